@@ -89,7 +89,8 @@ def write_run(outcome: Outcome, folder: Path, pages: bool = True) -> list[Path]:
     (name,) = own_solutions(outcome.solutions)
     provenance = gather_provenance(outcome)
     failed = write_solver(outcome, name, folder, provenance, pages=pages)
-    write_outcome(replace(outcome, alone=True), provenance, folder / stored.NAME)
+    kept = replace(outcome, alone=True)
+    failed |= _attempt(lambda path: write_outcome(kept, provenance, path), folder / stored.NAME)
     _insist(failed)
     return [*([folder / "report.html"] if pages else []), folder / "trajectory.csv", folder / "summary.json"]
 
@@ -104,13 +105,13 @@ def write_comparison(outcome: Outcome, folder: Path, pages: bool = True) -> list
         from graphnav.report import documents as report
 
         detectors = report.detector_pictures(outcome.recording, next(iter(outcome.solutions.values())))
-    failed = []
+    failed: dict[Path, str] = {}
     for name in own_solutions(outcome.solutions):
-        failed += write_solver(outcome, name, folder / name, provenance, detectors, pages)
+        failed |= write_solver(outcome, name, folder / name, provenance, detectors, pages)
     write_comparison_csv(folder / "comparison.csv", comparison(outcome))
     if pages:
-        failed += _attempt(lambda path: _draw_comparison(outcome, path.parent, provenance), folder / "comparison.html")
-    write_outcome(outcome, provenance, folder / stored.NAME)
+        failed |= _attempt(lambda path: _draw_comparison(outcome, path.parent, provenance), folder / "comparison.html")
+    failed |= _attempt(lambda path: write_outcome(outcome, provenance, path), folder / stored.NAME)
     _insist(failed)
     return [*([folder / "comparison.html"] if pages else []), folder / "comparison.csv"]
 
@@ -181,12 +182,12 @@ def write_solver(
     provenance: Mapping[str, Any],
     detectors: Sequence[Markup] | None = None,
     pages: bool = True,
-) -> list[str]:
+) -> dict[Path, str]:
     """The files of one solver; a folder that holds older ones keeps none of them under the same names.
 
     Returns
     -------
-    list of str
+    dict
         What could not be written, and why: a picture that fails takes no number with it.
     """
     from graphnav.recording.exporters import write_parts
@@ -203,7 +204,7 @@ def write_solver(
     (folder / "detections.csv").write_text(text, encoding="utf-8")
     done = time.perf_counter()
     report = folder / "report.html"
-    failed = _attempt(lambda _: _draw_solver(outcome, name, folder, provenance, detectors), report) if pages else []
+    failed = _attempt(lambda _: _draw_solver(outcome, name, folder, provenance, detectors), report) if pages else {}
     seconds = {"writing": done - began, "report": time.perf_counter() - done}
     write_json(folder / "summary.json", solver_summary(outcome, name, seconds, provenance))
     return failed
@@ -233,19 +234,20 @@ def _draw_solver(
     )
 
 
-def _attempt(write: Callable[[Path], object], path: Path) -> list[str]:
+def _attempt(write: Callable[[Path], object], path: Path) -> dict[Path, str]:
     """Write a file; what went wrong, if anything did, and then no file."""
     try:
         write(path)
     except Exception as error:
         path.unlink(missing_ok=True)
-        return [f"{path.name} could not be written ({type(error).__name__}: {error})"]
-    return []
+        return {path: f"{path.name} could not be written ({type(error).__name__}: {error})"}
+    return {}
 
 
-def _insist(failed: Sequence[str]) -> None:
+def _insist(failed: Mapping[Path, str]) -> None:
     if failed:
-        raise PartlyWrittenError(f"{'; '.join(failed)}; all other files are there", key="output.partly_written")
+        said = f"{'; '.join(failed.values())}; all other files are there"
+        raise PartlyWrittenError(said, key="output.partly_written", missing=failed)
 
 
 def write_evaluation(folder: Path, values: Mapping[str, Any], metrics: Metrics) -> None:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from pathlib import Path
+
 from graphnav.core.notes import key_of
 
 
@@ -29,7 +32,11 @@ class ConfigError(GraphnavError):
 
 
 class PartlyWrittenError(GraphnavError):
-    """Results of which one file could not be written; all others are there."""
+    """Results of which some files, `missing`, could not be written; all others are there."""
+
+    def __init__(self, sentence: str, *, key: str, missing: Iterable[Path]) -> None:
+        super().__init__(sentence, key=key)
+        self.missing = tuple(missing)
 
 
 class EstimationError(GraphnavError):

@@ -21,7 +21,7 @@ def stage_results(folder: Path) -> Iterator[Path]:
     It lies inside `folder`, which is made if need be and taken away again if nothing came of it, so that moving is
     renaming. A file that was there under the same name is replaced in one step.
 
-    What ends with a `PartlyWrittenError` keeps what it has written.
+    What ends with a `PartlyWrittenError` keeps what it has written, and nothing older of what it has not.
 
     Raises
     ------
@@ -43,6 +43,8 @@ def stage_results(folder: Path) -> Iterator[Path]:
                     target = folder / file.relative_to(part)
                     target.parent.mkdir(parents=True, exist_ok=True)
                     os.replace(file, target)
+                for file in () if failed is None else failed.missing:
+                    (folder / file.relative_to(part)).unlink(missing_ok=True)
             if failed is not None:
                 raise failed
         finally:

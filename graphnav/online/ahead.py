@@ -1,18 +1,21 @@
-"""The state at every row of the IMU, by prediction from the newest keyframe."""
+"""What is told of a running drive: the state at every row of the IMU, predicted from a keyframe; what has settled."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from graphnav.constraints.base import SAME_TIME
 from graphnav.core.earth import LocalFrame
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, States
+from graphnav.core.trajectory import Trajectory
 from graphnav.estimation.dense import Dense
 from graphnav.estimation.noise.model import NoiseModel
-from graphnav.estimation.solvers.window import Message
+from graphnav.estimation.solution import to_trajectory
+from graphnav.estimation.solvers.window import Message, SettledStates
 from graphnav.imu.dynamics import SCALE, ImuFactors, as_biases
 from graphnav.imu.preintegration import NOISE_FIGURES, preintegrate
 from graphnav.imu.samples import bridge_gaps
@@ -75,3 +78,18 @@ def since(
         bridge_gaps(imu), frame, ends, States.stack([start, now.state]), both, ba, bg, smooth=False
     )  # fmt: skip
     return t, *between(t)
+
+
+def export(settled: SettledStates, rows: NDArray[np.bool_], frame: LocalFrame) -> Trajectory:
+    """Some rows (N,) of what has settled, as a trajectory.
+
+    Raises
+    ------
+    FloatingPointError
+        If a state is no number.
+    """
+    track = to_trajectory("online", frame, settled.t[rows], settled.states[rows], settled.covariance[rows])
+    known = (track.llh, track.v, track.rph, track.sd_p, track.sd_v, track.sd_rph)
+    if not all(x is None or np.isfinite(x).all() for x in known):
+        raise FloatingPointError("states that are not finite")
+    return track

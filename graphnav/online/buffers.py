@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from graphnav.core.rotation import Array
@@ -92,10 +94,13 @@ class Buffer:
             self._data[: len(rows)] = rows.copy()
         self._begin, self._end = 0, len(rows)
 
-    def __getstate__(self) -> Array:
-        return self.rows.copy()
+    def __getstate__(self) -> dict[str, Any]:
+        more = {k: v for k, v in self.__dict__.items() if k not in ("_data", "_begin", "_end")}
+        return more | {"rows": self.rows.copy()}
 
-    def __setstate__(self, rows: Array) -> None:
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        rows = state.pop("rows")
+        self.__dict__.update(state)
         self._data = np.empty((max(256, len(rows)), rows.shape[1]))
         self._data[: len(rows)] = rows
         self._begin, self._end = 0, len(rows)

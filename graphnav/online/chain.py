@@ -28,11 +28,12 @@ from graphnav.estimation.solvers.stages import Place
 from graphnav.estimation.solvers.tree_window import TreeWindow
 from graphnav.estimation.solvers.verdicts import Verdicts
 from graphnav.estimation.solvers.watch import Watch
-from graphnav.estimation.solvers.window import Message, SettledStates, Window
+from graphnav.estimation.solvers.window import Message, SettledStates, Window, turn_limit
 from graphnav.imu.dynamics import ImuFactors
 from graphnav.imu.preintegration import NOISE_FIGURES
 from graphnav.online.looks import Stops
 from graphnav.online.sensors import Sensors
+from graphnav.recording import Recording
 
 _PLACE_SIGMA = 1000.0  # m, of where a stop may be
 _FIXES = 5  # that tell how often they come
@@ -56,15 +57,15 @@ class Chain:
     Parameters
     ----------
     message, t0 : the prior and the time it is for.
-    turn : rad, how far an attitude may move before rows are linearised anew.
+    setup : of the sensors.
     noise : how good the sensors are taken to be.
     """
 
     def __init__(
-        self, settings: Settings, message: Message, t0: float, turn: float, noise: NoiseModel = STATED
+        self, settings: Settings, message: Message, t0: float, setup: Recording, noise: NoiseModel = STATED
     ) -> None:
         self.settings, self.noise = settings, noise
-        self.window = _ENGINES[settings.solver.engine](message, turn)
+        self.window = _ENGINES[settings.solver.engine](message, find_turn(setup, noise))
         self.head = t0  # time of the message before the window, or of the first keyframe as long as it is in it
         self.opened = False  # whether the first keyframe has left the window
         self.verdicts = Verdicts({}, {})  # which fixes are used
@@ -120,11 +121,15 @@ class Chain:
     # ------------------------------------------------------------------------------------------ entering, leaving
     def _watch(self, problem: Problem, sensors: Sensors) -> None:
         """Have the fixes watched for errors that last, as soon as some tell how often they come."""
-        if self.window.newest.tests is not None or self.settings.gnss.faults == "off" or len(sensors.fixes) < _FIXES:
+        if (
+            self.window.newest.tests is not None
+            or self.settings.gnss.faults == "off"
+            or len(sensors.gnss.used) < _FIXES
+        ):
             return
         watched = [c for c in problem.constraints if c.watched and c.fix_of]
         if watched:
-            period = float(np.median(np.diff(sensors.fixes)))
+            period = float(np.median(np.diff(sensors.gnss.used)))
             self.window.watch(Watch(watched, period, len(self.window.newest.z)))
 
     def _weigh(self, problem: Problem) -> Problem:
@@ -269,6 +274,13 @@ class Chain:
             if stages[k].place.problem is None:
                 break  # nor do those before it
             stages[k] = replace(stages[k], place=replace(stages[k].place, problem=None))
+
+
+def find_turn(setup: Recording, noise: NoiseModel) -> float:
+    """How far (rad) an attitude may move before rows are linearised anew, by the accelerometer as it is judged."""
+    stated = setup.imu.noise
+    density = stated.accel_noise_density * float(np.sqrt(noise.factor("imu.accel_noise_density", 1.0)))
+    return turn_limit(replace(stated, accel_noise_density=density))
 
 
 def _with_decisions(problem: Problem, decided: dict[float, Held]) -> Problem:

@@ -31,11 +31,16 @@ from graphnav.estimation.noise.model import NoiseModel
 from graphnav.estimation.noise.words import describe
 from graphnav.estimation.problem import Problem, build_problem
 from graphnav.estimation.solution import ExcludedSpan
-from graphnav.online.sensors import Sensors, unit_of
+from graphnav.online.fixes import unit_of
+from graphnav.online.raw import without_ambiguities
+from graphnav.online.sensors import Sensors
 from graphnav.online.tracker import Tracker
 from graphnav.recording import Recording
 
 _PORTION = 4  # keyframes gone through again at a row
+_FIXES = 600  # in motion, that tell variances to 6 %
+_LONGEST = 900.0  # s of rows, where fixes are so rare that these are still too few
+_THINKING, _LONGEST_THOUGHT = 1.0 / 8.0, 20.0  # of the lag, and s: what judging may take, 11 s for 1100 keyframes
 
 
 @dataclass(frozen=True)
@@ -139,6 +144,22 @@ def _in_unit(noise: NoiseModel, base: Problem, unit: Array) -> NoiseModel:
             more = up if name.endswith(".up") else level
             figures[name] = replace(one, log_factor=one.log_factor + more, prior=one.prior + more)
     return replace(noise, figures=figures)
+
+
+def judge(
+    sensors: Sensors, settings: Settings, frame: LocalFrame, found: Alignment, times: Array, until: float
+) -> Judgement:
+    """Have the sensors judged by their rows up to a time (s); `times` (K,) are the keyframes so far, s."""
+    recording, every = (sensors.recording(-np.inf, until, all_of_them) for all_of_them in (False, True))
+    due = float(times[-1]) + min(_THINKING * settings.solver.lag, _LONGEST_THOUGHT)
+    settings = without_ambiguities(settings, sensors.setup)
+    return Judgement(recording, every, settings, frame, found, times, sensors.gnss.unit(), due)
+
+
+def are_enough(sensors: Sensors, found: Alignment, span: float) -> bool:
+    """Whether the rows of a span (s) tell the sensors so well that more would say little new."""
+    assert found.motion is not None
+    return bool(np.count_nonzero(sensors.gnss.used > found.motion) >= _FIXES or span > _LONGEST)
 
 
 class CatchUp:

@@ -4,7 +4,7 @@ graphnav-online/1 {"platform": "vehicle", "imu": {"noise": {...}}, "gnss": {"lev
 I,t,gx,gy,gz,ax,ay,az
 G,t,lat,lon,h,sd_e,sd_n,sd_u[,ve,vn,vu,sd_ve,sd_vn,sd_vu]
 O,t,speed
-R,t,place and clock;satellite,signal,...;...   raw observations, an epoch a line (`graphnav.online.raw`)
+R,t,place and clock;satellite,signal,...;...   raw observations, an epoch a line (`graphnav.online.raw_lines`)
 S,name,t,...                  another sensor (`graphnav.sensors`): its columns, in the units that are usual in files
 E
 """
@@ -22,7 +22,8 @@ from pydantic import BaseModel, ConfigDict, ValidationError, create_model
 from graphnav.core.complaints import complaint, suggest_nearest
 from graphnav.core.errors import RecordingError
 from graphnav.core.files import parse_json, parse_number
-from graphnav.online.raw import RAW, LiveRaw, live_raw, text_of, values_of
+from graphnav.online.raw import RAW
+from graphnav.online.raw_lines import LiveRaw, live_raw, text_of, values_of
 from graphnav.online.replay import rows_of
 from graphnav.online.sensors import Row
 from graphnav.recording import Gnss, Imu, ImuNoise, Odometer, Recording

@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from graphnav.core.rotation import Array
-from graphnav.online.raw import RAW, epochs_of, without_epochs
+from graphnav.online.raw import RAW
+from graphnav.online.raw_lines import epochs_of, without_epochs
 from graphnav.online.sanity import Row
 from graphnav.recording import Recording
 

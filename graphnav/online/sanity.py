@@ -33,8 +33,15 @@ _HELD = 200  # rows of other sensors
 _OVERTAKING = (
     10.0  # periods; rows that merely overtake each other are closer (as in `graphnav.recording.formats.repair`)
 )
+_TELLING = 400  # rows of the IMU that tell how often they come
 _HOLE = 1.5  # periods between two rows in which another may have been
 _STRANDS = 3  # clocks that rows far ahead may be of at a time: one, and two that come of wrong stamps
+
+
+def find_period(t: Array) -> float:
+    """Median time between the newest rows of an IMU at times (N,), s; infinity for a single one."""
+    near = np.diff(t[-_TELLING:])
+    return float(np.median(near)) if len(near) else math.inf
 
 
 def imu_reads(values: tuple[float, ...]) -> bool:
@@ -152,8 +159,7 @@ class ClockGuard:
 
     def fits(self, t: float, times: Array) -> bool:
         """Whether a row at a time that has passed may have been missed there; `times` (N,) are those of the rows."""
-        near = np.diff(times[-400:])
-        period = float(np.median(near)) if len(near) else math.inf
+        period = find_period(times)
         if period > _SLOWEST:
             return False  # one of these two is no time of an IMU
         if t > times[-1] - _OVERTAKING * period or times[0] - _OVERTAKING * period < t < times[0]:

@@ -9,21 +9,18 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from graphnav.config.raw_gnss import RawGnssSettings
-from graphnav.constraints.gnss import period
 from graphnav.core.rotation import Array
-from graphnav.estimation.noise.spacing import best_fixes, grid_start
 from graphnav.online.buffers import SAME, Buffer
+from graphnav.online.fixes import Fixes
+from graphnav.online.neighbours import Neighbours
 from graphnav.online.raw import RAW, RawEpochs
 from graphnav.online.sanity import ClockGuard, Reach, Row, fix_odds, imu_reads, odometer_reads, with_sane_velocity
-from graphnav.recording import Gnss, Odometer, Recording
+from graphnav.recording import Odometer, Recording
 from graphnav.recording.formats.repair import LATEST
-from graphnav.recording.plausibility.readings import ALONE, HOLE, Excesses, find_contradicted, measure_excess
 
 AHEAD = 60.0  # s; stamps of other sensors further than this before the IMU's are wrong
-_WIDTH = {"imu": 6, "gnss": 19, "odometer": 6}  # the last of a fix: six usual sigmas, and whether it is used
-_USED = 19
+_WIDTH = {"imu": 6, "odometer": 6}
 _TOLD = {"gnss": 3, "odometer": 1}  # values by which a row is known again
-_USUAL = 60.0  # s over which the usual sigma of fixes is averaged
 _NAN = float("nan")
 
 
@@ -43,42 +40,36 @@ class Sensors:
     raw_settings: RawGnssSettings = field(default_factory=RawGnssSettings)
     counts: Counter[str] = field(default_factory=Counter)
     imu: Buffer = field(default_factory=lambda: Buffer(_WIDTH["imu"]))
-    gnss: Buffer = field(default_factory=lambda: Buffer(_WIDTH["gnss"]))
+    gnss: Fixes = field(init=False)
     odometer: Buffer = field(default_factory=lambda: Buffer(_WIDTH["odometer"]))
     others: dict[str, Buffer] = field(init=False)  # of the sensors of `Recording.sensors`
     raw: RawEpochs | None = field(init=False)  # of a receiver whose single satellites are used in place of its fixes
     oldest: float = -np.inf  # s; rows up to here come too late
-    _unit: Array | None = None  # `unit`, once asked for
-    _means: dict[str, tuple[float, tuple[float, ...]]] = field(default_factory=dict)  # usual sigmas, and since when
     set_back: list[Row] = field(default_factory=list)  # the first rows of a clock that was set back
     moved: tuple[float, int] | None = None  # since when (s), and how many fixes are elsewhere than all before
     released: list[Row] = field(default_factory=list)  # rows that were held and are to be taken in now
-    left: list[float] = field(default_factory=list)  # s, fixes that were used until better ones of their span came
-    _grid: tuple[float, float] | None = None  # begin and length of the spans, s, of which the best fix is used
     _clock: ClockGuard = field(default_factory=ClockGuard)
     _reach: Reach = field(default_factory=Reach)
     _before: set[tuple[str | float, ...]] = field(default_factory=set)  # fixes and readings of the clock before
-    contradicted: float | None = None  # s, the row before one that was taken back; None once known
-    _excesses: Excesses = field(init=False)
-    _learnt: float = -np.inf  # s, up to where rows are in these
-    _last: tuple[tuple[float, ...], tuple[float, ...]] | None = None  # the newest two rows of the IMU with their times
+    _neighbours: Neighbours = field(init=False)
 
     def __post_init__(self) -> None:
         self.others = {name: Buffer(len(series.sensor.names)) for name, series in self.setup.sensors.items()}
-        self._excesses = Excesses(self._compared)
+        self.gnss = Fixes(self.setup.gnss)
+        # of a foot rates alone: it is hit for less than a row
+        self._neighbours = Neighbours(3 if self.setup.platform == "foot" else 6)
         raw, tight = self.setup.raw_gnss, self.setup.tight(self.raw_settings.coupling)
         self.raw = RawEpochs(raw, self.raw_settings) if raw is not None and tight else None
-
-    @property
-    def _compared(self) -> int:
-        """Columns of the IMU of which a reading can be contradicted: a foot is hit for less than a row."""
-        return 3 if self.setup.platform == "foot" else 6
 
     @property
     def aiding(self) -> dict[str, Buffer | RawEpochs]:
         """The buffers of all sensors but the IMU, by their names."""
         of_raw = {} if self.raw is None else {RAW: self.raw}
         return {"gnss": self.gnss, "odometer": self.odometer, **self.others, **of_raw}
+
+    @property
+    def _all(self) -> dict[str, Buffer | RawEpochs]:
+        return {"imu": self.imu, **self.aiding}
 
     def newest(self, sensor: str) -> float:
         """Newest time of a sensor, s."""
@@ -94,7 +85,7 @@ class Sensors:
 
     def anchors_of_all(self) -> Array:
         """Times (N,) of the rows that want a keyframe, s."""
-        times = [self.fixes] if self.anchors("gnss") else []
+        times = [self.gnss.used] if self.anchors("gnss") else []
         times += [b.t for name, b in self.aiding.items() if name != "gnss" and self.anchors(name)]
         return np.unique(np.concatenate([*times, np.empty(0)]))
 
@@ -137,21 +128,15 @@ class Sensors:
                 self.counts["gnss"] -= len(self.gnss)
                 self.counts["gnss: out of reach"] += len(self.gnss) - len(others) + 1
                 self.gnss.drop_before(np.inf)
-                self._means, self.moved, self.released = {}, (others[0][1], len(others)), others
+                self.gnss.forget_usual()
+                self.moved, self.released = (others[0][1], len(others)), others
                 return False
-            values = (
-                *values,
-                *self._track_sigma("position", t, values[3:6]),
-                *self._track_sigma("velocity", t, values[9:12]),
-                1.0,
-            )
+            values = self.gnss.complete(t, values)
         if not buffer.add(t, values):
             self.counts[f"{sensor}: repeated"] += 1
             return False
         self.counts[sensor] += 1
-        if sensor == "gnss" and self._grid is not None:
-            return self._choose(t, *self._grid)
-        return True
+        return self.gnss.choose(t) if sensor == "gnss" else True
 
     def _is_in_time(
         self, sensor: str, t: float, values: tuple[float, ...], told: tuple[str | float, ...], released: bool
@@ -214,103 +199,32 @@ class Sensors:
         self._clock.remember(t, values)
         self.imu.append(t, values)
         self.counts["imu"] += 1
-        self._compare(t, values)
         return True
 
-    def _compare(self, t: float, values: tuple[float, ...]) -> None:
-        """Take the row before the newest back if that and the one before contradict it."""
-        before, now = self._last, (t, *values)
-        self._last = now if before is None else before[1], now
-        if before is None:
-            return
-        for a, b, c, limit in zip(before[0][1:], before[1][1:], values, self._excesses.limits, strict=False):
-            if b - max(a, c) > limit or min(a, c) - b > limit:
-                break
-        else:
-            return
-        near = self.imu.t[-400:]
-        if len(near) < 4 or near[-3] != before[0][0] or near[-2] != before[1][0]:
-            return  # a late row stands between them
-        if np.diff(near[-3:]).max() < HOLE * np.median(np.diff(near)):
-            self.contradicted, self._last = before[0][0], (before[0], now)
-            self.imu.drop(before[1][0])
-            self._count_contradicted(1)
-
-    def _count_contradicted(self, count: int) -> None:
-        self.counts["imu"] -= count
-        self.counts["imu: contradicted by those around"] += count
+    def compare_newest(self) -> float | None:
+        """Take the row of the IMU before the newest back, if its neighbours contradict it; the time of that before."""
+        newest = self.imu.rows[-1].tolist()
+        found = self._neighbours.compare(newest[0], tuple(newest[1:]), self.imu)
+        if found is None:
+            return None
+        before, t = found
+        self._take_back([t])
+        return before
 
     def learn(self, until: float, stops: Array) -> None:
         """Learn from the rows up to a time (s), but those in stops (M, 2), how far readings lie beyond those around."""
-        rows = self.imu.between(self._learnt, until)
-        if len(rows) < 3:
-            return
-        self._learnt = float(rows[-2, 0])
-        t = rows[1:-1, 0, None]
-        moving = ~((t >= stops[:, 0]) & (t <= stops[:, 1])).any(axis=1)
-        self._excesses.add(measure_excess(rows[:, 1 : 1 + self._compared])[moving])
+        self._neighbours.learn(self.imu, until, stops)
 
     def drop_contradicted(self) -> None:
-        """Leave out the rows that those around them contradict, but the newest, of which that is not known yet."""
-        rows = self.imu.rows
-        bad = find_contradicted(rows[:, 0], rows[:, 1 : 1 + self._compared].T)
-        for t in rows[bad & (rows[:, 0] < self.imu.newest - ALONE), 0].tolist():
+        """Leave out the rows of the IMU that those around them contradict, as far as that is known."""
+        self._take_back(self._neighbours.find(self.imu))
+
+    def _take_back(self, times: list[float]) -> None:
+        for t in times:
             self.imu.drop(t)
-            self._count_contradicted(1)
-
-    @property
-    def fixes(self) -> Array:
-        """(N,) s, those that are used."""
-        return self.gnss.rows[self.gnss.rows[:, _USED] > 0.0, 0]
-
-    def space(self, spacing: float) -> None:
-        """Use the best fix of every span of `spacing` (s), as `estimation.noise.spacing` has it; 0: use all."""
-        self.gnss.rows[:, _USED], self._grid, self.left = 1.0, None, []
-        gnss = self._gnss(-np.inf, np.inf)
-        if not spacing or gnss is None or len(gnss.t) < 2 or period(gnss.t) > 0.5 * spacing:
-            return
-        begin = grid_start(gnss)
-        self._grid = begin, spacing
-        self.gnss.rows[:, _USED] = 0.0
-        self.gnss.rows[best_fixes(gnss, np.floor((gnss.t - begin) / spacing)), _USED] = 1.0
-
-    def _choose(self, t: float, begin: float, spacing: float) -> bool:
-        """Whether the fix at a time is one of the best of its span; those that no longer are go to `left`."""
-        span = np.floor((t - begin) / spacing)
-        near = self.gnss.rows[slice(*np.searchsorted(self.gnss.t, [t - 1.1 * spacing, t + 1.1 * spacing]))]
-        rows = np.flatnonzero(np.floor((near[:, 0] - begin) / spacing) == span)
-        gnss = self._as_gnss(near[rows])
-        assert gnss is not None
-        best = rows[best_fixes(gnss, np.zeros(len(rows)))]
-        others = np.setdiff1d(rows, best)
-        self.left += [float(x) for x in near[others[near[others, _USED] > 0.0], 0] if x != t]
-        near[rows, _USED] = 0.0
-        near[best, _USED] = 1.0
-        return bool(np.any(near[best, 0] == t))
-
-    def typical_sigmas(self, t: Array) -> Array:
-        """(N, 6) sigmas that the fixes at some times usually state, m and m/s: the units of errors that last."""
-        return self.gnss.rows[np.searchsorted(self.gnss.t, t - 1e-6), 13:19]
-
-    def unit(self) -> Array:
-        """(3,) m, in which errors of the fixes that last for minutes and hours are told, from the first question on."""
-        if self._unit is None:
-            self._unit = unit_of(self.gnss.rows[self.gnss.rows[:, _USED] > 0.0, 4:7])
-        return self._unit
-
-    def _track_sigma(self, kind: str, t: float, sd: tuple[float, ...]) -> tuple[float, ...]:
-        """A mean that looks back only, and so is the same whenever a fix is posed.
-
-        The median of a minute that `graphnav.constraints.gnss` takes would change with every row that follows, and
-        a slow error in such a unit would give itself away.
-        """
-        last, mean = self._means.get(kind, (-np.inf, sd))
-        if not math.isfinite(sum(sd)):
-            return mean  # a fix without a velocity
-        gain = -np.expm1(-max(t - last, 0.0) / _USUAL) if np.isfinite(last) else 1.0
-        mean = tuple(float(m + gain * (s - m)) for m, s in zip(mean, sd, strict=True))
-        self._means[kind] = max(t, last), mean
-        return mean
+        if times:
+            self.counts["imu"] -= len(times)
+            self.counts["imu: contradicted by those around"] += len(times)
 
     def release(self) -> None:
         """No more IMU rows will come: what was held is to be taken in now."""
@@ -327,7 +241,9 @@ class Sensors:
 
     def forget_time(self) -> None:
         """Another clock: what was noted of the times of rows holds no more."""
-        self._means, self._reach, self._last, self._learnt = {}, Reach(), None, -np.inf
+        self._reach = Reach()
+        self.gnss.forget_usual()
+        self._neighbours.forget_time()
 
     def _find_fault(self, sensor: str, values: tuple[float, ...]) -> str | None:
         """What is wrong with a row by itself, as it is counted."""
@@ -365,20 +281,17 @@ class Sensors:
                 self._clock.remember(when, what)
                 self.imu.append(when, what)
             self.counts["imu"] += len(rows)
-            self._last = None
+            self._neighbours.forget_newest()
             self._sort_out()
             return bool(rows)
         if t > self.imu.newest:
             self._clock.remember(t, values)
             self._clock.go_on()
             self._sort_out()
-        newest = t > self.imu.newest
         if not self.imu.add(t, values):
             self.counts["imu: repeated"] += 1
             return False
         self.counts["imu"] += 1
-        if newest:
-            self._compare(t, values)
         return True
 
     def _passed(self, t: float) -> str:
@@ -388,8 +301,21 @@ class Sensors:
 
     def drop_before(self, t: float) -> None:
         """Forget rows before a time."""
-        for buffer in (self.imu, *self.aiding.values()):
+        for buffer in self._all.values():
             buffer.drop_before(t)
+
+    def cut_after(self, t: float) -> dict[str, list[tuple[float, tuple[float, ...]]]]:
+        """Take out the rows after a time (s), by sensor; `put_back` takes them in again."""
+        later = {name: buffer.after(t) for name, buffer in self._all.items()}
+        for buffer in self._all.values():
+            buffer.drop_after(t)
+        return later
+
+    def put_back(self, later: dict[str, list[tuple[float, tuple[float, ...]]]]) -> None:
+        """Take in rows that were taken out."""
+        for name, buffer in self._all.items():
+            for row in later[name]:
+                buffer.add(*row)
 
     def imu_until(self, t: float) -> float:
         """When the IMU spoke first at or after a time, s; only that row tells that it was silent there."""
@@ -406,21 +332,9 @@ class Sensors:
             sensors[name] = replace(self.setup.sensors[name], t=rows[:, 0], values=rows[:, 1:])
         raw = None if self.raw is None else self.raw.between(begin, end)
         return replace(
-            self.setup, imu=imu, gnss=self._gnss(begin, end, every), odometer=self._odometer(begin, end),
+            self.setup, imu=imu, gnss=self.gnss.between_as_gnss(begin, end, every), odometer=self._odometer(begin, end),
             sensors=sensors, raw_gnss=raw,
         )  # fmt: skip
-
-    def _gnss(self, begin: float, end: float, every: bool = False) -> Gnss | None:
-        rows = self.gnss.between(begin, end)
-        return self._as_gnss(rows if every else rows[rows[:, _USED] > 0.0])
-
-    def _as_gnss(self, rows: Array) -> Gnss | None:
-        if self.setup.gnss is None or not len(rows):
-            return None
-        v = sd_v = None
-        if np.isfinite(rows[:, 7:13]).all(axis=1).any():
-            v, sd_v = rows[:, 7:10], rows[:, 10:13]
-        return replace(self.setup.gnss, t=rows[:, 0], llh=rows[:, 1:4], sd=rows[:, 4:7], v=v, sd_v=sd_v)
 
     def _odometer(self, begin: float, end: float) -> Odometer | None:
         rows = self.odometer.between(begin, end)
@@ -434,10 +348,3 @@ class Sensors:
 def _identify(name: str, t: float, values: tuple[float, ...]) -> tuple[str | float, ...]:
     """By what a row of another sensor is known again."""
     return (name, t, *(x for x in values if math.isfinite(x)))
-
-
-def unit_of(sd: Array) -> Array:
-    """(3,) median of stated sigmas (N, 3), one for both horizontal axes: their errors have one figure in common."""
-    east, north, up = np.median(sd, axis=0)
-    level = np.sqrt(0.5 * (east**2 + north**2))
-    return np.array([level, level, up])

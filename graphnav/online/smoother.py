@@ -16,37 +16,32 @@ from graphnav.core.earth import LocalFrame
 from graphnav.core.errors import EstimationError
 from graphnav.core.notes import Note
 from graphnav.core.trajectory import Trajectory
-from graphnav.detectors import detect
-from graphnav.estimation.alignment import Alignment, align, ready, with_known_heading
-from graphnav.estimation.building import start_sigma
+from graphnav.estimation.alignment import Alignment
 from graphnav.estimation.noise.explanations import FIXES
 from graphnav.estimation.noise.model import STATED, NoiseModel
 from graphnav.estimation.pipeline import origin
-from graphnav.estimation.solution import ExcludedSpan, to_trajectory
-from graphnav.estimation.solvers.batch import batch
+from graphnav.estimation.solution import ExcludedSpan
 from graphnav.estimation.solvers.watch import LONGEST
-from graphnav.estimation.solvers.window import first_message
-from graphnav.online.ahead import Live
-from graphnav.online.judging import CatchUp, Judgement
+from graphnav.online.ahead import Live, export
+from graphnav.online.judging import CatchUp, Judgement, are_enough, judge
 from graphnav.online.looks import CONTEXT, SURE
-from graphnav.online.raw import codes_alone, settings_online, without_ambiguities
+from graphnav.online.raw import settings_online
+from graphnav.online.sanity import find_period
 from graphnav.online.sensors import Row, Sensors
+from graphnav.online.start import find_start, list_keyframes, make_tracker, take_rows
 from graphnav.online.tracker import Tracker
 from graphnav.online.walker import Walker
 from graphnav.recording import Recording
+from graphnav.recording.plausibility.readings import HOLE
 
 AFTER = 0.05  # s of IMU after a keyframe that a fix may look at
 _ODOMETER = 0.3  # s that a keyframe waits for the odometer
 _SILENT = 2.0  # s after which an odometer is not waited for
 _STEP = 0.5  # s between looks at a walk
-_MISSING = 5  # rows of the IMU in a row, whose work the next one does
 _KNOWN = 4.0  # s before the newest keyframe up to which the stops are known
 _TRY = 2.0  # s between attempts at an alignment
 _LEVEL = 5.0  # s of rest that level a vehicle without GNSS
 _JUDGED = 120.0  # s of rows by which the sensors are judged again
-_FIXES = 600  # in motion, that tell variances to 6 %: more of them say little new
-_THINKING, _LONGEST_THOUGHT = 1.0 / 8.0, 20.0  # of the lag, and s: what judging may take, 11 s for 1100 keyframes
-_JUDGED_UNTIL = 900.0  # s of rows, where fixes are so rare that these are still too few
 _PATIENCE = 300.0  # s of rows kept while there is no motion to align with
 
 
@@ -79,7 +74,7 @@ class Smoother:
         self._began = -np.inf  # s, of what is being smoothed
         self._due = -np.inf  # s, of IMU time at which the next keyframes can be made
         self._awake = -np.inf  # s, at which there is anything to do
-        self._spacing = 0.0  # s, between the newest two rows of the IMU
+        self._period = np.inf  # s, of the IMU's rows
         self._dirty = np.inf
         self._settled: list[Trajectory] = []
         self._last_settled = -np.inf
@@ -101,9 +96,7 @@ class Smoother:
         sensors = self.sensors
         before = sensors.imu.newest
         if sensor == "imu" and sensors.add_next(t, values, before):  # as all but a few do
-            if sensors.contradicted is not None:
-                self._redo_contradicted()
-            self._look_if_due(t, before)
+            self._take_newest(t, before)
             return
         previous = sensors.newest(sensor)
         if not sensors.add(sensor, t, values, released):
@@ -113,9 +106,7 @@ class Smoother:
             if newest - before > self.settings.keyframes.bridge and len(sensors.imu) > 1 and np.isfinite(before):
                 after = float(sensors.imu.t[np.searchsorted(sensors.imu.t, before, side="right")])
                 self._restart(before, f"the IMU was silent from {before:.3f} to {after:.3f} s")
-            if sensors.contradicted is not None:
-                self._redo_contradicted()
-            self._look_if_due(newest, before)
+            self._take_newest(newest, before)
             return
         tracker = self.tracker
         if tracker is not None:
@@ -129,9 +120,9 @@ class Smoother:
             self._awake = -np.inf
             if sensor != "gnss" and t < previous:
                 tracker.note_late_row(sensor, t)
-            if sensors.left:
-                self._fixes = [x for x in self._fixes if x not in sensors.left]
-                self._dirty, sensors.left = min([self._dirty, *sensors.left]), []
+            if sensors.gnss.left:
+                self._fixes = [x for x in self._fixes if x not in sensors.gnss.left]
+                self._dirty, sensors.gnss.left = min([self._dirty, *sensors.gnss.left]), []
             if sensors.anchors(sensor) and t > tracker.newest + SAME_TIME:
                 self._fixes = sorted([*self._fixes, t])
                 self._due = min(self._due, t + AFTER)
@@ -145,12 +136,15 @@ class Smoother:
         if sensors.imu.newest >= self._due:
             self._look(sensors.imu.newest)
 
-    def _redo_contradicted(self) -> None:
-        """A row of the IMU was taken back: what was made of it is made again."""
-        tracker, t = self.tracker, self.sensors.contradicted
-        self.sensors.contradicted = None
-        if tracker is None or t is None:
-            return
+    def _take_newest(self, now: float, before: float) -> None:
+        """Take in the newest row of the IMU, at a time (s), and that of the row before."""
+        void = self.sensors.compare_newest()
+        if void is not None and self.tracker is not None:
+            self._redo(void, self.tracker)
+        self._look_if_due(now, before)
+
+    def _redo(self, t: float, tracker: Tracker) -> None:
+        """A row of the IMU was taken back: what was made of it from a time (s) on is made again."""
         if isinstance(tracker, Walker):
             tracker.finish_entering(self.sensors)
         self._awake = -np.inf
@@ -159,14 +153,13 @@ class Smoother:
             self._dirty = min(self._dirty, t)
 
     def _look_if_due(self, now: float, before: float) -> None:
-        spacing, self._spacing = self._spacing, now - before
         if now < self._awake:
             return
-        if self._spacing > 1.5 * spacing > 0.0 and isinstance(self.tracker, Walker):
+        if now - before > HOLE * self._period and isinstance(self.tracker, Walker):
             # what is done at which row stays the same where some are missing, which may yet come
-            for k in range(1, min(round(self._spacing / spacing), _MISSING + 1)):
-                if before + k * spacing >= self._awake - SAME_TIME:
-                    self._look(before + k * spacing)
+            for k in range(1, round((now - before) / self._period)):
+                if before + k * self._period >= self._awake - SAME_TIME:
+                    self._look(before + k * self._period)
         self._look(now)
 
     def _look(self, now: float) -> None:
@@ -179,7 +172,7 @@ class Smoother:
             tracker.go_on(self.sensors)
             self._awake = now
         elif now >= self._due - SAME_TIME:
-            self._advance(tracker)
+            self._advance(tracker, now)
             self._awake = now
         elif self._again is not None:
             self._go_through(self._again, tracker)
@@ -221,7 +214,7 @@ class Smoother:
                 self.notes.append(Note("online.not_aligned", str(error)))
         if self.tracker is not None:
             self._judge_at_last()
-            self._advance(self.tracker, last=True)
+            self._advance(self.tracker, self.sensors.imu.newest, last=True)
             self.tracker.settle(self.sensors)
             self._collect(self.tracker)
 
@@ -236,24 +229,15 @@ class Smoother:
             self._due = now + _TRY
         if now - first < _LEVEL:
             return
-        sensors.drop_contradicted()
-        recording = sensors.recording(-np.inf, now)
-        if recording.gnss is None and sensors.setup.gnss is not None and not last:
+        rows = take_rows(sensors, self.settings, now, last)
+        if rows is None:
             self._wait(now)
             return
-        if recording.gnss is not None and not last and not ready(recording, self.settings):
-            self._wait(now)
-            return
-        stationary = detect(recording, self.settings).stationary
-        if recording.gnss is not None and not last and not ready(recording, self.settings, stationary):
-            self._wait(now)  # fixes jumped while it stood
-            return
+        recording, stationary = rows
         if self.frame is None:
             self.frame = LocalFrame(origin(recording))
-        frame = self.frame
         try:
-            found = align(recording, codes_alone(self.settings), frame, lambda problem, start: batch(
-                problem, start, wanted=(0,), reintegrate=False), stationary)  # fmt: skip
+            found = find_start(recording, stationary, self.settings, self.frame)
         except EstimationError as error:
             if last:
                 raise
@@ -264,26 +248,19 @@ class Smoother:
         told = found.motion is not None and self.settings.gnss.position and recording.platform != "foot"
         if told and self.settings.noise.mode == "estimated":
             self._found, self._tentative = found, True
-            sensors.space(self.settings.noise.spacing)
+            sensors.gnss.space(self.settings.noise.spacing)
         self._fixes = [t for t in sensors.anchors_of_all().tolist() if t >= recording.start - SAME_TIME]
         self._began, self._judged = recording.start, recording.duration
         sensors.oldest = recording.start
-        self._advance(tracker)
+        self._advance(tracker, sensors.imu.newest)
         if self._found is not None and self.tracker is tracker:
-            self._note_judgement(self._found, tracker)
+            self._have_judged(self._found, tracker)
 
     def _track(self, found: Alignment, start: float, noise: NoiseModel) -> Tracker:
         """Begin at the first row of what an alignment has seen, s."""
         assert self.frame is not None
-        stated = with_known_heading(found, self.settings)
-        self.notes += [note for note in stated.notes if note not in self.notes]
-        # whether it tells the heading shows with the rows; the tree of iSAM2 moves its states by itself
-        turns = self._setup.gnss is None and self.settings.solver.engine == "window"
-        message = first_message(stated.state, start_sigma(stated), turns)
-        kind = Walker if self._setup.platform == "foot" else Tracker
-        tracker = kind(self.settings, self.frame, message, start, self._setup, noise)
-        if found is not stated:
-            tracker.window.head = message.moved(found.state.minus(stated.state)[0])
+        tracker, notes = make_tracker(found, start, noise, self.settings, self.frame, self._setup)
+        self.notes += [note for note in notes if note not in self.notes]
         return tracker
 
     def _say(self, said: tuple[str, ...]) -> None:
@@ -292,27 +269,19 @@ class Smoother:
         self._said = said
 
     def _judge_again(self, found: Alignment, tracker: Tracker) -> None:
-        """Have the sensors judged again before the first state settles, and whenever there are twice as many rows.
-
-        Up to `_FIXES` fixes in motion.
-        """
-        assert found.motion is not None
+        """Have the sensors judged again before the first state settles, then by ever more rows until those suffice."""
         span = tracker.newest - self._began
-        enough = np.count_nonzero(self.sensors.fixes > found.motion) >= _FIXES or span > _JUDGED_UNTIL
+        enough = are_enough(self.sensors, found, span)
         if not enough and span < max(min(self.settings.solver.lag, _JUDGED), 2.0 * self._judged):
             return
         self._judged = span
         self._found = None if enough else found
-        self._note_judgement(found, tracker)
+        self._have_judged(found, tracker)
 
-    def _note_judgement(self, found: Alignment, tracker: Tracker) -> None:
+    def _have_judged(self, found: Alignment, tracker: Tracker) -> None:
         assert self.frame is not None
         times = np.concatenate([self._times, tracker.window.t])
-        until = tracker.newest + AFTER
-        recording, every = (self.sensors.recording(-np.inf, until, all_of_them) for all_of_them in (False, True))
-        due = tracker.newest + min(_THINKING * self.settings.solver.lag, _LONGEST_THOUGHT)
-        settings = without_ambiguities(self.settings, self._setup)
-        self._judgement = Judgement(recording, every, settings, self.frame, found, times, self.sensors.unit(), due)
+        self._judgement = judge(self.sensors, self.settings, self.frame, found, times, tracker.newest + AFTER)
 
     def _use(self, judgement: Judgement, tracker: Tracker) -> None:
         """Begin to go through what has not settled with what the sensors were judged to be."""
@@ -353,61 +322,39 @@ class Smoother:
         """What was up to a time (s) settles as it is, and an alignment begins anew."""
         sensors = self.sensors
         self.notes.append(Note("online.anew", f"{why}: aligning anew"))
-        after = sensors.imu.rows[sensors.imu.t > before].copy()
-        later = {name: buffer.after(before) for name, buffer in sensors.aiding.items()}
-        for buffer in (sensors.imu, *sensors.aiding.values()):
-            buffer.drop_after(before)
+        later = sensors.cut_after(before)
         self._settle_all()
         self._faults = self.excluded
         self._begin_anew(before)
-        for row in after:
-            sensors.imu.add(float(row[0]), tuple(row[1:]))
-        for name, rows in later.items():
-            for row in rows:
-                sensors.aiding[name].add(*row)
-        sensors.space(0.0)  # all of them, until there is a start again
+        sensors.put_back(later)
+        sensors.gnss.space(0.0)  # all of them, until there is a start again
 
     def _begin_anew(self, oldest: float) -> None:
         """Forget all rows and what was made of them; those up to a time (s) come too late from now on."""
         self.tracker = self._found = self._judgement = self._again = None
         self._tentative, self._times, self._left_out = False, [], ()
         self.sensors.drop_before(np.inf)
-        self.sensors.space(0.0)
+        self.sensors.gnss.space(0.0)
         self.sensors.oldest = oldest
         self._fixes, self._dirty = [], np.inf
         self._due = self._awake = -np.inf
 
     # --------------------------------------------------------------------------------------------------- running
-    def _advance(self, tracker: Tracker, last: bool = False) -> None:
-        """Make the keyframes that are due."""
-        self.sensors.learn(tracker.newest - _KNOWN, tracker.stops)
-        sensors, period = self.sensors, 1.0 / self.settings.keyframes.rate
-        now = sensors.imu.newest
+    def _advance(self, tracker: Tracker, now: float, last: bool = False) -> None:
+        """Make the keyframes that are due at a time, s."""
+        sensors = self.sensors
+        sensors.learn(tracker.newest - _KNOWN, tracker.stops)
+        if isinstance(tracker, Walker):
+            self._advance_walk(tracker, now, last)
+            return
+        period, now = 1.0 / self.settings.keyframes.rate, sensors.imu.newest
         limit = now if last else now - AFTER
         odometer = sensors.odometer.newest
         if not last and now - odometer < _SILENT:
             limit = min(limit, max(odometer, now - _ODOMETER))
-        if isinstance(tracker, Walker):
-            at = _STEP * float(np.floor((now + SAME_TIME) / _STEP))
-            newest = tracker.take_steps(sensors, now if last else at - SURE, last, self._fixes, self._dirty)
-            if newest > -np.inf:
-                self._dirty, self._fixes = np.inf, [t for t in self._fixes if t > newest + SAME_TIME]
-            self._due = at + _STEP
-            return
         T = tracker.newest
         begun = bool(len(tracker.window)) or tracker.opened
-        anchors = [t for t in self._fixes if T + SAME_TIME < t <= limit]
-        if last and limit > T + SAME_TIME and (not anchors or limit > anchors[-1] + SAME_TIME):
-            anchors.append(limit)
-        times = [] if begun else [T]
-        at = T
-        for anchor in [*anchors, np.inf]:
-            while anchor - at > period * (1.0 + 1e-6) and at + period <= limit:
-                at += period
-                times.append(at)
-            if np.isfinite(anchor):
-                at = anchor
-                times.append(at)
+        times = ([] if begun else [T]) + list_keyframes(T, limit, self._fixes, period, last)
         late = [t for t in self._fixes if t <= T + SAME_TIME]
         if late and begun:  # a keyframe of its own, and those after it again
             self._dirty = min(self._dirty, *late)
@@ -426,6 +373,14 @@ class Smoother:
         T = tracker.newest
         self._due = min([T + period, *(t for t in self._fixes if t > T)]) + AFTER
 
+    def _advance_walk(self, walker: Walker, now: float, last: bool) -> None:
+        self._period = find_period(self.sensors.imu.t)
+        at = _STEP * float(np.floor((now + SAME_TIME) / _STEP))
+        newest = walker.take_steps(self.sensors, now if last else at - SURE, last, self._fixes, self._dirty)
+        if newest > -np.inf:
+            self._dirty, self._fixes = np.inf, [t for t in self._fixes if t > newest + SAME_TIME]
+        self._due = at + _STEP
+
     def _collect(self, tracker: Tracker) -> None:
         for part in tracker.settled:
             if self._found is not None:
@@ -433,11 +388,7 @@ class Smoother:
             rows = part.t > self._last_settled
             if rows.any():
                 assert self.frame is not None
-                track = to_trajectory("online", self.frame, part.t[rows], part.states[rows], part.covariance[rows])
-                known = (track.llh, track.v, track.rph, track.sd_p, track.sd_v, track.sd_rph)
-                if not all(x is None or np.isfinite(x).all() for x in known):
-                    raise FloatingPointError("states that are not finite")
-                self._settled.append(track)
+                self._settled.append(export(part, rows, self.frame))
                 self._last_settled = float(part.t[-1])
         tracker.settled.clear()
         self.sensors.oldest = max(self.sensors.oldest, tracker.head)

@@ -31,12 +31,12 @@ from graphnav.estimation.noise.model import STATED, NoiseModel
 from graphnav.estimation.problem import Problem, build_problem
 from graphnav.estimation.solvers.elimination import Predicted
 from graphnav.estimation.solvers.stages import Place
-from graphnav.estimation.solvers.window import Message, SettledStates, turn_limit
+from graphnav.estimation.solvers.window import Message, SettledStates
 from graphnav.imu.dynamics import ImuFactors
 from graphnav.imu.preintegration import preintegrate
 from graphnav.imu.samples import GAP, bridge_gaps
 from graphnav.online.ahead import Live, live, since
-from graphnav.online.chain import Chain, Posed
+from graphnav.online.chain import Chain, Posed, find_turn
 from graphnav.online.looks import CONTEXT, SURE, Readings, clip_spans
 from graphnav.online.sensors import Sensors
 from graphnav.online.steps import StepCutter
@@ -82,7 +82,7 @@ class Tracker(Chain):
         setup: Recording,
         noise: NoiseModel = STATED,
     ) -> None:
-        super().__init__(settings, message, t0, _turn(setup, noise), noise)
+        super().__init__(settings, message, t0, setup, noise)
         self.frame, self.foot = frame, setup.platform == "foot"
         self._readings = Readings()
         self._steps = StepCutter()
@@ -283,7 +283,7 @@ class Tracker(Chain):
         """One with another noise model that has settled what this one has, and has no keyframes since."""
         other, head = copy.copy(self), self.window.head
         other.noise, other._parameters, other.verdicts = noise, {}, copy.deepcopy(self.verdicts)
-        other.window = type(self.window)(head.moved(head.estimate), _turn(setup, noise))
+        other.window = type(self.window)(head.moved(head.estimate), find_turn(setup, noise))
         other._nodes, other._held, other._motions, other.settled, other._ahead = [], [], {}, [], None
         other._settling = False
         other._standing, other._readings = copy.copy(self._standing), copy.copy(self._readings)
@@ -328,7 +328,7 @@ class Tracker(Chain):
         """The unit of the slow errors of a recording's fixes, m."""
         if recording.gnss is None:
             return None
-        return sensors.typical_sigmas(recording.gnss.t)[:, :3]
+        return sensors.gnss.typical_sigmas(recording.gnss.t)[:, :3]
 
     def _pose(self, sensors: Sensors, times: Array, complete: bool = True) -> Problem:
         begin, stops = float(times[0]), self.stops
@@ -359,12 +359,12 @@ class Tracker(Chain):
 
         A few keyframes do not tell how often fixes come, nor what they usually state.
         """
-        spacing, rows = node_spacing(self.settings.gnss.slow_times, period(sensors.fixes)), []
+        spacing, rows = node_spacing(self.settings.gnss.slow_times, period(sensors.gnss.used)), []
         for c in problem.constraints:
             if isinstance(c, GnssPosition):
-                c = replace(c, usual_error=sensors.unit())
+                c = replace(c, usual_error=sensors.gnss.unit())
             elif isinstance(c, GnssVelocity):
-                c = replace(c, unit_error=sensors.typical_sigmas(problem.t[c.keyframe])[:, 3:])
+                c = replace(c, unit_error=sensors.gnss.typical_sigmas(problem.t[c.keyframe])[:, 3:])
             if isinstance(c, GnssPosition | GnssVelocity):
                 c = replace(c, processes=tuple(replace(p, spacing=spacing) for p in c.processes))
             rows.append(c)
@@ -396,10 +396,3 @@ class Tracker(Chain):
             replace(stage.place, problem=problem, k=first + skip - begin + i)
             for i, stage in enumerate(self.window.stages[first:end])
         ]
-
-
-def _turn(setup: Recording, noise: NoiseModel) -> float:
-    """How far (rad) an attitude may move before rows are linearised anew, by the accelerometer as it is judged."""
-    stated = setup.imu.noise
-    density = stated.accel_noise_density * float(np.sqrt(noise.factor("imu.accel_noise_density", 1.0)))
-    return turn_limit(replace(stated, accel_noise_density=density))

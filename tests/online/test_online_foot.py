@@ -104,6 +104,23 @@ def test_rows_of_the_imu_that_come_late_leave_no_trace(
         np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
 
 
+@pytest.mark.parametrize("side", [-1, 1])
+def test_a_row_beside_a_gap_that_comes_late_leaves_no_trace(
+    walk: Recording, rows: list[Row], side: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A gap is longer by a row until that comes: as much is done in it, and looks that fall into it are made."""
+    monkeypatch.setattr(Walker, "at_a_row", 1)
+    gaps = [(700 + 161 * k, 9 + 20 * (k % 3)) for k in range(7)]  # of a tenth to half a second
+    left = {k for first, count in gaps for k in range(first, first + count)}
+    late = {first - 1 if side < 0 else first + count for first, count in gaps}
+    kept = [k for k in range(len(rows)) if k not in left]
+    order = sorted(kept, key=lambda k: k + 60.5 * (k in late))
+    assert order != kept
+    one, other = walked(walk, [rows[k] for k in order]), walked(walk, [rows[k] for k in kept])
+    for name in ("t", "llh", "v", "rph", "sd_p"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+
+
 def test_what_is_over_is_not_searched_for_slides_and_the_rest_is_as_it_was(walk: Recording) -> None:
     spans = detect(walk).stationary
     since = walk.start + 10.0

@@ -22,7 +22,7 @@ from graphnav.config import settings_from
 from graphnav.core.errors import ConfigError, GraphnavError, RecordingError
 from graphnav.core.notes import key_of
 from graphnav.core.trajectory import Trajectory
-from graphnav.online import Online, Row, Session, rows_of, smoother, without_rows
+from graphnav.online import Online, Row, Session, ahead, rows_of, without_rows
 from graphnav.online.lines import HEAD, line_of, lines_of, setup_of
 from graphnav.online.store import _MAGIC, Store
 from graphnav.online.tracker import Tracker
@@ -327,13 +327,13 @@ def test_a_failure_within_costs_a_piece_and_not_the_session(
 def test_states_that_are_no_numbers_are_never_written(
     drive: tuple[Recording, Trajectory], rows: list[Row], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    real = smoother.to_trajectory
+    real = ahead.to_trajectory
 
     def blank(name: str, frame: object, t: np.ndarray, *more: object) -> Trajectory:
         track = real(name, frame, t, *more)
         return replace(track, llh=np.full_like(track.llh, np.nan)) if t[0] < 42.0 else track
 
-    monkeypatch.setattr(smoother, "to_trajectory", blank)
+    monkeypatch.setattr(ahead, "to_trajectory", blank)
     online, parts = Online(without_rows(drive[0]), QUICK), []
     for row in rows:
         online.add(row)

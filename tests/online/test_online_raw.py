@@ -24,7 +24,8 @@ from graphnav.gnss.carrier import consecutive
 from graphnav.gnss.integers import find_nearest
 from graphnav.online import Online, Row, rows_of, without_rows
 from graphnav.online.lines import head_of, line_of, row_of, setup_of
-from graphnav.online.raw import RawEpochs, epochs_of, without_epochs
+from graphnav.online.raw import RawEpochs
+from graphnav.online.raw_lines import epochs_of, without_epochs
 from graphnav.recording import Recording
 
 CODES = {"differences": False, "carrier": False}

@@ -35,11 +35,11 @@ def test_the_same_fixes_are_used_as_of_the_whole_recording(late: int) -> None:
         moves = np.isfinite(v[k, 0])
         sensors.add("gnss", t[k], (*llh[k], *sd[k], *v[k], *(sd_v[k] if moves else [NAN] * 3)))
         if n == 100:
-            sensors.space(1.0)
-            assert len(sensors.fixes) < 40
+            sensors.gnss.space(1.0)
+            assert len(sensors.gnss.used) < 40
     expected = space_fixes(recording, 1.0).gnss
     assert expected is not None
-    np.testing.assert_array_equal(sensors.fixes, expected.t)
+    np.testing.assert_array_equal(sensors.gnss.used, expected.t)
     assert sensors.recording().gnss.t.tolist() == expected.t.tolist()
     assert len(sensors.recording(every=True).gnss.t) == 300
 
@@ -63,7 +63,7 @@ def test_a_fix_that_gives_way_to_a_better_one_leaves_no_trace() -> None:
             if online.tracker is not None and since == np.inf:
                 since = next(t for t in sorted(worse) if t > row[1]) - 0.5
             if spaced and row[1] >= since:
-                online.sensors._grid = since, 2.0
+                online.sensors.gnss._grid = since, 2.0
         online.finish()
         return joined(online.settled())
 

@@ -19,7 +19,7 @@ from logs import frame
 from test_bad_input import TOML, content, line, toml, write_small
 from test_formats_binary import nav_pvt
 
-from graphnav.app import cli, convert
+from graphnav.app import cli, convert, outputs
 from graphnav.config import read_settings
 from graphnav.core.errors import ConfigError, GraphnavError, RecordingError
 from graphnav.core.files import MAX_FILE, MAX_LINE, open_file
@@ -259,7 +259,8 @@ def test_numbers_are_what_every_program_reads_as_one(tmp_path: Path, cell: str) 
 @pytest.mark.parametrize(
     ("row", "key"),
     [
-        ("1 inf 0 0 0 0 0 1", "not_finite"),
+        ("1 inf 0 0 0 0 0 1", "place"),
+        ("1 0 1e308 0 0 0 0 1", "place"),
         ("inf 0 0 0 0 0 0 1", "cell"),
         ("1 0 0 0 nan 0 0 1", "quaternion"),
         ("1e300 0 0 0 0 0 0 1", "cell"),
@@ -470,24 +471,27 @@ def test_what_cannot_be_written_is_refused_before_solving(tmp_path: Path, capsys
     assert not (tmp_path / "new").exists()
 
 
-@pytest.mark.parametrize("what", ["export", "report"])
+@pytest.mark.parametrize("what", ["export", "report", "run"])
 def test_what_was_solved_is_kept_if_one_file_fails(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, what: str
 ) -> None:
     def failing(*_: object, **__: object) -> None:
         raise OSError(28, "No space left on device")
 
-    if what == "export":
-        monkeypatch.setattr(convert, "write_parts", failing)
-    else:
-        monkeypatch.setattr(report, "write_report", failing)
+    place = {"export": (convert, "write_parts"), "report": (report, "write_report"), "run": (outputs, "write_outcome")}
+    monkeypatch.setattr(*place[what], failing)
     out = tmp_path / "out"
+    out.mkdir()
+    for name in ("report.html", "run.npz"):
+        (out / name).write_text("of a run before")
     refuse_command(
         capsys, "smooth", "kitti", "--solver", "ekf", "--noise", "stated", "--end", "60", "-o", out, "--export", "csv"
     )
     there = {path.name for path in out.iterdir()}
     assert {"trajectory.csv", "trajectory.tum", "summary.json", "calibration.json"} <= there
-    assert ("report.html" in there) == (what == "export")
+    assert ("report.html" in there) == (what != "report")
+    assert ("run.npz" in there) == (what != "run")
+    assert all(path.read_bytes() != b"of a run before" for path in out.iterdir())
     assert len(read_trajectory(out / "trajectory.csv")) > 50
 
 

@@ -31,6 +31,7 @@ from graphnav.recording.formats.repair import LATEST
 from graphnav.recording.formats.text import number_table, text_lines
 
 WEEK = 604800.0  # s
+_FARTHEST = 1e8  # m, twice around the Earth, whatever coordinates count from
 _DEG = np.pi / 180.0
 _UNITS = {"t": "s", "lat": "deg", "lon": "deg", "h": "m", "x": "m", "y": "m", "z": "m"} | dict.fromkeys(
     ("ve", "vn", "vu", "vd"), "mps"
@@ -115,9 +116,12 @@ def _build(
                 f"{path}, line {numbers[k]}, {name}: {position[k, axis] / _DEG:.6f} deg is out of range",
                 key="table.place",
             )
-    if np.isinf(position).any():
-        k = int(np.flatnonzero(np.isinf(position).any(axis=1))[0])
-        raise RecordingError(f"{path}, line {numbers[k]}: a position that is infinite", key="table.not_finite")
+    metres = position if local else position[:, 2:]
+    if (bad := np.abs(metres) > _FARTHEST).any():
+        k, axis = (int(i) for i in np.argwhere(bad)[0])
+        raise RecordingError(
+            f"{path}, line {numbers[k]}: {metres[k, axis]:g} m is no place of a drive", key="table.place"
+        )
     usable = np.isfinite(position[:, :2]).all(1) if local else np.isfinite(position).all(1)
     fresh = np.concatenate([[True], np.diff(t) > 0])
     if not usable.all():

@@ -1,0 +1,120 @@
+"""Fixes as they come: what sigmas they usually state, and which of them are used."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from graphnav.constraints.gnss import period
+from graphnav.core.rotation import Array
+from graphnav.estimation.noise.spacing import best_fixes, grid_start
+from graphnav.online.buffers import Buffer
+from graphnav.recording import Gnss
+
+_WIDTH, _USED = 19, 19  # the last columns: six usual sigmas, and whether it is used
+_USUAL = 60.0  # s over which the usual sigma of fixes is averaged
+
+
+class Fixes(Buffer):
+    """Rows of fixes, with what they usually state and whether they are used.
+
+    Parameters
+    ----------
+    setup : without rows; None where there are none.
+    """
+
+    def __init__(self, setup: Gnss | None) -> None:
+        super().__init__(_WIDTH)
+        self.left: list[float] = []  # s, those that were used until better ones of their span came
+        self._setup = setup
+        self._grid: tuple[float, float] | None = None  # begin and length of the spans, s, of which the best is used
+        self._unit: Array | None = None  # `unit`, once asked for
+        self._means: dict[str, tuple[float, tuple[float, ...]]] = {}  # usual sigmas, and since when
+
+    @property
+    def used(self) -> Array:
+        """(N,) s, times of those that are used."""
+        return self.rows[self.rows[:, _USED] > 0.0, 0]
+
+    def complete(self, t: float, values: tuple[float, ...]) -> tuple[float, ...]:
+        """The row of a fix at a time (s): its own values, what they usually are, and that it is used."""
+        position, velocity = (self._track_sigma(kind, t, values[k : k + 3]) for kind, k in (("p", 3), ("v", 9)))
+        return (*values, *position, *velocity, 1.0)
+
+    def forget_usual(self) -> None:
+        """What comes is of another receiver, or clock."""
+        self._means = {}
+
+    def space(self, spacing: float) -> None:
+        """Use the best fix of every span of `spacing` (s), as `estimation.noise.spacing` has it; 0: use all."""
+        self.rows[:, _USED], self._grid, self.left = 1.0, None, []
+        gnss = self.between_as_gnss(-np.inf, np.inf)
+        if not spacing or gnss is None or len(gnss.t) < 2 or period(gnss.t) > 0.5 * spacing:
+            return
+        begin = grid_start(gnss)
+        self._grid = begin, spacing
+        self.rows[:, _USED] = 0.0
+        self.rows[best_fixes(gnss, np.floor((gnss.t - begin) / spacing)), _USED] = 1.0
+
+    def choose(self, t: float) -> bool:
+        """Whether the fix at a time is one of the best of its span; those that no longer are go to `left`."""
+        if self._grid is None:
+            return True
+        begin, spacing = self._grid
+        span = np.floor((t - begin) / spacing)
+        near = self.rows[slice(*np.searchsorted(self.t, [t - 1.1 * spacing, t + 1.1 * spacing]))]
+        rows = np.flatnonzero(np.floor((near[:, 0] - begin) / spacing) == span)
+        gnss = self._as_gnss(near[rows])
+        assert gnss is not None
+        best = rows[best_fixes(gnss, np.zeros(len(rows)))]
+        others = np.setdiff1d(rows, best)
+        self.left += [float(x) for x in near[others[near[others, _USED] > 0.0], 0] if x != t]
+        near[rows, _USED] = 0.0
+        near[best, _USED] = 1.0
+        return bool(np.any(near[best, 0] == t))
+
+    def typical_sigmas(self, t: Array) -> Array:
+        """(N, 6) sigmas that the fixes at some times usually state, m and m/s: the units of errors that last."""
+        return self.rows[np.searchsorted(self.t, t - 1e-6), 13:19]
+
+    def unit(self) -> Array:
+        """(3,) m, in which errors that last for minutes and hours are told, from the first question on."""
+        if self._unit is None:
+            self._unit = unit_of(self.rows[self.rows[:, _USED] > 0.0, 4:7])
+        return self._unit
+
+    def between_as_gnss(self, begin: float, end: float, every: bool = False) -> Gnss | None:
+        """Those between two times (s), both included, that are used, or with `every` all; None without any."""
+        rows = self.between(begin, end)
+        return self._as_gnss(rows if every else rows[rows[:, _USED] > 0.0])
+
+    def _as_gnss(self, rows: Array) -> Gnss | None:
+        if self._setup is None or not len(rows):
+            return None
+        v = sd_v = None
+        if np.isfinite(rows[:, 7:13]).all(axis=1).any():
+            v, sd_v = rows[:, 7:10], rows[:, 10:13]
+        return replace(self._setup, t=rows[:, 0], llh=rows[:, 1:4], sd=rows[:, 4:7], v=v, sd_v=sd_v)
+
+    def _track_sigma(self, kind: str, t: float, sd: tuple[float, ...]) -> tuple[float, ...]:
+        """A mean that looks back only, and so is the same whenever a fix is posed.
+
+        The median of a minute that `graphnav.constraints.gnss` takes would change with every row that follows, and
+        a slow error in such a unit would give itself away.
+        """
+        last, mean = self._means.get(kind, (-np.inf, sd))
+        if not math.isfinite(sum(sd)):
+            return mean  # a fix without a velocity
+        gain = -np.expm1(-max(t - last, 0.0) / _USUAL) if np.isfinite(last) else 1.0
+        mean = tuple(float(m + gain * (s - m)) for m, s in zip(mean, sd, strict=True))
+        self._means[kind] = max(t, last), mean
+        return mean
+
+
+def unit_of(sd: Array) -> Array:
+    """(3,) median of stated sigmas (N, 3), one for both horizontal axes: their errors have one figure in common."""
+    east, north, up = np.median(sd, axis=0)
+    level = np.sqrt(0.5 * (east**2 + north**2))
+    return np.array([level, level, up])

@@ -1,0 +1,71 @@
+"""Readings of a running IMU beside those before and after them: which ones these contradict.
+
+The judgement is that of a recording (`graphnav.recording.plausibility.readings`), by the rows that have come so far.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from graphnav.core.rotation import Array
+from graphnav.online.buffers import Buffer
+from graphnav.online.sanity import find_period
+from graphnav.recording.plausibility.readings import ALONE, HOLE, Excesses, find_contradicted, measure_excess
+
+
+class Neighbours:
+    """How far readings lie beyond those before and after, and which lie too far.
+
+    Parameters
+    ----------
+    columns : of the IMU's rows that are compared.
+    """
+
+    def __init__(self, columns: int) -> None:
+        self._columns = columns
+        self._excesses = Excesses(columns)
+        self._learnt = -np.inf  # s, up to where rows are in these
+        self._last: tuple[tuple[float, ...], tuple[float, ...]] | None = None  # the newest two rows with their times
+
+    def forget_newest(self) -> None:
+        """What comes is no neighbour of what came."""
+        self._last = None
+
+    def forget_time(self) -> None:
+        """Another clock."""
+        self._last, self._learnt = None, -np.inf
+
+    def compare(self, t: float, values: tuple[float, ...], imu: Buffer) -> tuple[float, float] | None:
+        """Times of the two rows before the newest, if that and the first of them contradict the second."""
+        before, now = self._last, (t, *values)
+        self._last = now if before is None else before[1], now
+        if before is None:
+            return None
+        for a, b, c, limit in zip(before[0][1:], before[1][1:], values, self._excesses.limits, strict=False):
+            if b - max(a, c) > limit or min(a, c) - b > limit:
+                break
+        else:
+            return None
+        near = imu.t[-3:]
+        if len(imu) < 4 or near[0] != before[0][0] or near[1] != before[1][0]:
+            return None  # a late row stands between them
+        if np.diff(near).max() >= HOLE * find_period(imu.t):
+            return None
+        self._last = before[0], now
+        return before[0][0], before[1][0]
+
+    def learn(self, imu: Buffer, until: float, stops: Array) -> None:
+        """Learn from the rows up to a time (s), but those in stops (M, 2), how far readings lie beyond those around."""
+        rows = imu.between(self._learnt, until)
+        if len(rows) < 3:
+            return
+        self._learnt = float(rows[-2, 0])
+        t = rows[1:-1, 0, None]
+        moving = ~((t >= stops[:, 0]) & (t <= stops[:, 1])).any(axis=1)
+        self._excesses.add(measure_excess(rows[:, 1 : 1 + self._columns])[moving])
+
+    def find(self, imu: Buffer) -> list[float]:
+        """Times of the rows that those around contradict, but for the newest, of which that is not known yet."""
+        rows = imu.rows
+        bad = find_contradicted(rows[:, 0], rows[:, 1 : 1 + self._columns].T)
+        return [float(t) for t in rows[bad & (rows[:, 0] < imu.newest - ALONE), 0]]

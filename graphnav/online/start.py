@@ -1,0 +1,83 @@
+"""Where a running drive begins: which rows an alignment is tried with, and the tracker that sets out from it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from graphnav.config import Settings
+from graphnav.constraints.base import SAME_TIME
+from graphnav.core.earth import LocalFrame
+from graphnav.core.rotation import Array
+from graphnav.detectors import detect
+from graphnav.estimation.alignment import Alignment, align, ready, with_known_heading
+from graphnav.estimation.building import start_sigma
+from graphnav.estimation.noise.model import NoiseModel
+from graphnav.estimation.solvers.batch import batch
+from graphnav.estimation.solvers.window import first_message
+from graphnav.online.raw import codes_alone
+from graphnav.online.sensors import Sensors
+from graphnav.online.tracker import Tracker
+from graphnav.online.walker import Walker
+from graphnav.recording import Recording
+
+
+def take_rows(sensors: Sensors, settings: Settings, now: float, last: bool) -> tuple[Recording, Array] | None:
+    """The rows up to a time (s), and stops (M, 2) in them, if they may tell an attitude; None if not yet.
+
+    `last` says that no more will come, and these have to do.
+    """
+    sensors.drop_contradicted()
+    recording = sensors.recording(-np.inf, now)
+    waits = sensors.setup.gnss is not None and not last
+    if waits and (recording.gnss is None or not ready(recording, settings)):
+        return None
+    stationary = detect(recording, settings).stationary
+    if waits and not ready(recording, settings, stationary):
+        return None  # fixes jumped while it stood
+    return recording, stationary
+
+
+def find_start(recording: Recording, stationary: Array, settings: Settings, frame: LocalFrame) -> Alignment:
+    """The state at the first row of a recording, of which stops (M, 2) are known.
+
+    Raises
+    ------
+    EstimationError
+        If the rows do not tell it.
+    """
+    return align(recording, codes_alone(settings), frame, lambda problem, start: batch(
+        problem, start, wanted=(0,), reintegrate=False), stationary)  # fmt: skip
+
+
+def make_tracker(
+    found: Alignment, start: float, noise: NoiseModel, settings: Settings, frame: LocalFrame, setup: Recording
+) -> tuple[Tracker, tuple[str, ...]]:
+    """What begins at the first row (s) that an alignment has seen, and what is to be said of that."""
+    stated = with_known_heading(found, settings)
+    # whether it tells the heading shows with the rows; the tree of iSAM2 moves its states by itself
+    turns = setup.gnss is None and settings.solver.engine == "window"
+    message = first_message(stated.state, start_sigma(stated), turns)
+    kind = Walker if setup.platform == "foot" else Tracker
+    tracker = kind(settings, frame, message, start, setup, noise)
+    if found is not stated:
+        tracker.window.head = message.moved(found.state.minus(stated.state)[0])
+    return tracker, tuple(stated.notes)
+
+
+def list_keyframes(T: float, limit: float, fixes: list[float], period: float, last: bool) -> list[float]:
+    """Times of the keyframes after T up to `limit`: at fixes, and every `period` between; s.
+
+    The last of a drive is at `limit`.
+    """
+    anchors = [t for t in fixes if T + SAME_TIME < t <= limit]
+    if last and limit > T + SAME_TIME and (not anchors or limit > anchors[-1] + SAME_TIME):
+        anchors.append(limit)
+    times, at = [], T
+    for anchor in [*anchors, np.inf]:
+        while anchor - at > period * (1.0 + 1e-6) and at + period <= limit:
+            at += period
+            times.append(at)
+        if np.isfinite(anchor):
+            at = anchor
+            times.append(at)
+    return times
