@@ -75,7 +75,8 @@ def _describe_noise(outcome: Outcome) -> list[str]:
         name, _, kind = source.partition(".")
         ratios = [(axis, whole_ratio(noise, source, axis)) for axis in ("horizontal", "up")]
         factors = " and ".join(f"x {short(ratio)} {axis}" for axis, ratio in ratios if ratio is not None)
-        parts.append(f"{_FIXES.get(name, name)}{f' ({kind})' if kind else ''} {factors}")
+        if factors:  # none of the whole where each type has its own
+            parts.append(f"{_FIXES.get(name, name)}{f' ({kind})' if kind else ''} {factors}")
     given = outcome.request.noise
     how = "estimated" if given is None else "as given" if given.file is None else f"from {given.file}"
     return [f"noise {how}, in stated sigmas: {', '.join(parts)}"]

@@ -32,6 +32,7 @@ class Trajectory:
     covariance: Array | None = None  # (K, 9, 9)
     fix_type: Array | None = None  # (K,) where it is of a receiver: its numbers, NaN where unknown
     satellites: Array | None = None  # (K,) the same: how many it used
+    gps_zero: float | None = None  # s since the GPS epoch at t = 0, where it is known
     frame: str = "geodetic"  # "local": llh then holds metres x, y, z of unknown origin and yaw
     name: str = ""
     notes: tuple[str, ...] = field(default=())

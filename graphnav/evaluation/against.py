@@ -150,7 +150,7 @@ def read_against(asked: Against, name: str, recording: Recording, reference: Sol
 
 def _shift(path: Path, track: Trajectory, recording: Recording, reference: Solution) -> tuple[float, list[str]]:
     """What to add to the stamps of a trajectory, s, and why."""
-    known = between_clocks(recording.start, recording.gps_zero, float(track.t[0]), None)
+    known = between_clocks(recording.start, recording.gps_zero, float(track.t[0]), track.gps_zero)
     own_start = recording.start - float(track.t[0])
     notes: list[str] = []
     if track.t[-1] > recording.start and track.t[0] < recording.end:

@@ -286,11 +286,35 @@ def keys(recording: Recording) -> list[str]:
     return [f.key for f in inspect(recording).findings]
 
 
-def test_heights_in_feet_are_seen_where_it_goes_up_and_down(drive: Callable[[str], Recording]) -> None:
-    part = drive("boulder_drive_20250708").crop(0.0, 300.0)
-    feet = replace(part, gnss=replace(part.gnss, llh=part.gnss.llh * [1.0, 1.0, 1 / 0.3048]))
+@pytest.mark.parametrize("name", ["boulder_drive_20250708", "tokyo_20201105", "comma_highway_20180802"])
+@pytest.mark.parametrize("velocities", [True, False])
+def test_heights_in_feet_are_seen_where_it_goes_up_and_down(
+    part: Callable[[str], Recording], name: str, velocities: bool
+) -> None:
+    some = part(name)
+    some = replace(some, gnss=replace(some.gnss, v=some.gnss.v if velocities else None))
+    feet = replace(some, gnss=replace(some.gnss, llh=some.gnss.llh * [1.0, 1.0, 1 / 0.3048]))
     assert "gnss.feet" in keys(feet)
-    assert "gnss.feet" not in keys(part)
+    assert "gnss.feet" not in keys(some)
+
+
+def test_exchanged_places_are_seen_on_a_drive_in_circles(drive: Callable[[str], Recording]) -> None:
+    """Where the ways are distorted so much that their turns are those of nothing."""
+    right = drive("car_circles_boston_20241021")
+    wrong = replace(right, gnss=replace(right.gnss, llh=right.gnss.llh[:, [1, 0, 2]]))
+    assert "gnss.lat_lon" in keys(wrong)
+    assert "gnss.lat_lon" not in keys(right)
+
+
+def test_fixes_that_are_late_are_not_mended_at_the_odometer(drive: Callable[[str], Recording]) -> None:
+    """Of the three the IMU tells which is off; the advice, followed, leaves nothing to say."""
+    some = drive("tokyo_20201105").crop(100.0, 500.0)
+    late = replace(some, gnss=replace(some.gnss, t=some.gnss.t + 0.4))
+    (said,) = [f.sentence for f in inspect(late).findings if f.key == "odometer.late"]
+    (offset,) = map(float, re.findall(r"add (\S+) to time_offset in \[gnss\]", said))
+    mended = replace(late, gnss=replace(late.gnss, t=late.gnss.t + offset))
+    assert "odometer.late" not in keys(mended)
+    assert abs(offset + 0.4) < 0.05
 
 
 def test_axes_are_denied_only_by_better_ones() -> None:

@@ -200,6 +200,24 @@ def test_late_fixes_are_seen(tmp_path):
     assert recording.gnss.t == pytest.approx(DRIVE.gnss.t, abs=0.03)
 
 
+@pytest.mark.parametrize("name", ["alt_ft", "Altitude (ft)", "height[feet]"])
+def test_heights_in_feet_by_the_name_of_their_column_are_read_as_metres(tmp_path, name):
+    logs_there = write_logs(tmp_path)
+    head, *rows = logs_there[1].read_text().splitlines()
+    cells = [row.split(",") for row in rows]
+    rows = [",".join([*c[:3], f"{float(c[3]) / 0.3048:.5f}", *c[4:]]) for c in cells]
+    logs_there[1].write_text("\n".join([head.replace("height", name), *rows]) + "\n")
+    _, recording = drafted(tmp_path, logs_there)
+    np.testing.assert_allclose(recording.gnss.llh[:, 2], DRIVE.gnss.llh[:, 2], atol=1e-3)
+
+
+def test_fixes_that_are_all_nowhere_are_no_fixes(tmp_path, capsys):
+    imu, gnss, _ = write_logs(tmp_path)
+    head, *rows = gnss.read_text().splitlines()
+    gnss.write_text("\n".join([head, *(f"{r.split(',')[0]},0,0,{r.split(',', 3)[3]}" for r in rows)]) + "\n")
+    refuse_command(capsys, "draft.no_fix", "init", str(imu), str(gnss), "-o", str(tmp_path / "a.toml"))
+
+
 def test_clocks_that_have_nothing_in_common_are_brought_together(tmp_path):
     _, recording = drafted(tmp_path, write_logs(tmp_path, gnss_late=1.6e9))
     assert recording.gnss.t == pytest.approx(DRIVE.gnss.t, abs=0.03)

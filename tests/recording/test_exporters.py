@@ -228,92 +228,6 @@ def test_kf_gins_runs_on_over_the_end_of_a_week(tmp_path: Path) -> None:
     np.testing.assert_allclose(read_trajectory(file).t, [604799.5, 604800.5])
 
 
-POS = """\
-% program   : RTKLIB ver.2.4.3 b34
-% inp file  : rover.obs
-% obs start : 2020/11/05 23:59:58.0 GPST (week2130 431998.0s)
-%
-% (lat/lon/height=WGS84/ellipsoidal,Q=1:fix,2:float,3:sbas,4:dgps,5:single,6:ppp,ns=# of satellites)
-%  GPST                  latitude(deg) longitude(deg)  height(m)   Q  ns   sdn(m)   sde(m)   sdu(m)  sdne(m)  sdeu(m)  sdun(m) age(s)  ratio
-2020/11/05 23:59:58.000   35.666800000  -139.792200000    59.7500   1  12   0.0100   0.0200   0.0300   0.0010  -0.0010   0.0020   0.00   12.3
-2020/11/05 23:59:58.200   35.666800100  -139.792200100    59.7600   2  12   0.1100   0.1200   0.1300   0.0010  -0.0010   0.0020   0.00    1.3
-2020/11/06 00:00:00.400   35.666800200  -139.792200200    59.7700   5   9   1.1100   1.1200   1.1300   0.0010  -0.0010   0.0020   0.00    0.0
-"""  # noqa: E501
-
-
-def test_rtklib(tmp_path: Path) -> None:
-    file = tmp_path / "rover.pos"
-    file.write_text(POS)
-    found = read_trajectory(file)
-    # 2020-11-05 is a Thursday: four days into the week that starts on Sunday; the header says so too.
-    np.testing.assert_allclose(found.t, [431998.0, 431998.2, 432000.4], atol=1e-6)
-    np.testing.assert_allclose(found.llh[0], [35.6668 * DEG, -139.7922 * DEG, 59.75])
-    np.testing.assert_allclose(found.sd_p[0], [0.02, 0.01, 0.03])  # north first in the file
-    assert found.v is None
-    assert found.notes == ()
-
-
-def test_rtklib_with_week_and_seconds_velocity_and_utc(tmp_path: Path) -> None:
-    file = tmp_path / "rover.pos"
-    titles = "%  UTC   latitude(deg) longitude(deg)  height(m)   Q  ns sdn(m) sde(m) sdu(m) sdne(m) sdeu(m)"
-    titles += " sdun(m) age(s) ratio vn(m/s) ve(m/s) vu(m/s) sdvn sdve sdvu sdvne sdveu sdvun"
-    row = "2130 {} 35.0 139.0 50.0 1 12 0.01 0.02 0.03 0 0 0 0 9.9 1.5 -2.5 0.5 0.1 0.2 0.3 0 0 0"
-    file.write_text("\n".join([titles, row.format("604799.000"), row.format("604799.200")]) + "\n")
-    found = read_trajectory(file)
-    np.testing.assert_allclose(found.t, [604799.0, 604799.2])
-    np.testing.assert_allclose(found.v[0], [-2.5, 1.5, 0.5])
-    np.testing.assert_allclose(found.sd_v[0], [0.2, 0.1, 0.3])
-    assert "trajectory.time_scale" in map(key_of, found.notes)
-
-
-def test_rtklib_with_commas_is_the_same(tmp_path: Path) -> None:
-    (tmp_path / "a.pos").write_text(POS)
-    # RTKLIB leaves the space between date and time whatever separates the columns.
-    lines = [
-        ",".join(line.split()).replace(",", " ", 1) if line[0] != "%" else line.replace(" latitude", ",latitude")
-        for line in POS.splitlines()
-    ]
-    (tmp_path / "b.pos").write_text("\n".join(lines).replace("(deg) ", "(deg),").replace("(m) ", "(m),"))
-    a, b = read_trajectory(tmp_path / "a.pos"), read_trajectory(tmp_path / "b.pos")
-    np.testing.assert_array_equal(a.t, b.t)
-    np.testing.assert_array_equal(a.llh, b.llh)
-    np.testing.assert_array_equal(a.sd_p, b.sd_p)
-
-
-def test_rtklib_heights_above_the_sea_are_said_and_another_datum_is_refused(tmp_path: Path) -> None:
-    file = tmp_path / "a.pos"
-    file.write_text(POS.replace("WGS84/ellipsoidal", "WGS84/geodetic"))
-    assert "trajectory.height" in map(key_of, read_trajectory(file).notes)
-    file.write_text(POS.replace("WGS84/ellipsoidal", "Tokyo/ellipsoidal"))
-    with refused("rtklib.datum", RecordingError, "out-datum=wgs84"):
-        read_trajectory(file)
-
-
-@pytest.mark.parametrize(
-    ("titles", "key"),
-    [
-        (
-            "%  GPST          e-baseline(m)  n-baseline(m)  u-baseline(m)   Q  ns   sde(m)   sdn(m)   sdu(m)",
-            "rtklib.baseline",
-        ),
-        (
-            "%  GPST              x-ecef(m)      y-ecef(m)      z-ecef(m)   Q  ns   sdx(m)   sdy(m)   sdz(m)",
-            "rtklib.form",
-        ),
-        (
-            "%  GPST          latitude(d'\")   longitude(d'\")  height(m)   Q  ns   sdn(m)   sde(m)   sdu(m)",
-            "rtklib.degrees",
-        ),
-        ("% program : RTKLIB", "rtklib.no_header"),
-    ],
-)
-def test_other_rtklib_solutions_are_refused_with_the_way_out(tmp_path: Path, titles: str, key: str) -> None:
-    file = tmp_path / "rover.pos"
-    file.write_text(titles + "\n2020/11/05 23:59:58.000 1 2 3 1 12 0.01 0.02 0.03\n")
-    with refused(key, RecordingError, "out-" if key != "rtklib.no_header" else "%"):
-        read_trajectory(file)
-
-
 def test_names_with_units_and_down_velocity(tmp_path: Path) -> None:
     file = tmp_path / "truth.csv.gz"
     rows = "t_s,lat_deg,lon_deg,h_m,vn_mps,ve_mps,vd_mps,heading_deg,quality\n1,30,114,20,1,2,3,90,fixed\n"
@@ -349,7 +263,6 @@ def test_local_truth_in_two_dimensions(tmp_path: Path) -> None:
         ("0 1 2 3 0 0 0 2\n", "table.quaternion", ("line 1, qx qy qz qw",)),
         ("0 456300.0 30 114 20 0 0 0 0 0 0\n0 456300.5 30 114 20 0 0 x 0 0 0\n", "table.cell", ("line 2, vd", "'x'")),
         ("2020/11/05 23:59:58.000 35 139 50 1 12\n", "rtklib.no_header", ()),
-        (POS.replace("00:00:00.400", "00:00:61.400"), "table.date", ("line 9", "'2020-11-06 00:00:61.400'")),
         ("t,lat,lon,h\n\x00\x01\x02", "file.binary", ()),
     ],
 )

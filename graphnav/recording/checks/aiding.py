@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -15,9 +14,8 @@ from graphnav.core.timescales import NEAR, WEEK, between_clocks
 from graphnav.recording import Imu, Odometer, Recording
 from graphnav.recording import odometer as wheels
 from graphnav.recording.checks import crosschecks
-from graphnav.recording.checks.clock import ClockOffsets
+from graphnav.recording.checks.clock import FAIR, ClockOffsets
 from graphnav.recording.checks.crosschecks import Fit, Track
-from graphnav.recording.checks.stated import describe_exchange, describe_mirroring, exchange_lat_lon
 from graphnav.recording.odometer.faults import FROZEN, GAP, STUCK, WILD
 from graphnav.sensors.tables import TIME
 
@@ -158,39 +156,6 @@ def check_imu_clock(clock: ClockOffsets, odometer: Fit | None = None) -> Iterato
         f"against speed, +-{max(forward.spread, 0.01):.2f} s): add {mend}",
         "imu.clock",
     )
-
-
-def check_mirroring(recording: Recording, track: Track) -> Iterator[Finding]:
-    """A course that turns against the gyro because the positions are a mirror image, by exchange or by a sign."""
-    other = exchange_lat_lon(recording.gnss) if recording.gnss is not None else None
-    alone = crosschecks.track(replace(other, v=None)) if other is not None else None
-    yaw = crosschecks.yaw_fit(recording.imu, alone) if alone is not None else None
-    if yaw is not None and yaw.correlation > 0.8 and abs(yaw.coefficients[0] - 1.0) < 0.2:
-        yield describe_exchange("the turns of the gyro")
-    elif (crosschecks.sideways_correlation(recording.imu, track) or 0.0) > 0.0:  # the gyro turns as the force says
-        yield describe_mirroring("latitudes or longitudes have", "the turns of the gyro and the force in curves")
-
-
-def find_mirrored(recording: Recording, wrong: Sequence[Finding]) -> list[Finding]:
-    """What `velocities` found, or that the positions are wrong where the gyro turns with the velocities."""
-    gnss = recording.gnss
-    if gnss is None or gnss.v is None or recording.platform != "vehicle":
-        return list(wrong)
-    if not any(f.key == "gnss.velocity_axes" for f in wrong):
-        return list(wrong)
-    tracks = [crosschecks.track(one) for one in (gnss, replace(gnss, v=None))]
-    fits = [crosschecks.yaw_fit(recording.imu, track) for track in tracks if track is not None]
-    by_velocity, by_places = (
-        [fit.coefficients[0] if fit is not None and fit.correlation > 0.8 else 0.0 for fit in fits]
-        if len(fits) == 2
-        else (0.0, 0.0)
-    )
-    moved = np.gradient(crosschecks.local_positions(gnss)[:, :2], gnss.t, axis=0)
-    east, north = np.nansum(moved * gnss.v[:, :2], axis=0) < 0.0
-    if by_velocity > 0.0 > by_places and east != north:
-        which = "longitudes" if east else "latitudes"
-        return [describe_mirroring(f"the {which} have", "the velocities and the turns of the gyro")]
-    return list(wrong)
 
 
 def check_imu_axes(imu: Imu, forward: Fit | None, track: Track | None) -> Iterator[Finding]:
@@ -371,9 +336,15 @@ def odometer_findings(recording: Recording, track: Track | None, facts: dict[str
                 "odometer.scale",
             )
     if abs(fit.lag) > 0.1 + 4.0 * fit.spread:
+        own = crosschecks.forward_fit(recording.imu, crosschecks.odometer_track(odometer))
+        right = own is not None and own.correlation > FAIR and abs(own.lag) < 0.5 * abs(fit.lag)  # by the IMU
         yield Finding(
             "warning",
-            f"odometer stamps are {'late' if fit.lag > 0 else 'early'} against GNSS by {abs(fit.lag):.2f} s: "
-            f"add {-fit.lag:+.2f} to time_offset in [odometer]",
+            f"odometer stamps are {'late' if fit.lag > 0 else 'early'} against GNSS by {abs(fit.lag):.2f} s"
+            + (
+                f", and the IMU agrees with the odometer: add {fit.lag:+.2f} to time_offset in [gnss]"
+                if right
+                else f": add {-fit.lag:+.2f} to time_offset in [odometer]"
+            ),
             "odometer.late",
         )

@@ -24,6 +24,9 @@ from graphnav.recording.checks.lags import Lags
 Index = NDArray[Any]  # of row numbers
 
 MIN_PAIRS = 20
+_SLOPE = 8.0  # s over which a slope is taken: the force is then known to a tenth of a per cent
+_SLOPES = 6
+GRAVITY = 9.81  # m/s^2
 _MIN_SPEED = 3.0  # m/s, below which a course means little
 _FASTEST_CHANGE = 8.0  # m/s^2; what exceeds it is an error of the fix
 WIDE = 30.0  # s searched for clock errors
@@ -257,6 +260,29 @@ def forward_fit(imu: Imu, track: Track) -> Fit | None:
     return replace(fit, coefficients=fit.coefficients @ level)
 
 
+def climb_fit(imu: Imu, track: Track, gnss: Gnss, forward: Array) -> tuple[float, float] | None:
+    """Slopes felt, by the force along `forward` (3,) beyond what speeds up, on slopes of the heights, over `_SLOPE`.
+
+    Their correlation, and felt over those of the heights, by their sizes: neither has less noise than the other. None
+    where the way is too short.
+    """
+    p = local_positions(gnss)
+    way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(p[:, :2], axis=0).T))])
+    pull = np.concatenate([[0.0], np.cumsum(imu.accel[1:] @ forward * np.diff(imu.t))])
+    a = np.arange(max(track.t[0], imu.t[0]), min(track.t[-1], imu.t[-1]) - _SLOPE, _SLOPE)
+
+    def change(t: Array, x: Array) -> Array:
+        return np.asarray(np.interp(a + _SLOPE, t, x) - np.interp(a, t, x))
+
+    far = change(gnss.t, way)
+    moving = far > _MIN_SPEED * _SLOPE
+    felt = (change(imu.t, pull) - change(track.t, track.speed))[moving] / (_SLOPE * GRAVITY)
+    climbed = change(gnss.t, p[:, 2])[moving] / far[moving]
+    if len(felt) < _SLOPES or not felt.std() or not climbed.std():
+        return None
+    return float(np.corrcoef(felt, climbed)[0, 1]), float(felt.std() / climbed.std())
+
+
 def along_fit(imu: Imu, track: Track) -> Fit | None:
     """The same on the force along the stated forward axis alone, (1,): whether the axes as stated explain the speed."""
     i, j = _pairs(track)
@@ -305,6 +331,13 @@ def velocity_fit(track: Track, places: Track) -> Fit | None:
         return np.asarray((first > t[0]) & (last < t[-1]))
 
     return _search(0.5 * (places.t[i] + places.t[j]), y, x_at, places.t, valid)
+
+
+def odometer_track(odometer: Odometer) -> Track:
+    """Its speeds ten times a second, as if the way were straight."""
+    thin = slice(None, None, max(1, round(0.1 / float(np.median(np.diff(odometer.t))))))
+    t, speed = odometer.t[thin], odometer.speed[thin]
+    return Track(t, speed[:, None] * np.array([1.0, 0.0, 0.0]), np.zeros(len(t)), float(np.median(np.diff(t))))
 
 
 def odometer_fit(odometer: Odometer, track: Track) -> tuple[Fit, float] | None:

@@ -21,9 +21,7 @@ from graphnav.recording.checks.aiding import (
     check_gnss_jumps,
     check_gyro_sign,
     check_imu_axes,
-    check_mirroring,
     check_yaw_scale,
-    find_mirrored,
     odometer_findings,
     overlap_s,
 )
@@ -38,6 +36,7 @@ from graphnav.recording.checks.imu import (
     check_saturation,
     gap_limit,
 )
+from graphnav.recording.checks.places import check_height_unit, check_mirroring, find_mirrored
 from graphnav.recording.checks.raw import raw_facts, raw_findings
 from graphnav.recording.checks.series import series_facts, series_findings
 from graphnav.recording.checks.stated import (
@@ -174,11 +173,13 @@ def inspect(recording: Recording) -> Inspection:
         yaw = crosschecks.yaw_fit(recording.imu, track)
         forward = clock.by_velocity if track.instant else clock.by_places
         turns_back = yaw is not None and yaw.correlation > 0.8 and yaw.coefficients[0] < 0
-        if turns_back and (mirrored := list(check_mirroring(recording, track))):
+        turns_so = yaw is not None and yaw.correlation > 0.8 and not turns_back
+        if not turns_so and (mirrored := list(check_mirroring(recording, track, turns_back))):
             findings += mirrored
         elif not turned:
             findings += check_gyro_sign(recording.imu) if turns_back else check_imu_axes(recording.imu, forward, track)
             findings += check_yaw_scale(yaw)
+            findings += check_height_unit(recording, track, forward)
     elif vehicle and not turned:
         findings += check_imu_axes(recording.imu, None, None)
     if recording.odometer is not None:

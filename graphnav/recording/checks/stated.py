@@ -26,7 +26,6 @@ _IMPOSSIBLE = {
 }
 _SPEEDS = {1 / 3.6: "km/h", 0.44704: "mph", 1852 / 3600: "knots", 3.6: "m/s already"}
 _MENDED = 0.3  # of what is off is left by a change that mends it
-_FOOT = 0.3048  # m
 
 
 def check_stated_noise(noise: ImuNoise) -> Iterator[Finding]:
@@ -127,14 +126,6 @@ def velocities(gnss: Gnss) -> Iterator[Finding]:
     climb, meant = moved[real, 2], stated[real, 2]
     if len(climb) >= crosschecks.MIN_PAIRS and climb.std() > 0.0 and meant.std() > 0.0:
         alike = float(np.corrcoef(climb, meant)[0, 1])
-        ratio = float(climb @ meant) / float(meant @ meant)
-        if alike > 0.8 and abs(ratio * _FOOT - 1.0) < 0.1:
-            yield Finding(
-                "warning",
-                f"the heights climb {ratio:.2f} times as much as the upward velocity: they are in feet, of which "
-                f"0.3048 m make one; multiply h by 0.3048 in the file",
-                "gnss.feet",
-            )
         if alike < -0.6:
             yield Finding(
                 "warning",

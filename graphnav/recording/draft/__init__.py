@@ -192,6 +192,8 @@ class _Writer:
                 units["type"] = numbers
             if source.radians:
                 units["angle"] = Guess("rad", "lat and lon are all small enough")
+            if source.find_unit("h", "length") == "ft":
+                units["height"] = Guess("ft", "as the column's name says")
             if {"speed", "course"} <= values.keys() and "ve" not in values and late is None:
                 units["speed"] = fix_speed_unit(source)
             elif stated := source.find_unit("ve", "speed"):
@@ -280,6 +282,7 @@ class _Writer:
 
     def _units(self, units: dict[str, Guess]) -> None:
         default = {"type": "rtklib", "t": "s", "gyro": "rad/s", "accel": "m/s2", "angle": "deg", "speed": "m/s"}
+        default["height"] = "m"
         self.decisions += [f"{key} in {guess.value}: {guess.why}" for key, guess in units.items()]
         other = {key: guess for key, guess in units.items() if guess.value != default[key]}
         if other:

@@ -79,6 +79,7 @@ UNITS = {
     "kph": ("speed", "km/h"), "kmph": ("speed", "km/h"), "mph": ("speed", "mph"), "kn": ("speed", "knots"),
     "knots": ("speed", "knots"), "kt": ("speed", "knots"), "kts": ("speed", "knots"),
     "deg": ("angle", "deg"), "degrees": ("angle", "deg"), "rad": ("angle", "rad"), "m": ("length", "m"),
+    "ft": ("length", "ft"), "feet": ("length", "ft"), "foot": ("length", "ft"),
 }  # fmt: skip
 _AXES = ("gx", "gy", "gz", "ax", "ay", "az")
 

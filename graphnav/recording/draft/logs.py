@@ -193,7 +193,13 @@ def _read(path: Path, columns: matching.Columns, role: str, plain: Plain | None)
     needed = [n for n in wanted[: _NEEDED.get(role, len(wanted))] if n in names]
     whole = np.isfinite(table.stack(*needed)).all(-1)
     if role == "gnss":
-        whole &= (table["lat"] != 0.0) | (table["lon"] != 0.0)  # as it will be read: no fix
+        fixed = (table["lat"] != 0.0) | (table["lon"] != 0.0)  # as it will be read
+        if whole.any() and not (whole & fixed).any():
+            raise RecordingError(
+                f"{path}: every row is at 0, 0: the receiver had no fix, or its positions are in other columns",
+                key="draft.no_fix",
+            )
+        whole &= fixed
     if whole.sum() < 2:
         raise RecordingError(
             f"{path}: fewer than two rows hold all of {', '.join(names[n] for n in needed)}", key="table.few_rows"

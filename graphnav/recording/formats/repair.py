@@ -190,10 +190,11 @@ def is_on_earth(lat: Array, lon: Array, h: Array) -> Mask:
     return np.asarray(near)
 
 
-def geodetic(rows: Table, unit: str | None, label: str, remarks: Remarks) -> tuple[Array, Table]:
+def geodetic(rows: Table, unit: str | None, height: float, label: str, remarks: Remarks) -> tuple[Array, Table]:
     """(lat, lon, h) in rad, rad, m of rows whose position is usable, and those rows.
 
-    `unit` None means degrees, and angles that are all small enough to be radians are refused.
+    `unit` is that of the angles; None means degrees, and those that are all small enough to be radians are refused.
+    `height` is that of the heights, m.
 
     Raises
     ------
@@ -208,7 +209,7 @@ def geodetic(rows: Table, unit: str | None, label: str, remarks: Remarks) -> tup
             f"{_tell_rows(nowhere, label)} at 0, 0 (no fix) dropped (first at t = {first:.3f} s)",
         )
         rows = rows.take(~nowhere)
-    lat, lon, h = rows["lat"], rows["lon"], rows["h"]
+    lat, lon, h = rows["lat"], rows["lon"], height * rows["h"]
     scale = 1.0 if unit == "rad" else np.pi / 180.0
     if unit is None and np.abs(lat).max() < _RADIANS[0] and np.abs(lon).max() < _RADIANS[1]:
         raise RecordingError(

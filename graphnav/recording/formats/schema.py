@@ -48,8 +48,10 @@ def _three_positive(value: Any) -> Any:
 
 Sigmas = Annotated[tuple[float, float, float], BeforeValidator(_three_positive)]
 
+FOOT = 0.3048  # m
 RATE = {"rad/s": 1.0, "deg/s": np.pi / 180.0, "mdeg/s": np.pi / 180e3}
-FORCE = {"m/s2": 1.0, "g": 9.80665, "mg": 9.80665e-3, "ft/s2": 0.3048}  # standard gravity, by definition
+FORCE = {"m/s2": 1.0, "g": 9.80665, "mg": 9.80665e-3, "ft/s2": FOOT}  # standard gravity, by definition
+HEIGHT = {"m": 1.0, "ft": FOOT}
 SPEED = {"m/s": 1.0, "km/h": 1 / 3.6, "mph": 0.44704, "knots": 1852 / 3600}
 
 AngleUnit = Literal["deg", "rad"]
@@ -71,6 +73,7 @@ class GnssUnits(TomlTable):
 
     t: TimeUnit = "s"
     angle: AngleUnit | None = None
+    height: Literal["m", "ft"] = "m"
     speed: SpeedUnit = "m/s"
 
 

@@ -8,8 +8,8 @@ KF-GINS .nav       11 columns: GNSS week, seconds of week, lat, lon (deg), heigh
                    down (m/s), roll, pitch, yaw (deg) of a forward-right-down body to north-east-down in ZYX
                    order (the project's README, section 2), which are our roll, pitch and heading
 TUM                8 columns: t x y z qx qy qz qw, a local frame
-RTKLIB .pos        header lines with %, then date and time (or week and seconds), lat, lon, height, Q, ns,
-                   sdn, sde, sdu, ... (written by outsolheads and outsols of RTKLIB 2.4.3, solution.c)
+RTKLIB .pos        header lines with %, then date and time (or week and seconds) and any of RTKLIB's forms of a
+                   position (`graphnav.recording.formats.rtklib_solution`)
 =================  ====================================================================================
 
 Files with a GNSS week give t in seconds of the week of their first row, running on past its end.
@@ -26,11 +26,12 @@ from graphnav.core import rotation
 from graphnav.core.errors import RecordingError
 from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
+from graphnav.core.timescales import WEEK
 from graphnav.core.trajectory import Trajectory
 from graphnav.recording.formats.repair import LATEST
+from graphnav.recording.formats.rtklib_solution import parse_solution
 from graphnav.recording.formats.text import number_table, text_lines
 
-WEEK = 604800.0  # s
 _FARTHEST = 1e8  # m, twice around the Earth, whatever coordinates count from
 _DEG = np.pi / 180.0
 _UNITS = {"t": "s", "lat": "deg", "lon": "deg", "h": "m", "x": "m", "y": "m", "z": "m"} | dict.fromkeys(
@@ -39,7 +40,6 @@ _UNITS = {"t": "s", "lat": "deg", "lon": "deg", "h": "m", "x": "m", "y": "m", "z
 _UNITS |= dict.fromkeys(("roll", "pitch", "heading"), "deg")
 _SIGMAS = "sd_e sd_n sd_u sd_ve sd_vn sd_vu sd_roll sd_pitch sd_heading"
 _KNOWN = {*_UNITS, *_SIGMAS.split(), *["bgx", "bgy", "bgz", "bax", "bay", "baz"]}  # read; others may hold anything
-_GPS_EPOCH = np.datetime64("1980-01-06T00:00:00", "us")
 
 
 def read_trajectory(path: str | Path) -> Trajectory:
@@ -69,7 +69,9 @@ def read_trajectory(path: str | Path) -> Trajectory:
         raise RecordingError(f"{path}: no rows in it; a trajectory file needs at least one", key="file.no_rows")
     first = rows[0][1]
     if any(line.lstrip().startswith("%") for _, line in numbered[:100]):
-        return _read_rtklib(path, [line for _, line in numbered if line.lstrip().startswith("%")], rows)
+        solution = parse_solution(path, [line.strip() for _, line in numbered if line.lstrip()[0] == "%"], rows)
+        parts = vars(solution).copy()
+        return _build(path, rows, parts.pop("t"), parts.pop("llh"), parts.pop("notes"), **parts)
     if re.match(r"\s*\d{4}/\d\d/\d\d[\s,]", first):
         raise RecordingError(
             f"{path}: an RTKLIB solution without its header; write it again with out-outhead=on", key="rtklib.no_header"
@@ -95,6 +97,7 @@ def _build(
     position: Array,
     notes: list[str],
     local: bool = False,
+    gps_zero: float | None = None,
     **optional: Array | None,
 ) -> Trajectory:
     """Check time and position, leave out what cannot be used, and say so."""
@@ -142,6 +145,7 @@ def _build(
     return Trajectory(
         t=t[keep],
         llh=position[keep],
+        gps_zero=gps_zero,
         frame="local" if local else "geodetic",
         name=path.stem,
         notes=tuple(notes),
@@ -194,7 +198,8 @@ def _read_kf_gins(path: Path, rows: list[tuple[int, str]]) -> Trajectory:
     t = table[:, 1] + WEEK * (table[:, 0] - table[0, 0])  # KF-GINS itself writes week 0
     position = np.column_stack([table[:, 2:4] * _DEG, table[:, 4]])
     v = np.column_stack([table[:, 6], table[:, 5], -table[:, 7]])
-    return _build(path, rows, t, position, [], v=v, rph=table[:, 8:11] * _DEG)
+    zero = WEEK * table[0, 0] if table[0, 0] > 0.0 else None
+    return _build(path, rows, t, position, [], gps_zero=zero, v=v, rph=table[:, 8:11] * _DEG)
 
 
 def _read_tum(path: Path, rows: list[tuple[int, str]]) -> Trajectory:
@@ -209,94 +214,3 @@ def _read_tum(path: Path, rows: list[tuple[int, str]]) -> Trajectory:
         )
     rph = rotation.to_rph(rotation.from_quaternion(table[:, [7, 4, 5, 6]]))
     return _build(path, rows, table[:, 0], table[:, 1:4], [], rph=rph, local=True)
-
-
-def _read_rtklib(path: Path, head: list[str], rows: list[tuple[int, str]]) -> Trajectory:
-    titles = next((line for line in reversed(head) if re.search(r"\bQ\b.*\bns\b", line) and "=" not in line), None)
-    if titles is None:
-        raise RecordingError(
-            f"{path}: no RTKLIB line '%  GPST  latitude(deg) ...' that names the columns", key="rtklib.no_header"
-        )
-    if "baseline" in titles:
-        raise RecordingError(
-            f"{path}: an RTKLIB solution as east-north-up baseline to a base station whose place the columns do not "
-            "give; write it again with out-solformat=llh",
-            key="rtklib.baseline",
-        )
-    if "latitude(d'" in titles:
-        raise RecordingError(
-            f"{path}: latitude in degrees, minutes, seconds; write it again with out-degform=deg", key="rtklib.degrees"
-        )
-    if "latitude(deg)" not in titles:
-        raise RecordingError(
-            f"{path}: an RTKLIB solution not in lat/lon/height degrees; write it again with out-solformat=llh",
-            key="rtklib.form",
-        )
-    scale_name = re.split(r"[\s,]+", titles.strip().lstrip("% "))[0]
-    separator = "," if "," in rows[0][1] else None
-    columns = re.findall(r"[A-Za-z]+(?=\(|\s|$|,)", titles.strip().lstrip("%"))[1:]
-    names = ["date", "time", *columns]
-    notes: list[str] = []
-    if scale_name != "GPST":
-        notes.append(
-            Note(
-                "trajectory.time_scale",
-                f"{path.name}: times are in {scale_name}, not GPS time (18 s ahead of UTC since 2017)",
-            )
-        )
-    if any("lat/lon/height=Tokyo" in line for line in head):
-        raise RecordingError(
-            f"{path}: coordinates on the Tokyo datum; write it again with out-datum=wgs84", key="rtklib.datum"
-        )
-    if any("lat/lon/height=WGS84/geodetic" in line for line in head):
-        notes.append(
-            Note("trajectory.height", f"{path.name}: heights are above mean sea level, not above the ellipsoid")
-        )
-    dated = "/" in rows[0][1].split(separator)[0]
-    t, numeric = _read_rtklib_times(path, rows, separator) if dated else (None, rows)
-    table = number_table(path, numeric, names, separator)
-    if t is None:
-        t = table[:, 1] + WEEK * (table[:, 0] - table[0, 0])
-    at = {name: k for k, name in enumerate(names)}
-
-    def take(*wanted: str) -> Array | None:
-        return table[:, [at[n] for n in wanted]] if all(n in at for n in wanted) else None
-
-    position = take("latitude", "longitude", "height")
-    if position is None:
-        raise RecordingError(
-            f"{path}: the RTKLIB header does not name latitude, longitude and height", key="rtklib.columns"
-        )
-    position = position * np.array([_DEG, _DEG, 1.0])
-    return _build(
-        path, rows, t, position, notes,
-        sd_p=take("sde", "sdn", "sdu"), v=take("ve", "vn", "vu"), sd_v=take("sdve", "sdvn", "sdvu"),
-        fix_type=None if "Q" not in at else table[:, at["Q"]],
-        satellites=None if "ns" not in at else table[:, at["ns"]],
-    )  # fmt: skip
-
-
-def _read_rtklib_times(
-    path: Path, rows: list[tuple[int, str]], separator: str | None
-) -> tuple[Array, list[tuple[int, str]]]:
-    """Seconds of the week from date and time, and the rows with both taken out so that they are numbers."""
-    joint = separator or " "
-    stamps, rest = [], []
-    for number, line in rows:
-        date, _, tail = line.strip().partition(" ")  # a space whatever the separator of the columns
-        clock, _, tail = tail.strip().partition(joint)
-        stamps.append(f"{date.replace('/', '-')}T{clock.strip()}")
-        rest.append((number, f"0{joint}0{joint}{tail}"))
-    try:
-        when = np.array(stamps, dtype="datetime64[us]")
-    except ValueError:
-        for (number, _), stamp in zip(rows, stamps, strict=True):
-            try:
-                np.datetime64(stamp, "us")
-            except ValueError:
-                raise RecordingError(
-                    f"{path}, line {number}: '{stamp.replace('T', ' ')[:60]}' is not a date and time", key="table.date"
-                ) from None
-        raise
-    seconds = (when - _GPS_EPOCH) / np.timedelta64(1, "us") * 1e-6
-    return seconds - WEEK * np.floor(seconds[0] / WEEK), rest

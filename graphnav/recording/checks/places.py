@@ -1,0 +1,71 @@
+"""Whether the positions are places where the IMU has been: mirrored, exchanged, or heights in another unit."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from graphnav.core.findings import Finding
+from graphnav.recording import Recording
+from graphnav.recording.checks import crosschecks
+from graphnav.recording.checks.clock import CLEAR, FAIR
+from graphnav.recording.checks.crosschecks import Fit, Track
+from graphnav.recording.checks.stated import describe_exchange, describe_mirroring, exchange_lat_lon
+from graphnav.recording.formats.schema import FOOT
+
+_FEET = 0.3  # how far a ratio may be from 0.3048 by the noise of both: 1 is three times that off
+
+
+def check_mirroring(recording: Recording, track: Track, turns_back: bool) -> Iterator[Finding]:
+    """A course that does not turn as the gyro does, as the positions are a mirror image, by exchange or by a sign."""
+    other = exchange_lat_lon(recording.gnss) if recording.gnss is not None else None
+    way = crosschecks.track(replace(other, v=None)) if other is not None else None
+    yaw = crosschecks.yaw_fit(recording.imu, way) if way is not None else None
+    if yaw is not None and yaw.correlation > 0.8 and abs(yaw.coefficients[0] - 1.0) < 0.2:
+        yield describe_exchange("the turns of the gyro")
+    elif (
+        turns_back and (crosschecks.sideways_correlation(recording.imu, track) or 0.0) > 0.0
+    ):  # the gyro turns as the force says
+        yield describe_mirroring("latitudes or longitudes have", "the turns of the gyro and the force in curves")
+
+
+def check_height_unit(recording: Recording, track: Track, forward: Fit | None) -> Iterator[Finding]:
+    """Heights in feet: they climb 3.28 times as much as the IMU feels of slopes."""
+    if forward is None or forward.correlation < FAIR or recording.gnss is None:
+        return
+    ahead = forward.coefficients / np.linalg.norm(forward.coefficients)
+    found = crosschecks.climb_fit(recording.imu, track, recording.gnss, ahead)
+    if found is None:
+        return
+    correlation, ratio = found
+    if correlation > CLEAR and abs(ratio / FOOT - 1.0) < _FEET:
+        yield Finding(
+            "warning",
+            f"the heights climb {1.0 / ratio:.1f} times as much as the IMU feels of slopes (correlation "
+            f'{correlation:.2f}): they are in feet; say units = {{ height = "ft" }} in [gnss]',
+            "gnss.feet",
+        )
+
+
+def find_mirrored(recording: Recording, wrong: Sequence[Finding]) -> list[Finding]:
+    """What `velocities` found, or that the positions are wrong where the gyro turns with the velocities."""
+    gnss = recording.gnss
+    if gnss is None or gnss.v is None or recording.platform != "vehicle":
+        return list(wrong)
+    if not any(f.key == "gnss.velocity_axes" for f in wrong):
+        return list(wrong)
+    ways = [crosschecks.track(one) for one in (gnss, replace(gnss, v=None))]
+    fits = [crosschecks.yaw_fit(recording.imu, way) for way in ways if way is not None]
+    by_velocity, by_places = (
+        [fit.coefficients[0] if fit is not None and fit.correlation > 0.8 else 0.0 for fit in fits]
+        if len(fits) == 2
+        else (0.0, 0.0)
+    )
+    moved = np.gradient(crosschecks.local_positions(gnss)[:, :2], gnss.t, axis=0)
+    east, north = np.nansum(moved * gnss.v[:, :2], axis=0) < 0.0
+    if by_velocity > 0.0 > by_places and east != north:
+        which = "longitudes" if east else "latitudes"
+        return [describe_mirroring(f"the {which} have", "the velocities and the turns of the gyro")]
+    return list(wrong)
