@@ -52,7 +52,7 @@ def convert(
         folder = output_folder(out.parent if alone else out)
         with bar(quiet, "convert"), stage_results(folder) as part:
             target = part / out.name if alone else part
-            _, files, notes = conversion.export_file(source, target, export, point, rate, clock)
+            files, notes = conversion.export_file(source, target, export, point, rate, clock)
         files = final_path(files, part, folder)
         show(
             lambda: "\n".join([*(f"note: {note}" for note in notes), *(f"wrote {file}" for file in files)]),

@@ -31,6 +31,7 @@ _TRAJECTORY = "trajectory.csv"
 SUMMARY = "summary.json"  # of the run that wrote a trajectory: its clock and its points
 _DENSE = 20.0  # Hz
 _ROWS = 4096  # of these, handled at once
+_BESIDE = 8  # rows beside those that the rates and velocities of a part are taken from
 _MOST_ROWS = 2e7
 _MAX_GAP = 3.0  # s; wider gaps of a trajectory are not filled
 
@@ -117,15 +118,15 @@ def parse_point(text: str | None, option: str = "--point") -> str | Array:
 
 def export_file(
     source: str, out: Path, name: str | None, point: str | None, rate: float | None, clock: str | None
-) -> tuple[Trajectory, list[Path], list[str]]:
+) -> tuple[list[Path], list[str]]:
     """Write a trajectory for other programs: into the file `out`, or into the folder `out` under its own name.
 
     It is a file, or the folder of a run.
 
     Returns
     -------
-    trajectory, files, notes
-        As written, and sentences about what was not known.
+    files, notes
+        What was written, and sentences about what was not known.
 
     Raises
     ------
@@ -164,9 +165,8 @@ def export_file(
         notes.append("t is taken as Unix time: it is above 1e9")
     if gps_zero is None and {"gpx", "nav"} & set(targets):
         notes.append("what t counts from is not known: GPX is written without times, .nav with week 0; --clock says it")
-    moved = at_point(trajectory, None if isinstance(arm, str) else arm, rate)
-    files = write_formats(moved, targets, gps_zero)
-    return moved, files, notes
+    parts = at_point(trajectory, None if isinstance(arm, str) else arm, rate)
+    return _write(parts, targets, gps_zero, trajectory.name), notes
 
 
 def _trajectory_file(source: str) -> Path:
@@ -182,8 +182,8 @@ def _trajectory_file(source: str) -> Path:
     return path
 
 
-def at_point(trajectory: Trajectory, arm: Array | None, rate: float | None = None) -> Trajectory:
-    """The trajectory of the point at the end of a lever arm, at its own times or at `rate` (Hz).
+def at_point(trajectory: Trajectory, arm: Array | None, rate: float | None = None) -> Iterator[Trajectory]:
+    """The trajectory of the point at the end of a lever arm, at its own times or at `rate` (Hz), in parts.
 
     Raises
     ------
@@ -194,29 +194,34 @@ def at_point(trajectory: Trajectory, arm: Array | None, rate: float | None = Non
     """
     if arm is not None and not np.any(arm):
         arm = None
-    if arm is None and rate is None:
-        return trajectory
     if arm is not None and trajectory.rph is None:
         raise RecordingError(
             "--point: the trajectory has no attitude, so no other point of the body can be placed",
             key="trajectory.no_attitude",
         )
+    begin, end = trajectory.t[[0, -1]]
+    if rate is not None and (end - begin) * rate > _MOST_ROWS:
+        raise ConfigError(
+            f"--rate {rate:g}: makes {(end - begin) * rate:.3g} rows, more than {_MOST_ROWS:g}", key="option.value"
+        )
+    return iter([trajectory]) if arm is None and rate is None else _interpolate_parts(trajectory, arm, rate)
+
+
+def _interpolate_parts(trajectory: Trajectory, arm: Array | None, rate: float | None) -> Iterator[Trajectory]:
     t = trajectory.t
-    if rate is not None:
-        if (t[-1] - t[0]) * rate > _MOST_ROWS:
-            raise ConfigError(
-                f"--rate {rate:g}: makes {(t[-1] - t[0]) * rate:.3g} rows, more than {_MOST_ROWS:g}", key="option.value"
-            )
-        t = np.arange(np.ceil(t[0] * rate - 1e-6), np.floor(t[-1] * rate + 1e-6) + 1) / rate
-    moved, _ = interpolate(trajectory, t, max_gap=_MAX_GAP, lever_arm=arm)
-    if not len(moved):
+    wanted = t if rate is None else np.arange(np.ceil(t[0] * rate - 1e-6), np.floor(t[-1] * rate + 1e-6) + 1) / rate
+    found = 0
+    for k in range(0, len(wanted), _ROWS):
+        part = wanted[k : k + _ROWS]
+        around = slice(
+            max(np.searchsorted(t, part[0]) - _BESIDE, 0), np.searchsorted(t, part[-1], side="right") + _BESIDE
+        )
+        moved, _ = interpolate(trajectory.take(around), part, max_gap=_MAX_GAP, lever_arm=arm)
+        found += len(moved)
+        if len(moved):
+            yield moved
+    if not found:
         raise ConfigError(f"--rate {rate:g}: leaves no row of this trajectory; say a higher one", key="output.no_row")
-    return moved
-
-
-def write_formats(trajectory: Trajectory, targets: dict[str, Path], gps_zero: float | None) -> list[Path]:
-    """Write the formats, each to its path; `gps_zero` (s) is when t = 0 was, where it is known."""
-    return _write([trajectory], targets, gps_zero, trajectory.name)
 
 
 def export_run(
