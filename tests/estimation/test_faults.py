@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import oracle
@@ -26,7 +27,7 @@ from graphnav.estimation.solvers.ekf import ekf, refilter
 from graphnav.estimation.solvers.rows import Iterate, Layout, whiten
 from graphnav.estimation.solvers.rts import backward
 from graphnav.estimation.solvers.verdicts import Verdicts
-from graphnav.estimation.solvers.watch import MINUTE, Bank
+from graphnav.estimation.solvers.watch import MINUTE, Bank, _Slots
 from graphnav.evaluation.scoring import errors
 from graphnav.recording import Recording
 from graphnav.recording.formats import read
@@ -92,17 +93,20 @@ def left_out(solution: Solution, recording: Recording) -> Array:
 def test_signature_is_the_derivative_of_the_innovations(posed: Problem, monkeypatch: pytest.MonkeyPatch) -> None:
     """G of an error since row 63 that stays, or grows, against two filters whose fixes differ by it."""
     seen: dict[int, Array] = {}
-    updated = Bank.updated
+    updated, tested = Bank.updated, list[str]()
 
-    def spy(self: Bank, name: str, K: Array, G: Array, weighted: Array, r: Array, speed: float) -> int | None:
-        row = self._slots[name].seen - 1 if name == "gnss_position" else -1
+    def note(self: Bank, name: str, *given: Any) -> None:
+        tested.append(name)
+        updated(self, name, *given)
+
+    def spy(self: _Slots, score: Array, own: Array, *given: Any) -> None:
+        row = self.seen - 1 if tested[-1] == "gnss_position" else -1
         if 63 <= row < 160:
-            seen[row] = G[:, 6 * 6 : 6 * 6 + 6].copy()  # slot 6 begins at its 64th fix
-        updated(self, name, K, G, weighted, r, speed)
-        return None
+            seen[row] = own[:, 6 * 6 : 6 * 6 + 6].copy()  # slot 6 begins at its 64th fix
 
     rows = next(c for c in posed.constraints if c.name == "gnss_position")
-    monkeypatch.setattr(Bank, "updated", spy)
+    monkeypatch.setattr(Bank, "updated", note)
+    monkeypatch.setattr(_Slots, "found", spy)
     about = ekf(posed)
     plain = refilter(posed, about, watch=True).records[rows.name].residual
     delta = 1e-3

@@ -44,8 +44,8 @@ QUICK = settings_from({"noise": {"mode": "stated"}, "solver": {"lag": 20.0}})
 
 @pytest.fixture(scope="module")
 def drive() -> tuple[Recording, Trajectory]:
-    """A hundred seconds at 25 Hz, so that the tests are quick."""
-    path = oracle.vehicle_path(130.0, 25.0)
+    """A hundred seconds at 50 Hz, so that the tests are quick."""
+    path = oracle.vehicle_path(130.0, 50.0)
     recording, truth = oracle.drive(path, seed=3, outages=[(70.0, 80.0)], odometer_rate=10.0)
     return recording.crop(0.0, 100.0), truth
 
@@ -90,7 +90,7 @@ def test_isam2_smooths_online_as_the_window_does(drive: tuple[Recording, Traject
 
 def test_isam2_goes_on_from_its_checkpoint(drive: tuple[Recording, Trajectory], rows: list[Row]) -> None:
     rows, tracks = [row for row in rows if row[1] < 60.0], []
-    for every in (len(rows), 300):  # seven times
+    for every in (len(rows), 600):  # twenty times
         online, parts = Online(without_rows(drive[0]), QUICK, "isam2"), []
         for k, row in enumerate(rows):
             online.add(row)
@@ -147,7 +147,7 @@ def test_live_states_at_imu_rate_hold_to_their_sigmas(drive: tuple[Recording, Tr
     online, ratio = Online(without_rows(recording), QUICK), []
     for k, row in enumerate(rows):
         online.add(row)
-        if online.tracker is not None and k % 353 == 0:
+        if online.tracker is not None and k % 601 == 0:
             t, states, P = online.tracker.since(online.sensors)
             now = online.live()
             assert now is not None
@@ -215,7 +215,7 @@ def test_what_is_prepared_beside_the_drive_changes_nothing(
 def test_keyframes_are_prepared() -> None:
     """In the outage, too; only while another tracker goes through the window is there no time for it.
 
-    Between a reading and the next row of an IMU of 25 or 50 Hz there is none either.
+    Between a reading and the next row of an IMU of 50 Hz there is none either.
     """
     path = oracle.vehicle_path(130.0, 100.0)
     recording = oracle.drive(path, seed=3, outages=[(70.0, 80.0)], odometer_rate=10.0)[0].crop(0.0, 100.0)
@@ -250,7 +250,7 @@ def test_rows_older_than_the_window_are_counted(drive: tuple[Recording, Trajecto
 
 
 def test_a_silent_imu_ends_one_piece_and_begins_another(drive: tuple[Recording, Trajectory]) -> None:
-    whole, truth = oracle.drive(oracle.vehicle_path(200.0, 25.0), seed=5, odometer_rate=None)
+    whole, truth = oracle.drive(oracle.vehicle_path(200.0, 50.0), seed=5, odometer_rate=None)
     rows = [row for row in rows_of(whole)[1] if row[0] != "imu" or not 90.0 < row[1] < 96.0]
     online, track = played(whole, rows)
     assert "online.anew" in map(key_of, online.notes)
@@ -547,12 +547,7 @@ def test_a_socket_whose_sender_comes_back(folder: Path, config: Path, uninterrup
         with socket.create_connection(("127.0.0.1", port)) as sender:
             sender.sendall(part)
     assert process.wait(60) == 0, process.stderr.read()
-    # rows that come twice, and idle moments, move where the last linearisation is: the last digit
-    lines = (out / "trajectory.csv").read_bytes(), uninterrupted
-    track, other = (np.loadtxt(text.decode().splitlines(), delimiter=",", skiprows=1) for text in lines)
-    np.testing.assert_array_equal(track[:, 0], other[:, 0])
-    np.testing.assert_allclose(track[:, 1:10], other[:, 1:10], rtol=1e-9, atol=1e-6)
-    np.testing.assert_allclose(track[:, 10:], other[:, 10:], rtol=1e-5)
+    assert (out / "trajectory.csv").read_bytes() == uninterrupted
     assert b"status: " in process.stdout.read()
 
 
