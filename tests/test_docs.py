@@ -118,16 +118,8 @@ def test_what_a_page_shows_of_a_command_is_what_it_prints(text, clone, capsys):
         assert numbers[0][:last] == pytest.approx(numbers[1][:last], rel=0.05, abs=0.02)
 
 
-ENOUGH = 110.0  # s, as long as data/tokyo
-
-
 def run_alone(text, said):
-    """Run Python as a program would, in a copy of this process: nothing that it registers or draws stays here.
-
-    A recording that it loads ends after `ENOUGH` s.
-    """
-    load = graphnav.load
-    graphnav.load = lambda *given, **options: load(*given, **options).crop(0.0, ENOUGH)
+    """Run Python as a program would, in a copy of this process: nothing that it registers or draws stays here."""
     with said.open("w", encoding="utf-8") as file, redirect_stdout(file), redirect_stderr(file):
         matplotlib.use("Agg", force=True)
         warnings.resetwarnings()
