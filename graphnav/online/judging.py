@@ -8,6 +8,7 @@ and takes the first one's place when it has caught up.
 
 from __future__ import annotations
 
+import copy
 import threading
 from dataclasses import dataclass, replace
 from typing import Any
@@ -95,12 +96,12 @@ class Judgement:
 
     def _begin(self) -> None:
         self._answer: Answer | BaseException | None = None
-        self._thread = threading.Thread(target=self._work, daemon=True)
+        # its own copies: what objects work out at their first use must not appear while a checkpoint is written
+        self._thread = threading.Thread(target=self._work, args=copy.deepcopy((self._asked, self.found)), daemon=True)
         self._thread.start()
 
-    def _work(self) -> None:
-        recording, every, settings, frame, times, unit = self._asked
-        start = self.found
+    def _work(self, asked: tuple[Recording, Recording, Settings, LocalFrame, Array, Array], start: Alignment) -> None:
+        recording, every, settings, frame, times, unit = asked
         try:
             stationary = detect(every, settings).stationary
             base = build_problem(

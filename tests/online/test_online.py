@@ -13,6 +13,7 @@ from collections.abc import Iterable
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import oracle
@@ -32,6 +33,7 @@ from graphnav.estimation.solution import to_trajectory
 from graphnav.estimation.solvers.window import turn_limit
 from graphnav.online import Online, Row, Session, rows_of, without_rows
 from graphnav.online.buffers import Buffer
+from graphnav.online.judging import Judgement
 from graphnav.online.lines import END, head_of, line_of, lines_of, row_of, setup_of
 from graphnav.online.tracker import Tracker
 from graphnav.online.view import view
@@ -239,6 +241,26 @@ def test_a_reading_that_comes_when_its_keyframe_is_prepared_counts(
     assert len(late) >= 5
     assert order != list(range(len(rows)))
     same(played(drive[0], [rows[k] for k in order])[1], plain[1])
+
+
+def test_judging_beside_the_drive_works_on_copies(
+    drive: tuple[Recording, Trajectory], rows: list[Row], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A checkpoint is written meanwhile: nothing that stands in it may change under the pen."""
+    shared: list[bool] = []
+    work = Judgement._work
+
+    def spy(self: Judgement, asked: Any, start: Any) -> None:
+        shared.append(any(one is other for one, other in zip((*asked, start), (*self._asked, self.found), strict=True)))
+        work(self, asked, start)
+
+    monkeypatch.setattr(Judgement, "_work", spy)
+    online = Online(without_rows(drive[0]), settings_from({"solver": {"lag": 20.0}}))
+    for row in rows:
+        online.add(row)
+    online.finish()
+    assert shared
+    assert not any(shared)
 
 
 def test_rows_older_than_the_window_are_counted(drive: tuple[Recording, Trajectory], rows: list[Row]) -> None:
