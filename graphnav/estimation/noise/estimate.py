@@ -151,7 +151,7 @@ def estimate_noise(
     figures = _begin(problem, start, changed)
     if near is not None:
         return _iterate(problem, figures, _carry(*near, with_noise(problem, figures.model())), progress, intervals)
-    tried, found = _first_points(problem, figures, opening), list[NoiseEstimate]()
+    (tried, passes), found = _first_points(problem, figures, opening), list[NoiseEstimate]()
     for about in tried:
         try:
             found.append(_iterate(problem, _begin(problem, start), about, progress, intervals))
@@ -161,7 +161,7 @@ def estimate_noise(
     # of figures that are still on their way nobody knows how likely they will be
     told = [one for one in found if one.converged] or found[-1:]
     best = max(told, key=lambda one: one.log_evidence)
-    return replace(best, passes=len(tried) + sum(one.passes for one in found))
+    return replace(best, passes=passes + sum(one.passes for one in found))
 
 
 def _iterate(
@@ -218,21 +218,27 @@ def _begin(problem: Problem, start: NoiseModel | None, changed: bool = False) ->
     )
 
 
-def _first_points(problem: Problem, figures: _Components, opening: float | None) -> list[Points]:
-    """Points of a filter that nothing is known before, and of one without what seems grossly wrong, if they differ."""
+def _first_points(problem: Problem, figures: _Components, opening: float | None) -> tuple[list[Points], int]:
+    """Points of a filter that nothing is known before, and of one without what seems grossly wrong, if they differ.
+
+    Returns
+    -------
+    list of Points, int
+        And the passes of filter and smoother that it took.
+    """
     used = with_noise(problem, figures.model())
     about = backward(used, ekf(used, opening=opening))
     # what is grossly wrong takes a filter that uses everything too far away to be linearised there; what seems to drift
     # may as well be the filter, whose heading is not known yet
     sound = weigh_rows(used, refilter(used, about, watch=True, drifts=False).weights)
     if not any(rows.weight is not None and np.any(rows.weight == 0.0) for rows in sound.constraints):
-        return [about]
+        return [about], 1
     try:
         without = backward(sound, ekf(sound, opening=opening))
         one, other = (_pass(used, points, len(problem.t))[1] for points in (about, without))
     except EstimationError:  # by figures that are far off, so much seems wrong that what is left leads nowhere
-        return [about]
-    return [one] if near_to(other, one) else [about, without]
+        return [about], 2
+    return ([one] if near_to(other, one) else [about, without]), 4
 
 
 def _carry(points: Points, before: Problem, after: Problem) -> Points:
