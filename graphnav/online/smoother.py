@@ -254,7 +254,7 @@ class Smoother:
         sensors.oldest = recording.start
         self._advance(tracker, sensors.imu.newest)
         if self._found is not None and self.tracker is tracker:
-            self._have_judged(self._found, tracker)
+            self._begin_judging(self._found, tracker)
 
     def _track(self, found: Alignment, start: float, noise: NoiseModel) -> Tracker:
         """Begin at the first row of what an alignment has seen, s."""
@@ -276,9 +276,9 @@ class Smoother:
             return
         self._judged = span
         self._found = None if enough else found
-        self._have_judged(found, tracker)
+        self._begin_judging(found, tracker)
 
-    def _have_judged(self, found: Alignment, tracker: Tracker) -> None:
+    def _begin_judging(self, found: Alignment, tracker: Tracker) -> None:
         assert self.frame is not None
         times = np.concatenate([self._times, tracker.window.t])
         self._judgement = judge(self.sensors, self.settings, self.frame, found, times, tracker.newest + AFTER)

@@ -150,8 +150,8 @@ def exclude(base: Problem, found: NoiseEstimate) -> Explained:
         passes, looks = passes + other.passes, looks + 1
         spans, refined = trim_spans(spans, alone), trim_spans(again, alone)
         if spans:
-            way = decide(base, with_weights(other, alone, spans), spans)
-            best, looks = max(best, way, key=lambda some: some.log_evidence), looks + way.looks
+            candidate = decide(base, with_weights(other, alone, spans), spans)
+            best, looks = max(best, candidate, key=lambda some: some.log_evidence), looks + candidate.looks
         if _length(again) > 2.0 * _length(hidden):  # more seems wrong outside than inside: the filter is lost
             break
         if not refined:  # by figures that they have not led astray there are single outliers and no more
