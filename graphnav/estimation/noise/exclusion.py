@@ -142,7 +142,7 @@ def exclude(base: Problem, found: NoiseEstimate) -> Explained:
     if all(any(a <= begin and end <= b for a, b in left_out) for begin, end in hidden):
         return replace(one, looks=one.looks + 2)
     other, spans, passes, looks = found, hidden, 0, one.looks + 2
-    best = one
+    best, leading = one, found
     for _ in range(_SHRINKS):
         other = estimate_noise(base, None, without, (other.points, with_noise(base, other.noise)), changed=True)
         alone = _weigh_alone(with_noise(base, other.noise), other.points)
@@ -151,7 +151,9 @@ def exclude(base: Problem, found: NoiseEstimate) -> Explained:
         spans, refined = trim_spans(spans, alone), trim_spans(again, alone)
         if spans:
             candidate = decide(base, with_weights(other, alone, spans), spans)
-            best, looks = max(best, candidate, key=lambda some: some.log_evidence), looks + candidate.looks
+            looks += candidate.looks
+            if candidate.log_evidence > best.log_evidence:
+                best, leading = candidate, other
         if _length(again) > 2.0 * _length(hidden):  # more seems wrong outside than inside: the filter is lost
             break
         if not refined:  # by figures that they have not led astray there are single outliers and no more
@@ -163,6 +165,10 @@ def exclude(base: Problem, found: NoiseEstimate) -> Explained:
         if not refined or refined == spans:
             break
         spans, without = refined, replace(without, excluded=dict.fromkeys(FIXES, tuple(refined)))
+    if best is not one and not best.noise.excluded:  # outliers, each by itself: with the weights that say so
+        near = leading.points, with_noise(base, leading.noise)
+        free = estimate_noise(base, None, best.noise, near)
+        return Explained(free.noise, best.log_evidence, passes + free.passes, looks, free)
     return replace(best, passes=passes, looks=looks)
 
 
