@@ -28,19 +28,17 @@ from graphnav.constraints.base import Constraint
 from graphnav.constraints.gnss import TIMES
 from graphnav.core.errors import EstimationError
 from graphnav.core.rotation import Array
-from graphnav.estimation.faults import weigh_rows
 from graphnav.estimation.noise.apply import row_weights, with_noise
+from graphnav.estimation.noise.beginning import find_beginnings, smooth_about
 from graphnav.estimation.noise.model import INTERVALS, NoiseModel, RowWeights, VarianceComponent
 from graphnav.estimation.noise.moments import ImuMoments, imu_moments, lag_moments, process_moments, row_moments
+from graphnav.estimation.noise.outliers import CHANCE, limit_scaled, list_reduced
 from graphnav.estimation.noise.priors import TIME_WITHIN, prior
 from graphnav.estimation.problem import ParameterChain, Problem
-from graphnav.estimation.solvers.ekf import ekf, refilter
 from graphnav.estimation.solvers.linearise import Points
-from graphnav.estimation.solvers.passes import ForwardRecord, SmootherPass, near_to, points_of, values_of
-from graphnav.estimation.solvers.rts import backward
+from graphnav.estimation.solvers.passes import ForwardRecord, SmootherPass, points_of, values_of
 from graphnav.imu.preintegration import NOISE_FIGURES
 
-CHANCE = 1e-3  # below which a squared residual is taken for an outlier
 _USUAL = 0.05  # of the squares of an aiding sensor, that count for no more: nearly two in five may be wrong
 _FIRST = 1500  # keyframes: figures told by a thousand numbers are good to a twentieth
 _ROUNDS, _AGAIN = 8, 3  # passes, from priors and from figures that were estimated before
@@ -151,12 +149,14 @@ def estimate_noise(
     figures = _begin(problem, start, changed)
     if near is not None:
         return _iterate(problem, figures, _carry(*near, with_noise(problem, figures.model())), progress, intervals)
-    (tried, passes), found = _first_points(problem, figures, opening), list[NoiseEstimate]()
-    for about in tried:
+    (tried, passes), found = find_beginnings(with_noise(problem, figures.model()), opening), list[NoiseEstimate]()
+    for about, weights in tried:
+        figures = _begin(problem, start)
+        figures.weights |= weights
         try:
-            found.append(_iterate(problem, _begin(problem, start), about, progress, intervals))
+            found.append(_iterate(problem, figures, about, progress, intervals))
         except EstimationError:  # from there nothing leads anywhere
-            if about is tried[-1] and not found:
+            if about is tried[-1][0] and not found:
                 raise
     # of figures that are still on their way nobody knows how likely they will be
     told = [one for one in found if one.converged] or found[-1:]
@@ -181,7 +181,7 @@ def _iterate(
         figures.ahead = 1.0
         for k in range(_MOST):
             used = with_noise(problem, figures.model())
-            forward, smoothed = _pass(used, about, end)
+            forward, smoothed = smooth_about(used, about.first(end))
             passes += 1
             prior_then = figures.log_prior()
             now = float(np.sum(forward.log_likelihood)) + prior_then
@@ -218,29 +218,6 @@ def _begin(problem: Problem, start: NoiseModel | None, changed: bool = False) ->
     )
 
 
-def _first_points(problem: Problem, figures: _Components, opening: float | None) -> tuple[list[Points], int]:
-    """Points of a filter that nothing is known before, and of one without what seems grossly wrong, if they differ.
-
-    Returns
-    -------
-    list of Points, int
-        And the passes of filter and smoother that it took.
-    """
-    used = with_noise(problem, figures.model())
-    about = backward(used, ekf(used, opening=opening))
-    # what is grossly wrong takes a filter that uses everything too far away to be linearised there; what seems to drift
-    # may as well be the filter, whose heading is not known yet
-    sound = weigh_rows(used, refilter(used, about, watch=True, drifts=False).weights)
-    if not any(rows.weight is not None and np.any(rows.weight == 0.0) for rows in sound.constraints):
-        return [about], 1
-    try:
-        without = backward(sound, ekf(sound, opening=opening))
-        one, other = (_pass(used, points, len(problem.t))[1] for points in (about, without))
-    except EstimationError:  # by figures that are far off, so much seems wrong that what is left leads nowhere
-        return [about], 2
-    return ([one] if near_to(other, one) else [about, without]), 4
-
-
 def _carry(points: Points, before: Problem, after: Problem) -> Points:
     return points_of(after, points.states, values_of(before, points))
 
@@ -252,11 +229,6 @@ def _splice(about: Points, part: Points) -> Points:
         return Points(part.states, part.values)
     states = type(part.states).stack([part.states, about.states[n:]])
     return Points(states, np.concatenate([part.values, about.values[n:]]))
-
-
-def _pass(problem: Problem, about: Points, end: int) -> tuple[ForwardRecord, SmootherPass]:
-    forward = refilter(problem, about.first(end))
-    return forward, backward(problem, forward)
 
 
 def _cap(A: Array, B: Array, freedom: int, chance: float) -> tuple[float, float]:
@@ -296,7 +268,7 @@ def _improve(
             own = index[:n] == i
             if own.any():
                 figures.update(name, *_cap(found.A[own], found.B[own], 1, _USUAL))
-        _weigh(figures, problem, rows, np.maximum(found.left_out.sum(axis=1), found.whole.sum(axis=1)), n)
+        _weigh(figures, problem, rows, np.maximum(found.left_out, found.whole), n)
 
 
 def _weigh_intervals(figures: _Components, problem: Problem, imu: ImuMoments) -> None:
@@ -353,19 +325,9 @@ def _improve_time(figures: _Components, chain: ParameterChain, told: Array, lags
     figures.times[p.name] = float(np.clip(found, usual / _TIMES, usual * _TIMES))
 
 
-def limit_squares(squared: Array, m: int) -> Array:
-    """(N,) weights by which squared errors (N,) of m degrees of freedom are no larger than `CHANCE` allows."""
-    return np.asarray(np.minimum(1.0, float(chdtri(m, CHANCE)) / np.maximum(squared, 1e-30)))
-
-
 def _weigh(figures: _Components, problem: Problem, rows: Constraint, squared: Array, n: int) -> None:
     """Weights of the first n rows by their squared errors (n,): of their own, and of the whole with what lasts."""
-    m, t = len(rows.axes), problem.t[rows.keyframe]
     before = np.ones(len(rows)) if rows.weight is None else rows.weight
-    some = squared[before[:n] > 0.0]
-    # what half of the rows do is no error of rows: the figures have not come to what they are yet
-    usual = float(np.median(some)) / float(chdtri(m, 0.5)) if len(some) else 1.0
-    weight = np.concatenate([limit_squares(squared / max(usual, 1.0), m), before[n:]])  # later ones as they were
-    less = (weight < 1.0) & (before > 0.0)
-    less |= np.isin(t, t[less])  # with all rows of their times, so that each is known by its number among them
-    figures.weights[rows.name] = RowWeights(t[less], weight[less])
+    used = before > 0.0
+    weight = np.concatenate([limit_scaled(squared, len(rows.axes), used[:n]), before[n:]])  # later ones as they were
+    figures.weights[rows.name] = list_reduced(problem.t[rows.keyframe], weight, used)

@@ -30,15 +30,17 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.special import chdtri
 
 from graphnav.constraints.base import SAME_TIME
 from graphnav.core.rotation import Array
 from graphnav.estimation import faults
 from graphnav.estimation.noise.apply import row_weights, with_noise
-from graphnav.estimation.noise.estimate import CHANCE, NoiseEstimate, estimate_noise, limit_squares
+from graphnav.estimation.noise.estimate import NoiseEstimate, estimate_noise
 from graphnav.estimation.noise.explanations import FIXES, ONE_SENSOR, ROWS, WRONG, evidence, mask_within
 from graphnav.estimation.noise.model import INTERVALS, NoiseModel, RowWeights
 from graphnav.estimation.noise.moments import row_moments
+from graphnav.estimation.noise.outliers import CHANCE, limit_squares
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import ExcludedSpan
 from graphnav.estimation.solvers.ekf import refilter
@@ -85,9 +87,16 @@ def estimate_without_faults(
     if not explained.noise.excluded:
         return found
     # from the priors on: figures that were estimated with what is wrong in it are far from what they come to
-    anew = NoiseModel(excluded=explained.noise.excluded)
+    anew = NoiseModel(weights=explained.noise.weights, excluded=explained.noise.excluded)
     again = estimate_noise(base, opening, anew, (found.points, with_noise(base, found.noise)), progress)
-    return replace(again, passes=found.passes + again.passes, looks=found.looks)
+    passes = found.passes + again.passes
+    used = with_noise(base, again.noise)
+    surprise = _measure_surprise(used, again.points)
+    right = {kind: tuple(trim_spans([*some], surprise)) or some for kind, some in again.noise.excluded.items()}
+    if right != again.noise.excluded:  # what is right at the ends of spans, now that they are out, is taken back
+        again = estimate_noise(base, opening, replace(again.noise, excluded=right), (again.points, used), progress)
+        passes += again.passes
+    return replace(again, passes=passes, looks=found.looks)
 
 
 def with_disturbed_intervals(base: Problem, found: NoiseEstimate) -> NoiseEstimate:
@@ -145,7 +154,7 @@ def exclude(base: Problem, found: NoiseEstimate) -> Explained:
     best, leading = one, found
     for _ in range(_SHRINKS):
         other = estimate_noise(base, None, without, (other.points, with_noise(base, other.noise)), changed=True)
-        alone = _weigh_alone(with_noise(base, other.noise), other.points)
+        alone = _measure_surprise(with_noise(base, other.noise), other.points)
         again = find_spans(base, replace(other.noise, excluded={}), other)
         passes, looks = passes + other.passes, looks + 1
         spans, refined = trim_spans(spans, alone), trim_spans(again, alone)
@@ -177,28 +186,44 @@ def _length(spans: list[tuple[float, float]]) -> float:
     return sum(end - begin for begin, end in spans)
 
 
-Weighed = Mapping[str, tuple[Array, Array]]  # by constraint, times (N,) s of its rows, and weights (N,)
+Surprise = Mapping[str, tuple[Array, Array, int]]  # by constraint, (N,) s, (N,) squared errors, degrees of freedom
 
 
-def trim_spans(spans: list[tuple[float, float]], alone: Weighed) -> list[tuple[float, float]]:
+def trim_spans(spans: list[tuple[float, float]], alone: Surprise) -> list[tuple[float, float]]:
     """Spans (s) without what is right at their ends: fixes where a smoother that does not use them has them.
 
     Tests that go forward in time leave out too much: they date a fault from one of a few onsets, and what comes after
-    it is met by a filter that has been led astray.
+    it is met by a filter that has been led astray. Of each span that part is kept in which most more is wrong than
+    right: a row adds half of what its squared error exceeds that of a false alarm by, at most what it costs to be an
+    outlier by itself.
 
     Parameters
     ----------
-    alone : the fixes as that smoother has them; less than 1 is wrong.
+    alone : the fixes as that smoother has them.
     """
-    t = np.unique(np.concatenate([t[weight < 1.0] for t, weight in alone.values()]))
-    within = [t[mask_within(t, [span])] for span in spans]
-    return [(float(some[0]), float(some[-1])) for some in within if len(some)]
+    all_t = [t for t, _, _ in alone.values()]
+    t, number = np.unique(np.concatenate(all_t), return_inverse=True)
+    gain = np.full(len(t), -np.inf)
+    each = [np.minimum(0.5 * (x - float(chdtri(m, FALSE_ALARM))), _OUTLIER) for _, x, m in alone.values()]
+    np.maximum.at(gain, number, np.concatenate(each))  # what one kind of fix says is wrong, is
+    parts = ((t[within], gain[within]) for within in (mask_within(t, [span]) for span in spans))
+    return [part for some, gained in parts if (part := _find_likeliest(some, gained)) is not None]
 
 
-def with_weights(found: NoiseEstimate, alone: Weighed, spans: list[tuple[float, float]]) -> NoiseEstimate:
+def _find_likeliest(t: Array, gain: Array) -> tuple[float, float] | None:
+    """First and last time of the part with the largest sum of gains (N,), if that is above zero (Kadane)."""
+    before = np.concatenate([[0.0], np.cumsum(gain)])
+    least = np.minimum.accumulate(before)
+    end = int(np.argmax(before - least))
+    begin = int(np.argmin(before[: end + 1]))
+    return (float(t[begin]), float(t[end - 1])) if end > begin else None
+
+
+def with_weights(found: NoiseEstimate, alone: Surprise, spans: list[tuple[float, float]]) -> NoiseEstimate:
     """The estimate with weights for fixes in spans that it leaves out, so that each may be an outlier by itself."""
     weights = dict(found.noise.weights)
-    for name, (t, weight) in alone.items():
+    for name, (t, squared, m) in alone.items():
+        weight = limit_squares(squared, m)
         kept = _outside(weights.get(name, RowWeights(np.empty(0), np.empty(0))), spans)
         inside = mask_within(t, spans) & np.isin(t, t[weight < 1.0])  # with all rows of their times
         both, of_both = np.concatenate([kept.t, t[inside]]), np.concatenate([kept.weight, weight[inside]])
@@ -207,15 +232,11 @@ def with_weights(found: NoiseEstimate, alone: Weighed, spans: list[tuple[float, 
     return replace(found, noise=replace(found.noise, weights=weights))
 
 
-def _weigh_alone(problem: Problem, smoothed: SmootherPass) -> Weighed:
-    """Fixes, with weights by which each would be as likely as chance allows if it were not used."""
+def _measure_surprise(problem: Problem, smoothed: SmootherPass) -> Surprise:
+    """Fixes, with their squared errors if they were not used."""
+    fixes = (rows for rows in problem.constraints if rows.name in FIXES)
     return {
-        rows.name: (
-            problem.t[rows.keyframe],
-            limit_squares(row_moments(problem, rows, smoothed, len(rows)).left_out.sum(axis=1), len(rows.axes)),
-        )
-        for rows in problem.constraints
-        if rows.name in FIXES
+        c.name: (problem.t[c.keyframe], row_moments(problem, c, smoothed, len(c)).left_out, len(c.axes)) for c in fixes
     }
 
 

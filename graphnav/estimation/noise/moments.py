@@ -30,7 +30,7 @@ from graphnav.core.state import DIM
 from graphnav.estimation.problem import ParameterChain, Problem
 from graphnav.estimation.solvers.linearise import linearise, shift, stepping
 from graphnav.estimation.solvers.passes import ForwardRecord, SmootherPass, values_of
-from graphnav.estimation.solvers.recursion import lag_covariances, row_variances
+from graphnav.estimation.solvers.recursion import lag_covariances, row_covariances
 
 
 @dataclass(frozen=True)
@@ -39,8 +39,8 @@ class RowMoments:
 
     A: Array  # (N, m) w e^2 / R
     B: Array  # (N, m) redundancy
-    left_out: Array  # (N, m) squared residual against its variance, predicted without the row, as if its weight were 1
-    whole: Array  # (N, m) squared whole error, what lasts included, against its steady variance
+    left_out: Array  # (N,) squared residual against its covariance, predicted without the row, as if its weight were 1
+    whole: Array  # (N,) squared whole error, what lasts included, against its steady covariance
 
 
 @dataclass(frozen=True)
@@ -89,21 +89,26 @@ def row_moments(problem: Problem, rows: Constraint, smoothed: SmootherPass, n: i
     values = values_of(problem, smoothed)
     linear = linearise(rows, smoothed, problem.columns, which)
     H = linear.H
-    HPH = row_variances(H, smoothed.P, at)
+    HPH = row_covariances(H, smoothed.P, at)
     w = np.ones((n, 1)) if rows.weight is None else rows.weight[:n, None]
     R = linear.stated**2
-    B = np.clip(1.0 - w * HPH / R, 1e-6, 1.0)
-    left_out = (linear.residual / B) ** 2 / (R + HPH / B)
-    error, variance = linear.residual, R
+    B = np.clip(1.0 - w * np.diagonal(HPH, axis1=1, axis2=2) / R, 1e-6, 1.0)
+    # in axes in which the whitened covariance is diagonal: a stamp that is wrong moves all components alike
+    each, axes = np.linalg.eigh(HPH / (linear.stated[:, :, None] * linear.stated[:, None]))
+    free = np.clip(1.0 - w * each, 1e-6, 1.0)
+    predicted = np.einsum("nji,nj->ni", axes, linear.residual / linear.stated) / free
+    left_out = np.sum(predicted**2 / (1.0 + np.maximum(each, 0.0) / free), axis=1)
+    error, covariance = linear.residual, R[:, :, None] * np.eye(R.shape[1])
     for p in rows.parameters:
         if p.correlation_time is not None:
             J = linear.H[:, :, problem.columns[p.name]]
             error = error - np.einsum("nij,nj->ni", J, values[p.name][at])
-            variance = variance + J**2 @ p.sigma**2
+            covariance = covariance + (J * p.sigma**2) @ np.swapaxes(J, 1, 2)
+    whole = np.sum(error * np.linalg.solve(covariance, error[..., None])[..., 0], axis=1)
     # of the component that a factor scales
     share = 1.0 if rows.unscaled is None else 1.0 - rows.unscaled[:n] ** 2 / R
     A = share * w * linear.residual**2 / R
-    return RowMoments(A, share * np.where(w > 0.0, B, 0.0), left_out, error**2 / variance)
+    return RowMoments(A, share * np.where(w > 0.0, B, 0.0), left_out, whole)
 
 
 def lag_moments(

@@ -265,11 +265,13 @@ def lag_covariances(
 
 
 @compiled
-def row_variances(H: Array, P: Array, k: Array) -> Array:
-    """(n, m) diagonals of H P_k H^T of rows H (n, m, D) at keyframes k (n,)."""
-    out = np.empty(H.shape[:2])
-    for i in range(len(H)):
+def row_covariances(H: Array, P: Array, k: Array) -> Array:
+    """(n, m, m) H P_k H^T of rows H (n, m, D) at keyframes k (n,)."""
+    n, m, _ = H.shape
+    out = np.empty((n, m, m))
+    for i in range(n):
         HP = np.dot(H[i], P[k[i]])
-        for j in range(H.shape[1]):
-            out[i, j] = np.dot(HP[j], H[i, j])
+        for j in range(m):
+            for c in range(j + 1):
+                out[i, j, c] = out[i, c, j] = np.dot(HP[j], H[i, c])
     return out
