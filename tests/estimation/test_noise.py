@@ -14,12 +14,14 @@ from scipy.special import chdtrc, chdtri
 from graphnav import load
 from graphnav.config import Settings, settings_from
 from graphnav.config.gnss import GnssSettings
+from graphnav.constraints.base import Constraint
 from graphnav.constraints.gnss import STAMP_ERROR, STAMPS
 from graphnav.core.earth import LocalFrame
 from graphnav.core.rotation import Array
 from graphnav.core.trajectory import Trajectory
 from graphnav.detectors import detect
 from graphnav.estimation.alignment import align
+from graphnav.estimation.faults import weigh_rows
 from graphnav.estimation.noise.apply import row_weights, with_noise, without_parts
 from graphnav.estimation.noise.estimate import NoiseEstimate, estimate_noise
 from graphnav.estimation.noise.explanations import FIXES, WHEELS
@@ -33,6 +35,7 @@ from graphnav.estimation.problem import Problem, build_problem
 from graphnav.estimation.solution import Solution
 from graphnav.estimation.solvers.batch import batch
 from graphnav.estimation.solvers.ekf import ekf, refilter
+from graphnav.estimation.solvers.linearise import linearise
 from graphnav.estimation.solvers.passes import ForwardRecord, SmootherPass
 from graphnav.estimation.solvers.rts import backward, rts
 from graphnav.evaluation.scoring import errors
@@ -95,6 +98,31 @@ def lap() -> Recording:
     gnss = recording.gnss
     assert gnss is not None
     return replace(recording, gnss=replace(gnss, type=np.where(np.arange(len(gnss.t)) % 3 == 0, 2, 1)))
+
+
+@pytest.mark.parametrize("row", [40, 80])
+def test_what_a_row_is_off_by_is_that_of_a_smoother_without_it(row: int) -> None:
+    """Over all axes: a stamp that is wrong moves them all alike, and is no reason for an error across it."""
+    base, opening = posed(lap())
+    used, _, about = mixed(base, opening)
+
+    def smooth(without: bool) -> tuple[Constraint, SmootherPass]:
+        rows = next(c for c in used.constraints if c.name == "gnss_position")
+        weight = np.ones(len(rows)) if rows.weight is None else rows.weight.copy()
+        weight[row] = 0.0 if without else 0.7
+        some = weigh_rows(used, {rows.name: weight})
+        return replace(rows, weight=weight), backward(some, refilter(some, about))
+
+    rows, smoothed = smooth(without=False)
+    found = row_moments(used, rows, smoothed, len(rows)).left_out[row]
+    _, without = smooth(without=True)
+    linear = linearise(rows, without, used.columns, slice(row, row + 1))
+    H, P = linear.H[0], without.P[rows.keyframe[row]]
+    S = H @ P @ H.T + np.diag(linear.stated[0] ** 2)
+    expected = linear.residual[0] @ np.linalg.solve(S, linear.residual[0])
+    assert found == pytest.approx(expected, rel=0.02)
+    # axes by themselves say another thing
+    assert abs(np.sum(linear.residual[0] ** 2 / np.diag(S)) / expected - 1.0) > 0.02
 
 
 @pytest.mark.parametrize("name", ["simulated", "tokyo"])

@@ -85,9 +85,9 @@ def horizontal(driven: tuple[Recording, Trajectory], t: Array, p: Array, online:
     return np.hypot(*(p[:, k] - np.interp(t, driven[1].t, truth[:, k]) for k in (0, 1)))
 
 
-def test_as_it_drives_a_burst_and_gross_errors_do_no_harm(live: tuple[Recording, Trajectory]) -> None:
-    """A draw in which the place of the first stop is found; in three of ten an error of metres stays for all of it."""
-    rng = np.random.default_rng(7)
+@pytest.mark.parametrize("seed", [0, 3])  # the first fix of all is wrong; those of the first stop are
+def test_as_it_drives_a_burst_and_gross_errors_do_no_harm(live: tuple[Recording, Trajectory], seed: int) -> None:
+    rng = np.random.default_rng(seed)
     recording, N = live[0], len(live[0].gnss.t)
     gross = np.sort(rng.choice(N, N // 10, replace=False))
     burst = np.arange(150, 180)

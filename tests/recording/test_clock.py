@@ -8,10 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from graphnav.core.earth import LocalFrame
 from graphnav.recording.checks import crosschecks, lags
 from graphnav.recording.checks.clock import clock_of
 from graphnav.recording.draft.agreement import compare_with_fixes
 from graphnav.recording.formats import read
+
+SHIPPED = Path(__file__).resolve().parents[2] / "data" / "tokyo"
 
 
 def lasting(rng: np.random.Generator, n: int, steps: float) -> np.ndarray:
@@ -52,6 +55,30 @@ def test_nothing_is_known_of_a_lag_where_nothing_changes() -> None:
 
     _, sigma = lags.refine_lag(t, y, x_at, lambda lag: np.ones(300, dtype=bool), np.arange(300), 0.0, 20)
     assert sigma > 1.0
+
+
+def test_fixes_that_jump_turn_no_axis_and_no_clock() -> None:
+    """One in ten off by up to 200 m: their speeds are alike from one second to the next, and say nothing."""
+    drive = read(SHIPPED)
+    gnss = drive.gnss
+    assert gnss is not None
+    rng = np.random.default_rng(4)
+    wrong = rng.choice(len(gnss.t), len(gnss.t) // 10, replace=False)
+    frame = LocalFrame(gnss.llh[0])
+    p = frame.from_llh(gnss.llh)
+    p[wrong] += rng.uniform(5.0, 200.0, (len(wrong), 1)) * [0.6, 0.8, 0.0]
+    plain = replace(gnss, v=None, sd_v=None)
+    fits = []
+    for some in (plain, replace(plain, llh=frame.to_llh(p))):
+        track = crosschecks.track(some)
+        assert track is not None
+        fit = crosschecks.forward_fit(drive.imu, track)
+        assert fit is not None
+        fits.append(fit)
+    clean, dirty = fits
+    assert dirty.correlation > 0.95 * clean.correlation
+    assert abs(dirty.lag - clean.lag) < 0.1
+    np.testing.assert_allclose(dirty.coefficients, clean.coefficients, atol=0.05)
 
 
 @pytest.mark.parametrize("name", ["oracle_drive", "tokyo_20201105"])  # stamps right to 0.02 s, as their READMEs say

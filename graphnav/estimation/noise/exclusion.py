@@ -89,14 +89,23 @@ def estimate_without_faults(
     # from the priors on: figures that were estimated with what is wrong in it are far from what they come to
     anew = NoiseModel(weights=explained.noise.weights, excluded=explained.noise.excluded)
     again = estimate_noise(base, opening, anew, (found.points, with_noise(base, found.noise)), progress)
-    passes = found.passes + again.passes
-    used = with_noise(base, again.noise)
-    surprise = _measure_surprise(used, again.points)
-    right = {kind: tuple(trim_spans([*some], surprise)) or some for kind, some in again.noise.excluded.items()}
-    if right != again.noise.excluded:  # what is right at the ends of spans, now that they are out, is taken back
-        again = estimate_noise(base, opening, replace(again.noise, excluded=right), (again.points, used), progress)
-        passes += again.passes
-    return replace(again, passes=passes, looks=found.looks)
+    return _readmit(base, replace(again, passes=found.passes + again.passes, looks=found.looks))
+
+
+def _readmit(base: Problem, found: NoiseEstimate) -> NoiseEstimate:
+    """Without what is right at the ends of spans left out, now that they are, if that is likelier."""
+    used = with_noise(base, found.noise)
+    spans = _join(span for some in found.noise.excluded.values() for span in some)
+    surprise = _measure_surprise(used, found.points)
+    narrow = trim_spans(spans, surprise, FALSE_ALARM)
+    if not narrow or narrow == spans:
+        return found
+    with_all, without = (decide(base, with_weights(found, surprise, some), some) for some in (spans, narrow))
+    looks = found.looks + with_all.looks + without.looks
+    if without.log_evidence <= with_all.log_evidence:
+        return replace(found, looks=looks)
+    again = estimate_noise(base, None, without.noise, (found.points, used))
+    return replace(again, passes=found.passes + again.passes, looks=looks)
 
 
 def with_disturbed_intervals(base: Problem, found: NoiseEstimate) -> NoiseEstimate:
@@ -189,22 +198,23 @@ def _length(spans: list[tuple[float, float]]) -> float:
 Surprise = Mapping[str, tuple[Array, Array, int]]  # by constraint, (N,) s, (N,) squared errors, degrees of freedom
 
 
-def trim_spans(spans: list[tuple[float, float]], alone: Surprise) -> list[tuple[float, float]]:
+def trim_spans(spans: list[tuple[float, float]], alone: Surprise, chance: float = CHANCE) -> list[tuple[float, float]]:
     """Spans (s) without what is right at their ends: fixes where a smoother that does not use them has them.
 
     Tests that go forward in time leave out too much: they date a fault from one of a few onsets, and what comes after
     it is met by a filter that has been led astray. Of each span that part is kept in which most more is wrong than
-    right: a row adds half of what its squared error exceeds that of a false alarm by, at most what it costs to be an
-    outlier by itself.
+    right: a row adds half of what its squared error exceeds the limit by, at most what it costs to be an outlier by
+    itself.
 
     Parameters
     ----------
     alone : the fixes as that smoother has them.
+    chance : of a right one beyond the limit.
     """
     all_t = [t for t, _, _ in alone.values()]
     t, number = np.unique(np.concatenate(all_t), return_inverse=True)
     gain = np.full(len(t), -np.inf)
-    each = [np.minimum(0.5 * (x - float(chdtri(m, FALSE_ALARM))), _OUTLIER) for _, x, m in alone.values()]
+    each = [np.minimum(0.5 * (x - float(chdtri(m, chance))), _OUTLIER) for _, x, m in alone.values()]
     np.maximum.at(gain, number, np.concatenate(each))  # what one kind of fix says is wrong, is
     parts = ((t[within], gain[within]) for within in (mask_within(t, [span]) for span in spans))
     return [part for some, gained in parts if (part := _find_likeliest(some, gained)) is not None]

@@ -24,8 +24,7 @@ from graphnav.recording.checks.lags import Lags
 Index = NDArray[Any]  # of row numbers
 
 MIN_PAIRS = 20
-_SLOPE = 8.0  # s over which a slope is taken: the force is then known to a tenth of a per cent
-_SLOPES = 6
+_SLOPE, _SLOPES = 8.0, 6  # s over which a slope is taken: the force is then known to a tenth of a per cent
 GRAVITY = 9.81  # m/s^2
 _MIN_SPEED = 3.0  # m/s, below which a course means little
 _FASTEST_CHANGE = 8.0  # m/s^2; what exceeds it is an error of the fix
@@ -143,6 +142,15 @@ def _pairs(track: Track) -> tuple[Index, Index]:
     return i[near], i[near] + m
 
 
+def _possible_pairs(track: Track) -> tuple[Index, Index, Array]:
+    """Rows a second apart without a fix that jumps (there and back leaves speeds alike), and changes of speed, m/s."""
+    i, j = _pairs(track)
+    change, most = np.hypot(*(track.v[j] - track.v[i])[:, :2].T), _FASTEST_CHANGE * (track.t[j] - track.t[i])
+    y = track.speed[j] - track.speed[i]
+    real = (np.abs(y) < most) & (change < np.maximum(most, 5.0 * np.median(change) if len(change) else 0.0))
+    return i[real], j[real], y[real]
+
+
 def _regress(x: Array, y: Array) -> tuple[float, Array]:
     x, y = x - x.mean(0), y - y.mean()
     b = np.asarray(np.linalg.lstsq(x, y, rcond=None)[0], dtype=float)
@@ -247,10 +255,7 @@ def forward_fit(imu: Imu, track: Track) -> Fit | None:
     Level is square to the mean force, so nothing need be known of the axes. None where speed
     changes too little to say anything.
     """
-    i, j = _pairs(track)
-    y = track.speed[j] - track.speed[i]
-    real = np.abs(y) < _FASTEST_CHANGE * (track.t[j] - track.t[i])
-    i, j, y = i[real], j[real], y[real]
+    i, j, y = _possible_pairs(track)
     if len(y) < MIN_PAIRS or y.std() < 0.25:
         return None
     level = np.linalg.svd(find_up(imu)[None, :])[2][1:]  # (2, 3)
@@ -285,10 +290,8 @@ def climb_fit(imu: Imu, track: Track, gnss: Gnss, forward: Array) -> tuple[float
 
 def along_fit(imu: Imu, track: Track) -> Fit | None:
     """The same on the force along the stated forward axis alone, (1,): whether the axes as stated explain the speed."""
-    i, j = _pairs(track)
-    y = track.speed[j] - track.speed[i]
-    real = np.abs(y) < _FASTEST_CHANGE * (track.t[j] - track.t[i])
-    return _imu_fit(imu, imu.accel[:, 1:2], track, i[real], j[real], y[real])
+    i, j, y = _possible_pairs(track)
+    return _imu_fit(imu, imu.accel[:, 1:2], track, i, j, y)
 
 
 def yaw_fit(imu: Imu, track: Track) -> Fit | None:
@@ -309,10 +312,7 @@ def yaw_fit(imu: Imu, track: Track) -> Fit | None:
 
 def velocity_fit(track: Track, places: Track) -> Fit | None:
     """Change of speed by places on that by velocities: how late velocities are against places; None without changes."""
-    i, j = _pairs(places)
-    y = places.speed[j] - places.speed[i]
-    real = np.abs(y) < _FASTEST_CHANGE * (places.t[j] - places.t[i])
-    i, j, y = i[real], j[real], y[real]
+    i, j, y = _possible_pairs(places)
     if len(y) < MIN_PAIRS or y.std() < 0.25:
         return None
     t, travelled = track.t, np.zeros((len(track.t), 2))
