@@ -32,7 +32,7 @@ from graphnav.estimation.noise.apply import row_weights, with_noise
 from graphnav.estimation.noise.beginning import find_beginnings, smooth_about
 from graphnav.estimation.noise.model import INTERVALS, NoiseModel, RowWeights, VarianceComponent
 from graphnav.estimation.noise.moments import ImuMoments, imu_moments, lag_moments, process_moments, row_moments
-from graphnav.estimation.noise.outliers import CHANCE, limit_scaled, list_reduced
+from graphnav.estimation.noise.outliers import CHANCE, cost_of_outliers, limit_scaled, list_reduced
 from graphnav.estimation.noise.priors import TIME_WITHIN, prior
 from graphnav.estimation.problem import ParameterChain, Problem
 from graphnav.estimation.solvers.linearise import Points
@@ -60,13 +60,11 @@ class NoiseEstimate:
     log_prior: float
     passes: int  # of filter and smoother
     looks: int = 0  # passes of the filter alone, for measurements that are wrong
-    converged: bool = True
 
     @property
     def log_evidence(self) -> float:
         """Of the measurements, where each row and interval that has less weight than others is an outlier by chance."""
-        outliers = sum(int(np.sum(some.weight < 1.0)) for some in self.noise.weights.values())
-        return self.log_posterior + float(np.log(CHANCE)) * outliers
+        return self.log_posterior + cost_of_outliers(self.noise.weights)
 
 
 @dataclass
@@ -83,6 +81,11 @@ class _Components:
     ahead: float = 1.0  # times its own length that a step is taken at most
     known: bool = False  # whether they were estimated before
     same_data: bool = False  # and of the same measurements
+
+    def copy(self) -> _Components:
+        """The same, on its own."""
+        times, weights, steps = dict(self.times), dict(self.weights), dict(self.steps)
+        return replace(self, log=dict(self.log), freedom=dict(self.freedom), times=times, weights=weights, steps=steps)
 
     def model(self) -> NoiseModel:
         figures = {}
@@ -158,9 +161,7 @@ def estimate_noise(
         except EstimationError:  # from there nothing leads anywhere
             if about is tried[-1][0] and not found:
                 raise
-    # of figures that are still on their way nobody knows how likely they will be
-    told = [one for one in found if one.converged] or found[-1:]
-    best = max(told, key=lambda one: one.log_evidence)
+    best = max(found, key=lambda one: one.log_evidence)
     return replace(best, passes=passes + sum(one.passes for one in found))
 
 
@@ -172,13 +173,12 @@ def _iterate(
     intervals: bool,
 ) -> NoiseEstimate:
     """The estimate from figures, and points to linearise at, on."""
-    passes, total = 0, len(problem.t)
-    warm = figures.known
+    passes, total, converged = 0, len(problem.t), False
     rounds = _AGAIN if figures.same_data else _ROUNDS
-    ends = [total] if total <= 2 * _FIRST or warm else [_FIRST, total]
+    ends = [total] if total <= 2 * _FIRST or figures.known else [_FIRST, total]
     for end in ends:
-        before = -np.inf
-        figures.ahead = 1.0
+        before, converged, figures.ahead = -np.inf, False, 1.0
+        likeliest, most, at = figures, -np.inf, 0
         for k in range(_MOST):
             used = with_noise(problem, figures.model())
             forward, smoothed = smooth_about(used, about.first(end))
@@ -187,13 +187,22 @@ def _iterate(
             now = float(np.sum(forward.log_likelihood)) + prior_then
             if progress is not None:
                 progress("noise", min((k + 1) / rounds, 1.0))
+            if (evidence := now + cost_of_outliers(figures.weights)) > most:
+                likeliest, most, at = figures.copy(), evidence, k
             _improve(figures, used, forward, smoothed, end, intervals)
             about = _splice(about, smoothed)
             # chance makes each figure gain a half; with one sensor far off it takes many passes to see which
-            if k > 1 and abs(now - before) < (0.05 if k + 1 < rounds else 0.5) * len(figures.log):
+            converged = k > 1 and abs(now - before) < (0.05 if k + 1 < rounds else 0.5) * len(figures.log)
+            if converged or k - at == _ROUNDS:
                 break
             before, figures.ahead = now, _AHEAD if k > 1 and now > before else 1.0
-    return NoiseEstimate(figures.model(), smoothed, forward, now, prior_then, passes, converged=k + 1 < _MOST)
+        if not converged:  # figures that go to and fro, or are still on their way: the likeliest of them
+            figures = likeliest
+    if not converged:
+        forward, smoothed = smooth_about(with_noise(problem, figures.model()), about)
+        passes, prior_then = passes + 1, figures.log_prior()
+        now = float(np.sum(forward.log_likelihood)) + prior_then
+    return NoiseEstimate(figures.model(), smoothed, forward, now, prior_then, passes)
 
 
 def _begin(problem: Problem, start: NoiseModel | None, changed: bool = False) -> _Components:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 from scipy.special import chdtri
 
@@ -31,3 +33,8 @@ def list_reduced(t: Array, weight: Array, used: Array) -> RowWeights:
     less = (weight < 1.0) & used
     less |= np.isin(t, t[less])  # with all rows of their times, so that each is known by its number among them
     return RowWeights(t[less], weight[less])
+
+
+def cost_of_outliers(weights: Mapping[str, RowWeights]) -> float:
+    """Log-probability that as many rows and intervals have less weight than others by chance."""
+    return float(np.log(CHANCE)) * sum(int(np.sum(some.weight < 1.0)) for some in weights.values())
