@@ -168,10 +168,10 @@ def exclude(base: Problem, found: NoiseEstimate) -> Explained:
         passes, looks = passes + other.passes, looks + 1
         spans, refined = trim_spans(spans, alone), trim_spans(again, alone)
         # what begins slowly is dated better by the tests, what ends at once by the rows
-        for some in [spans, again] if spans != again else [spans]:
+        for some in _list_distinct(spans, trim_spans(spans, alone, FALSE_ALARM), again):
             candidate = decide(base, with_weights(other, alone, some), some)
             looks += candidate.looks
-            if some and candidate.log_evidence > best.log_evidence:
+            if candidate.log_evidence > best.log_evidence:
                 best, leading = candidate, other
         if _length(again) > 2.0 * _length(hidden):  # more seems wrong outside than inside: the filter is lost
             break
@@ -189,6 +189,11 @@ def exclude(base: Problem, found: NoiseEstimate) -> Explained:
         free = estimate_noise(base, None, best.noise, near)
         return Explained(free.noise, best.log_evidence, passes + free.passes, looks, free)
     return replace(best, passes=passes, looks=looks)
+
+
+def _list_distinct(*some: list[tuple[float, float]]) -> list[list[tuple[float, float]]]:
+    """Each list of spans once, and none that is empty."""
+    return [list(spans) for spans in dict.fromkeys(tuple(spans) for spans in some) if spans]
 
 
 def _length(spans: list[tuple[float, float]]) -> float:
