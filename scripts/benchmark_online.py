@@ -45,7 +45,7 @@ from graphnav.simulation import simulate
 
 RATE, LAP = 200.0, 3600.0
 WALK_RATE, EVERY = 250.0, 300.0  # Hz, s
-PARTS = ("posing", "solving")
+PARTS = ("building", "solving")
 A_ROW = 1e-4  # s; a row that takes longer did more than to be kept
 PORTION = 600.0  # s of rows that are in memory as rows
 

@@ -93,7 +93,7 @@ def vary(recording: Recording, name: str) -> Recording:
     if name == "no odometer":
         return recording.without("odometer")
     if name == "doubled odometer":
-        speed = replace(odometer, speed=2.0 * odometer.speed, way=None, pulse=None)
+        speed = replace(odometer, speed=2.0 * odometer.speed, counted=None, pulse=None)
         return replace(recording, odometer=speed)
     if name == "wrong arm":
         return replace(recording, gnss=replace(gnss, lever_arm=gnss.lever_arm + np.array([0.0, 0.5, 0.0])))

@@ -93,7 +93,7 @@ def allan(
     from graphnav.core.errors import RecordingError
     from graphnav.core.staging import final_path, stage_results
     from graphnav.recording.allan import allan_of
-    from graphnav.recording.draft import imu_of
+    from graphnav.recording.draft import read_imu_in_si
     from graphnav.recording.formats import load
     from graphnav.report import allan as pages
 
@@ -101,7 +101,7 @@ def allan(
     with bar(quiet, "allan"), permit_outside(allow_outside):
         tell("reading")
         if format is None and log.endswith((".csv", ".csv.gz")):
-            t, gyro, accel = imu_of(Path(log))
+            t, gyro, accel = read_imu_in_si(Path(log))
         else:
             imu = load(log, format, topic or ()).imu
             if imu is None:

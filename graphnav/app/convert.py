@@ -76,12 +76,12 @@ def _with_measured_noise(log: Log) -> Log:
     imu = log.imu
     if imu is None or not imu.noise_assumed:
         return log
-    from graphnav.recording.draft.guesses import noise_density
+    from graphnav.recording.draft.guesses import estimate_noise_density
 
     found = {
         f"{name}_noise_density": float(f"{value:.2g}")
         for name, x in (("gyro", imu.gyro), ("accel", imu.accel))
-        if (value := noise_density(imu.t, x)) > 0.0
+        if (value := estimate_noise_density(imu.t, x)) > 0.0
     }
     if not found:
         return log

@@ -181,7 +181,7 @@ def run_request(request: Request, progress: Progress | None = None) -> Outcome:
 
 def _run(request: Request, progress: Progress | None) -> Outcome:
     from graphnav.recording.checks.overview import inspect
-    from graphnav.recording.checks.stated import truth_apart
+    from graphnav.recording.checks.stated import is_truth_apart
     from graphnav.recording.formats import read
 
     timings: dict[str, float] = {}
@@ -199,7 +199,7 @@ def _run(request: Request, progress: Progress | None) -> Outcome:
     recording = inspection.recording
     used, notes = _withhold(recording, moved, zero)
     findings = [f.sentence for f in inspection.findings]
-    if truth_apart(recording):
+    if is_truth_apart(recording):
         recording = replace(recording, truth=None)
 
     from graphnav.estimation.pipeline import run

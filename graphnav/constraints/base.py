@@ -12,7 +12,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, Self
 
 import numpy as np
 
@@ -66,12 +66,22 @@ SAME_TIME = 1e-6  # s; measurements closer than this share a keyframe
 
 
 @dataclass(frozen=True)
+class UsualSigmas:
+    """What the fixes of a running drive usually state: the units of their errors that last."""
+
+    overall: Callable[[], Array]  # (3,) m, of positions
+    around: Callable[[Array], Array]  # keyframes (N,) -> (N, 6) m and m/s, of position and velocity
+    spacing: float  # s, of the nodes of these errors
+
+
+@dataclass(frozen=True)
 class Constraint(ABC):
     """N rows of one kind of measurement. Subclasses add their arrays and `linearize`."""
 
     name: ClassVar[str]
     axes: ClassVar[tuple[str, ...]]
     unit: ClassVar[str]
+    of_wheels: ClassVar[bool] = False  # True: its rows tell how the vehicle rolls, by how the IMU is mounted in it
     looks_ahead: ClassVar[bool] = True  # False: once the intervals and the odometer are there, rows can be built
     of_stops: ClassVar[bool] = False  # True: its rows are there because the platform stands
     turns: ClassVar[bool] = False  # True: a turn of all states about the vertical changes nothing but what the Earth's
@@ -116,6 +126,10 @@ class Constraint(ABC):
     def typical_error(self) -> Array:
         """(m,) typical 1-sigma of a whole error, white part and what lasts, of rows that are watched."""
         raise NotImplementedError(f"{self.name}: rows that are watched say what their errors usually are")
+
+    def in_units_of(self, usual: UsualSigmas) -> Self:
+        """The same rows, errors that last told in the units of a drive of which they are a part; of fixes alone."""
+        return self
 
     def scale_of(self, rows: slice | Array) -> float | Array:
         """Scale of the kernel for some rows."""

@@ -21,14 +21,14 @@ single-point fixes are wrong by has nothing to do with each other. With stated n
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from dataclasses import dataclass, field, replace
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from scipy.ndimage import median_filter
 
 from graphnav.config import Settings
-from graphnav.constraints.base import SAME_TIME, BuildContext, Constraint, Linearized
+from graphnav.constraints.base import SAME_TIME, BuildContext, Constraint, Linearized, UsualSigmas
 from graphnav.core import earth, rotation
 from graphnav.core.rotation import Array, mv
 from graphnav.core.state import NODE_SPACING, SECONDS, Parameter, States
@@ -178,6 +178,10 @@ class GnssPosition(Constraint):
         )
         return names, 2 * which[:, None] + np.array([0, 0, 1])
 
+    def in_units_of(self, usual: UsualSigmas) -> Self:
+        processes = tuple(replace(p, spacing=usual.spacing) for p in self.processes)
+        return replace(self, usual_error=usual.overall(), processes=processes)
+
     def typical_error(self) -> Array:
         return _bound_typical_error(self)
 
@@ -277,6 +281,10 @@ class GnssVelocity(Constraint):
             processes=(lasting, *_stamp_error(scene.settings, gnss.t[used])),
             **_build_common(scene, VELOCITY_TIME_OFFSET),
         )
+
+    def in_units_of(self, usual: UsualSigmas) -> Self:
+        processes = tuple(replace(p, spacing=usual.spacing) for p in self.processes)
+        return replace(self, unit_error=usual.around(self.keyframe)[:, 3:], processes=processes)
 
     def typical_error(self) -> Array:
         return _bound_typical_error(self)

@@ -142,6 +142,7 @@ class Wheels(Constraint):
     """What both constraints share: where rows are, and u_v with its derivatives."""
 
     looks_ahead: ClassVar[bool] = False
+    of_wheels: ClassVar[bool] = True
 
     past: IntervalMotion | None = None
     lever_arm: Array = field(default_factory=lambda: np.zeros(3))

@@ -16,7 +16,7 @@ from graphnav.core.rotation import Array
 from graphnav.detectors.base import NONE, merge_spans, spans_of, union
 from graphnav.detectors.windows import share_of
 from graphnav.recording import Gnss, Odometer, Recording
-from graphnav.recording.checks.crosschecks import local_positions
+from graphnav.recording.checks.crosschecks import compute_local_positions
 
 _SIGMAS = 3.0
 _SIGMAS_APART = 6.0  # of positions compared: their errors wander by more than receivers state
@@ -123,7 +123,7 @@ def _read_gnss(gnss: Gnss, settings: FusionSettings) -> list[Speeds]:
         found.append(Speeds(gnss.t[there], v[:, :2], np.maximum(settings.max_speed, _SIGMAS * sigma)))
     there = np.isfinite(gnss.llh).all(axis=1)
     if there.sum() > _MEDIAN and not (found and len(found[0].t) > 0.5 * there.sum()):
-        t, p, sd = gnss.t[there], local_positions(gnss)[there, :2], gnss.sd[there, :2].max(axis=1)
+        t, p, sd = gnss.t[there], compute_local_positions(gnss)[there, :2], gnss.sd[there, :2].max(axis=1)
         later = np.searchsorted(t, t + _BASE)
         k = np.flatnonzero(later < len(t))
         later = later[k]

@@ -11,7 +11,7 @@ from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import ExcludedSpan
-from graphnav.estimation.solvers.passes import SmootherPass, residual_record
+from graphnav.estimation.solvers.passes import SmootherPass, record_residuals
 
 
 def fault_spans(problem: Problem, smoothed: SmootherPass | None = None) -> tuple[ExcludedSpan, ...]:
@@ -24,7 +24,7 @@ def fault_spans(problem: Problem, smoothed: SmootherPass | None = None) -> tuple
         t = problem.t[rows.keyframe]
         off = None
         if smoothed is not None:
-            record = residual_record(problem, rows, smoothed)
+            record = record_residuals(problem, rows, smoothed)
             off = np.linalg.norm(record.residual, axis=1)
         for run in np.split(lost, np.flatnonzero(np.diff(lost) > 1) + 1):
             reason = ""

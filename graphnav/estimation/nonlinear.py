@@ -28,9 +28,9 @@ from graphnav.core.errors import EstimationError
 from graphnav.core.rotation import Array
 from graphnav.core.state import BLOCKS, DIM, States
 from graphnav.estimation.problem import Problem
-from graphnav.estimation.solvers.graph import jacobian_factor
+from graphnav.estimation.solvers.graph import make_jacobian_factor
 from graphnav.estimation.solvers.linearise import Points, linearise, linearise_links, shift
-from graphnav.estimation.solvers.rows import Iterate, Layout, chain_rows
+from graphnav.estimation.solvers.rows import Iterate, Layout, linearise_chain
 from graphnav.imu.dynamics import SCALE
 
 _ESTIMATORS: dict[str, Any] = {
@@ -143,13 +143,13 @@ def _make_factors(problem: Problem, layout: Layout) -> Iterator[Any]:
         own, means = [chains[name] for name in group.columns], gtsam.Values()
         for key, mean in zip(group.keys.tolist(), np.concatenate([c.mean for c in own], axis=1), strict=True):
             means.insert(_Q(key - layout.K), mean)
-        for alike in zip(*(chain_rows(c, group, c.mean) for c in own), strict=True):  # of the same nodes
+        for alike in zip(*(linearise_chain(c, group, c.mean) for c in own), strict=True):  # of the same nodes
             keys = [keys for keys, _ in alike[0][0]]
             A = [np.concatenate([blocks[i][1] for blocks, _ in alike], axis=1) for i in range(len(keys))]
             b = np.concatenate([b for _, b in alike], axis=1)
             for n in range(len(b)):
                 touched = [(_Q(int(k[n]) - layout.K), a[n]) for k, a in zip(keys, A, strict=True)]
-                yield gtsam.LinearContainerFactor(jacobian_factor(touched, b[n]), means)
+                yield gtsam.LinearContainerFactor(make_jacobian_factor(touched, b[n]), means)
 
 
 # whitened residual (m,) at states and parameter values, and its derivatives by the states (m, 15 each) and parameters

@@ -37,7 +37,7 @@ from graphnav.estimation.solvers.ekf import ekf
 from graphnav.estimation.solvers.rts import backward, rts
 from graphnav.imu.onboard_offset import without_onboard_offset
 from graphnav.recording import Own, Recording
-from graphnav.recording.checks.aiding import gnss_apart
+from graphnav.recording.checks.aiding import describe_gnss_apart
 from graphnav.recording.plausibility.screening import screen_recording
 
 SOLVERS = ("ekf", "rts", "batch")  # that run when none is named
@@ -89,7 +89,7 @@ def run(
     settings = settings or Settings()
     recording = with_own(recording, constraints, detectors)
     recording, found = screen_recording(recording)
-    if (apart := gnss_apart(recording)) is not None:  # it would be solved as if there were no GNSS
+    if (apart := describe_gnss_apart(recording)) is not None:  # it would be solved as if there were no GNSS
         raise RecordingError(f"'{recording.name}': {apart}", key="gnss.apart")
     with listening(progress):
         solutions = _run(recording, settings, solvers, progress, noise)
@@ -233,10 +233,10 @@ def _solve(
         out["incremental"] = incremental(problem, settings.solver.lag, progress, begin).settled
     if "isam2" in solvers:
         from graphnav.estimation.solvers.isam import isam2
-        from graphnav.estimation.solvers.rows import cost_at
+        from graphnav.estimation.solvers.rows import compute_cost_at
 
         out["isam2"] = one = isam2(problem, settings.solver.isam2_lag or np.inf, progress, begin).settled
-        best = cost_at(problem, smoothed)
+        best = compute_cost_at(problem, smoothed)
         if not settings.solver.isam2_lag and one.cost is not None and one.cost > best + _CLEARLY:
             note = Note(
                 "solver.worse_optimum",

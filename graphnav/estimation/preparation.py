@@ -13,7 +13,6 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from graphnav.config import Settings
-from graphnav.constraints.vehicle import NonHolonomic, OdometerSpeed
 from graphnav.core.earth import LocalFrame
 from graphnav.core.errors import EstimationError
 from graphnav.core.progress import Progress, tell
@@ -50,7 +49,6 @@ from graphnav.recording import Recording
 
 _LOST = 0.1  # rad by which a filter may be off for a smoother to rest on it
 _MOST_WRONG = 0.5  # share of the fixes that can be wrong; beyond it, it is the start that is
-_WHEELS = (NonHolonomic, OdometerSpeed)
 
 
 @dataclass(frozen=True)
@@ -210,8 +208,8 @@ def _find_way(
     from graphnav.estimation.solvers.batch import batch  # and GTSAM with it, which few runs of a filter need
 
     states = smoothed.states
-    if any(isinstance(c, _WHEELS) for c in problem.constraints):
-        free = replace(problem, constraints=tuple(c for c in problem.constraints if not isinstance(c, _WHEELS)))
+    if any(c.of_wheels for c in problem.constraints):
+        free = replace(problem, constraints=tuple(c for c in problem.constraints if not c.of_wheels))
         states = backward(free, ekf(free, progress, aligned.until)).states
         states = batch(free, states, wanted=(), reintegrate=False).states
     solved = batch(problem, states, wanted=(), reintegrate=False)

@@ -189,7 +189,7 @@ def _measure_delay(track: Trajectory, reference: Solution) -> float | None:
     # between its keyframes too, where speeds are no straight lines
     t, states, _ = reference.at(np.arange(reference.t[0], reference.t[-1], _STEP))
     ours = Track(t, states.v, np.zeros(len(t)), _STEP)
-    fit = crosschecks.velocity_fit(ours, places) if places is not None else None
+    fit = crosschecks.fit_velocity(ours, places) if places is not None else None
     if fit is None or fit.correlation <= CLEAR or abs(fit.lag) < max(_MATTERS, _SIGNIFICANT * fit.spread):
         return None
     return fit.lag

@@ -1,4 +1,4 @@
-"""The chain of keyframes of a running drive: how those that are posed enter the window, and what is kept of them.
+"""The chain of keyframes of a running drive: how those that are built enter the window, and what is kept of them.
 
 A keyframe enters with the parameters that begin or move on there, with the noise model as it is by then, and without
 the fixes that tests have found to be wrong. Where a fix shows that fixes have been wrong for some time, the keyframes
@@ -28,7 +28,7 @@ from graphnav.estimation.solvers.stages import Place
 from graphnav.estimation.solvers.tree_window import TreeWindow
 from graphnav.estimation.solvers.verdicts import Verdicts
 from graphnav.estimation.solvers.watch import Watch
-from graphnav.estimation.solvers.window import Message, SettledStates, Window, turn_limit
+from graphnav.estimation.solvers.window import Message, SettledStates, Window, compute_turn_limit
 from graphnav.imu.dynamics import ImuFactors
 from graphnav.imu.preintegration import NOISE_FIGURES
 from graphnav.online.looks import Stops
@@ -41,7 +41,7 @@ _ENGINES: dict[str, type[Window]] = {"window": Window, "isam2": TreeWindow}
 
 
 @dataclass(frozen=True)
-class Posed:
+class BuiltKeyframes:
     """Keyframes that are to enter, in a problem from its keyframe `first` on."""
 
     problem: Problem
@@ -77,6 +77,21 @@ class Chain:
         self.epochs = self.fixed = 0  # with carriers, that have settled, and those of them that are fixed
         self._parameters: dict[str, Parameter] = {}
         self._turned = False  # whether something has moved so far that it may have to be linearised again
+
+    @property
+    def busy(self) -> bool:
+        """Whether keyframes are entering, some at a row; here they enter at once."""
+        return False
+
+    def go_on(self, sensors: Sensors) -> None:
+        """Have some more of them enter."""
+
+    def finish_entering(self, sensors: Sensors) -> None:
+        """Have all of them enter, at once."""
+
+    def note_missed_row(self, sensors: Sensors, sensor: str, t: float) -> bool:
+        """A row came late, at a time (s): whether keyframes were made that would have looked at it."""
+        return True
 
     @property
     def newest(self) -> float:
@@ -156,13 +171,13 @@ class Chain:
         return _with_decisions(problem, decided) if decided else problem
 
     def _add(
-        self, posed: Problem, first: int, ahead: Predicted | None = None, begin: int = 0, end: int | None = None
+        self, built: Problem, first: int, ahead: Predicted | None = None, begin: int = 0, end: int | None = None
     ) -> float | None:
         """Add the keyframes of a problem from `first` on; the time before them to go on from, if a fault is found.
 
         `ahead` is what was expected of the first of them, if that still holds; `begin` and `end` are of a portion.
         """
-        problem, k, turn = self._weigh(posed), max(first, begin), 0.0
+        problem, k, turn = self._weigh(built), max(first, begin), 0.0
         while k < (len(problem.t) if end is None else end):
             turn = max(turn, self._push(problem, k, ahead))
             ahead = None
@@ -173,7 +188,7 @@ class Chain:
                     if again <= self.head + SAME_TIME:
                         self.window.forget_tests()
                     return again
-                problem = self._weigh(posed)
+                problem = self._weigh(built)
                 back = int(problem.t.searchsorted(again - SAME_TIME))
                 self._keep(len(self.window) - (k - back + 1))
                 k = back
@@ -268,7 +283,7 @@ class Chain:
         return settled
 
     def _forget(self) -> None:
-        """Stages need not know where their rows came from: that is posed again when it is asked for."""
+        """Stages need not know where their rows came from: that is built again when it is asked for."""
         stages = self.window.stages
         for k in range(len(stages) - 1, -1, -1):
             if stages[k].place.problem is None:
@@ -280,7 +295,7 @@ def find_turn(setup: Recording, noise: NoiseModel) -> float:
     """How far (rad) an attitude may move before rows are linearised anew, by the accelerometer as it is judged."""
     stated = setup.imu.noise
     density = stated.accel_noise_density * float(np.sqrt(noise.factor("imu.accel_noise_density", 1.0)))
-    return turn_limit(replace(stated, accel_noise_density=density))
+    return compute_turn_limit(replace(stated, accel_noise_density=density))
 
 
 def _with_decisions(problem: Problem, decided: dict[float, Held]) -> Problem:

@@ -99,7 +99,7 @@ class Fixes(Buffer):
         return replace(self._setup, t=rows[:, 0], llh=rows[:, 1:4], sd=rows[:, 4:7], v=v, sd_v=sd_v)
 
     def _track_sigma(self, kind: str, t: float, sd: tuple[float, ...]) -> tuple[float, ...]:
-        """A mean that looks back only, and so is the same whenever a fix is posed.
+        """A mean that looks back only, and so is the same whenever a fix is built.
 
         The median of a minute that `graphnav.constraints.gnss` takes would change with every row that follows, and
         a slow error in such a unit would give itself away.

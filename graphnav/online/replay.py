@@ -21,7 +21,7 @@ def without_rows(recording: Recording) -> Recording:
         recording,
         imu=replace(recording.imu, t=none, gyro=rows, accel=rows),
         gnss=gnss and replace(gnss, t=none, llh=rows, sd=rows, v=None, sd_v=None, type=None),
-        odometer=odometer and replace(odometer, t=none, speed=none, way=None, wheels=None),
+        odometer=odometer and replace(odometer, t=none, speed=none, counted=None, wheels=None),
         truth=None,
         raw_gnss=recording.raw_gnss and without_epochs(recording.raw_gnss),
         sensors={name: replace(s, t=none, values=s.values[:0]) for name, s in recording.sensors.items()},
@@ -35,8 +35,8 @@ def rows_of(recording: Recording) -> tuple[Array, list[Row]]:
         o = recording.odometer
         blank = np.full((len(o.t), 6), np.nan)
         blank[:, 0] = o.speed
-        if o.way is not None:
-            blank[:, 1] = o.way
+        if o.counted is not None:
+            blank[:, 1] = o.counted
         if o.wheels is not None:
             blank[:, 2:] = o.wheels
         parts.append((o.t, "odometer", blank))

@@ -342,7 +342,7 @@ class Sensors:
             return None
         way = rows[:, 2] if np.isfinite(rows[:, 2]).all() else None
         wheels = rows[:, 3:7] if np.isfinite(rows[:, 3:7]).any() else None
-        return replace(self.setup.odometer, t=rows[:, 0], speed=rows[:, 1], way=way, wheels=wheels)
+        return replace(self.setup.odometer, t=rows[:, 0], speed=rows[:, 1], counted=way, wheels=wheels)
 
 
 def _identify(name: str, t: float, values: tuple[float, ...]) -> tuple[str | float, ...]:

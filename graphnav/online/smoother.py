@@ -110,13 +110,8 @@ class Smoother:
             return
         tracker = self.tracker
         if tracker is not None:
-            if isinstance(tracker, Walker):
-                missed = sensor != "imu" or tracker.note_missed_row(t)
-                if sensor == "imu":
-                    tracker.look_again(sensors, t)
-                if not missed:
-                    return  # as if it had come in its turn
-                tracker.finish_entering(sensors)
+            if not tracker.note_missed_row(sensors, sensor, t):
+                return  # as if it had come in its turn
             self._awake = -np.inf
             if sensor != "gnss" and t < previous:
                 tracker.note_late_row(sensor, t)
@@ -145,8 +140,7 @@ class Smoother:
 
     def _redo(self, t: float, tracker: Tracker) -> None:
         """A row of the IMU was taken back: what was made of it from a time (s) on is made again."""
-        if isinstance(tracker, Walker):
-            tracker.finish_entering(self.sensors)
+        tracker.finish_entering(self.sensors)
         self._awake = -np.inf
         tracker.note_late_row("imu", t)
         if t <= tracker.newest + SAME_TIME:
@@ -155,7 +149,7 @@ class Smoother:
     def _look_if_due(self, now: float, before: float) -> None:
         if now < self._awake:
             return
-        if now - before > HOLE * self._period and isinstance(self.tracker, Walker):
+        if now - before > HOLE * self._period and self.tracker is not None and self.tracker.at_every_row:
             # what is done at which row stays the same where some are missing, which may yet come
             for k in range(1, round((now - before) / self._period)):
                 if before + k * self._period >= self._awake - SAME_TIME:
@@ -168,7 +162,7 @@ class Smoother:
         if tracker is None:
             self._align()
             self._awake = self._due if self.tracker is None else now
-        elif isinstance(tracker, Walker) and tracker.busy:
+        elif tracker.busy:
             tracker.go_on(self.sensors)
             self._awake = now
         elif now >= self._due - SAME_TIME:

@@ -13,7 +13,7 @@ from graphnav.estimation.alignment import Alignment, align, ready, with_known_he
 from graphnav.estimation.building import start_sigma
 from graphnav.estimation.noise.model import NoiseModel
 from graphnav.estimation.solvers.batch import batch
-from graphnav.estimation.solvers.window import first_message
+from graphnav.estimation.solvers.window import make_first_message
 from graphnav.online.raw import codes_alone
 from graphnav.online.sensors import Sensors
 from graphnav.online.tracker import Tracker
@@ -56,7 +56,7 @@ def make_tracker(
     stated = with_known_heading(found, settings)
     # whether it tells the heading shows with the rows; the tree of iSAM2 moves its states by itself
     turns = setup.gnss is None and settings.solver.engine == "window"
-    message = first_message(stated.state, start_sigma(stated), turns)
+    message = make_first_message(stated.state, start_sigma(stated), turns)
     kind = Walker if setup.platform == "foot" else Tracker
     tracker = kind(settings, frame, message, start, setup, noise)
     if found is not stated:

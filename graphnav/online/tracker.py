@@ -1,11 +1,11 @@
-"""The graph of a running drive: keyframes posed as they come, stops classified, the window kept and settled.
+"""The graph of a running drive: keyframes built as they come, stops classified, the window kept and settled.
 
-New keyframes are posed like a recording (`graphnav.estimation.problem.build_problem`), from the rows around them: the
+New keyframes are built like a recording (`graphnav.estimation.problem.build_problem`), from the rows around them: the
 same code builds the same rows as offline. Whatever changes the past inside the window (a fix that comes late, a stop
-that is recognised a second or two after it began) takes back the keyframes from there on and poses them again.
+that is recognised a second or two after it began) takes back the keyframes from there on and builds them again.
 
 `update` is what somebody waits for; `spare` does one thing at a time that nobody waits for. To that belongs all of the
-next keyframe but its fix: as soon as its interval is there it is posed and predicted. What was made so counts as long
+next keyframe but its fix: as soon as its interval is there it is built and predicted. What was made so counts as long
 as nothing that it rests on has changed; else the update makes it, from the same rows by the same code.
 """
 
@@ -18,8 +18,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from graphnav.config import Settings
-from graphnav.constraints.base import SAME_TIME
-from graphnav.constraints.gnss import GnssPosition, GnssVelocity, node_spacing, period
+from graphnav.constraints.base import SAME_TIME, UsualSigmas
+from graphnav.constraints.gnss import node_spacing, period
 from graphnav.constraints.vehicle import REACH
 from graphnav.core.earth import LocalFrame
 from graphnav.core.findings import period_of
@@ -36,7 +36,7 @@ from graphnav.imu.dynamics import ImuFactors
 from graphnav.imu.preintegration import preintegrate
 from graphnav.imu.samples import GAP, bridge_gaps
 from graphnav.online.ahead import Live, live, since
-from graphnav.online.chain import Chain, Posed, find_turn
+from graphnav.online.chain import BuiltKeyframes, Chain, find_turn
 from graphnav.online.looks import CONTEXT, SURE, Readings, clip_spans
 from graphnav.online.sensors import Sensors
 from graphnav.online.steps import StepCutter
@@ -45,7 +45,7 @@ from graphnav.recording.odometer import MeanSpeed
 
 ROWS_AFTER = 0.1  # s of rows after the last of some keyframes that these look at
 _ROWS_BEFORE = 2.0  # s of rows before a keyframe that its constraints look at where the IMU has no gap; else `CONTEXT`
-_BEFORE = 6  # keyframes posed again with a new one in a stop, so that it is seen for what it is
+_BEFORE = 6  # keyframes built again with a new one in a stop, so that it is seen for what it is
 _PORTIONS = 8  # of the lag: keyframes settle in groups this long
 _SMOOTHED = 8  # covariances that are smoothed back over in the time in which one keyframe is linearised again
 _LATEST = 0.5  # of the lag by which they may be late for it, where states still move
@@ -53,7 +53,7 @@ _LATEST = 0.5  # of the lag by which they may be late for it, where states still
 
 @dataclass(frozen=True)
 class _Ahead:
-    """The keyframe that is expected next, posed and predicted but for its fix, and what that rests on."""
+    """The keyframe that is expected next, built and predicted but for its fix, and what that rests on."""
 
     problem: Problem
     keyframe: Predicted
@@ -72,6 +72,7 @@ class Tracker(Chain):
     """
 
     at_a_row = 64  # keyframes that are linearised again at one row of the IMU
+    at_every_row = False  # whether rows that are missing would change what is done at which
 
     def __init__(
         self,
@@ -119,18 +120,18 @@ class Tracker(Chain):
                 self._readings.look(sensors, now)
         dirty, self._dirty = min(dirty, self._dirty), np.inf
         clock.append(time.thread_time())
-        posed = self._begin(sensors, new, dirty)
-        if posed is None:
+        built = self._begin(sensors, new, dirty)
+        if built is None:
             return np.inf
         clock.append(time.thread_time())
-        back = self._add(posed.problem, posed.first, posed.ahead)
+        back = self._add(built.problem, built.first, built.ahead)
         self._finish_keyframes()
         clock.append(time.thread_time())
         if len(new):
-            self.seconds = dict(zip(("looking", "posing", "solving"), np.diff(clock).tolist(), strict=True))
-        return posed.redone if back is None else min(posed.redone, self._go_back(sensors, posed, back))
+            self.seconds = dict(zip(("looking", "building", "solving"), np.diff(clock).tolist(), strict=True))
+        return built.redone if back is None else min(built.redone, self._go_back(sensors, built, back))
 
-    def _begin(self, sensors: Sensors, new: Array, dirty: float) -> Posed | None:
+    def _begin(self, sensors: Sensors, new: Array, dirty: float) -> BuiltKeyframes | None:
         """Pose the keyframes at the times `new` and those from `dirty` (s) on, which leave; None without any."""
         again = [stage.place.t for stage in self.window.since(dirty - SAME_TIME)]
         if not again and not len(new):
@@ -145,20 +146,20 @@ class Tracker(Chain):
         ahead, self._ahead = self._ahead if self._is_prepared(float(times[0])) else None, None
         problem = self._complete(ahead, sensors, before, times)
         if problem is None:
-            problem, ahead = self._apply_noise(self._pose(sensors, np.concatenate([before, times])), sensors), None
+            problem, ahead = self._apply_noise(self._build(sensors, np.concatenate([before, times])), sensors), None
         self._parameters |= problem.parameters
         self._watch(problem, sensors)
         redone = again[0] if again else np.inf
-        return Posed(problem, len(before), times, redone, None if ahead is None else ahead.keyframe)
+        return BuiltKeyframes(problem, len(before), times, redone, None if ahead is None else ahead.keyframe)
 
     def _finish_keyframes(self) -> None:
         """Keyframes have entered."""
         self.in_force = {rows.name: len(rows.b) for rows in self.window.stages[-1].measured if rows.H.any()}
         self._forget()
 
-    def _go_back(self, sensors: Sensors, posed: Posed, back: float) -> float:
+    def _go_back(self, sensors: Sensors, built: BuiltKeyframes, back: float) -> float:
         """Redo keyframes from a time on, in which a fault was found; the first that was redone, s."""
-        rest = posed.times[posed.times > self.newest + SAME_TIME]
+        rest = built.times[built.times > self.newest + SAME_TIME]
         return min(back, self.update(sensors, rest, back))
 
     def work_ahead(self, sensors: Sensors, expected: float = np.inf, settling: bool = True) -> bool:
@@ -216,7 +217,7 @@ class Tracker(Chain):
     def _prepare(self, sensors: Sensors, expected: float) -> None:
         """Pose and predict the keyframe that is expected, but for the fix."""
         before = self._list_before(len(self.window), expected)
-        problem = self._apply_noise(self._pose(sensors, np.array([*before, expected]), complete=False), sensors)
+        problem = self._apply_noise(self._build(sensors, np.array([*before, expected]), complete=False), sensors)
         self._parameters |= problem.parameters
         place, _ = self._place(self._weigh(problem), len(before))
         self._ahead = _Ahead(problem, self.window.expect(place), self.stops, self._readings.wrong)
@@ -257,7 +258,7 @@ class Tracker(Chain):
     def settle(self, sensors: Sensors) -> None:
         """Settle all keyframes: no more will come."""
         if len(self.window):
-            self.window.converge(always=True, renewed=lambda *which: self._pose_again(sensors, *which))
+            self.window.converge(always=True, renewed=lambda *which: self._build_again(sensors, *which))
             self._settle(np.inf)
 
     def _settle(self, until: float) -> None:
@@ -292,7 +293,7 @@ class Tracker(Chain):
 
     @property
     def stale(self) -> bool:
-        """Whether what has not settled was posed with figures of the odometer that are known better by now."""
+        """Whether what has not settled was built with figures of the odometer that are known better by now."""
         return self._readings.revised
 
     def adopt(self, other: Tracker, stationary: Array, until: float) -> None:
@@ -317,7 +318,7 @@ class Tracker(Chain):
 
     # ------------------------------------------------------------------------------------------------- keyframes
     def _list_before(self, keep: int, t: float) -> list[float]:
-        """Times of the keyframes that are posed again with those from t on, of the first `keep` in the window."""
+        """Times of the keyframes that are built again with those from t on, of the first `keep` in the window."""
         look = _BEFORE if len(self.stops) and self.stops[-1, 1] > t - _BEFORE else 1
         before = [stage.place.t for stage in self.window.stages[max(0, keep - look) : keep]]
         if self.opened and len(before) < look:
@@ -330,9 +331,9 @@ class Tracker(Chain):
             return None
         return sensors.gnss.typical_sigmas(recording.gnss.t)[:, :3]
 
-    def _pose(self, sensors: Sensors, times: Array, complete: bool = True) -> Problem:
+    def _build(self, sensors: Sensors, times: Array, complete: bool = True) -> Problem:
         begin, stops = float(times[0]), self.stops
-        if len(stops):  # a stop is posed whole, so that its place begins where it began
+        if len(stops):  # a stop is built whole, so that its place begins where it began
             stops = stops if self.foot else stops[stops[:, 1] > begin]
             here = stops[(stops[:, 0] < begin) & (stops[:, 1] > begin)]
             begin = min([begin, *here[:, 0].tolist()])
@@ -355,20 +356,14 @@ class Tracker(Chain):
         return problem
 
     def _apply_noise(self, problem: Problem, sensors: Sensors, noise: NoiseModel | None = None) -> Problem:
-        """A problem posed with stated noise as the noise model has it.
+        """A problem built with stated noise as the noise model has it.
 
         A few keyframes do not tell how often fixes come, nor what they usually state.
         """
-        spacing, rows = node_spacing(self.settings.gnss.slow_times, period(sensors.gnss.used)), []
-        for c in problem.constraints:
-            if isinstance(c, GnssPosition):
-                c = replace(c, usual_error=sensors.gnss.unit())
-            elif isinstance(c, GnssVelocity):
-                c = replace(c, unit_error=sensors.gnss.typical_sigmas(problem.t[c.keyframe])[:, 3:])
-            if isinstance(c, GnssPosition | GnssVelocity):
-                c = replace(c, processes=tuple(replace(p, spacing=spacing) for p in c.processes))
-            rows.append(c)
-        return with_noise(replace(problem, constraints=tuple(rows)), noise or self.noise)
+        spacing, fixes = node_spacing(self.settings.gnss.slow_times, period(sensors.gnss.used)), sensors.gnss
+        usual = UsualSigmas(fixes.unit, lambda k: fixes.typical_sigmas(problem.t[k]), spacing)
+        rows = tuple(c.in_units_of(usual) for c in problem.constraints)
+        return with_noise(replace(problem, constraints=rows), noise or self.noise)
 
     def _cut_around(self, sensors: Sensors, begin: float, end: float) -> Recording:
         """The rows that keyframes between two times look at.
@@ -381,17 +376,17 @@ class Tracker(Chain):
         return near if whole else sensors.recording(begin - CONTEXT, end)
 
     def _renew(self, sensors: Sensors, first: int, end: int) -> list[Place] | None:
-        """As `_pose_again`; None where that was enough for a row, and is to be asked for again at the next."""
-        return self._pose_again(sensors, first, end)
+        """As `_build_again`; None where that was enough for a row, and is to be asked for again at the next."""
+        return self._build_again(sensors, first, end)
 
-    def _pose_again(self, sensors: Sensors, first: int, end: int) -> list[Place]:
-        """The places of the stages from `first` to `end`, posed again with those around them, and stops as a whole."""
+    def _build_again(self, sensors: Sensors, first: int, end: int) -> list[Place]:
+        """The places of the stages from `first` to `end`, built again with those around them, and stops as a whole."""
         times, skip = self.times, len(self.times) - len(self.window)  # 1 once there is one before the first stage
         begin, until = max(0, first + skip - _BEFORE), min(end + skip + _BEFORE, len(times))
         for stop in self.stops if end < len(self.window) else ():
             if stop[0] < times[until - 1] < stop[1]:
                 until = int(np.searchsorted(times, stop[1] + SAME_TIME))
-        problem = self._weigh(self._apply_noise(self._pose(sensors, times[begin:until]), sensors))
+        problem = self._weigh(self._apply_noise(self._build(sensors, times[begin:until]), sensors))
         return [
             replace(stage.place, problem=problem, k=first + skip - begin + i)
             for i, stage in enumerate(self.window.stages[first:end])

@@ -1,7 +1,7 @@
 """The graph of a walk that goes on: what a step adds is done a portion at a row of the IMU.
 
 A step has some twenty keyframes, and its detector sees half a minute. Done at one row they take several periods of an
-IMU, and whoever reads its rows waits. So a row looks for steps, one poses the keyframes of those that are over, and a
+IMU, and whoever reads its rows waits. So a row looks for steps, one builds the keyframes of those that are over, and a
 few keyframes enter at each of the next. Until all have, the state now is predicted from the keyframe before them.
 """
 
@@ -18,7 +18,7 @@ from graphnav.estimation.noise.model import NoiseModel
 from graphnav.estimation.solvers.stages import Place
 from graphnav.estimation.solvers.window import Message
 from graphnav.online.ahead import Live, live, since
-from graphnav.online.chain import Posed
+from graphnav.online.chain import BuiltKeyframes
 from graphnav.online.looks import CONTEXT, SURE
 from graphnav.online.sanity import LASTING
 from graphnav.online.sensors import Sensors
@@ -27,23 +27,23 @@ from graphnav.recording import Recording
 
 _ENTERING = 4  # keyframes that enter at a row: half of the 4 ms that pass to the next of an IMU at 250 Hz
 _AGAIN = 8  # that are linearised again at a row, by the same measure
-_RENEWED = 64  # that are posed again at once for that: those around them, which come with them, are twelve
+_RENEWED = 64  # that are built again at once for that: those around them, which come with them, are twelve
 
 
 @dataclass(frozen=True)
 class _Work:
-    """What is left of a step: first to pose keyframes, then to let them enter."""
+    """What is left of a step: first to build keyframes, then to let them enter."""
 
     new: Array  # (K,) s
     dirty: float  # s, from where on keyframes are redone
     shown: tuple[Message, float]  # the keyframe, and its time, that the state now is predicted from meanwhile
-    posed: Posed | None = None
+    built: BuiltKeyframes | None = None
     entered: int = 0  # of the problem's keyframes, those before included
 
 
 @dataclass(frozen=True)
 class _Renewal:
-    """Places posed again, by their time, as long as the stops are these."""
+    """Places built again, by their time, as long as the stops are these."""
 
     stops: Array = field(default_factory=lambda: np.empty((0, 2)))
     places: dict[float, Place] = field(default_factory=dict)
@@ -64,6 +64,7 @@ class Walker(Tracker):
     """Keyframes of a walk."""
 
     at_a_row = _AGAIN
+    at_every_row = True
     _work: _Work | None = None
     _renewal = _Renewal()
     _looks: tuple[_Look, ...] = ()  # that rows which come late may have belonged to
@@ -150,35 +151,43 @@ class Walker(Tracker):
         """A portion of what there is to do."""
         work = self._work
         assert work is not None
-        posed = work.posed
-        if posed is None:
+        built = work.built
+        if built is None:
             if work.dirty < np.inf:
                 self._motions = {t: one for t, one in self._motions.items() if t < work.dirty}
                 self._renewal = _Renewal()
-            posed = self._begin(sensors, work.new, work.dirty)
-            self._work = None if posed is None else replace(work, posed=posed, entered=posed.first)
+            built = self._begin(sensors, work.new, work.dirty)
+            self._work = None if built is None else replace(work, built=built, entered=built.first)
             return
-        end = min(work.entered + _ENTERING, len(posed.problem.t))
-        back = self._add(posed.problem, posed.first, None, work.entered, end)
+        end = min(work.entered + _ENTERING, len(built.problem.t))
+        back = self._add(built.problem, built.first, None, work.entered, end)
         self._work = replace(work, entered=end)
-        if back is not None or end == len(posed.problem.t):
+        if back is not None or end == len(built.problem.t):
             self._work = None
             self._finish_keyframes()
         if back is not None:
             self._renewal = _Renewal()
-            self._go_back(sensors, posed, back)
+            self._go_back(sensors, built, back)
 
     def finish_entering(self, sensors: Sensors) -> None:
         """All that is left to do, at once."""
         while self._work is not None:
             self.go_on(sensors)
 
-    def note_missed_row(self, t: float) -> bool:
-        """A row of the IMU came late, at a time (s): whether keyframes were made that would have looked at it."""
+    def note_missed_row(self, sensors: Sensors, sensor: str, t: float) -> bool:
+        missed = sensor != "imu" or self._have_missed(t)
+        if sensor == "imu":
+            self.look_again(sensors, t)
+        if missed:
+            self.finish_entering(sensors)
+        return missed
+
+    def _have_missed(self, t: float) -> bool:
+        """Whether keyframes were made that would have looked at a row of the IMU at a time, s."""
         self._steps.read_again(t)
         work, newest = self._work, self.newest
-        if work is not None and work.posed is not None:
-            newest = max(newest, float(work.posed.times[-1]))
+        if work is not None and work.built is not None:
+            newest = max(newest, float(work.built.times[-1]))
         return t <= newest + ROWS_AFTER
 
     def note_late_row(self, sensor: str, t: float) -> None:
@@ -206,15 +215,15 @@ class Walker(Tracker):
 
     def _renew(self, sensors: Sensors, first: int, end: int) -> list[Place] | None:
         before = self._renewal
-        places = self._pose_again(sensors, first, end)
+        places = self._build_again(sensors, first, end)
         return places if self._renewal is before else None
 
-    def _pose_again(self, sensors: Sensors, first: int, end: int) -> list[Place]:
-        """As of `Tracker`; what is posed for some stages is kept for those that follow."""
+    def _build_again(self, sensors: Sensors, first: int, end: int) -> list[Place]:
+        """As of `Tracker`; what is built for some stages is kept for those that follow."""
         stages, known = self.window.stages[first:end], self._renewal
         if known.stops is not self.stops or not {stage.place.t for stage in stages} <= known.places.keys():
             until = max(end, min(first + _RENEWED, len(self.window)))
-            places = super()._pose_again(sensors, first, until)
+            places = super()._build_again(sensors, first, until)
             known = self._renewal = _Renewal(self.stops, {place.t: place for place in places})
         fresh = [known.places[stage.place.t] for stage in stages]
         return [replace(stage.place, problem=one.problem, k=one.k) for stage, one in zip(stages, fresh, strict=True)]

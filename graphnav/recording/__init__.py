@@ -111,8 +111,8 @@ class Odometer:
     speed: Array  # (M,) m/s
     lever_arm: Array = field(default_factory=lambda: np.zeros(3))  # m, RFU, from the IMU
     scale_sigma: float = 0.02
-    way: Array | None = None  # (M,) m counted up to t
-    pulse: float = 0.0  # m per count of `way`
+    counted: Array | None = None  # (M,) m counted up to t
+    pulse: float = 0.0  # m per count
     wheels: Array | None = None  # (M, 4) m/s, front left, front right, rear left, rear right; NaN where unknown
     signed: bool = True  # False: backward reads positive
     speed_sigma: float | None = None  # m/s, of one reading; None: told from the readings

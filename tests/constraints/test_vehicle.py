@@ -191,8 +191,8 @@ def test_an_unsigned_odometer_backs_up() -> None:
     recording = made.recording.crop(backs[0] - 120.0 - made.recording.start)
     odometer = recording.odometer
     begin, end = backs[0] - 5.0 - recording.start, backs[-1] + 1.0 - recording.start
-    way = None if odometer.way is None else np.r_[0.0, np.cumsum(np.abs(np.diff(odometer.way)))]
-    blind = replace(odometer, speed=np.abs(odometer.speed), way=way, signed=False)
+    way = None if odometer.counted is None else np.r_[0.0, np.cumsum(np.abs(np.diff(odometer.counted)))]
+    blind = replace(odometer, speed=np.abs(odometer.speed), counted=way, signed=False)
     far = {}
     for name, sensor in (("signed", odometer), ("unsigned", blind)):
         solution = estimated(replace(recording, odometer=sensor).without("gnss", (begin, end)), **STATED)

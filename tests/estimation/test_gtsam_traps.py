@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from helpers import Array
 
-from graphnav.estimation.solvers.graph import LinearGraph, jacobian_factor
+from graphnav.estimation.solvers.graph import LinearGraph, make_jacobian_factor
 
 N = 40
 
@@ -160,7 +160,7 @@ def test_rows_may_touch_more_variables_than_the_constructors_know() -> None:
     blocks = [(key, rng.standard_normal((3, w))) for key, w in widths.items()]
     b = rng.standard_normal(3)
     for count in (1, 3, 4, 6):
-        factor = jacobian_factor(blocks[:count], b)
+        factor = make_jacobian_factor(blocks[:count], b)
         A = np.concatenate([dict(blocks)[key] for key in list(factor.keys())], axis=1)
         np.testing.assert_allclose(factor.getA().T @ factor.getA(), A.T @ A, atol=1e-12)
         np.testing.assert_allclose(factor.getA().T @ factor.getb(), A.T @ b, atol=1e-12)

@@ -25,10 +25,10 @@ from graphnav.estimation.solution import Solution
 from graphnav.estimation.solvers.batch import batch
 from graphnav.estimation.solvers.ekf import ekf
 from graphnav.estimation.solvers.incremental import Incremental, incremental
-from graphnav.estimation.solvers.linearise import Step, node_steps
+from graphnav.estimation.solvers.linearise import Step, list_node_steps
 from graphnav.estimation.solvers.rts import backward
 from graphnav.estimation.solvers.stages import Message, Place, rotate_columns
-from graphnav.estimation.solvers.window import Window, first_message
+from graphnav.estimation.solvers.window import Window, make_first_message
 from graphnav.recording import Recording
 from graphnav.recording.formats import read
 
@@ -175,8 +175,8 @@ def fill(window: Window, problem: Problem, first: int, last: int, steps: dict[in
 
 
 def test_taking_keyframes_back_and_adding_them_again_changes_nothing(posed: Problem) -> None:
-    steps = node_steps(posed)
-    one, two = (Window(first_message(posed.prior.mean, posed.prior.sigma[0]), 1e-3) for _ in range(2))
+    steps = list_node_steps(posed)
+    one, two = (Window(make_first_message(posed.prior.mean, posed.prior.sigma[0]), 1e-3) for _ in range(2))
     fill(one, posed, 0, 60, steps)
     fill(two, posed, 0, 60, steps)
     two.truncate(35)
@@ -188,8 +188,8 @@ def test_taking_keyframes_back_and_adding_them_again_changes_nothing(posed: Prob
 
 def test_size_does_not_grow_with_the_drive(posed: Problem) -> None:
     """Keyframes in the window and numbers in a stage, over the drive run through three times."""
-    solver = Incremental(Window(first_message(posed.prior.mean, posed.prior.sigma[0]), 1e-3), lag=20.0)
-    steps, sizes = node_steps(posed), []
+    solver = Incremental(Window(make_first_message(posed.prior.mean, posed.prior.sigma[0]), 1e-3), lag=20.0)
+    steps, sizes = list_node_steps(posed), []
     for k in range(len(posed.t)):
         solver.add(Place(float(posed.t[k]), posed, k, steps.get(k, ()), linked=k > 0))
         sizes.append((len(solver.window), solver.window.newest.R.size))
@@ -245,7 +245,7 @@ def test_real_program_run(shared_data: Path, name: str) -> None:
 
 def test_what_smooths_back_is_the_whole_matrix(posed: Problem) -> None:
     """Of which a stage keeps the rows that are not those of the identity."""
-    window, steps = Window(first_message(posed.prior.mean, posed.prior.sigma[0]), 1e-3), node_steps(posed)
+    window, steps = Window(make_first_message(posed.prior.mean, posed.prior.sigma[0]), 1e-3), list_node_steps(posed)
     fill(window, posed, 0, 90, steps)
     P = window.newest.covariance
     for stage in reversed(window.stages[1:]):
@@ -259,8 +259,8 @@ def test_what_smooths_back_is_the_whole_matrix(posed: Problem) -> None:
 
 def test_covariances_come_in_portions_as_at_once(posed: Problem) -> None:
     """Of what was known when the first was asked for; and of what is known now once keyframes were taken back."""
-    steps = node_steps(posed)
-    one, two = (Window(first_message(posed.prior.mean, posed.prior.sigma[0]), 1e-3) for _ in range(2))
+    steps = list_node_steps(posed)
+    one, two = (Window(make_first_message(posed.prior.mean, posed.prior.sigma[0]), 1e-3) for _ in range(2))
     for window in (one, two):
         fill(window, posed, 0, 90, steps)
     fill(two, posed, 90, 100, steps)
@@ -280,8 +280,8 @@ def test_covariances_come_in_portions_as_at_once(posed: Problem) -> None:
 
 def test_linearised_again_in_portions_it_is_the_same(posed: Problem) -> None:
     """At once and in portions; and while keyframes come and some are taken back and made again."""
-    steps = node_steps(posed)
-    whole, parts, moving = (Window(first_message(posed.prior.mean, posed.prior.sigma[0]), 1e-3) for _ in range(3))
+    steps = list_node_steps(posed)
+    whole, parts, moving = (Window(make_first_message(posed.prior.mean, posed.prior.sigma[0]), 1e-3) for _ in range(3))
 
     def revise(window: Window) -> bool:
         # posed anew, as a running drive does: what has been linearised again keeps no rows

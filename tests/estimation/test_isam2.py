@@ -21,13 +21,13 @@ from graphnav.estimation.solvers.batch import batch
 from graphnav.estimation.solvers.ekf import ekf
 from graphnav.estimation.solvers.incremental import incremental
 from graphnav.estimation.solvers.isam import isam2
-from graphnav.estimation.solvers.linearise import node_steps
+from graphnav.estimation.solvers.linearise import list_node_steps
 from graphnav.estimation.solvers.points import move_covariance
 from graphnav.estimation.solvers.rts import backward
 from graphnav.estimation.solvers.stages import Place
 from graphnav.estimation.solvers.tree import Tree
-from graphnav.estimation.solvers.tree_marginals import Leaving, newest_covariance
-from graphnav.estimation.solvers.window import first_message, turn_limit
+from graphnav.estimation.solvers.tree_marginals import Leaving, compute_newest_covariance
+from graphnav.estimation.solvers.window import compute_turn_limit, make_first_message
 from graphnav.recording import Recording
 
 Drive = tuple[Recording, States, Array]
@@ -111,7 +111,10 @@ def test_within_a_lag_it_is_the_window(posed: Problem, solved: Solution) -> None
 def _played(problem: Problem, until: int, lag: float = np.inf, every: int = 5) -> tuple[Tree, list[int]]:
     mean = problem.prior.mean
     assert mean is not None
-    tree, steps = Tree(first_message(mean, problem.prior.sigma[0]), turn_limit(problem.imu_noise)), node_steps(problem)
+    tree, steps = (
+        Tree(make_first_message(mean, problem.prior.sigma[0]), compute_turn_limit(problem.imu_noise)),
+        list_node_steps(problem),
+    )
     slots = []
     for k in range(until):
         tree.add(Place(float(problem.t[k]), problem, k, steps.get(k, ()), linked=k > 0))
@@ -152,8 +155,12 @@ def test_taken_back_keyframes_are_as_if_they_had_never_come(posed: Problem) -> N
     tree.truncate(50)
     tree.read(), other.read()
     a, b = tree.newest, other.newest
-    np.testing.assert_allclose(a.state.minus(b.state)[0] / np.sqrt(np.diag(newest_covariance(other))), 0.0, atol=0.02)
-    np.testing.assert_allclose(np.diag(newest_covariance(tree)), np.diag(newest_covariance(other)), rtol=0.02)
+    np.testing.assert_allclose(
+        a.state.minus(b.state)[0] / np.sqrt(np.diag(compute_newest_covariance(other))), 0.0, atol=0.02
+    )
+    np.testing.assert_allclose(
+        np.diag(compute_newest_covariance(tree)), np.diag(compute_newest_covariance(other)), rtol=0.02
+    )
     assert tree.isam.getLinearizationPoint().size() == other.isam.getLinearizationPoint().size()
 
 
@@ -166,7 +173,7 @@ def test_keyframes_come_again_after_others_were_taken_back(drive: Drive) -> None
     stated = build_problem(recording.crop(0.0, 4.0), settings, frame, start, sigma, still)
     never, _ = _played(stated, 36)
     tree, _ = _played(stated, 26, every=1000)
-    steps = node_steps(stated)
+    steps = list_node_steps(stated)
     for back, until in ((24, 30), (29, 36)):
         tree.truncate(back)
         for k in range(back, until):
@@ -185,7 +192,7 @@ def test_a_tree_made_again_from_its_rows_goes_on_as_before(posed: Problem) -> No
 
     tree, _ = _played(posed, 60, lag=20.0)
     again = pickle.loads(pickle.dumps(tree))
-    steps = node_steps(posed)
+    steps = list_node_steps(posed)
     for k in range(60, 80):
         for one in (tree, again):
             one.add(Place(float(posed.t[k]), posed, k, steps.get(k, ()), linked=True))
@@ -199,7 +206,7 @@ def test_a_tree_made_again_from_its_rows_goes_on_as_before(posed: Problem) -> No
 def test_covariances_from_the_other_end_are_the_marginals_of_the_tree(posed: Problem) -> None:
     """Of keyframes that are to leave a lag, in portions with others coming meanwhile, and after a relinearisation."""
     tree, _ = _played(posed, 60, lag=40.0)
-    steps = node_steps(posed)
+    steps = list_node_steps(posed)
     for again in (False, True):
         leaving, count = Leaving(tree, 6), 6
         leaving.step(20)

@@ -64,7 +64,7 @@ class Drive:
             out["r"], out["N"], out["smoothed"], out["P_smoothed"],
         )  # fmt: skip
         k = np.arange(1, n)
-        out["lag"] = recursion.lag_covariances(k, 0, D, out["P"], out["P_ahead"], self.F, self.decay, out["N"])
+        out["lag"] = recursion.compute_lag_covariances(k, 0, D, out["P"], out["P_ahead"], self.F, self.decay, out["N"])
         return out
 
 

@@ -16,7 +16,7 @@ from graphnav.core.state import DIM, States
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.linearise import Points, linearise
 from graphnav.estimation.solvers.stages import Message
-from graphnav.estimation.solvers.turning import change_of_point, covariance_turning, plus_turning, split_turn
+from graphnav.estimation.solvers.turning import change_of_point, plus_turning, split_turn, turn_covariance
 from graphnav.estimation.solvers.window import Window
 from graphnav.online import Online, rows_of, without_rows
 from graphnav.simulation import simulate
@@ -75,7 +75,7 @@ def test_the_change_of_point_is_the_derivative(moves: tuple[States, Array]) -> N
     rng = np.random.default_rng(1)
     root = rng.standard_normal((6, DIM, DIM))
     P = root @ np.swapaxes(root, -1, -2)
-    back = T @ covariance_turning(P, states, e) @ np.swapaxes(T, -1, -2)
+    back = T @ turn_covariance(P, states, e) @ np.swapaxes(T, -1, -2)
     np.testing.assert_allclose(back, P, atol=1e-9)
 
 

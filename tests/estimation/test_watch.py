@@ -17,10 +17,10 @@ from graphnav.estimation.noise.apply import row_weights
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers import watch
 from graphnav.estimation.solvers.ekf import ekf, refilter
-from graphnav.estimation.solvers.linearise import node_steps
+from graphnav.estimation.solvers.linearise import list_node_steps
 from graphnav.estimation.solvers.stages import Place
 from graphnav.estimation.solvers.watch import Bank
-from graphnav.estimation.solvers.window import Window, first_message
+from graphnav.estimation.solvers.window import Window, make_first_message
 from graphnav.online import Online, rows_of, without_rows
 from graphnav.recording import Recording
 
@@ -49,9 +49,9 @@ def test_tests_beside_a_message_are_those_of_the_filter(posed: Problem, monkeypa
     refilter(problem, ekf(problem), watch=True, drifts=False)
     mean = problem.prior.mean
     assert mean is not None
-    message = first_message(mean, problem.prior.sigma[0])
+    message = make_first_message(mean, problem.prior.sigma[0])
     window = Window(replace(message, tests=watch.Watch([rows], 1.0, DIM)), np.inf)
-    plain, steps = Window(message, np.inf), node_steps(problem)
+    plain, steps = Window(message, np.inf), list_node_steps(problem)
     for k in range(len(problem.t)):
         for one in (window, plain):
             one.push(Place(float(problem.t[k]), problem, k, steps.get(k, ()), linked=k > 0))

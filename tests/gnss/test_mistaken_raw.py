@@ -22,7 +22,7 @@ from graphnav.gnss.arcs import find_arcs
 from graphnav.gnss.series import RawGnss
 from graphnav.gnss.signals import satellite_id, signal_id
 from graphnav.recording import Recording
-from graphnav.recording.checks.aiding import gnss_apart
+from graphnav.recording.checks.aiding import describe_gnss_apart
 from graphnav.recording.formats import read
 
 DRIVE = Path(__file__).resolve().parents[2] / "data" / "kamakura_rtk"
@@ -111,7 +111,7 @@ def test_a_base_that_ends_early_leaves_the_rovers_own_observations(changed, whol
 
 def test_a_wrong_week_is_told(changed):
     one = changed("recording.toml", lambda text: text.replace("2021-09-22T", "2021-09-29T"))
-    assert gnss_apart(one) is not None  # with which the program refuses
+    assert describe_gnss_apart(one) is not None  # with which the program refuses
     for script in (one, replace(one, gnss=None)):
         with pytest.raises(RecordingError):
             run(script, solvers=("ekf",))

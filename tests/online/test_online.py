@@ -30,7 +30,7 @@ from graphnav.core.notes import key_of
 from graphnav.core.trajectory import Trajectory
 from graphnav.estimation.pipeline import run
 from graphnav.estimation.solution import to_trajectory
-from graphnav.estimation.solvers.window import turn_limit
+from graphnav.estimation.solvers.window import compute_turn_limit
 from graphnav.online import Online, Row, Session, rows_of, without_rows
 from graphnav.online.buffers import Buffer
 from graphnav.online.judging import Judgement
@@ -720,7 +720,7 @@ def test_an_imu_is_judged_by_ever_more_rows(drive: tuple[Recording, Trajectory])
         one = whole.figures[name]
         assert abs(used.figures[name].log_factor - one.log_factor) < 3.0 * one.sigma, name
     assert sum(key_of(note) == "noise.imu" for note in online.notes) == 1
-    assert online.tracker.window.turn > turn_limit(quiet)
+    assert online.tracker.window.turn > compute_turn_limit(quiet)
 
 
 def test_resumed_while_it_is_judged_it_ends_with_the_same(drive: tuple[Recording, Trajectory], rows: list[Row]) -> None:

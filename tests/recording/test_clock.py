@@ -10,7 +10,7 @@ import pytest
 
 from graphnav.core.earth import LocalFrame
 from graphnav.recording.checks import crosschecks, lags
-from graphnav.recording.checks.clock import clock_of
+from graphnav.recording.checks.clock import measure_clock_offsets
 from graphnav.recording.draft.agreement import compare_with_fixes
 from graphnav.recording.formats import read
 
@@ -72,7 +72,7 @@ def test_fixes_that_jump_turn_no_axis_and_no_clock() -> None:
     for some in (plain, replace(plain, llh=frame.to_llh(p))):
         track = crosschecks.track(some)
         assert track is not None
-        fit = crosschecks.forward_fit(drive.imu, track)
+        fit = crosschecks.fit_forward(drive.imu, track)
         assert fit is not None
         fits.append(fit)
     clean, dirty = fits
@@ -89,7 +89,7 @@ def test_parts_of_a_drive_keep_to_the_error(shared_data: Path, name: str) -> Non
         part = drive.crop(a, a + 60.0)
         assert part.gnss is not None
         track = crosschecks.track(part.gnss)
-        fit = None if track is None else crosschecks.forward_fit(part.imu, track)
+        fit = None if track is None else crosschecks.fit_forward(part.imu, track)
         if fit is not None and fit.correlation > 0.6:
             z.append(max(abs(fit.lag) - 0.02, 0.0) / fit.spread)
     assert len(z) >= 6
@@ -107,11 +107,11 @@ def test_a_draft_and_the_checks_say_the_same(shared_data: Path, name: str, shift
     drafted = compare_with_fixes(
         imu.t, imu.gyro, imu.accel, up, (gnss.t, gnss.llh, None if gnss.v is None else gnss.v[:, :2])
     )
-    said = clock_of(imu, gnss).late
+    said = measure_clock_offsets(imu, gnss).late
     assert (drafted.offset is None) == (said is None)
     if drafted.offset is not None and said is not None:
         assert drafted.offset[0] == pytest.approx(said.lag, abs=1e-6)
         # what is then left is no longer complained of
-        assert clock_of(imu, replace(gnss, t=gnss.t + drafted.offset[0])).late is None
+        assert measure_clock_offsets(imu, replace(gnss, t=gnss.t + drafted.offset[0])).late is None
     # of dresden, whose receiver wanders, it is not sure
     assert (said is not None) == (shift != 0.0) or name.startswith("dresden")

@@ -14,7 +14,7 @@ from graphnav.app import cli
 from graphnav.core.errors import RecordingError
 from graphnav.core.rotation import exp
 from graphnav.recording.draft import columns, draft, guesses, motion
-from graphnav.recording.draft.agreement import level_axes
+from graphnav.recording.draft.agreement import find_level_axes
 from graphnav.recording.formats import read
 from graphnav.recording.formats.schema import rotation_from_letters
 
@@ -58,7 +58,7 @@ DRIVE, _ = oracle.drive(
     ],
 )  # fmt: skip
 def test_columns_are_found_by_meaning(header, sensor, found):
-    match = columns.match(header.split(","))
+    match = columns.match_columns(header.split(","))
     assert match.sensor == sensor
     for ours, theirs in found.items():
         assert match.names.get(ours) == theirs
@@ -66,8 +66,8 @@ def test_columns_are_found_by_meaning(header, sensor, found):
 
 def test_bare_axes_are_told_apart_by_the_file_name():
     header = ["time", "seconds_elapsed", "z", "y", "x"]
-    assert columns.match(header, "Gyroscope").names["gx"] == "x"
-    assert columns.match(header, "TotalAcceleration").sensor == "accel"
+    assert columns.match_columns(header, "Gyroscope").names["gx"] == "x"
+    assert columns.match_columns(header, "TotalAcceleration").sensor == "accel"
 
 
 @pytest.mark.parametrize(
@@ -91,23 +91,23 @@ def test_units_in_names(name, plain, unit):
      (1.7e18, 1e7, "ns"), (345600.0, 0.005, "s"), (345600000.0, 5.0, "ms")],
 )  # fmt: skip
 def test_time_units(first, step, unit):
-    assert guesses.time_unit(first + step * np.arange(100), None, imu=True).value == unit
+    assert guesses.guess_time_unit(first + step * np.arange(100), None, imu=True).value == unit
 
 
 def test_forces_without_gravity_and_raw_counts_are_refused():
     rng = np.random.default_rng(1)
     still = rng.normal(0, 0.3, (500, 3))
     with refused("draft.no_gravity", RecordingError, "a.csv"):
-        guesses.accel_unit(Path("a.csv"), still, "m/s2")
+        guesses.guess_accel_unit(Path("a.csv"), still, "m/s2")
     with refused("draft.raw_counts", RecordingError, "a.csv"):
-        guesses.accel_unit(Path("a.csv"), still + np.array([0, 0, 16384.0]), None)
-    assert guesses.accel_unit(Path("a.csv"), still / 9.8 + [0, 0, 1.0], None).value == "g"
+        guesses.guess_accel_unit(Path("a.csv"), still + np.array([0, 0, 16384.0]), None)
+    assert guesses.guess_accel_unit(Path("a.csv"), still / 9.8 + [0, 0, 1.0], None).value == "g"
 
 
 def test_white_noise_is_measured():
     rng = np.random.default_rng(2)
     t = np.arange(60000) / 100
-    assert guesses.noise_density(t, rng.normal(0, 0.02, (60000, 3))) == pytest.approx(0.002, rel=0.25)
+    assert guesses.estimate_noise_density(t, rng.normal(0, 0.02, (60000, 3))) == pytest.approx(0.002, rel=0.25)
 
 
 # ---- motion
@@ -116,10 +116,10 @@ def test_white_noise_is_measured():
 def test_lag_slope_and_angle_of_planar_vectors():
     rng = np.random.default_rng(4)
     t = np.arange(0, 300, motion.STEP)
-    z = motion.mean(rng.normal(size=len(t))) + 1j * motion.mean(rng.normal(size=len(t)))
+    z = motion.compute_moving_mean(rng.normal(size=len(t))) + 1j * motion.compute_moving_mean(rng.normal(size=len(t)))
     late = 0.37
     y = np.interp(t - late, t, z)
-    found = motion.lag(t, 2.0 * z * np.exp(1j * 0.6), t, y)
+    found = motion.find_lag(t, 2.0 * z * np.exp(1j * 0.6), t, y)
     assert found.seconds == pytest.approx(late, abs=0.01)
     assert found.correlation > 0.99
     assert found.slope == pytest.approx(2.0 * np.exp(1j * 0.6), rel=0.02)
@@ -128,15 +128,15 @@ def test_lag_slope_and_angle_of_planar_vectors():
 def test_lag_of_clocks_that_have_nothing_in_common():
     rng = np.random.default_rng(5)
     t = np.arange(0, 600, motion.STEP)
-    x = motion.mean(rng.normal(size=len(t)), 3.0)
-    found = motion.lag(t, 57.3 * x, t[1000:5000] + 1.7e6, x[1000:5000], anywhere=True)
+    x = motion.compute_moving_mean(rng.normal(size=len(t)), 3.0)
+    found = motion.find_lag(t, 57.3 * x, t[1000:5000] + 1.7e6, x[1000:5000], anywhere=True)
     assert found.seconds == pytest.approx(1.7e6, abs=0.02)
     assert found.slope == pytest.approx(57.3, rel=1e-3)
 
 
 def test_level_axes_are_right_handed():
     for up in ([0, 0, 1.0], [0, -1.0, 0], [0.6, 0, 0.8]):
-        first, second = level_axes(np.array(up))
+        first, second = find_level_axes(np.array(up))
         assert np.cross(first, second) == pytest.approx(up)
 
 

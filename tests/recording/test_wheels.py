@@ -66,8 +66,8 @@ CUMULATIVE = 'metres_per_pulse = 0.1\npulses = "cumulative"\nsigned = true'
 )
 def test_pulses_become_the_same_way_however_they_were_counted(tmp_path: Path, count: Array, key: str) -> None:
     o = made(tmp_path, f"metres_per_pulse = 0.02\n{key}", "t,pulses", np.column_stack([T, count]))
-    assert o.way is not None
-    assert np.allclose(o.way, 0.02 * PULSES, atol=1e-6)
+    assert o.counted is not None
+    assert np.allclose(o.counted, 0.02 * PULSES, atol=1e-6)
     assert np.abs(o.speed - speed_at(T))[1:-1].max() < 0.02 / 0.1 + 0.01  # one pulse over two periods
     assert o.pulse == 0.02
 
@@ -75,8 +75,8 @@ def test_pulses_become_the_same_way_however_they_were_counted(tmp_path: Path, co
 def test_a_counter_that_counts_back_and_runs_over(tmp_path: Path) -> None:
     true = np.round(300.0 * np.sin(0.2 * T))  # forward and backward across both ends of the byte
     o = made(tmp_path, CUMULATIVE, "t,pulses", np.column_stack([T, np.mod(true, 256)]))
-    assert o.way is not None
-    assert np.allclose(o.way, 0.1 * (true - true[0]), atol=1e-6)
+    assert o.counted is not None
+    assert np.allclose(o.counted, 0.1 * (true - true[0]), atol=1e-6)
     assert o.signed
     assert o.speed.min() < -5.0
 
@@ -162,7 +162,7 @@ def test_the_sigma_of_a_mean_is_that_of_its_errors(rate: float) -> None:
         assert 0.85 < white < 1.15
         rounded, _ = errors_over_sigma(Odometer(t, np.round(noisy / 0.2) * 0.2), window)
         assert 0.6 < rounded < 1.15
-        counted, error = errors_over_sigma(Odometer(t, np.gradient(way, t), way=way, pulse=0.1), window)
+        counted, error = errors_over_sigma(Odometer(t, np.gradient(way, t), counted=way, pulse=0.1), window)
         assert 0.7 < counted < 1.1
         assert error < 0.1 / np.sqrt(6.0) / window * 1.1
         told, _ = errors_over_sigma(Odometer(t, per_row), window)

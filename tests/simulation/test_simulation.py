@@ -483,11 +483,13 @@ def test_the_folder_holds_the_recording(name: str, tmp_path: Path) -> None:
 def test_counts_and_wheels_are_written_too(tmp_path: Path) -> None:
     t = np.arange(1.0, 60.0, 0.5)
     way = 0.25 * np.round(4.0 * t)
-    odometer = Odometer(t, 0 * t + 1.0, way=way, pulse=0.25, wheels=np.column_stack([0.9 + 0 * t] * 4), signed=False)
+    odometer = Odometer(
+        t, 0 * t + 1.0, counted=way, pulse=0.25, wheels=np.column_stack([0.9 + 0 * t] * 4), signed=False
+    )
     write_folder(replace(made("zhu2020").recording, odometer=odometer), tmp_path)
     again = read(tmp_path).odometer
     assert again is not None
-    np.testing.assert_allclose(np.diff(again.way), np.diff(way), atol=1e-9)
+    np.testing.assert_allclose(np.diff(again.counted), np.diff(way), atol=1e-9)
     assert (again.pulse, again.signed) == (0.25, False)
     np.testing.assert_array_equal(again.wheels, odometer.wheels)
 

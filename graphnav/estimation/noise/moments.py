@@ -30,7 +30,7 @@ from graphnav.core.state import DIM
 from graphnav.estimation.problem import ParameterChain, Problem
 from graphnav.estimation.solvers.linearise import linearise, shift, stepping
 from graphnav.estimation.solvers.passes import ForwardRecord, SmootherPass, values_of
-from graphnav.estimation.solvers.recursion import lag_covariances, row_covariances
+from graphnav.estimation.solvers.recursion import compute_lag_covariances, row_covariances
 
 
 @dataclass(frozen=True)
@@ -118,7 +118,9 @@ def lag_moments(
     at = problem.columns[chain.parameter.name]
     own = shift(at)
     k = stepping(chain, end)
-    cross = lag_covariances(k, at.start, at.stop, forward.P, forward.P_predicted, forward.F, forward.decay, smoothed.N)
+    cross = compute_lag_covariances(
+        k, at.start, at.stop, forward.P, forward.P_predicted, forward.F, forward.decay, smoothed.N
+    )
     c0, c1 = smoothed.values[k - 1, own], smoothed.values[k, own]
     variance = np.diagonal(smoothed.P[:, at, at], axis1=-2, axis2=-1)
     v0, v1 = variance[k - 1], variance[k]

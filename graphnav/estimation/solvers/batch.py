@@ -26,7 +26,7 @@ from graphnav.estimation.dense import dense
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import ParameterEstimate, Solution
 from graphnav.estimation.solvers.graph import Eliminated, LinearGraph
-from graphnav.estimation.solvers.passes import Progress, integrate_again, residual_record
+from graphnav.estimation.solvers.passes import Progress, integrate_again, record_residuals
 from graphnav.estimation.solvers.robust import REDESCENDING
 from graphnav.estimation.solvers.rows import (
     Iterate,
@@ -34,7 +34,7 @@ from graphnav.estimation.solvers.rows import (
     Rows,
     Step,
     Values,
-    column_norms,
+    compute_column_norms,
     cost,
     whiten,
 )
@@ -79,7 +79,7 @@ def batch(
     done = time.perf_counter()
     points, records = point.points(problem), {}
     for constraint in problem.constraints:
-        record = records[constraint.name] = residual_record(problem, constraint, points, robust=True)
+        record = records[constraint.name] = record_residuals(problem, constraint, points, robust=True)
         if constraint.robust != "none" and np.mean(record.weight < 0.1) > 0.5:
             notes.append(
                 Note(
@@ -123,7 +123,7 @@ def _graduate(problem: Problem, point: Iterate) -> Iterator[Problem]:
     points = point.points(problem)
     for c in problem.constraints:
         if c.robust == "gnc":
-            s2 = residual_record(problem, c, points).nis * (1.0 if c.weight is None else c.weight)
+            s2 = record_residuals(problem, c, points).nis * (1.0 if c.weight is None else c.weight)
             if np.max(s2) > c.robust_scale**2:
                 mu[c.name] = float(1.0 / (2.0 * float(np.max(s2)) / c.robust_scale**2 - 1.0))
     while mu and min(mu.values()) < _SHARP:
@@ -205,7 +205,7 @@ def _minimise(
 
 def solve_rows(rows: Rows, layout: Layout, damping: float = 0.0) -> tuple[Eliminated, Step, float]:
     """The rows eliminated, the step that leads to their optimum, and by how much they fall on the way."""
-    graph, size = LinearGraph(), np.sqrt(damping) * column_norms(rows, layout) if damping else None
+    graph, size = LinearGraph(), np.sqrt(damping) * compute_column_norms(rows, layout) if damping else None
     for blocks, b in rows:
         graph.add(blocks, b)
     if size is not None:

@@ -10,7 +10,7 @@ import numpy as np
 
 from graphnav.core.rotation import Array
 from graphnav.estimation.solvers.linearise import Points
-from graphnav.estimation.solvers.recursion import gain, update
+from graphnav.estimation.solvers.recursion import compute_gain, update
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ def hold(one: Decision | None, x: Any, P: Array, where: Any) -> tuple[Any, Array
     if not len(one.residual):
         return x, P
     HP, variance = one.H @ P, one.sigma**2
-    _, _, Kt = gain(HP, HP @ one.H.T, variance, one.residual)
+    _, _, Kt = compute_gain(HP, HP @ one.H.T, variance, one.residual)
     P, d = update(P, HP, one.H, Kt, variance), -(one.residual @ Kt)
     if isinstance(x, np.ndarray):
         return x + d, P

@@ -175,7 +175,7 @@ def _forward(
     assert state is not None
     x: Any = Estimate(state, np.concatenate([np.empty(0), *(c.mean[0] for c in problem.chains)]))
     if about is not None:
-        x = own.minus(x, _one(about, 0))
+        x = own.minus(x, _step(about, 0))
     P = np.diag(np.concatenate([problem.prior.sigma[0], *(c.sigma[0] for c in problem.chains)]) ** 2)
     records = stack.records
     watched = [c for c in fixes if c.watched]
@@ -279,13 +279,13 @@ def _anywhere(P: Array, block: str) -> Array:
     return P
 
 
-def _one(points: Points, k: int) -> Estimate:
+def _step(points: Points, k: int) -> Estimate:
     return Estimate(points.states[k : k + 1], points.values[k])
 
 
 def _leave_points(about: Points, own: AtEstimate, all_P: Array, n: int, e: Array) -> tuple[Estimate, Array]:
     """The estimate after the last of n given points, and its covariance, also in its place, by the error e there."""
-    at = _one(about, n - 1)
+    at = _step(about, n - 1)
     x = own.plus(at, e)
     all_P[n - 1] = own.carry(all_P[n - 1], at, x)
     return x, all_P[n - 1]

@@ -8,7 +8,7 @@ import numpy as np
 
 from graphnav.core.errors import EstimationError
 from graphnav.core.rotation import Array
-from graphnav.estimation.solvers.recursion import gain
+from graphnav.estimation.solvers.recursion import compute_gain
 from graphnav.estimation.solvers.robust import PASSES, soften, weight_and_cost
 from graphnav.estimation.solvers.stack import NONE, Innovations, RowBlock
 
@@ -31,7 +31,7 @@ def solve_innovation(HP: Array, HPHt: Array, variance: Array, r: Array, some: Ro
         If S is not positive definite.
     """
     try:
-        return gain(HP, HPHt, variance, r)
+        return compute_gain(HP, HPHt, variance, r)
     except np.linalg.LinAlgError:
         raise describe_breakdown(some) from None
 

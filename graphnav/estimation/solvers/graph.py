@@ -23,7 +23,7 @@ _SUMS = 1 << 60  # keys of variables that are eliminated before anybody sees the
 Blocks = Sequence[tuple[Array, Array]]  # (keys (N,), A (N, m, k)) per variable a factor touches
 
 
-def jacobian_factor(blocks: Sequence[tuple[int, Array]], b: Array) -> gtsam.JacobianFactor:
+def make_jacobian_factor(blocks: Sequence[tuple[int, Array]], b: Array) -> gtsam.JacobianFactor:
     """Whitened rows: the sum of A d[key] over the blocks (key, A) is b.
 
     GTSAM's constructors know up to three variables. More come in as sums of two: variables s with A d + B e = s
@@ -71,7 +71,7 @@ class LinearGraph:
             return
         for i in range(n):
             rows = [(k[i], A[i]) for k, A in zip(keys, columns, strict=True)]
-            push(jacobian_factor(rows, b[i]))
+            push(make_jacobian_factor(rows, b[i]))
 
     def eliminate(self, order: Sequence[int]) -> Eliminated:
         """Eliminate the variables in this order."""

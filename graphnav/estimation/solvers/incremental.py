@@ -19,11 +19,11 @@ from graphnav.core.state import DIM, States
 from graphnav.estimation.dense import dense
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import Solution
-from graphnav.estimation.solvers.linearise import Points, node_steps, scale_at, shift
-from graphnav.estimation.solvers.passes import Progress, parameters_of, residual_record
-from graphnav.estimation.solvers.rows import cost_at
+from graphnav.estimation.solvers.linearise import Points, list_node_steps, scale_at, shift
+from graphnav.estimation.solvers.passes import Progress, parameters_of, record_residuals
+from graphnav.estimation.solvers.rows import compute_cost_at
 from graphnav.estimation.solvers.stages import Message, Place
-from graphnav.estimation.solvers.window import SettledStates, Window, first_message, turn_limit
+from graphnav.estimation.solvers.window import SettledStates, Window, compute_turn_limit, make_first_message
 
 _PORTIONS = 8  # of the lag: keyframes settle in groups this long
 FINE = 0.02  # of the usual limits, within which what is left at the end is converged
@@ -101,21 +101,21 @@ def incremental(
     lag : s, see `Incremental`.
     start : one state to begin at, where that is not the prior's mean.
     """
-    window = Window(begin_at(problem, start), turn_limit(problem.imu_noise))
+    window = Window(begin_at(problem, start), compute_turn_limit(problem.imu_noise))
     return replay(problem, "incremental", Incremental(window, lag), lag, progress)
 
 
 def begin_at(problem: Problem, start: States | None) -> Message:
     """The prior of a problem, about its mean or one state to begin at."""
     assert problem.prior.mean is not None
-    message = first_message(problem.prior.mean, problem.prior.sigma[0])
+    message = make_first_message(problem.prior.mean, problem.prior.sigma[0])
     return message if start is None else message.moved(start.minus(problem.prior.mean)[0])
 
 
 def replay(problem: Problem, solver: str, engine: Engine, lag: float, progress: Progress | None) -> Replay:
     """Have all keyframes of a problem added in turn, and what is found as solutions."""
     began = time.perf_counter()
-    K, steps = len(problem.t), node_steps(problem)
+    K, steps = len(problem.t), list_node_steps(problem)
     points, P, seconds = [], np.empty((K, DIM, DIM)), np.empty(K)
     for k in range(K):
         before = time.thread_time()
@@ -135,7 +135,7 @@ def replay(problem: Problem, solver: str, engine: Engine, lag: float, progress: 
     states = States.stack([part.states for part in parts])
     covariance = np.concatenate([part.covariance for part in parts])
     at = Points(states, values)
-    records = {rows.name: residual_record(problem, rows, at, robust=True) for rows in problem.constraints}
+    records = {rows.name: record_residuals(problem, rows, at, robust=True) for rows in problem.constraints}
     whole = "all there was" if np.isinf(lag) else f"{lag:g} s of the future, or all there was"
     settled = Solution(
         solver=solver,
@@ -147,7 +147,7 @@ def replay(problem: Problem, solver: str, engine: Engine, lag: float, progress: 
         records=records,
         counts={"initial_prior": 1, "imu": K - 1, **{c.name: len(c) for c in problem.constraints}},
         iterations=1,
-        cost=cost_at(problem, at),
+        cost=compute_cost_at(problem, at),
         stopped=f"every keyframe settled with {whole}",
         timings={solver: elapsed},
         notes=(

@@ -17,8 +17,8 @@ from graphnav.estimation.solvers.incremental import FINE, Replay, are_due, begin
 from graphnav.estimation.solvers.passes import Progress
 from graphnav.estimation.solvers.stages import Message, Place
 from graphnav.estimation.solvers.tree import Tree
-from graphnav.estimation.solvers.tree_marginals import Leaving, newest_covariance
-from graphnav.estimation.solvers.window import SettledStates, turn_limit
+from graphnav.estimation.solvers.tree_marginals import Leaving, compute_newest_covariance
+from graphnav.estimation.solvers.window import SettledStates, compute_turn_limit
 
 _SKIP = 10  # keyframes between two looks at what has moved, as GTSAM's relinearizeSkip, at least
 _GROWN = 8  # what a look takes goes with the keyframes there: it comes when there are this part more of them
@@ -37,7 +37,7 @@ class TreeSmoother:
     """
 
     def __init__(self, prior: Message, problem: Problem, lag: float) -> None:
-        self.tree, self.lag = Tree(prior, turn_limit(problem.imu_noise)), lag
+        self.tree, self.lag = Tree(prior, compute_turn_limit(problem.imu_noise)), lag
         self.settled: list[SettledStates] = []
         self._problem = problem
         self._look = _SKIP  # the keyframe at which to look next at what has moved
@@ -62,7 +62,7 @@ class TreeSmoother:
             count = int(np.searchsorted(self._problem.t[: place.k], place.t - self.lag)) - oldest.k
             self._leaving = Leaving(tree, count)
             self._portion = 1 + _SHARE * self._leaving.left // count
-        return tree.newest, newest_covariance(tree)
+        return tree.newest, compute_newest_covariance(tree)
 
     def finish(self, problem: Problem) -> tuple[Problem, int]:
         """As of `Engine`."""

@@ -34,7 +34,8 @@ class Points:
     def nodes(self, problem: Problem) -> dict[str, Array]:
         """(n, k) per parameter: the value of each node after the last keyframe that it governs."""
         return {
-            c.parameter.name: self.values[last_of(c), shift(problem.columns[c.parameter.name])] for c in problem.chains
+            c.parameter.name: self.values[find_last_keyframes(c), shift(problem.columns[c.parameter.name])]
+            for c in problem.chains
         }
 
 
@@ -119,7 +120,7 @@ def advance(problem: Problem, n: int) -> Advance:
     return out
 
 
-def node_steps(problem: Problem) -> dict[int, tuple[Step, ...]]:
+def list_node_steps(problem: Problem) -> dict[int, tuple[Step, ...]]:
     """The parameters that begin or move on to their next node, by keyframe."""
     out: dict[int, list[Step]] = {}
     for chain in problem.chains:
@@ -174,7 +175,7 @@ def shift(columns: slice) -> slice:
     return slice(columns.start - DIM, columns.stop - DIM)
 
 
-def last_of(chain: ParameterChain) -> Array:
+def find_last_keyframes(chain: ParameterChain) -> Array:
     """(n,) the last keyframe that each node governs."""
     return np.searchsorted(chain.node, np.arange(len(chain.t)), side="right") - 1
 

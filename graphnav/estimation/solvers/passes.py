@@ -13,7 +13,7 @@ from graphnav.core.state import DIM, States
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import ConstraintRecord, ParameterEstimate, Solution
 from graphnav.estimation.solvers.invariant import plus_invariant
-from graphnav.estimation.solvers.linearise import Points, last_of, linearise, shift
+from graphnav.estimation.solvers.linearise import Points, find_last_keyframes, linearise, shift
 from graphnav.estimation.solvers.recursion import solve
 from graphnav.estimation.solvers.robust import weight_and_cost
 from graphnav.estimation.solvers.stack import Blocks, Innovations, RowBlock
@@ -136,7 +136,7 @@ def points_of(problem: Problem, states: States, known: dict[str, Array]) -> Poin
     return Points(states, np.concatenate([np.empty((len(states), 0)), *values], axis=1))
 
 
-def residual_record(problem: Problem, rows: Constraint, points: Points, robust: bool = False) -> ConstraintRecord:
+def record_residuals(problem: Problem, rows: Constraint, points: Points, robust: bool = False) -> ConstraintRecord:
     """What is left of a constraint at the solution; `robust` has the kernel's weights in the rows'."""
     linear = linearise(rows, points, problem.columns)
     nis = np.sum((linear.residual / linear.stated) ** 2, axis=-1)
@@ -179,7 +179,7 @@ def parameters_of(problem: Problem, values: Array, sigma: Array) -> dict[str, Pa
     for chain in problem.chains:
         if not chain.parameter.listed:
             continue
-        p, at, last = chain.parameter, shift(problem.columns[chain.parameter.name]), last_of(chain)
+        p, at, last = chain.parameter, shift(problem.columns[chain.parameter.name]), find_last_keyframes(chain)
         out[p.name] = ParameterEstimate(chain.t, values[last, at], sigma[last, at], p.prior_sigma, p.unit)
     return out
 

@@ -88,7 +88,7 @@ def solve(L: Array, X: Array) -> None:
 
 
 @compiled
-def gain(HP: Array, HPHt: Array, variance: Array, r: Array) -> tuple[Array, Array, Array]:
+def compute_gain(HP: Array, HPHt: Array, variance: Array, r: Array) -> tuple[Array, Array, Array]:
     """The lower root (m, m) of S = H P H^T + R, S^-1 r, and the gain transposed (m, D)."""
     m, D = HP.shape
     S = HPHt.copy()
@@ -166,7 +166,7 @@ def filter_rows(
             own, R = H[k, lo:hi], variance[k, lo:hi]
             HP = np.dot(own, P)
             left = r[k, lo:hi] + np.dot(own, e)
-            L, w_b, Kt_b = gain(HP, np.dot(HP, own.T), R, left)
+            L, w_b, Kt_b = compute_gain(HP, np.dot(HP, own.T), R, left)
             np.positive(w_b, solved[k, lo:hi])
             np.positive(L, root[k, lo:hi, lo:hi])
             if used[b]:
@@ -245,7 +245,7 @@ def smooth_rows(
 
 
 @compiled
-def lag_covariances(
+def compute_lag_covariances(
     k: Array, begin: int, end: int, P: Array, P_predicted: Array, F: Array, decay: Array, N: Array
 ) -> Array:
     """(n, end - begin) smoothed covariances of error states `begin` to `end` at keyframes k - 1 and k (n,).

@@ -13,7 +13,7 @@ import numpy as np
 from graphnav.core.rotation import Array, mv
 from graphnav.core.state import DIM, States
 from graphnav.estimation.problem import ParameterChain, Problem
-from graphnav.estimation.solvers.linearise import Points, last_of, linearise, linearise_links
+from graphnav.estimation.solvers.linearise import Points, find_last_keyframes, linearise, linearise_links
 from graphnav.imu.dynamics import SCALE
 
 _FEW = 6  # blocks of rows, which all of them touch
@@ -79,7 +79,7 @@ class Layout:
             self.groups.append(group)
             self.group_of |= dict.fromkeys(columns, group)
             self.width += [at] * n
-            for j, last in enumerate(last_of(chains[0])):
+            for j, last in enumerate(find_last_keyframes(chains[0])):
                 after.setdefault(int(last), []).append(int(keys[j]))
         self.keys = range(len(self.width))
         self.order = [key for k in range(K) for key in (k, *after.get(k, ()))]
@@ -123,7 +123,7 @@ def whiten(problem: Problem, point: Iterate, layout: Layout) -> Rows:
         blocks = [(rows.keyframe, H[:, :, :DIM])]
         out += _touching(blocks + layout.parameter_blocks(rows.keyframe, weighted), -scale * linear.residual)
     for chain in problem.chains:
-        out += chain_rows(chain, layout.group_of[chain.parameter.name], point.values[chain.parameter.name])
+        out += linearise_chain(chain, layout.group_of[chain.parameter.name], point.values[chain.parameter.name])
     return out
 
 
@@ -148,17 +148,17 @@ def cost(problem: Problem, point: Iterate, layout: Layout) -> float:
     for rows in (problem.prior, *problem.constraints):
         total += float(np.sum(linearise(rows, points, problem.columns).kernel()[1]))
     for chain in problem.chains:
-        for _, b in chain_rows(chain, layout.group_of[chain.parameter.name], point.values[chain.parameter.name]):
+        for _, b in linearise_chain(chain, layout.group_of[chain.parameter.name], point.values[chain.parameter.name]):
             total += 0.5 * float(np.sum(b * b))
     return total
 
 
-def cost_at(problem: Problem, points: Points) -> float:
+def compute_cost_at(problem: Problem, points: Points) -> float:
     """`cost` at points of all keyframes."""
     return cost(problem, Iterate(points.states, points.nodes(problem)), Layout(problem))
 
 
-def column_norms(rows: Rows, layout: Layout) -> Array:
+def compute_column_norms(rows: Rows, layout: Layout) -> Array:
     """(keys, widest) root of the diagonal of A^T A."""
     total = np.zeros((len(layout.keys), max(layout.width)))
     for blocks, _ in rows:
@@ -167,7 +167,7 @@ def column_norms(rows: Rows, layout: Layout) -> Array:
     return np.sqrt(total)
 
 
-def chain_rows(chain: ParameterChain, group: _Group, value: Array) -> Rows:
+def linearise_chain(chain: ParameterChain, group: _Group, value: Array) -> Rows:
     """The prior on a parameter's first node and its way from node to node."""
     pick = np.eye(group.width)[group.columns[chain.parameter.name]]  # (k, width)
     keys, off = group.keys, value - chain.mean

@@ -36,7 +36,7 @@ from graphnav.estimation.solvers.passes import (
     Updates,
     move_points,
     parameters_of,
-    residual_record,
+    record_residuals,
     sigmas_of,
 )
 from graphnav.estimation.solvers.recursion import STRETCH, move, smooth_rows
@@ -61,7 +61,7 @@ def backward(problem: Problem, forward: ForwardRecord, progress: Progress | None
             ahead = forward.P_predicted[end]
             _, inverse, info = dposv(ahead, np.eye(D))
             if info:
-                raise _breakdown(problem, end)
+                raise _explain_breakdown(problem, end)
             r[end], N[end] = inverse @ away, inverse @ (ahead - P[end]) @ inverse
         errors = np.empty((end, D))
         if forward.updates is not None:
@@ -85,7 +85,7 @@ def _smooth_filtered(
             Pp, at, ahead = forward.P_predicted[k + 1], slice(k, k + 1), slice(k + 1, k + 2)
             _, gain, info = dposv(Pp, move(forward.F[k], forward.decay[k], forward.P[k]))
             if info:
-                raise _breakdown(problem, k)
+                raise _explain_breakdown(problem, k)
             C = gain.T
             d = C @ np.concatenate([state.minus(before.states[ahead])[0], values - before.values[k + 1]])
             state, values = forward.states[at].plus(d[None, :DIM]), forward.values[k] + d[DIM:]
@@ -137,7 +137,7 @@ def _restore_digits(forward: ForwardRecord, P: Array, end: int) -> None:
         P[k] = 0.5 * (smoothed + smoothed.T)
 
 
-def _breakdown(problem: Problem, k: int) -> EstimationError:
+def _explain_breakdown(problem: Problem, k: int) -> EstimationError:
     sentence = f"the smoother's covariance broke down at {problem.t[k]:.3f} s: check the sigmas"
     return EstimationError(sentence, key="solver.breakdown")
 
@@ -147,7 +147,7 @@ def rts(problem: Problem, forward: FilterPass, found: SmootherPass | None = None
     began = time.perf_counter()
     found = found or backward(problem, forward)
     smoothed, all_values, all_P = found.states, found.values, found.P
-    records = {rows.name: residual_record(problem, rows, found) for rows in problem.constraints}
+    records = {rows.name: record_residuals(problem, rows, found) for rows in problem.constraints}
     covariance = all_P[:, :DIM, :DIM].copy()  # a view would hold what is known of the parameters too
     seconds = time.perf_counter() - began
     return Solution(

@@ -269,15 +269,15 @@ def predict_stage(before: Message, place: Place) -> tuple[States, Array, Columns
 
 
 def measure(place: Place, state: States, values: Array, columns: Columns, late: bool | None = None) -> Linear:
-    """The rows of a keyframe's measurements at a point, without a link; with `late` only those that `waits` says."""
+    """The rows of a keyframe's measurements at a point, without a link; with `late` those that enter last, or else."""
     assert place.problem is not None
     rows = place.problem.constraints
     if late is not None:
-        rows = tuple(c for c in rows if waits(c) == late)
+        rows = tuple(c for c in rows if enters_last(c) == late)
     return at_points([place], state, [values], columns, linked=False, rows=rows)[0]
 
 
-def waits(rows: Constraint) -> bool:
+def enters_last(rows: Constraint) -> bool:
     """Whether rows enter last: those that look ahead, and those whose weights an estimate tells."""
     return rows.looks_ahead or rows.robust != "none"
 

@@ -47,15 +47,15 @@ from graphnav.estimation.solvers.tree_nodes import (
     Keyframe,
     Made,
     Variable,
-    factor,
     fill_keys,
+    find_limits_of,
     fresh_isam,
-    interval_factor,
     is_constant,
-    limit_of,
+    make_factor,
+    make_interval_factor,
+    make_row_factor,
     read_estimates,
     read_factors,
-    row_factor,
     states_of,
     update_isam,
     write_factors,
@@ -129,11 +129,11 @@ class Tree:
                 node.point[own] = node.delta[own]
         made: list[Made] = []
         if link is None:
-            fresh.append((x, factor([(x, self._prior.R[:, :DIM])], self._prior.z)))
+            fresh.append((x, make_factor([(x, self._prior.R[:, :DIM])], self._prior.z)))
         else:
             fresh.append((x, None))
-            made.append((keyframe, LINK, interval_factor(self.keyframes[-1], x, link)))
-        made += [(keyframe, one.name, row_factor(keyframe, one, weighted=False)) for one in rows]
+            made.append((keyframe, LINK, make_interval_factor(self.keyframes[-1], x, link)))
+        made += [(keyframe, one.name, make_row_factor(keyframe, one, weighted=False)) for one in rows]
         self.keyframes.append(keyframe)
         # along time, where the order is free; CCOLAMD wants labels below the number of variables it is to order
         most = min(3, len({key for _, _, one in made for key in list(one.keys())}) - 1)
@@ -154,7 +154,7 @@ class Tree:
         if prior.columns:
             node = self._variable(prior.values, np.ones(len(prior.values)), place.t)
             fresh.append((node, None))
-            node.limit = limit_of(prior.columns, place)
+            node.limit = find_limits_of(prior.columns, place)
             nodes = {name: (node, shift(at)) for name, at in prior.columns.items()}
             blocks.append((node, prior.R[:, DIM:]))
         assert place.problem is not None
@@ -165,7 +165,7 @@ class Tree:
         self._in_force = nodes
         before = Place(place.t, None)
         self.keyframes.append(Keyframe(self._number, before, x, prior.state, prior.columns, nodes, {}))
-        update_isam(self.isam, place.t, fresh=[*fresh, (x, factor(blocks, prior.z))])
+        update_isam(self.isam, place.t, fresh=[*fresh, (x, make_factor(blocks, prior.z))])
         self._number += 1
         self._held = 1
         self.keyframes[0].read(self.isam)
@@ -204,7 +204,7 @@ class Tree:
             widths = [len(s.mean) for s in own_steps]
             edge = np.concatenate([[0], np.cumsum(widths)])
             node = self._variable(np.zeros(edge[-1]), np.ones(edge[-1]), place.t)
-            node.limit = limit_of(append_columns({}, own_steps), place)
+            node.limit = find_limits_of(append_columns({}, own_steps), place)
             old = self.variables.get(old_key)
             own_A, old_A = np.zeros((edge[-1], edge[-1])), np.zeros((edge[-1], 0 if old is None else len(old.unit)))
             for step, lo, hi in zip(own_steps, edge[:-1], edge[1:], strict=True):
@@ -219,7 +219,7 @@ class Tree:
                     old_A[at, was] = -step.decay * own_A[at, at]
                 in_force[step.name] = node, at
             blocks = [(node, own_A)] + ([(old, old_A)] if old is not None and old_A.any() else [])
-            fresh.append((node, factor(blocks, np.zeros(edge[-1]))))
+            fresh.append((node, make_factor(blocks, np.zeros(edge[-1]))))
         self._in_force = in_force
         return in_force
 
@@ -301,12 +301,14 @@ class Tree:
                 keyframe = self.keyframes[i]
                 if i in links:
                     assert linear.link is not None
-                    made.append((keyframe, LINK, interval_factor(self.keyframes[i - 1], keyframe.state, linear.link)))
+                    made.append(
+                        (keyframe, LINK, make_interval_factor(self.keyframes[i - 1], keyframe.state, linear.link))
+                    )
                     gone += keyframe.slots.pop(LINK)
                 if i in rows:
                     for one in linear.measured:
                         if one.name in keyframe.slots:
-                            made.append((keyframe, one.name, row_factor(keyframe, one, weighted=True)))
+                            made.append((keyframe, one.name, make_row_factor(keyframe, one, weighted=True)))
                             gone += keyframe.slots.pop(one.name)
         for i in rows:
             x = self.keyframes[i].state

@@ -24,18 +24,18 @@ from graphnav.estimation.solvers.window import SettledStates
 _AT_ONCE = 45  # variables: GTSAM's bookkeeping of one elimination grows faster than what it eliminates
 
 
-def newest_covariance(tree: Tree) -> Array:
+def compute_newest_covariance(tree: Tree) -> Array:
     """(15, 15) of the newest state."""
     last = tree.keyframes[-1]
     x = last.state
     try:
         found = tree.isam.marginalCovariance(x.key)
     except RuntimeError:
-        raise _undetermined(last.place.t) from None
+        raise _explain_undetermined(last.place.t) from None
     return move_covariance((x.unit[:, None] * found * x.unit)[None], x.delta[None])[0]
 
 
-def newest_root(tree: Tree, columns: Columns) -> Array:
+def compute_newest_root(tree: Tree, columns: Columns) -> Array:
     """(D, D) R, a triangle: R e are the whitened errors of the newest keyframe and its parameters."""
     last = tree.keyframes[-1]
     D = DIM + len(last.values)
@@ -133,13 +133,13 @@ class Leaving:
             while not self.step(_AT_ONCE):
                 pass
         except RuntimeError:  # GTSAM's for a variable that nothing determines
-            raise _undetermined(self._keyframes[0].place.t) from None
+            raise _explain_undetermined(self._keyframes[0].place.t) from None
         assert self._net is not None
         found = Eliminated(self._net).covariances()
         return {x.key: x.unit[:, None] * found[x.key] * x.unit for x in self._own}
 
 
-def _undetermined(t: float) -> EstimationError:
+def _explain_undetermined(t: float) -> EstimationError:
     return EstimationError(
         f"the data leave something undetermined at {t:.3f} s: there is no covariance", key="solver.undetermined"
     )

@@ -13,11 +13,11 @@ from graphnav.core import rotation
 from graphnav.core.errors import EstimationError
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, States
-from graphnav.estimation.solvers.graph import jacobian_factor
+from graphnav.estimation.solvers.graph import make_jacobian_factor
 from graphnav.estimation.solvers.linearise import Columns, shift
 from graphnav.estimation.solvers.stages import Measured, Place
 from graphnav.estimation.solvers.stages import rotate_columns as turned_by
-from graphnav.estimation.solvers.window import limits
+from graphnav.estimation.solvers.window import find_limits
 
 LINK = "imu"  # among the constraints of a keyframe: the interval before it
 _WILDFIRE = np.inf  # what the newest keyframe changes of older ones is passed on when they are read
@@ -152,17 +152,17 @@ def fill_keys(out: Any, variables: Iterable[Variable]) -> Any:
     return out
 
 
-def factor(blocks: Sequence[tuple[Variable, Array]], b: Array) -> Any:
+def make_factor(blocks: Sequence[tuple[Variable, Array]], b: Array) -> Any:
     """Whitened rows A e = b as a factor of the tree."""
-    return gtsam.LinearContainerFactor(jacobian_factor([(x.key, A * x.unit) for x, A in blocks], b))
+    return gtsam.LinearContainerFactor(make_jacobian_factor([(x.key, A * x.unit) for x, A in blocks], b))
 
 
-def interval_factor(last: Keyframe, x: Variable, link: Array) -> Any:
+def make_interval_factor(last: Keyframe, x: Variable, link: Array) -> Any:
     """A factor of an interval's whitened rows (15, 15 + D + 1), from the keyframe before to a state."""
     return _about(last, [(last.state, link[:, :DIM]), (x, link[:, DIM : 2 * DIM])], link[:, DIM:-1], link[:, -1])
 
 
-def row_factor(keyframe: Keyframe, one: Measured, weighted: bool) -> Any:
+def make_row_factor(keyframe: Keyframe, one: Measured, weighted: bool) -> Any:
     """A factor of measurements linearised where keyframe and parameters are now."""
     H, b, _ = one.weighted(np.zeros(one.H.shape[-1]), int(weighted))
     H = H.reshape(-1, H.shape[-1])
@@ -186,7 +186,7 @@ def _about(keyframe: Keyframe, blocks: list[tuple[Variable, Array]], H: Array, b
         _, A = touched.setdefault(node.key, (node, np.zeros((len(b), len(node.unit)))))
         A[:, own] = H[:, at]
         b = b + H[:, at] @ node.delta[own]
-    return factor([*blocks, *touched.values()], b)
+    return make_factor([*blocks, *touched.values()], b)
 
 
 def states_of(keyframes: Sequence[Keyframe]) -> States:
@@ -200,10 +200,10 @@ def is_constant(place: Place, name: str) -> bool:
     return p is not None and p.constant
 
 
-def limit_of(columns: Columns, place: Place) -> Array:
+def find_limits_of(columns: Columns, place: Place) -> Array:
     """How far parameters of a node may move, empty where nothing limits any of them."""
     assert place.problem is not None
-    found = limits(columns, {name: p.unit for name, p in place.problem.parameters.items()})[1]
+    found = find_limits(columns, {name: p.unit for name, p in place.problem.parameters.items()})[1]
     return found if np.isfinite(found).any() else np.zeros(0)
 
 

@@ -18,7 +18,7 @@ from graphnav.estimation.solvers.elimination import Predicted
 from graphnav.estimation.solvers.revision import Renewed, Renewing
 from graphnav.estimation.solvers.stages import Message, Place
 from graphnav.estimation.solvers.tree import Tree
-from graphnav.estimation.solvers.tree_marginals import Leaving, newest_root
+from graphnav.estimation.solvers.tree_marginals import Leaving, compute_newest_root
 from graphnav.estimation.solvers.window import SettledStates, Window
 
 _ROUNDS = 5
@@ -52,7 +52,7 @@ class TreeWindow(Window):
         e = np.concatenate([now.state.minus(stage.message.state)[0], now.values - stage.message.values])
         moved = stage.moved(e)
         message = moved.message
-        R, tests = newest_root(self.tree, message.columns) if full else message.R, message.tests
+        R, tests = compute_newest_root(self.tree, message.columns) if full else message.R, message.tests
         message = Message.of(message.state, message.values, message.columns, R, np.zeros(len(R)), tests)
         self.stages[-1] = replace(moved, message=message)
         self._means = None

@@ -32,7 +32,7 @@ from graphnav.estimation.solvers.stages import (
     predict_stage,
     width,
 )
-from graphnav.estimation.solvers.turning import covariance_turning, split_turn
+from graphnav.estimation.solvers.turning import split_turn, turn_covariance
 from graphnav.estimation.solvers.watch import Watch
 from graphnav.recording import ImuNoise
 
@@ -86,8 +86,8 @@ class Window:
 
     Parameters
     ----------
-    prior : message on the first keyframe before any measurement, from `first_message`.
-    turn : rad that an attitude may move before rows are linearised anew, from `turn_limit`.
+    prior : message on the first keyframe before any measurement, from `make_first_message`.
+    turn : rad that an attitude may move before rows are linearised anew, from `compute_turn_limit`.
     """
 
     def __init__(self, prior: Message, turn: float) -> None:
@@ -95,7 +95,7 @@ class Window:
         self.head = prior  # all that is known before the first stage
         self.stages: list[Stage] = []
         self.relinearized = 0  # stages made anew
-        self._limit = limits(prior.columns, {})
+        self._limit = find_limits(prior.columns, {})
         self._covariances: _Covariances | None = None  # of stages that are to leave
         self._means: list[Array] | None = None
         self._moved: Array | None = None  # `_moves`, of these
@@ -142,7 +142,7 @@ class Window:
         self._means = None
         if columns != self._limit[0]:
             assert place.problem is not None
-            self._limit = limits(columns, {name: p.unit for name, p in place.problem.parameters.items()})
+            self._limit = find_limits(columns, {name: p.unit for name, p in place.problem.parameters.items()})
         turn = split_turn(stage.message.state, e[None])[1][0] if turns else e
         return float(np.linalg.norm(turn[:3]))
 
@@ -226,7 +226,7 @@ class Window:
         states = self.head.state[:0]
         if gone:
             moved, states, turns = np.array([e[:DIM] for e in means]), States.stack(rows), gone[-1].message.turns
-            covariance = covariance_turning(covariance, states, moved) if turns else move_covariance(covariance, moved)
+            covariance = turn_covariance(covariance, states, moved) if turns else move_covariance(covariance, moved)
             states = plus(states, moved, turns)
             self.head = gone[-1].message
             del self.stages[:count]
@@ -318,7 +318,7 @@ class Window:
         return True
 
 
-def turn_limit(noise: ImuNoise) -> float:
+def compute_turn_limit(noise: ImuNoise) -> float:
     """How far an attitude may move (rad) before rows are linearised anew.
 
     What is neglected of a turn a is a^2/2 of the force it turns: in a second a^2/2 g, against the noise.
@@ -326,12 +326,12 @@ def turn_limit(noise: ImuNoise) -> float:
     return float(np.clip(np.sqrt(2.0 * _SHARE * noise.accel_noise_density / _G), 3e-4, 1e-2))
 
 
-def first_message(state: States, sigma: Array, turns: bool = False) -> Message:
+def make_first_message(state: States, sigma: Array, turns: bool = False) -> Message:
     """A prior: one state and its fifteen sigmas; `turns` as of `Message`."""
     return Message.of(state, np.zeros(0), {}, np.diag(1.0 / sigma), np.zeros(DIM), turns=turns)
 
 
-def limits(columns: Columns, units: dict[str, str]) -> tuple[Columns, Array]:
+def find_limits(columns: Columns, units: dict[str, str]) -> tuple[Columns, Array]:
     """How far each parameter may move before rows are linearised anew."""
     limit = np.full(width(columns) - DIM, np.inf)
     for name, at in columns.items():
@@ -339,4 +339,4 @@ def limits(columns: Columns, units: dict[str, str]) -> tuple[Columns, Array]:
     return columns, limit
 
 
-__all__ = ["Message", "Place", "SettledStates", "Window", "append_columns", "first_message"]
+__all__ = ["Message", "Place", "SettledStates", "Window", "append_columns", "make_first_message"]

@@ -24,12 +24,12 @@ _NO_BETTER = 0.05  # of a correlation
 _MIN_SPEED = 5.0  # m/s, at which wheels are compared
 
 
-def overlap_s(recording: Recording) -> float:
+def measure_overlap(recording: Recording) -> float:
     t = recording.gnss.t  # type: ignore[union-attr]
     return float(min(t[-1], recording.end) - max(t[0], recording.start))
 
 
-def gnss_apart(recording: Recording) -> str | None:
+def describe_gnss_apart(recording: Recording) -> str | None:
     """That GNSS and IMU share no time, and what may mend it; None if they do."""
     gnss, raw = recording.gnss, recording.raw_gnss
     own = gnss is not None and not gnss.derived  # fixes of a receiver, in place of which no observations are used
@@ -46,7 +46,7 @@ def gnss_apart(recording: Recording) -> str | None:
         near = f", {abs(weeks)} week(s) too {'late' if weeks > 0 else 'early'}" if weeks else ""
         return f"{apart}: the observations' times are GPS time, so what clock says of the IMU's t = 0 is wrong{near}"
     known = between_clocks(recording.start, recording.gps_zero, float(t[0]), None)
-    if (unit := _unit_of_stamps(t, recording)) is not None:
+    if (unit := _guess_stamp_unit(t, recording)) is not None:
         return f'{apart}: the stamps of the fixes are in {unit}; say units = {{ t = "{unit}" }} in [gnss]'
     left = t[0] + known.offset - recording.start if known is not None else np.inf
     if known is not None and abs(left) < NEAR:
@@ -61,7 +61,7 @@ def gnss_apart(recording: Recording) -> str | None:
     return f"{apart}; if their clocks differ, say time_offset in [gnss] ({offset:.3f} would start both together){local}"
 
 
-def _unit_of_stamps(t: Array, recording: Recording) -> str | None:
+def _guess_stamp_unit(t: Array, recording: Recording) -> str | None:
     """The unit in which stamps would lie within the recording, where they do not in s."""
     for unit, scale in TIME.items():
         inside = (scale * t > recording.start) & (scale * t < recording.end)
@@ -73,7 +73,7 @@ def _unit_of_stamps(t: Array, recording: Recording) -> str | None:
 def check_gnss_coverage(recording: Recording) -> Iterator[Finding]:
     gnss = recording.gnss
     assert gnss is not None
-    if (sentence := gnss_apart(recording)) is not None:
+    if (sentence := describe_gnss_apart(recording)) is not None:
         yield Finding("warning", sentence, "gnss.clock")
         return
     for late, what in ((gnss.t[0] - recording.start, "starts"), (recording.end - gnss.t[-1], "ends")):
@@ -101,7 +101,7 @@ def check_gnss_jumps(recording: Recording, track: Track | None) -> Iterator[Find
     assert gnss is not None
     if track is None or len(gnss.t) < 5:
         return
-    p, dt = crosschecks.local_positions(gnss)[:, :2], np.diff(gnss.t)
+    p, dt = crosschecks.compute_local_positions(gnss)[:, :2], np.diff(gnss.t)
     sd = np.hypot(gnss.sd[:, 0], gnss.sd[:, 1])
     near = dt < 3.5 * track.period
     if gnss.v is not None and not track.width.any():
@@ -164,32 +164,34 @@ def check_imu_axes(imu: Imu, forward: Fit | None, track: Track | None) -> Iterat
     if up[2] > 0.8 and (forward is None or forward.correlation < 0.7):
         return
     if forward is None or forward.correlation < 0.7:
-        yield Finding("warning", f"the mean force points {_direction(up)}, not up: are the axes right?", "imu.up")
+        yield Finding(
+            "warning", f"the mean force points {_describe_direction(up)}, not up: are the axes right?", "imu.up"
+        )
         return
     ahead = forward.coefficients / np.linalg.norm(forward.coefficients)
     if up[2] > 0.8 and ahead[1] > 0.7:
         return
-    along = crosschecks.along_fit(imu, track) if up[2] > 0.8 and track is not None else None
+    along = crosschecks.fit_along(imu, track) if up[2] > 0.8 and track is not None else None
     # what is proposed explains no more than what is stated: few changes of speed, and none across, tell no direction
     if along is not None and along.coefficients[0] > 0.5 and along.correlation > forward.correlation - _NO_BETTER:
         return
-    letters = _letters(imu.R_bs, ahead, up)
+    letters = _write_letters(imu.R_bs, ahead, up)
     hint = f'; axes = "{letters}" would agree' if letters else ""
     yield Finding(
         "warning",
-        f"the axes contradict the drive: forward by the GNSS speed is {_direction(ahead)}, up by gravity is "
-        f"{_direction(up)} in the axes stated{hint}",
+        f"the axes contradict the drive: forward by the GNSS speed is {_describe_direction(ahead)}, up by gravity is "
+        f"{_describe_direction(up)} in the axes stated{hint}",
         "imu.axes",
     )
 
 
-def _direction(v: Array) -> str:
+def _describe_direction(v: Array) -> str:
     names = (("left", "right"), ("backward", "forward"), ("down", "up"))
     k = int(np.argmax(np.abs(v)))
     return names[k][int(v[k] > 0)]
 
 
-def _letters(R_bs: Array, forward: Array, up: Array) -> str | None:
+def _write_letters(R_bs: Array, forward: Array, up: Array) -> str | None:
     """The three letters under which `forward` and `up` (body axes as loaded) would be so; None if none clearly does."""
     f, u = R_bs.T @ forward, R_bs.T @ up  # in the file's axes
     if np.abs(f).max() < 0.8 or np.abs(u).max() < 0.8 or np.argmax(np.abs(f)) == np.argmax(np.abs(u)):
@@ -269,10 +271,10 @@ def check_odometer_readings(recording: Recording, facts: dict[str, Any]) -> Iter
             f"odometer.{reason.replace(' ', '_')}",
         )
     if odometer.wheels is not None:
-        yield from _wheels_apart(odometer, recording.imu)
+        yield from _compare_wheels(odometer, recording.imu)
 
 
-def _wheels_apart(odometer: Odometer, imu: Imu) -> Iterator[Finding]:
+def _compare_wheels(odometer: Odometer, imu: Imu) -> Iterator[Finding]:
     """A wheel that is faster or slower than the others where the vehicle goes straight."""
     assert odometer.wheels is not None
     turn = imu.gyro @ crosschecks.find_up(imu)
@@ -296,16 +298,16 @@ def _wheels_apart(odometer: Odometer, imu: Imu) -> Iterator[Finding]:
             )
 
 
-def odometer_findings(recording: Recording, track: Track | None, facts: dict[str, Any]) -> Iterator[Finding]:
+def check_odometer(recording: Recording, track: Track | None, facts: dict[str, Any]) -> Iterator[Finding]:
     odometer = recording.odometer
     assert odometer is not None
     if min(odometer.t[-1], recording.end) <= max(odometer.t[0], recording.start):
-        unit = _unit_of_stamps(odometer.t, recording)
+        unit = _guess_stamp_unit(odometer.t, recording)
         hint = f'; its stamps are in {unit}: say units = {{ t = "{unit}" }} in [odometer]' if unit else ""
         yield Finding("warning", f"odometer and IMU do not overlap in time{hint}", "odometer.clock")
         return
     yield from check_odometer_readings(recording, facts)
-    found = crosschecks.odometer_fit(odometer, track) if track is not None else None
+    found = crosschecks.fit_odometer(odometer, track) if track is not None else None
     if found is None:
         return
     fit, scale = found
@@ -336,7 +338,7 @@ def odometer_findings(recording: Recording, track: Track | None, facts: dict[str
                 "odometer.scale",
             )
     if abs(fit.lag) > 0.1 + 4.0 * fit.spread:
-        own = crosschecks.forward_fit(recording.imu, crosschecks.odometer_track(odometer))
+        own = crosschecks.fit_forward(recording.imu, crosschecks.compute_odometer_track(odometer))
         right = own is not None and own.correlation > FAIR and abs(own.lag) < 0.5 * abs(fit.lag)  # by the IMU
         yield Finding(
             "warning",

@@ -46,12 +46,12 @@ def is_certain(fit: Fit) -> bool:
     return abs(fit.lag) >= _MATTERS + _SIGNIFICANT * fit.spread
 
 
-def clock_of(imu: Imu, gnss: Gnss) -> ClockOffsets:
+def measure_clock_offsets(imu: Imu, gnss: Gnss) -> ClockOffsets:
     """By the force along the way against changes of speed; what a drive without such says is None."""
     places = crosschecks.track(replace(gnss, v=None))
-    by_places = None if places is None else crosschecks.forward_fit(imu, places)
+    by_places = None if places is None else crosschecks.fit_forward(imu, places)
     track = crosschecks.track(gnss) if gnss.v is not None else None
     if track is None or not track.instant:
         return ClockOffsets(None, by_places, None)
-    between = None if places is None else crosschecks.velocity_fit(track, places)
-    return ClockOffsets(crosschecks.forward_fit(imu, track), by_places, between)
+    between = None if places is None else crosschecks.fit_velocity(track, places)
+    return ClockOffsets(crosschecks.fit_forward(imu, track), by_places, between)

@@ -62,7 +62,7 @@ class Fit:
     coefficients: Array  # (m,)
 
 
-def local_positions(gnss: Gnss) -> Array:
+def compute_local_positions(gnss: Gnss) -> Array:
     """Positions in ENU metres around the first fix, (M, 3)."""
     return LocalFrame(gnss.llh[0]).from_llh(gnss.llh)
 
@@ -79,14 +79,14 @@ def track(gnss: Gnss) -> Track | None:
     m = max(1, round(1.0 / period))
     if len(gnss.t) <= m + 2:
         return None
-    p = local_positions(gnss)
+    p = compute_local_positions(gnss)
     width = gnss.t[m:] - gnss.t[:-m]
     near = width < 1.5 * m * period
     t, v = 0.5 * (gnss.t[m:] + gnss.t[:-m]), (p[m:] - p[:-m]) / width[:, None]
     return Track(t[near], v[near], width[near], period) if near.sum() >= 5 else None
 
 
-def _mean(x: Array) -> Array:
+def _compute_mean(x: Array) -> Array:
     """Mean row of a long array, ten times quicker than `x.mean(axis=0)`."""
     return np.asarray(np.full(len(x), 1.0 / len(x)) @ x)
 
@@ -98,7 +98,7 @@ def _integrate(t: Array, rate: Array, twice: bool) -> Array:
     """
     dt = np.diff(t, prepend=2 * t[0] - t[1])
     out = np.empty(rate.shape)
-    for k, mean in enumerate(_mean(rate)):  # only changes matter; keeps the second integral small
+    for k, mean in enumerate(_compute_mean(rate)):  # only changes matter; keeps the second integral small
         change = rate[:, k] - mean
         change *= dt
         first = np.cumsum(change)
@@ -111,7 +111,7 @@ def _integrate(t: Array, rate: Array, twice: bool) -> Array:
     return out
 
 
-def _sampler(t: Array, rate: Array) -> Callable[[Array, Array], Array]:
+def _make_sampler(t: Array, rate: Array) -> Callable[[Array, Array], Array]:
     """mean(at, width) of the integral of `rate`; width 0 is the value there."""
     integral = cache(lambda twice: _integrate(t, rate, twice))
     period = (t[-1] - t[0]) / (len(t) - 1)
@@ -134,7 +134,7 @@ def _sampler(t: Array, rate: Array) -> Callable[[Array, Array], Array]:
     return mean
 
 
-def _pairs(track: Track) -> tuple[Index, Index]:
+def _pair_times(track: Track) -> tuple[Index, Index]:
     """Rows about a second apart."""
     m = max(1, round(1.0 / track.period))
     i = np.arange(len(track.t) - m)
@@ -142,9 +142,9 @@ def _pairs(track: Track) -> tuple[Index, Index]:
     return i[near], i[near] + m
 
 
-def _possible_pairs(track: Track) -> tuple[Index, Index, Array]:
+def _pair_possible(track: Track) -> tuple[Index, Index, Array]:
     """Rows a second apart without a fix that jumps (there and back leaves speeds alike), and changes of speed, m/s."""
-    i, j = _pairs(track)
+    i, j = _pair_times(track)
     change, most = np.hypot(*(track.v[j] - track.v[i])[:, :2].T), _FASTEST_CHANGE * (track.t[j] - track.t[i])
     y = track.speed[j] - track.speed[i]
     real = (np.abs(y) < most) & (change < np.maximum(most, 5.0 * np.median(change) if len(change) else 0.0))
@@ -178,7 +178,7 @@ def _regress_inliers(x: Array, y: Array) -> tuple[float, Array]:
     return _regress(x[keep], y[keep]) if keep.sum() >= MIN_PAIRS else (0.0, b)
 
 
-def _peak(lags: Array, c: Array) -> float:
+def _find_peak(lags: Array, c: Array) -> float:
     """Where evenly spaced values are highest, by the parabola through the highest and its neighbours."""
     k = int(np.argmax(c))
     if 0 < k < len(lags) - 1 and (curve := c[k - 1] - 2 * c[k] + c[k + 1]) < 0 and np.isfinite(curve):
@@ -208,13 +208,13 @@ def _search(t: Array, y: Array, x_at: lags_of_clocks.Regressors, span: Array, va
     close = np.unique(np.clip(rough[:, None] + np.arange(-4, 5), 0, len(lags) - 1))
     c = np.full(len(lags), -np.inf)
     c[close] = correlations(few, lags[close])
-    near = _peak(lags, c)
+    near = _find_peak(lags, c)
     coarse, reached = near, correlation(near, few)
     # far away only if nothing near explains y, and only for clearly more, for there are many far shifts
     reach = min(WIDE, 0.3 * (span[-1] - span[0]))
     if reached < 0.6 and reach > 5.0:
         wide = np.arange(-reach, reach + 0.1, 0.2)
-        far = _peak(wide, correlations(few, wide))
+        far = _find_peak(wide, correlations(few, wide))
         if abs(far) > 5.0 and correlation(far, few) > reached + 0.15:
             coarse = far
     lag, spread = lags_of_clocks.refine_lag(t, y, x_at, valid, many, coarse, MIN_PAIRS)
@@ -223,10 +223,10 @@ def _search(t: Array, y: Array, x_at: lags_of_clocks.Regressors, span: Array, va
     return Fit(lag, spread, r, correlation(0.0, every), b)
 
 
-def _imu_fit(imu: Imu, rate: Array, track: Track, i: Index, j: Index, y: Array) -> Fit | None:
+def _fit_imu(imu: Imu, rate: Array, track: Track, i: Index, j: Index, y: Array) -> Fit | None:
     if len(y) < MIN_PAIRS:
         return None
-    mean = _sampler(imu.t, rate)
+    mean = _make_sampler(imu.t, rate)
     ti, tj, wi, wj = track.t[i], track.t[j], track.width[i], track.width[j]
 
     def x_at(rows: Index, lag: Lags) -> Array:
@@ -245,33 +245,33 @@ def _imu_fit(imu: Imu, rate: Array, track: Track, i: Index, j: Index, y: Array) 
 
 def find_up(imu: Imu) -> Array:
     """Unit vector of the mean force: up, in body axes as loaded, (3,)."""
-    f = _mean(imu.accel)
+    f = _compute_mean(imu.accel)
     return f / np.linalg.norm(f) if f.any() else np.array([0.0, 0.0, 1.0])
 
 
-def forward_fit(imu: Imu, track: Track) -> Fit | None:
+def fit_forward(imu: Imu, track: Track) -> Fit | None:
     """Change of GNSS speed on integrated level force: coefficients are the forward direction in body axes, (3,).
 
     Level is square to the mean force, so nothing need be known of the axes. None where speed
     changes too little to say anything.
     """
-    i, j, y = _possible_pairs(track)
+    i, j, y = _pair_possible(track)
     if len(y) < MIN_PAIRS or y.std() < 0.25:
         return None
     level = np.linalg.svd(find_up(imu)[None, :])[2][1:]  # (2, 3)
-    fit = _imu_fit(imu, imu.accel @ level.T, track, i, j, y)
+    fit = _fit_imu(imu, imu.accel @ level.T, track, i, j, y)
     if fit is None or len(fit.coefficients) != len(level):  # no time in common
         return None
     return replace(fit, coefficients=fit.coefficients @ level)
 
 
-def climb_fit(imu: Imu, track: Track, gnss: Gnss, forward: Array) -> tuple[float, float] | None:
+def fit_climb(imu: Imu, track: Track, gnss: Gnss, forward: Array) -> tuple[float, float] | None:
     """Slopes felt, by the force along `forward` (3,) beyond what speeds up, on slopes of the heights, over `_SLOPE`.
 
     Their correlation, and felt over those of the heights, by their sizes: neither has less noise than the other. None
     where the way is too short.
     """
-    p = local_positions(gnss)
+    p = compute_local_positions(gnss)
     way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(p[:, :2], axis=0).T))])
     pull = np.concatenate([[0.0], np.cumsum(imu.accel[1:] @ forward * np.diff(imu.t))])
     a = np.arange(max(track.t[0], imu.t[0]), min(track.t[-1], imu.t[-1]) - _SLOPE, _SLOPE)
@@ -288,18 +288,18 @@ def climb_fit(imu: Imu, track: Track, gnss: Gnss, forward: Array) -> tuple[float
     return float(np.corrcoef(felt, climbed)[0, 1]), float(felt.std() / climbed.std())
 
 
-def along_fit(imu: Imu, track: Track) -> Fit | None:
+def fit_along(imu: Imu, track: Track) -> Fit | None:
     """The same on the force along the stated forward axis alone, (1,): whether the axes as stated explain the speed."""
-    i, j, y = _possible_pairs(track)
-    return _imu_fit(imu, imu.accel[:, 1:2], track, i, j, y)
+    i, j, y = _pair_possible(track)
+    return _fit_imu(imu, imu.accel[:, 1:2], track, i, j, y)
 
 
-def yaw_fit(imu: Imu, track: Track) -> Fit | None:
+def fit_yaw(imu: Imu, track: Track) -> Fit | None:
     """Change of course, counter-clockwise, on the integrated rate about the mean force: true over recorded, (1,).
 
     None without turns.
     """
-    i, j = _pairs(track)
+    i, j = _pair_times(track)
     course = np.arctan2(track.v[:, 1], track.v[:, 0])
     y = wrap(course[j] - course[i])
     speed = np.minimum(track.speed[i], track.speed[j])
@@ -307,12 +307,12 @@ def yaw_fit(imu: Imu, track: Track) -> Fit | None:
     i, j, y = i[real], j[real], y[real]
     if len(y) < MIN_PAIRS or y.std() < 0.04:
         return None
-    return _imu_fit(imu, imu.gyro @ find_up(imu)[:, None], track, i, j, y)
+    return _fit_imu(imu, imu.gyro @ find_up(imu)[:, None], track, i, j, y)
 
 
-def velocity_fit(track: Track, places: Track) -> Fit | None:
+def fit_velocity(track: Track, places: Track) -> Fit | None:
     """Change of speed by places on that by velocities: how late velocities are against places; None without changes."""
-    i, j, y = _possible_pairs(places)
+    i, j, y = _pair_possible(places)
     if len(y) < MIN_PAIRS or y.std() < 0.25:
         return None
     t, travelled = track.t, np.zeros((len(track.t), 2))
@@ -333,14 +333,14 @@ def velocity_fit(track: Track, places: Track) -> Fit | None:
     return _search(0.5 * (places.t[i] + places.t[j]), y, x_at, places.t, valid)
 
 
-def odometer_track(odometer: Odometer) -> Track:
+def compute_odometer_track(odometer: Odometer) -> Track:
     """Its speeds ten times a second, as if the way were straight."""
     thin = slice(None, None, max(1, round(0.1 / float(np.median(np.diff(odometer.t))))))
     t, speed = odometer.t[thin], odometer.speed[thin]
     return Track(t, speed[:, None] * np.array([1.0, 0.0, 0.0]), np.zeros(len(t)), float(np.median(np.diff(t))))
 
 
-def odometer_fit(odometer: Odometer, track: Track) -> tuple[Fit, float] | None:
+def fit_odometer(odometer: Odometer, track: Track) -> tuple[Fit, float] | None:
     """GNSS speed on odometer speed, and the scale (true over recorded, median); None without movement."""
     if len(odometer.t) < 5 or track.speed.std() < 0.5:
         return None
@@ -376,7 +376,7 @@ def odometer_fit(odometer: Odometer, track: Track) -> tuple[Fit, float] | None:
     return fit, float(np.median(track.speed[rows][moving] / x[moving]))
 
 
-def sideways_correlation(imu: Imu, track: Track) -> float | None:
+def correlate_sideways(imu: Imu, track: Track) -> float | None:
     """Correlation of the force to the right with what the gyro's turns ask for at the way's speed.
 
     None where there are no curves.

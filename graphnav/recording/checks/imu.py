@@ -17,7 +17,7 @@ STANDARD_GRAVITY = 9.80665  # m/s^2, where the place is unknown
 
 def check_imu_time(imu: Imu) -> Iterator[Finding]:
     step, period = np.diff(imu.t), period_of(imu.t)
-    gaps = np.flatnonzero(step > gap_limit(imu.t))
+    gaps = np.flatnonzero(step > find_gap_limit(imu.t))
     if len(gaps):
         worst = gaps[np.argmax(step[gaps])]
         severity: Literal["note", "warning"] = "warning" if step[worst] > 0.2 else "note"
@@ -35,7 +35,7 @@ def check_imu_time(imu: Imu) -> Iterator[Finding]:
         )
 
 
-def gap_limit(t: Array) -> float:
+def find_gap_limit(t: Array) -> float:
     return 2.5 * period_of(t)
 
 

@@ -21,7 +21,7 @@ Index = NDArray[Any]  # of row numbers
 Lags = Array | float  # s, (L,) or one
 Regressors = Callable[[Index, Lags], Array]  # (rows, lags) -> (L, K, m), of one lag (K, m)
 REACH = 5.0  # s on either side of the first guess, which is all that a sigma can come to
-_SLOW = 10.0  # s; what changes slower than this is the road (as in `graphnav.recording.draft.motion.band`)
+_SLOW = 10.0  # s; what changes slower than this is the road (as in `graphnav.recording.draft.motion.filter_band`)
 _STEP, _FINE, _FINEST = 0.1, 0.02, 0.005  # s, of the grids of lags
 _AT_ONCE = 1 << 16  # rows times lags, so that what is at work stays small
 _PARTS, _STUDENT = 4, 3.0  # parts, and the variance of Student's t with the degrees of freedom of their scatter
@@ -95,7 +95,7 @@ def refine_lag(
     close = profile(near)
     lag = _find_lowest(near, close)
     best = at(lag, rows)
-    scores = None if best is None else _scores(t, x_at, valid, best, lag)
+    scores = None if best is None else _score_lags(t, x_at, valid, best, lag)
     if best is None or scores is None:
         return lag, REACH
     variance, information = scores
@@ -139,7 +139,7 @@ def remove_slow(t: Array, x: Array) -> Array:
     return np.asarray(out - out.mean(0))
 
 
-def _scores(
+def _score_lags(
     t: Array, x_at: Regressors, valid: Callable[[float], Array], best: _At, lag: float
 ) -> tuple[float, float] | None:
     """Variance of the sum of scores at the best lag, and the information there.

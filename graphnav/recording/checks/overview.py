@@ -21,11 +21,11 @@ from graphnav.recording.checks.aiding import (
     check_gnss_jumps,
     check_gyro_sign,
     check_imu_axes,
+    check_odometer,
     check_yaw_scale,
-    odometer_findings,
-    overlap_s,
+    measure_overlap,
 )
-from graphnav.recording.checks.clock import clock_of
+from graphnav.recording.checks.clock import measure_clock_offsets
 from graphnav.recording.checks.crosschecks import Track
 from graphnav.recording.checks.imu import (
     check_force_at_rest,
@@ -34,19 +34,19 @@ from graphnav.recording.checks.imu import (
     check_noise_at_rest,
     check_repeats,
     check_saturation,
-    gap_limit,
+    find_gap_limit,
 )
 from graphnav.recording.checks.places import check_height_unit, check_mirroring, find_mirrored
-from graphnav.recording.checks.raw import raw_facts, raw_findings
-from graphnav.recording.checks.series import series_facts, series_findings
+from graphnav.recording.checks.raw import check_raw, describe_raw
+from graphnav.recording.checks.series import check_series, describe_series
 from graphnav.recording.checks.stated import (
     check_fix_types,
     check_foot_speed,
     check_lever_arms,
     check_rounding,
     check_stated_noise,
-    truth_findings,
-    velocities,
+    check_truth,
+    check_velocities,
 )
 from graphnav.recording.plausibility.screening import refuse, screen
 
@@ -136,11 +136,11 @@ def inspect(recording: Recording) -> Inspection:
             )
             recording = recording.without(name)
     known = {f.key for f in whole.findings}
-    facts: dict[str, dict[str, Any]] = {"imu": _imu_facts(recording)}
+    facts: dict[str, dict[str, Any]] = {"imu": _describe_imu(recording)}
     vehicle = recording.platform == "vehicle"
-    overlap = recording.gnss is not None and overlap_s(recording) > 0
+    overlap = recording.gnss is not None and measure_overlap(recording) > 0
     track = crosschecks.track(recording.gnss) if recording.gnss is not None else None
-    rest = _at_rest(recording, track if overlap else None)
+    rest = _find_rest(recording, track if overlap else None)
     findings += check_imu_time(recording.imu)
     findings += check_repeats(recording.imu)
     findings += check_saturation(recording.imu)
@@ -155,22 +155,22 @@ def inspect(recording: Recording) -> Inspection:
         if vehicle:  # a person who stands still sways
             findings += check_noise_at_rest(recording.imu, rest)
     if recording.gnss is not None:
-        facts["gnss"] = _gnss_facts(recording, track)
+        facts["gnss"] = _describe_gnss(recording, track)
         findings += check_gnss_coverage(recording)
         findings += check_rounding(recording.gnss)
         findings += check_fix_types(recording.gnss)
-        wrong = find_mirrored(recording, list(velocities(recording.gnss)))
+        wrong = find_mirrored(recording, list(check_velocities(recording.gnss)))
         if overlap or not wrong:
             # against wrong velocities, or on another clock, every position jumps
             findings += wrong or (check_gnss_jumps(recording, track) if overlap else ())
     if recording.raw_gnss is not None and len(recording.raw_gnss):
-        facts["raw_gnss"] = raw_facts(recording.raw_gnss)
-        findings += raw_findings(recording.raw_gnss)
+        facts["raw_gnss"] = describe_raw(recording.raw_gnss)
+        findings += check_raw(recording.raw_gnss)
     # of axes that are wrong already, or of forces without gravity, nothing is told by gravity
     turned = known & {"imu.forward_reversed", "imu.axes_turned", "imu.dead_axis", "imu.force_scale"}
     if vehicle and overlap and track is not None and recording.gnss is not None:
-        clock = whole.clock or clock_of(recording.imu, recording.gnss)
-        yaw = crosschecks.yaw_fit(recording.imu, track)
+        clock = whole.clock or measure_clock_offsets(recording.imu, recording.gnss)
+        yaw = crosschecks.fit_yaw(recording.imu, track)
         forward = clock.by_velocity if track.instant else clock.by_places
         turns_back = yaw is not None and yaw.correlation > 0.8 and yaw.coefficients[0] < 0
         turns_so = yaw is not None and yaw.correlation > 0.8 and not turns_back
@@ -183,18 +183,18 @@ def inspect(recording: Recording) -> Inspection:
     elif vehicle and not turned:
         findings += check_imu_axes(recording.imu, None, None)
     if recording.odometer is not None:
-        facts["odometer"] = _sensor_facts(recording.odometer.t)
+        facts["odometer"] = _describe_sensors(recording.odometer.t)
         step, speed = np.diff(recording.odometer.t), np.abs(recording.odometer.speed)
         facts["odometer"]["distance_m"] = round(float(np.sum(0.5 * (speed[1:] + speed[:-1]) * step)), 1)
         facts["odometer"]["max_speed_mps"] = float(np.abs(recording.odometer.speed).max())
-        findings += odometer_findings(recording, track, facts["odometer"])
-    facts |= {name: series_facts(series) for name, series in recording.sensors.items()}
-    findings += series_findings(recording)
+        findings += check_odometer(recording, track, facts["odometer"])
+    facts |= {name: describe_series(series) for name, series in recording.sensors.items()}
+    findings += check_series(recording)
     if recording.truth is not None:
         facts["truth"] = {"rows": len(recording.truth.t), "of": recording.truth.of}
         if recording.truth.closed_loop_sigma:
             facts["truth"] = {"closed_loop_sigma_m": recording.truth.closed_loop_sigma}
-        findings += truth_findings(recording)
+        findings += check_truth(recording)
     if any(f.severity != "note" for f in findings) and not has_keys(recording):
         findings.append(
             Finding(
@@ -214,23 +214,23 @@ def has_keys(recording: Recording) -> bool:
     return source is None or source.suffix == ".toml" or not recording.files
 
 
-def _sensor_facts(t: Array) -> dict[str, Any]:
+def _describe_sensors(t: Array) -> dict[str, Any]:
     return {"rows": len(t), "rate_hz": round(1.0 / period_of(t), 3), "span_s": round(float(t[-1] - t[0]), 3)}
 
 
-def _imu_facts(recording: Recording) -> dict[str, Any]:
-    facts = _sensor_facts(recording.imu.t)
+def _describe_imu(recording: Recording) -> dict[str, Any]:
+    facts = _describe_sensors(recording.imu.t)
     facts["duration_s"] = round(recording.duration, 3)
     step = np.diff(recording.imu.t)
-    facts["gaps"] = int((step > gap_limit(recording.imu.t)).sum())
+    facts["gaps"] = int((step > find_gap_limit(recording.imu.t)).sum())
     facts["longest_step_s"] = round(float(step.max()), 4)
     return facts
 
 
-def _gnss_facts(recording: Recording, track: Track | None) -> dict[str, Any]:
+def _describe_gnss(recording: Recording, track: Track | None) -> dict[str, Any]:
     gnss = recording.gnss
     assert gnss is not None
-    facts: dict[str, Any] = {"rows": 1} if len(gnss.t) == 1 else _sensor_facts(gnss.t)
+    facts: dict[str, Any] = {"rows": 1} if len(gnss.t) == 1 else _describe_sensors(gnss.t)
     facts["velocities"] = 0 if gnss.v is None else int((~np.isnan(gnss.v[:, 0])).sum())
     if gnss.types:
         facts["types"] = gnss.types
@@ -249,7 +249,7 @@ def _gnss_facts(recording: Recording, track: Track | None) -> dict[str, Any]:
     return facts
 
 
-def _at_rest(recording: Recording, track: Track | None) -> Array:
+def _find_rest(recording: Recording, track: Track | None) -> Array:
     """IMU rows that lie in quiet seconds; quiet is near the quietest part, and not moving where speed is known."""
     imu = recording.imu
     period = period_of(imu.t)

@@ -22,11 +22,11 @@ def check_mirroring(recording: Recording, track: Track, turns_back: bool) -> Ite
     """A course that does not turn as the gyro does, as the positions are a mirror image, by exchange or by a sign."""
     other = exchange_lat_lon(recording.gnss) if recording.gnss is not None else None
     way = crosschecks.track(replace(other, v=None)) if other is not None else None
-    yaw = crosschecks.yaw_fit(recording.imu, way) if way is not None else None
+    yaw = crosschecks.fit_yaw(recording.imu, way) if way is not None else None
     if yaw is not None and yaw.correlation > 0.8 and abs(yaw.coefficients[0] - 1.0) < 0.2:
         yield describe_exchange("the turns of the gyro")
     elif (
-        turns_back and (crosschecks.sideways_correlation(recording.imu, track) or 0.0) > 0.0
+        turns_back and (crosschecks.correlate_sideways(recording.imu, track) or 0.0) > 0.0
     ):  # the gyro turns as the force says
         yield describe_mirroring("latitudes or longitudes have", "the turns of the gyro and the force in curves")
 
@@ -36,7 +36,7 @@ def check_height_unit(recording: Recording, track: Track, forward: Fit | None) -
     if forward is None or forward.correlation < FAIR or recording.gnss is None:
         return
     ahead = forward.coefficients / np.linalg.norm(forward.coefficients)
-    found = crosschecks.climb_fit(recording.imu, track, recording.gnss, ahead)
+    found = crosschecks.fit_climb(recording.imu, track, recording.gnss, ahead)
     if found is None:
         return
     correlation, ratio = found
@@ -57,13 +57,13 @@ def find_mirrored(recording: Recording, wrong: Sequence[Finding]) -> list[Findin
     if not any(f.key == "gnss.velocity_axes" for f in wrong):
         return list(wrong)
     ways = [crosschecks.track(one) for one in (gnss, replace(gnss, v=None))]
-    fits = [crosschecks.yaw_fit(recording.imu, way) for way in ways if way is not None]
+    fits = [crosschecks.fit_yaw(recording.imu, way) for way in ways if way is not None]
     by_velocity, by_places = (
         [fit.coefficients[0] if fit is not None and fit.correlation > 0.8 else 0.0 for fit in fits]
         if len(fits) == 2
         else (0.0, 0.0)
     )
-    moved = np.gradient(crosschecks.local_positions(gnss)[:, :2], gnss.t, axis=0)
+    moved = np.gradient(crosschecks.compute_local_positions(gnss)[:, :2], gnss.t, axis=0)
     east, north = np.nansum(moved * gnss.v[:, :2], axis=0) < 0.0
     if by_velocity > 0.0 > by_places and east != north:
         which = "longitudes" if east else "latitudes"

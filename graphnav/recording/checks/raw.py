@@ -15,11 +15,11 @@ _GAP = 2.5  # periods beyond which a step between epochs is a gap
 _FEW = 5  # satellites, one more than a position with its clock takes
 
 
-def raw_facts(raw: RawGnss) -> dict[str, Any]:
+def describe_raw(raw: RawGnss) -> dict[str, Any]:
     """Figures of a series, by name."""
     epochs, _ = raw.epochs
     placed = np.isfinite(raw.p[:, 0])
-    by_epoch = _satellites(raw, placed)
+    by_epoch = _count_satellites(raw, placed)
     system = raw.satellite // 100
     facts: dict[str, Any] = {"epochs": len(epochs)}
     if len(epochs) > 1:
@@ -50,9 +50,9 @@ def raw_facts(raw: RawGnss) -> dict[str, Any]:
     return facts
 
 
-def raw_findings(raw: RawGnss) -> Iterator[Finding]:
+def check_raw(raw: RawGnss) -> Iterator[Finding]:
     """What a tightly coupled solution suffers from."""
-    by_epoch = _satellites(raw, np.isfinite(raw.p[:, 0]))
+    by_epoch = _count_satellites(raw, np.isfinite(raw.p[:, 0]))
     few = float(np.mean(by_epoch < _FEW))
     if few > 0.5:
         yield Finding(
@@ -64,7 +64,7 @@ def raw_findings(raw: RawGnss) -> Iterator[Finding]:
         yield Finding("note", "raw GNSS: no Doppler shifts, so no velocities", "raw_gnss.no_doppler")
 
 
-def _satellites(raw: RawGnss, which: np.ndarray) -> np.ndarray:
+def _count_satellites(raw: RawGnss, which: np.ndarray) -> np.ndarray:
     """(E,) satellites of each epoch with rows of a mask."""
     epochs, of = raw.epochs
     pairs = np.unique(np.stack([of[which], raw.satellite[which].astype(np.intp)], -1), axis=0)

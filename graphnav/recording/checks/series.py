@@ -49,7 +49,7 @@ def _screen(series: Series) -> tuple[Series, list[Finding]]:
     return take_rows(replace(series, values=values), sensor.usable(values)), findings
 
 
-def series_facts(series: Series) -> dict[str, Any]:
+def describe_series(series: Series) -> dict[str, Any]:
     """Rows, rate, span and the least and largest value of each column, in the units of files."""
     facts: dict[str, Any] = {"rows": len(series)}
     if len(series) > 1:
@@ -62,7 +62,7 @@ def series_facts(series: Series) -> dict[str, Any]:
     return facts
 
 
-def series_findings(recording: Recording) -> Iterator[Finding]:
+def check_series(recording: Recording) -> Iterator[Finding]:
     """Sensors that are on another clock, and that stand still while all else goes on."""
     for name, series in recording.sensors.items():
         if not len(series):

@@ -88,20 +88,20 @@ def check_fix_types(gnss: Gnss) -> Iterator[Finding]:
     """Types in the numbers of GGA's quality, which differ."""
     if gnss.type is None or not gnss.type_assumed:
         return
-    from graphnav.recording.draft.guesses import fix_numbers
+    from graphnav.recording.draft.guesses import guess_fix_numbers
 
-    if (guess := fix_numbers(gnss.type, gnss.sd[:, 0])).value == "nmea":
+    if (guess := guess_fix_numbers(gnss.type, gnss.sd[:, 0])).value == "nmea":
         sentence = (
             f'types of the fixes look like GGA\'s qualities: {guess.why}; say units = {{ type = "nmea" }} in [gnss]'
         )
         yield Finding("warning", sentence, "gnss.type_numbers")
 
 
-def velocities(gnss: Gnss) -> Iterator[Finding]:
+def check_velocities(gnss: Gnss) -> Iterator[Finding]:
     """Velocities whose axes, signs or unit the positions deny."""
     if gnss.v is None or len(gnss.t) < 10:
         return
-    p, v, m = crosschecks.local_positions(gnss), gnss.v, max(1, round(1.0 / float(np.median(np.diff(gnss.t)))))
+    p, v, m = crosschecks.compute_local_positions(gnss), gnss.v, max(1, round(1.0 / float(np.median(np.diff(gnss.t)))))
     dt = gnss.t[m:] - gnss.t[:-m]
     moved = p[m:] - p[:-m]
     # by the trapezoids of all rows between, which follow a change of speed
@@ -115,14 +115,14 @@ def velocities(gnss: Gnss) -> Iterator[Finding]:
     if moving.sum() >= crosschecks.MIN_PAIRS:
         other = exchange_lat_lon(gnss)
         if other is not None:
-            q = crosschecks.local_positions(other)
+            q = crosschecks.compute_local_positions(other)
             off, mended = (
                 float(np.median(np.linalg.norm((x[m:] - x[:-m] - stated)[moving, :2], axis=1))) for x in (p, q)
             )
             if mended < _MENDED * off:
                 yield describe_exchange("the velocities")
                 return
-        yield from _horizontal(moved[moving, :2], stated[moving, :2])
+        yield from _compute_horizontal(moved[moving, :2], stated[moving, :2])
     climb, meant = moved[real, 2], stated[real, 2]
     if len(climb) >= crosschecks.MIN_PAIRS and climb.std() > 0.0 and meant.std() > 0.0:
         alike = float(np.corrcoef(climb, meant)[0, 1])
@@ -160,7 +160,7 @@ def describe_mirroring(which: str, sensor: str) -> Finding:
     )
 
 
-def _horizontal(moved: Array, stated: Array) -> Iterator[Finding]:
+def _compute_horizontal(moved: Array, stated: Array) -> Iterator[Finding]:
     """Which change of the velocities (N, 2) agrees with the ways (N, 2), if they do not themselves."""
 
     def miss(change: Array) -> float:
@@ -186,12 +186,12 @@ def _horizontal(moved: Array, stated: Array) -> Iterator[Finding]:
             yield Finding("warning", sentence, "gnss.velocity_unit")
 
 
-def truth_findings(recording: Recording) -> Iterator[Finding]:
+def check_truth(recording: Recording) -> Iterator[Finding]:
     """A truth of another time, clock or place."""
     truth, gnss = recording.truth, recording.gnss
     if truth is None or truth.closed_loop_sigma is not None or not len(truth.t):
         return
-    if truth_apart(recording):
+    if is_truth_apart(recording):
         yield Finding(
             "warning",
             f"the truth ({truth.t[0]:.3f} to {truth.t[-1]:.3f} s) and the IMU ({recording.start:.3f} to "
@@ -204,13 +204,13 @@ def truth_findings(recording: Recording) -> Iterator[Finding]:
         return
     frame = LocalFrame(truth.llh[0])
     true, fixes = frame.from_llh(truth.llh)[:, :2], frame.from_llh(gnss.llh)[:, :2]
-    off = _median_distance(truth, true, gnss, fixes, 0.0)
+    off = _measure_median_distance(truth, true, gnss, fixes, 0.0)
     if off is None:
         return
     shifted = {
         shift: found
         for shift in (-LEAP, LEAP)
-        if (found := _median_distance(truth, true, gnss, fixes, shift)) is not None
+        if (found := _measure_median_distance(truth, true, gnss, fixes, shift)) is not None
     }
     best = min(shifted, key=lambda shift: shifted[shift], default=0.0)
     if shifted and off > 5.0 and shifted[best] < 0.2 * off:
@@ -227,7 +227,7 @@ def truth_findings(recording: Recording) -> Iterator[Finding]:
         )
 
 
-def truth_apart(recording: Recording) -> bool:
+def is_truth_apart(recording: Recording) -> bool:
     """Whether the truth shares no time with the IMU."""
     if recording.truth is None or not len(recording.truth.t):
         return False
@@ -235,7 +235,7 @@ def truth_apart(recording: Recording) -> bool:
     return bool(t[-1] < recording.start or t[0] > recording.end)
 
 
-def _median_distance(truth: Truth, true: Array, gnss: Gnss, fixes: Array, shift: float) -> float | None:
+def _measure_median_distance(truth: Truth, true: Array, gnss: Gnss, fixes: Array, shift: float) -> float | None:
     """Median horizontal distance (m) between fixes and a truth `shift` s later; None where too few are near in time."""
     t = truth.t + shift
     k = np.clip(np.searchsorted(t, gnss.t), 1, len(t) - 1)

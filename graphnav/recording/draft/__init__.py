@@ -18,7 +18,7 @@ from graphnav.recording.draft import guesses, motion
 from graphnav.recording.draft.agreement import CLEAR, FAIR, Agreement, compare_with_fixes
 from graphnav.recording.draft.guesses import Guess
 from graphnav.recording.draft.logs import Source
-from graphnav.recording.draft.sources import JOINED, find_logs, fix_speed_unit, fixes, plain_name
+from graphnav.recording.draft.sources import JOINED, find_logs, guess_fix_speed_unit, name_plain_file, read_fixes
 from graphnav.recording.formats.schema import FORCE, RATE, SPEED
 from graphnav.recording.formats.writer import quote
 
@@ -56,7 +56,7 @@ def draft(paths: Sequence[Path], folder: Path, name: str | None = None, topics: 
     return Draft(text, tuple(writer.decisions), writer.made)
 
 
-def imu_of(path: Path) -> tuple[Array, Array, Array]:
+def read_imu_in_si(path: Path) -> tuple[Array, Array, Array]:
     """Times (N,), rates and forces (N, 3) of a CSV file in SI, units as `draft` would guess them.
 
     Raises
@@ -66,8 +66,8 @@ def imu_of(path: Path) -> tuple[Array, Array, Array]:
     """
     source = find_logs([path]).sensors["imu"]
     gyro, accel = source.stack("gx", "gy", "gz"), source.stack("ax", "ay", "az")
-    force = guesses.accel_unit(path, accel, source.find_unit("ax", "accel"))
-    rate = guesses.gyro_unit(gyro, source.find_unit("gx", "gyro"), None, vehicle=False)
+    force = guesses.guess_accel_unit(path, accel, source.find_unit("ax", "accel"))
+    rate = guesses.guess_gyro_unit(gyro, source.find_unit("gx", "gyro"), None, vehicle=False)
     return source.t, gyro * RATE[str(rate.value)], accel * FORCE[str(force.value)]
 
 
@@ -95,7 +95,7 @@ class _Writer:
         agreement, felt = self._imu(found["imu"], found.get("gnss"), vehicle)
         course = None
         if "gnss" in found:
-            course = motion.course_of(*fixes(found["gnss"]))
+            course = motion.compute_course(*read_fixes(found["gnss"]))
             self._gnss(found["gnss"], agreement)
         if "odometer" in found:
             self._odometer(found["odometer"], course if course is not None and len(course.t) > 50 else None, felt)
@@ -113,15 +113,17 @@ class _Writer:
             t, gyro, accel = imu.t, imu.gyro @ imu.R_bs, imu.accel @ imu.R_bs  # in the log's own axes
         else:
             t, gyro, accel = source.t, source.stack("gx", "gy", "gz"), source.stack("ax", "ay", "az")
-            force = guesses.accel_unit(source.path, accel, source.find_unit("ax", "accel"))
+            force = guesses.guess_accel_unit(source.path, accel, source.find_unit("ax", "accel"))
             accel = accel * FORCE[str(force.value)]
-        up, up_why = guesses.up_of(accel)
+        up, up_why = guesses.guess_up(accel)
         agreement = Agreement()
         if gnss is not None:
-            self.epochs = _epochs(source, gnss)
-            agreement = compare_with_fixes(t, gyro, accel, up, fixes(gnss), self.epochs.offset if self.epochs else 0.0)
+            self.epochs = _find_epoch(source, gnss)
+            agreement = compare_with_fixes(
+                t, gyro, accel, up, read_fixes(gnss), self.epochs.offset if self.epochs else 0.0
+            )
         if source.log is None:
-            rate = guesses.gyro_unit(gyro, source.find_unit("gx", "gyro"), agreement.turn, vehicle)
+            rate = guesses.guess_gyro_unit(gyro, source.find_unit("gx", "gyro"), agreement.turn, vehicle)
             gyro = gyro * RATE[str(rate.value)]
             self._units({"t": source.t_unit, "gyro": rate, "accel": force})
             front = self._axes(up, up_why, agreement)
@@ -136,7 +138,7 @@ class _Writer:
         return agreement, (t, accel @ front)
 
     def _axes(self, up: Array, up_why: str, agreement: Agreement) -> Array:
-        forward, words = guesses.default_forward(up), "CHECK: nothing tells which way is forward"
+        forward, words = guesses.choose_forward(up), "CHECK: nothing tells which way is forward"
         lag = agreement.clearest
         if lag is not None and agreement.forward is not None and lag.correlation > 0.3:
             forward = agreement.forward
@@ -145,19 +147,19 @@ class _Writer:
                 f"{sure} is where the accelerations of the fixes are felt (coherence {lag.correlation:.2f}, "
                 f"{abs(lag.slope):.2f} of their size)"
             )
-        letters, (front, top) = guesses.axes(up, forward)
+        letters, (front, top) = guesses.guess_axes(up, forward)
         if letters is not None:
             self._key("axes", f'"{letters}"', f"{up_why}; {words}")
         else:
-            self._key("forward", _vector(front), words)
-            self._key("up", _vector(top), up_why)
+            self._key("forward", _format_vector(front), words)
+            self._key("up", _format_vector(top), up_why)
         return front
 
     def _noise(self, t: Array, gyro: Array, accel: Array) -> None:
         self.lines += ['# model = "..."                             # the IMU, if docs/imu-models.md has it']
         self.lines += ["", "[imu.noise]                                 # better: the data sheet's figures"]
         for key, samples, unit in (("gyro", gyro, "rad/s/sqrt(Hz)"), ("accel", accel, "m/s2/sqrt(Hz)")):
-            value = guesses.noise_density(t, samples)
+            value = guesses.estimate_noise_density(t, samples)
             if value > 0:
                 self._key(
                     f"{key}_noise_density",
@@ -173,7 +175,7 @@ class _Writer:
         numbers = None
         if "type" in values:
             sd = values.get("sd_e")
-            numbers = guesses.fix_numbers(values["type"], sd)
+            numbers = guesses.guess_fix_numbers(values["type"], sd)
             theirs = source.columns.names["type"]
             if numbers.value is None and theirs != "type":
                 dropped = (*dropped, "type")
@@ -195,7 +197,7 @@ class _Writer:
             if source.find_unit("h", "length") == "ft":
                 units["height"] = Guess("ft", "as the column's name says")
             if {"speed", "course"} <= values.keys() and "ve" not in values and late is None:
-                units["speed"] = fix_speed_unit(source)
+                units["speed"] = guess_fix_speed_unit(source)
             elif stated := source.find_unit("ve", "speed"):
                 units["speed"] = Guess(stated, "as the column's name says")
             self._units(units)
@@ -232,9 +234,11 @@ class _Writer:
         self.lines += ["", "[odometer]"]
         self._file(source, "odometer")
         if source.log is None:
-            speed = guesses.speed_unit(source.t, source.values["speed"], course, source.find_unit("speed", "speed"))
+            speed = guesses.guess_speed_unit(
+                source.t, source.values["speed"], course, source.find_unit("speed", "speed")
+            )
             self._units({"t": source.t_unit, "speed": speed})
-            lag = _odometer_lag(source.t, source.values["speed"] * SPEED[str(speed.value)], felt)
+            lag = _find_odometer_lag(source.t, source.values["speed"] * SPEED[str(speed.value)], felt)
             if lag is not None and lag.correlation > FAIR and abs(lag.seconds) > _SMALL:
                 sure = "" if lag.correlation > CLEAR else "CHECK: "
                 self._key("time_offset", f"{-lag.seconds:.2f}", f"{sure}s; {_describe_agreement(lag)}")
@@ -244,7 +248,7 @@ class _Writer:
     def _lever_arm(self, sensor: Gnss | Odometer | None, what: str) -> None:
         """That of a log, if it has one."""
         if sensor is not None and np.any(sensor.lever_arm):
-            self._key("lever_arm", _vector(sensor.lever_arm), f"m, {what}; as the log says")
+            self._key("lever_arm", _format_vector(sensor.lever_arm), f"m, {what}; as the log says")
         else:
             self._key("lever_arm", "[0.0, 0.0, 0.0]", f"CHECK: m, {what}")
 
@@ -262,7 +266,7 @@ class _Writer:
             rates, forces = (path.name for path in source.joined_from)
             self.decisions.append(f"{relative}: made of {rates} and {forces}, the forces at the times of the rates")
         elif source.plain is not None:
-            relative = plain_name(source.path, sensor)
+            relative = name_plain_file(source.path, sensor)
             self.made[relative] = {source.columns.names[ours]: x for ours, x in source.values.items()}
             words = f"made of {source.path.name}: {source.plain.words}"
             self.lines.append(f"# {words}")
@@ -291,25 +295,25 @@ class _Writer:
             self.lines.append(f"units = {{ {pairs} }}".ljust(43) + f" # {why}")
 
 
-def _odometer_lag(t: Array, speed: Array, felt: tuple[Array, Array]) -> motion.Lag | None:
+def _find_odometer_lag(t: Array, speed: Array, felt: tuple[Array, Array]) -> motion.Lag | None:
     """How late the wheel is, by its accelerations against the forward ones of the IMU."""
     if len(t) < 50:
         return None
-    grid, forward = motion.on_grid(felt[0], felt[1][:, None])
+    grid, forward = motion.resample_on_grid(felt[0], felt[1][:, None])
     even = np.arange(t[0], t[-1], motion.STEP)
-    pull = np.gradient(motion.mean(np.interp(even, t, speed)), motion.STEP)
-    return motion.lag(grid, motion.band(forward[:, 0]), even, motion.band(pull))
+    pull = np.gradient(motion.compute_moving_mean(np.interp(even, t, speed)), motion.STEP)
+    return motion.find_lag(grid, motion.filter_band(forward[:, 0]), even, motion.filter_band(pull))
 
 
-def _epochs(imu: Source, gnss: Source) -> ClockOffset | None:
+def _find_epoch(imu: Source, gnss: Source) -> ClockOffset | None:
     """What lies between the clocks of two logs, where both are known."""
-    first = [_first(source, sensor) for source, sensor in ((imu, "imu"), (gnss, "gnss"))]
+    first = [_read_first(source, sensor) for source, sensor in ((imu, "imu"), (gnss, "gnss"))]
     zeros = [None if source.log is None else source.log.gps_zero for source in (imu, gnss)]
     found = between_clocks(first[0], zeros[0], first[1], zeros[1])
     return found if found is not None and abs(first[1] + found.offset - first[0]) < NEAR else None
 
 
-def _first(source: Source, sensor: str) -> float:
+def _read_first(source: Source, sensor: str) -> float:
     return float((source.t if source.log is None else getattr(source.log, sensor).t)[0])
 
 
@@ -317,5 +321,5 @@ def _describe_agreement(lag: motion.Lag) -> str:
     return f"the accelerations agree best with the IMU's so (coherence {lag.correlation:.2f})"
 
 
-def _vector(v: Array) -> str:
+def _format_vector(v: Array) -> str:
     return "[" + ", ".join(f"{x:.4f}" for x in v) + "]"

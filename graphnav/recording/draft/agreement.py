@@ -8,7 +8,7 @@ import numpy as np
 
 from graphnav.core.rotation import Array
 from graphnav.recording import Gnss, Imu
-from graphnav.recording.checks.clock import ClockOffsets, clock_of
+from graphnav.recording.checks.clock import ClockOffsets, measure_clock_offsets
 from graphnav.recording.draft import motion
 
 CLEAR, FAIR = 0.8, 0.5  # correlations: sure, likely
@@ -69,7 +69,7 @@ class Agreement:
         return (known.lag - self.far, known.spread) if sure and known is not None else (-self.far, motion.STEP)
 
 
-def level_axes(up: Array) -> tuple[Array, Array]:
+def find_level_axes(up: Array) -> tuple[Array, Array]:
     """Two axes square to `up` and each other, so that the first, the second and up are right-handed."""
     start = np.eye(3)[int(np.abs(up).argmin())]
     first = start - (start @ up) * up
@@ -89,51 +89,53 @@ def compare_with_fixes(
 
 
 def _compare(t: Array, gyro: Array, accel: Array, up: Array, fixes: tuple[Array, Array, Array | None]) -> Agreement:
-    courses = [motion.course_of(fixes[0], fixes[1], v) for v in (None, fixes[2])]
+    courses = [motion.compute_course(fixes[0], fixes[1], v) for v in (None, fixes[2])]
     courses = courses if fixes[2] is not None else courses[:1]
     if any(len(course.t) < 10 for course in courses):
         return Agreement()
-    grid, rate = motion.on_grid(t, gyro @ up[:, None])
-    turns = [lag for course in courses if (lag := _turn_lag(grid, rate[:, 0], course)) is not None]
+    grid, rate = motion.resample_on_grid(t, gyro @ up[:, None])
+    turns = [lag for course in courses if (lag := _find_turn_lag(grid, rate[:, 0], course)) is not None]
     turn = max(turns, key=lambda lag: lag.correlation, default=None)
     shift = turn.seconds if turn is not None and abs(turn.seconds) > motion.NEAR else 0.0
-    axes = level_axes(up)
-    grid, felt = motion.on_grid(t, accel @ np.stack(axes, -1))
-    s = motion.band(felt[:, 0]) + 1j * motion.band(felt[:, 1])
+    axes = find_level_axes(up)
+    grid, felt = motion.resample_on_grid(t, accel @ np.stack(axes, -1))
+    s = motion.filter_band(felt[:, 0]) + 1j * motion.filter_band(felt[:, 1])
     lags: list[motion.Lag | None] = []
     for one in courses:
-        z = motion.band(one.forward) + 1j * motion.band(one.left)
-        found = motion.lag(grid, s, one.t - shift, z)
+        z = motion.filter_band(one.forward) + 1j * motion.filter_band(one.left)
+        found = motion.find_lag(grid, s, one.t - shift, z)
         if found is None:
             lags.append(None)
             continue
         # An antenna ahead of the IMU feels sideways what the IMU will feel; along the course they feel the same.
-        ahead = motion.lag(grid, (s * np.exp(-1j * np.angle(found.slope))).real, one.t - shift, z.real)
+        ahead = motion.find_lag(grid, (s * np.exp(-1j * np.angle(found.slope))).real, one.t - shift, z.real)
         seconds = ahead.seconds if ahead is not None and ahead.correlation > FAIR else found.seconds
         lags.append(motion.Lag(seconds + shift, found.correlation, found.slope))
     position, velocity = (*lags, None)[:2]
-    out = Agreement(turn, position, velocity, None, shift, _clock(t, gyro, accel, fixes, shift))
+    out = Agreement(turn, position, velocity, None, shift, _compare_clocks(t, gyro, accel, fixes, shift))
     if out.clearest is None:
         return out
     angle = np.angle(out.clearest.slope)
     return replace(out, forward=np.cos(angle) * axes[0] + np.sin(angle) * axes[1])
 
 
-def _clock(t: Array, gyro: Array, accel: Array, fixes: tuple[Array, Array, Array | None], shift: float) -> ClockOffsets:
+def _compare_clocks(
+    t: Array, gyro: Array, accel: Array, fixes: tuple[Array, Array, Array | None], shift: float
+) -> ClockOffsets:
     """As the recording will hold them, with the fixes `shift` seconds earlier."""
     rows = np.concatenate([[True], np.diff(fixes[0]) > 0.0]) & np.isfinite(fixes[1]).all(axis=1)
     v = None if fixes[2] is None else fixes[2][rows]
     if v is not None and v.shape[1] == 2:
         v = np.column_stack([v, np.zeros(len(v))])
     gnss = Gnss(fixes[0][rows] - shift, fixes[1][rows], np.ones((int(rows.sum()), 3)), v)
-    return clock_of(Imu(t, gyro, accel), gnss)
+    return measure_clock_offsets(Imu(t, gyro, accel), gnss)
 
 
-def _turn_lag(grid: Array, rate: Array, course: motion.Course) -> motion.Lag | None:
+def _find_turn_lag(grid: Array, rate: Array, course: motion.Course) -> motion.Lag | None:
     """The shift of clocks that overlap, unless only another one, any, makes the turns agree."""
     overlap = course.t[0] < grid[-1] and course.t[-1] > grid[0] if len(grid) else False
-    near = motion.lag(grid, rate, course.t, course.turn, course.speed**2) if overlap else None
+    near = motion.find_lag(grid, rate, course.t, course.turn, course.speed**2) if overlap else None
     if near is not None and near.correlation > FAIR:
         return near
-    far = motion.lag(grid, rate, course.t, course.turn, course.speed**2, anywhere=True)
+    far = motion.find_lag(grid, rate, course.t, course.turn, course.speed**2, anywhere=True)
     return far if far is not None and far.correlation > _LEAST_CORRELATION else near

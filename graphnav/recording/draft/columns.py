@@ -107,7 +107,7 @@ class Columns:
         return "gyro" if gyro else "accel" if accel else "odometer" if wheel else None
 
 
-def match(header: Sequence[str], stem: str = "") -> Columns:
+def match_columns(header: Sequence[str], stem: str = "") -> Columns:
     """Find our columns among a file's; `stem`, the file's name, tells what bare x, y, z are of."""
     spelt = [(name, *split_unit(name)) for name in header]
     certain = [some for some in spelt if not _UNCERTAIN.fullmatch(some[1])]
@@ -137,7 +137,7 @@ def match(header: Sequence[str], stem: str = "") -> Columns:
     return Columns(names, units)
 
 
-def clocks(header: Sequence[str]) -> list[str]:
+def find_clocks(header: Sequence[str]) -> list[str]:
     """The columns that may be times, the likeliest first."""
     spelt = [(name, split_unit(name)[0]) for name in header]
     found = [name for p in _PATTERNS["t"] for name, plain in spelt if re.fullmatch(p, plain)]
@@ -162,7 +162,7 @@ def split_unit(name: str) -> tuple[str, str]:
     return plain, ""
 
 
-def unit_of(columns: Columns, ours: str, kind: str) -> str | None:
+def find_stated_unit(columns: Columns, ours: str, kind: str) -> str | None:
     """The unit of recording.toml that a column's name states, if it is one of that kind."""
     found = UNITS.get(columns.units.get(ours, ""))
     return found[1] if found and found[0] == kind else None

@@ -30,11 +30,11 @@ class Guess:
     why: str
 
 
-def time_unit(t: Array, stated: str | None, imu: bool) -> Guess:
+def guess_time_unit(t: Array, stated: str | None, imu: bool) -> Guess:
     """s, ms, us or ns, by the name, by the size of an epoch, by the step."""
     if stated is not None:
         return Guess(stated, "as the column's name says")
-    if (unit := _unix_unit(t)) is not None:
+    if (unit := _guess_unix_unit(t)) is not None:
         return Guess(unit, f"{t[0]:.0f} is then a date of this century in Unix time")
     step = float(np.median(np.diff(t))) if len(t) > 1 else 1.0
     low, high = (5e-4, 0.11) if imu else (0.02, 11.0)
@@ -46,15 +46,15 @@ def time_unit(t: Array, stated: str | None, imu: bool) -> Guess:
 
 def is_date(t: Array) -> bool:
     """Whether stamps are dates of this century in Unix time, in some unit."""
-    return _unix_unit(t) is not None
+    return _guess_unix_unit(t) is not None
 
 
-def _unix_unit(t: Array) -> str | None:
+def _guess_unix_unit(t: Array) -> str | None:
     step = float(np.median(np.diff(t))) if len(t) > 1 else 0.0
     return next((u for u, scale in TIME.items() if 1e9 <= float(t[0]) * scale < 3e9 and step * scale < _APART), None)
 
 
-def accel_unit(path: Path, accel: Array, stated: str | None) -> Guess:
+def guess_accel_unit(path: Path, accel: Array, stated: str | None) -> Guess:
     """m/s2, g or mg, by the size of gravity.
 
     Raises
@@ -81,7 +81,7 @@ def accel_unit(path: Path, accel: Array, stated: str | None) -> Guess:
     )
 
 
-def gyro_unit(gyro: Array, stated: str | None, lag: motion.Lag | None, vehicle: bool) -> Guess:
+def guess_gyro_unit(gyro: Array, stated: str | None, lag: motion.Lag | None, vehicle: bool) -> Guess:
     """rad/s or deg/s: by the turns of the course if there are any, by the name, by the size."""
     if lag is not None and abs(lag.correlation) > _LIKELY:
         for unit, scale in RATE.items():
@@ -97,7 +97,7 @@ def gyro_unit(gyro: Array, stated: str | None, lag: motion.Lag | None, vehicle: 
     )
 
 
-def speed_unit(t: Array, speed: Array, course: motion.Course | None, stated: str | None) -> Guess:
+def guess_speed_unit(t: Array, speed: Array, course: motion.Course | None, stated: str | None) -> Guess:
     """m/s, km/h, mph or knots: by the fixes if there are any, by the name, by the size."""
     if course is not None:
         mine = np.interp(course.t, t, speed, np.nan, np.nan)
@@ -113,7 +113,7 @@ def speed_unit(t: Array, speed: Array, course: motion.Course | None, stated: str
     return Guess("km/h" if large > 45 else "m/s", f"95 % of the speeds are below {large:.3g}; a guess")
 
 
-def fix_numbers(types: Array, sd: Array | None) -> Guess:
+def guess_fix_numbers(types: Array, sd: Array | None) -> Guess:
     """Whose numbers types of fixes (N,) are, "rtklib", "nmea" or None, by the horizontal sigmas (N,) m of the fixes.
 
     A fixed solution is 1 or 4, and nothing else is that precise; what follows from it must fit the other numbers.
@@ -129,7 +129,7 @@ def fix_numbers(types: Array, sd: Array | None) -> Guess:
     return Guess(None, "its numbers and the sigmas do not tell whose they are")
 
 
-def up_of(accel: Array) -> tuple[Array, str]:
+def guess_up(accel: Array) -> tuple[Array, str]:
     """The up axis (3,) in file axes, and how steady gravity was."""
     mean = np.mean(accel, axis=0)
     up = mean / np.linalg.norm(mean)
@@ -138,7 +138,7 @@ def up_of(accel: Array) -> tuple[Array, str]:
     return up, f"gravity is felt along {'+' if up[axis] > 0 else '-'}{'xyz'[axis]}, {tilt:.0f} deg off it on average"
 
 
-def axes(up: Array, forward: Array) -> tuple[str | None, tuple[Array, Array]]:
+def guess_axes(up: Array, forward: Array) -> tuple[str | None, tuple[Array, Array]]:
     """Three letters if both vectors are near file axes, and in any case the two vectors."""
     square = forward - (forward @ up) * up
     square /= np.linalg.norm(square)
@@ -157,12 +157,12 @@ def axes(up: Array, forward: Array) -> tuple[str | None, tuple[Array, Array]]:
     return None, (square, up)
 
 
-def default_forward(up: Array) -> Array:
+def choose_forward(up: Array) -> Array:
     """A forward axis where nothing tells: x if it is level, else y."""
     return np.asarray(np.eye(3)[0 if abs(up[0]) < 0.7 else 1])
 
 
-def noise_density(t: Array, x: Array) -> float:
+def estimate_noise_density(t: Array, x: Array) -> float:
     """Noise of samples (N, 3) per root Hz, taken as white: between the quietest tenth of the log and its usual state.
 
     The Allan deviation times the root of its averaging time, which is the same for all times where noise is white;

@@ -14,7 +14,7 @@ from graphnav.recording import Gnss, Imu, Odometer
 from graphnav.recording.draft import columns as matching
 from graphnav.recording.draft import guesses
 from graphnav.recording.draft.guesses import Guess
-from graphnav.recording.draft.plain import Plain, read_plain, seconds_of_clock
+from graphnav.recording.draft.plain import Plain, read_clock_seconds, read_plain
 from graphnav.recording.formats.folder import other_log
 from graphnav.recording.formats.registry import Log
 from graphnav.recording.formats.repair import new_fixes
@@ -85,7 +85,7 @@ class Source:
 
     def find_unit(self, ours: str, kind: str) -> str | None:
         """The unit that a column's name states."""
-        return matching.unit_of(self.columns, ours, kind)
+        return matching.find_stated_unit(self.columns, ours, kind)
 
     @property
     def radians(self) -> bool:
@@ -118,7 +118,7 @@ def read_log(path: Path, topics: Sequence[str] = ()) -> dict[str, Source]:
         header = read_header(path) if plain is None else list(plain.columns)
     except RecordingError as error:
         raise NoSensorError(str(error), key=error.key) from error
-    columns = matching.match(header, path.name.split(".")[0])
+    columns = matching.match_columns(header, path.name.split(".")[0])
     sensor = columns.sensor
     if sensor is None:
         raise NoSensorError(
@@ -127,7 +127,7 @@ def read_log(path: Path, topics: Sequence[str] = ()) -> dict[str, Source]:
             key="draft.no_columns",
         )
     if plain is None:
-        columns = _with_clock(path, header, columns)
+        columns = _add_clock(path, header, columns)
     elif stamps := plain.dated or (plain.daily if columns.names["t"] == plain.daily else None):
         units = {ours: unit for ours, unit in columns.units.items() if ours != "t"}
         columns = matching.Columns({**columns.names, "t": stamps}, units)
@@ -139,7 +139,7 @@ def read_log(path: Path, topics: Sequence[str] = ()) -> dict[str, Source]:
     return {role: _read(path, columns, role, plain) for role in roles}
 
 
-def _stamps(cells: list[str]) -> Array | None:
+def _read_stamps(cells: list[str]) -> Array | None:
     """Stamps that rise with every row, as numbers; None where these are none."""
     try:
         t = np.array([float(cell) for cell in cells])
@@ -148,15 +148,15 @@ def _stamps(cells: list[str]) -> Array | None:
     return t if len(t) > 1 and (np.diff(t) > 0.0).all() else None
 
 
-def _with_clock(path: Path, header: list[str], columns: matching.Columns) -> matching.Columns:
+def _add_clock(path: Path, header: list[str], columns: matching.Columns) -> matching.Columns:
     """The columns with the one of times that dates the rows, if one of several does, else with one of numbers."""
-    several = matching.clocks(header)
+    several = matching.find_clocks(header)
     if len(several) < 2:
         return columns
     best = columns.names["t"]
     rows = first_rows(path, 100)
     cells = {name: [row[header.index(name)] for row in rows if len(row) == len(header)] for name in several}
-    stamps = {name: t for name in several if (t := _stamps(cells[name])) is not None}
+    stamps = {name: t for name in several if (t := _read_stamps(cells[name])) is not None}
     if best not in stamps:  # dates in words
         best = next(iter(stamps), best)
     best = next((name for name, t in stamps.items() if guesses.is_date(t)), best)
@@ -168,7 +168,7 @@ def _with_clock(path: Path, header: list[str], columns: matching.Columns) -> mat
     return matching.Columns({**columns.names, "t": best}, units)
 
 
-def _numbers(path: Path, name: str, plain: Plain | None) -> bool:
+def _read_numbers(path: Path, name: str, plain: Plain | None) -> bool:
     """Whether a column holds numbers and blanks alone."""
     if plain is not None:
         return name in plain.columns
@@ -183,7 +183,7 @@ def _read(path: Path, columns: matching.Columns, role: str, plain: Plain | None)
     wanted = WANTED[role]
     names = {ours: theirs for ours, theirs in columns.names.items() if ours in wanted}
     for extra in ("type", "satellites"):
-        if extra in names and not _numbers(path, names[extra], plain):
+        if extra in names and not _read_numbers(path, names[extra], plain):
             del names[extra]
     if plain is None:
         table = read_table(path, tuple(names), (), names)
@@ -205,7 +205,7 @@ def _read(path: Path, columns: matching.Columns, role: str, plain: Plain | None)
             f"{path}: fewer than two rows hold all of {', '.join(names[n] for n in needed)}", key="table.few_rows"
         )
     values = {ours: table[ours][whole] for ours in names}
-    if (seconds := seconds_of_clock(values["t"])) is not None:
+    if (seconds := read_clock_seconds(values["t"])) is not None:
         words = f"times of day of '{names['t']}', hhmmss, as s since midnight"
         values["t"], plain = seconds, Plain({}, words, daily=names["t"])
     order = np.argsort(values["t"], kind="stable")
@@ -228,5 +228,5 @@ def _read(path: Path, columns: matching.Columns, role: str, plain: Plain | None)
         columns = matching.Columns(columns.names, {**columns.units, "speed": columns.units.get(rear[0], "")})
     source = Source(path, matching.Columns(names, columns.units), values, plain=plain)
     inertial = role not in ("gnss", "odometer")
-    source.t_unit = guesses.time_unit(source.values["t"], source.find_unit("t", "t"), inertial)
+    source.t_unit = guesses.guess_time_unit(source.values["t"], source.find_unit("t", "t"), inertial)
     return source

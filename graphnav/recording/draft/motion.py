@@ -45,21 +45,23 @@ class Lag:
     slope: complex
 
 
-def course_of(t: Array, llh: Array, v: Array | None) -> Course:
+def compute_course(t: Array, llh: Array, v: Array | None) -> Course:
     """Course and accelerations of fixes: from velocities (N, 2 or 3) where they are known, else from positions."""
     p = LocalFrame(llh[0]).from_llh(llh)
     if v is None or np.isnan(v[:, :2]).all():
         keep = np.concatenate([[True], np.diff(t) > 0])
         t, p = t[keep], p[keep]
         grid = np.arange(t[0], t[-1], STEP)
-        east, north = (mean(np.gradient(mean(np.interp(grid, t, p[:, k])), STEP)) for k in (0, 1))
+        east, north = (
+            compute_moving_mean(np.gradient(compute_moving_mean(np.interp(grid, t, p[:, k])), STEP)) for k in (0, 1)
+        )
     else:
         known = ~np.isnan(v[:, :2]).any(-1)
         t, v = t[known], v[known]
         grid = np.arange(t[0], t[-1], STEP)
-        east, north = (mean(np.interp(grid, t, v[:, k])) for k in (0, 1))
+        east, north = (compute_moving_mean(np.interp(grid, t, v[:, k])) for k in (0, 1))
     # nothing is known inside gaps, nor where the means reach into them or over an end
-    gap = mean(_mask_gaps(grid, t).astype(float), 4.0 * _MEAN_OVER) > 0.0
+    gap = compute_moving_mean(_mask_gaps(grid, t).astype(float), 4.0 * _MEAN_OVER) > 0.0
     gap |= (grid < grid[0] + 2.0 * _MEAN_OVER) | (grid > grid[-1] - 2.0 * _MEAN_OVER)
     speed = np.hypot(east, north)
     ae, an = np.gradient(east, STEP), np.gradient(north, STEP)
@@ -72,7 +74,7 @@ def course_of(t: Array, llh: Array, v: Array | None) -> Course:
     return Course(grid, np.where(gap, np.nan, speed), turn, forward, left)
 
 
-def on_grid(t: Array, x: Array) -> tuple[Array, Array]:
+def resample_on_grid(t: Array, x: Array) -> tuple[Array, Array]:
     """Samples (N, k) as means over a second on an even grid; NaN inside gaps."""
     cumulative = np.concatenate([np.zeros((1, x.shape[1])), np.cumsum(x[1:] * np.diff(t)[:, None], axis=0)])
     grid = np.arange(t[0] + _MEAN_OVER / 2, t[-1] - _MEAN_OVER / 2, STEP)
@@ -84,7 +86,7 @@ def on_grid(t: Array, x: Array) -> tuple[Array, Array]:
     return grid, out
 
 
-def mean(x: Array, window: float = _MEAN_OVER) -> Array:
+def compute_moving_mean(x: Array, window: float = _MEAN_OVER) -> Array:
     """Moving mean over some seconds, of the grid."""
     n = 2 * round(window / STEP / 2)
     kernel = np.ones(n + 1)
@@ -93,7 +95,7 @@ def mean(x: Array, window: float = _MEAN_OVER) -> Array:
     return np.convolve(x, kernel)[within] / np.convolve(np.ones(len(x)), kernel)[within]
 
 
-def lag(t: Array, x: Array, u: Array, y: Array, weight: Array | None = None, anywhere: bool = False) -> Lag | None:
+def find_lag(t: Array, x: Array, u: Array, y: Array, weight: Array | None = None, anywhere: bool = False) -> Lag | None:
     """How late `y` at `u` is behind `x` at `t` (both on grids of `STEP`), where they agree best; None without a hint.
 
     Real signals, or planar vectors as complex numbers, whose `Lag.slope` then says how far `x` is turned from `y`.
@@ -114,16 +116,16 @@ def lag(t: Array, x: Array, u: Array, y: Array, weight: Array | None = None, any
     a, b = _resample_evenly(t, x), _resample_evenly(u, y)
     w = np.ones(len(b)) if weight is None else np.nan_to_num(_resample_evenly(u, weight))
     if anywhere:
-        shifts, r, slope = _all_lags(a, b, w)
+        shifts, r, slope = _list_all_lags(a, b, w)
     else:
         shifts = np.arange(np.ceil((-NEAR - apart) / STEP), np.floor((NEAR - apart) / STEP) + 1).astype(int)
-        r, slope = _lags(a, b, w, shifts)
+        r, slope = _list_lags(a, b, w, shifts)
         for _ in range(_TRIMS):
             if not np.isfinite(r).any():
                 return None
             best = int(np.nanargmax(np.abs(r)))
             b = _trim(a, b, w, int(shifts[best]), slope[best])
-            r, slope = _lags(a, b, w, shifts)
+            r, slope = _list_lags(a, b, w, shifts)
     if not np.isfinite(r).any():
         return None
     best = int(np.nanargmax(np.abs(r)))
@@ -135,13 +137,15 @@ def lag(t: Array, x: Array, u: Array, y: Array, weight: Array | None = None, any
     return Lag(float(apart + (shifts[best] + peak) * STEP), float(r[best]), complex(slope[best]))
 
 
-def band(x: Array) -> Array:
+def filter_band(x: Array) -> Array:
     """Smoothed over a second and without what is slower than ten, which slopes of the road would enter."""
     known = np.isfinite(x)
     filled = np.where(known, x, 0.0)
-    weight = mean(known.astype(float), 10.0)
-    slow = mean(filled, 10.0) / np.maximum(weight, 1e-9)
-    out = mean(np.where(known, x - slow, 0.0)) / np.maximum(mean(known.astype(float)), 1e-9)
+    weight = compute_moving_mean(known.astype(float), 10.0)
+    slow = compute_moving_mean(filled, 10.0) / np.maximum(weight, 1e-9)
+    out = compute_moving_mean(np.where(known, x - slow, 0.0)) / np.maximum(
+        compute_moving_mean(known.astype(float)), 1e-9
+    )
     return np.where(known, out, np.nan)
 
 
@@ -156,7 +160,7 @@ def _resample_evenly(t: Array, x: Array) -> Array:
     return out
 
 
-def _pairs(a: Array, b: Array, w: Array, shift: int) -> tuple[Array, Array, Array, Array]:
+def _pair_samples(a: Array, b: Array, w: Array, shift: int) -> tuple[Array, Array, Array, Array]:
     """a[k], b[k + shift] and its weight where all are known, without their weighted means; and which of b they are."""
     lo, hi = max(0, -shift), min(len(a), len(b) - shift)
     if hi - lo < _FEWEST:
@@ -169,11 +173,11 @@ def _pairs(a: Array, b: Array, w: Array, shift: int) -> tuple[Array, Array, Arra
     return x - v @ x, y - v @ y, v, ok + lo + shift
 
 
-def _lags(a: Array, b: Array, w: Array, shifts: Array) -> tuple[Array, Array]:
+def _list_lags(a: Array, b: Array, w: Array, shifts: Array) -> tuple[Array, Array]:
     """Correlation, and slope of a over b, at every shift."""
     r, slope = np.full(len(shifts), np.nan), np.full(len(shifts), np.nan, dtype=complex)
     for k, shift in enumerate(shifts):
-        x, y, v, _ = _pairs(a, b, w, int(shift))
+        x, y, v, _ = _pair_samples(a, b, w, int(shift))
         if not len(v):
             continue
         xx, yy, xy = float(v @ np.abs(x) ** 2), float(v @ np.abs(y) ** 2), v @ (x * np.conj(y))
@@ -185,7 +189,7 @@ def _lags(a: Array, b: Array, w: Array, shifts: Array) -> tuple[Array, Array]:
 
 def _trim(a: Array, b: Array, w: Array, shift: int, slope: complex) -> Array:
     """b without the samples that fit worst at a shift: beyond four robust sigmas of the weighted residuals."""
-    x, y, v, at = _pairs(a, b, w, shift)
+    x, y, v, at = _pair_samples(a, b, w, shift)
     factor = slope if np.iscomplexobj(y) else slope.real
     residual = np.abs((x - factor * y) * np.sqrt(v))
     out = b.copy()
@@ -193,7 +197,7 @@ def _trim(a: Array, b: Array, w: Array, shift: int, slope: complex) -> Array:
     return out
 
 
-def _all_lags(a: Array, b: Array, w: Array) -> tuple[Array, Array, Array]:
+def _list_all_lags(a: Array, b: Array, w: Array) -> tuple[Array, Array, Array]:
     """The same for every shift, by FFT, unknown samples as zero; only where half of the shorter overlaps."""
     wa, wb = np.isfinite(a).astype(float), np.where(np.isfinite(b), w, 0.0)
     a, b = np.nan_to_num(a), np.nan_to_num(b)

@@ -14,7 +14,7 @@ import numpy as np
 from graphnav.core.errors import RecordingError
 from graphnav.core.files import open_file, parse_number, read_bytes
 from graphnav.core.rotation import Array
-from graphnav.recording.draft.columns import UNITS, match, split_unit
+from graphnav.recording.draft.columns import UNITS, match_columns, split_unit
 
 DAY = 86400.0  # s
 _START = 1 << 16  # bytes, in which the header is
@@ -73,18 +73,18 @@ def read_plain(path: Path) -> Plain | None:
         return None
     # cut off amid a line, most likely
     begin, _ = _decode(start.rpartition(b"\n")[0] if len(start) == _START else start)
-    layout = _lay_out(path, _lines(begin.splitlines()))
+    layout = _lay_out(path, _read_lines(begin.splitlines()))
     if layout is None:
         return None
     text, encoding = _decode(read_bytes(path))
-    lines = _lines(text.splitlines())
+    lines = _read_lines(text.splitlines())
     rows = [_split(line, layout.mark) for _, line in lines[layout.first :]]
     names, done = layout.names, [*layout.done, *encoding]
     if len(rows[0]) == len(names) + 1 and not any(row[-1] for row in rows if len(row) > len(names)):
         rows = [row[: len(names)] for row in rows]
         done.append("an empty field at the end")
     wrong = next((k for k, row in enumerate(rows) if len(row) != len(names)), None)
-    if wrong is not None and match(names, path.stem).sensor is None:
+    if wrong is not None and match_columns(names, path.stem).sensor is None:
         return None  # notes, not numbers
     if wrong is not None:
         raise RecordingError(
@@ -95,12 +95,12 @@ def read_plain(path: Path) -> Plain | None:
     cells = dict(zip(names, map(list, zip(*rows, strict=True)), strict=True))
     if any("," in cell for cell in rows[0]):
         done.append("decimal commas")
-    columns = {name: x for name, some in cells.items() if (x := _numbers(some)) is not None}
-    dated, daily, more = _times(cells, columns, layout.above)
+    columns = {name: x for name, some in cells.items() if (x := _parse_numbers(some)) is not None}
+    dated, daily, more = _parse_times(cells, columns, layout.above)
     return Plain(columns, ", ".join([*done, *more]), dated, daily) if done or more else None
 
 
-def seconds_of_clock(t: Array) -> Array | None:
+def read_clock_seconds(t: Array) -> Array | None:
     """Seconds since midnight of times of day written as one number, hhmmss.ss; None where these are none.
 
     They are where no stamp has more than 59 minutes or seconds, and 40 s are missing between every two minutes.
@@ -123,10 +123,10 @@ def _decode(data: bytes) -> tuple[str, list[str]]:
         return data.decode("cp1252", errors="replace"), ["text of Windows"]
 
 
-def _lines(text: Sequence[str]) -> Lines:
+def _read_lines(text: Sequence[str]) -> Lines:
     """Numbers and text of the lines that hold something; after the first row without comments."""
     lines = [(k, line) for k, line in enumerate(text, 1) if line.strip()]
-    first = _first_row(lines)
+    first = _find_first_row(lines)
     return [(k, line) for i, (k, line) in enumerate(lines) if i <= (first or 0) or line.lstrip()[0] != "#"]
 
 
@@ -138,7 +138,7 @@ def _split(line: str, mark: str | None) -> list[str]:
     return [cell.strip() for cell in cells]
 
 
-def _values(line: str, mark: str | None) -> tuple[float, int]:
+def _read_values(line: str, mark: str | None) -> tuple[float, int]:
     """Which share of the fields of a line are numbers, dates or times of day, and how many."""
     cells = _split(line, mark)
     count = sum(_is_value(cell) for cell in cells)
@@ -146,22 +146,26 @@ def _values(line: str, mark: str | None) -> tuple[float, int]:
 
 
 def _is_value(cell: str) -> bool:
-    return _numbers([cell]) is not None or _clock(cell) is not None or bool(_date(cell) or _SLASHES.fullmatch(cell))
+    return (
+        _parse_numbers([cell]) is not None
+        or _parse_clock(cell) is not None
+        or bool(_parse_date(cell) or _SLASHES.fullmatch(cell))
+    )
 
 
-def _first_row(lines: Lines) -> int | None:
+def _find_first_row(lines: Lines) -> int | None:
     """Where two lines follow each other that are rows of one table."""
     for k in range(len(lines) - 1):
-        if _mark_of([line for _, line in lines[k : k + 2]]) != "":
+        if _find_mark([line for _, line in lines[k : k + 2]]) != "":
             return k
     return None
 
 
-def _mark_of(rows: Sequence[str]) -> str | None:
+def _find_mark(rows: Sequence[str]) -> str | None:
     """What stands between the fields of rows; "" where they are none: two fields and half of them are values."""
     found = []
     for mark in _MARKS:
-        some = [_values(row, mark) for row in rows]
+        some = [_read_values(row, mark) for row in rows]
         if (
             all(share >= 0.5 and count >= 2 for share, count in some)
             and len({len(_split(row, mark)) for row in rows}) == 1
@@ -172,10 +176,10 @@ def _mark_of(rows: Sequence[str]) -> str | None:
 
 def _lay_out(path: Path, lines: Lines) -> _Layout | None:
     """How a table is written; None where it is a CSV file or no table with a header."""
-    first = _first_row(lines)
+    first = _find_first_row(lines)
     if not first:  # none, or no line before it
         return None
-    mark = _mark_of([line for _, line in lines[first : first + 2]])
+    mark = _find_mark([line for _, line in lines[first : first + 2]])
     row = _split(lines[first][1], mark)
     head, units = first - 1, []
     two = [_split(_COMMENT.sub("", line), mark) for _, line in lines[max(first - 2, 0) : first]]
@@ -185,10 +189,10 @@ def _lay_out(path: Path, lines: Lines) -> _Layout | None:
     if mark is None and len(names) > len(row):  # names of several words stand farther apart
         names = re.split(r"\s{2,}", _COMMENT.sub("", lines[head][1]).strip())
     commented = _COMMENT.match(lines[head][1])
-    if len(names) == len(row) - 1 and _date(row[0]) and _clock(row[1]) is not None:
+    if len(names) == len(row) - 1 and _parse_date(row[0]) and _parse_clock(row[1]) is not None:
         names = ["date", *names]  # one name above a date and a time of day
     if len(names) not in (len(row), len(row) - 1):
-        if commented or match(names, path.stem).sensor is None:
+        if commented or match_columns(names, path.stem).sensor is None:
             return None
         raise RecordingError(
             f"{path}, line {lines[head][0]}: names {len(names)} columns where the rows have {len(row)} fields apart by "
@@ -212,7 +216,7 @@ def _are_units(cells: Sequence[str]) -> bool:
     return sum(unit in UNITS for unit in spelt) > 0.5 * len(spelt)
 
 
-def _numbers(cells: Sequence[str]) -> Array | None:
+def _parse_numbers(cells: Sequence[str]) -> Array | None:
     """A column as numbers, NaN where blank; None where it holds anything else."""
     try:
         return np.array([parse_number(c.replace(",", ".")) if c else np.nan for c in cells])
@@ -220,7 +224,7 @@ def _numbers(cells: Sequence[str]) -> Array | None:
         return None
 
 
-def _times(
+def _parse_times(
     cells: dict[str, list[str]], columns: dict[str, Array], above: Sequence[str]
 ) -> tuple[str | None, str | None, list[str]]:
     """Turns a column of dates, or one of times of day, into s; which is dated, which is daily, and words about it.
@@ -233,18 +237,20 @@ def _times(
         if any(_SLASHES.fullmatch(cell) for cell in some):
             words[name], doubt = _put_year_first(some)
             notes += [doubt] if doubt else []
-    daily = next((name for name, some in words.items() if all(not c or _clock(c) is not None for c in some)), None)
-    days = next((some for name, some in words.items() if name != daily and _date(some[0]) is not None), None)
+    daily = next(
+        (name for name, some in words.items() if all(not c or _parse_clock(c) is not None for c in some)), None
+    )
+    days = next((some for name, some in words.items() if name != daily and _parse_date(some[0]) is not None), None)
     if days is not None and any(":" in cell for cell in days):
         daily = next(name for name, some in words.items() if some is days)
         clocks = days
     elif daily is not None:
         if days is None:
-            stated = [found for line in above for word in re.split(r"[\s,;|]+", line) if (found := _date(word))]
+            stated = [found for line in above for word in re.split(r"[\s,;|]+", line) if (found := _parse_date(word))]
             days = [f"{stated[0]:%Y-%m-%d}"] * len(words[daily]) if stated else None
-        seconds = np.array([x if (x := _clock(c)) is not None else np.nan for c in words[daily]])
+        seconds = np.array([x if (x := _parse_clock(c)) is not None else np.nan for c in words[daily]])
         seconds += DAY * np.cumsum(np.diff(seconds, prepend=seconds[:1]) < -0.5 * DAY)  # over midnight
-        if days is None or (begin := _date(days[0])) is None:
+        if days is None or (begin := _parse_date(days[0])) is None:
             columns[daily] = seconds
             return None, daily, [*notes, f"times of day of '{daily}' as s since midnight"]
         midnight = begin.replace(tzinfo=UTC).timestamp()
@@ -252,7 +258,7 @@ def _times(
         return daily, None, [*notes, f"dates and times of day of '{daily}' as Unix time in s; CHECK: taken as UTC"]
     else:
         return None, None, notes
-    stamps = [_date(text) for text in clocks]
+    stamps = [_parse_date(text) for text in clocks]
     if any(x is None for x in stamps):
         return None, None, notes
     zone = stamps[0] is not None and stamps[0].tzinfo is not None
@@ -273,7 +279,7 @@ def _put_year_first(cells: list[str]) -> tuple[list[str], str]:
     ], f"CHECK: {cells[0][:10]} may begin with the day or the month, so dates are left out"
 
 
-def _date(text: str) -> datetime | None:
+def _parse_date(text: str) -> datetime | None:
     """A date with or without a time of day; None if it is none."""
     if len(text) < 8 or not text[:1].isdigit() or not text.isascii():
         return None
@@ -286,14 +292,14 @@ def _date(text: str) -> datetime | None:
     try:
         start = datetime(int(year), int(month), int(day))
         rest = rest.strip(" T").replace(",", ".")
-        if (seconds := _clock(rest) if rest else 0.0) is not None:
+        if (seconds := _parse_clock(rest) if rest else 0.0) is not None:
             return start + timedelta(seconds=seconds)
         return datetime.combine(start, time.fromisoformat(rest))
     except ValueError:
         return None
 
 
-def _clock(text: str) -> float | None:
+def _parse_clock(text: str) -> float | None:
     """A time of day, s since midnight; None if it is none."""
     found = _CLOCK.fullmatch(text)
     if found is None:

@@ -42,7 +42,7 @@ def find_logs(paths: Sequence[Path], topics: Sequence[str] = ()) -> LogsFound:
         If the only file holds nothing that is known, if one of a sensor cannot be read, if two hold the same, or none
         an IMU.
     """
-    files = [file for path in paths for file in _files(path)]
+    files = [file for path in paths for file in _list_files(path)]
     every: dict[str, list[Source]] = {}
     left: list[str] = []
     nothing: list[str] = []
@@ -63,14 +63,14 @@ def find_logs(paths: Sequence[Path], topics: Sequence[str] = ()) -> LogsFound:
     sensors = {sensor: chosen for sensor, some in every.items() if (chosen := _choose(sensor, some, left)) is not None}
     if "imu" not in sensors and "gyro" in sensors:
         if "accel" not in sensors and "accel" in every and "gravity" in sensors:
-            sensors["accel"] = _with_gravity(every["accel"][0], sensors["gravity"], left)
+            sensors["accel"] = _add_gravity(every["accel"][0], sensors["gravity"], left)
         if "accel" in sensors:
             sensors["imu"] = _join_imu(sensors["gyro"], sensors["accel"])
             if (pull := every.get("gravity")) and sensors["accel"] in every["accel"]:
                 left.append(f"{pull[0].path.name}: {sensors['accel'].path.name} has gravity in it")
         elif "accel" in every:
             worst = every["accel"][0]
-            guesses.accel_unit(worst.path, worst.stack("ax", "ay", "az"), worst.find_unit("ax", "accel"))
+            guesses.guess_accel_unit(worst.path, worst.stack("ax", "ay", "az"), worst.find_unit("ax", "accel"))
     if "imu" not in sensors:
         there = ", ".join(sensors) or "nothing"
         unread = f" ({refused[0]})" if refused else ""
@@ -87,7 +87,7 @@ def find_logs(paths: Sequence[Path], topics: Sequence[str] = ()) -> LogsFound:
 
 def _date_times_of_day(sensors: dict[str, Source]) -> None:
     """Times of day become those of the date of another log, if one has dates."""
-    dates = {s.path: unix for s in sensors.values() if (unix := _unix_start(s)) is not None}
+    dates = {s.path: unix for s in sensors.values() if (unix := _find_unix_start(s)) is not None}
     for source in sensors.values():
         if dates and source.plain is not None and source.plain.daily == source.columns.names["t"]:
             path, begin = next(iter(dates.items()))
@@ -97,7 +97,7 @@ def _date_times_of_day(sensors: dict[str, Source]) -> None:
             source.plain = replace(source.plain, words=words)
 
 
-def _unix_start(source: Source) -> float | None:
+def _find_unix_start(source: Source) -> float | None:
     """Unix time of the first row of a log that knows its date, s."""
     if source.log is None:
         return float(source.t[0]) if guesses.is_date(source.t) else None
@@ -105,13 +105,13 @@ def _unix_start(source: Source) -> float | None:
     return None if source.log.gps_zero is None else float(source.log.gps_zero + begin + GPS_TO_UNIX)
 
 
-def _files(path: Path) -> list[Path]:
+def _list_files(path: Path) -> list[Path]:
     """A log by itself, or those in a folder that is none."""
     if not path.is_dir() or any(known.load is not None and known.recognises(path) for known in formats().values()):
         return [path]
     every = [p for p in path.iterdir() if not p.name.startswith(".")]
     made = {JOINED, "recording.toml"}  # by an earlier draft
-    made |= {plain_name(p, sensor) for p in every for sensor in WANTED}
+    made |= {name_plain_file(p, sensor) for p in every for sensor in WANTED}
     inside = sorted(p for p in every if p.name not in made)
     logs = [p for p in inside if p.name.lower().endswith(_TABLES) or _is_known(p)]
     if not logs:
@@ -121,7 +121,7 @@ def _files(path: Path) -> list[Path]:
     return logs
 
 
-def plain_name(path: Path, sensor: str) -> str:
+def name_plain_file(path: Path, sensor: str) -> str:
     """The CSV file that is made of a sensor's part of a table that is none."""
     return f"{path.stem}-{sensor}.csv.gz"
 
@@ -158,13 +158,13 @@ def _choose(sensor: str, some: list[Source], left: list[str]) -> Source | None:
 
 def _has_gravity(source: Source) -> bool:
     try:
-        guesses.accel_unit(source.path, source.stack("ax", "ay", "az"), source.find_unit("ax", "accel"))
+        guesses.guess_accel_unit(source.path, source.stack("ax", "ay", "az"), source.find_unit("ax", "accel"))
     except RecordingError:
         return False
     return True
 
 
-def _with_gravity(accel: Source, gravity: Source, left: list[str]) -> Source:
+def _add_gravity(accel: Source, gravity: Source, left: list[str]) -> Source:
     """Accelerations without gravity and the gravity that a phone took out of them, put together again."""
     values = {"t": accel.values["t"]}
     for x in "xyz":
@@ -172,7 +172,7 @@ def _with_gravity(accel: Source, gravity: Source, left: list[str]) -> Source:
         values[f"a{x}"] = accel.values[f"a{x}"] + pull
     left.append(f"{accel.path.name} is without gravity: the forces are the sum of it and {gravity.path.name}")
     whole = Source(accel.path, accel.columns, values, t_unit=accel.t_unit)
-    guesses.accel_unit(accel.path, whole.stack("ax", "ay", "az"), None)
+    guesses.guess_accel_unit(accel.path, whole.stack("ax", "ay", "az"), None)
     return whole
 
 
@@ -191,7 +191,7 @@ def _join_imu(gyro: Source, accel: Source) -> Source:
     return joined
 
 
-def fixes(source: Source) -> tuple[Array, Array, Array | None]:
+def read_fixes(source: Source) -> tuple[Array, Array, Array | None]:
     """Times (N,), positions (N, 3) and horizontal velocities (N, 2), or None, of a GNSS log."""
     if source.log is not None:
         gnss = source.log.gnss
@@ -201,13 +201,13 @@ def fixes(source: Source) -> tuple[Array, Array, Array | None]:
     if {"ve", "vn"} <= values.keys():
         return source.t, source.llh, source.stack("ve", "vn") * SPEED[source.find_unit("ve", "speed") or "m/s"]
     if {"speed", "course"} <= values.keys():
-        speed = values["speed"] * SPEED[str(fix_speed_unit(source).value)]
+        speed = values["speed"] * SPEED[str(guess_fix_speed_unit(source).value)]
         course = values["course"] * ANGLE["rad" if source.find_unit("course", "angle") == "rad" else "deg"]
         return source.t, source.llh, np.stack([speed * np.sin(course), speed * np.cos(course)], -1)
     return source.t, source.llh, None
 
 
-def fix_speed_unit(source: Source) -> Guess:
+def guess_fix_speed_unit(source: Source) -> Guess:
     """The unit of a receiver's speed, by its positions."""
-    course = motion.course_of(source.t, source.llh, None)
-    return guesses.speed_unit(source.t, source.values["speed"], course, source.find_unit("speed", "speed"))
+    course = motion.compute_course(source.t, source.llh, None)
+    return guesses.guess_speed_unit(source.t, source.values["speed"], course, source.find_unit("speed", "speed"))

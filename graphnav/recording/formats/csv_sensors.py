@@ -137,7 +137,7 @@ def build_odometer(d: schema.OdometerTable, rows: Table, remarks: Remarks) -> Od
         speed,
         np.array(d.lever_arm),
         d.scale_sigma,
-        way=way,
+        counted=way,
         pulse=d.metres_per_pulse or 0.0,
         wheels=wheels,
         signed=signed,

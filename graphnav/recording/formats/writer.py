@@ -123,8 +123,8 @@ def _write_odometer(log: Log) -> _File | None:
         return None
     odometer = log.odometer
     header, columns = ["t", "speed"], [odometer.t, odometer.speed]
-    if odometer.way is not None:
-        header, columns = [*header, "pulses"], [*columns, np.round(odometer.way / odometer.pulse)]
+    if odometer.counted is not None:
+        header, columns = [*header, "pulses"], [*columns, np.round(odometer.counted / odometer.pulse)]
     if odometer.wheels is not None:
         header, columns = [*header, *WHEELS], [*columns, *odometer.wheels.T]
     return _File("odometer.csv.gz", header, columns)
@@ -222,7 +222,7 @@ def _write_toml(log: Log) -> str:
 
 def _write_odometer_keys(odometer: Odometer) -> list[str]:
     lines = []
-    if odometer.way is not None:
+    if odometer.counted is not None:
         lines += [f"metres_per_pulse = {float(odometer.pulse)!r}", 'pulses = "cumulative"']
     lines += [f"scale_sigma = {float(odometer.scale_sigma)!r}", f"signed = {str(odometer.signed).lower()}"]
     if odometer.speed_sigma is not None:

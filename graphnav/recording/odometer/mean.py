@@ -77,7 +77,7 @@ def counts(odometer: Odometer, step: float | None = None) -> float:
     """
     t, speed = odometer.t, odometer.speed
     step = quantum(speed) if step is None else step
-    if odometer.way is not None or step == 0.0:
+    if odometer.counted is not None or step == 0.0:
         return odometer.pulse
     even = np.r_[True, np.diff(t) < 1.5 * period_of(t)] & (speed != 0.0)
 
@@ -169,8 +169,10 @@ class MeanSpeed:
             good &= (t < begin) | (t >= end)
             across |= (t[:-1] < end) & (t[1:] > begin)
         bad = across | ~good[1:] | ~good[:-1]
-        counted = odometer.way is not None
-        distance = odometer.way if odometer.way is not None else _sum_from_zero(0.5 * (speed[1:] + speed[:-1]) * step)
+        counted = odometer.counted is not None
+        distance = (
+            odometer.counted if odometer.counted is not None else _sum_from_zero(0.5 * (speed[1:] + speed[:-1]) * step)
+        )
         white, rounding, ends = figures.sigmas(odometer)
         return cls(
             t,

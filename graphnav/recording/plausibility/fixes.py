@@ -50,12 +50,12 @@ def screen(recording: Recording) -> tuple[Recording, list[Finding]]:
             )
         )
         gnss = take_rows(gnss, np.arange(len(gnss.t)) >= cached)
-    p = _positions(gnss)
+    p = _compute_positions(gnss)
     off = find_out_of_reach(gnss.t, p)
     if off.any():
         findings.append(_drop_unreachable(gnss, p, off, recording.start))
         gnss = take_rows(gnss, ~off)
-        p = _positions(gnss)
+        p = _compute_positions(gnss)
     for a, b in find_frozen_heights(gnss, p):
         driven = float(np.hypot(*np.diff(p[a:b, :2], axis=0).T).sum())
         sd = gnss.sd.copy()
@@ -83,7 +83,7 @@ def count_cached_fixes(t: Array, start: float) -> int:
     return int(before[-1]) + 1 if len(before) and t[-1] > start else 0
 
 
-def _positions(gnss: Gnss) -> Array:
+def _compute_positions(gnss: Gnss) -> Array:
     """ENU metres around the middle one of the fixes, which one that is far off hardly ever is, (M, 3)."""
     middle = np.median(gnss.llh[np.isfinite(gnss.llh).all(axis=1)], axis=0) if len(gnss.t) else np.zeros(3)
     return LocalFrame(middle if np.isfinite(middle).all() else np.zeros(3)).from_llh(gnss.llh)
@@ -144,7 +144,7 @@ def find_frozen_heights(gnss: Gnss, p: Array) -> list[tuple[int, int]]:
     ]
 
 
-def _steps(gnss: Gnss) -> tuple[Array, float, NDArray[np.bool_]]:
+def _compute_steps(gnss: Gnss) -> tuple[Array, float, NDArray[np.bool_]]:
     """Time steps, their median, and which are no gap."""
     dt = np.diff(gnss.t)
     period = float(np.median(dt))
@@ -154,7 +154,7 @@ def _steps(gnss: Gnss) -> tuple[Array, float, NDArray[np.bool_]]:
 def check_sigmas(gnss: Gnss, p: Array) -> Iterator[Finding]:
     """Sigmas smaller than a phase can be measured, or that the scatter of the fixes denies; they are not changed."""
     sd = float(np.median(gnss.sd[:, :2]))
-    _, period, near = _steps(gnss)
+    _, period, near = _compute_steps(gnss)
     pairs = near[1:] & near[:-1]
     bend = (p[2:] - 2.0 * p[1:-1] + p[:-2])[pairs, :2]
     bend = bend[np.isfinite(bend).all(axis=1)]
@@ -199,8 +199,8 @@ def check_two_groups(gnss: Gnss, p: Array) -> Iterator[Finding]:
     if there.sum() < 2 * _MEAN_OF:
         return
     gnss, p = take_rows(gnss, there), p[there, :2]
-    dt, period, _ = _steps(gnss)
-    jump = _jumps(p, dt)
+    dt, period, _ = _compute_steps(gnss)
+    jump = _find_jumps(p, dt)
     sd = np.hypot(gnss.sd[:, 0], gnss.sd[:, 1])
     # the speed changes by what tyres grip over half the window; over a long gap no step shows, and none is taken
     limit = 5.0 * np.hypot(sd[1:], sd[:-1]) + _GRIP * np.maximum(0.5 * _MEAN_OF * period, dt) * dt
@@ -212,8 +212,8 @@ def check_two_groups(gnss: Gnss, p: Array) -> Iterator[Finding]:
     step = np.median(sign[:, None] * jump[big], axis=0)
     size = float(np.linalg.norm(step))
     for _ in range(3):  # the motion is clearer without the steps, and the steps are with the motion
-        group = _groups(jump @ (step / size), size)
-        jump = _jumps(p - group[:, None] * step, dt)
+        group = _find_groups(jump @ (step / size), size)
+        jump = _find_jumps(p - group[:, None] * step, dt)
     left = np.linalg.norm(jump, axis=1)
     alike = float((left[np.diff(group) != 0] < _ALIKE * size).mean())
     share = np.array([(group == 0).mean(), (group == 1).mean()])
@@ -227,13 +227,13 @@ def check_two_groups(gnss: Gnss, p: Array) -> Iterator[Finding]:
     )
 
 
-def _jumps(p: Array, dt: Array) -> Array:
+def _find_jumps(p: Array, dt: Array) -> Array:
     """What steps between fixes at p (M, 2) m differ by from the usual pace around them, (M - 1, 2) m."""
     rate = median_filter(np.diff(p, axis=0) / dt[:, None], size=(_MEAN_OF, 1), mode="nearest")
     return np.asarray(np.diff(p, axis=0) - rate * dt[:, None])
 
 
-def _groups(jump: Array, size: float) -> NDArray[np.intp]:
+def _find_groups(jump: Array, size: float) -> NDArray[np.intp]:
     """Group (M,) 0 or 1 of every fix: those with which jumps (M - 1,) along a step of that size are least off."""
     cost = np.abs(jump[:, None, None] - size * np.array([[0.0, 1.0], [-1.0, 0.0]]))  # from, to
     best, came = np.zeros(2), np.zeros((len(jump), 2), dtype=np.intp)

@@ -26,7 +26,7 @@ _RATE = 10.0  # Hz that changes of speed need
 def screen(recording: Recording, track: Track | None) -> tuple[Recording, list[Finding]]:
     """The recording without readings that cannot be right, and what was found; `track` is what GNSS says."""
     findings: list[Finding] = []
-    for one in (_find_beyond, _clock_jump, _other_scale):
+    for one in (_find_beyond, _find_clock_jump, _find_other_scale):
         odometer = recording.odometer
         if odometer is None or len(odometer.t) < 2:
             break
@@ -66,7 +66,7 @@ def _find_beyond(odometer: Odometer, track: Track | None, start: float) -> _Foun
     )
 
 
-def _misfit(odometer: Odometer, track: Track, rows: NDArray[np.bool_], later: float) -> float:
+def _measure_misfit(odometer: Odometer, track: Track, rows: NDArray[np.bool_], later: float) -> float:
     """Mean size of the GNSS speed less that of `rows` of the odometer `later` s later, m/s; NaN of too few."""
     t, speed = odometer.t[rows] + later, odometer.speed[rows]
     if len(t) < 2:
@@ -78,7 +78,7 @@ def _misfit(odometer: Odometer, track: Track, rows: NDArray[np.bool_], later: fl
     return float(np.mean(np.minimum(np.abs(off), _LEAST_SPEED)))  # a wild fix has no more say than that
 
 
-def _clock_jump(odometer: Odometer, track: Track | None, start: float) -> _Found:
+def _find_clock_jump(odometer: Odometer, track: Track | None, start: float) -> _Found:
     """A silence that was none: without it the readings on one side fit the GNSS speed, and with it they do not."""
     t = odometer.t
     none = np.zeros(len(t), dtype=bool)
@@ -91,8 +91,8 @@ def _clock_jump(odometer: Odometer, track: Track | None, start: float) -> _Found
         for after in (True, False):
             side = (t > t[k]) if after else (t <= t[k])
             shift = -jump if after else jump
-            as_read, moved = _misfit(odometer, track, side, 0.0), _misfit(odometer, track, side, shift)
-            other = _misfit(odometer, track, ~side, 0.0)
+            as_read, moved = _measure_misfit(odometer, track, side, 0.0), _measure_misfit(odometer, track, side, shift)
+            other = _measure_misfit(odometer, track, ~side, 0.0)
             if moved * _CLEAR < as_read and (np.isnan(other) or other * _CLEAR < as_read):
                 leap = ", the leap seconds between GPS time and UTC" if abs(jump - 18.0) < 0.5 else ""
                 return side, Finding(
@@ -105,7 +105,7 @@ def _clock_jump(odometer: Odometer, track: Track | None, start: float) -> _Found
     return none, None
 
 
-def _other_scale(odometer: Odometer, track: Track | None, start: float) -> _Found:
+def _find_other_scale(odometer: Odometer, track: Track | None, start: float) -> _Found:
     """Spans in which the odometer has another scale against GNSS than it has elsewhere, where it is nearly 1."""
     t = odometer.t
     bad = np.zeros(len(t), dtype=bool)

@@ -44,11 +44,11 @@ def count_expected(excess: Array, others: Array, resolution: float) -> Array:
     -------
     (M,)
     """
-    fall, last = _fall(others, resolution)
+    fall, last = _measure_fall(others, resolution)
     return np.asarray(TAIL * (excess / last) ** (-1.0 / fall))
 
 
-def _fall(others: Array, resolution: float | Array) -> tuple[Array, Array]:
+def _measure_fall(others: Array, resolution: float | Array) -> tuple[Array, Array]:
     """How slowly excesses (M, TAIL + 1) fall off, and the smallest of each row."""
     last = others[:, -1]
     return np.log(others[:, :-1] / last[:, None]).mean(axis=1) + 0.5 * resolution / last, last
@@ -117,6 +117,6 @@ class Excesses:
             return
         limits = np.full(len(self._least), np.inf)
         told = np.flatnonzero(self._largest[-1] > 0.0)
-        fall, last = _fall(self._largest.T[told], self._least[told])
+        fall, last = _measure_fall(self._largest.T[told], self._least[told])
         limits[told] = last * (TAIL / RARE) ** fall
         self.limits = tuple(limits.tolist())

@@ -20,8 +20,8 @@ from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.recording import Imu, Recording, take_rows
 from graphnav.recording.checks import crosschecks
-from graphnav.recording.checks.aiding import check_imu_axes, check_imu_clock, overlap_s
-from graphnav.recording.checks.clock import ClockOffsets, clock_of
+from graphnav.recording.checks.aiding import check_imu_axes, check_imu_clock, measure_overlap
+from graphnav.recording.checks.clock import ClockOffsets, measure_clock_offsets
 from graphnav.recording.checks.crosschecks import Fit, Track
 from graphnav.recording.checks.series import screen_series
 from graphnav.recording.formats.schema import FORCE
@@ -110,7 +110,7 @@ def screen(recording: Recording) -> Screened:
     """
     if recording.screened:
         return Screened(recording)
-    recording, of_imu, of_aiding, track = _without_the_impossible(recording)
+    recording, of_imu, of_aiding, track = _drop_impossible(recording)
     dead, clock = list(check_dead_axes(recording)), None
     findings = [*of_imu, *dead, *of_aiding]
     wrong_unit = any(f.key in _UNITS for f in of_imu)
@@ -121,23 +121,23 @@ def screen(recording: Recording) -> Screened:
         # stamps that are late by now this, now that have no clock
         if track is not None and not any(f.key == "gnss.stamped_on_arrival" for f in findings):
             assert recording.gnss is not None
-            clock = clock_of(recording.imu, recording.gnss)
+            clock = measure_clock_offsets(recording.imu, recording.gnss)
             forward = clock.by_velocity if track.instant else clock.by_places
         else:
-            forward = crosschecks.forward_fit(recording.imu, path) if path is not None else None
+            forward = crosschecks.fit_forward(recording.imu, path) if path is not None else None
         findings += check_forward_sign(recording.imu, path, forward)
         if clock is not None and track is not None:
-            odometer = crosschecks.odometer_fit(recording.odometer, track) if recording.odometer is not None else None
+            odometer = crosschecks.fit_odometer(recording.odometer, track) if recording.odometer is not None else None
             findings += check_imu_clock(clock, None if odometer is None else odometer[0])
     return Screened(recording, tuple(findings), clock)
 
 
-def _without_the_impossible(recording: Recording) -> tuple[Recording, list[Finding], list[Finding], Track | None]:
+def _drop_impossible(recording: Recording) -> tuple[Recording, list[Finding], list[Finding], Track | None]:
     """The recording without what cannot be right, findings of the IMU and of the others, and the way by the fixes."""
     of_imu: list[Finding] = list(check_imu_scale(recording))
     if not of_imu:  # where a unit is wrong throughout, nothing is known of single rows
-        imu, spikes = without_spikes(recording.imu, recording.start)
-        imu, contradicted = without_contradicted(imu, recording.start, forces=recording.platform != "foot")
+        imu, spikes = drop_spikes(recording.imu, recording.start)
+        imu, contradicted = drop_contradicted(imu, recording.start, forces=recording.platform != "foot")
         recording, of_imu = replace(recording, imu=imu), [*spikes, *contradicted]
     recording, of_aiding = screen_series(replace(recording, screened=True))
     track = None
@@ -146,7 +146,7 @@ def _without_the_impossible(recording: Recording) -> tuple[Recording, list[Findi
         of_aiding += more
         assert recording.gnss is not None
         track = crosschecks.track(recording.gnss)
-        if track is not None and overlap_s(recording) <= 0:
+        if track is not None and measure_overlap(recording) <= 0:
             track = None
     if recording.odometer is not None and len(recording.odometer.t):
         recording, more = plausibility_odometer.screen(recording, track)
@@ -175,8 +175,8 @@ def check_imu_scale(recording: Recording) -> Iterator[Finding]:
         np.sqrt(turn, out=turn)
         quiet = turn <= np.percentile(turn, _QUIET)
         f = float(np.median(np.linalg.norm(imu.accel[quiet], axis=1)))
-    if (sentence := _scale(f)) is not None:
-        g = _STANDARD_GRAVITY if recording.gnss is None else _gravity(recording)
+    if (sentence := _find_scale(f)) is not None:
+        g = _STANDARD_GRAVITY if recording.gnss is None else _measure_gravity(recording)
         yield Finding(
             "refused",
             f"the force has a median of {f:.3g} m/s2 where it is calm, not {g:.1f}: {sentence}",
@@ -184,14 +184,14 @@ def check_imu_scale(recording: Recording) -> Iterator[Finding]:
         )
 
 
-def _gravity(recording: Recording) -> float:
+def _measure_gravity(recording: Recording) -> float:
     """Where most fixes are, m/s^2."""
     assert recording.gnss is not None
     there = recording.gnss.llh[np.isfinite(recording.gnss.llh).all(axis=1)]
     return float(gravity(*np.median(there, axis=0)[[0, 2]])) if len(there) else _STANDARD_GRAVITY
 
 
-def _scale(f: float) -> str | None:
+def _find_scale(f: float) -> str | None:
     """What a force at rest looks like that is not gravity; None if it is."""
     g = _STANDARD_GRAVITY
     if g / _SCALE < f < g * _SCALE:
@@ -214,7 +214,7 @@ def _scale(f: float) -> str | None:
     return "the accelerometer's scale is wrong: look at units.accel in [imu] and at the range that was set"
 
 
-def without_spikes(imu: Imu, start: float) -> tuple[Imu, list[Finding]]:
+def drop_spikes(imu: Imu, start: float) -> tuple[Imu, list[Finding]]:
     """The IMU without the rows that no sensor can have read, which leaves gaps that are bridged."""
     gyro, accel = ~(np.abs(imu.gyro) <= GYRO_RANGE), ~(np.abs(imu.accel) <= ACCEL_RANGE)
     bad: NDArray[np.bool_] = np.asarray((gyro | accel).any(axis=1))
@@ -228,7 +228,7 @@ def without_spikes(imu: Imu, start: float) -> tuple[Imu, list[Finding]]:
     )
     value = values[k][wild[k]][0]
     sentence = (
-        f"{_rows(bad)} that no sensor can have read (the first, of the {name}, {value:.4g} {unit} at "
+        f"{_list_rows(bad)} that no sensor can have read (the first, of the {name}, {value:.4g} {unit} at "
         f"{imu.t[k] - start:.2f} s from the start; {most:g} {unit} is beyond any range)"
     )
     if bad.mean() > _ISOLATED:
@@ -236,7 +236,7 @@ def without_spikes(imu: Imu, start: float) -> tuple[Imu, list[Finding]]:
     return take_rows(imu, ~bad), [Finding("warning", f"{sentence}: left out, as a gap", "imu.spike")]
 
 
-def without_contradicted(imu: Imu, start: float, forces: bool) -> tuple[Imu, list[Finding]]:
+def drop_contradicted(imu: Imu, start: float, forces: bool) -> tuple[Imu, list[Finding]]:
     """The IMU without single rows that those before and after contradict, which leaves gaps that are bridged.
 
     With `forces`, of the accelerometer, too: what stands on tyres and springs is hit for more than a row, but not a
@@ -247,11 +247,11 @@ def without_contradicted(imu: Imu, start: float, forces: bool) -> tuple[Imu, lis
     if not bad.any():
         return imu, []
     first = float(imu.t[bad][0]) - start
-    sentence = f"{_rows(bad)} that those before and after contradict (the first at {first:.2f} s from the start)"
+    sentence = f"{_list_rows(bad)} that those before and after contradict (the first at {first:.2f} s from the start)"
     return take_rows(imu, ~bad), [Finding("note", f"{sentence}: left out, as a gap", "imu.contradicted")]
 
 
-def _rows(bad: NDArray[np.bool_]) -> str:
+def _list_rows(bad: NDArray[np.bool_]) -> str:
     return "1 IMU row" if bad.sum() == 1 else f"{bad.sum()} IMU rows"
 
 
@@ -322,7 +322,7 @@ def check_forward_sign(imu: Imu, track: Track | None, forward: Fit | None) -> It
         return
     along = f"the forward force falls when the speed rises (correlation {-forward.correlation:.2f})"
     if (
-        side := crosschecks.sideways_correlation(imu, track)
+        side := crosschecks.correlate_sideways(imu, track)
     ) is not None and side > 0:  # then nothing is turned: the other axes are right
         column = "a" + _AXIS[int(np.argmax(np.abs(imu.R_bs[1])))]
         yield Finding(
