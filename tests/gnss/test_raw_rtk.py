@@ -15,6 +15,7 @@ from helpers import errors, truth_states
 from test_raw_rows import scene
 
 from graphnav.config import settings_from
+from graphnav.constraints import raw_phase
 from graphnav.constraints.raw_gnss import CLOCK
 from graphnav.constraints.raw_phase import GnssPhase, WholeCycles
 from graphnav.core import earth
@@ -27,6 +28,7 @@ from graphnav.gnss.differential import with_differences
 from graphnav.gnss.ephemeris import EARTH_RATE
 from graphnav.gnss.integers import decorrelate, find_nearest
 from graphnav.gnss.series import RawGnss
+from graphnav.gnss.sigmas import reflection_sigma
 from graphnav.gnss.signals import L1, C
 from graphnav.recording.formats import read
 from graphnav.report.satellites import satellite_tables
@@ -283,6 +285,48 @@ def test_derivatives_are_those_of_differences(exact):
                           slice(None))  # fmt: skip
     np.testing.assert_allclose(held.residual[:, 0], [1.0, -4.0])
     np.testing.assert_allclose(held.jacobians["a"][:, 0, 0], [1.0, -1.0])
+
+
+@pytest.mark.parametrize("n", [2, 4, 9])
+def test_reflections_shift_a_place_as_least_squares_would(n):
+    rng = np.random.default_rng(n)
+    towards, sigma = 2e7 * rng.normal(size=(2 * n, 3)), rng.uniform(0.004, 0.02, 2 * n)
+    shifts, keyframe = raw_phase._project(towards, sigma, np.repeat([3, 5], n)), np.repeat([0, 1], n)
+    for k in range(2):
+        own = keyframe == k
+        e = towards[own] / np.linalg.norm(towards[own], axis=1)[:, None]
+        A = np.column_stack([e, np.ones(n)]) / sigma[own, None]
+        # of every difference of two satellites, which no clock is in, where the place explains errors of each
+        D = np.eye(n) - np.ones((n, n)) / n
+        place = np.linalg.pinv(A.T @ A)[:3, :3]
+        if n > 3:
+            np.testing.assert_allclose(D @ shifts[own] @ shifts[own].T @ D, D @ e @ place @ e.T @ D, rtol=1e-9)
+        else:  # as much of a difference as there is of it
+            apart = (D @ shifts[own])[0] - (D @ shifts[own])[1]
+            assert apart @ apart == pytest.approx(np.sum(sigma[own] ** 2))
+
+
+def test_reflections_that_last_are_in_the_sigma(drive):
+    """As long and as large as they are taken to be, for each satellite by itself: not a shift of the place."""
+    recording, truth = drive
+    raw, rng = recording.raw_gnss, np.random.default_rng(8)
+    carrier = raw.carrier.copy()
+    _, elevation = directions(raw.antenna, raw.p)
+    for satellite in np.unique(raw.satellite):
+        own = raw.satellite == satellite
+        decay = np.exp(-np.diff(raw.t[own]) / raw_phase._LASTING)
+        x = rng.standard_normal(int(own.sum()))
+        for i, a in enumerate(decay):
+            x[i + 1] = a * x[i] + np.sqrt(1.0 - a * a) * x[i + 1]
+        carrier[own] += reflection_sigma(elevation[own]) * x / WAVELENGTH
+    spoilt = replace(recording, raw_gnss=replace(raw, carrier=carrier))
+    for one in run(spoilt, STATED, ("ekf", "rts")).values():
+        off, sigma = errors(one, truth)[:2]
+        fixed = one.fixed[one.fixed[:, 1] > 0.0, 0]
+        k = np.searchsorted(one.t, fixed - 1e-6)
+        print(one.solver, np.mean((off[k] / sigma[k]) ** 2, axis=0), sigma[k].mean(0))
+        # three numbers that hardly change within the drive: chi-square of three or a few more, 99.9 %
+        assert 0.05 < np.mean((off[k] / sigma[k]) ** 2) < 5.4
 
 
 @pytest.fixture(scope="module")
