@@ -28,7 +28,7 @@ from graphnav.config import Settings
 from graphnav.constraints.ambiguities import ambiguities, ambiguity_name
 from graphnav.constraints.base import SAME_TIME, BuildContext, Constraint, Linearized
 from graphnav.constraints.raw_gnss import IONOSPHERE, RangeConstraint, common_fields, ionosphere_parameter
-from graphnav.constraints.raw_rows import prepare_rows
+from graphnav.constraints.raw_rows import period_of_epochs, prepare_rows
 from graphnav.core import rotation
 from graphnav.core.rotation import Array
 from graphnav.core.state import Parameter, States
@@ -60,6 +60,8 @@ class GnssPhase(RangeConstraint):
     begin: Array = field(default_factory=lambda: np.empty(0))  # (N,) s, of the arc
     whole: Array = field(default_factory=lambda: np.empty(0, dtype=bool))  # (N,) no half cycle is open in the arc
     reflected: Array = field(default_factory=lambda: np.empty((0, 3)))  # (N, 3) m, e.L
+    reflection: Array = field(default_factory=lambda: np.empty(0))  # (N,) cycles, 1-sigma of what lasts of an arc
+    period: float = 1.0  # s between epochs
     slots: tuple[str, ...] = ()  # names of the ambiguities
     group: Array = field(default_factory=lambda: np.empty(0, dtype=int))  # (slots,) system and signal; -1: no integers
 
@@ -110,12 +112,14 @@ class GnssPhase(RangeConstraint):
         }
         lasting = Parameter(REFLECTIONS, np.zeros(3), np.ones(3), "1", correlation_time=_LASTING, spacing=found.spacing)
         common["parameters"] += (ionosphere_parameter(found.raw, found.spacing), lasting, *(own[k] for k in there))
-        nominal = (raw.antenna - frame.r_e) @ frame.R_ne.T
+        nominal, reflection = (raw.antenna - frame.r_e) @ frame.R_ne.T, reflection_sigma(geometry.elevation)
         known = geometry.distance + geometry.troposphere - geometry.ionosphere
         return cls(
             offset=known - wavelength[used] * raw.carrier - raw.carrier_difference - raw.clock,
             nominal=nominal,
-            reflected=_project(common["s_n"] - nominal, reflection_sigma(geometry.elevation), keyframe[used]),
+            reflected=_project(common["s_n"] - nominal, reflection, keyframe[used]),
+            reflection=reflection / wavelength[used],
+            period=period_of_epochs(found.raw, s),
             slant=-obliquity(geometry.elevation) * (L1 / raw.frequency) ** 2,
             wavelength=wavelength[used],
             sigma=carrier_difference_sigma(raw.cn0, geometry.elevation, wavelength[used])[:, None],
@@ -138,6 +142,15 @@ class GnssPhase(RangeConstraint):
             residual = residual + np.sum(self.reflected[rows] * parameters[REFLECTIONS], axis=1)
             J[REFLECTIONS] = self.reflected[rows, None]
         return Linearized(residual[:, None], J, self.sigma[rows])
+
+
+def variance_left(duration: Array, period: float) -> Array:
+    """Of reflections of unit variance, what a mean over a time (s) holds of them more than were they white.
+
+    The variance of the mean of a Gauss-Markov sequence (Brockwell and Davis 1991, section 7.1) less 1 / n.
+    """
+    n, a = 1.0 + duration / period, np.exp(-period / _LASTING)
+    return np.asarray(2.0 * a / (n * (1.0 - a)) * (1.0 - (1.0 - a**n) / (n * (1.0 - a))))
 
 
 def _project(towards: Array, sigma: Array, keyframe: Array) -> Array:
