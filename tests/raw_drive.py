@@ -20,6 +20,7 @@ from graphnav.recording import Recording
 
 RADIUS, MU = 2.656e7, 3.986004418e14
 SATELLITES = [f"G{k:02d}" for k in range(1, 8)] + [f"E{k:02d}" for k in range(1, 6)]
+MANY = [*SATELLITES, *(f"G{k:02d}" for k in range(8, 13)), *(f"E{k:02d}" for k in range(6, 12))]  # as many as today
 BANDS = {"G": ((L1, "1C"), (1227.6e6, "2W")), "E": ((L1, "1C"), (1176.45e6, "5Q"))}
 BIAS = 7.0  # m, of Galileo's signal
 ZERO = 2200 * 604800.0

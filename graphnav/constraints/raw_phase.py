@@ -2,7 +2,7 @@
 
 With what `graphnav.constraints.raw_gnss` says of codes, and N the difference of rover's and base's ambiguity (cycles),
 
-    r_phase   = |s - p_a| + b - m z + T - dt - lambda (phi - N)
+    r_phase   = |s - p_a| + b - m z + T - dt - lambda (phi - N) + e.L c
 
 b is the same clock as that of the codes. Rows stay one for each satellite and signal rather than differences between
 satellites: sigmas are then independent, a kernel meets one satellite, and none of them is the reference. What receivers
@@ -11,6 +11,10 @@ delay a signal by is in all ambiguities of a system's signal alike; so integers 
     r_integer = N_i - N_j - n_ij
 
 (Teunissen and Montenbruck 2017, chapters 21, 23, 26). Rows are against a base: without one there are none.
+
+Reflections last: residuals at right integers stay alike for ten seconds and more, and do not average out as noise does.
+L c is what they shift a place by, c a process of unit variance in the axes of n, and L L^T the covariance of an epoch's
+place where reflections alone are wrong. What of them is no shift stays in the sigma of the rows.
 """
 
 from __future__ import annotations
@@ -24,16 +28,21 @@ from graphnav.config import Settings
 from graphnav.constraints.ambiguities import ambiguities, ambiguity_name
 from graphnav.constraints.base import SAME_TIME, BuildContext, Constraint, Linearized
 from graphnav.constraints.raw_gnss import IONOSPHERE, RangeConstraint, common_fields, ionosphere_parameter
-from graphnav.constraints.raw_rows import prepare_rows
+from graphnav.constraints.raw_rows import period_of_epochs, prepare_rows
+from graphnav.core import rotation
 from graphnav.core.rotation import Array
-from graphnav.core.state import States
+from graphnav.core.state import Parameter, States
 from graphnav.gnss.arcs import find_arcs
 from graphnav.gnss.atmosphere import obliquity
-from graphnav.gnss.sigmas import carrier_difference_sigma
+from graphnav.gnss.sigmas import carrier_difference_sigma, reflection_sigma
 from graphnav.gnss.signals import GLONASS, L1, C
 from graphnav.gnss.single_point import choose_coefficients, look
 from graphnav.recording import Recording
 
+REFLECTIONS = "gnss_reflections"
+# s, correlation time of reflections: by the residuals of two drives 13 and 30 s on the way, longer at rest
+_LASTING = 20.0
+_WEAKEST = 1e-3  # of the information on a place in its best direction; where there is less, satellites do not tell
 EXACT = 1e-3  # cycles, 1-sigma of a difference that is known as an integer: a tenth of a carrier's noise
 
 
@@ -50,6 +59,9 @@ class GnssPhase(RangeConstraint):
     slot: Array = field(default_factory=lambda: np.empty(0, dtype=int))  # (N,) index of `slots`
     begin: Array = field(default_factory=lambda: np.empty(0))  # (N,) s, of the arc
     whole: Array = field(default_factory=lambda: np.empty(0, dtype=bool))  # (N,) no half cycle is open in the arc
+    reflected: Array = field(default_factory=lambda: np.empty((0, 3)))  # (N, 3) m, e.L
+    reflection: Array = field(default_factory=lambda: np.empty(0))  # (N,) cycles, 1-sigma of what lasts of an arc
+    period: float = 1.0  # s between epochs
     slots: tuple[str, ...] = ()  # names of the ambiguities
     group: Array = field(default_factory=lambda: np.empty(0, dtype=int))  # (slots,) system and signal; -1: no integers
 
@@ -98,11 +110,16 @@ class GnssPhase(RangeConstraint):
             "elevation": geometry.elevation,
             "level": np.zeros(int(used.sum()), dtype=int),
         }
-        common["parameters"] += (ionosphere_parameter(found.raw, found.spacing), *(own[k] for k in there))
+        lasting = Parameter(REFLECTIONS, np.zeros(3), np.ones(3), "1", correlation_time=_LASTING, spacing=found.spacing)
+        common["parameters"] += (ionosphere_parameter(found.raw, found.spacing), lasting, *(own[k] for k in there))
+        nominal, reflection = (raw.antenna - frame.r_e) @ frame.R_ne.T, reflection_sigma(geometry.elevation)
         known = geometry.distance + geometry.troposphere - geometry.ionosphere
         return cls(
             offset=known - wavelength[used] * raw.carrier - raw.carrier_difference - raw.clock,
-            nominal=(raw.antenna - frame.r_e) @ frame.R_ne.T,
+            nominal=nominal,
+            reflected=_project(common["s_n"] - nominal, reflection, keyframe[used]),
+            reflection=reflection / wavelength[used],
+            period=period_of_epochs(found.raw, s),
             slant=-obliquity(geometry.elevation) * (L1 / raw.frequency) ** 2,
             wavelength=wavelength[used],
             sigma=carrier_difference_sigma(raw.cn0, geometry.elevation, wavelength[used])[:, None],
@@ -121,7 +138,46 @@ class GnssPhase(RangeConstraint):
             name, own = self.slots[k], np.where(slot == k, wavelength, 0.0)
             residual = residual + own * parameters[name][:, 0]
             J[name] = own[:, None, None]
+        if REFLECTIONS in parameters:
+            residual = residual + np.sum(self.reflected[rows] * parameters[REFLECTIONS], axis=1)
+            J[REFLECTIONS] = self.reflected[rows, None]
         return Linearized(residual[:, None], J, self.sigma[rows])
+
+
+def variance_left(duration: Array, period: float) -> Array:
+    """Of reflections of unit variance, what a mean over a time (s) holds of them more than were they white.
+
+    The variance of the mean of a Gauss-Markov sequence (Brockwell and Davis 1991, section 7.1) less 1 / n.
+    """
+    n, a = 1.0 + duration / period, np.exp(-period / _LASTING)
+    return np.asarray(2.0 * a / (n * (1.0 - a)) * (1.0 - (1.0 - a**n) / (n * (1.0 - a))))
+
+
+def _project(towards: Array, sigma: Array, keyframe: Array) -> Array:
+    """(N, 3) m, e.L of each row: L L^T is the covariance of an epoch's place by errors of these sigmas and a clock.
+
+    Parameters
+    ----------
+    towards : (N, 3) m, from the antenna to the satellite.
+    sigma : (N,) m.
+    keyframe : (N,) of the epochs.
+    """
+    e = towards / np.linalg.norm(towards, axis=1, keepdims=True)
+    epochs, which = np.unique(keyframe, return_inverse=True)
+    weight = sigma**-2.0
+    total, mean = np.zeros(len(epochs)), np.zeros((len(epochs), 3))
+    np.add.at(total, which, weight)
+    np.add.at(mean, which, weight[:, None] * e)
+    from_mean = e - (mean / total[:, None])[which]
+    information = np.zeros((len(epochs), 3, 3))
+    np.add.at(information, which, weight[:, None, None] * from_mean[:, :, None] * from_mean[:, None])
+    told, axes = np.linalg.eigh(information)
+    known = told > _WEAKEST * told[:, -1:]
+    size = np.where(known, 1.0 / np.sqrt(np.where(known, told, 1.0)), 0.0)
+    root = (axes * size[:, None]) @ np.swapaxes(
+        axes, -1, -2
+    )  # the symmetric one turns with the sky, not with its order
+    return np.asarray(rotation.mv(root[which], e))
 
 
 @dataclass(frozen=True)

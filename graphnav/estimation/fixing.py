@@ -131,7 +131,13 @@ def _note(epochs: Epochs, known: Known) -> str:
 
 
 def _decide(
-    sets: dict[int, list[list[Arc]]], at: dict[str, int], values: Array, P: Array, known: Known, impose: bool
+    sets: dict[int, list[list[Arc]]],
+    at: dict[str, int],
+    values: Array,
+    P: Array,
+    known: Known,
+    lasting: dict[Arc, float],
+    impose: bool,
 ) -> list[tuple[Arc, Arc, int]]:
     """Differences that can be told at an epoch.
 
@@ -139,6 +145,7 @@ def _decide(
     ----------
     at : column of each ambiguity.
     values, P : parameters with as many zeros in front as there are states, and the joint covariance.
+    lasting : cycles^2 that P lacks of arcs, as long as nothing is known of them.
     impose : whether P is without what is known.
     """
     arcs = [arc for some in sets.values() for one in some for arc in one]
@@ -156,6 +163,8 @@ def _decide(
         x = x + K @ (n - H @ x)
         I = np.eye(len(arcs)) - K @ H
         Q = I @ Q @ I.T + EXACT**2 * K @ K.T
+    alone = [one[0] for some in sets.values() for one in some if len(one) == 1]
+    Q[[place[arc] for arc in alone], [place[arc] for arc in alone]] += [lasting[arc] for arc in alone]
     pairs = []
     for some in sets.values():
         apart = [[place[arc] for arc in one] for one in some]
@@ -208,7 +217,8 @@ def hold_on(before: Held, epochs: Epochs, k: int, here: Points, covariance: Call
     sets, found = epochs.sets(k, known), []
     if any(len(some) > 1 for some in sets.values()):
         values = np.concatenate([np.zeros(DIM), here.values[0]])
-        found = _decide(sets, epochs.columns, values, covariance(), known, impose=False)
+        lasting = epochs.lasting(k, lambda arc: float(epochs.time[k]))
+        found = _decide(sets, epochs.columns, values, covariance(), known, lasting, impose=False)
     if found:
         held = replace(known, of=known.of.copy())
         for a, b, n in found:
@@ -260,7 +270,8 @@ def _sweep(epochs: Epochs, problem: Problem, smoothed: SmootherPass, known: Know
             continue
         tried.add(key)
         held = replace(known, of=known.of.copy())
-        for a, b, n in _decide(sets, epochs.columns, values[k], smoothed.P[k], known, impose=True):
+        lasting = epochs.lasting(k, epochs.last.__getitem__)
+        for a, b, n in _decide(sets, epochs.columns, values[k], smoothed.P[k], known, lasting, impose=True):
             held.join(a, b, n)
         if len(held.of) > len(known.of) and not epochs.odd(k, _one(smoothed, k), held):
             known.of = held.of

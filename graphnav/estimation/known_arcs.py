@@ -6,14 +6,14 @@ epoch.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.special import gammaincinv  # scipy.stats would take half a second to import
 
 from graphnav.constraints.ambiguities import slot_names
-from graphnav.constraints.raw_phase import GnssPhase
+from graphnav.constraints.raw_phase import GnssPhase, variance_left
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM
 from graphnav.estimation.solution import CarrierArcs
@@ -69,6 +69,7 @@ class Epochs:
         edges = np.searchsorted(phase.keyframe, [*self.keyframes, len(t)])
         for k, lo, hi in zip(self.keyframes, edges[:-1].tolist(), edges[1:].tolist(), strict=True):
             self.rows[k], self.active[k] = slice(lo, hi), arcs[lo:hi]
+        self.last = {arc: float(t[k]) for arc, k in zip(arcs, phase.keyframe.tolist(), strict=True)}  # s
 
     def odd(self, k: int, here: Points, known: Known) -> list[Arc]:
         """Arcs with integers that an epoch is not consistent with, and is without them.
@@ -101,6 +102,20 @@ class Epochs:
             share = np.maximum(1.0 - np.sum(Q * Q, axis=1), 1e-9)  # of its own error that is left in a residual
             kept[np.flatnonzero(kept)[np.argmax(left**2 / share)]] = False
         return [arcs[i] for i in used[~kept]]
+
+    def lasting(self, k: int, until: Callable[[Arc], float]) -> dict[Arc, float]:
+        """Cycles^2 that reflections add to what ambiguities at an epoch are told to, beyond white noise.
+
+        An ambiguity takes up whatever lasts as long as its arc, so no smoother sees it.
+
+        Parameters
+        ----------
+        until : s, of the last of an arc's carriers that tell of it.
+        """
+        own, arcs = self.rows[k], self.active[k]
+        duration = np.array([until(arc) - arc[1] for arc in arcs])
+        more = self.phase.reflection[own] ** 2 * variance_left(np.maximum(duration, 0.0), self.phase.period)
+        return dict(zip(arcs, more.tolist(), strict=True))
 
     def fixed(self, known: Mapping[int, Known]) -> Array:
         """(E, 2) s, and 1 where enough differences are known; by keyframe."""

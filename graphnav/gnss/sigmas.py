@@ -42,8 +42,13 @@ def carrier_sigma(cn0: Array, elevation: Array, wavelength: Array) -> Array:
 
 def carrier_difference_sigma(cn0: Array, elevation: Array, wavelength: Array) -> Array:
     """(N,) m, 1-sigma of the difference of two receivers' carriers."""
+    return np.asarray(np.hypot(np.sqrt(2.0 * _compute_thermal(cn0, wavelength)), reflection_sigma(elevation)))
+
+
+def reflection_sigma(elevation: Array) -> Array:
+    """(N,) m, 1-sigma of what reflections do to the difference of two receivers' carriers, for some time alike."""
     rising = 1.0 / np.maximum(np.sin(elevation), 0.1)
-    return np.asarray(np.sqrt(2.0 * (_compute_thermal(cn0, wavelength) + _CARRIER**2 * (1.0 + rising**2))))
+    return np.asarray(_CARRIER * np.sqrt(2.0 * (1.0 + rising**2)))
 
 
 def _compute_thermal(cn0: Array, wavelength: Array) -> Array:

@@ -15,6 +15,7 @@ from helpers import errors, truth_states
 from test_raw_rows import scene
 
 from graphnav.config import settings_from
+from graphnav.constraints import raw_phase
 from graphnav.constraints.raw_gnss import CLOCK
 from graphnav.constraints.raw_phase import GnssPhase, WholeCycles
 from graphnav.core import earth
@@ -27,6 +28,7 @@ from graphnav.gnss.differential import with_differences
 from graphnav.gnss.ephemeris import EARTH_RATE
 from graphnav.gnss.integers import decorrelate, find_nearest
 from graphnav.gnss.series import RawGnss
+from graphnav.gnss.sigmas import reflection_sigma
 from graphnav.gnss.signals import L1, C
 from graphnav.recording.formats import read
 from graphnav.report.satellites import satellite_tables
@@ -285,12 +287,63 @@ def test_derivatives_are_those_of_differences(exact):
     np.testing.assert_allclose(held.jacobians["a"][:, 0, 0], [1.0, -1.0])
 
 
+@pytest.mark.parametrize("n", [2, 4, 9])
+def test_reflections_shift_a_place_as_least_squares_would(n):
+    rng = np.random.default_rng(n)
+    towards, sigma = 2e7 * rng.normal(size=(2 * n, 3)), rng.uniform(0.004, 0.02, 2 * n)
+    shifts, keyframe = raw_phase._project(towards, sigma, np.repeat([3, 5], n)), np.repeat([0, 1], n)
+    for k in range(2):
+        own = keyframe == k
+        e = towards[own] / np.linalg.norm(towards[own], axis=1)[:, None]
+        A = np.column_stack([e, np.ones(n)]) / sigma[own, None]
+        # of every difference of two satellites, which no clock is in, where the place explains errors of each
+        D = np.eye(n) - np.ones((n, n)) / n
+        place = np.linalg.pinv(A.T @ A)[:3, :3]
+        if n > 3:
+            np.testing.assert_allclose(D @ shifts[own] @ shifts[own].T @ D, D @ e @ place @ e.T @ D, rtol=1e-9)
+        else:  # as much of a difference as there is of it
+            apart = (D @ shifts[own])[0] - (D @ shifts[own])[1]
+            assert apart @ apart == pytest.approx(np.sum(sigma[own] ** 2))
+
+
+def test_reflections_that_last_are_in_the_sigma(drive):
+    """As long and as large as they are taken to be, for each satellite by itself: not a shift of the place."""
+    recording, truth = drive
+    raw, rng = recording.raw_gnss, np.random.default_rng(8)
+    carrier = raw.carrier.copy()
+    _, elevation = directions(raw.antenna, raw.p)
+    for satellite in np.unique(raw.satellite):
+        own = raw.satellite == satellite
+        decay = np.exp(-np.diff(raw.t[own]) / raw_phase._LASTING)
+        x = rng.standard_normal(int(own.sum()))
+        for i, a in enumerate(decay):
+            x[i + 1] = a * x[i] + np.sqrt(1.0 - a * a) * x[i + 1]
+        carrier[own] += reflection_sigma(elevation[own]) * x / WAVELENGTH
+    spoilt = replace(recording, raw_gnss=replace(raw, carrier=carrier))
+    rows = GnssPhase.build(scene(recording, STATED))
+    own = rows.keyframe == rows.keyframe[len(rows) // 2]
+    towards = (rows.s_n - rows.nominal)[own]
+    L = np.linalg.lstsq(towards / np.linalg.norm(towards, axis=1)[:, None], rows.reflected[own], rcond=None)[0]
+    # nothing is better than the mean of such a process, whose variance over a time T is at least 2 tau / (T + 2 tau)
+    least = np.trace(L @ L.T) * 2.0 * raw_phase._LASTING / (np.ptp(raw.t) + 2.0 * raw_phase._LASTING)
+    for one in run(spoilt, STATED, ("ekf", "rts")).values():
+        off, sigma = errors(one, truth)[:2]
+        fixed = one.fixed[one.fixed[:, 1] > 0.0, 0]
+        assert len(fixed) > 10
+        k = np.searchsorted(one.t, fixed - 1e-6)
+        assert np.sum(sigma[k] ** 2, axis=1).min() > 0.9 * least
+        # three numbers that hardly change within the drive: chi-square of three or a few more, 99.9 %
+        assert 0.05 < np.mean((off[k] / sigma[k]) ** 2) < 5.4
+
+
 @pytest.fixture(scope="module")
 def drive():
     path = oracle.vehicle_path(120.0, 50.0)
     made, truth = oracle.drive(path, seed=5, gnss_velocity_sd=(0.1, 0.1, 0.1))
-    recording = raw_drive.with_observations(made, path, noise=0.5, seed=2).crop(0.0, 26.0)
-    return with_carriers(recording, path, 0.003)[0], truth
+    with pytest.MonkeyPatch.context() as patch:  # reflections of half a dozen satellites would outlast the drive
+        patch.setattr(raw_drive, "SATELLITES", raw_drive.MANY)
+        recording = raw_drive.with_observations(made, path, noise=0.5, seed=2).crop(0.0, 26.0)
+        return with_carriers(recording, path, 0.003)[0], truth
 
 
 def off_by(solution, truth):
@@ -317,14 +370,15 @@ def test_every_solver_is_fixed_and_right(drive):
 
 
 def test_a_wrong_integer_is_let_go_of(drive, monkeypatch):
-    """One number of the first vector that the filter finds is wrong, and nothing is noticed for some epochs."""
+    """Every other number of the first vector that the filter takes is wrong, and nothing is noticed for some epochs."""
     recording, truth = drive
     found, noticed = [], fixing.Epochs.odd
 
     def wrong(a, decorrelated):
-        found.append(find_nearest(a, decorrelated))
-        spoiled = (np.arange(len(a)) == 2) & (len(found) == 1)
-        return replace(found[-1], best=found[-1].best + spoiled)
+        nearest = find_nearest(a, decorrelated)
+        found.append(nearest.ratio >= fixing._RATIO)
+        spoiled = (np.arange(len(a)) % 2 == 0) & found[-1] & (sum(found) == 1)
+        return replace(nearest, best=nearest.best + 3 * spoiled)
 
     monkeypatch.setattr(fixing, "find_nearest", wrong)
     begin = recording.raw_gnss.t[0]
@@ -346,7 +400,7 @@ def test_records_name_satellites_and_the_report_sums_them_up(drive):
     recording, _ = drive
     one = run(recording, STATED, ("rts",))["rts"]
     record = one.records["gnss_phase"]
-    assert set(record.satellite) <= set(raw_drive.SATELLITES)
+    assert set(record.satellite) <= set(raw_drive.MANY)
     assert len(record.satellite) == len(record.elevation) == len(record.t)
     assert record.elevation.min() > np.radians(9.9)
     tables = satellite_tables(one)
