@@ -189,7 +189,12 @@ def test_a_file_of_another_drive_is_refused_and_a_poor_one_is_not(ekf, tmp_path,
 
 @pytest.mark.parametrize(
     ("point", "told"),
-    [("antenna", False), (-np.array(logs.LEVER_ARM), True), ("imu", True), (np.array([0.0, 0.0, logs.LEVER_ARM[2]]), True)],
+    [
+        ("antenna", False),
+        (-np.array(logs.LEVER_ARM), True),
+        ("imu", True),
+        (np.array([0.0, 0.0, logs.LEVER_ARM[2]]), True),
+    ],
 )
 def test_a_point_that_the_file_is_not_of_is_told(ekf, tmp_path, point, told):
     antenna = interpolate(moved(0.0), every(0.1, moved(0.0)).t, lever_arm=logs.LEVER_ARM)[0]
