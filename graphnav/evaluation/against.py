@@ -251,7 +251,7 @@ def _find_other_point(
 
     def miss(other: Array) -> float:
         left = (off - states.R_nb @ (other - arm))[:, :2]
-        return float(np.median(np.linalg.norm(left - np.median(left, axis=0), axis=1)))
+        return float(np.mean(np.linalg.norm(left - np.median(left, axis=0), axis=1)))  # where it stands counts little
 
     points = {f"[{_show(-arm)}] m, the arm with the other signs": -arm, "the IMU": np.zeros(3)}
     if antenna is not None:
