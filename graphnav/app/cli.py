@@ -106,10 +106,11 @@ def info(
         whole = read(pick_one(context, recording), topic or (), allow_outside, format)
         tell("checks")
         found = inspect(whole)
-        from graphnav.estimation.antenna import find_antenna, find_wrong_arms
+        from graphnav.estimation.antenna import find_antenna, find_untold_arm, find_wrong_arms
 
         more = find_wrong_arms(found.recording) if found.trusted and not quick else []
-        found = replace(found, findings=(*more, *found.findings, *([find_antenna(whole).finding] if antenna else [])))
+        last = [find_antenna(whole).finding] if antenna else find_untold_arm(found.recording)
+        found = replace(found, findings=(*more, *found.findings, *last))
     show(found.text, found.values, quiet, json)
 
 

@@ -117,6 +117,21 @@ def find_wrong_arms(recording: Recording) -> list[Finding]:
     return out
 
 
+def find_untold_arm(recording: Recording) -> list[Finding]:
+    """That nothing tells the signs of the antenna's lever arm, as the fixes are too coarse for `find_wrong_arms`."""
+    gnss = recording.gnss
+    if recording.platform != "vehicle" or gnss is None or np.abs(gnss.lever_arm).max() <= _LEAST_PART:
+        return []
+    sd = float(np.median(gnss.sd[:, :2])) if len(gnss.t) else 0.0
+    if sd <= _FINE:
+        return []
+    sentence = (
+        f"the fixes' 1-sigma of {sd:.2g} m is too coarse to tell whether lever_arm in [gnss] and its signs are right: "
+        "check them by hand"
+    )
+    return [Finding("note", sentence, "gnss.lever_arm_untold")]
+
+
 def _find_turning(recording: Recording) -> Recording:
     """The part of a drive, `_PART` s long at most, in which it turns most where there are fixes."""
     imu, gnss = recording.imu, recording.gnss

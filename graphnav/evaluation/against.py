@@ -34,6 +34,11 @@ _MAX_GAP = 3.0  # s; wider gaps of a trajectory are not filled
 _APPLIED = 1.0  # s; a larger shift is of the clock
 _FEWEST = 10  # rows in common
 _MATTERS, _SIGNIFICANT = 0.02, 3.0  # s and sigmas; a smaller shift is not worth saying, or may be chance
+_PLACE = 10_000.0  # m; frames of other datums, and filters that diverge, are nearer than that to where they began
+_CHORD = 10.0  # s; over so long metres of noise do not hide how fast and where to somebody went
+_MOVES = 1.0  # m/s
+_HALF = 0.5  # of the squares of chords, and of the variance of their lengths: two of one drive have more in common
+_MENDED = 0.3  # of what is off is left by a point that mends it
 _STEP = 0.1  # s, between speeds of ours
 
 
@@ -125,6 +130,7 @@ def read_against(asked: Against, name: str, recording: Recording, reference: Sol
                 f"{asked.path}: is to be of the antenna, and '{recording.name}' has no GNSS", key="against.no_gnss"
             )
         arm = stated
+    _require_same_drive(asked, track, recording, reference)
     borrowed = track.rph is None
     if borrowed:
         track = _with_attitude(track, reference)
@@ -136,10 +142,10 @@ def read_against(asked: Against, name: str, recording: Recording, reference: Sol
         )
     if np.any(arm):
         track = interpolate(track, track.t, max_gap=_MAX_GAP, lever_arm=-arm)[0]
-        shown = ", ".join(f"{x:.2f}" for x in arm)
         notes.append(
-            Note("against.point", f"{asked.path.name}: moved to the IMU from [{shown}] m (right, forward, up)")
+            Note("against.point", f"{asked.path.name}: moved to the IMU from [{_show(arm)}] m (right, forward, up)")
         )
+    notes += _find_other_point(asked.path, track, arm, antenna_lever_arm(recording, reference), reference)
     track = replace(track, name=name)
     _, known = interpolate(track, reference.t, max_gap=_MAX_GAP)
     t = reference.t[known]
@@ -180,6 +186,92 @@ def _shift(path: Path, track: Trajectory, recording: Recording, reference: Solut
         *notes,
         Note("against.late", f"{path.name}: {late:+.3f} s more, by which its speed fits ours{leap}"),
     ]
+
+
+def _require_same_drive(asked: Against, track: Trajectory, recording: Recording, reference: Solution) -> None:
+    """Refuse a trajectory that is elsewhere all the time, or moves otherwise at the times that it shares.
+
+    Raises
+    ------
+    RecordingError
+        If it is of another drive, or on another clock.
+    """
+    inside = track.take((track.t >= reference.t[0]) & (track.t <= reference.t[-1]))
+    if track.frame == "geodetic":
+        apart = np.linalg.norm(reference.frame.from_llh(inside.llh) - reference.at(inside.t)[1].p, axis=1)
+        if np.nanmin(apart) > _PLACE:
+            raise RecordingError(
+                f"{asked.path}: lies {np.nanmin(apart) / 1e3:.0f} km or more from '{recording.name}': it is of another "
+                "drive, or its latitudes and longitudes are wrong",
+                key="against.elsewhere",
+            )
+    if asked.shift is not None:
+        return  # as was asked
+    if _moves_otherwise(inside, reference):
+        raise RecordingError(
+            f"{asked.path}: moves otherwise than '{recording.name}' at the times that they share: it is of another "
+            "drive, or on another clock; --against-shift says what to add to its times",
+            key="against.other_drive",
+        )
+
+
+def _moves_otherwise(track: Trajectory, reference: Solution) -> bool:
+    """Whether neither the directions nor the speeds of a trajectory on the Earth are ours; False where few tell."""
+    k = np.searchsorted(track.t, track.t + _CHORD)
+    first = np.flatnonzero(k < len(track))
+    last = k[first]
+    whole = track.t[last] - track.t[first] < _CHORD + _MAX_GAP
+    first, last = first[whole], last[whole]
+    if len(first) < _FEWEST:
+        return False
+    theirs = reference.frame.from_llh(track.llh)[:, :2]
+    ours = reference.at(track.t)[1].p[:, :2]
+    a, b = (p[last] - p[first] for p in (theirs, ours))
+    way_a, way_b = np.linalg.norm(a, axis=1), np.linalg.norm(b, axis=1)
+    moving = np.maximum(way_a, way_b) > _MOVES * _CHORD
+    if moving.sum() < _FEWEST or np.ptp(track.t[first[moving]]) < 3.0 * _CHORD:
+        return False
+    unlike = np.sum((a - b) ** 2, axis=1)[moving] / (way_a**2 + way_b**2)[moving]
+    if np.median(unlike) < _HALF:
+        return False
+    lengths = (way_a[moving], way_b[moving])
+    return min(x.std() for x in lengths) > 0.0 and float(np.corrcoef(*lengths)[0, 1]) < np.sqrt(_HALF)
+
+
+def _find_other_point(
+    path: Path, track: Trajectory, arm: Array, antenna: Array | None, reference: Solution
+) -> list[Note]:
+    """Of which other point a trajectory that was moved to the IMU by an arm is, if that mends what is off.
+
+    A distance that turns with the body is an arm; one that does not is of another datum, and counts for nothing.
+    """
+    inside = track.take((track.t >= reference.t[0]) & (track.t <= reference.t[-1]))
+    states = reference.at(inside.t)[1]
+    off = reference.frame.from_llh(inside.llh) - states.p
+
+    def miss(other: Array) -> float:
+        left = (off - states.R_nb @ (other - arm))[:, :2]
+        return float(np.mean(np.linalg.norm(left - np.median(left, axis=0), axis=1)))  # where it stands counts little
+
+    points = {f"[{_show(-arm)}] m, the arm with the other signs": -arm, "the IMU": np.zeros(3)}
+    if antenna is not None:
+        points["the antenna"] = antenna
+        points[f"[{_show(-antenna)}] m, the antenna's arm with the other signs"] = -antenna
+    misses = {name: miss(point) for name, point in points.items()}
+    best = min(misses, key=lambda name: misses[name])
+    if not misses[best] < _MENDED * miss(arm):
+        return []
+    return [
+        Note(
+            "against.other_point",
+            f"{path.name}: it fits ours as the trajectory of {best} ({misses[best]:.2f} m off where it is "
+            f"{miss(arm):.2f} m as stated): look at --against-point, or at lever_arm in [gnss]",
+        )
+    ]
+
+
+def _show(arm: Array) -> str:
+    return ", ".join(f"{x:.2f}" for x in arm)
 
 
 def _measure_delay(track: Trajectory, reference: Solution) -> float | None:

@@ -32,6 +32,7 @@ from graphnav.estimation.noise.model import NoiseModel
 from graphnav.estimation.noise.words import describe
 from graphnav.estimation.problem import Problem, build_problem
 from graphnav.estimation.solution import ExcludedSpan
+from graphnav.online.checks import check_rows
 from graphnav.online.fixes import unit_of
 from graphnav.online.raw import without_ambiguities
 from graphnav.online.sensors import Sensors
@@ -52,6 +53,7 @@ class Answer:
     notes: tuple[str, ...]
     stationary: Array  # (M, 2) s
     excluded: tuple[ExcludedSpan, ...]  # spans that the noise model leaves out
+    doubts: tuple[str, ...]  # what the rows show of their units, axes and clocks
 
 
 class Judgement:
@@ -112,7 +114,7 @@ class Judgement:
             noise = estimate(base, start.until).noise
             used = with_noise(base, noise)
             said, wrong = describe(noise, used), faults.fault_spans(used)
-            self._answer = Answer(_in_unit(noise, base, unit), said, stationary, wrong)
+            self._answer = Answer(_in_unit(noise, base, unit), said, stationary, wrong, check_rows(every))
         except (EstimationError, np.linalg.LinAlgError) as error:
             self._answer = EstimationError(str(error), key=getattr(error, "key", "solver.undetermined"))
         except BaseException as error:  # said by whoever asks

@@ -65,7 +65,7 @@ def odometer_reads(values: tuple[float, ...]) -> bool:
 def fix_odds(values: tuple[float, ...]) -> str | None:
     """What is wrong with a fix by itself, as it is counted; None if nothing is."""
     lat, lon, h = (np.array([x]) for x in values[:3])
-    if not is_on_earth(lat, lon, h)[0]:
+    if not is_on_earth(lat, lon, h)[0] or values[0] == values[1] == 0.0:  # as receivers without a fix send
         return "nowhere on Earth"
     if not all(_SUREST <= sd <= VAGUEST for sd in values[3:6]):
         return "a sigma that says nothing"

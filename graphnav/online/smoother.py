@@ -23,6 +23,7 @@ from graphnav.estimation.pipeline import origin
 from graphnav.estimation.solution import ExcludedSpan
 from graphnav.estimation.solvers.watch import LONGEST
 from graphnav.online.ahead import Live, export
+from graphnav.online.checks import check_rows
 from graphnav.online.judging import CatchUp, Judgement, are_enough, judge
 from graphnav.online.looks import CONTEXT, SURE
 from graphnav.online.raw import settings_online
@@ -66,7 +67,7 @@ class Smoother:
         self._again: CatchUp | None = None  # going through what has not settled with it
         self._tentative = False  # nothing is to settle before the sensors have been judged once
         self._found: Alignment | None = None  # as long as the sensors are still to be judged by more rows
-        self._said: tuple[str, ...] = ()  # of the notes, those about what the sensors are judged to be
+        self._said: dict[str, tuple[str, ...]] = {}  # of the notes, those that more rows may change, by their matter
         self._judged = 0.0  # s of rows that they were judged by
         self._times: list[float] = []  # s, of keyframes that have settled meanwhile
         self._left_out: tuple[ExcludedSpan, ...] = ()  # of other measurements than fixes
@@ -74,8 +75,7 @@ class Smoother:
         self._began = -np.inf  # s, of what is being smoothed
         self._due = -np.inf  # s, of IMU time at which the next keyframes can be made
         self._awake = -np.inf  # s, at which there is anything to do
-        self._period = np.inf  # s, of the IMU's rows
-        self._dirty = np.inf
+        self._period = self._dirty = np.inf  # s, of the IMU's rows; from where on keyframes are to be redone
         self._settled: list[Trajectory] = []
         self._last_settled = -np.inf
         self._faults: tuple[ExcludedSpan, ...] = ()  # found before the newest alignment
@@ -206,13 +206,14 @@ class Smoother:
                 self._align(last=True)
             except EstimationError as error:
                 self.notes.append(Note("online.not_aligned", str(error)))
+            if "units" not in self._said:
+                self._say("units", check_rows(self.sensors.recording(every=True)))
         if self.tracker is not None:
             self._judge_at_last()
             self._advance(self.tracker, self.sensors.imu.newest, last=True)
             self.tracker.settle(self.sensors)
             self._collect(self.tracker)
 
-    # ------------------------------------------------------------------------------------------------- alignment
     def _align(self, last: bool = False) -> None:
         sensors = self.sensors
         if len(sensors.imu) < 2:
@@ -239,6 +240,7 @@ class Smoother:
             self._wait(now)
             return
         tracker = self.tracker = self._track(found, recording.start, STATED)
+        self._say("units", check_rows(sensors.recording(-np.inf, now, every=True)))
         told = found.motion is not None and self.settings.gnss.position and recording.platform != "foot"
         if told and self.settings.noise.mode == "estimated":
             self._found, self._tentative = found, True
@@ -257,10 +259,10 @@ class Smoother:
         self.notes += [note for note in notes if note not in self.notes]
         return tracker
 
-    def _say(self, said: tuple[str, ...]) -> None:
-        """Note what the sensors are judged to be, in place of what was thought before."""
-        self.notes = [note for note in self.notes if note not in self._said] + list(said)
-        self._said = said
+    def _say(self, matter: str, said: tuple[str, ...]) -> None:
+        """Note what is known of the noise, the units, ..., in place of what was thought before."""
+        self.notes = [note for note in self.notes if note not in self._said.get(matter, ())] + list(said)
+        self._said[matter] = said
 
     def _judge_again(self, found: Alignment, tracker: Tracker) -> None:
         """Have the sensors judged again before the first state settles, then by ever more rows until those suffice."""
@@ -286,7 +288,8 @@ class Smoother:
             self.notes.append(Note("online.not_judged", f"not judged again: {error}"))
             self._tentative = False
             return
-        self._say(found.notes)
+        self._say("noise", found.notes)
+        self._say("units", found.doubts)
         self._left_out = tuple(fault for fault in found.excluded if fault.kind not in FIXES)
         if tracker.opened:
             self._again = CatchUp(tracker.afresh(found.noise, self._setup))
@@ -310,6 +313,7 @@ class Smoother:
     def _wait(self, now: float) -> None:
         """Keep what the next attempt may need."""
         if now - float(self.sensors.imu.t[0]) > _PATIENCE:
+            self._say("units", check_rows(self.sensors.recording(every=True)))
             self.sensors.drop_before(now - 0.5 * _PATIENCE)
 
     def _restart(self, before: float, why: str) -> None:
@@ -333,7 +337,6 @@ class Smoother:
         self._fixes, self._dirty = [], np.inf
         self._due = self._awake = -np.inf
 
-    # --------------------------------------------------------------------------------------------------- running
     def _advance(self, tracker: Tracker, now: float, last: bool = False) -> None:
         """Make the keyframes that are due at a time, s."""
         sensors = self.sensors
@@ -386,8 +389,6 @@ class Smoother:
                 self._last_settled = float(part.t[-1])
         tracker.settled.clear()
         self.sensors.oldest = max(self.sensors.oldest, tracker.head)
-        begin = tracker.head
-        if len(tracker.stops):
-            begin = min(begin, max(float(tracker.stops[0, 0]), begin - 10.0 * CONTEXT))
+        begin = min([tracker.head, *(max(t, tracker.head - 10.0 * CONTEXT) for t in tracker.stops[:1, 0].tolist())])
         if self._found is None and self._judgement is None:  # else they are still to be judged by
             self.sensors.drop_before(begin - CONTEXT - 5.0)

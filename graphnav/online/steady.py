@@ -7,10 +7,12 @@ from pathlib import Path
 
 from graphnav.config import Settings, settings_from
 from graphnav.core.notes import Note
+from graphnav.online.checks import check_counts
 from graphnav.online.sensors import Row
 from graphnav.online.smoother import Smoother
 from graphnav.recording import Recording
 
+_TELLING = 512  # rows that tell which sensors are of no use
 _MOST_FAILURES = 100  # failures that are remembered
 
 
@@ -32,11 +34,15 @@ class Online(Smoother):
             )
         super().__init__(setup, settings)
         self.clocks = 1  # how many there have been: the times of each go on by themselves
+        self._rows = 0  # that were handed over
         self.failures: list[str] = []  # why pieces were given up
 
     def add(self, row: Row, released: bool = False) -> None:
         """Take in one row: sensor, time, values and whether it was held as in `graphnav.online.sensors.Sensors.add`."""
         sensors, rows = self.sensors, [(row, released)]
+        self._rows += 1
+        if self._rows >= _TELLING and not self._rows & (self._rows - 1):  # at powers of two
+            self._say("counts", check_counts(sensors.counts))
         while rows:
             try:
                 super().add(*rows.pop(0))
@@ -60,6 +66,7 @@ class Online(Smoother):
             super().finish()
         except Exception as error:
             self._give_up(error)
+        self._say("counts", check_counts(self.sensors.counts))
 
     def _give_up(self, error: Exception) -> None:
         """Drop the piece that is being smoothed, and begin anew with what comes."""

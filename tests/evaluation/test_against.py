@@ -9,13 +9,14 @@ from pathlib import Path
 import logs
 import numpy as np
 import pytest
-from helpers import refuse_command
+from helpers import refuse_command, refused
 
 from graphnav.app import cli
 from graphnav.app.scores import score
 from graphnav.config import Settings
 from graphnav.core.earth import LocalFrame
-from graphnav.core.interpolation import place_on_earth
+from graphnav.core.errors import RecordingError
+from graphnav.core.interpolation import interpolate, place_on_earth
 from graphnav.core.notes import key_of
 from graphnav.core.trajectory import Trajectory
 from graphnav.estimation.pipeline import run
@@ -150,3 +151,53 @@ def test_what_cannot_stand_beside_ours_is_one_line(drive, tmp_path, capsys, more
     arguments = ["compare", str(drive), "-o", str(tmp_path / "out"), "--solvers", "ekf", "--noise", "stated", *more]
     assert name in refuse_command(capsys, key, *arguments)
     assert not (tmp_path / "out").exists()
+
+
+def spoil(track: Trajectory, how: str) -> Trajectory:
+    """Another drive, or a poor trajectory of this one."""
+    llh, frame = track.llh.copy(), LocalFrame(track.llh[0])
+    if how == "another town":
+        llh[:, 0] += np.radians(1.0)
+    elif how == "another way":
+        llh = llh[::-1]
+    elif how == "noisy":
+        llh = frame.to_llh(frame.from_llh(llh) + np.random.default_rng(1).normal(0.0, 4.0, llh.shape))
+    elif how == "another datum":
+        llh = frame.to_llh(frame.from_llh(llh) + np.array([900.0, -400.0, 45.0]))
+    return replace(track, llh=llh, v=None)
+
+
+@pytest.mark.parametrize(
+    ("how", "key"),
+    [
+        ("another town", "against.elsewhere"),
+        ("another way", "against.other_drive"),
+        ("noisy", None),
+        ("another datum", None),
+    ],
+)
+@pytest.mark.parametrize("period", [0.1, 1.0])
+def test_a_file_of_another_drive_is_refused_and_a_poor_one_is_not(ekf, tmp_path, how, key, period):
+    write_as("csv", spoil(every(period, moved(0.0)), how), tmp_path / "its.csv", None)
+    asked = Against(tmp_path / "its.csv")
+    if key is None:
+        assert len(read_against(asked, "its", RECORDING, ekf).t) > 30
+    else:
+        with refused(key, RecordingError, "its.csv"):
+            read_against(asked, "its", RECORDING, ekf)
+
+
+@pytest.mark.parametrize(
+    ("point", "told"),
+    [
+        ("antenna", False),
+        (-np.array(logs.LEVER_ARM), True),
+        ("imu", True),
+        (np.array([0.0, 0.0, logs.LEVER_ARM[2]]), True),
+    ],
+)
+def test_a_point_that_the_file_is_not_of_is_told(ekf, tmp_path, point, told):
+    antenna = interpolate(moved(0.0), every(0.1, moved(0.0)).t, lever_arm=logs.LEVER_ARM)[0]
+    write_as("csv", antenna, tmp_path / "its.csv", None)
+    found = read_against(Against(tmp_path / "its.csv", point), "its", RECORDING, ekf)
+    assert ("against.other_point" in [key_of(note) for note in found.notes]) == told

@@ -16,7 +16,7 @@ import oracle
 import pytest
 
 from graphnav.app import cli
-from graphnav.estimation.antenna import find_wrong_arms
+from graphnav.estimation.antenna import find_untold_arm, find_wrong_arms
 from graphnav.recording import Recording
 from graphnav.recording.checks.overview import Inspection, inspect
 from graphnav.recording.formats import read
@@ -327,6 +327,17 @@ def test_axes_are_denied_only_by_better_ones() -> None:
 def test_right_lever_arms_are_not_denied() -> None:
     recording, _ = oracle.drive(oracle.vehicle_path(120.0, 50.0), seed=5, lever_arm=(0.4, -0.5, 1.2))
     assert find_wrong_arms(recording) == []
+
+
+@pytest.mark.parametrize(
+    ("arm", "sd", "told"),
+    [((0.4, -0.5, 1.2), 2.0, True), ((0.4, -0.5, 1.2), 0.02, False), ((0.0, 0.0, 0.0), 2.0, False)],
+)
+def test_an_arm_that_no_fix_can_check_is_said(arm: tuple[float, ...], sd: float, told: bool) -> None:
+    recording, _ = oracle.drive(oracle.vehicle_path(120.0, 20.0), seed=5, lever_arm=arm)
+    assert recording.gnss is not None
+    coarse = replace(recording, gnss=replace(recording.gnss, sd=np.full_like(recording.gnss.sd, sd)))
+    assert bool(find_untold_arm(coarse)) == told
 
 
 def test_fixes_of_before_the_drive_are_left_out(drive: Callable[[str], Recording]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import logs
@@ -237,7 +238,7 @@ def test_a_phone_with_a_file_per_sensor(tmp_path, capsys):
     files = [str(tmp_path / f"{n}.csv") for n in ("Gyroscope", "TotalAcceleration", "Location")]
     assert cli.run(["init", *files, "-o", str(tmp_path / "recording.toml")]) == 0
     printed = capsys.readouterr().out
-    assert all(name in printed for name in ("imu.csv.gz", "Gyroscope.csv", "TotalAcceleration.csv"))
+    assert all(name in printed for name in ("joined_imu.csv.gz", "Gyroscope.csv", "TotalAcceleration.csv"))
     recording = read(tmp_path)
     assert recording.imu.gyro == pytest.approx(DRIVE.imu.gyro[1 : len(recording.imu.t) + 1], abs=1e-6)
     assert recording.gnss.v[:, :2] == pytest.approx(gnss.v[:, :2], abs=1e-6)
@@ -276,6 +277,15 @@ def test_logs_that_cannot_be_drafted_say_why(tmp_path, text, key, names):
 
 
 # ---- real logs, as they came
+
+
+def test_a_folder_is_drafted_as_its_files_are(shared_data, tmp_path):
+    """None of them is taken for what an earlier draft made, and what that made is none of them."""
+    names = ("imu.csv.gz", "gnss.csv.gz")
+    for name in names:
+        shutil.copy(shared_data / "boulder_drive_20250708" / name, tmp_path / name)
+    of_files = draft([tmp_path / name for name in names], tmp_path).text
+    assert draft([tmp_path], tmp_path).text == of_files
 
 
 @pytest.mark.parametrize(

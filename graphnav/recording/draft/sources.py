@@ -20,7 +20,7 @@ from graphnav.recording.formats import formats
 from graphnav.recording.formats.schema import SPEED
 from graphnav.sensors.tables import ANGLE
 
-JOINED = "imu.csv.gz"  # the file that is made of a gyro's and an accelerometer's
+JOINED = "joined_imu.csv.gz"  # the file that is made of a gyro's and an accelerometer's; no name that logs have
 
 _TABLES = (".csv", ".csv.gz", ".txt", ".tsv", ".dat", ".asc", ".log")  # of a folder these are looked at
 

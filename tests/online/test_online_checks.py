@@ -1,0 +1,67 @@
+"""Sessions whose rows are in wrong units, axes or clocks from the first to the last: they go on, and say so."""
+
+from __future__ import annotations
+
+import numpy as np
+import oracle
+import pytest
+
+from graphnav.config import settings_from
+from graphnav.core.notes import key_of
+from graphnav.online import Online, Row, rows_of, without_rows
+from graphnav.recording import Recording
+
+QUICK = settings_from({"noise": {"mode": "stated"}, "solver": {"lag": 10.0}})
+TOLD = {"imu.force_scale", "imu.gyro_unit", "gnss.lat_lon", "imu.left_out", "gnss.left_out"}
+
+
+@pytest.fixture(scope="module")
+def drive() -> Recording:
+    return oracle.drive(oracle.vehicle_path(130.0, 25.0), seed=3)[0].crop(20.0, 64.0)
+
+
+def spoil(row: Row, how: str) -> Row:
+    sensor, t, values = row
+    x = np.array(values)
+    match sensor, how:
+        case "imu", "g":
+            x[3:] /= 9.80665
+        case "imu", "deg/s":
+            x[:3] *= 180.0 / np.pi
+        case ("imu", "IMU in ms") | ("gnss", "fixes in ms"):
+            t *= 1e3
+        case "gnss", "lon, lat":
+            x[:2] = x[1::-1]
+        case "gnss", "lon, lat in Europe":  # where both are below 90 deg
+            x[:2] = x[1] - np.radians(100.0), x[0]
+        case "gnss", "degrees":
+            x[:2] *= 180.0 / np.pi
+        case "gnss", "no place":
+            x[:2] = 0.0
+    return sensor, t, tuple(x.tolist())
+
+
+@pytest.mark.parametrize(
+    ("how", "keys"),
+    [
+        ("as it is", set()),
+        ("g", {"imu.force_scale"}),
+        ("deg/s", {"imu.gyro_unit"}),
+        ("lon, lat", {"gnss.left_out"}),
+        ("lon, lat in Europe", {"gnss.lat_lon"}),
+        ("degrees", {"gnss.left_out"}),
+        ("no place", {"gnss.left_out"}),
+        ("fixes in ms", {"gnss.left_out"}),
+        ("IMU in ms", {"imu.left_out"}),
+    ],
+)
+def test_a_session_in_a_wrong_unit_says_so(drive: Recording, how: str, keys: set[str]) -> None:
+    online = Online(without_rows(drive), QUICK)
+    for row in rows_of(drive)[1]:
+        online.add(spoil(row, how))
+    early = {key_of(note) for note in online.notes} & TOLD
+    online.finish()
+    found = {key_of(note) for note in online.notes} & TOLD
+    assert found == keys
+    assert early == found  # while it runs, not only at the end
+    assert not online.failures
