@@ -15,6 +15,8 @@ from graphnav.core.rotation import Array
 from graphnav.core.state import DIM
 
 STRETCH = 256  # keyframes from one word of how far it has come to the next
+# of det(R) / det(S): what an update leaves of a wide prior, after a first fix of ten orders, is lost in a difference
+CANCELS = 1e-4
 
 
 @compiled
@@ -233,10 +235,18 @@ def smooth_rows(
             if taken[b]:
                 lo, hi = begin[b], end[b]
                 own = H[k, lo:hi]
-                # I - K H as a whole: after a first fix it is what is left of a wide prior, of ten orders
-                M = I - np.dot(Kt[k, lo:hi].T, own)
-                r_k = np.dot(r_k, M) + np.dot(w[k, lo:hi], own)
-                N_k = np.dot(M.T, np.dot(N_k, M)) + np.dot(own.T, SH[k, lo:hi])
+                K = np.ascontiguousarray(Kt[k, lo:hi])
+                HK = np.dot(own, K.T)
+                if np.linalg.det(np.eye(hi - lo) - HK) < CANCELS:  # I - K H as a whole
+                    M = I - np.dot(K.T, own)
+                    r_k = np.dot(r_k, M) + np.dot(w[k, lo:hi], own)
+                    N_k = np.dot(M.T, np.dot(N_k, M)) + np.dot(own.T, SH[k, lo:hi])
+                else:  # by its few rows
+                    KN = np.dot(K, N_k)
+                    half = 0.5 * (np.dot(np.dot(KN, K.T), own) + SH[k, lo:hi]) - KN
+                    added = np.dot(own.T, half)
+                    r_k = r_k + np.dot(w[k, lo:hi] - np.dot(K, r_k), own)
+                    N_k = N_k + added + added.T
         N_k = 0.5 * (N_k + N_k.T)
         np.positive(r_k, r[k])
         np.positive(N_k, N[k])
