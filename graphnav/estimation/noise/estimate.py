@@ -57,7 +57,6 @@ class NoiseEstimate:
 
     noise: NoiseModel
     points: SmootherPass
-    forward: ForwardRecord
     log_posterior: float
     log_prior: float
     passes: int  # of filter and smoother
@@ -175,25 +174,27 @@ def _iterate(
     passes, total = 0, len(problem.t)
     warm = figures.known
     rounds = _AGAIN if figures.same_data else _ROUNDS
+    latest: tuple[ForwardRecord, SmootherPass] | None = None
     ends = [total] if total <= 2 * _FIRST or warm else [_FIRST, total]
     for end in ends:
         before = -np.inf
         figures.ahead = 1.0
         for k in range(_MOST):
-            used = with_noise(problem, figures.model())
-            forward, smoothed = _pass(used, about, end)
+            used, latest = with_noise(problem, figures.model()), None  # the pass before takes as much memory as this
+            latest = _pass(used, about, end)
             passes += 1
             prior_then = figures.log_prior()
-            now = float(np.sum(forward.log_likelihood)) + prior_then
+            now = float(np.sum(latest[0].log_likelihood)) + prior_then
             if progress is not None:
                 progress("noise", min((k + 1) / rounds, 1.0))
-            _improve(figures, used, forward, smoothed, end, intervals)
-            about = _splice(about, smoothed)
+            _improve(figures, used, *latest, end, intervals)
+            about = _splice(about, latest[1])
             # chance makes each figure gain a half; with one sensor far off it takes many passes to see which
             if k > 1 and abs(now - before) < (0.05 if k + 1 < rounds else 0.5) * len(figures.log):
                 break
             before, figures.ahead = now, _AHEAD if k > 1 and now > before else 1.0
-    return NoiseEstimate(figures.model(), smoothed, forward, now, prior_then, passes, converged=k + 1 < _MOST)
+    assert latest is not None
+    return NoiseEstimate(figures.model(), latest[1], now, prior_then, passes, converged=k + 1 < _MOST)
 
 
 def _begin(problem: Problem, start: NoiseModel | None, changed: bool = False) -> _Components:
