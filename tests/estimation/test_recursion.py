@@ -21,7 +21,7 @@ D = DIM + SCALE + PARAMETERS
 class Drive:
     """A linear drive with rows in blocks: two at each keyframe, one of three numbers and one of five."""
 
-    def __init__(self) -> None:
+    def __init__(self, noise: float = 1.0) -> None:
         rng = np.random.default_rng(4)
         n, w = KEYFRAMES, DIM + SCALE
         self.F = np.zeros((n - 1, DIM, w))
@@ -33,7 +33,7 @@ class Drive:
         self.Q = half @ np.swapaxes(half, 1, 2)
         self.gap = rng.standard_normal((n - 1, D))
         self.H, self.r = rng.standard_normal((n, ROWS, D)), rng.standard_normal((n, ROWS))
-        self.variance = rng.uniform(0.5, 2.0, (n, ROWS))
+        self.variance = noise * rng.uniform(0.5, 2.0, (n, ROWS))
         self.first, self.begin = 2 * np.arange(n + 1), np.tile([0, 3], n)
         self.end = np.tile([3, ROWS], n)
         self.used = np.arange(2 * n) != 4
@@ -68,9 +68,10 @@ class Drive:
         return out
 
 
-def test_filter_and_smoother_are_one_update_of_the_whole_drive() -> None:
-    """All keyframes as one Gaussian vector, and all rows as one measurement of it."""
-    drive, n = Drive(), KEYFRAMES
+@pytest.mark.parametrize("noise", [1e-8, 1.0, 100.0])
+def test_filter_and_smoother_are_one_update_of_the_whole_drive(noise: float) -> None:
+    """All keyframes as one Gaussian vector, and all rows, precise or not, as one measurement of it."""
+    drive, n = Drive(noise), KEYFRAMES
     mean, covariance = np.zeros((n, D)), np.zeros((n, D, n, D))
     mean[0], covariance[0, :, 0] = drive.e, drive.P
     for k in range(1, n):
