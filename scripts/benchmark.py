@@ -7,16 +7,26 @@ folders, so reading them counts. Those of more than three hours are solved in pa
 system says they were.
 
     python scripts/benchmark.py --hours 0.1667,1,4,12,24 --keep build/benchmark
+
+With `--reading` the IMU's file of the first of them is read instead, plain and gzip-compressed, beside NumPy's reader,
+which was in use before, and pyarrow's: processor time, and MB of text a second of it.
+
+    python scripts/benchmark.py --hours 1 --reading
 """
 
 from __future__ import annotations
 
 import argparse
+import gzip
+import io
 import json
 import subprocess
 import sys
 import tempfile
+import time
+from collections.abc import Callable
 from dataclasses import dataclass, fields
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +34,8 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
 import oracle
+
+from graphnav.recording.formats.decimals import read_decimals
 
 RATE = 200.0  # Hz, of the IMU
 LAP = 3600.0  # s; longer drives repeat a lap of this length
@@ -36,10 +48,14 @@ def main() -> None:
     parser.add_argument("--repeat", type=int, default=1, metavar="N", help="runs of each length; the fastest counts")
     parser.add_argument("--keep", type=Path, metavar="DIR", help="keep drives and results here and use them again")
     parser.add_argument("--no-odometer", action="store_true", help="leave the wheel speed out of the drives")
+    parser.add_argument("--reading", action="store_true", help="how long the IMU's file takes to be read")
     options = parser.parse_args()
     hours = [float(h) for h in options.hours.split(",")]
     with tempfile.TemporaryDirectory() as scratch:
         room = options.keep or Path(scratch)
+        if options.reading:
+            print(reading(build(room, hours[0], odometer=not options.no_odometer) / "imu.csv"))
+            return
         runs = []
         for h in hours:
             folder = build(room, h, odometer=not options.no_odometer)
@@ -128,6 +144,44 @@ wall = time.perf_counter() - start
 print(json.dumps([wall, usage.ru_utime + usage.ru_stime, usage.ru_maxrss]), flush=True)
 sys.exit(0 if status == 0 else 1)
 """
+
+
+def reading(plain: Path) -> str:
+    """Markdown: a row per reader, for a file of numbers as it is and compressed."""
+    packed = plain.with_suffix(".csv.gz")
+    text = plain.read_bytes()
+    packed.write_bytes(gzip.compress(text))
+    head, _, _ = text.partition(b"\n")
+    width = head.count(b",") + 1
+
+    def whole_arrays(opened: Any) -> None:
+        opened.readline()
+        read_decimals(opened, width, range(width))
+
+    def numpy_reader(opened: Any) -> None:
+        np.loadtxt(io.StringIO(opened.read().decode()), delimiter=",", skiprows=1)
+
+    def arrow(opened: Any) -> None:
+        from pyarrow import csv
+
+        csv.read_csv(io.BytesIO(opened.read()), read_options=csv.ReadOptions(use_threads=False))
+
+    lines = ["| reader | .csv: s | MB/s | .csv.gz: s | MB/s |", "| --- | ---: | ---: | ---: | ---: |"]
+    readers: dict[str, Callable[[Any], None]] = {"whole arrays": whole_arrays, "NumPy's": numpy_reader}
+    readers |= {"pyarrow's": arrow} if find_spec("pyarrow") else {}
+    for name, read in readers.items():
+        seconds = []
+        for path, opener in ((plain, open), (packed, gzip.open)):
+            tries = []
+            for _ in range(3):
+                began = time.process_time()
+                with opener(path, "rb") as opened:
+                    read(opened)
+                tries.append(time.process_time() - began)
+            seconds.append(min(tries))
+        cells = " | ".join(f"{s:.2f} | {len(text) / 1e6 / s:.0f}" for s in seconds)
+        lines.append(f"| {name} | {cells} |")
+    return "\n".join(lines)
 
 
 @dataclass(frozen=True)

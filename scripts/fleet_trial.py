@@ -3,11 +3,12 @@
 Forty drives through simulated towns, each with five sets of sensors and faults: as it is, without odometer, with one
 that reads double, with an antenna half a metre from where it is said to be, with fixes that are 20 m off for twenty
 seconds. One recording is poisoned (a cell that is no number) and one is absurd (forces of 1e300). The program is ended
-after a fifth of the drives and run again; then a process that solves is ended in the middle of a drive. The third run
-has only the drive to solve that was lost.
+after a fifth of the drives and run again; then a process that solves is ended in the middle of a drive, and later one
+is stopped, which is a drive that hangs. The third run has only the drives to solve that were lost.
 
     python scripts/fleet_trial.py --keep build/fleet
     python scripts/fleet_trial.py --keep build/fleet --dask 2
+    python scripts/fleet_trial.py --keep build/long --ways 2 --length 600 --options "--solver rts --noise stated"
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ import subprocess
 import sys
 import time
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -39,34 +41,37 @@ from graphnav.simulation import simulate
 WAYS = 40  # different drives, each with every one of
 VARIANTS = ("as it is", "no odometer", "doubled odometer", "wrong arm", "wrong fixes")
 LENGTH = 240.0  # s, the shortest town there is
-ENDED_AFTER = 0.2, 0.6  # share of the drives that are done when the program is ended, and when a process is
+# share of the drives that are done when the program is ended, when a process is, and when one is stopped
+ENDED_AFTER, STOPPED_AFTER = (0.2, 0.6), 0.8
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--ways", type=int, default=WAYS, help="different drives; five times as many are solved")
+    parser.add_argument("--length", type=float, default=LENGTH, help="s, of each drive (%(default)s)")
+    parser.add_argument("--limit", type=float, default=60.0, help="s, that a drive may take (%(default)s)")
     parser.add_argument("--keep", type=Path, required=True, metavar="DIR", help="drives and results go here")
     parser.add_argument("--processes", type=int, default=1)
     parser.add_argument("--dask", type=int, default=0, metavar="N", help="over a cluster of N workers on this machine")
     parser.add_argument("--options", default="--solver ekf --noise stated --end 60 --no-report", help="(%(default)s)")
     options = parser.parse_args()
-    drives = build(options.keep, options.ways)
+    drives = build(options.keep, options.ways, options.length)
     out = options.keep / f"out-{options.processes}-{options.dask}"
     if out.exists():
         shutil.rmtree(out)
     command = [str(Path(sys.executable).with_name("graphnav")), "fleet", str(drives), "-o", str(out)]
-    command += options.options.split()
+    command += [*options.options.split(), "--limit", str(options.limit)]
     count = 5 * options.ways + 2
     with cluster(options.dask) as address:
         command += ["--scheduler", address] if address else ["--processes", str(options.processes)]
-        first = run(command, out, int(ENDED_AFTER[0] * count), end_all)
-        second = run(command, out, int(ENDED_AFTER[1] * count), end_one)
+        first = run(command, out, {int(ENDED_AFTER[0] * count): end_all})
+        second = run(command, out, {int(ENDED_AFTER[1] * count): end_one, int(STOPPED_AFTER * count): stop_one})
         third = run(command, out)
     print(json.dumps({"ended": first, "goes on": second, "again": third, **figures(out)}, indent=1))
 
 
 # ------------------------------------------------------------------------------------------------------------ drives
-def build(room: Path, ways: int) -> Path:
+def build(room: Path, ways: int, length: float) -> Path:
     """The folder of all recordings; one that is there already is used again."""
     drives = room / "drives"
     for seed in range(ways):
@@ -75,7 +80,7 @@ def build(room: Path, ways: int) -> Path:
         town = "urban" if seed % 2 else "electric"
         gnss = "rtk" if seed % 4 < 2 else "single"
         one = simulate(
-            town, seed, duration=LENGTH, tunnels=0, gnss=gnss, barometer=seed % 3 == 0, antennas=seed % 5 == 0
+            town, seed, duration=length, tunnels=0, gnss=gnss, barometer=seed % 3 == 0, antennas=seed % 5 == 0
         )
         for name in VARIANTS:
             write_folder(vary(one.recording, name), drives / f"{seed:03d}-{name.replace(' ', '-')}")
@@ -116,14 +121,14 @@ def spoil(folder: Path, column: int, text: str) -> None:
 
 
 # ----------------------------------------------------------------------------------------------------------- running
-def run(command: list[str], out: Path, count: int | None = None, end: Any = None) -> dict[str, Any]:
+def run(command: list[str], out: Path, events: dict[int, Callable[[Any], None]] | None = None) -> dict[str, Any]:
     """Run the program, and when so many drives have a row do something to it; what it took."""
+    waiting = sorted((events or {}).items(), key=lambda event: event[0])
     began, before = time.perf_counter(), resource.getrusage(resource.RUSAGE_CHILDREN)
     program = subprocess.Popen([*command, "--quiet"], stderr=subprocess.PIPE)
-    while count is not None and program.poll() is None:
-        if len(list(out.glob("drives/*/drive.json"))) >= count:
-            end(program)
-            count = None
+    while waiting and program.poll() is None:
+        if len(list(out.glob("drives/*/drive.json"))) >= waiting[0][0]:
+            waiting.pop(0)[1](program)
         time.sleep(0.2)
     error = program.stderr.read().decode() if program.stderr else ""
     program.wait()
@@ -145,8 +150,18 @@ def end_all(program: subprocess.Popen[bytes]) -> None:
 
 def end_one(program: subprocess.Popen[bytes]) -> None:
     """End one of the processes that solve, of the program or of Dask's workers."""
+    _signal_worker(program, signal.SIGKILL)
+
+
+def stop_one(program: subprocess.Popen[bytes]) -> None:
+    """Let one of them stand still in the middle of its drive."""
+    _signal_worker(program, signal.SIGSTOP)
+
+
+def _signal_worker(program: subprocess.Popen[bytes], what: signal.Signals) -> None:
     own = [int(p.name) for p in Path("/proc").iterdir() if p.name.isdigit() and _is_worker(p, program.pid)]
-    os.kill(own[0], signal.SIGKILL)
+    if own:
+        os.kill(own[-1], what)
 
 
 def _is_worker(process: Path, parent: int) -> bool:

@@ -55,7 +55,6 @@ class NoiseEstimate:
 
     noise: NoiseModel
     points: SmootherPass
-    forward: ForwardRecord
     log_posterior: float
     log_prior: float
     passes: int  # of filter and smoother
@@ -176,21 +175,22 @@ def _iterate(
     passes, total, converged = 0, len(problem.t), False
     rounds = _AGAIN if figures.same_data else _ROUNDS
     ends = [total] if total <= 2 * _FIRST or figures.known else [_FIRST, total]
+    latest: tuple[ForwardRecord, SmootherPass] | None = None
     for end in ends:
         before, converged, figures.ahead = -np.inf, False, 1.0
         likeliest, most, at = figures, -np.inf, 0
         for k in range(_MOST):
-            used = with_noise(problem, figures.model())
-            forward, smoothed = smooth_about(used, about.first(end))
+            used, latest = with_noise(problem, figures.model()), None  # the pass before takes as much memory as this
+            latest = smooth_about(used, about.first(end))
             passes += 1
             prior_then = figures.log_prior()
-            now = float(np.sum(forward.log_likelihood)) + prior_then
+            now = float(np.sum(latest[0].log_likelihood)) + prior_then
             if progress is not None:
                 progress("noise", min((k + 1) / rounds, 1.0))
             if (evidence := now + cost_of_outliers(figures.weights)) > most:
                 likeliest, most, at = figures.copy(), evidence, k
-            _improve(figures, used, forward, smoothed, end, intervals)
-            about = _splice(about, smoothed)
+            _improve(figures, used, *latest, end, intervals)
+            about = _splice(about, latest[1])
             # chance makes each figure gain a half; with one sensor far off it takes many passes to see which
             converged = k > 1 and abs(now - before) < (0.05 if k + 1 < rounds else 0.5) * len(figures.log)
             if converged or k - at == _ROUNDS:
@@ -199,10 +199,12 @@ def _iterate(
         if not converged:  # figures that go to and fro, or are still on their way: the likeliest of them
             figures = likeliest
     if not converged:
-        forward, smoothed = smooth_about(with_noise(problem, figures.model()), about)
+        latest = None
+        latest = smooth_about(with_noise(problem, figures.model()), about)
         passes, prior_then = passes + 1, figures.log_prior()
-        now = float(np.sum(forward.log_likelihood)) + prior_then
-    return NoiseEstimate(figures.model(), smoothed, forward, now, prior_then, passes)
+        now = float(np.sum(latest[0].log_likelihood)) + prior_then
+    assert latest is not None
+    return NoiseEstimate(figures.model(), latest[1], now, prior_then, passes)
 
 
 def _begin(problem: Problem, start: NoiseModel | None, changed: bool = False) -> _Components:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 import sys
+from functools import cache
 
 import numpy as np
 
@@ -19,7 +20,8 @@ _FIELD = re.compile(r"%(?:\.(\d+)(f|g)|d|s)")
 _MOST_PLACES = 11  # for which 10^k 2^-53 is far below a half
 _WIDEST = 28  # bytes of a number: a sign, 15 digits, a point and eleven more
 _ROWS = 512  # at once: their text stays in the processor's cache
-_FEW, _MANY = 20_000, 2_000_000  # numbers that are worth calling compiled code, and loading Numba for it
+_COMPILED = "graphnav.recording.exporters.rows"
+_FEW, _SOME, _MANY = 500, 20_000, 2_000_000  # numbers worth calling compiled code, loading it, and Numba for it
 
 
 def rows_text(table: Array, row_format: str) -> str:
@@ -38,7 +40,8 @@ def rows_bytes(table: Array, row_format: str, last: Array | None = None) -> byte
     """
     table, form = np.asarray(table, dtype=float), row_format + "\n"
     assert len(_FIELD.findall(form)) == table.shape[1] + (last is not None), "a format of other columns"
-    if None not in _list_kinds(form) and can_compile() and table.size >= (_FEW if "numba" in sys.modules else _MANY):
+    least = _FEW if _COMPILED in sys.modules else _SOME if "numba" in sys.modules else _MANY
+    if table.size >= least and None not in _list_kinds(form) and can_compile():
         return b"".join(
             _write_compiled(table[k : k + _ROWS], form, None if last is None else last[k : k + _ROWS])
             for k in range(0, len(table), _ROWS)
@@ -81,7 +84,8 @@ def _write_compiled(table: Array, form: str, last: Array | None) -> bytes:
     return b"".join(parts)
 
 
-def _list_kinds(form: str) -> list[int | None]:
+@cache
+def _list_kinds(form: str) -> tuple[int | None, ...]:
     """What `graphnav.recording.exporters.rows` calls the fields of a format, None for those that it does not know."""
 
     def kind(one: re.Match[str]) -> int | None:
@@ -92,4 +96,4 @@ def _list_kinds(form: str) -> list[int | None]:
             return GENERAL if places == 6 else None
         return places if places <= _MOST_PLACES else None
 
-    return [kind(one) for one in _FIELD.finditer(form)]
+    return tuple(kind(one) for one in _FIELD.finditer(form))
