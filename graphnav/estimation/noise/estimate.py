@@ -178,7 +178,7 @@ def _iterate(
     latest: tuple[ForwardRecord, SmootherPass] | None = None
     for end in ends:
         before, converged, figures.ahead = -np.inf, False, 1.0
-        likeliest, most, at = figures, -np.inf, 0
+        likeliest, most = figures, -np.inf
         for k in range(_MOST):
             used, latest = with_noise(problem, figures.model()), None  # the pass before takes as much memory as this
             latest = smooth_about(used, about.first(end))
@@ -188,12 +188,12 @@ def _iterate(
             if progress is not None:
                 progress("noise", min((k + 1) / rounds, 1.0))
             if (evidence := now + cost_of_outliers(figures.weights)) > most:
-                likeliest, most, at = figures.copy(), evidence, k
+                likeliest, most = figures.copy(), evidence
             _improve(figures, used, *latest, end, intervals)
             about = _splice(about, latest[1])
             # chance makes each figure gain a half; with one sensor far off it takes many passes to see which
             converged = k > 1 and abs(now - before) < (0.05 if k + 1 < rounds else 0.5) * len(figures.log)
-            if converged or k - at == _ROUNDS:
+            if converged:
                 break
             before, figures.ahead = now, _AHEAD if k > 1 and now > before else 1.0
         if not converged:  # figures that go to and fro, or are still on their way: the likeliest of them
