@@ -106,7 +106,7 @@ def posed(online: Online) -> Problem:
     """The keyframes of it as one problem."""
     tracker = online.tracker
     assert tracker is not None
-    (place, *_) = tracker._pose_again(online.sensors, 0, len(tracker.window))
+    (place, *_) = tracker._build_again(online.sensors, 0, len(tracker.window))
     assert place.problem is not None
     return place.problem
 
@@ -115,7 +115,7 @@ def linearised_again(online: Online) -> Window:
     """Its window, about one trajectory."""
     tracker = online.tracker
     assert tracker is not None
-    tracker.window.converge(always=True, renewed=lambda *which: tracker._pose_again(online.sensors, *which))
+    tracker.window.converge(always=True, renewed=lambda *which: tracker._build_again(online.sensors, *which))
     return tracker.window
 
 

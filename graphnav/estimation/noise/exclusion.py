@@ -19,9 +19,10 @@ The best model decides what is left out.
 
 Figures that are estimated with a fault in the data may have grown until they hide it. So the tests are made with the
 prior medians of the figures as well. Where they find something else, the figures are estimated without it, from those
-found on, twice, as the spans come to what is wrong; each span is decided with these, and of these explanations of all
-measurements the likeliest stands. Where these figures know of no span at all, the third is that all is right, by
-figures that set out from them.
+found on, twice, as the spans come to what is wrong; each span is decided with these, as the tests date it and as its
+rows do, and of these explanations of all measurements the likeliest stands. Where these figures know of no span at all,
+another is that all is right, by figures that set out from them. What is right at the ends of a span that is left out
+shows once it is, and is taken back where that is likelier.
 """
 
 from __future__ import annotations
