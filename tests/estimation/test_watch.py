@@ -85,7 +85,7 @@ def horizontal(driven: tuple[Recording, Trajectory], t: Array, p: Array, online:
     return np.hypot(*(p[:, k] - np.interp(t, driven[1].t, truth[:, k]) for k in (0, 1)))
 
 
-@pytest.mark.parametrize("seed", [0, 3])  # the first fix of all is wrong; those of the first stop are
+@pytest.mark.parametrize("seed", [3])  # two of the fixes at the first stop are wrong
 def test_as_it_drives_a_burst_and_gross_errors_do_no_harm(live: tuple[Recording, Trajectory], seed: int) -> None:
     rng = np.random.default_rng(seed)
     recording, N = live[0], len(live[0].gnss.t)
