@@ -182,7 +182,8 @@ def rtk() -> Recording:
 def test_arcs_are_those_of_the_series_however_its_epochs_come(rtk: Recording) -> None:
     """Flags, gaps, open half cycles, slips that no flag tells, arcs of the base, and epochs that are not used."""
     raw, rng = rtk.raw_gnss, np.random.default_rng(4)
-    raw = replace(raw, lock=np.full(len(raw), np.nan))
+    own = {name: getattr(raw, name).copy() for name in ("slip", "half", "base_arc", "carrier")}  # others use it, too
+    raw = replace(raw, lock=np.full(len(raw), np.nan), **own)
     n = len(raw)
     raw.slip[rng.integers(0, n, 20)] = True
     raw.half[(raw.satellite == raw.satellite[0]) & (raw.t > 20.0) & (raw.t < 30.0)] = True
@@ -267,6 +268,7 @@ def test_wrong_integers_are_let_go_of(rtk: Recording, monkeypatch: pytest.Monkey
     true, inside = interpolate(truth_of(rtk)[0], track.t)
     assert inside.all()
     h = np.hypot(*((track.llh - true.llh)[:, :2] * 6.37e6 * [1.0, np.cos(true.llh[0, 0])]).T)
+    assert h[(track.t > 15.0) & (track.t < until - 1.0)].max() > 0.05
     assert h[track.t > until + 10.0].max() < 0.05
     assert tracker._head_held.fixed
 
