@@ -26,6 +26,7 @@ throughout.
 from __future__ import annotations
 
 import time
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -36,9 +37,9 @@ from graphnav.estimation.dense import dense
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import Solution
 from graphnav.estimation.solvers.decision import Decide, hold
-from graphnav.estimation.solvers.gain import describe_breakdown, solve_innovation, solve_robust, weights_of
+from graphnav.estimation.solvers.gain import solve_innovation, solve_robust, weights_of
 from graphnav.estimation.solvers.invariant import transport_covariance
-from graphnav.estimation.solvers.linearise import Advance, Points, advance, scale_at
+from graphnav.estimation.solvers.linearise import Points, advance, scale_at
 from graphnav.estimation.solvers.passes import (
     FilterPass,
     ForwardRecord,
@@ -51,9 +52,9 @@ from graphnav.estimation.solvers.passes import (
     parameters_of,
     sigmas_of,
 )
+from graphnav.estimation.solvers.point_filter import Errors, PointFilter, RememberedBank
 from graphnav.estimation.solvers.points import AtEstimate, AtPoints, Estimate
-from graphnav.estimation.solvers.recursion import STRETCH, filter_rows, predict, update
-from graphnav.estimation.solvers.retest import finds_fault
+from graphnav.estimation.solvers.recursion import predict, update
 from graphnav.estimation.solvers.rts import backward
 from graphnav.estimation.solvers.stack import Innovations, RowBlock, Stack
 from graphnav.estimation.solvers.verdicts import Verdicts
@@ -61,7 +62,6 @@ from graphnav.estimation.solvers.watch import Bank
 from graphnav.imu.dynamics import SCALE
 
 _PASSES = 4  # about where the pass before led
-_REMEMBERED = 64  # keyframes back to which the tests can be taken as they were
 
 
 def ekf(
@@ -179,39 +179,37 @@ def _forward(
     P = np.diag(np.concatenate([problem.prior.sigma[0], *(c.sigma[0] for c in problem.chains)]) ** 2)
     records = stack.records
     watched = [c for c in fixes if c.watched]
-    bank = Bank(watched, problem.t, D, drifts) if watched else None
-    banks: dict[int, Bank] = {}  # as they were before the latest keyframes with fixes
-    met = {int(k) for c in watched for k in c.keyframe}
+    tests = None
+    if watched:
+        tests = RememberedBank(Bank(watched, problem.t, D, drifts), {int(k) for c in watched for k in c.keyframe})
     verdicts = Verdicts(
         {c.name: problem.t[c.keyframe] for c in watched}, {c.name: records[c.name].used for c in watched}
     )
-    begun, P = (x, P), _place(P, records)
+    begin = partial(_begin, x, P, records)
+    x, P = begin()
     found: list[Any] = [None] * K  # estimates, or errors where points are given
     ahead = found.copy()
     k = 0
-    # a fix that is not used at the end may be taken back there
-    untested = not watched or (n == K and all(records[c.name].used[-1] > 0.0 for c in watched))
-    if about is not None and given and updates and untested and not decided and decide is None:
-        errors, errors_ahead = np.empty((n, D)), np.empty((n, D))
-        _filter_points(given, steps, stack, updates, x, P, errors_ahead, all_Pp, errors, all_P, progress)
-        if bank is None or not finds_fault(Bank(watched, problem.t, D, drifts), given, steps.decay, stack, updates):
-            found[:n], ahead[:n] = errors, errors_ahead
-            k = n
-            x, P = _leave_points(about, own, all_P, k, errors[k - 1])
+    if given is not None and updates is not None and not decided and decide is None:
+        out = Errors.allocate(n, all_Pp, all_P)
+        compiled = PointFilter(given, steps, stack, updates, out, begin)
+        k = compiled.run_all(progress) if tests is None else compiled.run_tested(tests, verdicts, problem.t, progress)
+        found[:k], ahead[:k] = out.filtered[:k], out.predicted[:k]
+        x, P = (out.filtered[k - 1], all_P[k - 1]) if k else begin()
+        if about is not None and k == n:
+            x, P = _leave_points(about, own, all_P, k, x)
     while k < K:
         where: AtEstimate | AtPoints = given if given is not None and k < n else own
-        if bank is not None and k in met:
-            banks[k] = bank.copy()
-            if len(banks) > _REMEMBERED:
-                del banks[next(iter(banks))]
+        if tests is not None:
+            tests.arrive(k)
         if k:
             x, F, Q = where.step(k, x)
             if where is own:
                 all_F[k - 1] = F
             predict(P, all_F[k - 1], steps.decay[k - 1], Q, steps.added[k - 1], all_Pp[k])
             P = all_Pp[k]
-            if bank is not None:
-                bank.predicted(all_F[k - 1], steps.decay[k - 1])
+            if tests is not None:
+                tests.now.predicted(all_F[k - 1], steps.decay[k - 1])
         for kind in watched if verdicts.anew else ():
             if (kind.name, problem.t[k]) in verdicts.anew:
                 P = _anywhere(P, kind.fix_of)
@@ -222,7 +220,7 @@ def _forward(
             taken.forget(k)
         # at its own estimate, each kind is linearised where those before it have led
         for some in stack.together(k, one_by_one=where is own):
-            x, P, fault = _update(some, x, P, where, stack, bank, taken)
+            x, P, fault = _update(some, x, P, where, stack, None if tests is None else tests.now, taken)
             if fault is not None:
                 again = verdicts.settle(some.parts[0][0].name, fault, float(problem.t[k]))
                 back = int(np.searchsorted(problem.t, again))
@@ -232,10 +230,10 @@ def _forward(
         if decide is not None and back is None:
             x, P = hold(decide(k, _here(about, k, x), P), x, P, where)
         if back is not None:  # once more from before the fault, without it
-            bank = banks.get(back) or bank.forgetful() if bank else None
-            banks = {key: old for key, old in banks.items() if key < back}
+            if tests is not None:
+                tests.go_back(back)
             k = back
-            x, P = (found[k - 1], all_P[k - 1]) if k else (begun[0], _place(begun[1], records))
+            x, P = (found[k - 1], all_P[k - 1]) if k else begin()
             continue
         found[k], all_P[k] = x, P
         if progress is not None and k % 256 == 0:
@@ -266,10 +264,10 @@ def _forward(
     )
 
 
-def _place(P: Array, records: dict[str, Innovations]) -> Array:
+def _begin(x: Any, P: Array, records: dict[str, Innovations]) -> tuple[Any, Array]:
     """What is known at the start, but for the place where the first fix, which tells it, is not used."""
     first = [one.used[0] for one in records.values() if one.rows.fix_of == "p" and len(one.used)]
-    return _anywhere(P, "p") if first and first[0] == 0.0 else P
+    return x, _anywhere(P, "p") if first and first[0] == 0.0 else P
 
 
 def _anywhere(P: Array, block: str) -> Array:
@@ -297,39 +295,6 @@ def _points(about: Points | None, errors: Array, own: list[Estimate]) -> Points:
     if own:
         parts.append(Points(States.stack([one.state for one in own]), np.array([one.values for one in own])))
     return join_passes(parts)
-
-
-def _filter_points(
-    given: AtPoints,
-    steps: Advance,
-    stack: Stack,
-    updates: Updates,
-    e: Array,
-    P: Array,
-    errors_predicted: Array,
-    P_predicted: Array,
-    errors: Array,
-    P_filtered: Array,
-    progress: Progress | None,
-) -> None:
-    """All keyframes that are linearised at given points, where nothing is to be decided on the way."""
-    blocks, at, n = stack.joint, np.zeros(1, dtype=int), len(errors)
-    updates.taken[:] = blocks.used
-    for k in range(0, n, STRETCH):
-        try:
-            filter_rows(
-                k, min(k + STRETCH, n), e, P, given.F, steps.decay, given.gap, given.Q, steps.added,
-                given.r, given.H, given.variance, blocks.first, blocks.begin, blocks.end, blocks.used,
-                errors_predicted, P_predicted, errors, P_filtered,
-                stack.root, stack.solved, updates.Kt, updates.SH, at,
-            )  # fmt: skip
-        except np.linalg.LinAlgError:
-            raise describe_breakdown(stack.block(int(at[0]))) from None
-        last = min(k + STRETCH, n) - 1
-        e, P = errors[last], P_filtered[last]
-        if progress is not None:
-            progress("filter", k / stack.K)
-    np.negative(stack.solved[:n], out=updates.w)
 
 
 def _update(

@@ -120,6 +120,10 @@ class AtPoints:
                 self.H[place] = linear.H
         self.variance = (self._sigma / stack.root_weight[:n]) ** 2
 
+    def weigh(self, some: RowBlock, root_weight: float | Array) -> None:
+        """Weigh some rows anew: the root of the weight of all, or of each number."""
+        self.variance[some.at] = (self._sigma[some.at] / root_weight) ** 2
+
     def step(self, k: int, x: Array) -> tuple[Array, Array, Array]:
         """As `AtEstimate.step`, of error states (D,)."""
         F, ahead = self.F[k - 1], self.gap[k - 1].copy()

@@ -1,0 +1,179 @@
+"""The filter at given points: compiled, with the tests for errors that last beside it.
+
+Tests change nothing about a filter until one of them finds something. So the compiled filter goes ahead a stretch of
+keyframes, and the tests follow by the gains and innovations that it leaves. Where they find a fault, both go back to
+before it, and on without what is wrong.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+
+from graphnav.core.rotation import Array
+from graphnav.estimation.solvers.gain import describe_breakdown, weights_of
+from graphnav.estimation.solvers.linearise import Advance
+from graphnav.estimation.solvers.passes import Progress, Updates
+from graphnav.estimation.solvers.points import AtPoints
+from graphnav.estimation.solvers.recursion import STRETCH, filter_rows
+from graphnav.estimation.solvers.stack import RowBlock, Stack
+from graphnav.estimation.solvers.verdicts import Verdicts
+from graphnav.estimation.solvers.watch import Bank
+
+_REMEMBERED = 64  # keyframes back to which the tests can be taken as they were
+_SHORTEST = 4  # keyframes that are filtered at once, behind a fault
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Error states (n, D) about given points and their covariances, predicted and filtered."""
+
+    predicted: Array
+    P_predicted: Array
+    filtered: Array
+    P: Array
+
+    @classmethod
+    def allocate(cls, n: int, P_predicted: Array, P: Array) -> Self:
+        """None yet, of n keyframes; the covariances go to the first of the arrays given."""
+        D = P.shape[1]
+        return cls(np.empty((n, D)), P_predicted, np.empty((n, D)), P)
+
+
+class RememberedBank:
+    """A bank of tests that remembers how it was before the latest keyframes with fixes."""
+
+    def __init__(self, bank: Bank, met: set[int]) -> None:
+        self.now, self._met = bank, met
+        self._before: dict[int, Bank] = {}
+
+    def arrive(self, k: int) -> None:
+        """The filter is about to go on to keyframe k."""
+        if k in self._met:
+            self._before[k] = self.now.copy()
+            if len(self._before) > _REMEMBERED:
+                del self._before[next(iter(self._before))]
+
+    def go_back(self, k: int) -> None:
+        """To before keyframe k; without any onset where that is too long ago."""
+        self.now = self._before.get(k) or self.now.forgetful()
+        self._before = {key: old for key, old in self._before.items() if key < k}
+
+
+class PointFilter:
+    """Filter keyframes linearised at given points, from what `begin` says of the errors (D,) and P before the first."""
+
+    def __init__(
+        self,
+        given: AtPoints,
+        steps: Advance,
+        stack: Stack,
+        updates: Updates,
+        out: Errors,
+        begin: Callable[[], tuple[Array, Array]],
+    ) -> None:
+        self._given, self._steps, self._stack, self._updates = given, steps, stack, updates
+        self._begin, self.out = begin, out
+        self._at = np.zeros(1, dtype=int)
+        updates.taken[:] = stack.joint.used
+
+    def run(self, k0: int, k1: int) -> None:
+        """Filter keyframes k0 to k1 with the blocks that are taken.
+
+        Raises
+        ------
+        EstimationError
+            If the covariance of an innovation is not positive definite.
+        """
+        given, out, updates, stack, blocks = self._given, self.out, self._updates, self._stack, self._stack.joint
+        e, P = (out.filtered[k0 - 1], out.P[k0 - 1]) if k0 else self._begin()
+        try:
+            filter_rows(
+                k0, k1, e, P, given.F, self._steps.decay, given.gap, given.Q, self._steps.added,
+                given.r, given.H, given.variance, blocks.first, blocks.begin, blocks.end, updates.taken,
+                out.predicted, out.P_predicted, out.filtered, out.P,
+                stack.root, stack.solved, updates.Kt, updates.SH, self._at,
+            )  # fmt: skip
+        except np.linalg.LinAlgError:
+            raise describe_breakdown(stack.block(int(self._at[0]))) from None
+        np.negative(stack.solved[k0:k1], out=updates.w[k0:k1])
+
+    def run_all(self, progress: Progress | None) -> int:
+        """Filter all keyframes; how many these are."""
+        n = len(self.out.filtered)
+        for k in range(0, n, STRETCH):
+            self.run(k, min(k + STRETCH, n))
+            if progress is not None:
+                progress("filter", k / self._stack.K)
+        return n
+
+    def run_tested(self, tests: RememberedBank, verdicts: Verdicts, t: Array, progress: Progress | None) -> int:
+        """Filter all keyframes without the fixes that tests find wrong.
+
+        Parameters
+        ----------
+        t : (K,) s, of all keyframes of the problem.
+
+        Returns
+        -------
+        int
+            The keyframe to go on from: behind the last, or where the filter begins anew.
+        """
+        n, k, length = len(self.out.filtered), 0, STRETCH
+        used = {name: one.used.copy() for name, one in self._stack.records.items() if name in verdicts.times}
+        while k < n:
+            end = min(k + length, n)
+            self.run(k, end)
+            back = self._test(tests, verdicts, t, k, end)
+            if back is None and end == len(t) and (trial := verdicts.ended()) is not None:
+                back = int(np.searchsorted(t, trial))
+            if back is not None:
+                tests.go_back(back)
+                self._reweigh(used)
+                if verdicts.anew:
+                    return back
+            # where one fault has been found the next is near, and what was filtered beyond it was in vain
+            k, length = (end, min(2 * length, STRETCH)) if back is None else (back, _SHORTEST)
+            if progress is not None:
+                progress("filter", k / self._stack.K)
+        for name in used:  # of what no update has seen since it was given up
+            self._stack.records[name].weight[:] = used[name]
+        return n
+
+    def _test(self, tests: RememberedBank, verdicts: Verdicts, t: Array, k0: int, k1: int) -> int | None:
+        """Whether, and from which keyframe on, a test finds something wrong that was used up to one of k0 to k1."""
+        given, updates, stack = self._given, self._updates, self._stack
+        for k in range(k0, k1):
+            tests.arrive(k)
+            bank = tests.now
+            if k:
+                bank.predicted(given.F[k - 1], self._steps.decay[k - 1])
+            for some in stack.together(k):
+                at, name, taken = some.at, some.parts[0][0].name, bool(updates.taken[some.number])
+                H, solved, root = given.H[at], stack.solved[at], stack.root[k, at[1], at[1]].copy()
+                r = root @ (root.T @ solved)
+                bank.seen(name, k, float(r @ solved), taken)
+                if taken:
+                    since = bank.updated(name, k, H, updates.Kt[at].T, r, root, given.speed(k))
+                    if since is not None:
+                        return int(np.searchsorted(t, verdicts.settle(name, since, float(t[k]))))
+        return None
+
+    def _reweigh(self, before: dict[str, Array]) -> None:
+        """Take the blocks in, or not, as fixes are used now."""
+        for name, was in before.items():
+            record = self._stack.records[name]
+            for k in np.unique(record.rows.keyframe[np.flatnonzero(record.used != was)]).tolist():
+                for some in self._stack.together(k):
+                    if some.parts[0][0] is record.rows:
+                        self._weigh(some)
+            was[:] = record.used
+
+    def _weigh(self, some: RowBlock) -> None:
+        rows, lo, hi = some.parts[0]
+        weight, root_weight = weights_of(self._stack.records[rows.name], lo, hi)
+        self._updates.taken[some.number] = weight > 0.0
+        self._given.weigh(some, root_weight)
