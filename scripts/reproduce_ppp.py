@@ -1,10 +1,12 @@
 """Precise point positioning with float ambiguities, by real orbits and clocks: a station that stands, and a vehicle.
 
     python scripts/reproduce_ppp.py static ../shared/data/raw_gnss_slac_20210428
+    python scripts/reproduce_ppp.py static ../shared/data/cssrlib_2021_078
     python scripts/reproduce_ppp.py li ../shared/data/raw_gnss_slac_20210428 --solver ekf --solver batch
 
-`static`: an hour of the station SLAC, GPS, 30 s, CODE's final orbits and clocks; errors against the place of its
-daily series, east, north, up, over time. Its IMU at rest is SIMULATED, with the errors of a low-cost MEMS.
+`static`: an hour of the station SLAC every 30 s, or a quarter of an hour of another antenna every second, CODE's final
+orbits and clocks; errors against the known place, east, north, up, over time. The IMU at rest is SIMULATED, with the
+errors of a low-cost MEMS.
 
 `li`: the experiment of Li 2024, PPP and IMU coupled tightly with zero velocity where the spectrum of the idling engine
 says that the vehicle stands, on the simulated drive of `scripts/reproduce_li2024.py`, stops of 60, 120 and 90 s. Orbits
@@ -19,7 +21,7 @@ from __future__ import annotations
 
 import argparse
 import time
-from dataclasses import fields, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -53,10 +55,31 @@ ANTENNA = 0.0083 + 2.5457 * 0.08951 - 1.5457 * 0.11713
 DAY = 2155 * 604800.0 + 3 * 86400.0  # s since the GPS epoch
 BEGIN, END = DAY + 19.5 * 3600.0, DAY + 20.5 * 3600.0  # of the clocks that come with the data
 RATE = 20.0  # Hz
+MINUTES = (5.0, 10.0, 14.9, 20.0, 30.0, 45.0, 59.5)
 MEMS = ImuNoise(1.5e-4, 4e-3, 5e-6, 2e-4, 2e-3, 0.1)
 
 
+@dataclass(frozen=True)
+class Station:
+    """An antenna at a known place (m in e), which it is `up` m above, and times, s since the GPS epoch."""
+
+    place: Array
+    up: float
+    begin: float
+    end: float
+
+
+STATIONS = {
+    "raw_gnss_slac_20210428": Station(MARKER, ANTENNA, BEGIN, END),
+    "cssrlib_2021_078": Station(
+        np.array([-3962108.673, 3381309.574, 3668678.638]), 0.0, 2149 * 604800.0 + 475190.0, 2149 * 604800.0 + 476100.0
+    ),
+}
+
+
 def sources(data: Path) -> Sources:
+    if (data / "rover.obs.gz").exists():
+        return Sources((data / "rover.obs.gz",), (data / "nav.gz",), (data / "orbit.sp3.gz",))
     return Sources(
         (data / "slac1180.21o.gz",), (data / "brdc1180.21n.gz",), tuple(data.glob("*ORB.SP3.gz")),
         tuple(data.glob("*CLK.CLK.gz")), tuple(data.glob("*.atx*")),
@@ -86,15 +109,16 @@ def standing(duration: float, place: Array, seed: int = 0) -> Imu:
 
 
 def static_recording(data: Path) -> Recording:
-    raw, fixes, said = load_raw(sources(data), BEGIN)
+    at = STATIONS[data.name]
+    raw, fixes, said = load_raw(sources(data), at.begin)
     for one in said:
         print(one)
-    raw = raw.take((raw.t > 0.0) & (raw.t < END - BEGIN))
-    good = np.isfinite(fixes.p[:, 0]) & (fixes.t > 0.0) & (fixes.t < END - BEGIN)
+    raw = raw.take((raw.t > 0.0) & (raw.t < at.end - at.begin))
+    good = np.isfinite(fixes.p[:, 0]) & (fixes.t > 0.0) & (fixes.t < at.end - at.begin)
     sd = np.sqrt(np.diagonal(fixes.covariance[good], axis1=1, axis2=2))
     gnss = Gnss(fixes.t[good], earth.ecef_to_llh(fixes.p[good]), sd, derived=True)
-    imu = standing(END - BEGIN, MARKER)
-    return Recording("SLAC, IMU simulated", "vehicle", imu, gnss, gps_zero=BEGIN, raw_gnss=raw)
+    imu = standing(at.end - at.begin, at.place)
+    return Recording(f"{data.name}, IMU simulated", "vehicle", imu, gnss, gps_zero=at.begin, raw_gnss=raw)
 
 
 def static(data: Path, chosen: dict[str, Any], solvers: tuple[str, ...]) -> None:
@@ -110,9 +134,10 @@ def static(data: Path, chosen: dict[str, Any], solvers: tuple[str, ...]) -> None
     solutions = run(recording, settings, solvers)
     print(f"{time.process_time() - began:.0f} s of processor time")
     print("m against the station's place, east, north, up, by the minutes since the first epoch; 1-sigma at the end")
+    at = STATIONS[data.name]
     for name, one in solutions.items():
-        off = one.states.p - one.frame.from_llh(earth.ecef_to_llh(MARKER[None])) - [0.0, 0.0, ANTENNA]
-        for minutes in (5, 10, 20, 30, 45, 59.5):
+        off = one.states.p - one.frame.from_llh(earth.ecef_to_llh(at.place[None])) - [0.0, 0.0, at.up]
+        for minutes in (x for x in MINUTES if 60.0 * x < at.end - at.begin):
             k = int(np.searchsorted(one.t, 60.0 * minutes))
             print(f"{name:6} {minutes:5.1f} " + " ".join(f"{x:7.3f}" for x in off[min(k, len(off) - 1)]))
         P = np.sqrt(np.diagonal(one.covariance[-1])[3:6])

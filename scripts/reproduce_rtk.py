@@ -2,10 +2,12 @@
 
     python scripts/reproduce_rtk.py ../shared/data/ucr_riverside_20200712 -o build/rtk
     python scripts/reproduce_rtk.py ../shared/data/cssrlib_2021_265 -o build/rtk
+    python scripts/reproduce_rtk.py ../shared/data/cssrlib_2021_078 -o build/rtk --end 60
 
 Prints horizontal errors (50 %, 95 %, largest), that of height (95 %), the share of epochs that are fixed and that of
 the fixed ones that are wrong (more than 0.1 m off), of filter, smoother and batch. These drives have no IMU: one is
-simulated from a spline through the truth, with the errors of a consumer-grade one, and called so.
+simulated from a spline through the truth, with the errors of a consumer-grade one, and called so. The last stands, and
+has a minute of its base station.
 """
 
 from __future__ import annotations
@@ -44,9 +46,10 @@ class Drive:
 
     week: int
     start: float  # s of the week
-    truth: str
+    truth: str | tuple[float, float, float]  # a table, or where the antenna stands, m in e
     base: tuple[float, float, float]
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    base_file: str = "base.obs.gz"
 
 
 DRIVES = {
@@ -54,6 +57,13 @@ DRIVES = {
         2114, 5784.0, "truth.csv.gz", (-2430697.636, -4704189.056, 3544329.070), (-0.011, 0.061, -0.142)
     ),
     "cssrlib_2021_265": Drive(2176, 282600.0, "reference_rtk.csv.gz", (-3959400.631, 3385704.533, 3667523.111)),
+    "cssrlib_2021_078": Drive(
+        2149,
+        475200.0,
+        (-3962108.673, 3381309.574, 3668678.638),
+        (-3959400.631, 3385704.533, 3667523.111),
+        base_file="base_1min.obs.gz",
+    ),
 }
 VARIANTS: dict[str, dict[str, Any]] = {
     "codes, Doppler": {"carrier": False},
@@ -82,13 +92,16 @@ axes = "RFU"
 rover = "{data}/rover.obs.gz"
 nav = "{data}/nav.gz"
 """
-BASE = """base = "{data}/base.obs.gz"
+BASE = """base = "{data}/{base_file}"
 base_position = [{base[0]}, {base[1]}, {base[2]}]
 """
 
 
 def truth_of(data: Path, drive: Drive, raw: RawGnss) -> tuple[Array, Array]:
     """Times of the rover's own epochs (s of the week) and places of the antenna (N, 3), e, the offset taken off."""
+    if not isinstance(drive.truth, str):
+        epochs, _ = raw.epochs
+        return epochs, np.tile(drive.truth, (len(epochs), 1))
     table = np.genfromtxt(data / drive.truth, delimiter=",", names=True)
     places = np.stack([table["x"], table["y"], table["z"]], -1)
     places = places + np.array(drive.offset) @ earth.enu_axes(earth.ecef_to_llh(places[0]))
@@ -107,10 +120,12 @@ def simulate_imu(t: Array, places: Array, seed: int = 1) -> tuple[Array, Array, 
     u = np.stack([one(t, 1) for one in path], -1)
     speed = np.hypot(u[:, 0], u[:, 1])
     moving = speed > 1.0  # m/s, below which millimetres of the truth would turn the vehicle
-    heading = PchipInterpolator(t[moving], np.unwrap(np.arctan2(u[moving, 0], u[moving, 1])))
-    pitch = PchipInterpolator(t[moving], np.arctan2(u[moving, 2], speed[moving]))
-    inside = np.clip(at, *t[moving][[0, -1]])
-    rph = np.stack([np.zeros(len(at)), pitch(inside), heading(inside)], -1)
+    rph = np.zeros((len(at), 3))
+    if moving.any():
+        heading = PchipInterpolator(t[moving], np.unwrap(np.arctan2(u[moving, 0], u[moving, 1])))
+        pitch = PchipInterpolator(t[moving], np.arctan2(u[moving, 2], speed[moving]))
+        inside = np.clip(at, *t[moving][[0, -1]])
+        rph[:, 1], rph[:, 2] = pitch(inside), heading(inside)
     R = rotation.from_rph(rph)
     dt = np.diff(at)[:, None]
     middle = R[:-1] @ rotation.exp(0.5 * rotation.log(np.swapaxes(R[:-1], -1, -2) @ R[1:]))
@@ -126,7 +141,7 @@ def recording_of(data: Path, folder: Path, with_base: bool = True) -> tuple[Reco
     """The drive with a simulated IMU, written into a folder, and its truth."""
     drive = DRIVES[data.name]
     sources = Sources(
-        rover=(data / "rover.obs.gz",), nav=(data / "nav.gz",), base=(data / "base.obs.gz",), base_position=drive.base
+        rover=(data / "rover.obs.gz",), nav=(data / "nav.gz",), base=(data / drive.base_file,), base_position=drive.base
     )
     raw, _, _ = load_raw(sources, zero=drive.week * 604800.0)
     t, places = truth_of(data, drive, raw)
@@ -135,7 +150,13 @@ def recording_of(data: Path, folder: Path, with_base: bool = True) -> tuple[Reco
     np.savetxt(folder / "imu.csv", table, "%.9g", ",", header="t,gx,gy,gz,ax,ay,az", comments="")
     noise = "\n".join(f"{name} = {value:.6g}" for name, value in vars(MEMS.noise).items() if isinstance(value, float))
     text = (TOML + BASE if with_base else TOML).format(
-        name=data.name, folder=folder, data=data, noise=noise, base=drive.base, week=drive.week
+        name=data.name,
+        folder=folder,
+        data=data,
+        noise=noise,
+        base=drive.base,
+        week=drive.week,
+        base_file=drive.base_file,
     )
     (folder / f"{data.name}.toml").write_text(text, encoding="utf-8")
     with permit_outside():

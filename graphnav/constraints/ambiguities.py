@@ -14,13 +14,13 @@ _PREFIX = "ambiguity."
 _SIGMA = 30.0  # m, 1-sigma about what the codes say: next to nothing known
 
 
-def ambiguities(arcs: Arcs, cycles: Array, wavelength: Array) -> dict[int, Parameter]:
-    """A parameter (cycles) for each slot that has arcs, by slot.
+def ambiguities(arcs: Arcs, guess: Array, wavelength: Array, unit: str = "cycles") -> dict[int, Parameter]:
+    """A parameter for each slot that has arcs, by slot.
 
     Parameters
     ----------
-    cycles : (N,) what the codes say the ambiguities are; that of an arc's first row is taken.
-    wavelength : (N,) m.
+    guess : (N,) what the codes say the ambiguities are; that of an arc's first row is taken.
+    wavelength : (N,) m, of the unit.
     """
     out = {}
     for slot, begins in enumerate(arcs.begins):
@@ -28,7 +28,7 @@ def ambiguities(arcs: Arcs, cycles: Array, wavelength: Array) -> dict[int, Param
             own = np.flatnonzero((arcs.slot == slot) & (arcs.arc >= 0))
             first = own[np.unique(arcs.arc[own], return_index=True)[1], None]
             sigma = _SIGMA / wavelength[first]
-            out[slot] = Parameter(ambiguity_name(arcs.names[slot]), cycles[first], sigma, "cycles", begins=begins)
+            out[slot] = Parameter(ambiguity_name(arcs.names[slot]), guess[first], sigma, unit, begins=begins)
     return out
 
 

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphnav.config import Settings
-from graphnav.constraints.ambiguities import ambiguity_name
+from graphnav.constraints.ambiguities import ambiguities, ambiguity_name
 from graphnav.constraints.base import BuildContext, Linearized
 from graphnav.constraints.raw_gnss import BIASES, PER_ROW, SATELLITES, RangeConstraint, common_fields, select_columns
 from graphnav.constraints.raw_rows import PreparedRows, prepare_rows
@@ -27,9 +27,11 @@ from graphnav.constraints.raw_selection import select_observations
 from graphnav.core.errors import RecordingError
 from graphnav.core.rotation import Array
 from graphnav.core.state import Parameter, States
-from graphnav.gnss.ppp import IonosphereFree, ionosphere_free
+from graphnav.gnss.ppp import SECOND, IonosphereFree, ionosphere_free, second_signals
+from graphnav.gnss.series import RawGnss
 from graphnav.gnss.sigmas import carrier_sigma, code_sigma
-from graphnav.gnss.signals import C, satellite_name
+from graphnav.gnss.signals import C
+from graphnav.gnss.single_point import signal_groups
 from graphnav.recording import Recording
 
 WET = "gnss_wet_delay"
@@ -39,7 +41,6 @@ _CODE_BIAS = 1.0  # m: a code's differential bias, half a nanosecond or two, in 
 _BIAS_WALK = 1e-5  # m/sqrt(s), a millimetre in three hours
 # m, towards a satellite, for hours: final orbits are good to 2.5 cm (IGS, "Products")
 _ORBIT = 0.025
-_AMBIGUITY = 30.0  # m, about what the first code says: next to nothing known
 
 
 @dataclass(frozen=True)
@@ -48,7 +49,7 @@ class _Free:
 
     found: PreparedRows
     rows: IonosphereFree
-    satellites: NDArray[np.int16]  # those that have rows
+    satellites: int  # of the systems that are used
     which: NDArray[np.intp]  # (N,) satellite
     group: NDArray[np.intp]  # (N,) system, 0 that with most rows
     groups: int
@@ -60,24 +61,36 @@ def _combine_free(scene: BuildContext) -> _Free | None:
     found, whole = scene.share(prepare_rows), scene.recording.raw_gnss
     if found is None or whole is None:
         return None
-    if not whole.precise:
-        raise RecordingError(
-            f"{scene.recording.name}: raw_gnss.ppp needs precise orbits and clocks; say sp3 and clk in the recording's "
-            "[raw_gnss]",
-            key="raw.ppp_orbits",
-        )
+    require_precise(scene.recording.name, whole)
     rows = ionosphere_free(found.raw, whole)
     if rows is None:
+        return None
+    every, of = found.raw.satellites
+    some = np.isin(every // 100, list(SECOND))
+    systems = [x for x in dict.fromkeys(system for system, _ in signal_groups(found.raw)[0]) if x in SECOND]
+    group = np.array([systems.index(x) for x in (found.raw.satellite[rows.which] // 100).tolist()])
+    return _Free(found, rows, int(some.sum()), (np.cumsum(some) - 1)[of[rows.which]], group, len(systems))
+
+
+def require_precise(name: str, raw: RawGnss) -> None:
+    """Whether a recording's series has what precise point positioning needs.
+
+    Raises
+    ------
+    RecordingError
+        If it has not.
+    """
+    if not raw.precise:
         raise RecordingError(
-            f"{scene.recording.name}: raw_gnss.ppp needs two signals of a satellite (GPS L1 and L2, Galileo E1 and "
-            "E5a); this receiver has one",
+            f"{name}: raw_gnss.ppp needs precise orbits and clocks; say sp3 and clk in the recording's [raw_gnss]",
+            key="raw.ppp_orbits",
+        )
+    if not second_signals(raw):
+        raise RecordingError(
+            f"{name}: raw_gnss.ppp needs two signals of a satellite (GPS L1 and L2, Galileo E1 and E5a); this receiver "
+            "has one",
             key="raw.ppp_signals",
         )
-    satellites, which = np.unique(found.raw.satellite[rows.which], return_inverse=True)
-    systems, group, many = np.unique(satellites[which] // 100, return_inverse=True, return_counts=True)
-    rank = np.empty(len(systems), dtype=np.intp)
-    rank[np.argsort(-many, kind="stable")] = np.arange(len(systems))
-    return _Free(found, rows, satellites, which, rank[group], len(systems))
 
 
 @dataclass(frozen=True)
@@ -138,7 +151,7 @@ class GnssPppCode(_Ppp):
             return None
         rows, raw = free.rows, free.found.raw.take(free.rows.which)
         common = cls._collect_shared_fields(scene, free, np.arange(len(rows.which)))
-        size, hours = len(free.satellites), scene.settings.gnss.slow_times[1]
+        size, hours = free.satellites, scene.settings.gnss.slow_times[1]
         common["parameters"] += (
             Parameter(
                 SATELLITES, np.zeros(size), np.full(size, _CODE_BIAS), "m", correlation_time=hours,
@@ -161,7 +174,8 @@ class GnssPppCarrier(_Ppp):
     name: ClassVar[str] = "gnss_ppp_carrier"
     unit: ClassVar[str] = "m"
 
-    ambiguities: tuple[str, ...] = ()  # (S,) names of the parameters, by satellite
+    slots: tuple[str, ...] = ()  # names of the ambiguities
+    slot: Array = field(default_factory=lambda: np.empty(0, dtype=int))  # (N,) index of `slots`
     begin: Array = field(default_factory=lambda: np.empty(0))  # (N,) s, of the arc
 
     @classmethod
@@ -173,26 +187,16 @@ class GnssPppCarrier(_Ppp):
         free = scene.share(_combine_free)
         if free is None:
             return None
-        rows = free.rows
-        used = np.flatnonzero((rows.arc >= 0) & np.isfinite(rows.carrier))
+        rows, arcs = free.rows, free.rows.arcs
+        used = np.flatnonzero(arcs.arc >= 0)
         if not len(used):
             return None
         raw = free.found.raw.take(rows.which[used])
         common = cls._collect_shared_fields(scene, free, used)
-        names = tuple(ambiguity_name(f"{satellite_name(s)}.free") for s in free.satellites)
-        begins_at: list[NDArray[np.intp]] = []
-        for k in range(len(names)):
-            own = used[free.which[used] == k]
-            begins_at.append(own[np.sort(np.unique(rows.arc[own], return_index=True)[1])])
-        common["parameters"] += tuple(
-            Parameter(
-                name, (rows.carrier - rows.code)[at, None], np.full((len(at), 1), _AMBIGUITY), "m",
-                begins=free.found.raw.t[rows.which[at]],
-            )
-            for name, at in zip(names, begins_at, strict=True)
-            if len(at)
-        )  # fmt: skip
-        size, hours = len(names), scene.settings.gnss.slow_times[1]
+        own = ambiguities(arcs, rows.carrier - rows.code, np.ones(len(arcs.arc)), "m")
+        there = sorted(own)
+        common["parameters"] += tuple(own[k] for k in there)
+        size, hours = free.satellites, scene.settings.gnss.slow_times[1]
         common["parameters"] += (
             Parameter(
                 ORBITS, np.zeros(size), np.full(size, _ORBIT), "m", correlation_time=hours, spacing=free.found.spacing
@@ -200,23 +204,22 @@ class GnssPppCarrier(_Ppp):
         )
         if scene.settings.raw_gnss.robust == "automatic":  # a slip is no error that a variance can describe
             common["robust"] = "cauchy"
-        _, first, of = np.unique(rows.arc[used], return_index=True, return_inverse=True)
         sigma = rows.growth[used] * carrier_sigma(raw.cn0, rows.geometry.elevation[used], C / raw.frequency)
         return cls(
             offset=(rows.known - rows.carrier)[used],
             sigma=sigma[:, None],
-            ambiguities=names,
-            begin=raw.t[first][of],
+            slots=tuple(ambiguity_name(arcs.names[k]) for k in there),
+            slot=np.searchsorted(there, arcs.slot[used]),
+            begin=arcs.begin[used],
             **common,
         )
 
     def linearize(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> Linearized:
         residual, J = self._linearize_free_ranges(states, parameters, rows)
-        own = (self.which[rows][:, None] == np.arange(len(self.ambiguities))).astype(float)
-        residual = residual + np.sum(own * parameters[ORBITS], axis=1)
-        J[ORBITS] = own[:, None]
-        for k, name in enumerate(self.ambiguities):
-            if name in parameters:
-                residual = residual + own[:, k] * parameters[name][:, 0]
-                J[name] = own[:, None, k, None]
+        own, J[ORBITS] = select_columns(parameters[ORBITS], self.which[rows])
+        residual, slot = residual + own, self.slot[rows]
+        for k, name in enumerate(self.slots):
+            one = (slot == k).astype(float)
+            residual = residual + one * parameters[name][:, 0]
+            J[name] = one[:, None, None]
         return Linearized(residual[:, None], J, self.sigma[rows])

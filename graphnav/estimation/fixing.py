@@ -72,7 +72,7 @@ def float_arcs(problem: Problem) -> CarrierArcs:
     if rows is None:
         return CarrierArcs()
     none = np.zeros(len(rows), dtype=bool)
-    return CarrierArcs.from_rows(problem.t[rows.keyframe], rows.which, rows.begin, none, slot_names(rows.ambiguities))
+    return CarrierArcs.from_rows(problem.t[rows.keyframe], rows.slot, rows.begin, none, slot_names(rows.slots))
 
 
 def fix(

@@ -63,7 +63,7 @@ def find_arcs(
     key = raw.satellite.astype(np.int64) * 1000 + raw.signal
     slots, slot = np.unique(key, return_inverse=True)
     if len(raw.arc_begin):
-        return _take_known_arcs(raw, slots, slot)
+        return arcs_by_begin(raw.arc_begin, slot, *_name_slots(slots))  # of a piece of a series
     epochs, epoch = raw.epochs
     typical = period or (float(np.median(np.diff(epochs))) if len(epochs) > 1 else np.inf)
     there = np.isfinite(raw.carrier) & np.isfinite(raw.p[:, 0]) & np.isfinite(raw.clock)
@@ -91,14 +91,14 @@ def find_arcs(
     return Arcs(slot, arc, *_name_slots(slots), tuple(raw.t[k] for k in firsts), int(slipped.sum()))
 
 
-def _take_known_arcs(raw: RawGnss, slots: NDArray[np.int64], slot: NDArray[np.intp]) -> Arcs:
-    """The arcs of a piece of a series, which were found as its epochs came."""
-    arc, begins = np.full(len(raw), -1), []
-    for k in range(len(slots)):
-        own = np.flatnonzero((slot == k) & np.isfinite(raw.arc_begin))
-        t, arc[own] = np.unique(raw.arc_begin[own], return_inverse=True)
+def arcs_by_begin(begin: Array, slot: NDArray[np.intp], names: tuple[str, ...], satellite: Ids, signal: Ids) -> Arcs:
+    """The arcs of rows (N,) of which is known when their arc begins (s; NaN where there is no carrier)."""
+    arc, begins = np.full(len(begin), -1), []
+    for k in range(len(names)):
+        own = np.flatnonzero((slot == k) & np.isfinite(begin))
+        t, arc[own] = np.unique(begin[own], return_inverse=True)
         begins.append(t)
-    return Arcs(slot, arc, *_name_slots(slots), tuple(begins), 0)
+    return Arcs(slot, arc, names, satellite, signal, tuple(begins), 0)
 
 
 def _name_slots(slots: NDArray[np.int64]) -> tuple[tuple[str, ...], Ids, Ids]:

@@ -18,11 +18,11 @@ from graphnav.core import earth
 from graphnav.core.rotation import Array
 from graphnav.core.timescales import gps_to_utc
 from graphnav.gnss.antex import ionosphere_free_offset, satellite_axes, shapiro_delay, wind_up
-from graphnav.gnss.arcs import Arcs, find_arcs
+from graphnav.gnss.arcs import Arcs, arcs_by_begin, find_arcs
 from graphnav.gnss.atmosphere import niell, zenith_delays
 from graphnav.gnss.carrier import rows_in
 from graphnav.gnss.series import RawGnss
-from graphnav.gnss.signals import GALILEO, GPS, QZSS, C
+from graphnav.gnss.signals import GALILEO, GPS, QZSS, C, signal_name
 from graphnav.gnss.single_point import Geometry, look
 from graphnav.gnss.tides import solid_tide, sun_and_moon
 
@@ -42,7 +42,7 @@ class IonosphereFree:
     carrier: Array  # (N,) m, with the satellite's clock; NaN where one of the two carriers is missing
     wet: Array  # (N,) how the wet delay grows from the zenith
     growth: Array  # (N,) of white noise that is alike on both signals
-    arc: NDArray[np.intp]  # (N,) number of the arc, over all satellites; -1 without a carrier
+    arcs: Arcs  # of N rows, in which neither carrier has slipped; a slot is a pair of signals of a satellite
 
 
 def ionosphere_free(raw: RawGnss, whole: RawGnss) -> IonosphereFree | None:
@@ -53,7 +53,7 @@ def ionosphere_free(raw: RawGnss, whole: RawGnss) -> IonosphereFree | None:
     raw : a row for each satellite and epoch, of its first signal.
     whole : all that the receiver has, with the second ones.
     """
-    second = _find_second(raw, whole)
+    second = _rows_of_second(raw, whole)
     which = np.flatnonzero(second >= 0)
     if not len(which):
         return None
@@ -70,13 +70,12 @@ def ionosphere_free(raw: RawGnss, whole: RawGnss) -> IonosphereFree | None:
     gps = one.t + one.zero
     sun, moon = sun_and_moon(gps)
     place = earth.ecef_to_llh(one.antenna)
-    enu = earth.enu_axes(place)
-    axes = satellite_axes(geometry.s, sun)
+    wound = one.wound if len(one.wound) else wind_up_of(one)
     extra = shapiro_delay(geometry.s, one.antenna) - np.sum(geometry.e * solid_tide(one.antenna, sun, moon), axis=1)
     if raw.antennas:
         bands = np.stack([one.signal // 100, other.signal // 100], -1)
         offset = ionosphere_free_offset(raw.antennas, one.satellite, f1, f2, bands, gps)
-        told = np.einsum("ni,nij,nj->n", offset, axes, geometry.e)
+        told = np.einsum("ni,nij,nj->n", offset, satellite_axes(geometry.s, sun), geometry.e)
         extra = extra + np.nan_to_num(told)
     utc = gps_to_utc(gps)
     day = (utc - utc.astype("datetime64[Y]")) / np.timedelta64(1, "D")
@@ -85,7 +84,7 @@ def ionosphere_free(raw: RawGnss, whole: RawGnss) -> IonosphereFree | None:
         dry, wet = np.zeros(len(one)), np.zeros(len(one))
     by_dry, by_wet = niell(place, geometry.elevation, day)
     carrier = free(one.carrier * C / f1, other.carrier * C / f2) + one.clock
-    carrier -= wind_up(one.satellite, one.t, axes, geometry.e, enu) * C / (f1 + f2)
+    carrier -= wound * C / (f1 + f2)
     good = (arcs.arc[first_rows] >= 0) & (arcs.arc[second[which]] >= 0) & ~one.half & ~other.half
     return IonosphereFree(
         which=which,
@@ -95,25 +94,37 @@ def ionosphere_free(raw: RawGnss, whole: RawGnss) -> IonosphereFree | None:
         carrier=np.where(good, carrier, np.nan),
         wet=by_wet,
         growth=np.hypot(alpha, beta),
-        arc=_number_joint_arcs(arcs, first_rows, second[which], good),
+        arcs=_join_arcs(arcs, first_rows, second[which], good),
     )
 
 
-def _find_second(raw: RawGnss, whole: RawGnss) -> NDArray[np.intp]:
-    """(N,) the row of `whole` with the second signal of each row; -1 where there is none.
+def second_signals(raw: RawGnss) -> dict[int, int]:
+    """The second signal of each satellite that has one: of several of a band that with most carriers."""
+    if raw.catalogue is not None:
+        return dict(raw.catalogue.second)
+    useful, out = np.isfinite(raw.carrier) & np.isfinite(raw.code) & np.isfinite(raw.clock), {}
+    for one in np.unique(raw.satellite[useful]).tolist():
+        own = useful & (raw.satellite == one) & (raw.signal // 100 == SECOND.get(one // 100, -1))
+        if own.any():
+            signals, many = np.unique(raw.signal[own], return_counts=True)
+            out[one] = int(signals[np.argmax(many)])
+    return out
 
-    Of several signals of a band that of which there are most carriers, for each satellite one throughout.
-    """
+
+def wind_up_of(raw: RawGnss) -> Array:
+    """(N,) cycles by which the carriers of a series are wound up, continuous for each satellite."""
+    geometry = look(raw, raw.antenna, None)
+    axes = satellite_axes(geometry.s, sun_and_moon(raw.t + raw.zero)[0])
+    return wind_up(raw.satellite, raw.t, axes, geometry.e, earth.enu_axes(earth.ecef_to_llh(raw.antenna)))
+
+
+def _rows_of_second(raw: RawGnss, whole: RawGnss) -> NDArray[np.intp]:
+    """(N,) the row of `whole` with the second signal of each row; -1 where there is none."""
     out = np.full(len(raw), -1, dtype=np.intp)
     epochs = np.unique(whole.t)
     useful = np.isfinite(whole.carrier) & np.isfinite(whole.code) & np.isfinite(whole.clock)
-    for one in np.unique(raw.satellite):
-        band = SECOND.get(int(one) // 100)
-        own = np.flatnonzero((whole.satellite == one) & useful & (whole.signal // 100 == (band or -1)))
-        if not len(own):
-            continue
-        signals, many = np.unique(whole.signal[own], return_counts=True)
-        own = own[whole.signal[own] == signals[np.argmax(many)]]
+    for one, signal in second_signals(whole).items():
+        own = np.flatnonzero((whole.satellite == one) & useful & (whole.signal == signal))
         at = np.full(len(epochs), -1, dtype=np.intp)
         at[np.searchsorted(epochs, whole.t[own])] = own
         rows = np.flatnonzero((raw.satellite == one) & (raw.signal // 100 == 1))
@@ -121,10 +132,9 @@ def _find_second(raw: RawGnss, whole: RawGnss) -> NDArray[np.intp]:
     return out
 
 
-def _number_joint_arcs(
-    arcs: Arcs, first: NDArray[np.intp], second: NDArray[np.intp], good: NDArray[np.bool_]
-) -> NDArray[np.intp]:
-    """(N,) numbers of arcs in which neither signal has slipped."""
-    pairs = np.stack([arcs.slot[first], arcs.arc[first], arcs.slot[second], arcs.arc[second]], -1)
-    number = np.unique(pairs, axis=0, return_inverse=True)[1].reshape(-1)
-    return np.where(good, number, -1)
+def _join_arcs(arcs: Arcs, first: NDArray[np.intp], second: NDArray[np.intp], good: NDArray[np.bool_]) -> Arcs:
+    """The arcs of pairs of rows: each begins where the younger of its two does."""
+    pairs, slot = np.unique(np.stack([arcs.slot[first], arcs.slot[second]], -1), axis=0, return_inverse=True)
+    names = tuple(f"{arcs.names[a]}+{signal_name(arcs.signal[b])}" for a, b in pairs.tolist())
+    begin = np.where(good, np.maximum(arcs.begin[first], arcs.begin[second]), np.nan)
+    return arcs_by_begin(begin, slot.reshape(-1), names, arcs.satellite[pairs[:, 0]], arcs.signal[pairs[:, 0]])

@@ -140,6 +140,7 @@ class Catalogue:
     groups: tuple[tuple[int, int], ...]  # systems with their signals, the reference first
     differenced: bool  # against a base station
     period: float  # s between epochs
+    second: tuple[tuple[int, int], ...] = ()  # satellites with their second signals (`graphnav.gnss.ppp`)
 
 
 @dataclass(frozen=True)
@@ -171,6 +172,7 @@ class RawGnss:
     base_arc: NDArray[np.intp] = field(default_factory=lambda: np.empty(0, dtype=int))
     baseline: float = 0.0  # m, to the base station
     arc_begin: Array = field(default_factory=lambda: np.empty(0))  # (N,) s, of the carrier's arc, where it is known
+    wound: Array = field(default_factory=lambda: np.empty(0))  # (N,) cycles of wind-up, where they are known
     # (N,) of the epoch among all that are used, of a piece of a series; -1 for one that came late
     number: NDArray[np.intp] = field(default_factory=lambda: np.empty(0, dtype=int))
     antenna: Array = field(default_factory=lambda: np.empty((0, 3)))  # (N, 3) m in e, single-point, of each epoch

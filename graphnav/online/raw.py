@@ -10,9 +10,9 @@ import numpy as np
 from graphnav.config import Settings
 from graphnav.config.raw_gnss import RawGnssSettings
 from graphnav.constraints.raw_selection import EARLY, select_usable
-from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.gnss.arcs import find_arcs
+from graphnav.gnss.ppp import wind_up_of
 from graphnav.gnss.series import RawGnss, primary
 from graphnav.gnss.single_point import choose_coefficients, look, solve
 from graphnav.online.raw_lines import WIDTH, series_of, take_sane
@@ -35,9 +35,10 @@ class RawEpochs:
     _t: list[float] = field(default_factory=list)  # s, of the epochs that are used
     _every: list[float] = field(default_factory=list)  # s
     _rows: dict[float, Array] = field(default_factory=dict)  # (n, WIDTH), by time
-    _arcs: dict[float, Array] = field(default_factory=dict)  # (n,) s, begins of the arcs of their carriers
+    # (n, 2), of their carriers: s, begins of the arcs, and cycles of wind-up
+    _arcs: dict[float, Array] = field(default_factory=dict)
     _number: dict[float, int] = field(default_factory=dict)  # of those that are used; -1 of one that came late
-    _last: dict[tuple[float, float], tuple[float, Array, float]] = field(
+    _last: dict[tuple[float, float], tuple[float, Array, Array]] = field(
         default_factory=dict
     )  # with a carrier, by slot
 
@@ -122,7 +123,9 @@ class RawEpochs:
         if not t:
             return series
         number = np.repeat([self._number[x] for x in t], [len(one) for one in rows])
-        return replace(series, arc_begin=np.concatenate([self._arcs[x] for x in t]), number=number)
+        arcs = np.concatenate([self._arcs[x] for x in t])
+        wound = arcs[:, 1] if self.settings.ppp else np.empty(0)
+        return replace(series, arc_begin=arcs[:, 0], wound=wound, number=number)
 
     def _with_place(self, t: float, rows: Array) -> Array:
         """Rows with a rough place of the antenna and its clock, where they have none: of this epoch, or the last."""
@@ -143,47 +146,40 @@ class RawEpochs:
         return rows
 
     def _find_arcs(self, t: float) -> Array:
-        """(n,) s, when the arcs of an epoch's carriers begin; NaN where there is no carrier."""
+        """(n, 2) of an epoch's carriers: s, begins of their arcs, NaN where there is none; and cycles of wind-up."""
         assert self.setup.catalogue is not None
         rows, last = self._rows[t], list(self._last.values())
-        if not (self.settings.carrier or self.settings.differences):
-            return np.full(len(rows), np.nan)
+        s = self.settings
+        if not (s.carrier or s.differences or s.ppp):
+            return np.full((len(rows), 2), np.nan)
         series = series_of([*(x for x, _, _ in last), t], [*(row[None] for _, row, _ in last), rows], self.setup)
         order = np.argsort(series.t, kind="stable")
-        series, based = series.take(order), self.setup.catalogue.differenced and self.settings.carrier
+        series, based = series.take(order), self.setup.catalogue.differenced and s.carrier and not s.ppp
         if not based:
             series = replace(series, carrier_difference=np.empty(0))
         period = self.setup.catalogue.period
         found = find_arcs(series, base_arc=series.base_arc if based else None, period=period)
-        begin = np.empty(len(order))
-        begin[order] = found.begin
-        out = begin[len(last) :]
-        before = {(row[0], row[1]): (x, arc) for x, row, arc in last}
+        here = np.empty((len(order), 2))
+        here[order, 0], here[order, 1] = found.begin, wind_up_of(series) if s.ppp else 0.0
+        out = here[len(last) :]
+        before = {(row[0], row[1]): (x, arc, now) for (x, row, arc), now in zip(last, here, strict=False)}
         for i, row in enumerate(rows):
-            x, arc = before.get((row[0], row[1]), (np.nan, np.nan))
-            if out[i] == x:  # it goes on
-                out[i] = arc
+            x, arc, now = before.get((row[0], row[1]), (np.nan, out[i], out[i]))
+            if out[i, 0] == x:  # it goes on
+                out[i, 0] = arc[0]
+            out[i, 1] += arc[1] - now[1]
         return out
 
     def _remember(self, t: float) -> None:
-        for row, arc in zip(self._rows[t], self._arcs[t].tolist(), strict=True):
-            if np.isfinite(arc):
+        for row, arc in zip(self._rows[t], self._arcs[t], strict=True):
+            if np.isfinite(arc[0]):
                 self._last[row[0], row[1]] = t, row, arc
-
-
-def settings_online(settings: Settings, setup: Recording) -> tuple[Settings, tuple[Note, ...]]:
-    """The settings as far as raw observations are used online, and what is to be said of that."""
-    s = settings.raw_gnss
-    if not setup.tight(s.coupling):
-        return settings, ()
-    less = {"ppp": False, "code": s.code or s.ppp}
-    note = Note("online.raw", "precise point positioning is not done online: codes are used, and changes of carriers")
-    return settings.model_copy(update={RAW: s.model_copy(update=less)}), (note,) if s.ppp else ()
 
 
 def codes_alone(settings: Settings) -> Settings:
     """The settings without carriers: a start needs nothing of them."""
-    less = settings.raw_gnss.model_copy(update={"differences": False, "carrier": False})
+    s = settings.raw_gnss
+    less = s.model_copy(update={"differences": False, "carrier": False, "ppp": False, "code": s.code or s.ppp})
     return settings.model_copy(update={RAW: less})
 
 

@@ -27,6 +27,8 @@ from graphnav.constraints.gnss import period
 from graphnav.core.errors import RecordingError
 from graphnav.core.files import parse_number
 from graphnav.core.rotation import Array
+from graphnav.gnss.antex import Antennas, SatelliteAntenna
+from graphnav.gnss.ppp import second_signals
 from graphnav.gnss.series import Catalogue, RawGnss, primary
 from graphnav.gnss.signals import SYSTEMS, satellite_id, satellite_name, signal_id, signal_name
 from graphnav.gnss.single_point import signal_groups
@@ -53,7 +55,8 @@ def without_epochs(raw: RawGnss) -> RawGnss:
     placed = raw.take(np.isfinite(raw.p[:, 0]))
     satellites, _ = placed.satellites
     groups, _ = signal_groups(placed.take(primary(placed)))
-    catalogue = Catalogue(tuple(satellites.tolist()), groups, raw.differenced, period(raw.epochs[0]))
+    second = tuple(second_signals(placed).items())
+    catalogue = Catalogue(tuple(satellites.tolist()), groups, raw.differenced, period(raw.epochs[0]), second)
     return replace(_make_empty(_fill_columns(raw)), catalogue=catalogue)
 
 
@@ -179,6 +182,8 @@ class LiveRaw(BaseModel):
     klobuchar: tuple[tuple[float, float, float, float], tuple[float, float, float, float]] | None = None
     troposphere: bool = False  # taken off the codes already
     precise: bool = False  # placed by precise orbits and clocks
+    second: dict[str, str] = {}  # of precise point positioning: the second signal of each satellite
+    antennas: dict[str, dict[int, Vector]] = {}  # m, in the satellite's axes, of its antenna, by band
 
     def setup(self) -> RawGnss:
         """A series without rows.
@@ -191,10 +196,16 @@ class LiveRaw(BaseModel):
         try:
             satellites = tuple(sorted({satellite_id(name) for name in self.satellites}))
             groups = tuple((SYSTEMS.index(system), signal_id(signal)) for system, signal in self.signals)
+            second = tuple((satellite_id(name), signal_id(signal)) for name, signal in self.second.items())
+            offsets = {satellite_id(name): one for name, one in self.antennas.items()}
         except (ValueError, IndexError):
             raise RecordingError(
                 'line 1: setup: raw_gnss: satellites are named as G05, signals as ["G", "1C"]', key="online.raw_names"
             ) from None
+        antennas: Antennas = {}
+        for satellite, one in offsets.items():
+            by_band = {band: np.array(x) for band, x in one.items()}
+            antennas[satellite] = (SatelliteAntenna(-np.inf, np.inf, by_band),)
         none, rows, ids = np.empty(0), np.empty((0, 3)), np.empty(0, dtype=np.int16)
         flags = np.empty(0, dtype=bool)
         return RawGnss(
@@ -203,7 +214,7 @@ class LiveRaw(BaseModel):
             place=self.place, klobuchar=self.klobuchar, troposphere=self.troposphere, lock=none,
             carrier_difference=none, base_arc=np.empty(0, dtype=np.intp), baseline=self.baseline, antenna=rows,
             receiver_clock=np.empty((0, 2)), lever_arm=np.array(self.lever_arm), precise=self.precise,
-            catalogue=Catalogue(satellites, groups, self.base, self.period),
+            antennas=antennas, catalogue=Catalogue(satellites, groups, self.base, self.period, second),
         )  # fmt: skip
 
 
@@ -212,10 +223,17 @@ def live_raw(raw: RawGnss) -> dict[str, object]:
     setup = raw if raw.catalogue is not None else without_epochs(raw)
     known = setup.catalogue
     assert known is not None
+    antennas = {
+        satellite_name(s): {band: x.tolist() for band, x in one.offset.items()}
+        for s in known.satellites
+        for one in setup.antennas.get(s, ())
+        if one.begin <= setup.zero <= one.end
+    }
     return {
         "lever_arm": setup.lever_arm.tolist(), "place": list(setup.place), "zero": setup.zero,
         "satellites": [satellite_name(s) for s in known.satellites],
         "signals": [(SYSTEMS[system], signal_name(signal)) for system, signal in known.groups],
         "period": known.period, "base": known.differenced, "baseline": setup.baseline, "klobuchar": setup.klobuchar,
         "troposphere": setup.troposphere, "precise": setup.precise,
+        "second": {satellite_name(s): signal_name(g) for s, g in known.second}, "antennas": antennas,
     }  # fmt: skip

@@ -12,6 +12,7 @@ import numpy as np
 
 from graphnav.config import Settings
 from graphnav.constraints.base import SAME_TIME
+from graphnav.constraints.raw_ppp import require_precise
 from graphnav.core.earth import LocalFrame
 from graphnav.core.errors import EstimationError
 from graphnav.core.notes import Note
@@ -26,7 +27,6 @@ from graphnav.online.ahead import Live, export
 from graphnav.online.checks import check_rows
 from graphnav.online.judging import CatchUp, Judgement, are_enough, judge
 from graphnav.online.looks import CONTEXT, SURE
-from graphnav.online.raw import settings_online
 from graphnav.online.sanity import find_period
 from graphnav.online.sensors import Row, Sensors
 from graphnav.online.start import find_start, list_keyframes, make_tracker, take_rows
@@ -57,11 +57,14 @@ class Smoother:
 
     def __init__(self, setup: Recording, settings: Settings | None = None) -> None:
         self._setup = setup
-        self.settings, said = settings_online(settings or Settings(), setup)
+        self.settings = settings or Settings()
+        raw, s = setup.raw_gnss, self.settings.raw_gnss
+        if s.ppp and raw is not None and setup.tight(s.coupling):
+            require_precise(setup.name, raw)
         self.sensors = Sensors(setup, self.settings.keyframes.bridge, self.settings.raw_gnss)
         self.frame: LocalFrame | None = None
         self.tracker: Tracker | None = None
-        self.notes: list[str] = [*said]
+        self.notes: list[str] = []
         self.late: Counter[str] = Counter()  # rows that came after the keyframe they belong before, and were used
         self._judgement: Judgement | None = None  # being made
         self._again: CatchUp | None = None  # going through what has not settled with it

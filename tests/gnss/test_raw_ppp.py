@@ -146,7 +146,7 @@ def test_the_combination_has_no_ionosphere_and_counts_arcs_of_both():
     slipped = replace(raw, slip=slip)
     arcs = ionosphere_free(slipped.take(primary(slipped)), slipped)
     own = rows.satellite == rows.satellite[0]
-    assert len(np.unique(arcs.arc[own])) == len(np.unique(free.arc[own])) + 1
+    assert len(np.unique(arcs.arcs.arc[own])) == len(np.unique(free.arcs.arc[own])) + 1
 
 
 def test_ppp_says_what_it_lacks():

@@ -18,6 +18,7 @@ from graphnav.constraints.gnss import GnssPosition
 from graphnav.constraints.raw_gnss import BIASES, CLOCK, GnssCode, GnssDoppler
 from graphnav.core.earth import LocalFrame
 from graphnav.estimation.pipeline import run
+from graphnav.gnss.signals import C
 from graphnav.imu.preintegration import preintegrate
 from graphnav.imu.samples import bridge_gaps
 from graphnav.recording.formats import read
@@ -62,33 +63,51 @@ def test_rows_are_the_measurement_of_the_truth(exact, cls, limit):
 
 
 def test_code_rows_are_gtsams_pseudorange_factor_with_a_lever_arm(exact):
-    """Its error and Jacobian: distance by the Earth's turn in the flight, clocks, antenna off the body."""
-    recording, truth = exact
-    where = scene(recording)
-    rows = GnssCode.build(where)
-    raw, frame = recording.raw_gnss, where.frame
-    states = truth_states(truth, where.t[rows.keyframe], frame)
-    pick = np.arange(3, len(rows), 97)
-    R_en = frame.R_ne.T
-    for k in pick:
-        own = np.flatnonzero((np.abs(raw.t - where.t[rows.keyframe[k]]) < 1e-6) & (raw.satellite == rows.satellite[k]))[
-            0
-        ]
-        linear = rows.linearize(
-            states[np.array([k])],
-            {p.name: np.zeros((1, p.size)) for p in rows.parameters if p.name != CLOCK} | {CLOCK: np.zeros((1, 2))},
-            np.array([k]),
-        )
-        pose = gtsam.Pose3(gtsam.Rot3(R_en @ states.R_nb[k]), frame.r_e + R_en @ states.p[k])
-        model = gtsam.noiseModel.Isotropic.Sigma(1, 1.0)
+    """Distance by the Earth's turn in the flight, clocks, antenna off the body."""
+    for rows, k, own, raw, _, pose, _, residual in picked(exact, GnssCode):
         # the ionosphere is no part of GTSAM's: taken off the code; its clocks are in seconds
-        delay = rows.slant[k] * 5e-9 * 299792458.0
-        factor = gtsam.PseudorangeFactorArm(0, 1, float(raw.code[own]) - delay, raw.p[own], rows.lever_arm, 0.0, model)
+        delay = rows.slant[k] * 5e-9 * C
+        factor = gtsam.PseudorangeFactorArm(
+            0, 1, float(raw.code[own]) - delay, raw.p[own], rows.lever_arm, 0.0, gtsam.noiseModel.Unit.Create(1)
+        )
         values = gtsam.Values()
         values.insert(0, pose)
         values.insert(1, 0.0)
-        error = factor.unwhitenedError(values)[0]
-        assert error == pytest.approx(linear.residual[0, 0], abs=1e-3)
+        assert factor.unwhitenedError(values)[0] == pytest.approx(residual, abs=1e-3)
+
+
+def test_doppler_rows_are_gtsams_doppler_factor_with_a_lever_arm(exact):
+    """But for what time is stretched by on the way, 1e-5 of the range rate, which GTSAM leaves out."""
+    for rows, k, own, raw, state, pose, R_en, residual in picked(exact, GnssDoppler):
+        length = C / raw.frequency[own]
+        turning = rows.gyro[k] - state.bg[0] - state.R_nb[0].T @ rows.omega_n
+        factor = gtsam.DopplerFactorArm(
+            0, 1, 2, 3, -raw.range_rate[own] / length, length, raw.p[own], raw.v[own], pose.translation(),
+            rows.lever_arm, turning, 1.0, 0.0, gtsam.noiseModel.Unit.Create(1),
+        )  # fmt: skip
+        values = gtsam.Values()
+        values.insert(0, pose)
+        values.insert(1, R_en @ state.v[0])
+        values.insert(2, 0.0)
+        values.insert(3, 0.0)
+        limit = 2e-5 * abs(raw.range_rate[own]) + 5e-5
+        assert factor.unwhitenedError(values)[0] == pytest.approx(residual, abs=limit)
+
+
+def picked(exact, cls):
+    """Some of the rows, where they are in the series, states and poses of the truth, and residuals without clocks."""
+    recording, truth = exact
+    where = scene(recording, cls=cls)
+    rows, raw, frame = cls.build(where), recording.raw_gnss, where.frame
+    states = truth_states(truth, where.t[rows.keyframe], frame)
+    R_en = frame.R_ne.T
+    none = {p.name: np.zeros((1, p.size)) for p in rows.parameters}
+    for k in np.arange(3, len(rows), 97):
+        here = (np.abs(raw.t - where.t[rows.keyframe[k]]) < 1e-6) & (raw.satellite == rows.satellite[k])
+        state = states[np.array([k])]
+        pose = gtsam.Pose3(gtsam.Rot3(R_en @ state.R_nb[0]), frame.r_e + R_en @ state.p[0])
+        residual = rows.linearize(state, none, np.array([k])).residual[0, 0]
+        yield rows, k, np.flatnonzero(here)[0], raw, state, pose, R_en, residual
 
 
 PATH = oracle.vehicle_path(120.0, 50.0)

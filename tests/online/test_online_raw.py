@@ -11,34 +11,45 @@ import numpy as np
 import oracle
 import pytest
 import raw_drive
+from helpers import refused
 from test_raw_rtk import with_carriers
 
 from graphnav.config import Settings, settings_from
 from graphnav.constraints.raw_phase import WholeCycles
+from graphnav.core.errors import RecordingError
 from graphnav.core.interpolation import interpolate
 from graphnav.core.notes import key_of
 from graphnav.core.trajectory import Trajectory
 from graphnav.estimation import fixing
 from graphnav.estimation.pipeline import run
 from graphnav.evaluation.evaluate import truth_of
+from graphnav.gnss.antex import SatelliteAntenna
 from graphnav.gnss.arcs import find_arcs
 from graphnav.gnss.carrier import consecutive
 from graphnav.gnss.integers import find_nearest
+from graphnav.gnss.series import RawGnss
+from graphnav.gnss.signals import satellite_id
 from graphnav.online import Online, Row, rows_of, without_rows
+from graphnav.online import raw as online_raw
 from graphnav.online.lines import head_of, line_of, row_of, setup_of
 from graphnav.online.raw import RawEpochs
 from graphnav.online.raw_lines import epochs_of, without_epochs
 from graphnav.recording import Recording
 
 CODES = {"differences": False, "carrier": False}
+PPP = {"ppp": True, "robust": "none"}
 LONG = {"noise": {"mode": "stated"}, "solver": {"lag": 1000.0}}
 
 
 @pytest.fixture(scope="module")
 def recording() -> Recording:
+    return observed_drive().crop(0.0, 100.0)
+
+
+def observed_drive(**more: object) -> Recording:
     path = oracle.vehicle_path(130.0, 50.0)
     made, _ = oracle.drive(path, seed=3, outages=[(60.0, 75.0)], gnss_velocity_sd=(0.1, 0.1, 0.1))
-    return raw_drive.with_observations(made, path, noise=1.0, seed=2, carrier=0.003).crop(0.0, 100.0)
+    return raw_drive.with_observations(made, path, noise=1.0, seed=2, carrier=0.003, **more)
 
 
 @pytest.fixture(scope="module")
@@ -115,10 +126,40 @@ def test_changes_of_carriers_pass_a_late_epoch_by(recording: Recording) -> None:
     assert pairs == {(a, b) for a, b in itertools.pairwise(t[t != late].tolist())}
 
 
-def test_precise_point_positioning_is_not_done_online(recording: Recording) -> None:
-    for ppp in (False, True):
-        online = Online(without_rows(recording), settings_from({"raw_gnss": {"ppp": ppp}}))
-        assert ("online.raw" in map(key_of, online.notes)) == ppp
+def test_precise_point_positioning_is_that_of_the_recording(two: Recording) -> None:
+    # a stop is found a little later as it drives, which sums of changes of carriers tell
+    still = {"zero_velocity": False, "zero_rate": False, "held_position": False}
+    how = settings_from(LONG | {"raw_gnss": PPP, "standstill": still})
+    setup = setup_of(head_of(two))
+    assert setup.raw_gnss is not None
+    assert setup.raw_gnss.antennas.keys() == two.raw_gnss.antennas.keys()
+    rows = [row_of(line_of(row)) if row[0] == "raw_gnss" else row for row in rows_of(two)[1]]
+    online, track = played(setup, rows, how)
+    assert online.tracker is not None
+    assert {"gnss_ppp_code", "gnss_ppp_carrier"} < online.tracker.in_force.keys()
+    whole = run(two, how, ("rts",))["rts"]
+    at = np.argmin(np.abs(whole.t - track.t[:, None]), axis=1)
+    same = np.abs(whole.t[at] - track.t) < 1e-6
+    assert same.sum() > 35
+    apart = whole.frame.from_llh(track.llh[same]) - whole.states.p[at[same]]
+    assert np.abs(apart / track.sd_p[same]).max() < 0.02
+    sigma = np.sqrt(np.diagonal(whole.covariance[at[same], 3:6, 3:6], axis1=1, axis2=2))
+    np.testing.assert_allclose(track.sd_p[same], sigma, rtol=0.01)
+
+
+@pytest.fixture(scope="module")
+def two() -> Recording:
+    """Two signals of each satellite, and antennas a metre off the satellites' centres of mass."""
+    made = observed_drive(second=True).crop(0.0, 45.0)
+    antenna = SatelliteAntenna(-np.inf, np.inf, {band: np.array([0.2, 0.0, 1.0 + 0.1 * band]) for band in (1, 2, 5)})
+    return replace(made, raw_gnss=replace(made.raw_gnss, antennas={satellite_id("G01"): (antenna,)}))
+
+
+def test_precise_point_positioning_says_what_it_lacks(recording: Recording, two: Recording) -> None:
+    settings, broadcast = settings_from({"raw_gnss": {"ppp": True}}), replace(two.raw_gnss, precise=False)
+    for one, key in ((recording, "raw.ppp_signals"), (replace(two, raw_gnss=broadcast), "raw.ppp_orbits")):
+        with refused(key, RecordingError):
+            Online(without_rows(one), settings)
 
 
 def test_it_goes_on_from_its_checkpoint(recording: Recording, rows: list[Row]) -> None:
@@ -177,6 +218,23 @@ def rtk() -> Recording:
         patch.setattr(raw_drive, "SATELLITES", raw_drive.MANY)
         made = raw_drive.with_observations(made, path, noise=0.3, seed=2).crop(0.0, 50.0)
         return with_carriers(made, path, 0.003)[0]
+
+
+def test_wind_up_goes_on_through_whole_cycles_however_epochs_come(
+    two: Recording, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def unwrapped(raw: RawGnss) -> np.ndarray:  # of a piece: its first value is within half a cycle
+        return np.unwrap(np.mod(0.3 * raw.t + 0.5, 1.0) - 0.5, period=1.0)
+
+    monkeypatch.setattr(online_raw, "wind_up_of", unwrapped)
+    raw = two.raw_gnss.take(two.raw_gnss.satellite == two.raw_gnss.satellite[0])
+    epochs = epochs_of(raw)
+    for order in (epochs, [*epochs[:3], *epochs[5:8], *epochs[3:5], *epochs[8:]]):
+        buffer = RawEpochs(without_epochs(raw), settings_from({"raw_gnss": {"ppp": True}}).raw_gnss)
+        for t, values in order:
+            buffer.add(t, values)
+        part = buffer.between(-np.inf, np.inf)
+        assert np.ptp(part.wound - 0.3 * part.t) < 1e-6
 
 
 def test_arcs_are_those_of_the_series_however_its_epochs_come(rtk: Recording) -> None:
