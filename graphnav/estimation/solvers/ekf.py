@@ -32,7 +32,7 @@ from typing import Any
 import numpy as np
 
 from graphnav.core.rotation import Array
-from graphnav.core.state import BLOCKS, DIM, States
+from graphnav.core.state import BLOCKS, DIM
 from graphnav.estimation.dense import dense
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import Solution

@@ -45,9 +45,7 @@ class StretchFilter:
     F : (K-1, 15, w), to be filled.
     """
 
-    def __init__(
-        self, problem: Problem, steps: Advance, stack: Stack, P_predicted: Array, P: Array, F: Array
-    ) -> None:
+    def __init__(self, problem: Problem, steps: Advance, stack: Stack, P_predicted: Array, P: Array, F: Array) -> None:
         self._problem, self._steps, self._stack = problem, steps, stack
         self._P_predicted, self._P, self._F = P_predicted, P, F
         self._length, blocks = 2 * _SHORTEST, stack.single
