@@ -57,6 +57,8 @@ __all__ = ["DEBUG", "PIPE_CLOSED", "app", "main", "run"]
 
 # Before NumPy is imported: see `graphnav.estimation.pipeline`, which limits threads for those who do not come this way.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+# Before the settings are: looking through all that is installed for plugins of Pydantic takes as long as they do.
+os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
 
 app = typer.Typer(
     name="graphnav",

@@ -25,12 +25,12 @@ from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, Self
 
 import numpy as np
-from scipy.ndimage import median_filter
 
 from graphnav.config import Settings
 from graphnav.constraints.base import SAME_TIME, BuildContext, Constraint, Linearized, UsualSigmas
 from graphnav.core import earth, rotation
 from graphnav.core.rotation import Array, mv
+from graphnav.core.running import run_median
 from graphnav.core.state import NODE_SPACING, SECONDS, Parameter, States
 from graphnav.recording import FIX_TYPES, Imu, Recording
 
@@ -337,7 +337,7 @@ def _compute_running_median(t: Array, sigma: Array) -> Array:
     A lasting error times a sigma that jumps from fix to fix would jump with it, and so give itself away.
     """
     size = 2 * int(np.clip(_MINUTE / period(t) / 2, 0, (len(t) - 1) // 2)) + 1
-    return median_filter(sigma, size=(size, 1), mode="nearest")
+    return run_median(sigma, size)
 
 
 def antenna_velocity(states: States, gyro: Array, omega_n: Array, lever: Array) -> tuple[Array, dict[str, Array]]:

@@ -24,12 +24,12 @@ from dataclasses import dataclass, field
 from typing import ClassVar
 
 import numpy as np
-from scipy.ndimage import maximum_filter1d
 
 from graphnav.config import Settings
 from graphnav.constraints.base import SAME_TIME, BuildContext, Constraint, Linearized
 from graphnav.core import rotation
 from graphnav.core.rotation import Array, mv
+from graphnav.core.running import run_maximum
 from graphnav.core.state import Parameter, States
 from graphnav.recording import Recording
 
@@ -108,7 +108,7 @@ def unrest(scene: BuildContext, rows: Array, stop: Array) -> tuple[Array, Array]
             here = stop == one
             x = means[rows[here]]
             change = np.abs(x - np.median(x, axis=0))
-            off[here] = maximum_filter1d(change, min(_NEIGHBOURS, len(x)), axis=0, mode="nearest")
+            off[here] = run_maximum(change, min(_NEIGHBOURS, len(x)))
         out.append(np.sqrt(np.maximum(off**2 - density**2 / T, 0.0)))
     return out[0], out[1]
 

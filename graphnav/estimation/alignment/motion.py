@@ -6,7 +6,6 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-from scipy.ndimage import median_filter
 
 from graphnav.config import Settings
 from graphnav.core import rotation
@@ -14,6 +13,7 @@ from graphnav.core.earth import LocalFrame
 from graphnav.core.errors import EstimationError
 from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
+from graphnav.core.running import run_median
 from graphnav.core.state import States
 from graphnav.detectors.base import NONE, mask_inside
 from graphnav.estimation.alignment.back import carry_back
@@ -48,7 +48,7 @@ def drop_implausible(recording: Recording) -> Recording:
     if gnss is None or len(gnss.t) < 5:
         return recording
     p = LocalFrame(gnss.llh[0]).from_llh(gnss.llh)[:, :2]
-    off = np.linalg.norm(p - median_filter(p, size=(5, 1), mode="nearest"), axis=1)
+    off = np.linalg.norm(p - run_median(p, 5), axis=1)
     usual = np.maximum(np.median(off), np.linalg.norm(gnss.sd[:, :2], axis=1))
     return replace(recording, gnss=pick_fixes(gnss, off <= _OUTLYING * usual))
 

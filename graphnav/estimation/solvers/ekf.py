@@ -32,7 +32,7 @@ from typing import Any
 import numpy as np
 
 from graphnav.core.rotation import Array
-from graphnav.core.state import BLOCKS, DIM, States
+from graphnav.core.state import BLOCKS, DIM
 from graphnav.estimation.dense import dense
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import Solution
@@ -57,6 +57,7 @@ from graphnav.estimation.solvers.points import AtEstimate, AtPoints, Estimate
 from graphnav.estimation.solvers.recursion import predict, update
 from graphnav.estimation.solvers.rts import backward
 from graphnav.estimation.solvers.stack import Innovations, RowBlock, Stack
+from graphnav.estimation.solvers.stretches import StretchFilter
 from graphnav.estimation.solvers.verdicts import Verdicts
 from graphnav.estimation.solvers.watch import Bank
 from graphnav.imu.dynamics import SCALE
@@ -149,6 +150,28 @@ def _smooth_about(
     return forward, smoothed, False
 
 
+class _Kept:
+    """Of K keyframes errors about given points, of the first n, and the estimates of those behind them."""
+
+    def __init__(self, n: int, K: int, D: int) -> None:
+        self.errors, self.own = np.empty((n, D)), Points.allocate(K, D - DIM)
+
+    def __setitem__(self, k: int, x: Any) -> None:
+        if k < len(self.errors):
+            self.errors[k] = x
+        else:
+            self.own.put(slice(k, k + 1), Points(x.state, x.values[None]))
+
+    def __getitem__(self, k: int) -> Any:
+        return self.errors[k] if k < len(self.errors) else _step(self.own, k)
+
+    def points(self, about: Points | None) -> Points:
+        """All as points."""
+        n = len(self.errors)
+        parts = [] if about is None else [move_points(about, self.errors)]
+        return join_passes([*parts, self.own.at(slice(n, None))] if n < len(self.own.values) else parts)
+
+
 def _forward(
     problem: Problem,
     K: int,
@@ -187,19 +210,25 @@ def _forward(
     )
     begin = partial(_begin, x, P, records)
     x, P = begin()
-    found: list[Any] = [None] * K  # estimates, or errors where points are given
-    ahead = found.copy()
+    found, ahead = _Kept(n, K, D), _Kept(n, K, D)
+    stretches = None
+    if tests is None and decide is None and not decided and all(c.passes == 1 for c in problem.constraints):
+        stretches = StretchFilter(problem, steps, stack, all_Pp, all_P, all_F)
     k = 0
     if given is not None and updates is not None and not decided and decide is None:
-        out = Errors.allocate(n, all_Pp, all_P)
+        out = Errors(ahead.errors, all_Pp, found.errors, all_P)
         compiled = PointFilter(given, steps, stack, updates, out, begin)
         k = compiled.run_all(progress) if tests is None else compiled.run_tested(tests, verdicts, problem.t, progress)
-        found[:k], ahead[:k] = out.filtered[:k], out.predicted[:k]
         x, P = (out.filtered[k - 1], all_P[k - 1]) if k else begin()
         if about is not None and k == n:
             x, P = _leave_points(about, own, all_P, k, x)
     while k < K:
         where: AtEstimate | AtPoints = given if given is not None and k < n else own
+        if stretches is not None and where is own and (on := stretches.run(k, x, P, ahead.own, found.own)) > k:
+            k, x, P = on, found[on - 1], all_P[on - 1]
+            if progress is not None:
+                progress("filter", k / K)
+            continue
         if tests is not None:
             tests.arrive(k)
         if k:
@@ -243,8 +272,7 @@ def _forward(
             x, P = _leave_points(about, own, all_P, k, x)
     log_likelihood = stack.finish()
     weights = {c.name: records[c.name].decided for c in fixes}
-    errors, errors_ahead = np.array(found[:n]).reshape(n, D), np.array(ahead[:n]).reshape(n, D)
-    filtered, predicted = _points(about, errors, found[n:]), _points(about, errors_ahead, ahead[n:])
+    filtered, predicted = found.points(about), ahead.points(about)
     return ForwardRecord(
         filtered.states,
         filtered.values,
@@ -257,8 +285,8 @@ def _forward(
         weights,
         bool(verdicts.anew),
         about,
-        errors,
-        errors_ahead,
+        found.errors,
+        ahead.errors,
         updates,
         log_likelihood,
     )
@@ -287,14 +315,6 @@ def _leave_points(about: Points, own: AtEstimate, all_P: Array, n: int, e: Array
     x = own.plus(at, e)
     all_P[n - 1] = own.carry(all_P[n - 1], at, x)
     return x, all_P[n - 1]
-
-
-def _points(about: Points | None, errors: Array, own: list[Estimate]) -> Points:
-    """Errors about given points, and the estimates that follow, as points."""
-    parts = [] if about is None else [move_points(about, errors)]
-    if own:
-        parts.append(Points(States.stack([one.state for one in own]), np.array([one.values for one in own])))
-    return join_passes(parts)
 
 
 def _update(

@@ -30,8 +30,8 @@ from graphnav.core.state import BLOCKS, States
 from graphnav.estimation.solvers.recursion import turn
 
 _THETA, _V = BLOCKS["theta"], BLOCKS["v"]
-_MOVING = _V.stop  # numbers of an error state that theta and dv are among
-_I9 = np.eye(_MOVING)
+MOVING = _V.stop  # numbers of an error state that theta and dv are among
+_I9 = np.eye(MOVING)
 
 
 def plus_invariant(states: States, e: Array) -> States:
@@ -56,12 +56,17 @@ def minus_invariant(states: States, other: States) -> Array:
 
 
 def transport_covariance(P: Array, states: States, moved: States) -> Array:
-    """Covariances (K, D, D) of errors about K states turned into those about the states they have moved to.
+    """Covariances (K, D, D) of errors about K states turned into those about the states they have moved to."""
+    return np.asarray(turn(P, compute_transport(states, moved)))
+
+
+def compute_transport(states: States, moved: States) -> Array:
+    """(K, 9, 9) what the first of errors about K states are about the states they have moved to.
 
     phi and nu stay: theta' = R_nb'^T R_nb theta, dv' = dv + (R_nb theta) x (v' - v).
     """
-    T = np.zeros((len(P), _MOVING, _MOVING))
+    T = np.zeros((len(states), MOVING, MOVING))
     T[:] = _I9
     T[:, _THETA, _THETA] = np.swapaxes(moved.R_nb, -1, -2) @ states.R_nb
     T[:, _V, _THETA] = rotation.skew(states.v - moved.v) @ states.R_nb
-    return np.asarray(turn(P, T))
+    return T

@@ -31,6 +31,21 @@ class Points:
     def first(self, n: int) -> Points:
         return Points(self.states[:n], self.values[:n])
 
+    def at(self, index: slice | Array) -> Points:
+        """Some of them."""
+        return Points(self.states[index], self.values[index])
+
+    def put(self, index: slice, points: Points) -> None:
+        """Some of them, replaced."""
+        for name in ("R_nb", "p", "v", "ba", "bg"):
+            getattr(self.states, name)[index] = getattr(points.states, name)
+        self.values[index] = points.values
+
+    @classmethod
+    def allocate(cls, n: int, width: int) -> Points:
+        """None yet, of so many parameters' values."""
+        return Points(States(np.empty((n, 3, 3)), *np.empty((4, n, 3))), np.empty((n, width)))
+
     def nodes(self, problem: Problem) -> dict[str, Array]:
         """(n, k) per parameter: the value of each node after the last keyframe that it governs."""
         return {

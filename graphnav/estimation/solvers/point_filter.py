@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Self
 
 import numpy as np
 
@@ -35,12 +34,6 @@ class Errors:
     P_predicted: Array
     filtered: Array
     P: Array
-
-    @classmethod
-    def allocate(cls, n: int, P_predicted: Array, P: Array) -> Self:
-        """None yet, of n keyframes; the covariances go to the first of the arrays given."""
-        D = P.shape[1]
-        return cls(np.empty((n, D)), P_predicted, np.empty((n, D)), P)
 
 
 class RememberedBank:

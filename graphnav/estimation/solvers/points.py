@@ -47,7 +47,7 @@ class AtEstimate:
     def step(self, k: int, x: Estimate) -> tuple[Estimate, Array, Array]:
         """The estimate at keyframe k from that at the one before, and F (15, w) and Q (15, 15) of the states."""
         at = slice(k - 1, k)
-        ahead, F = _transition(self._problem, at, x.state, x.values[None])
+        ahead, F = predict_states(self._problem, at, x.state, x.values[None])
         return (
             Estimate(ahead, self._steps.ahead(k - 1, x.values)),
             F[0],
@@ -99,7 +99,7 @@ class AtPoints:
         n, columns, self._steps = len(points.values), problem.columns, steps
         D = DIM + points.values.shape[1]
         begin, end, at = points.states[: n - 1], points.states[1:n], slice(0, n - 1)
-        ahead, F[: n - 1] = _transition(problem, at, begin, points.values[: n - 1])
+        ahead, F[: n - 1] = predict_states(problem, at, begin, points.values[: n - 1])
         self.F, self.Q = F[: n - 1], problem.motion.noise(at, begin.R_nb)
         values = steps.ahead(at, points.values[: n - 1])
         self.gap = np.concatenate([ahead.minus(end), values - points.values[1:]], axis=1)
@@ -161,7 +161,7 @@ class AtPoints:
         return float(self._speed[k])
 
 
-def _transition(problem: Problem, at: slice, states: States, values: Array) -> tuple[States, Array]:
+def predict_states(problem: Problem, at: slice, states: States, values: Array) -> tuple[States, Array]:
     """The states at the ends of intervals `at`, and F (n, 15, w) there, by the states and by the scale errors."""
     scale, motion = problem.columns.get(SCALE), problem.motion
     if scale is None:

@@ -44,11 +44,12 @@ def predict(P: Array, F: Array, decay: Array, Q: Array, added: Array, out: Array
     w = F.shape[1]
     top = np.dot(F, P[:w])
     np.add(np.dot(np.ascontiguousarray(top[:, :w]), F.T), Q, out[:DIM, :DIM])
-    np.multiply(top[:, DIM:], decay, out[:DIM, DIM:])
-    np.multiply(P[DIM:, DIM:] * decay, decay.reshape(-1, 1), out[DIM:, DIM:])
-    for i in range(len(added)):
-        out[DIM + i, DIM + i] += added[i]
+    for i in range(DIM):
+        np.multiply(top[i, DIM:], decay, out[i, DIM:])
     np.positive(out[:DIM, DIM:].T, out[DIM:, :DIM])
+    for i in range(len(decay)):
+        np.multiply(P[DIM + i, DIM:], decay[i] * decay, out[DIM + i, DIM:])
+        out[DIM + i, DIM + i] += added[i]
 
 
 @compiled
@@ -72,44 +73,55 @@ def turn(P: Array, T: Array) -> Array:
 
 
 @compiled
+def invert_root(L: Array) -> Array:
+    """L^-1 of a lower root (m, m)."""
+    out = np.zeros(L.shape)
+    for i in range(len(L)):
+        own = out[i]
+        own[i] = 1.0
+        for j in range(i):
+            own -= L[i, j] * out[j]
+        own /= L[i, i]
+    return out
+
+
+@compiled
 def solve(L: Array, X: Array) -> None:
     """X (m, n) <- S^-1 X for S = L L^T."""
-    m, U = len(L), np.ascontiguousarray(L.T)
-    for i in range(m):
-        own = X[i]
-        if i:
-            own -= np.dot(L[i, :i], X[:i])
-        own /= L[i, i]
-    for i in range(m - 1, -1, -1):
-        own = X[i]
-        if i < m - 1:
-            own -= np.dot(U[i, i + 1 :], X[i + 1 :])
-        own /= L[i, i]
+    inverse = invert_root(L)
+    np.dot(inverse.T, np.dot(inverse, X), X)
 
 
 @compiled
 def compute_gain(HP: Array, HPHt: Array, variance: Array, r: Array) -> tuple[Array, Array, Array]:
     """The lower root (m, m) of S = H P H^T + R, S^-1 r, and the gain transposed (m, D)."""
-    m, D = HP.shape
     S = HPHt.copy()
-    for i in range(m):
+    for i in range(len(S)):
         S[i, i] += variance[i]
     L = np.linalg.cholesky(S)
-    right = np.empty((m, D + 1))
-    np.positive(HP, right[:, :D])
-    np.positive(r, right[:, D])
-    solve(L, right)
-    return L, right[:, D].copy(), np.ascontiguousarray(right[:, :D])
+    inverse = invert_root(L)
+    return L, np.dot(inverse.T, np.dot(inverse, r)), np.dot(inverse.T, np.dot(inverse, HP))
+
+
+@compiled
+def halve_sum(A: Array, out: Array) -> None:
+    """(A + A^T) / 2, in `out`: what rounding has made of a symmetric matrix."""
+    np.add(A, A.T, out)
+    np.multiply(0.5, out, out)
 
 
 @compiled
 def update(P: Array, HP: Array, H: Array, Kt: Array, variance: Array) -> Array:
     """The covariance after an update, by Joseph's form: (I - KH) P first, then that (I - KH)^T + K R K^T."""
-    one = P - np.dot(Kt.T, HP)
-    left = np.dot(H, one.T) - variance.reshape(-1, 1) * Kt
-    two = one - np.dot(left.T, Kt)
+    one = np.dot(Kt.T, HP)
+    np.subtract(P, one, one)
+    left = np.dot(H, one.T)
+    left -= variance.reshape(-1, 1) * Kt
+    two = np.dot(left.T, Kt)
+    np.subtract(one, two, two)
     # rounding's asymmetry would grow, past what a stop leaves between its place and the state
-    return 0.5 * (two + two.T)
+    halve_sum(two, one)
+    return one
 
 
 @compiled
@@ -183,8 +195,9 @@ def filter_rows(
 def smooth_point(e: Array, P: Array, r: Array, N: Array, smoothed: Array, P_smoothed: Array) -> None:
     """Errors (D,) and covariance (D, D) of the smoother, from those of the filter and the disturbance behind them."""
     np.add(e, np.dot(P, r), smoothed)
-    one = P - np.dot(np.dot(P, N), P)
-    np.multiply(0.5, one + one.T, P_smoothed)
+    one = np.dot(np.dot(P, N), P)
+    np.subtract(P, one, one)
+    halve_sum(one, P_smoothed)
 
 
 @compiled
@@ -234,12 +247,14 @@ def smooth_rows(
                 lo, hi = begin[b], end[b]
                 own = H[k, lo:hi]
                 # I - K H as a whole: after a first fix it is what is left of a wide prior, of ten orders
-                M = I - np.dot(Kt[k, lo:hi].T, own)
+                M = np.dot(Kt[k, lo:hi].T, own)
+                np.subtract(I, M, M)
                 r_k = np.dot(r_k, M) + np.dot(w[k, lo:hi], own)
-                N_k = np.dot(M.T, np.dot(N_k, M)) + np.dot(own.T, SH[k, lo:hi])
-        N_k = 0.5 * (N_k + N_k.T)
+                N_k = np.dot(M.T, np.dot(N_k, M))
+                N_k += np.dot(own.T, SH[k, lo:hi])
         np.positive(r_k, r[k])
-        np.positive(N_k, N[k])
+        halve_sum(N_k, N[k])
+        N_k = N[k]
         if k == len(F):  # the last of all: its filtered covariance is of errors about the estimate already
             smooth_point(errors_predicted[k], P_predicted[k], r_k, N_k, smoothed[k], P_smoothed[k])
 

@@ -18,10 +18,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import median_filter
 
 from graphnav.core.findings import period_of, runs_of
 from graphnav.core.rotation import Array
+from graphnav.core.running import run_median
 from graphnav.recording import Imu, Odometer
 from graphnav.recording.odometer.mean import ReadingStatistics, gaps
 
@@ -107,7 +107,7 @@ def _compute_motion(odometer: Odometer, imu: Imu, known: float | None) -> _Inert
     def missing(lag: float) -> tuple[Array, Array]:
         gain = np.interp(seconds + 1.0 - lag, imu.t, gained) - np.interp(seconds - lag, imu.t, gained)
         off = change - gain
-        return off, median_filter(off, size=min(31, len(off) // 2 * 2 - 1), mode="nearest")
+        return off, run_median(off, min(31, len(off) // 2 * 2 - 1))
 
     def size(off: Array) -> float:
         return float(np.mean(np.minimum(np.abs(off), 1.0)))  # what is wrong has no more say than 1 m/s

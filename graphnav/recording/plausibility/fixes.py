@@ -7,11 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import median_filter, uniform_filter1d
 
 from graphnav.core.earth import LocalFrame
 from graphnav.core.findings import Finding, runs_of
 from graphnav.core.rotation import Array
+from graphnav.core.running import run_mean, run_median
 from graphnav.recording import Gnss, Recording, take_rows
 
 FASTEST = 150.0  # m/s; the fastest cars that can be bought reach 490 km/h, 136 m/s
@@ -229,7 +229,7 @@ def check_two_groups(gnss: Gnss, p: Array) -> Iterator[Finding]:
 
 def _find_jumps(p: Array, dt: Array) -> Array:
     """What steps between fixes at p (M, 2) m differ by from the usual pace around them, (M - 1, 2) m."""
-    rate = median_filter(np.diff(p, axis=0) / dt[:, None], size=(_MEAN_OF, 1), mode="nearest")
+    rate = run_median(np.diff(p, axis=0) / dt[:, None], _MEAN_OF)
     return np.asarray(np.diff(p, axis=0) - rate * dt[:, None])
 
 
@@ -253,13 +253,13 @@ def check_arrival_stamps(gnss: Gnss, p: Array) -> Iterator[Finding]:
     dt = np.diff(gnss.t)
     p = p[:, :2]
     # the mean steps: of fixes that arrive in bursts, the median says nothing
-    period = float(np.median(uniform_filter1d(dt, _MEAN_OF, mode="nearest")))
+    period = float(np.median(run_mean(dt, _MEAN_OF)))
     near = (dt < 3.5 * period) & np.isfinite(p[1:]).all(axis=1) & np.isfinite(p[:-1]).all(axis=1)
     step = np.diff(p, axis=0)
     step[~near] = 0.0
-    count = np.maximum(uniform_filter1d(near.astype(float), _MEAN_OF, mode="nearest"), 0.5 / _MEAN_OF)
-    pace = np.maximum(uniform_filter1d(np.where(near, dt, 0.0), _MEAN_OF, mode="nearest") / count, 1e-9)
-    typical = uniform_filter1d(step, _MEAN_OF, axis=0, mode="nearest") / count[:, None]
+    count = np.maximum(run_mean(near, _MEAN_OF), 0.5 / _MEAN_OF)
+    pace = np.maximum(run_mean(np.where(near, dt, 0.0), _MEAN_OF) / count, 1e-9)
+    typical = run_mean(step, _MEAN_OF) / count[:, None]
     typical_size = np.linalg.norm(typical, axis=1)
     moving = near & (typical_size > _LEAST_SPEED * pace)
     if moving.sum() < 2 * _MEAN_OF:

@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import median_filter
 
 from graphnav.core.findings import Finding, period_of, runs_of
+from graphnav.core.running import run_median
 from graphnav.recording import Odometer, Recording, take_rows
 from graphnav.recording.checks.crosschecks import MIN_PAIRS, Track
 from graphnav.recording.plausibility.fixes import FASTEST
@@ -121,7 +121,7 @@ def _find_other_scale(odometer: Odometer, track: Track | None, start: float) -> 
         return bad, None
     off = np.log(read[at] / track.speed[at])
     seconds = max(1, round(_LASTING / track.period))
-    typical = median_filter(off, size=min(seconds + 1 - seconds % 2, len(off)), mode="nearest")
+    typical = run_median(off, min(seconds + 1 - seconds % 2, len(off)))
     right = np.abs(typical) < np.log1p(_RADIUS)
     if right.sum() * track.period < _LASTING:
         return bad, None  # another unit, or another wheel, throughout

@@ -1,0 +1,39 @@
+"""Running medians, means and maxima of rows: a window of `size` about each, the first and last rows repeated beyond.
+
+SciPy's filters do the same, and are quicker in long windows; importing them takes as long as a short run.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+
+from graphnav.core.rotation import Array
+
+_MANY = 4_000_000  # numbers in all windows, for which SciPy is worth its import
+
+
+def run_median(x: Array, size: int) -> Array:
+    """Of rows x (K,) or (K, n); of an even `size` the upper of the two in the middle."""
+    if x.size * size > _MANY:
+        from scipy.ndimage import median_filter
+
+        return np.asarray(median_filter(x, size=(size, *(1,) * (x.ndim - 1)), mode="nearest"))
+    return np.asarray(np.partition(_windows(x, size), size // 2, axis=-1)[..., size // 2])
+
+
+def run_mean(x: Array, size: int) -> Array:
+    """Of rows x (K,) or (K, n)."""
+    return np.asarray(_windows(x, size).mean(axis=-1))
+
+
+def run_maximum(x: Array, size: int) -> Array:
+    """Of rows x (K,) or (K, n)."""
+    return np.asarray(_windows(x, size).max(axis=-1))
+
+
+def _windows(x: Array, size: int) -> Array:
+    """(K, ..., size) views of rows."""
+    before = size // 2
+    padded = np.pad(x, ((before, size - 1 - before), *((0, 0),) * (x.ndim - 1)), mode="edge")
+    return sliding_window_view(padded, size, axis=0)

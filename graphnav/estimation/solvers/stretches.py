@@ -1,0 +1,192 @@
+"""The filter at its own estimates, a stretch of keyframes at once.
+
+A filter that is linearised where it is must know where it is before it asks a constraint for its rows: one keyframe at
+a time, one kind of rows after the other. For few rows the asking costs far more than the arithmetic. So where the
+filter will be is guessed, by the IMU alone, for a stretch of keyframes: X_0 where a keyframe is predicted, and X_i
+behind the i-th kind of its rows. All rows and steps are linearised at the guess together, and filtered as rows at given
+points are, by errors y about X_0. An error about X_i is
+
+    e_i = T_i (y - m_i)      m_i = sum over j <= i of T_(j-1)^-1 (X_j [-] X_(j-1))
+
+with T_i what moving from X_0 to X_i makes of errors (`graphnav.estimation.solvers.invariant`), so that rows and steps
+linearised at X_i have r - H T_i m_i and H T_i. The guess moves by the e_i that are found, and so on until it stays. It
+stays where they are zero: there each row has been linearised where the filter was, and what is found is what a filter
+finds that goes step by step (Picard's iteration; Lelarasmee, Ruehli and Sangiovanni-Vincentelli 1982, "The waveform
+relaxation method for time-domain analysis of large scale integrated circuits"). What the first keyframes come to
+depends on nothing behind them: they are done once they stay, whatever those behind them do.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from graphnav.core.rotation import Array, mv
+from graphnav.core.state import DIM, States
+from graphnav.estimation.problem import Problem
+from graphnav.estimation.solvers.invariant import MOVING, compute_transport, minus_invariant
+from graphnav.estimation.solvers.linearise import Advance, Points, linearise, shift
+from graphnav.estimation.solvers.passes import join_passes, move_points
+from graphnav.estimation.solvers.points import Estimate, predict_states
+from graphnav.estimation.solvers.recursion import filter_rows, turn
+from graphnav.estimation.solvers.stack import Stack
+from graphnav.imu.dynamics import SCALE
+
+_SHORTEST, _LONGEST = 16, 256  # keyframes of a stretch
+_MOST = 10  # times that a stretch is linearised: each gains two digits or more
+_STAYS = 1e-9  # sigmas by which a guess may move when it stays
+
+
+class StretchFilter:
+    """Filter keyframes with rows about which nothing is to be decided, and that need one linearisation each.
+
+    Parameters
+    ----------
+    P_predicted, P : (K, D, D) and
+    F : (K-1, 15, w), to be filled.
+    """
+
+    def __init__(self, problem: Problem, steps: Advance, stack: Stack, P_predicted: Array, P: Array, F: Array) -> None:
+        self._problem, self._steps, self._stack = problem, steps, stack
+        self._P_predicted, self._P, self._F = P_predicted, P, F
+        self._length, blocks = 2 * _SHORTEST, stack.single
+        k = np.repeat(np.arange(stack.K), np.diff(blocks.first))
+        # points of all keyframes one behind the other: where it is predicted, and where each block leads
+        self._start = np.arange(stack.K) + blocks.first[:-1]
+        self._end = np.arange(stack.K) + blocks.first[1:]
+        self._before = np.arange(len(k)) + k  # of each block: behind it is the next
+        self._of_rows = {}
+        for name, (at_k, place) in stack.places.items():
+            block = np.searchsorted(k * (stack.M + 1) + blocks.begin, (at_k * (stack.M + 1) + place)[:, 0], "right") - 1
+            self._of_rows[name] = self._before[block]
+
+    def run(self, k: int, x: Estimate, P: Array, predicted: Points, filtered: Points) -> int:
+        """Filter a stretch from keyframe k on.
+
+        Parameters
+        ----------
+        x, P : at the keyframe before; predicted, where k is the first of all.
+        predicted, filtered : of all keyframes, to be filled.
+
+        Returns
+        -------
+        int
+            The keyframe to go on from: k where guessing leads nowhere.
+        """
+        k1 = min(k + self._length, self._stack.K)
+        points = self._guess(k, k1, x)
+        for _ in range(_MOST):
+            try:
+                stay, points = self._iterate(k, k1, x, P, points)
+            except np.linalg.LinAlgError:  # because the guess is far off, or else a single step will say so
+                break
+            if stay > k:
+                own = slice(k, stay)
+                predicted.put(own, points.at(self._start[own] - self._start[k]))
+                filtered.put(own, points.at(self._end[own] - self._start[k]))
+                last = int(self._end[stay - 1] - self._start[k])
+                x, P = Estimate(points.states[last : last + 1], points.values[last]), self._P[stay - 1]
+                k, points = stay, points.at(slice(last + 1, None))
+            if k == k1:
+                self._length = min(2 * self._length, _LONGEST)
+                return k
+        self._length = max(self._length // 2, _SHORTEST)
+        return k
+
+    def _guess(self, k: int, k1: int, x: Estimate) -> Points:
+        """Where the IMU alone leads."""
+        states, values, scale = x.state, x.values, self._problem.columns.get(SCALE)
+        reached, known = [], []
+        for j in range(k, k1):
+            if j:
+                at = slice(j - 1, j)
+                states = self._problem.motion.propagate(at, states, None if scale is None else values[shift(scale)])[0]
+                values = self._steps.ahead(j - 1, values)
+            reached.append(states)
+            known.append(values)
+        each = self._end[k:k1] - self._start[k:k1] + 1
+        return Points(States.stack(reached), np.array(known)).at(np.repeat(np.arange(k1 - k), each))
+
+    def _iterate(self, k: int, k1: int, x: Estimate, P: Array, points: Points) -> tuple[int, Points]:
+        """Filter keyframes k to k1 about points; the first keyframe that does not stay, and the points as found."""
+        stack, blocks, own = self._stack, self._stack.joint, slice(max(k - 1, 0), k1)
+        start, end = self._start[k:k1] - self._start[k], self._end[k:k1] - self._start[k]
+        counts = end - start + 1
+        of_first = np.repeat(start, counts)
+        T, m = _move_errors(points, of_first)
+        gap, Q, F = self._step(k, k1, x, points, start, end, T, m)
+        r, variance, H = self._linearise(own, k, points, T, m)
+        n, D = r.shape[0], H.shape[2]
+        predicted, errors, Kt, SH = np.empty((n, D)), np.empty((n, D)), np.zeros_like(H), np.empty_like(H)
+        steps = slice(own.start, k1 - 1)
+        filter_rows(
+            k - own.start, n, np.zeros(D), P, F, self._steps.decay[steps], gap, Q, self._steps.added[steps],
+            r, H, variance, blocks.first[own.start : k1 + 1], blocks.begin, blocks.end, blocks.used,
+            predicted, self._P_predicted[own], errors, self._P[own],
+            stack.root[own], stack.solved[own], Kt, SH, np.zeros(1, dtype=int),
+        )  # fmt: skip
+        self._P[k:k1] = turn(self._P[k:k1], T[end])
+        # what each number adds to y, by the root of all numbers' covariance: (L^T K^T) (L^-1 nu)
+        root = np.swapaxes(stack.root[k:k1], -1, -2)
+        Kt = Kt[k - own.start :]
+        added = np.cumsum((root @ Kt) * (root @ stack.solved[k:k1, :, None]), axis=1)
+        y = np.repeat(predicted[k - own.start :], counts, axis=0)
+        some = slice(self._stack.single.first[k], self._stack.single.first[k1])
+        behind = self._before[some] - self._start[k] + 1
+        y[behind] -= added[np.repeat(np.arange(k1 - k), counts - 1), self._stack.single.end[some] - 1]
+        e = _turn_errors(T, y - m)
+        sigma = np.sqrt(np.diagonal(self._P[k:k1], axis1=1, axis2=2))
+        still = np.all(np.abs(e) <= _STAYS * np.repeat(sigma, counts, axis=0), axis=1)
+        still = np.append(np.logical_and.reduceat(still, start), False)
+        return k + int(np.argmin(still)), move_points(points, e)
+
+    def _step(
+        self, k: int, k1: int, x: Estimate, points: Points, start: Array, end: Array, T: Array, m: Array
+    ) -> tuple[Array, Array, Array]:
+        """Where steps between the keyframes lead from points, (n, D) from the next of them, Q and F (n, 15, w)."""
+        before, ahead, steps = points.at(end[:-1]), points.at(start if k else start[1:]), slice(max(k - 1, 0), k1 - 1)
+        if k:
+            before = join_passes([Points(x.state, x.values[None]), before])
+        reached, F = predict_states(self._problem, steps, before.states, before.values)
+        values = self._steps.ahead(steps, before.values)
+        gap = np.concatenate([reached.minus(ahead.states), values - ahead.values], axis=1)
+        self._F[steps] = F
+        if len(end) > 1:
+            on, last = slice(len(F) - len(end) + 1, None), end[:-1]
+            F[on, :, :MOVING] = F[on, :, :MOVING] @ T[last]
+            gap[on, :DIM] -= mv(F[on], m[last, : F.shape[2]])
+            gap[on, DIM:] -= self._steps.decay[steps][on] * m[last, DIM:]
+        return gap, self._problem.motion.noise(steps, before.states.R_nb), F
+
+    def _linearise(self, own: slice, k: int, points: Points, T: Array, m: Array) -> tuple[Array, Array, Array]:
+        """Residuals, variances (n, M) and Jacobians (n, M, D) of the rows of keyframes `own` from k on."""
+        stack, problem, n = self._stack, self._problem, own.stop - own.start
+        r, sigma = np.zeros((n, stack.M)), np.ones((n, stack.M))
+        H = np.zeros((n, stack.M, DIM + points.values.shape[1]))
+        for rows in problem.constraints:
+            which = slice(*rows.keyframe.searchsorted((k, own.stop)))
+            if which.start == which.stop:
+                continue
+            at = self._of_rows[rows.name][which] - self._start[k]
+            linear = linearise(rows, points, problem.columns, which, at)
+            J = linear.H
+            J[:, :, :MOVING] = J[:, :, :MOVING] @ T[at]
+            place = rows.keyframe[which, None] - own.start, stack.places[rows.name][1][which]
+            r[place], sigma[place], H[place] = linear.residual - mv(J, m[at]), linear.stated, J
+        return r, (sigma / stack.root_weight[own]) ** 2, H
+
+
+def _move_errors(points: Points, first: Array) -> tuple[Array, Array]:
+    """T (n, 9, 9) and m (n, D) of points, by errors about the `first` (n,) of each keyframe's."""
+    of_first = points.states[first]
+    moved = np.zeros((len(first), DIM + points.values.shape[1]))
+    moved[1:, :DIM] = minus_invariant(points.states[1:], points.states[:-1])
+    moved[1:, DIM:] = np.diff(points.values, axis=0)
+    moved[np.unique(first)] = 0.0
+    moved[1:] = _turn_errors(compute_transport(points.states[:-1], of_first[:-1]), moved[1:])
+    m = np.cumsum(moved, axis=0)
+    return compute_transport(of_first, points.states), m - m[first]
+
+
+def _turn_errors(T: Array, e: Array) -> Array:
+    """Errors (n, D) of which the first are turned by T (n, 9, 9)."""
+    return np.concatenate([mv(T, e[:, :MOVING]), e[:, MOVING:]], axis=1)
