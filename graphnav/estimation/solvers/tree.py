@@ -39,6 +39,7 @@ from graphnav.estimation.solvers.stages import (
     group_runs,
     measure,
     predict_stage,
+    width,
 )
 from graphnav.estimation.solvers.tree_nodes import (
     LINK,
@@ -193,31 +194,27 @@ class Tree:
                 steps.append(Step(name, value, _TIED * self._first_sigma[name], 1.0, value))
         if not steps:
             return self._in_force
-        together: dict[int, list[Step]] = {}
-        for step in steps:
-            before = self._in_force.get(step.name)
-            together.setdefault(-1 if before is None else before[0].key, []).append(step)
         in_force = dict(self._in_force)
-        for old_key, own_steps in together.items():
-            widths = [len(s.mean) for s in own_steps]
-            edge = np.concatenate([[0], np.cumsum(widths)])
-            node = self._variable(np.zeros(edge[-1]), np.ones(edge[-1]), place.t)
-            node.limit = find_node_limits(append_columns({}, own_steps), place)
-            old = self.variables.get(old_key)
-            own_A, old_A = np.zeros((edge[-1], edge[-1])), np.zeros((edge[-1], 0 if old is None else len(old.unit)))
-            for step, lo, hi in zip(own_steps, edge[:-1], edge[1:], strict=True):
-                at = slice(int(lo), int(hi))
-                unit = self._first_sigma.setdefault(step.name, np.asarray(step.sigma, dtype=float))
-                node.unit[at] = unit
+        constant = [s for s in steps if s.name in self._constant]
+        for own_steps in (constant, [s for s in steps if s.name not in self._constant]):
+            if not own_steps:
+                continue
+            columns = append_columns({}, own_steps)
+            node = self._variable(np.zeros(width(columns) - DIM), np.ones(width(columns) - DIM), place.t)
+            node.limit = find_node_limits(columns, place)
+            own_A, old_A = np.zeros((len(node.unit), len(node.unit))), dict[int, tuple[Variable, Array]]()
+            for step in own_steps:
+                at = shift(columns[step.name])
+                node.unit[at] = self._first_sigma.setdefault(step.name, np.asarray(step.sigma, dtype=float))
                 node.anchor[at] = step.mean
                 own_A[at, at] = np.diag(1.0 / step.sigma)
-                if old is not None and step.decay:
-                    was = self._in_force[step.name][1]
+                if step.name in self._in_force and step.decay:
+                    old, was = self._in_force[step.name]
                     node.anchor[at] = step.ahead(old.anchor[was])
-                    old_A[at, was] = -step.decay * own_A[at, at]
+                    _, A = old_A.setdefault(old.key, (old, np.zeros((len(node.unit), len(old.unit)))))
+                    A[at, was] = -step.decay * own_A[at, at]
                 in_force[step.name] = node, at
-            blocks = [(node, own_A)] + ([(old, old_A)] if old is not None and old_A.any() else [])
-            fresh.append((node, make_factor(blocks, np.zeros(edge[-1]))))
+            fresh.append((node, make_factor([(node, own_A), *old_A.values()], np.zeros(len(node.unit)))))
         self._in_force = in_force
         return in_force
 
