@@ -132,3 +132,21 @@ def test_a_run_loads_only_what_it_needs(tmp_path, shared_data):
         )
     }
     assert not (rare | parts | own | {"gtsam"}) & found
+
+
+def test_constraints_are_linearised_in_one_place_and_solvers_know_none_of_them() -> None:
+    """Beside `linearise` only a constraint that is made of another asks it for its rows."""
+    callers, known, typed = set(), set(), set()
+    for path in FILES:
+        name = path.relative_to(PACKAGE).as_posix()
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        calls = [node for node in ast.walk(tree) if isinstance(node, ast.Call)]
+        if any(isinstance(c.func, ast.Attribute) and c.func.attr == "linearize" and len(c.args) > 1 for c in calls):
+            callers.add(name)
+        if name.startswith("estimation/solvers/"):
+            known |= {one for one in read_code(path)[0] if one.startswith("graphnav.constraints.")}
+            typed |= {name for c in calls if isinstance(c.func, ast.Name) and c.func.id == "isinstance"}
+    assert callers == {"estimation/solvers/linearise.py", "estimation/noise/explanations.py"}
+    base = "graphnav.constraints.base."
+    assert known == {base + one for one in ("Constraint", "Linearized", "assemble", "weigh_sigma")}
+    assert not typed

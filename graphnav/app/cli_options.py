@@ -125,7 +125,7 @@ def choose_detectors(settings: Settings, names: str | None) -> Settings:
     fire = split_names(names, get_args(DetectorName), "--detectors", "detector")
     if FUSED in fire and len(fire) > 1:
         raise ConfigError(
-            f"--detectors {names}: '{FUSED}' is all detectors together: name it alone, or name detectors",
+            f"--detectors {names}: '{FUSED}' has rules of its own: name it alone, or name detectors",
             key="detectors.fused_alone",
         )
     return settings.model_copy(update={"detectors": settings.detectors.model_copy(update={"fire": fire})})

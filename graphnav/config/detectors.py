@@ -97,7 +97,7 @@ class DetectorSettings(Section):
     @classmethod
     def _check_fused_is_alone(cls, fire: tuple[str, ...]) -> tuple[str, ...]:
         if FUSED in fire and len(fire) > 1:
-            raise ValueError("'fused' is all detectors together: name it alone, or name detectors")
+            raise ValueError("'fused' has rules of its own: name it alone, or name detectors")
         return tuple(dict.fromkeys(fire))
 
     @model_validator(mode="wrap")

@@ -134,7 +134,10 @@ def write_report(
                 ),
             ],
         ),
-        ("Detectors", [*_gallery(detectors), *tables.stop_table(solution, start)]),
+        (
+            "Detectors",
+            [*_gallery(detectors), *tables.stop_table(solution, start, words.describe_deciding(recording, settings))],
+        ),
         ("Findings", tables.odd(recording, findings)),
         ("Run", tables.run_table(only)),
         ("Provenance", provenance_tables(settings, provenance)),

@@ -71,6 +71,18 @@ def _measure_consistency(solution: Solution) -> tuple[str, float, int]:
     return every[0].kind, float(np.sqrt(sum((c.count - c.rejected) * c.mean_nis / c.dof for c in every) / used)), used
 
 
+def describe_deciding(recording: Recording, settings: Mapping[str, Any]) -> str:
+    """Which detectors decide where the platform stands."""
+    fire = settings.get("detectors", {}).get("fire", ("fused",))
+    if "fused" not in fire:
+        return f"{page.and_list(list(fire))}, each by itself"
+    if recording.platform == "foot":
+        return "the GLRT of stances"
+    return (
+        "the fusion: the low-band GLRT, held against speeds and integrated forces, and the FFT beside what that finds"
+    )
+
+
 def describe_run(recording: Recording, solutions: Mapping[str, Solution], withheld: Withheld, outages: Spans) -> str:
     """The run in a few sentences."""
     used = recording

@@ -304,8 +304,8 @@ def metric_tables(metrics: Mapping[str, Any] | None, name: str = "") -> list[Mar
     return [page.fold(f"All measures{' of ' if name else ''}{name}", inner)]
 
 
-def stop_table(solution: Solution, start: float) -> list[Markup]:
-    """Every stop: who found which share of it, and how many rows of which constraint came of it."""
+def stop_table(solution: Solution, start: float, decided_by: str) -> list[Markup]:
+    """Every stop: who found which share of it, and how many rows of which constraint came of it; who decided."""
     stops = stops_of_solution(solution)
     if not stops:
         return []
@@ -318,7 +318,7 @@ def stop_table(solution: Solution, start: float) -> list[Markup]:
         ]
         for stop in stops[:_LISTED]
     ]
-    note = "Share: of the stop that a detector by itself calls stationary."
+    note = f"Decided by {decided_by}. Share: of the stop that a detector by itself calls stationary."
     if len(stops) > _LISTED:
         note += f" {len(stops) - _LISTED} more are in detections.csv."
     return [*_long_table(["stands from", "for", "share by detector", "rows"], rows), page.paragraph(note, "soft")]

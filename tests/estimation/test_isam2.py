@@ -141,7 +141,7 @@ def test_relinearised_rows_take_the_place_of_the_old(posed: Problem) -> None:
     assert never.relinearised == 0
     factors = tree.isam.getFactorsUnsafe()
     alive = [i for i in range(factors.size()) if factors.at(i) is not None]
-    filed = [i for k in tree.keyframes for own in k.slots.values() for i in own]
+    filed = [i for k in tree.keyframes for i in k.slots.values()]
     assert len(filed) == len(set(filed))
     assert set(filed) <= set(alive)
     assert len(alive) == sum(

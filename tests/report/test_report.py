@@ -399,7 +399,10 @@ def test_stops_and_outages_are_told(tmp_path, recording):
     still = Detection("low_band_glrt", t, np.full(len(t), 0.5), 3.0, t > 0, spans)
     found = replace(solution(), detections=(still, replace(still, name="fused")))
     parser, text = checked(write_report(tmp_path / "r.html", recording, found, settings={}, outages=[(200.0, 230.0)]))
-    assert [row[:2] for row in cells(stop_table(found, START)[0])] == [["100.00 s", "30.00 s"], ["400.00 s", "12.00 s"]]
+    assert [row[:2] for row in cells(stop_table(found, START, "fused")[0])] == [
+        ["100.00 s", "30.00 s"],
+        ["400.00 s", "12.00 s"],
+    ]
     assert all(words in text for words in ("200 to 230 s", "42 s"))
     assert len(parser.figures) == 14
 

@@ -35,8 +35,7 @@ def hold(one: Decision | None, x: Any, P: Array, where: Any) -> tuple[Any, Array
         return x, P
     HP, variance = one.H @ P, one.sigma**2
     _, _, Kt = compute_gain(HP, HP @ one.H.T, variance, one.residual)
+    at, e = where.about(x)
     P, d = update(P, HP, one.H, Kt, variance), -(one.residual @ Kt)
-    if isinstance(x, np.ndarray):
-        return x + d, P
-    to = where.plus(x, d)
-    return to, where.carry(P, x, to)
+    to = where.plus(at, d if e is None else e + d)
+    return to, where.carry(P, at, to)

@@ -257,7 +257,7 @@ def _forward(
         if back is None and k == len(problem.t) - 1 and (trial := verdicts.ended()) is not None:
             back = int(np.searchsorted(problem.t, trial))
         if decide is not None and back is None:
-            x, P = hold(decide(k, _here(about, k, x), P), x, P, where)
+            x, P = hold(decide(k, _here(None if where is own else about, k, x), P), x, P, where)
         if back is not None:  # once more from before the fault, without it
             if tests is not None:
                 tests.go_back(back)
@@ -360,7 +360,6 @@ def _update(
 
 def _here(about: Points | None, k: int, x: Any) -> Points:
     """An estimate at a keyframe, or an error state about given points, as a point."""
-    if isinstance(x, Estimate):
+    if about is None:
         return Points(x.state, x.values[None])
-    assert about is not None
     return move_points(Points(about.states[k : k + 1], about.values[k : k + 1]), x[None])

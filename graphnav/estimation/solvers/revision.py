@@ -6,8 +6,8 @@ beside the window until it has caught up with the newest keyframe, and takes the
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,7 +15,7 @@ import numpy as np
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, States
 from graphnav.estimation.solvers.elimination import predict, update
-from graphnav.estimation.solvers.stages import Columns, Message, Place, Stage, at_points, follows, group_runs, plus
+from graphnav.estimation.solvers.stages import Columns, Linear, Place, Stage, at_points, follows, group_runs, plus
 
 if TYPE_CHECKING:
     from graphnav.estimation.solvers.window import Window
@@ -29,9 +29,10 @@ class Revision:
 
     def __init__(self, window: Window, first: int) -> None:
         self.window, self.first = window, first
-        before = window.stages[first - 1] if first else window.head
-        self._was = before
-        self._before: Stage | Message = before.moved(window.means()[first])
+        e = window.means()[first]
+        self._was = window.stages[first - 1] if first else None
+        self._stage = None if self._was is None else self._was.moved(e)  # the one before, where it is in the window
+        self._before = window.head.moved(e) if self._stage is None else self._stage.message
         self._made: list[tuple[Stage, Stage]] = []  # what was there, and what is instead
 
     def step(self, count: int, renewed: Renewing | None) -> bool:
@@ -42,7 +43,7 @@ class Revision:
         renewed : gives the places of stages, from an index to another, if not where their rows came from before.
         """
         window, made = self.window, self._made
-        if self.first and not _is(window.stages, self.first - 1, self._was):
+        if self._was is not None and not _is(window.stages, self.first - 1, self._was):
             return True
         while made and not _is(window.stages, self.first + len(made) - 1, made[-1][0]):
             made.pop()
@@ -61,7 +62,7 @@ class Revision:
             new if now.message.tests is None else replace(new, message=replace(new.message, tests=now.message.tests))
             for now, (_, new) in zip(window.stages[self.first :], made, strict=True)
         ]
-        window.replace_from(self.first, self._before, stages)
+        window.replace_from(self.first, self._before, self._stage, stages)
         return True
 
     def forget(self) -> None:
@@ -73,50 +74,46 @@ class Revision:
             self._made[k] = was, replace(stage, place=replace(stage.place, problem=None))
 
     def _again(self, old: Sequence[Stage], means: Sequence[Array], places: Sequence[Place]) -> list[Stage]:
-        before = self._made[-1][1] if self._made else self._before
-        message = before.message if isinstance(before, Stage) else before
-        around = [message, *(stage.message for stage in old)]
-        moves = [np.zeros(len(message.z)), *means]
-        states = plus(States.stack([m.state for m in around]), np.array([e[:DIM] for e in moves]), message.turns)
-        points = [
-            LinearisationPoint(states[k : k + 1], m.values + e[DIM:], m.columns)
-            for k, (m, e) in enumerate(zip(around, moves, strict=True))
-        ]
-        return remake(replace(message, tests=None), points, places)
-
-
-def _is(stages: Sequence[Stage], k: int, was: Stage | Message) -> bool:
-    """Whether stage k is still the one that was there, perhaps about another point."""
-    return isinstance(was, Stage) and k < len(stages) and stages[k].lost is was.lost
-
-
-@dataclass(frozen=True)
-class LinearisationPoint:
-    """Where rows are linearised: one state, parameter values and where they stand."""
-
-    state: States
-    values: Array
-    columns: Columns
-
-
-def remake(before: Message, points: Sequence[LinearisationPoint], places: Sequence[Place]) -> list[Stage]:
-    """Stages about given points; `points[0]` is that of the message before them."""
-
-    def alike(last: int, k: int) -> bool:
-        same = places[k].linked == places[last].linked and points[k + 1].columns == points[last + 1].columns
-        return same and follows(places[k], places[last])
-
-    out: list[Stage] = []
-    for run in group_runs(range(len(places)), alike):
-        linked, own = places[run[0]].linked, [places[k] for k in run]
-        part = [points[k + 1] for k in run]
-        around = [points[run[0]], *part] if linked else part
-        states, values = States.stack([point.state for point in around]), [point.values for point in around]
-        linears = at_points(own, states, values, part[-1].columns, linked)
-        for place, point, linear in zip(own, part, linears, strict=True):
+        """The stages about where the means of their errors lead, each from the one before."""
+        before = self._made[-1][1].message if self._made else self._before
+        around = [before, *(stage.message for stage in old)]
+        moves = [np.zeros(len(before.z)), *means]
+        states = plus(States.stack([m.state for m in around]), np.array([e[:DIM] for e in moves]), before.turns)
+        values = [m.values + e[DIM:] for m, e in zip(around, moves, strict=True)]
+        columns = [stage.message.columns for stage in old]
+        before = replace(before, tests=None)
+        out: list[Stage] = []
+        for k, linear in linearise_runs(places, states, values, columns):
             plain, bent = (tuple(m for m in linear.measured if (m.kernel == "none") == one) for one in (True, False))
-            ahead = predict(before, place, linear.link, plain, point.state, point.values, point.columns)
-            stage, _ = update(ahead, bent, weighted=True)
+            point = states[k + 1 : k + 2], values[k + 1], columns[k]
+            stage, _ = update(predict(before, places[k], linear.link, plain, *point), bent, weighted=True)
             before = stage.message
             out.append(stage)
-    return out
+        return out
+
+
+def linearise_runs(
+    places: Sequence[Place], states: States, values: Sequence[Array], columns: Sequence[Columns]
+) -> Iterator[tuple[int, Linear]]:
+    """The rows of consecutive keyframes, of as many at once as follow each other in one problem.
+
+    Parameters
+    ----------
+    places, columns : of n keyframes.
+    states, values : of the keyframe before them, and of them: n + 1.
+    """
+
+    def alike(last: int, k: int) -> bool:
+        same = places[k].linked == places[last].linked and columns[k] == columns[last]
+        return same and follows(places[k], places[last])
+
+    for run in group_runs(range(len(places)), alike):
+        linked, end = places[run[0]].linked, run[-1] + 1
+        points = slice(run[0] if linked else run[0] + 1, end + 1)
+        linears = at_points(places[run[0] : end], states[points], values[points], columns[run[0]], linked)
+        yield from zip(run, linears, strict=True)
+
+
+def _is(stages: Sequence[Stage], k: int, was: Stage) -> bool:
+    """Whether stage k is still the one that was there, perhaps about another point."""
+    return k < len(stages) and stages[k].lost is was.lost

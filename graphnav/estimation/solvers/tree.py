@@ -29,18 +29,17 @@ from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.elimination import Predicted
 from graphnav.estimation.solvers.linearise import Step, scale_at, shift
 from graphnav.estimation.solvers.passes import integrate_again
-from graphnav.estimation.solvers.revision import Renewed
+from graphnav.estimation.solvers.revision import Renewed, linearise_runs
 from graphnav.estimation.solvers.robust import PASSES
 from graphnav.estimation.solvers.stages import (
     Measured,
     Message,
     Place,
     append_columns,
-    at_points,
-    follows,
     group_runs,
     measure,
     predict_stage,
+    width,
 )
 from graphnav.estimation.solvers.tree_nodes import (
     LINK,
@@ -48,7 +47,7 @@ from graphnav.estimation.solvers.tree_nodes import (
     Made,
     Variable,
     fill_keys,
-    find_limits_of,
+    find_node_limits,
     fresh_isam,
     is_constant,
     make_factor,
@@ -154,7 +153,7 @@ class Tree:
         if prior.columns:
             node = self._variable(prior.values, np.ones(len(prior.values)), place.t)
             fresh.append((node, None))
-            node.limit = find_limits_of(prior.columns, place)
+            node.limit = find_node_limits(prior.columns, place)
             nodes = {name: (node, shift(at)) for name, at in prior.columns.items()}
             blocks.append((node, prior.R[:, DIM:]))
         assert place.problem is not None
@@ -195,31 +194,27 @@ class Tree:
                 steps.append(Step(name, value, _TIED * self._first_sigma[name], 1.0, value))
         if not steps:
             return self._in_force
-        together: dict[int, list[Step]] = {}
-        for step in steps:
-            before = self._in_force.get(step.name)
-            together.setdefault(-1 if before is None else before[0].key, []).append(step)
         in_force = dict(self._in_force)
-        for old_key, own_steps in together.items():
-            widths = [len(s.mean) for s in own_steps]
-            edge = np.concatenate([[0], np.cumsum(widths)])
-            node = self._variable(np.zeros(edge[-1]), np.ones(edge[-1]), place.t)
-            node.limit = find_limits_of(append_columns({}, own_steps), place)
-            old = self.variables.get(old_key)
-            own_A, old_A = np.zeros((edge[-1], edge[-1])), np.zeros((edge[-1], 0 if old is None else len(old.unit)))
-            for step, lo, hi in zip(own_steps, edge[:-1], edge[1:], strict=True):
-                at = slice(int(lo), int(hi))
-                unit = self._first_sigma.setdefault(step.name, np.asarray(step.sigma, dtype=float))
-                node.unit[at] = unit
+        constant = [s for s in steps if s.name in self._constant]
+        for own_steps in (constant, [s for s in steps if s.name not in self._constant]):
+            if not own_steps:
+                continue
+            columns = append_columns({}, own_steps)
+            node = self._variable(np.zeros(width(columns) - DIM), np.ones(width(columns) - DIM), place.t)
+            node.limit = find_node_limits(columns, place)
+            own_A, old_A = np.zeros((len(node.unit), len(node.unit))), dict[int, tuple[Variable, Array]]()
+            for step in own_steps:
+                at = shift(columns[step.name])
+                node.unit[at] = self._first_sigma.setdefault(step.name, np.asarray(step.sigma, dtype=float))
                 node.anchor[at] = step.mean
                 own_A[at, at] = np.diag(1.0 / step.sigma)
-                if old is not None and step.decay:
-                    was = self._in_force[step.name][1]
+                if step.name in self._in_force and step.decay:
+                    old, was = self._in_force[step.name]
                     node.anchor[at] = step.ahead(old.anchor[was])
-                    old_A[at, was] = -step.decay * own_A[at, at]
+                    _, A = old_A.setdefault(old.key, (old, np.zeros((len(node.unit), len(old.unit)))))
+                    A[at, was] = -step.decay * own_A[at, at]
                 in_force[step.name] = node, at
-            blocks = [(node, own_A)] + ([(old, old_A)] if old is not None and old_A.any() else [])
-            fresh.append((node, make_factor(blocks, np.zeros(edge[-1]))))
+            fresh.append((node, make_factor([(node, own_A), *old_A.values()], np.zeros(len(node.unit)))))
         self._in_force = in_force
         return in_force
 
@@ -238,26 +233,27 @@ class Tree:
         """Bring all estimates up to date."""
         read_estimates(self.isam, self.variables.values())
 
-    def moved(self, share: float = 1.0) -> Array:
-        """Which keyframes' estimates are further from where their rows were linearised than a share of the limits."""
+    def find_moves(self) -> Array:
+        """(K,) how far keyframes' estimates are from where their rows were linearised, 1 at the limit."""
         if len(self) <= self._held:
-            return np.empty(0, dtype=int)
+            return np.empty(0)
         off = np.array([k.state.delta[:3] - k.state.point[:3] for k in self.keyframes])
-        far = np.einsum("ki,ki->k", off, off) > (share * self.turn) ** 2
+        moves = np.linalg.norm(off, axis=1) / self.turn
         first = self.keyframes[self._held].number
-        limited = (x for x in self.variables.values() if len(x.limit) and x.last >= first)
-        gone = {x.key for x in limited if np.any(np.abs(x.delta - x.point) > share * x.limit)}
-        if gone:
-            far |= np.array([any(n.key in gone for n, _ in k.nodes.values()) for k in self.keyframes])
-        far[: self._held] = False
-        return np.flatnonzero(far)
+        limited = [x for x in self.variables.values() if len(x.limit) and x.last >= first]
+        far = {x.key: float(np.max(np.abs(x.delta - x.point) / x.limit)) for x in limited}
+        for k, keyframe in enumerate(self.keyframes):
+            moves[k] = max(moves[k], *(far.get(n.key, 0.0) for n, _ in keyframe.nodes.values()), 0.0)
+        moves[: self._held] = 0.0
+        return moves
 
     def relinearise(self, share: float = 1.0, renewed: Renewed | None = None) -> int:
         """Linearise anew what has moved beyond a share of the limits; returns how many keyframes that are."""
         self.read()
-        if not len(self.moved(share)):
+        moves = self.find_moves()
+        if not (moves > share).any():
             return 0
-        which = self.moved(_ALMOST * share)
+        which = np.flatnonzero(moves > _ALMOST * share)
         self.linearise_again(which, renewed)
         self.read()
         return len(which)
@@ -281,35 +277,24 @@ class Tree:
             return
         links = {k for i in rows for k in (i, i + 1) if k < len(self) and LINK in self.keyframes[k].slots}
         made: list[Made] = []
-        gone: list[int] = []
-
-        def alike(last: int, i: int) -> bool:
-            a, b = self.keyframes[last], self.keyframes[i]
-            same = i == last + 1 and a.columns == b.columns and LINK in a.slots and LINK in b.slots
-            return same and (renewed is not None or follows(b.place, a.place))  # or they will be of one problem
-
-        for run in group_runs(sorted(rows | links), alike):
-            own = self.keyframes[run[0] : run[-1] + 1]
+        for run in group_runs(sorted(rows | links), lambda last, i: i == last + 1):
+            first, own = run[0], self.keyframes[run[0] : run[-1] + 1]
             places = [k.place for k in own]
             if renewed is not None:
-                places = list(renewed(run[0] - self._held, run[-1] + 1 - self._held))
-            linked = run[0] in links
-            around = self.keyframes[run[0] - 1 : run[-1] + 1] if linked else own
-            values = [k.values for k in around]
-            linears = at_points(places, states_of(around), values, own[-1].columns, linked)
-            for i, linear in zip(run, linears, strict=True):
-                keyframe = self.keyframes[i]
+                places = list(renewed(first - self._held, first - self._held + len(own)))
+            # the interval before the oldest keyframe is gone
+            places = [p if LINK in k.slots else replace(p, linked=False) for p, k in zip(places, own, strict=True)]
+            around = [self.keyframes[max(first - 1, 0)], *own]
+            values, columns = [k.values for k in around], [k.columns for k in own]
+            for k, linear in linearise_runs(places, states_of(around), values, columns):
+                i, keyframe = first + k, own[k]
                 if i in links:
                     assert linear.link is not None
-                    made.append(
-                        (keyframe, LINK, make_interval_factor(self.keyframes[i - 1], keyframe.state, linear.link))
-                    )
-                    gone += keyframe.slots.pop(LINK)
+                    made.append((keyframe, LINK, make_interval_factor(around[k], keyframe.state, linear.link)))
                 if i in rows:
-                    for one in linear.measured:
-                        if one.name in keyframe.slots:
-                            made.append((keyframe, one.name, make_row_factor(keyframe, one, weighted=True)))
-                            gone += keyframe.slots.pop(one.name)
+                    measured = (one for one in linear.measured if one.name in keyframe.slots)
+                    made += [(keyframe, one.name, make_row_factor(keyframe, one, weighted=True)) for one in measured]
+        gone = [keyframe.slots.pop(name) for keyframe, name, _ in made]
         for i in rows:
             x = self.keyframes[i].state
             x.point = x.delta.copy()
@@ -353,7 +338,7 @@ class Tree:
         self.__dict__.update(state)
         self.isam, now = read_factors(rows, {x: x.last for x in self.variables.values()})
         for k in self.keyframes:
-            k.slots = {name: [now[i] for i in own] for name, own in k.slots.items()}
+            k.slots = {name: now[i] for name, i in k.slots.items()}
 
     def marginalise(self, count: int) -> None:
         """Let the first keyframes go, and the parameters' nodes that only they touch."""
@@ -364,7 +349,5 @@ class Tree:
             del self.variables[x.key]
         del self.keyframes[:count]
         for keyframe in self.keyframes:
-            if not any(left.intersection(own) for own in keyframe.slots.values()):
-                continue
-            kept = {name: [i for i in own if i not in left] for name, own in keyframe.slots.items()}
-            keyframe.slots = {name: own for name, own in kept.items() if own}
+            if not left.isdisjoint(keyframe.slots.values()):
+                keyframe.slots = {name: i for name, i in keyframe.slots.items() if i not in left}

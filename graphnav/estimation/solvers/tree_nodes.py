@@ -51,7 +51,7 @@ class Keyframe:
     anchor: States  # one
     columns: Columns
     nodes: dict[str, tuple[Variable, slice]]  # the node of each parameter in force
-    slots: dict[str, list[int]]  # indices of its factors, by constraint
+    slots: dict[str, int]  # index of its factor of each constraint
 
     @property
     def estimate(self) -> States:
@@ -131,7 +131,7 @@ def update_isam(
             f"the smoother's information broke down at {t:.3f} s: check sigmas and units", key="solver.breakdown"
         ) from error
     for (keyframe, name, _), index in zip(made, list(result.getNewFactorsIndices())[begin:], strict=True):
-        keyframe.slots.setdefault(name, []).append(index)
+        keyframe.slots[name] = index
 
 
 def read_estimates(isam: gtsam.ISAM2, variables: Collection[Variable]) -> None:
@@ -200,10 +200,9 @@ def is_constant(place: Place, name: str) -> bool:
     return p is not None and p.constant
 
 
-def find_limits_of(columns: Columns, place: Place) -> Array:
+def find_node_limits(columns: Columns, place: Place) -> Array:
     """How far parameters of a node may move, empty where nothing limits any of them."""
-    assert place.problem is not None
-    found = find_limits(columns, {name: p.unit for name, p in place.problem.parameters.items()})[1]
+    found = find_limits(columns, place)
     return found if np.isfinite(found).any() else np.zeros(0)
 
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from graphnav.estimation.solvers.elimination import Predicted
 from graphnav.estimation.solvers.revision import Renewed, Renewing
-from graphnav.estimation.solvers.stages import Message, Place
+from graphnav.estimation.solvers.stages import Message, Place, Stage
 from graphnav.estimation.solvers.tree import Tree
 from graphnav.estimation.solvers.tree_marginals import Leaving, compute_newest_root
 from graphnav.estimation.solvers.window import SettledStates, Window
@@ -40,21 +40,25 @@ class TreeWindow(Window):
         if self.tree is None:
             self.tree, self._before = Tree(self.head, self.turn), int(place.linked)
         ahead = self.expect(place) if ahead is None else replace(ahead, place=place)
-        turn = super().push(place, ahead)
-        self.tree.add(place, ahead, self.stages[-1].measured)
-        self._adopt(full=False)
-        return turn
+        stage, e = self._update(ahead)
+        self.tree.add(place, ahead, stage.measured)
+        self._append(self._adopt(stage))
+        return float(np.linalg.norm(e[:3]))
 
-    def _adopt(self, full: bool) -> None:
-        """Have the newest message about the tree's estimate; with `full` what it says of its errors is the tree's."""
+    def _adopt(self, stage: Stage) -> Stage:
+        """The newest stage about the tree's estimate."""
         assert self.tree is not None
-        stage, now = self.stages[-1], self.tree.newest
-        e = np.concatenate([now.state.minus(stage.message.state)[0], now.values - stage.message.values])
-        moved = stage.moved(e)
-        message = moved.message
-        R, tests = compute_newest_root(self.tree, message.columns) if full else message.R, message.tests
-        message = Message.of(message.state, message.values, message.columns, R, np.zeros(len(R)), tests)
-        self.stages[-1] = replace(moved, message=message)
+        now, message = self.tree.newest, stage.message
+        moved = stage.moved(np.concatenate([now.state.minus(message.state)[0], now.values - message.values]))
+        return replace(moved, message=replace(moved.message, z=np.zeros(len(message.z))))
+
+    def _adopt_all(self) -> None:
+        """Have the newest message as the tree knows it, with what it says of its errors."""
+        assert self.tree is not None
+        stage = self._adopt(self.stages[-1])
+        m = stage.message
+        R = compute_newest_root(self.tree, m.columns)
+        self.stages[-1] = replace(stage, message=Message.of(m.state, m.values, m.columns, R, m.z, m.tests))
         self._means = None
 
     # ------------------------------------------------------------------------------------------- what the tree knows
@@ -63,8 +67,8 @@ class TreeWindow(Window):
         if self.tree is None or not self.stages:
             return None
         self.tree.read()
-        moved = self.tree.moved(share)
-        return int(moved[0]) - self._before if len(moved) else None
+        moved = self.tree.find_moves() > share
+        return int(np.argmax(moved)) - self._before if moved.any() else None
 
     def converge(self, share: float = 1.0, always: bool = False, renewed: Renewed | None = None) -> int:
         """Relinearise until nothing has moved; returns how often."""
@@ -109,7 +113,7 @@ class TreeWindow(Window):
 
     def _relinearise(self, count: int) -> None:
         self.relinearized += count
-        self._adopt(full=True)
+        self._adopt_all()
 
     def truncate(self, keep: int) -> None:
         """Forget all but the first `keep` stages: something before what follows has changed."""
@@ -123,7 +127,7 @@ class TreeWindow(Window):
             return
         self.tree.truncate(keep + self._before)
         if self.stages:
-            self._adopt(full=True)
+            self._adopt_all()
 
     def settle(self, count: int) -> SettledStates:
         """Let the first `count` stages go, as the tree knows them."""

@@ -18,6 +18,7 @@ import numpy as np
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, States
 from graphnav.estimation.solvers.elimination import Predicted, predict, update
+from graphnav.estimation.solvers.linearise import shift
 from graphnav.estimation.solvers.points import move_covariance
 from graphnav.estimation.solvers.revision import Renewed, Renewing, Revision
 from graphnav.estimation.solvers.stages import (
@@ -95,7 +96,7 @@ class Window:
         self.head = prior  # all that is known before the first stage
         self.stages: list[Stage] = []
         self.relinearized = 0  # stages made anew
-        self._limit = find_limits(prior.columns, {})
+        self._limit: tuple[Columns, Array] = {}, np.empty(0)
         self._covariances: _Covariances | None = None  # of stages that are to leave
         self._means: list[Array] | None = None
         self._moved: Array | None = None  # `_moves`, of these
@@ -134,17 +135,22 @@ class Window:
         `ahead` is what was expected of it after the newest, if known already: only the rows that had to be waited for
         are then made.
         """
-        ahead = self.expect(place) if ahead is None else replace(ahead, place=place)
-        columns = ahead.columns
-        stage, e = update(ahead, measure(place, ahead.state, ahead.values, columns, late=True).measured)
-        moved, turns = stage.moved(e), stage.message.turns
-        self.stages.append(moved)
-        self._means = None
-        if columns != self._limit[0]:
-            assert place.problem is not None
-            self._limit = find_limits(columns, {name: p.unit for name, p in place.problem.parameters.items()})
-        turn = split_turn(stage.message.state, e[None])[1][0] if turns else e
+        stage, e = self._update(self.expect(place) if ahead is None else replace(ahead, place=place))
+        self._append(stage.moved(e))
+        turn = split_turn(stage.message.state, e[None])[1][0] if stage.message.turns else e
         return float(np.linalg.norm(turn[:3]))
+
+    @staticmethod
+    def _update(ahead: Predicted) -> tuple[Stage, Array]:
+        """A keyframe with all its rows, about its prediction, and the error state (D,) that is most likely there."""
+        return update(ahead, measure(ahead.place, ahead.state, ahead.values, ahead.columns, late=True).measured)
+
+    def _append(self, stage: Stage) -> None:
+        self.stages.append(stage)
+        self._means = None
+        columns = stage.message.columns
+        if columns != self._limit[0]:
+            self._limit = columns, find_limits(columns, stage.place)
 
     def watch(self, tests: Watch) -> None:
         """Have the fixes from the next keyframe on tested."""
@@ -170,13 +176,13 @@ class Window:
         else:
             self.head = self.head.moved(self.head.estimate)
 
-    def replace_from(self, first: int, before: Stage | Message, stages: Sequence[Stage]) -> None:
-        """Have other stages from one on, and what comes before them about another point."""
-        if isinstance(before, Stage):
-            tests = self.stages[first - 1].message.tests
-            self.stages[first - 1] = replace(before, message=replace(before.message, tests=tests))
-        else:
+    def replace_from(self, first: int, before: Message, stage: Stage | None, stages: Sequence[Stage]) -> None:
+        """Have other stages from one on, and the message before them, and its stage if it has one, as given."""
+        if stage is None:
             self.head = replace(before, tests=self.head.tests)
+        else:
+            tests = self.stages[first - 1].message.tests
+            self.stages[first - 1] = replace(stage, message=replace(before, tests=tests))
         self.stages[first:] = stages
         if stages:
             self.stages[-1] = self.stages[-1].moved(self.stages[-1].message.estimate)
@@ -269,13 +275,6 @@ class Window:
         beside = psi + [stage.psi for stage in self.stages] - np.concatenate([before, psi[:-1]])
         return np.hypot(np.linalg.norm(left[:, :3], axis=1), beside)
 
-    def relinearize(self, first: int, places: Sequence[Place] | None = None) -> None:
-        """Make the stages from `first` on anew about the smoothed states.
-
-        `places` are where their rows come from, if not where they came from before; all of one problem.
-        """
-        Revision(self, first).step(len(self), None if places is None else lambda *_: places)
-
     def converge(self, share: float = 1.0, always: bool = False, renewed: Renewed | None = None) -> int:
         """Relinearise until nothing has moved; returns how often.
 
@@ -286,13 +285,16 @@ class Window:
         renewed : gives the places of stages, from an index to another, where they no longer know their rows.
         """
         for count in range(_ROUNDS):
-            first = 0 if always and not count else self.find_first_moved(share)
+            first = self._find_first_again(share, always and not count)
             if first is None:
                 return count
-            # what has moved almost as far goes with it: it would be next
-            first = min(first, self.find_first_moved(_ALMOST * share) or 0) if first else 0
-            self.relinearize(first, None if renewed is None else renewed(first, len(self)))
+            Revision(self, first).step(len(self), renewed)
         return _ROUNDS
+
+    def _find_first_again(self, share: float, every: bool) -> int | None:
+        """The first stage to be linearised anew: what has moved almost as far goes with it, as it would be next."""
+        first = 0 if every else self.find_first_moved(share)
+        return min(first, self.find_first_moved(_ALMOST * share) or 0) if first else first
 
     @property
     def revising(self) -> bool:
@@ -305,11 +307,10 @@ class Window:
         Keyframes may come and go before the next part, and what has been made of them goes with them.
         """
         if self._revision is None:
-            first = 0 if always and not self._rounds else self.find_first_moved()
+            first = self._find_first_again(1.0, always and not self._rounds)
             if first is None or self._rounds == _ROUNDS:
                 self._rounds = 0
                 return False
-            first = min(first, self.find_first_moved(_ALMOST) or 0) if first else 0
             self._revision, self._rounds = Revision(self, first), self._rounds + 1
         if self._revision.step(count, renewed):
             self._revision = None
@@ -331,12 +332,14 @@ def make_first_message(state: States, sigma: Array, turns: bool = False) -> Mess
     return Message.of(state, np.zeros(0), {}, np.diag(1.0 / sigma), np.zeros(DIM), turns=turns)
 
 
-def find_limits(columns: Columns, units: dict[str, str]) -> tuple[Columns, Array]:
-    """How far each parameter may move before rows are linearised anew."""
-    limit = np.full(width(columns) - DIM, np.inf)
+def find_limits(columns: Columns, place: Place) -> Array:
+    """(D-15,) how far each parameter may move before rows are linearised anew; infinite where nothing limits it."""
+    assert place.problem is not None
+    parameters, limit = place.problem.parameters, np.full(width(columns) - DIM, np.inf)
     for name, at in columns.items():
-        limit[at.start - DIM : at.stop - DIM] = _LIMITS.get(units.get(name, ""), np.inf)
-    return columns, limit
+        if name in parameters:
+            limit[shift(at)] = _LIMITS.get(parameters[name].unit, np.inf)
+    return limit
 
 
 __all__ = ["Message", "Place", "SettledStates", "Window", "append_columns", "make_first_message"]
