@@ -572,6 +572,13 @@ MISTAKES: dict[str, list[Mistake]] = {
             (*SMOOTH, "--start", "700"),
             True,
         ),
+        Mistake(
+            "a part by the option of another program",
+            nothing,
+            ("--window", "--start", "--end"),
+            (*SMOOTH, "--window", "10-60"),
+            True,
+        ),
         Mistake("no folder to write into", nothing, ("-o",), ("smooth", "drive"), True),
         Mistake(
             "a file where a folder is meant",

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 
 from graphnav import __version__
 from graphnav.app import cli_fleet, cli_logs, cli_online, cli_solve
@@ -60,12 +61,29 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 # Before the settings are: looking through all that is installed for plugins of Pydantic takes as long as they do.
 os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
 
+# Commands as they are met: from a log to a result, then what else there is.
+_ORDER = (
+    "init", "info", "smooth", "compare", "report", "evaluate", "convert", "detect", "online", "fleet", "simulate",
+    "allan", "settings",
+)  # fmt: skip
+# Words of other programs for what --start and --end say.
+_SPAN = ("window", "span", "from", "to", "begin", "stop", "duration", "crop", "trim", "time", "until")
+
+
+class _InOrder(TyperGroup):
+    """Lists its commands in the order of `_ORDER`."""
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        return sorted(super().list_commands(ctx), key=_ORDER.index)
+
+
 app = typer.Typer(
     name="graphnav",
+    cls=_InOrder,
     add_completion=False,
     rich_markup_mode=None,
     context_settings={"help_option_names": ["-h", "--help"]},
-    help="Smooths recorded drives with a factor graph, beside the Kalman filter it replaces.",
+    help="Smooths recorded drives and walks with a factor graph, beside an EKF and an RTS smoother.",
     epilog="\b\nExample:\n  graphnav compare kitti --without gnss:400-460 -o out",
 )
 
@@ -73,7 +91,7 @@ app = typer.Typer(
 @app.callback(invoke_without_command=True)
 def _program(
     context: typer.Context,
-    version: Annotated[bool, typer.Option("--version", help="Print the version and leave.")] = False,
+    version: Annotated[bool, typer.Option("--version", help="Print the version and exit.")] = False,
 ) -> None:
     if version:
         say(f"graphnav {__version__}")
@@ -88,10 +106,10 @@ def info(
     context: typer.Context,
     recording: Source,
     antenna: Annotated[
-        bool, typer.Option("--antenna", help="Also find the antenna from the drive, and compare with its lever arm.")
+        bool, typer.Option("--antenna", help="Also estimate the antenna's lever arm from the drive.")
     ] = False,
     quick: Annotated[
-        bool, typer.Option("--quick", help="Leave out what takes solving: the signs of lever arms.")
+        bool, typer.Option("--quick", help="Leave out the checks that solve the drive: signs of lever arms.")
     ] = False,
     format: Format = None,
     topic: Topic = None,
@@ -99,7 +117,10 @@ def info(
     quiet: Quiet = False,
     json: Json = False,
 ) -> None:
-    """Check a recording and say what it holds: sensors, rates, gaps, distance, stops, and what is odd."""
+    """Check a recording: what it holds, and what is wrong with it.
+
+    Clocks, units, axes and lever arms of the sensors are checked against each other.
+    """
     from graphnav.recording.checks.overview import inspect
     from graphnav.recording.formats import read
 
@@ -132,7 +153,10 @@ def detect(
     quiet: Quiet = False,
     json: Json = False,
 ) -> None:
-    """Find where the vehicle stands, and write the intervals, the statistics they come from and a picture."""
+    """Find where the vehicle stands.
+
+    The intervals, the statistics of each detector and a page of figures are written.
+    """
     from graphnav.app import outputs, workflow
     from graphnav.config import read_settings
     from graphnav.core.staging import final_path, stage_results
@@ -166,7 +190,9 @@ def detect(
 @app.command(epilog="\b\nExample:\n  graphnav evaluate out/kitti/trajectory.csv truth.csv --require 'h_rms<0.5'")
 def evaluate(
     trajectory: Annotated[Path, typer.Argument(metavar="TRAJECTORY", help="CSV, TUM, KF-GINS .nav or RTKLIB .pos.")],
-    truth: Annotated[Path, typer.Argument(metavar="TRUTH", help="The same kinds, or a recording with a truth.")],
+    truth: Annotated[
+        Path, typer.Argument(metavar="TRUTH", help="A file of the same formats, or a recording with a truth.")
+    ],
     out: Annotated[
         Path | None, typer.Option("-o", "--out", metavar="OUT", help="Folder for evaluation.json and errors.csv.")
     ] = None,
@@ -175,7 +201,10 @@ def evaluate(
     quiet: Quiet = False,
     json: Json = False,
 ) -> None:
-    """Compare any trajectory file with any truth file, ours or another program's."""
+    """Compare a trajectory file with a truth.
+
+    Both may be of graphnav or of another program.
+    """
     from graphnav.app import outputs
     from graphnav.core.staging import stage_results
     from graphnav.evaluation import gates
@@ -204,7 +233,10 @@ def settings(
     config: Config = None,
     json: Json = False,
 ) -> None:
-    """Print all settings as a file for --config: the defaults, a profile's, or those that a file or a run comes to."""
+    """Print all settings, as a file for --config.
+
+    The defaults, or those of a profile, a file or an earlier run.
+    """
     from graphnav.config import read_settings, settings_text
 
     found = read_settings(config, profile)
@@ -255,7 +287,12 @@ def run(arguments: list[str]) -> int:
 
 def _usage(error: Any) -> str:
     """A usage error, and the command whose help says more."""
-    path = getattr(getattr(error, "ctx", None), "command_path", "graphnav")
+    context = getattr(error, "ctx", None)
+    path = getattr(context, "command_path", "graphnav")
+    options = {name for option in getattr(getattr(context, "command", None), "params", ()) for name in option.opts}
+    said = str(getattr(error, "option_name", ""))
+    if said.lstrip("-") in _SPAN and {"--start", "--end"} <= options:
+        return f"No such option: {said}; --start and --end choose a part of the recording; see {path} --help"
     return f"{error.format_message().rstrip('.')}; see {path} --help"
 
 

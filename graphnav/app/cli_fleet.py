@@ -36,40 +36,46 @@ def fleet(
     ],
     out: Out,
     solver: Annotated[
-        str, typer.Option("--solver", metavar="NAME", help="batch, incremental, isam2, rts or ekf.")
+        str, typer.Option("--solver", "--solvers", metavar="NAME", help="One of batch, incremental, isam2, rts, ekf.")
     ] = "batch",
     profile: Profile = None,
     config: Config = None,
     noise: Noise = None,
     withhold: Annotated[
-        float | None, typer.Option("--withhold", metavar="S", help="Withhold GNSS for S s again and again; score that.")
+        float | None,
+        typer.Option("--withhold", metavar="S", help="Withhold GNSS for S seconds, repeatedly, and score these spans."),
     ] = None,
     without: Without = None,
     rate: Rate = None,
     start: Start = None,
     end: End = None,
     processes: Annotated[
-        int | None, typer.Option("--processes", metavar="N", min=1, help="Drives at once; default: one a processor.")
+        int | None,
+        typer.Option("--processes", metavar="N", min=1, help="Drives solved at once; default: one for each processor."),
     ] = None,
     limit: Annotated[
-        float, typer.Option("--limit", metavar="S", min=1.0, help="What one drive may take before it is ended.")
+        float, typer.Option("--limit", metavar="S", min=1.0, help="Longest time for one drive, s; it is ended then.")
     ] = 3600.0,
     memory: Annotated[
         float | None,
         typer.Option(
-            "--memory", metavar="MB", min=1.0, help="What one drive may hold; default: its share of the machine."
+            "--memory", metavar="MB", min=1.0, help="Most memory for one drive; default: its share of the machine's."
         ),
     ] = None,
     scheduler: Annotated[
-        str | None, typer.Option("--scheduler", metavar="ADDRESS", help="Of a Dask cluster that sees the same files.")
+        str | None,
+        typer.Option("--scheduler", metavar="ADDRESS", help="Address of a Dask cluster that sees the same files."),
     ] = None,
-    again: Annotated[bool, typer.Option("--again", help="Solve also what is done already.")] = False,
+    again: Annotated[bool, typer.Option("--again", help="Solve all drives anew, also those that are done.")] = False,
     pages: Pages = True,
     allow_outside: AllowOutside = False,
     quiet: Quiet = False,
     json: Json = False,
 ) -> None:
-    """Solve many recordings, each apart from the others: one table, one page. What is done is not done again."""
+    """Solve many recordings and tabulate the results.
+
+    Each is solved as smooth would. The same command goes on after an interruption.
+    """
     from graphnav.app import convert, outputs
     from graphnav.app.fleet import manifest, page, tables, workers
     from graphnav.app.fleet.drive import DONE, Row

@@ -22,22 +22,30 @@ commands = typer.Typer()
     "  graphnav convert out/trajectory.csv -o track.gpx --point antenna"
 )
 def convert(
-    source: Annotated[str, typer.Argument(metavar="SOURCE", help="Another program's log, or a trajectory file.")],
-    out: Annotated[Path, typer.Option("-o", "--out", metavar="OUT", help="Folder; for a trajectory, a file will do.")],
+    source: Annotated[str, typer.Argument(metavar="SOURCE", help="A known log, or a trajectory file.")],
+    out: Annotated[
+        Path, typer.Option("-o", "--out", metavar="OUT", help="Folder to write; of a trajectory also a file.")
+    ],
     format: Format = None,
     export: Export = None,
     point: Point = None,
-    rate: Annotated[float | None, typer.Option("--rate", metavar="HZ", help="Trajectory: interpolate to.")] = None,
+    rate: Annotated[
+        float | None, typer.Option("--rate", metavar="HZ", help="Of a trajectory: interpolate to this rate.")
+    ] = None,
     clock: Annotated[
         str | None,
-        typer.Option("--clock", metavar="TEXT", help="Trajectory: unix, 'gps week 2313' or a UTC date of t = 0."),
+        typer.Option(
+            "--clock",
+            metavar="TEXT",
+            help="Of a trajectory: what t counts from: unix, 'gps week 2313', or the UTC date of t = 0.",
+        ),
     ] = None,
     topic: Topic = None,
     allow_outside: AllowOutside = False,
     quiet: Quiet = False,
     json: Json = False,
 ) -> None:
-    """Turn another program's log into a recording folder, or a trajectory into another format of trajectories."""
+    """Convert a log to a recording, or a trajectory to another format."""
     from graphnav.app import convert as conversion
     from graphnav.app.outputs import output_folder
     from graphnav.core.staging import final_path, stage_results
@@ -80,15 +88,22 @@ def convert(
 def allan(
     log: Annotated[str, typer.Argument(metavar="LOG", help="A log at rest: CSV, a recording or a known log.")],
     out: Annotated[Path, typer.Option("-o", "--out", metavar="OUT", help="Folder to write into.")],
-    start: Annotated[float | None, typer.Option("--start", metavar="S", help="Begin at, s from its start.")] = None,
-    end: Annotated[float | None, typer.Option("--end", metavar="S", help="End at, s from its start.")] = None,
+    start: Annotated[
+        float | None, typer.Option("--start", metavar="S", help="Use the log from here on, s from its start.")
+    ] = None,
+    end: Annotated[
+        float | None, typer.Option("--end", metavar="S", help="Use the log up to here, s from its start.")
+    ] = None,
     format: Format = None,
     topic: Topic = None,
     allow_outside: AllowOutside = False,
     quiet: Quiet = False,
     json: Json = False,
 ) -> None:
-    """Measure the noise figures of an IMU from a log at rest, and print them as lines for recording.toml."""
+    """Measure an IMU's noise figures from a log at rest.
+
+    They are printed as lines for recording.toml; a page shows the Allan deviations.
+    """
     from graphnav.app.outputs import output_folder
     from graphnav.core.errors import RecordingError
     from graphnav.core.staging import final_path, stage_results
@@ -139,20 +154,23 @@ def allan(
 
 @commands.command(epilog="\b\nExample:\n  graphnav init imu.csv ride.nmea -o recording.toml")
 def init(
-    logs: Annotated[list[Path], typer.Argument(metavar="LOG...", help="CSV files, or logs of a known kind.")],
-    out: Annotated[Path, typer.Option("-o", "--out", metavar="FILE", help="The .toml to write.")] = Path(
+    logs: Annotated[list[Path], typer.Argument(metavar="LOG...", help="CSV files, known logs, or a folder of them.")],
+    out: Annotated[Path, typer.Option("-o", "--out", metavar="FILE", help="The .toml to write, or its folder.")] = Path(
         "recording.toml"
     ),
     name: Annotated[
         str | None,
-        typer.Option("--name", help="Of the recording; default: as the file, or its folder."),
+        typer.Option("--name", metavar="NAME", help="Name of the recording; default: that of FILE or of its folder."),
     ] = None,
-    force: Annotated[bool, typer.Option("--force", help="Write over a file that is there.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Overwrite files that are there.")] = False,
     topic: Topic = None,
     quiet: Quiet = False,
     json: Json = False,
 ) -> None:
-    """Draft a recording.toml from logs: columns, units, axes and clocks as they seem to be, and why."""
+    """Draft a recording.toml from logs, with the reason for each line.
+
+    Columns, units, axes and clocks are told from the data; lines to look at are marked CHECK.
+    """
     from graphnav.app.outputs import output_folder
     from graphnav.core.staging import stage_results
     from graphnav.recording.draft import draft
@@ -190,20 +208,23 @@ def init(
 
 @commands.command(epilog="\b\nExample:\n  graphnav simulate urban -o out/urban --seed 1")
 def simulate(
-    scenario: Annotated[str | None, typer.Argument(metavar="SCENARIO", help="Its name; none lists them.")] = None,
+    scenario: Annotated[
+        str | None, typer.Argument(metavar="SCENARIO", help="Name of the scenario; without one all are listed.")
+    ] = None,
     out: Annotated[
-        Path | None, typer.Option("-o", "--out", metavar="DIR", help="Folder for the recording; made if need be.")
+        Path | None,
+        typer.Option("-o", "--out", metavar="DIR", help="Folder for the recording; made if it is not there."),
     ] = None,
     seed: Annotated[int, typer.Option("--seed", metavar="N", help="The same seed gives the same recording.")] = 0,
     option: Annotated[
         list[str] | None,
-        typer.Option("--set", metavar="KEY=VALUE", help="An option of the scenario; may be repeated. See --list."),
+        typer.Option("--set", metavar="KEY=VALUE", help="Set an option of the scenario (see --list); may be repeated."),
     ] = None,
     listing: Annotated[bool, typer.Option("--list", help="List the scenarios and their options.")] = False,
     quiet: Quiet = False,
     json: Json = False,
 ) -> None:
-    """Make a recording with truth: a simulated drive, with the errors of simulated sensors."""
+    """Simulate a drive or a walk: a recording with its truth."""
     from graphnav.app import outputs
     from graphnav.core.staging import final_path, stage_results
     from graphnav.simulation import catalogue, options_from

@@ -44,17 +44,21 @@ def online(
     ],
     out: Annotated[Path | None, typer.Option("-o", "--out", metavar="OUT", help="Folder to write into.")] = None,
     speed: Annotated[
-        float, typer.Option("--speed", metavar="X", help="Times real time of a replay; 0: as fast as it goes.")
+        float,
+        typer.Option("--speed", metavar="X", help="Speed of a replay in times real time; 0: as fast as possible."),
     ] = 0.0,
     lag: Annotated[
-        float | None, typer.Option("--lag", metavar="S", help="How much of the future a settled state has seen.")
+        float | None,
+        typer.Option("--lag", metavar="S", help="Lag of the smoothed states: how much of the future they have seen."),
     ] = None,
     engine: Annotated[
-        str | None, typer.Option("--engine", metavar="NAME", help="What smooths: window, or isam2 (GTSAM's).")
+        str | None, typer.Option("--engine", metavar="NAME", help="Smoother: window (default), or GTSAM's isam2.")
     ] = None,
     detectors: Fire = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on from the checkpoint in OUT.")] = False,
-    send: Annotated[bool, typer.Option("--send", help="Print the recording as lines instead of smoothing it.")] = False,
+    send: Annotated[
+        bool, typer.Option("--send", help="Print the recording as lines of the protocol instead of smoothing it.")
+    ] = False,
     profile: Profile = None,
     config: Config = None,
     format: Format = None,
@@ -62,7 +66,10 @@ def online(
     allow_outside: AllowOutside = False,
     quiet: Quiet = False,
 ) -> None:
-    """Smooth while the drive happens: a recording replayed, or lines of a live source (docs/online.md)."""
+    """Filter and smooth in real time: a replay, or a live source.
+
+    A live source sends lines, as docs/online.md describes.
+    """
     from graphnav.app.outputs import output_folder
     from graphnav.config import read_settings
     from graphnav.online.session import Session

@@ -13,22 +13,37 @@ if TYPE_CHECKING:
     from graphnav.config import Settings
 
 Source = Annotated[
-    str, typer.Argument(metavar="RECORDING", help="A folder, a .toml, a known log, or a built-in name such as kitti.")
+    str,
+    typer.Argument(
+        metavar="RECORDING", help="A folder with recording.toml, a .toml, a known log, or kitti (in the gtsam package)."
+    ),
 ]
 SEVERAL = {"allow_extra_args": True}  # of which `only` has more to say than the parser
 Format = Annotated[
-    str | None, typer.Option("--format", metavar="NAME", help="Which known log it is, where that is not seen.")
+    str | None, typer.Option("--format", metavar="NAME", help="Format of the log, where it is not recognised.")
 ]
 Export = Annotated[
     str | None,
-    typer.Option("--export", metavar="NAMES", help="Formats to write: some of gpx,nav,nmea,csv,tum,kml,parquet."),
+    typer.Option(
+        "--export",
+        metavar="NAMES",
+        help="Formats to write the trajectory in: some of gpx, nav, nmea, csv, tum, kml, parquet, with commas.",
+    ),
 ]
 Point = Annotated[
-    str | None, typer.Option("--point", metavar="POINT", help="Of --export: imu, antenna or x,y,z (m; RFU).")
+    str | None,
+    typer.Option(
+        "--point",
+        metavar="POINT",
+        help="Point that --export writes: imu (default), antenna, or x,y,z: m right, forward, up of the IMU.",
+    ),
 ]
-Out = Annotated[Path, typer.Option("-o", "--out", metavar="OUT", help="Folder to write into; made if need be.")]
+Out = Annotated[
+    Path, typer.Option("-o", "--out", metavar="OUT", help="Folder for the results; made if it is not there.")
+]
 Config = Annotated[
-    Path | None, typer.Option("--config", metavar="FILE", help="Settings, TOML; or the summary.json of a run.")
+    Path | None,
+    typer.Option("--config", metavar="FILE", help="Settings file (TOML), or the summary.json of an earlier run."),
 ]
 Profile = Annotated[
     str | None, typer.Option("--profile", metavar="NAME", help="Settings for car, car+odometer or foot.")
@@ -38,21 +53,28 @@ Without = Annotated[
     typer.Option(
         "--without",
         metavar="SOURCE[:FROM-TO]",
-        help="Withhold gnss, odometer or another sensor, in a span in s from the start or throughout; may be repeated.",
+        help="Withhold gnss, odometer or another sensor, throughout or between two times in s from the start; "
+        "may be repeated.",
     ),
 ]
-Rate = Annotated[float | None, typer.Option("--rate", metavar="HZ", help="Output rate; default: at the keyframes.")]
-Pages = Annotated[
-    bool, typer.Option("--report/--no-report", help="Draw the report; 'graphnav report OUT' does it later.")
+Rate = Annotated[
+    float | None, typer.Option("--rate", metavar="HZ", help="Output rate; default: one row for each keyframe.")
 ]
-Start = Annotated[float | None, typer.Option("--start", metavar="S", help="Begin at, s from the recording's start.")]
-End = Annotated[float | None, typer.Option("--end", metavar="S", help="End at, s from the recording's start.")]
+Pages = Annotated[
+    bool, typer.Option("--report/--no-report", help="Draw the report now, or later with 'graphnav report OUT'.")
+]
+Start = Annotated[
+    float | None, typer.Option("--start", metavar="S", help="Use the recording from here on, s from its start.")
+]
+End = Annotated[
+    float | None, typer.Option("--end", metavar="S", help="Use the recording up to here, s from its start.")
+]
 Noise = Annotated[
     str | None,
     typer.Option(
         "--noise",
         metavar="stated|estimated|FILE",
-        help="How good the sensors are: as stated, estimated, or as in a file or the summary.json of a run.",
+        help="Noise figures: as stated, estimated (default), or from a file or the summary.json of a run.",
     ),
 ]
 Fire = Annotated[
@@ -60,24 +82,26 @@ Fire = Annotated[
     typer.Option(
         "--detectors",
         metavar="NAMES",
-        help="Who decides where it stands: fused (default), or some of fft,glrt,low_band_glrt,acceleration_variance,"
-        "acceleration_magnitude,angular_rate_energy, each of which then suffices.",
+        help="Detectors of stops: fused (default), or some of fft, glrt, low_band_glrt, acceleration_variance, "
+        "acceleration_magnitude, angular_rate_energy, with commas; any one of them is then enough.",
     ),
 ]
 Topic = Annotated[
     list[str] | None,
-    typer.Option("--topic", metavar="NAME", help="Of a ROS bag, one to use for its sensor; may be repeated."),
+    typer.Option("--topic", metavar="NAME", help="Topic of a ROS bag to use; may be repeated, once for each sensor."),
 ]
 Quiet = Annotated[bool, typer.Option("--quiet", help="Print nothing but errors.")]
-Json = Annotated[bool, typer.Option("--json", help="Print JSON and nothing else.")]
+Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")]
 Require = Annotated[
     list[str] | None,
     typer.Option(
-        "--require", metavar="NAME<NUMBER", help="Leave with 3 unless it holds, as h_rms<0.5; may be repeated."
+        "--require",
+        metavar="NAME<NUMBER",
+        help="Exit with code 3 unless this holds, such as h_rms<0.5; may be repeated.",
     ),
 ]
 AllowOutside = Annotated[
-    bool, typer.Option("--allow-outside", help="Read files that RECORDING names outside its own folder, too.")
+    bool, typer.Option("--allow-outside", help="Also read files outside its own folder that RECORDING names.")
 ]
 
 

@@ -48,7 +48,7 @@ def smooth(
     recording: Source,
     out: Out,
     solver: Annotated[
-        str, typer.Option("--solver", "--solvers", metavar="NAME", help="batch, incremental, isam2, rts or ekf.")
+        str, typer.Option("--solver", "--solvers", metavar="NAME", help="One of batch, incremental, isam2, rts, ekf.")
     ] = "batch",
     profile: Profile = None,
     config: Config = None,
@@ -68,7 +68,10 @@ def smooth(
     quiet: Quiet = False,
     json: Json = False,
 ) -> None:
-    """Estimate the trajectory of a recording, with its uncertainty, and write it with a report."""
+    """Estimate the trajectory of a recording with one solver.
+
+    Position, velocity and attitude are written with their sigmas, and a report.
+    """
     asked = _Options(
         pick_one(context, recording), out, profile, config, noise, detectors, without, rate, start, end, require,
         format, topic, quiet, json, pages,
@@ -90,7 +93,7 @@ def compare(
             "--solvers",
             "--solver",
             metavar="NAMES",
-            help="Some of ekf, rts, incremental, isam2, batch, with commas between.",
+            help="Some of ekf, rts, incremental, isam2, batch, with commas.",
         ),
     ] = "ekf,rts,batch",
     profile: Profile = None,
@@ -104,19 +107,29 @@ def compare(
     against: Annotated[
         list[Path] | None,
         typer.Option(
-            "--against", metavar="FILE", help="Another program's .nav, .pos, TUM or CSV to put beside; may be repeated."
+            "--against",
+            metavar="FILE",
+            help="Trajectory of another program to compare with: .nav, .pos, TUM or CSV; may be repeated.",
         ),
     ] = None,
     against_point: Annotated[
         list[str] | None,
-        typer.Option("--against-point", metavar="POINT", help="Of each --against: imu (default), antenna or x,y,z."),
+        typer.Option(
+            "--against-point",
+            metavar="POINT",
+            help="Point that a file of --against is of: imu (default), antenna or x,y,z; once for each.",
+        ),
     ] = None,
     against_shift: Annotated[
         list[float] | None,
-        typer.Option("--against-shift", metavar="S", help="To add to the stamps of each --against; default: found."),
+        typer.Option(
+            "--against-shift",
+            metavar="S",
+            help="Seconds to add to the stamps of a file of --against; default: found from the data; once for each.",
+        ),
     ] = None,
     loose: Annotated[
-        bool, typer.Option("--loose", help="Solve raw GNSS with its fixes as well, as ekf-loose and so on.")
+        bool, typer.Option("--loose", help="Raw GNSS: also solve with its single-point fixes, as ekf-loose and so on.")
     ] = False,
     export: Export = None,
     point: Point = None,
@@ -128,7 +141,10 @@ def compare(
     quiet: Quiet = False,
     json: Json = False,
 ) -> None:
-    """Put the same recording through several solvers and compare them, against the truth where there is one."""
+    """Solve a recording with several solvers and compare them.
+
+    Errors are against the truth, or against the fixes that --without withholds.
+    """
     asked = _Options(
         pick_one(context, recording), out, profile, config, noise, detectors, without, rate, start, end, require,
         format, topic, quiet, json, pages,
@@ -146,16 +162,19 @@ def compare(
 
 @commands.command(epilog="\b\nExample:\n  graphnav report out/kitti")
 def report(
-    out: Annotated[Path, typer.Argument(metavar="OUT", help="What smooth or compare wrote into.")],
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="Folder that smooth or compare wrote.")],
     quiet: Quiet = False,
     json: Json = False,
 ) -> None:
-    """Draw the pages of a run again, without solving: after another version of graphnav, or after --no-report."""
+    """Draw the reports of a run again, without solving.
+
+    After an update of graphnav, or after --no-report.
+    """
     from graphnav.app import outputs
     from graphnav.core.staging import final_path, stage_results
 
     if not out.is_dir():
-        raise ConfigError(f"{out}: no such folder; name what smooth or compare wrote into", key="file.missing")
+        raise ConfigError(f"{out}: no such folder; name the folder that smooth or compare wrote", key="file.missing")
     with bar(quiet, "detect"):
         tell("reading")
         with stage_results(out) as part:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -19,7 +19,7 @@ from graphnav.app.scores import Withheld, score
 from graphnav.config import Settings
 from graphnav.constraints.base import SAME_TIME
 from graphnav.core.complaints import suggest_nearest
-from graphnav.core.errors import ConfigError, RecordingError
+from graphnav.core.errors import ConfigError, EstimationError, RecordingError
 from graphnav.core.findings import Finding
 from graphnav.core.notes import Note
 from graphnav.core.progress import Progress, listening, tell
@@ -211,7 +211,10 @@ def _run(request: Request, progress: Progress | None) -> Outcome:
         raise ConfigError(
             f"--loose: '{used.name}' has no raw observations that are used in place of fixes", key="option.not_here"
         )
-    solutions = run(used, request.settings, request.solvers, progress, model)
+    try:
+        solutions = run(used, request.settings, request.solvers, progress, model)
+    except EstimationError as error:
+        raise _name_cause(error, inspection.findings) from None
     if request.loose:
         others = run(used, couple_loosely(request.settings), request.solvers, progress, model)
         solutions |= {name + LOOSE: replace(one, solver=name + LOOSE) for name, one in others.items()}
@@ -240,6 +243,12 @@ def _run(request: Request, progress: Progress | None) -> Outcome:
         request, recording, zero, solutions, metrics, against, names, tuple(dict.fromkeys(findings)),
         tuple(f.sentence for f in checks if f.severity != "note"), timings | seconds, checks, densities,
     )  # fmt: skip
+
+
+def _name_cause(error: EstimationError, findings: Sequence[Finding]) -> EstimationError:
+    """The error with the gravest of what the checks found, which may be why."""
+    grave = [f.sentence for f in findings if f.severity != "note"]
+    return EstimationError(f"{error}; the likely cause: {grave[0]}", key=error.key) if grave else error
 
 
 def _find_densities(recording: Recording, settings: Settings, solutions: Mapping[str, Solution]) -> ImuNoise | None:

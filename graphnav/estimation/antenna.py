@@ -24,6 +24,7 @@ from graphnav.estimation.noise.estimate import estimate_noise
 from graphnav.estimation.pipeline import origin
 from graphnav.estimation.problem import build_problem
 from graphnav.estimation.solvers.ekf import ekf
+from graphnav.estimation.solvers.gain import describe_singular
 from graphnav.estimation.solvers.rts import backward, rts
 from graphnav.recording import Recording, take_rows
 
@@ -167,11 +168,14 @@ def _estimate(recording: Recording) -> tuple[Antenna, tuple[Array, Array, Array]
     sections = {name: getattr(settings, name).model_copy(update=values) for name, values in unknown.items()}
     settings = settings.model_copy(update=sections)
     problem = build_problem(recording, settings, frame, aligned.state, aligned.sigma, still, parts_of_noise=True)
-    tell("noise")
-    problem = with_noise(problem, estimate_noise(problem, aligned.until).noise)
-    tell("filter")
-    forward = ekf(problem, opening=aligned.until)
-    parameters = rts(problem, forward, backward(problem, forward)).parameters
+    try:
+        tell("noise")
+        problem = with_noise(problem, estimate_noise(problem, aligned.until).noise)
+        tell("filter")
+        forward = ekf(problem, opening=aligned.until)
+        parameters = rts(problem, forward, backward(problem, forward)).parameters
+    except np.linalg.LinAlgError as error:
+        raise describe_singular(error) from None
     arm, axle = parameters["gnss_lever_arm"], parameters.get(AXLE)
     antenna = Antenna(recording.gnss.lever_arm, arm.value[-1], arm.sigma[-1])
     if axle is None or recording.odometer is None:

@@ -169,6 +169,7 @@ BROKEN: dict[str, tuple[Change, str]] = {
     "accelerometer in g": (imu(accel=lambda x: x / 9.80665), r'accel = "g"'),
     "accelerometer taken as g": (imu(accel=lambda x: x * 9.80665), r"leave out units\.accel"),
     "gravity removed": (imu(accel=lambda x: x - [0, 0, 9.8]), "gravity seems to have been removed"),
+    "constant gravity removed": (imu(accel=lambda x: x - [0.9, 0.4, 9.6]), "gravity seems to have been removed"),
     "gyro reversed": (imu(gyro=lambda x: -x), "the gyro's sign is reversed"),
     "accelerometer reversed": (imu(accel=lambda x: -x), "the accelerometer's sign is reversed"),
     "no overlap": (imu(t=lambda t: t + 1e6), "do not overlap in time.*time_offset"),
@@ -195,6 +196,16 @@ def test_a_broken_imu_is_found(drive: Callable[[str], Recording], case: str) -> 
     change, pattern = BROKEN[case]
     # ten minutes in motion of a drive that gets no warning at all: test_no_false_alarm_on_a_drive
     assert len(warned(change(drive("tokyo_20201105").crop(900.0, 1500.0)), pattern)) >= 1
+
+
+def test_milliseconds_that_count_from_the_start_of_the_imu_are_found(part: Callable[[str], Recording]) -> None:
+    """The first fix, at 0 ms, lies within the IMU's time."""
+    recording = part("dresden_car_20140326")
+    zero = replace(recording.gnss, t=recording.gnss.t - recording.gnss.t[0] + recording.start)
+    assert not warned(replace(recording, gnss=zero), r'units = \{ t = "ms" \}')
+    assert (
+        len(warned(replace(recording, gnss=replace(zero, t=1e3 * zero.t)), r'units = \{ t = "ms" \} in \[gnss\]')) == 1
+    )
 
 
 ODD = [

@@ -36,6 +36,11 @@ def solve_innovation(HP: Array, HPHt: Array, variance: Array, r: Array, some: Ro
         raise describe_breakdown(some) from None
 
 
+def describe_singular(error: np.linalg.LinAlgError) -> EstimationError:
+    """What is said where a matrix has lost its digits on the way."""
+    return EstimationError(f"the estimate broke down ({error}): check sigmas, units and axes", key="solver.breakdown")
+
+
 def describe_breakdown(some: RowBlock) -> EstimationError:
     """What is said where a filter's covariance cannot take in some rows."""
     at = ", ".join(f"'{rows.name}' row {lo}" for rows, lo, _ in some.parts)

@@ -22,6 +22,7 @@ from graphnav.sensors.tables import TIME
 _SURE_SIGMAS = 4.0  # sigmas
 _NO_BETTER = 0.05  # of a correlation
 _MIN_SPEED = 5.0  # m/s, at which wheels are compared
+_SELDOM = 10.0  # s between fixes that no receiver on the way is set to
 
 
 def measure_overlap(recording: Recording) -> float:
@@ -34,8 +35,10 @@ def describe_gnss_apart(recording: Recording) -> str | None:
     gnss, raw = recording.gnss, recording.raw_gnss
     own = gnss is not None and not gnss.derived  # fixes of a receiver, in place of which no observations are used
     t = raw.t if raw is not None and not own else gnss.t if gnss is not None else np.empty(0)
-    if not len(t) or min(t[-1], recording.end) >= max(t[0], recording.start):
+    if not len(t):
         return None
+    if min(t[-1], recording.end) >= max(t[0], recording.start):
+        return _describe_large_steps(t, recording) if own else None
     offset = recording.start - t[0]
     apart = (
         f"GNSS ({t[0]:.3f} to {t[-1]:.3f} s) and IMU ({recording.start:.3f} to {recording.end:.3f} s) do not "
@@ -59,6 +62,19 @@ def describe_gnss_apart(recording: Recording) -> str | None:
         f"; {abs(hours):g} h apart, one may be in local time" if hours and abs(offset - 3600.0 * hours) < 60.0 else ""
     )
     return f"{apart}; if their clocks differ, say time_offset in [gnss] ({offset:.3f} would start both together){local}"
+
+
+def _describe_large_steps(t: Array, recording: Recording) -> str | None:
+    """That most fixes lie outside the IMU's time and, in another unit than s, within it; None where that is not so."""
+    unit = _guess_stamp_unit(t, recording)
+    outside = float(np.mean((t < recording.start) | (t > recording.end)))
+    if unit is None or outside < 0.5 or len(t) < 2 or not np.median(np.diff(t)) > _SELDOM:
+        return None
+    return (
+        f"{100 * outside:.0f} % of the fixes lie outside the time of the IMU ({recording.start:.3f} to "
+        f"{recording.end:.3f} s), and within it if their stamps are in {unit}: "
+        f'say units = {{ t = "{unit}" }} in [gnss]'
+    )
 
 
 def _guess_stamp_unit(t: Array, recording: Recording) -> str | None:

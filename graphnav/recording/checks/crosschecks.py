@@ -28,6 +28,7 @@ _SLOPE, _SLOPES = 8.0, 6  # s over which a slope is taken: the force is then kno
 GRAVITY = 9.81  # m/s^2
 _MIN_SPEED = 3.0  # m/s, below which a course means little
 _FASTEST_CHANGE = 8.0  # m/s^2; what exceeds it is an error of the fix
+_CHANGES = 0.25  # m/s, by which a speed changes at least (rms) where something is told by it
 WIDE = 30.0  # s searched for clock errors
 
 
@@ -256,13 +257,20 @@ def fit_forward(imu: Imu, track: Track) -> Fit | None:
     changes too little to say anything.
     """
     i, j, y = _pair_possible(track)
-    if len(y) < MIN_PAIRS or y.std() < 0.25:
+    if len(y) < MIN_PAIRS or y.std() < _CHANGES:
         return None
     level = np.linalg.svd(find_up(imu)[None, :])[2][1:]  # (2, 3)
     fit = _fit_imu(imu, imu.accel @ level.T, track, i, j, y)
     if fit is None or len(fit.coefficients) != len(level):  # no time in common
         return None
     return replace(fit, coefficients=fit.coefficients @ level)
+
+
+def fit_force(imu: Imu, track: Track) -> Fit | None:
+    """The same of the whole force, which may lack gravity: nothing is level then. Coefficients (3,)."""
+    i, j, y = _pair_possible(track)
+    fit = _fit_imu(imu, imu.accel, track, i, j, y) if len(y) and y.std() >= _CHANGES else None
+    return fit if fit is not None and len(fit.coefficients) == 3 else None
 
 
 def fit_climb(imu: Imu, track: Track, gnss: Gnss, forward: Array) -> tuple[float, float] | None:
@@ -313,7 +321,7 @@ def fit_yaw(imu: Imu, track: Track) -> Fit | None:
 def fit_velocity(track: Track, places: Track) -> Fit | None:
     """Change of speed by places on that by velocities: how late velocities are against places; None without changes."""
     i, j, y = _pair_possible(places)
-    if len(y) < MIN_PAIRS or y.std() < 0.25:
+    if len(y) < MIN_PAIRS or y.std() < _CHANGES:
         return None
     t, travelled = track.t, np.zeros((len(track.t), 2))
     travelled[1:] = np.cumsum(0.5 * (track.v[1:, :2] + track.v[:-1, :2]) * np.diff(t)[:, None], axis=0)

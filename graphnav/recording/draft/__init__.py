@@ -273,7 +273,10 @@ class _Writer:
             self.decisions.append(f"{relative}: {words}")
         self.lines.append(f"file = {quote(relative)}")
         if source.log is not None and (topics := source.log.topics.get(sensor, ())):
-            others = f"CHECK: it has the most messages; there is also {', '.join(topics[1:])}"
+            others = (
+                f"CHECK: it has the most messages; there is also {', '.join(topics[1:])}: to use it, "
+                "draft again with --topic, since axes and noise are of this one"
+            )
             if topics[0] in self.asked:
                 others = "as was asked"
             self._key("topic", quote(topics[0]), others if len(topics) > 1 else "the only one")

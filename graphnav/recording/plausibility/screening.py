@@ -21,7 +21,7 @@ from graphnav.core.rotation import Array
 from graphnav.recording import Imu, Recording, take_rows
 from graphnav.recording.checks import crosschecks
 from graphnav.recording.checks.aiding import check_imu_axes, check_imu_clock, measure_overlap
-from graphnav.recording.checks.clock import ClockOffsets, measure_clock_offsets
+from graphnav.recording.checks.clock import FAIR, ClockOffsets, measure_clock_offsets
 from graphnav.recording.checks.crosschecks import Fit, Track
 from graphnav.recording.checks.series import screen_series
 from graphnav.recording.formats.schema import FORCE
@@ -44,6 +44,7 @@ _MOVES = 20.0  # steps of its own resolution by which an axis has moved and not 
 # What a carrier that moves exceeds by far: a thousandth of g, and the Earth's rate, which one at rest reads
 _STIRS = {"accelerometer": 1e-3 * _STANDARD_GRAVITY, "gyro": 7.3e-5}  # m/s^2, rad/s
 _NOISY = 0.05  # of the steps go back on the one before; of noise up to a band B and a rate f it is 1.5 B / f
+_NO_GRAVITY = "gravity seems to have been removed from the accelerometer; graphnav needs the raw force"
 _AXIS = "xyz"
 _UNITS = ("imu.gyro_unit", "imu.force_scale")  # findings of `imu_scale`: nothing is known of single rows then
 
@@ -176,12 +177,26 @@ def check_imu_scale(recording: Recording) -> Iterator[Finding]:
         quiet = turn <= np.percentile(turn, _QUIET)
         f = float(np.median(np.linalg.norm(imu.accel[quiet], axis=1)))
     if (sentence := _find_scale(f)) is not None:
+        sentence = _NO_GRAVITY if _lacks_gravity(recording, f) else sentence
         g = _STANDARD_GRAVITY if recording.gnss is None else _measure_gravity(recording)
         yield Finding(
             "refused",
             f"the force has a median of {f:.3g} m/s2 where it is calm, not {g:.1f}: {sentence}",
             "imu.force_scale",
         )
+
+
+def _lacks_gravity(recording: Recording, f: float) -> bool:
+    """Whether a force of f m/s^2 at rest is of the right size otherwise: the fixes' accelerations are felt so."""
+    gnss, imu = recording.gnss, recording.imu
+    if gnss is None or f > _STANDARD_GRAVITY or measure_overlap(recording) <= 0:
+        return False
+    track = crosschecks.track(gnss) if (np.abs(imu.accel) < ACCEL_RANGE).all() else None
+    fit = None if track is None else crosschecks.fit_force(imu, track)
+    if fit is None or fit.correlation < FAIR:
+        return False
+    size = float(np.log(np.linalg.norm(fit.coefficients)))  # of the true one over that felt
+    return abs(size) < abs(size + np.log(f / _STANDARD_GRAVITY))
 
 
 def _measure_gravity(recording: Recording) -> float:
@@ -203,7 +218,7 @@ def _find_scale(f: float) -> str | None:
     if 1.0 / _UNIT_RATIO < f / near < _UNIT_RATIO:
         return f"{units[near]} in [imu]"
     if f < g / FORCE["g"]:
-        return "gravity seems to have been removed from the accelerometer; graphnav needs the raw force"
+        return _NO_GRAVITY
     step = round(float(np.log2(f / g))) if np.isfinite(f) else 0
     if step and 1.0 / _UNIT_RATIO < f / (g * 2.0**step) < _UNIT_RATIO:
         times = f"{2 ** abs(step)} times too {'large' if step > 0 else 'small'}"
