@@ -18,9 +18,9 @@ R_vb = Rz(-beta) Rx(alpha), and u_v = R_vb u = (right, forward, up)::
 Both coefficients, the mounting angles (which wander: load, wind, the crown of the road), the forward place of the
 axle that does not slip, and the scale are estimated.
 
-The sigma of a mean over T seconds is a density over sqrt(T), and larger where the constraints hold less well: beyond 3 m/s^2 of
-lateral force tyres leave their linear range; in quick yaw the axle's place matters; where pitch changes quickly
-(ramps, bumps) front and rear axle are on different slopes, half a wheelbase apart.
+The sigma of a mean over T seconds is a density over sqrt(T), and larger where the constraints hold less well: beyond 3
+m/s^2 of lateral force tyres leave their linear range; in quick yaw the axle's place matters; where pitch changes
+quickly (ramps, bumps) front and rear axle are on different slopes, half a wheelbase apart.
 """
 
 from __future__ import annotations
