@@ -1,7 +1,7 @@
-"""Errors of a trajectory against a truth: at the truth's epochs, at the truth's point, in the truth's axes.
+"""Errors of a trajectory against a truth: at the truth's epochs, at its point, in its axes.
 
-`errors` compares, `measure` boils down, `summary` and `text` show; `evaluate` does it for two files and
-`evaluate_recording` for a solution of a recording, with or without a truth of its own.
+`errors` computes differences, `measure` reduces them to numbers, `summary` and `text` present these; `evaluate` does
+all of it for two files and `evaluate_recording` for a solution of a recording, with or without a truth of its own.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ __all__ = [
 
 
 def truth_of(recording: Recording) -> tuple[Trajectory, Array | None] | None:
-    """The recording's truth and the lever arm from the IMU to its point; None without one or for a closed loop.
+    """The recording's truth and the lever arm from the IMU to its point; None without truth, or for a closed loop.
 
     Raises
     ------
@@ -75,7 +75,7 @@ def truth_of(recording: Recording) -> tuple[Trajectory, Array | None] | None:
 
 @dataclass(frozen=True)
 class AntennaCalibration:
-    """What a solution found of the antenna whose withheld fixes it is compared with."""
+    """The calibration of the antenna in the solution that is compared with withheld fixes."""
 
     clock_offset: float = 0.0  # s, to be added to the fixes' stamps
     lever_arm: Array | None = None  # (3,) m, right, forward, up; None: that of the recording
@@ -151,7 +151,7 @@ def evaluate_recording(
     at: Array | None = None,
     antenna: AntennaCalibration = _AS_STATED,
 ) -> Metrics | None:
-    """Metrics of a solution against the best truth there is: the recording's own, a closed loop, or the withheld GNSS.
+    """Metrics of a solution against the best available truth: the recording's own, a closed loop, or withheld GNSS.
 
     Parameters
     ----------
@@ -208,7 +208,7 @@ def evaluate(
     spans: Sequence[tuple[float, float]] = (),
     max_gap: float = MAX_GAP,
 ) -> Metrics:
-    """Metrics of one file against another, each of any kind `read_trajectory` knows.
+    """Metrics of one file against another, each of any kind that `read_trajectory` reads.
 
     Parameters
     ----------
@@ -265,7 +265,7 @@ def evaluate(
 
 
 def _shift_hint(trajectory: Trajectory, truth: Trajectory) -> str:
-    """'; ...' naming a shift of clocks that would make the two overlap, when a usual one does."""
+    """'; ...' naming a common clock shift that would make the two overlap, if there is one."""
     middle = 0.5 * (truth.t[0] + truth.t[-1] - trajectory.t[0] - trajectory.t[-1])
     half = 0.5 * (truth.t[-1] - truth.t[0] + trajectory.t[-1] - trajectory.t[0])
     unix = GPS_TO_UNIX - LEAP
@@ -287,7 +287,7 @@ def _shift_hint(trajectory: Trajectory, truth: Trajectory) -> str:
 def _leap_hint(
     found: Errors, trajectory: Trajectory, truth: Trajectory, lever_arm: Array | None, max_gap: float
 ) -> tuple[str, ...]:
-    """A note if 18 s of shift would explain most of the error: UTC taken for GPS time or the other way round."""
+    """A note if a shift of 18 s would explain most of the error: UTC taken for GPS time or the reverse."""
     before = float(np.sqrt(np.nanmean(found.horizontal**2)))
     if before < 1.0:
         return ()

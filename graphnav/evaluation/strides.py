@@ -1,9 +1,9 @@
 """Scores of a walk without a place on the Earth: shape, strides, height and closure.
 
-A solution's position and heading count from zero at its start, a truth in a local frame from anywhere. For the shape,
+Position and heading of a solution count from zero at its start, a truth in a local frame from anywhere. For the shape,
 yaw and offset are fitted over all epochs, as in `graphnav.evaluation.scoring`. For consistency that would be wrong: the
-solution is certain of its start and says of all else how far from there it may be. So the truth is moved to the
-solution where it begins, and only the yaw is fitted.
+solution is certain at its start and states everything else relative to it. So the truth is moved to the start of the
+solution, and only the yaw is fitted.
 """
 
 from __future__ import annotations
@@ -21,29 +21,29 @@ from graphnav.evaluation.scoring import closure
 from graphnav.recording import Recording
 
 _SPACING = 0.1  # s between the epochs compared with a dense truth
-_STANDS = 1.0  # s at the start of which a dense truth is averaged to place it
-_TURNS = 10  # of fitting a place on the foot; and epochs that make a shape
-_A_STRIDE = 0.3  # m; points closer together are no stride
+_STANDS = 1.0  # s at the start over which a dense truth is averaged to place it
+_TURNS = 10  # iterations of fitting a point on the foot; and epochs needed for a shape
+_A_STRIDE = 0.3  # m; the smallest distance between footprints that counts as a stride
 
 
 @dataclass(frozen=True)
 class WalkErrors:
-    """Of one solution; NaN where the truth does not tell. Sizes in m, NEES per degree of freedom (1 where true)."""
+    """Errors of one solution; NaN where the truth lacks the quantity. Lengths in m, NEES per degree of freedom."""
 
-    horizontal: float  # rms after the fit; of a loop, start to end
+    horizontal: float  # rms after the fit; for a loop, distance of the end from the start
     in_stance: float  # the same over the epochs in a stance only
     of_steps: float  # the same over the means of stances, so that a rest counts like a step
-    of_point: float  # the same with the place on the foot fitted that the truth is of
-    up: float  # rms with the start's height taken off; of a loop, end less start
+    of_point: float  # the same with the truth's point on the foot fitted
+    up: float  # rms relative to the height at the start; for a loop, end minus start
     stride: float  # median of stride length over its truth; 1 where there is no bias
     nees_h: float
     nees_up: float
 
 
 def floor_sigma(recording: Recording, solution: Solution) -> float:
-    """1-sigma of a coordinate of a dense truth, m: how its heights scatter from stance to stance on a flat floor.
+    """1-sigma of a coordinate of a dense truth, m: scatter of its heights between stances on a flat floor.
 
-    The first and the last are left out, in which the foot stands as it does in none between them.
+    The first and the last are left out, in which the foot stands differently.
     """
     truth = recording.truth
     assert truth is not None
@@ -100,7 +100,7 @@ def walk_errors(recording: Recording, solution: Solution, truth_sigma: float = 0
     else:
         true, mine = (np.linalg.norm(np.diff(x[:, :2], axis=0), axis=1) for x in (X, p))
         stride = float(np.median((mine / true)[true > _A_STRIDE]))
-    # points are measured where a foot stands; a dense truth has it in the air as well
+    # surveyed points are measured where a foot stands; a dense truth also covers the swing
     stances = _stances(solution) if X.shape[1] == 3 else np.empty((0, 2))
     horizontal, in_stance, of_steps = shapes(t, p, flat, stances)
     return WalkErrors(horizontal, in_stance, of_steps, of_point, up, stride, float(np.mean(nees_h)), nees_up)
@@ -133,7 +133,7 @@ def _of_loop(solution: Solution, sigma: float) -> WalkErrors:
 
 
 def _stances(solution: Solution) -> Array:
-    """(S, 2) s, where the foot stands; none where it was not looked for."""
+    """(S, 2) s, the stances; none where they were not detected."""
     return next((d.intervals for d in solution.detections if d.name == "fused"), np.empty((0, 2)))
 
 
@@ -144,7 +144,7 @@ def _shape(p: Array, truth: Array) -> float:
 
 
 def fit_point(states: States, flat: Array) -> tuple[float, Array]:
-    """Horizontal rms after fitting yaw, offset and a lever arm in the body, by turns, and that arm (3,), m."""
+    """Horizontal rms after fitting yaw, offset and, alternately, a lever arm in the body; and that arm (3,), m."""
     arm = np.zeros(3)
     level = states.R_nb[:, :2]
     for _ in range(_TURNS):
