@@ -1,4 +1,4 @@
-"""One page for a fleet: what it comes to, how its figures are spread, where it drove, and its drives, worst first."""
+"""One page for a fleet: totals, distributions of its figures, maps, and its drives, worst first."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from graphnav.app.fleet.drive import DONE, Row
 from graphnav.app.fleet.tables import numbers, totals, worst_first
 from graphnav.core.rotation import Array
 
-_LISTED = 1000  # drives in the table of the page; the files have all
-DRAWN = 2000  # tracks on the maps, of the drives that were done first
-_APART = 0.5  # deg; tracks further apart are on another map
+_LISTED = 1000  # drives in the page's table; the files contain all
+DRAWN = 2000  # tracks on the maps, of the drives that were solved first
+_APART = 0.5  # deg; tracks further apart go on different maps
 _MAPS = 12
 _SPREAD = {
     "span_end_h_median_m": "Horizontal error at the end of a withheld span, median of a drive (m)",
@@ -50,7 +50,7 @@ a{color:var(--ink)}
 
 
 def write_page(rows: Sequence[Row], path: Path, title: str) -> None:
-    """Write the page; links go to the reports beside it."""
+    """Write the page; it links to the reports beside it."""
     found = totals(rows)
     said = ", ".join(f"{count} {status}" for status, count in found["status"].items())
     lead = (
@@ -98,7 +98,7 @@ def _format_value(value: object) -> str:
 
 
 def _draw_histogram(x: Array, label: str) -> str:
-    """Bars over decades where values are spread over more than one, else over even steps."""
+    """A histogram with logarithmic bins where values span more than a decade, otherwise even ones."""
     if x.min() == x.max():
         return f"<figure><figcaption>{escape(label)}: {x[0]:.4g} of all</figcaption></figure>"
     log = bool(x.min() > 0.0 and x.max() > 10.0 * x.min())
@@ -125,7 +125,7 @@ def _label(value: float, log: bool) -> str:
 
 
 def _draw_maps(rows: Sequence[Row]) -> str:
-    """All tracks, those near each other on one map."""
+    """All tracks, those close to each other on one map."""
     placed = [(np.array(row["track"], dtype=float), row) for row in rows if row.get("track")]
     groups: list[list[tuple[Array, Row]]] = []
     for track, row in placed[:DRAWN]:
