@@ -18,26 +18,28 @@ from graphnav.core.errors import RecordingError
 from graphnav.core.rotation import Array
 
 PER_DECADE = 12  # averaging times
-_FEWEST_PERIODS = 9  # periods of the longest averaging time that the log must hold
-_SHORTEST = 60.0  # s of a log that is worth it
+_FEWEST_PERIODS = 9  # periods of the longest averaging time that the log must contain
+_SHORTEST = 60.0  # s, shortest log that is accepted
 _FLAT = 2.0 / np.pi * np.log(2.0)
-_MEANS_OF = 1.0  # s, of the means that show whether the log moves
-_TURNS, _PUSHES = np.radians(1.0), 0.1  # rad/s, m/s^2: more than this from the median, and it moves
+_MEANS_OF = 1.0  # s, over which means are taken to detect motion
+_TURNS, _PUSHES = np.radians(1.0), 0.1  # rad/s, m/s^2: deviation from the median above which the log is not at rest
 
 
 @dataclass(frozen=True)
 class AllanFigures:
-    """Figures of one sensor per axis (3,): of a gyro rad/s/sqrt(Hz), rad/s, rad/s/sqrt(s); with m/s^2 of forces."""
+    """Figures of one sensor per axis (3,): of a gyro in rad/s/sqrt(Hz), rad/s, rad/s/sqrt(s); of an accelerometer with
+    m/s^2.
+    """
 
     white: Array  # N, angle or velocity random walk
     instability: Array  # B
-    walk: Array  # K, 0 where the log is too short to see it
-    floor: Array  # s, where the deviation is lowest
+    walk: Array  # K, 0 where the log is too short to show it
+    floor: Array  # s, averaging time at the lowest deviation
 
 
 @dataclass(frozen=True)
 class Allan:
-    """Deviations of the six axes at averaging times, and the figures fitted to them."""
+    """Allan deviations of the six axes, and the figures fitted to them."""
 
     tau: Array  # (M,) s
     gyro: Array  # (M, 3) rad/s
@@ -48,7 +50,7 @@ class Allan:
     rate: float  # Hz
 
     def lines(self) -> list[str]:
-        """The lines to paste under [imu.noise]: root mean squares over the axes."""
+        """The lines for [imu.noise]: root mean squares over the axes."""
         out = []
         for name, noise, unit in (("gyro", self.gyro_noise, "rad/s"), ("accel", self.accel_noise, "m/s2")):
             out.append(_line(f"{name}_noise_density", _compute_rms(noise.white), f"{unit}/sqrt(Hz)"))
@@ -98,7 +100,9 @@ def allan_of(t: Array, gyro: Array, accel: Array) -> Allan:
 
 
 def find_motion(t: Array, gyro: Array, accel: Array) -> float | None:
-    """The first time (s from the start) at which means over a second leave the median of the log; None at rest."""
+    """The first time (s from the start) at which means over a second deviate from the median of the log; None at
+    rest.
+    """
     n = max(round(_MEANS_OF / float(np.median(np.diff(t)))), 1)
     for samples, limit in ((gyro, _TURNS), (accel, _PUSHES)):
         means = samples[: len(samples) // n * n].reshape(-1, n, 3).mean(1)
@@ -129,7 +133,7 @@ def _fit(tau: Array, deviation: Array, count: int) -> AllanFigures:
     """N, B and K of each axis."""
     from scipy.optimize import nnls
 
-    # the relative sigma of a variance from as many independent differences as fit into the log
+    # relative sigma of a variance from as many independent differences as the log contains
     weight = np.sqrt(np.maximum(count * tau[0] / tau / 2.0 - 1.0, 0.5))
     terms = np.stack([1.0 / tau, np.full(len(tau), _FLAT), tau / 3.0], -1)
     out = []
