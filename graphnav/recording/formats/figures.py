@@ -1,6 +1,6 @@
 """Noise figures as data sheets print them: "0.15 deg/sqrt(h)", "7 deg/h", "60 ug/sqrt(Hz)", "300 ppm".
 
-A figure is a number and a unit. What unit a key takes follows from what it is; a number alone is SI.
+A figure is a number and a unit. Each key accepts the units of its quantity; a number alone is in SI.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ def _per_root(units: dict[str, float], roots: dict[str, float]) -> dict[str, flo
 _HZ = {"hz": 1.0}
 _GYRO_NOISE = _per_root(_RATE, _HZ) | _per_root(_ANGLE, _TIME)
 _ACCEL_NOISE = _per_root(_FORCE, _HZ) | _per_root(_SPEED, _TIME)
-# the same dimension in two ways: rad/s/sqrt(s), as here, and rad/s2/sqrt(Hz), as Kalibr has it
+# the same dimension written in two ways: rad/s/sqrt(s), as here, and rad/s2/sqrt(Hz), as in Kalibr
 _GYRO_WALK = _per_root(_RATE, _TIME) | _per_root({"rad/s2": 1.0, "deg/s2": _DEG}, _HZ)
 _ACCEL_WALK = _per_root(_FORCE, _TIME) | _per_root({"m/s3": 1.0}, _HZ)
 _RATIO = {"%": 1e-2, "ppm": 1e-6}
@@ -55,7 +55,7 @@ _FIGURE = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*([^\s\d.
 
 
 def parse_figure(key: str, value: Any) -> Any:
-    """A figure in SI: numbers as they are, text by its unit. Anything else is left for the caller to refuse.
+    """Convert a figure to SI: numbers unchanged, text by its unit. Anything else is left for the caller to refuse.
 
     Raises
     ------
@@ -83,7 +83,7 @@ def parse_figure(key: str, value: Any) -> Any:
 
 
 def _normalise_unit(unit: str) -> str:
-    """One spelling of a unit: lower case, no blanks, ASCII."""
+    """Normalise a unit: lower case, no blanks, ASCII."""
     text = unit.lower().replace(" ", "").replace("·", "").replace("*", "")
     for old, new in (
         ("°", "deg"),

@@ -1,4 +1,4 @@
-"""Odometers as they are: what a reading is worth, where readings are wrong, and the mean speed over any window."""
+"""Odometers: error of a reading, wrong readings, and the mean speed over any window."""
 
 from __future__ import annotations
 
