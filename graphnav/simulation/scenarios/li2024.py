@@ -56,7 +56,7 @@ def run(
     edges = tuple(START + x for x in (150.0, 210.0, 380.0, 500.0, 680.0, 770.0)) if short else STOPS
     rng = stream(seed, "way")
     plan, t = [Manoeuvre(15.0, 0.0)], start + 15.0
-    # a stop's edges are where the wheels stand to the tenth of a second: the plan allows for the spline's reach
+    # edges of a stop are where the wheels stand to the tenth of a second: the plan accounts for the spline's extent
     for begin, finish in (edges[0:2], edges[2:4], edges[4:6], (end - 5.0, end)):
         still, away = begin - SETTLE, finish + SETTLE if finish < end else end
         plan += [*streets(still - t, rng), Manoeuvre(away - still, 0.0)]
@@ -87,7 +87,7 @@ def run(
 
 
 def _list_events(edges: tuple[float, ...], seed: int) -> list[Boarding | Fidget]:
-    """Who gets in and out when: a door at stop 1, most at stop 2, two doors at stop 3; no seat is quite still."""
+    """Passengers: a door at stop 1, most at stop 2, two doors at stop 3; no seat is completely still."""
     rng = stream(seed, "events")
 
     def at(stop: int, share: float) -> float:
