@@ -1,4 +1,4 @@
-"""From a recording to solutions: cut where it must be, align, pose, solve with each solver."""
+"""From a recording to solutions: split where necessary, align, build the problem, solve with each solver."""
 
 from __future__ import annotations
 
@@ -40,10 +40,10 @@ from graphnav.recording import Own, Recording
 from graphnav.recording.checks.aiding import describe_gnss_apart
 from graphnav.recording.plausibility.screening import screen_recording
 
-SOLVERS = ("ekf", "rts", "batch")  # that run when none is named
+SOLVERS = ("ekf", "rts", "batch")  # run when none is named
 KNOWN = ("ekf", "rts", "incremental", "isam2", "batch")
 _CLEARLY = 10.0  # half chi-square; a likelihood ratio of 22,000
-_SHORTEST = 5.0  # s; a piece between two cuts that is shorter cannot be aligned
+_SHORTEST = 5.0  # s; a shorter piece between two cuts cannot be aligned
 
 
 def run(
@@ -99,7 +99,7 @@ def run(
 def with_own(
     recording: Recording, constraints: Sequence[type[Constraint]] = (), detectors: Sequence[type[Detector]] = ()
 ) -> Recording:
-    """The recording, or the setup of a live source, with classes of a script to be solved with as well.
+    """The recording, or the setup of a live source, with the constraints and detectors of a script added.
 
     Raises
     ------
@@ -132,7 +132,8 @@ def _run(
         notes.append(Note("pieces.parts", sentence))
     for part in parts:
         try:
-            # matrices here have thirty rows: threads for them cost more than the work, twenty times on a busy machine
+            # matrices here have thirty rows: threads for them cost more than the work, twenty times as much on a busy
+            # machine
             with threadpool_limits(limits=1, user_api="blas"):
                 solved = _solve_with_retry(part.recording, settings, frame, solvers, progress, noise)
             found.append({name: crop_solution(one, part) for name, one in solved.items()})
@@ -155,7 +156,7 @@ def _solve_with_retry(
     progress: Progress | None,
     noise: NoiseModel | None,
 ) -> dict[str, Solution]:
-    """`_solve`; where a filter breaks down, without what its covariance may not have the digits for, or as stated."""
+    """`_solve`; where a filter breaks down numerically, again with a simpler model or stated noise."""
     try:
         return _solve(recording, settings, frame, solvers, progress, noise)
     except (EstimationError, np.linalg.LinAlgError) as error:
@@ -172,7 +173,7 @@ def _solve_with_retry(
 
 
 def _simplify(settings: Settings, noise: NoiseModel | None) -> Iterator[tuple[Settings, NoiseModel | None, Note]]:
-    """Settings and noise models that ask less of a covariance, and what to say of them."""
+    """Settings and noise models that demand less numerical precision of a covariance, with notes."""
     still = settings.standstill.model_copy(update={"held_position": False})
     if settings.standstill.held_position:
         settings = settings.model_copy(update={"standstill": still})
@@ -219,12 +220,12 @@ def _solve(
     out = {"ekf": forward.solution}
     if "rts" in solvers:
         out["rts"] = rts(problem, forward, smoothed)
-    # what a run does not need is not imported: GTSAM least of all
+    # modules are imported only where a run needs them, above all GTSAM
     if "batch" in solvers:
         from graphnav.estimation.solvers.batch import batch
 
         out["batch"] = batch(problem, start.states, start.nodes(problem), progress=progress)
-        # what it took to get there is part of it
+        # includes the attempts before
         out["batch"] = replace(out["batch"], timings={**forward.solution.timings, **out["batch"].timings})
     begin = found.aligned.state if found.diverged else None
     if "incremental" in solvers:
@@ -269,7 +270,7 @@ def _solve(
 
 
 def _bind_graph(problem: Problem, solution: Solution) -> Callable[[], tuple[Any, Any]]:
-    """What makes the problem GTSAM's, with a solution's values of parameters."""
+    """Attach the conversion to GTSAM, with a solution's values of parameters."""
 
     def export() -> tuple[Any, Any]:
         from graphnav.estimation.nonlinear import Exported  # which needs GTSAM
@@ -281,7 +282,7 @@ def _bind_graph(problem: Problem, solution: Solution) -> Callable[[], tuple[Any,
 
 
 def check_profile(recording: Recording, settings: Settings) -> list[str]:
-    """What the settings' profile asks for and the recording lacks, in sentences.
+    """Notes on what the settings' profile requires and the recording lacks.
 
     Raises
     ------
@@ -316,7 +317,7 @@ def origin(recording: Recording) -> np.ndarray:
 
 
 def _split_pieces(recording: Recording, settings: Settings) -> tuple[list[Recording], list[str]]:
-    """The recording cut at IMU gaps too long to bridge, and a sentence for each cut."""
+    """The recording split at IMU gaps too long to bridge, and a note on each cut."""
     t = recording.imu.t
     cuts = np.flatnonzero(np.diff(t) > settings.keyframes.bridge)
     if not len(cuts):

@@ -1,16 +1,16 @@
 """The first state of a drive: attitude, velocity, position and biases at the first IMU sample, with sigmas.
 
-A short smoothing problem, posed and solved with the same parts as the whole drive, over the first stretch in
-which the vehicle moves. Levelling (the mean specific force points up) and the median turn rate (a vehicle
-mostly goes straight or stands) start it, and the heading that turns the felt accelerations into those of the
-fixes, or one of three more 90 degrees apart: the one that explains the fixes best wins. So neither speed nor a standing
-start is assumed. What is too slow to feel its accelerations knows its heading by its course, which is forwards unless
-they say otherwise. From there the gyro carries the attitude back to the first sample. Before anything moves, two
-antennas tell the heading of a vehicle that stands.
+A short smoothing problem is built and solved like that of the whole drive, over the first span in which the vehicle
+moves. Its initial attitude comes from levelling (the mean specific force points up), its gyro bias from the median turn
+rate (a vehicle mostly goes straight or stands), its heading from the rotation that maps the measured accelerations to
+those of the fixes; three more headings 90 degrees apart are tried, and the one that explains the fixes best is used. So
+neither speed nor a stationary start is assumed. A vehicle too slow for measurable accelerations gets its heading from
+its course, taken as forwards unless they show reverse. From there the gyro carries the attitude back to the first
+sample. Before any motion, two antennas give the heading of a stationary vehicle.
 
-What the short problem learned, the long one will learn again from the same data. So the result enters as the
-point to start from, with a prior `prior_inflation` times wider than its own sigma: information counts once. Only
-what the fixes do not contain, that a vehicle's forward axis is roughly its course, enters at its own worth.
+The whole drive's problem uses the data of the short one again. So the result enters as its initial point, with a prior
+`prior_inflation` times wider than its own sigma: information counts once. Only information that is not in the fixes,
+that a vehicle's forward axis is roughly its course, enters with its own weight.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def align(
 
 
 def ready(recording: Recording, settings: Settings, stationary: Array | None = None) -> bool:
-    """Whether the fixes so far show all the motion that an alignment wants to see, or two antennas tell the heading.
+    """Whether the fixes so far contain all the motion that an alignment needs, or two antennas give the heading.
 
     Parameters
     ----------
@@ -71,7 +71,7 @@ def ready(recording: Recording, settings: Settings, stationary: Array | None = N
 
 
 def with_known_heading(found: Alignment, settings: Settings) -> Alignment:
-    """The alignment with the start heading the user states, where there is one."""
+    """The alignment with the initial heading that the user states, if any."""
     known = settings.alignment.heading
     if known is None:
         return found

@@ -1,4 +1,4 @@
-"""What the direction of travel says of the heading of a vehicle, beside what its accelerations say."""
+"""The heading of a vehicle by its direction of travel, in addition to its accelerations."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from graphnav.estimation.alignment.travel import average_across, travel
 from graphnav.estimation.solution import Solution
 from graphnav.recording import Gnss
 
-COURSE_SIGMA = np.radians(10.0)  # rad, a stated forward axis against the course: mounting, side slip
-_SIGMAS = 3.0  # by which accelerations must speak for reverse, or against the course at all
-_DOUBT = 2.0  # sigmas for reverse beyond which forwards is not to be taken for granted either
+COURSE_SIGMA = np.radians(10.0)  # rad, 1-sigma of the stated forward axis against the course: mounting, side slip
+_SIGMAS = 3.0  # significance at which accelerations show reverse, or contradict the course
+_DOUBT = 2.0  # sigmas in favour of reverse beyond which forwards is not assumed either
 
 
 @dataclass(frozen=True)
 class Heading:
-    """What is known of a heading, and how well."""
+    """A heading with its sigma."""
 
     turn: float  # rad clockwise, from that of the solution
     own: float  # rad, 1-sigma
@@ -29,10 +29,10 @@ class Heading:
 
 
 def with_course(tried: list[Solution], fixes: Gnss, own: float, wide: float) -> Heading:
-    """Bring in that a vehicle's forward axis is its course, forwards or in reverse, to `COURSE_SIGMA`.
+    """Use that a vehicle's forward axis is its course, forwards or in reverse, to `COURSE_SIGMA`.
 
-    Reverse, if the accelerations say so at three sigmas; at two the course is left aside; forwards otherwise. They mean
-    a heading of density exp(cos(heading - found) / sigma^2) / const, which for a small sigma is that of Gauss.
+    Reverse if the accelerations show it at three sigmas; at two the course is not used; forwards otherwise. The
+    assumption is a heading of density exp(cos(heading - found) / sigma^2) / const, which is Gaussian for a small sigma.
 
     Parameters
     ----------
@@ -49,7 +49,7 @@ def with_course(tried: list[Solution], fixes: Gnss, own: float, wide: float) -> 
     alike = _count_alike(float(way.turn[-1]), float(gone[-1]), dt)
     own = min(np.pi, float(np.hypot(np.sqrt(alike) * own, _spread(tried, least, alike))))
     wide = max(own, wide)
-    # the longer the way, the less do fixes err in its direction, and the more has a biased gyro turned
+    # over a longer distance, fixes err less in its direction, and a biased gyro has turned further
     up, P = best.states.R_nb[0, 2], best.covariance[0][12:15, 12:15]
     drift = 0.5 * gone * np.sqrt(alike * (up @ P @ up))
     sigma = np.hypot(way.sigma / np.maximum(np.abs(way.D), 1e-9), drift)
@@ -67,7 +67,7 @@ def with_course(tried: list[Solution], fixes: Gnss, own: float, wide: float) -> 
             ),
         )
     if abs(off) > _SIGMAS * np.hypot(course, own) or -0.5 * _SIGMAS**2 < for_forwards < -0.5 * _DOUBT**2:
-        # the axes may be wrong, the accelerations or the course: a sigma has to cover them all
+        # the axes may be wrong, the accelerations or the course: the sigma has to cover all of them
         notes = (
             Note(
                 "alignment.axes",
@@ -80,7 +80,7 @@ def with_course(tried: list[Solution], fixes: Gnss, own: float, wide: float) -> 
 
 
 def _spread(tried: list[Solution], least: int, alike: float) -> float:
-    """How far (rad) the headings of all solutions are from the best one, each as likely as its fit says."""
+    """Spread (rad) of the headings of all solutions about the best one, each weighted by its likelihood."""
     weight = np.array([np.exp((tried[least].cost - one.cost) / alike) for one in tried])
     heading = np.array([rotation.to_rph(one.states.R_nb[0])[2] for one in tried])
     off = rotation.wrap(heading - heading[least])
@@ -88,10 +88,10 @@ def _spread(tried: list[Solution], least: int, alike: float) -> float:
 
 
 def _count_alike(turn: float, length: float, dt: float) -> float:
-    """How many fixes in a row are worth one at worst, for what changes as quickly as a vehicle's motion.
+    """Number of successive fixes that are worth one in the worst case, for changes as fast as a vehicle's motion.
 
     At a rate w (rad/s), errors of the variance s^2 that are white from fix to fix have the density s^2 dt; the worst
-    that last (`graphnav.estimation.alignment.travel`), s^2 / w. The rate is that of the turns (rad, in so many
-    seconds), or one turn in the stretch.
+    correlated ones (`graphnav.estimation.alignment.travel`), s^2 / w. The rate is that of the turns (rad, in so many
+    seconds), or one turn in the span.
     """
     return max(1.0, length / (max(turn, 2.0 * np.pi) * dt))
