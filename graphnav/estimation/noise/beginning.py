@@ -10,7 +10,7 @@ from graphnav.estimation.noise.model import RowWeights
 from graphnav.estimation.noise.moments import row_moments
 from graphnav.estimation.noise.outliers import limit_scaled, list_reduced
 from graphnav.estimation.problem import Problem
-from graphnav.estimation.solvers.ekf import ekf, refilter
+from graphnav.estimation.solvers.ekf import ekf, near, refilter
 from graphnav.estimation.solvers.linearise import Points
 from graphnav.estimation.solvers.passes import ForwardRecord, SmootherPass, near_to
 from graphnav.estimation.solvers.rts import backward
@@ -56,7 +56,7 @@ def find_beginnings(problem: Problem, opening: float | None) -> tuple[list[Begin
             found = weigh_rows(problem, refilter(problem, about, watch=True, drifts=False).weights)
             if _list_unused(found) == _list_unused(sound):
                 break
-            about, sound = backward(found, ekf(found, opening=opening)), found
+            sound, (_, about) = found, near(found, about, opening)
             passes += 2
         if sound is problem:
             return [(plain, {})], passes

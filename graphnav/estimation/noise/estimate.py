@@ -173,11 +173,11 @@ def _iterate(
 ) -> NoiseEstimate:
     """The estimate from figures, and points to linearise at, on."""
     passes, total, converged = 0, len(problem.t), False
-    rounds = _AGAIN if figures.same_data else _ROUNDS
     ends = [total] if total <= 2 * _FIRST or figures.known else [_FIRST, total]
     latest: tuple[ForwardRecord, SmootherPass] | None = None
     for end in ends:
         before, converged, figures.ahead = -np.inf, False, 1.0
+        rounds = _AGAIN if figures.same_data or end != ends[0] else _ROUNDS
         likeliest, most = figures, -np.inf
         for k in range(_MOST):
             used, latest = with_noise(problem, figures.model()), None  # the pass before takes as much memory as this

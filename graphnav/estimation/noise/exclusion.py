@@ -27,7 +27,7 @@ shows once it is, and is taken back where that is likelier.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -38,7 +38,7 @@ from graphnav.core.rotation import Array
 from graphnav.estimation import faults
 from graphnav.estimation.noise.apply import row_weights, with_noise
 from graphnav.estimation.noise.estimate import NoiseEstimate, estimate_noise
-from graphnav.estimation.noise.explanations import FIXES, ONE_SENSOR, ROWS, WRONG, evidence, mask_within
+from graphnav.estimation.noise.explanations import FIXES, ONE_SENSOR, ROWS, WHEELS, WRONG, Kinds, evidence, mask_within
 from graphnav.estimation.noise.model import INTERVALS, NoiseModel, RowWeights
 from graphnav.estimation.noise.moments import row_moments
 from graphnav.estimation.noise.outliers import CHANCE, limit_squares
@@ -101,7 +101,8 @@ def _readmit(base: Problem, found: NoiseEstimate) -> NoiseEstimate:
     narrow = trim_spans(spans, surprise, FALSE_ALARM)
     if not narrow or narrow == spans:
         return found
-    with_all, without = (decide(base, with_weights(found, surprise, some), some) for some in (spans, narrow))
+    among = _list_explanations(found.noise)
+    with_all, without = (decide(base, with_weights(found, surprise, some), some, among) for some in (spans, narrow))
     looks = found.looks + with_all.looks + without.looks
     if without.log_evidence <= with_all.log_evidence:
         return replace(found, looks=looks)
@@ -139,7 +140,7 @@ def with_disturbed_intervals(base: Problem, found: NoiseEstimate) -> NoiseEstima
 def _log_evidence(base: Problem, found: NoiseEstimate) -> float:
     """Of all measurements, those that are left out too; each outlier among the others has its cost."""
     spans = _join(span for some in found.noise.excluded.values() for span in some)
-    whole = decide(base, found, spans).log_evidence if spans else found.log_posterior
+    whole = decide(base, found, spans, _list_explanations(found.noise)).log_evidence if spans else found.log_posterior
     outliers = sum(_count(_outside(some, spans)) for some in found.noise.weights.values())
     return whole - _OUTLIER * outliers
 
@@ -267,8 +268,10 @@ def find_spans(base: Problem, noise: NoiseModel, found: NoiseEstimate) -> list[t
     return join_spans(faults.fault_spans(faults.weigh_rows(open_, watched.weights)))
 
 
-def decide(base: Problem, found: NoiseEstimate, spans: list[tuple[float, float]]) -> Explained:
-    """Who is wrong in each span, by the figures found."""
+def decide(
+    base: Problem, found: NoiseEstimate, spans: list[tuple[float, float]], among: Collection[Kinds] = WRONG
+) -> Explained:
+    """Who is wrong in each span, by the figures found: nobody, or one of some explanations."""
     if not spans:
         return Explained(found.noise, found.log_posterior, 0, 0)
     noise = replace(found.noise, excluded={})
@@ -284,7 +287,7 @@ def decide(base: Problem, found: NoiseEstimate, spans: list[tuple[float, float]]
     known = values_of(with_noise(base, found.noise), found.points)
     about = points_of(used, found.points.states, known)
     posed = {kinds: with_noise(base, replace(noise, weights=outside | some)) for kinds, some in beside.items()}
-    before, likelihood, looks = evidence(used, about, spans, posed)
+    before, likelihood, looks = evidence(used, about, spans, posed, among)
     excluded: dict[str, tuple[tuple[float, float], ...]] = {}
     total = before + found.log_prior
     dropped: dict[str, list[tuple[float, float]]] = {name: [] for name in noise.weights}
@@ -305,6 +308,15 @@ def decide(base: Problem, found: NoiseEstimate, spans: list[tuple[float, float]]
     excluded = {name: some for name, some in excluded.items() if name in present}
     weights = {name: _outside(some, dropped[name]) for name, some in noise.weights.items()}
     return Explained(replace(noise, weights=weights, excluded=excluded), total, 0, looks)
+
+
+def _list_explanations(noise: NoiseModel) -> set[Kinds]:
+    """Those by which a noise model leaves spans out."""
+    found = set[Kinds]()
+    for span in {span for some in noise.excluded.values() for span in some}:
+        names = {name for name, some in noise.excluded.items() if span in some}
+        found.add(WHEELS if names & set(WHEELS) else tuple(name for name in FIXES if name in names))
+    return found
 
 
 def _count(some: RowWeights) -> int:

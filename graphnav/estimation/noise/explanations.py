@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -23,7 +23,8 @@ from graphnav.recording import Recording
 
 FIXES, WHEELS = ("gnss_position", "gnss_velocity"), ("nhc", "odometer")
 ROWS = ("rows",)
-WRONG: tuple[tuple[str, ...], ...] = ((), FIXES[:1], FIXES[1:], FIXES, WHEELS, INTERVALS, ROWS)
+Kinds = tuple[str, ...]  # constraints that an explanation says are wrong
+WRONG: tuple[Kinds, ...] = ((), FIXES[:1], FIXES[1:], FIXES, WHEELS, INTERVALS, ROWS)
 ONE_SENSOR = FIXES[:1], FIXES[1:], WHEELS  # wrong in a span: the others are not, but may have outliers there
 _NONE = 1e-9  # sigma of an error that is not there
 
@@ -113,7 +114,11 @@ def with_own_errors(problem: Problem, spans: list[tuple[float, float]], kinds: t
 
 
 def evidence(
-    problem: Problem, about: Points, spans: list[tuple[float, float]], beside: Mapping[tuple[str, ...], Problem]
+    problem: Problem,
+    about: Points,
+    spans: list[tuple[float, float]],
+    beside: Mapping[Kinds, Problem],
+    among: Collection[Kinds] = WRONG,
 ) -> tuple[float, Array, int]:
     """Log-likelihood of innovations before all spans, (M, 7) from each span's beginning on, by `WRONG`, and passes.
 
@@ -123,6 +128,7 @@ def evidence(
     about : points of all keyframes.
     spans : s, first and last wrong fix, in order and apart.
     beside : by `WRONG`, the problem with more noise of single intervals of the IMU or less weight of single rows.
+    among : explanations to weigh beside that nothing is wrong; the others' likelihood is -inf.
     """
     edges = np.append(np.searchsorted(problem.t, [a - SAME_TIME for a, _ in spans]), len(problem.t))
     known = values_of(problem, about)
@@ -131,7 +137,7 @@ def evidence(
     present = {rows.name for rows in problem.constraints}
     for kinds in WRONG:
         possible = present & set(kinds) if kinds == WHEELS else kinds in (INTERVALS, ROWS) or present.issuperset(kinds)
-        if not possible:
+        if not possible or (kinds and kinds not in among):
             found.append(np.full(len(spans), -np.inf))
             continue
         base = beside.get(kinds, problem)
