@@ -83,7 +83,7 @@ class Fixes(Buffer):
     def unit(self) -> Array:
         """(3,) m, unit of errors that last for minutes and hours; constant from the first call on."""
         if self._unit is None:
-            self._unit = unit_of(self.rows[self.rows[:, _USED] > 0.0, 4:7])
+            self._unit = compute_unit(self.rows[self.rows[:, _USED] > 0.0, 4:7])
         return self._unit
 
     def between_as_gnss(self, begin: float, end: float, every: bool = False) -> Gnss | None:
@@ -114,7 +114,7 @@ class Fixes(Buffer):
         return mean
 
 
-def unit_of(sd: Array) -> Array:
+def compute_unit(sd: Array) -> Array:
     """(3,) median of stated sigmas (N, 3), one for both horizontal axes, whose errors share one variance component."""
     east, north, up = np.median(sd, axis=0)
     level = np.sqrt(0.5 * (east**2 + north**2))

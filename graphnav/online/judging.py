@@ -33,7 +33,7 @@ from graphnav.estimation.noise.words import describe
 from graphnav.estimation.problem import Problem, build_problem
 from graphnav.estimation.solution import ExcludedSpan
 from graphnav.online.checks import check_rows
-from graphnav.online.fixes import unit_of
+from graphnav.online.fixes import compute_unit
 from graphnav.online.raw import without_ambiguities
 from graphnav.online.sensors import Sensors
 from graphnav.online.tracker import Tracker
@@ -131,7 +131,9 @@ class Judgement:
 
 def _level(base: Problem) -> Problem:
     """The problem with a common unit of both horizontal axes for errors that last for minutes and hours."""
-    rows = (replace(c, usual_error=unit_of(c.sigma)) if isinstance(c, GnssPosition) else c for c in base.constraints)
+    rows = (
+        replace(c, usual_error=compute_unit(c.sigma)) if isinstance(c, GnssPosition) else c for c in base.constraints
+    )
     return replace(base, constraints=tuple(rows))
 
 

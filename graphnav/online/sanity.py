@@ -41,7 +41,7 @@ def find_period(t: Array) -> float:
     return float(np.median(near)) if len(near) else math.inf
 
 
-def imu_reads(values: tuple[float, ...]) -> bool:
+def can_imu_read(values: tuple[float, ...]) -> bool:
     """Whether an IMU can read these rates (rad/s) and forces (m/s^2)."""
     gx, gy, gz, ax, ay, az = values
     return (
@@ -54,12 +54,12 @@ def imu_reads(values: tuple[float, ...]) -> bool:
     )
 
 
-def odometer_reads(values: tuple[float, ...]) -> bool:
+def can_odometer_read(values: tuple[float, ...]) -> bool:
     """Whether a vehicle can be that fast (m/s)."""
     return -FASTEST <= values[0] <= FASTEST
 
 
-def fix_odds(values: tuple[float, ...]) -> str | None:
+def find_fix_fault(values: tuple[float, ...]) -> str | None:
     """The fault of a fix by itself, under the name it is counted by; None if there is none."""
     lat, lon, h = (np.array([x]) for x in values[:3])
     if not is_on_earth(lat, lon, h)[0] or values[0] == values[1] == 0.0:  # sent by receivers without a fix
@@ -209,7 +209,7 @@ class ClockGuard:
         rows, self._ahead, self._new = self._ahead, [], True
         return rows
 
-    def leap(self, t: float, values: tuple[float, ...], gap: float) -> list[Row]:
+    def hold_leap(self, t: float, values: tuple[float, ...], gap: float) -> list[Row]:
         """Hold an IMU row far ahead; returns the rows that continue from there, in order, once there are enough.
 
         `gap` (s) is the longest between rows of one clock.

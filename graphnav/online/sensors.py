@@ -14,7 +14,15 @@ from graphnav.online.buffers import SAME, Buffer
 from graphnav.online.fixes import Fixes
 from graphnav.online.neighbours import Neighbours
 from graphnav.online.raw import RAW, RawEpochs
-from graphnav.online.sanity import ClockGuard, Reach, Row, fix_odds, imu_reads, odometer_reads, with_sane_velocity
+from graphnav.online.sanity import (
+    ClockGuard,
+    Reach,
+    Row,
+    can_imu_read,
+    can_odometer_read,
+    find_fix_fault,
+    with_sane_velocity,
+)
 from graphnav.recording import Odometer, Recording
 from graphnav.recording.formats.repair import LATEST
 
@@ -77,16 +85,16 @@ class Sensors:
             return -np.inf
         return self.imu.newest if sensor == "imu" else self.aiding[sensor].newest
 
-    def anchors(self, sensor: str) -> bool:
+    def needs_keyframes(self, sensor: str) -> bool:
         """Whether each row of a sensor needs a keyframe."""
         if sensor in self.others:
             return self.setup.sensors[sensor].sensor.keyframes
         return sensor == ("gnss" if self.raw is None else RAW)
 
-    def anchors_of_all(self) -> Array:
+    def list_keyframe_times(self) -> Array:
         """Times (N,) of the rows that need a keyframe, s."""
-        times = [self.gnss.used] if self.anchors("gnss") else []
-        times += [b.t for name, b in self.aiding.items() if name != "gnss" and self.anchors(name)]
+        times = [self.gnss.used] if self.needs_keyframes("gnss") else []
+        times += [b.t for name, b in self.aiding.items() if name != "gnss" and self.needs_keyframes(name)]
         return np.unique(np.concatenate([*times, np.empty(0)]))
 
     def add(self, sensor: str, t: float, values: tuple[float, ...], released: bool = False) -> bool:
@@ -195,7 +203,7 @@ class Sensors:
         """Process an IMU row if it is regular; returns False to leave it to `add`. `newest` is the time before it."""
         if not newest + SAME < t <= newest + self.longest_gap or t <= self.oldest or self._clock.undecided:
             return False
-        if len(values) != _WIDTH["imu"] or not imu_reads(values):
+        if len(values) != _WIDTH["imu"] or not can_imu_read(values):
             return False
         self._clock.remember(t, values)
         self.imu.append(t, values)
@@ -253,8 +261,8 @@ class Sensors:
     def _find_fault(self, sensor: str, values: tuple[float, ...]) -> str | None:
         """The fault of a row by itself, under the name it is counted by."""
         if sensor == "gnss":
-            return fix_odds(values)
-        reads = imu_reads(values[:6]) if sensor == "imu" else odometer_reads(values)
+            return find_fix_fault(values)
+        reads = can_imu_read(values[:6]) if sensor == "imu" else can_odometer_read(values)
         return None if reads else "beyond any sensor"
 
     def _add_imu(self, t: float, values: tuple[float, ...]) -> bool:
@@ -280,7 +288,7 @@ class Sensors:
                 self.released += held
                 return False
         if len(self.imu) and t > self.imu.newest + self.longest_gap:
-            rows = self._clock.leap(t, values, self.longest_gap)
+            rows = self._clock.hold_leap(t, values, self.longest_gap)
             self.counts["imu: stamp in the future"] += 1 - len(rows)
             for _, when, what in rows:
                 self._clock.remember(when, what)

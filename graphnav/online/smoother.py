@@ -120,12 +120,12 @@ class Smoother:
             if sensors.gnss.left:
                 self._fixes = [x for x in self._fixes if x not in sensors.gnss.left]
                 self._dirty, sensors.gnss.left = min([self._dirty, *sensors.gnss.left]), []
-            if sensors.anchors(sensor) and t > tracker.newest + SAME_TIME:
+            if sensors.needs_keyframes(sensor) and t > tracker.newest + SAME_TIME:
                 self._fixes = sorted([*self._fixes, t])
                 self._due = min(self._due, t + AFTER)
             elif t <= tracker.newest + SAME_TIME:
                 self.late[sensor] += 1
-                if sensors.anchors(sensor):
+                if sensors.needs_keyframes(sensor):
                     self._fixes = sorted([*self._fixes, t])
                 self._dirty = min(self._dirty, t)
             elif sensor == "odometer" and previous < tracker.newest - SAME_TIME:
@@ -177,7 +177,7 @@ class Smoother:
         elif tracker.work_ahead(self.sensors, expected := self._predict_keyframe(tracker), not self._tentative):
             self._collect(tracker)
         elif tracker.stale and not self._tentative:
-            self._again = CatchUp(tracker.afresh(tracker.noise, self._setup))
+            self._again = CatchUp(tracker.restart_settled(tracker.noise, self._setup))
         else:
             if self._found is not None and self._judgement is None and not self._tentative:
                 self._judge_again(self._found, tracker)
@@ -247,7 +247,7 @@ class Smoother:
         if told and self.settings.noise.mode == "estimated":
             self._found, self._tentative = found, True
             sensors.gnss.space(self.settings.noise.spacing)
-        self._fixes = [t for t in sensors.anchors_of_all().tolist() if t >= recording.start - SAME_TIME]
+        self._fixes = [t for t in sensors.list_keyframe_times().tolist() if t >= recording.start - SAME_TIME]
         self._began, self._judged = recording.start, recording.duration
         sensors.oldest = recording.start
         self._advance(tracker, sensors.imu.newest)
@@ -296,7 +296,7 @@ class Smoother:
         self._say("units", found.doubts)
         self._left_out = tuple(fault for fault in found.excluded if fault.kind not in FIXES)
         if tracker.opened:
-            self._again = CatchUp(tracker.afresh(found.noise, self._setup))
+            self._again = CatchUp(tracker.restart_settled(found.noise, self._setup))
         else:
             again = self._track(judgement.found, self._began, found.noise)
             again.adopt(tracker, found.stationary, judgement.until)
@@ -365,7 +365,7 @@ class Smoother:
             self._fixes = [t for t in self._fixes if t > limit and t > T + SAME_TIME]
             redone = tracker.update(sensors, np.array(times), dirty)
             if self._again is not None and redone < np.inf:
-                self._again.tracker.back_to(redone, tracker)
+                self._again.tracker.rewind(redone, tracker)
             self._collect(tracker)
             if tracker.verdicts.anew and not last:
                 said = f"for {LONGEST:.0f} s fixes contradicted all else, until {tracker.newest:.3f} s"

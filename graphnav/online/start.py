@@ -9,7 +9,7 @@ from graphnav.constraints.base import SAME_TIME
 from graphnav.core.earth import LocalFrame
 from graphnav.core.rotation import Array
 from graphnav.detectors import detect
-from graphnav.estimation.alignment import Alignment, align, ready, with_known_heading
+from graphnav.estimation.alignment import Alignment, align, is_ready, with_known_heading
 from graphnav.estimation.building import start_sigma
 from graphnav.estimation.noise.model import NoiseModel
 from graphnav.estimation.solvers.batch import batch
@@ -29,10 +29,10 @@ def take_rows(sensors: Sensors, settings: Settings, now: float, last: bool) -> t
     sensors.drop_contradicted()
     recording = sensors.recording(-np.inf, now)
     waits = sensors.setup.gnss is not None and not last
-    if waits and (recording.gnss is None or not ready(recording, settings)):
+    if waits and (recording.gnss is None or not is_ready(recording, settings)):
         return None
     stationary = detect(recording, settings).stationary
-    if waits and not ready(recording, settings, stationary):
+    if waits and not is_ready(recording, settings, stationary):
         return None  # fixes jumped at rest
     return recording, stationary
 
@@ -69,11 +69,11 @@ def list_keyframes(T: float, limit: float, fixes: list[float], period: float, la
 
     The last of a drive is at `limit`.
     """
-    anchors = [t for t in fixes if T + SAME_TIME < t <= limit]
-    if last and limit > T + SAME_TIME and (not anchors or limit > anchors[-1] + SAME_TIME):
-        anchors.append(limit)
+    needs_keyframes = [t for t in fixes if T + SAME_TIME < t <= limit]
+    if last and limit > T + SAME_TIME and (not needs_keyframes or limit > needs_keyframes[-1] + SAME_TIME):
+        needs_keyframes.append(limit)
     times, at = [], T
-    for anchor in [*anchors, np.inf]:
+    for anchor in [*needs_keyframes, np.inf]:
         while anchor - at > period * (1.0 + 1e-6) and at + period <= limit:
             at += period
             times.append(at)

@@ -282,7 +282,7 @@ class Tracker(Chain):
         self._motions = {t: one for t, one in self._motions.items() if t > self.head - CONTEXT}
         self._forget()
 
-    def afresh(self, noise: NoiseModel, setup: Recording) -> Tracker:
+    def restart_settled(self, noise: NoiseModel, setup: Recording) -> Tracker:
         """A tracker with another noise model, with the settled states of this one and no keyframes since."""
         other, head = copy.copy(self), self.window.head
         other.noise, other._parameters, other.verdicts = noise, {}, copy.deepcopy(self.verdicts)
@@ -306,7 +306,7 @@ class Tracker(Chain):
         before, after = clip_spans(stationary, self.head, until - SURE), clip_spans(other.stops, until - SURE, np.inf)
         self._standing.replace(merge_spans(np.concatenate([before, after]), gap=SAME_TIME), other.times)
 
-    def back_to(self, t: float, other: Tracker) -> None:
+    def rewind(self, t: float, other: Tracker) -> None:
         """Remove the keyframes from a time on, where another tracker has redone them with different stops."""
         self._keep(len(self.window) - len(self.window.since(t - SAME_TIME)))
         self._motions = {end: one for end, one in self._motions.items() if end < t}

@@ -102,9 +102,9 @@ class Walker(Tracker):
 
     def _steps_until(self, sensors: Sensors, limit: float, last: bool) -> Array:
         """Keyframes of a walk that can be made by now, and their effect on those before."""
-        before, newest = self._known, self.newest
+        before, newest = self._save_cut, self.newest
         found = times = self._steps.until(sensors, self.settings, self._standing, self.newest, limit, last)
-        after = self._known
+        after = self._save_cut
         if (stood := self._steps.over) is not None:  # the sway of a foot is estimated from all of its standing
             self._keep(len(self.window) - len(self.window.since(stood + SAME_TIME)))
             times = self._steps.until(sensors, self.settings, self._standing, self.newest, limit, last)
@@ -117,29 +117,29 @@ class Walker(Tracker):
         return times[1:] if len(self.window) or self.opened else times
 
     @property
-    def _known(self) -> tuple[Array, float, float | None]:
+    def _save_cut(self) -> tuple[Array, float, float | None]:
         """The state from which the next detection continues."""
         return self._standing.spans, self._standing.looked, self._steps.pieces
 
-    def _know(self, known: tuple[Array, float, float | None]) -> None:
+    def _restore_cut(self, known: tuple[Array, float, float | None]) -> None:
         self._standing.spans, self._standing.looked, self._steps.pieces = known
 
     def look_again(self, sensors: Sensors, t: float) -> None:
         """A row of the IMU arrived late, at a time (s): redo the steps that it changes."""
-        looks, now = [one for one in self._looks if one.limit + SURE >= t - SAME_TIME], self._known
+        looks, now = [one for one in self._looks if one.limit + SURE >= t - SAME_TIME], self._save_cut
         for one in looks:
-            self._know(one.before)
+            self._restore_cut(one.before)
             found = self._steps.until(sensors, self.settings, self._standing, one.newest, one.limit, False)
             if not _are_same((found, self._standing.spans), (one.times, one.after[0])):
                 break
         else:
-            self._know(now)
+            self._restore_cut(now)
             return
-        self._know(now)
+        self._restore_cut(now)
         self.finish_entering(sensors)
         if one.newest < self._oldest:
             return  # it has settled
-        self._know(one.before)
+        self._restore_cut(one.before)
         self._keep(len(self.window) - len(self.window.since(one.newest + SAME_TIME)))
         self._motions = {end: motion for end, motion in self._motions.items() if end <= one.newest}
         self._looks, self._renewal = tuple(x for x in self._looks if x.limit < one.limit), _Renewal()
@@ -195,8 +195,8 @@ class Walker(Tracker):
         if np.isfinite(t):
             self._renewal = _Renewal()
 
-    def afresh(self, noise: NoiseModel, setup: Recording) -> Tracker:
-        other = super().afresh(noise, setup)
+    def restart_settled(self, noise: NoiseModel, setup: Recording) -> Tracker:
+        other = super().restart_settled(noise, setup)
         assert isinstance(other, Walker)
         other._work, other._renewal = None, _Renewal()
         return other
