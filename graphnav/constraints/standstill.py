@@ -99,7 +99,7 @@ def _estimate_swaying(rate: Array, T: Array, run: Array) -> Array:
     return out
 
 
-def unrest(scene: BuildContext, rows: Array, stop: Array) -> tuple[Array, Array]:
+def measure_unrest(scene: BuildContext, rows: Array, stop: Array) -> tuple[Array, Array]:
     """Scatter (N, 3) of force (m/s^2) and rate (rad/s) around each interval, without sensor noise."""
     iv, noise = scene.intervals, scene.recording.imu.noise
     T = iv.T[rows][:, None]
@@ -142,7 +142,7 @@ class ZeroVelocity(_Standing):
         rows, stop = find_standing(scene)
         if not len(rows) or not scene.settings.standstill.zero_velocity or scene.recording.platform == "foot":
             return None
-        force, _ = unrest(scene, rows, stop)
+        force, _ = measure_unrest(scene, rows, stop)
         # how a body sways cannot be observed per axis: the largest is used for all
         sigma = np.hypot(_STILL_V, force.max(axis=1, keepdims=True) / _SWAY)
         return cls(keyframe=rows + 1, sigma=np.broadcast_to(sigma, (len(rows), 3)))
@@ -173,7 +173,7 @@ class ZeroRate(_Standing):
             rows, stop = _find_standing(scene, rows, stop)
         if not len(rows) or not scene.settings.standstill.zero_rate:
             return None
-        _, rate = unrest(scene, rows, stop)
+        _, rate = measure_unrest(scene, rows, stop)
         own = scene.recording.imu.noise.gyro_noise_density / np.sqrt(scene.intervals.T[rows])
         if scene.recording.platform == "foot":
             rate = np.hypot(rate, _estimate_swaying(scene.intervals.rate[rows], scene.intervals.T[rows], stop))
@@ -206,7 +206,7 @@ class HeldPosition(_Standing):
         rows, stop = find_standing(scene)
         if not len(rows) or not scene.settings.standstill.held_position or scene.recording.platform == "foot":
             return None
-        force, _ = unrest(scene, rows, stop)
+        force, _ = measure_unrest(scene, rows, stop)
         sigma = np.hypot(_STILL_P, force.max(axis=1, keepdims=True) / _SWAY**2)
         return cls(
             keyframe=rows + 1,

@@ -25,14 +25,14 @@ from graphnav.core.earth import LocalFrame
 from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.detectors.base import NONE
-from graphnav.estimation.alignment.antennas import baseline_heading
+from graphnav.estimation.alignment.antennas import measure_baseline_heading
 from graphnav.estimation.alignment.course import COURSE_SIGMA
 from graphnav.estimation.alignment.first import Alignment
-from graphnav.estimation.alignment.motion import Smoother, align_in_motion, drop_implausible, motion
+from graphnav.estimation.alignment.motion import Smoother, align_in_motion, drop_implausible, find_motion_span
 from graphnav.estimation.alignment.rest import at_rest
 from graphnav.recording import Recording
 
-__all__ = ["COURSE_SIGMA", "Alignment", "Smoother", "align", "ready", "with_known_heading"]
+__all__ = ["COURSE_SIGMA", "Alignment", "Smoother", "align", "is_ready", "with_known_heading"]
 
 
 def align(
@@ -51,22 +51,22 @@ def align(
         If nothing in the recording can give an attitude.
     """
     recording = drop_implausible(recording)
-    span = motion(recording, settings, stationary)
+    span = find_motion_span(recording, settings, stationary)
     if span is None:
         return at_rest(recording, settings, frame, stationary)
     return replace(align_in_motion(recording, settings, frame, smooth, span), motion=span[0], until=span[1])
 
 
-def ready(recording: Recording, settings: Settings, stationary: Array | None = None) -> bool:
+def is_ready(recording: Recording, settings: Settings, stationary: Array | None = None) -> bool:
     """Whether the fixes so far contain all the motion that an alignment needs, or two antennas give the heading.
 
     Parameters
     ----------
     stationary : as for `align`; None where stops have not been detected yet; a quiet IMU alone stands for them then.
     """
-    span = motion(drop_implausible(recording), settings, NONE if stationary is None else stationary)
+    span = find_motion_span(drop_implausible(recording), settings, NONE if stationary is None else stationary)
     if span is None:
-        return baseline_heading(recording, settings, stationary) is not None
+        return measure_baseline_heading(recording, settings, stationary) is not None
     return recording.gnss is not None and span[1] < recording.gnss.t[-1]
 
 

@@ -27,7 +27,9 @@ class BaselineHeading:
     until: float  # s, the last reading used
 
 
-def baseline_heading(recording: Recording, settings: Settings, stationary: Array | None) -> BaselineHeading | None:
+def measure_baseline_heading(
+    recording: Recording, settings: Settings, stationary: Array | None
+) -> BaselineHeading | None:
     """The heading of a vehicle that is stationary at the start, by the readings of two antennas there.
 
     Errors of readings are correlated over seconds (multipath), and all contain that of the mounting: their mean is no

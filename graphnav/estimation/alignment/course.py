@@ -9,7 +9,7 @@ import numpy as np
 from graphnav.constraints.base import SAME_TIME
 from graphnav.core import rotation
 from graphnav.core.notes import Note
-from graphnav.estimation.alignment.travel import average_across, travel
+from graphnav.estimation.alignment.travel import average_across, measure_travel
 from graphnav.estimation.solution import Solution
 from graphnav.recording import Gnss
 
@@ -44,7 +44,7 @@ def with_course(tried: list[Solution], fixes: Gnss, own: float, wide: float) -> 
     best, dt = tried[least], float(np.median(np.diff(fixes.t)))
     at = np.clip(np.searchsorted(best.t, fixes.t - SAME_TIME), 0, len(best.t) - 1)
     yaw = np.unwrap(np.arctan2(best.states.R_nb[:, 1, 1], best.states.R_nb[:, 0, 1]))
-    way = travel(best.states.p[at, :2], average_across(fixes.sd), yaw[at])
+    way = measure_travel(best.states.p[at, :2], average_across(fixes.sd), yaw[at])
     gone = fixes.t - fixes.t[0]
     alike = _count_alike(float(way.turn[-1]), float(gone[-1]), dt)
     own = min(np.pi, float(np.hypot(np.sqrt(alike) * own, _spread(tried, least, alike))))

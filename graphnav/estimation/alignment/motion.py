@@ -19,7 +19,7 @@ from graphnav.detectors.base import NONE, mask_inside
 from graphnav.estimation.alignment.back import carry_back
 from graphnav.estimation.alignment.course import COURSE_SIGMA, with_course
 from graphnav.estimation.alignment.first import Alignment, level, pick_fixes
-from graphnav.estimation.alignment.travel import average_across, integrate_yaw, travel
+from graphnav.estimation.alignment.travel import average_across, integrate_yaw, measure_travel
 from graphnav.estimation.problem import Problem, build_problem
 from graphnav.estimation.solution import Solution
 from graphnav.imu.preintegration import prefix
@@ -55,7 +55,7 @@ def drop_implausible(recording: Recording) -> Recording:
     return replace(recording, gnss=pick_fixes(gnss, off <= _OUTLYING * usual))
 
 
-def motion(recording: Recording, settings: Settings, stationary: Array = NONE) -> tuple[float, float] | None:
+def find_motion_span(recording: Recording, settings: Settings, stationary: Array = NONE) -> tuple[float, float] | None:
     """The span (s) to align over: from just before the first motion until there has been enough of it.
 
     The platform moves where it is farther away than errors of the fixes explain, over ground or in its own axes
@@ -77,8 +77,8 @@ def motion(recording: Recording, settings: Settings, stationary: Array = NONE) -
     else:  # a foot turns about every axis
         yaw, still = np.zeros(len(t)), np.zeros(len(t), dtype=bool)
     sd = average_across(gnss.sd)
-    way = travel(p, sd, yaw, still)
-    away = np.maximum(way.times_sigma, travel(p, sd, np.zeros(len(t)), still).times_sigma) > _MOVES
+    way = measure_travel(p, sd, yaw, still)
+    away = np.maximum(way.times_sigma, measure_travel(p, sd, np.zeros(len(t)), still).times_sigma) > _MOVES
     if not away.any():
         return None
     first = int(np.argmax(away))

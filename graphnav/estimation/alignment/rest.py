@@ -11,7 +11,7 @@ from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.core.state import States
 from graphnav.detectors.base import NONE
-from graphnav.estimation.alignment.antennas import baseline_heading
+from graphnav.estimation.alignment.antennas import measure_baseline_heading
 from graphnav.estimation.alignment.first import Alignment, level
 from graphnav.imu.preintegration import prefix
 from graphnav.imu.samples import bridge_gaps
@@ -46,7 +46,7 @@ def at_rest(recording: Recording, settings: Settings, frame: LocalFrame, station
         note = Note("alignment.no_gnss", "no GNSS: levelled at the start, position and heading count from zero there")
     else:
         sd_p, sd_heading = 10.0 * gnss.sd[0] + 1.0, np.pi
-        known = baseline_heading(recording, settings, stationary)
+        known = measure_baseline_heading(recording, settings, stationary)
         if known is None:
             note = Note("alignment.no_motion", "no motion in the GNSS fixes: levelled at the start, heading unknown")
         else:

@@ -44,7 +44,7 @@ class Travel:
         return np.abs(self.D) / self.sigma
 
 
-def travel(p: Array, sd: Array, yaw: Array, still: NDArray[np.bool_] | None = None) -> Travel:
+def measure_travel(p: Array, sd: Array, yaw: Array, still: NDArray[np.bool_] | None = None) -> Travel:
     """Distance travelled along points.
 
     The path between two points is a chord up to a turn of a radian between them; beyond, it is unknown.
