@@ -78,7 +78,7 @@ def online(
     live = source == "-" or source.startswith("tcp:")
     recording = None if live else read(source, topic or (), allow_outside, format)
     session = Session(settings, source, folder, resume, recording)
-    shown = Shown(session, quiet)
+    shown = LiveView(session, quiet)
     with StopRequest() as asked:
         try:
             if live:
@@ -119,14 +119,14 @@ def _send(recording: Recording, speed: float) -> None:
         say(line, flush=speed > 0 or line == END)
 
 
-def replay(session: Session, pace: Pace, shown: Shown, asked: StopRequest) -> None:
+def replay(session: Session, pace: Pace, shown: LiveView, asked: StopRequest) -> None:
     """Process the rows of a recording as they become due."""
     for row in session.rows[session.taken :]:
         pace.wait(row[1], shown.update, asked)
         if asked:
             return
         session.add(row)
-        shown.now_and_then()
+        shown.update_if_due()
 
 
 class StopRequest:
@@ -155,7 +155,7 @@ class StopRequest:
         self.so = True
 
 
-def follow(session: Session, chunks: Iterator[bytes], shown: Shown, asked: StopRequest) -> None:
+def follow(session: Session, chunks: Iterator[bytes], shown: LiveView, asked: StopRequest) -> None:
     """Process lines until the source ends or an end is requested; b"" means that nothing arrived for a while."""
     rest, heard = b"", time.monotonic()
     for chunk in chunks:
@@ -165,7 +165,7 @@ def follow(session: Session, chunks: Iterator[bytes], shown: Shown, asked: StopR
             whole = [line[:LONGEST] for line in whole]
             session.add_lines([line.decode("utf-8", "replace") for line in whole], asked.__bool__)
             heard = time.monotonic()
-        shown.now_and_then(time.monotonic() - heard)
+        shown.update_if_due(time.monotonic() - heard)
         if session.done or asked:
             return
 
@@ -227,7 +227,7 @@ class Pace:
                 meanwhile()
 
 
-class Shown:
+class LiveView:
     """The live view: a table that stays in place on a terminal, otherwise a line from time to time."""
 
     def __init__(self, session: Session, quiet: bool) -> None:
@@ -239,7 +239,7 @@ class Shown:
             self.live = Live(auto_refresh=False)
             self.live.start()
 
-    def now_and_then(self, silent: float = 0.0) -> None:
+    def update_if_due(self, silent: float = 0.0) -> None:
         if not self.quiet and time.monotonic() >= self.next:
             self.update(silent)
 

@@ -13,7 +13,7 @@ KERNELS = ("huber", "cauchy", "geman-mcclure", "tukey", "welsch", "gnc")
 _BY_NAME = {"none": "off", None: "off", False: "off", True: "automatic"}  # values that earlier versions wrote
 
 
-def _switch(value: Any) -> Any:
+def _check_switch(value: Any) -> Any:
     value = _BY_NAME.get(value, value) if isinstance(value, str | bool) else value
     if value not in SWITCH:
         raise ValueError(f'\'{value}\' must be "off", "on" or "automatic"')
@@ -36,7 +36,7 @@ def _check_gate(value: Any) -> Any:
     return float(value) if number else value
 
 
-Switch = Annotated[Literal["off", "on", "automatic"], BeforeValidator(_switch)]
+Switch = Annotated[Literal["off", "on", "automatic"], BeforeValidator(_check_switch)]
 Kernel = Annotated[str, BeforeValidator(_check_kernel)]
 Gate = Annotated[float | str, BeforeValidator(_check_gate)]
 

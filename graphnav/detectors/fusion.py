@@ -229,7 +229,7 @@ def _count(n: int) -> str:
 
 def _find_speed(speeds: list[Speeds], span: Array) -> float:
     """Speed in a span in which nothing changes, by the sensor with the most epochs; NaN if there are none."""
-    found = [s.over(span) for s in speeds]
+    found = [s.speed_in(span) for s in speeds]
     return float(np.nanmax(found)) if not np.isnan(found).all() else float("nan")
 
 

@@ -41,7 +41,7 @@ class Speeds:
         """(K,) m/s, magnitude."""
         return np.sqrt(np.einsum("kj,kj->k", self.v, self.v))
 
-    def over(self, span: Array) -> float:
+    def speed_in(self, span: Array) -> float:
         """Speed in a span in which nothing changes, m/s: 0 if it is within the error, NaN without epochs.
 
         The velocity is constant in such a span, so the median over the epochs counts, and a wander within the stated

@@ -64,7 +64,7 @@ class Allan:
         return out
 
 
-def allan_of(t: Array, gyro: Array, accel: Array) -> Allan:
+def compute_allan(t: Array, gyro: Array, accel: Array) -> Allan:
     """Allan deviations and figures of a log at rest: t (N,) s, gyro (N, 3) rad/s, accel (N, 3) m/s^2.
 
     Raises
@@ -94,7 +94,7 @@ def allan_of(t: Array, gyro: Array, accel: Array) -> Allan:
         )
     m = list_averaging(len(t))
     tau = m * period
-    devs = [deviations(x, period, m) for x in (gyro, accel)]
+    devs = [compute_deviations(x, period, m) for x in (gyro, accel)]
     noises = [_fit(tau, d, len(t)) for d in devs]
     return Allan(tau, devs[0], devs[1], noises[0], noises[1], duration, 1.0 / period)
 
@@ -119,7 +119,7 @@ def list_averaging(count: int) -> Array:
     return np.unique(np.round(steps).astype(int))
 
 
-def deviations(x: Array, period: float, m: Array) -> Array:
+def compute_deviations(x: Array, period: float, m: Array) -> Array:
     """Overlapping Allan deviations (M, k) of samples (N, k) at averaging times of `m` (M,) samples."""
     total = np.concatenate([np.zeros((1, x.shape[1])), np.cumsum(x - x.mean(0), axis=0)]) * period
     out = np.empty((len(m), x.shape[1]))

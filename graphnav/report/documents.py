@@ -135,7 +135,7 @@ def write_report(
             ],
         ),
         ("Detectors", [*_gallery(detectors), *tables.stop_table(solution, start)]),
-        ("Findings", tables.odd(recording, findings)),
+        ("Findings", tables.list_findings(recording, findings)),
         ("Run", tables.run_table(only)),
         ("Provenance", provenance_tables(settings, provenance)),
     ]
@@ -204,7 +204,7 @@ def write_comparison(
         ("Uncertainty", _gallery(pictures.sigma_pictures(tracks, start, end, spans))),
         ("Constraints", [page.table(["constraint", "solver", *tables.CONSISTENCY_HEAD], rows)] if rows else []),
         ("Noise model", [*tables.noise_tables(noise, first), *tables.excluded_table(first, start)]),
-        ("Findings", tables.odd(recording, findings)),
+        ("Findings", tables.list_findings(recording, findings)),
         ("Runs", tables.run_table(solutions)),
         ("Provenance", provenance_tables(settings, provenance)),
     ]
@@ -248,10 +248,10 @@ def _list_doubts(solutions: Mapping[str, Solution], errors: Mapping[str, Errors]
 def _verdicts(solutions: Mapping[str, Solution], errors: Mapping[str, Errors]) -> list[Markup]:
     """Per solver, whether its sigma is consistent with its errors."""
     if errors:
-        return [words.believe(name, e) for name, e in errors.items()]
+        return [words.describe_sigma(name, e) for name, e in errors.items()]
     # without truth, a filter's innovations test the common model better than any residuals
     filters = [s for s in solutions.values() if any(r.kind == "innovation" for r in s.records.values())]
-    return [words.believe_without_truth(solution) for solution in filters or solutions.values()]
+    return [words.describe_sigma_without_truth(solution) for solution in filters or solutions.values()]
 
 
 def _consistency(errors: Mapping[str, Errors], start: float, end: float, spans: Shades) -> list[Markup]:

@@ -30,7 +30,7 @@ def provenance_tables(settings: Mapping[str, Any], provenance: Mapping[str, Any]
         out.append(page.fold("Settings as resolved", [page.download(SETTINGS, data), page.code(toml, "settings")]))
     inputs = provenance.pop("inputs", {})
     if provenance:
-        listed = [f"{key} {page.show(value)}" for key, value in page.flat(provenance).items()]
+        listed = [f"{key} {page.show(value)}" for key, value in page.flatten(provenance).items()]
         out += [page.heading("Versions"), page.paragraph(page.and_list(listed))]
     if inputs:
         rows = [[name, page.digest(digest)] for name, digest in inputs.items()]

@@ -142,7 +142,7 @@ def list_tiles(recording: Recording, solutions: Mapping[str, Solution], errors: 
     return page.tiles(out)
 
 
-def believe(name: str, errors: Errors) -> Markup:
+def describe_sigma(name: str, errors: Errors) -> Markup:
     """One sentence that compares errors with their sigma (and the truth's own, if stated)."""
     from graphnav.evaluation.sigmas import judge_sigmas
 
@@ -183,7 +183,7 @@ def believe(name: str, errors: Errors) -> Markup:
     return page.paragraph(Note("sigma.consistent", words), "verdict good")
 
 
-def believe_without_truth(solution: Solution) -> Markup:
+def describe_sigma_without_truth(solution: Solution) -> Markup:
     """One sentence on the sigma by innovations or residuals, where there is no truth."""
     kind, size, used = _measure_consistency(solution)
     missing = f"{solution.solver}: there is no truth to compare with"

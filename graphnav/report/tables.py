@@ -297,7 +297,9 @@ def metric_tables(metrics: Mapping[str, Any] | None, name: str = "") -> list[Mar
     if not metrics:
         return []
     plain = {key: value for key, value in metrics.items() if key not in ("spans", "notes")}
-    inner = [page.pairs({k: v if v is None or isinstance(v, float) else str(v) for k, v in page.flat(plain).items()})]
+    inner = [
+        page.pairs({k: v if v is None or isinstance(v, float) else str(v) for k, v in page.flatten(plain).items()})
+    ]
     spans = metrics.get("spans")
     if isinstance(spans, Sequence) and spans and isinstance(spans[0], Mapping):
         inner.append(page.table(list(spans[0]), [[s.get(k) for k in spans[0]] for s in spans]))
@@ -324,7 +326,7 @@ def stop_table(solution: Solution, start: float) -> list[Markup]:
     return [*_long_table(["stands from", "for", "share by detector", "rows"], rows), page.paragraph(note, "soft")]
 
 
-def odd(recording: Recording, findings: Sequence[str]) -> list[Markup]:
+def list_findings(recording: Recording, findings: Sequence[str]) -> list[Markup]:
     """Findings on the recording, each listed once."""
     lines = list(dict.fromkeys([*recording.remarks, *findings]))
     if recording.imu.noise_assumed:

@@ -245,7 +245,7 @@ def check_odometer_readings(recording: Recording, facts: dict[str, Any]) -> Iter
     """Checks of the odometer's readings by themselves, and of the IMU against them."""
     odometer = recording.odometer
     assert odometer is not None
-    step = wheels.quantum(odometer.speed)
+    step = wheels.find_quantum(odometer.speed)
     facts["sigma_mps"] = round(wheels.reading_sigma(odometer), 4)
     if step > 0.0:
         facts["step_mps"] = round(step, 5)

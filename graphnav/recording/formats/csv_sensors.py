@@ -18,8 +18,8 @@ from graphnav.recording.formats.repair import (
     VAGUEST,
     VAGUEST_V,
     Remarks,
+    convert_geodetic,
     fixes_by_type,
-    geodetic,
     horizontal_velocity,
     sigmas,
 )
@@ -64,7 +64,7 @@ def _turn(rows: Table, names: tuple[str, ...], unit: float, R_bs: Array) -> Arra
 
 def build_gnss(d: schema.GnssTable, rows: Table, remarks: Remarks) -> Gnss:
     """Fixes (rad, m) with their sigmas, without those of useless precision; velocities where all axes are given."""
-    llh, rows = geodetic(rows, d.units.angle, schema.HEIGHT[d.units.height], "GNSS", remarks)
+    llh, rows = convert_geodetic(rows, d.units.angle, schema.HEIGHT[d.units.height], "GNSS", remarks)
     every = np.ones(len(rows), dtype=bool)
     sd = sigmas(rows, ("sd_e", "sd_n", "sd_u"), d.sd, DEFAULT_SD, "GNSS position", every, remarks)
     vague = (sd > VAGUEST).any(axis=1)
@@ -182,7 +182,7 @@ def build_truth(d: schema.TruthTable, rows: Table, remarks: Remarks) -> Truth:
     if d.frame == "local":
         xyz = rows.stack("x", "y", "z") if "z" in rows else rows.stack("x", "y")
     else:
-        llh, rows = geodetic(rows, d.units.angle, schema.HEIGHT[d.units.height], "truth", remarks)
+        llh, rows = convert_geodetic(rows, d.units.angle, schema.HEIGHT[d.units.height], "truth", remarks)
     v = _read_part(rows, ("ve", "vn", "vu"), schema.SPEED[d.units.speed])
     rph = _read_part(rows, ("roll", "pitch", "heading"), ANGLE[d.units.angle or "deg"])
     return Truth(rows["t"], llh, xyz, v, rph, d.of)

@@ -27,7 +27,7 @@ from graphnav.recording.formats.csv_sensors import (
     list_needed,
 )
 from graphnav.recording.formats.registry import Format, Log
-from graphnav.recording.formats.repair import Remarks, usable_rows
+from graphnav.recording.formats.repair import Remarks, select_usable_rows
 from graphnav.recording.formats.table import Table, read_table
 from graphnav.recording.formats.trajectories import read_trajectory
 from graphnav.sensors import list_sensors
@@ -79,7 +79,7 @@ def read_folder(source: str | Path) -> Recording:
                 read_table(file, required, (), section.columns)  # raises an error that says what is missing
         if name in known:
             required = (*required, *list_needed(known[name], rows))
-        return usable_rows(rows, name, required, keep, section.units.t, section.time_offset, remarks)
+        return select_usable_rows(rows, name, required, keep, section.units.t, section.time_offset, remarks)
 
     def sensor(name: str, of_table: Callable[[Any, Table, Remarks], Any], of_log: Callable[[Any, Any], Any]) -> Any:
         """The sensor of a table of the .toml: from its CSV file, or from the log of another program."""

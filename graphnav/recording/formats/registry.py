@@ -93,10 +93,10 @@ def log_format(
             raise RecordingError(f"{path}: no such file or folder", key="file.missing")
         if not path.is_dir():
             check_regular(path)
-        from graphnav.recording.formats.soundness import sound  # which imports this module
+        from graphnav.recording.formats.soundness import drop_unsound_rows  # which imports this module
 
         log = choose(path, topics) if choose is not None and topics else load(path)
-        return replace(_without_nowhere(sound(log, path)), files=log.files or _list_files(path))
+        return replace(_without_nowhere(drop_unsound_rows(log, path)), files=log.files or _list_files(path))
 
     return Format(
         name, about, can_read, lambda source: load_log(source).recording(source), load=load_log,

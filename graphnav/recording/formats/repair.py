@@ -44,7 +44,7 @@ class Remarks(list[str]):
         self.append(Note(key, sentence))
 
 
-def usable_rows(
+def select_usable_rows(
     rows: Table, sensor: str, needed: tuple[str, ...], keep: Keep | None, unit: str, offset: float, remarks: Remarks
 ) -> Table:
     """The rows complete in the needed values, ordered by time, without repeated times; t in seconds plus `offset`.
@@ -190,7 +190,7 @@ def is_on_earth(lat: Array, lon: Array, h: Array) -> Mask:
     return np.asarray(near)
 
 
-def geodetic(rows: Table, unit: str | None, height: float, label: str, remarks: Remarks) -> tuple[Array, Table]:
+def convert_geodetic(rows: Table, unit: str | None, height: float, label: str, remarks: Remarks) -> tuple[Array, Table]:
     """(lat, lon, h) in rad, rad, m of rows with usable position, and those rows.
 
     `unit` is that of the angles; None means degrees, and angles that are all small enough to be radians are refused.

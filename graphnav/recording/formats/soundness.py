@@ -16,7 +16,7 @@ from graphnav.recording.formats.registry import Log
 from graphnav.recording.formats.repair import LATEST, VAGUEST, VAGUEST_V, is_on_earth
 
 
-def sound(log: Log, path: Path) -> Log:
+def drop_unsound_rows(log: Log, path: Path) -> Log:
     """The log without unusable rows; each kind of them is remarked on.
 
     Raises

@@ -23,7 +23,7 @@ from scipy.ndimage import median_filter
 from graphnav.core.findings import period_of, runs_of
 from graphnav.core.rotation import Array
 from graphnav.recording import Imu, Odometer
-from graphnav.recording.odometer.mean import ReadingStatistics, gaps
+from graphnav.recording.odometer.mean import ReadingStatistics, find_gaps
 
 GAP, STUCK, FROZEN, WILD = "no readings", "stuck at zero", "frozen", "against the motion"
 
@@ -63,7 +63,7 @@ def faults(
     `figures` and `lag` (s) are what is known of the odometer already.
     """
     figures = figures or ReadingStatistics.of(odometer)
-    found = [(a, b, GAP) for a, b in gaps(odometer.t, figures.longest)]
+    found = [(a, b, GAP) for a, b in find_gaps(odometer.t, figures.longest)]
     if len(odometer.t) >= 10:
         motion = _compute_motion(odometer, imu, lag) if imu is not None and len(imu.t) > 10 else None
         found += _find_wrong(odometer, imu, motion, figures)

@@ -23,7 +23,7 @@ _MAD = 1.4826  # sigma over the median magnitude of a normal variable
 _ROUNDING = np.sqrt(1.0 / 12.0)  # 1-sigma of a rounding error, in steps
 
 
-def quantum(speed: Array) -> float:
+def find_quantum(speed: Array) -> float:
     """Resolution of readings that differ by whole multiples of it, m/s; 0 where there is none.
 
     Differences of adjacent readings are tested, not the readings: a resolution with an error of 1 % of a per cent is
@@ -58,7 +58,7 @@ def reading_sigma(odometer: Odometer, step: float | None = None) -> float:
     if odometer.speed_sigma is not None:
         return odometer.speed_sigma
     t, speed = odometer.t, odometer.speed
-    rounding = _ROUNDING * (quantum(speed) if step is None else step)
+    rounding = _ROUNDING * (find_quantum(speed) if step is None else step)
     if len(t) < 10:
         return rounding
     steps = np.diff(t)
@@ -69,14 +69,14 @@ def reading_sigma(odometer: Odometer, step: float | None = None) -> float:
     return max(scatter, rounding)
 
 
-def counts(odometer: Odometer, step: float | None = None) -> float:
+def find_pulse_length(odometer: Odometer, step: float | None = None) -> float:
     """Metres per pulse where the speeds are pulses counted from row to row, else 0.
 
     Rounding errors of such readings telescope: the error of the mean of n of them is 1/n of that of one, and 1/sqrt(n)
     if they were independent. Third differences show which, as in `reading_sigma`.
     """
     t, speed = odometer.t, odometer.speed
-    step = quantum(speed) if step is None else step
+    step = find_quantum(speed) if step is None else step
     if odometer.counted is not None or step == 0.0:
         return odometer.pulse
     even = np.r_[True, np.diff(t) < 1.5 * period_of(t)] & (speed != 0.0)
@@ -102,7 +102,7 @@ def find_longest_step(t: Array) -> float:
     return 3.5 * max(period_of(t), float(np.percentile(np.diff(t), 95.0))) if len(t) > 1 else 0.0
 
 
-def gaps(t: Array, longest: float | None = None) -> Spans:
+def find_gaps(t: Array, longest: float | None = None) -> Spans:
     """Spans without readings, from where the first one is missing; `longest` as by `find_longest_step`, if known."""
     k = np.flatnonzero(np.diff(t) > (find_longest_step(t) if longest is None else longest))
     return np.stack([t[k] + period_of(t), t[k + 1]], -1).reshape(-1, 2)
@@ -120,8 +120,10 @@ class ReadingStatistics:
     @classmethod
     def of(cls, odometer: Odometer) -> ReadingStatistics:
         """Estimate them from these readings."""
-        step = quantum(odometer.speed)
-        return cls(step, reading_sigma(odometer, step), counts(odometer, step), find_longest_step(odometer.t))
+        step = find_quantum(odometer.speed)
+        return cls(
+            step, reading_sigma(odometer, step), find_pulse_length(odometer, step), find_longest_step(odometer.t)
+        )
 
     def sigmas(self, odometer: Odometer) -> tuple[float, float, float]:
         """`white`, `rounding` and `ends` of a `MeanSpeed`."""
