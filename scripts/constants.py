@@ -62,10 +62,12 @@ CONSTANTS = (
     Constant(f"{NOISE}.priors", "_SHARES", "lasting parts of a stated variance: as much as the whole, all together"),
     Constant(f"{NOISE}.estimate", "CHANCE", "probability of an outlier", 10.0),
     Constant(
-        f"{NOISE}.estimate", "_USUAL", "share of squares that count for no more: nearly two in five rows may be wrong"
+        f"{NOISE}.estimate", "_BOUNDED", "share of squares that are bounded: nearly two in five rows may be wrong"
     ),
-    Constant(f"{NOISE}.estimate", "_TIMES", "a correlation time between a tenth of a second and an hour"),
-    Constant(f"{NOISE}.estimate", "_LOST", "what a vehicle turns and accelerates by at most while samples are lost"),
+    Constant(f"{NOISE}.estimate", "_TIME_RANGE", "a correlation time between a tenth of a second and an hour"),
+    Constant(
+        f"{NOISE}.estimate", "_MANOEUVRE", "what a vehicle turns and accelerates by at most while samples are lost"
+    ),
     Constant(
         f"{NOISE}.estimate",
         "_FIRST",
@@ -74,10 +76,10 @@ CONSTANTS = (
         whole=True,
     ),
     Constant(f"{NOISE}.estimate", "_ROUNDS", "computing: passes that are made in any case", 2.0, whole=True),
-    Constant(f"{NOISE}.estimate", "_AHEAD", "computing: how far a step is extrapolated"),
+    Constant(f"{NOISE}.estimate", "_EXTRAPOLATION", "computing: how far a step is extrapolated"),
     Constant(
         f"{NOISE}.exclusion",
-        "_SHRINKS",
+        "_REFINEMENTS",
         "computing: a span comes to what is wrong, and is looked at once more",
         2.0,
         whole=True,
@@ -97,12 +99,15 @@ CONSTANTS = (
     Constant("graphnav.estimation.building", "_FAR_AWAY", "m, single fixes in a city"),
     Constant(
         "graphnav.estimation.preparation",
-        "_LOST",
+        "_LINEAR",
         "rad: half its square is the share of a vector that linearising loses",
     ),
     Constant("graphnav.estimation.preparation", "_MOST_WRONG", "the larger part"),
 )
-DERIVED = {"CHANCE": ("_OUTLIER", lambda x: -float(np.log(x))), "FALSE_ALARM": ("_ODDS", lambda x: -float(np.log(x)))}
+DERIVED = {
+    "CHANCE": ("OUTLIER_COST", lambda x: -float(np.log(x))),
+    "FALSE_ALARM": ("_FAULT_COST", lambda x: -float(np.log(x))),
+}
 
 
 @contextmanager
@@ -119,8 +124,10 @@ def changed(constant: Constant, value: Any) -> Iterator[None]:
     ]
     if constant.name in DERIVED:
         name, of = DERIVED[constant.name]
-        place = vars(importlib.import_module(f"{NOISE}.exclusion"))
-        places.append((place, name, place[name], of(value)))
+        for module in [module for module in sys.modules if module.startswith(NOISE)]:
+            place = vars(sys.modules[module])
+            if name in place:
+                places.append((place, name, place[name], of(value)))
     try:
         for place, name, _, new in places:
             place[name] = new

@@ -1,8 +1,8 @@
-"""From a recording to the problem that every solver gets: aligned, posed, its noise model estimated.
+"""From a recording to the problem that every solver gets: aligned, built, its noise model estimated.
 
-A straight line: align, build the problem, estimate the noise model, look once for measurements that are wrong in spans
-and decide each by evidence, estimate again without them. The filter then runs as a filter would, from the start on, and
-its smoother is where the batch solver sets out.
+In order: align, build the problem, estimate the noise model, search for spans of wrong measurements and decide each by
+evidence, estimate again without them. The filter then runs causally from the start, and its smoother gives the batch
+solver its first linearisation point.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from graphnav.estimation.fixing import fix, float_arcs
 from graphnav.estimation.noise.apply import with_noise, without_parts
 from graphnav.estimation.noise.estimate import NoiseEstimate, estimate_noise
 from graphnav.estimation.noise.exclusion import (
+    estimate_disturbed_intervals,
     estimate_without_faults,
     excluded_share,
-    with_disturbed_intervals,
 )
 from graphnav.estimation.noise.model import STATED, NoiseModel
 from graphnav.estimation.noise.spacing import space_fixes
@@ -40,15 +40,13 @@ from graphnav.estimation.solvers.passes import (
     FilterPass,
     SmootherPass,
     near_to,
-    points_of,
     points_of_solution,
-    values_of,
 )
 from graphnav.estimation.solvers.rts import backward
 from graphnav.recording import Recording
 
-_LOST = 0.1  # rad by which a filter may be off for a smoother to rest on it
-_MOST_WRONG = 0.5  # share of the fixes that can be wrong; beyond it, it is the start that is
+_LINEAR = 0.1  # rad between linearisation point and smoothed attitude, up to which the smoother is used
+_MOST_WRONG = 0.5  # share of excluded fixes, beyond which the start is wrong rather than the fixes
 
 
 @dataclass(frozen=True)
@@ -117,7 +115,7 @@ def prepare(
         problem = _without_refused(problem, forward)
         if any(rows.gate is not None for rows in problem.constraints):
             smoothed = backward(problem, refilter(problem, smoothed, progress), progress)
-        forward, smoothed = _find_way(problem, aligned, known, forward, smoothed, progress, passes)
+        forward, smoothed = _relinearise(problem, aligned, known, forward, smoothed, progress, passes)
     passes.update(filter=1, smoother=1)
     notes, epochs, arcs = describe(noise, problem), {}, {"": float_arcs(problem)}
     if built.carriers is not None:
@@ -136,53 +134,50 @@ def prepare(
 def _find_noise(
     builder: ProblemBuilder, built: BuiltProblem, progress: Progress | None, passes: Counter[str]
 ) -> tuple[NoiseModel, Points | None, BuiltProblem]:
-    """The noise model, points to linearise at, and the problem: with start and stops that rest on nothing wrong."""
-    best = _estimate(built, builder.settings, progress, passes)
+    """The noise model, linearisation points, and the problem with a start and stops that rest on no excluded fix."""
+    best = _estimate(built, builder.settings, progress)
     if excluded_share(built.problem, best.noise) > _MOST_WRONG:
-        # most fixes contradict what came of the start: it is looked for in what follows
+        # most fixes contradict the start: align again with the fixes behind those that the alignment used
         try:
             later = builder.build_later(built)
-            again = _estimate(later, builder.settings, progress, passes)
+            again = _estimate(later, builder.settings, progress)
+            total = best.passes + again.passes
             if excluded_share(later.problem, again.noise) < excluded_share(built.problem, best.noise):
                 built, best = later, again
+            best = replace(best, passes=total)
         except EstimationError:
             pass  # nothing moves later on
     without = builder.build_without(built, best.noise, parts=True)
     if without is not built:
         built = without
-        best = estimate_noise(built.problem, built.aligned.until, best.noise, progress=progress)
-        passes.update(filter=best.passes, smoother=best.passes)
-    best = with_disturbed_intervals(built.problem, best)
-    passes.update(filter=best.passes + best.looks + 1, smoother=best.passes)
+        again = estimate_noise(built.problem, built.aligned.until, best.noise, progress=progress)
+        best = replace(again, passes=best.passes + again.passes)
+    best = estimate_disturbed_intervals(built.problem, best)
+    passes.update(best.passes + Counter(filter=1))
     plain = NoiseModel(excluded=best.noise.excluded)
     if _is_likelier(built.problem, plain, best):
         return plain, None, built
-    # of what the estimation has left only its points are wanted any more: the rest is half of all memory
+    # the points alone: the covariances of the last pass are half of all memory
     return best.noise, Points(best.points.states, best.points.values), built
 
 
-def _estimate(
-    built: BuiltProblem, settings: Settings, progress: Progress | None, passes: Counter[str]
-) -> NoiseEstimate:
-    """The noise model, with spans of wrong measurements left out if they are to be."""
+def _estimate(built: BuiltProblem, settings: Settings, progress: Progress | None) -> NoiseEstimate:
+    """The noise model, without spans of wrong measurements unless the settings keep them."""
     estimate = estimate_noise if settings.gnss.faults == "off" else estimate_without_faults
-    found = estimate(built.problem, built.aligned.until, progress=progress)
-    passes.update(filter=found.passes + found.looks, smoother=found.passes)
-    return found
+    return estimate(built.problem, built.aligned.until, progress=progress)
 
 
 def _is_likelier(base: Problem, plain: NoiseModel, found: NoiseEstimate) -> bool:
-    """Whether the figures as stated make the innovations likelier than the estimate, with its prior, does.
+    """Whether the stated figures are more probable than the estimate, its prior included.
 
-    Both without what is left out: likelihoods are compared of the same measurements.
+    Both leave the same measurements out, so that the likelihoods compare.
     """
-    known = values_of(with_noise(base, found.noise), found.points)
     problem = with_noise(base, plain)
-    forward = refilter(problem, points_of(problem, found.points.states, known))
+    forward = refilter(problem, found.carry_points(base, problem))
     return float(np.sum(forward.log_likelihood)) > found.log_posterior
 
 
-def _find_way(
+def _relinearise(
     problem: Problem,
     aligned: Alignment,
     known: Points | None,
@@ -191,19 +186,19 @@ def _find_way(
     progress: Progress | None,
     passes: Counter[str],
 ) -> tuple[FilterPass, SmootherPass]:
-    """Filter and smooth about better points where the filter was too far off for a smoother to rest on it.
+    """Filter and smooth about better points where the filter was linearised too far from the smoothed solution.
 
-    These are `known`, from the estimation of the noise, where it came about; else those of a batch solution.
+    The points are `known`, those of the noise estimate, if there are any; else those of a batch solution.
 
-    Fixes that weigh little beside wheels let a filter that is not sure of its heading turn the mounting round
-    rather than the velocity, and no step finds back from there. So wheels come second.
+    If the heading is uncertain and fixes weigh little beside wheels, a filter may turn the mounting by half a turn
+    instead of the velocity, a local minimum. So the batch is solved without wheels first.
     """
-    if near_to(smoothed, forward.linearised, _LOST):
+    if near_to(smoothed, forward.linearised, _LINEAR):
         return forward, smoothed
     if known is not None and len(known.states) == len(problem.t):
         passes.update(filter=2, smoother=1)
         smoothed = backward(problem, refilter(problem, known, progress), progress)
-        if near_to(smoothed, known, _LOST):
+        if near_to(smoothed, known, _LINEAR):
             return ekf(problem, progress, aligned.until, known=smoothed), smoothed
     from graphnav.estimation.solvers.batch import batch  # and GTSAM with it, which few runs of a filter need
 

@@ -1,4 +1,4 @@
-"""What may be wrong in spans of a recording, each as a problem of its own, and how likely it makes the measurements."""
+"""What may be wrong in a span: each explanation as a problem of its own, and how likely it makes the measurements."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from graphnav.constraints.base import SAME_TIME, BuildContext, Constraint, Linea
 from graphnav.core.rotation import Array
 from graphnav.core.state import Parameter, States
 from graphnav.estimation.noise.model import INTERVALS
+from graphnav.estimation.noise.spans import Span, mask_within
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.ekf import refilter
 from graphnav.estimation.solvers.linearise import Points
@@ -23,23 +24,15 @@ from graphnav.recording import Recording
 
 FIXES, WHEELS = ("gnss_position", "gnss_velocity"), ("nhc", "odometer")
 ROWS = ("rows",)
-Kinds = tuple[str, ...]  # constraints that an explanation says are wrong
-WRONG: tuple[Kinds, ...] = ((), FIXES[:1], FIXES[1:], FIXES, WHEELS, INTERVALS, ROWS)
+Explanation = tuple[str, ...]  # the constraints whose rows are wrong by it
+EXPLANATIONS: tuple[Explanation, ...] = ((), FIXES[:1], FIXES[1:], FIXES, WHEELS, INTERVALS, ROWS)
 ONE_SENSOR = FIXES[:1], FIXES[1:], WHEELS  # wrong in a span: the others are not, but may have outliers there
-_NONE = 1e-9  # sigma of an error that is not there
-
-
-def mask_within(t: Array, spans: list[tuple[float, float]]) -> Array:
-    """(N,) mask of times (N,) s in spans, ends included."""
-    out = np.zeros(len(t), dtype=bool)
-    for begin, end in spans:
-        out |= (t >= begin - SAME_TIME) & (t <= end + SAME_TIME)
-    return out
+_NONE = 1e-9  # sigma of an error outside its span
 
 
 @dataclass(frozen=True)
-class _Shifted(Constraint):
-    """Rows of a constraint with an error in common within spans."""
+class _CommonError(Constraint):
+    """Rows of a constraint with an unknown error in common within spans."""
 
     inner: Any = None
     error: str = ""
@@ -71,8 +64,8 @@ class _Shifted(Constraint):
         return Linearized(residual, linear.jacobians | {self.error: J}, linear.sigma)
 
 
-def with_common_errors(problem: Problem, spans: list[tuple[float, float]], kinds: tuple[str, ...]) -> Problem:
-    """The problem with one unknown error of each of some constraints in each span (s)."""
+def with_common_errors(problem: Problem, spans: list[Span], kinds: Explanation) -> Problem:
+    """The problem with one unknown error for each of some constraints in each span (s)."""
     begins, wide = [float(problem.t[0]) - 1.0], [0.0]
     for a, b in spans:
         begins += [a, b + 2.0 * SAME_TIME]  # a node holds from this much before it
@@ -85,7 +78,7 @@ def with_common_errors(problem: Problem, spans: list[tuple[float, float]], kinds
         sigma = np.maximum(np.outer(wide, np.full(2 * m, WIDE[rows.unit])), _NONE)
         own = Parameter(name, np.zeros(sigma.shape), sigma, rows.unit, begins=np.array(begins))
         t = problem.t[rows.keyframe]
-        return _Shifted(
+        return _CommonError(
             keyframe=rows.keyframe,
             parameters=(*rows.parameters, own),
             weight=rows.weight,
@@ -97,8 +90,8 @@ def with_common_errors(problem: Problem, spans: list[tuple[float, float]], kinds
     return replace(problem, constraints=tuple(shifted(rows) for rows in problem.constraints))
 
 
-def with_own_errors(problem: Problem, spans: list[tuple[float, float]], kinds: tuple[str, ...]) -> Problem:
-    """The problem with an unknown error of each row of some constraints in the spans (s), as a frozen receiver has."""
+def with_own_errors(problem: Problem, spans: list[Span], kinds: Explanation) -> Problem:
+    """The problem with an unknown error for each row of some constraints in the spans (s), as of a frozen receiver."""
 
     def loose(rows: Constraint) -> Constraint:
         if rows.name not in kinds:
@@ -116,38 +109,47 @@ def with_own_errors(problem: Problem, spans: list[tuple[float, float]], kinds: t
 def evidence(
     problem: Problem,
     about: Points,
-    spans: list[tuple[float, float]],
-    beside: Mapping[Kinds, Problem],
-    among: Collection[Kinds] = WRONG,
+    spans: list[Span],
+    weighted: Mapping[Explanation, Problem],
+    among: Collection[Explanation] = EXPLANATIONS,
 ) -> tuple[float, Array, int]:
-    """Log-likelihood of innovations before all spans, (M, 7) from each span's beginning on, by `WRONG`, and passes.
+    """Log-likelihoods of the innovations by each explanation.
 
     Parameters
     ----------
     problem : with its noise model and no fix left out.
     about : points of all keyframes.
     spans : s, first and last wrong fix, in order and apart.
-    beside : by `WRONG`, the problem with more noise of single intervals of the IMU or less weight of single rows.
-    among : explanations to weigh beside that nothing is wrong; the others' likelihood is -inf.
+    weighted : by explanation, the problem with the weights of rows and intervals that go with it.
+    among : explanations to evaluate besides that nothing is wrong; the others have -inf.
+
+    Returns
+    -------
+    float
+        Before the first span.
+    Array
+        (M, len(EXPLANATIONS)) from the start of each span to the start of the next.
+    int
+        Filter passes.
     """
     edges = np.append(np.searchsorted(problem.t, [a - SAME_TIME for a, _ in spans]), len(problem.t))
     known = values_of(problem, about)
     found: list[Array] = []
     before, passes = 0.0, 0
     present = {rows.name for rows in problem.constraints}
-    for kinds in WRONG:
+    for kinds in EXPLANATIONS:
         possible = present & set(kinds) if kinds == WHEELS else kinds in (INTERVALS, ROWS) or present.issuperset(kinds)
         if not possible or (kinds and kinds not in among):
             found.append(np.full(len(spans), -np.inf))
             continue
-        base = beside.get(kinds, problem)
-        ways = [base]
+        base = weighted.get(kinds, problem)
+        models = [base]
         if kinds and kinds not in (INTERVALS, ROWS):
-            ways = [with_common_errors(base, spans, kinds)]
+            models = [with_common_errors(base, spans, kinds)]
         if kinds and set(kinds) <= set(FIXES):
-            ways.append(with_own_errors(base, spans, kinds))
+            models.append(with_own_errors(base, spans, kinds))
         each = []
-        for one in ways:
+        for one in models:
             likelihood = refilter(one, points_of(one, about.states, known)).log_likelihood
             passes += 1
             before = float(np.sum(likelihood[: edges[0]])) if not kinds else before

@@ -10,22 +10,23 @@ from scipy.special import chdtri
 from graphnav.core.rotation import Array
 from graphnav.estimation.noise.model import RowWeights
 
-CHANCE = 1e-3  # below which a squared residual is taken for an outlier
+CHANCE = 1e-3  # probability of a larger squared error, below which a row is an outlier
+OUTLIER_COST = -float(np.log(CHANCE))  # negative log-probability of one outlier beforehand
 
 
 def limit_squares(squared: Array, m: int) -> Array:
-    """(N,) weights by which squared errors (N,) of m degrees of freedom are no larger than `CHANCE` allows."""
+    """(N,) weights that bring squared errors (N,) of m degrees of freedom down to the limit of `CHANCE`."""
     return np.asarray(np.minimum(1.0, float(chdtri(m, CHANCE)) / np.maximum(squared, 1e-30)))
 
 
 def limit_scaled(squared: Array, m: int, used: Array) -> Array:
-    """The same, where errors are as large as those of half of the rows that are used (N,), if those are too large.
+    """The same weights, with the squared errors scaled to the expected median where the median is larger than that.
 
-    What half of the rows do is no error of rows: the figures have not come to what they are yet.
+    If half of the rows in use (N,) are off, it is the variance that has not converged yet, and not the rows.
     """
     some = squared[used]
-    usual = float(np.median(some)) / float(chdtri(m, 0.5)) if len(some) else 1.0
-    return limit_squares(squared / max(usual, 1.0), m)
+    scale = float(np.median(some)) / float(chdtri(m, 0.5)) if len(some) else 1.0
+    return limit_squares(squared / max(scale, 1.0), m)
 
 
 def list_reduced(t: Array, weight: Array, used: Array) -> RowWeights:
@@ -35,6 +36,11 @@ def list_reduced(t: Array, weight: Array, used: Array) -> RowWeights:
     return RowWeights(t[less], weight[less])
 
 
+def count_reduced(some: RowWeights) -> int:
+    """How many rows have a weight below 1; they are listed with all rows of their times."""
+    return int(np.sum(some.weight < 1.0))
+
+
 def cost_of_outliers(weights: Mapping[str, RowWeights]) -> float:
-    """Log-probability that as many rows and intervals have less weight than others by chance."""
-    return float(np.log(CHANCE)) * sum(int(np.sum(some.weight < 1.0)) for some in weights.values())
+    """Log-probability beforehand of as many outliers as there are reduced weights."""
+    return float(np.log(CHANCE)) * sum(count_reduced(some) for some in weights.values())

@@ -1,6 +1,8 @@
-"""Where an estimate of noise begins: points to linearise at, and weights of what is grossly wrong."""
+"""Where the estimate of a noise model starts: linearisation points, and weights of gross outliers."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -15,8 +17,15 @@ from graphnav.estimation.solvers.linearise import Points
 from graphnav.estimation.solvers.passes import ForwardRecord, SmootherPass, near_to
 from graphnav.estimation.solvers.rts import backward
 
-_SOUGHT = 5  # times what is grossly wrong is sought: in most drives the second finds what the first found
-Beginning = tuple[Points, dict[str, RowWeights]]
+_ROUNDS = 5  # searches for gross outliers at most; in most drives the second finds what the first found
+
+
+@dataclass(frozen=True)
+class Initial:
+    """Linearisation points of all keyframes, and weights by constraint of the rows that they do not rest on."""
+
+    points: Points
+    weights: dict[str, RowWeights] = field(default_factory=dict)
 
 
 def smooth_about(problem: Problem, about: Points) -> tuple[ForwardRecord, SmootherPass]:
@@ -25,24 +34,24 @@ def smooth_about(problem: Problem, about: Points) -> tuple[ForwardRecord, Smooth
     return forward, backward(problem, forward)
 
 
-def find_beginnings(problem: Problem, opening: float | None) -> tuple[list[Beginning], int]:
-    """Points of a filter that nothing is known before, and of one without what seems grossly wrong, if they differ.
+def find_initial_points(problem: Problem, opening: float | None) -> tuple[list[Initial], int]:
+    """Points of a filter that uses all measurements, and of one without gross outliers if that leads elsewhere.
 
-    What is grossly wrong takes a filter that uses everything too far away to be linearised there. So what seems wrong
-    beside it is left out, and what is wrong is sought again beside the filter without that, until the same is found.
-    Errors that grow are not sought: what seems to drift may as well be the filter, whose heading is not known yet.
+    Gross outliers take a filter that uses everything too far from the truth to be linearised there. So they are left
+    out, and searched for again with the filter that does without them, until the same ones are found. Growing errors
+    are not searched for: while the heading is still uncertain, the filter itself drifts against the fixes.
 
     Parameters
     ----------
-    problem : with the figures to set out from.
+    problem : with the figures to start from.
     opening : as for `graphnav.estimation.solvers.ekf.ekf`.
 
     Returns
     -------
-    list of (Points, dict)
-        The dict has weights of the rows that the points do without, by constraint.
+    list of Initial
+        One, or two where both have to be tried.
     int
-        Passes of filter and smoother that it took.
+        Passes of filter and smoother.
 
     Raises
     ------
@@ -52,24 +61,25 @@ def find_beginnings(problem: Problem, opening: float | None) -> tuple[list[Begin
     plain = about = backward(problem, ekf(problem, opening=opening))
     sound, passes = problem, 1
     try:
-        for _ in range(_SOUGHT):
+        for _ in range(_ROUNDS):
             found = weigh_rows(problem, refilter(problem, about, watch=True, drifts=False).weights)
             if _list_unused(found) == _list_unused(sound):
                 break
             sound, (_, about) = found, near(found, about, opening)
             passes += 2
         if sound is problem:
-            return [(plain, {})], passes
+            return [Initial(plain)], passes
         (_, one), (_, other) = (smooth_about(problem, points) for points in (plain, about))
-    except EstimationError:  # by figures that are far off, so much seems wrong that what is left leads nowhere
-        return [(plain, {})], passes + 1
+    except EstimationError:  # with figures that are far off, most rows seem wrong, and the rest determines nothing
+        return [Initial(plain)], passes + 1
     weights = {}
     for rows in sound.constraints:
         if rows.weight is not None and np.any(rows.weight == 0.0):
             every = np.ones(len(rows), dtype=bool)
             weight = limit_scaled(row_moments(sound, rows, about, len(rows)).left_out, len(rows.axes), every)
             weights[rows.name] = list_reduced(sound.t[rows.keyframe], weight, every)
-    return ([(one, weights)] if near_to(other, one) else [(plain, {}), (about, weights)]), passes + 2
+    same = near_to(other, one)
+    return [Initial(one, weights)] if same else [Initial(plain), Initial(about, weights)], passes + 2
 
 
 def _list_unused(problem: Problem) -> dict[str, list[int]]:

@@ -1,0 +1,100 @@
+"""Spans of time in which measurements are suspected: joined, compared, and trimmed to what is wrong in them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+
+import numpy as np
+from scipy.special import chdtri
+
+from graphnav.constraints.base import SAME_TIME
+from graphnav.core.rotation import Array
+from graphnav.estimation.noise.model import RowWeights
+from graphnav.estimation.noise.outliers import CHANCE, OUTLIER_COST
+from graphnav.estimation.problem import Problem
+from graphnav.estimation.solution import ExcludedSpan
+
+Span = tuple[float, float]  # s, first and last measurement in it
+LeftOutErrors = Mapping[str, tuple[Array, Array, int]]  # by constraint: (N,) s, (N,) squared errors, degrees of freedom
+
+
+def mask_within(t: Array, spans: Iterable[Span]) -> Array:
+    """(N,) mask of times (N,) s in spans, ends included."""
+    out = np.zeros(len(t), dtype=bool)
+    for begin, end in spans:
+        out |= (t >= begin - SAME_TIME) & (t <= end + SAME_TIME)
+    return out
+
+
+def drop_within(some: RowWeights, spans: Iterable[Span]) -> RowWeights:
+    """The weights of the rows outside all spans."""
+    keep = ~mask_within(some.t, spans)
+    return RowWeights(some.t[keep], some.weight[keep])
+
+
+def join(spans: Iterable[Span]) -> list[Span]:
+    """Spans in order, those that overlap or touch as one."""
+    out: list[Span] = []
+    for begin, end in sorted(spans):
+        if out and begin <= out[-1][1] + SAME_TIME:
+            out[-1] = (out[-1][0], max(end, out[-1][1]))
+        else:
+            out.append((begin, end))
+    return out
+
+
+def join_faults(faults: Iterable[ExcludedSpan]) -> list[Span]:
+    """Spans of several measurements; a single one is judged by its weight instead."""
+    return join((fault.t_start, fault.t_end) for fault in faults if fault.count > 1)
+
+
+def total_length(spans: Iterable[Span]) -> float:
+    """s"""
+    return sum(end - begin for begin, end in spans)
+
+
+def are_covered(spans: Iterable[Span], by: list[Span]) -> bool:
+    """Whether each span lies within one of others."""
+    return all(any(a <= begin and end <= b for a, b in by) for begin, end in spans)
+
+
+def list_distinct(*candidates: list[Span]) -> list[list[Span]]:
+    """Candidates without repetitions and without empty ones."""
+    return [list(spans) for spans in dict.fromkeys(tuple(spans) for spans in candidates) if spans]
+
+
+def extend_to_next_fix(problem: Problem, spans: list[Span], fixes: tuple[str, ...]) -> list[Span]:
+    """Spans up to the first keyframe with a fix behind each: an error that begins in a span is corrected there."""
+    rows = [c.keyframe for c in problem.constraints if c.name in fixes]
+    t = np.append(np.unique(problem.t[np.concatenate(rows)]), problem.t[-1])
+    return [(a, max(b, float(t[min(int(np.searchsorted(t, b + SAME_TIME)), len(t) - 1)]))) for a, b in spans]
+
+
+def trim(spans: list[Span], errors: LeftOutErrors, chance: float = CHANCE) -> list[Span]:
+    """Spans without the correct fixes at their ends.
+
+    The tests run forward in time and leave out too much: they date a fault by one of a few onsets, and the fixes behind
+    it meet a filter that the fault has led astray. Of each span the part with the largest sum of scores is kept, where
+    a fix scores half of what its squared error exceeds the limit by, at most the cost of a single outlier.
+
+    Parameters
+    ----------
+    errors : of the fixes, predicted by a smoother that does not use them.
+    chance : that a correct fix exceeds the limit.
+    """
+    all_t = [t for t, _, _ in errors.values()]
+    t, number = np.unique(np.concatenate(all_t), return_inverse=True)
+    score = np.full(len(t), -np.inf)
+    each = [np.minimum(0.5 * (x - float(chdtri(m, chance))), OUTLIER_COST) for _, x, m in errors.values()]
+    np.maximum.at(score, number, np.concatenate(each))  # a fix is wrong if its position or its velocity is
+    parts = ((t[within], score[within]) for within in (mask_within(t, [span]) for span in spans))
+    return [part for some, scores in parts if (part := _find_best_part(some, scores)) is not None]
+
+
+def _find_best_part(t: Array, score: Array) -> Span | None:
+    """First and last time of the part with the largest sum of scores (N,), if that is positive (Kadane's algorithm)."""
+    before = np.concatenate([[0.0], np.cumsum(score)])
+    least = np.minimum.accumulate(before)
+    end = int(np.argmax(before - least))
+    begin = int(np.argmin(before[: end + 1]))
+    return (float(t[begin]), float(t[end - 1])) if end > begin else None
