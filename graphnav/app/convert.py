@@ -29,9 +29,9 @@ from graphnav.recording.formats.writer import write_recording
 
 _TRAJECTORY = "trajectory.csv"
 SUMMARY = "summary.json"  # of the run that wrote a trajectory: has its clock and its points
-_DENSE = 20.0  # Hz
-_ROWS = 4096  # rows processed at once
-_BESIDE = 8  # rows on either side from which rates and velocities of a part are computed
+_DENSE_RATE = 20.0  # Hz
+_ROWS_AT_ONCE = 4096  # rows processed at once
+_CONTEXT_ROWS = 8  # rows on either side from which rates and velocities of a part are computed
 _MOST_ROWS = 2e7
 _MAX_GAP = 3.0  # s; wider gaps of a trajectory are not interpolated
 
@@ -211,10 +211,11 @@ def _interpolate_parts(trajectory: Trajectory, arm: Array | None, rate: float | 
     t = trajectory.t
     wanted = t if rate is None else np.arange(np.ceil(t[0] * rate - 1e-6), np.floor(t[-1] * rate + 1e-6) + 1) / rate
     found = 0
-    for k in range(0, len(wanted), _ROWS):
-        part = wanted[k : k + _ROWS]
+    for k in range(0, len(wanted), _ROWS_AT_ONCE):
+        part = wanted[k : k + _ROWS_AT_ONCE]
         around = slice(
-            max(np.searchsorted(t, part[0]) - _BESIDE, 0), np.searchsorted(t, part[-1], side="right") + _BESIDE
+            max(np.searchsorted(t, part[0]) - _CONTEXT_ROWS, 0),
+            np.searchsorted(t, part[-1], side="right") + _CONTEXT_ROWS,
         )
         moved, _ = interpolate(trajectory.take(around), part, max_gap=_MAX_GAP, lever_arm=arm)
         found += len(moved)
@@ -259,10 +260,10 @@ def export_run(
 def _of_point(solution: Solution, rate: float | None, arm: Array) -> Iterator[Trajectory]:
     """The trajectory of the point at the end of a lever arm, in parts."""
     # between keyframes a second apart the turn rate, and with it the point's velocity, would be uncertain
-    dense = max(rate or 0.0, _DENSE)
+    dense = max(rate or 0.0, _DENSE_RATE)
     there = [piece.times(dense) for piece in solution.between]
     wanted = solution.t if rate is None else np.concatenate([piece.times(rate) for piece in solution.between])
-    for t in np.split(wanted, np.flatnonzero(np.diff(np.floor(wanted * (dense / _ROWS)))) + 1):
+    for t in np.split(wanted, np.flatnonzero(np.diff(np.floor(wanted * (dense / _ROWS_AT_ONCE)))) + 1):
         # one row on each side for the position, two for the turn rate, and one to spare
         around = [
             times[max(np.searchsorted(times, t[0]) - 3, 0) : np.searchsorted(times, t[-1], side="right") + 3]

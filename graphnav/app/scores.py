@@ -26,7 +26,7 @@ Withheld = tuple[str, Span | None]
 
 _DENSEST, _MOST = 0.1, 5_000  # s between, and number of, the truth epochs that are solved for exactly
 _MOST_TURNING = 20_000  # the same where a point at the end of a lever arm moves between them
-_ENOUGH = 1000  # number of keyframes that makes other epochs unnecessary
+_ENOUGH_KEYFRAMES = 1000  # number of keyframes that makes other epochs unnecessary
 # s; between epochs that count as one, and between rows too close for anything to happen
 _SAME, _BETWEEN_ROWS = 1e-4, 0.02
 OUTAGE = 10.0  # s; a longer interval between fixes is scored as an outage
@@ -120,7 +120,7 @@ def _choose_epochs(solution: Solution, truth: Array) -> Array:
         if foreign and len(t) and measure_spacing(own) >= measure_spacing(truth):
             return np.asarray(t[before + after <= MAX_GAP])
         there = (np.minimum(np.abs(before), np.abs(after)) <= _SAME) | (before + after <= _BETWEEN_ROWS)
-        if not foreign and there.sum() >= max(_ENOUGH, 0.8 * len(t)):
+        if not foreign and there.sum() >= max(_ENOUGH_KEYFRAMES, 0.8 * len(t)):
             return np.asarray(t[there])
     return _thin(truth, solution, _MOST)
 

@@ -33,7 +33,7 @@ from graphnav.report.plots.thinning import BINS
 from graphnav.sensors import Series, list_sensors
 
 NAME = "run.npz"
-_FORM = "graphnav-run/3"
+_RUN_FORMAT = "graphnav-run/3"
 _ANEW = ("between", "graphs", "own")  # available only by solving again, and classes of a script
 _PACKAGE = __name__.partition(".")[0]
 
@@ -75,7 +75,9 @@ def write_outcome(outcome: Outcome, provenance: Mapping[str, Any], path: Path) -
     """Store everything of an outcome that its pages show, with the provenance of the run."""
     arrays: list[Array] = []
     outcome = replace(outcome, recording=_thin_recording(outcome.recording))
-    plain = json.dumps({"form": _FORM, "outcome": _pack(outcome, arrays), "provenance": _pack(provenance, arrays)})
+    plain = json.dumps(
+        {"form": _RUN_FORMAT, "outcome": _pack(outcome, arrays), "provenance": _pack(provenance, arrays)}
+    )
     text = np.frombuffer(plain.encode(), dtype=np.uint8)
     named: dict[str, Any] = {f"a{k}": a for k, a in enumerate(arrays)}
     np.savez(path, text=text, **named)  # uncompressed: compression takes a second per hour of a drive and saves a third
@@ -102,7 +104,7 @@ def read_outcome(path: Path) -> tuple[Outcome, dict[str, Any]]:
             arrays = [file[f"a{k}"] for k in range(len(file.files) - 1)]
     except (OSError, ValueError, KeyError, BadZipFile, zlib.error, EOFError, RuntimeError, MemoryError) as error:
         raise ConfigError(f"{path}: cannot be read ({error})", key="file.unreadable") from None
-    if not isinstance(values, dict) or values.get("form") != _FORM:
+    if not isinstance(values, dict) or values.get("form") != _RUN_FORMAT:
         raise ConfigError(f"{path}: is of another version of graphnav; solve again", key="results.other_version")
     try:
         outcome, provenance = _unpack(values["outcome"], arrays), _unpack(values["provenance"], arrays)

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from graphnav.evaluation.gates import Verdict
 
 BAD_INPUT, INTERNAL, NOT_MET, INTERRUPTED, PIPE_CLOSED = 2, 1, 3, 130, 141
-_LONGEST = 1500  # characters of an error line
+_MAX_LENGTH = 1500  # characters of an error line
 DEBUG = "GRAPHNAV_DEBUG"  # if set, a traceback is shown
 
 
@@ -67,7 +67,7 @@ def fail(reason: str, code: int, debug: bool) -> int:
     if debug:
         traceback.print_exc()
     line = _strip_controls(" ".join(reason.split()))
-    print(f"graphnav: {line if len(line) <= _LONGEST else line[:_LONGEST] + '...'}", file=sys.stderr)
+    print(f"graphnav: {line if len(line) <= _MAX_LENGTH else line[:_MAX_LENGTH] + '...'}", file=sys.stderr)
     return code
 
 

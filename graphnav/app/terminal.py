@@ -195,14 +195,14 @@ _STAGES = {
     "noise": 12.0, "filter": 2.5, "smoother": 0.4, "batch": 0.9, "covariances": 0.2, "incremental": 4.8,
     "isam2": 44.0, "evaluation": 0.1, "writing": 0.7,
 }  # fmt: skip
-_BEFORE = ("reading", "checks", "detection", "alignment", "preintegration", "noise", "filter", "smoother")
+_COMMON_STAGES = ("reading", "checks", "detection", "alignment", "preintegration", "noise", "filter", "smoother")
 _WORK = {
     "info": ("reading", "checks"), "detect": ("reading", "detection", "writing"), "evaluate": ("reading",),
     "simulate": ("driving", "writing"), "convert": ("reading", "writing"), "init": ("reading", "writing"),
-    "ekf": (*_BEFORE, "evaluation", "writing"), "rts": (*_BEFORE, "evaluation", "writing"),
-    "batch": (*_BEFORE, "batch", "covariances", "evaluation", "writing"),
-    "incremental": (*_BEFORE, "incremental", "evaluation", "writing"),
-    "isam2": (*_BEFORE, "isam2", "evaluation", "writing"),
+    "ekf": (*_COMMON_STAGES, "evaluation", "writing"), "rts": (*_COMMON_STAGES, "evaluation", "writing"),
+    "batch": (*_COMMON_STAGES, "batch", "covariances", "evaluation", "writing"),
+    "incremental": (*_COMMON_STAGES, "incremental", "evaluation", "writing"),
+    "isam2": (*_COMMON_STAGES, "isam2", "evaluation", "writing"),
 }  # fmt: skip
 
 

@@ -52,9 +52,9 @@ PIVOT = "pivot"
 TRAVEL = "pivot_travel"
 PATTERN = "stance_pattern"
 FOOT_AXIS = "foot_axis"
-_NODES = np.linspace(-1.0, 1.0, 5)  # nodes of the pattern, in c
-_WIDE = 3 * len(_NODES)
-_SHORTEST = 0.01  # s; the mean over a shorter interval carries no information
+_PATTERN_NODES = np.linspace(-1.0, 1.0, 5)  # nodes of the pattern, in c
+_WIDE = 3 * len(_PATTERN_NODES)
+_SHORTEST_MEAN = 0.01  # s; the mean over a shorter interval carries no information
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,9 @@ class Stance(Constraint):
 
     past: IntervalMotion | None = None
     phase: Array = field(default_factory=lambda: np.empty(0))  # (N,) c
-    share: Array = field(default_factory=lambda: np.empty((0, len(_NODES))))  # weight of each node of the pattern
+    share: Array = field(
+        default_factory=lambda: np.empty((0, len(_PATTERN_NODES)))
+    )  # weight of each node of the pattern
     sigma: Array = field(default_factory=lambda: np.empty((0, 3)))
 
     @classmethod
@@ -125,14 +127,14 @@ class Stance(Constraint):
         J = {name: x[:, :3] for name, x in J.items()} | {PIVOT: by_lever, TRAVEL: phase[..., None] * by_lever[..., :2]}
         if PATTERN in parameters:
             share = self.share[rows]
-            u = u + np.einsum("nk,nki->ni", share, parameters[PATTERN].reshape(-1, len(_NODES), 3))
+            u = u + np.einsum("nk,nki->ni", share, parameters[PATTERN].reshape(-1, len(_PATTERN_NODES), 3))
             J[PATTERN] = np.kron(share[:, None], np.eye(3))
         return Linearized(u, J, self.sigma[rows])
 
 
 def _interpolate_phase(phase: Array) -> Array:
     """(N, 5) weights of the nodes for linear interpolation at phases (N,)."""
-    return np.maximum(0.0, 1.0 - np.abs(phase[:, None] - _NODES) / (_NODES[1] - _NODES[0]))
+    return np.maximum(0.0, 1.0 - np.abs(phase[:, None] - _PATTERN_NODES) / (_PATTERN_NODES[1] - _PATTERN_NODES[0]))
 
 
 def _mark_rolling(t: Array, span: Array, scene: BuildContext, lasts: float) -> Array:
@@ -166,7 +168,7 @@ class FootLateral(Constraint):
         s, iv = scene.settings.foot, scene.intervals
         if scene.recording.platform != "foot" or not len(scene.stationary) or not s.lateral:
             return None
-        moving = iv.T > _SHORTEST
+        moving = iv.T > _SHORTEST_MEAN
         moving[find_standing(scene)[0]] = False
         rows = np.flatnonzero(moving)
         past = IntervalMotion.of(iv, rows, scene.frame)

@@ -36,7 +36,7 @@ from graphnav.recording import Recording
 
 PLACE = "stop_position"
 _NEIGHBOURS = 5  # intervals over which residual motion is measured
-_SWAY = 2.0 * np.pi  # rad/s, the slowest sway of a body on springs
+_SWAY_RATE = 2.0 * np.pi  # rad/s, the slowest sway of a body on springs
 _STILL_V, _STILL_P = 1e-3, 1e-3  # m/s, m: lower limits for any body
 _FASTEST = 60.0  # m/s; times the seconds without a fix: bound on the distance of a stop from the last one
 _ROLLING = 0.1  # rad/s; a foot that rolls over its stance turns faster
@@ -144,7 +144,7 @@ class ZeroVelocity(_Standing):
             return None
         force, _ = measure_unrest(scene, rows, stop)
         # how a body sways cannot be observed per axis: the largest is used for all
-        sigma = np.hypot(_STILL_V, force.max(axis=1, keepdims=True) / _SWAY)
+        sigma = np.hypot(_STILL_V, force.max(axis=1, keepdims=True) / _SWAY_RATE)
         return cls(keyframe=rows + 1, sigma=np.broadcast_to(sigma, (len(rows), 3)))
 
     def linearize(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> Linearized:
@@ -207,7 +207,7 @@ class HeldPosition(_Standing):
         if not len(rows) or not scene.settings.standstill.held_position or scene.recording.platform == "foot":
             return None
         force, _ = measure_unrest(scene, rows, stop)
-        sigma = np.hypot(_STILL_P, force.max(axis=1, keepdims=True) / _SWAY**2)
+        sigma = np.hypot(_STILL_P, force.max(axis=1, keepdims=True) / _SWAY_RATE**2)
         return cls(
             keyframe=rows + 1,
             sigma=np.repeat(sigma, 3, axis=1),

@@ -49,14 +49,14 @@ ODOMETER_SCALE = "odometer_scale"
 ODOMETER_DELAY = "odometer_delay"
 NHC_ERROR, ODOMETER_ERROR = "nhc_error", "odometer_error"
 REACH = 4.0  # sigmas of the delay that the rows cover
-_SHORTEST = 0.02  # s; the mean over a shorter interval carries no information
+_SHORTEST_MEAN = 0.02  # s; the mean over a shorter interval carries no information
 _LINEAR = 3.0  # m/s^2, lateral force up to which tyres behave linearly
 _BEYOND = 0.1  # m/s of sideways speed per m/s^2 beyond that
 _AXLE_LEFT = 0.2  # m, uncertainty of the axle's place in a turn: front wheels steer, tyres have width
 _HALF_WHEELBASE = 1.3  # m
 _I2, _I3 = np.eye(2), np.eye(3)
 _E_Y = np.array([[0.0, 1.0, 0.0]])
-_AHEAD = _E_Y[None]
+_FORWARD = _E_Y[None]
 _SIDE_UP = _I3[None, ::2]
 _BY_HEADING = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]])  # u @ this = (u_y, -u_x, 0)
 _BY_AXLE = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 0.0], [-1.0, 0.0, 0.0]])  # omega @ this = omega x e_y
@@ -189,7 +189,7 @@ class _Velocity:
 def find_moving_rows(scene: BuildContext) -> Array:
     """Indices of the intervals in which the vehicle moves, long enough to carry information."""
     t0, t1 = scene.intervals.t0, scene.intervals.t1
-    usable = t1 - t0 >= _SHORTEST
+    usable = t1 - t0 >= _SHORTEST_MEAN
     for begin, end in scene.stationary:
         usable &= (t1 <= begin + SAME_TIME) | (t0 >= end - SAME_TIME)
     return np.flatnonzero(usable)
@@ -366,7 +366,7 @@ class OdometerSpeed(Wheels):
         else:
             read = self._read[rows]
         scale, ahead = 1.0 + parameters[ODOMETER_SCALE][:, 0], found.u[:, 1]
-        A = _AHEAD if self.signed else np.where(ahead < 0.0, -1.0, 1.0)[:, None, None] * _AHEAD
+        A = _FORWARD if self.signed else np.where(ahead < 0.0, -1.0, 1.0)[:, None, None] * _FORWARD
         residual = (A[:, 0, 1] * ahead - scale * read)[:, None]
         jacobians = found.derivatives(A, parameters)
         jacobians[ODOMETER_SCALE] = -read[:, None, None]

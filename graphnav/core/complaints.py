@@ -16,9 +16,9 @@ from graphnav.core.files import read_text
 from graphnav.core.notes import Note
 
 _TABLE = re.compile(r"\[([^\[\]]+)\]")
-_NAMES = 30  # names listed in one sentence at most
-_SHOWN = 60  # characters of a value quoted in a sentence at most
-_WORD = re.compile(rf"\S{{{2 * _SHOWN},}}")  # a quoted value, as no sentence of graphnav has a word of this length
+_MAX_NAMES = 30  # names listed in one sentence at most
+_MAX_QUOTED = 60  # characters of a value quoted in a sentence at most
+_WORD = re.compile(rf"\S{{{2 * _MAX_QUOTED},}}")  # a quoted value, as no sentence of graphnav has a word of this length
 _DEEPEST = 50  # levels of nested tables at most; graphnav's own files have four
 _KEY = re.compile(r"([\w\-.\"']+)\s*=")
 
@@ -88,7 +88,7 @@ def complaint(source: str | Path, error: ValidationError, model: type[BaseModel]
     line = _line_of(text, loc)
     where = f"{source}, line {line}: " if line else f"{source}: "
     described = _describe(first, loc, model)
-    return Note(described.key, where + _WORD.sub(lambda word: f"{word[0][:_SHOWN]}...", described))
+    return Note(described.key, where + _WORD.sub(lambda word: f"{word[0][:_MAX_QUOTED]}...", described))
 
 
 def _describe(first: Any, loc: tuple[str, ...], model: type[BaseModel]) -> Note:
@@ -109,7 +109,7 @@ def _describe(first: Any, loc: tuple[str, ...], model: type[BaseModel]) -> Note:
 def shorten(value: Any) -> str:
     """Quote a value of a file, shortened if it is long."""
     text = repr(value)
-    return text if len(text) <= _SHOWN else f"{text[:_SHOWN]}..."
+    return text if len(text) <= _MAX_QUOTED else f"{text[:_MAX_QUOTED]}..."
 
 
 def suggest_nearest(name: str, known: Sequence[str]) -> str:
@@ -117,7 +117,7 @@ def suggest_nearest(name: str, known: Sequence[str]) -> str:
     close = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
     if close:
         return f"did you mean '{close[0]}'?"
-    return f"known: {', '.join(known[:_NAMES]) or 'none'}{', ...' * (len(known) > _NAMES)}"
+    return f"known: {', '.join(known[:_MAX_NAMES]) or 'none'}{', ...' * (len(known) > _MAX_NAMES)}"
 
 
 def split_names(text: str, known: Sequence[str], option: str, what: str) -> tuple[str, ...]:

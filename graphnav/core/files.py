@@ -29,7 +29,7 @@ MAX_FILE, MAX_LINE = "GRAPHNAV_MAX_FILE_MB", "GRAPHNAV_MAX_LINE_KB"
 _DEFAULTS = {MAX_FILE: 2000, MAX_LINE: 1000}
 _WRITTEN = 64 << 20  # bytes at most of a file that is read as a whole: settings, descriptions, summaries
 _RATIO, _SMALL = 200, 8 << 20  # the size check of a packed log matters only beyond this many bytes
-_CHUNK = 1 << 16
+_READ_SIZE = 1 << 16
 _GZIP = b"\x1f\x8b"
 
 Kind = type[GraphnavError]
@@ -236,7 +236,7 @@ class Opened(io.BufferedReader):
     """The bytes of a file, unpacked; `size` is that on disk, `packed` whether it is gzip-compressed."""
 
     def __init__(self, raw: _Bounded, size: int, packed: bool) -> None:
-        super().__init__(raw, 4 * _CHUNK)
+        super().__init__(raw, 4 * _READ_SIZE)
         self.size, self.packed = size, packed
 
 
@@ -256,7 +256,7 @@ class _Bounded(io.RawIOBase):
 
     def readinto(self, buffer: Any) -> int:
         try:
-            chunk = self._source.read(min(len(buffer), _CHUNK))
+            chunk = self._source.read(min(len(buffer), _READ_SIZE))
         except (EOFError, zlib.error, gzip.BadGzipFile) as cause:
             cut = isinstance(cause, EOFError)
             why = "the compressed file is cut off" if cut else f"the compressed file is damaged ({cause})"

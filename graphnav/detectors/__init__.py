@@ -28,7 +28,7 @@ from graphnav.recording import Recording
 
 __all__ = ["Detection", "Detections", "Detector", "detect", "glrt_statistic", "list_detectors", "stops"]
 
-_SHORTEST = 3.0  # s, the shortest recording that is examined
+_SHORTEST_RECORDING = 3.0  # s, the shortest recording that is examined
 
 
 @cache
@@ -73,11 +73,14 @@ def detect(recording: Recording, settings: Settings | None = None, since: float 
             (Note("detectors.vehicles_only", f"{', '.join(idle)}: of vehicles only, finds no stance"),) if idle else ()
         )
         return Detections(stances.stationary, stances.all, (*d.notes, *more, *stances.notes))
-    if not recording.duration >= _SHORTEST or not scene.period > 0.0:
+    if not recording.duration >= _SHORTEST_RECORDING or not scene.period > 0.0:
         return Detections(
             NONE,
             (),
-            (*d.notes, Note("detectors.too_short", f"no detection: the recording is shorter than {_SHORTEST:g} s")),
+            (
+                *d.notes,
+                Note("detectors.too_short", f"no detection: the recording is shorter than {_SHORTEST_RECORDING:g} s"),
+            ),
         )
     if not len(scene.low.t):
         return Detections(
@@ -143,7 +146,7 @@ def stops(
     """
     d = settings.detectors
     scene = Scene(recording, d)
-    if not recording.duration >= _SHORTEST or not scene.period > 0.0:
+    if not recording.duration >= _SHORTEST_RECORDING or not scene.period > 0.0:
         return NONE
     certain = scene.certain
     left = longer_than(subtract_spans(np.array([[recording.start, recording.end]]), certain), d.fusion.min_duration)

@@ -43,7 +43,7 @@ class Link:
     mean: float  # m/s, magnitude of the mean velocity between them if both are stops
 
 
-_UNKNOWN = Link(0.0, float("inf"), float("inf"), float("inf"))
+_UNKNOWN_LINK = Link(0.0, float("inf"), float("inf"), float("inf"))
 
 
 def link(b: Blocks, before: Array, after: Array) -> Link:
@@ -53,12 +53,12 @@ def link(b: Blocks, before: Array, after: Array) -> Link:
     j = int(np.searchsorted(b.t, min(after[1], after[0] + _INNER)))
     n0, n1 = (int(k) - i for k in np.searchsorted(b.t, [before[1], after[0]]))
     if T > LONGEST or n0 < 3 or j - i - n1 < 3 or not b.whole[i + 1 : j].all():
-        return _UNKNOWN
+        return _UNKNOWN_LINK
     rate = b.rate[i:j]
     bias = 0.5 * (rate[:n0].mean(axis=0) + rate[n1:].mean(axis=0))
     left, yaw = _level_force(b.force[i:j], rate - bias, n0, b.period)
     if np.abs(yaw).max() > _STRAIGHT:
-        return _UNKNOWN
+        return _UNKNOWN_LINK
     if n1 <= n0:
         return Link(0.0, _SIGMAS * _LEAST_SIGMA, 0.0, 0.0)
     off = left[n1:].mean()

@@ -35,8 +35,8 @@ _MET = 0.7  # share of stationary windows that must meet a ratio for it to be re
 _STRETCH = 0.05  # relative excess of a window's duration at which its frequencies are wrong
 _STRAY = 0.05  # relative deviation of an idle line from those observed
 _COLUMNS = 600  # columns of the spectrogram that is kept for the figure
-_SHOWN = 60.0  # Hz, upper end of that spectrogram
-_SLOWEST = 49.0  # Hz, lowest sampling rate at which the detector works
+_SPECTROGRAM_END = 60.0  # Hz, upper end of that spectrogram
+_LOWEST_RATE = 49.0  # Hz, lowest sampling rate at which the detector works
 CONDITIONS = (
     "forward limit", "up limit", "pitch limit",
     "forward Peak-1", "forward Peak-2", "up Peak-1", "up Peak-2", "pitch Peak-1",
@@ -64,8 +64,8 @@ def _detect(scene: Scene, labels: Labels | None, shown: bool) -> Detection:
     begin = np.arange(w.count) * step
     t_first, t_last = imu.t[begin], imu.t[begin + length - 1] if w.count else imu.t[:0]
     t = 0.5 * (t_first + t_last) - 0.5 * period
-    if not w.count or rate < _SLOWEST:
-        reason = "the recording is shorter than a window" if rate >= _SLOWEST else f"{rate:.3g} Hz are too few"
+    if not w.count or rate < _LOWEST_RATE:
+        reason = "the recording is shorter than a window" if rate >= _LOWEST_RATE else f"{rate:.3g} Hz are too few"
         return Detection(
             "fft",
             t,
@@ -173,7 +173,7 @@ def _measure(w: Windows, bands: Sequence[tuple[float, float]]) -> tuple[Array, A
     """Amplitude and frequency of the peaks (W, 3 channels, 3 bands), and a thinned spectrogram of the up force."""
     height, where = np.full((w.count, 3, 3), np.nan), np.full((w.count, 3, 3), np.nan)
     f = w.frequencies
-    shown = int(np.searchsorted(f, _SHOWN))
+    shown = int(np.searchsorted(f, _SPECTROGRAM_END))
     keep = np.unique(np.linspace(0, w.count - 1, _COLUMNS).astype(int))
     rows = []
     for part, a in w.amplitudes():

@@ -39,7 +39,7 @@ from graphnav.detectors.scene import Detector, Labels, Scene
 from graphnav.detectors.windows import Blocks, kernel, share_of, smooth_rows
 
 LOW_BAND, FFT = "low_band_glrt", "fft"
-_LOOK = 3.0  # s about an end in which the edge is sought
+_EDGE_SEARCH = 3.0  # s about an end in which the edge is sought
 _INNER = 1.5  # s inside a candidate that define its mean force and rate
 _EDGE = 3.0  # the statistic S of a single row at an edge
 _WORTH = 1.0  # s, the least by which the FFT detector may extend a span
@@ -47,8 +47,8 @@ _FURTHEST = 10.0  # s, the most
 _AWAY = 0.3  # ratio of mean to largest speed of a disturbance above which it moves the vehicle away
 _BLIND = 0.2  # share of moving windows that look stationary above which stillness is no evidence
 _AROUND = 60.0  # s about a span in which an odometer must have moved for its zero to count
-_ENOUGH = 20.0  # s of certain motion needed to estimate that share
-_CLEARLY = 10.0  # multiple of the low-band GLRT's threshold at which the vehicle clearly moves
+_ENOUGH_MOTION = 20.0  # s of certain motion needed to estimate that share
+_CLEAR_MOTION = 10.0  # multiple of the low-band GLRT's threshold at which the vehicle clearly moves
 _REACH = 0.3  # s, of the low-pass filter: closer to the recording's ends no edge can be found
 
 
@@ -69,7 +69,7 @@ def edges(b: Blocks, spans: Array, s: Scale, threshold: float) -> Array:
 def _leave(b: Blocks, h: Array, white: Array, middle: float, end: float, way: int, threshold: float) -> float:
     """Last time, from the middle towards one end, at which a row still agrees with those before it."""
     inner = min(_INNER, abs(end - middle))
-    lo, hi = sorted((end + way * _LOOK, end - way * (inner + 1.0)))
+    lo, hi = sorted((end + way * _EDGE_SEARCH, end - way * (inner + 1.0)))
     i, j = np.searchsorted(b.t, [lo, hi])
     i, j = max(i - len(h), 0), min(j + len(h), len(b.t))
     if j - i <= len(h) + 2:
@@ -95,13 +95,13 @@ def _leave(b: Blocks, h: Array, white: Array, middle: float, end: float, way: in
 
 
 def _without_speed(b: Blocks, spans: Array, settings: FusionSettings) -> Array:
-    """The spans cut where the force, integrated from `_LOOK` s inside, leads to a speed: braking that looked
+    """The spans cut where the force, integrated from `_EDGE_SEARCH` s inside, leads to a speed: braking that looked
     stationary.
     """
     limit = 0.5 * settings.bridge_speed
     out = spans.copy()
     for k, (start, end) in enumerate(spans):
-        inside = min(_LOOK, 0.5 * (end - start - _INNER))
+        inside = min(_EDGE_SEARCH, 0.5 * (end - start - _INNER))
         if inside <= 0.0:
             continue
         first, last = (
@@ -180,7 +180,7 @@ def _share_still_in_motion(found: Detection, certain: Array) -> float:
     """Share of the windows in certain motion that look stationary; 0 where there are too few to tell."""
     step = float(found.t[1] - found.t[0]) if len(found.t) > 1 else 0.0
     moving = mask_within(found.t, certain, _INNER) & np.isfinite(found.statistic)
-    return float(found.mask[moving].mean()) if moving.sum() * step > _ENOUGH else 0.0
+    return float(found.mask[moving].mean()) if moving.sum() * step > _ENOUGH_MOTION else 0.0
 
 
 def _leads_to_speed(b: Blocks, span: Array, speeds: list[Speeds], settings: FusionSettings) -> bool:
@@ -326,7 +326,7 @@ def decide_fused(scene: Scene, detectors: Mapping[str, type[Detector]], shown: b
     low, _ = scene.share(low_band)
     still, certain, notes = candidates(scene, low)
     half = 0.5 * scene.settings.low_band_glrt.window
-    labels = Labels(still, spans_of(low.statistic > _CLEARLY * low.threshold, low.t, half))
+    labels = Labels(still, spans_of(low.statistic > _CLEAR_MOTION * low.threshold, low.t, half))
     notes = (*low.notes, *notes)
     found, idling = [low], NONE
     if shown:

@@ -27,7 +27,7 @@ from graphnav.detectors.windows import Blocks, find_unbroken, sum_running, windo
 
 _TINY = 1e-300
 _WINDOW_STEP = 0.1  # s between windows
-_SCALE = 0.05  # share of g that an accelerometer's scale and bias may be off
+_GRAVITY_ERROR = 0.05  # share of g that an accelerometer's scale and bias may be off
 # twice the expectation under noise alone: three axes of each sensor, one direction of the magnitude
 _AT_NOISE = {
     "glrt": 12.0, "acceleration_variance": 6.0, "acceleration_magnitude": 2.0, "angular_rate_energy": 6.0,
@@ -203,7 +203,7 @@ def _centre(rows: Array, reference: Array, g: float, at_rest: bool) -> tuple[Arr
     bias = np.median(means[reference, 3:6], axis=0)
     means[:, 8] += bias @ bias - 2.0 * means[:, 3:6] @ bias
     measured = float(np.median(np.linalg.norm(means[reference, :3], axis=1)))
-    return means, measured if at_rest and abs(measured / g - 1.0) < _SCALE else g
+    return means, measured if at_rest and abs(measured / g - 1.0) < _GRAVITY_ERROR else g
 
 
 def _find_quietest(m: Means) -> Array:

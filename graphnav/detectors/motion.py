@@ -21,7 +21,7 @@ from graphnav.recording.checks.crosschecks import compute_local_positions
 _SIGMAS = 3.0
 _SIGMAS_APART = 6.0  # for differences of positions: their errors wander by more than receivers state
 _MEDIAN = 3  # epochs of the running median
-_LONGEST = 2.0  # s, longest gap between epochs within a span of motion
+_LONGEST_GAP = 2.0  # s, longest gap between epochs within a span of motion
 _BASE = 4.0  # s between the positions that are differenced
 
 
@@ -78,7 +78,7 @@ def find_moving(found: list[Speeds]) -> Array:
         excess = s.speed - s.limit
         k = np.arange(len(excess))
         fast = take_median(excess[np.maximum(k - 1, 0)], excess, excess[np.minimum(k + 1, len(k) - 1)]) > 0.0
-        breaks = np.diff(s.t) > _LONGEST
+        breaks = np.diff(s.t) > _LONGEST_GAP
         spans = [spans_of(fast[a:b], s.t[a:b]) for a, b in _split_pieces(breaks)]
         one = union([p for p in spans if len(p)]) if any(len(p) for p in spans) else NONE
         if len(one):

@@ -21,7 +21,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from graphnav.core.rotation import Array
 
 CHANNELS = ("force y", "force z", "rate x")  # forward, up, pitch
-_CHUNK = 256  # windows at a time: a few MB whatever the length of the recording
+_WINDOWS_AT_ONCE = 256  # windows at a time: a few MB whatever the length of the recording
 LOWEST, _HIGHEST = 8.0, 50.0  # Hz, where idle lines are looked for
 _FLOOR = 3.0  # Hz on either side of a bin over which the background is taken
 _CLEAR = 2.0  # natural logarithm of power over background at which there is a line
@@ -50,7 +50,7 @@ class Windows:
 
     def amplitudes(self, which: Array | None = None) -> Iterator[tuple[slice, Array]]:
         """Single-sided amplitudes (w, 3, F) of all windows or of some, chunk by chunk, in the columns' units."""
-        if self.count <= _CHUNK:  # small enough to be kept
+        if self.count <= _WINDOWS_AT_ONCE:  # small enough to be kept
             yield (
                 slice(0, self.count if which is None else len(which)),
                 self._all if which is None else self._all[which],
@@ -67,8 +67,8 @@ class Windows:
         ramp = np.linspace(-1.0, 1.0, n)
         hann = np.hanning(n + 1)[:-1]
         # removes mean and trend and applies the weights, afterwards: w (x - a - b ramp)
-        for begin in range(0, len(number), _CHUNK):
-            some = number[begin : begin + _CHUNK]
+        for begin in range(0, len(number), _WINDOWS_AT_ONCE):
+            some = number[begin : begin + _WINDOWS_AT_ONCE]
             x = np.empty((len(some), len(self.columns), n), dtype=np.float32)
             for c, column in enumerate(self.columns):
                 view = sliding_window_view(column, n)[some * self.step]

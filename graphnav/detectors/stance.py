@@ -37,8 +37,8 @@ from graphnav.detectors.glrt import glrt_statistic
 from graphnav.detectors.windows import find_unbroken, sum_running
 from graphnav.recording import Imu
 
-_QUIET = 1.0  # s; the quietest second of the recording defines bias and gravity
-_ENOUGH = 5  # spans needed for the statistics of their depth
+_QUIET_SPAN = 1.0  # s; the quietest second of the recording defines bias and gravity
+_FEWEST_SPANS = 5  # spans needed for the statistics of their depth
 _LEAST_SPREAD = 0.3  # of log e: least spread between stances
 _SPREADS = 3.0
 _EDGE_SEARCH = 0.8  # s from an end of a span within which its quietest moment is sought: twice the duration of a slide
@@ -107,7 +107,7 @@ def _find_below(name: str, e: Array, imu: Imu, period: float, window: int, setti
 
 def _average_quietest(imu: Imu, period: float) -> tuple[Array, float]:
     """Mean rate (3,) and magnitude of the mean force of the second in which both scatter least."""
-    n = min(len(imu.t), max(2, round(_QUIET / period)))
+    n = min(len(imu.t), max(2, round(_QUIET_SPAN / period)))
     rows = np.column_stack([imu.gyro, imu.accel])
     means, squares = sum_running(rows).means(n), sum_running(rows**2).means(n)
     scatter = squares - means**2
@@ -122,7 +122,7 @@ def _as_deep_as_others(spans: Array, t: Array, e: Array, threshold: float) -> Ar
 
     Missing rows do not split a stance: the parts would be many, and the stances of the walk the outliers.
     """
-    if len(spans) < _ENOUGH:
+    if len(spans) < _FEWEST_SPANS:
         return np.ones(len(spans), dtype=bool)
     first, last = np.searchsorted(t, spans[:, 0]), np.searchsorted(t, spans[:, 1], side="right")
     moved = np.concatenate([[0], np.cumsum(np.nan_to_num(e) >= threshold)])
@@ -131,7 +131,7 @@ def _as_deep_as_others(spans: Array, t: Array, e: Array, threshold: float) -> Ar
     lowest = np.array([np.log(np.nanmin(e[a:b])) for a, b in zip(first, last, strict=True)])
     depth = np.full(one[-1] + 1, np.inf)
     np.minimum.at(depth, one, lowest)
-    if len(depth) < _ENOUGH:
+    if len(depth) < _FEWEST_SPANS:
         return np.ones(len(spans), dtype=bool)
     middle = float(np.median(depth))
     spread = max(1.4826 * float(np.median(np.abs(depth - middle))), _LEAST_SPREAD)

@@ -21,10 +21,10 @@ MISLABELLED = 0.2  # share of the moving windows that other sensors may mislabel
 _TELLS = 0.5  # sum of the shares of wrong decisions of either kind; 1 is a statistic without information
 MISTAKEN = 0.05  # share of the moving windows that may be mislabelled
 _BIN = 0.1  # decades
-_SPREAD = np.array([0.05, 0.25, 0.4, 0.25, 0.05])  # smoothing, bins
+_SMOOTHING = np.array([0.05, 0.25, 0.4, 0.25, 0.05])  # smoothing, bins
 _DEPTH = 4.0  # ratio of both sides to a valley
-_FEW = 10.0  # times the fewest values: a smaller population must be separated by more than chance
-_APART = 4  # empty bins that this takes
+_SMALL_POPULATION = 10.0  # times the fewest values: a smaller population must be separated by more than chance
+_EMPTY_BINS = 4  # empty bins that this takes
 
 
 def valley(log_values: Array, low: float, high: float, fewest: int) -> float | None:
@@ -40,7 +40,7 @@ def valley(log_values: Array, low: float, high: float, fewest: int) -> float | N
     if len(x) < 2 * fewest or not low < high:
         return None
     edges = np.arange(np.floor(min(low, x.min()) / _BIN) - 3, np.ceil(max(high, x.max()) / _BIN) + 4) * _BIN
-    density = np.convolve(np.histogram(x, edges)[0], _SPREAD, mode="same")
+    density = np.convolve(np.histogram(x, edges)[0], _SMOOTHING, mode="same")
     middle = 0.5 * (edges[1:] + edges[:-1])
     inside = np.flatnonzero((middle >= low) & (middle <= high))
     if not len(inside):
@@ -55,7 +55,7 @@ def valley(log_values: Array, low: float, high: float, fewest: int) -> float | N
     smaller = min(below.sum(), (~below).sum())
     if contrast.max() < _DEPTH or smaller < fewest:
         return None
-    if smaller < _FEW * fewest and len(lowest) < _APART:
+    if smaller < _SMALL_POPULATION * fewest and len(lowest) < _EMPTY_BINS:
         return None
     return float(middle[bottom])
 

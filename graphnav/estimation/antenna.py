@@ -27,7 +27,7 @@ from graphnav.estimation.solvers.ekf import ekf
 from graphnav.estimation.solvers.rts import backward, rts
 from graphnav.recording import Recording, take_rows
 
-_UNKNOWN = 2.0  # m, 1-sigma before the drive
+_PRIOR_SIGMA = 2.0  # m, 1-sigma before the drive
 _FINE = 0.3  # m, 1-sigma of fixes that are precise enough
 _LEAST_PART = 0.25  # m, of a component of an arm whose sign matters, or of its error: tape measures are better
 _OPPOSITE = 0.5  # ratio of the distances of the estimate from the opposite sign and from the stated one
@@ -165,7 +165,7 @@ def _estimate(recording: Recording) -> tuple[Antenna, tuple[Array, Array, Array]
         raise EstimationError(
             f"'{recording.name}': without motion nothing tells where the antenna is", key="antenna.no_motion"
         )
-    unknown = {"gnss": {"lever_arm_sigma": _UNKNOWN}, "vehicle": {"axle_sigma": _UNKNOWN}}
+    unknown = {"gnss": {"lever_arm_sigma": _PRIOR_SIGMA}, "vehicle": {"axle_sigma": _PRIOR_SIGMA}}
     sections = {name: getattr(settings, name).model_copy(update=values) for name, values in unknown.items()}
     settings = settings.model_copy(update=sections)
     problem = build_problem(recording, settings, frame, aligned.state, aligned.sigma, still, parts_of_noise=True)

@@ -40,7 +40,10 @@ _ESTIMATORS: dict[str, Any] = {
     "tukey": gtsam.noiseModel.mEstimator.Tukey,
     "welsch": gtsam.noiseModel.mEstimator.Welsch,
 }
-_ROUNDS, _SMALL = 20, 1e-9  # iterations of reweighting by kernels; relative change of the cost at convergence
+_MAX_ITERATIONS, _CONVERGED = (
+    20,
+    1e-9,
+)  # iterations of reweighting by kernels; relative change of the cost at convergence
 _X, _V, _B, _Q = (gtsam.symbol_shorthand.X, gtsam.symbol_shorthand.V, gtsam.symbol_shorthand.B,
                   gtsam.symbol_shorthand.Q)  # fmt: skip
 
@@ -92,7 +95,7 @@ def _with_unlisted(problem: Problem, states: States, values: dict[str, Array]) -
     first = np.cumsum([0, *(c.mean.size for c in chains)])
     sigma = np.concatenate([c.sigma.ravel() for c in chains])
     mean = at = np.concatenate([c.mean.ravel() for c in chains])
-    for k in range(_ROUNDS):
+    for k in range(_MAX_ITERATIONS):
         points = Iterate(states, out).points(problem)
         parts = [(diags_array(1.0 / sigma), (mean - at) / sigma)]
         for rows in problem.constraints:
@@ -116,7 +119,7 @@ def _with_unlisted(problem: Problem, states: States, values: dict[str, Array]) -
         out |= {
             c.parameter.name: x.reshape(c.mean.shape) for c, x in zip(chains, np.split(at, first[1:-1]), strict=True)
         }
-        if k and np.all(np.abs(step) < _SMALL * sigma):
+        if k and np.all(np.abs(step) < _CONVERGED * sigma):
             break
     return out
 

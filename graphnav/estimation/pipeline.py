@@ -42,8 +42,8 @@ from graphnav.recording.plausibility.screening import screen_recording
 
 SOLVERS = ("ekf", "rts", "batch")  # run when none is named
 KNOWN = ("ekf", "rts", "incremental", "isam2", "batch")
-_CLEARLY = 10.0  # half chi-square; a likelihood ratio of 22,000
-_SHORTEST = 5.0  # s; a shorter piece between two cuts cannot be aligned
+_CLEARLY_BETTER = 10.0  # half chi-square; a likelihood ratio of 22,000
+_SHORTEST_PIECE = 5.0  # s; a shorter piece between two cuts cannot be aligned
 
 
 def run(
@@ -238,7 +238,7 @@ def _solve(
 
         out["isam2"] = one = isam2(problem, settings.solver.isam2_lag or np.inf, progress, begin).settled
         best = compute_cost_at(problem, smoothed)
-        if not settings.solver.isam2_lag and one.cost is not None and one.cost > best + _CLEARLY:
+        if not settings.solver.isam2_lag and one.cost is not None and one.cost > best + _CLEARLY_BETTER:
             note = Note(
                 "solver.worse_optimum",
                 "isam2 ended in an optimum that explains the data worse than rts does: do not trust it "
@@ -334,7 +334,7 @@ def _split_pieces(recording: Recording, settings: Settings) -> tuple[list[Record
     pieces = []
     for lo, hi in itertools.pairwise(edges):
         begin, end = t[lo + 1] - recording.start, t[hi] - recording.start
-        if end - begin < _SHORTEST:
+        if end - begin < _SHORTEST_PIECE:
             notes.append(
                 Note(
                     "pieces.too_short", f"{begin:.1f} to {end:.1f} s left out: too short between two gaps to be aligned"

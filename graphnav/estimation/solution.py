@@ -18,7 +18,7 @@ from graphnav.detectors.base import Detection
 from graphnav.estimation.noise.model import STATED, NoiseModel, RowWeights
 
 _OUT = 9  # errors of attitude, position, velocity, which are those of a trajectory
-_ROWS = 4096  # rows of a block: 25 MB while it is processed
+_BLOCK_ROWS = 4096  # rows of a block: 25 MB while it is processed
 
 
 class Between(Protocol):
@@ -222,8 +222,8 @@ class Solution:
             return
         for piece in self.between:
             times = piece.times(rate)
-            for k in range(0, len(times), _ROWS):
-                t = times[k : k + _ROWS]
+            for k in range(0, len(times), _BLOCK_ROWS):
+                t = times[k : k + _BLOCK_ROWS]
                 yield to_trajectory(self.solver, self.frame, t, *piece(t, _OUT), joint=False)
 
     def at(self, t: Array) -> tuple[Array, States, Array]:

@@ -32,15 +32,15 @@ from graphnav.recording.formats.trajectories import read_trajectory
 
 _MAX_GAP = 3.0  # s; wider gaps of a trajectory are not filled
 _APPLIED = 1.0  # s; a larger shift is one of the clock
-_FEWEST = 10  # rows in common, at least
+_FEWEST_ROWS = 10  # rows in common, at least
 _MATTERS, _SIGNIFICANT = 0.02, 3.0  # s and sigmas; a smaller shift is not reported, or may be chance
 _PLACE = 10_000.0  # m; frames of other datums, and diverging filters, are closer than that to the start
 _CHORD = 10.0  # s; over so long a chord the noise of positions does not hide distance and direction
-_MOVES = 1.0  # m/s
+_LEAST_SPEED = 1.0  # m/s
 # share of the squared chords, and of the variance of their lengths, that two trajectories of one drive have in common
-_HALF = 0.5
+_COMMON_SHARE = 0.5
 _MENDED = 0.3  # ratio of the discrepancies with and without another point below which that point explains them
-_STEP = 0.1  # s, between speeds of our solution
+_SPEED_STEP = 0.1  # s, between speeds of our solution
 
 
 @dataclass(frozen=True)
@@ -107,7 +107,7 @@ def read_against(asked: Against, name: str, recording: Recording, reference: Sol
         track = replace(track, t=track.t + shift)
         notes += words
     inside = (track.t >= reference.t[0]) & (track.t <= reference.t[-1])
-    if inside.sum() < _FEWEST:
+    if inside.sum() < _FEWEST_ROWS:
         raise RecordingError(
             f"{asked.path}: {int(inside.sum())} rows in common with '{recording.name}': its time runs from "
             f"{track.t[0]:.3f} to {track.t[-1]:.3f} s, the recording's from {reference.t[0]:.3f} to "
@@ -226,20 +226,20 @@ def _moves_otherwise(track: Trajectory, reference: Solution) -> bool:
     last = k[first]
     whole = track.t[last] - track.t[first] < _CHORD + _MAX_GAP
     first, last = first[whole], last[whole]
-    if len(first) < _FEWEST:
+    if len(first) < _FEWEST_ROWS:
         return False
     theirs = reference.frame.from_llh(track.llh)[:, :2]
     ours = reference.at(track.t)[1].p[:, :2]
     a, b = (p[last] - p[first] for p in (theirs, ours))
     way_a, way_b = np.linalg.norm(a, axis=1), np.linalg.norm(b, axis=1)
-    moving = np.maximum(way_a, way_b) > _MOVES * _CHORD
-    if moving.sum() < _FEWEST or np.ptp(track.t[first[moving]]) < 3.0 * _CHORD:
+    moving = np.maximum(way_a, way_b) > _LEAST_SPEED * _CHORD
+    if moving.sum() < _FEWEST_ROWS or np.ptp(track.t[first[moving]]) < 3.0 * _CHORD:
         return False
     unlike = np.sum((a - b) ** 2, axis=1)[moving] / (way_a**2 + way_b**2)[moving]
-    if np.median(unlike) < _HALF:
+    if np.median(unlike) < _COMMON_SHARE:
         return False
     lengths = (way_a[moving], way_b[moving])
-    return min(x.std() for x in lengths) > 0.0 and float(np.corrcoef(*lengths)[0, 1]) < np.sqrt(_HALF)
+    return min(x.std() for x in lengths) > 0.0 and float(np.corrcoef(*lengths)[0, 1]) < np.sqrt(_COMMON_SHARE)
 
 
 def _find_other_point(
@@ -284,8 +284,8 @@ def _measure_delay(track: Trajectory, reference: Solution) -> float | None:
     llh = track.llh if track.frame == "geodetic" else reference.frame.to_llh(np.nan_to_num(track.llh))
     places = crosschecks.track(Gnss(track.t, llh, np.ones((len(track), 3))))
     # between its keyframes too, where speeds do not change linearly
-    t, states, _ = reference.at(np.arange(reference.t[0], reference.t[-1], _STEP))
-    ours = Track(t, states.v, np.zeros(len(t)), _STEP)
+    t, states, _ = reference.at(np.arange(reference.t[0], reference.t[-1], _SPEED_STEP))
+    ours = Track(t, states.v, np.zeros(len(t)), _SPEED_STEP)
     fit = crosschecks.fit_velocity(ours, places) if places is not None else None
     if fit is None or fit.correlation <= CLEAR or abs(fit.lag) < max(_MATTERS, _SIGNIFICANT * fit.spread):
         return None

@@ -12,11 +12,11 @@ from typing import Any
 from graphnav.core.errors import ConfigError
 from graphnav.evaluation.metrics import COMPONENTS
 
-_FORM = re.compile(r"(?:([\w-]+):)?\s*([A-Za-z]\w*)\s*(<=|>=|<|>)\s*(\S+)")
+_REQUIREMENT = re.compile(r"(?:([\w-]+):)?\s*([A-Za-z]\w*)\s*(<=|>=|<|>)\s*(\S+)")
 _COMPARE = {"<": operator.lt, "<=": operator.le, ">": operator.gt, ">=": operator.ge}
 _SPAN = ("start_s", "end_s", "n", "distance_m", "end_h_m", "end_3d_m", "max_h_m", "max_up_m", "drift_mps",
          "drift_percent", "nees_p")  # fmt: skip
-_UNITS = ("_m", "_mps", "_deg", "_s")  # suffixes that may be omitted
+_UNIT_SUFFIXES = ("_m", "_mps", "_deg", "_s")  # suffixes that may be omitted
 
 
 def names() -> tuple[str, ...]:
@@ -70,7 +70,7 @@ def parse_requirement(text: str, solvers: Sequence[str] = ()) -> Requirement:
     ConfigError
         If it is not of that form, or names no number or no solver that there is, with the nearest that are.
     """
-    found = _FORM.fullmatch(text.strip())
+    found = _REQUIREMENT.fullmatch(text.strip())
     usage = "write NAME<NUMBER, such as h_rms<0.5, with <, <=, > or >="
     if found is None:
         raise ConfigError(f"--require {text}: {usage}", key="option.requirement")
@@ -90,7 +90,7 @@ def parse_requirement(text: str, solvers: Sequence[str] = ()) -> Requirement:
 def _complete_name(name: str, text: str) -> str:
     """The name with its unit, and with the number of its span if it has one."""
     every = names()
-    short = {full.removesuffix(unit): full for unit in _UNITS for full in every if full.endswith(unit)}
+    short = {full.removesuffix(unit): full for unit in _UNIT_SUFFIXES for full in every if full.endswith(unit)}
     known = {**short, **{full: full for full in every}}
     span = re.match(r"span(\d+)_", name)
     plain = re.sub(r"^span\d+_", "span_", name)

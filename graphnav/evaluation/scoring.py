@@ -18,7 +18,7 @@ from graphnav.evaluation.metrics import Closure, Errors
 
 MAX_GAP = 3.0  # s; the widest gap that is interpolated over
 _LARGER = 1.05  # ratio to the stated sigma above which it is noted
-_SLOW = 0.5  # m/s; below, the direction of travel is undefined
+_LEAST_SPEED = 0.5  # m/s; below, the direction of travel is undefined
 
 
 def errors(
@@ -124,7 +124,7 @@ def errors(
             Note("truth.no_velocity", "the truth has no velocity: its direction of travel is taken from its positions")
         )
     speed = np.linalg.norm(travel, axis=1)
-    moving = speed > _SLOW
+    moving = speed > _LEAST_SPEED
     along = np.where(moving[:, None], travel / np.where(moving, speed, 1.0)[:, None], np.nan)
     return Errors(
         t=seen.t,

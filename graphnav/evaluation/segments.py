@@ -9,7 +9,7 @@ import numpy as np
 from graphnav.core.rotation import Array
 from graphnav.evaluation.metrics import Errors
 
-_FEWEST = 10  # segments, at least
+_FEWEST_SEGMENTS = 10  # segments, at least
 _STEPS = (1.0, 2.0, 5.0)
 
 
@@ -44,10 +44,10 @@ def relative_errors(errors: Errors) -> tuple[Relative, ...]:
     way, e, heading = errors.distance[known], errors.p[known, :2], errors.rph[known, 2]
     out = []
     for length in (step * 10.0**k for k in range(1, 6) for step in _STEPS):
-        if (way[-1] - way[0]) / length < _FEWEST:
+        if (way[-1] - way[0]) / length < _FEWEST_SEGMENTS:
             break
         first, last = _segments(way, length)
-        if len(first) >= _FEWEST:
+        if len(first) >= _FEWEST_SEGMENTS:
             off = np.hypot(*(e[last] - e[first]).T)
             turned = np.degrees(np.angle(np.exp(1j * (heading[last] - heading[first]))))
             p95, largest = np.quantile(off, 0.95), off.max()

@@ -20,9 +20,9 @@ from graphnav.estimation.solution import Solution
 from graphnav.evaluation.scoring import closure
 from graphnav.recording import Recording
 
-_SPACING = 0.1  # s between the epochs compared with a dense truth
-_STANDS = 1.0  # s at the start over which a dense truth is averaged to place it
-_TURNS = 10  # iterations of fitting a point on the foot; and epochs needed for a shape
+_EPOCH_SPACING = 0.1  # s between the epochs compared with a dense truth
+_INITIAL_STANCE = 1.0  # s at the start over which a dense truth is averaged to place it
+_FIT_ITERATIONS = 10  # iterations of fitting a point on the foot; and epochs needed for a shape
 _A_STRIDE = 0.3  # m; the smallest distance between footprints that counts as a stride
 
 
@@ -76,9 +76,9 @@ def walk_errors(recording: Recording, solution: Solution, truth_sigma: float = 0
     t, X = truth.t, truth.xyz
     inside = (t >= solution.t[0]) & (t <= solution.t[-1]) & np.isfinite(X).all(axis=1)
     t, X = t[inside], X[inside]
-    first = X[t <= t[0] + _STANDS].mean(axis=0) if X.shape[1] == 3 else X[0]
+    first = X[t <= t[0] + _INITIAL_STANCE].mean(axis=0) if X.shape[1] == 3 else X[0]
     if X.shape[1] == 3:
-        _, rows = np.unique(np.floor((t - t[0]) / _SPACING), return_index=True)
+        _, rows = np.unique(np.floor((t - t[0]) / _EPOCH_SPACING), return_index=True)
         t, X = t[rows], X[rows]
     _, states, covariance = solution.at(t)
     p, P = states.p, covariance[:, 3:6, 3:6]
@@ -86,7 +86,7 @@ def walk_errors(recording: Recording, solution: Solution, truth_sigma: float = 0
     of_point, arm = fit_point(states, flat)
     # about the start
     q = p if X.shape[1] == 2 else p + states.R_nb @ arm
-    at_start = q[0] if X.shape[1] == 2 else q[t <= t[0] + _STANDS].mean(axis=0)
+    at_start = q[0] if X.shape[1] == 2 else q[t <= t[0] + _INITIAL_STANCE].mean(axis=0)
     a, b = X[:, :2] - first[:2], (q - at_start)[:, :2]
     anchored = _rotate(a, float(np.arctan2(np.sum(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]), np.sum(a * b))))
     e = b - anchored
@@ -94,7 +94,7 @@ def walk_errors(recording: Recording, solution: Solution, truth_sigma: float = 0
     nees_h = 0.5 * np.einsum("ni,nij,nj->n", e, np.linalg.inv(P[:, :2, :2] + R * np.eye(2)), e)
     up = nees_up = stride = np.nan
     if X.shape[1] == 3:
-        height = p[:, 2] - X[:, 2] - np.mean((p[:, 2] - X[:, 2])[t <= t[0] + _STANDS])
+        height = p[:, 2] - X[:, 2] - np.mean((p[:, 2] - X[:, 2])[t <= t[0] + _INITIAL_STANCE])
         up, e_up = float(np.sqrt(np.mean(height**2))), (q - at_start)[:, 2] - (X[:, 2] - first[2])
         nees_up = float(np.mean(e_up**2 / (P[:, 2, 2] + R)))
     else:
@@ -117,7 +117,7 @@ def shapes(t: Array, p: Array, truth: Array, stances: Array) -> tuple[float, flo
     rows = [(t >= a) & (t <= b) for a, b in stances]
     inside = np.any(rows, axis=0) if rows else np.zeros(len(t), dtype=bool)
     everywhere = _shape(p, truth)
-    if np.count_nonzero(inside) <= _TURNS:
+    if np.count_nonzero(inside) <= _FIT_ITERATIONS:
         return everywhere, everywhere, everywhere
     means = [np.array([x[one].mean(axis=0) for one in rows if one.any()]) for x in (p, truth)]
     return everywhere, _shape(p[inside], truth[inside]), _shape(*means)
@@ -147,7 +147,7 @@ def fit_point(states: States, flat: Array) -> tuple[float, Array]:
     """Horizontal rms after fitting yaw, offset and, alternately, a lever arm in the body; and that arm (3,), m."""
     arm = np.zeros(3)
     level = states.R_nb[:, :2]
-    for _ in range(_TURNS):
+    for _ in range(_FIT_ITERATIONS):
         p = np.column_stack([states.p[:, :2] + level @ arm, np.zeros(len(flat))])
         yaw, offset = fit_yaw(flat, p)
         e = p[:, :2] - (_rotate(flat[:, :2], yaw) + offset[:2])

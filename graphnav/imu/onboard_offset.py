@@ -29,9 +29,9 @@ from graphnav.recording import Imu, Recording
 
 _AFTER = 5.0  # s of rest after which the correction starts
 _RESTS = np.deg2rad(3.0)  # rad/s on every axis, below which the unit takes itself to be at rest
-_RATE = 2.0 * np.pi * 0.02  # rad/s, kappa
-_BLOCK = 0.25  # s over which angles are averaged
-_SHORTEST = 3.0  # s of correction in a rest, below which the bend is not significant
+_KAPPA = 2.0 * np.pi * 0.02  # rad/s, kappa
+_ANGLE_BLOCK = 0.25  # s over which angles are averaged
+_SHORTEST_CORRECTION = 3.0  # s of correction in a rest, below which the bend is not significant
 _ODDS = 100.0  # likelihood ratio above which the correction is undone
 
 
@@ -61,7 +61,7 @@ def offset_learnt(imu: Imu) -> Array:
     active = np.zeros(len(imu.t), dtype=bool)
     for begin, end in _find_rests(imu):
         active[begin:end] = (begin == 0) | (imu.t[begin:end] > imu.t[begin] + _AFTER)
-    return np.asarray(np.cumsum(imu.gyro * (_RATE * active * _find_periods(imu))[:, None], axis=0))
+    return np.asarray(np.cumsum(imu.gyro * (_KAPPA * active * _find_periods(imu))[:, None], axis=0))
 
 
 def compute_evidence(imu: Imu, offset: Array) -> float:
@@ -70,9 +70,9 @@ def compute_evidence(imu: Imu, offset: Array) -> float:
     angle, bent = np.cumsum(imu.gyro * T, axis=0), np.cumsum(offset * T, axis=0)
     total = 0.0
     for begin, end in _find_rests(imu):
-        if np.count_nonzero(np.diff(offset[begin:end, 0])) * float(np.median(T)) < _SHORTEST:
+        if np.count_nonzero(np.diff(offset[begin:end, 0])) * float(np.median(T)) < _SHORTEST_CORRECTION:
             continue
-        first = np.flatnonzero(np.diff(((imu.t[begin:end] - imu.t[begin]) / _BLOCK).astype(int), prepend=-1))
+        first = np.flatnonzero(np.diff(((imu.t[begin:end] - imu.t[begin]) / _ANGLE_BLOCK).astype(int), prepend=-1))
         count = np.diff(np.append(first, end - begin))[:, None]
         t, force, phi, theta = (
             np.add.reduceat(x[begin:end], first, axis=0) / count for x in (imu.t[:, None], imu.accel, angle, bent)

@@ -42,7 +42,7 @@ from graphnav.recording import Imu
 
 NOISE_FIGURES = ("gyro_noise_density", "accel_noise_density", "gyro_bias_walk", "accel_bias_walk")
 _CYCLES = ((0, 1, 2), (1, 2, 0), (2, 0, 1))
-_FEW = 16  # number of intervals below which calls cost more than arithmetic
+_FEW_INTERVALS = 16  # number of intervals below which calls cost more than arithmetic
 _CELL = 4  # Jacobians and noise of intervals of `MANY` pieces are summed over cells of this many pieces; means are not
 
 
@@ -234,7 +234,7 @@ def _multiply_up(turn: Array) -> Array:
     L, n = turn.shape[:2]
     out = np.empty((L + 1, n, 3, 3))
     out[0] = np.eye(3)
-    size = 1 if n > _FEW else max(1, math.isqrt(L))
+    size = 1 if n > _FEW_INTERVALS else max(1, math.isqrt(L))
     blocks = L // size
     # for few intervals the calls dominate: products within runs of pieces side by side, then across the runs
     if size > 1:

@@ -13,7 +13,7 @@ from graphnav.recording import Imu
 
 GAP = 1.5  # sample periods between rows above which there is a gap
 MANY = 64  # pieces above which an interval is processed apart from shorter ones
-_CHUNK = 40_000  # pieces processed at once: keeps the working arrays in the processor's cache
+_PIECES_AT_ONCE = 40_000  # pieces processed at once: keeps the working arrays in the processor's cache
 
 
 @dataclass(frozen=True)
@@ -120,7 +120,7 @@ def chunks(count: Array) -> Iterator[Array]:
         lo, hi = start + 1, len(order)
         while lo < hi:
             mid = (lo + hi + 1) // 2
-            fits = (mid - start) * count[order[mid - 1]] <= _CHUNK
+            fits = (mid - start) * count[order[mid - 1]] <= _PIECES_AT_ONCE
             alike = count[order[mid - 1]] <= 2 * count[order[start]] + 16
             alike &= (count[order[mid - 1]] >= MANY) == (count[order[start]] >= MANY)
             lo, hi = (mid, hi) if fits and alike else (lo, mid - 1)

@@ -23,7 +23,7 @@ from graphnav.core.rotation import Array
 from graphnav.imu.samples import Samples
 from graphnav.recording import ImuNoise
 
-_SHARE = 0.25  # share of the variance of a linearly changing signal
+_VARIANCE_SHARE = 0.25  # share of the variance of a linearly changing signal
 
 
 def with_unresolved_motion(samples: Samples, noise: ImuNoise) -> Samples:
@@ -41,7 +41,7 @@ def _estimate_density(x: Array, white: float, period: float) -> Array:
     change = np.sum(np.diff(x, axis=0) ** 2, axis=1) / 3.0
     change = np.maximum(change - 2.0 * white**2 / period, 0.0)
     both = 0.5 * (np.sqrt(np.r_[change[:1], change]) + np.sqrt(np.r_[change, change[-1:]]))
-    return np.asarray(_SHARE * both**2 / 12.0 * period)
+    return np.asarray(_VARIANCE_SHARE * both**2 / 12.0 * period)
 
 
 def with_coning(samples: Samples) -> Samples:

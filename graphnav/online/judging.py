@@ -40,8 +40,8 @@ from graphnav.online.tracker import Tracker
 from graphnav.recording import Recording
 
 _PORTION = 4  # keyframes processed again per row
-_FIXES = 600  # fixes in motion, which determine variances to 6 %
-_LONGEST = 900.0  # s of rows after which estimation ends where fixes are rare
+_ENOUGH_FIXES = 600  # fixes in motion, which determine variances to 6 %
+_LONGEST_SPAN = 900.0  # s of rows after which estimation ends where fixes are rare
 # of the lag, and s: time allowed for the estimation, 11 s for 1100 keyframes
 _THINKING, _LONGEST_THOUGHT = 1.0 / 8.0, 20.0
 
@@ -165,7 +165,7 @@ def judge(
 def are_enough(sensors: Sensors, found: Alignment, span: float) -> bool:
     """Whether the rows of a span (s) determine the noise model so well that more rows would change little."""
     assert found.motion is not None
-    return bool(np.count_nonzero(sensors.gnss.used > found.motion) >= _FIXES or span > _LONGEST)
+    return bool(np.count_nonzero(sensors.gnss.used > found.motion) >= _ENOUGH_FIXES or span > _LONGEST_SPAN)
 
 
 class CatchUp:

@@ -18,11 +18,11 @@ from graphnav.recording.odometer import ReadingStatistics, faults
 
 CONTEXT = 30.0  # s of rows before a keyframe that its constraints may use
 SURE = 1.0  # s before now up to which detection is reliable: the end of a stop is known only afterwards
-_EVERY = 2.0  # s between runs of the detectors
-_LOOK = 30.0  # s of rows that they use
-_SEEN = 25.0  # s of these for which they answer; the first few lack the rows before
+_DETECTOR_INTERVAL = 2.0  # s between runs of the detectors
+_DETECTOR_SPAN = 30.0  # s of rows that they use
+_ANSWERED_SPAN = 25.0  # s of these for which they answer; the first few lack the rows before
 _REVIEW = 10.0  # s between reviews of earlier answers, while nothing is stationary
-_CLEARLY = 0.1  # relative change of a figure
+_CLEAR_CHANGE = 0.1  # relative change of a figure
 _WHEELS, _WHEELS_LOOK = 10.0, 40.0  # s between checks of the odometer, and s of rows that they use
 
 
@@ -42,16 +42,16 @@ class Stops:
 
     def due(self, now: float) -> bool:
         """Whether the next run is due."""
-        return self._seen is None and now - self.looked >= _EVERY - SAME_TIME
+        return self._seen is None and now - self.looked >= _DETECTOR_INTERVAL - SAME_TIME
 
     def look(self, sensors: Sensors, settings: Settings, now: float, head: float) -> None:
         """Run the detectors; the first time over everything since `head`."""
         whole = not np.isfinite(self.looked)
-        since, answered = (head, -np.inf) if whole else (now - _SEEN, self.looked - SURE)
+        since, answered = (head, -np.inf) if whole else (now - _ANSWERED_SPAN, self.looked - SURE)
         if now - self._reviewed >= _REVIEW - SAME_TIME:
             self._reviewed, answered = now, since
         self.looked = now
-        recording = sensors.recording(-np.inf if whole else now - _LOOK, now, every=True)
+        recording = sensors.recording(-np.inf if whole else now - _DETECTOR_SPAN, now, every=True)
         self._seen = since, stops(recording, settings, since, now - SURE, self.spans, answered)
 
     def replace(self, spans: Array, edges: Array) -> None:
@@ -139,7 +139,7 @@ class Readings:
 
 def _other(before: tuple[float, ...], now: tuple[float, ...]) -> bool:
     """Whether sigmas differ clearly."""
-    return any(abs(a - b) > _CLEARLY * max(a, b) for a, b in zip(before, now, strict=True))
+    return any(abs(a - b) > _CLEAR_CHANGE * max(a, b) for a, b in zip(before, now, strict=True))
 
 
 def clip_spans(spans: Array, begin: float, end: float) -> Array:

@@ -27,17 +27,17 @@ _MOST_FIXES = 600  # fixes: those that contradict so many consistent ones are be
 _SET_BACK = 20  # consecutive IMU rows at times that have passed: not late rows, but another clock
 LASTING = 1.2  # s, duration of these: more than a second, so that one falls on a remembered second
 _REMEMBERED = 36_000  # s, ten hours
-_SLOWEST = 0.5  # s between rows of an IMU (as in `graphnav.recording.formats.repair`)
+_LONGEST_PERIOD = 0.5  # s between rows of an IMU (as in `graphnav.recording.formats.repair`)
 _HELD = 200  # rows of other sensors held at most
 _OVERTAKING = 10.0  # periods; rows that overtake each other are closer (as in `graphnav.recording.formats.repair`)
-_TELLING = 400  # rows of the IMU that determine its period
+_PERIOD_ROWS = 400  # rows of the IMU that determine its period
 _HOLE = 1.5  # periods between two rows between which another may be missing
 _STRANDS = 3  # clocks tracked at a time for rows far ahead: one real, and two from wrong stamps
 
 
 def find_period(t: Array) -> float:
     """Median time between the newest rows of an IMU at times (N,), s; infinity for a single one."""
-    near = np.diff(t[-_TELLING:])
+    near = np.diff(t[-_PERIOD_ROWS:])
     return float(np.median(near)) if len(near) else math.inf
 
 
@@ -157,7 +157,7 @@ class ClockGuard:
     def fits(self, t: float, times: Array) -> bool:
         """Whether a row at a time that has passed may have been missing there; `times` (N,) are those of the rows."""
         period = find_period(times)
-        if period > _SLOWEST:
+        if period > _LONGEST_PERIOD:
             return False  # one of these two stamps is wrong
         if t > times[-1] - _OVERTAKING * period or times[0] - _OVERTAKING * period < t < times[0]:
             return True

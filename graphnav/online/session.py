@@ -18,7 +18,7 @@ from graphnav.online.store import Store
 from graphnav.recording import Recording
 
 CHECKPOINTS = 60.0  # s of IMU time between checkpoints, each of tens of MB: the time that a resumed run has to redo
-_FEW = 5  # invalid lines that are reported
+_REPORTED_LINES = 5  # invalid lines that are reported
 
 
 class Session:
@@ -178,7 +178,7 @@ class Session:
             row = row_of(line)
         except ValueError as error:
             self.bad += 1
-            if len(self.complaints) < _FEW:
+            if len(self.complaints) < _REPORTED_LINES:
                 self.complaints.append(str(error))
             return
         if row is not None:

@@ -38,8 +38,8 @@ from graphnav.recording.plausibility.readings import HOLE
 AFTER = 0.05  # s of IMU rows after a keyframe that a fix may use
 _ODOMETER = 0.3  # s that a keyframe waits for the odometer
 _SILENT = 2.0  # s of silence after which an odometer is not waited for
-_STEP = 0.5  # s between detections of steps in a walk
-_KNOWN = 4.0  # s before the newest keyframe up to which the stops are final
+_STEP_DETECTION = 0.5  # s between detections of steps in a walk
+_FINAL_STOPS = 4.0  # s before the newest keyframe up to which the stops are final
 _TRY = 2.0  # s between attempts at an alignment
 _LEVEL = 5.0  # s of rest that determine the level of a vehicle without GNSS
 _JUDGED = 120.0  # s of rows after which the noise model is estimated again
@@ -344,7 +344,7 @@ class Smoother:
     def _advance(self, tracker: Tracker, now: float, last: bool = False) -> None:
         """Make the keyframes that are due at a time, s."""
         sensors = self.sensors
-        sensors.learn(tracker.newest - _KNOWN, tracker.stops)
+        sensors.learn(tracker.newest - _FINAL_STOPS, tracker.stops)
         if isinstance(tracker, Walker):
             self._advance_walk(tracker, now, last)
             return
@@ -376,11 +376,11 @@ class Smoother:
 
     def _advance_walk(self, walker: Walker, now: float, last: bool) -> None:
         self._period = find_period(self.sensors.imu.t)
-        at = _STEP * float(np.floor((now + SAME_TIME) / _STEP))
+        at = _STEP_DETECTION * float(np.floor((now + SAME_TIME) / _STEP_DETECTION))
         newest = walker.take_steps(self.sensors, now if last else at - SURE, last, self._fixes, self._dirty)
         if newest > -np.inf:
             self._dirty, self._fixes = np.inf, [t for t in self._fixes if t > newest + SAME_TIME]
-        self._due = at + _STEP
+        self._due = at + _STEP_DETECTION
 
     def _collect(self, tracker: Tracker) -> None:
         for part in tracker.settled:

@@ -12,7 +12,7 @@ from graphnav.online.sensors import Row
 from graphnav.online.smoother import Smoother
 from graphnav.recording import Recording
 
-_TELLING = 512  # rows after which unusable sensors are reported
+_REPORTED_AFTER = 512  # rows after which unusable sensors are reported
 _MOST_FAILURES = 100  # failures kept in memory
 
 
@@ -43,7 +43,7 @@ class Online(Smoother):
         """
         sensors, rows = self.sensors, [(row, released)]
         self._rows += 1
-        if self._rows >= _TELLING and not self._rows & (self._rows - 1):  # at powers of two
+        if self._rows >= _REPORTED_AFTER and not self._rows & (self._rows - 1):  # at powers of two
             self._say("counts", check_counts(sensors.counts))
         while rows:
             try:

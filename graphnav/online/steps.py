@@ -16,9 +16,9 @@ from graphnav.online.looks import SURE, Stops, clip_spans
 from graphnav.online.sensors import Sensors
 
 _WALK, _WALK_LEAST = 30.0, 4.0  # s of a walk that its detector uses, and the least
-_SHORTEST = 0.05  # s between detections of steps that are worth keyframes
+_DETECTION_INTERVAL = 0.05  # s between detections of steps that are worth keyframes
 _EDGE = 0.1  # s by which the end of a stance may move once later rows are known: several periods
-_STANDS = 3.0  # s; a longer stance is standing, and need not be over
+_STANDING = 3.0  # s; a longer stance is standing, and need not be over
 
 
 class StepCutter:
@@ -45,13 +45,13 @@ class StepCutter:
         spans = clip_spans(to_samples(detect(recording, settings, T - _EDGE).stationary, recording), T, limit)
         ongoing = bool(len(spans)) and spans[-1, 1] >= limit - SAME_TIME
         if not last and len(spans):
-            if ongoing and limit - spans[-1, 0] < _STANDS:
+            if ongoing and limit - spans[-1, 0] < _STANDING:
                 limit, spans, ongoing = float(spans[-1, 0]), spans[:-1], False
             elif not ongoing:
                 limit = float(spans[-1, 1])
-        elif not last and limit - T < _STANDS:
+        elif not last and limit - T < _STANDING:
             return none
-        if limit - T <= _SHORTEST:
+        if limit - T <= _DETECTION_INTERVAL:
             return none
         standing.looked = limit
         standing.add(spans)

@@ -45,7 +45,7 @@ from graphnav.recording.odometer import MeanSpeed
 
 ROWS_AFTER = 0.1  # s of rows that keyframes use after the last of them
 _ROWS_BEFORE = 2.0  # s of rows before a keyframe that its constraints use where the IMU has no gap; else `CONTEXT`
-_BEFORE = 6  # keyframes built again with a new one in a stop, so that the stop is recognised
+_REBUILT_BEFORE = 6  # keyframes built again with a new one in a stop, so that the stop is recognised
 _PORTIONS = 8  # of the lag: keyframes settle in groups of this duration
 _SMOOTHED = 8  # covariances that can be smoothed in the time of one relinearisation
 _LATEST = 0.5  # of the lag by which settling may be delayed while states still move
@@ -323,7 +323,7 @@ class Tracker(Chain):
     # ------------------------------------------------------------------------------------------------- keyframes
     def _list_before(self, keep: int, t: float) -> list[float]:
         """Times of the keyframes that are built again with those from t on, of the first `keep` in the window."""
-        look = _BEFORE if len(self.stops) and self.stops[-1, 1] > t - _BEFORE else 1
+        look = _REBUILT_BEFORE if len(self.stops) and self.stops[-1, 1] > t - _REBUILT_BEFORE else 1
         before = [stage.place.t for stage in self.window.stages[max(0, keep - look) : keep]]
         if self.opened and len(before) < look:
             before.insert(0, self.head)
@@ -386,7 +386,7 @@ class Tracker(Chain):
     def _build_again(self, sensors: Sensors, first: int, end: int) -> list[Place]:
         """The stages from `first` to `end`, built again with those around them, and stops as a whole."""
         times, skip = self.times, len(self.times) - len(self.window)  # 1 if there is one before the first stage
-        begin, until = max(0, first + skip - _BEFORE), min(end + skip + _BEFORE, len(times))
+        begin, until = max(0, first + skip - _REBUILT_BEFORE), min(end + skip + _REBUILT_BEFORE, len(times))
         for stop in self.stops if end < len(self.window) else ():
             if stop[0] < times[until - 1] < stop[1]:
                 until = int(np.searchsorted(times, stop[1] + SAME_TIME))

@@ -19,10 +19,13 @@ from graphnav.core.rotation import Array
 
 PER_DECADE = 12  # averaging times
 _FEWEST_PERIODS = 9  # periods of the longest averaging time that the log must contain
-_SHORTEST = 60.0  # s, shortest log that is accepted
+_SHORTEST_LOG = 60.0  # s, shortest log that is accepted
 _FLAT = 2.0 / np.pi * np.log(2.0)
 _MEANS_OF = 1.0  # s, over which means are taken to detect motion
-_TURNS, _PUSHES = np.radians(1.0), 0.1  # rad/s, m/s^2: deviation from the median above which the log is not at rest
+_MOVING_RATE, _MOVING_FORCE = (
+    np.radians(1.0),
+    0.1,
+)  # rad/s, m/s^2: deviation from the median above which the log is not at rest
 
 
 @dataclass(frozen=True)
@@ -81,7 +84,7 @@ def compute_allan(t: Array, gyro: Array, accel: Array) -> Allan:
             key="allan.gaps",
         )
     duration = len(t) * period
-    if duration < _SHORTEST:
+    if duration < _SHORTEST_LOG:
         raise RecordingError(
             f"{duration:.0f} s are too short; an hour at rest is better, a minute the least", key="allan.short"
         )
@@ -104,7 +107,7 @@ def find_motion(t: Array, gyro: Array, accel: Array) -> float | None:
     rest.
     """
     n = max(round(_MEANS_OF / float(np.median(np.diff(t)))), 1)
-    for samples, limit in ((gyro, _TURNS), (accel, _PUSHES)):
+    for samples, limit in ((gyro, _MOVING_RATE), (accel, _MOVING_FORCE)):
         means = samples[: len(samples) // n * n].reshape(-1, n, 3).mean(1)
         far = np.flatnonzero((np.abs(means - np.median(means, axis=0)) > limit).any(-1))
         if len(far):

@@ -16,7 +16,7 @@ from graphnav.recording.exporters.digits import rows_text
 from graphnav.report import page
 from graphnav.report import pictures as report_pictures
 
-_LISTED = 30  # stops listed at most
+_MAX_STOPS = 30  # stops listed at most
 
 
 def write(recording: Recording, found: Detections, folder: Path) -> list[Path]:
@@ -95,9 +95,9 @@ def text(recording: Recording, found: Detections, files: list[Path]) -> str:
     spans = found.stationary - recording.start
     first, stops, each = _words(recording, found)
     lines = [first, f"  {stops}"]
-    lines += [f"    {a:9.2f} - {b:9.2f}  {b - a:8.2f} s" for a, b in spans[:_LISTED]]
-    if len(spans) > _LISTED:
-        lines.append(f"    ... and {len(spans) - _LISTED} more in detections.csv")
+    lines += [f"    {a:9.2f} - {b:9.2f}  {b - a:8.2f} s" for a, b in spans[:_MAX_STOPS]]
+    if len(spans) > _MAX_STOPS:
+        lines.append(f"    ... and {len(spans) - _MAX_STOPS} more in detections.csv")
     lines.append(f"  {each}")
     lines += [f"  note: {note}" for note in found.notes]
     return "\n".join([*lines, "", "look at", *(f"  {file}" for file in files)])

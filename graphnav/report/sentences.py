@@ -22,9 +22,9 @@ from graphnav.report.tables import Withheld
 if TYPE_CHECKING:
     from graphnav.evaluation.metrics import Errors
 
-_LISTED = 6  # outages listed at most
-_FEWEST = 10  # rows needed to judge a sigma
-_MOST = 0.5  # share of the fixes' information; above it most measurements contradict the result
+_MAX_OUTAGES = 6  # outages listed at most
+_FEWEST_ROWS = 10  # rows needed to judge a sigma
+_LARGEST_EXCLUDED_SHARE = 0.5  # share of the fixes' information; above it most measurements contradict the result
 _TOO_LARGE = {"innovation": 1.5, "residual": 1.15}  # RMS over sigma; a fit reduces residuals
 
 
@@ -38,7 +38,7 @@ def list_doubts(solutions: Mapping[str, Solution], errors: Mapping[str, Errors])
     for solution in solutions.values():
         fixes = solution.records.get("gnss_position")
         left_out = 0.0 if fixes is None else 1.0 - float(np.mean(row_weights(fixes.t, solution.noise, "gnss_position")))
-        if left_out > _MOST:
+        if left_out > _LARGEST_EXCLUDED_SHARE:
             words = f"This result cannot be trusted: {100 * left_out:.0f} % of what the fixes say contradicts the rest "
             out.append(Note("doubt.left_out", words + "and is left out"))
             break  # all solvers use the same noise model
@@ -54,7 +54,7 @@ def list_doubts(solutions: Mapping[str, Solution], errors: Mapping[str, Errors])
         filters = [s for s in solutions.values() if any(r.kind == "innovation" for r in s.records.values())]
         for solution in filters or solutions.values():
             kind, size, used = _measure_consistency(solution)
-            if used >= _FEWEST and size > _TOO_LARGE[kind]:
+            if used >= _FEWEST_ROWS and size > _TOO_LARGE[kind]:
                 wrong.append(f"{solution.solver}: {kind}s are {size:.2f} times their sigma")
     if wrong:
         out.append(Note("doubt.sigma", f"The stated sigma cannot be trusted: {'; '.join(wrong)}"))
@@ -104,8 +104,8 @@ def describe_run(recording: Recording, solutions: Mapping[str, Solution], withhe
     elif len(spans):
         words += f" The foot was found on the floor {len(spans)} times."
     if outages:
-        listed = [f"{a:.0f} to {b:.0f} s" for a, b in outages[:_LISTED]]
-        more = [f"{len(outages) - _LISTED} more"] if len(outages) > _LISTED else []
+        listed = [f"{a:.0f} to {b:.0f} s" for a, b in outages[:_MAX_OUTAGES]]
+        more = [f"{len(outages) - _MAX_OUTAGES} more"] if len(outages) > _MAX_OUTAGES else []
         words += f" There were no GNSS fixes from {page.and_list([*listed, *more])}."
     excluded = sum(int(part.count) for part in solution.excluded)
     if excluded:
@@ -188,7 +188,7 @@ def describe_sigma_without_truth(solution: Solution) -> Markup:
     kind, size, used = _measure_consistency(solution)
     missing = f"{solution.solver}: there is no truth to compare with"
     larger, mark = size > _TOO_LARGE[kind], ""
-    if used < _FEWEST:
+    if used < _FEWEST_ROWS:
         note = Note("no_truth.few", f"{missing}, and too few measurements to judge sigma by.")
     elif kind == "innovation":
         measured = f"they are {size:.2f} times as large as predicted (RMS; 1 where sigma is true)"

@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     from graphnav.estimation.noise.table import FigureRow
     from graphnav.evaluation.metrics import Errors
 
-_LISTED = 40  # rejected measurements and stops listed at most
-_SHOWN = 10  # excluded spans and stops shown; the others are folded
+_MAX_ROWS = 40  # rejected measurements and stops listed at most
+_UNFOLDED_ROWS = 10  # excluded spans and stops shown; the others are folded
 Withheld = Sequence[tuple[str, tuple[float, float] | None]]
 
 
@@ -200,9 +200,9 @@ def excluded_table(solution: Solution, start: float) -> list[Markup]:
 
 def _long_table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> list[Markup]:
     """A table whose later rows are folded."""
-    out = [page.table(head, rows[:_SHOWN])]
-    if len(rows) > _SHOWN:
-        out.append(page.fold(f"{len(rows) - _SHOWN} more", [page.table(head, rows[_SHOWN:])]))
+    out = [page.table(head, rows[:_UNFOLDED_ROWS])]
+    if len(rows) > _UNFOLDED_ROWS:
+        out.append(page.fold(f"{len(rows) - _UNFOLDED_ROWS} more", [page.table(head, rows[_UNFOLDED_ROWS:])]))
     return out
 
 
@@ -217,14 +217,14 @@ def rejected_table(solution: Solution, start: float) -> list[Markup]:
             rows.append((float(r.t[k]), [Quantity(f"{r.t[k] - start:.2f} s"), kind, size, float(white[k, worst])]))
     if not rows:
         return []
-    largest = sorted(rows, key=lambda row: -row[1][3])[:_LISTED]
+    largest = sorted(rows, key=lambda row: -row[1][3])[:_MAX_ROWS]
     table = page.table(
         ["when", "constraint", "largest component", "over sigma"], [r for _, r in sorted(largest, key=lambda r: r[0])]
     )
     many = len(rows)
     words = f"{many} rejected measurement{'s' if many > 1 else ''}"
-    if many > _LISTED:
-        words += f", the {_LISTED} farthest off"
+    if many > _MAX_ROWS:
+        words += f", the {_MAX_ROWS} farthest off"
     return [page.fold(words, [table])]
 
 
@@ -318,11 +318,11 @@ def stop_table(solution: Solution, start: float) -> list[Markup]:
             ", ".join(f"{name} {100.0 * share:.0f} %" for name, share in stop.fired.items()),
             ", ".join(f"{count} {name}" for name, count in stop.rows.items()) or "none",
         ]
-        for stop in stops[:_LISTED]
+        for stop in stops[:_MAX_ROWS]
     ]
     note = "Share: of the stop that a detector by itself calls stationary."
-    if len(stops) > _LISTED:
-        note += f" {len(stops) - _LISTED} more are in detections.csv."
+    if len(stops) > _MAX_ROWS:
+        note += f" {len(stops) - _MAX_ROWS} more are in detections.csv."
     return [*_long_table(["stands from", "for", "share by detector", "rows"], rows), page.paragraph(note, "soft")]
 
 

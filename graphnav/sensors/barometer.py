@@ -14,7 +14,7 @@ from graphnav.core.rotation import Array
 from graphnav.sensors.base import Column, Sensor, Series
 from graphnav.sensors.tables import NotNegative, Positive, TomlTable
 
-_SCALE, _PRESSURE = 288.15 / 6.5e-3, 101325.0  # m, Pa
+_SCALE_HEIGHT, _PRESSURE = 288.15 / 6.5e-3, 101325.0  # m, Pa
 _POWER = 287.05287 * 6.5e-3 / 9.80665
 
 
@@ -45,10 +45,10 @@ SENSOR = Sensor(
 
 def standard_height(series: Series) -> Array:
     """(N,) m in the standard atmosphere, from pressure, or the stated height where a row has no pressure."""
-    of_pressure = _SCALE * (1.0 - (series["pressure"] / _PRESSURE) ** _POWER)
+    of_pressure = _SCALE_HEIGHT * (1.0 - (series["pressure"] / _PRESSURE) ** _POWER)
     return np.where(np.isfinite(of_pressure), of_pressure, series["height"])
 
 
 def standard_pressure(height: Array) -> Array:
     """(N,) Pa at heights (N,) m of the standard atmosphere: the inverse of `standard_height`."""
-    return np.asarray(_PRESSURE * (1.0 - height / _SCALE) ** (1.0 / _POWER))
+    return np.asarray(_PRESSURE * (1.0 - height / _SCALE_HEIGHT) ** (1.0 / _POWER))

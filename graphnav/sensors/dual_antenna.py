@@ -28,15 +28,15 @@ class Figures(TomlTable):
         return baseline
 
 
-_SD = (np.radians(1e-3), np.radians(90.0))  # a receiver states no less, and more is no information
+_SIGMA_RANGE = (np.radians(1e-3), np.radians(90.0))  # a receiver states no less, and more is no information
 SENSOR = Sensor(
     name="dual_antenna",
     about="heading, and pitch, of the line from one antenna to another",
     columns=(
         Column("heading", ANGLE, -2.0 * np.pi, 2.0 * np.pi),
         Column("pitch", ANGLE, -0.5 * np.pi, 0.5 * np.pi),
-        Column("sd_heading", ANGLE, *_SD),
-        Column("sd_pitch", ANGLE, *_SD),
+        Column("sd_heading", ANGLE, *_SIGMA_RANGE),
+        Column("sd_pitch", ANGLE, *_SIGMA_RANGE),
     ),
     needs=(("heading",),),
     figures=Figures,

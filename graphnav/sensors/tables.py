@@ -11,7 +11,7 @@ from pydantic.types import Strict
 from graphnav.core.complaints import suggest_nearest
 
 _SMALLEST, _LARGEST = 1e-15, 1e9  # of a number, so that its square can be represented
-_LONGEST = 1e7  # of the components of a vector: m from the Earth's centre, or a direction
+_MAX_COMPONENT = 1e7  # of the components of a vector: m from the Earth's centre, or a direction
 
 Number = Annotated[float, Strict(), Field(allow_inf_nan=False)]
 
@@ -33,8 +33,8 @@ def three_numbers(value: Any) -> Any:
         raise ValueError("must be three numbers in brackets")
     if any(isinstance(x, bool) or not isinstance(x, int | float) or not np.isfinite(x) for x in value):
         raise ValueError("must be three numbers in brackets")
-    if any(abs(x) > _LONGEST for x in value):
-        raise ValueError(f"must be three numbers in brackets, none beyond {_LONGEST:g}")
+    if any(abs(x) > _MAX_COMPONENT for x in value):
+        raise ValueError(f"must be three numbers in brackets, none beyond {_MAX_COMPONENT:g}")
     return tuple(float(x) for x in value)
 
 

@@ -29,8 +29,8 @@ from graphnav.simulation.inertial import SimulatedImu
 from graphnav.simulation.kinematics import TrueMotion
 from graphnav.simulation.result import Simulated
 
-_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(3)
-_CHUNK = 1 << 13  # samples at a time
+_GAUSS_NODES, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(3)
+_SAMPLES_AT_ONCE = 1 << 13  # samples at a time
 
 
 @dataclass(frozen=True)
@@ -67,12 +67,12 @@ def move_foot(
     t = foot.start + np.arange(count + 1) * dt
     ends = _move_foot(foot, R_fb, t)
     parts = max(1, round(2.0 * dt / STEP))  # of a period: half a spline's step at most
-    nodes = ((np.arange(parts)[:, None] + 0.5 + 0.5 * _NODES) * dt / parts).ravel()
-    weights = np.tile(0.5 * _WEIGHTS / parts, parts)
+    nodes = ((np.arange(parts)[:, None] + 0.5 + 0.5 * _GAUSS_NODES) * dt / parts).ravel()
+    weights = np.tile(0.5 * _GAUSS_WEIGHTS / parts, parts)
     acceleration = foot.spline.derivative(2)
     gyro, accel = np.empty((count, 3)), np.empty((count, 3))
-    for a in range(0, count, _CHUNK):
-        rows = slice(a, min(a + _CHUNK, count))
+    for a in range(0, count, _SAMPLES_AT_ONCE):
+        rows = slice(a, min(a + _SAMPLES_AT_ONCE, count))
         inside = (t[:-1][rows, None] + nodes).ravel()
         felt = _move_foot(foot, R_fb, inside)
         to_body = np.swapaxes(felt.R_nb, -1, -2)

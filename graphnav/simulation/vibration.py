@@ -20,7 +20,7 @@ from graphnav.simulation.splines import centres, spline
 RIGHT, FORWARD, UP, PITCH, ROLL = range(5)  # channels: m, m, m, rad, rad
 STEP = 0.02  # s between coefficients: movements up to some 15 Hz
 DEGREE = 4
-_SLOW, _SLOW_DEGREE = 0.1, 3  # s; correlation time of a line's modulation
+_MODULATION_TIME, _MODULATION_DEGREE = 0.1, 3  # s; correlation time of a line's modulation
 
 Part = Callable[[Array], tuple[Array, Array]]
 MG = 9.80665e-3  # m/s^2
@@ -102,9 +102,9 @@ class Engine:
 
     def lines(self, path: Path, rate: float, rng: np.random.Generator) -> Part:
         """The vibration of the engine; `rate` is the IMU's, Hz, whose averaging the stated amplitudes include."""
-        t = centres(path.start, path.end, _SLOW, _SLOW_DEGREE)
+        t = centres(path.start, path.end, _MODULATION_TIME, _MODULATION_DEGREE)
         v = path.speed(t)
-        wander = self.wander_hz * gauss_markov(len(t), _SLOW / self.wander_time, rng)
+        wander = self.wander_hz * gauss_markov(len(t), _MODULATION_TIME / self.wander_time, rng)
         f = self.frequency(v, wander)
         load = 1.0 + (self.moving_gain - 1.0) * v * v / (v * v + 1.0)
         accel, turn = _draw_amplitudes(self.idle, len(t))
@@ -122,8 +122,8 @@ class Engine:
         # forward and pitch are a quarter turn apart, so that gravity on the pitching does not add to the line
         phases = rng.uniform(0.0, 2.0 * np.pi, (len(self.orders), 5))
         phases[:, PITCH] = phases[:, FORWARD] + 0.5 * np.pi
-        phase = spline(path.start, _SLOW, 2.0 * np.pi * f, _SLOW_DEGREE)
-        size = spline(path.start, _SLOW, amplitude, _SLOW_DEGREE)
+        phase = spline(path.start, _MODULATION_TIME, 2.0 * np.pi * f, _MODULATION_DEGREE)
+        size = spline(path.start, _MODULATION_TIME, amplitude, _MODULATION_DEGREE)
         return _EngineOrders(phase.antiderivative(), phase, size, size.derivative(), np.array(self.orders), phases)
 
 

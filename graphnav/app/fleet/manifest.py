@@ -23,7 +23,7 @@ from graphnav.estimation.noise.files import MODES
 from graphnav.estimation.pipeline import KNOWN
 from graphnav.recording.formats import formats
 
-_FORM = "graphnav-recording"  # contained in every recording.toml
+_RECORDING_FORMAT = "graphnav-recording"  # contained in every recording.toml
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,8 @@ def read_drives(source: Path, asked: DriveOptions) -> list[tuple[str, str, Drive
         found = [(_name_of(path, source), str(path), asked, str(path)) for path in _find_recordings(source)]
         if not found:
             raise ConfigError(
-                f'{source}: holds no recording; each is a .toml that says format = "{_FORM}/1"', key="recording.none"
+                f'{source}: holds no recording; each is a .toml that says format = "{_RECORDING_FORMAT}/1"',
+                key="recording.none",
             )
         return _number_clones(found)
     rows = _csv_rows(source) if source.suffix == ".csv" else _toml_rows(source)
@@ -142,7 +143,9 @@ def _find_recordings(folder: Path) -> list[Path]:
         for file in sorted(files):
             path = Path(place) / file
             # an unreadable file gets a row that states so, under its name
-            if file == "recording.toml" or (file.endswith(".toml") and path.is_file() and _FORM in _begin(path)):
+            if file == "recording.toml" or (
+                file.endswith(".toml") and path.is_file() and _RECORDING_FORMAT in _begin(path)
+            ):
                 found.append(path)
     return found
 

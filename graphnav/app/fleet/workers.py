@@ -26,7 +26,7 @@ from graphnav.app.fleet.drive import CRASHED, HUNG, Row, make_lost_row
 from graphnav.app.fleet.manifest import Task
 from graphnav.core.errors import ConfigError
 
-_AHEAD = 10  # drives submitted ahead to a scheduler, per thread of its workers
+_SUBMITTED_AHEAD = 10  # drives submitted ahead to a scheduler, per thread of its workers
 
 
 @dataclass(frozen=True)
@@ -182,7 +182,7 @@ def solve_on_cluster(tasks: Sequence[Task], scheduler: str, limits: Limits) -> I
             return list(futures)
 
         # a scheduler that is given all drives at once keeps them all in memory
-        under_way = completed(next_few(max(_AHEAD, _AHEAD * sum(client.nthreads().values()))))
+        under_way = completed(next_few(max(_SUBMITTED_AHEAD, _SUBMITTED_AHEAD * sum(client.nthreads().values()))))
         try:
             for future in under_way:
                 task = of.pop(future.key)

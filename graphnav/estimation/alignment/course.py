@@ -14,7 +14,7 @@ from graphnav.estimation.solution import Solution
 from graphnav.recording import Gnss
 
 COURSE_SIGMA = np.radians(10.0)  # rad, 1-sigma of the stated forward axis against the course: mounting, side slip
-_SIGMAS = 3.0  # significance at which accelerations show reverse, or contradict the course
+_SIGNIFICANT_SIGMAS = 3.0  # significance at which accelerations show reverse, or contradict the course
 _DOUBT = 2.0  # sigmas in favour of reverse beyond which forwards is not assumed either
 
 
@@ -57,16 +57,19 @@ def with_course(tried: list[Solution], fixes: Gnss, own: float, wide: float) -> 
     course = float(np.hypot(COURSE_SIGMA, sigma[told]))
     off, notes = -float(np.angle(way.D[told])), tuple[str, ...]()
     for_forwards = 2.0 * np.cos(off) / (own**2 + course**2)
-    if for_forwards < -0.5 * _SIGMAS**2:
+    if for_forwards < -0.5 * _SIGNIFICANT_SIGMAS**2:
         off -= float(np.copysign(np.pi, off))
-    elif for_forwards < 0.5 * _SIGMAS**2:
+    elif for_forwards < 0.5 * _SIGNIFICANT_SIGMAS**2:
         notes = (
             Note(
                 "alignment.reverse_open",
                 "accelerations are too weak to tell forwards from reverse: the first motion is taken to be forwards",
             ),
         )
-    if abs(off) > _SIGMAS * np.hypot(course, own) or -0.5 * _SIGMAS**2 < for_forwards < -0.5 * _DOUBT**2:
+    if (
+        abs(off) > _SIGNIFICANT_SIGMAS * np.hypot(course, own)
+        or -0.5 * _SIGNIFICANT_SIGMAS**2 < for_forwards < -0.5 * _DOUBT**2
+    ):
         # the axes may be wrong, the accelerations or the course: the sigma has to cover all of them
         notes = (
             Note(
@@ -74,7 +77,7 @@ def with_course(tried: list[Solution], fixes: Gnss, own: float, wide: float) -> 
                 f"the body's forward axis is {abs(np.degrees(off)):.0f} deg from the course: check the IMU's axes",
             ),
         )
-        return Heading(0.0, max(own, abs(off) / _SIGMAS), max(wide, abs(off) / _SIGMAS), notes)
+        return Heading(0.0, max(own, abs(off) / _SIGNIFICANT_SIGMAS), max(wide, abs(off) / _SIGNIFICANT_SIGMAS), notes)
     gain = wide**2 / (wide**2 + course**2)
     return Heading(gain * off, float(np.hypot((1.0 - gain) * own, gain * course)), float(np.sqrt(gain) * course), notes)
 

@@ -28,13 +28,13 @@ from graphnav.recording import Gnss, Imu, Recording
 
 # rad, to which the fixes must determine the direction of travel: better than the other contributions
 _DIRECTION = 0.5 * COURSE_SIGMA
-_FIXES = 10  # fixes that the short problem should contain
+_WANTED_FIXES = 10  # fixes that the short problem should contain
 _FEWEST_FIXES = 3  # fixes without which there is no acceleration
-_MOVES = 5.0  # sigmas of travel that count as motion: noise reaches them once in 270 000 fixes, exp(-5^2/2)
-_BEFORE = 10.0  # s of the span before the motion
+_MOVING_SIGMAS = 5.0  # sigmas of travel that count as motion: noise reaches them once in 270 000 fixes, exp(-5^2/2)
+_LEAD_TIME = 10.0  # s of the span before the motion
 _OUTLYING = 6.0  # multiple of the typical deviation of fixes from their running median, or of their sigma
 # rad, of the initial headings that are tried, relative to the first guess
-_TURNS = (0.0, 0.5 * np.pi, 1.5 * np.pi, np.pi)
+_HEADINGS_TRIED = (0.0, 0.5 * np.pi, 1.5 * np.pi, np.pi)
 _FIRST_ITERATIONS = 10  # iterations after which a start either has converged or creeps
 _UNLIKELY = 14.0  # difference of log-likelihoods at a ratio of one in a million: -ln 1e-6
 
@@ -78,17 +78,17 @@ def find_motion_span(recording: Recording, settings: Settings, stationary: Array
         yaw, still = np.zeros(len(t)), np.zeros(len(t), dtype=bool)
     sd = average_across(gnss.sd)
     way = measure_travel(p, sd, yaw, still)
-    away = np.maximum(way.times_sigma, measure_travel(p, sd, np.zeros(len(t)), still).times_sigma) > _MOVES
+    away = np.maximum(way.times_sigma, measure_travel(p, sd, np.zeros(len(t)), still).times_sigma) > _MOVING_SIGMAS
     if not away.any():
         return None
     first = int(np.argmax(away))
     enough = (way.times_sigma > 1.0 / np.tan(_DIRECTION)) & (t > t[first] + settings.alignment.window)
-    enough &= np.arange(len(t)) >= first + _FIXES
+    enough &= np.arange(len(t)) >= first + _WANTED_FIXES
     last = int(np.argmax(enough)) if enough.any() else len(t) - 1
     # at the speed that followed, it took a while to get that far
     speed = np.abs(way.D[last] - way.D[first]) / max(t[last] - t[first], 1.0)
     under_way = np.abs(way.D[first]) / speed if speed > 0.0 else np.inf
-    begin = min(t[first] - _BEFORE - under_way, t[max(last - _FEWEST_FIXES + 1, 0)])
+    begin = min(t[first] - _LEAD_TIME - under_way, t[max(last - _FEWEST_FIXES + 1, 0)])
     return float(max(t[0], np.round(begin, 3))), float(t[last])  # rounding errors of D must not count
 
 
@@ -181,7 +181,7 @@ def _try_headings(
     where its likelihood is negligible beside the best; `worth` successive fixes are worth one in the worst case, over a
     span with one turn (`graphnav.estimation.alignment.course`).
     """
-    ends = [np.array([*rp, heading + turn]) for turn in _TURNS]
+    ends = [np.array([*rp, heading + turn]) for turn in _HEADINGS_TRIED]
     tried = [_try(part, settings, frame, smooth, end, bias) for end in ends[:-1]]
     assert part.gnss is not None
     worth = max(1.0, len(part.gnss.t) / (2.0 * np.pi))

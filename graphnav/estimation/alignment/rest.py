@@ -17,7 +17,7 @@ from graphnav.imu.preintegration import prefix
 from graphnav.imu.samples import bridge_gaps
 from graphnav.recording import Recording
 
-_AT_ONCE = 0.05  # s from the start within which a foot counts as standing there
+_FIRST_STANCE = 0.05  # s from the start within which a foot counts as standing there
 _OPENING = 10  # stances of a walk by which tilt and accelerometer bias are separated
 _WALKING = 3.0  # m/s, 1-sigma of the initial velocity of a foot in the air
 
@@ -85,7 +85,7 @@ def _find_stand(recording: Recording, stances: Array) -> tuple[float, float]:
 
     The middle half of a stance is used.
     """
-    if len(stances) and stances[0, 0] > recording.start + _AT_ONCE:
+    if len(stances) and stances[0, 0] > recording.start + _FIRST_STANCE:
         length = float(stances[0, 1] - stances[0, 0])
         return float(stances[0, 0]) + 0.25 * length, min(1.0, 0.5 * length)
     return recording.start, 1.0

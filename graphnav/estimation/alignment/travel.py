@@ -27,7 +27,7 @@ from graphnav.imu.samples import bridge_gaps
 from graphnav.recording import Imu
 
 # m, 1-sigma along an axis: motion of an antenna on a vehicle that does not travel; suspension, load, a mast
-_SWAY = 0.4
+_ANTENNA_SWAY = 0.4
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ def measure_travel(p: Array, sd: Array, yaw: Array, still: NDArray[np.bool_] | N
     """
     moves = np.ones(len(p) - 1) if still is None else 1.0 - (still[1:] & still[:-1])
     angle = moves * np.abs(np.diff(yaw))
-    variance = sd**2 + _SWAY**2
+    variance = sd**2 + _ANTENNA_SWAY**2
     seen = angle < 1.0
     step = seen * moves * np.diff(p[:, 0] + 1j * p[:, 1]) * np.exp(-0.5j * (yaw[1:] + yaw[:-1]))
     angle = np.where(seen, angle, 2.0)  # the end of one path and the beginning of another

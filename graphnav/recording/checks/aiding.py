@@ -19,7 +19,7 @@ from graphnav.recording.checks.crosschecks import Fit, Track
 from graphnav.recording.odometer.faults import FROZEN, GAP, STUCK, WILD
 from graphnav.sensors.tables import TIME
 
-_SURE_SIGMAS = 4.0  # sigmas
+_CERTAIN_SIGMAS = 4.0  # sigmas
 _NO_BETTER = 0.05  # of a correlation
 _MIN_SPEED = 5.0  # m/s, above which wheel speeds are compared
 
@@ -145,7 +145,7 @@ def check_imu_clock(clock: ClockOffsets, odometer: Fit | None = None) -> Iterato
         return
     lag = forward.lag
     leap = ", the leap seconds between GPS time and UTC" if abs(abs(lag) - 18.0) < 0.5 else ""
-    certain = abs(lag) - 4.0 * forward.spread > _SURE_SIGMAS * GnssSettings().time_offset_sigma
+    certain = abs(lag) - 4.0 * forward.spread > _CERTAIN_SIGMAS * GnssSettings().time_offset_sigma
     # an offset that the odometer shows as well is the receiver's
     own = odometer is None or odometer.correlation < 0.9 or abs(odometer.lag - lag) > 0.5 * abs(lag)
     mend = f"{-lag:+.2f} to time_offset in [imu]" if own else f"{lag:+.2f} to time_offset in [gnss]"

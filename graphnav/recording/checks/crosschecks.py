@@ -24,7 +24,7 @@ from graphnav.recording.checks.lags import Lags
 Index = NDArray[Any]  # of row numbers
 
 MIN_PAIRS = 20
-_SLOPE, _SLOPES = 8.0, 6  # s over which a slope is taken: the force is then known to a tenth of a per cent
+_SLOPE_SPAN, _SLOPES = 8.0, 6  # s over which a slope is taken: the force is then known to a tenth of a per cent
 GRAVITY = 9.81  # m/s^2
 _MIN_SPEED = 3.0  # m/s, below which a course is undefined
 _FASTEST_CHANGE = 8.0  # m/s^2; a larger acceleration is an error of the fix
@@ -267,7 +267,7 @@ def fit_forward(imu: Imu, track: Track) -> Fit | None:
 
 def fit_climb(imu: Imu, track: Track, gnss: Gnss, forward: Array) -> tuple[float, float] | None:
     """Slopes by the force along `forward` (3,), corrected for acceleration, against those of the heights, over
-    `_SLOPE`.
+    `_SLOPE_SPAN`.
 
     Their correlation, and the ratio of their magnitudes: neither has less noise than the other. None where the drive is
     too short.
@@ -275,14 +275,14 @@ def fit_climb(imu: Imu, track: Track, gnss: Gnss, forward: Array) -> tuple[float
     p = compute_local_positions(gnss)
     way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(p[:, :2], axis=0).T))])
     pull = np.concatenate([[0.0], np.cumsum(imu.accel[1:] @ forward * np.diff(imu.t))])
-    a = np.arange(max(track.t[0], imu.t[0]), min(track.t[-1], imu.t[-1]) - _SLOPE, _SLOPE)
+    a = np.arange(max(track.t[0], imu.t[0]), min(track.t[-1], imu.t[-1]) - _SLOPE_SPAN, _SLOPE_SPAN)
 
     def change(t: Array, x: Array) -> Array:
-        return np.asarray(np.interp(a + _SLOPE, t, x) - np.interp(a, t, x))
+        return np.asarray(np.interp(a + _SLOPE_SPAN, t, x) - np.interp(a, t, x))
 
     far = change(gnss.t, way)
-    moving = far > _MIN_SPEED * _SLOPE
-    felt = (change(imu.t, pull) - change(track.t, track.speed))[moving] / (_SLOPE * GRAVITY)
+    moving = far > _MIN_SPEED * _SLOPE_SPAN
+    felt = (change(imu.t, pull) - change(track.t, track.speed))[moving] / (_SLOPE_SPAN * GRAVITY)
     climbed = change(gnss.t, p[:, 2])[moving] / far[moving]
     if len(felt) < _SLOPES or not felt.std() or not climbed.std():
         return None

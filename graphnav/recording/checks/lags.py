@@ -21,9 +21,9 @@ Index = NDArray[Any]  # of row numbers
 Lags = Array | float  # s, (L,) or one
 Regressors = Callable[[Index, Lags], Array]  # (rows, lags) -> (L, K, m), of one lag (K, m)
 REACH = 5.0  # s on either side of the first guess: the largest sigma that can result
-_SLOW = 10.0  # s; slower changes are those of the road (as in `graphnav.recording.draft.motion.filter_band`)
-_STEP, _FINE, _FINEST = 0.1, 0.02, 0.005  # s, of the grids of lags
-_AT_ONCE = 1 << 16  # rows times lags, to bound the memory in use
+_SLOW_CHANGES = 10.0  # s; slower changes are those of the road (as in `graphnav.recording.draft.motion.filter_band`)
+_COARSE, _FINE, _FINEST = 0.1, 0.02, 0.005  # s, of the grids of lags
+_NUMBERS_AT_ONCE = 1 << 16  # rows times lags, to bound the memory in use
 # number of parts, and the variance of Student's t with the degrees of freedom of their scatter
 _PARTS, _STUDENT = 4, 3.0
 _OUTLYING = 5.0  # robust sigmas beyond which a row is an error of the fix
@@ -88,11 +88,11 @@ def refine_lag(
     def profile(lags: Array) -> Array:
         return np.array([np.nan if one is None else one.unexplained for one in at_each(lags, rows)])
 
-    wide = guess + np.arange(-REACH, REACH + _STEP / 2, _STEP)
+    wide = guess + np.arange(-REACH, REACH + _COARSE / 2, _COARSE)
     seen = profile(wide)
     if not np.isfinite(seen).any():
         return guess, REACH
-    near = wide[int(np.nanargmin(seen))] + np.arange(-_STEP, _STEP + _FINE / 2, _FINE)
+    near = wide[int(np.nanargmin(seen))] + np.arange(-_COARSE, _COARSE + _FINE / 2, _FINE)
     close = profile(near)
     lag = _find_lowest(near, close)
     best = at(lag, rows)
@@ -118,7 +118,7 @@ def share_rows(lags: Array, rows: Index, valid: Callable[[float], Array]) -> Ite
     inside = np.array([valid(float(lag))[rows] for lag in lags])
     begin = 0
     for k in range(1, len(lags) + 1):
-        full = (k - begin) * len(rows) >= _AT_ONCE
+        full = (k - begin) * len(rows) >= _NUMBERS_AT_ONCE
         if k == len(lags) or full or not np.array_equal(inside[k], inside[begin]):
             yield rows[inside[begin]], lags[begin:k]
             begin = k
@@ -134,7 +134,7 @@ def regress_each(x: Array, y: Array) -> Array:
 
 def remove_slow(t: Array, x: Array) -> Array:
     """Columns (N, m) at times t (N,) minus their means over the ten seconds around each, with zero mean."""
-    lo, hi = np.searchsorted(t, t - _SLOW / 2), np.searchsorted(t, t + _SLOW / 2, side="right")
+    lo, hi = np.searchsorted(t, t - _SLOW_CHANGES / 2), np.searchsorted(t, t + _SLOW_CHANGES / 2, side="right")
     total = np.concatenate([np.zeros((1, x.shape[1])), np.cumsum(x - x.mean(0), axis=0)])
     out = x - x.mean(0) - (total[hi] - total[lo]) / (hi - lo)[:, None]
     return np.asarray(out - out.mean(0))

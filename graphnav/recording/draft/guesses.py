@@ -14,11 +14,11 @@ from graphnav.recording.formats.schema import FORCE, RATE, SPEED, rotation_from_
 from graphnav.sensors.tables import TIME
 
 _G = 9.80665
-_LASTING = 0.5  # share of the typical force that is in its mean, even for a swinging foot
+_MEAN_SHARE = 0.5  # share of the typical force that is in its mean, even for a swinging foot
 _LIKELY = 0.5  # correlation
 _STRAIGHT = np.cos(np.radians(12.0))  # cosine of the angle to a file axis below which the axis is meant
-_QUIET = 5.0  # s
-_APART = 100.0  # s; larger steps between stamps mean a smaller unit
+_QUIET_SPAN = 5.0  # s
+_LARGEST_STEP = 100.0  # s; larger steps between stamps mean a smaller unit
 _FIXED = 0.15  # m; only fixed carrier phases state less
 
 
@@ -51,7 +51,9 @@ def is_date(t: Array) -> bool:
 
 def _guess_unix_unit(t: Array) -> str | None:
     step = float(np.median(np.diff(t))) if len(t) > 1 else 0.0
-    return next((u for u, scale in TIME.items() if 1e9 <= float(t[0]) * scale < 3e9 and step * scale < _APART), None)
+    return next(
+        (u for u, scale in TIME.items() if 1e9 <= float(t[0]) * scale < 3e9 and step * scale < _LARGEST_STEP), None
+    )
 
 
 def guess_accel_unit(path: Path, accel: Array, stated: str | None) -> Guess:
@@ -63,7 +65,7 @@ def guess_accel_unit(path: Path, accel: Array, stated: str | None) -> Guess:
         If gravity has been taken out, or the numbers are raw counts.
     """
     size = float(np.median(np.linalg.norm(accel, axis=-1)))
-    lasting = float(np.linalg.norm(np.mean(accel, axis=0))) > _LASTING * size  # more than a motion alone
+    lasting = float(np.linalg.norm(np.mean(accel, axis=0))) > _MEAN_SHARE * size  # more than a motion alone
     for unit, scale in FORCE.items():
         if lasting and 0.8 * _G < size * scale < 1.25 * _G:
             return Guess(unit, f"the median force, {size:.4g}, is then that of gravity")
@@ -176,7 +178,7 @@ def estimate_noise_density(t: Array, x: Array) -> float:
     while m * period <= 0.5 and len(x) // m > 4:
         means = x[: len(x) // m * m].reshape(-1, m, x.shape[1]).mean(1)
         squares = 0.5 * np.diff(means, axis=0) ** 2
-        n = max(round(_QUIET / (m * period)), 4)
+        n = max(round(_QUIET_SPAN / (m * period)), 4)
         windows = squares[: len(squares) // n * n].reshape(-1, n, x.shape[1])
         if len(windows):
             variance = np.percentile(windows.mean(1), (10, 50), axis=0).mean(1)

@@ -20,8 +20,8 @@ from graphnav.core.rotation import Array
 
 STEP = 0.1  # s, of the common grid
 _MEAN_OVER = 1.0  # s, of the moving mean over everything
-_SLOW = 3.0  # m/s; below, a course is undefined
-_FEWEST, _TRIMS = 50, 3
+_LEAST_SPEED = 3.0  # m/s; below, a course is undefined
+_FEWEST_SAMPLES, _TRIMS = 50, 3
 NEAR = 3.0  # s, range of the offset of clocks that overlap already
 
 
@@ -65,7 +65,7 @@ def compute_course(t: Array, llh: Array, v: Array | None) -> Course:
     gap |= (grid < grid[0] + 2.0 * _MEAN_OVER) | (grid > grid[-1] - 2.0 * _MEAN_OVER)
     speed = np.hypot(east, north)
     ae, an = np.gradient(east, STEP), np.gradient(north, STEP)
-    slow = (speed < _SLOW) | gap
+    slow = (speed < _LEAST_SPEED) | gap
     safe = np.where(slow, np.inf, speed)
     forward, left = (east * ae + north * an) / safe, (east * an - north * ae) / safe
     turn = left / safe
@@ -164,11 +164,11 @@ def _resample_evenly(t: Array, x: Array) -> Array:
 def _pair_samples(a: Array, b: Array, w: Array, shift: int) -> tuple[Array, Array, Array, Array]:
     """a[k], b[k + shift] and its weight where all are known, minus their weighted means; and which of b they are."""
     lo, hi = max(0, -shift), min(len(a), len(b) - shift)
-    if hi - lo < _FEWEST:
+    if hi - lo < _FEWEST_SAMPLES:
         return np.empty(0), np.empty(0), np.empty(0), np.empty(0, int)
     x, y, v = a[lo:hi], b[lo + shift : hi + shift], w[lo + shift : hi + shift]
     ok = np.flatnonzero(np.isfinite(x) & np.isfinite(y) & (v > 0))
-    if len(ok) < _FEWEST:
+    if len(ok) < _FEWEST_SAMPLES:
         return np.empty(0), np.empty(0), np.empty(0), np.empty(0, int)
     x, y, v = x[ok], y[ok], v[ok] / v[ok].sum()
     return x - v @ x, y - v @ y, v, ok + lo + shift

@@ -19,7 +19,7 @@ GENERAL, WORD = -1, -2  # kinds of fields: %.6g and %s; others are the decimals 
 _FIELD = re.compile(r"%(?:\.(\d+)(f|g)|d|s)")
 _MOST_PLACES = 11  # for which 10^k 2^-53 is far below a half
 _WIDEST = 28  # bytes of a number: a sign, 15 digits, a point and eleven more
-_ROWS = 512  # rows at once: their text stays in the processor's cache
+_ROWS_AT_ONCE = 512  # rows at once: their text stays in the processor's cache
 _COMPILED = "graphnav.recording.exporters.rows"
 _FEW, _SOME, _MANY = 500, 20_000, 2_000_000  # numbers above which loading and calling compiled code pays off
 
@@ -43,8 +43,8 @@ def rows_bytes(table: Array, row_format: str, last: Array | None = None) -> byte
     least = _FEW if _COMPILED in sys.modules else _SOME if "numba" in sys.modules else _MANY
     if table.size >= least and None not in _list_kinds(form) and can_compile():
         return b"".join(
-            _write_compiled(table[k : k + _ROWS], form, None if last is None else last[k : k + _ROWS])
-            for k in range(0, len(table), _ROWS)
+            _write_compiled(table[k : k + _ROWS_AT_ONCE], form, None if last is None else last[k : k + _ROWS_AT_ONCE])
+            for k in range(0, len(table), _ROWS_AT_ONCE)
         )
     return _write_plainly(table, form, last)
 

@@ -16,8 +16,8 @@ from graphnav.recording.exporters import Add, require_geodetic
 from graphnav.recording.exporters.digits import rows_text
 
 _MAX_POINTS = 20000
-_SPACING = 0.05  # m, smallest distance between points
-_SPARE = 16  # ratio of the points kept to those wanted, until the length of the path is known
+_LEAST_SPACING = 0.05  # m, smallest distance between points
+_SPARE_POINTS = 16  # ratio of the points kept to those wanted, until the length of the path is known
 
 # The line is clamped to the ground: KML heights are above mean sea level, ours above the ellipsoid.
 _DOCUMENT = """<?xml version="1.0" encoding="UTF-8"?>
@@ -82,12 +82,12 @@ class _Thinned:
         new = np.column_stack([block.t, block.llh, along])
         self._last, self._end = p[-1:], new[-1]
         self._kept = np.concatenate([self._kept, new])
-        if len(self._kept) > _SPARE * _MAX_POINTS:
-            self._kept = self._at_least(self._kept, along[-1] / (_SPARE / 2 * _MAX_POINTS))
+        if len(self._kept) > _SPARE_POINTS * _MAX_POINTS:
+            self._kept = self._at_least(self._kept, along[-1] / (_SPARE_POINTS / 2 * _MAX_POINTS))
 
     def rows(self) -> Array:
         """Times (s), llh (rad, m) and distance (m) of the points, (N, 5)."""
-        kept = self._at_least(self._kept, max(self._end[4] / _MAX_POINTS, _SPACING))
+        kept = self._at_least(self._kept, max(self._end[4] / _MAX_POINTS, _LEAST_SPACING))
         return kept if kept[-1, 0] == self._end[0] else np.concatenate([kept, self._end[None]])
 
     @staticmethod

@@ -27,7 +27,7 @@ from graphnav.recording.formats.table import Table
 from graphnav.sensors import Sensor, Series
 from graphnav.sensors.tables import ANGLE
 
-_AT_ONCE = 1 << 16  # rows at once
+_ROWS_AT_ONCE = 1 << 16  # rows at once
 
 
 def build_imu(d: schema.ImuTable, rows: Table, remarks: Remarks) -> Imu:
@@ -55,8 +55,8 @@ def build_imu(d: schema.ImuTable, rows: Table, remarks: Remarks) -> Imu:
 def _turn(rows: Table, names: tuple[str, ...], unit: float, R_bs: Array) -> Array:
     """Columns (N, 3) in body axes, removed from the table: for a day of rows nothing is held twice."""
     out = np.empty((len(rows), 3))
-    for k in range(0, len(out), _AT_ONCE):
-        some = slice(k, k + _AT_ONCE)
+    for k in range(0, len(out), _ROWS_AT_ONCE):
+        some = slice(k, k + _ROWS_AT_ONCE)
         np.matmul(np.stack([rows[name][some] for name in names], -1) * unit, R_bs.T, out=out[some])
     rows.release(*names)
     return out

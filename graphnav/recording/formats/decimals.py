@@ -16,7 +16,7 @@ import numpy as np
 from graphnav.core.files import parse_number
 from graphnav.core.rotation import Array
 
-_BLOCK = 1 << 18  # bytes processed at once: keeps the working arrays in the processor's cache
+_BLOCK_SIZE = 1 << 18  # bytes processed at once: keeps the working arrays in the processor's cache
 _SLAB = 1 << 22  # rows of a column in one allocation: 32 MB, which are returned to the system when released
 _COMMA, _MINUS, _POINT, _LINE = b",-.\n"
 _PAD = 16  # bytes before a block, for words that extend back beyond it
@@ -36,7 +36,7 @@ def read_decimals(file: IO[bytes], width: int, use: Sequence[int]) -> list[Array
     """
     slabs: list[list[Array]] = [[] for _ in use]
     rows = 0
-    while block := file.read(_BLOCK):
+    while block := file.read(_BLOCK_SIZE):
         found = _parse_columns(block + file.readline(), width, list(use))
         done = 0
         while done < found.shape[1]:

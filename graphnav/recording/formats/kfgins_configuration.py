@@ -25,7 +25,7 @@ DEG_PER_SQRT_H = np.pi / 180 / 60  # rad/s/sqrt(Hz)
 MGAL = 1e-5  # m/s^2
 _LEAST, _MOST = 1e-12, 1e12  # limit of a noise figure in the configuration's units: above any sensor
 _DEEPEST = 50  # levels of nested tables; two are used
-_FARTHEST = 1000.0  # m, of a lever arm
+_MAX_LEVER_ARM = 1000.0  # m, of a lever arm
 
 
 def read_configuration(path: Path) -> dict[str, Any]:
@@ -94,9 +94,11 @@ def find_file(config_file: Path, config: dict[str, Any], keys: tuple[str, ...]) 
 def read_lever_arm(where: Path, config: dict[str, Any], key: str) -> Array:
     """A lever arm of the configuration (forward, right, down) in RFU; zero where there is none."""
     value = config.get(key, [0.0, 0.0, 0.0])
-    if not (isinstance(value, list) and len(value) == 3 and all(_is_number(x) and abs(x) <= _FARTHEST for x in value)):
+    if not (
+        isinstance(value, list) and len(value) == 3 and all(_is_number(x) and abs(x) <= _MAX_LEVER_ARM for x in value)
+    ):
         raise RecordingError(
-            f"{where}, {key}: must be three numbers, forward, right, down in m, of {_FARTHEST:g} m at most",
+            f"{where}, {key}: must be three numbers, forward, right, down in m, of {_MAX_LEVER_ARM:g} m at most",
             key="yaml.value",
         )
     return rotation_from_letters("FRD") @ np.array(value, dtype=float)

@@ -338,7 +338,7 @@ def fixes_by_type(rows: Table, numbers: str) -> NDArray[np.intp] | None:
 
 
 # 1-sigma of a vertical velocity that is taken as zero because a receiver gives only speed and course: a slope of 10 %
-_SLOPE = 0.1
+_STEEPEST = 0.1
 
 
 def horizontal_velocity(speed: Array, course: Array, sd: tuple[float, float, float]) -> tuple[Array, Array, str]:
@@ -350,7 +350,7 @@ def horizontal_velocity(speed: Array, course: Array, sd: tuple[float, float, flo
     v = np.stack([speed * np.sin(course), speed * np.cos(course), np.zeros_like(speed)], -1)
     v[np.isnan(v).any(-1)] = np.nan
     sd_v = np.tile(np.array(sd), (len(speed), 1))
-    sd_v[:, 2] = np.maximum(sd[2], _SLOPE * np.abs(np.nan_to_num(speed)))
+    sd_v[:, 2] = np.maximum(sd[2], _STEEPEST * np.abs(np.nan_to_num(speed)))
     sd_v[np.isnan(v).any(-1)] = np.nan
     return (
         v,

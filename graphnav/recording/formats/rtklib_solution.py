@@ -21,7 +21,7 @@ from graphnav.core.timescales import GPS_TO_UNIX, WEEK, of_week, unix_to_gps
 from graphnav.recording.formats.text import Rows, number_table
 
 _GPS_EPOCH = np.datetime64("1980-01-06T00:00:00", "us")
-_AHEAD = {"UTC": 0.0, "JST": 9 * 3600.0}  # s ahead of UTC
+_ZONES = {"UTC": 0.0, "JST": 9 * 3600.0}  # s ahead of UTC
 _NUMBER = r"[-+]?\d+(?:\.\d*)?"
 # the columns of a position, the letters of its axes in those of sigmas, and the order of east, north, up in them
 _FORMS = {
@@ -83,8 +83,8 @@ def parse_solution(path: Path, head: list[str], rows: Rows) -> Solution:
     if gps is None:
         gps = WEEK * table[:, 0] + table[:, 1]
     notes: list[str] = []
-    if scale in _AHEAD:
-        gps = unix_to_gps(gps + GPS_TO_UNIX - _AHEAD[scale])
+    if scale in _ZONES:
+        gps = unix_to_gps(gps + GPS_TO_UNIX - _ZONES[scale])
         sentence = f"{path.name}: times were in {scale}; the leap seconds of their date make them GPS time"
         notes.append(Note("trajectory.time_scale", sentence))
     if any("lat/lon/height=WGS84/geodetic" in line for line in head):

@@ -32,15 +32,15 @@ from graphnav.recording.formats.repair import LATEST
 from graphnav.recording.formats.rtklib_solution import parse_solution
 from graphnav.recording.formats.text import number_table, text_lines
 
-_FARTHEST = 1e8  # m, twice around the Earth, whatever the coordinates' origin
+_MAX_COORDINATE = 1e8  # m, twice around the Earth, whatever the coordinates' origin
 _DEG = np.pi / 180.0
 _UNITS = {"t": "s", "lat": "deg", "lon": "deg", "h": "m", "x": "m", "y": "m", "z": "m"} | dict.fromkeys(
     ("ve", "vn", "vu", "vd"), "mps"
 )
 _UNITS |= dict.fromkeys(("roll", "pitch", "heading"), "deg")
-_SIGMAS = "sd_e sd_n sd_u sd_ve sd_vn sd_vu sd_roll sd_pitch sd_heading"
+_SIGMA_COLUMNS = "sd_e sd_n sd_u sd_ve sd_vn sd_vu sd_roll sd_pitch sd_heading"
 # columns that are read; others may hold anything
-_KNOWN = {*_UNITS, *_SIGMAS.split(), *["bgx", "bgy", "bgz", "bax", "bay", "baz"]}
+_KNOWN_COLUMNS = {*_UNITS, *_SIGMA_COLUMNS.split(), *["bgx", "bgy", "bgz", "bax", "bay", "baz"]}
 
 
 def read_trajectory(path: str | Path) -> Trajectory:
@@ -121,7 +121,7 @@ def _build(
                 key="table.place",
             )
     metres = position if local else position[:, 2:]
-    if (bad := np.abs(metres) > _FARTHEST).any():
+    if (bad := np.abs(metres) > _MAX_COORDINATE).any():
         k, axis = (int(i) for i in np.argwhere(bad)[0])
         raise RecordingError(
             f"{path}, line {numbers[k]}: {metres[k, axis]:g} m is no place of a drive", key="table.place"
@@ -168,7 +168,7 @@ def _read_csv(path: Path, rows: list[tuple[int, str]]) -> Trajectory:
         raise RecordingError(
             f"{path}, line 1: no column '{missing[0]}'; found {', '.join(names)[:300]}", key="table.column"
         )
-    wanted = {names[k] for name, k in columns.items() if name in _KNOWN}
+    wanted = {names[k] for name, k in columns.items() if name in _KNOWN_COLUMNS}
     table = number_table(path, rows, names, ",", wanted)
 
     def take(*wanted: str, scale: float = 1.0) -> Array | None:

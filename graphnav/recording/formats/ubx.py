@@ -25,7 +25,7 @@ from graphnav.recording.formats.repair import Remarks
 _SYNC = b"\xb5\x62"
 _PVT, _HP, _MEAS, _RAW = (1, 7), (1, 0x14), (0x10, 2), (0x10, 3)
 _GYRO, _ACCEL, _SPEED = (14, 13, 5), (16, 17, 18), 11
-_SCALE = dict.fromkeys(_GYRO, np.pi / 180 * 2.0**-12) | dict.fromkeys(_ACCEL, 2.0**-10) | {_SPEED: 1e-3}
+_SCALES = dict.fromkeys(_GYRO, np.pi / 180 * 2.0**-12) | dict.fromkeys(_ACCEL, 2.0**-10) | {_SPEED: 1e-3}
 _TICKS = (1e-3, 39.0625e-6, 1e-6)  # s, ticks of the sensors' time tags in various receivers
 _WRAP = 2.0**32
 
@@ -130,10 +130,10 @@ def _note(content: _Content, message: Any, is_raw: bool) -> int | None:
             if not hasattr(message, f"dataField_{count:02d}"):
                 return tag
             kind, value = getattr(message, f"dataType_{count:02d}"), getattr(message, f"dataField_{count:02d}")
-        if kind in _SCALE:
+        if kind in _SCALES:
             signed = value - (1 << 24) if value & 0x800000 else value
             assert tag is not None
-            content.samples.setdefault(kind, []).append((tag, signed * _SCALE[kind]))
+            content.samples.setdefault(kind, []).append((tag, signed * _SCALES[kind]))
 
 
 def _find_week_start(message: Any) -> float | None:

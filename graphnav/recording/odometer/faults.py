@@ -29,7 +29,7 @@ GAP, STUCK, FROZEN, WILD = "no readings", "stuck at zero", "frozen", "against th
 
 _G = 9.81  # m/s^2
 _GRIP = 1.2 * _G  # m/s^2, above the grip of tyres on any road
-_SLOPE = 0.05 * _G  # m/s^2, uncertainty of the force: 3 degrees of pitch
+_FORCE_ERROR = 0.05 * _G  # m/s^2, uncertainty of the force: 3 degrees of pitch
 _LAG_ERROR = 0.5  # s; shorter windows are no more certain, as the delay is known to some hundredths only
 _RADIUS = 0.05  # of the speed: scale, and tyres on bumps
 _DEAF = 1.0  # m/s, below which passive sensors do not detect a turning wheel (ABS: about 3 km/h)
@@ -42,7 +42,7 @@ _STAYS = 0.5  # s of equal readings (five at least) that may be stuck
 _LONGER = 5.0  # multiple of the duration that 99 % of repetitions stay below
 _SPIKE = 1.0  # s
 _ISLAND = 10.0  # s that the IMU can bridge
-_TURN = 0.05  # rad/s for a second: above that of any stationary vehicle
+_MOVING_RATE = 0.05  # rad/s for a second: above that of any stationary vehicle
 _SHAKEN = 5  # consecutive seconds with vibration as in motion
 
 
@@ -160,7 +160,7 @@ def _find_breaks(
             if known.any():
                 moved = known & (fast > 0.0)
                 typical = _TIMES_TYPICAL * float(np.percentile(off[moved], 90.0)) if moved.any() else 0.0
-                limit = np.maximum(allowed + _SLOPE * np.maximum(dt, _LAG_ERROR), typical)
+                limit = np.maximum(allowed + _FORCE_ERROR * np.maximum(dt, _LAG_ERROR), typical)
                 bad |= known & (off > limit)
         found += _intersect(i[bad], j[bad], found)
     return sorted(found)
@@ -207,7 +207,7 @@ def _can_follow(t: Array, v: Array, motion: _InertialMotion | None, i: int, j: i
     gained = 0.0 if motion is None else motion.force[j] - motion.force[i]
     if motion is None or abs(gained) > 1e5:
         return bool(abs(v[j] - v[i]) <= _GRIP * apart)
-    return bool(abs(v[j] - v[i] - gained) <= _SLOPE * max(apart, _LAG_ERROR) + _RADIUS * max(v[i], v[j]) + 1e-9)
+    return bool(abs(v[j] - v[i] - gained) <= _FORCE_ERROR * max(apart, _LAG_ERROR) + _RADIUS * max(v[i], v[j]) + 1e-9)
 
 
 def _find_islands(
@@ -271,7 +271,7 @@ def _find_departure(t: Array, force: Array, earliest: int, k: int) -> int:
     """The reading at which the motion at k began: back as long as the force of the preceding second shows it."""
     while k > earliest:
         before = max(int(np.searchsorted(t, t[k] - 1.0)), earliest)
-        if abs(force[k] - force[before]) <= _SLOPE * (t[k] - t[before]):
+        if abs(force[k] - force[before]) <= _FORCE_ERROR * (t[k] - t[before]):
             break
         k -= 1
     return k
@@ -291,7 +291,7 @@ def _find_moving_zeros(
     rest, fast = read == 0.0, read > 3.0
     if not rest.any():
         return []
-    turn = np.abs((gyro.mean(axis=1) - np.median(gyro[rest].mean(axis=1), axis=0)) @ up) > _TURN
+    turn = np.abs((gyro.mean(axis=1) - np.median(gyro[rest].mean(axis=1), axis=0)) @ up) > _MOVING_RATE
     shaken = np.zeros(count, dtype=bool)
     if fast.sum() >= 20:
         shakes = [np.linalg.norm(x.std(axis=1), axis=-1) for x in (gyro, accel)]

@@ -19,7 +19,7 @@ FASTEST = 150.0  # m/s; the fastest cars that can be bought reach 490 km/h, 136 
 MISLED = 440.0  # m
 _CACHED = 60.0  # s; a receiver that is switched on outputs fixes at least that often
 _FROZEN = (60.0, 300.0)  # s, and m driven: within these a road or receiver noise changes a height
-_SLOPE = 0.1  # steepest road: bound on the deviation of a height
+_STEEPEST = 0.1  # steepest road: bound on the deviation of a height
 _CARRIER = 1e-3  # m: a two-hundredth of the carrier's wavelength (0.19 m), the resolution of its phase
 _WAVE = 0.19  # m, of L1
 _ACCELERATION = 2.0  # m/s^2, typical acceleration of vehicles
@@ -59,14 +59,15 @@ def screen(recording: Recording) -> tuple[Recording, list[Finding]]:
     for a, b in find_frozen_heights(gnss, p):
         driven = float(np.hypot(*np.diff(p[a:b, :2], axis=0).T).sum())
         sd = gnss.sd.copy()
-        sd[a:b, 2] = np.maximum(sd[a:b, 2], _SLOPE * driven)
+        sd[a:b, 2] = np.maximum(sd[a:b, 2], _STEEPEST * driven)
         h, begin, end = gnss.llh[a, 2], gnss.t[a] - recording.start, gnss.t[b - 1] - recording.start
         gnss = replace(gnss, sd=sd)
         findings.append(
             Finding(
                 "warning",
                 f"the heights of the fixes stay at {h:.4g} m from {begin:.1f} to {end:.1f} s, over {driven:.0f} m: "
-                f"frozen or not logged; they are given a sigma of {_SLOPE * driven:.0f} m there (a slope of a tenth)",
+                "frozen or not logged; they are given a sigma of "
+                f"{_STEEPEST * driven:.0f} m there (a slope of a tenth)",
                 "gnss.height_frozen",
             )
         )

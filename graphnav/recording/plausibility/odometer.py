@@ -16,9 +16,9 @@ from graphnav.recording.plausibility.fixes import FASTEST
 _CLOCK_STEP = 1.0  # s, and ten periods: a silence of the odometer that may be a jump of its clock
 _RADIUS = 0.1  # relative difference of tyre radii: wear, load, pressure, a spare wheel
 _LEAST_SPEED = 5.0  # m/s, above which speeds are compared
-_LASTING = 10.0  # s; shorter ones are slip, or an error of a fix
+_SHORTEST_SPAN = 10.0  # s; shorter ones are slip, or an error of a fix
 _CLEAR = 4.0  # ratio of the misfits of two clocks (white errors: one in thousands with 20 of them a side)
-_RATE = 10.0  # Hz needed for changes of speed
+_SPEED_RATE = 10.0  # Hz needed for changes of speed
 
 
 def screen(recording: Recording, track: Track | None) -> tuple[Recording, list[Finding]]:
@@ -38,7 +38,7 @@ def screen(recording: Recording, track: Track | None) -> tuple[Recording, list[F
 
 def build_odometer_track(odometer: Odometer) -> Track | None:
     """The odometer's speed in the form of a GNSS track, for recordings without GNSS."""
-    every = max(1, round(1.0 / (_RATE * period_of(odometer.t)))) if len(odometer.t) > 1 else 1
+    every = max(1, round(1.0 / (_SPEED_RATE * period_of(odometer.t)))) if len(odometer.t) > 1 else 1
     t, speed = odometer.t[::every], odometer.speed[::every]
     if len(t) < 5:
         return None
@@ -118,10 +118,10 @@ def _find_other_scale(odometer: Odometer, track: Track | None, start: float) -> 
     if len(at) < MIN_PAIRS:
         return bad, None
     off = np.log(read[at] / track.speed[at])
-    seconds = max(1, round(_LASTING / track.period))
+    seconds = max(1, round(_SHORTEST_SPAN / track.period))
     typical = median_filter(off, size=min(seconds + 1 - seconds % 2, len(off)), mode="nearest")
     right = np.abs(typical) < np.log1p(_RADIUS)
-    if right.sum() * track.period < _LASTING:
+    if right.sum() * track.period < _SHORTEST_SPAN:
         return bad, None  # another unit, or another wheel, throughout
     own = float(np.median(off[right]))
     noise = float(np.median(np.abs(off[right] - own))) / 0.6745
@@ -133,7 +133,7 @@ def _find_other_scale(odometer: Odometer, track: Track | None, start: float) -> 
         factor = float(np.median(off[a:b]))
         # a scale is one factor; fixes among high buildings make speeds of all magnitudes
         scatter = float(np.median(np.abs(off[a:b] - factor))) / 0.6745
-        if end - begin < _LASTING - 2.0 * track.period or scatter > np.log1p(_RADIUS):
+        if end - begin < _SHORTEST_SPAN - 2.0 * track.period or scatter > np.log1p(_RADIUS):
             continue
         # up to the adjacent right readings: what lies between is unknown
         low = track.t[at[a - 1]] if a > 0 else -np.inf

@@ -36,17 +36,20 @@ ACCEL_RANGE = 1000.0  # m/s^2
 GYRO_RANGE = 70.0  # rad/s
 _STANDARD_GRAVITY = 9.80665  # m/s^2, where the position is unknown
 _ISOLATED = 0.01  # share of the rows; above it the cause is not in single rows
-_QUIET = 10.0  # percentile of the turn rate up to which a foot stands and a vehicle moves calmly
+_QUIET_PERCENTILE = 10.0  # percentile of the turn rate up to which a foot stands and a vehicle moves calmly
 # A factor of two is the smallest by which a scale is mistaken (the ranges of a sensor are that far apart): the middle.
-_SCALE = np.sqrt(2.0)
+_SCALE_RATIO = np.sqrt(2.0)
 _UNIT_RATIO = 1.2  # ratio of the force found and that of a unit: a biased sensor among vibration
 _DEAD = 10.0  # s; the longest repetition of an axis in thirty real recordings while others move is 0.08 s
-_MOVES = 20.0  # steps of its own resolution by which an axis has moved and not only flickered
+_MOVING_STEPS = 20.0  # steps of its own resolution by which an axis has moved and not only flickered
 # Levels that a moving carrier exceeds by far: a thousandth of g, and the Earth's rate
 _STIRS = {"accelerometer": 1e-3 * _STANDARD_GRAVITY, "gyro": 7.3e-5}  # m/s^2, rad/s
 _NOISY = 0.05  # share of the steps that reverse the one before; for noise up to a band B and a rate f it is 1.5 B / f
 _AXIS = "xyz"
-_UNITS = ("imu.gyro_unit", "imu.force_scale")  # findings of `check_imu_scale`: single rows cannot be judged then
+_UNIT_FINDINGS = (
+    "imu.gyro_unit",
+    "imu.force_scale",
+)  # findings of `check_imu_scale`: single rows cannot be judged then
 
 
 @dataclass(frozen=True)
@@ -114,7 +117,7 @@ def screen(recording: Recording) -> Screened:
     recording, of_imu, of_aiding, track = _drop_impossible(recording)
     dead, clock = list(check_dead_axes(recording)), None
     findings = [*of_imu, *dead, *of_aiding]
-    wrong_unit = any(f.key in _UNITS for f in of_imu)
+    wrong_unit = any(f.key in _UNIT_FINDINGS for f in of_imu)
     if recording.platform == "vehicle" and not dead and not wrong_unit:
         path = track
         if path is None and recording.odometer is not None:
@@ -174,7 +177,7 @@ def check_imu_scale(recording: Recording) -> Iterator[Finding]:
         for x in imu.gyro.T:
             turn += (x - np.median(x)) ** 2
         np.sqrt(turn, out=turn)
-        quiet = turn <= np.percentile(turn, _QUIET)
+        quiet = turn <= np.percentile(turn, _QUIET_PERCENTILE)
         f = float(np.median(np.linalg.norm(imu.accel[quiet], axis=1)))
     if (sentence := _find_scale(f)) is not None:
         g = _STANDARD_GRAVITY if recording.gnss is None else _measure_gravity(recording)
@@ -195,7 +198,7 @@ def _measure_gravity(recording: Recording) -> float:
 def _find_scale(f: float) -> str | None:
     """The likely unit or scale of a force at rest that is not gravity; None if it is."""
     g = _STANDARD_GRAVITY
-    if g / _SCALE < f < g * _SCALE:
+    if g / _SCALE_RATIO < f < g * _SCALE_RATIO:
         return None
     units = {g / size: f'the accelerometer seems to be in {name}: say units = {{ accel = "{name}" }}'
              for name, size in FORCE.items() if name != "m/s2"}  # fmt: skip
@@ -307,7 +310,7 @@ def _is_moving(x: Array, same: Array, least: float) -> bool:
     steps = steps[np.abs(steps) > 1e-12 * np.abs(x).max()]
     if len(steps) < 2 or float(np.std(x)) < least or float(same.mean()) >= 0.5:
         return False
-    if float(np.ptp(x)) <= _MOVES * float(np.abs(steps).min()):
+    if float(np.ptp(x)) <= _MOVING_STEPS * float(np.abs(steps).min()):
         return False
     return float((steps[1:] * steps[:-1] < 0.0).mean()) > _NOISY
 

@@ -16,8 +16,12 @@ from graphnav.report.plots.thinning import BINS, thin
 _DYNAMIC = 2.5  # decades of amplitude in the spectrogram
 _FLOOR = 1e-6  # lower limit of a statistic on its logarithmic axis
 _FUSED = "fused"
-_SHOWN = ("low_band_glrt", "glrt", "fft")  # of more than `_MOST`; the others are in statistics.csv.gz
-_MOST = 4
+_SHOWN_STATISTICS = (
+    "low_band_glrt",
+    "glrt",
+    "fft",
+)  # of more than `_MAX_STATISTICS`; the others are in statistics.csv.gz
+_MAX_STATISTICS = 4
 
 
 def detections(recording: Recording, found: Sequence[Detection]) -> Figure:
@@ -33,8 +37,8 @@ def detections(recording: Recording, found: Sequence[Detection]) -> Figure:
     for d in found:
         if d.name != _FUSED and np.isfinite(d.statistic).any():
             by_name.setdefault(d.name, []).append(d)
-    if len(by_name) > _MOST:
-        by_name = {name: every for name, every in by_name.items() if name in _SHOWN}
+    if len(by_name) > _MAX_STATISTICS:
+        by_name = {name: every for name, every in by_name.items() if name in _SHOWN_STATISTICS}
     shown = drawn_rows(imu)
     t = imu.t[shown] - t0
     force, rate = (size[shown] for size in _sizes(imu))

@@ -168,12 +168,12 @@ class Figure:
             lowest = k + columns >= count
             # an axis shared by several panels belongs to the lowest of them
             self.axes[f"xaxis{xname[1:]}"] = {
-                **_LOOK, "range": list(lims[k]), "domain": across, "anchor": yname, "nticks": 6 if columns == 1 else 4,
+                **_STYLE, "range": list(lims[k]), "domain": across, "anchor": yname, "nticks": 6 if columns == 1 else 4,
                 "hoverformat": ".2f", "showline": True, **({"title": {"text": x, "standoff": 6}} if lowest else {}),
                 **({"type": "log"} if x_log else {}),
             }  # fmt: skip
             logarithmic = log if isinstance(log, bool) else log[k]
-            look = {**_LOOK, "range": list(ylim), "domain": [max(top - height / inner, 0.0), top], "anchor": xname}
+            look = {**_STYLE, "range": list(ylim), "domain": [max(top - height / inner, 0.0), top], "anchor": xname}
             if logarithmic:
                 look |= {"type": "log", "minorloglabels": "complete", "nticks": 3}
             if names is not None:
@@ -210,7 +210,7 @@ class Figure:
         return {"data": self.data, "layout": layout}
 
 
-_LOOK = {"zeroline": False, "gridcolor": "var(--grid)", "linecolor": "var(--ink)", "exponentformat": "none"}
+_STYLE = {"zeroline": False, "gridcolor": "var(--grid)", "linecolor": "var(--ink)", "exponentformat": "none"}
 
 
 def limits(

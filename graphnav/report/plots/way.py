@@ -11,7 +11,7 @@ import numpy as np
 from graphnav.core.rotation import Array
 from graphnav.report.plots.figure import SHADES, Figure, Panel, Spans, colour, limits
 
-_FEW = 60  # stops that are marked individually
+_MARKED_STOPS = 60  # stops that are marked individually
 _WIDE, _HIGH = 1080.0, 560  # pixels of the map on a wide screen; narrower pages show more of the north
 
 
@@ -125,7 +125,7 @@ def _draw_stops(panel: Panel, t: Array, en: Array, stops: Spans, standing: str) 
         return
     begin, end = np.array(stops).T
     x, y = (np.interp(0.5 * (begin + end), t, en[:, k]) for k in (0, 1))
-    panel.dots(x, y, "stop", standing, 8.0 if len(stops) <= _FEW else 5.0, "D", t=begin, way=True)
+    panel.dots(x, y, "stop", standing, 8.0 if len(stops) <= _MARKED_STOPS else 5.0, "D", t=begin, way=True)
 
 
 def _mark_ends(panel: Panel, en: Array, scale: float) -> None:
