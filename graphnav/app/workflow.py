@@ -270,7 +270,7 @@ def list_unused_noise(noise: NoiseModel, solution: Solution) -> list[str]:
     have = dict.fromkeys(INTERVALS, solution.t) | {name: record.t for name, record in solution.records.items()}
     named = {group.split(".")[0] for group in noise.figures} - {"imu"} | set(noise.weights) | set(noise.excluded)
     notes: list[str] = [
-        Note("noise.file.unused", f"noise model: it has figures of {name}, of which nothing is used here")
+        Note("noise.file.unused", f"noise model: it has figures of {name}, which is not used here")
         for name in sorted(named - set(have))
     ]
     for name, some in noise.weights.items():

@@ -40,7 +40,8 @@ class ClosedLoop(Constraint):
             return None
         note = Note(
             "closed_loop.set",
-            f"the end is set to be the start, to {sigma:g} m (closed_loop): the closure is no measure",
+            f"the end is constrained to the start, to {sigma:g} m (closed_loop): "
+            "the closure error is no measure of accuracy",
         )
         return cls(keyframe=np.array([len(scene.t) - 1]), sigma=np.full((1, 3), sigma), notes=(note,))
 

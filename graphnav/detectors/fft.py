@@ -108,7 +108,7 @@ def _detect(scene: Scene, labels: Labels | None, shown: bool) -> Detection:
             notes.append(
                 Note(
                     "detectors.fft.conditions",
-                    f"not asked for, because this engine does not meet it at idle: {', '.join(left_out)}",
+                    f"not required, because this engine does not meet it at idle: {', '.join(left_out)}",
                 )
             )
     usable = asked[3:8].any() and (line is not None or not settings.find_line)

@@ -135,14 +135,14 @@ def candidates(scene: Scene, found: Detection) -> tuple[Array, Array, tuple[str,
         notes.append(
             Note(
                 "detectors.speed_known",
-                f"{_count(measured)} smooth but no stop: odometer or GNSS say that the vehicle moved",
+                f"{_count(measured)} smooth but not a stop: odometer or GNSS show that the vehicle moved",
             )
         )
     if moves.sum() > measured:
         notes.append(
             Note(
                 "detectors.speed_felt",
-                f"{_count(int(moves.sum()) - measured)} smooth but no stop: the force before or after shows speed",
+                f"{_count(int(moves.sum()) - measured)} smooth but not a stop: the force before or after shows a speed",
             )
         )
     share = _share_still_in_motion(found, certain)

@@ -136,7 +136,7 @@ def _find_threshold(
         notes = (
             Note(
                 "detectors.low_band.noise",
-                "the IMU's stated noise is too large to tell stops by it: only the stillest stretches count",
+                "the IMU's stated noise is too large to detect stops: only the quietest spans count",
             ),
         )
     if label.sum() * period >= _LEAST_MOTION:

@@ -73,8 +73,7 @@ def detect_stances(
             notes.append(
                 Note(
                     "detectors.stance.lulls",
-                    f"{len(one.intervals) - len(deep)} short lulls that do not reach as deep as the stances were left "
-                    "out",
+                    f"{len(one.intervals) - len(deep)} short lulls, less quiet than the stances, were left out",
                 )
             )
         begin = int(np.searchsorted(deep[:, 1], since)) if len(deep) else 0

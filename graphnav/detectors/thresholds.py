@@ -99,7 +99,7 @@ def own_threshold(
     return least, (
         Note(
             "detectors.threshold",
-            f"{name}: nothing tells standing from moving windows, so only its sensors' noise counts as rest",
+            f"{name}: standing and moving windows cannot be separated, so only sensor noise counts as rest",
         ),
     )
 

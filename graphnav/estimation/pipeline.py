@@ -241,7 +241,7 @@ def _solve(
         if not settings.solver.isam2_lag and one.cost is not None and one.cost > best + _CLEARLY_BETTER:
             note = Note(
                 "solver.worse_optimum",
-                "isam2 ended in an optimum that explains the data worse than rts does: do not trust it "
+                "isam2 ended in an optimum that explains the data worse than that of rts: do not trust it "
                 f"(half chi-square {one.cost:.0f}, not {best:.0f})",
             )
             out["isam2"] = replace(one, notes=(note, *one.notes))

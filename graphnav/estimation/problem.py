@@ -239,7 +239,7 @@ def _describe_samples(samples: Samples, recording: Recording) -> tuple[str, ...]
         Note(
             "imu.gaps_bridged",
             f"{len(length)} gaps in the IMU bridged ({length.sum():.2f} s in all, longest {length[worst]:.2f} s at "
-            f"{samples.bridged[worst, 0] - recording.start:.1f} s): uncertainty grows there by what the signal usually "
-            "changes in such a time",
+            f"{samples.bridged[worst, 0] - recording.start:.1f} s): uncertainty grows there by the typical change "
+            "of the signal over such a time",
         ),
     )

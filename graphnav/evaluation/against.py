@@ -121,7 +121,7 @@ def read_against(asked: Against, name: str, recording: Recording, reference: Sol
         notes.append(
             Note(
                 "against.frame",
-                f"{asked.path.name}: metres of a frame of its own, turned by {np.degrees(yaw):.1f} deg onto ours",
+                f"{asked.path.name}: metres in a local frame, rotated by {np.degrees(yaw):.1f} deg onto ours",
             )
         )
     arm = asked.point
@@ -211,7 +211,7 @@ def _require_same_drive(asked: Against, track: Trajectory, recording: Recording,
         return  # as requested
     if _moves_otherwise(inside, reference):
         raise RecordingError(
-            f"{asked.path}: moves otherwise than '{recording.name}' at the times that they share: it is of another "
+            f"{asked.path}: moves differently from '{recording.name}' at their common times: it is of another "
             "drive, or on another clock; --against-shift says what to add to its times",
             key="against.other_drive",
         )

@@ -184,7 +184,7 @@ def evaluate_recording(
     found = truth_of(recording)
     if found is None and recording.truth is not None and recording.truth.closed_loop_sigma is not None:
         sigma = recording.truth.closed_loop_sigma
-        note = Note("truth.closed_loop", f"the only truth is that the end is the start, to {sigma:g} m")
+        note = Note("truth.closed_loop", f"the only truth is that the drive ends where it starts, to {sigma:g} m")
         return Metrics(trajectory.name, closure=closure(trajectory), notes=(*trajectory.notes, note))
     late = 0.0
     if found is None and gnss_spans and recording.gnss is not None:

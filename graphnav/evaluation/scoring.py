@@ -63,7 +63,7 @@ def errors(
         notes.append(
             Note(
                 "truth.lever_arm",
-                f"the estimate has no attitude, so the lever arm of {arm:.2f} m to the truth's point is left out",
+                f"the estimate has no attitude, so the lever arm of {arm:.2f} m to the truth's point is ignored",
             )
         )
     elif lever_arm is not None and trajectory.covariance is None and trajectory.sd_rph is None:
@@ -192,7 +192,7 @@ def _fit(
     spread = np.sqrt(np.mean(np.sum((source[:, :2] - source[:, :2].mean(0)) ** 2, axis=1)))
     if spread < 0.1:
         raise RecordingError(
-            f"the {len(source)} shared epochs spread over {spread:.3f} m only: too little to fit a yaw",
+            f"the {len(source)} common epochs extend over {spread:.3f} m only: too little to fit a yaw",
             key="truth.too_little",
         )
     yaw, offset = fit_yaw(source, target)
@@ -219,7 +219,7 @@ def _subtract_fit(cov: Array, estimate: Trajectory, notes: list[str]) -> Array:
         notes.append(
             Note(
                 "nees.fit_unknown",
-                "NEES leaves the fit out of account: there is no covariance of place and heading at every epoch",
+                "NEES ignores the fit: there is no covariance of position and heading at every epoch",
             )
         )
         return cov
@@ -228,7 +228,8 @@ def _subtract_fit(cov: Array, estimate: Trajectory, notes: list[str]) -> Array:
     notes.append(
         Note(
             "nees.after_fit",
-            f"NEES is of what the fit leaves, errors of place and heading taken to last as in dead reckoning{by}",
+            "NEES is of the errors after the fit; errors of position and heading are assumed to persist as in dead "
+            f"reckoning{by}",
         )
     )
     return rest

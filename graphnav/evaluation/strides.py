@@ -72,7 +72,7 @@ def walk_errors(recording: Recording, solution: Solution, truth_sigma: float = 0
     if truth is not None and truth.closed_loop_sigma is not None:
         return _of_loop(solution, truth.closed_loop_sigma)
     if truth is None or truth.xyz is None:
-        raise ValueError(f"'{recording.name}' has no truth in a local frame and is no loop")
+        raise ValueError(f"'{recording.name}' has neither a truth in a local frame nor a closed loop")
     t, X = truth.t, truth.xyz
     inside = (t >= solution.t[0]) & (t <= solution.t[-1]) & np.isfinite(X).all(axis=1)
     t, X = t[inside], X[inside]

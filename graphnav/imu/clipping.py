@@ -131,9 +131,8 @@ def with_whole_peaks(samples: Samples, R_bs: Array, known: Array | None = None) 
             notes.append(
                 Note(
                     "imu.clipped",
-                    f"{what} {'xyz'[axis]} (file axes) ends at {limit:.3g} {unit}: {len(peaks)} peaks were cut off "
-                    "and put "
-                    "back by their sides",
+                    f"{what} {'xyz'[axis]} (file axes) ends at {limit:.3g} {unit}: {len(peaks)} clipped peaks were "
+                    "restored from their sides",
                 )
             )
         if cut:

@@ -49,7 +49,7 @@ def without_onboard_offset(recording: Recording, settings: Settings) -> tuple[Re
     most = 1e3 * float(np.abs(offset).max())
     note = Note(
         "imu.onboard_offset",
-        f"the unit corrected its gyro's offset while it rested, by up to {most:.1f} mrad/s: undone",
+        f"the unit corrected its gyro's offset at rest, by up to {most:.1f} mrad/s: the correction is undone",
     )
     return replace(recording, imu=replace(imu, gyro=imu.gyro + offset)), (note,)
 

@@ -80,8 +80,8 @@ class Online(Smoother):
         self.notes.append(
             Note(
                 "online.failed",
-                f"at {now:.3f} s the smoother failed ({type(error).__name__}); what had not settled"
-                f"{f' since {since:.3f} s' if since > -1e300 else ''} is lost: aligning anew",
+                f"at {now:.3f} s the smoother failed ({type(error).__name__}); unsettled states"
+                f"{f' since {since:.3f} s' if since > -1e300 else ''} are lost: aligning anew",
             )
         )
         self.tracker = None

@@ -63,7 +63,7 @@ def carry_back(
                 *notes,
                 Note(
                     "alignment.stands_first",
-                    f"stands for the first {stood:.0f} s; the attitude is that of the first motion",
+                    f"stationary for the first {stood:.0f} s; the attitude is from the first motion",
                 ),
             )
             sd_bg = np.full(3, noise.gyro_noise_density / np.sqrt(stood) + noise.gyro_bias_walk * np.sqrt(stood))

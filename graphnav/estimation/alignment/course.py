@@ -63,7 +63,8 @@ def with_course(tried: list[Solution], fixes: Gnss, own: float, wide: float) -> 
         notes = (
             Note(
                 "alignment.reverse_open",
-                "accelerations are too weak to tell forwards from reverse: the first motion is taken to be forwards",
+                "accelerations are too weak to distinguish forwards from reverse: "
+                "the first motion is assumed to be forwards",
             ),
         )
     if (

@@ -109,7 +109,7 @@ def align_in_motion(
     tried = _try_headings(part, settings, frame, smooth, rp, heading, bias)
     if not tried:
         raise EstimationError(
-            f"'{recording.name}': no start attitude explains the GNSS fixes between {begin - recording.start:.0f} "
+            f"'{recording.name}': no initial attitude explains the GNSS fixes between {begin - recording.start:.0f} "
             f"and {end - recording.start:.0f} s; check the axes, the units and the time stamps",
             key="alignment.not_explained",
         )

@@ -43,7 +43,7 @@ def at_rest(recording: Recording, settings: Settings, frame: LocalFrame, station
     if gnss is None or not len(gnss.t):
         # without fixes the first pose defines the frame: position and heading are exact by definition
         p, sd_p, sd_heading = np.zeros(3), np.full(3, 1e-3), 1e-4
-        note = Note("alignment.no_gnss", "no GNSS: levelled at the start, position and heading count from zero there")
+        note = Note("alignment.no_gnss", "no GNSS: levelled at the start, where position and heading are zero")
     else:
         sd_p, sd_heading = 10.0 * gnss.sd[0] + 1.0, np.pi
         known = measure_baseline_heading(recording, settings, stationary)

@@ -122,7 +122,7 @@ def check_gnss_jumps(recording: Recording, track: Track | None) -> Iterator[Find
         yield Finding(
             "warning",
             f"{count} in GNSS position that the motion and the sigmas do not explain, the largest {size[worst]:.1f} m "
-            f"at {at:.1f} s from the start; an estimated noise model weighs such down, else a robust kernel does",
+            f"at {at:.1f} s from the start; an estimated noise model down-weights them, otherwise a robust kernel does",
             "gnss.jump",
         )
 
@@ -137,7 +137,7 @@ def check_imu_clock(clock: ClockOffsets, odometer: Fit | None = None) -> Iterato
         yield Finding(
             "note",
             f"the stamps of GNSS positions and velocities are {clock.apart:.2f} s apart: they cannot both be right, "
-            "and what is left after time_offset is estimated of each",
+            "and the rest after time_offset is estimated for each",
             "gnss.two_clocks",
         )
     forward = clock.late

@@ -199,7 +199,7 @@ def inspect(recording: Recording) -> Inspection:
         findings.append(
             Finding(
                 "note",
-                "keys in brackets are those of a recording.toml, which this log has none of: graphnav init "
+                "keys in brackets belong in a recording.toml, which this log does not have: graphnav init "
                 f"{recording.source} drafts one",
                 "recording.log",
             )
