@@ -22,7 +22,7 @@ def settings_from(values: Mapping[str, Any], source: str = "settings", text: str
     Raises
     ------
     ConfigError
-        Naming the source, the line, the key, the value and its unit, and the nearest known key for an unknown one.
+        For an invalid value or key; names the source, line, key, value and unit, and the nearest known key.
     """
     try:
         return Settings.model_validate(dict(values))
@@ -36,19 +36,19 @@ def read_settings(path: str | Path | None = None, profile: str | None = None) ->
     Parameters
     ----------
     path
-        TOML, or the summary.json of a run, whose settings are then used again; None: no file.
+        TOML, or the summary.json of a run, for its settings; None: no file.
     profile
-        One of `PROFILES`; it goes before the file's own.
+        One of `PROFILES`; overrides the file's own.
 
     Returns
     -------
     Settings
-        All of them, defaults included.
+        All settings, defaults included.
 
     Raises
     ------
     ConfigError
-        If the file cannot be read or holds something that is not a setting, or there is no such profile.
+        If the file cannot be read or contains invalid settings, or there is no such profile.
     """
     values: Mapping[str, Any] = {}
     text = ""

@@ -30,21 +30,21 @@ def interpolate(
     Parameters
     ----------
     trajectory
-        What to interpolate.
+        The trajectory.
     t
         (N,) s.
     max_gap
-        s, between two of its rows that are interpolated; a time that falls on a row needs no neighbour.
+        s, longest gap between rows that is interpolated; a time that falls on a row needs no neighbour.
     lever_arm
-        (3,) m, right, forward, up: position, velocity and covariance are then those of the point at its end. Rows
-        without attitude stay where they are, and without an attitude sigma the sigmas stay what they are.
+        (3,) m, right, forward, up: position, velocity and covariance are those of the point at its end. Rows
+        without attitude are not moved, and without an attitude sigma the sigmas are unchanged.
 
     Returns
     -------
     trajectory : Trajectory
-        At M of the times.
+        At the M times that can be interpolated.
     mask : array of bool
-        (N,), which those are.
+        (N,), True for those times.
     """
     k, s, ok = _bracket(trajectory.t, np.asarray(t, dtype=float), max_gap)
     k, s, t = k[ok], s[ok, None], np.asarray(t, dtype=float)[ok]

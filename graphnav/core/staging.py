@@ -22,8 +22,6 @@ def stage_results(folder: Path) -> Iterator[Path]:
     empty. A file of the same name is replaced in one step. After a `PartlyWrittenError` the files written so far are
     kept, and no older file remains in place of one that is missing.
 
-    What ends with a `PartlyWrittenError` keeps what it has written, and nothing older of what it has not.
-
     Raises
     ------
     ConfigError

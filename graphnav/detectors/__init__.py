@@ -51,16 +51,16 @@ def detect(recording: Recording, settings: Settings | None = None, since: float 
     Parameters
     ----------
     recording
-        As read.
+        The recording, as read.
     settings
         The defaults when None.
     since
-        s; of stances that are over by then, where they begin and end need not be known.
+        s; the limits of stances that end before this time need not be determined.
 
     Returns
     -------
     Detections
-        The answer, (M, 2) s on the recording's clock, and that of each detector.
+        The fused answer, (M, 2) s on the recording's clock, and that of each detector.
     """
     d = (settings or Settings()).detectors
     scene = Scene(recording, d)

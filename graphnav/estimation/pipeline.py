@@ -60,22 +60,22 @@ def run(
     Parameters
     ----------
     recording
-        From `graphnav.load`.
+        The recording, as `graphnav.load` returns it.
     settings
-        The defaults when None.
+        All settings; the defaults when None.
     solvers
-        Out of "ekf", "rts", "incremental", "isam2", "batch".
+        Names of solvers: "ekf", "rts", "incremental", "isam2", "batch".
     progress
-        Called now and then with a stage and its share done, 0 to 1.
+        Function called with a stage and the share of it that is done, 0 to 1.
     noise
-        How good the sensors are taken to be; estimated, or as `settings.noise` says, when None.
+        Noise model of the sensors; when None, estimated or stated as `settings.noise` sets.
     constraints, detectors
-        Classes of a script, beside those that graphnav has.
+        Additional classes of a script.
 
     Returns
     -------
     dict
-        Solver name to `Solution`, in the order asked for.
+        A `Solution` by name of solver, in the order of `solvers`.
 
     Raises
     ------

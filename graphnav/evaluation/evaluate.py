@@ -92,19 +92,19 @@ def withheld_truth(
 ) -> tuple[Trajectory, Array]:
     """The fixes withheld in `spans` (s from the start; None: all) as the truth of those spans, with their lever arm.
 
-    A withheld fix is met as a used one is: at its stamp on the IMU's clock, with the lever arm that was estimated.
+    A withheld fix is treated like a used one: at its stamp on the IMU's clock, with the estimated lever arm.
 
     Parameters
     ----------
     recording
-        The full one, before `Recording.without`. The fixes' own sigmas go with them, so that the NEES knows that the
-        truth is not exact.
+        The full recording, before `Recording.without`. The sigmas of the fixes are included, so that the NEES
+        accounts for the error of this truth.
     source
-        Whose measurements; only "gnss" has positions.
+        The withheld sensor; only "gnss" has positions.
     spans
         s from the recording's start, on the receiver's clock.
     antenna
-        What the solution to be compared estimated of the antenna.
+        The antenna as estimated by the solution to be compared.
 
     Returns
     -------
@@ -156,28 +156,28 @@ def evaluate_recording(
     Parameters
     ----------
     trajectory
-        Of the IMU.
+        The trajectory of the IMU.
     recording
-        The full one, nothing withheld.
+        The full recording, with nothing withheld.
     withheld
         (source, span in s from the start or None) as given to `Recording.without`; each span of GNSS is scored by
         itself.
     max_gap
-        s, between neighbouring rows that are interpolated.
+        s, longest gap between rows that is interpolated.
     at
-        (N,) s, epochs to compare at; those of the sparser of both when None.
+        (N,) s, epochs to compare at; those of the sparser trajectory when None.
     antenna
-        What the solution estimated of the antenna, for withheld fixes.
+        The antenna as estimated by the solution, for withheld fixes.
 
     Returns
     -------
     Metrics or None
-        None where there is nothing to compare with.
+        None if there is no truth.
 
     Raises
     ------
     RecordingError
-        If the two share no epoch.
+        If trajectory and truth have no common epoch.
     """
     gnss_spans = [span for source, span in withheld if source == "gnss"]
     spans = [span for span in gnss_spans if span is not None]
@@ -219,19 +219,19 @@ def evaluate(
     lever_arm
         (3,) m from the estimate's point to the truth's, right, forward, up; that of the recording when None.
     spans
-        s on the files' clock, each scored by itself.
+        s on the files' clock, each scored separately.
     max_gap
-        s, between neighbouring rows that are interpolated.
+        s, longest gap between rows that is interpolated.
 
     Returns
     -------
     Metrics
-        Errors in the local east, north and up at the epochs of the sparser of both.
+        Errors in the local east, north and up at the epochs of the sparser file.
 
     Raises
     ------
     RecordingError
-        If a file cannot be read, or the two share no time; it then says by how much they may be shifted.
+        If a file cannot be read, or the two have no time in common; the message then states a possible shift.
     """
     trajectory_path, truth_path = Path(trajectory_path), Path(truth_path)
     trajectory = read_trajectory(trajectory_path)

@@ -43,7 +43,7 @@ class ImuSample(_Row):
     Raises
     ------
     RecordingError
-        If something has another length, or a size that no sensor reads, as of degrees or g.
+        If a value has the wrong length or an impossible magnitude, as one in deg/s or g.
     """
 
     __slots__ = ()
@@ -63,7 +63,7 @@ class Fix(_Row):
     Raises
     ------
     RecordingError
-        If something has another length, or a size that cannot be.
+        If a value has the wrong length or an impossible magnitude.
     """
 
     __slots__ = ()
@@ -103,7 +103,7 @@ class WheelSpeed(_Row):
     Raises
     ------
     RecordingError
-        If it is no number, or one that no vehicle reaches.
+        If it is not a number, or a speed that no vehicle reaches.
     """
 
     __slots__ = ()
@@ -123,7 +123,7 @@ class Reading(_Row):
     Raises
     ------
     RecordingError
-        If the sensor has no such column, one that it needs is missing, or a value lies beyond its bounds.
+        If the sensor has no such column, a needed column is missing, or a value is outside its bounds.
     """
 
     __slots__ = ()
@@ -159,8 +159,8 @@ def live_setup(
     antenna, axle : (3,) m from the IMU to the antenna and to the point that does not slip, right, forward, up; None
         where there is no GNSS, no odometer.
     platform : "vehicle" or "foot".
-    name : of the recording.
-    sensors : others that there are, without rows: ``SENSOR.series([], {}, sigma=0.3)``.
+    name : name of the recording.
+    sensors : other sensors, without rows: ``SENSOR.series([], {}, sigma=0.3)``.
 
     Returns
     -------

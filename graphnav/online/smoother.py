@@ -52,7 +52,7 @@ class Smoother:
     Parameters
     ----------
     setup : a recording without rows (`graphnav.online.without_rows`): platform, noise figures, lever arms.
-    settings : as for a recording; `solver.lag` says how much future a settled state has seen.
+    settings : as for a recording; `solver.lag` is the span of later measurements that a settled state includes.
     """
 
     def __init__(self, setup: Recording, settings: Settings | None = None) -> None:

@@ -22,8 +22,8 @@ class Online(Smoother):
     Parameters
     ----------
     setup : a recording without rows (`graphnav.online.without_rows`): platform, noise figures, lever arms.
-    settings : as for a recording; `solver.lag` says how much future a settled state has seen.
-    engine : "window" or "isam2", what smooths; `solver.engine` of the settings when None.
+    settings : as for a recording; `solver.lag` is the span of later measurements that a settled state includes.
+    engine : the smoother, "window" or "isam2"; `solver.engine` of the settings when None.
     """
 
     def __init__(self, setup: Recording, settings: Settings | None = None, engine: str | None = None) -> None:

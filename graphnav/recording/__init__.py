@@ -84,14 +84,14 @@ def fix_types(types: Array, numbers: dict[int, int] | None = None) -> NDArray[np
     Parameters
     ----------
     types
-        (N,) what a log says, NaN where it is blank.
+        (N,) numbers in the log, NaN where blank.
     numbers
-        The log's own numbers -> those of `FIX_TYPES`; these when None.
+        Map of the log's numbers to those of `FIX_TYPES`; None if they are the same.
 
     Returns
     -------
     array of int or None
-        (N,), 0 where a number is blank or means no type; None if no fix says its type.
+        (N,), 0 where a number is blank or not a type; None if no fix states its type.
     """
     numbers = {k: k for k in FIX_TYPES} if numbers is None else numbers
     found = np.zeros(len(types), dtype=np.intp)
@@ -199,7 +199,7 @@ class Recording:
         Returns
         -------
         Recording
-            The same without those rows; without the sensor where `span` is None.
+            Without those rows; without the sensor where `span` is None.
 
         Raises
         ------
@@ -235,12 +235,12 @@ class Recording:
         Parameters
         ----------
         start, end
-            s from the start of the recording; to its ends when None.
+            s from the start of the recording; its own start or end when None.
 
         Returns
         -------
         Recording
-            With the rows between; a loop's truth is left out, as a part of a loop is none.
+            The rows between; the truth of a closed loop is dropped, as a part is not closed.
 
         Raises
         ------
@@ -291,12 +291,12 @@ def take_rows(sensor: Any, mask: NDArray[np.bool_] | slice) -> Any:
     sensor
         An `Imu`, `Gnss`, `Odometer` or the like.
     mask
-        (N,) bool, which rows; or a slice, and its arrays are views.
+        (N,) bool, or a slice, for which the arrays are views.
 
     Returns
     -------
     The same kind of sensor
-        All its arrays by row cut; lever arms and axes as they are.
+        With all arrays by row selected; lever arms and axes are unchanged.
     """
     parts = {
         key: value[mask]

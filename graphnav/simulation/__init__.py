@@ -39,21 +39,21 @@ def simulate(name: str, seed: int = 0, **options: Any) -> Simulated:
     Parameters
     ----------
     name
-        Of the scenario: `graphnav simulate --list`.
+        Name of the scenario; `graphnav simulate --list` lists them.
     seed
-        Of all random numbers.
+        Seed of all random numbers.
     options
         The scenario's own.
 
     Returns
     -------
     Simulated
-        The recording, the truth at every sample, the stops and what was put in.
+        The recording, the truth at every sample, the stops and the parameters of the simulation.
 
     Raises
     ------
     ConfigError
-        For an unknown scenario or option, or an option's impossible value.
+        For an unknown scenario or option, or an invalid value of an option.
     """
     one = scenario(name)
     known = defaults(one)

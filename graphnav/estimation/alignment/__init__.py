@@ -42,8 +42,8 @@ def align(
 
     Parameters
     ----------
-    smooth : solves a posed problem from start states; handed in because solvers stand behind this room.
-    stationary : (N, 2) s, intervals in which a vehicle stands, where fixes that jump are no motion; a foot's stances.
+    smooth : function that solves a problem from initial states; passed in because solvers import this package.
+    stationary : (N, 2) s, intervals in which a vehicle stands, where jumps of fixes are not motion; for a foot its stances.
 
     Raises
     ------

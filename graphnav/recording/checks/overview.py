@@ -122,8 +122,8 @@ def inspect(recording: Recording) -> Inspection:
     Returns
     -------
     Inspection
-        Facts by sensor, the recording without what cannot be right, and findings: the gravest first, then in the
-        order of the checks, the loader's remarks first.
+        Facts by sensor, the recording without impossible rows, and findings: the most severe first, then in the
+        order of the checks, beginning with the loader's remarks.
     """
     whole = screen(recording)
     recording = whole.recording

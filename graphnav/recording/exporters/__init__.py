@@ -33,8 +33,8 @@ def write_all(blocks: Trajectory | Iterable[Trajectory], folder: Path, name: str
 
     Parameters
     ----------
-    blocks : a trajectory, or its parts one behind the other: only one of them need be in memory.
-    name : that the files say; the trajectory's own if None.
+    blocks : a trajectory, or its successive parts, only one of which need be in memory.
+    name : name in the files; the trajectory's own if None.
 
     Raises
     ------
@@ -58,7 +58,7 @@ def write_parts(
 
     Parameters
     ----------
-    utc : of times of the trajectory, where the clock is known.
+    utc : function that converts times of the trajectory to UTC, where the clock is known.
 
     Raises
     ------
@@ -95,7 +95,7 @@ def check_names(names: Sequence[str], gps_zero: float | None) -> None:
     Raises
     ------
     RecordingError
-        Saying what is missing.
+        If a format needs what the recording does not have.
     """
     if "nmea" in names and gps_zero is None:
         raise RecordingError(
@@ -114,11 +114,11 @@ def write_as(name: str, trajectory: Trajectory, path: Path, utc: Array | None = 
     Parameters
     ----------
     name
-        Of the format.
+        Name of the format.
     trajectory
-        What to write.
+        The trajectory.
     path
-        The file, replaced if it is there.
+        The file, replaced if it exists.
     utc
         (K,) datetime64, where the clock is known.
 

@@ -37,11 +37,11 @@ def read(
     source
         A path, or a built-in name such as ``kitti``. A folder of that name is ``./kitti``.
     topics
-        Of a ROS bag: those to use, each for the sensor that its type is of; the others are found.
+        For a ROS bag: topics to use, each for the sensor of its type; the others are chosen automatically.
     allow_outside
-        Whether files that are named in it may lie outside its folder.
+        Whether files named in it may lie outside its folder.
     name
-        The format to read it as; found from the content if None.
+        The format; recognised from the content if None.
 
     Returns
     -------
@@ -51,8 +51,7 @@ def read(
     Raises
     ------
     RecordingError
-        If nothing is there, if nothing knows how to read it, or if what is there cannot be used; for a name that no
-        format has.
+        If the source does not exist, is of unknown format, or cannot be used, or if there is no format of that name.
     """
     chosen = _format_of(source, name)
     with permit_outside(allow_outside):
@@ -67,14 +66,14 @@ def load(source: str | Path, name: str | None = None, topics: Sequence[str] = ()
     source
         A path, or a built-in name.
     name
-        The format to read it as; found from the content if None.
+        The format; recognised from the content if None.
     topics
         As for `read`.
 
     Returns
     -------
     Log
-        The sensors that are there, in SI units and body axes right-forward-up; None for the others.
+        The sensors in it, in SI units and body axes right-forward-up; None for the others.
 
     Raises
     ------

@@ -60,7 +60,7 @@ def read_trajectory(path: str | Path) -> Trajectory:
     Raises
     ------
     RecordingError
-        Naming the file, and the line and field where there is one, if it cannot be read as it is.
+        If it cannot be read; the message names the file and, if there is one, the line and field.
     """
     path = Path(path)
     lines = text_lines(path)

@@ -39,7 +39,7 @@ def count_expected(excess: Array, others: Array, resolution: float) -> Array:
     ----------
     excess : (M,) above zero.
     others : (M, TAIL + 1) the next smaller ones of each, the largest first.
-    resolution : in which they are told, in their unit: less than half of it says nothing of how they fall off.
+    resolution : of the readings, in their unit: differences below half of it carry no information on the tail.
 
     Returns
     -------

@@ -87,7 +87,7 @@ def screen_recording(recording: Recording) -> tuple[Recording, list[str]]:
     recording : Recording
         Without rows that no sensor can have read.
     notes : list of str
-        A sentence with a key for everything found.
+        A sentence with a key for each finding.
 
     Raises
     ------
