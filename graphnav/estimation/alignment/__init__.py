@@ -42,8 +42,9 @@ def align(
 
     Parameters
     ----------
-    smooth : function that solves a problem from initial states; passed in because solvers import this package.
-    stationary : (N, 2) s, intervals in which a vehicle stands, where jumps of fixes are not motion; for a foot its stances.
+    smooth : function that solves a problem from initial states; solvers import this package.
+    stationary : (N, 2) s, intervals in which a vehicle stands, where jumps of fixes are
+        not motion; of a foot, its stances.
 
     Raises
     ------
