@@ -8,6 +8,9 @@ BIN := $(VENV)/bin
 # the matrices are small: threads would only wait for each other
 export OPENBLAS_NUM_THREADS := 1
 
+# machine code of the filter and the smoother, kept on disk
+COMPILE := $(BIN)/python -c "from graphnav import load, run; run(load('data/tokyo').crop(0.0, 60.0))"
+
 .PHONY: demo test check suite docs clean
 
 demo: $(VENV)/installed
@@ -16,7 +19,9 @@ demo: $(VENV)/installed
 # with `make -j2` side by side: mypy has the core that the suite's last tests leave idle
 test: check suite
 
+# compiled before, or every worker would compile the same
 suite: $(VENV)/installed-dev
+	@$(COMPILE)
 	$(BIN)/pytest -n $(JOBS) --dist worksteal
 
 check: $(VENV)/installed-dev
@@ -34,7 +39,7 @@ $(VENV)/installed: pyproject.toml
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet -e '.[fast,plots]'
 	@echo "compiling the filter and the smoother, once"
-	@$(BIN)/python -c "from graphnav import load, run; run(load('data/tokyo').crop(0.0, 60.0))"
+	@$(COMPILE)
 	@touch $@
 
 $(VENV)/installed-dev: pyproject.toml

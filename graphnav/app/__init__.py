@@ -1,1 +1,1 @@
-"""The program: commands, what they print, and what they leave on disk."""
+"""The program: its commands, what they print, and what they write."""

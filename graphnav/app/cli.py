@@ -1,6 +1,6 @@
-"""The program `graphnav`. Commands read their options here; `workflow` and `outputs` beside it do the work.
+"""The program `graphnav`. Commands parse their options here; `workflow` and `outputs` do the work.
 
-Nothing heavy is imported before a command runs, so that help comes at once.
+Nothing heavy is imported before a command runs, so that help appears at once.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ from graphnav.core.progress import tell
 
 __all__ = ["DEBUG", "PIPE_CLOSED", "app", "main", "run"]
 
-# Before NumPy is imported: see `graphnav.estimation.pipeline`, which limits threads for those who do not come this way.
+# before NumPy is imported; `graphnav.estimation.pipeline` limits threads for all other callers
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 # Before the settings are: looking through all that is installed for plugins of Pydantic takes as long as they do.
 os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
@@ -250,12 +250,12 @@ app.add_typer(cli_fleet.commands)
 
 
 def main() -> None:
-    """Run the program and leave with its exit code: 0, or 2 for bad input or usage with one line that says why."""
+    """Run the program and exit: 0, or 2 for bad input or usage with one line that states the reason."""
     sys.exit(run(sys.argv[1:]))
 
 
 def run(arguments: list[str]) -> int:
-    """Run the program on `arguments`; returns the exit code and lets no traceback through."""
+    """Run the program on `arguments`; returns the exit code and raises nothing."""
     debug = bool(os.environ.get(DEBUG))
     if not debug:
         import warnings
@@ -268,16 +268,16 @@ def run(arguments: list[str]) -> int:
     except Interrupted as error:
         return fail(str(error), INTERRUPTED, False)
     except (KeyboardInterrupt, typer.Abort) as error:
-        if isinstance(error.__cause__, EOFError):  # of which typer thinks that somebody has typed it
+        if isinstance(error.__cause__, EOFError):  # which typer takes for an abort by the user
             return fail(_internal(error.__cause__), INTERNAL, debug)
         code = INTERRUPTED
     except MemoryError:
         return fail("out of memory; use a shorter part (--start, --end)", INTERNAL, debug)
     except OSError as error:
-        # files are read and written by modules that turn what they expect into sentences; this is a full disk or so
+        # modules turn the errors they expect into sentences; this is a full disk or similar
         return fail(f"{error.filename or 'input or output'}: {error.strerror or error}", BAD_INPUT, debug)
     except Exception as error:
-        if hasattr(error, "format_message"):  # typer's own: a usage error
+        if hasattr(error, "format_message"):  # typer's own usage errors
             return fail(_usage(error), BAD_INPUT, debug)
         return fail(_internal(error), INTERNAL, debug)
     if code == INTERRUPTED:
@@ -297,7 +297,7 @@ def _usage(error: Any) -> str:
 
 
 def _internal(error: Exception) -> str:
-    """The error and the last line of graphnav that led to it."""
+    """An internal error, with the last line of graphnav that led to it."""
     frames = traceback.extract_tb(error.__traceback__)
     package = Path(__file__).parents[1]
     at = ([frame for frame in frames if package in Path(frame.filename).parents] or list(frames))[-1]

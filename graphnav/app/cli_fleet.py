@@ -1,4 +1,4 @@
-"""The command `fleet`: many recordings at once. `graphnav.app.cli` has the others."""
+"""The command `fleet`: many recordings at once. `graphnav.app.cli` has the other commands."""
 
 from __future__ import annotations
 
@@ -145,7 +145,7 @@ def fleet(
 
 
 def _count_processors() -> int:
-    """Those that this process may use, where the system says so."""
+    """Number of processors that this process may use, where the system states it."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
@@ -154,7 +154,7 @@ def _resolve_noise(noise: str) -> str:
 
 
 def _describe(row: dict[str, Any]) -> str:
-    """One line on a drive."""
+    """One line about a drive."""
     if row["status"] != "done":
         return f"{row['status']}: {row.get('error')}"
     return f"{row.get('verdict')}, {row['time_s']:.1f} s" + (", done before" if row.get("skipped") else "")

@@ -107,7 +107,7 @@ def allan(
     from graphnav.app.outputs import output_folder
     from graphnav.core.errors import RecordingError
     from graphnav.core.staging import final_path, stage_results
-    from graphnav.recording.allan import allan_of
+    from graphnav.recording.allan import compute_allan
     from graphnav.recording.draft import read_imu_in_si
     from graphnav.recording.formats import load
     from graphnav.report import allan as pages
@@ -131,7 +131,7 @@ def allan(
             )
         tell("variances")
         try:
-            result = allan_of(t[part_asked], gyro[part_asked], accel[part_asked])
+            result = compute_allan(t[part_asked], gyro[part_asked], accel[part_asked])
         except RecordingError as error:
             raise RecordingError(f"{log}: {error}", key=error.key) from None
         tell("writing")

@@ -1,6 +1,6 @@
-"""The command `online`: smooth while the drive happens, a recording replayed or a live source of lines.
+"""The command `online`: smooth during the drive, from a replayed recording or a live source of lines.
 
-What has settled is on disk at once. Ctrl-C, a crash or a full disk lose none of it; --resume goes on from there.
+Settled states are on disk at once. Ctrl-C, a crash or a full disk lose none of them; --resume continues.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from graphnav.recording import Recording
 
 LONGEST = 1 << 20  # bytes of a line
-TICK = 0.5  # s between views, and of waiting for a source
+TICK = 0.5  # s between updates of the view, and of each wait for a source
 
 commands = typer.Typer()
 
@@ -85,7 +85,7 @@ def online(
     live = source == "-" or source.startswith("tcp:")
     recording = None if live else read(source, topic or (), allow_outside, format)
     session = Session(settings, source, folder, resume, recording)
-    shown = Shown(session, quiet)
+    shown = LiveView(session, quiet)
     with StopRequest() as asked:
         try:
             if live:
@@ -105,7 +105,7 @@ def online(
 
 
 def _override(settings: Settings, lag: float | None, engine: str | None) -> Settings:
-    """The settings with what was typed in the place of theirs."""
+    """The settings, overridden by the options given."""
     from graphnav.config import settings_from
 
     if lag is not None and not lag >= 1.0:
@@ -126,18 +126,20 @@ def _send(recording: Recording, speed: float) -> None:
         say(line, flush=speed > 0 or line == END)
 
 
-def replay(session: Session, pace: Pace, shown: Shown, asked: StopRequest) -> None:
-    """Take in the rows of a recording when they are due."""
+def replay(session: Session, pace: Pace, shown: LiveView, asked: StopRequest) -> None:
+    """Process the rows of a recording as they become due."""
     for row in session.rows[session.taken :]:
         pace.wait(row[1], shown.update, asked)
         if asked:
             return
         session.add(row)
-        shown.now_and_then()
+        shown.update_if_due()
 
 
 class StopRequest:
-    """Whether Ctrl-C or a SIGTERM asked to end: between two rows, where the smoother is whole."""
+    """Whether Ctrl-C or a SIGTERM requested an end; checked between two rows, where the smoother's state is
+    consistent.
+    """
 
     def __init__(self) -> None:
         self.so = False
@@ -156,21 +158,21 @@ class StopRequest:
 
     def _ask(self, _: int, frame: FrameType | None) -> None:
         if self.so:
-            raise KeyboardInterrupt  # asked twice: at once, from the checkpoint on disk
+            raise KeyboardInterrupt  # requested twice: ends at once, --resume continues from the checkpoint on disk
         self.so = True
 
 
-def follow(session: Session, chunks: Iterator[bytes], shown: Shown, asked: StopRequest) -> None:
-    """Take in lines until the source ends or says so; b"" means that nothing came for a while."""
+def follow(session: Session, chunks: Iterator[bytes], shown: LiveView, asked: StopRequest) -> None:
+    """Process lines until the source ends or an end is requested; b"" means that nothing arrived for a while."""
     rest, heard = b"", time.monotonic()
     for chunk in chunks:
         if chunk:
             *whole, rest = (rest + chunk).split(b"\n")
-            rest = rest[:LONGEST]  # what never ends is no row, and told as such when it does
+            rest = rest[:LONGEST]  # a line without an end is no row, and is reported as one when it does end
             whole = [line[:LONGEST] for line in whole]
             session.add_lines([line.decode("utf-8", "replace") for line in whole], asked.__bool__)
             heard = time.monotonic()
-        shown.now_and_then(time.monotonic() - heard)
+        shown.update_if_due(time.monotonic() - heard)
         if session.done or asked:
             return
 
@@ -187,7 +189,7 @@ def standard_input() -> Iterator[bytes]:
 
 
 def connections(source: str) -> Iterator[bytes]:
-    """What clients send, one after the other; a client that leaves may come back."""
+    """The lines of clients, one client after the other; a client that disconnects may reconnect."""
     try:
         server = socket.create_server(("127.0.0.1", int(source.removeprefix("tcp:"))))
     except (ValueError, OSError) as error:
@@ -208,13 +210,13 @@ def connections(source: str) -> Iterator[bytes]:
                     except OSError:
                         chunk = b""
                     if not chunk:
-                        yield b"\n"  # a line torn off is none
+                        yield b"\n"  # an incomplete line is dropped
                         break
                     yield chunk
 
 
 class Pace:
-    """Waits until a row is due at so many times real time."""
+    """Waits until a row is due at a multiple of real time."""
 
     def __init__(self, speed: float) -> None:
         self.speed, self.began, self.first = speed, time.monotonic(), float("nan")
@@ -232,8 +234,8 @@ class Pace:
                 meanwhile()
 
 
-class Shown:
-    """The live view: a table that stays in place on a terminal, else a line now and then."""
+class LiveView:
+    """The live view: a table that stays in place on a terminal, otherwise a line from time to time."""
 
     def __init__(self, session: Session, quiet: bool) -> None:
         self.session, self.quiet, self.next = session, quiet, 0.0
@@ -244,7 +246,7 @@ class Shown:
             self.live = Live(auto_refresh=False)
             self.live.start()
 
-    def now_and_then(self, silent: float = 0.0) -> None:
+    def update_if_due(self, silent: float = 0.0) -> None:
         if not self.quiet and time.monotonic() >= self.next:
             self.update(silent)
 

@@ -18,7 +18,7 @@ Source = Annotated[
         metavar="RECORDING", help="A folder with recording.toml, a .toml, a known log, or kitti (in the gtsam package)."
     ),
 ]
-SEVERAL = {"allow_extra_args": True}  # of which `only` has more to say than the parser
+SEVERAL = {"allow_extra_args": True}  # `pick_one` reports it more clearly than the parser
 Format = Annotated[
     str | None, typer.Option("--format", metavar="NAME", help="Format of the log, where it is not recognised.")
 ]
@@ -106,7 +106,7 @@ AllowOutside = Annotated[
 
 
 def pick_one(context: typer.Context, recording: str) -> str:
-    """The one recording that is asked for.
+    """The one recording requested.
 
     Raises
     ------
@@ -123,7 +123,7 @@ def pick_one(context: typer.Context, recording: str) -> str:
 
 
 def collect_withheld(without: list[str] | None, start: float | None, end: float | None) -> tuple[Any, ...]:
-    """What is withheld; the span asked for must not be empty."""
+    """What is withheld; the requested span must not be empty."""
     from graphnav.app import workflow
 
     if start is not None and end is not None and not start < end:
@@ -132,7 +132,7 @@ def collect_withheld(without: list[str] | None, start: float | None, end: float 
 
 
 def choose_detectors(settings: Settings, names: str | None) -> Settings:
-    """The settings with the detectors of --detectors; as they are without.
+    """The settings with the detectors of --detectors, unchanged without that option.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Commands that solve, or draw what was solved: `smooth`, `compare`, `report`. `graphnav.app.cli` has the others."""
+"""Commands that solve, or draw a stored solution: `smooth`, `compare`, `report`. `graphnav.app.cli` has the others."""
 
 from __future__ import annotations
 
@@ -207,7 +207,7 @@ class _Options:
 
 @dataclass(frozen=True)
 class _Beside:
-    """Trajectory files to put beside the solutions, of which point they are, and what to add to their stamps."""
+    """Other programs' trajectories to compare with: files, their point on the body, and s to add to their stamps."""
 
     files: list[Path]
     points: list[str]
@@ -274,7 +274,7 @@ def _solve(
         files = final_path(files, part, folder)
         if not asked.pages:
             outputs.remove_pages(folder, () if alone else names)
-        if exported:  # by itself, so that one that fails takes nothing with it
+        if exported:  # in its own right, so that a failing file does not prevent the others
             with stage_results(folder) as part:
                 more = convert.export_run(outcome, part, exported, point, alone)
             files += final_path(more, part, folder)

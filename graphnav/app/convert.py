@@ -1,4 +1,4 @@
-"""Logs of other programs into a recording folder, and trajectories into other programs' files."""
+"""Conversion of other programs' logs into a recording folder, and of trajectories into other formats."""
 
 from __future__ import annotations
 
@@ -28,21 +28,21 @@ from graphnav.recording.formats.trajectories import read_trajectory
 from graphnav.recording.formats.writer import write_recording
 
 _TRAJECTORY = "trajectory.csv"
-SUMMARY = "summary.json"  # of the run that wrote a trajectory: its clock and its points
-_DENSE = 20.0  # Hz
-_ROWS = 4096  # of these, handled at once
-_BESIDE = 8  # rows beside those that the rates and velocities of a part are taken from
+SUMMARY = "summary.json"  # of the run that wrote a trajectory: has its clock and its points
+_DENSE_RATE = 20.0  # Hz
+_ROWS_AT_ONCE = 4096  # rows processed at once
+_CONTEXT_ROWS = 8  # rows on either side from which rates and velocities of a part are computed
 _MOST_ROWS = 2e7
-_MAX_GAP = 3.0  # s; wider gaps of a trajectory are not filled
+_MAX_GAP = 3.0  # s; wider gaps of a trajectory are not interpolated
 
 
 def is_export(source: Path, out: Path) -> bool:
-    """Whether a trajectory is to be written for another program, rather than a log to be read."""
+    """Whether a trajectory is to be exported, rather than a log read."""
     return out.suffix[1:] in NAMES and not out.is_dir() and not source.is_dir()
 
 
 def check_rate(rate: float | None) -> None:
-    """Refuse an output rate (Hz) that makes no sense.
+    """Refuse an invalid output rate (Hz).
 
     Raises
     ------
@@ -54,7 +54,7 @@ def check_rate(rate: float | None) -> None:
 
 
 def convert_log(source: str, out: Path, name: str | None, topics: Sequence[str] = ()) -> tuple[Log, list[Path]]:
-    """Read a log of any kind that is known and write it as a recording folder.
+    """Read a log of any known kind and write it as a recording folder.
 
     Raises
     ------
@@ -72,7 +72,7 @@ def convert_log(source: str, out: Path, name: str | None, topics: Sequence[str] 
 
 
 def _with_measured_noise(log: Log) -> Log:
-    """The log with the densities that its IMU shows, where it states no figures."""
+    """The log with the noise densities measured from its IMU, where it states none."""
     imu = log.imu
     if imu is None or not imu.noise_assumed:
         return log
@@ -95,7 +95,7 @@ def _with_measured_noise(log: Log) -> Log:
 
 
 def parse_point(text: str | None, option: str = "--point") -> str | Array:
-    """``imu``, ``antenna``, or a lever arm ``x,y,z`` (m; right, forward, up of the IMU).
+    """Parse ``imu``, ``antenna``, or a lever arm ``x,y,z`` (m; right, forward, up of the IMU).
 
     Raises
     ------
@@ -119,9 +119,9 @@ def parse_point(text: str | None, option: str = "--point") -> str | Array:
 def export_file(
     source: str, out: Path, name: str | None, point: str | None, rate: float | None, clock: str | None
 ) -> tuple[list[Path], list[str]]:
-    """Write a trajectory for other programs: into the file `out`, or into the folder `out` under its own name.
+    """Write a trajectory for other programs: to the file `out`, or into the folder `out` under its own name.
 
-    It is a file, or the folder of a run.
+    The source is a file, or the folder of a run.
 
     Returns
     -------
@@ -170,7 +170,7 @@ def export_file(
 
 
 def _trajectory_file(source: str) -> Path:
-    """The trajectory that is meant: the file itself, or that of a run's folder."""
+    """The trajectory file: the source itself, or the one in a run's folder."""
     path = Path(source)
     if (path / _TRAJECTORY).is_file():
         return path / _TRAJECTORY
@@ -211,10 +211,11 @@ def _interpolate_parts(trajectory: Trajectory, arm: Array | None, rate: float | 
     t = trajectory.t
     wanted = t if rate is None else np.arange(np.ceil(t[0] * rate - 1e-6), np.floor(t[-1] * rate + 1e-6) + 1) / rate
     found = 0
-    for k in range(0, len(wanted), _ROWS):
-        part = wanted[k : k + _ROWS]
+    for k in range(0, len(wanted), _ROWS_AT_ONCE):
+        part = wanted[k : k + _ROWS_AT_ONCE]
         around = slice(
-            max(np.searchsorted(t, part[0]) - _BESIDE, 0), np.searchsorted(t, part[-1], side="right") + _BESIDE
+            max(np.searchsorted(t, part[0]) - _CONTEXT_ROWS, 0),
+            np.searchsorted(t, part[-1], side="right") + _CONTEXT_ROWS,
         )
         moved, _ = interpolate(trajectory.take(around), part, max_gap=_MAX_GAP, lever_arm=arm)
         found += len(moved)
@@ -229,7 +230,7 @@ def export_run(
 ) -> list[Path]:
     """Write the solutions of a run in some formats, in files named after the point: trajectory.gpx, antenna.gpx.
 
-    One that is `alone` lies in `folder`, else each in a folder of its name in it.
+    A single solution (`alone`) is written into `folder`, otherwise each into a folder of its name in it.
 
     Raises
     ------
@@ -258,12 +259,12 @@ def export_run(
 
 def _of_point(solution: Solution, rate: float | None, arm: Array) -> Iterator[Trajectory]:
     """The trajectory of the point at the end of a lever arm, in parts."""
-    # between keyframes a second apart the turn rate, and with it the point's velocity, would be guessed
-    dense = max(rate or 0.0, _DENSE)
+    # between keyframes a second apart the turn rate, and with it the point's velocity, would be uncertain
+    dense = max(rate or 0.0, _DENSE_RATE)
     there = [piece.times(dense) for piece in solution.between]
     wanted = solution.t if rate is None else np.concatenate([piece.times(rate) for piece in solution.between])
-    for t in np.split(wanted, np.flatnonzero(np.diff(np.floor(wanted * (dense / _ROWS)))) + 1):
-        # a row on each side for the place, two for the turn rate, and one to spare
+    for t in np.split(wanted, np.flatnonzero(np.diff(np.floor(wanted * (dense / _ROWS_AT_ONCE)))) + 1):
+        # one row on each side for the position, two for the turn rate, and one to spare
         around = [
             times[max(np.searchsorted(times, t[0]) - 3, 0) : np.searchsorted(times, t[-1], side="right") + 3]
             for times in there
@@ -280,7 +281,7 @@ def _write(blocks: Iterable[Trajectory], targets: dict[str, Path], gps_zero: flo
 
 
 def _run(source: Path) -> dict[str, Any]:
-    """What the summary beside a trajectory says of its points and its clock."""
+    """The summary beside a trajectory, which states its points and its clock."""
     path = source.parent / SUMMARY
     try:
         values = parse_json(read_text(path))
@@ -290,14 +291,14 @@ def _run(source: Path) -> dict[str, Any]:
 
 
 def log_values(log: Log) -> dict[str, Any]:
-    """What was read and what was assumed, for JSON."""
+    """The converted log for JSON: what was read and what was assumed."""
     sensors = {name: getattr(log, name) for name in ("imu", "gnss", "odometer", "truth")}
     rows = {name: len(sensor.t) for name, sensor in {**sensors, **log.sensors}.items() if sensor is not None}
     return {"name": log.name, "platform": log.platform, "rows": rows, "assumed": log.remarks}
 
 
 def log_text(log: Log, files: Sequence[Path]) -> str:
-    """What was read, what was assumed, and what was written."""
+    """The converted log for people: what was read, what was assumed, and what was written."""
     held = []
     sensors = {"IMU": log.imu, "GNSS": log.gnss, "odometer": log.odometer, **log.sensors, "truth": log.truth}
     for label, sensor in sensors.items():

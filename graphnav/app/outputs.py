@@ -1,4 +1,4 @@
-"""What a run leaves on disk: trajectories, calibration, summary and report per solver, and the comparison."""
+"""Files of a run: trajectories, calibration, summary and report per solver, and the comparison."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ FILES = (
 
 
 def output_folder(path: str | Path, files: Sequence[str] = (), folders: Sequence[str] = ()) -> Path:
-    """`path`, sure to be a folder that can be written to or made; it is not made yet.
+    """`path`, checked to be a folder that can be created or written to; it is not created yet.
 
     Parameters
     ----------
@@ -58,7 +58,7 @@ def output_folder(path: str | Path, files: Sequence[str] = (), folders: Sequence
         raise ConfigError(f"-o {folder}: {what}", key="output.cannot_write")
     if not os.access(there, os.W_OK | os.X_OK):
         raise ConfigError(f"-o {folder}: no permission to write into {there}", key="output.cannot_write")
-    try:  # a file system that cannot be written to, a name that is too long or none: by trying
+    try:  # a read-only file system, a name that is too long or invalid: found by trying
         (folder / max(FILES, key=len)).resolve().exists()
         os.rmdir(tempfile.mkdtemp(prefix=".graphnav-", dir=there))
     except (OSError, ValueError) as error:
@@ -82,7 +82,7 @@ def output_folder(path: str | Path, files: Sequence[str] = (), folders: Sequence
 
 
 def write_run(outcome: Outcome, folder: Path, pages: bool = True) -> list[Path]:
-    """Everything of the only solver of a run, straight into `folder`; returns the files to look at first.
+    """Write all files of a run with a single solver into `folder`; returns the files to look at first.
 
     Without `pages` none is drawn; `draw_again` can do that later.
     """
@@ -96,7 +96,9 @@ def write_run(outcome: Outcome, folder: Path, pages: bool = True) -> list[Path]:
 
 
 def write_comparison(outcome: Outcome, folder: Path, pages: bool = True) -> list[Path]:
-    """Everything per solver under its own name, and the table and page that compare them; `pages` as in `write_run`."""
+    """Write all files of each solver under its name, and the table and page that compare them; `pages` as in
+    `write_run`.
+    """
     from graphnav.evaluation.metrics import write_comparison_csv
 
     provenance = gather_provenance(outcome)
@@ -117,13 +119,13 @@ def write_comparison(outcome: Outcome, folder: Path, pages: bool = True) -> list
 
 
 def remove_pages(folder: Path, solvers: Sequence[str] = ()) -> None:
-    """Take away the pages of a run before, of which the results have been replaced without new ones."""
+    """Remove the pages of an earlier run whose results have been replaced without new pages."""
     for page in ("comparison.html", "report.html", *(f"{name}/report.html" for name in solvers)):
         (folder / page).unlink(missing_ok=True)
 
 
 def draw_again(folder: Path, part: Path) -> list[Path]:
-    """The pages of a run that was written into `folder`, drawn again into `part` without solving.
+    """Draw the pages of a run stored in `folder` into `part`, without solving.
 
     Raises
     ------
@@ -132,7 +134,7 @@ def draw_again(folder: Path, part: Path) -> list[Path]:
     """
     outcome, provenance = stored.read_outcome(folder / stored.NAME)
     try:
-        return _draw_pages(outcome, provenance, part, outcome.alone)  # the folder may hold a comparison of before
+        return _draw_pages(outcome, provenance, part, outcome.alone)  # the folder may contain an earlier comparison
     except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
         raise ConfigError(
             f"{folder / stored.NAME}: its parts do not fit together ({type(error).__name__}: {error}); solve again",
@@ -183,7 +185,7 @@ def write_solver(
     detectors: Sequence[Markup] | None = None,
     pages: bool = True,
 ) -> dict[Path, str]:
-    """The files of one solver; a folder that holds older ones keeps none of them under the same names.
+    """Write the files of one solver; older files of the same names are removed.
 
     Returns
     -------
@@ -235,7 +237,7 @@ def _draw_solver(
 
 
 def _attempt(write: Callable[[Path], object], path: Path) -> dict[Path, str]:
-    """Write a file; what went wrong, if anything did, and then no file."""
+    """Write a file; returns the reason if that fails, and then leaves no file."""
     try:
         write(path)
     except Exception as error:
@@ -266,7 +268,7 @@ def write_evaluation(folder: Path, values: Mapping[str, Any], metrics: Metrics) 
 
 
 def _calibration(p: ParameterEstimate) -> dict[str, Any]:
-    """A constant as its value, a slow parameter as its nodes."""
+    """A constant as its value, a time-varying parameter as its nodes."""
     nodes = slice(None) if len(p.t) > 1 else 0
     return {
         "unit": p.unit,
@@ -279,7 +281,7 @@ def _calibration(p: ParameterEstimate) -> dict[str, Any]:
 
 
 def _list_findings(outcome: Outcome) -> list[str]:
-    """What the report lists as odd."""
+    """The findings listed in the report."""
     lines = list(outcome.findings)
     if outcome.zero:
         lines.append(f"only a part is used: times here count from {outcome.zero:.3f} s after the recording's start")

@@ -1,4 +1,4 @@
-"""Errors of a run against the best truth there is, over all of it and over each span in which something is missing."""
+"""Errors of a run against the best available truth, over all of it and over each span with withheld or missing data."""
 
 from __future__ import annotations
 
@@ -24,17 +24,18 @@ if TYPE_CHECKING:
 Span = tuple[float, float]
 Withheld = tuple[str, Span | None]
 
-_DENSEST, _MOST = 0.1, 5_000  # s between, and number of, the epochs of a truth that are met exactly
-_MOST_TURNING = 20_000  # the same where a point at the end of a lever arm swings between them
-_ENOUGH = 1000  # keyframes that make other epochs needless
-_SAME, _BETWEEN_ROWS = 1e-4, 0.02  # s; between epochs that are one, and between rows where nothing else can happen
-OUTAGE = 10.0  # s; fixes further apart than this are an outage worth a line of its own
+_DENSEST, _MOST = 0.1, 5_000  # s between, and number of, the truth epochs that are solved for exactly
+_MOST_TURNING = 20_000  # the same where a point at the end of a lever arm moves between them
+_ENOUGH_KEYFRAMES = 1000  # number of keyframes that makes other epochs unnecessary
+# s; between epochs that count as one, and between rows too close for anything to happen
+_SAME, _BETWEEN_ROWS = 1e-4, 0.02
+OUTAGE = 10.0  # s; a longer interval between fixes is scored as an outage
 
 
 def outages(recording: Recording) -> list[Span]:
     """Spans of more than `OUTAGE` s without a fix, s from the start; both ends of the recording count too.
 
-    Each lasts from the last fix to one period before the next: at its end there is still none.
+    Each lasts from the last fix to one period before the next: there is still no fix at its end.
     """
     if recording.gnss is None or not len(recording.gnss.t):
         return []
@@ -48,7 +49,9 @@ def outages(recording: Recording) -> list[Span]:
 def score(
     recording: Recording, used: Recording, solutions: Mapping[str, Solution], withheld: tuple[Withheld, ...]
 ) -> tuple[dict[str, Metrics], str | None, tuple[str, ...]]:
-    """Metrics per solver against the best truth there is, what that is, and what is missing in each of their spans."""
+    """Metrics per solver against the best available truth, a description of it, and what is missing in each of their
+    spans.
+    """
     from graphnav.evaluation.evaluate import evaluate_recording, truth_of, withheld_truth
 
     spans = [(f"without {source}", span) for source, span in withheld if span is not None]
@@ -56,7 +59,7 @@ def score(
     gnss_withheld = any(source == "gnss" for source, _ in withheld)
     if truth is not None and truth.closed_loop_sigma is not None:
         if any("closed_loop" in solution.records for solution in own_solutions(solutions).values()):
-            return {}, None, ()  # what was put in is no measure of what came out
+            return {}, None, ()  # data that was used is no truth
         against, spans = "the start, where the loop ends", []
     elif truth is not None:
         against = "the recording's truth"
@@ -67,7 +70,7 @@ def score(
         spans = [(name, span) for name, span in spans if name == "without gnss"]
     else:
         return {}, None, ()
-    # the evaluation scores each span of GNSS by itself, whatever it is that is missing there
+    # the evaluation scores each span of withheld GNSS by itself, whatever is missing in it
     asked: list[Withheld] = [("gnss", span) for _, span in spans]
     if truth is None and any(source == "gnss" and span is None for source, span in withheld):
         asked.append(("gnss", None))
@@ -94,7 +97,7 @@ def score(
 
 
 def _read_antenna(solution: Solution) -> AntennaCalibration:
-    """The last estimates of the antenna; as stated where none are, as in another program's trajectory."""
+    """The last estimates of the antenna; as stated where there are none, as in another program's trajectory."""
     from graphnav.evaluation.evaluate import AntennaCalibration
 
     offset, lever = solution.parameters.get(TIME_OFFSET), solution.parameters.get(LEVER_ARM)
@@ -104,8 +107,8 @@ def _read_antenna(solution: Solution) -> AntennaCalibration:
 def _choose_epochs(solution: Solution, truth: Array) -> Array:
     """Epochs to compare at: the keyframes where the truth has them and they are many, else (some of) the truth's.
 
-    Never others: interpolated between keyframes, a filter would seem to know in an outage what the fix after it
-    will tell. So would another program's, between its rows: of such a file and the truth the denser is interpolated.
+    No others: interpolated between keyframes, a filter would use in an outage the fix after it. The same holds for
+    another program's rows: of such a file and the truth the denser is interpolated.
     """
     truth = truth[np.isfinite(truth)]
     if len(truth) > 1:
@@ -117,20 +120,20 @@ def _choose_epochs(solution: Solution, truth: Array) -> Array:
         if foreign and len(t) and measure_spacing(own) >= measure_spacing(truth):
             return np.asarray(t[before + after <= MAX_GAP])
         there = (np.minimum(np.abs(before), np.abs(after)) <= _SAME) | (before + after <= _BETWEEN_ROWS)
-        if not foreign and there.sum() >= max(_ENOUGH, 0.8 * len(t)):
+        if not foreign and there.sum() >= max(_ENOUGH_KEYFRAMES, 0.8 * len(t)):
             return np.asarray(t[there])
     return _thin(truth, solution, _MOST)
 
 
 def _thin(t: Array, solution: Solution, most: int) -> Array:
-    """At most so many of some times over the length of a solution, and none closer than `_DENSEST`."""
+    """At most `most` of the times within a solution, none closer than `_DENSEST`."""
     spacing = max(_DENSEST, (solution.t[-1] - solution.t[0]) / most)
     _, apart = np.unique(np.floor(t / spacing), return_index=True)
     return np.asarray(t[apart])
 
 
 def _score_at(solution: Solution, t: Array, placed: bool) -> Trajectory:
-    """The solution at the times, or at all keyframes where these will do; in metres of its frame if not `placed`."""
+    """The solution at the times, or at all keyframes where these suffice; in metres of its frame if not `placed`."""
     if isinstance(solution, Foreign):
         track = solution.track_at(t)
         return track if placed else replace(track, llh=solution.frame.from_llh(track.llh), frame="local")

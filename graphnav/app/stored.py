@@ -1,8 +1,7 @@
-"""What came of a run, kept in a file beside its results, so that its pages can be drawn again without solving.
+"""The outcome of a run, stored beside its results, so that its pages can be drawn again without solving.
 
-`run.npz` holds the arrays, and as JSON how they hang together: nested dataclasses of this package by their names, and
-plain values. Of the IMU it holds the rows that are drawn. What lies between the keyframes is not in it: it is drawn
-straight.
+`run.npz` holds the arrays and, as JSON, their structure: nested dataclasses of this package by name, and plain values.
+Of the IMU it holds the rows that are drawn. States between keyframes are not stored; they are drawn as straight lines.
 """
 
 from __future__ import annotations
@@ -34,14 +33,14 @@ from graphnav.report.plots.thinning import BINS
 from graphnav.sensors import Series, list_sensors
 
 NAME = "run.npz"
-_FORM = "graphnav-run/3"
-_ANEW = ("between", "graphs", "own")  # what only solving again gives, and classes of a script
+_RUN_FORMAT = "graphnav-run/3"
+_ANEW = ("between", "graphs", "own")  # available only by solving again, and classes of a script
 _PACKAGE = __name__.partition(".")[0]
 
 
 @dataclass(frozen=True)
 class Straight:
-    """States between keyframes as straight lines, of one piece of a recording."""
+    """States between keyframes by linear interpolation, for one piece of a recording."""
 
     t: Array  # (K,) s
     states: States
@@ -58,11 +57,11 @@ class Straight:
         return float(self.t[-1])
 
     def times(self, rate: float) -> Array:
-        """As those of the solution that was stored."""
+        """The times of output, as of the stored solution."""
         return times_between(self.start, self.end, rate)
 
     def __call__(self, t: Array, size: int = DIM) -> tuple[States, Array]:
-        """States and covariances, of the first errors, at times inside."""
+        """States and covariances, of the first `size` error components, at times within it."""
         k = np.clip(np.searchsorted(self.t, t, side="right") - 1, 0, len(self.t) - 2)
         s = ((t - self.t[k]) / (self.t[k + 1] - self.t[k]))[:, None]
         a, b = self.states[k], self.states[k + 1]
@@ -73,17 +72,19 @@ class Straight:
 
 
 def write_outcome(outcome: Outcome, provenance: Mapping[str, Any], path: Path) -> None:
-    """Keep all of an outcome that its pages show, with the provenance of the run."""
+    """Store everything of an outcome that its pages show, with the provenance of the run."""
     arrays: list[Array] = []
     outcome = replace(outcome, recording=_thin_recording(outcome.recording))
-    plain = json.dumps({"form": _FORM, "outcome": _pack(outcome, arrays), "provenance": _pack(provenance, arrays)})
+    plain = json.dumps(
+        {"form": _RUN_FORMAT, "outcome": _pack(outcome, arrays), "provenance": _pack(provenance, arrays)}
+    )
     text = np.frombuffer(plain.encode(), dtype=np.uint8)
     named: dict[str, Any] = {f"a{k}": a for k, a in enumerate(arrays)}
-    np.savez(path, text=text, **named)  # as it is: deflating takes a second an hour of a drive and leaves two thirds
+    np.savez(path, text=text, **named)  # uncompressed: compression takes a second per hour of a drive and saves a third
 
 
 def read_outcome(path: Path) -> tuple[Outcome, dict[str, Any]]:
-    """An outcome with what its pages show of the recording, and the provenance of its run.
+    """Read an outcome, with what its pages show of the recording, and the provenance of its run.
 
     Raises
     ------
@@ -103,7 +104,7 @@ def read_outcome(path: Path) -> tuple[Outcome, dict[str, Any]]:
             arrays = [file[f"a{k}"] for k in range(len(file.files) - 1)]
     except (OSError, ValueError, KeyError, BadZipFile, zlib.error, EOFError, RuntimeError, MemoryError) as error:
         raise ConfigError(f"{path}: cannot be read ({error})", key="file.unreadable") from None
-    if not isinstance(values, dict) or values.get("form") != _FORM:
+    if not isinstance(values, dict) or values.get("form") != _RUN_FORMAT:
         raise ConfigError(f"{path}: is of another version of graphnav; solve again", key="results.other_version")
     try:
         outcome, provenance = _unpack(values["outcome"], arrays), _unpack(values["provenance"], arrays)
@@ -118,16 +119,16 @@ def read_outcome(path: Path) -> tuple[Outcome, dict[str, Any]]:
 
 
 def _thin_recording(recording: Recording) -> Recording:
-    """As much of a recording as the pages show."""
+    """The part of a recording that the pages show."""
     imu = recording.imu
     shown = np.zeros(len(imu.t), dtype=bool)
-    shown[: 4 * BINS + 1] = True  # for the period, and more than is drawn without thinning
+    shown[: 4 * BINS + 1] = True  # enough to determine the period, and more than is drawn without thinning
     shown[drawn_rows(imu)] = True
     return replace(recording, imu=take_rows(imu, shown), raw_gnss=None)
 
 
 def _pack(value: Any, arrays: list[Array]) -> Any:
-    """A value as JSON holds it, one key telling what it is; arrays go into the list."""
+    """A value as JSON can hold it, with a key that states its type; arrays are appended to the list."""
     if isinstance(value, Note):
         return {"note": [value.key, str(value)]}
     if value is None or isinstance(value, bool | int | float | str):
@@ -159,7 +160,7 @@ def _pack(value: Any, arrays: list[Array]) -> Any:
 
 
 def _unpack(value: Any, arrays: list[Array]) -> Any:
-    """The opposite of `_pack`."""
+    """The inverse of `_pack`."""
     if not isinstance(value, dict):
         return value
     if "note" in value:

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 def solver_summary(
     outcome: Outcome, name: str, seconds: Mapping[str, float], provenance: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """What summary.json holds; `seconds` of writing, by what was written."""
+    """The content of summary.json; `seconds` are those of writing, by file."""
     from graphnav.evaluation.metrics import summary
     from graphnav.report.sentences import list_doubts
 
@@ -87,7 +87,7 @@ def solver_summary(
 
 
 def _ambiguities(solution: Solution) -> dict[str, Any] | None:
-    """Epochs with carriers against a base station: how many have integers and how many real numbers."""
+    """Number of epochs with carriers against a base station that have integer and real-valued ambiguities."""
     epochs = len(solution.fixed)
     if not epochs:
         return None
@@ -97,7 +97,7 @@ def _ambiguities(solution: Solution) -> dict[str, Any] | None:
 
 
 def noise_rows(outcome: Outcome, solution: Solution) -> tuple[FigureRow, ...]:
-    """The figures of a solution's noise model beside those stated."""
+    """The figures of a solution's noise model beside the stated ones."""
     from graphnav.estimation.noise.table import figure_rows
 
     recording, settings = outcome.recording, outcome.request.settings
@@ -108,7 +108,9 @@ def noise_rows(outcome: Outcome, solution: Solution) -> tuple[FigureRow, ...]:
 
 
 def noise_summary(outcome: Outcome, solution: Solution) -> dict[str, Any]:
-    """What `graphnav.estimation.noise.files.read_noise` reads, with what is stated and used beside each figure."""
+    """The noise model in the form that `graphnav.estimation.noise.files.read_noise` reads, with stated and used
+    figures.
+    """
     from graphnav.estimation.noise.files import noise_values
 
     values = noise_values(solution.noise, outcome.request.settings.noise.mode)
@@ -121,7 +123,7 @@ def noise_summary(outcome: Outcome, solution: Solution) -> dict[str, Any]:
 
 
 def comparison(outcome: Outcome, ours: bool = False) -> list[dict[str, Any]]:
-    """One flat row per solver: errors where there are any, stated sigmas, seconds and iterations."""
+    """One flat row per solver: errors where there is a truth, stated sigmas, seconds and iterations."""
     from graphnav.evaluation.metrics import comparison_rows
 
     measured = {row["solver"]: row for row in comparison_rows(outcome.metrics)}
@@ -138,7 +140,7 @@ def comparison(outcome: Outcome, ours: bool = False) -> list[dict[str, Any]]:
 
 
 def median_sigmas(solution: Solution) -> dict[str, float]:
-    """Medians of the sigmas a solution states of itself: horizontal and up (m), heading (deg)."""
+    """Medians of a solution's stated sigmas: horizontal and up (m), heading (deg)."""
     track = solution.trajectory()
     out = {}
     if track.sd_p is not None:
@@ -150,7 +152,7 @@ def median_sigmas(solution: Solution) -> dict[str, float]:
 
 
 def gather_provenance(outcome: Outcome) -> dict[str, Any]:
-    """Versions, what was read (with its sha256), where the noise model is from, and how the program was called."""
+    """Versions, inputs (with their sha256), the source of the noise model, and the command line."""
     given = outcome.request.noise
     files = [*outcome.recording.files, *([given.file] if given is not None and given.file is not None else [])]
     used: str = outcome.request.settings.noise.mode

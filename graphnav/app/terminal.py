@@ -1,4 +1,4 @@
-"""What the command line shows: summaries as plain text, and progress on a terminal."""
+"""Output on the terminal: summaries as plain text, and progress."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _WIDEST = 1000  # characters of a table
 
 
 def run_text(outcome: Outcome, files: Sequence[Path]) -> str:
-    """What was read, what is worth knowing, how good it is, and where to look."""
+    """Summary of a run: what was read, findings, errors, and files to look at."""
     lines = [f"warning: {doubt[0].lower()}{doubt[1:]}" for doubt in _list_doubts(outcome)]
     lines.append(_describe_recording(outcome))
     lines += [f"  {source} withheld{'' if span is None else f' {span[0]:g}-{span[1]:g} s'}"
@@ -45,7 +45,7 @@ def run_text(outcome: Outcome, files: Sequence[Path]) -> str:
     severity = {f.sentence: f.severity for f in outcome.checks}
     for note in dict.fromkeys([*outcome.findings, *notes]):
         if key_of(note) in ("noise.imu", "noise.rows"):
-            continue  # the report has the table
+            continue  # the report has the full table
         lines.append(f"  {severity.get(note, 'note')}: {note}")
     lines.append("")
     lines += _tabulate_errors(outcome)
@@ -61,7 +61,7 @@ def _list_doubts(outcome: Outcome) -> tuple[str, ...]:
 
 
 def _describe_noise(outcome: Outcome) -> list[str]:
-    """The noise model in a line: what differs from what is stated."""
+    """The noise model in one line: figures that differ from the stated ones."""
     from graphnav.estimation.noise.table import whole_ratio
 
     noise = next(iter(outcome.solutions.values())).noise
@@ -75,7 +75,7 @@ def _describe_noise(outcome: Outcome) -> list[str]:
         name, _, kind = source.partition(".")
         ratios = [(axis, whole_ratio(noise, source, axis)) for axis in ("horizontal", "up")]
         factors = " and ".join(f"x {short(ratio)} {axis}" for axis, ratio in ratios if ratio is not None)
-        if factors:  # none of the whole where each type has its own
+        if factors:  # no common figure where each type has its own
             parts.append(f"{_FIXES.get(name, name)}{f' ({kind})' if kind else ''} {factors}")
     given = outcome.request.noise
     how = "estimated" if given is None else "as given" if given.file is None else f"from {given.file}"
@@ -105,7 +105,7 @@ def _describe_recording(outcome: Outcome) -> str:
 
 
 def _tabulate_errors(outcome: Outcome) -> list[str]:
-    """A row per solver: its errors, or the sigmas it states where there is nothing to compare with."""
+    """A row per solver: its errors, or its stated sigmas if there is no truth."""
     if not outcome.metrics:
         head = ["solver", "keyframes", "sd hor. (m)", "sd up (m)", "sd head. (deg)", "seconds"]
         rows = [
@@ -131,7 +131,7 @@ def _tabulate_errors(outcome: Outcome) -> list[str]:
 
 
 def _list_sigmas(solution: Solution) -> list[float]:
-    """Those that `summary.median_sigmas` gives, NaN where there are none."""
+    """The sigmas of `summary.median_sigmas`, NaN where there are none."""
     found = median_sigmas(solution)
     return [found.get(key, float("nan")) for key in ("sd_h_median_m", "sd_u_median_m", "sd_heading_median_deg")]
 
@@ -141,7 +141,7 @@ def _format_seconds(solution: Solution) -> str:
 
 
 def _tabulate_spans(outcome: Outcome) -> list[str]:
-    """For every span without a source, a row per solver."""
+    """For every withheld span, a row per solver."""
     lines: list[str] = []
     for k, missing in enumerate(outcome.span_names):
         every = {name: m.spans[k] for name, m in outcome.metrics.items()}
@@ -162,12 +162,12 @@ def _tabulate_spans(outcome: Outcome) -> list[str]:
 
 
 def _share(span: SpanErrors) -> str:
-    """Drift as a share of the way; of a vehicle that stands it means nothing."""
+    """Drift as a share of the distance travelled; undefined for a stationary vehicle."""
     return short(span.drift_percent) if span.distance >= 1.0 else "-"
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    """Lines of a table, the first column to the left and numbers to the right; as wide as it is."""
+    """Lines of a table, the first column left-aligned and numbers right-aligned; not wrapped."""
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text
@@ -183,31 +183,31 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
 
 
 def short(x: float) -> str:
-    """Three significant digits, '-' where there is no number."""
+    """Three significant digits, '-' for no number."""
     if not np.isfinite(x):
         return "-"
     return f"{x:.0f}" if abs(x) >= 1000 else f"{x:.3g}" if abs(x) >= 1e-3 or x == 0 else f"{x:.1e}"
 
 
-# What the stages weigh against each other: seconds of an hour's drive at 200 Hz, for the time left and nothing else.
+# relative weights of the stages for the time left: seconds for an hour's drive at 200 Hz
 _STAGES = {
     "reading": 0.5, "checks": 0.6, "driving": 5.0, "detection": 0.2, "alignment": 0.1, "preintegration": 0.7,
     "noise": 12.0, "filter": 2.5, "smoother": 0.4, "batch": 0.9, "covariances": 0.2, "incremental": 4.8,
     "isam2": 44.0, "evaluation": 0.1, "writing": 0.7,
 }  # fmt: skip
-_BEFORE = ("reading", "checks", "detection", "alignment", "preintegration", "noise", "filter", "smoother")
+_COMMON_STAGES = ("reading", "checks", "detection", "alignment", "preintegration", "noise", "filter", "smoother")
 _WORK = {
     "info": ("reading", "checks"), "detect": ("reading", "detection", "writing"), "evaluate": ("reading",),
     "simulate": ("driving", "writing"), "convert": ("reading", "writing"), "init": ("reading", "writing"),
-    "ekf": (*_BEFORE, "evaluation", "writing"), "rts": (*_BEFORE, "evaluation", "writing"),
-    "batch": (*_BEFORE, "batch", "covariances", "evaluation", "writing"),
-    "incremental": (*_BEFORE, "incremental", "evaluation", "writing"),
-    "isam2": (*_BEFORE, "isam2", "evaluation", "writing"),
+    "ekf": (*_COMMON_STAGES, "evaluation", "writing"), "rts": (*_COMMON_STAGES, "evaluation", "writing"),
+    "batch": (*_COMMON_STAGES, "batch", "covariances", "evaluation", "writing"),
+    "incremental": (*_COMMON_STAGES, "incremental", "evaluation", "writing"),
+    "isam2": (*_COMMON_STAGES, "isam2", "evaluation", "writing"),
 }  # fmt: skip
 
 
 class Pace:
-    """How much of some work is done when a stage has come to a share of its own, and how long the rest will take."""
+    """Progress of some work by the shares of its stages, and the time left."""
 
     def __init__(self, work: Sequence[str]) -> None:
         wanted = {stage for one in work for stage in _WORK.get(one, ())}
@@ -216,20 +216,20 @@ class Pace:
         self.done = 0.0
 
     def reach(self, stage: str, share: float) -> None:
-        """Take note; what is done a second time takes nothing back."""
+        """Record the share of a stage; repeated stages never reduce the progress."""
         name = stage.split()[0]
         if name in self._stages:
             before = self._stages[: self._stages.index(name)]
             self.done = max(self.done, (sum(_STAGES[s] for s in before) + share * _STAGES[name]) / self._total)
 
     def estimate_left(self, elapsed: float) -> float | None:
-        """s, as the time up to here tells; None where that is too little."""
+        """Estimated time left, s; None where it is too early to tell."""
         return elapsed * (1.0 / self.done - 1.0) if self.done > 0.03 and elapsed > 1.0 else None
 
 
 @contextmanager
 def progress_bar(quiet: bool, work: Sequence[str]) -> Iterator[Progress | None]:
-    """A bar with stage and time left, on stderr if that is a terminal, of what takes longer than half a second."""
+    """A progress bar with stage and time left, on stderr if that is a terminal, for work of more than half a second."""
     if quiet or not sys.stderr.isatty():
         yield None
         return

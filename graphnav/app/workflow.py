@@ -33,12 +33,12 @@ if TYPE_CHECKING:
     from graphnav.evaluation.metrics import Metrics
 
 
-LOOSE = "-loose"  # behind the name of a solver that had fixes in place of raw observations
+LOOSE = "-loose"  # suffix of the name of a solution from fixes in place of raw observations
 
 
 @dataclass(frozen=True)
 class GivenNoise:
-    """A noise model, and the file that it is from, if it is from one."""
+    """A noise model, and the file it was read from, if any."""
 
     model: NoiseModel
     file: Path | None = None
@@ -46,7 +46,7 @@ class GivenNoise:
 
 @dataclass(frozen=True)
 class Request:
-    """What is asked for; times in s from the recording's start."""
+    """The options of a run; times in s from the recording's start."""
 
     source: str
     solvers: tuple[str, ...]
@@ -55,51 +55,51 @@ class Request:
     start: float | None = None
     end: float | None = None
     rate: float | None = None  # Hz of the output; None: at the keyframes
-    options: Mapping[str, Any] = field(default_factory=dict)  # as they were given, for provenance
-    noise: GivenNoise | None = None  # to be used as it is; else what the settings say
-    against: tuple[Against, ...] = ()  # trajectories of other programs to put beside the solutions
-    topics: tuple[str, ...] = ()  # of a ROS bag, as `graphnav.recording.formats.read` takes them
+    options: Mapping[str, Any] = field(default_factory=dict)  # as given, for provenance
+    noise: GivenNoise | None = None  # used as it is; otherwise the settings decide
+    against: tuple[Against, ...] = ()  # trajectories of other programs to compare with
+    topics: tuple[str, ...] = ()  # of a ROS bag, for `graphnav.recording.formats.read`
     format: str | None = None  # of a log, likewise
-    exported: tuple[str, ...] = ()  # formats that are to be written as well, of
+    exported: tuple[str, ...] = ()  # additional output formats, for `point`
     point: str | None = None  # "antenna", "imu" or a lever arm
-    judge_arms: bool = False  # ask the drive for the signs of lever arms even where nothing is in doubt
-    loose: bool = False  # solve with fixes in place of raw observations as well
+    judge_arms: bool = False  # check the signs of lever arms even if nothing is in doubt
+    loose: bool = False  # also solve with fixes in place of raw observations
 
     def settings_of(self, name: str) -> Settings:
-        """Those that the solution of a name was made with."""
+        """The settings of the solution of that name."""
         return couple_loosely(self.settings) if name.endswith(LOOSE) else self.settings
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of a request.
+    """The result of a request.
 
-    `recording` is the part asked for with nothing withheld; `zero` (s) is how far its start lies behind the start
-    of the whole recording, from which all times that people give or read are counted.
+    `recording` is the requested part with nothing withheld; `zero` (s) is the offset of its start from the start of the
+    whole recording, from which all times for users are counted.
     """
 
     request: Request
     recording: Recording
     zero: float
     solutions: dict[str, Solution]
-    metrics: dict[str, Metrics]  # empty where there is nothing to compare with
-    against: str | None  # what the metrics compare with, in words
-    span_names: tuple[str, ...]  # of the spans of every metrics: what is missing in each
-    findings: tuple[str, ...]  # everything worth knowing about the recording and the comparison
-    warnings: tuple[str, ...]  # those of the findings that results suffer from
-    timings: dict[str, float]  # s by stage, of what all solvers share
-    checks: tuple[Finding, ...] = ()  # what the checks of the recording found, with keys and severities
-    densities: ImuNoise | None = None  # what the noise factors of the IMU are relative to, if not to what it states
-    alone: bool = False  # whether its files lie straight in the folder, as those of one solver
+    metrics: dict[str, Metrics]  # empty where there is no truth
+    against: str | None  # description of the truth of the metrics
+    span_names: tuple[str, ...]  # what is missing in each of the spans of every metrics
+    findings: tuple[str, ...]  # all notes on the recording and the comparison
+    warnings: tuple[str, ...]  # those that make results worse
+    timings: dict[str, float]  # s by stage, common to all solvers
+    checks: tuple[Finding, ...] = ()  # findings of the checks of the recording, with keys and severities
+    densities: ImuNoise | None = None  # the IMU densities that noise factors refer to, if not the stated ones
+    alone: bool = False  # whether the files are written straight into the folder, as for a single solver
 
     @property
     def used_withheld(self) -> tuple[Withheld, ...]:
-        """What was withheld, in s from the start of `recording`."""
+        """The withheld spans, in s from the start of `recording`."""
         return _move(self.request.withheld, self.zero)
 
 
 def name_runs(solvers: tuple[str, ...], loose: bool) -> tuple[str, ...]:
-    """The names of the solutions that solvers make."""
+    """The names of the solutions of some solvers."""
     return tuple(name for solver in solvers for name in ((solver, solver + LOOSE) if loose else (solver,)))
 
 
@@ -109,7 +109,7 @@ def couple_loosely(settings: Settings) -> Settings:
 
 
 def parse_withheld(text: str) -> Withheld:
-    """``gnss:600-660`` or ``odometer`` as (source, span in s or None).
+    """Parse ``gnss:600-660`` or ``odometer`` into (source, span in s or None).
 
     Raises
     ------
@@ -143,7 +143,7 @@ def parse_withheld(text: str) -> Withheld:
 
 
 def parse_noise(text: str | None, settings: Settings) -> tuple[Settings, GivenNoise | None]:
-    """What `--noise` says: the settings with its mode, and the noise model of a file.
+    """Parse `--noise`: the settings with its mode, and the noise model of a file.
 
     Raises
     ------
@@ -252,7 +252,7 @@ def _name_cause(error: EstimationError, findings: Sequence[Finding]) -> Estimati
 
 
 def _find_densities(recording: Recording, settings: Settings, solutions: Mapping[str, Solution]) -> ImuNoise | None:
-    """Those of the rests, which factors of a walk are relative to; None where they are to what is stated."""
+    """Noise densities measured at rest, to which a walk's factors refer; None where they refer to the stated ones."""
     if recording.platform != "foot":
         return None
     if not any(group.startswith("imu.") for solution in solutions.values() for group in solution.noise.figures):
@@ -275,11 +275,11 @@ def _read_others(request: Request, recording: Recording, solutions: Mapping[str,
 
 
 def list_unused_noise(noise: NoiseModel, solution: Solution) -> list[str]:
-    """Sentences on what a noise model says of measurements that a solution has not."""
+    """Notes on the parts of a noise model that concern measurements which a solution does not have."""
     have = dict.fromkeys(INTERVALS, solution.t) | {name: record.t for name, record in solution.records.items()}
     named = {group.split(".")[0] for group in noise.figures} - {"imu"} | set(noise.weights) | set(noise.excluded)
     notes: list[str] = [
-        Note("noise.file.unused", f"noise model: it has figures of {name}, of which nothing is used here")
+        Note("noise.file.unused", f"noise model: it has figures of {name}, which is not used here")
         for name in sorted(named - set(have))
     ]
     for name, some in noise.weights.items():
@@ -315,7 +315,7 @@ def read_part(
     topics: tuple[str, ...] = (),
     name: str | None = None,
 ) -> Recording:
-    """The part asked for of a recording, without what is withheld; times in s from the recording's start.
+    """The requested part of a recording, without what is withheld; times in s from the recording's start.
 
     `topics` and `name` are those of `graphnav.recording.formats.read`.
 
@@ -341,7 +341,7 @@ def _measure_time(timings: dict[str, float], stage: str) -> Iterator[None]:
 
 
 def _crop(whole: Recording, request: Request) -> Recording:
-    """The part of the recording that is asked for."""
+    """The requested part of the recording."""
     if (request.start or 0.0) >= whole.duration or (request.end is not None and request.end <= 0.0):
         option = f"--start {request.start:g}" if (request.start or 0.0) >= whole.duration else f"--end {request.end:g}"
         raise RecordingError(
@@ -356,7 +356,7 @@ def _move(withheld: tuple[Withheld, ...], by: float) -> tuple[Withheld, ...]:
 
 
 def _withhold(recording: Recording, withheld: tuple[Withheld, ...], zero: float) -> tuple[Recording, list[str]]:
-    """The recording without what is withheld (s from its start), and sentences about what that did not change."""
+    """The recording without what is withheld (s from its start), and notes where that changed nothing."""
     used = recording
     notes: list[str] = []
     for source, span in withheld:
@@ -368,7 +368,7 @@ def _withhold(recording: Recording, withheld: tuple[Withheld, ...], zero: float)
                 key="option.span_outside",
             )
         if source in recording.aiding and source not in used.aiding:
-            continue  # all of it is gone already
+            continue  # already removed
         before = used
         used = used.without(source, span)
         if span is not None and len(used.aiding[source].t) == len(before.aiding[source].t):

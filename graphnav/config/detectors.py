@@ -12,7 +12,7 @@ from graphnav.core.notes import Note
 
 
 class StanceSettings(Section):
-    """Where a foot is on the floor."""
+    """Detection of when a foot is on the floor."""
 
     window: float = Field(0.05, gt=0, le=1, description="s, length of a window")
     threshold: float = Field(1.5, gt=0, description="rad/s, of the statistic, between stance and swing")
@@ -22,7 +22,7 @@ class StanceSettings(Section):
 
 
 class LowBandSettings(Section):
-    """The GLRT with unknown means, below the engine's band."""
+    """The GLRT with unknown means, below the engine's frequency band."""
 
     window: float = Field(2.0, gt=0.3, le=30, description="s, length of a window")
     threshold: float = Field(3.0, gt=0, description="of the statistic; 1 is the sensor's noise and a body that sways")
@@ -32,14 +32,14 @@ class LowBandSettings(Section):
 
 
 class GlrtSettings(Section):
-    """The GLRT and its relatives."""
+    """The GLRT and related detectors."""
 
     window: float = Field(1.0, gt=0, le=30, description="s, length of a window")
     threshold: float | None = Field(None, gt=0, description="of the GLRT; found from the recording if unset")
 
 
 class FftSettings(Section):
-    """The detector of an engine's idle line; the paper's values (Li 2024, section 4.2)."""
+    """The detector of an engine's idle line; defaults from the paper (Li 2024, section 4.2)."""
 
     window: float = Field(3.0, ge=1, le=30, description="s, length of a window")
     step: float = Field(1.0, ge=0.1, le=30, description="s between the starts of windows")
@@ -55,7 +55,7 @@ class FftSettings(Section):
 
 
 class FusionSettings(Section):
-    """From the detectors' answers to stationary intervals."""
+    """Fusion of the detectors' answers to stationary intervals."""
 
     min_duration: float = Field(1.0, gt=0, description="s, the shortest interval")
     margin: float = Field(0.1, ge=0, description="s, taken off both ends of every interval")
@@ -71,11 +71,11 @@ FUSED: Final = "fused"
 DetectorName = Literal[
     "fused", "fft", "glrt", "acceleration_variance", "acceleration_magnitude", "angular_rate_energy", "low_band_glrt"
 ]
-_OLD = {"sway": "low_band_glrt"}  # tables that are called otherwise now
+_OLD = {"sway": "low_band_glrt"}  # former names of tables
 
 
 class DetectorSettings(Section):
-    """Where the vehicle stands."""
+    """Detection of when the vehicle is stationary."""
 
     fire: tuple[DetectorName, ...] = Field(
         (FUSED,), min_length=1, description="who decides: fused, or names of detectors, each of which then suffices"
@@ -90,7 +90,7 @@ class DetectorSettings(Section):
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What is to be said of how they were given."""
+        """Notes on how the settings were given."""
         return self._notes
 
     @field_validator("fire")
@@ -103,7 +103,7 @@ class DetectorSettings(Section):
     @model_validator(mode="wrap")
     @classmethod
     def _rename_old(cls, values: Any, handler: ModelWrapValidatorHandler[DetectorSettings]) -> DetectorSettings:
-        """Tables under the names that they had before."""
+        """Accept tables under their former names."""
         old = [name for name in _OLD if isinstance(values, Mapping) and name in values]
         for name in old:
             if _OLD[name] in values:

@@ -1,4 +1,4 @@
-"""Settings from files, and as a file."""
+"""Reading settings from files, and writing them."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def settings_from(values: Mapping[str, Any], source: str = "settings", text: str
     Raises
     ------
     ConfigError
-        Naming the source, the line, the key, the value and its unit, and the nearest known key for an unknown one.
+        For an invalid value or key; names the source, line, key, value and unit, and the nearest known key.
     """
     try:
         return Settings.model_validate(dict(values))
@@ -36,19 +36,19 @@ def read_settings(path: str | Path | None = None, profile: str | None = None) ->
     Parameters
     ----------
     path
-        TOML, or the summary.json of a run, whose settings are then used again; None: no file.
+        TOML, or the summary.json of a run, for its settings; None: no file.
     profile
-        One of `PROFILES`; it goes before the file's own.
+        One of `PROFILES`; overrides the file's own.
 
     Returns
     -------
     Settings
-        All of them, defaults included.
+        All settings, defaults included.
 
     Raises
     ------
     ConfigError
-        If the file cannot be read or holds something that is not a setting, or there is no such profile.
+        If the file cannot be read or contains invalid settings, or there is no such profile.
     """
     values: Mapping[str, Any] = {}
     text = ""
@@ -66,7 +66,7 @@ def read_settings(path: str | Path | None = None, profile: str | None = None) ->
 
 
 def _take_settings_of_run(path: Path) -> Mapping[str, Any]:
-    """What a summary.json keeps."""
+    """The settings that a summary.json holds."""
     try:
         values = parse_json(read_text(path, ConfigError))["settings"]
     except (ValueError, KeyError, TypeError):
@@ -81,14 +81,16 @@ def _take_settings_of_run(path: Path) -> Mapping[str, Any]:
 
 
 def settings_text(settings: Settings) -> str:
-    """A file that `read_settings` reads: every key with its unit and sentence, those that are unset as comments."""
+    """The text of a file that `read_settings` reads: every key with its unit and description, unset keys as
+    comments.
+    """
     lines: list[str] = []
 
     def table(section: BaseModel, at: str) -> None:
         nested: dict[str, BaseModel] = {}
         for name, field in type(section).model_fields.items():
             value = getattr(section, name)
-            if name == "sensors":  # a table of each sensor, whether it is set or not
+            if name == "sensors":  # a table for each sensor, whether set or not
                 nested |= {f"{name}.{sensor}": settings.sensor(sensor) for sensor in list_sensors()}
                 continue
             if isinstance(value, BaseModel):
@@ -107,7 +109,7 @@ def settings_text(settings: Settings) -> str:
 
 
 def toml_value(value: Any) -> str:
-    """A value of a setting; JSON's numbers, texts and lists are TOML's as well."""
+    """The TOML text of a value; JSON's numbers, strings and lists are valid TOML."""
     if isinstance(value, Mapping):
         return "{ " + ", ".join(f"{key} = {toml_value(one)}" for key, one in value.items()) + " }"
     return json.dumps(value)

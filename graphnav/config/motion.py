@@ -1,4 +1,4 @@
-"""Settings of what is known of motion without any receiver: stops, wheels, a foot."""
+"""Settings of motion constraints that need no receiver: stops, wheels, a foot."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from graphnav.config.section import Section
 
 
 class StandstillSettings(Section):
-    """What is used where the platform stands still."""
+    """Constraints where the platform is stationary."""
 
     zero_velocity: bool = Field(True, description="no velocity")
     zero_rate: bool = Field(True, description="no turn rate (of a foot: not in its stances, but where it stands)")
@@ -19,7 +19,7 @@ class StandstillSettings(Section):
 
 
 class VehicleSettings(Outliers):
-    """What is used of a vehicle's wheels."""
+    """Constraints from a vehicle's wheels."""
 
     nhc: bool = Field(True, description="no speed sideways and up where the wheels do not slip")
     odometer: bool = Field(True, description="use the odometer where there is one")
@@ -45,7 +45,7 @@ class VehicleSettings(Outliers):
 
 
 class FootSettings(Outliers):
-    """What is used of a foot's way over the floor and through the air."""
+    """Constraints of a foot on the floor and in swing."""
 
     usual_kernel: ClassVar[str] = "cauchy"
 

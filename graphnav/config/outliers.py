@@ -1,4 +1,4 @@
-"""What is done with rows that are far off: the switches that every kind of measurement has."""
+"""Outliers: the settings common to every kind of measurement."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from graphnav.config.section import Section
 
 SWITCH = ("off", "on", "automatic")
 KERNELS = ("huber", "cauchy", "geman-mcclure", "tukey", "welsch", "gnc")
-_BY_NAME = {"none": "off", None: "off", False: "off", True: "automatic"}  # as earlier versions wrote them
+_BY_NAME = {"none": "off", None: "off", False: "off", True: "automatic"}  # values that earlier versions wrote
 
 
-def _switch(value: Any) -> Any:
+def _check_switch(value: Any) -> Any:
     value = _BY_NAME.get(value, value) if isinstance(value, str | bool) else value
     if value not in SWITCH:
         raise ValueError(f'\'{value}\' must be "off", "on" or "automatic"')
@@ -36,13 +36,13 @@ def _check_gate(value: Any) -> Any:
     return float(value) if number else value
 
 
-Switch = Annotated[Literal["off", "on", "automatic"], BeforeValidator(_switch)]
+Switch = Annotated[Literal["off", "on", "automatic"], BeforeValidator(_check_switch)]
 Kernel = Annotated[str, BeforeValidator(_check_kernel)]
 Gate = Annotated[float | str, BeforeValidator(_check_gate)]
 
 
 class Outliers(Section):
-    """What every solver does with rows that are far off."""
+    """Treatment of outliers, the same in every solver."""
 
     usual_kernel: ClassVar[str] = "none"  # "automatic"
     usual_gate: ClassVar[float | None] = None
@@ -58,17 +58,17 @@ class Outliers(Section):
 
     @property
     def kernel(self) -> str:
-        """The kernel to use, "none" for none."""
+        """The robust kernel in effect, "none" if there is none."""
         return {"off": "none", "on": "cauchy", "automatic": self.usual_kernel}.get(self.robust, self.robust)
 
     @property
     def limit(self) -> float | None:
-        """The gate to use."""
+        """The gate in effect, None if there is none."""
         if isinstance(self.gate, str):
             return {"off": None, "on": 6.0, "automatic": self.usual_gate}[self.gate]
         return self.gate
 
     @property
     def outliers(self) -> dict[str, Any]:
-        """What a constraint is told of it."""
+        """The arguments of a constraint that describe its treatment of outliers."""
         return {"robust": self.kernel, "robust_scale": self.robust_scale, "gate": self.limit}

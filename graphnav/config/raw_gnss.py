@@ -42,7 +42,7 @@ class RawGnssSettings(Outliers):
     @model_validator(mode="before")
     @classmethod
     def _with_ppp(cls, values: Any) -> Any:
-        """Precise point positioning has the codes and the carriers in it: they are not used twice."""
+        """Precise point positioning uses codes and carriers itself: they are not used a second time."""
         if isinstance(values, Mapping) and values.get("ppp") is True:
             return {"code": False, "differences": False, **values}
         return values

@@ -1,4 +1,4 @@
-"""What every table of settings has in common."""
+"""The base class of all tables of settings."""
 
 from __future__ import annotations
 
@@ -6,6 +6,6 @@ from pydantic import BaseModel, ConfigDict
 
 
 class Section(BaseModel):
-    """A table: unknown keys, infinities and changes are refused."""
+    """A table that refuses unknown keys and infinities and cannot be changed."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)

@@ -1,4 +1,4 @@
-"""All settings, each with its unit and a sentence."""
+"""All settings, each with its unit and a description."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from graphnav.sensors import list_sensors
 
 Profile = Literal["car", "car+odometer", "foot"]
 
-# What is made of the platform, below whatever the settings say themselves.
+# Defaults of each platform; any setting that is given overrides them.
 PROFILES: dict[str, dict[str, dict[str, Any]]] = {
     "car": {"vehicle": {"nhc": True, "odometer": False}},
     "car+odometer": {"vehicle": {"nhc": True, "odometer": True}},
@@ -36,7 +36,7 @@ class KeyframeSettings(Section):
 
 
 class AlignmentSettings(Section):
-    """The first attitude."""
+    """Initial attitude."""
 
     window: float = Field(30.0, gt=1, description="s of motion used to find the first attitude")
     prior_inflation: float = Field(
@@ -52,7 +52,7 @@ class AlignmentSettings(Section):
 
 
 class ImuSettings(Section):
-    """How the IMU's figures are used."""
+    """Use of the IMU."""
 
     coning: bool = Field(
         True, description="of a foot: rows are plain means; false for a unit that makes up for coning and sculling"
@@ -63,7 +63,7 @@ class ImuSettings(Section):
 
 
 class NoiseSettings(Section):
-    """How good the sensors are taken to be."""
+    """Noise model of the sensors."""
 
     mode: Literal["estimated", "stated"] = Field(
         "estimated", description="estimated from the recording by likelihood, or as the recording states it"
@@ -78,7 +78,7 @@ class NoiseSettings(Section):
 
 
 class SolverSettings(Section):
-    """The outer loop of the batch solver, and how long the incremental ones wait."""
+    """Iterations of the batch solver, and lags of the incremental solvers."""
 
     lag: float = Field(
         120.0, ge=1, description="s of future that a state has seen when the incremental solver lets it settle"
@@ -94,15 +94,15 @@ class SolverSettings(Section):
 
 
 class SensorSettings(Outliers):
-    """How a sensor beside IMU, GNSS and odometer is used."""
+    """Use of a sensor beside IMU, GNSS and odometer."""
 
     use: bool = Field(True, description="use its rows")
 
 
 class Settings(Section):
-    """Everything that can be set; `Settings()` is the default, `Settings(profile="car")` one of `PROFILES`.
+    """All settings; `Settings()` are the defaults, `Settings(profile="car")` those of one of `PROFILES`.
 
-    Without a profile everything is used that the recording's platform and sensors allow.
+    Without a profile, everything that the recording's platform and sensors permit is used.
     """
 
     profile: Profile | None = Field(None, description="what the recording is of: car, car+odometer or foot")
@@ -125,17 +125,17 @@ class Settings(Section):
         for name in sensors:
             if name not in list_sensors():
                 raise ValueError(f"no sensor '{name}' is known; {suggest_nearest(name, tuple(list_sensors()))}")
-        default = SensorSettings()  # which need not be kept
+        default = SensorSettings()  # not kept, so that settings with and without it are equal
         return {name: one for name, one in sensors.items() if one != default}
 
     def sensor(self, name: str) -> SensorSettings:
-        """How a sensor is used; as usual where nothing is set."""
+        """How a sensor is used; the defaults where nothing is set."""
         return self.sensors.get(name, SensorSettings())
 
     @model_validator(mode="before")
     @classmethod
     def _with_profile(cls, values: Any) -> Any:
-        """The profile's values where none are given."""
+        """Fill in the profile's values where none are given."""
         chosen = PROFILES.get(str(values.get("profile"))) if isinstance(values, Mapping) else None
         if chosen is None:
             return values
@@ -146,5 +146,5 @@ class Settings(Section):
         return merged
 
     def without_wheels(self) -> Settings:
-        """The same with nothing assumed of wheels."""
+        """The same settings without any assumption about wheels."""
         return self.model_copy(update={"vehicle": self.vehicle.model_copy(update={"nhc": False, "odometer": False})})

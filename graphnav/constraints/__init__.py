@@ -1,4 +1,4 @@
-"""One file per constraint; every concrete `Constraint` in this folder is found by itself."""
+"""One file per constraint; every concrete `Constraint` in this folder is found automatically."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from graphnav.recording import Recording
 
 @cache
 def list_constraints() -> tuple[type[Constraint], ...]:
-    """All constraint classes, in the order of their names."""
+    """All constraint classes, sorted by name."""
     found = {}
     for module in pkgutil.iter_modules(__path__):
         for member in vars(importlib.import_module(f"{__name__}.{module.name}")).values():
@@ -25,12 +25,12 @@ def list_constraints() -> tuple[type[Constraint], ...]:
 
 
 def kinds_for(recording: Recording) -> tuple[type[Constraint], ...]:
-    """Those of graphnav and those that a script adds for a recording."""
+    """The constraint classes for a recording: graphnav's own and those that a script adds."""
     return (*list_constraints(), *recording.own.constraints)
 
 
 def check_own(kinds: Sequence[type[Constraint]]) -> tuple[type[Constraint], ...]:
-    """Constraints of a script, in the order of their names.
+    """Check the constraints of a script and sort them by name.
 
     Raises
     ------

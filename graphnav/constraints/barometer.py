@@ -1,11 +1,11 @@
-"""Height by a barometer, with an offset that walks and a scale.
+"""Height by a barometer, with an offset that is a random walk and a scale.
 
     h + s (h - h_0) - z - b,   h = h(p) + v_up (t_r - t_k)
 
-z is the mean of the readings since the keyframe before, t_r the mean of their times and t_k the keyframe: what is read
-at any rate counts, and needs no state of its own. The offset b holds the weather, the geoid and where the sensor sits;
-the scale s the temperature of the air, from the frame's origin (h_0) on. It is of the height and not of the readings:
-their noise times a scale would draw it to whatever makes them small.
+z is the mean of the readings since the previous keyframe, t_r the mean of their times and t_k the keyframe: readings at
+any rate are used without states of their own. The offset b contains the weather, the geoid and the sensor's place; the
+scale s the temperature of the air, relative to the frame's origin (h_0). It scales the height and not the readings,
+whose noise times a scale would draw the estimate towards small readings.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ OFFSET, SCALE = "barometer_offset", "barometer_scale"
 
 @dataclass(frozen=True)
 class BarometricHeight(Constraint):
-    """The body was as high as its barometer said."""
+    """The height that the barometer read."""
 
     name: ClassVar[str] = "barometer"
     turns: ClassVar[bool] = True
@@ -43,13 +43,13 @@ class BarometricHeight(Constraint):
     }
 
     height: Array = field(default_factory=lambda: np.empty(0))  # (N,) m, mean of the readings
-    late: Array = field(default_factory=lambda: np.empty(0))  # (N,) s, mean of their times after the keyframe
+    late: Array = field(default_factory=lambda: np.empty(0))  # (N,) s, mean of their times relative to the keyframe
     frame: LocalFrame | None = None
     sigma: Array = field(default_factory=lambda: np.empty((0, 1)))
 
     @classmethod
     def epochs(cls, recording: Recording, settings: Settings, stationary: Array) -> Array:
-        return np.empty(0)  # any keyframe will do
+        return np.empty(0)  # any keyframe is suitable
 
     @classmethod
     def build(cls, scene: BuildContext) -> BarometricHeight | None:
@@ -57,7 +57,7 @@ class BarometricHeight(Constraint):
         if series is None:
             return None
         figures = series.figures
-        interval = np.searchsorted(scene.t, series.t - SAME_TIME)  # that ends at this keyframe
+        interval = np.searchsorted(scene.t, series.t - SAME_TIME)  # in the interval that ends at this keyframe
         inside = (interval > 0) & (interval < len(scene.t))
         interval, t, z = interval[inside], series.t[inside], standard_height(series)[inside]
         count = np.bincount(interval, minlength=len(scene.t))
@@ -91,7 +91,7 @@ class BarometricHeight(Constraint):
             above = h - self.frame.origin[2]
             residual, gain = residual + parameters[SCALE] * above, gain + parameters[SCALE]
             jacobians[SCALE] = above[..., None]
-        # the vertical turns with the place on a round Earth
+        # the vertical changes with position on a curved Earth
         level = (late * v[:, :2] / A)[:, None, :] @ C[:, :2]
         jacobians["p"] = gain[..., None] * (C[:, 2:] + level)
         jacobians["v"] = (gain * late)[..., None] * C[:, 2:]

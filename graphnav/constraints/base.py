@@ -1,10 +1,10 @@
-"""The contract of every constraint: written once, used by every solver.
+"""The interface of all constraints: written once, used by every solver.
 
-A constraint is N rows of m numbers, each row tied to one keyframe. `linearize` gives, at the states and
-parameter values of some rows, the residual (predicted minus measured), its derivative with respect to
-the error-state blocks and parameters it depends on, and the measurement's sigma. It knows nothing of
-filters or graphs, and no weights, gates or robust kernels: those belong to the solvers, which read
-`robust`, `robust_scale`, `gate`, `watched` and `weight`.
+A constraint is N rows of m numbers, each row tied to one keyframe. `linearize` gives, at the states and parameter
+values of some rows, the residual (predicted minus measured), its derivatives with respect to the blocks of the error
+state and the parameters it depends on, and the measurement's sigma. It contains no filter or graph, and no weights,
+gates or robust kernels: those belong to the solvers, which read `robust`, `robust_scale`, `gate`, `watched` and
+`weight`.
 """
 
 from __future__ import annotations
@@ -38,19 +38,19 @@ class Linearized:
 
 @dataclass(frozen=True)
 class BuildContext(Shared):
-    """What a constraint may look at to build its rows."""
+    """Everything from which a constraint builds its rows."""
 
     recording: Recording
     settings: Settings
     frame: LocalFrame
     t: Array  # (K,) keyframe times, s
-    stationary: Array  # (M, 2) spans in which the platform stands still, s
-    intervals: Intervals  # (K-1) between the keyframes
-    speed: MeanSpeed | None = None  # of the odometer, where it is known already
-    typical_sigmas: Array | None = None  # (M, 3) m, sigma that the fixes usually state, where it is known already
+    stationary: Array  # (M, 2) spans in which the platform is stationary, s
+    intervals: Intervals  # (K-1) intervals between the keyframes
+    speed: MeanSpeed | None = None  # preintegrated odometer, where it is available
+    typical_sigmas: Array | None = None  # (M, 3) m, typical sigma stated by the fixes, where it is available
 
     def series(self, name: str) -> Series | None:
-        """The rows of a sensor of `graphnav.sensors`; None where there are none, or the settings do not use it."""
+        """The rows of a sensor of `graphnav.sensors`; None where there are none, or the settings exclude it."""
         series = self.recording.sensors.get(name)
         return series if series is not None and len(series) and self.settings.sensor(name).use else None
 
@@ -62,16 +62,16 @@ class BuildContext(Shared):
         return np.where(np.abs(self.t[best] - t) < SAME_TIME, best, -1)
 
 
-SAME_TIME = 1e-6  # s; measurements closer than this share a keyframe
+SAME_TIME = 1e-6  # s; measurements closer together than this share a keyframe
 
 
 @dataclass(frozen=True)
 class UsualSigmas:
-    """What the fixes of a running drive usually state: the units of their errors that last."""
+    """Typical sigmas stated by the fixes of a running drive: the units of their time-correlated errors."""
 
     overall: Callable[[], Array]  # (3,) m, of positions
     around: Callable[[Array], Array]  # keyframes (N,) -> (N, 6) m and m/s, of position and velocity
-    spacing: float  # s, of the nodes of these errors
+    spacing: float  # s, between the nodes of these errors
 
 
 @dataclass(frozen=True)
@@ -81,54 +81,61 @@ class Constraint(ABC):
     name: ClassVar[str]
     axes: ClassVar[tuple[str, ...]]
     unit: ClassVar[str]
-    of_wheels: ClassVar[bool] = False  # True: its rows tell how the vehicle rolls, by how the IMU is mounted in it
-    looks_ahead: ClassVar[bool] = True  # False: once the intervals and the odometer are there, rows can be built
-    of_stops: ClassVar[bool] = False  # True: its rows are there because the platform stands
+    # True: its rows constrain how the vehicle rolls, given how the IMU is mounted in it
+    of_wheels: ClassVar[bool] = False
+    # False: rows can be built only once the intervals and the odometer are available
+    looks_ahead: ClassVar[bool] = True
+    of_stops: ClassVar[bool] = False  # True: its rows exist because the platform is stationary
     turns: ClassVar[bool] = False  # True: a turn of all states about the vertical changes nothing but what the Earth's
     # rate does, neither of the residuals nor of their sigmas
-    passes: ClassVar[int] = 1  # of a filter's update; more for rows that are far from linear over its uncertainty
-    depends_on: ClassVar[tuple[str, ...]] = tuple(BLOCKS)  # blocks to differentiate by, where `linearize` does not say
+    passes: ClassVar[int] = 1  # of a filter's update; more for rows that are strongly nonlinear over its uncertainty
+    # blocks for numerical differentiation, where `linearize` gives no Jacobians
+    depends_on: ClassVar[tuple[str, ...]] = tuple(BLOCKS)
     words: ClassVar[Mapping[str, tuple[tuple[str, str, float], ...]]] = {}  # of its parameters' numbers, for people:
     # what it is, a unit, and how many of these are one of the parameter's own
     noise_axes: ClassVar[tuple[str, ...]] = ()  # variance component of each axis; none: its sigmas are taken as stated
 
-    sensor: ClassVar[str] = ""  # of `graphnav.sensors` whose rows they are
-    fix_of: ClassVar[str] = ""  # of a receiver's fixes: the block of the state that each gives, "p" or "v"
+    sensor: ClassVar[str] = ""  # name of the sensor of `graphnav.sensors` that the rows come from
+    fix_of: ClassVar[str] = ""  # for fixes of a receiver: the block of the state that each measures, "p" or "v"
 
     keyframe: Array  # (N,) int, ascending
     parameters: tuple[Parameter, ...] = ()
     processes: tuple[
         Parameter, ...
-    ] = ()  # of its errors; parameters where a noise model has them (`graphnav.estimation.noise`)
+    ] = ()  # parameters of its time-correlated errors, where a noise model has them (`graphnav.estimation.noise`)
     robust: str = "none"
     robust_scale: float | Array = 3.0  # or (N,)
-    graduation: float = np.inf  # mu of graduated non-convexity; infinite at its end
+    graduation: float = np.inf  # mu of graduated non-convexity; infinite once it has converged
     gate: float | None = None
     watched: bool = False  # for errors that last
     unscaled: Array | None = None  # (N, m) part of the sigmas that no variance factor scales: known geometry
-    weight: Array | None = None  # (N,) of each row's information, 0 = not used; all 1 when None
-    notes: tuple[str, ...] = ()  # sentences that belong with the result
+    weight: Array | None = None  # (N,) weight of each row's information, 0 = not used; None: 1 for all
+    notes: tuple[str, ...] = ()  # notes to be reported with the result
 
     def __len__(self) -> int:
         return len(self.keyframe)
 
     @property
     def labels(self) -> dict[str, Array]:
-        """What a record of rows of satellites has beside them: their names, azimuths and elevations, (N,) each."""
+        """Names, azimuths and elevations of the satellites of the rows, (N,) each, for records; empty for other
+        rows.
+        """
         return {}
 
     def noise_groups(self) -> tuple[tuple[str, ...], Array]:
-        """Names of the variance components of the rows, and which of them each number (N, m) has; -1 for none."""
+        """Names of the variance components of the rows, and the component of each number (N, m); -1 for none."""
         names = tuple(dict.fromkeys(self.noise_axes))
         index = [names.index(axis) for axis in self.noise_axes] or [-1] * len(self.axes)
         return tuple(f"{self.name}.{name}" for name in names), np.tile(index, (len(self), 1))
 
     def typical_error(self) -> Array:
-        """(m,) typical 1-sigma of a whole error, white part and what lasts, of rows that are watched."""
+        """(m,) typical 1-sigma of a whole error, white and time-correlated, of watched rows."""
         raise NotImplementedError(f"{self.name}: rows that are watched say what their errors usually are")
 
     def in_units_of(self, usual: UsualSigmas) -> Self:
-        """The same rows, errors that last told in the units of a drive of which they are a part; of fixes alone."""
+        """The rows with time-correlated errors in the units of the whole drive, of which they are a part; fixes
+        only.
+        """
         return self
 
     def scale_of(self, rows: slice | Array) -> float | Array:
@@ -137,18 +144,19 @@ class Constraint(ABC):
 
     @classmethod
     def epochs(cls, recording: Recording, settings: Settings, stationary: Array) -> Array:
-        """Times (s) at which this constraint wants keyframes; none unless it says so."""
+        """Times (s) at which the constraint needs keyframes; none by default."""
         return np.empty(0)
 
     @classmethod
     @abstractmethod
     def build(cls, scene: BuildContext) -> Constraint | None:
-        """The rows for a recording, or None when it has nothing for this constraint."""
+        """Build the rows for a recording, or None when it has no data for this constraint."""
 
     def linearize(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> Linearized:
-        """Rows `rows` at `states` (one per row) and parameter values (n, k), one per row.
+        """Linearise rows `rows` at `states` (one per row) and parameter values (n, k), one per row.
 
-        One that gives no Jacobians has `residual` and a field `sigma` (N, m), and is differentiated numerically.
+        A constraint without Jacobians defines `residual` and a field `sigma` (N, m) instead, and is differentiated
+        numerically.
         """
 
         jacobians = {}
@@ -170,22 +178,22 @@ class Constraint(ABC):
         return Linearized(self.residual(states, parameters, rows), jacobians, sigma[rows])
 
     def residual(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> Array:
-        """(n, m) predicted minus measured, of a constraint that leaves its Jacobians to differences."""
+        """(n, m) predicted minus measured, for a constraint that is differentiated numerically."""
         raise NotImplementedError(f"{self.name}: has neither linearize nor residual")
 
 
-# rad, m, m/s, m/s^2, rad/s: central differences lose the square of a step and the digits of a residual over it
+# rad, m, m/s, m/s^2, rad/s: balance truncation error against rounding error of central differences
 _STEPS = {"theta": 1e-5, "p": 1e-1, "v": 1e-2, "ba": 1e-3, "bg": 1e-5}
 
 
 def _differentiate(f: Callable[[Array], Array], steps: Array) -> Array:
-    """(n, m, k) central differences of f (n, m) of a vector (k,) about zero."""
+    """(n, m, k) central differences about zero of f, (n, m), a function of a vector (k,)."""
     ways = np.diag(steps)
     return np.stack([(f(d) - f(-d)) / (2.0 * h) for d, h in zip(ways, steps, strict=True)], -1)
 
 
 def assemble(linearized: Linearized, parameters: dict[str, slice] | None = None, width: int = DIM) -> Array:
-    """The Jacobian over a whole error state.
+    """Assemble the Jacobian over a whole error state.
 
     Parameters
     ----------
@@ -212,7 +220,7 @@ def assemble(linearized: Linearized, parameters: dict[str, slice] | None = None,
 
 
 def weigh_sigma(rows: Constraint, sigma: Array, which: slice | Array = slice(None)) -> Array:
-    """Sigmas with the weights of their rows in them.
+    """Sigmas that include the weights of their rows.
 
     Parameters
     ----------

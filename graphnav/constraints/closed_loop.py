@@ -1,7 +1,7 @@
-"""The end is the start, where the recording states it: p_K - p_0, with p_0 where the frame begins.
+"""The drive ends where it starts, if the recording states so: p_K - p_0, with p_0 at the origin of the frame.
 
-Only for recordings whose positions count from their start (no GNSS), and never where the closure itself is what is
-to be judged.
+Only for recordings whose positions count from their start (no GNSS), and never where the loop closure error itself is
+evaluated.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class ClosedLoop(Constraint):
 
     @classmethod
     def epochs(cls, recording: Recording, settings: Settings, stationary: Array) -> Array:
-        return np.empty(0)  # the last keyframe is always there
+        return np.empty(0)  # there always is a last keyframe
 
     @classmethod
     def build(cls, scene: BuildContext) -> ClosedLoop | None:
@@ -40,7 +40,8 @@ class ClosedLoop(Constraint):
             return None
         note = Note(
             "closed_loop.set",
-            f"the end is set to be the start, to {sigma:g} m (closed_loop): the closure is no measure",
+            f"the end is constrained to the start, to {sigma:g} m (closed_loop): "
+            "the closure error is no measure of accuracy",
         )
         return cls(keyframe=np.array([len(scene.t) - 1]), sigma=np.full((1, 3), sigma), notes=(note,))
 

@@ -1,6 +1,6 @@
 """Heading and pitch of the line between two antennas.
 
-With the baseline b in body axes, turned by what its direction is wrong by (delta), and d = R_ln R_nb b::
+With the baseline b in body axes, corrected by the errors of its direction (delta), and d = R_ln R_nb b::
 
     heading:   atan2(d_east, d_north) - psi + delta_heading            from -pi to pi
     pitch:     atan2(d_up, |d_east, d_north|) - theta + delta_pitch
@@ -27,7 +27,7 @@ from graphnav.sensors.dual_antenna import SENSOR
 
 @dataclass(frozen=True)
 class Baseline(Constraint):
-    """What both angles share."""
+    """The part common to both angles."""
 
     unit: ClassVar[str] = "rad"
     sensor: ClassVar[str] = SENSOR.name
@@ -73,7 +73,7 @@ class Baseline(Constraint):
 
     @classmethod
     def _name_error(cls) -> str:
-        """Name of what the baseline's direction is wrong by."""
+        """Name of the parameter for the error of the baseline's direction."""
         return f"{SENSOR.name}_{cls.column}_offset"
 
     def linearize(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> Linearized:
@@ -95,7 +95,7 @@ class Baseline(Constraint):
 
 @dataclass(frozen=True)
 class DualHeading(Baseline):
-    """The second antenna lies in a direction from the first."""
+    """Heading of the line from the first antenna to the second."""
 
     name: ClassVar[str] = "dual_antenna_heading"
     axes: ClassVar[tuple[str, ...]] = ("heading",)
@@ -110,7 +110,7 @@ class DualHeading(Baseline):
 
 @dataclass(frozen=True)
 class DualPitch(Baseline):
-    """And so much above it."""
+    """Pitch of that line."""
 
     name: ClassVar[str] = "dual_antenna_pitch"
     axes: ClassVar[tuple[str, ...]] = ("pitch",)

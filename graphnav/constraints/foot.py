@@ -1,35 +1,34 @@
-"""What a foot allows: where the shoe is on the floor it does not slide, and in the air it goes where it points.
+"""Constraints of a foot: a shoe does not slide on the floor, and moves where it points in the air.
 
 Ren 2021 takes the IMU's velocity as zero in stance and its sideways velocity as zero in swing (eq. 6-9, 16-19). Both
-are nearly true only, and what is missing is not noise. Over the floor a shoe rolls, from the heel at its landing to
-the toes where it takes off, and the IMU on top of it, 5 to 15 cm above the sole, goes forward meanwhile: at
-0.2 rad/s in the middle of a stance 2 cm/s, 1.5 % of the way of a walk. What does not move is where shoe and floor
-touch. So the rows of `Stance` say, of the mean over each interval within a stance (see
-`constraints.vehicle.IntervalMotion`),
+hold only approximately, and the deviation is not noise. A shoe rolls over the floor, from the heel at landing to the
+toes at take-off, while the IMU on top of it, 5 to 15 cm above the sole, moves forward: at 0.2 rad/s in the middle of a
+stance by 2 cm/s, 1.5 % of the distance walked. The point at rest is where shoe and floor touch. So the rows of `Stance`
+are, for the mean over each interval within a stance (see `constraints.vehicle.IntervalMotion`),
 
     mean of  v_b + omega_nb x (l + c d)  =  0          l: pivot,  d = (d_x, d_y, 0): its travel,  c: -1 ... 1
 
 with the lever arm l from the IMU to the middle of the rolling and its travel d along the sole both estimated. c goes
-from -1 at the landing to 0 in `half_stance` and from 0 to 1 in as much before the foot leaves the floor; in a long
-stance, and in standing, nothing turns in between.
+from -1 at landing to 0 within `half_stance`, and from 0 to 1 over the same time before take-off; in between, in a long
+stance or in standing, nothing rolls.
 
-What is left is a share of the turn rate (the pivot is not a point, the sole gives way) and a little more:
+The remaining error is a share of the turn rate (the pivot is not a point, the sole is compliant) plus a small constant:
 
     sigma^2 = (still^2 + (rolling |omega|)^2) max(1, tau / T)
 
-The second factor is for errors that last: over a time tau they are one error, not one per interval of length T. What
-the pivot does not explain lasts for a stance, so tau is as long as one: its rows together weigh like one.
+The second factor accounts for correlation: over a time tau errors are one error, not one per interval of length T. What
+the pivot does not explain lasts for a stance, so tau is the length of one: its rows together weigh as one.
 
-A foot gives way under its weight, and does so in every step: arch and sole sink by some millimetres after the landing,
-and come back when the heel has risen already. That is no error of one stance but of all of them, and in the sigma it
-would average out over a walk as it does not in truth. So a velocity that comes back, `pattern`, is estimated as well,
-in the body's axes and linear in c between five nodes from -1 to 1, for tau after a landing and before a leaving.
+A foot deforms under load in every step: arch and sole sink by some millimetres after landing, and recover once the heel
+has risen. That error repeats in every stance; treated as noise it would average out over a walk, which it does not. So
+a repeating velocity, `pattern`, is estimated as well, in body axes and linear in c between five nodes from -1 to 1, for
+tau after landing and before take-off.
 
-In swing the foot hardly goes sideways. `FootLateral` says of the mean over each interval
+In swing the foot hardly moves sideways. The rows of `FootLateral` are, for the mean over each interval,
 
     u_x + a u_y + b u_z  =  0                          a, b: the foot's own sideways axis in the body's, estimated
 
-with a density made so that a whole swing counts as one row of `sideways`, wider by what the foot turns in it.
+with a density such that a whole swing counts as one row of `sideways`, wider the more the foot turns in it.
 """
 
 from __future__ import annotations
@@ -53,32 +52,35 @@ PIVOT = "pivot"
 TRAVEL = "pivot_travel"
 PATTERN = "stance_pattern"
 FOOT_AXIS = "foot_axis"
-_NODES = np.linspace(-1.0, 1.0, 5)  # of the pattern, in c
-_WIDE = 3 * len(_NODES)
-_SHORTEST = 0.01  # s; a mean over less says nothing
+_PATTERN_NODES = np.linspace(-1.0, 1.0, 5)  # nodes of the pattern, in c
+_WIDE = 3 * len(_PATTERN_NODES)
+_SHORTEST_MEAN = 0.01  # s; the mean over a shorter interval carries no information
 
 
 @dataclass(frozen=True)
 class Stance(Constraint):
-    """Where the shoe touches the floor it does not move."""
+    """The shoe does not slide where it touches the floor."""
 
     name: ClassVar[str] = "stance"
     turns: ClassVar[bool] = True
     of_stops: ClassVar[bool] = True
     axes: ClassVar[tuple[str, ...]] = ("right", "forward", "up")
     unit: ClassVar[str] = "m/s"
-    # velocity in the body turns with the attitude by as much as there is of it, and at a landing a filter expects a
+    # the velocity in body axes turns with the attitude, and at a landing a filter predicts a decimetre per second that
+    # the foot does not have: linearised there, its updates would seem to observe the heading
     # decimetre per second that the foot does not have: linearised there, it believes to learn of the heading
     passes: ClassVar[int] = 2
 
     past: IntervalMotion | None = None
     phase: Array = field(default_factory=lambda: np.empty(0))  # (N,) c
-    share: Array = field(default_factory=lambda: np.empty((0, len(_NODES))))  # of each node of the pattern
+    share: Array = field(
+        default_factory=lambda: np.empty((0, len(_PATTERN_NODES)))
+    )  # weight of each node of the pattern
     sigma: Array = field(default_factory=lambda: np.empty((0, 3)))
 
     @classmethod
     def epochs(cls, recording: Recording, settings: Settings, stationary: Array) -> Array:
-        """Both ends of every stance, and in stance and swing as many between them as `foot.rate` asks for."""
+        """Both ends of every stance, and keyframes between them at `foot.rate`, in stance and in swing."""
         if recording.platform != "foot" or not len(stationary):
             return np.empty(0)
         edges = np.unique(np.concatenate([[recording.start], stationary.ravel(), [recording.end]]))
@@ -125,20 +127,20 @@ class Stance(Constraint):
         J = {name: x[:, :3] for name, x in J.items()} | {PIVOT: by_lever, TRAVEL: phase[..., None] * by_lever[..., :2]}
         if PATTERN in parameters:
             share = self.share[rows]
-            u = u + np.einsum("nk,nki->ni", share, parameters[PATTERN].reshape(-1, len(_NODES), 3))
+            u = u + np.einsum("nk,nki->ni", share, parameters[PATTERN].reshape(-1, len(_PATTERN_NODES), 3))
             J[PATTERN] = np.kron(share[:, None], np.eye(3))
         return Linearized(u, J, self.sigma[rows])
 
 
 def _interpolate_phase(phase: Array) -> Array:
     """(N, 5) weights of the nodes for linear interpolation at phases (N,)."""
-    return np.maximum(0.0, 1.0 - np.abs(phase[:, None] - _NODES) / (_NODES[1] - _NODES[0]))
+    return np.maximum(0.0, 1.0 - np.abs(phase[:, None] - _PATTERN_NODES) / (_PATTERN_NODES[1] - _PATTERN_NODES[0]))
 
 
 def _mark_rolling(t: Array, span: Array, scene: BuildContext, lasts: float) -> Array:
-    """(N,) 1 at times t (N,) for so long after landing and before leaving in their stances (N, 2), else 0.
+    """(N,) 1 at times t (N,) within `lasts` s after landing and before take-off of their stances (N, 2), else 0.
 
-    A recording neither begins with a landing nor ends with a leaving.
+    The beginning of a recording is no landing, and its end no take-off.
     """
     landed = (t - span[:, 0] < lasts) & (span[:, 0] > scene.recording.start + SAME_TIME)
     leaves = (span[:, 1] - t < lasts) & (span[:, 1] < scene.recording.end - SAME_TIME)
@@ -147,7 +149,7 @@ def _mark_rolling(t: Array, span: Array, scene: BuildContext, lasts: float) -> A
 
 @dataclass(frozen=True)
 class FootLateral(Constraint):
-    """In the air a foot goes where it points."""
+    """The foot has no sideways velocity in swing."""
 
     name: ClassVar[str] = "foot_lateral"
     turns: ClassVar[bool] = True
@@ -159,18 +161,19 @@ class FootLateral(Constraint):
 
     @classmethod
     def epochs(cls, recording: Recording, settings: Settings, stationary: Array) -> Array:
-        return np.empty(0)  # those of the stances will do
+        return np.empty(0)  # the keyframes of the stances suffice
 
     @classmethod
     def build(cls, scene: BuildContext) -> FootLateral | None:
         s, iv = scene.settings.foot, scene.intervals
         if scene.recording.platform != "foot" or not len(scene.stationary) or not s.lateral:
             return None
-        moving = iv.T > _SHORTEST
+        moving = iv.T > _SHORTEST_MEAN
         moving[find_standing(scene)[0]] = False
         rows = np.flatnonzero(moving)
         past = IntervalMotion.of(iv, rows, scene.frame)
-        # a swing lies between two stances; the heading changes in it by the integral of the turn rate about the
+        # a swing lies between two stances; its heading change is the integral of the turn rate about the vertical, the
+        # direction of the mean force of a swing
         # vertical, which the force points to in the mean of a swing
         swing = np.searchsorted(scene.stationary[:, 0], iv.t0[rows])
         lasts = np.bincount(swing, weights=iv.T[rows])[swing]

@@ -7,16 +7,16 @@ ENU at the fix, where receivers state their sigmas::
     r_v = R_ln (u + a d) - v_meas                                a = R_nb (f_b - b_a) + g
     omega_nb = omega_b - b_g - R_nb^T omega_ie
 
-d is what must be added to the stamps of the fixes, one constant for positions and one for velocities: a
-receiver's filters delay them differently (boulder's differ by 0.1 s, dresden's by 0.7 s). To it comes what the stamp of
-a single fix is wrong by, where fixes are stamped when they arrive: white, the same for position and velocity of a fix.
+d is added to the stamps of the fixes, one constant for positions and one for velocities: a receiver's filters delay
+them differently (boulder's differ by 0.1 s, dresden's by 0.7 s). Where fixes are stamped on arrival, each stamp has an
+error of its own as well: white, and common to the position and velocity of a fix.
 
-e is the time-correlated part of a position's error: fixes of one receiver seconds apart are wrong alike, and a thousand
-of them are not worth a thousand. It is the sum of three Gauss-Markov processes in units of the stated sigma: one of
-seconds (reflections), one of minutes (multipath as satellites move, satellites coming and going) and one of hours
-(orbits, atmosphere, the base's coordinates). The stated sigma itself is that of the white part. How much of each there
-is, the noise model says (`graphnav.estimation.noise`), for each type of fix where there are several: what fixed and
-single-point fixes are wrong by has nothing to do with each other. With stated noise there is the white part alone.
+e is the time-correlated part of a position's error: errors of one receiver's fixes seconds apart are nearly equal, so a
+thousand fixes are not a thousand independent measurements. It is the sum of three Gauss-Markov processes in units of
+the stated sigma: one of seconds (multipath), one of minutes (multipath as satellites move, changes of the satellites in
+view) and one of hours (orbits, atmosphere, coordinates of the base). The stated sigma itself is that of the white part.
+The noise model estimates the size of each (`graphnav.estimation.noise`), for each type of fix where there are several:
+errors of fixed and of single-point solutions are unrelated. With stated noise there is only the white part.
 """
 
 from __future__ import annotations
@@ -37,15 +37,16 @@ from graphnav.recording import FIX_TYPES, Imu, Recording
 LEVER_ARM = "gnss_lever_arm"
 TIME_OFFSET = "gnss_time_offset"
 VELOCITY_TIME_OFFSET = "gnss_velocity_time_offset"
-TIMES = ("seconds", "minutes", "hours")  # of the processes of a position's error
+TIMES = ("seconds", "minutes", "hours")  # correlation times of the processes of a position's error
 ERRORS = tuple(f"gnss_error_of_{time}" for time in TIMES)
 VELOCITY_ERROR = "gnss_velocity_error"
 STAMP_ERROR = "gnss_stamp_error"
-STAMPS = "gnss_position.stamps"  # its variance component
-OFFSETS = {f"prior.{name}": name for name in (TIME_OFFSET, VELOCITY_TIME_OFFSET)}  # and those of the offsets' priors
+STAMPS = "gnss_position.stamps"  # variance component of the stamp errors
+# variance components of the offsets' priors
+OFFSETS = {f"prior.{name}": name for name in (TIME_OFFSET, VELOCITY_TIME_OFFSET)}
 _I3 = np.eye(3)
 _MINUTE = 60.0  # s
-_WHITE = 1e-3  # s, a correlation time that leaves nothing from one fix to the next
+_WHITE = 1e-3  # s, a correlation time at which nothing is left from one fix to the next
 _HALF_WINDOW = 0.05  # s each side over which turn rate and force at a fix are averaged
 
 
@@ -54,14 +55,14 @@ def _make_empty(*shape: int) -> Array:
 
 
 def _mask_covered(recording: Recording) -> Array:
-    """Mask of the fixes the IMU covers."""
+    """Mask of the fixes within the IMU's time span."""
     assert recording.gnss is not None
     t = recording.gnss.t
     return (t >= recording.start - SAME_TIME) & (t <= recording.end + SAME_TIME)
 
 
 def _build_common(scene: BuildContext, offset: str) -> dict[str, Any]:
-    """Parameters and what the solvers want to know, from the settings."""
+    """The parameters of both constraints and their treatment of outliers, from the settings."""
     settings, gnss = scene.settings.gnss, scene.recording.gnss
     assert gnss is not None
     parameters: list[Parameter] = []
@@ -74,11 +75,11 @@ def _build_common(scene: BuildContext, offset: str) -> dict[str, Any]:
 
 
 def _stamp_error(settings: Settings, t: Array) -> tuple[Parameter, ...]:
-    """What the stamps of single fixes are wrong by, in units of what an offset of all of them may be."""
+    """Error of the stamps of single fixes, in units of the 1-sigma of their common offset."""
     sigma = np.full(1, settings.gnss.time_offset_sigma)
     if not sigma[0] > 0.0:
         return ()
-    # a node at every fix, however soon it follows: two fixes with one stamp error would contradict each other
+    # a node at every fix, however close: two fixes with one stamp error would contradict each other
     spacing = min(float(np.diff(t).min()), NODE_SPACING) if len(t) > 1 else NODE_SPACING
     own = (STAMPS,)
     return (
@@ -87,14 +88,14 @@ def _stamp_error(settings: Settings, t: Array) -> tuple[Parameter, ...]:
 
 
 def _time_offset(parameters: dict[str, Array], constant: str) -> Array | None:
-    """(n, 1) s to be added to stamps, and None where nothing of it is estimated."""
+    """(n, 1) s to be added to stamps, and None where no part of it is estimated."""
     some = [parameters[name] for name in (constant, STAMP_ERROR) if name in parameters]
     return np.asarray(sum(some)) if some else None
 
 
 @dataclass(frozen=True)
 class GnssPosition(Constraint):
-    """The antenna was at a fix."""
+    """The position of the antenna at a fix."""
 
     name: ClassVar[str] = "gnss_position"
     axes: ClassVar[tuple[str, ...]] = ("east", "north", "up")
@@ -112,11 +113,11 @@ class GnssPosition(Constraint):
     omega_n: Array = field(default_factory=lambda: np.zeros(3))  # Earth rate
     unit_error: Array = field(
         default_factory=lambda: _make_empty(0, 3)
-    )  # the same, smoothed: the unit of lasting errors
+    )  # the same, smoothed: unit of the time-correlated errors
     usual_error: Array = field(
         default_factory=lambda: np.zeros(3)
-    )  # median of these: the unit of what lasts for minutes and hours
-    type: Array | None = None  # (N,) of graphnav.recording.FIX_TYPES, where there are several
+    )  # median of these: unit of the errors of minutes and hours
+    type: Array | None = None  # (N,) index into graphnav.recording.FIX_TYPES, where there are several types
 
     @classmethod
     def epochs(cls, recording: Recording, settings: Settings, stationary: Array) -> Array:
@@ -207,7 +208,7 @@ class GnssPosition(Constraint):
         residual, jacobians = mv(C, away), {block: C @ x for block, x in J.items()}
         for name in parameters:
             if name.startswith(ERRORS):
-                # in units that change from fix to fix, a level that lasts would give itself away by these changes
+                # a lasting error in units that change from fix to fix would be observable by these changes
                 unit = self.usual_error if name.startswith(ERRORS[1:]) else self.unit_error[rows]
                 size = np.broadcast_to(unit, residual.shape) * self._of(name, rows)
                 residual = residual + size * parameters[name]
@@ -215,7 +216,7 @@ class GnssPosition(Constraint):
         return Linearized(residual, jacobians, self.sigma[rows])
 
     def _of(self, name: str, rows: slice | Array) -> float | Array:
-        """Whose a process is: 1 where it is the error of a fix, 0 where the fix is of another type."""
+        """1 where a process is the error of a fix, 0 where the fix is of another type."""
         if self.type is None:
             return 1.0
         kind = next(k for k, kind in FIX_TYPES.items() if name.endswith(kind))
@@ -224,7 +225,7 @@ class GnssPosition(Constraint):
 
 @dataclass(frozen=True)
 class GnssVelocity(Constraint):
-    """The antenna moved with a velocity."""
+    """The velocity of the antenna at a fix."""
 
     name: ClassVar[str] = "gnss_velocity"
     axes: ClassVar[tuple[str, ...]] = ("east", "north", "up")
@@ -242,7 +243,7 @@ class GnssVelocity(Constraint):
     lever_arm: Array = field(default_factory=lambda: np.zeros(3))
     unit_error: Array = field(
         default_factory=lambda: _make_empty(0, 3)
-    )  # stated sigma, smoothed: the unit of lasting errors
+    )  # stated sigma, smoothed: unit of the time-correlated errors
 
     @classmethod
     def epochs(cls, recording: Recording, settings: Settings, stationary: Array) -> Array:
@@ -312,7 +313,7 @@ class GnssVelocity(Constraint):
 
 
 def _bound_typical_error(rows: GnssPosition | GnssVelocity) -> Array:
-    """At least what the receiver claims: a fix that keeps to that is no wrong one, however good the others are."""
+    """At least the stated sigma: a fix within it is not wrong, however good the others are."""
     lasting = sum((p.sigma**2 for p in rows.parameters if p.name.startswith((*ERRORS, VELOCITY_ERROR))), np.zeros(3))
     whole = np.sqrt(rows.sigma**2 + lasting * rows.unit_error**2)
     return np.asarray(np.median(np.maximum(whole, rows.unit_error), axis=0))
@@ -324,9 +325,9 @@ def period(t: Array) -> float:
 
 
 def node_spacing(slow_times: tuple[float, ...], dt: float) -> float:
-    """How far apart (s) nodes of lasting errors may be, whose value stays from one to the next.
+    """Spacing (s) of the nodes of time-correlated errors, between which the value is held.
 
-    A process of seconds needs one at every fix, `dt` s apart, up to a fifth of its correlation time.
+    A process of seconds needs one node per fix, `dt` s apart, up to a fifth of its correlation time.
     """
     return max(dt, min(0.2 * SECONDS, *(0.01 * time for time in slow_times), NODE_SPACING))
 
@@ -334,7 +335,7 @@ def node_spacing(slow_times: tuple[float, ...], dt: float) -> float:
 def _compute_running_median(t: Array, sigma: Array) -> Array:
     """Running median of sigmas over a minute.
 
-    A lasting error times a sigma that jumps from fix to fix would jump with it, and so give itself away.
+    A lasting error times a sigma that jumps from fix to fix would jump too, and thus be observable.
     """
     size = 2 * int(np.clip(_MINUTE / period(t) / 2, 0, (len(t) - 1) // 2)) + 1
     return run_median(sigma, size)
@@ -362,7 +363,9 @@ def acceleration(states: States, accel: Array, g_n: Array) -> tuple[Array, dict[
 
 
 def average_around(imu: Imu, x: Array, t: Array) -> Array:
-    """(N, 3) mean of an IMU signal around times t: one sample's vibration would be noise times lever arm."""
+    """(N, 3) mean of an IMU signal around times t: vibration in a single sample, times the lever arm, would be
+    noise.
+    """
     lo = np.searchsorted(imu.t, t - _HALF_WINDOW)
     hi = np.maximum(np.searchsorted(imu.t, t + _HALF_WINDOW), lo + 1)
     lo, hi = np.minimum(lo, len(imu.t) - 1), np.minimum(hi, len(imu.t))

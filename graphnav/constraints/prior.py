@@ -1,6 +1,6 @@
-"""What is believed of the first state before any measurement.
+"""Prior of the first state, before any measurement.
 
-r = x_0 [-] x_hat,  the error state of the first keyframe about the alignment's answer
+r = x_0 [-] x_hat, the error state of the first keyframe about the result of the alignment
 """
 
 from __future__ import annotations
@@ -20,7 +20,9 @@ from graphnav.recording import Recording
 
 @dataclass(frozen=True)
 class InitialPrior(Constraint):
-    """One row of fifteen at the first keyframe; the filter starts from it, the graph holds it as a factor."""
+    """One row of fifteen numbers at the first keyframe: the filter's initial state and covariance, a factor in the
+    graph.
+    """
 
     name: ClassVar[str] = "initial_prior"
     axes: ClassVar[tuple[str, ...]] = tuple(
@@ -37,7 +39,7 @@ class InitialPrior(Constraint):
 
     @classmethod
     def build(cls, scene: BuildContext) -> InitialPrior | None:
-        return None  # comes from the alignment, not from the recording
+        return None  # it comes from the alignment, not from the recording
 
     def linearize(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> Linearized:
         assert self.mean is not None

@@ -1,21 +1,22 @@
-"""What standing still says: no velocity, no turn rate, and the place where the platform stopped.
+"""Constraints of a stationary platform: zero velocity, zero turn rate, and the place where it stopped.
 
-Skog et al. 2010 (zero velocity), Li 2024 (the same, found by the engine's idling). While the wheels stand::
+Skog et al. 2010 (zero velocity), Li 2024 (the same, detected by the idling engine). While the wheels do not turn::
 
     zero velocity:   R_nb^T v
     zero rate:       omega_b - b_g - R_nb^T omega_n        mean over the interval that ends at the keyframe
     held position:   p - a                                 a: one unknown place for each stop
 
-The velocity is taken in the body, where an unknown heading has no part in it: in n, a filter that comes to a stop with
-a speed left over would learn from it that its heading is right. So would it from a way that it has gone since the stop
-began, so the place is held from the end of the first interval on, whose velocity is known by then.
+The velocity is taken in body axes, where it does not depend on an unknown heading. In n, a filter that stops with a
+residual velocity error would take its update for an observation of the heading. A displacement since the beginning of
+the stop would have the same effect, so the place is held from the end of the first interval on, when the velocity is
+known.
 
-For a foot the first and the last give way to `graphnav.constraints.foot`; the second holds where it really stands.
+For a foot, `graphnav.constraints.foot` replaces the first and the last; zero rate is used where the foot stands still.
 
-A body on springs is not perfectly still: passengers move it, the engine shakes it. How much, the recording says
-itself: the scatter of the one-interval means of force and rate around their median, over a few intervals, is what
-the sigmas are made of, on top of the sensors' own noise. A force that scatters by s moves a body that sways at 1 Hz
-or more by no more than s / (2 pi) in velocity and s / (2 pi)^2 in position.
+A body on springs is not perfectly still: passengers move it, the engine shakes it. The recording shows how much: the
+sigmas follow from the scatter of the one-interval means of force and rate around their median over a few intervals, in
+addition to sensor noise. A body that sways at 1 Hz or more and whose force scatters by s moves by at most s / (2 pi) in
+velocity and s / (2 pi)^2 in position.
 """
 
 from __future__ import annotations
@@ -34,18 +35,18 @@ from graphnav.core.state import Parameter, States
 from graphnav.recording import Recording
 
 PLACE = "stop_position"
-_NEIGHBOURS = 5  # intervals over which unrest is looked for
-_SWAY = 2.0 * np.pi  # rad/s, the slowest swaying of a body on springs
-_STILL_V, _STILL_P = 1e-3, 1e-3  # m/s, m: no body stands stiller than this
-_FASTEST = 60.0  # m/s; times the seconds without a fix: how far from the last one a stop may be
-_ROLLING = 0.1  # rad/s; a foot that rolls over its stance turns quicker
+_NEIGHBOURS = 5  # intervals over which residual motion is measured
+_SWAY_RATE = 2.0 * np.pi  # rad/s, the slowest sway of a body on springs
+_STILL_V, _STILL_P = 1e-3, 1e-3  # m/s, m: lower limits for any body
+_FASTEST = 60.0  # m/s; times the seconds without a fix: bound on the distance of a stop from the last one
+_ROLLING = 0.1  # rad/s; a foot that rolls over its stance turns faster
 _LIFTING = 0.15  # s at either end of standing, in which the heel may have begun to lift
-_STANDING = 0.6  # s; in a walk no stance is that quiet for so long
+_STANDING = 0.6  # s; no stance of a walk is that quiet for so long
 _I3 = np.eye(3)
 
 
 def find_standing(scene: BuildContext) -> tuple[Array, Array]:
-    """Indices of the intervals inside stationary spans, and of the span each lies in."""
+    """Indices of the intervals inside stationary spans, and of the span of each."""
     iv, spans = scene.intervals, scene.stationary
     if not len(spans):
         return np.empty(0, dtype=int), np.empty(0, dtype=int)
@@ -56,9 +57,9 @@ def find_standing(scene: BuildContext) -> tuple[Array, Array]:
 
 
 def _find_standing(scene: BuildContext, rows: Array, stop: Array) -> tuple[Array, Array]:
-    """Those of the intervals in which a foot does not roll over its stance but stands, and in which standing.
+    """The intervals in which a foot stands rather than rolls over its stance, and the stop of each.
 
-    They last together for longer than any stance of a walk is that quiet, at less than the rate of the slowest rolling.
+    Together they last longer than any stance of a walk is that quiet, at less than the rate of the slowest rolling.
     """
     iv = scene.intervals
     rate = iv.rate[rows]
@@ -78,12 +79,13 @@ def _find_standing(scene: BuildContext, rows: Array, stop: Array) -> tuple[Array
 
 
 def _estimate_swaying(rate: Array, T: Array, run: Array) -> Array:
-    """1-sigma (N, 3), rad/s, of the mean rates (N, 3) of intervals in which a foot stands, from how its angle wanders.
+    """1-sigma (N, 3), rad/s, of the mean rates (N, 3) of intervals in which a foot stands, from the wander of its
+    angle.
 
-    A standing body sways slowly: where its rate passes zero it is not still, and what it does in one interval it does
-    in the next. So the rates are taken to be white with the density q by which the angle of a whole run of intervals
-    departs from a straight line. For a random walk of length T that departure has the variance q T / 15 (regression
-    of a Wiener process on time); a body that sways about its balance departs no less for its q.
+    A standing body sways slowly: it is not still where its rate crosses zero, and rates of successive intervals are
+    correlated. So they are modelled as white with the density q by which the angle over a run of intervals departs from
+    a straight line. For a random walk of length T that departure has the variance q T / 15 (regression of a Wiener
+    process on time); a body that sways about an equilibrium departs no less for its q.
     """
     out = np.zeros_like(rate)
     for one in np.unique(run):
@@ -97,8 +99,8 @@ def _estimate_swaying(rate: Array, T: Array, run: Array) -> Array:
     return out
 
 
-def unrest(scene: BuildContext, rows: Array, stop: Array) -> tuple[Array, Array]:
-    """Scatter (N, 3) of force (m/s^2) and rate (rad/s) around each interval, sensors' own noise not included."""
+def measure_unrest(scene: BuildContext, rows: Array, stop: Array) -> tuple[Array, Array]:
+    """Scatter (N, 3) of force (m/s^2) and rate (rad/s) around each interval, without sensor noise."""
     iv, noise = scene.intervals, scene.recording.imu.noise
     T = iv.T[rows][:, None]
     out = []
@@ -114,7 +116,7 @@ def unrest(scene: BuildContext, rows: Array, stop: Array) -> tuple[Array, Array]
 
 
 class _Standing(Constraint):
-    """Rows at the ends of the intervals in which the platform stands."""
+    """Rows at the ends of the intervals in which the platform is stationary."""
 
     looks_ahead: ClassVar[bool] = False
     of_stops: ClassVar[bool] = True
@@ -126,7 +128,7 @@ class _Standing(Constraint):
 
 @dataclass(frozen=True)
 class ZeroVelocity(_Standing):
-    """The platform does not move (ZUPT)."""
+    """The platform does not move (zero-velocity update, ZUPT)."""
 
     name: ClassVar[str] = "zero_velocity"
     turns: ClassVar[bool] = True
@@ -140,9 +142,9 @@ class ZeroVelocity(_Standing):
         rows, stop = find_standing(scene)
         if not len(rows) or not scene.settings.standstill.zero_velocity or scene.recording.platform == "foot":
             return None
-        force, _ = unrest(scene, rows, stop)
-        # how a body sways is not told by axis: its largest for all
-        sigma = np.hypot(_STILL_V, force.max(axis=1, keepdims=True) / _SWAY)
+        force, _ = measure_unrest(scene, rows, stop)
+        # how a body sways cannot be observed per axis: the largest is used for all
+        sigma = np.hypot(_STILL_V, force.max(axis=1, keepdims=True) / _SWAY_RATE)
         return cls(keyframe=rows + 1, sigma=np.broadcast_to(sigma, (len(rows), 3)))
 
     def linearize(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> Linearized:
@@ -153,7 +155,7 @@ class ZeroVelocity(_Standing):
 
 @dataclass(frozen=True)
 class ZeroRate(_Standing):
-    """The platform does not turn: the gyro reads its bias and the Earth (ZARU)."""
+    """The platform does not turn: the gyro reads its bias and the Earth's rate (ZARU)."""
 
     name: ClassVar[str] = "zero_rate"
     turns: ClassVar[bool] = True
@@ -171,7 +173,7 @@ class ZeroRate(_Standing):
             rows, stop = _find_standing(scene, rows, stop)
         if not len(rows) or not scene.settings.standstill.zero_rate:
             return None
-        _, rate = unrest(scene, rows, stop)
+        _, rate = measure_unrest(scene, rows, stop)
         own = scene.recording.imu.noise.gyro_noise_density / np.sqrt(scene.intervals.T[rows])
         if scene.recording.platform == "foot":
             rate = np.hypot(rate, _estimate_swaying(scene.intervals.rate[rows], scene.intervals.T[rows], stop))
@@ -191,7 +193,7 @@ class ZeroRate(_Standing):
 
 @dataclass(frozen=True)
 class HeldPosition(_Standing):
-    """The platform is where it stopped."""
+    """The platform stays where it stopped."""
 
     name: ClassVar[str] = "held_position"
     axes: ClassVar[tuple[str, ...]] = ("east", "north", "up")
@@ -204,8 +206,8 @@ class HeldPosition(_Standing):
         rows, stop = find_standing(scene)
         if not len(rows) or not scene.settings.standstill.held_position or scene.recording.platform == "foot":
             return None
-        force, _ = unrest(scene, rows, stop)
-        sigma = np.hypot(_STILL_P, force.max(axis=1, keepdims=True) / _SWAY**2)
+        force, _ = measure_unrest(scene, rows, stop)
+        sigma = np.hypot(_STILL_P, force.max(axis=1, keepdims=True) / _SWAY_RATE**2)
         return cls(
             keyframe=rows + 1,
             sigma=np.repeat(sigma, 3, axis=1),
@@ -218,7 +220,9 @@ class HeldPosition(_Standing):
 
 
 def _guess_places(scene: BuildContext, stops: Array) -> Parameter:
-    """One unknown place per stop: about where the fixes around it say, as far off as a vehicle can go meanwhile."""
+    """One unknown place per stop: initially that of the fixes around it, with the range of a vehicle since then as
+    sigma.
+    """
     begins = scene.stationary[stops, 0]
     gnss = scene.recording.gnss
     if gnss is None or len(gnss.t) < 2:

@@ -1,14 +1,14 @@
-"""What wheels allow: no sideways or upward speed where they do not slip, and forward speed as the odometer has it.
+"""Constraints of wheels: no sideways or upward velocity, and the forward speed that the odometer measured.
 
 Zhu 2020, eq. 10-19, with two differences. First, the constraint is on the mean velocity over the whole interval
-that ends at a keyframe, not on the velocity of one moment. Seen from the state at the end, s seconds later, with
-C(s) the rotation from the axes then to those at s, which the gyro gives::
+that ends at a keyframe, not on the velocity at one moment. Expressed by the state at the end, s seconds later, with
+C(s) the rotation from the axes at the end to those at s, which the gyro gives::
 
     v_b(s) = C(s) R_nb^T (v - (g - omega_n x v) s) - C(s) dV(s)       dV(s): force integrated from s to the end
     u      = mean of v_b + omega_nb x l                               at the lever arm l
 
-So every reading of a fast odometer counts, and what the springs do within a second averages out. Second, a car is
-not a cart: with the mounting angles pitch alpha and heading beta of the IMU against the vehicle,
+So every reading of a fast odometer is used, and motion on the springs within a second averages out. Second, a car is
+not a rigid cart: with the mounting angles pitch alpha and heading beta of the IMU against the vehicle,
 R_vb = Rz(-beta) Rx(alpha), and u_v = R_vb u = (right, forward, up)::
 
     right:    u_v,x - slip  u_v,y (u_v,y omega_z)     tyres need a slip angle for lateral acceleration
@@ -18,9 +18,9 @@ R_vb = Rz(-beta) Rx(alpha), and u_v = R_vb u = (right, forward, up)::
 Both coefficients, the mounting angles (which wander: load, wind, the crown of the road), the forward place of the
 axle that does not slip, and the scale are estimated.
 
-The sigma of a mean over T seconds is a density over sqrt(T), and more where the rules hold less: beyond 3 m/s^2 of
-lateral force tyres leave their linear range; in quick yaw the axle's place matters; where pitch changes quickly
-(ramps, bumps) front and rear axle are on different slopes, half a wheelbase apart.
+The sigma of a mean over T seconds is a density over sqrt(T), and larger where the constraints hold less well: beyond 3
+m/s^2 of lateral force tyres leave their linear range; in quick yaw the axle's place matters; where pitch changes
+quickly (ramps, bumps) front and rear axle are on different slopes, half a wheelbase apart.
 """
 
 from __future__ import annotations
@@ -48,15 +48,15 @@ BODY = "slip_squat"
 ODOMETER_SCALE = "odometer_scale"
 ODOMETER_DELAY = "odometer_delay"
 NHC_ERROR, ODOMETER_ERROR = "nhc_error", "odometer_error"
-REACH = 4.0  # sigmas of the delay that rows are prepared for
-_SHORTEST = 0.02  # s; a mean over less says nothing
+REACH = 4.0  # sigmas of the delay that the rows cover
+_SHORTEST_MEAN = 0.02  # s; the mean over a shorter interval carries no information
 _LINEAR = 3.0  # m/s^2, lateral force up to which tyres behave linearly
 _BEYOND = 0.1  # m/s of sideways speed per m/s^2 beyond that
-_AXLE_LEFT = 0.2  # m, what is not known of the axle's place in a turn: front wheels steer, tyres have width
+_AXLE_LEFT = 0.2  # m, uncertainty of the axle's place in a turn: front wheels steer, tyres have width
 _HALF_WHEELBASE = 1.3  # m
 _I2, _I3 = np.eye(2), np.eye(3)
 _E_Y = np.array([[0.0, 1.0, 0.0]])
-_AHEAD = _E_Y[None]
+_FORWARD = _E_Y[None]
 _SIDE_UP = _I3[None, ::2]
 _BY_HEADING = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]])  # u @ this = (u_y, -u_x, 0)
 _BY_AXLE = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 0.0], [-1.0, 0.0, 0.0]])  # omega @ this = omega x e_y
@@ -66,21 +66,21 @@ _BY_AXLE = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 0.0], [-1.0, 0.0, 0.0]])  # ome
 class IntervalMotion:
     """Mean velocity and force over the intervals that end at some keyframes, as a function of the state there.
 
-    Six numbers and their derivatives by what they are made of, velocity first.
+    Six numbers and their derivatives, velocity first.
     """
 
     frame: LocalFrame
     by_seen: Array  # (N, 6, 9) of `Intervals.past_*`: by v, g - omega_n x v and omega_n, in body axes
     by_ba: Array  # (N, 6, 3)
-    felt: Array  # (N, 6) less the velocity gained, and the mean force
-    ba: Array  # (N, 3) the biases they were computed with
+    felt: Array  # (N, 6) minus the velocity gained, and the mean force
+    ba: Array  # (N, 3) the biases used for them
     bg: Array
-    rate: Array  # (N, 3) mean rate and force, less those biases
+    rate: Array  # (N, 3) mean rate and force, minus those biases
     force: Array
 
     @classmethod
     def of(cls, intervals: Intervals, rows: Array, frame: LocalFrame) -> IntervalMotion:
-        """The past of the intervals `rows`."""
+        """Select the intervals `rows`."""
         iv, n = intervals, len(rows)
         by_seen, by_ba = np.zeros((n, 6, 9)), np.empty((n, 6, 3))
         by_seen[:, :3, :3], by_seen[:, :3, 3:6], by_seen[:, 3:, 3:6] = iv.past_turn[rows], -iv.past_late[rows], _I3
@@ -91,10 +91,10 @@ class IntervalMotion:
     def velocity(
         self, states: States, parameters: dict[str, Array], rows: slice | Array, lever: Array
     ) -> tuple[Array, Array, dict[str, Array]]:
-        """u (N, 3) at a lever arm and the mean acceleration, (N, 6), turn rate, and the derivatives of the first.
+        """u (N, 3) at a lever arm and the mean acceleration, (N, 6), turn rate, and the derivatives of the first. All
+        in body axes.
 
-        All in body axes. The acceleration is without what turning brings, as springs feel it: what the accelerometer
-        reads less gravity.
+        The acceleration excludes centripetal and tangential terms, as springs sense it: accelerometer minus gravity.
         """
         by_seen, by_ba, rate, force = self.by_seen[rows].copy(), self.by_ba[rows], self.rate[rows], self.force[rows]
         W, n = self.frame.W, len(states)
@@ -110,7 +110,7 @@ class IntervalMotion:
         cross, L = rotation.skew(seen), rotation.skew(lever)
         by_seen[:, :3, :3] += by_seen[:, :3, 3:6] @ rotation.skew(dg)
         by_seen[:, :3, 6:] = L
-        seen[:, 2] -= rate - dg  # the turn rate, negative
+        seen[:, 2] -= rate - dg  # minus the turn rate
         found = mv(by_seen, seen.reshape(n, 9)) + mv(by_ba, da) + self.felt[rows]
         by_bg = np.zeros((n, 6, 3))
         by_bg[:, :3] = L - by_seen[:, :3, 3:6] @ cross[:, 0]
@@ -139,7 +139,7 @@ def _rotate_to_vehicle(u: Array, mounting: Array) -> tuple[Array, Array, Array]:
 
 @dataclass(frozen=True)
 class Wheels(Constraint):
-    """What both constraints share: where rows are, and u_v with its derivatives."""
+    """The part common to both constraints: the keyframes, and u_v with its derivatives."""
 
     looks_ahead: ClassVar[bool] = False
     of_wheels: ClassVar[bool] = True
@@ -149,7 +149,7 @@ class Wheels(Constraint):
 
     @classmethod
     def epochs(cls, recording: Recording, settings: Settings, stationary: Array) -> Array:
-        return np.empty(0)  # any keyframe will do
+        return np.empty(0)  # any keyframe is suitable
 
     def _velocity(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> _Velocity:
         assert self.past is not None
@@ -171,7 +171,7 @@ class _Velocity:
     J: dict[str, Array]  # (N, 6, k) `IntervalMotion.velocity`
 
     def derivatives(self, A: Array, parameters: dict[str, Array], by_forward: Array | None = None) -> dict[str, Array]:
-        """Of A u (N, m) for A (N, m, 3), plus `by_forward` (N, m) times the forward acceleration."""
+        """Derivatives of A u (N, m) for A (N, m, 3), plus `by_forward` (N, m) times the forward acceleration."""
         B = A @ self.R_vb
         if by_forward is None:
             out = {name: B @ x[:, :3] for name, x in self.J.items()}
@@ -187,21 +187,21 @@ class _Velocity:
 
 
 def find_moving_rows(scene: BuildContext) -> Array:
-    """Indices of the intervals in which the vehicle does not stand, long enough to mean something."""
+    """Indices of the intervals in which the vehicle moves, long enough to carry information."""
     t0, t1 = scene.intervals.t0, scene.intervals.t1
-    usable = t1 - t0 >= _SHORTEST
+    usable = t1 - t0 >= _SHORTEST_MEAN
     for begin, end in scene.stationary:
         usable &= (t1 <= begin + SAME_TIME) | (t0 >= end - SAME_TIME)
     return np.flatnonzero(usable)
 
 
-def interval_motion(scene: BuildContext) -> IntervalMotion:
-    """Of the intervals `moving_rows`."""
+def build_interval_motion(scene: BuildContext) -> IntervalMotion:
+    """Mean motion over the intervals of `moving_rows`."""
     return IntervalMotion.of(scene.intervals, scene.share(find_moving_rows), scene.frame)
 
 
 def wheel_parameters(scene: BuildContext) -> tuple[Array, list[Parameter]]:
-    """Lever arm (3,) of the point that does not slip, m, and the parameters both constraints depend on."""
+    """Lever arm (3,) of the point that does not slip, m, and the parameters of both constraints."""
     s, odometer = scene.settings.vehicle, scene.recording.odometer
     parameters = list(scale_parameter(scene.recording))
     lever = np.zeros(3) if odometer is None else odometer.lever_arm
@@ -217,10 +217,10 @@ def wheel_parameters(scene: BuildContext) -> tuple[Array, list[Parameter]]:
 
 
 def slow_error_parameter(name: str, density: Array, kind: type[Wheels]) -> Parameter:
-    """Gauss-Markov process (k,) of what wheels are wrong by for seconds: camber, wind, load, slip.
+    """Gauss-Markov process (k,) of wheel errors that last for seconds: camber, wind, load, slip.
 
-    Over long times it is worth white noise of the density given (m/s/sqrt(Hz)), the variance of which is 2 T sigma^2
-    for a process of the correlation time T.
+    Over long times it is equivalent to white noise of the density given (m/s/sqrt(Hz)), whose variance is 2 T sigma^2
+    for a process of correlation time T.
     """
     groups = tuple(f"{kind.name}.seconds.{axis}" for axis in kind.noise_axes)
     sigma = density / np.sqrt(2.0 * SECONDS)
@@ -231,7 +231,7 @@ def slow_error_parameter(name: str, density: Array, kind: type[Wheels]) -> Param
 
 @dataclass(frozen=True)
 class NonHolonomic(Wheels):
-    """The vehicle moves neither sideways nor up (NHC)."""
+    """The vehicle has no sideways or upward velocity (NHC)."""
 
     name: ClassVar[str] = "nhc"
     axes: ClassVar[tuple[str, ...]] = ("right", "up")
@@ -245,7 +245,7 @@ class NonHolonomic(Wheels):
         s = scene.settings.vehicle
         if scene.recording.platform != "vehicle" or not s.nhc:
             return None
-        rows, past = scene.share(find_moving_rows), scene.share(interval_motion)
+        rows, past = scene.share(find_moving_rows), scene.share(build_interval_motion)
         lever_arm, parameters = wheel_parameters(scene)
         if s.body_sigma > 0:
             parameters.append(
@@ -283,7 +283,7 @@ class NonHolonomic(Wheels):
         A[:, 0, 1], A[:, 1, 1], by_forward[:, 1] = -2.0 * slip * v * w, -squat * a, -squat * v
         jacobians = found.derivatives(A, parameters, by_forward)
         jacobians[BODY] = -effect[:, :, None] * _I2
-        # the turn rate's own share, v v d(omega_z)
+        # contribution of the turn rate itself, v v d(omega_z)
         by_w = (slip * v * v)[:, None]
         jacobians["bg"][:, 0, 2] += by_w[:, 0]
         Rt = np.swapaxes(states.R_nb, -1, -2)
@@ -300,18 +300,18 @@ def _average_speed(odometer: Odometer, imu: Imu) -> MeanSpeed:
 
 @dataclass(frozen=True)
 class OdometerSpeed(Wheels):
-    """The vehicle moved as fast as its odometer read."""
+    """The forward speed that the odometer measured."""
 
     name: ClassVar[str] = "odometer"
     axes: ClassVar[tuple[str, ...]] = ("forward",)
     noise_axes: ClassVar[tuple[str, ...]] = ("forward",)
     unit: ClassVar[str] = "m/s"
 
-    begin: Array = field(default_factory=lambda: np.empty(0))  # the interval of each row, s
+    begin: Array = field(default_factory=lambda: np.empty(0))  # interval of each row, s
     end: Array = field(default_factory=lambda: np.empty(0))
     speed: MeanSpeed | None = None
-    signed: bool = True  # False: it cannot tell forwards from backwards
-    reach: float = 0.0  # s, the longest delay for which the readings of all rows are there
+    signed: bool = True  # False: it does not distinguish forwards from backwards
+    reach: float = 0.0  # s, the longest delay for which the readings of all rows are available
     sigma: Array = field(default_factory=lambda: np.empty((0, 1)))
 
     @classmethod
@@ -320,7 +320,7 @@ class OdometerSpeed(Wheels):
         if scene.recording.platform != "vehicle" or odometer is None or not s.odometer:
             return None
         speed = scene.speed or _average_speed(odometer, scene.recording.imu)
-        rows, past = scene.share(find_moving_rows), scene.share(interval_motion)
+        rows, past = scene.share(find_moving_rows), scene.share(build_interval_motion)
         begin, end = scene.intervals.t0[rows], scene.intervals.t1[rows]
         reach = REACH * odometer.delay_sigma
         good = np.all([np.isfinite(speed(begin, end, d)[0]) for d in {-reach, 0.0, reach}], axis=0)
@@ -360,13 +360,13 @@ class OdometerSpeed(Wheels):
     def linearize(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> Linearized:
         assert self.speed is not None
         found = self._velocity(states, parameters, rows)
-        if ODOMETER_DELAY in parameters:  # what is true now is read `delay` later
+        if ODOMETER_DELAY in parameters:  # the current speed is read `delay` later
             delay = np.minimum(np.maximum(parameters[ODOMETER_DELAY][:, 0], -self.reach), self.reach)
             read, by_delay = self.speed(self.begin[rows], self.end[rows], delay)
         else:
             read = self._read[rows]
         scale, ahead = 1.0 + parameters[ODOMETER_SCALE][:, 0], found.u[:, 1]
-        A = _AHEAD if self.signed else np.where(ahead < 0.0, -1.0, 1.0)[:, None, None] * _AHEAD
+        A = _FORWARD if self.signed else np.where(ahead < 0.0, -1.0, 1.0)[:, None, None] * _FORWARD
         residual = (A[:, 0, 1] * ahead - scale * read)[:, None]
         jacobians = found.derivatives(A, parameters)
         jacobians[ODOMETER_SCALE] = -read[:, None, None]

@@ -1,1 +1,1 @@
-"""What every other room stands on: errors, files, time, rotations, the Earth, states and trajectories."""
+"""Foundations of all other packages: errors, files, time, rotations, the Earth, states and trajectories."""

@@ -1,4 +1,4 @@
-"""What is wrong with a TOML file or a key of it, in one plain sentence: file, line, key, value, unit, nearest key."""
+"""Errors in TOML files as one plain sentence: file, line, key, value, unit and the nearest known key."""
 
 from __future__ import annotations
 
@@ -16,15 +16,21 @@ from graphnav.core.files import read_text
 from graphnav.core.notes import Note
 
 _TABLE = re.compile(r"\[([^\[\]]+)\]")
-_NAMES = 30  # that a sentence lists
-_SHOWN = 60  # characters of a value in a sentence
-_WORD = re.compile(rf"\S{{{2 * _SHOWN},}}")  # that no sentence of ours has, but a value that it quotes
-_DEEPEST = 50  # tables in tables; what graphnav reads has four
+_MAX_NAMES = 30  # names listed in one sentence at most
+_MAX_QUOTED = 60  # characters of a value quoted in a sentence at most
+_WORD = re.compile(rf"\S{{{2 * _MAX_QUOTED},}}")  # a quoted value, as no sentence of graphnav has a word of this length
+_DEEPEST = 50  # levels of nested tables at most; graphnav's own files have four
 _KEY = re.compile(r"([\w\-.\"']+)\s*=")
 
 
 def read_toml(path: Path, error: type[GraphnavError]) -> tuple[dict[str, Any], str]:
-    """The values of a TOML file, and its text.
+    """Read a TOML file.
+
+    Returns
+    -------
+    values : dict
+    text : str
+        Of the file, for line numbers.
 
     Raises
     ------
@@ -33,7 +39,7 @@ def read_toml(path: Path, error: type[GraphnavError]) -> tuple[dict[str, Any], s
     """
     text = read_text(path, error)
     try:
-        # keys of thousands of parts take the parser minutes
+        # the parser takes minutes for keys of thousands of parts
         if any(line.partition("=")[0].count(".") > 2 * _DEEPEST for line in text.splitlines()):
             raise RecursionError
         values = tomllib.loads(text)
@@ -41,12 +47,12 @@ def read_toml(path: Path, error: type[GraphnavError]) -> tuple[dict[str, Any], s
         return values, text
     except RecursionError:
         raise error(f"{path}: not valid TOML (nested too deep)", key="toml.syntax") from None
-    except ValueError as cause:  # tomllib's own is one, and that of a number of thousands of digits
+    except ValueError as cause:  # tomllib's own error is one; so is that for an integer of thousands of digits
         raise error(f"{path}: not valid TOML ({cause})", key="toml.syntax") from None
 
 
 def check_whole_numbers(values: Any) -> None:
-    """Refuse whole numbers that no program means; in hexadecimal they have any number of digits.
+    """Refuse integers of more than 64 bits; hexadecimal ones may have any number of digits.
 
     Raises
     ------
@@ -73,16 +79,16 @@ def _leaves(value: Any, key: str = "", depth: int = 0) -> Iterator[tuple[str, An
 
 
 def complaint(source: str | Path, error: ValidationError, model: type[BaseModel], text: str = "") -> Note:
-    """The first complaint of pydantic; an unknown key goes before the missing one that it may have been meant for.
+    """Describe the first error that pydantic reports; an unknown key before the missing key it may stand for.
 
-    `text` is that of the file, for the line.
+    `text` is the file's content, for the line number.
     """
     first = min(error.errors(), key=lambda e: e["type"] != "extra_forbidden")
     loc = tuple(str(part) for part in first["loc"])
     line = _line_of(text, loc)
     where = f"{source}, line {line}: " if line else f"{source}: "
     described = _describe(first, loc, model)
-    return Note(described.key, where + _WORD.sub(lambda word: f"{word[0][:_SHOWN]}...", described))
+    return Note(described.key, where + _WORD.sub(lambda word: f"{word[0][:_MAX_QUOTED]}...", described))
 
 
 def _describe(first: Any, loc: tuple[str, ...], model: type[BaseModel]) -> Note:
@@ -91,7 +97,7 @@ def _describe(first: Any, loc: tuple[str, ...], model: type[BaseModel]) -> Note:
         return Note("key.unknown", f"unknown key '{key}'{_suggest(loc, model)}")
     if first["type"] == "missing":
         return Note("key.missing", f"'{key}' is missing")
-    if first["type"] == "value_error":  # our own sentence
+    if first["type"] == "value_error":  # raised by a validator of graphnav
         what = str(first["ctx"]["error"])
         return Note("key.value", f"'{key}': {what}{_describe_key(loc, model)}" if key else what)
     if first["type"] in ("model_type", "model_attributes_type"):
@@ -101,21 +107,21 @@ def _describe(first: Any, loc: tuple[str, ...], model: type[BaseModel]) -> Note:
 
 
 def shorten(value: Any) -> str:
-    """A value as it stands in a file, no longer than people look at."""
+    """Quote a value of a file, shortened if it is long."""
     text = repr(value)
-    return text if len(text) <= _SHOWN else f"{text[:_SHOWN]}..."
+    return text if len(text) <= _MAX_QUOTED else f"{text[:_MAX_QUOTED]}..."
 
 
 def suggest_nearest(name: str, known: Sequence[str]) -> str:
-    """What may have been meant: the nearest of the names there are, else all of them."""
+    """The known name nearest to `name` as a question, or a list of all known names."""
     close = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
     if close:
         return f"did you mean '{close[0]}'?"
-    return f"known: {', '.join(known[:_NAMES]) or 'none'}{', ...' * (len(known) > _NAMES)}"
+    return f"known: {', '.join(known[:_MAX_NAMES]) or 'none'}{', ...' * (len(known) > _MAX_NAMES)}"
 
 
 def split_names(text: str, known: Sequence[str], option: str, what: str) -> tuple[str, ...]:
-    """The names of an option with commas between, each once.
+    """Split the value of an option at its commas; each name once.
 
     Raises
     ------
@@ -134,7 +140,7 @@ def split_names(text: str, known: Sequence[str], option: str, what: str) -> tupl
 
 
 def _list_tables(model: type[BaseModel], at: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], type[BaseModel]]]:
-    """Every table of a file by its place, the whole file first."""
+    """Every table of a file by its place, the file's top level first."""
     yield at, model
     for name, field in model.model_fields.items():
         options = (field.annotation, *getattr(field.annotation, "__args__", ()))
@@ -144,7 +150,7 @@ def _list_tables(model: type[BaseModel], at: tuple[str, ...] = ()) -> Iterator[t
 
 
 def _suggest(loc: tuple[str, ...], model: type[BaseModel]) -> str:
-    """'; did you mean ...' with the nearest key of the table `loc` lies in, else of any table."""
+    """'; did you mean ...' with the nearest key of the table that `loc` is in, else of any table."""
     tables = dict(_list_tables(model))
     here = loc[:-1]
     while here not in tables:
@@ -164,9 +170,9 @@ def _suggest(loc: tuple[str, ...], model: type[BaseModel]) -> str:
 
 
 def _describe_key(loc: tuple[str, ...], model: type[BaseModel]) -> str:
-    """The unit and the sentence of a key, in brackets."""
+    """The unit and description of a key, in brackets."""
     tables = dict(_list_tables(model))
-    for n in range(len(loc), 0, -1):  # an entry of a tuple has the key of the tuple
+    for n in range(len(loc), 0, -1):  # an entry of a tuple is described by the key of the tuple
         field = tables[loc[: n - 1]].model_fields.get(loc[n - 1]) if loc[: n - 1] in tables else None
         if field is not None:
             return f" ({field.description})" if field.description else ""
@@ -174,7 +180,7 @@ def _describe_key(loc: tuple[str, ...], model: type[BaseModel]) -> str:
 
 
 def _line_of(text: str, loc: tuple[str, ...]) -> int | None:
-    """The line (1-based) that says the key or, for one that is nowhere, opens the table it should be in."""
+    """The line (1-based) of a key, or of the header of its table if the key is absent."""
     table: tuple[str, ...] = ()
     found, depth = None, 0
     for number, line in enumerate(text.splitlines(), 1):

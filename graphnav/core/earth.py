@@ -77,7 +77,7 @@ def _compute_gravity(s2: Array, h: Array) -> Array:
 
 
 def _compute_gravity_one(x: float, y: float, z: float) -> tuple[float, float, float]:
-    """Gravity (m/s^2) at one point, both in ECEF: `_find_normal` and `_compute_gravity` in plain numbers."""
+    """Gravity (m/s^2) at one point, both in ECEF: `_find_normal` and `_compute_gravity` for scalars."""
     p = math.sqrt(x * x + y * y)
     za, pb = z * A, p * B
     size = math.sqrt(za * za + pb * pb)
@@ -125,7 +125,7 @@ class LocalFrame:
 
     @cached_property
     def gravity_gradient(self) -> Array:
-        """Newton's, -(g/r)(I - 3 u u^T), 1/s^2: small, but without it long outages drift."""
+        """Gradient of Newtonian gravity, -(g/r)(I - 3 u u^T), 1/s^2: small, but without it long outages drift."""
         g = self.gravity_n(np.zeros(3))
         size = float(np.linalg.norm(g))
         up = -g / size
@@ -150,7 +150,7 @@ class LocalFrame:
         most) is left out.
         """
         r = self.r_e + np.asarray(p_n, dtype=float) @ self.R_ne
-        if r.size == 3:  # a filter asks for one at a time
+        if r.size == 3:  # a filter asks for single points
             return (np.array(_compute_gravity_one(*r.ravel().tolist())) @ self.R_ne.T).reshape(r.shape)
         s, c, p = _find_normal(r)
         h = p * c + r[..., 2] * s - A * np.sqrt(1.0 - E2 * s * s)

@@ -1,4 +1,4 @@
-"""What can go wrong, said in one plain line: where, what, and how to mend it."""
+"""Errors that a user can cause, each a plain sentence: where, what is wrong, and how to correct it."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from graphnav.core.notes import key_of
 
 
 class GraphnavError(Exception):
-    """Base of every error a user can cause; the command line prints it and exits with 2.
+    """Base of every error a user can cause; the command line prints it and exits with code 2.
 
     Attributes
     ----------
@@ -18,21 +18,21 @@ class GraphnavError(Exception):
     """
 
     def __init__(self, sentence: str = "", *, key: str = "") -> None:
-        """The sentence, and its key unless it is a `Note`, which has one."""
+        """Take the sentence and its key; a `Note` carries its key already."""
         super().__init__(sentence)
         self.key = key or key_of(sentence)
 
 
 class RecordingError(GraphnavError):
-    """A recording, or a file of it, that cannot be used as it is."""
+    """A recording, or one of its files, cannot be used as it is."""
 
 
 class ConfigError(GraphnavError):
-    """Settings that name an unknown key or hold an impossible value."""
+    """Settings contain an unknown key or an invalid value."""
 
 
 class PartlyWrittenError(GraphnavError):
-    """Results of which some files, `missing`, could not be written; all others are there."""
+    """Some files of the results, `missing`, could not be written; all others were."""
 
     def __init__(self, sentence: str, *, key: str, missing: Iterable[Path]) -> None:
         super().__init__(sentence, key=key)
@@ -40,4 +40,4 @@ class PartlyWrittenError(GraphnavError):
 
 
 class EstimationError(GraphnavError):
-    """The data do not determine what was asked for (no motion to align with, a cut graph, ...)."""
+    """The data do not determine what was asked for (no motion to align with, a disconnected graph, ...)."""

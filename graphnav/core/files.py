@@ -1,10 +1,10 @@
-"""Files from anywhere, opened within limits: regular files only, of so many bytes unpacked, in lines so long.
+"""Opening files within limits: regular files only, bounded in unpacked size and in line length.
 
-Whatever goes wrong with a file, be it that it is a pipe or a device, that its compression is damaged, or that it
-unpacks to far more, is one sentence in the caller's own kind of error. The limits are `GRAPHNAV_MAX_FILE_MB` and
-`GRAPHNAV_MAX_LINE_KB` of the environment; SECURITY.md has their defaults.
+Anything wrong with a file (a pipe or device, damaged compression, more bytes than allowed) is raised as one sentence in
+the error class that the caller names. The limits are the environment variables `GRAPHNAV_MAX_FILE_MB` and
+`GRAPHNAV_MAX_LINE_KB`; SECURITY.md states their defaults.
 
-What a file names in its turn is read only from its own folder and those in it, unless `permit_outside`.
+Files named inside other files are read only from the folder of the naming file or below, unless `permit_outside`.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ from graphnav.core.errors import ConfigError, GraphnavError, RecordingError
 
 MAX_FILE, MAX_LINE = "GRAPHNAV_MAX_FILE_MB", "GRAPHNAV_MAX_LINE_KB"
 _DEFAULTS = {MAX_FILE: 2000, MAX_LINE: 1000}
-_WRITTEN = 64 << 20  # bytes of a file that people or programs write as a whole: settings, descriptions, summaries
-_RATIO, _SMALL = 200, 8 << 20  # a log packs to a tenth or so; below so many bytes it does not matter
-_CHUNK = 1 << 16
+_WRITTEN = 64 << 20  # bytes at most of a file that is read as a whole: settings, descriptions, summaries
+_RATIO, _SMALL = 200, 8 << 20  # the size check of a packed log matters only beyond this many bytes
+_READ_SIZE = 1 << 16
 _GZIP = b"\x1f\x8b"
 
 Kind = type[GraphnavError]
@@ -38,7 +38,7 @@ _outside: ContextVar[bool] = ContextVar("outside", default=False)
 
 @contextmanager
 def permit_outside(allowed: bool = True) -> Iterator[None]:
-    """Files named in other files may lie anywhere as long as this lasts, if `allowed`."""
+    """Within this context, files named in other files may lie anywhere if `allowed`."""
     before = _outside.set(allowed or _outside.get())
     try:
         yield
@@ -47,7 +47,7 @@ def permit_outside(allowed: bool = True) -> Iterator[None]:
 
 
 def resolve_beside(source: Path, name: str, key: str, error: Kind = RecordingError) -> Path:
-    """The path of a file that the file `source` names under a key.
+    """The path of a file that is named in `source` under `key`.
 
     Raises
     ------
@@ -66,15 +66,15 @@ def resolve_beside(source: Path, name: str, key: str, error: Kind = RecordingErr
 
 
 def is_inside(path: Path, folder: Path, error: Kind = RecordingError) -> bool:
-    """Whether a path may be read because of what a file in `folder` says."""
+    """Whether a path named by a file in `folder` may be read."""
     try:
         return _outside.get() or path.resolve().is_relative_to(folder.resolve())
-    except (OSError, ValueError, RuntimeError):  # too long, a null character, a loop of links
+    except (OSError, ValueError, RuntimeError):  # too long, a null character, or a loop of links
         raise error(f"{_shorten(path)}: is no path of a file", key="file.name") from None
 
 
 def check_inside(files: Iterable[Path], source: Path, error: Kind = RecordingError) -> None:
-    """Refuse files found in a folder that are links to somewhere outside it.
+    """Refuse files of a folder that are links to somewhere outside it.
 
     Raises
     ------
@@ -91,7 +91,7 @@ def check_inside(files: Iterable[Path], source: Path, error: Kind = RecordingErr
 
 
 def exists(path: Path, error: Kind = RecordingError) -> bool:
-    """Whether anything is there.
+    """Whether the path exists.
 
     Raises
     ------
@@ -107,7 +107,7 @@ def exists(path: Path, error: Kind = RecordingError) -> bool:
 
 
 def check_regular(path: Path, error: Kind = RecordingError) -> None:
-    """Refuse what is not a file of bytes that end: a pipe, a device, a socket, a folder.
+    """Refuse pipes, devices, sockets and folders: only regular files have an end.
 
     Raises
     ------
@@ -129,7 +129,7 @@ def check_regular(path: Path, error: Kind = RecordingError) -> None:
 
 
 def open_file(path: Path, error: Kind = RecordingError, text: bool = True, limit: int | None = None) -> Opened:
-    """The bytes of a file, unpacked if it is gzip-compressed; reading them raises only `error`.
+    """Open a file for reading bytes, unpacked if it is gzip-compressed; reading raises only `error`.
 
     Parameters
     ----------
@@ -150,13 +150,13 @@ def open_file(path: Path, error: Kind = RecordingError, text: bool = True, limit
 
 
 def read_bytes(path: Path, error: Kind = RecordingError, text: bool = True, limit: int | None = None) -> bytes:
-    """All bytes of a file; as `open_file`."""
+    """All bytes of a file, as `open_file` reads them."""
     with open_file(path, error, text, limit) as file:
         return file.read()
 
 
 def check_size(path: Path, count: int, error: Kind = RecordingError) -> None:
-    """Refuse what another program has unpacked to more bytes than a file may hold.
+    """Refuse more bytes than a file may hold when another program has unpacked it.
 
     Raises
     ------
@@ -168,7 +168,7 @@ def check_size(path: Path, count: int, error: Kind = RecordingError) -> None:
 
 
 def read_text(path: Path, error: Kind = RecordingError) -> str:
-    """The text of a file that is written as a whole: settings, a description.
+    """The text of a file that is read as a whole: settings, a description.
 
     Raises
     ------
@@ -182,7 +182,7 @@ def read_text(path: Path, error: Kind = RecordingError) -> str:
 
 
 def parse_json(text: str) -> Any:
-    """JSON, with everything that is wrong with it as a ValueError in a few words."""
+    """Parse JSON; everything that is wrong with it is a ValueError in a few words."""
     try:
         values = json.loads(text, parse_int=_parse_whole)
     except RecursionError:
@@ -191,7 +191,7 @@ def parse_json(text: str) -> Any:
 
 
 def parse_number(text: str) -> float:
-    """A number in ASCII digits, as C and every other program reads it; `float` takes 1_000 and digits of any script.
+    """Parse a number in ASCII digits, as C does; `float` would also take 1_000 and the digits of any script.
 
     Raises
     ------
@@ -210,7 +210,7 @@ def _parse_whole(digits: str) -> int:
 
 
 def _limit(name: str, unit: int) -> int:
-    """A limit in bytes."""
+    """A limit in bytes, from the environment or its default."""
     stated = os.environ.get(name, "")
     if not stated:
         return _DEFAULTS[name] * unit
@@ -233,15 +233,15 @@ def _shorten(path: Path) -> str:
 
 
 class Opened(io.BufferedReader):
-    """The bytes of a file, unpacked; `size` is that on disk, `packed` whether it is gzip-compressed there."""
+    """The bytes of a file, unpacked; `size` is that on disk, `packed` whether it is gzip-compressed."""
 
     def __init__(self, raw: _Bounded, size: int, packed: bool) -> None:
-        super().__init__(raw, 4 * _CHUNK)
+        super().__init__(raw, 4 * _READ_SIZE)
         self.size, self.packed = size, packed
 
 
 class _Bounded(io.RawIOBase):
-    """A file that ends with a sentence where it goes beyond a limit or is damaged."""
+    """A stream that raises one sentence where the file exceeds a limit or is damaged."""
 
     def __init__(
         self, path: Path, plain: IO[bytes], packed: bool, size: int, most: int, line: int | None, error: Kind
@@ -256,7 +256,7 @@ class _Bounded(io.RawIOBase):
 
     def readinto(self, buffer: Any) -> int:
         try:
-            chunk = self._source.read(min(len(buffer), _CHUNK))
+            chunk = self._source.read(min(len(buffer), _READ_SIZE))
         except (EOFError, zlib.error, gzip.BadGzipFile) as cause:
             cut = isinstance(cause, EOFError)
             why = "the compressed file is cut off" if cut else f"the compressed file is damaged ({cause})"
@@ -295,6 +295,6 @@ class _Bounded(io.RawIOBase):
 
 
 def sha256(path: Path) -> str:
-    """Of a file, in hexadecimal digits."""
+    """The SHA-256 of a file, in hexadecimal digits."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()

@@ -1,4 +1,4 @@
-"""One thing worth knowing about a recording, and the small helpers that every check uses."""
+"""A finding about a recording, and small helpers that every check uses."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 from graphnav.core.rotation import Array
 
 Severity = Literal["note", "warning", "untrusted", "refused"]
-SEVERITIES: tuple[Severity, ...] = ("refused", "untrusted", "warning", "note")  # the gravest first
+SEVERITIES: tuple[Severity, ...] = ("refused", "untrusted", "warning", "note")  # the most severe first
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing worth knowing.
+    """One finding about a recording.
 
     A *note* changes nothing, results suffer from a *warning*, what is solved with an *untrusted* one may be wrong
     altogether whatever its sigmas say, and with a *refused* one nothing is solved.
@@ -24,21 +24,21 @@ class Finding:
 
     severity: Severity
     sentence: str
-    key: str = ""  # what it is about in a word that stays the same, such as "imu.spike"
+    key: str = ""  # a stable identifier, such as "imu.spike"
 
     def values(self) -> dict[str, str]:
-        """All of it, for JSON."""
+        """The finding as a dictionary, for JSON."""
         return {"key": self.key, "severity": self.severity, "sentence": self.sentence}
 
 
 def period_of(t: Array) -> float:
-    """Median step of time stamps, s; NaN of fewer than two."""
-    every = max(1, len(t) // 100_000)  # a hundred thousand steps tell it as well as all
+    """Median step of time stamps, s; NaN for fewer than two."""
+    every = max(1, len(t) // 100_000)  # a hundred thousand steps are enough
     if len(t) < 2:
         return float("nan")
     steps = t[1::every] - t[:-1:every]
     half = len(steps) // 2
-    steps.partition((max(half - 1, 0), half))  # np.median's own checks would cost as much again
+    steps.partition((max(half - 1, 0), half))  # np.median's own checks would double the time
     return float(steps[half] if len(steps) % 2 else 0.5 * (steps[half - 1] + steps[half]))
 
 

@@ -17,34 +17,34 @@ from graphnav.core.earth import LocalFrame
 from graphnav.core.rotation import Array
 from graphnav.core.trajectory import Trajectory
 
-_SAME_TIME = 1e-6  # s; what a text file rounds a time stamp to
+_SAME_TIME = 1e-6  # s; resolution of a time stamp in a text file
 
 
 def interpolate(
     trajectory: Trajectory, t: Array, *, max_gap: float = 3.0, lever_arm: Array | None = None
 ) -> tuple[Trajectory, Array]:
-    """The trajectory at other times, never outside it, and never across a gap.
+    """Interpolate a trajectory to other times, never outside its span and never across a gap.
 
     Without a covariance one is made of the sigmas (NaN where there are none). Biases are dropped.
 
     Parameters
     ----------
     trajectory
-        What to interpolate.
+        The trajectory.
     t
         (N,) s.
     max_gap
-        s, between two of its rows that are interpolated; a time that falls on a row needs no neighbour.
+        s, longest gap between rows that is interpolated; a time that falls on a row needs no neighbour.
     lever_arm
-        (3,) m, right, forward, up: position, velocity and covariance are then those of the point at its end. Rows
-        without attitude stay where they are, and without an attitude sigma the sigmas stay what they are.
+        (3,) m, right, forward, up: position, velocity and covariance are those of the point at its end. Rows
+        without attitude are not moved, and without an attitude sigma the sigmas are unchanged.
 
     Returns
     -------
     trajectory : Trajectory
-        At M of the times.
+        At the M times that can be interpolated.
     mask : array of bool
-        (N,), which those are.
+        (N,), True for those times.
     """
     k, s, ok = _bracket(trajectory.t, np.asarray(t, dtype=float), max_gap)
     k, s, t = k[ok], s[ok, None], np.asarray(t, dtype=float)[ok]
@@ -53,7 +53,7 @@ def interpolate(
 
     frame = LocalFrame(trajectory.llh[0]) if trajectory.frame == "geodetic" else None
     slope = differentiate(trajectory, max_gap) if trajectory.v is None else None
-    if lever_arm is None and 4 * len(t) < len(trajectory):  # with one, the rows around are needed for rates
+    if lever_arm is None and 4 * len(t) < len(trajectory):  # rates need the rows around
         rows = np.union1d(k, nxt)
         trajectory, k, nxt = trajectory.take(rows), np.searchsorted(rows, k), np.searchsorted(rows, nxt)
         slope = None if slope is None else slope[rows]
@@ -110,7 +110,7 @@ def interpolate(
 
 
 def differentiate(trajectory: Trajectory, max_gap: float) -> Array:
-    """Velocities of a trajectory's positions, (K, 3) m/s, in its local frame or that of its first row.
+    """Velocities (K, 3) in m/s of a trajectory's positions, in its local frame or that of its first row.
 
     Those of cubic splines, of which none leads across a gap of more than `max_gap` s; NaN for a row alone.
     """
@@ -127,7 +127,7 @@ def differentiate(trajectory: Trajectory, max_gap: float) -> Array:
 
 
 def full_covariance(trajectory: Trajectory) -> Array | None:
-    """The covariance (K, 9, 9), or a diagonal one of the sigmas with NaN where they are missing."""
+    """The covariance (K, 9, 9), or a diagonal one made of the sigmas, NaN where they are missing."""
     if trajectory.covariance is not None:
         return trajectory.covariance
     parts = (trajectory.sd_p, trajectory.sd_v, trajectory.sd_rph)
@@ -159,7 +159,7 @@ def yaw_matrix(yaw: float) -> Array:
 
 
 def place_on_earth(trajectory: Trajectory, frame: LocalFrame, yaw: float, offset: Array) -> Trajectory:
-    """A trajectory of a local frame put on the Earth: p_n = Rz(yaw) p + offset in `frame`."""
+    """Place a trajectory of a local frame on the Earth: p_n = Rz(yaw) p + offset in `frame`."""
     R_nm = yaw_matrix(yaw)
     p_n = trajectory.llh @ R_nm.T + offset
     R_lm = frame.R_ln(p_n) @ R_nm
@@ -179,7 +179,7 @@ def place_on_earth(trajectory: Trajectory, frame: LocalFrame, yaw: float, offset
 
 
 def _bracket(times: Array, t: Array, max_gap: float) -> tuple[Any, Array, Any]:
-    """The row before each time, the fraction of the way to the next, and whether it may be used."""
+    """The row before each time, the fraction of the interval to the next, and whether both may be used."""
     k = np.clip(np.searchsorted(times, t, side="right") - 1, 0, max(len(times) - 2, 0))
     dt = times[np.minimum(k + 1, len(times) - 1)] - times[k]
     s = np.clip((t - times[k]) / np.where(dt > 0, dt, 1.0), 0.0, 1.0)
@@ -189,7 +189,7 @@ def _bracket(times: Array, t: Array, max_gap: float) -> tuple[Any, Array, Any]:
 
 
 def _compute_rates(t: Array, R: Array) -> Array:
-    """Body rates (K, 3), rad/s, at the rows: central differences that weigh the nearer neighbour more."""
+    """Body rates (K, 3), rad/s, at the rows: central differences that weight the nearer neighbour more."""
     if len(t) < 2:
         return np.zeros((len(t), 3))
     dt = np.diff(t)[:, None]
@@ -199,7 +199,7 @@ def _compute_rates(t: Array, R: Array) -> Array:
 
 
 def _blend(a: Array, b: Array, s: Array) -> Array:
-    # Not a + s (b - a): a NaN neighbour must not spoil a time that falls on a row.
+    # not a + s (b - a): a NaN neighbour must not affect a time that falls on a row
     return np.where(s == 0, a, np.where(s == 1, b, (1 - s) * a + s * b))
 
 
@@ -208,7 +208,7 @@ def _apply(R: Array, v: Array) -> Array:
 
 
 def _propagate(A: Array, cov: Array) -> Array:
-    """A P A' where a NaN in P spoils only the variances it enters."""
+    """A P A' in which a NaN in P affects only the variances it enters."""
     out = A @ np.nan_to_num(cov) @ np.swapaxes(A, -1, -2)
     missing = np.isnan(np.diagonal(cov, axis1=-2, axis2=-1)).astype(float)
     spoilt = np.einsum("...ij,...j->...i", np.abs(A) > 0, missing) > 0

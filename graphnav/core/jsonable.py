@@ -1,4 +1,4 @@
-"""Values as plain JSON, and the most memory that this process ever held."""
+"""Values as plain JSON, and the peak memory of this process."""
 
 from __future__ import annotations
 
@@ -13,31 +13,32 @@ import numpy as np
 
 
 def peak_memory_mb() -> float:
-    """The most memory this process ever held, MB of 2^20 bytes."""
+    """Peak memory of this process, MB of 2^20 bytes."""
     try:
-        # where there is one: ru_maxrss of a process that was forked counts its parent's memory as well
+        # preferred where it exists: ru_maxrss of a forked process includes its parent's memory
         for line in Path("/proc/self/status").read_text(encoding="ascii").splitlines():
             if line.startswith("VmHWM:"):
                 return round(int(line.split()[1]) / 1024.0, 1)
     except (OSError, ValueError):
         pass
-    import resource  # not on Windows
+    import resource  # on Windows
 
     size = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return round(size / (1024.0**2 if sys.platform == "darwin" else 1024.0), 1)
 
 
 def write_json(path: Path, values: Any) -> None:
-    """Plain JSON: arrays as lists, whatever is not finite as null."""
+    """Write plain JSON: arrays as lists, anything not finite as null."""
     path.write_text(json_text(values) + "\n", encoding="utf-8")
 
 
 def json_text(values: Any) -> str:
-    """Values as JSON, as `write_json` writes them: indented, a list of numbers or words on one line."""
+    """Values as the text `write_json` writes: indented, lists of numbers or words on one line."""
     return _write_value(values, "\n")
 
 
-_ENCODER = json.JSONEncoder(ensure_ascii=False, allow_nan=False)  # of the C library, as it has no indent
+# without indentation, the encoder written in C is used
+_ENCODER = json.JSONEncoder(ensure_ascii=False, allow_nan=False)
 
 
 def _write_value(value: Any, line: str) -> str:
@@ -47,7 +48,8 @@ def _write_value(value: Any, line: str) -> str:
         inner = [f"{_ENCODER.encode(str(key))}: {_write_value(one, deeper)}" for key, one in value.items()]
         return f"{{{deeper}{f',{deeper}'.join(inner)}{line}}}" if inner else "{}"
     if isinstance(value, np.ndarray | np.generic):
-        if value.ndim == 2 and value.dtype.kind in "iuf" and np.isfinite(value).all():  # a row a line, all at once
+        # one line per row, encoded together
+        if value.ndim == 2 and value.dtype.kind in "iuf" and np.isfinite(value).all():
             rows = _ENCODER.encode(value.tolist())[1:-1].replace("], [", f"],{deeper}[")
             return f"[{deeper}{rows}{line}]" if rows else "[]"
         value = value.tolist()

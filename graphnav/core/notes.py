@@ -1,19 +1,19 @@
-"""A sentence that users meet, with a key beside it that stays the same whatever its words are."""
+"""A sentence for the user with a stable key beside it, which does not change when the wording does."""
 
 from __future__ import annotations
 
 
 class Note(str):
-    """A sentence and its stable key: where it comes from, and what it is about, such as "noise.outliers".
+    """A sentence and its stable key, which says where it comes from and what it is about, such as "noise.outliers".
 
-    It is a string, so code that only shows it needs no keys; scripts and tests read `key`.
+    It is a string: code that only shows it needs no key; scripts and tests read `key`.
     """
 
     __slots__ = ("key",)
     key: str
 
     def __new__(cls, key: str, sentence: str) -> Note:
-        """The sentence with its key."""
+        """Make a note of a sentence and its key."""
         note = super().__new__(cls, sentence)
         note.key = key
         return note
@@ -23,5 +23,5 @@ class Note(str):
 
 
 def key_of(sentence: str) -> str:
-    """The key of a sentence, "" of one without."""
+    """The key of a sentence, "" if it has none."""
     return sentence.key if isinstance(sentence, Note) else ""

@@ -1,4 +1,4 @@
-"""Progress of long work: a stage reports its share done, and a listener set by the caller shows it."""
+"""Progress of long work: stages report the share that is done, and a listener set by the caller shows it."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 
-Progress = Callable[[str, float], None]  # a stage, and its share done, 0 to 1
+Progress = Callable[[str, float], None]  # a stage, and the share of it that is done, 0 to 1
 
 _LISTENER: ContextVar[Progress | None] = ContextVar("graphnav_progress", default=None)
 
 
 @contextmanager
 def listening(listener: Progress | None) -> Iterator[None]:
-    """What is told inside goes to `listener`."""
+    """Within this context, reports go to `listener`."""
     token = _LISTENER.set(listener)
     try:
         yield
@@ -22,7 +22,7 @@ def listening(listener: Progress | None) -> Iterator[None]:
 
 
 def tell(stage: str, share: float = 0.0) -> None:
-    """Report the share of its work that a stage has done; without a listener nothing happens."""
+    """Report the share of a stage that is done; without a listener nothing happens."""
     listener = _LISTENER.get()
     if listener is not None:
         listener(stage, share)

@@ -22,20 +22,20 @@ _GENERATORS = np.array(
 )
 # coefficients of (x^2)^j, j = 0..4, of sin(x)/x, (1 - cos x)/x^2 and the two that follow: (-1)^j / (2j + 1 + k)!
 _TAYLOR = np.array([[(-1.0) ** j / math.factorial(2 * j + 1 + k) for k in range(4)] for j in range(5)])
-_TINY = 1e-300  # keeps sin(x)/x = 1 at x = 0 without a case of its own
+_TINY = 1e-300  # makes sin(x)/x = 1 at x = 0 without a separate case
 
 
 def skew(v: Array) -> Array:
     """Cross-product matrix: ``skew(a) @ b == cross(a, b)``; (..., 3) -> (..., 3, 3)."""
     v = np.asarray(v, dtype=float)
-    if v.size == 3:  # a filter asks for one at a time, where the array machinery would cost more than the work
+    if v.size == 3:  # a filter asks for single vectors, for which general array code costs more than the work itself
         x, y, z = v.ravel().tolist()
         return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]).reshape(*v.shape, 3)
     return (v @ _GENERATORS).reshape(*v.shape, 3)
 
 
 def columns(*parts: Array) -> Array:
-    """``np.stack(parts, axis=-1)``, several times quicker for the few rows that a filter asks for at a time."""
+    """``np.stack(parts, axis=-1)``, several times faster for the few rows that a filter asks for."""
     out = np.empty((*np.shape(parts[0]), len(parts)))
     for k, part in enumerate(parts):
         out[..., k] = part
@@ -155,10 +155,10 @@ def _right_jacobian_inverse_one(x: float, y: float, z: float) -> Array:
 
 
 def integrals(v: Array) -> tuple[Array, Array]:
-    """Gamma1 and Gamma2 of a constant rotation: int_0^1 Exp(s v) ds and the integral of that.
+    """Gamma1 and Gamma2 of a constant rotation: int_0^1 Exp(s v) ds and its integral.
 
-    Gamma1 is the left Jacobian of SO(3); both are what the exponential of the Galilean group Gal(3)
-    puts in front of a constant force (Kelly, "All about the Galilean group SGal(3)", 2023, eq. 27-28).
+    Gamma1 is the left Jacobian of SO(3); both are the factors of a constant force in the exponential of the Galilean
+    group Gal(3) (Kelly, "All about the Galilean group SGal(3)", 2023, eq. 27-28).
     """
     v = np.asarray(v, dtype=float)
     _, b, c, d = coefficients(np.sum(v * v, axis=-1))
@@ -174,7 +174,7 @@ def to_quaternion(R: Array) -> Array:
     R = np.asarray(R, dtype=float)
     d = np.diagonal(R, axis1=-2, axis2=-1)
     trace = d.sum(-1)
-    # Four squared components; build from the largest so that no quotient is small.
+    # four squared components; build from the largest so that no quotient is small
     squared = np.stack([1 + trace, *(1 + 2 * d[..., i] - trace for i in range(3))], -1)
     wx, wy, wz = (
         R[..., 2, 1] - R[..., 1, 2],

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.special import gammaincinv  # scipy.stats would take a second to import
+from scipy.special import gammaincinv  # importing scipy.stats would take a second
 
 from graphnav.core.rotation import Array
 
-_NONE = 0.05  # autocorrelation that is not told from none
+_NONE = 0.05  # autocorrelation below which it is indistinguishable from zero
 
 
 def effective_size(z: Array) -> float:
-    """Of columns z (N, m), evenly spaced: N over the integrated autocorrelation, summed over the columns."""
+    """Effective size of evenly spaced columns z (N, m): N over the integrated autocorrelation, summed over the
+    columns.
+    """
     total = 0.0
     for x in z.T:
         power, length = float(np.mean(x * x)), 1.0
@@ -38,16 +40,16 @@ def effective_epochs(x: Array) -> float:
     r = np.fft.irfft(np.sum(np.abs(np.fft.rfft(x, 2 * n, axis=0)) ** 2, axis=1))[:n] / total
     over = np.flatnonzero(r <= 0.0)
     r = r[1 : over[0] if len(over) else n]
-    share = 1.0 - np.arange(1, len(r) + 1) / n  # of the pairs that there are: r holds it once, its square twice
+    share = 1.0 - np.arange(1, len(r) + 1) / n  # over the pairs: r is counted once, its square twice
     return float(n / (1.0 + 2.0 * float(np.sum(r**2 / share))))
 
 
 def chi_square_band(dof: int, n: float, outside: float = 0.05) -> tuple[float, float]:
-    """The two-sided band, 95 % unless told, of the mean of n independent chi-square values, per degree of freedom."""
+    """The two-sided band (95 % by default) of the mean of n independent chi-square values, per degree of freedom."""
     low, high = (chi_square_quantile(p, dof * n) / (dof * n) for p in (0.5 * outside, 1.0 - 0.5 * outside))
     return low, high
 
 
 def chi_square_quantile(probability: float, dof: float) -> float:
-    """Where the chi-square distribution function, the regularised incomplete gamma function, is `probability`."""
+    """The quantile of the chi-square distribution (inverse of the regularised incomplete gamma function)."""
     return 2.0 * float(gammaincinv(0.5 * dof, probability))

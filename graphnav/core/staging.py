@@ -1,4 +1,4 @@
-"""Results appear whole or not at all, whatever stops the writing: Ctrl-C, a full disk, an error."""
+"""Results are written completely or not at all, whatever stops the writing: Ctrl-C, a full disk, an error."""
 
 from __future__ import annotations
 
@@ -16,12 +16,11 @@ from graphnav.core.errors import ConfigError, PartlyWrittenError
 
 @contextmanager
 def stage_results(folder: Path) -> Iterator[Path]:
-    """A folder to write into, whose files move to `folder` at the end; if that is not reached, nothing of them is left.
+    """A folder to write into; its files move to `folder` at the end, or are removed if the end is not reached.
 
-    It lies inside `folder`, which is made if need be and taken away again if nothing came of it, so that moving is
-    renaming. A file that was there under the same name is replaced in one step.
-
-    What ends with a `PartlyWrittenError` keeps what it has written, and nothing older of what it has not.
+    It lies inside `folder`, so that moving is renaming; `folder` is created if need be, and removed again if it stays
+    empty. A file of the same name is replaced in one step. After a `PartlyWrittenError` the files written so far are
+    kept, and no older file remains in place of one that is missing.
 
     Raises
     ------
@@ -51,21 +50,22 @@ def stage_results(folder: Path) -> Iterator[Path]:
             shutil.rmtree(part, ignore_errors=True)
     except OSError as error:
         if error.filename and not Path(error.filename).resolve().is_relative_to(folder.resolve()):
-            raise  # of a file that was to be read
+            raise  # a file that was to be read
         raise ConfigError(
             f"-o {folder}: cannot be written ({error.strerror or error}); what was there before is unchanged",
             key="output.cannot_write",
         ) from None
     finally:
         for path in made:
-            with suppress(OSError):  # not empty: something came of it
+            with suppress(OSError):  # not empty
                 path.rmdir()
 
 
 @contextmanager
 def defer_interrupts() -> Iterator[None]:
-    """Ctrl-C waits until the end of what is inside, which is to be short."""
-    if threading.current_thread() is not threading.main_thread():  # which alone may say so, and alone is interrupted
+    """Defer Ctrl-C to the end of this context, which should be short."""
+    # only the main thread may set handlers, and only it is interrupted
+    if threading.current_thread() is not threading.main_thread():
         yield
         return
     waiting: list[int] = []
@@ -79,10 +79,10 @@ def defer_interrupts() -> Iterator[None]:
 
 
 def _list_missing(folder: Path) -> list[Path]:
-    """The folders on the way to `folder` that are not there, innermost first."""
+    """The missing folders on the way to `folder`, innermost first."""
     return [path for path in (folder, *folder.parents) if not path.exists()]
 
 
 def final_path(files: list[Path], part: Path, folder: Path) -> list[Path]:
-    """Where files of a staged folder are in the end; others stay where they are."""
+    """Where files of a staged folder are moved to; others stay where they are."""
     return [folder / file.relative_to(part) if file.is_relative_to(part) else file for file in files]

@@ -29,51 +29,51 @@ BLOCKS = {
     "bg": slice(12, 15),
 }
 DIM = 15
-SECONDS = 3.0  # s, correlation time at first of what is wrong for seconds: reflections, slipping tyres
-NODE_SPACING = 5.0  # s between the nodes of what walks slowly: mounting angles, scale of an odometer
+SECONDS = 3.0  # s, initial correlation time of errors that last for seconds: multipath, tyre slip
+NODE_SPACING = 5.0  # s between the nodes of slow random walks: mounting angles, odometer scale
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """Something estimated beside the states: a constant, a random walk, a stationary Gauss-Markov process, or a
-    constant that begins anew at given times.
+    """A quantity estimated beside the states: a constant, a random walk, a stationary Gauss-Markov process, or a
+    constant that is reset at given times.
     """
 
     name: str
-    initial: Array  # (k,), or (n, k) for one that begins anew
+    initial: Array  # (k,), or (n, k) for one that is reset
     sigma: Array  # the same shape, 1-sigma of the initial value
     unit: str
     walk: float | Array = 0.0  # unit/sqrt(s) of a random walk, (k,) or one for all; 0 = constant
-    correlation_time: float | None = None  # s; given, a Gauss-Markov process about zero with `sigma` at all times
-    spacing: float = NODE_SPACING  # s, at least, from one of its nodes to the next
-    begins: Array | None = None  # (n,) s; given, `initial` and `sigma` hold anew from each of these times on
-    reported: bool = False  # of one that begins anew: a solution holds its values
+    correlation_time: float | None = None  # s; if given, a Gauss-Markov process about zero with `sigma` at all times
+    spacing: float = NODE_SPACING  # s, at least, between two nodes
+    begins: Array | None = None  # (n,) s; if given, `initial` and `sigma` apply anew from each of these times on
+    reported: bool = False  # whether a solution reports its values
     noise_groups: tuple[
         str, ...
-    ] = ()  # (k,) of a process: the variance component (`graphnav.estimation.noise`) of each number
+    ] = ()  # (k,) of a process: name of the variance component (`graphnav.estimation.noise`) of each number
 
     @property
     def size(self) -> int:
-        """k"""
+        """Number of components, k."""
         return int(np.shape(self.initial)[-1])
 
     @property
     def listed(self) -> bool:
-        """Whether a solution holds its values; places of stops are nobody's calibration."""
+        """Whether a solution reports its values; the positions of stops are not calibration."""
         return self.begins is None or self.reported
 
     @property
     def prior_sigma(self) -> Array:
-        """(k,) 1-sigma before any measurement; of one that begins anew, the last."""
+        """(k,) 1-sigma before any measurement; of a parameter that is reset, the last."""
         return np.atleast_2d(self.sigma)[-1]
 
     @cached_property
     def constant(self) -> bool:
-        """One value for the whole recording."""
+        """Whether one value holds for the whole recording."""
         return self.begins is None and self.correlation_time is None and not np.any(self.walk)
 
     def step(self, dt: Array) -> tuple[Array, Array]:
-        """Decay (n,) and sigma (n, k) of what is added over times dt (n,)."""
+        """Decay (n,) and 1-sigma (n, k) of the process noise over times dt (n,)."""
         if self.correlation_time is None:
             return np.ones_like(dt), np.sqrt(dt)[:, None] * np.broadcast_to(self.walk, self.sigma.shape)
         decay = np.exp(-dt / self.correlation_time)
@@ -82,7 +82,7 @@ class Parameter:
 
 @dataclass(frozen=True)
 class States:
-    """K states; `states[index]` takes rows (a slice or an index array, so rows stay an axis)."""
+    """K states; ``states[index]`` takes rows by a slice or an index array, so that the row axis stays."""
 
     R_nb: Array  # (K, 3, 3)
     p: Array  # (K, 3)
@@ -97,7 +97,7 @@ class States:
         return States(self.R_nb[index], self.p[index], self.v[index], self.ba[index], self.bg[index])
 
     def plus(self, delta: Array) -> States:
-        """Move by error states: ``R_nb Exp(theta)``, the rest added.
+        """Retract by error states: ``R_nb Exp(theta)``, the rest added.
 
         Parameters
         ----------
@@ -118,7 +118,7 @@ class States:
         )
 
     def minus(self, other: States) -> Array:
-        """The error states between two.
+        """The error states between two sets of states.
 
         Parameters
         ----------
@@ -143,5 +143,5 @@ class States:
 
     @staticmethod
     def stack(rows: list[States]) -> States:
-        """One struct of many."""
+        """Stack single states into one struct of arrays."""
         return States(*(np.concatenate([getattr(s, f) for s in rows]) for f in ("R_nb", "p", "v", "ba", "bg")))

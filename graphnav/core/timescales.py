@@ -14,11 +14,11 @@ import numpy as np
 from graphnav.core.rotation import Array
 
 WEEK = 604800.0  # s
-NEAR = 3600.0  # s; logs of one drive begin within that of each other
-UNIX = 1e9  # s; stamps above are dates of this century in Unix time
-GPS_TO_UNIX = 315964800.0  # s from the Unix to the GPS epoch, leap seconds aside
+NEAR = 3600.0  # s; logs of one drive begin within this of each other
+UNIX = 1e9  # s; larger stamps are Unix time of this century
+GPS_TO_UNIX = 315964800.0  # s from the Unix to the GPS epoch, leap seconds excluded
 _EPOCH = np.datetime64("1980-01-06T00:00:00", "us")
-# days on which GPS - UTC grew by one, to 1 s at the first
+# days on which GPS - UTC grew by one second, to 1 s at the first
 _LEAPS = np.array(
     [
         "1981-07-01", "1982-07-01", "1983-07-01", "1985-07-01", "1988-01-01", "1990-01-01", "1991-01-01", "1992-07-01",
@@ -29,7 +29,7 @@ _LEAPS = np.array(
 )  # fmt: skip
 
 
-LEAP = float(len(_LEAPS))  # s, GPS time ahead of UTC since the last of them
+LEAP = float(len(_LEAPS))  # s, GPS time minus UTC since the last of them
 
 
 def leap_seconds(utc: Array) -> Array:
@@ -49,7 +49,7 @@ def unix_to_gps(t: Array) -> Array:
 
 
 def gps_to_utc(t: Array) -> Array:
-    """UTC (datetime64[us]) of seconds since the GPS epoch; right but for the second before a leap."""
+    """UTC (datetime64[us]) of seconds since the GPS epoch; exact except within the second before a leap."""
     gps = _EPOCH + np.round(np.asarray(t, dtype=float) * 1e6).astype("timedelta64[us]")
     leap = leap_seconds(gps)
     leap = leap_seconds(gps - (leap * 1e6).astype("timedelta64[us]"))
@@ -57,13 +57,14 @@ def gps_to_utc(t: Array) -> Array:
 
 
 def of_week(gps: Array) -> tuple[Array, float]:
-    """Seconds of the GPS week of the first of some GPS times, and where that week begins (s since the GPS epoch)."""
+    """Times in seconds of the GPS week of the first, and where that week begins (s since the GPS epoch)."""
     zero = WEEK * np.floor(gps[0] / WEEK)
     return gps - zero, float(zero)
 
 
 def parse_clock(text: str, t: float) -> float:
-    """Seconds since the GPS epoch at t = 0 of a clock in words; `t` (s) is a time of the log, for the leap seconds.
+    """Seconds since the GPS epoch at t = 0 of a clock given in words; `t` (s) is a time of the log, for the leap
+    seconds.
 
     ``unix``: seconds since 1970 UTC. ``gps week 2313``: seconds of that week. ``2024-05-01T12:00:00Z``: seconds since
     then, UTC.
@@ -85,14 +86,15 @@ def parse_clock(text: str, t: float) -> float:
 
 @dataclass(frozen=True)
 class ClockOffset:
-    """What lies between two clocks that are known: to be added to the second's stamps, s, and in words why."""
+    """Offset between two known clocks: s to be added to the second's stamps, and the reason in words."""
 
     offset: float
     words: str
 
 
 def between_clocks(t: float, zero: float | None, u: float, other: float | None) -> ClockOffset | None:
-    """From a clock that reads `u` to one that reads `t`, both s, whose zeros (s since the GPS epoch) may be known.
+    """The offset from a clock that reads `u` to one that reads `t`, s; their zeros (s since the GPS epoch) may be
+    known.
 
     Stamps above 1e9 are Unix time; those below a week are seconds of the GPS week of the others, where these are known.
     None where this does not tell, or the clocks are the same.
@@ -120,7 +122,7 @@ def between_clocks(t: float, zero: float | None, u: float, other: float | None) 
 
 
 def clock_words(gps_zero: float) -> str:
-    """The words of `parse_clock` for a clock: a GPS week, Unix time, or the UTC date of its zero."""
+    """The words for a clock that `parse_clock` reads: a GPS week, Unix time, or the UTC date of its zero."""
     if -GPS_TO_UNIX <= gps_zero < -GPS_TO_UNIX + 60.0:
         return "unix"
     if gps_zero % WEEK == 0.0:

@@ -1,4 +1,4 @@
-"""A trajectory as people exchange it: time, geodetic position, velocity, attitude, and their sigmas."""
+"""A trajectory in the form that files hold: time, geodetic position, velocity, attitude, and their sigmas."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from graphnav.core.rotation import Array
 
 @dataclass(frozen=True)
 class Trajectory:
-    """What every output format is written from and every evaluation reads; radians and metres.
+    """A trajectory as output formats write and evaluations read it, in radians and metres.
 
     Optional parts are None where a source does not have them. `sd_p` and `sd_v` are along the local
     east, north and up; `sd_rph` are of roll, pitch, heading. `covariance`, where known, is of
@@ -30,7 +30,7 @@ class Trajectory:
     gyro_bias: Array | None = None  # (K, 3) rad/s, RFU
     accel_bias: Array | None = None  # (K, 3) m/s^2, RFU
     covariance: Array | None = None  # (K, 9, 9)
-    fix_type: Array | None = None  # (K,) where it is of a receiver: its numbers, NaN where unknown
+    fix_type: Array | None = None  # (K,) of a receiver's trajectory: number of satellites used, NaN where unknown
     satellites: Array | None = None  # (K,) the same: how many it used
     gps_zero: float | None = None  # s since the GPS epoch at t = 0, where it is known
     frame: str = "geodetic"  # "local": llh then holds metres x, y, z of unknown origin and yaw
@@ -42,11 +42,11 @@ class Trajectory:
 
     @property
     def R_lb(self) -> Array | None:
-        """Body to local ENU, (K, 3, 3)."""
+        """Rotation from body to local ENU, (K, 3, 3)."""
         return None if self.rph is None else rotation.from_rph(self.rph)
 
     def take(self, index: Array | slice) -> Trajectory:
-        """Some rows.
+        """Select rows.
 
         Parameters
         ----------

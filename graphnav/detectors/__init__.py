@@ -1,7 +1,7 @@
-"""Where the vehicle stands, or a foot is on the floor.
+"""Detection of stationary intervals, and of when a foot is on the floor.
 
-`detect` runs the detectors on a recording, and those of `detectors.fire` decide. One file per detector; every concrete
-`Detector` in this folder is found by itself.
+`detect` runs the detectors on a recording; those named by `detectors.fire` decide. One file per detector; every
+concrete `Detector` in this folder is found automatically.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ from graphnav.recording import Recording
 
 __all__ = ["Detection", "Detections", "Detector", "detect", "glrt_statistic", "list_detectors", "stops"]
 
-_SHORTEST = 3.0  # s, of a recording in which anything can be told
+_SHORTEST_RECORDING = 3.0  # s, the shortest recording that is examined
 
 
 @cache
 def list_detectors() -> dict[str, type[Detector]]:
-    """All detector classes by their names, in the order of these."""
+    """All detector classes by name, sorted."""
     found = {}
     for module in pkgutil.iter_modules(__path__):
         for member in vars(importlib.import_module(f"{__name__}.{module.name}")).values():
@@ -44,21 +44,23 @@ def list_detectors() -> dict[str, type[Detector]]:
 
 
 def detect(recording: Recording, settings: Settings | None = None, since: float = -np.inf) -> Detections:
-    """Stationary intervals and the statistics they come from. Never fails: a note says what could not be done.
+    """Find the stationary intervals of a recording, with the statistics they are based on.
+
+    Never fails: a note states what could not be done.
 
     Parameters
     ----------
     recording
-        As read.
+        The recording, as read.
     settings
         The defaults when None.
     since
-        s; of stances that are over by then, where they begin and end need not be known.
+        s; the limits of stances that end before this time need not be determined.
 
     Returns
     -------
     Detections
-        The answer, (M, 2) s on the recording's clock, and that of each detector.
+        The fused answer, (M, 2) s on the recording's clock, and that of each detector.
     """
     d = (settings or Settings()).detectors
     scene = Scene(recording, d)
@@ -71,11 +73,14 @@ def detect(recording: Recording, settings: Settings | None = None, since: float 
             (Note("detectors.vehicles_only", f"{', '.join(idle)}: of vehicles only, finds no stance"),) if idle else ()
         )
         return Detections(stances.stationary, stances.all, (*d.notes, *more, *stances.notes))
-    if not recording.duration >= _SHORTEST or not scene.period > 0.0:
+    if not recording.duration >= _SHORTEST_RECORDING or not scene.period > 0.0:
         return Detections(
             NONE,
             (),
-            (*d.notes, Note("detectors.too_short", f"no detection: the recording is shorter than {_SHORTEST:g} s")),
+            (
+                *d.notes,
+                Note("detectors.too_short", f"no detection: the recording is shorter than {_SHORTEST_RECORDING:g} s"),
+            ),
         )
     if not len(scene.low.t):
         return Detections(
@@ -94,7 +99,7 @@ def detect(recording: Recording, settings: Settings | None = None, since: float 
 
 
 def _decide(scene: Scene, shown: bool = True) -> Decision:
-    """What the detectors that fire come to."""
+    """The decision of the detectors that fire."""
     if scene.settings.fire == (FUSED,):
         found = [decide_fused(scene, list_detectors(), shown)]
     else:
@@ -104,7 +109,7 @@ def _decide(scene: Scene, shown: bool = True) -> Decision:
 
 
 def check_own(kinds: Sequence[type[Detector]]) -> tuple[type[Detector], ...]:
-    """Detectors of a script, in the order of their names.
+    """Check the detectors of a script and sort them by name.
 
     Raises
     ------
@@ -131,16 +136,17 @@ def check_own(kinds: Sequence[type[Detector]]) -> tuple[type[Detector], ...]:
 def stops(
     recording: Recording, settings: Settings, since: float, until: float, before: Array, new: float
 ) -> Array | None:
-    """What `detect` calls stationary of a vehicle between two times, (M, 2) s, and nothing else.
+    """The stationary intervals of a vehicle between two times, (M, 2) s, as `detect` finds them, without its
+    statistics.
 
-    So it need not look at spectra where nothing is still. None where odometer or GNSS are certain of motion from
-    the time `new` on, and not certain of any in the stops (K, 2) found `before`: then there is nothing to be said that
-    was not said then. Where positions alone tell speeds, nothing is said of the seconds over which they were last
-    compared, if they show motion: a smooth drive would pass for a stop there.
+    Spectra are computed only where something is still. Returns None where odometer or GNSS show certain motion from the
+    time `new` on and none in the stops (K, 2) found `before`: then nothing can have changed. Where speeds come from
+    positions alone, the last seconds over which positions were compared are left open if they show motion: a smooth
+    drive would pass for a stop there.
     """
     d = settings.detectors
     scene = Scene(recording, d)
-    if not recording.duration >= _SHORTEST or not scene.period > 0.0:
+    if not recording.duration >= _SHORTEST_RECORDING or not scene.period > 0.0:
         return NONE
     certain = scene.certain
     left = longer_than(subtract_spans(np.array([[recording.start, recording.end]]), certain), d.fusion.min_duration)

@@ -1,4 +1,4 @@
-"""What a detector answers, and the arithmetic of time spans that all of them use."""
+"""The answer of a detector, and arithmetic of time spans."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from graphnav.core.rotation import Array, columns
 
 Mask = NDArray[np.bool_]
 
-NONE = np.zeros((0, 2))  # no span at all
+NONE = np.zeros((0, 2))  # no span
 NONE.flags.writeable = False
 
 
@@ -20,15 +20,15 @@ NONE.flags.writeable = False
 class Detection:
     """The answer of one detector.
 
-    `t` is the centre of each window; a window is stationary where `mask` is True, which is mostly where the
-    statistic is below the threshold. `intervals` lie inside the recording, in order, and do not touch.
+    `t` is the centre of each window; a window is stationary where `mask` is True, usually where the statistic is below
+    the threshold. `intervals` lie within the recording, ordered and disjoint.
     """
 
     name: str
     t: Array  # (N,) s, centre of each window
     statistic: Array  # (N,) NaN where a window crosses a gap
     threshold: float | Array  # of the statistic
-    mask: Mask  # (N,) True: stationary
+    mask: Mask  # (N,) True where stationary
     intervals: Array  # (M, 2) s
     notes: tuple[str, ...] = ()
     details: Mapping[str, Array] = field(default_factory=dict)
@@ -36,14 +36,14 @@ class Detection:
 
 @dataclass(frozen=True)
 class Detections:
-    """What all detectors say of a recording; `stationary` is the fused answer, (M, 2) s."""
+    """The answers of all detectors; `stationary` is the fused one, (M, 2) s."""
 
     stationary: Array
     all: tuple[Detection, ...]
     notes: tuple[str, ...] = ()
 
     def __getitem__(self, name: str) -> Detection:
-        """One detector's answer by its name; KeyError if there is none."""
+        """The answer of one detector by name; KeyError if there is none."""
         for detection in self.all:
             if detection.name == name:
                 return detection
@@ -51,7 +51,7 @@ class Detections:
 
 
 def spans_of(mask: Mask, t: Array, half: float = 0.0) -> Array:
-    """(M, 2) spans covered by the runs of True, each row of t standing for `half` seconds on either side of it."""
+    """(M, 2) spans covered by runs of True, where each row of t stands for `half` seconds on either side."""
     padded = np.zeros(len(mask) + 2, dtype=bool)
     padded[1:-1] = mask
     edges = np.flatnonzero(padded[1:] != padded[:-1])
@@ -60,7 +60,7 @@ def spans_of(mask: Mask, t: Array, half: float = 0.0) -> Array:
 
 
 def merge_spans(spans: Array, gap: float = 0.0) -> Array:
-    """Spans in order, those that overlap or lie at most `gap` seconds apart as one."""
+    """Ordered spans; those that overlap or lie at most `gap` seconds apart are merged."""
     if not len(spans):
         return NONE
     if len(spans) == 1:
@@ -75,7 +75,7 @@ def merge_spans(spans: Array, gap: float = 0.0) -> Array:
 
 
 def subtract_spans(spans: Array, taken: Array) -> Array:
-    """The spans less what lies in `taken`; both in order and without overlap."""
+    """The spans without the parts that lie in `taken`; both ordered and disjoint."""
     if not len(spans) or not len(taken):
         return spans
     out = []
@@ -90,12 +90,12 @@ def subtract_spans(spans: Array, taken: Array) -> Array:
 
 
 def longer_than(spans: Array, shortest: float) -> Array:
-    """Those spans that last at least so many seconds."""
+    """The spans that last at least `shortest` seconds."""
     return spans[spans[:, 1] - spans[:, 0] >= shortest] if len(spans) else NONE
 
 
 def mask_inside(t: Array, spans: Array) -> Mask:
-    """Which times lie in one of the spans (in order, without overlap); ends belong to them."""
+    """Which times lie in one of the spans (ordered, disjoint), ends included."""
     if not len(spans):
         return np.zeros(len(t), dtype=bool)
     k = np.searchsorted(spans[:, 0], t, side="right") - 1
@@ -103,7 +103,7 @@ def mask_inside(t: Array, spans: Array) -> Mask:
 
 
 def mask_within(t: Array, spans: Array, half: float) -> Mask:
-    """Which windows of `half` s on either side of t lie wholly in one of the spans."""
+    """Which windows of `half` s on either side of t lie entirely within one of the spans."""
     if not len(spans):
         return np.zeros(len(t), dtype=bool)
     k = np.searchsorted(spans[:, 0], t - half, side="right") - 1
@@ -111,15 +111,15 @@ def mask_within(t: Array, spans: Array, half: float) -> Mask:
 
 
 def seconds_in(spans: Array, of: Array) -> Array:
-    """(M,) s of each span of `of` (M, 2) that lie in `spans` (in order, without overlap)."""
+    """(M,) s of each span of `of` (M, 2) that is covered by `spans` (ordered, disjoint)."""
     if not len(spans) or not len(of):
         return np.zeros(len(of))
     edge, total = spans.ravel(), np.cumsum(np.diff(spans).ravel())
-    before = np.column_stack([np.r_[0.0, total[:-1]], total]).ravel()  # seconds in spans up to each edge
+    before = np.column_stack([np.r_[0.0, total[:-1]], total]).ravel()  # seconds covered up to each edge
     upto = np.interp(of, edge, before)
     return np.asarray(upto[:, 1] - upto[:, 0])
 
 
 def union(parts: Sequence[Array]) -> Array:
-    """All spans of several sets, merged."""
+    """The union of several sets of spans."""
     return merge_spans(np.concatenate(parts)) if parts else NONE

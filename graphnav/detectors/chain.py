@@ -1,15 +1,15 @@
-"""What the IMU says of the speed between one still stretch and the next.
+"""The change of speed between stationary-looking spans, by the IMU.
 
-A stretch in which nothing changes is a stop or a smooth cruise: an IMU by itself cannot tell. But no vehicle comes
-from one to the other without a push. The force between two such stretches, levelled with the tilt that the gyro
-saw, integrates to the difference of their speeds:
+A span in which nothing changes is a stop or a smooth cruise: an IMU by itself cannot tell which. But no vehicle passes
+from one to the other without acceleration. The specific force between two such spans, levelled with the tilt that the
+gyro measured, integrates to the difference of their speeds:
 
     dv = integral (f_y - f_y0 + g dpitch) dt,     dpitch = integral (omega_x - bias) dt
 
-so that from one known speed those of all linked stretches follow, and where none is known the faster of two cannot
-be a stop. The same integral decides whether a disturbance between two stops moved the vehicle or shook it only, and,
-from one stretch out to where a speed was measured last or is measured next, whether the stretch may be a stop at all:
-were it one, the integral would be that speed.
+so that one known speed gives those of all linked spans, and where none is known the faster of two cannot be a stop. The
+same integral decides whether a disturbance between two stops moved the vehicle or only shook it. Taken from one span
+out to where a speed was last or next measured, it decides whether the span can be a stop at all: if it is, the integral
+equals that speed.
 """
 
 from __future__ import annotations
@@ -22,43 +22,43 @@ from numpy.typing import NDArray
 from graphnav.core.rotation import Array
 from graphnav.detectors.windows import Blocks
 
-_INNER = 1.5  # s of a stretch that say what its force and rate are
-LONGEST = 60.0  # s between stretches over which a difference of speed still means something
-_LEAST_SIGMA = 0.02  # m/s, 1-sigma of any such difference
+_INNER = 1.5  # s of a span from which its mean force and rate are taken
+LONGEST = 60.0  # s between spans over which a difference of speed is still informative
+_LEAST_SIGMA = 0.02  # m/s, smallest 1-sigma of any such difference
 _SIGMAS = 3.0
 _G = 9.81  # m/s^2
-_TURN_ON = 1.0e-4  # rad/s, of what a gyro's bias may differ from its mean over the stretches
-_CROSS = 0.01  # of the yaw that a gyro's scale and axes turn into tilt
-_STRAIGHT = 0.3  # rad of yaw; beyond, what biases looked like before points elsewhere
-_MISALIGNED = 0.1  # rad, of the body's axes against the vehicle's
+_TURN_ON = 1.0e-4  # rad/s, by which a gyro's bias may differ from its mean over the spans
+_CROSS = 0.01  # share of the yaw that gyro scale factors and axis misalignments turn into tilt
+_STRAIGHT = 0.3  # rad of yaw; beyond, accelerometer biases seen at first act along other axes
+_MISALIGNED = 0.1  # rad, misalignment of the body's axes with the vehicle's
 
 
 @dataclass(frozen=True)
 class Link:
-    """Between one still stretch and the next."""
+    """The change of speed from one stationary-looking span to the next."""
 
     change: float  # m/s, forward
-    tolerance: float  # m/s, 3 sigma of the change; infinite when nothing can be said
+    tolerance: float  # m/s, 3 sigma of the change; infinite where it is unknown
     peak: float  # m/s, largest horizontal speed between them if both are stops
-    mean: float  # m/s, size of the mean velocity between them if both are stops
+    mean: float  # m/s, magnitude of the mean velocity between them if both are stops
 
 
-_UNKNOWN = Link(0.0, float("inf"), float("inf"), float("inf"))
+_UNKNOWN_LINK = Link(0.0, float("inf"), float("inf"), float("inf"))
 
 
 def link(b: Blocks, before: Array, after: Array) -> Link:
-    """Change of speed between two still spans, each (2,) s; unknown across a turn or a gap."""
+    """Change of speed between two spans, each (2,) s; unknown across a turn or a gap."""
     T = float(after[0] - before[1])
     i = int(np.searchsorted(b.t, max(before[0], before[1] - _INNER)))
     j = int(np.searchsorted(b.t, min(after[1], after[0] + _INNER)))
     n0, n1 = (int(k) - i for k in np.searchsorted(b.t, [before[1], after[0]]))
     if T > LONGEST or n0 < 3 or j - i - n1 < 3 or not b.whole[i + 1 : j].all():
-        return _UNKNOWN
+        return _UNKNOWN_LINK
     rate = b.rate[i:j]
     bias = 0.5 * (rate[:n0].mean(axis=0) + rate[n1:].mean(axis=0))
     left, yaw = _level_force(b.force[i:j], rate - bias, n0, b.period)
     if np.abs(yaw).max() > _STRAIGHT:
-        return _UNKNOWN
+        return _UNKNOWN_LINK
     if n1 <= n0:
         return Link(0.0, _SIGMAS * _LEAST_SIGMA, 0.0, 0.0)
     off = left[n1:].mean()
@@ -69,7 +69,7 @@ def link(b: Blocks, before: Array, after: Array) -> Link:
         _G * _CROSS * float(np.abs(yaw[n0:n1]).sum()) * b.period,
         _MISALIGNED * float(np.abs(left.real).sum()) * b.period,
     )
-    # what is left at the other end belongs to biases and to a tilt that the gyro did not see
+    # what remains at the other end is due to biases and to tilt that the gyro did not measure
     share = np.linspace(0.0, 1.0, len(left))
     way = np.cumsum(left - share * off) * b.period
     way -= share * way[-1]
@@ -79,24 +79,24 @@ def link(b: Blocks, before: Array, after: Array) -> Link:
 
 @dataclass(frozen=True)
 class Outwards:
-    """What the speed beside a still stretch is if that is a stop, from its end on outwards."""
+    """Speeds next to a span, integrated outwards from its end on the assumption that it is a stop."""
 
-    way: int  # 1 on from its end, -1 back from its start
+    way: int  # 1: onwards from its end, -1: backwards from its start
     t: Array  # (n,) s
     speed: Array  # (n,) m/s, horizontal
     tolerance: Array  # (n,) m/s, 3 sigma of it
 
     def within(self, first: float, last: float) -> NDArray[np.bool_] | None:
-        """(n,) which rows lie between two times; None where one of these is further out than they go, or none does."""
+        """(n,) which rows lie between two times; None if none does, or if the rows do not reach so far."""
         there = (self.t >= first) & (self.t <= last)
         outer = last if self.way > 0 else first
         return there if there.any() and self.way * (self.t[-1] - outer) >= 0.0 else None
 
 
 def find_speed_beside(b: Blocks, span: Array, way: int) -> Outwards | None:
-    """Speeds beside a still span (2,) s, were it a stop, up to a gap or a turn; None where there are too few rows.
+    """Speeds next to a span (2,) s, if it is a stop, up to a gap or a turn; None where there are too few rows.
 
-    What rate and force are at rest is their mean over the span, as sure as they scatter in it.
+    Rate and force at rest are their means over the span, with the uncertainty given by their scatter in it.
 
     Parameters
     ----------
@@ -115,7 +115,7 @@ def find_speed_beside(b: Blocks, span: Array, way: int) -> Outwards | None:
     left, yaw = _level_force(force, way * (rate - rate[:n0].mean(axis=0)), n0, b.period)
     n = int(np.argmax(np.append(np.abs(yaw[n0:]) > _STRAIGHT, True)))
     left, yaw, T = left[n0 : n0 + n], np.abs(yaw[n0 : n0 + n]), b.period * np.arange(1, n + 1)
-    # densities of white noise, by the scatter in the stretch, and what they leave of its means
+    # densities of white noise by the scatter in the span, and the variance they leave in its means
     of_force, of_rate = (float(np.sqrt(x[:n0].var(axis=0).max() * b.period)) for x in (force, rate))
     known = 1.0 / (n0 * b.period)
     doubt = (
@@ -146,7 +146,7 @@ def at_rest_until(b: Blocks, span: Array, way: int, most: float, limit: float) -
     if n0 < 3 or not b.whole[i + 1 : j].all():
         return end
     force, rate, t = b.force[i:j][::way], b.rate[i:j][::way], b.t[i:j][::way]
-    # backwards in time everything turns the other way
+    # reversed in time, rates change their sign
     left, _ = _level_force(force, way * (rate - rate[:n0].mean(axis=0)), n0, b.period)
     speed = np.abs(np.cumsum(left[n0:]) * b.period)
     over = np.flatnonzero(speed > limit)
@@ -155,9 +155,9 @@ def at_rest_until(b: Blocks, span: Array, way: int, most: float, limit: float) -
 
 
 def _level_force(force: Array, omega: Array, still: int, period: float) -> tuple[NDArray[np.complex128], Array]:
-    """Horizontal force (n,), right + i forward, without gravity and without what it was at first; and the yaw.
+    """Horizontal force (n,), right + i forward, without gravity and without its initial value; and the yaw.
 
-    The first `still` rows stand; `omega` (n, 3) is without bias.
+    The first `still` rows are stationary; `omega` (n, 3) is without bias.
     """
     up = force[:still].mean(axis=0)
     g = float(np.linalg.norm(up))
@@ -167,14 +167,14 @@ def _level_force(force: Array, omega: Array, still: int, period: float) -> tuple
     level = np.stack([np.cross(forward, up), forward], -1) @ np.array([1.0, 1.0j])
     yaw = np.cumsum(omega @ up) * period
     turned = np.exp(1j * yaw)
-    # the tilt, summed in the axes of the beginning and seen in those of each row; up then leans by -tilt x up
+    # the tilt, summed in the initial axes and expressed in those of each row; up then leans by -tilt x up
     tilt = np.cumsum((omega @ level) * turned) * period / turned
     tilt -= tilt[:still].mean()
     return force @ level - 1j * g * tilt, yaw
 
 
 def moving_by_chain(links: list[Link], known: Array) -> np.ndarray:
-    """Which of M stretches move, given the M - 1 links between them and the speeds known of some.
+    """Which of M spans move, given the M - 1 links between them and the speeds that are known.
 
     Parameters
     ----------
@@ -185,7 +185,7 @@ def moving_by_chain(links: list[Link], known: Array) -> np.ndarray:
     groups = np.split(np.arange(M), [k + 1 for k, one in enumerate(links) if not np.isfinite(one.tolerance)])
     for group in groups:
         change = np.r_[0.0, np.cumsum([links[k].change for k in group[:-1]])]
-        # independent errors: their squares add
+        # errors are independent: variances add
         doubt = np.r_[0.0, np.cumsum([links[k].tolerance ** 2 for k in group[:-1]])]
         sure = np.flatnonzero(np.isfinite(known[group]))
         for m in range(len(group)):
@@ -199,6 +199,6 @@ def moving_by_chain(links: list[Link], known: Array) -> np.ndarray:
                 away = abs(known[group[of[nearest]]] + speed[nearest])
                 out[group[m]] = away > max(apart[nearest], _SIGMAS * _LEAST_SIGMA)
             else:
-                # no speed is known: a stretch faster than another one in the chain moves
+                # without a known speed: a span that is faster than another one in the chain moves
                 out[group[m]] = bool((speed > np.maximum(apart, _SIGMAS * _LEAST_SIGMA)).any())
     return out

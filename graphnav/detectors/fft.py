@@ -1,4 +1,4 @@
-"""Stationary where the engine's idle line rules the spectrum: Li 2024, section 4.2, for any engine.
+"""Stationary intervals where the engine's idle line dominates the spectrum: Li 2024, section 4.2, for any engine.
 
 In windows of 3 s every second, of forward force, up force and pitch rate, Peak-0, Peak-1 and Peak-2 are the highest
 amplitudes from 0 to 10, 10 to 20 and 20 to 30 Hz. A window is stationary if
@@ -7,10 +7,11 @@ amplitudes from 0 to 10, 10 to 20 and 20 to 30 Hz. A window is stationary if
     no peak exceeds 15 mg or 0.7 deg/s;
     1.5 Peak-1 > Peak-0 and 1.5 Peak-2 > Peak-0 of both forces, and Peak-1 >= 7 Peak-0 of the pitch rate.
 
-The statistic is the largest of these quotients, so that it is below 1 where all hold. The paper's bands belong to an
-idle line at 12.5 Hz. Here the line is found in what else is known to be still, or alone in what is calm below any idle
-line, and the bands move with it. A ratio that this engine does not meet while it idles (no second harmonic, no pitch)
-is not asked for. Alone, every window has to be as calm, because an engine idles while a vehicle rolls as well.
+The statistic is the largest of these quotients, so that it is below 1 where all conditions hold. The paper's bands
+belong to an idle line at 12.5 Hz. Here the line is found in windows that other detectors call stationary or, without
+them, in windows that are calm below any idle line; the bands are scaled with it. A ratio that this engine does not meet
+while idling (no second harmonic, no pitch) is not required. When the detector decides alone, every window must be that
+calm, because an engine also idles while a vehicle rolls.
 """
 
 from __future__ import annotations
@@ -29,25 +30,25 @@ from graphnav.detectors.scene import MG, Detector, Labels, Scene
 from graphnav.detectors.spectrum import FEWEST_WINDOWS, LOWEST, IdleLine, Windows, idle_line, peaks
 from graphnav.detectors.thresholds import log_statistic, valley
 
-LINE_OF_THE_PAPER = 12.495  # Hz, to which its bands belong
-_MET = 0.7  # share of still windows that meet a ratio for it to be asked for
-_STRETCH = 0.05  # by which a window may last longer than its rows should: then its frequencies are wrong
-_STRAY = 0.05  # of its frequency that an idle line may lie outside of what was seen of it
-_COLUMNS = 600  # of the spectrogram that is kept for a picture
-_SHOWN = 60.0  # Hz of it
-_SLOWEST = 49.0  # Hz, below which the detector has nothing to look at
+LINE_OF_THE_PAPER = 12.495  # Hz, the idle line that the paper's bands belong to
+_MET = 0.7  # share of stationary windows that must meet a ratio for it to be required
+_STRETCH = 0.05  # relative excess of a window's duration at which its frequencies are wrong
+_STRAY = 0.05  # relative deviation of an idle line from those observed
+_COLUMNS = 600  # columns of the spectrogram that is kept for the figure
+_SPECTROGRAM_END = 60.0  # Hz, upper end of that spectrogram
+_LOWEST_RATE = 49.0  # Hz, lowest sampling rate at which the detector works
 CONDITIONS = (
     "forward limit", "up limit", "pitch limit",
     "forward Peak-1", "forward Peak-2", "up Peak-1", "up Peak-2", "pitch Peak-1",
 )  # fmt: skip
-_ALWAYS = ("forward limit", "up limit")  # asked for alone: what rises above them shakes as a drive does
+_ALWAYS = ("forward limit", "up limit")  # always required: windows that exceed them are shaken as while driving
 
 
 class IdleFft(Detector):
-    """Windows ruled by the idle line."""
+    """The detector of windows dominated by the idle line."""
 
     name = "fft"
-    edge = 4.0  # s: windows of 3 s begin at other seconds in a part of a recording than in all of it
+    edge = 4.0  # s: the grid of 3-s windows in a part of a recording is shifted against that of the whole
 
     @classmethod
     def detect(cls, scene: Scene, labels: Labels | None = None, shown: bool = True) -> Detection:
@@ -63,8 +64,8 @@ def _detect(scene: Scene, labels: Labels | None, shown: bool) -> Detection:
     begin = np.arange(w.count) * step
     t_first, t_last = imu.t[begin], imu.t[begin + length - 1] if w.count else imu.t[:0]
     t = 0.5 * (t_first + t_last) - 0.5 * period
-    if not w.count or rate < _SLOWEST:
-        reason = "the recording is shorter than a window" if rate >= _SLOWEST else f"{rate:.3g} Hz are too few"
+    if not w.count or rate < _LOWEST_RATE:
+        reason = "the recording is shorter than a window" if rate >= _LOWEST_RATE else f"{rate:.3g} Hz are too few"
         return Detection(
             "fft",
             t,
@@ -107,7 +108,7 @@ def _detect(scene: Scene, labels: Labels | None, shown: bool) -> Detection:
             notes.append(
                 Note(
                     "detectors.fft.conditions",
-                    f"not asked for, because this engine does not meet it at idle: {', '.join(left_out)}",
+                    f"not required, because this engine does not meet it at idle: {', '.join(left_out)}",
                 )
             )
     usable = asked[3:8].any() and (line is not None or not settings.find_line)
@@ -124,10 +125,10 @@ def _detect(scene: Scene, labels: Labels | None, shown: bool) -> Detection:
 
 
 def _weigh_idling(w: Windows, settings: FftSettings) -> Array:
-    """(W,) below 1 where the engine may idle, for a detector without labels of still windows.
+    """(W,) below 1 where the engine may idle, for use without labels of stationary windows.
 
-    Below the lowest idle line no peak may rise above the paper's limits, nor, where windows fall into two populations
-    by what they have there, above the lower one.
+    Below the lowest idle line no peak may exceed the paper's limits nor, where the windows fall into two populations by
+    their amplitude there, the lower one.
     """
     height = _measure(w, [(0.0, LOWEST)])[0][:, :, 0]
     x = log_statistic((height / _find_limits(settings)).max(axis=1))
@@ -136,7 +137,7 @@ def _weigh_idling(w: Windows, settings: FftSettings) -> Array:
 
 
 def _detect_line(height: Array, where: Array, line: IdleLine) -> Mask:
-    """Windows in which the line rules the band of Peak-1 or Peak-2 of one channel at least."""
+    """Windows in which the line dominates the band of Peak-1 or Peak-2 of at least one channel."""
     near = np.zeros(len(height), dtype=bool)
     for k in (1, 2):
         at = np.abs(where[:, :, k] / (k * line.frequency) - 1.0) < 0.1
@@ -145,9 +146,9 @@ def _detect_line(height: Array, where: Array, line: IdleLine) -> Mask:
 
 
 def _measure_off_line(where: Array, asked: Mask, line: IdleLine) -> Array:
-    """How far the line of each window is from where it was seen while idling; above 1 it is another.
+    """Deviation of each window's line from those observed while idling; above 1 it is another line.
 
-    While driving an engine's lines move with its speed. Of the channels whose Peak-1 is asked for the nearest counts.
+    While driving, an engine's lines move with its speed. Of the channels whose Peak-1 is required, the nearest counts.
     """
     channels = [c for c, k in ((0, 3), (1, 5), (2, 7)) if asked[k]] or [0, 1, 2]
     middle = 0.5 * (line.lowest + line.highest)
@@ -172,7 +173,7 @@ def _measure(w: Windows, bands: Sequence[tuple[float, float]]) -> tuple[Array, A
     """Amplitude and frequency of the peaks (W, 3 channels, 3 bands), and a thinned spectrogram of the up force."""
     height, where = np.full((w.count, 3, 3), np.nan), np.full((w.count, 3, 3), np.nan)
     f = w.frequencies
-    shown = int(np.searchsorted(f, _SHOWN))
+    shown = int(np.searchsorted(f, _SPECTROGRAM_END))
     keep = np.unique(np.linspace(0, w.count - 1, _COLUMNS).astype(int))
     rows = []
     for part, a in w.amplitudes():
@@ -185,9 +186,9 @@ def _measure(w: Windows, bands: Sequence[tuple[float, float]]) -> tuple[Array, A
 
 
 def _compute_quotients(height: Array, settings: FftSettings) -> Array:
-    """(W, 8) as in `CONDITIONS`: all below 1 is stationary, NaN what cannot be seen."""
+    """(W, 8) in the order of `CONDITIONS`: all below 1 means stationary, NaN where a peak cannot be observed."""
     limit = _find_limits(settings)
-    # fmax leaves out a peak that cannot be seen
+    # fmax ignores a peak that cannot be observed
     size = np.fmax(np.fmax(height[..., 0], height[..., 1]), height[..., 2]) / limit
     peak0 = height[:, :, 0]
     ratios = [peak0[:, c] / (settings.force_ratio * np.maximum(height[:, c, k], 1e-12)) for c in (0, 1) for k in (1, 2)]
@@ -196,12 +197,12 @@ def _compute_quotients(height: Array, settings: FftSettings) -> Array:
 
 
 def _find_limits(settings: FftSettings) -> Array:
-    """(3,) m/s^2, m/s^2, rad/s: what no peak of forward force, up force and pitch rate may exceed."""
+    """(3,) m/s^2, m/s^2, rad/s: upper limits for the peaks of forward force, up force and pitch rate."""
     return np.array([settings.force_limit * MG, settings.force_limit * MG, np.radians(settings.rate_limit)])
 
 
 def _divide_speed(t: Array, settings: FftSettings, speeds: Sequence[Speeds]) -> Array:
-    """Speed over the limit, the largest of all sensors; 0 where none is known."""
+    """Speed over its limit, the largest of all sensors; 0 where none is known."""
     out = np.zeros(len(t))
     half = 0.5 * settings.window
     for s in speeds:

@@ -1,14 +1,14 @@
-"""From the detectors' answers to stationary intervals: candidates, vetoes, bridges and their ends.
+"""Fusion of the detectors' answers to stationary intervals: candidates, vetoes, bridges and edges.
 
-1. Stretches that a detector calls still are candidates: in the fusion the low-band GLRT, a likelihood ratio test, else
-   the one that decides alone. Their ends are moved to where the low-passed force and rate leave what they are inside
+1. Candidates are the spans of one detector: in the fusion the low-band GLRT, a likelihood ratio test, else the one
+   that decides alone. Their ends are moved to where the low-passed force and rate depart from their means inside
    (never outwards past a disturbance).
-2. Nothing changed in a candidate, so neither did its speed: if the speeds known inside say motion, all of it moves,
-   and so does what the force links to it (`graphnav.detectors.chain`). Where no sensor looked, the speed measured last
-   before it, and first after it, must be one that the force leads to from rest.
+2. Nothing changes in a candidate, so neither does its speed: if the speeds measured inside show motion, all of it
+   moves, and so do the spans that the force links to it (`graphnav.detectors.chain`). Where no speed was measured
+   inside, the one measured last before it, and first after it, must be one that the force leads to from rest.
 3. Two candidates are one stop if the force between them, integrated, leads from rest to rest without reaching a
-   speed in between: a passenger moved, not the vehicle. In the fusion what the FFT detector calls stationary next to
-   a stop joins it under the same condition.
+   speed in between: a passenger moved, not the vehicle. In the fusion, what the FFT detector calls stationary next
+   to a stop is added under the same condition.
 """
 
 from __future__ import annotations
@@ -39,21 +39,21 @@ from graphnav.detectors.scene import Detector, Labels, Scene
 from graphnav.detectors.windows import Blocks, kernel, share_of, smooth_rows
 
 LOW_BAND, FFT = "low_band_glrt", "fft"
-_LOOK = 3.0  # s about an end in which the edge is sought
-_INNER = 1.5  # s inside a candidate that say what is normal in it
-_EDGE = 3.0  # of S of a single row
-_WORTH = 1.0  # s, the least that the FFT detector may add to an end
+_EDGE_SEARCH = 3.0  # s about an end in which the edge is sought
+_INNER = 1.5  # s inside a candidate that define its mean force and rate
+_EDGE = 3.0  # the statistic S of a single row at an edge
+_WORTH = 1.0  # s, the least by which the FFT detector may extend a span
 _FURTHEST = 10.0  # s, the most
-_AWAY = 0.3  # of the speed that a disturbance may reach, on average over it
-_BLIND = 0.2  # of the moving windows that may look still before stillness means little
-_AROUND = 60.0  # s about a stretch in which an odometer must have moved for its zero to count
-_ENOUGH = 20.0  # s of certain motion from which that share is known
-_CLEARLY = 10.0  # times its threshold the low-band GLRT is where the vehicle clearly moves
-_REACH = 0.3  # s, of the low-pass: nearer to the recording's ends no edge can be seen
+_AWAY = 0.3  # ratio of mean to largest speed of a disturbance above which it moves the vehicle away
+_BLIND = 0.2  # share of moving windows that look stationary above which stillness is no evidence
+_AROUND = 60.0  # s about a span in which an odometer must have moved for its zero to count
+_ENOUGH_MOTION = 20.0  # s of certain motion needed to estimate that share
+_CLEAR_MOTION = 10.0  # multiple of the low-band GLRT's threshold at which the vehicle clearly moves
+_REACH = 0.3  # s, of the low-pass filter: closer to the recording's ends no edge can be found
 
 
 def edges(b: Blocks, spans: Array, s: Scale, threshold: float) -> Array:
-    """The spans with their ends where the low-passed rows leave the mean that they have just inside."""
+    """The spans with ends where the low-passed rows depart from their mean just inside."""
     h = kernel(b.period)
     out = []
     white = np.r_[np.full(3, 1.0 / s.force), np.full(3, 1.0 / s.rate)]
@@ -67,9 +67,9 @@ def edges(b: Blocks, spans: Array, s: Scale, threshold: float) -> Array:
 
 
 def _leave(b: Blocks, h: Array, white: Array, middle: float, end: float, way: int, threshold: float) -> float:
-    """Last time, going from the middle towards one end, at which a row is still like those before it."""
+    """Last time, from the middle towards one end, at which a row still agrees with those before it."""
     inner = min(_INNER, abs(end - middle))
-    lo, hi = sorted((end + way * _LOOK, end - way * (inner + 1.0)))
+    lo, hi = sorted((end + way * _EDGE_SEARCH, end - way * (inner + 1.0)))
     i, j = np.searchsorted(b.t, [lo, hi])
     i, j = max(i - len(h), 0), min(j + len(h), len(b.t))
     if j - i <= len(h) + 2:
@@ -84,7 +84,7 @@ def _leave(b: Blocks, h: Array, white: Array, middle: float, end: float, way: in
         if not normal.any():
             return middle
     off = ((rows - share_of(rows[normal], 0.5)) ** 2).sum(axis=1) / 6.0
-    # what is normal inside must not end the stop: twice its upper quantile, at least the detector's own limit
+    # normal scatter must not end the stop: twice its upper quantile, at least the detector's own limit
     limit = max(threshold, 2.0 * float(share_of(off[normal], 0.95)))
     begin = int(np.argmax(normal))
     beyond = np.flatnonzero(off[begin:] > limit)
@@ -95,11 +95,13 @@ def _leave(b: Blocks, h: Array, white: Array, middle: float, end: float, way: in
 
 
 def _without_speed(b: Blocks, spans: Array, settings: FusionSettings) -> Array:
-    """The spans cut where the force, integrated from `_LOOK` s inside, leads to a speed: braking that looked still."""
+    """The spans cut where the force, integrated from `_EDGE_SEARCH` s inside, leads to a speed: braking that looked
+    stationary.
+    """
     limit = 0.5 * settings.bridge_speed
     out = spans.copy()
     for k, (start, end) in enumerate(spans):
-        inside = min(_LOOK, 0.5 * (end - start - _INNER))
+        inside = min(_EDGE_SEARCH, 0.5 * (end - start - _INNER))
         if inside <= 0.0:
             continue
         first, last = (
@@ -111,10 +113,10 @@ def _without_speed(b: Blocks, spans: Array, settings: FusionSettings) -> Array:
 
 
 def candidates(scene: Scene, found: Detection) -> tuple[Array, Array, tuple[str, ...]]:
-    """What a detector found as stretches with edges, without those that move; what of certain motion is; sentences."""
+    """Candidates of a detector, with edges and without those that move; spans of certain motion; notes."""
     b, speeds, certain = scene.blocks, scene.known, scene.certain
     by_rows = found.name == LOW_BAND  # its windows are of the rows in which edges are sought
-    # a threshold that the data moved up is for windows; an edge is where the noise and sway of a row end
+    # a threshold raised by the data applies to windows; an edge is where the noise and sway of single rows end
     limit = min(float(np.max(found.threshold)), _EDGE) if by_rows else _EDGE
     spans = edges(b, found.intervals, scene.share(low_band)[1], limit)
     if not by_rows:
@@ -125,7 +127,7 @@ def candidates(scene: Scene, found: Detection) -> tuple[Array, Array, tuple[str,
     certain = _screen_motion(b, spans, speeds, certain)
     known = np.array([_find_speed(speeds, span) for span in spans])
     moves = np.array([_leads_to_speed(b, span, speeds, scene.settings.fusion) for span in spans]) & np.isnan(known)
-    rest = np.flatnonzero(~moves)  # one that moves may brake steadily: the force over it counts, not its mean
+    rest = np.flatnonzero(~moves)  # a moving vehicle may brake steadily: the integral of its force counts, not the mean
     moves[rest] = moving_by_chain([link(b, *pair) for pair in pairwise(spans[rest])], known[rest])
     notes = []
     measured = int((np.nan_to_num(known) > 0.0).sum())
@@ -133,14 +135,14 @@ def candidates(scene: Scene, found: Detection) -> tuple[Array, Array, tuple[str,
         notes.append(
             Note(
                 "detectors.speed_known",
-                f"{_count(measured)} smooth but no stop: odometer or GNSS say that the vehicle moved",
+                f"{_count(measured)} smooth but not a stop: odometer or GNSS show that the vehicle moved",
             )
         )
     if moves.sum() > measured:
         notes.append(
             Note(
                 "detectors.speed_felt",
-                f"{_count(int(moves.sum()) - measured)} smooth but no stop: the force before or after shows speed",
+                f"{_count(int(moves.sum()) - measured)} smooth but not a stop: the force before or after shows a speed",
             )
         )
     share = _share_still_in_motion(found, certain)
@@ -155,15 +157,15 @@ def candidates(scene: Scene, found: Detection) -> tuple[Array, Array, tuple[str,
             )
         )
     spans = subtract_spans(spans[~moves], certain)
-    if not by_rows and len(certain):  # ends that certain motion has made are no better than it is timed
+    if not by_rows and len(certain):  # ends set by certain motion are as uncertain as its timing
         spans = _without_speed(b, spans, scene.settings.fusion)
     return spans, certain, tuple(notes)
 
 
 def _screen_motion(b: Blocks, spans: Array, speeds: list[Speeds], certain: Array) -> Array:
-    """Spans of certain motion without those in the midst of a still stretch whose speed the force does not lead to.
+    """Spans of certain motion, without those inside a stationary-looking span whose speed the force does not explain.
 
-    They begin and end where nothing changes: it is the fixes, or the wheels, that are wrong.
+    Nothing changes at their ends, so the fixes or the odometer are wrong there.
     """
     keep = np.ones(len(certain), dtype=bool)
     for k, (begin, end) in enumerate(certain):
@@ -175,16 +177,16 @@ def _screen_motion(b: Blocks, spans: Array, speeds: list[Speeds], certain: Array
 
 
 def _share_still_in_motion(found: Detection, certain: Array) -> float:
-    """Share of the windows in certain motion that look still; 0 where there are too few to tell."""
+    """Share of the windows in certain motion that look stationary; 0 where there are too few to tell."""
     step = float(found.t[1] - found.t[0]) if len(found.t) > 1 else 0.0
     moving = mask_within(found.t, certain, _INNER) & np.isfinite(found.statistic)
-    return float(found.mask[moving].mean()) if moving.sum() * step > _ENOUGH else 0.0
+    return float(found.mask[moving].mean()) if moving.sum() * step > _ENOUGH_MOTION else 0.0
 
 
 def _leads_to_speed(b: Blocks, span: Array, speeds: list[Speeds], settings: FusionSettings) -> bool:
-    """Whether the speeds measured last before a still stretch, or first after it, are none that a stop there leads to.
+    """Whether the speeds last measured before a span, or first after it, contradict a stop there.
 
-    Single epochs count no more than elsewhere, and all may be as late as an odometer.
+    Single epochs do not count, as elsewhere, and every speed may be as late as an odometer's.
     """
     for way in (-1, 1):
         beside: Outwards | None = None
@@ -204,7 +206,7 @@ def _leads_to_speed(b: Blocks, span: Array, speeds: list[Speeds], settings: Fusi
 
 
 def _find_excess(beside: Outwards, s: Speeds, k: int, late: float) -> float:
-    """m/s by which a measured speed is greater than all that a stop leads to while it was measured; -inf if unknown."""
+    """m/s by which a measured speed exceeds every speed that a stop permits while it was measured; -inf if unknown."""
     there = beside.within(s.t[k] - s.half - late, s.t[k] + s.half)
     if there is None:
         return -np.inf
@@ -212,7 +214,7 @@ def _find_excess(beside: Outwards, s: Speeds, k: int, late: float) -> float:
 
 
 def _reads_zero(speeds: list[Speeds], span: Array) -> bool:
-    """Whether an odometer that is alive reads zero all along a span."""
+    """Whether a working odometer reads zero throughout a span."""
     for s in speeds:
         near = (s.t >= span[0] - _AROUND) & (s.t <= span[1] + _AROUND)
         inner = (s.t >= span[0] + s.late) & (s.t <= span[1])
@@ -226,13 +228,13 @@ def _count(n: int) -> str:
 
 
 def _find_speed(speeds: list[Speeds], span: Array) -> float:
-    """Speed in a span in which nothing changes, by the sensor that sees most; NaN if none looked."""
-    found = [s.over(span) for s in speeds]
+    """Speed in a span in which nothing changes, by the sensor with the most epochs; NaN if there are none."""
+    found = [s.speed_in(span) for s in speeds]
     return float(np.nanmax(found)) if not np.isnan(found).all() else float("nan")
 
 
 def bridge_disturbances(b: Blocks, spans: Array, certain: Array, settings: FusionSettings) -> Array:
-    """The spans with the disturbances between them filled where the vehicle did not move."""
+    """The spans, joined across disturbances in which the vehicle did not move."""
     out = list(spans[:1])
     for span in spans[1:]:
         before = out[-1]
@@ -247,13 +249,13 @@ def bridge_disturbances(b: Blocks, spans: Array, certain: Array, settings: Fusio
 
 
 def _is_only_shaken(one: Link, settings: FusionSettings) -> bool:
-    """Whether what lies between two stops shook the vehicle without moving it: to and fro, but not away."""
+    """Whether the vehicle was only shaken between two stops: it moved back and forth, but not away."""
     away = one.mean > _AWAY * settings.bridge_speed
     return one.peak < settings.bridge_speed and not away and abs(one.change) < one.tolerance
 
 
 def join_idling(b: Blocks, spans: Array, idling: Array, settings: FusionSettings) -> Array:
-    """The spans with what the FFT detector calls stationary at their ends, as far as the force says rest as well."""
+    """The spans extended by what the FFT detector calls stationary at their ends, as far as the force agrees."""
     out = spans.copy()
     limit = 0.5 * settings.bridge_speed
     for k, span in enumerate(spans):
@@ -263,14 +265,14 @@ def join_idling(b: Blocks, spans: Array, idling: Array, settings: FusionSettings
             if further < _WORTH:
                 continue
             until = at_rest_until(b, span, way, min(further, _FURTHEST), limit)
-            # a second is left to the push that the integral has only begun to feel
+            # one second is left for an acceleration that the integral has only begun to show
             if way * (until - span[side]) > _WORTH:
                 out[k, side] = until - way * _WORTH
     return merge_spans(out)
 
 
 def fuse(b: Blocks, spans: Array, idling: Array, certain: Array, settings: FusionSettings) -> tuple[Array, Array]:
-    """Stationary intervals from candidates and the FFT detector's answer, and what in them is disturbed."""
+    """Stationary intervals from candidates and the FFT detector's answer, and the disturbances within them."""
     still = spans
     if len(spans) and len(idling):
         spans = subtract_spans(join_idling(b, spans, idling, settings), certain)
@@ -286,16 +288,16 @@ def fuse(b: Blocks, spans: Array, idling: Array, certain: Array, settings: Fusio
 
 @dataclass(frozen=True)
 class Decision:
-    """What detectors come to."""
+    """A decision on stationary intervals."""
 
     spans: Array  # (M, 2) s, stationary
-    disturbed: Array  # (L, 2) s, of these what was bridged
+    disturbed: Array  # (L, 2) s, disturbances bridged within them
     notes: tuple[str, ...]
-    found: tuple[Detection, ...]  # by each
+    found: tuple[Detection, ...]  # number of windows by detector
 
 
 def decide(scene: Scene, detector: type[Detector], shown: bool) -> Decision:
-    """What one detector comes to by itself: its intervals, held against measured speeds and the force between them."""
+    """The decision of a single detector: its intervals, checked against measured speeds and the force between them."""
     found = detector.detect(scene, None, shown)
     still, certain, notes = candidates(scene, found)
     spans, disturbed = fuse(scene.blocks, still, NONE, certain, scene.settings.fusion)
@@ -303,7 +305,7 @@ def decide(scene: Scene, detector: type[Detector], shown: bool) -> Decision:
 
 
 def merge_decisions(parts: Sequence[Decision]) -> Decision:
-    """Several that decide by themselves: it stands where one of them says so."""
+    """Merge the decisions of several detectors: stationary where any of them says so."""
     notes = dict.fromkeys(note for part in parts for note in part.notes)
     return Decision(
         union([part.spans for part in parts]),
@@ -314,7 +316,7 @@ def merge_decisions(parts: Sequence[Decision]) -> Decision:
 
 
 def decide_fused(scene: Scene, detectors: Mapping[str, type[Detector]], shown: bool) -> Decision:
-    """The fusion: the low-band GLRT proposes, speeds and forces refuse, the FFT adds what lies next to a stop.
+    """The fusion: the low-band GLRT proposes, speeds and forces veto, the FFT detector extends the ends of stops.
 
     Parameters
     ----------
@@ -324,7 +326,7 @@ def decide_fused(scene: Scene, detectors: Mapping[str, type[Detector]], shown: b
     low, _ = scene.share(low_band)
     still, certain, notes = candidates(scene, low)
     half = 0.5 * scene.settings.low_band_glrt.window
-    labels = Labels(still, spans_of(low.statistic > _CLEARLY * low.threshold, low.t, half))
+    labels = Labels(still, spans_of(low.statistic > _CLEAR_MOTION * low.threshold, low.t, half))
     notes = (*low.notes, *notes)
     found, idling = [low], NONE
     if shown:

@@ -1,4 +1,4 @@
-"""Zero-velocity statistics over short windows: generalised likelihood ratio test and its relatives.
+"""Zero-velocity statistics over short windows: the generalised likelihood ratio test and related detectors.
 
 For a window of N rows of specific force f_k and turn rate omega_k, with window mean f_bar (Skog et al. 2010, "Zero-
 Velocity Detection - An Algorithm Evaluation", IEEE Trans. Biomed. Eng. 57(11), eq. 9, 13, 15, 18; Ren 2021, eq. 3-5):
@@ -27,7 +27,7 @@ from graphnav.detectors.windows import Blocks, find_unbroken, sum_running, windo
 
 _TINY = 1e-300
 _WINDOW_STEP = 0.1  # s between windows
-_SCALE = 0.05  # of g that a sensor's scale and bias may be off
+_GRAVITY_ERROR = 0.05  # share of g that an accelerometer's scale and bias may be off
 # twice the expectation under noise alone: three axes of each sensor, one direction of the magnitude
 _AT_NOISE = {
     "glrt": 12.0, "acceleration_variance": 6.0, "acceleration_magnitude": 2.0, "angular_rate_energy": 6.0,
@@ -36,7 +36,7 @@ Statistic = Callable[[Array, float, float, float], Array]
 
 
 def rows_for(accel: Array, gyro: Array) -> Array:
-    """[force, rate, |force|, |force|^2, |rate|^2], (N, 9): what the statistics need the means of."""
+    """[force, rate, |force|, |force|^2, |rate|^2], (N, 9): the rows whose window means the statistics need."""
     squares = np.einsum("nj,nj->n", accel, accel)
     turning = np.einsum("nj,nj->n", gyro, gyro)
     return np.column_stack([accel, gyro, np.sqrt(squares), squares, turning])
@@ -56,7 +56,7 @@ def acceleration_variance(means: Array, sigma_a: float, sigma_w: float, g: float
 
 
 def acceleration_magnitude(means: Array, sigma_a: float, sigma_w: float, g: float) -> Array:
-    """How far the size of the force is from gravity, over sigma_a^2; eq. 15."""
+    """Mean square deviation of the force's magnitude from gravity over sigma_a^2; eq. 15."""
     off = means[:, 7] - 2.0 * g * means[:, 6] + g * g
     return np.asarray(np.maximum(off, 0.0) / sigma_a**2)
 
@@ -108,12 +108,12 @@ class Means:
     t: Array  # (W,) s, centre
     half: float  # s, of a window
     rows: Array  # (W, 9) as in `rows_for`
-    whole: Array  # (W,) bool, False where a gap crosses
+    whole: Array  # (W,) bool, False where a window crosses a gap
 
 
 def window_means(b: Blocks, length: float) -> Means | None:
-    """Means over windows of `length` s that begin a tenth of a second apart; None where there is no window."""
-    # the blocks between two windows are summed once, for all of them
+    """Means over windows of `length` s every tenth of a second; None where there is no window."""
+    # the blocks between two windows are summed once for all windows
     group = max(1, min(round(_WINDOW_STEP / b.period), round(0.5 * length / b.period)))
     count = len(b.t) // group
     rows = b.mean[: count * group].reshape(count, group, -1).mean(axis=1)
@@ -135,11 +135,11 @@ def _compute_means(scene: Scene) -> Means | None:
 
 
 class _Windowed(Detector):
-    """One statistic of the recording, with a threshold of its own.
+    """One statistic of the recording with its own threshold.
 
-    The threshold lies where the fewest windows are called wrongly, of those that another detector finds still and
-    those that it finds moving: an idling engine may lift the statistic far above the sensors' noise. Without any
-    still ones it is twice what the sensors' noise makes of the statistic. Alone it looks for the valley between two
+    The threshold minimises wrong decisions between the windows that another detector calls stationary and those it
+    calls moving: an idling engine may raise the statistic far above sensor noise. Without stationary windows it is
+    twice the statistic's expectation under sensor noise. A detector that decides alone seeks the valley between two
     populations of its own (`own_threshold`).
     """
 
@@ -198,18 +198,18 @@ class AngularRateEnergy(_Windowed):
 
 
 def _centre(rows: Array, reference: Array, g: float, at_rest: bool) -> tuple[Array, float]:
-    """The means without the rate that `reference` windows have, and gravity as these read it if they are at rest."""
+    """The means without the mean rate of the `reference` windows, and gravity as these read it if they are at rest."""
     means = rows.copy()
     bias = np.median(means[reference, 3:6], axis=0)
     means[:, 8] += bias @ bias - 2.0 * means[:, 3:6] @ bias
     measured = float(np.median(np.linalg.norm(means[reference, :3], axis=1)))
-    return means, measured if at_rest and abs(measured / g - 1.0) < _SCALE else g
+    return means, measured if at_rest and abs(measured / g - 1.0) < _GRAVITY_ERROR else g
 
 
 def _find_quietest(m: Means) -> Array:
-    """(W,) bool, the second of windows in which force and rate scatter least: whatever moves, it is the likeliest rest.
+    """(W,) bool, the second of windows in which force and rate scatter least: the likeliest rest.
 
-    Each against its own typical scatter, so that neither unit decides.
+    Each is divided by its own typical scatter, so that neither unit dominates.
     """
     force = m.rows[:, 7] - np.einsum("wj,wj->w", m.rows[:, :3], m.rows[:, :3])
     rate = m.rows[:, 8] - np.einsum("wj,wj->w", m.rows[:, 3:6], m.rows[:, 3:6])
@@ -220,12 +220,12 @@ def _find_quietest(m: Means) -> Array:
 
 
 def _average_idling(scene: Scene, g: float) -> Array:
-    """(1, 9) means of a window with an engine that idles at the limits of Li 2024: Peak-1 and Peak-2 of every axis.
+    """(1, 9) means of a window with an idling engine at the limits of Li 2024 for Peak-1 and Peak-2 of every axis.
 
     A line of amplitude A has the mean square A^2 / 2, so every axis has the mean square A^2.
     """
     fft = scene.settings.fft
     force, rate = fft.force_limit * MG, np.radians(fft.rate_limit)
-    # along gravity the lines change the size of the force: its mean is g + A^2/g, about which it scatters by A
+    # along gravity the lines change the magnitude of the force: its mean is g + A^2/g with scatter A
     size = g + force**2 / g
     return np.array([[0.0, 0.0, g, 0.0, 0.0, 0.0, size, g**2 + 3.0 * force**2, 3.0 * rate**2]])

@@ -27,18 +27,18 @@ from graphnav.detectors.windows import LowPassed, find_unbroken, sum_running, wi
 from graphnav.recording import ImuNoise
 
 NAME = "low_band_glrt"
-_DOWN, _UP = 1.5, 0.7  # decades that the data may move the threshold down and up
-_LEAST_MOTION = 30.0  # s of certain motion that say where the threshold must not be
-_QUIETEST = 1.0  # s that say how much noise there can be at most
-_TRUSTED = 0.05  # of the stated noise is the least that is believed
-_OVERSTATED = 2.0  # times what the quietest windows allow
+_DOWN, _UP = 1.5, 0.7  # decades by which the data may lower or raise the threshold
+_LEAST_MOTION = 30.0  # s of certain motion needed to bound the threshold
+_QUIETEST = 1.0  # s of the quietest windows, which bound the noise from above
+_TRUSTED = 0.05  # least share of the stated noise that is believed
+_OVERSTATED = 2.0  # ratio to the noise of the quietest windows above which stated noise is too large
 
 
 class LowBandGlrt(Detector):
-    """The detector, by its name; it needs no labels."""
+    """The low-band GLRT; it needs no labels."""
 
     name = NAME
-    edge = 0.3  # what its windows begin with moves the quantiles that edges are set by
+    edge = 0.3  # the grid of windows changes the quantiles that edges are set by
 
     @classmethod
     def detect(cls, scene: Scene, labels: Labels | None = None, shown: bool = True) -> Detection:
@@ -46,7 +46,7 @@ class LowBandGlrt(Detector):
 
 
 def low_band(scene: Scene) -> tuple[Detection, Scale]:
-    """Its answer, and the scale of a low-passed row at rest, which edges are found by; to be shared."""
+    """The answer of the low-band GLRT, and the scale of a low-passed row at rest, by which edges are found."""
     return detect_low_band(scene.low, scene.recording.imu.noise, scene.settings.low_band_glrt, scene.certain)
 
 
@@ -56,12 +56,12 @@ class Scale:
 
     force: float
     rate: float
-    stated: float = 1.0  # S of what the stated noise would make of a row at rest
-    overstated: bool = False  # the recording knows windows far below that
+    stated: float = 1.0  # S of a row at rest under the stated noise
+    overstated: bool = False  # whether the recording has windows far below that
 
 
 def measure_spreads(low: LowPassed, window: int) -> Array:
-    """Variance per axis of force and of rate in every window of low-passed rows, (W, 2); NaN where a gap lies in it."""
+    """Variance per axis of force and of rate in every window of low-passed rows, (W, 2); NaN across a gap."""
     rows = low.rows - low.rows.mean(axis=0)
     sums = sum_running(np.concatenate([rows, rows**2], axis=1)).means(window)
     spread = np.maximum(sums[:, 6:] - sums[:, :6] ** 2, 0.0)
@@ -70,9 +70,10 @@ def measure_spreads(low: LowPassed, window: int) -> Array:
 
 
 def scale(low: LowPassed, noise: ImuNoise, settings: LowBandSettings, spread: Array) -> Scale:
-    """What sensor noise and sway make of a low-passed row of a standing vehicle.
+    """Scale of a low-passed row of a stationary vehicle from sensor noise and sway.
 
-    Noise is in every window, so the quietest ones bound it from above: figures stated too large must not hide motion.
+    Every window contains the noise, so the quietest windows bound it from above: figures stated too large must not hide
+    motion.
     """
     stated = low.gain * np.array([noise.accel_noise_density, noise.gyro_noise_density])
     there = spread[np.isfinite(spread).all(axis=1)]
@@ -95,7 +96,7 @@ def compute_statistic(spread: Array, s: Scale) -> Array:
 def detect_low_band(
     low: LowPassed, noise: ImuNoise, settings: LowBandSettings, moving: Array
 ) -> tuple[Detection, Scale]:
-    """Windows in which nothing but noise and sway is left below the engine's frequencies, and the scale used.
+    """Windows with nothing but noise and sway below the engine's frequencies, and the scale used.
 
     Parameters
     ----------
@@ -112,7 +113,7 @@ def detect_low_band(
     found = compute_statistic(spread, s)
     threshold, notes = _find_threshold(t, found, settings, moving, low.period, s)
     mask = found < threshold
-    # a window says nothing of where in it motion began: only what all windows over it call still is
+    # a window does not show where in it motion began: stationary is only what all windows over it agree on
     spans = spans_of(mask, t, 0.5 * settings.window)
     return Detection(NAME, t, found, threshold, mask, longer_than(spans, settings.window), notes), s
 
@@ -130,15 +131,15 @@ def _find_threshold(
         return float(10.0**split), ()
     notes: tuple[str, ...] = ()
     if s.overstated and np.mean(found < settings.threshold) < 0.5:
-        # noise that hides so much is not believed, and no population stands out: what is left is 3 sigma of the sway
+        # noise that would hide so much is not believed, and no population stands out: 3 sigma of the sway remains
         start = min(start, float(np.log10(9.0 * swaying)))
         notes = (
             Note(
                 "detectors.low_band.noise",
-                "the IMU's stated noise is too large to tell stops by it: only the stillest stretches count",
+                "the IMU's stated noise is too large to detect stops: only the quietest spans count",
             ),
         )
     if label.sum() * period >= _LEAST_MOTION:
-        # some of these windows may be mislabelled; the threshold keeps clear of the others
+        # some of these windows may be mislabelled; the threshold keeps a distance from the others
         start = min(start, max(float(np.quantile(x[label], MISTAKEN)) - np.log10(2.0), start - _DOWN))
     return float(10.0**start), notes

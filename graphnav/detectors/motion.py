@@ -1,7 +1,7 @@
-"""What odometer and GNSS say about motion: spans in which a speed exceeds what its own error can explain.
+"""Certain motion by odometer and GNSS: spans in which a speed exceeds its own error.
 
-An odometer that reads zero proves nothing (unplugged, or slower than its first pulse), a fix can lie for a few
-epochs, and both may be late. So single epochs never count, and only motion is concluded from them, never rest.
+A zero of an odometer proves nothing (unplugged, or slower than its first pulse), a fix can be wrong for a few epochs,
+and both may be late. So single epochs never count, and only motion is concluded from them, never rest.
 """
 
 from __future__ import annotations
@@ -19,33 +19,33 @@ from graphnav.recording import Gnss, Odometer, Recording
 from graphnav.recording.checks.crosschecks import compute_local_positions
 
 _SIGMAS = 3.0
-_SIGMAS_APART = 6.0  # of positions compared: their errors wander by more than receivers state
-_MEDIAN = 3  # epochs over which the median is taken
-_LONGEST = 2.0  # s between epochs that a span of motion leads across
-_BASE = 4.0  # s over which positions are compared
+_SIGMAS_APART = 6.0  # for differences of positions: their errors wander by more than receivers state
+_MEDIAN = 3  # epochs of the running median
+_LONGEST_GAP = 2.0  # s, longest gap between epochs within a span of motion
+_BASE = 4.0  # s between the positions that are differenced
 
 
 @dataclass(frozen=True)
 class Speeds:
-    """Speeds with what they must exceed to mean motion, from one sensor."""
+    """Speeds from one sensor, with the limit above which they mean motion."""
 
     t: Array  # (K,) s
     v: Array  # (K, 1) m/s forward, or (K, 2) horizontal
     limit: Array  # (K,) m/s
     late: float = 0.0  # s, by which the stamps may be late
-    half: float = 0.0  # s on either side of t of which v is the mean
-    silent_at_rest: bool = False  # reads zero whatever happens when it is unplugged
+    half: float = 0.0  # s on either side of t over which v is the mean
+    silent_at_rest: bool = False  # whether it reads zero when it is unplugged
 
     @cached_property
     def speed(self) -> Array:
-        """(K,) m/s, without a sign."""
+        """(K,) m/s, magnitude."""
         return np.sqrt(np.einsum("kj,kj->k", self.v, self.v))
 
-    def over(self, span: Array) -> float:
-        """Speed in a span in which nothing changes, m/s: 0 if it may be none, NaN if the sensor did not look.
+    def speed_in(self, span: Array) -> float:
+        """Speed in a span in which nothing changes, m/s: 0 if it is within the error, NaN without epochs.
 
-        The velocity is the same all along such a span. So its median over the epochs counts, and what wanders by as
-        much as it says is not motion.
+        The velocity is constant in such a span, so the median over the epochs counts, and a wander within the stated
+        error is not motion.
         """
         # what a late sensor says first belongs to the time before
         first = min(span[0] + self.late, 0.5 * (span[0] + span[1]) + self.late)
@@ -62,7 +62,7 @@ class Speeds:
 
 
 def speeds(recording: Recording, settings: FusionSettings) -> list[Speeds]:
-    """Speeds of every sensor that knows any."""
+    """Speeds of every sensor that measures one."""
     found = []
     if recording.odometer is not None and len(recording.odometer.t) > 2:
         found.append(_read_odometer(recording.odometer, settings))
@@ -72,13 +72,13 @@ def speeds(recording: Recording, settings: FusionSettings) -> list[Speeds]:
 
 
 def find_moving(found: list[Speeds]) -> Array:
-    """(M, 2) s, spans of certain motion: less at the ends by what the stamps may be late and the speeds are blurred."""
+    """(M, 2) s, spans of certain motion, shortened at the ends by possible delays and averaging times."""
     parts = []
     for s in found:
         excess = s.speed - s.limit
         k = np.arange(len(excess))
         fast = take_median(excess[np.maximum(k - 1, 0)], excess, excess[np.minimum(k + 1, len(k) - 1)]) > 0.0
-        breaks = np.diff(s.t) > _LONGEST
+        breaks = np.diff(s.t) > _LONGEST_GAP
         spans = [spans_of(fast[a:b], s.t[a:b]) for a, b in _split_pieces(breaks)]
         one = union([p for p in spans if len(p)]) if any(len(p) for p in spans) else NONE
         if len(one):
@@ -99,14 +99,14 @@ def _split_pieces(breaks: np.ndarray) -> list[tuple[int, int]]:
 
 
 def find_smallest_step(values: Array) -> float:
-    """Smallest step between the values of a quantised sensor; tiny where it is none."""
+    """Smallest step between the values of a quantised sensor; a tiny number where there is none."""
     steps = np.diff(np.unique(np.abs(values)))
     steps = steps[steps > 1e-6]
     return float(np.quantile(steps, 0.05)) if len(steps) else 0.0
 
 
 def _read_odometer(o: Odometer, settings: FusionSettings) -> Speeds:
-    # one pulse in a period may be the jitter of a wheel that stands on a tooth
+    # one pulse per period may be jitter of a wheel that stands on a tooth
     limit = max(settings.max_speed, 1.5 * find_smallest_step(o.speed))
     return Speeds(o.t, o.speed[:, None], np.full(len(o.t), limit), settings.odometer_delay)
 

@@ -1,4 +1,4 @@
-"""What detectors look at, each part made once, and the contract that all of them keep."""
+"""The data that detectors share, each derived once, and the interface of a detector."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ MG = 9.80665e-3  # m/s^2
 
 @dataclass(frozen=True)
 class Scene(Shared):
-    """A recording, or a window of one, and what several detectors need of it."""
+    """A recording, or a window of one, with quantities that several detectors need."""
 
     recording: Recording
     settings: DetectorSettings
 
     @cached_property
     def period(self) -> float:
-        """s between rows of the IMU; not above 0 where there are too few."""
+        """s between IMU rows; not positive where there are too few."""
         return period_of(self.recording.imu.t)
 
     @cached_property
@@ -52,7 +52,7 @@ class Scene(Shared):
 
     @cached_property
     def certain(self) -> Array:
-        """(M, 2) s, spans in which odometer or GNSS are certain of motion."""
+        """(M, 2) s, spans in which odometer or GNSS show certain motion."""
         return find_moving(self.known)
 
     @cached_property
@@ -68,25 +68,25 @@ class Scene(Shared):
 
 @dataclass(frozen=True)
 class Labels:
-    """Spans that others find still and moving, each (M, 2) s."""
+    """Spans that other detectors call stationary and moving, each (M, 2) s."""
 
     still: Array
     moving: Array
 
 
 class Detector(ABC):
-    """Looks for stationary windows. Subclasses in this folder are found by themselves.
+    """Interface of a detector of stationary windows. Subclasses in this folder are found automatically.
 
-    A detector never fails: what it cannot look at gives a `Detection` without windows and a note.
+    A detector never fails: where it cannot work it returns a `Detection` without windows and a note.
     """
 
     name: ClassVar[str]
-    edge: ClassVar[float]  # s by which the ends of a stop may differ between a recording and a window of it
+    edge: ClassVar[float]  # s by which the ends of a stop may differ between a recording and a part of it
 
     @classmethod
     @abstractmethod
     def detect(cls, scene: Scene, labels: Labels | None = None, shown: bool = True) -> Detection:
-        """Its answer.
+        """Detect stationary windows.
 
         Parameters
         ----------

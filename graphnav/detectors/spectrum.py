@@ -1,11 +1,11 @@
-"""Amplitude spectra of short windows, and the line that an idling engine leaves in them.
+"""Amplitude spectra of short windows, and the line of an idling engine in them.
 
-Leakage is met twice. The mean and the trend of a window are taken off, and a Hann window makes what lies 5 bins off
-a strong line 1/500 of it instead of 1/16, so that the changes of force below 10 Hz do not fill the bands above. Its
-price is a main lobe four bins wide (1.3 Hz of a 3-s window), which no band notices. A line between two bins would
-read up to 15 % low; the ratio of the two highest bins tells where between them it is, exactly for a pure line
-(Grandke 1983, "Interpolation Algorithms for Discrete Fourier Transforms of Weighted Signals", IEEE Trans. Instrum.
-Meas. 32, eq. 16, 17), and gives frequency and amplitude back.
+Leakage is reduced in two steps. The mean and trend of a window are removed, and a Hann window attenuates a strong line
+5 bins off to 1/500 instead of 1/16, so that changes of force below 10 Hz do not fill the bands above. The price is a
+main lobe four bins wide (1.3 Hz for a 3-s window), which is narrow against the bands. A line between two bins would
+read up to 15 % low; the ratio of the two highest bins gives its place between them, exactly for a pure line (Grandke
+1983, "Interpolation Algorithms for Discrete Fourier Transforms of Weighted Signals", IEEE Trans. Instrum. Meas. 32, eq.
+16, 17), and with it frequency and amplitude.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from numpy.lib.stride_tricks import sliding_window_view
 from graphnav.core.rotation import Array
 
 CHANNELS = ("force y", "force z", "rate x")  # forward, up, pitch
-_CHUNK = 256  # windows at a time: a few MB whatever the length of the recording
+_WINDOWS_AT_ONCE = 256  # windows at a time: a few MB whatever the length of the recording
 LOWEST, _HIGHEST = 8.0, 50.0  # Hz, where idle lines are looked for
-_FLOOR = 3.0  # Hz on either side of a bin that say what the spectrum is around a line
-_CLEAR = 2.0  # natural logarithm of power over what is around it at which a line is there
+_FLOOR = 3.0  # Hz on either side of a bin over which the background is taken
+_CLEAR = 2.0  # natural logarithm of power over background at which there is a line
 FEWEST_WINDOWS = 3
 _LOOKED_AT = 200  # windows at most
 
@@ -40,7 +40,7 @@ class Windows:
 
     @property
     def count(self) -> int:
-        """How many windows there are."""
+        """Number of windows."""
         return max(0, (len(self.columns[0]) - self.length) // self.step + 1)
 
     @property
@@ -50,7 +50,7 @@ class Windows:
 
     def amplitudes(self, which: Array | None = None) -> Iterator[tuple[slice, Array]]:
         """Single-sided amplitudes (w, 3, F) of all windows or of some, chunk by chunk, in the columns' units."""
-        if self.count <= _CHUNK:  # few enough to be kept
+        if self.count <= _WINDOWS_AT_ONCE:  # small enough to be kept
             yield (
                 slice(0, self.count if which is None else len(which)),
                 self._all if which is None else self._all[which],
@@ -66,13 +66,13 @@ class Windows:
         n = self.length
         ramp = np.linspace(-1.0, 1.0, n)
         hann = np.hanning(n + 1)[:-1]
-        # what takes mean and trend off and weighs, applied after them: w (x - a - b ramp)
-        for begin in range(0, len(number), _CHUNK):
-            some = number[begin : begin + _CHUNK]
+        # removes mean and trend and applies the weights, afterwards: w (x - a - b ramp)
+        for begin in range(0, len(number), _WINDOWS_AT_ONCE):
+            some = number[begin : begin + _WINDOWS_AT_ONCE]
             x = np.empty((len(some), len(self.columns), n), dtype=np.float32)
             for c, column in enumerate(self.columns):
                 view = sliding_window_view(column, n)[some * self.step]
-                # single precision holds a spectrum's five digits once the mean of the window is off
+                # single precision holds a spectrum's five digits once the window's mean is removed
                 x[:, c] = view - view.mean(axis=1, keepdims=True)
             slope = (x @ ramp.astype(np.float32)) / np.float32(ramp @ ramp)
             x -= slope[..., None] * ramp.astype(np.float32)
@@ -94,7 +94,7 @@ def peaks(amplitude: Array, frequencies: Array, low: float, high: float) -> tupl
     last = len(frequencies) - 1
     flat, row = amplitude.reshape(-1, amplitude.shape[-1]), np.arange(k.size)
     at = [flat[row, np.minimum(k.ravel() + d, last)].reshape(k.shape) for d in (-1, 0, 1)]  # k > 0
-    # what borders on a band may be a line of the next one: only a peak is interpolated
+    # a value at the edge of a band may belong to a line of the next band: only a peak is interpolated
     peak = (at[1] >= at[0]) & (at[1] >= at[2]) & (k < last)
     up = at[2] >= at[0]
     ratio = np.where(up, at[2], at[0]) / np.maximum(at[1], 1e-30)
@@ -106,20 +106,20 @@ def peaks(amplitude: Array, frequencies: Array, low: float, high: float) -> tupl
 
 @dataclass(frozen=True)
 class IdleLine:
-    """The line of an idling engine, and what was seen of it."""
+    """The line of an idling engine."""
 
     frequency: float  # Hz, median over the windows that show it
-    lowest: float  # Hz, 5 % of these windows below
-    highest: float  # Hz, 95 % of these windows below
+    lowest: float  # Hz, 5 % quantile over these windows
+    highest: float  # Hz, 95 % quantile over these windows
     clarity: float  # natural logarithm of the line's power over the spectrum around it
     harmonic: float  # the same of the second harmonic; NaN above the Nyquist frequency
-    share: float  # of the windows looked at that show it
+    share: float  # share of the examined windows that show it
 
 
 def idle_line(windows: Windows, still: Array) -> IdleLine | None:
-    """The line that stands out in the windows numbered `still`, by itself and with its second harmonic.
+    """The line that stands out in the windows numbered `still`, with its second harmonic; None without one.
 
-    A quarter of the windows is enough: an engine may be switched off for the rest.
+    A quarter of the windows is enough: the engine may be switched off in the others.
     """
     if len(still) < FEWEST_WINDOWS:
         return None
@@ -131,7 +131,7 @@ def idle_line(windows: Windows, still: Array) -> IdleLine | None:
     clear = np.asarray((power - _take_local_median(power, reach)).max(axis=1))  # (w, F), the clearest channel
     quarter = max(1, len(some) // 4)
     line = np.sort(clear, axis=0)[-quarter:].mean(axis=0)
-    # noise alone reaches something too; a line lies above what half the bins do
+    # noise alone reaches some level; a line lies above half of the bins
     line = np.maximum(line - np.median(line), 0.0)
     inside = np.flatnonzero((f > LOWEST - f[1]) & (f <= min(_HIGHEST, f[-1] - 2.0 * f[1])))
     peak = [int(k) for k in inside if line[k] >= line[k - 1] and line[k] >= line[k + 1] and line[k] > _CLEAR]
@@ -141,12 +141,12 @@ def idle_line(windows: Windows, still: Array) -> IdleLine | None:
     def second(k: int) -> float:
         return float(line[2 * k - 1 : 2 * k + 2].max()) if 2 * k + 1 < len(f) else float("nan")
 
-    # a strong second harmonic is a line as well, but one without the fundamental's own half below it
+    # a strong second harmonic is a line too, but has no line at half its frequency
     best = max(peak, key=lambda k: line[k] + np.nan_to_num(second(k)))
     where, height = peaks(spectra, f, 0.88 * f[best], 1.12 * f[best] + f[1])
     shown = clear[:, best - 1 : best + 2].max(axis=1) > _CLEAR
     shown = shown if shown.any() else np.ones(len(some), dtype=bool)
-    # of the channel in which it stands out most
+    # in the channel in which it stands out most
     floor = np.exp(0.5 * _take_local_median(power, reach)[..., best])
     strongest = int(np.median(height[shown] / floor[shown], axis=0).argmax())
     low, middle, high = np.quantile(where[shown, strongest], [0.05, 0.5, 0.95])
@@ -154,12 +154,12 @@ def idle_line(windows: Windows, still: Array) -> IdleLine | None:
 
 
 def _take_local_median(power: Array, reach: int) -> Array:
-    """Median of the spectrum around each bin, by blocks of `reach` bins."""
+    """Median of the spectrum around each bin, over blocks of `reach` bins."""
     n = power.shape[-1] // reach
     if n < 2:
         return np.median(power, axis=-1, keepdims=True)
     block = np.median(power[..., : n * reach].reshape(*power.shape[:-1], n, reach), axis=-1)
-    # a block and its neighbours: the lower half of three medians is never a line's own
+    # a block and its neighbours: the lower half of three medians never contains the line itself
     padded = np.concatenate([block[..., :1], block, block[..., -1:]], axis=-1)
     middle = np.median(np.stack([padded[..., :-2], padded[..., 1:-1], padded[..., 2:]]), axis=0)
     k = np.minimum(np.arange(power.shape[-1]) // reach, n - 1)

@@ -1,25 +1,25 @@
-"""Where a foot is on the floor: the GLRT (Skog et al. 2010, eq. 9; Ren 2021, eq. 3-5) in units of turn rate.
+"""Stances of a foot: the GLRT (Skog et al. 2010, eq. 9; Ren 2021, eq. 3-5) in units of turn rate.
 
-What keeps a foot in stance from reading like one at rest is not the noise of its sensors, but that the shoe rolls
-over the floor. So the sigmas of the test are not the sensors' but those of rolling, and it reads
+A foot in stance does not read like one at rest because the shoe rolls over the floor, rather than because of sensor
+noise. So the sigmas of the test are those of rolling, and it becomes
 
     e^2 = mean |omega_k - b|^2 + mean |f_k - g f_bar/|f_bar||^2 / c^2            over `window`
 
-with b, g the mean rate and the size of the mean force of the quietest second of the recording, which hold the biases.
-e is the turn rate of a foot that moves that much. c, m/s^2 per rad/s, is what a force must differ by to weigh as much
-as a turn rate; it is that of Skog's sigmas, 0.01 m/s^2 to 0.1 deg/s.
+with b and g the mean rate and the magnitude of the mean force of the quietest second of the recording, which contain
+the biases. e is the turn rate of a foot that moves that much. c, m/s^2 per rad/s, is the deviation of the force that
+weighs as much as a turn rate of 1; it follows from Skog's sigmas, 0.01 m/s^2 and 0.1 deg/s.
 
-In the swing of any walk e is several rad/s, in the middle of a stance some tenths. The threshold lies between them,
-at 1.5 rad/s, where an IMU 10 cm above the floor moves at 0.15 m/s, a twentieth of what it does in swing. It need not
-be sharp, because the rows of `graphnav.constraints.foot` account for the rolling and weigh less the more of it there
-is. What must not happen is to take part of a swing for a stance: the slow first step of a walk has a moment in which
-force and rate are low. But such a moment is not as deep as stances are. So spans whose lowest e stands out from
-that of all spans, by three of their spreads (median absolute deviation, in log e), are left out.
+In swing e is several rad/s, in the middle of a stance some tenths. The threshold lies between them, at 1.5 rad/s, where
+an IMU 10 cm above the floor moves at 0.15 m/s, a twentieth of its speed in swing. It need not be sharp, because the
+rows of `graphnav.constraints.foot` model the rolling and weigh less the stronger it is. What must not happen is that a
+part of a swing passes for a stance: in the slow first step of a walk force and rate are low for a moment, but less low
+than in stances. So spans whose lowest e is an outlier among those of all spans, by three of their spreads (median
+absolute deviation, in log e), are discarded.
 
-What e cannot see is a force that lasts: a foot that is carried level to its last footprint and slows down there turns
-little, and what slows it tilts the mean force more than it lengthens it. But over the whole span it adds up. So from
-the quietest moment near either end the gyro carries the axes outward, and the force beyond what it was there is
-integrated; the span ends where that velocity exceeds the threshold times `_REACH`, the most that rolling allows.
+e does not show a lasting force: a foot that is carried level to its last footprint and slows down there turns little,
+and the deceleration tilts the mean force more than it lengthens it. But over the whole span it adds up. So from the
+quietest moment near either end the gyro carries the axes outward, and the excess force is integrated; the span ends
+where that velocity exceeds the threshold times `_REACH`, the most that rolling permits.
 """
 
 from __future__ import annotations
@@ -37,18 +37,18 @@ from graphnav.detectors.glrt import glrt_statistic
 from graphnav.detectors.windows import find_unbroken, sum_running
 from graphnav.recording import Imu
 
-_QUIET = 1.0  # s; the quietest of the recording says what bias and gravity are
-_ENOUGH = 5  # spans, to say what is usual
-_LEAST_SPREAD = 0.3  # of log e, between the stances of the most even walk
+_QUIET_SPAN = 1.0  # s; the quietest second of the recording defines bias and gravity
+_FEWEST_SPANS = 5  # spans needed for the statistics of their depth
+_LEAST_SPREAD = 0.3  # of log e: least spread between stances
 _SPREADS = 3.0
-_EDGE_SEARCH = 0.8  # s from an end of a span within which its quietest moment is looked for: twice what a slide lasts
-_REACH = 0.2  # m, from an IMU on a shoe to where the shoe touches the floor, at most
+_EDGE_SEARCH = 0.8  # s from an end of a span within which its quietest moment is sought: twice the duration of a slide
+_REACH = 0.2  # m, largest distance from an IMU on a shoe to the point of contact with the floor
 
 
 def detect_stances(
     imu: Imu, period: float, settings: StanceSettings, which: Sequence[str] = ("glrt",), since: float = -np.inf
 ) -> Detections:
-    """Stances of a foot, and e with the threshold they come from.
+    """Stances of a foot, and the statistic e with its threshold.
 
     Parameters
     ----------
@@ -73,8 +73,7 @@ def detect_stances(
             notes.append(
                 Note(
                     "detectors.stance.lulls",
-                    f"{len(one.intervals) - len(deep)} short lulls that do not reach as deep as the stances were left "
-                    "out",
+                    f"{len(one.intervals) - len(deep)} short lulls, less quiet than the stances, were left out",
                 )
             )
         begin = int(np.searchsorted(deep[:, 1], since)) if len(deep) else 0
@@ -91,12 +90,12 @@ def detect_stances(
 
 def _find_below(name: str, e: Array, imu: Imu, period: float, window: int, settings: StanceSettings) -> Detection:
     """Spans in which e is below its threshold."""
-    t = 0.5 * (imu.t[: len(e)] + imu.t[window - 1 :]) - 0.5 * period  # a row speaks for the period before it
+    t = 0.5 * (imu.t[: len(e)] + imu.t[window - 1 :]) - 0.5 * period  # a row covers the period before it
     whole = find_unbroken(np.r_[True, np.diff(imu.t) < period + settings.bridge], window)
     e = np.where(whole, e, np.nan)
     below = e < settings.threshold
     spans = longer_than(merge_spans(spans_of(below, t, 0.5 * period), settings.bridge), settings.shortest)
-    # windows begin and end inside the recording: its first and last stance reach to its ends
+    # windows lie within the recording: the first and the last stance reach to its ends
     half = 0.5 * window * period
     if len(spans) and spans[0, 0] < imu.t[0] + half:
         spans[0, 0] = imu.t[0] - period
@@ -106,31 +105,32 @@ def _find_below(name: str, e: Array, imu: Imu, period: float, window: int, setti
 
 
 def _average_quietest(imu: Imu, period: float) -> tuple[Array, float]:
-    """Mean rate (3,) and size of the mean force of the second in which both scatter least."""
-    n = min(len(imu.t), max(2, round(_QUIET / period)))
+    """Mean rate (3,) and magnitude of the mean force of the second in which both scatter least."""
+    n = min(len(imu.t), max(2, round(_QUIET_SPAN / period)))
     rows = np.column_stack([imu.gyro, imu.accel])
     means, squares = sum_running(rows).means(n), sum_running(rows**2).means(n)
     scatter = squares - means**2
-    # each against its own typical scatter, so that neither unit decides
+    # each divided by its own typical scatter, so that neither unit dominates
     total = np.sum(scatter / np.maximum(np.median(scatter, axis=0), 1e-12), axis=1)
     k = int(np.argmin(total))
     return means[k, :3], float(np.linalg.norm(means[k, 3:]))
 
 
 def _as_deep_as_others(spans: Array, t: Array, e: Array, threshold: float) -> Array:
-    """(M,) bool, which spans reach about as low as the others do.
+    """(M,) bool, which spans reach about as low as the others.
 
-    Rows that are missing do not make two stances of one: standing would be many, and those of the walk the odd ones.
+    Missing rows do not split a stance: the parts would be many, and the stances of the walk the outliers.
     """
-    if len(spans) < _ENOUGH:
+    if len(spans) < _FEWEST_SPANS:
         return np.ones(len(spans), dtype=bool)
     first, last = np.searchsorted(t, spans[:, 0]), np.searchsorted(t, spans[:, 1], side="right")
     moved = np.concatenate([[0], np.cumsum(np.nan_to_num(e) >= threshold)])
-    one = np.cumsum(np.concatenate([[False], moved[first[1:]] > moved[last[:-1] - 1]]))  # which stance each is part of
+    # the stance that each is part of
+    one = np.cumsum(np.concatenate([[False], moved[first[1:]] > moved[last[:-1] - 1]]))
     lowest = np.array([np.log(np.nanmin(e[a:b])) for a, b in zip(first, last, strict=True)])
     depth = np.full(one[-1] + 1, np.inf)
     np.minimum.at(depth, one, lowest)
-    if len(depth) < _ENOUGH:
+    if len(depth) < _FEWEST_SPANS:
         return np.ones(len(spans), dtype=bool)
     middle = float(np.median(depth))
     spread = max(1.4826 * float(np.median(np.abs(depth - middle))), _LEAST_SPREAD)
@@ -138,7 +138,7 @@ def _as_deep_as_others(spans: Array, t: Array, e: Array, threshold: float) -> Ar
 
 
 def _without_sliding(spans: Array, imu: Imu, t: Array, e: Array, bias: Array, fastest: float) -> Array:
-    """The spans (M, 2) cut where the foot moves at more than `fastest` m/s against their quietest moments.
+    """The spans (M, 2), cut where the foot moves at more than `fastest` m/s relative to their quietest moments.
 
     t, e (W,) are of the windows that begin with each row.
     """
@@ -146,7 +146,7 @@ def _without_sliding(spans: Array, imu: Imu, t: Array, e: Array, bias: Array, fa
     window = len(imu.t) - len(t) + 1
     force = sum_running(imu.accel).means(window)
     T = np.diff(imu.t, prepend=2.0 * imu.t[0] - imu.t[1])
-    ways = []  # from a quiet moment outward: which span, which end of it, the window, the first row and how many
+    ways = []  # from a quiet moment outward: the span, its end, the window, the first row and the number of rows
     for side, way in ((0, -1), (1, 1)):
         for n, (begin, end) in enumerate(spans):
             lo, hi = (begin, min(begin + _EDGE_SEARCH, end)) if side == 0 else (max(end - _EDGE_SEARCH, begin), end)
@@ -164,8 +164,8 @@ def _without_sliding(spans: Array, imu: Imu, t: Array, e: Array, bias: Array, fa
     longest = int(counts.max())
     sign = 2 * sides[:, None] - 1
     rows = rows[:, None] + sign * np.minimum(np.arange(longest), counts[:, None] - 1)  # (W, L), the last repeated
-    dt = sign * T[rows]  # a row speaks for the period before its time
-    R = rotation.exp(0.5 * dt[:, :, None] * (imu.gyro[rows] - bias))  # of half a period; products of these follow
+    dt = sign * T[rows]  # a row covers the period before its time
+    R = rotation.exp(0.5 * dt[:, :, None] * (imu.gyro[rows] - bias))  # over half a period; products of these follow
     R[:, 1:] = R[:, :-1] @ R[:, 1:]
     step = 1
     while step < longest:

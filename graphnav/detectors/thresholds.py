@@ -1,9 +1,9 @@
-"""Thresholds from the recording itself: the valley between what is still and what is not.
+"""Thresholds from the recording itself: the valley between stationary and moving windows.
 
-The logarithm of a statistic of windows falls into two populations if a recording holds both (Kittler and
-Illingworth 1986 look for such a split in images): standing windows close together at the sensors' own noise, moving
-ones higher and wide. Between them there are few, because braking and pulling away take little time. No valley, no
-split: nothing is made of a recording that only stands or never does.
+The logarithm of a statistic falls into two populations if a recording contains both (Kittler and Illingworth 1986 split
+images in this way): stationary windows close together at the level of sensor noise, moving ones higher and spread
+widely. Few lie between, because braking and starting take little time. Without a valley, as in a recording that only
+stands or never does, there is no split.
 """
 
 from __future__ import annotations
@@ -16,15 +16,15 @@ from graphnav.detectors.base import mask_within
 from graphnav.detectors.scene import Scene
 
 _TINY = 1e-300
-FEWEST = 1.0  # s of a population that the data may tell of
-MISLABELLED = 0.2  # of the moving windows that other sensors may be wrong about
-_TELLS = 0.5  # of the shares of either kind called wrongly; 1 is a statistic that says nothing
-MISTAKEN = 0.05  # of the moving windows that may be mislabelled
+FEWEST = 1.0  # s, smallest population that counts
+MISLABELLED = 0.2  # share of the moving windows that other sensors may mislabel
+_TELLS = 0.5  # sum of the shares of wrong decisions of either kind; 1 is a statistic without information
+MISTAKEN = 0.05  # share of the moving windows that may be mislabelled
 _BIN = 0.1  # decades
-_SPREAD = np.array([0.05, 0.25, 0.4, 0.25, 0.05])  # smoothing, bins
-_DEPTH = 4.0  # how many times lower than both sides a valley is
-_FEW = 10.0  # times the fewest values: a population below that must stand apart by more than chance
-_APART = 4  # bins that then must be empty
+_SMOOTHING = np.array([0.05, 0.25, 0.4, 0.25, 0.05])  # smoothing, bins
+_DEPTH = 4.0  # ratio of both sides to a valley
+_SMALL_POPULATION = 10.0  # times the fewest values: a smaller population must be separated by more than chance
+_EMPTY_BINS = 4  # empty bins that this takes
 
 
 def valley(log_values: Array, low: float, high: float, fewest: int) -> float | None:
@@ -40,40 +40,40 @@ def valley(log_values: Array, low: float, high: float, fewest: int) -> float | N
     if len(x) < 2 * fewest or not low < high:
         return None
     edges = np.arange(np.floor(min(low, x.min()) / _BIN) - 3, np.ceil(max(high, x.max()) / _BIN) + 4) * _BIN
-    density = np.convolve(np.histogram(x, edges)[0], _SPREAD, mode="same")
+    density = np.convolve(np.histogram(x, edges)[0], _SMOOTHING, mode="same")
     middle = 0.5 * (edges[1:] + edges[:-1])
     inside = np.flatnonzero((middle >= low) & (middle <= high))
     if not len(inside):
         return None
-    # the highest there is on the left and on the right of each bin
+    # the maximum on the left and on the right of each bin
     left, right = np.maximum.accumulate(density), np.maximum.accumulate(density[::-1])[::-1]
     contrast = np.minimum(left, right)[inside] / np.maximum(density[inside], 0.5)
     lowest = np.flatnonzero(contrast >= contrast.max() * 0.99)
-    # of a wide valley the middle
+    # the middle of a wide valley
     bottom = inside[lowest[len(lowest) // 2]]
     below = x < middle[bottom]
     smaller = min(below.sum(), (~below).sum())
     if contrast.max() < _DEPTH or smaller < fewest:
         return None
-    if smaller < _FEW * fewest and len(lowest) < _APART:
+    if smaller < _SMALL_POPULATION * fewest and len(lowest) < _EMPTY_BINS:
         return None
     return float(middle[bottom])
 
 
 def log_statistic(statistic: Array) -> Array:
-    """log10, where populations of a statistic are told apart; zero becomes very small, NaN stays."""
+    """log10 of a statistic; zero becomes very small, NaN stays."""
     return np.log10(np.maximum(statistic, _TINY))
 
 
 def own_threshold(
     scene: Scene, name: str, t: Array, half: float, values: Array, least: float, most: float
 ) -> tuple[float, tuple[str, ...]]:
-    """Threshold of a statistic that decides alone, and what there is to be said of it.
+    """Threshold of a statistic that decides alone, and notes on it.
 
-    The valley between standing and moving windows if there is one. Else, where odometer or GNSS tell what moves, what
-    tells that best from the rest (which may move unseen, so it has to tell it well), or half of what the quietest
-    twentieth of it has; and `most` where nothing moves. An IMU by itself leaves `least`: an engine that idles in all
-    of the recording then hides the rest that it is.
+    The valley between stationary and moving windows if there is one. Otherwise, where odometer or GNSS show motion, the
+    threshold that best separates it from the rest (which may contain unseen motion, so the separation must be good), or
+    half of the quietest twentieth of it; and `most` where nothing moves. With an IMU alone it is `least`: an engine
+    that idles throughout then hides rest.
 
     Parameters
     ----------
@@ -87,7 +87,7 @@ def own_threshold(
     split = valley(x, float(np.log10(least)), float(np.log10(most)), max(2, round(FEWEST / step)))
     if split is not None and not (moves.any() and np.mean(x[moves] < split) > MISLABELLED):
         return max(least, float(10.0**split)), ()
-    rests = ~mask_within(t, scene.certain, -half) & np.isfinite(x)  # no part of them is certain to move
+    rests = ~mask_within(t, scene.certain, -half) & np.isfinite(x)  # no part of it is certain to move
     if moves.any() and rests.any():
         found, wrong = find_fewest_errors(values[rests], values[moves], least)
         if wrong < _TELLS:
@@ -99,15 +99,16 @@ def own_threshold(
     return least, (
         Note(
             "detectors.threshold",
-            f"{name}: nothing tells standing from moving windows, so only its sensors' noise counts as rest",
+            f"{name}: standing and moving windows cannot be separated, so only sensor noise counts as rest",
         ),
     )
 
 
 def find_fewest_errors(still: Array, moving: Array, least: float) -> tuple[float, float]:
-    """Threshold that calls the smallest share of still windows moving plus of moving windows still, at least `least`.
+    """Threshold, at least `least`, with the smallest sum of the shares of stationary windows called moving and the
+    reverse.
 
-    Of several that do equally well, the middle one by their logarithm. The second number is that sum of shares.
+    Among equals the middle one by logarithm. The second number returned is that sum.
     """
     if not len(still):
         return least, 1.0

@@ -1,8 +1,8 @@
-"""What all windowed statistics share: blocks of rows, running sums over them, and a low-passed copy of the IMU.
+"""Blocks of rows, running sums over them, and a low-passed copy of the IMU, common to all windowed statistics.
 
-Sums of windows are differences of one running sum (O(1) per window, whatever its length). The rows are first summed
-in blocks, so that an hour at 200 Hz leaves 180 000 of them; a low-pass far below an engine's lowest line then
-leaves what the body itself does.
+Window sums are differences of one running sum (O(1) per window, whatever its length). Rows are first summed in blocks,
+so that an hour at 200 Hz becomes 180 000 blocks; a low-pass filter far below an engine's lowest line then leaves the
+motion of the body itself.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from numpy.lib.stride_tricks import sliding_window_view
 from graphnav.core.rotation import Array
 from graphnav.recording import Imu
 
-BLOCK_RATE = 50.0  # Hz, at least, of the blocks
-_KERNEL = 0.4  # s, length of the low-pass
-_LOW_RATE = 10.0  # Hz, of the low-passed rows
-_LONGEST_GAP = 0.2  # s that a block may last longer than it should and still count
+BLOCK_RATE = 50.0  # Hz, lowest rate of the blocks
+_KERNEL = 0.4  # s, length of the low-pass filter
+_LOW_RATE = 10.0  # Hz, rate of the low-passed rows
+_LONGEST_GAP = 0.2  # s by which a block may last too long and still be valid
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class Blocks:
     mean: Array  # (K, 9)
     period: float  # s per block
     row_period: float  # s per row of the IMU
-    whole: Array  # (K,) bool, False where a gap lies in the block or before it
+    whole: Array  # (K,) bool, False where there is a gap in the block or before it
 
     @property
     def force(self) -> Array:
@@ -44,7 +44,7 @@ class Blocks:
 
 
 def blocks(imu: Imu, row_period: float) -> Blocks:
-    """Blocks of at most 1/`BLOCK_RATE` s; the rows after the last whole block are left out."""
+    """Blocks of at most 1/`BLOCK_RATE` s; rows after the last complete block are dropped."""
     size = max(1, int(1.0 / (BLOCK_RATE * row_period) + 1e-6))
     count = len(imu.t) // size
     n = count * size
@@ -64,10 +64,10 @@ def blocks(imu: Imu, row_period: float) -> Blocks:
 
 @dataclass(frozen=True)
 class Sums:
-    """Running sums of rows: means over any window for the price of one subtraction."""
+    """Running sums of rows: means over any window by one subtraction."""
 
     total: Array  # (K + 1, c)
-    offset: Array  # (c,) taken off before summing, so that sums of many hours keep their digits
+    offset: Array  # (c,) subtracted before summing, so that sums over many hours keep their precision
 
     def means(self, length: int, step: int = 1) -> Array:
         """(W, c) means over windows of `length` rows that begin every `step` rows."""
@@ -90,10 +90,9 @@ def window_times(t: Array, length: int, step: int = 1) -> Array:
 
 
 def find_unbroken(whole: Array, length: int, step: int = 1, first: int = 1) -> Array:
-    """Which of those windows no gap crosses; `whole` as in `Blocks`.
+    """Which of these windows no gap crosses; `whole` as in `Blocks`.
 
-    A gap before the first row of a window does not matter to it; with `first` 0 it does, where rows are means in which
-    it may lie.
+    A gap before the first row of a window is harmless, except with `first` 0, where rows are means that may contain it.
     """
     broken = np.r_[0, np.cumsum(~whole)]
     begin = np.arange(0, len(whole) - length + 1, step)
@@ -102,13 +101,13 @@ def find_unbroken(whole: Array, length: int, step: int = 1, first: int = 1) -> A
 
 @dataclass(frozen=True)
 class LowPassed:
-    """The IMU below about 2 Hz: what the body does, without what an engine adds from 8 Hz on."""
+    """The IMU below about 2 Hz: the motion of the body, without the engine's vibration from 8 Hz on."""
 
     t: Array  # (K,) s, centre of the kernel
     rows: Array  # (K, 6) force, rate
     gain: float  # 1/sqrt(s): noise density -> 1-sigma of a row
     period: float  # s
-    whole: Array  # (K,) bool, False where a gap lies under the kernel
+    whole: Array  # (K,) bool, False where there is a gap under the kernel
 
 
 def kernel(period: float) -> Array:
@@ -134,7 +133,7 @@ def low_pass(b: Blocks) -> LowPassed:
 
 
 def share_of(x: Array, share: float) -> Array:
-    """`np.quantile` down the first axis, several times quicker for a few hundred rows."""
+    """`np.quantile` along the first axis, several times faster for a few hundred rows."""
     x = np.sort(x, axis=0)
     at = share * (len(x) - 1)
     k = int(at)
@@ -142,5 +141,5 @@ def share_of(x: Array, share: float) -> Array:
 
 
 def smooth_rows(rows: Array, h: Array) -> Array:
-    """Every row low-passed by h, (K - len(h) + 1, c): for a short stretch."""
+    """All rows filtered with h, (K - len(h) + 1, c): for a short span."""
     return np.asarray(sliding_window_view(rows, len(h), axis=0) @ h)

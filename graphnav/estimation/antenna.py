@@ -1,7 +1,7 @@
-"""Whether the antenna is where the recording says: its lever arm estimated from the drive, beside the one stated.
+"""Estimation of the antenna's lever arm from the drive, for comparison with the stated one.
 
-A wrong lever arm, or one with a wrong sign, fits no turn: the fixes swing about the IMU otherwise than stated. The
-estimate is that of `gnss.lever_arm_sigma`, from the first part of the drive, with next to nothing known before.
+A wrong lever arm, or one with a wrong sign, contradicts every turn: the fixes move about the IMU otherwise than stated.
+The estimate is that of `gnss.lever_arm_sigma`, from the first part of the drive, with a very wide prior.
 """
 
 from __future__ import annotations
@@ -28,18 +28,18 @@ from graphnav.estimation.solvers.gain import describe_singular
 from graphnav.estimation.solvers.rts import backward, rts
 from graphnav.recording import Recording, take_rows
 
-_UNKNOWN = 2.0  # m, 1-sigma before the drive
-_FINE = 0.3  # m, 1-sigma of fixes that tell
-_LEAST_PART = 0.25  # m, of a part of an arm whose sign matters, or of an error of one: tapes do better
-_OPPOSITE = 0.5  # of how far it is found from where it is stated, it may be from where the other sign puts it
+_PRIOR_SIGMA = 2.0  # m, 1-sigma before the drive
+_FINE = 0.3  # m, 1-sigma of fixes that are precise enough
+_LEAST_PART = 0.25  # m, of a component of an arm whose sign matters, or of its error: tape measures are better
+_OPPOSITE = 0.5  # ratio of the distances of the estimate from the opposite sign and from the stated one
 _PART = 240.0  # s
 _FEWEST_FIXES = 30  # fixes
-_SURE_SIGMAS = 8.0  # sigmas: 4, and twice that because errors of fixes are alike for minutes
+_SURE_SIGMAS = 8.0  # 4 sigmas, doubled because errors of fixes are correlated for minutes
 
 
 @dataclass(frozen=True)
 class Antenna:
-    """Where the antenna is, from the IMU, right, forward, up."""
+    """The position of the antenna relative to the IMU, right, forward, up."""
 
     stated: Array  # (3,) m
     found: Array  # (3,) m
@@ -47,12 +47,12 @@ class Antenna:
 
     @property
     def agrees(self) -> bool:
-        """Whether the drive has nothing against what is stated."""
+        """Whether the drive is consistent with the stated lever arm."""
         return bool((np.abs(self.found - self.stated) <= _SURE_SIGMAS * self.sigma).all())
 
     @property
     def finding(self) -> Finding:
-        """It in a sentence."""
+        """The comparison in a sentence."""
         found = ", ".join(f"{x:.2f} +- {s:.2f}" for x, s in zip(self.found, self.sigma, strict=True))
         stated = ", ".join(f"{x:.2f}" for x in self.stated)
         if self.agrees:
@@ -81,9 +81,9 @@ def find_antenna(recording: Recording) -> Antenna:
 
 
 def find_wrong_arms(recording: Recording) -> list[Finding]:
-    """Lever arms that the drive denies: parts that it finds where the opposite sign would put them; else the antenna.
+    """Findings on lever arms that the drive contradicts: components with the opposite sign; otherwise the antenna's.
 
-    Of a vehicle with fixes that are precise enough to tell, by the part of the drive that turns most; else nothing.
+    Only for a vehicle with sufficiently precise fixes, from the part of the drive with the most turning.
     """
     gnss = recording.gnss
     if recording.platform != "vehicle" or gnss is None or len(gnss.t) < _FEWEST_FIXES:
@@ -119,7 +119,9 @@ def find_wrong_arms(recording: Recording) -> list[Finding]:
 
 
 def find_untold_arm(recording: Recording) -> list[Finding]:
-    """That nothing tells the signs of the antenna's lever arm, as the fixes are too coarse for `find_wrong_arms`."""
+    """A note that the signs of the antenna's lever arm cannot be checked, as the fixes are too coarse for
+    `find_wrong_arms`.
+    """
     gnss = recording.gnss
     if recording.platform != "vehicle" or gnss is None or np.abs(gnss.lever_arm).max() <= _LEAST_PART:
         return []
@@ -134,7 +136,7 @@ def find_untold_arm(recording: Recording) -> list[Finding]:
 
 
 def _find_turning(recording: Recording) -> Recording:
-    """The part of a drive, `_PART` s long at most, in which it turns most where there are fixes."""
+    """The part of a drive, at most `_PART` s long, that turns most while there are fixes."""
     imu, gnss = recording.imu, recording.gnss
     assert gnss is not None
     if recording.duration <= _PART:
@@ -148,7 +150,7 @@ def _find_turning(recording: Recording) -> Recording:
 
 
 def _estimate(recording: Recording) -> tuple[Antenna, tuple[Array, Array, Array] | None]:
-    """The antenna, and how far ahead the point is that does not slip, (1,) m each: stated, found, sigma."""
+    """The antenna, and the forward position of the point that does not slip, (1,) m each: stated, found, sigma."""
     from graphnav.estimation.solvers.batch import batch
 
     if recording.gnss is None or not len(recording.gnss.t):
@@ -164,7 +166,7 @@ def _estimate(recording: Recording) -> tuple[Antenna, tuple[Array, Array, Array]
         raise EstimationError(
             f"'{recording.name}': without motion nothing tells where the antenna is", key="antenna.no_motion"
         )
-    unknown = {"gnss": {"lever_arm_sigma": _UNKNOWN}, "vehicle": {"axle_sigma": _UNKNOWN}}
+    unknown = {"gnss": {"lever_arm_sigma": _PRIOR_SIGMA}, "vehicle": {"axle_sigma": _PRIOR_SIGMA}}
     sections = {name: getattr(settings, name).model_copy(update=values) for name, values in unknown.items()}
     settings = settings.model_copy(update=sections)
     problem = build_problem(recording, settings, frame, aligned.state, aligned.sigma, still, parts_of_noise=True)

@@ -1,4 +1,6 @@
-"""A recording aligned and its problem built; anew where measurements are wrong that its start and stops rest on."""
+"""Alignment of a recording and construction of its problem; repeated where wrong measurements affect its start and
+stops.
+"""
 
 from __future__ import annotations
 
@@ -26,19 +28,19 @@ from graphnav.estimation.problem import Problem, build_problem
 from graphnav.estimation.solution import Solution
 from graphnav.recording import Recording
 
-_DIVERGED_BY = 0.5  # rad between the stated and the found start attitude, beyond which a filter diverges for a while
-_FAR_AWAY = 100.0  # m, by which single fixes in a city may be wrong
+_DIVERGED_BY = 0.5  # rad between the stated and the found initial attitude, beyond which a filter diverges for a while
+_FAR_AWAY = 100.0  # m, error of single fixes in a city
 
 
 @dataclass
 class Clock:
-    """How long each stage has taken, s."""
+    """Time used by each stage, s."""
 
     seconds: dict[str, float] = field(default_factory=dict)
 
     @contextmanager
     def book(self, stage: str) -> Iterator[None]:
-        """What runs inside belongs to a stage."""
+        """Count the time within this context for a stage."""
         began = time.perf_counter()
         try:
             yield
@@ -48,10 +50,10 @@ class Clock:
 
 @dataclass(frozen=True)
 class BuiltProblem:
-    """A problem, and what it was built from."""
+    """A problem and what it was built from."""
 
     problem: Problem
-    carriers: GnssPhase | None  # carrier phases, which the problem does without as long as they have no integers
+    carriers: GnssPhase | None  # carrier phases, which are not part of the problem until they have integers
     aligned: Alignment
     detections: Detections
 
@@ -60,7 +62,7 @@ class BuiltProblem:
 class ProblemBuilder:
     """Aligns a recording and builds its problem.
 
-    `used` is the recording with the fixes that the problem uses; alignment and detectors see them all.
+    `used` is the recording with the fixes that the problem uses; alignment and detectors use all of them.
     """
 
     recording: Recording
@@ -71,7 +73,7 @@ class ProblemBuilder:
 
     def align(self, recording: Recording, stationary: Array) -> Alignment:
         """The first state of the recording, or of a part of it."""
-        # of carriers an alignment needs nothing, and solves dozens of problems
+        # an alignment needs no carriers, and solves dozens of problems
         codes_alone = self.settings.raw_gnss.model_copy(update={"differences": False})
         settings = self.settings.model_copy(update={"raw_gnss": codes_alone})
         tell("alignment")
@@ -79,7 +81,7 @@ class ProblemBuilder:
             return align(recording, settings, self.frame, _smooth, stationary)
 
     def build(self, aligned: Alignment, detections: Detections, parts: bool) -> BuiltProblem:
-        """The problem; with the parts that noise figures contribute to its intervals, if these are to change."""
+        """Build the problem; with the contribution of each noise figure to its intervals, if these are to change."""
         tell("preintegration")
         with self.clock.book("preintegration"):
             stated = with_known_heading(aligned, self.settings)
@@ -88,11 +90,11 @@ class ProblemBuilder:
                 self.used, self.settings, self.frame, start.state, start_sigma(start), detections.stationary,
                 parts_of_noise=parts,
             )  # fmt: skip
-        problem, carriers = split_carriers(problem)  # the noise model rests on the codes
+        problem, carriers = split_carriers(problem)  # the noise model depends on the codes
         return BuiltProblem(problem, carriers, aligned, detections)
 
     def build_later(self, built: BuiltProblem) -> BuiltProblem:
-        """The problem with a start that is looked for behind the fixes which the alignment has seen."""
+        """The problem with a start that is sought after the fixes used by the first alignment."""
         gnss, until = self.recording.gnss, built.aligned.until
         assert gnss is not None
         assert until is not None
@@ -100,9 +102,9 @@ class ProblemBuilder:
         return self.build(self.align(rest, built.detections.stationary), built.detections, parts=True)
 
     def build_without(self, built: BuiltProblem, noise: NoiseModel, parts: bool) -> BuiltProblem:
-        """The problem with a start and stops that do not rest on fixes which a noise model leaves out.
+        """The problem with a start and stops that do not depend on fixes excluded by a noise model.
 
-        It is the same object where they are the same without.
+        Returns the same object where these are unchanged.
         """
         if not noise.excluded or self.recording.gnss is None:
             return built
@@ -129,10 +131,10 @@ def has_diverged(found: Alignment, stated: Alignment) -> bool:
 
 
 def start_sigma(start: Alignment) -> Array:
-    """(15,) 1-sigma of the start, with a place that the alignment does not claim to know.
+    """(15,) 1-sigma of the start, with an unknown position where there are fixes.
 
-    It has the place from fixes that the problem uses too, by sigmas that may be wrong; without fixes it is where the
-    start is said to be.
+    The alignment took its position from fixes that the problem uses too, with sigmas that may be wrong; without fixes
+    it is the stated start.
     """
     sigma = start.sigma.copy()
     if start.motion is None:
@@ -142,7 +144,7 @@ def start_sigma(start: Alignment) -> Array:
 
 
 def _differ(a: Array, b: Array) -> bool:
-    """Whether one has a stop that the other has nothing of."""
+    """Whether one has a stop that does not overlap any of the other."""
     return any(
         not np.any((other[:, 0] < end) & (other[:, 1] > begin)) for one, other in ((a, b), (b, a)) for begin, end in one
     )

@@ -1,9 +1,9 @@
-"""States between keyframes, at any rate: the IMU's own samples integrated from the keyframe before.
+"""States between keyframes, at any rate: the IMU's samples integrated from the keyframe before.
 
-A filter's state between keyframes is that prediction. A smoother knows the next keyframe too; what the
-prediction misses it by is laid over the interval so that position, velocity and attitude stay one motion: the
-position's share is the cubic that begins with nothing and ends with the miss in position and velocity, the
-velocity's is its derivative, attitude and biases go linearly. Covariances are interpolated linearly.
+A filter's state between keyframes is that prediction. A smoother knows the next keyframe too; the difference between
+prediction and that keyframe is distributed over the interval so that position, velocity and attitude remain consistent:
+that of position is the cubic that starts at zero and ends with the differences of position and velocity, that of
+velocity its derivative, attitude and biases are linear. Covariances are interpolated linearly.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from graphnav.imu.samples import Samples
 
 
 def times_between(start: float, end: float, rate: float) -> Array:
-    """Multiples of 1/rate between two times (s), with both ends."""
+    """Multiples of 1/rate between two times (s), and both ends."""
     steps = np.arange(np.ceil(start * rate), np.floor(end * rate) + 1) / rate
     inner = steps[(steps > start + 1e-6) & (steps < end - 1e-6)]
     return np.concatenate([[start], inner, [end]])
@@ -52,15 +52,18 @@ class Dense:
         return float(self.t[-1])
 
     def times(self, rate: float) -> Array:
-        """Multiples of 1/rate on the recording's clock, with both ends."""
+        """Multiples of 1/rate on the recording's clock, and both ends."""
         return times_between(self.start, self.end, rate)
 
     def __call__(self, t: Array, size: int = DIM) -> tuple[States, Array]:
-        """States and covariances (M, size, size), of the first errors, at ascending times from `start` to `end`."""
+        """States and covariances (M, size, size), of the first error components, at ascending times from `start` to
+        `end`.
+        """
         k = np.clip(np.searchsorted(self.t, t, side="left") - 1, 0, len(self.t) - 2)
         T = np.diff(self.t)[k]
         s = (t - self.t[k]) / T
-        # every target is reached from its keyframe, and for the miss so is the end of every interval with one in it
+        # every time is predicted from its keyframe, and so is the end of every interval that contains one, for the
+        # difference
         touched = np.unique(k)
         ends = self.t[touched + 1] if self.smooth else self.t[:0]
         targets = np.unique(np.concatenate([t[t > self.t[0]], ends]))
@@ -86,7 +89,7 @@ class Dense:
         k = np.searchsorted(self.t, t, side="left") - 1
         if not len(t):
             return self.states[k]
-        # of the intervals touched alone, so that few times cost little
+        # only of the intervals needed, so that few times cost little
         first, last = int(k[0]), int(k[-1]) + 1
         samples, used = self.samples.between(self.t[first], self.t[last]), slice(first, last)
         dR, dV, dP = within(samples, self.t[first : last + 1], t, self.ba[used], self.bg[used])
@@ -94,7 +97,7 @@ class Dense:
 
 
 def _distribute(miss: Array, s: Array, T: Array) -> Array:
-    """The share (M, 15) of a miss at the fraction s of intervals T long."""
+    """The share (M, 15) of a difference at the fraction s of intervals of length T."""
     out = miss * s
     p, v = miss[:, 3:6], miss[:, 6:9]
     out[:, 3:6] = p * (3 * s**2 - 2 * s**3) + v * T * (s**3 - s**2)
@@ -103,7 +106,7 @@ def _distribute(miss: Array, s: Array, T: Array) -> Array:
 
 
 def _choose(mask: Array, yes: States, no: States) -> States:
-    """Rows of one struct or another."""
+    """Rows of one struct or the other."""
     return States(
         np.where(mask[:, None, None], yes.R_nb, no.R_nb),
         *(np.where(mask[:, None], getattr(yes, f), getattr(no, f)) for f in ("p", "v", "ba", "bg")),
@@ -111,7 +114,7 @@ def _choose(mask: Array, yes: States, no: States) -> States:
 
 
 def _scatter(rows: States, mask: Array, like: States) -> States:
-    """`rows` put where `mask` is true; elsewhere as in `like`."""
+    """`rows` where `mask` is true; elsewhere those of `like`."""
     out = like[np.arange(len(like))]
     for name in ("R_nb", "p", "v", "ba", "bg"):
         getattr(out, name)[mask] = getattr(rows, name)
@@ -119,7 +122,7 @@ def _scatter(rows: States, mask: Array, like: States) -> States:
 
 
 def dense(problem: Problem, states: States, covariance: Array, scale: Array | None, smooth: bool) -> Dense:
-    """For a solution of a problem; `scale` is (k,) or, as a filter knew it at each keyframe, (K, k)."""
+    """Make the states between keyframes of a solution; `scale` is (k,) or, for a filter, (K, k) as of each keyframe."""
     ba, bg = states.ba[:-1], states.bg[:-1]
     if scale is not None:
         scale = np.broadcast_to(scale, (len(states), scale.shape[-1]))[:-1]

@@ -1,4 +1,4 @@
-"""Spans of measurements that no solver uses, and what is wrong with them."""
+"""Spans of measurements that no solver uses, and the errors in them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from graphnav.estimation.solvers.passes import SmootherPass, record_residuals
 
 
 def fault_spans(problem: Problem, smoothed: SmootherPass | None = None) -> tuple[ExcludedSpan, ...]:
-    """The rows of weight 0, by constraint and in order of time; with a smoothed solution, what is wrong with them."""
+    """The rows of weight 0, by constraint and ordered by time; with their errors if a smoothed solution is given."""
     out = []
     for rows in problem.constraints:
         lost = np.flatnonzero(rows.weight == 0.0) if rows.weight is not None else np.empty(0, dtype=int)
@@ -37,7 +37,7 @@ def fault_spans(problem: Problem, smoothed: SmootherPass | None = None) -> tuple
 
 
 def describe_faults(faults: tuple[ExcludedSpan, ...], problem: Problem) -> tuple[str, ...]:
-    """A sentence for each kind of measurement that some are left out of."""
+    """A sentence for each kind of measurement with excluded rows."""
     out = []
     for rows in problem.constraints:
         own = [fault for fault in faults if fault.kind == rows.name]

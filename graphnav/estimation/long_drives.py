@@ -1,10 +1,10 @@
-"""Recordings that are too long to be solved at once: in parts that overlap, of which each keeps its own share.
+"""Recordings too long to be solved at once: solved in overlapping parts, each of which contributes its own span.
 
 A pass of the filter keeps some twenty matrices of the error state for every keyframe until the smoother has used them,
-nearly a gigabyte an hour. So a recording of more than a few hours is cut into equal parts. Each is solved with what
-comes before and after it for as long as that has a say, from an alignment and with noise figures of its own; what it
-says of its own span stands. Nothing is cut where the fixes before do not tell a filter that begins there its place and
-its heading: in outages, at long halts, and without a receiver.
+nearly a gigabyte an hour. So a recording of more than a few hours is cut into equal parts. Each is solved together with
+what precedes and follows it for as long as that has an influence, from an alignment and with noise figures of its own;
+its solution is used for its own span. No cut is made where the fixes before it do not determine position and heading of
+a filter that starts there: in outages, at long stops, and without a receiver.
 """
 
 from __future__ import annotations
@@ -23,19 +23,20 @@ from graphnav.estimation.noise.model import NoiseModel, RowWeights
 from graphnav.estimation.solution import Between, CarrierArcs, ConstraintRecord, ParameterEstimate, Solution
 from graphnav.recording import Recording, take_rows
 
-STRAIGHT, _STATES = 10_800.0, 44  # s, at most solved at once: 3 GB at a keyframe a second and 44 error states
-PART = 3_600.0  # s, at most, of a part: the estimation of noise has enough keyframes by a factor of two
+STRAIGHT, _STATES = 10_800.0, 44  # s solved at once at most: 3 GB at a keyframe a second and 44 error states
+PART = 3_600.0  # s of a part at most: twice the keyframes that the estimation of noise needs
 OVERLAP = (
-    600.0  # s: what inertial sensors knew ten minutes ago says little (`graphnav.estimation.solvers.watch.LONGEST`)
+    # s: information of inertial sensors ten minutes ago is negligible (`graphnav.estimation.solvers.watch.LONGEST`)
+    600.0
 )
 
-_SILENCE = 60.0  # s between fixes, after which inertial sensors of any grade have begun to drift
-_COURSE = 0.01  # rad, of a heading that is told: half its square is nothing beside what sensors know
+_SILENCE = 60.0  # s between fixes, after which inertial sensors of any grade have started to drift
+_COURSE = 0.01  # rad, of a known heading: half its square is negligible against sensor errors
 
 
 @dataclass(frozen=True)
 class Share:
-    """A part of a recording with its overlaps, and the span (s, the end not in it) that it answers for."""
+    """A part of a recording with its overlaps, and the span (s, end exclusive) that it contributes."""
 
     recording: Recording
     start: float
@@ -55,14 +56,16 @@ def shares(recording: Recording, settings: Settings) -> list[Share]:
         part = recording.crop(first - 1e-9, last + 1e-9)
         lo_row, hi_row = np.searchsorted(recording.imu.t, part.imu.t[[0, -1]])
         own = slice(int(lo_row), int(hi_row) + 1)
-        part = replace(part, imu=take_rows(recording.imu, own))  # no copy of what is by far the largest
+        part = replace(part, imu=take_rows(recording.imu, own))  # no copy of the largest arrays
         start = -np.inf if k == 0 else begin + lo
         out.append(Share(part, start, np.inf if k == len(edges) - 2 else begin + hi))
     return out
 
 
 def _limit_length(recording: Recording, settings: Settings) -> float:
-    """s, at most solved at once: memory goes by the square of the error states, of which satellites have their own."""
+    """s solved at once at most: memory grows with the square of the error states, of which satellites have their
+    own.
+    """
     raw, chosen = recording.raw_gnss, settings.raw_gnss
     if raw is None or not recording.tight(chosen.coupling):
         return STRAIGHT
@@ -78,7 +81,7 @@ def _limit_length(recording: Recording, settings: Settings) -> float:
 
 
 def _is_told(recording: Recording, t: float) -> bool:
-    """Whether fixes come all through the overlap before a time (s), and their course tells the heading."""
+    """Whether there are fixes throughout the overlap before a time (s), and their course determines the heading."""
     gnss = recording.gnss
     if gnss is None:
         return False
@@ -92,7 +95,7 @@ def _is_told(recording: Recording, t: float) -> bool:
 
 @dataclass(frozen=True)
 class _Span:
-    """`Solution.between` of a part, for its own span alone."""
+    """`Solution.between` of a part, restricted to its own span."""
 
     whole: Between
     start: float
@@ -104,12 +107,12 @@ class _Span:
         return t[(t >= self.start) & (t <= self.end)]
 
     def __call__(self, t: Array, size: int = DIM) -> tuple[States, Array]:
-        """As of the part."""
+        """As for the part."""
         return self.whole(t, size)
 
 
 def crop_solution(solution: Solution, share: Share) -> Solution:
-    """What a solution of a part says of the part's own span, without the graph that it was solved with."""
+    """The solution of a part restricted to its own span, without the graph that it was solved with."""
     start, end = share.start, share.end
     if np.isneginf(start) and np.isposinf(end):
         return solution
@@ -118,7 +121,7 @@ def crop_solution(solution: Solution, share: Share) -> Solution:
         return np.flatnonzero((t >= start) & (t < end))
 
     def node(p: ParameterEstimate) -> ParameterEstimate:
-        in_force = np.searchsorted(p.t, start, side="right") - 1  # holds from before the span on
+        in_force = np.searchsorted(p.t, start, side="right") - 1  # applies from before the span on
         some = np.flatnonzero((p.t < end) & (np.arange(len(p.t)) >= in_force))
         return replace(p, t=p.t[some], value=p.value[some], sigma=p.sigma[some])
 
@@ -172,6 +175,6 @@ def crop_solution(solution: Solution, share: Share) -> Solution:
         noise=noise(solution.noise),
         arcs=stretches(solution.arcs),
         fixed=solution.fixed[inside(solution.fixed[:, 0])] if len(solution.fixed) else solution.fixed,
-        graphs=(),  # which hold all that was built for the part, ten times what is said of it
+        graphs=(),  # which hold everything built for the part, ten times the size of the result
         between=tuple(_Span(b, max(b.start, start), min(b.end, float(last))) for b in solution.between),
     )

@@ -1,4 +1,4 @@
-"""A solved problem as GTSAM's own: a `NonlinearFactorGraph` and `Values`, to go on with in GTSAM.
+"""A solved problem as GTSAM's own: a `NonlinearFactorGraph` and `Values`, for further use in GTSAM.
 
 Variables, with k the number of the keyframe and j that of a node:
 
@@ -40,21 +40,24 @@ _ESTIMATORS: dict[str, Any] = {
     "tukey": gtsam.noiseModel.mEstimator.Tukey,
     "welsch": gtsam.noiseModel.mEstimator.Welsch,
 }
-_ROUNDS, _SMALL = 20, 1e-9  # of weighting by kernels; of the sigmas before, where no more is gained
+_MAX_ITERATIONS, _CONVERGED = (
+    20,
+    1e-9,
+)  # iterations of reweighting by kernels; relative change of the cost at convergence
 _X, _V, _B, _Q = (gtsam.symbol_shorthand.X, gtsam.symbol_shorthand.V, gtsam.symbol_shorthand.B,
                   gtsam.symbol_shorthand.Q)  # fmt: skip
 
 
 @dataclass(frozen=True)
 class Exported:
-    """A problem and where it was solved, which becomes a graph when it is asked for."""
+    """A problem and its solution, converted to a graph when it is called."""
 
     problem: Problem
     states: States
     values: dict[str, Array]  # (nodes, k) per parameter
 
     def __call__(self) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
-        """The graph, and the solution as its values.
+        """Make the graph, and the solution as its values.
 
         Raises
         ------
@@ -80,8 +83,10 @@ class Exported:
 
 
 def _with_unlisted(problem: Problem, states: States, values: dict[str, Array]) -> dict[str, Array]:
-    """The values with those that solutions do not list, places of stops and ambiguities: the best there are given the
-    rest, all of them together. Rows are linear in them, but for their kernels.
+    """The values together with parameters that solutions do not list, places of stops and ambiguities: optimal given
+    the rest.
+
+    Rows are linear in them, except for their kernels.
     """
     out = {c.parameter.name: c.mean for c in problem.chains} | values
     chains = [c for c in problem.chains if c.parameter.name not in values]
@@ -90,7 +95,7 @@ def _with_unlisted(problem: Problem, states: States, values: dict[str, Array]) -
     first = np.cumsum([0, *(c.mean.size for c in chains)])
     sigma = np.concatenate([c.sigma.ravel() for c in chains])
     mean = at = np.concatenate([c.mean.ravel() for c in chains])
-    for k in range(_ROUNDS):
+    for k in range(_MAX_ITERATIONS):
         points = Iterate(states, out).points(problem)
         parts = [(diags_array(1.0 / sigma), (mean - at) / sigma)]
         for rows in problem.constraints:
@@ -98,7 +103,7 @@ def _with_unlisted(problem: Problem, states: States, values: dict[str, Array]) -
             own = {c.parameter.name: (c, i) for c, i in zip(chains, first, strict=False) if c.parameter.name in names}
             if own:
                 linear = linearise(rows, points, problem.columns)
-                # at first they are too far off for a kernel to tell what is
+                # at first they are too far off for a kernel to distinguish outliers
                 root = np.sqrt(linear.kernel()[0] if k else np.ones(len(rows)))[:, None] / linear.sigma
                 H = csr_array((root.size, len(sigma)))
                 for name, (c, i) in own.items():
@@ -114,7 +119,7 @@ def _with_unlisted(problem: Problem, states: States, values: dict[str, Array]) -
         out |= {
             c.parameter.name: x.reshape(c.mean.shape) for c, x in zip(chains, np.split(at, first[1:-1]), strict=True)
         }
-        if k and np.all(np.abs(step) < _SMALL * sigma):
+        if k and np.all(np.abs(step) < _CONVERGED * sigma):
             break
     return out
 
@@ -128,7 +133,7 @@ def state_at(values: gtsam.Values, k: int) -> States:
 
 
 def _make_factors(problem: Problem, layout: Layout) -> Iterator[Any]:
-    """Intervals, rows, and the priors of parameters with their way from node to node."""
+    """Intervals, rows, and the priors and process models of parameters."""
     unit = gtsam.noiseModel.Unit.Create(DIM)
     scale = (SCALE,) if SCALE in problem.columns else ()
     for k in range(layout.K - 1):
@@ -185,7 +190,7 @@ def _evaluate_row(rows: Constraint, i: int, problem: Problem) -> Evaluated:
 def _make_custom(
     noise: Any, layout: Layout, keyframes: tuple[int, ...], names: tuple[str, ...], evaluate: Evaluated
 ) -> Any:
-    """A factor over keyframes and the nodes of parameters in force at the first of them."""
+    """A factor over keyframes and the nodes of parameters valid at the first of them."""
     first = np.array(keyframes[:1])
     nodes = [
         (g, _Q(int(g.keys[g.node[first[0]]]) - layout.K))

@@ -1,4 +1,4 @@
-"""From a recording to solutions: cut where it must be, align, pose, solve with each solver."""
+"""From a recording to solutions: split where necessary, align, build the problem, solve with each solver."""
 
 from __future__ import annotations
 
@@ -41,10 +41,10 @@ from graphnav.recording import Own, Recording
 from graphnav.recording.checks.aiding import describe_gnss_apart
 from graphnav.recording.plausibility.screening import screen_recording
 
-SOLVERS = ("ekf", "rts", "batch")  # that run when none is named
+SOLVERS = ("ekf", "rts", "batch")  # run when none is named
 KNOWN = ("ekf", "rts", "incremental", "isam2", "batch")
-_CLEARLY = 10.0  # half chi-square; a likelihood ratio of 22,000
-_SHORTEST = 5.0  # s; a piece between two cuts that is shorter cannot be aligned
+_CLEARLY_BETTER = 10.0  # half chi-square; a likelihood ratio of 22,000
+_SHORTEST_PIECE = 5.0  # s; a shorter piece between two cuts cannot be aligned
 
 
 def run(
@@ -61,22 +61,22 @@ def run(
     Parameters
     ----------
     recording
-        From `graphnav.load`.
+        The recording, as `graphnav.load` returns it.
     settings
-        The defaults when None.
+        All settings; the defaults when None.
     solvers
-        Out of "ekf", "rts", "incremental", "isam2", "batch".
+        Names of solvers: "ekf", "rts", "incremental", "isam2", "batch".
     progress
-        Called now and then with a stage and its share done, 0 to 1.
+        Function called with a stage and the share of it that is done, 0 to 1.
     noise
-        How good the sensors are taken to be; estimated, or as `settings.noise` says, when None.
+        Noise model of the sensors; when None, estimated or stated as `settings.noise` sets.
     constraints, detectors
-        Classes of a script, beside those that graphnav has.
+        Additional classes of a script.
 
     Returns
     -------
     dict
-        Solver name to `Solution`, in the order asked for.
+        A `Solution` by name of solver, in the order of `solvers`.
 
     Raises
     ------
@@ -100,7 +100,7 @@ def run(
 def with_own(
     recording: Recording, constraints: Sequence[type[Constraint]] = (), detectors: Sequence[type[Detector]] = ()
 ) -> Recording:
-    """The recording, or the setup of a live source, with classes of a script to be solved with as well.
+    """The recording, or the setup of a live source, with the constraints and detectors of a script added.
 
     Raises
     ------
@@ -133,7 +133,8 @@ def _run(
         notes.append(Note("pieces.parts", sentence))
     for part in parts:
         try:
-            # matrices here have thirty rows: threads for them cost more than the work, twenty times on a busy machine
+            # matrices here have thirty rows: threads for them cost more than the work, twenty times as much on a busy
+            # machine
             with threadpool_limits(limits=1, user_api="blas"):
                 solved = _solve_with_retry(part.recording, settings, frame, solvers, progress, noise)
             found.append({name: crop_solution(one, part) for name, one in solved.items()})
@@ -156,7 +157,7 @@ def _solve_with_retry(
     progress: Progress | None,
     noise: NoiseModel | None,
 ) -> dict[str, Solution]:
-    """`_solve`; where a filter breaks down, without what its covariance may not have the digits for, or as stated."""
+    """`_solve`; where a filter breaks down numerically, again with a simpler model or stated noise."""
     try:
         return _solve(recording, settings, frame, solvers, progress, noise)
     except (EstimationError, np.linalg.LinAlgError) as error:
@@ -175,7 +176,7 @@ def _solve_with_retry(
 
 
 def _simplify(settings: Settings, noise: NoiseModel | None) -> Iterator[tuple[Settings, NoiseModel | None, Note]]:
-    """Settings and noise models that ask less of a covariance, and what to say of them."""
+    """Settings and noise models that demand less numerical precision of a covariance, with notes."""
     still = settings.standstill.model_copy(update={"held_position": False})
     if settings.standstill.held_position:
         settings = settings.model_copy(update={"standstill": still})
@@ -222,12 +223,12 @@ def _solve(
     out = {"ekf": forward.solution}
     if "rts" in solvers:
         out["rts"] = rts(problem, forward, smoothed)
-    # what a run does not need is not imported: GTSAM least of all
+    # modules are imported only where a run needs them, above all GTSAM
     if "batch" in solvers:
         from graphnav.estimation.solvers.batch import batch
 
         out["batch"] = batch(problem, start.states, start.nodes(problem), progress=progress)
-        # what it took to get there is part of it
+        # includes the attempts before
         out["batch"] = replace(out["batch"], timings={**forward.solution.timings, **out["batch"].timings})
     begin = found.aligned.state if found.diverged else None
     if "incremental" in solvers:
@@ -240,10 +241,10 @@ def _solve(
 
         out["isam2"] = one = isam2(problem, settings.solver.isam2_lag or np.inf, progress, begin).settled
         best = compute_cost_at(problem, smoothed)
-        if not settings.solver.isam2_lag and one.cost is not None and one.cost > best + _CLEARLY:
+        if not settings.solver.isam2_lag and one.cost is not None and one.cost > best + _CLEARLY_BETTER:
             note = Note(
                 "solver.worse_optimum",
-                "isam2 ended in an optimum that explains the data worse than rts does: do not trust it "
+                "isam2 ended in an optimum that explains the data worse than that of rts: do not trust it "
                 f"(half chi-square {one.cost:.0f}, not {best:.0f})",
             )
             out["isam2"] = replace(one, notes=(note, *one.notes))
@@ -272,7 +273,7 @@ def _solve(
 
 
 def _bind_graph(problem: Problem, solution: Solution) -> Callable[[], tuple[Any, Any]]:
-    """What makes the problem GTSAM's, with a solution's values of parameters."""
+    """Attach the conversion to GTSAM, with a solution's values of parameters."""
 
     def export() -> tuple[Any, Any]:
         from graphnav.estimation.nonlinear import Exported  # which needs GTSAM
@@ -284,7 +285,7 @@ def _bind_graph(problem: Problem, solution: Solution) -> Callable[[], tuple[Any,
 
 
 def check_profile(recording: Recording, settings: Settings) -> list[str]:
-    """What the settings' profile asks for and the recording lacks, in sentences.
+    """Notes on what the settings' profile requires and the recording lacks.
 
     Raises
     ------
@@ -319,7 +320,7 @@ def origin(recording: Recording) -> np.ndarray:
 
 
 def _split_pieces(recording: Recording, settings: Settings) -> tuple[list[Recording], list[str]]:
-    """The recording cut at IMU gaps too long to bridge, and a sentence for each cut."""
+    """The recording split at IMU gaps too long to bridge, and a note on each cut."""
     t = recording.imu.t
     cuts = np.flatnonzero(np.diff(t) > settings.keyframes.bridge)
     if not len(cuts):
@@ -336,7 +337,7 @@ def _split_pieces(recording: Recording, settings: Settings) -> tuple[list[Record
     pieces = []
     for lo, hi in itertools.pairwise(edges):
         begin, end = t[lo + 1] - recording.start, t[hi] - recording.start
-        if end - begin < _SHORTEST:
+        if end - begin < _SHORTEST_PIECE:
             notes.append(
                 Note(
                     "pieces.too_short", f"{begin:.1f} to {end:.1f} s left out: too short between two gaps to be aligned"

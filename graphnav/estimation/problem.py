@@ -1,4 +1,4 @@
-"""Keyframes, the intervals between them and the constraint rows on them; no solver in it."""
+"""Keyframes, the intervals between them and the constraint rows on them; independent of solvers."""
 
 from __future__ import annotations
 
@@ -27,22 +27,23 @@ from graphnav.recording.odometer import MeanSpeed
 
 @dataclass(frozen=True)
 class ParameterChain:
-    """A parameter and its nodes: one for a constant; a slow one has the next at the first keyframe after its spacing.
+    """A parameter and its nodes: one for a constant; a time-varying one has the next at the first keyframe after its
+    spacing.
 
     From node to node: value - mean -> decay (value - mean) + white noise of `sigma`.
     """
 
     parameter: Parameter
     t: Array  # (n,) s
-    node: Array  # (K,) int, the node in force at each keyframe
+    node: Array  # (K,) int, the node valid at each keyframe
     mean: Array  # (n, k)
-    sigma: Array  # (n, k): of the first node, and of what is added on the way to each other
-    decay: Array  # (n,), that of the first means nothing
+    sigma: Array  # (n, k): of the first node, and of the process noise before each other node
+    decay: Array  # (n,), that of the first is unused
 
 
 @dataclass(frozen=True)
 class Problem:
-    """Everything a solver needs, and nothing it has to look up elsewhere."""
+    """Everything a solver needs."""
 
     recording: Recording
     settings: Settings
@@ -54,12 +55,12 @@ class Problem:
     prior: InitialPrior
     constraints: tuple[Constraint, ...]
     notes: tuple[str, ...] = ()
-    imu_noise: ImuNoise = field(default_factory=ImuNoise)  # that the intervals were integrated with
-    interval_factors: Array | None = None  # (K-1, 4) on the variances of `NOISE_FIGURES` beside; ones when None
+    imu_noise: ImuNoise = field(default_factory=ImuNoise)  # biases that the intervals were integrated with
+    interval_factors: Array | None = None  # (K-1, 4) factors on the variances of `NOISE_FIGURES`; ones when None
 
     @cached_property
     def parameters(self) -> dict[str, Parameter]:
-        """What is estimated beside the states, by name."""
+        """The parameters estimated beside the states, by name."""
         own = (*scale_parameter(self.recording), *(p for rows in self.constraints for p in rows.parameters))
         return {p.name: p for p in own}
 
@@ -70,7 +71,7 @@ class Problem:
 
     @cached_property
     def columns(self) -> dict[str, slice]:
-        """Where each parameter stands behind the fifteen states in an augmented error state."""
+        """Columns of each parameter in an augmented error state, after the fifteen of the states."""
         out, at = {}, DIM
         for chain in self.chains:
             width = chain.parameter.size
@@ -79,7 +80,7 @@ class Problem:
         return out
 
     def complete(self, recording: Recording, usual: Array | None = None) -> Problem:
-        """With the constraints that look ahead, from a recording that reaches as far as they look.
+        """Add the constraints that depend on later rows, from a recording that extends far enough.
 
         `usual` as for `build_problem`.
         """
@@ -90,7 +91,7 @@ class Problem:
         return replace(self, recording=recording, constraints=tuple(sorted(rows, key=lambda c: c.name)))
 
     def reintegrate(self, ba: Array, bg: Array) -> Problem:
-        """The same problem with its intervals integrated anew about better biases, (K-1, 3) each."""
+        """The problem with its intervals integrated again about better biases, (K-1, 3) each."""
         imu = replace(self.recording.imu, noise=self.imu_noise)
         intervals = preintegrate(self.samples, imu, self.t, ba, bg, self.interval_factors is not None)
         if self.interval_factors is not None:
@@ -113,7 +114,7 @@ def build_problem(
     complete: bool = True,
     parts_of_noise: bool = False,
 ) -> Problem:
-    """Pose the estimation problem for a recording.
+    """Build the estimation problem of a recording.
 
     Parameters
     ----------
@@ -125,7 +126,7 @@ def build_problem(
     usual : (M, 3) m, the unit of the slow errors of the recording's fixes, where it is known already.
     known : what intervals between keyframes say that were integrated before, by the time they end at.
     highest : what the IMU has read at other times, as `graphnav.imu.clipping.highest` says.
-    complete : False leaves out the constraints that look ahead, for `Problem.completed`.
+    complete : False leaves out the constraints that depend on later rows, for `Problem.complete`.
     parts_of_noise : keep what each noise figure contributes to the intervals' covariances, for
     `graphnav.estimation.noise`.
     """
@@ -166,7 +167,7 @@ def build_problem(
 
 
 def _build_constraints(scene: BuildContext, ahead: bool | None) -> tuple[Constraint, ...]:
-    """The constraints of a scene: those that look ahead, those that do not, or all (None)."""
+    """Build the constraints: those that depend on later rows, those that do not, or all (None)."""
     classes = (cls for cls in kinds_for(scene.recording) if ahead is None or cls.looks_ahead == ahead)
     rows = tuple(rows for cls in classes if (rows := cls.build(scene)) is not None and len(rows))
     return tuple(_note_differences(one) if type(one).linearize is Constraint.linearize else one for one in rows)
@@ -178,7 +179,7 @@ def _note_differences(rows: Constraint) -> Constraint:
 
 
 def keyframe_times(start: float, end: float, epochs: Array, rate: float) -> Array:
-    """Keyframes at both ends, at every epoch between, and in between at `rate` at least."""
+    """Keyframes at both ends, at every epoch between, and in between at least at `rate`."""
     inside = epochs[(epochs > start + SAME_TIME) & (epochs < end - SAME_TIME)]
     fixed = np.unique(np.concatenate([[start], inside, [end]]))
     fixed = fixed[np.concatenate([[True], np.diff(fixed) > SAME_TIME])]
@@ -189,7 +190,7 @@ def keyframe_times(start: float, end: float, epochs: Array, rate: float) -> Arra
 
 
 def to_samples(stationary: Array | None, recording: Recording) -> Array:
-    """The parts of stationary spans that a recording covers, (M, 2), from sample to sample of the IMU."""
+    """The parts of stationary spans that a recording covers, (M, 2), limited to IMU samples."""
     if stationary is None or not len(stationary):
         return np.empty((0, 2))
     begin, end = recording.start, recording.end
@@ -218,9 +219,9 @@ def _build_chains(parameters: Iterable[Parameter], t: Array) -> tuple[ParameterC
     return tuple(chains)
 
 
-@lru_cache(maxsize=16)  # a noise model's passes pose the same problem again and again
+@lru_cache(maxsize=16)  # a noise model's passes build the same chains repeatedly
 def _keep_apart(keyframes: bytes, spacing: float) -> Array:
-    """Those of the keyframes that lie so far apart at least; the same ones however long the drive goes on."""
+    """The keyframes that are at least `spacing` apart, independent of later ones."""
     t = np.frombuffer(keyframes)
     out = [float(t[0])]
     for x in t.tolist():
@@ -238,7 +239,7 @@ def _describe_samples(samples: Samples, recording: Recording) -> tuple[str, ...]
         Note(
             "imu.gaps_bridged",
             f"{len(length)} gaps in the IMU bridged ({length.sum():.2f} s in all, longest {length[worst]:.2f} s at "
-            f"{samples.bridged[worst, 0] - recording.start:.1f} s): uncertainty grows there by what the signal usually "
-            "changes in such a time",
+            f"{samples.bridged[worst, 0] - recording.start:.1f} s): uncertainty grows there by the typical change "
+            "of the signal over such a time",
         ),
     )

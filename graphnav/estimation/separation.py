@@ -1,6 +1,6 @@
-"""Combined separation: how far the forward filter and what lies behind each keyframe are apart.
+"""Combined separation: difference between the forward filter and the information after each keyframe.
 
-A smoother combines, per axis, the filter's position x_f with what all later measurements say by themselves, x_b:
+A smoother combines, per axis, the filter's position x_f with that of all later measurements by themselves, x_b:
 
     x_s / P_s = x_f / P_f + x_b / P_b      1 / P_s = 1 / P_f + 1 / P_b      (Fraser and Potter 1969)
 
@@ -19,7 +19,7 @@ from graphnav.core.earth import LocalFrame
 from graphnav.core.rotation import Array
 from graphnav.estimation.solution import Separation
 
-_TOLD = 1e-4  # of P_f that the later measurements must take off: a backward sigma a hundred times the forward one
+_TOLD = 1e-4  # share of P_f that the later measurements must remove: a backward sigma a hundred times the forward one
 
 
 def separation(frame: LocalFrame, t: Array, forward: Array, P_f: Array, smoothed: Array, P_s: Array) -> Separation:

@@ -1,4 +1,4 @@
-"""What a solver returns: states, covariances, parameters, residuals and how it got there."""
+"""The result of a solver: states, covariances, parameters, residuals and a record of the solution."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from graphnav.detectors.base import Detection
 from graphnav.estimation.noise.model import STATED, NoiseModel, RowWeights
 
 _OUT = 9  # errors of attitude, position, velocity, which are those of a trajectory
-_ROWS = 4096  # of a block: 25 MB while it is worked on
+_BLOCK_ROWS = 4096  # rows of a block: 25 MB while it is processed
 
 
 class Between(Protocol):
@@ -39,13 +39,13 @@ class Between(Protocol):
         ...
 
     def __call__(self, t: Array, size: int = DIM) -> tuple[States, Array]:
-        """States and covariances (M, size, size), of the first errors, at times inside."""
+        """States and covariances (M, size, size), of the first error components, at times within it."""
         ...
 
 
 @dataclass(frozen=True)
 class ConstraintRecord:
-    """What one constraint said to one solver: innovations of a filter, residuals of a smoother."""
+    """Rows of one constraint in one solver: innovations of a filter, residuals of a smoother."""
 
     kind: str  # "innovation" or "residual"
     t: Array  # (N,) s
@@ -53,17 +53,17 @@ class ConstraintRecord:
     sigma: Array  # (N, m) of the innovation (state and measurement) or of the measurement
     nis: Array  # (N,) normalised squared innovation, as weighted, or residual, at the full weight; chi-square with m
     # degrees of freedom for a filter
-    weight: Array  # (N,) robust weight, 1 = as a Gaussian, 0 = rejected
+    weight: Array  # (N,) robust weight, 1 = Gaussian, 0 = rejected
     axes: tuple[str, ...]  # names of the m components
     unit: str
-    satellite: Array = field(default_factory=lambda: np.empty(0, dtype=str))  # (N,) names, where rows are of satellites
+    satellite: Array = field(default_factory=lambda: np.empty(0, dtype=str))  # (N,) names, for rows of satellites
     azimuth: Array = field(default_factory=lambda: np.empty(0))  # (N,) rad from north to the east, of these
     elevation: Array = field(default_factory=lambda: np.empty(0))  # (N,) rad, of these
 
 
 @dataclass(frozen=True)
 class ParameterEstimate:
-    """A slow or constant parameter: `t` holds its nodes, one for a constant."""
+    """A constant or time-varying parameter: `t` holds its nodes, one for a constant."""
 
     t: Array  # (n,) s
     value: Array  # (n, k)
@@ -73,13 +73,13 @@ class ParameterEstimate:
 
     @property
     def observable(self) -> Array:
-        """(k,) whether the data told more than half of what was unknown."""
+        """(k,) whether the data removed more than half of the prior uncertainty."""
         return self.sigma[-1] < 0.5 * self.prior_sigma
 
 
 @dataclass(frozen=True)
 class CarrierArcs:
-    """Stretches over which cycles of a signal were counted on, cut where its ambiguity became an integer or none."""
+    """Spans of continuous carrier tracking, split where the ambiguity became an integer or ceased to be one."""
 
     name: Array = field(default_factory=lambda: np.empty(0, dtype=str))  # (S,) satellite and signal: "G05.1C"
     begin: Array = field(default_factory=lambda: np.empty(0))  # (S,) s, first epoch of the stretch
@@ -88,7 +88,7 @@ class CarrierArcs:
 
     @classmethod
     def from_rows(cls, t: Array, slot: Array, arc: Array, integer: Array, names: Sequence[str]) -> CarrierArcs:
-        """The stretches of N rows.
+        """Make the spans of N rows.
 
         Parameters
         ----------
@@ -118,16 +118,18 @@ class ExcludedSpan:
 
 @dataclass(frozen=True)
 class Separation:
-    """Position of the forward filter less that of what comes after each keyframe (`graphnav.estimation.separation`)."""
+    """Position of the forward filter minus that by the information after each keyframe
+    (`graphnav.estimation.separation`).
+    """
 
     t: Array  # (K,) s
-    value: Array  # (K, 3) m, east, north, up; NaN where what comes after tells nothing
+    value: Array  # (K, 3) m, east, north, up; NaN where there is no information after it
     sigma: Array  # (K, 3) m, 1-sigma of `value`
 
 
 @dataclass(frozen=True)
 class Solution:
-    """One solver's answer. Covariance blocks are of the error state of `graphnav.core.state`, (K, 15, 15)."""
+    """The solution of one solver. Covariance blocks are of the error state of `graphnav.core.state`, (K, 15, 15)."""
 
     solver: str
     frame: LocalFrame
@@ -136,25 +138,27 @@ class Solution:
     covariance: Array
     parameters: dict[str, ParameterEstimate] = field(default_factory=dict)
     records: dict[str, ConstraintRecord] = field(default_factory=dict)
-    counts: dict[str, int] = field(default_factory=dict)  # factors or updates by kind
+    counts: dict[str, int] = field(default_factory=dict)  # number of factors or updates by kind
     iterations: int = 0
     cost: float = float("nan")  # half the sum of squared whitened residuals at the end
     stopped: str = ""  # why it stopped, a sentence
     timings: dict[str, float] = field(default_factory=dict)  # s by stage
     notes: tuple[str, ...] = ()
-    detections: tuple[Detection, ...] = ()  # where the platform was found to stand, the fused answer last
-    excluded: tuple[ExcludedSpan, ...] = ()  # spans of measurements found to be wrong, which no solver used
-    noise: NoiseModel = STATED  # that all solvers used
-    passes: Mapping[str, int] = field(default_factory=dict)  # over all keyframes, before the solver's own
-    graphs: tuple[Callable[[], tuple[Any, Any]], ...] = ()  # makes what `to_gtsam` gives, for each piece
-    separation: Separation | None = None  # of the filter and its smoother, the same for all solvers
-    fixed: Array = field(default_factory=lambda: np.empty((0, 2)))  # s of epochs with carriers, and 1 for integers
-    arcs: CarrierArcs = field(default_factory=CarrierArcs)  # of carriers that have ambiguities
-    between: tuple[Between, ...] = ()  # gives states between keyframes, one for each piece of the recording
+    detections: tuple[Detection, ...] = ()  # detections of stationary intervals, the fused one last
+    excluded: tuple[ExcludedSpan, ...] = ()  # excluded spans of measurements, the same for all solvers
+    noise: NoiseModel = STATED  # noise model, the same for all solvers
+    passes: Mapping[str, int] = field(default_factory=dict)  # factors over all keyframes, apart from the solver's own
+    # functions that make the result of `to_gtsam`, one for each piece
+    graphs: tuple[Callable[[], tuple[Any, Any]], ...] = ()
+    separation: Separation | None = None  # of filter and smoother, the same for all solvers
+    # s of epochs with carriers, and 1 where they have integers
+    fixed: Array = field(default_factory=lambda: np.empty((0, 2)))
+    arcs: CarrierArcs = field(default_factory=CarrierArcs)  # of carriers with ambiguities
+    between: tuple[Between, ...] = ()  # give states between keyframes, one for each piece of the recording
 
     @property
     def stationary(self) -> Array:
-        """(M, 2) s, where the platform stands."""
+        """(M, 2) s, spans in which the platform is stationary."""
         spans = [d.intervals for d in self.detections if d.name == "fused"]
         return np.concatenate([np.empty((0, 2)), *spans])
 
@@ -201,7 +205,7 @@ class Solution:
         return to_trajectory(self.solver, self.frame, t, states, covariance)
 
     def blocks(self, rate: float | None = None) -> Iterator[Trajectory]:
-        """`trajectory` in parts, one behind the other, so that only one of them need be in memory.
+        """`trajectory` in successive parts, only one of which need be in memory.
 
         Parameters
         ----------
@@ -218,8 +222,8 @@ class Solution:
             return
         for piece in self.between:
             times = piece.times(rate)
-            for k in range(0, len(times), _ROWS):
-                t = times[k : k + _ROWS]
+            for k in range(0, len(times), _BLOCK_ROWS):
+                t = times[k : k + _BLOCK_ROWS]
                 yield to_trajectory(self.solver, self.frame, t, *piece(t, _OUT), joint=False)
 
     def at(self, t: Array) -> tuple[Array, States, Array]:
@@ -251,9 +255,9 @@ class Solution:
 def to_trajectory(
     name: str, frame: LocalFrame, t: Array, states: States, covariance: Array, joint: bool = True
 ) -> Trajectory:
-    """States in the fixed navigation frame turned into the local ENU at each point.
+    """States in the fixed navigation frame, in the local ENU at each point.
 
-    Without `joint` covariances are left out, of which sigmas need but a third.
+    Without `joint` covariances are omitted; sigmas need a third of the work.
     """
     R_ln = frame.R_ln(states.p)
     rph = rotation.to_rph(R_ln @ states.R_nb)
@@ -285,7 +289,7 @@ def to_trajectory(
 
 
 def join_solutions(parts: list[Solution], notes: tuple[str, ...] = ()) -> Solution:
-    """Solutions of the pieces of one recording, put end to end in one frame."""
+    """Join the solutions of the pieces of one recording in one frame."""
     first = parts[0]
     if len(parts) == 1:
         return replace(first, notes=(*notes, *first.notes))

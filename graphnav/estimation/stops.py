@@ -1,4 +1,4 @@
-"""Every stop, or stance of a foot: which detectors found it, and which rows a solver got from it."""
+"""Every stop, or stance of a foot: the detectors that found it, and the rows that a solver built from it."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from graphnav.core.rotation import Array
 from graphnav.detectors.base import Detection, seconds_in
 from graphnav.estimation.solution import ConstraintRecord, Solution
 
-HEAD = "start,end,detector,fired,rows"  # of detections.csv
+HEAD = "start,end,detector,fired,rows"  # columns of detections.csv
 
 
 @dataclass(frozen=True)
 class Stop:
-    """A span in which the platform stands."""
+    """A span in which the platform is stationary."""
 
     start: float  # s
     end: float  # s
-    fired: Mapping[str, float]  # share of it that each detector calls stationary; those that call none are left out
-    rows: Mapping[str, int]  # how many rows of each constraint were used because of it
+    fired: Mapping[str, float]  # share of it that each detector calls stationary; detectors that call none are omitted
+    rows: Mapping[str, int]  # number of rows of each constraint that were used because of it
 
     def values(self) -> dict[str, Any]:
-        """The same for JSON."""
+        """The stop for JSON."""
         fired = {name: round(share, 3) for name, share in self.fired.items()}
         return {"start": round(self.start, 4), "end": round(self.end, 4), "fired": fired, "rows": dict(self.rows)}
 
@@ -61,10 +61,10 @@ def stops_of_solution(solution: Solution) -> tuple[Stop, ...]:
 
 
 def detections_text(found: Sequence[Detection], records: Mapping[str, ConstraintRecord] | None = None) -> str:
-    """What detections.csv holds: a row per interval and detector, the fused answer last.
+    """The content of detections.csv: a row per interval and detector, the fused one last.
 
-    Its rows tell which detectors call which share of the stop stationary, and how many rows of which constraint came
-    of it: "low_band_glrt:0.97 fft:0.41" and "zero_velocity:23 zero_rate:23".
+    The rows of fused stops state the share that each detector calls stationary, and the number of rows by constraint:
+    "low_band_glrt:0.97 fft:0.41" and "zero_velocity:23 zero_rate:23".
     """
     rows = [f"{a:.4f},{b:.4f},{d.name},," for d in found if d.name != FUSED for a, b in d.intervals]
     for stop in stops_of(found, records):

@@ -1,1 +1,1 @@
-"""Solutions against a truth, and against other programs."""
+"""Evaluation of solutions against a truth, and against other programs."""

@@ -1,8 +1,8 @@
-"""Another program's trajectory beside our solutions: on the recording's clock, on the Earth, at the IMU.
+"""Trajectories of other programs beside our solutions: on the recording's clock, on the Earth, at the IMU.
 
-A file counts its time from where it likes. It is put on the recording's clock by what is known of both (GPS week, Unix
-time, UTC), else by its own start; what the speeds then say of a shift is applied where it is more than a second (leap
-seconds, another start), and only said where it is less, for that is the other program's own error.
+A file may count time from any zero. It is put on the recording's clock by what is known of both clocks (GPS week, Unix
+time, UTC), otherwise by its own start. A time shift found from the speeds is applied if it exceeds a second (leap
+seconds, another start), and only reported if it is less, for then it is an error of the other program.
 """
 
 from __future__ import annotations
@@ -31,20 +31,21 @@ from graphnav.recording.checks.crosschecks import Track
 from graphnav.recording.formats.trajectories import read_trajectory
 
 _MAX_GAP = 3.0  # s; wider gaps of a trajectory are not filled
-_APPLIED = 1.0  # s; a larger shift is of the clock
-_FEWEST = 10  # rows in common
-_MATTERS, _SIGNIFICANT = 0.02, 3.0  # s and sigmas; a smaller shift is not worth saying, or may be chance
-_PLACE = 10_000.0  # m; frames of other datums, and filters that diverge, are nearer than that to where they began
-_CHORD = 10.0  # s; over so long metres of noise do not hide how fast and where to somebody went
-_MOVES = 1.0  # m/s
-_HALF = 0.5  # of the squares of chords, and of the variance of their lengths: two of one drive have more in common
-_MENDED = 0.3  # of what is off is left by a point that mends it
-_STEP = 0.1  # s, between speeds of ours
+_APPLIED = 1.0  # s; a larger shift is one of the clock
+_FEWEST_ROWS = 10  # rows in common, at least
+_MATTERS, _SIGNIFICANT = 0.02, 3.0  # s and sigmas; a smaller shift is not reported, or may be chance
+_PLACE = 10_000.0  # m; frames of other datums, and diverging filters, are closer than that to the start
+_CHORD = 10.0  # s; over so long a chord the noise of positions does not hide distance and direction
+_LEAST_SPEED = 1.0  # m/s
+# share of the squared chords, and of the variance of their lengths, that two trajectories of one drive have in common
+_COMMON_SHARE = 0.5
+_MENDED = 0.3  # ratio of the discrepancies with and without another point below which that point explains them
+_SPEED_STEP = 0.1  # s, between speeds of our solution
 
 
 @dataclass(frozen=True)
 class Against:
-    """A trajectory file to compare with: of which point it is, and s to add to its stamps (None: to be found)."""
+    """A trajectory file to compare with: its point on the body, and s to add to its stamps (None: to be found)."""
 
     path: Path
     point: str | Array = "imu"  # "imu", "antenna", or a lever arm (3,) m, RFU
@@ -53,34 +54,35 @@ class Against:
 
 @dataclass(frozen=True)
 class Foreign(Solution):
-    """Another program's trajectory as if it were a solution: it has states and what sigmas it states, nothing else."""
+    """Another program's trajectory with the interface of a solution: states and the sigmas it states, nothing else."""
 
     track: Trajectory = field(default_factory=lambda: Trajectory(np.empty(0), np.empty((0, 3))))
-    borrowed: bool = False  # whether its attitude is ours, to place points of the body by, and no answer of its own
+    # whether the attitude is borrowed from our solution to refer points of the body, and not its own
+    borrowed: bool = False
 
     def trajectory(self, rate: float | None = None) -> Trajectory:
-        """At the keyframes of the solution beside it, or at `rate` (Hz)."""
+        """The trajectory at the keyframes of the solution beside it, or at `rate` (Hz)."""
         t = self.t if rate is None else np.arange(self.track.t[0], self.track.t[-1], 1.0 / rate)
         track = self.track_at(t)
         return replace(track, rph=None, sd_rph=None) if self.borrowed else track
 
     def track_at(self, t: Array) -> Trajectory:
-        """At those of some times (M,) that it can be interpolated to."""
+        """The trajectory at those of the times (M,) that it can be interpolated to."""
         return interpolate(self.track, t, max_gap=_MAX_GAP)[0]
 
     def at(self, t: Array) -> tuple[Array, States, Array]:
-        """Times, states (NaN where unknown) and covariances (NaN) at those of some times that it knows."""
+        """Times, states (NaN where unknown) and covariances (NaN) at those of the times that it covers."""
         track = self.track_at(t)
         return track.t, _build_states(self.frame, track), np.full((len(track), DIM, DIM), np.nan)
 
 
 def own_solutions(solutions: Mapping[str, Solution]) -> dict[str, Solution]:
-    """The solutions that are ours."""
+    """The solutions that are not from other programs."""
     return {name: s for name, s in solutions.items() if not isinstance(s, Foreign)}
 
 
 def antenna_lever_arm(recording: Recording, solution: Solution) -> Array | None:
-    """From the IMU to the antenna, m, RFU: as estimated, else as stated; None without GNSS."""
+    """Lever arm from the IMU to the antenna, m, RFU: as estimated, else as stated; None without GNSS."""
     if recording.gnss is None:
         return None
     estimated = solution.parameters.get("gnss_lever_arm")
@@ -105,7 +107,7 @@ def read_against(asked: Against, name: str, recording: Recording, reference: Sol
         track = replace(track, t=track.t + shift)
         notes += words
     inside = (track.t >= reference.t[0]) & (track.t <= reference.t[-1])
-    if inside.sum() < _FEWEST:
+    if inside.sum() < _FEWEST_ROWS:
         raise RecordingError(
             f"{asked.path}: {int(inside.sum())} rows in common with '{recording.name}': its time runs from "
             f"{track.t[0]:.3f} to {track.t[-1]:.3f} s, the recording's from {reference.t[0]:.3f} to "
@@ -119,7 +121,7 @@ def read_against(asked: Against, name: str, recording: Recording, reference: Sol
         notes.append(
             Note(
                 "against.frame",
-                f"{asked.path.name}: metres of a frame of its own, turned by {np.degrees(yaw):.1f} deg onto ours",
+                f"{asked.path.name}: metres in a local frame, rotated by {np.degrees(yaw):.1f} deg onto ours",
             )
         )
     arm = asked.point
@@ -155,7 +157,7 @@ def read_against(asked: Against, name: str, recording: Recording, reference: Sol
 
 
 def _shift(path: Path, track: Trajectory, recording: Recording, reference: Solution) -> tuple[float, list[str]]:
-    """What to add to the stamps of a trajectory, s, and why."""
+    """s to add to the stamps of a trajectory, and the reason."""
     known = between_clocks(recording.start, recording.gps_zero, float(track.t[0]), track.gps_zero)
     own_start = recording.start - float(track.t[0])
     notes: list[str] = []
@@ -169,7 +171,7 @@ def _shift(path: Path, track: Trajectory, recording: Recording, reference: Solut
             [Note("against.clock", f"{path.name}: {own_start:+.3f} s: it counts from a start of its own")],
         )
     else:
-        return 0.0, []  # said by the caller
+        return 0.0, []  # given by the caller
     late = _measure_delay(replace(track, t=track.t + shift), reference)
     if late is None:
         return shift, notes
@@ -189,7 +191,7 @@ def _shift(path: Path, track: Trajectory, recording: Recording, reference: Solut
 
 
 def _require_same_drive(asked: Against, track: Trajectory, recording: Recording, reference: Solution) -> None:
-    """Refuse a trajectory that is elsewhere all the time, or moves otherwise at the times that it shares.
+    """Refuse a trajectory that is elsewhere all the time, or moves differently at the common times.
 
     Raises
     ------
@@ -206,44 +208,46 @@ def _require_same_drive(asked: Against, track: Trajectory, recording: Recording,
                 key="against.elsewhere",
             )
     if asked.shift is not None:
-        return  # as was asked
+        return  # as requested
     if _moves_otherwise(inside, reference):
         raise RecordingError(
-            f"{asked.path}: moves otherwise than '{recording.name}' at the times that they share: it is of another "
+            f"{asked.path}: moves differently from '{recording.name}' at their common times: it is of another "
             "drive, or on another clock; --against-shift says what to add to its times",
             key="against.other_drive",
         )
 
 
 def _moves_otherwise(track: Trajectory, reference: Solution) -> bool:
-    """Whether neither the directions nor the speeds of a trajectory on the Earth are ours; False where few tell."""
+    """Whether both directions and speeds of a trajectory on the Earth differ from ours; False where there are too few
+    rows.
+    """
     k = np.searchsorted(track.t, track.t + _CHORD)
     first = np.flatnonzero(k < len(track))
     last = k[first]
     whole = track.t[last] - track.t[first] < _CHORD + _MAX_GAP
     first, last = first[whole], last[whole]
-    if len(first) < _FEWEST:
+    if len(first) < _FEWEST_ROWS:
         return False
     theirs = reference.frame.from_llh(track.llh)[:, :2]
     ours = reference.at(track.t)[1].p[:, :2]
     a, b = (p[last] - p[first] for p in (theirs, ours))
     way_a, way_b = np.linalg.norm(a, axis=1), np.linalg.norm(b, axis=1)
-    moving = np.maximum(way_a, way_b) > _MOVES * _CHORD
-    if moving.sum() < _FEWEST or np.ptp(track.t[first[moving]]) < 3.0 * _CHORD:
+    moving = np.maximum(way_a, way_b) > _LEAST_SPEED * _CHORD
+    if moving.sum() < _FEWEST_ROWS or np.ptp(track.t[first[moving]]) < 3.0 * _CHORD:
         return False
     unlike = np.sum((a - b) ** 2, axis=1)[moving] / (way_a**2 + way_b**2)[moving]
-    if np.median(unlike) < _HALF:
+    if np.median(unlike) < _COMMON_SHARE:
         return False
     lengths = (way_a[moving], way_b[moving])
-    return min(x.std() for x in lengths) > 0.0 and float(np.corrcoef(*lengths)[0, 1]) < np.sqrt(_HALF)
+    return min(x.std() for x in lengths) > 0.0 and float(np.corrcoef(*lengths)[0, 1]) < np.sqrt(_COMMON_SHARE)
 
 
 def _find_other_point(
     path: Path, track: Trajectory, arm: Array, antenna: Array | None, reference: Solution
 ) -> list[Note]:
-    """Of which other point a trajectory that was moved to the IMU by an arm is, if that mends what is off.
+    """The other point of the body that a trajectory refers to, if that explains its discrepancies.
 
-    A distance that turns with the body is an arm; one that does not is of another datum, and counts for nothing.
+    A discrepancy that turns with the body is a lever arm; one that does not is due to another datum, and is ignored.
     """
     inside = track.take((track.t >= reference.t[0]) & (track.t <= reference.t[-1]))
     states = reference.at(inside.t)[1]
@@ -251,7 +255,8 @@ def _find_other_point(
 
     def miss(other: Array) -> float:
         left = (off - states.R_nb @ (other - arm))[:, :2]
-        return float(np.mean(np.linalg.norm(left - np.median(left, axis=0), axis=1)))  # where it stands counts little
+        # a stationary vehicle adds little
+        return float(np.mean(np.linalg.norm(left - np.median(left, axis=0), axis=1)))
 
     points = {f"[{_show(-arm)}] m, the arm with the other signs": -arm, "the IMU": np.zeros(3)}
     if antenna is not None:
@@ -275,12 +280,12 @@ def _show(arm: Array) -> str:
 
 
 def _measure_delay(track: Trajectory, reference: Solution) -> float | None:
-    """How much later the same speeds are in `reference`, s; None where that is not clear, or within its own error."""
+    """Delay of the speeds in `reference`, s; None where it is ambiguous or within its own error."""
     llh = track.llh if track.frame == "geodetic" else reference.frame.to_llh(np.nan_to_num(track.llh))
     places = crosschecks.track(Gnss(track.t, llh, np.ones((len(track), 3))))
-    # between its keyframes too, where speeds are no straight lines
-    t, states, _ = reference.at(np.arange(reference.t[0], reference.t[-1], _STEP))
-    ours = Track(t, states.v, np.zeros(len(t)), _STEP)
+    # between its keyframes too, where speeds do not change linearly
+    t, states, _ = reference.at(np.arange(reference.t[0], reference.t[-1], _SPEED_STEP))
+    ours = Track(t, states.v, np.zeros(len(t)), _SPEED_STEP)
     fit = crosschecks.fit_velocity(ours, places) if places is not None else None
     if fit is None or fit.correlation <= CLEAR or abs(fit.lag) < max(_MATTERS, _SIGNIFICANT * fit.spread):
         return None
@@ -288,14 +293,14 @@ def _measure_delay(track: Trajectory, reference: Solution) -> float | None:
 
 
 def _with_attitude(track: Trajectory, reference: Solution) -> Trajectory:
-    """The part of a trajectory that a solution covers, with the attitude of that."""
+    """The part of a trajectory that a solution covers, with the attitude of that solution."""
     inside = track.take((track.t >= reference.t[0]) & (track.t <= reference.t[-1]))
     states = reference.at(inside.t)[1]
     return replace(inside, rph=rotation.to_rph(reference.frame.R_ln(states.p) @ states.R_nb))
 
 
 def without_attitude(metrics: Metrics) -> Metrics:
-    """Measures of a trajectory whose attitude is borrowed: those of the attitude are none of its own."""
+    """The metrics of a trajectory with borrowed attitude, without those of the attitude."""
     errors = metrics.errors
     if errors is not None:
         none = np.full_like(errors.rph, np.nan)
@@ -306,7 +311,7 @@ def without_attitude(metrics: Metrics) -> Metrics:
 
 
 def _build_states(frame: LocalFrame, track: Trajectory) -> States:
-    """A trajectory on the Earth as states in a navigation frame, NaN where it does not say."""
+    """A trajectory on the Earth as states in a navigation frame, NaN for missing quantities."""
     p = frame.from_llh(track.llh)
     R_nl = np.swapaxes(frame.R_ln(p), -1, -2)
     unknown = np.full(p.shape, np.nan)

@@ -1,7 +1,7 @@
-"""Errors of a trajectory against a truth: at the truth's epochs, at the truth's point, in the truth's axes.
+"""Errors of a trajectory against a truth: at the truth's epochs, at its point, in its axes.
 
-`errors` compares, `measure` boils down, `summary` and `text` show; `evaluate` does it for two files and
-`evaluate_recording` for a solution of a recording, with or without a truth of its own.
+`errors` computes differences, `measure` reduces them to numbers, `summary` and `text` present these; `evaluate` does
+all of it for two files and `evaluate_recording` for a solution of a recording, with or without a truth of its own.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ __all__ = [
 
 
 def truth_of(recording: Recording) -> tuple[Trajectory, Array | None] | None:
-    """The recording's truth and the lever arm from the IMU to its point; None without one or for a closed loop.
+    """The recording's truth and the lever arm from the IMU to its point; None without truth, or for a closed loop.
 
     Raises
     ------
@@ -75,7 +75,7 @@ def truth_of(recording: Recording) -> tuple[Trajectory, Array | None] | None:
 
 @dataclass(frozen=True)
 class AntennaCalibration:
-    """What a solution found of the antenna whose withheld fixes it is compared with."""
+    """The calibration of the antenna in the solution that is compared with withheld fixes."""
 
     clock_offset: float = 0.0  # s, to be added to the fixes' stamps
     lever_arm: Array | None = None  # (3,) m, right, forward, up; None: that of the recording
@@ -92,19 +92,19 @@ def withheld_truth(
 ) -> tuple[Trajectory, Array]:
     """The fixes withheld in `spans` (s from the start; None: all) as the truth of those spans, with their lever arm.
 
-    A withheld fix is met as a used one is: at its stamp on the IMU's clock, with the lever arm that was estimated.
+    A withheld fix is treated like a used one: at its stamp on the IMU's clock, with the estimated lever arm.
 
     Parameters
     ----------
     recording
-        The full one, before `Recording.without`. The fixes' own sigmas go with them, so that the NEES knows that the
-        truth is not exact.
+        The full recording, before `Recording.without`. The sigmas of the fixes are included, so that the NEES
+        accounts for the error of this truth.
     source
-        Whose measurements; only "gnss" has positions.
+        The withheld sensor; only "gnss" has positions.
     spans
         s from the recording's start, on the receiver's clock.
     antenna
-        What the solution to be compared estimated of the antenna.
+        The antenna as estimated by the solution to be compared.
 
     Returns
     -------
@@ -151,40 +151,40 @@ def evaluate_recording(
     at: Array | None = None,
     antenna: AntennaCalibration = _AS_STATED,
 ) -> Metrics | None:
-    """Metrics of a solution against the best truth there is: the recording's own, a closed loop, or the withheld GNSS.
+    """Metrics of a solution against the best available truth: the recording's own, a closed loop, or withheld GNSS.
 
     Parameters
     ----------
     trajectory
-        Of the IMU.
+        The trajectory of the IMU.
     recording
-        The full one, nothing withheld.
+        The full recording, with nothing withheld.
     withheld
         (source, span in s from the start or None) as given to `Recording.without`; each span of GNSS is scored by
         itself.
     max_gap
-        s, between neighbouring rows that are interpolated.
+        s, longest gap between rows that is interpolated.
     at
-        (N,) s, epochs to compare at; those of the sparser of both when None.
+        (N,) s, epochs to compare at; those of the sparser trajectory when None.
     antenna
-        What the solution estimated of the antenna, for withheld fixes.
+        The antenna as estimated by the solution, for withheld fixes.
 
     Returns
     -------
     Metrics or None
-        None where there is nothing to compare with.
+        None if there is no truth.
 
     Raises
     ------
     RecordingError
-        If the two share no epoch.
+        If trajectory and truth have no common epoch.
     """
     gnss_spans = [span for source, span in withheld if source == "gnss"]
     spans = [span for span in gnss_spans if span is not None]
     found = truth_of(recording)
     if found is None and recording.truth is not None and recording.truth.closed_loop_sigma is not None:
         sigma = recording.truth.closed_loop_sigma
-        note = Note("truth.closed_loop", f"the only truth is that the end is the start, to {sigma:g} m")
+        note = Note("truth.closed_loop", f"the only truth is that the drive ends where it starts, to {sigma:g} m")
         return Metrics(trajectory.name, closure=closure(trajectory), notes=(*trajectory.notes, note))
     late = 0.0
     if found is None and gnss_spans and recording.gnss is not None:
@@ -208,7 +208,7 @@ def evaluate(
     spans: Sequence[tuple[float, float]] = (),
     max_gap: float = MAX_GAP,
 ) -> Metrics:
-    """Metrics of one file against another, each of any kind `read_trajectory` knows.
+    """Metrics of one file against another, each of any kind that `read_trajectory` reads.
 
     Parameters
     ----------
@@ -219,19 +219,19 @@ def evaluate(
     lever_arm
         (3,) m from the estimate's point to the truth's, right, forward, up; that of the recording when None.
     spans
-        s on the files' clock, each scored by itself.
+        s on the files' clock, each scored separately.
     max_gap
-        s, between neighbouring rows that are interpolated.
+        s, longest gap between rows that is interpolated.
 
     Returns
     -------
     Metrics
-        Errors in the local east, north and up at the epochs of the sparser of both.
+        Errors in the local east, north and up at the epochs of the sparser file.
 
     Raises
     ------
     RecordingError
-        If a file cannot be read, or the two share no time; it then says by how much they may be shifted.
+        If a file cannot be read, or the two have no time in common; the message then states a possible shift.
     """
     trajectory_path, truth_path = Path(trajectory_path), Path(truth_path)
     trajectory = read_trajectory(trajectory_path)
@@ -265,7 +265,7 @@ def evaluate(
 
 
 def _shift_hint(trajectory: Trajectory, truth: Trajectory) -> str:
-    """'; ...' naming a shift of clocks that would make the two overlap, when a usual one does."""
+    """'; ...' naming a common clock shift that would make the two overlap, if there is one."""
     middle = 0.5 * (truth.t[0] + truth.t[-1] - trajectory.t[0] - trajectory.t[-1])
     half = 0.5 * (truth.t[-1] - truth.t[0] + trajectory.t[-1] - trajectory.t[0])
     unix = GPS_TO_UNIX - LEAP
@@ -287,7 +287,7 @@ def _shift_hint(trajectory: Trajectory, truth: Trajectory) -> str:
 def _leap_hint(
     found: Errors, trajectory: Trajectory, truth: Trajectory, lever_arm: Array | None, max_gap: float
 ) -> tuple[str, ...]:
-    """A note if 18 s of shift would explain most of the error: UTC taken for GPS time or the other way round."""
+    """A note if a shift of 18 s would explain most of the error: UTC taken for GPS time or the reverse."""
     before = float(np.sqrt(np.nanmean(found.horizontal**2)))
     if before < 1.0:
         return ()

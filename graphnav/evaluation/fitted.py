@@ -1,23 +1,24 @@
-"""The covariance of errors that are left when a yaw and an offset have been fitted to them.
+"""Covariance of the errors that remain after a yaw and an offset have been fitted.
 
-Of a walk, place and heading count from its start, where they are certain; a truth in a frame of its own is fitted over
-all epochs. What is left at an epoch is then not the error e_i of which the estimate states the covariance P_i, but
+Position and heading of a walk count from its start, where they are certain; a truth in a frame of its own is fitted
+over all epochs. The remaining error at an epoch is then not the error e_i whose covariance P_i the estimate states, but
 
     r_i = e_i - B_i theta,   theta = sum_j G_j e_j        B_i = [I, J a_i],  J a = (-a_y, a_x),  a_i = p_i - mean
 
-(least squares of e_j on an offset and a yaw), and so of
+(least squares of e_j on an offset and a yaw), with the covariance
 
     cov r_i = P_i - B_i K_i - K_i' B_i' + B_i S B_i',     K_i = sum_j G_j cov(e_j, e_i),  S = cov theta
 
-At the start P is nothing and r is what the fit makes of all other errors; in the middle r is far less than e. Between
-epochs an estimate states no covariance. Here errors of place and heading last, as in dead reckoning: for j > i
+At the start P is zero and r is caused by all other errors through the fit; in the middle r is far smaller than e. The
+estimate states no covariances between epochs. Here errors of position and heading persist, as in dead reckoning: for j
+> i
 
-    e_j = e_i + J (p_j - p_i) psi_i + what comes later, independent of both
+    e_j = e_i + J (p_j - p_i) psi_i + later contributions, independent of both
 
-which is exact for a filter without fixes, and for a smoother as far as what comes later tells nothing of before. What
-comes later is what the stated covariances grow by; where they grow by less than nothing, as where a smoother knows the
-end of a walk better than its middle, it is taken for nothing, and the covariance of all epochs after it is larger than
-stated: a verdict on it is then lenient, and `after_fit` says by how much.
+which is exact for a filter without fixes, and for a smoother as far as later measurements carry no information about
+earlier states. The later contributions are the growth of the stated covariances. Where these shrink, as where a
+smoother knows the end of a walk better than its middle, the contribution is set to zero, and the covariance of all
+later epochs is larger than stated: a verdict on it is then lenient, and `after_fit` returns by how much.
 """
 
 from __future__ import annotations
@@ -31,9 +32,9 @@ _STATE = (0, 1, 2, _HEADING)
 
 
 def after_fit(cov: Array, p: Array, v: Array | None) -> tuple[Array, float]:
-    """Covariances (N, 9, 9) of errors from which a yaw and an offset were fitted over all of the epochs.
+    """Covariances (N, 9, 9) of errors after a yaw and an offset have been fitted over all of the epochs.
 
-    And how much larger than stated the horizontal sigma had to be taken, rms over the epochs: 1 for dead reckoning.
+    Also how much larger than stated the horizontal sigma had to be taken, rms over the epochs: 1 for dead reckoning.
 
     Parameters
     ----------
@@ -55,11 +56,11 @@ def after_fit(cov: Array, p: Array, v: Array | None) -> tuple[Array, float]:
     X = _propagate_dead_reckoning(stated, turned)
     cov = cov.copy()
     cov[np.ix_(range(n), _STATE, _STATE)] = X * sign[:, None] * sign
-    # epochs from i on: those after it carry its error
+    # epochs from i on: their errors contain its error
     ahead, moved = _from(G), _from(np.einsum("jkl,jl->jk", G, turned))
     moved = moved - np.einsum("ikl,il->ik", ahead, turned)
     K = ahead @ cov[:, :3] - moved[..., None] * cov[:, None, _HEADING]
-    # epochs before i: it carries theirs
+    # epochs before i: its error contains theirs
     places, yaws = _sum_before(G @ X[:, :3, :3]), _sum_before(np.einsum("jkl,jl->jk", G, X[:, :3, 3]))
     about = _sum_before(np.einsum("jkl,jl,jm->jkm", G, X[:, :3, 3], turned))
     K[:, :, :3] += places + yaws[..., None] * turned[:, None] - about
@@ -73,13 +74,13 @@ def after_fit(cov: Array, p: Array, v: Array | None) -> tuple[Array, float]:
 
 
 def _propagate_dead_reckoning(X: Array, turned: Array) -> Array:
-    """Covariances (N, 4, 4) of place and yaw that dead reckoning can have, nowhere below the stated ones."""
+    """Covariances (N, 4, 4) of position and yaw consistent with dead reckoning, nowhere below the stated ones."""
     out = X.copy()
     F = np.eye(4)
     for k in range(1, len(X)):
         F[:3, 3] = turned[k] - turned[k - 1]
         before = F @ out[k - 1] @ F.T
-        # scaled to unit diagonal, so that metres and radians weigh alike
+        # scaled to unit diagonal, so that metres and radians have equal weight
         sd = np.sqrt(np.maximum(np.diagonal(X[k]), 1e-30))
         value, axes = np.linalg.eigh((X[k] - before) / np.outer(sd, sd))
         out[k] = before + (axes * np.maximum(value, 0.0)) @ axes.T * np.outer(sd, sd)
@@ -87,15 +88,15 @@ def _propagate_dead_reckoning(X: Array, turned: Array) -> Array:
 
 
 def _rotate(x: Array) -> Array:
-    """(N, 3) turned a quarter anticlockwise over the horizontal."""
+    """(N, 3) rotated anticlockwise by a quarter turn in the horizontal plane."""
     return np.column_stack([-x[:, 1], x[:, 0], np.zeros(len(x))])
 
 
 def _from(x: Array) -> Array:
-    """Sums of the rows from each on."""
+    """Sums of the rows from each row on."""
     return np.asarray(np.cumsum(x[::-1], axis=0)[::-1])
 
 
 def _sum_before(x: Array) -> Array:
-    """Sums of the rows before each."""
+    """Sums of the rows before each row."""
     return np.asarray(np.cumsum(x, axis=0) - x)

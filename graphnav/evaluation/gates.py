@@ -1,4 +1,4 @@
-"""Requirements on the numbers of a result, such as ``h_rms<0.5``, for scripts that must stop when one is not met."""
+"""Requirements on the numbers of a result, such as ``h_rms<0.5``, for scripts that stop when one is not met."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from typing import Any
 from graphnav.core.errors import ConfigError
 from graphnav.evaluation.metrics import COMPONENTS
 
-_FORM = re.compile(r"(?:([\w-]+):)?\s*([A-Za-z]\w*)\s*(<=|>=|<|>)\s*(\S+)")
+_REQUIREMENT = re.compile(r"(?:([\w-]+):)?\s*([A-Za-z]\w*)\s*(<=|>=|<|>)\s*(\S+)")
 _COMPARE = {"<": operator.lt, "<=": operator.le, ">": operator.gt, ">=": operator.ge}
 _SPAN = ("start_s", "end_s", "n", "distance_m", "end_h_m", "end_3d_m", "max_h_m", "max_up_m", "drift_mps",
          "drift_percent", "nees_p")  # fmt: skip
-_UNITS = ("_m", "_mps", "_deg", "_s")  # which a name may leave out
+_UNIT_SUFFIXES = ("_m", "_mps", "_deg", "_s")  # suffixes that may be omitted
 
 
 def names() -> tuple[str, ...]:
-    """Every number that can be asked for; those of spans begin with ``span_`` (in each) or ``span2_`` (in that one)."""
+    """All numbers that can be required; those of spans begin with ``span_`` (every span) or ``span2_`` (the second)."""
     errors = [
         f"{key}_{what}_{unit}" for key, (_, unit, _) in COMPONENTS.items() for what in ("rms", "p95", "max", "mean")
     ]
@@ -33,10 +33,10 @@ def names() -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class Requirement:
-    """A number and its limit; of one solver, or of every one that runs."""
+    """A number and its limit, for one solver or for all that run."""
 
-    text: str  # as it was given
-    name: str  # in full, of `names`, or span2_... for the second span
+    text: str  # as given
+    name: str  # full name, of `names`, or span2_... for the second span
     sign: str  # <, <=, > or >=
     limit: float
     solver: str | None = None
@@ -44,7 +44,7 @@ class Requirement:
 
 @dataclass(frozen=True)
 class Verdict:
-    """Whether a requirement is met by one solver; a number that is not known meets none."""
+    """Whether one solver meets a requirement; an unknown number meets none."""
 
     requirement: Requirement
     solver: str
@@ -52,25 +52,25 @@ class Verdict:
 
     @property
     def met(self) -> bool:
-        """Whether it is."""
+        """Whether the requirement is met."""
         return self.value is not None and bool(_COMPARE[self.requirement.sign](self.value, self.requirement.limit))
 
     @property
     def sentence(self) -> str:
-        """For people."""
+        """The verdict as a sentence."""
         shown = "not known" if self.value is None else f"{self.value:g}"
         return f"{self.solver} has {self.requirement.name} {shown}, required {self.requirement.text}"
 
 
 def parse_requirement(text: str, solvers: Sequence[str] = ()) -> Requirement:
-    """``h_rms<0.5``, ``span_max_h<=1``, or ``batch:nees_p<2`` of one solver out of `solvers`.
+    """Parse ``h_rms<0.5``, ``span_max_h<=1``, or ``batch:nees_p<2`` for one of the `solvers`.
 
     Raises
     ------
     ConfigError
         If it is not of that form, or names no number or no solver that there is, with the nearest that are.
     """
-    found = _FORM.fullmatch(text.strip())
+    found = _REQUIREMENT.fullmatch(text.strip())
     usage = "write NAME<NUMBER, such as h_rms<0.5, with <, <=, > or >="
     if found is None:
         raise ConfigError(f"--require {text}: {usage}", key="option.requirement")
@@ -88,9 +88,9 @@ def parse_requirement(text: str, solvers: Sequence[str] = ()) -> Requirement:
 
 
 def _complete_name(name: str, text: str) -> str:
-    """The name with its unit, and the number of its span where it has one."""
+    """The name with its unit, and with the number of its span if it has one."""
     every = names()
-    short = {full.removesuffix(unit): full for unit in _UNITS for full in every if full.endswith(unit)}
+    short = {full.removesuffix(unit): full for unit in _UNIT_SUFFIXES for full in every if full.endswith(unit)}
     known = {**short, **{full: full for full in every}}
     span = re.match(r"span(\d+)_", name)
     plain = re.sub(r"^span\d+_", "span_", name)
@@ -104,7 +104,7 @@ def _complete_name(name: str, text: str) -> str:
 
 
 def judge(requirements: Sequence[Requirement], rows: Sequence[Mapping[str, Any]]) -> list[Verdict]:
-    """The verdicts on rows of numbers, one row a solver, as `metrics.comparison_rows` makes them."""
+    """The verdicts on rows of numbers, one row per solver, as `metrics.comparison_rows` makes them."""
     verdicts = []
     for requirement in requirements:
         for row in rows:
@@ -119,13 +119,13 @@ def judge(requirements: Sequence[Requirement], rows: Sequence[Mapping[str, Any]]
 
 
 def text(verdicts: Sequence[Verdict]) -> str:
-    """Lines of text that follow others; "" without verdicts."""
+    """The verdicts as lines of text; "" if there are none."""
     lines = [f"  {'met' if verdict.met else 'not met'}: {verdict.sentence}" for verdict in verdicts]
     return "\n".join(["\n", "required", *lines]) if lines else ""
 
 
 def values(verdicts: Sequence[Verdict]) -> list[dict[str, Any]]:
-    """For JSON."""
+    """The verdicts for JSON."""
     return [
         {"require": v.requirement.text, "solver": v.solver, "name": v.requirement.name, "value": v.value, "met": v.met}
         for v in verdicts

@@ -1,4 +1,4 @@
-"""Errors of a trajectory boiled down to numbers: a dictionary, a table for the terminal, a comparison.
+"""Errors of a trajectory reduced to numbers: a dictionary, a table for the terminal, a comparison.
 
 NEES is e' P^-1 e, chi-square with as many degrees of freedom as e has where the covariance is true
 (Bar-Shalom, Li, Kirubarajan, *Estimation with Applications to Tracking and Navigation*, 5.4).
@@ -21,7 +21,7 @@ from graphnav.core.sample_size import chi_square_band, chi_square_quantile, effe
 
 @dataclass(frozen=True)
 class Errors:
-    """Estimate minus truth at N shared epochs; NaN where either has nothing to compare."""
+    """Estimate minus truth at N common epochs; NaN where either lacks the quantity."""
 
     t: Array  # (N,) s
     p: Array  # (N, 3) m, east, north, up at the point
@@ -31,13 +31,13 @@ class Errors:
     sd_p: Array  # (N, 3) m, the estimate's own sigma at the compared point
     sd_v: Array  # (N, 3) m/s
     sd_rph: Array  # (N, 3) rad
-    nees_p: Array  # (N,) dof_p degrees of freedom; the truth's own sigma, where it has one, is added
+    nees_p: Array  # (N,) dof_p degrees of freedom; the truth's sigma, if it has one, is added
     nees_axis: Array  # (N, 3) one degree of freedom each: east, north, up
     nees_v: Array  # (N,) 3 degrees of freedom
     nees_rph: Array  # (N,) 3 degrees of freedom, of the rotation between estimate and truth
     distance: Array  # (N,) m, horizontal, travelled by the truth since its first scored epoch
     dof_p: int = 3  # 2 for a truth without height
-    epochs: int = 0  # that there were, scored or not
+    epochs: int = 0  # number of epochs, scored or not
     notes: tuple[str, ...] = ()
     nees_heading: Array | None = None  # (N,) 1 degree of freedom
 
@@ -52,7 +52,7 @@ class Errors:
 
 @dataclass(frozen=True)
 class Statistic:
-    """Of one component over the epochs that have it; `p95` and `max` are of its size."""
+    """Statistics of one component over the epochs that have it; `p95` and `max` are of its magnitude."""
 
     rms: float
     p95: float
@@ -77,17 +77,17 @@ class Nees:
     low: float
     high: float
     inside: float
-    effective: float  # how many independent epochs the n are worth
+    effective: float  # number of independent epochs that the n are equivalent to
 
 
 @dataclass(frozen=True)
 class SpanErrors:
-    """What happened in a span of time, such as an outage; drift is of the largest horizontal error."""
+    """Errors in a span of time, such as an outage; the drift is that of the largest horizontal error."""
 
-    start: float  # s, as it was asked for
+    start: float  # s, as requested
     end: float  # s
     n: int
-    distance: float  # m, travelled in it
+    distance: float  # m, distance travelled in it
     end_h: float  # m, at its last epoch
     end_3d: float  # m
     max_h: float  # m
@@ -109,7 +109,7 @@ class Closure:
 
 @dataclass(frozen=True)
 class Metrics:
-    """Everything `summary` and `text` show; `errors` is there for plots."""
+    """All numbers that `summary` and `text` present; `errors` is kept for plots."""
 
     name: str
     n: int = 0
@@ -124,7 +124,7 @@ class Metrics:
     errors: Errors | None = field(default=None, repr=False, compare=False)
 
 
-# key in `components` -> (what people read, unit in keys, unit in tables)
+# key in `components` -> (name for people, unit in keys, unit in tables)
 COMPONENTS = {
     "e": ("east", "m", "m"),
     "n": ("north", "m", "m"),
@@ -146,7 +146,7 @@ _NEES = {"p": "position", "e": "east", "n": "north", "up": "up", "v": "velocity"
 def measure(
     errors: Errors, name: str = "", spans: Sequence[tuple[float, float]] = (), *, start: float = 0.0
 ) -> Metrics:
-    """Statistics of errors, over all epochs and in each of `spans` (from, to in s after `start`)."""
+    """Statistics of errors over all epochs and in each of `spans` (from, to in s after `start`)."""
     deg = np.rad2deg(errors.rph)
     series = {
         "e": errors.p[:, 0], "n": errors.p[:, 1], "up": errors.p[:, 2], "h": errors.horizontal,
@@ -175,7 +175,7 @@ def measure(
 
 
 def compute_statistic(x: Array) -> Statistic | None:
-    """Of the finite values of `x` (N,); None where there are none. The 95 % point is interpolated linearly."""
+    """Statistics of the finite values of `x` (N,); None if there are none. The 95 % point is interpolated linearly."""
     x = x[np.isfinite(x)]
     if not len(x):
         return None
@@ -250,7 +250,7 @@ def _span(errors: Errors, start: float, end: float, origin: float) -> SpanErrors
 
 
 def summary(metrics: Metrics) -> dict[str, Any]:
-    """A plain dictionary for JSON, five significant digits, units in the keys; None for what is not known."""
+    """The metrics as a dictionary for JSON: five significant digits, units in the keys, None where unknown."""
     out: dict[str, Any] = {
         "n": metrics.n,
         "epochs": metrics.epochs,
@@ -289,7 +289,7 @@ def summary(metrics: Metrics) -> dict[str, Any]:
 
 
 def text(metrics: Metrics) -> str:
-    """An aligned table for the terminal."""
+    """The metrics as an aligned table for the terminal."""
     lines = []
     if metrics.n:
         lines.append(f"{metrics.n} of {metrics.epochs} epochs, {metrics.duration:.1f} s, {metrics.distance:.1f} m")
@@ -351,7 +351,7 @@ def _round(x: float) -> float | None:
 
 
 def _format_short(x: float) -> str:
-    """Four significant digits without an exponent in the range people meet."""
+    """Four significant digits, without an exponent in the common range."""
     if not math.isfinite(x):
         return "-"
     size = abs(x)

@@ -1,4 +1,4 @@
-"""Estimate minus truth, epoch by epoch; `graphnav.evaluation.evaluate` is the door to it."""
+"""Estimate minus truth, epoch by epoch; `graphnav.evaluation.evaluate` is the entry point."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from graphnav.evaluation.fitted import after_fit
 from graphnav.evaluation.metrics import Closure, Errors
 
 MAX_GAP = 3.0  # s; the widest gap that is interpolated over
-_LARGER = 1.05  # times the stated sigma: worth saying
-_SLOW = 0.5  # m/s; slower than this a direction of travel means little
+_LARGER = 1.05  # ratio to the stated sigma above which it is noted
+_LEAST_SPEED = 0.5  # m/s; below, the direction of travel is undefined
 
 
 def errors(
@@ -30,10 +30,10 @@ def errors(
     at: Array | None = None,
     from_start: bool | None = None,
 ) -> Errors:
-    """Estimate minus truth at every epoch of the sparser of the two that the other can be interpolated to.
+    """Estimate minus truth at every epoch of the sparser of the two to which the other can be interpolated.
 
-    So the attitude of one-second keyframes, which no interpolation follows through a turn, is compared
-    at the keyframes when the truth has ten rows a second, and a dense estimate at the truth's epochs.
+    Thus the attitude of one-second keyframes, which cannot be interpolated through a turn, is compared at the keyframes
+    when the truth has ten rows a second, and a dense estimate at the truth's epochs.
 
     Parameters
     ----------
@@ -63,7 +63,7 @@ def errors(
         notes.append(
             Note(
                 "truth.lever_arm",
-                f"the estimate has no attitude, so the lever arm of {arm:.2f} m to the truth's point is left out",
+                f"the estimate has no attitude, so the lever arm of {arm:.2f} m to the truth's point is ignored",
             )
         )
     elif lever_arm is not None and trajectory.covariance is None and trajectory.sd_rph is None:
@@ -102,7 +102,7 @@ def errors(
     rph, theta = missing, missing
     if estimate.rph is not None and seen.rph is not None:
         rph = rotation.wrap(estimate.rph - seen.rph)
-        # Through the rotation, not the angles: these are far from linear where a foot points down.
+        # by the rotation, not the angles: these are strongly nonlinear where a foot points down
         theta = rotation.log(np.swapaxes(rotation.from_rph(estimate.rph), -1, -2) @ rotation.from_rph(seen.rph))
 
     cov = full_covariance(estimate)
@@ -124,7 +124,7 @@ def errors(
             Note("truth.no_velocity", "the truth has no velocity: its direction of travel is taken from its positions")
         )
     speed = np.linalg.norm(travel, axis=1)
-    moving = speed > _SLOW
+    moving = speed > _LEAST_SPEED
     along = np.where(moving[:, None], travel / np.where(moving, speed, 1.0)[:, None], np.nan)
     return Errors(
         t=seen.t,
@@ -150,7 +150,7 @@ def errors(
 
 
 def closure(trajectory: Trajectory) -> Closure:
-    """How far the last row is from the first, for a loop that ends where it began."""
+    """Distance of the last row from the first, for a loop that ends where it began."""
     p = trajectory.llh if trajectory.frame == "local" else LocalFrame(trajectory.llh[0]).from_llh(trajectory.llh)
     gap, length = p[-1] - p[0], float(np.sum(np.linalg.norm(np.diff(p[:, :2], axis=0), axis=1)))
     h = float(np.hypot(gap[0], gap[1]))
@@ -165,7 +165,7 @@ def distance_travelled(t: Array, llh: Array) -> Array:
     _, first = np.unique(np.floor((t - t[0]) / 0.5), return_index=True)
     knots = np.unique(np.append(first, len(t) - 1))
     p = LocalFrame(llh[0]).from_llh(llh[knots])
-    # Chords in the plane at the first point; the drop of the Earth's surface below it is no travel.
+    # chords in the plane at the first point; the drop of the Earth's surface below it is no distance travelled
     steps = np.linalg.norm(np.diff(p, axis=0), axis=1) ** 2 - np.diff(llh[knots, 2]) ** 2
     return np.interp(t, t[knots], np.concatenate([[0.0], np.cumsum(np.sqrt(np.maximum(steps, 0.0)))]))
 
@@ -178,9 +178,11 @@ def _fit(
     at: Array | None,
     notes: list[str],
 ) -> tuple[Trajectory, Trajectory]:
-    """Both on the Earth, the local one turned and moved onto the other (the truth onto the estimate if both are)."""
+    """Place both on the Earth, fitting the local one to the other by yaw and offset (the truth to the estimate if both
+    are).
+    """
     if trajectory.frame == truth.frame:
-        # Neither knows where it is: anywhere will do, and lengths stay what they are.
+        # neither has a place on the Earth: any will do, and lengths stay unchanged
         trajectory = place_on_earth(trajectory, LocalFrame(np.zeros(3)), 0.0, np.zeros(3))
     estimate, seen, _, _ = _pair_epochs(trajectory, truth, lever_arm, max_gap, at)
     mine, theirs = estimate.llh, seen.llh
@@ -190,7 +192,7 @@ def _fit(
     spread = np.sqrt(np.mean(np.sum((source[:, :2] - source[:, :2].mean(0)) ** 2, axis=1)))
     if spread < 0.1:
         raise RecordingError(
-            f"the {len(source)} shared epochs spread over {spread:.3f} m only: too little to fit a yaw",
+            f"the {len(source)} common epochs extend over {spread:.3f} m only: too little to fit a yaw",
             key="truth.too_little",
         )
     yaw, offset = fit_yaw(source, target)
@@ -212,12 +214,12 @@ def _fit(
 
 
 def _subtract_fit(cov: Array, estimate: Trajectory, notes: list[str]) -> Array:
-    """The covariance (N, 9, 9) of what a fit leaves of errors that count from the estimate's own start."""
+    """The covariance (N, 9, 9) after a fit, for errors that count from the estimate's own start."""
     if not np.isfinite(cov).all():
         notes.append(
             Note(
                 "nees.fit_unknown",
-                "NEES leaves the fit out of account: there is no covariance of place and heading at every epoch",
+                "NEES ignores the fit: there is no covariance of position and heading at every epoch",
             )
         )
         return cov
@@ -226,7 +228,8 @@ def _subtract_fit(cov: Array, estimate: Trajectory, notes: list[str]) -> Array:
     notes.append(
         Note(
             "nees.after_fit",
-            f"NEES is of what the fit leaves, errors of place and heading taken to last as in dead reckoning{by}",
+            "NEES is of the errors after the fit; errors of position and heading are assumed to persist as in dead "
+            f"reckoning{by}",
         )
     )
     return rest
@@ -235,7 +238,9 @@ def _subtract_fit(cov: Array, estimate: Trajectory, notes: list[str]) -> Array:
 def _pair_epochs(
     trajectory: Trajectory, truth: Trajectory, lever_arm: Array | None, max_gap: float, at: Array | None
 ) -> tuple[Trajectory, Trajectory, Array, int]:
-    """Estimate and truth at the epochs they share, the truth's horizontal velocity there (N, 2), and of how many."""
+    """Estimate and truth at their common epochs, the truth's horizontal velocity there (N, 2), and the number of
+    epochs.
+    """
     moving = truth if truth.v is not None else replace(truth, v=differentiate(truth, max_gap))
     if at is not None:
         seen, _ = interpolate(moving, at[np.isin(at, trajectory.t)], max_gap=max_gap)
@@ -254,12 +259,12 @@ def _pair_epochs(
 
 
 def measure_spacing(t: Array) -> float:
-    """Usual time between rows at t (N,), s, to 0.1 ms so that rounding decides nothing; infinite for one row."""
+    """Typical time between rows at t (N,), s, to 0.1 ms so that rounding decides nothing; infinite for one row."""
     return float(np.round(np.median(np.diff(t)), 4)) if len(t) > 1 else np.inf
 
 
 def _are_between(t: Array, rows: Array) -> bool:
-    """Whether some of the times are no row's, to 0.1 ms."""
+    """Whether some of the times are not those of rows, to 0.1 ms."""
     k = np.clip(np.searchsorted(rows, t), 1, len(rows) - 1) if len(rows) > 1 else np.zeros(len(t), dtype=int)
     return bool((np.minimum(np.abs(t - rows[k]), np.abs(t - rows[k - 1])) > 1e-4).any())
 
@@ -270,7 +275,7 @@ def _nees(e: Array, cov: Array) -> Array:
     rows = np.flatnonzero(np.isfinite(e).all(axis=1) & np.isfinite(cov).all(axis=(1, 2)))
     diagonal = np.diagonal(cov[rows], axis1=-2, axis2=-1)
     rows = rows[(diagonal > 0).all(axis=1)]
-    # Scaled to unit diagonal, so that the test for singularity knows no units.
+    # scaled to unit diagonal, so that the test for singularity is independent of units
     sd = np.sqrt(np.diagonal(cov[rows], axis1=-2, axis2=-1))
     unit = cov[rows] / (sd[:, :, None] * sd[:, None, :])
     good = np.linalg.eigvalsh(unit)[:, 0] > 1e-12 if len(rows) else np.zeros(0, dtype=bool)

@@ -1,4 +1,4 @@
-"""Relative errors: how far the displacement over a segment of the way is off, by the segment's length."""
+"""Relative errors: errors of the displacement over segments of the trajectory, by their length."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ import numpy as np
 from graphnav.core.rotation import Array
 from graphnav.evaluation.metrics import Errors
 
-_FEWEST = 10  # segments
+_FEWEST_SEGMENTS = 10  # segments, at least
 _STEPS = (1.0, 2.0, 5.0)
 
 
 @dataclass(frozen=True)
 class Relative:
-    """Of all segments of one length. A start that is off, and an error that stays, are in none of it."""
+    """Relative errors of all segments of one length. An initial error, and one that stays constant, do not enter."""
 
     length: float  # m, horizontal
     count: int
@@ -26,7 +26,7 @@ class Relative:
 
     @property
     def percent(self) -> float:
-        """Rms over the length, %."""
+        """Rms error over the segment's length, %."""
         return 100.0 * self.rms / self.length
 
 
@@ -44,10 +44,10 @@ def relative_errors(errors: Errors) -> tuple[Relative, ...]:
     way, e, heading = errors.distance[known], errors.p[known, :2], errors.rph[known, 2]
     out = []
     for length in (step * 10.0**k for k in range(1, 6) for step in _STEPS):
-        if (way[-1] - way[0]) / length < _FEWEST:
+        if (way[-1] - way[0]) / length < _FEWEST_SEGMENTS:
             break
         first, last = _segments(way, length)
-        if len(first) >= _FEWEST:
+        if len(first) >= _FEWEST_SEGMENTS:
             off = np.hypot(*(e[last] - e[first]).T)
             turned = np.degrees(np.angle(np.exp(1j * (heading[last] - heading[first]))))
             p95, largest = np.quantile(off, 0.95), off.max()
@@ -56,15 +56,15 @@ def relative_errors(errors: Errors) -> tuple[Relative, ...]:
 
 
 def _segments(way: Array, length: float) -> tuple[np.ndarray, np.ndarray]:
-    """First and last rows of segments as long as that to a tenth."""
+    """First and last rows of segments of that length, to a tenth."""
     last = np.searchsorted(way, way + length)
     first = np.flatnonzero(last < len(way))
     first = first[way[last[first]] - way[first] <= 1.1 * length]
-    first = first[np.diff(way[first], prepend=-np.inf) > 0.0]  # a standing vehicle begins one segment
+    first = first[np.diff(way[first], prepend=-np.inf) > 0.0]  # a stationary vehicle begins one segment
     return first, last[first]
 
 
 def rms(x: Array) -> float:
-    """Root mean square of what is finite."""
+    """Root mean square of the finite values."""
     x = x[np.isfinite(x)]
     return float(np.sqrt(np.mean(x * x))) if len(x) else float("nan")

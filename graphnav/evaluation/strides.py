@@ -1,9 +1,9 @@
 """Scores of a walk without a place on the Earth: shape, strides, height and closure.
 
-A solution's position and heading count from zero at its start, a truth in a local frame from anywhere. For the shape,
+Position and heading of a solution count from zero at its start, a truth in a local frame from anywhere. For the shape,
 yaw and offset are fitted over all epochs, as in `graphnav.evaluation.scoring`. For consistency that would be wrong: the
-solution is certain of its start and says of all else how far from there it may be. So the truth is moved to the
-solution where it begins, and only the yaw is fitted.
+solution is certain at its start and states everything else relative to it. So the truth is moved to the start of the
+solution, and only the yaw is fitted.
 """
 
 from __future__ import annotations
@@ -20,30 +20,30 @@ from graphnav.estimation.solution import Solution
 from graphnav.evaluation.scoring import closure
 from graphnav.recording import Recording
 
-_SPACING = 0.1  # s between the epochs compared with a dense truth
-_STANDS = 1.0  # s at the start of which a dense truth is averaged to place it
-_TURNS = 10  # of fitting a place on the foot; and epochs that make a shape
-_A_STRIDE = 0.3  # m; points closer together are no stride
+_EPOCH_SPACING = 0.1  # s between the epochs compared with a dense truth
+_INITIAL_STANCE = 1.0  # s at the start over which a dense truth is averaged to place it
+_FIT_ITERATIONS = 10  # iterations of fitting a point on the foot; and epochs needed for a shape
+_A_STRIDE = 0.3  # m; the smallest distance between footprints that counts as a stride
 
 
 @dataclass(frozen=True)
 class WalkErrors:
-    """Of one solution; NaN where the truth does not tell. Sizes in m, NEES per degree of freedom (1 where true)."""
+    """Errors of one solution; NaN where the truth lacks the quantity. Lengths in m, NEES per degree of freedom."""
 
-    horizontal: float  # rms after the fit; of a loop, start to end
+    horizontal: float  # rms after the fit; for a loop, distance of the end from the start
     in_stance: float  # the same over the epochs in a stance only
     of_steps: float  # the same over the means of stances, so that a rest counts like a step
-    of_point: float  # the same with the place on the foot fitted that the truth is of
-    up: float  # rms with the start's height taken off; of a loop, end less start
+    of_point: float  # the same with the truth's point on the foot fitted
+    up: float  # rms relative to the height at the start; for a loop, end minus start
     stride: float  # median of stride length over its truth; 1 where there is no bias
     nees_h: float
     nees_up: float
 
 
 def floor_sigma(recording: Recording, solution: Solution) -> float:
-    """1-sigma of a coordinate of a dense truth, m: how its heights scatter from stance to stance on a flat floor.
+    """1-sigma of a coordinate of a dense truth, m: scatter of its heights between stances on a flat floor.
 
-    The first and the last are left out, in which the foot stands as it does in none between them.
+    The first and the last are left out, in which the foot stands differently.
     """
     truth = recording.truth
     assert truth is not None
@@ -72,13 +72,13 @@ def walk_errors(recording: Recording, solution: Solution, truth_sigma: float = 0
     if truth is not None and truth.closed_loop_sigma is not None:
         return _of_loop(solution, truth.closed_loop_sigma)
     if truth is None or truth.xyz is None:
-        raise ValueError(f"'{recording.name}' has no truth in a local frame and is no loop")
+        raise ValueError(f"'{recording.name}' has neither a truth in a local frame nor a closed loop")
     t, X = truth.t, truth.xyz
     inside = (t >= solution.t[0]) & (t <= solution.t[-1]) & np.isfinite(X).all(axis=1)
     t, X = t[inside], X[inside]
-    first = X[t <= t[0] + _STANDS].mean(axis=0) if X.shape[1] == 3 else X[0]
+    first = X[t <= t[0] + _INITIAL_STANCE].mean(axis=0) if X.shape[1] == 3 else X[0]
     if X.shape[1] == 3:
-        _, rows = np.unique(np.floor((t - t[0]) / _SPACING), return_index=True)
+        _, rows = np.unique(np.floor((t - t[0]) / _EPOCH_SPACING), return_index=True)
         t, X = t[rows], X[rows]
     _, states, covariance = solution.at(t)
     p, P = states.p, covariance[:, 3:6, 3:6]
@@ -86,7 +86,7 @@ def walk_errors(recording: Recording, solution: Solution, truth_sigma: float = 0
     of_point, arm = fit_point(states, flat)
     # about the start
     q = p if X.shape[1] == 2 else p + states.R_nb @ arm
-    at_start = q[0] if X.shape[1] == 2 else q[t <= t[0] + _STANDS].mean(axis=0)
+    at_start = q[0] if X.shape[1] == 2 else q[t <= t[0] + _INITIAL_STANCE].mean(axis=0)
     a, b = X[:, :2] - first[:2], (q - at_start)[:, :2]
     anchored = _rotate(a, float(np.arctan2(np.sum(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]), np.sum(a * b))))
     e = b - anchored
@@ -94,13 +94,13 @@ def walk_errors(recording: Recording, solution: Solution, truth_sigma: float = 0
     nees_h = 0.5 * np.einsum("ni,nij,nj->n", e, np.linalg.inv(P[:, :2, :2] + R * np.eye(2)), e)
     up = nees_up = stride = np.nan
     if X.shape[1] == 3:
-        height = p[:, 2] - X[:, 2] - np.mean((p[:, 2] - X[:, 2])[t <= t[0] + _STANDS])
+        height = p[:, 2] - X[:, 2] - np.mean((p[:, 2] - X[:, 2])[t <= t[0] + _INITIAL_STANCE])
         up, e_up = float(np.sqrt(np.mean(height**2))), (q - at_start)[:, 2] - (X[:, 2] - first[2])
         nees_up = float(np.mean(e_up**2 / (P[:, 2, 2] + R)))
     else:
         true, mine = (np.linalg.norm(np.diff(x[:, :2], axis=0), axis=1) for x in (X, p))
         stride = float(np.median((mine / true)[true > _A_STRIDE]))
-    # points are measured where a foot stands; a dense truth has it in the air as well
+    # surveyed points are measured where a foot stands; a dense truth also covers the swing
     stances = _stances(solution) if X.shape[1] == 3 else np.empty((0, 2))
     horizontal, in_stance, of_steps = shapes(t, p, flat, stances)
     return WalkErrors(horizontal, in_stance, of_steps, of_point, up, stride, float(np.mean(nees_h)), nees_up)
@@ -117,7 +117,7 @@ def shapes(t: Array, p: Array, truth: Array, stances: Array) -> tuple[float, flo
     rows = [(t >= a) & (t <= b) for a, b in stances]
     inside = np.any(rows, axis=0) if rows else np.zeros(len(t), dtype=bool)
     everywhere = _shape(p, truth)
-    if np.count_nonzero(inside) <= _TURNS:
+    if np.count_nonzero(inside) <= _FIT_ITERATIONS:
         return everywhere, everywhere, everywhere
     means = [np.array([x[one].mean(axis=0) for one in rows if one.any()]) for x in (p, truth)]
     return everywhere, _shape(p[inside], truth[inside]), _shape(*means)
@@ -133,7 +133,7 @@ def _of_loop(solution: Solution, sigma: float) -> WalkErrors:
 
 
 def _stances(solution: Solution) -> Array:
-    """(S, 2) s, where the foot stands; none where it was not looked for."""
+    """(S, 2) s, the stances; none where they were not detected."""
     return next((d.intervals for d in solution.detections if d.name == "fused"), np.empty((0, 2)))
 
 
@@ -144,10 +144,10 @@ def _shape(p: Array, truth: Array) -> float:
 
 
 def fit_point(states: States, flat: Array) -> tuple[float, Array]:
-    """Horizontal rms after fitting yaw, offset and a lever arm in the body, by turns, and that arm (3,), m."""
+    """Horizontal rms after fitting yaw, offset and, alternately, a lever arm in the body; and that arm (3,), m."""
     arm = np.zeros(3)
     level = states.R_nb[:, :2]
-    for _ in range(_TURNS):
+    for _ in range(_FIT_ITERATIONS):
         p = np.column_stack([states.p[:, :2] + level @ arm, np.zeros(len(flat))])
         yaw, offset = fit_yaw(flat, p)
         e = p[:, :2] - (_rotate(flat[:, :2], yaw) + offset[:2])

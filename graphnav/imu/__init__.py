@@ -1,1 +1,1 @@
-"""From raw IMU samples to the intervals between keyframes."""
+"""Raw IMU samples, preintegrated intervals between keyframes, and IMU factors."""

@@ -1,18 +1,18 @@
-"""Peaks that a sensor cut off: found by their shape, restored as far as it tells, with a larger variance there.
+"""Clipped peaks of IMU signals: found by their shape, partly restored, and given a larger variance.
 
-A foot turns faster than the usual 300 deg/s range of inertial units, and not all of them end at a round number that
-repeats itself: after temperature compensation a cut peak is flat to a per cent only. But it is wider than it could be.
-A peak that is a parabola, x = p - c t^2, is within a share b of its height for 2 tau with c tau^2 = b p, and outside of
+A foot turns faster than the usual 300 deg/s range of inertial units, and not all units clip at a round number that
+repeats: after temperature compensation a clipped peak is flat to one per cent only. But it is wider than an unclipped
+one. A parabolic peak, x = p - c t^2, is within a share b of its height for 2 tau with c tau^2 = b p, and outside of
 that, tau' from its middle, it has the slope s = 2 c tau'. So
 
     q = s tau^2 / (2 tau' b p)
 
-is 1 for a peak and several where the sides would meet far above. With whole rows counted, q of a parabola is 2.25 at
-most (three rows). Ranges end softly, too: a peak that bends over the last few per cent is within 1 % of its height for
-a row or two only. So where one peak shows that an axis ends, all its peaks are asked again with b = 3 %.
+is 1 for a peak, and several where the sides would meet far above. Counted in whole rows, q of a parabola is at most
+2.25 (three rows). Ranges may also end softly: a peak that bends over the last few per cent is within 1 % of its height
+for only a row or two. So once one peak shows that an axis clips, all its peaks are tested again with b = 3 %.
 
-Within a cut peak the cubic goes on that leaves from either side with the slope it has there. How much is added is a
-guess, of which the half is taken for its 1-sigma: white noise of that effect over the peak.
+Within a clipped peak the signal is the cubic that continues both sides with their slopes. The amount added is
+uncertain; half of it is taken as 1-sigma: white noise of that effect over the peak.
 """
 
 from __future__ import annotations
@@ -26,18 +26,18 @@ from graphnav.core.rotation import Array
 from graphnav.imu.samples import Samples
 from graphnav.recording import Imu
 
-_RANGE_END = 0.95  # of the highest reading: a range that ends lower than that for some peaks is none
+_RANGE_END = 0.95  # share of the highest reading: a limit that some peaks exceed by more is not the end of the range
 _BAND = 0.01  # b
-_SOFT_BAND = 0.03  # b, of an axis that is known to end: it does so softly
+_SOFT_BAND = 0.03  # b of an axis that is known to clip: it may do so softly
 _TOO_FLAT = 2.5  # q
-_FEWEST_ROWS = 3  # rows of a flat top
+_FEWEST_ROWS = 3  # rows of a flat top at least
 _LEAST = {"gyro": 4.0, "accel": 19.0}  # rad/s, m/s^2: no range ends lower (250 deg/s, 2 g)
-_DOUBT = 0.5  # of what is added
+_DOUBT = 0.5  # 1-sigma as a share of what is added
 
 
 @dataclass(frozen=True)
 class Peak:
-    """Rows `first` to `last` (not included) of an axis that were cut, and what they are likely to have been."""
+    """A clipped peak: rows `first` to `last` (exclusive) of one axis, and their restored values."""
 
     first: int
     last: int
@@ -45,9 +45,9 @@ class Peak:
 
 
 def find_cut_peaks(t: Array, x: Array, least: float, highest: Array | None = None) -> list[Peak]:
-    """The peaks above `least` of one axis (N,), read at times (N,) s, that were cut off.
+    """The clipped peaks above `least` of one axis (N,), sampled at times (N,) s.
 
-    `highest` (2,) is what the sensor is known to have read at other times, up and down.
+    `highest` (2,) are the highest readings of the sensor at other times, up and down.
     """
     most = np.zeros(2) if highest is None else highest
     if not (sure := _find_flat(t, x, least, _BAND, most)):
@@ -57,7 +57,7 @@ def find_cut_peaks(t: Array, x: Array, least: float, highest: Array | None = Non
 
 
 def _find_flat(t: Array, x: Array, least: float, band: float, highest: Array) -> list[Peak]:
-    """The peaks that are within `band` of their height for longer than their sides allow."""
+    """The peaks that are within `band` of their height for longer than their slopes explain."""
     found = []
     for sign, most in zip((1.0, -1.0), highest, strict=True):
         y = sign * x
@@ -75,7 +75,7 @@ def _find_flat(t: Array, x: Array, least: float, band: float, highest: Array) ->
             half = 0.5 * (last - first) * step
             if min(up, down) * half**2 < _TOO_FLAT * 2.0 * (half + 1.5 * step) * band * top:
                 continue
-            from scipy.interpolate import CubicHermiteSpline  # which few recordings need, and takes long to import
+            from scipy.interpolate import CubicHermiteSpline  # few recordings need it, and the import takes long
 
             curve = CubicHermiteSpline(t[[first - 1, last]], y[[first - 1, last]], [up, -down])
             found.append(Peak(first, last, sign * np.maximum(curve(t[first:last]), y[first:last])))
@@ -83,15 +83,15 @@ def _find_flat(t: Array, x: Array, least: float, band: float, highest: Array) ->
 
 
 def highest(imu: Imu) -> Array:
-    """(2, 3, 2) the highest readings of gyro and accelerometer by their own axes, up and down."""
+    """(2, 3, 2) highest readings of gyro and accelerometer in the sensors' own axes, up and down."""
     both = (imu.gyro @ imu.R_bs, imu.accel @ imu.R_bs)
     return np.array([np.stack([x.max(axis=0, initial=0.0), (-x).max(axis=0, initial=0.0)], -1) for x in both])
 
 
 def first_not_cut(samples: Samples, R_bs: Array, before: Array, now: Array) -> float:
-    """When the first peak was, s, that seemed cut as long as readings were no higher than `before`, but is not.
+    """Time (s) of the first peak that seemed clipped by the readings `before`, but is not by those of `now`.
 
-    Infinite if there is none; `before` and `now` are as `highest` says.
+    Infinite if there is none; both are as `highest` returns them.
     """
     first = np.inf
     for k, name in enumerate(_LEAST):
@@ -104,7 +104,7 @@ def first_not_cut(samples: Samples, R_bs: Array, before: Array, now: Array) -> f
 
 
 def with_whole_peaks(samples: Samples, R_bs: Array, known: Array | None = None) -> tuple[Samples, tuple[str, ...]]:
-    """The samples with cut peaks put back, and sentences that say so.
+    """The samples with clipped peaks restored, and notes on them.
 
     Parameters
     ----------
@@ -131,9 +131,8 @@ def with_whole_peaks(samples: Samples, R_bs: Array, known: Array | None = None) 
             notes.append(
                 Note(
                     "imu.clipped",
-                    f"{what} {'xyz'[axis]} (file axes) ends at {limit:.3g} {unit}: {len(peaks)} peaks were cut off "
-                    "and put "
-                    "back by their sides",
+                    f"{what} {'xyz'[axis]} (file axes) ends at {limit:.3g} {unit}: {len(peaks)} clipped peaks were "
+                    "restored from their sides",
                 )
             )
         if cut:

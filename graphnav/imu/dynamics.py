@@ -1,4 +1,4 @@
-"""What a preintegrated interval says of the states at its ends, on the rotating, curved Earth.
+"""The IMU factor: relation of the states at both ends of a preintegrated interval, on the rotating, curved Earth.
 
 In the fixed local frame n the vehicle obeys (Groves 2013, eq. 5.18-5.29, with n Earth-fixed)::
 
@@ -43,7 +43,7 @@ _I3 = np.eye(3)
 def scale_parameter(recording: Recording) -> tuple[Parameter, ...]:
     """Scale errors (gyro x y z, accelerometer x y z), where the noise figures leave them open.
 
-    Of a foot, which turns and is shaken about all axes, also what each axis has of the others: 9 and 9, those first.
+    For a foot, which turns and is shaken about all axes, also the cross-axis terms: 9 and 9, the scale errors first.
     """
     return _scale_parameter(recording.imu.noise, 9 if recording.platform == "foot" else 3)
 
@@ -57,19 +57,19 @@ def _scale_parameter(noise: ImuNoise, each: int) -> tuple[Parameter, ...]:
 
 
 def as_biases(scale: Array, force: Array, rate: Array) -> tuple[Array, Array]:
-    """What scale errors (k,) or (n, k) are like at means (n, 3): biases of accelerometer and gyro, (n, 3) each."""
+    """The biases of accelerometer and gyro, (n, 3) each, that scale errors (k,) or (n, k) amount to at means (n, 3)."""
     half = scale.shape[-1] // 2
     of_accel, of_gyro = scale[..., half:] * force[:, _FROM[:half]], scale[..., :half] * rate[:, _FROM[:half]]
     return (of_accel, of_gyro) if half == 3 else (of_accel @ _INTO, of_gyro @ _INTO)
 
 
 def by_scale(by_bias: Array, mean: Array, k: int) -> Array:
-    """(n, r, k): derivative by k errors of a triad, from that by its bias (n, r, 3)."""
+    """(n, r, k): derivative by k scale errors of a triad, from that by its bias (n, r, 3)."""
     return np.asarray(by_bias[..., _TO[:k]] * mean[:, None, _FROM[:k]])
 
 
 class EarthMotion:
-    """How states move in a local frame over times T (n,) when it is known what the force did; the module's formulas."""
+    """Motion of states in a local frame over times T (n,), given the integrated force; the formulas of this module."""
 
     def __init__(self, T: Array, frame: LocalFrame) -> None:
         self._frame, self._h = frame, T[:, None]
@@ -80,11 +80,11 @@ class EarthMotion:
         self._once, self._twice = h * gamma1, h * h * gamma2  # (n, 3, 3) int E, iint E
 
     def reach(self, rows: slice, start: States, dR: Array, dP: Array, dV: Array) -> States:
-        """The states at the ends of times `rows`, by dR (n, 3, 3), dP and dV (n, 3) in the axes of their starts."""
+        """The states after times `rows`, by dR (n, 3, 3), dP and dV (n, 3) in the axes of their starts."""
         frame, h, back = self._frame, self._h[rows], self.back[rows]
         by_place = start.p @ frame.W.T
         G = frame.gravity_n(start.p) + start.p @ frame.W2.T
-        bent, u = start.v @ frame.gravity_gradient.T, start.v + by_place  # gravity changes along the way
+        bent, u = start.v @ frame.gravity_gradient.T, start.v + by_place  # gravity changes over the interval
         p = start.p + h * (u + h * h / 6.0 * bent) + mv(self._twice[rows], G) + mv(start.R_nb, dP)
         p = mv(back, p)
         v = mv(back, u + 0.5 * h * h * bent + mv(self._once[rows], G) + mv(start.R_nb, dV)) - p @ frame.W.T
@@ -92,7 +92,9 @@ class EarthMotion:
 
 
 class ImuFactors:
-    """Prediction over preintegrated intervals in a local frame; what does not depend on states is done once."""
+    """Prediction over preintegrated intervals in a local frame; everything independent of the states is computed
+    once.
+    """
 
     def __init__(self, intervals: Intervals, frame: LocalFrame) -> None:
         self.intervals, self.frame = intervals, frame
@@ -111,13 +113,13 @@ class ImuFactors:
         self.expected = np.concatenate([intervals.ba, intervals.bg], axis=-1)
 
     def prepare(self) -> ImuFactors:
-        """The same, with all that is made when it is asked for first made already."""
+        """Compute everything that would otherwise be computed at first use; returns itself."""
         _ = self.whitener, self.inner
         return self
 
     @cached_property
     def inner(self) -> Array:
-        """(n, 6, 6) derivative of the end's (p, v) by the start's, that of gravity with it."""
+        """(n, 6, 6) derivative of the end's (p, v) by the start's, the gravity gradient included."""
         frame, h = self.frame, self.intervals.T[:, None, None]
         gradient, by_place = frame.gravity_gradient, frame.gravity_gradient + frame.W2
         ahead = np.empty((len(h), 6, 6))  # of (E p, E u)
@@ -139,7 +141,7 @@ class ImuFactors:
         return np.linalg.inv(np.linalg.cholesky(self.intervals.covariance))
 
     def propagate(self, rows: slice, start: States, scale: Array | None = None) -> tuple[States, Array]:
-        """The states at the ends of intervals `rows` and F (n, 15, 15) there, from the states at their starts.
+        """Propagate states to the ends of intervals `rows`, with F (n, 15, 15).
 
         `scale` is (k,), (n, k) or None, k 6 or 18.
         """
@@ -169,7 +171,7 @@ class ImuFactors:
         return (self.post[rows].reshape(-1, 6, 2, 3) @ R_nb[:, None]).reshape(-1, 6, 6)
 
     def scale_columns(self, rows: slice, F: Array, k: int) -> Array:
-        """d(end) / d(scale), (n, 15, k): the bias columns of F times what the scale multiplies."""
+        """d(end) / d(scale), (n, 15, k): the bias columns of F times what the scale errors multiply."""
         iv, half = self.intervals, k // 2
         out = np.zeros((len(F), DIM, k))
         out[:, :9, :half] = by_scale(F[:, :9, 12:15], iv.rate[rows], half)
@@ -212,7 +214,7 @@ class ImuFactors:
         Jj[:, :3, :3] = inverse
         value = self._body(r, start.R_nb)
         both, Jj = self.body_rows(both, start.R_nb), self.body_rows(Jj, start.R_nb)
-        # the frame of p and v turns with the start's attitude
+        # the frame of p and v rotates with the start's attitude
         both[:, 3:6, :3] += rotation.skew(value[:, 3:6])
         both[:, 6:9, :3] += rotation.skew(value[:, 6:9])
         return value, both[:, :, :DIM], Jj, both[:, :, DIM:]

@@ -1,7 +1,7 @@
-"""Covariances of preintegrated intervals: white noise of the samples, and bias walks inside an interval.
+"""Covariances of preintegrated intervals: white noise of the samples, and bias random walks within an interval.
 
-`graphnav.imu.preintegration` has the sums written out. Arrays of pieces run along the first axis, intervals along
-the last: (L, ..., n).
+The sums are derived in `graphnav.imu.preintegration`. Arrays of pieces run along the first axis, intervals along the
+last: (L, ..., n).
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ from graphnav.core.rotation import Array
 from graphnav.imu.samples import Samples
 from graphnav.recording import Imu
 
-_WALK_POINTS = 6  # quadrature points for the effect of bias walk inside an interval
+_WALK_POINTS = 6  # quadrature points for the effect of bias random walks within an interval
 
 
 def take_last(x: Array) -> Array:
-    """(n, ...) what (L, ..., n) holds at the end."""
+    """The last element of (L, ..., n) along the first axis, as (n, ...)."""
     x = x[-1]
     return np.ascontiguousarray(x.transpose(x.ndim - 1, *range(x.ndim - 1)))
 
@@ -27,7 +27,7 @@ def running_sum(terms: Array) -> Array:
     out = np.zeros((len(terms) + 1, *terms.shape[1:]))
     if out[0].size < 100:
         np.cumsum(terms, axis=0, out=out[1:])
-    else:  # several times quicker than NumPy's sums, which go down one column after the other
+    else:  # several times faster than NumPy's sums, which run down one column after the other
         for k, term in enumerate(terms):
             np.add(out[k], term, out=out[k + 1])
     return out
@@ -77,9 +77,10 @@ def white_covariance(qg: Array, qa: Array, left: Array, a_edge: Array, b_edge: A
 def walk_covariances(
     edge: Array, left: Array, A: Array, B: Array, PA: Array, PB: Array, a: Array, b: Array
 ) -> tuple[Array, Array]:
-    """Covariances (n, 15, 15), start frame, of walks of unit density inside the interval, by midpoint quadrature.
+    """Covariances (n, 15, 15), start frame, of bias random walks of unit density within the interval, by midpoint
+    quadrature.
 
-    Of the gyro's bias and of the accelerometer's.
+    First that of the gyro's bias, then that of the accelerometer's.
     """
     n = edge.shape[1]
     T = edge[-1]
@@ -87,7 +88,7 @@ def walk_covariances(
     at = np.abs(edge[:, None] - target).argmin(axis=0).T  # the edge nearest to each quadrature point
     row = np.arange(n)[:, None]
     s = left[at, row][..., None, None]
-    # of a change of the gyro's bias, of one of the accelerometer's
+    # effect of a change of the gyro's bias, and of one of the accelerometer's
     M = np.zeros((n, _WALK_POINTS, 15, 6))
     eye = np.eye(3)
     A_t, B_t, PA_t, PB_t = (x[at, :, :, row] for x in (A, B, PA, PB))

@@ -1,17 +1,17 @@
-"""Gyros whose unit corrects their offset by itself while it rests: told from the rests, and undone.
+"""Gyros whose unit corrects their offset at rest: detected from the rests, and undone.
 
-Some units take the offset off before a row leaves them, and learn it where they seem to rest. That of x-io (Fusion,
-FusionOffset.c, MIT; many small units carry it) begins after 5 s below 3 deg/s on every axis and lets it follow what
-is left with a cut-off of 0.02 Hz,
+Some units subtract an offset before they output a row, and learn it while they seem to rest. That of x-io (Fusion,
+FusionOffset.c, MIT; common in small units) starts after 5 s below 3 deg/s on every axis and lets the offset follow the
+output with a cut-off of 0.02 Hz,
 
     y = omega_raw - o,    do/dt = kappa y,    kappa = 2 pi 0.02 Hz
 
-so in a rest the rows decay with a time constant of 8 s, and the bias before it is not the bias after it: by more than
-any figure of a data sheet allows. As y is what was recorded, o is known but for a constant, and y + o has one bias.
+so at rest the rows decay with a time constant of 8 s, and the biases before and after differ by more than any data
+sheet permits. As y is what was recorded, o is known except for a constant, and y + o has one bias.
 
-Whether it was so is asked of the rests. In one, the angle that the rows add up to, less the tilt that the force
-shows, is a straight line for a constant bias, and bends with the integral of o if the unit corrected it. The sums of
-squares left by both are compared as likelihoods of a regression are: n ln of their ratio, n independent values.
+Whether the unit did so is tested on the rests. In a rest, the integrated angle less the tilt shown by the force is a
+straight line for a constant bias, and bends with the integral of o if the unit corrected it. The residual sums of
+squares are compared as likelihoods of a regression: n ln of their ratio, for n independent values.
 """
 
 from __future__ import annotations
@@ -27,18 +27,18 @@ from graphnav.core.rotation import Array
 from graphnav.core.sample_size import effective_size
 from graphnav.recording import Imu, Recording
 
-_AFTER = 5.0  # s of rest after which the unit begins
-_RESTS = np.deg2rad(3.0)  # rad/s, on every axis
-_RATE = 2.0 * np.pi * 0.02  # rad/s, kappa
-_BLOCK = 0.25  # s over which angles are averaged
-_SHORTEST = 3.0  # s of correction in a rest, below which a bend says nothing
-_ODDS = 100.0  # between the likelihoods at which it is believed
+_AFTER = 5.0  # s of rest after which the correction starts
+_RESTS = np.deg2rad(3.0)  # rad/s on every axis, below which the unit takes itself to be at rest
+_KAPPA = 2.0 * np.pi * 0.02  # rad/s, kappa
+_ANGLE_BLOCK = 0.25  # s over which angles are averaged
+_SHORTEST_CORRECTION = 3.0  # s of correction in a rest, below which the bend is not significant
+_ODDS = 100.0  # likelihood ratio above which the correction is undone
 
 
 def without_onboard_offset(recording: Recording, settings: Settings) -> tuple[Recording, tuple[str, ...]]:
-    """A walk with the gyro as it was before its unit corrected it in rests, and a sentence if it did.
+    """A walk with the gyro rates before the unit's correction, and a note if there was one.
 
-    Drives are as they were: on a straight road such a unit takes a slow turn for its offset, and must not be used.
+    Drives stay unchanged: on a straight road such a unit takes a slow turn for its offset, and must not be used.
     """
     if recording.platform != "foot" or not settings.imu.onboard_offset:
         return recording, ()
@@ -49,37 +49,39 @@ def without_onboard_offset(recording: Recording, settings: Settings) -> tuple[Re
     most = 1e3 * float(np.abs(offset).max())
     note = Note(
         "imu.onboard_offset",
-        f"the unit corrected its gyro's offset while it rested, by up to {most:.1f} mrad/s: undone",
+        f"the unit corrected its gyro's offset at rest, by up to {most:.1f} mrad/s: the correction is undone",
     )
     return replace(recording, imu=replace(imu, gyro=imu.gyro + offset)), (note,)
 
 
 def offset_learnt(imu: Imu) -> Array:
-    """(N, 3) rad/s that the unit would have taken off more than at the start; a rest at the start had begun before."""
+    """(N, 3) rad/s, the offset that the unit subtracts beyond that at the start; a rest at the start is taken to have
+    begun earlier.
+    """
     active = np.zeros(len(imu.t), dtype=bool)
     for begin, end in _find_rests(imu):
         active[begin:end] = (begin == 0) | (imu.t[begin:end] > imu.t[begin] + _AFTER)
-    return np.asarray(np.cumsum(imu.gyro * (_RATE * active * _find_periods(imu))[:, None], axis=0))
+    return np.asarray(np.cumsum(imu.gyro * (_KAPPA * active * _find_periods(imu))[:, None], axis=0))
 
 
 def compute_evidence(imu: Imu, offset: Array) -> float:
-    """Twice the logarithm of how much likelier the rows are if the unit took `offset` (N, 3) off than if it did not."""
+    """Twice the log likelihood ratio of the rows with `offset` (N, 3) subtracted by the unit against without."""
     T = _find_periods(imu)[:, None]
     angle, bent = np.cumsum(imu.gyro * T, axis=0), np.cumsum(offset * T, axis=0)
     total = 0.0
     for begin, end in _find_rests(imu):
-        if np.count_nonzero(np.diff(offset[begin:end, 0])) * float(np.median(T)) < _SHORTEST:
+        if np.count_nonzero(np.diff(offset[begin:end, 0])) * float(np.median(T)) < _SHORTEST_CORRECTION:
             continue
-        first = np.flatnonzero(np.diff(((imu.t[begin:end] - imu.t[begin]) / _BLOCK).astype(int), prepend=-1))
+        first = np.flatnonzero(np.diff(((imu.t[begin:end] - imu.t[begin]) / _ANGLE_BLOCK).astype(int), prepend=-1))
         count = np.diff(np.append(first, end - begin))[:, None]
         t, force, phi, theta = (
             np.add.reduceat(x[begin:end], first, axis=0) / count for x in (imu.t[:, None], imu.accel, angle, bent)
         )
         mean = force.mean(axis=0)
-        phi = phi + np.cross(mean, force - mean) / (mean @ mean)  # less the tilt
+        phi = phi + np.cross(mean, force - mean) / (mean @ mean)  # minus the tilt
         line = np.concatenate([np.ones_like(t), t - t.mean()], axis=1)
         straight, corrected = (x - line @ np.linalg.lstsq(line, x, rcond=None)[0] for x in (phi, phi + theta))
-        # axes of the walk, not of the unit: about the vertical force says nothing, and the noise is another
+        # in the axes of the walk, not of the unit: force carries no information about the vertical, whose noise differs
         axes = np.linalg.svd(mean[None])[2].T
         for a, b in zip((straight @ axes).T, (corrected @ axes).T, strict=True):
             n = min(effective_size(a[:, None]), effective_size(b[:, None]))
@@ -88,7 +90,7 @@ def compute_evidence(imu: Imu, offset: Array) -> float:
 
 
 def _find_rests(imu: Imu) -> Iterator[tuple[int, int]]:
-    """First row and the one after the last of each stretch that seems to the unit a rest long enough."""
+    """First row and the row after the last of each rest that is long enough for the unit's correction."""
     still = (np.abs(imu.gyro) < _RESTS).all(axis=1)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], still, [False]]).astype(int)))
     for begin, end in edges.reshape(-1, 2):

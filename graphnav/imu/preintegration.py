@@ -42,16 +42,16 @@ from graphnav.recording import Imu
 
 NOISE_FIGURES = ("gyro_noise_density", "accel_noise_density", "gyro_bias_walk", "accel_bias_walk")
 _CYCLES = ((0, 1, 2), (1, 2, 0), (2, 0, 1))
-_FEW = 16  # intervals at once, below which calls cost more than numbers
-_CELL = 4  # Jacobians and noise of intervals of `MANY` pieces are summed over cells of so many; means never
+_FEW_INTERVALS = 16  # number of intervals below which calls cost more than arithmetic
+_CELL = 4  # Jacobians and noise of intervals of `MANY` pieces are summed over cells of this many pieces; means are not
 
 
 @dataclass(frozen=True)
 class Intervals:
-    """n preintegrated intervals; start-frame quantities unless said otherwise.
+    """n preintegrated intervals, in the start frame unless noted otherwise.
 
-    `covariance` is of (theta, p, v, ba, bg): theta a right perturbation of dR, p and v in body axes at
-    the interval's start, biases at its end.
+    `covariance` is of (theta, p, v, ba, bg): theta a right perturbation of dR, p and v in body axes at the interval's
+    start, biases at its end.
     """
 
     t0: Array  # (n,) s
@@ -64,12 +64,12 @@ class Intervals:
     v_bg: Array  # (n, 3, 3) m
     p_ba: Array  # (n, 3, 3) s^2
     p_bg: Array  # (n, 3, 3) m s
-    ba: Array  # (n, 3) the biases they were computed with
+    ba: Array  # (n, 3) the biases used for them
     bg: Array  # (n, 3)
-    rate: Array  # (n, 3) mean rate and force less those biases: what scale errors multiply
+    rate: Array  # (n, 3) mean rate and force minus those biases: what scale errors multiply
     force: Array  # (n, 3)
     covariance: Array  # (n, 15, 15)
-    parts: Array  # (n, 4, 15, 15) of it, by each of `NOISE_FIGURES`; (n, 0, 15, 15) where not asked for
+    parts: Array  # (n, 4, 15, 15) contributions of each of `NOISE_FIGURES`; (n, 0, 15, 15) unless asked for
     past_turn: (
         Array  # (n, 3, 3) means over the interval, s before its end: C(s) from the axes at its end to those at s,
     )
@@ -85,21 +85,21 @@ class Intervals:
 
     @property
     def T(self) -> Array:
-        """Lengths, s."""
+        """Durations, s."""
         return self.t1 - self.t0
 
     def with_noise(self, factors: Array) -> Intervals:
-        """The same with the variances of `NOISE_FIGURES` multiplied by factors (4,) or (n, 4); needs `parts`."""
+        """The intervals with the variances of `NOISE_FIGURES` multiplied by factors (4,) or (n, 4); needs `parts`."""
         parts = factors[..., None, None] * self.parts
         return replace(self, covariance=self.covariance + np.sum(parts - self.parts, axis=1), parts=parts)
 
     def without_parts(self) -> Intervals:
-        """The same without what each noise figure contributes, which takes room."""
+        """The intervals without the contributions of each noise figure, to save memory."""
         n, _, *size = self.parts.shape
         return replace(self, parts=np.empty((n, 0, *size)))
 
     def out_of_range(self, bg: Array, angle: float = 1e-3) -> Array:
-        """(n,) whether the gyro bias moved so far that the first-order correction is not enough.
+        """(n,) whether the gyro bias moved beyond the range of the first-order correction.
 
         The neglected second-order term turns the force by angle^2/2: 5e-6 m/s at 1e-3 rad over 1 s.
         """
@@ -107,7 +107,7 @@ class Intervals:
 
 
 def preintegrate(samples: Samples, imu: Imu, t: Array, ba: Array, bg: Array, parts_of_noise: bool = False) -> Intervals:
-    """All intervals between consecutive keyframe times.
+    """Preintegrate all intervals between consecutive keyframe times.
 
     Parameters
     ----------
@@ -140,7 +140,7 @@ def preintegrate_unknown(
     known: Mapping[float, Intervals],
     parts_of_noise: bool = False,
 ) -> Intervals:
-    """`preintegrate`, but for intervals that are `known` already, by the time they end at."""
+    """`preintegrate`, except for intervals that are in `known` already, by their end times."""
     missing = [k for k, end in enumerate(t[1:].tolist()) if end not in known or known[end].t0[0] != t[k]]
     if len(missing) == len(t) - 1:
         return preintegrate(samples, imu, t, ba, bg, parts_of_noise)
@@ -181,9 +181,10 @@ def within(samples: Samples, keyframes: Array, t: Array, ba: Array, bg: Array) -
 
 
 def _unbias(x: Array, index: Array, bias: Array) -> Array:
-    """(L, 3, n) samples of (L, n) pieces less the bias (n, 3) of each interval.
+    """(L, 3, n) samples of (L, n) pieces minus the bias (n, 3) of each interval.
 
-    Pieces first and intervals last here and below: every operation then runs along contiguous numbers.
+    Pieces along the first axis and intervals along the last, here and below: every operation then runs over contiguous
+    numbers.
     """
     return np.ascontiguousarray(np.swapaxes(x.take(index, axis=0), 1, 2)) - bias.T
 
@@ -227,13 +228,16 @@ def _integrate_pieces(w: Array, f: Array, dt: Array) -> tuple[Array, Array, Arra
 
 
 def _multiply_up(turn: Array) -> Array:
-    """Running products of rotations (L, n, 3, 3) along the first axis, from one: one more than there are factors."""
+    """Running products of rotations (L, n, 3, 3) along the first axis, from the identity: one more than there are
+    factors.
+    """
     L, n = turn.shape[:2]
     out = np.empty((L + 1, n, 3, 3))
     out[0] = np.eye(3)
-    size = 1 if n > _FEW else max(1, math.isqrt(L))
+    size = 1 if n > _FEW_INTERVALS else max(1, math.isqrt(L))
     blocks = L // size
-    if size > 1:  # of few intervals the calls are what costs: runs of pieces side by side, then run after run
+    # for few intervals the calls dominate: products within runs of pieces side by side, then across the runs
+    if size > 1:
         within = turn[: blocks * size].reshape(blocks, size, n, 3, 3).copy()
         for k in range(1, size):
             np.matmul(within[:, k - 1], within[:, k], out=within[:, k])
@@ -262,7 +266,7 @@ def _integrate(
     R, V, P = _integrate_pieces(w, f, dt)
     T = dt.sum(0)
     A = running_sum((-0.5 * dt)[:, None, None] * (R[:-1] + R[1:]))
-    # the rest in cells of a few pieces, within which A is a straight line
+    # the rest in cells of a few pieces, within which A is linear
     cut = np.append(np.arange(0, L, _CELL if L >= MANY else 1), L)
     A, R, V, P = A[cut], R[cut], V[cut], P[cut]
     edge = running_sum(dt)[cut]
@@ -305,7 +309,7 @@ def _integrate(
 
 
 def _mean_velocity_parts(edge: Array, R: Array, V: Array, A: Array) -> tuple[Array, Array, Array, Array]:
-    """What the mean velocity over an interval is made of, seen from its end; by the trapezoidal rule."""
+    """Terms of the mean velocity over an interval in the axes at its end; by the trapezoidal rule."""
     T = edge[-1]
     h = edge[1:] - edge[:-1]
     weight = np.zeros_like(edge)

@@ -1,4 +1,4 @@
-"""IMU rows as pieces of constant rate and force: gaps filled, periods split at the times of keyframes."""
+"""IMU rows as pieces of constant rate and force: gaps bridged, periods split at keyframe times."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from graphnav.core.findings import period_of
 from graphnav.core.rotation import Array
 from graphnav.recording import Imu
 
-GAP = 1.5  # sample periods between rows that are a gap
-MANY = 64  # pieces of an interval beyond which it is handled apart from shorter ones
-_CHUNK = 40_000  # pieces handled at once: keeps the working arrays in the processor's cache
+GAP = 1.5  # sample periods between rows above which there is a gap
+MANY = 64  # pieces above which an interval is processed apart from shorter ones
+_PIECES_AT_ONCE = 40_000  # pieces processed at once: keeps the working arrays in the processor's cache
 
 
 @dataclass(frozen=True)
 class Samples:
     """IMU samples as pieces of constant rate and force, with gaps made explicit.
 
-    `extra_gyro`, `extra_accel` are white densities squared ((rad/s)^2/Hz, (m/s^2)^2/Hz) on top of the
-    sensor's own: where a gap is bridged, and what `graphnav.imu.unresolved` adds for a foot.
+    `extra_gyro`, `extra_accel` are white densities squared ((rad/s)^2/Hz, (m/s^2)^2/Hz) in addition to the sensor's
+    own: where a gap is bridged, and from `graphnav.imu.unresolved` for a foot.
     """
 
     t: Array  # (N,) end of each sample's period
@@ -33,19 +33,19 @@ class Samples:
     bridged: Array  # (g, 2) start and end of every bridged gap, s
 
     def between(self, begin: float, end: float) -> Samples:
-        """Those whose periods lie, all or in part, between two times (s); views."""
+        """The samples whose periods overlap the span between two times (s), as views."""
         k = slice(np.searchsorted(self.t, begin, side="left"), np.searchsorted(self.t, end, side="left") + 1)
         rows = {name: getattr(self, name)[k] for name in ("t", "gyro", "accel", "extra_gyro", "extra_accel")}
         return replace(self, **rows)
 
 
 def bridge_gaps(imu: Imu, factor: float = GAP) -> Samples:
-    """Put a made-up sample into every gap: the mean of its neighbours, with the noise that deserves.
+    """Fill every gap with one sample: the mean of its neighbours, with the appropriate noise.
 
-    A row only speaks for one sample period before its stamp. What happened in a longer silence g is
-    unknown by as much as the signal itself usually changes over g, which the recording shows:
-    half its structure function, D(g)/2 = E|x(t+g) - x(t)|^2 / 2 per axis, is the variance of a guess
-    from the neighbours. That error lasts the whole gap, so the equivalent white density is D(g)/2 * g.
+    A row covers only one sample period before its stamp. Over a longer gap g the signal is unknown by as much as it
+    usually changes over g, which the recording shows: half its structure function, D(g)/2 = E|x(t+g) - x(t)|^2 / 2 per
+    axis, is the variance of a guess from the neighbours. That error lasts for the whole gap, so the equivalent white
+    density is D(g)/2 * g.
     """
     dt = imu.t[1:] - imu.t[:-1]
     period = period_of(imu.t)
@@ -55,7 +55,7 @@ def bridge_gaps(imu: Imu, factor: float = GAP) -> Samples:
         return Samples(imu.t, imu.gyro, imu.accel, zero, zero, float(imu.t[0] - period), np.empty((0, 2)))
     t_fill = imu.t[gap + 1] - period
     length = t_fill - imu.t[gap]
-    at = gap + 1  # the made-up sample stands before the row that ends the gap
+    at = gap + 1  # the added sample precedes the row that ends the gap
     fill = {name: 0.5 * (getattr(imu, name)[gap] + getattr(imu, name)[gap + 1]) for name in ("gyro", "accel")}
     extra = {name: _compute_structure(getattr(imu, name), length / period) * length for name in ("gyro", "accel")}
     return Samples(
@@ -81,7 +81,7 @@ def _compute_structure(x: Array, lags: Array) -> Array:
 
 @dataclass(frozen=True)
 class Pieces:
-    """Sample periods split at keyframes: interval i owns pieces first[i] .. first[i] + count[i]."""
+    """Sample periods split at keyframes: interval i has the pieces first[i] .. first[i] + count[i]."""
 
     edges: Array  # (pieces + 1,) s
     dt: Array
@@ -90,7 +90,7 @@ class Pieces:
     count: Array
 
     def pad(self, rows: Array) -> tuple[Array, Array]:
-        """(L, n) lengths and sample indices of some intervals, padded with pieces of no length."""
+        """(L, n) durations and sample indices of some intervals, padded with pieces of no duration."""
         piece = np.arange(int(self.count[rows].max()))[:, None]
         inside = piece < self.count[rows]
         at = np.minimum(self.first[rows] + piece, len(self.dt) - 1)
@@ -98,9 +98,9 @@ class Pieces:
 
 
 def pieces_of(samples: Samples, t: Array, extra: Array | None = None) -> Pieces:
-    """Pieces between keyframes t, split at the `extra` times too."""
+    """Pieces between keyframes t, also split at the `extra` times."""
     inner = samples.t[(samples.t > t[0]) & (samples.t < t[-1])]
-    # all but sorted already, which is what a stable sort makes use of
+    # nearly sorted already, which a stable sort exploits
     edges = np.sort(np.concatenate([inner, t] if extra is None else [inner, t, extra]), kind="stable")
     dt = edges[1:] - edges[:-1]
     if dt.size and dt.min() <= 0.0:
@@ -112,15 +112,15 @@ def pieces_of(samples: Samples, t: Array, extra: Array | None = None) -> Pieces:
 
 
 def chunks(count: Array) -> Iterator[Array]:
-    """Intervals of similar length together, so that little is padded."""
+    """Group intervals of similar length, so that little is padded."""
     order = np.argsort(count, kind="stable")
     start = 0
     while start < len(order):
-        # the longest of the chunk decides its width; lengths are ascending, so look ahead by bisection
+        # the longest of the group sets its width; lengths ascend, so the end is found by bisection
         lo, hi = start + 1, len(order)
         while lo < hi:
             mid = (lo + hi + 1) // 2
-            fits = (mid - start) * count[order[mid - 1]] <= _CHUNK
+            fits = (mid - start) * count[order[mid - 1]] <= _PIECES_AT_ONCE
             alike = count[order[mid - 1]] <= 2 * count[order[start]] + 16
             alike &= (count[order[mid - 1]] >= MANY) == (count[order[start]] >= MANY)
             lo, hi = (mid, hi) if fits and alike else (lo, mid - 1)

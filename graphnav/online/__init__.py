@@ -1,4 +1,4 @@
-"""Smoothing while the drive happens: rows of sensors in, a live state and a settled trajectory out."""
+"""Online smoothing: rows of sensors in, a live state and a settled trajectory out."""
 
 from graphnav.online.ahead import Live
 from graphnav.online.replay import rows_of, without_rows

@@ -1,4 +1,4 @@
-"""What is told of a running drive: the state at every row of the IMU, predicted from a keyframe; what has settled."""
+"""Output of a running drive: the state at every IMU row, predicted from a keyframe, and settled states."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from graphnav.online.sensors import Sensors
 
 @dataclass(frozen=True)
 class Live:
-    """The state now: one state, the covariance of its error state, and the newest keyframe it is predicted from."""
+    """The current state: one state, the covariance of its error state, and the newest keyframe it is predicted from."""
 
     t: float
     state: States
@@ -33,7 +33,7 @@ class Live:
 
 
 def live(newest: Message, T: float, frame: LocalFrame, sensors: Sensors, noise: NoiseModel) -> Live:
-    """The state at the newest IMU row, from the message `newest` of the newest keyframe at T (s)."""
+    """Predict the state at the newest IMU row from the message `newest` of the newest keyframe at T (s)."""
     now = sensors.imu.newest
     state, P = newest.state, newest.covariance
     if now > T + SAME_TIME:
@@ -60,7 +60,7 @@ def since(
 ) -> tuple[Array, States, Array]:
     """Times (M,), states and covariances (M, 15, 15) at every IMU row since the newest keyframe at T (s).
 
-    Predicted through each row; covariances lie on the straight line between those at both ends.
+    States are predicted through each row; covariances are interpolated linearly between both ends.
     """
     t = sensors.imu.t[sensors.imu.t > T + SAME_TIME].copy()
     if not len(t):
@@ -81,7 +81,7 @@ def since(
 
 
 def export(settled: SettledStates, rows: NDArray[np.bool_], frame: LocalFrame) -> Trajectory:
-    """Some rows (N,) of what has settled, as a trajectory.
+    """Settled rows (N,) as a trajectory.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Rows of one sensor, in order of time, bounded at their old end."""
+"""Rows of one sensor in order of time, with the oldest dropped."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ import numpy as np
 
 from graphnav.core.rotation import Array
 
-SAME = 1e-9  # s; rows closer than this are one
+SAME = 1e-9  # s; rows closer together than this are the same row
 
 
 class Buffer:
-    """Rows (t, values) kept in order whatever order they come in; a row at the end costs no copy."""
+    """Rows (t, values), kept in order of time whatever order they arrive in; appending at the end copies nothing."""
 
     def __init__(self, columns: int) -> None:
         self._data = np.empty((256, 1 + columns))
@@ -33,18 +33,18 @@ class Buffer:
 
     @property
     def newest(self) -> float:
-        """Newest time, minus infinity without any."""
+        """Newest time, minus infinity without rows."""
         return float(self._data[self._end - 1, 0]) if self._end > self._begin else -np.inf
 
     def append(self, t: float, values: tuple[float, ...]) -> None:
-        """Put a row that is newer than all others at the end."""
+        """Append a row that is newer than all others."""
         if self._end == len(self._data):
             self._make_room()
         self._data[self._end] = (t, *values)
         self._end += 1
 
     def add(self, t: float, values: tuple[float, ...]) -> bool:
-        """Put a row in its place; False if there is one at that time already, which stays."""
+        """Insert a row by its time; returns False if there already is one at that time, which stays."""
         if t > self.newest + SAME:
             self.append(t, values)
             return True
@@ -62,25 +62,25 @@ class Buffer:
         return True
 
     def after(self, t: float) -> list[tuple[float, tuple[float, ...]]]:
-        """The rows after a time, each as it was put in."""
+        """The rows after a time, as they were added."""
         return [(float(row[0]), tuple(row[1:].tolist())) for row in self.rows[self.t > t]]
 
     def drop_before(self, t: float) -> None:
-        """Forget the rows before a time."""
+        """Drop the rows before a time."""
         self._begin += int(np.searchsorted(self.t, t))
 
     def drop_after(self, t: float) -> None:
-        """Forget the rows after a time."""
+        """Drop the rows after a time."""
         self._end = self._begin + int(np.searchsorted(self.t, t, side="right"))
 
     def drop(self, t: float) -> None:
-        """Forget the row at a time."""
+        """Drop the row at a time."""
         at = self._begin + int(np.searchsorted(self.t, t))
         self._data[at : self._end - 1] = self._data[at + 1 : self._end]
         self._end -= 1
 
     def between(self, begin: float, end: float) -> Array:
-        """The rows from `begin` to `end`, both included, as a copy."""
+        """A copy of the rows from `begin` to `end`, both included."""
         lo, hi = np.searchsorted(self.t, begin, side="left"), np.searchsorted(self.t, end, side="right")
         return self.rows[lo:hi].copy()
 

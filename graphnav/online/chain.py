@@ -1,8 +1,8 @@
-"""The chain of keyframes of a running drive: how those that are built enter the window, and what is kept of them.
+"""The chain of keyframes of a running drive: how they enter the window, and what is recorded of them.
 
-A keyframe enters with the parameters that begin or move on there, with the noise model as it is by then, and without
-the fixes that tests have found to be wrong. Where a fix shows that fixes have been wrong for some time, the keyframes
-since then leave again and enter without those.
+A keyframe enters with the parameters that begin or change there, with the current noise model, and without the fixes
+that tests have excluded. If a fix shows that fixes have been wrong for some time, the keyframes since then are removed
+and enter again without them.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ from graphnav.online.looks import Stops
 from graphnav.online.sensors import Sensors
 from graphnav.recording import Recording
 
-_PLACE_SIGMA = 1000.0  # m, of where a stop may be
-_FIXES = 5  # that tell how often they come
+_PLACE_SIGMA = 1000.0  # m, 1-sigma of the place of a stop
+_FEWEST_FIXES = 5  # fixes from which their period is known
 _ENGINES: dict[str, type[Window]] = {"window": Window, "isam2": TreeWindow}
 
 
@@ -48,7 +48,7 @@ class BuiltKeyframes:
     first: int
     times: Array  # (K,) s
     redone: float  # s, the first of them that was in the window before
-    ahead: Predicted | None  # what was expected of the first
+    ahead: Predicted | None  # prediction of the first
 
 
 class Chain:
@@ -66,31 +66,31 @@ class Chain:
     ) -> None:
         self.settings, self.noise = settings, noise
         self.window = _ENGINES[settings.solver.engine](message, find_turn(setup, noise))
-        self.head = t0  # time of the message before the window, or of the first keyframe as long as it is in it
+        self.head = t0  # time of the message before the window, or of the first keyframe while it is in the window
         self.opened = False  # whether the first keyframe has left the window
-        self.verdicts = Verdicts({}, {})  # which fixes are used
+        self.verdicts = Verdicts({}, {})  # mask of the fixes in use
         self._standing = Stops()
         self._nodes: list[dict[str, float]] = []  # per stage, when each parameter's node began
         self._head_nodes: dict[str, float] = {}
         self._held: list[Held] = []  # per stage, integers of ambiguities
         self._head_held = Held()
-        self.epochs = self.fixed = 0  # with carriers, that have settled, and those of them that are fixed
+        self.epochs = self.fixed = 0  # settled keyframes with carriers, and those of them that are fixed
         self._parameters: dict[str, Parameter] = {}
-        self._turned = False  # whether something has moved so far that it may have to be linearised again
+        self._turned = False  # whether some state has moved so far that it may need to be relinearised
 
     @property
     def busy(self) -> bool:
-        """Whether keyframes are entering, some at a row; here they enter at once."""
+        """Whether keyframes are still entering, a few per row; here they enter at once."""
         return False
 
     def go_on(self, sensors: Sensors) -> None:
-        """Have some more of them enter."""
+        """Let some more of them enter."""
 
     def finish_entering(self, sensors: Sensors) -> None:
-        """Have all of them enter, at once."""
+        """Let all of them enter at once."""
 
     def note_missed_row(self, sensors: Sensors, sensor: str, t: float) -> bool:
-        """A row came late, at a time (s): whether keyframes were made that would have looked at it."""
+        """Record a row that came late, at a time (s): whether keyframes exist that would have used it."""
         return True
 
     @property
@@ -100,30 +100,30 @@ class Chain:
 
     @property
     def stops(self) -> Array:
-        """Spans (M, 2) between keyframes in which the vehicle stands, or the foot, s."""
+        """Spans (M, 2) between keyframes in which the vehicle, or the foot, is stationary, s."""
         return self._standing.spans
 
     @property
     def times(self) -> Array:
-        """Times of all keyframes that an interval in the window touches, s."""
+        """Times of all keyframes at the ends of intervals in the window, s."""
         t = self.window.t
         return np.concatenate([[self.head], t]) if self.opened else t
 
     @property
     def excluded(self) -> tuple[ExcludedSpan, ...]:
-        """Spans of fixes that are not used, whoever found them."""
+        """Spans of excluded fixes, by whatever test."""
         times, used = self.verdicts.times, self.verdicts.used
         left = {name: used[name] * (row_weights(t, self.noise, name) > 0.0) for name, t in times.items()}
         return Verdicts(times, left).faults()
 
     @property
     def _judged_imu(self) -> bool:
-        """Whether some figure of the IMU is not used as stated."""
+        """Whether some figure of the IMU differs from the stated one."""
         return any(self.noise.factor(f"imu.{name}", 1.0) != 1.0 for name in NOISE_FIGURES)
 
     @property
     def _noise_of_rows(self) -> NoiseModel:
-        """The noise model for a problem whose intervals have it already."""
+        """The noise model for a problem whose intervals include it already."""
         rows = {name: one for name, one in self.noise.figures.items() if not name.startswith("imu.")}
         weights = {name: some for name, some in self.noise.weights.items() if name not in INTERVALS}
         return replace(self.noise, figures=rows, weights=weights)
@@ -135,11 +135,11 @@ class Chain:
 
     # ------------------------------------------------------------------------------------------ entering, leaving
     def _watch(self, problem: Problem, sensors: Sensors) -> None:
-        """Have the fixes watched for errors that last, as soon as some tell how often they come."""
+        """Start to watch the fixes for lasting errors, once their period is known."""
         if (
             self.window.newest.tests is not None
             or self.settings.gnss.faults == "off"
-            or len(sensors.gnss.used) < _FIXES
+            or len(sensors.gnss.used) < _FEWEST_FIXES
         ):
             return
         watched = [c for c in problem.constraints if c.watched and c.fix_of]
@@ -159,7 +159,7 @@ class Chain:
         return self._hold(replace(problem, constraints=tuple(rows)))
 
     def _hold(self, problem: Problem) -> Problem:
-        """The problem with the integers that were decided on at its keyframes, and let go of."""
+        """The problem with the integers decided at its keyframes, except released ones."""
         if not self.settings.raw_gnss.integers or split_carriers(problem)[1] is None:
             return problem
         begin, end = np.searchsorted(self.window.t, problem.t[[0, -1]] + [-SAME_TIME, SAME_TIME])
@@ -173,9 +173,10 @@ class Chain:
     def _add(
         self, built: Problem, first: int, ahead: Predicted | None = None, begin: int = 0, end: int | None = None
     ) -> float | None:
-        """Add the keyframes of a problem from `first` on; the time before them to go on from, if a fault is found.
+        """Add the keyframes of a problem from `first` on; returns the time before them to go back to, if a fault is
+        found.
 
-        `ahead` is what was expected of the first of them, if that still holds; `begin` and `end` are of a portion.
+        `ahead` is the prediction of the first of them, if it is still valid; `begin` and `end` are of a portion.
         """
         problem, k, turn = self._weigh(built), max(first, begin), 0.0
         while k < (len(problem.t) if end is None else end):
@@ -212,7 +213,7 @@ class Chain:
         return turn
 
     def _decide(self, problem: Problem, k: int) -> Held:
-        """Integers that can be told behind keyframe `k` of a problem, the newest."""
+        """Integers that can be decided up to keyframe `k` of a problem, the newest."""
         held = (self._held[-1] if self._held else self._head_held).go_on()
         phase, newest = split_carriers(problem)[1], self.window.newest
         if phase is None or not self.settings.raw_gnss.integers or k not in phase.keyframe:
@@ -223,7 +224,7 @@ class Chain:
         return hold_on(held, Epochs(phase, newest.columns, problem.t), k, here, lambda: newest.covariance)
 
     def _begin_ambiguities(self, problem: Problem, steps: tuple[Step, ...]) -> tuple[Step, ...]:
-        """Ambiguities, but those that begin anyway, begin anew about what they are thought to be."""
+        """Ambiguities, except those that are reset anyway, are reset about their current estimates."""
         phase, newest, begun = split_carriers(problem)[1], self.window.newest, {step.name for step in steps}
         assert phase is not None
         return tuple(
@@ -233,14 +234,14 @@ class Chain:
         )
 
     def _place(self, problem: Problem, k: int) -> tuple[Place, dict[str, float]]:
-        """Keyframe `k` of a problem as the next one, and when each parameter's node began there."""
+        """Append keyframe `k` of a problem, with the times when each parameter's node began there."""
         t = float(problem.t[k])
         first = not self.window.stages and not self.opened
         nodes = dict(self._nodes[-1] if self._nodes else self._head_nodes)
         return Place(t, problem, k, self._moves(t, nodes), linked=not first), nodes
 
     def _moves(self, t: float, nodes: dict[str, float]) -> tuple[Step, ...]:
-        """Parameters that begin or move on at a keyframe; `nodes` is brought up to date."""
+        """Parameters that begin or change at a keyframe; `nodes` is updated."""
         steps = []
         stop = self._stop_at(t) if PLACE in self._parameters else None
         for name, p in self._parameters.items():
@@ -264,7 +265,7 @@ class Chain:
         return tuple(steps)
 
     def _stop_at(self, t: float) -> float | None:
-        """When the stop began that lasts at a time."""
+        """When the stop that lasts at a time began."""
         inside = (self.stops[:, 0] <= t + SAME_TIME) & (self.stops[:, 1] >= t - SAME_TIME)
         return float(self.stops[inside][0, 0]) if inside.any() else None
 
@@ -283,23 +284,23 @@ class Chain:
         return settled
 
     def _forget(self) -> None:
-        """Stages need not know where their rows came from: that is built again when it is asked for."""
+        """Drop what stages know of the origin of their rows; it is rebuilt when needed."""
         stages = self.window.stages
         for k in range(len(stages) - 1, -1, -1):
             if stages[k].place.problem is None:
-                break  # nor do those before it
+                break  # nor for those before it
             stages[k] = replace(stages[k], place=replace(stages[k].place, problem=None))
 
 
 def find_turn(setup: Recording, noise: NoiseModel) -> float:
-    """How far (rad) an attitude may move before rows are linearised anew, by the accelerometer as it is judged."""
+    """How far (rad) an attitude may move before rows are relinearised, by the noise of the accelerometer."""
     stated = setup.imu.noise
     density = stated.accel_noise_density * float(np.sqrt(noise.factor("imu.accel_noise_density", 1.0)))
     return compute_turn_limit(replace(stated, accel_noise_density=density))
 
 
 def _with_decisions(problem: Problem, decided: dict[float, Held]) -> Problem:
-    """A problem with what was decided at some of its keyframes, by time."""
+    """A problem with the integers decided at some of its keyframes, by time."""
     phase = split_carriers(problem)[1]
     if phase is None:
         return problem

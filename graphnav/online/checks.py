@@ -1,6 +1,6 @@
-"""What the rows of a running drive show of themselves: units, axes, clocks. It is noted; the estimate is untouched.
+"""Checks of the rows of a running drive: units, axes, clocks. They give notes and leave the estimate unchanged.
 
-The checks are those that a recording goes through before it is solved (`graphnav.recording.checks.overview`).
+The checks are those of a recording before it is solved (`graphnav.recording.checks.overview`).
 """
 
 from __future__ import annotations
@@ -11,9 +11,9 @@ from graphnav.core.notes import Note
 from graphnav.recording import Recording
 from graphnav.recording.checks.overview import inspect
 
-_FEWEST_ROWS = 50  # of the IMU
-_MOST_LEFT_OUT = 0.5  # of a sensor's rows; more are no odd ones among right ones
-# why rows are left out, by what they are counted as, and what makes all of them so
+_FEWEST_ROWS = 50  # rows of the IMU, at least
+_MOST_LEFT_OUT = 0.5  # share of a sensor's rows; above it they are not single outliers
+# causes of rejected rows, and what makes all rows of a sensor so
 _CAUSES = {
     "nowhere on Earth": "latitude, longitude (in deg in lines, in rad in Python) and height (m), in this order?",
     "stamp in the future": "are all times in s, and of one clock?",
@@ -26,12 +26,12 @@ _CAUSES = {
 
 
 def check_rows(recording: Recording) -> tuple[Note, ...]:
-    """Notes of what cannot be, or is likely not to be, as the rows so far say; none where these are too few."""
+    """Notes on rows that are impossible or unlikely; none while there are too few rows."""
     if len(recording.imu.t) < _FEWEST_ROWS:
         return ()
     try:
         findings = inspect(recording).findings
-    except Exception:  # of what nobody waits for, nothing may end the drive
+    except Exception:  # a background check must never end the drive
         return ()
     return tuple(
         Note(f.key, f"rows sent up to {recording.end:.1f} s: {f.sentence}") for f in findings if f.severity != "note"
@@ -39,7 +39,7 @@ def check_rows(recording: Recording) -> tuple[Note, ...]:
 
 
 def check_counts(counts: Counter[str]) -> tuple[Note, ...]:
-    """Notes of sensors most of whose rows are left out; `counts` are rows by sensor, and by sensor and why not."""
+    """Notes on sensors most of whose rows are rejected; `counts` are rows by sensor, and by sensor and reason."""
     out = []
     for sensor in dict.fromkeys(key.partition(":")[0] for key in counts):
         lost = {why: counts[f"{sensor}: {why}"] for why in _CAUSES}

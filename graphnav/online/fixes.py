@@ -1,4 +1,4 @@
-"""Fixes as they come: what sigmas they usually state, and which of them are used."""
+"""Fixes as they arrive: their typical sigmas, and which of them are used."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from graphnav.estimation.noise.spacing import best_fixes, grid_start
 from graphnav.online.buffers import Buffer
 from graphnav.recording import Gnss
 
-_WIDTH, _USED = 19, 19  # the last columns: six usual sigmas, and whether it is used
-_USUAL = 60.0  # s over which the usual sigma of fixes is averaged
+_WIDTH, _USED = 19, 19  # the last columns: six typical sigmas, and whether the fix is used
+_USUAL = 60.0  # s over which the typical sigma of fixes is averaged
 
 
 class Fixes(Buffer):
-    """Rows of fixes, with what they usually state and whether they are used.
+    """Rows of fixes with their typical sigmas and whether they are used.
 
     Parameters
     ----------
@@ -27,28 +27,29 @@ class Fixes(Buffer):
 
     def __init__(self, setup: Gnss | None) -> None:
         super().__init__(_WIDTH)
-        self.left: list[float] = []  # s, those that were used until better ones of their span came
+        self.left: list[float] = []  # s, fixes that were used until better ones of their span arrived
         self._setup = setup
-        self._grid: tuple[float, float] | None = None  # begin and length of the spans, s, of which the best is used
-        self._unit: Array | None = None  # `unit`, once asked for
-        self._means: dict[str, tuple[float, tuple[float, ...]]] = {}  # usual sigmas, and since when
+        # begin and duration of the spans, s, of which the best fix is used
+        self._grid: tuple[float, float] | None = None
+        self._unit: Array | None = None  # `unit`, once determined
+        self._means: dict[str, tuple[float, tuple[float, ...]]] = {}  # typical sigmas, and since when
 
     @property
     def used(self) -> Array:
-        """(N,) s, times of those that are used."""
+        """(N,) s, times of the fixes in use."""
         return self.rows[self.rows[:, _USED] > 0.0, 0]
 
     def complete(self, t: float, values: tuple[float, ...]) -> tuple[float, ...]:
-        """The row of a fix at a time (s): its own values, what they usually are, and that it is used."""
+        """The row of a fix at a time (s): its own values, typical sigmas, and that it is used."""
         position, velocity = (self._track_sigma(kind, t, values[k : k + 3]) for kind, k in (("p", 3), ("v", 9)))
         return (*values, *position, *velocity, 1.0)
 
     def forget_usual(self) -> None:
-        """What comes is of another receiver, or clock."""
+        """Reset the typical sigmas: what follows is of another receiver or clock."""
         self._means = {}
 
     def space(self, spacing: float) -> None:
-        """Use the best fix of every span of `spacing` (s), as `estimation.noise.spacing` has it; 0: use all."""
+        """Use the best fix of every span of `spacing` (s), as `estimation.noise.spacing` sets it; 0: use all."""
         self.rows[:, _USED], self._grid, self.left = 1.0, None, []
         gnss = self.between_as_gnss(-np.inf, np.inf)
         if not spacing or gnss is None or len(gnss.t) < 2 or period(gnss.t) > 0.5 * spacing:
@@ -76,17 +77,17 @@ class Fixes(Buffer):
         return bool(np.any(near[best, 0] == t))
 
     def typical_sigmas(self, t: Array) -> Array:
-        """(N, 6) sigmas that the fixes at some times usually state, m and m/s: the units of errors that last."""
+        """(N, 6) typical sigmas of the fixes at some times, m and m/s: the units of time-correlated errors."""
         return self.rows[np.searchsorted(self.t, t - 1e-6), 13:19]
 
     def unit(self) -> Array:
-        """(3,) m, in which errors that last for minutes and hours are told, from the first question on."""
+        """(3,) m, unit of errors that last for minutes and hours; constant from the first call on."""
         if self._unit is None:
-            self._unit = unit_of(self.rows[self.rows[:, _USED] > 0.0, 4:7])
+            self._unit = compute_unit(self.rows[self.rows[:, _USED] > 0.0, 4:7])
         return self._unit
 
     def between_as_gnss(self, begin: float, end: float, every: bool = False) -> Gnss | None:
-        """Those between two times (s), both included, that are used, or with `every` all; None without any."""
+        """The used fixes between two times (s), both included, or with `every` all of them; None if there are none."""
         rows = self.between(begin, end)
         return self._as_gnss(rows if every else rows[rows[:, _USED] > 0.0])
 
@@ -99,22 +100,22 @@ class Fixes(Buffer):
         return replace(self._setup, t=rows[:, 0], llh=rows[:, 1:4], sd=rows[:, 4:7], v=v, sd_v=sd_v)
 
     def _track_sigma(self, kind: str, t: float, sd: tuple[float, ...]) -> tuple[float, ...]:
-        """A mean that looks back only, and so is the same whenever a fix is built.
+        """A causal mean, which does not change after a fix has been built.
 
-        The median of a minute that `graphnav.constraints.gnss` takes would change with every row that follows, and
-        a slow error in such a unit would give itself away.
+        The median over a minute in `graphnav.constraints.gnss` would change with every following row, and a slow error
+        in a changing unit would be observable.
         """
         last, mean = self._means.get(kind, (-np.inf, sd))
         if not math.isfinite(sum(sd)):
-            return mean  # a fix without a velocity
+            return mean  # a fix without velocity
         gain = -np.expm1(-max(t - last, 0.0) / _USUAL) if np.isfinite(last) else 1.0
         mean = tuple(float(m + gain * (s - m)) for m, s in zip(mean, sd, strict=True))
         self._means[kind] = max(t, last), mean
         return mean
 
 
-def unit_of(sd: Array) -> Array:
-    """(3,) median of stated sigmas (N, 3), one for both horizontal axes: their errors have one figure in common."""
+def compute_unit(sd: Array) -> Array:
+    """(3,) median of stated sigmas (N, 3), one for both horizontal axes, whose errors share one variance component."""
     east, north, up = np.median(sd, axis=0)
     level = np.sqrt(0.5 * (east**2 + north**2))
     return np.array([level, level, up])

@@ -1,9 +1,9 @@
-"""Estimating the noise model again by more rows, beside the drive: no keyframe waits for it.
+"""Repeated estimation of the noise model during the drive; no keyframe waits for it.
 
-The estimate itself (`graphnav.estimation.noise`), which filters and smooths some minutes a dozen times, is made in a
-thread. Its answer is used at the first row after a fixed time of the drive, so that what comes out does not depend on
-how long it took. A second tracker then goes through what has not settled with the new model, some keyframes at a row,
-and takes the first one's place when it has caught up.
+The estimation (`graphnav.estimation.noise`), which filters and smooths some minutes of rows a dozen times, runs in a
+thread. Its result is used at the first row after a fixed time of the drive, so that the output does not depend on how
+long it took. A second tracker then processes the unsettled keyframes with the new model, some keyframes per row, and
+replaces the first when it has caught up.
 """
 
 from __future__ import annotations
@@ -33,31 +33,32 @@ from graphnav.estimation.noise.words import describe
 from graphnav.estimation.problem import Problem, build_problem
 from graphnav.estimation.solution import ExcludedSpan
 from graphnav.online.checks import check_rows
-from graphnav.online.fixes import unit_of
+from graphnav.online.fixes import compute_unit
 from graphnav.online.raw import without_ambiguities
 from graphnav.online.sensors import Sensors
 from graphnav.online.tracker import Tracker
 from graphnav.recording import Recording
 
-_PORTION = 4  # keyframes gone through again at a row
-_FIXES = 600  # in motion, that tell variances to 6 %
-_LONGEST = 900.0  # s of rows, where fixes are so rare that these are still too few
-_THINKING, _LONGEST_THOUGHT = 1.0 / 8.0, 20.0  # of the lag, and s: what judging may take, 11 s for 1100 keyframes
+_PORTION = 4  # keyframes processed again per row
+_ENOUGH_FIXES = 600  # fixes in motion, which determine variances to 6 %
+_LONGEST_SPAN = 900.0  # s of rows after which estimation ends where fixes are rare
+# of the lag, and s: time allowed for the estimation, 11 s for 1100 keyframes
+_THINKING, _LONGEST_THOUGHT = 1.0 / 8.0, 20.0
 
 
 @dataclass(frozen=True)
 class Answer:
-    """What some rows say of the sensors."""
+    """Result of a judgement of the sensors."""
 
     noise: NoiseModel
     notes: tuple[str, ...]
     stationary: Array  # (M, 2) s
-    excluded: tuple[ExcludedSpan, ...]  # spans that the noise model leaves out
-    doubts: tuple[str, ...]  # what the rows show of their units, axes and clocks
+    excluded: tuple[ExcludedSpan, ...]  # spans that the noise model excludes
+    doubts: tuple[str, ...]  # findings on units, axes and clocks
 
 
 class Judgement:
-    """The noise model that the rows of a recording tell.
+    """A noise model being estimated from the rows of a recording.
 
     Parameters
     ----------
@@ -83,7 +84,7 @@ class Judgement:
         self._begin()
 
     def answer(self) -> Answer:
-        """Wait for it.
+        """Wait for the result.
 
         Raises
         ------
@@ -98,7 +99,7 @@ class Judgement:
 
     def _begin(self) -> None:
         self._answer: Answer | BaseException | None = None
-        # its own copies: what objects work out at their first use must not appear while a checkpoint is written
+        # own copies: values computed at first use must not appear while a checkpoint is written
         self._thread = threading.Thread(target=self._work, args=copy.deepcopy((self._asked, self.found)), daemon=True)
         self._thread.start()
 
@@ -117,7 +118,7 @@ class Judgement:
             self._answer = Answer(_in_unit(noise, base, unit), said, stationary, wrong, check_rows(every))
         except (EstimationError, np.linalg.LinAlgError) as error:
             self._answer = EstimationError(str(error), key=getattr(error, "key", "solver.undetermined"))
-        except BaseException as error:  # said by whoever asks
+        except BaseException as error:  # reported by the caller
             self._answer = error
 
     def __getstate__(self) -> dict[str, Any]:
@@ -129,15 +130,17 @@ class Judgement:
 
 
 def _level(base: Problem) -> Problem:
-    """The problem with one unit for both horizontal axes of what lasts for minutes and hours."""
-    rows = (replace(c, usual_error=unit_of(c.sigma)) if isinstance(c, GnssPosition) else c for c in base.constraints)
+    """The problem with a common unit of both horizontal axes for errors that last for minutes and hours."""
+    rows = (
+        replace(c, usual_error=compute_unit(c.sigma)) if isinstance(c, GnssPosition) else c for c in base.constraints
+    )
     return replace(base, constraints=tuple(rows))
 
 
 def _in_unit(noise: NoiseModel, base: Problem, unit: Array) -> NoiseModel:
-    """The model that says the same of errors that last for minutes and hours in another unit (3,), m.
+    """The same model with errors that last for minutes and hours in another unit (3,), m.
 
-    An estimate has what the fixes state by then for its unit; the parameters of a drive keep theirs.
+    An estimate uses the typical stated sigma so far as its unit; the parameters of a drive keep theirs.
     """
     own = next((c.usual_error for c in base.constraints if isinstance(c, GnssPosition)), unit)
     level, up = (2.0 * np.log(own / unit)[1:]).tolist()
@@ -152,7 +155,7 @@ def _in_unit(noise: NoiseModel, base: Problem, unit: Array) -> NoiseModel:
 def judge(
     sensors: Sensors, settings: Settings, frame: LocalFrame, found: Alignment, times: Array, until: float
 ) -> Judgement:
-    """Have the sensors judged by their rows up to a time (s); `times` (K,) are the keyframes so far, s."""
+    """Start to judge the sensors by their rows up to a time (s); `times` (K,) are the keyframes so far, s."""
     recording, every = (sensors.recording(-np.inf, until, all_of_them) for all_of_them in (False, True))
     due = float(times[-1]) + min(_THINKING * settings.solver.lag, _LONGEST_THOUGHT)
     settings = without_ambiguities(settings, sensors.setup)
@@ -160,13 +163,13 @@ def judge(
 
 
 def are_enough(sensors: Sensors, found: Alignment, span: float) -> bool:
-    """Whether the rows of a span (s) tell the sensors so well that more would say little new."""
+    """Whether the rows of a span (s) determine the noise model so well that more rows would change little."""
     assert found.motion is not None
-    return bool(np.count_nonzero(sensors.gnss.used > found.motion) >= _FIXES or span > _LONGEST)
+    return bool(np.count_nonzero(sensors.gnss.used > found.motion) >= _ENOUGH_FIXES or span > _LONGEST_SPAN)
 
 
 class CatchUp:
-    """A tracker that goes through the keyframes of another, which goes on meanwhile.
+    """A tracker that processes the keyframes of another one, which continues meanwhile.
 
     Parameters
     ----------
@@ -177,10 +180,10 @@ class CatchUp:
         self.tracker = tracker
 
     def step(self, sensors: Sensors, other: Tracker) -> bool:
-        """Go through a few more keyframes of the other; True once it has caught up."""
+        """Process a few more keyframes of the other; True once it has caught up."""
         t, done = other.window.t, len(self.tracker.window)
         end = min(done + _PORTION, len(t))
         while end < len(t) and np.any(np.abs(other.stops[:, 0] - t[end - 1]) < SAME_TIME):
-            end += 1  # where a stop begins shows only in what follows
+            end += 1  # the beginning of a stop is known only from later rows
         self.tracker.update(sensors, t[done:end])
         return len(self.tracker.window) >= len(t)

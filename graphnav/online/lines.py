@@ -1,11 +1,11 @@
-"""The line protocol of a live source: text, a row a line, described in docs/online.md.
+"""The line protocol of a live source: text, one row per line, described in docs/online.md.
 
 graphnav-online/1 {"platform": "vehicle", "imu": {"noise": {...}}, "gnss": {"lever_arm": [0, 0, 1.2]}}
 I,t,gx,gy,gz,ax,ay,az
 G,t,lat,lon,h,sd_e,sd_n,sd_u[,ve,vn,vu,sd_ve,sd_vn,sd_vu]
 O,t,speed
-R,t,place and clock;satellite,signal,...;...   raw observations, an epoch a line (`graphnav.online.raw_lines`)
-S,name,t,...                  another sensor (`graphnav.sensors`): its columns, in the units that are usual in files
+R,t,place and clock;satellite,signal,...;...   raw observations, one epoch per line (`graphnav.online.raw_lines`)
+S,name,t,...                  another sensor (`graphnav.sensors`): its columns, in the default units of files
 E
 """
 
@@ -67,7 +67,7 @@ class _Setup(_Part):
 
 
 def setup_of(line: str) -> Recording:
-    """The sensors that the first line of a source describes.
+    """The sensors described by the first line of a source.
 
     Raises
     ------
@@ -92,7 +92,7 @@ def setup_of(line: str) -> Recording:
     stated = found.imu.noise.model_dump(exclude_none=True)  # type: ignore[attr-defined]
     gnss = odometer = None
     if found.gnss is not None:
-        derived = found.raw_gnss is not None  # fixes serve the start
+        derived = found.raw_gnss is not None  # fixes are used for the start
         gnss = Gnss(_NONE, _ROWS, _ROWS, lever_arm=np.array(found.gnss.lever_arm), derived=derived)
     if (o := found.odometer) is not None:
         odometer = Odometer(
@@ -110,7 +110,7 @@ def setup_of(line: str) -> Recording:
 
 
 def row_of(line: str) -> Row | None:
-    """A row; None for an empty line or a comment.
+    """Parse a row; None for an empty line or a comment.
 
     Raises
     ------
@@ -157,7 +157,7 @@ def _series_row(cells: list[str]) -> Row:
 
 
 def _usual(column: Column) -> float:
-    """Size in SI of the unit that is usual in files."""
+    """Size in SI of the default unit of files."""
     return next(iter(column.units.values()))
 
 
@@ -180,7 +180,7 @@ def head_of(recording: Recording) -> str:
 
 
 def line_of(row: Row) -> str:
-    """A row as a line; every number reads back as it was."""
+    """The line of a row; every number reads back exactly."""
     sensor, t, values = row
     if sensor == "imu":
         return f"I,{t!r}," + ",".join(map(repr, values))
@@ -198,7 +198,7 @@ def line_of(row: Row) -> str:
 
 
 def lines_of(recording: Recording) -> Iterator[tuple[float, str]]:
-    """A recording as a live source would send it: time and line, the first line and the end included."""
+    """A recording as a live source would send it: time and line, including the first line and the end."""
     yield recording.start, head_of(recording)
     for row in rows_of(recording)[1]:
         yield row[1], line_of(row)
@@ -206,7 +206,7 @@ def lines_of(recording: Recording) -> Iterator[tuple[float, str]]:
 
 
 def split(chunks: Iterable[bytes]) -> Iterator[str]:
-    """Whole lines of a stream that comes in pieces; what follows the last line end is dropped."""
+    """Complete lines of a stream that arrives in chunks; anything after the last line end is dropped."""
     rest = b""
     for chunk in chunks:
         *whole, rest = (rest + chunk).split(b"\n")

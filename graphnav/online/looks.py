@@ -1,7 +1,7 @@
-"""What is looked for beside the keyframes as a drive goes on: where the vehicle stands, where its odometer is wrong.
+"""Detection beside the keyframes of a running drive: of stops, and of odometer faults.
 
-Looks are made now and then (the rows they see overlap), between one keyframe and the next where there is time, and
-take effect at the next keyframe.
+Detection runs at intervals (the rows it uses overlap), between keyframes when there is time, and takes effect at the
+next keyframe.
 """
 
 from __future__ import annotations
@@ -16,59 +16,60 @@ from graphnav.detectors.base import merge_spans
 from graphnav.online.sensors import Sensors
 from graphnav.recording.odometer import ReadingStatistics, faults
 
-CONTEXT = 30.0  # s of rows before a keyframe that its constraints may look at
-SURE = 1.0  # s before now that the detectors answer for: the end of a stop shows only when it is over
-_EVERY = 2.0  # s between looks of the detectors
-_LOOK = 30.0  # s that they see
-_SEEN = 25.0  # s of these that they answer for; the first few lack what was before
-_REVIEW = 10.0  # s between looks at what was answered before, while nothing stands
-_CLEARLY = 0.1  # of a figure
-_WHEELS, _WHEELS_LOOK = 10.0, 40.0  # s between looks at the odometer, and what they see
+CONTEXT = 30.0  # s of rows before a keyframe that its constraints may use
+SURE = 1.0  # s before now up to which detection is reliable: the end of a stop is known only afterwards
+_DETECTOR_INTERVAL = 2.0  # s between runs of the detectors
+_DETECTOR_SPAN = 30.0  # s of rows that they use
+_ANSWERED_SPAN = 25.0  # s of these for which they answer; the first few lack the rows before
+_REVIEW = 10.0  # s between reviews of earlier answers, while nothing is stationary
+_CLEAR_CHANGE = 0.1  # relative change of a figure
+_WHEELS, _WHEELS_LOOK = 10.0, 40.0  # s between checks of the odometer, and s of rows that they use
 
 
 class Stops:
-    """Where the vehicle stands, as far as the detectors can tell by now."""
+    """Stops of the vehicle as far as the detectors have found them."""
 
     def __init__(self) -> None:
         self.spans: Array = np.empty((0, 2))  # s, between keyframes
         self.looked = -np.inf  # s, up to where
         self._reviewed = -np.inf
-        self._seen: tuple[float, Array | None] | None = None  # since when, and what; not yet in `spans`
+        self._seen: tuple[float, Array | None] | None = None  # since when, and which; not yet in `spans`
 
     @property
     def news(self) -> bool:
-        """Whether something was seen that is not taken over yet."""
+        """Whether stops were found that have not been taken over yet."""
         return self._seen is not None
 
     def due(self, now: float) -> bool:
-        """Whether it is time to look again."""
-        return self._seen is None and now - self.looked >= _EVERY - SAME_TIME
+        """Whether the next run is due."""
+        return self._seen is None and now - self.looked >= _DETECTOR_INTERVAL - SAME_TIME
 
     def look(self, sensors: Sensors, settings: Settings, now: float, head: float) -> None:
-        """Ask the detectors; the first time about everything since `head`."""
+        """Run the detectors; the first time over everything since `head`."""
         whole = not np.isfinite(self.looked)
-        since, answered = (head, -np.inf) if whole else (now - _SEEN, self.looked - SURE)
+        since, answered = (head, -np.inf) if whole else (now - _ANSWERED_SPAN, self.looked - SURE)
         if now - self._reviewed >= _REVIEW - SAME_TIME:
             self._reviewed, answered = now, since
         self.looked = now
-        recording = sensors.recording(-np.inf if whole else now - _LOOK, now, every=True)
+        recording = sensors.recording(-np.inf if whole else now - _DETECTOR_SPAN, now, every=True)
         self._seen = since, stops(recording, settings, since, now - SURE, self.spans, answered)
 
     def replace(self, spans: Array, edges: Array) -> None:
-        """Know other spans, cut to keyframes `edges`."""
+        """Replace the spans, cut to keyframes `edges`."""
         self.spans, self._seen = np.empty((0, 2)), (-np.inf, spans)
         self.take(edges)
 
     def add(self, spans: Array) -> None:
-        """Know more spans, between keyframes already."""
+        """Add spans that lie between keyframes already."""
         self.spans = merge_spans(np.concatenate([self.spans, spans]), gap=SAME_TIME)
 
     def forget(self, t: float) -> None:
-        """Those that ended before a time do not matter any more."""
+        """Drop the stops that ended before a time."""
         self.spans = self.spans[self.spans[:, 1] > t]
 
     def take(self, edges: Array) -> float:
-        """Take over what was seen, cut to keyframes; the start of the first interval between `edges` that changes.
+        """Take over the stops found, cut to keyframes; returns the start of the first interval between `edges` that
+        changes.
 
         `edges` are the keyframes, in any order.
         """
@@ -93,27 +94,27 @@ class Stops:
 
 
 class Readings:
-    """What an odometer's readings are worth, and where they are wrong, as far as can be told by now."""
+    """Quality of an odometer's readings, and spans in which they are wrong, as known so far."""
 
     def __init__(self) -> None:
         self.wrong: Array = np.empty((0, 2))  # s
         self.figures: ReadingStatistics | None = None
-        self.revised = False  # whether the figures have become clearly others
+        self.revised = False  # whether the figures have changed clearly
         self._looked = -np.inf  # s
-        self._moving, self._told, self._counted = 0, 0, -np.inf  # readings in motion, by when told, and up to when
-        self._lag: float | None = None  # s by which it is late, as far as the IMU can tell
+        self._moving, self._told, self._counted = 0, 0, -np.inf  # readings in motion, at the last check, and up to when
+        self._lag: float | None = None  # s, delay of the readings as measured with the IMU
 
     @property
     def looked(self) -> bool:
-        """Whether ever."""
+        """Whether a check has been made."""
         return bool(np.isfinite(self._looked))
 
     def due(self, now: float) -> bool:
-        """Whether it is time to look again."""
+        """Whether the next check is due."""
         return now - self._looked >= _WHEELS - SAME_TIME
 
     def look(self, sensors: Sensors, now: float) -> float:
-        """Look for wrong readings; returns the start of the first that was not known."""
+        """Check the readings; returns the start of the first wrong span that was not known before."""
         whole, self._looked = not self.looked, now
         recording = sensors.recording(-np.inf if whole else now - _WHEELS_LOOK, now)
         if recording.odometer is None:
@@ -121,7 +122,7 @@ class Readings:
         lag, o = self._lag, recording.odometer
         self._moving += int(np.count_nonzero(o.speed[o.t > self._counted]))
         self._counted = float(o.t[-1])
-        # ever more seldom, as more readings tell little new; while it stands they tell nothing
+        # at increasing intervals, as more readings add little; readings at rest add nothing
         if self.figures is None or self._moving >= 2 * max(self._told, 1):
             every = sensors.recording().odometer
             assert every is not None
@@ -137,8 +138,8 @@ class Readings:
 
 
 def _other(before: tuple[float, ...], now: tuple[float, ...]) -> bool:
-    """Whether sigmas are clearly others."""
-    return any(abs(a - b) > _CLEARLY * max(a, b) for a, b in zip(before, now, strict=True))
+    """Whether sigmas differ clearly."""
+    return any(abs(a - b) > _CLEAR_CHANGE * max(a, b) for a, b in zip(before, now, strict=True))
 
 
 def clip_spans(spans: Array, begin: float, end: float) -> Array:

@@ -1,6 +1,6 @@
-"""Readings of a running IMU beside those before and after them: which ones these contradict.
+"""Consistency of IMU readings with those before and after them in a running drive.
 
-The judgement is that of a recording (`graphnav.recording.plausibility.readings`), by the rows that have come so far.
+The test is that of a recording (`graphnav.recording.plausibility.readings`), on the rows so far.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from graphnav.recording.plausibility.readings import ALONE, HOLE, Excesses, find
 
 
 class Neighbours:
-    """How far readings lie beyond those before and after, and which lie too far.
+    """Typical deviations of readings from their neighbours, and readings that deviate too far.
 
     Parameters
     ----------
@@ -28,15 +28,15 @@ class Neighbours:
         self._last: tuple[tuple[float, ...], tuple[float, ...]] | None = None  # the newest two rows with their times
 
     def forget_newest(self) -> None:
-        """What comes is no neighbour of what came."""
+        """Forget the newest rows: what follows is not adjacent to them."""
         self._last = None
 
     def forget_time(self) -> None:
-        """Another clock."""
+        """Forget all times: the clock has changed."""
         self._last, self._learnt = None, -np.inf
 
     def compare(self, t: float, values: tuple[float, ...], imu: Buffer) -> tuple[float, float] | None:
-        """Times of the two rows before the newest, if that and the first of them contradict the second."""
+        """Times of the two rows before the newest, if the newest and the first of them contradict the second."""
         before, now = self._last, (t, *values)
         self._last = now if before is None else before[1], now
         if before is None:
@@ -48,14 +48,14 @@ class Neighbours:
             return None
         near = imu.t[-3:]
         if len(imu) < 4 or near[0] != before[0][0] or near[1] != before[1][0]:
-            return None  # a late row stands between them
+            return None  # there is a late row between them
         if np.diff(near).max() >= HOLE * find_period(imu.t):
             return None
         self._last = before[0], now
         return before[0][0], before[1][0]
 
     def learn(self, imu: Buffer, until: float, stops: Array) -> None:
-        """Learn from the rows up to a time (s), but those in stops (M, 2), how far readings lie beyond those around."""
+        """Learn typical deviations from the rows up to a time (s), except those in stops (M, 2)."""
         rows = imu.between(self._learnt, until)
         if len(rows) < 3:
             return
@@ -65,7 +65,7 @@ class Neighbours:
         self._excesses.add(measure_excess(rows[:, 1 : 1 + self._columns])[moving])
 
     def find(self, imu: Buffer) -> list[float]:
-        """Times of the rows that those around contradict, but for the newest, of which that is not known yet."""
+        """Times of the rows that their neighbours contradict, except the newest, which has no successor yet."""
         rows = imu.rows
         bad = find_contradicted(rows[:, 0], rows[:, 1 : 1 + self._columns].T)
         return [float(t) for t in rows[bad & (rows[:, 0] < imu.newest - ALONE), 0]]

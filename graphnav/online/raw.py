@@ -1,4 +1,4 @@
-"""Epochs of raw observations that have come, and what is done with raw observations online."""
+"""Epochs of raw observations received so far, and their settings online."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ RAW = "raw_gnss"
 
 @dataclass
 class RawEpochs:
-    """Epochs in order of time; those closer than they are used tell where arcs of carriers end.
+    """Epochs in order of time; epochs that are too close to be used still show where arcs of carriers end.
 
     Parameters
     ----------
@@ -32,7 +32,7 @@ class RawEpochs:
 
     setup: RawGnss
     settings: RawGnssSettings
-    _t: list[float] = field(default_factory=list)  # s, of the epochs that are used
+    _t: list[float] = field(default_factory=list)  # s, of the epochs in use
     _every: list[float] = field(default_factory=list)  # s
     _rows: dict[float, Array] = field(default_factory=dict)  # (n, WIDTH), by time
     # (n, 2), of their carriers: s, begins of the arcs, and cycles of wind-up
@@ -52,11 +52,11 @@ class RawEpochs:
 
     @property
     def newest(self) -> float:
-        """Newest time, minus infinity without any."""
+        """Newest time, minus infinity without epochs."""
         return self._t[-1] if self._t else -np.inf
 
     def odds(self, values: tuple[float, ...]) -> str | None:
-        """What is wrong with an epoch by itself; None if nothing is."""
+        """The fault of an epoch by itself; None if there is none."""
         assert self.setup.catalogue is not None
         if not values or len(values) % WIDTH:
             return "not a number"
@@ -68,24 +68,24 @@ class RawEpochs:
         return None if usable.any() else "no satellite that is of use"
 
     def wanted(self, t: float) -> bool:
-        """Whether no epoch is there that is so near to a time that one of the two suffices."""
+        """Whether there is no epoch so close to a time that one of the two suffices."""
         k, least = bisect_left(self._t, t), self.settings.period - EARLY
         near = self._t[max(k - 1, 0) : k + 1]
         return t not in self._rows and all(abs(x - t) >= least and x != t for x in near)
 
     def add(self, t: float, values: tuple[float, ...], used: bool = True) -> bool:
-        """Put an epoch in its place; False if there is one at that time already, which stays."""
+        """Insert an epoch by its time; returns False if there already is one at that time, which stays."""
         if t in self._rows:
             return False
         k = bisect_left(self._every, t)
         self._every.insert(k, t)
         self._rows[t] = self._with_place(t, take_sane(np.reshape(values, (-1, WIDTH))))
         if used:
-            # what is counted already stays: an epoch that comes late has no number, and changes pass it by
+            # numbers given stay: a late epoch has none, and changes of carriers bypass it
             self._number[t] = self._number.get(self.newest, -1) + 1 if t > self.newest else -1
             insort(self._t, t)
         later = self._every[k:]
-        if len(later) > 1:  # what came before is to be known again
+        if len(later) > 1:  # earlier epochs must be recognisable
             self._last = {}
             for x in self._every[:k]:
                 self._remember(x)
@@ -99,7 +99,7 @@ class RawEpochs:
         return [(x, tuple(self._rows[x].ravel().tolist())) for x in self._every[bisect_right(self._every, t) :]]
 
     def drop_before(self, t: float) -> None:
-        """Forget the epochs before a time."""
+        """Drop the epochs before a time."""
         k = bisect_left(self._every, t)
         for x in self._every[:k]:
             del self._rows[x], self._arcs[x]
@@ -107,7 +107,7 @@ class RawEpochs:
         del self._every[:k], self._t[: bisect_left(self._t, t)]
 
     def drop_after(self, t: float) -> None:
-        """Forget the epochs after a time."""
+        """Drop the epochs after a time."""
         k, self._last = bisect_right(self._every, t), {}
         for x in self._every[k:]:
             del self._rows[x], self._arcs[x]
@@ -116,7 +116,7 @@ class RawEpochs:
             self._remember(x)
 
     def between(self, begin: float, end: float) -> RawGnss:
-        """Those that are used from `begin` to `end`, both included, and the one before, as a series."""
+        """The epochs in use from `begin` to `end`, both included, and the one before, as a series."""
         t = self._t[max(bisect_left(self._t, begin) - 1, 0) : bisect_right(self._t, end)]
         rows = [self._rows[x] for x in t]
         series = series_of(t, rows, self.setup)
@@ -128,7 +128,7 @@ class RawEpochs:
         return replace(series, arc_begin=arcs[:, 0], wound=wound, number=number)
 
     def _with_place(self, t: float, rows: Array) -> Array:
-        """Rows with a rough place of the antenna and its clock, where they have none: of this epoch, or the last."""
+        """Rows with an approximate antenna position and clock where they have none: of this epoch, or the last."""
         if np.isfinite(rows[:, -5:]).all():
             return rows
         rows = rows.copy()
@@ -184,7 +184,7 @@ def codes_alone(settings: Settings) -> Settings:
 
 
 def without_ambiguities(settings: Settings, setup: Recording) -> Settings:
-    """The settings for a noise model: changes of carriers have figures of their own, ambiguities have none."""
+    """The settings for a noise model: changes of carriers have variance components, ambiguities have none."""
     s, raw = settings.raw_gnss, setup.raw_gnss
     if raw is None or not (s.carrier and raw.differenced):
         return settings

@@ -1,4 +1,4 @@
-"""A recording as what a live source would have sent: the setup of its sensors, and their rows."""
+"""A recording as a live source would have sent it: the setup of its sensors, and their rows."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def without_rows(recording: Recording) -> Recording:
 
 
 def rows_of(recording: Recording) -> tuple[Array, list[Row]]:
-    """Every row of a recording in the order in which sensors without delay would have sent them, and their times."""
+    """Every row of a recording in the order in which sensors without delay would have sent it, with its time."""
     parts: list[tuple[Array, str, Array]] = []
     if recording.odometer is not None:
         o = recording.odometer

@@ -1,7 +1,6 @@
-"""Rows for `Online.add` made of what a driver has at hand, each checked: lengths, units, sizes; and what comes out.
+"""Rows for `Online.add` made from a driver's values, each checked for length, unit and range; and the live output.
 
-Every one of these is a plain row (sensor, time, values) as `graphnav.online.sensors.Row` has them, so that rows of both
-kinds may be mixed.
+Each is a plain row (sensor, time, values) as in `graphnav.online.sensors.Row`, so that both kinds may be mixed.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ _HEIGHTS = (-1000.0, 50000.0)  # m, as in files
 
 
 class _Row(tuple[str, float, tuple[float, ...]]):
-    """A row that was checked."""
+    """A checked row."""
 
     __slots__ = ()
 
@@ -44,7 +43,7 @@ class ImuSample(_Row):
     Raises
     ------
     RecordingError
-        If something has another length, or a size that no sensor reads, as of degrees or g.
+        If a value has the wrong length or an impossible magnitude, as one in deg/s or g.
     """
 
     __slots__ = ()
@@ -64,7 +63,7 @@ class Fix(_Row):
     Raises
     ------
     RecordingError
-        If something has another length, or a size that cannot be.
+        If a value has the wrong length or an impossible magnitude.
     """
 
     __slots__ = ()
@@ -104,7 +103,7 @@ class WheelSpeed(_Row):
     Raises
     ------
     RecordingError
-        If it is no number, or one that no vehicle reaches.
+        If it is not a number, or a speed that no vehicle reaches.
     """
 
     __slots__ = ()
@@ -119,12 +118,12 @@ class WheelSpeed(_Row):
 
 
 class Reading(_Row):
-    """What another sensor (`graphnav.sensors`) read at `t` (s): its columns by their names, in SI.
+    """A row of another sensor (`graphnav.sensors`) at `t` (s): its columns by name, in SI.
 
     Raises
     ------
     RecordingError
-        If the sensor has no such column, one that it needs is missing, or a value lies beyond its bounds.
+        If the sensor has no such column, a needed column is missing, or a value is outside its bounds.
     """
 
     __slots__ = ()
@@ -152,7 +151,7 @@ def live_setup(
     name: str = "live",
     sensors: Sequence[Series] = (),
 ) -> Recording:
-    """What `Online` must know before the first row: a recording without rows.
+    """What `Online` needs before the first row: a recording without rows.
 
     Parameters
     ----------
@@ -160,8 +159,8 @@ def live_setup(
     antenna, axle : (3,) m from the IMU to the antenna and to the point that does not slip, right, forward, up; None
         where there is no GNSS, no odometer.
     platform : "vehicle" or "foot".
-    name : of the recording.
-    sensors : others that there are, without rows: ``SENSOR.series([], {}, sigma=0.3)``.
+    name : name of the recording.
+    sensors : other sensors, without rows: ``SENSOR.series([], {}, sigma=0.3)``.
 
     Returns
     -------
@@ -223,7 +222,7 @@ def _time(kind: type, t: float) -> float:
 def _vector(
     kind: type | None, t: float, name: str, unit: str, values: Sequence[float], most: float, hint: str = ""
 ) -> tuple[float, float, float]:
-    """Three finite numbers of at most a size."""
+    """Check three finite numbers of limited size."""
     try:
         count = len(values)
     except TypeError:

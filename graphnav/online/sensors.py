@@ -1,4 +1,4 @@
-"""What has come from the sensors so far: checked, in order of time, and bounded."""
+"""Rows received from all sensors: checked, in order of time, and bounded."""
 
 from __future__ import annotations
 
@@ -14,13 +14,21 @@ from graphnav.online.buffers import SAME, Buffer
 from graphnav.online.fixes import Fixes
 from graphnav.online.neighbours import Neighbours
 from graphnav.online.raw import RAW, RawEpochs
-from graphnav.online.sanity import ClockGuard, Reach, Row, fix_odds, imu_reads, odometer_reads, with_sane_velocity
+from graphnav.online.sanity import (
+    ClockGuard,
+    Reach,
+    Row,
+    can_imu_read,
+    can_odometer_read,
+    find_fix_fault,
+    with_sane_velocity,
+)
 from graphnav.recording import Odometer, Recording
 from graphnav.recording.formats.repair import LATEST
 
-AHEAD = 60.0  # s; stamps of other sensors further than this before the IMU's are wrong
+AHEAD = 60.0  # s; stamps of other sensors that are further before the IMU's are wrong
 _WIDTH = {"imu": 6, "odometer": 6}
-_TOLD = {"gnss": 3, "odometer": 1}  # values by which a row is known again
+_TOLD = {"gnss": 3, "odometer": 1}  # number of values by which a repeated row is recognised
 _NAN = float("nan")
 
 
@@ -43,27 +51,27 @@ class Sensors:
     gnss: Fixes = field(init=False)
     odometer: Buffer = field(default_factory=lambda: Buffer(_WIDTH["odometer"]))
     others: dict[str, Buffer] = field(init=False)  # of the sensors of `Recording.sensors`
-    raw: RawEpochs | None = field(init=False)  # of a receiver whose single satellites are used in place of its fixes
-    oldest: float = -np.inf  # s; rows up to here come too late
+    raw: RawEpochs | None = field(init=False)  # of a receiver whose raw observations are used in place of its fixes
+    oldest: float = -np.inf  # s; rows up to here are too late
     set_back: list[Row] = field(default_factory=list)  # the first rows of a clock that was set back
     moved: tuple[float, int] | None = None  # since when (s), and how many fixes are elsewhere than all before
-    released: list[Row] = field(default_factory=list)  # rows that were held and are to be taken in now
+    released: list[Row] = field(default_factory=list)  # held rows that are to be processed now
     _clock: ClockGuard = field(default_factory=ClockGuard)
     _reach: Reach = field(default_factory=Reach)
-    _before: set[tuple[str | float, ...]] = field(default_factory=set)  # fixes and readings of the clock before
+    _before: set[tuple[str | float, ...]] = field(default_factory=set)  # fixes and readings of the earlier clock
     _neighbours: Neighbours = field(init=False)
 
     def __post_init__(self) -> None:
         self.others = {name: Buffer(len(series.sensor.names)) for name, series in self.setup.sensors.items()}
         self.gnss = Fixes(self.setup.gnss)
-        # of a foot rates alone: it is hit for less than a row
+        # for a foot, of rates only: an impact lasts for less than a row
         self._neighbours = Neighbours(3 if self.setup.platform == "foot" else 6)
         raw, tight = self.setup.raw_gnss, self.setup.tight(self.raw_settings.coupling)
         self.raw = RawEpochs(raw, self.raw_settings) if raw is not None and tight else None
 
     @property
     def aiding(self) -> dict[str, Buffer | RawEpochs]:
-        """The buffers of all sensors but the IMU, by their names."""
+        """The buffers of all sensors except the IMU, by name."""
         of_raw = {} if self.raw is None else {RAW: self.raw}
         return {"gnss": self.gnss, "odometer": self.odometer, **self.others, **of_raw}
 
@@ -77,25 +85,26 @@ class Sensors:
             return -np.inf
         return self.imu.newest if sensor == "imu" else self.aiding[sensor].newest
 
-    def anchors(self, sensor: str) -> bool:
-        """Whether each row of a sensor wants a keyframe."""
+    def needs_keyframes(self, sensor: str) -> bool:
+        """Whether each row of a sensor needs a keyframe."""
         if sensor in self.others:
             return self.setup.sensors[sensor].sensor.keyframes
         return sensor == ("gnss" if self.raw is None else RAW)
 
-    def anchors_of_all(self) -> Array:
-        """Times (N,) of the rows that want a keyframe, s."""
-        times = [self.gnss.used] if self.anchors("gnss") else []
-        times += [b.t for name, b in self.aiding.items() if name != "gnss" and self.anchors(name)]
+    def list_keyframe_times(self) -> Array:
+        """Times (N,) of the rows that need a keyframe, s."""
+        times = [self.gnss.used] if self.needs_keyframes("gnss") else []
+        times += [b.t for name, b in self.aiding.items() if name != "gnss" and self.needs_keyframes(name)]
         return np.unique(np.concatenate([*times, np.empty(0)]))
 
     def add(self, sensor: str, t: float, values: tuple[float, ...], released: bool = False) -> bool:
-        """Take in a row; False if it is of no use (`counts` says why), or is held until an IMU row tells its clock.
+        """Process a row; False if it is rejected (`counts` states the reason), or held until an IMU row shows its
+        clock.
 
         The values are gyro and force of an IMU (rad/s, m/s^2); latitude, longitude (rad), height, three sigmas,
-        velocity and its sigmas (NaN where there is none) of a fix; speed, way counted and four wheels of an odometer;
-        of other sensors their columns in SI, NaN where there is none. Rows of `released` were held before and are not
-        held again.
+        velocity and its sigmas (NaN where there is none) of a fix; speed, counted distance and four wheels of an
+        odometer; of other sensors their columns in SI, NaN where there is none. Rows of `released` were held before and
+        are not held again.
         """
         if sensor in self.others:
             return self._add_other(sensor, t, values, released)
@@ -124,7 +133,7 @@ class Sensors:
             if others is None:
                 self.counts["gnss: out of reach"] += 1
                 return False
-            if others:  # they are where the vehicle is, and those before were not
+            if others:  # the vehicle is there, and the fixes before were wrong
                 self.counts["gnss"] -= len(self.gnss)
                 self.counts["gnss: out of reach"] += len(self.gnss) - len(others) + 1
                 self.gnss.drop_before(np.inf)
@@ -141,8 +150,8 @@ class Sensors:
     def _is_in_time(
         self, sensor: str, t: float, values: tuple[float, ...], told: tuple[str | float, ...], released: bool
     ) -> bool:
-        """Whether a row comes when it can be used; `told` is by what it is known again."""
-        if told in self._before:  # a sender that begins again before that step
+        """Whether a row arrives in time to be used; a repeated row is recognised by `told`."""
+        if told in self._before:  # a sender that restarts before that step
             self.counts[f"{sensor}: repeated"] += 1
             return False
         far_ahead = bool(len(self.imu)) and t > self.imu.newest + AHEAD
@@ -191,10 +200,10 @@ class Sensors:
         return why is None
 
     def add_next(self, t: float, values: tuple[float, ...], newest: float) -> bool:
-        """Take in an IMU row if nothing is odd about it; False leaves it to `add`. `newest` is the time before it."""
+        """Process an IMU row if it is regular; returns False to leave it to `add`. `newest` is the time before it."""
         if not newest + SAME < t <= newest + self.longest_gap or t <= self.oldest or self._clock.undecided:
             return False
-        if len(values) != _WIDTH["imu"] or not imu_reads(values):
+        if len(values) != _WIDTH["imu"] or not can_imu_read(values):
             return False
         self._clock.remember(t, values)
         self.imu.append(t, values)
@@ -202,7 +211,9 @@ class Sensors:
         return True
 
     def compare_newest(self) -> float | None:
-        """Take the row of the IMU before the newest back, if its neighbours contradict it; the time of that before."""
+        """Remove the IMU row before the newest if its neighbours contradict it; returns the time of the row before
+        that.
+        """
         newest = self.imu.rows[-1].tolist()
         found = self._neighbours.compare(newest[0], tuple(newest[1:]), self.imu)
         if found is None:
@@ -212,11 +223,13 @@ class Sensors:
         return before
 
     def learn(self, until: float, stops: Array) -> None:
-        """Learn from the rows up to a time (s), but those in stops (M, 2), how far readings lie beyond those around."""
+        """Learn from the rows up to a time (s), except those in stops (M, 2), how far readings deviate from their
+        neighbours.
+        """
         self._neighbours.learn(self.imu, until, stops)
 
     def drop_contradicted(self) -> None:
-        """Leave out the rows of the IMU that those around them contradict, as far as that is known."""
+        """Remove the IMU rows that their neighbours contradict, as far as that is known."""
         self._take_back(self._neighbours.find(self.imu))
 
     def _take_back(self, times: list[float]) -> None:
@@ -227,12 +240,12 @@ class Sensors:
             self.counts["imu: contradicted by those around"] += len(times)
 
     def release(self) -> None:
-        """No more IMU rows will come: what was held is to be taken in now."""
+        """No more IMU rows will arrive: release the held rows."""
         self._clock.release()
         self._sort_out()
 
     def _sort_out(self) -> None:
-        """What was held and is known by now."""
+        """Classify the held rows as far as possible."""
         clock = self._clock
         for sensor, _, _ in clock.known:
             self.counts[f"{sensor}: repeated"] += 1
@@ -240,23 +253,23 @@ class Sensors:
         clock.known, clock.released = [], []
 
     def forget_time(self) -> None:
-        """Another clock: what was noted of the times of rows holds no more."""
+        """The clock has changed: forget what depends on times of rows."""
         self._reach = Reach()
         self.gnss.forget_usual()
         self._neighbours.forget_time()
 
     def _find_fault(self, sensor: str, values: tuple[float, ...]) -> str | None:
-        """What is wrong with a row by itself, as it is counted."""
+        """The fault of a row by itself, under the name it is counted by."""
         if sensor == "gnss":
-            return fix_odds(values)
-        reads = imu_reads(values[:6]) if sensor == "imu" else odometer_reads(values)
+            return find_fix_fault(values)
+        reads = can_imu_read(values[:6]) if sensor == "imu" else can_odometer_read(values)
         return None if reads else "beyond any sensor"
 
     def _add_imu(self, t: float, values: tuple[float, ...]) -> bool:
         if t <= self.oldest or (t < self.imu.newest - SAME and not self._clock.fits(t, self.imu.t)):
             self.counts[self._passed(t)] += 1
             if self._clock.hold(("imu", t, values)):
-                self.set_back = self._clock.set_back()  # which count when they are taken in
+                self.set_back = self._clock.set_back()  # counted when they are processed
                 self.counts -= Counter(self._passed(when) for sensor, when, _ in self.set_back if sensor == "imu")
                 for name, width in _TOLD.items():
                     rows = getattr(self, name).rows[:, : width + 1].tolist()
@@ -275,7 +288,7 @@ class Sensors:
                 self.released += held
                 return False
         if len(self.imu) and t > self.imu.newest + self.longest_gap:
-            rows = self._clock.leap(t, values, self.longest_gap)
+            rows = self._clock.hold_leap(t, values, self.longest_gap)
             self.counts["imu: stamp in the future"] += 1 - len(rows)
             for _, when, what in rows:
                 self._clock.remember(when, what)
@@ -295,35 +308,35 @@ class Sensors:
         return True
 
     def _passed(self, t: float) -> str:
-        """What an IMU row at a time that has passed is counted as."""
+        """The count that an IMU row at a time that has passed belongs to."""
         repeated = t > self.oldest and bool(np.any(np.abs(self.imu.t - t) <= SAME))
         return "imu: repeated" if repeated else "imu: too late"
 
     def drop_before(self, t: float) -> None:
-        """Forget rows before a time."""
+        """Drop rows before a time."""
         for buffer in self._all.values():
             buffer.drop_before(t)
 
     def cut_after(self, t: float) -> dict[str, list[tuple[float, tuple[float, ...]]]]:
-        """Take out the rows after a time (s), by sensor; `put_back` takes them in again."""
+        """Remove the rows after a time (s), by sensor; `put_back` adds them again."""
         later = {name: buffer.after(t) for name, buffer in self._all.items()}
         for buffer in self._all.values():
             buffer.drop_after(t)
         return later
 
     def put_back(self, later: dict[str, list[tuple[float, tuple[float, ...]]]]) -> None:
-        """Take in rows that were taken out."""
+        """Add rows again that were removed."""
         for name, buffer in self._all.items():
             for row in later[name]:
                 buffer.add(*row)
 
     def imu_until(self, t: float) -> float:
-        """When the IMU spoke first at or after a time, s; only that row tells that it was silent there."""
+        """Time of the first IMU row at or after a time, s: only that row shows that the IMU was silent."""
         rows = self.imu.t
         return float(rows[min(int(np.searchsorted(rows, t - SAME)), len(rows) - 1)]) if len(rows) else t
 
     def recording(self, begin: float = -np.inf, end: float = np.inf, every: bool = False) -> Recording:
-        """The rows between two times as a recording; with `every` the fixes that are not used, too."""
+        """The rows between two times as a recording; with `every` also the fixes that are not used."""
         rows = self.imu.between(begin, end)
         imu = replace(self.setup.imu, t=rows[:, 0], gyro=rows[:, 1:4], accel=rows[:, 4:7])
         sensors = {}
@@ -346,5 +359,5 @@ class Sensors:
 
 
 def _identify(name: str, t: float, values: tuple[float, ...]) -> tuple[str | float, ...]:
-    """By what a row of another sensor is known again."""
+    """The values by which a repeated row of another sensor is recognised."""
     return (name, t, *(x for x in values if math.isfinite(x)))

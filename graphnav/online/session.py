@@ -17,8 +17,8 @@ from graphnav.online.steady import Online
 from graphnav.online.store import Store
 from graphnav.recording import Recording
 
-CHECKPOINTS = 60.0  # s of IMU time between checkpoints, each of tens of MB: as long as a resumed run has to redo
-_FEW = 5  # bad lines that are told
+CHECKPOINTS = 60.0  # s of IMU time between checkpoints, each of tens of MB: the time that a resumed run has to redo
+_REPORTED_LINES = 5  # invalid lines that are reported
 
 
 class Session:
@@ -59,14 +59,15 @@ class Session:
             self._take_pending(self.store)
 
     def add(self, row: Row) -> None:
-        """Take in one row."""
+        """Process one row."""
         assert self.online is not None
         self.online.add(row)
         self.taken += 1
         self._save()
 
     def add_lines(self, lines: list[str], asked: Callable[[], bool] = bool) -> None:
-        """Take in lines of a live source; they are in the journal before they count.
+        """Process lines of a live source; they are in the journal before they count. Once `asked` to end, the rest
+        stays there.
 
         Once `asked` to end, the rest stays there.
         """
@@ -78,18 +79,18 @@ class Session:
             self._take_pending(self.store, asked)
 
     def finish(self) -> None:
-        """Nothing more will come: settle all and say what it was."""
+        """End of the input: settle everything and write the summary."""
         if self.online is None:
             return
         if not self.done:
             self.online.finish()
             self.done = True
             self._save(last=True)
-        if self.store is not None:  # again where a run that was done is resumed: its summary may be what was missing
+        if self.store is not None:  # again where a finished run is resumed: its summary may have been missing
             self.store.summarise(json.dumps(self.summary(), indent=2) + "\n")
 
     def require_settled(self) -> None:
-        """Refuse a run that is over and has nothing to show.
+        """Refuse a finished run that has no result.
 
         Raises
         ------
@@ -108,17 +109,17 @@ class Session:
         raise RecordingError(f"nothing could be smoothed: {why}", key="online.nothing")
 
     def stop(self) -> None:
-        """Asked to end before the source does: remember where it was."""
+        """End before the source does: write a checkpoint."""
         if self.store is not None and self.online is not None and not self.done:
             self.store.checkpoint(self.online, self._counts())
 
     def close(self) -> None:
-        """Let go of the files."""
+        """Close the files."""
         if self.store is not None:
             self.store.close()
 
     def summary(self) -> dict[str, object]:
-        """Counts of rows, and what was noted."""
+        """Counts of rows, and notes."""
         assert self.online is not None
         online = self.online
         more: dict[str, object] = {}
@@ -143,7 +144,7 @@ class Session:
         }
 
     def _begin_piece(self, store: Store, online: Online, tracks: list[Trajectory]) -> None:
-        """What has settled so far is of a clock that is no more; what follows goes into a file of its own."""
+        """Begin a new file: the settled states so far are of an earlier clock."""
         self.rows_settled += sum(len(track) for track in tracks)
         if tracks:
             store.append(tracks)
@@ -172,12 +173,12 @@ class Session:
             self.finish()
             return
         if self.done or line.startswith("graphnav-online/"):
-            return  # a sender that begins anew
+            return  # a sender that restarts
         try:
             row = row_of(line)
         except ValueError as error:
             self.bad += 1
-            if len(self.complaints) < _FEW:
+            if len(self.complaints) < _REPORTED_LINES:
                 self.complaints.append(str(error))
             return
         if row is not None:
@@ -195,6 +196,6 @@ class Session:
         newest = self.online.sensors.imu.newest
         if tracks:
             self.store.append(tracks)
-        if last or newest - self._kept > CHECKPOINTS:  # rows settled since are cut off and made again on resume
+        if last or newest - self._kept > CHECKPOINTS:  # rows settled since are cut off and computed again on resume
             self.store.checkpoint(self.online, self._counts(), self.done)
             self._kept = newest

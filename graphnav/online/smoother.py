@@ -1,7 +1,7 @@
-"""From sensors' rows, as they come, to a live state and a settled trajectory.
+"""From sensors' rows, as they arrive, to a live state and a settled trajectory.
 
-Rows may come in any order and with gaps: each is used at its own time as long as that lies in the window. What
-comes out depends on the rows and their order alone, never on when or in what portions they were handed over.
+Rows may arrive in any order and with gaps: each is used at its own time while that lies in the window. The output
+depends on the rows and their order only, never on when or in what portions they arrive.
 """
 
 from __future__ import annotations
@@ -35,24 +35,24 @@ from graphnav.online.walker import Walker
 from graphnav.recording import Recording
 from graphnav.recording.plausibility.readings import HOLE
 
-AFTER = 0.05  # s of IMU after a keyframe that a fix may look at
+AFTER = 0.05  # s of IMU rows after a keyframe that a fix may use
 _ODOMETER = 0.3  # s that a keyframe waits for the odometer
-_SILENT = 2.0  # s after which an odometer is not waited for
-_STEP = 0.5  # s between looks at a walk
-_KNOWN = 4.0  # s before the newest keyframe up to which the stops are known
+_SILENT = 2.0  # s of silence after which an odometer is not waited for
+_STEP_DETECTION = 0.5  # s between detections of steps in a walk
+_FINAL_STOPS = 4.0  # s before the newest keyframe up to which the stops are final
 _TRY = 2.0  # s between attempts at an alignment
-_LEVEL = 5.0  # s of rest that level a vehicle without GNSS
-_JUDGED = 120.0  # s of rows by which the sensors are judged again
+_LEVEL = 5.0  # s of rest that determine the level of a vehicle without GNSS
+_JUDGED = 120.0  # s of rows after which the noise model is estimated again
 _PATIENCE = 300.0  # s of rows kept while there is no motion to align with
 
 
 class Smoother:
-    """Smooths while the drive happens; `graphnav.online.Online` is one that nothing ends.
+    """Online smoother; `graphnav.online.Online` wraps one so that nothing ends it.
 
     Parameters
     ----------
     setup : a recording without rows (`graphnav.online.without_rows`): platform, noise figures, lever arms.
-    settings : as for a recording; `solver.lag` says how much future a settled state has seen.
+    settings : as for a recording; `solver.lag` is the span of later measurements that a settled state includes.
     """
 
     def __init__(self, setup: Recording, settings: Settings | None = None) -> None:
@@ -65,19 +65,19 @@ class Smoother:
         self.frame: LocalFrame | None = None
         self.tracker: Tracker | None = None
         self.notes: list[str] = []
-        self.late: Counter[str] = Counter()  # rows that came after the keyframe they belong before, and were used
-        self._judgement: Judgement | None = None  # being made
-        self._again: CatchUp | None = None  # going through what has not settled with it
-        self._tentative = False  # nothing is to settle before the sensors have been judged once
-        self._found: Alignment | None = None  # as long as the sensors are still to be judged by more rows
-        self._said: dict[str, tuple[str, ...]] = {}  # of the notes, those that more rows may change, by their matter
-        self._judged = 0.0  # s of rows that they were judged by
+        self.late: Counter[str] = Counter()  # used rows that arrived after the keyframe they should have entered
+        self._judgement: Judgement | None = None  # estimation of the noise model in progress
+        self._again: CatchUp | None = None  # tracker that processes the unsettled keyframes with the new model
+        self._tentative = False  # nothing may settle before the noise model has been estimated once
+        self._found: Alignment | None = None  # whether the noise model is to be estimated again
+        self._said: dict[str, tuple[str, ...]] = {}  # notes that further rows may change, by subject
+        self._judged = 0.0  # s of rows that it was estimated from
         self._times: list[float] = []  # s, of keyframes that have settled meanwhile
         self._left_out: tuple[ExcludedSpan, ...] = ()  # of other measurements than fixes
-        self._fixes: list[float] = []  # s, rows that want a keyframe and are not yet in the graph
+        self._fixes: list[float] = []  # s, rows that need a keyframe and are not yet in the graph
         self._began = -np.inf  # s, of what is being smoothed
-        self._due = -np.inf  # s, of IMU time at which the next keyframes can be made
-        self._awake = -np.inf  # s, at which there is anything to do
+        self._due = -np.inf  # s of IMU time at which the next keyframes can be made
+        self._awake = -np.inf  # s, at which the next work is due
         self._period = self._dirty = np.inf  # s, of the IMU's rows; from where on keyframes are to be redone
         self._settled: list[Trajectory] = []
         self._last_settled = -np.inf
@@ -85,7 +85,7 @@ class Smoother:
 
     @property
     def excluded(self) -> tuple[ExcludedSpan, ...]:
-        """Spans of measurements found to be wrong, which were not used."""
+        """Spans of measurements that were found wrong and are not used."""
         return self._faults + (self.tracker.excluded + self._left_out if self.tracker is not None else ())
 
     @property
@@ -94,18 +94,20 @@ class Smoother:
         return "aligning" if self.tracker is None else "running"
 
     def add(self, row: Row, released: bool = False) -> None:
-        """Take in one row: sensor, time, values and whether it was held as in `graphnav.online.sensors.Sensors.add`."""
+        """Process one row: sensor, time, values and whether it was held, as in
+        `graphnav.online.sensors.Sensors.add`.
+        """
         sensor, t, values = row
         sensors = self.sensors
         before = sensors.imu.newest
-        if sensor == "imu" and sensors.add_next(t, values, before):  # as all but a few do
+        if sensor == "imu" and sensors.add_next(t, values, before):  # as nearly all do
             self._take_newest(t, before)
             return
         previous = sensors.newest(sensor)
         if not sensors.add(sensor, t, values, released):
             return
         if sensor == "imu" and (newest := sensors.imu.newest) > before:
-            # a row before this one that was left out leaves no trace: what is done at which row stays the same
+            # an earlier row that was rejected leaves no trace: the schedule of work stays the same
             if newest - before > self.settings.keyframes.bridge and len(sensors.imu) > 1 and np.isfinite(before):
                 after = float(sensors.imu.t[np.searchsorted(sensors.imu.t, before, side="right")])
                 self._restart(before, f"the IMU was silent from {before:.3f} to {after:.3f} s")
@@ -114,19 +116,19 @@ class Smoother:
         tracker = self.tracker
         if tracker is not None:
             if not tracker.note_missed_row(sensors, sensor, t):
-                return  # as if it had come in its turn
+                return  # as if it had arrived in order
             self._awake = -np.inf
             if sensor != "gnss" and t < previous:
                 tracker.note_late_row(sensor, t)
             if sensors.gnss.left:
                 self._fixes = [x for x in self._fixes if x not in sensors.gnss.left]
                 self._dirty, sensors.gnss.left = min([self._dirty, *sensors.gnss.left]), []
-            if sensors.anchors(sensor) and t > tracker.newest + SAME_TIME:
+            if sensors.needs_keyframes(sensor) and t > tracker.newest + SAME_TIME:
                 self._fixes = sorted([*self._fixes, t])
                 self._due = min(self._due, t + AFTER)
             elif t <= tracker.newest + SAME_TIME:
                 self.late[sensor] += 1
-                if sensors.anchors(sensor):
+                if sensors.needs_keyframes(sensor):
                     self._fixes = sorted([*self._fixes, t])
                 self._dirty = min(self._dirty, t)
             elif sensor == "odometer" and previous < tracker.newest - SAME_TIME:
@@ -135,14 +137,14 @@ class Smoother:
             self._look(sensors.imu.newest)
 
     def _take_newest(self, now: float, before: float) -> None:
-        """Take in the newest row of the IMU, at a time (s), and that of the row before."""
+        """Process the newest row of the IMU, at a time (s), and that of the row before."""
         void = self.sensors.compare_newest()
         if void is not None and self.tracker is not None:
             self._redo(void, self.tracker)
         self._look_if_due(now, before)
 
     def _redo(self, t: float, tracker: Tracker) -> None:
-        """A row of the IMU was taken back: what was made of it from a time (s) on is made again."""
+        """A row of the IMU was removed: redo everything that used it, from a time (s) on."""
         tracker.finish_entering(self.sensors)
         self._awake = -np.inf
         tracker.note_late_row("imu", t)
@@ -153,14 +155,14 @@ class Smoother:
         if now < self._awake:
             return
         if now - before > HOLE * self._period and self.tracker is not None and self.tracker.at_every_row:
-            # what is done at which row stays the same where some are missing, which may yet come
+            # the schedule stays the same where some rows are missing, which may still arrive
             for k in range(1, round((now - before) / self._period)):
                 if before + k * self._period >= self._awake - SAME_TIME:
                     self._look(before + k * self._period)
         self._look(now)
 
     def _look(self, now: float) -> None:
-        """Do what there is to do; without keyframes to make one thing at a row, so that none waits for long."""
+        """Do the work that is due; without keyframes to make, one task per row, so that no row waits for long."""
         tracker = self.tracker
         if tracker is None:
             self._align()
@@ -178,14 +180,14 @@ class Smoother:
         elif tracker.work_ahead(self.sensors, expected := self._predict_keyframe(tracker), not self._tentative):
             self._collect(tracker)
         elif tracker.stale and not self._tentative:
-            self._again = CatchUp(tracker.afresh(tracker.noise, self._setup))
+            self._again = CatchUp(tracker.restart_settled(tracker.noise, self._setup))
         else:
             if self._found is not None and self._judgement is None and not self._tentative:
                 self._judge_again(self._found, tracker)
             self._awake = expected if now < expected else self._due
 
     def _predict_keyframe(self, tracker: Tracker) -> float:
-        """When the next keyframe will stand, as far as is known, s."""
+        """Expected time of the next keyframe, s."""
         T, period = tracker.newest, 1.0 / self.settings.keyframes.rate
         fix = min((t for t in self._fixes if t > T + SAME_TIME), default=np.inf)
         return fix if fix - T <= period * (1.0 + 1e-6) else T + period
@@ -195,12 +197,12 @@ class Smoother:
         return None if self.tracker is None else self.tracker.live(self.sensors)
 
     def settled(self) -> list[Trajectory]:
-        """What has settled since it was last asked for."""
+        """The trajectory settled since the last call."""
         out, self._settled = self._settled, []
         return out
 
     def finish(self) -> None:
-        """Nothing more will come: settle all."""
+        """End of the input: settle everything."""
         self._settle_all()
 
     def _settle_all(self) -> None:
@@ -222,7 +224,7 @@ class Smoother:
         if len(sensors.imu) < 2:
             return
         first, now = float(sensors.imu.t[0]), sensors.imu.newest
-        if not last:  # at full times, so that a row which is missing there changes nothing
+        if not last:  # at whole multiples, so that a missing row changes nothing
             now = _TRY * float(np.floor(now / _TRY))
             self._due = now + _TRY
         if now - first < _LEVEL:
@@ -248,7 +250,7 @@ class Smoother:
         if told and self.settings.noise.mode == "estimated":
             self._found, self._tentative = found, True
             sensors.gnss.space(self.settings.noise.spacing)
-        self._fixes = [t for t in sensors.anchors_of_all().tolist() if t >= recording.start - SAME_TIME]
+        self._fixes = [t for t in sensors.list_keyframe_times().tolist() if t >= recording.start - SAME_TIME]
         self._began, self._judged = recording.start, recording.duration
         sensors.oldest = recording.start
         self._advance(tracker, sensors.imu.newest)
@@ -256,19 +258,21 @@ class Smoother:
             self._begin_judging(self._found, tracker)
 
     def _track(self, found: Alignment, start: float, noise: NoiseModel) -> Tracker:
-        """Begin at the first row of what an alignment has seen, s."""
+        """Start tracking at the first row that an alignment has used, s."""
         assert self.frame is not None
         tracker, notes = make_tracker(found, start, noise, self.settings, self.frame, self._setup)
         self.notes += [note for note in notes if note not in self.notes]
         return tracker
 
     def _say(self, matter: str, said: tuple[str, ...]) -> None:
-        """Note what is known of the noise, the units, ..., in place of what was thought before."""
+        """Note what is known about the noise, the units, ..., replacing the earlier note on the same subject."""
         self.notes = [note for note in self.notes if note not in self._said.get(matter, ())] + list(said)
         self._said[matter] = said
 
     def _judge_again(self, found: Alignment, tracker: Tracker) -> None:
-        """Have the sensors judged again before the first state settles, then by ever more rows until those suffice."""
+        """Estimate the noise model again before the first state settles, then from ever more rows until they
+        suffice.
+        """
         span = tracker.newest - self._began
         enough = are_enough(self.sensors, found, span)
         if not enough and span < max(min(self.settings.solver.lag, _JUDGED), 2.0 * self._judged):
@@ -283,7 +287,7 @@ class Smoother:
         self._judgement = judge(self.sensors, self.settings, self.frame, found, times, tracker.newest + AFTER)
 
     def _use(self, judgement: Judgement, tracker: Tracker) -> None:
-        """Begin to go through what has not settled with what the sensors were judged to be."""
+        """Start to process the unsettled keyframes with the new noise model."""
         self._judgement = None
         try:
             found = judgement.answer()
@@ -295,32 +299,32 @@ class Smoother:
         self._say("units", found.doubts)
         self._left_out = tuple(fault for fault in found.excluded if fault.kind not in FIXES)
         if tracker.opened:
-            self._again = CatchUp(tracker.afresh(found.noise, self._setup))
+            self._again = CatchUp(tracker.restart_settled(found.noise, self._setup))
         else:
             again = self._track(judgement.found, self._began, found.noise)
             again.adopt(tracker, found.stationary, judgement.until)
             self._again = CatchUp(again)
 
     def _go_through(self, again: CatchUp, tracker: Tracker) -> None:
-        """Some of it; what has caught up takes over."""
+        """Process some of them; the new tracker takes over once it has caught up."""
         if again.step(self.sensors, tracker):
             self.tracker, self._again, self._tentative = again.tracker, None, False
 
     def _judge_at_last(self) -> None:
-        """Nothing more will come: do not wait for what is being judged."""
+        """End of the input: do not wait for an estimation in progress."""
         if self._judgement is not None and self.tracker is not None:
             self._use(self._judgement, self.tracker)
         while self._again is not None and self.tracker is not None:
             self._go_through(self._again, self.tracker)
 
     def _wait(self, now: float) -> None:
-        """Keep what the next attempt may need."""
+        """Keep the rows that the next attempt at an alignment may need."""
         if now - float(self.sensors.imu.t[0]) > _PATIENCE:
             self._say("units", check_rows(self.sensors.recording(every=True)))
             self.sensors.drop_before(now - 0.5 * _PATIENCE)
 
     def _restart(self, before: float, why: str) -> None:
-        """What was up to a time (s) settles as it is, and an alignment begins anew."""
+        """Settle the states up to a time (s) as they are, and start a new alignment."""
         sensors = self.sensors
         self.notes.append(Note("online.anew", f"{why}: aligning anew"))
         later = sensors.cut_after(before)
@@ -328,10 +332,10 @@ class Smoother:
         self._faults = self.excluded
         self._begin_anew(before)
         sensors.put_back(later)
-        sensors.gnss.space(0.0)  # all of them, until there is a start again
+        sensors.gnss.space(0.0)  # all of them, until there is a new start
 
     def _begin_anew(self, oldest: float) -> None:
-        """Forget all rows and what was made of them; those up to a time (s) come too late from now on."""
+        """Drop all rows and states; rows up to a time (s) are too late from now on."""
         self.tracker = self._found = self._judgement = self._again = None
         self._tentative, self._times, self._left_out = False, [], ()
         self.sensors.drop_before(np.inf)
@@ -343,7 +347,7 @@ class Smoother:
     def _advance(self, tracker: Tracker, now: float, last: bool = False) -> None:
         """Make the keyframes that are due at a time, s."""
         sensors = self.sensors
-        sensors.learn(tracker.newest - _KNOWN, tracker.stops)
+        sensors.learn(tracker.newest - _FINAL_STOPS, tracker.stops)
         if isinstance(tracker, Walker):
             self._advance_walk(tracker, now, last)
             return
@@ -364,7 +368,7 @@ class Smoother:
             self._fixes = [t for t in self._fixes if t > limit and t > T + SAME_TIME]
             redone = tracker.update(sensors, np.array(times), dirty)
             if self._again is not None and redone < np.inf:
-                self._again.tracker.back_to(redone, tracker)
+                self._again.tracker.rewind(redone, tracker)
             self._collect(tracker)
             if tracker.verdicts.anew and not last:
                 said = f"for {LONGEST:.0f} s fixes contradicted all else, until {tracker.newest:.3f} s"
@@ -375,11 +379,11 @@ class Smoother:
 
     def _advance_walk(self, walker: Walker, now: float, last: bool) -> None:
         self._period = find_period(self.sensors.imu.t)
-        at = _STEP * float(np.floor((now + SAME_TIME) / _STEP))
+        at = _STEP_DETECTION * float(np.floor((now + SAME_TIME) / _STEP_DETECTION))
         newest = walker.take_steps(self.sensors, now if last else at - SURE, last, self._fixes, self._dirty)
         if newest > -np.inf:
             self._dirty, self._fixes = np.inf, [t for t in self._fixes if t > newest + SAME_TIME]
-        self._due = at + _STEP
+        self._due = at + _STEP_DETECTION
 
     def _collect(self, tracker: Tracker) -> None:
         for part in tracker.settled:
@@ -393,5 +397,5 @@ class Smoother:
         tracker.settled.clear()
         self.sensors.oldest = max(self.sensors.oldest, tracker.head)
         begin = min([tracker.head, *(max(t, tracker.head - 10.0 * CONTEXT) for t in tracker.stops[:1, 0].tolist())])
-        if self._found is None and self._judgement is None:  # else they are still to be judged by
+        if self._found is None and self._judgement is None:  # otherwise it is still to be estimated from them
             self.sensors.drop_before(begin - CONTEXT - 5.0)

@@ -1,4 +1,4 @@
-"""Where a running drive begins: which rows an alignment is tried with, and the tracker that sets out from it."""
+"""Start of a running drive: the rows of an alignment, and the tracker that starts from it."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from graphnav.constraints.base import SAME_TIME
 from graphnav.core.earth import LocalFrame
 from graphnav.core.rotation import Array
 from graphnav.detectors import detect
-from graphnav.estimation.alignment import Alignment, align, ready, with_known_heading
+from graphnav.estimation.alignment import Alignment, align, is_ready, with_known_heading
 from graphnav.estimation.building import start_sigma
 from graphnav.estimation.noise.model import NoiseModel
 from graphnav.estimation.solvers.batch import batch
@@ -22,23 +22,23 @@ from graphnav.recording import Recording
 
 
 def take_rows(sensors: Sensors, settings: Settings, now: float, last: bool) -> tuple[Recording, Array] | None:
-    """The rows up to a time (s), and stops (M, 2) in them, if they may tell an attitude; None if not yet.
+    """The rows up to a time (s), and stops (M, 2) in them, if an alignment may succeed; None if it is too early.
 
-    `last` says that no more will come, and these have to do.
+    With `last`, no more rows will arrive.
     """
     sensors.drop_contradicted()
     recording = sensors.recording(-np.inf, now)
     waits = sensors.setup.gnss is not None and not last
-    if waits and (recording.gnss is None or not ready(recording, settings)):
+    if waits and (recording.gnss is None or not is_ready(recording, settings)):
         return None
     stationary = detect(recording, settings).stationary
-    if waits and not ready(recording, settings, stationary):
-        return None  # fixes jumped while it stood
+    if waits and not is_ready(recording, settings, stationary):
+        return None  # fixes jumped at rest
     return recording, stationary
 
 
 def find_start(recording: Recording, stationary: Array, settings: Settings, frame: LocalFrame) -> Alignment:
-    """The state at the first row of a recording, of which stops (M, 2) are known.
+    """The state at the first row of a recording with known stops (M, 2).
 
     Raises
     ------
@@ -52,9 +52,9 @@ def find_start(recording: Recording, stationary: Array, settings: Settings, fram
 def make_tracker(
     found: Alignment, start: float, noise: NoiseModel, settings: Settings, frame: LocalFrame, setup: Recording
 ) -> tuple[Tracker, tuple[str, ...]]:
-    """What begins at the first row (s) that an alignment has seen, and what is to be said of that."""
+    """A tracker that starts at the first row (s) that an alignment has used, and notes."""
     stated = with_known_heading(found, settings)
-    # whether it tells the heading shows with the rows; the tree of iSAM2 moves its states by itself
+    # whether it determines the heading is only seen later; iSAM2's tree moves its states by itself
     turns = setup.gnss is None and settings.solver.engine == "window"
     message = make_first_message(stated.state, start_sigma(stated), turns)
     kind = Walker if setup.platform == "foot" else Tracker
@@ -65,15 +65,15 @@ def make_tracker(
 
 
 def list_keyframes(T: float, limit: float, fixes: list[float], period: float, last: bool) -> list[float]:
-    """Times of the keyframes after T up to `limit`: at fixes, and every `period` between; s.
+    """Times of the keyframes after T up to `limit`, s: at fixes, and every `period` between.
 
     The last of a drive is at `limit`.
     """
-    anchors = [t for t in fixes if T + SAME_TIME < t <= limit]
-    if last and limit > T + SAME_TIME and (not anchors or limit > anchors[-1] + SAME_TIME):
-        anchors.append(limit)
+    needs_keyframes = [t for t in fixes if T + SAME_TIME < t <= limit]
+    if last and limit > T + SAME_TIME and (not needs_keyframes or limit > needs_keyframes[-1] + SAME_TIME):
+        needs_keyframes.append(limit)
     times, at = [], T
-    for anchor in [*anchors, np.inf]:
+    for anchor in [*needs_keyframes, np.inf]:
         while anchor - at > period * (1.0 + 1e-6) and at + period <= limit:
             at += period
             times.append(at)

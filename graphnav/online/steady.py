@@ -1,4 +1,4 @@
-"""A smoother that goes on whatever comes: a clock that is set back, fixes that are elsewhere, a piece that fails."""
+"""A smoother that continues whatever arrives: a clock that is set back, fixes elsewhere, a piece that fails."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from graphnav.online.sensors import Row
 from graphnav.online.smoother import Smoother
 from graphnav.recording import Recording
 
-_TELLING = 512  # rows that tell which sensors are of no use
-_MOST_FAILURES = 100  # failures that are remembered
+_REPORTED_AFTER = 512  # rows after which unusable sensors are reported
+_MOST_FAILURES = 100  # failures kept in memory
 
 
 class Online(Smoother):
-    """Smooths while the drive happens.
+    """Smooths during the drive.
 
     Parameters
     ----------
     setup : a recording without rows (`graphnav.online.without_rows`): platform, noise figures, lever arms.
-    settings : as for a recording; `solver.lag` says how much future a settled state has seen.
-    engine : "window" or "isam2", what smooths; `solver.engine` of the settings when None.
+    settings : as for a recording; `solver.lag` is the span of later measurements that a settled state includes.
+    engine : the smoother, "window" or "isam2"; `solver.engine` of the settings when None.
     """
 
     def __init__(self, setup: Recording, settings: Settings | None = None, engine: str | None = None) -> None:
@@ -33,20 +33,22 @@ class Online(Smoother):
                 settings.model_dump() | {"solver": settings.solver.model_dump() | {"engine": engine}}
             )
         super().__init__(setup, settings)
-        self.clocks = 1  # how many there have been: the times of each go on by themselves
-        self._rows = 0  # that were handed over
-        self.failures: list[str] = []  # why pieces were given up
+        self.clocks = 1  # number of pieces; the times of each are independent
+        self._rows = 0  # settled trajectories that were returned
+        self.failures: list[str] = []  # reasons why pieces were abandoned
 
     def add(self, row: Row, released: bool = False) -> None:
-        """Take in one row: sensor, time, values and whether it was held as in `graphnav.online.sensors.Sensors.add`."""
+        """Process one row: sensor, time, values and whether it was held, as in
+        `graphnav.online.sensors.Sensors.add`.
+        """
         sensors, rows = self.sensors, [(row, released)]
         self._rows += 1
-        if self._rows >= _TELLING and not self._rows & (self._rows - 1):  # at powers of two
+        if self._rows >= _REPORTED_AFTER and not self._rows & (self._rows - 1):  # at powers of two
             self._say("counts", check_counts(sensors.counts))
         while rows:
             try:
                 super().add(*rows.pop(0))
-            except Exception as error:  # whatever it is, rows go on coming
+            except Exception as error:  # whatever fails, rows keep arriving
                 self._give_up(error)
             if sensors.set_back:
                 rows += [(one, False) for one in self._go_back()]
@@ -57,7 +59,7 @@ class Online(Smoother):
                 sensors.released = []
 
     def finish(self) -> None:
-        """Nothing more will come: settle all."""
+        """End of the input: settle everything."""
         self.sensors.release()
         held, self.sensors.released = self.sensors.released, []
         for row in held:
@@ -69,7 +71,7 @@ class Online(Smoother):
         self._say("counts", check_counts(self.sensors.counts))
 
     def _give_up(self, error: Exception) -> None:
-        """Drop the piece that is being smoothed, and begin anew with what comes."""
+        """Drop the piece that is being smoothed, and start anew with the next rows."""
         now = self.sensors.imu.newest
         at = traceback.extract_tb(error.__traceback__)[-1]
         said = f"at {now:.3f} s: {type(error).__name__}: {error} in {Path(at.filename).name}:{at.lineno}"
@@ -78,15 +80,15 @@ class Online(Smoother):
         self.notes.append(
             Note(
                 "online.failed",
-                f"at {now:.3f} s the smoother failed ({type(error).__name__}); what had not settled"
-                f"{f' since {since:.3f} s' if since > -1e300 else ''} is lost: aligning anew",
+                f"at {now:.3f} s the smoother failed ({type(error).__name__}); unsettled states"
+                f"{f' since {since:.3f} s' if since > -1e300 else ''} are lost: aligning anew",
             )
         )
         self.tracker = None
         self._begin_anew(now)
 
     def _go_back(self) -> list[Row]:
-        """End the piece of the old clock; returns the rows of the new one, which are to be taken in."""
+        """End the piece of the old clock; returns the rows of the new one, which are to be processed."""
         sensors = self.sensors
         rows, sensors.set_back = sensors.set_back, []
         first = next(t for sensor, t, _ in rows if sensor == "imu")
@@ -97,7 +99,7 @@ class Online(Smoother):
                 f"the clock of the IMU was set back from {before:.3f} to {first:.3f} s: aligning anew",
             )
         )
-        self.finish()  # no more rows of the old clock will come
+        self.finish()  # no more rows of the old clock will arrive
         self._faults = self.excluded
         self.clocks += 1
         self._begin_anew(float("-inf"))
@@ -107,7 +109,7 @@ class Online(Smoother):
         return rows
 
     def _go_elsewhere(self, since: float, count: int) -> None:
-        """End the piece whose fixes cannot be reached from those that outnumber them by now."""
+        """End the piece whose fixes are out of reach of those that by now outnumber them."""
         sensors = self.sensors
         sensors.moved = None
         if self.tracker is None:

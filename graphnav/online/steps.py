@@ -1,4 +1,4 @@
-"""Keyframes of a walk as it goes on, step by step, and what a step tells of those before it."""
+"""Keyframes of a running walk, step by step, and changes of earlier ones that a step brings."""
 
 from __future__ import annotations
 
@@ -15,47 +15,47 @@ from graphnav.imu.samples import bridge_gaps
 from graphnav.online.looks import SURE, Stops, clip_spans
 from graphnav.online.sensors import Sensors
 
-_WALK, _WALK_LEAST = 30.0, 4.0  # s of a walk that its detector sees, and the least
-_SHORTEST = 0.05  # s between looks at a walk that are worth keyframes
-_EDGE = 0.1  # s by which a stance ends elsewhere once it is told by rows: several periods
-_STANDS = 3.0  # s, a stance as long as that is standing, and need not be over
+_WALK, _WALK_LEAST = 30.0, 4.0  # s of a walk that its detector uses, and the least
+_DETECTION_INTERVAL = 0.05  # s between detections of steps that are worth keyframes
+_EDGE = 0.1  # s by which the end of a stance may move once later rows are known: several periods
+_STANDING = 3.0  # s; a longer stance is standing, and need not be over
 
 
 class StepCutter:
-    """Up to where a walk has been cut into steps, and what its IMU has read at most."""
+    """Progress of cutting a walk into steps, and the highest readings of its IMU."""
 
     def __init__(self) -> None:
-        self.highest: Array | None = None  # as `graphnav.imu.clipping.highest` says
+        self.highest: Array | None = None  # as returned by `graphnav.imu.clipping.highest`
         self._seen = -np.inf  # s, up to where that is known
-        self.pieces: float | None = None  # s, begin of a standing that goes on, of which keyframes were made
-        self.over: float | None = None  # s, begin of one that is over by now: its keyframes are to be made anew
+        self.pieces: float | None = None  # s, beginning of a standing that continues, of which keyframes were made
+        self.over: float | None = None  # s, beginning of one that is over: its keyframes are to be made again
 
     def until(self, sensors: Sensors, settings: Settings, standing: Stops, T: float, limit: float, last: bool) -> Array:
-        """Keyframes after T, that at T first: up to the newest stance that has begun or ended, whose spans are kept.
+        """Keyframes after T, starting with T: up to the newest stance that has begun or ended, whose spans are kept.
 
-        Only whole stances and swings say what phase a moment of them is in.
+        The phase of a moment is known only in complete stances and swings.
         """
         none, self.over = np.empty(0), None
         whole = not np.isfinite(standing.looked)
         recording = sensors.recording(-np.inf if whole else min(T, limit) - _WALK, limit + SURE)
         if recording.duration < _WALK_LEAST:
             return none
-        rows = recording.imu.t  # keyframes stand where the stances will be said to begin and end
+        rows = recording.imu.t  # keyframes are placed where the stances will begin and end
         limit = float(rows[max(int(np.searchsorted(rows, limit + SAME_TIME)) - 1, 0)])
         spans = clip_spans(to_samples(detect(recording, settings, T - _EDGE).stationary, recording), T, limit)
         ongoing = bool(len(spans)) and spans[-1, 1] >= limit - SAME_TIME
         if not last and len(spans):
-            if ongoing and limit - spans[-1, 0] < _STANDS:
+            if ongoing and limit - spans[-1, 0] < _STANDING:
                 limit, spans, ongoing = float(spans[-1, 0]), spans[:-1], False
             elif not ongoing:
                 limit = float(spans[-1, 1])
-        elif not last and limit - T < _STANDS:
+        elif not last and limit - T < _STANDING:
             return none
-        if limit - T <= _SHORTEST:
+        if limit - T <= _DETECTION_INTERVAL:
             return none
         standing.looked = limit
         standing.add(spans)
-        # a swing is one because of the stance before it
+        # a swing is defined by the stance before it
         before = standing.spans[standing.spans[:, 0] <= T]
         begin = max([T - _WALK, *before[:, 0].tolist()]) if len(before) else T
         pieces, self.pieces = self.pieces, float(standing.spans[-1, 0]) if ongoing and not last else None
@@ -66,13 +66,13 @@ class StepCutter:
         return keyframe_times(T, limit, np.concatenate([*epochs, none]), settings.keyframes.rate)
 
     def read_again(self, t: float) -> None:
-        """A row came late, at a time (s): what it reads counts, too."""
+        """A row arrived late, at a time (s): its readings count too."""
         self._seen = min(self._seen, float(np.nextafter(t, -np.inf)))
 
     def changed(self, sensors: Sensors, head: float) -> float:
-        """From when on intervals after `head` would be integrated otherwise by now, s.
+        """From when on intervals after `head` would now be integrated differently, s.
 
-        A peak is cut where the IMU's range ends, which nothing shows before it has read more.
+        A peak is clipped at the end of the IMU's range, which is known only from later readings.
         """
         now, fresh = self.highest, sensors.recording(np.nextafter(self._seen, np.inf)).imu
         if len(fresh.t):

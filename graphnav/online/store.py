@@ -1,4 +1,4 @@
-"""What an online run leaves on disk, so that nothing that has settled is lost whatever ends it.
+"""Files of an online run, so that nothing that has settled is lost however the run ends.
 
     trajectory.csv    grows as keyframes settle, by whole rows, each time made sure of (fsync)
     checkpoint        the smoother as it was at most a minute ago, and how far the source was read; replaced in one step
@@ -41,20 +41,20 @@ _PLAIN = {
     "numpy.core.numeric": ("_frombuffer",),
     "pathlib": ("Path", "PosixPath", "PurePosixPath", "WindowsPath"),
 }
-# which open files when they are made
+# these open files when they are created
 _ACTING = {("graphnav.online.store", "Store"), ("graphnav.online.session", "Session")}
 
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """A smoother, and where it was."""
+    """A smoother and its progress."""
 
     online: Online
-    source: str  # what the rows come from
-    counts: dict[str, int]  # rows taken in, settled, and lines that were bad
+    source: str  # the source of the rows
+    counts: dict[str, int]  # numbers of rows processed, rows settled, and invalid lines
     length: int  # bytes of trajectory.csv
-    journal: int  # number of the journal with what came since
-    done: bool  # nothing more will come
+    journal: int  # number of the journal with the lines since
+    done: bool  # end of the input was reached
     piece: int = 1  # number of the clock that the times are of
 
 
@@ -69,7 +69,7 @@ class Store:
 
     def __init__(self, folder: Path, source: str, resume: bool, live: bool) -> None:
         self.folder, self.source, self.live = folder, source, live
-        self.pending: deque[bytes] = deque()  # lines in the journal that were not taken in yet
+        self.pending: deque[bytes] = deque()  # lines in the journal that have not been processed
         self._journal: FileIO | None = None
         self._number, self.piece = 0, 1
         path = folder / CHECKPOINT
@@ -90,7 +90,7 @@ class Store:
                 f"-o {folder}: holds a run already; go on with --resume or name another folder", key="output.holds_run"
             )
         folder.mkdir(parents=True, exist_ok=True)
-        for other in folder.glob("trajectory-*.csv"):  # later than the checkpoint, or of a run before
+        for other in folder.glob("trajectory-*.csv"):  # later than the checkpoint, or of an earlier run
             if self.resumed is None or _number_of(other) > self.piece:
                 other.unlink()
         for other in folder.glob("journal-*"):
@@ -110,17 +110,17 @@ class Store:
 
     @property
     def trajectory(self) -> Path:
-        """The file that grows."""
+        """The growing trajectory file."""
         return self.folder / (TRAJECTORY if self.piece == 1 else f"trajectory-{self.piece}.csv")
 
     def begin_piece(self, number: int) -> None:
-        """Go on in another file."""
+        """Continue in another file."""
         self._file.close()
         self.piece = number
         self._file = self._fresh()
 
     def _fresh(self) -> FileIO:
-        """The file that grows, with nothing but its header in it."""
+        """The trajectory file with nothing but its header."""
         head = (csv.HEADER + "\n").encode()
         self._length = 0
         self._file = self.trajectory.open("w+b", buffering=0)
@@ -129,7 +129,7 @@ class Store:
         return self._file
 
     def recall(self) -> None:
-        """Make the whole lines that came after the checkpoint resumed from pending again."""
+        """Make the complete lines that arrived after the resumed checkpoint pending again."""
         path = self._path(self._number)
         if not path.exists():
             return
@@ -140,7 +140,7 @@ class Store:
         self.pending.extend(whole.split(b"\n") if whole else [])
 
     def note(self, lines: list[bytes]) -> None:
-        """Keep lines of a live source before they are taken in."""
+        """Write lines of a live source to the journal before they are processed."""
         if self._journal is None:
             self._journal = self._path(self._number).open("ab", buffering=0)
         journal = self._journal
@@ -148,7 +148,7 @@ class Store:
         self.pending.extend(lines)
 
     def append(self, tracks: list[Trajectory]) -> None:
-        """Add rows that have settled."""
+        """Append settled rows."""
         rows = "".join(csv.rows(track) for track in tracks).encode()
 
         def write() -> None:
@@ -161,7 +161,7 @@ class Store:
         self._length += len(rows)
 
     def checkpoint(self, online: Online, counts: dict[str, int], done: bool = False) -> None:
-        """Remember the smoother as it is now; what the journal held before is done with."""
+        """Write a checkpoint of the smoother; lines of the journal before it are no longer needed."""
         number = self._number + 1
         now = Checkpoint(online, self.source, counts, self._length, number, done, self.piece)
         path, fresh = self.folder / CHECKPOINT, self.folder / (CHECKPOINT + ".new")
@@ -188,11 +188,11 @@ class Store:
         self._number = number
 
     def summarise(self, text: str) -> None:
-        """Write what is said at the end."""
+        """Write the summary at the end."""
         self._guard(lambda: (self.folder / SUMMARY).write_text(text, encoding="utf-8"))
 
     def close(self) -> None:
-        """Nothing more will be written."""
+        """Close: nothing more will be written."""
         self._file.close()
         if self._journal is not None:
             self._journal.close()
@@ -201,7 +201,7 @@ class Store:
         return self.folder / f"journal-{number:06d}"
 
     def _guard(self, write: Any) -> None:
-        """Write; if that fails, what is on disk stays whole and the reason is one sentence."""
+        """Write; if that fails, the file on disk stays complete and the reason is one sentence."""
         try:
             write()
         except OSError as error:
@@ -218,7 +218,7 @@ class Store:
 
 
 class _Digested:
-    """A file that is written through a digest, so that a checkpoint is in memory nowhere as a whole."""
+    """A file that is hashed while it is written, so that a checkpoint is never in memory as a whole."""
 
     def __init__(self, file: BinaryIO) -> None:
         self._file, self.digest = file, _DIGEST()
@@ -237,7 +237,7 @@ def _read(path: Path) -> Checkpoint:
             file.seek(start)
             try:
                 found = _Unpickler(file).load()
-            except Exception:  # whatever a pickle made by somebody else stumbles over
+            except Exception:  # whatever a forged pickle causes
                 found = None
     if not isinstance(found, Checkpoint):
         raise ConfigError(f"--resume: {path} is no checkpoint of this version, or damaged", key="checkpoint.damaged")
@@ -245,7 +245,7 @@ def _read(path: Path) -> Checkpoint:
 
 
 class _Unpickler(pickle.Unpickler):
-    """Makes graphnav's own objects and arrays, and calls nothing else, whoever wrote the file."""
+    """Creates graphnav's own objects and arrays only, and calls nothing else, whoever wrote the file."""
 
     def find_class(self, module: str, name: str) -> Any:
         if module.startswith("graphnav.") and "." not in name and (module, name) not in _ACTING:

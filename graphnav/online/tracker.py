@@ -1,12 +1,12 @@
-"""The graph of a running drive: keyframes built as they come, stops classified, the window kept and settled.
+"""The graph of a running drive: keyframes built as they come, stops classified, the window maintained and settled.
 
 New keyframes are built like a recording (`graphnav.estimation.problem.build_problem`), from the rows around them: the
-same code builds the same rows as offline. Whatever changes the past inside the window (a fix that comes late, a stop
-that is recognised a second or two after it began) takes back the keyframes from there on and builds them again.
+same code builds the same rows as offline. Whatever changes the past inside the window (a fix that arrives late, a stop
+that is recognised a second or two after it began) removes the keyframes from there on and builds them again.
 
-`update` is what somebody waits for; `spare` does one thing at a time that nobody waits for. To that belongs all of the
-next keyframe but its fix: as soon as its interval is there it is built and predicted. What was made so counts as long
-as nothing that it rests on has changed; else the update makes it, from the same rows by the same code.
+`update` is on the critical path; `work_ahead` does one task at a time that nothing waits for. This includes all of the
+next keyframe but its fix: as soon as its interval is available it is built and predicted. Prepared work is used if
+nothing it depends on has changed; otherwise `update` redoes it, from the same rows by the same code.
 """
 
 from __future__ import annotations
@@ -43,17 +43,17 @@ from graphnav.online.steps import StepCutter
 from graphnav.recording import Recording
 from graphnav.recording.odometer import MeanSpeed
 
-ROWS_AFTER = 0.1  # s of rows after the last of some keyframes that these look at
-_ROWS_BEFORE = 2.0  # s of rows before a keyframe that its constraints look at where the IMU has no gap; else `CONTEXT`
-_BEFORE = 6  # keyframes built again with a new one in a stop, so that it is seen for what it is
-_PORTIONS = 8  # of the lag: keyframes settle in groups this long
-_SMOOTHED = 8  # covariances that are smoothed back over in the time in which one keyframe is linearised again
-_LATEST = 0.5  # of the lag by which they may be late for it, where states still move
+ROWS_AFTER = 0.1  # s of rows that keyframes use after the last of them
+_ROWS_BEFORE = 2.0  # s of rows before a keyframe that its constraints use where the IMU has no gap; else `CONTEXT`
+_REBUILT_BEFORE = 6  # keyframes built again with a new one in a stop, so that the stop is recognised
+_PORTIONS = 8  # of the lag: keyframes settle in groups of this duration
+_SMOOTHED = 8  # covariances that can be smoothed in the time of one relinearisation
+_LATEST = 0.5  # of the lag by which settling may be delayed while states still move
 
 
 @dataclass(frozen=True)
 class _Ahead:
-    """The keyframe that is expected next, built and predicted but for its fix, and what that rests on."""
+    """The next keyframe, built and predicted except for its fix, and what that depends on."""
 
     problem: Problem
     keyframe: Predicted
@@ -71,8 +71,8 @@ class Tracker(Chain):
     noise : how good they are taken to be.
     """
 
-    at_a_row = 64  # keyframes that are linearised again at one row of the IMU
-    at_every_row = False  # whether rows that are missing would change what is done at which
+    at_a_row = 64  # keyframes relinearised per row of the IMU
+    at_every_row = False  # whether missing rows would change the schedule of work
 
     def __init__(
         self,
@@ -89,15 +89,15 @@ class Tracker(Chain):
         self._steps = StepCutter()
         self.settled: list[SettledStates] = []
         self.in_force: dict[str, int] = {}  # rows of each constraint at the newest keyframe
-        self.seconds: dict[str, float] = {}  # of its thread, by what the newest update did
-        self._motions: dict[float, ImuFactors] = {}  # of intervals integrated already, by the time they end at
+        self.seconds: dict[str, float] = {}  # CPU seconds of its thread, by task of the newest update
+        self._motions: dict[float, ImuFactors] = {}  # integrated intervals, by their end times
         self._dirty = np.inf  # s, from where on keyframes are to be redone with the next
         self._ahead: _Ahead | None = None
-        self._tried = -np.inf  # s, the newest keyframe when some were to settle last
-        self._settling = False  # whether some are to settle once they are linearised again
+        self._tried = -np.inf  # s, the newest keyframe when settling was last due
+        self._settling = False  # whether some are to settle once they have been relinearised
 
     def note_late_row(self, sensor: str, t: float) -> None:
-        """A row came after newer ones of its sensor: what was made of those beyond it is void."""
+        """A row arrived after newer ones of its sensor: discard what was prepared from those beyond it."""
         self._ahead = None
         if sensor == "imu":
             self._motions = {end: one for end, one in self._motions.items() if end < t}
@@ -132,7 +132,9 @@ class Tracker(Chain):
         return built.redone if back is None else min(built.redone, self._go_back(sensors, built, back))
 
     def _begin(self, sensors: Sensors, new: Array, dirty: float) -> BuiltKeyframes | None:
-        """Pose the keyframes at the times `new` and those from `dirty` (s) on, which leave; None without any."""
+        """Build the keyframes at the times `new` and those from `dirty` (s) on, which are removed; None if there are
+        none.
+        """
         again = [stage.place.t for stage in self.window.since(dirty - SAME_TIME)]
         if not again and not len(new):
             return None
@@ -153,19 +155,19 @@ class Tracker(Chain):
         return BuiltKeyframes(problem, len(before), times, redone, None if ahead is None else ahead.keyframe)
 
     def _finish_keyframes(self) -> None:
-        """Keyframes have entered."""
+        """Called when keyframes have entered."""
         self.in_force = {rows.name: len(rows.b) for rows in self.window.stages[-1].measured if rows.H.any()}
         self._forget()
 
     def _go_back(self, sensors: Sensors, built: BuiltKeyframes, back: float) -> float:
-        """Redo keyframes from a time on, in which a fault was found; the first that was redone, s."""
+        """Redo keyframes from a time on, in which a fault was found; returns the first that was redone, s."""
         rest = built.times[built.times > self.newest + SAME_TIME]
         return min(back, self.update(sensors, rest, back))
 
     def work_ahead(self, sensors: Sensors, expected: float = np.inf, settling: bool = True) -> bool:
-        """Do one thing that need not wait for the next keyframe, or should not delay it; False if there is none.
+        """Do one task that need not wait for the next keyframe, or should not delay it; False if there is none.
 
-        What comes out depends on the rows that have come when it is called, so it is called at certain rows.
+        The result depends on the rows that have arrived, so it is called at fixed rows.
 
         Parameters
         ----------
@@ -196,13 +198,13 @@ class Tracker(Chain):
         elif self._standing.news or self._dirty < np.inf:
             self.update(sensors, np.empty(0))
         elif sensors.raw is None and not self._is_prepared(expected) and self._is_covered(sensors, expected):
-            self._prepare(sensors, expected)  # with raw observations a clock begins anew, which only the epoch tells
+            self._prepare(sensors, expected)  # with raw observations a clock is reset, which only the epoch determines
         else:
             return False
         return True
 
     def _integrate(self, sensors: Sensors, expected: float) -> None:
-        """The interval up to a keyframe that is expected."""
+        """Integrate the interval up to the expected keyframe."""
         T, start = self.newest, self.window.newest.state
         imu = self._cut_around(sensors, T, sensors.imu.newest).imu
         ends = np.array([T, expected])
@@ -210,12 +212,12 @@ class Tracker(Chain):
         self._motions[expected] = ImuFactors(interval, self.frame).prepare()
 
     def _is_covered(self, sensors: Sensors, t: float) -> bool:
-        """Whether the odometer has come as far as rows at a keyframe ask for."""
+        """Whether the odometer's rows reach as far as a keyframe needs them."""
         o = sensors.setup.odometer
         return o is None or sensors.odometer.newest >= t + REACH * o.delay_sigma
 
     def _prepare(self, sensors: Sensors, expected: float) -> None:
-        """Pose and predict the keyframe that is expected, but for the fix."""
+        """Build and predict the expected keyframe, except for the fix."""
         before = self._list_before(len(self.window), expected)
         problem = self._apply_noise(self._build(sensors, np.array([*before, expected]), complete=False), sensors)
         self._parameters |= problem.parameters
@@ -223,7 +225,7 @@ class Tracker(Chain):
         self._ahead = _Ahead(problem, self.window.expect(place), self.stops, self._readings.wrong)
 
     def _is_prepared(self, t: float) -> bool:
-        """Whether what was prepared for a keyframe still holds."""
+        """Whether what was prepared for a keyframe is still valid."""
         one = self._ahead
         return (
             one is not None
@@ -234,7 +236,7 @@ class Tracker(Chain):
         )
 
     def _complete(self, ahead: _Ahead | None, sensors: Sensors, before: list[float], times: Array) -> Problem | None:
-        """What was prepared for a new keyframe with its fix, if it was."""
+        """The prepared keyframe with its fix, if one was prepared."""
         if ahead is None or len(times) > 1 or len(ahead.problem.t) != len(before) + 1:
             return None
         recording = sensors.recording(float(ahead.problem.t[0]) - _ROWS_BEFORE, float(times[-1]) + ROWS_AFTER)
@@ -246,7 +248,7 @@ class Tracker(Chain):
         return problem if problem.parameters.keys() <= self._parameters.keys() else None
 
     def _revise(self, sensors: Sensors, always: bool = False) -> bool:
-        """Linearise again as much as there is time for at a row; False once there is nothing left to do."""
+        """Relinearise as much as one row permits; False once nothing is left to do."""
         more = self.window.revise(self.at_a_row, lambda *which: self._renew(sensors, *which), always)
         self._forget()
         return more
@@ -262,7 +264,7 @@ class Tracker(Chain):
             self._settle(np.inf)
 
     def _settle(self, until: float) -> None:
-        """Settle the keyframes before a time, which have been linearised again where they moved."""
+        """Settle the keyframes before a time, after relinearising those that moved."""
         self._settling = False
         count = self.window.leaving or int(np.searchsorted(self.window.t, until))
         if not count:
@@ -270,18 +272,18 @@ class Tracker(Chain):
         last = until == np.inf
         overdue = self.newest - float(self.window.stages[0].place.t) - self.settings.solver.lag
         if not last and overdue < _LATEST * self.settings.solver.lag and self.window.find_first_moved() is not None:
-            return  # still being linearised again: the next keyframe will do
+            return  # relinearisation is in progress: the next keyframe will do
         if last:
             count = len(self.window)
         elif not self.window.smooth_back(count, _SMOOTHED * self.at_a_row) and overdue < self.settings.solver.lag:
-            return  # some rows more
+            return  # some more rows
         self.settled.append(self._leave(count))
-        self._ahead = None  # what has settled may say that sigmas are others
+        self._ahead = None  # settled states may show that sigmas have changed
         self._motions = {t: one for t, one in self._motions.items() if t > self.head - CONTEXT}
         self._forget()
 
-    def afresh(self, noise: NoiseModel, setup: Recording) -> Tracker:
-        """One with another noise model that has settled what this one has, and has no keyframes since."""
+    def restart_settled(self, noise: NoiseModel, setup: Recording) -> Tracker:
+        """A tracker with another noise model, with the settled states of this one and no keyframes since."""
         other, head = copy.copy(self), self.window.head
         other.noise, other._parameters, other.verdicts = noise, {}, copy.deepcopy(self.verdicts)
         other.window = type(self.window)(head.moved(head.estimate), find_turn(setup, noise))
@@ -293,23 +295,25 @@ class Tracker(Chain):
 
     @property
     def stale(self) -> bool:
-        """Whether what has not settled was built with figures of the odometer that are known better by now."""
+        """Whether the unsettled keyframes were built with figures of the odometer that are better known by now."""
         return self._readings.revised
 
     def adopt(self, other: Tracker, stationary: Array, until: float) -> None:
-        """Take over what another has seen, but for the stops up to a time, which have been looked for anew."""
+        """Take over detections and counts of another tracker, except the stops up to a time, which were detected
+        anew.
+        """
         self._standing, self._readings = copy.copy(other._standing), copy.copy(other._readings)
         before, after = clip_spans(stationary, self.head, until - SURE), clip_spans(other.stops, until - SURE, np.inf)
         self._standing.replace(merge_spans(np.concatenate([before, after]), gap=SAME_TIME), other.times)
 
-    def back_to(self, t: float, other: Tracker) -> None:
-        """Forget the keyframes from a time on, where another has redone them and sees stops otherwise."""
+    def rewind(self, t: float, other: Tracker) -> None:
+        """Remove the keyframes from a time on, where another tracker has redone them with different stops."""
         self._keep(len(self.window) - len(self.window.since(t - SAME_TIME)))
         self._motions = {end: one for end, one in self._motions.items() if end < t}
         self._standing = copy.copy(other._standing)
 
     def live(self, sensors: Sensors) -> Live:
-        """The state at the newest IMU row, by prediction from the newest keyframe."""
+        """The state at the newest IMU row, predicted from the newest keyframe."""
         return live(self.window.newest, self.newest, self.frame, sensors, self.noise)
 
     def since(self, sensors: Sensors) -> tuple[Array, States, Array]:
@@ -319,21 +323,21 @@ class Tracker(Chain):
     # ------------------------------------------------------------------------------------------------- keyframes
     def _list_before(self, keep: int, t: float) -> list[float]:
         """Times of the keyframes that are built again with those from t on, of the first `keep` in the window."""
-        look = _BEFORE if len(self.stops) and self.stops[-1, 1] > t - _BEFORE else 1
+        look = _REBUILT_BEFORE if len(self.stops) and self.stops[-1, 1] > t - _REBUILT_BEFORE else 1
         before = [stage.place.t for stage in self.window.stages[max(0, keep - look) : keep]]
         if self.opened and len(before) < look:
             before.insert(0, self.head)
         return before
 
     def _scale_errors(self, sensors: Sensors, recording: Recording) -> Array | None:
-        """The unit of the slow errors of a recording's fixes, m."""
+        """The unit of time-correlated errors of a recording's fixes, m."""
         if recording.gnss is None:
             return None
         return sensors.gnss.typical_sigmas(recording.gnss.t)[:, :3]
 
     def _build(self, sensors: Sensors, times: Array, complete: bool = True) -> Problem:
         begin, stops = float(times[0]), self.stops
-        if len(stops):  # a stop is built whole, so that its place begins where it began
+        if len(stops):  # a stop is built as a whole, so that its place begins where it began
             stops = stops if self.foot else stops[stops[:, 1] > begin]
             here = stops[(stops[:, 0] < begin) & (stops[:, 1] > begin)]
             begin = min([begin, *here[:, 0].tolist()])
@@ -356,9 +360,9 @@ class Tracker(Chain):
         return problem
 
     def _apply_noise(self, problem: Problem, sensors: Sensors, noise: NoiseModel | None = None) -> Problem:
-        """A problem built with stated noise as the noise model has it.
+        """Apply the noise model to a problem built with stated noise.
 
-        A few keyframes do not tell how often fixes come, nor what they usually state.
+        A few keyframes do not show the period of the fixes, nor their typical sigmas.
         """
         spacing, fixes = node_spacing(self.settings.gnss.slow_times, period(sensors.gnss.used)), sensors.gnss
         usual = UsualSigmas(fixes.unit, lambda k: fixes.typical_sigmas(problem.t[k]), spacing)
@@ -366,9 +370,9 @@ class Tracker(Chain):
         return with_noise(replace(problem, constraints=rows), noise or self.noise)
 
     def _cut_around(self, sensors: Sensors, begin: float, end: float) -> Recording:
-        """The rows that keyframes between two times look at.
+        """The rows that keyframes between two times use.
 
-        Only what gaps in the IMU hide is told by the signal of the last half minute.
+        Only the noise of bridged IMU gaps depends on the signal of the last half minute.
         """
         near = sensors.recording(begin - _ROWS_BEFORE, end)
         t = near.imu.t
@@ -376,13 +380,13 @@ class Tracker(Chain):
         return near if whole else sensors.recording(begin - CONTEXT, end)
 
     def _renew(self, sensors: Sensors, first: int, end: int) -> list[Place] | None:
-        """As `_build_again`; None where that was enough for a row, and is to be asked for again at the next."""
+        """As `_build_again`; None if the work for this row is done, and it is to be called again at the next."""
         return self._build_again(sensors, first, end)
 
     def _build_again(self, sensors: Sensors, first: int, end: int) -> list[Place]:
-        """The places of the stages from `first` to `end`, built again with those around them, and stops as a whole."""
-        times, skip = self.times, len(self.times) - len(self.window)  # 1 once there is one before the first stage
-        begin, until = max(0, first + skip - _BEFORE), min(end + skip + _BEFORE, len(times))
+        """The stages from `first` to `end`, built again with those around them, and stops as a whole."""
+        times, skip = self.times, len(self.times) - len(self.window)  # 1 if there is one before the first stage
+        begin, until = max(0, first + skip - _REBUILT_BEFORE), min(end + skip + _REBUILT_BEFORE, len(times))
         for stop in self.stops if end < len(self.window) else ():
             if stop[0] < times[until - 1] < stop[1]:
                 until = int(np.searchsorted(times, stop[1] + SAME_TIME))

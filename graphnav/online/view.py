@@ -1,4 +1,4 @@
-"""What a running smoother has to show: a few lines of text."""
+"""Status of a running smoother in a few lines of text."""
 
 from __future__ import annotations
 

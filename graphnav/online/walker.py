@@ -1,8 +1,8 @@
-"""The graph of a walk that goes on: what a step adds is done a portion at a row of the IMU.
+"""The graph of a running walk: the work of a step is distributed over IMU rows.
 
-A step has some twenty keyframes, and its detector sees half a minute. Done at one row they take several periods of an
-IMU, and whoever reads its rows waits. So a row looks for steps, one builds the keyframes of those that are over, and a
-few keyframes enter at each of the next. Until all have, the state now is predicted from the keyframe before them.
+A step has some twenty keyframes, and its detector uses half a minute of rows. All at one row would take several periods
+of an IMU and delay its rows. So one row detects steps, one builds the keyframes of completed steps, and a few keyframes
+enter at each of the next. Until all have entered, the live state is predicted from the keyframe before them.
 """
 
 from __future__ import annotations
@@ -25,25 +25,25 @@ from graphnav.online.sensors import Sensors
 from graphnav.online.tracker import ROWS_AFTER, Tracker
 from graphnav.recording import Recording
 
-_ENTERING = 4  # keyframes that enter at a row: half of the 4 ms that pass to the next of an IMU at 250 Hz
-_AGAIN = 8  # that are linearised again at a row, by the same measure
-_RENEWED = 64  # that are built again at once for that: those around them, which come with them, are twelve
+_ENTERING = 4  # keyframes that enter per row: half of the 4 ms between rows of an IMU at 250 Hz
+_AGAIN = 8  # relinearised per row, by the same measure
+_RENEWED = 64  # built again at once for that: those around them, which come with them, are twelve
 
 
 @dataclass(frozen=True)
 class _Work:
-    """What is left of a step: first to build keyframes, then to let them enter."""
+    """Remaining work of a step: first building keyframes, then letting them enter."""
 
     new: Array  # (K,) s
     dirty: float  # s, from where on keyframes are redone
-    shown: tuple[Message, float]  # the keyframe, and its time, that the state now is predicted from meanwhile
+    shown: tuple[Message, float]  # the keyframe, and its time, from which the live state is predicted meanwhile
     built: BuiltKeyframes | None = None
-    entered: int = 0  # of the problem's keyframes, those before included
+    entered: int = 0  # of the problem's keyframes, including those before
 
 
 @dataclass(frozen=True)
 class _Renewal:
-    """Places built again, by their time, as long as the stops are these."""
+    """Stages built again, by their times, valid as long as the stops are these."""
 
     stops: Array = field(default_factory=lambda: np.empty((0, 2)))
     places: dict[float, Place] = field(default_factory=dict)
@@ -51,7 +51,7 @@ class _Renewal:
 
 @dataclass(frozen=True)
 class _Look:
-    """A look for steps: what was known before, and what it found."""
+    """A detection of steps: what was known before, and what it found."""
 
     limit: float  # s, up to where
     newest: float  # s, the newest keyframe then
@@ -67,7 +67,7 @@ class Walker(Tracker):
     at_every_row = True
     _work: _Work | None = None
     _renewal = _Renewal()
-    _looks: tuple[_Look, ...] = ()  # that rows which come late may have belonged to
+    _looks: tuple[_Look, ...] = ()  # to which late rows may have belonged
 
     @property
     def busy(self) -> bool:
@@ -75,7 +75,7 @@ class Walker(Tracker):
         return self._work is not None
 
     def take_steps(self, sensors: Sensors, limit: float, last: bool, fixes: list[float], dirty: float) -> float:
-        """Have the keyframes of the steps that are over by `limit` (s) enter at the rows to come, or now.
+        """Let the keyframes of steps that are over by `limit` (s) enter at the next rows, or now.
 
         Parameters
         ----------
@@ -101,11 +101,11 @@ class Walker(Tracker):
         return newest
 
     def _steps_until(self, sensors: Sensors, limit: float, last: bool) -> Array:
-        """Keyframes of a walk that can be made by now, and what they change of those before."""
-        before, newest = self._known, self.newest
+        """Keyframes of a walk that can be made by now, and their effect on those before."""
+        before, newest = self._save_cut, self.newest
         found = times = self._steps.until(sensors, self.settings, self._standing, self.newest, limit, last)
-        after = self._known
-        if (stood := self._steps.over) is not None:  # how much a foot sways is told from all of its standing
+        after = self._save_cut
+        if (stood := self._steps.over) is not None:  # the sway of a foot is estimated from all of its standing
             self._keep(len(self.window) - len(self.window.since(stood + SAME_TIME)))
             times = self._steps.until(sensors, self.settings, self._standing, self.newest, limit, last)
         looks = [one for one in self._looks if one.limit > limit - LASTING - SURE]
@@ -117,29 +117,29 @@ class Walker(Tracker):
         return times[1:] if len(self.window) or self.opened else times
 
     @property
-    def _known(self) -> tuple[Array, float, float | None]:
-        """What the next look goes on from."""
+    def _save_cut(self) -> tuple[Array, float, float | None]:
+        """The state from which the next detection continues."""
         return self._standing.spans, self._standing.looked, self._steps.pieces
 
-    def _know(self, known: tuple[Array, float, float | None]) -> None:
+    def _restore_cut(self, known: tuple[Array, float, float | None]) -> None:
         self._standing.spans, self._standing.looked, self._steps.pieces = known
 
     def look_again(self, sensors: Sensors, t: float) -> None:
-        """A row of the IMU came late, at a time (s): redo the steps that are seen otherwise with it."""
-        looks, now = [one for one in self._looks if one.limit + SURE >= t - SAME_TIME], self._known
+        """A row of the IMU arrived late, at a time (s): redo the steps that it changes."""
+        looks, now = [one for one in self._looks if one.limit + SURE >= t - SAME_TIME], self._save_cut
         for one in looks:
-            self._know(one.before)
+            self._restore_cut(one.before)
             found = self._steps.until(sensors, self.settings, self._standing, one.newest, one.limit, False)
             if not _are_same((found, self._standing.spans), (one.times, one.after[0])):
                 break
         else:
-            self._know(now)
+            self._restore_cut(now)
             return
-        self._know(now)
+        self._restore_cut(now)
         self.finish_entering(sensors)
         if one.newest < self._oldest:
-            return  # it is settled
-        self._know(one.before)
+            return  # it has settled
+        self._restore_cut(one.before)
         self._keep(len(self.window) - len(self.window.since(one.newest + SAME_TIME)))
         self._motions = {end: motion for end, motion in self._motions.items() if end <= one.newest}
         self._looks, self._renewal = tuple(x for x in self._looks if x.limit < one.limit), _Renewal()
@@ -148,7 +148,7 @@ class Walker(Tracker):
         self.finish_entering(sensors)
 
     def go_on(self, sensors: Sensors) -> None:
-        """A portion of what there is to do."""
+        """Do a portion of the work."""
         work = self._work
         assert work is not None
         built = work.built
@@ -170,7 +170,7 @@ class Walker(Tracker):
             self._go_back(sensors, built, back)
 
     def finish_entering(self, sensors: Sensors) -> None:
-        """All that is left to do, at once."""
+        """Do all remaining work at once."""
         while self._work is not None:
             self.go_on(sensors)
 
@@ -183,7 +183,7 @@ class Walker(Tracker):
         return missed
 
     def _have_missed(self, t: float) -> bool:
-        """Whether keyframes were made that would have looked at a row of the IMU at a time, s."""
+        """Whether keyframes were made that would have used a row of the IMU at a time, s."""
         self._steps.read_again(t)
         work, newest = self._work, self.newest
         if work is not None and work.built is not None:
@@ -195,14 +195,14 @@ class Walker(Tracker):
         if np.isfinite(t):
             self._renewal = _Renewal()
 
-    def afresh(self, noise: NoiseModel, setup: Recording) -> Tracker:
-        other = super().afresh(noise, setup)
+    def restart_settled(self, noise: NoiseModel, setup: Recording) -> Tracker:
+        other = super().restart_settled(noise, setup)
         assert isinstance(other, Walker)
         other._work, other._renewal = None, _Renewal()
         return other
 
     def live(self, sensors: Sensors) -> Live:
-        """The state at the newest IMU row, by prediction from the newest keyframe before those that are entering."""
+        """The state at the newest IMU row, predicted from the newest keyframe before those that are entering."""
         return live(*self._shown, self.frame, sensors, self.noise)
 
     def since(self, sensors: Sensors) -> tuple[Array, States, Array]:
@@ -219,7 +219,7 @@ class Walker(Tracker):
         return places if self._renewal is before else None
 
     def _build_again(self, sensors: Sensors, first: int, end: int) -> list[Place]:
-        """As of `Tracker`; what is built for some stages is kept for those that follow."""
+        """As in `Tracker`; what is built for some stages is kept for those that follow."""
         stages, known = self.window.stages[first:end], self._renewal
         if known.stops is not self.stops or not {stage.place.t for stage in stages} <= known.places.keys():
             until = max(end, min(first + _RENEWED, len(self.window)))
@@ -230,5 +230,5 @@ class Walker(Tracker):
 
 
 def _are_same(found: tuple[Array, Array], known: tuple[Array, Array]) -> bool:
-    """Whether keyframes and stances are."""
+    """Whether keyframes and stances are the same."""
     return all(np.array_equal(a, b) for a, b in zip(found, known, strict=True))

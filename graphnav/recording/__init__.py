@@ -1,6 +1,6 @@
-"""A recording: what the sensors said, in SI units, body axes RFU and one clock. Frozen arrays.
+"""A recording: the rows of all sensors, in SI units, body axes RFU and on one clock, as frozen arrays.
 
-`graphnav.recording.formats.read` makes one from any source graphnav knows.
+`graphnav.recording.formats.read` makes one from any source that graphnav can read.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from graphnav.sensors import Series, list_sensors
 
 @dataclass(frozen=True)
 class ImuNoise:
-    """1-sigma noise figures of an IMU, SI, continuous time (the field names are recording.toml's)."""
+    """1-sigma noise figures of an IMU, SI, continuous time (field names as in recording.toml)."""
 
     gyro_noise_density: float = 1.0e-4  # rad/s/sqrt(Hz)
     accel_noise_density: float = 1.0e-3  # m/s^2/sqrt(Hz)
@@ -47,11 +47,11 @@ class Imu:
 
     @property
     def period(self) -> float:
-        """Usual time between rows at the beginning, s."""
+        """Typical time between rows at the beginning, s."""
         return float(np.median(np.diff(self.t[:1000])))
 
 
-# Types of fixes by RTKLIB's quality numbers (SOLQ_FIX to SOLQ_PPP of rtklib.h); 0 where a fix says nothing
+# Types of fixes by RTKLIB's quality numbers (SOLQ_FIX to SOLQ_PPP of rtklib.h); 0 where a fix states none
 FIX_TYPES = {0: "unknown", 1: "fixed", 2: "float", 3: "sbas", 4: "differential", 5: "single", 6: "ppp"}
 
 
@@ -65,14 +65,14 @@ class Gnss:
     v: Array | None = None  # (M, 3) m/s, local ENU
     sd_v: Array | None = None  # (M, 3) m/s
     lever_arm: Array = field(default_factory=lambda: np.zeros(3))  # m, RFU, from the IMU
-    type: NDArray[np.intp] | None = None  # (M,) of FIX_TYPES; None: no fix says of what type it is
-    type_assumed: bool = False  # True when they are a CSV file's numbers, which were taken for RTKLIB's
+    type: NDArray[np.intp] | None = None  # (M,) of FIX_TYPES; None: no fix states its type
+    type_assumed: bool = False  # True when they are numbers of a CSV file, which were taken for RTKLIB's
     derived: bool = False  # single-point positions computed from the recording's own raw observations
-    satellites: Array | None = None  # (M,) used in each fix, NaN where unknown; only shown
+    satellites: Array | None = None  # (M,) number used in each fix, NaN where unknown; only displayed
 
     @property
     def types(self) -> dict[str, int]:
-        """How many fixes there are of each type, by its name; empty where none says."""
+        """Number of fixes of each type, by its name; empty where none states it."""
         if self.type is None:
             return {}
         return {name: n for k, name in FIX_TYPES.items() if (n := int(np.count_nonzero(self.type == k)))}
@@ -84,14 +84,14 @@ def fix_types(types: Array, numbers: dict[int, int] | None = None) -> NDArray[np
     Parameters
     ----------
     types
-        (N,) what a log says, NaN where it is blank.
+        (N,) numbers in the log, NaN where blank.
     numbers
-        The log's own numbers -> those of `FIX_TYPES`; these when None.
+        Map of the log's numbers to those of `FIX_TYPES`; None if they are the same.
 
     Returns
     -------
     array of int or None
-        (N,), 0 where a number is blank or means no type; None if no fix says its type.
+        (N,), 0 where a number is blank or not a type; None if no fix states its type.
     """
     numbers = {k: k for k in FIX_TYPES} if numbers is None else numbers
     found = np.zeros(len(types), dtype=np.intp)
@@ -104,7 +104,7 @@ def fix_types(types: Array, numbers: dict[int, int] | None = None) -> NDArray[np
 class Odometer:
     """Forward speed of the point that does not slip sideways.
 
-    Where pulses were counted, `way` is what the readings are and `speed` its slope at t.
+    Where pulses were counted, `way` is the measured quantity and `speed` its slope at t.
     """
 
     t: Array  # (M,) s
@@ -115,26 +115,26 @@ class Odometer:
     pulse: float = 0.0  # m per count
     wheels: Array | None = None  # (M, 4) m/s, front left, front right, rear left, rear right; NaN where unknown
     signed: bool = True  # False: backward reads positive
-    speed_sigma: float | None = None  # m/s, of one reading; None: told from the readings
+    speed_sigma: float | None = None  # m/s, of one reading; None: estimated from the readings
     delay_sigma: float = 0.0  # s, of the stamps; 0: they are exact
 
 
 @dataclass(frozen=True)
 class Truth:
-    """A reference, only for evaluation. Exactly one of `llh`, `xyz`, `closed_loop_sigma` is given."""
+    """A reference, used only for evaluation. Exactly one of `llh`, `xyz`, `closed_loop_sigma` is given."""
 
     t: Array  # (M,) s
     llh: Array | None = None  # (M, 3) rad, rad, m
     xyz: Array | None = None  # (M, 2 or 3) m in a local frame of unknown origin and yaw
     v: Array | None = None  # (M, 3) m/s, local ENU, NaN where absent
     rph: Array | None = None  # (M, 3) rad, NaN where absent
-    of: str = "imu"  # whose point it is: "imu", "gnss", "odometer"
+    of: str = "imu"  # the point it refers to: "imu", "gnss", "odometer"
     closed_loop_sigma: float | None = None  # m; the end is the start
 
 
 @dataclass(frozen=True)
 class Own:
-    """What a script solves a recording with beside what graphnav has, in the order of their names."""
+    """Constraints and detectors that a script adds to graphnav's own, sorted by name."""
 
     constraints: tuple[type[Any], ...] = ()
     detectors: tuple[type[Any], ...] = ()
@@ -142,7 +142,7 @@ class Own:
 
 @dataclass(frozen=True)
 class Recording:
-    """One drive or walk. `remarks` are sentences about what loading changed or found odd."""
+    """One drive or walk. `remarks` are notes on what loading changed or found unusual."""
 
     name: str
     platform: str  # "vehicle" | "foot"
@@ -151,17 +151,17 @@ class Recording:
     odometer: Odometer | None = None
     truth: Truth | None = None
     source: Path | None = None
-    files: tuple[Path, ...] = ()  # everything that was read, for provenance
+    files: tuple[Path, ...] = ()  # files that were read, for provenance
     gps_zero: float | None = None  # s since the GPS epoch (1980-01-06) at t = 0, where it is known
     remarks: tuple[str, ...] = ()
-    screened: bool = False  # whether `graphnav.recording.plausibility.screening.screen` has been over it
-    raw_gnss: RawGnss | None = None  # observations of the antenna that `gnss` has fixes of
-    sensors: Mapping[str, Series] = field(default_factory=dict)  # others (`graphnav.sensors`), by their names
-    own: Own = Own()  # as `graphnav.run` was given them
+    screened: bool = False  # whether `graphnav.recording.plausibility.screening.screen` has been applied
+    raw_gnss: RawGnss | None = None  # observations of the antenna that the fixes of `gnss` are of
+    sensors: Mapping[str, Series] = field(default_factory=dict)  # other sensors (`graphnav.sensors`), by name
+    own: Own = Own()  # as passed to `graphnav.run`
 
     @cached_property
     def start(self) -> float:
-        """Start of the first IMU period: where the recording's own clock reads 0, s."""
+        """Start of the first IMU period: zero of the recording's own clock, s."""
         return float(self.imu.t[0] - self.imu.period)
 
     @property
@@ -176,7 +176,7 @@ class Recording:
 
     @property
     def aiding(self) -> dict[str, Any]:
-        """GNSS, odometer and the other sensors that there are, by their names."""
+        """GNSS, odometer and the other sensors present, by name."""
         own = {"gnss": self.gnss, "odometer": self.odometer, **self.sensors}
         return {name: sensor for name, sensor in own.items() if sensor is not None}
 
@@ -199,7 +199,7 @@ class Recording:
         Returns
         -------
         Recording
-            The same without those rows; without the sensor where `span` is None.
+            Without those rows; without the sensor where `span` is None.
 
         Raises
         ------
@@ -223,7 +223,7 @@ class Recording:
             rest = {name: series for name, series in self.sensors.items() if name != source}
             return replace(self, sensors=rest if left is None else {**self.sensors, source: left})
         changed: dict[str, Any] = {source: left}
-        if source == "gnss" and self.raw_gnss is not None:  # whose fixes they are
+        if source == "gnss" and self.raw_gnss is not None:  # the origin of the fixes
             raw = self.raw_gnss.t - self.start
             out = np.zeros(len(raw), dtype=bool) if span is None else (raw < span[0]) | (raw > span[1])
             changed["raw_gnss"] = take_rows(self.raw_gnss, out) if out.any() else None
@@ -235,12 +235,12 @@ class Recording:
         Parameters
         ----------
         start, end
-            s from the start of the recording; to its ends when None.
+            s from the start of the recording; its own start or end when None.
 
         Returns
         -------
         Recording
-            With the rows between; a loop's truth is left out, as a part of a loop is none.
+            The rows between; the truth of a closed loop is dropped, as a part is not closed.
 
         Raises
         ------
@@ -268,12 +268,12 @@ class Recording:
             and self.truth.closed_loop_sigma is not None
             and len(parts["imu"].t) < len(self.imu.t)
         ):
-            parts["truth"] = None  # a part of a loop is none
+            parts["truth"] = None  # a part of a loop is not a loop
         return replace(self, **parts)
 
 
 def sources() -> tuple[str, ...]:
-    """Names of what can be withheld.
+    """Names of the sources that can be withheld.
 
     Returns
     -------
@@ -284,19 +284,19 @@ def sources() -> tuple[str, ...]:
 
 
 def take_rows(sensor: Any, mask: NDArray[np.bool_] | slice) -> Any:
-    """Some rows of a sensor.
+    """Select rows of a sensor.
 
     Parameters
     ----------
     sensor
         An `Imu`, `Gnss`, `Odometer` or the like.
     mask
-        (N,) bool, which rows; or a slice, and its arrays are views.
+        (N,) bool, or a slice, for which the arrays are views.
 
     Returns
     -------
     The same kind of sensor
-        All its arrays by row cut; lever arms and axes as they are.
+        With all arrays by row selected; lever arms and axes are unchanged.
     """
     parts = {
         key: value[mask]

@@ -18,26 +18,31 @@ from graphnav.core.errors import RecordingError
 from graphnav.core.rotation import Array
 
 PER_DECADE = 12  # averaging times
-_FEWEST_PERIODS = 9  # periods of the longest averaging time that the log must hold
-_SHORTEST = 60.0  # s of a log that is worth it
+_FEWEST_PERIODS = 9  # periods of the longest averaging time that the log must contain
+_SHORTEST_LOG = 60.0  # s, shortest log that is accepted
 _FLAT = 2.0 / np.pi * np.log(2.0)
-_MEANS_OF = 1.0  # s, of the means that show whether the log moves
-_TURNS, _PUSHES = np.radians(1.0), 0.1  # rad/s, m/s^2: more than this from the median, and it moves
+_MEANS_OF = 1.0  # s, over which means are taken to detect motion
+_MOVING_RATE, _MOVING_FORCE = (
+    np.radians(1.0),
+    0.1,
+)  # rad/s, m/s^2: deviation from the median above which the log is not at rest
 
 
 @dataclass(frozen=True)
 class AllanFigures:
-    """Figures of one sensor per axis (3,): of a gyro rad/s/sqrt(Hz), rad/s, rad/s/sqrt(s); with m/s^2 of forces."""
+    """Figures of one sensor per axis (3,): of a gyro in rad/s/sqrt(Hz), rad/s, rad/s/sqrt(s); of an accelerometer with
+    m/s^2.
+    """
 
     white: Array  # N, angle or velocity random walk
     instability: Array  # B
-    walk: Array  # K, 0 where the log is too short to see it
-    floor: Array  # s, where the deviation is lowest
+    walk: Array  # K, 0 where the log is too short to show it
+    floor: Array  # s, averaging time at the lowest deviation
 
 
 @dataclass(frozen=True)
 class Allan:
-    """Deviations of the six axes at averaging times, and the figures fitted to them."""
+    """Allan deviations of the six axes, and the figures fitted to them."""
 
     tau: Array  # (M,) s
     gyro: Array  # (M, 3) rad/s
@@ -48,7 +53,7 @@ class Allan:
     rate: float  # Hz
 
     def lines(self) -> list[str]:
-        """The lines to paste under [imu.noise]: root mean squares over the axes."""
+        """The lines for [imu.noise]: root mean squares over the axes."""
         out = []
         for name, noise, unit in (("gyro", self.gyro_noise, "rad/s"), ("accel", self.accel_noise, "m/s2")):
             out.append(_line(f"{name}_noise_density", _compute_rms(noise.white), f"{unit}/sqrt(Hz)"))
@@ -62,7 +67,7 @@ class Allan:
         return out
 
 
-def allan_of(t: Array, gyro: Array, accel: Array) -> Allan:
+def compute_allan(t: Array, gyro: Array, accel: Array) -> Allan:
     """Allan deviations and figures of a log at rest: t (N,) s, gyro (N, 3) rad/s, accel (N, 3) m/s^2.
 
     Raises
@@ -79,7 +84,7 @@ def allan_of(t: Array, gyro: Array, accel: Array) -> Allan:
             key="allan.gaps",
         )
     duration = len(t) * period
-    if duration < _SHORTEST:
+    if duration < _SHORTEST_LOG:
         raise RecordingError(
             f"{duration:.0f} s are too short; an hour at rest is better, a minute the least", key="allan.short"
         )
@@ -92,15 +97,17 @@ def allan_of(t: Array, gyro: Array, accel: Array) -> Allan:
         )
     m = list_averaging(len(t))
     tau = m * period
-    devs = [deviations(x, period, m) for x in (gyro, accel)]
+    devs = [compute_deviations(x, period, m) for x in (gyro, accel)]
     noises = [_fit(tau, d, len(t)) for d in devs]
     return Allan(tau, devs[0], devs[1], noises[0], noises[1], duration, 1.0 / period)
 
 
 def find_motion(t: Array, gyro: Array, accel: Array) -> float | None:
-    """The first time (s from the start) at which means over a second leave the median of the log; None at rest."""
+    """The first time (s from the start) at which means over a second deviate from the median of the log; None at
+    rest.
+    """
     n = max(round(_MEANS_OF / float(np.median(np.diff(t)))), 1)
-    for samples, limit in ((gyro, _TURNS), (accel, _PUSHES)):
+    for samples, limit in ((gyro, _MOVING_RATE), (accel, _MOVING_FORCE)):
         means = samples[: len(samples) // n * n].reshape(-1, n, 3).mean(1)
         far = np.flatnonzero((np.abs(means - np.median(means, axis=0)) > limit).any(-1))
         if len(far):
@@ -115,7 +122,7 @@ def list_averaging(count: int) -> Array:
     return np.unique(np.round(steps).astype(int))
 
 
-def deviations(x: Array, period: float, m: Array) -> Array:
+def compute_deviations(x: Array, period: float, m: Array) -> Array:
     """Overlapping Allan deviations (M, k) of samples (N, k) at averaging times of `m` (M,) samples."""
     total = np.concatenate([np.zeros((1, x.shape[1])), np.cumsum(x - x.mean(0), axis=0)]) * period
     out = np.empty((len(m), x.shape[1]))
@@ -129,7 +136,7 @@ def _fit(tau: Array, deviation: Array, count: int) -> AllanFigures:
     """N, B and K of each axis."""
     from scipy.optimize import nnls
 
-    # the relative sigma of a variance from as many independent differences as fit into the log
+    # relative sigma of a variance from as many independent differences as the log contains
     weight = np.sqrt(np.maximum(count * tau[0] / tau / 2.0 - 1.0, 0.5))
     terms = np.stack([1.0 / tau, np.full(len(tau), _FLAT), tau / 3.0], -1)
     out = []

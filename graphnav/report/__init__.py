@@ -1,1 +1,1 @@
-"""Pages for people: reports, comparisons, detections, and the figures in them."""
+"""Pages for people: reports, comparisons, detections, and their figures."""

@@ -1,4 +1,4 @@
-"""What `graphnav allan` writes: the deviations as CSV, the lines for recording.toml, and a page with a picture."""
+"""Output of `graphnav allan`: the deviations as CSV, the lines for recording.toml, and a page with a figure."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def write(result: Allan, folder: Path) -> list[Path]:
 
 
 def _picture(tau: Array, deviations: Array, noise: AllanFigures, unit: str) -> Figure:
-    """Deviations (M, 3) over averaging times (M,) s, and what was fitted to them."""
+    """Deviations (M, 3) over averaging times (M,) s, and the model fitted to them."""
     fit = _model(tau, noise)
     low, high = np.log10([min(deviations.min(), fit.min()), max(deviations.max(), fit.max())])
     figure = Figure(
@@ -50,6 +50,6 @@ def _picture(tau: Array, deviations: Array, noise: AllanFigures, unit: str) -> F
 
 
 def _model(tau: Array, noise: AllanFigures) -> Array:
-    """The fitted deviation, of the root mean square over the axes."""
+    """Deviation of the fitted model, of the root mean square over the axes."""
     N2, B2, K2 = (np.mean(np.square(x)) for x in (noise.white, noise.instability, noise.walk))
     return np.asarray(np.sqrt(N2 / tau + B2 * 2.0 / np.pi * np.log(2.0) + K2 * tau / 3.0))

@@ -1,4 +1,4 @@
-"""How a constraint's residuals or innovations compare with their sigma, in numbers and one sentence."""
+"""Comparison of a constraint's residuals or innovations with their sigma, in numbers and one sentence."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from graphnav.report.page import Quantity
 
 @dataclass(frozen=True)
 class Consistency:
-    """How one constraint's residuals compare with their sigma."""
+    """Statistics of one constraint's residuals over their sigma."""
 
     count: int
     rejected: int
     reduced: int
-    mean_nis: float  # of what was not rejected
+    mean_nis: float  # over rows that were not rejected
     dof: int
-    outside: float  # share of components beyond 3 sigma, of what was not rejected
+    outside: float  # share of components beyond 3 sigma, over rows that were not rejected
     kind: str
 
     @property
@@ -32,7 +32,7 @@ class Consistency:
             return Note("consistency.few", "too few to judge")
         ratio = self.mean_nis / self.dof
         if self.kind == "residual":
-            # a fit takes up part of the noise, so a smoother's residuals are below their sigma, never above
+            # a fit absorbs part of the noise, so a smoother's residuals may be below their sigma, never above
             if ratio > 1.3:
                 return Note(
                     "consistency.residuals_large",
@@ -49,8 +49,8 @@ class Consistency:
 def consistency(record: ConstraintRecord) -> Consistency:
     """Summarise a record.
 
-    A residual of weight w counts with the sigma that it was used with, larger by 1 / sqrt(w); of an innovation
-    the normalised square is of that already.
+    A residual of weight w is divided by the sigma it was used with, larger by 1 / sqrt(w); the normalised square of an
+    innovation includes that already.
     """
     used = record.weight > 1e-9
     weight = record.weight[used] if record.kind == "residual" else np.ones(int(used.sum()))

@@ -1,4 +1,4 @@
-"""What `graphnav detect` leaves on disk and says: detections.csv, statistics.csv.gz, detections.html, a summary."""
+"""Output of `graphnav detect`: detections.csv, statistics.csv.gz, detections.html, a summary."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from graphnav.recording.exporters.digits import rows_text
 from graphnav.report import page
 from graphnav.report import pictures as report_pictures
 
-_LISTED = 30  # stops
+_MAX_STOPS = 30  # stops listed at most
 
 
 def write(recording: Recording, found: Detections, folder: Path) -> list[Path]:
-    """All files; times are on the recording's clock, as in trajectory.csv."""
+    """Write all files; times are on the recording's clock, as in trajectory.csv."""
     folder.mkdir(parents=True, exist_ok=True)
     intervals, statistics = (folder / n for n in ("detections.csv", "statistics.csv.gz"))
     intervals.write_text(detections_text(found.all), encoding="utf-8")
-    # no name and no time in the header: the same recording gives the same bytes
+    # no name and no time in the header, so that the same recording gives the same bytes
     with statistics.open("wb") as raw, gzip.GzipFile("", "wb", 5, raw, mtime=0) as file:
         file.write(statistics_text(found).encode())
     html = folder / "detections.html"
@@ -48,12 +48,12 @@ def _page(recording: Recording, found: Detections) -> str:
 
 
 def format_fired(stop: Stop) -> str:
-    """Who found a stop, and which share of it."""
+    """The detectors that found a stop, and the share that each found."""
     return ", ".join(f"{name} {100.0 * share:.0f} %" for name, share in stop.fired.items())
 
 
 def statistics_text(found: Detections) -> str:
-    """Every detector's statistic, threshold and mask at the windows of the first; a blank where there is none."""
+    """Every detector's statistic, threshold and mask at the windows of the first; blank where there is none."""
     detections = [d for d in found.all if len(d.t)]
     if not detections:
         return "t\n"
@@ -70,7 +70,7 @@ def statistics_text(found: Detections) -> str:
 
 
 def _find_nearest(of: Array, t: Array) -> tuple[np.ndarray, np.ndarray]:
-    """Row of `of` nearest to each time, and whether it is as near as its own spacing lets it be."""
+    """Row of `of` nearest to each time, and whether it is within half of its own spacing."""
     if len(of) == 1:
         return np.zeros(len(t), dtype=int), np.abs(t - of[0]) < 1.0
     k = np.clip(np.searchsorted(of, t), 1, len(of) - 1)
@@ -79,7 +79,7 @@ def _find_nearest(of: Array, t: Array) -> tuple[np.ndarray, np.ndarray]:
 
 
 def values(recording: Recording, found: Detections) -> dict[str, Any]:
-    """The same for JSON; times are on the recording's clock, as in detections.csv."""
+    """The detections for JSON; times are on the recording's clock, as in detections.csv."""
     return {
         "recording": recording.name,
         "duration_s": recording.duration,
@@ -91,20 +91,20 @@ def values(recording: Recording, found: Detections) -> dict[str, Any]:
 
 
 def text(recording: Recording, found: Detections, files: list[Path]) -> str:
-    """Stops, seconds, the idle line or why there is none, and where to look."""
+    """Stops, seconds, the idle line or why there is none, and the files written."""
     spans = found.stationary - recording.start
     first, stops, each = _words(recording, found)
     lines = [first, f"  {stops}"]
-    lines += [f"    {a:9.2f} - {b:9.2f}  {b - a:8.2f} s" for a, b in spans[:_LISTED]]
-    if len(spans) > _LISTED:
-        lines.append(f"    ... and {len(spans) - _LISTED} more in detections.csv")
+    lines += [f"    {a:9.2f} - {b:9.2f}  {b - a:8.2f} s" for a, b in spans[:_MAX_STOPS]]
+    if len(spans) > _MAX_STOPS:
+        lines.append(f"    ... and {len(spans) - _MAX_STOPS} more in detections.csv")
     lines.append(f"  {each}")
     lines += [f"  note: {note}" for note in found.notes]
     return "\n".join([*lines, "", "look at", *(f"  {file}" for file in files)])
 
 
 def _words(recording: Recording, found: Detections) -> tuple[str, str, str]:
-    """What was looked at, how much of it stands, and what each detector says."""
+    """What was examined, the stationary share, and the notes of each detector."""
     spans = found.stationary
     seconds = float(np.diff(spans).sum()) if len(spans) else 0.0
     many = "1 stop" if len(spans) == 1 else f"{len(spans)} stops"

@@ -1,4 +1,4 @@
-"""report.html and comparison.html: what was done on what, how good it is, and whether to believe the sigma."""
+"""report.html and comparison.html: the input, the results, their errors, and whether the sigmas are consistent."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def write_report(
     spans = _shades(solution, start, withheld, outages)
     if detectors is None:
         detectors = detector_pictures(recording, solution)
-    if not pictures.has_place(solution):  # nor does what comes after
+    if not pictures.has_place(solution):  # nor the keyframes after it
         solution = replace(solution, separation=None)
     own, others = ({k: p for k, p in solution.parameters.items() if has_names(k) == of_it} for of_it in (True, False))
     sections: Sections = [
@@ -138,7 +138,7 @@ def write_report(
             "Detectors",
             [*_gallery(detectors), *tables.stop_table(solution, start, words.describe_deciding(recording, settings))],
         ),
-        ("Findings", tables.odd(recording, findings)),
+        ("Findings", tables.list_findings(recording, findings)),
         ("Run", tables.run_table(only)),
         ("Provenance", provenance_tables(settings, provenance)),
     ]
@@ -207,7 +207,7 @@ def write_comparison(
         ("Uncertainty", _gallery(pictures.sigma_pictures(tracks, start, end, spans))),
         ("Constraints", [page.table(["constraint", "solver", *tables.CONSISTENCY_HEAD], rows)] if rows else []),
         ("Noise model", [*tables.noise_tables(noise, first), *tables.excluded_table(first, start)]),
-        ("Findings", tables.odd(recording, findings)),
+        ("Findings", tables.list_findings(recording, findings)),
         ("Runs", tables.run_table(solutions)),
         ("Provenance", provenance_tables(settings, provenance)),
     ]
@@ -227,7 +227,7 @@ def detector_pictures(recording: Recording, solution: Solution) -> list[Markup]:
 
 
 def _clocks(recording: Recording) -> list[page.TimeAxis]:
-    """The recording's own clock, and where it is known which one that is GPS time and UTC."""
+    """The recording's own clock, and GPS time and UTC where its zero is known."""
     out = [page.TimeAxis("time on the recording's clock [s]", recording.start)]
     if recording.gps_zero is not None:
         gps = recording.gps_zero + recording.start
@@ -237,24 +237,24 @@ def _clocks(recording: Recording) -> list[page.TimeAxis]:
 
 
 def _shades(solution: Solution, start: float, withheld: Withheld, outages: Spans) -> Shades:
-    """Spans of time worth a tint, s from the start, by what they are."""
+    """Spans of time to be tinted, s from the start, by kind."""
     excluded = [(part.t_start - start, part.t_end - start) for part in solution.excluded]
     gone = list(dict.fromkeys(span for _, span in withheld if span is not None))
     return {"withheld": gone, "no GNSS": list(outages), "excluded": excluded}
 
 
 def _list_doubts(solutions: Mapping[str, Solution], errors: Mapping[str, Errors]) -> list[Markup]:
-    """Why the result cannot be trusted, where it cannot."""
+    """Reasons why the result cannot be trusted, if any."""
     return [page.paragraph(doubt, "verdict bad") for doubt in words.list_doubts(solutions, errors)]
 
 
 def _verdicts(solutions: Mapping[str, Solution], errors: Mapping[str, Errors]) -> list[Markup]:
     """Per solver, whether its sigma is consistent with its errors."""
     if errors:
-        return [words.believe(name, e) for name, e in errors.items()]
-    # where there is no truth a filter's innovations judge the model that all share better than any residuals
+        return [words.describe_sigma(name, e) for name, e in errors.items()]
+    # without truth, a filter's innovations test the common model better than any residuals
     filters = [s for s in solutions.values() if any(r.kind == "innovation" for r in s.records.values())]
-    return [words.believe_without_truth(solution) for solution in filters or solutions.values()]
+    return [words.describe_sigma_without_truth(solution) for solution in filters or solutions.values()]
 
 
 def _consistency(errors: Mapping[str, Errors], start: float, end: float, spans: Shades) -> list[Markup]:

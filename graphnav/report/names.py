@@ -1,4 +1,4 @@
-"""What the numbers of a calibration are: words and a unit for people, by the names that constraints give them."""
+"""Names and units, for people, of the numbers of a calibration, by the names that constraints give them."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _CROSS = ("right from forward", "right from up", "forward from right", "forward 
 
 @dataclass(frozen=True)
 class Component:
-    """One number of a parameter: what it is, and how it is shown."""
+    """One number of a parameter: its name and how it is displayed."""
 
     words: str
     unit: str
@@ -35,7 +35,7 @@ def _along(words: str) -> list[Component]:
     return [Component(f"{words}, {axis}", "m") for axis in _AXES]
 
 
-# What is of interest in a calibration; all else belongs to the noise of the measurements.
+# The parameters of a calibration; all others belong to the noise of the measurements.
 _NAMED = {
     "mounting": [Component("mounting, pitch", "deg", _DEG), Component("mounting, heading", "deg", _DEG)],
     "gnss_lever_arm": _along("antenna lever arm"),
@@ -61,18 +61,18 @@ _NAMED = {
 
 
 def has_names(name: str) -> bool:
-    """Whether a parameter is of the calibration, and its numbers have names."""
+    """Whether a parameter belongs to the calibration and its numbers have names."""
     return name in _NAMED or name == "imu_scale" or name in _by_constraints()
 
 
 @cache
 def _by_constraints() -> dict[str, list[Component]]:
-    """What constraints say of their parameters themselves."""
+    """The names that constraints give their own parameters."""
     return {name: [Component(*one) for one in each] for kind in list_constraints() for name, each in kind.words.items()}
 
 
 def components(name: str, estimate: ParameterEstimate) -> list[Component]:
-    """One for each of a parameter's numbers; those without a name are counted."""
+    """One per number of a parameter; those without a name are numbered."""
     size = estimate.value.shape[1]
     known = _scales(size // 2) if name == "imu_scale" else (_NAMED | _by_constraints()).get(name, [])
     if len(known) == size:

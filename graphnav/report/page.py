@@ -1,8 +1,8 @@
 """The HTML around figures and tables: one self-contained page, light or dark as the reader prefers.
 
-`parts.html` and `page.html` are its templates, which escape all that is no markup. Figures are drawn by plotly in the
-reader's browser: plotly's own script, 4.8 MB, and the data of all figures go into the page deflated (`page.js` unpacks
-them).
+`parts.html` and `page.html` are its templates, which escape everything that is not markup. Figures are drawn by plotly
+in the reader's browser: plotly's own script, 4.8 MB, and the data of all figures are compressed in the page (`page.js`
+decompresses them).
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from markupsafe import Markup
 from graphnav.report.plots import PALETTE, TIME, Figure, css_colours
 
 _HERE = Path(__file__).parent
-_LEVEL = 5  # of zlib: two thirds of the time of level 6, less than a hundredth larger
+_LEVEL = 5  # of zlib: two thirds of the time of level 6, and less than a hundredth larger
 
 
 def show(value: Any) -> Any:
-    """A value as words; numbers with four significant digits."""
+    """A value as text; numbers with four significant digits."""
     if value is None:
         return "-"
     if isinstance(value, bool):
@@ -50,11 +50,11 @@ def number(value: float, digits: int = 4) -> str:
 
 
 class Quantity(str):
-    """A number as it is to be shown, with its unit if need be: it stands to the right in a table."""
+    """A number and its unit, if any, as displayed: right-aligned in a table."""
 
 
 def format_measured(value: float, sigma: float) -> Quantity:
-    """A value with as many places as its sigma gives sense to."""
+    """A value with as many decimals as its sigma justifies."""
     if not (math.isfinite(value) and math.isfinite(sigma)) or sigma <= 0:
         return Quantity(number(value))
     places = 1 - math.floor(math.log10(sigma))
@@ -74,14 +74,14 @@ bullets, code, columns, digest, download, fold, gallery, heading, links, pairs, 
 
 
 def solver(name: str) -> Markup:
-    """A solver's name with its colour."""
+    """A solver's name in its colour."""
     return _PARTS.solver(name, name if name in PALETTE else "other")
 
 
 def table(head: Sequence[Any], rows: Iterable[Sequence[Any]], best: Sequence[int] = ()) -> Markup:
-    """A table, words left and numbers right; in the columns `best` the smallest number is bold.
+    """A table, text left and numbers right; in the columns `best` the smallest number is bold.
 
-    A column in which no row has its number is left out.
+    A column without any number is omitted.
     """
     rows = [list(row) for row in rows]
     known = [any(not isinstance(row[k], float) or not math.isnan(row[k]) for row in rows) for k in range(len(head))]
@@ -101,18 +101,18 @@ def table(head: Sequence[Any], rows: Iterable[Sequence[Any]], best: Sequence[int
 
 
 def _kind(value: Any) -> str:
-    """The class of a cell of words, wider for a sentence."""
+    """The class of a text cell, wider for a sentence."""
     if isinstance(value, Quantity) or not isinstance(value, str):
         return ""
     return "words long" if len(value) > 24 and not isinstance(value, Markup) else "words"
 
 
-def flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+def flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     """A nested mapping with dotted keys."""
     out: dict[str, Any] = {}
     for key, value in values.items():
         if isinstance(value, Mapping) and value:
-            out.update(flat(value, f"{prefix}{key}."))
+            out.update(flatten(value, f"{prefix}{key}."))
         else:
             out[f"{prefix}{key}"] = value
     return out
@@ -135,7 +135,8 @@ def and_list(parts: Sequence[str]) -> str:
 
 @dataclass(frozen=True)
 class TimeAxis:
-    """A clock that figures over time can be read on: what it is called, and what it reads at the start, s.
+    """A clock for the time axes of figures: its name and its reading at the start, s. `date`: seconds of the calendar
+    since 1970.
 
     `date`: the seconds are of a day of the calendar, since 1970.
     """
@@ -173,7 +174,7 @@ def _read(name: str) -> str:
 
 @dataclass(frozen=True)
 class Packed:
-    """Something deflated, as base64, and how many bytes it was."""
+    """Compressed data in base64, and its uncompressed size."""
 
     size: int
     data: Markup

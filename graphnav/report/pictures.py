@@ -1,4 +1,4 @@
-"""The pictures that `graphnav.report.documents` puts together, each from plain data to a captioned figure."""
+"""The figures of `graphnav.report.documents`, each from plain data to a figure with a caption."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ DEG_H = float(np.degrees(3600.0))
 
 
 def trajectory_picture(recording: Recording, solutions: Mapping[str, Solution], spans: Shades) -> Markup:
-    """The way from above, with what was and what was not used of the fixes."""
+    """The track from above, with the fixes that were and were not used."""
     start = recording.start
     first = next(iter(solutions.values()))
     truth = _truth(recording, solutions)
@@ -78,7 +78,7 @@ def profile_picture(recording: Recording, solutions: Mapping[str, Solution]) -> 
 
 
 def fixes_of(recording: Recording, solution: Solution) -> plots.Fixes | None:
-    """The fixes in metres, of what kind each is, and which the solver did not use though nobody withheld them."""
+    """The fixes in metres, the kind of each, and those that the solver did not use though they were not withheld."""
     if recording.gnss is None or not has_place(solution):
         return None
     gnss, t = recording.gnss, recording.gnss.t
@@ -106,7 +106,7 @@ def fixes_of(recording: Recording, solution: Solution) -> plots.Fixes | None:
 
 
 def _truth(recording: Recording, solutions: Mapping[str, Solution]) -> tuple[Array, Array] | None:
-    """Times (M,) and places (M, 2 or 3) of the truth, in metres like the first solution's."""
+    """Times (M,) and positions (M, 2 or 3) of the truth, in metres of the first solution's frame."""
     truth, first = recording.truth, next(iter(solutions.values()))
     if truth is None or (truth.llh is None and truth.xyz is None):
         return None
@@ -118,12 +118,14 @@ def _truth(recording: Recording, solutions: Mapping[str, Solution]) -> tuple[Arr
 
 
 def has_place(solution: Solution) -> bool:
-    """Whether a solution knows where on the Earth it is; else its place and heading count from the start."""
+    """Whether a solution has a place on the Earth; otherwise position and heading count from the start."""
     return any(kind.startswith("gnss") for kind in solution.records)
 
 
 def _lay_on(t: Array, xyz: Array, solution: Solution) -> tuple[Array, Array] | None:
-    """A truth (M, 2 or 3) in another frame, turned and moved onto a solution: times (N,) and places (N, 2 or 3)."""
+    """A truth (M, 2 or 3) in another frame, fitted to a solution by yaw and offset: times (N,) and positions (N, 2 or
+    3).
+    """
     shared = (t >= solution.t[0]) & (t <= solution.t[-1]) & np.isfinite(xyz).all(axis=1)
     if shared.sum() < 2:
         return None
@@ -135,7 +137,7 @@ def _lay_on(t: Array, xyz: Array, solution: Solution) -> tuple[Array, Array] | N
 
 
 def error_series(errors: Errors, start: float) -> dict[str, Series]:
-    """Errors as things to draw: position (m), velocity (m/s), attitude (deg), where there are any."""
+    """Error series to draw: position (m), velocity (m/s), attitude (deg), as far as present."""
     t = errors.t - start
     out = {}
     for kind, value, sigma, scale in (
@@ -165,7 +167,7 @@ def error_pictures(errors: Mapping[str, Errors], start: float, end: float, spans
 
 
 def _find_known(series: Mapping[str, Series]) -> list[int]:
-    """The components that any of the series has a value of: a truth may have no heights."""
+    """The components that any of the series has values of: a truth may have no heights."""
     return [k for k in range(3) if any(np.isfinite(s.value[:, k]).any() for s in series.values())]
 
 
@@ -188,7 +190,7 @@ def nees_pictures(errors: Mapping[str, Errors], start: float, end: float, spans:
 
 
 def sigma_pictures(tracks: Mapping[str, Trajectory], start: float, end: float, spans: Shades) -> list[Markup]:
-    """What the solvers themselves say of their uncertainty."""
+    """The sigmas stated by the solvers."""
     out = []
     wanted = (
         ("Position", "sd_p", ENU, "m", 1.0),
@@ -208,7 +210,9 @@ def sigma_pictures(tracks: Mapping[str, Trajectory], start: float, end: float, s
 
 
 def motion_pictures(recording: Recording, solutions: Mapping[str, Solution], spans: Shades) -> list[Markup]:
-    """Position, velocity and attitude as estimated, with 3 sigma, and what fixes and receiver said of them."""
+    """Estimated position, velocity and attitude with 3 sigma, and the fixes' and the receiver's measurements of
+    them.
+    """
     start, end = recording.start, recording.duration
     first = next(iter(solutions.values()))
     tracks = {name: s.trajectory() for name, s in solutions.items()}
@@ -245,7 +249,7 @@ def motion_pictures(recording: Recording, solutions: Mapping[str, Solution], spa
 
 
 def separation_pictures(solution: Solution, start: float, end: float, spans: Shades) -> list[Markup]:
-    """Forward filter less what comes after each keyframe."""
+    """Forward filter minus the information after each keyframe."""
     found = solution.separation
     if found is None or not np.isfinite(found.value).any():
         return []
@@ -255,7 +259,7 @@ def separation_pictures(solution: Solution, start: float, end: float, spans: Sha
 
 
 def quality_pictures(recording: Recording, solution: Solution, spans: Shades) -> list[Markup]:
-    """What fixes state of themselves: 1-sigma, horizontal and up, and satellites."""
+    """Quality stated by the fixes: 1-sigma, horizontal and up, and satellites."""
     gnss, fixes = recording.gnss, fixes_of(recording, solution)
     if gnss is None or fixes is None or not len(gnss.t):
         return []
@@ -275,7 +279,7 @@ def quality_pictures(recording: Recording, solution: Solution, spans: Shades) ->
 
 
 def _unwrap(rph: Array) -> Array:
-    """Roll, pitch, heading (N, 3) in deg; the heading, from 0 to 360 at first, without a jump."""
+    """Roll, pitch, heading (N, 3) in deg; the heading starts within 0 to 360 and has no jumps."""
     out = np.degrees(rph)
     known = np.isfinite(out[:, 2])
     heading = np.unwrap(out[known, 2], period=360.0)
@@ -301,7 +305,7 @@ def bias_pictures(solution: Solution, start: float, end: float, spans: Shades) -
 def parameter_pictures(
     parameters: Mapping[str, ParameterEstimate], solver: str, start: float, end: float, spans: Shades
 ) -> list[Markup]:
-    """Slow parameters over time with 3 sigma, where the data told anything of them."""
+    """Time-varying parameters with 3 sigma, where the data determined them."""
     out = []
     for name, p in parameters.items():
         if len(p.t) > 2 and np.any(p.sigma < 0.5 * p.prior_sigma):
@@ -329,7 +333,7 @@ def zoom_pictures(errors: Mapping[str, Errors], start: float, spans: Spans, what
 
 
 def difference_pictures(solutions: Mapping[str, Solution], start: float, end: float, spans: Shades) -> list[Markup]:
-    """How far the solvers are from the last of them, at the keyframes they share."""
+    """Differences between the solvers and the last of them, at their common keyframes."""
     name, reference = list(own_solutions(solutions).items())[-1]
     series = {}
     for key, s in solutions.items():
@@ -359,7 +363,7 @@ def record_pictures(solution: Solution, start: float, end: float, spans: Shades)
 
 
 def timeline_picture(solution: Solution, recording: Recording, spans: Shades) -> list[Markup]:
-    """Which constraint was used when."""
+    """Times at which each constraint was used."""
     records = {kind: record for kind, record in solution.records.items() if len(record.t)}
     if not records:
         return []

@@ -1,4 +1,4 @@
-"""From what, with what and how a result was made: enough to make it again."""
+"""Inputs, versions, settings and command of a result: enough to reproduce it."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SETTINGS = "settings.toml"
 
 
 def provenance_tables(settings: Mapping[str, Any], provenance: Mapping[str, Any] | None) -> list[Markup]:
-    """The command and settings that make the same again; versions and inputs."""
+    """The command and settings that reproduce the result; versions and inputs."""
     provenance = dict(provenance or {})
     out = []
     options = provenance.pop("options", None)
@@ -30,7 +30,7 @@ def provenance_tables(settings: Mapping[str, Any], provenance: Mapping[str, Any]
         out.append(page.fold("Settings as resolved", [page.download(SETTINGS, data), page.code(toml, "settings")]))
     inputs = provenance.pop("inputs", {})
     if provenance:
-        listed = [f"{key} {page.show(value)}" for key, value in page.flat(provenance).items()]
+        listed = [f"{key} {page.show(value)}" for key, value in page.flatten(provenance).items()]
         out += [page.heading("Versions"), page.paragraph(page.and_list(listed))]
     if inputs:
         rows = [[name, page.digest(digest)] for name, digest in inputs.items()]
@@ -39,7 +39,7 @@ def provenance_tables(settings: Mapping[str, Any], provenance: Mapping[str, Any]
 
 
 def command(options: Mapping[str, Any], settings: bool = True) -> str:
-    """The call of the program for options as `app.workflow.Request` keeps them, with `SETTINGS` if asked for."""
+    """The command line for options as `app.workflow.Request` stores them, with `SETTINGS` if given."""
     given = dict(options)
     name = "compare" if "solvers" in given else "smooth"
     words = ["graphnav", name, str(given.pop("recording", "RECORDING"))]
@@ -54,7 +54,7 @@ def command(options: Mapping[str, Any], settings: bool = True) -> str:
 
 
 def toml_text(values: Mapping[str, Any], table: str = "") -> str:
-    """Nested plain values as TOML; what is None is left out, as TOML has no word for it."""
+    """Nested plain values as TOML; None is omitted, as TOML cannot express it."""
     plain = [f"{key} = {_toml(value)}" for key, value in values.items()
              if value is not None and not isinstance(value, Mapping)]  # fmt: skip
     head = [f"[{table}]"] if table and (plain or not values) else []
@@ -68,5 +68,5 @@ def toml_text(values: Mapping[str, Any], table: str = "") -> str:
 def _toml(value: Any) -> str:
     if isinstance(value, list | tuple):
         return f"[{', '.join(_toml(one) for one in value)}]"
-    # JSON's words for numbers, truth and strings are TOML's
+    # JSON's numbers, booleans and strings are valid TOML
     return json.dumps(value, ensure_ascii=False)

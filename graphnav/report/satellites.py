@@ -1,4 +1,4 @@
-"""What a report shows of raw GNSS, of which a solution has rows by satellite: pictures and tables."""
+"""Report sections on raw GNSS, for a solution that has rows by satellite: figures and tables."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _ELEVATIONS = (0.0, 15.0, 30.0, 45.0, 60.0, 90.0)  # deg
 
 
 def satellite_parts(solution: Solution, start: float, end: float, spans: Shades) -> list[Markup]:
-    """The section on satellites, of a solution that has rows of them; nothing otherwise.
+    """The section on satellites, for a solution that has rows of them; empty otherwise.
 
     Parameters
     ----------
@@ -67,7 +67,7 @@ def satellite_records(solution: Solution) -> dict[str, ConstraintRecord]:
 
 
 def satellite_tables(solution: Solution) -> list[Markup]:
-    """Residuals of rows of satellites, in sigmas as weighted, by satellite and by elevation."""
+    """Residuals of satellite rows, in sigmas as weighted, by satellite and by elevation."""
     records = satellite_records(solution)
     if not records:
         return []
@@ -93,7 +93,7 @@ def satellite_tables(solution: Solution) -> list[Markup]:
 
 
 def _residual_cells(record: ConstraintRecord, some: Array) -> list[Any]:
-    """How many rows there are, the share that has less than half of its weight, and the RMS of the others in sigmas."""
+    """Number of rows, the share with less than half of their weight, and the RMS of the others in sigmas."""
     count = int(np.count_nonzero(some))
     if not count:
         return ["-", "-", "-"]
@@ -104,7 +104,7 @@ def _residual_cells(record: ConstraintRecord, some: Array) -> list[Any]:
 
 
 def ambiguity_table(solution: Solution) -> list[Markup]:
-    """How many epochs with carriers against a base station have integer ambiguities."""
+    """Numbers of epochs with integer and real-valued ambiguities, of those with carriers against a base station."""
     epochs = solution.fixed
     if not len(epochs):
         return []

@@ -1,4 +1,4 @@
-"""The sentences and the few numbers that `graphnav.report.documents` begins with, each from plain data to HTML."""
+"""The sentences and key numbers at the top of a report, each from plain data to HTML."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ from graphnav.report.tables import Withheld
 if TYPE_CHECKING:
     from graphnav.evaluation.metrics import Errors
 
-_LISTED = 6  # outages
-_FEWEST = 10  # rows that say something of a sigma
-_MOST = 0.5  # share of what the fixes say; beyond it most of what was measured contradicts the result
+_MAX_OUTAGES = 6  # outages listed at most
+_FEWEST_ROWS = 10  # rows needed to judge a sigma
+_LARGEST_EXCLUDED_SHARE = 0.5  # share of the fixes' information; above it most measurements contradict the result
 _TOO_LARGE = {"innovation": 1.5, "residual": 1.15}  # RMS over sigma; a fit reduces residuals
 
 
 def list_doubts(solutions: Mapping[str, Solution], errors: Mapping[str, Errors]) -> tuple[str, ...]:
-    """Sentences on why a result cannot be trusted, none where nothing speaks against it."""
+    """Reasons why a result cannot be trusted, as sentences; none if there are none."""
     from graphnav.evaluation.sigmas import judge_sigmas
 
     out = []
@@ -38,7 +38,7 @@ def list_doubts(solutions: Mapping[str, Solution], errors: Mapping[str, Errors])
     for solution in solutions.values():
         fixes = solution.records.get("gnss_position")
         left_out = 0.0 if fixes is None else 1.0 - float(np.mean(row_weights(fixes.t, solution.noise, "gnss_position")))
-        if left_out > _MOST:
+        if left_out > _LARGEST_EXCLUDED_SHARE:
             words = f"This result cannot be trusted: {100 * left_out:.0f} % of what the fixes say contradicts the rest "
             out.append(Note("doubt.left_out", words + "and is left out"))
             break  # all solvers use the same noise model
@@ -54,7 +54,7 @@ def list_doubts(solutions: Mapping[str, Solution], errors: Mapping[str, Errors])
         filters = [s for s in solutions.values() if any(r.kind == "innovation" for r in s.records.values())]
         for solution in filters or solutions.values():
             kind, size, used = _measure_consistency(solution)
-            if used >= _FEWEST and size > _TOO_LARGE[kind]:
+            if used >= _FEWEST_ROWS and size > _TOO_LARGE[kind]:
                 wrong.append(f"{solution.solver}: {kind}s are {size:.2f} times their sigma")
     if wrong:
         out.append(Note("doubt.sigma", f"The stated sigma cannot be trusted: {'; '.join(wrong)}"))
@@ -62,7 +62,7 @@ def list_doubts(solutions: Mapping[str, Solution], errors: Mapping[str, Errors])
 
 
 def _measure_consistency(solution: Solution) -> tuple[str, float, int]:
-    """Of a solution's records: of which kind they are, RMS over sigma, and how many rows tell it."""
+    """Kind, RMS over sigma and number of rows of each of a solution's records."""
     every = [consistency(record) for record in solution.records.values() if len(record.t)]
     every = [c for c in every if np.isfinite(c.mean_nis)]
     used = sum(c.count - c.rejected for c in every)
@@ -84,7 +84,7 @@ def describe_deciding(recording: Recording, settings: Mapping[str, Any]) -> str:
 
 
 def describe_run(recording: Recording, solutions: Mapping[str, Solution], withheld: Withheld, outages: Spans) -> str:
-    """The run in a few sentences."""
+    """Describe the run in a few sentences."""
     used = recording
     for source, span in withheld:
         if source in used.aiding:
@@ -116,8 +116,8 @@ def describe_run(recording: Recording, solutions: Mapping[str, Solution], withhe
     elif len(spans):
         words += f" The foot was found on the floor {len(spans)} times."
     if outages:
-        listed = [f"{a:.0f} to {b:.0f} s" for a, b in outages[:_LISTED]]
-        more = [f"{len(outages) - _LISTED} more"] if len(outages) > _LISTED else []
+        listed = [f"{a:.0f} to {b:.0f} s" for a, b in outages[:_MAX_OUTAGES]]
+        more = [f"{len(outages) - _MAX_OUTAGES} more"] if len(outages) > _MAX_OUTAGES else []
         words += f" There were no GNSS fixes from {page.and_list([*listed, *more])}."
     excluded = sum(int(part.count) for part in solution.excluded)
     if excluded:
@@ -128,7 +128,7 @@ def describe_run(recording: Recording, solutions: Mapping[str, Solution], withhe
 
 
 def list_tiles(recording: Recording, solutions: Mapping[str, Solution], errors: Mapping[str, Errors]) -> Markup:
-    """The few numbers to see first."""
+    """The key numbers."""
     states = next(iter(solutions.values())).states
     way = float(np.linalg.norm(np.diff(states.p, axis=0), axis=1).sum())
     out = [
@@ -154,8 +154,8 @@ def list_tiles(recording: Recording, solutions: Mapping[str, Solution], errors: 
     return page.tiles(out)
 
 
-def believe(name: str, errors: Errors) -> Markup:
-    """One sentence that compares errors with their sigma (and the truth's own, where it states one)."""
+def describe_sigma(name: str, errors: Errors) -> Markup:
+    """One sentence that compares errors with their sigma (and the truth's own, if stated)."""
     from graphnav.evaluation.sigmas import judge_sigmas
 
     judged = judge_sigmas(errors)
@@ -195,12 +195,12 @@ def believe(name: str, errors: Errors) -> Markup:
     return page.paragraph(Note("sigma.consistent", words), "verdict good")
 
 
-def believe_without_truth(solution: Solution) -> Markup:
-    """One sentence on what innovations or residuals say of the sigma, where there is no truth to say it."""
+def describe_sigma_without_truth(solution: Solution) -> Markup:
+    """One sentence on the sigma by innovations or residuals, where there is no truth."""
     kind, size, used = _measure_consistency(solution)
     missing = f"{solution.solver}: there is no truth to compare with"
     larger, mark = size > _TOO_LARGE[kind], ""
-    if used < _FEWEST:
+    if used < _FEWEST_ROWS:
         note = Note("no_truth.few", f"{missing}, and too few measurements to judge sigma by.")
     elif kind == "innovation":
         measured = f"they are {size:.2f} times as large as predicted (RMS; 1 where sigma is true)"
@@ -225,7 +225,7 @@ def believe_without_truth(solution: Solution) -> Markup:
 
 
 def describe_closure(name: str, metrics: Mapping[str, Any] | None) -> list[Markup]:
-    """How far from the start a loop ended, where that is the truth."""
+    """The closure error of a loop, where that is the truth."""
     if not metrics or metrics.get("closure_h_m") is None:
         return []
     h, up, way, share = (page.show(metrics.get(f"closure_{k}")) for k in ("h_m", "up_m", "distance_m", "percent"))

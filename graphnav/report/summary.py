@@ -1,4 +1,4 @@
-"""The first page of a report: whether position, velocity and attitude can be used, from what, and what was left out."""
+"""The first page of a report: whether position, velocity and attitude are usable, the inputs, and what was excluded."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from graphnav.report.tables import Withheld
 if TYPE_CHECKING:
     from graphnav.evaluation.metrics import Errors
 
-_LINES = 3  # of what was left out
+_LINES = 3  # exclusions listed
 _SAYS = {
     "fits": ("good", "sigma is consistent"),
     "cautious": ("", "sigma is cautious"),
     "too small": ("bad", "sigma is too small"),
     "unclear": ("", "consistency of sigma is open: errors are correlated for too long"),
 }
-# by whose innovations or residuals a block is judged where there is no truth
+# constraints whose innovations or residuals judge a block where there is no truth
 _SHOWS = {
     "position": ("gnss_position", "gnss_code"),
     "velocity": ("gnss_velocity", "gnss_doppler", "odometer", "nhc", "zero_velocity", "stance"),
@@ -39,7 +39,7 @@ _SHOWS = {
 
 
 def verdicts(solution: Solution, errors: Errors | None) -> Markup:
-    """Position, velocity and attitude: how good, and whether the stated sigma is consistent."""
+    """Accuracy of position, velocity and attitude, and whether the stated sigma is consistent."""
     judged = _judge_by_records(solution) | ({} if errors is None else _judge_by_truth(errors))
     nothing = ("", "nothing is there to judge it by")
     return page.verdicts(
@@ -62,7 +62,7 @@ def _judge_by_truth(errors: Errors) -> dict[str, tuple[str, str]]:
     worst = {"too small": 0, "unclear": 1, "cautious": 2, "fits": 3}
     out = {}
     for block, size in sizes.items():
-        # three angles together hide one: heading is judged by itself as well
+        # an average over three angles would hide a wrong one: heading is judged by itself as well
         own = [j for j in every if j.block == block or (block == "attitude" and j.block == "heading")]
         if own:
             one = min(own, key=lambda j: worst[j.verdict])
@@ -86,7 +86,7 @@ def _judge_by_records(solution: Solution) -> dict[str, tuple[str, str]]:
 
 
 def sigma_table(solution: Solution) -> list[Markup]:
-    """The stated 1-sigma that half, 95 % and all of the keyframes keep within."""
+    """The stated 1-sigma below which half, 95 % and all of the keyframes lie."""
     track = solution.trajectory()
     rows: list[list[Any]] = []
 
@@ -107,7 +107,7 @@ def sigma_table(solution: Solution) -> list[Markup]:
 
 
 def fix_table(recording: Recording, solution: Solution, withheld: Withheld) -> list[Markup]:
-    """Fixes of each kind: how many, how many were left out or used, the longest gap, the largest residual."""
+    """Fixes of each kind: number, excluded or used, longest gap, largest residual."""
     fixes, nan = fixes_of(recording, solution), float("nan")
     if fixes is None:
         return []
@@ -145,7 +145,7 @@ def fix_table(recording: Recording, solution: Solution, withheld: Withheld) -> l
 
 
 def _list_stated(recording: Recording, rows: Array) -> list[Any]:
-    """Median horizontal sigma that fixes state (m) and, where they say it, satellites: the median and the fewest."""
+    """Median horizontal sigma stated by the fixes (m) and, if stated, satellites: median and minimum."""
     gnss = recording.gnss
     assert gnss is not None
     out: list[Any] = [float(np.median(np.hypot(gnss.sd[rows, 0], gnss.sd[rows, 1])))]
@@ -157,7 +157,7 @@ def _list_stated(recording: Recording, rows: Array) -> list[Any]:
 
 
 def separation_table(solution: Solution) -> list[Markup]:
-    """Forward filter less what comes after, per axis: its size, and that over its own sigma."""
+    """Forward filter minus the information after it, per axis: its size, and that over its own sigma."""
     if solution.separation is None:
         return []
     rows: list[list[Any]] = []
@@ -183,7 +183,7 @@ def _rows_at(t: Array, of: Array | None) -> np.ndarray:
 
 
 def left_out(solution: Solution, start: float) -> list[Markup]:
-    """What was left out and why, in three lines: the largest spans, the rest together, what weighs less."""
+    """What was excluded and why, in three lines: the largest spans, the rest together, what was down-weighted."""
     spans = sorted(solution.excluded, key=lambda p: -p.count)
     some = spans[:_LINES] if len(spans) <= _LINES else spans[: _LINES - 1]
     lines = [
@@ -204,12 +204,12 @@ def left_out(solution: Solution, start: float) -> list[Markup]:
 
 
 def links(files: Sequence[str]) -> list[Markup]:
-    """The files beside the page, to open in other programs."""
+    """Links to the files beside the page, for other programs."""
     return [page.links(files)] if files else []
 
 
 def relative_tables(errors: Mapping[str, Errors]) -> list[Markup]:
-    """Relative errors by the length of segments, where there is a truth."""
+    """Relative errors by length of segment, where there is a truth."""
     rows = [
         [page.solver(name), Quantity(f"{r.length:g}"), r.count, r.rms, r.percent, r.p95, r.largest, r.heading_rms]
         for name, e in errors.items()

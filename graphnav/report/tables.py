@@ -1,4 +1,4 @@
-"""The tables and sentences that `graphnav.report.documents` puts together, each from plain data to HTML."""
+"""The tables of `graphnav.report.documents`, each from plain data to HTML."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ if TYPE_CHECKING:
     from graphnav.estimation.noise.table import FigureRow
     from graphnav.evaluation.metrics import Errors
 
-_LISTED = 40  # rejected measurements, stops
-_SHOWN = 10  # excluded spans, stops; the others open on demand
+_MAX_ROWS = 40  # rejected measurements and stops listed at most
+_UNFOLDED_ROWS = 10  # excluded spans and stops shown; the others are folded
 Withheld = Sequence[tuple[str, tuple[float, float] | None]]
 
 
 def constraint_table(solution: Solution) -> list[Markup]:
-    """Counts of everything used, and the consistency of what left a record."""
+    """Counts of everything used, and the consistency of each record."""
     out = []
     rows = [[kind, *consistency_row(consistency(record))] for kind, record in solution.records.items()]
     if rows:
@@ -98,7 +98,7 @@ def span_row(errors: Errors, span: tuple[float, float], start: float) -> list[fl
 def accuracy_tables(
     errors: Mapping[str, Errors], withheld: Withheld, start: float, outages: Spans = ()
 ) -> list[Markup]:
-    """A table of all solvers over everything, and one for each withheld span."""
+    """A table of all solvers over the whole run, and one for each withheld span."""
     if not errors:
         return []
     rows = [[page.solver(name), *accuracy_row(e)] for name, e in errors.items()]
@@ -133,7 +133,7 @@ NOISE_HEAD = ("figure", "stated", "used", "unit", "times stated sigma", "1-sigma
 
 
 def noise_tables(rows: Sequence[FigureRow], solution: Solution) -> list[Markup]:
-    """How good the sensors were taken to be, and which rows weigh less."""
+    """The noise model, and the rows that are down-weighted."""
     noise = solution.noise
     if not rows and not noise.weights:
         return [page.paragraph(Note("noise.as_stated", "All noise figures are used as they are stated."))]
@@ -180,7 +180,7 @@ def noise_tables(rows: Sequence[FigureRow], solution: Solution) -> list[Markup]:
 
 
 def _format_range(log_factor: float, sigma: float) -> Quantity:
-    """1-sigma range of a factor on sigma, of the logarithm of that on the variance."""
+    """1-sigma range of a factor on sigma, from that of the logarithm of the factor on the variance."""
     if sigma <= 0.0:
         return Quantity("-")
     low, high = (page.number(float(np.exp(0.5 * (log_factor + s * sigma))), 2) for s in (-1.0, 1.0))
@@ -188,7 +188,7 @@ def _format_range(log_factor: float, sigma: float) -> Quantity:
 
 
 def excluded_table(solution: Solution, start: float) -> list[Markup]:
-    """What the solver left out of itself, when and why."""
+    """Measurements that the solver excluded, when and why."""
     parts = solution.excluded
     if not parts:
         return []
@@ -200,14 +200,14 @@ def excluded_table(solution: Solution, start: float) -> list[Markup]:
 
 def _long_table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> list[Markup]:
     """A table whose later rows are folded."""
-    out = [page.table(head, rows[:_SHOWN])]
-    if len(rows) > _SHOWN:
-        out.append(page.fold(f"{len(rows) - _SHOWN} more", [page.table(head, rows[_SHOWN:])]))
+    out = [page.table(head, rows[:_UNFOLDED_ROWS])]
+    if len(rows) > _UNFOLDED_ROWS:
+        out.append(page.fold(f"{len(rows) - _UNFOLDED_ROWS} more", [page.table(head, rows[_UNFOLDED_ROWS:])]))
     return out
 
 
 def rejected_table(solution: Solution, start: float) -> list[Markup]:
-    """Every rejected measurement with its time; of many the largest."""
+    """Every rejected measurement with its time; the largest ones if there are many."""
     rows: list[tuple[float, list[Any]]] = []
     for kind, r in solution.records.items():
         white = np.abs(r.residual) / r.sigma
@@ -217,14 +217,14 @@ def rejected_table(solution: Solution, start: float) -> list[Markup]:
             rows.append((float(r.t[k]), [Quantity(f"{r.t[k] - start:.2f} s"), kind, size, float(white[k, worst])]))
     if not rows:
         return []
-    largest = sorted(rows, key=lambda row: -row[1][3])[:_LISTED]
+    largest = sorted(rows, key=lambda row: -row[1][3])[:_MAX_ROWS]
     table = page.table(
         ["when", "constraint", "largest component", "over sigma"], [r for _, r in sorted(largest, key=lambda r: r[0])]
     )
     many = len(rows)
     words = f"{many} rejected measurement{'s' if many > 1 else ''}"
-    if many > _LISTED:
-        words += f", the {_LISTED} farthest off"
+    if many > _MAX_ROWS:
+        words += f", the {_MAX_ROWS} farthest off"
     return [page.fold(words, [table])]
 
 
@@ -256,7 +256,7 @@ def nees_table(errors: Mapping[str, Errors]) -> list[Markup]:
 
 
 def parameter_table(parameters: Mapping[str, ParameterEstimate]) -> list[Markup]:
-    """What was estimated once or slowly: last value and sigma, and what was known before."""
+    """Constant and slowly varying parameters: last value and sigma, and their priors."""
     rows = []
     for name, p in parameters.items():
         for k, one in enumerate(components(name, p)):
@@ -270,7 +270,7 @@ def parameter_table(parameters: Mapping[str, ParameterEstimate]) -> list[Markup]
 
 
 def run_table(solutions: Mapping[str, Solution]) -> list[Markup]:
-    """Seconds by stage, iterations and cost, a column per solver; why each stopped."""
+    """Seconds by stage, iterations and cost, one column per solver; the reason why each stopped."""
     every, solutions = solutions, own_solutions(solutions)
     stages = list(dict.fromkeys(stage for s in solutions.values() for stage in s.timings))
 
@@ -293,11 +293,13 @@ def run_table(solutions: Mapping[str, Solution]) -> list[Markup]:
 
 
 def metric_tables(metrics: Mapping[str, Any] | None, name: str = "") -> list[Markup]:
-    """Whatever the evaluation measured, as tables that open on demand."""
+    """All measures of the evaluation, in folded tables."""
     if not metrics:
         return []
     plain = {key: value for key, value in metrics.items() if key not in ("spans", "notes")}
-    inner = [page.pairs({k: v if v is None or isinstance(v, float) else str(v) for k, v in page.flat(plain).items()})]
+    inner = [
+        page.pairs({k: v if v is None or isinstance(v, float) else str(v) for k, v in page.flatten(plain).items()})
+    ]
     spans = metrics.get("spans")
     if isinstance(spans, Sequence) and spans and isinstance(spans[0], Mapping):
         inner.append(page.table(list(spans[0]), [[s.get(k) for k in spans[0]] for s in spans]))
@@ -305,7 +307,7 @@ def metric_tables(metrics: Mapping[str, Any] | None, name: str = "") -> list[Mar
 
 
 def stop_table(solution: Solution, start: float, decided_by: str) -> list[Markup]:
-    """Every stop: who found which share of it, and how many rows of which constraint came of it; who decided."""
+    """Every stop: the share that each detector found, the number of rows by constraint, and which detectors decide."""
     stops = stops_of_solution(solution)
     if not stops:
         return []
@@ -316,16 +318,16 @@ def stop_table(solution: Solution, start: float, decided_by: str) -> list[Markup
             ", ".join(f"{name} {100.0 * share:.0f} %" for name, share in stop.fired.items()),
             ", ".join(f"{count} {name}" for name, count in stop.rows.items()) or "none",
         ]
-        for stop in stops[:_LISTED]
+        for stop in stops[:_MAX_ROWS]
     ]
     note = f"Decided by {decided_by}. Share: of the stop that a detector by itself calls stationary."
-    if len(stops) > _LISTED:
-        note += f" {len(stops) - _LISTED} more are in detections.csv."
+    if len(stops) > _MAX_ROWS:
+        note += f" {len(stops) - _MAX_ROWS} more are in detections.csv."
     return [*_long_table(["stands from", "for", "share by detector", "rows"], rows), page.paragraph(note, "soft")]
 
 
-def odd(recording: Recording, findings: Sequence[str]) -> list[Markup]:
-    """Findings on the recording, each said once."""
+def list_findings(recording: Recording, findings: Sequence[str]) -> list[Markup]:
+    """Findings on the recording, each listed once."""
     lines = list(dict.fromkeys([*recording.remarks, *findings]))
     if recording.imu.noise_assumed:
         lines.append("The recording states no IMU noise figures; consumer-grade ones were assumed.")

@@ -1,6 +1,6 @@
 """Sensors beside IMU, GNSS and odometer; one file each, with a module-level ``SENSOR = Sensor(...)``.
 
-A sensor of a script is made known with `register` before its recording is read.
+A script adds its own sensor with `register`, before it reads the recording.
 """
 
 from __future__ import annotations
@@ -14,7 +14,8 @@ from graphnav.sensors.base import Column, Sensor, Series
 
 __all__ = ["Column", "Sensor", "Series", "register", "registered"]
 
-_TAKEN = {"imu", "gnss", "raw_gnss", "odometer", "truth", "name", "platform", "format", "clock"}  # of recording.toml
+# keys of recording.toml
+_TAKEN = {"imu", "gnss", "raw_gnss", "odometer", "truth", "name", "platform", "format", "clock"}
 _own: dict[str, Sensor] = {}
 
 
@@ -26,12 +27,12 @@ def _find() -> dict[str, Sensor]:
 
 
 def list_sensors() -> dict[str, Sensor]:
-    """All sensors that are known, by their names."""
+    """All known sensors by name."""
     return _find() | _own
 
 
 def register(sensor: Sensor) -> Sensor:
-    """Make a sensor known, so that recordings, settings and the line protocol may name it; returns it.
+    """Add a sensor, so that recordings, settings and the line protocol may name it; returns it.
 
     Raises
     ------

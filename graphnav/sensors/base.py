@@ -1,4 +1,4 @@
-"""How a sensor is declared, once for everything that reads, cuts, checks, sends and writes its rows."""
+"""Declaration of a sensor: one object that all code for reading, cutting, checking, streaming and writing uses."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from graphnav.sensors.tables import SensorTable, TimeUnit, TomlTable
 
 @dataclass(frozen=True)
 class Column:
-    """A column of a sensor's file.
+    """One column of a sensor's file.
 
-    `units` are those of files, each with its size in SI; the first is usual, and is what recordings are written in.
-    A value outside `lowest` to `highest` (SI) cannot have been measured, and counts as absent.
+    `units` are those that files may use, each with its size in SI; the first is the default, which recordings are
+    written in. A value outside `lowest` to `highest` (SI) is treated as missing.
     """
 
     name: str
@@ -32,10 +32,10 @@ class Column:
 
 @dataclass(frozen=True)
 class Sensor:
-    """A sensor beside IMU, GNSS and odometer, whose rows are a time and some numbers.
+    """A sensor beside IMU, GNSS and odometer: each row is a time and some numbers.
 
-    `needs` are sets of columns one of which a row must have whole; the others are optional. `figures` are the keys of
-    its table in recording.toml beside those that all sensors have. With `keyframes` a state is wanted at each row.
+    `needs` are sets of columns; a row must be complete in one of them, other columns are optional. `figures` are the
+    keys of its table in recording.toml beside the common ones. With `keyframes`, a state is placed at each row.
     """
 
     name: str
@@ -56,13 +56,13 @@ class Sensor:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the columns, without t."""
+        """Names of the columns, without t."""
         return tuple(c.name for c in self.columns)
 
     @cached_property
     def table(self) -> type[SensorTable]:
-        """The table of recording.toml."""
-        make: Any = create_model  # whose fields are not known before
+        """The model of its table in recording.toml."""
+        make: Any = create_model  # whose fields are not known statically
         kinds: dict[str, Any] = {c.name: (Literal[tuple(c.units)], next(iter(c.units))) for c in self.columns}
         units = make(f"{self.name}_units", __base__=TomlTable, t=(TimeUnit, "s"), **kinds)
         bases = (SensorTable,) if self.figures is TomlTable else (self.figures, SensorTable)
@@ -71,20 +71,20 @@ class Sensor:
         return made  # type: ignore[no-any-return]
 
     def usable(self, values: Array) -> NDArray[np.bool_]:
-        """(N,) which rows (N, k) have all columns of one of the sets that are needed."""
+        """(N,) whether rows (N, k) are complete in one of the sets of columns that `needs` lists."""
         there, out = np.isfinite(values), np.zeros(len(values), dtype=bool)
         for some in self.needs:
             out |= there[:, [self.names.index(name) for name in some]].all(axis=1)
         return out
 
     def within_bounds(self, values: Array) -> Array:
-        """Rows (N, k) with NaN in place of what cannot have been measured."""
+        """Rows (N, k) with NaN in place of values outside the bounds."""
         lowest, highest = np.array([(c.lowest, c.highest) for c in self.columns]).T
         with np.errstate(invalid="ignore"):
             return np.where((values >= lowest) & (values <= highest), values, np.nan)
 
     def series(self, t: Array, columns: Mapping[str, Array], **figures: Any) -> Series:
-        """Rows made in a script.
+        """Make a series of arrays, as a script does.
 
         Parameters
         ----------
@@ -114,7 +114,7 @@ class Sensor:
 
 @dataclass(frozen=True)
 class Series:
-    """What a sensor said: rows of numbers in SI, NaN where a row has none."""
+    """The rows of one sensor: numbers in SI, NaN where a row has none."""
 
     sensor: Sensor
     t: Array  # (N,) s, strictly increasing
@@ -125,10 +125,10 @@ class Series:
         return len(self.t)
 
     def __getitem__(self, column: str) -> Array:
-        """(N,) of one column."""
+        """(N,) values of one column."""
         return np.asarray(self.values[:, self.sensor.names.index(column)])
 
     def sigma(self, column: str, otherwise: float) -> Array:
-        """(N,) 1-sigma that the rows state in the column ``sd_...``, and what stands for it where they state none."""
+        """(N,) 1-sigma from the column ``sd_...``, `otherwise` where a row states none."""
         stated = self[f"sd_{column}"]
         return np.where(np.isfinite(stated), stated, otherwise)

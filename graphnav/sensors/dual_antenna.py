@@ -1,4 +1,4 @@
-"""Two antennas on one receiver: the direction from the first to the second, as heading and, where it is told, pitch."""
+"""Two antennas on one receiver: heading, and pitch if given, of the line from the first to the second."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from graphnav.sensors.tables import ANGLE, NotNegative, Positive, TomlTable, Vec
 
 
 class Figures(TomlTable):
-    """What [dual_antenna] says beside its file."""
+    """Keys of [dual_antenna] beside its file."""
 
     baseline: Vector = Field(
         (0.0, 1.0, 0.0), description="from the first to the second antenna: right, forward, up; any length"
     )
-    # carriers are good to 5 mm: 0.3 deg over a metre
+    # carrier phases are good to 5 mm: 0.3 deg over a metre
     sigma: Positive = Field(0.3, description="deg, 1-sigma of a heading that states none, and of a pitch")
-    # antennas are set by hand: 2 cm in a metre
+    # antennas are mounted by hand: 2 cm in a metre
     baseline_sigma: NotNegative = Field(1.0, description="deg, 1-sigma of the baseline's direction; 0 = exact")
 
     @field_validator("baseline")
@@ -28,15 +28,15 @@ class Figures(TomlTable):
         return baseline
 
 
-_SD = (np.radians(1e-3), np.radians(90.0))  # less is no receiver's, more says nothing
+_SIGMA_RANGE = (np.radians(1e-3), np.radians(90.0))  # a receiver states no less, and more is no information
 SENSOR = Sensor(
     name="dual_antenna",
     about="heading, and pitch, of the line from one antenna to another",
     columns=(
         Column("heading", ANGLE, -2.0 * np.pi, 2.0 * np.pi),
         Column("pitch", ANGLE, -0.5 * np.pi, 0.5 * np.pi),
-        Column("sd_heading", ANGLE, *_SD),
-        Column("sd_pitch", ANGLE, *_SD),
+        Column("sd_heading", ANGLE, *_SIGMA_RANGE),
+        Column("sd_pitch", ANGLE, *_SIGMA_RANGE),
     ),
     needs=(("heading",),),
     figures=Figures,

@@ -1,4 +1,4 @@
-"""What tables of a recording.toml are made of: numbers that can be used, units, and what every sensor's table holds."""
+"""Building blocks of the tables in recording.toml: valid numbers, units, and the keys common to all sensors."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from pydantic.types import Strict
 
 from graphnav.core.complaints import suggest_nearest
 
-_SMALLEST, _LARGEST = 1e-15, 1e9  # of a figure: squares of it are numbers
-_LONGEST = 1e7  # of the components of a vector: m, from the Earth's centre at most, or of a direction
+_SMALLEST, _LARGEST = 1e-15, 1e9  # of a number, so that its square can be represented
+_MAX_COMPONENT = 1e7  # of the components of a vector: m from the Earth's centre, or a direction
 
 Number = Annotated[float, Strict(), Field(allow_inf_nan=False)]
 
@@ -28,13 +28,13 @@ NotNegative = Annotated[float, Strict(), Field(allow_inf_nan=False, ge=0), After
 
 
 def three_numbers(value: Any) -> Any:
-    """A vector; ValueError if the value is none."""
+    """Check a vector of three numbers; ValueError otherwise."""
     if not isinstance(value, list | tuple) or len(value) != 3:
         raise ValueError("must be three numbers in brackets")
     if any(isinstance(x, bool) or not isinstance(x, int | float) or not np.isfinite(x) for x in value):
         raise ValueError("must be three numbers in brackets")
-    if any(abs(x) > _LONGEST for x in value):
-        raise ValueError(f"must be three numbers in brackets, none beyond {_LONGEST:g}")
+    if any(abs(x) > _MAX_COMPONENT for x in value):
+        raise ValueError(f"must be three numbers in brackets, none beyond {_MAX_COMPONENT:g}")
     return tuple(float(x) for x in value)
 
 
@@ -47,7 +47,7 @@ TimeUnit = Literal["s", "ms", "us", "ns"]
 
 
 class TomlTable(BaseModel):
-    """A table: unknown keys and changes are refused."""
+    """A table that refuses unknown keys and cannot be changed."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -60,14 +60,14 @@ Topics = Annotated[tuple[str, ...], BeforeValidator(_one_or_more)]
 
 
 class Keep(TomlTable):
-    """Rows to use: those whose column holds at least this."""
+    """Selects rows whose column holds at least this value."""
 
     column: str
     at_least: Number
 
 
 class SensorTable(TomlTable):
-    """What every sensor's table may hold."""
+    """The keys common to all sensors' tables."""
 
     required: ClassVar[tuple[str, ...]] = ()
     optional: ClassVar[tuple[str, ...]] = ()

@@ -1,7 +1,7 @@
 """Simulated recordings with exact truth: `simulate("li2024", seed=1)`.
 
-A scenario is a function of a seed and a few options; `scenarios()` lists them. Every number that comes from here is
-called simulated, in the recording's name too.
+A scenario is a function of a seed and a few options; `scenarios()` lists them. All results are labelled as simulated,
+also in the recording's name.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ __all__ = ["Scenario", "Simulated", "catalogue", "options_from", "scenario", "sc
 
 
 def scenario(name: str) -> Scenario:
-    """The scenario of a name.
+    """The scenario of that name.
 
     Raises
     ------
@@ -39,21 +39,21 @@ def simulate(name: str, seed: int = 0, **options: Any) -> Simulated:
     Parameters
     ----------
     name
-        Of the scenario: `graphnav simulate --list`.
+        Name of the scenario; `graphnav simulate --list` lists them.
     seed
-        Of all random numbers.
+        Seed of all random numbers.
     options
         The scenario's own.
 
     Returns
     -------
     Simulated
-        The recording, the truth at every sample, the stops and what was put in.
+        The recording, the truth at every sample, the stops and the parameters of the simulation.
 
     Raises
     ------
     ConfigError
-        For an unknown scenario or option, or an option's impossible value.
+        For an unknown scenario or option, or an invalid value of an option.
     """
     one = scenario(name)
     known = defaults(one)
@@ -78,7 +78,7 @@ def defaults(one: Scenario) -> dict[str, Any]:
 
 
 def _fits_default(value: Any, default: Any) -> bool:
-    """Whether a value may stand for a default: numbers for numbers, of which True is none."""
+    """Whether a value has the type of a default: a number for a number, which True is not."""
     if isinstance(default, bool) or isinstance(value, bool):
         return isinstance(default, bool) and isinstance(value, bool)
     if isinstance(default, float | int):
@@ -87,7 +87,7 @@ def _fits_default(value: Any, default: Any) -> bool:
 
 
 def options_from(name: str, settings: Sequence[str]) -> dict[str, Any]:
-    """Options from the command line's KEY=VALUE; values are written as in TOML, text without quotes.
+    """Parse options KEY=VALUE of the command line; values are written as in TOML, text without quotes.
 
     Raises
     ------
@@ -111,7 +111,7 @@ def options_from(name: str, settings: Sequence[str]) -> dict[str, Any]:
 
 
 def catalogue() -> str:
-    """Every scenario with its sentence and its options."""
+    """Every scenario with its description and options."""
     lines = []
     for name, one in scenarios().items():
         options = ", ".join(f"{key}={str(value).lower()}" for key, value in defaults(one).items())

@@ -1,4 +1,4 @@
-"""GNSS fixes and wheel speeds, with the errors that real ones have."""
+"""GNSS fixes and wheel speeds with realistic errors."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ Three = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class SimulatedFault:
-    """A span in which fixes go wrong while their stated sigmas stay: times are the motion's, s."""
+    """A span in which fixes go wrong while their stated sigmas stay unchanged: times are the motion's, s."""
 
     start: float
     end: float
-    noise: float = 1.0  # white errors of position and velocity are so many times larger
-    growth: Three = (0.0, 0.0, 0.0)  # m/s east, north, up: a position error that grows from nothing
+    noise: float = 1.0  # factor on the white errors of position and velocity
+    growth: Three = (0.0, 0.0, 0.0)  # m/s east, north, up: rate of a growing position error
     velocity: Three = (0.0, 0.0, 0.0)  # m/s added to the velocity
 
 
@@ -41,14 +41,14 @@ class GnssModel:
     slow_time: float = 120.0  # s
     velocity: Three | None = (0.03, 0.03, 0.05)  # m/s; None: no velocities
     rate: float = 1.0  # Hz
-    phase: float = 0.0  # s by which fixes come after whole periods
+    phase: float = 0.0  # s by which fixes follow whole periods
     lever_arm: Three = (0.0, 0.5, 0.1)  # m, IMU to antenna, IMU's axes
     outages: tuple[Span, ...] = ()
     dropouts: float = 0.0  # share of single fixes that are missing
     faults: tuple[SimulatedFault, ...] = ()
 
     def read(self, motion: TrueMotion, seed: int) -> Gnss:
-        """The fixes of a drive."""
+        """Simulate the fixes of a drive."""
         t0, t1 = motion.t[0], motion.t[-1]
         t = t0 + self.phase + np.arange(int((t1 - t0 - self.phase) * self.rate + 1e-6) + 1) / self.rate
         llh, v = motion.point(t, np.array(self.lever_arm))
@@ -79,7 +79,7 @@ class GnssModel:
 
 
 def displace(llh: Array, enu: Array) -> Array:
-    """Places (n, 3) displaced by metres east, north, up, by the ellipsoid's radii there."""
+    """Places (n, 3) displaced by metres east, north, up."""
     w = 1.0 - E2 * np.sin(llh[:, 0]) ** 2
     north, east = A * (1.0 - E2) / w**1.5 + llh[:, 2], A / np.sqrt(w) + llh[:, 2]
     return llh + np.column_stack([enu[:, 1] / north, enu[:, 0] / (east * np.cos(llh[:, 0])), enu[:, 2]])
@@ -87,7 +87,7 @@ def displace(llh: Array, enu: Array) -> Array:
 
 @dataclass(frozen=True)
 class OdometerModel:
-    """The wheels' speed: a reading is the mean over one period around its time (less the delay)."""
+    """Wheel speed: a reading is the mean over one period around its time (minus the delay)."""
 
     rate: float = 20.0  # Hz, 10 to 100
     scale: float = 0.01  # 1-sigma of the scale error
@@ -95,11 +95,11 @@ class OdometerModel:
     pulse: float = 0.0  # m per pulse; 0: not counted in pulses
     delay: float = 0.0  # s by which readings come late; a recording states it as the 1-sigma of its stamps
     signed: bool = True
-    stuck: tuple[Span, ...] = ()  # reads zero whatever the wheels do
+    stuck: tuple[Span, ...] = ()  # reads zero regardless of the wheels
     unplugged: tuple[Span, ...] = ()  # no readings
 
     def read(self, path: Path, mount: Mount, seed: int) -> tuple[Odometer, float]:
-        """The readings of a drive, and the scale error that is in them."""
+        """Simulate the readings of a drive; returns also their scale error."""
         rng = stream(seed, "odometer")
         scale = self.scale * rng.standard_normal()
         t = path.start + np.arange(int((path.end - path.start) * self.rate + 1e-6) + 1) / self.rate
@@ -119,7 +119,7 @@ class OdometerModel:
         kept = np.ones(len(t), dtype=bool)
         for a, b in self.unplugged:
             kept &= ~((t >= a) & (t <= b))
-        # a recording states what its scale may be wrong by; a scale that is exact still has a tyre's wear
+        # a recording states its scale uncertainty; even an exact scale changes with tyre wear
         stated = max(self.scale, 0.001)
         readings = Odometer(
             t[kept], speed[kept], mount.axle_lever_arm, stated, signed=self.signed, delay_sigma=self.delay

@@ -1,4 +1,4 @@
-"""Where and when one foot of a walker stands: footprints along a route of straights and corners."""
+"""Footprints of a walker's foot along a route of straights and corners: places and times."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def rectangle(perimeter: float, laps: int, corner: float = 0.6, ratio: float = 0
 
 @dataclass(frozen=True)
 class Footprints:
-    """K footprints of one foot; the first begins before the walk does, the last never ends."""
+    """K footprints of one foot; the first begins before the walk, the last does not end."""
 
     place: Array  # (K, 2) m, east and north: the ball of the foot on the floor
     land: Array  # (K,) rad, heading when it comes down
@@ -70,7 +70,7 @@ class Footprints:
 
 @dataclass(frozen=True)
 class Cadence:
-    """How a walker of a speed steps, and how evenly."""
+    """Stride of a walker at some speed, and its variation."""
 
     speed: float  # m/s
     length: float  # m, of a stride
@@ -93,10 +93,10 @@ def footsteps(
     along: Route, cadence: Cadence, start: float, walked: float, end: float, rng: np.random.Generator, *,
     side: float = 0.08, toe_out: float = 6.0, closed: bool = False,
 ) -> Footprints:  # fmt: skip
-    """Footprints of a foot `side` m right of the route, which walks from `start` for `walked` s of one to `end`.
+    """Footprints of a foot `side` m right of the route, which walks from `start` for `walked` s to `end`.
 
-    It begins and ends with strides of some two thirds, standing beside the other foot; strides are shorter in
-    corners. A foot that turns does a third of it on the floor, on its ball. `toe_out` in deg; `closed` puts the last
+    It begins and ends with strides of some two thirds, standing beside the other foot; strides are shorter in corners.
+    A third of a foot's turning takes place on the floor, about its ball. `toe_out` in deg; `closed` puts the last
     footprint on the first.
     """
     count = max(3, round(along.length / cadence.length + 0.7))

@@ -1,4 +1,4 @@
-"""How a foot moves: rolling over the floor from heel to toes, then through the air to its next footprint.
+"""Motion of a foot: rolling over the floor from heel to toes, then through the air to its next footprint.
 
 On the floor a shoe is a convex body that rolls without slipping. With h(theta) the height of the IMU over the floor
 at pitch theta (the support function of the sole as seen from the IMU), a turn by d theta carries the IMU forward by
@@ -29,8 +29,8 @@ STEP = 0.005  # s between coefficients: a shock lasts some 15 ms
 DEGREE = 4  # force and turn acceleration are continuous
 EAST, NORTH, UP, ROLL, PITCH, HEADING = range(6)  # channels: m, rad
 PLACE = slice(EAST, UP + 1)
-_MUSCLE = 0.012  # s, the time in which a turn rate can change
-_SWING = 0.045  # s, over which the foot's height in the air is evened out
+_MUSCLE = 0.012  # s, the shortest time in which a turn rate can change
+_SWING = 0.045  # s, over which the foot's height in the air is smoothed
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class Sole:
     points: tuple[tuple[float, float], ...] = (
         (-0.135, -0.080), (-0.105, -0.093), (0.100, -0.093), (0.140, -0.089), (0.180, -0.076),
     )  # fmt: skip
-    ball: int = 2  # which of them a foot turns on
+    ball: int = 2  # points about which a foot turns
     # m, over which the weight goes from one to the next: from landing to lift-off the pivot travels 16 cm, in motion
     # capture of real shoes 15
     softness: float = 0.006
@@ -64,16 +64,16 @@ class Sole:
 
 @dataclass(frozen=True)
 class Style:
-    """How high, how far and how hard; angles in deg."""
+    """Height, distance and impact of a step; angles in deg."""
 
     strike_pitch: float
     off_pitch: float
     last_pitch: float  # the steepest, just after lift-off
     high_pitch: float  # the toes' highest, before the strike
     clearance: float  # m, at its highest
-    landing: tuple[float, float]  # m/s, forward and down, that the strike ends
-    impact: float  # m/s^2, of the shaking that a strike leaves
-    give: float  # s, by which the shoe and the flesh soften the strike
+    landing: tuple[float, float]  # m/s, forward and down, stopped by the strike
+    impact: float  # m/s^2, of the vibration after a strike
+    give: float  # s, over which the shoe and soft tissue spread the strike
     swing_roll: float = 7.0
     swing_yaw: float = 4.0
     circumduction: float = 0.025  # m, outward
@@ -81,7 +81,7 @@ class Style:
 
     @classmethod
     def of(cls, speed: float) -> Style:
-        """Of a walking speed, m/s."""
+        """The style at a walking speed, m/s."""
         v = float(np.clip(speed, 0.5, 2.2))
         hard = max(v - 1.2, 0.0)
         return cls(
@@ -111,7 +111,7 @@ _ROLLING = ((_FLAT, 1.6), (0.38, -0.3), (_HEEL_OFF, -2.6), (0.74, -6.5), (0.88, 
 def walk(steps: Footprints, style: Style, sole: Sole, end: float, rng: np.random.Generator) -> Foot:
     """The foot's motion from 0 to `end` s over its footprints.
 
-    The first stance is rest until the heel lifts, the last is rest from the slap on.
+    The first stance is rest until the heel lifts, the last is rest after the landing.
     """
     K = len(steps)
     t = centres(0.0, end, STEP, DEGREE)
@@ -134,7 +134,7 @@ def walk(steps: Footprints, style: Style, sole: Sole, end: float, rng: np.random
     ahead = np.diff(steps.place, axis=0)
     share, slope = _share_of_swing(u), u**6 - u**5  # the latter: of unit slope at its end, else nothing at both
     landing = style.landing[0] * vary[1:, 0] * took / np.maximum(np.linalg.norm(ahead, axis=1), 0.1)
-    # the shoe gives way by millimetres, by which it takes the edge off what ends with the strike
+    # the sole compresses by millimetres, which softens the end of the strike
     share = gaussian_filter1d(share + np.minimum(landing, 0.5)[k] * slope + k, style.give / STEP) - k
     base = steps.place[k] + share[:, None] * ahead[k]
     h = sole.height(pitch)
@@ -155,7 +155,7 @@ def walk(steps: Footprints, style: Style, sole: Sole, end: float, rng: np.random
 
 
 def _smooth(t: Array, knots: list[Array], values: list[Array]) -> Array:
-    """A muscle's curve through values (K, ...) at times (K, ...), each list in order of time within a stride."""
+    """A smooth curve through values (K, ...) at times (K, ...), each list in order of time within a stride."""
     at = np.concatenate([np.ravel(x) for x in knots])
     order = np.argsort(at, kind="stable")
     curve = PchipInterpolator(at[order], np.concatenate([np.ravel(x) for x in values])[order], extrapolate=False)
@@ -175,7 +175,7 @@ def _make_pitch(t: Array, steps: Footprints, begins: Array, ends: Array, style: 
     for share, value, column in ((0.0, style.off_pitch, 5), (0.17, style.last_pitch, 6), (0.88, style.high_pitch, 7)):
         knots.append(steps.off[:-1] + share * S)
         values.append(value * vary[:-1, column])
-    # at rest, level but for what the shoe gives way
+    # at rest, level except for the compression of the sole
     knots += [np.array([-1.0, begins[0] + 0.35 * D[0]]), np.array([begins[-1] + 0.4 * D[-1], steps.off[-1] + 1.0])]
     values += [np.full(2, -0.3), np.full(2, -0.3)]
     return np.deg2rad(_smooth(t, knots, values))
@@ -216,9 +216,9 @@ def _share_of_swing(u: Array) -> Array:
 
 
 def _make_ring(t: Array, strikes: Array, style: Style, rng: np.random.Generator) -> Array:
-    """(J, 6) what is left of a strike: shoe, flesh and mounting ring and die out within some 0.15 s.
+    """(J, 6) vibration after a strike: shoe, soft tissue and mount ring and decay within some 0.15 s.
 
-    Movements of `style.impact` and turns such as go with them at a foot's size.
+    Displacements of `style.impact` and corresponding turns at a foot's size.
     """
     out = np.zeros((len(t), 6))
     share = np.array([0.5, 0.5, 0.8, 0.6, 0.8, 0.3])  # of the acceleration; m/s^2, and rad/s^2 over 0.1 m

@@ -1,4 +1,4 @@
-"""Errors of an IMU from the figures of a data sheet."""
+"""Errors of an IMU by the figures of a data sheet."""
 
 from __future__ import annotations
 
@@ -18,10 +18,11 @@ DEG_SQRT_H = _DEG / 60.0  # rad/s/sqrt(Hz)
 
 @dataclass(frozen=True)
 class Triad:
-    """Three like sensors at right angles, SI (rad/s or m/s^2). All figures are 1-sigma, drawn anew for each seed.
+    """Three equal sensors at right angles, SI (rad/s or m/s^2).
 
-    The in-run instability is a Gauss-Markov process of this sigma: its Allan deviation has its top, 0.62 sigma, at
-    1.9 correlation times, where a flicker floor of the same name has 0.66.
+    All figures are 1-sigma, drawn for each seed. The in-run instability is a Gauss-Markov process of this sigma: its
+    Allan deviation has its maximum, 0.62 sigma, at 1.9 correlation times, where a flicker floor of the same name has
+    0.66.
     """
 
     noise: float  # per sqrt(Hz)
@@ -31,12 +32,12 @@ class Triad:
     walk: float = 0.0  # per sqrt(s), random walk of the bias
     scale: float = 0.0  # 1
     misalignment: float = 0.0  # rad, of each axis towards each other one
-    limit: float = np.inf  # readings beyond it are cut off
-    step: float = 0.0  # of the last digit
+    limit: float = np.inf  # readings beyond it are clipped
+    step: float = 0.0  # resolution
 
     @property
     def bias_walk(self) -> float:
-        """The random walk that the bias looks like over times short against the correlation time."""
+        """The random walk that is equivalent to the bias over times short against the correlation time."""
         return float(np.hypot(self.walk, self.instability * np.sqrt(2.0 / self.correlation_time)))
 
     def read(self, true: Array, rate: float, rng: np.random.Generator) -> tuple[Array, Array]:
@@ -91,11 +92,13 @@ class SimulatedImu:
 
     @property
     def noise(self) -> ImuNoise:
-        """The figures a recording states for it. A misalignment acts as a scale error across, and is in the scale."""
+        """The figures that a recording states for it. A misalignment acts as a cross-axis scale error, and is included
+        in the scale.
+        """
         return ImuNoise(
             gyro_noise_density=self.gyro.noise,
             accel_noise_density=self.accel.noise,
-            # a filter needs some walk, and none is slower than what shifts a bias by 1 % of itself in an hour
+            # a filter needs some random walk; none is smaller than a change of 1 % of the bias in an hour
             gyro_bias_walk=max(self.gyro.bias_walk, 1e-2 * self.gyro.bias / 60.0),
             accel_bias_walk=max(self.accel.bias_walk, 1e-2 * self.accel.bias / 60.0),
             gyro_bias_sigma=self.gyro.bias,
@@ -111,7 +114,7 @@ class SimulatedImu:
         return g, a, b_g, b_a
 
     def at(self, rate: float) -> SimulatedImu:
-        """The same sensors read at another rate."""
+        """The same sensors sampled at another rate."""
         return replace(self, rate=float(rate))
 
 
@@ -128,7 +131,8 @@ EG370N = SimulatedImu(
     gyroscope(0.06, 360.0, instability_deg_h=0.8),
     accelerometer(60.0, 2.0, instability_mg=0.012),
 )  # fmt: skip
-# "White noise 0.1 degree/h" and "0.05 mg" are taken for 0.1 deg/sqrt(h) and 50 ug/sqrt(Hz), as data sheets of such
+# "White noise 0.1 degree/h" and "0.05 mg" are taken as 0.1 deg/sqrt(h) and 50 ug/sqrt(Hz), as data sheets of such
+# sensors state them.
 # sensors have them.
 MIMU = SimulatedImu(
     "MIMU of Zhu 2020, table 1", 400.0,

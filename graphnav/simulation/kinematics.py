@@ -1,4 +1,4 @@
-"""What an error-free IMU on a moving vehicle feels, and where it is.
+"""Error-free IMU readings of a moving vehicle, and its position.
 
 With V_b the velocity of the IMU over the Earth in its own axes, omega_b its rate and Omega_b the Earth's, the
 specific force is
@@ -27,14 +27,16 @@ from graphnav.core.rotation import Array
 from graphnav.simulation.motion import BANK, HEADING, SLIP, SLOPE, SPEED, Path
 from graphnav.simulation.vibration import PITCH, ROLL, Shake
 
-_CHUNK = 1 << 15  # samples at a time: what stays in a processor's cache
-_NODES = np.array([0.0, 0.5 - 0.5 / np.sqrt(5.0), 0.5 + 0.5 / np.sqrt(5.0)])  # the fourth is the next one's first
-_WEIGHTS = np.array([1.0, 5.0, 5.0, 1.0]) / 12.0
+_SAMPLES_AT_ONCE = 1 << 15  # samples at a time: these stay in the processor's cache
+_LOBATTO_NODES = np.array(
+    [0.0, 0.5 - 0.5 / np.sqrt(5.0), 0.5 + 0.5 / np.sqrt(5.0)]
+)  # the fourth is the next one's first
+_LOBATTO_WEIGHTS = np.array([1.0, 5.0, 5.0, 1.0]) / 12.0
 
 
 @dataclass(frozen=True)
 class Mount:
-    """Where the IMU sits on the vehicle: m in vehicle axes (RFU), deg."""
+    """Mounting of the IMU on the vehicle: m in vehicle axes (RFU), deg."""
 
     above_axle: tuple[float, float, float] = (0.0, 1.2, 0.9)  # from the middle of the rear axle to the IMU
     angles: tuple[float, float, float] = (0.0, 0.0, 0.0)  # roll, pitch, heading of the IMU against the vehicle
@@ -72,7 +74,7 @@ class TrueMotion:
 
 @dataclass(frozen=True)
 class _AxleMotion:
-    """All of the motion at some times but the place, in local ENU at the axle (l) and vehicle axes (v)."""
+    """The motion at some times except the position, in local ENU at the axle (l) and vehicle axes (v)."""
 
     v_axle: Array  # (n, 3) l
     R_base: Array  # (n, 3, 3) l from the road's axes
@@ -94,7 +96,7 @@ def _derive_axle_motion(path: Path, shake: Shake, mount: Mount, t: Array) -> _Ax
         d_body[:, k] += d_shaken[:, channel]
     R_base = rotation.from_rph(base)
     speed, slip = x[:, SPEED], x[:, SLIP]
-    # in a bend to the right the tyres give way to the left
+    # in a right-hand bend the tyres deform to the left
     v_road = np.column_stack([-speed * np.sin(slip), speed * np.cos(slip), np.zeros(len(t))])
     return _AxleMotion(
         rotation.mv(R_base, v_road), R_base, _turn_rate(base, d_base), np.array(mount.above_axle) + shaken[:, :3],
@@ -148,15 +150,15 @@ def move(path: Path, origin: tuple[float, float, float], mount: Mount, shake: Sh
     R = np.empty((count + 1, 3, 3))
     omega_eb, arm = np.empty((count + 1, 3)), np.empty((count + 1, 3))
     gyro, accel = np.empty((count, 3)), np.empty((count, 3))
-    for a in range(0, count, _CHUNK):
+    for a in range(0, count, _SAMPLES_AT_ONCE):
         tell("driving", a / count)
-        b = min(a + _CHUNK, count)
+        b = min(a + _SAMPLES_AT_ONCE, count)
         n = b - a
-        nodes = np.append((t[a:b, None] + _NODES / rate).ravel(), t[b])
+        nodes = np.append((t[a:b, None] + _LOBATTO_NODES / rate).ravel(), t[b])
         felt = _derive_axle_motion(path, shake, mount, nodes)
         axle[a + 1 : b + 1] = _travel(axle[a], _compute_means(felt.v_axle), 1.0 / rate)
-        # between two samples the place hardly changes: what is left of a straight line is 1e-5 m
-        place = axle[a:b, None] + _NODES[:, None] * (axle[a + 1 : b + 1] - axle[a:b])[:, None]
+        # between two samples the place hardly changes: the deviation from a straight line is 1e-5 m
+        place = axle[a:b, None] + _LOBATTO_NODES[:, None] * (axle[a + 1 : b + 1] - axle[a:b])[:, None]
         place = np.concatenate([place.reshape(-1, 3), axle[b : b + 1]])
         V_l, V_v, omega, earth, g = _level(felt, place[:, 0], place[:, 2])
         gyro[a:b] = _compute_means(omega + earth)
@@ -167,8 +169,8 @@ def move(path: Path, origin: tuple[float, float, float], mount: Mount, shake: Sh
         assert len(V_l) == 3 * n + 1
     R_vb = mount.R_vb
     llh, v, R_lb = np.empty_like(axle), np.empty_like(axle), np.empty_like(R)
-    for a in range(0, count + 1, _CHUNK):
-        rows = slice(a, a + _CHUNK)
+    for a in range(0, count + 1, _SAMPLES_AT_ONCE):
+        rows = slice(a, a + _SAMPLES_AT_ONCE)
         llh[rows], turn = _move(axle[rows], arm[rows])
         v[rows], R_lb[rows] = rotation.mv(turn, V[rows]), turn @ R[rows] @ R_vb
 
@@ -193,8 +195,8 @@ def move(path: Path, origin: tuple[float, float, float], mount: Mount, shake: Sh
 
 def _compute_means(x: Array) -> Array:
     """Means (n, 3) over n periods of values (3 n + 1, 3) at their Lobatto nodes."""
-    inner = _WEIGHTS[1] * (x[1::3] + x[2::3])
-    return inner + _WEIGHTS[0] * (x[:-1:3] + x[3::3])
+    inner = _LOBATTO_WEIGHTS[1] * (x[1::3] + x[2::3])
+    return inner + _LOBATTO_WEIGHTS[0] * (x[:-1:3] + x[3::3])
 
 
 def _place_rate(llh: Array, v: Array) -> Array:
@@ -203,7 +205,9 @@ def _place_rate(llh: Array, v: Array) -> Array:
 
 
 def _travel(start: Array, v: Array, dt: float) -> Array:
-    """llh (n, 3) at the ends of n periods with mean velocities v, by fixed point on the radii (each pass wins 1e-5)."""
+    """llh (n, 3) at the ends of n periods with mean velocities v, by fixed-point iteration on the radii (each gains
+    1e-5).
+    """
     llh = np.tile(start, (len(v) + 1, 1))
     for _ in range(3):
         step = _place_rate(0.5 * (llh[:-1] + llh[1:]), v) * dt

@@ -1,4 +1,4 @@
-"""What the driver does: manoeuvres one after another, turned into smooth functions of time.
+"""The driver: successive manoeuvres as smooth functions of time.
 
 The motion is that of the point that does not slip sideways (the middle of the rear axle), and of the road under it.
 """
@@ -16,20 +16,20 @@ from graphnav.core.findings import runs_of
 from graphnav.core.rotation import Array
 from graphnav.simulation.splines import centres, spline
 
-STEP = 0.1  # s between coefficients: a driver's foot and hands do not move faster
+STEP = 0.1  # s between coefficients: a driver's hands and feet are no faster
 DEGREE = 3  # the acceleration is smooth, the jerk continuous
-SETTLE = (DEGREE - 1) / 2 * STEP  # s by which the spline of a speed that ends on the grid reaches beyond its end
+SETTLE = (DEGREE - 1) / 2 * STEP  # s by which the spline of a speed that ends on the grid extends beyond its end
 
 SPEED, HEADING, SLOPE, BANK, SLIP = range(5)  # channels of Path.spline
 
 
 @dataclass(frozen=True)
 class Manoeuvre:
-    """One thing a driver does. The speed changes evenly through it; turn and slope follow the way covered.
+    """One manoeuvre. The speed changes linearly through it; turn and slope change with the distance covered.
 
-    `speed` is the speed at its end, m/s, negative in reverse; `turn` the change of heading, deg, to the right
-    positive; `grade` the slope at its end, rise over run; `bank` the road's fall to the right at its end, deg.
-    None keeps what was.
+    `speed` is the speed at its end, m/s, negative in reverse; `turn` the change of heading, deg, to the right positive;
+    `grade` the slope at its end, rise over run; `bank` the road's fall to the right at its end, deg. None keeps the
+    previous value.
     """
 
     duration: float  # s
@@ -40,12 +40,12 @@ class Manoeuvre:
 
 
 def stand(duration: float) -> Manoeuvre:
-    """Do not move."""
+    """Stand still."""
     return Manoeuvre(duration, 0.0)
 
 
 def cruise(duration: float, speed: float, turn: float = 0.0, grade: float | None = None) -> Manoeuvre:
-    """Keep (or reach evenly) a speed, perhaps bending and climbing."""
+    """Keep (or reach linearly) a speed, possibly in a bend and on a slope."""
     return Manoeuvre(duration, speed, turn, grade)
 
 
@@ -66,7 +66,7 @@ class Path:
         return self.sample(SPEED, t)
 
     def distance(self, t: Array) -> Array:
-        """Metres along the way from the start, backward ones counted negative."""
+        """Distance along the path from the start, m, backward motion counted negative."""
         whole = self.spline.antiderivative()
         return whole(np.clip(t, self.start, self.end))[..., SPEED] - whole(self.start)[SPEED]
 
@@ -118,7 +118,7 @@ def drive(
 
     def along(ends: Sequence[float], first: float) -> Array:
         last, before = np.array(ends, dtype=float), np.r_[first, ends[:-1]]
-        # where nothing is covered, nothing can change
+        # where no distance is covered, nothing can change
         last = np.where(length == 0, before, last)
         return before[i] + (last - before)[i] * share
 

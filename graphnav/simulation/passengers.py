@@ -1,4 +1,4 @@
-"""People who open doors, get in and out, and do not sit still: the sprung body of a standing vehicle moves."""
+"""Passengers who open doors, get in and out, and move on their seats: motion of a standing vehicle's sprung body."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ from graphnav.core.rotation import Array
 from graphnav.simulation.motion import Path
 from graphnav.simulation.vibration import UP, Part, oscillator, sample_movement, shake_times, sway
 
-# What a passenger of 75 kg does to a car on its springs (100 kN/m in heave, some 40 kNm/rad in roll and 100 in
+# Effect of a passenger of 75 kg on a car's suspension (100 kN/m in heave, some 40 kNm/rad in roll and 100 in pitch; the
+# seat 0.4 m to the side and 0.3 m from the middle): the static response, m and rad.
 # pitch; the seat 0.4 m to the side and 0.3 m from the middle): the static answer, m and rad.
 _SINKS, _ROLLS, _PITCHES = 0.0075, 0.0070, 0.0022
 
@@ -29,7 +30,7 @@ class Boarding:
 
 @dataclass(frozen=True)
 class Fidget:
-    """A person shifts on the seat."""
+    """A person moves on the seat."""
 
     t: float
     size: float  # share of the weight that moves
@@ -41,9 +42,9 @@ def movement(
     pivot_to_imu: tuple[float, float, float],
     rng: np.random.Generator,
 ) -> Part:
-    """The body under `events`: pushes through heave, pitch and roll, each on its spring and damper."""
+    """Motion of the body under `events`: forces in heave, pitch and roll, each with its spring and damper."""
     t = shake_times(path)
-    push = np.zeros((len(t), 3))  # heave, pitch, roll, as static answers
+    push = np.zeros((len(t), 3))  # heave, pitch, roll, as static responses
     for event in events:
         if isinstance(event, Fidget):
             there = _make_hump(t, event.t, rng.uniform(0.5, 1.2)) * event.size
@@ -75,5 +76,5 @@ def _step(t: Array, at: float, width: float) -> Array:
 
 
 def _make_hump(t: Array, at: float, width: float) -> Array:
-    """A push that comes and goes within some `width` s."""
+    """A force that rises and falls within some `width` s."""
     return np.exp(-0.5 * ((t - at) / (0.4 * width)) ** 2)

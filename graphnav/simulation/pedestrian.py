@@ -1,7 +1,7 @@
-"""What an error-free IMU on a foot feels, and a walk's recording.
+"""Error-free IMU readings of a foot, and the recording of a walk.
 
 Walks are short: everything is in one east-north-up frame n at the start, with its own gravity vector at each place.
-With the acceleration of the splines, exact like their places,
+With the acceleration of the splines, as exact as their positions,
 
     f_b = R_nb^T (dv_n/dt + 2 Omega_n x v_n - g_n)                                    (Groves 2013, eq. 5.36 and 5.53)
 
@@ -29,8 +29,8 @@ from graphnav.simulation.inertial import SimulatedImu
 from graphnav.simulation.kinematics import TrueMotion
 from graphnav.simulation.result import Simulated
 
-_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(3)
-_CHUNK = 1 << 13  # samples at a time
+_GAUSS_NODES, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(3)
+_SAMPLES_AT_ONCE = 1 << 13  # samples at a time
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ def _move_foot(foot: Foot, R_fb: Array, t: Array) -> _FootMotion:
 def move_foot(
     foot: Foot, origin: tuple[float, float, float], R_fb: Array, rate: float, compensated: bool = False
 ) -> TrueMotion:
-    """Walk from `origin` (deg, deg, m; the floor) with an IMU of `rate` Hz, turned by R_fb against the foot.
+    """Walk from `origin` (deg, deg, m; the floor) with an IMU of `rate` Hz, rotated by R_fb against the foot.
 
     Samples are means over their periods; `compensated` ones are the constant rate and force that lead to the same
     attitude and velocity. Six minutes take a second.
@@ -67,12 +67,12 @@ def move_foot(
     t = foot.start + np.arange(count + 1) * dt
     ends = _move_foot(foot, R_fb, t)
     parts = max(1, round(2.0 * dt / STEP))  # of a period: half a spline's step at most
-    nodes = ((np.arange(parts)[:, None] + 0.5 + 0.5 * _NODES) * dt / parts).ravel()
-    weights = np.tile(0.5 * _WEIGHTS / parts, parts)
+    nodes = ((np.arange(parts)[:, None] + 0.5 + 0.5 * _GAUSS_NODES) * dt / parts).ravel()
+    weights = np.tile(0.5 * _GAUSS_WEIGHTS / parts, parts)
     acceleration = foot.spline.derivative(2)
     gyro, accel = np.empty((count, 3)), np.empty((count, 3))
-    for a in range(0, count, _CHUNK):
-        rows = slice(a, min(a + _CHUNK, count))
+    for a in range(0, count, _SAMPLES_AT_ONCE):
+        rows = slice(a, min(a + _SAMPLES_AT_ONCE, count))
         inside = (t[:-1][rows, None] + nodes).ravel()
         felt = _move_foot(foot, R_fb, inside)
         to_body = np.swapaxes(felt.R_nb, -1, -2)
@@ -108,7 +108,7 @@ def record_walk(
     mounting: tuple[float, float, float], exact: bool = False, compensated: bool = False,
     facts: dict[str, Any] | None = None,
 ) -> Simulated:  # fmt: skip
-    """Walk and read the IMU, mounted with roll, pitch and heading (deg) against the shoe.
+    """Simulate a walk and read the IMU, mounted with roll, pitch and heading (deg) against the shoe.
 
     The facts hold `stances` and `contacts`, (M, 2) s. `exact` leaves out the IMU's errors and keeps its stated
     figures.

@@ -1,4 +1,4 @@
-"""What a scenario returns, and how a drive's parts become a recording."""
+"""The result of a scenario, and the assembly of a recording from a drive's parts."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from graphnav.simulation.vibration import Shake
 
 @dataclass(frozen=True)
 class Simulated:
-    """A recording as its files would hold it, and everything about it that no sensor tells."""
+    """A recording as its files would contain it, and everything about it that no sensor measures."""
 
     recording: Recording
     truth: Trajectory  # of the IMU at the start and every sample, biases included (of the period that ends there)
     stops: Array  # (M, 2) s: the wheels do not turn
-    facts: dict[str, Any] = field(default_factory=dict)  # what was put in, for JSON
+    facts: dict[str, Any] = field(default_factory=dict)  # the parameters of the simulation, for JSON
     motion: TrueMotion | None = field(default=None, repr=False)  # with the error-free samples
 
     def text(self) -> str:
@@ -63,7 +63,7 @@ def record(
     truth_rate: float = 10.0,
     facts: dict[str, Any] | None = None,
 ) -> Simulated:
-    """Drive `path` and read the sensors. `exact` leaves out the IMU's errors and keeps its stated figures."""
+    """Drive `path` and read the sensors. `exact` omits the IMU's errors and keeps its stated figures."""
     motion = move(path, origin, mount, shake, imu.rate)
     gyro, accel = motion.gyro, motion.accel
     b_g, b_a = np.zeros_like(gyro), np.zeros_like(accel)

@@ -1,4 +1,4 @@
-"""A barometer and a second antenna, with the errors that real ones have."""
+"""A barometer and a second antenna with realistic errors."""
 
 from __future__ import annotations
 
@@ -25,17 +25,17 @@ def _list_epochs(motion: TrueMotion, rate: float) -> Array:
 
 @dataclass(frozen=True)
 class BarometerModel:
-    """Air pressure at the IMU: white noise, the weather and how it changes, and air that is not the standard's."""
+    """Air pressure at the IMU: white noise, changing weather, and a non-standard atmosphere."""
 
     rate: float = 10.0  # Hz
-    # chips resolve 0.012 hPa, 0.1 m (MS5611); wind and the vehicle's ventilation make the rest
+    # chips resolve 0.012 hPa, 0.1 m (MS5611); the rest is due to wind and the vehicle's ventilation
     white: float = 0.5  # m
     weather: float = 85.0  # m, 1-sigma: pressures of a region differ by 10 hPa from day to day
     walk: float = 0.1  # m/sqrt(s): 1.5 hPa in three hours
     scale: float = 0.03  # 1-sigma: 9 K from the standard atmosphere's temperature
 
     def read(self, motion: TrueMotion, seed: int) -> tuple[Series, dict[str, float]]:
-        """The readings of a drive, and the offset (m, at the start) and scale error in them."""
+        """Simulate the readings of a drive; returns also their offset (m, at the start) and scale error."""
         t, rng = _list_epochs(motion, self.rate), stream(seed, "barometer")
         offset, scale = self.weather * rng.standard_normal(), self.scale * rng.standard_normal()
         white, steps = rng.standard_normal((2, len(t)))
@@ -56,7 +56,7 @@ class DualAntennaModel:
     """
 
     baseline: Three = (1.0, 0.0, 0.0)  # m, first to second antenna as stated, IMU's axes
-    turned: float = 1.0  # deg, 1-sigma of how the mounting is off the stated baseline: 2 cm in a metre
+    turned: float = 1.0  # deg, 1-sigma of the mounting against the stated baseline: 2 cm in a metre
     white: float = 0.2  # deg, of a baseline of a metre
     slow: float = 0.23  # deg, the same
     slow_time: float = 60.0  # s
@@ -64,7 +64,7 @@ class DualAntennaModel:
     outages: tuple[Span, ...] = ()
 
     def read(self, motion: TrueMotion, seed: int) -> tuple[Series, dict[str, float]]:
-        """The readings of a drive, and the degrees by which the baseline is turned in heading and pitch."""
+        """Simulate the readings of a drive; returns also the error of the baseline in heading and pitch, deg."""
         t, rng = _list_epochs(motion, self.rate), stream(seed, "second antenna")
         turned = np.radians(self.turned) * rng.standard_normal(2)
         white = rng.standard_normal((len(t), 2))
@@ -93,5 +93,5 @@ class DualAntennaModel:
 
 
 def _cut(angle: Array) -> Array:
-    """With the digits that a file has: a ten-thousandth of a degree."""
+    """Rounded to the digits of a file: a ten-thousandth of a degree."""
     return np.radians(np.round(np.degrees(angle), 4))

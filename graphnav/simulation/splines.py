@@ -1,9 +1,8 @@
-"""Uniform B-splines as the one kind of function a simulated motion is made of.
+"""Uniform B-splines, of which every simulated motion consists.
 
-Their coefficients are values of the wanted function at the splines' centres. Where neighbouring coefficients
-are equal the spline is constant exactly, so a vehicle that is told to stand stands; the derivative and the
-integral are splines again, so motion, rate and force belong together exactly.
-De Boor, *A Practical Guide to Splines* (2001), ch. IX-XI.
+Their coefficients are values of the desired function at the splines' centres. Where neighbouring coefficients are equal
+the spline is exactly constant, so a stop is exact; the derivative and the integral are splines again, so motion, rate
+and force are exactly consistent. De Boor, *A Practical Guide to Splines* (2001), ch. IX-XI.
 """
 
 from __future__ import annotations
@@ -29,5 +28,5 @@ def spline(start: float, step: float, coefficients: Array, degree: int) -> BSpli
 
 
 def stream(seed: int, part: str) -> np.random.Generator:
-    """The random numbers of one part of a simulation: other parts may change without changing these."""
+    """The random numbers of one part of a simulation, independent of changes to other parts."""
     return np.random.default_rng([seed, zlib.crc32(part.encode())])

@@ -1,4 +1,4 @@
-"""How the sprung body shakes: engine lines, road, idling, suspension. Displacements of the IMU and small turns.
+"""Vibration of the sprung body: engine lines, road, idling, suspension, as displacements of the IMU and small turns.
 
 Everything is a displacement with an exact rate, so that force, rate and the true position agree: a line of 3 mg at
 12.5 Hz is a movement of 5 micrometres, a passenger's weight one of millimetres.
@@ -20,7 +20,7 @@ from graphnav.simulation.splines import centres, spline
 RIGHT, FORWARD, UP, PITCH, ROLL = range(5)  # channels: m, m, m, rad, rad
 STEP = 0.02  # s between coefficients: movements up to some 15 Hz
 DEGREE = 4
-_SLOW, _SLOW_DEGREE = 0.1, 3  # s; what modulates a line
+_MODULATION_TIME, _MODULATION_DEGREE = 0.1, 3  # s; correlation time of a line's modulation
 
 Part = Callable[[Array], tuple[Array, Array]]
 MG = 9.80665e-3  # m/s^2
@@ -66,7 +66,7 @@ def sample_movement(path: Path, movement: Array) -> Sampled:
 # --------------------------------------------------------------------------------------------------------- engine
 @dataclass(frozen=True)
 class Idle:
-    """What the IMU reads of an idling engine, for each order: amplitudes of force (right, forward, up) and pitch."""
+    """IMU readings of an idling engine, for each order: amplitudes of force (right, forward, up) and pitch."""
 
     accel_mg: tuple[tuple[float, float, float], ...]
     pitch_rate_deg_s: tuple[float, ...]
@@ -84,8 +84,8 @@ class Engine:
     orders: tuple[float, ...] = (1.0, 2.0)
     spans: tuple[tuple[float, float, Idle], ...] = ()
     gears_hz_per_mps: tuple[float, ...] = (9.0, 5.0, 3.3, 2.4, 1.9, 1.5)
-    shift_down_hz: float = 22.0  # a gear is held down to here
-    moving_gain: float = 2.0  # amplitudes under load against those at idle
+    shift_down_hz: float = 22.0  # lowest frequency before changing down
+    moving_gain: float = 2.0  # ratio of amplitudes under load to those at idle
     wander_hz: float = 0.0  # 1-sigma of the idling speed's slow changes
     wander_time: float = 5.0  # s
 
@@ -96,15 +96,15 @@ class Engine:
         gear = np.maximum((each > self.shift_down_hz).sum(axis=1) - 1, 0)
         idle = self.idle_hz + wander
         f = np.maximum(each[np.arange(len(v)), gear], idle)
-        # the clutch takes up half a second; a standstill is all idle
+        # the clutch engages over half a second; a standstill is all idle
         f = signal.convolve(np.pad(f, 3, mode="edge"), np.ones(7) / 7.0, mode="valid")
         return np.where(v == 0.0, idle, f)
 
     def lines(self, path: Path, rate: float, rng: np.random.Generator) -> Part:
-        """The part; `rate` is the IMU's, Hz, whose averaging the stated amplitudes have already gone through."""
-        t = centres(path.start, path.end, _SLOW, _SLOW_DEGREE)
+        """The vibration of the engine; `rate` is the IMU's, Hz, whose averaging the stated amplitudes include."""
+        t = centres(path.start, path.end, _MODULATION_TIME, _MODULATION_DEGREE)
         v = path.speed(t)
-        wander = self.wander_hz * gauss_markov(len(t), _SLOW / self.wander_time, rng)
+        wander = self.wander_hz * gauss_markov(len(t), _MODULATION_TIME / self.wander_time, rng)
         f = self.frequency(v, wander)
         load = 1.0 + (self.moving_gain - 1.0) * v * v / (v * v + 1.0)
         accel, turn = _draw_amplitudes(self.idle, len(t))
@@ -113,17 +113,17 @@ class Engine:
             for value, other in zip((accel, turn), _draw_amplitudes(idle, len(t)), strict=True):
                 value += weight.reshape(-1, *(1,) * (value.ndim - 1)) * (other - value)
         omega = 2.0 * np.pi * f[:, None] * np.array(self.orders)
-        # The mean over a sample weakens a line; beyond Nyquist an IMU's own low-pass leaves little of it.
+        # averaging over a sample attenuates a line; beyond Nyquist an IMU's own low-pass filter leaves little of it
         share = omega / (2.0 * np.pi * rate)
         seen = np.sinc(np.minimum(share, 0.5)) * np.sqrt(1.0 + (2.0 * share) ** 16)
         amplitude = np.zeros((len(t), len(self.orders), 5))
         amplitude[:, :, :3] = accel * (load[:, None] / seen / omega**2)[:, :, None]
         amplitude[:, :, PITCH] = turn * load[:, None] / seen / omega
-        # forward and pitch a quarter turn apart, so that gravity on the nodding does not add to the line
+        # forward and pitch are a quarter turn apart, so that gravity on the pitching does not add to the line
         phases = rng.uniform(0.0, 2.0 * np.pi, (len(self.orders), 5))
         phases[:, PITCH] = phases[:, FORWARD] + 0.5 * np.pi
-        phase = spline(path.start, _SLOW, 2.0 * np.pi * f, _SLOW_DEGREE)
-        size = spline(path.start, _SLOW, amplitude, _SLOW_DEGREE)
+        phase = spline(path.start, _MODULATION_TIME, 2.0 * np.pi * f, _MODULATION_DEGREE)
+        size = spline(path.start, _MODULATION_TIME, amplitude, _MODULATION_DEGREE)
         return _EngineOrders(phase.antiderivative(), phase, size, size.derivative(), np.array(self.orders), phases)
 
 
@@ -160,9 +160,9 @@ class _EngineOrders:
 # ---------------------------------------------------------------------------------------------------- road and idling
 @dataclass(frozen=True)
 class Mode:
-    """A way in which the body swings: its channel, frequency and damping, and how strongly it is excited.
+    """A mode of the body: its channel, frequency and damping, and its excitation.
 
-    `size` is the rms of its acceleration, m/s^2 for a movement and rad/s^2 for a turn.
+    `size` is the rms of its acceleration, m/s^2 for a displacement and rad/s^2 for a turn.
     """
 
     channel: int
@@ -176,7 +176,8 @@ ROAD = (
     Mode(UP, 1.5, 0.3, 0.35), Mode(UP, 9.0, 0.2, 0.25), Mode(FORWARD, 2.5, 0.4, 0.12), Mode(FORWARD, 8.0, 0.3, 0.10),
     Mode(RIGHT, 2.0, 0.4, 0.12), Mode(RIGHT, 8.0, 0.3, 0.10), Mode(PITCH, 1.7, 0.3, 0.12), Mode(ROLL, 1.9, 0.3, 0.15),
 )  # fmt: skip
-# An engine that idles shakes the body on its springs: 0.1 mg peaks near 3 Hz in the spectrum of a quarter of an hour,
+# an idling engine shakes the body on its springs: 0.1 mg peaks near 3 Hz in the spectrum of a quarter of an hour, as in
+# table 4 of Li 2024
 # as in table 4 of Li 2024.
 FLOOR = (
     Mode(UP, 3.4, 0.08, 0.011), Mode(FORWARD, 3.2, 0.12, 0.011), Mode(RIGHT, 3.0, 0.12, 0.010),
@@ -185,10 +186,10 @@ FLOOR = (
 
 
 def road_noise(path: Path, rng: np.random.Generator, size: float = 1.0, modes: Sequence[Mode] = ROAD) -> Part:
-    """The road's unevenness: as the root of the speed, and dying faster below walking pace.
+    """Excitation by the road: proportional to the root of the speed, and decreasing faster below walking pace.
 
     The excitation of a road whose slopes are white grows as sqrt(v) (ISO 8608, w = 2); the tyre's contact patch
-    swallows what is shorter than itself, which at 0.2 m/s is all of it.
+    averages over shorter wavelengths, which at 0.2 m/s are all of them.
     """
     v = np.abs(path.speed(shake_times(path)))
     return sample_movement(path, _excite_modes(modes, size * np.sqrt(v / 14.0) * v / (v + 2.0), rng))
@@ -200,7 +201,7 @@ def idle_floor(path: Path, rng: np.random.Generator, size: float = 1.0, modes: S
 
 
 def _excite_modes(modes: Sequence[Mode], envelope: Array, rng: np.random.Generator) -> Array:
-    """(J, 5) what white noise of changing strength makes of the modes."""
+    """(J, 5) response of the modes to white noise of changing strength."""
     out = np.zeros((len(envelope), 5))
     for mode in modes:
         b, a = oscillator(mode.hz, mode.damping)
@@ -212,7 +213,7 @@ def _excite_modes(modes: Sequence[Mode], envelope: Array, rng: np.random.Generat
 
 
 def oscillator(hz: float, damping: float) -> tuple[Array, Array]:
-    """A mass on spring and damper as a digital filter at 1 / STEP Hz; of a steady push it makes the push."""
+    """A mass on spring and damper as a digital filter at 1 / STEP Hz, with unit static response."""
     w = 2.0 * np.pi * hz
     return signal.bilinear([w * w], [1.0, 2.0 * damping * w, w * w], fs=1.0 / STEP)
 
@@ -229,7 +230,7 @@ def gauss_markov(count: int, step: float, rng: np.random.Generator, columns: int
 # ---------------------------------------------------------------------------------------------------------- springs
 @dataclass(frozen=True)
 class Springs:
-    """How the body leans on its springs when the vehicle accelerates, and how it swings back."""
+    """Lean of the body on its springs under acceleration, and its oscillation."""
 
     pitch_per_accel: float = 0.15  # deg per m/s^2, nose up under power
     roll_per_accel: float = 0.35  # deg per m/s^2, outward in bends
@@ -238,7 +239,7 @@ class Springs:
     height: float = 1.2  # m, of the IMU above the axis it leans about
 
     def lean(self, path: Path) -> Part:
-        """Squat, dive and roll, with what they move the IMU by."""
+        """Squat, dive and roll, with the displacement of the IMU."""
         t = shake_times(path)
         inside = np.clip(t, path.start, path.end)
         x, dx = path.spline(inside), path.spline.derivative()(inside)
@@ -250,7 +251,7 @@ class Springs:
 
 
 def sway(pitch: Array, roll: Array, pivot_to_imu: tuple[float, float, float]) -> Array:
-    """(J, 5): turns (J,) about a point of the body and the movement they give the IMU, first order."""
+    """(J, 5): turns (J,) about a point of the body and the displacement of the IMU, first order."""
     right, forward, up = pivot_to_imu
     out = np.zeros((len(pitch), 5))
     out[:, PITCH], out[:, ROLL] = pitch, roll

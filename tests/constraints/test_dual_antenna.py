@@ -14,7 +14,7 @@ from graphnav.core import rotation
 from graphnav.core.errors import RecordingError
 from graphnav.core.notes import key_of
 from graphnav.detectors import detect
-from graphnav.estimation.alignment.antennas import baseline_heading
+from graphnav.estimation.alignment.antennas import measure_baseline_heading
 from graphnav.estimation.pipeline import run
 from graphnav.online import Online, rows_of, without_rows
 from graphnav.recording import Recording
@@ -72,7 +72,7 @@ def standing() -> Recording:
 
 
 def test_a_vehicle_that_stands_knows_its_heading(standing):
-    found = baseline_heading(standing, SETTINGS, detect(standing).stationary)
+    found = measure_baseline_heading(standing, SETTINGS, detect(standing).stationary)
     true = standing.truth.rph[0, 2]
     assert abs(rotation.wrap(found.heading - true)) < 4.0 * found.sigma
     assert found.sigma < np.radians(1.5)
@@ -96,10 +96,10 @@ def test_its_heading_is_known_live_before_it_moves(standing):
 
 
 def test_on_the_move_readings_tell_no_start(drive):
-    assert baseline_heading(drive, SETTINGS, np.empty((0, 2))) is None
-    assert baseline_heading(drive, SETTINGS, None) is None
+    assert measure_baseline_heading(drive, SETTINGS, np.empty((0, 2))) is None
+    assert measure_baseline_heading(drive, SETTINGS, None) is None
     far = drive.crop(10.0, 30.0)
-    assert baseline_heading(far, SETTINGS, np.array([[drive.start + 15.0, drive.start + 20.0]])) is None
+    assert measure_baseline_heading(far, SETTINGS, np.array([[drive.start + 15.0, drive.start + 20.0]])) is None
 
 
 def test_a_baseline_that_stands_upright_is_refused():

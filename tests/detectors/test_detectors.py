@@ -317,9 +317,9 @@ def test_what_wanders_as_much_as_it_says_is_no_motion():
     truth = np.tile([8.0, 1.0], (len(t), 1)) + 0.05 * rng.standard_normal((len(t), 2))
     limit = np.full(len(t), 0.15)
     span = np.array([10.0, 40.0])
-    assert motion.Speeds(t, lies, limit).over(span) == 0.0
-    assert abs(motion.Speeds(t, truth, limit).over(span) - np.hypot(8.0, 1.0)) < 0.05
-    assert np.isnan(motion.Speeds(t, truth, limit).over(np.array([70.0, 80.0])))
+    assert motion.Speeds(t, lies, limit).speed_in(span) == 0.0
+    assert abs(motion.Speeds(t, truth, limit).speed_in(span) - np.hypot(8.0, 1.0)) < 0.05
+    assert np.isnan(motion.Speeds(t, truth, limit).speed_in(np.array([70.0, 80.0])))
     assert len(motion.find_moving([motion.Speeds(t, truth, limit)])) == 1
 
 

@@ -388,7 +388,7 @@ def test_states_between_keyframes_come_in_parts_just_the_same(
     _, solution = solved_lap
     whole = solution.trajectory(50.0)
     assert len(whole) > 1000
-    monkeypatch.setattr("graphnav.estimation.solution._ROWS", 37)
+    monkeypatch.setattr("graphnav.estimation.solution._BLOCK_ROWS", 37)
     parts = list(solution.blocks(50.0))
     assert max(len(part) for part in parts) == 37
     for name in ("t", "llh", "v", "rph", "sd_p", "sd_v", "sd_rph", "gyro_bias", "accel_bias"):

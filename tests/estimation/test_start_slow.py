@@ -18,7 +18,7 @@ from graphnav.core.earth import LocalFrame
 from graphnav.detectors import detect
 from graphnav.detectors.base import NONE
 from graphnav.estimation.alignment import Alignment, align
-from graphnav.estimation.alignment.travel import travel
+from graphnav.estimation.alignment.travel import measure_travel
 from graphnav.estimation.pipeline import origin
 from graphnav.estimation.solvers.batch import batch
 from graphnav.recording import Recording, Truth
@@ -156,7 +156,7 @@ def test_errors_of_fixes_leave_no_more_of_a_way_than_stated(rate: float, time: f
     rng = np.random.default_rng(5)
     over = []
     for _ in range(200):
-        way = travel(lasting(t, 2.0, time, rng), np.full(len(t), 2.0), rate * t)
+        way = measure_travel(lasting(t, 2.0, time, rng), np.full(len(t), 2.0), rate * t)
         over.append(way.D[-1] / way.sigma[-1])
     # two axes each
     assert np.sum(np.abs(over) ** 2) < chi2.ppf(SURE, 2 * len(over))
@@ -165,11 +165,11 @@ def test_errors_of_fixes_leave_no_more_of_a_way_than_stated(rate: float, time: f
 def test_a_way_on_a_circle_is_its_length() -> None:
     t = np.arange(0.0, 60.0, 1.0)
     p = 11.0 * np.column_stack([np.cos(0.3 * t), np.sin(0.3 * t)])
-    way = travel(p, np.full(len(t), 3.0), 0.3 * t + 0.5 * np.pi)
+    way = measure_travel(p, np.full(len(t), 3.0), 0.3 * t + 0.5 * np.pi)
     # chords, and along the axis that points forwards
     assert way.D[-1].real == pytest.approx(59 * 2.0 * 11.0 * np.sin(0.15), rel=1e-9)
     assert abs(way.D[-1].imag) < 1e-9
-    ground = travel(p, np.full(len(t), 3.0), np.zeros(len(t)))
+    ground = measure_travel(p, np.full(len(t), 3.0), np.zeros(len(t)))
     assert way.times_sigma[-1] > 2.0 * ground.times_sigma.max()
 
 

@@ -8,7 +8,7 @@ import pytest
 from graphnav.core.sample_size import effective_epochs
 from graphnav.evaluation.metrics import Errors
 from graphnav.evaluation.sigmas import judge_sigmas
-from graphnav.report.sentences import believe
+from graphnav.report.sentences import describe_sigma
 
 N = 600
 
@@ -51,13 +51,13 @@ def test_sigmas_half_as_large_as_errors_are_found_too_small(steps: float, block:
         x[:, block : block + 3] *= 2.0
         name = ("position", "velocity", "attitude")[block // 3]
         assert {j.block: j.verdict for j in judge_sigmas(errors_of(x))}[name] == "too small"
-        assert "verdict bad" in believe("batch", errors_of(x))
+        assert "verdict bad" in describe_sigma("batch", errors_of(x))
 
 
 def test_a_heading_that_is_lost_is_not_believed() -> None:
     x = lasting(np.random.default_rng(5), 10.0)
     x[:, 8] = 71.0 / 2.0  # deg over its sigma, all the time
-    said = believe("batch", errors_of(x))
+    said = describe_sigma("batch", errors_of(x))
     assert "verdict bad" in said
     assert "heading" in said
     assert "position" not in said
@@ -70,7 +70,7 @@ def test_an_error_that_does_not_change_is_one() -> None:
     x[:, 8] = 1.8
     judged = {j.block: j for j in judge_sigmas(errors_of(x))}
     assert judged["heading"].verdict == "unclear"
-    said = believe("batch", errors_of(x))
+    said = describe_sigma("batch", errors_of(x))
     assert "verdict bad" not in said
     assert "verdict good" not in said
 

@@ -478,7 +478,7 @@ def test_a_line_that_never_ends_is_one_bad_line(drive: tuple[Recording, Trajecto
     session, held = Session(QUICK, "-"), []
 
     class Quiet:
-        def now_and_then(self, silent: float = 0.0) -> None:
+        def update_if_due(self, silent: float = 0.0) -> None:
             held.append(tracemalloc.get_traced_memory()[1])
 
     head, *lines = [line.encode() + b"\n" for _, line in lines_of(drive[0])][:200]

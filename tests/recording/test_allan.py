@@ -28,7 +28,7 @@ def at_rest(seconds, N=(2e-4, 3e-3), K=(0.0, 0.0), seed=0):
 
 def test_deviations_are_those_of_allantools():
     t, gyro, accel = at_rest(400.0, K=(1e-5, 1e-4))
-    found = allan.allan_of(t, gyro, accel)
+    found = allan.compute_allan(t, gyro, accel)
     m = allan.list_averaging(len(t))
     for axis in range(3):
         for mine, samples in ((found.gyro, gyro), (found.accel, accel)):
@@ -39,7 +39,7 @@ def test_deviations_are_those_of_allantools():
 
 def test_white_noise_and_walk_are_recovered():
     N, K = (2e-4, 3e-3), (2e-5, 2e-4)
-    found = allan.allan_of(*at_rest(7200.0, N, K, seed=1))
+    found = allan.compute_allan(*at_rest(7200.0, N, K, seed=1))
     for noise, white, walk in zip((found.gyro_noise, found.accel_noise), N, K, strict=True):
         assert noise.white == pytest.approx(np.full(3, white), rel=0.03)
         assert noise.walk == pytest.approx(np.full(3, walk), rel=0.35)
@@ -55,7 +55,7 @@ def test_flicker_noise_is_seen_as_bias_instability():
     density = np.concatenate([[0.0], B**2 / (np.pi * f[1:])])
     drawn = (rng.normal(size=(len(f), 3)) + 1j * rng.normal(size=(len(f), 3))) / np.sqrt(2)
     gyro = np.fft.irfft(drawn * np.sqrt(density * RATE * n / 2.0)[:, None], n, axis=0)
-    found = allan.allan_of(np.arange(1, n + 1) / RATE, gyro, at_rest(n / RATE)[2][:n])
+    found = allan.compute_allan(np.arange(1, n + 1) / RATE, gyro, at_rest(n / RATE)[2][:n])
     middle = found.gyro[(found.tau > 1.0) & (found.tau < 100.0)]
     assert np.sqrt(np.mean(middle**2)) == pytest.approx(B * np.sqrt(2 * np.log(2) / np.pi), rel=0.05)
     assert found.gyro_noise.instability == pytest.approx(np.full(3, B), rel=0.2)
@@ -89,10 +89,10 @@ def test_what_is_not_at_rest_or_too_short_is_refused(tmp_path, capsys):
     t, gyro, accel = at_rest(100.0)
     accel[3000:3500, 1] += 0.5
     with refused("allan.moves", RecordingError, "60 s"):
-        allan.allan_of(t, gyro, accel)
+        allan.compute_allan(t, gyro, accel)
     with refused("allan.short", RecordingError, "50 s"):
-        allan.allan_of(t[:2500], gyro[:2500], accel[:2500])
+        allan.compute_allan(t[:2500], gyro[:2500], accel[:2500])
     t[2000:] += 0.5
     with refused("allan.gaps", RecordingError, "0.520 s", "40.0 s"):
-        allan.allan_of(t[:3000], gyro[:3000], accel[:3000])
+        allan.compute_allan(t[:3000], gyro[:3000], accel[:3000])
     assert "kitti" in refuse_command(capsys, "allan.gaps", "allan", "kitti", "-o", tmp_path)

@@ -23,7 +23,7 @@ def cells(count: int) -> list[str]:
 
 @pytest.mark.parametrize("line_end", ["\n", "\r\n"])
 def test_every_number_is_the_one_that_float_reads(monkeypatch: pytest.MonkeyPatch, line_end: str) -> None:
-    monkeypatch.setattr(decimals, "_BLOCK", 5000)  # many blocks, which end anywhere
+    monkeypatch.setattr(decimals, "_BLOCK_SIZE", 5000)  # many blocks, which end anywhere
     monkeypatch.setattr(decimals, "_SLAB", 700)
     written = [*cells(7993), "-0.0", "-.5", "5.", "007", "9007199254740993", "0.1234567890123456", "nan"]
     text = line_end.join(",".join(written[k : k + 4]) for k in range(0, len(written), 4))

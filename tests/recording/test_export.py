@@ -139,7 +139,7 @@ def test_a_trajectory_at_another_rate() -> None:
 def test_parts_of_a_trajectory_are_those_of_the_whole(arm, monkeypatch) -> None:
     track = turning()
     (whole,) = convert.at_point(track, arm, rate=33.0)
-    monkeypatch.setattr(convert, "_ROWS", 100)
+    monkeypatch.setattr(convert, "_ROWS_AT_ONCE", 100)
     parts = list(convert.at_point(track, arm, rate=33.0))
     assert len(parts) == 10
     for name in ("t", "llh", "v", "rph", "sd_p"):

@@ -14,7 +14,7 @@ from graphnav.core.rotation import Array
 from graphnav.recording import Odometer, Recording
 from graphnav.recording.checks import overview as checks
 from graphnav.recording.formats import read
-from graphnav.recording.odometer import MeanSpeed, counts, faults, gaps, quantum, reading_sigma
+from graphnav.recording.odometer import MeanSpeed, faults, find_gaps, find_pulse_length, find_quantum, reading_sigma
 from graphnav.recording.odometer.faults import FROZEN, GAP, STUCK, WILD
 from graphnav.simulation import simulate
 
@@ -130,7 +130,7 @@ def test_the_step_of_rounded_readings_is_found(step: float, digits: int) -> None
     for seed in range(3):
         v = speed_at(T) + 0.03 * np.random.default_rng(seed).standard_normal(len(T))
         read_as = np.round(np.round(v / step) * step, digits) if step else v
-        assert quantum(read_as) == pytest.approx(step, rel=1e-3)
+        assert find_quantum(read_as) == pytest.approx(step, rel=1e-3)
 
 
 @pytest.mark.parametrize("sigma", [0.01, 0.05, 0.3])
@@ -173,13 +173,15 @@ def test_pulses_in_a_column_of_speeds_are_recognised() -> None:
     t = np.arange(0.0, 400.0, 0.05)
     way = np.floor(way_to(t) / 0.02) * 0.02
     per_row = np.diff(way, prepend=way[0]) * 20.0
-    assert counts(Odometer(t, per_row)) == pytest.approx(0.02, rel=1e-3)
+    assert find_pulse_length(Odometer(t, per_row)) == pytest.approx(0.02, rel=1e-3)
     rng = np.random.default_rng(1)
-    assert counts(Odometer(t, np.round((speed_at(t) + 0.1 * rng.standard_normal(len(t))) / 0.2) * 0.2)) == 0.0
-    assert counts(Odometer(t, np.round(speed_at(t) / 0.2) * 0.2)) == 0.0
+    assert (
+        find_pulse_length(Odometer(t, np.round((speed_at(t) + 0.1 * rng.standard_normal(len(t))) / 0.2) * 0.2)) == 0.0
+    )
+    assert find_pulse_length(Odometer(t, np.round(speed_at(t) / 0.2) * 0.2)) == 0.0
     # counted over the last second, as some loggers do: the errors of neighbours are nearly the same
     over_a_second = (np.floor(way_to(t) / 0.2) - np.floor(way_to(t - 1.0) / 0.2)) * 0.2
-    assert counts(Odometer(t, over_a_second)) == 0.0
+    assert find_pulse_length(Odometer(t, over_a_second)) == 0.0
 
 
 # --- the mean over a window ------------------------------------------------------------------------------------
@@ -214,7 +216,7 @@ def test_no_mean_where_readings_are_missing_or_wrong() -> None:
     expected = (a < 0.0) | (a + 1.0 > t[-1]) | beside
     edge = np.min(np.abs(np.subtract.outer(a, [0.0, t[-1] - 1.0, 38.9, 45.1, 68.9, 72.0])), axis=1) < 0.06
     assert (none == expected)[~edge].all()
-    assert np.allclose(gaps(t), [[40.0, 45.1]], atol=0.11)
+    assert np.allclose(find_gaps(t), [[40.0, 45.1]], atol=0.11)
 
 
 def test_the_sigma_of_a_mean_does_not_ask_what_comes_after_its_window() -> None:

@@ -36,7 +36,7 @@ from graphnav.evaluation.metrics import Errors
 from graphnav.evaluation.segments import relative_errors
 from graphnav.imu.dynamics import SCALE
 from graphnav.recording import Gnss, Imu, Recording, Truth
-from graphnav.recording.allan import allan_of
+from graphnav.recording.allan import compute_allan
 from graphnav.report import allan as allan_page
 from graphnav.report import page
 from graphnav.report import pictures as report_pictures
@@ -44,7 +44,7 @@ from graphnav.report.consistency import consistency
 from graphnav.report.documents import write_comparison, write_report
 from graphnav.report.names import components, has_names
 from graphnav.report.provenance import command, toml_text
-from graphnav.report.sentences import believe_without_truth, list_doubts
+from graphnav.report.sentences import describe_sigma_without_truth, list_doubts
 from graphnav.report.summary import fix_table, left_out, sigma_table, verdicts
 from graphnav.report.tables import accuracy_row, excluded_table, rejected_table, span_row, stop_table
 
@@ -419,7 +419,7 @@ def test_stops_and_outages_are_told(tmp_path, recording):
 )
 def test_sigma_is_judged_by_what_was_met_where_there_is_no_truth(tmp_path, recording, scale, kind, key):
     found = replace(solution(), records={"gnss_position": record(scale, kind)})
-    said = believe_without_truth(found)
+    said = describe_sigma_without_truth(found)
     assert re.findall(r'data-key="([^"]*)"', said) == [f"no_truth.{key}"]
     size = np.sqrt(consistency(found.records["gnss_position"]).mean_nis / 3.0)
     assert f"{size:.2f}" in said
@@ -651,7 +651,7 @@ def test_the_page_of_an_allan_variance_draws_the_deviations_and_their_fit(tmp_pa
     rng, rate = np.random.default_rng(3), 50.0
     t = np.arange(1, 6001) / rate
     gyro, accel = rng.normal(0.0, 1e-3, (len(t), 3)), rng.normal([0.0, 0.0, 9.8], 1e-2, (len(t), 3))
-    result = allan_of(t, gyro, accel)
+    result = compute_allan(t, gyro, accel)
     path, _, _ = allan_page.write(result, tmp_path)
     for title, deviation, sigma in (("Gyro", result.gyro, 1e-3), ("Accelerometer", result.accel, 1e-2)):
         figure = figures_of(path)[title]

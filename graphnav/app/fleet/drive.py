@@ -1,4 +1,4 @@
-"""One drive of a fleet: solved, written, and summed up in a row; or the sentence that says why not."""
+"""One drive of a fleet: solved, written, and summarised in a row; or the sentence that states why not."""
 
 from __future__ import annotations
 
@@ -31,15 +31,15 @@ from graphnav.recording import Recording
 
 NAME = "drive.json"
 DONE, REFUSED, FAILED, CRASHED, HUNG = "done", "refused", "failed", "crashed", "hung"
-_FINAL = (DONE, REFUSED)  # that the same program makes of the same input again
-_POINTS = 200  # of a track on the map of all
-_FIRST, _BETWEEN = 60.0, 30.0  # s before the first span that is withheld, and more than a span's length after each
+_FINAL = (DONE, REFUSED)  # statuses that the same program reproduces from the same input
+_POINTS = 200  # points of a track on the map
+_FIRST, _BETWEEN = 60.0, 30.0  # s before the first withheld span, and multiples of a span's length after each
 
 Row = dict[str, Any]
 
 
 def solve_drive(task: Task) -> Row:
-    """Solve a drive and write it, unless it is done; its row in either case, whatever goes wrong."""
+    """Solve a drive and write its results, unless that is done already; returns its row in any case."""
     began = time.perf_counter()
     folder = Path(task.folder)
     row: Row = {"drive": task.name, "status": FAILED, "source": task.source, "solver": task.solver}
@@ -71,7 +71,7 @@ def solve_drive(task: Task) -> Row:
 
 
 def make_lost_row(task: Task, status: str, error: str, seconds: float) -> Row:
-    """The row of a drive that took its process with it, which could not write one."""
+    """The row of a drive whose process ended and so could not write one."""
     row: Row = {"drive": task.name, "status": status, "source": task.source, "solver": task.solver, "error": error}
     row["time_s"] = round(seconds, 3)
     keep_row(Path(task.folder), "", row)
@@ -79,13 +79,13 @@ def make_lost_row(task: Task, status: str, error: str, seconds: float) -> Row:
 
 
 def keep_row(folder: Path, key: str, row: Mapping[str, Any]) -> None:
-    """Write the row beside the drive's results; a folder that cannot be written to has no other place to say so."""
+    """Write the row beside the drive's results; errors are ignored if the folder is not writable."""
     with suppress(GraphnavError), stage_results(folder) as part:
         write_json(part / NAME, {"key": key, "row": row})
 
 
 def read_row(folder: Path, key: str | None = None) -> Row | None:
-    """The row of a drive that was done before with the same key; with any, if `key` is None."""
+    """The row of a drive that was solved earlier with the same key; with any key, if `key` is None."""
     try:
         values = parse_json(read_text(folder / NAME))
         row = values["row"]
@@ -96,7 +96,7 @@ def read_row(folder: Path, key: str | None = None) -> Row | None:
 
 
 def hash_task(task: Task) -> str:
-    """What a result depends on: this version, all that is asked, and every byte of input."""
+    """Hash of everything a result depends on: this version, all options, and every byte of input."""
     asked = {k: v for k, v in asdict(task).items() if k not in ("name", "source", "folder", "again")}
     asked |= {"graphnav": graphnav.__version__, "noise": task.noise and sha256(Path(task.noise))}
     asked["input"] = [(name, sha256(path)) for name, path in _list_inputs(task.source)]
@@ -104,7 +104,7 @@ def hash_task(task: Task) -> str:
 
 
 def _list_inputs(source: str) -> Iterator[tuple[str, Path]]:
-    """The files that a recording is read from, by their names in it; a built-in one has none."""
+    """The input files of a recording, by their names in it; a built-in one has none."""
     path = Path(source)
     if path.is_dir():
         if not (path / "recording.toml").is_file():
@@ -120,7 +120,7 @@ def _list_inputs(source: str) -> Iterator[tuple[str, Path]]:
         try:
             values = tomllib.loads(read_text(path))
         except (GraphnavError, tomllib.TOMLDecodeError, RecursionError):
-            return  # which reading it will say
+            return  # reported when it is read
         for name in sorted({text for text in _texts(values) if len(text) < 255 and "\0" not in text}):
             if (path.parent / name).is_file():
                 yield name, path.parent / name
@@ -135,7 +135,7 @@ def _texts(values: Any) -> Iterator[str]:
 
 
 def _request(task: Task) -> Request:
-    """What `smooth` would ask for."""
+    """The request that `smooth` would make."""
     settings = settings_from(task.settings)
     noise = parse_noise(task.noise, settings)[1] if task.noise else None
     withheld = tuple(parse_withheld(one) for one in task.without)
@@ -150,10 +150,10 @@ def _request(task: Task) -> Request:
 
 
 def spans(recording: Recording, length: float, zero: float = 0.0) -> list[tuple[float, float]]:
-    """Spans (s from the start of a recording of which this begins at `zero`) whose fixes are withheld and scored.
+    """Spans (s from the start of a recording of which this part begins at `zero`) whose fixes are withheld and scored.
 
-    A minute is left to begin with, and between two of them more than their own length, so that each is an outage by
-    itself; half a minute is left at the end.
+    The first minute is kept, more than a span's length between two spans, so that each is an outage by itself, and half
+    a minute at the end.
     """
     if recording.gnss is None:
         return []
@@ -162,7 +162,7 @@ def spans(recording: Recording, length: float, zero: float = 0.0) -> list[tuple[
 
 
 def _collect_figures(outcome: Outcome) -> Row:
-    """What a row says of a drive that was solved."""
+    """The figures of a solved drive for its row."""
     ((name, solution),) = outcome.solutions.items()
     summary = solver_summary(outcome, name, {}, {})
     measured: Mapping[str, Any] = {**(summary["errors"] or {}), **(summary["nees"] or {})}
@@ -208,7 +208,7 @@ MEASURED = (
 
 
 def _measure_left_out(solution: Solution) -> float | None:
-    """The share of the fixes' information that is left out."""
+    """The share of the fixes' information that is excluded."""
     fixes = solution.records.get("gnss_position")
     if fixes is None or not len(fixes.t):
         return None
@@ -216,7 +216,7 @@ def _measure_left_out(solution: Solution) -> float | None:
 
 
 def _track(outcome: Outcome, solution: Solution) -> list[list[float]] | None:
-    """Longitudes and latitudes (deg) of a few points, where the recording says where on the Earth it is."""
+    """Longitudes and latitudes (deg) of a few points, if the recording has a place on the Earth."""
     if outcome.recording.gnss is None:
         return None
     few = np.unique(np.linspace(0, len(solution.t) - 1, _POINTS).round().astype(int))
@@ -225,11 +225,11 @@ def _track(outcome: Outcome, solution: Solution) -> list[list[float]] | None:
 
 
 def _round_figure(x: float | None) -> float | None:
-    """Five digits, as a summary has."""
+    """Round to five digits, as in a summary."""
     return None if x is None or not math.isfinite(x) else float(f"{x:.5g}")
 
 
 def _forget_peak() -> None:
-    """Begin to count the most memory anew, where the system can."""
+    """Reset the peak memory counter, where the system permits."""
     with suppress(OSError):
         Path("/proc/self/clear_refs").write_text("5", encoding="ascii")

@@ -1,4 +1,4 @@
-"""Which drives a fleet has, and the settings of each: from a folder, or from a manifest in CSV or TOML."""
+"""The drives of a fleet and the settings of each: from a folder, or from a manifest in CSV or TOML."""
 
 from __future__ import annotations
 
@@ -23,40 +23,40 @@ from graphnav.estimation.noise.files import MODES
 from graphnav.estimation.pipeline import KNOWN
 from graphnav.recording.formats import formats
 
-_FORM = "graphnav-recording"  # that every recording.toml names
+_RECORDING_FORMAT = "graphnav-recording"  # contained in every recording.toml
 
 
 @dataclass(frozen=True)
 class DriveOptions:
-    """What is asked of a drive; the same for all, except where a manifest says otherwise."""
+    """The options of a drive; the same for all, except where a manifest overrides them."""
 
     solver: str = "batch"
     profile: str | None = None
     config: str | None = None  # path of a settings file
-    settings: str | None = None  # over those, TOML
+    settings: str | None = None  # overrides of that file, TOML
     noise: str | None = None
-    without: str | None = None  # some, with blanks between
+    without: str | None = None  # several, separated by blanks
     start: float | None = None  # s from the recording's start
     end: float | None = None
 
 
 @dataclass(frozen=True)
 class Task:
-    """One drive, in values that can be sent to another process or machine."""
+    """One drive as plain values that can be sent to another process or machine."""
 
-    name: str  # of the drive and of its folder
+    name: str  # name of the drive and of its folder
     source: str
-    folder: str  # to write into
+    folder: str  # folder to write into
     solver: str
     settings: dict[str, Any]
-    noise: str | None = None  # a file, where one is given
+    noise: str | None = None  # a file, if one is given
     without: tuple[str, ...] = ()
-    withhold: float | None = None  # s, length of the spans without GNSS that are scored
+    withhold: float | None = None  # s, duration of the withheld GNSS spans that are scored
     start: float | None = None
     end: float | None = None
     rate: float | None = None
     pages: bool = True
-    again: bool = False  # solve even what is done
+    again: bool = False  # solve again even if it is done
     outside: bool = False  # whether recordings may name files outside their folders
 
 
@@ -64,7 +64,7 @@ _COLUMNS = ("recording", "name", *(f.name for f in fields(DriveOptions)))
 
 
 def read_drives(source: Path, asked: DriveOptions) -> list[tuple[str, str, DriveOptions, str]]:
-    """Name, recording, what is asked, and where that was said, of every drive.
+    """Name, recording, options, and the source of these, of every drive.
 
     Parameters
     ----------
@@ -82,7 +82,8 @@ def read_drives(source: Path, asked: DriveOptions) -> list[tuple[str, str, Drive
         found = [(_name_of(path, source), str(path), asked, str(path)) for path in _find_recordings(source)]
         if not found:
             raise ConfigError(
-                f'{source}: holds no recording; each is a .toml that says format = "{_FORM}/1"', key="recording.none"
+                f'{source}: holds no recording; each is a .toml that says format = "{_RECORDING_FORMAT}/1"',
+                key="recording.none",
             )
         return _number_clones(found)
     rows = _csv_rows(source) if source.suffix == ".csv" else _toml_rows(source)
@@ -101,7 +102,7 @@ def read_drives(source: Path, asked: DriveOptions) -> list[tuple[str, str, Drive
 def build_task(
     drive: tuple[str, str, DriveOptions, str], out: Path, known: dict[Any, dict[str, Any]], **common: Any
 ) -> Task:
-    """A drive with its settings read and checked; `known` keeps those that many share.
+    """Build a task with its settings read and checked; `known` caches settings that drives share.
 
     Raises
     ------
@@ -135,20 +136,22 @@ def build_task(
 
 
 def _find_recordings(folder: Path) -> list[Path]:
-    """Files that say they are a recording, at any depth."""
+    """Recordings of known form in a folder, at any depth."""
     found = []
     for place, folders, files in os.walk(folder):
         folders[:] = sorted(name for name in folders if not name.startswith("."))
         for file in sorted(files):
             path = Path(place) / file
-            # one that cannot be read has its name, and a row that says so
-            if file == "recording.toml" or (file.endswith(".toml") and path.is_file() and _FORM in _begin(path)):
+            # an unreadable file gets a row that states so, under its name
+            if file == "recording.toml" or (
+                file.endswith(".toml") and path.is_file() and _RECORDING_FORMAT in _begin(path)
+            ):
                 found.append(path)
     return found
 
 
 def _begin(path: Path) -> str:
-    """The first of a file, where the format is named."""
+    """The first bytes of a file, in which the format is named."""
     try:
         with path.open(encoding="utf-8", errors="replace") as file:
             return file.read(4000)
@@ -163,12 +166,12 @@ def _name_of(path: Path, folder: Path) -> str:
 
 
 def _clean_name(text: str) -> str:
-    """A name that every file system takes."""
+    """A name that every file system accepts."""
     return re.sub(r"[^\w.+-]+", "_", text).strip("._")[:120] or "drive"
 
 
 def _number_clones(drives: list[tuple[str, str, DriveOptions, str]]) -> list[tuple[str, str, DriveOptions, str]]:
-    """The same with different names: a number behind those that come again."""
+    """Make names unique: repeated ones get a number appended."""
     taken: set[str] = set()
     out = []
     for name, *rest in drives:
@@ -224,7 +227,7 @@ def _check_columns(names: Iterable[str], where: str) -> None:
 
 
 def _drive(source: Path, where: str, row: Mapping[str, Any], asked: DriveOptions) -> tuple[str, str, DriveOptions, str]:
-    """A row of a manifest; what is blank is as for all."""
+    """One row of a manifest; a blank field takes the common value."""
     said: dict[str, Any] = {}
     for key in (f.name for f in fields(DriveOptions)):
         value = row.get(key)
@@ -262,7 +265,7 @@ def _drive(source: Path, where: str, row: Mapping[str, Any], asked: DriveOptions
 
 
 def _find_beside(source: Path, name: str, where: str, key: str) -> Path:
-    """What a manifest names; as elsewhere, that lies in its folder or below unless the command says otherwise."""
+    """A file named by a manifest; it must be in the manifest's folder or below unless the command permits otherwise."""
     path = source.parent / name
     if not is_inside(path, source.parent, ConfigError):
         raise ConfigError(
@@ -273,7 +276,7 @@ def _find_beside(source: Path, name: str, where: str, key: str) -> Path:
 
 
 def _toml(text: str) -> dict[str, Any]:
-    """Settings in one cell, with semicolons for line ends."""
+    """Parse settings in one cell, with semicolons as line ends."""
     try:
         return tomllib.loads(text if "\n" in text else text.replace(";", "\n"))
     except tomllib.TOMLDecodeError as error:
@@ -293,7 +296,7 @@ def _write(values: Mapping[str, Any], at: str = "") -> str:
 
 
 def _overlay(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
-    """Nested values with others over them."""
+    """Merge nested values; `above` takes precedence."""
     out = dict(below)
     for key, value in above.items():
         inner = out.get(key)

@@ -1,4 +1,4 @@
-"""One page for a fleet: what it comes to, how its figures are spread, where it drove, and its drives, worst first."""
+"""One page for a fleet: totals, distributions of its figures, maps, and its drives, worst first."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from graphnav.app.fleet.drive import DONE, Row
 from graphnav.app.fleet.tables import numbers, totals, worst_first
 from graphnav.core.rotation import Array
 
-_LISTED = 1000  # drives in the table of the page; the files have all
-DRAWN = 2000  # tracks on the maps, of the drives that were done first
-_APART = 0.5  # deg; tracks further apart are on another map
+_MAX_DRIVES = 1000  # drives in the page's table; the files contain all
+DRAWN = 2000  # tracks on the maps, of the drives that were solved first
+_MAP_DISTANCE = 0.5  # deg; tracks further apart go on different maps
 _MAPS = 12
-_SPREAD = {
+_HISTOGRAMS = {
     "span_end_h_median_m": "Horizontal error at the end of a withheld span, median of a drive (m)",
     "h_rms_m": "Horizontal error, RMS of a drive (m)",
     "nees_p": "NEES of the position, per degree of freedom; 1 where the sigmas are true",
@@ -50,14 +50,14 @@ a{color:var(--ink)}
 
 
 def write_page(rows: Sequence[Row], path: Path, title: str) -> None:
-    """Write the page; links go to the reports beside it."""
+    """Write the page; it links to the reports beside it."""
     found = totals(rows)
     said = ", ".join(f"{count} {status}" for status, count in found["status"].items())
     lead = (
         f"{found['drives']} drives, {found['hours']:.2f} h, {found['km']:.1f} km: {said}; {found['doubtful']} doubtful."
     )
     spread = [
-        _draw_histogram(numbers(rows, key), label) for key, label in _SPREAD.items() if len(numbers(rows, key)) > 1
+        _draw_histogram(numbers(rows, key), label) for key, label in _HISTOGRAMS.items() if len(numbers(rows, key)) > 1
     ]
     parts = [
         f"<h1>{escape(title)}</h1><p>{escape(lead)}</p>",
@@ -75,7 +75,7 @@ def write_page(rows: Sequence[Row], path: Path, title: str) -> None:
 
 def _table(rows: Sequence[Row]) -> str:
     lines = []
-    for row in rows[:_LISTED]:
+    for row in rows[:_MAX_DRIVES]:
         name = escape(str(row["drive"]))
         if row.get("report"):
             name = f'<a href="{escape(str(row["report"]))}">{name}</a>'
@@ -84,7 +84,7 @@ def _table(rows: Sequence[Row]) -> str:
         kind = "" if row["status"] == DONE else ' class="bad"'
         lines.append(f'<tr><td>{name}</td>{cells}<td class="words"><span{kind}>{why}</span></td></tr>')
     head = "".join(f"<th>{escape(label)}</th>" for label in _TABLE.values())
-    more = f'<p class="soft">and {len(rows) - _LISTED} more in fleet.csv</p>' if len(rows) > _LISTED else ""
+    more = f'<p class="soft">and {len(rows) - _MAX_DRIVES} more in fleet.csv</p>' if len(rows) > _MAX_DRIVES else ""
     return (
         f'<div class="wide"><table><thead><tr><th>drive</th>{head}<th class="words">why</th></tr></thead>'
         f"<tbody>{''.join(lines)}</tbody></table></div>{more}"
@@ -98,7 +98,7 @@ def _format_value(value: object) -> str:
 
 
 def _draw_histogram(x: Array, label: str) -> str:
-    """Bars over decades where values are spread over more than one, else over even steps."""
+    """A histogram with logarithmic bins where values span more than a decade, otherwise even ones."""
     if x.min() == x.max():
         return f"<figure><figcaption>{escape(label)}: {x[0]:.4g} of all</figcaption></figure>"
     log = bool(x.min() > 0.0 and x.max() > 10.0 * x.min())
@@ -125,11 +125,11 @@ def _label(value: float, log: bool) -> str:
 
 
 def _draw_maps(rows: Sequence[Row]) -> str:
-    """All tracks, those near each other on one map."""
+    """All tracks, those close to each other on one map."""
     placed = [(np.array(row["track"], dtype=float), row) for row in rows if row.get("track")]
     groups: list[list[tuple[Array, Row]]] = []
     for track, row in placed[:DRAWN]:
-        near = next((g for g in groups if np.abs(g[0][0][0] - track[0]).max() < _APART), None)
+        near = next((g for g in groups if np.abs(g[0][0][0] - track[0]).max() < _MAP_DISTANCE), None)
         if near is None:
             groups.append([(track, row)])
         else:

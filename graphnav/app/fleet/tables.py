@@ -1,4 +1,4 @@
-"""The rows of a fleet as CSV and as Parquet, and what they come to."""
+"""The rows of a fleet as CSV and Parquet, and their totals."""
 
 from __future__ import annotations
 
@@ -37,12 +37,12 @@ _BADNESS = ("span_end_h_median_m", "h_rms_m", "sd_h_median_m")
 
 
 def columns_of(rows: Sequence[Row]) -> list[str]:
-    """`COLUMNS`, and one for the factor of each noise figure that any drive has."""
+    """`COLUMNS`, plus one for the factor of each noise figure that any drive has."""
     return [*COLUMNS, *sorted({key for row in rows for key in row if key.startswith("noise.")})]
 
 
 def write_csv(rows: Sequence[Row], path: Path) -> None:
-    """One line per drive; what is not known is blank."""
+    """One line per drive; unknown values are blank."""
     text = io.StringIO()
     writer = csv.DictWriter(text, columns_of(rows), extrasaction="ignore", lineterminator="\n")
     writer.writeheader()
@@ -51,7 +51,7 @@ def write_csv(rows: Sequence[Row], path: Path) -> None:
 
 
 def write_parquet(rows: Sequence[Row], path: Path) -> bool:
-    """The same as Parquet, if pyarrow is there; whether it is."""
+    """Write the same as Parquet if pyarrow is installed; returns whether it is."""
     if find_spec("pyarrow") is None:
         return False
     import pyarrow as pa
@@ -69,7 +69,7 @@ def write_parquet(rows: Sequence[Row], path: Path) -> bool:
 
 
 def worst_first(rows: Sequence[Row]) -> list[Row]:
-    """Drives without a result, those whose result is doubtful, and the rest, each by the size of its error."""
+    """Drives without a result first, then those with a doubtful result, then the rest, each ordered by error."""
 
     def badness(row: Row) -> tuple[bool, bool, float]:
         off = next((float(row[key]) for key in _BADNESS if row.get(key) is not None), 0.0)
@@ -79,12 +79,12 @@ def worst_first(rows: Sequence[Row]) -> list[Row]:
 
 
 def numbers(rows: Sequence[Row], key: str) -> Array:
-    """The values of a column that are known."""
+    """The finite values of a column."""
     return np.array([float(row[key]) for row in rows if row.get(key) is not None])
 
 
 def totals(rows: Sequence[Row]) -> dict[str, Any]:
-    """What a fleet comes to."""
+    """The totals of a fleet."""
     status, solved = Counter(row["status"] for row in rows), [row for row in rows if row["status"] == DONE]
     return {
         "drives": len(rows),
@@ -99,7 +99,7 @@ def totals(rows: Sequence[Row]) -> dict[str, Any]:
 
 
 def text(rows: Sequence[Row], most: int = 10) -> str:
-    """For a terminal: the totals, and the drives that came to nothing."""
+    """The totals, and the failed drives, for a terminal."""
     found = totals(rows)
     said = ", ".join(f"{count} {status}" for status, count in found["status"].items())
     lines = [

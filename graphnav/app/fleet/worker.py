@@ -1,4 +1,4 @@
-"""A process that solves drives: a task in JSON on every line of its input, a row on every line of its output."""
+"""A process that solves drives: reads a task in JSON per line, writes a row in JSON per line."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from graphnav.core.jsonable import json_text
 
 
 def main() -> None:
-    """Solve until there is nothing more to solve; the argument is what this process may hold, MB, 0 for all."""
+    """Solve tasks until the input ends; the argument is the memory limit of this process, MB, 0 for none."""
     _limit_memory(float(sys.argv[1]))
-    # whatever prints, also in compiled code, must not mix with the rows
+    # anything printed, also by compiled code, must not mix with the rows
     out = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)
     for line in sys.stdin:
@@ -26,7 +26,7 @@ def main() -> None:
 
 
 def _limit_memory(megabytes: float) -> None:
-    """Let what asks for more than its share fail, rather than have the system choose who is to end."""
+    """Limit the memory of this process, so that an allocation fails rather than the system killing some process."""
     if megabytes:
         with suppress(ImportError, OSError, ValueError):
             import resource  # not on Windows

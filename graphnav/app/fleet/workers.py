@@ -1,8 +1,8 @@
-"""Drives shared out to processes, here or on the machines of a Dask cluster; none can take another with it.
+"""Distribution of drives to processes, here or on the machines of a Dask cluster; a crash affects one drive only.
 
-Each process solves one drive after the other. One that dies costs its drive and is replaced, and so does one that
-takes longer than it may, which is ended. They are processes of their own (`graphnav.app.fleet.worker`), not forks: on a
-cluster just as here, where a fault in compiled code would end Dask's worker.
+Each process solves one drive after the other. One that dies loses only its drive and is replaced; so is one that
+exceeds its time limit, which is killed. They are separate processes (`graphnav.app.fleet.worker`), not forks, on a
+cluster as well, where a crash in compiled code would end Dask's worker.
 """
 
 from __future__ import annotations
@@ -26,19 +26,19 @@ from graphnav.app.fleet.drive import CRASHED, HUNG, Row, make_lost_row
 from graphnav.app.fleet.manifest import Task
 from graphnav.core.errors import ConfigError
 
-_AHEAD = 10  # drives that a scheduler is told of, for each thread of its workers
+_SUBMITTED_AHEAD = 10  # drives submitted ahead to a scheduler, per thread of its workers
 
 
 @dataclass(frozen=True)
 class Limits:
-    """What one drive may take."""
+    """Limits for one drive."""
 
     seconds: float
     memory_mb: float | None = None
 
 
 def share_of_memory(processes: int) -> float | None:
-    """This machine's memory in MB, shared by so many processes; None where it is not known."""
+    """This machine's memory in MB divided by the number of processes; None where it is unknown."""
     try:
         return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**20 / processes
     except (AttributeError, ValueError, OSError):
@@ -53,7 +53,7 @@ class Worker:
         self._process: subprocess.Popen[str] | None = None
 
     def solve(self, task: Task) -> Row:
-        """The row of a drive, whatever becomes of the process."""
+        """The row of a drive, whatever happens to the process."""
         began = time.monotonic()
         process = self._ensure_process()
         assert process.stdin is not None
@@ -70,7 +70,7 @@ class Worker:
             process.stdin.write(json.dumps(asdict(task)) + "\n")
             process.stdin.flush()
             answer = process.stdout.readline()
-        except OSError:  # it ended before it had read
+        except OSError:  # it ended before reading the task
             answer = ""
         finally:
             timer.cancel()
@@ -86,7 +86,7 @@ class Worker:
         return make_lost_row(task, CRASHED, f"the process that solved it {_end_of(code)}", spent)
 
     def close(self) -> None:
-        """End the process, at once."""
+        """End the process at once."""
         if self._process is not None:
             self._process.kill()
             self._process.wait()
@@ -99,7 +99,7 @@ class Worker:
             self._process = subprocess.Popen(
                 [sys.executable, "-m", "graphnav.app.fleet.worker", f"{self._limits.memory_mb or 0:.0f}"],
                 stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True,
-                # a signal of the terminal is for the program, which ends its workers
+                # signals of the terminal go to the main program, which ends its workers
                 start_new_session=True, env={**os.environ, "PYTHONPATH": path, "OPENBLAS_NUM_THREADS": "1"},
             )  # fmt: skip
         return self._process
@@ -116,7 +116,7 @@ def _end_of(code: int) -> str:
 
 
 def solve_here(tasks: Sequence[Task], processes: int, limits: Limits) -> Iterator[Row]:
-    """Rows of drives as they are done, by so many processes."""
+    """Rows of drives as they are solved by a number of processes."""
     own = threading.local()
     workers: list[Worker] = []
 
@@ -140,18 +140,18 @@ def solve_here(tasks: Sequence[Task], processes: int, limits: Limits) -> Iterato
         pool.shutdown()
 
 
-_OF_THREAD = threading.local()  # a worker for each thread of a worker of Dask's
+_OF_THREAD = threading.local()  # one process per thread of a Dask worker
 
 
 def solve_apart(task: Task, limits: Limits) -> Row:
-    """The row of a drive, solved by a process of this thread's own."""
+    """The row of a drive, solved by this thread's own process."""
     if getattr(_OF_THREAD, "limits", None) != limits:
         _OF_THREAD.worker, _OF_THREAD.limits = Worker(limits), limits
     return _OF_THREAD.worker.solve(task)
 
 
 def solve_on_cluster(tasks: Sequence[Task], scheduler: str, limits: Limits) -> Iterator[Row]:
-    """Rows of drives as they are done, by the workers of a Dask cluster that see the same files.
+    """Rows of drives as they are solved by the workers of a Dask cluster that see the same files.
 
     Raises
     ------
@@ -181,8 +181,8 @@ def solve_on_cluster(tasks: Sequence[Task], scheduler: str, limits: Limits) -> I
             of.update((future.key, task) for future, task in zip(futures, few, strict=True))
             return list(futures)
 
-        # a scheduler that is told of all drives at once holds them all
-        under_way = completed(next_few(max(_AHEAD, _AHEAD * sum(client.nthreads().values()))))
+        # a scheduler that is given all drives at once keeps them all in memory
+        under_way = completed(next_few(max(_SUBMITTED_AHEAD, _SUBMITTED_AHEAD * sum(client.nthreads().values()))))
         try:
             for future in under_way:
                 task = of.pop(future.key)

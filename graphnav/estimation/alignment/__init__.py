@@ -1,16 +1,16 @@
 """The first state of a drive: attitude, velocity, position and biases at the first IMU sample, with sigmas.
 
-A short smoothing problem, posed and solved with the same parts as the whole drive, over the first stretch in
-which the vehicle moves. Levelling (the mean specific force points up) and the median turn rate (a vehicle
-mostly goes straight or stands) start it, and the heading that turns the felt accelerations into those of the
-fixes, or one of three more 90 degrees apart: the one that explains the fixes best wins. So neither speed nor a standing
-start is assumed. What is too slow to feel its accelerations knows its heading by its course, which is forwards unless
-they say otherwise. From there the gyro carries the attitude back to the first sample. Before anything moves, two
-antennas tell the heading of a vehicle that stands.
+A short smoothing problem is built and solved like that of the whole drive, over the first span in which the vehicle
+moves. Its initial attitude comes from levelling (the mean specific force points up), its gyro bias from the median turn
+rate (a vehicle mostly goes straight or stands), its heading from the rotation that maps the measured accelerations to
+those of the fixes; three more headings 90 degrees apart are tried, and the one that explains the fixes best is used. So
+neither speed nor a stationary start is assumed. A vehicle too slow for measurable accelerations gets its heading from
+its course, taken as forwards unless they show reverse. From there the gyro carries the attitude back to the first
+sample. Before any motion, two antennas give the heading of a stationary vehicle.
 
-What the short problem learned, the long one will learn again from the same data. So the result enters as the
-point to start from, with a prior `prior_inflation` times wider than its own sigma: information counts once. Only
-what the fixes do not contain, that a vehicle's forward axis is roughly its course, enters at its own worth.
+The whole drive's problem uses the data of the short one again. So the result enters as its initial point, with a prior
+`prior_inflation` times wider than its own sigma: information counts once. Only information that is not in the fixes,
+that a vehicle's forward axis is roughly its course, enters with its own weight.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ from graphnav.core.earth import LocalFrame
 from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.detectors.base import NONE
-from graphnav.estimation.alignment.antennas import baseline_heading
+from graphnav.estimation.alignment.antennas import measure_baseline_heading
 from graphnav.estimation.alignment.course import COURSE_SIGMA
 from graphnav.estimation.alignment.first import Alignment
-from graphnav.estimation.alignment.motion import Smoother, align_in_motion, drop_implausible, motion
+from graphnav.estimation.alignment.motion import Smoother, align_in_motion, drop_implausible, find_motion_span
 from graphnav.estimation.alignment.rest import at_rest
 from graphnav.recording import Recording
 
-__all__ = ["COURSE_SIGMA", "Alignment", "Smoother", "align", "ready", "with_known_heading"]
+__all__ = ["COURSE_SIGMA", "Alignment", "Smoother", "align", "is_ready", "with_known_heading"]
 
 
 def align(
@@ -42,8 +42,9 @@ def align(
 
     Parameters
     ----------
-    smooth : solves a posed problem from start states; handed in because solvers stand behind this room.
-    stationary : (N, 2) s, intervals in which a vehicle stands, where fixes that jump are no motion; a foot's stances.
+    smooth : function that solves a problem from initial states; solvers import this package.
+    stationary : (N, 2) s, intervals in which a vehicle stands, where jumps of fixes are
+        not motion; of a foot, its stances.
 
     Raises
     ------
@@ -51,27 +52,27 @@ def align(
         If nothing in the recording can give an attitude.
     """
     recording = drop_implausible(recording)
-    span = motion(recording, settings, stationary)
+    span = find_motion_span(recording, settings, stationary)
     if span is None:
         return at_rest(recording, settings, frame, stationary)
     return replace(align_in_motion(recording, settings, frame, smooth, span), motion=span[0], until=span[1])
 
 
-def ready(recording: Recording, settings: Settings, stationary: Array | None = None) -> bool:
-    """Whether the fixes so far show all the motion that an alignment wants to see, or two antennas tell the heading.
+def is_ready(recording: Recording, settings: Settings, stationary: Array | None = None) -> bool:
+    """Whether the fixes so far contain all the motion that an alignment needs, or two antennas give the heading.
 
     Parameters
     ----------
     stationary : as for `align`; None where stops have not been detected yet; a quiet IMU alone stands for them then.
     """
-    span = motion(drop_implausible(recording), settings, NONE if stationary is None else stationary)
+    span = find_motion_span(drop_implausible(recording), settings, NONE if stationary is None else stationary)
     if span is None:
-        return baseline_heading(recording, settings, stationary) is not None
+        return measure_baseline_heading(recording, settings, stationary) is not None
     return recording.gnss is not None and span[1] < recording.gnss.t[-1]
 
 
 def with_known_heading(found: Alignment, settings: Settings) -> Alignment:
-    """The alignment with the start heading the user states, where there is one."""
+    """The alignment with the initial heading that the user states, if any."""
     known = settings.alignment.heading
     if known is None:
         return found

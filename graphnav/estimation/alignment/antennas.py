@@ -1,4 +1,4 @@
-"""The heading of a vehicle that stands, by two antennas: the direction of their baseline less that in the vehicle."""
+"""The heading of a stationary vehicle by two antennas: the direction of their baseline minus that in the vehicle."""
 
 from __future__ import annotations
 
@@ -15,23 +15,25 @@ from graphnav.estimation.alignment.back import find_stand_end
 from graphnav.estimation.alignment.first import level
 from graphnav.recording import Recording
 
-_FEWEST_READINGS = 3  # readings: their median is none of one that is wrong
+_FEWEST_READINGS = 3  # readings needed so that a single wrong one does not affect the median
 
 
 @dataclass(frozen=True)
 class BaselineHeading:
-    """What two antennas say of the heading at the start."""
+    """The heading at the start by two antennas."""
 
     heading: float  # rad
     sigma: float  # rad
     until: float  # s, the last reading used
 
 
-def baseline_heading(recording: Recording, settings: Settings, stationary: Array | None) -> BaselineHeading | None:
-    """The heading of a vehicle that stands at the start, by the readings of two antennas there.
+def measure_baseline_heading(
+    recording: Recording, settings: Settings, stationary: Array | None
+) -> BaselineHeading | None:
+    """The heading of a vehicle that is stationary at the start, by the readings of two antennas there.
 
-    Errors of readings within seconds are alike (multipath), and that of the mounting is in all of them: many are worth
-    no more than one.
+    Errors of readings are correlated over seconds (multipath), and all contain that of the mounting: their mean is no
+    better than one.
 
     Parameters
     ----------

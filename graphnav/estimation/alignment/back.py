@@ -16,7 +16,7 @@ from graphnav.imu.preintegration import prefix
 from graphnav.imu.samples import bridge_gaps
 from graphnav.recording import Imu, Recording
 
-_BASE = 5.0  # s between fixes that tell the first velocity
+_BASE = 5.0  # s between the fixes that give the first velocity
 
 
 def carry_back(
@@ -29,7 +29,7 @@ def carry_back(
     begin: float,
     notes: tuple[str, ...],
 ) -> Alignment:
-    """From the start of the short problem to the first sample of the recording."""
+    """Carry the state back from the start of the short problem to the first sample of the recording."""
     imu, noise = recording.imu, recording.imu.noise
     bg, ba = solution.states.bg[0], solution.states.ba[0]
     p, v = solution.states.p[0], solution.states.v[0]
@@ -42,7 +42,7 @@ def carry_back(
         drift = np.zeros(3)
         if back > 0.05:
             dR, dV, dP = prefix(bridge_gaps(imu), still, np.array([begin]), ba, bg)
-            R = rotation.exp(solution.frame.omega_n * back) @ R @ dR[0].T  # the Earth turned meanwhile
+            R = rotation.exp(solution.frame.omega_n * back) @ R @ dR[0].T  # the Earth has turned meanwhile
             g = solution.frame.gravity_n(p)
             v0 = v - g * back - R @ dV[0]
             p = p - v0 * back - 0.5 * g * back**2 - R @ dP[0]
@@ -63,7 +63,7 @@ def carry_back(
                 *notes,
                 Note(
                     "alignment.stands_first",
-                    f"stands for the first {stood:.0f} s; the attitude is that of the first motion",
+                    f"stationary for the first {stood:.0f} s; the attitude is from the first motion",
                 ),
             )
             sd_bg = np.full(3, noise.gyro_noise_density / np.sqrt(stood) + noise.gyro_bias_walk * np.sqrt(stood))
@@ -78,9 +78,9 @@ def carry_back(
 
 
 def find_stand_end(imu: Imu, start: float, end: float) -> float:
-    """How long nothing but vibration is in the samples from the start: one-second means hardly differ. `start` if not.
+    """End of the initial span with nothing but vibration: one-second means hardly differ. `start` if there is none.
 
-    The last second before the first that differs is left out as well: something may have begun in it.
+    The last second before the first that differs is left out as well, as motion may have begun in it.
     """
     rows = imu.t <= end
     blocks = max(1, int(end - start))
@@ -97,16 +97,16 @@ def find_stand_end(imu: Imu, start: float, end: float) -> float:
 
 
 def _measure_range(x: Array) -> Array:
-    """(N, k) highest less lowest so far."""
+    """(N, k) maximum minus minimum so far."""
     return np.maximum.accumulate(x, axis=0) - np.minimum.accumulate(x, axis=0)
 
 
 def _refine_by_fixes(
     recording: Recording, frame: LocalFrame, R: Array, found: tuple[Array, Array, Array, Array]
 ) -> tuple[Array, Array, Array, Array]:
-    """Position and velocity at the start, each with its sigma: as found, or by the first fixes where these know more.
+    """Position and velocity at the start, each with its sigma: as found, or by the first fixes if these are better.
 
-    Inertial sensors lose the place within a minute or so; fixes from before the first motion are still there.
+    Inertial sensors lose the position within a minute or so; fixes from before the first motion are still valid.
     """
     p, sd_p, v, sd_v = found
     gnss = recording.gnss
@@ -118,7 +118,7 @@ def _refine_by_fixes(
     if len(later):
         j, dt = later[0], float(gnss.t[later[0]] - gnss.t[i])
         v_fix = (frame.from_llh(gnss.llh[j]) - frame.from_llh(gnss.llh[i])) / dt
-        sd_v_fix = 3.0 * np.hypot(gnss.sd[i], gnss.sd[j]) / dt + 2.0 * dt  # the speed may change meanwhile, 2 m/s^2
+        sd_v_fix = 3.0 * np.hypot(gnss.sd[i], gnss.sd[j]) / dt + 2.0 * dt  # the speed may change meanwhile, by 2 m/s^2
     if np.linalg.norm(sd_v_fix) < np.linalg.norm(sd_v):
         v, sd_v = v_fix, sd_v_fix
     away = abs(float(gnss.t[i]) - recording.start)

@@ -1,4 +1,4 @@
-"""What an alignment gives, and what each way to it needs."""
+"""The result of an alignment, and helpers of all its methods."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ _SIGMAS = 3.0
 
 @dataclass(frozen=True)
 class Alignment:
-    """The prior of the first keyframe: one state, 15 sigmas, and what was done in words."""
+    """The prior of the first keyframe: one state, 15 sigmas, and notes."""
 
     state: States
     sigma: Array  # (15,) of the prior
-    own_sigma: Array  # (3,) rad, of roll, pitch, heading as the alignment itself believes them
+    own_sigma: Array  # (3,) rad, of roll, pitch, heading, the alignment's own
     notes: tuple[str, ...]
-    motion: float | None = None  # s, from when on the heading is told: the first motion, or two antennas; None: never
-    until: float | None = None  # s, the end of what a filter goes through twice: the stretch of motion, or first steps
+    motion: float | None = None  # s, from when on the heading is known: the first motion, or two antennas; None: never
+    until: float | None = None  # s, end of the span that a filter processes twice: the span of motion, or first steps
 
     @property
     def rph(self) -> Array:
@@ -32,7 +32,7 @@ class Alignment:
         return rotation.to_rph(self.state.R_nb[0])
 
     def contradicts(self, other: Alignment) -> bool:
-        """Whether another is not where this one can be: by its own sigma of attitude, by its prior's of the rest."""
+        """Whether another contradicts this one: by its own sigma of attitude, by the prior's of the rest."""
         sigma = np.concatenate([self.own_sigma, self.sigma[3:]])
         off = np.concatenate([rotation.wrap(self.rph - other.rph), self.state.minus(other.state)[0, 3:]])
         return bool(np.any(np.abs(off) > _SIGMAS * sigma))
@@ -47,7 +47,7 @@ def level(recording: Recording, begin: float, seconds: float = 1.0) -> Array:
 
 
 def pick_fixes(gnss: Gnss, rows: Array) -> Gnss:
-    """Fixes picked by index or mask."""
+    """Select fixes by index or mask."""
     pick: dict[str, Any] = {"t": gnss.t[rows], "llh": gnss.llh[rows], "sd": gnss.sd[rows]}
     if gnss.v is not None and gnss.sd_v is not None:
         pick |= {"v": gnss.v[rows], "sd_v": gnss.sd_v[rows]}

@@ -1,4 +1,4 @@
-"""The first state from motion: a short smoothing problem over the first stretch in which the vehicle moves."""
+"""The first state from motion: a short smoothing problem over the first span in which the vehicle moves."""
 
 from __future__ import annotations
 
@@ -19,28 +19,30 @@ from graphnav.detectors.base import NONE, mask_inside
 from graphnav.estimation.alignment.back import carry_back
 from graphnav.estimation.alignment.course import COURSE_SIGMA, with_course
 from graphnav.estimation.alignment.first import Alignment, level, pick_fixes
-from graphnav.estimation.alignment.travel import average_across, integrate_yaw, travel
+from graphnav.estimation.alignment.travel import average_across, integrate_yaw, measure_travel
 from graphnav.estimation.problem import Problem, build_problem
 from graphnav.estimation.solution import Solution
 from graphnav.imu.preintegration import prefix
 from graphnav.imu.samples import bridge_gaps
 from graphnav.recording import Gnss, Imu, Recording
 
-_DIRECTION = 0.5 * COURSE_SIGMA  # rad, to which the fixes shall know the direction of travel: less than the rest does
-_FIXES = 10  # that the short problem wants to see
-_FEWEST_FIXES = 3  # without which there is no acceleration
-_MOVES = 5.0  # sigmas of way that are motion: noise gets there once in 270 000 fixes, exp(-5^2/2)
-_BEFORE = 10.0  # s of the stretch before the motion
-_OUTLYING = 6.0  # times what fixes usually are off their running median, or their sigma
-_TURNS = (0.0, 0.5 * np.pi, 1.5 * np.pi, np.pi)  # rad, of the start headings that are tried from the first guess
-_FIRST_ITERATIONS = 10  # iterations by which a start either has converged or creeps
-_UNLIKELY = 14.0  # by which a log-likelihood is less where one in a million is left: -ln 1e-6
+# rad, to which the fixes must determine the direction of travel: better than the other contributions
+_DIRECTION = 0.5 * COURSE_SIGMA
+_WANTED_FIXES = 10  # fixes that the short problem should contain
+_FEWEST_FIXES = 3  # fixes without which there is no acceleration
+_MOVING_SIGMAS = 5.0  # sigmas of travel that count as motion: noise reaches them once in 270 000 fixes, exp(-5^2/2)
+_LEAD_TIME = 10.0  # s of the span before the motion
+_OUTLYING = 6.0  # multiple of the typical deviation of fixes from their running median, or of their sigma
+# rad, of the initial headings that are tried, relative to the first guess
+_HEADINGS_TRIED = (0.0, 0.5 * np.pi, 1.5 * np.pi, np.pi)
+_FIRST_ITERATIONS = 10  # iterations after which a start either has converged or creeps
+_UNLIKELY = 14.0  # difference of log-likelihoods at a ratio of one in a million: -ln 1e-6
 
 Smoother = Callable[[Problem, States], Solution]
 
 
 def drop_implausible(recording: Recording) -> Recording:
-    """Without the fixes that lie far off the running median of five: they would be taken for motion."""
+    """Drop the fixes far off the running median of five, which would be taken for motion."""
     gnss = recording.gnss
     if gnss is not None and not np.isfinite(gnss.llh).all():
         gnss = pick_fixes(gnss, np.flatnonzero(np.isfinite(gnss.llh).all(axis=1)))
@@ -53,12 +55,12 @@ def drop_implausible(recording: Recording) -> Recording:
     return replace(recording, gnss=pick_fixes(gnss, off <= _OUTLYING * usual))
 
 
-def motion(recording: Recording, settings: Settings, stationary: Array = NONE) -> tuple[float, float] | None:
-    """The stretch (s) to align over: from just before the first motion until enough of it was seen.
+def find_motion_span(recording: Recording, settings: Settings, stationary: Array = NONE) -> tuple[float, float] | None:
+    """The span (s) to align over: from just before the first motion until there has been enough of it.
 
-    It moves where it is farther away than the errors of the fixes can have brought it, over ground or in its own axes
-    (`graphnav.estimation.alignment.travel`); enough is seen once these errors leave little doubt of the direction. What
-    the fixes say of motion while a vehicle stands, `stationary` (N, 2) s, is none.
+    The platform moves where it is farther away than errors of the fixes explain, over ground or in its own axes
+    (`graphnav.estimation.alignment.travel`); there is enough motion once these errors leave little doubt about the
+    direction. Apparent motion of the fixes while a vehicle is stationary, `stationary` (N, 2) s, does not count.
     """
     gnss = recording.gnss
     if gnss is None:
@@ -75,19 +77,19 @@ def motion(recording: Recording, settings: Settings, stationary: Array = NONE) -
     else:  # a foot turns about every axis
         yaw, still = np.zeros(len(t)), np.zeros(len(t), dtype=bool)
     sd = average_across(gnss.sd)
-    way = travel(p, sd, yaw, still)
-    away = np.maximum(way.times_sigma, travel(p, sd, np.zeros(len(t)), still).times_sigma) > _MOVES
+    way = measure_travel(p, sd, yaw, still)
+    away = np.maximum(way.times_sigma, measure_travel(p, sd, np.zeros(len(t)), still).times_sigma) > _MOVING_SIGMAS
     if not away.any():
         return None
     first = int(np.argmax(away))
     enough = (way.times_sigma > 1.0 / np.tan(_DIRECTION)) & (t > t[first] + settings.alignment.window)
-    enough &= np.arange(len(t)) >= first + _FIXES
+    enough &= np.arange(len(t)) >= first + _WANTED_FIXES
     last = int(np.argmax(enough)) if enough.any() else len(t) - 1
-    # at the speed that followed it took a while to get that far
+    # at the speed that followed, it took a while to get that far
     speed = np.abs(way.D[last] - way.D[first]) / max(t[last] - t[first], 1.0)
     under_way = np.abs(way.D[first]) / speed if speed > 0.0 else np.inf
-    begin = min(t[first] - _BEFORE - under_way, t[max(last - _FEWEST_FIXES + 1, 0)])
-    return float(max(t[0], np.round(begin, 3))), float(t[last])  # what rounding did to D shall not show
+    begin = min(t[first] - _LEAD_TIME - under_way, t[max(last - _FEWEST_FIXES + 1, 0)])
+    return float(max(t[0], np.round(begin, 3))), float(t[last])  # rounding errors of D must not count
 
 
 def align_in_motion(
@@ -107,7 +109,7 @@ def align_in_motion(
     tried = _try_headings(part, settings, frame, smooth, rp, heading, bias)
     if not tried:
         raise EstimationError(
-            f"'{recording.name}': no start attitude explains the GNSS fixes between {begin - recording.start:.0f} "
+            f"'{recording.name}': no initial attitude explains the GNSS fixes between {begin - recording.start:.0f} "
             f"and {end - recording.start:.0f} s; check the axes, the units and the time stamps",
             key="alignment.not_explained",
         )
@@ -134,10 +136,10 @@ def align_in_motion(
 
 
 def _fit_heading(part: Recording, frame: LocalFrame, rp: Array, bias: Array) -> float:
-    """Heading (rad) at the start of `part` by which levelled accelerations become those of the fixes.
+    """Heading (rad) at the start of `part` that maps levelled accelerations to those of the fixes.
 
-    With both horizontal accelerations as complex numbers east + i north, fixes = z * felt + d by least squares;
-    the argument of z is the turn from the heading-zero frame, d takes up tilt.
+    With both horizontal accelerations as complex numbers east + i north, fixes = z * measured + d by least squares; the
+    argument of z is the rotation from the frame of zero heading, d absorbs tilt.
     """
     gnss = part.gnss
     assert gnss is not None
@@ -154,13 +156,13 @@ def _fit_heading(part: Recording, frame: LocalFrame, rp: Array, bias: Array) -> 
 
 
 def _estimate_rate(imu: Imu) -> Array:
-    """Median turn rate, kept within what the sensor's turn-on bias can be, rad/s."""
+    """Median turn rate, limited to the sensor's turn-on bias, rad/s."""
     limit = 3.0 * imu.noise.gyro_bias_sigma
     return np.clip(np.median(imu.gyro, axis=0), -limit, limit)
 
 
 def _thin(gnss: Gnss, begin: float, end: float, spacing: float = 0.9) -> Gnss:
-    """Fixes of a span at most about one a second: enough to align, and quick."""
+    """Fixes of a span, about one a second at most: enough to align, and fast."""
     there = np.flatnonzero((gnss.t >= begin) & (gnss.t <= end))
     keep, last = [], -np.inf
     for i in there:
@@ -173,13 +175,13 @@ def _thin(gnss: Gnss, begin: float, end: float, spacing: float = 0.9) -> Gnss:
 def _try_headings(
     part: Recording, settings: Settings, frame: LocalFrame, smooth: Smoother, rp: Array, heading: float, bias: Array
 ) -> list[Solution]:
-    """Solutions of the short problem from each of the start headings.
+    """Solutions of the short problem from each of the initial headings.
 
-    The last points backwards and may creep along a saddle, on to the minimum that the others have or to none. It is
-    given up where nothing would be left of its weight beside the best; `worth` fixes in a row are worth one at worst,
-    over a stretch with one turn (`graphnav.estimation.alignment.course`).
+    The last points backwards and may creep along a saddle, towards the minimum of the others or none. It is abandoned
+    where its likelihood is negligible beside the best; `worth` successive fixes are worth one in the worst case, over a
+    span with one turn (`graphnav.estimation.alignment.course`).
     """
-    ends = [np.array([*rp, heading + turn]) for turn in _TURNS]
+    ends = [np.array([*rp, heading + turn]) for turn in _HEADINGS_TRIED]
     tried = [_try(part, settings, frame, smooth, end, bias) for end in ends[:-1]]
     assert part.gnss is not None
     worth = max(1.0, len(part.gnss.t) / (2.0 * np.pi))
@@ -192,7 +194,7 @@ def _try_headings(
 
 
 def _try(part: Recording, settings: Settings, frame: LocalFrame, smooth: Smoother, rph: Array, bias: Array) -> Solution:
-    """Solve the short problem from one start attitude."""
+    """Solve the short problem from one initial attitude."""
     noise, gnss = part.imu.noise, part.gnss
     assert gnss is not None
     fixes = frame.from_llh(gnss.llh)
@@ -207,9 +209,9 @@ def _try(part: Recording, settings: Settings, frame: LocalFrame, smooth: Smoothe
             [noise.gyro_bias_sigma] * 3,
         ]
     )
-    # one bad fix or a burst must not decide the heading
+    # an outlying fix or a burst must not decide the heading
     robust = settings.gnss.model_copy(update={"robust": "cauchy", "lever_arm_sigma": None, "time_offset_sigma": 0.0})
-    # what the wheels say of the heading is brought in by `_with_course`
+    # the information of the wheels on the heading is added by `with_course`
     problem = build_problem(part, settings.without_wheels().model_copy(update={"gnss": robust}), frame, start, sigma)
     dR, _, _ = prefix(problem.samples, problem.t[0], problem.t[1:], np.zeros(3), bias)
     t = problem.t

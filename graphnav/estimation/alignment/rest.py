@@ -1,4 +1,4 @@
-"""The first state where nothing shows motion over ground: levelled, the heading by two antennas, unknown, or zero."""
+"""The first state without motion over ground: levelled, the heading by two antennas, unknown, or zero."""
 
 from __future__ import annotations
 
@@ -11,19 +11,21 @@ from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.core.state import States
 from graphnav.detectors.base import NONE
-from graphnav.estimation.alignment.antennas import baseline_heading
+from graphnav.estimation.alignment.antennas import measure_baseline_heading
 from graphnav.estimation.alignment.first import Alignment, level
 from graphnav.imu.preintegration import prefix
 from graphnav.imu.samples import bridge_gaps
 from graphnav.recording import Recording
 
-_AT_ONCE = 0.05  # s from the start within which a foot that stands is found
-_OPENING = 10  # stances of a walk by which tilt and accelerometer bias are told apart
-_WALKING = 3.0  # m/s, 1-sigma of the start velocity of a foot in the air
+_FIRST_STANCE = 0.05  # s from the start within which a foot counts as standing there
+_OPENING = 10  # stances of a walk by which tilt and accelerometer bias are separated
+_WALKING = 3.0  # m/s, 1-sigma of the initial velocity of a foot in the air
 
 
 def at_rest(recording: Recording, settings: Settings, frame: LocalFrame, stationary: Array) -> Alignment:
-    """Level; the heading is that of two antennas or unknown. Of a foot, `stationary` (N, 2) s are its stances."""
+    """Levelled attitude; the heading is that of two antennas or unknown. For a foot, `stationary` (N, 2) s are its
+    stances.
+    """
     noise, gnss = recording.imu.noise, recording.gnss
     stances = stationary if recording.platform == "foot" else NONE
     begin, seconds = _find_stand(recording, stances)
@@ -41,10 +43,10 @@ def at_rest(recording: Recording, settings: Settings, frame: LocalFrame, station
     if gnss is None or not len(gnss.t):
         # without fixes the first pose defines the frame: position and heading are exact by definition
         p, sd_p, sd_heading = np.zeros(3), np.full(3, 1e-3), 1e-4
-        note = Note("alignment.no_gnss", "no GNSS: levelled at the start, position and heading count from zero there")
+        note = Note("alignment.no_gnss", "no GNSS: levelled at the start, where position and heading are zero")
     else:
         sd_p, sd_heading = 10.0 * gnss.sd[0] + 1.0, np.pi
-        known = baseline_heading(recording, settings, stationary)
+        known = measure_baseline_heading(recording, settings, stationary)
         if known is None:
             note = Note("alignment.no_motion", "no motion in the GNSS fixes: levelled at the start, heading unknown")
         else:
@@ -78,11 +80,12 @@ def at_rest(recording: Recording, settings: Settings, frame: LocalFrame, station
 
 
 def _find_stand(recording: Recording, stances: Array) -> tuple[float, float]:
-    """From when (s), and for how long, to level: from the start, or for a foot that starts in the air its first stance.
+    """Start (s) and duration of the span for levelling: from the start, or, for a foot that starts in the air, its
+    first stance.
 
-    Of a stance the middle half is used.
+    The middle half of a stance is used.
     """
-    if len(stances) and stances[0, 0] > recording.start + _AT_ONCE:
+    if len(stances) and stances[0, 0] > recording.start + _FIRST_STANCE:
         length = float(stances[0, 1] - stances[0, 0])
         return float(stances[0, 0]) + 0.25 * length, min(1.0, 0.5 * length)
     return recording.start, 1.0

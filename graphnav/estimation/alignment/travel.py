@@ -1,14 +1,14 @@
-"""How far fixes show a platform to have travelled, seen from itself, beside what their own errors explain.
+"""Displacement of a platform in its own axes, from fixes, and the part of it that their errors explain.
 
-A displacement over ground says nothing of a vehicle that circles, and little of one that creeps. So steps from fix to
-fix are turned back into the axes of the platform, as the gyro turns, and only then summed,
+A displacement over ground shows little of a vehicle that circles or creeps. So steps from fix to fix are rotated back
+into the axes of the platform, by the gyro, and only then summed,
 
     D = sum of (p_i - p_i-1) r_i,      r_i: the turn from the axes at i to those at the start,
 
-which grows with the way on any course. Summed by parts, the errors e_i of the fixes enter D at both ends, and in
-between with what the axes turn, e_i (r_i - r_i+1). What that adds depends on how long errors last. Of a Gauss-Markov
-process of variance s^2 and correlation time T, turned at the rate w, it has the variance 2 T w^2 s^2 / (1 + w^2 T^2)
-per second, and most for T = 1/w: w s^2. Nothing is known of T. So along each axis
+which grows with the distance on any course. Summed by parts, the errors e_i of the fixes enter D at both ends, and in
+between multiplied by the rotation of the axes, e_i (r_i - r_i+1). That contribution depends on how long errors last.
+For a Gauss-Markov process of variance s^2 and correlation time T, rotating at the rate w, it has the variance 2 T w^2
+s^2 / (1 + w^2 T^2) per second, with the maximum w s^2 at T = 1/w. As T is unknown, along each axis
 
     var D  <=  s^2 (2 + total turn in rad)
 
@@ -26,12 +26,13 @@ from graphnav.core.rotation import Array
 from graphnav.imu.samples import bridge_gaps
 from graphnav.recording import Imu
 
-_SWAY = 0.4  # m, 1-sigma along an axis: what an antenna moves on a vehicle that does not travel; springs, load, a mast
+# m, 1-sigma along an axis: motion of an antenna on a vehicle that does not travel; suspension, load, a mast
+_ANTENNA_SWAY = 0.4
 
 
 @dataclass(frozen=True)
 class Travel:
-    """What was travelled since the first of N points."""
+    """Distance travelled since the first of N points."""
 
     D: NDArray[np.complex128]  # (N,) m, forward + i left where `yaw` is of forward from east
     sigma: Array  # (N,) m, along one axis
@@ -39,14 +40,14 @@ class Travel:
 
     @property
     def times_sigma(self) -> Array:
-        """(N,) how many sigmas the way is long."""
+        """(N,) distance in sigmas."""
         return np.abs(self.D) / self.sigma
 
 
-def travel(p: Array, sd: Array, yaw: Array, still: NDArray[np.bool_] | None = None) -> Travel:
-    """What was travelled along points.
+def measure_travel(p: Array, sd: Array, yaw: Array, still: NDArray[np.bool_] | None = None) -> Travel:
+    """Distance travelled along points.
 
-    The way between two points is a chord, as far as the turn between them goes; of more than a radian it says nothing.
+    The path between two points is a chord up to a turn of a radian between them; beyond, it is unknown.
 
     Parameters
     ----------
@@ -57,10 +58,10 @@ def travel(p: Array, sd: Array, yaw: Array, still: NDArray[np.bool_] | None = No
     """
     moves = np.ones(len(p) - 1) if still is None else 1.0 - (still[1:] & still[:-1])
     angle = moves * np.abs(np.diff(yaw))
-    variance = sd**2 + _SWAY**2
+    variance = sd**2 + _ANTENNA_SWAY**2
     seen = angle < 1.0
     step = seen * moves * np.diff(p[:, 0] + 1j * p[:, 1]) * np.exp(-0.5j * (yaw[1:] + yaw[:-1]))
-    angle = np.where(seen, angle, 2.0)  # an end here and a beginning there, as of two ways
+    angle = np.where(seen, angle, 2.0)  # the end of one path and the beginning of another
     within = np.concatenate([[0.0], np.cumsum(angle * variance[1:])])
     D, turn = (np.concatenate([[0.0], np.cumsum(x)]) for x in (step, angle))
     return Travel(D, np.sqrt(variance[0] + variance + within), turn)
@@ -72,10 +73,10 @@ def average_across(sd: Array) -> Array:
 
 
 def integrate_yaw(imu: Imu, t: Array, bias: Array) -> Array:
-    """(N,) rad, what the body has turned about up since the first of the times `t`, counter-clockwise, by the gyro.
+    """(N,) rad, rotation of the body about up since the first of the times `t`, counter-clockwise, by the gyro.
 
-    Up is the mean specific force from each time to the next: what a vehicle accelerates by leans it by a few degrees,
-    of which a turn rate keeps the cosine. `bias` (3,) rad/s.
+    Up is the mean specific force from each time to the next: acceleration tilts it by a few degrees, of which the turn
+    rate keeps the cosine. `bias` (3,) rad/s.
     """
     samples = bridge_gaps(imu)
     edges = np.concatenate([[samples.start], samples.t])

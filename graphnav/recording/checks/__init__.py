@@ -1,1 +1,1 @@
-"""What a recording shows of itself before anything is solved: clocks, axes, units, gaps."""
+"""Checks of a recording before it is solved: clocks, axes, units, gaps."""

@@ -19,10 +19,10 @@ from graphnav.recording.checks.crosschecks import Fit, Track
 from graphnav.recording.odometer.faults import FROZEN, GAP, STUCK, WILD
 from graphnav.sensors.tables import TIME
 
-_SURE_SIGMAS = 4.0  # sigmas
+_CERTAIN_SIGMAS = 4.0  # sigmas
 _NO_BETTER = 0.05  # of a correlation
-_MIN_SPEED = 5.0  # m/s, at which wheels are compared
-_SELDOM = 10.0  # s between fixes that no receiver on the way is set to
+_MIN_SPEED = 5.0  # m/s, above which wheel speeds are compared
+_SELDOM = 10.0  # s between fixes; no receiver on a drive is set to a longer period
 
 
 def measure_overlap(recording: Recording) -> float:
@@ -31,9 +31,9 @@ def measure_overlap(recording: Recording) -> float:
 
 
 def describe_gnss_apart(recording: Recording) -> str | None:
-    """That GNSS and IMU share no time, and what may mend it; None if they do."""
+    """A finding that GNSS and IMU share no time, with a likely remedy; None if they do."""
     gnss, raw = recording.gnss, recording.raw_gnss
-    own = gnss is not None and not gnss.derived  # fixes of a receiver, in place of which no observations are used
+    own = gnss is not None and not gnss.derived  # from a receiver's fixes; no raw observations are used in their place
     t = raw.t if raw is not None and not own else gnss.t if gnss is not None else np.empty(0)
     if not len(t):
         return None
@@ -44,7 +44,7 @@ def describe_gnss_apart(recording: Recording) -> str | None:
         f"GNSS ({t[0]:.3f} to {t[-1]:.3f} s) and IMU ({recording.start:.3f} to {recording.end:.3f} s) do not "
         "overlap in time"
     )
-    if not own:  # raw observations, whose receiver knows the date
+    if not own:  # from raw observations, whose receiver knows the date
         weeks = round(offset / WEEK)
         near = f", {abs(weeks)} week(s) too {'late' if weeks > 0 else 'early'}" if weeks else ""
         return f"{apart}: the observations' times are GPS time, so what clock says of the IMU's t = 0 is wrong{near}"
@@ -78,7 +78,7 @@ def _describe_large_steps(t: Array, recording: Recording) -> str | None:
 
 
 def _guess_stamp_unit(t: Array, recording: Recording) -> str | None:
-    """The unit in which stamps would lie within the recording, where they do not in s."""
+    """The unit of stamps with which they would lie within the recording, if they do not in s."""
     for unit, scale in TIME.items():
         inside = (scale * t > recording.start) & (scale * t < recording.end)
         if unit != "s" and inside.mean() > 0.5:
@@ -112,7 +112,7 @@ def check_gnss_coverage(recording: Recording) -> Iterator[Finding]:
 
 
 def check_gnss_jumps(recording: Recording, track: Track | None) -> Iterator[Finding]:
-    """Fixes that no motion explains: a step against the velocities, or an acceleration no vehicle has."""
+    """Fixes that no motion explains: a step against the velocities, or an impossible acceleration."""
     gnss = recording.gnss
     assert gnss is not None
     if track is None or len(gnss.t) < 5:
@@ -138,23 +138,22 @@ def check_gnss_jumps(recording: Recording, track: Track | None) -> Iterator[Find
         yield Finding(
             "warning",
             f"{count} in GNSS position that the motion and the sigmas do not explain, the largest {size[worst]:.1f} m "
-            f"at {at:.1f} s from the start; an estimated noise model weighs such down, else a robust kernel does",
+            f"at {at:.1f} s from the start; an estimated noise model down-weights them, otherwise a robust kernel does",
             "gnss.jump",
         )
 
 
 def check_imu_clock(clock: ClockOffsets, odometer: Fit | None = None) -> Iterator[Finding]:
-    """By GNSS speed, and by the positions alone, which in some receivers are of another time.
+    """The clock of the IMU by GNSS speed, and by the positions alone, whose stamps differ in some receivers.
 
-    `odometer` is its fit against GNSS, which tells whose clock it is. What is further off than the stamps of the fixes
-    are allowed to be would be solved into something else. The course, which leads or lags with the lever arm, is not
-    asked.
+    `odometer` is its fit against GNSS, which shows whose clock is off. Offsets beyond the permitted error of the fixes'
+    stamps would distort the solution. The course, which leads or lags with the lever arm, is not used.
     """
     if clock.apart is not None:
         yield Finding(
             "note",
             f"the stamps of GNSS positions and velocities are {clock.apart:.2f} s apart: they cannot both be right, "
-            "and what is left after time_offset is estimated of each",
+            "and the rest after time_offset is estimated for each",
             "gnss.two_clocks",
         )
     forward = clock.late
@@ -162,8 +161,8 @@ def check_imu_clock(clock: ClockOffsets, odometer: Fit | None = None) -> Iterato
         return
     lag = forward.lag
     leap = ", the leap seconds between GPS time and UTC" if abs(abs(lag) - 18.0) < 0.5 else ""
-    certain = abs(lag) - 4.0 * forward.spread > _SURE_SIGMAS * GnssSettings().time_offset_sigma
-    # what the odometer is off by as well is the receiver's
+    certain = abs(lag) - 4.0 * forward.spread > _CERTAIN_SIGMAS * GnssSettings().time_offset_sigma
+    # an offset that the odometer shows as well is the receiver's
     own = odometer is None or odometer.correlation < 0.9 or abs(odometer.lag - lag) > 0.5 * abs(lag)
     mend = f"{-lag:+.2f} to time_offset in [imu]" if own else f"{lag:+.2f} to time_offset in [gnss]"
     yield Finding(
@@ -175,7 +174,7 @@ def check_imu_clock(clock: ClockOffsets, odometer: Fit | None = None) -> Iterato
 
 
 def check_imu_axes(imu: Imu, forward: Fit | None, track: Track | None) -> Iterator[Finding]:
-    """Axes that the drive contradicts: by the mean force, and by the forward force where another fits it better."""
+    """Axes that the drive contradicts: by the mean force, or by a forward force that fits another axis better."""
     up = crosschecks.find_up(imu)
     if up[2] > 0.8 and (forward is None or forward.correlation < 0.7):
         return
@@ -188,7 +187,8 @@ def check_imu_axes(imu: Imu, forward: Fit | None, track: Track | None) -> Iterat
     if up[2] > 0.8 and ahead[1] > 0.7:
         return
     along = crosschecks.fit_along(imu, track) if up[2] > 0.8 and track is not None else None
-    # what is proposed explains no more than what is stated: few changes of speed, and none across, tell no direction
+    # the proposed axes explain no more than the stated ones: without changes of speed and turns no direction is
+    # determined
     if along is not None and along.coefficients[0] > 0.5 and along.correlation > forward.correlation - _NO_BETTER:
         return
     letters = _write_letters(imu.R_bs, ahead, up)
@@ -208,7 +208,7 @@ def _describe_direction(v: Array) -> str:
 
 
 def _write_letters(R_bs: Array, forward: Array, up: Array) -> str | None:
-    """The three letters under which `forward` and `up` (body axes as loaded) would be so; None if none clearly does."""
+    """The three letters of the axes with `forward` and `up` (body axes as loaded); None if none clearly fit."""
     f, u = R_bs.T @ forward, R_bs.T @ up  # in the file's axes
     if np.abs(f).max() < 0.8 or np.abs(u).max() < 0.8 or np.argmax(np.abs(f)) == np.argmax(np.abs(u)):
         return None
@@ -220,7 +220,7 @@ def _write_letters(R_bs: Array, forward: Array, up: Array) -> str | None:
 
 
 def check_gyro_sign(imu: Imu) -> Iterator[Finding]:
-    """The gyro about the mean force turns against the course: no choice of axes mends that."""
+    """The gyro about the mean force turns opposite to the course: no choice of axes explains that."""
     if crosschecks.find_up(imu)[2] < 0:
         what = "the accelerometer's sign is reversed (gyro and course deny its up), it must read +9.8 upward at rest"
         yield Finding("warning", f"{what}; negate it in the file", "imu.force_sign")
@@ -252,16 +252,16 @@ def check_yaw_scale(yaw: Fit | None) -> Iterator[Finding]:
 
 
 _WORD = {GAP: "gives no readings", STUCK: "is stuck at zero", FROZEN: "is frozen", WILD: "reads against the motion"}
-_COARSE = 0.1  # m/s, a step that is worth a word
-_WHEEL = 0.02  # of the speed by which a wheel may differ: worn tyres differ by half of that
+_COARSE = 0.1  # m/s, a resolution that is reported
+_WHEEL = 0.02  # relative difference of a wheel that is reported: worn tyres differ by half of it
 _WHEELS = ("front left", "front right", "rear left", "rear right")
 
 
 def check_odometer_readings(recording: Recording, facts: dict[str, Any]) -> Iterator[Finding]:
-    """What the readings say of themselves, and the IMU of them."""
+    """Checks of the odometer's readings by themselves, and of the IMU against them."""
     odometer = recording.odometer
     assert odometer is not None
-    step = wheels.quantum(odometer.speed)
+    step = wheels.find_quantum(odometer.speed)
     facts["sigma_mps"] = round(wheels.reading_sigma(odometer), 4)
     if step > 0.0:
         facts["step_mps"] = round(step, 5)
@@ -291,11 +291,11 @@ def check_odometer_readings(recording: Recording, facts: dict[str, Any]) -> Iter
 
 
 def _compare_wheels(odometer: Odometer, imu: Imu) -> Iterator[Finding]:
-    """A wheel that is faster or slower than the others where the vehicle goes straight."""
+    """A wheel that is faster or slower than the others on straight road."""
     assert odometer.wheels is not None
     turn = imu.gyro @ crosschecks.find_up(imu)
     turn = np.abs(np.interp(odometer.t, imu.t, turn - np.median(turn)))
-    # a turn of 0.02 rad/s moves a wheel by 0.02 m/s against the middle
+    # a turn rate of 0.02 rad/s changes a wheel's speed by 0.02 m/s relative to the middle
     straight = (np.abs(odometer.speed) > _MIN_SPEED) & (turn < 0.02)
     there = ~np.isnan(odometer.wheels).all(axis=0)
     speeds = odometer.wheels[straight][:, there]

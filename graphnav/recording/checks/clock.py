@@ -1,4 +1,4 @@
-"""What a drive says of the clocks of its IMU and its fixes; `graphnav info` and `graphnav init` both ask here."""
+"""Clock offset between IMU and fixes, for `graphnav info` and `graphnav init`."""
 
 from __future__ import annotations
 
@@ -8,46 +8,46 @@ from graphnav.recording import Gnss, Imu
 from graphnav.recording.checks import crosschecks
 from graphnav.recording.checks.crosschecks import Fit
 
-CLEAR, FAIR = 0.8, 0.6  # correlations: sure, likely
-_MATTERS = 0.05  # s; what is less off than this the smoother estimates (`gnss.time_offset_sigma`, 2.5 sigma)
+CLEAR, FAIR = 0.8, 0.6  # correlations: certain, likely
+_MATTERS = 0.05  # s; the smoother estimates smaller offsets itself (`gnss.time_offset_sigma`, 2.5 sigma)
 _SIGNIFICANT = 3.0  # sigma
 
 
 @dataclass(frozen=True)
 class ClockOffsets:
-    """How late the IMU's stamps are by the velocities of the fixes, and by their places alone; None where unknown."""
+    """Delays of the IMU's stamps against velocities and positions of the fixes; None where unknown."""
 
     by_velocity: Fit | None
     by_places: Fit | None
-    between: Fit | None  # how late velocities are against places
+    between: Fit | None  # delay of velocities against positions
 
     @property
     def apart(self) -> float | None:
-        """How far the stamps of velocities and places are apart, s, where that is sure."""
+        """Offset between the stamps of velocities and positions, s, where it is certain."""
         fit = self.between
         return abs(fit.lag) if fit is not None and fit.correlation > CLEAR and is_certain(fit) else None
 
     @property
     def late(self) -> Fit | None:
-        """The IMU's stamps against the fixes' where they are surely off: by velocities if there are any."""
+        """The certain delay of the IMU's stamps against the fixes': by velocities if there are any."""
         velocity, places = self.by_velocity, self.by_places
         if velocity is None or places is None:
             one = velocity or places
             return one if one is not None and one.correlation >= FAIR and is_certain(one) else None
         if self.apart is not None and (velocity.lag * places.lag <= 0.0 or abs(places.lag) < _MATTERS):
-            return None  # between the two already, or right for the places
+            return None  # between the two, or right for the positions
         sure = [fit for fit in (velocity, places) if fit.correlation >= FAIR and is_certain(fit)]
         shared = velocity.lag * places.lag > 0.0 and abs(velocity.lag) >= _MATTERS and velocity.correlation >= FAIR
         return velocity if velocity in sure or (sure and shared) else None
 
 
 def is_certain(fit: Fit) -> bool:
-    """Whether a lag is no chance, and large enough to matter."""
+    """Whether a lag is significant and large enough to matter."""
     return abs(fit.lag) >= _MATTERS + _SIGNIFICANT * fit.spread
 
 
 def measure_clock_offsets(imu: Imu, gnss: Gnss) -> ClockOffsets:
-    """By the force along the way against changes of speed; what a drive without such says is None."""
+    """Delays from the force along the direction of travel and changes of speed; None where the drive has none."""
     places = crosschecks.track(replace(gnss, v=None))
     by_places = None if places is None else crosschecks.fit_forward(imu, places)
     track = crosschecks.track(gnss) if gnss.v is not None else None

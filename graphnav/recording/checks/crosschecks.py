@@ -1,8 +1,8 @@
-"""What the sensors of one drive say about each other: clock, axes and units from regressions.
+"""Comparison of the sensors of one drive: clock, axes and units by regressions.
 
-Changes of GNSS speed are regressed on the integrated force, changes of course on the integrated rate, both on
-all three axes. The correlation as a function of a shift in time gives the clock error whatever the axes; the
-coefficients at the best shift give the axes and the scale whatever was assumed of them.
+Changes of GNSS speed are regressed on the integrated force, changes of course on the integrated rate, both on all three
+axes. The correlation as a function of a time shift gives the clock error whatever the axes; the coefficients at the
+best shift give the axes and the scale whatever was assumed of them.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from graphnav.recording.checks.lags import Lags
 Index = NDArray[Any]  # of row numbers
 
 MIN_PAIRS = 20
-_SLOPE, _SLOPES = 8.0, 6  # s over which a slope is taken: the force is then known to a tenth of a per cent
+_SLOPE_SPAN, _SLOPES = 8.0, 6  # s over which a slope is taken: the force is then known to a tenth of a per cent
 GRAVITY = 9.81  # m/s^2
-_MIN_SPEED = 3.0  # m/s, below which a course means little
-_FASTEST_CHANGE = 8.0  # m/s^2; what exceeds it is an error of the fix
-_CHANGES = 0.25  # m/s, by which a speed changes at least (rms) where something is told by it
-WIDE = 30.0  # s searched for clock errors
+_MIN_SPEED = 3.0  # m/s, below which a course is undefined
+_FASTEST_CHANGE = 8.0  # m/s^2; a larger acceleration is an error of the fix
+_CHANGES = 0.25  # m/s, rms change of speed, below which a regression on it determines nothing
+WIDE = 30.0  # s, largest clock error searched for
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class Track:
 
     @property
     def instant(self) -> bool:
-        """Whether these are velocities that the receiver gave."""
+        """Whether these are velocities of the receiver."""
         return not self.width.any()
 
 
@@ -59,7 +59,7 @@ class Fit:
     lag: float  # s
     spread: float  # s, 1-sigma of the lag (`graphnav.recording.checks.lags`)
     correlation: float
-    at_zero: float  # the correlation without a shift
+    at_zero: float  # correlation without a shift
     coefficients: Array  # (m,)
 
 
@@ -69,7 +69,7 @@ def compute_local_positions(gnss: Gnss) -> Array:
 
 
 def track(gnss: Gnss) -> Track | None:
-    """Velocities the receiver gave, or differences of positions about a second apart; None if too few."""
+    """Velocities of the receiver, or differences of positions about a second apart; None if too few."""
     if len(gnss.t) < 5:
         return None
     period = float(np.median(np.diff(gnss.t)))
@@ -88,14 +88,14 @@ def track(gnss: Gnss) -> Track | None:
 
 
 def _compute_mean(x: Array) -> Array:
-    """Mean row of a long array, ten times quicker than `x.mean(axis=0)`."""
+    """Mean row of a long array, ten times faster than `x.mean(axis=0)`."""
     return np.asarray(np.full(len(x), 1.0 / len(x)) @ x)
 
 
 def _integrate(t: Array, rate: Array, twice: bool) -> Array:
-    """Integral at the ends of the periods, of rows that are means over them, less their mean; or its own integral.
+    """Integral, at the ends of the periods, of rows that are means over them, minus their mean; or its own integral.
 
-    Axis by axis and in place: of a day each number more takes a hundred megabytes.
+    Axis by axis and in place: for a day each temporary array takes a hundred megabytes.
     """
     dt = np.diff(t, prepend=2 * t[0] - t[1])
     out = np.empty(rate.shape)
@@ -113,12 +113,12 @@ def _integrate(t: Array, rate: Array, twice: bool) -> Array:
 
 
 def _make_sampler(t: Array, rate: Array) -> Callable[[Array, Array], Array]:
-    """mean(at, width) of the integral of `rate`; width 0 is the value there."""
+    """Sampler mean(at, width) of the integral of `rate`; width 0 gives the value at that time."""
     integral = cache(lambda twice: _integrate(t, rate, twice))
     period = (t[-1] - t[0]) / (len(t) - 1)
 
     def columns(at: Array, values: Array) -> Array:
-        # rows are where even steps put them, but for those behind a gap
+        # rows are evenly spaced except after gaps
         k = np.clip(np.ceil((at - t[0]) / period).astype(int), 1, len(t) - 1)
         off = (t[k - 1] > at) | (t[k] < at)
         if off.any():
@@ -144,7 +144,7 @@ def _pair_times(track: Track) -> tuple[Index, Index]:
 
 
 def _pair_possible(track: Track) -> tuple[Index, Index, Array]:
-    """Rows a second apart without a fix that jumps (there and back leaves speeds alike), and changes of speed, m/s."""
+    """Rows a second apart without fixes that jump (back and forth leaves speeds alike), and changes of speed, m/s."""
     i, j = _pair_times(track)
     change, most = np.hypot(*(track.v[j] - track.v[i])[:, :2].T), _FASTEST_CHANGE * (track.t[j] - track.t[i])
     y = track.speed[j] - track.speed[i]
@@ -155,7 +155,7 @@ def _pair_possible(track: Track) -> tuple[Index, Index, Array]:
 def _regress(x: Array, y: Array) -> tuple[float, Array]:
     x, y = x - x.mean(0), y - y.mean()
     b = np.asarray(np.linalg.lstsq(x, y, rcond=None)[0], dtype=float)
-    prediction, norm = x @ b, np.linalg.norm(y)  # the sign is in b: a reversed axis correlates as well
+    prediction, norm = x @ b, np.linalg.norm(y)  # the sign is in b: a reversed axis has the same correlation
     scale = np.linalg.norm(prediction) * norm
     return (float(prediction @ y / scale) if scale > 0 else 0.0), b
 
@@ -169,7 +169,7 @@ def _correlate_each(x: Array, y: Array) -> Array:
 
 
 def _regress_inliers(x: Array, y: Array) -> tuple[float, Array]:
-    """The same without what lies beyond 5 sigma (by the median), twice: spikes of a fix hide a good fit."""
+    """`_regress` without rows beyond 5 sigma (by the median), repeated twice: spikes of fixes hide a good fit."""
     x, y = x - np.median(x, axis=0), y - np.median(y)
     keep = np.ones(len(y), dtype=bool)
     for _ in range(2):
@@ -180,7 +180,7 @@ def _regress_inliers(x: Array, y: Array) -> tuple[float, Array]:
 
 
 def _find_peak(lags: Array, c: Array) -> float:
-    """Where evenly spaced values are highest, by the parabola through the highest and its neighbours."""
+    """Position of the maximum of evenly spaced values, by the parabola through it and its neighbours."""
     k = int(np.argmax(c))
     if 0 < k < len(lags) - 1 and (curve := c[k - 1] - 2 * c[k] + c[k + 1]) < 0 and np.isfinite(curve):
         return float(lags[k] + 0.5 * (c[k - 1] - c[k + 1]) / curve * (lags[1] - lags[0]))
@@ -188,7 +188,7 @@ def _find_peak(lags: Array, c: Array) -> float:
 
 
 def _search(t: Array, y: Array, x_at: lags_of_clocks.Regressors, span: Array, valid: Callable[[float], Array]) -> Fit:
-    """The shift at which x explains y, of times t, best; `x_at(rows, lags)`, `valid(lag)` a mask of the rows."""
+    """The time shift at which x explains y best; `x_at(rows, lags)`, and `valid(lag)` a mask of the rows."""
     every = np.arange(len(y))
 
     def correlations(rows: Index, lags: Array) -> Array:
@@ -203,7 +203,7 @@ def _search(t: Array, y: Array, x_at: lags_of_clocks.Regressors, span: Array, va
 
     few = every[:: max(1, len(y) // 800)]
     many = every[:: max(1, len(y) // 4000)]
-    # changes over a second stay alike for about as long: where they may fit best is seen from every fourth shift
+    # changes over a second are correlated for about as long: every fourth shift shows where the best fit may be
     lags = np.arange(-5.0, 5.01, 0.1)
     rough = np.argsort(correlations(few, lags[::4]))[-3:] * 4
     close = np.unique(np.clip(rough[:, None] + np.arange(-4, 5), 0, len(lags) - 1))
@@ -211,7 +211,7 @@ def _search(t: Array, y: Array, x_at: lags_of_clocks.Regressors, span: Array, va
     c[close] = correlations(few, lags[close])
     near = _find_peak(lags, c)
     coarse, reached = near, correlation(near, few)
-    # far away only if nothing near explains y, and only for clearly more, for there are many far shifts
+    # larger shifts only if no small one explains y, and only for a clearly better fit, for there are many of them
     reach = min(WIDE, 0.3 * (span[-1] - span[0]))
     if reached < 0.6 and reach > 5.0:
         wide = np.arange(-reach, reach + 0.1, 0.2)
@@ -251,17 +251,17 @@ def find_up(imu: Imu) -> Array:
 
 
 def fit_forward(imu: Imu, track: Track) -> Fit | None:
-    """Change of GNSS speed on integrated level force: coefficients are the forward direction in body axes, (3,).
+    """Regression of changes of GNSS speed on integrated level force; coefficients are the forward direction in body
+    axes.
 
-    Level is square to the mean force, so nothing need be known of the axes. None where speed
-    changes too little to say anything.
+    Level is perpendicular to the mean force, so no axes need be known. None where speed changes too little.
     """
     i, j, y = _pair_possible(track)
     if len(y) < MIN_PAIRS or y.std() < _CHANGES:
         return None
     level = np.linalg.svd(find_up(imu)[None, :])[2][1:]  # (2, 3)
     fit = _fit_imu(imu, imu.accel @ level.T, track, i, j, y)
-    if fit is None or len(fit.coefficients) != len(level):  # no time in common
+    if fit is None or len(fit.coefficients) != len(level):  # no common time
         return None
     return replace(fit, coefficients=fit.coefficients @ level)
 
@@ -274,22 +274,23 @@ def fit_force(imu: Imu, track: Track) -> Fit | None:
 
 
 def fit_climb(imu: Imu, track: Track, gnss: Gnss, forward: Array) -> tuple[float, float] | None:
-    """Slopes felt, by the force along `forward` (3,) beyond what speeds up, on slopes of the heights, over `_SLOPE`.
+    """Slopes by the force along `forward` (3,), corrected for acceleration, against those of the heights, over
+    `_SLOPE_SPAN`.
 
-    Their correlation, and felt over those of the heights, by their sizes: neither has less noise than the other. None
-    where the way is too short.
+    Their correlation, and the ratio of their magnitudes: neither has less noise than the other. None where the drive is
+    too short.
     """
     p = compute_local_positions(gnss)
     way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(p[:, :2], axis=0).T))])
     pull = np.concatenate([[0.0], np.cumsum(imu.accel[1:] @ forward * np.diff(imu.t))])
-    a = np.arange(max(track.t[0], imu.t[0]), min(track.t[-1], imu.t[-1]) - _SLOPE, _SLOPE)
+    a = np.arange(max(track.t[0], imu.t[0]), min(track.t[-1], imu.t[-1]) - _SLOPE_SPAN, _SLOPE_SPAN)
 
     def change(t: Array, x: Array) -> Array:
-        return np.asarray(np.interp(a + _SLOPE, t, x) - np.interp(a, t, x))
+        return np.asarray(np.interp(a + _SLOPE_SPAN, t, x) - np.interp(a, t, x))
 
     far = change(gnss.t, way)
-    moving = far > _MIN_SPEED * _SLOPE
-    felt = (change(imu.t, pull) - change(track.t, track.speed))[moving] / (_SLOPE * GRAVITY)
+    moving = far > _MIN_SPEED * _SLOPE_SPAN
+    felt = (change(imu.t, pull) - change(track.t, track.speed))[moving] / (_SLOPE_SPAN * GRAVITY)
     climbed = change(gnss.t, p[:, 2])[moving] / far[moving]
     if len(felt) < _SLOPES or not felt.std() or not climbed.std():
         return None
@@ -297,15 +298,15 @@ def fit_climb(imu: Imu, track: Track, gnss: Gnss, forward: Array) -> tuple[float
 
 
 def fit_along(imu: Imu, track: Track) -> Fit | None:
-    """The same on the force along the stated forward axis alone, (1,): whether the axes as stated explain the speed."""
+    """Regression on the force along the stated forward axis alone, (1,): whether the stated axes explain the speed."""
     i, j, y = _pair_possible(track)
     return _fit_imu(imu, imu.accel[:, 1:2], track, i, j, y)
 
 
 def fit_yaw(imu: Imu, track: Track) -> Fit | None:
-    """Change of course, counter-clockwise, on the integrated rate about the mean force: true over recorded, (1,).
+    """Regression of changes of course, counter-clockwise, on the integrated rate about the mean force, (1,).
 
-    None without turns.
+    The coefficient is true over recorded. None without turns.
     """
     i, j = _pair_times(track)
     course = np.arctan2(track.v[:, 1], track.v[:, 0])
@@ -319,7 +320,7 @@ def fit_yaw(imu: Imu, track: Track) -> Fit | None:
 
 
 def fit_velocity(track: Track, places: Track) -> Fit | None:
-    """Change of speed by places on that by velocities: how late velocities are against places; None without changes."""
+    """Regression of changes of speed by positions on those by velocities: delay of velocities; None without changes."""
     i, j, y = _pair_possible(places)
     if len(y) < MIN_PAIRS or y.std() < _CHANGES:
         return None
@@ -342,7 +343,7 @@ def fit_velocity(track: Track, places: Track) -> Fit | None:
 
 
 def compute_odometer_track(odometer: Odometer) -> Track:
-    """Its speeds ten times a second, as if the way were straight."""
+    """The odometer's speeds ten times a second, as if the drive were straight."""
     thin = slice(None, None, max(1, round(0.1 / float(np.median(np.diff(odometer.t))))))
     t, speed = odometer.t[thin], odometer.speed[thin]
     return Track(t, speed[:, None] * np.array([1.0, 0.0, 0.0]), np.zeros(len(t)), float(np.median(np.diff(t))))
@@ -369,7 +370,7 @@ def fit_odometer(odometer: Odometer, track: Track) -> tuple[Fit, float] | None:
     inside = valid(0.0)
     if inside.sum() < MIN_PAIRS:
         return None
-    # spikes of the fix would pull the fit: leave out what lies far from a first line
+    # spikes of fixes would bias the fit: leave out what lies far from a first line
     x = x_at(every, 0.0)[:, 0]
     slope = _regress(x[inside, None], track.speed[inside])[1][0]
     off = track.speed - slope * x
@@ -385,7 +386,7 @@ def fit_odometer(odometer: Odometer, track: Track) -> tuple[Fit, float] | None:
 
 
 def correlate_sideways(imu: Imu, track: Track) -> float | None:
-    """Correlation of the force to the right with what the gyro's turns ask for at the way's speed.
+    """Correlation of the force to the right with the one that the gyro's rate and the speed require.
 
     None where there are no curves.
     """
@@ -397,10 +398,10 @@ def correlate_sideways(imu: Imu, track: Track) -> float | None:
     force, turn = (
         np.diff(np.r_[0.0, np.cumsum(x)][edge]) / np.maximum(count, 1) for x in (imu.accel[:, 0], imu.gyro[:, 2])
     )
-    wanted = -np.interp(seconds + 0.5, track.t, track.speed) * turn  # to the left in a curve to the left
+    wanted = -np.interp(seconds + 0.5, track.t, track.speed) * turn  # to the left in a left curve
     used = count > 0
     if used.sum() < MIN_PAIRS or wanted[used].std() == 0.0 or force[used].std() == 0.0:
         return None
     alike = float(np.corrcoef(wanted[used], force[used])[0, 1])
-    # 4 sigma of the correlation of that many that have nothing to do with each other
+    # 4 sigma of the correlation of as many unrelated values
     return alike if abs(alike) > 4.0 / np.sqrt(used.sum()) else None

@@ -12,7 +12,7 @@ from graphnav.core.findings import Finding, period_of, runs_of
 from graphnav.core.rotation import Array
 from graphnav.recording import Imu, Recording
 
-STANDARD_GRAVITY = 9.80665  # m/s^2, where the place is unknown
+STANDARD_GRAVITY = 9.80665  # m/s^2, where the position is unknown
 
 
 def check_imu_time(imu: Imu) -> Iterator[Finding]:
@@ -76,7 +76,7 @@ def check_saturation(imu: Imu) -> Iterator[Finding]:
 
 
 def check_gyro_unit(recording: Recording) -> Iterator[Finding]:
-    """Turn rates that a sensor can read, but that its carrier does not reach."""
+    """Turn rates that a sensor can read, but a vehicle or foot does not reach."""
     x, y, z = np.abs(recording.imu.gyro).T
     rate = float(np.percentile(np.maximum(np.maximum(x, y), z), 99.0))
     if rate > (4.0 if recording.platform == "vehicle" else 35.0):  # 35 rad/s = 2000 deg/s, the usual full scale

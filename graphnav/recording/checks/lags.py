@@ -1,9 +1,9 @@
-"""How far two clocks are apart by two signals that are one, and how well that is known.
+"""Offset between two clocks from two recordings of one signal, and its sigma.
 
-Of y = b x(lag) + misfit the misfit is no white noise: slopes of the road last for seconds, an overtaking of smoothed
-fixes as long as the filter that smooths them. So everything is taken less its mean over ten seconds, and what is left
-counts as many rows as its own correlation leaves independent. The sigma is of the likelihood of every lag within reach,
-not of the curvature at the best one alone: where speed hardly changes, several lags explain it nearly as well.
+In y = b x(lag) + misfit the misfit is not white noise: slopes of the road last for seconds, the overshoot of smoothed
+fixes as long as their filter. So means over ten seconds are subtracted from everything, and the remaining rows count as
+many as their autocorrelation leaves independent. The sigma follows from the likelihood of every lag within reach, not
+only from the curvature at the best one: where speed hardly changes, several lags explain it nearly as well.
 """
 
 from __future__ import annotations
@@ -20,17 +20,18 @@ from graphnav.core.rotation import Array
 Index = NDArray[Any]  # of row numbers
 Lags = Array | float  # s, (L,) or one
 Regressors = Callable[[Index, Lags], Array]  # (rows, lags) -> (L, K, m), of one lag (K, m)
-REACH = 5.0  # s on either side of the first guess, which is all that a sigma can come to
-_SLOW = 10.0  # s; what changes slower than this is the road (as in `graphnav.recording.draft.motion.filter_band`)
-_STEP, _FINE, _FINEST = 0.1, 0.02, 0.005  # s, of the grids of lags
-_AT_ONCE = 1 << 16  # rows times lags, so that what is at work stays small
-_PARTS, _STUDENT = 4, 3.0  # parts, and the variance of Student's t with the degrees of freedom of their scatter
+REACH = 5.0  # s on either side of the first guess: the largest sigma that can result
+_SLOW_CHANGES = 10.0  # s; slower changes are those of the road (as in `graphnav.recording.draft.motion.filter_band`)
+_COARSE, _FINE, _FINEST = 0.1, 0.02, 0.005  # s, of the grids of lags
+_NUMBERS_AT_ONCE = 1 << 16  # rows times lags, to bound the memory in use
+# number of parts, and the variance of Student's t with the degrees of freedom of their scatter
+_PARTS, _STUDENT = 4, 3.0
 _OUTLYING = 5.0  # robust sigmas beyond which a row is an error of the fix
 
 
 @dataclass(frozen=True)
 class _At:
-    """The regression at one lag: rows, regressors and observations less their slow part, coefficients, misfit."""
+    """The regression at one lag: rows, regressors and observations minus their slow part, coefficients, misfit."""
 
     rows: Index
     x: Array
@@ -40,7 +41,7 @@ class _At:
 
     @property
     def unexplained(self) -> float:
-        """Logarithm of the share of the variance that is left."""
+        """Logarithm of the unexplained share of the variance."""
         return float(np.log(max(self.e @ self.e / max(self.y @ self.y, 1e-300), 1e-12)))
 
 
@@ -77,7 +78,7 @@ def refine_lag(
     def at(lag: float, some: Index) -> _At | None:
         return at_each(np.array([lag]), some)[0]
 
-    for _ in range(2):  # spikes of a fix hide a good fit
+    for _ in range(2):  # spikes of fixes hide a good fit
         found = at(guess, rows)
         if found is None:
             return guess, REACH
@@ -87,11 +88,11 @@ def refine_lag(
     def profile(lags: Array) -> Array:
         return np.array([np.nan if one is None else one.unexplained for one in at_each(lags, rows)])
 
-    wide = guess + np.arange(-REACH, REACH + _STEP / 2, _STEP)
+    wide = guess + np.arange(-REACH, REACH + _COARSE / 2, _COARSE)
     seen = profile(wide)
     if not np.isfinite(seen).any():
         return guess, REACH
-    near = wide[int(np.nanargmin(seen))] + np.arange(-_STEP, _STEP + _FINE / 2, _FINE)
+    near = wide[int(np.nanargmin(seen))] + np.arange(-_COARSE, _COARSE + _FINE / 2, _FINE)
     close = profile(near)
     lag = _find_lowest(near, close)
     best = at(lag, rows)
@@ -106,18 +107,18 @@ def refine_lag(
     lags, order = np.unique(lags, return_index=True)
     depth = depth[order]
     lags, depth = lags[np.isfinite(depth)], depth[np.isfinite(depth)]
-    # of a regression with an unknown variance, the two coefficients, mean and lag taken off the degrees of freedom
+    # for a regression with unknown variance: the two coefficients, mean and lag reduce the degrees of freedom
     likelihood = np.exp(-0.5 * max(worth - 4.0, 1.0) * (depth - depth.min())) * np.gradient(lags)
     by_likelihood = np.sqrt(np.sum(likelihood * (lags - lag) ** 2) / likelihood.sum())
     return lag, float(max(spread, by_likelihood))
 
 
 def share_rows(lags: Array, rows: Index, valid: Callable[[float], Array]) -> Iterator[tuple[Index, Array]]:
-    """Successive lags at which the same rows are valid: these rows, and the lags; many rows at few lags at once."""
+    """Group successive lags at which the same rows are valid: these rows, and the lags; large groups are split."""
     inside = np.array([valid(float(lag))[rows] for lag in lags])
     begin = 0
     for k in range(1, len(lags) + 1):
-        full = (k - begin) * len(rows) >= _AT_ONCE
+        full = (k - begin) * len(rows) >= _NUMBERS_AT_ONCE
         if k == len(lags) or full or not np.array_equal(inside[k], inside[begin]):
             yield rows[inside[begin]], lags[begin:k]
             begin = k
@@ -132,8 +133,8 @@ def regress_each(x: Array, y: Array) -> Array:
 
 
 def remove_slow(t: Array, x: Array) -> Array:
-    """Columns (N, m) at times t (N,) less their means over the ten seconds around each, and without a mean."""
-    lo, hi = np.searchsorted(t, t - _SLOW / 2), np.searchsorted(t, t + _SLOW / 2, side="right")
+    """Columns (N, m) at times t (N,) minus their means over the ten seconds around each, with zero mean."""
+    lo, hi = np.searchsorted(t, t - _SLOW_CHANGES / 2), np.searchsorted(t, t + _SLOW_CHANGES / 2, side="right")
     total = np.concatenate([np.zeros((1, x.shape[1])), np.cumsum(x - x.mean(0), axis=0)])
     out = x - x.mean(0) - (total[hi] - total[lo]) / (hi - lo)[:, None]
     return np.asarray(out - out.mean(0))
@@ -144,9 +145,9 @@ def _score_lags(
 ) -> tuple[float, float] | None:
     """Variance of the sum of scores at the best lag, and the information there.
 
-    A row's score is its misfit times what a second of lag would change. Scores are correlated: the variance of their
-    sum is by their autocorrelation until it first vanishes, or by the scatter of four equally informed parts if that
-    says more, as it does where a clock wanders.
+    A row's score is its misfit times its derivative by the lag. Scores are correlated: the variance of their sum is
+    computed with their autocorrelation until it first vanishes, or from the scatter of four equally informed parts if
+    that is larger, as it is where a clock wanders.
     """
     inside = valid(lag - _FINE)[best.rows] & valid(lag + _FINE)[best.rows]
     rows, x = best.rows[inside], best.x[inside]
@@ -169,7 +170,7 @@ def _score_lags(
 
 
 def _find_lowest(lags: Array, values: Array) -> float:
-    """Where evenly spaced values are lowest, by the parabola through the lowest and its neighbours."""
+    """Position of the minimum of evenly spaced values, by the parabola through it and its neighbours."""
     k = int(np.nanargmin(values))
     if 0 < k < len(lags) - 1 and np.isfinite(values[k - 1 : k + 2]).all():
         bend = values[k - 1] - 2.0 * values[k] + values[k + 1]

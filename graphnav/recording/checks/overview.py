@@ -1,7 +1,7 @@
-"""Looks a recording over before it is solved: what it holds, and what in it is odd, in plain words.
+"""Inspection of a recording before it is solved: what it contains, and what is unusual, in plain words.
 
-Each check is a small function that yields findings; it says nothing where the data do not tell. What cannot be right is
-looked for first (`graphnav.recording.plausibility.screening`), and the rest is checked without it.
+Each check is a small function that returns findings, none where the data are insufficient. Impossible rows are sought
+first (`graphnav.recording.plausibility.screening`), and the rest is checked without them.
 """
 
 from __future__ import annotations
@@ -55,26 +55,26 @@ _REST_WINDOW = 1.0  # s
 
 @dataclass(frozen=True)
 class Inspection:
-    """What `inspect` found; `facts` are per sensor, name -> value in SI units unless the name says otherwise."""
+    """The result of `inspect`; `facts` are per sensor, name -> value in SI units unless the name states otherwise."""
 
     name: str
     platform: str
     facts: dict[str, dict[str, Any]]
-    recording: Recording = field(repr=False)  # what was inspected, without what cannot be right
+    recording: Recording = field(repr=False)  # what was inspected, without impossible rows
     findings: tuple[Finding, ...] = field(default=())
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """The sentences of the warnings, and of what is graver."""
+        """The sentences of the warnings and of more severe findings."""
         return tuple(f.sentence for f in self.findings if f.severity != "note")
 
     @property
     def trusted(self) -> bool:
-        """Whether nothing was found with which a result may be wrong altogether."""
+        """Whether there is no finding because of which a result may be entirely wrong."""
         return all(f.severity in ("note", "warning") for f in self.findings)
 
     def refuse(self) -> None:
-        """Raise what it cannot be solved with.
+        """Raise an error if the recording cannot be solved.
 
         Raises
         ------
@@ -84,12 +84,12 @@ class Inspection:
         refuse(self.recording, self.findings)
 
     def values(self) -> dict[str, Any]:
-        """All of it, for JSON."""
+        """The inspection for JSON."""
         findings = [f.values() for f in self.findings]
         return {"name": self.name, "platform": self.platform, **self.facts, "findings": findings}
 
     def text(self) -> str:
-        """A summary of several lines for people."""
+        """The inspection as several lines of text."""
         lines = [f"{self.name} ({self.platform})"]
         for sensor, facts in self.facts.items():
             shown = ", ".join(_show(name, value) for name, value in facts.items())
@@ -122,8 +122,8 @@ def inspect(recording: Recording) -> Inspection:
     Returns
     -------
     Inspection
-        Facts by sensor, the recording without what cannot be right, and findings: the gravest first, then in the
-        order of the checks, the loader's remarks first.
+        Facts by sensor, the recording without impossible rows, and findings: the most severe first, then in the
+        order of the checks, beginning with the loader's remarks.
     """
     whole = screen(recording)
     recording = whole.recording
@@ -152,7 +152,7 @@ def inspect(recording: Recording) -> Inspection:
     if rest.any():
         facts["imu"]["still_s"] = float(rest.sum() * period_of(recording.imu.t))
         findings += check_force_at_rest(recording, rest, facts["imu"])
-        if vehicle:  # a person who stands still sways
+        if vehicle:  # a standing person sways
             findings += check_noise_at_rest(recording.imu, rest)
     if recording.gnss is not None:
         facts["gnss"] = _describe_gnss(recording, track)
@@ -161,12 +161,12 @@ def inspect(recording: Recording) -> Inspection:
         findings += check_fix_types(recording.gnss)
         wrong = find_mirrored(recording, list(check_velocities(recording.gnss)))
         if overlap or not wrong:
-            # against wrong velocities, or on another clock, every position jumps
+            # against wrong velocities, or on another clock, every position would jump
             findings += wrong or (check_gnss_jumps(recording, track) if overlap else ())
     if recording.raw_gnss is not None and len(recording.raw_gnss):
         facts["raw_gnss"] = describe_raw(recording.raw_gnss)
         findings += check_raw(recording.raw_gnss)
-    # of axes that are wrong already, or of forces without gravity, nothing is told by gravity
+    # with wrong axes, or forces without gravity, gravity proves nothing
     turned = known & {"imu.forward_reversed", "imu.axes_turned", "imu.dead_axis", "imu.force_scale"}
     if vehicle and overlap and track is not None and recording.gnss is not None:
         clock = whole.clock or measure_clock_offsets(recording.imu, recording.gnss)
@@ -199,7 +199,7 @@ def inspect(recording: Recording) -> Inspection:
         findings.append(
             Finding(
                 "note",
-                "keys in brackets are those of a recording.toml, which this log has none of: graphnav init "
+                "keys in brackets belong in a recording.toml, which this log does not have: graphnav init "
                 f"{recording.source} drafts one",
                 "recording.log",
             )
@@ -250,7 +250,7 @@ def _describe_gnss(recording: Recording, track: Track | None) -> dict[str, Any]:
 
 
 def _find_rest(recording: Recording, track: Track | None) -> Array:
-    """IMU rows that lie in quiet seconds; quiet is near the quietest part, and not moving where speed is known."""
+    """IMU rows in quiet seconds: near the quietest part of the recording, and not moving where the speed is known."""
     imu = recording.imu
     period = period_of(imu.t)
     n = max(5, round(_REST_WINDOW / period))
@@ -271,7 +271,7 @@ def _find_rest(recording: Recording, track: Track | None) -> Array:
         quiet &= np.abs(np.interp(middle, o.t, o.speed, left=np.inf, right=np.inf)) < 0.05
     elif track is not None:
         quiet &= np.interp(middle, track.t, track.speed, left=np.inf, right=np.inf) < 0.3
-    else:  # nothing but the IMU: stillness must be plain
+    else:  # with an IMU alone, stillness must be obvious
         quiet &= (force < 0.3) & (rate < 0.03)
     mask[: blocks * n] = np.repeat(quiet, n)
     return mask

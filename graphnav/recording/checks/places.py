@@ -1,4 +1,4 @@
-"""Whether the positions are places where the IMU has been: mirrored, exchanged, or heights in another unit."""
+"""Checks of positions against the IMU: mirrored, exchanged, or heights in another unit."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from graphnav.recording.checks.crosschecks import Fit, Track
 from graphnav.recording.checks.stated import describe_exchange, describe_mirroring, exchange_lat_lon
 from graphnav.recording.formats.schema import FOOT
 
-_FEET = 0.3  # how far a ratio may be from 0.3048 by the noise of both: 1 is three times that off
+_FEET = 0.3  # relative deviation from 0.3048 that the noise of both permits: a ratio of 1 is three times as far off
 
 
 def check_mirroring(recording: Recording, track: Track, turns_back: bool) -> Iterator[Finding]:
-    """A course that does not turn as the gyro does, as the positions are a mirror image, by exchange or by a sign."""
+    """A course that turns opposite to the gyro, as positions are mirrored by an exchange or a sign."""
     other = exchange_lat_lon(recording.gnss) if recording.gnss is not None else None
     way = crosschecks.track(replace(other, v=None)) if other is not None else None
     yaw = crosschecks.fit_yaw(recording.imu, way) if way is not None else None
@@ -27,12 +27,12 @@ def check_mirroring(recording: Recording, track: Track, turns_back: bool) -> Ite
         yield describe_exchange("the turns of the gyro")
     elif (
         turns_back and (crosschecks.correlate_sideways(recording.imu, track) or 0.0) > 0.0
-    ):  # the gyro turns as the force says
+    ):  # the gyro agrees with the force
         yield describe_mirroring("latitudes or longitudes have", "the turns of the gyro and the force in curves")
 
 
 def check_height_unit(recording: Recording, track: Track, forward: Fit | None) -> Iterator[Finding]:
-    """Heights in feet: they climb 3.28 times as much as the IMU feels of slopes."""
+    """Heights in feet: they climb 3.28 times as much as the slopes that the IMU measures."""
     if forward is None or forward.correlation < FAIR or recording.gnss is None:
         return
     ahead = forward.coefficients / np.linalg.norm(forward.coefficients)
@@ -50,7 +50,9 @@ def check_height_unit(recording: Recording, track: Track, forward: Fit | None) -
 
 
 def find_mirrored(recording: Recording, wrong: Sequence[Finding]) -> list[Finding]:
-    """What `velocities` found, or that the positions are wrong where the gyro turns with the velocities."""
+    """The finding `wrong` on velocities, or that the positions are mirrored, where the gyro agrees with the
+    velocities.
+    """
     gnss = recording.gnss
     if gnss is None or gnss.v is None or recording.platform != "vehicle":
         return list(wrong)

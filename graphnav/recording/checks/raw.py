@@ -11,7 +11,7 @@ from graphnav.core.findings import Finding, period_of
 from graphnav.gnss.series import RawGnss
 from graphnav.gnss.signals import NAMES, SYSTEMS, satellite_name, signal_name
 
-_GAP = 2.5  # periods beyond which a step between epochs is a gap
+_GAP_PERIODS = 2.5  # periods beyond which a step between epochs is a gap
 _FEW = 5  # satellites, one more than a position with its clock takes
 
 
@@ -25,7 +25,7 @@ def describe_raw(raw: RawGnss) -> dict[str, Any]:
     if len(epochs) > 1:
         period, step = period_of(epochs), np.diff(epochs)
         facts |= {"rate_hz": round(1.0 / period, 3), "span_s": round(float(epochs[-1] - epochs[0]), 3)}
-        facts["gaps"] = int((step > _GAP * period).sum())
+        facts["gaps"] = int((step > _GAP_PERIODS * period).sum())
         facts["longest_step_s"] = round(float(step.max()), 3)
     for k in range(len(SYSTEMS)):
         if (system == k).any():

@@ -1,4 +1,4 @@
-"""What the declaration of a sensor tells of its rows: which cannot have been measured, and what there is of them."""
+"""Checks of a sensor's rows by its declaration: impossible values, and a summary of the others."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from graphnav.core.findings import Finding, period_of
 from graphnav.recording import Recording, take_rows
 from graphnav.sensors import Series
 
-_ISOLATED = 0.01  # of the rows; what more of them have in common is no fault of single rows
-_SAME = 10.0  # s that a sensor which measures all the time is not seen to read the same number while others move
+_ISOLATED = 0.01  # share of the rows; above it the cause is not in single rows
+_SAME = 10.0  # s for which a working sensor does not repeat one number while others change
 
 
 def screen_series(recording: Recording) -> tuple[Recording, list[Finding]]:
-    """The recording without values beyond the bounds of their sensors, and what was found."""
+    """The recording without values beyond the bounds of their sensors, and findings."""
     kept, findings = {}, []
     for name, series in recording.sensors.items():
         kept[name], found = _screen(series)
@@ -63,7 +63,7 @@ def describe_series(series: Series) -> dict[str, Any]:
 
 
 def check_series(recording: Recording) -> Iterator[Finding]:
-    """Sensors that are on another clock, and that stand still while all else goes on."""
+    """Sensors on another clock, and sensors that stand still while everything else changes."""
     for name, series in recording.sensors.items():
         if not len(series):
             continue

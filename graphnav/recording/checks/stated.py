@@ -1,4 +1,4 @@
-"""Checks of what a recording states and of what its positions, velocities and truth say of each other."""
+"""Checks of stated figures, and of positions, velocities and truth against each other."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from graphnav.recording.checks.crosschecks import Track
 
 _LONGEST_ARM = 15.0  # m; no lever arm on a road vehicle is that long
 _RUN = 8.0  # m/s, above any walking speed
-# SI figures that no IMU has (a phone's are a tenth or less), and the unit of a data sheet that may have been meant
+# SI figures that no IMU has (a phone's are a tenth or less), and the data-sheet unit that was probably meant
 _IMPOSSIBLE = {
     "gyro_noise_density": (0.02, "rad/s/sqrt(Hz)", "deg/sqrt(h)"),
     "accel_noise_density": (0.5, "m/s2/sqrt(Hz)", "ug/sqrt(Hz)"),
@@ -25,11 +25,11 @@ _IMPOSSIBLE = {
     "accel_bias_sigma": (5.0, "m/s2", "mg"),
 }
 _SPEEDS = {1 / 3.6: "km/h", 0.44704: "mph", 1852 / 3600: "knots", 3.6: "m/s already"}
-_MENDED = 0.3  # of what is off is left by a change that mends it
+_MENDED = 0.3  # ratio of the discrepancies with and without a change below which that change explains them
 
 
 def check_stated_noise(noise: ImuNoise) -> Iterator[Finding]:
-    """Figures that were typed in a data sheet's unit."""
+    """Noise figures entered in a data sheet's unit."""
     for key, (limit, unit, meant) in _IMPOSSIBLE.items():
         value = float(getattr(noise, key))
         if value > limit:
@@ -53,7 +53,7 @@ def check_lever_arms(recording: Recording) -> Iterator[Finding]:
 
 
 def check_foot_speed(recording: Recording, track: Track | None) -> Iterator[Finding]:
-    """A vehicle's log with a foot's platform."""
+    """A vehicle's log with the platform "foot"."""
     if recording.platform == "foot" and track is not None:
         speed = float(np.percentile(track.speed, 95.0))
         if speed > _RUN:
@@ -65,7 +65,7 @@ def check_foot_speed(recording: Recording, track: Track | None) -> Iterator[Find
 
 
 def check_rounding(gnss: Gnss) -> Iterator[Finding]:
-    """Positions with fewer digits than their sigma is worth."""
+    """Positions with fewer digits than their sigma requires."""
     degrees = np.degrees(gnss.llh[:, :2])
     if len(degrees) < 10 or not np.ptp(degrees, axis=0).all():
         return
@@ -85,7 +85,7 @@ def check_rounding(gnss: Gnss) -> Iterator[Finding]:
 
 
 def check_fix_types(gnss: Gnss) -> Iterator[Finding]:
-    """Types in the numbers of GGA's quality, which differ."""
+    """Fix types in the numbers of GGA's quality, which differ from RTKLIB's."""
     if gnss.type is None or not gnss.type_assumed:
         return
     from graphnav.recording.draft.guesses import guess_fix_numbers
@@ -98,13 +98,13 @@ def check_fix_types(gnss: Gnss) -> Iterator[Finding]:
 
 
 def check_velocities(gnss: Gnss) -> Iterator[Finding]:
-    """Velocities whose axes, signs or unit the positions deny."""
+    """Velocities whose axes, signs or unit disagree with the positions."""
     if gnss.v is None or len(gnss.t) < 10:
         return
     p, v, m = crosschecks.compute_local_positions(gnss), gnss.v, max(1, round(1.0 / float(np.median(np.diff(gnss.t)))))
     dt = gnss.t[m:] - gnss.t[:-m]
     moved = p[m:] - p[:-m]
-    # by the trapezoids of all rows between, which follow a change of speed
+    # by the trapezoidal rule over all rows between, which follows changes of speed
     steps = 0.5 * (v[1:] + v[:-1]) * np.diff(gnss.t)[:, None]
     total = np.concatenate([np.zeros((1, 3)), np.cumsum(np.nan_to_num(steps), axis=0)])
     stated = total[m:] - total[:-m]
@@ -136,13 +136,13 @@ def check_velocities(gnss: Gnss) -> Iterator[Finding]:
 
 
 def exchange_lat_lon(gnss: Gnss) -> Gnss | None:
-    """The fixes with latitude and longitude exchanged; None where that is no place."""
+    """The fixes with latitude and longitude exchanged; None where that is no valid place."""
     llh = gnss.llh[:, [1, 0, 2]]
     return replace(gnss, llh=llh) if np.nanmax(np.abs(llh[:, 0])) < 0.5 * np.pi else None
 
 
 def describe_exchange(sensor: str) -> Finding:
-    """That they are, by `sensor`."""
+    """The finding that they are exchanged, by `sensor`."""
     return Finding(
         "refused",
         f"latitude and longitude are exchanged: exchanged back, the positions agree with {sensor}; exchange the names "
@@ -152,7 +152,7 @@ def describe_exchange(sensor: str) -> Finding:
 
 
 def describe_mirroring(which: str, sensor: str) -> Finding:
-    """That positions have the wrong sign, by `sensor`."""
+    """The finding that positions have the wrong sign, by `sensor`."""
     return Finding(
         "refused",
         f"{which} the wrong sign, by {sensor}: south and west are negative; negate the column in the file",
@@ -161,7 +161,7 @@ def describe_mirroring(which: str, sensor: str) -> Finding:
 
 
 def _compute_horizontal(moved: Array, stated: Array) -> Iterator[Finding]:
-    """Which change of the velocities (N, 2) agrees with the ways (N, 2), if they do not themselves."""
+    """The change of velocities (N, 2) that makes them agree with displacements (N, 2), if they do not themselves."""
 
     def miss(change: Array) -> float:
         return float(np.median(np.linalg.norm(moved - stated @ change.T, axis=1)))
@@ -236,7 +236,9 @@ def is_truth_apart(recording: Recording) -> bool:
 
 
 def _measure_median_distance(truth: Truth, true: Array, gnss: Gnss, fixes: Array, shift: float) -> float | None:
-    """Median horizontal distance (m) between fixes and a truth `shift` s later; None where too few are near in time."""
+    """Median horizontal distance (m) between fixes and a truth shifted by `shift` s; None where too few are close in
+    time.
+    """
     t = truth.t + shift
     k = np.clip(np.searchsorted(t, gnss.t), 1, len(t) - 1)
     near = (gnss.t >= t[k - 1]) & (gnss.t <= t[k]) & (t[k] - t[k - 1] < 3.0)

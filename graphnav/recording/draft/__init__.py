@@ -1,4 +1,4 @@
-"""Drafts a recording.toml from logs that nobody prepared: `draft` looks at them, guesses, and says why and how sure."""
+"""Draft of a recording.toml from arbitrary logs: `draft` inspects them, guesses, and states reasons and confidence."""
 
 from __future__ import annotations
 
@@ -25,24 +25,24 @@ from graphnav.recording.formats.writer import quote
 __all__ = ["Draft", "draft"]
 
 _UNIX = 1e9  # s
-_SMALL = 0.03  # s; shifts of clocks below this are left to the smoother, which estimates them
-_SD = "[3.3, 3.3, 6.6]"  # m, what is assumed of fixes that state none (graphnav.recording.formats.repair.DEFAULT_SD)
+_SMALL = 0.03  # s; smaller clock offsets are left to the smoother, which estimates them
+_SD = "[3.3, 3.3, 6.6]"  # m, assumed of fixes that state none (graphnav.recording.formats.repair.DEFAULT_SD)
 
 
 @dataclass(frozen=True)
 class Draft:
-    """A recording.toml and what was decided on the way, in words."""
+    """A recording.toml and the decisions made, in words."""
 
     text: str
     decisions: tuple[str, ...]
-    made: dict[str, dict[str, Array]]  # files to lie beside it: name -> columns
+    made: dict[str, dict[str, Array]]  # files to be written beside it: name -> columns
 
 
 def draft(paths: Sequence[Path], folder: Path, name: str | None = None, topics: Sequence[str] = ()) -> Draft:
-    """Describe logs (CSV files, or logs of programs that are known) in a recording.toml that will lie in `folder`.
+    """Describe logs (CSV files, or logs of known programs) in a recording.toml for `folder`.
 
-    Of a folder all logs in it are looked at; what holds no sensor is left out and said. `topics` are those to use of
-    a ROS bag.
+    Of a folder all logs in it are considered; those without sensor data are left out with a note. `topics` are those to
+    use of a ROS bag.
 
     Raises
     ------
@@ -72,12 +72,12 @@ def read_imu_in_si(path: Path) -> tuple[Array, Array, Array]:
 
 
 class _Writer:
-    """Lines of the file; every decision goes into a comment and into a list."""
+    """Writes the lines of the file; every decision goes into a comment and into a list."""
 
     def __init__(self, folder: Path, asked: Sequence[str]) -> None:
         self.folder = folder
         self.asked = asked  # topics
-        self.epochs: ClockOffset | None = None  # of the clocks of IMU and fixes
+        self.epochs: ClockOffset | None = None  # delays between the clocks of IMU and fixes
         self.lines: list[str] = []
         self.decisions: list[str] = []
         self.made: dict[str, dict[str, Array]] = {}
@@ -104,7 +104,7 @@ class _Writer:
     # ---- one table each
 
     def _imu(self, source: Source, gnss: Source | None, vehicle: bool) -> tuple[Agreement, tuple[Array, Array]]:
-        """Writes [imu]; returns what the fixes said, and times and forward forces."""
+        """Write [imu]; returns the comparison with the fixes, and times and forward forces."""
         self.lines += ["", "[imu]"]
         self._file(source, "imu")
         if source.log is not None:
@@ -246,7 +246,7 @@ class _Writer:
         self._lever_arm(source.log.odometer if source.log else None, "from the IMU to the middle of the rear axle")
 
     def _lever_arm(self, sensor: Gnss | Odometer | None, what: str) -> None:
-        """That of a log, if it has one."""
+        """Write the lever arm of a log, if it has one."""
         if sensor is not None and np.any(sensor.lever_arm):
             self._key("lever_arm", _format_vector(sensor.lever_arm), f"m, {what}; as the log says")
         else:
@@ -299,7 +299,7 @@ class _Writer:
 
 
 def _find_odometer_lag(t: Array, speed: Array, felt: tuple[Array, Array]) -> motion.Lag | None:
-    """How late the wheel is, by its accelerations against the forward ones of the IMU."""
+    """Delay of the wheel speed, by its accelerations against the forward ones of the IMU."""
     if len(t) < 50:
         return None
     grid, forward = motion.resample_on_grid(felt[0], felt[1][:, None])
@@ -309,7 +309,7 @@ def _find_odometer_lag(t: Array, speed: Array, felt: tuple[Array, Array]) -> mot
 
 
 def _find_epoch(imu: Source, gnss: Source) -> ClockOffset | None:
-    """What lies between the clocks of two logs, where both are known."""
+    """Offset between the clocks of two logs, where both are known."""
     first = [_read_first(source, sensor) for source, sensor in ((imu, "imu"), (gnss, "gnss"))]
     zeros = [None if source.log is None else source.log.gps_zero for source in (imu, gnss)]
     found = between_clocks(first[0], zeros[0], first[1], zeros[1])

@@ -1,4 +1,4 @@
-"""What IMU and fixes say of each other: the gyro's unit, the shift of the clocks, the forward axis."""
+"""Comparison of IMU and fixes: the gyro's unit, the clock offset, the forward axis."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from graphnav.recording import Gnss, Imu
 from graphnav.recording.checks.clock import ClockOffsets, measure_clock_offsets
 from graphnav.recording.draft import motion
 
-CLEAR, FAIR = 0.8, 0.5  # correlations: sure, likely
-_LEAST_CORRELATION = 0.75  # the least for a shift of clocks that have nothing in common
-_TWO_CLOCKS = 0.15  # s; velocities further from the positions than this have a latency of their own
+CLEAR, FAIR = 0.8, 0.5  # correlations: certain, likely
+_LEAST_CORRELATION = 0.75  # least correlation for the offset of unrelated clocks
+_TWO_CLOCKS = 0.15  # s; velocities with a larger offset from the positions have a latency of their own
 
 
 @dataclass(frozen=True)
 class Agreement:
     """`turn` of the turn rates; `position` and `velocity` of the accelerations, as `motion.Lag`, None where unknown.
 
-    These find clocks that have nothing in common and the way forward. How far apart clocks are that overlap is said by
-    `clock`, as in `graphnav info`, of fixes that come `far` seconds earlier than they are stamped.
+    These determine the offset of unrelated clocks and the forward direction. The offset of overlapping clocks is
+    `clock`, as in `graphnav info`, for fixes `far` seconds earlier than they are stamped.
     """
 
     turn: motion.Lag | None = None
@@ -30,17 +30,17 @@ class Agreement:
     forward: Array | None = None  # (3,) in file axes
     far: float = 0.0  # s
     clock: ClockOffsets | None = None
-    known: float = 0.0  # s, to be added to the stamps of the fixes beforehand; the rest is found on top
+    known: float = 0.0  # s, to be added to the stamps of the fixes beforehand; the rest is found in addition
 
     @property
     def clearest(self) -> motion.Lag | None:
-        """The one with the highest coherence."""
+        """The one with the highest correlation."""
         both = [lag for lag in (self.position, self.velocity) if lag is not None]
         return max(both, key=lambda lag: lag.correlation, default=None)
 
     @property
     def late_velocity(self) -> float | None:
-        """How much later than the positions the velocities come, s, where that is surely another latency."""
+        """Delay of the velocities against the positions, s, where it is certain."""
         between = self.clock.between if self.clock is not None else None
         if between is None or self.clock is None or self.clock.apart is None or abs(between.lag) < _TWO_CLOCKS:
             return None
@@ -48,7 +48,7 @@ class Agreement:
 
     @property
     def offset(self) -> tuple[float, float] | None:
-        """What to add to the stamps of the fixes, s, and its 1-sigma; None where nothing says that they are off."""
+        """s to add to the stamps of the fixes, and its 1-sigma; None where nothing shows an offset."""
         found = self._found_offset
         if not self.known:
             return found
@@ -56,7 +56,7 @@ class Agreement:
 
     @property
     def _found_offset(self) -> tuple[float, float] | None:
-        """The same, of the fixes with what is known added to their stamps."""
+        """The offset of the fixes after the known offset has been added to their stamps."""
         if self.clock is None:
             return None
         clock = self.clock if self.late_velocity is None else ClockOffsets(None, self.clock.by_places, None)
@@ -70,7 +70,7 @@ class Agreement:
 
 
 def find_level_axes(up: Array) -> tuple[Array, Array]:
-    """Two axes square to `up` and each other, so that the first, the second and up are right-handed."""
+    """Two axes perpendicular to `up` and each other, such that the first, the second and up are right-handed."""
     start = np.eye(3)[int(np.abs(up).argmin())]
     first = start - (start @ up) * up
     first /= np.linalg.norm(first)
@@ -107,7 +107,8 @@ def _compare(t: Array, gyro: Array, accel: Array, up: Array, fixes: tuple[Array,
         if found is None:
             lags.append(None)
             continue
-        # An antenna ahead of the IMU feels sideways what the IMU will feel; along the course they feel the same.
+        # an antenna ahead of the IMU senses sideways what the IMU will sense later; along the course both sense the
+        # same
         ahead = motion.find_lag(grid, (s * np.exp(-1j * np.angle(found.slope))).real, one.t - shift, z.real)
         seconds = ahead.seconds if ahead is not None and ahead.correlation > FAIR else found.seconds
         lags.append(motion.Lag(seconds + shift, found.correlation, found.slope))
@@ -122,7 +123,7 @@ def _compare(t: Array, gyro: Array, accel: Array, up: Array, fixes: tuple[Array,
 def _compare_clocks(
     t: Array, gyro: Array, accel: Array, fixes: tuple[Array, Array, Array | None], shift: float
 ) -> ClockOffsets:
-    """As the recording will hold them, with the fixes `shift` seconds earlier."""
+    """Compare with the fixes `shift` seconds earlier, as the recording will hold them."""
     rows = np.concatenate([[True], np.diff(fixes[0]) > 0.0]) & np.isfinite(fixes[1]).all(axis=1)
     v = None if fixes[2] is None else fixes[2][rows]
     if v is not None and v.shape[1] == 2:
@@ -132,7 +133,7 @@ def _compare_clocks(
 
 
 def _find_turn_lag(grid: Array, rate: Array, course: motion.Course) -> motion.Lag | None:
-    """The shift of clocks that overlap, unless only another one, any, makes the turns agree."""
+    """The offset of overlapping clocks, unless only an arbitrary one makes the turns agree."""
     overlap = course.t[0] < grid[-1] and course.t[-1] > grid[0] if len(grid) else False
     near = motion.find_lag(grid, rate, course.t, course.turn, course.speed**2) if overlap else None
     if near is not None and near.correlation > FAIR:

@@ -1,4 +1,4 @@
-"""Which column is what: names of phones, receivers, ROS and data loggers, matched by meaning, and the units in them."""
+"""Meaning of columns: names used by phones, receivers, ROS and data loggers, and the units in them."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-# A name is brought to one spelling first: lower case, words apart by _, the unit taken off. Earlier patterns win.
+# A name is normalised first: lower case, words separated by _, the unit removed. Earlier patterns take precedence.
 _GYRO = r"(?:.*_)?(?:gyr\w*?|angular_(?:velocity|rate)|ang_vel|omega|rotation_rate|rot_rate|imu_w|w|turn_rate|g)_?"
 _ACCEL = r"(?:.*_)?(?:acc\w*?|linear_acceleration|total_acceleration|specific_force|imu_a|imu_f|force|a|f)_?"
 _HORIZONTAL = r"sd_?h|(?:.*_)?(?:h_?acc\w*|horizontal_accuracy)|accuracy|eph|epe(?:_m)?"
 _VERTICAL = r"sd_?v|(?:.*_)?(?:v_?acc\w*|vertical_accuracy)|altitude_accuracy|epv"
 _OF_SPEED = r"sd_?v|sd_?speed|(?:.*_)?(?:s_?acc|(?:speed|velocity|vel)_?acc\w*)|eps"
-# what says how uncertain something is, or how satellites stand, is not the thing
+# columns of uncertainties, or of satellite geometry, are not the quantity itself
 _UNCERTAIN = re.compile(
     r"(?:.*_)?(?:sd|std|stdev|sigma|var|variance|cov\w*|accuracy|[hvpgt]dop|err\w*|uncertainty|ep[hves])(?:_.*)?|.*_acc"
 )
@@ -86,14 +86,14 @@ _AXES = ("gx", "gy", "gz", "ax", "ay", "az")
 
 @dataclass(frozen=True)
 class Columns:
-    """Columns of one file: our name -> the file's, and our name -> the unit that its name states."""
+    """Columns of one file: our name -> the file's, and our name -> the unit stated in its name."""
 
     names: dict[str, str]
     units: dict[str, str] = field(default_factory=dict)
 
     @property
     def sensor(self) -> str | None:
-        """What the file is of: imu, gyro, accel, gravity (a phone's own estimate of it), gnss, odometer, or None."""
+        """The sensor of the file: imu, gyro, accel, gravity (a phone's own estimate of it), gnss, odometer, or None."""
         gyro, accel = ({f"{s}{x}" for x in "xyz"} <= self.names.keys() for s in "ga")
         if "t" not in self.names:
             return None
@@ -108,7 +108,7 @@ class Columns:
 
 
 def match_columns(header: Sequence[str], stem: str = "") -> Columns:
-    """Find our columns among a file's; `stem`, the file's name, tells what bare x, y, z are of."""
+    """Match a file's columns to ours; `stem`, the file's name, shows what bare x, y, z are of."""
     spelt = [(name, *split_unit(name)) for name in header]
     certain = [some for some in spelt if not _UNCERTAIN.fullmatch(some[1])]
     names: dict[str, str] = {}
@@ -129,7 +129,7 @@ def match_columns(header: Sequence[str], stem: str = "") -> Columns:
             names[f"{kind}{x}"] = bare[x][0]
             if bare[x][1]:
                 units[f"{kind}{x}"] = bare[x][1]
-    # one letter is not enough when the triple is not whole
+    # a single letter is not enough when the triple is incomplete
     for kind in "ga":
         if not all(f"{kind}{x}" in names for x in "xyz"):
             for x in "xyz":
@@ -145,7 +145,7 @@ def find_clocks(header: Sequence[str]) -> list[str]:
 
 
 def split_unit(name: str) -> tuple[str, str]:
-    """A name in one spelling, and the unit it states ('' if none)."""
+    """The normalised name and the unit in it ('' if none)."""
     bracket = re.search(r"[(\[]([^)\]]*)[)\]]\s*$", name)
     base = name[: bracket.start()] if bracket else name
     base = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", base)
@@ -156,7 +156,7 @@ def split_unit(name: str) -> tuple[str, str]:
     words = plain.split("_")
     for count in (3, 2, 1):
         unit = "_".join(words[-count:])
-        # "a_g" may be anything, "g" alone and "s" alone are names
+        # "a_g" may be anything; "g" and "s" alone are names
         if len(words) > count and unit in UNITS:
             return "_".join(words[:-count]), unit
     return plain, ""

@@ -1,4 +1,4 @@
-"""What the size and the course of the numbers tell: units, axes, shifts of clocks, noise; each with how sure it is."""
+"""Guesses from magnitude and course of the numbers: units, axes, clock offsets, noise; each with its confidence."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ from graphnav.recording.formats.schema import FORCE, RATE, SPEED, rotation_from_
 from graphnav.sensors.tables import TIME
 
 _G = 9.80665
-_LASTING = 0.5  # of the usual force is in its mean, even of a foot that swings
+_MEAN_SHARE = 0.5  # share of the typical force that is in its mean, even for a swinging foot
 _LIKELY = 0.5  # correlation
-_STRAIGHT = np.cos(np.radians(12.0))  # nearer to a file axis than this, the axis is meant
-_QUIET = 5.0  # s
-_APART = 100.0  # s; stamps further apart are in a smaller unit
-_FIXED = 0.15  # m; fixed carrier phases state less, all else usually more
+_STRAIGHT = np.cos(np.radians(12.0))  # cosine of the angle to a file axis below which the axis is meant
+_QUIET_SPAN = 5.0  # s
+_LARGEST_STEP = 100.0  # s; larger steps between stamps mean a smaller unit
+_FIXED = 0.15  # m; only fixed carrier phases state less
 
 
 @dataclass(frozen=True)
 class Guess:
-    """A value for recording.toml and why, in words."""
+    """A value for recording.toml and the reason, in words."""
 
     value: object
     why: str
 
 
 def guess_time_unit(t: Array, stated: str | None, imu: bool) -> Guess:
-    """s, ms, us or ns, by the name, by the size of an epoch, by the step."""
+    """s, ms, us or ns: by the name, by the magnitude of an epoch, by the step."""
     if stated is not None:
         return Guess(stated, "as the column's name says")
     if (unit := _guess_unix_unit(t)) is not None:
@@ -51,11 +51,13 @@ def is_date(t: Array) -> bool:
 
 def _guess_unix_unit(t: Array) -> str | None:
     step = float(np.median(np.diff(t))) if len(t) > 1 else 0.0
-    return next((u for u, scale in TIME.items() if 1e9 <= float(t[0]) * scale < 3e9 and step * scale < _APART), None)
+    return next(
+        (u for u, scale in TIME.items() if 1e9 <= float(t[0]) * scale < 3e9 and step * scale < _LARGEST_STEP), None
+    )
 
 
 def guess_accel_unit(path: Path, accel: Array, stated: str | None) -> Guess:
-    """m/s2, g or mg, by the size of gravity.
+    """m/s2, g or mg, by the magnitude of gravity.
 
     Raises
     ------
@@ -63,7 +65,7 @@ def guess_accel_unit(path: Path, accel: Array, stated: str | None) -> Guess:
         If gravity has been taken out, or the numbers are raw counts.
     """
     size = float(np.median(np.linalg.norm(accel, axis=-1)))
-    lasting = float(np.linalg.norm(np.mean(accel, axis=0))) > _LASTING * size  # what a motion alone does not do
+    lasting = float(np.linalg.norm(np.mean(accel, axis=0))) > _MEAN_SHARE * size  # more than a motion alone
     for unit, scale in FORCE.items():
         if lasting and 0.8 * _G < size * scale < 1.25 * _G:
             return Guess(unit, f"the median force, {size:.4g}, is then that of gravity")
@@ -82,7 +84,7 @@ def guess_accel_unit(path: Path, accel: Array, stated: str | None) -> Guess:
 
 
 def guess_gyro_unit(gyro: Array, stated: str | None, lag: motion.Lag | None, vehicle: bool) -> Guess:
-    """rad/s or deg/s: by the turns of the course if there are any, by the name, by the size."""
+    """rad/s or deg/s: by the turns of the course if there are any, by the name, by the magnitude."""
     if lag is not None and abs(lag.correlation) > _LIKELY:
         for unit, scale in RATE.items():
             if 0.6 < abs(lag.slope) * scale < 1.6:
@@ -98,7 +100,7 @@ def guess_gyro_unit(gyro: Array, stated: str | None, lag: motion.Lag | None, veh
 
 
 def guess_speed_unit(t: Array, speed: Array, course: motion.Course | None, stated: str | None) -> Guess:
-    """m/s, km/h, mph or knots: by the fixes if there are any, by the name, by the size."""
+    """m/s, km/h, mph or knots: by the fixes if there are any, by the name, by the magnitude."""
     if course is not None:
         mine = np.interp(course.t, t, speed, np.nan, np.nan)
         ok = np.isfinite(mine) & (course.speed > 3.0)
@@ -114,23 +116,23 @@ def guess_speed_unit(t: Array, speed: Array, course: motion.Course | None, state
 
 
 def guess_fix_numbers(types: Array, sd: Array | None) -> Guess:
-    """Whose numbers types of fixes (N,) are, "rtklib", "nmea" or None, by the horizontal sigmas (N,) m of the fixes.
+    """The convention of fix types (N,), "rtklib", "nmea" or None, by the horizontal sigmas (N,) m of the fixes.
 
-    A fixed solution is 1 or 4, and nothing else is that precise; what follows from it must fit the other numbers.
+    A fixed solution is 1 or 4, and nothing else is that precise; the other numbers must be consistent with it.
     """
     if sd is None:
         return Guess(None, "no sigmas tell whose numbers they are")
     typical = {int(k): float(np.median(sd[types == k])) for k in np.unique(types[np.isfinite(types)])}
     precise = {k for k, s in typical.items() if s < _FIXED}
     for whose, fixed, known in (("rtklib", 1, range(7)), ("nmea", 4, (0, 1, 2, 4, 5, 9))):
-        floats = {2} if whose == "rtklib" else {5}  # that have settled may state as little
+        floats = {2} if whose == "rtklib" else {5}  # converged ones may state as little
         if fixed in precise and precise <= {fixed} | floats and set(typical) <= set(known):
             return Guess(whose, f"fixes of {fixed} state {typical[fixed]:.2g} m at the median, as fixed ones do")
     return Guess(None, "its numbers and the sigmas do not tell whose they are")
 
 
 def guess_up(accel: Array) -> tuple[Array, str]:
-    """The up axis (3,) in file axes, and how steady gravity was."""
+    """The up axis (3,) in file axes, and how constant gravity was."""
     mean = np.mean(accel, axis=0)
     up = mean / np.linalg.norm(mean)
     tilt = np.degrees(np.arccos(np.clip(np.abs(up).max(), 0, 1)))
@@ -139,7 +141,7 @@ def guess_up(accel: Array) -> tuple[Array, str]:
 
 
 def guess_axes(up: Array, forward: Array) -> tuple[str | None, tuple[Array, Array]]:
-    """Three letters if both vectors are near file axes, and in any case the two vectors."""
+    """Three letters if both vectors are close to file axes, and in any case the two vectors."""
     square = forward - (forward @ up) * up
     square /= np.linalg.norm(square)
     if np.abs(up).max() > _STRAIGHT and np.abs(square).max() > _STRAIGHT:
@@ -158,17 +160,17 @@ def guess_axes(up: Array, forward: Array) -> tuple[str | None, tuple[Array, Arra
 
 
 def choose_forward(up: Array) -> Array:
-    """A forward axis where nothing tells: x if it is level, else y."""
+    """A forward axis where nothing determines it: x if it is level, else y."""
     return np.asarray(np.eye(3)[0 if abs(up[0]) < 0.7 else 1])
 
 
 def estimate_noise_density(t: Array, x: Array) -> float:
-    """Noise of samples (N, 3) per root Hz, taken as white: between the quietest tenth of the log and its usual state.
+    """Noise density of samples (N, 3), taken as white: between the quietest tenth of the log and its typical state.
 
-    The Allan deviation times the root of its averaging time, which is the same for all times where noise is white;
-    the least of those up to half a second, as vibration is above it at the short ones and motion at the long ones.
-    Of the quietest tenth it is the sensor's own, of the median it has the shaking of the drive in it, and, too large,
-    its motion; the geometric mean of both is given.
+    The Allan deviation times the root of its averaging time, which is constant for white noise; its minimum over times
+    up to half a second, as vibration raises it at short ones and motion at long ones. That of the quietest tenth is the
+    sensor's own; that of the median includes the vibration of the drive and, undesirably, its motion; the geometric
+    mean of both is returned.
     """
     period = float(np.median(np.diff(t)))
     least = np.full(2, np.inf)
@@ -176,7 +178,7 @@ def estimate_noise_density(t: Array, x: Array) -> float:
     while m * period <= 0.5 and len(x) // m > 4:
         means = x[: len(x) // m * m].reshape(-1, m, x.shape[1]).mean(1)
         squares = 0.5 * np.diff(means, axis=0) ** 2
-        n = max(round(_QUIET / (m * period)), 4)
+        n = max(round(_QUIET_SPAN / (m * period)), 4)
         windows = squares[: len(squares) // n * n].reshape(-1, n, x.shape[1])
         if len(windows):
             variance = np.percentile(windows.mean(1), (10, 50), axis=0).mean(1)

@@ -1,4 +1,4 @@
-"""One log of a draft: which sensors it holds, and its numbers."""
+"""One log of a draft: its sensors and its numbers."""
 
 from __future__ import annotations
 
@@ -49,28 +49,28 @@ WANTED = {
     "odometer": ("t", "speed", *WHEELS),
     "gravity": ("t", "pull_x", "pull_y", "pull_z"),
 }
-_PAUSES = 1000.0  # times as long as all of its rows together a log may last
-_NEEDED = {"gnss": 4, "odometer": 2}  # of those, how many must be there in a row
+_PAUSES = 1000.0  # ratio of a log's duration to that of all its rows together, at most
+_NEEDED = {"gnss": 4, "odometer": 2}  # number of these that a row must have
 
 
 @dataclass(eq=False)
 class Source:
-    """One sensor's log: columns by our names in the file's units, or the log of a program that is known."""
+    """One sensor's log: columns by our names in the file's units, or the log of a known program."""
 
     path: Path
     columns: matching.Columns = field(default_factory=lambda: matching.Columns({}))
     values: dict[str, Array] = field(default_factory=dict)
     log: Log | None = None
     t_unit: Guess = field(default_factory=lambda: Guess("s", ""))
-    joined_from: tuple[Path, Path] | None = None  # a gyro's and an accelerometer's file, whose rows are put together
-    plain: Plain | None = None  # a table that is no CSV file of numbers, of which one is made
+    joined_from: tuple[Path, Path] | None = None  # files of a gyro and an accelerometer, whose rows are combined
+    plain: Plain | None = None  # a table that is not a CSV file of numbers, which is converted into one
 
     def __len__(self) -> int:
         return len(self.values["t"]) if self.log is None else len(next(s.t for s in self.held))
 
     @property
     def held(self) -> list[Imu | Gnss | Odometer]:
-        """The sensors of the log of a program that is known."""
+        """The sensors in the log of a known program."""
         log = self.log
         return [] if log is None else [s for s in (log.gnss, log.imu, log.odometer) if s is not None]
 
@@ -103,7 +103,7 @@ class Source:
 
 
 class NoSensorError(RecordingError):
-    """A file that holds no sensor that is known."""
+    """A file without a known sensor."""
 
 
 def read_log(path: Path, topics: Sequence[str] = ()) -> dict[str, Source]:
@@ -140,7 +140,7 @@ def read_log(path: Path, topics: Sequence[str] = ()) -> dict[str, Source]:
 
 
 def _read_stamps(cells: list[str]) -> Array | None:
-    """Stamps that rise with every row, as numbers; None where these are none."""
+    """Increasing stamps as numbers; None where these are none."""
     try:
         t = np.array([float(cell) for cell in cells])
     except ValueError:
@@ -149,7 +149,7 @@ def _read_stamps(cells: list[str]) -> Array | None:
 
 
 def _add_clock(path: Path, header: list[str], columns: matching.Columns) -> matching.Columns:
-    """The columns with the one of times that dates the rows, if one of several does, else with one of numbers."""
+    """The columns with the time column that dates the rows, if one of several does, else with a numerical one."""
     several = matching.find_clocks(header)
     if len(several) < 2:
         return columns
@@ -169,7 +169,7 @@ def _add_clock(path: Path, header: list[str], columns: matching.Columns) -> matc
 
 
 def _read_numbers(path: Path, name: str, plain: Plain | None) -> bool:
-    """Whether a column holds numbers and blanks alone."""
+    """Whether a column holds only numbers and blanks."""
     if plain is not None:
         return name in plain.columns
     try:
@@ -179,7 +179,7 @@ def _read_numbers(path: Path, name: str, plain: Plain | None) -> bool:
 
 
 def _read(path: Path, columns: matching.Columns, role: str, plain: Plain | None) -> Source:
-    """The columns of one sensor, rows that hold all it needs, in order of time."""
+    """The columns of one sensor: rows complete in what it needs, in order of time."""
     wanted = WANTED[role]
     names = {ours: theirs for ours, theirs in columns.names.items() if ours in wanted}
     for extra in ("type", "satellites"):

@@ -1,12 +1,12 @@
-"""Two sensors that saw the same motion: how far apart their clocks are, in what unit, and which way is forward.
+"""Two sensors of the same motion: clock offset, unit, and forward direction.
 
-The turn rate about up, of the gyro and of the course over ground, is the same signal whatever the mount: the slope of
-one over the other is the gyro's unit, and where their clocks have nothing in common, the best agreement finds the
-shift roughly. Not finely: ahead of the rear axle the course turns before the body does, by the distance over the speed.
+The turn rate about up, of the gyro and of the course over ground, is the same signal whatever the mount: the ratio of
+the two is the gyro's unit and, for unrelated clocks, the best agreement gives a rough offset. It is not precise: ahead
+of the rear axle the course turns before the body does, by the distance over the speed.
 
-The accelerations along and across the course are those that the accelerometer felt in its own horizontal plane, turned
-by the angle of the mount: planar vectors as complex numbers, least squares, at the shift of the clocks where they agree
-best.
+The accelerations along and across the course are those that the accelerometer measured in its own horizontal plane,
+rotated by the angle of the mount: planar vectors as complex numbers, least squares, at the clock offset of best
+agreement.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from graphnav.core.rotation import Array
 
 STEP = 0.1  # s, of the common grid
 _MEAN_OVER = 1.0  # s, of the moving mean over everything
-_SLOW = 3.0  # m/s; slower than this a course means little
-_FEWEST, _TRIMS = 50, 3
-NEAR = 3.0  # s, how far apart clocks are looked for that already overlap
+_LEAST_SPEED = 3.0  # m/s; below, a course is undefined
+_FEWEST_SAMPLES, _TRIMS = 50, 3
+NEAR = 3.0  # s, range of the offset of clocks that overlap already
 
 
 @dataclass(frozen=True)
@@ -38,10 +38,10 @@ class Course:
 
 @dataclass(frozen=True)
 class Lag:
-    """How late the second signal is (s), the correlation there, and the slope of the first over the second."""
+    """Delay of the second signal (s), the correlation there, and the slope of the first over the second."""
 
     seconds: float
-    correlation: float  # the size of it, for planar vectors
+    correlation: float  # its magnitude, for planar vectors
     slope: complex
 
 
@@ -60,12 +60,12 @@ def compute_course(t: Array, llh: Array, v: Array | None) -> Course:
         t, v = t[known], v[known]
         grid = np.arange(t[0], t[-1], STEP)
         east, north = (compute_moving_mean(np.interp(grid, t, v[:, k])) for k in (0, 1))
-    # nothing is known inside gaps, nor where the means reach into them or over an end
+    # unknown inside gaps, and where the means extend into them or beyond an end
     gap = compute_moving_mean(_mask_gaps(grid, t).astype(float), 4.0 * _MEAN_OVER) > 0.0
     gap |= (grid < grid[0] + 2.0 * _MEAN_OVER) | (grid > grid[-1] - 2.0 * _MEAN_OVER)
     speed = np.hypot(east, north)
     ae, an = np.gradient(east, STEP), np.gradient(north, STEP)
-    slow = (speed < _SLOW) | gap
+    slow = (speed < _LEAST_SPEED) | gap
     safe = np.where(slow, np.inf, speed)
     forward, left = (east * ae + north * an) / safe, (east * an - north * ae) / safe
     turn = left / safe
@@ -96,9 +96,10 @@ def compute_moving_mean(x: Array, window: float = _MEAN_OVER) -> Array:
 
 
 def find_lag(t: Array, x: Array, u: Array, y: Array, weight: Array | None = None, anywhere: bool = False) -> Lag | None:
-    """How late `y` at `u` is behind `x` at `t` (both on grids of `STEP`), where they agree best; None without a hint.
+    """Delay of `y` at `u` behind `x` at `t` (both on grids of `STEP`) at the best agreement; None without one.
 
-    Real signals, or planar vectors as complex numbers, whose `Lag.slope` then says how far `x` is turned from `y`.
+    Real signals, or planar vectors as complex numbers, whose `Lag.slope` then gives the rotation of `x` against `y`.
+    Outlying samples of `y` at the best lag are left out, and the search is repeated.
 
     Samples of `y` that fit by far the worst at the best lag are left out, and the best looked for again.
 
@@ -138,7 +139,7 @@ def find_lag(t: Array, x: Array, u: Array, y: Array, weight: Array | None = None
 
 
 def filter_band(x: Array) -> Array:
-    """Smoothed over a second and without what is slower than ten, which slopes of the road would enter."""
+    """Smoothed over a second, without changes slower than ten seconds, which slopes of the road would enter."""
     known = np.isfinite(x)
     filled = np.where(known, x, 0.0)
     weight = compute_moving_mean(known.astype(float), 10.0)
@@ -161,13 +162,13 @@ def _resample_evenly(t: Array, x: Array) -> Array:
 
 
 def _pair_samples(a: Array, b: Array, w: Array, shift: int) -> tuple[Array, Array, Array, Array]:
-    """a[k], b[k + shift] and its weight where all are known, without their weighted means; and which of b they are."""
+    """a[k], b[k + shift] and its weight where all are known, minus their weighted means; and which of b they are."""
     lo, hi = max(0, -shift), min(len(a), len(b) - shift)
-    if hi - lo < _FEWEST:
+    if hi - lo < _FEWEST_SAMPLES:
         return np.empty(0), np.empty(0), np.empty(0), np.empty(0, int)
     x, y, v = a[lo:hi], b[lo + shift : hi + shift], w[lo + shift : hi + shift]
     ok = np.flatnonzero(np.isfinite(x) & np.isfinite(y) & (v > 0))
-    if len(ok) < _FEWEST:
+    if len(ok) < _FEWEST_SAMPLES:
         return np.empty(0), np.empty(0), np.empty(0), np.empty(0, int)
     x, y, v = x[ok], y[ok], v[ok] / v[ok].sum()
     return x - v @ x, y - v @ y, v, ok + lo + shift
@@ -188,7 +189,7 @@ def _list_lags(a: Array, b: Array, w: Array, shifts: Array) -> tuple[Array, Arra
 
 
 def _trim(a: Array, b: Array, w: Array, shift: int, slope: complex) -> Array:
-    """b without the samples that fit worst at a shift: beyond four robust sigmas of the weighted residuals."""
+    """b without the outlying samples at a shift: those beyond four robust sigmas of the weighted residuals."""
     x, y, v, at = _pair_samples(a, b, w, shift)
     factor = slope if np.iscomplexobj(y) else slope.real
     residual = np.abs((x - factor * y) * np.sqrt(v))
@@ -198,7 +199,7 @@ def _trim(a: Array, b: Array, w: Array, shift: int, slope: complex) -> Array:
 
 
 def _list_all_lags(a: Array, b: Array, w: Array) -> tuple[Array, Array, Array]:
-    """The same for every shift, by FFT, unknown samples as zero; only where half of the shorter overlaps."""
+    """Correlations at every shift, by FFT, unknown samples as zero; only where half of the shorter signal overlaps."""
     wa, wb = np.isfinite(a).astype(float), np.where(np.isfinite(b), w, 0.0)
     a, b = np.nan_to_num(a), np.nan_to_num(b)
     n = 1 << int(np.ceil(np.log2(len(a) + len(b))))
@@ -215,6 +216,6 @@ def _list_all_lags(a: Array, b: Array, w: Array) -> tuple[Array, Array, Array]:
 
 
 def _mask_gaps(grid: Array, t: Array) -> Array:
-    """Grid times inside or next to a gap of more than two seconds."""
+    """Grid times inside or adjacent to a gap of more than two seconds."""
     k = np.clip(np.searchsorted(t, grid), 1, len(t) - 1)
     return np.asarray(t[k] - t[k - 1] > 2.0)

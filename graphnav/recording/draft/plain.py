@@ -1,4 +1,4 @@
-"""Tables that are no CSV of numbers: other separators, decimal commas, lines above the header, dates, times of day."""
+"""Tables other than CSV of numbers: other separators, decimal commas, lines above the header, dates, times of day."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ from graphnav.core.rotation import Array
 from graphnav.recording.draft.columns import UNITS, match_columns, split_unit
 
 DAY = 86400.0  # s
-_START = 1 << 16  # bytes, in which the header is
+_START = 1 << 16  # bytes that contain the header
 _MARKS = {"\t": "a tab", ";": "a semicolon", ",": "a comma", "|": "a bar", None: "blanks"}
 _COMMENT = re.compile(r"\s*(?:#|%|//)+\s?")
 _DAY_FIRST = re.compile(r"(\d{1,2})\.(\d{1,2})\.(\d{4})(.*)")  # 08.07.2025
 _YEAR_FIRST = re.compile(r"(\d{4})[-/.](\d{1,2})[-/.](\d{1,2})(.*)")  # 2025-07-08
-_SLASHES = re.compile(r"(\d{1,2})/(\d{1,2})/(\d{4})(.*)")  # 07/08/2025, of which one number may tell the month
+_SLASHES = re.compile(r"(\d{1,2})/(\d{1,2})/(\d{4})(.*)")  # 07/08/2025, where one number may identify the month
 _CLOCK = re.compile(r"(\d{1,2}):(\d{2}):(\d{2})(?:[.,:](\d{1,9}))?\s*([AaPp][Mm])?")
 
-Lines = list[tuple[int, str]]  # number in the file, from 1, and text
+Lines = list[tuple[int, str]]  # line number in the file, from 1, and text
 
 
 @dataclass(frozen=True)
 class Plain:
-    """The columns of a table as numbers, by the file's names, and in words what was done to them."""
+    """The columns of a table as numbers, by the file's names, and notes on the conversion."""
 
     columns: dict[str, Array]
     words: str
@@ -40,17 +40,17 @@ class Plain:
 
 @dataclass(frozen=True)
 class _Layout:
-    """How a table is written."""
+    """The layout of a table."""
 
     mark: str | None  # between fields; None for blanks
     names: list[str]
     above: list[str]  # lines before the header
-    first: int  # where rows begin, among the lines
-    done: list[str] = field(default_factory=list)  # what a CSV file does not have
+    first: int  # index of the first row among the lines
+    done: list[str] = field(default_factory=list)  # notes on deviations from a CSV file
 
 
 def read_plain(path: Path) -> Plain | None:
-    """A table whose fields, numbers or times are written in another way than a CSV file's; None if they are not.
+    """Read a table whose fields, numbers or times are written differently from a CSV file's; None for a CSV file.
 
     Parameters
     ----------
@@ -71,7 +71,7 @@ def read_plain(path: Path) -> Plain | None:
         start = raw.read(_START)
     if path.suffix == ".gz" or b"\0" in start:
         return None
-    # cut off amid a line, most likely
+    # most likely cut off within a line
     begin, _ = _decode(start.rpartition(b"\n")[0] if len(start) == _START else start)
     layout = _lay_out(path, _read_lines(begin.splitlines()))
     if layout is None:
@@ -103,7 +103,7 @@ def read_plain(path: Path) -> Plain | None:
 def read_clock_seconds(t: Array) -> Array | None:
     """Seconds since midnight of times of day written as one number, hhmmss.ss; None where these are none.
 
-    They are where no stamp has more than 59 minutes or seconds, and 40 s are missing between every two minutes.
+    They are where no stamp has more than 59 minutes or seconds, and 40 s are missing between successive minutes.
     """
     hours, minutes, seconds = t // 10_000, t // 100 % 100, t % 100
     if not ((t >= 0.0) & (t < 240_000.0) & (minutes < 60.0) & (seconds < 60.0)).all():
@@ -116,7 +116,7 @@ def read_clock_seconds(t: Array) -> Array | None:
 
 
 def _decode(data: bytes) -> tuple[str, list[str]]:
-    """Text, and in words its encoding where it is not UTF-8."""
+    """The text, and its encoding in words where it is not UTF-8."""
     try:
         return data.decode("utf-8-sig"), []
     except UnicodeDecodeError:
@@ -124,7 +124,7 @@ def _decode(data: bytes) -> tuple[str, list[str]]:
 
 
 def _read_lines(text: Sequence[str]) -> Lines:
-    """Numbers and text of the lines that hold something; after the first row without comments."""
+    """Numbers and text of non-empty lines; after the first row without comments."""
     lines = [(k, line) for k, line in enumerate(text, 1) if line.strip()]
     first = _find_first_row(lines)
     return [(k, line) for i, (k, line) in enumerate(lines) if i <= (first or 0) or line.lstrip()[0] != "#"]
@@ -139,7 +139,7 @@ def _split(line: str, mark: str | None) -> list[str]:
 
 
 def _read_values(line: str, mark: str | None) -> tuple[float, int]:
-    """Which share of the fields of a line are numbers, dates or times of day, and how many."""
+    """The share of a line's fields that are numbers, dates or times of day, and the number of fields."""
     cells = _split(line, mark)
     count = sum(_is_value(cell) for cell in cells)
     return count / max(sum(cell != "" for cell in cells), 1), count
@@ -154,7 +154,7 @@ def _is_value(cell: str) -> bool:
 
 
 def _find_first_row(lines: Lines) -> int | None:
-    """Where two lines follow each other that are rows of one table."""
+    """Index of the first of two consecutive lines that are rows of one table."""
     for k in range(len(lines) - 1):
         if _find_mark([line for _, line in lines[k : k + 2]]) != "":
             return k
@@ -162,7 +162,7 @@ def _find_first_row(lines: Lines) -> int | None:
 
 
 def _find_mark(rows: Sequence[str]) -> str | None:
-    """What stands between the fields of rows; "" where they are none: two fields and half of them are values."""
+    """The separator of the fields of rows; "" where they are none: at least two fields, half of them values."""
     found = []
     for mark in _MARKS:
         some = [_read_values(row, mark) for row in rows]
@@ -175,7 +175,7 @@ def _find_mark(rows: Sequence[str]) -> str | None:
 
 
 def _lay_out(path: Path, lines: Lines) -> _Layout | None:
-    """How a table is written; None where it is a CSV file or no table with a header."""
+    """The layout of a table; None for a CSV file or no table with a header."""
     first = _find_first_row(lines)
     if not first:  # none, or no line before it
         return None
@@ -186,7 +186,7 @@ def _lay_out(path: Path, lines: Lines) -> _Layout | None:
     if len(two) == 2 and len(two[0]) == len(two[1]) == len(row) and _are_units(two[1]):
         head, units = first - 2, two[1]
     names = _split(_COMMENT.sub("", lines[head][1]), mark)
-    if mark is None and len(names) > len(row):  # names of several words stand farther apart
+    if mark is None and len(names) > len(row):  # names of several words are separated by wider gaps
         names = re.split(r"\s{2,}", _COMMENT.sub("", lines[head][1]).strip())
     commented = _COMMENT.match(lines[head][1])
     if len(names) == len(row) - 1 and _parse_date(row[0]) and _parse_clock(row[1]) is not None:
@@ -217,7 +217,7 @@ def _are_units(cells: Sequence[str]) -> bool:
 
 
 def _parse_numbers(cells: Sequence[str]) -> Array | None:
-    """A column as numbers, NaN where blank; None where it holds anything else."""
+    """A column as numbers, NaN where blank; None where it contains anything else."""
     try:
         return np.array([parse_number(c.replace(",", ".")) if c else np.nan for c in cells])
     except ValueError:
@@ -227,9 +227,9 @@ def _parse_numbers(cells: Sequence[str]) -> Array | None:
 def _parse_times(
     cells: dict[str, list[str]], columns: dict[str, Array], above: Sequence[str]
 ) -> tuple[str | None, str | None, list[str]]:
-    """Turns a column of dates, or one of times of day, into s; which is dated, which is daily, and words about it.
+    """Convert a column of dates, or one of times of day, to s; returns which is dated, which is daily, and notes.
 
-    Dates alone stand in a column beside times of day, or in a line above the header.
+    Dates alone may stand in a column beside times of day, or in a line above the header.
     """
     words = {name: some for name, some in cells.items() if name not in columns and any(some)}
     notes = []
@@ -268,7 +268,7 @@ def _parse_times(
 
 
 def _put_year_first(cells: list[str]) -> tuple[list[str], str]:
-    """Dates with slashes with the year first; where nothing tells the day from the month, their times of day."""
+    """Dates with slashes rewritten year first; only their times of day where day and month are ambiguous."""
     parts = [found.groups() for cell in cells if (found := _SLASHES.fullmatch(cell))]
     day_first, month_first = (any(int(part[k]) > 12 for part in parts) for k in (0, 1))
     if day_first != month_first:

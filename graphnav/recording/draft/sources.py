@@ -1,4 +1,4 @@
-"""The logs that a draft is made of: of several the one to use, and those that belong together joined."""
+"""The logs of a draft: selection among several of one sensor, and combination of those that belong together."""
 
 from __future__ import annotations
 
@@ -20,21 +20,21 @@ from graphnav.recording.formats import formats
 from graphnav.recording.formats.schema import SPEED
 from graphnav.sensors.tables import ANGLE
 
-JOINED = "joined_imu.csv.gz"  # the file that is made of a gyro's and an accelerometer's; no name that logs have
+JOINED = "joined_imu.csv.gz"  # the file combined from a gyro's and an accelerometer's; no log has this name
 
-_TABLES = (".csv", ".csv.gz", ".txt", ".tsv", ".dat", ".asc", ".log")  # of a folder these are looked at
+_TABLES = (".csv", ".csv.gz", ".txt", ".tsv", ".dat", ".asc", ".log")  # files of a folder that are considered
 
 
 @dataclass
 class LogsFound:
-    """What logs hold, by sensor, and in words which of them are left out."""
+    """The contents of logs, by sensor, and notes on those left out."""
 
     sensors: dict[str, Source]
     left_out: list[str]
 
 
 def find_logs(paths: Sequence[Path], topics: Sequence[str] = ()) -> LogsFound:
-    """What the logs hold, by sensor; of a folder all that is in it. What is no sensor's log is left out.
+    """The contents of logs by sensor; of a folder all that is in it. Files without sensor data are left out.
 
     Raises
     ------
@@ -46,7 +46,7 @@ def find_logs(paths: Sequence[Path], topics: Sequence[str] = ()) -> LogsFound:
     every: dict[str, list[Source]] = {}
     left: list[str] = []
     nothing: list[str] = []
-    refused: list[str] = []  # why some are no tables
+    refused: list[str] = []  # reasons why some are no tables
     for path in files:
         try:
             found = read_log(path, topics)
@@ -86,7 +86,7 @@ def find_logs(paths: Sequence[Path], topics: Sequence[str] = ()) -> LogsFound:
 
 
 def _date_times_of_day(sensors: dict[str, Source]) -> None:
-    """Times of day become those of the date of another log, if one has dates."""
+    """Times of day get the date of another log, if one has dates."""
     dates = {s.path: unix for s in sensors.values() if (unix := _find_unix_start(s)) is not None}
     for source in sensors.values():
         if dates and source.plain is not None and source.plain.daily == source.columns.names["t"]:
@@ -98,7 +98,7 @@ def _date_times_of_day(sensors: dict[str, Source]) -> None:
 
 
 def _find_unix_start(source: Source) -> float | None:
-    """Unix time of the first row of a log that knows its date, s."""
+    """Unix time of the first row of a log with a known date, s."""
     if source.log is None:
         return float(source.t[0]) if guesses.is_date(source.t) else None
     begin = next(sensor.t[0] for sensor in source.held)
@@ -106,11 +106,11 @@ def _find_unix_start(source: Source) -> float | None:
 
 
 def _list_files(path: Path) -> list[Path]:
-    """A log by itself, or those in a folder that is none."""
+    """A log by itself, or those in a folder that is not a log itself."""
     if not path.is_dir() or any(known.load is not None and known.recognises(path) for known in formats().values()):
         return [path]
     every = [p for p in path.iterdir() if not p.name.startswith(".")]
-    made = {JOINED, "recording.toml"}  # by an earlier draft
+    made = {JOINED, "recording.toml"}  # written by an earlier draft
     made |= {name_plain_file(p, sensor) for p in every for sensor in WANTED}
     inside = sorted(p for p in every if p.name not in made)
     logs = [p for p in inside if p.name.lower().endswith(_TABLES) or _is_known(p)]
@@ -122,7 +122,7 @@ def _list_files(path: Path) -> list[Path]:
 
 
 def name_plain_file(path: Path, sensor: str) -> str:
-    """The CSV file that is made of a sensor's part of a table that is none."""
+    """The CSV file for a sensor's part of a table of another form."""
     return f"{path.stem}-{sensor}.csv.gz"
 
 
@@ -133,7 +133,7 @@ def _is_known(path: Path) -> bool:
 
 
 def _choose(sensor: str, some: list[Source], left: list[str]) -> Source | None:
-    """The log to use of several of one sensor; what is left out, and why, is put into words."""
+    """The log to use of several of one sensor; the others are noted with the reason."""
     if sensor == "accel":
         with_gravity = [s for s in some if _has_gravity(s)]
         if len(with_gravity) < len(some) and with_gravity:
@@ -146,10 +146,10 @@ def _choose(sensor: str, some: list[Source], left: list[str]) -> Source | None:
         raise RecordingError(
             f"{some[1].path}: a second imu, after {some[0].path}; name only one of them", key="draft.two_imus"
         )
-    # what the system has not corrected yet comes second: it is the same, in other units on some phones
+    # uncorrected readings come second: they are the same, in other units on some phones
     best = min(some, key=lambda s: ("uncalibrated" in s.path.name.lower(), -len(s)))
     if sensor == "odometer":
-        best = some[0]  # the speed of a receiver beside a wheel's
+        best = some[0]  # a receiver's speed beside a wheel's
     others = [s.path.name for s in some if s is not best and s.path != best.path]
     if others:
         left.append(f"{', '.join(others)}: a second {sensor}, beside {best.path.name}")
@@ -165,7 +165,7 @@ def _has_gravity(source: Source) -> bool:
 
 
 def _add_gravity(accel: Source, gravity: Source, left: list[str]) -> Source:
-    """Accelerations without gravity and the gravity that a phone took out of them, put together again."""
+    """Accelerations without gravity plus the gravity that the phone subtracted."""
     values = {"t": accel.values["t"]}
     for x in "xyz":
         pull = np.interp(accel.t, gravity.t, gravity.values[f"pull_{x}"])
@@ -177,7 +177,7 @@ def _add_gravity(accel: Source, gravity: Source, left: list[str]) -> Source:
 
 
 def _join_imu(gyro: Source, accel: Source) -> Source:
-    """One IMU of two files, as phones write them: the forces interpolated to the times of the rates, in s."""
+    """One IMU from two files, as phones write them: forces interpolated to the times of the rates, in s."""
     t, at = gyro.t, accel.t
     inside = (t >= at[0]) & (t <= at[-1])
     if inside.sum() < 2:

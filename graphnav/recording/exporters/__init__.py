@@ -1,6 +1,6 @@
-"""One module per output format, each with ``writing(path, name)``: a file that trajectories are added to in blocks.
+"""One module per output format, each with ``writing(path, name)``: a file to which trajectories are added in blocks.
 
-`write_all` writes what every run leaves, `write_as` one format by name, `write_parts` any of them in one go.
+`write_all` writes the formats of every run, `write_as` one format by name, `write_parts` any of them in one pass.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from graphnav.core.errors import RecordingError
 from graphnav.core.rotation import Array
 from graphnav.core.trajectory import Trajectory
 
-NAMES = ("csv", "tum", "kml", "gpx", "nav", "nmea", "parquet")  # which are the suffixes of the files too
+NAMES = ("csv", "tum", "kml", "gpx", "nav", "nmea", "parquet")  # which are also the file suffixes
 
 
 class Add(Protocol):
@@ -29,12 +29,12 @@ class Add(Protocol):
 
 
 def write_all(blocks: Trajectory | Iterable[Trajectory], folder: Path, name: str | None = None) -> None:
-    """Write trajectory.csv, trajectory.kml and trajectory.tum into `folder`, which is made if need be.
+    """Write trajectory.csv, trajectory.kml and trajectory.tum into `folder`, which is created if need be.
 
     Parameters
     ----------
-    blocks : a trajectory, or its parts one behind the other: only one of them need be in memory.
-    name : that the files say; the trajectory's own if None.
+    blocks : a trajectory, or its successive parts, only one of which need be in memory.
+    name : name in the files; the trajectory's own if None.
 
     Raises
     ------
@@ -54,18 +54,18 @@ def write_parts(
     name: str = "",
     utc: Callable[[Array], Array] | None = None,
 ) -> None:
-    """Write the parts of a trajectory, one behind the other, in some formats at once, each to its path.
+    """Write the successive parts of a trajectory in several formats at once, each to its path.
 
     Parameters
     ----------
-    utc : of times of the trajectory, where the clock is known.
+    utc : function that converts times of the trajectory to UTC, where the clock is known.
 
     Raises
     ------
     RecordingError
         If a format cannot hold this trajectory.
     """
-    # under another name until all is there: what cannot be written leaves what was there before
+    # under a temporary name until it is complete: a failure leaves the earlier file
     parts = {path: path.with_name(f".{path.name}.part") for path in map(Path, targets.values())}
     try:
         with ExitStack() as stack:
@@ -90,12 +90,12 @@ def write_parts(
 
 
 def check_names(names: Sequence[str], gps_zero: float | None) -> None:
-    """Refuse formats that a recording cannot be written in, before it is solved; `gps_zero` as `Recording` has it.
+    """Refuse, before solving, formats that a recording cannot be written in; `gps_zero` as in `Recording`.
 
     Raises
     ------
     RecordingError
-        Saying what is missing.
+        If a format needs what the recording does not have.
     """
     if "nmea" in names and gps_zero is None:
         raise RecordingError(
@@ -114,11 +114,11 @@ def write_as(name: str, trajectory: Trajectory, path: Path, utc: Array | None = 
     Parameters
     ----------
     name
-        Of the format.
+        Name of the format.
     trajectory
-        What to write.
+        The trajectory.
     path
-        The file, replaced if it is there.
+        The file, replaced if it exists.
     utc
         (K,) datetime64, where the clock is known.
 
@@ -131,7 +131,7 @@ def write_as(name: str, trajectory: Trajectory, path: Path, utc: Array | None = 
 
 
 def require_geodetic(trajectory: Trajectory, path: Path) -> None:
-    """Refuse a trajectory whose place on Earth is not known."""
+    """Refuse a trajectory without a place on the Earth."""
     if trajectory.frame != "geodetic":
         raise RecordingError(
             f"{path}: a trajectory in a local frame has no latitude and longitude; write it as .tum",

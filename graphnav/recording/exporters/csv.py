@@ -21,7 +21,7 @@ HEADER = (
 
 @contextmanager
 def writing(path: Path, name: str = "") -> Iterator[Add]:
-    """A file that trajectories are added to, one behind the other; digits as in `rows`."""
+    """A file to which successive trajectories are added; digits as in `rows`."""
     with path.open("wb") as file:
         file.write(HEADER.encode() + b"\n")
 
@@ -33,16 +33,16 @@ def writing(path: Path, name: str = "") -> Iterator[Add]:
 
 
 def rows(trajectory: Trajectory) -> str:
-    """The rows of `trajectory`, a line each.
+    """The lines of `trajectory`.
 
-    Digits: a microsecond, a micrometre on the ground (1e-11 deg), 0.01 mm in height, 0.01 mm/s, 1e-7 deg;
-    sigmas and biases six significant.
+    Digits: a microsecond, a micrometre on the ground (1e-11 deg), 0.01 mm in height, 0.01 mm/s, 1e-7 deg; sigmas and
+    biases six significant.
     """
     return _write_rows(trajectory).decode("ascii")
 
 
 def columns(trajectory: Trajectory) -> list[tuple[Array | None, str]]:
-    """The columns of the file in its units, (K, n) each or None for three blanks, and the format of their numbers."""
+    """The columns in the file's units, (K, n) each or None for three blanks, and their number formats."""
     deg = np.rad2deg(1.0)
 
     def apply_scale(values: Array | None, scale: float = 1.0) -> Array | None:

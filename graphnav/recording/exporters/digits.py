@@ -1,7 +1,7 @@
 """Tables as text with the digits that C's ``%.kf`` and ``%.6g`` give.
 
-Few rows go through ``%``. Many go through `graphnav.recording.exporters.rows` where that is compiled, twenty times as
-quickly; what it is not sure of goes through ``%`` again. The text is the same to the byte.
+Few rows are formatted with ``%``. Many are formatted by `graphnav.recording.exporters.rows` where that is compiled,
+twenty times as fast; rows it cannot decide are formatted with ``%`` again. The text is identical to the byte.
 """
 
 from __future__ import annotations
@@ -15,22 +15,22 @@ import numpy as np
 from graphnav.core.compiled import can_compile
 from graphnav.core.rotation import Array
 
-GENERAL, WORD = -1, -2  # kinds of fields: %.6g and %s; others are the places of %.kf
+GENERAL, WORD = -1, -2  # kinds of fields: %.6g and %s; others are the decimals of %.kf
 _FIELD = re.compile(r"%(?:\.(\d+)(f|g)|d|s)")
 _MOST_PLACES = 11  # for which 10^k 2^-53 is far below a half
 _WIDEST = 28  # bytes of a number: a sign, 15 digits, a point and eleven more
-_ROWS = 512  # at once: their text stays in the processor's cache
+_ROWS_AT_ONCE = 512  # rows at once: their text stays in the processor's cache
 _COMPILED = "graphnav.recording.exporters.rows"
-_FEW, _SOME, _MANY = 500, 20_000, 2_000_000  # numbers worth calling compiled code, loading it, and Numba for it
+_FEW, _SOME, _MANY = 500, 20_000, 2_000_000  # numbers above which loading and calling compiled code pays off
 
 
 def rows_text(table: Array, row_format: str) -> str:
-    """The rows of `table` (K, n) through one ``%`` format with n places, a line each; NaN becomes blank."""
+    """The rows of `table` (K, n) in one ``%`` format with n fields, one line each; NaN becomes blank."""
     return rows_bytes(table, row_format).decode("ascii")
 
 
 def rows_bytes(table: Array, row_format: str, last: Array | None = None) -> bytes:
-    """The same in ASCII.
+    """The same as ASCII bytes.
 
     Parameters
     ----------
@@ -43,8 +43,8 @@ def rows_bytes(table: Array, row_format: str, last: Array | None = None) -> byte
     least = _FEW if _COMPILED in sys.modules else _SOME if "numba" in sys.modules else _MANY
     if table.size >= least and None not in _list_kinds(form) and can_compile():
         return b"".join(
-            _write_compiled(table[k : k + _ROWS], form, None if last is None else last[k : k + _ROWS])
-            for k in range(0, len(table), _ROWS)
+            _write_compiled(table[k : k + _ROWS_AT_ONCE], form, None if last is None else last[k : k + _ROWS_AT_ONCE])
+            for k in range(0, len(table), _ROWS_AT_ONCE)
         )
     return _write_plainly(table, form, last)
 
@@ -59,13 +59,13 @@ def _write_plainly(table: Array, form: str, last: Array | None) -> bytes:
 
 
 def _write_compiled(table: Array, form: str, last: Array | None) -> bytes:
-    from graphnav.recording.exporters import rows  # and Numba with it
+    from graphnav.recording.exporters import rows  # which imports Numba
 
     kinds = np.array(_list_kinds(form))
     whole = [k for k, one in enumerate(_FIELD.finditer(form)) if one[0] == "%d"]
     if whole:
         table = table.copy()
-        table[:, whole] = np.trunc(table[:, whole]) + 0.0  # %d knows no negative zero
+        table[:, whole] = np.trunc(table[:, whole]) + 0.0  # %d has no negative zero
     between = _FIELD.split(form)[:: _FIELD.groups + 1]
     literal = np.frombuffer("".join(between).encode("ascii"), np.uint8)
     ends = np.cumsum([0, *map(len, between)])
@@ -86,7 +86,9 @@ def _write_compiled(table: Array, form: str, last: Array | None) -> bytes:
 
 @cache
 def _list_kinds(form: str) -> tuple[int | None, ...]:
-    """What `graphnav.recording.exporters.rows` calls the fields of a format, None for those that it does not know."""
+    """The kinds of a format's fields for `graphnav.recording.exporters.rows`, None for a format that it cannot
+    write.
+    """
 
     def kind(one: re.Match[str]) -> int | None:
         if one[2] is None:

@@ -1,8 +1,8 @@
-"""GPX 1.1 (topografix.com/GPX/1/1): one track of every row, for maps, watches and route planners.
+"""GPX 1.1 (topografix.com/GPX/1/1): one track of all rows, for maps, watches and route planners.
 
 The schema's order of elements is kept: ``ele`` before ``time``. Heights are above the ellipsoid, where GPX readers
-expect them above mean sea level: the difference, the geoid's height, needs a model that is not here, and the track's
-description says so.
+expect them above mean sea level: the difference, the geoid's height, needs a model that graphnav does not have, and the
+track's description says so.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _STAMPED = _POINT.replace("</trkpt>", "<time>%sZ</time></trkpt>")
 
 @contextmanager
 def writing(path: Path, name: str = "") -> Iterator[Add]:
-    """A file, with times where UTC is known."""
+    """A GPX file, with times where UTC is known."""
     begun = False
     with path.open("wb") as file:
 

@@ -1,4 +1,4 @@
-"""KML: the path as a line on the ground, its start and its end, for Google Earth and the like."""
+"""KML: the path as a line on the ground, its start and its end, for Google Earth and similar programs."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from graphnav.recording.exporters import Add, require_geodetic
 from graphnav.recording.exporters.digits import rows_text
 
 _MAX_POINTS = 20000
-_SPACING = 0.05  # m, at least
-_SPARE = 16  # times as many are kept until the length of the path is known
+_LEAST_SPACING = 0.05  # m, smallest distance between points
+_SPARE_POINTS = 16  # ratio of the points kept to those wanted, until the length of the path is known
 
-# The line is clamped to the ground: KML heights are above mean sea level and ours above the ellipsoid.
+# The line is clamped to the ground: KML heights are above mean sea level, ours above the ellipsoid.
 _DOCUMENT = """<?xml version="1.0" encoding="UTF-8"?>
 <kml xmlns="http://www.opengis.net/kml/2.2">
 <Document>
@@ -41,7 +41,7 @@ _PLACEMARK = (
 
 @contextmanager
 def writing(path: Path, name: str = "") -> Iterator[Add]:
-    """A file, its path thinned by distance so that stops cost nothing and turns keep their shape."""
+    """A KML file; its path is thinned by distance, so that stops need no points and turns keep their shape."""
     path_so_far = _Thinned()
     with path.open("w", encoding="utf-8") as file:
 
@@ -61,19 +61,19 @@ def writing(path: Path, name: str = "") -> Iterator[Add]:
 
 
 class _Thinned:
-    """Points a near-even distance apart along a path that comes in parts, the first and the last among them.
+    """Points at nearly equal distances along a path that arrives in parts, including the first and the last.
 
-    Kept are a few times as many as are wanted in the end: the distance between them is known only then.
+    More points are kept than are wanted in the end, as their distance is known only then.
     """
 
     def __init__(self) -> None:
         self._frame: LocalFrame | None = None
-        self._kept = np.empty((0, 5))  # t, llh, way so far
-        self._last = np.empty((0, 3))  # where the path is, in metres
+        self._kept = np.empty((0, 5))  # t, llh, distance so far
+        self._last = np.empty((0, 3))  # frame of the path, in metres
         self._end = np.empty(5)
 
     def add(self, block: Trajectory) -> None:
-        """Go on."""
+        """Add a part."""
         self._frame = self._frame or LocalFrame(block.llh[0])
         p = self._frame.from_llh(block.llh)
         steps = np.linalg.norm(np.diff(np.concatenate([self._last if len(self._last) else p[:1], p]), axis=0), axis=1)
@@ -82,12 +82,12 @@ class _Thinned:
         new = np.column_stack([block.t, block.llh, along])
         self._last, self._end = p[-1:], new[-1]
         self._kept = np.concatenate([self._kept, new])
-        if len(self._kept) > _SPARE * _MAX_POINTS:
-            self._kept = self._at_least(self._kept, along[-1] / (_SPARE / 2 * _MAX_POINTS))
+        if len(self._kept) > _SPARE_POINTS * _MAX_POINTS:
+            self._kept = self._at_least(self._kept, along[-1] / (_SPARE_POINTS / 2 * _MAX_POINTS))
 
     def rows(self) -> Array:
-        """Times (s), llh (rad, m) and way (m) of the points, (N, 5)."""
-        kept = self._at_least(self._kept, max(self._end[4] / _MAX_POINTS, _SPACING))
+        """Times (s), llh (rad, m) and distance (m) of the points, (N, 5)."""
+        kept = self._at_least(self._kept, max(self._end[4] / _MAX_POINTS, _LEAST_SPACING))
         return kept if kept[-1, 0] == self._end[0] else np.concatenate([kept, self._end[None]])
 
     @staticmethod

@@ -22,7 +22,9 @@ from graphnav.recording.exporters.digits import rows_bytes
 
 @contextmanager
 def writing(path: Path, name: str = "") -> Iterator[Add]:
-    """A file; without UTC the trajectory's own times are the seconds and the week is 0, as KF-GINS itself writes."""
+    """A .nav file; without UTC the trajectory's own times are the seconds and the week is 0, as KF-GINS itself
+    writes.
+    """
     with path.open("wb") as file:
 
         def add(block: Trajectory, utc: Array | None = None) -> None:

@@ -1,7 +1,7 @@
-"""NMEA 0183: GGA, RMC and, where sigmas are known, GST for every row, as a receiver would have sent them.
+"""NMEA 0183: GGA, RMC and, where sigmas are known, GST for every row, as a receiver would send them.
 
-Fields that a smoothed trajectory cannot fill (satellites, HDOP, geoid) are empty, as the standard allows; the altitude
-field holds the height above the ellipsoid with a geoid separation of 0, so that their sum is right.
+Fields that a smoothed trajectory does not have (satellites, HDOP, geoid) are empty, as the standard permits; the
+altitude field holds the height above the ellipsoid with a geoid separation of 0, so that their sum is right.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _KNOTS = 3600 / 1852
 
 @contextmanager
 def writing(path: Path, name: str = "") -> Iterator[Add]:
-    """A file; every sentence begins with the time of day, so that UTC is needed."""
+    """An NMEA file; every sentence begins with the time of day, so UTC is needed."""
     with path.open("w", encoding="ascii", newline="") as file:
 
         def add(block: Trajectory, utc: Array | None = None) -> None:

@@ -1,4 +1,4 @@
-"""Apache Parquet: the columns of trajectory.csv as doubles with all their digits, a group of rows per block.
+"""Apache Parquet: the columns of trajectory.csv as doubles in full precision, a group of rows per block.
 
 A missing value is null. Units as in trajectory.csv: degrees for angles, SI for the rest.
 """
@@ -21,7 +21,7 @@ from graphnav.recording.exporters.csv import HEADER, columns
 
 @contextmanager
 def writing(path: Path, name: str = "") -> Iterator[Add]:
-    """A file that blocks are added to; `name` is kept in its metadata.
+    """A Parquet file to which blocks are added; `name` is kept in its metadata.
 
     Raises
     ------
@@ -30,7 +30,7 @@ def writing(path: Path, name: str = "") -> Iterator[Add]:
     """
     pa, pq = _import_pyarrow(path)
     schema = pa.schema([(column, pa.float64()) for column in HEADER.split(",")], metadata={"name": name})
-    # bytes of like meaning together pack to about half; a dictionary of doubles that never repeat only costs
+    # splitting bytes by significance halves the size; a dictionary of unique doubles would only cost
     with pq.ParquetWriter(path, schema, compression="zstd", use_dictionary=False, use_byte_stream_split=True) as file:
 
         def add(block: Trajectory, utc: Array | None = None) -> None:

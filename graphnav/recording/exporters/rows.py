@@ -1,8 +1,8 @@
-"""Rows of numbers as text, on arrays alone: compiled where Numba is there, and far slower than ``%`` where not.
+"""Formatting of rows of numbers on arrays alone: compiled with Numba, and far slower than ``%`` without.
 
 A number is split into its whole part and the rest, which is exact, and only the rest times a power of ten is rounded.
-Where that product lies so close to a half that its own rounding could decide, or is not finite, nothing is written and
-the row is the caller's.
+Where that product is so close to a half that its own rounding could decide, or is not finite, nothing is written and
+the row is left to the caller.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from graphnav.core.compiled import compiled
 from graphnav.core.rotation import Array
 from graphnav.recording.exporters.digits import GENERAL, WORD
 
-_ROUNDING = 2.0**-52  # of a product, that may be off by half of that
+_ROUNDING = 2.0**-52  # of a product, which may be off by half of that
 _MOST_WHOLE = 1e15
 _TENS = 10.0 ** np.arange(23)  # exact
 _WHOLE_TENS = 10 ** np.arange(17)
@@ -24,8 +24,8 @@ _MINUS, _POINT, _ZERO, _E = 45, 46, 48, 101
 
 @compiled
 def write_digits(number: int, count: int, out: Array, at: int) -> int:
-    """The last `count` digits of a whole number in `out` from `at` on; where they end."""
-    left = np.uint64(number)  # of signed numbers a division takes twice as long
+    """Write the last `count` digits of a whole number into `out` from `at` on; returns where they end."""
+    left = np.uint64(number)  # division of signed numbers takes twice as long
     for i in range(at + count - 1, at - 1, -1):
         rest = left // _TEN
         out[i] = _DIGITS[left - rest * _TEN]
@@ -35,7 +35,7 @@ def write_digits(number: int, count: int, out: Array, at: int) -> int:
 
 @compiled
 def write_fixed(x: float, places: int, out: Array, at: int) -> int:
-    """``%.kf``; NaN is blank; -1 where it is not settled."""
+    """Write ``%.kf``; NaN is blank; -1 where the rounding is undecided."""
     if np.isnan(x):
         return at
     size = abs(x)
@@ -63,7 +63,7 @@ def write_fixed(x: float, places: int, out: Array, at: int) -> int:
 
 @compiled
 def write_general(x: float, out: Array, at: int) -> int:
-    """``%.6g``; NaN is blank; -1 where it is not settled."""
+    """Write ``%.6g``; NaN is blank; -1 where the rounding is undecided."""
     if np.isnan(x):
         return at
     size = abs(x)
@@ -82,7 +82,7 @@ def write_general(x: float, out: Array, at: int) -> int:
     if np.signbit(x):
         out[at] = _MINUS
         at += 1
-    begin, before = at, 1 if exponent < -4 else exponent + 1  # digits before the point
+    begin, before = at, 1 if exponent < -4 else exponent + 1  # digits before the decimal point
     if before <= 0:
         out[at], out[at + 1] = _ZERO, _POINT
         at = write_digits(0, -before, out, at + 2)
@@ -93,7 +93,7 @@ def write_general(x: float, out: Array, at: int) -> int:
             out[i] = out[i - 1]
         out[at + before] = _POINT
         at += count + 1
-    while out[at - 1] == _ZERO and at > begin + before:  # behind the point
+    while out[at - 1] == _ZERO and at > begin + before:  # after the decimal point
         at -= 1
     if out[at - 1] == _POINT:
         at -= 1
@@ -107,7 +107,8 @@ def write_general(x: float, out: Array, at: int) -> int:
 def write_rows(
     table: Array, row: int, kinds: Array, words: Array, literal: Array, ends: Array, out: Array
 ) -> tuple[int, int]:
-    """Lines in `out` for the rows of a table from `row` on; the first that is not settled, and how many bytes.
+    """Write lines into `out` for the rows of a table from `row` on; returns the first undecided row, and the number of
+    bytes.
 
     Parameters
     ----------

@@ -19,7 +19,9 @@ from graphnav.recording.exporters.digits import rows_bytes
 
 @contextmanager
 def writing(path: Path, name: str = "") -> Iterator[Add]:
-    """A file in metres of the fixed ENU frame at the first point, and the quaternion from body (RFU) to that frame."""
+    """A TUM file in metres of the fixed ENU frame at the first point, and the quaternion from body (RFU) to that
+    frame.
+    """
     frame: LocalFrame | None = None
     with path.open("wb") as file:
 
@@ -36,7 +38,7 @@ def writing(path: Path, name: str = "") -> Iterator[Add]:
             p_n, R_nb = block.llh, R_lb
             if block.frame == "geodetic":
                 p_n = frame.from_llh(block.llh)
-                # Attitudes are kept in the local level of each point; the file has one frame for everything.
+                # attitudes refer to the local level of each point; the file has one frame for all of them
                 R_nb = np.swapaxes(frame.R_ln(p_n), -1, -2) @ R_lb
             q = rotation.to_quaternion(R_nb)
             table = np.column_stack([block.t, p_n, q[:, 1:], q[:, 0]])

@@ -1,4 +1,4 @@
-"""Every log format graphnav reads, one module each; `read` finds the one that fits.
+"""Every log format that graphnav reads, one module each; `read` selects the one that fits.
 
 A new format is a new module in this package with a module-level ``FORMAT = Format(...)``.
 """
@@ -21,7 +21,7 @@ __all__ = ["Format", "Log", "formats", "load", "read"]
 
 
 def formats() -> dict[str, Format]:
-    """Every known format by name; built-in names come first, so that `kitti` never means a folder."""
+    """All known formats by name; built-in names come first, so that `kitti` never means a folder."""
     modules = [importlib.import_module(f"{__name__}.{m.name}") for m in pkgutil.iter_modules(__path__)]
     found = [m.FORMAT for m in modules if isinstance(getattr(m, "FORMAT", None), Format)]
     return {f.name: f for f in sorted(found, key=lambda f: (not f.builtin, f.name))}
@@ -30,18 +30,18 @@ def formats() -> dict[str, Format]:
 def read(
     source: str | Path, topics: Sequence[str] = (), allow_outside: bool = False, name: str | None = None
 ) -> Recording:
-    """A recording from a folder with recording.toml, a .toml of that form, a log of a known kind, or a built-in name.
+    """Read a recording from a folder with recording.toml, such a .toml, a log of a known program, or a built-in name.
 
     Parameters
     ----------
     source
         A path, or a built-in name such as ``kitti``. A folder of that name is ``./kitti``.
     topics
-        Of a ROS bag: those to use, each for the sensor that its type is of; the others are found.
+        For a ROS bag: topics to use, each for the sensor of its type; the others are chosen automatically.
     allow_outside
-        Whether files that are named in it may lie outside its folder.
+        Whether files named in it may lie outside its folder.
     name
-        The format to read it as; found from the content if None.
+        The format; recognised from the content if None.
 
     Returns
     -------
@@ -51,8 +51,7 @@ def read(
     Raises
     ------
     RecordingError
-        If nothing is there, if nothing knows how to read it, or if what is there cannot be used; for a name that no
-        format has.
+        If the source does not exist, is of unknown format, or cannot be used, or if there is no format of that name.
     """
     chosen = _format_of(source, name)
     with permit_outside(allow_outside):
@@ -60,21 +59,21 @@ def read(
 
 
 def load(source: str | Path, name: str | None = None, topics: Sequence[str] = ()) -> Log:
-    """Whatever a source holds, be it a whole recording or one sensor's log.
+    """Read whatever a source contains: a whole recording or one sensor's log.
 
     Parameters
     ----------
     source
         A path, or a built-in name.
     name
-        The format to read it as; found from the content if None.
+        The format; recognised from the content if None.
     topics
         As for `read`.
 
     Returns
     -------
     Log
-        The sensors that are there, in SI units and body axes right-forward-up; None for the others.
+        The sensors in it, in SI units and body axes right-forward-up; None for the others.
 
     Raises
     ------
@@ -94,7 +93,7 @@ def load(source: str | Path, name: str | None = None, topics: Sequence[str] = ()
 
 
 def _format_of(source: str | Path, name: str | None) -> Format:
-    """The format of that name, or the first that knows the source."""
+    """The format of that name, or the first that recognises the source."""
     known = formats()
     if name is not None and name not in known:
         written = set(name.split(",")) <= set(EXPORTED)
@@ -112,7 +111,7 @@ def _format_of(source: str | Path, name: str | None) -> Format:
 
 
 def _choose(chosen: Format, source: str | Path, topics: Sequence[str]) -> Log:
-    """The log with these topics."""
+    """Read the log with these topics."""
     if chosen.choose is None:
         raise RecordingError(
             f"--topic {topics[0]}: {source} is no ROS bag; in a recording.toml say topic in the sensor's table",
@@ -122,7 +121,7 @@ def _choose(chosen: Format, source: str | Path, topics: Sequence[str]) -> Log:
 
 
 def _explain_unknown(source: str | Path, known: dict[str, Format]) -> RecordingError:
-    """Why nothing can read a source."""
+    """The reason why no format reads a source."""
     builtin = ", ".join(name for name, f in known.items() if f.builtin)
     path = Path(source)
     if path.is_dir():

@@ -1,4 +1,4 @@
-"""Sensors from the CSV files of recording.toml: its sections say what the columns are, `rows` holds them."""
+"""Sensors from the CSV files of recording.toml, whose tables describe the columns held in `rows`."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from graphnav.recording.formats.repair import (
     VAGUEST,
     VAGUEST_V,
     Remarks,
+    convert_geodetic,
     fixes_by_type,
-    geodetic,
     horizontal_velocity,
     sigmas,
 )
@@ -27,11 +27,11 @@ from graphnav.recording.formats.table import Table
 from graphnav.sensors import Sensor, Series
 from graphnav.sensors.tables import ANGLE
 
-_AT_ONCE = 1 << 16  # rows
+_ROWS_AT_ONCE = 1 << 16  # rows at once
 
 
 def build_imu(d: schema.ImuTable, rows: Table, remarks: Remarks) -> Imu:
-    """Samples in body axes RFU, rad/s and m/s^2, with the noise figures as stated, else a consumer IMU's."""
+    """Samples in body axes RFU, rad/s and m/s^2, with the stated noise figures, else a consumer IMU's."""
     R_bs = d.R_bs
     gyro = _turn(rows, ("gx", "gy", "gz"), schema.RATE[d.units.gyro], R_bs)
     accel = _turn(rows, ("ax", "ay", "az"), schema.FORCE[d.units.accel], R_bs)
@@ -53,18 +53,18 @@ def build_imu(d: schema.ImuTable, rows: Table, remarks: Remarks) -> Imu:
 
 
 def _turn(rows: Table, names: tuple[str, ...], unit: float, R_bs: Array) -> Array:
-    """(N, 3) columns in body axes, and no longer in the table: of a day of them nothing is held twice."""
+    """Columns (N, 3) in body axes, removed from the table: for a day of rows nothing is held twice."""
     out = np.empty((len(rows), 3))
-    for k in range(0, len(out), _AT_ONCE):
-        some = slice(k, k + _AT_ONCE)
+    for k in range(0, len(out), _ROWS_AT_ONCE):
+        some = slice(k, k + _ROWS_AT_ONCE)
         np.matmul(np.stack([rows[name][some] for name in names], -1) * unit, R_bs.T, out=out[some])
     rows.release(*names)
     return out
 
 
 def build_gnss(d: schema.GnssTable, rows: Table, remarks: Remarks) -> Gnss:
-    """Fixes (rad, m) with their sigmas, without those too vague to say anything; velocities where all axes are told."""
-    llh, rows = geodetic(rows, d.units.angle, schema.HEIGHT[d.units.height], "GNSS", remarks)
+    """Fixes (rad, m) with their sigmas, without those of useless precision; velocities where all axes are given."""
+    llh, rows = convert_geodetic(rows, d.units.angle, schema.HEIGHT[d.units.height], "GNSS", remarks)
     every = np.ones(len(rows), dtype=bool)
     sd = sigmas(rows, ("sd_e", "sd_n", "sd_u"), d.sd, DEFAULT_SD, "GNSS position", every, remarks)
     vague = (sd > VAGUEST).any(axis=1)
@@ -84,7 +84,7 @@ def build_gnss(d: schema.GnssTable, rows: Table, remarks: Remarks) -> Gnss:
     there = [c for c in ("ve", "vn", "vu") if c in rows]
     if len(there) == 3:
         scale = schema.SPEED[d.units.speed]
-        for name in ("sd_ve", "sd_vn", "sd_vu"):  # the file's sigmas have the file's unit, the .toml's are m/s
+        for name in ("sd_ve", "sd_vn", "sd_vu"):  # the file's sigmas have the file's unit, those of the .toml m/s
             rows = rows.with_column(name, rows[name] * scale) if name in rows else rows
         v = rows.stack("ve", "vn", "vu") * scale
         absent = np.isnan(v).any(-1)
@@ -114,7 +114,7 @@ def build_gnss(d: schema.GnssTable, rows: Table, remarks: Remarks) -> Gnss:
 
 
 def build_odometer(d: schema.OdometerTable, rows: Table, remarks: Remarks) -> Odometer:
-    """Speeds, m/s, of a speed, of several wheels, or of counted pulses."""
+    """Speeds, m/s, from a speed, from several wheels, or from counted pulses."""
     t, scale = rows["t"], schema.SPEED[d.units.speed]
     used = d.readings(tuple(rows.columns))
     wheels = way = None
@@ -126,7 +126,7 @@ def build_odometer(d: schema.OdometerTable, rows: Table, remarks: Remarks) -> Od
                 f"{rows.path}: {len(t)} usable row; pulses need at least 2 to make a speed", key="table.few_rows"
             )
         way = d.metres_per_pulse * count_pulses(rows["pulses"], d.pulses, d.signed, remarks)
-        # over both neighbouring periods, so that it is the speed at t and not half a period before
+        # over both adjacent periods, so that it is the speed at t and not half a period earlier
         ahead, behind = np.minimum(np.arange(len(t)) + 1, len(t) - 1), np.maximum(np.arange(len(t)) - 1, 0)
         speed = (way[ahead] - way[behind]) / (t[ahead] - t[behind])
     else:
@@ -147,7 +147,7 @@ def build_odometer(d: schema.OdometerTable, rows: Table, remarks: Remarks) -> Od
 
 
 def list_needed(sensor: Sensor, rows: Table) -> tuple[str, ...]:
-    """The columns that every row must have: the first of the sets that the file has.
+    """The columns that every row must have: the first of the sets that the file contains.
 
     Raises
     ------
@@ -156,7 +156,7 @@ def list_needed(sensor: Sensor, rows: Table) -> tuple[str, ...]:
     """
     for some in sensor.needs:
         if all(name in rows for name in some):
-            # of several sets a row may have any, which `Sensor.usable` looks at
+            # of several sets a row may have any, which `Sensor.usable` checks
             return some if len([s for s in sensor.needs if all(name in rows for name in s)]) == 1 else ()
     sets = " or ".join(" and ".join(some) for some in sensor.needs)
     raise RecordingError(
@@ -177,12 +177,12 @@ def build_series(sensor: Sensor, d: Any, rows: Table, remarks: Remarks) -> Serie
 
 
 def build_truth(d: schema.TruthTable, rows: Table, remarks: Remarks) -> Truth:
-    """Reference places, and velocities (m/s) and angles (rad) where the file has them."""
+    """Reference positions, and velocities (m/s) and angles (rad) where the file has them."""
     llh = xyz = None
     if d.frame == "local":
         xyz = rows.stack("x", "y", "z") if "z" in rows else rows.stack("x", "y")
     else:
-        llh, rows = geodetic(rows, d.units.angle, schema.HEIGHT[d.units.height], "truth", remarks)
+        llh, rows = convert_geodetic(rows, d.units.angle, schema.HEIGHT[d.units.height], "truth", remarks)
     v = _read_part(rows, ("ve", "vn", "vu"), schema.SPEED[d.units.speed])
     rph = _read_part(rows, ("roll", "pitch", "heading"), ANGLE[d.units.angle or "deg"])
     return Truth(rows["t"], llh, xyz, v, rph, d.of)

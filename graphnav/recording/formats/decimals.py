@@ -1,10 +1,9 @@
-"""Plain decimal numbers in CSV text, read with whole-array arithmetic: several times quicker than cell by cell.
+"""Plain decimal numbers in CSV text, parsed with whole-array arithmetic: several times faster than cell by cell.
 
-Eight characters at a time are one 64-bit word, and three multiplications turn the digits in it into their number,
-for all cells at once. Digits that make a whole number below 2^53, divided by a power of ten up to 10^22, are rounded
-once: the result is the double nearest to what is written, the same that `float` gives (Clinger, "How to read
-floating point numbers accurately", 1990). Cells that are anything else (exponents, nan, more digits) are read
-one by one.
+Eight characters at a time are one 64-bit word, and three multiplications convert its digits into their number, for all
+cells at once. Digits that form a whole number below 2^53, divided by a power of ten up to 10^22, are rounded once: the
+result is the nearest double, as `float` gives it (Clinger, "How to read floating point numbers accurately", 1990). Any
+other cells (exponents, nan, more digits) are parsed one by one.
 """
 
 from __future__ import annotations
@@ -17,18 +16,18 @@ import numpy as np
 from graphnav.core.files import parse_number
 from graphnav.core.rotation import Array
 
-_BLOCK = 1 << 18  # bytes handled at once: keeps the working arrays in the processor's cache
-_SLAB = 1 << 22  # rows of a column held in one piece: 32 MB, which go back to the system when they are let go
+_BLOCK_SIZE = 1 << 18  # bytes processed at once: keeps the working arrays in the processor's cache
+_SLAB = 1 << 22  # rows of a column in one allocation: 32 MB, which are returned to the system when released
 _COMMA, _MINUS, _POINT, _LINE = b",-.\n"
-_PAD = 16  # bytes before a block, for words that reach back beyond it
-_MOST_DIGITS = 16  # digits read on each side of the point
+_PAD = 16  # bytes before a block, for words that extend back beyond it
+_MOST_DIGITS = 16  # digits parsed on each side of the decimal point
 _U = np.uint64
 _TENS = 10 ** np.arange(19, dtype=_U)
 _LAST_BYTES = np.array([2**64 - 2 ** (64 - 8 * k) for k in range(9)], _U)  # the last k bytes of a word
 
 
 def read_decimals(file: IO[bytes], width: int, use: Sequence[int]) -> list[Array]:
-    """The columns `use`, (N,) each, of lines of `width` cells; held twice is one of them at a time.
+    """The columns `use`, (N,) each, of lines of `width` cells; only one of them is in memory twice at a time.
 
     Raises
     ------
@@ -37,7 +36,7 @@ def read_decimals(file: IO[bytes], width: int, use: Sequence[int]) -> list[Array
     """
     slabs: list[list[Array]] = [[] for _ in use]
     rows = 0
-    while block := file.read(_BLOCK):
+    while block := file.read(_BLOCK_SIZE):
         found = _parse_columns(block + file.readline(), width, list(use))
         done = 0
         while done < found.shape[1]:
@@ -45,7 +44,7 @@ def read_decimals(file: IO[bytes], width: int, use: Sequence[int]) -> list[Array
             count = min(found.shape[1] - done, _SLAB - at)
             for column, values in zip(slabs, found, strict=True):
                 if not at:
-                    column.append(np.empty(_SLAB))  # of which the system gives what is written to
+                    column.append(np.empty(_SLAB))  # the system allocates only what is written
                 column[-1][at : at + count] = values[done : done + count]
             done, rows = done + count, rows + count
     columns = []
@@ -58,12 +57,12 @@ def read_decimals(file: IO[bytes], width: int, use: Sequence[int]) -> list[Array
 
 
 def _parse_columns(text: bytes, width: int, use: list[int]) -> Array:
-    """The same of a few whole lines."""
+    """`read_decimals` for a few complete lines."""
     if b"\r" in text:
         text = text.replace(b"\r\n", b"\n")
     text = b"," * _PAD + text + (b"" if text.endswith(b"\n") else b"\n")
     b = np.frombuffer(text, np.uint8)
-    # nothing below a comma is part of a plain number
+    # no character below a comma is part of a plain number
     edges = np.flatnonzero(b <= _COMMA)[_PAD - 1 :]
     begin, end = edges[:-1].reshape(-1, width) + 1, edges[1:].reshape(-1, width)
     if (b[end] != np.where(np.arange(width) < width - 1, _COMMA, _LINE)).any():
@@ -87,17 +86,17 @@ def _parse_columns(text: bytes, width: int, use: list[int]) -> Array:
 
 
 def _find_points(points: Array, begin: Array, end: Array) -> Array:
-    """Where in each cell the decimal point is; its end where there is none."""
+    """Position of the decimal point in each cell; its end where there is none."""
     if len(points) == end.size and ((points := points.reshape(end.shape)) >= begin).all() and (points < end).all():
         return points
     at = end.copy()
     cell = np.searchsorted(end.ravel(), points)
-    at.flat[cell[::-1]] = points[::-1]  # the first of several: what is behind it will not pass as digits
+    at.flat[cell[::-1]] = points[::-1]  # the first of several: the rest will not pass as digits
     return at
 
 
 def _parse_digits(text: bytes, end: Array, n: Array) -> tuple[Array, Array]:
-    """The numbers written by the n digits (16 at most) that stand before `end`, and whether digits they are."""
+    """The numbers of the n digits (16 at most) before `end`, and whether they are digits."""
     value, plain = _parse_eight(text, end, np.minimum(n, 8))
     long = np.flatnonzero(n > 8)
     if len(long):
@@ -108,7 +107,7 @@ def _parse_digits(text: bytes, end: Array, n: Array) -> tuple[Array, Array]:
 
 
 def _parse_eight(text: bytes, end: Array, n: Array) -> tuple[Array, Array]:
-    """`_parse_digits` for n of 8 at most."""
+    """`_parse_digits` for n up to 8."""
     words = np.ndarray(len(text) - 7, "<u8", text, 0, (1,))  # the eight bytes from each byte on, the first lowest
     within = _LAST_BYTES.take(n)
     word = (words.take(end - 8) ^ _U(0x3030303030303030)) & within

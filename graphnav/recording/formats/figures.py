@@ -1,6 +1,6 @@
 """Noise figures as data sheets print them: "0.15 deg/sqrt(h)", "7 deg/h", "60 ug/sqrt(Hz)", "300 ppm".
 
-A figure is a number and a unit. What unit a key takes follows from what it is; a number alone is SI.
+A figure is a number and a unit. Each key accepts the units of its quantity; a number alone is in SI.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ from typing import Any
 _DEG, _G, _H = math.pi / 180.0, 9.80665, 3600.0
 _TIME = {"s": 1.0, "min": 60.0, "h": _H}
 _ANGLE = {"rad": 1.0, "mrad": 1e-3, "urad": 1e-6, "deg": _DEG, "mdeg": 1e-3 * _DEG}
-_RATE = {f"{a}/{t}": x / y for a, x in _ANGLE.items() for t, y in _TIME.items()}
-_RATE |= {"dps": _DEG, "mdps": 1e-3 * _DEG, "dph": _DEG / _H}
+_RATE_UNITS = {f"{a}/{t}": x / y for a, x in _ANGLE.items() for t, y in _TIME.items()}
+_RATE_UNITS |= {"dps": _DEG, "mdps": 1e-3 * _DEG, "dph": _DEG / _H}
 _SPEED = {"m/s": 1.0, "mm/s": 1e-3, "cm/s": 1e-2, "m/h": 1.0 / _H}
 _FORCE = {"m/s2": 1.0, "mm/s2": 1e-3, "g": _G, "mg": 1e-3 * _G, "ug": 1e-6 * _G, "gal": 1e-2, "mgal": 1e-5}
 
@@ -24,10 +24,10 @@ def _per_root(units: dict[str, float], roots: dict[str, float]) -> dict[str, flo
 
 # a rate per root of frequency is a rate times a root of time: deg/s/sqrt(Hz) = deg/sqrt(s)
 _HZ = {"hz": 1.0}
-_GYRO_NOISE = _per_root(_RATE, _HZ) | _per_root(_ANGLE, _TIME)
+_GYRO_NOISE = _per_root(_RATE_UNITS, _HZ) | _per_root(_ANGLE, _TIME)
 _ACCEL_NOISE = _per_root(_FORCE, _HZ) | _per_root(_SPEED, _TIME)
-# the same dimension in two ways: rad/s/sqrt(s), as here, and rad/s2/sqrt(Hz), as Kalibr has it
-_GYRO_WALK = _per_root(_RATE, _TIME) | _per_root({"rad/s2": 1.0, "deg/s2": _DEG}, _HZ)
+# the same dimension written in two ways: rad/s/sqrt(s), as here, and rad/s2/sqrt(Hz), as in Kalibr
+_GYRO_WALK = _per_root(_RATE_UNITS, _TIME) | _per_root({"rad/s2": 1.0, "deg/s2": _DEG}, _HZ)
 _ACCEL_WALK = _per_root(_FORCE, _TIME) | _per_root({"m/s3": 1.0}, _HZ)
 _RATIO = {"%": 1e-2, "ppm": 1e-6}
 
@@ -36,7 +36,7 @@ UNITS: dict[str, dict[str, float]] = {
     "accel_noise_density": _ACCEL_NOISE,
     "gyro_bias_walk": _GYRO_WALK,
     "accel_bias_walk": _ACCEL_WALK,
-    "gyro_bias_sigma": _RATE,
+    "gyro_bias_sigma": _RATE_UNITS,
     "accel_bias_sigma": _FORCE,
     "gyro_scale_sigma": _RATIO,
     "accel_scale_sigma": _RATIO,
@@ -55,7 +55,7 @@ _FIGURE = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*([^\s\d.
 
 
 def parse_figure(key: str, value: Any) -> Any:
-    """A figure in SI: numbers as they are, text by its unit. Anything else is left for the caller to refuse.
+    """Convert a figure to SI: numbers unchanged, text by its unit. Anything else is left for the caller to refuse.
 
     Raises
     ------
@@ -83,7 +83,7 @@ def parse_figure(key: str, value: Any) -> Any:
 
 
 def _normalise_unit(unit: str) -> str:
-    """One spelling of a unit: lower case, no blanks, ASCII."""
+    """Normalise a unit: lower case, no blanks, ASCII."""
     text = unit.lower().replace(" ", "").replace("·", "").replace("*", "")
     for old, new in (
         ("°", "deg"),

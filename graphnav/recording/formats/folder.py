@@ -1,4 +1,4 @@
-"""graphnav's own form: a folder with recording.toml and CSV files, or any .toml of that form."""
+"""graphnav's own format: a folder with recording.toml and CSV files, or such a .toml."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ from graphnav.recording.formats.csv_sensors import (
     list_needed,
 )
 from graphnav.recording.formats.registry import Format, Log
-from graphnav.recording.formats.repair import Remarks, usable_rows
+from graphnav.recording.formats.repair import Remarks, select_usable_rows
 from graphnav.recording.formats.table import Table, read_table
 from graphnav.recording.formats.trajectories import read_trajectory
 from graphnav.sensors import list_sensors
 
-_SETTLED = {  # what a log's reader assumes, and the keys that say it
+_SETTLED = {  # assumptions of a log's reader, and the keys that replace them
     "axes_assumed": {"axes", "forward", "up"},
     "lever_arm_unknown": {"lever_arm"},
     "sigma_assumed": {"sd"},
@@ -41,7 +41,7 @@ _RAW_FILES = ("rover", "nav", "sp3", "clk", "antex", "base")
 
 
 def read_folder(source: str | Path) -> Recording:
-    """A recording from a folder holding recording.toml, or from a .toml of that form.
+    """Read a recording from a folder with recording.toml, or from such a .toml.
 
     Raises
     ------
@@ -53,11 +53,11 @@ def read_folder(source: str | Path) -> Recording:
     d = schema.read_description(path)
     remarks = Remarks()
     files = [path]
-    logs: dict[str, Log | None] = {}  # by file; one log may hold several sensors
-    zeros: list[float] = []  # of their clocks
-    topics: dict[str, tuple[str, ...]] = {}  # asked for of each file
+    logs: dict[str, Log | None] = {}  # by file; one log may contain several sensors
+    zeros: list[float] = []  # zeros of their clocks
+    topics: dict[str, tuple[str, ...]] = {}  # topics of each file
     known = list_sensors()
-    settled: set[str] = set()  # what logs assume and the .toml states
+    settled: set[str] = set()  # assumptions of logs that the .toml replaces
     for name in ("imu", "gnss", "odometer", *known):
         section = getattr(d, name)
         if section is not None:
@@ -73,13 +73,13 @@ def read_folder(source: str | Path) -> Recording:
             position = ("x", "y") if section.frame == "local" else ("lat", "lon", "h")
             required, optional = (*required, *position), tuple(c for c in optional if c not in position)
         rows = read_table(file, required, optional, section.columns, keep.column if keep else None)
-        if name == "odometer":  # which columns it needs depends on which it has
+        if name == "odometer":  # the columns needed depend on those present
             required = (*required, *section.readings(tuple(rows.columns)))
             if not all(column in rows for column in required):
-                read_table(file, required, (), section.columns)  # says what is missing
+                read_table(file, required, (), section.columns)  # raises an error that says what is missing
         if name in known:
             required = (*required, *list_needed(known[name], rows))
-        return usable_rows(rows, name, required, keep, section.units.t, section.time_offset, remarks)
+        return select_usable_rows(rows, name, required, keep, section.units.t, section.time_offset, remarks)
 
     def sensor(name: str, of_table: Callable[[Any, Table, Remarks], Any], of_log: Callable[[Any, Any], Any]) -> Any:
         """The sensor of a table of the .toml: from its CSV file, or from the log of another program."""
@@ -156,7 +156,7 @@ def read_folder(source: str | Path) -> Recording:
 def _load_raw(
     d: schema.RawGnssTable, path: Path, zero: float | None, remarks: Remarks, files: list[Path]
 ) -> tuple[RawGnss, Gnss]:
-    """The raw observations of [raw_gnss], and the single-point fixes that they make."""
+    """The raw observations of [raw_gnss], and single-point fixes computed from them."""
     if zero is None:
         raise RecordingError(
             f"{path}: 'clock': [raw_gnss] needs to know what t = 0 is: say clock = \"gps week 2130\" or a UTC date",
@@ -201,7 +201,7 @@ def _load_raw(
 
 
 def _read_truth(d: schema.TruthTable, file: Path, remarks: Remarks) -> Truth:
-    """The truth from a trajectory file of another program."""
+    """Read the truth from a trajectory file of another program."""
     for key in ("columns", "units", "keep"):
         if key in d.model_fields_set:
             raise RecordingError(f"{file}: 'truth.{key}' is only for CSV files", key="key.not_here")
@@ -213,7 +213,7 @@ def _read_truth(d: schema.TruthTable, file: Path, remarks: Remarks) -> Truth:
 
 
 def other_log(file: Path, topics: Sequence[str] = ()) -> Log | None:
-    """The log of another program, or None for a CSV file or one that is not there; `topics` are for a ROS bag."""
+    """The log of another program, or None for a CSV file or a missing one; `topics` are for a ROS bag."""
     from graphnav.recording.formats import formats  # which imports this module
 
     if file.name.endswith((".csv", ".csv.gz")) or not file.exists():
@@ -225,9 +225,9 @@ def other_log(file: Path, topics: Sequence[str] = ()) -> Log | None:
 
 
 def _complete_imu(d: schema.ImuTable, imu: Imu) -> Imu:
-    """The IMU of another program's log, with what the .toml adds to it."""
+    """The IMU of another program's log, completed by the .toml."""
     if {"axes", "forward", "up"} & d.model_fields_set:
-        turn = d.R_bs @ imu.R_bs.T  # the .toml speaks of the file's own axes
+        turn = d.R_bs @ imu.R_bs.T  # the .toml refers to the file's own axes
         imu = replace(imu, gyro=imu.gyro @ turn.T, accel=imu.accel @ turn.T, R_bs=d.R_bs)
     stated = d.figures if d.noise or d.model else {}
     return replace(

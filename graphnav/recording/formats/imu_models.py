@@ -1,15 +1,15 @@
-"""Noise figures of some well-known IMUs, for ``model = "..."`` in a recording's [imu], with where each comes from.
+"""Noise figures of well-known IMUs, for ``model = "..."`` in a recording's [imu], each with its source.
 
-Three kinds of sources, which differ in what they claim:
+The sources are of three kinds, which mean different things:
 
-- data sheets: white noise, and mostly the in-run bias stability B, of a sensor at rest on a bench. The walk of the
-  bias, which a filter needs, they do not state; it is taken as B over the root of `FLOOR_TIME`, where the Allan
+- data sheets: white noise, and usually the in-run bias stability B, of a sensor at rest on a bench. They do not state
+  the random walk of the bias that a filter needs; it is taken as B over the root of `FLOOR_TIME`, where the Allan
   deviation of such sensors is lowest;
-- figures tuned by others on drives: white noise with vibration in it, and a first-order Gauss-Markov bias of sigma s
-  and correlation time T, which is a walk of s sqrt(2/T) starting from s;
-- Allan variances, with both walks measured.
+- figures tuned by others on drives: white noise that includes vibration, and a first-order Gauss-Markov bias of sigma s
+  and correlation time T, which is a random walk of s sqrt(2/T) starting from s;
+- Allan variances, with both random walks measured.
 
-In a car that shakes the figures turn out larger than on a bench; they are judged from the drive.
+In a car that vibrates the figures are larger than on a bench; they are estimated from the drive.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ FLOOR_TIME = 100.0  # s
 
 @dataclass(frozen=True)
 class ImuModel:
-    """One IMU: figures in SI by their recording.toml names, and their source in words."""
+    """One IMU: figures in SI by their recording.toml names, and their source."""
 
     name: str
     noise: dict[str, float]
@@ -41,7 +41,7 @@ def _read_sheet(
     name: str, source: str, white: tuple[str, str], stability: tuple[str, str] | None = None,
     turn_on: tuple[str, str] | None = None, scale: tuple[str, str] | None = None,
 ) -> ImuModel:  # fmt: skip
-    """From a data sheet: gyro and accelerometer each."""
+    """Figures from a data sheet: gyro and accelerometer each."""
     noise = _convert_figures({"noise_density": white[0]}, {"noise_density": white[1]})
     if stability is not None:
         inside = _convert_figures({"bias_sigma": stability[0]}, {"bias_sigma": stability[1]})
@@ -57,7 +57,7 @@ def _read_tuning(
     name: str, source: str, white: tuple[str, str], bias: tuple[str, str], hours: float,
     scale: tuple[str, str] | None = None,
 ) -> ImuModel:  # fmt: skip
-    """From a filter's settings with Gauss-Markov biases of a correlation time in hours."""
+    """Figures from a filter's settings with Gauss-Markov biases of a correlation time in hours."""
     noise = _read_sheet(name, source, white, None, bias, scale).noise
     root = (2.0 / (hours * 3600.0)) ** 0.5
     walks = {f"{s}_bias_walk": noise[f"{s}_bias_sigma"] * root for s in ("gyro", "accel")}
@@ -96,7 +96,7 @@ MODELS = {model.name: model for model in _ALL}
 
 
 def find_model(name: str) -> ImuModel | None:
-    """A model by its name, however it is spelt: capitals, blanks and dashes do not matter."""
+    """Find a model by name; capitals, blanks and dashes do not matter."""
     plain = _normalise_name(name)
     return next((model for model in _ALL if _normalise_name(model.name) == plain), None)
 

@@ -39,8 +39,8 @@ from graphnav.recording.formats.schema import rotation_from_letters
 from graphnav.recording.formats.text import number_table, text_lines
 from graphnav.recording.formats.trajectories import read_trajectory
 
-_GAP = 1.5  # a step this many times the period is a gap: the increments after it are still of one period
-_LARGEST = 0.3  # rad or m/s: more than any IMU increments by in one sample
+_GAP_PERIODS = 1.5  # a step of this many periods is a gap: the increments after it are still of one period
+_LARGEST = 0.3  # rad or m/s: larger than any increment of a sample
 _IMU_KEYS, _GNSS_KEYS = ("imupath", "imufile"), ("gnsspath", "gnssfile")
 
 
@@ -54,7 +54,7 @@ def recognises(path: Path) -> bool:
 
 
 def load(path: Path) -> Log:
-    """A data set through its configuration, a folder of its files, or a single IMU or GNSS file.
+    """Read a data set by its configuration, a folder of its files, or a single IMU or GNSS file.
 
     Raises
     ------
@@ -236,7 +236,7 @@ def _read_imu(path: Path, remarks: Remarks) -> tuple[Imu, Array | None]:
             key="imu.increments_large",
         )
     period = float(np.median(step))
-    gap = step > _GAP * period
+    gap = step > _GAP_PERIODS * period
     dt = np.concatenate([[period], np.where(gap, period, step)])[:, None]
     if gap.any():
         remarks.add(

@@ -23,13 +23,13 @@ from graphnav.recording.formats.schema import rotation_from_letters
 DEG_PER_H = np.pi / 180 / 3600  # rad/s
 DEG_PER_SQRT_H = np.pi / 180 / 60  # rad/s/sqrt(Hz)
 MGAL = 1e-5  # m/s^2
-_LEAST, _MOST = 1e-12, 1e12  # of a noise figure in the configuration's units: wider than any sensor
-_DEEPEST = 50  # of tables in tables: what is read has two
-_FARTHEST = 1000.0  # m, of a lever arm
+_LEAST, _MOST = 1e-12, 1e12  # limit of a noise figure in the configuration's units: above any sensor
+_DEEPEST = 50  # levels of nested tables; two are used
+_MAX_LEVER_ARM = 1000.0  # m, of a lever arm
 
 
 def read_configuration(path: Path) -> dict[str, Any]:
-    """Its values; aliases and deep nesting are refused."""
+    """The values of a configuration; aliases and deep nesting are refused."""
     import yaml
 
     text = read_text(path)
@@ -42,7 +42,7 @@ def read_configuration(path: Path) -> dict[str, Any]:
         line = f", line {mark.line + 1}" if mark is not None else ""
         why = " ".join(str(getattr(error, "problem", None) or error).split())
         raise RecordingError(f"{path}{line}: not valid YAML ({why})", key="yaml.syntax") from None
-    except ValueError as error:  # a date that is none, a number of hundreds of digits
+    except ValueError as error:  # an invalid date, a number of hundreds of digits
         raise RecordingError(f"{path}: not valid YAML ({error})", key="yaml.syntax") from None
     if not isinstance(values, dict):
         raise RecordingError(f"{path}: not a configuration of KF-GINS or OB_GINS", key="log.no_configuration")
@@ -50,7 +50,7 @@ def read_configuration(path: Path) -> dict[str, Any]:
 
 
 def _check_tokens(path: Path, yaml: Any, text: str) -> None:
-    """Refuse what makes much out of little: a few lines of aliases stand for any amount of values."""
+    """Refuse aliases, by which a few lines can expand to any amount of values."""
     opening = (yaml.FlowSequenceStartToken, yaml.FlowMappingStartToken,
                yaml.BlockSequenceStartToken, yaml.BlockMappingStartToken)  # fmt: skip
     closing = (yaml.FlowSequenceEndToken, yaml.FlowMappingEndToken, yaml.BlockEndToken)
@@ -69,7 +69,7 @@ def _check_tokens(path: Path, yaml: Any, text: str) -> None:
 
 
 def find_file(config_file: Path, config: dict[str, Any], keys: tuple[str, ...]) -> Path | None:
-    """The file a key names: as it stands, below any folder above the configuration, or beside it."""
+    """The file that a key names: as written, below any folder above the configuration, or beside it."""
     key = next((k for k in keys if k in config), None)
     if key is None:
         return None
@@ -94,16 +94,18 @@ def find_file(config_file: Path, config: dict[str, Any], keys: tuple[str, ...]) 
 def read_lever_arm(where: Path, config: dict[str, Any], key: str) -> Array:
     """A lever arm of the configuration (forward, right, down) in RFU; zero where there is none."""
     value = config.get(key, [0.0, 0.0, 0.0])
-    if not (isinstance(value, list) and len(value) == 3 and all(_is_number(x) and abs(x) <= _FARTHEST for x in value)):
+    if not (
+        isinstance(value, list) and len(value) == 3 and all(_is_number(x) and abs(x) <= _MAX_LEVER_ARM for x in value)
+    ):
         raise RecordingError(
-            f"{where}, {key}: must be three numbers, forward, right, down in m, of {_FARTHEST:g} m at most",
+            f"{where}, {key}: must be three numbers, forward, right, down in m, of {_MAX_LEVER_ARM:g} m at most",
             key="yaml.value",
         )
     return rotation_from_letters("FRD") @ np.array(value, dtype=float)
 
 
 def _is_number(value: Any) -> bool:
-    """Whether it is a number that a float can hold."""
+    """Whether it is a number that a float can represent."""
     return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
 
 
@@ -148,7 +150,7 @@ def read_imu_noise(where: Path, config: dict[str, Any], remarks: Remarks) -> Imu
 
 
 def mention_unused(config: dict[str, Any], remarks: Remarks) -> None:
-    """Keys of the configuration that have no place in a recording."""
+    """Remark on keys of the configuration that have no equivalent in a recording."""
     if any(key in config for key in ("starttime", "endtime")):
         span = f"{str(config.get('starttime', ''))[:30]} to {str(config.get('endtime', ''))[:30]}"
         remarks.add("log.span_not_used", f"starttime and endtime ({span}) are not applied: use --start and --end")

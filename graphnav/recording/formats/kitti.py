@@ -38,7 +38,7 @@ SD = (0.1, 0.1, 0.1)  # m
 
 
 def data_folder() -> Path:
-    """Where the installed gtsam keeps its example data; found without importing gtsam.
+    """The folder of the installed gtsam's example data; found without importing gtsam.
 
     Raises
     ------

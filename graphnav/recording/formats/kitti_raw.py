@@ -21,7 +21,7 @@ from graphnav.recording.formats.repair import Remarks, is_on_earth
 from graphnav.recording.formats.schema import rotation_from_letters
 from graphnav.recording.formats.text import text_lines
 
-_FIX_PERIOD = 1.0  # s; the smoothed positions of an INS, taken more often, would pass for independent fixes
+_FIX_PERIOD = 1.0  # s; the smoothed positions of an INS, used more often, would count as independent fixes
 _COLUMNS = 30
 
 
@@ -34,7 +34,7 @@ def _find_oxts(path: Path) -> Path | None:
 
 
 def load(path: Path) -> Log:
-    """The IMU, positions and velocities of the INS once a second as fixes, and its whole solution as the truth.
+    """Read the IMU, positions and velocities of the INS once a second as fixes, and its whole solution as the truth.
 
     Raises
     ------

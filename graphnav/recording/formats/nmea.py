@@ -31,7 +31,7 @@ _BY_QUALITY = {1: 2.5, 2: 1.0, 4: 0.02, 5: 0.4}
 
 @dataclass
 class _Epoch:
-    """What sentences of one time say; angles in degrees."""
+    """The data of the sentences of one time; angles in degrees."""
 
     time: float  # s of the UTC day
     line: int
@@ -44,7 +44,7 @@ class _Epoch:
 
 
 def recognises(path: Path) -> bool:
-    """Whether one of the first lines is a sentence ($, talker and type, a comma) and UBX does not say more."""
+    """Whether one of the first lines is a sentence ($, talker and type, a comma) and the file is not mainly UBX."""
     if ubx.recognises(path):
         return False
     lines = first_bytes(path).splitlines()[:20]
@@ -117,7 +117,7 @@ def load(path: Path) -> Log:
 
 
 def _collect_epochs(path: Path) -> tuple[list[_Epoch], list[int], int]:
-    """Epochs in the order of the file, the numbers of broken lines, and how many lines hold anything."""
+    """Epochs in the order of the file, the numbers of invalid lines, and the number of non-empty lines."""
     import pynmeagps
 
     epochs: list[_Epoch] = []
@@ -133,12 +133,12 @@ def _collect_epochs(path: Path) -> tuple[list[_Epoch], list[int], int]:
         kind = raw[start + 3 : start + 6]
         if kind not in (b"GGA", b"GST", b"RMC", b"VTG", b"ZDA"):
             continue
-        if b"_" in raw[start:] or not raw[start:].isascii():  # which int and float of Python take for digits
+        if b"_" in raw[start:] or not raw[start:].isascii():  # which Python's int and float accept as digits
             broken.append(number)
             continue
         try:
             message = pynmeagps.NMEAReader.parse(raw[start:].strip() + b"\r\n")
-        except Exception:  # the parser's own errors and whatever a cut line makes it stumble over
+        except Exception:  # the parser's own errors and any that a truncated line causes in it
             broken.append(number)
             continue
         time = getattr(message, "time", None)
@@ -150,7 +150,7 @@ def _collect_epochs(path: Path) -> tuple[list[_Epoch], list[int], int]:
             continue
         try:
             _note(epochs[-1], kind, message)
-        except (AttributeError, TypeError, ValueError):  # no number, or no field, where the checksum is right
+        except (AttributeError, TypeError, ValueError):  # no number, or a missing field, despite a correct checksum
             broken.append(number)
     return epochs, broken, count
 
@@ -173,7 +173,7 @@ def _note(epoch: _Epoch, kind: bytes, message: Any) -> None:
     elif kind == b"ZDA":
         try:
             date = datetime.date(int(message.year), int(message.month), int(message.day))
-            epoch.date = date if date.year >= 1980 else None  # before there was GPS
+            epoch.date = date if date.year >= 1980 else None  # before GPS existed
         except (TypeError, ValueError):
             epoch.date = None
     elif epoch.speed is None and (message.sogk != "" or message.sogn != ""):
@@ -186,12 +186,12 @@ def _number(value: Any) -> float:
         return float("nan")
     try:
         return parse_number(value) if isinstance(value, str) else float(value)
-    except OverflowError:  # a whole number of hundreds of digits
+    except OverflowError:  # an integer of hundreds of digits
         return float("nan")
 
 
 def _date_fixes(epochs: list[_Epoch], fixes: list[_Epoch], remarks: Remarks) -> tuple[Array, float | None]:
-    """GPS seconds of week of the fixes and where the week begins; a time that falls back by half a day is the next."""
+    """GPS seconds of week of the fixes and where the week begins; a step back by half a day starts the next day."""
     days, day, before = {}, 0, epochs[0].time
     for e in epochs:
         day += e.time < before - 0.5 * _DAY

@@ -1,4 +1,4 @@
-"""Pulses of a wheel into a running count: per row or cumulative, counters of 8, 16 or 32 bit unwrapped."""
+"""Wheel pulses as a running count: per row or cumulative, with 8-, 16- or 32-bit counters unwrapped."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ def count_pulses(
 ) -> Array:
     """(M,) pulses since the first row.
 
-    A counter that is not said to be cumulative is taken for one if it hardly ever falls: counts per row rise and
-    fall with the speed.
+    A counter of unstated kind is taken as cumulative if it hardly ever decreases: counts per row rise and fall with the
+    speed.
     """
     step = np.diff(pulses)
     if kind is None:
@@ -29,25 +29,25 @@ def count_pulses(
             f"the odometer's pulses are taken as {'a running count' if kind == 'cumulative' else 'counts per row'}; "
             f'if they are not, say pulses = "{"per_row" if kind == "cumulative" else "cumulative"}"',
         )
-    if kind == "per_row":  # those of row k came between the rows k-1 and k
+    if kind == "per_row":  # those of row k were counted between rows k-1 and k
         return np.cumsum(pulses) - pulses[0]
     return np.r_[0.0, np.cumsum(_unwrap(pulses, step, signed, remarks))]
 
 
 def _unwrap(pulses: Array, step: Array, signed: bool | None, remarks: Remarks) -> Array:
-    """Steps between rows without the jumps of a counter that ran over, or began anew."""
+    """Steps between rows without the jumps of a counter that overflowed or restarted."""
     back = step < 0.0
     if not back.any() or pulses.min() < 0.0:
         return step
     modulus = next((m for m in _MODULI if pulses.max() < m), None)
     if modulus is None:
         return step
-    if signed is None:  # what counts backward does so by a few pulses as well
+    if signed is None:  # a counter that counts backward does so by single pulses too
         signed = bool((step[back] > -0.5 * modulus).any())
     # a step of less than half the range either way; of less than the whole range forward if there is no backward
     whole = np.mod(step + 0.5 * modulus, modulus) - 0.5 * modulus if signed else np.mod(step, modulus)
     ran_over = whole != step
-    # one that began anew at zero did not run over: nothing near the end of the range, and a step like no other
+    # a restart at zero is no overflow: no value near the end of the range, and an unusual step
     typical = np.abs(step[~ran_over]).max(initial=0.0)
     anew = ran_over & (np.abs(whole) > 4.0 * typical + 4.0)
     whole[anew] = 0.0

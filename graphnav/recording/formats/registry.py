@@ -1,7 +1,7 @@
-"""How a log format makes itself known: its module in this package holds one `FORMAT`.
+"""Registration of log formats: the module of a format in this package defines one `FORMAT`.
 
-A log need not hold every sensor: it is read into a `Log`, and becomes a recording alone, or with others through the
-``file`` keys of a recording.toml.
+A log need not contain every sensor: it is read into a `Log`, and becomes a recording by itself, or with others through
+the ``file`` keys of a recording.toml.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from graphnav.sensors import Series
 
 @dataclass(frozen=True)
 class Log:
-    """What one log holds, as a `Recording` would have it, with whatever it lacks left None."""
+    """The contents of a log, with the fields of a `Recording`; missing sensors are None."""
 
     name: str
     imu: Imu | None = None
@@ -30,9 +30,9 @@ class Log:
     gps_zero: float | None = None  # s since the GPS epoch at t = 0 of the log, where it is known
     mount_known: bool = True  # whether the IMU's axes are by definition those of the vehicle
     files: tuple[Path, ...] = ()
-    remarks: tuple[str, ...] = ()  # sentences about what was assumed
-    sensors: Mapping[str, Series] = field(default_factory=dict)  # others, by their names
-    topics: Mapping[str, tuple[str, ...]] = field(default_factory=dict)  # sensor -> that used, then those it could be
+    remarks: tuple[str, ...] = ()  # notes on assumptions
+    sensors: Mapping[str, Series] = field(default_factory=dict)  # other sensors, by name
+    topics: Mapping[str, tuple[str, ...]] = field(default_factory=dict)  # sensor -> topic used, then the alternatives
 
     def recording(self, source: str | Path) -> Recording:
         """The log as a recording.
@@ -57,18 +57,19 @@ class Log:
 
 @dataclass(frozen=True)
 class Format:
-    """One way a recording, or a part of one, can be stored.
+    """A format in which a recording, or a part of one, is stored.
 
-    `recognises` must be cheap and must not raise; `read` and `load` raise RecordingError for anything they cannot use.
+    `recognises` must be fast and must not raise; `read` and `load` raise RecordingError for anything they cannot use.
     """
 
     name: str
     about: str  # one sentence
     recognises: Callable[[str | Path], bool]
     read: Callable[[str | Path], Recording]
-    builtin: bool = False  # a name that is always there, such as "kitti", rather than a path
+    builtin: bool = False  # a name that is always available, such as "kitti", rather than a path
     load: Callable[[str | Path], Log] | None = None  # for logs of other programs
-    choose: Callable[[str | Path, Sequence[str]], Log] | None = None  # `load` of named topics, where logs have them
+    # `load` with named topics, for logs that have topics
+    choose: Callable[[str | Path, Sequence[str]], Log] | None = None
 
 
 def log_format(
@@ -78,7 +79,7 @@ def log_format(
     load: Callable[[Path], Log],
     choose: Callable[[Path, Sequence[str]], Log] | None = None,
 ) -> Format:
-    """The `Format` of another program's log."""
+    """Make the `Format` of another program's log."""
 
     def can_read(source: str | Path) -> bool:
         try:
@@ -92,10 +93,10 @@ def log_format(
             raise RecordingError(f"{path}: no such file or folder", key="file.missing")
         if not path.is_dir():
             check_regular(path)
-        from graphnav.recording.formats.soundness import sound  # which imports this module
+        from graphnav.recording.formats.soundness import drop_unsound_rows  # which imports this module
 
         log = choose(path, topics) if choose is not None and topics else load(path)
-        return replace(_without_nowhere(sound(log, path)), files=log.files or _list_files(path))
+        return replace(_without_nowhere(drop_unsound_rows(log, path)), files=log.files or _list_files(path))
 
     return Format(
         name, about, can_read, lambda source: load_log(source).recording(source), load=load_log,
@@ -104,7 +105,7 @@ def log_format(
 
 
 def _without_nowhere(log: Log) -> Log:
-    """The log without fixes at latitude and longitude 0, which receivers write that have none."""
+    """The log without fixes at latitude and longitude 0, which receivers write when they have none."""
     gnss = log.gnss
     if gnss is None or not (nowhere := (gnss.llh[:, :2] == 0.0).all(axis=1)).any() or nowhere.all():
         return log
@@ -117,12 +118,12 @@ def _without_nowhere(log: Log) -> Log:
 
 
 def _list_files(path: Path) -> tuple[Path, ...]:
-    """A file, or those of a folder."""
+    """The file itself, or the files of a folder."""
     return tuple(sorted(file for file in path.iterdir() if file.is_file())) if path.is_dir() else (path,)
 
 
 def first_bytes(path: Path, count: int = 4096) -> bytes:
-    """The beginning of a file; nothing of a folder or of what cannot be read."""
+    """The beginning of a file; empty for a folder or an unreadable file."""
     if not path.is_file():
         return b""
     with path.open("rb") as file:

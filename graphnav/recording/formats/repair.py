@@ -1,4 +1,4 @@
-"""Which rows of a sensor's file can be used; whatever is changed is said in a remark."""
+"""Selection of the usable rows of a sensor's file; all changes are remarked on."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from graphnav.recording.formats.table import Mask, Table
 from graphnav.sensors.tables import TIME, Keep
 
 _LABEL = {"imu": "IMU", "gnss": "GNSS", "odometer": "odometer", "truth": "truth"}
-LATEST = 1e11  # s, either way: three thousand years
-VAGUEST, VAGUEST_V = 1e5, 1e4  # m, m/s; a fix with a sigma beyond these says nothing
-_SUREST = 1e-9  # m, m/s; a sigma below says that it was not meant as one
-_HIGHEST = 9000.0  # m, that a drive on Earth may come to
-_LOWEST, _SKY = -1000.0, 50000.0  # m, that anything may be read at
-_SET_BACK = 10.0  # periods; rows that merely overtake each other are closer
+LATEST = 1e11  # s, either sign: three thousand years
+VAGUEST, VAGUEST_V = 1e5, 1e4  # m, m/s; a fix with a larger sigma carries no information
+_SUREST = 1e-9  # m, m/s; a smaller sigma is not meant as one
+_HIGHEST = 9000.0  # m, highest drive on Earth
+_LOWEST, _SKY = -1000.0, 50000.0  # m, range of valid heights
+_SET_BACK = 10.0  # periods; rows that overtake each other are closer
 _RADIANS = (1.58, 3.15)  # |lat|, |lon| that angles in radians cannot exceed
 
 
@@ -37,17 +37,17 @@ NMEA_TYPES = {0: 0, 1: 5, 2: 4, 3: 0, 4: 1, 5: 2, 9: 3}
 
 
 class Remarks(list[str]):
-    """Sentences about what loading changed or assumed."""
+    """Notes on what loading changed or assumed."""
 
     def add(self, key: str, sentence: str) -> None:
-        """One more sentence, under the key that says what it is about."""
+        """Add a note under a key."""
         self.append(Note(key, sentence))
 
 
-def usable_rows(
+def select_usable_rows(
     rows: Table, sensor: str, needed: tuple[str, ...], keep: Keep | None, unit: str, offset: float, remarks: Remarks
 ) -> Table:
-    """The rows that hold every needed value, in order of time, each time once; t in seconds plus `offset`.
+    """The rows complete in the needed values, ordered by time, without repeated times; t in seconds plus `offset`.
 
     Raises
     ------
@@ -58,11 +58,11 @@ def usable_rows(
     label = _LABEL.get(sensor, sensor)
     with np.errstate(over="ignore"):
         t = rows["t"] * TIME[unit] + offset
-    # a stamp of thousands of years is none, as an infinite one
+    # a stamp of thousands of years is invalid, like an infinite one
     rows = rows.with_column("t", np.where(np.abs(t) > LATEST, np.inf, rows["t"]))
     for name in rows.columns:
         bad = np.flatnonzero(np.isinf(rows[name]))
-        if len(bad) and sensor == "odometer":  # of which single readings can be missed
+        if len(bad) and sensor == "odometer":  # of which single readings can be missing
             rows = rows.with_column(name, np.where(np.isinf(rows[name]), np.nan, rows[name]))
         elif len(bad):
             what = "no time" if name == "t" else "infinite"
@@ -126,10 +126,10 @@ def usable_rows(
 
 
 def new_fixes(columns: Mapping[str, Array]) -> NDArray[np.bool_]:
-    """(N,) which rows of fixes are new, of a log that holds the last fix in its rows until there is another.
+    """(N,) which rows of fixes are new, for a log that repeats the last fix until there is another.
 
-    That is one in which most fixes, between two that differ, fill two rows or more, the same in all but their time.
-    A receiver that stands and rounds repeats itself too, but not between two fixes under way.
+    In such a log most fixes, between two that differ, fill two rows or more, identical except for their time. A
+    standing receiver that rounds repeats itself too, but not between two fixes in motion.
     """
     others = [x for name, x in columns.items() if name != "t"]
     same = np.ones(max(len(columns["t"]) - 1, 0), dtype=bool)
@@ -141,7 +141,7 @@ def new_fixes(columns: Mapping[str, Array]) -> NDArray[np.bool_]:
 
 
 def _check_passes(rows: Table, label: str) -> None:
-    """Refuse a clock that was set back: the stamps before and after it then lie among each other."""
+    """Refuse a clock that was set back: the stamps before and after it are then interleaved."""
     t = rows["t"]
     period = float(np.median(np.abs(np.diff(t))))
     back = np.flatnonzero(np.diff(t) < -_SET_BACK * period)
@@ -149,7 +149,7 @@ def _check_passes(rows: Table, label: str) -> None:
         again, before = float(t[k + 1]), t[: k + 1]
         before = before[before >= again]
         after = t[k + 1 :][t[k + 1 :] <= t[k]]
-        # rows that were only written later than others fill the hole that they left
+        # rows that were only written late fill the gap that they left
         shared = min(before.max(), after.max()) - max(before.min(), after.min())
         if shared > 0.5 * (t[k] - again) and shared > _SET_BACK * period:
             jump = float(t[k] - again + period)
@@ -184,17 +184,17 @@ def _check_imu_time(rows: Table, unit: str) -> None:
 
 
 def is_on_earth(lat: Array, lon: Array, h: Array) -> Mask:
-    """Which of some places (N,) in rad and m a drive can be at."""
+    """Which of the places (N,) in rad and m are possible on a drive."""
     with np.errstate(invalid="ignore"):
         near = (np.abs(lat) <= np.pi / 2) & (np.abs(lon) <= 2 * np.pi) & (h >= _LOWEST) & (h <= _SKY)
     return np.asarray(near)
 
 
-def geodetic(rows: Table, unit: str | None, height: float, label: str, remarks: Remarks) -> tuple[Array, Table]:
-    """(lat, lon, h) in rad, rad, m of rows whose position is usable, and those rows.
+def convert_geodetic(rows: Table, unit: str | None, height: float, label: str, remarks: Remarks) -> tuple[Array, Table]:
+    """(lat, lon, h) in rad, rad, m of rows with usable position, and those rows.
 
-    `unit` is that of the angles; None means degrees, and those that are all small enough to be radians are refused.
-    `height` is that of the heights, m.
+    `unit` is that of the angles; None means degrees, and angles that are all small enough to be radians are refused.
+    `height` is the unit of the heights, in m.
 
     Raises
     ------
@@ -242,7 +242,7 @@ def geodetic(rows: Table, unit: str | None, height: float, label: str, remarks: 
 
 
 def _guess_other_form(lat: Array, lon: Array, label: str) -> str:
-    """What latitudes and longitudes out of range may be instead."""
+    """The likely mistake behind latitudes and longitudes out of range."""
     if all((np.abs(x) % 100.0 < 60.0).all() and np.abs(x).max() < 100.0 * top for x, top in ((lat, 91), (lon, 181))):
         whole, minutes = divmod(abs(lat[0]), 100.0)
         return f"; degrees and minutes together, as in NMEA? {lat[0]:g} is then {whole:g} deg {minutes:g} min"
@@ -300,13 +300,13 @@ def sigmas(
     return np.where(blank, fallback, sd)
 
 
-_FINEST = 5  # decimals that are written on purpose; with more, a column is not rounded
+_FINEST = 5  # decimals in deliberate use; with more, a column is not rounded
 
 
 def _find_floor(positive: Array) -> float | None:
-    """What a sigma is at most that was printed as zero: half a unit of the last decimal of the others in its column.
+    """The largest sigma that could have been printed as zero: half a unit of the last decimal of its column.
 
-    Where they are not rounded it is the smallest of them; None where there is none.
+    In an unrounded column it is the smallest positive value; None where there is none.
     """
     if not len(positive):
         return None
@@ -318,7 +318,7 @@ def _find_floor(positive: Array) -> float | None:
 
 
 def fixes_by_type(rows: Table, numbers: str) -> NDArray[np.intp] | None:
-    """Types (N,) of the fixes of a table with a column of them, in the numbers of "rtklib" or "nmea".
+    """Types (N,) of the fixes of a table with such a column, in the numbers of "rtklib" or "nmea".
 
     Raises
     ------
@@ -338,19 +338,19 @@ def fixes_by_type(rows: Table, numbers: str) -> NDArray[np.intp] | None:
 
 
 # 1-sigma of a vertical velocity that is taken as zero because a receiver gives only speed and course: a slope of 10 %
-_SLOPE = 0.1
+_STEEPEST = 0.1
 
 
 def horizontal_velocity(speed: Array, course: Array, sd: tuple[float, float, float]) -> tuple[Array, Array, str]:
-    """East-north-up velocities of speed (N,) m/s over ground and course (N,) rad, their sigmas, and what was assumed.
+    """East-north-up velocities from speed (N,) m/s over ground and course (N,) rad, their sigmas, and notes.
 
-    A standing receiver may leave the course blank; a blank speed gives no velocity.
+    A stationary receiver may leave the course blank; a blank speed gives no velocity.
     """
     course = np.where(np.isnan(course) & (speed < sd[0]), 0.0, course)
     v = np.stack([speed * np.sin(course), speed * np.cos(course), np.zeros_like(speed)], -1)
     v[np.isnan(v).any(-1)] = np.nan
     sd_v = np.tile(np.array(sd), (len(speed), 1))
-    sd_v[:, 2] = np.maximum(sd[2], _SLOPE * np.abs(np.nan_to_num(speed)))
+    sd_v[:, 2] = np.maximum(sd[2], _STEEPEST * np.abs(np.nan_to_num(speed)))
     sd_v[np.isnan(v).any(-1)] = np.nan
     return (
         v,

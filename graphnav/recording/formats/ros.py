@@ -28,7 +28,7 @@ _TWISTS = ("geometry_msgs/msg/TwistStamped", "geometry_msgs/msg/TwistWithCovaria
 _ROLES = {"imu": (_IMU,), "fix": (_FIX,), "twist": _TWISTS}
 _STATUS = {0: 5, 1: 3, 2: 4}  # of a NavSatFix: unaugmented, of satellites, of a base (carrier phases or not)
 _UNIX = 1e9  # s; stamps above are dates
-_SIDEWAYS = 0.2  # a body moves ahead; a velocity whose second component is larger than this is in east-north-up
+_SIDEWAYS = 0.2  # a body moves forward; a velocity with a larger second component is in east-north-up
 
 
 @dataclass
@@ -49,7 +49,7 @@ def recognises(path: Path) -> bool:
 
 
 def load(path: Path, wanted: Sequence[str] = ()) -> Log:
-    """The IMU, fixes and speed of the topics that are `wanted`, else of those that have the most messages.
+    """Read the IMU, fixes and speed of the topics `wanted`, otherwise of those with the most messages.
 
     Raises
     ------
@@ -99,13 +99,13 @@ def load(path: Path, wanted: Sequence[str] = ()) -> Log:
 
 
 def _choose_topics(ranked: dict[str, list[_Topic]], wheel: bool) -> dict[str, tuple[str, ...]]:
-    """By sensor, the topic that is used, and those that could be."""
+    """By sensor, the topic that is used, and the alternatives."""
     of = {"imu": "imu", "fix": "gnss"} | ({"twist": "odometer"} if wheel else {})
     return {of[role]: tuple(t.name for t in found) for role, found in ranked.items() if found and role in of}
 
 
 def _read(path: Path) -> tuple[list[_Topic], set[str]]:
-    """The topics that can be used, with their rows, and the types of the others."""
+    """The usable topics with their rows, and the types of the others."""
     from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
 
@@ -120,7 +120,7 @@ def _read(path: Path) -> tuple[list[_Topic], set[str]]:
                 topic = topics.setdefault(connection.topic, _Topic(connection.topic, connection.msgtype))
                 topic.t.append(message.header.stamp.sec + message.header.stamp.nanosec * 1e-9)
                 topic.rows.append(_read_row(message, connection.msgtype))
-    except Exception as error:  # a broken bag fails in whatever library reads its storage
+    except Exception as error:  # a damaged bag fails in whatever library reads its storage
         raise RecordingError(
             f"{path}: cannot be read as a ROS bag ({' '.join(str(error).split())[:200]})", key="file.damaged"
         ) from None
@@ -141,7 +141,7 @@ def _read_row(message: Any, kind: str) -> list[float]:
 
 
 def _build_table(topic: _Topic) -> tuple[Array, Array]:
-    """Times and rows in order of time, each time once."""
+    """Times and rows ordered by time, each time once."""
     t, rows = np.array(topic.t), np.array(topic.rows, dtype=float)
     t, first = np.unique(t, return_index=True)
     return t, rows[first]
@@ -189,13 +189,13 @@ def _read_gnss(topic: _Topic, remarks: Remarks) -> Gnss | None:
         )
     remarks.add("gnss.read_as", f"GNSS: {topic.name}; heights above the ellipsoid")
     remarks.add("gnss.lever_arm_unknown", "GNSS: the antenna's lever arm is not in the log and taken as zero")
-    # many drivers write 0 whatever the fix is: where no other status is to be seen, it says nothing
+    # many drivers always write 0: without any other status it carries no information
     kinds = fix_types(rows[:, 6], _STATUS) if rows[:, 6].any() else None
     return Gnss(t, np.column_stack([np.radians(rows[:, :2]), rows[:, 2]]), sd, type=kinds)
 
 
 def _read_twist(topic: _Topic, gnss: Gnss | None, remarks: Remarks) -> tuple[Gnss | None, Odometer | None]:
-    """A velocity over ground goes to the fixes, a speed of the body becomes the odometer."""
+    """Assign a velocity over ground to the fixes, or a speed of the body to the odometer."""
     t, rows = _build_table(topic)
     good = np.isfinite(rows).all(-1)
     t, rows = t[good], rows[good]

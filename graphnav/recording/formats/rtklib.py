@@ -1,6 +1,6 @@
-"""Positions computed by RTKLIB (.pos) as GNSS fixes: lat, lon, height with sigmas, and velocities where there are any.
+"""Positions computed by RTKLIB (.pos) as GNSS fixes: lat, lon, height with sigmas, and velocities if present.
 
-Their form is in `graphnav.recording.formats.rtklib_solution`.
+The format is described in `graphnav.recording.formats.rtklib_solution`.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ def recognises(path: Path) -> bool:
 
 
 def load(path: Path) -> Log:
-    """The solution as fixes of the antenna.
+    """Read the solution as fixes of the antenna.
 
     Raises
     ------

@@ -21,7 +21,7 @@ from graphnav.core.timescales import GPS_TO_UNIX, WEEK, of_week, unix_to_gps
 from graphnav.recording.formats.text import Rows, number_table
 
 _GPS_EPOCH = np.datetime64("1980-01-06T00:00:00", "us")
-_AHEAD = {"UTC": 0.0, "JST": 9 * 3600.0}  # s ahead of UTC
+_ZONES = {"UTC": 0.0, "JST": 9 * 3600.0}  # s ahead of UTC
 _NUMBER = r"[-+]?\d+(?:\.\d*)?"
 # the columns of a position, the letters of its axes in those of sigmas, and the order of east, north, up in them
 _FORMS = {
@@ -33,10 +33,10 @@ _FORMS = {
 
 @dataclass(frozen=True)
 class Solution:
-    """The rows of a .pos file; what it does not have is None."""
+    """The rows of a .pos file; missing columns are None."""
 
     t: Array  # (K,) s of the GPS week in which the first row lies
-    gps_zero: float  # where that begins, s since the GPS epoch
+    gps_zero: float  # beginning of that week, s since the GPS epoch
     llh: Array  # (K, 3) rad, rad, m
     sd_p: Array | None  # (K, 3) m, east, north, up; so are the others
     v: Array | None  # (K, 3) m/s
@@ -47,7 +47,7 @@ class Solution:
 
 
 def parse_solution(path: Path, head: list[str], rows: Rows) -> Solution:
-    """Read the lines of a .pos file: those of its header, with %, and its rows.
+    """Parse the lines of a .pos file: its header, with %, and its rows.
 
     Raises
     ------
@@ -83,8 +83,8 @@ def parse_solution(path: Path, head: list[str], rows: Rows) -> Solution:
     if gps is None:
         gps = WEEK * table[:, 0] + table[:, 1]
     notes: list[str] = []
-    if scale in _AHEAD:
-        gps = unix_to_gps(gps + GPS_TO_UNIX - _AHEAD[scale])
+    if scale in _ZONES:
+        gps = unix_to_gps(gps + GPS_TO_UNIX - _ZONES[scale])
         sentence = f"{path.name}: times were in {scale}; the leap seconds of their date make them GPS time"
         notes.append(Note("trajectory.time_scale", sentence))
     if any("lat/lon/height=WGS84/geodetic" in line for line in head):
@@ -114,7 +114,7 @@ def parse_solution(path: Path, head: list[str], rows: Rows) -> Solution:
         frame = LocalFrame(of_base)
         llh = frame.to_llh(position)
         turns = frame.R_ln(position)
-    if turns is not None:  # into the east, north, up of the place itself
+    if turns is not None:  # into the east, north, up of the position itself
         pairs = [axes[k] + axes[(k + 1) % 3] for k in range(3)]
         sd_p, sd_v = (
             _turn_sigmas(turns, sd, take(*(f"sd{of}{pair}" for pair in pairs))) for of, sd in (("", sd_p), ("v", sd_v))
@@ -146,13 +146,13 @@ def _base(path: Path, head: list[str]) -> Array:
 
 
 def _degrees(parts: Array | None) -> Array:
-    """Degrees of degrees, which have the sign, also of zero, minutes and seconds (K, 3)."""
+    """Degrees from degrees, minutes and seconds (K, 3); the sign is that of the degrees, even of zero."""
     assert parts is not None
     return np.copysign(np.abs(parts[:, 0]) + parts[:, 1] / 60.0 + parts[:, 2] / 3600.0, parts[:, 0])
 
 
 def _turn_sigmas(turns: Array, sd: Array | None, mixed: Array | None) -> Array | None:
-    """Sigmas (K, 3) along axes that (K, 3, 3) turns to, of variances and of covariances of axes 01, 12 and 20."""
+    """Sigmas (K, 3) along the axes of rotations (K, 3, 3), from variances and covariances of axes 01, 12 and 20."""
     if sd is None:
         return None
     P = np.zeros((len(sd), 3, 3))
@@ -163,7 +163,7 @@ def _turn_sigmas(turns: Array, sd: Array | None, mixed: Array | None) -> Array |
 
 
 def _parse_dates(path: Path, rows: Rows, separator: str | None) -> tuple[Array, Rows]:
-    """Seconds since the GPS epoch of dates and times, and the rows with both taken out so that they are numbers."""
+    """Seconds since the GPS epoch of dates and times, and the rows without these, so that they are numbers."""
     joint = separator or " "
     stamps, rest = [], []
     for number, line in rows:

@@ -1,4 +1,4 @@
-"""recording.toml: every key it may hold, with its unit, and what is wrong with one that cannot be used."""
+"""recording.toml: all keys with their units, and validation."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ class GnssUnits(TomlTable):
 
 
 class FixUnits(GnssUnits):
-    """Units of gnss.csv; `type` is whose numbers the types of the fixes are."""
+    """Units of gnss.csv; `type` is the convention of the fix types."""
 
     type: Literal["rtklib", "nmea"] = "rtklib"
 
@@ -122,7 +122,7 @@ class ImuTable(SensorTable):
     up: Vector | None = None
     units: ImuUnits = ImuUnits()
     noise: Noise | None = None  # type: ignore[valid-type]
-    model: str | None = None  # of graphnav.recording.formats.imu_models; [imu.noise] goes before it
+    model: str | None = None  # of graphnav.recording.formats.imu_models; [imu.noise] overrides it
 
     @field_validator("model")
     @classmethod
@@ -143,14 +143,14 @@ class ImuTable(SensorTable):
 
     @property
     def figures(self) -> dict[str, float]:
-        """The noise figures that are stated: those of the model, with those of [imu.noise] over them."""
+        """The stated noise figures: those of the model, overridden by those of [imu.noise]."""
         model = find_model(self.model) if self.model else None
         stated: dict[str, float] = self.noise.model_dump(exclude_none=True) if self.noise else {}
         return {**(model.noise if model else {}), **stated}
 
     @property
     def R_bs(self) -> Array:
-        """Body (RFU) from the file's axes, (3, 3); ValueError if they make none."""
+        """Body (RFU) from the file's axes, (3, 3); ValueError if they are invalid."""
         if self.forward is not None and self.up is not None:
             return rotation_from_vectors(self.forward, self.up)
         return rotation_from_letters(self.axes or "RFU")
@@ -182,7 +182,7 @@ Files = Annotated[tuple[str, ...], BeforeValidator(_names)]
 
 
 class RawGnssTable(TomlTable):
-    """[raw_gnss]: observations of a receiver, and what places its satellites"""
+    """[raw_gnss]: observations of a receiver, and the data that place its satellites"""
 
     columns_known: ClassVar[tuple[str, ...]] = (
         "t", "prn", "qzss", "code", "carrier", "doppler", "range_rate", "cn0",
@@ -235,10 +235,10 @@ class OdometerTable(SensorTable):
     lever_arm: Vector = Field((0.0, 0.0, 0.0), description="m from the IMU: right, forward, up")
     scale_sigma: Positive = Field(0.02, description="1-sigma of the scale, 0.02 = 2 %")
     metres_per_pulse: Positive | None = Field(None, description="m; given, the pulses are used")
-    pulses: Literal["cumulative", "per_row"] | None = None  # None: told from the counts
+    pulses: Literal["cumulative", "per_row"] | None = None  # None: decided from the counts
     use: Literal["rear", "front", "all"] | None = None  # wheels; None: the rear ones if there is no `speed`
     speed_sigma: Positive | None = Field(None, description="m/s, of one reading")
-    signed: Annotated[bool, Strict()] | None = None  # None: told from the readings
+    signed: Annotated[bool, Strict()] | None = None  # None: estimated from the readings
     delay_sigma: NotNegative = Field(0.0, description="s, of the stamps")
 
     @model_validator(mode="after")
@@ -251,7 +251,7 @@ class OdometerTable(SensorTable):
         return self
 
     def readings(self, there: Sequence[str]) -> tuple[str, ...]:
-        """The columns the speed comes from, out of those that are there; what is wanted and not there is named too."""
+        """The columns that the speed comes from, of those present; missing columns that are required are named too."""
         if self.metres_per_pulse is not None:
             return ("pulses",)
         wanted = {"front": WHEELS[:2], "rear": WHEELS[2:], "all": WHEELS}[self.use or "rear"]
@@ -287,7 +287,7 @@ class RecordingFile(TomlTable):
     format: Literal["graphnav-recording/1"]
     name: str | None = None
     platform: Literal["vehicle", "foot"]
-    clock: str | None = None  # what t = 0 is, see graphnav.core.timescales.parse_clock; only for output
+    clock: str | None = None  # meaning of t = 0, see graphnav.core.timescales.parse_clock; only for output
     imu: ImuTable
     gnss: GnssTable | None = None
     raw_gnss: RawGnssTable | None = None
@@ -310,7 +310,7 @@ class RecordingFile(TomlTable):
 
 
 def rotation_from_letters(axes: str) -> Array:
-    """R_bs of three letters saying where the file's x, y, z point; 'BRU': x backward, y right, z up."""
+    """R_bs of three letters stating the directions of the file's x, y, z; 'BRU': x backward, y right, z up."""
     if len(axes) != 3 or any(letter not in _LETTERS for letter in axes):
         raise ValueError("must be three letters out of R/L, F/B, U/D, such as RFU, FLU or FRD")
     R_bs = np.array([_LETTERS[letter] for letter in axes], dtype=float).T
@@ -324,13 +324,13 @@ def rotation_from_letters(axes: str) -> Array:
 
 
 def rotation_from_vectors(forward: Sequence[float], up: Sequence[float]) -> Array:
-    """R_bs of two vectors in the file's axes: up is kept, forward is made square to it."""
+    """R_bs of two vectors in the file's axes: up is kept, forward is made perpendicular to it."""
     f, u = np.asarray(forward, dtype=float), np.asarray(up, dtype=float)
     if np.linalg.norm(f) < 1e-6 or np.linalg.norm(u) < 1e-6:
         raise ValueError("forward and up must not be zero")
     f, u = f / np.linalg.norm(f), u / np.linalg.norm(u)
     square = f - (f @ u) * u
-    # Below 10 degrees apart a rough up turns forward into noise.
+    # closer than 10 degrees, errors of up turn forward into noise
     if np.linalg.norm(square) < np.sin(np.radians(10.0)):
         raise ValueError("forward and up are nearly parallel")
     f = square / np.linalg.norm(square)
@@ -338,7 +338,7 @@ def rotation_from_vectors(forward: Sequence[float], up: Sequence[float]) -> Arra
 
 
 def recording_file() -> type[RecordingFile]:
-    """The whole of recording.toml, with the tables of all sensors that are known."""
+    """The model of recording.toml, with the tables of all known sensors."""
     tables: dict[str, Any] = {name: (sensor.table | None, None) for name, sensor in list_sensors().items()}
     return create_model("RecordingFile", __base__=RecordingFile, **tables)
 

@@ -1,4 +1,4 @@
-"""What no log of another program may hold, whatever its form: rows that are no numbers, or nowhere, or at no time."""
+"""Removal of invalid rows from other programs' logs: not numbers, impossible positions or times."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from graphnav.recording.formats.registry import Log
 from graphnav.recording.formats.repair import LATEST, VAGUEST, VAGUEST_V, is_on_earth
 
 
-def sound(log: Log, path: Path) -> Log:
-    """The log without rows that cannot be used, each kind of them said in a remark.
+def drop_unsound_rows(log: Log, path: Path) -> Log:
+    """The log without unusable rows; each kind of them is remarked on.
 
     Raises
     ------
@@ -56,7 +56,7 @@ def sound(log: Log, path: Path) -> Log:
 
 
 def _clean_gnss(gnss: Gnss, check_rows: Callable[[str, NDArray[np.bool_], str], bool]) -> Gnss:
-    """The fixes that are somewhere, and as sure of it as any receiver is that has a fix."""
+    """The fixes at possible positions, with the precision of a valid fix."""
     there: NDArray[np.bool_] = np.asarray(is_on_earth(*gnss.llh.T) & (np.abs(gnss.t) <= LATEST))
     first = gnss.llh[~there][:1]
     at = "".join(f" (the first at {np.degrees(p[0]):.7g}, {np.degrees(p[1]):.7g} deg, {p[2]:.7g} m)" for p in first)

@@ -1,4 +1,4 @@
-"""CSV files of numbers, read with whole-array arithmetic and explained line by line when they fail."""
+"""CSV files of numbers, parsed with whole-array arithmetic; line by line for error messages."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from graphnav.core.files import exists, open_file, parse_number
 from graphnav.core.rotation import Array
 from graphnav.recording.formats.decimals import read_decimals
 
-_BLANK = re.compile(r"(?m)(?:(?<=,)|^(?=[ \t]*,))[ \t]*(?=,|$)")  # an empty cell of a line that has cells
-_MARKS = {";": "a semicolon", "\t": "a tab", " ": "blanks"}  # between fields, in the order in which they are looked for
+_BLANK = re.compile(r"(?m)(?:(?<=,)|^(?=[ \t]*,))[ \t]*(?=,|$)")  # an empty cell of a line that is not empty
+_MARKS = {";": "a semicolon", "\t": "a tab", " ": "blanks"}  # separators, in the order of their tests
 
 
 Mask = Any  # an array of bool, or of row numbers
@@ -28,14 +28,14 @@ Mask = Any  # an array of bool, or of row numbers
 
 @dataclass(frozen=True)
 class Table:
-    """The wanted columns of one file, by our names, NaN where a cell is blank."""
+    """The requested columns of one file, by our names, NaN where a cell is blank."""
 
     path: Path
     columns: dict[str, Array]  # each (N,)
     file_names: dict[str, str]  # our name -> the file's
-    rows: NDArray[np.intp]  # (N,) which rows of the file these are
+    rows: NDArray[np.intp]  # (N,) row numbers in the file
 
-    KEEP: ClassVar[str] = "keep"  # the name under which the column of `keep` is found
+    KEEP: ClassVar[str] = "keep"  # name of the column of `keep`
 
     def __len__(self) -> int:
         return len(next(iter(self.columns.values())))
@@ -47,7 +47,7 @@ class Table:
         return self.columns[name]
 
     def get(self, name: str, default: Array) -> Array:
-        """A column, or what stands for it."""
+        """A column, or the default if it is missing."""
         return self.columns.get(name, default)
 
     def stack(self, *names: str) -> Array:
@@ -55,12 +55,12 @@ class Table:
         return np.stack([self.columns[n] for n in names], -1)
 
     def release(self, *names: str) -> None:
-        """Let go of columns that nothing is to be read from any more: of a day of an IMU each is 140 MB."""
+        """Release columns that are no longer needed: for a day of an IMU each is 140 MB."""
         for name in names:
             del self.columns[name]
 
     def take(self, mask: Mask) -> Table:
-        """The rows of a mask or an index array."""
+        """Select rows by a mask or an index array."""
         return replace(self, columns={n: c[mask] for n, c in self.columns.items()}, rows=self.rows[mask])
 
     def with_column(self, name: str, values: Array) -> Table:
@@ -125,7 +125,7 @@ def read_table(
 
 
 def _list_names(header: list[str]) -> str:
-    """The names of columns, as many as people look at."""
+    """The names of columns, shortened to a readable number."""
     names = [name[:40] for name in header[:30]]
     return ", ".join(names if len(names) == len(header) else [*names, "..."])
 
@@ -184,7 +184,7 @@ def _open_bytes(path: Path) -> IO[bytes]:
 
 
 def _read_header(path: Path) -> tuple[int, list[str]]:
-    """How many lines come before the data, and the column names."""
+    """Number of lines before the data, and the column names."""
     with _open_bytes(path) as raw:
         start = raw.read(1 << 16)
     if start[:2] in (b"\xff\xfe", b"\xfe\xff"):
@@ -224,11 +224,11 @@ def _is_number(text: str) -> bool:
 
 
 def _parse(path: Path, skip: int, header: list[str], use: list[int]) -> list[Array]:
-    """The wanted columns, (N,) each: plain numbers, else as NumPy reads them, else cell by cell."""
+    """The requested columns, (N,) each: plain numbers, else as NumPy parses them, else cell by cell."""
     try:
         with _open_bytes(path) as raw:
             head = b"".join(raw.readline() for _ in range(skip))
-            if len(head.splitlines()) == skip:  # else lines end in a way of their own
+            if len(head.splitlines()) == skip:  # otherwise lines end in an unusual way
                 return read_decimals(raw, len(header), use)
     except ValueError:
         pass
@@ -242,13 +242,13 @@ def _parse(path: Path, skip: int, header: list[str], use: list[int]) -> list[Arr
 
 
 def _load_text(text: str, skip: int, header: list[str], use: list[int]) -> Array:
-    # With usecols NumPy checks only that no row is too short for those.
+    # with usecols NumPy checks only that no row is too short for those
     for line in text.splitlines()[skip:]:
         cells = line.partition("#")[0].strip()
         if cells and cells.count(",") != len(header) - 1:
             raise ValueError("rows and header differ in length")
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # no rows: said by the caller
+        warnings.simplefilter("ignore", UserWarning)  # no rows: reported by the caller
         values = np.loadtxt(
             io.StringIO(_BLANK.sub("nan", text)),
             delimiter=",",
@@ -262,7 +262,7 @@ def _load_text(text: str, skip: int, header: list[str], use: list[int]) -> Array
 
 
 def _list_lines(path: Path) -> Iterator[tuple[int, str]]:
-    """(line number, text) of every line after the header that holds something."""
+    """(line number, text) of every non-empty line after the header."""
     with _open(path) as file:
         seen_header = False
         for number, line in enumerate(file, 1):
@@ -273,7 +273,7 @@ def _list_lines(path: Path) -> Iterator[tuple[int, str]]:
 
 
 def _suggest_cause(cell: str, cells: list[str], header: list[str], use: list[int]) -> str:
-    """What a cell that is no number may be, and what to do."""
+    """The likely meaning of a cell that is not a number, and what to do."""
     if [one.strip('"') for one in cells] == header:
         return "; the header is there again: cut the file in two there, or take the line out"
     if re.fullmatch(r"(\d+-\d+-\d+[T ])?\d{1,2}:\d{2}(:\d{2}([.,]\d*)?)?Z?", cell):
@@ -284,7 +284,7 @@ def _suggest_cause(cell: str, cells: list[str], header: list[str], use: list[int
 
 
 def _parse_cells(path: Path, header: list[str], use: list[int]) -> Array:
-    """The slow and careful way, which says what is wrong and where."""
+    """The slow parser, which reports what is wrong and where."""
     rows = []
     try:
         for number, line in _list_lines(path):

@@ -1,4 +1,4 @@
-"""Text files without a header that names their columns: lines, and tables of numbers with errors that name the line."""
+"""Text files without column names: lines, and tables of numbers with errors that name the line."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def text_lines(path: Path) -> list[str]:
 def number_table(
     path: Path, rows: list[tuple[int, str]], names: list[str], delimiter: str | None, wanted: set[str] | None = None
 ) -> Array:
-    """Numbers (K, n) of text rows, NaN for a blank and in columns not `wanted`, which may hold words.
+    """Numbers (K, n) of text rows, NaN for blanks and for columns not `wanted`, which may hold words.
 
     Errors name the line and the column.
     """
@@ -46,7 +46,7 @@ def number_table(
                 return table
     except ValueError:
         pass
-    for number, line in rows:  # only to say where; the fast reader does not
+    for number, line in rows:  # only to locate the error, which the fast parser does not
         fields = line.split(delimiter)
         if len(fields) != len(names):
             raise RecordingError(

@@ -32,14 +32,15 @@ from graphnav.recording.formats.repair import LATEST
 from graphnav.recording.formats.rtklib_solution import parse_solution
 from graphnav.recording.formats.text import number_table, text_lines
 
-_FARTHEST = 1e8  # m, twice around the Earth, whatever coordinates count from
+_MAX_COORDINATE = 1e8  # m, twice around the Earth, whatever the coordinates' origin
 _DEG = np.pi / 180.0
 _UNITS = {"t": "s", "lat": "deg", "lon": "deg", "h": "m", "x": "m", "y": "m", "z": "m"} | dict.fromkeys(
     ("ve", "vn", "vu", "vd"), "mps"
 )
 _UNITS |= dict.fromkeys(("roll", "pitch", "heading"), "deg")
-_SIGMAS = "sd_e sd_n sd_u sd_ve sd_vn sd_vu sd_roll sd_pitch sd_heading"
-_KNOWN = {*_UNITS, *_SIGMAS.split(), *["bgx", "bgy", "bgz", "bax", "bay", "baz"]}  # read; others may hold anything
+_SIGMA_COLUMNS = "sd_e sd_n sd_u sd_ve sd_vn sd_vu sd_roll sd_pitch sd_heading"
+# columns that are read; others may hold anything
+_KNOWN_COLUMNS = {*_UNITS, *_SIGMA_COLUMNS.split(), *["bgx", "bgy", "bgz", "bax", "bay", "baz"]}
 
 
 def read_trajectory(path: str | Path) -> Trajectory:
@@ -59,7 +60,7 @@ def read_trajectory(path: str | Path) -> Trajectory:
     Raises
     ------
     RecordingError
-        Naming the file, and the line and field where there is one, if it cannot be read as it is.
+        If it cannot be read; the message names the file and, if there is one, the line and field.
     """
     path = Path(path)
     lines = text_lines(path)
@@ -100,7 +101,7 @@ def _build(
     gps_zero: float | None = None,
     **optional: Array | None,
 ) -> Trajectory:
-    """Check time and position, leave out what cannot be used, and say so."""
+    """Check time and position and drop unusable rows, with notes."""
     numbers = np.array([number for number, _ in rows])
     if (bad := ~(np.abs(t) <= LATEST)).any():
         raise RecordingError(f"{path}, line {numbers[bad][0]}, t: {t[bad][0]:g} is no time in s", key="table.cell")
@@ -120,7 +121,7 @@ def _build(
                 key="table.place",
             )
     metres = position if local else position[:, 2:]
-    if (bad := np.abs(metres) > _FARTHEST).any():
+    if (bad := np.abs(metres) > _MAX_COORDINATE).any():
         k, axis = (int(i) for i in np.argwhere(bad)[0])
         raise RecordingError(
             f"{path}, line {numbers[k]}: {metres[k, axis]:g} m is no place of a drive", key="table.place"
@@ -158,7 +159,7 @@ def _read_csv(path: Path, rows: list[tuple[int, str]]) -> Trajectory:
     rows = rows[1:]
     if not rows:
         raise RecordingError(f"{path}: a header and no rows", key="file.no_rows")
-    # A unit that is ours may be part of the name; any other is left as it is and so not found.
+    # a unit of ours may be part of the name; any other is left in the name, which is then not found
     columns = {(base if _UNITS.get(base := name.rpartition("_")[0]) == name.rpartition("_")[2] else name): k
                for k, name in enumerate(names)}  # fmt: skip
     local = "lat" not in columns and {"x", "y"} <= columns.keys()
@@ -167,7 +168,7 @@ def _read_csv(path: Path, rows: list[tuple[int, str]]) -> Trajectory:
         raise RecordingError(
             f"{path}, line 1: no column '{missing[0]}'; found {', '.join(names)[:300]}", key="table.column"
         )
-    wanted = {names[k] for name, k in columns.items() if name in _KNOWN}
+    wanted = {names[k] for name, k in columns.items() if name in _KNOWN_COLUMNS}
     table = number_table(path, rows, names, ",", wanted)
 
     def take(*wanted: str, scale: float = 1.0) -> Array | None:

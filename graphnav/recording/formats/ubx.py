@@ -25,14 +25,14 @@ from graphnav.recording.formats.repair import Remarks
 _SYNC = b"\xb5\x62"
 _PVT, _HP, _MEAS, _RAW = (1, 7), (1, 0x14), (0x10, 2), (0x10, 3)
 _GYRO, _ACCEL, _SPEED = (14, 13, 5), (16, 17, 18), 11
-_SCALE = dict.fromkeys(_GYRO, np.pi / 180 * 2.0**-12) | dict.fromkeys(_ACCEL, 2.0**-10) | {_SPEED: 1e-3}
-_TICKS = (1e-3, 39.0625e-6, 1e-6)  # s, of the sensors' time tags in various receivers
+_SCALES = dict.fromkeys(_GYRO, np.pi / 180 * 2.0**-12) | dict.fromkeys(_ACCEL, 2.0**-10) | {_SPEED: 1e-3}
+_TICKS = (1e-3, 39.0625e-6, 1e-6)  # s, ticks of the sensors' time tags in various receivers
 _WRAP = 2.0**32
 
 
 @dataclass
 class _Content:
-    """What a log says, in the order of its messages."""
+    """The contents of a log, in the order of its messages."""
 
     pvt: list[Any] = field(default_factory=list)
     precise: dict[int, Any] = field(default_factory=dict)  # NAV-HPPOSLLH by iTOW
@@ -42,13 +42,13 @@ class _Content:
 
 
 def recognises(path: Path) -> bool:
-    """Whether a frame of one of the messages that are used is in the first bytes, be NMEA between them or not."""
+    """Whether there is a frame of one of the used messages in the first bytes, with or without NMEA between frames."""
     head = first_bytes(path, 1 << 18)
     return any(_SYNC + bytes(kind) in head for kind in (_PVT, _MEAS, _RAW))
 
 
 def load(path: Path) -> Log:
-    """Fixes, and the receiver's own IMU and wheel where the log has them.
+    """Read fixes, and the receiver's own IMU and wheel speed if the log has them.
 
     Raises
     ------
@@ -87,7 +87,7 @@ def _collect_messages(path: Path) -> _Content:
         while True:
             try:
                 raw, _ = reader.read()
-            except Exception:  # bytes between the frames that look like another protocol and are not
+            except Exception:  # bytes between the frames that only resemble another protocol
                 content.broken += 1
                 continue
             if raw is None:
@@ -99,7 +99,7 @@ def _collect_messages(path: Path) -> _Content:
                 continue
             try:
                 message = pyubx2.UBXReader.parse(raw)
-            except Exception:  # pyubx2's own errors, and what a frame of another version makes it stumble over
+            except Exception:  # pyubx2's own errors, and any that a frame of another version causes in it
                 content.broken += 1
                 continue
             if kind == _PVT:
@@ -130,17 +130,17 @@ def _note(content: _Content, message: Any, is_raw: bool) -> int | None:
             if not hasattr(message, f"dataField_{count:02d}"):
                 return tag
             kind, value = getattr(message, f"dataType_{count:02d}"), getattr(message, f"dataField_{count:02d}")
-        if kind in _SCALE:
+        if kind in _SCALES:
             signed = value - (1 << 24) if value & 0x800000 else value
             assert tag is not None
-            content.samples.setdefault(kind, []).append((tag, signed * _SCALE[kind]))
+            content.samples.setdefault(kind, []).append((tag, signed * _SCALES[kind]))
 
 
 def _find_week_start(message: Any) -> float | None:
-    """Where the GPS week of a NAV-PVT began, s since the GPS epoch; None without a date."""
+    """Beginning of the GPS week of a NAV-PVT, s since the GPS epoch; None without a date."""
     try:
         date = datetime.date(message.year, message.month, message.day)
-    except ValueError:  # 0/0/0 of a receiver that does not know it yet
+    except ValueError:  # 0/0/0 while the receiver does not know the date
         return None
     if date.year < 1980:
         return None
@@ -150,7 +150,7 @@ def _find_week_start(message: Any) -> float | None:
 
 
 def _unroll_tow(messages: list[Any]) -> Array:
-    """Times of NAV-PVT messages in s, running on over the end of a week."""
+    """Times of NAV-PVT messages in s, continuous over the end of a week."""
     t = np.array([m.iTOW for m in messages]) * 1e-3
     return np.asarray(t + WEEK * np.cumsum(np.concatenate([[0.0], np.diff(t) < -0.5 * WEEK])))
 
@@ -189,14 +189,14 @@ def _read_gnss(fixes: list[Any], content: _Content, remarks: Remarks) -> Gnss:
 
 
 def _classify_fix(message: Any) -> int:
-    """Of FIX_TYPES: by the carrier phases, then by the corrections; one that leans on an IMU is of neither kind."""
+    """Fix type of FIX_TYPES: by the carrier phases, then by the corrections; 0 for one that depends on an IMU."""
     if message.carrSoln in (1, 2):
         return 1 if message.carrSoln == 2 else 2
     return 0 if message.fixType == 4 else 4 if message.diffSoln else 5
 
 
 def _read_sensors(path: Path, content: _Content, remarks: Remarks) -> tuple[Imu | None, Odometer | None]:
-    """The receiver's IMU and wheel, on the clock of the fixes where there are any."""
+    """The receiver's IMU and wheel speed, on the clock of the fixes if there are any."""
     series = {k: np.array(v, dtype=float).T for k, v in content.samples.items()}
     for k in series:
         tags = series[k][0]
@@ -232,13 +232,13 @@ def _read_sensors(path: Path, content: _Content, remarks: Remarks) -> tuple[Imu 
 
 
 def _drop_repeated(series: Array) -> tuple[Array, Array]:
-    """Time tags in order, each once, and the values."""
+    """Time tags in order, without repetitions, and the values."""
     tags, first = np.unique(series[0], return_index=True)
     return tags, series[1][first]
 
 
 def _fit_clock(content: _Content, remarks: Remarks) -> tuple[float, float]:
-    """Seconds per time tag, and GPS seconds of the week at tag 0, by which tags came last before which fix."""
+    """Seconds per time tag, and GPS seconds of the week at tag 0, from the last tags before each fix."""
     if len(content.last_tag) < 2:
         remarks.add("log.sensor_clock_unknown", "clock of the sensors: their own time tags, taken as ms")
         return _TICKS[0], 0.0

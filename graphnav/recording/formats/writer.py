@@ -1,4 +1,4 @@
-"""Writes a recording folder: SI, degrees for angles, body axes RFU, every number such that it reads back unchanged."""
+"""Writer of recording folders: SI, degrees for angles, body axes RFU; all numbers read back unchanged."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ class _File:
 
 
 def write_recording(log: Log, folder: Path) -> list[Path]:
-    """Write `log` into `folder`, which is made if need be; returns the files, recording.toml first.
+    """Write `log` into `folder`, which is created if need be; returns the files, recording.toml first.
 
-    Without an IMU the folder is no recording yet: its recording.toml names an imu.csv that has to be put there.
+    Without an IMU the folder is not a recording yet: its recording.toml names an imu.csv that must be added.
     """
     folder.mkdir(parents=True, exist_ok=True)
     files = [
@@ -71,10 +71,10 @@ def write_folder(recording: Recording, folder: str | Path, notes: Sequence[str] 
 
 
 def degrees(angle: Array) -> Array:
-    """Degrees that, times pi/180, give back the radians bit for bit where there are any such.
+    """Degrees that, times pi/180, give the radians bit for bit if such exist.
 
-    There are where the radians were made from degrees; the fewest digits that will do are chosen. Elsewhere the
-    result is the nearest, off by a part in 1e16.
+    They do where the radians were converted from degrees; those with the fewest digits are chosen. Otherwise the result
+    is the nearest, with an error of a part in 1e16.
     """
     plain = np.asarray(angle, dtype=float) / _DEG
     best = plain.copy()
@@ -131,7 +131,7 @@ def _write_odometer(log: Log) -> _File | None:
 
 
 def _write_series(series: Series) -> _File:
-    """Its columns in the units that are usual in files; those that no row has are left out."""
+    """Its columns in their default units; columns without values are omitted."""
     header, columns = ["t"], [series.t]
     for column in series.sensor.columns:
         values, size = series[column.name], next(iter(column.units.values()))
@@ -163,7 +163,7 @@ def write_csv(path: Path, header: list[str], columns: list[Array]) -> None:
     """Write columns as gzipped CSV; NaN is blank."""
     table = np.column_stack(columns)
     row = ",".join(["%r"] * len(header)) + "\n"
-    # no time stamp in the file: the same log gives the same bytes
+    # no time stamp in the file, so that the same log gives the same bytes
     with path.open("wb") as raw, gzip.GzipFile("", "wb", 4, raw, mtime=0) as file:
         file.write((",".join(header) + "\n").encode())
         for start in range(0, len(table), 2000):
@@ -245,7 +245,7 @@ def _write_noise(noise: ImuNoise, assumed: bool) -> list[str]:
 
 
 def _format_value(value: Any) -> str:
-    """JSON's numbers, texts and lists are TOML's as well."""
+    """JSON's numbers, strings and lists are valid TOML."""
     return quote(value) if isinstance(value, str) else json.dumps(value)
 
 

@@ -1,4 +1,4 @@
-"""What a made recording keeps of its digits, and the facts beside it; `writer` writes the folder."""
+"""Rounding of made recordings, and the facts beside them; `writer` writes the folder."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from graphnav.sensors.tables import ANGLE
 
 __all__ = ["round_recording", "write_facts", "write_folder"]
 
-# digits after the point, each far below what any sensor resolves
+# digits after the decimal point, each far below any sensor's resolution
 _T, _RATE, _FORCE, _LAT_LON, _M, _M_S, _DEG = 6, 9, 7, 10, 4, 5, 7
 
 
 def round_recording(recording: Recording) -> Recording:
-    """The recording with the digits that a file of it should have: what is written is what is read again."""
+    """The recording rounded to the digits of its files: what is written is what is read again."""
     imu = recording.imu
     imu = replace(imu, t=_cut(imu.t, _T), gyro=_cut(imu.gyro, _RATE), accel=_cut(imu.accel, _FORCE))
     gnss, odometer, truth = recording.gnss, recording.odometer, recording.truth
@@ -53,13 +53,13 @@ def _cut_llh(llh: Array) -> Array:
 
 
 def _to_degrees(rph: Array) -> Array:
-    """Roll and pitch as they are, heading from 0 to below 360."""
+    """Roll and pitch unchanged, heading from 0 to below 360."""
     degrees = _cut(rph / ANGLE["deg"], _DEG)
     degrees[:, 2] = _cut(np.mod(degrees[:, 2], 360.0), _DEG) % 360.0
     return degrees
 
 
 def write_facts(path: Path, facts: Mapping[str, Any]) -> Path:
-    """What is known of a recording and no sensor says, as JSON beside it."""
+    """Write facts about a recording that no sensor measures, as JSON beside it."""
     path.write_text(json.dumps(facts, indent=2) + "\n", encoding="utf-8")
     return path

@@ -1,4 +1,4 @@
-"""Odometers as they are: what a reading is worth, where readings are wrong, and the mean speed over any window."""
+"""Odometers: error of a reading, wrong readings, and the mean speed over any window."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ from graphnav.recording.odometer.faults import Faults, faults
 from graphnav.recording.odometer.mean import (
     MeanSpeed,
     ReadingStatistics,
-    counts,
+    find_gaps,
     find_longest_step,
-    gaps,
-    quantum,
+    find_pulse_length,
+    find_quantum,
     reading_sigma,
 )
 
@@ -17,10 +17,10 @@ __all__ = [
     "Faults",
     "MeanSpeed",
     "ReadingStatistics",
-    "counts",
     "faults",
+    "find_gaps",
     "find_longest_step",
-    "gaps",
-    "quantum",
+    "find_pulse_length",
+    "find_quantum",
     "reading_sigma",
 ]

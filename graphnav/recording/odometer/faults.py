@@ -1,15 +1,15 @@
-"""Where an odometer does not say what the wheels do: unplugged, stuck at zero, frozen, wild.
+"""Spans in which odometer readings are wrong: unplugged, stuck at zero, frozen, erratic.
 
-Speed read, less the forward force integrated, is almost a constant while an odometer is right: what is left are the
-slope of the road and biases, which change slowly, and of the slope the gyro knows the changes::
+The speed read, minus the integral of the forward force, is almost constant while an odometer works: what remains is due
+to the slope of the road and biases, which change slowly, and the gyro measures changes of the slope::
 
     x(t) = v(t) - integral of (f_y - g pitch - c) dt       pitch: integral of the pitch rate
-                                                           c: median of what is missing, within half a minute
+                                                           c: median of the remainder, within half a minute
 
-So x may not change within a short time by more than the error of two readings and what is not known of the force.
-Where it does, something is wrong (a *break*); which side of it is wrong is told by what comes before and after:
-readings that stay the same are stuck, and a short stretch between others that agree is wild. Without a usable IMU
-there is what tyres can grip.
+So x may not change within a short time by more than the error of two readings and the uncertainty of the force. Where
+it does, something is wrong (a *break*); the readings before and after show which side of it: readings that stay the
+same are stuck, and a short span between others that agree is erratic. Without a usable IMU the limit is the grip of
+tyres.
 """
 
 from __future__ import annotations
@@ -23,47 +23,47 @@ from graphnav.core.findings import period_of, runs_of
 from graphnav.core.rotation import Array
 from graphnav.core.running import run_median
 from graphnav.recording import Imu, Odometer
-from graphnav.recording.odometer.mean import ReadingStatistics, gaps
+from graphnav.recording.odometer.mean import ReadingStatistics, find_gaps
 
 GAP, STUCK, FROZEN, WILD = "no readings", "stuck at zero", "frozen", "against the motion"
 
 _G = 9.81  # m/s^2
-_GRIP = 1.2 * _G  # m/s^2, more than tyres transmit on any road
-_SLOPE = 0.05 * _G  # m/s^2, what may be unknown of the force: 3 degrees of pitch
-_LAG_ERROR = 0.5  # s, shorter windows are not better known: the delay is known to some hundredths only
+_GRIP = 1.2 * _G  # m/s^2, above the grip of tyres on any road
+_FORCE_ERROR = 0.05 * _G  # m/s^2, uncertainty of the force: 3 degrees of pitch
+_LAG_ERROR = 0.5  # s; shorter windows are no more certain, as the delay is known to some hundredths only
 _RADIUS = 0.05  # of the speed: scale, and tyres on bumps
-_DEAF = 1.0  # m/s, below which passive sensors do not see a wheel turn (ABS: about 3 km/h)
-_BACKWARD = 6.0  # m/s, the fastest that anyone reverses
-_WINDOWS = (0.0, 0.5, 1.0, 2.0, 4.0)  # s over which x is compared; 0: neighbours
-_TIMES_TYPICAL = 6.0  # times the 90th percentile of the drive itself: an IMU or axes that are worse than thought
-_LATEST = 1.5  # s an odometer may be late (or a third of it early)
-_ALIKE = 0.05  # m/s in a second, on average: as good as no change
+_DEAF = 1.0  # m/s, below which passive sensors do not detect a turning wheel (ABS: about 3 km/h)
+_BACKWARD = 6.0  # m/s, fastest speed in reverse
+_WINDOWS = (0.0, 0.5, 1.0, 2.0, 4.0)  # s over which x is compared; 0: adjacent readings
+_TIMES_TYPICAL = 6.0  # multiple of the 90th percentile of the drive itself: an IMU or axes that are worse than assumed
+_LATEST = 1.5  # s, largest delay of an odometer (or a third of it early)
+_ALIKE = 0.05  # m/s per second, on average: no significant change
 _STAYS = 0.5  # s of equal readings (five at least) that may be stuck
-_LONGER = 5.0  # times what all but one in a hundred readings are repeated
+_LONGER = 5.0  # multiple of the duration that 99 % of repetitions stay below
 _SPIKE = 1.0  # s
-_ISLAND = 10.0  # s that can be bridged with the IMU
-_TURN = 0.05  # rad/s for a second: nothing that stands turns like that
-_SHAKEN = 5  # s in a row that shake as in motion
+_ISLAND = 10.0  # s that the IMU can bridge
+_MOVING_RATE = 0.05  # rad/s for a second: above that of any stationary vehicle
+_SHAKEN = 5  # consecutive seconds with vibration as in motion
 
 
 @dataclass(frozen=True)
 class Faults:
-    """Spans that are not to be used, in order, and why."""
+    """Spans that are not to be used, ordered, with reasons."""
 
     spans: Array  # (M, 2) s, [first bad reading, next good one)
     reasons: tuple[str, ...]
-    lag: float | None = None  # s by which the odometer is late, as far as the IMU can tell
+    lag: float | None = None  # s, delay of the odometer as far as the IMU shows it
 
 
 def faults(
     odometer: Odometer, imu: Imu | None = None, figures: ReadingStatistics | None = None, lag: float | None = None
 ) -> Faults:
-    """Where readings are missing or wrong; see the module's head. Times are those of the odometer's own stamps.
+    """Spans of missing or wrong readings, by the method above, in the odometer's own time.
 
     `figures` and `lag` (s) are what is known of the odometer already.
     """
     figures = figures or ReadingStatistics.of(odometer)
-    found = [(a, b, GAP) for a, b in gaps(odometer.t, figures.longest)]
+    found = [(a, b, GAP) for a, b in find_gaps(odometer.t, figures.longest)]
     if len(odometer.t) >= 10:
         motion = _compute_motion(odometer, imu, lag) if imu is not None and len(imu.t) > 10 else None
         found += _find_wrong(odometer, imu, motion, figures)
@@ -74,15 +74,15 @@ def faults(
 
 @dataclass(frozen=True)
 class _InertialMotion:
-    """What the IMU knows at the odometer's times."""
+    """The motion by the IMU at the odometer's times."""
 
-    force: Array  # (M,) m/s, forward force integrated, slope and bias taken off
+    force: Array  # (M,) m/s, forward force integrated, without slope and bias
     known: NDArray[np.bool_]  # (M,)
-    lag: float  # s by which the odometer is late
+    lag: float  # s, delay of the odometer
 
 
 def _find_axes(imu: Imu) -> tuple[Array, Array]:
-    """Forward square to up, and up as gravity has it, in body axes."""
+    """Forward, perpendicular to up, and up by gravity, in body axes."""
     up = np.median(imu.accel, axis=0)
     size = np.linalg.norm(up)
     up = up / size if size > 0.5 * _G else np.array([0.0, 0.0, 1.0])
@@ -110,16 +110,16 @@ def _compute_motion(odometer: Odometer, imu: Imu, known: float | None) -> _Inert
         return off, run_median(off, min(31, len(off) // 2 * 2 - 1))
 
     def size(off: Array) -> float:
-        return float(np.mean(np.minimum(np.abs(off), 1.0)))  # what is wrong has no more say than 1 m/s
+        return float(np.mean(np.minimum(np.abs(off), 1.0)))  # outliers count no more than 1 m/s
 
     lags = np.arange(-_LATEST / 3.0, _LATEST + 0.01, 0.05) if known is None else np.array([known])
     misfits = [size(np.subtract(*missing(lag))) for lag in lags]
     lag, left = float(lags[int(np.argmin(misfits))]), min(misfits)
-    # clocks far apart, wrong axes: the force explains nothing of the changes of speed
+    # unrelated clocks or wrong axes: the force does not explain the changes of speed
     if left > max(0.5 * size(change), _ALIKE) and size(change) > _ALIKE:
         return None
     slow = missing(lag)[1]
-    # the sum of c, at the middles of the seconds; beyond them it goes on as it was
+    # the sum of c, at the middles of the seconds; extrapolated beyond them
     at = t - lag
     ends = np.r_[min(at[0], seconds[0]) - 1.0 - lag, seconds + 0.5 - lag, max(at[-1], seconds[-1]) + 2.0]
     c = np.r_[slow[0], slow, slow[-1]]
@@ -134,7 +134,7 @@ def _compute_motion(odometer: Odometer, imu: Imu, known: float | None) -> _Inert
 def _find_breaks(
     odometer: Odometer, motion: _InertialMotion | None, figures: ReadingStatistics
 ) -> list[tuple[int, int]]:
-    """Pairs of readings between which x changes by more than it can, the closest pairs that show it, in order."""
+    """Pairs of readings between which x changes by more than is possible, the closest ones that show it, ordered."""
     t, v = odometer.t, odometer.speed
     error = figures.step + 6.0 * figures.sigma
     period = period_of(t)
@@ -160,14 +160,16 @@ def _find_breaks(
             if known.any():
                 moved = known & (fast > 0.0)
                 typical = _TIMES_TYPICAL * float(np.percentile(off[moved], 90.0)) if moved.any() else 0.0
-                limit = np.maximum(allowed + _SLOPE * np.maximum(dt, _LAG_ERROR), typical)
+                limit = np.maximum(allowed + _FORCE_ERROR * np.maximum(dt, _LAG_ERROR), typical)
                 bad |= known & (off > limit)
         found += _intersect(i[bad], j[bad], found)
     return sorted(found)
 
 
 def _intersect(i: NDArray[np.intp], j: NDArray[np.intp], found: list[tuple[int, int]]) -> list[tuple[int, int]]:
-    """What windows [i, j] that overlap have in common (or cover), without those that show a break found already."""
+    """The intersection of overlapping windows [i, j] (or their union), without those that show a break found
+    already.
+    """
     out: list[tuple[int, int]] = []
     if found:
         begins, ends = np.array(found).T
@@ -188,14 +190,14 @@ def _find_wrong(
     breaks = _find_breaks(odometer, motion, figures)
     equal = [(a - 1, b - 1) for a, b in runs_of(np.r_[False, v[1:] == v[:-1]])]  # first and last of equal readings
     stays = [(a, b) for a, b in equal if b - a >= 4 and t[b] - t[a] >= _STAYS]
-    bad: list[tuple[int, int, str]] = []  # first bad reading, first good one
+    bad: list[tuple[int, int, str]] = []  # first wrong reading, first right one
     bad += _find_islands(t, v, motion, breaks, stays, _SPIKE)
     bad += _find_stuck(t, v, motion, breaks, stays)
     bad += _find_noiseless(v, figures, equal, stays)
     if motion is not None and imu is not None:
         bad += _find_moving_zeros(odometer, imu, motion.lag, stays)
     bad += _find_islands(t, v, motion, breaks, stays, _ISLAND)
-    bad += [(k + 1, max(m, k + 2), WILD) for k, m in breaks]  # which side is right is unknown
+    bad += [(k + 1, max(m, k + 2), WILD) for k, m in breaks]  # it is unknown which side is right
     return _merge(t, bad)
 
 
@@ -205,7 +207,7 @@ def _can_follow(t: Array, v: Array, motion: _InertialMotion | None, i: int, j: i
     gained = 0.0 if motion is None else motion.force[j] - motion.force[i]
     if motion is None or abs(gained) > 1e5:
         return bool(abs(v[j] - v[i]) <= _GRIP * apart)
-    return bool(abs(v[j] - v[i] - gained) <= _SLOPE * max(apart, _LAG_ERROR) + _RADIUS * max(v[i], v[j]) + 1e-9)
+    return bool(abs(v[j] - v[i] - gained) <= _FORCE_ERROR * max(apart, _LAG_ERROR) + _RADIUS * max(v[i], v[j]) + 1e-9)
 
 
 def _find_islands(
@@ -216,7 +218,7 @@ def _find_islands(
     stays: list[tuple[int, int]],
     longest: float,
 ) -> list[tuple[int, int, str]]:
-    """What lies between two breaks, where what is before and after agrees; the breaks are taken off the list."""
+    """Spans between two breaks whose surroundings agree; their breaks are removed from the list."""
     out, k = [], 0
     while k + 1 < len(breaks):
         (before, begin), (end, after) = breaks[k], breaks[k + 1]
@@ -232,11 +234,11 @@ def _find_islands(
 def _find_stuck(
     t: Array, v: Array, motion: _InertialMotion | None, breaks: list[tuple[int, int]], stays: list[tuple[int, int]]
 ) -> list[tuple[int, int, str]]:
-    """Equal readings with a break at either end or within; the breaks are taken off the list."""
+    """Equal readings with a break at either end or within; their breaks are removed from the list."""
     out = []
     for a, b in stays:
         mine = [(i, j) for i, j in breaks if i <= b and j >= a]
-        # a break at the end alone: what comes then is wild, if the motion cannot have led there from the first of them
+        # a break at the end only: the readings after it are erratic, if the motion cannot have led there
         if not mine or (mine[0][0] >= b and not _can_follow(t, v, motion, a, mine[-1][1])):
             continue
         for one in mine:
@@ -245,7 +247,7 @@ def _find_stuck(
         begin = a + (v[a] != 0.0)
         if first < a:
             begin = first + 1
-        elif v[a] == 0.0 and mine[0][1] <= b:  # where it stood before it was stuck, its zeros were true
+        elif v[a] == 0.0 and mine[0][1] <= b:  # zeros before the vehicle started to move were right
             begin = 1 + (first if motion is None else _find_departure(t, motion.force, a, first))
         out.append((begin, max(last, b + 1), STUCK if v[a] == 0.0 else FROZEN))
     return out
@@ -254,7 +256,9 @@ def _find_stuck(
 def _find_noiseless(
     v: Array, figures: ReadingStatistics, equal: list[tuple[int, int]], stays: list[tuple[int, int]]
 ) -> list[tuple[int, int, str]]:
-    """Readings that stay the same while moving, of a sensor whose noise is above its step: it never is so still."""
+    """Readings that stay the same in motion, of a sensor whose noise exceeds its resolution and so never repeats for
+    long.
+    """
     if figures.sigma < 2.0 * figures.step:
         return []
     repeats = np.array([b - a for a, b in equal if v[a] != 0.0])
@@ -264,10 +268,10 @@ def _find_noiseless(
 
 
 def _find_departure(t: Array, force: Array, earliest: int, k: int) -> int:
-    """The reading at which what moves at k began to move: back while the force of the second before says so."""
+    """The reading at which the motion at k began: back as long as the force of the preceding second shows it."""
     while k > earliest:
         before = max(int(np.searchsorted(t, t[k] - 1.0)), earliest)
-        if abs(force[k] - force[before]) <= _SLOPE * (t[k] - t[before]):
+        if abs(force[k] - force[before]) <= _FORCE_ERROR * (t[k] - t[before]):
             break
         k -= 1
     return k
@@ -276,7 +280,7 @@ def _find_departure(t: Array, force: Array, earliest: int, k: int) -> int:
 def _find_moving_zeros(
     odometer: Odometer, imu: Imu, lag: float, stays: list[tuple[int, int]]
 ) -> list[tuple[int, int, str]]:
-    """Zeros while the vehicle turns, or shakes as it does when it moves."""
+    """Zeros while the vehicle turns, or vibrates as in motion."""
     t, v = odometer.t, odometer.speed
     up = _find_axes(imu)[1]
     n = max(2, round(1.0 / period_of(imu.t)))
@@ -287,7 +291,7 @@ def _find_moving_zeros(
     rest, fast = read == 0.0, read > 3.0
     if not rest.any():
         return []
-    turn = np.abs((gyro.mean(axis=1) - np.median(gyro[rest].mean(axis=1), axis=0)) @ up) > _TURN
+    turn = np.abs((gyro.mean(axis=1) - np.median(gyro[rest].mean(axis=1), axis=0)) @ up) > _MOVING_RATE
     shaken = np.zeros(count, dtype=bool)
     if fast.sum() >= 20:
         shakes = [np.linalg.norm(x.std(axis=1), axis=-1) for x in (gyro, accel)]
@@ -298,7 +302,7 @@ def _find_moving_zeros(
     for a, b in stays:
         if v[a] != 0.0:
             continue
-        # a second that begins or ends a stop may be seen by a sensor that is deaf to slow wheels
+        # the second before or after a stop is ambiguous for a sensor that does not detect slow wheels
         inside = (second[:, 0] + lag > t[a] + 1.0) & (second[:, 1] + lag < t[b] - 1.0)
         shows = np.flatnonzero(inside & (turn | shaken))
         if len(shows):
@@ -307,7 +311,7 @@ def _find_moving_zeros(
 
 
 def _merge(t: Array, bad: list[tuple[int, int, str]]) -> list[tuple[float, float, str]]:
-    """As times, with what overlaps in one; the reason is that of the longest part."""
+    """As times, with overlapping ones merged; the reason is that of the longest part."""
     out: list[tuple[int, int, str, int]] = []
     for begin, end, reason in sorted(bad):
         if out and begin < out[-1][1]:

@@ -1,7 +1,7 @@
-"""What an odometer's readings are worth: their step, their noise, and the mean speed over any window.
+"""Error of an odometer's readings (resolution, noise), and the mean speed over any window.
 
-A window's mean is the way covered in it over its length, so every reading of a fast odometer counts; the way is
-what was counted, or the integral of the speed read, straight between the readings.
+A window's mean is the distance covered in it over its length, so every reading of a fast odometer counts; the distance
+is the counted one, or the integral of the speed with linear interpolation between readings.
 """
 
 from __future__ import annotations
@@ -18,47 +18,47 @@ from graphnav.recording import Odometer
 
 Spans = Array  # (M, 2) s, [first bad reading, next good one)
 
-_FINEST = 1e-7  # m/s, differences below are the rounding of floating point
-_MAD = 1.4826  # sigma over the median size of a normal variable
+_FINEST = 1e-7  # m/s; smaller differences are rounding of floating point
+_MAD = 1.4826  # sigma over the median magnitude of a normal variable
 _ROUNDING = np.sqrt(1.0 / 12.0)  # 1-sigma of a rounding error, in steps
 
 
-def quantum(speed: Array) -> float:
-    """The step of which readings differ by whole multiples, m/s; 0 where there is none.
+def find_quantum(speed: Array) -> float:
+    """Resolution of readings that differ by whole multiples of it, m/s; 0 where there is none.
 
-    Differences of neighbouring readings are asked, not the readings: a step of 1 % of a percent is still told from
-    the next there, and an offset does no harm.
+    Differences of adjacent readings are tested, not the readings: a resolution with an error of 1 % of a per cent is
+    still found, and an offset does not matter.
     """
     size = np.abs(np.diff(speed))
     size = size[np.isfinite(size) & (size > _FINEST)]
     if len(size) < 10:
         return 0.0
-    # the coarsest that explains them: below it there may be the digits of a file, or a unit converted
+    # the coarsest that explains them: finer ones may be digits of a file, or a converted unit
     for share in (50.0, 25.0, 10.0, 5.0, 1.0):
-        for parts in (1, 2, 3):  # the smallest seen may be two or three steps
+        for parts in (1, 2, 3):  # the smallest difference may be two or three steps
             step = float(np.percentile(size, share)) / parts
             few = size[size < 20.5 * step]
-            for _ in range(3):  # sums over many steps tell one of them better than one does
+            for _ in range(3):  # sums over many steps determine one more precisely
                 count = np.round(few / step)
                 if not count.any():
                     break
                 step = float(count @ few / (count @ count))
-            # without a step the remainders are spread evenly, three in ten below 0.15
+            # without a resolution the remainders are uniform, three in ten below 0.15
             if (np.abs(few / step - np.round(few / step)) < 0.15).mean() > 0.95 and len(few) >= 10:
                 return step
     return 0.0
 
 
 def reading_sigma(odometer: Odometer, step: float | None = None) -> float:
-    """1-sigma of one reading by its own figures, m/s: as stated, else its scatter, at least that of its step.
+    """1-sigma of one reading, m/s: as stated, else its scatter, at least that of its resolution.
 
-    The scatter is that of third differences while moving, which leave nothing of a motion that is smooth over four
-    readings: the variance of a third difference is 20 times that of a reading. `step` is the quantum, if known.
+    The scatter is that of third differences in motion, which remove any motion that is smooth over four readings: the
+    variance of a third difference is 20 times that of a reading. `step` is the quantum, if known.
     """
     if odometer.speed_sigma is not None:
         return odometer.speed_sigma
     t, speed = odometer.t, odometer.speed
-    rounding = _ROUNDING * (quantum(speed) if step is None else step)
+    rounding = _ROUNDING * (find_quantum(speed) if step is None else step)
     if len(t) < 10:
         return rounding
     steps = np.diff(t)
@@ -69,14 +69,14 @@ def reading_sigma(odometer: Odometer, step: float | None = None) -> float:
     return max(scatter, rounding)
 
 
-def counts(odometer: Odometer, step: float | None = None) -> float:
+def find_pulse_length(odometer: Odometer, step: float | None = None) -> float:
     """Metres per pulse where the speeds are pulses counted from row to row, else 0.
 
-    The rounding errors of such readings telescope: the mean of n of them is wrong by 1/n of what one is wrong by, and
-    by 1/sqrt(n) were they new with every reading. Third differences tell, as in `reading_sigma`.
+    Rounding errors of such readings telescope: the error of the mean of n of them is 1/n of that of one, and 1/sqrt(n)
+    if they were independent. Third differences show which, as in `reading_sigma`.
     """
     t, speed = odometer.t, odometer.speed
-    step = quantum(speed) if step is None else step
+    step = find_quantum(speed) if step is None else step
     if odometer.counted is not None or step == 0.0:
         return odometer.pulse
     even = np.r_[True, np.diff(t) < 1.5 * period_of(t)] & (speed != 0.0)
@@ -90,7 +90,7 @@ def counts(odometer: Odometer, step: float | None = None) -> float:
     if len(t) < 800:
         return 0.0
     one = scatter(1)
-    # counts change to and fro by their step from row to row; what is counted over many periods hardly changes
+    # counts alternate by their step from row to row; those over many periods hardly change
     if not step < one < np.inf:
         return 0.0
     telescopes = any(scatter(n) < one * n**-0.75 for n in (2, 4))  # half-way between
@@ -98,19 +98,19 @@ def counts(odometer: Odometer, step: float | None = None) -> float:
 
 
 def find_longest_step(t: Array) -> float:
-    """The longest step between stamps that is none of a gap, s: jitter and a dropped row or two are usual."""
+    """The longest step between stamps that is not a gap, s: jitter and a dropped row or two are common."""
     return 3.5 * max(period_of(t), float(np.percentile(np.diff(t), 95.0))) if len(t) > 1 else 0.0
 
 
-def gaps(t: Array, longest: float | None = None) -> Spans:
-    """Spans without readings, from where the first one is missing; `longest` as `longest_step` says, if known."""
+def find_gaps(t: Array, longest: float | None = None) -> Spans:
+    """Spans without readings, from where the first one is missing; `longest` as by `find_longest_step`, if known."""
     k = np.flatnonzero(np.diff(t) > (find_longest_step(t) if longest is None else longest))
     return np.stack([t[k] + period_of(t), t[k + 1]], -1).reshape(-1, 2)
 
 
 @dataclass(frozen=True)
 class ReadingStatistics:
-    """What many readings tell of each of them."""
+    """Statistics of a single reading, estimated from many."""
 
     step: float  # m/s, `quantum`
     sigma: float  # m/s, `reading_sigma`
@@ -119,15 +119,17 @@ class ReadingStatistics:
 
     @classmethod
     def of(cls, odometer: Odometer) -> ReadingStatistics:
-        """As these readings tell."""
-        step = quantum(odometer.speed)
-        return cls(step, reading_sigma(odometer, step), counts(odometer, step), find_longest_step(odometer.t))
+        """Estimate them from these readings."""
+        step = find_quantum(odometer.speed)
+        return cls(
+            step, reading_sigma(odometer, step), find_pulse_length(odometer, step), find_longest_step(odometer.t)
+        )
 
     def sigmas(self, odometer: Odometer) -> tuple[float, float, float]:
         """`white`, `rounding` and `ends` of a `MeanSpeed`."""
         if odometer.speed_sigma is not None:
             return float(odometer.speed_sigma), 0.0, 0.0
-        if self.pulse:  # each end of a count is wrong by up to one pulse, evenly: a difference of two
+        if self.pulse:  # each end of a count has an error of up to one pulse, uniform: a difference of two
             return 0.0, 0.0, float(np.sqrt(2.0) * _ROUNDING * self.pulse)
         rounding = _ROUNDING * self.step
         return float(np.sqrt(max(self.sigma**2 - rounding**2, 0.0))), rounding, 0.0
@@ -142,24 +144,26 @@ def _sum_from_zero(steps: NDArray[Any]) -> NDArray[Any]:
 
 @dataclass(frozen=True)
 class MeanSpeed:
-    """Mean speed over windows, from sums made once: a call costs two searches per window.
+    """Mean speed over windows, from sums computed once: a call costs two searches per window. Built by `of`.
 
-    Built by `of`. NaN where a window is not covered by good readings throughout.
+    NaN where a window is not covered by good readings throughout.
     """
 
     t: Array  # (M,) s
     speed: Array  # (M,) m/s
     distance: Array  # (M,) m up to t
-    straight: bool  # whether `distance` is counted, and so interpolated evenly between readings
-    bad: NDArray[np.intp]  # (M,) how many of the segments between readings up to t are bad
-    changes: NDArray[np.intp]  # (M,) how often the reading changed up to t
-    white: float  # m/s, the part of a reading's sigma that is new with every reading
-    rounding: float  # m/s, the part that stays as long as the reading does
-    ends: float  # m, the error of a way that is counted
+    straight: bool  # whether `distance` is counted, and so interpolated linearly between readings
+    bad: NDArray[np.intp]  # (M,) number of bad segments between readings up to t
+    changes: NDArray[np.intp]  # (M,) number of changes of the reading up to t
+    white: float  # m/s, the part of a reading's error that is independent of the others
+    rounding: float  # m/s, the part that persists while the reading does not change
+    ends: float  # m, error of a counted distance
 
     @classmethod
     def of(cls, odometer: Odometer, spans: Spans | None = None, figures: ReadingStatistics | None = None) -> MeanSpeed:
-        """Without the readings in `spans` (see `faults`) and not across gaps; `figures` if they are known already."""
+        """Build without the readings in `spans` (see `faults`) and not across gaps; `figures` if they are known
+        already.
+        """
         figures = figures or ReadingStatistics.of(odometer)
         t, speed = odometer.t, odometer.speed
         step = t[1:] - t[:-1]
@@ -191,7 +195,7 @@ class MeanSpeed:
         return np.minimum(np.maximum(np.searchsorted(self.t, x, side="right") - 1, 0), len(self.t) - 2)
 
     def _interpolate(self, k: NDArray[np.intp], x: Array) -> tuple[Array, Array]:
-        """Way and speed at x in the segments k."""
+        """Distance and speed at x in the segments k."""
         s, step = x - self.t[k], self.t[k + 1] - self.t[k]
         slope = (self.speed[k + 1] - self.speed[k]) / step
         speed = self.speed[k] + slope * s
@@ -202,8 +206,8 @@ class MeanSpeed:
     def __call__(self, a: Array, b: Array, delay: float | Array = 0.0) -> tuple[Array, Array]:
         """Means over [a + delay, b + delay] and their derivative by the delay, (N,) each: m/s, m/s^2.
 
-        The derivative is that of the speeds read; where pulses are counted, of their slope over two periods, for
-        the exact one would be a staircase.
+        The derivative is that of the speeds read; where pulses are counted, of their slope over two periods, as the
+        exact one would be a staircase.
         """
         a, b = np.asarray(a, dtype=float) + delay, np.asarray(b, dtype=float) + delay
         if len(self.t) < 2:
@@ -218,9 +222,9 @@ class MeanSpeed:
     def sigma(self, a: Array, b: Array, delay: float | Array = 0.0) -> Array:
         """1-sigma of those means, (N,) m/s.
 
-        Noise is new with every reading. The error of a rounded one stays as long as the reading stays the same and
-        is another after a change: a counter at even speed changes to and fro between two values, a speed that was
-        rounded on the way stands. A count is wrong at its ends alone.
+        Noise is independent for every reading. A rounding error persists while the reading does not change: a counter
+        at constant speed alternates between two values, a speed rounded by the sensor persists. A count has errors at
+        its ends only.
         """
         a, b = np.asarray(a, dtype=float) + delay, np.asarray(b, dtype=float) + delay
         if len(self.t) < 2:

@@ -1,1 +1,1 @@
-"""Rows that cannot be right: found before anything is solved, then masked or refused."""
+"""Impossible rows: found before anything is solved, then masked or refused."""

@@ -1,4 +1,4 @@
-"""Fixes that cannot be right: out of reach, frozen heights, sigmas that the fixes deny, two groups, late stamps."""
+"""Impossible fixes: out of reach, frozen heights, sigmas that contradict the scatter, two groups, late stamps."""
 
 from __future__ import annotations
 
@@ -17,24 +17,24 @@ from graphnav.recording import Gnss, Recording, take_rows
 FASTEST = 150.0  # m/s; the fastest cars that can be bought reach 490 km/h, 136 m/s
 # A receiver cannot follow a reflection that comes more than one and a half code chips late (GPS C/A: 293 m a chip).
 MISLED = 440.0  # m
-_CACHED = 60.0  # s; a receiver that is on fixes at least as often as that
-_FROZEN = (60.0, 300.0)  # s, and m driven: a road or the receiver's own noise moves a height within that
-_SLOPE = 0.1  # what a road climbs at most: so far may a height be from what it was
-_CARRIER = 1e-3  # m: a two-hundredth of the carrier's wave (0.19 m), what its phase can be measured to
+_CACHED = 60.0  # s; a receiver that is switched on outputs fixes at least that often
+_FROZEN = (60.0, 300.0)  # s, and m driven: within these a road or receiver noise changes a height
+_STEEPEST = 0.1  # steepest road: bound on the deviation of a height
+_CARRIER = 1e-3  # m: a two-hundredth of the carrier's wavelength (0.19 m), the resolution of its phase
 _WAVE = 0.19  # m, of L1
-_ACCELERATION = 2.0  # m/s^2, what vehicles accelerate at usually
-_UNBELIEVED = 10.0  # times a sigma that is right the scatter of neighbouring fixes never is: errors last, scatter less
+_ACCELERATION = 2.0  # m/s^2, typical acceleration of vehicles
+_UNBELIEVED = 10.0  # ratio to the scatter of adjacent fixes that no true sigma has: errors last, scatter is smaller
 _SMOOTH = 2e-3  # of the sigma; filtered fixes of phones scatter by five thousandths
-_GRIP = 8.0  # m/s^2, what tyres grip
-_MEAN_OF = 11  # fixes, of which most steps are right even where half of the fixes are off
-_MINORITY = 0.2  # of the fixes: fewer that are off are outvoted by the rest
-_ISOLATED = 0.01  # of the steps
-_ALIKE = 0.25  # of their size by which steps between two groups differ; those of reflections are of all sizes
-_LEAST_SPEED = 3.0  # m/s, below which a step says little of the time it took
+_GRIP = 8.0  # m/s^2, grip of tyres
+_MEAN_OF = 11  # fixes in a window in which most steps are right even where half of the fixes are off
+_MINORITY = 0.2  # share of the fixes: smaller groups are outvoted by the rest
+_ISOLATED = 0.01  # share of the steps
+_ALIKE = 0.25  # relative spread of the steps between two groups; those of multipath vary more
+_LEAST_SPEED = 3.0  # m/s, below which a step carries little information on its duration
 
 
 def screen(recording: Recording) -> tuple[Recording, list[Finding]]:
-    """The recording without fixes out of reach and without trust in frozen heights, and what was found."""
+    """The recording without fixes out of reach and with large sigmas for frozen heights, and findings."""
     gnss = recording.gnss
     assert gnss is not None
     findings: list[Finding] = []
@@ -59,14 +59,15 @@ def screen(recording: Recording) -> tuple[Recording, list[Finding]]:
     for a, b in find_frozen_heights(gnss, p):
         driven = float(np.hypot(*np.diff(p[a:b, :2], axis=0).T).sum())
         sd = gnss.sd.copy()
-        sd[a:b, 2] = np.maximum(sd[a:b, 2], _SLOPE * driven)
+        sd[a:b, 2] = np.maximum(sd[a:b, 2], _STEEPEST * driven)
         h, begin, end = gnss.llh[a, 2], gnss.t[a] - recording.start, gnss.t[b - 1] - recording.start
         gnss = replace(gnss, sd=sd)
         findings.append(
             Finding(
                 "warning",
                 f"the heights of the fixes stay at {h:.4g} m from {begin:.1f} to {end:.1f} s, over {driven:.0f} m: "
-                f"frozen or not logged; they are given a sigma of {_SLOPE * driven:.0f} m there (a slope of a tenth)",
+                "frozen or not logged; they are given a sigma of "
+                f"{_STEEPEST * driven:.0f} m there (a slope of a tenth)",
                 "gnss.height_frozen",
             )
         )
@@ -78,19 +79,19 @@ def screen(recording: Recording) -> tuple[Recording, list[Finding]]:
 
 
 def count_cached_fixes(t: Array, start: float) -> int:
-    """How many of the first fixes at t (M,) s are long before the IMU starts, with none for as long after them."""
+    """Number of the first fixes at t (M,) s that precede the IMU's start by long, with none for as long after them."""
     before = np.flatnonzero((t[:-1] < start) & (np.diff(t) > _CACHED))
     return int(before[-1]) + 1 if len(before) and t[-1] > start else 0
 
 
 def _compute_positions(gnss: Gnss) -> Array:
-    """ENU metres around the middle one of the fixes, which one that is far off hardly ever is, (M, 3)."""
+    """ENU metres around the middle fix, which hardly ever is an outlier, (M, 3)."""
     middle = np.median(gnss.llh[np.isfinite(gnss.llh).all(axis=1)], axis=0) if len(gnss.t) else np.zeros(3)
     return LocalFrame(middle if np.isfinite(middle).all() else np.zeros(3)).from_llh(gnss.llh)
 
 
 def find_out_of_reach(t: Array, p: Array) -> NDArray[np.bool_]:
-    """Fixes at p (M, 3) m, t (M,) s, that cannot be reached from the most that can be reached from each other."""
+    """Fixes at p (M, 3) m, t (M,) s, that cannot be reached from the largest consistent set."""
     lost = np.zeros(len(t), dtype=bool)
     there = np.flatnonzero(np.isfinite(p).all(axis=1))
     if len(there) < 3:
@@ -135,7 +136,7 @@ def _drop_unreachable(gnss: Gnss, p: Array, off: NDArray[np.bool_], start: float
 
 
 def find_frozen_heights(gnss: Gnss, p: Array) -> list[tuple[int, int]]:
-    """[first, end) of the fixes whose height stays the same to the last digit while the vehicle drives."""
+    """[first, end) of the fixes whose height is constant to the last digit while the vehicle drives."""
     same = np.diff(gnss.llh[:, 2]) == 0.0
     distance = np.r_[0.0, np.cumsum(np.nan_to_num(np.hypot(*np.diff(p[:, :2], axis=0).T)))]
     lasting, driven = _FROZEN
@@ -145,20 +146,22 @@ def find_frozen_heights(gnss: Gnss, p: Array) -> list[tuple[int, int]]:
 
 
 def _compute_steps(gnss: Gnss) -> tuple[Array, float, NDArray[np.bool_]]:
-    """Time steps, their median, and which are no gap."""
+    """Time steps, their median, and which are not gaps."""
     dt = np.diff(gnss.t)
     period = float(np.median(dt))
     return dt, period, dt < 1.9 * period
 
 
 def check_sigmas(gnss: Gnss, p: Array) -> Iterator[Finding]:
-    """Sigmas smaller than a phase can be measured, or that the scatter of the fixes denies; they are not changed."""
+    """Sigmas below the resolution of a carrier phase, or contradicted by the scatter of the fixes; they are not
+    changed.
+    """
     sd = float(np.median(gnss.sd[:, :2]))
     _, period, near = _compute_steps(gnss)
     pairs = near[1:] & near[:-1]
     bend = (p[2:] - 2.0 * p[1:-1] + p[:-2])[pairs, :2]
     bend = bend[np.isfinite(bend).all(axis=1)]
-    # white errors of s bend by s sqrt(6)
+    # white errors of s have second differences of s sqrt(6)
     scatter = float(np.median(np.abs(bend))) / 0.6745 / np.sqrt(6.0) if len(bend) >= 10 else float("nan")
     driven = _ACCELERATION * period**2 / np.sqrt(6.0)
     if sd < _CARRIER:
@@ -194,7 +197,7 @@ def check_sigmas(gnss: Gnss, p: Array) -> Iterator[Finding]:
 
 
 def check_two_groups(gnss: Gnss, p: Array) -> Iterator[Finding]:
-    """Fixes that go back and forth between two places a constant step apart: no vote tells which are right."""
+    """Fixes that alternate between two places a constant step apart, which leaves open which are right."""
     there: NDArray[np.bool_] = np.asarray(np.isfinite(p).all(axis=1))
     if there.sum() < 2 * _MEAN_OF:
         return
@@ -202,7 +205,7 @@ def check_two_groups(gnss: Gnss, p: Array) -> Iterator[Finding]:
     dt, period, _ = _compute_steps(gnss)
     jump = _find_jumps(p, dt)
     sd = np.hypot(gnss.sd[:, 0], gnss.sd[:, 1])
-    # the speed changes by what tyres grip over half the window; over a long gap no step shows, and none is taken
+    # the speed changes by the grip of tyres over half the window; steps over a long gap are not used
     limit = 5.0 * np.hypot(sd[1:], sd[:-1]) + _GRIP * np.maximum(0.5 * _MEAN_OF * period, dt) * dt
     big = np.flatnonzero(np.linalg.norm(jump, axis=1) > limit)
     if not len(big):
@@ -211,7 +214,7 @@ def check_two_groups(gnss: Gnss, p: Array) -> Iterator[Finding]:
     sign = np.sign(jump[big] @ axis)
     step = np.median(sign[:, None] * jump[big], axis=0)
     size = float(np.linalg.norm(step))
-    for _ in range(3):  # the motion is clearer without the steps, and the steps are with the motion
+    for _ in range(3):  # the motion is clearer without the steps, and the steps without the motion
         group = _find_groups(jump @ (step / size), size)
         jump = _find_jumps(p - group[:, None] * step, dt)
     left = np.linalg.norm(jump, axis=1)
@@ -228,13 +231,13 @@ def check_two_groups(gnss: Gnss, p: Array) -> Iterator[Finding]:
 
 
 def _find_jumps(p: Array, dt: Array) -> Array:
-    """What steps between fixes at p (M, 2) m differ by from the usual pace around them, (M - 1, 2) m."""
+    """Deviation of steps between fixes at p (M, 2) m from the typical velocity around them, (M - 1, 2) m."""
     rate = run_median(np.diff(p, axis=0) / dt[:, None], _MEAN_OF)
     return np.asarray(np.diff(p, axis=0) - rate * dt[:, None])
 
 
 def _find_groups(jump: Array, size: float) -> NDArray[np.intp]:
-    """Group (M,) 0 or 1 of every fix: those with which jumps (M - 1,) along a step of that size are least off."""
+    """Group (M,) 0 or 1 of every fix: the one for which jumps (M - 1,) along a step of that size fit best."""
     cost = np.abs(jump[:, None, None] - size * np.array([[0.0, 1.0], [-1.0, 0.0]]))  # from, to
     best, came = np.zeros(2), np.zeros((len(jump), 2), dtype=np.intp)
     for k, one in enumerate(cost):
@@ -249,10 +252,10 @@ def _find_groups(jump: Array, size: float) -> NDArray[np.intp]:
 
 
 def check_arrival_stamps(gnss: Gnss, p: Array) -> Iterator[Finding]:
-    """Stamps that are uneven where positions advance evenly: of the arrival, not of the measurement."""
+    """Stamps that are uneven where positions advance evenly: those of arrival, not of measurement."""
     dt = np.diff(gnss.t)
     p = p[:, :2]
-    # the mean steps: of fixes that arrive in bursts, the median says nothing
+    # the mean steps: for fixes that arrive in bursts the median is useless
     period = float(np.median(run_mean(dt, _MEAN_OF)))
     near = (dt < 3.5 * period) & np.isfinite(p[1:]).all(axis=1) & np.isfinite(p[:-1]).all(axis=1)
     step = np.diff(p, axis=0)
@@ -266,7 +269,7 @@ def check_arrival_stamps(gnss: Gnss, p: Array) -> Iterator[Finding]:
         return
     uneven = (dt / pace - 1.0)[moving]
     ahead = (np.sum(step * typical, axis=1)[moving] / typical_size[moving] ** 2) - 1.0
-    # of most stamps: some fixes that are missing make steps uneven, too
+    # for most stamps: missing fixes make steps uneven, too
     spread = float(np.median(np.abs(uneven - np.median(uneven)))) / 0.6745
     speed = float(np.median(typical_size[moving] / pace[moving]))
     sd = float(np.median(gnss.sd[:, :2]))
@@ -278,7 +281,7 @@ def check_arrival_stamps(gnss: Gnss, p: Array) -> Iterator[Finding]:
     ahead = np.clip(ahead, -3.0, 3.0)
     slope = float(uneven @ ahead / (uneven @ uneven))
     error = float(np.std(ahead - slope * uneven)) / float(np.linalg.norm(uneven))
-    if slope + 4.0 * error < 0.5 or back > _ISOLATED:  # nearer to no than to full part in the advance
+    if slope + 4.0 * error < 0.5 or back > _ISOLATED:  # closer to no part than to the full part in the advance
         seen = f"go back in {100 * back:.0f} % of the steps" if back > _ISOLATED else "advance evenly"
         yield Finding(
             "warning",

@@ -1,4 +1,4 @@
-"""Odometer readings that cannot be right: beyond any speed, after a jump of the clock, or of another scale."""
+"""Impossible odometer readings: beyond any speed, after a jump of the clock, or with another scale."""
 
 from __future__ import annotations
 
@@ -14,17 +14,15 @@ from graphnav.recording.checks.crosschecks import MIN_PAIRS, Track
 from graphnav.recording.plausibility.fixes import FASTEST
 
 _CLOCK_STEP = 1.0  # s, and ten periods: a silence of the odometer that may be a jump of its clock
-_RADIUS = 0.1  # by which a tyre may differ from another: wear, load, pressure, a spare wheel
+_RADIUS = 0.1  # relative difference of tyre radii: wear, load, pressure, a spare wheel
 _LEAST_SPEED = 5.0  # m/s, above which speeds are compared
-_LASTING = 10.0  # s; shorter is slip, or a fix's error
-_CLEAR = (
-    4.0  # times by which one clock fits better than the other (white errors: one in thousands with 20 of them a side)
-)
-_RATE = 10.0  # Hz that changes of speed need
+_SHORTEST_SPAN = 10.0  # s; shorter ones are slip, or an error of a fix
+_CLEAR = 4.0  # ratio of the misfits of two clocks (white errors: one in thousands with 20 of them a side)
+_SPEED_RATE = 10.0  # Hz needed for changes of speed
 
 
 def screen(recording: Recording, track: Track | None) -> tuple[Recording, list[Finding]]:
-    """The recording without readings that cannot be right, and what was found; `track` is what GNSS says."""
+    """The recording without impossible readings, and findings; `track` is the velocity by GNSS."""
     findings: list[Finding] = []
     for one in (_find_beyond, _find_clock_jump, _find_other_scale):
         odometer = recording.odometer
@@ -39,8 +37,8 @@ def screen(recording: Recording, track: Track | None) -> tuple[Recording, list[F
 
 
 def build_odometer_track(odometer: Odometer) -> Track | None:
-    """The odometer's speed as if it were GNSS's, for where there is none."""
-    every = max(1, round(1.0 / (_RATE * period_of(odometer.t)))) if len(odometer.t) > 1 else 1
+    """The odometer's speed in the form of a GNSS track, for recordings without GNSS."""
+    every = max(1, round(1.0 / (_SPEED_RATE * period_of(odometer.t)))) if len(odometer.t) > 1 else 1
     t, speed = odometer.t[::every], odometer.speed[::every]
     if len(t) < 5:
         return None
@@ -67,7 +65,7 @@ def _find_beyond(odometer: Odometer, track: Track | None, start: float) -> _Foun
 
 
 def _measure_misfit(odometer: Odometer, track: Track, rows: NDArray[np.bool_], later: float) -> float:
-    """Mean size of the GNSS speed less that of `rows` of the odometer `later` s later, m/s; NaN of too few."""
+    """Mean deviation of the GNSS speed from that of `rows` of the odometer `later` s later, m/s; NaN for too few."""
     t, speed = odometer.t[rows] + later, odometer.speed[rows]
     if len(t) < 2:
         return float("nan")
@@ -75,11 +73,11 @@ def _measure_misfit(odometer: Odometer, track: Track, rows: NDArray[np.bool_], l
     if both.sum() < MIN_PAIRS:
         return float("nan")
     off = track.speed[both] - np.abs(np.interp(track.t[both], t, speed))
-    return float(np.mean(np.minimum(np.abs(off), _LEAST_SPEED)))  # a wild fix has no more say than that
+    return float(np.mean(np.minimum(np.abs(off), _LEAST_SPEED)))  # an outlying fix counts no more than that
 
 
 def _find_clock_jump(odometer: Odometer, track: Track | None, start: float) -> _Found:
-    """A silence that was none: without it the readings on one side fit the GNSS speed, and with it they do not."""
+    """A false silence: the readings after it fit the GNSS speed if it is removed, and do not if it is kept."""
     t = odometer.t
     none = np.zeros(len(t), dtype=bool)
     if track is None:
@@ -106,7 +104,7 @@ def _find_clock_jump(odometer: Odometer, track: Track | None, start: float) -> _
 
 
 def _find_other_scale(odometer: Odometer, track: Track | None, start: float) -> _Found:
-    """Spans in which the odometer has another scale against GNSS than it has elsewhere, where it is nearly 1."""
+    """Spans in which the odometer's scale against GNSS differs from that elsewhere, where it is nearly 1."""
     t = odometer.t
     bad = np.zeros(len(t), dtype=bool)
     if track is None:
@@ -120,24 +118,24 @@ def _find_other_scale(odometer: Odometer, track: Track | None, start: float) -> 
     if len(at) < MIN_PAIRS:
         return bad, None
     off = np.log(read[at] / track.speed[at])
-    seconds = max(1, round(_LASTING / track.period))
+    seconds = max(1, round(_SHORTEST_SPAN / track.period))
     typical = run_median(off, min(seconds + 1 - seconds % 2, len(off)))
     right = np.abs(typical) < np.log1p(_RADIUS)
-    if right.sum() * track.period < _LASTING:
+    if right.sum() * track.period < _SHORTEST_SPAN:
         return bad, None  # another unit, or another wheel, throughout
     own = float(np.median(off[right]))
     noise = float(np.median(np.abs(off[right] - own))) / 0.6745
-    # two tyres, one as large and one as small as may be
+    # two tyres, as large and as small as possible
     wrong = np.abs(typical - own) > max(np.log((1.0 + _RADIUS) / (1.0 - _RADIUS)), 6.0 * noise)
     spans: list[tuple[float, float, float]] = []
     for a, b in runs_of(wrong):
         begin, end = track.t[at[a]], track.t[at[b - 1]]
         factor = float(np.median(off[a:b]))
-        # a scale is one factor; fixes among high houses make speeds of all sizes
+        # a scale is one factor; fixes among high buildings make speeds of all magnitudes
         scatter = float(np.median(np.abs(off[a:b] - factor))) / 0.6745
-        if end - begin < _LASTING - 2.0 * track.period or scatter > np.log1p(_RADIUS):
+        if end - begin < _SHORTEST_SPAN - 2.0 * track.period or scatter > np.log1p(_RADIUS):
             continue
-        # up to the neighbours that are right: what lies between is not known
+        # up to the adjacent right readings: what lies between is unknown
         low = track.t[at[a - 1]] if a > 0 else -np.inf
         high = track.t[at[b]] if b < len(at) else np.inf
         bad |= (t > low) & (t < high)

@@ -1,9 +1,10 @@
-"""Single readings of an IMU that those before and after contradict.
+"""Single IMU readings that contradict the readings before and after.
 
-How far a reading lies beyond both of its neighbours is nothing where a signal is smooth, and as much as bumps are high
-where there are bumps. The largest of these excesses are taken to fall off as a power (B. M. Hill, A simple general
-approach to inference about the tail of a distribution, Annals of Statistics 3, 1975), which is slower than those of
-any recording do. A reading so far beyond all others that a thousand recordings would have one is none of the motion.
+The excess of a reading over both of its neighbours is small where a signal is smooth, and as large as the bumps where
+there are bumps. The largest excesses are assumed to follow a power law (B. M. Hill, A simple general approach to
+inference about the tail of a distribution, Annals of Statistics 3, 1975), which decays more slowly than those of any
+recording. A reading so far beyond all others that only one in a thousand recordings would contain it is not due to
+motion.
 """
 
 from __future__ import annotations
@@ -16,29 +17,29 @@ from numpy.typing import NDArray
 from graphnav.core.findings import period_of
 from graphnav.core.rotation import Array
 
-TAIL = 100  # excesses that tell how the largest fall off: to a tenth
-RARE = 1e-3  # readings as far beyond the others that a recording has by chance
-ALONE = 1.0  # s around a single reading without another; more of them are something that happened
-_SINGLE = 0.01  # of the rows; what more of them have in common is no fault of single rows
-_TELL = 5  # times `TAIL`, rows in motion of which these are the largest fifth
-HOLE = 1.5  # periods between two rows that are no neighbours
+TAIL = 100  # excesses from which the decay is estimated: to a tenth
+RARE = 1e-3  # expected number of such readings in a recording by chance, below which a reading is rejected
+ALONE = 1.0  # s around a single reading without another; several are a real event
+_SINGLE = 0.01  # share of the rows; above it the cause is not in single rows
+_TELL = 5  # multiple of `TAIL`, rows in motion of which these are the largest fifth
+HOLE = 1.5  # periods between two rows that are not adjacent
 
 
 def measure_excess(x: Array) -> Array:
-    """How far each of the values (N, ...) but the first and the last lies beyond both its neighbours, (N-2, ...)."""
+    """Excess of each of the values (N, ...) except the first and the last over both its neighbours, (N-2, ...)."""
     low, high = np.minimum(x[:-2], x[2:]), np.maximum(x[:-2], x[2:])
     middle = x[1:-1]
     return np.asarray(np.maximum(middle - high, low - middle).clip(min=0.0))
 
 
 def count_expected(excess: Array, others: Array, resolution: float) -> Array:
-    """How many excesses as large or larger are to be expected among others.
+    """Expected number of excesses at least as large, given others.
 
     Parameters
     ----------
     excess : (M,) above zero.
     others : (M, TAIL + 1) the next smaller ones of each, the largest first.
-    resolution : in which they are told, in their unit: less than half of it says nothing of how they fall off.
+    resolution : of the readings, in their unit: differences below half of it carry no information on the tail.
 
     Returns
     -------
@@ -49,13 +50,13 @@ def count_expected(excess: Array, others: Array, resolution: float) -> Array:
 
 
 def _measure_fall(others: Array, resolution: float | Array) -> tuple[Array, Array]:
-    """How slowly excesses (M, TAIL + 1) fall off, and the smallest of each row."""
+    """Hill estimate (reciprocal of the tail exponent) of excesses (M, TAIL + 1), and the smallest of each row."""
     last = others[:, -1]
     return np.log(others[:, :-1] / last[:, None]).mean(axis=1) + 0.5 * resolution / last, last
 
 
 def find_contradicted(t: Array, readings: Iterable[Array]) -> NDArray[np.bool_]:
-    """Which rows hold a reading that those before and after contradict.
+    """Which rows hold a reading that the rows before and after contradict.
 
     Parameters
     ----------
@@ -81,7 +82,7 @@ def find_contradicted(t: Array, readings: Iterable[Array]) -> NDArray[np.bool_]:
 
 
 def _find_limit(excess: Array) -> float:
-    """The largest excess (of N) that is one of the motion; looked for from the smallest on: none hides another."""
+    """The largest excess (of N) due to motion; sought from the smallest upwards, so that no outlier hides another."""
     found = excess[excess > 0.0]
     most = min(int(_SINGLE * len(excess)), len(found) - TAIL - 1)
     if most < 1:
@@ -94,7 +95,7 @@ def _find_limit(excess: Array) -> float:
 
 
 class Excesses:
-    """The largest excesses of a session so far, axis by axis, and which would be none of its motion.
+    """The largest excesses of a session so far, axis by axis, and those that are not due to motion.
 
     Parameters
     ----------
@@ -108,7 +109,7 @@ class Excesses:
         self._count = 0
 
     def add(self, excess: Array) -> None:
-        """Take in those (N, axes) of rows in motion: a stop says nothing of the next bump."""
+        """Add those (N, axes) of rows in motion: a stop shows nothing about the next bump."""
         self._count += len(excess)
         self._least = np.minimum(self._least, np.where(excess > 0.0, excess, np.inf).min(axis=0, initial=np.inf))
         both = np.concatenate([self._largest, excess])

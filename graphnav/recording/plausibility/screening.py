@@ -1,8 +1,8 @@
-"""What cannot be right is found before anything is solved: masked where the rest still solves, else refused.
+"""Impossible rows are found before anything is solved: masked where the rest can be solved, otherwise refused.
 
-`screen` goes over a recording once. Single rows that no sensor can have read are taken out, as if they had never been
-logged, and said; a sensor that is wrong throughout, so that every state would be, is a *refused* finding, which
-`screen_recording` raises. Nothing is mended by a guess.
+`screen` processes a recording once. Single rows that no sensor can have read are removed, as if they had never been
+logged, with a note; a sensor that is wrong throughout, so that every state would be, is a *refused* finding, which
+`screen_recording` raises. Nothing is corrected by a guess.
 """
 
 from __future__ import annotations
@@ -29,37 +29,41 @@ from graphnav.recording.plausibility import fixes as plausibility_gnss
 from graphnav.recording.plausibility import odometer as plausibility_odometer
 from graphnav.recording.plausibility.readings import find_contradicted
 
-# What can be read at all: no accelerometer for vehicles or feet has a range beyond 100 g (those for crash tests have
+# Limits of readings: no accelerometer for vehicles or feet has a range beyond 100 g (those for crash tests have 200 g
+# and more, and cannot tell gravity from their own offset), and no gyro for them one beyond 4000 deg/s.
 # 200 g and more, and cannot tell gravity from their own offset), and no gyro for them one beyond 4000 deg/s.
 ACCEL_RANGE = 1000.0  # m/s^2
 GYRO_RANGE = 70.0  # rad/s
-_STANDARD_GRAVITY = 9.80665  # m/s^2, where the place is unknown
-_ISOLATED = 0.01  # of the rows; what more of them have in common is no fault of single rows
-_QUIET = 10.0  # percentile of the turn rate up to which a foot stands and a vehicle is calm
+_STANDARD_GRAVITY = 9.80665  # m/s^2, where the position is unknown
+_ISOLATED = 0.01  # share of the rows; above it the cause is not in single rows
+_QUIET_PERCENTILE = 10.0  # percentile of the turn rate up to which a foot stands and a vehicle moves calmly
 # A factor of two is the smallest by which a scale is mistaken (the ranges of a sensor are that far apart): the middle.
-_SCALE = np.sqrt(2.0)
-_UNIT_RATIO = 1.2  # between the force found and what a unit would give: a biased sensor among vibration
-_DEAD = 10.0  # s; the longest that an axis repeats itself in thirty real recordings while others move is 0.08 s
-_MOVES = 20.0  # steps of its own resolution by which an axis has moved and not only flickered
-# What a carrier that moves exceeds by far: a thousandth of g, and the Earth's rate, which one at rest reads
+_SCALE_RATIO = np.sqrt(2.0)
+_UNIT_RATIO = 1.2  # ratio of the force found and that of a unit: a biased sensor among vibration
+_DEAD = 10.0  # s; the longest repetition of an axis in thirty real recordings while others move is 0.08 s
+_MOVING_STEPS = 20.0  # steps of its own resolution by which an axis has moved and not only flickered
+# Levels that a moving carrier exceeds by far: a thousandth of g, and the Earth's rate
 _STIRS = {"accelerometer": 1e-3 * _STANDARD_GRAVITY, "gyro": 7.3e-5}  # m/s^2, rad/s
-_NOISY = 0.05  # of the steps go back on the one before; of noise up to a band B and a rate f it is 1.5 B / f
+_NOISY = 0.05  # share of the steps that reverse the one before; for noise up to a band B and a rate f it is 1.5 B / f
 _NO_GRAVITY = "gravity seems to have been removed from the accelerometer; graphnav needs the raw force"
 _AXIS = "xyz"
-_UNITS = ("imu.gyro_unit", "imu.force_scale")  # findings of `imu_scale`: nothing is known of single rows then
+_UNIT_FINDINGS = (
+    "imu.gyro_unit",
+    "imu.force_scale",
+)  # findings of `check_imu_scale`: single rows cannot be judged then
 
 
 @dataclass(frozen=True)
 class Screened:
-    """A recording without what cannot be right, and what was found."""
+    """A recording without impossible rows, and findings."""
 
     recording: Recording
     findings: tuple[Finding, ...] = ()
-    clock: ClockOffsets | None = None  # of the IMU against the fixes, where it was looked at
+    clock: ClockOffsets | None = None  # clock offset of the IMU against the fixes, where it was measured
 
 
 def refuse(recording: Recording, findings: tuple[Finding, ...]) -> None:
-    """Raise what a recording cannot be solved with.
+    """Raise an error if a recording cannot be solved.
 
     Raises
     ------
@@ -72,7 +76,7 @@ def refuse(recording: Recording, findings: tuple[Finding, ...]) -> None:
 
 
 def screen_recording(recording: Recording) -> tuple[Recording, list[str]]:
-    """The recording without what cannot be right.
+    """The recording without impossible rows.
 
     Parameters
     ----------
@@ -84,7 +88,7 @@ def screen_recording(recording: Recording) -> tuple[Recording, list[str]]:
     recording : Recording
         Without rows that no sensor can have read.
     notes : list of str
-        A sentence with a key for everything found.
+        A sentence with a key for each finding.
 
     Raises
     ------
@@ -97,7 +101,7 @@ def screen_recording(recording: Recording) -> tuple[Recording, list[str]]:
 
 
 def screen(recording: Recording) -> Screened:
-    """Look a recording over for what cannot be right.
+    """Screen a recording for impossible rows.
 
     Parameters
     ----------
@@ -114,7 +118,7 @@ def screen(recording: Recording) -> Screened:
     recording, of_imu, of_aiding, track = _drop_impossible(recording)
     dead, clock = list(check_dead_axes(recording)), None
     findings = [*of_imu, *dead, *of_aiding]
-    wrong_unit = any(f.key in _UNITS for f in of_imu)
+    wrong_unit = any(f.key in _UNIT_FINDINGS for f in of_imu)
     if recording.platform == "vehicle" and not dead and not wrong_unit:
         path = track
         if path is None and recording.odometer is not None:
@@ -134,9 +138,9 @@ def screen(recording: Recording) -> Screened:
 
 
 def _drop_impossible(recording: Recording) -> tuple[Recording, list[Finding], list[Finding], Track | None]:
-    """The recording without what cannot be right, findings of the IMU and of the others, and the way by the fixes."""
+    """The recording without impossible rows, findings on the IMU and on the others, and the track by the fixes."""
     of_imu: list[Finding] = list(check_imu_scale(recording))
-    if not of_imu:  # where a unit is wrong throughout, nothing is known of single rows
+    if not of_imu:  # where a unit is wrong throughout, single rows cannot be judged
         imu, spikes = drop_spikes(recording.imu, recording.start)
         imu, contradicted = drop_contradicted(imu, recording.start, forces=recording.platform != "foot")
         recording, of_imu = replace(recording, imu=imu), [*spikes, *contradicted]
@@ -159,7 +163,7 @@ def check_imu_scale(recording: Recording) -> Iterator[Finding]:
     """A force at rest that is not gravity, and a turn rate that no sensor reads: units and scales."""
     imu = recording.imu
     wild = np.zeros(len(imu.t), dtype=bool)
-    for x in imu.gyro.T:  # axis by axis, here and below: a day has a hundred megabytes of each
+    for x in imu.gyro.T:  # axis by axis, here and below: for a day each takes a hundred megabytes
         wild |= ~(np.abs(x) <= GYRO_RANGE)
     beyond = float(wild.mean())
     if beyond > _ISOLATED:
@@ -174,7 +178,7 @@ def check_imu_scale(recording: Recording) -> Iterator[Finding]:
         for x in imu.gyro.T:
             turn += (x - np.median(x)) ** 2
         np.sqrt(turn, out=turn)
-        quiet = turn <= np.percentile(turn, _QUIET)
+        quiet = turn <= np.percentile(turn, _QUIET_PERCENTILE)
         f = float(np.median(np.linalg.norm(imu.accel[quiet], axis=1)))
     if (sentence := _find_scale(f)) is not None:
         sentence = _NO_GRAVITY if _lacks_gravity(recording, f) else sentence
@@ -200,16 +204,16 @@ def _lacks_gravity(recording: Recording, f: float) -> bool:
 
 
 def _measure_gravity(recording: Recording) -> float:
-    """Where most fixes are, m/s^2."""
+    """Gravity where most fixes are, m/s^2."""
     assert recording.gnss is not None
     there = recording.gnss.llh[np.isfinite(recording.gnss.llh).all(axis=1)]
     return float(gravity(*np.median(there, axis=0)[[0, 2]])) if len(there) else _STANDARD_GRAVITY
 
 
 def _find_scale(f: float) -> str | None:
-    """What a force at rest looks like that is not gravity; None if it is."""
+    """The likely unit or scale of a force at rest that is not gravity; None if it is."""
     g = _STANDARD_GRAVITY
-    if g / _SCALE < f < g * _SCALE:
+    if g / _SCALE_RATIO < f < g * _SCALE_RATIO:
         return None
     units = {g / size: f'the accelerometer seems to be in {name}: say units = {{ accel = "{name}" }}'
              for name, size in FORCE.items() if name != "m/s2"}  # fmt: skip
@@ -230,7 +234,7 @@ def _find_scale(f: float) -> str | None:
 
 
 def drop_spikes(imu: Imu, start: float) -> tuple[Imu, list[Finding]]:
-    """The IMU without the rows that no sensor can have read, which leaves gaps that are bridged."""
+    """The IMU without rows that no sensor can have read; the gaps are bridged."""
     gyro, accel = ~(np.abs(imu.gyro) <= GYRO_RANGE), ~(np.abs(imu.accel) <= ACCEL_RANGE)
     bad: NDArray[np.bool_] = np.asarray((gyro | accel).any(axis=1))
     if not bad.any():
@@ -252,10 +256,10 @@ def drop_spikes(imu: Imu, start: float) -> tuple[Imu, list[Finding]]:
 
 
 def drop_contradicted(imu: Imu, start: float, forces: bool) -> tuple[Imu, list[Finding]]:
-    """The IMU without single rows that those before and after contradict, which leaves gaps that are bridged.
+    """The IMU without single rows that the rows before and after contradict; the gaps are bridged.
 
-    With `forces`, of the accelerometer, too: what stands on tyres and springs is hit for more than a row, but not a
-    foot, and no hit turns a body there and back.
+    With `forces`, also of the accelerometer: a hit on tyres and springs lasts for more than a row, unlike one on a
+    foot, and no hit turns a body back and forth.
     """
     sensors = (imu.gyro, imu.accel) if forces else (imu.gyro,)
     bad = find_contradicted(imu.t, (values @ imu.R_bs[:, axis] for values in sensors for axis in range(3)))
@@ -271,7 +275,7 @@ def _list_rows(bad: NDArray[np.bool_]) -> str:
 
 
 def check_dead_axes(recording: Recording) -> Iterator[Finding]:
-    """An axis that repeats one value while the others of its sensor move."""
+    """An axis that repeats one value while the others of its sensor change."""
     imu = recording.imu
     period = period_of(imu.t)
     whole = recording.duration
@@ -303,15 +307,17 @@ def check_dead_axes(recording: Recording) -> Iterator[Finding]:
 
 
 def _compare_repeats(x: Array) -> tuple[Array, Array]:
-    """An axis (N,) of the file, and which values (N-1,) are that before: turned and back, these differ by rounding."""
+    """An axis (N,) of the file, and which values (N-1,) equal the previous one: rotated and back, these differ by
+    rounding.
+    """
     step = np.diff(x)
     return x, np.abs(step, out=step) <= 1e-12 * max(float(x.max()), -float(x.min()))
 
 
 def _is_moving(x: Array, same: Array, least: float) -> bool:
-    """Whether an axis moves by many steps of its resolution, not only now and then, and with a sensor's noise.
+    """Whether an axis moves by many steps of its resolution, continually, and with a sensor's noise.
 
-    Its standard deviation is then above `least`.
+    Its standard deviation is then above `least`. Without noise an axis of a simulation may well be constant.
 
     Without noise an axis of a simulation may well be constant.
     """
@@ -319,7 +325,7 @@ def _is_moving(x: Array, same: Array, least: float) -> bool:
     steps = steps[np.abs(steps) > 1e-12 * np.abs(x).max()]
     if len(steps) < 2 or float(np.std(x)) < least or float(same.mean()) >= 0.5:
         return False
-    if float(np.ptp(x)) <= _MOVES * float(np.abs(steps).min()):
+    if float(np.ptp(x)) <= _MOVING_STEPS * float(np.abs(steps).min()):
         return False
     return float((steps[1:] * steps[:-1] < 0.0).mean()) > _NOISY
 
@@ -328,7 +334,9 @@ _LEAST_CORRELATION = 0.7  # of a correlation, and of a unit vector's component
 
 
 def check_forward_sign(imu: Imu, track: Track | None, forward: Fit | None) -> Iterator[Finding]:
-    """The forward force falls when the speed rises: one axis of the accelerometer is reversed, or all of the IMU."""
+    """The forward force decreases when the speed increases: one axis of the accelerometer is reversed, or all of the
+    IMU.
+    """
     up = crosschecks.find_up(imu)
     if track is None or forward is None or forward.correlation < _LEAST_CORRELATION or up[2] < 0.8:
         return
@@ -338,7 +346,7 @@ def check_forward_sign(imu: Imu, track: Track | None, forward: Fit | None) -> It
     along = f"the forward force falls when the speed rises (correlation {-forward.correlation:.2f})"
     if (
         side := crosschecks.correlate_sideways(imu, track)
-    ) is not None and side > 0:  # then nothing is turned: the other axes are right
+    ) is not None and side > 0:  # then nothing is rotated: the other axes are right
         column = "a" + _AXIS[int(np.argmax(np.abs(imu.R_bs[1])))]
         yield Finding(
             "refused",

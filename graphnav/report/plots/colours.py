@@ -1,8 +1,9 @@
-"""Colours of everything drawn, for light pages and for dark ones."""
+"""Colours of all figures, for light pages and for dark ones."""
 
 from __future__ import annotations
 
-# Okabe and Ito, "Color Universal Design" (2008): told apart with every common colour vision. The second
+# Okabe and Ito, "Color Universal Design" (2008): distinguishable with every common colour vision. The second colour of
+# each is for dark pages.
 # colour of each is for dark pages.
 PALETTE = {
     "ekf": ("#d55e00", "#f08a3c"),
@@ -20,9 +21,9 @@ PALETTE = {
     "outage": ("#71809c", "#8da0c4"),
     "stop": ("#6f42a8", "#c3a1f0"),
     "ink": ("#6a6a6b", "#a9a9aa"),
-    "paper": ("#ffffff", "#ffffff"),  # on the spectrogram, whatever the page
+    "paper": ("#ffffff", "#ffffff"),  # on the spectrogram, for light and dark pages
     "grid": ("#dededf", "#35373b"),
-    # of fixes, by their type (or how exact they say they are), the best first
+    # of fixes, by type (or stated accuracy), the best first
     "fixed": ("#2f8f4e", "#5fd28a"),
     "float": ("#b7860b", "#f0c040"),
     "ppp": ("#0b7d86", "#4fd0da"),

@@ -1,4 +1,4 @@
-"""Consistency of sigma: whitened residuals, NIS and NEES with their chi-square bands; what was used when."""
+"""Consistency of sigma: whitened residuals, NIS and NEES with their chi-square bands; use of constraints over time."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def residuals(record: ConstraintRecord, start: float, end: float, solver: str = 
     m = white.shape[1]
     tops = [float(np.clip(np.nanmax(np.abs(white[:, k]), initial=3.5) * 1.06, 4.0, 12.0)) for k in range(m)]
     nis = record.nis
-    # beyond this an epoch is in the outermost 1 % of the distribution
+    # an epoch beyond this is in the outermost 1 % of the distribution
     lo, hi = chi_square_quantile(0.005, m), chi_square_quantile(0.995, m)
     bottom, top = math.log10(0.1 * lo), math.log10(max(10.0 * hi, min(np.nanmax(nis, initial=hi), 1000.0 * hi)))
     figure = Figure(
@@ -43,7 +43,7 @@ def residuals(record: ConstraintRecord, start: float, end: float, solver: str = 
     *components, last = figure.panels
     for k, panel in enumerate(components):
         panel.shade(spans)
-        # what lies beyond the panel is drawn at its edge: it must be seen
+        # values beyond the panel are drawn at its edge, so that they are seen
         _epochs(panel, t, np.clip(white[:, k], -0.98 * tops[k], 0.98 * tops[k]), record.weight, look)
         panel.level(-3.0, dash=True)
         panel.level(3.0, dash=True)
@@ -54,7 +54,7 @@ def residuals(record: ConstraintRecord, start: float, end: float, solver: str = 
 
 
 def _epochs(panel: Panel, t: Array, y: Array, weight: Array, look: str) -> None:
-    """What was used, weakened and rejected, each in its look."""
+    """Used, down-weighted and rejected epochs, each with its marker."""
     rejected = weight <= 1e-9
     reduced = ~rejected & (weight < 0.5)
     used = ~rejected & ~reduced
@@ -77,7 +77,7 @@ def nees(
     """
     scaled = {key: np.where(s.value > 0, s.value / np.array(dofs, float), np.nan) for key, s in series.items()}
     edges = [(chi_square_quantile(0.005, dof) / dof, chi_square_quantile(0.995, dof) / dof) for dof in dofs]
-    # errors cross zero: how near to it they came is nothing to look at
+    # errors cross zero: how close to it they come means nothing
     ylims = []
     for k, (low, high) in enumerate(edges):
         values = [np.log10(np.maximum(v[:, k], 0.3 * low)) for v in scaled.values()]
@@ -97,7 +97,7 @@ def nees(
 def timeline(
     records: Mapping[str, ConstraintRecord], start: float, end: float, solver: str = "", *, spans: Shades
 ) -> Figure:
-    """A row per constraint: when it was used, weakened and rejected; `end` of the time axis from `start`."""
+    """A row per constraint: when it was used, down-weighted and rejected; `end` of the time axis from `start`."""
     count = max(len(records), 1)
     names = {float(count - 1 - k): name for k, name in enumerate(records)}
     figure = Figure([""], (0.0, end), [(-0.6, count - 0.4)], height=24 * count, names=names)

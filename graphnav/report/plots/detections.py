@@ -14,10 +14,14 @@ from graphnav.report.plots.figure import Figure, Panel, limits
 from graphnav.report.plots.thinning import BINS, thin
 
 _DYNAMIC = 2.5  # decades of amplitude in the spectrogram
-_FLOOR = 1e-6  # of a statistic, on its logarithmic axis
+_FLOOR = 1e-6  # lower limit of a statistic on its logarithmic axis
 _FUSED = "fused"
-_SHOWN = ("low_band_glrt", "glrt", "fft")  # of more than `_MOST`; the others are in statistics.csv.gz
-_MOST = 4
+_SHOWN_STATISTICS = (
+    "low_band_glrt",
+    "glrt",
+    "fft",
+)  # of more than `_MAX_STATISTICS`; the others are in statistics.csv.gz
+_MAX_STATISTICS = 4
 
 
 def detections(recording: Recording, found: Sequence[Detection]) -> Figure:
@@ -33,8 +37,8 @@ def detections(recording: Recording, found: Sequence[Detection]) -> Figure:
     for d in found:
         if d.name != _FUSED and np.isfinite(d.statistic).any():
             by_name.setdefault(d.name, []).append(d)
-    if len(by_name) > _MOST:
-        by_name = {name: every for name, every in by_name.items() if name in _SHOWN}
+    if len(by_name) > _MAX_STATISTICS:
+        by_name = {name: every for name, every in by_name.items() if name in _SHOWN_STATISTICS}
     shown = drawn_rows(imu)
     t = imu.t[shown] - t0
     force, rate = (size[shown] for size in _sizes(imu))
@@ -75,22 +79,22 @@ def detections(recording: Recording, found: Sequence[Detection]) -> Figure:
 
 
 def drawn_rows(imu: Imu) -> NDArray[np.intp]:
-    """Those of an IMU's rows that the figure shows; of these and any others the same."""
+    """The rows of an IMU that the figure shows, independent of other rows."""
     return np.union1d(*(thin(imu.t, _norm(x)) for x in (imu.accel, imu.gyro)))
 
 
 def _sizes(imu: Imu) -> tuple[Array, Array]:
-    """Of force (m/s^2) and rate (deg/s)."""
+    """Magnitudes of force (m/s^2) and rate (deg/s)."""
     return _norm(imu.accel), np.degrees(_norm(imu.gyro))
 
 
 def _norm(x: Array) -> Array:
-    """(N,) lengths of vectors (N, 3), without their squares in memory: those of a day take 400 MB."""
+    """(N,) lengths of vectors (N, 3), computed without their squares in memory: for a day these take 400 MB."""
     return np.sqrt(np.einsum("ij,ij->i", x, x))
 
 
 def _speeds(recording: Recording) -> list[tuple[str, Array, Array, str]]:
-    """(words, s from the start, m/s, colour) of every sensor that measures one."""
+    """(name, s from the start, m/s, colour) of every sensor that measures a speed."""
     out = []
     gnss, odometer = recording.gnss, recording.odometer
     if gnss is not None and gnss.v is not None and np.isfinite(gnss.v).any():

@@ -1,7 +1,7 @@
-"""Figures as plotly takes them: panels over one x axis, and in each what is to be seen.
+"""Figures in plotly's form: panels over one x axis.
 
-Plain JSON that refers to colours as `var(--name)`, as the page's style sheet does; `page.js` puts in those of the
-reader's light or dark page, and draws. Numbers go as little-endian 32-bit floats, which plotly reads as they are.
+Plain JSON that refers to colours as `var(--name)`, as the page's style sheet does; `page.js` inserts those of the
+reader's light or dark page, and draws. Numbers are passed as little-endian 32-bit floats, which plotly reads directly.
 """
 
 from __future__ import annotations
@@ -45,19 +45,19 @@ class Panel:
         self, x: Array, y: Array, name: str, label: str = "", width: float = 1.4, alpha: float = 1.0,
         dash: bool = False, quiet: bool = False,
     ) -> None:  # fmt: skip
-        """A line over x in order, broken where y is not finite or x leaps."""
+        """A line over ascending x, interrupted where y is not finite or x has a gap."""
         x, y = with_breaks(x, thin(x, y), y)
         look = {"color": colour(name), "width": width, "dash": "dash" if dash else "solid"}
         self._add(label, {"mode": "lines", "x": numbers(x), "y": numbers(y), "line": look, "opacity": alpha}, quiet)
 
     def level(self, y: float, **kw: Any) -> None:
-        """A line across at y."""
+        """A horizontal line at y."""
         self.line(np.array(self.xlim), np.full(2, y), "ink", quiet=True, **{"width": 1.0, **kw})
 
     def way(
         self, xy: Array, name: str, label: str, t: Array | None = None, width: float = 1.8, alpha: float = 1.0
     ) -> None:
-        """A line through places (N, 2), passed at t."""
+        """A line through places (N, 2), reached at t."""
         rows = choose_rows(*xy.T)
         at: dict[str, Any] = {} if t is None else {"customdata": numbers(t[rows])}
         look = {"color": colour(name), "width": width}
@@ -80,7 +80,7 @@ class Panel:
         self._add(label, {"mode": "markers", "marker": look, **places, **at}, at=words, way=way)
 
     def band(self, x: Array, low: Array, high: Array, name: str, label: str = "", alpha: float = 0.18) -> None:
-        """A tinted area between two lines, broken where x leaps."""
+        """A tinted area between two lines, interrupted where x has a gap."""
         x, low, high = with_breaks(x, thin(x, high - low, BINS // 2), low, high)
         parts = []
         for run in np.ma.clump_unmasked(np.ma.masked_invalid(low + high)):
@@ -93,7 +93,7 @@ class Panel:
             self._add(label, {"x": numbers(both[0]), "y": numbers(both[1]), **look}, quiet=True)
 
     def shade(self, spans: Mapping[str, Spans]) -> None:
-        """Tint whole spans of x, by what they are (a key of `SHADES`)."""
+        """Tint whole spans of x, by kind (a key of `SHADES`)."""
         for what, every in spans.items():
             cut = [(max(a, self.xlim[0]), min(b, self.xlim[1])) for a, b in every]
             self.figure.shapes += [
@@ -121,7 +121,7 @@ class Panel:
         self, x: float, y: float, text: str, align: str = "left", shift: tuple[float, float] = (6, 0),
         name: str = "truth",
     ) -> None:  # fmt: skip
-        """Words beside a place, moved by pixels."""
+        """Text beside a place, shifted by pixels."""
         self.figure.annotations.append({
             "text": text, "xref": self.axes["xaxis"], "yref": self.axes["yaxis"], "x": x, "y": y, "xanchor": align,
             "yanchor": "bottom", "xshift": shift[0], "yshift": shift[1], "showarrow": False,
@@ -166,14 +166,14 @@ class Figure:
             panel = Panel(self, k, units[k] if units else "", lims[k], ylim)
             xname, yname = panel.axes["xaxis"], panel.axes["yaxis"]
             lowest = k + columns >= count
-            # an axis that several panels share belongs to the lowest of them
+            # an axis shared by several panels belongs to the lowest of them
             self.axes[f"xaxis{xname[1:]}"] = {
-                **_LOOK, "range": list(lims[k]), "domain": across, "anchor": yname, "nticks": 6 if columns == 1 else 4,
+                **_STYLE, "range": list(lims[k]), "domain": across, "anchor": yname, "nticks": 6 if columns == 1 else 4,
                 "hoverformat": ".2f", "showline": True, **({"title": {"text": x, "standoff": 6}} if lowest else {}),
                 **({"type": "log"} if x_log else {}),
             }  # fmt: skip
             logarithmic = log if isinstance(log, bool) else log[k]
-            look = {**_LOOK, "range": list(ylim), "domain": [max(top - height / inner, 0.0), top], "anchor": xname}
+            look = {**_STYLE, "range": list(ylim), "domain": [max(top - height / inner, 0.0), top], "anchor": xname}
             if logarithmic:
                 look |= {"type": "log", "minorloglabels": "complete", "nticks": 3}
             if names is not None:
@@ -190,17 +190,17 @@ class Figure:
             self.panels.append(panel)
 
     def x_of(self, k: int) -> str:
-        """The x axis of panel k: that of the first, unless it stands apart."""
+        """The x axis of panel k: that of the first, unless panels stand apart."""
         return _axis("x", k if self.apart else 0)
 
     @property
     def json(self) -> dict[str, Any]:
-        """`data` and `layout` as plotly takes them; the width is the container's."""
+        """`data` and `layout` for plotly; the width is the container's."""
         layout = {
             "autosize": True, "margin": {"l": _LEFT, "r": _RIGHT, "t": _ABOVE, "b": _BELOW},
             "paper_bgcolor": "rgba(0,0,0,0)", "plot_bgcolor": "rgba(0,0,0,0)",
             "font": {"family": 'system-ui, "Segoe UI", Roboto, sans-serif', "size": 11, "color": "var(--soft)"},
-            "showlegend": False,  # the page has one, outside the picture
+            "showlegend": False,  # the page has one, outside the figure
             "hovermode": "x" if self.time else "closest",
             "hoverlabel": {"bgcolor": "var(--card)", "bordercolor": "var(--edge)", "font": {"color": "var(--words)"}},
             "annotations": self.annotations, "shapes": self.shapes, **self.axes,
@@ -210,21 +210,21 @@ class Figure:
         return {"data": self.data, "layout": layout}
 
 
-_LOOK = {"zeroline": False, "gridcolor": "var(--grid)", "linecolor": "var(--ink)", "exponentformat": "none"}
+_STYLE = {"zeroline": False, "gridcolor": "var(--grid)", "linecolor": "var(--ink)", "exponentformat": "none"}
 
 
 def limits(
     values: Sequence[Array], floor: float = 0.0, symmetric: bool = False, always: Sequence[Array] = ()
 ) -> tuple[float, float]:
-    """Limits of an axis that a spike does not set, at least `floor` wide.
+    """Limits of an axis that single outliers do not set, at least `floor` wide.
 
-    All is shown within the middle 99 % of the values and half as much again on either side, which are 5.2 sigma of a
-    Gaussian, and all of `always`; what lies farther out is found by zooming out.
+    They include the middle 99 % of the values plus half as much again on either side, which are 5.2 sigma of a
+    Gaussian, and all of `always`; values further out are seen by zooming out.
     """
     flat = np.concatenate([np.ravel(v) for v in values]) if values else np.zeros(0)
     flat = flat[np.isfinite(flat)]
     lo, hi = (float(flat.min()), float(flat.max())) if len(flat) else (0.0, 1.0)
-    if len(flat) > 200:  # of fewer, 1 % is less than two
+    if len(flat) > 200:  # for fewer values, 1 % is less than two
         a, b = np.quantile(flat, [0.005, 0.995])
         if b > a:
             kept = [v[np.isfinite(v)] for v in always]
@@ -238,12 +238,12 @@ def limits(
 
 
 def numbers(values: Array) -> dict[str, str]:
-    """A typed array, as plotly reads it."""
+    """A typed array in plotly's form."""
     return {"dtype": "f4", "bdata": base64.b64encode(np.asarray(values, dtype="<f4").tobytes()).decode("ascii")}
 
 
 def colour(name: str) -> str:
-    """A colour of the page, by the name of a solver or of another drawn thing."""
+    """A colour of the page, by the name of a solver or another drawn object."""
     return f"var(--{name if name in PALETTE else 'other'})"
 
 

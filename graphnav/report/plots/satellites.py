@@ -1,4 +1,4 @@
-"""Raw GNSS: the sky, which satellites were used when, residuals by satellite and elevation, arcs of carriers."""
+"""Raw GNSS: sky plot, satellites used over time, residuals by satellite and elevation, arcs of carriers."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from graphnav.report.plots.figure import Figure, colour, limits
 from graphnav.report.plots.series import Shades
 from graphnav.report.plots.thinning import BINS
 
-HALF = 0.5  # of a row's weight, below which it counts as refused
+HALF = 0.5  # weight of a row below which it counts as rejected
 _SKY = 320  # pixels
-_ROW = 15  # pixels of a satellite or signal
-_PLENTY = 4 * BINS  # dots of a cloud, which are drawn without thinning
+_ROW = 15  # pixels per satellite or signal
+_PLENTY = 4 * BINS  # points of a scatter plot that are drawn without thinning
 _RINGS = (0.0, 30.0, 60.0)  # deg of elevation
 _BINS = np.arange(0.0, 90.1, 5.0)  # deg of elevation
 
 
 def sky(record: ConstraintRecord, solver: str) -> Figure:
-    """Where the satellites stood: the zenith in the middle, the horizon around, north up; refused rows marked.
+    """Sky plot: the zenith in the middle, the horizon around, north up; rejected rows marked.
 
     Parameters
     ----------
@@ -63,7 +63,7 @@ def sky(record: ConstraintRecord, solver: str) -> Figure:
 def used_satellites(
     records: Mapping[str, ConstraintRecord], start: float, end: float, solver: str, *, spans: Shades
 ) -> Figure:
-    """How many satellites were used, and how many refused, at each epoch; a panel for each kind of row."""
+    """Numbers of satellites used and rejected at each epoch; a panel for each kind of row."""
     counts, ylims = [], []
     for record in records.values():
         t, of = np.unique(record.t, return_inverse=True)
@@ -79,7 +79,7 @@ def used_satellites(
 
 
 def satellite_rows(record: ConstraintRecord, start: float, end: float, solver: str, *, spans: Shades) -> Figure:
-    """A line for each satellite: when its rows were used, and when refused."""
+    """A line for each satellite: when its rows were used, and when rejected."""
     every = sorted(set(record.satellite.tolist()))
     figure, places = _named_rows(every, (0.0, end), {"spans": spans})
     (panel,) = figure.panels
@@ -96,7 +96,7 @@ def satellite_rows(record: ConstraintRecord, start: float, end: float, solver: s
 
 
 def residuals_by_elevation(records: Mapping[str, ConstraintRecord], solver: str) -> Figure:
-    """Every residual over its elevation, and by steps of it their RMS beside the sigma that was stated."""
+    """Every residual over its elevation, and by steps of it their RMS beside the stated sigma."""
     shown = [(kind, np.degrees(r.elevation), r, r.residual[:, 0]) for kind, r in records.items()]
     units = [r.unit for r in records.values()]
     ylims = [limits([y[r.weight >= HALF]], symmetric=True) for _, _, r, y in shown]
@@ -116,7 +116,7 @@ def residuals_by_elevation(records: Mapping[str, ConstraintRecord], solver: str)
 
 
 def residuals_by_satellite(kind: str, record: ConstraintRecord, solver: str) -> Figure:
-    """For each satellite the middle, the middle half and the middle 95 % of its residuals."""
+    """For each satellite the median, the middle half and the middle 95 % of its residuals."""
     every = sorted(set(record.satellite.tolist()))
     y, used = record.residual[:, 0], record.weight >= HALF
     parts = {name: np.quantile(own, [0.025, 0.25, 0.5, 0.75, 0.975]) for name in every
@@ -136,7 +136,7 @@ def residuals_by_satellite(kind: str, record: ConstraintRecord, solver: str) -> 
 
 
 def carrier_arcs(arcs: CarrierArcs, start: float, end: float, *, spans: Shades) -> Figure:
-    """A line for each signal of a satellite: its arcs, with integer ambiguities and with real ones."""
+    """A line for each signal of a satellite: its arcs, with integer and with real-valued ambiguities."""
     figure, places = _named_rows(sorted(set(arcs.name.tolist())), (0.0, end), {"spans": spans})
     (panel,) = figure.panels
     row = np.array([places[name] for name in arcs.name.tolist()])
@@ -150,7 +150,7 @@ def carrier_arcs(arcs: CarrierArcs, start: float, end: float, *, spans: Shades) 
 
 
 def _named_rows(every: list[str], xlim: tuple[float, float], more: dict[str, Any]) -> tuple[Figure, dict[str, float]]:
-    """A panel with a line for each name, the first on top, and where these are."""
+    """A panel with a line for each name, the first on top, and the positions of these."""
     places = {name: float(len(every) - 1 - k) for k, name in enumerate(every)}
     spans = more.pop("spans", {})
     figure = Figure(
@@ -162,7 +162,7 @@ def _named_rows(every: list[str], xlim: tuple[float, float], more: dict[str, Any
 
 
 def _some(rows: NDArray[np.intp], most: int = _PLENTY) -> NDArray[np.intp]:
-    """Rows for a cloud of dots, evenly chosen: it keeps its shape, which extremes alone would not."""
+    """Evenly chosen rows of a scatter plot: it keeps its shape, which extremes alone would not."""
     return rows[:: -(-len(rows) // most) or 1]
 
 

@@ -1,4 +1,4 @@
-"""Things over time: values with 3 sigma, sigmas, errors in withheld spans."""
+"""Quantities over time: values with 3 sigma, sigmas, errors in withheld spans."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ import numpy as np
 from graphnav.core.rotation import Array
 from graphnav.report.plots.figure import Figure, Panel, Spans, limits
 
-Shades = Mapping[str, Spans]  # s from the start, by what they are
+Shades = Mapping[str, Spans]  # s from the start, by kind
 
 
 @dataclass(frozen=True)
 class Series:
-    """Something of k components over time, with its 1-sigma where there is one."""
+    """A quantity of k components over time, with its 1-sigma where known."""
 
     t: Array  # (N,) s from the recording's start
     value: Array  # (N, k)
     sigma: Array | None = None  # (N, k)
 
     def take(self, components: Sequence[int]) -> Series:
-        """Some of the components."""
+        """Select components."""
         return Series(self.t, self.value[:, components], None if self.sigma is None else self.sigma[:, components])
 
 
@@ -49,7 +49,7 @@ def bands(
             extremes.append(s.value[:, k])
             always += [s.value[(s.t >= a) & (s.t <= b), k] for gone in spans.values() for a, b in gone]
             if s.sigma is not None:
-                # the first moments of a filter must not set the scale of the whole drive
+                # the first seconds of a filter must not set the scale for the whole drive
                 width = 3.0 * s.sigma[:, k]
                 width = np.minimum(width, np.nanquantile(width, 0.97) if np.isfinite(width).any() else 0.0)
                 centre = 0.0 if about_zero else s.value[:, k]

@@ -1,4 +1,4 @@
-"""Which rows of long series are worth drawing."""
+"""Selection of the rows of long series to draw."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ import numpy as np
 
 from graphnav.core.rotation import Array
 
-BINS = 600  # columns a line is thinned to: half a wide panel's pixels, so that there is something to zoom into
+BINS = 600  # columns that a line is thinned to: half a wide panel's pixels, so that zooming shows more
 
 
 def thin(t: Array, y: Array, bins: int = BINS) -> np.ndarray:
-    """Indices (sorted) of the rows worth drawing: per column of pixels the first, last, lowest and highest.
+    """Indices (sorted) of the rows to draw: per pixel column the first, last, lowest and highest.
 
     A line through them covers the same pixels as the line through all rows (Jugel et al., "M4: A
     Visualization-Oriented Time Series Data Aggregation", VLDB 2014). Rows where y is not finite break
@@ -41,7 +41,7 @@ def thin(t: Array, y: Array, bins: int = BINS) -> np.ndarray:
 
 
 def with_breaks(t: Array, rows: np.ndarray, *columns: Array) -> Any:
-    """t and columns at the kept rows, with a NaN row in every long gap of t, where a line must not lead across.
+    """t and columns at the kept rows, with a NaN row in every long gap of t, which a line must not cross.
 
     Long is more than 20 median steps and more than one hundredth of the whole.
     """
@@ -55,6 +55,6 @@ def with_breaks(t: Array, rows: np.ndarray, *columns: Array) -> Any:
 
 
 def choose_rows(x: Array, y: Array, bins: int = BINS) -> np.ndarray:
-    """Indices (sorted) of the rows of a way (x, y) that is drawn with `bins` columns: extremes of both are kept."""
+    """Indices (sorted) of the rows to draw of a track (x, y) with `bins` columns: extremes of both are kept."""
     k = np.arange(len(x), dtype=float)
     return np.union1d(thin(k, x, bins), thin(k, y, bins))

@@ -1,4 +1,4 @@
-"""The way from above and from the side, with the fixes as good as each is."""
+"""The track from above and from the side, with the fixes by quality."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ import numpy as np
 from graphnav.core.rotation import Array
 from graphnav.report.plots.figure import SHADES, Figure, Panel, Spans, colour, limits
 
-_FEW = 60  # stops that get a large mark each
-_WIDE, _HIGH = 1080.0, 560  # pixels of the map on a desk; narrower pages show more of the north
+_MARKED_STOPS = 60  # stops that are marked individually
+_WIDE, _HIGH = 1080.0, 560  # pixels of the map on a wide screen; narrower pages show more of the north
 
 
 @dataclass(frozen=True)
 class Fixes:
     """GNSS fixes: times (M,) in s from the start, east, north, up (M, 3) in m, and which were excluded (M,).
 
-    `kinds` are the rows (M,) bool of each kind of fix, by its name: a type, or how exact it says it is.
+    `kinds` are the rows (M,) bool of each kind of fix, by name: a type, or a stated accuracy.
     """
 
     t: Array
@@ -28,7 +28,7 @@ class Fixes:
     kinds: Mapping[str, np.ndarray]
 
 
-# kind of a fix -> colour; others as they come
+# kind of a fix -> colour; further kinds take the next colours
 FIX_COLOURS = {
     "fixed": "fixed", "float": "float", "ppp": "ppp", "differential": "differential", "sbas": "sbas",
     "single": "single", "unknown": "ink", "GNSS fix": "ink",
@@ -45,7 +45,7 @@ def trajectory(
     stops: Spans = (),
     standing: str = "stop",
 ) -> Figure:
-    """Where it went, to scale, north up.
+    """The track, to scale, north up.
 
     Parameters
     ----------
@@ -82,7 +82,7 @@ def trajectory(
 
 
 def profile(lines: Mapping[str, tuple[Array, Array]], points: Mapping[str, tuple[Array, Array]]) -> Figure:
-    """Heights (m) over the distance travelled (m): `lines` of solvers and truth, `points` of fixes by their kind."""
+    """Heights (m) over the distance travelled (m): `lines` of solvers and truth, `points` of fixes by kind."""
     reach = max((float(x[-1]) for x, _ in lines.values() if len(x)), default=1.0)
     kilo, unit = (1e-3, "km") if reach >= 2000.0 else (1.0, "m")
     values = [y for _, y in (*lines.values(), *points.values())]
@@ -98,7 +98,7 @@ def profile(lines: Mapping[str, tuple[Array, Array]], points: Mapping[str, tuple
 
 
 def draw_fixes(panel: Panel, fixes: Fixes, k: int | None = None) -> None:
-    """Each kind in its colour, what was excluded as a cross: on a map, or component k over time."""
+    """Each kind in its colour, excluded fixes as crosses: on a map, or component k over time."""
     x, y = (fixes.enu[:, 0], fixes.enu[:, 1]) if k is None else (fixes.t, fixes.enu[:, k])
     for kind, of_it in fixes.kinds.items():
         rows = of_it & ~fixes.excluded & np.isfinite(y)
@@ -125,13 +125,13 @@ def _draw_stops(panel: Panel, t: Array, en: Array, stops: Spans, standing: str) 
         return
     begin, end = np.array(stops).T
     x, y = (np.interp(0.5 * (begin + end), t, en[:, k]) for k in (0, 1))
-    panel.dots(x, y, "stop", standing, 8.0 if len(stops) <= _FEW else 5.0, "D", t=begin, way=True)
+    panel.dots(x, y, "stop", standing, 8.0 if len(stops) <= _MARKED_STOPS else 5.0, "D", t=begin, way=True)
 
 
 def _mark_ends(panel: Panel, en: Array, scale: float) -> None:
-    """Where the track starts and ends, the words on the side where the track is not, but inside the map."""
+    """Mark the start and end of the track, with labels on the side away from the track but inside the map."""
     west, east = panel.xlim
-    edge = 0.12 * (east - west)  # the room that words take on a phone
+    edge = 0.12 * (east - west)  # room for labels on a phone
     together = bool(np.linalg.norm(en[-1] - en[0]) < 16.0 * scale)
     few = max(1, len(en) // 30)
     for row, inner, marker, words in ((0, few, "^", "start"), (-1, max(-1 - few, -len(en)), "s", "end")):
@@ -144,9 +144,9 @@ def _mark_ends(panel: Panel, en: Array, scale: float) -> None:
 
 
 def _scale_bar(figure: Figure, panel: Panel) -> None:
-    """A bar of a round number of metres at the lower edge of a map: about a fifth of its width, a tenth of its height.
+    """A scale bar of a round number of metres at the lower edge of a map: about a fifth of its width.
 
-    Both axes have the same scale, so a track that is high and narrow stands in a map much wider than itself.
+    Both axes have the same scale, so a track that is tall and narrow lies in a map much wider than itself.
     """
     (west, east), (south, north) = panel.xlim, panel.ylim
     reach = max(east - west, 0.5 * (north - south))

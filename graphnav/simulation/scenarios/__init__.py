@@ -1,4 +1,4 @@
-"""The scenarios, found by themselves: a module here holds `SCENARIOS`, a list of `Scenario`."""
+"""The scenarios, found automatically: a module here defines `SCENARIOS`, a list of `Scenario`."""
 
 from __future__ import annotations
 

@@ -20,7 +20,7 @@ from graphnav.simulation.series import BarometerModel, DualAntennaModel
 from graphnav.simulation.splines import stream
 from graphnav.simulation.vibration import Engine, Idle, Shake, Springs, idle_floor, road_noise
 
-# a four-cylinder: its second order is the strong one
+# a four-cylinder engine: its second order is the strongest
 FOUR_CYLINDERS = Idle(((0.4, 0.5, 0.8), (1.5, 3.0, 6.0), (0.5, 1.0, 2.0)), (0.02, 0.15, 0.02))
 ORDERS = (1.0, 2.0, 4.0)
 RTK = GnssModel(white=(0.01, 0.01, 0.02), slow=(0.008, 0.008, 0.015), lever_arm=(0.1, -0.3, 0.8))
@@ -48,7 +48,7 @@ def electric(
     seed: int, *, duration: float = 900.0, tunnels: int = 1, gnss: str = "rtk", odometer: bool = True,
     barometer: bool = False, antennas: bool = False, exact: bool = False, rate: float = 100.0,
 ) -> Simulated:  # fmt: skip
-    """The same sort of town in a car whose stops are silent."""
+    """A similar town in a car without engine vibration at stops."""
     return _build_town("electric", seed, duration, tunnels, gnss, odometer, 0.0, barometer, antennas, exact, rate)
 
 
@@ -91,7 +91,7 @@ def _build_town(
 
 
 def _seat_passengers(path: Path, seed: int) -> list[Boarding | Fidget]:
-    """People on their seats all along, and the driver getting out at the end."""
+    """Passengers on their seats throughout, and the driver getting out at the end."""
     rng = stream(seed, "events")
     times = np.sort(rng.uniform(path.start, path.end, rng.poisson((path.end - path.start) / 60.0)))
     fidgets = [Fidget(float(t), float(rng.uniform(0.02, 0.15))) for t in times]

@@ -22,13 +22,13 @@ START, END = 6920.0, 13845.0  # 01:55:20, 03:50:45
 STOPS = tuple(3600.0 * h + 60.0 * m + s for h, m, s in _CLOCK)
 # Table 4, mg and deg/s, for half, once and twice the crankshaft's frequency; right is not in the table: figure 3 shows
 # one line there, near 12.5 Hz, and more noise. The half order is the 6.248 Hz that the table finds below 10 Hz.
-_HALF = (0.03, 0.085, 0.03)
+_HALF_ORDER = (0.03, 0.085, 0.03)
 TABLE_4 = (
-    Idle((_HALF, (1.5, 3.085, 5.402), (0.2, 2.124, 3.994)), (0.003, 0.395, 0.003)),
-    Idle((_HALF, (1.0, 1.622, 2.839), (0.2, 4.283, 2.001)), (0.002, 0.182, 0.005)),
-    Idle((_HALF, (1.4, 2.821, 4.927), (0.2, 2.829, 4.782)), (0.002, 0.305, 0.005)),
+    Idle((_HALF_ORDER, (1.5, 3.085, 5.402), (0.2, 2.124, 3.994)), (0.003, 0.395, 0.003)),
+    Idle((_HALF_ORDER, (1.0, 1.622, 2.839), (0.2, 4.283, 2.001)), (0.002, 0.182, 0.005)),
+    Idle((_HALF_ORDER, (1.4, 2.821, 4.927), (0.2, 2.829, 4.782)), (0.002, 0.305, 0.005)),
 )
-MEAN = Idle((_HALF, (1.3, 2.509, 4.389), (0.2, 3.078, 3.592)), (0.002, 0.294, 0.004))
+MEAN = Idle((_HALF_ORDER, (1.3, 2.509, 4.389), (0.2, 3.078, 3.592)), (0.002, 0.294, 0.004))
 # Within a bin of the 12.495 and 24.991 Hz of table 4, and near the middle of a bin of each stop's whole spectrum,
 # where the table's amplitudes can be read off again.
 IDLE_HZ = 12.49585
@@ -56,7 +56,7 @@ def run(
     edges = tuple(START + x for x in (150.0, 210.0, 380.0, 500.0, 680.0, 770.0)) if short else STOPS
     rng = stream(seed, "way")
     plan, t = [Manoeuvre(15.0, 0.0)], start + 15.0
-    # a stop's edges are where the wheels stand to the tenth of a second: the plan allows for the spline's reach
+    # edges of a stop are where the wheels stand to the tenth of a second: the plan accounts for the spline's extent
     for begin, finish in (edges[0:2], edges[2:4], edges[4:6], (end - 5.0, end)):
         still, away = begin - SETTLE, finish + SETTLE if finish < end else end
         plan += [*streets(still - t, rng), Manoeuvre(away - still, 0.0)]
@@ -87,7 +87,7 @@ def run(
 
 
 def _list_events(edges: tuple[float, ...], seed: int) -> list[Boarding | Fidget]:
-    """Who gets in and out when: a door at stop 1, most at stop 2, two doors at stop 3; no seat is quite still."""
+    """Passengers: a door at stop 1, most at stop 2, two doors at stop 3; no seat is completely still."""
     rng = stream(seed, "events")
 
     def at(stop: int, share: float) -> float:

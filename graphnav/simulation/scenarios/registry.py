@@ -1,4 +1,4 @@
-"""How a scenario makes itself known."""
+"""Registration of scenarios."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Fast and slow: a motorway, and traffic that crawls."""
+"""A motorway, and crawling traffic."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def crawl(
 ) -> Simulated:  # fmt: skip
     """Two minutes of driving, `jam` s of creeping at `slowest` to `fastest` m/s with true stops between, and on.
 
-    The road is smooth: what tells creeping from standing is next to nothing.
+    The road is smooth: creeping hardly differs from standing.
     """
     if not 0.0 < slowest <= fastest <= 3.0:
         raise ConfigError(

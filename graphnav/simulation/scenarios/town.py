@@ -1,4 +1,4 @@
-"""Streets to drive through: what the town scenarios, and the ways between stops of others, are made of."""
+"""Streets: the parts of the town scenarios, and of the drives between stops in others."""
 
 from __future__ import annotations
 
