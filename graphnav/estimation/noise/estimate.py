@@ -27,10 +27,9 @@ from scipy.special import chdtrc, chdtri
 
 from graphnav.constraints.base import Constraint
 from graphnav.constraints.gnss import TIMES
-from graphnav.core.errors import EstimationError
 from graphnav.core.rotation import Array
 from graphnav.estimation.noise.apply import row_weights, with_noise
-from graphnav.estimation.noise.initial_points import find_initial_points, smooth_about
+from graphnav.estimation.noise.initial_points import BREAKDOWN, find_initial_points, smooth_about
 from graphnav.estimation.noise.model import INTERVALS, NoiseModel, RowWeights, VarianceComponent
 from graphnav.estimation.noise.moments import ImuMoments, imu_moments, lag_moments, process_moments, row_moments
 from graphnav.estimation.noise.outliers import CHANCE, cost_of_outliers, limit_scaled, list_reduced
@@ -166,7 +165,7 @@ def estimate_noise(
         figures.weights |= initial.weights
         try:
             found.append(_iterate(problem, figures, initial.points, progress, intervals))
-        except EstimationError:  # the filter breaks down from these points; others may do
+        except BREAKDOWN:  # from these points; others may do
             if initial is initials[-1] and not found:
                 raise
     best = max(found, key=lambda one: one.log_evidence)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from graphnav.estimation.solvers.linearise import Points
 from graphnav.estimation.solvers.passes import ForwardRecord, SmootherPass, near_to
 from graphnav.estimation.solvers.rts import backward
 
+BREAKDOWN = EstimationError, np.linalg.LinAlgError  # what a filter raises that has lost its digits
 _ROUNDS = 5  # searches for gross outliers at most; in most drives the second finds what the first found
 
 
@@ -56,9 +57,12 @@ def find_initial_points(problem: Problem, opening: float | None) -> tuple[list[I
     Raises
     ------
     EstimationError
-        If the filter breaks down with everything used.
+        If the filter breaks down with everything used, with a robust kernel on the fixes as well.
     """
-    plain = about = backward(problem, ekf(problem, opening=opening))
+    try:
+        plain = about = backward(problem, ekf(problem, opening=opening))
+    except BREAKDOWN:  # outliers of hundreds of sigmas leave no digits in its covariance
+        plain = about = _smooth_robustly(problem, opening)
     sound, passes = problem, 1
     try:
         for _ in range(_ROUNDS):
@@ -70,8 +74,11 @@ def find_initial_points(problem: Problem, opening: float | None) -> tuple[list[I
         if sound is problem:
             return [Initial(plain)], passes
         (_, one), (_, other) = (smooth_about(problem, points) for points in (plain, about))
-    except EstimationError:  # with figures that are far off, most rows seem wrong, and the rest determines nothing
-        return [Initial(plain)], passes + 1
+    except BREAKDOWN:  # with figures or points that are far off, most rows seem wrong
+        try:
+            return [Initial(plain), Initial(_smooth_robustly(problem, opening))], passes + 2
+        except BREAKDOWN:
+            return [Initial(plain)], passes + 2
     weights = {}
     for rows in sound.constraints:
         if rows.weight is not None and np.any(rows.weight == 0.0):
@@ -80,6 +87,13 @@ def find_initial_points(problem: Problem, opening: float | None) -> tuple[list[I
             weights[rows.name] = list_reduced(sound.t[rows.keyframe], weight, every)
     same = near_to(other, one)
     return [Initial(one, weights)] if same else [Initial(plain), Initial(about, weights)], passes + 2
+
+
+def _smooth_robustly(problem: Problem, opening: float | None) -> SmootherPass:
+    """Filter and smoother with Cauchy's kernel on the fixes."""
+    rows = (replace(c, robust="cauchy") if c.fix_of else c for c in problem.constraints)
+    problem = replace(problem, constraints=tuple(rows))
+    return backward(problem, ekf(problem, opening=opening))
 
 
 def _list_unused(problem: Problem) -> dict[str, list[int]]:
