@@ -33,6 +33,7 @@ _FEWEST_FIXES = 3  # fixes without which there is no acceleration
 _MOVING_SIGMAS = 5.0  # sigmas of travel that count as motion: noise reaches them once in 270 000 fixes, exp(-5^2/2)
 _LEAD_TIME = 10.0  # s of the span before the motion
 _OUTLYING = 6.0  # multiple of the typical deviation of fixes from their running median, or of their sigma
+_GRIP = 8.0  # m/s^2, of tyres
 # rad, of the initial headings that are tried, relative to the first guess
 _HEADINGS_TRIED = (0.0, 0.5 * np.pi, 1.5 * np.pi, np.pi)
 _FIRST_ITERATIONS = 10  # iterations after which a start either has converged or creeps
@@ -42,7 +43,11 @@ Smoother = Callable[[Problem, States], Solution]
 
 
 def drop_implausible(recording: Recording) -> Recording:
-    """Drop the fixes far off the running median of five, which would be taken for motion."""
+    """Drop the fixes that would be taken for motion: far off the running median of five.
+
+    The first and the last are compared with the line through the medians beside them, from which a vehicle may
+    accelerate.
+    """
     gnss = recording.gnss
     if gnss is not None and not np.isfinite(gnss.llh).all():
         gnss = pick_fixes(gnss, np.flatnonzero(np.isfinite(gnss.llh).all(axis=1)))
@@ -50,7 +55,12 @@ def drop_implausible(recording: Recording) -> Recording:
     if gnss is None or len(gnss.t) < 5:
         return recording
     p = LocalFrame(gnss.llh[0]).from_llh(gnss.llh)[:, :2]
-    off = np.linalg.norm(p - run_median(p, 5), axis=1)
+    middle = run_median(p, 5)
+    off = np.linalg.norm(p - middle, axis=1)
+    for end, near, far in ((0, 2, 4), (-1, -3, -5)):  # there the median is the fix itself
+        dt = gnss.t[end] - gnss.t[[near, far]]
+        line = middle[near] + (middle[far] - middle[near]) * dt[0] / (dt[0] - dt[1])
+        off[end] = max(0.0, float(np.linalg.norm(p[end] - line)) - 0.5 * _GRIP * abs(dt[0] * dt[1]))
     usual = np.maximum(np.median(off), np.linalg.norm(gnss.sd[:, :2], axis=1))
     return replace(recording, gnss=pick_fixes(gnss, off <= _OUTLYING * usual))
 
