@@ -163,6 +163,8 @@ def estimate_noise(
     for initial in initials:
         figures = _begin(problem, start)
         figures.weights |= initial.weights
+        for name, more in initial.log_factors.items():
+            figures.log[name] += more
         try:
             found.append(_iterate(problem, figures, initial.points, progress, intervals))
         except BREAKDOWN:  # from these points; others may do

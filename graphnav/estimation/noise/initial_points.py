@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
+from scipy.special import chdtri
 
 from graphnav.core.errors import EstimationError
 from graphnav.estimation.faults import weigh_rows
@@ -13,20 +14,24 @@ from graphnav.estimation.noise.moments import row_moments
 from graphnav.estimation.noise.outliers import limit_scaled, list_reduced
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.ekf import ekf, near, refilter
-from graphnav.estimation.solvers.linearise import Points
+from graphnav.estimation.solvers.linearise import Points, linearise
 from graphnav.estimation.solvers.passes import ForwardRecord, SmootherPass, near_to
+from graphnav.estimation.solvers.robust import weight_and_cost
 from graphnav.estimation.solvers.rts import backward
+from graphnav.estimation.solvers.watch import WIDE
 
 BREAKDOWN = EstimationError, np.linalg.LinAlgError  # what a filter raises that has lost its digits
+_COOLING = 3.0  # factor by which the sigmas of an annealing fall in each round
 _ROUNDS = 5  # searches for gross outliers at most; in most drives the second finds what the first found
 
 
 @dataclass(frozen=True)
 class Initial:
-    """Linearisation points of all keyframes, and weights by constraint of the rows that they do not rest on."""
+    """Linearisation points of all keyframes, and what goes with them."""
 
     points: Points
-    weights: dict[str, RowWeights] = field(default_factory=dict)
+    weights: dict[str, RowWeights] = field(default_factory=dict)  # by constraint, of the rows they do not rest on
+    log_factors: dict[str, float] = field(default_factory=dict)  # of figures, beyond those of the problem
 
 
 def smooth_about(problem: Problem, about: Points) -> tuple[ForwardRecord, SmootherPass]:
@@ -36,11 +41,12 @@ def smooth_about(problem: Problem, about: Points) -> tuple[ForwardRecord, Smooth
 
 
 def find_initial_points(problem: Problem, opening: float | None) -> tuple[list[Initial], int]:
-    """Points of a filter that uses all measurements, and of one without gross outliers if that leads elsewhere.
+    """Points of a filter that uses all measurements, and others if leaving gross outliers out leads elsewhere.
 
     Gross outliers take a filter that uses everything too far from the truth to be linearised there. So they are left
     out, and searched for again with the filter that does without them, until the same ones are found. Growing errors
-    are not searched for: while the heading is still uncertain, the filter itself drifts against the fixes.
+    are not searched for: while the heading is still uncertain, the filter itself drifts against the fixes. If that
+    leads elsewhere, or the filter breaks down, points that rest on few outliers are found by annealing.
 
     Parameters
     ----------
@@ -50,19 +56,20 @@ def find_initial_points(problem: Problem, opening: float | None) -> tuple[list[I
     Returns
     -------
     list of Initial
-        One, or two where both have to be tried.
+        Several where all have to be tried.
     int
         Passes of filter and smoother.
 
     Raises
     ------
     EstimationError
-        If the filter breaks down with everything used, with a robust kernel on the fixes as well.
+        If the filter breaks down with large sigmas of all fixes, too.
     """
     try:
         plain = about = backward(problem, ekf(problem, opening=opening))
     except BREAKDOWN:  # outliers of hundreds of sigmas leave no digits in its covariance
-        plain = about = _smooth_robustly(problem, opening)
+        initial, passes = _anneal(problem, opening)
+        return [initial], passes
     sound, passes = problem, 1
     try:
         for _ in range(_ROUNDS):
@@ -75,25 +82,50 @@ def find_initial_points(problem: Problem, opening: float | None) -> tuple[list[I
             return [Initial(plain)], passes
         (_, one), (_, other) = (smooth_about(problem, points) for points in (plain, about))
     except BREAKDOWN:  # with figures or points that are far off, most rows seem wrong
-        try:
-            return [Initial(plain), Initial(_smooth_robustly(problem, opening))], passes + 2
-        except BREAKDOWN:
-            return [Initial(plain)], passes + 2
+        annealed, more = _anneal(problem, opening)
+        return [Initial(plain), annealed], passes + more
     weights = {}
     for rows in sound.constraints:
         if rows.weight is not None and np.any(rows.weight == 0.0):
             every = np.ones(len(rows), dtype=bool)
             weight = limit_scaled(row_moments(sound, rows, about, len(rows)).left_out, len(rows.axes), every)
             weights[rows.name] = list_reduced(sound.t[rows.keyframe], weight, every)
-    same = near_to(other, one)
-    return [Initial(one, weights)] if same else [Initial(plain), Initial(about, weights)], passes + 2
+    if near_to(other, one):
+        return [Initial(one, weights)], passes + 2
+    annealed, more = _anneal(problem, opening)
+    return [Initial(plain), Initial(about, weights), annealed], passes + 2 + more
 
 
-def _smooth_robustly(problem: Problem, opening: float | None) -> SmootherPass:
-    """Filter and smoother with Cauchy's kernel on the fixes."""
-    rows = (replace(c, robust="cauchy") if c.fix_of else c for c in problem.constraints)
-    problem = replace(problem, constraints=tuple(rows))
-    return backward(problem, ekf(problem, opening=opening))
+def _anneal(problem: Problem, opening: float | None) -> tuple[Initial, int]:
+    """Points and figures that no outlier leads astray, by deterministic annealing, and the passes it took.
+
+    The errors of fixes are assumed to be as large as they get, then a third of that in each round, with weights by the
+    residuals of the round before; until half of them are no smaller than assumed, or the stated sigmas are reached.
+    (Yang, Antonante, Tzoumas and Carlone 2020, "Graduated non-convexity for robust spatial perception", eq. 12, with
+    the sigma in place of mu.)
+    """
+    fixes = [rows for rows in problem.constraints if rows.fix_of]
+    weights, about, wider, passes = {rows.name: np.ones(len(rows)) for rows in fixes}, None, 1.0, 0
+    while True:
+        sigma = {rows.name: WIDE[rows.unit] * wider for rows in fixes}
+        stated = {rows.name: np.min(rows.sigma, axis=1) for rows in fixes}  # type: ignore[attr-defined]
+        share = {name: x**2 / (x**2 + sigma[name] ** 2) for name, x in stated.items()}
+        eased = weigh_rows(problem, {name: x * weights[name] for name, x in share.items()})
+        about = backward(eased, ekf(eased, opening=opening) if about is None else refilter(eased, about))
+        _, about = smooth_about(eased, about)
+        passes += 2
+        settled = not share or min(np.median(x) for x in share.values()) > 0.5
+        for rows in fixes:
+            error = linearise(rows, about, problem.columns)
+            m = len(rows.axes)
+            squared = share[rows.name] * np.sum((error.residual / error.stated) ** 2, axis=1)
+            weights[rows.name] = weight_and_cost("geman-mcclure", np.sqrt(squared), np.sqrt(m))[0]
+            settled |= bool(np.median(squared) > chdtri(m, 0.5))
+        if settled:
+            break
+        wider /= _COOLING
+    larger = {group: -float(np.median(np.log(share[rows.name]))) for rows in fixes for group in rows.noise_groups()[0]}
+    return Initial(about, log_factors=larger), passes
 
 
 def _list_unused(problem: Problem) -> dict[str, list[int]]:
