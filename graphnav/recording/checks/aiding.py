@@ -26,7 +26,11 @@ _SELDOM = 10.0  # s between fixes; no receiver on a drive is set to a longer per
 
 
 def measure_overlap(recording: Recording) -> float:
-    t = recording.gnss.t  # type: ignore[union-attr]
+    """How long fixes and IMU overlap, s; below zero if they do not, or only by stamps in another unit."""
+    assert recording.gnss is not None
+    t = recording.gnss.t
+    if _describe_large_steps(t, recording) is not None:
+        return -1.0
     return float(min(t[-1], recording.end) - max(t[0], recording.start))
 
 
@@ -219,11 +223,19 @@ def _write_letters(R_bs: Array, forward: Array, up: Array) -> str | None:
     )
 
 
-def check_gyro_sign(imu: Imu) -> Iterator[Finding]:
-    """The gyro about the mean force turns opposite to the course: no choice of axes explains that."""
+def check_gyro_sign(imu: Imu, track: Track) -> Iterator[Finding]:
+    """The gyro about the mean force turns opposite to the course: no choice of axes explains that.
+
+    A vehicle that leans into its curves feels none, and which of the two is mirrored is then open.
+    """
     if crosschecks.find_up(imu)[2] < 0:
         what = "the accelerometer's sign is reversed (gyro and course deny its up), it must read +9.8 upward at rest"
         yield Finding("warning", f"{what}; negate it in the file", "imu.force_sign")
+    elif crosschecks.correlate_sideways(imu, track) is None:
+        what = "the gyro turns against the GNSS course: its sign is reversed, or latitudes or longitudes have the wrong"
+        yield Finding(
+            "warning", f"{what} sign (south and west are negative); negate it, or them, in the file", "imu.gyro_sign"
+        )
     else:
         what = "the gyro's sign is reversed: it turns against the GNSS course while gravity points as stated"
         yield Finding("warning", f"{what}; negate it in the file", "imu.gyro_sign")
