@@ -17,7 +17,7 @@ import pytest
 
 from graphnav.app import cli
 from graphnav.estimation.antenna import find_untold_arm, find_wrong_arms
-from graphnav.recording import Recording
+from graphnav.recording import Recording, take_rows
 from graphnav.recording.checks.overview import Inspection, inspect
 from graphnav.recording.formats import read
 from graphnav.recording.formats.schema import rotation_from_letters
@@ -434,3 +434,11 @@ def test_fixes_in_milliseconds_of_which_one_lies_within_the_drive(drive: Callabl
     recording = drive("dresden_car_20140326")
     late = replace(recording, gnss=replace(recording.gnss, t=1e3 * recording.gnss.t))
     assert [f.key for f in inspect(late).findings if f.severity != "note"] == ["gnss.clock"]
+
+
+def test_an_imu_that_covers_little_of_the_fixes_is_named(drive: Callable[[str], Recording]) -> None:
+    recording = drive("boulder_drive_20250708")
+    for share, told in ((0.2, True), (0.7, False)):
+        rows = recording.imu.t < recording.start + share * recording.duration
+        cut = replace(recording, imu=take_rows(recording.imu, rows))
+        assert ("gnss.beyond_imu" in keys(cut)) == told

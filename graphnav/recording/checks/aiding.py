@@ -96,6 +96,14 @@ def check_gnss_coverage(recording: Recording) -> Iterator[Finding]:
     if (sentence := describe_gnss_apart(recording)) is not None:
         yield Finding("warning", sentence, "gnss.clock")
         return
+    inside = int(np.sum((gnss.t >= recording.start) & (gnss.t <= recording.end)))
+    if inside < 0.5 * len(gnss.t):
+        yield Finding(
+            "warning",
+            f"the IMU covers {inside} of {len(gnss.t)} fixes ({recording.start:.3f} to {recording.end:.3f} s of "
+            f"{gnss.t[0]:.3f} to {gnss.t[-1]:.3f} s): the rest is not used; is its file whole?",
+            "gnss.beyond_imu",
+        )
     for late, what in ((gnss.t[0] - recording.start, "starts"), (recording.end - gnss.t[-1], "ends")):
         if late > 5.0:
             yield Finding(
@@ -104,8 +112,8 @@ def check_gnss_coverage(recording: Recording) -> Iterator[Finding]:
     if len(gnss.t) < 3:
         return
     step = np.diff(gnss.t)
-    inside = (gnss.t[1:] > recording.start) & (gnss.t[:-1] < recording.end)
-    gaps = np.flatnonzero((step > max(3.5 * period_of(gnss.t), 1.5)) & inside)
+    there = (gnss.t[1:] > recording.start) & (gnss.t[:-1] < recording.end)
+    gaps = np.flatnonzero((step > max(3.5 * period_of(gnss.t), 1.5)) & there)
     if len(gaps):
         worst = gaps[np.argmax(step[gaps])]
         count = "1 gap" if len(gaps) == 1 else f"{len(gaps)} gaps"
