@@ -131,7 +131,7 @@ def info(
         found = inspect(whole)
         from graphnav.estimation.antenna import find_antenna, find_untold_arm, find_wrong_arms
 
-        more = find_wrong_arms(found.recording) if found.trusted and not quick else []
+        more = find_wrong_arms(found.recording, found.findings) if found.trusted and not quick else []
         last = [find_antenna(whole).finding] if antenna else find_untold_arm(found.recording)
         found = replace(found, findings=(*more, *found.findings, *last))
     show(found.text, found.values, quiet, json)

@@ -236,7 +236,7 @@ def _run(request: Request, progress: Progress | None) -> Outcome:
     if request.judge_arms or list_doubts(solutions, errors):  # which takes a second
         from graphnav.estimation.antenna import find_wrong_arms
 
-        checks = (*find_wrong_arms(used), *checks)
+        checks = (*find_wrong_arms(used, checks), *checks)
         findings = [*(f.sentence for f in checks), *findings]
     densities = _find_densities(used, request.settings, solutions)
     return Outcome(

@@ -18,6 +18,7 @@ from graphnav.core.notes import Note
 _TABLE = re.compile(r"\[([^\[\]]+)\]")
 _MAX_NAMES = 30  # names listed in one sentence at most
 _MAX_QUOTED = 60  # characters of a value quoted in a sentence at most
+_PLACE = re.compile(r" \(at line (\d+), column (\d+)\)$")  # of tomllib's errors
 _WORD = re.compile(rf"\S{{{2 * _MAX_QUOTED},}}")  # a quoted value, as no sentence of graphnav has a word of this length
 _DEEPEST = 50  # levels of nested tables at most; graphnav's own files have four
 _KEY = re.compile(r"([\w\-.\"']+)\s*=")
@@ -48,7 +49,10 @@ def read_toml(path: Path, error: type[GraphnavError]) -> tuple[dict[str, Any], s
     except RecursionError:
         raise error(f"{path}: not valid TOML (nested too deep)", key="toml.syntax") from None
     except ValueError as cause:  # tomllib's own error is one; so is that for an integer of thousands of digits
-        raise error(f"{path}: not valid TOML ({cause})", key="toml.syntax") from None
+        where, what = f"{path}", str(cause)
+        if place := _PLACE.search(what):
+            where, what = f"{path}, line {place[1]}, column {place[2]}", what[: place.start()]
+        raise error(f"{where}: not valid TOML: {what[:1].lower()}{what[1:]}", key="toml.syntax") from None
 
 
 def check_whole_numbers(values: Any) -> None:
@@ -96,7 +100,7 @@ def _describe(first: Any, loc: tuple[str, ...], model: type[BaseModel]) -> Note:
     if first["type"] == "extra_forbidden":
         return Note("key.unknown", f"unknown key '{key}'{_suggest(loc, model)}")
     if first["type"] == "missing":
-        return Note("key.missing", f"'{key}' is missing")
+        return Note("key.missing", f"'{key}' is missing{_describe_key(loc, model)}")
     if first["type"] == "value_error":  # raised by a validator of graphnav
         what = str(first["ctx"]["error"])
         return Note("key.value", f"'{key}': {what}{_describe_key(loc, model)}" if key else what)

@@ -6,6 +6,7 @@ The estimate is that of `gnss.lever_arm_sigma`, from the first part of the drive
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -35,6 +36,12 @@ _OPPOSITE = 0.5  # ratio of the distances of the estimate from the opposite sign
 _PART = 240.0  # s
 _FEWEST_FIXES = 30  # fixes
 _SURE_SIGMAS = 8.0  # 4 sigmas, doubled because errors of fixes are correlated for minutes
+# Findings by which attitude, times or positions are wrong: what the drive then says of lever arms follows from that.
+_FIRST = {
+    "imu.axes", "imu.clock", "imu.contradicted", "imu.force_sign", "imu.gyro_fast", "imu.gyro_scale", "imu.gyro_sign",
+    "imu.gyro_unit", "imu.up", "gnss.clock", "gnss.feet", "gnss.lat_lon", "gnss.mirrored", "gnss.velocity_axes",
+    "gnss.velocity_down", "gnss.velocity_unit",
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -80,12 +87,15 @@ def find_antenna(recording: Recording) -> Antenna:
     return _estimate(recording)[0]
 
 
-def find_wrong_arms(recording: Recording) -> list[Finding]:
+def find_wrong_arms(recording: Recording, findings: Sequence[Finding] = ()) -> list[Finding]:
     """Findings on lever arms that the drive contradicts: components with the opposite sign; otherwise the antenna's.
 
-    Only for a vehicle with sufficiently precise fixes, from the part of the drive with the most turning.
+    Only for a vehicle with sufficiently precise fixes, from the part of the drive with the most turning, and not
+    where one of the `findings` is the cause.
     """
     gnss = recording.gnss
+    if any(f.severity != "note" and f.key in _FIRST for f in findings):
+        return []
     if recording.platform != "vehicle" or gnss is None or len(gnss.t) < _FEWEST_FIXES:
         return []
     if np.median(gnss.sd[:, :2]) > _FINE:
@@ -104,6 +114,9 @@ def find_wrong_arms(recording: Recording) -> list[Finding]:
         sure = np.abs(found - stated) > _SURE_SIGMAS * sigma
         nearer = np.abs(found + stated) < _OPPOSITE * np.abs(found - stated)
         wrong = sure & (np.abs(stated) > _LEAST_PART) & (found * stated < 0.0) & nearer
+        rest = np.abs(np.where(wrong, -stated, stated) - found) - _SURE_SIGMAS * sigma
+        if (rest > _LEAST_PART).any():  # the signs are not all of it
+            continue
         for k in np.flatnonzero(wrong):
             out.append(
                 Finding(

@@ -44,12 +44,12 @@ def describe_faults(faults: tuple[ExcludedSpan, ...], problem: Problem) -> tuple
         if own:
             longest = max(own, key=lambda f: f.t_end - f.t_start)
             begin = longest.t_start - problem.recording.start
+            where = "in one span" if len(own) == 1 else f"in {len(own)} spans; the longest"
             out.append(
                 Note(
                     "gnss.excluded",
-                    f"{rows.name}: {sum(f.count for f in own)} of {len(rows)} are wrong and left out, in {len(own)} "
-                    "spans; "
-                    f"the longest, from {begin:.1f} s for {longest.t_end - longest.t_start:.1f} s, is {longest.reason}",
+                    f"{rows.name}: {sum(f.count for f in own)} of {len(rows)} are wrong and left out, "
+                    f"{where}, from {begin:.1f} s for {longest.t_end - longest.t_start:.1f} s, is {longest.reason}",
                 )
             )
     return tuple(out)

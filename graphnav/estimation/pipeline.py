@@ -168,7 +168,7 @@ def _solve_with_retry(
                 again = _solve(recording, other, frame, solvers, progress, model)
             except (EstimationError, np.linalg.LinAlgError):
                 continue
-            note = Note(reason.key, f"{reason}, {error}")
+            note = Note(reason.key, f"{reason}: {error}")
             return {name: replace(one, notes=(note, *one.notes)) for name, one in again.items()}
         if isinstance(error, EstimationError):
             raise
@@ -180,9 +180,13 @@ def _simplify(settings: Settings, noise: NoiseModel | None) -> Iterator[tuple[Se
     still = settings.standstill.model_copy(update={"held_position": False})
     if settings.standstill.held_position:
         settings = settings.model_copy(update={"standstill": still})
-        yield settings, noise, Note("standstill.not_held", "places of stops are not held: with them")
+        yield settings, noise, Note("standstill.not_held", "places of stops are not held, because it failed with them")
     if noise is None and settings.noise.mode != "stated":
-        yield settings, STATED, Note("noise.not_estimated", "noise is as stated, and no fix left out: to estimate it")
+        yield (
+            settings,
+            STATED,
+            Note("noise.not_estimated", "noise is as stated, and no fix is left out, because estimating it failed"),
+        )
 
 
 def _solve(

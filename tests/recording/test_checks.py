@@ -17,7 +17,7 @@ import pytest
 
 from graphnav.app import cli
 from graphnav.estimation.antenna import find_untold_arm, find_wrong_arms
-from graphnav.recording import Recording
+from graphnav.recording import Recording, take_rows
 from graphnav.recording.checks.overview import Inspection, inspect
 from graphnav.recording.formats import read
 from graphnav.recording.formats.schema import rotation_from_letters
@@ -374,3 +374,71 @@ def test_a_comparison_says_that_a_lever_arm_has_the_wrong_sign(tmp_path: Path) -
         checks = json.loads((tmp_path / "out" / "ekf" / "summary.json").read_text())["checks"]
         found[sign] = "gnss.lever_arm_sign" in {check["key"] for check in checks}
     assert found == {"": False, "-": True}
+
+
+def test_lever_arms_are_not_judged_by_an_imu_that_is_wrong() -> None:
+    recording, _ = oracle.drive(oracle.vehicle_path(120.0, 50.0), seed=5, lever_arm=(0.4, -0.5, 1.2))
+    assert recording.gnss is not None
+    wrong = replace(recording, gnss=replace(recording.gnss, lever_arm=np.array([0.4, 0.5, 1.2])))
+    turned = inspect(replace(wrong, imu=replace(wrong.imu, gyro=-wrong.imu.gyro)))
+    assert "imu.gyro_sign" in {f.key for f in turned.findings}
+    assert find_wrong_arms(wrong, inspect(wrong).findings) != []
+    assert find_wrong_arms(wrong, turned.findings) == []
+
+
+@pytest.mark.parametrize(
+    ("stated", "told"), [((0.4, 0.5, 1.2), ["gnss.lever_arm_sign"]), ((1.9, 0.5, 1.2), ["gnss.lever_arm"])]
+)
+def test_a_sign_is_named_where_it_is_all_that_is_wrong(stated: tuple[float, ...], told: list[str]) -> None:
+    recording, _ = oracle.drive(oracle.vehicle_path(120.0, 50.0), seed=5, lever_arm=(0.4, -0.5, 1.2))
+    assert recording.gnss is not None
+    wrong = replace(recording, gnss=replace(recording.gnss, lever_arm=np.array(stated)))
+    assert [f.key for f in find_wrong_arms(wrong)] == told
+
+
+@pytest.mark.parametrize("name", ["dresden_car_20140326", "motorbike_dresden_20160809", "car_circles_boston_20241021"])
+@pytest.mark.parametrize("exchanged", [False, True])
+def test_a_reversed_gyro_is_no_exchange_of_latitude_and_longitude(
+    drive: Callable[[str], Recording], name: str, exchanged: bool
+) -> None:
+    """Both mirror the course; the exchange stretches it, too."""
+    recording = drive(name)
+    gnss, sign = recording.gnss, 1.0 if exchanged else -1.0
+    llh = gnss.llh - [0.0, np.median(gnss.llh[:, 1]) - 0.2, 0.0]  # where both are latitudes
+    moved = replace(gnss, llh=llh[:, [1, 0, 2]] if exchanged else llh)
+    found = keys(replace(recording, gnss=moved, imu=replace(recording.imu, gyro=sign * recording.imu.gyro)))
+    assert ("gnss.lat_lon" in found) == exchanged
+    assert ("imu.gyro_sign" in found) != exchanged
+
+
+@pytest.mark.parametrize(
+    "name", [*TURNING, "canada_rover", "car_circles_boston_20251119", "motorbike_dresden_20160809"]
+)
+@pytest.mark.parametrize("in_g", [False, True])
+def test_forces_without_gravity_are_not_taken_for_another_unit(
+    drive: Callable[[str], Recording], name: str, in_g: bool
+) -> None:
+    recording = drive(name)
+    force = recording.imu.accel
+    force = force / 9.80665 if in_g else force - force.mean(axis=0)
+    (refused,) = [
+        f.sentence
+        for f in inspect(replace(recording, imu=replace(recording.imu, accel=force))).findings
+        if f.severity == "refused"
+    ]
+    assert ("in g:" in refused) == in_g
+    assert ("gravity seems to have been removed" in refused) != in_g
+
+
+def test_fixes_in_milliseconds_of_which_one_lies_within_the_drive(drive: Callable[[str], Recording]) -> None:
+    recording = drive("dresden_car_20140326")
+    late = replace(recording, gnss=replace(recording.gnss, t=1e3 * recording.gnss.t))
+    assert [f.key for f in inspect(late).findings if f.severity != "note"] == ["gnss.clock"]
+
+
+def test_an_imu_that_covers_little_of_the_fixes_is_named(drive: Callable[[str], Recording]) -> None:
+    recording = drive("boulder_drive_20250708")
+    for share, told in ((0.2, True), (0.7, False)):
+        rows = recording.imu.t < recording.start + share * recording.duration
+        cut = replace(recording, imu=take_rows(recording.imu, rows))
+        assert ("gnss.beyond_imu" in keys(cut)) == told

@@ -26,7 +26,11 @@ _SELDOM = 10.0  # s between fixes; no receiver on a drive is set to a longer per
 
 
 def measure_overlap(recording: Recording) -> float:
-    t = recording.gnss.t  # type: ignore[union-attr]
+    """How long fixes and IMU overlap, s; below zero if they do not, or only by stamps in another unit."""
+    assert recording.gnss is not None
+    t = recording.gnss.t
+    if _describe_large_steps(t, recording) is not None:
+        return -1.0
     return float(min(t[-1], recording.end) - max(t[0], recording.start))
 
 
@@ -92,6 +96,14 @@ def check_gnss_coverage(recording: Recording) -> Iterator[Finding]:
     if (sentence := describe_gnss_apart(recording)) is not None:
         yield Finding("warning", sentence, "gnss.clock")
         return
+    inside = int(np.sum((gnss.t >= recording.start) & (gnss.t <= recording.end)))
+    if inside < 0.5 * len(gnss.t):
+        yield Finding(
+            "warning",
+            f"the IMU covers {inside} of {len(gnss.t)} fixes ({recording.start:.3f} to {recording.end:.3f} s of "
+            f"{gnss.t[0]:.3f} to {gnss.t[-1]:.3f} s): the rest is not used; is its file whole?",
+            "gnss.beyond_imu",
+        )
     for late, what in ((gnss.t[0] - recording.start, "starts"), (recording.end - gnss.t[-1], "ends")):
         if late > 5.0:
             yield Finding(
@@ -100,8 +112,8 @@ def check_gnss_coverage(recording: Recording) -> Iterator[Finding]:
     if len(gnss.t) < 3:
         return
     step = np.diff(gnss.t)
-    inside = (gnss.t[1:] > recording.start) & (gnss.t[:-1] < recording.end)
-    gaps = np.flatnonzero((step > max(3.5 * period_of(gnss.t), 1.5)) & inside)
+    there = (gnss.t[1:] > recording.start) & (gnss.t[:-1] < recording.end)
+    gaps = np.flatnonzero((step > max(3.5 * period_of(gnss.t), 1.5)) & there)
     if len(gaps):
         worst = gaps[np.argmax(step[gaps])]
         count = "1 gap" if len(gaps) == 1 else f"{len(gaps)} gaps"
@@ -219,11 +231,19 @@ def _write_letters(R_bs: Array, forward: Array, up: Array) -> str | None:
     )
 
 
-def check_gyro_sign(imu: Imu) -> Iterator[Finding]:
-    """The gyro about the mean force turns opposite to the course: no choice of axes explains that."""
+def check_gyro_sign(imu: Imu, track: Track) -> Iterator[Finding]:
+    """The gyro about the mean force turns opposite to the course: no choice of axes explains that.
+
+    A vehicle that leans into its curves feels none, and which of the two is mirrored is then open.
+    """
     if crosschecks.find_up(imu)[2] < 0:
         what = "the accelerometer's sign is reversed (gyro and course deny its up), it must read +9.8 upward at rest"
         yield Finding("warning", f"{what}; negate it in the file", "imu.force_sign")
+    elif crosschecks.correlate_sideways(imu, track) is None:
+        what = "the gyro turns against the GNSS course: its sign is reversed, or latitudes or longitudes have the wrong"
+        yield Finding(
+            "warning", f"{what} sign (south and west are negative); negate it, or them, in the file", "imu.gyro_sign"
+        )
     else:
         what = "the gyro's sign is reversed: it turns against the GNSS course while gravity points as stated"
         yield Finding("warning", f"{what}; negate it in the file", "imu.gyro_sign")

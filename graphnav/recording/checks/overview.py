@@ -168,16 +168,19 @@ def inspect(recording: Recording) -> Inspection:
         findings += check_raw(recording.raw_gnss)
     # with wrong axes, or forces without gravity, gravity proves nothing
     turned = known & {"imu.forward_reversed", "imu.axes_turned", "imu.dead_axis", "imu.force_scale"}
-    if vehicle and overlap and track is not None and recording.gnss is not None:
+    upright = not known & {"imu.force_scale", "imu.dead_axis"}  # else no turn about the vertical is known either
+    if vehicle and overlap and track is not None and recording.gnss is not None and upright:
         clock = whole.clock or measure_clock_offsets(recording.imu, recording.gnss)
         yaw = crosschecks.fit_yaw(recording.imu, track)
         forward = clock.by_velocity if track.instant else clock.by_places
         turns_back = yaw is not None and yaw.correlation > 0.8 and yaw.coefficients[0] < 0
         turns_so = yaw is not None and yaw.correlation > 0.8 and not turns_back
-        if not turns_so and (mirrored := list(check_mirroring(recording, track, turns_back))):
+        if not turns_so and (mirrored := list(check_mirroring(recording, track, yaw, turns_back))):
             findings += mirrored
         elif not turned:
-            findings += check_gyro_sign(recording.imu) if turns_back else check_imu_axes(recording.imu, forward, track)
+            findings += (
+                check_gyro_sign(recording.imu, track) if turns_back else check_imu_axes(recording.imu, forward, track)
+            )
             findings += check_yaw_scale(yaw)
             findings += check_height_unit(recording, track, forward)
     elif vehicle and not turned:

@@ -18,12 +18,17 @@ from graphnav.recording.formats.schema import FOOT
 _FEET = 0.3  # relative deviation from 0.3048 that the noise of both permits: a ratio of 1 is three times as far off
 
 
-def check_mirroring(recording: Recording, track: Track, turns_back: bool) -> Iterator[Finding]:
-    """A course that turns opposite to the gyro, as positions are mirrored by an exchange or a sign."""
+def check_mirroring(recording: Recording, track: Track, as_read: Fit | None, turns_back: bool) -> Iterator[Finding]:
+    """A course that turns opposite to the gyro, as positions are mirrored by an exchange or a sign.
+
+    Exchanged positions are also stretched, one way by the cosine of the latitude: the course agrees better (`as_read`
+    is its fit to the gyro) after the exchange if they were exchanged, and worse if only a sign is wrong.
+    """
     other = exchange_lat_lon(recording.gnss) if recording.gnss is not None else None
     way = crosschecks.track(replace(other, v=None)) if other is not None else None
     yaw = crosschecks.fit_yaw(recording.imu, way) if way is not None else None
-    if yaw is not None and yaw.correlation > 0.8 and abs(yaw.coefficients[0] - 1.0) < 0.2:
+    better = yaw is not None and (not turns_back or as_read is None or yaw.correlation > as_read.correlation)
+    if yaw is not None and better and yaw.correlation > 0.8 and abs(yaw.coefficients[0] - 1.0) < 0.2:
         yield describe_exchange("the turns of the gyro")
     elif (
         turns_back and (crosschecks.correlate_sideways(recording.imu, track) or 0.0) > 0.0

@@ -274,8 +274,8 @@ class _Writer:
         self.lines.append(f"file = {quote(relative)}")
         if source.log is not None and (topics := source.log.topics.get(sensor, ())):
             others = (
-                f"CHECK: it has the most messages; there is also {', '.join(topics[1:])}: to use it, "
-                "draft again with --topic, since axes and noise are of this one"
+                f"CHECK: it has the most messages; there is also {', '.join(topics[1:])}: to use it, draft again with "
+                f"--topic {topics[1]} --force, since axes and noise are of this one"
             )
             if topics[0] in self.asked:
                 others = "as was asked"

@@ -284,7 +284,9 @@ class TruthTable(SensorTable):
 class RecordingFile(TomlTable):
     """The whole of recording.toml."""
 
-    format: Literal["graphnav-recording/1"]
+    format: Literal["graphnav-recording/1"] = Field(
+        description='format = "graphnav-recording/1" is its first line; graphnav init drafts all of it'
+    )
     name: str | None = None
     platform: Literal["vehicle", "foot"]
     clock: str | None = None  # meaning of t = 0, see graphnav.core.timescales.parse_clock; only for output

@@ -20,6 +20,7 @@ from graphnav.core.rotation import Array
 from graphnav.recording.formats.decimals import read_decimals
 
 _BLANK = re.compile(r"(?m)(?:(?<=,)|^(?=[ \t]*,))[ \t]*(?=,|$)")  # an empty cell of a line that is not empty
+_EMPTY = "is empty; copy the log again, or leave this file out"
 _MARKS = {";": "a semicolon", "\t": "a tab", " ": "blanks"}  # separators, in the order of their tests
 
 
@@ -120,7 +121,9 @@ def read_table(
     use = [header.index(theirs) for theirs in file_names.values()]
     values = _parse(path, skip, header, use)
     if not len(values[0]):
-        raise RecordingError(f"{path}: holds a header and no rows", key="file.no_rows")
+        raise RecordingError(
+            f"{path}: holds a header and no rows; copy the log again, or leave this file out", key="file.no_rows"
+        )
     return Table(path, dict(zip(file_names, values, strict=True)), file_names, np.arange(len(values[0])))
 
 
@@ -172,11 +175,11 @@ def _open_bytes(path: Path) -> IO[bytes]:
     file = open_file(path)
     why, key = None, "file.gzip"
     if not file.size:
-        why, key = "is empty", "file.empty"
+        why, key = _EMPTY, "file.empty"
     elif file.packed != (path.suffix == ".gz"):
         why = "is gzip-compressed; its name must end in .gz"
         if not file.packed:
-            why = "is not gzip-compressed although its name ends in .gz"
+            why = "is not gzip-compressed although its name ends in .gz; rename it, or compress it"
     if why is not None:
         file.close()
         raise RecordingError(f"{path}: {why}", key=key)
@@ -190,7 +193,7 @@ def _read_header(path: Path) -> tuple[int, list[str]]:
     if start[:2] in (b"\xff\xfe", b"\xfe\xff"):
         raise RecordingError(f"{path}: is UTF-16 text; save it as UTF-8", key="file.text")
     if b"\0" in start:
-        raise RecordingError(f"{path}: is a binary file, not a CSV table", key="file.binary")
+        raise RecordingError(f"{path}: is a binary file, not a CSV table; save it as CSV", key="file.binary")
     text = start.decode("utf-8-sig", errors="replace")
     for number, line in enumerate(text.splitlines(), 1):
         line = line.split("#")[0].strip()
@@ -198,7 +201,7 @@ def _read_header(path: Path) -> tuple[int, list[str]]:
             continue
         names = [name.strip().strip('"') for name in line.split(",")]
         if "\ufffd" in line:
-            raise RecordingError(f"{path}, line {number}: is not UTF-8 text", key="file.text")
+            raise RecordingError(f"{path}, line {number}: is not UTF-8 text; save it as UTF-8", key="file.text")
         mark = next((words for one, words in _MARKS.items() if one in line), None)
         if len(names) == 1 and mark is not None:
             raise RecordingError(
@@ -212,7 +215,7 @@ def _read_header(path: Path) -> tuple[int, list[str]]:
                 key="table.no_header",
             )
         return number, names
-    raise RecordingError(f"{path}: is empty", key="file.empty")
+    raise RecordingError(f"{path}: {_EMPTY}", key="file.empty")
 
 
 def _is_number(text: str) -> bool:
@@ -307,5 +310,5 @@ def _parse_cells(path: Path, header: list[str], use: list[int]) -> Array:
                     ) from None
             rows.append(row)
     except UnicodeDecodeError:
-        raise RecordingError(f"{path}: is not UTF-8 text", key="file.text") from None
+        raise RecordingError(f"{path}: is not UTF-8 text; save it as UTF-8", key="file.text") from None
     return np.array(rows, dtype=float).reshape(-1, len(use))

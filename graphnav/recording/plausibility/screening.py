@@ -39,6 +39,7 @@ _ISOLATED = 0.01  # share of the rows; above it the cause is not in single rows
 _QUIET_PERCENTILE = 10.0  # percentile of the turn rate up to which a foot stands and a vehicle moves calmly
 # A factor of two is the smallest by which a scale is mistaken (the ranges of a sensor are that far apart): the middle.
 _SCALE_RATIO = np.sqrt(2.0)
+_STEADY = 0.7  # of a force that scatters by 45 deg; of real drives 0.99 and more with gravity, at most 0.5 without
 _UNIT_RATIO = 1.2  # ratio of the force found and that of a unit: a biased sensor among vibration
 _DEAD = 10.0  # s; the longest repetition of an axis in thirty real recordings while others move is 0.08 s
 _MOVING_STEPS = 20.0  # steps of its own resolution by which an axis has moved and not only flickered
@@ -181,7 +182,8 @@ def check_imu_scale(recording: Recording) -> Iterator[Finding]:
         quiet = turn <= np.percentile(turn, _QUIET_PERCENTILE)
         f = float(np.median(np.linalg.norm(imu.accel[quiet], axis=1)))
     if (sentence := _find_scale(f)) is not None:
-        sentence = _NO_GRAVITY if _lacks_gravity(recording, f) else sentence
+        steady = float(np.linalg.norm(imu.accel[quiet].mean(axis=0))) / max(f, 1e-9)
+        sentence = _NO_GRAVITY if _lacks_gravity(recording, f, steady) else sentence
         g = _STANDARD_GRAVITY if recording.gnss is None else _measure_gravity(recording)
         yield Finding(
             "refused",
@@ -190,10 +192,16 @@ def check_imu_scale(recording: Recording) -> Iterator[Finding]:
         )
 
 
-def _lacks_gravity(recording: Recording, f: float) -> bool:
-    """Whether a force of f m/s^2 at rest is of the right size otherwise: the fixes' accelerations are felt so."""
+def _lacks_gravity(recording: Recording, f: float, steady: float) -> bool:
+    """Whether a force of f m/s^2 in calm is without gravity: it has no direction that stays (`steady`, the size of its
+    mean over f, is small), or is of the right size otherwise, as the fixes' accelerations are felt so.
+    """
     gnss, imu = recording.gnss, recording.imu
-    if gnss is None or f > _STANDARD_GRAVITY or measure_overlap(recording) <= 0:
+    if f > _STANDARD_GRAVITY:
+        return False
+    if steady < _STEADY and recording.platform == "vehicle":
+        return True
+    if gnss is None or measure_overlap(recording) <= 0:
         return False
     track = crosschecks.track(gnss) if (np.abs(imu.accel) < ACCEL_RANGE).all() else None
     fit = None if track is None else crosschecks.fit_force(imu, track)
