@@ -22,6 +22,8 @@ _GENERATORS = np.array(
 )
 # coefficients of (x^2)^j, j = 0..4, of sin(x)/x, (1 - cos x)/x^2 and the two that follow: (-1)^j / (2j + 1 + k)!
 _TAYLOR = np.array([[(-1.0) ** j / math.factorial(2 * j + 1 + k) for k in range(4)] for j in range(5)])
+# of ww, xx, yy, zz, wx, wy, wz, xy, xz, yz: the products of each component with w, x, y, z
+_WITH = np.array([[0, 4, 5, 6], [4, 1, 7, 8], [5, 7, 2, 9], [6, 8, 9, 3]])
 _TINY = 1e-300  # makes sin(x)/x = 1 at x = 0 without a separate case
 
 
@@ -172,27 +174,15 @@ def integrals(v: Array) -> tuple[Array, Array]:
 def to_quaternion(R: Array) -> Array:
     """Unit quaternions (w, x, y, z) with w >= 0: (..., 3, 3) -> (..., 4)."""
     R = np.asarray(R, dtype=float)
-    d = np.diagonal(R, axis1=-2, axis2=-1)
-    trace = d.sum(-1)
-    # four squared components; build from the largest so that no quotient is small
-    squared = np.stack([1 + trace, *(1 + 2 * d[..., i] - trace for i in range(3))], -1)
-    wx, wy, wz = (
-        R[..., 2, 1] - R[..., 1, 2],
-        R[..., 0, 2] - R[..., 2, 0],
-        R[..., 1, 0] - R[..., 0, 1],
-    )
-    xy, xz, yz = R[..., 0, 1] + R[..., 1, 0], R[..., 0, 2] + R[..., 2, 0], R[..., 1, 2] + R[..., 2, 1]
-    rows = np.stack(
-        [
-            np.stack([squared[..., 0], wx, wy, wz], -1),
-            np.stack([wx, squared[..., 1], xy, xz], -1),
-            np.stack([wy, xy, squared[..., 2], yz], -1),
-            np.stack([wz, xz, yz, squared[..., 3]], -1),
-        ],
-        -2,
-    )
-    best = np.argmax(squared, -1)
-    q = np.take_along_axis(rows, best[..., None, None], -2)[..., 0, :]
+    x, y, z = R[..., 0, 0], R[..., 1, 1], R[..., 2, 2]
+    trace = x + y + z
+    products = columns(  # of components, four times
+        1 + trace, 1 + 2 * x - trace, 1 + 2 * y - trace, 1 + 2 * z - trace,
+        R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1],
+        R[..., 0, 1] + R[..., 1, 0], R[..., 0, 2] + R[..., 2, 0], R[..., 1, 2] + R[..., 2, 1],
+    )  # fmt: skip
+    # those with the largest component, so that no quotient is small
+    q = np.take_along_axis(products, _WITH[np.argmax(products[..., :4], -1)], -1)
     q = q / np.linalg.norm(q, axis=-1, keepdims=True)
     return np.where(q[..., :1] < 0, -q, q)
 

@@ -99,7 +99,7 @@ class StretchFilter:
         for j in range(k, k1):
             if j:
                 at = slice(j - 1, j)
-                states = self._problem.motion.propagate(at, states, None if scale is None else values[shift(scale)])[0]
+                states = self._problem.motion.advance(at, states, None if scale is None else values[shift(scale)])
                 values = self._steps.ahead(j - 1, values)
             reached.append(states)
             known.append(values)
