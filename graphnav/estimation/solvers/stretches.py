@@ -33,7 +33,7 @@ from graphnav.imu.dynamics import SCALE
 
 _SHORTEST, _LONGEST = 16, 256  # keyframes of a stretch
 _MOST = 10  # times that a stretch is linearised: each gains two digits or more
-_STAYS = 1e-9  # sigmas by which a guess may move when it stays
+_STAYS = 1e-8  # sigmas by which a guess that stays may move: a move leaves a tenth at most, so it ends within 1e-9
 
 
 class StretchFilter:
