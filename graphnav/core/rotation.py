@@ -106,6 +106,8 @@ def _exp_one(x: float, y: float, z: float) -> Array:
 def log(R: Array) -> Array:
     """Rotation vectors in [0, pi] of rotation matrices: (..., 3, 3) -> (..., 3)."""
     R = np.asarray(R, dtype=float)
+    if R.size == 9 and (one := _log_one(*R.ravel().tolist())) is not None:
+        return one.reshape(R.shape[:-1])
     w = 0.5 * columns(R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1])
     c = 0.5 * (R[..., 0, 0] + R[..., 1, 1] + R[..., 2, 2] - 1.0)
     s = np.sqrt(np.sum(w * w, axis=-1) + _TINY)
@@ -116,6 +118,19 @@ def log(R: Array) -> Array:
         far = q[..., 1:] * (2.0 * np.arctan2(n, q[..., 0]) / np.maximum(n, 1e-9))[..., None]
         v = np.where((c < -0.5)[..., None], far, v)
     return v
+
+
+def _log_one(
+    xx: float, xy: float, xz: float, yx: float, yy: float, yz: float, zx: float, zy: float, zz: float
+) -> Array | None:
+    """`log` of a single matrix; None towards pi."""
+    c = 0.5 * (xx + yy + zz - 1.0)
+    if not c >= -0.5:
+        return None
+    x, y, z = 0.5 * (zy - yz), 0.5 * (xz - zx), 0.5 * (yx - xy)
+    s = math.sqrt(x * x + y * y + z * z + _TINY)
+    a = math.atan2(s, c) / s
+    return np.array([x * a, y * a, z * a])
 
 
 def right_jacobian(v: Array) -> Array:
