@@ -24,7 +24,7 @@ from graphnav.core.errors import ConfigError
 from graphnav.core.files import check_regular, check_size, exists, parse_json
 from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
-from graphnav.core.state import DIM, States
+from graphnav.core.state import States, split_covariance
 from graphnav.estimation.dense import times_between
 from graphnav.estimation.solution import Solution
 from graphnav.recording import Recording, take_rows
@@ -60,14 +60,19 @@ class Straight:
         """The times of output, as of the stored solution."""
         return times_between(self.start, self.end, rate)
 
-    def __call__(self, t: Array, size: int = DIM) -> tuple[States, Array]:
-        """States and covariances, of the first `size` error components, at times within it."""
+    def apart(self, t: Array) -> tuple[States, dict[str, Array]]:
+        """States, with covariances of position, velocity and attitude each by itself."""
+        states, P = self(t)
+        return states, split_covariance(P)
+
+    def __call__(self, t: Array) -> tuple[States, Array]:
+        """States and covariances at times within it."""
         k = np.clip(np.searchsorted(self.t, t, side="right") - 1, 0, len(self.t) - 2)
         s = ((t - self.t[k]) / (self.t[k + 1] - self.t[k]))[:, None]
         a, b = self.states[k], self.states[k + 1]
         turn = rotation.exp(s * rotation.log(np.swapaxes(a.R_nb, -1, -2) @ b.R_nb))
         p, v, ba, bg = (x + s * (y - x) for x, y in ((a.p, b.p), (a.v, b.v), (a.ba, b.ba), (a.bg, b.bg)))
-        P, Q = self.covariance[k, :size, :size], self.covariance[k + 1, :size, :size]
+        P, Q = self.covariance[k], self.covariance[k + 1]
         return States(a.R_nb @ turn, p, v, ba, bg), P + s[:, :, None] * (Q - P)
 
 

@@ -29,7 +29,7 @@ def solver_summary(
 ) -> dict[str, Any]:
     """The content of summary.json; `seconds` are those of writing, by file."""
     from graphnav.evaluation.metrics import summary
-    from graphnav.report.sentences import list_doubts
+    from graphnav.report.doubts import list_doubts
 
     solution, metrics = outcome.solutions[name], outcome.metrics.get(name)
     errors = None if metrics is None else summary(metrics)

@@ -55,7 +55,7 @@ def run_text(outcome: Outcome, files: Sequence[Path]) -> str:
 
 
 def _list_doubts(outcome: Outcome) -> tuple[str, ...]:
-    from graphnav.report.sentences import list_doubts
+    from graphnav.report.doubts import list_doubts
 
     return list_doubts(outcome.solutions, {k: m.errors for k, m in outcome.metrics.items() if m.errors is not None})
 

@@ -203,7 +203,7 @@ def _run(request: Request, progress: Progress | None) -> Outcome:
         recording = replace(recording, truth=None)
 
     from graphnav.estimation.pipeline import run
-    from graphnav.report.sentences import list_doubts
+    from graphnav.report.doubts import list_doubts
 
     given = request.noise
     model = None if given is None else given.model

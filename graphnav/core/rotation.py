@@ -22,6 +22,8 @@ _GENERATORS = np.array(
 )
 # coefficients of (x^2)^j, j = 0..4, of sin(x)/x, (1 - cos x)/x^2 and the two that follow: (-1)^j / (2j + 1 + k)!
 _TAYLOR = np.array([[(-1.0) ** j / math.factorial(2 * j + 1 + k) for k in range(4)] for j in range(5)])
+# of ww, xx, yy, zz, wx, wy, wz, xy, xz, yz: the products of each component with w, x, y, z
+_WITH = np.array([[0, 4, 5, 6], [4, 1, 7, 8], [5, 7, 2, 9], [6, 8, 9, 3]])
 _TINY = 1e-300  # makes sin(x)/x = 1 at x = 0 without a separate case
 
 
@@ -104,6 +106,8 @@ def _exp_one(x: float, y: float, z: float) -> Array:
 def log(R: Array) -> Array:
     """Rotation vectors in [0, pi] of rotation matrices: (..., 3, 3) -> (..., 3)."""
     R = np.asarray(R, dtype=float)
+    if R.size == 9 and (one := _log_one(*R.ravel().tolist())) is not None:
+        return one.reshape(R.shape[:-1])
     w = 0.5 * columns(R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1])
     c = 0.5 * (R[..., 0, 0] + R[..., 1, 1] + R[..., 2, 2] - 1.0)
     s = np.sqrt(np.sum(w * w, axis=-1) + _TINY)
@@ -114,6 +118,19 @@ def log(R: Array) -> Array:
         far = q[..., 1:] * (2.0 * np.arctan2(n, q[..., 0]) / np.maximum(n, 1e-9))[..., None]
         v = np.where((c < -0.5)[..., None], far, v)
     return v
+
+
+def _log_one(
+    xx: float, xy: float, xz: float, yx: float, yy: float, yz: float, zx: float, zy: float, zz: float
+) -> Array | None:
+    """`log` of a single matrix; None towards pi."""
+    c = 0.5 * (xx + yy + zz - 1.0)
+    if not c >= -0.5:
+        return None
+    x, y, z = 0.5 * (zy - yz), 0.5 * (xz - zx), 0.5 * (yx - xy)
+    s = math.sqrt(x * x + y * y + z * z + _TINY)
+    a = math.atan2(s, c) / s
+    return np.array([x * a, y * a, z * a])
 
 
 def right_jacobian(v: Array) -> Array:
@@ -172,27 +189,15 @@ def integrals(v: Array) -> tuple[Array, Array]:
 def to_quaternion(R: Array) -> Array:
     """Unit quaternions (w, x, y, z) with w >= 0: (..., 3, 3) -> (..., 4)."""
     R = np.asarray(R, dtype=float)
-    d = np.diagonal(R, axis1=-2, axis2=-1)
-    trace = d.sum(-1)
-    # four squared components; build from the largest so that no quotient is small
-    squared = np.stack([1 + trace, *(1 + 2 * d[..., i] - trace for i in range(3))], -1)
-    wx, wy, wz = (
-        R[..., 2, 1] - R[..., 1, 2],
-        R[..., 0, 2] - R[..., 2, 0],
-        R[..., 1, 0] - R[..., 0, 1],
-    )
-    xy, xz, yz = R[..., 0, 1] + R[..., 1, 0], R[..., 0, 2] + R[..., 2, 0], R[..., 1, 2] + R[..., 2, 1]
-    rows = np.stack(
-        [
-            np.stack([squared[..., 0], wx, wy, wz], -1),
-            np.stack([wx, squared[..., 1], xy, xz], -1),
-            np.stack([wy, xy, squared[..., 2], yz], -1),
-            np.stack([wz, xz, yz, squared[..., 3]], -1),
-        ],
-        -2,
-    )
-    best = np.argmax(squared, -1)
-    q = np.take_along_axis(rows, best[..., None, None], -2)[..., 0, :]
+    x, y, z = R[..., 0, 0], R[..., 1, 1], R[..., 2, 2]
+    trace = x + y + z
+    products = columns(  # of components, four times
+        1 + trace, 1 + 2 * x - trace, 1 + 2 * y - trace, 1 + 2 * z - trace,
+        R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1],
+        R[..., 0, 1] + R[..., 1, 0], R[..., 0, 2] + R[..., 2, 0], R[..., 1, 2] + R[..., 2, 1],
+    )  # fmt: skip
+    # those with the largest component, so that no quotient is small
+    q = np.take_along_axis(products, _WITH[np.argmax(products[..., :4], -1)], -1)
     q = q / np.linalg.norm(q, axis=-1, keepdims=True)
     return np.where(q[..., :1] < 0, -q, q)
 

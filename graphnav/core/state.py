@@ -80,6 +80,11 @@ class Parameter:
         return decay, np.sqrt(1.0 - decay**2)[:, None] * self.sigma
 
 
+def split_covariance(P: Array) -> dict[str, Array]:
+    """Covariances (K, 3, 3) of position, velocity and attitude, each by itself."""
+    return {block: P[:, BLOCKS[block], BLOCKS[block]] for block in ("p", "v", "theta")}
+
+
 @dataclass(frozen=True)
 class States:
     """K states; ``states[index]`` takes rows by a slice or an index array, so that the row axis stays."""

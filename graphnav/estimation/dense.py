@@ -9,12 +9,13 @@ velocity its derivative, attitude and biases are linear. Covariances are interpo
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from graphnav.core.earth import LocalFrame
 from graphnav.core.rotation import Array
-from graphnav.core.state import DIM, States
+from graphnav.core.state import States, split_covariance
 from graphnav.estimation.problem import Problem
 from graphnav.imu.dynamics import EarthMotion, as_biases
 from graphnav.imu.preintegration import within
@@ -55,40 +56,53 @@ class Dense:
         """Multiples of 1/rate on the recording's clock, and both ends."""
         return times_between(self.start, self.end, rate)
 
-    def __call__(self, t: Array, size: int = DIM) -> tuple[States, Array]:
-        """States and covariances (M, size, size), of the first error components, at ascending times from `start` to
-        `end`.
-        """
+    def __call__(self, t: Array) -> tuple[States, Array]:
+        """States and covariances (M, 15, 15) at ascending times from `start` to `end`."""
+        k, s = self._locate(t)
+        return self._reach(t, k, s), _interpolate(self.covariance, k, s)
+
+    def apart(self, t: Array) -> tuple[States, dict[str, Array]]:
+        """The same with covariances (M, 3, 3) of position, velocity and attitude each by itself."""
+        k, s = self._locate(t)
+        return self._reach(t, k, s), {name: _interpolate(own, k, s) for name, own in self._apart.items()}
+
+    @cached_property
+    def _apart(self) -> dict[str, Array]:
+        return {block: np.ascontiguousarray(own) for block, own in split_covariance(self.covariance).items()}
+
+    def _locate(self, t: Array) -> tuple[Array, Array]:
+        """The keyframe before each time, and the share of the interval behind it that has gone by."""
         k = np.clip(np.searchsorted(self.t, t, side="left") - 1, 0, len(self.t) - 2)
-        T = np.diff(self.t)[k]
-        s = (t - self.t[k]) / T
-        # every time is predicted from its keyframe, and so is the end of every interval that contains one, for the
-        # difference
-        touched = np.unique(k)
-        ends = self.t[touched + 1] if self.smooth else self.t[:0]
-        targets = np.unique(np.concatenate([t[t > self.t[0]], ends]))
+        return k, (t - self.t[k]) / np.diff(self.t)[k]
+
+    def _reach(self, t: Array, k: Array, s: Array) -> States:
+        begin = int(np.searchsorted(t, self.t[0], side="right"))  # of the times behind the first keyframe
+        first, t, k, s = self.states[k[:begin]], t[begin:], k[begin:], s[begin:]
+        if not len(t):
+            return first
+        reached = self._smooth(t, k, s) if self.smooth else self._filter(t, k, s)
+        return States.stack([first, reached]) if begin else reached
+
+    def _filter(self, t: Array, k: Array, s: Array) -> States:
+        reached = self._predict(t)
+        exact = np.flatnonzero(np.isclose(s, 1.0, rtol=0.0, atol=1e-9))
+        for name in States.__dataclass_fields__:
+            getattr(reached, name)[exact] = getattr(self.states, name)[k[exact] + 1]
+        return reached
+
+    def _smooth(self, t: Array, k: Array, s: Array) -> States:
+        # predicted as well: the end of every interval that contains a time, for the difference there
+        touched, interval = np.unique(k, return_inverse=True)
+        ends = self.t[touched + 1]
+        targets = np.sort(np.concatenate([t, ends]), kind="stable")  # nearly sorted already
         ahead = self._predict(targets)
-        states = self.states[k]
-        moved = t > self.t[0]
-        at = np.searchsorted(targets, t[moved])
-        reached = ahead[at]
-        if self.smooth:
-            predicted = ahead[np.searchsorted(targets, ends)]
-            miss = self.states[touched + 1].minus(predicted)[np.searchsorted(touched, k[moved])]
-            reached = reached.plus(_distribute(miss, s[moved, None], T[moved, None]))
-        else:
-            exact = np.isclose(s[moved], 1.0, rtol=0.0, atol=1e-9)
-            reached = _choose(exact, self.states[k[moved] + 1], reached)
-        states = _choose(moved, _scatter(reached, moved, states), states)
-        w = s[:, None, None]
-        before, after = self.covariance[k, :size, :size], self.covariance[k + 1, :size, :size]
-        return states, (1.0 - w) * before + w * after
+        miss = self.states[touched + 1].minus(ahead[np.searchsorted(targets, ends)])
+        T = ends - self.t[touched]
+        return ahead[np.searchsorted(targets, t)].plus(_distribute(miss[interval], s[:, None], T[interval, None]))
 
     def _predict(self, t: Array) -> States:
         """Prediction from the keyframe before each time."""
         k = np.searchsorted(self.t, t, side="left") - 1
-        if not len(t):
-            return self.states[k]
         # only of the intervals needed, so that few times cost little
         first, last = int(k[0]), int(k[-1]) + 1
         samples, used = self.samples.between(self.t[first], self.t[last]), slice(first, last)
@@ -105,19 +119,13 @@ def _distribute(miss: Array, s: Array, T: Array) -> Array:
     return out
 
 
-def _choose(mask: Array, yes: States, no: States) -> States:
-    """Rows of one struct or the other."""
-    return States(
-        np.where(mask[:, None, None], yes.R_nb, no.R_nb),
-        *(np.where(mask[:, None], getattr(yes, f), getattr(no, f)) for f in ("p", "v", "ba", "bg")),
-    )
-
-
-def _scatter(rows: States, mask: Array, like: States) -> States:
-    """`rows` where `mask` is true; elsewhere those of `like`."""
-    out = like[np.arange(len(like))]
-    for name in ("R_nb", "p", "v", "ba", "bg"):
-        getattr(out, name)[mask] = getattr(rows, name)
+def _interpolate(of_keyframes: Array, k: Array, s: Array) -> Array:
+    """Covariances between keyframes k and those behind them."""
+    w = s[:, None, None]
+    out, after = of_keyframes[k], of_keyframes[k + 1]
+    out *= 1.0 - w
+    after *= w
+    out += after
     return out
 
 

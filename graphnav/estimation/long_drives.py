@@ -17,7 +17,7 @@ import numpy as np
 from graphnav.config import Settings
 from graphnav.core.earth import A
 from graphnav.core.rotation import Array
-from graphnav.core.state import DIM, States
+from graphnav.core.state import States
 from graphnav.detectors.base import Detection
 from graphnav.estimation.noise.model import NoiseModel, RowWeights
 from graphnav.estimation.solution import Between, CarrierArcs, ConstraintRecord, ParameterEstimate, Solution
@@ -106,9 +106,13 @@ class _Span:
         t = self.whole.times(rate)
         return t[(t >= self.start) & (t <= self.end)]
 
-    def __call__(self, t: Array, size: int = DIM) -> tuple[States, Array]:
+    def __call__(self, t: Array) -> tuple[States, Array]:
         """As for the part."""
-        return self.whole(t, size)
+        return self.whole(t)
+
+    def apart(self, t: Array) -> tuple[States, dict[str, Array]]:
+        """As for the part."""
+        return self.whole.apart(t)
 
 
 def crop_solution(solution: Solution, share: Share) -> Solution:

@@ -9,10 +9,10 @@ from typing import Any, Protocol
 import numpy as np
 
 from graphnav.core import rotation
-from graphnav.core.earth import LocalFrame
+from graphnav.core.earth import LocalFrame, enu_axes
 from graphnav.core.errors import EstimationError
 from graphnav.core.rotation import Array
-from graphnav.core.state import BLOCKS, DIM, States
+from graphnav.core.state import BLOCKS, States, split_covariance
 from graphnav.core.trajectory import Trajectory
 from graphnav.detectors.base import Detection
 from graphnav.estimation.noise.model import STATED, NoiseModel, RowWeights
@@ -38,8 +38,12 @@ class Between(Protocol):
         """Times at a rate, ends included."""
         ...
 
-    def __call__(self, t: Array, size: int = DIM) -> tuple[States, Array]:
-        """States and covariances (M, size, size), of the first error components, at times within it."""
+    def __call__(self, t: Array) -> tuple[States, Array]:
+        """States and covariances (M, 15, 15) at times within it."""
+        ...
+
+    def apart(self, t: Array) -> tuple[States, dict[str, Array]]:
+        """The same with covariances (M, 3, 3) of position, velocity and attitude each by itself."""
         ...
 
 
@@ -224,7 +228,7 @@ class Solution:
             times = piece.times(rate)
             for k in range(0, len(times), _BLOCK_ROWS):
                 t = times[k : k + _BLOCK_ROWS]
-                yield to_trajectory(self.solver, self.frame, t, *piece(t, _OUT), joint=False)
+                yield to_trajectory(self.solver, self.frame, t, *piece.apart(t))
 
     def at(self, t: Array) -> tuple[Array, States, Array]:
         """States between the keyframes.
@@ -253,29 +257,29 @@ class Solution:
 
 
 def to_trajectory(
-    name: str, frame: LocalFrame, t: Array, states: States, covariance: Array, joint: bool = True
+    name: str, frame: LocalFrame, t: Array, states: States, covariance: Array | Mapping[str, Array]
 ) -> Trajectory:
     """States in the fixed navigation frame, in the local ENU at each point.
 
-    Without `joint` covariances are omitted; sigmas need a third of the work.
+    Without joint covariances where `covariance` has those of position, velocity and attitude apart; sigmas need a
+    third of the work.
     """
-    R_ln = frame.R_ln(states.p)
+    llh = frame.to_llh(states.p)
+    R_ln = enu_axes(llh) @ frame.R_ne.T
     rph = rotation.to_rph(R_ln @ states.R_nb)
     turns = {"p": R_ln, "v": R_ln, "theta": rotation.rph_jacobian(rph)}  # from the error state to local axes
     cov = None
-    if joint:
+    if isinstance(covariance, np.ndarray):
         J = np.zeros((len(t), 9, 9))
         for k, (block, turn) in enumerate(turns.items()):
             J[:, 3 * k : 3 * k + 3, BLOCKS[block]] = turn
         cov = J @ covariance[:, :_OUT, :_OUT] @ np.swapaxes(J, -1, -2)
-    variance = [
-        np.einsum("kij,kij->ki", turn @ covariance[:, BLOCKS[block], BLOCKS[block]], turn)
-        for block, turn in turns.items()
-    ]
+        covariance = split_covariance(covariance)
+    variance = [np.einsum("kij,kij->ki", turn @ covariance[block], turn) for block, turn in turns.items()]
     sd = np.sqrt(np.maximum(np.concatenate(variance, axis=1), 0.0))
     return Trajectory(
         t=t,
-        llh=frame.to_llh(states.p),
+        llh=llh,
         v=np.einsum("kij,kj->ki", R_ln, states.v),
         rph=rph,
         sd_p=sd[:, 0:3],

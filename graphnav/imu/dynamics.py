@@ -147,13 +147,7 @@ class ImuFactors:
         """
         iv, R = self.intervals, start.R_nb
         n = len(R)
-        delta = np.concatenate([start.ba, start.bg], -1) - self.expected[rows]
-        if scale is not None:
-            delta += np.concatenate(as_biases(scale, iv.force[rows], iv.rate[rows]), -1)
-        bent = mv(self.bias[rows], delta)
-        turn, moved = bent[:, :3], self.step[rows] + bent[:, 3:]  # dP, dV
-        dR = iv.dR[rows] @ rotation.exp(turn)
-
+        turn, dR, moved = self._correct(rows, start, scale)
         end = self._earth.reach(rows, start, dR, moved[:, :3], moved[:, 3:])
         turned = self._turn(rows, R)
         F = np.zeros((n, DIM, DIM))
@@ -165,6 +159,21 @@ class ImuFactors:
         F[:, 3:9, 9:15] = turned @ self.bias[rows, 3:]
         F[:, 9:15, 9:15] = _I6
         return end, F
+
+    def advance(self, rows: slice, start: States, scale: Array | None = None) -> States:
+        """The states of `propagate` alone."""
+        _, dR, moved = self._correct(rows, start, scale)
+        return self._earth.reach(rows, start, dR, moved[:, :3], moved[:, 3:])
+
+    def _correct(self, rows: slice, start: States, scale: Array | None) -> tuple[Array, Array, Array]:
+        """What errors of biases and scale turn dR by (n, 3), dR, and dP with dV (n, 6), as the states have them."""
+        iv = self.intervals
+        delta = np.concatenate([start.ba, start.bg], -1) - self.expected[rows]
+        if scale is not None:
+            delta += np.concatenate(as_biases(scale, iv.force[rows], iv.rate[rows]), -1)
+        bent = mv(self.bias[rows], delta)
+        turn = bent[:, :3]
+        return turn, iv.dR[rows] @ rotation.exp(turn), self.step[rows] + bent[:, 3:]
 
     def _turn(self, rows: slice, R_nb: Array) -> Array:
         """(n, 6, 6) from (dP, dV) in the start's body axes to (p, v) at the end."""
@@ -196,7 +205,7 @@ class ImuFactors:
 
     def residual(self, states: States, scale: Array | None = None) -> Array:
         """(n, 15) end minus prediction for all intervals, in the frames of `Intervals.covariance`."""
-        ahead, _ = self.propagate(slice(None), states[:-1], scale)
+        ahead = self.advance(slice(None), states[:-1], scale)
         return self._body(states[1:].minus(ahead), states.R_nb[:-1])
 
     def linearize(self, states: States, scale: Array | None = None) -> tuple[Array, Array, Array, Array]:

@@ -10,7 +10,7 @@ import numpy as np
 from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.estimation.solution import ConstraintRecord
-from graphnav.report.page import Quantity
+from graphnav.report.wording import Quantity
 
 
 @dataclass(frozen=True)

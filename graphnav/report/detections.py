@@ -15,6 +15,7 @@ from graphnav.recording import Recording
 from graphnav.recording.exporters.digits import rows_text
 from graphnav.report import page
 from graphnav.report import pictures as report_pictures
+from graphnav.report.wording import Quantity
 
 _MAX_STOPS = 30  # stops listed at most
 
@@ -35,7 +36,12 @@ def write(recording: Recording, found: Detections, folder: Path) -> list[Path]:
 def _page(recording: Recording, found: Detections) -> str:
     spans = found.stationary - recording.start
     rows = [
-        [page.Quantity(f"{a:.2f} s"), page.Quantity(f"{b:.2f} s"), page.Quantity(f"{b - a:.2f} s"), format_fired(stop)]
+        [
+            Quantity(f"{a:.2f} s"),
+            Quantity(f"{b:.2f} s"),
+            Quantity(f"{b - a:.2f} s"),
+            format_fired(stop),
+        ]
         for (a, b), stop in zip(spans, stops_of(found.all), strict=True)
     ]
     lead = [page.paragraph(line) for line in _words(recording, found)]

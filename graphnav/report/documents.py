@@ -18,6 +18,7 @@ from graphnav.report import pictures as pictures
 from graphnav.report import sentences as words
 from graphnav.report import summary as summary
 from graphnav.report import tables as tables
+from graphnav.report.doubts import list_doubts
 from graphnav.report.names import has_names
 from graphnav.report.plots import Shades, Spans
 from graphnav.report.provenance import provenance_tables
@@ -245,7 +246,7 @@ def _shades(solution: Solution, start: float, withheld: Withheld, outages: Spans
 
 def _list_doubts(solutions: Mapping[str, Solution], errors: Mapping[str, Errors]) -> list[Markup]:
     """Reasons why the result cannot be trusted, if any."""
-    return [page.paragraph(doubt, "verdict bad") for doubt in words.list_doubts(solutions, errors)]
+    return [page.paragraph(doubt, "verdict bad") for doubt in list_doubts(solutions, errors)]
 
 
 def _verdicts(solutions: Mapping[str, Solution], errors: Mapping[str, Errors]) -> list[Markup]:

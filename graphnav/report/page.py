@@ -22,43 +22,10 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
 from graphnav.report.plots import PALETTE, TIME, Figure, css_colours
+from graphnav.report.wording import Quantity, show
 
 _HERE = Path(__file__).parent
 _LEVEL = 5  # of zlib: two thirds of the time of level 6, and less than a hundredth larger
-
-
-def show(value: Any) -> Any:
-    """A value as text; numbers with four significant digits."""
-    if value is None:
-        return "-"
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    return number(value) if isinstance(value, float) else value
-
-
-def number(value: float, digits: int = 4) -> str:
-    """A number for people: `digits` significant digits, whole from a thousand on, '-' where there is none."""
-    if not math.isfinite(value):
-        return "-"
-    if value == 0:
-        return "0"
-    size = abs(value)
-    if size >= 1e7 or size < 1e-4:
-        return f"{value:.{digits - 1}g}"
-    places = max(0, digits - 1 - math.floor(math.log10(size)))
-    return f"{value:.{min(places, digits)}f}"
-
-
-class Quantity(str):
-    """A number and its unit, if any, as displayed: right-aligned in a table."""
-
-
-def format_measured(value: float, sigma: float) -> Quantity:
-    """A value with as many decimals as its sigma justifies."""
-    if not (math.isfinite(value) and math.isfinite(sigma)) or sigma <= 0:
-        return Quantity(number(value))
-    places = 1 - math.floor(math.log10(sigma))
-    return Quantity(f"{value:.{max(places, 0)}f}" if places <= 8 else f"{value:.4g}")
 
 
 _TEMPLATES = Environment(
@@ -126,11 +93,6 @@ def picture(figure: Figure, title: str, note: str = "", kind: str = "") -> Marku
     kind : "large" takes the whole width; empty shares the width with others.
     """
     return _PARTS.picture(figure, title, _pack(json.dumps(figure.json, separators=(",", ":")).encode()), note, kind)
-
-
-def and_list(parts: Sequence[str]) -> str:
-    """a, b and c"""
-    return parts[0] if len(parts) == 1 else ", ".join(parts[:-1]) + " and " + parts[-1]
 
 
 @dataclass(frozen=True)

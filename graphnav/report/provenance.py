@@ -10,7 +10,8 @@ from typing import Any
 
 from markupsafe import Markup
 
-from graphnav.report import page
+from graphnav.report import page, wording
+from graphnav.report.wording import and_list
 
 SETTINGS = "settings.toml"
 
@@ -30,8 +31,8 @@ def provenance_tables(settings: Mapping[str, Any], provenance: Mapping[str, Any]
         out.append(page.fold("Settings as resolved", [page.download(SETTINGS, data), page.code(toml, "settings")]))
     inputs = provenance.pop("inputs", {})
     if provenance:
-        listed = [f"{key} {page.show(value)}" for key, value in page.flatten(provenance).items()]
-        out += [page.heading("Versions"), page.paragraph(page.and_list(listed))]
+        listed = [f"{key} {wording.show(value)}" for key, value in page.flatten(provenance).items()]
+        out += [page.heading("Versions"), page.paragraph(and_list(listed))]
     if inputs:
         rows = [[name, page.digest(digest)] for name, digest in inputs.items()]
         out += [page.heading("Inputs"), page.table(["file", "sha256"], rows)]

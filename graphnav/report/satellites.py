@@ -11,9 +11,9 @@ from markupsafe import Markup
 from graphnav.core.rotation import Array
 from graphnav.estimation.solution import ConstraintRecord, Solution
 from graphnav.report import page
-from graphnav.report.page import Quantity
 from graphnav.report.plots import Shades
 from graphnav.report.plots import satellites as plots
+from graphnav.report.wording import Quantity
 
 _ELEVATIONS = (0.0, 15.0, 30.0, 45.0, 60.0, 90.0)  # deg
 

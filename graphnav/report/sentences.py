@@ -8,74 +8,28 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from markupsafe import Markup
 
-from graphnav.core.notes import Note, key_of
-from graphnav.estimation.noise.apply import row_weights
+from graphnav.core.notes import Note
 from graphnav.estimation.solution import Solution
 from graphnav.evaluation.against import own_solutions
 from graphnav.evaluation.segments import rms
 from graphnav.recording import Recording
-from graphnav.report import page
-from graphnav.report.consistency import consistency
+from graphnav.report import page, wording
+from graphnav.report.doubts import FEWEST_ROWS, TOO_LARGE, measure_consistency
 from graphnav.report.plots import Spans
 from graphnav.report.tables import Withheld
+from graphnav.report.wording import and_list
 
 if TYPE_CHECKING:
     from graphnav.evaluation.metrics import Errors
 
 _MAX_OUTAGES = 6  # outages listed at most
-_FEWEST_ROWS = 10  # rows needed to judge a sigma
-_LARGEST_EXCLUDED_SHARE = 0.5  # share of the fixes' information; above it most measurements contradict the result
-_TOO_LARGE = {"innovation": 1.5, "residual": 1.15}  # RMS over sigma; a fit reduces residuals
-
-
-def list_doubts(solutions: Mapping[str, Solution], errors: Mapping[str, Errors]) -> tuple[str, ...]:
-    """Reasons why a result cannot be trusted, as sentences; none if there are none."""
-    from graphnav.evaluation.sigmas import judge_sigmas
-
-    out = []
-    solutions = own_solutions(solutions)
-    errors = {name: e for name, e in errors.items() if name in solutions}
-    for solution in solutions.values():
-        fixes = solution.records.get("gnss_position")
-        left_out = 0.0 if fixes is None else 1.0 - float(np.mean(row_weights(fixes.t, solution.noise, "gnss_position")))
-        if left_out > _LARGEST_EXCLUDED_SHARE:
-            words = f"This result cannot be trusted: {100 * left_out:.0f} % of what the fixes say contradicts the rest "
-            out.append(Note("doubt.left_out", words + "and is left out"))
-            break  # all solvers use the same noise model
-    notes = dict.fromkeys(note for solution in solutions.values() for note in solution.notes)
-    out += [Note(key, note) for note in notes if (key := key_of(note)) == "doubt.axes"]
-    wrong = []
-    for name, e in errors.items():
-        small = [j for j in judge_sigmas(e) if j.verdict == "too small"]
-        if small:
-            sizes = page.and_list([f"{j.size:.2g} times sigma ({j.block})" for j in small])
-            wrong.append(f"{name}: errors are {sizes}")
-    if not errors:
-        filters = [s for s in solutions.values() if any(r.kind == "innovation" for r in s.records.values())]
-        for solution in filters or solutions.values():
-            kind, size, used = _measure_consistency(solution)
-            if used >= _FEWEST_ROWS and size > _TOO_LARGE[kind]:
-                wrong.append(f"{solution.solver}: {kind}s are {size:.2f} times their sigma")
-    if wrong:
-        out.append(Note("doubt.sigma", f"The stated sigma cannot be trusted: {'; '.join(wrong)}"))
-    return tuple(out)
-
-
-def _measure_consistency(solution: Solution) -> tuple[str, float, int]:
-    """Kind, RMS over sigma and number of rows of each of a solution's records."""
-    every = [consistency(record) for record in solution.records.values() if len(record.t)]
-    every = [c for c in every if np.isfinite(c.mean_nis)]
-    used = sum(c.count - c.rejected for c in every)
-    if not used:
-        return "residual", float("nan"), 0
-    return every[0].kind, float(np.sqrt(sum((c.count - c.rejected) * c.mean_nis / c.dof for c in every) / used)), used
 
 
 def describe_deciding(recording: Recording, settings: Mapping[str, Any]) -> str:
     """Which detectors decide where the platform stands."""
     fire = settings.get("detectors", {}).get("fire", ("fused",))
     if "fused" not in fire:
-        return f"{page.and_list(list(fire))}, each by itself"
+        return f"{and_list(list(fire))}, each by itself"
     if recording.platform == "foot":
         return "the GLRT of stances"
     return (
@@ -99,16 +53,16 @@ def describe_run(recording: Recording, solutions: Mapping[str, Solution], withhe
     solutions = own_solutions(solutions)
     solution = next(iter(solutions.values()))
     several = len(solutions) > 1
-    who = f"The solvers {page.and_list(list(solutions))}" if several else f"The {solution.solver} solver"
+    who = f"The solvers {and_list(list(solutions))}" if several else f"The {solution.solver} solver"
     words = (
         f"{who} estimated the trajectory of the {recording.platform} recording '{recording.name}' "
-        f"({recording.duration:.1f} s) from {page.and_list(sources)}, at {len(solution.t)} keyframes."
+        f"({recording.duration:.1f} s) from {and_list(sources)}, at {len(solution.t)} keyframes."
     )
     if others:
-        words += f" Beside them, of other programs: {page.and_list(others)}."
+        words += f" Beside them, of other programs: {and_list(others)}."
     if withheld:
         listed = [f"{source} {span[0]:g} to {span[1]:g} s" if span else f"all of {source}" for source, span in withheld]
-        words += f" Withheld: {page.and_list(listed)} (seconds from the start)."
+        words += f" Withheld: {and_list(listed)} (seconds from the start)."
     spans = solution.stationary
     if len(spans) and recording.platform == "vehicle":
         stops = "1 stop was" if len(spans) == 1 else f"{len(spans)} stops were"
@@ -118,7 +72,7 @@ def describe_run(recording: Recording, solutions: Mapping[str, Solution], withhe
     if outages:
         listed = [f"{a:.0f} to {b:.0f} s" for a, b in outages[:_MAX_OUTAGES]]
         more = [f"{len(outages) - _MAX_OUTAGES} more"] if len(outages) > _MAX_OUTAGES else []
-        words += f" There were no GNSS fixes from {page.and_list([*listed, *more])}."
+        words += f" There were no GNSS fixes from {and_list([*listed, *more])}."
     excluded = sum(int(part.count) for part in solution.excluded)
     if excluded:
         words += f" {excluded} measurements were excluded as faulty."
@@ -141,12 +95,12 @@ def list_tiles(recording: Recording, solutions: Mapping[str, Solution], errors: 
     several = len(solutions) > 1
     for name, solution in solutions.items():
         if name in errors:
-            value = f"{page.number(rms(errors[name].horizontal), 3)} m"
+            value = f"{wording.number(rms(errors[name].horizontal), 3)} m"
             out.append((value, f"horizontal error, RMS{', ' + name if several else ''}"))
         else:
             sd = solution.trajectory().sd_p
             if sd is not None:
-                value = f"{page.number(float(np.median(np.hypot(sd[:, 0], sd[:, 1]))), 3)} m"
+                value = f"{wording.number(float(np.median(np.hypot(sd[:, 0], sd[:, 1]))), 3)} m"
                 out.append((value, f"horizontal sigma, median{', ' + name if several else ''}"))
     if not several:
         seconds = sum(next(iter(solutions.values())).timings.values())
@@ -164,21 +118,21 @@ def describe_sigma(name: str, errors: Errors) -> Markup:
         return page.paragraph(Note("sigma.not_judged", words), "verdict")
     worst = [j for j in judged if j.verdict == "too small"] or [j for j in judged if j.verdict == "unclear"]
     shown = worst or judged
-    measured = page.and_list(
+    measured = and_list(
         [
             f"{j.block} errors are {j.size:.2f} times their sigma (RMS), {100 * j.inside:.1f} % within 3 sigma"
             for j in shown
         ]
     )
     measured += " (a Gaussian: 1 and 99.7 %)"
-    blocks = page.and_list([j.block for j in shown])
+    blocks = and_list([j.block for j in shown])
     if worst and worst[0].verdict == "too small":
         when = " at times" if all(j.inside > 0.9 for j in worst) else ""
         words = f"{name}: the stated sigma is too small{when}, of {blocks}: {measured}."
         words += " Errors of the truth itself count here as well."
         return page.paragraph(Note("sigma.too_small", words), "verdict bad")
     if worst:
-        alike = page.and_list([f"{j.effective:.0f}" for j in worst])
+        alike = and_list([f"{j.effective:.0f}" for j in worst])
         words = (
             f"{name}: whether sigma of {blocks} can be relied on remains open: {measured}, but the errors are alike "
             f"for so long that they are worth {alike} independent values, and chance may do that."
@@ -186,7 +140,7 @@ def describe_sigma(name: str, errors: Errors) -> Markup:
         return page.paragraph(Note("sigma.unclear", words), "verdict")
     seen = {j.block for j in judged}
     unseen = [what for what in ("position", "velocity", "attitude") if what not in seen]
-    rest = f" Nothing is there to judge {page.and_list(unseen)} by." if unseen else ""
+    rest = f" Nothing is there to judge {and_list(unseen)} by." if unseen else ""
     if all(j.verdict == "cautious" for j in judged):
         return page.paragraph(
             Note("sigma.cautious", f"{name}: the stated sigma is cautious: {measured}.{rest}"), "verdict"
@@ -197,10 +151,10 @@ def describe_sigma(name: str, errors: Errors) -> Markup:
 
 def describe_sigma_without_truth(solution: Solution) -> Markup:
     """One sentence on the sigma by innovations or residuals, where there is no truth."""
-    kind, size, used = _measure_consistency(solution)
+    kind, size, used = measure_consistency(solution)
     missing = f"{solution.solver}: there is no truth to compare with"
-    larger, mark = size > _TOO_LARGE[kind], ""
-    if used < _FEWEST_ROWS:
+    larger, mark = size > TOO_LARGE[kind], ""
+    if used < FEWEST_ROWS:
         note = Note("no_truth.few", f"{missing}, and too few measurements to judge sigma by.")
     elif kind == "innovation":
         measured = f"they are {size:.2f} times as large as predicted (RMS; 1 where sigma is true)"
@@ -228,6 +182,6 @@ def describe_closure(name: str, metrics: Mapping[str, Any] | None) -> list[Marku
     """The closure error of a loop, where that is the truth."""
     if not metrics or metrics.get("closure_h_m") is None:
         return []
-    h, up, way, share = (page.show(metrics.get(f"closure_{k}")) for k in ("h_m", "up_m", "distance_m", "percent"))
+    h, up, way, share = (wording.show(metrics.get(f"closure_{k}")) for k in ("h_m", "up_m", "distance_m", "percent"))
     words = f"the loop of {way} m closes to {h} m horizontally ({share} % of the way) and {up} m in height."
     return [page.paragraph(f"{name}: {words}", "verdict")]

@@ -14,11 +14,11 @@ from graphnav.estimation.noise.apply import row_weights
 from graphnav.estimation.solution import Solution
 from graphnav.evaluation.segments import relative_errors, rms
 from graphnav.recording import Recording
-from graphnav.report import page
+from graphnav.report import page, wording
 from graphnav.report.consistency import consistency
-from graphnav.report.page import Quantity
 from graphnav.report.pictures import ENU, fixes_of
 from graphnav.report.tables import Withheld
+from graphnav.report.wording import Quantity, and_list
 
 if TYPE_CHECKING:
     from graphnav.evaluation.metrics import Errors
@@ -51,12 +51,12 @@ def _judge_by_truth(errors: Errors) -> dict[str, tuple[str, str]]:
     from graphnav.evaluation.sigmas import judge_sigmas
 
     # a truth may have no heights
-    up = f", {page.number(rms(errors.p[:, 2]), 3)} m up" if np.isfinite(errors.p[:, 2]).any() else ""
+    up = f", {wording.number(rms(errors.p[:, 2]), 3)} m up" if np.isfinite(errors.p[:, 2]).any() else ""
     sizes = {
-        "position": f"{page.number(rms(errors.horizontal), 3)} m rms horizontal{up}",
-        "velocity": f"{page.number(rms(np.linalg.norm(errors.v, axis=1)), 3)} m/s rms",
-        "attitude": f"{page.number(rms(np.degrees(errors.rph[:, :2])), 3)} deg rms roll and pitch, "
-        f"{page.number(rms(np.degrees(errors.rph[:, 2])), 3)} deg heading",
+        "position": f"{wording.number(rms(errors.horizontal), 3)} m rms horizontal{up}",
+        "velocity": f"{wording.number(rms(np.linalg.norm(errors.v, axis=1)), 3)} m/s rms",
+        "attitude": f"{wording.number(rms(np.degrees(errors.rph[:, :2])), 3)} deg rms roll and pitch, "
+        f"{wording.number(rms(np.degrees(errors.rph[:, 2])), 3)} deg heading",
     }
     every = judge_sigmas(errors)
     worst = {"too small": 0, "unclear": 1, "cautious": 2, "fits": 3}
@@ -199,7 +199,7 @@ def left_out(solution: Solution, start: float) -> list[Markup]:
         if np.any(((w := row_weights(record.t, solution.noise, name)) > 0) & (w < 0.5))
     ]
     if less and len(lines) < _LINES:
-        lines.append(f"less than half weight, because they are farther off than chance allows: {page.and_list(less)}")
+        lines.append(f"less than half weight, because they are farther off than chance allows: {and_list(less)}")
     return [page.heading("Left out"), page.bullets(lines or [Note("left_out.nothing", "Nothing was left out.")])]
 
 

@@ -16,11 +16,11 @@ from graphnav.estimation.stops import stops_of_solution
 from graphnav.evaluation.against import own_solutions
 from graphnav.evaluation.segments import rms
 from graphnav.recording import Recording
-from graphnav.report import page
+from graphnav.report import page, wording
 from graphnav.report.consistency import CONSISTENCY_HEAD, consistency, consistency_row, mean_or_nan
 from graphnav.report.names import components
-from graphnav.report.page import Quantity
 from graphnav.report.plots import Spans
+from graphnav.report.wording import Quantity, and_list
 
 if TYPE_CHECKING:
     from graphnav.estimation.noise.table import FigureRow
@@ -45,7 +45,7 @@ def constraint_table(solution: Solution) -> list[Markup]:
             note += "A fit takes up part of the noise: the mean NIS of its residuals lies below the components."
         out.append(page.paragraph(note, "soft"))
     if solution.counts:
-        counted = page.and_list([f"{count} {kind}" for kind, count in solution.counts.items()])
+        counted = and_list([f"{count} {kind}" for kind, count in solution.counts.items()])
         out.append(page.paragraph(f"Factors or updates by kind: {counted}.", "soft"))
     return out
 
@@ -165,14 +165,14 @@ def noise_tables(rows: Sequence[FigureRow], solution: Solution) -> list[Markup]:
     less = [
         f"{np.count_nonzero(some.weight < 1.0)} of {len(solution.records[name].t)} rows of {name} are off by "
         "more than chance allows once in a thousand times and weigh less, the least of them "
-        f"{page.number(float(some.weight.min()), 2)} of a row."
+        f"{wording.number(float(some.weight.min()), 2)} of a row."
         for name, some in noise.weights.items()
         if len(some.t) and name in solution.records
     ]
     less += [
         f"{len(some.t)} of {len(solution.t) - 1} intervals between keyframes have more noise of the "
         f"{_OF_IMU[name]} than chance allows once in a thousand times, "
-        f"{page.number(float(np.sqrt(1.0 / some.weight.min())), 2)} times the usual one at most."
+        f"{wording.number(float(np.sqrt(1.0 / some.weight.min())), 2)} times the usual one at most."
         for name, some in noise.weights.items()
         if len(some.t) and name in _OF_IMU
     ]
@@ -183,7 +183,7 @@ def _format_range(log_factor: float, sigma: float) -> Quantity:
     """1-sigma range of a factor on sigma, from that of the logarithm of the factor on the variance."""
     if sigma <= 0.0:
         return Quantity("-")
-    low, high = (page.number(float(np.exp(0.5 * (log_factor + s * sigma))), 2) for s in (-1.0, 1.0))
+    low, high = (wording.number(float(np.exp(0.5 * (log_factor + s * sigma))), 2) for s in (-1.0, 1.0))
     return Quantity(f"{low} to {high}")
 
 
@@ -263,7 +263,7 @@ def parameter_table(parameters: Mapping[str, ParameterEstimate]) -> list[Markup]
             value, sigma = one.scale * float(p.value[-1, k]), one.scale * float(p.sigma[-1, k])
             known = "yes" if p.observable[k] else "no: mostly the prior"
             before = one.scale * float(p.prior_sigma[k])
-            shown = [page.format_measured(value, sigma), page.format_measured(sigma, sigma), before]
+            shown = [wording.format_measured(value, sigma), wording.format_measured(sigma, sigma), before]
             rows.append([one.words, *shown, one.unit, known])
     head = ["parameter", "value", "sigma", "sigma before", "unit", "seen by the data"]
     return [page.table(head, rows)] if rows else []

@@ -30,6 +30,11 @@ def test_exp_and_log_agree_with_scipy(vectors: np.ndarray) -> None:
     np.testing.assert_allclose(ro.log(R), vectors, atol=2e-15 + 1e-13 * np.abs(vectors).max())
 
 
+def test_a_single_logarithm_is_as_in_a_batch(vectors: np.ndarray) -> None:
+    R = ro.exp(vectors)
+    np.testing.assert_allclose([ro.log(one) for one in R], ro.log(R), rtol=1e-15)
+
+
 def test_small_angles_keep_their_digits() -> None:
     v = np.array([[3e-9, -1e-9, 2e-9], [1e-7, 2e-7, -3e-7]])
     np.testing.assert_allclose(ro.log(ro.exp(v)), v, rtol=1e-8)

@@ -19,7 +19,7 @@ from graphnav.core import rotation as ro
 from graphnav.core.earth import LocalFrame
 from graphnav.core.interpolation import interpolate
 from graphnav.core.notes import key_of
-from graphnav.core.state import States
+from graphnav.core.state import States, split_covariance
 from graphnav.detectors import detect
 from graphnav.detectors.base import Detection
 from graphnav.estimation.pipeline import run
@@ -368,9 +368,13 @@ class _Rows:
     def times(self, rate: float) -> Array:
         return self.t
 
-    def __call__(self, t: Array, size: int = 15) -> tuple[States, Array]:
+    def apart(self, t: Array) -> tuple[States, dict[str, Array]]:
+        states, P = self(t)
+        return states, split_covariance(P)
+
+    def __call__(self, t: Array) -> tuple[States, Array]:
         k = np.searchsorted(self.t, t)
-        return self.states[k], self.P[k, :size, :size]
+        return self.states[k], self.P[k]
 
 
 def test_strides_and_shape_of_a_walk() -> None:

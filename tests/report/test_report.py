@@ -38,13 +38,14 @@ from graphnav.imu.dynamics import SCALE
 from graphnav.recording import Gnss, Imu, Recording, Truth
 from graphnav.recording.allan import compute_allan
 from graphnav.report import allan as allan_page
-from graphnav.report import page
+from graphnav.report import page, wording
 from graphnav.report import pictures as report_pictures
 from graphnav.report.consistency import consistency
 from graphnav.report.documents import write_comparison, write_report
+from graphnav.report.doubts import list_doubts
 from graphnav.report.names import components, has_names
 from graphnav.report.provenance import command, toml_text
-from graphnav.report.sentences import describe_sigma_without_truth, list_doubts
+from graphnav.report.sentences import describe_sigma_without_truth
 from graphnav.report.summary import fix_table, left_out, sigma_table, verdicts
 from graphnav.report.tables import accuracy_row, excluded_table, rejected_table, span_row, stop_table
 
@@ -554,8 +555,8 @@ def test_comparison_has_a_row_per_solver_and_span(tmp_path, recording):
     parser, text = checked(path)
     for k in range(4):
         # outside the outlier's span RMS and largest are the offset itself
-        assert page.number(0.111 * (k + 1)) in text
-        assert page.number(7 * 0.111 * (k + 1)) in text
+        assert wording.number(0.111 * (k + 1)) in text
+        assert wording.number(7 * 0.111 * (k + 1)) in text
     assert text.count("Withheld 100 to 160 s") == text.count("Withheld 250 to 350 s") == 1
     said = [key.removeprefix("sigma.") for key in parser.keys if key.startswith("sigma.")]
     assert dict(zip(solvers, said, strict=True)) == {

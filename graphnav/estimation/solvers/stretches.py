@@ -33,7 +33,7 @@ from graphnav.imu.dynamics import SCALE
 
 _SHORTEST, _LONGEST = 16, 256  # keyframes of a stretch
 _MOST = 10  # times that a stretch is linearised: each gains two digits or more
-_STAYS = 1e-9  # sigmas by which a guess may move when it stays
+_STAYS = 1e-8  # sigmas by which a guess that stays may move: a move leaves a tenth at most, so it ends within 1e-9
 
 
 class StretchFilter:
@@ -99,7 +99,7 @@ class StretchFilter:
         for j in range(k, k1):
             if j:
                 at = slice(j - 1, j)
-                states = self._problem.motion.propagate(at, states, None if scale is None else values[shift(scale)])[0]
+                states = self._problem.motion.advance(at, states, None if scale is None else values[shift(scale)])
                 values = self._steps.ahead(j - 1, values)
             reached.append(states)
             known.append(values)

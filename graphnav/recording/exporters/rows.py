@@ -17,6 +17,7 @@ _ROUNDING = 2.0**-52  # of a product, which may be off by half of that
 _MOST_WHOLE = 1e15
 _TENS = 10.0 ** np.arange(23)  # exact
 _WHOLE_TENS = 10 ** np.arange(17)
+_FALLING = 10.0 ** np.arange(4, -18, -1.0)
 _TEN = np.uint64(10)
 _DIGITS = np.frombuffer(b"0123456789", np.uint8)
 _MINUS, _POINT, _ZERO, _E = 45, 46, 48, 101
@@ -71,7 +72,9 @@ def write_general(x: float, out: Array, at: int) -> int:
         return -1
     exponent, number = 0, 0
     if size > 0.0:
-        exponent = int(np.floor(np.log10(size)))
+        exponent = 4
+        while size < _FALLING[4 - exponent]:
+            exponent -= 1
         scaled = size * _TENS[5 - exponent]
         number = int(scaled + 0.5)
         if abs(scaled - number) >= 0.5 - _ROUNDING * scaled or scaled < 99_999.5 or number > 1_000_000:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from graphnav.core import rotation
-from graphnav.core.earth import LocalFrame
+from graphnav.core.earth import LocalFrame, enu_axes
 from graphnav.core.errors import RecordingError
 from graphnav.core.rotation import Array
 from graphnav.core.trajectory import Trajectory
@@ -39,7 +39,7 @@ def writing(path: Path, name: str = "") -> Iterator[Add]:
             if block.frame == "geodetic":
                 p_n = frame.from_llh(block.llh)
                 # attitudes refer to the local level of each point; the file has one frame for all of them
-                R_nb = np.swapaxes(frame.R_ln(p_n), -1, -2) @ R_lb
+                R_nb = np.swapaxes(enu_axes(block.llh) @ frame.R_ne.T, -1, -2) @ R_lb
             q = rotation.to_quaternion(R_nb)
             table = np.column_stack([block.t, p_n, q[:, 1:], q[:, 0]])
             file.write(rows_bytes(table, " ".join(["%.6f"] + ["%.5f"] * 3 + ["%.10f"] * 4)))

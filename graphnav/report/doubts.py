@@ -1,0 +1,65 @@
+"""Reasons why a result cannot be trusted, without anything that draws."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from graphnav.core.notes import Note, key_of
+from graphnav.estimation.noise.apply import row_weights
+from graphnav.estimation.solution import Solution
+from graphnav.evaluation.against import own_solutions
+from graphnav.report.consistency import consistency
+from graphnav.report.wording import and_list
+
+if TYPE_CHECKING:
+    from graphnav.evaluation.metrics import Errors
+
+FEWEST_ROWS = 10  # rows needed to judge a sigma
+_LARGEST_EXCLUDED_SHARE = 0.5  # share of the fixes' information; above it most measurements contradict the result
+TOO_LARGE = {"innovation": 1.5, "residual": 1.15}  # RMS over sigma; a fit reduces residuals
+
+
+def list_doubts(solutions: Mapping[str, Solution], errors: Mapping[str, Errors]) -> tuple[str, ...]:
+    """Reasons why a result cannot be trusted, as sentences; none if there are none."""
+    from graphnav.evaluation.sigmas import judge_sigmas
+
+    out = []
+    solutions = own_solutions(solutions)
+    errors = {name: e for name, e in errors.items() if name in solutions}
+    for solution in solutions.values():
+        fixes = solution.records.get("gnss_position")
+        left_out = 0.0 if fixes is None else 1.0 - float(np.mean(row_weights(fixes.t, solution.noise, "gnss_position")))
+        if left_out > _LARGEST_EXCLUDED_SHARE:
+            words = f"This result cannot be trusted: {100 * left_out:.0f} % of what the fixes say contradicts the rest "
+            out.append(Note("doubt.left_out", words + "and is left out"))
+            break  # all solvers use the same noise model
+    notes = dict.fromkeys(note for solution in solutions.values() for note in solution.notes)
+    out += [Note(key, note) for note in notes if (key := key_of(note)) == "doubt.axes"]
+    wrong = []
+    for name, e in errors.items():
+        small = [j for j in judge_sigmas(e) if j.verdict == "too small"]
+        if small:
+            sizes = and_list([f"{j.size:.2g} times sigma ({j.block})" for j in small])
+            wrong.append(f"{name}: errors are {sizes}")
+    if not errors:
+        filters = [s for s in solutions.values() if any(r.kind == "innovation" for r in s.records.values())]
+        for solution in filters or solutions.values():
+            kind, size, used = measure_consistency(solution)
+            if used >= FEWEST_ROWS and size > TOO_LARGE[kind]:
+                wrong.append(f"{solution.solver}: {kind}s are {size:.2f} times their sigma")
+    if wrong:
+        out.append(Note("doubt.sigma", f"The stated sigma cannot be trusted: {'; '.join(wrong)}"))
+    return tuple(out)
+
+
+def measure_consistency(solution: Solution) -> tuple[str, float, int]:
+    """Kind, RMS over sigma and number of rows of each of a solution's records."""
+    every = [consistency(record) for record in solution.records.values() if len(record.t)]
+    every = [c for c in every if np.isfinite(c.mean_nis)]
+    used = sum(c.count - c.rejected for c in every)
+    if not used:
+        return "residual", float("nan"), 0
+    return every[0].kind, float(np.sqrt(sum((c.count - c.rejected) * c.mean_nis / c.dof for c in every) / used)), used
