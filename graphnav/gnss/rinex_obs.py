@@ -22,12 +22,24 @@ from graphnav.core.timescales import WEEK, utc_to_gps
 from graphnav.gnss.files import Lines, calendar_days, find_moved_points, numbers, read_bytes
 from graphnav.gnss.rinex_header import Header, read_header
 from graphnav.gnss.series import Observations, note_cut, once
-from graphnav.gnss.signals import BEIDOU, GLONASS, GPS, QZSS, SYSTEMS, Ids, is_known_signal, satellite_id, signal_id
+from graphnav.gnss.signals import (
+    BEIDOU,
+    GLONASS,
+    GPS,
+    QZSS,
+    SBAS,
+    SYSTEMS,
+    Ids,
+    is_known_signal,
+    satellite_id,
+    signal_id,
+)
 
 _SYSTEM_OF = np.full(256, -1)
 for _k, _letter in enumerate(SYSTEMS):
     _SYSTEM_OF[ord(_letter)] = _k
 _KINDS = "CLDS"
+_AUXILIARY = "IXT"  # the ionosphere's phase, the receiver's channel, the Doppler shift of Transit
 _WIDTH = 16  # of a field: value F14.3, loss of lock I1, strength I1
 
 
@@ -85,7 +97,7 @@ def parse_observations(data: bytes, path: Path) -> Observations:
         unknown |= {
             f"{SYSTEMS[system]} {name}"
             for name, there in zip(named, np.isfinite(value).T, strict=True)
-            if there.any() and name[0] in _KINDS and not is_known_signal(system, name[1:])
+            if there.any() and name[0] not in _AUXILIARY and not _is_known_type(system, name)
         }
         for signal in dict.fromkeys(name[1:] for name in named if is_known_signal(system, name[1:])):
             at = {kind: [k for k, name in enumerate(named) if name == kind + signal] for kind in _KINDS}
@@ -117,17 +129,21 @@ def parse_observations(data: bytes, path: Path) -> Observations:
     )  # fmt: skip
 
 
+def _is_known_type(system: int, name: str) -> bool:
+    return name[0] in _KINDS and is_known_signal(system, name[1:])
+
+
 def _translate_name(name: str, system: int, version: float) -> str:
     """A type by its name of version 3.05."""
     if version >= 3.0:
-        if system == BEIDOU and name[1:2] == "1" and version < 3.035 and name[2:3] in "IQX":
-            return name[0] + "2" + name[2:]  # B1I until 3.03
+        if system == BEIDOU and name[1:] in (("1I", "1Q", "1X") if version < 3.035 else ("1I", "1Q")):
+            return name[0] + "2" + name[2:]  # B1I until 3.03, and of programs that never changed; 1X is B1C since
         return name
     kind, band = ("C", name[1:]) if name[0] in "CP" else (name[0], name[1:])
     if name[0] == "P":
         attribute = "P" if system == GLONASS else "W"
     elif band == "1":
-        attribute = "C" if system in (GPS, GLONASS, QZSS) else "X"
+        attribute = "C" if system in (GPS, GLONASS, QZSS, SBAS) else "X"
     elif band == "2":
         # the carrier on L2 is that of P2, and C2 another code on it
         attribute = {GPS: "X" if kind == "C" else "W", GLONASS: "C" if kind == "C" else "P"}.get(system, "X")
@@ -168,11 +184,14 @@ def _read_version_3(lines: Lines, header: Header, path: Path, remarks: list[str]
         raise _refuse_epoch(lines, epoch[bad], path)
     flag, count = np.nan_to_num(flag).astype(int), np.nan_to_num(count).astype(int)
     system = _SYSTEM_OF[first]
-    own = np.flatnonzero(system >= 0)
+    own = np.flatnonzero((system >= 0) | _names_satellite(lines.block(np.arange(len(lines)), 0, 3)))
     of = np.searchsorted(epoch, own) - 1
     keep = (of >= 0) & (own - epoch[np.maximum(of, 0)] <= count[np.maximum(of, 0)]) & (flag[np.maximum(of, 0)] <= 1)
     own, of = own[keep], of[keep]
     _say_cut(lines, epoch, own, of, flag, count, path, remarks)
+    known = system[own] >= 0
+    _say_unknown([chr(letter) for letter in first[own[~known]]], path, remarks)
+    own, of = own[known], of[known]
     if len(own) and own[-1] == len(lines) - 1 and not lines.whole:
         own, of = own[:-1], of[:-1]  # its last field may be cut
     if not (flag <= 1).any():
@@ -223,6 +242,7 @@ def _read_version_2(lines: Lines, header: Header, path: Path, remarks: list[str]
     first_line: list[int] = []
     of: list[int] = []
     satellite: list[int] = []
+    unknown: list[str] = []
     k, cut = header.end, False
     while k < len(lines):
         text = lines.text(k)
@@ -262,9 +282,12 @@ def _read_version_2(lines: Lines, header: Header, path: Path, remarks: list[str]
                 satellite.append(one)
                 of.append(len(epochs))
                 first_line.append(begin + i * each)
+            else:
+                unknown.append(name[0])
         epochs.append(k)
         flags.append(flag)
         k = begin + count * each
+    _say_unknown(unknown, path, remarks)
     if cut:
         remarks.append(note_cut(path.name, "record"))
     epoch = np.array(epochs, dtype=np.intp)
@@ -302,6 +325,22 @@ def _say_cut(
             f"{len(short)} epochs hold fewer satellites than they announce (the first at line {epoch[short[0]] + 1})"
         )
         remarks.append(Note("raw.short_epochs", f"{path.name}: {sentence}"))
+
+
+def _names_satellite(name: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """(n,) which of some names (n, 3) are a letter and a number, of whatever system."""
+    letter, tens, ones = name.T
+    digit = (ones >= ord("0")) & (ones <= ord("9"))
+    ten = (tens == ord(" ")) | ((tens >= ord("0")) & (tens <= ord("9")))
+    return np.asarray((letter >= ord("A")) & (letter <= ord("Z")) & ten & digit)
+
+
+def _say_unknown(letters: list[str], path: Path, remarks: list[str]) -> None:
+    """A remark about observations of satellites of systems that are not known, by their letters."""
+    if letters:
+        some = ", ".join(f"{letters.count(one)} of {one}" for one in sorted(set(letters)))
+        sentence = f"observations of satellite systems not known are left out: {some} (known: {', '.join(SYSTEMS)})"
+        remarks.append(Note("raw.unknown_systems", f"{path.name}: {sentence}"))
 
 
 def _refuse_epoch(lines: Lines, epoch: NDArray[np.intp], path: Path, begin: int = 2) -> RecordingError:

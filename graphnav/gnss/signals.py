@@ -28,6 +28,15 @@ _MHZ: dict[int, dict[int, float]] = {
     NAVIC: {1: 1575.42, 5: 1176.45, 9: 2492.028},
     SBAS: {1: 1575.42, 5: 1176.45},
 }
+_ATTRIBUTES: dict[int, dict[int, str]] = {  # of the codes on each band, RINEX 4.01, tables 11 to 17
+    GPS: {1: "CSLXPWYMNR", 2: "CDSLXPWYMNR", 5: "IQX"},
+    GLONASS: {1: "CP", 2: "CP", 3: "IQX", 4: "ABX", 6: "ABX"},
+    GALILEO: {1: "ABCXZ", 5: "IQX", 6: "ABCXZ", 7: "IQX", 8: "IQX"},
+    BEIDOU: {1: "DPXASLZN", 2: "IQX", 5: "DPX", 6: "IQXADPZ", 7: "IQXDPZ", 8: "DPX"},
+    QZSS: {1: "CESLXZB", 2: "SLX", 5: "IQXDPZ", 6: "SLXEZ"},
+    NAVIC: {1: "DPX", 5: "ABCX", 9: "ABCX"},
+    SBAS: {1: "C", 5: "IQX"},
+}
 _STEP = {1: 0.5625, 2: 0.4375}  # MHz from channel to channel of GLONASS
 L1 = 1575.42e6  # Hz
 
@@ -43,6 +52,8 @@ def satellite_id(name: str) -> int:
     number = name[1:3].strip()
     if not (number.isascii() and number.isdigit() and int(number)):
         raise ValueError(f"'{name}' names no satellite")
+    if name[0] not in SYSTEMS:
+        raise ValueError(f"'{name}' is of no satellite system that is known")
     return 100 * SYSTEMS.index(name[0]) + int(number)
 
 
@@ -67,8 +78,8 @@ def signal_name(signal: int) -> str:
 
 
 def is_known_signal(system: int, name: str) -> bool:
-    """Whether a band of a system is in the tables."""
-    return name[:1].isdigit() and int(name[0]) in _MHZ[system] and name[1:2].isupper()
+    """Whether a system's satellites send a signal of that name, band and attribute: "1C"."""
+    return len(name) == 2 and name[0].isdecimal() and name[1] in _ATTRIBUTES[system].get(int(name[0]), "")
 
 
 def frequencies(satellite: Ids, signal: Ids, channels: Mapping[int, int] | None = None) -> Array:

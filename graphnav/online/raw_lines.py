@@ -30,7 +30,7 @@ from graphnav.core.rotation import Array
 from graphnav.gnss.antex import Antennas, SatelliteAntenna
 from graphnav.gnss.ppp import second_signals
 from graphnav.gnss.series import Catalogue, RawGnss, primary
-from graphnav.gnss.signals import SYSTEMS, satellite_id, satellite_name, signal_id, signal_name
+from graphnav.gnss.signals import NAMES, SYSTEMS, is_known_signal, satellite_id, satellite_name, signal_id, signal_name
 from graphnav.gnss.single_point import signal_groups
 from graphnav.sensors.tables import NotNegative, Positive, Vector
 
@@ -93,7 +93,7 @@ def values_of(text: str) -> tuple[float, ...]:
     for one in satellites:
         name, signal, *rest = one.split(",", 2)
         try:
-            ids = [satellite_id(name), signal_id(signal)]
+            ids = [satellite_id(name), _known_signal(name[0], signal)]
         except (ValueError, IndexError):
             raise ValueError(f"'{one[:12]}' begins with no satellite and signal") from None
         out += [*ids, *_numbers("".join(rest), WIDTH - 7, name), *own]
@@ -114,6 +114,19 @@ def take_sane(rows: Array) -> Array:
     _, first = np.unique(rows[:, :2], axis=0, return_index=True)
     good &= np.isin(np.arange(len(rows)), first)
     return rows if good.all() else rows[good]
+
+
+def _known_signal(system: str, name: str) -> int:
+    """The number of a signal that satellites of a system send.
+
+    Raises
+    ------
+    ValueError
+        If they send none of that name.
+    """
+    if not is_known_signal(SYSTEMS.index(system), name):
+        raise ValueError(f"{NAMES[SYSTEMS.index(system)]} has no signal '{name}'")
+    return signal_id(name)
 
 
 def _cells(numbers: list[float]) -> str:
@@ -195,12 +208,13 @@ class LiveRaw(BaseModel):
         """
         try:
             satellites = tuple(sorted({satellite_id(name) for name in self.satellites}))
-            groups = tuple((SYSTEMS.index(system), signal_id(signal)) for system, signal in self.signals)
-            second = tuple((satellite_id(name), signal_id(signal)) for name, signal in self.second.items())
+            groups = tuple((SYSTEMS.index(system), _known_signal(system, name)) for system, name in self.signals)
+            second = tuple((satellite_id(name), _known_signal(name[0], signal)) for name, signal in self.second.items())
             offsets = {satellite_id(name): one for name, one in self.antennas.items()}
-        except (ValueError, IndexError):
+        except (ValueError, IndexError) as error:
             raise RecordingError(
-                'line 1: setup: raw_gnss: satellites are named as G05, signals as ["G", "1C"]', key="online.raw_names"
+                f'line 1: setup: raw_gnss: {error}; satellites are named as G05, signals as ["G", "1C"]',
+                key="online.raw_names",
             ) from None
         antennas: Antennas = {}
         for satellite, one in offsets.items():

@@ -152,16 +152,41 @@ def test_a_file_that_is_cut_in_a_record_keeps_what_is_whole(changed, whole):
     assert same_rows(raw_of(base), whole, lambda _: False)
 
 
-def test_signals_that_are_not_known_are_named_and_the_others_stay(changed, whole):
+@pytest.mark.parametrize("name", ["9Q", "5K", "1I"])
+def test_signals_that_are_not_known_are_named_and_the_others_stay(changed, whole, name):
+    """A band that GPS has not, and codes that it does not send on the bands that it has."""
+
     def unknown(text: str) -> str:
-        return text.replace("C5Q L5Q", "C9Q L9Q", 1).replace("S5Q", "S9Q", 1)  # a band that GPS has not
+        return text.replace("C5Q L5Q", f"C{name} L{name}", 1).replace("S5Q", f"S{name}", 1)
 
     one = changed("rover.obs.gz", unknown)
     raw, signal = raw_of(one), signal_id("5Q")
-    assert "raw.unknown_signals" in keys(one)
+    said = next(remark for remark in one.remarks if key_of(remark) == "raw.unknown_signals")
+    assert f"G C{name}" in said
     lost = set(np.unique(whole.satellite[whole.signal == signal])) - set(np.unique(raw.satellite[raw.signal == signal]))
     assert lost
     assert same_rows(raw, whole, lambda key: key[1] in lost and key[2] == signal)
+
+
+def test_satellites_of_systems_that_are_not_known_are_counted_and_the_others_stay(changed, whole):
+    name, other = "E30", "X30"
+
+    def unknown(text: str) -> str:
+        return re.sub(rf"^{name}", other, text, flags=re.MULTILINE)
+
+    rows = len(np.unique(whole.t[whole.satellite == satellite_id(name)]))
+    one = changed("rover.obs.gz", unknown)
+    said = next(remark for remark in one.remarks if key_of(remark) == "raw.unknown_systems")
+    assert f"{rows} of X" in said
+    assert not keys(one) & {"raw.cut", "raw.short_epochs"}
+    assert same_rows(raw_of(one), whole, lambda key: key[1] == satellite_id(name))
+    ephemeris = changed("nav.gz", unknown)
+    assert "raw.unused_messages" in keys(ephemeris)
+    assert "raw.broken_records" not in keys(ephemeris)
+    raw = raw_of(ephemeris)
+    np.testing.assert_array_equal(
+        np.isfinite(raw.p[:, 0]), np.isfinite(whole.p[:, 0]) & (whole.satellite != satellite_id(name))
+    )
 
 
 def test_a_half_cycle_ends_its_own_arc_alone(changed, whole):
