@@ -10,8 +10,9 @@ from __future__ import annotations
 
 import copy
 import threading
+from collections.abc import Callable
+from concurrent.futures import Future
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -57,76 +58,79 @@ class Answer:
     doubts: tuple[str, ...]  # findings on units, axes and clocks
 
 
+@dataclass(frozen=True)
+class Question:
+    """What a judgement of the sensors is of."""
+
+    recording: Recording
+    every: Recording  # with the fixes, too, that are not used
+    settings: Settings
+    frame: LocalFrame
+    found: Alignment
+    times: Array  # (K,) s, keyframes, the first at the start of the recording: weights of rows hold at these
+    unit: Array  # (3,) m, in which the answer is to tell errors of the fixes that last for minutes and hours
+
+
+def answer(asked: Question) -> Answer:
+    """Judge the sensors.
+
+    Raises
+    ------
+    EstimationError
+        If the rows do not tell.
+    """
+    settings, start = asked.settings, asked.found
+    try:
+        stationary = detect(asked.every, settings).stationary
+        base = build_problem(
+            asked.recording, settings, asked.frame, start.state, start_sigma(start), stationary, asked.times,
+            parts_of_noise=True,
+        )  # fmt: skip
+        base = _level(base)
+        estimate = estimate_noise if settings.gnss.faults == "off" else estimate_without_faults
+        noise = estimate(base, start.until).noise
+        used = with_noise(base, noise)
+        said, wrong = describe(noise, used), faults.fault_spans(used)
+        return Answer(_in_unit(noise, base, asked.unit), said, stationary, wrong, check_rows(asked.every))
+    except np.linalg.LinAlgError as error:
+        raise EstimationError(str(error), key="solver.undetermined") from error
+
+
 class Judgement:
-    """A noise model being estimated from the rows of a recording.
+    """An answer that is worked out in a thread of its own, from a copy of the question.
+
+    The copy is because values computed at first use must not appear in the question while a checkpoint is written.
+    A checkpoint keeps the question; it is asked again on resuming.
 
     Parameters
     ----------
-    every : that with the fixes, too, that are not used.
-    times : (K,) s, keyframes, the first at the start of the recording: weights of rows hold at these.
-    unit : (3,) m, in which the answer is to tell errors of the fixes that last for minutes and hours.
     due : s, when the answer is to be used.
     """
 
-    def __init__(
-        self,
-        recording: Recording,
-        every: Recording,
-        settings: Settings,
-        frame: LocalFrame,
-        found: Alignment,
-        times: Array,
-        unit: Array,
-        due: float,
-    ) -> None:
-        self.found, self.due, self.until = found, due, float(times[-1])
-        self._asked = recording, every, settings, frame, times, unit
-        self._begin()
+    def __init__(self, asked: Question, due: float) -> None:
+        self.asked, self.due = asked, due
+        self._answer: Future[Answer] = _start(answer, copy.deepcopy(asked))
 
     def answer(self) -> Answer:
-        """Wait for the result.
+        """Wait for the result, with the errors of `answer`."""
+        return self._answer.result()
 
-        Raises
-        ------
-        EstimationError
-            If the rows do not tell.
-        """
-        self._thread.join()
-        if isinstance(self._answer, BaseException):
-            raise self._answer
-        assert self._answer is not None
-        return self._answer
+    def __reduce__(self) -> tuple[type[Judgement], tuple[Question, float]]:
+        return Judgement, (self.asked, self.due)
 
-    def _begin(self) -> None:
-        self._answer: Answer | BaseException | None = None
-        # own copies: values computed at first use must not appear while a checkpoint is written
-        self._thread = threading.Thread(target=self._work, args=copy.deepcopy((self._asked, self.found)), daemon=True)
-        self._thread.start()
 
-    def _work(self, asked: tuple[Recording, Recording, Settings, LocalFrame, Array, Array], start: Alignment) -> None:
-        recording, every, settings, frame, times, unit = asked
+def _start(work: Callable[[Question], Answer], asked: Question) -> Future[Answer]:
+    """Have work done in a thread that nothing waits for at the end of the program."""
+    out: Future[Answer] = Future()
+
+    def do() -> None:
         try:
-            stationary = detect(every, settings).stationary
-            base = build_problem(
-                recording, settings, frame, start.state, start_sigma(start), stationary, times, parts_of_noise=True
-            )  # fmt: skip
-            base = _level(base)
-            estimate = estimate_noise if settings.gnss.faults == "off" else estimate_without_faults
-            noise = estimate(base, start.until).noise
-            used = with_noise(base, noise)
-            said, wrong = describe(noise, used), faults.fault_spans(used)
-            self._answer = Answer(_in_unit(noise, base, unit), said, stationary, wrong, check_rows(every))
-        except (EstimationError, np.linalg.LinAlgError) as error:
-            self._answer = EstimationError(str(error), key=getattr(error, "key", "solver.undetermined"))
-        except BaseException as error:  # reported by the caller
-            self._answer = error
+            out.set_result(work(asked))
+        except BaseException as error:  # reported by whoever asks for the result
+            out.set_exception(error)
 
-    def __getstate__(self) -> dict[str, Any]:
-        return {k: v for k, v in self.__dict__.items() if k not in ("_thread", "_answer")}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state)
-        self._begin()
+    threading.Thread(target=do, daemon=True).start()
+    return out
 
 
 def _level(base: Problem) -> Problem:
@@ -159,7 +163,7 @@ def judge(
     recording, every = (sensors.recording(-np.inf, until, all_of_them) for all_of_them in (False, True))
     due = float(times[-1]) + min(_THINKING * settings.solver.lag, _LONGEST_THOUGHT)
     settings = without_ambiguities(settings, sensors.setup)
-    return Judgement(recording, every, settings, frame, found, times, sensors.gnss.unit(), due)
+    return Judgement(Question(recording, every, settings, frame, found, times, sensors.gnss.unit()), due)
 
 
 def are_enough(sensors: Sensors, found: Alignment, span: float) -> bool:

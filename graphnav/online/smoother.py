@@ -270,9 +270,7 @@ class Smoother:
         self._said[matter] = said
 
     def _judge_again(self, found: Alignment, tracker: Tracker) -> None:
-        """Estimate the noise model again before the first state settles, then from ever more rows until they
-        suffice.
-        """
+        """Estimate the noise model again before a state settles, then from ever more rows until they suffice."""
         span = tracker.newest - self._began
         enough = are_enough(self.sensors, found, span)
         if not enough and span < max(min(self.settings.solver.lag, _JUDGED), 2.0 * self._judged):
@@ -301,8 +299,8 @@ class Smoother:
         if tracker.opened:
             self._again = CatchUp(tracker.restart_settled(found.noise, self._setup))
         else:
-            again = self._track(judgement.found, self._began, found.noise)
-            again.adopt(tracker, found.stationary, judgement.until)
+            again = self._track(judgement.asked.found, self._began, found.noise)
+            again.adopt(tracker, found.stationary, float(judgement.asked.times[-1]))
             self._again = CatchUp(again)
 
     def _go_through(self, again: CatchUp, tracker: Tracker) -> None:

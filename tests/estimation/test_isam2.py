@@ -26,7 +26,13 @@ from graphnav.estimation.solvers.points import move_covariance
 from graphnav.estimation.solvers.rts import backward
 from graphnav.estimation.solvers.stages import Place
 from graphnav.estimation.solvers.tree import Tree
-from graphnav.estimation.solvers.tree_marginals import Leaving, compute_newest_covariance
+from graphnav.estimation.solvers.tree_marginals import (
+    begin_elimination,
+    compute_newest_covariance,
+    eliminate,
+    read_keyframes,
+    settle,
+)
 from graphnav.estimation.solvers.window import compute_turn_limit, make_first_message
 from graphnav.recording import Recording
 
@@ -181,7 +187,7 @@ def test_keyframes_come_again_after_others_were_taken_back(drive: Drive) -> None
     for one in (tree, never):
         while one.relinearise(0.02):
             pass
-    a, b = Leaving(tree, len(tree)).settled(), Leaving(never, len(never)).settled()
+    a, b = (settle(one, begin_elimination(one, len(one))) for one in (tree, never))
     assert np.abs(a.states.minus(b.states) / np.sqrt(np.diagonal(b.covariance, axis1=1, axis2=2))).max() < 0.01
     np.testing.assert_allclose(a.covariance[:, range(15), range(15)], b.covariance[:, range(15), range(15)], rtol=0.01)
 
@@ -197,7 +203,7 @@ def test_a_tree_made_again_from_its_rows_goes_on_as_before(posed: Problem) -> No
         for one in (tree, again):
             one.add(Place(float(posed.t[k]), posed, k, steps.get(k, ()), linked=True))
             one.relinearise()
-    a, b = Leaving(tree, len(tree)).settled(), Leaving(again, len(again)).settled()
+    a, b = (settle(one, begin_elimination(one, len(one))) for one in (tree, again))
     np.testing.assert_allclose(a.states.p, b.states.p, atol=1e-6)
     np.testing.assert_allclose(a.covariance, b.covariance, rtol=1e-4, atol=1e-14)
     assert isinstance(a.states, States)
@@ -208,8 +214,7 @@ def test_covariances_from_the_other_end_are_the_marginals_of_the_tree(posed: Pro
     tree, _ = _played(posed, 60, lag=40.0)
     steps = list_node_steps(posed)
     for again in (False, True):
-        leaving, count = Leaving(tree, 6), 6
-        leaving.step(20)
+        leaving, count = eliminate(tree, begin_elimination(tree, 6), 20), 6
         if again:
             tree.linearise_again(range(3, len(tree)))
         expected = [tree.isam.marginalCovariance(k.state.key) for k in tree.keyframes[:count]]
@@ -217,8 +222,8 @@ def test_covariances_from_the_other_end_are_the_marginals_of_the_tree(posed: Pro
         if not again:
             k = tree.keyframes[-1].place.k + 1
             tree.add(Place(float(posed.t[k]), posed, k, steps.get(k, ()), linked=True))
-        found = leaving.settled()
-        delta = leaving._delta
+        delta = read_keyframes(tree, 0, count).delta if again else leaving.estimates.delta
+        found = settle(tree, leaving)
         own = move_covariance(unit[:, None] * np.array(expected) * unit, delta)
         for a, b in zip(found.covariance, own, strict=True):
             sd = np.sqrt(np.diag(b))

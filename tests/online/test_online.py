@@ -10,7 +10,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterable
-from dataclasses import replace
+from dataclasses import fields, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -31,9 +31,8 @@ from graphnav.core.trajectory import Trajectory
 from graphnav.estimation.pipeline import run
 from graphnav.estimation.solution import to_trajectory
 from graphnav.estimation.solvers.window import compute_turn_limit
-from graphnav.online import Online, Row, Session, rows_of, without_rows
+from graphnav.online import Online, Row, Session, judging, rows_of, smoother, without_rows
 from graphnav.online.buffers import Buffer
-from graphnav.online.judging import Judgement
 from graphnav.online.lines import END, head_of, line_of, lines_of, row_of, setup_of
 from graphnav.online.tracker import Tracker
 from graphnav.online.view import view
@@ -247,20 +246,27 @@ def test_judging_beside_the_drive_works_on_copies(
     drive: tuple[Recording, Trajectory], rows: list[Row], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A checkpoint is written meanwhile: nothing that stands in it may change under the pen."""
-    shared: list[bool] = []
-    work = Judgement._work
+    used: list[judging.Question] = []
+    kept: list[judging.Question] = []
+    answer, judge = judging.answer, judging.judge
 
-    def spy(self: Judgement, asked: Any, start: Any) -> None:
-        shared.append(any(one is other for one, other in zip((*asked, start), (*self._asked, self.found), strict=True)))
-        work(self, asked, start)
+    def answer_seen(asked: judging.Question) -> judging.Answer:
+        used.append(asked)
+        return answer(asked)
 
-    monkeypatch.setattr(Judgement, "_work", spy)
+    def judge_seen(*given: Any) -> judging.Judgement:
+        kept.append((out := judge(*given)).asked)
+        return out
+
+    monkeypatch.setattr(judging, "answer", answer_seen)
+    monkeypatch.setattr(smoother, "judge", judge_seen)
     online = Online(without_rows(drive[0]), settings_from({"solver": {"lag": 20.0}}))
     for row in rows:
         online.add(row)
     online.finish()
-    assert shared
-    assert not any(shared)
+    assert len(used) == len(kept) > 0
+    for one, other in zip(used, kept, strict=True):
+        assert all(getattr(one, f.name) is not getattr(other, f.name) for f in fields(one))
 
 
 def test_rows_older_than_the_window_are_counted(drive: tuple[Recording, Trajectory], rows: list[Row]) -> None:

@@ -17,7 +17,13 @@ from graphnav.estimation.solvers.incremental import FINE, Replay, are_due, begin
 from graphnav.estimation.solvers.passes import Progress
 from graphnav.estimation.solvers.stages import Message, Place
 from graphnav.estimation.solvers.tree import Tree
-from graphnav.estimation.solvers.tree_marginals import Leaving, compute_newest_covariance
+from graphnav.estimation.solvers.tree_marginals import (
+    Elimination,
+    begin_elimination,
+    compute_newest_covariance,
+    eliminate,
+    settle,
+)
 from graphnav.estimation.solvers.window import SettledStates, compute_turn_limit
 
 _SKIP = 10  # keyframes between two looks at what has moved, as GTSAM's relinearizeSkip, at least
@@ -41,7 +47,7 @@ class TreeSmoother:
         self.settled: list[SettledStates] = []
         self._problem = problem
         self._look = _SKIP  # the keyframe at which to look next at what has moved
-        self._leaving: Leaving | None = None  # of what is to settle
+        self._leaving: Elimination | None = None  # of what is to settle
         self._portion = 0  # variables that are eliminated for that at a keyframe
 
     def add(self, place: Place) -> tuple[Message, Array]:
@@ -49,10 +55,10 @@ class TreeSmoother:
         tree = self.tree
         turn = tree.add(replace(place, problem=self._problem))
         look = turn > tree.turn or (place.k >= self._look and self._leaving is None)
-        if self._leaving is not None and (self._leaving.step(self._portion) or look):
-            self.settled.append(self._leaving.settled())
-            tree.marginalise(self._leaving.count)
-            self._leaving = None
+        if self._leaving is not None:
+            before, self._leaving = self._leaving, eliminate(tree, self._leaving, self._portion)
+            if look or self._leaving is before:
+                self._settle(self._leaving)
         if look:
             tree.relinearise()
             self._look = place.k + max(_SKIP, len(tree) // _GROWN)
@@ -60,20 +66,25 @@ class TreeSmoother:
         if self._leaving is None and are_due(oldest.t, place.t, self.lag):
             self._problem, _ = tree.integrate_again(self._problem)
             count = int(np.searchsorted(self._problem.t[: place.k], place.t - self.lag)) - oldest.k
-            self._leaving = Leaving(tree, count)
-            self._portion = 1 + _SHARE * self._leaving.left // count
+            self._leaving = begin_elimination(tree, count)
+            self._portion = 1 + _SHARE * len(self._leaving.behind) // count
         return tree.newest, compute_newest_covariance(tree)
+
+    def _settle(self, leaving: Elimination) -> None:
+        """Let its keyframes go."""
+        self.settled.append(settle(self.tree, leaving))
+        self.tree.marginalise(leaving.count)
+        self._leaving = None
 
     def finish(self, problem: Problem) -> tuple[Problem, int]:
         """As of `Engine`."""
         if self._leaving is not None:
-            self.settled.append(self._leaving.settled())
-            self.tree.marginalise(self._leaving.count)
+            self._settle(self._leaving)
         for _ in range(_ROUNDS):
             self._problem, again = self.tree.integrate_again(self._problem)
             if not self.tree.relinearise(FINE) and not again:
                 break
-        self.settled.append(Leaving(self.tree, len(self.tree)).settled())
+        self.settled.append(settle(self.tree, begin_elimination(self.tree, len(self.tree))))
         return self._problem, self.tree.relinearised
 
 

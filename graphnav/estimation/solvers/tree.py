@@ -86,8 +86,8 @@ class Tree:
         self.variables: dict[int, Variable] = {}
         self._first_sigma: dict[str, Array] = {}
         self._constant: set[str] = set()
-        self.changed = np.inf  # number of the oldest keyframe whose factors were replaced since somebody looked
-        self._held = 0  # keyframes at the front that stay as they are: 1 where the first is behind the window
+        self.version = 0  # grows where factors are replaced
+        self.held = 0  # keyframes at the front that stay as they are: 1 where the first is behind the window
 
     def __len__(self) -> int:
         return len(self.keyframes)
@@ -166,7 +166,7 @@ class Tree:
         self.keyframes.append(Keyframe(self._number, before, x, prior.state, prior.columns, nodes, {}))
         update_isam(self.isam, place.t, fresh=[*fresh, (x, make_factor(blocks, prior.z))])
         self._number += 1
-        self._held = 1
+        self.held = 1
         self.keyframes[0].read(self.isam)
 
     def _recent(self) -> Iterable[Variable]:
@@ -233,18 +233,32 @@ class Tree:
         """Bring all estimates up to date."""
         read_estimates(self.isam, self.variables.values())
 
+    def _change(self, keyframes: Iterable[Keyframe]) -> None:
+        """Factors of some keyframes are replaced."""
+        self.version += 1
+        for k in keyframes:
+            k.version = self.version
+
+    def find_first_changed(self, version: int) -> float:
+        """Number of the oldest keyframe whose factors were replaced after a version; infinite if there is none."""
+        return (
+            next((k.number for k in self.keyframes if k.version > version), np.inf)
+            if self.version > version
+            else np.inf
+        )
+
     def find_moves(self) -> Array:
         """(K,) how far keyframes' estimates are from where their rows were linearised, 1 at the limit."""
-        if len(self) <= self._held:
+        if len(self) <= self.held:
             return np.empty(0)
         off = np.array([k.state.delta[:3] - k.state.point[:3] for k in self.keyframes])
         moves = np.linalg.norm(off, axis=1) / self.turn
-        first = self.keyframes[self._held].number
+        first = self.keyframes[self.held].number
         limited = [x for x in self.variables.values() if len(x.limit) and x.last >= first]
         far = {x.key: float(np.max(np.abs(x.delta - x.point) / x.limit)) for x in limited}
         for k, keyframe in enumerate(self.keyframes):
             moves[k] = max(moves[k], *(far.get(n.key, 0.0) for n, _ in keyframe.nodes.values()), 0.0)
-        moves[: self._held] = 0.0
+        moves[: self.held] = 0.0
         return moves
 
     def relinearise(self, share: float = 1.0, renewed: Renewed | None = None) -> int:
@@ -272,7 +286,7 @@ class Tree:
 
     def linearise_again(self, which: Iterable[int], renewed: Renewed | None = None) -> None:
         """Linearise keyframes, and the intervals on either side, where they are now."""
-        rows = {i for i in map(int, which) if i >= self._held}
+        rows = {i for i in map(int, which) if i >= self.held}
         if not rows:
             return
         links = {k for i in rows for k in (i, i + 1) if k < len(self) and LINK in self.keyframes[k].slots}
@@ -281,7 +295,7 @@ class Tree:
             first, own = run[0], self.keyframes[run[0] : run[-1] + 1]
             places = [k.place for k in own]
             if renewed is not None:
-                places = list(renewed(first - self._held, first - self._held + len(own)))
+                places = list(renewed(first - self.held, first - self.held + len(own)))
             # the interval before the oldest keyframe is gone
             places = [p if LINK in k.slots else replace(p, linked=False) for p, k in zip(places, own, strict=True)]
             around = [self.keyframes[max(first - 1, 0)], *own]
@@ -301,7 +315,7 @@ class Tree:
             for node, _ in self.keyframes[i].nodes.values():
                 node.point = node.delta.copy()
         self.relinearised += len(rows)
-        self.changed = min(self.changed, self.keyframes[min(rows)].number)
+        self._change(self.keyframes[i] for i in rows)
         self._replace(made, gone, self.keyframes[max(min(rows) - 1, 0)].number)
 
     # ---------------------------------------------------------------------------------------------------- leaving
@@ -321,13 +335,13 @@ class Tree:
             del self.variables[key]
         for x in self.variables.values():
             x.last = min(x.last, last.number)
-        self.changed = min(self.changed, self._number)
+        self._change([last])
         self._replace([], own, last.number)
         self.read()
 
     def hold(self) -> None:
         """The first keyframe is behind the window from now on, and stays as it is."""
-        self._held = 1
+        self.held = 1
 
     def __getstate__(self) -> dict[str, Any]:
         """All but the tree itself, which is made again from its factors."""

@@ -7,18 +7,20 @@ eliminating the tree's factors from the other end, the newest first: what is lef
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
+
 import gtsam
 import numpy as np
 
 from graphnav.core import rotation
 from graphnav.core.errors import EstimationError
 from graphnav.core.rotation import Array
-from graphnav.core.state import DIM
+from graphnav.core.state import DIM, States
 from graphnav.estimation.solvers.graph import Eliminated
 from graphnav.estimation.solvers.linearise import Columns, shift
 from graphnav.estimation.solvers.points import move_covariance
 from graphnav.estimation.solvers.tree import Tree
-from graphnav.estimation.solvers.tree_nodes import fill_keys, states_of
+from graphnav.estimation.solvers.tree_nodes import Keyframe, Variable, fill_keys, states_of
 from graphnav.estimation.solvers.window import SettledStates
 
 _AT_ONCE = 45  # variables: GTSAM's bookkeeping of one elimination grows faster than what it eliminates
@@ -58,85 +60,102 @@ def compute_newest_root(tree: Tree, columns: Columns) -> Array:
     return np.asarray(np.linalg.qr((V / np.sqrt(np.maximum(w, np.finfo(float).eps))).T, "r") / sd)
 
 
-class Leaving:
-    """Keyframes of a tree as they are known when it begins, with covariances that are found a portion at a time.
+@dataclass(frozen=True)
+class Estimates:
+    """Keyframes of a tree as it knew them at some time, without covariances."""
 
-    What comes meanwhile does not count; where rows have been linearised anew, it begins anew.
+    keyframes: tuple[Keyframe, ...]
+    delta: Array  # (n, 15) of their states
+    states: States
+    values: tuple[Array, ...]  # (D-15,) each
+
+
+@dataclass(frozen=True)
+class Elimination:
+    """What is known of the oldest keyframes of a tree, once all behind them are eliminated: so far or to the end."""
+
+    first: int  # keyframes from here
+    count: int  # to here
+    estimates: Estimates  # of these
+    version: int  # of the tree when it began
+    newest: int  # number of its newest keyframe then
+    behind: tuple[Variable, ...]  # still to be eliminated
+    own: tuple[Variable, ...]  # those of the keyframes
+    graph: gtsam.GaussianFactorGraph
+    net: gtsam.GaussianBayesNet | None = None  # of the keyframes' own, at the end
+
+
+def read_keyframes(tree: Tree, first: int, count: int) -> Estimates:
+    """Keyframes from `first` to `count` as they are known now."""
+    tree.read()
+    own = tuple(tree.keyframes[first:count])
+    return Estimates(own, np.array([k.state.delta for k in own]), states_of(own), tuple(k.values for k in own))
+
+
+def begin_elimination(tree: Tree, count: int, first: int = 0) -> Elimination:
+    """Nothing eliminated yet, of the first `count` keyframes, or those of them from `first` on."""
+    behind = tree.keyframes[count].number if count < len(tree) else np.inf
+    variables = tree.variables.values()
+    return Elimination(
+        first,
+        count,
+        read_keyframes(tree, first, count),
+        tree.version,
+        tree.keyframes[-1].number,
+        tuple(sorted((x for x in variables if x.first >= behind), key=lambda x: x.first)),
+        tuple(sorted((x for x in variables if x.first < behind), key=lambda x: x.last)),
+        tree.isam.getFactorsUnsafe().linearize(tree.isam.getLinearizationPoint()),
+    )
+
+
+def eliminate(tree: Tree, so_far: Elimination, most: int) -> Elimination:
+    """At most so many variables of the keyframes behind eliminated, and at last those that leave; then it is the same.
+
+    Keyframes that came since it began do not count; where rows have been linearised anew, it begins anew.
+    """
+    if tree.find_first_changed(so_far.version) <= so_far.newest:
+        so_far = begin_elimination(tree, so_far.count, so_far.first)
+    if so_far.behind:
+        order = fill_keys(gtsam.Ordering(), reversed(so_far.behind[-most:]))
+        graph = so_far.graph.eliminatePartialSequential(order, gtsam.EliminateQR)[1]
+        return replace(so_far, behind=so_far.behind[:-most], graph=graph)
+    if so_far.net is None:
+        order = fill_keys(gtsam.Ordering(), so_far.own)
+        return replace(so_far, net=so_far.graph.eliminateSequential(order, gtsam.EliminateQR))
+    return so_far
+
+
+def settle(tree: Tree, so_far: Elimination, now: bool = False) -> SettledStates:
+    """States, parameters and covariances, all at once of what is left to be done.
 
     Parameters
     ----------
-    count, first : the first `count` keyframes, or those of them from `first` on.
+    now : states and parameters as they are known now, not as when the elimination began.
     """
-
-    def __init__(self, tree: Tree, count: int, first: int = 0) -> None:
-        self.count, self.first, self._tree = count, first, tree
-        self._begin()
-
-    def _begin(self) -> None:
-        tree = self._tree
-        tree.changed, self._newest = np.inf, tree.keyframes[-1].number
-        self._keyframes = tree.keyframes[self.first : self.count]
-        behind = tree.keyframes[self.count].number if self.count < len(tree) else np.inf
-        variables = tree.variables.values()
-        self._left = sorted((x for x in variables if x.first >= behind), key=lambda x: x.first)
-        self._own = sorted((x for x in variables if x.first < behind), key=lambda x: x.last)
-        self._net: gtsam.GaussianBayesNet | None = None
-        self._graph = tree.isam.getFactorsUnsafe().linearize(tree.isam.getLinearizationPoint())
-        self.read()
-
-    @property
-    def left(self) -> int:
-        """Variables that are behind."""
-        return len(self._left)
-
-    def read(self) -> None:
-        """Take the estimates as they are now."""
-        self._tree.read()
-        self._delta = np.array([k.state.delta for k in self._keyframes])
-        self._states, self._values = states_of(self._keyframes), tuple(k.values for k in self._keyframes)
-
-    def step(self, most: int) -> bool:
-        """Eliminate at most so many variables of the keyframes behind, and at last those that leave; True once done."""
-        if self._tree.changed <= self._newest:
-            self._begin()
-        if self._left:
-            last, self._left = self._left[-most:], self._left[:-most]
-            order = fill_keys(gtsam.Ordering(), reversed(last))
-            self._graph = self._graph.eliminatePartialSequential(order, gtsam.EliminateQR)[1]
-        elif self._net is None:
-            self._net = self._graph.eliminateSequential(fill_keys(gtsam.Ordering(), self._own), gtsam.EliminateQR)
-        else:
-            return True
-        return False
-
-    def settled(self) -> SettledStates:
-        """States, parameters and covariances, all at once of what is left to be done."""
-        own, marginal = self._keyframes, self._covariances()
-        sigma = []
-        for k, values in zip(own, self._values, strict=True):
-            out = np.zeros(len(values))
-            for name, at in k.columns.items():
-                node, part = k.nodes[name]
-                out[shift(at)] = np.sqrt(np.maximum(np.diag(marginal[node.key])[part], 0.0))
-            sigma.append(out)
-        return SettledStates(
-            t=np.array([k.place.t for k in own]),
-            states=self._states,
-            covariance=move_covariance(np.stack([marginal[k.state.key] for k in own]), self._delta),
-            columns=tuple(k.columns for k in own),
-            values=self._values,
-            sigma=tuple(sigma),
-        )
-
-    def _covariances(self) -> dict[int, Array]:
-        try:
-            while not self.step(_AT_ONCE):
-                pass
-        except RuntimeError:  # GTSAM's for a variable that nothing determines
-            raise _explain_undetermined(self._keyframes[0].place.t) from None
-        assert self._net is not None
-        found = Eliminated(self._net).covariances()
-        return {x.key: x.unit[:, None] * found[x.key] * x.unit for x in self._own}
+    try:
+        while (further := eliminate(tree, so_far, _AT_ONCE)) is not so_far:
+            so_far = further
+    except RuntimeError:  # GTSAM's for a variable that nothing determines
+        raise _explain_undetermined(so_far.estimates.keyframes[0].place.t) from None
+    assert so_far.net is not None
+    one = read_keyframes(tree, so_far.first, so_far.count) if now else so_far.estimates
+    found = Eliminated(so_far.net).covariances()
+    marginal = {x.key: x.unit[:, None] * found[x.key] * x.unit for x in so_far.own}
+    sigma = []
+    for k, values in zip(one.keyframes, one.values, strict=True):
+        out = np.zeros(len(values))
+        for name, at in k.columns.items():
+            node, part = k.nodes[name]
+            out[shift(at)] = np.sqrt(np.maximum(np.diag(marginal[node.key])[part], 0.0))
+        sigma.append(out)
+    return SettledStates(
+        t=np.array([k.place.t for k in one.keyframes]),
+        states=one.states,
+        covariance=move_covariance(np.stack([marginal[k.state.key] for k in one.keyframes]), one.delta),
+        columns=tuple(k.columns for k in one.keyframes),
+        values=one.values,
+        sigma=tuple(sigma),
+    )
 
 
 def _explain_undetermined(t: float) -> EstimationError:

@@ -18,7 +18,13 @@ from graphnav.estimation.solvers.elimination import Predicted
 from graphnav.estimation.solvers.revision import Renewed, Renewing
 from graphnav.estimation.solvers.stages import Message, Place, Stage
 from graphnav.estimation.solvers.tree import Tree
-from graphnav.estimation.solvers.tree_marginals import Leaving, compute_newest_root
+from graphnav.estimation.solvers.tree_marginals import (
+    Elimination,
+    begin_elimination,
+    compute_newest_root,
+    eliminate,
+    settle,
+)
 from graphnav.estimation.solvers.window import SettledStates, Window
 
 _ROUNDS = 5
@@ -31,14 +37,13 @@ class TreeWindow(Window):
 
     def __init__(self, prior: Message, turn: float) -> None:
         super().__init__(prior, turn)
-        self.tree: Tree | None = None
-        self._before = 0  # keyframes in the tree before the first stage
-        self._leaving: Leaving | None = None  # of stages that are to leave
+        self.tree = Tree(prior, turn)
+        self._leaving: Elimination | None = None  # of stages that are to leave
 
     def push(self, place: Place, ahead: Predicted | None = None) -> float:
         """As of `Window`; the newest message is about the tree's estimate."""
-        if self.tree is None:
-            self.tree, self._before = Tree(self.head, self.turn), int(place.linked)
+        if not self.tree.keyframes:
+            self.tree = Tree(self.head, self.turn)
         ahead = self.expect(place) if ahead is None else replace(ahead, place=place)
         stage, e = self._update(ahead)
         self.tree.add(place, ahead, stage.measured)
@@ -47,14 +52,12 @@ class TreeWindow(Window):
 
     def _adopt(self, stage: Stage) -> Stage:
         """The newest stage about the tree's estimate."""
-        assert self.tree is not None
         now, message = self.tree.newest, stage.message
         moved = stage.moved(np.concatenate([now.state.minus(message.state)[0], now.values - message.values]))
         return replace(moved, message=replace(moved.message, z=np.zeros(len(message.z))))
 
     def _adopt_all(self) -> None:
         """Have the newest message as the tree knows it, with what it says of its errors."""
-        assert self.tree is not None
         stage = self._adopt(self.stages[-1])
         m = stage.message
         R = compute_newest_root(self.tree, m.columns)
@@ -64,19 +67,19 @@ class TreeWindow(Window):
     # ------------------------------------------------------------------------------------------- what the tree knows
     def find_first_moved(self, share: float = 1.0) -> int | None:
         """The first stage that the tree would linearise anew; None if there is none."""
-        if self.tree is None or not self.stages:
+        if not self.stages:
             return None
         self.tree.read()
         moved = self.tree.find_moves() > share
-        return int(np.argmax(moved)) - self._before if moved.any() else None
+        return int(np.argmax(moved)) - self.tree.held if moved.any() else None
 
     def converge(self, share: float = 1.0, always: bool = False, renewed: Renewed | None = None) -> int:
         """Relinearise until nothing has moved; returns how often."""
-        if self.tree is None or not self.stages:
+        if not self.stages:
             return 0
         count = 0
         if always:
-            self.tree.linearise_again(range(self._before, len(self.tree)), renewed)
+            self.tree.linearise_again(range(self.tree.held, len(self.tree)), renewed)
             self._relinearise(len(self))
             share, count = min(share, _FINE), 1
         while count < _ROUNDS and (done := self.tree.relinearise(share, renewed)):
@@ -97,15 +100,15 @@ class TreeWindow(Window):
 
     def smooth_back(self, count: int, most: int) -> bool:
         """A part of what `settle` does for the first stages, over at most so many; True once it is done."""
-        assert self.tree is not None
         if self._leaving is None:
-            self._leaving = Leaving(self.tree, self._before + count, self._before)
-        return self._leaving.step(_PORTION)
+            self._leaving = begin_elimination(self.tree, self.tree.held + count, self.tree.held)
+        before, self._leaving = self._leaving, eliminate(self.tree, self._leaving, _PORTION)
+        return self._leaving is before
 
     @property
     def leaving(self) -> int:
         """How many stages `smooth_back` is about, 0 if it has not begun."""
-        return 0 if self._leaving is None else self._leaving.count - self._before
+        return 0 if self._leaving is None else self._leaving.count - self._leaving.first
 
     def __getstate__(self) -> dict[str, Any]:
         """All but what has been done for stages that are to leave, which is made again."""
@@ -119,34 +122,29 @@ class TreeWindow(Window):
         """Forget all but the first `keep` stages: something before what follows has changed."""
         if keep >= len(self.stages):
             return
-        assert self.tree is not None
         del self.stages[keep:]
         self._means = self._leaving = None
-        if keep + self._before == 0:
-            self.tree = None  # it has only just begun
+        if keep + self.tree.held == 0:
+            self.tree = Tree(self.head, self.turn)  # it had only just begun
             return
-        self.tree.truncate(keep + self._before)
+        self.tree.truncate(keep + self.tree.held)
         if self.stages:
             self._adopt_all()
 
     def settle(self, count: int) -> SettledStates:
         """Let the first `count` stages go, as the tree knows them."""
-        assert self.tree is not None or not count
         gone = self.stages[:count]
-        if self.tree is None or not gone:
+        if not gone:
             return super().settle(0)
-        if self.leaving != count:
-            self._leaving = Leaving(self.tree, self._before + count, self._before)
-        assert self._leaving is not None
-        self._leaving.read()  # as it is now, wherever a run may have been resumed
-        out, self._leaving = self._leaving.settled(), None
+        if self._leaving is None or self.leaving != count:
+            self._leaving = begin_elimination(self.tree, self.tree.held + count, self.tree.held)
+        out, self._leaving = settle(self.tree, self._leaving, now=True), None  # wherever a run may have been resumed
         self.head = gone[-1].message
         del self.stages[:count]
         self._means = None
-        if len(self.tree) > self._before + count:
-            self.tree.marginalise(self._before + count - 1)
+        if len(self.tree) > self.tree.held + count:
+            self.tree.marginalise(self.tree.held + count - 1)
             self.tree.hold()
-            self._before = 1
         else:
-            self.tree, self._before = None, 0
+            self.tree = Tree(self.head, self.turn)
         return out
