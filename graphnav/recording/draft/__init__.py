@@ -51,7 +51,7 @@ def draft(paths: Sequence[Path], folder: Path, name: str | None = None, topics: 
     """
     found = find_logs(paths, topics)
     writer = _Writer(folder, topics)
-    writer.decisions += [f"left out: {reason}" for reason in found.left_out]
+    writer.decisions += found.notes
     text = writer.text(found.sensors, name or folder.resolve().name or "drive")
     return Draft(text, tuple(writer.decisions), writer.made)
 
@@ -273,13 +273,15 @@ class _Writer:
             self.decisions.append(f"{relative}: {words}")
         self.lines.append(f"file = {quote(relative)}")
         if source.log is not None and (topics := source.log.topics.get(sensor, ())):
-            others = (
-                f"CHECK: it has the most messages; there is also {', '.join(topics[1:])}: to use it, draft again with "
-                f"--topic {topics[1]} --force, since axes and noise are of this one"
-            )
-            if topics[0] in self.asked:
-                others = "as was asked"
-            self._key("topic", quote(topics[0]), others if len(topics) > 1 else "the only one")
+            why = "the only one"
+            if len(topics) > 1 and topics[0] in self.asked:
+                why = "as was asked"
+            elif len(topics) > 1:
+                why = (
+                    f"CHECK: it has the most messages; there is also {', '.join(topics[1:])}: to use it, draft again "
+                    f"with --topic {topics[1]} --force, since axes and noise are of this one"
+                )
+            self._key("topic", quote(topics[0]), why)
         if source.joined_from is None and source.plain is None and not is_inside(source.path, self.folder):
             self.decisions.append(f"{relative}: lies outside the folder of this file; say --allow-outside to read it")
         names = {o: theirs for o, theirs in source.columns.names.items() if o != theirs and o not in dropped}

@@ -27,10 +27,10 @@ _TABLES = (".csv", ".csv.gz", ".txt", ".tsv", ".dat", ".asc", ".log")  # files o
 
 @dataclass
 class LogsFound:
-    """The contents of logs, by sensor, and notes on those left out."""
+    """The contents of logs, by sensor, and a sentence for each file that is left out or added to another."""
 
     sensors: dict[str, Source]
-    left_out: list[str]
+    notes: list[str]
 
 
 def find_logs(paths: Sequence[Path], topics: Sequence[str] = ()) -> LogsFound:
@@ -59,7 +59,7 @@ def find_logs(paths: Sequence[Path], topics: Sequence[str] = ()) -> LogsFound:
         for sensor, source in found.items():
             every.setdefault(sensor, []).append(source)
     if nothing:
-        left.append(f"{', '.join(nothing)}: no sensor is recognised in the columns")
+        left.append(f"left out: {', '.join(nothing)}: no sensor is recognised in the columns")
     sensors = {sensor: chosen for sensor, some in every.items() if (chosen := _choose(sensor, some, left)) is not None}
     if "imu" not in sensors and "gyro" in sensors:
         if "accel" not in sensors and "accel" in every and "gravity" in sensors:
@@ -67,7 +67,7 @@ def find_logs(paths: Sequence[Path], topics: Sequence[str] = ()) -> LogsFound:
         if "accel" in sensors:
             sensors["imu"] = _join_imu(sensors["gyro"], sensors["accel"])
             if (pull := every.get("gravity")) and sensors["accel"] in every["accel"]:
-                left.append(f"{pull[0].path.name}: {sensors['accel'].path.name} has gravity in it")
+                left.append(f"left out: {pull[0].path.name}: {sensors['accel'].path.name} has gravity in it")
         elif "accel" in every:
             worst = every["accel"][0]
             guesses.guess_accel_unit(worst.path, worst.stack("ax", "ay", "az"), worst.find_unit("ax", "accel"))
@@ -81,7 +81,7 @@ def find_logs(paths: Sequence[Path], topics: Sequence[str] = ()) -> LogsFound:
     _date_times_of_day(sensors)
     parts = [s.path.name for name in ("gyro", "accel", "gravity") for s in every.get(name, ())]
     if "imu" in every and parts:
-        left.append(f"{', '.join(parts)}: {sensors['imu'].path.name} holds both")
+        left.append(f"left out: {', '.join(parts)}: {sensors['imu'].path.name} holds both")
     return LogsFound({name: sensors[name] for name in ("imu", "gnss", "odometer") if name in sensors}, left)
 
 
@@ -138,7 +138,7 @@ def _choose(sensor: str, some: list[Source], left: list[str]) -> Source | None:
         with_gravity = [s for s in some if _has_gravity(s)]
         if len(with_gravity) < len(some) and with_gravity:
             names = ", ".join(s.path.name for s in some if s not in with_gravity)
-            left.append(f"{names}: accelerations without gravity")
+            left.append(f"left out: {names}: accelerations without gravity")
         some = with_gravity
     if not some:
         return None
@@ -152,7 +152,7 @@ def _choose(sensor: str, some: list[Source], left: list[str]) -> Source | None:
         best = some[0]  # a receiver's speed beside a wheel's
     others = [s.path.name for s in some if s is not best and s.path != best.path]
     if others:
-        left.append(f"{', '.join(others)}: a second {sensor}, beside {best.path.name}")
+        left.append(f"left out: {', '.join(others)}: a second {sensor}, beside {best.path.name}")
     return best
 
 
