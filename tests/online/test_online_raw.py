@@ -33,7 +33,7 @@ from graphnav.online import Online, Row, rows_of, without_rows
 from graphnav.online import raw as online_raw
 from graphnav.online.lines import head_of, line_of, row_of, setup_of
 from graphnav.online.raw import RawEpochs
-from graphnav.online.raw_lines import epochs_of, without_epochs
+from graphnav.online.raw_lines import LiveRaw, epochs_of, live_raw, without_epochs
 from graphnav.recording import Recording
 
 CODES = {"differences": False, "carrier": False}
@@ -346,6 +346,17 @@ def test_lines_that_are_no_epochs_are_told(rtk: Recording, spoil: Callable[[str]
     line = line_of(("raw_gnss", *epochs_of(rtk.raw_gnss)[0]))
     with pytest.raises(ValueError, match=r"\w"):
         row_of(spoil(line))
+
+
+@pytest.mark.parametrize("name", ["1K", "9C", "C"])
+def test_a_source_is_refused_that_names_a_signal_that_its_satellites_do_not_send(rtk: Recording, name: str) -> None:
+    said = live_raw(rtk.raw_gnss)
+    assert LiveRaw.model_validate(said).setup().catalogue == without_epochs(rtk.raw_gnss).catalogue
+    with refused("online.raw_names", RecordingError, f"'{name}'"):
+        LiveRaw.model_validate(said | {"signals": [("G", name)]}).setup()
+    line = line_of(("raw_gnss", *epochs_of(rtk.raw_gnss)[0]))
+    with pytest.raises(ValueError, match=r"\w"):
+        row_of(line.replace(",1C,", f",{name},", 1))
 
 
 def test_a_satellite_that_cannot_be_costs_only_itself(rtk: Recording) -> None:
