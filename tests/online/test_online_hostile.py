@@ -431,7 +431,7 @@ def test_a_summary_that_could_not_be_written_is_written_when_resumed(
     session = Session(QUICK, "-", tmp_path)
     session.add_lines([line for _, line in lines_of(drive[0])][:50])
     (tmp_path / "summary.json").mkdir()
-    with pytest.raises(GraphnavError, match="--resume"):
+    with refused("output.cannot_write", GraphnavError, "--resume"):
         session.finish()
     session.close()
     (tmp_path / "summary.json").rmdir()

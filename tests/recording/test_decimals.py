@@ -41,7 +41,7 @@ def test_column_without_points() -> None:
     "text", ["1,2\n3", "1,2\n3,4,5", "1,,2", "1,x", "1,1.2.3", "1,-", "1,--2", "1,2-3", "1,2\n\n3,4", "1, 2", '1,"2"']
 )
 def test_anything_else_is_left_to_others(text: str) -> None:
-    with pytest.raises(ValueError, match=r"cells|reshape|convert"):
+    with pytest.raises(ValueError):  # noqa: PT011 - NumPy's own among them
         read_decimals(io.BytesIO(text.encode()), 2, (0, 1))
 
 

@@ -56,6 +56,7 @@ from graphnav.estimation.solvers.tree_nodes import (
     read_estimates,
     read_factors,
     states_of,
+    turns_of,
     update_isam,
     write_factors,
 )
@@ -131,8 +132,9 @@ class Tree:
             fresh.append((x, make_factor([(x, self._prior.R[:, :DIM])], self._prior.z)))
         else:
             fresh.append((x, None))
-            made.append((keyframe, LINK, make_interval_factor(self.keyframes[-1], x, link)))
-        made += [(keyframe, one.name, make_row_factor(keyframe, one, weighted=False)) for one in rows]
+            turns = turns_of([self.keyframes[-1], keyframe])
+            made.append((keyframe, LINK, make_interval_factor(self.keyframes[-1], x, link, turns)))
+        made += [(keyframe, one.name, make_row_factor(keyframe, one, False, np.eye(3))) for one in rows]
         self.keyframes.append(keyframe)
         # along time, where the order is free; CCOLAMD wants labels below the number of variables it is to order
         most = min(3, len({key for _, _, one in made for key in list(one.keys())}) - 1)
@@ -299,15 +301,19 @@ class Tree:
             # the interval before the oldest keyframe is gone
             places = [p if LINK in k.slots else replace(p, linked=False) for p, k in zip(places, own, strict=True)]
             around = [self.keyframes[max(first - 1, 0)], *own]
-            values, columns = [k.values for k in around], [k.columns for k in own]
+            values, columns, turns = [k.values for k in around], [k.columns for k in own], turns_of(around)
             for k, linear in linearise_runs(places, states_of(around), values, columns):
                 i, keyframe = first + k, own[k]
                 if i in links:
                     assert linear.link is not None
-                    made.append((keyframe, LINK, make_interval_factor(around[k], keyframe.state, linear.link)))
+                    made.append(
+                        (keyframe, LINK, make_interval_factor(around[k], keyframe.state, linear.link, turns[k : k + 2]))
+                    )
                 if i in rows:
                     measured = (one for one in linear.measured if one.name in keyframe.slots)
-                    made += [(keyframe, one.name, make_row_factor(keyframe, one, weighted=True)) for one in measured]
+                    made += [
+                        (keyframe, one.name, make_row_factor(keyframe, one, True, turns[k + 1])) for one in measured
+                    ]
         gone = [keyframe.slots.pop(name) for keyframe, name, _ in made]
         for i in rows:
             x = self.keyframes[i].state

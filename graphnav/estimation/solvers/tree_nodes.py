@@ -158,26 +158,26 @@ def make_factor(blocks: Sequence[tuple[Variable, Array]], b: Array) -> Any:
     return gtsam.LinearContainerFactor(make_jacobian_factor([(x.key, A * x.unit) for x, A in blocks], b))
 
 
-def make_interval_factor(last: Keyframe, x: Variable, link: Array) -> Any:
-    """A factor of an interval's whitened rows (15, 15 + D + 1), from the keyframe before to a state."""
-    return _about(last, [(last.state, link[:, :DIM]), (x, link[:, DIM : 2 * DIM])], link[:, DIM:-1], link[:, -1])
+def turns_of(keyframes: Sequence[Keyframe]) -> Array:
+    """(n, 3, 3) J_r of attitudes about their anchors: rows over a state become rows over errors about its anchor."""
+    return rotation.right_jacobian(np.array([k.state.delta[:3] for k in keyframes]))
 
 
-def make_row_factor(keyframe: Keyframe, one: Measured, weighted: bool) -> Any:
-    """A factor of measurements linearised where keyframe and parameters are now."""
+def make_interval_factor(last: Keyframe, x: Variable, link: Array, turns: Array) -> Any:
+    """A factor of an interval's whitened rows (15, 15 + D + 1), from the keyframe before to a state, J_r of both."""
+    blocks = [(last.state, turned_by(link[:, :DIM], turns[0])), (x, turned_by(link[:, DIM : 2 * DIM], turns[1]))]
+    return _about(last, blocks, link[:, DIM:-1], link[:, -1])
+
+
+def make_row_factor(keyframe: Keyframe, one: Measured, weighted: bool, turn: Array) -> Any:
+    """A factor of measurements linearised where keyframe, of J_r (3, 3), and parameters are now."""
     H, b, _ = one.weighted(np.zeros(one.H.shape[-1]), int(weighted))
     H = H.reshape(-1, H.shape[-1])
-    return _about(keyframe, [(keyframe.state, H[:, :DIM])], H, b.ravel())
+    return _about(keyframe, [(keyframe.state, turned_by(H[:, :DIM], turn))], H, b.ravel())
 
 
 def _about(keyframe: Keyframe, blocks: list[tuple[Variable, Array]], H: Array, b: Array) -> Any:
-    """A factor of rows over states and a keyframe's parameters, H (m, D), linearised where they are now.
-
-    Columns of a state about the anchor moved by d become those of the errors about the anchor itself.
-    """
-    blocks = [
-        (x, turned_by(A, rotation.right_jacobian(x.delta[None, :3])[0]) if x.delta[:3].any() else A) for x, A in blocks
-    ]
+    """A factor of rows over states' errors about anchors and a keyframe's parameters, H (m, D), as they are now."""
     b = b + sum(A @ x.delta for x, A in blocks)
     touched: dict[int, tuple[Variable, Array]] = {}
     for name, at in keyframe.columns.items():
