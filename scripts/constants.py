@@ -77,7 +77,9 @@ CONSTANTS = (
     ),
     Constant(f"{NOISE}.estimate", "_ROUNDS", "computing: passes that are made in any case", 2.0, whole=True),
     Constant(f"{NOISE}.estimate", "_EXTRAPOLATION", "computing: how far a step is extrapolated"),
-    Constant(f"{NOISE}.initial_points", "_COOLING", "computing: by how much the sigmas of an annealing fall in a round"),
+    Constant(
+        f"{NOISE}.initial_points", "_COOLING", "computing: by how much the sigmas of an annealing fall in a round"
+    ),
     Constant(
         f"{NOISE}.exclusion",
         "_REFINEMENTS",
