@@ -262,7 +262,7 @@ def run(arguments: list[str]) -> int:
 
         warnings.simplefilter("ignore")
     try:
-        code = app(arguments, prog_name="graphnav", standalone_mode=False)
+        code = app(arguments, prog_name="graphnav", standalone_mode=False, obj=tuple(arguments))
     except GraphnavError as error:
         return fail(str(error), BAD_INPUT, debug)
     except Interrupted as error:

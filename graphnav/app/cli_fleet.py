@@ -21,6 +21,7 @@ from graphnav.app.cli_options import (
     Rate,
     Start,
     Without,
+    choose_solver,
 )
 from graphnav.app.talk import Interrupted, say, show
 from graphnav.core.errors import ConfigError
@@ -31,6 +32,7 @@ commands = typer.Typer()
 
 @commands.command(epilog="\b\nExample:\n  graphnav fleet drives -o out --solver rts --withhold 60")
 def fleet(
+    context: typer.Context,
     source: Annotated[
         Path, typer.Argument(metavar="SOURCE", help="A folder of recordings, or a manifest .csv or .toml.")
     ],
@@ -85,7 +87,7 @@ def fleet(
     if withhold is not None and not withhold > 0.0:
         raise ConfigError(f"--withhold {withhold:g}: must be a number of seconds above 0", key="option.value")
     asked = manifest.DriveOptions(
-        solver,
+        choose_solver(context, solver)[0],
         profile,
         None if config is None else str(config),
         None,

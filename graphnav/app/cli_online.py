@@ -75,6 +75,14 @@ def online(
     from graphnav.online.session import Session
     from graphnav.recording.formats import read
 
+    live = source == "-" or source.startswith("tcp:")
+    if not speed >= 0.0:
+        raise ConfigError(f"--speed {speed:g}: must be a number from 0 on", key="option.value")
+    if send and live:
+        raise ConfigError(f"{source}: --send prints a recording; this is a live source", key="option.not_here")
+    for option, value in (("--format", format), ("--topic", topic)):
+        if live and value:
+            raise ConfigError(f"{option}: is of recordings; {source} is a live source", key="option.not_here")
     if send:
         _send(read(source, topic or (), allow_outside, format), speed)
         return
@@ -82,7 +90,6 @@ def online(
     if resume and out is None:
         raise ConfigError("--resume: say which folder to go on in: -o OUT", key="option.missing")
     folder = None if out is None else output_folder(out)
-    live = source == "-" or source.startswith("tcp:")
     recording = None if live else read(source, topic or (), allow_outside, format)
     session = Session(settings, source, folder, resume, recording)
     shown = LiveView(session, quiet)
@@ -190,10 +197,15 @@ def standard_input() -> Iterator[bytes]:
 
 def connections(source: str) -> Iterator[bytes]:
     """The lines of clients, one client after the other; a client that disconnects may reconnect."""
+    port = source.removeprefix("tcp:")
+    if not (port.isascii() and port.isdigit() and len(port) < 6 and int(port) < 1 << 16):
+        raise ConfigError(
+            f"{source}: cannot listen there: a port is a number from 0 to 65535", key="online.cannot_listen"
+        )
     try:
-        server = socket.create_server(("127.0.0.1", int(source.removeprefix("tcp:"))))
-    except (ValueError, OSError) as error:
-        raise ConfigError(f"{source}: cannot listen there ({error})", key="online.cannot_listen") from None
+        server = socket.create_server(("127.0.0.1", int(port)))
+    except OSError as error:
+        raise ConfigError(f"{source}: cannot listen there ({error.strerror})", key="online.cannot_listen") from None
     with server:
         while True:
             if not select.select([server], [], [], TICK)[0]:

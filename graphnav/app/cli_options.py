@@ -153,3 +153,40 @@ def choose_detectors(settings: Settings, names: str | None) -> Settings:
             key="detectors.fused_alone",
         )
     return settings.model_copy(update={"detectors": settings.detectors.model_copy(update={"fire": fire})})
+
+
+def choose_solvers(context: typer.Context, names: str) -> tuple[str, ...]:
+    """The solvers of a list with commas; an error names the option as it was typed.
+
+    Raises
+    ------
+    ConfigError
+        If one is not known, or there is none.
+    """
+    from graphnav.core.complaints import split_names
+    from graphnav.estimation import pipeline
+
+    return split_names(names, pipeline.KNOWN, _find_typed(context), "solver")
+
+
+def choose_solver(context: typer.Context, name: str) -> tuple[str, ...]:
+    """The one solver that was named, by itself in a tuple.
+
+    Raises
+    ------
+    ConfigError
+        If it is not known, or several are named.
+    """
+    chosen = choose_solvers(context, name)
+    if len(chosen) > 1:
+        raise ConfigError(
+            f"{_find_typed(context)} {name}: {context.info_name} uses one; several are for graphnav compare",
+            key="option.value",
+        )
+    return chosen
+
+
+def _find_typed(context: typer.Context) -> str:
+    """The spelling of --solver that was typed last; --solver where none was."""
+    given = [argument.partition("=")[0] for argument in context.obj or ()]
+    return next((name for name in reversed(given) if name in ("--solver", "--solvers")), "--solver")

@@ -31,6 +31,8 @@ from graphnav.app.cli_options import (
     Topic,
     Without,
     choose_detectors,
+    choose_solver,
+    choose_solvers,
     collect_withheld,
     pick_one,
 )
@@ -77,7 +79,7 @@ def smooth(
         format, topic, quiet, json, pages,
     )  # fmt: skip
     with permit_outside(allow_outside):
-        _solve(asked, solver, "--solver", export, point)
+        _solve(asked, choose_solver(context, solver), True, export, point)
 
 
 @commands.command(
@@ -157,7 +159,7 @@ def compare(
                 key="option.count",
             )
     with permit_outside(allow_outside):
-        _solve(asked, solvers, "--solvers", export, point, beside, loose)
+        _solve(asked, choose_solvers(context, solvers), False, export, point, beside, loose)
 
 
 @commands.command(epilog="\b\nExample:\n  graphnav report out/kitti")
@@ -216,8 +218,8 @@ class _Beside:
 
 def _solve(
     asked: _Options,
-    solvers: str,
-    option: str,
+    chosen: tuple[str, ...],
+    alone: bool,
     export: str | None = None,
     point: str | None = None,
     beside: _Beside | None = None,
@@ -228,19 +230,15 @@ def _solve(
     from graphnav.config import read_settings
     from graphnav.core.complaints import split_names
     from graphnav.core.staging import final_path, stage_results
-    from graphnav.estimation import pipeline
     from graphnav.evaluation import gates
     from graphnav.recording.exporters import NAMES
 
     withheld = collect_withheld(asked.without, asked.start, asked.end)
     convert.check_rate(asked.rate)
-    chosen, alone = split_names(solvers, pipeline.KNOWN, option, "solver"), option == "--solver"
-    if alone and len(chosen) > 1:
-        raise ConfigError(f"--solver {solvers}: smooth uses one; several are for graphnav compare", key="option.value")
     names = workflow.name_runs(chosen, loose)
     requirements = [gates.parse_requirement(one, names) for one in asked.require or ()]
     given: dict[str, Any] = {
-        "recording": asked.recording, option.lstrip("-"): ",".join(chosen), "profile": asked.profile,
+        "recording": asked.recording, "solver" if alone else "solvers": ",".join(chosen), "profile": asked.profile,
         "config": asked.config and str(asked.config), "noise": asked.noise, "detectors": asked.detectors,
         "without": asked.without, "rate": asked.rate, "start": asked.start, "end": asked.end, "format": asked.format,
         "topic": asked.topic,

@@ -14,7 +14,7 @@ from graphnav.core.complaints import split_names
 from graphnav.core.errors import ConfigError, RecordingError
 from graphnav.core.files import parse_json, read_text
 from graphnav.core.interpolation import interpolate
-from graphnav.core.notes import Note
+from graphnav.core.notes import Note, format_count
 from graphnav.core.rotation import Array
 from graphnav.core.staging import final_path, stage_results
 from graphnav.core.timescales import gps_to_utc, parse_clock
@@ -304,7 +304,7 @@ def log_text(log: Log, files: Sequence[Path]) -> str:
     for label, sensor in sensors.items():
         if sensor is not None and len(sensor.t):
             span = f"{sensor.t[0]:.3f} to {sensor.t[-1]:.3f} s"
-            held.append(f"  {label:<9} {len(sensor.t)} rows, {span}")
+            held.append(f"  {label:<9} {format_count(len(sensor.t), 'row')}, {span}")
     lines = [f"{log.name} ({log.platform})", *held, *(f"  assumed: {remark}" for remark in log.remarks)]
     if log.imu is None:
         lines.append("  warning: no IMU in it: put its rows into imu.csv beside recording.toml, or use 'graphnav init'")

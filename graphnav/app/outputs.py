@@ -53,6 +53,9 @@ def output_folder(path: str | Path, files: Sequence[str] = (), folders: Sequence
     there = folder
     while not exists(there, ConfigError) and there != there.parent:
         there = there.parent
+    broken = next((place for place in (folder, *folder.parents) if place.is_symlink() and not place.exists()), None)
+    if broken is not None:
+        raise ConfigError(f"-o {folder}: {broken} is a link to nothing", key="output.cannot_write")
     if not there.is_dir():
         what = "is a file; name a folder to write into" if there == folder else f"cannot be made, {there} is a file"
         raise ConfigError(f"-o {folder}: {what}", key="output.cannot_write")

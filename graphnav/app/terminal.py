@@ -14,7 +14,7 @@ import numpy as np
 from graphnav.app.summary import median_sigmas
 from graphnav.app.workflow import Outcome
 from graphnav.constraints.gnss import TIMES
-from graphnav.core.notes import key_of
+from graphnav.core.notes import format_count, key_of
 from graphnav.core.progress import Progress
 from graphnav.core.staging import defer_interrupts
 from graphnav.estimation.solution import Solution
@@ -86,19 +86,18 @@ def _describe_stops(outcome: Outcome) -> str:
     spans = next(iter(outcome.solutions.values())).stationary
     if not len(spans):
         return "stands nowhere"
-    many = "1 stop" if len(spans) == 1 else f"{len(spans)} stops"
-    return f"{many}, {np.diff(spans).sum():.1f} s in all: detections.csv"
+    return f"{format_count(len(spans), 'stop')}, {np.diff(spans).sum():.1f} s in all: detections.csv"
 
 
 def _describe_recording(outcome: Outcome) -> str:
     recording = outcome.recording
     rate = 1.0 / float(np.median(np.diff(recording.imu.t)))
-    parts = [f"{recording.duration:.1f} s", f"IMU {len(recording.imu.t)} rows at {rate:.4g} Hz"]
+    parts = [f"{recording.duration:.1f} s", f"IMU {format_count(len(recording.imu.t), 'row')} at {rate:.4g} Hz"]
     if recording.gnss is not None:
-        parts.append(f"GNSS {len(recording.gnss.t)} fixes")
+        parts.append(f"GNSS {format_count(len(recording.gnss.t), 'fix', 'fixes')}")
     if recording.odometer is not None:
-        parts.append(f"odometer {len(recording.odometer.t)} rows")
-    parts += [f"{name} {len(series)} rows" for name, series in recording.sensors.items()]
+        parts.append(f"odometer {format_count(len(recording.odometer.t), 'row')}")
+    parts += [f"{name} {format_count(len(series), 'row')}" for name, series in recording.sensors.items()]
     if recording.truth is not None:
         parts.append("truth")
     return f"{recording.name} ({recording.platform}): {', '.join(parts)}"

@@ -25,3 +25,8 @@ class Note(str):
 def key_of(sentence: str) -> str:
     """The key of a sentence, "" if it has none."""
     return sentence.key if isinstance(sentence, Note) else ""
+
+
+def format_count(number: int, one: str, several: str = "") -> str:
+    """A number with its noun: "1 row", "2 rows"; `several` is the plural where an s does not make it."""
+    return f"{number} {one if number == 1 else several or one + 's'}"

@@ -17,7 +17,7 @@ from graphnav.core import rotation
 from graphnav.core.earth import LocalFrame
 from graphnav.core.errors import RecordingError
 from graphnav.core.interpolation import fit_yaw, interpolate, place_on_earth
-from graphnav.core.notes import Note
+from graphnav.core.notes import Note, format_count
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, States
 from graphnav.core.timescales import LEAP, NEAR, between_clocks
@@ -109,9 +109,9 @@ def read_against(asked: Against, name: str, recording: Recording, reference: Sol
     inside = (track.t >= reference.t[0]) & (track.t <= reference.t[-1])
     if inside.sum() < _FEWEST_ROWS:
         raise RecordingError(
-            f"{asked.path}: {int(inside.sum())} rows in common with '{recording.name}': its time runs from "
-            f"{track.t[0]:.3f} to {track.t[-1]:.3f} s, the recording's from {reference.t[0]:.3f} to "
-            f"{reference.t[-1]:.3f} s; --against-shift says what to add",
+            f"{asked.path}: {format_count(int(inside.sum()), 'row')} in common with "
+            f"'{recording.name}': its time runs from {track.t[0]:.3f} to {track.t[-1]:.3f} s, the "
+            f"recording's from {reference.t[0]:.3f} to {reference.t[-1]:.3f} s; --against-shift says what to add",
             key="against.no_overlap",
         )
     if track.frame == "local":

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from graphnav.core.notes import Note
+from graphnav.core.notes import Note, format_count
 from graphnav.core.rotation import Array
 from graphnav.gnss.series import Observations, once
 from graphnav.gnss.signals import GPS, L1, QZSS, C, signal_id
@@ -47,7 +47,7 @@ def observations(columns: Mapping[str, Array], zero: float, name: str) -> Observ
             remarks=(
                 Note(
                     "raw.rows_left_out",
-                    f"{name}: {int((~whole).sum())} rows without time, prn (1 to 99) or code left out",
+                    f"{name}: {format_count(int((~whole).sum()), 'row')} without time, prn (1 to 99) or code left out",
                 ),
             ),
         )

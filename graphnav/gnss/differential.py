@@ -68,7 +68,7 @@ def with_differences(rover: RawGnss, base: RawGnss, position: Array) -> tuple[Ra
     missing = np.isnan(difference) & np.isfinite(rover.code) & np.isfinite(rover.p[:, 0])
     notes: tuple[str, ...] = ()
     if missing.any():
-        sentence = f"{int(missing.sum())} of {len(rover)} codes have no counterpart at the base and are not used"
+        sentence = f"codes not used because the base has no counterpart: {int(missing.sum())} of {len(rover)}"
         notes = (Note("raw.without_base", sentence),)
     away = float(np.linalg.norm(np.median(rover.antenna, axis=0) - position))
     return replace(

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from graphnav.core.errors import RecordingError
 from graphnav.core.files import parse_number
-from graphnav.core.notes import Note
+from graphnav.core.notes import Note, format_count
 from graphnav.core.rotation import Array
 from graphnav.core.timescales import WEEK, utc_to_gps
 from graphnav.gnss.files import Lines, calendar_days, find_moved_points, numbers, read_bytes
@@ -321,9 +321,8 @@ def _say_cut(
     if len(short) == 1 and short[0] == len(epoch) - 1:
         remarks.append(note_cut(path.name, "record"))
     elif len(short):
-        sentence = (
-            f"{len(short)} epochs hold fewer satellites than they announce (the first at line {epoch[short[0]] + 1})"
-        )
+        some, line = format_count(len(short), "epoch"), epoch[short[0]] + 1
+        sentence = f"{some} with fewer satellites than announced, the first at line {line}"
         remarks.append(Note("raw.short_epochs", f"{path.name}: {sentence}"))
 
 

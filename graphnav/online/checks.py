@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections import Counter
 
-from graphnav.core.notes import Note
+from graphnav.core.notes import Note, format_count
 from graphnav.recording import Recording
 from graphnav.recording.checks.overview import inspect
 
@@ -49,7 +49,7 @@ def check_counts(counts: Counter[str]) -> tuple[Note, ...]:
             out.append(
                 Note(
                     f"{sensor}.left_out",
-                    f"{sensor}: {sum(lost.values())} of {total} rows are left out, {lost[why]} of them as "
+                    f"{sensor}: left out {sum(lost.values())} of {format_count(total, 'row')}, {lost[why]} of them as "
                     f'"{why}": {_CAUSES[why]}',
                 )
             )

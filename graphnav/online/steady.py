@@ -6,7 +6,7 @@ import traceback
 from pathlib import Path
 
 from graphnav.config import Settings, settings_from
-from graphnav.core.notes import Note
+from graphnav.core.notes import Note, format_count
 from graphnav.online.checks import check_counts
 from graphnav.online.sensors import Row
 from graphnav.online.smoother import Smoother
@@ -116,7 +116,7 @@ class Online(Smoother):
             return
         now = sensors.imu.newest
         try:
-            self._restart(now, f"{count} fixes since {since:.3f} s are out of reach of all before")
+            self._restart(now, f"since {since:.3f} s out of reach of all before: {format_count(count, 'fix', 'fixes')}")
         except Exception as error:
             self._give_up(error)
         self.frame = None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from graphnav.core.notes import format_count
 from graphnav.estimation.noise.explanations import FIXES
 from graphnav.estimation.solution import to_trajectory
 from graphnav.online.session import Session
@@ -21,7 +22,11 @@ def view(session: Session, silent: float = 0.0) -> list[tuple[str, str]]:
         since = sensors.imu.newest - float(sensors.imu.t[0]) if len(sensors.imu) else 0.0
         fixes = len(sensors.gnss)
         lines.append(
-            ("rows so far", f"{since:.0f} s of IMU, {fixes} fixes: needs motion and fixes to find its attitude")
+            (
+                "rows so far",
+                f"{since:.0f} s of IMU, {format_count(fixes, 'fix', 'fixes')}: "
+                "needs motion and fixes to find its attitude",
+            )
         )
     else:
         now = tracker.live(sensors)
@@ -54,7 +59,7 @@ def view(session: Session, silent: float = 0.0) -> list[tuple[str, str]]:
     lines.append(("settled", f"{session.rows_settled} keyframes"))
     if late or wrong or odd or session.bad:
         said = [f"{late} late rows used"] * bool(late) + [f"{n} {k}" for k, n in sorted(odd.items())]
-        said += [f"{wrong} wrong fixes left out"] * bool(wrong)
+        said += [f"{format_count(wrong, 'wrong fix', 'wrong fixes')} left out"] * bool(wrong)
         said += [f"{session.bad} bad lines ({session.complaints[0]})"] if session.complaints else []
         lines.append(("odd", ", ".join(said)))
     if online.failures:

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from graphnav.core.errors import RecordingError
+from graphnav.core.notes import format_count
 from graphnav.core.rotation import Array
 
 PER_DECADE = 12  # averaging times
@@ -79,8 +80,9 @@ def compute_allan(t: Array, gyro: Array, accel: Array) -> Allan:
     gap = np.flatnonzero(np.diff(t) > 1.5 * period)
     if len(gap):
         raise RecordingError(
-            f"{len(gap)} gaps, the first of {t[gap[0] + 1] - t[gap[0]]:.3f} s at {t[gap[0]] - t[0]:.1f} s: an Allan "
-            "variance needs a log without any; choose a part with --start and --end",
+            f"{format_count(len(gap), 'gap')}, the first of {t[gap[0] + 1] - t[gap[0]]:.3f} s "
+            f"at {t[gap[0]] - t[0]:.1f} s: an Allan variance needs a log without any; "
+            "choose a part with --start and --end",
             key="allan.gaps",
         )
     duration = len(t) * period

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from graphnav.core.notes import format_count
 from graphnav.core.rotation import Array
 from graphnav.detectors import Detections
 from graphnav.estimation.stops import Stop, detections_text, stops_of
@@ -113,7 +114,7 @@ def _words(recording: Recording, found: Detections) -> tuple[str, str, str]:
     """What was examined, the stationary share, and the notes of each detector."""
     spans = found.stationary
     seconds = float(np.diff(spans).sum()) if len(spans) else 0.0
-    many = "1 stop" if len(spans) == 1 else f"{len(spans)} stops"
+    many = format_count(len(spans), "stop")
     share = f" ({100.0 * seconds / recording.duration:.1f} %)" if seconds else ""
     each = [f"{d.name} {float(np.diff(d.intervals).sum()) if len(d.intervals) else 0.0:.1f}" for d in found.all]
     return (

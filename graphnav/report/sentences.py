@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from markupsafe import Markup
 
-from graphnav.core.notes import Note
+from graphnav.core.notes import Note, format_count
 from graphnav.estimation.solution import Solution
 from graphnav.evaluation.against import own_solutions
 from graphnav.evaluation.segments import rms
@@ -45,10 +45,10 @@ def describe_run(recording: Recording, solutions: Mapping[str, Solution], withhe
             used = used.without(source, span)
     sources = [f"an IMU at {1.0 / used.imu.period:.4g} Hz"]
     if used.gnss is not None:
-        sources.append(f"{len(used.gnss.t)} GNSS fixes")
+        sources.append(format_count(len(used.gnss.t), "GNSS fix", "GNSS fixes"))
     if used.odometer is not None:
-        sources.append(f"{len(used.odometer.t)} odometer rows")
-    sources += [f"{len(series)} rows of {name}" for name, series in used.sensors.items()]
+        sources.append(format_count(len(used.odometer.t), "odometer row"))
+    sources += [f"{format_count(len(series), 'row')} of {name}" for name, series in used.sensors.items()]
     others = [name for name in solutions if name not in own_solutions(solutions)]
     solutions = own_solutions(solutions)
     solution = next(iter(solutions.values()))
@@ -56,7 +56,7 @@ def describe_run(recording: Recording, solutions: Mapping[str, Solution], withhe
     who = f"The solvers {and_list(list(solutions))}" if several else f"The {solution.solver} solver"
     words = (
         f"{who} estimated the trajectory of the {recording.platform} recording '{recording.name}' "
-        f"({recording.duration:.1f} s) from {and_list(sources)}, at {len(solution.t)} keyframes."
+        f"({recording.duration:.1f} s) from {and_list(sources)}, at {format_count(len(solution.t), 'keyframe')}."
     )
     if others:
         words += f" Beside them, of other programs: {and_list(others)}."
@@ -68,7 +68,7 @@ def describe_run(recording: Recording, solutions: Mapping[str, Solution], withhe
         stops = "1 stop was" if len(spans) == 1 else f"{len(spans)} stops were"
         words += f" {stops} found, {np.diff(spans).sum():.0f} s in all."
     elif len(spans):
-        words += f" The foot was found on the floor {len(spans)} times."
+        words += f" The foot was found on the floor {format_count(len(spans), 'time')}."
     if outages:
         listed = [f"{a:.0f} to {b:.0f} s" for a, b in outages[:_MAX_OUTAGES]]
         more = [f"{len(outages) - _MAX_OUTAGES} more"] if len(outages) > _MAX_OUTAGES else []

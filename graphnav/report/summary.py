@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from markupsafe import Markup
 
-from graphnav.core.notes import Note
+from graphnav.core.notes import Note, format_count
 from graphnav.core.rotation import Array
 from graphnav.estimation.noise.apply import row_weights
 from graphnav.estimation.solution import Solution
@@ -187,12 +187,15 @@ def left_out(solution: Solution, start: float) -> list[Markup]:
     spans = sorted(solution.excluded, key=lambda p: -p.count)
     some = spans[:_LINES] if len(spans) <= _LINES else spans[: _LINES - 1]
     lines = [
-        f"{p.kind}, {p.count} rows from {p.t_start - start:.1f} to {p.t_end - start:.1f} s: {p.reason or 'faulty'}"
+        f"{p.kind}, {format_count(p.count, 'row')} from {p.t_start - start:.1f} to {p.t_end - start:.1f} s: "
+        f"{p.reason or 'faulty'}"
         for p in some
     ]
     if len(spans) > len(some):
         rest = spans[len(some) :]
-        lines.append(f"{sum(int(p.count) for p in rest)} rows in {len(rest)} more spans: see the noise model")
+        lines.append(
+            f"{format_count(sum(int(p.count) for p in rest), 'row')} in {len(rest)} more spans: see the noise model"
+        )
     less = [
         f"{np.count_nonzero((w > 0) & (w < 0.5))} of {name}"
         for name, record in solution.records.items()

@@ -163,16 +163,16 @@ def noise_tables(rows: Sequence[FigureRow], solution: Solution) -> list[Markup]:
             out.append(page.paragraph(Note("noise.of_first_piece", cut), "soft"))
         out.append(page.paragraph(note, "soft"))
     less = [
-        f"{np.count_nonzero(some.weight < 1.0)} of {len(solution.records[name].t)} rows of {name} are off by "
-        "more than chance allows once in a thousand times and weigh less, the least of them "
+        f"Rows of {name} with less weight, because they are off by more than chance allows once in a thousand times: "
+        f"{np.count_nonzero(some.weight < 1.0)} of {len(solution.records[name].t)}; the least counts as "
         f"{wording.number(float(some.weight.min()), 2)} of a row."
         for name, some in noise.weights.items()
         if len(some.t) and name in solution.records
     ]
     less += [
-        f"{len(some.t)} of {len(solution.t) - 1} intervals between keyframes have more noise of the "
-        f"{_OF_IMU[name]} than chance allows once in a thousand times, "
-        f"{wording.number(float(np.sqrt(1.0 / some.weight.min())), 2)} times the usual one at most."
+        f"Intervals between keyframes with more noise of the {_OF_IMU[name]} than chance allows once in a thousand "
+        f"times: {len(some.t)} of {len(solution.t) - 1}; at most "
+        f"{wording.number(float(np.sqrt(1.0 / some.weight.min())), 2)} times the usual noise."
         for name, some in noise.weights.items()
         if len(some.t) and name in _OF_IMU
     ]

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from graphnav.core.notes import format_count
 from graphnav.core.rotation import Array
 from graphnav.core.trajectory import Trajectory
 from graphnav.recording import Imu, Recording, Truth
@@ -35,7 +36,7 @@ class Simulated:
         imu, stopped = self.recording.imu, float(np.sum(np.diff(self.stops)))
         return (
             f"{self.recording.name}: {self.recording.duration:.1f} s, IMU at {1.0 / np.median(np.diff(imu.t)):.4g} Hz, "
-            f"{len(self.stops)} stops ({stopped:.1f} s)"
+            f"{format_count(len(self.stops), 'stop')} ({stopped:.1f} s)"
         )
 
     def write(self, folder: str | FilePath) -> list[FilePath]:

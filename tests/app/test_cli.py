@@ -387,6 +387,7 @@ BAD = {
     "unknown command": (["smoth", "kitti"], "", "smoth"),
     "unknown option": (["smooth", "kitti", "-o", "o", "--solvr", "ekf"], "", "--solvr"),
     "no output": (["smooth", "kitti"], "", "-o"),
+    "output is a link to nothing": (["smooth", "kitti", "-o", "link/o"], "output.cannot_write", "-o link/o: "),
     "no number": (["smooth", "kitti", "-o", "o", "--start", "soon"], "", "--start"),
     "output is a file": (["smooth", "kitti", "-o", "file"], "output.cannot_write", "-o file: "),
     "output under a file": (["smooth", "kitti", "-o", "file/o"], "output.cannot_write", "-o file/o: "),
@@ -396,6 +397,13 @@ BAD = {
         "ekf, rts, incremental, isam2, batch",
     ),
     "two solvers": (["smooth", "kitti", "-o", "o", "--solver", "ekf,rts"], "option.value", "--solver ekf,rts"),
+    "as typed": (["smooth", "kitti", "-o", "o", "--solvers", "lstm"], "option.unknown_name", "--solvers lstm"),
+    "as typed, with =": (["compare", "kitti", "-o", "o", "--solver=lstm"], "option.unknown_name", "--solver lstm"),
+    "unknown solver of a fleet": (
+        ["fleet", ".", "-o", "o", "--solver", "lstm"],
+        "option.unknown_name",
+        "--solver lstm",
+    ),
     "unknown among solvers": (["compare", "kitti", "-o", "o", "--solvers", "ekf,ukf"], "option.unknown_name", "'ukf'"),
     "no solvers": (["compare", "kitti", "-o", "o", "--solvers", ","], "option.no_name", "--solvers"),
     "unknown source": (["smooth", "kitti", "-o", "o", "--without", "gns:1-2"], "option.withheld", "'gnss'"),
@@ -432,9 +440,10 @@ BAD = {
 def test_bad_input_is_one_line_and_exit_code_2(arguments, key, name, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     Path("file").write_text("")
+    Path("link").symlink_to("nothing")
     Path("bad.toml").write_text("[keyframes]\nrat = 1.0\n")
     assert name in refuse_command(capsys, key, *arguments)
-    assert {p.name for p in tmp_path.iterdir()} == {"file", "bad.toml"}  # nothing was written
+    assert {p.name for p in tmp_path.iterdir()} == {"file", "link", "bad.toml"}  # nothing was written
 
 
 def test_exit_code_and_sentence_of_the_installed_program():

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import oracle
 import pytest
-from helpers import Array, at_rate, refused, truth_states
+from helpers import Array, at_rate, refuse_command, refused, truth_states
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
@@ -603,18 +603,20 @@ def test_bad_usage_is_one_line_and_code_two(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(signal, "signal", lambda *_: None)  # the handlers of the tests stay
-    for arguments, reason in (
-        (["no-such-thing"], "no-such-thing"),
-        (["-", "--resume"], "say which folder"),
-        (["-", "--lag", "0"], "at least 1 s"),
-        (["-", "--detectors", "no-such-thing"], "no-such-thing"),
-        (["-", "--detectors", "fused,fft"], "name it alone"),
-        (["tcp:x"], "cannot listen"),
+    for arguments, key, name in (
+        (["no-such-thing"], "file.missing", "no-such-thing"),
+        (["-", "--resume"], "option.missing", "--resume"),
+        (["-", "--lag", "0"], "option.value", "--lag 0"),
+        (["-", "--speed", "-1"], "option.value", "--speed -1"),
+        (["-", "--detectors", "no-such-thing"], "option.unknown_name", "no-such-thing"),
+        (["-", "--detectors", "fused,fft"], "detectors.fused_alone", "fused"),
+        (["-", "--format", "ubx"], "option.not_here", "--format"),
+        (["-", "--topic", "/imu"], "option.not_here", "--topic"),
+        (["-", "--send"], "option.not_here", "--send"),
+        (["tcp:x"], "online.cannot_listen", "tcp:x"),
+        (["tcp:70000"], "online.cannot_listen", "tcp:70000"),
     ):
-        assert cli.run(["online", *arguments]) == 2
-        error = capsys.readouterr().err
-        assert reason in error
-        assert error.count("\n") == 1
+        assert name in refuse_command(capsys, key, "online", *arguments)
 
 
 def test_the_detectors_that_decide_can_be_named(monkeypatch: pytest.MonkeyPatch) -> None:

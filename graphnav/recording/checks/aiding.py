@@ -9,6 +9,7 @@ import numpy as np
 
 from graphnav.config.gnss import GnssSettings
 from graphnav.core.findings import Finding, period_of
+from graphnav.core.notes import format_count
 from graphnav.core.rotation import Array
 from graphnav.core.timescales import NEAR, WEEK, between_clocks
 from graphnav.recording import Imu, Odometer, Recording
@@ -100,7 +101,8 @@ def check_gnss_coverage(recording: Recording) -> Iterator[Finding]:
     if inside < 0.5 * len(gnss.t):
         yield Finding(
             "warning",
-            f"the IMU covers {inside} of {len(gnss.t)} fixes ({recording.start:.3f} to {recording.end:.3f} s of "
+            f"the IMU covers {inside} of {format_count(len(gnss.t), 'fix', 'fixes')} "
+            f"({recording.start:.3f} to {recording.end:.3f} s of "
             f"{gnss.t[0]:.3f} to {gnss.t[-1]:.3f} s): the rest is not used; is its file whole?",
             "gnss.beyond_imu",
         )
@@ -116,7 +118,7 @@ def check_gnss_coverage(recording: Recording) -> Iterator[Finding]:
     gaps = np.flatnonzero((step > max(3.5 * period_of(gnss.t), 1.5)) & there)
     if len(gaps):
         worst = gaps[np.argmax(step[gaps])]
-        count = "1 gap" if len(gaps) == 1 else f"{len(gaps)} gaps"
+        count = format_count(len(gaps), "gap")
         at = gnss.t[worst] - recording.start
         yield Finding(
             "note", f"{count} in GNSS, the longest {step[worst]:.1f} s at {at:.1f} s from the start", "gnss.gap"
@@ -145,7 +147,7 @@ def check_gnss_jumps(recording: Recording, track: Track | None) -> Iterator[Find
     bad = np.flatnonzero(near & (size > limit))
     if len(bad):
         worst = bad[np.argmax(size[bad])]
-        count = "1 jump" if len(bad) == 1 else f"{len(bad)} jumps"
+        count = format_count(len(bad), "jump")
         at = gnss.t[worst + 1] - recording.start
         yield Finding(
             "warning",

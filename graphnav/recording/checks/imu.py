@@ -9,6 +9,7 @@ import numpy as np
 
 from graphnav.core.earth import gravity
 from graphnav.core.findings import Finding, period_of, runs_of
+from graphnav.core.notes import format_count
 from graphnav.core.rotation import Array
 from graphnav.recording import Imu, Recording
 
@@ -21,7 +22,7 @@ def check_imu_time(imu: Imu) -> Iterator[Finding]:
     if len(gaps):
         worst = gaps[np.argmax(step[gaps])]
         severity: Literal["note", "warning"] = "warning" if step[worst] > 0.2 else "note"
-        count = "1 gap" if len(gaps) == 1 else f"{len(gaps)} gaps"
+        count = format_count(len(gaps), "gap")
         after = imu.t[worst] - imu.t[0]
         yield Finding(
             severity, f"{count} in the IMU, the longest {step[worst]:.3f} s at {after:.1f} s from the start", "imu.gap"

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from graphnav.core.errors import RecordingError
+from graphnav.core.notes import format_count
 from graphnav.core.rotation import Array
 from graphnav.recording import Gnss, Imu, ImuNoise, Odometer, Truth
 from graphnav.recording.formats import schema
@@ -75,7 +76,7 @@ def build_gnss(d: schema.GnssTable, rows: Table, remarks: Remarks) -> Gnss:
                 key="gnss.sigma_all_vague",
             )
         remarks.add(
-            "gnss.sigma_vague", f"{vague.sum()} of {len(rows)} fixes have a sigma of more than {VAGUEST:g} m: left out"
+            "gnss.sigma_vague", f"fixes with a sigma of more than {VAGUEST:g} m, left out: {vague.sum()} of {len(rows)}"
         )
         llh, sd, rows = llh[~vague], sd[~vague], rows.take(~vague)
     v = sd_v = None
@@ -172,7 +173,10 @@ def build_series(sensor: Sensor, d: Any, rows: Table, remarks: Remarks) -> Serie
     figures = sensor.figures(**{name: getattr(d, name) for name in sensor.figures.model_fields})
     whole = sensor.usable(values)
     if not whole.all():
-        remarks.add(f"{sensor.name}.rows_blank", f"{(~whole).sum()} {sensor.name} rows without a measurement dropped")
+        remarks.add(
+            f"{sensor.name}.rows_blank",
+            f"{format_count((~whole).sum(), sensor.name + ' row')} without a measurement dropped",
+        )
     return Series(sensor, rows["t"][whole], values[whole], figures)
 
 

@@ -23,6 +23,7 @@ import numpy as np
 
 from graphnav.core.errors import RecordingError
 from graphnav.core.files import check_inside, parse_number, read_bytes
+from graphnav.core.notes import format_count
 from graphnav.core.rotation import Array
 from graphnav.core.timescales import WEEK
 from graphnav.recording import Gnss, Imu, Odometer, Truth
@@ -213,7 +214,9 @@ def _read_imu(path: Path, remarks: Remarks) -> tuple[Imu, Array | None]:
             (n, line) for n, line in enumerate(text_lines(path), 1) if line.strip() and line.lstrip()[0] not in "#%"
         ]
         if len(rows) < 2:
-            raise RecordingError(f"{path}: {len(rows)} rows; an IMU file needs at least 2", key="table.few_rows")
+            raise RecordingError(
+                f"{path}: {format_count(len(rows), 'row')}; an IMU file needs at least 2", key="table.few_rows"
+            )
         width = len(rows[0][1].split())
         if width < 7:
             raise RecordingError(
@@ -241,7 +244,7 @@ def _read_imu(path: Path, remarks: Remarks) -> tuple[Imu, Array | None]:
     if gap.any():
         remarks.add(
             "imu.increments_after_gap",
-            f"{gap.sum()} gaps in the IMU: the increments after each are taken as those of one period",
+            f"{format_count(gap.sum(), 'gap')} in the IMU: the increments after each are taken as those of one period",
         )
     R_bs = rotation_from_letters("FRD")
     remarks.add(

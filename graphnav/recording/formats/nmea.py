@@ -14,6 +14,7 @@ import numpy as np
 
 from graphnav.core.errors import RecordingError
 from graphnav.core.files import parse_number, read_bytes
+from graphnav.core.notes import format_count
 from graphnav.core.rotation import Array
 from graphnav.core.timescales import of_week, utc_to_gps
 from graphnav.recording import Gnss, fix_types
@@ -64,8 +65,8 @@ def load(path: Path) -> Log:
     if broken:
         remarks.add(
             "log.broken_lines",
-            f"{path.name}, line {broken[0]}: not a sound sentence (checksum or form); {len(broken)} of {lines} lines "
-            "were skipped",
+            f"{path.name}, line {broken[0]}: not a sound sentence (checksum or form); skipped {len(broken)} of "
+            f"{format_count(lines, 'line')}",
         )
     fixes = [e for e in epochs if e.gga is not None and e.gga.quality not in (0, 6, 7, 8) and e.gga.lat != ""]
     if not fixes:
@@ -104,7 +105,7 @@ def load(path: Path) -> Log:
     if len(order) < len(t):
         remarks.add(
             "gnss.rows_left_out",
-            f"{len(t) - len(order)} fixes without a height or with the time of another were left out",
+            f"left out {format_count(len(t) - len(order), 'fix', 'fixes')} without a height or with another's time",
         )
     kinds = fix_types(np.array([e.gga.quality for e in fixes])[order], NMEA_TYPES)
     v, sd_v = (None if x is None else x[order] for x in (v, sd_v))
@@ -231,8 +232,8 @@ def _read_sigmas(fixes: list[_Epoch], remarks: Remarks) -> Array:
         sd[k] = axis, axis, 2.0 * axis
     remarks.add(
         "gnss.sigma_of_hdop",
-        f"{without.sum()} of {len(fixes)} fixes have no GST: their sigmas are GGA's HDOP times 2.5 m (autonomous), 1 m "
-        "(differential), 0.4 m (float) or 0.02 m (fixed), twice that in height",
+        f"fixes without GST: {without.sum()} of {len(fixes)}; their sigmas are GGA's HDOP times 2.5 m (autonomous), "
+        "1 m (differential), 0.4 m (float) or 0.02 m (fixed), twice that in height",
     )
     return sd
 

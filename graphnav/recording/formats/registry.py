@@ -12,7 +12,7 @@ from pathlib import Path
 
 from graphnav.core.errors import RecordingError
 from graphnav.core.files import check_regular, exists
-from graphnav.core.notes import Note
+from graphnav.core.notes import Note, format_count
 from graphnav.recording import Gnss, Imu, Odometer, Recording, Truth, take_rows
 from graphnav.sensors import Series
 
@@ -109,7 +109,7 @@ def _without_nowhere(log: Log) -> Log:
     gnss = log.gnss
     if gnss is None or not (nowhere := (gnss.llh[:, :2] == 0.0).all(axis=1)).any() or nowhere.all():
         return log
-    many = "1 fix" if nowhere.sum() == 1 else f"{nowhere.sum()} fixes"
+    many = format_count(nowhere.sum(), "fix", "fixes")
     return replace(
         log,
         gnss=take_rows(gnss, ~nowhere),

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphnav.core.errors import RecordingError
-from graphnav.core.notes import Note
+from graphnav.core.notes import Note, format_count
 from graphnav.core.rotation import Array
 from graphnav.recording import FIX_TYPES, fix_types
 from graphnav.recording.formats.table import Mask, Table
@@ -96,7 +96,7 @@ def select_usable_rows(
         _check_passes(rows, label)
         remarks.add(
             f"{sensor}.rows_unordered",
-            f"{label} rows out of order sorted by time ({(step < 0).sum()} steps back, "
+            f"{label} rows out of order sorted by time ({format_count((step < 0).sum(), 'step')} back, "
             f"the first after t = {t[first]:.3f} s)",
         )
         rows = rows.take(np.argsort(t, kind="stable"))
@@ -296,7 +296,9 @@ def sigmas(
             )
     blank = np.isnan(sd)
     if stated is None and (n := (blank.any(-1) & used).sum()):
-        remarks.add(f"{of}.sigma_blank", f"{assumed} where the file's own are blank ({n} of {len(rows)} rows)")
+        remarks.add(
+            f"{of}.sigma_blank", f"{assumed} where the file's own are blank ({n} of {format_count(len(rows), 'row')})"
+        )
     return np.where(blank, fallback, sd)
 
 

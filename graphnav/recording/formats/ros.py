@@ -16,6 +16,7 @@ import numpy as np
 
 from graphnav.core.complaints import suggest_nearest
 from graphnav.core.errors import RecordingError
+from graphnav.core.notes import format_count
 from graphnav.core.rotation import Array
 from graphnav.core.timescales import unix_to_gps
 from graphnav.recording import Gnss, Imu, ImuNoise, Odometer, fix_types
@@ -185,7 +186,8 @@ def _read_gnss(topic: _Topic, remarks: Remarks) -> Gnss | None:
     if not known.all():
         remarks.add(
             "gnss.sigma_assumed",
-            f"{topic.name}: {np.sum(~known)} fixes without a covariance get sigmas of 3.3, 3.3, 6.6 m",
+            f"{topic.name}: sigmas of 3.3, 3.3, 6.6 m for "
+            f"{format_count(np.sum(~known), 'fix', 'fixes')} without a covariance",
         )
     remarks.add("gnss.read_as", f"GNSS: {topic.name}; heights above the ellipsoid")
     remarks.add("gnss.lever_arm_unknown", "GNSS: the antenna's lever arm is not in the log and taken as zero")

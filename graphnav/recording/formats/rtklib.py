@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from graphnav.core.errors import RecordingError
+from graphnav.core.notes import format_count
 from graphnav.recording import Gnss, fix_types
 from graphnav.recording.formats.registry import Log, first_bytes, log_format
 from graphnav.recording.formats.repair import Remarks
@@ -45,7 +46,10 @@ def load(path: Path) -> Log:
         )
     good = np.flatnonzero((sd > 0).all(-1))
     if len(good) < len(t):
-        remarks.add("gnss.rows_left_out", f"{len(t) - len(good)} fixes without a sigma above zero left out")
+        remarks.add(
+            "gnss.rows_left_out",
+            f"{format_count(len(t) - len(good), 'fix', 'fixes')} without a sigma above zero left out",
+        )
         track, t, sd = track.take(good), t[good], sd[good]
     v, sd_v = track.v, track.sd_v
     if v is not None and sd_v is None:

@@ -24,7 +24,7 @@ import numpy as np
 
 from graphnav.core import rotation
 from graphnav.core.errors import RecordingError
-from graphnav.core.notes import Note
+from graphnav.core.notes import Note, format_count
 from graphnav.core.rotation import Array
 from graphnav.core.timescales import WEEK
 from graphnav.core.trajectory import Trajectory
@@ -129,12 +129,17 @@ def _build(
     usable = np.isfinite(position[:, :2]).all(1) if local else np.isfinite(position).all(1)
     fresh = np.concatenate([[True], np.diff(t) > 0])
     if not usable.all():
-        notes.append(Note("trajectory.no_position", f"{path.name}: {np.sum(~usable)} rows without a position left out"))
+        notes.append(
+            Note(
+                "trajectory.no_position",
+                f"{path.name}: {format_count(int(np.sum(~usable)), 'row')} without a position left out",
+            )
+        )
     if not fresh.all():
         notes.append(
             Note(
                 "trajectory.repeated",
-                f"{path.name}: {np.sum(~fresh)} rows that repeat the time of the row before left out",
+                f"{path.name}: left out {format_count(int(np.sum(~fresh)), 'row')} with the time of the row before",
             )
         )
     keep = usable & fresh

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from graphnav.core.earth import LocalFrame
 from graphnav.core.findings import Finding, runs_of
+from graphnav.core.notes import format_count
 from graphnav.core.rotation import Array
 from graphnav.core.running import run_mean, run_median
 from graphnav.recording import Gnss, Recording, take_rows
@@ -39,13 +40,12 @@ def screen(recording: Recording) -> tuple[Recording, list[Finding]]:
     assert gnss is not None
     findings: list[Finding] = []
     if cached := count_cached_fixes(gnss.t, recording.start):
-        many = "1 fix" if cached == 1 else f"{cached} fixes"
         early = recording.start - gnss.t[0]
         findings.append(
             Finding(
                 "note",
-                f"{many} of before the IMU, the first {early:.0f} s before it starts, left out: a receiver "
-                "gives out what it had kept until it has new ones",
+                f"{format_count(cached, 'fix', 'fixes')} of before the IMU, the first {early:.0f} s before it starts, "
+                "left out: a receiver gives out what it had kept until it has new ones",
                 "gnss.cached",
             )
         )
@@ -80,7 +80,7 @@ def screen(recording: Recording) -> tuple[Recording, list[Finding]]:
 
 def count_cached_fixes(t: Array, start: float) -> int:
     """Number of the first fixes at t (M,) s that precede the IMU's start by long, with none for as long after them."""
-    before = np.flatnonzero((t[:-1] < start) & (np.diff(t) > _CACHED))
+    before = np.flatnonzero((t[:-1] < start - _CACHED) & (np.diff(t) > _CACHED))
     return int(before[-1]) + 1 if len(before) and t[-1] > start else 0
 
 
@@ -124,7 +124,7 @@ def _drop_unreachable(gnss: Gnss, p: Array, off: NDArray[np.bool_], start: float
     kept = np.flatnonzero(~off & np.isfinite(p).all(axis=1))
     near = kept[np.argmin(np.abs(gnss.t[kept] - gnss.t[k]))]
     away = float(np.linalg.norm(p[k] - p[near]))
-    many = "1 fix" if off.sum() == 1 else f"{off.sum()} fixes"
+    many = format_count(off.sum(), "fix", "fixes")
     sure = len(kept) > 0.5 * len(off)
     rest = "" if sure else "; what is left is fewer than half of them, so the result is not to be trusted"
     return Finding(
