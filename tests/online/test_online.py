@@ -616,7 +616,7 @@ def test_bad_usage_is_one_line_and_code_two(
         (["tcp:x"], "online.cannot_listen", "tcp:x"),
         (["tcp:70000"], "online.cannot_listen", "tcp:70000"),
     ):
-        assert name in refuse_command(capsys, key, "online", *arguments)
+        assert name in refuse_command(capsys, key, "online", "--quiet", *arguments)
 
 
 def test_the_detectors_that_decide_can_be_named(monkeypatch: pytest.MonkeyPatch) -> None:
