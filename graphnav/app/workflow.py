@@ -93,6 +93,11 @@ class Outcome:
     alone: bool = False  # whether the files are written straight into the folder, as for a single solver
 
     @property
+    def untrusted(self) -> tuple[str, ...]:
+        """What makes the results wrong altogether, whatever their sigmas say."""
+        return tuple(Note(f.key, f.sentence) for f in self.checks if f.severity == "untrusted")
+
+    @property
     def used_withheld(self) -> tuple[Withheld, ...]:
         """The withheld spans, in s from the start of `recording`."""
         return _move(self.request.withheld, self.zero)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from markupsafe import Markup
 
+from graphnav.core.notes import Note, key_of
 from graphnav.core.timescales import GPS_TO_UNIX, gps_to_utc
 from graphnav.estimation.solution import Solution
 from graphnav.recording import Recording
@@ -43,6 +44,7 @@ def write_report(
     withheld: Withheld = (),
     outages: Spans = (),
     findings: Sequence[str] = (),
+    untrusted: Sequence[str] = (),
     provenance: Mapping[str, Any] | None = None,
     detectors: Sequence[Markup] | None = None,
     noise: Sequence[FigureRow] = (),
@@ -57,6 +59,7 @@ def write_report(
     withheld : (source, span), span in s from the recording's start or None for all of it.
     outages : s from the start, where the recording itself has no fixes.
     findings : sentences about what was odd in the recording.
+    untrusted : those of them that make the result wrong whatever its sigmas say; the report begins with them.
     provenance : version, input hashes and the like, plain values; `options` are those of the command.
     detectors : of `detector_pictures`, for who writes several reports of one recording; drawn here if None.
     noise : figures of the noise model, of `graphnav.estimation.noise.table.figure_rows`.
@@ -144,7 +147,7 @@ def write_report(
         ("Provenance", provenance_tables(settings, provenance)),
     ]
     lead = [
-        *_list_doubts(only, every),
+        *_list_doubts(untrusted, only, every),
         page.paragraph(words.describe_run(recording, only, withheld, outages)),
         summary.verdicts(solution, errors),
         *words.describe_closure(name, metrics),
@@ -168,6 +171,7 @@ def write_comparison(
     withheld: Withheld = (),
     outages: Spans = (),
     findings: Sequence[str] = (),
+    untrusted: Sequence[str] = (),
     provenance: Mapping[str, Any] | None = None,
     noise: Sequence[FigureRow] = (),
 ) -> Path:
@@ -213,7 +217,7 @@ def write_comparison(
         ("Provenance", provenance_tables(settings, provenance)),
     ]
     lead = [
-        *_list_doubts(solutions, every),
+        *_list_doubts(untrusted, solutions, every),
         page.paragraph(words.describe_run(recording, solutions, withheld, outages)),
         *_verdicts(solutions, every),
         *(note for name, values in metrics_of.items() for note in words.describe_closure(name, values)),
@@ -244,9 +248,12 @@ def _shades(solution: Solution, start: float, withheld: Withheld, outages: Spans
     return {"withheld": gone, "no GNSS": list(outages), "excluded": excluded}
 
 
-def _list_doubts(solutions: Mapping[str, Solution], errors: Mapping[str, Errors]) -> list[Markup]:
+def _list_doubts(
+    untrusted: Sequence[str], solutions: Mapping[str, Solution], errors: Mapping[str, Errors]
+) -> list[Markup]:
     """Reasons why the result cannot be trusted, if any."""
-    return [page.paragraph(doubt, "verdict bad") for doubt in list_doubts(solutions, errors)]
+    found = [Note(key_of(one), f"This result cannot be trusted: {one}") for one in untrusted]
+    return [page.paragraph(doubt, "verdict bad") for doubt in (*found, *list_doubts(solutions, errors))]
 
 
 def _verdicts(solutions: Mapping[str, Solution], errors: Mapping[str, Errors]) -> list[Markup]:

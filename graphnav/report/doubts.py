@@ -38,12 +38,12 @@ def list_doubts(solutions: Mapping[str, Solution], errors: Mapping[str, Errors])
             break  # all solvers use the same noise model
     notes = dict.fromkeys(note for solution in solutions.values() for note in solution.notes)
     out += [Note(key, note) for note in notes if (key := key_of(note)) == "doubt.axes"]
-    wrong = []
+    sizes: dict[str, list[str]] = {}
     for name, e in errors.items():
-        small = [j for j in judge_sigmas(e) if j.verdict == "too small"]
-        if small:
-            sizes = and_list([f"{j.size:.2g} times sigma ({j.block})" for j in small])
-            wrong.append(f"{name}: errors are {sizes}")
+        for j in judge_sigmas(e):
+            if j.verdict == "too small":
+                sizes.setdefault(j.block, []).append(f"{j.size:.2g} ({name})")
+    wrong = [f"{block} errors are {and_list(each)} times their sigma" for block, each in sizes.items()]
     if not errors:
         filters = [s for s in solutions.values() if any(r.kind == "innovation" for r in s.records.values())]
         for solution in filters or solutions.values():
@@ -51,7 +51,7 @@ def list_doubts(solutions: Mapping[str, Solution], errors: Mapping[str, Errors])
             if used >= FEWEST_ROWS and size > TOO_LARGE[kind]:
                 wrong.append(f"{solution.solver}: {kind}s are {size:.2f} times their sigma")
     if wrong:
-        out.append(Note("doubt.sigma", f"The stated sigma cannot be trusted: {'; '.join(wrong)}"))
+        out.append(Note("doubt.sigma", f"The result's sigmas cannot be trusted: {'; '.join(wrong)}"))
     return tuple(out)
 
 

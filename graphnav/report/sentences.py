@@ -132,10 +132,10 @@ def describe_sigma(name: str, errors: Errors) -> Markup:
         words += " Errors of the truth itself count here as well."
         return page.paragraph(Note("sigma.too_small", words), "verdict bad")
     if worst:
-        alike = and_list([f"{j.effective:.0f}" for j in worst])
+        alike = and_list([format_count(round(j.effective), "independent value") for j in worst])
         words = (
             f"{name}: whether sigma of {blocks} can be relied on remains open: {measured}, but the errors are alike "
-            f"for so long that they are worth {alike} independent values, and chance may do that."
+            f"for so long that they are worth {alike}, and chance may do that."
         )
         return page.paragraph(Note("sigma.unclear", words), "verdict")
     seen = {j.block for j in judged}

@@ -19,7 +19,7 @@ from graphnav.constraints.gnss import LEVER_ARM, TIME_OFFSET, VELOCITY_TIME_OFFS
 from graphnav.constraints.vehicle import AXLE, BODY, MOUNTING, ODOMETER_DELAY, ODOMETER_SCALE
 from graphnav.core import rotation
 from graphnav.core.earth import LocalFrame
-from graphnav.core.notes import key_of
+from graphnav.core.notes import Note, key_of
 from graphnav.core.state import States
 from graphnav.detectors.base import Detection
 from graphnav.estimation.noise.model import NoiseModel, RowWeights, VarianceComponent
@@ -441,6 +441,12 @@ def test_what_cannot_be_trusted_says_so_first(tmp_path, recording):
     assert first_keys(replace(solution(), noise=partly)) == []
     larger = replace(solution(), records={"gnss_position": record(2.0)})
     assert first_keys(larger) == ["doubt.sigma"]
+    late = Note("imu.clock", "the stamps of the IMU are late")
+    for path in (
+        write_report(tmp_path / "r.html", recording, larger, settings={}, untrusted=[late]),
+        write_comparison(tmp_path / "c.html", recording, {"ekf": larger}, settings={}, untrusted=[late]),
+    ):
+        assert checked(path)[0].keys[:2] == ["imu.clock", "doubt.sigma"]
     assert list_doubts({"ekf": solution()}, {"ekf": errors_of(sd=0.02)})
     assert not list_doubts({"ekf": solution()}, {"ekf": errors_of(sd=0.3)})
 

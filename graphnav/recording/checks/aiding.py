@@ -382,7 +382,7 @@ def check_odometer(recording: Recording, track: Track | None, facts: dict[str, A
             "warning",
             f"odometer stamps are {'late' if fit.lag > 0 else 'early'} against GNSS by {abs(fit.lag):.2f} s"
             + (
-                f", and the IMU agrees with the odometer: add {fit.lag:+.2f} to time_offset in [gnss]"
+                f", and the IMU agrees with the odometer: add {fit.lag:+.2f} to time_offset in [gnss], once for both"
                 if right
                 else f": add {-fit.lag:+.2f} to time_offset in [odometer]"
             ),
