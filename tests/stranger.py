@@ -18,6 +18,7 @@ from graphnav.core.trajectory import Trajectory
 from graphnav.recording import Gnss, Recording, Truth
 from graphnav.recording.formats import read
 from graphnav.recording.formats.schema import rotation_from_letters
+from graphnav.sensors.barometer import standard_pressure
 
 UNIX = 1751990400.0  # s, 8 July 2025, 16:00 UTC, a second after the start of every cut
 G = 9.80665
@@ -102,10 +103,12 @@ def write_phone(folder: Path, drive: Cut, total: bool = True) -> Path:
         "time,seconds_elapsed,qz,qy,qx,qw,roll,pitch,yaw",
         [*stamps(t), *np.zeros((7, len(t)))],
     )
+    slow = t[::100]
+    pressure = standard_pressure(np.interp(slow, gnss.t, gnss.llh[:, 2])) / 100.0  # hPa
     _write(
         folder / "Barometer.csv",
         "time,seconds_elapsed,relativeAltitude,pressure",
-        [*stamps(t[::100]), *np.ones((2, len(t[::100])))],
+        [*stamps(slow), np.zeros(len(slow)), pressure],
     )
     (folder / "Annotation.csv").write_text("time,seconds_elapsed,text,millisecond_press_duration\n")
     (folder / "Metadata.csv").write_text(

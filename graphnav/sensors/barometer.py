@@ -14,7 +14,8 @@ from graphnav.core.rotation import Array
 from graphnav.sensors.base import Column, Sensor, Series
 from graphnav.sensors.tables import NotNegative, Positive, TomlTable
 
-_SCALE_HEIGHT, _PRESSURE = 288.15 / 6.5e-3, 101325.0  # m, Pa
+ATMOSPHERE = 101325.0  # Pa
+_SCALE_HEIGHT = 288.15 / 6.5e-3  # m
 _POWER = 287.05287 * 6.5e-3 / 9.80665
 
 
@@ -45,10 +46,10 @@ SENSOR = Sensor(
 
 def standard_height(series: Series) -> Array:
     """(N,) m in the standard atmosphere, from pressure, or the stated height where a row has no pressure."""
-    of_pressure = _SCALE_HEIGHT * (1.0 - (series["pressure"] / _PRESSURE) ** _POWER)
+    of_pressure = _SCALE_HEIGHT * (1.0 - (series["pressure"] / ATMOSPHERE) ** _POWER)
     return np.where(np.isfinite(of_pressure), of_pressure, series["height"])
 
 
 def standard_pressure(height: Array) -> Array:
     """(N,) Pa at heights (N,) m of the standard atmosphere: the inverse of `standard_height`."""
-    return np.asarray(_PRESSURE * (1.0 - height / _SCALE_HEIGHT) ** (1.0 / _POWER))
+    return np.asarray(ATMOSPHERE * (1.0 - height / _SCALE_HEIGHT) ** (1.0 / _POWER))

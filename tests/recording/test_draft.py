@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import tomllib
 from pathlib import Path
 
 import logs
@@ -55,7 +56,8 @@ DRIVE, _ = oracle.drive(
         ("t_s,lat,lat_std,lon,alt,std_alt,ve,vn,vu,sd_v,speedAccuracy", "gnss",
          {"lat": "lat", "h": "alt", "sd_u": "sd_v", "sd_ve": "speedAccuracy"}),
         ("t_s,lat,lon,h,sd_e,sd_n,sd_u,ve,vn,vu,sd_v,hdop", "gnss", {"sd_u": "sd_u", "sd_vn": "sd_v", "speed": None}),
-        ("time,temperature,pressure", None, {"t": "time"}),
+        ("time,temperature,pressure", "barometer", {"t": "time", "pressure": "pressure"}),
+        ("time,temperature,humidity", None, {"t": "time"}),
     ],
 )  # fmt: skip
 def test_columns_are_found_by_meaning(header, sensor, found):
@@ -305,3 +307,27 @@ def test_real_logs_get_the_axes_and_clocks_that_are_known(shared_data, tmp_path,
     assert found.gnss.t[0] - raw == pytest.approx(gnss_offset, abs=0.25)
     if known.odometer is not None:
         assert found.odometer.t[0] == pytest.approx(known.odometer.t[0], abs=0.06)
+
+
+@pytest.mark.parametrize(
+    ("name", "pressure", "unit"),
+    [
+        ("pressure", 1013.2, "hPa"),
+        ("pressure", 650.0, "hPa"),
+        ("baro", 100900.0, "Pa"),
+        ("pressure", 98.7, "kPa"),
+        ("pressure", 29.92, "inHg"),
+        ("air_pressure_mbar", 990.0, "mbar"),
+        ("pressure", 2.4, None),
+        ("tire_pressure", 1013.2, None),
+    ],
+)
+def test_the_pressure_of_the_air_in_its_units(name: str, pressure: float, unit: str | None, tmp_path: Path) -> None:
+    imu, air = tmp_path / "imu.csv", tmp_path / "air.csv"
+    t = np.arange(0.0, 20.0, 0.01)
+    np.savetxt(imu, np.column_stack([t, np.tile([0.0, 0.0, 0.1, 0.0, 0.0, 9.81], (len(t), 1))]), "%.6g", ",",
+               header="t,gx,gy,gz,ax,ay,az", comments="")  # fmt: skip
+    np.savetxt(air, np.column_stack([t[::100], np.full(20, pressure)]), "%.6g", ",", header=f"t,{name}", comments="")
+    made = tomllib.loads(draft([imu, air], tmp_path).text)
+    assert made.get("barometer", {}).get("units", {}).get("pressure", "Pa") == (unit or "Pa")
+    assert ("barometer" in made) == (unit is not None)

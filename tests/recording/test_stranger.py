@@ -22,6 +22,7 @@ from graphnav.recording.draft.guesses import estimate_noise_density
 from graphnav.recording.draft.plain import read_plain
 from graphnav.recording.formats import read
 from graphnav.recording.formats.trajectories import read_trajectory
+from graphnav.sensors.barometer import standard_height
 
 RECORDING, TRUTH = logs.simulated(60.0)
 FAST = ("--solver", "ekf", "--noise", "stated", "--quiet")
@@ -59,7 +60,6 @@ def test_the_folder_of_a_phone(tokyo, tmp_path, capsys, total):
     decisions = " ".join(json.loads(capsys.readouterr().out)["decisions"])
     for name in (
         "Magnetometer.csv",
-        "Barometer.csv",
         "Annotation.csv",
         "Metadata.csv",
         "Orientation.csv",
@@ -69,6 +69,9 @@ def test_the_folder_of_a_phone(tokyo, tmp_path, capsys, total):
     recording = read(folder)
     assert recording.imu.t[0] == pytest.approx(stranger.UNIX + drive.recording.imu.t[0], abs=0.1)
     assert recording.gps_zero is not None
+    air = recording.sensors["barometer"]
+    height = np.interp(air.t - stranger.UNIX, drive.recording.gnss.t, drive.recording.gnss.llh[:, 2])
+    assert standard_height(air) == pytest.approx(height, abs=0.01)
     imu = drive.recording.imu
     force = np.interp(recording.imu.t - stranger.UNIX, imu.t, np.linalg.norm(imu.accel, axis=1))
     assert rms(np.linalg.norm(recording.imu.accel, axis=1) - force) < 0.1  # m/s2; between rows 2 ms apart

@@ -18,7 +18,14 @@ from graphnav.recording.draft import guesses, motion
 from graphnav.recording.draft.agreement import CLEAR, FAIR, Agreement, compare_with_fixes
 from graphnav.recording.draft.guesses import Guess
 from graphnav.recording.draft.logs import Source
-from graphnav.recording.draft.sources import JOINED, find_logs, guess_fix_speed_unit, name_plain_file, read_fixes
+from graphnav.recording.draft.sources import (
+    JOINED,
+    find_logs,
+    guess_fix_speed_unit,
+    guess_pressure_unit,
+    name_plain_file,
+    read_fixes,
+)
 from graphnav.recording.formats.schema import FORCE, RATE, SPEED
 from graphnav.recording.formats.writer import quote
 
@@ -99,6 +106,8 @@ class _Writer:
             self._gnss(found["gnss"], agreement)
         if "odometer" in found:
             self._odometer(found["odometer"], course if course is not None and len(course.t) > 50 else None, felt)
+        if "barometer" in found:
+            self._barometer(found["barometer"])
         return "\n".join(self.lines) + "\n"
 
     # ---- one table each
@@ -245,6 +254,13 @@ class _Writer:
                 self._key("delay_sigma", "0.05", "s, what is left of it; it is estimated")
         self._lever_arm(source.log.odometer if source.log else None, "from the IMU to the middle of the rear axle")
 
+    def _barometer(self, source: Source) -> None:
+        self.lines += ["", "[barometer]"]
+        self._file(source, "barometer")
+        unit = guess_pressure_unit(source)
+        assert unit is not None
+        self._units({"t": source.t_unit, "pressure": unit})
+
     def _lever_arm(self, sensor: Gnss | Odometer | None, what: str) -> None:
         """Write the lever arm of a log, if it has one."""
         if sensor is not None and np.any(sensor.lever_arm):
@@ -291,7 +307,7 @@ class _Writer:
 
     def _units(self, units: dict[str, Guess]) -> None:
         default = {"type": "rtklib", "t": "s", "gyro": "rad/s", "accel": "m/s2", "angle": "deg", "speed": "m/s"}
-        default["height"] = "m"
+        default |= {"height": "m", "pressure": "Pa"}
         self.decisions += [f"{key} in {guess.value}: {guess.why}" for key, guess in units.items()]
         other = {key: guess for key, guess in units.items() if guess.value != default[key]}
         if other:

@@ -57,6 +57,9 @@ _PATTERNS: dict[str, tuple[str, ...]] = {
         r"course(?:_over_ground)?|cog", r"(?:.*_)?(?:bearing|track|course|head_mot|motion_heading|heading_of_motion)",
         r"heading|kurs",
     ),
+    "pressure": (
+        r"(?:air_?|baro(?:met(?:er|ric))?_?|atmospheric_?|static_?|abs(?:olute)?_?)?pressure|baro(?:meter)?",
+    ),
     "type": (
         r"type", r"q", r"(?:.*_)?(?:fix|gps|gnss|gga|nmea|sol|solution|rtk)_?(?:q|qual\w*|type|status|flag)",
         r"quality|q_?flag",
@@ -79,6 +82,8 @@ UNITS = {
     "kph": ("speed", "km/h"), "kmph": ("speed", "km/h"), "mph": ("speed", "mph"), "kn": ("speed", "knots"),
     "knots": ("speed", "knots"), "kt": ("speed", "knots"), "kts": ("speed", "knots"),
     "deg": ("angle", "deg"), "degrees": ("angle", "deg"), "rad": ("angle", "rad"), "m": ("length", "m"),
+    "pa": ("pressure", "Pa"), "hpa": ("pressure", "hPa"), "mbar": ("pressure", "mbar"), "kpa": ("pressure", "kPa"),
+    "inhg": ("pressure", "inHg"),
     "ft": ("length", "ft"), "feet": ("length", "ft"), "foot": ("length", "ft"),
 }  # fmt: skip
 _AXES = ("gx", "gy", "gz", "ax", "ay", "az")
@@ -93,7 +98,7 @@ class Columns:
 
     @property
     def sensor(self) -> str | None:
-        """The sensor of the file: imu, gyro, accel, gravity (a phone's own estimate of it), gnss, odometer, or None."""
+        """The sensor of the file, a key of `logs.WANTED`, or None; gravity is a phone's own estimate of it."""
         gyro, accel = ({f"{s}{x}" for x in "xyz"} <= self.names.keys() for s in "ga")
         if "t" not in self.names:
             return None
@@ -104,7 +109,9 @@ class Columns:
         if {"lat", "lon"} <= self.names.keys():
             return "gnss"
         wheel = any(name == "speed" or name.startswith("speed_") for name in self.names)
-        return "gyro" if gyro else "accel" if accel else "odometer" if wheel else None
+        if gyro or accel:
+            return "gyro" if gyro else "accel"
+        return "odometer" if wheel else "barometer" if "pressure" in self.names else None
 
 
 def match_columns(header: Sequence[str], stem: str = "") -> Columns:

@@ -11,6 +11,8 @@ from graphnav.core.errors import RecordingError
 from graphnav.core.rotation import Array
 from graphnav.recording.draft import motion
 from graphnav.recording.formats.schema import FORCE, RATE, SPEED, rotation_from_letters
+from graphnav.sensors import barometer
+from graphnav.sensors.barometer import ATMOSPHERE
 from graphnav.sensors.tables import TIME
 
 _G = 9.80665
@@ -185,3 +187,16 @@ def estimate_noise_density(t: Array, x: Array) -> float:
             least = np.minimum(least, np.sqrt(variance * m * period))
         m *= 2
     return float(np.sqrt(least[0] * least[1])) if np.isfinite(least).all() else 0.0
+
+
+def guess_pressure_unit(pressure: Array, stated: str | None) -> Guess | None:
+    """The unit of air pressures (N,): as stated, or that in which they are nearest to one atmosphere."""
+    column = barometer.SENSOR.columns[0]
+    middle = float(np.median(pressure))
+    if not middle > 0.0:
+        return None
+    unit = stated or min(column.units, key=lambda one: abs(np.log(middle * column.units[one] / ATMOSPHERE)))
+    if not column.lowest <= middle * column.units[unit] <= column.highest:
+        return None
+    why = "as the column's name says" if stated else f"their median is {middle:.5g}"
+    return Guess(unit, why)

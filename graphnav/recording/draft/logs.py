@@ -47,6 +47,7 @@ WANTED = {
         "satellites",
     ),
     "odometer": ("t", "speed", *WHEELS),
+    "barometer": ("t", "pressure"),
     "gravity": ("t", "pull_x", "pull_y", "pull_z"),
 }
 _PAUSES = 1000.0  # ratio of a log's duration to that of all its rows together, at most
@@ -227,6 +228,6 @@ def _read(path: Path, columns: matching.Columns, role: str, plain: Plain | None)
         values["speed"] = np.mean([values[w] for w in rear], axis=0)
         columns = matching.Columns(columns.names, {**columns.units, "speed": columns.units.get(rear[0], "")})
     source = Source(path, matching.Columns(names, columns.units), values, plain=plain)
-    inertial = role not in ("gnss", "odometer")
+    inertial = role not in ("gnss", "odometer", "barometer")
     source.t_unit = guesses.guess_time_unit(source.values["t"], source.find_unit("t", "t"), inertial)
     return source

@@ -82,7 +82,12 @@ def find_logs(paths: Sequence[Path], topics: Sequence[str] = ()) -> LogsFound:
     parts = [s.path.name for name in ("gyro", "accel", "gravity") for s in every.get(name, ())]
     if "imu" in every and parts:
         left.append(f"left out: {', '.join(parts)}: {sensors['imu'].path.name} holds both")
-    return LogsFound({name: sensors[name] for name in ("imu", "gnss", "odometer") if name in sensors}, left)
+    if (air := sensors.get("barometer")) is not None and guess_pressure_unit(air) is None:
+        left.append(f"left out: {air.path.name}: its pressures are not those of air in any unit")
+        del sensors["barometer"]
+    return LogsFound(
+        {name: sensors[name] for name in ("imu", "gnss", "odometer", "barometer") if name in sensors}, left
+    )
 
 
 def _date_times_of_day(sensors: dict[str, Source]) -> None:
@@ -211,3 +216,9 @@ def guess_fix_speed_unit(source: Source) -> Guess:
     """The unit of a receiver's speed, by its positions."""
     course = motion.compute_course(source.t, source.llh, None)
     return guesses.guess_speed_unit(source.t, source.values["speed"], course, source.find_unit("speed", "speed"))
+
+
+def guess_pressure_unit(source: Source) -> Guess | None:
+    """The unit of a barometer's pressures; None where they are not those of air in any."""
+    pressure = source.values["pressure"]
+    return guesses.guess_pressure_unit(pressure, source.find_unit("pressure", "pressure"))
