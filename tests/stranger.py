@@ -104,7 +104,8 @@ def write_phone(folder: Path, drive: Cut, total: bool = True) -> Path:
         [*stamps(t), *np.zeros((7, len(t)))],
     )
     slow = t[::100]
-    pressure = standard_pressure(np.interp(slow, gnss.t, gnss.llh[:, 2])) / 100.0  # hPa
+    wind = 0.2 * np.random.default_rng(6).normal(size=len(slow))  # m
+    pressure = standard_pressure(np.interp(slow, gnss.t, gnss.llh[:, 2]) + wind) / 100.0  # hPa
     _write(
         folder / "Barometer.csv",
         "time,seconds_elapsed,relativeAltitude,pressure",

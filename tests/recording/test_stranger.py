@@ -71,7 +71,7 @@ def test_the_folder_of_a_phone(tokyo, tmp_path, capsys, total):
     assert recording.gps_zero is not None
     air = recording.sensors["barometer"]
     height = np.interp(air.t - stranger.UNIX, drive.recording.gnss.t, drive.recording.gnss.llh[:, 2])
-    assert standard_height(air) == pytest.approx(height, abs=0.01)
+    assert rms(standard_height(air) - height) < 0.3  # m, of which 0.2 are wind
     imu = drive.recording.imu
     force = np.interp(recording.imu.t - stranger.UNIX, imu.t, np.linalg.norm(imu.accel, axis=1))
     assert rms(np.linalg.norm(recording.imu.accel, axis=1) - force) < 0.1  # m/s2; between rows 2 ms apart
