@@ -442,7 +442,7 @@ def test_a_truth_of_the_antenna_is_met_at_the_antenna_as_estimated() -> None:
             circle(t), recording, antenna=evaluation.AntennaCalibration(lever_arm=lever_arm)
         )
         assert metrics is not None
-        assert metrics.components["horizontal"].rms == pytest.approx(right, abs=1e-4)
+        assert metrics.components["h"].rms == pytest.approx(right, abs=1e-4)
         assert metrics.components["up"].rms == pytest.approx(up, abs=1e-4)
 
 
