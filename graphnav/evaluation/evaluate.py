@@ -167,7 +167,7 @@ def evaluate_recording(
     at
         (N,) s, epochs to compare at; those of the sparser trajectory when None.
     antenna
-        The antenna as estimated by the solution, for withheld fixes.
+        The antenna as estimated by the solution, for withheld fixes and a truth of the antenna.
 
     Returns
     -------
@@ -193,6 +193,8 @@ def evaluate_recording(
     if found is None:
         return None
     truth, lever_arm = found
+    if recording.truth is not None and recording.truth.of == "gnss" and antenna.lever_arm is not None:
+        lever_arm = antenna.lever_arm
     alone = recording.gnss is None
     found_errors = errors(trajectory, truth, lever_arm=lever_arm, max_gap=max_gap, at=at, from_start=alone)
     # spans are on the fixes' own clock, and so are the errors then

@@ -431,6 +431,21 @@ def test_withheld_fixes_are_met_on_the_receivers_clock_and_at_the_antenna_as_est
     assert stated.spans[0].max_h > 0.9 * SPEED * late
 
 
+def test_a_truth_of_the_antenna_is_met_at_the_antenna_as_estimated() -> None:
+    t = np.arange(0.0, 60.0, 0.1)
+    arm = np.array([0.0, 0.0, 1.5])
+    antenna = moved(circle(t), arm)
+    gnss = Gnss(t, antenna.llh, np.full((len(t), 3), 0.02), lever_arm=np.array([0.4, 0.0, 1.2]))
+    recording = _recording(t, gnss, Truth(t, llh=antenna.llh, of="gnss"))
+    for lever_arm, right, up in ((arm, 0.0, 0.0), (None, 0.4, 0.3)):
+        metrics = evaluation.evaluate_recording(
+            circle(t), recording, antenna=evaluation.AntennaCalibration(lever_arm=lever_arm)
+        )
+        assert metrics is not None
+        assert metrics.components["h"].rms == pytest.approx(right, abs=1e-4)
+        assert metrics.components["up"].rms == pytest.approx(up, abs=1e-4)
+
+
 def test_truth_of_a_recording() -> None:
     t = np.arange(0.0, 10.0, 0.1)
     source = circle(t)

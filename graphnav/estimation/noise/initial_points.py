@@ -11,7 +11,7 @@ from graphnav.core.errors import EstimationError
 from graphnav.estimation.faults import weigh_rows
 from graphnav.estimation.noise.model import RowWeights
 from graphnav.estimation.noise.moments import row_moments
-from graphnav.estimation.noise.outliers import limit_scaled, list_reduced
+from graphnav.estimation.noise.outliers import limit_scaled, limit_squares, list_reduced
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.ekf import ekf, near, refilter
 from graphnav.estimation.solvers.linearise import Points, linearise
@@ -106,6 +106,7 @@ def _anneal(problem: Problem, opening: float | None) -> tuple[Initial, int]:
     """
     fixes = [rows for rows in problem.constraints if rows.fix_of]
     weights, about, wider, passes = {rows.name: np.ones(len(rows)) for rows in fixes}, None, 1.0, 0
+    outliers: dict[str, RowWeights] = {}
     while True:
         sigma = {rows.name: WIDE[rows.unit] * wider for rows in fixes}
         stated = {rows.name: np.min(rows.sigma, axis=1) for rows in fixes}  # type: ignore[attr-defined]
@@ -121,11 +122,13 @@ def _anneal(problem: Problem, opening: float | None) -> tuple[Initial, int]:
             squared = share[rows.name] * np.sum((error.residual / error.stated) ** 2, axis=1)
             weights[rows.name] = weight_and_cost("geman-mcclure", np.sqrt(squared), np.sqrt(m))[0]
             settled |= bool(np.median(squared) > chdtri(m, 0.5))
+            every = np.ones(len(rows), dtype=bool)
+            outliers[rows.name] = list_reduced(problem.t[rows.keyframe], limit_squares(squared, m), every)
         if settled:
             break
         wider /= _COOLING
     larger = {group: -float(np.median(np.log(share[rows.name]))) for rows in fixes for group in rows.noise_groups()[0]}
-    return Initial(about, log_factors=larger), passes
+    return Initial(about, outliers, larger), passes
 
 
 def _list_unused(problem: Problem) -> dict[str, list[int]]:
