@@ -364,6 +364,12 @@ class Tree:
         """Let the first keyframes go, and the parameters' nodes that only they touch."""
         first = self.keyframes[count].number
         gone = [x for x in self.variables.values() if x.last < first]
+        going, touched, factors = {x.key for x in gone}, set[int](), self.isam.getFactorsUnsafe()
+        for keys in (set(one.keys()) for i in range(factors.size()) if (one := factors.at(i)) is not None):
+            touched |= keys if going.isdisjoint(keys) else set()
+        if any(x.first < first <= x.last and x.key not in touched for x in self.variables.values()):
+            # in force still, but last touched by what goes: it may stand below it, and GTSAM would drop it with it
+            self._replace([], [], self.keyframes[0].number)
         left = set(self.isam.marginalizeLeavesWithIndices(fill_keys(gtsam.KeyList(), gone))[1])
         for x in gone:
             del self.variables[x.key]
