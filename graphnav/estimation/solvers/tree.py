@@ -364,11 +364,12 @@ class Tree:
         """Let the first keyframes go, and the parameters' nodes that only they touch."""
         first = self.keyframes[count].number
         gone = [x for x in self.variables.values() if x.last < first]
-        going, touched, factors = {x.key for x in gone}, set[int](), self.isam.getFactorsUnsafe()
+        after = {x.key for x in self.variables.values() if x.first >= first}
+        touched, factors = set[int](), self.isam.getFactorsUnsafe()
         for keys in (set(one.keys()) for i in range(factors.size()) if (one := factors.at(i)) is not None):
-            touched |= keys if going.isdisjoint(keys) else set()
+            touched |= set() if after.isdisjoint(keys) else keys
         if any(x.first < first <= x.last and x.key not in touched for x in self.variables.values()):
-            # in force still, but last touched by what goes: it may stand below it, and GTSAM would drop it with it
+            # in force, but touched by nothing that stays: it may stand below what goes, and GTSAM would drop it too
             self._replace([], [], self.keyframes[0].number)
         left = set(self.isam.marginalizeLeavesWithIndices(fill_keys(gtsam.KeyList(), gone))[1])
         for x in gone:
