@@ -46,6 +46,7 @@ from graphnav.estimation.solvers.tree_nodes import (
     Keyframe,
     Made,
     Variable,
+    are_leaves,
     fill_keys,
     find_node_limits,
     fresh_isam,
@@ -364,12 +365,7 @@ class Tree:
         """Let the first keyframes go, and the parameters' nodes that only they touch."""
         first = self.keyframes[count].number
         gone = [x for x in self.variables.values() if x.last < first]
-        after = {x.key for x in self.variables.values() if x.first >= first}
-        touched, factors = set[int](), self.isam.getFactorsUnsafe()
-        for keys in (set(one.keys()) for i in range(factors.size()) if (one := factors.at(i)) is not None):
-            touched |= set() if after.isdisjoint(keys) else keys
-        if any(x.first < first <= x.last and x.key not in touched for x in self.variables.values()):
-            # in force, but touched by nothing that stays: it may stand below what goes, and GTSAM would drop it too
+        if not are_leaves(self.isam, {x.key for x in gone}):  # GTSAM would drop what stands below them, too
             self._replace([], [], self.keyframes[0].number)
         left = set(self.isam.marginalizeLeavesWithIndices(fill_keys(gtsam.KeyList(), gone))[1])
         for x in gone:
