@@ -33,6 +33,7 @@ from graphnav.estimation.solvers.tree_marginals import (
     read_keyframes,
     settle,
 )
+from graphnav.estimation.solvers.tree_nodes import update_isam
 from graphnav.estimation.solvers.window import compute_turn_limit, make_first_message
 from graphnav.recording import Recording
 
@@ -137,6 +138,23 @@ def test_marginalised_keyframes_leave_nothing_behind(posed: Problem) -> None:
     tree, slots = _played(posed, len(posed.t), lag=20.0)
     assert max(slots[-40:]) <= 1.2 * max(slots[30:70])
     assert tree.isam.getLinearizationPoint().size() == len(tree.variables)
+
+
+def test_what_leaves_takes_no_parameter_along_that_is_in_force(posed: Problem) -> None:
+    """The place of a stop, of which all rows leave, stands below their states where GTSAM's order has it first."""
+    tree, _ = _played(posed, 40)
+    stop, _ = tree.keyframes[-1].nodes["stop_position"]
+    count = int(np.searchsorted(posed.t, 12.0))
+    order = [(x, 0 if x is stop else 1 + x.last) for x in tree.variables.values()]
+    update_isam(tree.isam, float(posed.t[39]), order=order, anew=tree.variables.values())
+    before = settle(tree, begin_elimination(tree, len(tree), count))
+    tree.marginalise(count)
+    after = settle(tree, begin_elimination(tree, len(tree)))
+    sd = np.sqrt(np.diagonal(before.covariance, axis1=1, axis2=2))
+    scale = sd[:, :, None] * sd[:, None]
+    np.testing.assert_allclose(after.covariance / scale, before.covariance / scale, atol=1e-6)
+    for own, known in zip(after.sigma, before.sigma, strict=True):
+        np.testing.assert_allclose(own, known, rtol=1e-6)
 
 
 def test_relinearised_rows_take_the_place_of_the_old(posed: Problem) -> None:

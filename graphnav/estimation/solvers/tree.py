@@ -46,6 +46,7 @@ from graphnav.estimation.solvers.tree_nodes import (
     Keyframe,
     Made,
     Variable,
+    are_leaves,
     fill_keys,
     find_node_limits,
     fresh_isam,
@@ -364,6 +365,8 @@ class Tree:
         """Let the first keyframes go, and the parameters' nodes that only they touch."""
         first = self.keyframes[count].number
         gone = [x for x in self.variables.values() if x.last < first]
+        if not are_leaves(self.isam, {x.key for x in gone}):  # GTSAM would drop what stands below them, too
+            self._replace([], [], self.keyframes[0].number)
         left = set(self.isam.marginalizeLeavesWithIndices(fill_keys(gtsam.KeyList(), gone))[1])
         for x in gone:
             del self.variables[x.key]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -151,6 +152,15 @@ def fill_keys(out: Any, variables: Iterable[Variable]) -> Any:
     for x in variables:
         out.push_back(x.key)
     return out
+
+
+def are_leaves(isam: gtsam.ISAM2, keys: Collection[int]) -> bool:
+    """Whether nothing else in a tree is eliminated before them."""
+    for clique in re.findall(r'label="([^"]*)"', isam.dot()):  # those eliminated here, and : those that they depend on
+        own, _, rest = ([int(key) in keys for key in re.findall(r"\d+", part)] for part in clique.partition(":"))
+        if (any(rest) and not all(own)) or own != sorted(own, reverse=True):
+            return False
+    return True
 
 
 def make_factor(blocks: Sequence[tuple[Variable, Array]], b: Array) -> Any:
