@@ -474,7 +474,7 @@ def test_the_noise_model_is_a_table(tmp_path, recording):
             "37",
             "0.3000",
             "4.250",
-            "7 of 600 rows",
+            "7 of 600",
             "0.12",
         ):
             assert words in text, words
