@@ -25,6 +25,7 @@ from graphnav.estimation.solution import Solution
 from graphnav.imu.preintegration import prefix
 from graphnav.imu.samples import bridge_gaps
 from graphnav.recording import Gnss, Imu, Recording
+from graphnav.recording.plausibility.fixes import GRIP
 
 # rad, to which the fixes must determine the direction of travel: better than the other contributions
 _DIRECTION = 0.5 * COURSE_SIGMA
@@ -33,7 +34,6 @@ _FEWEST_FIXES = 3  # fixes without which there is no acceleration
 _MOVING_SIGMAS = 5.0  # sigmas of travel that count as motion: noise reaches them once in 270 000 fixes, exp(-5^2/2)
 _LEAD_TIME = 10.0  # s of the span before the motion
 _OUTLYING = 6.0  # multiple of the typical deviation of fixes from their running median, or of their sigma
-_GRIP = 8.0  # m/s^2, of tyres
 # rad, of the initial headings that are tried, relative to the first guess
 _HEADINGS_TRIED = (0.0, 0.5 * np.pi, 1.5 * np.pi, np.pi)
 _FIRST_ITERATIONS = 10  # iterations after which a start either has converged or creeps
@@ -60,7 +60,7 @@ def drop_implausible(recording: Recording) -> Recording:
     for end, near, far in ((0, 2, 4), (-1, -3, -5)):  # there the median is the fix itself
         dt = gnss.t[end] - gnss.t[[near, far]]
         line = middle[near] + (middle[far] - middle[near]) * dt[0] / (dt[0] - dt[1])
-        off[end] = max(0.0, float(np.linalg.norm(p[end] - line)) - 0.5 * _GRIP * abs(dt[0] * dt[1]))
+        off[end] = max(0.0, float(np.linalg.norm(p[end] - line)) - 0.5 * GRIP * abs(dt[0] * dt[1]))
     usual = np.maximum(np.median(off), np.linalg.norm(gnss.sd[:, :2], axis=1))
     return replace(recording, gnss=pick_fixes(gnss, off <= _OUTLYING * usual))
 

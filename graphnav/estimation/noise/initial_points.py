@@ -82,8 +82,7 @@ def find_initial_points(problem: Problem, opening: float | None) -> tuple[list[I
             return [Initial(plain)], passes
         (_, one), (_, other) = (smooth_about(problem, points) for points in (plain, about))
     except BREAKDOWN:  # with figures or points that are far off, most rows seem wrong
-        annealed, more = _anneal(problem, opening)
-        return [Initial(plain), annealed], passes + more
+        return _add_annealed([Initial(plain)], passes, problem, opening)
     weights = {}
     for rows in sound.constraints:
         if rows.weight is not None and np.any(rows.weight == 0.0):
@@ -92,8 +91,18 @@ def find_initial_points(problem: Problem, opening: float | None) -> tuple[list[I
             weights[rows.name] = list_reduced(sound.t[rows.keyframe], weight, every)
     if near_to(other, one):
         return [Initial(one, weights)], passes + 2
-    annealed, more = _anneal(problem, opening)
-    return [Initial(plain), Initial(about, weights), annealed], passes + 2 + more
+    return _add_annealed([Initial(plain), Initial(about, weights)], passes + 2, problem, opening)
+
+
+def _add_annealed(
+    initials: list[Initial], passes: int, problem: Problem, opening: float | None
+) -> tuple[list[Initial], int]:
+    """The initial points with annealed ones, if these do not break down, and all passes."""
+    try:
+        annealed, more = _anneal(problem, opening)
+    except BREAKDOWN:
+        return initials, passes
+    return [*initials, annealed], passes + more
 
 
 def _anneal(problem: Problem, opening: float | None) -> tuple[Initial, int]:
@@ -106,11 +115,10 @@ def _anneal(problem: Problem, opening: float | None) -> tuple[Initial, int]:
     """
     fixes = [rows for rows in problem.constraints if rows.fix_of]
     weights, about, wider, passes = {rows.name: np.ones(len(rows)) for rows in fixes}, None, 1.0, 0
+    stated = {rows.name: np.min(rows.sigma, axis=1) for rows in fixes}  # type: ignore[attr-defined]
     outliers: dict[str, RowWeights] = {}
     while True:
-        sigma = {rows.name: WIDE[rows.unit] * wider for rows in fixes}
-        stated = {rows.name: np.min(rows.sigma, axis=1) for rows in fixes}  # type: ignore[attr-defined]
-        share = {name: x**2 / (x**2 + sigma[name] ** 2) for name, x in stated.items()}
+        share = {c.name: 1.0 / (1.0 + (WIDE[c.unit] * wider / stated[c.name]) ** 2) for c in fixes}
         eased = weigh_rows(problem, {name: x * weights[name] for name, x in share.items()})
         about = backward(eased, ekf(eased, opening=opening) if about is None else refilter(eased, about))
         _, about = smooth_about(eased, about)

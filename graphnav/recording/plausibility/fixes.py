@@ -26,7 +26,7 @@ _WAVE = 0.19  # m, of L1
 _ACCELERATION = 2.0  # m/s^2, typical acceleration of vehicles
 _UNBELIEVED = 10.0  # ratio to the scatter of adjacent fixes that no true sigma has: errors last, scatter is smaller
 _SMOOTH = 2e-3  # of the sigma; filtered fixes of phones scatter by five thousandths
-_GRIP = 8.0  # m/s^2, grip of tyres
+GRIP = 8.0  # m/s^2, grip of tyres
 _MEAN_OF = 11  # fixes in a window in which most steps are right even where half of the fixes are off
 _MINORITY = 0.2  # share of the fixes: smaller groups are outvoted by the rest
 _ISOLATED = 0.01  # share of the steps
@@ -206,7 +206,7 @@ def check_two_groups(gnss: Gnss, p: Array) -> Iterator[Finding]:
     jump = _find_jumps(p, dt)
     sd = np.hypot(gnss.sd[:, 0], gnss.sd[:, 1])
     # the speed changes by the grip of tyres over half the window; steps over a long gap are not used
-    limit = 5.0 * np.hypot(sd[1:], sd[:-1]) + _GRIP * np.maximum(0.5 * _MEAN_OF * period, dt) * dt
+    limit = 5.0 * np.hypot(sd[1:], sd[:-1]) + GRIP * np.maximum(0.5 * _MEAN_OF * period, dt) * dt
     big = np.flatnonzero(np.linalg.norm(jump, axis=1) > limit)
     if not len(big):
         return
