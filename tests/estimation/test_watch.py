@@ -44,8 +44,8 @@ def test_tests_beside_a_message_are_those_of_the_filter(posed: Problem, monkeypa
     rows = next(c for c in posed.constraints if c.name == "gnss_position")
     problem = replace(posed, constraints=(rows,))
     kept: list[Bank] = []
-    updated = Bank.updated
-    monkeypatch.setattr(Bank, "updated", lambda self, *a: (kept.append(self), updated(self, *a))[1])
+    follow = Bank.follow
+    monkeypatch.setattr(Bank, "follow", lambda self, *a: (kept.append(self), follow(self, *a))[1])
     refilter(problem, ekf(problem), watch=True, drifts=False)
     mean = problem.prior.mean
     assert mean is not None

@@ -52,7 +52,7 @@ from graphnav.estimation.solvers.passes import (
     parameters_of,
     sigmas_of,
 )
-from graphnav.estimation.solvers.point_filter import Errors, PointFilter, RememberedBank
+from graphnav.estimation.solvers.point_filter import Errors, PointFilter
 from graphnav.estimation.solvers.points import AtEstimate, AtPoints, Estimate
 from graphnav.estimation.solvers.recursion import predict, update
 from graphnav.estimation.solvers.rts import backward
@@ -204,7 +204,7 @@ def _forward(
     watched = [c for c in fixes if c.watched]
     tests = None
     if watched:
-        tests = RememberedBank(Bank(watched, problem.t, D, drifts), {int(k) for c in watched for k in c.keyframe})
+        tests = Bank(watched, problem.t, D, drifts)
     verdicts = Verdicts(
         {c.name: problem.t[c.keyframe] for c in watched}, {c.name: records[c.name].used for c in watched}
     )
@@ -238,7 +238,7 @@ def _forward(
             predict(P, all_F[k - 1], steps.decay[k - 1], Q, steps.added[k - 1], all_Pp[k])
             P = all_Pp[k]
             if tests is not None:
-                tests.now.predicted(all_F[k - 1], steps.decay[k - 1])
+                tests.predicted(all_F[k - 1], steps.decay[k - 1])
         for kind in watched if verdicts.anew else ():
             if (kind.name, problem.t[k]) in verdicts.anew:
                 P = _anywhere(P, kind.fix_of)
@@ -249,7 +249,7 @@ def _forward(
             taken.forget(k)
         # at its own estimate, each kind is linearised where those before it have led
         for some in stack.together(k, one_by_one=where is own):
-            x, P, fault = _update(some, x, P, where, stack, None if tests is None else tests.now, taken)
+            x, P, fault = _update(some, x, P, where, stack, tests, taken)
             if fault is not None:
                 again = verdicts.settle(some.parts[0][0].name, fault, float(problem.t[k]))
                 back = int(np.searchsorted(problem.t, again))
@@ -353,7 +353,7 @@ def _update(
     if taken is not None:
         taken.add(some, Kt, -solved, root)
     P = update(P, HP, H, Kt, sigma * sigma)
-    fault = None if bank is None else bank.updated(rows.name, some.k, H, Kt.T, r, root, where.speed(some.k))
+    fault = None if bank is None else bank.updated(rows.name, some.k, H, Kt, solved, root, float(where.speeds[some.k]))
     to = where.plus(at, d)
     return to, where.carry(P, at, to), fault
 

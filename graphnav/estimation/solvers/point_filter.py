@@ -22,7 +22,6 @@ from graphnav.estimation.solvers.stack import RowBlock, Stack
 from graphnav.estimation.solvers.verdicts import Verdicts
 from graphnav.estimation.solvers.watch import Bank
 
-_REMEMBERED = 64  # keyframes back to which the tests can be taken as they were
 _SHORTEST = 4  # keyframes that are filtered at once, behind a fault
 
 
@@ -34,26 +33,6 @@ class Errors:
     P_predicted: Array
     filtered: Array
     P: Array
-
-
-class RememberedBank:
-    """A bank of tests that remembers how it was before the latest keyframes with fixes."""
-
-    def __init__(self, bank: Bank, met: set[int]) -> None:
-        self.now, self._met = bank, met
-        self._before: dict[int, Bank] = {}
-
-    def arrive(self, k: int) -> None:
-        """The filter is about to go on to keyframe k."""
-        if k in self._met:
-            self._before[k] = self.now.copy()
-            if len(self._before) > _REMEMBERED:
-                del self._before[next(iter(self._before))]
-
-    def go_back(self, k: int) -> None:
-        """To before keyframe k; without any onset where that is too long ago."""
-        self.now = self._before.get(k) or self.now.forgetful()
-        self._before = {key: old for key, old in self._before.items() if key < k}
 
 
 class PointFilter:
@@ -103,7 +82,7 @@ class PointFilter:
                 progress("filter", k / self._stack.K)
         return n
 
-    def run_tested(self, tests: RememberedBank, verdicts: Verdicts, t: Array, progress: Progress | None) -> int:
+    def run_tested(self, tests: Bank, verdicts: Verdicts, t: Array, progress: Progress | None) -> int:
         """Filter all keyframes without the fixes that tests find wrong.
 
         Parameters
@@ -120,7 +99,11 @@ class PointFilter:
         while k < n:
             end = min(k + length, n)
             self.run(k, end)
-            back = self._test(tests, verdicts, t, k, end)
+            given, back = self._given, None
+            fault = tests.follow(k, end, given.F, self._steps.decay, self._stack, self._updates, given.speeds)
+            if fault is not None:
+                name, at, since = fault
+                back = int(np.searchsorted(t, verdicts.settle(name, since, float(t[at]))))
             if back is None and end == len(t) and (trial := verdicts.ended()) is not None:
                 back = int(np.searchsorted(t, trial))
             if back is not None:
@@ -135,25 +118,6 @@ class PointFilter:
         for name in used:  # of what no update has seen since it was given up
             self._stack.records[name].weight[:] = used[name]
         return n
-
-    def _test(self, tests: RememberedBank, verdicts: Verdicts, t: Array, k0: int, k1: int) -> int | None:
-        """Whether, and from which keyframe on, a test finds something wrong that was used up to one of k0 to k1."""
-        given, updates, stack = self._given, self._updates, self._stack
-        for k in range(k0, k1):
-            tests.arrive(k)
-            bank = tests.now
-            if k:
-                bank.predicted(given.F[k - 1], self._steps.decay[k - 1])
-            for some in stack.together(k):
-                at, name, taken = some.at, some.parts[0][0].name, bool(updates.taken[some.number])
-                H, solved, root = given.H[at], stack.solved[at], stack.root[k, at[1], at[1]].copy()
-                r = root @ (root.T @ solved)
-                bank.seen(name, k, float(r @ solved), taken)
-                if taken:
-                    since = bank.updated(name, k, H, updates.Kt[at].T, r, root, given.speed(k))
-                    if since is not None:
-                        return int(np.searchsorted(t, verdicts.settle(name, since, float(t[k]))))
-        return None
 
     def _reweigh(self, before: dict[str, Array]) -> None:
         """Take the blocks in, or not, as fixes are used now."""

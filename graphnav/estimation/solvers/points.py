@@ -108,7 +108,7 @@ class AtPoints:
         self.F[:, :3] = turned @ self.F[:, :3]
         self.Q[:, :3] = turned @ self.Q[:, :3]
         self.Q[:, :, :3] = self.Q[:, :, :3] @ np.swapaxes(turned, -1, -2)
-        self._speed = np.linalg.norm(points.states.v, axis=1)
+        self.speeds = np.linalg.norm(points.states.v, axis=1)
         self.r, self._sigma = np.zeros((n, stack.M)), np.ones((n, stack.M))
         self.H = np.zeros((n, stack.M, D))
         for rows in problem.constraints:
@@ -155,10 +155,6 @@ class AtPoints:
     def carry(P: Array, x: Array, to: Array) -> Array:
         """The points stay."""
         return P
-
-    def speed(self, k: int) -> float:
-        """m/s."""
-        return float(self._speed[k])
 
 
 def predict_states(problem: Problem, at: slice, states: States, values: Array) -> tuple[States, Array]:

@@ -11,7 +11,7 @@ S = L L^T all the same: with w = L^-1 r, and L_jj what the kind j has on the dia
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -85,6 +85,8 @@ class Blocks:
     alone: Array  # (B,) one kind, about which something is to be decided
     used: Array  # (B,) rows of weight 0 are not
     part: Array  # (B+1,) the first of the parts that each is made of
+    k: Array  # (B,) keyframe
+    kind: Array  # (B,) number of the constraint, of the first where several are taken in together
 
 
 class Stack:
@@ -135,13 +137,18 @@ class Stack:
         head, last = part[:-1], part[1:] - 1
         first = np.searchsorted(table[0, head], np.arange(self.K + 1))
         apart, used = table[6, head].astype(bool), table[7, head].astype(bool)
-        return Blocks(first, table[4, head], table[5, last], apart, used, part)
+        return Blocks(first, table[4, head], table[5, last], apart, used, part, *table[:2, head])
 
     def together(self, k: int, one_by_one: bool = False) -> Iterator[RowBlock]:
         """All rows of a keyframe, in the order of the constraints; each kind by itself if wanted so."""
         blocks = self.single if one_by_one else self.joint
         for b in range(blocks.first[k], blocks.first[k + 1]):
             yield self.block(b, blocks)
+
+    def find_kinds(self, names: Sequence[str]) -> Array:
+        """(B,) which of some constraints each joint block is of, -1 for none."""
+        number = [names.index(c.name) if c.name in names else -1 for c in self._constraints]
+        return np.array(number)[self.joint.kind]
 
     def block(self, b: int, blocks: Blocks | None = None) -> RowBlock:
         """Block number b."""
