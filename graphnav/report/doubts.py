@@ -24,7 +24,7 @@ TOO_LARGE = {"innovation": 1.5, "residual": 1.15}  # RMS over sigma; a fit reduc
 
 def list_doubts(solutions: Mapping[str, Solution], errors: Mapping[str, Errors]) -> tuple[str, ...]:
     """Reasons why a result cannot be trusted, as sentences; none if there are none."""
-    from graphnav.evaluation.sigmas import judge_sigmas
+    from graphnav.evaluation.sigmas import judge_sigmas, select_verdict
 
     out = []
     solutions = own_solutions(solutions)
@@ -40,9 +40,8 @@ def list_doubts(solutions: Mapping[str, Solution], errors: Mapping[str, Errors])
     out += [Note(key, note) for note in notes if (key := key_of(note)) == "doubt.axes"]
     sizes: dict[str, list[str]] = {}
     for name, e in errors.items():
-        for j in judge_sigmas(e):
-            if j.verdict == "too small":
-                sizes.setdefault(j.block, []).append(f"{j.size:.2g} ({name})")
+        for j in select_verdict(judge_sigmas(e), "too small"):
+            sizes.setdefault(j.block, []).append(f"{j.size:.2g} ({name})")
     wrong = [f"{block} errors are {and_list(each)} times their sigma" for block, each in sizes.items()]
     if not errors:
         filters = [s for s in solutions.values() if any(r.kind == "innovation" for r in s.records.values())]

@@ -6,7 +6,7 @@ import numpy as np
 
 from graphnav.constraints.gnss import STAMP_ERROR, GnssPosition
 from graphnav.constraints.vehicle import MOUNTING
-from graphnav.core.notes import Note
+from graphnav.core.notes import Note, format_count
 from graphnav.estimation.noise.model import INTERVALS, NoiseModel
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.linearise import Points, shift
@@ -86,8 +86,11 @@ def describe(noise: NoiseModel, problem: Problem) -> tuple[str, ...]:
         out.append(Note("noise.rows", f"noise model, {rows.name}: white part in stated sigmas: {'; '.join(parts)}"))
         some = noise.weights.get(rows.name)
         if some is not None and len(some.t):
-            less = np.count_nonzero(some.weight < 1.0)
+            less = int(np.count_nonzero(some.weight < 1.0))
             out.append(
-                Note("noise.outliers", f"{rows.name}: {less} of {len(rows)} rows are outliers and have less weight")
+                Note(
+                    "noise.outliers",
+                    f"{rows.name}: {format_count(less, 'outlier')} among {len(rows)} rows, down-weighted",
+                )
             )
     return tuple(out)
