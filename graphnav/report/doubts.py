@@ -33,8 +33,8 @@ def list_doubts(solutions: Mapping[str, Solution], errors: Mapping[str, Errors])
         fixes = solution.records.get("gnss_position")
         left_out = 0.0 if fixes is None else 1.0 - float(np.mean(row_weights(fixes.t, solution.noise, "gnss_position")))
         if left_out > _LARGEST_EXCLUDED_SHARE:
-            words = f"This result cannot be trusted: {100 * left_out:.0f} % of what the fixes say contradicts the rest "
-            out.append(Note("doubt.left_out", words + "and is left out"))
+            words = f"This result cannot be trusted: {100 * left_out:.0f} % of the fixes' information contradicts the "
+            out.append(Note("doubt.left_out", words + "other measurements and is left out"))
             break  # all solvers use the same noise model
     notes = dict.fromkeys(note for solution in solutions.values() for note in solution.notes)
     out += [Note(key, note) for note in notes if (key := key_of(note)) == "doubt.axes"]

@@ -84,7 +84,7 @@ def batch(
             notes.append(
                 Note(
                     "solver.outliers",
-                    f"most rows of {constraint.name} were given up as outliers: do not trust this solution",
+                    f"most rows of {constraint.name} are down-weighted as outliers: do not trust this solution",
                 )
             )
     return Solution(

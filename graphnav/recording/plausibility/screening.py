@@ -186,7 +186,7 @@ def check_imu_scale(recording: Recording) -> Iterator[Finding]:
         g = _STANDARD_GRAVITY if recording.gnss is None else _measure_gravity(recording)
         yield Finding(
             "refused",
-            f"the force has a median of {f:.3g} m/s2 where it is calm, not {g:.1f}: {sentence}",
+            f"the specific force where it is calm is {f:.3g} m/s2 (median), not {g:.1f}: {sentence}",
             "imu.force_scale",
         )
 
