@@ -74,7 +74,7 @@ def describe_run(recording: Recording, solutions: Mapping[str, Solution], withhe
         words += f" There were no GNSS fixes from {and_list([*listed, *more])}."
     excluded = sum(int(part.count) for part in solution.excluded)
     if excluded:
-        words += f" {format_count(excluded, 'measurement')} excluded as faulty."
+        words += f" Excluded as faulty: {format_count(excluded, 'measurement')}."
     if not several and solution.stopped:
         words += f" How it ended: {solution.stopped.rstrip('.')}."
     return words
