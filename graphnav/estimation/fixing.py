@@ -125,8 +125,8 @@ def fix(
 def _note(epochs: Epochs, known: Known) -> str:
     every = {arc for arcs in epochs.active.values() for arc in arcs}
     return (
-        f"gnss_phase: {len(known.of)} of {len(every)} arcs of carriers have integer ambiguities; "
-        f"{len(known.let_go)} were let go of"
+        f"gnss_phase: integer ambiguities for {len(known.of)} of {len(every)} carrier-phase arcs, "
+        f"{len(known.let_go)} released"
     )
 
 

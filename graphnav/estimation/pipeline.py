@@ -180,12 +180,16 @@ def _simplify(settings: Settings, noise: NoiseModel | None) -> Iterator[tuple[Se
     still = settings.standstill.model_copy(update={"held_position": False})
     if settings.standstill.held_position:
         settings = settings.model_copy(update={"standstill": still})
-        yield settings, noise, Note("standstill.not_held", "places of stops are not held, because it failed with them")
+        yield (
+            settings,
+            noise,
+            Note("standstill.not_held", "the position at stops is not held: the solver failed with it"),
+        )
     if noise is None and settings.noise.mode != "stated":
         yield (
             settings,
             STATED,
-            Note("noise.not_estimated", "noise is as stated, and no fix is left out, because estimating it failed"),
+            Note("noise.not_estimated", "noise as stated and no fix left out: estimating the noise failed"),
         )
 
 
@@ -248,8 +252,8 @@ def _solve(
         if not settings.solver.isam2_lag and one.cost is not None and one.cost > best + _CLEARLY_BETTER:
             note = Note(
                 "solver.worse_optimum",
-                "isam2 ended in an optimum that explains the data worse than that of rts: do not trust it "
-                f"(half chi-square {one.cost:.0f}, not {best:.0f})",
+                f"isam2 converged to a worse optimum than rts (half chi-square {one.cost:.0f}, not {best:.0f}): do not "
+                "trust it",
             )
             out["isam2"] = replace(one, notes=(note, *one.notes))
     timings = {"detection": detection, **found.timings}

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from graphnav.core.errors import RecordingError
-from graphnav.core.notes import Note
+from graphnav.core.notes import Note, format_count
 from graphnav.core.timescales import WEEK
 from graphnav.gnss.ephemeris import Ephemerides
 from graphnav.gnss.messages import Decoder
@@ -67,7 +67,7 @@ def parse_ubx(data: bytes, path: Path) -> tuple[Observations, Ephemerides]:
         raise RecordingError(f"{path}: no RXM-RAWX messages; switch them on in the receiver", key="raw.no_messages")
     remarks = []
     if found.broken:
-        remarks.append(Note("raw.broken_records", f"{path.name}: {found.broken} broken frames were skipped"))
+        remarks.append(Note("raw.broken_records", f"{path.name}: {format_count(found.broken, 'broken frame')} skipped"))
     if found.cut:
         remarks.append(note_cut(path.name, "message"))
     week0 = found.times[0][1]
@@ -81,7 +81,7 @@ def parse_ubx(data: bytes, path: Path) -> tuple[Observations, Ephemerides]:
         signal[(rows["gnss"] == gnss) & (rows["sig"] == sig)] = one
     known = (signal >= 0) & (system >= 0) & (rows["sv"] > 0) & (rows["sv"] < 255)
     if not known.all():
-        sentence = f"{int((~known).sum())} measurements of signals that are not known are left out"
+        sentence = f"{format_count((~known).sum(), 'measurement')} of unknown signals left out"
         remarks.append(Note("raw.unknown_signals", f"{path.name}: {sentence}"))
     number = np.where(rows["gnss"] == 1, rows["sv"].astype(int) - 100, rows["sv"])
     satellite = (100 * system + number).astype(np.int16)

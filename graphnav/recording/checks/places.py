@@ -48,7 +48,7 @@ def check_height_unit(recording: Recording, track: Track, forward: Fit | None) -
     if correlation > CLEAR and abs(ratio / FOOT - 1.0) < _FEET:
         yield Finding(
             "warning",
-            f"the heights climb {1.0 / ratio:.1f} times as much as the IMU feels of slopes (correlation "
+            f"the heights climb {1.0 / ratio:.1f} times as much as the slopes that the IMU measures (correlation "
             f'{correlation:.2f}): they are in feet; say units = {{ height = "ft" }} in [gnss]',
             "gnss.feet",
         )
