@@ -7,7 +7,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -26,6 +26,7 @@ from graphnav.detectors import check_own as check_detectors
 from graphnav.estimation import faults
 from graphnav.estimation.building import start_sigma
 from graphnav.estimation.long_drives import OVERLAP, crop_solution, shares
+from graphnav.estimation.noise.files import MODES
 from graphnav.estimation.noise.imu_floor import with_measured_floor
 from graphnav.estimation.noise.model import STATED, NoiseModel
 from graphnav.estimation.noise.words import describe_far
@@ -52,7 +53,7 @@ def run(
     settings: Settings | None = None,
     solvers: tuple[str, ...] = SOLVERS,
     progress: Progress | None = None,
-    noise: NoiseModel | None = None,
+    noise: NoiseModel | Literal["stated", "estimated"] | None = None,
     constraints: Sequence[type[Constraint]] = (),
     detectors: Sequence[type[Detector]] = (),
 ) -> dict[str, Solution]:
@@ -69,7 +70,7 @@ def run(
     progress
         Function called with a stage and the share of it that is done, 0 to 1.
     noise
-        Noise model of the sensors; when None, estimated or stated as `settings.noise` sets.
+        Noise model of the sensors, or how it is found; when None, as `settings.noise.mode` sets.
     constraints, detectors
         Additional classes of a script.
 
@@ -85,9 +86,15 @@ def run(
     EstimationError
         If the recording does not determine a trajectory.
     ConfigError
-        If the settings' profile is of another platform, or a class of a script is not complete.
+        If the settings' profile is of another platform, a class of a script is not complete, or `noise` is none of
+        these.
     """
     settings = settings or Settings()
+    if noise is not None and not isinstance(noise, NoiseModel):
+        if noise not in MODES:
+            raise ConfigError(f"noise={noise!r}: give a NoiseModel or one of {', '.join(MODES)}", key="noise.mode")
+        settings = settings.model_copy(update={"noise": settings.noise.model_copy(update={"mode": noise})})
+        noise = None
     recording = with_own(recording, constraints, detectors)
     recording, found = screen_recording(recording)
     if (apart := describe_gnss_apart(recording)) is not None:  # it would be solved as if there were no GNSS
