@@ -29,7 +29,7 @@ import numpy as np
 
 from graphnav.core import rotation
 from graphnav.core.earth import LocalFrame
-from graphnav.core.rotation import Array, mv
+from graphnav.core.rotation import Array, apply, multiply, mv
 from graphnav.core.state import DIM, Parameter, States
 from graphnav.imu.preintegration import Intervals
 from graphnav.recording import ImuNoise, Recording
@@ -75,44 +75,32 @@ class EarthMotion:
     """
 
     def __init__(self, T: Array, frame: LocalFrame) -> None:
-        self._frame = frame
-        h = self._h = T[:, None]
+        self._frame, self._h = frame, T[:, None]
+        h = self._h
         a, b, c, d = rotation.coefficients(float(frame.omega_n @ frame.omega_n) * h * h)
-        self._turn = a * h, b * h * h  # of E = I + a W + b W^2, and likewise of its integrals
-        self._once = h, b * h * h, c * h**3
-        self._twice = 0.5 * h * h, c * h**3, d * h**4
-
-    @cached_property
-    def back(self) -> Array:
-        """(n, 3, 3) E^T"""
-        a, b = (x[..., None] for x in self._turn)
-        return np.asarray(_I3 - a * self._frame.W + b * self._frame.W2)
+        I, W, W2 = (x.ravel() for x in (_I3, frame.W, frame.W2))
+        once = b * h * h
+        twice = c * h * h * h
+        self.back = (I - (a * h) * W + once * W2).reshape(-1, 3, 3)  # E^T
+        self._once = (h * I + once * W + twice * W2).reshape(-1, 3, 3)  # int E, and iint E
+        self._twice = (0.5 * h * h * I + twice * W + (d * h**4) * W2).reshape(-1, 3, 3)
 
     def reach(self, rows: slice, start: States, dR: Array, dP: Array, dV: Array, of: Array | None = None) -> States:
         """The states after times `rows`, by dR (n, 3, 3), dP and dV (n, 3) in the axes of their starts.
 
         `of` (n,) tells the start of each, where several have the same.
         """
-        frame, h = self._frame, self._h[rows]
-        W, W2 = frame.W.T, frame.W2.T
-        by_place = start.p @ W
-        G = frame.gravity_n(start.p) + start.p @ W2
+        frame, h, back = self._frame, self._h[rows], self.back[rows]
+        by_place = start.p @ frame.W.T
+        G = frame.gravity_n(start.p) + start.p @ frame.W2.T
         bent, u = start.v @ frame.gravity_gradient.T, start.v + by_place  # gravity changes over the interval
-        p, G1, G2, R = start.p, G @ W, G @ W2, start.R_nb
         if of is not None:
-            table = np.concatenate([p, u, bent, G, G1, G2], axis=1).take(of, axis=0)
-            p, u, bent, G, G1, G2 = (table[:, k : k + 3] for k in range(0, 18, 3))
-            R = R.take(of, axis=0)
-            start = States(R, p, u, start.ba.take(of, axis=0), start.bg.take(of, axis=0))
-        (a, b), (v0, v1, v2), (p0, p1, p2) = ([x[rows] for x in some] for some in (self._turn, self._once, self._twice))
-        p = p + h * (u + h * h / 6.0 * bent) + (p0 * G + p1 * G1 + p2 * G2) + rotation.apply(R, dP)
-        v = u + 0.5 * h * h * bent + (v0 * G + v1 * G1 + v2 * G2) + rotation.apply(R, dV)
-        p, v = (x - a * (x @ W) + b * (x @ W2) for x in (p, v))
-        turned = rotation.multiply(np.swapaxes(dR, -1, -2), np.swapaxes(R, -1, -2))  # the transpose, by rows
-        rows_of = turned.reshape(-1, 3)
-        by_W, by_W2 = ((rows_of @ x).reshape(turned.shape) for x in (W, W2))
-        turned = turned - a[..., None] * by_W + b[..., None] * by_W2
-        return States(np.swapaxes(turned, -1, -2), p, v - p @ W, start.ba, start.bg)
+            start, G, bent, u = start[of], *(x.take(of, axis=0) for x in (G, bent, u))
+        R, once, twice = start.R_nb, self._once[rows], self._twice[rows]
+        p = start.p + h * (u + h * h / 6.0 * bent) + apply(twice, G) + apply(R, dP)
+        p = apply(back, p)
+        v = apply(back, u + 0.5 * h * h * bent + apply(once, G) + apply(R, dV)) - p @ frame.W.T
+        return States(multiply(back, multiply(R, dR)), p, v, start.ba, start.bg)
 
 
 class ImuFactors:
