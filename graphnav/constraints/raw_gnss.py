@@ -14,9 +14,9 @@ its codes leaves, and for hours; d for seconds the same of velocities; q for hou
 and the atmosphere towards it. How large c and q are for hours is stated: a drive does not tell them from its place.
 The rest the noise model estimates.
 
-Against a base station both rows have - h sin(elevation) as well: signals are received at the antennas' phase centres, and
-h is by how much more the rover's is above the point that its lever arm states than the base's above its position. A
-drive does not tell it from its height.
+Against a base station both kinds of ranges have - h sin(elevation) as well: signals are received at the antennas' phase
+centres, and h is by how much more the rover's is above the point that its lever arm states than the base's above its
+position. A drive does not tell it from its height.
 
 Distances are differences against a nominal place of each epoch, so that no digits are lost.
 """
