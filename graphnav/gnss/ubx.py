@@ -22,7 +22,7 @@ from graphnav.gnss.signals import BEIDOU, GALILEO, GLONASS, GPS, NAVIC, QZSS, SB
 SYNC = b"\xb5\x62"
 _RAWX, _SFRBX = (0x02, 0x15), (0x02, 0x13)
 _SYSTEM = {0: GPS, 1: SBAS, 2: GALILEO, 3: BEIDOU, 5: QZSS, 6: GLONASS, 7: NAVIC}  # gnssId
-_SIGNAL = {
+SIGNALS = {  # gnssId and sigId
     (0, 0): "1C", (0, 3): "2L", (0, 4): "2S", (0, 6): "5I", (0, 7): "5Q", (1, 0): "1C",
     (2, 0): "1C", (2, 1): "1B", (2, 3): "5I", (2, 4): "5Q", (2, 5): "7I", (2, 6): "7Q", (2, 8): "6B", (2, 9): "6C",
     (3, 0): "2I", (3, 1): "2I", (3, 2): "7I", (3, 3): "7I", (3, 4): "6I", (3, 5): "1P", (3, 6): "1D", (3, 7): "5P",
@@ -75,7 +75,7 @@ def parse_ubx(data: bytes, path: Path) -> tuple[Observations, Ephemerides]:
     rows = np.concatenate(found.rows)
     t = np.repeat(t_of, [len(x) for x in found.rows])
     system = np.array([_SYSTEM.get(int(g), -1) for g in range(256)])[rows["gnss"]]
-    names = {key: signal_id(name) for key, name in _SIGNAL.items()}
+    names = {key: signal_id(name) for key, name in SIGNALS.items()}
     signal = np.full(len(rows), -1, dtype=np.int16)
     for (gnss, sig), one in names.items():
         signal[(rows["gnss"] == gnss) & (rows["sig"] == sig)] = one
