@@ -20,7 +20,7 @@ from graphnav.core.errors import EstimationError
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, States
 from graphnav.estimation.solvers.linearise import shift
-from graphnav.estimation.solvers.robust import PASSES
+from graphnav.estimation.solvers.recursion import PASSES
 from graphnav.estimation.solvers.stages import Columns, Measured, Message, Place, Stage, rotate_columns, width
 from graphnav.estimation.solvers.watch import Watch
 

@@ -29,8 +29,8 @@ from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.elimination import Predicted
 from graphnav.estimation.solvers.linearise import Step, scale_at, shift
 from graphnav.estimation.solvers.passes import integrate_again
+from graphnav.estimation.solvers.recursion import PASSES
 from graphnav.estimation.solvers.revision import Renewed, linearise_runs
-from graphnav.estimation.solvers.robust import PASSES
 from graphnav.estimation.solvers.stages import (
     Measured,
     Message,

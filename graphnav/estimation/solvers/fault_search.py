@@ -1,0 +1,128 @@
+"""The tests for errors that last beside a filter at given points, by the gains and innovations that it leaves.
+
+Where they find a fault, filter and tests go back to before it, and on without what is wrong.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from graphnav.constraints.base import Constraint
+from graphnav.core.rotation import Array
+from graphnav.core.state import BLOCKS, DIM
+from graphnav.estimation.solvers.linearise import Advance
+from graphnav.estimation.solvers.points import PointFilter
+from graphnav.estimation.solvers.recursion import UNUSED
+from graphnav.estimation.solvers.stack import RowBlock, Stack
+from graphnav.estimation.solvers.verdicts import Verdicts
+from graphnav.estimation.solvers.watch import Bank
+
+_REMEMBERED = 64  # keyframes back to which the tests can be taken as they were
+
+
+class FaultSearch:
+    """Find the fixes that are wrong, and weigh them in a filter.
+
+    Parameters
+    ----------
+    watched : whose errors are looked for.
+    given : the filter.
+    t : (K,) s, of all keyframes of the problem.
+    """
+
+    def __init__(
+        self,
+        watched: Sequence[Constraint],
+        given: PointFilter,
+        steps: Advance,
+        stack: Stack,
+        bank: Bank,
+        t: Array,
+    ) -> None:
+        self._watched, self._filter, self._steps, self._stack, self._t = watched, given, steps, stack, t
+        records = stack.records
+        self.verdicts = Verdicts(
+            {c.name: t[c.keyframe] for c in watched}, {c.name: records[c.name].used for c in watched}
+        )
+        self._used = {c.name: records[c.name].used.copy() for c in watched}
+        self._bank, self._met = bank, {int(k) for c in watched for k in c.keyframe}
+        self._before: dict[int, Bank] = {}  # the tests as they were before the latest keyframes with fixes
+        self._free: set[tuple[str, float]] = set()  # where nothing is known any more
+        self.at_start = np.zeros(given.H.shape[2])  # (D,) variance by which less is known at the start
+
+    def follow(self, k0: int, k1: int) -> int:
+        """Test what was filtered from one keyframe to another; the keyframe to go on from."""
+        since = self._test(k0, k1)
+        if since is None and k1 == len(self._t):
+            since = self.verdicts.ended()
+        if since is None:
+            return k1
+        back = int(np.searchsorted(self._t, since))
+        # without any onset where that is too long ago
+        self._bank = self._before.get(back) or self._bank.forgetful()
+        self._before = {k: old for k, old in self._before.items() if k < back}
+        self._reweigh()
+        self._begin_anew()
+        return back
+
+    def _test(self, k0: int, k1: int) -> float | None:
+        """When something began to be wrong that was used up to one of k0 to k1."""
+        given, stack = self._filter, self._stack
+        for k in range(k0, k1):
+            if k in self._met:
+                self._before[k] = self._bank.copy()
+                if len(self._before) > _REMEMBERED:
+                    del self._before[next(iter(self._before))]
+            bank = self._bank
+            if k:
+                bank.predicted(given.F[k - 1], self._steps.decay[k - 1])
+            for some in stack.together(k):
+                at, name, taken = some.at, some.parts[0][0].name, bool(given.updates.taken[some.number])
+                solved, root, bent = stack.solved[at], stack.root[k, at[1], at[1]].copy(), stack.bent[at]
+                r = root @ (root.T @ solved)
+                bank.seen(name, k, float(r @ solved), taken)
+                if taken:
+                    if np.any(bent < 1.0):
+                        root = np.asarray(
+                            np.linalg.cholesky(root @ root.T + np.diag(given.variance[at] * (1.0 / bent - 1.0)))
+                        )
+                    since = bank.updated(name, k, given.H[at], given.updates.Kt[at].T, r, root, float(given.speed[k]))
+                    if since is not None:
+                        return self.verdicts.settle(name, since, float(self._t[k]))
+        return None
+
+    def _reweigh(self) -> None:
+        """Take the blocks in, or not, as fixes are used now."""
+        for name, was in self._used.items():
+            record = self._stack.records[name]
+            for k in np.unique(record.rows.keyframe[np.flatnonzero(record.used != was)]).tolist():
+                for some in self._stack.together(k):
+                    if some.parts[0][0] is record.rows:
+                        self._weigh(some)
+            was[:] = record.used
+
+    def _weigh(self, some: RowBlock) -> None:
+        rows, lo, hi = some.parts[0]
+        used = self._stack.records[rows.name].used[lo:hi]
+        weight = np.maximum(used, UNUSED) if used.any() else np.ones(hi - lo)
+        self._filter.weigh(some, bool(used.any()), np.repeat(np.sqrt(weight), len(rows.axes)))
+
+    def _begin_anew(self) -> None:
+        """Where fixes of a fault that does not end are taken back nothing is known any more of what they measure."""
+        for rows in self._watched:
+            for name, t in self.verdicts.anew - self._free:
+                k = int(np.searchsorted(self._t, t))
+                if name == rows.name and k:
+                    self._filter.Q[k - 1] += np.diag(free(DIM, rows.fix_of))
+                elif name == rows.name:
+                    self.at_start += free(len(self.at_start), rows.fix_of)
+        self._free |= self.verdicts.anew
+
+
+def free(D: int, block: str) -> Array:
+    """(D,) variance of an error state with nothing known of a block, but for what moves with it."""
+    out = np.zeros(D)
+    out[BLOCKS[block]] = 1e6
+    return out
