@@ -23,8 +23,17 @@ def explain_rows(parts: Iterable[tuple[Constraint, int, int]]) -> EstimationErro
     )
 
 
-def explain_time(t: float, what: str = "information") -> EstimationError:
-    """Where a smoother's information or covariance is not positive definite at a time, s."""
+def explain_smoother(at: float | None = None) -> EstimationError:
+    """Where a smoother's covariance or information has no root, at a time (s) if one is known."""
+    when = "" if at is None else f" at {at:.3f} s"
     return EstimationError(
-        f"the smoother's {what} broke down at {t:.3f} s: check the sigmas and units", key="solver.breakdown"
+        f"the smoother's information broke down{when}: check sigmas and units", key="solver.breakdown"
+    )
+
+
+def explain_undetermined(at: float | None = None) -> EstimationError:
+    """Where rows leave a variable open, at a time (s) if one is known."""
+    when = "" if at is None else f" at {at:.3f} s"
+    return EstimationError(
+        f"the data leave something undetermined{when}: there is no covariance", key="solver.undetermined"
     )

@@ -21,12 +21,12 @@ import time
 import numpy as np
 from scipy.linalg.lapack import dposv
 
-from graphnav.core.errors import EstimationError
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, States
 from graphnav.estimation.dense import dense
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import Solution
+from graphnav.estimation.solvers.breakdown import explain_smoother
 from graphnav.estimation.solvers.linearise import scale_at
 from graphnav.estimation.solvers.passes import (
     FilterPass,
@@ -61,7 +61,7 @@ def backward(problem: Problem, forward: ForwardRecord, progress: Progress | None
             ahead = forward.P_predicted[end]
             _, inverse, info = dposv(ahead, np.eye(D))
             if info:
-                raise _explain_breakdown(problem, end)
+                raise explain_smoother(float(problem.t[end]))
             r[end], N[end] = inverse @ away, inverse @ (ahead - P[end]) @ inverse
         errors = np.empty((end, D))
         if forward.updates is not None:
@@ -85,7 +85,7 @@ def _smooth_filtered(
             Pp, at, ahead = forward.P_predicted[k + 1], slice(k, k + 1), slice(k + 1, k + 2)
             _, gain, info = dposv(Pp, move(forward.F[k], forward.decay[k], forward.P[k]))
             if info:
-                raise _explain_breakdown(problem, k)
+                raise explain_smoother(float(problem.t[k]))
             C = gain.T
             d = C @ np.concatenate([state.minus(before.states[ahead])[0], values - before.values[k + 1]])
             state, values = forward.states[at].plus(d[None, :DIM]), forward.values[k] + d[DIM:]
@@ -135,11 +135,6 @@ def _restore_digits(forward: ForwardRecord, P: Array, end: int) -> None:
         M = I - C @ F
         smoothed = M @ forward.P[k] @ M.T + C @ (P[k + 1] + Pp - FP @ F.T) @ C.T
         P[k] = 0.5 * (smoothed + smoothed.T)
-
-
-def _explain_breakdown(problem: Problem, k: int) -> EstimationError:
-    sentence = f"the smoother's covariance broke down at {problem.t[k]:.3f} s: check the sigmas"
-    return EstimationError(sentence, key="solver.breakdown")
 
 
 def rts(problem: Problem, forward: FilterPass, found: SmootherPass | None = None) -> Solution:

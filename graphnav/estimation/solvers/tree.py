@@ -365,7 +365,8 @@ class Tree:
         """Let the first keyframes go, and the parameters' nodes that only they touch."""
         first = self.keyframes[count].number
         gone = [x for x in self.variables.values() if x.last < first]
-        if not are_leaves(self.isam, {x.key for x in gone}):  # GTSAM would drop what stands below them, too
+        stay = [x for x in self.variables.values() if x.last >= first]
+        if not are_leaves(self.isam, gone, stay):  # GTSAM would drop what stands below them, too
             self._replace([], [], self.keyframes[0].number)
         left = set(self.isam.marginalizeLeavesWithIndices(fill_keys(gtsam.KeyList(), gone))[1])
         for x in gone:
