@@ -34,8 +34,8 @@ from graphnav.estimation.preparation import prepare
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.separation import separation
 from graphnav.estimation.solution import Solution, join_solutions
+from graphnav.estimation.solvers.breakdown import explain_singular
 from graphnav.estimation.solvers.ekf import ekf
-from graphnav.estimation.solvers.gain import describe_singular
 from graphnav.estimation.solvers.rts import backward, rts
 from graphnav.imu.onboard_offset import without_onboard_offset
 from graphnav.recording import Own, Recording
@@ -179,7 +179,7 @@ def _solve_with_retry(
             return {name: replace(one, notes=(note, *one.notes)) for name, one in again.items()}
         if isinstance(error, EstimationError):
             raise
-        raise describe_singular(error) from None
+        raise explain_singular(error) from None
 
 
 def _simplify(settings: Settings, noise: NoiseModel | None) -> Iterator[tuple[Settings, NoiseModel | None, Note]]:

@@ -24,7 +24,9 @@ from graphnav.estimation.problem import Problem, build_problem
 from graphnav.estimation.solution import Solution
 from graphnav.estimation.solvers.batch import batch
 from graphnav.estimation.solvers.ekf import ekf, refilter
+from graphnav.estimation.solvers.likelihood_ratio import update_tests
 from graphnav.estimation.solvers.passes import Updates
+from graphnav.estimation.solvers.recursion import move
 from graphnav.estimation.solvers.rows import Iterate, Layout, whiten
 from graphnav.estimation.solvers.rts import backward
 from graphnav.estimation.solvers.stack import Stack
@@ -98,9 +100,9 @@ def test_signature_is_the_derivative_of_the_innovations(posed: Problem, monkeypa
     kept: list[tuple[Bank, Stack, Updates]] = []
     follow = Bank.follow
 
-    def keep(self: Bank, k0: int, k1: int, F: Array, decay: Array, stack: Stack, updates: Updates, v: Array) -> Any:
+    def keep(self: Bank, k0: int, k1: int, F: Array, decay: Array, stack: Stack, updates: Updates, *more: Array) -> Any:
         kept.append((self, stack, updates))
-        return follow(self, k0, k1, F, decay, stack, updates, v)
+        return follow(self, k0, k1, F, decay, stack, updates, *more)
 
     monkeypatch.setattr(Bank, "follow", keep)
     about = ekf(posed)
@@ -109,10 +111,12 @@ def test_signature_is_the_derivative_of_the_innovations(posed: Problem, monkeypa
     # the same tests a block at a time, with what an error since the 64th fix does to the state: slot 6 begins there
     _, stack, updates = kept[0]
     bank = Bank([rows], posed.t, forward.P.shape[1])
+    own = bank._slots[rows.name]
+    layout, room = np.array([0, own.columns.start, own.L, own.m, own.c]), (np.empty((own.L, own.c)), np.empty(own.L))
     seen, begun, fix = dict[int, Array](), 0.0, 0
     for k in range(len(posed.t)):
         if k:
-            bank.predicted(forward.F[k - 1], forward.decay[k - 1])
+            bank.X[:] = move(forward.F[k - 1], forward.decay[k - 1], bank.X)
         for some in stack.together(k):
             name = some.parts[0][0].name
             H, Kt, solved, root = (x[some.at] for x in (updates.H, updates.Kt, updates.w, stack.root))
@@ -122,8 +126,12 @@ def test_signature_is_the_derivative_of_the_innovations(posed: Problem, monkeypa
                 U = np.concatenate([np.eye(3), (posed.t[k] - begun) / MINUTE * np.eye(3)], axis=1)
                 seen[fix] = U - H @ X
                 fix += 1
-            root = root[:, some.at[1]].copy()
-            bank.updated(name, k, H, Kt, -solved, root, 0.0)
+                update_tests(
+                    bank.X, own.memory, layout, np.array([own.prior, MINUTE]), posed.t[k], H, Kt,
+                    root[:, some.at[1]].copy(), -solved, *room,
+                )  # fmt: skip
+            else:
+                bank.X -= Kt.T @ (H @ bank.X)
     for one in ("score", "info"):
         mine, followed = (getattr(x._slots[rows.name], one) for x in (bank, kept[0][0]))
         np.testing.assert_allclose(mine, followed, rtol=1e-9, atol=1e-9 * np.abs(mine).max())
