@@ -288,7 +288,6 @@ def smooth_rows(
     Kt, H, w, SH : of the updates: gains transposed, rows, S^-1 nu and S^-1 H.
     taken : (B,) whether a block was taken in.
     """
-    I = np.eye(len(r_k))
     for k in range(k1 - 1, k0 - 1, -1):
         if k < len(F):
             r_k = move_back(F[k], decay[k], r_k.reshape(1, -1)).ravel()
@@ -298,13 +297,11 @@ def smooth_rows(
         for b in range(first[k + 1] - 1, first[k] - 1, -1):
             if taken[b]:
                 lo, hi = begin[b], end[b]
-                own = H[k, lo:hi]
-                # I - K H as a whole: after a first fix it is what is left of a wide prior, of ten orders
-                M = np.dot(Kt[k, lo:hi].T, own)
-                np.subtract(I, M, M)
-                r_k = np.dot(r_k, M) + np.dot(w[k, lo:hi], own)
-                N_k = np.dot(M.T, np.dot(N_k, M))
-                N_k += np.dot(own.T, SH[k, lo:hi])
+                own, gain = H[k, lo:hi], Kt[k, lo:hi]
+                r_k = r_k + np.dot(w[k, lo:hi] - np.dot(gain, r_k), own)
+                # from one side after the other: after a first fix what is left of N is smaller by ten orders each time
+                N_k = N_k - np.dot(np.dot(N_k, gain.T), own)
+                N_k += np.dot(own.T, SH[k, lo:hi] - np.dot(gain, N_k))
         np.positive(r_k, r[k])
         halve_sum(N_k, N[k])
         N_k = N[k]
