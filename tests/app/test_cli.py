@@ -273,7 +273,7 @@ def test_evaluate_prints_a_table_and_writes_nothing_unasked(compared, tmp_path, 
 
 # -------------------------------------------------------------------------------------------------------------- smooth
 def test_smooth_a_part_of_a_real_drive_without_fixes_in_a_span(tmp_path):
-    part = ["--start", 100, "--end", 220, "--without", "gnss:150-170", "--noise", "stated"]
+    part = ["--start", 100, "--end", 220, "--without", "gnss:150-170"]
     assert command("smooth", "kitti", *part, "-o", tmp_path, "--solver", "rts") == 0
     assert {p.name for p in tmp_path.iterdir()} == {*FILES, "run.npz"}
     s = summary(tmp_path)
@@ -288,7 +288,7 @@ def test_smooth_a_part_of_a_real_drive_without_fixes_in_a_span(tmp_path):
 def test_quiet_is_silent_and_a_config_file_counts(drive, tmp_path, capfd):
     config = tmp_path / "settings.toml"
     config.write_text("[keyframes]\nrate = 2.0\n")
-    quiet = ["--quiet", "--config", config, "--noise", "stated"]
+    quiet = ["--quiet", "--config", config]
     assert command("smooth", drive, *quiet, "--end", 120, "--solver", "ekf", "-o", tmp_path / "o") == 0
     assert capfd.readouterr() == ("", "")
     s = summary(tmp_path / "o")
@@ -489,7 +489,7 @@ def test_an_end_of_a_file_is_not_taken_for_ctrl_c(tmp_path, monkeypatch, capsys)
 
 
 def test_a_reader_that_stops_early_is_no_error():
-    with subprocess.Popen([PROGRAM, "info", "kitti"], stdout=subprocess.PIPE, stderr=subprocess.PIPE) as run:
+    with subprocess.Popen([PROGRAM, "info", "kitti", "--quick"], stdout=subprocess.PIPE, stderr=subprocess.PIPE) as run:
         run.stdout.close()
         assert run.stderr.read() == b""
         assert run.wait(timeout=60) == cli.PIPE_CLOSED
