@@ -41,8 +41,8 @@ def solver_summary(
         errors = {key: value for key, value in errors.items() if key not in nees}
     doubts = list_doubts({name: solution}, {} if metrics is None or metrics.errors is None else {name: metrics.errors})
     timings = {**solution.timings, "evaluation": outcome.timings["evaluation"], **seconds}
-    untrusted = [Finding("untrusted", doubt, key_of(doubt)) for doubt in doubts]
-    messages = dict.fromkeys([*untrusted, *outcome.checks, *(Finding("note", note, key_of(note)) for note in notes)])
+    unreliable = [Finding("unreliable", doubt, key_of(doubt)) for doubt in doubts]
+    messages = dict.fromkeys([*unreliable, *outcome.checks, *(Finding("note", note, key_of(note)) for note in notes)])
     rejected = {key: int(np.sum(r.weight <= 1e-9)) for key, r in solution.records.items()}
     return {
         "solver": name,

@@ -9,10 +9,11 @@ import numpy as np
 
 from graphnav.core.findings import Finding
 from graphnav.recording import Recording
-from graphnav.recording.checks import crosschecks
+from graphnav.recording.checks import crosschecks, tracks
 from graphnav.recording.checks.clock import CLEAR, FAIR
-from graphnav.recording.checks.crosschecks import Fit, Track
+from graphnav.recording.checks.crosschecks import Fit
 from graphnav.recording.checks.stated import describe_exchange, describe_mirroring, exchange_lat_lon
+from graphnav.recording.checks.tracks import Track
 from graphnav.recording.formats.schema import FOOT
 
 _FEET = 0.3  # relative deviation from 0.3048 that the noise of both permits: a ratio of 1 is three times as far off
@@ -25,7 +26,7 @@ def check_mirroring(recording: Recording, track: Track, as_read: Fit | None, tur
     is its fit to the gyro) after the exchange if they were exchanged, and worse if only a sign is wrong.
     """
     other = exchange_lat_lon(recording.gnss) if recording.gnss is not None else None
-    way = crosschecks.track(replace(other, v=None)) if other is not None else None
+    way = tracks.compute_track(replace(other, v=None)) if other is not None else None
     yaw = crosschecks.fit_yaw(recording.imu, way) if way is not None else None
     better = yaw is not None and (not turns_back or as_read is None or yaw.correlation > as_read.correlation)
     if yaw is not None and better and yaw.correlation > 0.8 and abs(yaw.coefficients[0] - 1.0) < 0.2:
@@ -63,14 +64,14 @@ def find_mirrored(recording: Recording, wrong: Sequence[Finding]) -> list[Findin
         return list(wrong)
     if not any(f.key == "gnss.velocity_axes" for f in wrong):
         return list(wrong)
-    ways = [crosschecks.track(one) for one in (gnss, replace(gnss, v=None))]
+    ways = [tracks.compute_track(one) for one in (gnss, replace(gnss, v=None))]
     fits = [crosschecks.fit_yaw(recording.imu, way) for way in ways if way is not None]
     by_velocity, by_places = (
         [fit.coefficients[0] if fit is not None and fit.correlation > 0.8 else 0.0 for fit in fits]
         if len(fits) == 2
         else (0.0, 0.0)
     )
-    moved = np.gradient(crosschecks.compute_local_positions(gnss)[:, :2], gnss.t, axis=0)
+    moved = np.gradient(tracks.compute_local_positions(gnss)[:, :2], gnss.t, axis=0)
     east, north = np.nansum(moved * gnss.v[:, :2], axis=0) < 0.0
     if by_velocity > 0.0 > by_places and east != north:
         which = "longitudes" if east else "latitudes"
