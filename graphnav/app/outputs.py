@@ -221,8 +221,10 @@ def _draw_solver(
 ) -> None:
     from graphnav.evaluation.metrics import summary
     from graphnav.report import documents as report
+    from graphnav.report.doubts import find_departures
 
     solution, metrics = outcome.solutions[name], outcome.metrics.get(name)
+    astray = find_departures(outcome.solutions).get(name)
     report.write_report(
         folder / "report.html",
         outcome.recording,
@@ -234,6 +236,7 @@ def _draw_solver(
         outages=outages(outcome.recording),
         findings=_list_findings(outcome),
         defects=outcome.defects,
+        astray=astray,
         provenance=provenance,
         detectors=detectors,
         noise=noise_rows(outcome, solution),

@@ -61,7 +61,7 @@ class Straight:
         return times_between(self.start, self.end, rate)
 
     def apart(self, t: Array) -> tuple[States, dict[str, Array]]:
-        """States, with covariances of position, velocity and attitude each by itself."""
+        """States, with covariances (6, M) of position, velocity and attitude each by itself."""
         states, P = self(t)
         return states, split_covariance(P)
 

@@ -143,6 +143,16 @@ class LocalFrame:
         """The local ENU axes at a point, from n: v_local = R_ln @ v_n; (..., 3) -> (..., 3, 3)."""
         return enu_axes(self.to_llh(p_n)) @ self.R_ne.T
 
+    def level(self, p_n: Array) -> tuple[Array, Array]:
+        """(lat, lon, h) (n, 3) of positions in n, and `R_ln` there by `rotation.components`, (3, 3, n)."""
+        r = self.r_e + p_n @ self.R_ne
+        s, c, p = _find_normal(r)
+        so, co = r[:, 1] / p, r[:, 0] / p
+        h = p * c + r[:, 2] * s - A * np.sqrt(1.0 - E2 * s * s)
+        llh = columns(np.arctan2(s, c), np.arctan2(r[:, 1], r[:, 0]), h)
+        axes = np.array([[-so, co, 0.0 * s], [-s * co, -s * so, c], [c * co, c * so, s]])
+        return llh, self.R_ne @ axes
+
     def gravity_n(self, p_n: Array) -> Array:
         """Gravity (gravitation and the centrifugal term) at points, m/s^2 in n; (..., 3) -> (..., 3).
 

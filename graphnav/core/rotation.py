@@ -24,6 +24,8 @@ _GENERATORS = np.array(
 _TAYLOR = np.array([[(-1.0) ** j / math.factorial(2 * j + 1 + k) for k in range(4)] for j in range(5)])
 # of ww, xx, yy, zz, wx, wy, wz, xy, xz, yz: the products of each component with w, x, y, z
 _WITH = np.array([[0, 4, 5, 6], [4, 1, 7, 8], [5, 7, 2, 9], [6, 8, 9, 3]])
+_MANY = 100  # matrices, of which sums over arrays are faster than products of each
+_LEAST_COSINE = 1e-16  # of a pitch
 _TINY = 1e-300  # makes sin(x)/x = 1 at x = 0 without a separate case
 
 
@@ -47,6 +49,27 @@ def columns(*parts: Array) -> Array:
 def mv(M: Array, v: Array) -> Array:
     """Matrix times vector along the leading axes: (..., m, k), (..., k) -> (..., m)."""
     return (M @ v[..., None])[..., 0]
+
+
+def components(M: Array) -> Array:
+    """Matrices or vectors (n, ...) as (..., n), so that operations on a component run over contiguous numbers."""
+    return np.ascontiguousarray(np.moveaxis(M, 0, -1))
+
+
+def multiply(A: Array, B: Array) -> Array:
+    """``A @ B`` of (n, 3, 3); several times faster where they are many."""
+    if len(A) < _MANY:
+        return np.asarray(A @ B)
+    A, B, out = components(A), components(B), np.empty((len(A), 3, 3))
+    for i in range(3):
+        for j in range(3):
+            out[:, i, j] = A[i, 0] * B[0, j] + A[i, 1] * B[1, j] + A[i, 2] * B[2, j]
+    return out
+
+
+def apply(M: Array, v: Array) -> Array:
+    """`mv` of (n, 3, 3) and (n, 3), the same way."""
+    return mv(M, v) if len(M) < _MANY else np.einsum("nij,nj->ni", M, v)
 
 
 def coefficients(theta2: Array) -> tuple[Array, Array, Array, Array]:
@@ -246,6 +269,16 @@ def rph_jacobian(rph: Array) -> Array:
     zero, one = np.zeros_like(roll), np.ones_like(roll)
     rows = [[sr * tp, one, -cr * tp], [cr, zero, sr], [sr / cp, zero, -cr / cp]]
     return np.stack([np.stack(r, -1) for r in rows], -2)
+
+
+def find_rph(R_nb: Array, R_ln: Array) -> tuple[Array, Array]:
+    """`to_rph` of R_ln R_nb, (n, 3), and `rph_jacobian` there, (3, 3, n); of `components` (3, 3, n)."""
+    x, y, z = np.einsum("in,ijn->jn", R_ln[2], R_nb)
+    cp = np.maximum(np.hypot(x, z), _LEAST_COSINE)
+    sr, cr, tp, zero = -x / cp, z / cp, y / cp, np.zeros_like(x)
+    heading = np.arctan2(*(np.einsum("in,in->n", R_ln[i], R_nb[:, 1]) for i in (0, 1)))
+    J = np.array([[sr * tp, zero + 1.0, -cr * tp], [cr, zero, sr], [sr / cp, zero, -cr / cp]])
+    return columns(np.arctan2(-x, z), np.arctan2(y, cp), np.mod(heading, 2 * np.pi)), J
 
 
 def wrap(angle: Array) -> Array:

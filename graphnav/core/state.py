@@ -81,8 +81,10 @@ class Parameter:
 
 
 def split_covariance(P: Array) -> dict[str, Array]:
-    """Covariances (K, 3, 3) of position, velocity and attitude, each by itself."""
-    return {block: P[:, BLOCKS[block], BLOCKS[block]] for block in ("p", "v", "theta")}
+    """Covariances (6, K) of position, velocity and attitude, each by itself: xx, yy, zz, xy, xz, yz."""
+    i, j = np.array([[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]])
+    first = {name: BLOCKS[name].start for name in ("p", "v", "theta")}
+    return {name: np.ascontiguousarray(P[:, at + i, at + j].T) for name, at in first.items()}
 
 
 @dataclass(frozen=True)
@@ -99,7 +101,10 @@ class States:
         return len(self.p)
 
     def __getitem__(self, index: slice | NDArray[Any]) -> States:
-        return States(self.R_nb[index], self.p[index], self.v[index], self.ba[index], self.bg[index])
+        if isinstance(index, slice) or index.dtype == bool:
+            return States(self.R_nb[index], self.p[index], self.v[index], self.ba[index], self.bg[index])
+        # several times faster than by brackets
+        return States(*(x.take(index, axis=0) for x in (self.R_nb, self.p, self.v, self.ba, self.bg)))
 
     def plus(self, delta: Array) -> States:
         """Retract by error states: ``R_nb Exp(theta)``, the rest added.

@@ -62,13 +62,14 @@ class Dense:
         return self._reach(t, k, s), _interpolate(self.covariance, k, s)
 
     def apart(self, t: Array) -> tuple[States, dict[str, Array]]:
-        """The same with covariances (M, 3, 3) of position, velocity and attitude each by itself."""
+        """The same with covariances (6, M) of position, velocity and attitude each by itself."""
         k, s = self._locate(t)
-        return self._reach(t, k, s), {name: _interpolate(own, k, s) for name, own in self._apart.items()}
+        apart = {name: own.take(k, axis=1) + s * change.take(k, axis=1) for name, (own, change) in self._apart.items()}
+        return self._reach(t, k, s), apart
 
     @cached_property
-    def _apart(self) -> dict[str, Array]:
-        return {block: np.ascontiguousarray(own) for block, own in split_covariance(self.covariance).items()}
+    def _apart(self) -> dict[str, tuple[Array, Array]]:
+        return {block: (own, np.diff(own, axis=1)) for block, own in split_covariance(self.covariance).items()}
 
     def _locate(self, t: Array) -> tuple[Array, Array]:
         """The keyframe before each time, and the share of the interval behind it that has gone by."""
@@ -107,7 +108,7 @@ class Dense:
         first, last = int(k[0]), int(k[-1]) + 1
         samples, used = self.samples.between(self.t[first], self.t[last]), slice(first, last)
         dR, dV, dP = within(samples, self.t[first : last + 1], t, self.ba[used], self.bg[used])
-        return EarthMotion(t - self.t[k], self.frame).reach(slice(None), self.states[k], dR, dP, dV)
+        return EarthMotion(t - self.t[k], self.frame).reach(slice(None), self.states[used], dR, dP, dV, k - first)
 
 
 def _distribute(miss: Array, s: Array, T: Array) -> Array:
@@ -122,7 +123,7 @@ def _distribute(miss: Array, s: Array, T: Array) -> Array:
 def _interpolate(of_keyframes: Array, k: Array, s: Array) -> Array:
     """Covariances between keyframes k and those behind them."""
     w = s[:, None, None]
-    out, after = of_keyframes[k], of_keyframes[k + 1]
+    out, after = of_keyframes.take(k, axis=0), of_keyframes.take(k + 1, axis=0)
     out *= 1.0 - w
     after *= w
     out += after

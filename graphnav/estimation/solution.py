@@ -9,7 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from graphnav.core import rotation
-from graphnav.core.earth import LocalFrame, enu_axes
+from graphnav.core.earth import LocalFrame
 from graphnav.core.errors import EstimationError
 from graphnav.core.rotation import Array
 from graphnav.core.state import BLOCKS, States, split_covariance
@@ -43,7 +43,7 @@ class Between(Protocol):
         ...
 
     def apart(self, t: Array) -> tuple[States, dict[str, Array]]:
-        """The same with covariances (M, 3, 3) of position, velocity and attitude each by itself."""
+        """The same with covariances (6, M) of position, velocity and attitude each by itself."""
         ...
 
 
@@ -264,32 +264,38 @@ def to_trajectory(
     Without joint covariances where `covariance` has those of position, velocity and attitude apart; sigmas need a
     third of the work.
     """
-    llh = frame.to_llh(states.p)
-    R_ln = enu_axes(llh) @ frame.R_ne.T
-    rph = rotation.to_rph(R_ln @ states.R_nb)
-    turns = {"p": R_ln, "v": R_ln, "theta": rotation.rph_jacobian(rph)}  # from the error state to local axes
+    llh, R_ln = frame.level(states.p)
+    rph, by_theta = rotation.find_rph(rotation.components(states.R_nb), R_ln)
+    turns = {"p": R_ln, "v": R_ln, "theta": by_theta}  # from the error state to local axes
     cov = None
     if isinstance(covariance, np.ndarray):
         J = np.zeros((len(t), 9, 9))
         for k, (block, turn) in enumerate(turns.items()):
-            J[:, 3 * k : 3 * k + 3, BLOCKS[block]] = turn
+            J[:, 3 * k : 3 * k + 3, BLOCKS[block]] = np.moveaxis(turn, -1, 0)
         cov = J @ covariance[:, :_OUT, :_OUT] @ np.swapaxes(J, -1, -2)
         covariance = split_covariance(covariance)
-    variance = [np.einsum("kij,kij->ki", turn @ covariance[block], turn) for block, turn in turns.items()]
-    sd = np.sqrt(np.maximum(np.concatenate(variance, axis=1), 0.0))
+    sd_p, sd_v, sd_rph = (_find_sigmas(turn, covariance[block]) for block, turn in turns.items())
     return Trajectory(
         t=t,
         llh=llh,
-        v=np.einsum("kij,kj->ki", R_ln, states.v),
+        v=np.einsum("ijn,nj->ni", R_ln, states.v),
         rph=rph,
-        sd_p=sd[:, 0:3],
-        sd_v=sd[:, 3:6],
-        sd_rph=sd[:, 6:9],
+        sd_p=sd_p,
+        sd_v=sd_v,
+        sd_rph=sd_rph,
         gyro_bias=states.bg,
         accel_bias=states.ba,
         covariance=cov,
         name=name,
     )
+
+
+def _find_sigmas(turn: Array, P: Array) -> Array:
+    """(n, 3) sigmas of what `turn` (3, 3, n) makes of covariances P (6, n)."""
+    x, y, z = turn[:, 0], turn[:, 1], turn[:, 2]
+    variance = x * x * P[0] + y * y * P[1] + z * z * P[2]
+    variance += 2.0 * (x * y * P[3] + x * z * P[4] + y * z * P[5])
+    return np.sqrt(np.maximum(variance, 0.0)).T
 
 
 def join_solutions(parts: list[Solution], notes: tuple[str, ...] = ()) -> Solution:

@@ -119,8 +119,7 @@ def load_raw(
         notes.append(
             Note(
                 "raw.no_ionosphere",
-                "no ionosphere coefficients in the navigation files: the delay of the night is assumed (5 ns at the "
-                "zenith)",
+                "no ionosphere coefficients in the navigation files: the delay at night is assumed, 5 ns at the zenith",
             )
         )
     raw, fixes = _correct_times(raw, fixes)

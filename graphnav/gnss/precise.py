@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphnav.core.errors import RecordingError
-from graphnav.core.notes import Note
+from graphnav.core.notes import Note, format_count
 from graphnav.core.rotation import Array
 from graphnav.core.timescales import utc_to_gps
 from graphnav.gnss.ephemeris import Placed, rotate_earth
@@ -82,7 +82,7 @@ def read_precise(sp3: list[Path], clk: list[Path]) -> Orbits:
         (
             Note(
                 "raw_gnss.orbit_short",
-                f"{len(few)} satellites have fewer than {_NODES} nodes in {sp3[0].name} and no orbit",
+                f"{format_count(len(few), 'satellite')} with fewer than {_NODES} nodes in {sp3[0].name}: no orbit",
             ),
         )
         if few

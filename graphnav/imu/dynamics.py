@@ -29,7 +29,7 @@ import numpy as np
 
 from graphnav.core import rotation
 from graphnav.core.earth import LocalFrame
-from graphnav.core.rotation import Array, mv
+from graphnav.core.rotation import Array, apply, multiply, mv
 from graphnav.core.state import DIM, Parameter, States
 from graphnav.imu.preintegration import Intervals
 from graphnav.recording import ImuNoise, Recording
@@ -69,26 +69,38 @@ def by_scale(by_bias: Array, mean: Array, k: int) -> Array:
 
 
 class EarthMotion:
-    """Motion of states in a local frame over times T (n,), given the integrated force; the formulas of this module."""
+    """Motion of states in a local frame over times T (n,), given the integrated force; the formulas of this module.
+
+    E turns about one axis, so that it and its integrals are I, W and W^2 of the frame times numbers of T alone.
+    """
 
     def __init__(self, T: Array, frame: LocalFrame) -> None:
         self._frame, self._h = frame, T[:, None]
-        turned = frame.omega_n * self._h
-        gamma1, gamma2 = rotation.integrals(turned)
-        self.back = np.swapaxes(rotation.exp(turned), -1, -2)  # (n, 3, 3) E^T
-        h = self._h[..., None]
-        self._once, self._twice = h * gamma1, h * h * gamma2  # (n, 3, 3) int E, iint E
+        h = self._h
+        a, b, c, d = rotation.coefficients(float(frame.omega_n @ frame.omega_n) * h * h)
+        I, W, W2 = (x.ravel() for x in (_I3, frame.W, frame.W2))
+        once = b * h * h
+        twice = c * h * h * h
+        self.back = (I - (a * h) * W + once * W2).reshape(-1, 3, 3)  # E^T
+        self._once = (h * I + once * W + twice * W2).reshape(-1, 3, 3)  # int E, and iint E
+        self._twice = (0.5 * h * h * I + twice * W + (d * h**4) * W2).reshape(-1, 3, 3)
 
-    def reach(self, rows: slice, start: States, dR: Array, dP: Array, dV: Array) -> States:
-        """The states after times `rows`, by dR (n, 3, 3), dP and dV (n, 3) in the axes of their starts."""
+    def reach(self, rows: slice, start: States, dR: Array, dP: Array, dV: Array, of: Array | None = None) -> States:
+        """The states after times `rows`, by dR (n, 3, 3), dP and dV (n, 3) in the axes of their starts.
+
+        `of` (n,) tells the start of each, where several have the same.
+        """
         frame, h, back = self._frame, self._h[rows], self.back[rows]
         by_place = start.p @ frame.W.T
         G = frame.gravity_n(start.p) + start.p @ frame.W2.T
         bent, u = start.v @ frame.gravity_gradient.T, start.v + by_place  # gravity changes over the interval
-        p = start.p + h * (u + h * h / 6.0 * bent) + mv(self._twice[rows], G) + mv(start.R_nb, dP)
-        p = mv(back, p)
-        v = mv(back, u + 0.5 * h * h * bent + mv(self._once[rows], G) + mv(start.R_nb, dV)) - p @ frame.W.T
-        return States(back @ start.R_nb @ dR, p, v, start.ba, start.bg)
+        if of is not None:
+            start, G, bent, u = start[of], *(x.take(of, axis=0) for x in (G, bent, u))
+        R, once, twice = start.R_nb, self._once[rows], self._twice[rows]
+        p = start.p + h * (u + h * h / 6.0 * bent) + apply(twice, G) + apply(R, dP)
+        p = apply(back, p)
+        v = apply(back, u + 0.5 * h * h * bent + apply(once, G) + apply(R, dV)) - p @ frame.W.T
+        return States(multiply(back, multiply(R, dR)), p, v, start.ba, start.bg)
 
 
 class ImuFactors:

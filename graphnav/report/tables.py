@@ -243,6 +243,8 @@ def nees_table(errors: Mapping[str, Errors]) -> list[Markup]:
     for name, e in errors.items():
         judged = {one.block: one for one in judge_sigmas(e)}
         nees = {"position": (e.nees_p, e.dof_p), "velocity": (e.nees_v, 3), "attitude": (e.nees_rph, 3)}
+        if e.dof_p == 3:
+            nees["height"] = (e.nees_axis[:, 2], 1)
         if e.nees_heading is not None:
             nees["heading"] = (e.nees_heading, 1)
         for words, (values, dof) in nees.items():

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from graphnav.core import rotation
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM
 from graphnav.estimation.solvers import recursion
@@ -40,7 +41,7 @@ class Drive:
         self.blocks = recursion.Blocks(
             first=2 * np.arange(n + 1), begin=np.tile([0, 3], n), end=np.tile([3, ROWS], n), used=self.used,
             gate=np.full(2 * n, np.inf), kernel=np.zeros(2 * n, dtype=int), size=np.tile([3, 5], n),
-            part=np.arange(2 * n + 1),
+            part=np.arange(2 * n + 1), k=np.repeat(np.arange(n), 2), kind=np.tile([0, 1], n),
         )  # fmt: skip
         self.e, self.P = rng.standard_normal(D), np.diag(rng.uniform(1.0, 4.0, D))
 
@@ -72,6 +73,15 @@ class Drive:
         )  # fmt: skip
         out["taken"] = taken
         k = np.arange(1, n)
+        # small, so that turns add up
+        moved = 1e-6 * (out["errors"] - out["ahead"])
+        half = np.concatenate([np.ones((n, 1)), 0.5 * moved[:, :3]], axis=1)
+        turned = half / np.linalg.norm(half, axis=1, keepdims=True)
+        out |= {"away": np.zeros((n, D)), "P_back": out["P"].copy()}
+        recursion.smooth_filtered(
+            0, n - 1, moved, turned, self.F, self.decay, out["P_ahead"], out["P"], out["P_back"], out["away"],
+            np.zeros(1, dtype=int),
+        )  # fmt: skip
         out["lag"] = recursion.compute_lag_covariances(k, 0, D, out["P"], out["P_ahead"], self.F, self.decay, out["N"])
         return out
 
@@ -103,6 +113,8 @@ def test_filter_and_smoother_are_one_update_of_the_whole_drive() -> None:
     found = drive.solved()
     np.testing.assert_allclose(found["smoothed"], mean, atol=1e-8)
     np.testing.assert_allclose(found["errors"][-1], mean[-1], atol=1e-8)
+    np.testing.assert_allclose(found["errors"] + 1e6 * found["away"], mean, atol=1e-4)
+    np.testing.assert_allclose(found["P_back"], found["P_smoothed"], atol=1e-8)
     for k in range(n):
         np.testing.assert_allclose(found["P_smoothed"][k], blocks[k, :, k], atol=1e-8)
     for k in range(1, n):
@@ -172,3 +184,13 @@ def test_without_a_compiler_the_numbers_are_the_same(tmp_path: Path) -> None:
     assert set(plain) == set(found)
     for name, value in found.items():
         np.testing.assert_allclose(plain[name], value, rtol=1e-9, atol=1e-12, err_msg=name)
+
+
+def test_turns_one_behind_the_other() -> None:
+    rng = np.random.default_rng(2)
+    for size in (0.0, 1e-9, 1e-3, 1.0, 3.0):
+        first, then = rng.standard_normal((2, 3))
+        then *= size / np.linalg.norm(then)
+        both = rotation.exp(first) @ rotation.exp(then)
+        found = recursion.compose_turns(rotation.to_quaternion(rotation.exp(first)), then)
+        np.testing.assert_allclose(found, rotation.log(both), atol=1e-12)

@@ -309,6 +309,14 @@ def test_heights_in_feet_are_seen_where_it_goes_up_and_down(
     assert "gnss.feet" not in keys(some)
 
 
+def test_heights_in_feet_are_seen_on_a_drive_with_an_outage(drive: Callable[[str], Recording]) -> None:
+    """Across a minute without fixes there is no slope to compare."""
+    right = drive("oracle_drive")
+    feet = replace(right, gnss=replace(right.gnss, llh=right.gnss.llh * [1.0, 1.0, 1 / 0.3048]))
+    assert "gnss.feet" in keys(feet)
+    assert "gnss.feet" not in keys(right)
+
+
 def test_exchanged_places_are_seen_on_a_drive_in_circles(drive: Callable[[str], Recording]) -> None:
     """Where the ways are distorted so much that their turns are those of nothing."""
     right = drive("car_circles_boston_20241021")

@@ -47,51 +47,40 @@ class FaultSearch:
             {c.name: t[c.keyframe] for c in watched}, {c.name: records[c.name].used for c in watched}
         )
         self._used = {c.name: records[c.name].used.copy() for c in watched}
-        self._bank, self._met = bank, {int(k) for c in watched for k in c.keyframe}
-        self._before: dict[int, Bank] = {}  # the tests as they were before the latest keyframes with fixes
+        self._bank = bank
         self._free: set[tuple[str, float]] = set()  # where nothing is known any more
         self.at_start = np.zeros(given.H.shape[2])  # (D,) variance by which less is known at the start
 
     def follow(self, k0: int, k1: int) -> int:
         """Test what was filtered from one keyframe to another; the keyframe to go on from."""
-        since = self._test(k0, k1)
-        if since is None and k1 == len(self._t):
+        given, since = self._filter, None
+        roots = self._find_roots(k0, k1)
+        fault = self._bank.follow(k0, k1, given.F, self._steps.decay, self._stack, given.updates, given.speed, roots)
+        if fault is not None:
+            name, k, since = fault
+            since = self.verdicts.settle(name, since, float(self._t[k]))
+        elif k1 == len(self._t):
             since = self.verdicts.ended()
         if since is None:
             return k1
         back = int(np.searchsorted(self._t, since))
-        # without any onset where that is too long ago
-        self._bank = self._before.get(back) or self._bank.forgetful()
-        self._before = {k: old for k, old in self._before.items() if k < back}
+        self._bank.go_back(back)
         self._reweigh()
         self._begin_anew()
         return back
 
-    def _test(self, k0: int, k1: int) -> float | None:
-        """When something began to be wrong that was used up to one of k0 to k1."""
-        given, stack = self._filter, self._stack
-        for k in range(k0, k1):
-            if k in self._met:
-                self._before[k] = self._bank.copy()
-                if len(self._before) > _REMEMBERED:
-                    del self._before[next(iter(self._before))]
-            bank = self._bank
-            if k:
-                bank.predicted(given.F[k - 1], self._steps.decay[k - 1])
-            for some in stack.together(k):
-                at, name, taken = some.at, some.parts[0][0].name, bool(given.updates.taken[some.number])
-                solved, root, bent = stack.solved[at], stack.root[k, at[1], at[1]].copy(), stack.bent[at]
-                r = root @ (root.T @ solved)
-                bank.seen(name, k, float(r @ solved), taken)
-                if taken:
-                    if np.any(bent < 1.0):
-                        root = np.asarray(
-                            np.linalg.cholesky(root @ root.T + np.diag(given.variance[at] * (1.0 / bent - 1.0)))
-                        )
-                    since = bank.updated(name, k, given.H[at], given.updates.Kt[at].T, r, root, float(given.speed[k]))
-                    if since is not None:
-                        return self.verdicts.settle(name, since, float(self._t[k]))
-        return None
+    def _find_roots(self, k0: int, k1: int) -> Array:
+        """(n, M, M) lower roots of S of the updates of keyframes k0 to k1, with what kernels have added to it."""
+        given, blocks = self._filter, self._stack.joint
+        roots, bent = self._stack.root, self._stack.bent
+        softened = [b for b in range(blocks.first[k0], blocks.first[k1]) if given.updates.taken[b] and blocks.kernel[b]]
+        if softened:
+            roots = roots.copy()
+        for b in softened:
+            k, at = blocks.k[b], slice(blocks.begin[b], blocks.end[b])
+            added = given.variance[k, at] * (1.0 / bent[k, at] - 1.0)
+            roots[k, at, at] = np.linalg.cholesky(roots[k, at, at] @ roots[k, at, at].T + np.diag(added))
+        return roots
 
     def _reweigh(self) -> None:
         """Take the blocks in, or not, as fixes are used now."""

@@ -33,6 +33,8 @@ class Blocks(NamedTuple):
     kernel: Array  # (B,) 0, `HUBER` or `CAUCHY`
     size: Array  # (B,) numbers of one row
     part: Array  # (B+1,) the first of the parts that each is made of
+    k: Array  # (B,) keyframe
+    kind: Array  # (B,) number of the constraint, of the first where several are taken in together
 
 
 @compiled
@@ -308,6 +310,79 @@ def smooth_rows(
         N_k = N[k]
         if k == len(F):  # the last of all: its filtered covariance is of errors about the estimate already
             smooth_point(errors_predicted[k], P_predicted[k], r_k, N_k, smoothed[k], P_smoothed[k])
+
+
+@compiled
+def divide_covariance(P: Array, X: Array) -> None:
+    """X (D, n) <- P^-1 X by Cholesky's root of P (D, D)."""
+    L = np.linalg.cholesky(P)
+    D = len(L)
+    for i in range(D):
+        own = X[i]
+        for j in range(i):
+            own -= L[i, j] * X[j]
+        own /= L[i, i]
+    for i in range(D - 1, -1, -1):
+        own = X[i]
+        for j in range(i + 1, D):
+            own -= L[j, i] * X[j]
+        own /= L[i, i]
+
+
+@compiled
+def compose_turns(q: Array, v: Array) -> tuple[float, float, float]:
+    """The rotation vector of the rotation of a quaternion q (4,) and, after it, that of a rotation vector v (3,)."""
+    n = np.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
+    w0, s = np.cos(0.5 * n), 0.5
+    if n > 0.0:
+        s = np.sin(0.5 * n) / n
+    x0, y0, z0 = s * v[0], s * v[1], s * v[2]
+    w = q[0] * w0 - q[1] * x0 - q[2] * y0 - q[3] * z0
+    x = q[0] * x0 + q[1] * w0 + q[2] * z0 - q[3] * y0
+    y = q[0] * y0 - q[1] * z0 + q[2] * w0 + q[3] * x0
+    z = q[0] * z0 + q[1] * y0 - q[2] * x0 + q[3] * w0
+    if w < 0.0:
+        w, x, y, z = -w, -x, -y, -z
+    half = np.sqrt(x * x + y * y + z * z)
+    a = 2.0
+    if half > 0.0:
+        a = 2.0 * np.arctan2(half, w) / half
+    return a * x, a * y, a * z
+
+
+@compiled
+def smooth_filtered(
+    k0: int,
+    k1: int,
+    moved: Array,
+    turned: Array,
+    F: Array,
+    decay: Array,
+    P_predicted: Array,
+    P: Array,
+    P_smoothed: Array,
+    errors: Array,
+    at: Array,
+) -> None:
+    """Smoothed errors (n, D) about filtered states, and covariances, of keyframes k1 - 1 down to k0, from those of k1.
+
+    C = P F^T P-^-1     e = C (x^s - x-) of the next     P^s = P + C (P^s - P-) C^T
+
+    Parameters
+    ----------
+    moved : (n, D) filtered states less predicted ones; `turned` (n, 4) the quaternions of their rotations.
+    at : (1,), the keyframe that is smoothed.
+    """
+    for k in range(k1 - 1, k0 - 1, -1):
+        at[0] = k
+        ahead = P_predicted[k + 1]
+        away = moved[k + 1] + errors[k + 1]
+        away[0], away[1], away[2] = compose_turns(turned[k + 1], errors[k + 1])
+        Ct = move(F[k], decay[k], P[k])
+        divide_covariance(ahead, Ct)
+        np.dot(away, Ct, errors[k])
+        two = P[k] + np.dot(Ct.T, np.dot(P_smoothed[k + 1] - ahead, Ct))
+        halve_sum(two, P_smoothed[k])
 
 
 @compiled

@@ -21,6 +21,7 @@ import time
 import numpy as np
 from scipy.linalg.lapack import dposv
 
+from graphnav.core import rotation
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, States
 from graphnav.estimation.dense import dense
@@ -39,7 +40,7 @@ from graphnav.estimation.solvers.passes import (
     record_residuals,
     sigmas_of,
 )
-from graphnav.estimation.solvers.recursion import STRETCH, move, smooth_rows
+from graphnav.estimation.solvers.recursion import STRETCH, move, smooth_filtered, smooth_rows
 
 _CANCELLED = 7e4  # times smaller than filtered: P - P N P is good to eps times the square of that, a millionth
 
@@ -77,25 +78,25 @@ def _smooth_filtered(
     problem: Problem, forward: ForwardRecord, end: int, all_values: Array, all_P: Array, progress: Progress | None
 ) -> States:
     """States from keyframe `end` on, with values and covariances in their places."""
-    K, before = len(forward.P), forward.predicted
-    state, values, P = forward.states[K - 1 : K], forward.values[-1], forward.P[-1]
-    states: list[States] = []
-    for k in range(K - 1, end - 1, -1):
-        if k < K - 1:
-            Pp, at, ahead = forward.P_predicted[k + 1], slice(k, k + 1), slice(k + 1, k + 2)
-            _, gain, info = dposv(Pp, move(forward.F[k], forward.decay[k], forward.P[k]))
-            if info:
-                raise explain_smoother(float(problem.t[k]))
-            C = gain.T
-            d = C @ np.concatenate([state.minus(before.states[ahead])[0], values - before.values[k + 1]])
-            state, values = forward.states[at].plus(d[None, :DIM]), forward.values[k] + d[DIM:]
-            P = forward.P[k] + C @ (P - Pp) @ C.T
-            P = 0.5 * (P + P.T)
-        states.append(state)
-        all_values[k], all_P[k] = values, P
-        if progress is not None and k % 256 == 0:
-            progress("smoother", 1.0 - k / K)
-    return States.stack(states[::-1])
+    K, D = forward.P.shape[:2]
+    own, before, some = forward.at(slice(end, K)), forward.predicted.at(slice(end, K)), slice(end, K)
+    moved = np.concatenate([own.states.minus(before.states), own.values - before.values], axis=1)
+    turned = rotation.to_quaternion(np.swapaxes(before.states.R_nb, -1, -2) @ own.states.R_nb)
+    errors, at = np.zeros((K - end, D)), np.zeros(1, dtype=int)
+    all_P[K - 1] = forward.P[K - 1]
+    for hi in range(K - 1, end, -STRETCH):
+        lo = max(hi - STRETCH, end)
+        try:
+            smooth_filtered(
+                lo - end, hi - end, moved, turned, forward.F[end:], forward.decay[end:],
+                forward.P_predicted[some], forward.P[some], all_P[some], errors, at,
+            )  # fmt: skip
+        except np.linalg.LinAlgError:
+            raise explain_smoother(float(problem.t[end + int(at[0])])) from None
+        if progress is not None:
+            progress("smoother", 1.0 - lo / K)
+    all_values[some] = own.values + errors[:, DIM:]
+    return own.states.plus(errors[:, :DIM])
 
 
 def _smooth_points(

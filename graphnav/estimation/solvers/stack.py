@@ -11,7 +11,7 @@ S = L L^T all the same: with w = L^-1 r, and L_jj what the kind j has on the dia
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -128,12 +128,19 @@ class Stack:
         kinds = np.array([_describe(c) for c in self._constraints]).reshape(-1, 3)[table[1, head]]
         kernel, size = kinds[:, 1:].T.astype(int)
         used = table[7, head].astype(bool)
-        return Blocks(first, table[4, head], table[5, last], used, kinds[:, 0].copy(), kernel, size, part)
+        return Blocks(
+            first, table[4, head], table[5, last], used, kinds[:, 0].copy(), kernel, size, part, *table[:2, head]
+        )
 
     def together(self, k: int) -> Iterator[RowBlock]:
         """All rows of a keyframe, in the order of the constraints."""
         for b in range(self.joint.first[k], self.joint.first[k + 1]):
             yield self.block(b)
+
+    def find_kinds(self, names: Sequence[str]) -> Array:
+        """(B,) which of some constraints each joint block is of, -1 for none."""
+        number = [names.index(c.name) if c.name in names else -1 for c in self._constraints]
+        return np.array(number)[self.joint.kind]
 
     def block(self, b: int) -> RowBlock:
         """Block number b."""

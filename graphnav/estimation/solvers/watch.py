@@ -22,8 +22,8 @@ from __future__ import annotations
 
 from array import array
 from bisect import bisect_left
-from collections.abc import Iterable, Mapping
-from typing import Self
+from collections.abc import Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.linalg.lapack import dtrtrs
@@ -31,7 +31,16 @@ from scipy.special import chdtri, gammaincinv
 
 from graphnav.constraints.base import Constraint
 from graphnav.core.rotation import Array
-from graphnav.estimation.solvers.recursion import move, solve
+from graphnav.estimation.solvers.likelihood_ratio import (
+    add_row,
+    begin_slot,
+    follow_filter,
+    memory_size,
+)
+
+if TYPE_CHECKING:
+    from graphnav.estimation.solvers.passes import Updates
+    from graphnav.estimation.solvers.stack import Stack
 
 PATIENCE = 60.0  # s, after which fixes that are refused may be the ones that are right
 _EVERY = 8  # fixes between two looks at what is usual
@@ -42,6 +51,7 @@ _ONSET = float(chdtri(1, 0.05))  # of T, by which an onset may be less likely th
 FALSE_ALARM = 1e-7  # per test: one drive in a hundred of an hour, if errors were Gaussian
 WIDE = {"m": 100.0, "m/s": 10.0}  # reflections in a city are off by up to a hundred metres; wheels by their speed
 MINUTE = 60.0  # s, in which an error may grow by as much as it can be
+_REMEMBERED = 64  # keyframes with fixes back to which the tests can be taken as they were
 LONGEST = 600.0  # s, about, of the oldest onset: what inertial sensors knew ten minutes ago says little
 
 
@@ -56,63 +66,67 @@ class _Slots:
     """The tests of one constraint: slot l has columns c l to c (l + 1) of those it has in the bank.
 
     The first m of them are of the part of an error that stays, the others of what it grows by in a minute: c is 2 m
-    where errors may grow, else m.
+    where errors may grow, else m. What they know is `memory`, as `likelihood_ratio` has it.
     """
 
     def __init__(self, begin: int, L: int, rows: Constraint, drifts: bool) -> None:
-        m = len(rows.axes)
-        c = 2 * m if drifts else m
-        self.columns, self.L, self.m, self.drifts = slice(begin, begin + L * c), L, m, drifts
-        self.threshold = float(chdtri(c, FALSE_ALARM))
-        self.rows = rows
-        self.first = np.full(L, np.nan)  # when each slot began, NaN before
-        self.inputs = np.zeros((m, L, c // m, m))  # U of each slot
-        self.one, self.prior = np.eye(m), np.eye(c) / WIDE[rows.unit] ** 2
-        self.score, self.info = np.zeros((L, c)), np.tile(self.prior, (L, 1, 1))
-        self.seen = 0
-        self.typical_sigmas = _InnovationLevel(m)
+        self.m = len(rows.axes)
+        self.L, self.c = L, 2 * self.m if drifts else self.m
+        self.columns = slice(begin, begin + L * self.c)
+        self.threshold = float(chdtri(self.c, FALSE_ALARM))
+        self.rows, self.prior = rows, WIDE[rows.unit] ** -2.0
+        self.memory = np.zeros(memory_size(L, self.c))
+        self.typical_sigmas = _InnovationLevel(self.m)
+        self.forget()
+
+    @property
+    def first(self) -> Array:
+        """(L,) s, when each slot began, NaN before."""
+        return self.memory[: self.L]
+
+    @property
+    def score(self) -> Array:
+        """(L, c) sum G^T S^-1 nu."""
+        return self.memory[self.L : self.L * (1 + self.c)].reshape(self.L, self.c)
+
+    @property
+    def info(self) -> Array:
+        """(L, c, c) W^-2 + sum G^T S^-1 G."""
+        return self.memory[self.L * (1 + self.c) : -1].reshape(self.L, self.c, self.c)
 
     def copy(self) -> _Slots:
+        """The same, on its own."""
         other = object.__new__(_Slots)
         other.__dict__ |= self.__dict__
-        other.first, other.inputs = self.first.copy(), self.inputs.copy()
-        other.score, other.info = self.score.copy(), self.info.copy()
+        other.memory = self.memory.copy()
         return other
 
     def forget(self) -> None:
         """Begin none again until its turn."""
-        self.first[:], self.score[:], self.info[:], self.inputs[:] = np.nan, 0.0, self.prior, 0.0
+        self.first[:], self.score[:], self.info[:] = np.nan, 0.0, self.prior * np.eye(self.c)
 
     def begin(self, t: float) -> slice:
-        """Begin the slot whose turn it is at a fix, and let the others grow; its columns in the bank."""
-        self.seen += 1
-        slot = min((self.seen & -self.seen).bit_length() - 1, self.L - 1)
-        self.first[slot], self.score[slot], self.info[slot] = t, 0.0, self.prior
-        self.inputs[:, slot, 0] = self.one
-        if self.drifts:
-            minutes = np.where(np.isnan(self.first), 0.0, (t - self.first) / MINUTE)
-            self.inputs[:, :, 1] = minutes[:, None] * self.one[:, None]
-        c = len(self.prior)
-        return slice(self.columns.start + c * slot, self.columns.start + c * (slot + 1))
+        """Begin the slot whose turn it is at a fix; its columns in the bank."""
+        slot = begin_slot(self.memory, t, self.L, self.c, self.prior)
+        return slice(self.columns.start + self.c * slot, self.columns.start + self.c * (slot + 1))
 
-    def found(self, score: Array, G: Array, weighted: Array, speed: float) -> float | None:
-        """When a fault began that a fix adds enough to be sure of, or None.
+    def find(self, t: float, errors: Array, T: Array, factor: float, speed: float) -> float | None:
+        """When a fault began that the fix at t, s, adds enough to be sure of, or None.
 
         Parameters
         ----------
-        score : (L c,) G^T S^-1 nu.
-        G : (n m, L c) signature, and `weighted` S^-1 G.
+        errors, T : (L, c) and (L,), the errors most likely, and how much more likely they make the innovations.
+        factor : by which these are usually larger than the filter says.
         """
-        self.score += score.reshape(self.score.shape)
-        G3, S3 = (x.reshape(-1, *self.score.shape).swapaxes(0, 1) for x in (G, weighted))
-        self.info += G3.swapaxes(1, 2) @ S3
-        b = np.linalg.solve(self.info, self.score[..., None])[..., 0]
-        T = np.einsum("lm,lm->l", self.score, b) / self.threshold
-        if T.max() <= self.typical_sigmas.factor:
+        T = T / self.threshold
+        if T.max() <= factor:
             return None
-        now = np.einsum("mlk,lk->lm", self.inputs.reshape(self.m, *b.shape), b)
+        now = errors[:, : self.m]
+        if self.c > self.m:
+            minutes = np.where(np.isnan(self.first), 0.0, (t - self.first) / MINUTE)
+            now = now + minutes[:, None] * errors[:, self.m :]
         T = np.where(matters(self.rows, now, speed), T, 0.0)
-        if T.max() <= self.typical_sigmas.factor:
+        if T.max() <= factor:
             return None
         # of the onsets that are about as likely the latest: it takes least
         return float(np.max(self.first[T.max() - _ONSET / self.threshold <= T]))
@@ -163,33 +177,8 @@ class _InnovationLevel:
                 self.factor = max(1.0, float(np.median(np.frombuffer(self.nis)[:known])) / self.median)
 
 
-class _Tests:
-    """The tests of some constraints, and what unit errors since their onsets do to an estimate: X (D, C)."""
-
-    _slots: dict[str, _Slots]
-    X: Array
-
-    def __contains__(self, name: str) -> bool:
-        return name in self._slots
-
-    def copy(self) -> Self:
-        """The same, on its own."""
-        other = object.__new__(type(self))
-        other.__dict__ |= self.__dict__
-        other._slots = {name: slots.copy() for name, slots in self._slots.items()}
-        return other
-
-    def forgetful(self) -> Self:
-        """The same without any onset."""
-        other = self.copy()
-        other.X = np.zeros_like(self.X)
-        for slots in other._slots.values():
-            slots.forget()
-        return other
-
-
-class Bank(_Tests):
-    """All tests of a filter.
+class Bank:
+    """All tests of a filter, and how they were before the latest keyframes with fixes.
 
     Parameters
     ----------
@@ -199,49 +188,90 @@ class Bank(_Tests):
     drifts : whether errors may grow, too.
     """
 
-    def __init__(self, constraints: Iterable[Constraint], t: Array, width: int, drifts: bool = True) -> None:
+    def __init__(self, constraints: Sequence[Constraint], t: Array, width: int, drifts: bool = True) -> None:
         self._slots, self._t = _slots(constraints, t, LONGEST, drifts), t
-        self.X = np.zeros((width, _width(self._slots)))
+        some, columns = self._slots.values(), _width(self._slots)
+        ends = np.cumsum([width * columns, *(len(slots.memory) for slots in some)])
+        self._state = np.concatenate([np.zeros(ends[0]), *(slots.memory for slots in some)])
+        self.X = self._state[: ends[0]].reshape(width, columns)
+        for slots, begin, end in zip(some, ends[:-1], ends[1:], strict=True):
+            slots.memory = self._state[begin:end]
+        self._layouts = np.array(
+            [(begin, s.columns.start, s.L, s.m, s.c) for s, begin in zip(some, ends[:-1], strict=True)]
+        )
+        self._scales = np.array([(slots.prior, MINUTE) for slots in some])
+        most = self._layouts.max(axis=0)
+        self._errors, self._T = np.zeros((len(some), most[2], most[4])), np.zeros((len(some), most[2]))
+        self._met = np.isin(np.arange(len(t)), np.concatenate([c.keyframe for c in constraints]))
+        self._before, self._keys = np.empty((_REMEMBERED, ends[-1])), np.zeros(_REMEMBERED, dtype=int)
+        self._ends = np.zeros(2, dtype=int)
 
-    def copy(self) -> Bank:
-        """The same, on its own."""
-        other = super().copy()
-        other.X = self.X.copy()
-        return other
+    def go_back(self, k: int) -> None:
+        """To before keyframe k; without any onset where that is too long ago."""
+        begin, end = self._ends
+        while end > begin and self._keys[(end - 1) % _REMEMBERED] > k:
+            end -= 1
+        if end > begin and self._keys[(end - 1) % _REMEMBERED] == k:
+            end -= 1
+            self._state[:] = self._before[end % _REMEMBERED]
+        else:
+            self.X[:] = 0.0
+            for slots in self._slots.values():
+                slots.forget()
+        self._ends[1] = end
 
-    def predicted(self, F: Array, decay: Array) -> None:
-        """The filter has gone on to the next keyframe, by a step as `graphnav.estimation.solvers.recursion` has it."""
-        self.X = move(F, decay, self.X)
-
-    def seen(self, name: str, k: int, nis: float, used: bool) -> None:
-        """The filter has seen an innovation of so many squared sigmas, used or not."""
-        if slots := self._slots.get(name):
-            slots.typical_sigmas.add(float(self._t[k]), nis, used)
-
-    def updated(self, name: str, k: int, H: Array, K: Array, r: Array, root: Array, speed: float) -> float | None:
-        """The filter has used rows at keyframe k; when a fault began that they are enough to be sure of, or None.
+    def follow(
+        self,
+        k0: int,
+        k1: int,
+        F: Array,
+        decay: Array,
+        stack: Stack,
+        updates: Updates,
+        speeds: Array,
+        roots: Array,
+    ) -> tuple[str, int, float] | None:
+        """Follow a filter from keyframe k0 to k1: the kind that finds a fault, where, and when it began, if one does.
 
         Parameters
         ----------
-        H, K : (n m, D) and the gain (D, n m).
-        r : (n m,) residual, -nu, and the lower root of its covariance S.
-        speed : m/s, of the vehicle.
+        F, decay : of its steps, as `graphnav.estimation.solvers.recursion` has them.
+        updates : what it has taken in, as `stack` has it, with roots and innovations of all blocks there.
+        speeds : (n,) m/s, of the vehicle.
+        roots : (n, M, M) lower roots of S of the updates.
         """
-        if name not in self:
-            self.X -= K @ (H @ self.X)
-            return None
-        slots = self._slots[name]
-        self.X[:, slots.begin(float(self._t[k]))] = 0.0
-        G = -(H @ self.X)
-        own = G[:, slots.columns]
-        own[:] = (own.reshape(-1, *slots.inputs.shape) + slots.inputs).reshape(own.shape)  # a fix itself has the error
-        weighted = own.copy()
-        solve(root, weighted)
-        self.X += K @ G
-        return slots.found(-(r @ weighted), own, weighted, speed)
+        blocks, names = updates.blocks, list(self._slots)
+        kind, limit = stack.find_kinds(names), np.full(len(blocks.begin), np.inf)
+        white = (stack.solved[k0:k1, None] @ stack.root[k0:k1])[:, 0]
+        levels = []
+        for b in range(blocks.first[k0], blocks.first[k1]):
+            if kind[b] >= 0:
+                slots, k = self._slots[names[kind[b]]], int(blocks.k[b])
+                own = white[k - k0, blocks.begin[b] : blocks.end[b]]
+                slots.typical_sigmas.add(float(self._t[k]), float(own @ own), bool(updates.taken[b]))
+                levels.append((b, slots.typical_sigmas, slots.typical_sigmas.factor))
+                limit[b] = slots.typical_sigmas.factor * slots.threshold
+        k, b = k0, int(blocks.first[k0])
+        while True:
+            k, b = follow_filter(
+                k, k1, b, self._t, F, decay, updates.H, updates.Kt, roots, -updates.w,
+                blocks.first, blocks.begin, blocks.end, updates.taken, kind, limit, self._met,
+                self._layouts, self._scales, self._state, self._before, self._keys, self._ends, self._errors, self._T,
+            )  # fmt: skip
+            if k == k1:
+                return None
+            i, slots = kind[b], self._slots[names[kind[b]]]
+            errors, T = self._errors[i, : slots.L, : slots.c], self._T[i, : slots.L]
+            since = slots.find(float(self._t[k]), errors, T, limit[b] / slots.threshold, float(speeds[k]))
+            if since is not None:
+                for at, level, factor in levels:  # what is behind it is not known yet
+                    if at <= b:
+                        level.factor = factor
+                return names[i], k, since
+            b += 1
 
 
-class Watch(_Tests):
+class Watch:
     """The same tests beside a square-root message R y = z, which is then R y = z - R X b for errors b since each onset.
 
     Of errors that stay alone: one that grows may as well be the IMU's, and no evidence decides as it drives. With
@@ -261,7 +291,7 @@ class Watch(_Tests):
         self._stands: tuple[Array, Array] | None = None  # R and R X
 
     @property
-    def X(self) -> Array:  # type: ignore[override]
+    def X(self) -> Array:
         """(D, C) what a unit error since each onset does to the estimate."""
         if self._X is None:
             assert self._stands is not None
@@ -276,15 +306,35 @@ class Watch(_Tests):
         """The message has come to a triangular R (D, D), with Z = R X (D, C) beside it."""
         self._X, self._stands = None, (R, Z)
 
+    def copy(self) -> Watch:
+        """The same, on its own."""
+        other = object.__new__(Watch)
+        other.__dict__ |= self.__dict__
+        other._slots = {name: slots.copy() for name, slots in self._slots.items()}
+        return other
+
+    def forgetful(self) -> Watch:
+        """The same without any onset."""
+        other = self.copy()
+        other.X = np.zeros_like(self.X)
+        for slots in other._slots.values():
+            slots.forget()
+        return other
+
     def begin(self, name: str, t: float, sigma: Array) -> tuple[slice, slice, Array]:
-        """Begin an onset with fixes of these sigmas (n, m): its columns, those of the kind, and B (n m, L c)."""
+        """Begin an onset with fixes of these sigmas (n, m): its columns, those of the kind, and B (n m, L m)."""
         slots = self._slots[name]
         own = slots.begin(t)
-        inputs = slots.inputs.reshape(slots.m, -1)
-        return own, slots.columns, (inputs / sigma[..., None]).reshape(sigma.size, -1)
+        inputs = np.eye(slots.m)[:, None] * np.isfinite(slots.first)[:, None]
+        return own, slots.columns, (inputs.reshape(slots.m, -1) / sigma[..., None]).reshape(sigma.size, -1)
 
     def found(self, name: str, t: float, rho: Array, Gamma: Array, speed: float) -> float | None:
-        """When a fault began, or None, by what a fix has left behind: rho (n m,) and Gamma (n m, L c) of its kind."""
-        slots = self._slots[name]
+        """When a fault began, or None, by what a fix has left behind: rho (n m,) and Gamma (n m, L m) of its kind."""
+        slots, rho, Gamma = self._slots[name], np.ascontiguousarray(rho), np.ascontiguousarray(Gamma)
         slots.typical_sigmas.add(t, float(rho @ rho))
-        return slots.found(rho @ Gamma, Gamma, Gamma, speed)
+        errors, T = np.empty((slots.L, slots.c)), np.empty(slots.L)
+        add_row(slots.memory, rho, Gamma, slots.L, slots.c, errors, T)
+        return slots.find(t, errors, T, slots.typical_sigmas.factor, speed)
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._slots

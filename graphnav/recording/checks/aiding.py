@@ -167,8 +167,8 @@ def check_imu_clock(clock: ClockOffsets, odometer: Fit | None = None) -> Iterato
     if clock.apart is not None:
         yield Finding(
             "note",
-            f"the stamps of GNSS positions and velocities are {clock.apart:.2f} s apart: they cannot both be right, "
-            "and the rest after time_offset is estimated for each",
+            f"the stamps of GNSS positions and velocities are {clock.apart:.2f} s apart, so one of them is wrong: a "
+            "time offset of each is estimated",
             "gnss.two_clocks",
         )
     forward = clock.late

@@ -16,17 +16,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphnav.core.rotation import Array, wrap
-from graphnav.recording import Gnss, Imu, Odometer
+from graphnav.recording import Imu, Odometer
 from graphnav.recording.checks import lags as lags_of_clocks
 from graphnav.recording.checks.lags import Lags
-from graphnav.recording.checks.tracks import Track, compute_local_positions
+from graphnav.recording.checks.tracks import Track
 
 Index = NDArray[Any]  # of row numbers
 
 MIN_PAIRS = 20
-_SLOPE_SPAN, _SLOPES = 8.0, 6  # s over which a slope is taken: the force is then known to a tenth of a per cent
-GRAVITY = 9.81  # m/s^2
-_MIN_SPEED = 3.0  # m/s, below which a course is undefined
+MIN_SPEED = 3.0  # m/s, below which a course is undefined
 _FASTEST_CHANGE = 8.0  # m/s^2; a larger acceleration is an error of the fix
 _CHANGES = 0.25  # m/s, rms change of speed, below which a regression on it determines nothing
 WIDE = 30.0  # s, largest clock error searched for
@@ -229,30 +227,6 @@ def fit_force(imu: Imu, track: Track) -> Fit | None:
     return fit if fit is not None and len(fit.coefficients) == 3 else None
 
 
-def fit_climb(imu: Imu, track: Track, gnss: Gnss, forward: Array) -> tuple[float, float] | None:
-    """Slopes by the force along `forward` (3,), corrected for acceleration, against those of the heights, over
-    `_SLOPE_SPAN`.
-
-    Their correlation, and the ratio of their magnitudes: neither has less noise than the other. None where the drive is
-    too short.
-    """
-    p = compute_local_positions(gnss)
-    way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(p[:, :2], axis=0).T))])
-    pull = np.concatenate([[0.0], np.cumsum(imu.accel[1:] @ forward * np.diff(imu.t))])
-    a = np.arange(max(track.t[0], imu.t[0]), min(track.t[-1], imu.t[-1]) - _SLOPE_SPAN, _SLOPE_SPAN)
-
-    def change(t: Array, x: Array) -> Array:
-        return np.asarray(np.interp(a + _SLOPE_SPAN, t, x) - np.interp(a, t, x))
-
-    far = change(gnss.t, way)
-    moving = far > _MIN_SPEED * _SLOPE_SPAN
-    felt = (change(imu.t, pull) - change(track.t, track.speed))[moving] / (_SLOPE_SPAN * GRAVITY)
-    climbed = change(gnss.t, p[:, 2])[moving] / far[moving]
-    if len(felt) < _SLOPES or not felt.std() or not climbed.std():
-        return None
-    return float(np.corrcoef(felt, climbed)[0, 1]), float(felt.std() / climbed.std())
-
-
 def fit_along(imu: Imu, track: Track) -> Fit | None:
     """Regression on the force along the stated forward axis alone, (1,): whether the stated axes explain the speed."""
     i, j, y = _pair_possible(track)
@@ -268,7 +242,7 @@ def fit_yaw(imu: Imu, track: Track) -> Fit | None:
     course = np.arctan2(track.v[:, 1], track.v[:, 0])
     y = wrap(course[j] - course[i])
     speed = np.minimum(track.speed[i], track.speed[j])
-    real = (speed > _MIN_SPEED) & (np.abs(y) < 1.5 * (track.t[j] - track.t[i]))
+    real = (speed > MIN_SPEED) & (np.abs(y) < 1.5 * (track.t[j] - track.t[i]))
     i, j, y = i[real], j[real], y[real]
     if len(y) < MIN_PAIRS or y.std() < 0.04:
         return None
@@ -328,7 +302,7 @@ def fit_odometer(odometer: Odometer, track: Track) -> tuple[Fit, float] | None:
     fit = _search(track.t, track.speed, x_at, track.t, valid)
     rows = every[valid(fit.lag)]
     x = x_at(rows, fit.lag)[:, 0]
-    moving = (np.abs(x) > 0.3 * np.abs(x).max()) & (track.speed[rows] > _MIN_SPEED)
+    moving = (np.abs(x) > 0.3 * np.abs(x).max()) & (track.speed[rows] > MIN_SPEED)
     if moving.sum() < MIN_PAIRS:
         return None
     return fit, float(np.median(track.speed[rows][moving] / x[moving]))

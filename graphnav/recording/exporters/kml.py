@@ -68,7 +68,7 @@ class _Thinned:
 
     def __init__(self) -> None:
         self._frame: LocalFrame | None = None
-        self._kept = np.empty((0, 5))  # t, llh, distance so far
+        self._kept: list[Array] = []  # parts (n, 5): t, llh, distance so far
         self._last = np.empty((0, 3))  # frame of the path, in metres
         self._end = np.empty(5)
 
@@ -81,13 +81,14 @@ class _Thinned:
         along = begin + np.cumsum(steps)
         new = np.column_stack([block.t, block.llh, along])
         self._last, self._end = p[-1:], new[-1]
-        self._kept = np.concatenate([self._kept, new])
-        if len(self._kept) > _SPARE_POINTS * _MAX_POINTS:
-            self._kept = self._at_least(self._kept, along[-1] / (_SPARE_POINTS / 2 * _MAX_POINTS))
+        self._kept.append(new)
+        if sum(map(len, self._kept)) > _SPARE_POINTS * _MAX_POINTS:
+            spacing = along[-1] / (_SPARE_POINTS / 2 * _MAX_POINTS)
+            self._kept = [self._at_least(np.concatenate(self._kept), spacing)]
 
     def rows(self) -> Array:
         """Times (s), llh (rad, m) and distance (m) of the points, (N, 5)."""
-        kept = self._at_least(self._kept, max(self._end[4] / _MAX_POINTS, _LEAST_SPACING))
+        kept = self._at_least(np.concatenate(self._kept), max(self._end[4] / _MAX_POINTS, _LEAST_SPACING))
         return kept if kept[-1, 0] == self._end[0] else np.concatenate([kept, self._end[None]])
 
     @staticmethod

@@ -39,7 +39,8 @@ def writing(path: Path, name: str = "") -> Iterator[Add]:
             if block.frame == "geodetic":
                 p_n = frame.from_llh(block.llh)
                 # attitudes refer to the local level of each point; the file has one frame for all of them
-                R_nb = np.swapaxes(enu_axes(block.llh) @ frame.R_ne.T, -1, -2) @ R_lb
+                R_ln = (enu_axes(block.llh).reshape(-1, 3) @ frame.R_ne.T).reshape(-1, 3, 3)
+                R_nb = rotation.multiply(np.swapaxes(R_ln, -1, -2), R_lb)
             q = rotation.to_quaternion(R_nb)
             table = np.column_stack([block.t, p_n, q[:, 1:], q[:, 0]])
             file.write(rows_bytes(table, " ".join(["%.6f"] + ["%.5f"] * 3 + ["%.10f"] * 4)))

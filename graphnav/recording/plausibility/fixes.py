@@ -44,8 +44,8 @@ def screen(recording: Recording) -> tuple[Recording, list[Finding]]:
         findings.append(
             Finding(
                 "note",
-                f"{format_count(cached, 'fix', 'fixes')} of before the IMU, the first {early:.0f} s before it starts, "
-                "left out: a receiver gives out what it had kept until it has new ones",
+                f"{format_count(cached, 'fix', 'fixes')} from up to {early:.0f} s before the IMU starts left out: the "
+                "receiver repeats its last position until it has a new one",
                 "gnss.cached",
             )
         )
@@ -190,8 +190,8 @@ def check_sigmas(gnss: Gnss, p: Array) -> Iterator[Finding]:
         if sd > _WAVE:
             yield Finding(
                 "warning",
-                f"the 1-sigma of the fixed solutions is {sd:.2g} m, more than the carrier's wave ({_WAVE:g} m) whose "
-                "cycles they have told apart: look at the unit of the sigmas",
+                f"the 1-sigma of the fixed solutions is {sd:.2g} m, more than the carrier's wavelength "
+                f"({_WAVE:g} m), whose cycles they resolve: look at the unit of the sigmas",
                 "gnss.sigma_large",
             )
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from graphnav.core.earth import gravity
 from graphnav.core.errors import RecordingError
 from graphnav.core.findings import Finding, period_of, runs_of
-from graphnav.core.notes import Note
+from graphnav.core.notes import Note, format_count
 from graphnav.core.rotation import Array
 from graphnav.recording import Imu, Recording, take_rows
 from graphnav.recording.checks import crosschecks, tracks
@@ -32,7 +32,6 @@ from graphnav.recording.plausibility.readings import find_contradicted
 
 # Limits of readings: no accelerometer for vehicles or feet has a range beyond 100 g (those for crash tests have 200 g
 # and more, and cannot tell gravity from their own offset), and no gyro for them one beyond 4000 deg/s.
-# 200 g and more, and cannot tell gravity from their own offset), and no gyro for them one beyond 4000 deg/s.
 ACCEL_RANGE = 1000.0  # m/s^2
 GYRO_RANGE = 70.0  # rad/s
 _STANDARD_GRAVITY = 9.80665  # m/s^2, where the position is unknown
@@ -188,7 +187,7 @@ def check_imu_scale(recording: Recording) -> Iterator[Finding]:
         g = _STANDARD_GRAVITY if recording.gnss is None else _measure_gravity(recording)
         yield Finding(
             "refused",
-            f"the force has a median of {f:.3g} m/s2 where it is calm, not {g:.1f}: {sentence}",
+            f"the specific force where it is calm is {f:.3g} m/s2 (median), not {g:.1f}: {sentence}",
             "imu.force_scale",
         )
 
@@ -280,7 +279,7 @@ def drop_contradicted(imu: Imu, start: float, forces: bool) -> tuple[Imu, list[F
 
 
 def _list_rows(bad: NDArray[np.bool_]) -> str:
-    return "1 IMU row" if bad.sum() == 1 else f"{bad.sum()} IMU rows"
+    return format_count(bad.sum(), "IMU row")
 
 
 def check_dead_axes(recording: Recording) -> Iterator[Finding]:
