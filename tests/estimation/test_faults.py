@@ -100,9 +100,9 @@ def test_signature_is_the_derivative_of_the_innovations(posed: Problem, monkeypa
     kept: list[tuple[Bank, Stack, Updates]] = []
     follow = Bank.follow
 
-    def keep(self: Bank, *rest: Any) -> Any:
-        kept.append((self, *rest[4:6]))
-        return follow(self, *rest)
+    def keep(self: Bank, k0: int, k1: int, F: Array, decay: Array, stack: Stack, updates: Updates, *more: Array) -> Any:
+        kept.append((self, stack, updates))
+        return follow(self, k0, k1, F, decay, stack, updates, *more)
 
     monkeypatch.setattr(Bank, "follow", keep)
     about = ekf(posed)
@@ -111,6 +111,8 @@ def test_signature_is_the_derivative_of_the_innovations(posed: Problem, monkeypa
     # the same tests a block at a time, with what an error since the 64th fix does to the state: slot 6 begins there
     _, stack, updates = kept[0]
     bank = Bank([rows], posed.t, forward.P.shape[1])
+    own = bank._slots[rows.name]
+    layout, room = np.array([0, own.columns.start, own.L, own.m, own.c]), (np.empty((own.L, own.c)), np.empty(own.L))
     seen, begun, fix = dict[int, Array](), 0.0, 0
     for k in range(len(posed.t)):
         if k:
@@ -124,9 +126,10 @@ def test_signature_is_the_derivative_of_the_innovations(posed: Problem, monkeypa
                 U = np.concatenate([np.eye(3), (posed.t[k] - begun) / MINUTE * np.eye(3)], axis=1)
                 seen[fix] = U - H @ X
                 fix += 1
-                own = bank._slots[name].memory, bank._layouts[0], bank._scales[0], float(posed.t[k])
-                root = root[:, some.at[1]].copy()
-                update_tests(bank.X, *own, H, Kt, root, -solved, bank._errors[0], bank._T[0])
+                update_tests(
+                    bank.X, own.memory, layout, np.array([own.prior, MINUTE]), posed.t[k], H, Kt,
+                    root[:, some.at[1]].copy(), -solved, *room,
+                )  # fmt: skip
             else:
                 bank.X -= Kt.T @ (H @ bank.X)
     for one in ("score", "info"):

@@ -19,8 +19,6 @@ from graphnav.estimation.solvers.stack import RowBlock, Stack
 from graphnav.estimation.solvers.verdicts import Verdicts
 from graphnav.estimation.solvers.watch import Bank
 
-_REMEMBERED = 64  # keyframes back to which the tests can be taken as they were
-
 
 class FaultSearch:
     """Find the fixes that are wrong, and weigh them in a filter.
@@ -53,13 +51,8 @@ class FaultSearch:
 
     def follow(self, k0: int, k1: int) -> int:
         """Test what was filtered from one keyframe to another; the keyframe to go on from."""
-        given, since = self._filter, None
-        roots = self._find_roots(k0, k1)
-        fault = self._bank.follow(k0, k1, given.F, self._steps.decay, self._stack, given.updates, given.speed, roots)
-        if fault is not None:
-            name, k, since = fault
-            since = self.verdicts.settle(name, since, float(self._t[k]))
-        elif k1 == len(self._t):
+        since = self._test(k0, k1)
+        if since is None and k1 == len(self._t):
             since = self.verdicts.ended()
         if since is None:
             return k1
@@ -69,18 +62,33 @@ class FaultSearch:
         self._begin_anew()
         return back
 
-    def _find_roots(self, k0: int, k1: int) -> Array:
-        """(n, M, M) lower roots of S of the updates of keyframes k0 to k1, with what kernels have added to it."""
-        given, blocks = self._filter, self._stack.joint
-        roots, bent = self._stack.root, self._stack.bent
-        softened = [b for b in range(blocks.first[k0], blocks.first[k1]) if given.updates.taken[b] and blocks.kernel[b]]
-        if softened:
-            roots = roots.copy()
-        for b in softened:
-            k, at = blocks.k[b], slice(blocks.begin[b], blocks.end[b])
-            added = given.variance[k, at] * (1.0 / bent[k, at] - 1.0)
-            roots[k, at, at] = np.linalg.cholesky(roots[k, at, at] @ roots[k, at, at].T + np.diag(added))
-        return roots
+    def _test(self, k0: int, k1: int) -> float | None:
+        """When something began to be wrong that was used up to one of k0 to k1."""
+        given = self._filter
+        root, solved = self._innovations_by_kernels(k0, k1)
+        fault = self._bank.follow(
+            k0, k1, given.F, self._steps.decay, self._stack, given.updates, root, solved, given.speeds
+        )
+        if fault is None:
+            return None
+        name, at, since = fault
+        return self.verdicts.settle(name, since, float(self._t[at]))
+
+    def _innovations_by_kernels(self, k0: int, k1: int) -> tuple[Array, Array]:
+        """Roots of S (K, M, M) and S^-1 r (K, M), with the weights that kernels have left at keyframes k0 to k1."""
+        stack = self._stack
+        bent = k0 + np.flatnonzero(np.any(stack.bent[k0:k1] < 1.0, axis=1))
+        if not len(bent):
+            return stack.root, stack.solved
+        roots, solved = stack.root.copy(), stack.solved.copy()
+        for some in (block for k in bent.tolist() for block in stack.together(k)):
+            at, own, weight = some.at, (some.k, some.at[1], some.at[1]), stack.bent[some.at]
+            if np.any((weight > 0.0) & (weight < 1.0)):
+                root = stack.root[own]
+                S = root @ root.T
+                roots[own] = np.linalg.cholesky(S + np.diag(self._filter.variance[at] * (1.0 / weight - 1.0)))
+                solved[at] = np.linalg.solve(roots[own] @ roots[own].T, S @ stack.solved[at])
+        return roots, solved
 
     def _reweigh(self) -> None:
         """Take the blocks in, or not, as fixes are used now."""

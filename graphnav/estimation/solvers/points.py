@@ -64,7 +64,7 @@ class PointFilter:
         self.F[:, :3] = turned @ self.F[:, :3]
         self.Q[:, :3] = turned @ self.Q[:, :3]
         self.Q[:, :, :3] = self.Q[:, :, :3] @ np.swapaxes(turned, -1, -2)
-        self.speed = np.linalg.norm(points.states.v, axis=1)
+        self.speeds = np.linalg.norm(points.states.v, axis=1)
         of_rows = {rows.name: rows.keyframe for rows in problem.constraints}
         self.r, self._sigma, self.H = linearise_all(problem, stack, points, slice(0, n), of_rows)
         self.variance = (self._sigma / stack.root_weight[:n]) ** 2

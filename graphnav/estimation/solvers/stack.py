@@ -129,7 +129,7 @@ class Stack:
         kernel, size = kinds[:, 1:].T.astype(int)
         used = table[7, head].astype(bool)
         return Blocks(
-            first, table[4, head], table[5, last], used, kinds[:, 0].copy(), kernel, size, part, *table[:2, head]
+            first, table[4, head], table[5, last], used, kinds[:, 0].copy(), kernel, size, part, *table[:2, head].copy()
         )
 
     def together(self, k: int) -> Iterator[RowBlock]:

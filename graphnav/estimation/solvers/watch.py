@@ -206,6 +206,9 @@ class Bank:
         self._before, self._keys = np.empty((_REMEMBERED, ends[-1])), np.zeros(_REMEMBERED, dtype=int)
         self._ends = np.zeros(2, dtype=int)
 
+    def __contains__(self, name: str) -> bool:
+        return name in self._slots
+
     def go_back(self, k: int) -> None:
         """To before keyframe k; without any onset where that is too long ago."""
         begin, end = self._ends
@@ -228,8 +231,9 @@ class Bank:
         decay: Array,
         stack: Stack,
         updates: Updates,
+        root: Array,
+        solved: Array,
         speeds: Array,
-        roots: Array,
     ) -> tuple[str, int, float] | None:
         """Follow a filter from keyframe k0 to k1: the kind that finds a fault, where, and when it began, if one does.
 
@@ -237,8 +241,8 @@ class Bank:
         ----------
         F, decay : of its steps, as `graphnav.estimation.solvers.recursion` has them.
         updates : what it has taken in, as `stack` has it, with roots and innovations of all blocks there.
+        root, solved : (K, M, M) and (K, M) of those, with the weights by which they were taken in.
         speeds : (n,) m/s, of the vehicle.
-        roots : (n, M, M) lower roots of S of the updates.
         """
         blocks, names = updates.blocks, list(self._slots)
         kind, limit = stack.find_kinds(names), np.full(len(blocks.begin), np.inf)
@@ -254,7 +258,7 @@ class Bank:
         k, b = k0, int(blocks.first[k0])
         while True:
             k, b = follow_filter(
-                k, k1, b, self._t, F, decay, updates.H, updates.Kt, roots, -updates.w,
+                k, k1, b, self._t, F, decay, updates.H, updates.Kt, root, solved,
                 blocks.first, blocks.begin, blocks.end, updates.taken, kind, limit, self._met,
                 self._layouts, self._scales, self._state, self._before, self._keys, self._ends, self._errors, self._T,
             )  # fmt: skip
