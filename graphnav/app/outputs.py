@@ -175,7 +175,7 @@ def _draw_comparison(outcome: Outcome, folder: Path, provenance: Mapping[str, An
         withheld=outcome.used_withheld,
         outages=outages(outcome.recording),
         findings=_list_findings(outcome),
-        untrusted=outcome.untrusted,
+        defects=outcome.defects,
         provenance=provenance,
         noise=noise_rows(outcome, next(iter(outcome.solutions.values()))),
     )
@@ -235,7 +235,7 @@ def _draw_solver(
         withheld=outcome.used_withheld,
         outages=outages(outcome.recording),
         findings=_list_findings(outcome),
-        untrusted=outcome.untrusted,
+        defects=outcome.defects,
         astray=astray,
         provenance=provenance,
         detectors=detectors,

@@ -43,8 +43,8 @@ def solver_summary(
     astray = find_departures(outcome.solutions).get(name)  # which no solution tells by itself
     doubts = doubts if astray is None else (astray, *doubts)
     timings = {**solution.timings, "evaluation": outcome.timings["evaluation"], **seconds}
-    untrusted = [Finding("untrusted", doubt, key_of(doubt)) for doubt in doubts]
-    messages = dict.fromkeys([*untrusted, *outcome.checks, *(Finding("note", note, key_of(note)) for note in notes)])
+    unreliable = [Finding("unreliable", doubt, key_of(doubt)) for doubt in doubts]
+    messages = dict.fromkeys([*unreliable, *outcome.checks, *(Finding("note", note, key_of(note)) for note in notes)])
     rejected = {key: int(np.sum(r.weight <= 1e-9)) for key, r in solution.records.items()}
     return {
         "solver": name,

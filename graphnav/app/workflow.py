@@ -93,9 +93,9 @@ class Outcome:
     alone: bool = False  # whether the files are written straight into the folder, as for a single solver
 
     @property
-    def untrusted(self) -> tuple[str, ...]:
+    def defects(self) -> tuple[str, ...]:
         """What makes the results wrong altogether, whatever their sigmas say."""
-        return tuple(Note(f.key, f.sentence) for f in self.checks if f.severity == "untrusted")
+        return tuple(Note(f.key, f.sentence) for f in self.checks if f.severity == "unreliable")
 
     @property
     def used_withheld(self) -> tuple[Withheld, ...]:

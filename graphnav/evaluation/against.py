@@ -25,9 +25,9 @@ from graphnav.core.trajectory import Trajectory
 from graphnav.estimation.solution import Solution
 from graphnav.evaluation.metrics import Metrics
 from graphnav.recording import Gnss, Recording
-from graphnav.recording.checks import crosschecks
+from graphnav.recording.checks import crosschecks, tracks
 from graphnav.recording.checks.clock import CLEAR
-from graphnav.recording.checks.crosschecks import Track
+from graphnav.recording.checks.tracks import Track
 from graphnav.recording.formats.trajectories import read_trajectory
 
 _MAX_GAP = 3.0  # s; wider gaps of a trajectory are not filled
@@ -293,7 +293,7 @@ def _show(arm: Array) -> str:
 def _measure_delay(track: Trajectory, reference: Solution) -> float | None:
     """Delay of the speeds in `reference`, s; None where it is ambiguous or within its own error."""
     llh = track.llh if track.frame == "geodetic" else reference.frame.to_llh(np.nan_to_num(track.llh))
-    places = crosschecks.track(Gnss(track.t, llh, np.ones((len(track), 3))))
+    places = tracks.compute_track(Gnss(track.t, llh, np.ones((len(track), 3))))
     # between its keyframes too, where speeds do not change linearly
     t, states, _ = reference.at(np.arange(reference.t[0], reference.t[-1], _SPEED_STEP))
     ours = Track(t, states.v, np.zeros(len(t)), _SPEED_STEP)

@@ -265,7 +265,7 @@ def parameter_table(parameters: Mapping[str, ParameterEstimate]) -> list[Markup]
             value, sigma = one.scale * float(p.value[-1, k]), one.scale * float(p.sigma[-1, k])
             known = "yes" if p.observable[k] else "no: mostly the prior"
             before = one.scale * float(p.prior_sigma[k])
-            shown = [wording.format_measured(value, sigma), wording.format_measured(sigma, sigma), before]
+            shown = [wording.format_to_sigma(value, sigma), wording.format_to_sigma(sigma, sigma), before]
             rows.append([one.words, *shown, one.unit, known])
     head = ["parameter", "value", "sigma", "sigma before", "unit", "seen by the data"]
     return [page.table(head, rows)] if rows else []

@@ -443,8 +443,8 @@ def test_what_cannot_be_trusted_says_so_first(tmp_path, recording):
     assert first_keys(larger) == ["doubt.sigma"]
     late = Note("imu.clock", "the stamps of the IMU are late")
     for path in (
-        write_report(tmp_path / "r.html", recording, larger, settings={}, untrusted=[late]),
-        write_comparison(tmp_path / "c.html", recording, {"ekf": larger}, settings={}, untrusted=[late]),
+        write_report(tmp_path / "r.html", recording, larger, settings={}, defects=[late]),
+        write_comparison(tmp_path / "c.html", recording, {"ekf": larger}, settings={}, defects=[late]),
     ):
         assert checked(path)[0].keys[:2] == ["imu.clock", "doubt.sigma"]
     assert list_doubts({"ekf": solution()}, {"ekf": errors_of(sd=0.02)})

@@ -242,7 +242,7 @@ class Tree:
         for k in keyframes:
             k.version = self.version
 
-    def find_first_changed(self, version: int) -> float:
+    def find_oldest_relinearised(self, version: int) -> float:
         """Number of the oldest keyframe whose factors were replaced after a version; infinite if there is none."""
         return (
             next((k.number for k in self.keyframes if k.version > version), np.inf)

@@ -113,7 +113,7 @@ def eliminate(tree: Tree, so_far: Elimination, most: int) -> Elimination:
 
     Keyframes that came since it began do not count; where rows have been linearised anew, it begins anew.
     """
-    if tree.find_first_changed(so_far.version) <= so_far.newest:
+    if tree.find_oldest_relinearised(so_far.version) <= so_far.newest:
         so_far = begin_elimination(tree, so_far.count, so_far.first)
     if so_far.behind:
         order = fill_keys(gtsam.Ordering(), reversed(so_far.behind[-most:]))

@@ -11,7 +11,8 @@ from graphnav.core.findings import Finding, period_of, runs_of
 from graphnav.core.notes import format_count
 from graphnav.core.running import run_median
 from graphnav.recording import Odometer, Recording, take_rows
-from graphnav.recording.checks.crosschecks import MIN_PAIRS, Track
+from graphnav.recording.checks.crosschecks import MIN_PAIRS
+from graphnav.recording.checks.tracks import Track
 from graphnav.recording.plausibility.fixes import FASTEST
 
 _CLOCK_STEP = 1.0  # s, and ten periods: a silence of the odometer that may be a jump of its clock

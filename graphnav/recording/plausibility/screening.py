@@ -19,11 +19,12 @@ from graphnav.core.findings import Finding, period_of, runs_of
 from graphnav.core.notes import Note, format_count
 from graphnav.core.rotation import Array
 from graphnav.recording import Imu, Recording, take_rows
-from graphnav.recording.checks import crosschecks
+from graphnav.recording.checks import crosschecks, tracks
 from graphnav.recording.checks.aiding import check_imu_axes, check_imu_clock, measure_overlap
 from graphnav.recording.checks.clock import FAIR, ClockOffsets, measure_clock_offsets
-from graphnav.recording.checks.crosschecks import Fit, Track
+from graphnav.recording.checks.crosschecks import Fit
 from graphnav.recording.checks.series import screen_series
+from graphnav.recording.checks.tracks import Track
 from graphnav.recording.formats.schema import FORCE
 from graphnav.recording.plausibility import fixes as plausibility_gnss
 from graphnav.recording.plausibility import odometer as plausibility_odometer
@@ -150,7 +151,7 @@ def _drop_impossible(recording: Recording) -> tuple[Recording, list[Finding], li
         recording, more = plausibility_gnss.screen(recording)
         of_aiding += more
         assert recording.gnss is not None
-        track = crosschecks.track(recording.gnss)
+        track = tracks.compute_track(recording.gnss)
         if track is not None and measure_overlap(recording) <= 0:
             track = None
     if recording.odometer is not None and len(recording.odometer.t):
@@ -202,7 +203,7 @@ def _lacks_gravity(recording: Recording, f: float, steady: float) -> bool:
         return True
     if gnss is None or measure_overlap(recording) <= 0:
         return False
-    track = crosschecks.track(gnss) if (np.abs(imu.accel) < ACCEL_RANGE).all() else None
+    track = tracks.compute_track(gnss) if (np.abs(imu.accel) < ACCEL_RANGE).all() else None
     fit = None if track is None else crosschecks.fit_force(imu, track)
     if fit is None or fit.correlation < FAIR:
         return False
