@@ -30,7 +30,7 @@ HEAD = """\
 # What can go wrong
 
 Mistakes that the tests make on `data/tokyo`, and the [key](keys.md) of what `graphnav info` finds; the first finding
-may be the cause of the others. A note changes nothing; with a warning the result suffers; an untrusted one may be wrong
+may be the cause of the others. A note changes nothing; a warning makes results worse; an unreliable one may be wrong
 whatever its sigmas say; what is refused is not solved. What cannot be read, or is no key, setting or command, is an
 error: exit code 2 and a line that names file, line and column, and what to do.
 """

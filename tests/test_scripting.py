@@ -12,9 +12,11 @@ import sys
 import tomllib
 from pathlib import Path
 
+import numpy as np
 import pytest
 from helpers import full_disk, refuse_command, refused
 
+from graphnav import load, run
 from graphnav.app import cli
 from graphnav.app.terminal import Pace
 from graphnav.config import PROFILES, Settings, read_settings, settings_from, settings_text
@@ -166,6 +168,17 @@ def test_a_profile_is_below_the_file_and_the_flag_above_its_profile(tmp_path):
 def test_settings_as_text_are_the_same_settings(profile):
     given = read_settings(None, profile)
     assert settings_from(tomllib.loads(settings_text(given))) == given
+
+
+def test_how_noise_is_found_can_be_said_in_a_word():
+    drive = load(TOKYO).crop(0.0, 30.0)
+    by_word = run(drive, solvers=("ekf",), noise="stated")["ekf"]
+    by_setting = run(drive, Settings(noise={"mode": "stated"}), solvers=("ekf",))["ekf"]
+    assert not by_word.noise.figures
+    assert np.array_equal(by_word.states.p, by_setting.states.p)
+    with pytest.raises(ConfigError) as refusal:
+        run(drive, noise="states")
+    assert refusal.value.key == "noise.mode"
 
 
 def test_a_profile_of_another_platform_is_refused_and_a_missing_odometer_is_said(tmp_path, capsys):

@@ -26,6 +26,7 @@ from graphnav.app.cli_options import (
 from graphnav.app.talk import Interrupted, say, show
 from graphnav.core.errors import ConfigError
 from graphnav.core.files import permit_outside
+from graphnav.core.notes import format_count
 
 commands = typer.Typer()
 
@@ -125,7 +126,7 @@ def fleet(
         files = [part / "fleet.csv"]
         if tables.write_parquet(rows, part / "fleet.parquet"):
             files.append(part / "fleet.parquet")
-        page.write_page(rows, part / "fleet.html", f"{source.name}: {len(rows)} drives")
+        page.write_page(rows, part / "fleet.html", f"{source.name}: {format_count(len(rows), 'drive')}")
         files.insert(0, part / "fleet.html")
     files = final_path(files, part, folder)
     lacking = "" if len(files) > 2 else "\nno fleet.parquet: pyarrow is not installed"
@@ -141,7 +142,7 @@ def fleet(
     )
     if not any(row["status"] == DONE for row in rows):
         raise ConfigError(
-            f"{source}: none of {len(rows)} drives could be solved; {folder / 'fleet.csv'} says why",
+            f"{source}: none of {format_count(len(rows), 'drive')} could be solved; {folder / 'fleet.csv'} says why",
             key="fleet.none_solved",
         )
 

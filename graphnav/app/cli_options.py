@@ -166,7 +166,7 @@ def choose_solvers(context: typer.Context, names: str) -> tuple[str, ...]:
     from graphnav.core.complaints import split_names
     from graphnav.estimation import pipeline
 
-    return split_names(names, pipeline.KNOWN, _find_typed(context), "solver")
+    return split_names(names, pipeline.KNOWN, _read_option_name(context), "solver")
 
 
 def choose_solver(context: typer.Context, name: str) -> tuple[str, ...]:
@@ -180,13 +180,13 @@ def choose_solver(context: typer.Context, name: str) -> tuple[str, ...]:
     chosen = choose_solvers(context, name)
     if len(chosen) > 1:
         raise ConfigError(
-            f"{_find_typed(context)} {name}: {context.info_name} uses one; several are for graphnav compare",
+            f"{_read_option_name(context)} {name}: {context.info_name} uses one; several are for graphnav compare",
             key="option.value",
         )
     return chosen
 
 
-def _find_typed(context: typer.Context) -> str:
+def _read_option_name(context: typer.Context) -> str:
     """The spelling of --solver that was typed last; --solver where none was."""
     given = [argument.partition("=")[0] for argument in context.obj or ()]
     return next((name for name in reversed(given) if name in ("--solver", "--solvers")), "--solver")

@@ -175,7 +175,7 @@ def _draw_comparison(outcome: Outcome, folder: Path, provenance: Mapping[str, An
         withheld=outcome.used_withheld,
         outages=outages(outcome.recording),
         findings=_list_findings(outcome),
-        untrusted=outcome.untrusted,
+        defects=outcome.defects,
         provenance=provenance,
         noise=noise_rows(outcome, next(iter(outcome.solutions.values()))),
     )
@@ -221,8 +221,10 @@ def _draw_solver(
 ) -> None:
     from graphnav.evaluation.metrics import summary
     from graphnav.report import documents as report
+    from graphnav.report.doubts import find_departures
 
     solution, metrics = outcome.solutions[name], outcome.metrics.get(name)
+    astray = find_departures(outcome.solutions).get(name)
     report.write_report(
         folder / "report.html",
         outcome.recording,
@@ -233,7 +235,8 @@ def _draw_solver(
         withheld=outcome.used_withheld,
         outages=outages(outcome.recording),
         findings=_list_findings(outcome),
-        untrusted=outcome.untrusted,
+        defects=outcome.defects,
+        astray=astray,
         provenance=provenance,
         detectors=detectors,
         noise=noise_rows(outcome, solution),
@@ -247,7 +250,8 @@ def _attempt(write: Callable[[Path], object], path: Path) -> dict[Path, str]:
         write(path)
     except Exception as error:
         path.unlink(missing_ok=True)
-        return {path: f"{path.name} could not be written ({type(error).__name__}: {error})"}
+        why = getattr(error, "strerror", None) or f"{type(error).__name__}: {error}"
+        return {path: f"{path.name} could not be written ({why})"}
     return {}
 
 

@@ -29,7 +29,7 @@ def solver_summary(
 ) -> dict[str, Any]:
     """The content of summary.json; `seconds` are those of writing, by file."""
     from graphnav.evaluation.metrics import summary
-    from graphnav.report.doubts import list_doubts
+    from graphnav.report.doubts import find_departures, list_doubts
 
     solution, metrics = outcome.solutions[name], outcome.metrics.get(name)
     errors = None if metrics is None else summary(metrics)
@@ -40,9 +40,11 @@ def solver_summary(
         nees = {key: value for key, value in errors.items() if key.startswith("nees_")}
         errors = {key: value for key, value in errors.items() if key not in nees}
     doubts = list_doubts({name: solution}, {} if metrics is None or metrics.errors is None else {name: metrics.errors})
+    astray = find_departures(outcome.solutions).get(name)  # which no solution tells by itself
+    doubts = doubts if astray is None else (astray, *doubts)
     timings = {**solution.timings, "evaluation": outcome.timings["evaluation"], **seconds}
-    untrusted = [Finding("untrusted", doubt, key_of(doubt)) for doubt in doubts]
-    messages = dict.fromkeys([*untrusted, *outcome.checks, *(Finding("note", note, key_of(note)) for note in notes)])
+    unreliable = [Finding("unreliable", doubt, key_of(doubt)) for doubt in doubts]
+    messages = dict.fromkeys([*unreliable, *outcome.checks, *(Finding("note", note, key_of(note)) for note in notes)])
     rejected = {key: int(np.sum(r.weight <= 1e-9)) for key, r in solution.records.items()}
     return {
         "solver": name,

@@ -37,7 +37,7 @@ _WIDEST = 1000  # characters of a table
 def run_text(outcome: Outcome, files: Sequence[Path]) -> str:
     """Summary of a run: what was read, findings, errors, and files to look at."""
     lines = [f"warning: {doubt[0].lower()}{doubt[1:]}" for doubt in _list_doubts(outcome)]
-    lines += [f"untrusted: {sentence}" for sentence in outcome.untrusted]
+    lines += [f"unreliable: {sentence}" for sentence in outcome.defects]
     lines.append(_describe_recording(outcome))
     lines += [f"  {source} withheld{'' if span is None else f' {span[0]:g}-{span[1]:g} s'}"
               for source, span in outcome.request.withheld]  # fmt: skip
@@ -45,8 +45,8 @@ def run_text(outcome: Outcome, files: Sequence[Path]) -> str:
     lines += [f"  {line}" for line in _describe_noise(outcome)]
     severity = {f.sentence: f.severity for f in outcome.checks}
     for note in dict.fromkeys([*outcome.findings, *notes]):
-        if key_of(note) in ("noise.imu", "noise.rows") or note in outcome.untrusted:
-            continue  # the report has the full table; what makes a result untrusted is said first
+        if key_of(note) in ("noise.imu", "noise.rows") or note in outcome.defects:
+            continue  # the report has the full table; what makes a result unreliable is said first
         lines.append(f"  {severity.get(note, 'note')}: {note}")
     lines.append("")
     lines += _tabulate_errors(outcome)

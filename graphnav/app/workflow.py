@@ -21,7 +21,7 @@ from graphnav.constraints.base import SAME_TIME
 from graphnav.core.complaints import suggest_nearest
 from graphnav.core.errors import ConfigError, EstimationError, RecordingError
 from graphnav.core.findings import Finding
-from graphnav.core.notes import Note
+from graphnav.core.notes import Note, format_count
 from graphnav.core.progress import Progress, listening, tell
 from graphnav.estimation.noise.model import INTERVALS, NoiseModel
 from graphnav.estimation.solution import Solution
@@ -93,9 +93,9 @@ class Outcome:
     alone: bool = False  # whether the files are written straight into the folder, as for a single solver
 
     @property
-    def untrusted(self) -> tuple[str, ...]:
+    def defects(self) -> tuple[str, ...]:
         """What makes the results wrong altogether, whatever their sigmas say."""
-        return tuple(Note(f.key, f.sentence) for f in self.checks if f.severity == "untrusted")
+        return tuple(Note(f.key, f.sentence) for f in self.checks if f.severity == "unreliable")
 
     @property
     def used_withheld(self) -> tuple[Withheld, ...]:
@@ -284,7 +284,7 @@ def list_unused_noise(noise: NoiseModel, solution: Solution) -> list[str]:
     have = dict.fromkeys(INTERVALS, solution.t) | {name: record.t for name, record in solution.records.items()}
     named = {group.split(".")[0] for group in noise.figures} - {"imu"} | set(noise.weights) | set(noise.excluded)
     notes: list[str] = [
-        Note("noise.file.unused", f"noise model: it has figures of {name}, which is not used here")
+        Note("noise.file.unused", f"noise model: figures of {name}, which this recording does not use")
         for name in sorted(named - set(have))
     ]
     for name, some in noise.weights.items():
@@ -297,7 +297,8 @@ def list_unused_noise(noise: NoiseModel, solution: Solution) -> list[str]:
                 notes.append(
                     Note(
                         "noise.file.rows",
-                        f"noise model: {lost} of the {len(some.t)} rows of {name} that it weighs are not here",
+                        f"noise model: {format_count(lost, 'weight')} of {len(some.t)} for {name} "
+                        "without a row in this recording",
                     )
                 )
     for name, spans in noise.excluded.items():
@@ -306,7 +307,8 @@ def list_unused_noise(noise: NoiseModel, solution: Solution) -> list[str]:
             notes.append(
                 Note(
                     "noise.file.spans",
-                    f"noise model: {lost} of the {len(spans)} spans of {name} that it leaves out hold nothing here",
+                    f"noise model: {format_count(lost, 'excluded span')} of {len(spans)} of {name} "
+                    "without a row in this recording",
                 )
             )
     return notes

@@ -88,7 +88,7 @@ class Constraint(ABC):
     of_stops: ClassVar[bool] = False  # True: its rows exist because the platform is stationary
     turns: ClassVar[bool] = False  # True: a turn of all states about the vertical changes nothing but what the Earth's
     # rate does, neither of the residuals nor of their sigmas
-    passes: ClassVar[int] = 1  # of a filter's update; more for rows that are strongly nonlinear over its uncertainty
+    iterated: ClassVar[bool] = False  # a filter linearises rows where they lead: they are strongly nonlinear
     # blocks for numerical differentiation, where `linearize` gives no Jacobians
     depends_on: ClassVar[tuple[str, ...]] = tuple(BLOCKS)
     words: ClassVar[Mapping[str, tuple[tuple[str, str, float], ...]]] = {}  # of its parameters' numbers, for people:

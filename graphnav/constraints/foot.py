@@ -69,7 +69,7 @@ class Stance(Constraint):
     # the velocity in body axes turns with the attitude, and at a landing a filter predicts a decimetre per second that
     # the foot does not have: linearised there, its updates would seem to observe the heading
     # decimetre per second that the foot does not have: linearised there, it believes to learn of the heading
-    passes: ClassVar[int] = 2
+    iterated: ClassVar[bool] = True
 
     past: IntervalMotion | None = None
     phase: Array = field(default_factory=lambda: np.empty(0))  # (N,) c

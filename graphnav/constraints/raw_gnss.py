@@ -14,6 +14,10 @@ its codes leaves, and for hours; d for seconds the same of velocities; q for hou
 and the atmosphere towards it. How large c and q are for hours is stated: a drive does not tell them from its place.
 The rest the noise model estimates.
 
+Against a base station both kinds of ranges have - h sin(elevation) as well: signals are received at the antennas' phase
+centres, and h is by how much more the rover's is above the point that its lever arm states than the base's above its
+position. A drive does not tell it from its height.
+
 Distances are differences against a nominal place of each epoch, so that no digits are lost.
 """
 
@@ -43,6 +47,7 @@ from graphnav.recording import Recording
 
 BIASES = "gnss_signal_biases"
 IONOSPHERE = "gnss_ionosphere"
+PHASE_CENTRES = "gnss_phase_centres"
 CODE_ERRORS = tuple(f"gnss_code_error_of_{time}" for time in TIMES)
 SATELLITES = "gnss_satellite_errors"
 RATE_ERROR = "gnss_doppler_error"
@@ -56,6 +61,9 @@ AXES = ("horizontal", "horizontal", "up")
 _HOURS, ONE = np.array([1.0, 1.0, 2.0]), 0.7
 _ERROR = np.array([1.0, 1.0, 2.0])  # m, unit of what lasts for seconds and minutes
 _DIFFERENCED = 0.1  # of what lasts for hours, against a base station
+# m, 1-sigma of one antenna less another: calibrated models have their phase centres on L1 7 cm above their reference
+# points, with a standard deviation of 2.5 cm (National Geodetic Survey, absolute calibrations)
+_PHASE_CENTRES, _CENTRES_WALK = 0.035, 1e-5
 _GRADIENT = 2e-6  # of the zenith's delay over the distance to a base station, on an ordinary day (Odijk 2002)
 _RATE_ERROR = np.array([0.05, 0.05, 0.1])  # m/s
 _LEVELS = (45.0, 40.0, 35.0)  # dB-Hz, between the classes of signals that have a variance factor of their own
@@ -77,6 +85,9 @@ def common_fields(scene: BuildContext, found: PreparedRows) -> dict[str, Any]:
                 spacing=found.spacing,
             ),
         )
+    if raw.differenced:
+        size = np.full(1, _PHASE_CENTRES)
+        parameters += (Parameter(PHASE_CENTRES, np.zeros(1), size, "m", _CENTRES_WALK, spacing=found.spacing),)
     return {
         "keyframe": found.keyframe,
         "s_n": found.s_n,
@@ -180,6 +191,10 @@ class RangeConstraint(SatelliteConstraint):
         }
         if LEVER_ARM in parameters:
             J[LEVER_ARM] = -e[:, None] @ states.R_nb
+        if PHASE_CENTRES in parameters:
+            up = np.sin(self.elevation[rows])
+            residual = residual - up * parameters[PHASE_CENTRES][:, 0]
+            J[PHASE_CENTRES] = -up[:, None, None]
         return residual, J, e
 
 

@@ -2,7 +2,7 @@
 
 With what `graphnav.constraints.raw_gnss` says of codes, and N the difference of rover's and base's ambiguity (cycles),
 
-    r_phase   = |s - p_a| + b - m z + T - dt - lambda (phi - N) + e.L c
+    r_phase   = |s - p_a| + b - m z + T - dt - lambda (phi - N) + e.L c - h sin(elevation)
 
 b is the same clock as that of the codes. Rows stay one for each satellite and signal rather than differences between
 satellites: sigmas are then independent, a kernel meets one satellite, and none of them is the reference. What receivers

@@ -10,15 +10,15 @@ from numpy.typing import NDArray
 
 from graphnav.core.rotation import Array
 
-Severity = Literal["note", "warning", "untrusted", "refused"]
-SEVERITIES: tuple[Severity, ...] = ("refused", "untrusted", "warning", "note")  # the most severe first
+Severity = Literal["note", "warning", "unreliable", "refused"]
+SEVERITIES: tuple[Severity, ...] = ("refused", "unreliable", "warning", "note")  # the most severe first
 
 
 @dataclass(frozen=True)
 class Finding:
     """One finding about a recording.
 
-    A *note* changes nothing, results suffer from a *warning*, what is solved with an *untrusted* one may be wrong
+    A *note* changes nothing, results suffer from a *warning*, what is solved with an *unreliable* one may be wrong
     altogether whatever its sigmas say, and with a *refused* one nothing is solved.
     """
 

@@ -20,7 +20,7 @@ from itertools import pairwise
 import numpy as np
 
 from graphnav.config.detectors import FusionSettings
-from graphnav.core.notes import Note
+from graphnav.core.notes import Note, format_count
 from graphnav.core.rotation import Array
 from graphnav.detectors.base import (
     NONE,
@@ -135,14 +135,14 @@ def candidates(scene: Scene, found: Detection) -> tuple[Array, Array, tuple[str,
         notes.append(
             Note(
                 "detectors.speed_known",
-                f"{_count(measured)} smooth but not a stop: odometer or GNSS show that the vehicle moved",
+                f"{_count(measured)} not taken as a stop: odometer or GNSS show motion",
             )
         )
     if moves.sum() > measured:
         notes.append(
             Note(
                 "detectors.speed_felt",
-                f"{_count(int(moves.sum()) - measured)} smooth but not a stop: the force before or after shows a speed",
+                f"{_count(int(moves.sum()) - measured)} not taken as a stop: the force before or after shows motion",
             )
         )
     share = _share_still_in_motion(found, certain)
@@ -153,7 +153,8 @@ def candidates(scene: Scene, found: Detection) -> tuple[Array, Array, tuple[str,
             Note(
                 "detectors.still_in_motion",
                 f"{100.0 * share:.0f} % of the seconds in certain motion are as still as a stop (a simulation without "
-                f"road?): a stop needs a measured speed as well, which {_count(int(unseen.sum()))} without",
+                "road?): a stop needs a measured speed as well, which leaves out "
+                f"{format_count(int(unseen.sum()), 'stretch', 'stretches')}",
             )
         )
     spans = subtract_spans(spans[~moves], certain)
@@ -224,7 +225,7 @@ def _reads_zero(speeds: list[Speeds], span: Array) -> bool:
 
 
 def _count(n: int) -> str:
-    return "1 stretch is" if n == 1 else f"{n} stretches are"
+    return format_count(n, "smooth stretch", "smooth stretches")
 
 
 def _find_speed(speeds: list[Speeds], span: Array) -> float:

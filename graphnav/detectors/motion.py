@@ -16,7 +16,7 @@ from graphnav.core.rotation import Array
 from graphnav.detectors.base import NONE, merge_spans, spans_of, union
 from graphnav.detectors.windows import share_of
 from graphnav.recording import Gnss, Odometer, Recording
-from graphnav.recording.checks.crosschecks import compute_local_positions
+from graphnav.recording.checks.tracks import compute_local_positions
 
 _SIGMAS = 3.0
 _SIGMAS_APART = 6.0  # for differences of positions: their errors wander by more than receivers state

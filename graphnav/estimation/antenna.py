@@ -24,8 +24,8 @@ from graphnav.estimation.noise.apply import with_noise
 from graphnav.estimation.noise.estimate import estimate_noise
 from graphnav.estimation.pipeline import origin
 from graphnav.estimation.problem import build_problem
+from graphnav.estimation.solvers.breakdown import explain_singular
 from graphnav.estimation.solvers.ekf import ekf
-from graphnav.estimation.solvers.gain import describe_singular
 from graphnav.estimation.solvers.rts import backward, rts
 from graphnav.recording import Recording, take_rows
 
@@ -190,7 +190,7 @@ def _estimate(recording: Recording) -> tuple[Antenna, tuple[Array, Array, Array]
         forward = ekf(problem, opening=aligned.until)
         parameters = rts(problem, forward, backward(problem, forward)).parameters
     except np.linalg.LinAlgError as error:
-        raise describe_singular(error) from None
+        raise explain_singular(error) from None
     arm, axle = parameters["gnss_lever_arm"], parameters.get(AXLE)
     antenna = Antenna(recording.gnss.lever_arm, arm.value[-1], arm.sigma[-1])
     if axle is None or recording.odometer is None:

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from graphnav.core.notes import Note
+from graphnav.core.notes import Note, format_count
 from graphnav.core.rotation import Array
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import ExcludedSpan
@@ -44,12 +44,13 @@ def describe_faults(faults: tuple[ExcludedSpan, ...], problem: Problem) -> tuple
         if own:
             longest = max(own, key=lambda f: f.t_end - f.t_start)
             begin = longest.t_start - problem.recording.start
-            where = "in one span" if len(own) == 1 else f"in {len(own)} spans; the longest"
+            many = f"{format_count(sum(f.count for f in own), 'row')} of {len(rows)}"
+            where = "from" if len(own) == 1 else f"in {len(own)} spans, the longest from"
             out.append(
                 Note(
                     "gnss.excluded",
-                    f"{rows.name}: {sum(f.count for f in own)} of {len(rows)} are wrong and left out, "
-                    f"{where}, from {begin:.1f} s for {longest.t_end - longest.t_start:.1f} s, is {longest.reason}",
+                    f"{rows.name}: {many} left out as faulty, {where} {begin:.1f} to "
+                    f"{begin + longest.t_end - longest.t_start:.1f} s: {longest.reason}",
                 )
             )
     return tuple(out)

@@ -125,8 +125,8 @@ def fix(
 def _note(epochs: Epochs, known: Known) -> str:
     every = {arc for arcs in epochs.active.values() for arc in arcs}
     return (
-        f"gnss_phase: {len(known.of)} of {len(every)} arcs of carriers have integer ambiguities; "
-        f"{len(known.let_go)} were let go of"
+        f"gnss_phase: integer ambiguities for {len(known.of)} of {len(every)} carrier-phase arcs, "
+        f"{len(known.let_go)} released"
     )
 
 
@@ -305,7 +305,7 @@ def with_integers(problem: Problem, phase: GnssPhase, found: Sequence[tuple[int,
         keyframe=np.array([k for k, *_ in found]), slots=phase.slots,
         pair=np.array([[index[a], index[b]] for _, a, b, _ in found]),
         cycles=np.array([float(n) for *_, n in found]),
-        parameters=tuple(p for p in phase.parameters if p.name in index),
+        parameters=phase.parameters,  # all, in that order: the columns of ambiguities stay where the carriers' are
     )  # fmt: skip
     return replace(problem, constraints=tuple(sorted((*problem.constraints, whole), key=lambda c: c.name)))
 

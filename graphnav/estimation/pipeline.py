@@ -7,7 +7,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -26,6 +26,7 @@ from graphnav.detectors import check_own as check_detectors
 from graphnav.estimation import faults
 from graphnav.estimation.building import start_sigma
 from graphnav.estimation.long_drives import OVERLAP, crop_solution, shares
+from graphnav.estimation.noise.files import MODES
 from graphnav.estimation.noise.imu_floor import with_measured_floor
 from graphnav.estimation.noise.model import STATED, NoiseModel
 from graphnav.estimation.noise.words import describe_far
@@ -33,8 +34,8 @@ from graphnav.estimation.preparation import prepare
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.separation import separation
 from graphnav.estimation.solution import Solution, join_solutions
+from graphnav.estimation.solvers.breakdown import explain_singular
 from graphnav.estimation.solvers.ekf import ekf
-from graphnav.estimation.solvers.gain import describe_singular
 from graphnav.estimation.solvers.rts import backward, rts
 from graphnav.imu.onboard_offset import without_onboard_offset
 from graphnav.recording import Own, Recording
@@ -52,7 +53,7 @@ def run(
     settings: Settings | None = None,
     solvers: tuple[str, ...] = SOLVERS,
     progress: Progress | None = None,
-    noise: NoiseModel | None = None,
+    noise: NoiseModel | Literal["stated", "estimated"] | None = None,
     constraints: Sequence[type[Constraint]] = (),
     detectors: Sequence[type[Detector]] = (),
 ) -> dict[str, Solution]:
@@ -69,7 +70,7 @@ def run(
     progress
         Function called with a stage and the share of it that is done, 0 to 1.
     noise
-        Noise model of the sensors; when None, estimated or stated as `settings.noise` sets.
+        Noise model of the sensors, or how it is found; when None, as `settings.noise.mode` sets.
     constraints, detectors
         Additional classes of a script.
 
@@ -85,9 +86,15 @@ def run(
     EstimationError
         If the recording does not determine a trajectory.
     ConfigError
-        If the settings' profile is of another platform, or a class of a script is not complete.
+        If the settings' profile is of another platform, a class of a script is not complete, or `noise` is none of
+        these.
     """
     settings = settings or Settings()
+    if noise is not None and not isinstance(noise, NoiseModel):
+        if noise not in MODES:
+            raise ConfigError(f"noise={noise!r}: give a NoiseModel or one of {', '.join(MODES)}", key="noise.mode")
+        settings = settings.model_copy(update={"noise": settings.noise.model_copy(update={"mode": noise})})
+        noise = None
     recording = with_own(recording, constraints, detectors)
     recording, found = screen_recording(recording)
     if (apart := describe_gnss_apart(recording)) is not None:  # it would be solved as if there were no GNSS
@@ -172,7 +179,7 @@ def _solve_with_retry(
             return {name: replace(one, notes=(note, *one.notes)) for name, one in again.items()}
         if isinstance(error, EstimationError):
             raise
-        raise describe_singular(error) from None
+        raise explain_singular(error) from None
 
 
 def _simplify(settings: Settings, noise: NoiseModel | None) -> Iterator[tuple[Settings, NoiseModel | None, Note]]:
@@ -180,12 +187,16 @@ def _simplify(settings: Settings, noise: NoiseModel | None) -> Iterator[tuple[Se
     still = settings.standstill.model_copy(update={"held_position": False})
     if settings.standstill.held_position:
         settings = settings.model_copy(update={"standstill": still})
-        yield settings, noise, Note("standstill.not_held", "places of stops are not held, because it failed with them")
+        yield (
+            settings,
+            noise,
+            Note("standstill.not_held", "the position at stops is not held: the solver failed with it"),
+        )
     if noise is None and settings.noise.mode != "stated":
         yield (
             settings,
             STATED,
-            Note("noise.not_estimated", "noise is as stated, and no fix is left out, because estimating it failed"),
+            Note("noise.not_estimated", "noise as stated and no fix left out: estimating the noise failed"),
         )
 
 
@@ -248,8 +259,8 @@ def _solve(
         if not settings.solver.isam2_lag and one.cost is not None and one.cost > best + _CLEARLY_BETTER:
             note = Note(
                 "solver.worse_optimum",
-                "isam2 ended in an optimum that explains the data worse than that of rts: do not trust it "
-                f"(half chi-square {one.cost:.0f}, not {best:.0f})",
+                f"isam2 converged to a worse optimum than rts (half chi-square {one.cost:.0f}, not {best:.0f}): do not "
+                "trust it",
             )
             out["isam2"] = replace(one, notes=(note, *one.notes))
     timings = {"detection": detection, **found.timings}

@@ -13,7 +13,7 @@ from graphnav.constraints import kinds_for
 from graphnav.constraints.base import SAME_TIME, BuildContext, Constraint
 from graphnav.constraints.prior import InitialPrior
 from graphnav.core.earth import LocalFrame
-from graphnav.core.notes import Note
+from graphnav.core.notes import Note, format_count
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, Parameter, States
 from graphnav.imu.clipping import with_whole_peaks
@@ -238,8 +238,8 @@ def _describe_samples(samples: Samples, recording: Recording) -> tuple[str, ...]
     return (
         Note(
             "imu.gaps_bridged",
-            f"{len(length)} gaps in the IMU bridged ({length.sum():.2f} s in all, longest {length[worst]:.2f} s at "
-            f"{samples.bridged[worst, 0] - recording.start:.1f} s): uncertainty grows there by the typical change "
-            "of the signal over such a time",
+            f"{format_count(len(length), 'gap')} in the IMU bridged ({length.sum():.2f} s in all, the longest "
+            f"{length[worst]:.2f} s at {samples.bridged[worst, 0] - recording.start:.1f} s): process noise there as "
+            "large as the signal typically changes over such a time",
         ),
     )

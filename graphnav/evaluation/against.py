@@ -25,9 +25,9 @@ from graphnav.core.trajectory import Trajectory
 from graphnav.estimation.solution import Solution
 from graphnav.evaluation.metrics import Metrics
 from graphnav.recording import Gnss, Recording
-from graphnav.recording.checks import crosschecks
+from graphnav.recording.checks import crosschecks, tracks
 from graphnav.recording.checks.clock import CLEAR
-from graphnav.recording.checks.crosschecks import Track
+from graphnav.recording.checks.tracks import Track
 from graphnav.recording.formats.trajectories import read_trajectory
 
 _MAX_GAP = 3.0  # s; wider gaps of a trajectory are not filled
@@ -101,7 +101,7 @@ def read_against(asked: Against, name: str, recording: Recording, reference: Sol
     notes = list(track.notes)
     if asked.shift is not None:
         track = replace(track, t=track.t + asked.shift)
-        notes.append(Note("against.shift", f"{asked.path.name}: {asked.shift:+g} s, as was asked"))
+        notes.append(Note("against.shift", f"{asked.path.name}: stamps shifted by {asked.shift:+g} s, as asked"))
     else:
         shift, words = _shift(asked.path, track, recording, reference)
         track = replace(track, t=track.t + shift)
@@ -139,7 +139,7 @@ def read_against(asked: Against, name: str, recording: Recording, reference: Sol
         notes.append(
             Note(
                 "against.no_attitude",
-                f"{asked.path.name}: has no attitude; points of the body are placed by that of {reference.solver}",
+                f"{asked.path.name}: has no attitude; that of {reference.solver} places its lever arm",
             )
         )
     if np.any(arm):
@@ -164,11 +164,19 @@ def _shift(path: Path, track: Trajectory, recording: Recording, reference: Solut
     if track.t[-1] > recording.start and track.t[0] < recording.end:
         shift = 0.0
     elif known is not None and abs(track.t[0] + known.offset - recording.start) < NEAR:
-        shift, notes = known.offset, [Note("against.clock", f"{path.name}: {known.offset:+.0f} s: {known.words}")]
+        shift, notes = (
+            known.offset,
+            [Note("against.clock", f"{path.name}: stamps shifted by {known.offset:+.0f} s: {known.words}")],
+        )
     elif abs(track.t[0]) < NEAR:
         shift, notes = (
             own_start,
-            [Note("against.clock", f"{path.name}: {own_start:+.3f} s: it counts from a start of its own")],
+            [
+                Note(
+                    "against.clock",
+                    f"{path.name}: stamps shifted by {own_start:+.3f} s: they count from the file's own start",
+                )
+            ],
         )
     else:
         return 0.0, []  # given by the caller
@@ -179,14 +187,17 @@ def _shift(path: Path, track: Trajectory, recording: Recording, reference: Solut
         word = "early" if late > 0.0 else "late"
         return shift, [
             *notes,
-            Note("against.late", f"{path.name}: its speed is {abs(late):.3f} s {word} against ours: left as it is"),
+            Note("against.late", f"{path.name}: by its speed {abs(late):.3f} s {word} against ours; not corrected"),
         ]
     leap = ""
     if abs(abs(late) - LEAP) < 0.1:
         late, leap = float(np.copysign(LEAP, late)), ": the leap seconds between UTC and GPS time"
     return shift + late, [
         *notes,
-        Note("against.late", f"{path.name}: {late:+.3f} s more, by which its speed fits ours{leap}"),
+        Note(
+            "against.late",
+            f"{path.name}: stamps shifted by another {late:+.3f} s, where its speed agrees with ours{leap}",
+        ),
     ]
 
 
@@ -269,8 +280,8 @@ def _find_other_point(
     return [
         Note(
             "against.other_point",
-            f"{path.name}: it fits ours as the trajectory of {best} ({misses[best]:.2f} m off where it is "
-            f"{miss(arm):.2f} m as stated): look at --against-point, or at lever_arm in [gnss]",
+            f"{path.name}: {misses[best]:.2f} m from ours if taken as the trajectory of {best}, "
+            f"{miss(arm):.2f} m as stated: look at --against-point, or at lever_arm in [gnss]",
         )
     ]
 
@@ -282,7 +293,7 @@ def _show(arm: Array) -> str:
 def _measure_delay(track: Trajectory, reference: Solution) -> float | None:
     """Delay of the speeds in `reference`, s; None where it is ambiguous or within its own error."""
     llh = track.llh if track.frame == "geodetic" else reference.frame.to_llh(np.nan_to_num(track.llh))
-    places = crosschecks.track(Gnss(track.t, llh, np.ones((len(track), 3))))
+    places = tracks.compute_track(Gnss(track.t, llh, np.ones((len(track), 3))))
     # between its keyframes too, where speeds do not change linearly
     t, states, _ = reference.at(np.arange(reference.t[0], reference.t[-1], _SPEED_STEP))
     ours = Track(t, states.v, np.zeros(len(t)), _SPEED_STEP)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -11,6 +12,7 @@ from graphnav.core.sample_size import chi_square_band, chi_square_quantile, effe
 from graphnav.evaluation.metrics import Errors, over_sigmas
 
 _TOO_SMALL, _CAUTIOUS = 1.5, 0.5  # error over sigma; what lies between is acceptable
+PARTS = {"position": "height", "attitude": "heading"}  # judged by themselves as well
 _BY_CHANCE = 0.0027  # outside three standard deviations of a Gaussian
 
 
@@ -18,11 +20,12 @@ _BY_CHANCE = 0.0027  # outside three standard deviations of a Gaussian
 class BlockVerdict:
     """The verdict on the sigmas of one block of errors."""
 
-    block: str  # position, velocity, attitude or heading
+    block: str  # position, height, velocity, attitude or heading
     size: float  # error over sigma, rms
     inside: float  # share of epochs within the region that holds 99.7 % of a Gaussian's
     effective: float  # number of independent epochs that they are equivalent to
     verdict: str  # "too small", "unclear", "cautious" or "fits"
+    rest: str = ""  # verdict of position without height, or of attitude without heading
 
 
 def judge_sigmas(errors: Errors) -> tuple[BlockVerdict, ...]:
@@ -30,17 +33,35 @@ def judge_sigmas(errors: Errors) -> tuple[BlockVerdict, ...]:
 
     A sigma is too small where errors are more than 1.5 times as large and chance (three standard deviations) does not
     explain it for as many independent epochs. Where it may, as for an error that hardly changes and so counts once, it
-    is unclear.
+    is unclear. Height and heading are judged by themselves as well: an average over three axes would hide a wrong one.
     """
     p, v, rph = over_sigmas(errors)
-    blocks = [("position", errors.nees_p, errors.dof_p, p), ("velocity", errors.nees_v, 3, v),
-              ("attitude", errors.nees_rph, 3, rph)]  # fmt: skip
-    if not np.isfinite(errors.nees_p).any():  # a covariance that is not invertible still has sigmas
-        size = np.mean(errors.nees_axis[:, : errors.dof_p], axis=1)
-        blocks[0] = ("position", size * errors.dof_p, errors.dof_p, p)
-    if errors.nees_heading is not None:  # an average over three angles would hide a wrong one
-        blocks.append(("heading", errors.nees_heading, 1, rph[:, 2:]))
-    return tuple(_judge(name, x, dof, z) for name, x, dof, z in blocks if np.isfinite(x).any())
+    nees_p = errors.nees_p
+    if not np.isfinite(nees_p).any():  # a covariance that is not invertible still has sigmas
+        nees_p = np.sum(errors.nees_axis[:, : errors.dof_p], axis=1)
+    out = []
+    for block, nees, dof, z, nees_part in (
+        ("position", nees_p, errors.dof_p, p, errors.nees_axis[:, 2] if errors.dof_p == 3 else None),
+        ("velocity", errors.nees_v, 3, v, None),
+        ("attitude", errors.nees_rph, 3, rph, errors.nees_heading),
+    ):
+        if not np.isfinite(nees).any():
+            continue
+        whole = _judge(block, nees, dof, z)
+        if nees_part is None or not np.isfinite(nees_part).any():
+            out.append(whole)
+            continue
+        level = np.sum(z[:, :2] ** 2, axis=1)
+        rest = _judge(block, level, 2, z[:, :2]).verdict if np.isfinite(level).any() else ""
+        out += [replace(whole, rest=rest), _judge(PARTS[block], nees_part, 1, z[:, 2:])]
+    return tuple(out)
+
+
+def select_verdict(judged: Sequence[BlockVerdict], verdict: str) -> list[BlockVerdict]:
+    """The blocks of a verdict; height stands for position, and heading for attitude, where the rest has another."""
+    found = {j.block: j for j in judged if j.verdict == verdict}
+    explained = {whole for whole, part in PARTS.items() if part in found and whole in found}
+    return [j for j in found.values() if j.block not in explained or j.rest == verdict]
 
 
 def _judge(block: str, nees: Array, dof: int, over_sigma: Array) -> BlockVerdict:

@@ -77,7 +77,7 @@ def place(
         remarks.append(Note("raw.no_ephemeris", f"no ephemeris for {names}: their observations are not used"))
     if ill:
         names = ", ".join(satellite_name(s) for s in ill)
-        remarks.append(Note("raw.unhealthy", f"unhealthy by their own word and not used: {names}"))
+        remarks.append(Note("raw.unhealthy", f"marked unhealthy in the navigation data, not used: {names}"))
     partly = sorted(lost - set(lost_all))
     if partly:
         names = ", ".join(satellite_name(s) for s in partly)

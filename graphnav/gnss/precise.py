@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphnav.core.errors import RecordingError
-from graphnav.core.notes import Note
+from graphnav.core.notes import Note, format_count
 from graphnav.core.rotation import Array
 from graphnav.core.timescales import utc_to_gps
 from graphnav.gnss.ephemeris import Placed, rotate_earth
@@ -54,6 +54,19 @@ class Orbits:
             out.clock[own] = clock - 2.0 * np.sum(p * v, axis=1) / C**2
         return out
 
+    def clock_noise(self) -> dict[int, tuple[float, float]]:
+        """By satellite how far its clock is off a line between two nodes (m, 1-sigma in the middle), and their spacing.
+
+        Between them a clock is a random walk. Of variance q h over a spacing h (s), its second differences have 2 q h
+        and the middle of a line has q h / 4; a median of their sizes says q.
+        """
+        out = {}
+        for one, (t, clock) in self.clock.items():
+            if len(t) > _NODES:
+                size = 1.4826 * float(np.median(np.abs(np.diff(clock, 2))))
+                out[one] = C * size / np.sqrt(8.0), float(np.median(np.diff(t)))
+        return out
+
 
 def read_precise(sp3: list[Path], clk: list[Path]) -> Orbits:
     """Orbits and clocks of some files; those of clock files go before those of orbit files.
@@ -82,7 +95,7 @@ def read_precise(sp3: list[Path], clk: list[Path]) -> Orbits:
         (
             Note(
                 "raw_gnss.orbit_short",
-                f"{len(few)} satellites have fewer than {_NODES} nodes in {sp3[0].name} and no orbit",
+                f"{format_count(len(few), 'satellite')} with fewer than {_NODES} nodes in {sp3[0].name}: no orbit",
             ),
         )
         if few

@@ -13,7 +13,7 @@ import numpy as np
 
 from graphnav.core.errors import RecordingError
 from graphnav.core.files import parse_number
-from graphnav.core.notes import Note
+from graphnav.core.notes import Note, format_count
 from graphnav.core.timescales import WEEK, utc_to_gps
 from graphnav.gnss.ephemeris import Ephemerides, Glonass, Kepler
 from graphnav.gnss.files import calendar_days, read_bytes
@@ -52,7 +52,7 @@ def read_navigation(paths: list[Path]) -> Ephemerides:
         _read(path, found)
         if found.broken:
             sentence = (
-                f"{len(found.broken)} records cannot be read and are left out (the first at line {found.broken[0]})"
+                f"{format_count(len(found.broken), 'unreadable record')} left out (the first at line {found.broken[0]})"
             )
             remarks.append(Note("raw.broken_records", f"{path.name}: {sentence}"))
         if found.skipped:

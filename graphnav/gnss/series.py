@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphnav.core.errors import RecordingError
-from graphnav.core.notes import Note
+from graphnav.core.notes import Note, format_count
 from graphnav.core.rotation import Array
 from graphnav.gnss.antex import Antennas
 from graphnav.gnss.signals import C, Ids, frequencies
@@ -116,7 +116,10 @@ def once(obs: Observations) -> Observations:
         return out
     return replace(
         out,
-        remarks=(*out.remarks, Note("raw.twice", f"{twice} observations are there twice; the first of each is used")),
+        remarks=(
+            *out.remarks,
+            Note("raw.twice", f"{format_count(twice, 'repeated observation')} left out; the first of each is used"),
+        ),
     )
 
 
@@ -127,7 +130,7 @@ def _drop_impossible(obs: Observations) -> Observations:
     if not bad.any():
         return obs
     code, carrier, doppler = (np.where(bad, np.nan, x) for x in (obs.code, obs.carrier, obs.doppler))
-    sentence = f"{bad.sum()} observations are beyond what a receiver can measure and are left out"
+    sentence = f"{format_count(bad.sum(), 'observation')} beyond what a receiver can measure, left out"
     remark = Note("raw.impossible", sentence)
     return replace(obs, code=code, carrier=carrier, doppler=doppler, remarks=(*obs.remarks, remark))
 
@@ -181,6 +184,8 @@ class RawGnss:
     files: tuple[str, ...] = ()
     precise: bool = False  # placed by precise orbits and clocks
     antennas: Antennas = field(default_factory=dict)  # of the satellites, where an ANTEX file is given
+    # by satellite, as `graphnav.gnss.precise.Orbits.clock_noise` says
+    clock_noise: dict[int, tuple[float, float]] = field(default_factory=dict)
     catalogue: Catalogue | None = None  # of the series that this is a piece of
 
     def __len__(self) -> int:

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from graphnav.core.errors import RecordingError
-from graphnav.core.notes import Note
+from graphnav.core.notes import Note, format_count
 from graphnav.core.timescales import WEEK
 from graphnav.gnss.ephemeris import Ephemerides
 from graphnav.gnss.messages import Decoder
@@ -22,7 +22,7 @@ from graphnav.gnss.signals import BEIDOU, GALILEO, GLONASS, GPS, NAVIC, QZSS, SB
 SYNC = b"\xb5\x62"
 _RAWX, _SFRBX = (0x02, 0x15), (0x02, 0x13)
 _SYSTEM = {0: GPS, 1: SBAS, 2: GALILEO, 3: BEIDOU, 5: QZSS, 6: GLONASS, 7: NAVIC}  # gnssId
-_SIGNAL = {
+SIGNALS = {  # gnssId and sigId
     (0, 0): "1C", (0, 3): "2L", (0, 4): "2S", (0, 6): "5I", (0, 7): "5Q", (1, 0): "1C",
     (2, 0): "1C", (2, 1): "1B", (2, 3): "5I", (2, 4): "5Q", (2, 5): "7I", (2, 6): "7Q", (2, 8): "6B", (2, 9): "6C",
     (3, 0): "2I", (3, 1): "2I", (3, 2): "7I", (3, 3): "7I", (3, 4): "6I", (3, 5): "1P", (3, 6): "1D", (3, 7): "5P",
@@ -67,7 +67,7 @@ def parse_ubx(data: bytes, path: Path) -> tuple[Observations, Ephemerides]:
         raise RecordingError(f"{path}: no RXM-RAWX messages; switch them on in the receiver", key="raw.no_messages")
     remarks = []
     if found.broken:
-        remarks.append(Note("raw.broken_records", f"{path.name}: {found.broken} broken frames were skipped"))
+        remarks.append(Note("raw.broken_records", f"{path.name}: {format_count(found.broken, 'broken frame')} skipped"))
     if found.cut:
         remarks.append(note_cut(path.name, "message"))
     week0 = found.times[0][1]
@@ -75,13 +75,13 @@ def parse_ubx(data: bytes, path: Path) -> tuple[Observations, Ephemerides]:
     rows = np.concatenate(found.rows)
     t = np.repeat(t_of, [len(x) for x in found.rows])
     system = np.array([_SYSTEM.get(int(g), -1) for g in range(256)])[rows["gnss"]]
-    names = {key: signal_id(name) for key, name in _SIGNAL.items()}
+    names = {key: signal_id(name) for key, name in SIGNALS.items()}
     signal = np.full(len(rows), -1, dtype=np.int16)
     for (gnss, sig), one in names.items():
         signal[(rows["gnss"] == gnss) & (rows["sig"] == sig)] = one
     known = (signal >= 0) & (system >= 0) & (rows["sv"] > 0) & (rows["sv"] < 255)
     if not known.all():
-        sentence = f"{int((~known).sum())} measurements of signals that are not known are left out"
+        sentence = f"{format_count((~known).sum(), 'measurement')} of unknown signals left out"
         remarks.append(Note("raw.unknown_signals", f"{path.name}: {sentence}"))
     number = np.where(rows["gnss"] == 1, rows["sv"].astype(int) - 100, rows["sv"])
     satellite = (100 * system + number).astype(np.int16)

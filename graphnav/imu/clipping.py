@@ -21,7 +21,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from graphnav.core.notes import Note
+from graphnav.core.notes import Note, format_count
 from graphnav.core.rotation import Array
 from graphnav.imu.samples import Samples
 from graphnav.recording import Imu
@@ -131,8 +131,8 @@ def with_whole_peaks(samples: Samples, R_bs: Array, known: Array | None = None) 
             notes.append(
                 Note(
                     "imu.clipped",
-                    f"{what} {'xyz'[axis]} (file axes) ends at {limit:.3g} {unit}: {len(peaks)} clipped peaks were "
-                    "restored from their sides",
+                    f"{what} {'xyz'[axis]} (file axes) is clipped at {limit:.3g} {unit}: "
+                    f"{format_count(len(peaks), 'peak')} restored from the flanks",
                 )
             )
         if cut:

@@ -9,6 +9,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from graphnav.config.raw_gnss import RawGnssSettings
+from graphnav.core.complaints import shorten, suggest_nearest
+from graphnav.core.errors import RecordingError
 from graphnav.core.rotation import Array
 from graphnav.online.buffers import SAME, Buffer
 from graphnav.online.fixes import Fixes
@@ -27,7 +29,7 @@ from graphnav.recording import Odometer, Recording
 from graphnav.recording.formats.repair import LATEST
 
 AHEAD = 60.0  # s; stamps of other sensors that are further before the IMU's are wrong
-_WIDTH = {"imu": 6, "odometer": 6}
+_WIDTH = {"imu": 6, "gnss": 12, "odometer": 6}
 _TOLD = {"gnss": 3, "odometer": 1}  # number of values by which a repeated row is recognised
 _NAN = float("nan")
 
@@ -60,9 +62,11 @@ class Sensors:
     _reach: Reach = field(default_factory=Reach)
     _before: set[tuple[str | float, ...]] = field(default_factory=set)  # fixes and readings of the earlier clock
     _neighbours: Neighbours = field(init=False)
+    _widths: dict[str, int] = field(init=False)  # number of values of a row, by sensor
 
     def __post_init__(self) -> None:
         self.others = {name: Buffer(len(series.sensor.names)) for name, series in self.setup.sensors.items()}
+        self._widths = _WIDTH | {name: len(series.sensor.names) for name, series in self.setup.sensors.items()}
         self.gnss = Fixes(self.setup.gnss)
         # for a foot, of rates only: an impact lasts for less than a row
         self._neighbours = Neighbours(3 if self.setup.platform == "foot" else 6)
@@ -78,6 +82,30 @@ class Sensors:
     @property
     def _all(self) -> dict[str, Buffer | RawEpochs]:
         return {"imu": self.imu, **self.aiding}
+
+    def check_form(self, row: Row) -> None:
+        """Raise an error for what is no row, before anything is done with it.
+
+        Raises
+        ------
+        RecordingError
+            If it names no sensor, or its values are not as many numbers as the sensor's rows have.
+        """
+        try:
+            sensor, t, values = row
+            width, count = self._widths.get(sensor), len(values)
+            math.isnan(sum(() if sensor == RAW else values, t))  # fails unless all are numbers
+        except (TypeError, ValueError, OverflowError):
+            raise RecordingError(f"no row (sensor, time, numbers): {shorten(row)}", key="row.form") from None
+        if width is None and sensor != RAW:
+            known = suggest_nearest(str(sensor), (*self._widths, RAW))
+            raise RecordingError(f"row at t = {t}: no sensor '{sensor}'; {known}", key="row.name")
+        if width is not None and count != width:
+            raise RecordingError(
+                f"{sensor} row at t = {t}: needs {width} numbers, not {count}; Fix, ImuSample, WheelSpeed and Reading "
+                "of graphnav.online make rows",
+                key="row.form",
+            )
 
     def newest(self, sensor: str) -> float:
         """Newest time of a sensor, s."""

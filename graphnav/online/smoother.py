@@ -290,7 +290,7 @@ class Smoother:
         try:
             found = judgement.answer()
         except Exception as error:
-            self.notes.append(Note("online.not_judged", f"not judged again: {error}"))
+            self.notes.append(Note("online.not_judged", f"noise and faults not estimated again: {error}"))
             self._tentative = False
             return
         self._say("noise", found.notes)

@@ -40,8 +40,14 @@ class Online(Smoother):
     def add(self, row: Row, released: bool = False) -> None:
         """Process one row: sensor, time, values and whether it was held, as in
         `graphnav.online.sensors.Sensors.add`.
+
+        Raises
+        ------
+        RecordingError
+            If it is no row of a known sensor with as many numbers as that has; nothing is done with it then.
         """
         sensors, rows = self.sensors, [(row, released)]
+        sensors.check_form(row)
         self._rows += 1
         if self._rows >= _REPORTED_AFTER and not self._rows & (self._rows - 1):  # at powers of two
             self._say("counts", check_counts(sensors.counts))

@@ -44,7 +44,8 @@ def write_report(
     withheld: Withheld = (),
     outages: Spans = (),
     findings: Sequence[str] = (),
-    untrusted: Sequence[str] = (),
+    defects: Sequence[str] = (),
+    astray: str | None = None,
     provenance: Mapping[str, Any] | None = None,
     detectors: Sequence[Markup] | None = None,
     noise: Sequence[FigureRow] = (),
@@ -59,7 +60,8 @@ def write_report(
     withheld : (source, span), span in s from the recording's start or None for all of it.
     outages : s from the start, where the recording itself has no fixes.
     findings : sentences about what was odd in the recording.
-    untrusted : those of them that make the result wrong whatever its sigmas say; the report begins with them.
+    defects : those of them that make the result wrong whatever its sigmas say; the report begins with them.
+    astray : a sentence if another solver of the same run contradicts this one; likewise.
     provenance : version, input hashes and the like, plain values; `options` are those of the command.
     detectors : of `detector_pictures`, for who writes several reports of one recording; drawn here if None.
     noise : figures of the noise model, of `graphnav.estimation.noise.table.figure_rows`.
@@ -147,7 +149,8 @@ def write_report(
         ("Provenance", provenance_tables(settings, provenance)),
     ]
     lead = [
-        *_list_doubts(untrusted, only, every),
+        *([] if astray is None else [page.paragraph(astray, "verdict bad")]),
+        *_list_doubts(defects, only, every),
         page.paragraph(words.describe_run(recording, only, withheld, outages)),
         summary.verdicts(solution, errors),
         *words.describe_closure(name, metrics),
@@ -171,7 +174,7 @@ def write_comparison(
     withheld: Withheld = (),
     outages: Spans = (),
     findings: Sequence[str] = (),
-    untrusted: Sequence[str] = (),
+    defects: Sequence[str] = (),
     provenance: Mapping[str, Any] | None = None,
     noise: Sequence[FigureRow] = (),
 ) -> Path:
@@ -217,7 +220,7 @@ def write_comparison(
         ("Provenance", provenance_tables(settings, provenance)),
     ]
     lead = [
-        *_list_doubts(untrusted, solutions, every),
+        *_list_doubts(defects, solutions, every),
         page.paragraph(words.describe_run(recording, solutions, withheld, outages)),
         *_verdicts(solutions, every),
         *(note for name, values in metrics_of.items() for note in words.describe_closure(name, values)),
@@ -249,10 +252,10 @@ def _shades(solution: Solution, start: float, withheld: Withheld, outages: Spans
 
 
 def _list_doubts(
-    untrusted: Sequence[str], solutions: Mapping[str, Solution], errors: Mapping[str, Errors]
+    defects: Sequence[str], solutions: Mapping[str, Solution], errors: Mapping[str, Errors]
 ) -> list[Markup]:
     """Reasons why the result cannot be trusted, if any."""
-    found = [Note(key_of(one), f"This result cannot be trusted: {one}") for one in untrusted]
+    found = [Note(key_of(one), f"This result cannot be trusted: {one}") for one in defects]
     return [page.paragraph(doubt, "verdict bad") for doubt in (*found, *list_doubts(solutions, errors))]
 
 

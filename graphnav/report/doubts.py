@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from graphnav.core.notes import Note, key_of
+from graphnav.core.sample_size import chi_square_quantile
+from graphnav.core.state import BLOCKS
 from graphnav.estimation.noise.apply import row_weights
 from graphnav.estimation.solution import Solution
 from graphnav.evaluation.against import own_solutions
@@ -18,31 +20,61 @@ if TYPE_CHECKING:
     from graphnav.evaluation.metrics import Errors
 
 FEWEST_ROWS = 10  # rows needed to judge a sigma
+_BY_INFORMATION = "batch rts isam2 incremental ekf"  # the most first
+_BY_CHANCE = 0.0027  # outside three standard deviations of a Gaussian, in a whole drive
+_ROUNDING = 1e-12  # m^2, a micrometre
 _LARGEST_EXCLUDED_SHARE = 0.5  # share of the fixes' information; above it most measurements contradict the result
 TOO_LARGE = {"innovation": 1.5, "residual": 1.15}  # RMS over sigma; a fit reduces residuals
 
 
+def find_departures(solutions: Mapping[str, Solution]) -> dict[str, Note]:
+    """The solvers whose positions are farther from those of the most informed solver than chance allows, and how far.
+
+    Solvers of one recording use the same measurements: what one knows less than another is in its covariance, which is
+    therefore that of the difference or more.
+    """
+    out = {}
+    solutions = own_solutions(solutions)
+    for name, one in solutions.items():
+        solver, dash, coupling = name.partition("-")
+        others = [better + dash + coupling for better in _BY_INFORMATION.partition(solver)[0].split()]
+        best = next((other for other in others if other in solutions), None)
+        if best is None or not np.array_equal(one.t, solutions[best].t):
+            continue
+        off = one.states.p - solutions[best].states.p
+        P = one.covariance[:, BLOCKS["p"], BLOCKS["p"]]
+        known = np.isfinite(P).all(axis=(1, 2))
+        off, P = off[known], P[known] + _ROUNDING * np.eye(3)
+        over = np.sqrt(np.einsum("ki,ki->k", off, np.linalg.solve(P, off[:, :, None])[:, :, 0]))
+        size = np.linalg.norm(off, axis=1)
+        beyond = np.flatnonzero(over > np.sqrt(chi_square_quantile(1.0 - _BY_CHANCE / max(len(off), 1), 3)))
+        if len(beyond):
+            k = beyond[np.argmax(size[beyond])]
+            far = f"up to {size[k]:.2g} m from {best}, {over[k]:.2g} times its own sigma"
+            out[name] = Note("doubt.solver", f"The trajectory of {name} cannot be trusted: {far}")
+    return out
+
+
 def list_doubts(solutions: Mapping[str, Solution], errors: Mapping[str, Errors]) -> tuple[str, ...]:
     """Reasons why a result cannot be trusted, as sentences; none if there are none."""
-    from graphnav.evaluation.sigmas import judge_sigmas
+    from graphnav.evaluation.sigmas import judge_sigmas, select_verdict
 
-    out = []
+    out: list[str] = list(find_departures(solutions).values())
     solutions = own_solutions(solutions)
     errors = {name: e for name, e in errors.items() if name in solutions}
     for solution in solutions.values():
         fixes = solution.records.get("gnss_position")
         left_out = 0.0 if fixes is None else 1.0 - float(np.mean(row_weights(fixes.t, solution.noise, "gnss_position")))
         if left_out > _LARGEST_EXCLUDED_SHARE:
-            words = f"This result cannot be trusted: {100 * left_out:.0f} % of what the fixes say contradicts the rest "
-            out.append(Note("doubt.left_out", words + "and is left out"))
+            words = f"This result cannot be trusted: {100 * left_out:.0f} % of the fixes' information contradicts the "
+            out.append(Note("doubt.left_out", words + "other measurements and is left out"))
             break  # all solvers use the same noise model
     notes = dict.fromkeys(note for solution in solutions.values() for note in solution.notes)
     out += [Note(key, note) for note in notes if (key := key_of(note)) == "doubt.axes"]
     sizes: dict[str, list[str]] = {}
     for name, e in errors.items():
-        for j in judge_sigmas(e):
-            if j.verdict == "too small":
-                sizes.setdefault(j.block, []).append(f"{j.size:.2g} ({name})")
+        for j in select_verdict(judge_sigmas(e), "too small"):
+            sizes.setdefault(j.block, []).append(f"{j.size:.2g}" + (f" ({name})" if len(errors) > 1 else ""))
     wrong = [f"{block} errors are {and_list(each)} times their sigma" for block, each in sizes.items()]
     if not errors:
         filters = [s for s in solutions.values() if any(r.kind == "innovation" for r in s.records.values())]

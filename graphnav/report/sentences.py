@@ -65,8 +65,7 @@ def describe_run(recording: Recording, solutions: Mapping[str, Solution], withhe
         words += f" Withheld: {and_list(listed)} (seconds from the start)."
     spans = solution.stationary
     if len(spans) and recording.platform == "vehicle":
-        stops = "1 stop was" if len(spans) == 1 else f"{len(spans)} stops were"
-        words += f" {stops} found, {np.diff(spans).sum():.0f} s in all."
+        words += f" Found: {format_count(len(spans), 'stop')}, {np.diff(spans).sum():.0f} s in all."
     elif len(spans):
         words += f" The foot was found on the floor {format_count(len(spans), 'time')}."
     if outages:
@@ -75,7 +74,7 @@ def describe_run(recording: Recording, solutions: Mapping[str, Solution], withhe
         words += f" There were no GNSS fixes from {and_list([*listed, *more])}."
     excluded = sum(int(part.count) for part in solution.excluded)
     if excluded:
-        words += f" {excluded} measurements were excluded as faulty."
+        words += f" Excluded as faulty: {format_count(excluded, 'measurement')}."
     if not several and solution.stopped:
         words += f" How it ended: {solution.stopped.rstrip('.')}."
     return words
@@ -110,13 +109,13 @@ def list_tiles(recording: Recording, solutions: Mapping[str, Solution], errors: 
 
 def describe_sigma(name: str, errors: Errors) -> Markup:
     """One sentence that compares errors with their sigma (and the truth's own, if stated)."""
-    from graphnav.evaluation.sigmas import judge_sigmas
+    from graphnav.evaluation.sigmas import judge_sigmas, select_verdict
 
     judged = judge_sigmas(errors)
     if not judged:
         words = f"{name}: no epoch has both an error and a sigma, so sigma cannot be judged."
         return page.paragraph(Note("sigma.not_judged", words), "verdict")
-    worst = [j for j in judged if j.verdict == "too small"] or [j for j in judged if j.verdict == "unclear"]
+    worst = select_verdict(judged, "too small") or select_verdict(judged, "unclear")
     shown = worst or judged
     measured = and_list(
         [

@@ -25,10 +25,10 @@ if TYPE_CHECKING:
 
 _LINES = 3  # exclusions listed
 _SAYS = {
-    "fits": ("good", "sigma is consistent"),
-    "cautious": ("", "sigma is cautious"),
     "too small": ("bad", "sigma is too small"),
     "unclear": ("", "consistency of sigma is open: errors are correlated for too long"),
+    "cautious": ("", "sigma is cautious"),
+    "fits": ("good", "sigma is consistent"),
 }
 # constraints whose innovations or residuals judge a block where there is no truth
 _SHOWS = {
@@ -48,7 +48,7 @@ def verdicts(solution: Solution, errors: Errors | None) -> Markup:
 
 
 def _judge_by_truth(errors: Errors) -> dict[str, tuple[str, str]]:
-    from graphnav.evaluation.sigmas import judge_sigmas
+    from graphnav.evaluation.sigmas import PARTS, judge_sigmas, select_verdict
 
     # a truth may have no heights
     up = f", {wording.number(rms(errors.p[:, 2]), 3)} m up" if np.isfinite(errors.p[:, 2]).any() else ""
@@ -59,15 +59,14 @@ def _judge_by_truth(errors: Errors) -> dict[str, tuple[str, str]]:
         f"{wording.number(rms(np.degrees(errors.rph[:, 2])), 3)} deg heading",
     }
     every = judge_sigmas(errors)
-    worst = {"too small": 0, "unclear": 1, "cautious": 2, "fits": 3}
     out = {}
     for block, size in sizes.items():
-        # an average over three angles would hide a wrong one: heading is judged by itself as well
-        own = [j for j in every if j.block == block or (block == "attitude" and j.block == "heading")]
-        if own:
-            one = min(own, key=lambda j: worst[j.verdict])
-            kind, says = _SAYS[one.verdict]
-            out[block] = kind, f"{size}; {says} (errors are {one.size:.2f} sigma, rms)"
+        own = [j for j in every if j.block in (block, PARTS.get(block))]
+        for verdict, (kind, says) in _SAYS.items():  # the gravest first
+            if some := select_verdict(own, verdict):
+                part = "" if some[0].block == block else f"{some[0].block} "
+                out[block] = kind, f"{size}; {says} ({part}errors are {some[0].size:.2f} sigma, rms)"
+                break
     return out
 
 

@@ -243,6 +243,8 @@ def nees_table(errors: Mapping[str, Errors]) -> list[Markup]:
     for name, e in errors.items():
         judged = {one.block: one for one in judge_sigmas(e)}
         nees = {"position": (e.nees_p, e.dof_p), "velocity": (e.nees_v, 3), "attitude": (e.nees_rph, 3)}
+        if e.dof_p == 3:
+            nees["height"] = (e.nees_axis[:, 2], 1)
         if e.nees_heading is not None:
             nees["heading"] = (e.nees_heading, 1)
         for words, (values, dof) in nees.items():
@@ -263,7 +265,7 @@ def parameter_table(parameters: Mapping[str, ParameterEstimate]) -> list[Markup]
             value, sigma = one.scale * float(p.value[-1, k]), one.scale * float(p.sigma[-1, k])
             known = "yes" if p.observable[k] else "no: mostly the prior"
             before = one.scale * float(p.prior_sigma[k])
-            shown = [wording.format_measured(value, sigma), wording.format_measured(sigma, sigma), before]
+            shown = [wording.format_to_sigma(value, sigma), wording.format_to_sigma(sigma, sigma), before]
             rows.append([one.words, *shown, one.unit, known])
     head = ["parameter", "value", "sigma", "sigma before", "unit", "seen by the data"]
     return [page.table(head, rows)] if rows else []

@@ -33,7 +33,7 @@ class Quantity(str):
     """A number and its unit, if any, as displayed: right-aligned in a table."""
 
 
-def format_measured(value: float, sigma: float) -> Quantity:
+def format_to_sigma(value: float, sigma: float) -> Quantity:
     """A value with as many decimals as its sigma justifies."""
     if not (math.isfinite(value) and math.isfinite(sigma)) or sigma <= 0:
         return Quantity(number(value))

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import oracle
 import pytest
-from helpers import Array, dense, errors, factors, random_states, truth_states
+from helpers import Array, at_rate, dense, errors, factors, random_states, truth_states
 
 from graphnav.config import settings_from
 from graphnav.constraints.vehicle import OdometerSpeed
@@ -222,9 +222,9 @@ def test_sigmas_are_true(drive: tuple[Recording, Trajectory]) -> None:
     """NEES of settled positions over drives with other noise: as in test_consistency, of far fewer drives."""
     ratio = []
     for seed in range(4):
-        recording, truth = oracle.drive(oracle.vehicle_path(240.0), seed=20 + seed, outages=[(110.0, 150.0)])
+        recording, truth = oracle.drive(oracle.vehicle_path(240.0, 100.0), seed=20 + seed, outages=[(110.0, 150.0)])
         settings = settings_from({"solver": {"lag": 30.0}})
-        solution = run(recording, settings, solvers=("incremental",), noise=STATED)["incremental"]
+        solution = run(at_rate(recording, 25.0), settings, solvers=("incremental",), noise=STATED)["incremental"]
         i = np.clip(np.searchsorted(truth.t, solution.t - 1e-6), 0, len(truth.t) - 1)
         met = np.abs(truth.t[i] - solution.t) < 1e-6  # not where a stop begins or ends
         at_rows = replace(solution, t=solution.t[met], states=solution.states[met], covariance=solution.covariance[met])
@@ -235,7 +235,7 @@ def test_sigmas_are_true(drive: tuple[Recording, Trajectory]) -> None:
 
 @pytest.mark.parametrize("name", ["oracle_drive"])
 def test_real_program_run(shared_data: Path, name: str) -> None:
-    found = run(read(shared_data / name).crop(0.0, 300.0), solvers=("incremental", "batch"))
+    found = run(at_rate(read(shared_data / name).crop(50.0, 250.0), 50.0), solvers=("incremental", "batch"))
     a, b = found["incremental"], found["batch"]
     # what comes after the lag still tells of errors that last for minutes and hours: as much as variances say
     var = [np.diagonal(one.covariance, axis1=1, axis2=2)[:, 3:6] for one in (a, b)]

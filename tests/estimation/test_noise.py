@@ -409,7 +409,7 @@ def test_sigmas_of_the_drive_are_true_with_estimated_figures(
 @pytest.mark.parametrize("nhc", [True, False])
 def test_an_odometer_that_is_wrong_for_seconds(nhc: bool) -> None:
     """Its errors last for 3 s: they are seen to, and are as large as they are."""
-    path = oracle.vehicle_path(duration=240, seed=11)
+    path = oracle.vehicle_path(duration=240, rate=50.0, seed=11)
     found = []
     for seed in (0, 1):
         recording, _ = oracle.drive(path, seed=seed, odometer_rate=20.0)
@@ -470,8 +470,8 @@ def test_intervals_have_factors_that_stay_when_they_are_integrated_anew() -> Non
 
 
 def clean(seed: int, wheels: bool) -> tuple[Recording, Trajectory]:
-    """Four minutes in which nothing is wrong, and their truth."""
-    path = oracle.vehicle_path(duration=240, rate=50.0, seed=11)
+    """Minutes in which nothing is wrong, and their truth."""
+    path = oracle.vehicle_path(duration=160, rate=50.0, seed=11)
     return oracle.drive(path, seed=seed, odometer_rate=20.0 if wheels else None)
 
 
@@ -521,7 +521,7 @@ def test_nothing_is_left_out_of_clean_data(seed: int, wheels: bool) -> None:
 
 @pytest.mark.parametrize("wheels", [True, False])
 def test_fixes_that_are_wrong_alike_are_left_out(wheels: bool) -> None:
-    wrong, bad = shifted(clean(0, wheels)[0], 120.0, 150.0, (8.0, -6.0, 0.0))
+    wrong, bad = shifted(clean(0, wheels)[0], 90.0, 120.0, (8.0, -6.0, 0.0))
     found = run(wrong, None, ("rts",))["rts"]
     assert np.array_equal(found.records["gnss_position"].weight == 0.0, bad)
     assert not set(found.noise.excluded) & set(WHEELS)
@@ -568,7 +568,7 @@ def test_a_run_with_the_noise_that_another_found_is_the_same(name: str) -> None:
 
 
 def test_of_a_second_the_best_fix_is_used() -> None:
-    recording, _ = oracle.drive(oracle.vehicle_path(duration=120, seed=4), seed=2)
+    recording, _ = oracle.drive(oracle.vehicle_path(duration=120, rate=50.0, seed=4), seed=2)
     gnss = recording.gnss
     assert gnss is not None
     assert space_fixes(recording, 1.0) is recording  # one a second

@@ -14,6 +14,7 @@ from graphnav.core import rotation
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM
 from graphnav.estimation.solvers import recursion
+from graphnav.estimation.solvers.robust import weight_and_cost
 
 SCALE, PARAMETERS, KEYFRAMES, ROWS = 6, 5, 7, 8  # D = 26
 D = DIM + SCALE + PARAMETERS
@@ -35,9 +36,13 @@ class Drive:
         self.gap = rng.standard_normal((n - 1, D))
         self.H, self.r = rng.standard_normal((n, ROWS, D)), rng.standard_normal((n, ROWS))
         self.variance = rng.uniform(0.5, 2.0, (n, ROWS))
-        self.first, self.begin = 2 * np.arange(n + 1), np.tile([0, 3], n)
-        self.end = np.tile([3, ROWS], n)
         self.used = np.arange(2 * n) != 4
+        self.scale = np.ones((n, ROWS))
+        self.blocks = recursion.Blocks(
+            first=2 * np.arange(n + 1), begin=np.tile([0, 3], n), end=np.tile([3, ROWS], n), used=self.used,
+            gate=np.full(2 * n, np.inf), kernel=np.zeros(2 * n, dtype=int), size=np.tile([3, 5], n),
+            part=np.arange(2 * n + 1), k=np.repeat(np.arange(n), 2), kind=np.tile([0, 1], n),
+        )  # fmt: skip
         self.e, self.P = rng.standard_normal(D), np.diag(rng.uniform(1.0, 4.0, D))
 
     def whole(self, k: int) -> Array:
@@ -51,19 +56,22 @@ class Drive:
         n = KEYFRAMES
         out = {name: np.zeros((n, D)) for name in ("ahead", "errors", "r", "smoothed")}
         out |= {name: np.zeros((n, D, D)) for name in ("P_ahead", "P", "N", "P_smoothed")}
-        out |= {"root": np.zeros((n, ROWS, ROWS)), "solved": np.zeros((n, ROWS))}
+        out |= {"root": np.zeros((n, ROWS, ROWS))}
+        out |= {name: np.zeros((n, ROWS)) for name in ("solved", "bent", "w")}
         out |= {name: np.zeros((n, ROWS, D)) for name in ("Kt", "SH")}
+        taken, blocks = np.zeros(2 * n, dtype=bool), self.blocks
         recursion.filter_rows(
             0, n, self.e, self.P, self.F, self.decay, self.gap, self.Q, self.added, self.r, self.H, self.variance,
-            self.first, self.begin, self.end, self.used, out["ahead"], out["P_ahead"], out["errors"], out["P"],
-            out["root"], out["solved"], out["Kt"], out["SH"], np.zeros(1, dtype=int),
+            self.scale, blocks, self.used, out["ahead"], out["P_ahead"], out["errors"], out["P"],
+            out["root"], out["solved"], out["bent"], out["Kt"], out["w"], out["SH"], taken, np.zeros(1, dtype=int),
         )  # fmt: skip
         recursion.smooth_rows(
-            0, n, np.zeros(D), np.zeros((D, D)), self.F, self.decay, out["Kt"], self.H, -out["solved"], out["SH"],
-            self.first, self.begin, self.end, self.used,
+            0, n, np.zeros(D), np.zeros((D, D)), self.F, self.decay, out["Kt"], self.H, out["w"], out["SH"],
+            blocks.first, blocks.begin, blocks.end, taken,
             out["ahead"], out["P_ahead"], out["errors"], out["P"],
             out["r"], out["N"], out["smoothed"], out["P_smoothed"],
         )  # fmt: skip
+        out["taken"] = taken
         k = np.arange(1, n)
         # small, so that turns add up
         moved = 1e-6 * (out["errors"] - out["ahead"])
@@ -92,7 +100,7 @@ def test_filter_and_smoother_are_one_update_of_the_whole_drive() -> None:
         covariance[k, :DIM, k, :DIM] += drive.Q[k - 1]
         covariance[k, DIM:, k, DIM:] += np.diag(drive.added[k - 1])
     taken = np.concatenate(
-        [np.arange(drive.begin[b], drive.end[b]) + ROWS * (b // 2) for b in np.flatnonzero(drive.used)]
+        [np.arange(drive.blocks.begin[b], drive.blocks.end[b]) + ROWS * (b // 2) for b in np.flatnonzero(drive.used)]
     )
     H = np.zeros((n, ROWS, n, D))
     for k in range(n):
@@ -111,6 +119,49 @@ def test_filter_and_smoother_are_one_update_of_the_whole_drive() -> None:
         np.testing.assert_allclose(found["P_smoothed"][k], blocks[k, :, k], atol=1e-8)
     for k in range(1, n):
         np.testing.assert_allclose(found["lag"][k - 1], np.diagonal(blocks[k - 1, :, k]), atol=1e-8)
+
+
+@pytest.mark.parametrize("kernel", ["huber", "cauchy"])
+def test_a_kernel_weighs_rows_by_what_their_update_leaves(kernel: str) -> None:
+    """Of weights that are found by the last update the next finds the same, but for what is left to converge."""
+    drive = Drive()
+    code = {"huber": recursion.HUBER, "cauchy": recursion.CAUCHY}[kernel]
+    drive.r *= 5.0
+    drive.scale[:] = 1.5
+    drive.blocks = drive.blocks._replace(kernel=np.full(2 * KEYFRAMES, code))
+    found = drive.solved()
+    for b in np.flatnonzero(drive.used):
+        k, lo, hi = b // 2, drive.blocks.begin[b], drive.blocks.end[b]
+        H, L = drive.H[k, lo:hi], found["root"][k, lo:hi, lo:hi]
+        R = np.diag(drive.variance[k, lo:hi])
+        HPH, r = L @ L.T - R, L @ (L.T @ found["solved"][k, lo:hi])
+        weight, left = np.ones(1), r - HPH @ found["solved"][k, lo:hi]
+        for _ in range(recursion.PASSES - 1):
+            s = np.array([np.sqrt(np.sum(left**2 / np.diag(R)))])
+            weight = weight_and_cost(kernel, s, 1.5)[0]
+            left = r - HPH @ np.linalg.solve(HPH + R / weight, r)
+        np.testing.assert_allclose(found["bent"][k, lo:hi], weight[0], rtol=1e-9)
+        np.testing.assert_allclose(found["w"][k, lo:hi], -np.linalg.solve(HPH + R / weight, r), rtol=1e-7)
+        np.testing.assert_allclose(found["SH"][k, lo:hi], np.linalg.solve(HPH + R / weight, H), rtol=1e-7)
+
+
+def test_a_gate_refuses_what_its_innovation_says() -> None:
+    drive = Drive()
+    nis = [
+        found["solved"][b // 2, lo:hi] @ found["root"][b // 2, lo:hi, lo:hi] @ found["root"][b // 2, lo:hi, lo:hi].T
+        @ found["solved"][b // 2, lo:hi]
+        for found in (drive.solved(),)
+        for b, (lo, hi) in enumerate(zip(drive.blocks.begin, drive.blocks.end, strict=True))
+    ]  # fmt: skip
+    first = int(np.argmax(np.where(drive.used, nis, 0.0)))
+    gate = np.full(2 * KEYFRAMES, np.inf)
+    gate[first] = 0.99 * nis[first]
+    drive.blocks = drive.blocks._replace(gate=gate)
+    found = drive.solved()
+    assert np.array_equal(found["taken"], drive.used & (np.arange(2 * KEYFRAMES) != first))
+    without = Drive()
+    without.used = drive.used & (np.arange(2 * KEYFRAMES) != first)
+    assert np.array_equal(found["smoothed"], without.solved()["smoothed"])
 
 
 def test_a_covariance_that_is_none_is_found_out() -> None:

@@ -23,8 +23,8 @@ from graphnav.estimation.pipeline import origin, run
 from graphnav.estimation.problem import Problem, build_problem
 from graphnav.estimation.solvers.batch import batch
 from graphnav.estimation.solvers.ekf import ekf, near, refilter
-from graphnav.estimation.solvers.linearise import Points, advance
-from graphnav.estimation.solvers.points import AtEstimate, AtPoints, Estimate
+from graphnav.estimation.solvers.linearise import Points, advance, linearise
+from graphnav.estimation.solvers.points import Errors, PointFilter, predict_states
 from graphnav.estimation.solvers.recursion import move
 from graphnav.estimation.solvers.rts import backward
 from graphnav.estimation.solvers.stack import Stack
@@ -76,27 +76,28 @@ def test_steps_and_rows_at_points_are_those_of_an_estimate_to_first_order(posed:
     K, D = len(posed.t), DIM + points.values.shape[1]
     stack, steps = Stack(posed, K), advance(posed, K)
     F = np.empty((K - 1, DIM, posed.columns[SCALE].stop))
-    given, own = AtPoints(posed, points, stack, steps, F), AtEstimate(posed, steps)
-
-    def here(k: int, e: Array) -> Estimate:
-        return Estimate(points.states[k : k + 1].plus(e[None, :DIM]), points.values[k] + e[DIM:])
+    out = Errors(np.empty((K, D)), np.empty((K, D, D)), np.empty((K, D)), np.empty((K, D, D)))
+    given = PointFilter(posed, points, stack, steps, F, out)
 
     for k in (3, 60, 150):
-        linear = given.step(k, np.zeros(D))
 
         def ahead(e: Array, k: int = k) -> Array:
-            reached = own.step(k, here(k - 1, e))[0]
-            return np.concatenate([reached.state.minus(points.states[k : k + 1])[0], reached.values - points.values[k]])
+            at, to = slice(k - 1, k), slice(k, k + 1)
+            values = points.values[at] + e[DIM:]
+            reached, _ = predict_states(posed, at, points.states[at].plus(e[None, :DIM]), values)
+            return np.concatenate([reached.minus(points.states[to]), steps.ahead(at, values) - points.values[to]], 1)[0]
 
-        np.testing.assert_allclose(linear[0], ahead(np.zeros(D)), atol=1e-9)
-        whole = move(linear[1], steps.decay[k - 1], np.eye(D))
+        np.testing.assert_allclose(given.gap[k - 1], ahead(np.zeros(D)), atol=1e-9)
+        whole = move(given.F[k - 1], steps.decay[k - 1], np.eye(D))
         np.testing.assert_allclose(whole, derivative(ahead, D), atol=2e-5, rtol=1e-4)
-        for some in stack.together(k, one_by_one=True):
-            r, H, sigma = given.rows(some, None)
-            mine, H_own, sigma_own = own.rows(some, here(k, np.zeros(D)))
-            np.testing.assert_allclose(r, mine, atol=1e-9)
-            np.testing.assert_allclose(H, H_own, atol=1e-9)
-            np.testing.assert_allclose(sigma, sigma_own)
+        for some in stack.together(k):
+            own = [linearise(rows, points, posed.columns, slice(lo, hi)) for rows, lo, hi in some.parts]
+            np.testing.assert_allclose(
+                given.r[some.at], np.concatenate([one.residual.ravel() for one in own]), atol=1e-12
+            )
+            np.testing.assert_allclose(
+                given.H[some.at], np.concatenate([one.H.reshape(-1, D) for one in own]), atol=1e-12
+            )
 
 
 def test_rows_taken_together_are_those_taken_one_after_another(posed: Problem) -> None:

@@ -7,7 +7,7 @@ import pytest
 
 from graphnav.core.sample_size import effective_epochs
 from graphnav.evaluation.metrics import Errors
-from graphnav.evaluation.sigmas import judge_sigmas
+from graphnav.evaluation.sigmas import judge_sigmas, select_verdict
 from graphnav.report.sentences import describe_sigma
 
 N = 600
@@ -61,6 +61,21 @@ def test_a_heading_that_is_lost_is_not_believed() -> None:
     assert "verdict bad" in said
     assert "heading" in said
     assert "position" not in said
+
+
+@pytest.mark.parametrize(("axis", "part", "whole"), [(2, "height", "position"), (8, "heading", "attitude")])
+def test_an_axis_that_alone_is_wrong_is_named(axis: int, part: str, whole: str) -> None:
+    x = lasting(np.random.default_rng(8), 0.0)
+    x[:, axis] *= 2.0
+    judged = judge_sigmas(errors_of(x))
+    assert {j.block: j.verdict for j in judged}[whole] == "fits"  # the mean over three axes hides it
+    assert [j.block for j in select_verdict(judged, "too small")] == [part]
+    x[:, axis] *= 2.0
+    judged = judge_sigmas(errors_of(x))
+    assert {j.block: j.verdict for j in judged}[whole] == "too small"
+    assert [j.block for j in select_verdict(judged, "too small")] == [part]
+    x[:, axis - 2 : axis] *= 4.0  # the others as well
+    assert [j.block for j in select_verdict(judge_sigmas(errors_of(x)), "too small")] == [whole, part]
 
 
 def test_an_error_that_does_not_change_is_one() -> None:

@@ -22,6 +22,7 @@ from graphnav.core.notes import key_of
 from graphnav.core.trajectory import Trajectory
 from graphnav.estimation import fixing
 from graphnav.estimation.pipeline import run
+from graphnav.estimation.solution import Solution
 from graphnav.evaluation.evaluate import truth_of
 from graphnav.gnss.antex import SatelliteAntenna
 from graphnav.gnss.arcs import find_arcs
@@ -265,12 +266,16 @@ def test_arcs_are_those_of_the_series_however_its_epochs_come(rtk: Recording) ->
         np.testing.assert_array_equal(part.arc_begin, whole.begin[own])
 
 
+@pytest.fixture(scope="module")
+def offline(rtk: Recording) -> dict[str, Solution]:
+    return run(rtk, settings_from({"noise": {"mode": "stated"}}), ("ekf", "rts"))
+
+
 @pytest.mark.parametrize("engine", ["window", "isam2"])
-def test_integers_online_are_those_of_the_recording(rtk: Recording, engine: str) -> None:
+def test_integers_online_are_those_of_the_recording(rtk: Recording, offline: dict[str, Solution], engine: str) -> None:
     online, track = played(without_rows(rtk), rows_of(rtk)[1], settings_from(LONG), engine)
     tracker = online.tracker
     assert tracker is not None
-    offline = run(rtk, settings_from({"noise": {"mode": "stated"}}), ("ekf", "rts"))
     whole, filtered = offline["rts"], offline["ekf"].fixed
     assert (tracker.epochs, tracker.fixed) == (len(filtered), np.sum(filtered[:, 1]))
     at = np.argmin(np.abs(whole.t - track.t[:, None]), axis=1)

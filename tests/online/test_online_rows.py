@@ -49,6 +49,32 @@ def test_they_are_taken_in_and_kept_as_plain_rows() -> None:
 
 
 @pytest.mark.parametrize(
+    "row",
+    [
+        ("gnss", 0.02, (0.8, 0.2, 500.0, 0.02, 0.02, 0.04)),  # without velocity, which is NaN where there is none
+        ("imu", 0.02, (0.0, 0.0, 0.0, 0.0, 9.8)),
+        ("imu", "now", (0.0, 0.0, 0.0, 0.0, 0.0, 9.8)),
+        ("imu", 0.02, (0.0, 0.0, 0.0, 0.0, 0.0, None)),
+        ("imu", 0.02, (0.0, 0.0, 0.0, 0.0, 0.0, 10**400)),
+        ("lidar", 0.02, (1.0,)),
+        ([], 0.02, (1.0,)),
+        (0.02, 48.0, 11.0, 500.0, 1.0, 1.0),
+        "imu",
+        None,
+    ],
+)
+def test_what_is_no_row_is_refused_and_changes_nothing(row: object) -> None:
+    online = Online(live_setup(antenna=SD), Settings())
+    online.add(ImuSample(0.01, (0, 0, 0), (0, 0, 9.8)))
+    with pytest.raises(RecordingError) as found:
+        online.add(row)
+    assert found.value.key.startswith("row.")
+    assert "\n" not in str(found.value)
+    assert not online.failures
+    assert online.sensors.counts.total() == 1
+
+
+@pytest.mark.parametrize(
     ("make", "key", "name"),
     [
         (lambda: Fix(1.0, 48.0, 11.0, 500.0, (1.0, 1.0)), "row.three", "sd"),

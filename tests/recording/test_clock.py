@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from graphnav.core.earth import LocalFrame
-from graphnav.recording.checks import crosschecks, lags
+from graphnav.recording.checks import crosschecks, lags, tracks
 from graphnav.recording.checks.clock import measure_clock_offsets
 from graphnav.recording.draft.agreement import compare_with_fixes
 from graphnav.recording.formats import read
@@ -70,7 +70,7 @@ def test_fixes_that_jump_turn_no_axis_and_no_clock() -> None:
     plain = replace(gnss, v=None, sd_v=None)
     fits = []
     for some in (plain, replace(plain, llh=frame.to_llh(p))):
-        track = crosschecks.track(some)
+        track = tracks.compute_track(some)
         assert track is not None
         fit = crosschecks.fit_forward(drive.imu, track)
         assert fit is not None
@@ -88,7 +88,7 @@ def test_parts_of_a_drive_keep_to_the_error(shared_data: Path, name: str) -> Non
     for a in np.arange(0.0, min(drive.duration, 900.0) - 60.0, 60.0):
         part = drive.crop(a, a + 60.0)
         assert part.gnss is not None
-        track = crosschecks.track(part.gnss)
+        track = tracks.compute_track(part.gnss)
         fit = None if track is None else crosschecks.fit_forward(part.imu, track)
         if fit is not None and fit.correlation > 0.6:
             z.append(max(abs(fit.lag) - 0.02, 0.0) / fit.spread)

@@ -312,7 +312,7 @@ def test_fixes_of_two_places_are_not_trusted(tokyo: Recording) -> None:
         llh[200:400, 1] += 1.0
         return llh
 
-    assert found(change(tokyo, "gnss", llh=thirds)) == {"gnss.out_of_reach": "untrusted"}
+    assert found(change(tokyo, "gnss", llh=thirds)) == {"gnss.out_of_reach": "unreliable"}
 
 
 @pytest.mark.parametrize("value", [None, 0.0])
@@ -338,10 +338,10 @@ def test_heights_that_stay_while_standing_are_not_frozen(oracle: Recording, shar
 
 
 @pytest.mark.parametrize("seconds", [1.0, -1.0])
-def test_fixes_of_another_clock_make_the_result_untrusted(tokyo: Recording, oracle: Recording, seconds: float) -> None:
+def test_fixes_of_another_clock_make_the_result_unreliable(tokyo: Recording, oracle: Recording, seconds: float) -> None:
     for recording, within in ((tokyo, 0.08), (oracle, 0.12)):
         late = change(recording, "gnss", t=lambda t: t + seconds)
-        assert found(late) == {"imu.clock": "untrusted"}
+        assert found(late) == {"imu.clock": "unreliable"}
         inspection = inspect(late)
         assert not inspection.trusted
         assert inspection.findings[0].key == "imu.clock"
@@ -415,7 +415,7 @@ def test_fixes_of_two_groups_are_not_trusted(tokyo: Recording, oracle: Recording
         changed = change(recording, "gnss", llh=north)
         if not velocities:
             changed = replace(changed, gnss=replace(changed.gnss, v=None, sd_v=None))
-        assert found(changed)["gnss.two_groups"] == "untrusted"
+        assert found(changed)["gnss.two_groups"] == "unreliable"
 
 
 def test_some_fixes_that_are_off_are_outvoted(tokyo: Recording) -> None:
@@ -533,7 +533,7 @@ def test_findings_have_keys_and_the_gravest_are_first(tokyo: Recording) -> None:
     values = inspect(wild).values()["findings"]
     assert values[0]["key"] == "imu.dead_axis"
     assert values[0]["severity"] == "refused"
-    ranks = [("refused", "untrusted", "warning", "note").index(one["severity"]) for one in values]
+    ranks = [("refused", "unreliable", "warning", "note").index(one["severity"]) for one in values]
     assert ranks == sorted(ranks)
     with pytest.raises(RecordingError):
         inspect(wild).refuse()

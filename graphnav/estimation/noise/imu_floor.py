@@ -55,7 +55,7 @@ def with_measured_floor(recording: Recording, settings: Settings) -> tuple[Recor
     )
     noise: ImuNoise = replace(imu.noise, **lower)
     return replace(recording, imu=replace(imu, noise=noise)), (
-        Note("noise.imu.quieter", f"where it stands the IMU is quieter than stated: {said}"),
+        Note("noise.imu.quieter", f"at rest the IMU is quieter than stated: {said}"),
     )
 
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from graphnav.constraints.gnss import STAMP_ERROR, GnssPosition
 from graphnav.constraints.vehicle import MOUNTING
-from graphnav.core.notes import Note
+from graphnav.core.notes import Note, format_count
 from graphnav.estimation.noise.model import INTERVALS, NoiseModel
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.linearise import Points, shift
@@ -19,7 +19,7 @@ _IMU = {
 }
 
 
-_IMU_WHITE = dict(zip(INTERVALS, ("more noise of the gyro", "more noise of the accelerometer"), strict=True))
+_IMU_WHITE = dict(zip(INTERVALS, ("gyro noise", "accelerometer noise"), strict=True))
 _FAR = 5.0  # prior sigmas, which chance does not reach
 
 
@@ -44,9 +44,8 @@ def describe_far(problem: Problem, smoothed: Points) -> tuple[str, ...]:
             out.append(
                 Note(
                     "noise.far_from_stated",
-                    f"{p.name}{which} comes out at {value[k]:.2g} {p.unit}, {away[k]:.0f} sigmas from the "
-                    f"{stated[k]:.2g} +- {sigma[k]:.2g} that is stated of it: what is stated is wrong, or it stands in "
-                    "for an error of another kind",
+                    f"{p.name}{which}: estimated {value[k]:.2g} {p.unit}, stated {stated[k]:.2g} +- {sigma[k]:.2g}, "
+                    f"{away[k]:.0f} sigmas apart: what is stated is wrong, or it absorbs an error of another kind",
                 )
             )
     return tuple(out)
@@ -61,12 +60,11 @@ def describe(noise: NoiseModel, problem: Problem) -> tuple[str, ...]:
     if imu:
         out.append(Note("noise.imu", f"noise model, IMU: stated figures multiplied by: {', '.join(imu)}"))
     of_imu = [(name, noise.weights[name]) for name in INTERVALS if name in noise.weights]
-    more = [f"{len(some.t)} with {_IMU_WHITE[name]}" for name, some in of_imu if len(some.t)]
+    more = [f"{_IMU_WHITE[name]} in {len(some.t)}" for name, some in of_imu if len(some.t)]
     if more:
         most = np.sqrt(1.0 / min(float(np.min(some.weight)) for _, some in of_imu if len(some.t)))
-        said = f"of {len(problem.t) - 1} intervals between keyframes {' and '.join(more)} than usual"
-        said = f"{said}, {most:.2g} times at most"
-        out.append(Note("noise.imu.outliers", f"noise model, IMU: {said}"))
+        said = f"larger {' and '.join(more)} of {len(problem.t) - 1} intervals between keyframes"
+        out.append(Note("noise.imu.outliers", f"noise model, IMU: {said}, up to {most:.2g} times the usual"))
     for rows in problem.constraints:
         names = [g for g in rows.noise_groups()[0] if g in noise.figures]
         errors = [
@@ -86,8 +84,11 @@ def describe(noise: NoiseModel, problem: Problem) -> tuple[str, ...]:
         out.append(Note("noise.rows", f"noise model, {rows.name}: white part in stated sigmas: {'; '.join(parts)}"))
         some = noise.weights.get(rows.name)
         if some is not None and len(some.t):
-            less = np.count_nonzero(some.weight < 1.0)
+            less = int(np.count_nonzero(some.weight < 1.0))
             out.append(
-                Note("noise.outliers", f"{rows.name}: {less} of {len(rows)} rows are outliers and have less weight")
+                Note(
+                    "noise.outliers",
+                    f"{rows.name}: {format_count(less, 'outlier')} among {len(rows)} rows, down-weighted",
+                )
             )
     return tuple(out)

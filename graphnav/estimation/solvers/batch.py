@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from graphnav.core.notes import Note
+from graphnav.core.notes import Note, format_count
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, States
 from graphnav.estimation.dense import dense
@@ -84,7 +84,7 @@ def batch(
             notes.append(
                 Note(
                     "solver.outliers",
-                    f"most rows of {constraint.name} were given up as outliers: do not trust this solution",
+                    f"most rows of {constraint.name} are down-weighted as outliers: do not trust this solution",
                 )
             )
     return Solution(
@@ -198,7 +198,10 @@ def _minimise(
         stopped += f" ({refused} steps taken back and damped)"
     if renewed:
         notes.append(
-            Note("solver.integrated_again", f"{renewed} intervals integrated again because the gyro bias had moved")
+            Note(
+                "solver.integrated_again",
+                f"{format_count(renewed, 'interval')} integrated again because the gyro bias had moved",
+            )
         )
     return _Minimum(problem, point, layout, eliminated, now, iteration, stopped, tuple(notes))
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -26,16 +25,11 @@ class Decision:
 Decide = Callable[[int, Points, Array], Decision | None]  # of a keyframe, the point there and P (D, D)
 
 
-def hold(one: Decision | None, x: Any, P: Array, where: Any) -> tuple[Any, Array]:
-    """An update with what was decided."""
-    if one is None:
-        return x, P
+def hold(one: Decision, P: Array) -> tuple[Array, Array]:
+    """An update with what was decided: how far (D,) it moves the estimate, and the covariance about where it was."""
     P = P + np.diag(one.added)
     if not len(one.residual):
-        return x, P
+        return np.zeros(len(P)), P
     HP, variance = one.H @ P, one.sigma**2
     _, _, Kt = compute_gain(HP, HP @ one.H.T, variance, one.residual)
-    at, e = where.about(x)
-    P, d = update(P, HP, one.H, Kt, variance), -(one.residual @ Kt)
-    to = where.plus(at, d if e is None else e + d)
-    return to, where.carry(P, at, to)
+    return -(one.residual @ Kt), update(P, HP, one.H, Kt, variance)

@@ -32,12 +32,12 @@ from typing import Any
 import numpy as np
 
 from graphnav.core.rotation import Array
-from graphnav.core.state import BLOCKS, DIM
+from graphnav.core.state import DIM
 from graphnav.estimation.dense import dense
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import Solution
 from graphnav.estimation.solvers.decision import Decide, hold
-from graphnav.estimation.solvers.gain import solve_innovation, solve_robust, weights_of
+from graphnav.estimation.solvers.fault_search import FaultSearch, free
 from graphnav.estimation.solvers.invariant import transport_covariance
 from graphnav.estimation.solvers.linearise import Points, advance, scale_at
 from graphnav.estimation.solvers.passes import (
@@ -45,20 +45,17 @@ from graphnav.estimation.solvers.passes import (
     ForwardRecord,
     Progress,
     SmootherPass,
-    Updates,
     join_passes,
     move_points,
     near_to,
     parameters_of,
     sigmas_of,
+    subtract_points,
 )
-from graphnav.estimation.solvers.point_filter import Errors, PointFilter
-from graphnav.estimation.solvers.points import AtEstimate, AtPoints, Estimate
-from graphnav.estimation.solvers.recursion import predict, update
+from graphnav.estimation.solvers.points import Errors, PointFilter
 from graphnav.estimation.solvers.rts import backward
-from graphnav.estimation.solvers.stack import Innovations, RowBlock, Stack
+from graphnav.estimation.solvers.stack import Innovations, Stack
 from graphnav.estimation.solvers.stretches import StretchFilter
-from graphnav.estimation.solvers.verdicts import Verdicts
 from graphnav.estimation.solvers.watch import Bank
 from graphnav.imu.dynamics import SCALE
 
@@ -150,28 +147,6 @@ def _smooth_about(
     return forward, smoothed, False
 
 
-class _Kept:
-    """Of K keyframes errors about given points, of the first n, and the estimates of those behind them."""
-
-    def __init__(self, n: int, K: int, D: int) -> None:
-        self.errors, self.own = np.empty((n, D)), Points.allocate(K, D - DIM)
-
-    def __setitem__(self, k: int, x: Any) -> None:
-        if k < len(self.errors):
-            self.errors[k] = x
-        else:
-            self.own.put(slice(k, k + 1), Points(x.state, x.values[None]))
-
-    def __getitem__(self, k: int) -> Any:
-        return self.errors[k] if k < len(self.errors) else _step(self.own, k)
-
-    def points(self, about: Points | None) -> Points:
-        """All as points."""
-        n = len(self.errors)
-        parts = [] if about is None else [move_points(about, self.errors)]
-        return join_passes([*parts, self.own.at(slice(n, None))] if n < len(self.own.values) else parts)
-
-
 def _forward(
     problem: Problem,
     K: int,
@@ -182,97 +157,49 @@ def _forward(
     decide: Decide | None = None,
 ) -> ForwardRecord:
     """Filter the first K keyframes, of which the first n are linearised at given points."""
-    n = 0 if about is None else len(about.values)
-    scale, steps = problem.columns.get(SCALE), advance(problem, K)
+    n, scale, steps = 0 if about is None else len(about.values), problem.columns.get(SCALE), advance(problem, K)
     D = DIM + steps.decay.shape[1]
     all_P, all_Pp = np.empty((K, D, D)), np.empty((K, D, D))
     all_F = np.empty((K - 1, DIM, DIM if scale is None else scale.stop))
     fixes = [c for c in problem.constraints if watch and c.fix_of]
-    decided = {c.name for c in problem.constraints if c.gate is not None or c.robust != "none"}
-    stack, own = Stack(problem, K, decided.union(c.name for c in fixes)), AtEstimate(problem, steps)
-    given, updates = None, None
-    if about is not None:
-        given = AtPoints(problem, about, stack, steps, all_F)
-        updates = Updates.none(stack.joint, given.H)
-    state = problem.prior.mean
-    assert state is not None
-    x: Any = Estimate(state, np.concatenate([np.empty(0), *(c.mean[0] for c in problem.chains)]))
-    if about is not None:
-        x = own.minus(x, _step(about, 0))
-    P = np.diag(np.concatenate([problem.prior.sigma[0], *(c.sigma[0] for c in problem.chains)]) ** 2)
-    records = stack.records
     watched = [c for c in fixes if c.watched]
-    tests = None
-    if watched:
-        tests = Bank(watched, problem.t, D, drifts)
-    verdicts = Verdicts(
-        {c.name: problem.t[c.keyframe] for c in watched}, {c.name: records[c.name].used for c in watched}
-    )
-    begin = partial(_begin, x, P, records)
-    x, P = begin()
-    found, ahead = _Kept(n, K, D), _Kept(n, K, D)
-    stretches = None
-    if tests is None and decide is None and not decided and all(c.passes == 1 for c in problem.constraints):
-        stretches = StretchFilter(problem, steps, stack, all_Pp, all_P, all_F)
-    k = 0
-    if given is not None and updates is not None and not decided and decide is None:
-        out = Errors(ahead.errors, all_Pp, found.errors, all_P)
-        compiled = PointFilter(given, steps, stack, updates, out, begin)
-        k = compiled.run_all(progress) if tests is None else compiled.run_tested(tests, verdicts, problem.t, progress)
-        x, P = (out.filtered[k - 1], all_P[k - 1]) if k else begin()
-        if about is not None and k == n:
-            x, P = _leave_points(about, own, all_P, k, x)
+    stack = Stack(problem, K, {c.name for c in fixes})
+    ahead, found = Points.allocate(K, D - DIM), Points.allocate(K, D - DIM)
+    errors = Errors(np.empty((n, D)), all_Pp, np.empty((n, D)), all_P)
+    assert problem.prior.mean is not None
+    x = Points(problem.prior.mean, np.concatenate([np.empty(0), *(c.mean[0] for c in problem.chains)])[None])
+    P = np.diag(np.concatenate([problem.prior.sigma[0], *(c.sigma[0] for c in problem.chains)]) ** 2)
+    updates, search = None, None
+    if about is not None:
+        given = PointFilter(problem, about, stack, steps, all_F, errors)
+        if watched:
+            bank = Bank(watched, problem.t, D, drifts)
+            search = FaultSearch(watched, given, steps, stack, bank, problem.t)
+        follow = search.follow if search is not None else None
+        if decide is not None:
+            follow = partial(_hold_errors, decide, about, errors)
+        start = subtract_points(x, about.first(1))[0]
+        given.run(partial(_begin, start, P, stack.records, search), follow, progress)
+        updates = given.updates
+        # from there on it is linearised where the filter is
+        last = about.at(slice(n - 1, n))
+        x = move_points(last, errors.filtered[n - 1 :])
+        all_P[n - 1] = transport_covariance(all_P[n - 1 : n], last.states, x.states)[0]
+        P = all_P[n - 1]
+    else:
+        x, P = _begin(x, P, stack.records)
+    stretches, k = StretchFilter(problem, steps, stack, all_Pp, all_P, all_F), n
     while k < K:
-        where: AtEstimate | AtPoints = given if given is not None and k < n else own
-        if stretches is not None and where is own and (on := stretches.run(k, x, P, ahead.own, found.own)) > k:
-            k, x, P = on, found[on - 1], all_P[on - 1]
-            if progress is not None:
-                progress("filter", k / K)
-            continue
-        if tests is not None:
-            tests.arrive(k)
-        if k:
-            x, F, Q = where.step(k, x)
-            if where is own:
-                all_F[k - 1] = F
-            predict(P, all_F[k - 1], steps.decay[k - 1], Q, steps.added[k - 1], all_Pp[k])
-            P = all_Pp[k]
-            if tests is not None:
-                tests.predicted(all_F[k - 1], steps.decay[k - 1])
-        for kind in watched if verdicts.anew else ():
-            if (kind.name, problem.t[k]) in verdicts.anew:
-                P = _anywhere(P, kind.fix_of)
-        ahead[k], all_Pp[k] = x, P
-        back: int | None = None
-        taken = updates if k < n else None
-        if taken is not None:
-            taken.forget(k)
-        # at its own estimate, each kind is linearised where those before it have led
-        for some in stack.together(k, one_by_one=where is own):
-            x, P, fault = _update(some, x, P, where, stack, tests, taken)
-            if fault is not None:
-                again = verdicts.settle(some.parts[0][0].name, fault, float(problem.t[k]))
-                back = int(np.searchsorted(problem.t, again))
-                break
-        if back is None and k == len(problem.t) - 1 and (trial := verdicts.ended()) is not None:
-            back = int(np.searchsorted(problem.t, trial))
-        if decide is not None and back is None:
-            x, P = hold(decide(k, _here(None if where is own else about, k, x), P), x, P, where)
-        if back is not None:  # once more from before the fault, without it
-            if tests is not None:
-                tests.go_back(back)
-            k = back
-            x, P = (found[k - 1], all_P[k - 1]) if k else begin()
-            continue
-        found[k], all_P[k] = x, P
-        if progress is not None and k % 256 == 0:
+        on = stretches.run(k, x, P, ahead, found)
+        k = on if decide is None else _hold(decide, k, on, found, all_P)
+        x, P = found.at(slice(k - 1, k)), all_P[k - 1]
+        if progress is not None:
             progress("filter", k / K)
-        k += 1
-        if about is not None and k == n:  # from here on linearised where the filter is
-            x, P = _leave_points(about, own, all_P, k, x)
     log_likelihood = stack.finish()
-    weights = {c.name: records[c.name].decided for c in fixes}
-    filtered, predicted = found.points(about), ahead.points(about)
+    filtered, predicted = found, ahead
+    if about is not None:
+        filtered = join_passes([move_points(about, errors.filtered), found.at(slice(n, None))])
+        predicted = join_passes([move_points(about, errors.predicted), ahead.at(slice(n, None))])
     return ForwardRecord(
         filtered.states,
         filtered.values,
@@ -281,85 +208,43 @@ def _forward(
         all_Pp,
         all_F,
         steps.decay,
-        records,
-        weights,
-        bool(verdicts.anew),
+        stack.records,
+        {c.name: stack.records[c.name].decided for c in fixes},
+        search is not None and bool(search.verdicts.anew),
         about,
-        found.errors,
-        ahead.errors,
+        errors.filtered,
+        errors.predicted,
         updates,
         log_likelihood,
     )
 
 
-def _begin(x: Any, P: Array, records: dict[str, Innovations]) -> tuple[Any, Array]:
+def _begin(x: Any, P: Array, records: dict[str, Innovations], search: FaultSearch | None = None) -> tuple[Any, Array]:
     """What is known at the start, but for the place where the first fix, which tells it, is not used."""
     first = [one.used[0] for one in records.values() if one.rows.fix_of == "p" and len(one.used)]
-    return x, _anywhere(P, "p") if first and first[0] == 0.0 else P
+    less = np.zeros(len(P)) if search is None else search.at_start
+    return x, P + np.diag(less + free(len(P), "p") if first and first[0] == 0.0 else less)
 
 
-def _anywhere(P: Array, block: str) -> Array:
-    """A covariance with nothing known of a block, but for what moves with it."""
-    P = P.copy()
-    P[BLOCKS[block], BLOCKS[block]] += 1e6 * np.eye(3)
-    return P
+def _hold(decide: Decide, k0: int, k1: int, found: Points, all_P: Array) -> int:
+    """Decide at keyframes from k0 to k1, and hold to what is decided first; the keyframe to go on from."""
+    for k in range(k0, k1):
+        here = found.at(slice(k, k + 1))
+        if (one := decide(k, here, all_P[k])) is not None:
+            d, P = hold(one, all_P[k])
+            to = move_points(here, d[None])
+            found.put(slice(k, k + 1), to)
+            all_P[k] = transport_covariance(P[None], here.states, to.states)[0]
+            return k + 1
+    return k1
 
 
-def _step(points: Points, k: int) -> Estimate:
-    return Estimate(points.states[k : k + 1], points.values[k])
-
-
-def _leave_points(about: Points, own: AtEstimate, all_P: Array, n: int, e: Array) -> tuple[Estimate, Array]:
-    """The estimate after the last of n given points, and its covariance, also in its place, by the error e there."""
-    at = _step(about, n - 1)
-    x = own.plus(at, e)
-    all_P[n - 1] = own.carry(all_P[n - 1], at, x)
-    return x, all_P[n - 1]
-
-
-def _update(
-    some: RowBlock, x: Any, P: Array, where: Any, stack: Stack, bank: Bank | None, taken: Updates | None
-) -> tuple[Any, Array, float | None]:
-    """One update with rows of a keyframe, added to what that has taken in; when a fault began comes last."""
-    rows, lo, hi = some.parts[0]
-    record = stack.records[rows.name]
-    weight, root_weight = weights_of(record, lo, hi) if some.alone else (1.0, stack.root_weight[some.at])
-    at, e = where.about(x)
-    for left in range(where.passes(some) - 1, -1, -1):
-        r, H, sigma = where.rows(some, at)
-        r, sigma = r if e is None else r + H @ e, sigma / root_weight
-        HP = H @ P
-        HPHt = HP @ H.T
-        root, solved, Kt = solve_innovation(HP, HPHt, sigma * sigma, r, some)
-        if not left:
-            stack.seen(some, root, solved)
-            nis, bent = float(r @ solved), np.ones(hi - lo)
-            if rows.robust != "none" and rows.gate is None:  # a gate stands in place of a kernel
-                sigma, bent = solve_robust(HP, HPHt, sigma, r, solved, some)
-                root, solved, Kt = solve_innovation(HP, HPHt, sigma * sigma, r, some)
-        d = -(r @ Kt) if e is None else e - r @ Kt
-        if left:  # again about where this leads (Jazwinski 1970, theorem 8.2)
-            P, at = where.carry(P, at, ahead := where.plus(at, d)), ahead
-            e = where.minus(x, at)
-    if some.alone:
-        refused = rows.gate is not None and nis > rows.gate**2
-        weight = 0.0 if refused else weight
-        record.weight[lo:hi] = 0.0 if refused else record.used[lo:hi] * bent
-        record.refused[lo:hi] = refused
-    if bank is not None:
-        bank.seen(rows.name, some.k, nis, weight > 0.0)
-    if weight == 0.0:
-        return x, P, None
-    if taken is not None:
-        taken.add(some, Kt, -solved, root)
-    P = update(P, HP, H, Kt, sigma * sigma)
-    fault = None if bank is None else bank.updated(rows.name, some.k, H, Kt, solved, root, float(where.speeds[some.k]))
-    to = where.plus(at, d)
-    return to, where.carry(P, at, to), fault
-
-
-def _here(about: Points | None, k: int, x: Any) -> Points:
-    """An estimate at a keyframe, or an error state about given points, as a point."""
-    if about is None:
-        return Points(x.state, x.values[None])
-    return move_points(Points(about.states[k : k + 1], about.values[k : k + 1]), x[None])
+def _hold_errors(decide: Decide, about: Points, errors: Errors, k0: int, k1: int) -> int:
+    """As `_hold`, of errors about given points, which stay."""
+    for k in range(k0, k1):
+        here = move_points(about.at(slice(k, k + 1)), errors.filtered[k : k + 1])
+        if (one := decide(k, here, errors.P[k])) is not None:
+            d, errors.P[k] = hold(one, errors.P[k])
+            errors.filtered[k] += d
+            return k + 1
+    return k1

@@ -16,11 +16,11 @@ from functools import cache
 import numpy as np
 from scipy.linalg.lapack import dgeqrf, dtpmqrt, dtpqrt, dtrtri, dtrtrs
 
-from graphnav.core.errors import EstimationError
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, States
+from graphnav.estimation.solvers.breakdown import explain_smoother
 from graphnav.estimation.solvers.linearise import shift
-from graphnav.estimation.solvers.robust import PASSES
+from graphnav.estimation.solvers.recursion import PASSES
 from graphnav.estimation.solvers.stages import Columns, Measured, Message, Place, Stage, rotate_columns, width
 from graphnav.estimation.solvers.watch import Watch
 
@@ -118,9 +118,7 @@ def predict(
     top[:, :D] *= _upper(D)
     root, info = dtrtri(R[:E, :E]) if E else (np.zeros((0, 0)), 0)
     if info:
-        raise EstimationError(
-            f"the smoother's information broke down at {place.t:.3f} s: check sigmas and units", key="solver.breakdown"
-        )
+        raise explain_smoother(place.t)
     root = root * _upper(E)
     g = np.zeros(D0)
     g[DIM:] = values[: D0 - DIM] - before.values
@@ -164,10 +162,7 @@ def update(ahead: Predicted, rows: Sequence[Measured], weighted: bool = False) -
             top, beside, fault = _test(top, tests.copy(), rows, y, passes, place.t, ahead.state)
         y, info = dtrtrs(top[:, :D], top[:, D])
         if info:
-            raise EstimationError(
-                f"the smoother's information broke down at {place.t:.3f} s: check sigmas and units",
-                key="solver.breakdown",
-            )
+            raise explain_smoother(place.t)
     measured = (*ahead.measured, *rows)
     turns = ahead.before.turns and all(one.turns for one in measured)
     message = Message.of(ahead.state, ahead.values, ahead.columns, top[:, :D], top[:, D], beside, turns)

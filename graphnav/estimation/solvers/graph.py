@@ -16,8 +16,8 @@ import gtsam
 import numpy as np
 from scipy.linalg.lapack import dtrtri
 
-from graphnav.core.errors import EstimationError
 from graphnav.core.rotation import Array
+from graphnav.estimation.solvers.breakdown import explain_undetermined
 
 _SUMS = 1 << 60  # keys of variables that are eliminated before anybody sees them
 Blocks = Sequence[tuple[Array, Array]]  # (keys (N,), A (N, m, k)) per variable a factor touches
@@ -126,9 +126,7 @@ class Eliminated:
             key, *parents = conditional.keys()
             R_inverse, singular = dtrtri(conditional.R())
             if singular:
-                raise EstimationError(
-                    "the data leave something undetermined: there is no covariance", key="solver.undetermined"
-                )
+                raise explain_undetermined()
             n = len(R_inverse)
             kept = [*parents, *(k for k in where if first.get(k, i) < i and k not in parents)]
             index = [column for p in kept for column in where[p]]

@@ -13,7 +13,7 @@ from typing import Protocol
 
 import numpy as np
 
-from graphnav.core.notes import Note
+from graphnav.core.notes import Note, format_count
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, States
 from graphnav.estimation.dense import dense
@@ -153,7 +153,7 @@ def replay(problem: Problem, solver: str, engine: Engine, lag: float, progress: 
         notes=(
             *problem.notes,
             Note("solver.step_times", ("" if np.isinf(lag) else f"lag {lag:g} s: ") + describe(seconds)),
-            Note("solver.relinearised", f"{again} keyframes were linearised again"),
+            Note("solver.relinearised", f"{format_count(again, 'keyframe')} linearised again"),
         ),
         between=(dense(problem, states, covariance, scale_at(problem.columns, values), smooth=True),),
     )

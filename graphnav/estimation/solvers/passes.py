@@ -12,11 +12,11 @@ from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, States
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import ConstraintRecord, ParameterEstimate, Solution
-from graphnav.estimation.solvers.invariant import plus_invariant
+from graphnav.estimation.solvers.invariant import minus_invariant, plus_invariant
 from graphnav.estimation.solvers.linearise import Points, find_last_keyframes, linearise, shift
-from graphnav.estimation.solvers.recursion import solve
+from graphnav.estimation.solvers.recursion import Blocks
 from graphnav.estimation.solvers.robust import weight_and_cost
-from graphnav.estimation.solvers.stack import Blocks, Innovations, RowBlock
+from graphnav.estimation.solvers.stack import Innovations
 from graphnav.imu.dynamics import as_biases
 
 _TURN = 0.02  # rad; what is linear in an error of attitude is wrong by half its square
@@ -35,7 +35,7 @@ class SmootherPass(Points):
 
 @dataclass(frozen=True)
 class Updates:
-    """The updates of n keyframes, block by block as `graphnav.estimation.solvers.stack.Blocks` has them."""
+    """The updates of n keyframes, block by block as `graphnav.estimation.solvers.recursion.Blocks` has them."""
 
     blocks: Blocks
     Kt: Array  # (n, M, D) gains transposed
@@ -50,17 +50,6 @@ class Updates:
         return cls(
             blocks, np.zeros_like(H), H, np.zeros(H.shape[:2]), np.zeros_like(H), np.zeros(len(blocks.begin), bool)
         )
-
-    def forget(self, k: int) -> None:
-        """Take those of keyframe k back."""
-        self.taken[self.blocks.first[k] : self.blocks.first[k + 1]] = False
-
-    def add(self, some: RowBlock, Kt: Array, w: Array, root: Array) -> None:
-        """An update, with the lower root of S."""
-        at = some.at
-        self.Kt[at], self.w[at], self.SH[at] = Kt, w, self.H[at]
-        solve(root, self.SH[at])
-        self.taken[some.number] = True
 
 
 @dataclass(frozen=True)
@@ -107,6 +96,11 @@ class FilterPass(ForwardRecord):
 def move_points(points: Points, errors: Array) -> Points:
     """Points moved by error states (K, D)."""
     return Points(plus_invariant(points.states, errors[:, :DIM]), points.values + errors[:, DIM:])
+
+
+def subtract_points(points: Points, other: Points) -> Array:
+    """The error states (K, D) with ``move_points(other, errors) == points``."""
+    return np.concatenate([minus_invariant(points.states, other.states), points.values - other.values], axis=1)
 
 
 def join_passes(parts: list[Points]) -> Points:

@@ -1,104 +1,60 @@
-"""Where a filter takes its Jacobians: at its own estimate, or at points that are given.
+"""The filter linearised at points that are given, those of an earlier pass, all at once.
 
-A filter goes from keyframe to keyframe with an estimate x and the covariance of its error, and asks one of these for
-the step to a keyframe and for the rows there. `AtEstimate` linearises where the filter is: x is a state and parameter
-values. `AtPoints` has linearised everything at once, at the points X of an earlier pass: x is the error state e with
-X_k [+] e_k the estimate, and (Bell 1994: one step of the iterated smoother)
+Its estimate at keyframe k is X_k [+] e_k, with X_k the point and e_k the error state that the filter finds (Bell 1994:
+one step of the iterated smoother):
 
     e_{k+1} <- f(X_k) [-] X_{k+1} + F e_k     nu = -(r(X) + H e)
 
-A pass at given points takes a ninth of the time, and is the better one wherever the filter has gone astray.
+A pass at given points takes a fraction of the time of one that is linearised where it is
+(`graphnav.estimation.solvers.stretches`), and is the better one wherever the filter has gone astray.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
 from graphnav.core import rotation
-from graphnav.core.rotation import Array
+from graphnav.core.rotation import Array, mv
 from graphnav.core.state import DIM, States
 from graphnav.estimation.problem import Problem
-from graphnav.estimation.solvers.invariant import minus_invariant, plus_invariant, transport_covariance
+from graphnav.estimation.solvers.breakdown import explain_rows
+from graphnav.estimation.solvers.invariant import MOVING
 from graphnav.estimation.solvers.linearise import Advance, Points, linearise, shift
-from graphnav.estimation.solvers.recursion import turn
+from graphnav.estimation.solvers.passes import Progress, Updates
+from graphnav.estimation.solvers.recursion import STRETCH, filter_rows, turn
 from graphnav.estimation.solvers.stack import RowBlock, Stack
 from graphnav.imu.dynamics import SCALE
 
-Rows = tuple[Array, Array, Array]  # residuals (m,), Jacobian (m, D) and sigmas (m,)
+_SHORTEST = 4  # keyframes that are filtered at once, behind one at which something was found
+Follow = Callable[[int, int], int]  # looks at what was filtered from a keyframe to another, and says where to go on
 
 
 @dataclass(frozen=True)
-class Estimate:
-    """A state of one row and parameter values (D-15,)."""
+class Errors:
+    """Error states (n, D) about given points and their covariances, predicted and filtered."""
 
-    state: States
-    values: Array
-
-
-class AtEstimate:
-    """Steps and rows linearised where the filter is."""
-
-    def __init__(self, problem: Problem, steps: Advance) -> None:
-        self._problem, self._columns, self._scale = problem, problem.columns, problem.columns.get(SCALE)
-        self._steps, self._width = steps, DIM + steps.decay.shape[1]
-
-    def step(self, k: int, x: Estimate) -> tuple[Estimate, Array, Array]:
-        """The estimate at keyframe k from that at the one before, and F (15, w) and Q (15, 15) of the states."""
-        at = slice(k - 1, k)
-        ahead, F = predict_states(self._problem, at, x.state, x.values[None])
-        return (
-            Estimate(ahead, self._steps.ahead(k - 1, x.values)),
-            F[0],
-            self._problem.motion.noise(at, x.state.R_nb)[0],
-        )
-
-    def rows(self, some: RowBlock, at: Estimate) -> Rows:
-        """Rows of one constraint linearised at an estimate."""
-        ((rows, lo, hi),) = some.parts
-        here = Points(at.state, at.values[None])
-        linear = linearise(rows, here, self._columns, slice(lo, hi), np.zeros(hi - lo, dtype=int))
-        return linear.residual.ravel(), linear.H.reshape(-1, self._width), linear.stated.ravel()
-
-    @staticmethod
-    def about(x: Estimate) -> tuple[Estimate, None]:
-        """What the rows of an update are linearised about, and the error state (D,) from there to x if there is one."""
-        return x, None
-
-    @staticmethod
-    def passes(some: RowBlock) -> int:
-        """How often the rows of an update are linearised."""
-        return some.parts[0][0].passes
-
-    @staticmethod
-    def plus(at: Estimate, d: Array) -> Estimate:
-        """`at` moved by an error state."""
-        return Estimate(plus_invariant(at.state, d[None, :DIM]), at.values + d[DIM:])
-
-    @staticmethod
-    def minus(x: Estimate, at: Estimate) -> Array:
-        """The error state (D,) that leads from `at` to x."""
-        return np.concatenate([minus_invariant(x.state, at.state)[0], x.values - at.values])
-
-    @staticmethod
-    def carry(P: Array, x: Estimate, to: Estimate) -> Array:
-        """The covariance P (D, D) of errors about x as one of errors about an estimate that x has moved to."""
-        return transport_covariance(P[None], x.state, to.state)[0]
+    predicted: Array
+    P_predicted: Array
+    filtered: Array
+    P: Array
 
 
-class AtPoints:
-    """Steps and rows of the first n keyframes, all linearised at n points.
+class PointFilter:
+    """Filter the first keyframes linearised at given points.
 
     Parameters
     ----------
     F : (n-1, 15, w) or more, for the transition matrices.
+    out : of all n keyframes, to be filled.
     """
 
-    def __init__(self, problem: Problem, points: Points, stack: Stack, steps: Advance, F: Array) -> None:
-        n, columns, self._steps = len(points.values), problem.columns, steps
-        D = DIM + points.values.shape[1]
+    def __init__(self, problem: Problem, points: Points, stack: Stack, steps: Advance, F: Array, out: Errors) -> None:
+        n = len(points.values)
         begin, end, at = points.states[: n - 1], points.states[1:n], slice(0, n - 1)
+        self._stack, self._steps, self.out = stack, steps, out
         ahead, F[: n - 1] = predict_states(problem, at, begin, points.values[: n - 1])
         self.F, self.Q = F[: n - 1], problem.motion.noise(at, begin.R_nb)
         values = steps.ahead(at, points.values[: n - 1])
@@ -109,52 +65,46 @@ class AtPoints:
         self.Q[:, :3] = turned @ self.Q[:, :3]
         self.Q[:, :, :3] = self.Q[:, :, :3] @ np.swapaxes(turned, -1, -2)
         self.speeds = np.linalg.norm(points.states.v, axis=1)
-        self.r, self._sigma = np.zeros((n, stack.M)), np.ones((n, stack.M))
-        self.H = np.zeros((n, stack.M, D))
-        for rows in problem.constraints:
-            at_k = rows.keyframe[: int(np.searchsorted(rows.keyframe, n))]
-            if len(at_k):
-                linear = linearise(rows, points, columns, slice(0, len(at_k)))
-                place = at_k[:, None], stack.places[rows.name][1][: len(at_k)]
-                self.r[place], self._sigma[place] = linear.residual, linear.stated
-                self.H[place] = linear.H
+        of_rows = {rows.name: rows.keyframe for rows in problem.constraints}
+        self.r, self._sigma, self.H = linearise_all(problem, stack, points, slice(0, n), of_rows)
         self.variance = (self._sigma / stack.root_weight[:n]) ** 2
+        self.used = stack.joint.used.copy()
+        self.updates = Updates.none(stack.joint, self.H)
+        self._at = np.zeros(1, dtype=int)
 
-    def weigh(self, some: RowBlock, root_weight: float | Array) -> None:
+    def weigh(self, some: RowBlock, used: bool, root_weight: float | Array) -> None:
         """Weigh some rows anew: the root of the weight of all, or of each number."""
+        self.used[some.number] = used
         self.variance[some.at] = (self._sigma[some.at] / root_weight) ** 2
 
-    def step(self, k: int, x: Array) -> tuple[Array, Array, Array]:
-        """As `AtEstimate.step`, of error states (D,)."""
-        F, ahead = self.F[k - 1], self.gap[k - 1].copy()
-        ahead[:DIM] += F @ x[: F.shape[1]]
-        ahead[DIM:] += self._steps.decay[k - 1] * x[DIM:]
-        return ahead, F, self.Q[k - 1]
+    def run(self, begin: Callable[[], tuple[Array, Array]], follow: Follow | None, progress: Progress | None) -> None:
+        """Filter all keyframes, from what `begin` says of the errors (D,) and P before the first.
 
-    def rows(self, some: RowBlock, at: None) -> Rows:
-        """As `AtEstimate.rows`, linearised at the points."""
-        at_k = some.at
-        return self.r[at_k], self.H[at_k], self._sigma[at_k]
+        Nothing that follows changes a filter until it has found something. So the filter goes ahead a stretch of
+        keyframes, and `follow` comes after; where it finds something, both go on from there.
+        """
+        n, k, length = len(self.out.filtered), 0, STRETCH
+        while k < n:
+            end = min(k + length, n)
+            self._filter(k, end, begin)
+            on = end if follow is None else follow(k, end)
+            # where one fault has been found the next is near, and what was filtered beyond it was in vain
+            k, length = on, min(2 * length, STRETCH) if on == end else _SHORTEST
+            if progress is not None:
+                progress("filter", k / self._stack.K)
 
-    @staticmethod
-    def about(x: Array) -> tuple[None, Array]:
-        """The points, which all error states are from."""
-        return None, x
-
-    @staticmethod
-    def passes(some: RowBlock) -> int:
-        """The points stay."""
-        return 1
-
-    @staticmethod
-    def plus(at: None, d: Array) -> Array:
-        """The points moved by an error state."""
-        return d
-
-    @staticmethod
-    def carry(P: Array, x: Array, to: Array) -> Array:
-        """The points stay."""
-        return P
+    def _filter(self, k0: int, k1: int, begin: Callable[[], tuple[Array, Array]]) -> None:
+        out, updates, stack, n = self.out, self.updates, self._stack, len(self.out.filtered)
+        e, P = (out.filtered[k0 - 1], out.P[k0 - 1]) if k0 else begin()
+        try:
+            filter_rows(
+                k0, k1, e, P, self.F, self._steps.decay, self.gap, self.Q, self._steps.added,
+                self.r, self.H, self.variance, stack.scale[:n], stack.joint, self.used,
+                out.predicted, out.P_predicted, out.filtered, out.P,
+                stack.root, stack.solved, stack.bent, updates.Kt, updates.w, updates.SH, updates.taken, self._at,
+            )  # fmt: skip
+        except np.linalg.LinAlgError:
+            raise explain_rows(stack.block(int(self._at[0])).parts) from None
 
 
 def predict_states(problem: Problem, at: slice, states: States, values: Array) -> tuple[States, Array]:
@@ -164,6 +114,42 @@ def predict_states(problem: Problem, at: slice, states: States, values: Array) -
         return motion.propagate(at, states)
     ahead, F = motion.propagate(at, states, values[:, shift(scale)])
     return ahead, np.concatenate([F, motion.scale_columns(at, F, scale.stop - scale.start)], axis=2)
+
+
+def linearise_all(
+    problem: Problem,
+    stack: Stack,
+    points: Points,
+    own: slice,
+    of_rows: Mapping[str, Array],
+    first: int = 0,
+    offset: int = 0,
+    moved: tuple[Array, Array] | None = None,
+) -> tuple[Array, Array, Array]:
+    """Residuals, sigmas (n, M) and Jacobians (n, M, D) of the rows of keyframes `own`, from keyframe `first` on.
+
+    Parameters
+    ----------
+    of_rows : of each constraint the point that each row is at, less `offset`.
+    moved : T (n, 9, 9) and m (n, D), where the errors about a point are T (y - m) of the errors y that rows are about.
+    """
+    n = own.stop - own.start
+    r, sigma = np.zeros((n, stack.M)), np.ones((n, stack.M))
+    H = np.zeros((n, stack.M, DIM + points.values.shape[1]))
+    for rows in problem.constraints:
+        which = slice(*rows.keyframe.searchsorted((first, own.stop)))
+        if which.start == which.stop:
+            continue
+        at = of_rows[rows.name][which] - offset
+        linear = linearise(rows, points, problem.columns, which, at)
+        J, residual = linear.H, linear.residual
+        if moved is not None:
+            T, m = moved
+            J[:, :, :MOVING] = J[:, :, :MOVING] @ T[at]
+            residual = residual - mv(J, m[at])
+        place = rows.keyframe[which, None] - own.start, stack.places[rows.name][1][which]
+        r[place], sigma[place], H[place] = residual, linear.stated, J
+    return r, sigma, H
 
 
 def move_covariance(P: Array, e: Array) -> Array:

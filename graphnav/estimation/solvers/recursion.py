@@ -8,6 +8,8 @@ themselves and on the scale errors of the IMU behind them; each parameter beyond
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from graphnav.core.compiled import compiled
@@ -15,6 +17,24 @@ from graphnav.core.rotation import Array
 from graphnav.core.state import DIM
 
 STRETCH = 256  # keyframes from one word of how far it has come to the next
+PASSES = 4  # of re-weighting where a measurement is met for the first time
+UNUSED = 1e-12  # weight of a row that is not used beside others of its keyframe
+HUBER, CAUCHY = 1, 2
+
+
+class Blocks(NamedTuple):
+    """Rows that are taken in at once: those of keyframe k are the blocks `first[k]` to `first[k+1]`."""
+
+    first: Array  # (K+1,)
+    begin: Array  # (B,) place in the keyframe of the first number, and behind the last
+    end: Array
+    used: Array  # (B,) rows of weight 0 are not
+    gate: Array  # (B,) normalised innovation squared beyond which it is refused
+    kernel: Array  # (B,) 0, `HUBER` or `CAUCHY`
+    size: Array  # (B,) numbers of one row
+    part: Array  # (B+1,) the first of the parts that each is made of
+    k: Array  # (B,) keyframe
+    kind: Array  # (B,) number of the constraint, of the first where several are taken in together
 
 
 @compiled
@@ -125,6 +145,25 @@ def update(P: Array, HP: Array, H: Array, Kt: Array, variance: Array) -> Array:
 
 
 @compiled
+def weigh_robustly(
+    HP: Array, HPHt: Array, variance: Array, r: Array, solved: Array, kernel: int, scale: Array, size: int
+) -> Array:
+    """Weights (m,) of a kernel for rows of `size` numbers, by what the update leaves: none at first."""
+    weight, sigma = np.ones(len(r)), np.sqrt(variance)
+    for last in range(PASSES - 1):
+        left = (r - np.dot(HPHt, solved)) / sigma
+        for lo in range(0, len(r), size):
+            s, k = np.sqrt(np.sum(left[lo : lo + size] ** 2)), scale[lo]
+            own = 1.0 / (1.0 + (s / k) ** 2)
+            if kernel == HUBER:
+                own = k / s if s > k else 1.0
+            weight[lo : lo + size] = max(own, UNUSED)
+        if last < PASSES - 2:
+            solved = compute_gain(HP, HPHt, variance / weight, r)[1]
+    return weight
+
+
+@compiled
 def filter_rows(
     k0: int,
     k1: int,
@@ -138,9 +177,8 @@ def filter_rows(
     r: Array,
     H: Array,
     variance: Array,
-    first: Array,
-    begin: Array,
-    end: Array,
+    scale: Array,
+    blocks: Blocks,
     used: Array,
     errors_predicted: Array,
     P_predicted: Array,
@@ -148,8 +186,11 @@ def filter_rows(
     P_filtered: Array,
     root: Array,
     solved: Array,
+    bent: Array,
     Kt: Array,
+    w: Array,
     SH: Array,
+    taken: Array,
     at: Array,
 ) -> None:
     """Filter keyframes k0 to k1, linearised throughout, from errors e (D,) and P before them.
@@ -158,10 +199,12 @@ def filter_rows(
     ----------
     gap : (n-1, D) where a step leads from a point, less the next point.
     Q, added : (n-1, 15, 15) and (n-1, D-15) as for `predict`.
-    r, H, variance : (n, M), (n, M, D), (n, M) of the rows at the points.
+    r, H, variance, scale : (n, M), (n, M, D), (n, M), (n, M) of the rows at the points, and of their kernels.
     used : (B,) whether a block is taken in; of one that is not there is an innovation only.
-    root, solved : (n, M, M), (n, M), filled with roots of S and S^-1 (r + H e).
-    Kt, SH : (n, M, D), filled with gains transposed and S^-1 H.
+    root, solved : (n, M, M), (n, M), filled with roots of S and S^-1 (r + H e), before any kernel.
+    bent : (n, M), filled with weights of kernels, 0 of rows that a gate refuses.
+    Kt, w, SH : (n, M, D), (n, M), (n, M, D), filled with gains transposed, S^-1 nu and S^-1 H.
+    taken : (B,), filled with whether a block was taken in.
     at : (1,), the block that is taken in.
     """
     for k in range(k0, k1):
@@ -172,17 +215,27 @@ def filter_rows(
             np.positive(P, P_predicted[k])
         P = P_predicted[k]
         np.positive(e, errors_predicted[k])
-        for b in range(first[k], first[k + 1]):
+        for b in range(blocks.first[k], blocks.first[k + 1]):
             at[0] = b
-            lo, hi = begin[b], end[b]
+            lo, hi = blocks.begin[b], blocks.end[b]
             own, R = H[k, lo:hi], variance[k, lo:hi]
             HP = np.dot(own, P)
+            HPHt = np.dot(HP, own.T)
             left = r[k, lo:hi] + np.dot(own, e)
-            L, w_b, Kt_b = compute_gain(HP, np.dot(HP, own.T), R, left)
+            L, w_b, Kt_b = compute_gain(HP, HPHt, R, left)
             np.positive(w_b, solved[k, lo:hi])
             np.positive(L, root[k, lo:hi, lo:hi])
-            if used[b]:
+            refused = np.dot(left, w_b) > blocks.gate[b]
+            taken[b] = used[b] and not refused
+            bent[k, lo:hi] = 0.0 if refused else 1.0
+            if taken[b]:
+                if blocks.kernel[b]:
+                    weight = weigh_robustly(HP, HPHt, R, left, w_b, blocks.kernel[b], scale[k, lo:hi], blocks.size[b])
+                    np.positive(weight, bent[k, lo:hi])
+                    R = R / weight
+                    L, w_b, Kt_b = compute_gain(HP, HPHt, R, left)
                 np.positive(Kt_b, Kt[k, lo:hi])
+                np.negative(w_b, w[k, lo:hi])
                 np.positive(own, SH[k, lo:hi])
                 solve(L, SH[k, lo:hi])
                 e = e - np.dot(left, Kt_b)

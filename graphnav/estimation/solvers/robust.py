@@ -12,7 +12,6 @@ import numpy as np
 
 from graphnav.core.rotation import Array
 
-PASSES = 4  # of re-weighting where a measurement is met for the first time
 REDESCENDING = ("geman-mcclure", "tukey", "welsch", "gnc")
 
 

@@ -22,12 +22,12 @@ import numpy as np
 from scipy.linalg.lapack import dposv
 
 from graphnav.core import rotation
-from graphnav.core.errors import EstimationError
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, States
 from graphnav.estimation.dense import dense
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import Solution
+from graphnav.estimation.solvers.breakdown import explain_smoother
 from graphnav.estimation.solvers.linearise import scale_at
 from graphnav.estimation.solvers.passes import (
     FilterPass,
@@ -62,7 +62,7 @@ def backward(problem: Problem, forward: ForwardRecord, progress: Progress | None
             ahead = forward.P_predicted[end]
             _, inverse, info = dposv(ahead, np.eye(D))
             if info:
-                raise _explain_breakdown(problem, end)
+                raise explain_smoother(float(problem.t[end]))
             r[end], N[end] = inverse @ away, inverse @ (ahead - P[end]) @ inverse
         errors = np.empty((end, D))
         if forward.updates is not None:
@@ -92,7 +92,7 @@ def _smooth_filtered(
                 forward.P_predicted[some], forward.P[some], all_P[some], errors, at,
             )  # fmt: skip
         except np.linalg.LinAlgError:
-            raise _explain_breakdown(problem, end + int(at[0])) from None
+            raise explain_smoother(float(problem.t[end + int(at[0])])) from None
         if progress is not None:
             progress("smoother", 1.0 - lo / K)
     all_values[some] = own.values + errors[:, DIM:]
@@ -136,11 +136,6 @@ def _restore_digits(forward: ForwardRecord, P: Array, end: int) -> None:
         M = I - C @ F
         smoothed = M @ forward.P[k] @ M.T + C @ (P[k + 1] + Pp - FP @ F.T) @ C.T
         P[k] = 0.5 * (smoothed + smoothed.T)
-
-
-def _explain_breakdown(problem: Problem, k: int) -> EstimationError:
-    sentence = f"the smoother's covariance broke down at {problem.t[k]:.3f} s: check the sigmas"
-    return EstimationError(sentence, key="solver.breakdown")
 
 
 def rts(problem: Problem, forward: FilterPass, found: SmootherPass | None = None) -> Solution:

@@ -20,8 +20,10 @@ from graphnav.constraints.base import Constraint
 from graphnav.core.rotation import Array, mv
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import ConstraintRecord
+from graphnav.estimation.solvers.recursion import CAUCHY, HUBER, UNUSED, Blocks
+from graphnav.estimation.solvers.robust import soften
 
-NONE = 1e-12  # weight of a row that is not used beside others of its keyframe
+_KERNELS = {"none": 0, "huber": HUBER, "cauchy": CAUCHY}
 
 
 class Innovations:
@@ -67,7 +69,6 @@ class RowBlock:
     begin: int
     end: int
     parts: list[tuple[Constraint, int, int]]  # each with its rows lo..hi
-    alone: bool  # one kind, about which something is to be decided
 
     @property
     def at(self) -> tuple[int, slice]:
@@ -75,31 +76,18 @@ class RowBlock:
         return self.k, slice(self.begin, self.end)
 
 
-@dataclass(frozen=True)
-class Blocks:
-    """Rows that are taken in at once: those of keyframe k are the blocks `first[k]` to `first[k+1]`."""
-
-    first: Array  # (K+1,)
-    begin: Array  # (B,) place in the keyframe of the first number, and behind the last
-    end: Array
-    alone: Array  # (B,) one kind, about which something is to be decided
-    used: Array  # (B,) rows of weight 0 are not
-    part: Array  # (B+1,) the first of the parts that each is made of
-    k: Array  # (B,) keyframe
-    kind: Array  # (B,) number of the constraint, of the first where several are taken in together
-
-
 class Stack:
     """The rows of the first K keyframes, at most M numbers each.
 
-    `alone` are the names of constraints whose rows are taken in without others; those of weight 0 are anyway.
+    `alone` are the names of constraints whose rows are taken in without others; those of weight 0 and those about which
+    something is to be decided are anyway.
     """
 
     def __init__(self, problem: Problem, K: int, alone: Collection[str] = ()) -> None:
         self.K, self._constraints = K, problem.constraints
         self.records = {c.name: Innovations(c) for c in self._constraints}
         self.places: dict[str, tuple[Array, Array]] = {}  # per constraint: keyframe (n, 1) and place there (n, m)
-        weights, filled = [], np.zeros(K, dtype=int)
+        weights, scales, filled = [], [], np.zeros(K, dtype=int)
         parts = []  # of each kind at each keyframe: keyframe, kind, rows lo..hi, numbers begin..end, apart, used
         for i, c in enumerate(self._constraints):
             first, m = np.searchsorted(c.keyframe, np.arange(K + 1)), len(c.axes)
@@ -112,56 +100,53 @@ class Stack:
             used = np.maximum.reduceat(weight, lo) > 0.0 if len(lo) else np.ones(0, dtype=bool)
             apart = np.minimum.reduceat(weight, lo) == 0.0 if len(lo) else used
             numbers = filled[here], filled[here] + m * (hi - lo)
-            parts.append(np.stack([here, np.full(len(here), i), lo, hi, *numbers, apart | (c.name in alone), used]))
+            apart |= c.name in alone or c.gate is not None or c.robust != "none"
+            parts.append(np.stack([here, np.full(len(here), i), lo, hi, *numbers, apart, used]))
             filled += m * np.diff(first)
             # what is not used beside others of its kind weighs next to nothing; alone it has an innovation only
-            weight = np.where(np.repeat(used, hi - lo), np.maximum(weight, NONE), 1.0)
+            weight = np.where(np.repeat(used, hi - lo), np.maximum(weight, UNUSED), 1.0)
             weights.append(np.sqrt(weight)[:, None])
-            if c.weight is not None:
-                self.records[c.name].weight[: len(k)] = c.weight[: len(k)]
+            scales.append(np.broadcast_to(c.scale_of(slice(0, len(k))), len(k))[:, None])
         self.M = int(np.max(filled, initial=0))
-        self.root_weight = np.ones((K, self.M))
-        for place, weight in zip(self.places.values(), weights, strict=True):
-            self.root_weight[place] = weight
+        self.root_weight, self.scale = np.ones((2, K, self.M))
+        for place, weight, scale in zip(self.places.values(), weights, scales, strict=True):
+            self.root_weight[place], self.scale[place] = weight, scale
         table = np.concatenate(parts, axis=1) if parts else np.empty((8, 0), dtype=int)
         table = table[:, np.argsort(table[0], kind="stable")]
         self._parts = table[:6].T.tolist()
         self.single = self._blocks(table, np.ones(table.shape[1], dtype=bool))
         k, apart = table[0], table[6].astype(bool)
         self.joint = self._blocks(table, np.diff(k, prepend=-1).astype(bool) | apart | np.roll(apart, 1))
-        self.root, self.solved = np.zeros((K, self.M, self.M)), np.zeros((K, self.M))
+        # of each update: the lower root of S, S^-1 r, and what a kernel has left of the weights of rows
+        self.root, self.solved, self.bent = np.zeros((K, self.M, self.M)), np.zeros((K, self.M)), np.ones((K, self.M))
 
     def _blocks(self, table: Array, new: Array) -> Blocks:
         """Parts (8, n) in blocks, where `new` (n,) each begins one."""
         part = np.append(np.flatnonzero(new), table.shape[1])
         head, last = part[:-1], part[1:] - 1
         first = np.searchsorted(table[0, head], np.arange(self.K + 1))
-        apart, used = table[6, head].astype(bool), table[7, head].astype(bool)
-        return Blocks(first, table[4, head], table[5, last], apart, used, part, *table[:2, head])
+        kinds = np.array([_describe(c) for c in self._constraints]).reshape(-1, 3)[table[1, head]]
+        kernel, size = kinds[:, 1:].T.astype(int)
+        used = table[7, head].astype(bool)
+        return Blocks(
+            first, table[4, head], table[5, last], used, kinds[:, 0].copy(), kernel, size, part, *table[:2, head].copy()
+        )
 
-    def together(self, k: int, one_by_one: bool = False) -> Iterator[RowBlock]:
-        """All rows of a keyframe, in the order of the constraints; each kind by itself if wanted so."""
-        blocks = self.single if one_by_one else self.joint
-        for b in range(blocks.first[k], blocks.first[k + 1]):
-            yield self.block(b, blocks)
+    def together(self, k: int) -> Iterator[RowBlock]:
+        """All rows of a keyframe, in the order of the constraints."""
+        for b in range(self.joint.first[k], self.joint.first[k + 1]):
+            yield self.block(b)
 
     def find_kinds(self, names: Sequence[str]) -> Array:
         """(B,) which of some constraints each joint block is of, -1 for none."""
         number = [names.index(c.name) if c.name in names else -1 for c in self._constraints]
         return np.array(number)[self.joint.kind]
 
-    def block(self, b: int, blocks: Blocks | None = None) -> RowBlock:
+    def block(self, b: int) -> RowBlock:
         """Block number b."""
-        blocks = blocks or self.joint
-        some = self._parts[blocks.part[b] : blocks.part[b + 1]]
+        some = self._parts[self.joint.part[b] : self.joint.part[b + 1]]
         parts = [(self._constraints[i], lo, hi) for _, i, lo, hi, _, _ in some]
-        alone = blocks is self.single or bool(blocks.alone[b])
-        return RowBlock(some[0][0], b, some[0][4], some[-1][5], parts, alone)
-
-    def seen(self, rows: RowBlock, root: Array, solved: Array) -> None:
-        """Rows have had an innovation r: the lower root of its covariance S, and S^-1 r."""
-        k, at = rows.at
-        self.root[k, at, at], self.solved[k, at] = root, solved
+        return RowBlock(some[0][0], b, some[0][4], some[-1][5], parts)
 
     def finish(self) -> Array:
         """Work out the innovations of each kind; returns their log-likelihood (K,), but for a constant."""
@@ -182,5 +167,13 @@ class Stack:
             record.residual[:n], record.sigma[:n] = residual[place], sigma[place]
             total = np.bincount(k, np.sum(white[place] ** 2, axis=1), self.K)
             record.nis[:n] = total[k] / np.bincount(k, minlength=self.K)[k]
+            bent = self.bent[k, place[1][:, 0]]
+            record.weight[:n], record.refused[:n] = record.used[:n] * bent, bent == 0.0
         log_determinant = np.sum(np.log(np.where(spread > 0.0, spread, 1.0)), axis=1)
         return -log_determinant - 0.5 * np.sum(np.where(weighs, white, 0.0) ** 2, axis=1)
+
+
+def _describe(rows: Constraint) -> tuple[float, int, int]:
+    """Gate, kernel and numbers of one row of a constraint; a gate stands in place of a kernel."""
+    gate = np.inf if rows.gate is None else rows.gate**2
+    return gate, _KERNELS[soften(rows.robust)] if rows.gate is None else 0, len(rows.axes)

@@ -31,6 +31,7 @@ from graphnav.core.errors import EstimationError
 from graphnav.core.rotation import Array, mv
 from graphnav.core.state import DIM, States
 from graphnav.estimation.problem import Problem
+from graphnav.estimation.solvers.breakdown import explain_smoother
 from graphnav.estimation.solvers.linearise import Columns, Points, Step, linearise, linearise_links, scale_at, shift
 from graphnav.estimation.solvers.robust import soften, weight_and_cost
 from graphnav.estimation.solvers.turning import change_of_point, plus_turning, split_turn
@@ -98,9 +99,7 @@ class Message:
         """(D,) the error state that it makes most likely."""
         found, info = dgesv(self.R, self.z)[2:]  # not triangular any more once its point has turned
         if info:
-            raise EstimationError(
-                "the smoother's information broke down: check sigmas and units", key="solver.breakdown"
-            )
+            raise explain_smoother()
         return np.asarray(found)
 
     @property

@@ -13,7 +13,11 @@ linearised at X_i have r - H T_i m_i and H T_i. The guess moves by the e_i that 
 stays where they are zero: there each row has been linearised where the filter was, and what is found is what a filter
 finds that goes step by step (Picard's iteration; Lelarasmee, Ruehli and Sangiovanni-Vincentelli 1982, "The waveform
 relaxation method for time-domain analysis of large scale integrated circuits"). What the first keyframes come to
-depends on nothing behind them: they are done once they stay, whatever those behind them do.
+depends on nothing behind them: they are done once they stay, whatever those behind them do. A keyframe alone always
+comes to stay, one kind of rows after the other.
+
+Rows that are strongly nonlinear over what the filter does not know are linearised at X_i itself, where they lead: the
+iterated Kalman filter (Jazwinski 1970, theorem 8.2), which is Gauss and Newton's method on the update.
 """
 
 from __future__ import annotations
@@ -23,10 +27,11 @@ import numpy as np
 from graphnav.core.rotation import Array, mv
 from graphnav.core.state import DIM, States
 from graphnav.estimation.problem import Problem
+from graphnav.estimation.solvers.breakdown import explain_rows
 from graphnav.estimation.solvers.invariant import MOVING, compute_transport, minus_invariant
-from graphnav.estimation.solvers.linearise import Advance, Points, linearise, shift
+from graphnav.estimation.solvers.linearise import Advance, Points, shift
 from graphnav.estimation.solvers.passes import join_passes, move_points
-from graphnav.estimation.solvers.points import Estimate, predict_states
+from graphnav.estimation.solvers.points import linearise_all, predict_states
 from graphnav.estimation.solvers.recursion import filter_rows, turn
 from graphnav.estimation.solvers.stack import Stack
 from graphnav.imu.dynamics import SCALE
@@ -37,7 +42,7 @@ _STAYS = 1e-8  # sigmas by which a guess that stays may move: a move leaves a te
 
 
 class StretchFilter:
-    """Filter keyframes with rows about which nothing is to be decided, and that need one linearisation each.
+    """Filter keyframes linearised where the filter is.
 
     Parameters
     ----------
@@ -55,11 +60,13 @@ class StretchFilter:
         self._end = np.arange(stack.K) + blocks.first[1:]
         self._before = np.arange(len(k)) + k  # of each block: behind it is the next
         self._of_rows = {}
-        for name, (at_k, place) in stack.places.items():
+        for rows in problem.constraints:
+            at_k, place = stack.places[rows.name]
             block = np.searchsorted(k * (stack.M + 1) + blocks.begin, (at_k * (stack.M + 1) + place)[:, 0], "right") - 1
-            self._of_rows[name] = self._before[block]
+            self._of_rows[rows.name] = self._before[block] + rows.iterated
+        self._taken, self._at = np.zeros(len(stack.joint.begin), dtype=bool), np.zeros(1, dtype=int)
 
-    def run(self, k: int, x: Estimate, P: Array, predicted: Points, filtered: Points) -> int:
+    def run(self, k: int, x: Points, P: Array, predicted: Points, filtered: Points) -> int:
         """Filter a stretch from keyframe k on.
 
         Parameters
@@ -70,31 +77,49 @@ class StretchFilter:
         Returns
         -------
         int
-            The keyframe to go on from: k where guessing leads nowhere.
+            The keyframe to go on from.
+
+        Raises
+        ------
+        EstimationError
+            If the covariance of an innovation is not positive definite.
         """
-        k1 = min(k + self._length, self._stack.K)
+        if (on := self._run(k, min(k + self._length, self._stack.K), x, P, predicted, filtered)) > k:
+            return on
+        # where guessing leads nowhere a keyframe alone does: its blocks are right one after the other
+        return self._run(k, k + 1, x, P, predicted, filtered, alone=True)
+
+    def _run(
+        self, k: int, k1: int, x: Points, P: Array, predicted: Points, filtered: Points, alone: bool = False
+    ) -> int:
         points = self._guess(k, k1, x)
-        for _ in range(_MOST):
+        most = _MOST + int(self._end[k] - self._start[k]) * alone
+        for left in range(most - 1, -1, -1):
             try:
                 stay, points = self._iterate(k, k1, x, P, points)
-            except np.linalg.LinAlgError:  # because the guess is far off, or else a single step will say so
-                break
+            except np.linalg.LinAlgError:
+                if alone:
+                    raise explain_rows(self._stack.block(int(self._at[0])).parts) from None
+                break  # because the guess is far off, or else a keyframe alone will say so
+            if alone and not left:
+                stay = k1
             if stay > k:
                 own = slice(k, stay)
                 predicted.put(own, points.at(self._start[own] - self._start[k]))
                 filtered.put(own, points.at(self._end[own] - self._start[k]))
                 last = int(self._end[stay - 1] - self._start[k])
-                x, P = Estimate(points.states[last : last + 1], points.values[last]), self._P[stay - 1]
+                x, P = points.at(slice(last, last + 1)), self._P[stay - 1]
                 k, points = stay, points.at(slice(last + 1, None))
             if k == k1:
-                self._length = min(2 * self._length, _LONGEST)
+                if not alone:
+                    self._length = min(2 * self._length, _LONGEST)
                 return k
         self._length = max(self._length // 2, _SHORTEST)
         return k
 
-    def _guess(self, k: int, k1: int, x: Estimate) -> Points:
+    def _guess(self, k: int, k1: int, x: Points) -> Points:
         """Where the IMU alone leads."""
-        states, values, scale = x.state, x.values, self._problem.columns.get(SCALE)
+        states, values, scale = x.states, x.values[0], self._problem.columns.get(SCALE)
         reached, known = [], []
         for j in range(k, k1):
             if j:
@@ -106,7 +131,7 @@ class StretchFilter:
         each = self._end[k:k1] - self._start[k:k1] + 1
         return Points(States.stack(reached), np.array(known)).at(np.repeat(np.arange(k1 - k), each))
 
-    def _iterate(self, k: int, k1: int, x: Estimate, P: Array, points: Points) -> tuple[int, Points]:
+    def _iterate(self, k: int, k1: int, x: Points, P: Array, points: Points) -> tuple[int, Points]:
         """Filter keyframes k to k1 about points; the first keyframe that does not stay, and the points as found."""
         stack, blocks, own = self._stack, self._stack.joint, slice(max(k - 1, 0), k1)
         start, end = self._start[k:k1] - self._start[k], self._end[k:k1] - self._start[k]
@@ -114,15 +139,16 @@ class StretchFilter:
         of_first = np.repeat(start, counts)
         T, m = _move_errors(points, of_first)
         gap, Q, F = self._step(k, k1, x, points, start, end, T, m)
-        r, variance, H = self._linearise(own, k, points, T, m)
+        r, sigma, H = linearise_all(self._problem, stack, points, own, self._of_rows, k, self._start[k], (T, m))
         n, D = r.shape[0], H.shape[2]
-        predicted, errors, Kt, SH = np.empty((n, D)), np.empty((n, D)), np.zeros_like(H), np.empty_like(H)
+        predicted, errors, Kt, SH, w = np.empty((n, D)), np.empty((n, D)), np.zeros_like(H), np.empty_like(H), r.copy()
         steps = slice(own.start, k1 - 1)
         filter_rows(
             k - own.start, n, np.zeros(D), P, F, self._steps.decay[steps], gap, Q, self._steps.added[steps],
-            r, H, variance, blocks.first[own.start : k1 + 1], blocks.begin, blocks.end, blocks.used,
+            r, H, (sigma / stack.root_weight[own]) ** 2, stack.scale[own],
+            blocks._replace(first=blocks.first[own.start : k1 + 1]), blocks.used,
             predicted, self._P_predicted[own], errors, self._P[own],
-            stack.root[own], stack.solved[own], Kt, SH, np.zeros(1, dtype=int),
+            stack.root[own], stack.solved[own], stack.bent[own], Kt, w, SH, self._taken, self._at,
         )  # fmt: skip
         self._P[k:k1] = turn(self._P[k:k1], T[end])
         # what each number adds to y, by the root of all numbers' covariance: (L^T K^T) (L^-1 nu)
@@ -140,12 +166,12 @@ class StretchFilter:
         return k + int(np.argmin(still)), move_points(points, e)
 
     def _step(
-        self, k: int, k1: int, x: Estimate, points: Points, start: Array, end: Array, T: Array, m: Array
+        self, k: int, k1: int, x: Points, points: Points, start: Array, end: Array, T: Array, m: Array
     ) -> tuple[Array, Array, Array]:
         """Where steps between the keyframes lead from points, (n, D) from the next of them, Q and F (n, 15, w)."""
         before, ahead, steps = points.at(end[:-1]), points.at(start if k else start[1:]), slice(max(k - 1, 0), k1 - 1)
         if k:
-            before = join_passes([Points(x.state, x.values[None]), before])
+            before = join_passes([x, before])
         reached, F = predict_states(self._problem, steps, before.states, before.values)
         values = self._steps.ahead(steps, before.values)
         gap = np.concatenate([reached.minus(ahead.states), values - ahead.values], axis=1)
@@ -156,23 +182,6 @@ class StretchFilter:
             gap[on, :DIM] -= mv(F[on], m[last, : F.shape[2]])
             gap[on, DIM:] -= self._steps.decay[steps][on] * m[last, DIM:]
         return gap, self._problem.motion.noise(steps, before.states.R_nb), F
-
-    def _linearise(self, own: slice, k: int, points: Points, T: Array, m: Array) -> tuple[Array, Array, Array]:
-        """Residuals, variances (n, M) and Jacobians (n, M, D) of the rows of keyframes `own` from k on."""
-        stack, problem, n = self._stack, self._problem, own.stop - own.start
-        r, sigma = np.zeros((n, stack.M)), np.ones((n, stack.M))
-        H = np.zeros((n, stack.M, DIM + points.values.shape[1]))
-        for rows in problem.constraints:
-            which = slice(*rows.keyframe.searchsorted((k, own.stop)))
-            if which.start == which.stop:
-                continue
-            at = self._of_rows[rows.name][which] - self._start[k]
-            linear = linearise(rows, points, problem.columns, which, at)
-            J = linear.H
-            J[:, :, :MOVING] = J[:, :, :MOVING] @ T[at]
-            place = rows.keyframe[which, None] - own.start, stack.places[rows.name][1][which]
-            r[place], sigma[place], H[place] = linear.residual - mv(J, m[at]), linear.stated, J
-        return r, (sigma / stack.root_weight[own]) ** 2, H
 
 
 def _move_errors(points: Points, first: Array) -> tuple[Array, Array]:

@@ -29,8 +29,8 @@ from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.elimination import Predicted
 from graphnav.estimation.solvers.linearise import Step, scale_at, shift
 from graphnav.estimation.solvers.passes import integrate_again
+from graphnav.estimation.solvers.recursion import PASSES
 from graphnav.estimation.solvers.revision import Renewed, linearise_runs
-from graphnav.estimation.solvers.robust import PASSES
 from graphnav.estimation.solvers.stages import (
     Measured,
     Message,
@@ -242,7 +242,7 @@ class Tree:
         for k in keyframes:
             k.version = self.version
 
-    def find_first_changed(self, version: int) -> float:
+    def find_oldest_relinearised(self, version: int) -> float:
         """Number of the oldest keyframe whose factors were replaced after a version; infinite if there is none."""
         return (
             next((k.number for k in self.keyframes if k.version > version), np.inf)
@@ -365,7 +365,8 @@ class Tree:
         """Let the first keyframes go, and the parameters' nodes that only they touch."""
         first = self.keyframes[count].number
         gone = [x for x in self.variables.values() if x.last < first]
-        if not are_leaves(self.isam, {x.key for x in gone}):  # GTSAM would drop what stands below them, too
+        stay = [x for x in self.variables.values() if x.last >= first]
+        if not are_leaves(self.isam, gone, stay):  # GTSAM would drop what stands below them, too
             self._replace([], [], self.keyframes[0].number)
         left = set(self.isam.marginalizeLeavesWithIndices(fill_keys(gtsam.KeyList(), gone))[1])
         for x in gone:

@@ -13,9 +13,9 @@ import gtsam
 import numpy as np
 
 from graphnav.core import rotation
-from graphnav.core.errors import EstimationError
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, States
+from graphnav.estimation.solvers.breakdown import explain_undetermined
 from graphnav.estimation.solvers.graph import Eliminated
 from graphnav.estimation.solvers.linearise import Columns, shift
 from graphnav.estimation.solvers.points import move_covariance
@@ -33,7 +33,7 @@ def compute_newest_covariance(tree: Tree) -> Array:
     try:
         found = tree.isam.marginalCovariance(x.key)
     except RuntimeError:
-        raise _explain_undetermined(last.place.t) from None
+        raise explain_undetermined(last.place.t) from None
     return move_covariance((x.unit[:, None] * found * x.unit)[None], x.delta[None])[0]
 
 
@@ -113,7 +113,7 @@ def eliminate(tree: Tree, so_far: Elimination, most: int) -> Elimination:
 
     Keyframes that came since it began do not count; where rows have been linearised anew, it begins anew.
     """
-    if tree.find_first_changed(so_far.version) <= so_far.newest:
+    if tree.find_oldest_relinearised(so_far.version) <= so_far.newest:
         so_far = begin_elimination(tree, so_far.count, so_far.first)
     if so_far.behind:
         order = fill_keys(gtsam.Ordering(), reversed(so_far.behind[-most:]))
@@ -136,7 +136,7 @@ def settle(tree: Tree, so_far: Elimination, now: bool = False) -> SettledStates:
         while (further := eliminate(tree, so_far, _AT_ONCE)) is not so_far:
             so_far = further
     except RuntimeError:  # GTSAM's for a variable that nothing determines
-        raise _explain_undetermined(so_far.estimates.keyframes[0].place.t) from None
+        raise explain_undetermined(so_far.estimates.keyframes[0].place.t) from None
     assert so_far.net is not None
     one = read_keyframes(tree, so_far.first, so_far.count) if now else so_far.estimates
     found = Eliminated(so_far.net).covariances()
@@ -155,10 +155,4 @@ def settle(tree: Tree, so_far: Elimination, now: bool = False) -> SettledStates:
         columns=tuple(k.columns for k in one.keyframes),
         values=one.values,
         sigma=tuple(sigma),
-    )
-
-
-def _explain_undetermined(t: float) -> EstimationError:
-    return EstimationError(
-        f"the data leave something undetermined at {t:.3f} s: there is no covariance", key="solver.undetermined"
     )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -11,9 +10,9 @@ import gtsam
 import numpy as np
 
 from graphnav.core import rotation
-from graphnav.core.errors import EstimationError
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, States
+from graphnav.estimation.solvers.breakdown import explain_smoother
 from graphnav.estimation.solvers.graph import make_jacobian_factor
 from graphnav.estimation.solvers.linearise import Columns, shift
 from graphnav.estimation.solvers.stages import Measured, Place
@@ -129,9 +128,7 @@ def update_isam(
             graph, new, list(gone), groups, None, None if anew is None else fill_keys(gtsam.KeyList(), anew)
         )
     except RuntimeError as error:  # GTSAM's for a variable that nothing determines
-        raise EstimationError(
-            f"the smoother's information broke down at {t:.3f} s: check sigmas and units", key="solver.breakdown"
-        ) from error
+        raise explain_smoother(t) from error
     for (keyframe, name, _), index in zip(made, list(result.getNewFactorsIndices())[begin:], strict=True):
         keyframe.slots[name] = index
 
@@ -154,13 +151,12 @@ def fill_keys(out: Any, variables: Iterable[Variable]) -> Any:
     return out
 
 
-def are_leaves(isam: gtsam.ISAM2, keys: Collection[int]) -> bool:
-    """Whether nothing else in a tree is eliminated before them."""
-    for clique in re.findall(r'label="([^"]*)"', isam.dot()):  # those eliminated here, and : those that they depend on
-        own, _, rest = ([int(key) in keys for key in re.findall(r"\d+", part)] for part in clique.partition(":"))
-        if (any(rest) and not all(own)) or own != sorted(own, reverse=True):
-            return False
-    return True
+def are_leaves(isam: gtsam.ISAM2, variables: Iterable[Variable], others: Iterable[Variable]) -> bool:
+    """Whether variables are below all others in a tree: an update of all the others would eliminate none of them."""
+    of_others = gtsam.ISAM2UpdateParams()
+    of_others.extraReelimKeys = fill_keys(gtsam.KeyList(), others)
+    affected, _ = isam.predictUpdateInfo(gtsam.NonlinearFactorGraph(), gtsam.Values(), of_others)
+    return not any(affected.count(x.key) for x in variables)
 
 
 def make_factor(blocks: Sequence[tuple[Variable, Array]], b: Array) -> Any:

@@ -36,10 +36,7 @@ from graphnav.estimation.solvers.likelihood_ratio import (
     begin_slot,
     follow_filter,
     memory_size,
-    remember,
-    update_tests,
 )
-from graphnav.estimation.solvers.recursion import move
 
 if TYPE_CHECKING:
     from graphnav.estimation.solvers.passes import Updates
@@ -212,11 +209,6 @@ class Bank:
     def __contains__(self, name: str) -> bool:
         return name in self._slots
 
-    def arrive(self, k: int) -> None:
-        """The filter is about to go on to keyframe k."""
-        if self._met[k]:
-            remember(k, self._state, self._before, self._keys, self._ends)
-
     def go_back(self, k: int) -> None:
         """To before keyframe k; without any onset where that is too long ago."""
         begin, end = self._ends
@@ -231,12 +223,17 @@ class Bank:
                 slots.forget()
         self._ends[1] = end
 
-    def predicted(self, F: Array, decay: Array) -> None:
-        """The filter has gone on to the next keyframe, by a step as `graphnav.estimation.solvers.recursion` has it."""
-        self.X[:] = move(F, decay, self.X)
-
     def follow(
-        self, k0: int, k1: int, F: Array, decay: Array, stack: Stack, updates: Updates, speeds: Array
+        self,
+        k0: int,
+        k1: int,
+        F: Array,
+        decay: Array,
+        stack: Stack,
+        updates: Updates,
+        root: Array,
+        solved: Array,
+        speeds: Array,
     ) -> tuple[str, int, float] | None:
         """Follow a filter from keyframe k0 to k1: the kind that finds a fault, where, and when it began, if one does.
 
@@ -244,6 +241,7 @@ class Bank:
         ----------
         F, decay : of its steps, as `graphnav.estimation.solvers.recursion` has them.
         updates : what it has taken in, as `stack` has it, with roots and innovations of all blocks there.
+        root, solved : (K, M, M) and (K, M) of those, with the weights by which they were taken in.
         speeds : (n,) m/s, of the vehicle.
         """
         blocks, names = updates.blocks, list(self._slots)
@@ -260,7 +258,7 @@ class Bank:
         k, b = k0, int(blocks.first[k0])
         while True:
             k, b = follow_filter(
-                k, k1, b, self._t, F, decay, updates.H, updates.Kt, stack.root, stack.solved,
+                k, k1, b, self._t, F, decay, updates.H, updates.Kt, root, solved,
                 blocks.first, blocks.begin, blocks.end, updates.taken, kind, limit, self._met,
                 self._layouts, self._scales, self._state, self._before, self._keys, self._ends, self._errors, self._T,
             )  # fmt: skip
@@ -275,28 +273,6 @@ class Bank:
                         level.factor = factor
                 return names[i], k, since
             b += 1
-
-    def seen(self, name: str, k: int, nis: float, used: bool) -> None:
-        """The filter has seen an innovation of so many squared sigmas, used or not."""
-        if slots := self._slots.get(name):
-            slots.typical_sigmas.add(float(self._t[k]), nis, used)
-
-    def updated(self, name: str, k: int, H: Array, Kt: Array, solved: Array, root: Array, speed: float) -> float | None:
-        """The filter has used rows at keyframe k; when a fault began that they are enough to be sure of, or None.
-
-        Parameters
-        ----------
-        H, Kt : (n m, D) and the gain transposed (n m, D).
-        solved : (n m,) -S^-1 nu, and the lower root of S.
-        speed : m/s, of the vehicle.
-        """
-        if name not in self:
-            self.X -= Kt.T @ (H @ self.X)
-            return None
-        i, t = list(self._slots).index(name), float(self._t[k])
-        slots, errors, T = self._slots[name], self._errors[i], self._T[i]
-        update_tests(self.X, slots.memory, self._layouts[i], self._scales[i], t, H, Kt, root, solved, errors, T)
-        return slots.find(t, errors[: slots.L, : slots.c], T[: slots.L], slots.typical_sigmas.factor, speed)
 
 
 class Watch:

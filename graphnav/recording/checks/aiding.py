@@ -14,9 +14,10 @@ from graphnav.core.rotation import Array
 from graphnav.core.timescales import NEAR, WEEK, between_clocks
 from graphnav.recording import Imu, Odometer, Recording
 from graphnav.recording import odometer as wheels
-from graphnav.recording.checks import crosschecks
+from graphnav.recording.checks import crosschecks, tracks
 from graphnav.recording.checks.clock import FAIR, ClockOffsets
-from graphnav.recording.checks.crosschecks import Fit, Track
+from graphnav.recording.checks.crosschecks import Fit
+from graphnav.recording.checks.tracks import Track
 from graphnav.recording.odometer.faults import FROZEN, GAP, STUCK, WILD
 from graphnav.sensors.tables import TIME
 
@@ -131,7 +132,7 @@ def check_gnss_jumps(recording: Recording, track: Track | None) -> Iterator[Find
     assert gnss is not None
     if track is None or len(gnss.t) < 5:
         return
-    p, dt = crosschecks.compute_local_positions(gnss)[:, :2], np.diff(gnss.t)
+    p, dt = tracks.compute_local_positions(gnss)[:, :2], np.diff(gnss.t)
     sd = np.hypot(gnss.sd[:, 0], gnss.sd[:, 1])
     near = dt < 3.5 * track.period
     if gnss.v is not None and not track.width.any():
@@ -166,8 +167,8 @@ def check_imu_clock(clock: ClockOffsets, odometer: Fit | None = None) -> Iterato
     if clock.apart is not None:
         yield Finding(
             "note",
-            f"the stamps of GNSS positions and velocities are {clock.apart:.2f} s apart: they cannot both be right, "
-            "and the rest after time_offset is estimated for each",
+            f"the stamps of GNSS positions and velocities are {clock.apart:.2f} s apart, so one of them is wrong: a "
+            "time offset of each is estimated",
             "gnss.two_clocks",
         )
     forward = clock.late
@@ -180,7 +181,7 @@ def check_imu_clock(clock: ClockOffsets, odometer: Fit | None = None) -> Iterato
     own = odometer is None or odometer.correlation < 0.9 or abs(odometer.lag - lag) > 0.5 * abs(lag)
     mend = f"{-lag:+.2f} to time_offset in [imu]" if own else f"{lag:+.2f} to time_offset in [gnss]"
     yield Finding(
-        "untrusted" if certain else "warning",
+        "unreliable" if certain else "warning",
         f"IMU stamps are {'late' if lag > 0 else 'early'} against GNSS by {abs(lag):.2f} s{leap} (forward force "
         f"against speed, +-{max(forward.spread, 0.01):.2f} s): add {mend}",
         "imu.clock",
@@ -376,7 +377,7 @@ def check_odometer(recording: Recording, track: Track | None, facts: dict[str, A
                 "odometer.scale",
             )
     if abs(fit.lag) > 0.1 + 4.0 * fit.spread:
-        own = crosschecks.fit_forward(recording.imu, crosschecks.compute_odometer_track(odometer))
+        own = crosschecks.fit_forward(recording.imu, tracks.compute_odometer_track(odometer))
         right = own is not None and own.correlation > FAIR and abs(own.lag) < 0.5 * abs(fit.lag)  # by the IMU
         yield Finding(
             "warning",

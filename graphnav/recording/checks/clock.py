@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 from graphnav.recording import Gnss, Imu
-from graphnav.recording.checks import crosschecks
+from graphnav.recording.checks import crosschecks, tracks
 from graphnav.recording.checks.crosschecks import Fit
 
 CLEAR, FAIR = 0.8, 0.6  # correlations: certain, likely
@@ -48,9 +48,9 @@ def is_certain(fit: Fit) -> bool:
 
 def measure_clock_offsets(imu: Imu, gnss: Gnss) -> ClockOffsets:
     """Delays from the force along the direction of travel and changes of speed; None where the drive has none."""
-    places = crosschecks.track(replace(gnss, v=None))
+    places = tracks.compute_track(replace(gnss, v=None))
     by_places = None if places is None else crosschecks.fit_forward(imu, places)
-    track = crosschecks.track(gnss) if gnss.v is not None else None
+    track = tracks.compute_track(gnss) if gnss.v is not None else None
     if track is None or not track.instant:
         return ClockOffsets(None, by_places, None)
     between = None if places is None else crosschecks.fit_velocity(track, places)

@@ -15,41 +15,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from graphnav.core.earth import LocalFrame
 from graphnav.core.rotation import Array, wrap
-from graphnav.recording import Gnss, Imu, Odometer
+from graphnav.recording import Imu, Odometer
 from graphnav.recording.checks import lags as lags_of_clocks
 from graphnav.recording.checks.lags import Lags
+from graphnav.recording.checks.tracks import Track
 
 Index = NDArray[Any]  # of row numbers
 
 MIN_PAIRS = 20
-_SLOPE_SPAN, _SLOPES = 8.0, 6  # s over which a slope is taken: the force is then known to a tenth of a per cent
-GRAVITY = 9.81  # m/s^2
-_MIN_SPEED = 3.0  # m/s, below which a course is undefined
+MIN_SPEED = 3.0  # m/s, below which a course is undefined
 _FASTEST_CHANGE = 8.0  # m/s^2; a larger acceleration is an error of the fix
 _CHANGES = 0.25  # m/s, rms change of speed, below which a regression on it determines nothing
 WIDE = 30.0  # s, largest clock error searched for
-
-
-@dataclass(frozen=True)
-class Track:
-    """Velocity from GNSS, each the mean over `width` seconds around t (0: of the instant)."""
-
-    t: Array  # (K,) s
-    v: Array  # (K, 3) m/s, ENU
-    width: Array  # (K,) s
-    period: float  # s between fixes
-
-    @property
-    def speed(self) -> Array:
-        """Horizontal speed, m/s."""
-        return np.hypot(self.v[:, 0], self.v[:, 1])
-
-    @property
-    def instant(self) -> bool:
-        """Whether these are velocities of the receiver."""
-        return not self.width.any()
 
 
 @dataclass(frozen=True)
@@ -61,30 +39,6 @@ class Fit:
     correlation: float
     at_zero: float  # correlation without a shift
     coefficients: Array  # (m,)
-
-
-def compute_local_positions(gnss: Gnss) -> Array:
-    """Positions in ENU metres around the first fix, (M, 3)."""
-    return LocalFrame(gnss.llh[0]).from_llh(gnss.llh)
-
-
-def track(gnss: Gnss) -> Track | None:
-    """Velocities of the receiver, or differences of positions about a second apart; None if too few."""
-    if len(gnss.t) < 5:
-        return None
-    period = float(np.median(np.diff(gnss.t)))
-    if gnss.v is not None:
-        there = ~np.isnan(gnss.v[:, 0])
-        if there.mean() > 0.3 and there.sum() >= 5:
-            return Track(gnss.t[there], gnss.v[there], np.zeros(there.sum()), period)
-    m = max(1, round(1.0 / period))
-    if len(gnss.t) <= m + 2:
-        return None
-    p = compute_local_positions(gnss)
-    width = gnss.t[m:] - gnss.t[:-m]
-    near = width < 1.5 * m * period
-    t, v = 0.5 * (gnss.t[m:] + gnss.t[:-m]), (p[m:] - p[:-m]) / width[:, None]
-    return Track(t[near], v[near], width[near], period) if near.sum() >= 5 else None
 
 
 def _compute_mean(x: Array) -> Array:
@@ -273,30 +227,6 @@ def fit_force(imu: Imu, track: Track) -> Fit | None:
     return fit if fit is not None and len(fit.coefficients) == 3 else None
 
 
-def fit_climb(imu: Imu, track: Track, gnss: Gnss, forward: Array) -> tuple[float, float] | None:
-    """Slopes by the force along `forward` (3,), corrected for acceleration, against those of the heights, over
-    `_SLOPE_SPAN`.
-
-    Their correlation, and the ratio of their magnitudes: neither has less noise than the other. None where the drive is
-    too short.
-    """
-    p = compute_local_positions(gnss)
-    way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(p[:, :2], axis=0).T))])
-    pull = np.concatenate([[0.0], np.cumsum(imu.accel[1:] @ forward * np.diff(imu.t))])
-    a = np.arange(max(track.t[0], imu.t[0]), min(track.t[-1], imu.t[-1]) - _SLOPE_SPAN, _SLOPE_SPAN)
-
-    def change(t: Array, x: Array) -> Array:
-        return np.asarray(np.interp(a + _SLOPE_SPAN, t, x) - np.interp(a, t, x))
-
-    far = change(gnss.t, way)
-    moving = far > _MIN_SPEED * _SLOPE_SPAN
-    felt = (change(imu.t, pull) - change(track.t, track.speed))[moving] / (_SLOPE_SPAN * GRAVITY)
-    climbed = change(gnss.t, p[:, 2])[moving] / far[moving]
-    if len(felt) < _SLOPES or not felt.std() or not climbed.std():
-        return None
-    return float(np.corrcoef(felt, climbed)[0, 1]), float(felt.std() / climbed.std())
-
-
 def fit_along(imu: Imu, track: Track) -> Fit | None:
     """Regression on the force along the stated forward axis alone, (1,): whether the stated axes explain the speed."""
     i, j, y = _pair_possible(track)
@@ -312,7 +242,7 @@ def fit_yaw(imu: Imu, track: Track) -> Fit | None:
     course = np.arctan2(track.v[:, 1], track.v[:, 0])
     y = wrap(course[j] - course[i])
     speed = np.minimum(track.speed[i], track.speed[j])
-    real = (speed > _MIN_SPEED) & (np.abs(y) < 1.5 * (track.t[j] - track.t[i]))
+    real = (speed > MIN_SPEED) & (np.abs(y) < 1.5 * (track.t[j] - track.t[i]))
     i, j, y = i[real], j[real], y[real]
     if len(y) < MIN_PAIRS or y.std() < 0.04:
         return None
@@ -340,13 +270,6 @@ def fit_velocity(track: Track, places: Track) -> Fit | None:
         return np.asarray((first > t[0]) & (last < t[-1]))
 
     return _search(0.5 * (places.t[i] + places.t[j]), y, x_at, places.t, valid)
-
-
-def compute_odometer_track(odometer: Odometer) -> Track:
-    """The odometer's speeds ten times a second, as if the drive were straight."""
-    thin = slice(None, None, max(1, round(0.1 / float(np.median(np.diff(odometer.t))))))
-    t, speed = odometer.t[thin], odometer.speed[thin]
-    return Track(t, speed[:, None] * np.array([1.0, 0.0, 0.0]), np.zeros(len(t)), float(np.median(np.diff(t))))
 
 
 def fit_odometer(odometer: Odometer, track: Track) -> tuple[Fit, float] | None:
@@ -379,7 +302,7 @@ def fit_odometer(odometer: Odometer, track: Track) -> tuple[Fit, float] | None:
     fit = _search(track.t, track.speed, x_at, track.t, valid)
     rows = every[valid(fit.lag)]
     x = x_at(rows, fit.lag)[:, 0]
-    moving = (np.abs(x) > 0.3 * np.abs(x).max()) & (track.speed[rows] > _MIN_SPEED)
+    moving = (np.abs(x) > 0.3 * np.abs(x).max()) & (track.speed[rows] > MIN_SPEED)
     if moving.sum() < MIN_PAIRS:
         return None
     return fit, float(np.median(track.speed[rows][moving] / x[moving]))

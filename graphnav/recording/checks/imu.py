@@ -46,7 +46,7 @@ def check_repeats(imu: Imu) -> Iterator[Finding]:
     if same.mean() > 0.002:
         yield Finding(
             "note",
-            f"{same.sum()} IMU rows ({100 * same.mean():.1f} %) repeat the values of the row before",
+            f"{format_count(same.sum(), 'IMU row')} ({100 * same.mean():.1f} %) with the values of the row before",
             "imu.repeats",
         )
     stuck = max((b - a for a, b in runs_of(same)), default=0) * period_of(imu.t)

@@ -15,7 +15,7 @@ from graphnav.core.findings import SEVERITIES, Finding, period_of, runs_of
 from graphnav.core.notes import key_of
 from graphnav.core.rotation import Array
 from graphnav.recording import Recording
-from graphnav.recording.checks import crosschecks
+from graphnav.recording.checks import crosschecks, tracks
 from graphnav.recording.checks.aiding import (
     check_gnss_coverage,
     check_gnss_jumps,
@@ -26,7 +26,6 @@ from graphnav.recording.checks.aiding import (
     measure_overlap,
 )
 from graphnav.recording.checks.clock import measure_clock_offsets
-from graphnav.recording.checks.crosschecks import Track
 from graphnav.recording.checks.imu import (
     check_force_at_rest,
     check_gyro_unit,
@@ -48,6 +47,7 @@ from graphnav.recording.checks.stated import (
     check_truth,
     check_velocities,
 )
+from graphnav.recording.checks.tracks import Track
 from graphnav.recording.plausibility.screening import refuse, screen
 
 _REST_WINDOW = 1.0  # s
@@ -139,7 +139,7 @@ def inspect(recording: Recording) -> Inspection:
     facts: dict[str, dict[str, Any]] = {"imu": _describe_imu(recording)}
     vehicle = recording.platform == "vehicle"
     overlap = recording.gnss is not None and measure_overlap(recording) > 0
-    track = crosschecks.track(recording.gnss) if recording.gnss is not None else None
+    track = tracks.compute_track(recording.gnss) if recording.gnss is not None else None
     rest = _find_rest(recording, track if overlap else None)
     findings += check_imu_time(recording.imu)
     findings += check_repeats(recording.imu)

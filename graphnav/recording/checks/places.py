@@ -8,13 +8,17 @@ from dataclasses import replace
 import numpy as np
 
 from graphnav.core.findings import Finding
-from graphnav.recording import Recording
-from graphnav.recording.checks import crosschecks
+from graphnav.core.rotation import Array
+from graphnav.recording import Gnss, Imu, Recording
+from graphnav.recording.checks import crosschecks, tracks
 from graphnav.recording.checks.clock import CLEAR, FAIR
-from graphnav.recording.checks.crosschecks import Fit, Track
+from graphnav.recording.checks.crosschecks import Fit
+from graphnav.recording.checks.imu import STANDARD_GRAVITY
 from graphnav.recording.checks.stated import describe_exchange, describe_mirroring, exchange_lat_lon
+from graphnav.recording.checks.tracks import Track
 from graphnav.recording.formats.schema import FOOT
 
+_SLOPE_SPAN, _SLOPES = 8.0, 6  # s over which a slope is taken: the force is then known to a tenth of a per cent
 _FEET = 0.3  # relative deviation from 0.3048 that the noise of both permits: a ratio of 1 is three times as far off
 
 
@@ -25,7 +29,7 @@ def check_mirroring(recording: Recording, track: Track, as_read: Fit | None, tur
     is its fit to the gyro) after the exchange if they were exchanged, and worse if only a sign is wrong.
     """
     other = exchange_lat_lon(recording.gnss) if recording.gnss is not None else None
-    way = crosschecks.track(replace(other, v=None)) if other is not None else None
+    way = tracks.compute_track(replace(other, v=None)) if other is not None else None
     yaw = crosschecks.fit_yaw(recording.imu, way) if way is not None else None
     better = yaw is not None and (not turns_back or as_read is None or yaw.correlation > as_read.correlation)
     if yaw is not None and better and yaw.correlation > 0.8 and abs(yaw.coefficients[0] - 1.0) < 0.2:
@@ -41,17 +45,44 @@ def check_height_unit(recording: Recording, track: Track, forward: Fit | None) -
     if forward is None or forward.correlation < FAIR or recording.gnss is None:
         return
     ahead = forward.coefficients / np.linalg.norm(forward.coefficients)
-    found = crosschecks.fit_climb(recording.imu, track, recording.gnss, ahead)
+    found = fit_climb(recording.imu, track, recording.gnss, ahead)
     if found is None:
         return
     correlation, ratio = found
     if correlation > CLEAR and abs(ratio / FOOT - 1.0) < _FEET:
         yield Finding(
             "warning",
-            f"the heights climb {1.0 / ratio:.1f} times as much as the IMU feels of slopes (correlation "
+            f"the heights climb {1.0 / ratio:.1f} times as much as the slopes that the IMU measures (correlation "
             f'{correlation:.2f}): they are in feet; say units = {{ height = "ft" }} in [gnss]',
             "gnss.feet",
         )
+
+
+def fit_climb(imu: Imu, track: Track, gnss: Gnss, forward: Array) -> tuple[float, float] | None:
+    """Slopes by the force along `forward` (3,), corrected for acceleration, against those of the heights, over
+    `_SLOPE_SPAN`.
+
+    Their correlation, and the ratio of their magnitudes: neither has less noise than the other. None where the drive is
+    too short. A span mostly without fixes has no slope of its own.
+    """
+    p = tracks.compute_local_positions(gnss)
+    way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(p[:, :2], axis=0).T))])
+    pull = np.concatenate([[0.0], np.cumsum(imu.accel[1:] @ forward * np.diff(imu.t))])
+    a = np.arange(max(track.t[0], imu.t[0]), min(track.t[-1], imu.t[-1]) - _SLOPE_SPAN, _SLOPE_SPAN)
+
+    def change(t: Array, x: Array) -> Array:
+        return np.asarray(np.interp(a + _SLOPE_SPAN, t, x) - np.interp(a, t, x))
+
+    far = change(gnss.t, way)
+    late = gnss.t[1:][np.diff(gnss.t) > 0.5 * _SLOPE_SPAN]  # the ends of gaps
+    early = gnss.t[:-1][np.diff(gnss.t) > 0.5 * _SLOPE_SPAN]
+    whole = np.searchsorted(late, a, side="right") == np.searchsorted(early, a + _SLOPE_SPAN)
+    moving = (far > crosschecks.MIN_SPEED * _SLOPE_SPAN) & whole
+    felt = (change(imu.t, pull) - change(track.t, track.speed))[moving] / (_SLOPE_SPAN * STANDARD_GRAVITY)
+    climbed = change(gnss.t, p[:, 2])[moving] / far[moving]
+    if len(felt) < _SLOPES or not felt.std() or not climbed.std():
+        return None
+    return float(np.corrcoef(felt, climbed)[0, 1]), float(felt.std() / climbed.std())
 
 
 def find_mirrored(recording: Recording, wrong: Sequence[Finding]) -> list[Finding]:
@@ -63,14 +94,14 @@ def find_mirrored(recording: Recording, wrong: Sequence[Finding]) -> list[Findin
         return list(wrong)
     if not any(f.key == "gnss.velocity_axes" for f in wrong):
         return list(wrong)
-    ways = [crosschecks.track(one) for one in (gnss, replace(gnss, v=None))]
+    ways = [tracks.compute_track(one) for one in (gnss, replace(gnss, v=None))]
     fits = [crosschecks.fit_yaw(recording.imu, way) for way in ways if way is not None]
     by_velocity, by_places = (
         [fit.coefficients[0] if fit is not None and fit.correlation > 0.8 else 0.0 for fit in fits]
         if len(fits) == 2
         else (0.0, 0.0)
     )
-    moved = np.gradient(crosschecks.compute_local_positions(gnss)[:, :2], gnss.t, axis=0)
+    moved = np.gradient(tracks.compute_local_positions(gnss)[:, :2], gnss.t, axis=0)
     east, north = np.nansum(moved * gnss.v[:, :2], axis=0) < 0.0
     if by_velocity > 0.0 > by_places and east != north:
         which = "longitudes" if east else "latitudes"

@@ -12,8 +12,8 @@ from graphnav.core.findings import Finding
 from graphnav.core.rotation import Array
 from graphnav.core.timescales import LEAP
 from graphnav.recording import Gnss, ImuNoise, Recording, Truth
-from graphnav.recording.checks import crosschecks
-from graphnav.recording.checks.crosschecks import Track
+from graphnav.recording.checks import crosschecks, tracks
+from graphnav.recording.checks.tracks import Track
 
 _LONGEST_ARM = 15.0  # m; no lever arm on a road vehicle is that long
 _RUN = 8.0  # m/s, above any walking speed
@@ -101,7 +101,7 @@ def check_velocities(gnss: Gnss) -> Iterator[Finding]:
     """Velocities whose axes, signs or unit disagree with the positions."""
     if gnss.v is None or len(gnss.t) < 10:
         return
-    p, v, m = crosschecks.compute_local_positions(gnss), gnss.v, max(1, round(1.0 / float(np.median(np.diff(gnss.t)))))
+    p, v, m = tracks.compute_local_positions(gnss), gnss.v, max(1, round(1.0 / float(np.median(np.diff(gnss.t)))))
     dt = gnss.t[m:] - gnss.t[:-m]
     moved = p[m:] - p[:-m]
     # by the trapezoidal rule over all rows between, which follows changes of speed
@@ -115,7 +115,7 @@ def check_velocities(gnss: Gnss) -> Iterator[Finding]:
     if moving.sum() >= crosschecks.MIN_PAIRS:
         other = exchange_lat_lon(gnss)
         if other is not None:
-            q = crosschecks.compute_local_positions(other)
+            q = tracks.compute_local_positions(other)
             off, mended = (
                 float(np.median(np.linalg.norm((x[m:] - x[:-m] - stated)[moving, :2], axis=1))) for x in (p, q)
             )

@@ -76,7 +76,8 @@ def build_gnss(d: schema.GnssTable, rows: Table, remarks: Remarks) -> Gnss:
                 key="gnss.sigma_all_vague",
             )
         remarks.add(
-            "gnss.sigma_vague", f"fixes with a sigma of more than {VAGUEST:g} m, left out: {vague.sum()} of {len(rows)}"
+            "gnss.sigma_vague",
+            f"{format_count(vague.sum(), 'fix', 'fixes')} with a sigma of more than {VAGUEST:g} m left out",
         )
         llh, sd, rows = llh[~vague], sd[~vague], rows.take(~vague)
     v = sd_v = None

@@ -14,6 +14,7 @@ import numpy as np
 
 from graphnav.core.errors import RecordingError
 from graphnav.core.files import check_inside, parse_number
+from graphnav.core.notes import format_count
 from graphnav.core.rotation import Array
 from graphnav.recording import Gnss, Imu, Truth
 from graphnav.recording.formats.registry import Log, log_format
@@ -61,10 +62,14 @@ def load(path: Path) -> Log:
         )
     order = np.argsort(t, kind="stable")
     if (np.diff(order) < 0).any():
-        remarks.add("log.rows_unordered", f"{(np.diff(t) < 0).sum()} samples out of order were sorted by time")
+        remarks.add(
+            "log.rows_unordered", f"{format_count((np.diff(t) < 0).sum(), 'sample')} out of order sorted by time"
+        )
     order = order[np.concatenate([[True], np.diff(t[order]) > 0])]
     if len(order) < len(t):
-        remarks.add("log.rows_repeated", f"{len(t) - len(order)} samples with the time of another were dropped")
+        remarks.add(
+            "log.rows_repeated", f"{format_count(len(t) - len(order), 'sample')} with the time of another dropped"
+        )
     t, rows = t[order], rows[order]
     R_bs = rotation_from_letters("FLU")
     llh = np.column_stack([np.radians(rows[:, :2]), rows[:, 2]])

@@ -76,7 +76,7 @@ def load(path: Path) -> Log:
     if simulated:
         remarks.add(
             "gnss.not_measured",
-            f"{simulated} GGA positions that the receiver only estimated, or was told, were left out",
+            f"{format_count(simulated, 'GGA position')} by dead reckoning, manual input or a simulator left out",
         )
     t, zero = _date_fixes(epochs, fixes, remarks)
     separation = np.array([_number(e.gga.sep) for e in fixes])

@@ -104,8 +104,8 @@ def select_usable_rows(
     repeated = np.r_[False, np.diff(t) == 0]
     if repeated.mean() > 0.6 and (~repeated).sum() > 1:
         raise RecordingError(
-            f"{rows.path}: {repeated.sum()} of {len(rows)} rows have the time of the row before: the fraction of the "
-            "seconds was lost; log t with milliseconds",
+            f"{rows.path}: {_tell_rows(repeated, '')} of {len(rows)} with the time of the row before: the fraction of "
+            "the seconds was lost; log t with milliseconds",
             key="table.times_repeated",
         )
     if repeated.any():
@@ -120,7 +120,7 @@ def select_usable_rows(
     if sensor == "gnss" and not (new := new_fixes(rows.columns)).all():
         rows = rows.take(new)
         remarks.add(
-            "gnss.held", f"{(~new).sum()} GNSS rows that repeat the fix of the row before left out: {len(rows)} are new"
+            "gnss.held", f"{_tell_rows(~new, 'GNSS')} with the fix of the row before left out, {len(rows)} kept"
         )
     return rows
 
@@ -162,8 +162,7 @@ def _check_passes(rows: Table, label: str) -> None:
 
 
 def _tell_rows(mask: Mask, label: str) -> str:
-    n = int(mask.sum())
-    return f"{n} {label} row{'s' if n > 1 else ''}"
+    return format_count(mask.sum(), f"{label} row".strip())
 
 
 def _check_imu_time(rows: Table, unit: str) -> None:

@@ -179,7 +179,9 @@ def _read_gnss(topic: _Topic, remarks: Remarks) -> Gnss | None:
         remarks.add("gnss.topic_not_used", f"{topic.name}: no message has a fix, so it is not used")
         return None
     if not good.all():
-        remarks.add("gnss.rows_left_out", f"{topic.name}: {np.sum(~good)} messages without a fix left out")
+        remarks.add(
+            "gnss.rows_left_out", f"{topic.name}: {format_count(np.sum(~good), 'message')} without a fix left out"
+        )
     t, rows = t[good], rows[good]
     known = (rows[:, 3:6] > 0).all(-1)
     sd = np.where(known[:, None], np.sqrt(np.abs(np.nan_to_num(rows[:, 3:6]))), DEFAULT_SD)

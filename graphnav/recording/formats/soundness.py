@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphnav.core.errors import RecordingError
-from graphnav.core.notes import Note
+from graphnav.core.notes import Note, format_count
 from graphnav.recording import Gnss, take_rows
 from graphnav.recording.formats.registry import Log
 from graphnav.recording.formats.repair import LATEST, VAGUEST, VAGUEST_V, is_on_earth
@@ -31,26 +31,29 @@ def drop_unsound_rows(log: Log, path: Path) -> Log:
         if good.all():
             return True
         if good.sum() < (2 if what == "IMU" else 1):
-            raise RecordingError(f"{path}: {what}: all {len(good)} rows {why}", key="table.none_sound")
+            raise RecordingError(f"{path}: {what}: no usable row among {len(good)}: {why}", key="table.none_sound")
         remarks.append(
-            Note(f"{what.lower()}.rows_left_out", f"{what}: {np.sum(~good)} of {len(good)} rows {why}: left out")
+            Note(
+                f"{what.lower()}.rows_left_out",
+                f"{what}: {format_count(int(np.sum(~good)), 'row')} of {len(good)} left out: {why}",
+            )
         )
         return False
 
     if imu is not None:
         finite = np.isfinite(imu.gyro).all(axis=1) & np.isfinite(imu.accel).all(axis=1)
         good = finite & (np.abs(imu.t) <= LATEST)
-        if not check_rows("IMU", good, "are no numbers or at no time"):
+        if not check_rows("IMU", good, "values or times that are no numbers"):
             imu = take_rows(imu, good)
     if gnss is not None:
         gnss = _clean_gnss(gnss, check_rows)
     if odometer is not None:
         good = np.isfinite(odometer.speed) & (np.abs(odometer.t) <= LATEST)
-        if not check_rows("odometer", good, "are no numbers or at no time"):
+        if not check_rows("odometer", good, "values or times that are no numbers"):
             odometer = take_rows(odometer, good)
     if truth is not None and truth.llh is not None:
         good = is_on_earth(*truth.llh.T) & (np.abs(truth.t) <= LATEST)
-        if not check_rows("truth", good, "are nowhere on Earth or at no time"):
+        if not check_rows("truth", good, "positions nowhere on Earth, or times that are no numbers"):
             truth = take_rows(truth, good)
     return replace(log, imu=imu, gnss=gnss, odometer=odometer, truth=truth, remarks=tuple(remarks))
 
@@ -60,10 +63,10 @@ def _clean_gnss(gnss: Gnss, check_rows: Callable[[str, NDArray[np.bool_], str], 
     there: NDArray[np.bool_] = np.asarray(is_on_earth(*gnss.llh.T) & (np.abs(gnss.t) <= LATEST))
     first = gnss.llh[~there][:1]
     at = "".join(f" (the first at {np.degrees(p[0]):.7g}, {np.degrees(p[1]):.7g} deg, {p[2]:.7g} m)" for p in first)
-    if not check_rows("GNSS", there, f"are nowhere on Earth or at no time{at}"):
+    if not check_rows("GNSS", there, f"positions nowhere on Earth, or times that are no numbers{at}"):
         gnss = take_rows(gnss, there)
     sure: NDArray[np.bool_] = np.asarray(((gnss.sd > 0.0) & (gnss.sd <= VAGUEST)).all(axis=1))
-    if not check_rows("GNSS", sure, f"have a sigma that is not above 0 or beyond {VAGUEST:g} m"):
+    if not check_rows("GNSS", sure, f"sigmas that are not above 0, or beyond {VAGUEST:g} m"):
         gnss = take_rows(gnss, sure)
     if gnss.v is None or gnss.sd_v is None:
         return gnss

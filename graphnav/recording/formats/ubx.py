@@ -16,6 +16,7 @@ import numpy as np
 
 from graphnav.core.errors import RecordingError
 from graphnav.core.files import open_file
+from graphnav.core.notes import format_count
 from graphnav.core.rotation import Array
 from graphnav.core.timescales import WEEK, utc_to_gps
 from graphnav.recording import Gnss, Imu, Odometer, fix_types
@@ -58,10 +59,14 @@ def load(path: Path) -> Log:
     content = _collect_messages(path)
     remarks = Remarks()
     if content.broken:
-        remarks.add("log.broken_frames", f"{content.broken} broken frames were skipped")
+        remarks.add("log.broken_frames", f"{format_count(content.broken, 'broken frame')} skipped")
     fixes = [m for m in content.pvt if m.gnssFixOk and m.fixType in (3, 4)]
     if not fixes and not content.samples:
-        what = f"{len(content.pvt)} NAV-PVT messages without a fix" if content.pvt else "no NAV-PVT and no ESF messages"
+        what = (
+            f"{format_count(len(content.pvt), 'NAV-PVT message')} without a fix"
+            if content.pvt
+            else "no NAV-PVT and no ESF messages"
+        )
         raise RecordingError(f"{path}: {what} in {path.stat().st_size} bytes; nothing to use", key="log.no_messages")
     dated = [start for start in map(_find_week_start, fixes) if start is not None]
     zero = dated[0] if dated else None

@@ -44,8 +44,8 @@ def screen(recording: Recording) -> tuple[Recording, list[Finding]]:
         findings.append(
             Finding(
                 "note",
-                f"{format_count(cached, 'fix', 'fixes')} of before the IMU, the first {early:.0f} s before it starts, "
-                "left out: a receiver gives out what it had kept until it has new ones",
+                f"{format_count(cached, 'fix', 'fixes')} from up to {early:.0f} s before the IMU starts left out: the "
+                "receiver repeats its last position until it has a new one",
                 "gnss.cached",
             )
         )
@@ -128,7 +128,7 @@ def _drop_unreachable(gnss: Gnss, p: Array, off: NDArray[np.bool_], start: float
     sure = len(kept) > 0.5 * len(off)
     rest = "" if sure else "; what is left is fewer than half of them, so the result is not to be trusted"
     return Finding(
-        "warning" if sure else "untrusted",
+        "warning" if sure else "unreliable",
         f"{many} out of reach of the others, the first {away / 1e3:.4g} km away at {gnss.t[k] - start:.1f} s from the "
         f"start (nothing on land is faster than {FASTEST:g} m/s): not used{rest}",
         "gnss.out_of_reach",
@@ -190,8 +190,8 @@ def check_sigmas(gnss: Gnss, p: Array) -> Iterator[Finding]:
         if sd > _WAVE:
             yield Finding(
                 "warning",
-                f"the 1-sigma of the fixed solutions is {sd:.2g} m, more than the carrier's wave ({_WAVE:g} m) whose "
-                "cycles they have told apart: look at the unit of the sigmas",
+                f"the 1-sigma of the fixed solutions is {sd:.2g} m, more than the carrier's wavelength "
+                f"({_WAVE:g} m), whose cycles they resolve: look at the unit of the sigmas",
                 "gnss.sigma_large",
             )
 
@@ -223,7 +223,7 @@ def check_two_groups(gnss: Gnss, p: Array) -> Iterator[Finding]:
     if (left > limit).sum() > _MINORITY * len(big) or alike < 1.0 - _MINORITY or share.min() < _MINORITY:
         return
     yield Finding(
-        "untrusted",
+        "unreliable",
         f"the fixes are of two groups {size:.0f} m apart ({100 * share.min():.0f} and {100 * share.max():.0f} % of "
         "them), each consistent in itself: nothing tells which is right, and the result is not to be trusted",
         "gnss.two_groups",

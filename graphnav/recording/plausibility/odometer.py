@@ -8,9 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphnav.core.findings import Finding, period_of, runs_of
+from graphnav.core.notes import format_count
 from graphnav.core.running import run_median
 from graphnav.recording import Odometer, Recording, take_rows
-from graphnav.recording.checks.crosschecks import MIN_PAIRS, Track
+from graphnav.recording.checks.crosschecks import MIN_PAIRS
+from graphnav.recording.checks.tracks import Track
 from graphnav.recording.plausibility.fixes import FASTEST
 
 _CLOCK_STEP = 1.0  # s, and ten periods: a silence of the odometer that may be a jump of its clock
@@ -55,7 +57,7 @@ def _find_beyond(odometer: Odometer, track: Track | None, start: float) -> _Foun
     if not bad.any():
         return bad, None
     k = int(np.flatnonzero(bad)[0])
-    many = "1 odometer reading" if bad.sum() == 1 else f"{bad.sum()} odometer readings"
+    many = format_count(bad.sum(), "odometer reading")
     return bad, Finding(
         "warning",
         f"{many} beyond any vehicle's speed (the first {odometer.speed[k]:.4g} m/s at {odometer.t[k] - start:.2f} s "

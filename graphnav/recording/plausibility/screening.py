@@ -16,14 +16,15 @@ from numpy.typing import NDArray
 from graphnav.core.earth import gravity
 from graphnav.core.errors import RecordingError
 from graphnav.core.findings import Finding, period_of, runs_of
-from graphnav.core.notes import Note
+from graphnav.core.notes import Note, format_count
 from graphnav.core.rotation import Array
 from graphnav.recording import Imu, Recording, take_rows
-from graphnav.recording.checks import crosschecks
+from graphnav.recording.checks import crosschecks, tracks
 from graphnav.recording.checks.aiding import check_imu_axes, check_imu_clock, measure_overlap
 from graphnav.recording.checks.clock import FAIR, ClockOffsets, measure_clock_offsets
-from graphnav.recording.checks.crosschecks import Fit, Track
+from graphnav.recording.checks.crosschecks import Fit
 from graphnav.recording.checks.series import screen_series
+from graphnav.recording.checks.tracks import Track
 from graphnav.recording.formats.schema import FORCE
 from graphnav.recording.plausibility import fixes as plausibility_gnss
 from graphnav.recording.plausibility import odometer as plausibility_odometer
@@ -31,7 +32,6 @@ from graphnav.recording.plausibility.readings import find_contradicted
 
 # Limits of readings: no accelerometer for vehicles or feet has a range beyond 100 g (those for crash tests have 200 g
 # and more, and cannot tell gravity from their own offset), and no gyro for them one beyond 4000 deg/s.
-# 200 g and more, and cannot tell gravity from their own offset), and no gyro for them one beyond 4000 deg/s.
 ACCEL_RANGE = 1000.0  # m/s^2
 GYRO_RANGE = 70.0  # rad/s
 _STANDARD_GRAVITY = 9.80665  # m/s^2, where the position is unknown
@@ -151,7 +151,7 @@ def _drop_impossible(recording: Recording) -> tuple[Recording, list[Finding], li
         recording, more = plausibility_gnss.screen(recording)
         of_aiding += more
         assert recording.gnss is not None
-        track = crosschecks.track(recording.gnss)
+        track = tracks.compute_track(recording.gnss)
         if track is not None and measure_overlap(recording) <= 0:
             track = None
     if recording.odometer is not None and len(recording.odometer.t):
@@ -187,7 +187,7 @@ def check_imu_scale(recording: Recording) -> Iterator[Finding]:
         g = _STANDARD_GRAVITY if recording.gnss is None else _measure_gravity(recording)
         yield Finding(
             "refused",
-            f"the force has a median of {f:.3g} m/s2 where it is calm, not {g:.1f}: {sentence}",
+            f"the specific force where it is calm is {f:.3g} m/s2 (median), not {g:.1f}: {sentence}",
             "imu.force_scale",
         )
 
@@ -203,7 +203,7 @@ def _lacks_gravity(recording: Recording, f: float, steady: float) -> bool:
         return True
     if gnss is None or measure_overlap(recording) <= 0:
         return False
-    track = crosschecks.track(gnss) if (np.abs(imu.accel) < ACCEL_RANGE).all() else None
+    track = tracks.compute_track(gnss) if (np.abs(imu.accel) < ACCEL_RANGE).all() else None
     fit = None if track is None else crosschecks.fit_force(imu, track)
     if fit is None or fit.correlation < FAIR:
         return False
@@ -279,7 +279,7 @@ def drop_contradicted(imu: Imu, start: float, forces: bool) -> tuple[Imu, list[F
 
 
 def _list_rows(bad: NDArray[np.bool_]) -> str:
-    return "1 IMU row" if bad.sum() == 1 else f"{bad.sum()} IMU rows"
+    return format_count(bad.sum(), "IMU row")
 
 
 def check_dead_axes(recording: Recording) -> Iterator[Finding]:

@@ -1,0 +1,125 @@
+"""The tests for errors that last beside a filter at given points, by the gains and innovations that it leaves.
+
+Where they find a fault, filter and tests go back to before it, and on without what is wrong.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from graphnav.constraints.base import Constraint
+from graphnav.core.rotation import Array
+from graphnav.core.state import BLOCKS, DIM
+from graphnav.estimation.solvers.linearise import Advance
+from graphnav.estimation.solvers.points import PointFilter
+from graphnav.estimation.solvers.recursion import UNUSED
+from graphnav.estimation.solvers.stack import RowBlock, Stack
+from graphnav.estimation.solvers.verdicts import Verdicts
+from graphnav.estimation.solvers.watch import Bank
+
+
+class FaultSearch:
+    """Find the fixes that are wrong, and weigh them in a filter.
+
+    Parameters
+    ----------
+    watched : whose errors are looked for.
+    given : the filter.
+    t : (K,) s, of all keyframes of the problem.
+    """
+
+    def __init__(
+        self,
+        watched: Sequence[Constraint],
+        given: PointFilter,
+        steps: Advance,
+        stack: Stack,
+        bank: Bank,
+        t: Array,
+    ) -> None:
+        self._watched, self._filter, self._steps, self._stack, self._t = watched, given, steps, stack, t
+        records = stack.records
+        self.verdicts = Verdicts(
+            {c.name: t[c.keyframe] for c in watched}, {c.name: records[c.name].used for c in watched}
+        )
+        self._used = {c.name: records[c.name].used.copy() for c in watched}
+        self._bank = bank
+        self._free: set[tuple[str, float]] = set()  # where nothing is known any more
+        self.at_start = np.zeros(given.H.shape[2])  # (D,) variance by which less is known at the start
+
+    def follow(self, k0: int, k1: int) -> int:
+        """Test what was filtered from one keyframe to another; the keyframe to go on from."""
+        since = self._test(k0, k1)
+        if since is None and k1 == len(self._t):
+            since = self.verdicts.ended()
+        if since is None:
+            return k1
+        back = int(np.searchsorted(self._t, since))
+        self._bank.go_back(back)
+        self._reweigh()
+        self._begin_anew()
+        return back
+
+    def _test(self, k0: int, k1: int) -> float | None:
+        """When something began to be wrong that was used up to one of k0 to k1."""
+        given = self._filter
+        root, solved = self._innovations_by_kernels(k0, k1)
+        fault = self._bank.follow(
+            k0, k1, given.F, self._steps.decay, self._stack, given.updates, root, solved, given.speeds
+        )
+        if fault is None:
+            return None
+        name, at, since = fault
+        return self.verdicts.settle(name, since, float(self._t[at]))
+
+    def _innovations_by_kernels(self, k0: int, k1: int) -> tuple[Array, Array]:
+        """Roots of S (K, M, M) and S^-1 r (K, M), with the weights that kernels have left at keyframes k0 to k1."""
+        stack = self._stack
+        bent = k0 + np.flatnonzero(np.any(stack.bent[k0:k1] < 1.0, axis=1))
+        if not len(bent):
+            return stack.root, stack.solved
+        roots, solved = stack.root.copy(), stack.solved.copy()
+        for some in (block for k in bent.tolist() for block in stack.together(k)):
+            at, own, weight = some.at, (some.k, some.at[1], some.at[1]), stack.bent[some.at]
+            if np.any((weight > 0.0) & (weight < 1.0)):
+                root = stack.root[own]
+                S = root @ root.T
+                roots[own] = np.linalg.cholesky(S + np.diag(self._filter.variance[at] * (1.0 / weight - 1.0)))
+                solved[at] = np.linalg.solve(roots[own] @ roots[own].T, S @ stack.solved[at])
+        return roots, solved
+
+    def _reweigh(self) -> None:
+        """Take the blocks in, or not, as fixes are used now."""
+        for name, was in self._used.items():
+            record = self._stack.records[name]
+            for k in np.unique(record.rows.keyframe[np.flatnonzero(record.used != was)]).tolist():
+                for some in self._stack.together(k):
+                    if some.parts[0][0] is record.rows:
+                        self._weigh(some)
+            was[:] = record.used
+
+    def _weigh(self, some: RowBlock) -> None:
+        rows, lo, hi = some.parts[0]
+        used = self._stack.records[rows.name].used[lo:hi]
+        weight = np.maximum(used, UNUSED) if used.any() else np.ones(hi - lo)
+        self._filter.weigh(some, bool(used.any()), np.repeat(np.sqrt(weight), len(rows.axes)))
+
+    def _begin_anew(self) -> None:
+        """Where fixes of a fault that does not end are taken back nothing is known any more of what they measure."""
+        for rows in self._watched:
+            for name, t in self.verdicts.anew - self._free:
+                k = int(np.searchsorted(self._t, t))
+                if name == rows.name and k:
+                    self._filter.Q[k - 1] += np.diag(free(DIM, rows.fix_of))
+                elif name == rows.name:
+                    self.at_start += free(len(self.at_start), rows.fix_of)
+        self._free |= self.verdicts.anew
+
+
+def free(D: int, block: str) -> Array:
+    """(D,) variance of an error state with nothing known of a block, but for what moves with it."""
+    out = np.zeros(D)
+    out[BLOCKS[block]] = 1e6
+    return out
