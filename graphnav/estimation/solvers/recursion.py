@@ -390,15 +390,14 @@ def compute_lag_covariances(
 
     Cov(x_k-1, x_k) = P_k-1 F^T P-_k^-1 P^s_k = P_k-1 F^T (I - N P-_k)
     """
-    out = np.empty((len(k), end - begin))
+    out, w = np.empty((len(k), end - begin)), F.shape[2]
     for i in range(len(k)):
         j = k[i]
-        rest = -np.dot(P_predicted[j, begin:end], N[j])
-        for c in range(end - begin):
-            rest[c, begin + c] += 1.0
-        rest = move_back(F[j - 1], decay[j - 1], rest)
-        for c in range(end - begin):
-            out[i, c] = np.dot(P[j - 1, begin + c], rest[c])
+        for c in range(begin, end):
+            rest, own = np.dot(P_predicted[j, c], N[j]), P[j - 1, c]
+            rest[c] -= 1.0
+            moved = np.dot(np.dot(F[j - 1], own[:w]), rest[:DIM])
+            out[i, c - begin] = -moved - np.sum(decay[j - 1] * own[DIM:] * rest[DIM:])
     return out
 
 
