@@ -201,7 +201,7 @@ def _relinearise(
         smoothed = backward(problem, refilter(problem, known, progress), progress)
         if near_to(smoothed, known, _LINEAR):
             return ekf(problem, progress, aligned.until, known=smoothed), smoothed
-    from graphnav.estimation.solvers.batch import batch  # and GTSAM with it, which few runs of a filter need
+    from graphnav.estimation.factor_graph.batch import batch  # and GTSAM with it, which few runs of a filter need
 
     states = smoothed.states
     if any(c.of_wheels for c in problem.constraints):
