@@ -33,11 +33,11 @@ from graphnav.config import Settings, settings_from
 from graphnav.core.earth import LocalFrame
 from graphnav.detectors import detect
 from graphnav.estimation.alignment import align
+from graphnav.estimation.factor_graph.batch import batch
 from graphnav.estimation.noise.apply import with_noise
 from graphnav.estimation.noise.estimate import estimate_noise
 from graphnav.estimation.pipeline import origin
 from graphnav.estimation.problem import Problem, build_problem
-from graphnav.estimation.solvers.batch import batch
 from graphnav.estimation.solvers.ekf import ekf
 from graphnav.online import Online, Row, rows_of, without_rows
 from graphnav.recording import Recording

@@ -27,11 +27,11 @@ import oracle
 from benchmark_online import LAP, RATE, memory_mb, posed
 
 from graphnav.config import Settings
+from graphnav.estimation.factor_graph.isam import isam2
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import Solution
 from graphnav.estimation.solvers.ekf import ekf
 from graphnav.estimation.solvers.incremental import Replay, incremental
-from graphnav.estimation.solvers.isam import isam2
 from graphnav.estimation.solvers.passes import Progress
 
 LAG = 120.0

@@ -24,13 +24,13 @@ from graphnav.core.earth import LocalFrame
 from graphnav.core.rotation import Array
 from graphnav.core.state import States
 from graphnav.detectors import detect
+from graphnav.estimation.factor_graph.batch import batch
+from graphnav.estimation.factor_graph.isam import isam2
 from graphnav.estimation.pipeline import origin
 from graphnav.estimation.preparation import prepare
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import Solution
-from graphnav.estimation.solvers.batch import batch
 from graphnav.estimation.solvers.incremental import are_due, incremental
-from graphnav.estimation.solvers.isam import isam2
 from graphnav.imu.dynamics import SCALE, as_biases
 
 RECORDINGS = ("kitti", "gcp_walks/walk31.toml", "oracle_drive", "tokyo_20201105")

@@ -34,7 +34,7 @@ ROOMS = {
     "__main__": ["app"],
 }  # fmt: skip
 
-GTSAM_ROOMS = {"estimation"}
+GTSAM_ROOMS = {"estimation/factor_graph"}
 MATPLOTLIB_ROOMS: set[str] = set()  # pictures are drawn in the reader's browser
 PRINTING = {"app/talk.py"}
 
@@ -85,8 +85,14 @@ def test_a_room_imports_from_what_it_names(room):
 
 @pytest.mark.parametrize(("library", "rooms"), [("gtsam", GTSAM_ROOMS), ("matplotlib", MATPLOTLIB_ROOMS)])
 def test_heavy_libraries_stay_in_their_rooms(library, rooms):
-    users = {room_of(path) for path in FILES if any(name.split(".")[0] == library for name in read_code(path)[0])}
-    assert users == rooms
+    users = [path for path in FILES if any(name.split(".")[0] == library for name in read_code(path)[0])]
+    assert {path.parent.relative_to(PACKAGE).as_posix() for path in users} == rooms
+
+
+def test_solvers_know_nothing_of_the_factor_graph():
+    users = [path for path in FILES if path.parent == PACKAGE / "estimation" / "solvers"]
+    assert users
+    assert not [path for path in users for name in read_code(path)[0] if "factor_graph" in name]
 
 
 def test_only_the_command_line_prints():
@@ -143,7 +149,7 @@ def test_constraints_are_linearised_in_one_place_and_solvers_know_none_of_them()
         calls = [node for node in ast.walk(tree) if isinstance(node, ast.Call)]
         if any(isinstance(c.func, ast.Attribute) and c.func.attr == "linearize" and len(c.args) > 1 for c in calls):
             callers.add(name)
-        if name.startswith("estimation/solvers/"):
+        if name.startswith(("estimation/solvers/", "estimation/factor_graph/")):
             known |= {one for one in read_code(path)[0] if one.startswith("graphnav.constraints.")}
             typed |= {name for c in calls if isinstance(c.func, ast.Name) and c.func.id == "isinstance"}
     assert callers == {"estimation/solvers/linearise.py", "estimation/noise/explanations.py"}

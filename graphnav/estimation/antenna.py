@@ -164,7 +164,7 @@ def _find_turning(recording: Recording) -> Recording:
 
 def _estimate(recording: Recording) -> tuple[Antenna, tuple[Array, Array, Array] | None]:
     """The antenna, and the forward position of the point that does not slip, (1,) m each: stated, found, sigma."""
-    from graphnav.estimation.solvers.batch import batch
+    from graphnav.estimation.factor_graph.batch import batch
 
     if recording.gnss is None or not len(recording.gnss.t):
         raise EstimationError(

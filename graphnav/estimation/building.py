@@ -151,6 +151,6 @@ def _differ(a: Array, b: Array) -> bool:
 
 
 def _smooth(problem: Problem, start: States) -> Solution:
-    from graphnav.estimation.solvers.batch import batch
+    from graphnav.estimation.factor_graph.batch import batch
 
     return batch(split_carriers(problem)[0], start, wanted=(0,), reintegrate=False)

@@ -240,7 +240,7 @@ def _solve(
         out["rts"] = rts(problem, forward, smoothed)
     # modules are imported only where a run needs them, above all GTSAM
     if "batch" in solvers:
-        from graphnav.estimation.solvers.batch import batch
+        from graphnav.estimation.factor_graph.batch import batch
 
         out["batch"] = batch(problem, start.states, start.nodes(problem), progress=progress)
         # includes the attempts before
@@ -251,7 +251,7 @@ def _solve(
 
         out["incremental"] = incremental(problem, settings.solver.lag, progress, begin).settled
     if "isam2" in solvers:
-        from graphnav.estimation.solvers.isam import isam2
+        from graphnav.estimation.factor_graph.isam import isam2
         from graphnav.estimation.solvers.rows import compute_cost_at
 
         out["isam2"] = one = isam2(problem, settings.solver.isam2_lag or np.inf, progress, begin).settled
@@ -291,7 +291,7 @@ def _bind_graph(problem: Problem, solution: Solution) -> Callable[[], tuple[Any,
     """Attach the conversion to GTSAM, with a solution's values of parameters."""
 
     def export() -> tuple[Any, Any]:
-        from graphnav.estimation.nonlinear import Exported  # which needs GTSAM
+        from graphnav.estimation.factor_graph.nonlinear import Exported  # which needs GTSAM
 
         values = {name: estimate.value for name, estimate in solution.parameters.items()}
         return Exported(problem, solution.states, values)()

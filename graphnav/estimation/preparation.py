@@ -207,7 +207,7 @@ def _relinearise(
             passes.update(filter=1)
             return ekf(problem, progress, aligned.until, known=smoothed), smoothed
         about = smoothed
-    from graphnav.estimation.solvers.batch import batch  # and GTSAM with it, which few runs of a filter need
+    from graphnav.estimation.factor_graph.batch import batch  # and GTSAM with it, which few runs of a filter need
 
     states = smoothed.states
     if wheels:

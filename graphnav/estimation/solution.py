@@ -170,7 +170,7 @@ class Solution:
         """The problem as GTSAM's `NonlinearFactorGraph` and this solution as its `Values`.
 
         Variables are X(k) Pose3, V(k) velocity, B(k) imuBias.ConstantBias of keyframe k, and Q(j) nodes of parameters
-        (`graphnav.estimation.nonlinear`). Sigmas and weights are those that were used.
+        (`graphnav.estimation.factor_graph.nonlinear`). Sigmas and weights are those that were used.
 
         Parameters
         ----------

@@ -16,6 +16,7 @@ from graphnav.constraints.base import SAME_TIME
 from graphnav.constraints.standstill import PLACE
 from graphnav.core.rotation import Array
 from graphnav.core.state import BLOCKS, Parameter
+from graphnav.estimation.factor_graph.tree_window import TreeWindow
 from graphnav.estimation.fixing import LOST_PLACE, LOST_SPEED, Held, hold_on, split_carriers, with_integers
 from graphnav.estimation.known_arcs import Epochs
 from graphnav.estimation.noise.apply import row_weights
@@ -25,7 +26,6 @@ from graphnav.estimation.solution import ExcludedSpan
 from graphnav.estimation.solvers.elimination import Predicted
 from graphnav.estimation.solvers.linearise import Points, Step
 from graphnav.estimation.solvers.stages import Place
-from graphnav.estimation.solvers.tree_window import TreeWindow
 from graphnav.estimation.solvers.verdicts import Verdicts
 from graphnav.estimation.solvers.watch import Watch
 from graphnav.estimation.solvers.window import Message, SettledStates, Window, compute_turn_limit

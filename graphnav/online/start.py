@@ -11,8 +11,8 @@ from graphnav.core.rotation import Array
 from graphnav.detectors import detect
 from graphnav.estimation.alignment import Alignment, align, is_ready, with_known_heading
 from graphnav.estimation.building import start_sigma
+from graphnav.estimation.factor_graph.batch import batch
 from graphnav.estimation.noise.model import NoiseModel
-from graphnav.estimation.solvers.batch import batch
 from graphnav.estimation.solvers.window import make_first_message
 from graphnav.online.raw import codes_alone
 from graphnav.online.sensors import Sensors

@@ -19,9 +19,9 @@ from graphnav.constraints.prior import InitialPrior
 from graphnav.core import rotation as ro
 from graphnav.core.earth import LocalFrame
 from graphnav.core.state import BLOCKS, DIM, States
+from graphnav.estimation.factor_graph.gaussian import LinearGraph
 from graphnav.estimation.problem import Problem, build_problem, keyframe_times
 from graphnav.estimation.solvers.ekf import ekf
-from graphnav.estimation.solvers.graph import LinearGraph
 from graphnav.estimation.solvers.invariant import plus_invariant, transport_covariance
 from graphnav.imu.preintegration import preintegrate
 from graphnav.imu.samples import bridge_gaps

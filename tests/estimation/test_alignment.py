@@ -15,7 +15,7 @@ from graphnav.core.earth import LocalFrame
 from graphnav.core.notes import key_of
 from graphnav.core.trajectory import Trajectory
 from graphnav.estimation.alignment import Alignment, align, with_known_heading
-from graphnav.estimation.solvers.batch import batch
+from graphnav.estimation.factor_graph.batch import batch
 from graphnav.recording import Recording
 
 DEG = np.pi / 180.0

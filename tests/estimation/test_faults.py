@@ -19,10 +19,10 @@ from graphnav.core.trajectory import Trajectory
 from graphnav.detectors import detect
 from graphnav.estimation import faults
 from graphnav.estimation.alignment import align
+from graphnav.estimation.factor_graph.batch import batch
 from graphnav.estimation.pipeline import origin, run
 from graphnav.estimation.problem import Problem, build_problem
 from graphnav.estimation.solution import Solution
-from graphnav.estimation.solvers.batch import batch
 from graphnav.estimation.solvers.ekf import ekf, refilter
 from graphnav.estimation.solvers.likelihood_ratio import update_tests
 from graphnav.estimation.solvers.passes import Updates

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from helpers import Array
 
-from graphnav.estimation.solvers.graph import LinearGraph, make_jacobian_factor
+from graphnav.estimation.factor_graph.gaussian import LinearGraph, make_jacobian_factor
 
 N = 40
 

@@ -17,12 +17,12 @@ from graphnav.core.notes import key_of
 from graphnav.core.rotation import exp, right_jacobian_inverse
 from graphnav.core.state import DIM, States
 from graphnav.core.trajectory import Trajectory
+from graphnav.estimation.factor_graph.batch import batch
 from graphnav.estimation.noise.apply import with_noise
 from graphnav.estimation.noise.model import STATED, NoiseModel, VarianceComponent
 from graphnav.estimation.pipeline import run
 from graphnav.estimation.problem import Problem, build_problem
 from graphnav.estimation.solution import Solution
-from graphnav.estimation.solvers.batch import batch
 from graphnav.estimation.solvers.ekf import ekf
 from graphnav.estimation.solvers.incremental import Incremental, incremental
 from graphnav.estimation.solvers.linearise import Step, list_node_steps

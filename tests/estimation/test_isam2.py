@@ -13,27 +13,27 @@ from graphnav.config import settings_from
 from graphnav.core.earth import LocalFrame
 from graphnav.core.rotation import exp
 from graphnav.core.state import States
-from graphnav.estimation.noise.apply import with_noise
-from graphnav.estimation.noise.model import NoiseModel, VarianceComponent
-from graphnav.estimation.problem import Problem, build_problem
-from graphnav.estimation.solution import Solution
-from graphnav.estimation.solvers.batch import batch
-from graphnav.estimation.solvers.ekf import ekf
-from graphnav.estimation.solvers.incremental import incremental
-from graphnav.estimation.solvers.isam import isam2
-from graphnav.estimation.solvers.linearise import list_node_steps
-from graphnav.estimation.solvers.points import move_covariance
-from graphnav.estimation.solvers.rts import backward
-from graphnav.estimation.solvers.stages import Place
-from graphnav.estimation.solvers.tree import Tree
-from graphnav.estimation.solvers.tree_marginals import (
+from graphnav.estimation.factor_graph.batch import batch
+from graphnav.estimation.factor_graph.isam import isam2
+from graphnav.estimation.factor_graph.tree import Tree
+from graphnav.estimation.factor_graph.tree_marginals import (
     begin_elimination,
     compute_newest_covariance,
     eliminate,
     read_keyframes,
     settle,
 )
-from graphnav.estimation.solvers.tree_nodes import update_isam
+from graphnav.estimation.factor_graph.tree_nodes import update_isam
+from graphnav.estimation.noise.apply import with_noise
+from graphnav.estimation.noise.model import NoiseModel, VarianceComponent
+from graphnav.estimation.problem import Problem, build_problem
+from graphnav.estimation.solution import Solution
+from graphnav.estimation.solvers.ekf import ekf
+from graphnav.estimation.solvers.incremental import incremental
+from graphnav.estimation.solvers.linearise import list_node_steps
+from graphnav.estimation.solvers.points import move_covariance
+from graphnav.estimation.solvers.rts import backward
+from graphnav.estimation.solvers.stages import Place
 from graphnav.estimation.solvers.window import compute_turn_limit, make_first_message
 from graphnav.recording import Recording
 

@@ -21,6 +21,7 @@ from graphnav.core.rotation import Array
 from graphnav.core.trajectory import Trajectory
 from graphnav.detectors import detect
 from graphnav.estimation.alignment import align
+from graphnav.estimation.factor_graph.batch import batch
 from graphnav.estimation.faults import weigh_rows
 from graphnav.estimation.noise.apply import row_weights, with_noise, without_parts
 from graphnav.estimation.noise.estimate import NoiseEstimate, estimate_noise
@@ -33,7 +34,6 @@ from graphnav.estimation.noise.words import describe_far
 from graphnav.estimation.pipeline import SOLVERS, origin, run
 from graphnav.estimation.problem import Problem, build_problem
 from graphnav.estimation.solution import Solution
-from graphnav.estimation.solvers.batch import batch
 from graphnav.estimation.solvers.ekf import ekf, refilter
 from graphnav.estimation.solvers.linearise import linearise
 from graphnav.estimation.solvers.passes import ForwardRecord, SmootherPass

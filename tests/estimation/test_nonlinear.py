@@ -21,7 +21,7 @@ from graphnav.core.state import DIM
 from graphnav.detectors import detect
 from graphnav.detectors.base import Detection
 from graphnav.detectors.scene import Detector
-from graphnav.estimation.nonlinear import Exported, state_at
+from graphnav.estimation.factor_graph.nonlinear import Exported, state_at
 from graphnav.estimation.pipeline import run, with_own
 from graphnav.estimation.problem import build_problem
 from graphnav.estimation.solvers.rows import Iterate, Layout, cost

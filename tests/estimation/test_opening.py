@@ -13,8 +13,8 @@ from test_solvers import NO_WHEELS, WHITE, nearly_linear, sigmas
 from graphnav.config import settings_from
 from graphnav.core.earth import LocalFrame
 from graphnav.estimation.alignment import align
+from graphnav.estimation.factor_graph.batch import batch
 from graphnav.estimation.problem import Problem, build_problem
-from graphnav.estimation.solvers.batch import batch
 from graphnav.estimation.solvers.ekf import ekf
 from graphnav.estimation.solvers.rts import rts
 

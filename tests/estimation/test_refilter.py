@@ -17,11 +17,11 @@ from graphnav.core.rotation import Array
 from graphnav.core.state import DIM
 from graphnav.detectors import detect
 from graphnav.estimation.alignment import align
+from graphnav.estimation.factor_graph.batch import batch
 from graphnav.estimation.noise.apply import with_noise
 from graphnav.estimation.noise.model import NoiseModel, VarianceComponent
 from graphnav.estimation.pipeline import origin, run
 from graphnav.estimation.problem import Problem, build_problem
-from graphnav.estimation.solvers.batch import batch
 from graphnav.estimation.solvers.ekf import ekf, near, refilter
 from graphnav.estimation.solvers.linearise import Points, advance, linearise
 from graphnav.estimation.solvers.points import Errors, PointFilter, predict_states

@@ -19,15 +19,15 @@ from graphnav.core.earth import LocalFrame
 from graphnav.core.rotation import exp
 from graphnav.core.state import DIM
 from graphnav.core.trajectory import Trajectory
+from graphnav.estimation.factor_graph.batch import batch, solve_rows
+from graphnav.estimation.factor_graph.isam import isam2
 from graphnav.estimation.noise.apply import with_noise
 from graphnav.estimation.noise.model import STATED, NoiseModel, VarianceComponent
 from graphnav.estimation.pipeline import run
 from graphnav.estimation.problem import Problem, build_problem
 from graphnav.estimation.solution import Solution
-from graphnav.estimation.solvers.batch import batch, solve_rows
 from graphnav.estimation.solvers.ekf import ekf
 from graphnav.estimation.solvers.incremental import Replay, incremental
-from graphnav.estimation.solvers.isam import isam2
 from graphnav.estimation.solvers.robust import weight_and_cost
 from graphnav.estimation.solvers.rows import Iterate, Layout, whiten
 from graphnav.estimation.solvers.rts import rts

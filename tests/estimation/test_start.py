@@ -21,8 +21,8 @@ from graphnav.estimation import preparation
 from graphnav.estimation.alignment import Alignment, align
 from graphnav.estimation.alignment.first import pick_fixes
 from graphnav.estimation.alignment.motion import drop_implausible
+from graphnav.estimation.factor_graph.batch import batch
 from graphnav.estimation.pipeline import origin, run
-from graphnav.estimation.solvers.batch import batch
 from graphnav.estimation.solvers.verdicts import Verdicts
 from graphnav.evaluation.scoring import Errors, errors
 from graphnav.online import Online, rows_of, without_rows

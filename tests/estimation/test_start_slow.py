@@ -19,8 +19,8 @@ from graphnav.detectors import detect
 from graphnav.detectors.base import NONE
 from graphnav.estimation.alignment import Alignment, align
 from graphnav.estimation.alignment.travel import measure_travel
+from graphnav.estimation.factor_graph.batch import batch
 from graphnav.estimation.pipeline import origin
-from graphnav.estimation.solvers.batch import batch
 from graphnav.recording import Recording, Truth
 from graphnav.recording.formats import read
 

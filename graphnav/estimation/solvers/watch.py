@@ -206,9 +206,6 @@ class Bank:
         self._before, self._keys = np.empty((_REMEMBERED, ends[-1])), np.zeros(_REMEMBERED, dtype=int)
         self._ends = np.zeros(2, dtype=int)
 
-    def __contains__(self, name: str) -> bool:
-        return name in self._slots
-
     def go_back(self, k: int) -> None:
         """To before keyframe k; without any onset where that is too long ago."""
         begin, end = self._ends

@@ -27,8 +27,8 @@ from graphnav.constraints.base import Constraint
 from graphnav.core.errors import EstimationError
 from graphnav.core.rotation import Array
 from graphnav.core.state import BLOCKS, DIM, States
+from graphnav.estimation.factor_graph.gaussian import make_jacobian_factor
 from graphnav.estimation.problem import Problem
-from graphnav.estimation.solvers.graph import make_jacobian_factor
 from graphnav.estimation.solvers.linearise import Points, linearise, linearise_links, shift
 from graphnav.estimation.solvers.rows import Iterate, Layout, linearise_chain
 from graphnav.imu.dynamics import SCALE

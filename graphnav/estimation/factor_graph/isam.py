@@ -1,7 +1,7 @@
 """A recorded drive through GTSAM's iSAM2, keyframe by keyframe: its own answer, live and settled.
 
-The rows are those of every solver; the tree is that of `graphnav.estimation.solvers.tree`. With a lag, keyframes older
-than it are settled and marginalised; without one, the whole drive is relinearised until nothing moves any more.
+The rows are those of every solver; the tree is that of `graphnav.estimation.factor_graph.tree`. With a lag, keyframes
+older than it are settled and marginalised; without one, the whole drive is relinearised until nothing moves any more.
 """
 
 from __future__ import annotations
@@ -12,18 +12,18 @@ import numpy as np
 
 from graphnav.core.rotation import Array
 from graphnav.core.state import States
-from graphnav.estimation.problem import Problem
-from graphnav.estimation.solvers.incremental import FINE, Replay, are_due, begin_at, replay
-from graphnav.estimation.solvers.passes import Progress
-from graphnav.estimation.solvers.stages import Message, Place
-from graphnav.estimation.solvers.tree import Tree
-from graphnav.estimation.solvers.tree_marginals import (
+from graphnav.estimation.factor_graph.tree import Tree
+from graphnav.estimation.factor_graph.tree_marginals import (
     Elimination,
     begin_elimination,
     compute_newest_covariance,
     eliminate,
     settle,
 )
+from graphnav.estimation.problem import Problem
+from graphnav.estimation.solvers.incremental import FINE, Replay, are_due, begin_at, replay
+from graphnav.estimation.solvers.passes import Progress
+from graphnav.estimation.solvers.stages import Message, Place
 from graphnav.estimation.solvers.window import SettledStates, compute_turn_limit
 
 _SKIP = 10  # keyframes between two looks at what has moved, as GTSAM's relinearizeSkip, at least

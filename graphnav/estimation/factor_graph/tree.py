@@ -25,23 +25,7 @@ import numpy as np
 
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM
-from graphnav.estimation.problem import Problem
-from graphnav.estimation.solvers.elimination import Predicted
-from graphnav.estimation.solvers.linearise import Step, scale_at, shift
-from graphnav.estimation.solvers.passes import integrate_again
-from graphnav.estimation.solvers.recursion import PASSES
-from graphnav.estimation.solvers.revision import Renewed, linearise_runs
-from graphnav.estimation.solvers.stages import (
-    Measured,
-    Message,
-    Place,
-    append_columns,
-    group_runs,
-    measure,
-    predict_stage,
-    width,
-)
-from graphnav.estimation.solvers.tree_nodes import (
+from graphnav.estimation.factor_graph.tree_nodes import (
     LINK,
     Keyframe,
     Made,
@@ -60,6 +44,22 @@ from graphnav.estimation.solvers.tree_nodes import (
     turns_of,
     update_isam,
     write_factors,
+)
+from graphnav.estimation.problem import Problem
+from graphnav.estimation.solvers.elimination import Predicted
+from graphnav.estimation.solvers.linearise import Step, scale_at, shift
+from graphnav.estimation.solvers.passes import integrate_again
+from graphnav.estimation.solvers.recursion import PASSES
+from graphnav.estimation.solvers.revision import Renewed, linearise_runs
+from graphnav.estimation.solvers.stages import (
+    Measured,
+    Message,
+    Place,
+    append_columns,
+    group_runs,
+    measure,
+    predict_stage,
+    width,
 )
 
 NODE_EVERY = 30.0  # s from one node of a constant to the next

@@ -1,4 +1,4 @@
-"""Covariances of a `graphnav.estimation.solvers.tree.Tree`, all of errors about the estimates.
+"""Covariances of a `graphnav.estimation.factor_graph.tree.Tree`, all of errors about the estimates.
 
 The newest keyframe stands in the root of GTSAM's Bayes tree, where a marginal costs next to nothing. One deep in the
 tree it finds clique by clique from the root, and anew after each update. So those of the oldest are found by
@@ -15,12 +15,12 @@ import numpy as np
 from graphnav.core import rotation
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, States
+from graphnav.estimation.factor_graph.gaussian import Eliminated
+from graphnav.estimation.factor_graph.tree import Tree
+from graphnav.estimation.factor_graph.tree_nodes import Keyframe, Variable, fill_keys, states_of
 from graphnav.estimation.solvers.breakdown import explain_undetermined
-from graphnav.estimation.solvers.graph import Eliminated
 from graphnav.estimation.solvers.linearise import Columns, shift
 from graphnav.estimation.solvers.points import move_covariance
-from graphnav.estimation.solvers.tree import Tree
-from graphnav.estimation.solvers.tree_nodes import Keyframe, Variable, fill_keys, states_of
 from graphnav.estimation.solvers.window import SettledStates
 
 _AT_ONCE = 45  # variables: GTSAM's bookkeeping of one elimination grows faster than what it eliminates

@@ -14,17 +14,17 @@ from typing import Any
 
 import numpy as np
 
-from graphnav.estimation.solvers.elimination import Predicted
-from graphnav.estimation.solvers.revision import Renewed, Renewing
-from graphnav.estimation.solvers.stages import Message, Place, Stage
-from graphnav.estimation.solvers.tree import Tree
-from graphnav.estimation.solvers.tree_marginals import (
+from graphnav.estimation.factor_graph.tree import Tree
+from graphnav.estimation.factor_graph.tree_marginals import (
     Elimination,
     begin_elimination,
     compute_newest_root,
     eliminate,
     settle,
 )
+from graphnav.estimation.solvers.elimination import Predicted
+from graphnav.estimation.solvers.revision import Renewed, Renewing
+from graphnav.estimation.solvers.stages import Message, Place, Stage
 from graphnav.estimation.solvers.window import SettledStates, Window
 
 _ROUNDS = 5

@@ -12,8 +12,8 @@ import numpy as np
 from graphnav.core import rotation
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, States
+from graphnav.estimation.factor_graph.gaussian import make_jacobian_factor
 from graphnav.estimation.solvers.breakdown import explain_smoother
-from graphnav.estimation.solvers.graph import make_jacobian_factor
 from graphnav.estimation.solvers.linearise import Columns, shift
 from graphnav.estimation.solvers.stages import Measured, Place
 from graphnav.estimation.solvers.stages import rotate_columns as turned_by
