@@ -175,7 +175,7 @@ BROKEN: dict[str, tuple[Change, str]] = {
     "no overlap": (imu(t=lambda t: t + 1e6), "do not overlap in time.*time_offset"),
     "gyro clipped": (imu(gyro=lambda x: np.clip(x, -0.5, 0.5)), "gyro z .* is saturated"),
     "stuck": (imu(gyro=lambda x: _stick(x), accel=lambda x: _stick(x)), r"repeats one value for [23]\.\d s"),
-    "gap": (lambda r: r.without("odometer") and _gap(r), r"1 gap in the IMU, the longest 3\.\d+ s at 50\.\d s"),
+    "gap": (lambda r: r.without("odometer") and _gap(r), r"1 gap in the IMU, of 3(\.\d+)? s at 50\.\d s"),
 }
 
 
