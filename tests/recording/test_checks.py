@@ -309,6 +309,23 @@ def test_heights_in_feet_are_seen_where_it_goes_up_and_down(
     assert "gnss.feet" not in keys(some)
 
 
+@pytest.mark.parametrize("velocities", [True, False])
+@pytest.mark.parametrize(
+    "wrong", [lambda llh: np.tile(llh[:1], (len(llh), 1)), lambda llh: llh * [1e-7, 1e-7, 1.0]], ids=["frozen", "1e-7"]
+)
+def test_fixes_that_stay_while_the_wheels_turn_are_told(
+    wrong: Callable[[np.ndarray], np.ndarray], velocities: bool
+) -> None:
+    right = read(Path(__file__).parents[2] / "data" / "tokyo")
+    if not velocities:
+        right = replace(right, gnss=replace(right.gnss, v=None, sd_v=None))
+    still = replace(right, gnss=replace(right.gnss, llh=wrong(right.gnss.llh)), truth=None)
+    assert "gnss.frozen" in keys(still)
+    assert ("gnss.frozen" in keys(still.without("odometer"))) == velocities  # nothing else tells
+    assert "gnss.frozen" not in keys(still.crop(25.0, 50.0))  # where it stands
+    assert "gnss.frozen" not in keys(right)
+
+
 def test_heights_in_feet_are_seen_on_a_drive_with_an_outage(drive: Callable[[str], Recording]) -> None:
     """Across a minute without fixes there is no slope to compare."""
     right = drive("oracle_drive")

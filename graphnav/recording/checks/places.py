@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from graphnav.core.findings import Finding
+from graphnav.core.findings import Finding, period_of
 from graphnav.core.rotation import Array
 from graphnav.recording import Gnss, Imu, Recording
 from graphnav.recording.checks import crosschecks
@@ -18,6 +18,7 @@ from graphnav.recording.checks.stated import describe_exchange, describe_mirrori
 from graphnav.recording.formats.schema import FOOT
 
 _SLOPE_SPAN, _SLOPES = 8.0, 6  # s over which a slope is taken: the force is then known to a tenth of a per cent
+_TURNING_RADIUS = 5.0  # m, of the smallest cars
 _FEET = 0.3  # relative deviation from 0.3048 that the noise of both permits: a ratio of 1 is three times as far off
 
 
@@ -37,6 +38,39 @@ def check_mirroring(recording: Recording, track: Track, as_read: Fit | None, tur
         turns_back and (crosschecks.correlate_sideways(recording.imu, track) or 0.0) > 0.0
     ):  # the gyro agrees with the force
         yield describe_mirroring("latitudes or longitudes have", "the turns of the gyro and the force in curves")
+
+
+def check_frozen(recording: Recording) -> Iterator[Finding]:
+    """Fixes that stay where no vehicle can, while wheels or the fixes' own velocities drive.
+
+    A car that drives a full turn of its smallest circle leaves any smaller one.
+    """
+    gnss, odometer = recording.gnss, recording.odometer
+    if gnss is None or len(gnss.t) < crosschecks.MIN_PAIRS or recording.platform != "vehicle":
+        return
+    p = crosschecks.compute_local_positions(gnss)[:, :2]
+    away = np.linalg.norm(p - np.median(p, axis=0), axis=1)
+    within = float(np.max(away))
+    sd = np.hypot(*gnss.sd[:, :2].T)
+    if within > _TURNING_RADIUS or np.sqrt(np.mean(away**2)) > 3.0 * np.median(sd):
+        return
+    if odometer is not None and len(odometer.t) > 1:
+        who, t, speed = "the odometer drives", odometer.t, np.abs(odometer.speed)
+    elif gnss.v is not None:
+        known = np.isfinite(gnss.v).all(axis=1)
+        who, t, speed = "their velocities drive", gnss.t[known], np.hypot(*gnss.v[known, :2].T)
+    else:
+        return
+    step, speed = np.diff(t), np.minimum(speed[1:], speed[:-1])
+    sure = (step < 5.0 * max(period_of(t), 1.0)) & (t[1:] > gnss.t[0]) & (t[:-1] < gnss.t[-1])
+    sure &= speed > crosschecks.MIN_SPEED  # no noise of one that stands
+    driven = float(np.sum((speed * step)[sure]))
+    if driven > 2.0 * np.pi * _TURNING_RADIUS:
+        yield Finding(
+            "untrusted",
+            f"the fixes stay within {within:.2g} m while {who} {driven:.0f} m: frozen, or of another unit than degrees",
+            "gnss.frozen",
+        )
 
 
 def check_height_unit(recording: Recording, track: Track, forward: Fit | None) -> Iterator[Finding]:
