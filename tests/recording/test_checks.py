@@ -306,7 +306,9 @@ def test_heights_in_feet_are_seen_where_it_goes_up_and_down(
     some = replace(some, gnss=replace(some.gnss, v=some.gnss.v if velocities else None))
     feet = replace(some, gnss=replace(some.gnss, llh=some.gnss.llh * [1.0, 1.0, 1 / 0.3048]))
     assert "gnss.feet" in keys(feet)
-    assert "gnss.feet" not in keys(some)
+    tenths = replace(some, gnss=replace(some.gnss, llh=some.gnss.llh * [1.0, 1.0, 10.0]))
+    assert "gnss.height_scale" in keys(tenths)
+    assert not {"gnss.feet", "gnss.height_scale"} & set(keys(some))
 
 
 @pytest.mark.parametrize("velocities", [True, False])

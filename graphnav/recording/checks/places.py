@@ -19,6 +19,7 @@ from graphnav.recording.formats.schema import FOOT
 
 _SLOPE_SPAN, _SLOPES = 8.0, 6  # s over which a slope is taken: the force is then known to a tenth of a per cent
 _TURNING_RADIUS = 5.0  # m, of the smallest cars
+_SCALE = np.sqrt(2.0)  # the middle between right and twice as large, the smallest factor between units
 _FEET = 0.3  # relative deviation from 0.3048 that the noise of both permits: a ratio of 1 is three times as far off
 
 
@@ -74,7 +75,7 @@ def check_frozen(recording: Recording) -> Iterator[Finding]:
 
 
 def check_height_unit(recording: Recording, track: Track, forward: Fit | None) -> Iterator[Finding]:
-    """Heights in feet: they climb 3.28 times as much as the slopes that the IMU measures."""
+    """Heights in feet, which climb 3.28 times as much as the slopes that the IMU measures, or in another unit."""
     if forward is None or forward.correlation < FAIR or recording.gnss is None:
         return
     ahead = forward.coefficients / np.linalg.norm(forward.coefficients)
@@ -82,13 +83,13 @@ def check_height_unit(recording: Recording, track: Track, forward: Fit | None) -
     if found is None:
         return
     correlation, ratio = found
+    climbs = f"the heights climb {1.0 / ratio:.2g} times as much as the slopes that the IMU measures (correlation "
+    climbs += f"{correlation:.2f})"
     if correlation > CLEAR and abs(ratio / FOOT - 1.0) < _FEET:
-        yield Finding(
-            "warning",
-            f"the heights climb {1.0 / ratio:.1f} times as much as the slopes that the IMU measures (correlation "
-            f'{correlation:.2f}): they are in feet; say units = {{ height = "ft" }} in [gnss]',
-            "gnss.feet",
-        )
+        hint = 'they are in feet; say units = { height = "ft" } in [gnss]'
+        yield Finding("warning", f"{climbs}: {hint}", "gnss.feet")
+    elif correlation > CLEAR and abs(np.log(ratio)) > np.log(_SCALE):
+        yield Finding("warning", f"{climbs}: look at their unit and column", "gnss.height_scale")
 
 
 def fit_climb(imu: Imu, track: Track, gnss: Gnss, forward: Array) -> tuple[float, float] | None:
