@@ -32,7 +32,19 @@ def unpack(commit: str, folder: Path) -> Path:
 
 def solve(code: Path, source: str, more: list[str], out: Path) -> dict[str, bytes]:
     """The trajectory of each solver as one tree's code writes it."""
-    command = [sys.executable, "-m", "graphnav", "compare", source, "--solvers", ",".join(SOLVERS), "-o", str(out)]
+    # -P: the folder it runs in, which is this tree, would come before PYTHONPATH
+    command = [
+        sys.executable,
+        "-P",
+        "-m",
+        "graphnav",
+        "compare",
+        source,
+        "--solvers",
+        ",".join(SOLVERS),
+        "-o",
+        str(out),
+    ]
     environment = {**os.environ, "PYTHONPATH": str(code), "OPENBLAS_NUM_THREADS": "1"}
     subprocess.run([*command, "--quiet", *more], check=True, env=environment, cwd=ROOT)
     return {name: (out / name / "trajectory.csv").read_bytes() for name in SOLVERS}

@@ -221,7 +221,7 @@ def _city(half: float, rng: np.random.Generator) -> list[tuple[float, float, flo
     return knots
 
 
-@lru_cache(maxsize=4)
+@lru_cache(maxsize=12)
 def vehicle_path(
     duration: float = 600.0,
     rate: float = 200.0,

@@ -250,7 +250,8 @@ def _attempt(write: Callable[[Path], object], path: Path) -> dict[Path, str]:
         write(path)
     except Exception as error:
         path.unlink(missing_ok=True)
-        return {path: f"{path.name} could not be written ({type(error).__name__}: {error})"}
+        why = getattr(error, "strerror", None) or f"{type(error).__name__}: {error}"
+        return {path: f"{path.name} could not be written ({why})"}
     return {}
 
 

@@ -85,9 +85,10 @@ def _describe_noise(outcome: Outcome) -> list[str]:
 
 def _describe_stops(outcome: Outcome) -> str:
     spans = next(iter(outcome.solutions.values())).stationary
+    kind = "stop" if outcome.recording.platform == "vehicle" else "stance"
     if not len(spans):
-        return "stands nowhere"
-    return f"{format_count(len(spans), 'stop')}, {np.diff(spans).sum():.1f} s in all: detections.csv"
+        return f"no {kind}s"
+    return f"{format_count(len(spans), kind)}, {np.diff(spans).sum():.1f} s in all: detections.csv"
 
 
 def _describe_recording(outcome: Outcome) -> str:

@@ -4,10 +4,11 @@ With the models of `graphnav.gnss.ppp` and z the wet delay at the zenith, a rand
 satellite's codes are wrong by (its code biases), N the ambiguity of a carrier's arc::
 
     r_code    = |s - p_a| + b + b_s + m z + q + [...] - dt - P
-    r_carrier = |s - p_a| + b + b_s + m z + N + [...] - dt - Phi
+    r_carrier = |s - p_a| + b + b_s + m z + N + o + d + [...] - dt - Phi
 
-Clock b, lever arm and ambiguities are parameters as those of `graphnav.constraints.raw_gnss`; the bias of another
-system is a constant.
+o is what a satellite's orbit is off by, for hours; d, of satellites whose clocks are unsteady, what these are off the
+line between two nodes of the product. Clock b, lever arm and ambiguities are parameters as those of
+`graphnav.constraints.raw_gnss`; the bias of another system is a constant.
 """
 
 from __future__ import annotations
@@ -36,11 +37,13 @@ from graphnav.recording import Recording
 
 WET = "gnss_wet_delay"
 ORBITS = "gnss_satellite_orbits"
+CLOCKS = "gnss_satellite_clocks"
 _WET, _WET_WALK = 0.1, 1.7e-4  # m, of a standard atmosphere's; m/sqrt(s): 1 cm in an hour (Kouba and Heroux 2001)
 _CODE_BIAS = 1.0  # m: a code's differential bias, half a nanosecond or two, in the combination
 _BIAS_WALK = 1e-5  # m/sqrt(s), a millimetre in three hours
 # m, towards a satellite, for hours: final orbits are good to 2.5 cm (IGS, "Products")
 _ORBIT = 0.025
+_STEADY = 0.005  # m off a line between two nodes: half of a carrier's noise in the combination, in which it is lost
 
 
 @dataclass(frozen=True)
@@ -177,6 +180,7 @@ class GnssPppCarrier(_Ppp):
     slots: tuple[str, ...] = ()  # names of the ambiguities
     slot: Array = field(default_factory=lambda: np.empty(0, dtype=int))  # (N,) index of `slots`
     begin: Array = field(default_factory=lambda: np.empty(0))  # (N,) s, of the arc
+    clock: Array = field(default_factory=lambda: np.empty(0, dtype=int))  # (N,) of the unsteady ones; -1 of the others
 
     @classmethod
     def epochs(cls, recording: Recording, settings: Settings, stationary: Array) -> Array:
@@ -202,6 +206,17 @@ class GnssPppCarrier(_Ppp):
                 ORBITS, np.zeros(size), np.full(size, _ORBIT), "m", correlation_time=hours, spacing=free.found.spacing
             ),
         )
+        noise = free.found.raw.clock_noise
+        unsteady = [s for s in free.found.raw.satellites[0].tolist() if noise.get(s, (0.0, 0.0))[0] > _STEADY]
+        if unsteady:
+            # between nodes the variance is 2/3 of that in the middle, on the average; it lasts for a quarter of the way
+            sigma, apart = np.array([noise[s] for s in unsteady]).T
+            common["parameters"] += (
+                Parameter(
+                    CLOCKS, np.zeros(len(unsteady)), np.sqrt(2.0 / 3.0) * sigma, "m",
+                    correlation_time=float(apart.max()) / 4.0, spacing=free.found.spacing,
+                ),
+            )  # fmt: skip
         if scene.settings.raw_gnss.robust == "automatic":  # a slip is no error that a variance can describe
             common["robust"] = "cauchy"
         sigma = rows.growth[used] * carrier_sigma(raw.cn0, rows.geometry.elevation[used], C / raw.frequency)
@@ -211,6 +226,7 @@ class GnssPppCarrier(_Ppp):
             slots=tuple(ambiguity_name(arcs.names[k]) for k in there),
             slot=np.searchsorted(there, arcs.slot[used]),
             begin=arcs.begin[used],
+            clock=np.array([unsteady.index(s) if s in unsteady else -1 for s in raw.satellite.tolist()], dtype=int),
             **common,
         )
 
@@ -218,6 +234,9 @@ class GnssPppCarrier(_Ppp):
         residual, J = self._linearize_free_ranges(states, parameters, rows)
         own, J[ORBITS] = select_columns(parameters[ORBITS], self.which[rows])
         residual, slot = residual + own, self.slot[rows]
+        if CLOCKS in parameters:
+            own, J[CLOCKS] = select_columns(parameters[CLOCKS], self.clock[rows])
+            residual = residual + own
         for k, name in enumerate(self.slots):
             one = (slot == k).astype(float)
             residual = residual + one * parameters[name][:, 0]

@@ -228,7 +228,6 @@ def _describe(line: IdleLine) -> str:
 def _no_line(windows: int, settings: FftSettings, alone: bool) -> str:
     if windows < FEWEST_WINDOWS:
         return f"no idle line: no {settings.window + 2 * settings.step:.3g} s are still enough to look for one"
-    return (
-        "no idle line from 8 to 50 Hz where the vehicle stands: engine off, electric, or out of the IMU's sight; "
-        + ("so no stop is found by it" if alone else "the other detectors do without")
+    return "no idle line from 8 to 50 Hz where the vehicle stands: engine off, electric, or too faint for the IMU; " + (
+        "so no stop is found by it" if alone else "the other detectors do without"
     )

@@ -30,7 +30,7 @@ import numpy as np
 
 from graphnav.config.detectors import FUSED, StanceSettings
 from graphnav.core import rotation
-from graphnav.core.notes import Note
+from graphnav.core.notes import Note, format_count
 from graphnav.core.rotation import Array
 from graphnav.detectors.base import NONE, Detection, Detections, longer_than, mask_inside, merge_spans, spans_of, union
 from graphnav.detectors.glrt import glrt_statistic
@@ -70,12 +70,8 @@ def detect_stances(
         one = found[-1]
         deep = one.intervals[_as_deep_as_others(one.intervals, one.t, one.statistic, settings.threshold)]
         if len(deep) < len(one.intervals):
-            notes.append(
-                Note(
-                    "detectors.stance.lulls",
-                    f"{len(one.intervals) - len(deep)} short lulls, less quiet than the stances, were left out",
-                )
-            )
+            lulls = format_count(len(one.intervals) - len(deep), "short lull")
+            notes.append(Note("detectors.stance.lulls", f"{lulls} less quiet than the stances left out"))
         begin = int(np.searchsorted(deep[:, 1], since)) if len(deep) else 0
         cut = _without_sliding(deep[begin:], imu, one.t, one.statistic, bias, settings.threshold * _REACH)
         kept.append(np.concatenate([deep[:begin], cut]))

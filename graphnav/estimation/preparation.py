@@ -46,6 +46,7 @@ from graphnav.estimation.solvers.rts import backward
 from graphnav.recording import Recording
 
 _LINEAR = 0.1  # rad between linearisation point and smoothed attitude, up to which the smoother is used
+_ROUNDS = 5  # of filter and smoother about what they found before; where that leads nowhere, a batch is solved
 _MOST_WRONG = 0.5  # share of excluded fixes, beyond which the start is wrong rather than the fixes
 
 
@@ -189,22 +190,27 @@ def _relinearise(
 ) -> tuple[FilterPass, SmootherPass]:
     """Filter and smooth about better points where the filter was linearised too far from the smoothed solution.
 
-    The points are `known`, those of the noise estimate, if there are any; else those of a batch solution.
+    The points are `known`, those of the noise estimate, if there are any, else the smoother's own; each pass about
+    those of the pass before is a Gauss-Newton step. If that does not settle they are those of a batch solution.
 
     If the heading is uncertain and fixes weigh little beside wheels, a filter may turn the mounting by half a turn
-    instead of the velocity, a local minimum. So the batch is solved without wheels first.
+    instead of the velocity, a local minimum. So the batch is then solved at once, without wheels first.
     """
     if near_to(smoothed, forward.linearised, _LINEAR):
         return forward, smoothed
-    if known is not None and len(known.states) == len(problem.t):
-        passes.update(filter=2, smoother=1)
-        smoothed = backward(problem, refilter(problem, known, progress), progress)
-        if near_to(smoothed, known, _LINEAR):
+    wheels = aligned.motion is not None and any(c.of_wheels for c in problem.constraints)
+    about: Points = smoothed if known is None or len(known.states) != len(problem.t) else known
+    for _ in range(int(about is known) if wheels else _ROUNDS):
+        passes.update(filter=1, smoother=1)
+        smoothed = backward(problem, refilter(problem, about, progress), progress)
+        if near_to(smoothed, about, _LINEAR):
+            passes.update(filter=1)
             return ekf(problem, progress, aligned.until, known=smoothed), smoothed
+        about = smoothed
     from graphnav.estimation.factor_graph.batch import batch  # and GTSAM with it, which few runs of a filter need
 
     states = smoothed.states
-    if any(c.of_wheels for c in problem.constraints):
+    if wheels:
         free = replace(problem, constraints=tuple(c for c in problem.constraints if not c.of_wheels))
         states = backward(free, ekf(free, progress, aligned.until)).states
         states = batch(free, states, wanted=(), reintegrate=False).states

@@ -102,8 +102,9 @@ def load_raw(
     raw, remarks = place(obs, nav, precise, rover, corrected)
     antennas = {satellite: some for path in sources.antex for satellite, some in read_antex(path).items()}
     raw = replace(
-        raw, lever_arm=np.array(sources.lever_arm), precise=precise is not None, antennas=antennas if precise else {}
-    )
+        raw, lever_arm=np.array(sources.lever_arm), precise=precise is not None, antennas=antennas if precise else {},
+        clock_noise=precise.clock_noise() if precise else {},
+    )  # fmt: skip
     one = primary(raw) & np.isfinite(raw.p[:, 0])
     if not one.any():
         raise RecordingError(

@@ -9,6 +9,7 @@ positioning using IGS orbit and clock products").
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,13 +23,16 @@ from graphnav.gnss.arcs import Arcs, arcs_by_begin, find_arcs
 from graphnav.gnss.atmosphere import niell, zenith_delays
 from graphnav.gnss.carrier import rows_in
 from graphnav.gnss.series import RawGnss
-from graphnav.gnss.signals import GALILEO, GPS, QZSS, C, signal_name
+from graphnav.gnss.signals import GALILEO, GPS, QZSS, C, signal_id, signal_name
 from graphnav.gnss.single_point import Geometry, look
 from graphnav.gnss.tides import solid_tide, sun_and_moon
 
 # the second band, whose combination with the first the clocks of precise products are of; of BeiDou and GLONASS these
 # are combinations of other signals from product to product
 SECOND = {GPS: 2, GALILEO: 5, QZSS: 2}
+# the code on the first band that these clocks are of, where receivers may have another one beside it: the two are
+# apart by up to a nanosecond, another one for each satellite, and by two and a half times that in the combination
+_OF_CLOCKS = {GPS: signal_id("1W")}
 
 
 @dataclass(frozen=True)
@@ -53,11 +57,14 @@ def ionosphere_free(raw: RawGnss, whole: RawGnss) -> IonosphereFree | None:
     raw : a row for each satellite and epoch, of its first signal.
     whole : all that the receiver has, with the second ones.
     """
-    second = _rows_of_second(raw, whole)
+    second = _rows_beside(raw, whole, second_signals(whole), np.isfinite(whole.carrier))
     which = np.flatnonzero(second >= 0)
     if not len(which):
         return None
     one, other = raw.take(which), whole.take(second[which])
+    signals = {int(s): _OF_CLOCKS[int(s) // 100] for s in np.unique(one.satellite) if int(s) // 100 in _OF_CLOCKS}
+    better = _rows_beside(one, whole, signals, np.ones(len(whole), dtype=bool))
+    code = np.where(better >= 0, whole.code[better], one.code)
     arcs, first_rows = find_arcs(whole), rows_in(one, whole)
     f1, f2 = one.frequency, other.frequency
     alpha = f1**2 / (f1**2 - f2**2)
@@ -90,7 +97,7 @@ def ionosphere_free(raw: RawGnss, whole: RawGnss) -> IonosphereFree | None:
         which=which,
         geometry=geometry,
         known=geometry.distance + extra + dry * by_dry + wet * by_wet,
-        code=free(one.code, other.code) + free(one.clock, other.clock),
+        code=free(code, other.code) + free(one.clock, other.clock),
         carrier=np.where(good, carrier, np.nan),
         wet=by_wet,
         growth=np.hypot(alpha, beta),
@@ -118,12 +125,14 @@ def wind_up_of(raw: RawGnss) -> Array:
     return wind_up(raw.satellite, raw.t, axes, geometry.e, earth.enu_axes(earth.ecef_to_llh(raw.antenna)))
 
 
-def _rows_of_second(raw: RawGnss, whole: RawGnss) -> NDArray[np.intp]:
-    """(N,) the row of `whole` with the second signal of each row; -1 where there is none."""
+def _rows_beside(
+    raw: RawGnss, whole: RawGnss, signals: Mapping[int, int], usable: NDArray[np.bool_]
+) -> NDArray[np.intp]:
+    """(N,) the usable row of `whole` with another signal of a satellite, beside a row of its first band; -1: none."""
     out = np.full(len(raw), -1, dtype=np.intp)
     epochs = np.unique(whole.t)
-    useful = np.isfinite(whole.carrier) & np.isfinite(whole.code) & np.isfinite(whole.clock)
-    for one, signal in second_signals(whole).items():
+    useful = usable & np.isfinite(whole.code) & np.isfinite(whole.clock)
+    for one, signal in signals.items():
         own = np.flatnonzero((whole.satellite == one) & useful & (whole.signal == signal))
         at = np.full(len(epochs), -1, dtype=np.intp)
         at[np.searchsorted(epochs, whole.t[own])] = own

@@ -54,6 +54,19 @@ class Orbits:
             out.clock[own] = clock - 2.0 * np.sum(p * v, axis=1) / C**2
         return out
 
+    def clock_noise(self) -> dict[int, tuple[float, float]]:
+        """By satellite how far its clock is off a line between two nodes (m, 1-sigma in the middle), and their spacing.
+
+        Between them a clock is a random walk. Of variance q h over a spacing h (s), its second differences have 2 q h
+        and the middle of a line has q h / 4; a median of their sizes says q.
+        """
+        out = {}
+        for one, (t, clock) in self.clock.items():
+            if len(t) > _NODES:
+                size = 1.4826 * float(np.median(np.abs(np.diff(clock, 2))))
+                out[one] = C * size / np.sqrt(8.0), float(np.median(np.diff(t)))
+        return out
+
 
 def read_precise(sp3: list[Path], clk: list[Path]) -> Orbits:
     """Orbits and clocks of some files; those of clock files go before those of orbit files.

@@ -184,6 +184,8 @@ class RawGnss:
     files: tuple[str, ...] = ()
     precise: bool = False  # placed by precise orbits and clocks
     antennas: Antennas = field(default_factory=dict)  # of the satellites, where an ANTEX file is given
+    # by satellite, as `graphnav.gnss.precise.Orbits.clock_noise` says
+    clock_noise: dict[int, tuple[float, float]] = field(default_factory=dict)
     catalogue: Catalogue | None = None  # of the series that this is a piece of
 
     def __len__(self) -> int:

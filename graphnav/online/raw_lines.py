@@ -197,6 +197,7 @@ class LiveRaw(BaseModel):
     precise: bool = False  # placed by precise orbits and clocks
     second: dict[str, str] = {}  # of precise point positioning: the second signal of each satellite
     antennas: dict[str, dict[int, Vector]] = {}  # m, in the satellite's axes, of its antenna, by band
+    clock_noise: dict[str, tuple[NotNegative, Positive]] = {}  # m off a line between nodes, s apart
 
     def setup(self) -> RawGnss:
         """A series without rows.
@@ -211,6 +212,7 @@ class LiveRaw(BaseModel):
             groups = tuple((SYSTEMS.index(system), _known_signal(system, name)) for system, name in self.signals)
             second = tuple((satellite_id(name), _known_signal(name[0], signal)) for name, signal in self.second.items())
             offsets = {satellite_id(name): one for name, one in self.antennas.items()}
+            noise = {satellite_id(name): one for name, one in self.clock_noise.items()}
         except (ValueError, IndexError) as error:
             raise RecordingError(
                 f'line 1: setup: raw_gnss: {error}; satellites are named as G05, signals as ["G", "1C"]',
@@ -228,7 +230,8 @@ class LiveRaw(BaseModel):
             place=self.place, klobuchar=self.klobuchar, troposphere=self.troposphere, lock=none,
             carrier_difference=none, base_arc=np.empty(0, dtype=np.intp), baseline=self.baseline, antenna=rows,
             receiver_clock=np.empty((0, 2)), lever_arm=np.array(self.lever_arm), precise=self.precise,
-            antennas=antennas, catalogue=Catalogue(satellites, groups, self.base, self.period, second),
+            antennas=antennas, clock_noise=noise,
+            catalogue=Catalogue(satellites, groups, self.base, self.period, second),
         )  # fmt: skip
 
 
@@ -250,4 +253,5 @@ def live_raw(raw: RawGnss) -> dict[str, object]:
         "period": known.period, "base": known.differenced, "baseline": setup.baseline, "klobuchar": setup.klobuchar,
         "troposphere": setup.troposphere, "precise": setup.precise,
         "second": {satellite_name(s): signal_name(g) for s, g in known.second}, "antennas": antennas,
+        "clock_noise": {satellite_name(s): one for s, one in setup.clock_noise.items() if s in known.satellites},
     }  # fmt: skip

@@ -74,7 +74,7 @@ def list_doubts(solutions: Mapping[str, Solution], errors: Mapping[str, Errors])
     sizes: dict[str, list[str]] = {}
     for name, e in errors.items():
         for j in select_verdict(judge_sigmas(e), "too small"):
-            sizes.setdefault(j.block, []).append(f"{j.size:.2g} ({name})")
+            sizes.setdefault(j.block, []).append(f"{j.size:.2g}" + (f" ({name})" if len(errors) > 1 else ""))
     wrong = [f"{block} errors are {and_list(each)} times their sigma" for block, each in sizes.items()]
     if not errors:
         filters = [s for s in solutions.values() if any(r.kind == "innovation" for r in s.records.values())]

@@ -64,10 +64,9 @@ def describe_run(recording: Recording, solutions: Mapping[str, Solution], withhe
         listed = [f"{source} {span[0]:g} to {span[1]:g} s" if span else f"all of {source}" for source, span in withheld]
         words += f" Withheld: {and_list(listed)} (seconds from the start)."
     spans = solution.stationary
-    if len(spans) and recording.platform == "vehicle":
-        words += f" Found: {format_count(len(spans), 'stop')}, {np.diff(spans).sum():.0f} s in all."
-    elif len(spans):
-        words += f" The foot was found on the floor {format_count(len(spans), 'time')}."
+    if len(spans):
+        stops = format_count(len(spans), "stop" if recording.platform == "vehicle" else "stance")
+        words += f" Found: {stops}, {np.diff(spans).sum():.0f} s in all."
     if outages:
         listed = [f"{a:.0f} to {b:.0f} s" for a, b in outages[:_MAX_OUTAGES]]
         more = [f"{len(outages) - _MAX_OUTAGES} more"] if len(outages) > _MAX_OUTAGES else []
@@ -76,7 +75,7 @@ def describe_run(recording: Recording, solutions: Mapping[str, Solution], withhe
     if excluded:
         words += f" Excluded as faulty: {format_count(excluded, 'measurement')}."
     if not several and solution.stopped:
-        words += f" How it ended: {solution.stopped.rstrip('.')}."
+        words += f" {solution.stopped[0].upper()}{solution.stopped[1:].rstrip('.')}."
     return words
 
 
@@ -118,10 +117,7 @@ def describe_sigma(name: str, errors: Errors) -> Markup:
     worst = select_verdict(judged, "too small") or select_verdict(judged, "unclear")
     shown = worst or judged
     measured = and_list(
-        [
-            f"{j.block} errors are {j.size:.2f} times their sigma (RMS), {100 * j.inside:.1f} % within 3 sigma"
-            for j in shown
-        ]
+        [f"{j.block} errors are {j.size:.2f} sigma rms, {100 * j.inside:.1f} % within 3 sigma" for j in shown]
     )
     measured += " (a Gaussian: 1 and 99.7 %)"
     blocks = and_list([j.block for j in shown])
@@ -133,8 +129,8 @@ def describe_sigma(name: str, errors: Errors) -> Markup:
     if worst:
         alike = and_list([format_count(round(j.effective), "independent value") for j in worst])
         words = (
-            f"{name}: whether sigma of {blocks} can be relied on remains open: {measured}, but the errors are alike "
-            f"for so long that they are worth {alike}, and chance may do that."
+            f"{name}: whether sigma of {blocks} is consistent stays open: {measured}, but correlated over so long that "
+            f"they count as {alike} only."
         )
         return page.paragraph(Note("sigma.unclear", words), "verdict")
     seen = {j.block for j in judged}

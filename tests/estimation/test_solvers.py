@@ -10,7 +10,7 @@ import gtsam
 import numpy as np
 import oracle
 import pytest
-from helpers import Array, Factor, dense, errors, factors, truth_states
+from helpers import Array, Factor, at_rate, dense, errors, factors, truth_states
 
 from graphnav.config import Settings, settings_from
 from graphnav.constraints.gnss import ERRORS, LEVER_ARM
@@ -398,7 +398,7 @@ def test_states_between_keyframes_come_in_parts_just_the_same(
 
 @pytest.fixture(scope="module")
 def shipped(shared_data: Path) -> Recording:
-    return read(shared_data / "oracle_drive").crop(0.0, 300.0)
+    return at_rate(read(shared_data / "oracle_drive").crop(0.0, 300.0), 50.0)
 
 
 @pytest.fixture(scope="module")

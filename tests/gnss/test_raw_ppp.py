@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import oracle
@@ -18,8 +18,9 @@ from graphnav.gnss.antex import read_antex, satellite_axes, wind_up
 from graphnav.gnss.atmosphere import niell
 from graphnav.gnss.load import Sources, load_raw
 from graphnav.gnss.ppp import ionosphere_free
+from graphnav.gnss.precise import Orbits
 from graphnav.gnss.series import primary
-from graphnav.gnss.signals import L1, C, satellite_id, satellite_name
+from graphnav.gnss.signals import L1, C, satellite_id, satellite_name, signal_id
 from graphnav.gnss.tides import solid_tide, sun_and_moon
 from graphnav.recording import Gnss, Imu, ImuNoise, Recording
 
@@ -147,6 +148,48 @@ def test_the_combination_has_no_ionosphere_and_counts_arcs_of_both():
     arcs = ionosphere_free(slipped.take(primary(slipped)), slipped)
     own = rows.satellite == rows.satellite[0]
     assert len(np.unique(arcs.arcs.arc[own])) == len(np.unique(free.arcs.arc[own])) + 1
+
+
+def test_the_code_that_the_clocks_are_of_goes_before_another():
+    drive = oracle.vehicle_path(120.0)
+    made = raw_drive.with_observations(oracle.drive(drive)[0], drive, carrier=0.0, second=True).crop(0.0, 20.0)
+    raw, off = made.raw_gnss, 3.0
+    gps = np.flatnonzero((raw.satellite < 100) & (raw.signal == signal_id("1C")) & (raw.t < np.median(raw.t)))
+    more = raw.take(gps)
+    more = replace(
+        more, signal=np.full(len(gps), signal_id("1W")), code=more.code + off, carrier=np.full(len(gps), np.nan)
+    )
+    order = np.argsort(np.concatenate([raw.t, more.t]), kind="stable")
+    arrays = {
+        f.name: np.concatenate([getattr(raw, f.name), getattr(more, f.name)])[order]
+        for f in fields(raw)
+        if isinstance(getattr(raw, f.name), np.ndarray) and len(getattr(raw, f.name)) == len(raw)
+    }
+    both = replace(raw, **arrays)
+    rows = raw.take(primary(raw))
+    plain, found = ionosphere_free(rows, raw), ionosphere_free(rows, both)
+    one = rows.take(plain.which)
+    changed = (one.satellite < 100) & (one.t < np.median(raw.t))
+    assert 0 < changed.sum() < len(one)
+    alpha = L1**2 / (L1**2 - 1227.6e6**2)
+    np.testing.assert_allclose(found.code - plain.code, np.where(changed, alpha * off, 0.0), atol=1e-6)
+    np.testing.assert_array_equal(found.carrier, plain.carrier)
+
+
+def test_how_far_clocks_are_off_a_line_is_told_by_their_nodes():
+    """Of a random walk, sampled every second: beside what it truly is in the middle between nodes 300 s apart."""
+    rng = np.random.default_rng(3)
+    walk = np.cumsum(rng.normal(scale=5e-12, size=300 * 400 + 1))  # s
+    t = np.arange(len(walk), dtype=float)
+    nodes = slice(None, None, 300)
+    steady = 1e-4 + 1e-11 * t
+    orbits = Orbits({}, {5: (t[nodes], walk[nodes]), 6: (t[nodes], steady[nodes])})
+    noise = orbits.clock_noise()
+    middle = walk[150::300] - 0.5 * (walk[nodes][:-1] + walk[nodes][1:])
+    sigma, apart = noise[5]
+    assert apart == 300.0
+    assert sigma == pytest.approx(C * np.sqrt(np.mean(middle**2)), rel=0.2)
+    assert noise[6][0] < 1e-6
 
 
 def test_ppp_says_what_it_lacks():

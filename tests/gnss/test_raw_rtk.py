@@ -369,6 +369,21 @@ def test_every_solver_is_fixed_and_right(drive):
     assert np.sqrt(np.mean(off**2)) > 2.0 * np.sqrt(np.mean(off_by(solutions["rts"], truth)[0] ** 2))
 
 
+def test_an_unknown_phase_centre_is_in_the_height_and_in_nothing_else(drive):
+    """Five centimetres above the point stated: heights are off by them, within their sigmas, and no place is."""
+    recording, truth = drive
+    raw, high = recording.raw_gnss, np.array([0.0, 0.0, 0.05])
+    lower = replace(recording, raw_gnss=replace(raw, lever_arm=raw.lever_arm - high))
+    right, off = (run(one, STATED, ("rts",))["rts"] for one in (recording, lower))
+    k = np.searchsorted(off.t, off.fixed[off.fixed[:, 1] > 0.0, 0] - 1e-6)
+    assert len(k) > 10
+    error, sigma, _, _ = errors(off, truth)
+    moved = error[k] - errors(right, truth)[0][k]
+    np.testing.assert_allclose(moved, off.states.R_nb[k] @ high, atol=1e-3)  # up in the vehicle, which leans a little
+    assert np.abs(error[k, 2] / sigma[k, 2]).max() < 2.0
+    assert sigma[k, :2].max() < 0.02
+
+
 def test_a_wrong_integer_is_let_go_of(drive, monkeypatch):
     """Every other number of the first vector that the filter takes is wrong, and nothing is noticed for some epochs."""
     recording, truth = drive

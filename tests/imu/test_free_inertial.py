@@ -102,7 +102,7 @@ def test_prefix_gives_the_states_in_between() -> None:
 
 @pytest.fixture(scope="module")
 def straight() -> tuple[Recording, Trajectory]:
-    path = oracle.straight_path(100e3, rate=50.0)
+    path = oracle.straight_path(100e3, rate=20.0)
     assert path.length == pytest.approx(100e3, abs=50.0)
     return oracle.drive(path, imu_noise=None, gnss_exact=True)
 

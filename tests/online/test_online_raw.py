@@ -16,12 +16,14 @@ from test_raw_rtk import with_carriers
 
 from graphnav.config import Settings, settings_from
 from graphnav.constraints.raw_phase import WholeCycles
+from graphnav.constraints.raw_ppp import CLOCKS
 from graphnav.core.errors import RecordingError
 from graphnav.core.interpolation import interpolate
 from graphnav.core.notes import key_of
 from graphnav.core.trajectory import Trajectory
 from graphnav.estimation import fixing
 from graphnav.estimation.pipeline import run
+from graphnav.estimation.solution import Solution
 from graphnav.evaluation.evaluate import truth_of
 from graphnav.gnss.antex import SatelliteAntenna
 from graphnav.gnss.arcs import find_arcs
@@ -133,11 +135,13 @@ def test_precise_point_positioning_is_that_of_the_recording(two: Recording) -> N
     setup = setup_of(head_of(two))
     assert setup.raw_gnss is not None
     assert setup.raw_gnss.antennas.keys() == two.raw_gnss.antennas.keys()
+    assert setup.raw_gnss.clock_noise == two.raw_gnss.clock_noise
     rows = [row_of(line_of(row)) if row[0] == "raw_gnss" else row for row in rows_of(two)[1]]
     online, track = played(setup, rows, how)
     assert online.tracker is not None
     assert {"gnss_ppp_code", "gnss_ppp_carrier"} < online.tracker.in_force.keys()
     whole = run(two, how, ("rts",))["rts"]
+    assert CLOCKS in whole.parameters
     at = np.argmin(np.abs(whole.t - track.t[:, None]), axis=1)
     same = np.abs(whole.t[at] - track.t) < 1e-6
     assert same.sum() > 35
@@ -149,10 +153,11 @@ def test_precise_point_positioning_is_that_of_the_recording(two: Recording) -> N
 
 @pytest.fixture(scope="module")
 def two() -> Recording:
-    """Two signals of each satellite, and antennas a metre off the satellites' centres of mass."""
+    """Two signals of each satellite, and of one an antenna a metre off its centre of mass and an unsteady clock."""
     made = observed_drive(second=True).crop(0.0, 45.0)
     antenna = SatelliteAntenna(-np.inf, np.inf, {band: np.array([0.2, 0.0, 1.0 + 0.1 * band]) for band in (1, 2, 5)})
-    return replace(made, raw_gnss=replace(made.raw_gnss, antennas={satellite_id("G01"): (antenna,)}))
+    g01 = satellite_id("G01")
+    return replace(made, raw_gnss=replace(made.raw_gnss, antennas={g01: (antenna,)}, clock_noise={g01: (0.03, 300.0)}))
 
 
 def test_precise_point_positioning_says_what_it_lacks(recording: Recording, two: Recording) -> None:
@@ -265,12 +270,16 @@ def test_arcs_are_those_of_the_series_however_its_epochs_come(rtk: Recording) ->
         np.testing.assert_array_equal(part.arc_begin, whole.begin[own])
 
 
+@pytest.fixture(scope="module")
+def offline(rtk: Recording) -> dict[str, Solution]:
+    return run(rtk, settings_from({"noise": {"mode": "stated"}}), ("ekf", "rts"))
+
+
 @pytest.mark.parametrize("engine", ["window", "isam2"])
-def test_integers_online_are_those_of_the_recording(rtk: Recording, engine: str) -> None:
+def test_integers_online_are_those_of_the_recording(rtk: Recording, offline: dict[str, Solution], engine: str) -> None:
     online, track = played(without_rows(rtk), rows_of(rtk)[1], settings_from(LONG), engine)
     tracker = online.tracker
     assert tracker is not None
-    offline = run(rtk, settings_from({"noise": {"mode": "stated"}}), ("ekf", "rts"))
     whole, filtered = offline["rts"], offline["ekf"].fixed
     assert (tracker.epochs, tracker.fixed) == (len(filtered), np.sum(filtered[:, 1]))
     at = np.argmin(np.abs(whole.t - track.t[:, None]), axis=1)

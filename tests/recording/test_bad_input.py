@@ -313,8 +313,10 @@ def test_what_is_no_recording_says_what_to_point_at(tmp_path: Path) -> None:
         read(tmp_path)
     write_small(tmp_path)
     (tmp_path / "recording.toml").rename(tmp_path / "other.toml")
-    with refused("recording.none", RecordingError, "other.toml"):
+    (tmp_path / "pyproject.toml").write_text("[project]\n")
+    with refused("recording.none", RecordingError, "other.toml") as caught:
         read(tmp_path)
+    assert "pyproject" not in str(caught.value)
     with refused("recording.none", RecordingError, "imu.csv"):
         read(tmp_path / "imu.csv")
     with refused("file.unreadable", RecordingError, "absent.toml"):

@@ -380,7 +380,7 @@ def test_a_comparison_says_that_a_lever_arm_has_the_wrong_sign(tmp_path: Path) -
             text.replace("0.0, 0.6]", f"0.0, {sign}0.6]"), encoding="utf-8"
         )
         asked = ["compare", str(tmp_path / "drive"), "-o", str(tmp_path / "out"), "--solver", "ekf", "--no-report"]
-        assert cli.run([*asked, "--noise", "stated", "--quiet"]) == 0
+        assert cli.run([*asked, "--end", "90", "--noise", "stated", "--quiet"]) == 0
         checks = json.loads((tmp_path / "out" / "ekf" / "summary.json").read_text())["checks"]
         found[sign] = "gnss.lever_arm_sign" in {check["key"] for check in checks}
     assert found == {"": False, "-": True}

@@ -21,9 +21,7 @@ from graphnav.core.errors import ConfigError
 from graphnav.core.files import exists, is_inside, read_text
 from graphnav.estimation.noise.files import MODES
 from graphnav.estimation.pipeline import KNOWN
-from graphnav.recording.formats import formats
-
-_RECORDING_FORMAT = "graphnav-recording"  # contained in every recording.toml
+from graphnav.recording.formats import formats, is_description
 
 
 @dataclass(frozen=True)
@@ -82,7 +80,7 @@ def read_drives(source: Path, asked: DriveOptions) -> list[tuple[str, str, Drive
         found = [(_name_of(path, source), str(path), asked, str(path)) for path in _find_recordings(source)]
         if not found:
             raise ConfigError(
-                f'{source}: holds no recording; each is a .toml that says format = "{_RECORDING_FORMAT}/1"',
+                f'{source}: holds no recording; each is a .toml that says format = "graphnav-recording/1"',
                 key="recording.none",
             )
         return _number_clones(found)
@@ -143,20 +141,9 @@ def _find_recordings(folder: Path) -> list[Path]:
         for file in sorted(files):
             path = Path(place) / file
             # an unreadable file gets a row that states so, under its name
-            if file == "recording.toml" or (
-                file.endswith(".toml") and path.is_file() and _RECORDING_FORMAT in _begin(path)
-            ):
+            if file == "recording.toml" or (file.endswith(".toml") and is_description(path)):
                 found.append(path)
     return found
-
-
-def _begin(path: Path) -> str:
-    """The first bytes of a file, in which the format is named."""
-    try:
-        with path.open(encoding="utf-8", errors="replace") as file:
-            return file.read(4000)
-    except OSError:
-        return ""
 
 
 def _name_of(path: Path, folder: Path) -> str:

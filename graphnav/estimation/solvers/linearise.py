@@ -165,7 +165,7 @@ def linearise(
     values, states = points.values, points.states
     at = constraint.keyframe[which] if at is None else at
     if len(at) != 1 or len(values) != 1:
-        values, states = values[at], states[at]
+        values, states = values.take(at, axis=0), states[at]
     given = {p.name: values[:, shift(columns[p.name])] for p in constraint.parameters}
     return Rows(constraint, which, constraint.linearize(states, given, which), columns, DIM + values.shape[1])
 

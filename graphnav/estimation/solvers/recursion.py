@@ -288,7 +288,6 @@ def smooth_rows(
     Kt, H, w, SH : of the updates: gains transposed, rows, S^-1 nu and S^-1 H.
     taken : (B,) whether a block was taken in.
     """
-    I = np.eye(len(r_k))
     for k in range(k1 - 1, k0 - 1, -1):
         if k < len(F):
             r_k = move_back(F[k], decay[k], r_k.reshape(1, -1)).ravel()
@@ -298,13 +297,11 @@ def smooth_rows(
         for b in range(first[k + 1] - 1, first[k] - 1, -1):
             if taken[b]:
                 lo, hi = begin[b], end[b]
-                own = H[k, lo:hi]
-                # I - K H as a whole: after a first fix it is what is left of a wide prior, of ten orders
-                M = np.dot(Kt[k, lo:hi].T, own)
-                np.subtract(I, M, M)
-                r_k = np.dot(r_k, M) + np.dot(w[k, lo:hi], own)
-                N_k = np.dot(M.T, np.dot(N_k, M))
-                N_k += np.dot(own.T, SH[k, lo:hi])
+                own, gain = H[k, lo:hi], Kt[k, lo:hi]
+                r_k = r_k + np.dot(w[k, lo:hi] - np.dot(gain, r_k), own)
+                # from one side after the other: after a first fix what is left of N is smaller by ten orders each time
+                N_k = N_k - np.dot(np.dot(N_k, gain.T), own)
+                N_k += np.dot(own.T, SH[k, lo:hi] - np.dot(gain, N_k))
         np.positive(r_k, r[k])
         halve_sum(N_k, N[k])
         N_k = N[k]
@@ -393,15 +390,14 @@ def compute_lag_covariances(
 
     Cov(x_k-1, x_k) = P_k-1 F^T P-_k^-1 P^s_k = P_k-1 F^T (I - N P-_k)
     """
-    out = np.empty((len(k), end - begin))
+    out, w = np.empty((len(k), end - begin)), F.shape[2]
     for i in range(len(k)):
         j = k[i]
-        rest = -np.dot(P_predicted[j, begin:end], N[j])
-        for c in range(end - begin):
-            rest[c, begin + c] += 1.0
-        rest = move_back(F[j - 1], decay[j - 1], rest)
-        for c in range(end - begin):
-            out[i, c] = np.dot(P[j - 1, begin + c], rest[c])
+        for c in range(begin, end):
+            rest, own = np.dot(P_predicted[j, c], N[j]), P[j - 1, c]
+            rest[c] -= 1.0
+            moved = np.dot(np.dot(F[j - 1], own[:w]), rest[:DIM])
+            out[i, c - begin] = -moved - np.sum(decay[j - 1] * own[DIM:] * rest[DIM:])
     return out
 
 

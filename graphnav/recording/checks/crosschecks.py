@@ -78,7 +78,7 @@ def _make_sampler(t: Array, rate: Array) -> Callable[[Array, Array], Array]:
         if off.any():
             k[off] = np.clip(np.searchsorted(t, at[off]), 1, len(t) - 1)
         s = np.clip((at - t[k - 1]) / (t[k] - t[k - 1]), 0.0, 1.0)[:, None]
-        return np.asarray((1.0 - s) * values[k - 1] + s * values[k])
+        return np.asarray((1.0 - s) * values.take(k - 1, axis=0) + s * values.take(k, axis=0))
 
     def mean(at: Array, width: Array) -> Array:
         if not width.any():
@@ -190,7 +190,7 @@ def _fit_imu(imu: Imu, rate: Array, track: Track, i: Index, j: Index, y: Array) 
         place = np.cumsum(used) - 1
         at = np.add.outer(lag, track.t[used])
         values = mean(at.ravel(), np.broadcast_to(track.width[used], at.shape).ravel()).reshape(*at.shape, -1)
-        return np.asarray(values[..., place[j[rows]], :] - values[..., place[i[rows]], :])
+        return np.asarray(values.take(place[j[rows]], axis=-2) - values.take(place[i[rows]], axis=-2))
 
     def valid(lag: float) -> Array:
         return (ti + lag - wi / 2 > imu.t[0]) & (tj + lag + wj / 2 < imu.t[-1])

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack
 from importlib import import_module
 from importlib.util import find_spec
@@ -73,10 +74,14 @@ def write_parts(
             for one, part in zip(targets, parts.values(), strict=True):
                 module = import_module(f"graphnav.recording.exporters.{one}")
                 adders.append(stack.enter_context(module.writing(part, name)))
-            for block in blocks:
-                stamps = None if utc is None else utc(block.t)
-                for add in adders:
-                    add(block, stamps)
+            pool = stack.enter_context(ThreadPoolExecutor(1))
+            writing: Future[None] | None = None
+            for block in blocks:  # the next one is computed while one is written
+                if writing is not None:
+                    writing.result()
+                writing = pool.submit(_add_to_all, adders, block, utc)
+            if writing is not None:
+                writing.result()
         for path, part in parts.items():
             os.replace(part, path)
     except RecordingError as error:
@@ -87,6 +92,12 @@ def write_parts(
     finally:
         for part in parts.values():
             part.unlink(missing_ok=True)
+
+
+def _add_to_all(adders: Sequence[Add], block: Trajectory, utc: Callable[[Array], Array] | None) -> None:
+    stamps = None if utc is None else utc(block.t)
+    for add in adders:
+        add(block, stamps)
 
 
 def check_names(names: Sequence[str], gps_zero: float | None) -> None:

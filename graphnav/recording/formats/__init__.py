@@ -17,7 +17,9 @@ from graphnav.recording import Recording
 from graphnav.recording.exporters import NAMES as EXPORTED
 from graphnav.recording.formats.registry import Format, Log
 
-__all__ = ["Format", "Log", "formats", "load", "read"]
+__all__ = ["Format", "Log", "formats", "is_description", "load", "read"]
+
+_DESCRIPTION = "graphnav-recording"  # contained in every recording.toml
 
 
 def formats() -> dict[str, Format]:
@@ -120,12 +122,23 @@ def _choose(chosen: Format, source: str | Path, topics: Sequence[str]) -> Log:
     return chosen.choose(source, topics)
 
 
+def is_description(path: Path) -> bool:
+    """Whether a file describes a recording, by the format that it begins with."""
+    if not path.is_file():
+        return False
+    try:
+        with path.open(encoding="utf-8", errors="replace") as file:
+            return _DESCRIPTION in file.read(4000)
+    except OSError:
+        return False
+
+
 def _explain_unknown(source: str | Path, known: dict[str, Format]) -> RecordingError:
     """The reason why no format reads a source."""
     builtin = ", ".join(name for name, f in known.items() if f.builtin)
     path = Path(source)
     if path.is_dir():
-        there = sorted(p.name for p in path.glob("*.toml"))
+        there = sorted(p.name for p in path.glob("*.toml") if is_description(p))
         hint = f"point at one of {', '.join(there)} in it" if there else f"graphnav init {path} -o {path} drafts one"
         return RecordingError(f"{path}: the folder holds no recording.toml; {hint}", key="recording.none")
     if path.exists():
