@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
+from functools import cache
 from typing import Any
 
 import gtsam
@@ -30,8 +31,10 @@ def make_jacobian_factor(blocks: Sequence[tuple[int, Array]], b: Array) -> gtsam
     exactly, which are eliminated at once.
     """
     rest = [(key, np.asfortranarray(A)) for key, A in blocks]
-    sums: list[int] = []
     make: Any = gtsam.JacobianFactor
+    if len(rest) <= 3:
+        return make(*(part for block in rest for part in block), b, _unit(len(b)))
+    sums: list[int] = []
     graph, ordering, one = gtsam.GaussianFactorGraph(), gtsam.Ordering(), np.eye(len(b))
     while len(rest) > 3:
         (k0, A0), (k1, A1) = rest.pop(), rest.pop()
@@ -40,12 +43,15 @@ def make_jacobian_factor(blocks: Sequence[tuple[int, Array]], b: Array) -> gtsam
         rest.insert(0, (key, one))
         sums.append(key)
         ordering.push_back(key)
-    factor = make(*(part for block in rest for part in block), b, gtsam.noiseModel.Unit.Create(len(b)))
-    if not sums:
-        return factor
-    graph.push_back(factor)
+    graph.push_back(make_jacobian_factor(rest, b))
     _, left = graph.eliminatePartialSequential(ordering)
     return gtsam.JacobianFactor(left.at(0)).whiten()
+
+
+@cache
+def _unit(m: int) -> gtsam.noiseModel.Unit:
+    """The noise of m whitened rows."""
+    return gtsam.noiseModel.Unit.Create(m)
 
 
 class LinearGraph:
@@ -53,12 +59,11 @@ class LinearGraph:
 
     def __init__(self) -> None:
         self._graph = gtsam.GaussianFactorGraph()
-        self._unit: dict[int, gtsam.noiseModel.Unit] = {}
 
     def add(self, blocks: Blocks, b: Array) -> None:
         """N factors of m rows each: sum over blocks of A[n] d[key[n]] = b[n]."""
         n, m = b.shape
-        unit = self._unit.setdefault(m, gtsam.noiseModel.Unit.Create(m))
+        unit = _unit(m)
         # GTSAM keeps matrices by columns: handing them over that way saves it a strided copy
         columns = [np.ascontiguousarray(np.swapaxes(A, 1, 2)).swapaxes(1, 2) for _, A in blocks]
         keys = [k.tolist() for k, _ in blocks]

@@ -70,7 +70,7 @@ class Keyframe:
 
     def read(self, isam: gtsam.ISAM2) -> None:
         """Bring its variables up to date, where it is the newest: they are in the root, or were eliminated just now."""
-        for x in (self.state, *(node for node, _ in self.nodes.values())):
+        for x in {x.key: x for x in (self.state, *(node for node, _ in self.nodes.values()))}.values():
             x.delta = x.unit * isam.calculateEstimateVector(x.key)
 
 
@@ -161,7 +161,8 @@ def are_leaves(isam: gtsam.ISAM2, variables: Iterable[Variable], others: Iterabl
 
 def make_factor(blocks: Sequence[tuple[Variable, Array]], b: Array) -> Any:
     """Whitened rows A e = b as a factor of the tree."""
-    return gtsam.LinearContainerFactor(make_jacobian_factor([(x.key, A * x.unit) for x, A in blocks], b))
+    scaled = [(x.key, np.multiply(A, x.unit, order="F")) for x, A in blocks]
+    return gtsam.LinearContainerFactor(make_jacobian_factor(scaled, b))
 
 
 def turns_of(keyframes: Sequence[Keyframe]) -> Array:
@@ -186,8 +187,9 @@ def _about(keyframe: Keyframe, blocks: list[tuple[Variable, Array]], H: Array, b
     """A factor of rows over states' errors about anchors and a keyframe's parameters, H (m, D), as they are now."""
     b = b + sum(A @ x.delta for x, A in blocks)
     touched: dict[int, tuple[Variable, Array]] = {}
+    filled = H.any(axis=0).tolist()
     for name, at in keyframe.columns.items():
-        if not H[:, at].any():
+        if not any(filled[at]):
             continue
         node, own = keyframe.nodes[name]
         _, A = touched.setdefault(node.key, (node, np.zeros((len(b), len(node.unit)))))
