@@ -15,7 +15,7 @@ from graphnav.recording.checks.clock import CLEAR, FAIR
 from graphnav.recording.checks.crosschecks import Fit
 from graphnav.recording.checks.imu import STANDARD_GRAVITY
 from graphnav.recording.checks.stated import describe_exchange, describe_mirroring, exchange_lat_lon
-from graphnav.recording.checks.tracks import Track
+from graphnav.recording.checks.tracks import Track, compute_local_positions
 from graphnav.recording.formats.schema import FOOT
 
 _SLOPE_SPAN, _SLOPES = 8.0, 6  # s over which a slope is taken: the force is then known to a tenth of a per cent
@@ -50,7 +50,7 @@ def check_frozen(recording: Recording) -> Iterator[Finding]:
     gnss, odometer = recording.gnss, recording.odometer
     if gnss is None or len(gnss.t) < crosschecks.MIN_PAIRS or recording.platform != "vehicle":
         return
-    p = crosschecks.compute_local_positions(gnss)[:, :2]
+    p = compute_local_positions(gnss)[:, :2]
     away = np.linalg.norm(p - np.median(p, axis=0), axis=1)
     within = float(np.max(away))
     sd = np.hypot(*gnss.sd[:, :2].T)
@@ -69,7 +69,7 @@ def check_frozen(recording: Recording) -> Iterator[Finding]:
     driven = float(np.sum((speed * step)[sure]))
     if driven > 2.0 * np.pi * _TURNING_RADIUS:
         yield Finding(
-            "untrusted",
+            "unreliable",
             f"the fixes stay within {within:.2g} m while {who} {driven:.0f} m: frozen, or of another unit than degrees",
             "gnss.frozen",
         )
