@@ -314,7 +314,7 @@ class RecordingFile(TomlTable):
 def rotation_from_letters(axes: str) -> Array:
     """R_bs of three letters stating the directions of the file's x, y, z; 'BRU': x backward, y right, z up."""
     if len(axes) != 3 or any(letter not in _LETTERS for letter in axes):
-        raise ValueError("must be three letters out of R/L, F/B, U/D, such as RFU, FLU or FRD")
+        raise ValueError("must be three capitals out of R/L, F/B, U/D, such as RFU, FLU or FRD")
     R_bs = np.array([_LETTERS[letter] for letter in axes], dtype=float).T
     determinant = np.linalg.det(R_bs)
     if abs(determinant) < 0.5:
