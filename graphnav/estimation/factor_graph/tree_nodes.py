@@ -187,7 +187,7 @@ def _about(keyframe: Keyframe, blocks: list[tuple[Variable, Array]], H: Array, b
     """A factor of rows over states' errors about anchors and a keyframe's parameters, H (m, D), as they are now."""
     b = b + sum(A @ x.delta for x, A in blocks)
     touched: dict[int, tuple[Variable, Array]] = {}
-    filled = H.any(axis=0).tolist()
+    filled: list[bool] = np.any(H, axis=0).tolist()
     for name, at in keyframe.columns.items():
         if not any(filled[at]):
             continue
