@@ -43,6 +43,7 @@ _CODE_BIAS = 1.0  # m: a code's differential bias, half a nanosecond or two, in 
 _BIAS_WALK = 1e-5  # m/sqrt(s), a millimetre in three hours
 # m, towards a satellite, for hours: final orbits are good to 2.5 cm (IGS, "Products")
 _ORBIT = 0.025
+_ARCH = 0.25  # of the way between two nodes, for which a clock that is off the line stays off it
 _STEADY = 0.005  # m off a line between two nodes: half of a carrier's noise in the combination, in which it is lost
 
 
@@ -181,6 +182,9 @@ class GnssPppCarrier(_Ppp):
     slot: Array = field(default_factory=lambda: np.empty(0, dtype=int))  # (N,) index of `slots`
     begin: Array = field(default_factory=lambda: np.empty(0))  # (N,) s, of the arc
     clock: Array = field(default_factory=lambda: np.empty(0, dtype=int))  # (N,) of the unsteady ones; -1 of the others
+    off_line: Array = field(
+        default_factory=lambda: np.empty(0)
+    )  # (N,) sigma of such a clock over that between two nodes
 
     @classmethod
     def epochs(cls, recording: Recording, settings: Settings, stationary: Array) -> Array:
@@ -206,15 +210,16 @@ class GnssPppCarrier(_Ppp):
                 ORBITS, np.zeros(size), np.full(size, _ORBIT), "m", correlation_time=hours, spacing=free.found.spacing
             ),
         )
-        noise = free.found.raw.clock_noise
+        noise = raw.clock_noise
+        apart = np.array([noise.get(s, (0.0, 1.0))[1] for s in raw.satellite.tolist()])
+        between = np.mod(raw.t + raw.zero, apart) / apart  # nodes are at whole numbers of their spacing
         unsteady = [s for s in free.found.raw.satellites[0].tolist() if noise.get(s, (0.0, 0.0))[0] > _STEADY]
         if unsteady:
-            # between nodes the variance is 2/3 of that in the middle, on the average; it lasts for a quarter of the way
-            sigma, apart = np.array([noise[s] for s in unsteady]).T
+            sigma, spacing = np.array([noise[s] for s in unsteady]).T
             common["parameters"] += (
                 Parameter(
-                    CLOCKS, np.zeros(len(unsteady)), np.sqrt(2.0 / 3.0) * sigma, "m",
-                    correlation_time=float(apart.max()) / 4.0, spacing=free.found.spacing,
+                    CLOCKS, np.zeros(len(unsteady)), sigma, "m", correlation_time=_ARCH * float(spacing.max()),
+                    spacing=free.found.spacing,
                 ),
             )  # fmt: skip
         if scene.settings.raw_gnss.robust == "automatic":  # a slip is no error that a variance can describe
@@ -227,6 +232,7 @@ class GnssPppCarrier(_Ppp):
             slot=np.searchsorted(there, arcs.slot[used]),
             begin=arcs.begin[used],
             clock=np.array([unsteady.index(s) if s in unsteady else -1 for s in raw.satellite.tolist()], dtype=int),
+            off_line=2.0 * np.sqrt(between * (1.0 - between)),
             **common,
         )
 
@@ -236,7 +242,7 @@ class GnssPppCarrier(_Ppp):
         residual, slot = residual + own, self.slot[rows]
         if CLOCKS in parameters:
             own, J[CLOCKS] = select_columns(parameters[CLOCKS], self.clock[rows])
-            residual = residual + own
+            residual, J[CLOCKS] = residual + self.off_line[rows] * own, self.off_line[rows, None, None] * J[CLOCKS]
         for k, name in enumerate(self.slots):
             one = (slot == k).astype(float)
             residual = residual + one * parameters[name][:, 0]

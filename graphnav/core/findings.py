@@ -8,6 +8,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from graphnav.core.notes import format_count
 from graphnav.core.rotation import Array
 
 Severity = Literal["note", "warning", "unreliable", "refused"]
@@ -46,3 +47,10 @@ def runs_of(mask: NDArray[Any]) -> list[tuple[int, int]]:
     """[start, end) of every run of True."""
     edges = np.flatnonzero(np.diff(np.r_[0, mask.astype(np.int8), 0]))
     return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
+
+
+def describe_gaps(sensor: str, length: Array, begin: Array) -> str:
+    """Gaps of a sensor: their number, and the longest with its beginning, s."""
+    k = int(np.argmax(length))
+    which = "of" if len(length) == 1 else "the longest of"
+    return f"{format_count(len(length), 'gap')} in {sensor}, {which} {length[k]:.3g} s at {begin[k]:.1f} s"

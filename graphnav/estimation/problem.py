@@ -13,7 +13,8 @@ from graphnav.constraints import kinds_for
 from graphnav.constraints.base import SAME_TIME, BuildContext, Constraint
 from graphnav.constraints.prior import InitialPrior
 from graphnav.core.earth import LocalFrame
-from graphnav.core.notes import Note, format_count
+from graphnav.core.findings import describe_gaps
+from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, Parameter, States
 from graphnav.imu.clipping import with_whole_peaks
@@ -233,13 +234,8 @@ def _keep_apart(keyframes: bytes, spacing: float) -> Array:
 def _describe_samples(samples: Samples, recording: Recording) -> tuple[str, ...]:
     if not len(samples.bridged):
         return ()
-    length = samples.bridged[:, 1] - samples.bridged[:, 0]
-    worst = int(np.argmax(length))
-    return (
-        Note(
-            "imu.gaps_bridged",
-            f"{format_count(len(length), 'gap')} in the IMU bridged ({length.sum():.2f} s in all, the longest "
-            f"{length[worst]:.2f} s at {samples.bridged[worst, 0] - recording.start:.1f} s): process noise there as "
-            "large as the signal typically changes over such a time",
-        ),
+    begin, end = samples.bridged[:, :2].T
+    sentence = (
+        f"{describe_gaps('the IMU', end - begin, begin - recording.start)}: bridged, with process noise as large "
     )
+    return (Note("imu.gaps_bridged", f"{sentence}as the signal typically changes over such a time"),)

@@ -272,7 +272,7 @@ def _consistency(errors: Mapping[str, Errors], start: float, end: float, spans: 
     table = tables.nees_table(errors)
     if not table:
         return []
-    note = "Errors of one drive are alike for seconds to minutes, so a true sigma scatters about 1 as well."
+    note = "Errors of one drive are correlated for seconds to minutes, so NEES scatters about 1 where sigma is true."
     return [*table, page.paragraph(note, "soft"), *_gallery(pictures.nees_pictures(errors, start, end, spans))]
 
 

@@ -237,7 +237,7 @@ def nees_table(errors: Mapping[str, Errors]) -> list[Markup]:
     says = {
         "too small": "sigma too small",
         "cautious": "sigma cautious",
-        "unclear": "chance may do that",
+        "unclear": "open: too few independent epochs",
         "fits": "fits",
     }
     for name, e in errors.items():

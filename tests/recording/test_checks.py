@@ -175,7 +175,7 @@ BROKEN: dict[str, tuple[Change, str]] = {
     "no overlap": (imu(t=lambda t: t + 1e6), "do not overlap in time.*time_offset"),
     "gyro clipped": (imu(gyro=lambda x: np.clip(x, -0.5, 0.5)), "gyro z .* is saturated"),
     "stuck": (imu(gyro=lambda x: _stick(x), accel=lambda x: _stick(x)), r"repeats one value for [23]\.\d s"),
-    "gap": (lambda r: r.without("odometer") and _gap(r), r"1 gap in the IMU, the longest 3\.\d+ s at 50\.\d s"),
+    "gap": (lambda r: r.without("odometer") and _gap(r), r"1 gap in the IMU, of 3(\.\d+)? s at 50\.\d s"),
 }
 
 
@@ -306,7 +306,26 @@ def test_heights_in_feet_are_seen_where_it_goes_up_and_down(
     some = replace(some, gnss=replace(some.gnss, v=some.gnss.v if velocities else None))
     feet = replace(some, gnss=replace(some.gnss, llh=some.gnss.llh * [1.0, 1.0, 1 / 0.3048]))
     assert "gnss.feet" in keys(feet)
-    assert "gnss.feet" not in keys(some)
+    tenths = replace(some, gnss=replace(some.gnss, llh=some.gnss.llh * [1.0, 1.0, 10.0]))
+    assert "gnss.height_scale" in keys(tenths)
+    assert not {"gnss.feet", "gnss.height_scale"} & set(keys(some))
+
+
+@pytest.mark.parametrize("velocities", [True, False])
+@pytest.mark.parametrize(
+    "wrong", [lambda llh: np.tile(llh[:1], (len(llh), 1)), lambda llh: llh * [1e-7, 1e-7, 1.0]], ids=["frozen", "1e-7"]
+)
+def test_fixes_that_stay_while_the_wheels_turn_are_told(
+    wrong: Callable[[np.ndarray], np.ndarray], velocities: bool
+) -> None:
+    right = read(Path(__file__).parents[2] / "data" / "tokyo")
+    if not velocities:
+        right = replace(right, gnss=replace(right.gnss, v=None, sd_v=None))
+    still = replace(right, gnss=replace(right.gnss, llh=wrong(right.gnss.llh)), truth=None)
+    assert "gnss.frozen" in keys(still)
+    assert ("gnss.frozen" in keys(still.without("odometer"))) == velocities  # nothing else tells
+    assert "gnss.frozen" not in keys(still.crop(25.0, 50.0))  # where it stands
+    assert "gnss.frozen" not in keys(right)
 
 
 def test_heights_in_feet_are_seen_on_a_drive_with_an_outage(drive: Callable[[str], Recording]) -> None:

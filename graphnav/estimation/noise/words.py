@@ -7,6 +7,7 @@ import numpy as np
 from graphnav.constraints.gnss import STAMP_ERROR, GnssPosition
 from graphnav.constraints.vehicle import MOUNTING
 from graphnav.core.notes import Note, format_count
+from graphnav.core.rotation import wrap
 from graphnav.estimation.noise.model import INTERVALS, NoiseModel
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.linearise import Points, shift
@@ -36,15 +37,17 @@ def describe_far(problem: Problem, smoothed: Points) -> tuple[str, ...]:
         k = int(np.argmax(away))
         if p.name == MOUNTING and away[k] > _FAR and abs(value[k]) > 0.25 * np.pi:
             said = (
-                f"the IMU's axes are {abs(np.degrees(value[k])):.0f} deg from those of a vehicle that travels forwards"
+                f"the IMU's axes are {abs(np.degrees(wrap(value[k]))):.0f} deg from those of a vehicle that travels "
+                "forwards"
             )
             out.append(Note("doubt.axes", f"The attitude cannot be trusted: {said}; check axes in [imu]"))
         elif away[k] > _FAR:
             which = f" (number {k + 1} of {p.size})" if p.size > 1 else ""
+            unit = "" if p.unit == "1" else f" {p.unit}"
             out.append(
                 Note(
                     "noise.far_from_stated",
-                    f"{p.name}{which}: estimated {value[k]:.2g} {p.unit}, stated {stated[k]:.2g} +- {sigma[k]:.2g}, "
+                    f"{p.name}{which}: estimated {value[k]:.2g}{unit}, stated {stated[k]:.2g} +- {sigma[k]:.2g}, "
                     f"{away[k]:.0f} sigmas apart: what is stated is wrong, or it absorbs an error of another kind",
                 )
             )

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from graphnav.config.gnss import GnssSettings
-from graphnav.core.findings import Finding, period_of
+from graphnav.core.findings import Finding, describe_gaps, period_of
 from graphnav.core.notes import format_count
 from graphnav.core.rotation import Array
 from graphnav.core.timescales import NEAR, WEEK, between_clocks
@@ -118,12 +118,7 @@ def check_gnss_coverage(recording: Recording) -> Iterator[Finding]:
     there = (gnss.t[1:] > recording.start) & (gnss.t[:-1] < recording.end)
     gaps = np.flatnonzero((step > max(3.5 * period_of(gnss.t), 1.5)) & there)
     if len(gaps):
-        worst = gaps[np.argmax(step[gaps])]
-        count = format_count(len(gaps), "gap")
-        at = gnss.t[worst] - recording.start
-        yield Finding(
-            "note", f"{count} in GNSS, the longest {step[worst]:.1f} s at {at:.1f} s from the start", "gnss.gap"
-        )
+        yield Finding("note", describe_gaps("GNSS", step[gaps], gnss.t[gaps] - recording.start), "gnss.gap")
 
 
 def check_gnss_jumps(recording: Recording, track: Track | None) -> Iterator[Finding]:
@@ -293,9 +288,7 @@ def check_odometer_readings(recording: Recording, facts: dict[str, Any]) -> Iter
     elif step > _COARSE:
         yield Finding("note", f"the odometer reads in steps of {step:.3g} m/s", "odometer.steps")
     if not odometer.signed:
-        yield Finding(
-            "note", "the odometer never reads below zero: it is taken to read backward as forward", "odometer.unsigned"
-        )
+        yield Finding("note", "the odometer never reads below zero: taken as unsigned", "odometer.unsigned")
     found = wheels.faults(odometer, recording.imu)
     for reason in dict.fromkeys(found.reasons):
         spans = found.spans[[r == reason for r in found.reasons]]

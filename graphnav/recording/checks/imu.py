@@ -8,7 +8,7 @@ from typing import Any, Literal
 import numpy as np
 
 from graphnav.core.earth import gravity
-from graphnav.core.findings import Finding, period_of, runs_of
+from graphnav.core.findings import Finding, describe_gaps, period_of, runs_of
 from graphnav.core.notes import format_count
 from graphnav.core.rotation import Array
 from graphnav.recording import Imu, Recording
@@ -20,13 +20,8 @@ def check_imu_time(imu: Imu) -> Iterator[Finding]:
     step, period = np.diff(imu.t), period_of(imu.t)
     gaps = np.flatnonzero(step > find_gap_limit(imu.t))
     if len(gaps):
-        worst = gaps[np.argmax(step[gaps])]
-        severity: Literal["note", "warning"] = "warning" if step[worst] > 0.2 else "note"
-        count = format_count(len(gaps), "gap")
-        after = imu.t[worst] - imu.t[0]
-        yield Finding(
-            severity, f"{count} in the IMU, the longest {step[worst]:.3f} s at {after:.1f} s from the start", "imu.gap"
-        )
+        severity: Literal["note", "warning"] = "warning" if step.max() > 0.2 else "note"
+        yield Finding(severity, describe_gaps("the IMU", step[gaps], imu.t[gaps] - imu.t[0]), "imu.gap")
     uneven = float((np.abs(step - period) > 0.25 * period).mean())
     if uneven > 0.05:
         yield Finding(

@@ -35,7 +35,7 @@ from graphnav.recording.checks.imu import (
     check_saturation,
     find_gap_limit,
 )
-from graphnav.recording.checks.places import check_height_unit, check_mirroring, find_mirrored
+from graphnav.recording.checks.places import check_frozen, check_height_unit, check_mirroring, find_mirrored
 from graphnav.recording.checks.raw import check_raw, describe_raw
 from graphnav.recording.checks.series import check_series, describe_series
 from graphnav.recording.checks.stated import (
@@ -158,6 +158,7 @@ def inspect(recording: Recording) -> Inspection:
         facts["gnss"] = _describe_gnss(recording, track)
         findings += check_gnss_coverage(recording)
         findings += check_rounding(recording.gnss)
+        findings += check_frozen(recording)
         findings += check_fix_types(recording.gnss)
         wrong = find_mirrored(recording, list(check_velocities(recording.gnss)))
         if overlap or not wrong:

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from graphnav.core.findings import Finding
+from graphnav.core.findings import Finding, period_of
 from graphnav.core.rotation import Array
 from graphnav.recording import Gnss, Imu, Recording
 from graphnav.recording.checks import crosschecks, tracks
@@ -15,10 +15,12 @@ from graphnav.recording.checks.clock import CLEAR, FAIR
 from graphnav.recording.checks.crosschecks import Fit
 from graphnav.recording.checks.imu import STANDARD_GRAVITY
 from graphnav.recording.checks.stated import describe_exchange, describe_mirroring, exchange_lat_lon
-from graphnav.recording.checks.tracks import Track
+from graphnav.recording.checks.tracks import Track, compute_local_positions
 from graphnav.recording.formats.schema import FOOT
 
 _SLOPE_SPAN, _SLOPES = 8.0, 6  # s over which a slope is taken: the force is then known to a tenth of a per cent
+_TURNING_RADIUS = 5.0  # m, of the smallest cars
+_SCALE = np.sqrt(2.0)  # the middle between right and twice as large, the smallest factor between units
 _FEET = 0.3  # relative deviation from 0.3048 that the noise of both permits: a ratio of 1 is three times as far off
 
 
@@ -40,8 +42,41 @@ def check_mirroring(recording: Recording, track: Track, as_read: Fit | None, tur
         yield describe_mirroring("latitudes or longitudes have", "the turns of the gyro and the force in curves")
 
 
+def check_frozen(recording: Recording) -> Iterator[Finding]:
+    """Fixes that stay where no vehicle can, while wheels or the fixes' own velocities drive.
+
+    A car that drives a full turn of its smallest circle leaves any smaller one.
+    """
+    gnss, odometer = recording.gnss, recording.odometer
+    if gnss is None or len(gnss.t) < crosschecks.MIN_PAIRS or recording.platform != "vehicle":
+        return
+    p = compute_local_positions(gnss)[:, :2]
+    away = np.linalg.norm(p - np.median(p, axis=0), axis=1)
+    within = float(np.max(away))
+    sd = np.hypot(*gnss.sd[:, :2].T)
+    if within > _TURNING_RADIUS or np.sqrt(np.mean(away**2)) > 3.0 * np.median(sd):
+        return
+    if odometer is not None and len(odometer.t) > 1:
+        who, t, speed = "the odometer drives", odometer.t, np.abs(odometer.speed)
+    elif gnss.v is not None:
+        known = np.isfinite(gnss.v).all(axis=1)
+        who, t, speed = "their velocities drive", gnss.t[known], np.hypot(*gnss.v[known, :2].T)
+    else:
+        return
+    step, speed = np.diff(t), np.minimum(speed[1:], speed[:-1])
+    sure = (step < 5.0 * max(period_of(t), 1.0)) & (t[1:] > gnss.t[0]) & (t[:-1] < gnss.t[-1])
+    sure &= speed > crosschecks.MIN_SPEED  # no noise of one that stands
+    driven = float(np.sum((speed * step)[sure]))
+    if driven > 2.0 * np.pi * _TURNING_RADIUS:
+        yield Finding(
+            "unreliable",
+            f"the fixes stay within {within:.2g} m while {who} {driven:.0f} m: frozen, or of another unit than degrees",
+            "gnss.frozen",
+        )
+
+
 def check_height_unit(recording: Recording, track: Track, forward: Fit | None) -> Iterator[Finding]:
-    """Heights in feet: they climb 3.28 times as much as the slopes that the IMU measures."""
+    """Heights in feet, which climb 3.28 times as much as the slopes that the IMU measures, or in another unit."""
     if forward is None or forward.correlation < FAIR or recording.gnss is None:
         return
     ahead = forward.coefficients / np.linalg.norm(forward.coefficients)
@@ -49,13 +84,13 @@ def check_height_unit(recording: Recording, track: Track, forward: Fit | None) -
     if found is None:
         return
     correlation, ratio = found
+    climbs = f"the heights climb {1.0 / ratio:.2g} times as much as the slopes that the IMU measures (correlation "
+    climbs += f"{correlation:.2f})"
     if correlation > CLEAR and abs(ratio / FOOT - 1.0) < _FEET:
-        yield Finding(
-            "warning",
-            f"the heights climb {1.0 / ratio:.1f} times as much as the slopes that the IMU measures (correlation "
-            f'{correlation:.2f}): they are in feet; say units = {{ height = "ft" }} in [gnss]',
-            "gnss.feet",
-        )
+        hint = 'they are in feet; say units = { height = "ft" } in [gnss]'
+        yield Finding("warning", f"{climbs}: {hint}", "gnss.feet")
+    elif correlation > CLEAR and abs(np.log(ratio)) > np.log(_SCALE):
+        yield Finding("warning", f"{climbs}: look at their unit and column", "gnss.height_scale")
 
 
 def fit_climb(imu: Imu, track: Track, gnss: Gnss, forward: Array) -> tuple[float, float] | None:

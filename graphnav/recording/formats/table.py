@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from graphnav.core.errors import RecordingError
 from graphnav.core.files import exists, open_file, parse_number
+from graphnav.core.notes import format_count
 from graphnav.core.rotation import Array
 from graphnav.recording.formats.decimals import read_decimals
 
@@ -293,9 +294,9 @@ def _parse_cells(path: Path, header: list[str], use: list[int]) -> Array:
         for number, line in _list_lines(path):
             cells = [cell.strip() for cell in line.split(",")]
             if len(cells) != len(header):
+                many = format_count(len(cells), "field")
                 raise RecordingError(
-                    f"{path}, line {number}: has {len(cells)} fields where the header has {len(header)}",
-                    key="table.fields",
+                    f"{path}, line {number}: has {many} where the header has {len(header)}", key="table.fields"
                 )
             row = []
             for column in use:

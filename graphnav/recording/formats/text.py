@@ -8,6 +8,7 @@ import numpy as np
 
 from graphnav.core.errors import RecordingError
 from graphnav.core.files import parse_number, read_bytes
+from graphnav.core.notes import format_count
 from graphnav.core.rotation import Array
 
 Rows = list[tuple[int, str]]  # line number in the file (from 1) and text
@@ -50,7 +51,8 @@ def number_table(
         fields = line.split(delimiter)
         if len(fields) != len(names):
             raise RecordingError(
-                f"{path}, line {number}: {len(fields)} fields where {len(names)} were expected", key="table.fields"
+                f"{path}, line {number}: {format_count(len(fields), 'field')} where {len(names)} were expected",
+                key="table.fields",
             )
         for k in use:
             try:
