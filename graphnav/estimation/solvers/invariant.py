@@ -25,9 +25,9 @@ from __future__ import annotations
 import numpy as np
 
 from graphnav.core import rotation
+from graphnav.core.compiled import compiled
 from graphnav.core.rotation import Array, mv
 from graphnav.core.state import BLOCKS, States
-from graphnav.estimation.solvers.recursion import turn
 
 _THETA, _V = BLOCKS["theta"], BLOCKS["v"]
 MOVING = _V.stop  # numbers of an error state that theta and dv are among
@@ -53,6 +53,26 @@ def minus_invariant(states: States, other: States) -> Array:
     phi = mv(other.R_nb, theta)
     dv = mv(rotation.exp(-phi), states.v) - other.v + mv(rotation.skew(phi), other.v)
     return np.concatenate([theta, states.p - other.p, dv, states.ba - other.ba, states.bg - other.bg], axis=-1)
+
+
+@compiled
+def turn(P: Array, T: Array) -> Array:
+    """Covariances P (K, D, D) of errors of which the first m are now T (K, m, m) times what they were.
+
+    T is what a move of the point that errors are about makes of them, by how they move it: with `States.plus` a right
+    Jacobian (`graphnav.estimation.solvers.points`), in the filter, whose errors turn together, that of
+    `compute_transport`, and along turns about the vertical that of
+    `graphnav.estimation.solvers.turning`.
+    """
+    out, m = np.empty(P.shape), T.shape[1]
+    for k in range(len(P)):
+        own, J, to = P[k], T[k], out[k]
+        top = np.dot(J, own[:m])
+        np.positive(own[m:, m:], to[m:, m:])
+        np.positive(np.dot(np.ascontiguousarray(top[:, :m]), J.T), to[:m, :m])
+        np.positive(top[:, m:], to[:m, m:])
+        np.positive(top[:, m:].T, to[m:, :m])
+    return out
 
 
 def transport_covariance(P: Array, states: States, moved: States) -> Array:

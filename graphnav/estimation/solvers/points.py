@@ -21,10 +21,10 @@ from graphnav.core.rotation import Array, mv
 from graphnav.core.state import DIM, States
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.breakdown import explain_rows
-from graphnav.estimation.solvers.invariant import MOVING
+from graphnav.estimation.solvers.invariant import MOVING, turn
 from graphnav.estimation.solvers.linearise import Advance, Points, linearise, shift
 from graphnav.estimation.solvers.passes import Progress, Updates
-from graphnav.estimation.solvers.recursion import STRETCH, filter_rows, turn
+from graphnav.estimation.solvers.recursion import STRETCH, filter_rows
 from graphnav.estimation.solvers.stack import RowBlock, Stack
 from graphnav.imu.dynamics import SCALE
 

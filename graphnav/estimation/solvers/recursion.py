@@ -73,26 +73,6 @@ def predict(P: Array, F: Array, decay: Array, Q: Array, added: Array, out: Array
 
 
 @compiled
-def turn(P: Array, T: Array) -> Array:
-    """Covariances P (K, D, D) of errors of which the first m are now T (K, m, m) times what they were.
-
-    T is what a move of the point that errors are about makes of them, by how they move it: with `States.plus` a right
-    Jacobian (`graphnav.estimation.solvers.points`), in the filter, whose errors turn together, that of
-    `graphnav.estimation.solvers.invariant`, and along turns about the vertical that of
-    `graphnav.estimation.solvers.turning`.
-    """
-    out, m = np.empty(P.shape), T.shape[1]
-    for k in range(len(P)):
-        own, J, to = P[k], T[k], out[k]
-        top = np.dot(J, own[:m])
-        np.positive(own[m:, m:], to[m:, m:])
-        np.positive(np.dot(np.ascontiguousarray(top[:, :m]), J.T), to[:m, :m])
-        np.positive(top[:, m:], to[:m, m:])
-        np.positive(top[:, m:].T, to[m:, :m])
-    return out
-
-
-@compiled
 def invert_root(L: Array) -> Array:
     """L^-1 of a lower root (m, m)."""
     out = np.zeros(L.shape)

@@ -28,11 +28,11 @@ from graphnav.core.rotation import Array, mv
 from graphnav.core.state import DIM, States
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.breakdown import explain_rows
-from graphnav.estimation.solvers.invariant import MOVING, compute_transport, minus_invariant
+from graphnav.estimation.solvers.invariant import MOVING, compute_transport, minus_invariant, turn
 from graphnav.estimation.solvers.linearise import Advance, Points, shift
 from graphnav.estimation.solvers.passes import join_passes, move_points
 from graphnav.estimation.solvers.points import linearise_all, predict_states
-from graphnav.estimation.solvers.recursion import filter_rows, turn
+from graphnav.estimation.solvers.recursion import filter_rows
 from graphnav.estimation.solvers.stack import Stack
 from graphnav.imu.dynamics import SCALE
 

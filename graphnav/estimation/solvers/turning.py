@@ -26,7 +26,7 @@ import numpy as np
 from graphnav.core import rotation
 from graphnav.core.rotation import Array, mv
 from graphnav.core.state import DIM, States
-from graphnav.estimation.solvers.recursion import turn
+from graphnav.estimation.solvers.invariant import turn
 
 _Z = rotation.skew(np.array([0.0, 0.0, 1.0]))
 _I3 = np.eye(3)
