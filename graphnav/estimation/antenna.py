@@ -25,8 +25,7 @@ from graphnav.estimation.noise.estimate import estimate_noise
 from graphnav.estimation.pipeline import origin
 from graphnav.estimation.problem import build_problem
 from graphnav.estimation.solvers.breakdown import explain_singular
-from graphnav.estimation.solvers.ekf import ekf
-from graphnav.estimation.solvers.rts import backward, rts
+from graphnav.estimation.solvers.passes import parameters_of, sigmas_of
 from graphnav.recording import Recording, take_rows
 
 _PRIOR_SIGMA = 2.0  # m, 1-sigma before the drive
@@ -185,12 +184,11 @@ def _estimate(recording: Recording) -> tuple[Antenna, tuple[Array, Array, Array]
     problem = build_problem(recording, settings, frame, aligned.state, aligned.sigma, still, parts_of_noise=True)
     try:
         tell("noise")
-        problem = with_noise(problem, estimate_noise(problem, aligned.until).noise)
-        tell("filter")
-        forward = ekf(problem, opening=aligned.until)
-        parameters = rts(problem, forward, backward(problem, forward)).parameters
+        found = estimate_noise(problem, aligned.until)
     except np.linalg.LinAlgError as error:
         raise explain_singular(error) from None
+    problem = with_noise(problem, found.noise)
+    parameters = parameters_of(problem, found.points.values, sigmas_of(found.points.P))
     arm, axle = parameters["gnss_lever_arm"], parameters.get(AXLE)
     antenna = Antenna(recording.gnss.lever_arm, arm.value[-1], arm.sigma[-1])
     if axle is None or recording.odometer is None:

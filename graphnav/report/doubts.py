@@ -21,7 +21,10 @@ if TYPE_CHECKING:
 
 FEWEST_ROWS = 10  # rows needed to judge a sigma
 _BY_INFORMATION = "batch rts isam2 incremental ekf"  # the most first
-_BY_CHANCE = 0.0027  # outside three standard deviations of a Gaussian, in a whole drive
+_BY_CHANCE = 0.0027  # outside three standard deviations of a Gaussian
+_BRIEF = (
+    0.01  # share of a drive in which what a filter met by chance, an outlier or the first fix after a gap, may show
+)
 _ROUNDING = 1e-12  # m^2, a micrometre
 _LARGEST_EXCLUDED_SHARE = 0.5  # share of the fixes' information; above it most measurements contradict the result
 TOO_LARGE = {"innovation": 1.5, "residual": 1.15}  # RMS over sigma; a fit reduces residuals
@@ -47,8 +50,8 @@ def find_departures(solutions: Mapping[str, Solution]) -> dict[str, Note]:
         off, P = off[known], P[known] + _ROUNDING * np.eye(3)
         over = np.sqrt(np.einsum("ki,ki->k", off, np.linalg.solve(P, off[:, :, None])[:, :, 0]))
         size = np.linalg.norm(off, axis=1)
-        beyond = np.flatnonzero(over > np.sqrt(chi_square_quantile(1.0 - _BY_CHANCE / max(len(off), 1), 3)))
-        if len(beyond):
+        beyond = np.flatnonzero(over > np.sqrt(chi_square_quantile(1.0 - _BY_CHANCE, 3)))
+        if len(beyond) > _BRIEF * len(off):
             k = beyond[np.argmax(size[beyond])]
             far = f"up to {size[k]:.2g} m from {best}, {over[k]:.2g} times its own sigma"
             out[name] = Note("doubt.solver", f"The trajectory of {name} cannot be trusted: {far}")

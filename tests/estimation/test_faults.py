@@ -128,7 +128,7 @@ def test_signature_is_the_derivative_of_the_innovations(posed: Problem, monkeypa
                 fix += 1
                 update_tests(
                     bank.X, own.memory, layout, np.array([own.prior, MINUTE]), posed.t[k], H, Kt,
-                    root[:, some.at[1]].copy(), -solved, *room,
+                    root[:, some.at[1]].copy(), solved, *room,
                 )  # fmt: skip
             else:
                 bank.X -= Kt.T @ (H @ bank.X)

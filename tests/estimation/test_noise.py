@@ -619,7 +619,7 @@ def test_each_fix_has_a_stamp_error_of_its_own(late: tuple[Recording, Trajectory
 
 def test_a_constant_far_beyond_its_prior_is_said(late: tuple[Recording, Trajectory]) -> None:
     base, opening = posed(late[0])
-    assert [line.split()[0] for line in describe_far(base, backward(base, ekf(base, opening=opening)))] == [
+    assert [line.split(":")[0] for line in describe_far(base, backward(base, ekf(base, opening=opening)))] == [
         "gnss_time_offset"
     ]
     well, opening = posed(oracle.drive(oracle.vehicle_path(duration=200, rate=50.0, seed=6), seed=5)[0])

@@ -454,16 +454,18 @@ def test_what_cannot_be_trusted_says_so_first(tmp_path, recording):
 def test_a_solver_that_the_others_contradict_is_named_first(tmp_path, recording):
     """By its own sigma: what a filter has not known yet it may be wrong by; what it claims to know, not."""
 
-    def moved(one, by, sd=0.2):
+    def moved(one, by, sd=0.2, share=0.05):
         p, P = one.states.p.copy(), one.covariance.copy()
-        p[40:45, 1] += by
-        P[40:45, 3:6, 3:6] = sd**2 * np.eye(3)
+        some = slice(40, 40 + max(int(share * len(p)), 1))
+        p[some, 1] += by
+        P[some, 3:6, 3:6] = sd**2 * np.eye(3)
         return replace(one, states=replace(one.states, p=p), covariance=P)
 
     rts, batch = solution("rts"), solution("batch")
     assert find_departures({"ekf": moved(solution(), 0.5), "rts": rts, "batch": batch}) == {}
     assert find_departures({"ekf": moved(solution(), 98.0, sd=60.0), "rts": rts}) == {}
     assert find_departures({"ekf": moved(solution(), 98.0)}) == {}  # nothing to compare with
+    assert find_departures({"ekf": moved(solution(), 2.0, share=0.0), "rts": rts}) == {}  # an outlier that it met
     astray = {"ekf": moved(solution(), 98.0), "rts": rts, "batch": batch}
     assert list(find_departures(astray)) == ["ekf"]
     assert "98 m" in find_departures(astray)["ekf"]

@@ -65,30 +65,27 @@ class FaultSearch:
     def _test(self, k0: int, k1: int) -> float | None:
         """When something began to be wrong that was used up to one of k0 to k1."""
         given = self._filter
-        root, solved = self._innovations_by_kernels(k0, k1)
-        fault = self._bank.follow(
-            k0, k1, given.F, self._steps.decay, self._stack, given.updates, root, solved, given.speeds
-        )
+        root = self._roots_by_kernels(k0, k1)
+        fault = self._bank.follow(k0, k1, given.F, self._steps.decay, self._stack, given.updates, root, given.speeds)
         if fault is None:
             return None
         name, at, since = fault
         return self.verdicts.settle(name, since, float(self._t[at]))
 
-    def _innovations_by_kernels(self, k0: int, k1: int) -> tuple[Array, Array]:
-        """Roots of S (K, M, M) and S^-1 r (K, M), with the weights that kernels have left at keyframes k0 to k1."""
+    def _roots_by_kernels(self, k0: int, k1: int) -> Array:
+        """(K, M, M) roots of S, with the weights that kernels have left at keyframes k0 to k1."""
         stack = self._stack
         bent = k0 + np.flatnonzero(np.any(stack.bent[k0:k1] < 1.0, axis=1))
         if not len(bent):
-            return stack.root, stack.solved
-        roots, solved = stack.root.copy(), stack.solved.copy()
+            return stack.root
+        out = stack.root.copy()
         for some in (block for k in bent.tolist() for block in stack.together(k)):
-            at, own, weight = some.at, (some.k, some.at[1], some.at[1]), stack.bent[some.at]
+            own, weight = (some.k, some.at[1], some.at[1]), stack.bent[some.at]
             if np.any((weight > 0.0) & (weight < 1.0)):
                 root = stack.root[own]
-                S = root @ root.T
-                roots[own] = np.linalg.cholesky(S + np.diag(self._filter.variance[at] * (1.0 / weight - 1.0)))
-                solved[at] = np.linalg.solve(roots[own] @ roots[own].T, S @ stack.solved[at])
-        return roots, solved
+                more = self._filter.variance[some.at] * (1.0 / weight - 1.0)
+                out[own] = np.linalg.cholesky(root @ root.T + np.diag(more))
+        return out
 
     def _reweigh(self) -> None:
         """Take the blocks in, or not, as fixes are used now."""

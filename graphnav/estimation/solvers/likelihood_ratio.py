@@ -98,7 +98,7 @@ def update_tests(
 
     Parameters
     ----------
-    root, solved : the lower root of S and -S^-1 nu.
+    root, solved : the lower root of S and S^-1 nu.
     errors, T : as for `add_row`.
     """
     column, L, m, c = layout[1], layout[2], layout[3], layout[4]
@@ -119,7 +119,7 @@ def update_tests(
         for j in range(i):
             own[i] -= root[i, j] * own[j]
         own[i] /= root[i, i]
-    add_row(memory, -np.dot(root.T, solved), own, L, c, errors, T)
+    add_row(memory, np.dot(root.T, solved), own, L, c, errors, T)
 
 
 @compiled

@@ -229,7 +229,6 @@ class Bank:
         stack: Stack,
         updates: Updates,
         root: Array,
-        solved: Array,
         speeds: Array,
     ) -> tuple[str, int, float] | None:
         """Follow a filter from keyframe k0 to k1: the kind that finds a fault, where, and when it began, if one does.
@@ -238,7 +237,7 @@ class Bank:
         ----------
         F, decay : of its steps, as `graphnav.estimation.solvers.recursion` has them.
         updates : what it has taken in, as `stack` has it, with roots and innovations of all blocks there.
-        root, solved : (K, M, M) and (K, M) of those, with the weights by which they were taken in.
+        root : (K, M, M) of those, with the weights by which they were taken in.
         speeds : (n,) m/s, of the vehicle.
         """
         blocks, names = updates.blocks, list(self._slots)
@@ -255,7 +254,7 @@ class Bank:
         k, b = k0, int(blocks.first[k0])
         while True:
             k, b = follow_filter(
-                k, k1, b, self._t, F, decay, updates.H, updates.Kt, root, solved,
+                k, k1, b, self._t, F, decay, updates.H, updates.Kt, root, updates.w,
                 blocks.first, blocks.begin, blocks.end, updates.taken, kind, limit, self._met,
                 self._layouts, self._scales, self._state, self._before, self._keys, self._ends, self._errors, self._T,
             )  # fmt: skip
