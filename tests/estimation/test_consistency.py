@@ -86,11 +86,6 @@ def drives(shared_data: Path) -> list[tuple[Recording, Trajectory]]:
 
 
 @pytest.fixture(scope="module")
-def positions(drives: list[tuple[Recording, Trajectory]]) -> dict[str, Score]:
-    return scored(drives, STATED)
-
-
-@pytest.fixture(scope="module")
 def estimated(drives: list[tuple[Recording, Trajectory]]) -> dict[str, Score]:
     return scored(drives, INERTIAL)
 
@@ -110,11 +105,6 @@ def assert_consistent(score: Score) -> None:
     assert np.all(score.unsettled < HIGH), dict(zip(AXES, score.unsettled.round(2), strict=True))
     assert WHOLE[0] < score.whole < WHOLE[1]
     assert DARK[0] < score.outage < DARK[1]
-
-
-@pytest.mark.parametrize("solver", SOLVERS)
-def test_with_positions(positions: dict[str, Score], solver: str) -> None:
-    assert_consistent(positions[solver])
 
 
 @pytest.mark.parametrize("solver", SOLVERS)
