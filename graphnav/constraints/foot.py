@@ -68,7 +68,6 @@ class Stance(Constraint):
     unit: ClassVar[str] = "m/s"
     # the velocity in body axes turns with the attitude, and at a landing a filter predicts a decimetre per second that
     # the foot does not have: linearised there, its updates would seem to observe the heading
-    # decimetre per second that the foot does not have: linearised there, it believes to learn of the heading
     iterated: ClassVar[bool] = True
 
     past: IntervalMotion | None = None
