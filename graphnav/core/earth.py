@@ -51,19 +51,26 @@ def _find_normal(r: Array) -> tuple[Array, Array, Array]:
     return up / size, out / size, p
 
 
+def _find_height(r: Array, s: Array, c: Array, p: Array) -> Array:
+    """Height of points in ECEF by `_find_normal` of them, m."""
+    return np.asarray(p * c + r[..., 2] * s - A * np.sqrt(1.0 - E2 * s * s))
+
+
 def ecef_to_llh(r: Array) -> Array:
     """Inverse of `llh_to_ecef`, exact to a micrometre below 10 km of height."""
     s, c, p = _find_normal(r)
-    h = p * c + r[..., 2] * s - A * np.sqrt(1.0 - E2 * s * s)
-    return np.stack([np.arctan2(s, c), np.arctan2(r[..., 1], r[..., 0]), h], -1)
+    return np.stack([np.arctan2(s, c), np.arctan2(r[..., 1], r[..., 0]), _find_height(r, s, c, p)], -1)
 
 
 def enu_axes(llh: Array) -> Array:
     """R_ne: rows are the east, north and up axes in ECEF; (..., 3) -> (..., 3, 3)."""
     lat, lon = np.asarray(llh, dtype=float)[..., 0], np.asarray(llh, dtype=float)[..., 1]
-    sl, cl, so, co = np.sin(lat), np.cos(lat), np.sin(lon), np.cos(lon)
-    parts = (-so, co, 0.0 * sl, -sl * co, -sl * so, cl, cl * co, cl * so, sl)
-    return columns(*parts).reshape(*sl.shape, 3, 3)
+    return columns(*_list_enu_axes(np.sin(lat), np.cos(lat), np.sin(lon), np.cos(lon))).reshape(*lat.shape, 3, 3)
+
+
+def _list_enu_axes(sl: Array, cl: Array, so: Array, co: Array) -> tuple[Array, ...]:
+    """The nine components of `enu_axes`, row by row, by sines and cosines of latitude and longitude."""
+    return -so, co, 0.0 * sl, -sl * co, -sl * so, cl, cl * co, cl * so, sl
 
 
 def gravity(lat: Array, h: Array) -> Array:
@@ -147,10 +154,8 @@ class LocalFrame:
         """(lat, lon, h) (n, 3) of positions in n, and `R_ln` there by `rotation.components`, (3, 3, n)."""
         r = self.r_e + p_n @ self.R_ne
         s, c, p = _find_normal(r)
-        so, co = r[:, 1] / p, r[:, 0] / p
-        h = p * c + r[:, 2] * s - A * np.sqrt(1.0 - E2 * s * s)
-        llh = columns(np.arctan2(s, c), np.arctan2(r[:, 1], r[:, 0]), h)
-        axes = np.array([[-so, co, 0.0 * s], [-s * co, -s * so, c], [c * co, c * so, s]])
+        llh = columns(np.arctan2(s, c), np.arctan2(r[:, 1], r[:, 0]), _find_height(r, s, c, p))
+        axes = np.array(_list_enu_axes(s, c, r[:, 1] / p, r[:, 0] / p)).reshape(3, 3, -1)
         return llh, self.R_ne @ axes
 
     def gravity_n(self, p_n: Array) -> Array:
@@ -163,7 +168,6 @@ class LocalFrame:
         if r.size == 3:  # a filter asks for single points
             return (np.array(_compute_gravity_one(*r.ravel().tolist())) @ self.R_ne.T).reshape(r.shape)
         s, c, p = _find_normal(r)
-        h = p * c + r[..., 2] * s - A * np.sqrt(1.0 - E2 * s * s)
-        size = -_compute_gravity(s * s, h)
+        size = -_compute_gravity(s * s, _find_height(r, s, c, p))
         down = np.stack([size * c / p * r[..., 0], size * c / p * r[..., 1], size * s], -1)
         return down @ self.R_ne.T

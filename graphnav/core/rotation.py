@@ -265,19 +265,22 @@ def rph_jacobian(rph: Array) -> Array:
     Grows as 1/cos(pitch), as Euler angles do.
     """
     roll, pitch, _ = np.moveaxis(np.asarray(rph, dtype=float), -1, 0)
-    sr, cr, tp, cp = np.sin(roll), np.cos(roll), np.tan(pitch), np.cos(pitch)
-    zero, one = np.zeros_like(roll), np.ones_like(roll)
-    rows = [[sr * tp, one, -cr * tp], [cr, zero, sr], [sr / cp, zero, -cr / cp]]
+    rows = _list_rph_jacobian(np.sin(roll), np.cos(roll), np.tan(pitch), np.cos(pitch))
     return np.stack([np.stack(r, -1) for r in rows], -2)
+
+
+def _list_rph_jacobian(sr: Array, cr: Array, tp: Array, cp: Array) -> list[list[Array]]:
+    """The rows of `rph_jacobian`, by sine and cosine of roll, tangent and cosine of pitch."""
+    zero = np.zeros_like(sr)
+    return [[sr * tp, zero + 1.0, -cr * tp], [cr, zero, sr], [sr / cp, zero, -cr / cp]]
 
 
 def find_rph(R_nb: Array, R_ln: Array) -> tuple[Array, Array]:
     """`to_rph` of R_ln R_nb, (n, 3), and `rph_jacobian` there, (3, 3, n); of `components` (3, 3, n)."""
     x, y, z = np.einsum("in,ijn->jn", R_ln[2], R_nb)
     cp = np.maximum(np.hypot(x, z), _LEAST_COSINE)
-    sr, cr, tp, zero = -x / cp, z / cp, y / cp, np.zeros_like(x)
     heading = np.arctan2(*(np.einsum("in,in->n", R_ln[i], R_nb[:, 1]) for i in (0, 1)))
-    J = np.array([[sr * tp, zero + 1.0, -cr * tp], [cr, zero, sr], [sr / cp, zero, -cr / cp]])
+    J = np.array(_list_rph_jacobian(-x / cp, z / cp, y / cp, cp))
     return columns(np.arctan2(-x, z), np.arctan2(y, cp), np.mod(heading, 2 * np.pi)), J
 
 

@@ -31,7 +31,6 @@ from graphnav.recording.formats.repair import LATEST
 AHEAD = 60.0  # s; stamps of other sensors that are further before the IMU's are wrong
 _WIDTH = {"imu": 6, "gnss": 12, "odometer": 6}
 _TOLD = {"gnss": 3, "odometer": 1}  # number of values by which a repeated row is recognised
-_NAN = float("nan")
 
 
 @dataclass

@@ -66,6 +66,14 @@ def test_local_axes_elsewhere() -> None:
     np.testing.assert_allclose(R_ln @ np.swapaxes(R_ln, -1, -2), np.broadcast_to(np.eye(3), (3, 3, 3)), atol=1e-14)
 
 
+def test_places_and_axes_at_once_are_those_one_by_one() -> None:
+    frame = earth.LocalFrame(np.array([0.6, 2.4, 50.0]))
+    p_n = np.random.default_rng(1).normal(0.0, [3e4, 3e4, 1e3], (40, 3))
+    llh, R_ln = frame.level(p_n)
+    np.testing.assert_allclose(llh, frame.to_llh(p_n), rtol=1e-15)
+    np.testing.assert_allclose(np.moveaxis(R_ln, -1, 0), frame.R_ln(p_n), atol=1e-14)
+
+
 @pytest.mark.parametrize(
     ("lat", "value"),
     # NIMA TR8350.2, table 3.4: normal gravity at the equator and at the pole; GRS 80 at 45 deg (Moritz 1980) is

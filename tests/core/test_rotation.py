@@ -158,6 +158,13 @@ def test_rph_jacobian_numerically() -> None:
     np.testing.assert_allclose(ro.rph_jacobian(rph), numerical, atol=2e-8)
 
 
+def test_of_components_roll_pitch_heading_are_those_of_the_product() -> None:
+    R_nb, R_ln = np.split(random_rotations(np.random.default_rng(3), 100), 2)
+    rph, J = ro.find_rph(ro.components(R_nb), ro.components(R_ln))
+    np.testing.assert_allclose(rph, ro.to_rph(R_ln @ R_nb), atol=1e-13)
+    np.testing.assert_allclose(np.moveaxis(J, -1, 0), ro.rph_jacobian(rph), rtol=1e-9, atol=1e-9)
+
+
 def test_wrap() -> None:
     np.testing.assert_allclose(ro.wrap(DEG * np.array([-180.0, 180.0, 190.0, 540.0, -10.0, 359.0])) / DEG,
                                [-180.0, -180.0, -170.0, -180.0, -10.0, -1.0], atol=1e-12)  # fmt: skip
