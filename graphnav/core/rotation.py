@@ -280,7 +280,7 @@ def find_rph(R_nb: Array, R_ln: Array) -> tuple[Array, Array]:
     x, y, z = np.einsum("in,ijn->jn", R_ln[2], R_nb)
     cp = np.maximum(np.hypot(x, z), _LEAST_COSINE)
     heading = np.arctan2(*(np.einsum("in,in->n", R_ln[i], R_nb[:, 1]) for i in (0, 1)))
-    J = np.array(_list_rph_jacobian(-x / cp, z / cp, y / cp, cp))
+    J: Array = np.array(_list_rph_jacobian(-x / cp, z / cp, y / cp, cp))
     return columns(np.arctan2(-x, z), np.arctan2(y, cp), np.mod(heading, 2 * np.pi)), J
 
 
