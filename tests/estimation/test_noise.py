@@ -167,7 +167,7 @@ def test_lag_moments_are_the_derivative_of_the_likelihood_by_the_correlation_tim
     for chain in lasting:
         p = chain.parameter
         assert p.correlation_time is not None
-        dt, later, cross, before = lag_moments(used, chain, forward, smoothed, K)
+        dt, later, cross, before = lag_moments(used, chain, smoothed, K)
 
         def expected(time: float, p=p, dt=dt, later=later, cross=cross, before=before) -> float:
             a = np.exp(-dt / time)[:, None]

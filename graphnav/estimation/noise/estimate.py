@@ -279,7 +279,7 @@ def _improve(
             _improve_process(figures, chain, driven[chain.parameter.name])
             observed = _is_observed(figures, chain)
             if chain.parameter.correlation_time is not None and observed.any():
-                _improve_time(figures, chain, observed, lag_moments(problem, chain, forward, smoothed, end))
+                _improve_time(figures, chain, observed, lag_moments(problem, chain, smoothed, end))
     for rows in problem.constraints:
         names, index = rows.noise_groups()
         if not names:
@@ -332,11 +332,16 @@ def _improve_time(figures: _Components, chain: ParameterChain, observed: Array, 
     assert p.correlation_time is not None
     if not len(dt):
         return
+    dt, first = np.unique(dt, return_inverse=True)  # few differ
+    later, cross, before, count = (
+        np.stack([np.bincount(first, one, len(dt)) for one in some.T[observed]], axis=-1)
+        for some in (later, cross, before, np.ones_like(before))
+    )
     times = p.correlation_time * np.exp(_GRID)
     a = np.exp(-dt[:, None] / times)[..., None]
-    q = (1.0 - a * a) * chain.sigma[0] ** 2
+    q = (1.0 - a * a) * chain.sigma[0, observed] ** 2
     squares = later[:, None] - 2.0 * a * cross[:, None] + a * a * before[:, None]
-    value = -0.5 * np.sum((np.log(q) + squares / q)[..., observed], axis=(0, 2))
+    value = -0.5 * np.sum(count[:, None] * np.log(q) + squares / q, axis=(0, 2))
     median = figures.prior_times[p.name]
     value -= 0.5 * (np.log(times / median) / TIME_WITHIN) ** 2
     j = int(np.clip(np.argmax(value), 1, len(_GRID) - 2))

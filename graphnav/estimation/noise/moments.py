@@ -30,7 +30,9 @@ from graphnav.core.state import DIM
 from graphnav.estimation.problem import ParameterChain, Problem
 from graphnav.estimation.solvers.linearise import linearise, shift, stepping
 from graphnav.estimation.solvers.passes import ForwardRecord, SmootherPass, values_of
-from graphnav.estimation.solvers.recursion import compute_lag_covariances, row_covariances
+from graphnav.estimation.solvers.recursion import row_covariances
+
+_FORGOTTEN = 1e-6  # share of a value that is left of it, below which what is left is lost in rounding
 
 
 @dataclass(frozen=True)
@@ -111,18 +113,20 @@ def row_moments(problem: Problem, rows: Constraint, smoothed: SmootherPass, n: i
     return RowMoments(A, share * np.where(w > 0.0, B, 0.0), left_out, whole)
 
 
-def lag_moments(
-    problem: Problem, chain: ParameterChain, forward: ForwardRecord, smoothed: SmootherPass, end: int
-) -> tuple[Array, Array, Array, Array]:
-    """Of a process, from node to node: times between (n,), E[c' c'], E[c' c] and E[c c] (n, k), c' the later."""
+def lag_moments(problem: Problem, chain: ParameterChain, smoothed: SmootherPass, end: int) -> tuple[Array, ...]:
+    """Of a process, from node to node: times between (n,), E[c' c'], E[c' c] and E[c c] (n, k), c' the later.
+
+    As c' = a c + w, E[c' c] is half of (E[c' c'] + a^2 E[c c] - E[w w]) / a. Where next to nothing of c is left in c'
+    (`_FORGOTTEN`), the two are taken for independent.
+    """
     at = problem.columns[chain.parameter.name]
     own = shift(at)
-    k = stepping(chain, end)
-    cross = compute_lag_covariances(
-        k, at.start, at.stop, forward.P, forward.P_predicted, forward.F, forward.decay, smoothed.N
-    )
-    c0, c1 = smoothed.values[k - 1, own], smoothed.values[k, own]
+    k, A, B = process_moments(problem, chain, smoothed, end)
+    k, j = k[1:], chain.node[k[1:]]
+    driven = chain.sigma[j] ** 2 * (1.0 + A[1:] - B[1:])
     variance = np.diagonal(smoothed.P[:, at, at], axis1=-2, axis2=-1)
-    v0, v1 = variance[k - 1], variance[k]
-    dt = np.diff(chain.t)[chain.node[k] - 1]
-    return dt, c1 * c1 + v1, c1 * c0 + cross, c0 * c0 + v0
+    c0, c1 = smoothed.values[k - 1, own], smoothed.values[k, own]
+    before, later = c0 * c0 + variance[k - 1], c1 * c1 + variance[k]
+    a = np.maximum(chain.decay[j], _FORGOTTEN)[:, None]
+    cross = np.where(a > _FORGOTTEN, 0.5 * (later + a * a * before - driven) / a, c1 * c0)
+    return np.diff(chain.t)[j - 1], later, cross, before

@@ -363,25 +363,6 @@ def smooth_filtered(
 
 
 @compiled
-def compute_lag_covariances(
-    k: Array, begin: int, end: int, P: Array, P_predicted: Array, F: Array, decay: Array, N: Array
-) -> Array:
-    """(n, end - begin) smoothed covariances of error states `begin` to `end` at keyframes k - 1 and k (n,).
-
-    Cov(x_k-1, x_k) = P_k-1 F^T P-_k^-1 P^s_k = P_k-1 F^T (I - N P-_k)
-    """
-    out, w = np.empty((len(k), end - begin)), F.shape[2]
-    for i in range(len(k)):
-        j = k[i]
-        for c in range(begin, end):
-            rest, own = np.dot(P_predicted[j, c], N[j]), P[j - 1, c]
-            rest[c] -= 1.0
-            moved = np.dot(np.dot(F[j - 1], own[:w]), rest[:DIM])
-            out[i, c - begin] = -moved - np.sum(decay[j - 1] * own[DIM:] * rest[DIM:])
-    return out
-
-
-@compiled
 def row_covariances(H: Array, P: Array, k: Array) -> Array:
     """(n, m, m) H P_k H^T of rows H (n, m, D) at keyframes k (n,)."""
     n, m, _ = H.shape

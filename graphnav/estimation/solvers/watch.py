@@ -55,13 +55,6 @@ _REMEMBERED = 64  # keyframes with fixes back to which the tests can be taken as
 LONGEST = 600.0  # s, about, of the oldest onset: what inertial sensors knew ten minutes ago says little
 
 
-def matters(rows: Constraint, error: Array, speed: Array | float) -> Array:
-    """(...) whether errors (..., m) of fixes at speeds (...), m/s, are large enough to be faults, however certain."""
-    # a position is off by what the vehicle moves while clocks are
-    clocks = _CLOCKS * np.asarray(speed) if rows.fix_of == "p" else np.asarray(_CLOCKS * _BRAKING)
-    return np.asarray(np.sum(error**2 / (rows.typical_error() ** 2 + clocks[..., None] ** 2), axis=-1) > LARGE**2)
-
-
 class _Slots:
     """The tests of one constraint: slot l has columns c l to c (l + 1) of those it has in the bank.
 
@@ -74,7 +67,7 @@ class _Slots:
         self.L, self.c = L, 2 * self.m if drifts else self.m
         self.columns = slice(begin, begin + L * self.c)
         self.threshold = float(chdtri(self.c, FALSE_ALARM))
-        self.rows, self.prior = rows, WIDE[rows.unit] ** -2.0
+        self.fix_of, self.typical_error, self.prior = rows.fix_of, rows.typical_error(), WIDE[rows.unit] ** -2.0
         self.memory = np.zeros(memory_size(L, self.c))
         self.typical_sigmas = _InnovationLevel(self.m)
         self.forget()
@@ -125,7 +118,10 @@ class _Slots:
         if self.c > self.m:
             minutes = np.where(np.isnan(self.first), 0.0, (t - self.first) / MINUTE)
             now = now + minutes[:, None] * errors[:, self.m :]
-        T = np.where(matters(self.rows, now, speed), T, 0.0)
+        # a position is off by what the vehicle moves while clocks are
+        clocks = _CLOCKS * (speed if self.fix_of == "p" else _BRAKING)
+        large = np.sum(now**2 / (self.typical_error**2 + clocks**2), axis=-1) > LARGE**2  # if not, no fault
+        T = np.where(large, T, 0.0)
         if T.max() <= factor:
             return None
         # of the onsets that are about as likely the latest: it takes least
