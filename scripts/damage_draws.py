@@ -3,10 +3,11 @@
     python scripts/damage_draws.py -o draws.json --draws 40 --seed 1
     python scripts/damage_draws.py -o draws.json --draws 40 --seed 1 --only 17
 
-What is drawn, and how large, is in `FAULTS`: errors of fixes as in street canyons, wrong sigmas, stamps and lever arms,
-outages, a worse IMU, wheels that lag, slip or stand below walking pace. Every draw is solved as stated with every fix
-used, with the defaults, and undamaged with the defaults; errors are against the drive's own truth, or against fixes
-that are withheld. Rows go to the file as they come.
+What is drawn, and how large, is in `damage_kinds`. Faults: errors of fixes as in street canyons, wrong sigmas, stamps
+and lever arms, outages, a worse IMU, wheels that lag, slip or stand below walking pace. Habits of receivers and
+loggers: rare, interpolated, rounded, smoothed or held fixes, one sigma for all, an IMU that is slow, coarse, or loses
+rows. Every draw is solved as stated with every fix used, with the defaults, and undamaged with the defaults; errors are
+against the drive's own truth, or against fixes that are withheld. Rows go to the file as they come.
 """
 
 from __future__ import annotations
@@ -16,160 +17,24 @@ import json
 import os
 import sys
 import time
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from damage import STATED, moved
+from damage import STATED
+from damage_kinds import FAMILIES
 from do_no_harm import DRIVES, HERE, load, placed, withheld_of
 
 import graphnav
 from graphnav.app.scores import score
 from graphnav.config import settings_from
 from graphnav.evaluation.metrics import summary
-from graphnav.recording import Gnss, Imu, Odometer, Recording
+from graphnav.recording import Recording
 
 SOLVERS = ("ekf", "rts", "batch")
 LENGTHS = 120.0, 300.0  # s, of a window
 NAMES = ("tokyo", "tokyo_no_doppler", "boulder", "kitti", "comma", "dresden", "tokyo_clone", "oracle", "circles_2024")
-
-Rng = np.random.Generator
-
-
-@dataclass(frozen=True)
-class Fault:
-    """One way for a sensor to go wrong, and how often a draw has it."""
-
-    sensor: str
-    chance: float
-    damage: Callable[[Any, Rng], tuple[Any, str]]  # the sensor as it comes, and what was done to it
-
-
-def spans(t: np.ndarray, rng: Rng, most: int, shortest: float, longest: float) -> list[tuple[float, float]]:
-    """Up to `most` spans (s) within times t (N,)."""
-    out = []
-    for _ in range(int(rng.integers(1, most + 1))):
-        length = float(np.exp(rng.uniform(np.log(shortest), np.log(longest))))
-        begin = float(rng.uniform(t[0], max(t[-1] - length, t[0])))
-        out.append((begin, begin + length))
-    return out
-
-
-def wrong_sigmas(gnss: Gnss, rng: Rng) -> tuple[Gnss, str]:
-    by = float(np.exp(rng.uniform(np.log(0.2), np.log(15.0))))
-    sd_v = None if gnss.sd_v is None else gnss.sd_v * by
-    return replace(gnss, sd=gnss.sd * by, sd_v=sd_v), f"sigmas x {by:.2f}"
-
-
-def outliers(gnss: Gnss, rng: Rng) -> tuple[Gnss, str]:
-    share, size = rng.uniform(0.01, 0.1), np.exp(rng.uniform(np.log(5.0), np.log(100.0)))
-    wrong = rng.random(len(gnss.t)) < share
-    by = size * wrong[:, None] * rng.standard_normal((len(gnss.t), 3))
-    return moved(gnss, by), f"{100 * share:.0f} % off by {size:.0f} m"
-
-
-def bursts(gnss: Gnss, rng: Rng) -> tuple[Gnss, str]:
-    by, said = np.zeros((len(gnss.t), 3)), []
-    for begin, end in spans(gnss.t, rng, 3, 3.0, 60.0):
-        error = rng.standard_normal(3) * np.exp(rng.uniform(np.log(3.0), np.log(30.0)))
-        inside = (gnss.t >= begin) & (gnss.t < end)
-        ramp = (gnss.t[inside] - begin) / (end - begin) if rng.random() < 0.4 else np.ones(int(inside.sum()))
-        by[inside] += ramp[:, None] * error
-        said.append(f"{begin - gnss.t[0]:.0f}-{end - gnss.t[0]:.0f} s by {np.linalg.norm(error):.0f} m")
-    return moved(gnss, by), "bursts " + ", ".join(said)
-
-
-def canyons(gnss: Gnss, rng: Rng) -> tuple[Gnss, str]:
-    """Errors that last for ten to thirty seconds, of which the sigmas know nothing."""
-    by, said = np.zeros((len(gnss.t), 3)), []
-    for begin, end in spans(gnss.t, rng, 3, 20.0, 90.0):
-        inside = np.flatnonzero((gnss.t >= begin) & (gnss.t < end))
-        tau, size = rng.uniform(10.0, 30.0), np.exp(rng.uniform(np.log(1.0), np.log(8.0)))
-        error = size * rng.standard_normal(3)
-        for k in inside:
-            a = np.exp(-(gnss.t[k] - gnss.t[max(k - 1, 0)]) / tau)
-            error = a * error + size * np.sqrt(1.0 - a * a) * rng.standard_normal(3)
-            by[k] = error
-        said.append(f"{begin - gnss.t[0]:.0f}-{end - gnss.t[0]:.0f} s of {size:.1f} m")
-    return moved(gnss, by), "canyons " + ", ".join(said)
-
-
-def outages(gnss: Gnss, rng: Rng) -> tuple[Gnss, str]:
-    keep, some = np.ones(len(gnss.t), dtype=bool), spans(gnss.t, rng, 2, 15.0, 60.0)
-    for begin, end in some:
-        keep &= (gnss.t < begin) | (gnss.t > end)
-    per_row = {
-        name: value[keep]
-        for name in ("t", "llh", "sd", "v", "sd_v", "type", "satellites")
-        if (value := getattr(gnss, name)) is not None
-    }
-    return replace(gnss, **per_row), "none " + ", ".join(f"{a - gnss.t[0]:.0f}-{b - gnss.t[0]:.0f} s" for a, b in some)
-
-
-def late_stamps(gnss: Gnss, rng: Rng) -> tuple[Gnss, str]:
-    late, jitter = rng.uniform(-0.1, 0.3), rng.choice([0.0, 0.2, 0.5])
-    t = np.sort(gnss.t + late + rng.uniform(0.0, 1.0, len(gnss.t)) * jitter)
-    return replace(gnss, t=t + np.arange(len(t)) * 1e-7), f"stamps late by {late:.2f} s and up to {jitter} more"
-
-
-def wrong_arm(gnss: Gnss, rng: Rng) -> tuple[Gnss, str]:
-    by = rng.uniform(-0.8, 0.8, 3)
-    return replace(gnss, lever_arm=gnss.lever_arm + by), f"lever arm off by {np.linalg.norm(by):.1f} m"
-
-
-def worse_noise(imu: Imu, rng: Rng) -> tuple[Imu, str]:
-    by, root = rng.uniform(2.0, 10.0), np.sqrt(1.0 / imu.period)
-    gyro = imu.gyro + by * imu.noise.gyro_noise_density * root * rng.standard_normal(imu.gyro.shape)
-    accel = imu.accel + by * imu.noise.accel_noise_density * root * rng.standard_normal(imu.accel.shape)
-    return replace(imu, gyro=gyro, accel=accel), f"IMU noise x {by:.1f}"
-
-
-def own_errors(imu: Imu, rng: Rng) -> tuple[Imu, str]:
-    """Scale errors and misalignments of a consumer IMU."""
-    of_gyro, of_accel = (np.eye(3) + 0.01 * rng.standard_normal((3, 3)) for _ in range(2))
-    return replace(imu, gyro=imu.gyro @ of_gyro.T, accel=imu.accel @ of_accel.T), "IMU scale and axes 1 %"
-
-
-def dead_zone(odometer: Odometer, rng: Rng) -> tuple[Odometer, str]:
-    below = rng.uniform(0.5, 2.0)
-    speed = np.where(np.abs(odometer.speed) < below, 0.0, odometer.speed)
-    return replace(odometer, speed=speed, wheels=None, counted=None), f"wheels stand below {below:.1f} m/s"
-
-
-def lag(odometer: Odometer, rng: Rng) -> tuple[Odometer, str]:
-    late = rng.uniform(0.1, 0.6)
-    return replace(odometer, t=odometer.t + late), f"wheels late by {late:.2f} s"
-
-
-def slip(odometer: Odometer, rng: Rng) -> tuple[Odometer, str]:
-    speed, some = odometer.speed.copy(), spans(odometer.t, rng, 3, 1.0, 15.0)
-    for begin, end in some:
-        speed[(odometer.t >= begin) & (odometer.t < end)] *= rng.uniform(0.5, 1.4)
-    return replace(odometer, speed=speed, wheels=None, counted=None), f"wheels slip {len(some)} times"
-
-
-def wrong_scale(odometer: Odometer, rng: Rng) -> tuple[Odometer, str]:
-    by = 1.0 + rng.uniform(-0.06, 0.06)
-    return replace(odometer, speed=by * odometer.speed, wheels=None, counted=None), f"wheels x {by:.3f}"
-
-
-FAULTS = (
-    Fault("gnss", 0.5, wrong_sigmas),
-    Fault("gnss", 0.3, outliers),
-    Fault("gnss", 0.4, bursts),
-    Fault("gnss", 0.3, canyons),
-    Fault("gnss", 0.2, wrong_arm),
-    Fault("gnss", 0.25, late_stamps),
-    Fault("gnss", 0.3, outages),
-    Fault("imu", 0.25, worse_noise),
-    Fault("imu", 0.25, own_errors),
-    Fault("odometer", 0.3, dead_zone),
-    Fault("odometer", 0.3, lag),
-    Fault("odometer", 0.3, slip),
-    Fault("odometer", 0.3, wrong_scale),
-)
 
 
 def draw(number: int, options: argparse.Namespace) -> tuple[dict[str, Any], Recording, Recording, bool]:
@@ -185,7 +50,7 @@ def draw(number: int, options: argparse.Namespace) -> tuple[dict[str, Any], Reco
     if clean.odometer is not None and rng.random() < 0.4:
         clean = clean.without("odometer")
     used, done = clean, []
-    for fault in FAULTS:
+    for fault in FAMILIES[options.family]:
         sensor = getattr(used, fault.sensor)
         if rng.random() < fault.chance and sensor is not None:
             changed, said = fault.damage(sensor, rng)
@@ -257,6 +122,7 @@ def main() -> None:
     parser.add_argument("-o", "--output", type=Path, required=True, help="the rows, JSON; those there are kept")
     parser.add_argument("--data", type=Path, default=os.environ.get("GRAPHNAV_DATA", HERE.parent / "shared" / "data"))
     parser.add_argument("--drives", type=lambda text: text.split(","), default=list(NAMES))
+    parser.add_argument("--family", choices=FAMILIES, default="faults", help="what the drives are damaged by")
     parser.add_argument("--draws", type=int, default=40)
     parser.add_argument("--only", type=int, help="this draw alone")
     parser.add_argument("--seed", type=int, default=1)
