@@ -11,6 +11,7 @@ from damage import moved
 
 from graphnav.core.earth import LocalFrame
 from graphnav.recording import Gnss, Imu, Odometer
+from graphnav.recording.formats.rounding import measure_rounding
 
 Rng = np.random.Generator
 
@@ -165,14 +166,15 @@ def interpolated(gnss: Gnss, rng: Rng) -> tuple[Gnss, str]:
     def line(x: np.ndarray) -> np.ndarray:
         return np.stack([np.interp(t, gnss.t, column) for column in x.T], axis=-1)
 
-    out = replace(kept(gnss, there), t=t, llh=frame.to_llh(line(frame.from_llh(gnss.llh))))
+    llh = frame.to_llh(line(frame.from_llh(gnss.llh)))
+    out = replace(kept(gnss, there), t=t, llh=llh, rounding=(0.0, 0.0, 0.0))
     return out if gnss.v is None else replace(out, v=line(gnss.v)), f"rows interpolated, {more} a fix"
 
 
 def rounded(gnss: Gnss, rng: Rng) -> tuple[Gnss, str]:
     digits = int(rng.choice([5, 6]))
     llh = np.column_stack([np.radians(np.round(np.degrees(gnss.llh[:, :2]), digits)), np.round(gnss.llh[:, 2], 0)])
-    return replace(gnss, llh=llh), f"{digits} decimals of a degree, whole metres of height"
+    return replace(gnss, llh=llh, rounding=measure_rounding(llh)), f"{digits} decimals of a degree, whole metres of height"
 
 
 def low_pass(gnss: Gnss, rng: Rng) -> tuple[Gnss, str]:
@@ -182,7 +184,7 @@ def low_pass(gnss: Gnss, rng: Rng) -> tuple[Gnss, str]:
     for k in range(1, len(p)):
         a = np.exp(-(gnss.t[k] - gnss.t[k - 1]) / tau)
         p[k] = a * p[k - 1] + (1.0 - a) * p[k]
-    return replace(gnss, llh=frame.to_llh(p)), f"positions smoothed over {tau:.1f} s"
+    return replace(gnss, llh=frame.to_llh(p), rounding=(0.0, 0.0, 0.0)), f"positions smoothed over {tau:.1f} s"
 
 
 def static_hold(gnss: Gnss, rng: Rng) -> tuple[Gnss, str]:

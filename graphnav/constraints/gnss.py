@@ -155,7 +155,8 @@ class GnssPosition(Constraint):
             keyframe=keyframe[used],
             p_n=p_n,
             R_ln=earth.enu_axes(llh) @ scene.frame.R_ne.T,
-            sigma=sd,
+            sigma=np.hypot(sd, gnss.rounding),
+            unscaled=np.broadcast_to(gnss.rounding, sd.shape),
             unit_error=_compute_running_median(gnss.t[used], sd)
             if scene.typical_sigmas is None
             else scene.typical_sigmas[used],

@@ -69,6 +69,7 @@ class Gnss:
     type_assumed: bool = False  # True when they are numbers of a CSV file, which were taken for RTKLIB's
     derived: bool = False  # single-point positions computed from the recording's own raw observations
     satellites: Array | None = None  # (M,) number used in each fix, NaN where unknown; only displayed
+    rounding: tuple[float, ...] = (0.0, 0.0, 0.0)  # m, east, north, up: standard deviation of the log's last digits
 
     @property
     def types(self) -> dict[str, int]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import importlib
 import pkgutil
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from graphnav.core.complaints import suggest_nearest
@@ -16,6 +17,7 @@ from graphnav.core.files import exists, permit_outside
 from graphnav.recording import Recording
 from graphnav.recording.exporters import NAMES as EXPORTED
 from graphnav.recording.formats.registry import Format, Log
+from graphnav.recording.formats.rounding import measure_rounding
 
 __all__ = ["Format", "Log", "formats", "is_description", "load", "read"]
 
@@ -57,7 +59,10 @@ def read(
     """
     chosen = _format_of(source, name)
     with permit_outside(allow_outside):
-        return _choose(chosen, source, topics).recording(source) if topics else chosen.read(source)
+        found = _choose(chosen, source, topics).recording(source) if topics else chosen.read(source)
+    if found.gnss is None:
+        return found
+    return replace(found, gnss=replace(found.gnss, rounding=measure_rounding(found.gnss.llh)))
 
 
 def load(source: str | Path, name: str | None = None, topics: Sequence[str] = ()) -> Log:

@@ -1,0 +1,40 @@
+"""What the digits of a log round off.
+
+A value rounded to a step is off by an error that is uniform over the step, of a standard deviation of step / sqrt(12)
+(Widrow, Kollar and Liu 1996, "Statistical theory of quantization"). No variance factor scales it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from graphnav.core.rotation import Array
+
+_RADIUS = 6.371e6  # m, of the Earth: nobody minds a third of a percent here
+_MOST_DIGITS = 10  # decimals that degrees in double precision have
+_FEWEST = 4  # values from which on a step is no chance: of finer ones, one set in ten thousand has it
+
+
+def measure_rounding(llh: Array) -> tuple[float, ...]:
+    """Standard deviation of what places are rounded by, east, north and up, m; 0 where no step shows.
+
+    Parameters
+    ----------
+    llh : (N, 3) rad, rad, m; NaN where there is none.
+    """
+    llh = llh[np.isfinite(llh).all(axis=1)]
+    if not len(llh):
+        return (0.0, 0.0, 0.0)
+    lat, lon = (_RADIUS * np.radians(find_step(np.degrees(column))) for column in llh[:, :2].T)
+    return tuple(float(step) / np.sqrt(12.0) for step in (lon * np.cos(llh[0, 0]), lat, find_step(llh[:, 2])))
+
+
+def find_step(x: Array) -> float:
+    """The power of ten that values (N,) are whole multiples of; 0 where there is none, or too few differ to tell."""
+    x = np.unique(x)
+    for digits in range(_MOST_DIGITS + 1):
+        steps = x * 10.0**digits
+        off = np.abs(steps - np.round(steps))
+        if np.all(off <= 1e-9 + 1e-15 * np.abs(steps)):
+            return 10.0**-digits if len(np.unique(np.round(steps))) >= _FEWEST else 0.0
+    return 0.0

@@ -1,0 +1,48 @@
+"""What the digits of a log round off."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from graphnav import Settings, load, run
+from graphnav.evaluation.evaluate import evaluate_recording
+from graphnav.recording.formats.rounding import find_step, measure_rounding
+
+HERE = Path(__file__).resolve().parents[1]
+
+
+@pytest.mark.parametrize("digits", [0, 1, 3, 7, 9])
+def test_a_step_is_found_in_values_that_are_rounded(digits: int) -> None:
+    x = np.radians(np.round(139.7 + 10.0 ** (1 - digits) * np.random.default_rng(digits).standard_normal(500), digits))
+    assert find_step(np.degrees(x)) == pytest.approx(10.0**-digits)
+
+
+def test_no_step_is_found_where_there_is_none() -> None:
+    x = 35.0 + np.random.default_rng(0).standard_normal(100)
+    assert find_step(x) == 0.0
+    assert find_step(np.full(100, 120.0)) == 0.0
+    assert find_step(np.round(x) / 3.0) == 0.0
+
+
+def test_the_deviation_is_that_of_the_error() -> None:
+    rng = np.random.default_rng(1)
+    llh = np.column_stack([np.radians(60.0 + 0.01 * rng.random(4000)), np.radians(10.0 + 0.01 * rng.random(4000)),
+                           80.0 + 40.0 * rng.random(4000)])  # fmt: skip
+    rounded = np.column_stack([np.radians(np.round(np.degrees(llh[:, :2]), 5)), np.round(llh[:, 2], 1)])
+    away = (rounded - llh) * [6.371e6, 6.371e6 * np.cos(np.radians(60.0)), 1.0]
+    np.testing.assert_allclose(measure_rounding(rounded), np.std(away, axis=0)[[1, 0, 2]], rtol=0.05)
+
+
+def test_fixes_better_than_their_digits_leave_a_consistent_solution() -> None:
+    """Fixes good to 2 cm, written with six decimals of a degree and whole metres of height."""
+    drive = load(HERE.parent / "data" / "tokyo").crop(0.0, 100.0)
+    assert drive.gnss is not None
+    llh = np.column_stack([np.radians(np.round(np.degrees(drive.gnss.llh[:, :2]), 6)), np.round(drive.gnss.llh[:, 2])])
+    rounded = replace(drive, gnss=replace(drive.gnss, llh=llh, rounding=measure_rounding(llh)))
+    tracks = (run(one, Settings(), ("rts",))["rts"].trajectory() for one in (drive, rounded))
+    whole, some = (np.mean(evaluate_recording(track, drive).errors.nees_p) for track in tracks)
+    assert some < 1.5 * whole
