@@ -174,7 +174,9 @@ def interpolated(gnss: Gnss, rng: Rng) -> tuple[Gnss, str]:
 def rounded(gnss: Gnss, rng: Rng) -> tuple[Gnss, str]:
     digits = int(rng.choice([5, 6]))
     llh = np.column_stack([np.radians(np.round(np.degrees(gnss.llh[:, :2]), digits)), np.round(gnss.llh[:, 2], 0)])
-    return replace(gnss, llh=llh, rounding=measure_rounding(llh)), f"{digits} decimals of a degree, whole metres of height"
+    return replace(
+        gnss, llh=llh, rounding=measure_rounding(llh)
+    ), f"{digits} decimals of a degree, whole metres of height"
 
 
 def low_pass(gnss: Gnss, rng: Rng) -> tuple[Gnss, str]:

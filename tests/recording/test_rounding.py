@@ -28,6 +28,14 @@ def test_no_step_is_found_where_there_is_none() -> None:
     assert find_step(np.round(x) / 3.0) == 0.0
 
 
+def test_a_step_of_minutes_is_found() -> None:
+    minutes = 60.0 * 48.0 + np.round(10.0 * np.random.default_rng(2).random(100), 4)
+    llh = np.column_stack([np.radians(minutes / 60.0), np.full(100, 0.1), np.zeros(100)])
+    found = np.sqrt(12.0) * np.array(measure_rounding(llh))
+    assert found[1] == pytest.approx(0.185, rel=0.01)  # of 1852 m a minute
+    assert found[0] == found[2] == 0.0
+
+
 def test_the_deviation_is_that_of_the_error() -> None:
     rng = np.random.default_rng(1)
     llh = np.column_stack([np.radians(60.0 + 0.01 * rng.random(4000)), np.radians(10.0 + 0.01 * rng.random(4000)),

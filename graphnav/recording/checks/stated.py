@@ -66,22 +66,18 @@ def check_foot_speed(recording: Recording, track: Track | None) -> Iterator[Find
 
 def check_rounding(gnss: Gnss) -> Iterator[Finding]:
     """Positions with fewer digits than their sigma requires."""
-    degrees = np.degrees(gnss.llh[:, :2])
-    if len(degrees) < 10 or not np.ptp(degrees, axis=0).all():
-        return
-    for digits in range(2, 7):
-        scaled = degrees * 10.0**digits
-        if np.abs(scaled - np.round(scaled)).max() < 1e-4:
-            step = 10.0**-digits * 111_320.0
-            sd = float(np.median(gnss.sd[:, :2]))
-            if step > 3.0 * sd:
-                yield Finding(
-                    "warning",
-                    f"positions are rounded to {10.0**-digits:g} deg, {step:.2g} m, and their 1-sigma is {sd:.2g} m: "
-                    "log more digits, or state a larger sd",
-                    "gnss.rounded",
-                )
-            return
+    steps, sd = np.sqrt(12.0) * np.array(gnss.rounding), np.median(gnss.sd, axis=0)
+    for what, step, size in (
+        ("positions", np.max(steps[:2]), np.mean(sd[:2])),
+        ("heights", steps[2], sd[2]),
+    ):
+        if step > 3.0 * size:
+            yield Finding(
+                "warning",
+                f"{what} are rounded to {step:.2g} m, and their 1-sigma is {size:.2g} m: log more digits; until then "
+                f"{step / np.sqrt(12.0):.2g} m are added to it, in quadrature",
+                "gnss.rounded",
+            )
 
 
 def check_fix_types(gnss: Gnss) -> Iterator[Finding]:

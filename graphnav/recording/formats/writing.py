@@ -12,6 +12,7 @@ import numpy as np
 
 from graphnav.core.rotation import Array
 from graphnav.recording import Recording
+from graphnav.recording.formats.rounding import measure_rounding
 from graphnav.recording.formats.writer import write_folder
 from graphnav.sensors.tables import ANGLE
 
@@ -27,9 +28,9 @@ def round_recording(recording: Recording) -> Recording:
     imu = replace(imu, t=_cut(imu.t, _T), gyro=_cut(imu.gyro, _RATE), accel=_cut(imu.accel, _FORCE))
     gnss, odometer, truth = recording.gnss, recording.odometer, recording.truth
     if gnss is not None:
-        v, sd_v = gnss.v, gnss.sd_v
+        v, sd_v, llh = gnss.v, gnss.sd_v, _cut_llh(gnss.llh)
         gnss = replace(
-            gnss, t=_cut(gnss.t, _T), llh=_cut_llh(gnss.llh), sd=_cut(gnss.sd, _M),
+            gnss, t=_cut(gnss.t, _T), llh=llh, sd=_cut(gnss.sd, _M), rounding=measure_rounding(llh),
             v=None if v is None else _cut(v, _M_S), sd_v=None if sd_v is None else _cut(sd_v, _M_S),
         )  # fmt: skip
     if odometer is not None:
