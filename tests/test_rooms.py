@@ -26,7 +26,7 @@ ROOMS = {
     "estimation": ["core", "config", "gnss", "recording", "imu", "detectors", "constraints"],
     "online": ["core", "sensors", "config", "gnss", "recording", "imu", "detectors", "constraints", "estimation"],
     "evaluation": ["core", "recording", "estimation"],
-    "report": ["core", "recording", "detectors", "constraints", "estimation", "evaluation"],
+    "report": ["core", "recording", "detectors", "estimation", "evaluation"],
     "app": [
         "core", "sensors", "config", "recording", "imu", "detectors", "simulation", "constraints", "estimation",
         "online", "evaluation", "report",

@@ -6,6 +6,7 @@ Nothing heavy is imported before a command runs, so that help appears at once.
 from __future__ import annotations
 
 import os
+import re
 import sys
 import traceback
 from dataclasses import replace
@@ -293,7 +294,8 @@ def _usage(error: Any) -> str:
     said = str(getattr(error, "option_name", ""))
     if said.lstrip("-") in _SPAN and {"--start", "--end"} <= options:
         return f"No such option: {said}; --start and --end choose a part of the recording; see {path} --help"
-    return f"{error.format_message().rstrip('.')}; see {path} --help"
+    message = re.sub(r"Input should be (.*?)(, unable to .*)?$", r"must be \1", error.format_message().rstrip("."))
+    return f"{message}; see {path} --help"
 
 
 def _internal(error: Exception) -> str:

@@ -97,10 +97,11 @@ def fleet(
         start,
         end,
     )
+    known: dict[Any, Any] = {}
+    manifest.resolve_options(asked, known)  # so that no line of a manifest is blamed for what the command line says
     folder = outputs.output_folder(out, ("fleet.csv", "fleet.parquet", "fleet.html"), ("drives",)).resolve()
     with permit_outside(allow_outside):
         drives = manifest.read_drives(source.resolve(), asked)
-    known: dict[Any, Any] = {}
     tasks = [
         manifest.build_task(
             drive, folder, known, withhold=withhold, rate=rate, pages=pages, again=again, outside=allow_outside
@@ -129,7 +130,8 @@ def fleet(
         page.write_page(rows, part / "fleet.html", f"{source.name}: {format_count(len(rows), 'drive')}")
         files.insert(0, part / "fleet.html")
     files = final_path(files, part, folder)
-    lacking = "" if len(files) > 2 else "\nno fleet.parquet: pyarrow is not installed"
+    lacking = "" if withhold is None else tables.describe_unscored(rows, withhold)
+    lacking += "" if len(files) > 2 else "\nno fleet.parquet: pyarrow is not installed"
     show(
         lambda: "\n".join([tables.text(rows) + lacking, "look at", *(f"  {file}" for file in files)]),
         lambda: {

@@ -15,6 +15,7 @@ from graphnav.core.files import permit_outside
 from graphnav.core.progress import tell
 
 commands = typer.Typer()
+Force = Annotated[bool, typer.Option("--force", help="Overwrite files that are there.")]
 
 
 @commands.command(
@@ -41,6 +42,7 @@ def convert(
         ),
     ] = None,
     topic: Topic = None,
+    force: Force = False,
     allow_outside: AllowOutside = False,
     quiet: Quiet = False,
     json: Json = False,
@@ -75,7 +77,7 @@ def convert(
     folder = output_folder(out)
     with bar(quiet, "convert"), permit_outside(allow_outside):
         tell("reading")
-        log, files = conversion.convert_log(source, folder, format, topic or ())
+        log, files = conversion.convert_log(source, folder, format, topic or (), force)
     show(
         lambda: conversion.log_text(log, files),
         lambda: {**conversion.log_values(log), "files": files},
@@ -162,7 +164,7 @@ def init(
         str | None,
         typer.Option("--name", metavar="NAME", help="Name of the recording; default: that of FILE or of its folder."),
     ] = None,
-    force: Annotated[bool, typer.Option("--force", help="Overwrite files that are there.")] = False,
+    force: Force = False,
     topic: Topic = None,
     quiet: Quiet = False,
     json: Json = False,

@@ -176,7 +176,10 @@ def report(
     from graphnav.core.staging import final_path, stage_results
 
     if not out.is_dir():
-        raise ConfigError(f"{out}: no such folder; name the folder that smooth or compare wrote", key="file.missing")
+        what = "is a file" if out.exists() else "no such folder"
+        raise ConfigError(f"{out}: {what}; name the folder that smooth or compare wrote", key="file.missing")
+    if (out / "drives").is_dir():
+        raise ConfigError(f"{out}: the results of a fleet; name a folder in {out / 'drives'}", key="results.none")
     with bar(quiet, "detect"):
         tell("reading")
         with stage_results(out) as part:
@@ -253,7 +256,8 @@ def _solve(
     for k, file in enumerate(beside.files if beside is not None else ()):
         assert beside is not None
         if not file.is_file():
-            raise ConfigError(f"--against {file}: no such file", key="file.missing")
+            what = "is a folder" if file.is_dir() else "no such file"
+            raise ConfigError(f"--against {file}: {what}; name a trajectory file", key="file.missing")
         of = convert.parse_point(beside.points[k] if beside.points else None, "--against-point")
         against.append(workflow.Against(file, of, beside.shifts[k] if beside.shifts else None))
     settings = choose_detectors(read_settings(asked.config, asked.profile), asked.detectors)

@@ -53,7 +53,9 @@ def check_rate(rate: float | None) -> None:
         raise ConfigError(f"--rate {rate:g}: must be above 0 and at most 10000 Hz", key="option.value")
 
 
-def convert_log(source: str, out: Path, name: str | None, topics: Sequence[str] = ()) -> tuple[Log, list[Path]]:
+def convert_log(
+    source: str, out: Path, name: str | None, topics: Sequence[str] = (), force: bool = False
+) -> tuple[Log, list[Path]]:
     """Read a log of any known kind and write it as a recording folder.
 
     Raises
@@ -61,13 +63,16 @@ def convert_log(source: str, out: Path, name: str | None, topics: Sequence[str] 
     RecordingError
         If it cannot be read.
     ConfigError
-        If it would be written over itself.
+        If it would be written over itself, or without `force` over another recording.
     """
     log = _with_measured_noise(load(source, name, topics))
     if any(file.resolve().parent == out.resolve() and file.name.endswith((".toml", ".csv.gz")) for file in log.files):
         raise ConfigError(f"-o {out}: the recording is read from there; name another folder", key="output.is_input")
     with stage_results(out) as part:
         files = write_recording(log, part)
+        described = out / "recording.toml"
+        if not force and described.exists() and described.read_bytes() != (part / described.name).read_bytes():
+            raise ConfigError(f"{described}: is another recording's; say --force to write over it", key="output.exists")
     return log, final_path(files, part, out)
 
 

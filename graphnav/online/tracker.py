@@ -128,7 +128,7 @@ class Tracker(Chain):
         self._finish_keyframes()
         clock.append(time.thread_time())
         if len(new):
-            self.seconds = dict(zip(("looking", "building", "solving"), np.diff(clock).tolist(), strict=True))
+            self.seconds = dict(zip(("detecting", "building", "solving"), np.diff(clock).tolist(), strict=True))
         return built.redone if back is None else min(built.redone, self._go_back(sensors, built, back))
 
     def _begin(self, sensors: Sensors, new: Array, dirty: float) -> BuiltKeyframes | None:

@@ -50,7 +50,7 @@ def view(session: Session, silent: float = 0.0) -> list[tuple[str, str]]:
             ("speed", f"{speed:.2f} m/s, up {climb:+.2f} m/s   1-sigma {track.sd_v[0].max():.3f} m/s"),
             ("attitude", f"roll {roll:.2f} pitch {pitch:.2f} heading {heading:.2f} deg   1-sigma {sd[3]:.3f} deg"),
             ("in force", ", ".join(tracker.in_force) or "nothing but the IMU"),
-            ("last fix", f"{now.t - sensors.gnss.newest:.1f} s ago" if len(sensors.gnss) else "none yet"),
+            ("last fix", f"{max(now.t - sensors.gnss.newest, 0.0):.1f} s ago" if len(sensors.gnss) else "none yet"),
             ("window", f"{len(tracker.window)} keyframes, {tracker.newest - tracker.head:.0f} s"),
             ("update", ", ".join(f"{name} {1e3 * s:.1f} ms" for name, s in tracker.seconds.items())),
         ]

@@ -12,6 +12,7 @@ from markupsafe import Markup
 
 from graphnav.core.notes import Note, key_of
 from graphnav.core.timescales import GPS_TO_UNIX, gps_to_utc
+from graphnav.estimation.names import has_names
 from graphnav.estimation.solution import Solution
 from graphnav.recording import Recording
 from graphnav.report import page
@@ -20,7 +21,6 @@ from graphnav.report import sentences as words
 from graphnav.report import summary as summary
 from graphnav.report import tables as tables
 from graphnav.report.doubts import list_doubts
-from graphnav.report.names import has_names
 from graphnav.report.plots import Shades, Spans
 from graphnav.report.provenance import provenance_tables
 from graphnav.report.satellites import satellite_parts

@@ -14,11 +14,11 @@ from graphnav.core.interpolation import fit_yaw, yaw_matrix
 from graphnav.core.rotation import Array
 from graphnav.core.trajectory import Trajectory
 from graphnav.detectors.base import Detection
+from graphnav.estimation.names import components
 from graphnav.estimation.solution import ParameterEstimate, Solution
 from graphnav.evaluation.against import own_solutions
 from graphnav.recording import FIX_TYPES, Recording
 from graphnav.report import page, plots
-from graphnav.report.names import components
 from graphnav.report.plots import Series, Shades, Spans
 from graphnav.report.plots.way import draw_fixes
 
@@ -310,12 +310,12 @@ def parameter_pictures(
     for name, p in parameters.items():
         if len(p.t) > 2 and np.any(p.sigma < 0.5 * p.prior_sigma):
             told = np.any(p.sigma < 0.5 * p.prior_sigma, axis=0)
-            shown = [one for one, drawn in zip(components(name, p), told, strict=True) if drawn]
+            shown = [one for one, drawn in zip(components(name, p.value.shape[1], p.unit), told, strict=True) if drawn]
             scale = np.array([one.scale for one in shown])
             series = {solver: Series(p.t - start, scale * p.value[:, told], scale * p.sigma[:, told])}
             titles, units = [one.words for one in shown], [one.unit for one in shown]
             figure = plots.bands(series, titles, units, end, spans=spans, about_zero=False)
-            words = name.replace("_", " ")
+            words = " ".join(one.upper() if one in ("gnss", "imu") else one for one in name.split("_"))
             out.append(page.picture(figure, f"{words[:1].upper()}{words[1:]} and 3 sigma"))
     return out
 

@@ -10,6 +10,7 @@ from markupsafe import Markup
 
 from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
+from graphnav.estimation.names import components
 from graphnav.estimation.noise.model import INTERVALS
 from graphnav.estimation.solution import ParameterEstimate, Solution
 from graphnav.estimation.stops import stops_of_solution
@@ -18,7 +19,6 @@ from graphnav.evaluation.segments import rms
 from graphnav.recording import Recording
 from graphnav.report import page, wording
 from graphnav.report.consistency import CONSISTENCY_HEAD, consistency, consistency_row, mean_or_nan
-from graphnav.report.names import components
 from graphnav.report.plots import Spans
 from graphnav.report.wording import Quantity, and_list
 
@@ -261,7 +261,7 @@ def parameter_table(parameters: Mapping[str, ParameterEstimate]) -> list[Markup]
     """Constant and slowly varying parameters: last value and sigma, and their priors."""
     rows = []
     for name, p in parameters.items():
-        for k, one in enumerate(components(name, p)):
+        for k, one in enumerate(components(name, p.value.shape[1], p.unit)):
             value, sigma = one.scale * float(p.value[-1, k]), one.scale * float(p.sigma[-1, k])
             known = "yes" if p.observable[k] else "no: mostly the prior"
             before = one.scale * float(p.prior_sigma[k])

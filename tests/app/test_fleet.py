@@ -224,6 +224,7 @@ def test_a_manifest_gives_each_drive_its_own_settings(tmp_path: Path) -> None:
         ("recording,end\nkitti\n", ("line 2", "2 cells")),
         ("recording\n", ("no recording",)),
         ("recording\n../elsewhere\n", ("line 2", "--allow-outside")),
+        ("recording,start\nkitti,nan\n", ("line 2", "start", "nan")),
         ("recording,config\nkitti,/etc/settings.toml\n", ("line 2", "config", "--allow-outside")),
     ],
 )
@@ -235,6 +236,28 @@ def test_a_manifest_that_cannot_be_is_refused_where_it_says_so(tmp_path: Path, t
     assert "m.csv" in str(caught.value)
     for word in words:
         assert word in str(caught.value)
+
+
+def test_a_manifest_is_not_blamed_for_what_the_command_line_says(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "m.csv").write_text("recording\nkitti\n")
+    for option, value in (("--without", "gnss:soon"), ("--start", "nan"), ("--config", "missing.toml")):
+        assert cli.run(["fleet", str(tmp_path / "m.csv"), "-o", str(tmp_path / "out"), option, value]) == 2
+        said = capsys.readouterr().err
+        assert value in said
+        assert "m.csv" not in said
+    assert not (tmp_path / "out").exists()
+
+
+def test_drives_in_which_nothing_could_be_withheld_are_counted() -> None:
+    parts = [load("kitti").crop(100.0, 100.0 + length) for length in (104.9, 105.1, 300.0, 300.0)]
+    parts[2] = replace(parts[2], gnss=None)
+    rows = [{"status": DONE, "placed": part.gnss is not None, "duration_s": part.duration} for part in parts]
+    unscored = [row for row, part in zip(rows, parts, strict=True) if not spans(part, 15.0)]
+    assert unscored == [rows[0], rows[2]]
+    assert "2 of 4" in tables.describe_unscored([*rows, {"status": REFUSED}], 15.0)
+    assert tables.describe_unscored([rows[1], rows[3]], 15.0) == ""
 
 
 def test_withheld_spans_are_outages_by_themselves() -> None:

@@ -311,6 +311,19 @@ def test_a_recording_is_not_written_over_itself(tmp_path, kf_gins):
         convert.convert_log(str(tmp_path / "out"), tmp_path / "out", None)
 
 
+def test_another_recording_is_not_written_over_unasked(tmp_path, kf_gins):
+    out, described = tmp_path / "out", tmp_path / "out" / "recording.toml"
+    convert.convert_log(str(kf_gins), out, None)
+    convert.convert_log(str(kf_gins), out, None)
+    described.write_text(described.read_text() + "# measured by hand\n")
+    before = {file: file.read_bytes() for file in out.iterdir()}
+    with refused("output.exists", ConfigError, "recording.toml"):
+        convert.convert_log("kitti", out, None)
+    assert {file: file.read_bytes() for file in out.iterdir()} == before
+    convert.convert_log("kitti", out, None, force=True)
+    assert "by hand" not in described.read_text()
+
+
 def test_unknown_formats_and_files_say_what_is_known(tmp_path):
     (tmp_path / "a.txt").write_text("hello\n")
     with refused("recording.none", RecordingError, "a.txt", "kf-gins"):

@@ -201,6 +201,15 @@ def test_trajectory_is_to_scale_and_marks_what_happened():
     assert (x_of(stop), y_of(stop).tolist(), numbers(stop["customdata"]).tolist()) == ([123.0], [41.0], [40.0])
 
 
+@pytest.mark.parametrize(("over", "up"), [(30.0, 0.0), (-30.0, 2.0), (25.0, -10.0), (0.0, -25.0), (0.0, 25.0)])
+def test_labels_of_ends_that_are_near_do_not_cover_each_other(over: float, up: float) -> None:
+    way = np.array([[0.0, 0.0], [1000.0, 0.0], [1000.0, 500.0], [over, up]])
+    notes = [note for note in plots.trajectory({"batch": (T[:4], way)}).annotations if note["text"] in ("start", "end")]
+    (low, high) = sorted((note["y"] + note["yshift"], note["y"]) for note in notes)  # a metre is about a pixel
+    assert high[0] - low[0] >= 14.0  # a line of text
+    assert high[1] >= low[1]
+
+
 def test_scale_bar_is_as_long_as_it_says():
     figure = plots.trajectory({"batch": (T, np.stack([3 * T, T], -1))})
     words = next(note["text"] for note in figure.annotations if note["text"].endswith((" m", " km")))

@@ -22,6 +22,7 @@ from graphnav.core.earth import LocalFrame
 from graphnav.core.notes import Note, key_of
 from graphnav.core.state import States
 from graphnav.detectors.base import Detection
+from graphnav.estimation.names import components, has_names
 from graphnav.estimation.noise.model import NoiseModel, RowWeights, VarianceComponent
 from graphnav.estimation.noise.table import figure_rows
 from graphnav.estimation.solution import (
@@ -43,7 +44,6 @@ from graphnav.report import pictures as report_pictures
 from graphnav.report.consistency import consistency
 from graphnav.report.documents import write_comparison, write_report
 from graphnav.report.doubts import find_departures, list_doubts
-from graphnav.report.names import components, has_names
 from graphnav.report.provenance import command, toml_text
 from graphnav.report.sentences import describe_sigma_without_truth
 from graphnav.report.summary import fix_table, left_out, sigma_table, verdicts
@@ -364,14 +364,12 @@ def test_a_calibration_has_names_and_no_index():
     sizes = {SCALE: 6, MOUNTING: 2, AXLE: 1, BODY: 2, ODOMETER_SCALE: 1, ODOMETER_DELAY: 1, LEVER_ARM: 3,
              TIME_OFFSET: 1, VELOCITY_TIME_OFFSET: 1, PIVOT: 3, TRAVEL: 2, FOOT_AXIS: 2}  # fmt: skip
     for name, size in (*sizes.items(), (SCALE, 18)):
-        one = np.ones((1, size))
-        found = components(name, ParameterEstimate(np.zeros(1), one, one, one[0], "u"))
+        found = components(name, size, "u")
         assert has_names(name)
         assert len({c.words for c in found}) == size
         assert not any("[" in c.words for c in found)
-    one = np.ones((1, 15))
     assert not has_names(PATTERN)
-    assert len(components(PATTERN, ParameterEstimate(np.zeros(1), one, one, one[0], "m/s"))) == 15
+    assert len(components(PATTERN, 15, "m/s")) == 15
 
 
 def test_relative_errors_are_those_of_displacements():

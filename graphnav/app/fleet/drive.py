@@ -33,7 +33,7 @@ NAME = "drive.json"
 DONE, REFUSED, FAILED, CRASHED, HUNG = "done", "refused", "failed", "crashed", "hung"
 _FINAL = (DONE, REFUSED)  # statuses that the same program reproduces from the same input
 _POINTS = 200  # points of a track on the map
-_FIRST, _BETWEEN = 60.0, 30.0  # s before the first withheld span, and multiples of a span's length after each
+FIRST_SPAN, AFTER_SPANS = 60.0, 30.0  # s before the first withheld span and after the last
 
 Row = dict[str, Any]
 
@@ -60,7 +60,7 @@ def solve_drive(task: Task) -> Row:
     except GraphnavError as error:
         row |= {"status": REFUSED, "error": str(error)}
     except MemoryError:
-        row["error"] = "out of memory; give a shorter part (start, end)"
+        row["error"] = "out of memory; raise --memory or solve a shorter part (start, end)"
     except OSError as error:
         row["error"] = f"{error.filename or 'input or output'}: {error.strerror or error}"
     except Exception as error:
@@ -157,7 +157,7 @@ def spans(recording: Recording, length: float, zero: float = 0.0) -> list[tuple[
     """
     if recording.gnss is None:
         return []
-    starts = np.arange(_FIRST, recording.duration - length - _BETWEEN + 1e-9, 2.0 * length + _BETWEEN)
+    starts = np.arange(FIRST_SPAN, recording.duration - length - AFTER_SPANS + 1e-9, 2.0 * length + AFTER_SPANS)
     return [(float(zero + s), float(zero + s + length)) for s in starts]
 
 

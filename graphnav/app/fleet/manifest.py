@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import math
 import os
 import re
 import tomllib
@@ -108,29 +109,42 @@ def build_task(
         Naming where it was said.
     """
     name, source, asked, where = drive
-    if asked.solver not in KNOWN:
-        raise ConfigError(
-            f"{where}: no solver '{asked.solver}'; {suggest_nearest(asked.solver, KNOWN)}", key="manifest.solver"
-        )
     try:
-        without = tuple((asked.without or "").split())
-        for one in without:
-            parse_withheld(one)
-        key = (asked.config, asked.profile, asked.settings, asked.noise)
-        if key not in known:
-            settings = read_settings(asked.config, asked.profile)
-            if asked.settings:
-                settings = settings_from(_overlay(settings.model_dump(exclude_unset=True), _toml(asked.settings)))
-            known[key] = parse_noise(asked.noise, settings)[0].model_dump(mode="json")
+        without, settings = resolve_options(asked, known)
     except ConfigError as error:
         raise ConfigError(f"{where}: {error}", key=error.key) from None
-    if asked.start is not None and asked.end is not None and not asked.start < asked.end:
-        raise ConfigError(f"{where}: end {asked.end:g} must be later than start {asked.start:g}", key="manifest.span")
     given = asked.noise if asked.noise is not None and Path(asked.noise).is_file() else None
     return Task(
-        name, source, str(out / "drives" / name), asked.solver, known[key], given, without,
+        name, source, str(out / "drives" / name), asked.solver, settings, given, without,
         start=asked.start, end=asked.end, **common,
     )  # fmt: skip
+
+
+def resolve_options(asked: DriveOptions, known: dict[Any, dict[str, Any]]) -> tuple[tuple[str, ...], dict[str, Any]]:
+    """What is withheld and the settings of a drive, checked; `known` caches settings that drives share.
+
+    Raises
+    ------
+    ConfigError
+        Naming the option.
+    """
+    if asked.solver not in KNOWN:
+        raise ConfigError(f"no solver '{asked.solver}'; {suggest_nearest(asked.solver, KNOWN)}", key="manifest.solver")
+    without = tuple((asked.without or "").split())
+    for one in without:
+        parse_withheld(one)
+    for name, value in (("start", asked.start), ("end", asked.end)):
+        if value is not None and not math.isfinite(value):
+            raise ConfigError(f"{name} {value:g} is not a number of seconds", key="manifest.value")
+    if asked.start is not None and asked.end is not None and not asked.start < asked.end:
+        raise ConfigError(f"end {asked.end:g} must be later than start {asked.start:g}", key="manifest.span")
+    key = (asked.config, asked.profile, asked.settings, asked.noise)
+    if key not in known:
+        settings = read_settings(asked.config, asked.profile)
+        if asked.settings:
+            settings = settings_from(_overlay(settings.model_dump(exclude_unset=True), _toml(asked.settings)))
+        known[key] = parse_noise(asked.noise, settings)[0].model_dump(mode="json")
+    return without, known[key]
 
 
 def _find_recordings(folder: Path) -> list[Path]:

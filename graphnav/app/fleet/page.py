@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from graphnav.app.fleet.drive import DONE, Row
-from graphnav.app.fleet.tables import numbers, totals, worst_first
+from graphnav.app.fleet.tables import describe_totals, numbers, totals, worst_first
 from graphnav.core.rotation import Array
 
 _MAX_DRIVES = 1000  # drives in the page's table; the files contain all
@@ -51,11 +51,7 @@ a{color:var(--ink)}
 
 def write_page(rows: Sequence[Row], path: Path, title: str) -> None:
     """Write the page; it links to the reports beside it."""
-    found = totals(rows)
-    said = ", ".join(f"{count} {status}" for status, count in found["status"].items())
-    lead = (
-        f"{found['drives']} drives, {found['hours']:.2f} h, {found['km']:.1f} km: {said}; {found['doubtful']} doubtful."
-    )
+    lead = f"{describe_totals(totals(rows))}."
     spread = [
         _draw_histogram(numbers(rows, key), label) for key, label in _HISTOGRAMS.items() if len(numbers(rows, key)) > 1
     ]

@@ -5,14 +5,15 @@ from __future__ import annotations
 import csv
 import io
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from graphnav.app.fleet.drive import DONE, MEASURED, Row
+from graphnav.app.fleet.drive import AFTER_SPANS, DONE, FIRST_SPAN, MEASURED, Row
+from graphnav.core.notes import format_count
 from graphnav.core.rotation import Array
 
 COLUMNS = (
@@ -33,6 +34,19 @@ _TEXTS = (
     "report",
     "version",
 )
+MEDIANS = {
+    "span_end_h_median_m": "horizontal error at the end of a withheld span (m)",
+    "h_rms_m": "horizontal error, rms (m)",
+    "h_p95_m": "horizontal error, 95 % (m)",
+    "h_max_m": "horizontal error, largest (m)",
+    "up_rms_m": "height error, rms (m)",
+    "3d_rms_m": "position error in space, rms (m)",
+    "heading_rms_deg": "heading error, rms (deg)",
+    "closure_h_m": "horizontal gap between end and start (m)",
+    "nees_p": "NEES of the position, 1 where the sigmas are true",
+    "nees_p_inside_95": "share of the positions within their 95 % regions",
+    "sd_h_median_m": "horizontal sigma (m)",
+}
 _BADNESS = ("span_end_h_median_m", "h_rms_m", "sd_h_median_m")
 
 
@@ -94,18 +108,35 @@ def totals(rows: Sequence[Row]) -> dict[str, Any]:
         "km": round(float(numbers(solved, "distance_m").sum()) / 1000.0, 3),
         "processor_s": round(float(numbers(rows, "time_s").sum()), 1),
         "memory_mb": float(numbers(rows, "memory_mb").max(initial=0.0)),
-        "medians": {key: float(np.median(x)) for key in (*MEASURED, *_BADNESS) if len(x := numbers(rows, key))},
+        "medians": {key: float(np.median(x)) for key in MEDIANS if len(x := numbers(rows, key))},
     }
+
+
+def describe_totals(found: Mapping[str, Any]) -> str:
+    """The first line about a fleet."""
+    said = ", ".join(f"{count} {status}" for status, count in found["status"].items())
+    drives = format_count(found["drives"], "drive")
+    return f"{drives}, {found['hours']:.2f} h, {found['km']:.1f} km: {said}; {found['doubtful']} doubtful"
+
+
+def describe_unscored(rows: Sequence[Row], withhold: float) -> str:
+    """A line about the drives in which no span of `withhold` s could be withheld, "" if there are none."""
+    solved = [row for row in rows if row["status"] == DONE]
+    least = FIRST_SPAN + withhold + AFTER_SPANS
+    count = sum(not row.get("placed") or row["duration_s"] < least for row in solved)
+    if not count:
+        return ""
+    of = f"{count} of {format_count(len(solved), 'solved drive')}"
+    return f"\nnothing withheld by --withhold {withhold:g} in {of}: no GNSS, or shorter than {least:g} s"
 
 
 def text(rows: Sequence[Row], most: int = 10) -> str:
     """The totals, and the failed drives, for a terminal."""
     found = totals(rows)
-    said = ", ".join(f"{count} {status}" for status, count in found["status"].items())
-    lines = [
-        f"{found['drives']} drives, {found['hours']:.2f} h, {found['km']:.1f} km: {said}; {found['doubtful']} doubtful"
-    ]
-    lines += [f"  median {key:<22}{value:10.4g}" for key, value in found["medians"].items()]
+    lines = [describe_totals(found)]
+    if found["medians"]:
+        lines.append("medians of the drives:")
+    lines += [f"  {MEDIANS[key]:<54}{value:10.4g}" for key, value in found["medians"].items()]
     lost = [row for row in rows if row["status"] != DONE]
     lines += [f"  {row['drive']}: {row['status']}: {row.get('error')}" for row in lost[:most]]
     return "\n".join([*lines, *([f"  and {len(lost) - most} more"] if len(lost) > most else [])])

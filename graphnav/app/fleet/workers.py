@@ -80,9 +80,7 @@ class Worker:
         self._process = None
         spent = time.monotonic() - began
         if late.is_set():
-            return make_lost_row(
-                task, HUNG, f"not done in {self._limits.seconds:g} s, and ended; --limit gives it longer", spent
-            )
+            return make_lost_row(task, HUNG, f"ended after {self._limits.seconds:g} s, the --limit of one drive", spent)
         return make_lost_row(task, CRASHED, f"the process that solved it {_end_of(code)}", spent)
 
     def close(self) -> None:

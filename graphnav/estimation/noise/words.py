@@ -8,6 +8,7 @@ from graphnav.constraints.gnss import STAMP_ERROR, GnssPosition
 from graphnav.constraints.vehicle import MOUNTING
 from graphnav.core.notes import Note, format_count
 from graphnav.core.rotation import wrap
+from graphnav.estimation.names import components
 from graphnav.estimation.noise.model import INTERVALS, NoiseModel
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.linearise import Points, shift
@@ -42,12 +43,12 @@ def describe_far(problem: Problem, smoothed: Points) -> tuple[str, ...]:
             )
             out.append(Note("doubt.axes", f"The attitude cannot be trusted: {said}; check axes in [imu]"))
         elif away[k] > _FAR:
-            which = f" (number {k + 1} of {p.size})" if p.size > 1 else ""
-            unit = "" if p.unit == "1" else f" {p.unit}"
+            shown = components(p.name, p.size, p.unit)[k]
+            found, given, sd = (float(f"{shown.scale * x:.2g}") for x in (value[k], stated[k], sigma[k]))
             out.append(
                 Note(
                     "noise.far_from_stated",
-                    f"{p.name}{which}: estimated {value[k]:.2g}{unit}, stated {stated[k]:.2g} +- {sigma[k]:.2g}, "
+                    f"{shown.words}: estimated {found:g} {shown.unit}, stated {given:g} +- {sd:g}, "
                     f"{away[k]:.0f} sigmas apart: what is stated is wrong, or it absorbs an error of another kind",
                 )
             )

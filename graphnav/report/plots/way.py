@@ -12,6 +12,7 @@ from graphnav.core.rotation import Array
 from graphnav.report.plots.figure import SHADES, Figure, Panel, Spans, colour, limits
 
 _MARKED_STOPS = 60  # stops that are marked individually
+_LABEL = 120.0  # pixels on a wide screen of a label on a phone
 _WIDE, _HIGH = 1080.0, 560  # pixels of the map on a wide screen; narrower pages show more of the north
 
 
@@ -133,6 +134,8 @@ def _mark_ends(panel: Panel, en: Array, scale: float) -> None:
     west, east = panel.xlim
     edge = 0.12 * (east - west)  # room for labels on a phone
     together = bool(np.linalg.norm(en[-1] - en[0]) < 16.0 * scale)
+    near = bool(np.linalg.norm(en[-1] - en[0]) < _LABEL * scale)
+    lower = -int(en[-1, 1] < en[0, 1])  # the row whose label goes below, so that one does not cover the other
     few = max(1, len(en) // 30)
     for row, inner, marker, words in ((0, few, "^", "start"), (-1, max(-1 - few, -len(en)), "s", "end")):
         panel.dots(en[[row], 0], en[[row], 1], "truth", "", 10.0, marker)
@@ -140,7 +143,8 @@ def _mark_ends(panel: Panel, en: Array, scale: float) -> None:
         left = bool(x > east - edge or (x < en[min(inner, len(en) - 1), 0] and x > west + edge))
         if not (together and row == 0):
             words = "start and end" if together else words
-            panel.words(float(x), float(en[row, 1]), words, "right" if left else "left", (-8 if left else 8, 0))
+            down = -18 if near and not together and row == lower else 0
+            panel.words(float(x), float(en[row, 1]), words, "right" if left else "left", (-8 if left else 8, down))
 
 
 def _scale_bar(figure: Figure, panel: Panel) -> None:

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from functools import cache
 
 from graphnav.constraints import list_constraints
-from graphnav.estimation.solution import ParameterEstimate
 
 _AXES = ("right", "forward", "up")
 _DEG = 57.29577951308232
@@ -71,14 +70,12 @@ def _by_constraints() -> dict[str, list[Component]]:
     return {name: [Component(*one) for one in each] for kind in list_constraints() for name, each in kind.words.items()}
 
 
-def components(name: str, estimate: ParameterEstimate) -> list[Component]:
+def components(name: str, size: int, unit: str) -> list[Component]:
     """One per number of a parameter; those without a name are numbered."""
-    size = estimate.value.shape[1]
     known = _scales(size // 2) if name == "imu_scale" else (_NAMED | _by_constraints()).get(name, [])
     if len(known) == size:
         return known
-    unit = estimate.unit or "-"
     if size == 1:
-        return [Component(name, unit)]
+        return [Component(name, unit or "-")]
     axes = ("east", "north", "up") if name.startswith("gnss_") and size == 3 else range(size)
-    return [Component(f"{name} [{axis}]", unit) for axis in axes]
+    return [Component(f"{name} [{axis}]", unit or "-") for axis in axes]
