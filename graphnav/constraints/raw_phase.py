@@ -34,14 +34,12 @@ from graphnav.core.rotation import Array
 from graphnav.core.state import Parameter, States
 from graphnav.gnss.arcs import find_arcs
 from graphnav.gnss.atmosphere import obliquity
-from graphnav.gnss.sigmas import carrier_difference_sigma, reflection_sigma
+from graphnav.gnss.sigmas import REFLECTED, carrier_difference_sigma, reflection_sigma
 from graphnav.gnss.signals import GLONASS, L1, C
 from graphnav.gnss.single_point import choose_coefficients, look
 from graphnav.recording import Recording
 
 REFLECTIONS = "gnss_reflections"
-# s, correlation time of reflections: by the residuals of two drives 13 and 30 s on the way, longer at rest
-_LASTING = 20.0
 _WEAKEST = 1e-3  # of the information on a place in its best direction; where there is less, satellites do not tell
 EXACT = 1e-3  # cycles, 1-sigma of a difference that is known as an integer: a tenth of a carrier's noise
 
@@ -110,9 +108,12 @@ class GnssPhase(RangeConstraint):
             "elevation": geometry.elevation,
             "level": np.zeros(int(used.sum()), dtype=int),
         }
-        lasting = Parameter(REFLECTIONS, np.zeros(3), np.ones(3), "1", correlation_time=_LASTING, spacing=found.spacing)
+        lasting = Parameter(
+            REFLECTIONS, np.zeros(3), np.ones(3), "1", correlation_time=REFLECTED, spacing=found.spacing
+        )
         common["parameters"] += (ionosphere_parameter(found.raw, found.spacing), lasting, *(own[k] for k in there))
-        nominal, reflection = (raw.antenna - frame.r_e) @ frame.R_ne.T, reflection_sigma(geometry.elevation)
+        nominal = (raw.antenna - frame.r_e) @ frame.R_ne.T
+        reflection = np.sqrt(2.0) * reflection_sigma(geometry.elevation)  # of two receivers
         known = geometry.distance + geometry.troposphere - geometry.ionosphere
         return cls(
             offset=known - wavelength[used] * raw.carrier - raw.carrier_difference - raw.clock,
@@ -149,7 +150,7 @@ def variance_left(duration: Array, period: float) -> Array:
 
     The variance of the mean of a Gauss-Markov sequence (Brockwell and Davis 1991, section 7.1) less 1 / n.
     """
-    n, a = 1.0 + duration / period, np.exp(-period / _LASTING)
+    n, a = 1.0 + duration / period, np.exp(-period / REFLECTED)
     return np.asarray(2.0 * a / (n * (1.0 - a)) * (1.0 - (1.0 - a**n) / (n * (1.0 - a))))
 
 

@@ -6,9 +6,11 @@ satellite's codes are wrong by (its code biases), N the ambiguity of a carrier's
     r_code    = |s - p_a| + b + b_s + m z + q + [...] - dt - P
     r_carrier = |s - p_a| + b + b_s + m z + N + o + d + [...] - dt - Phi
 
-o is what a satellite's orbit is off by, for hours; d, of satellites whose clocks are unsteady, what these are off the
-line between two nodes of the product. Clock b, lever arm and ambiguities are parameters as those of
-`graphnav.constraints.raw_gnss`; the bias of another system is a constant.
+o is what a satellite's orbit is off by, for hours; d what lasts for seconds: reflections, and what its clock is off the
+line between two nodes of the product. Both are far larger than the white noise of a carrier, and what float
+ambiguities tell of a place are changes of millimetres: without d a single satellite moves it by decimetres. Clock b,
+lever arm and ambiguities are parameters as those of `graphnav.constraints.raw_gnss`; the bias of another system is a
+constant.
 """
 
 from __future__ import annotations
@@ -30,21 +32,19 @@ from graphnav.core.rotation import Array
 from graphnav.core.state import Parameter, States
 from graphnav.gnss.ppp import SECOND, IonosphereFree, ionosphere_free, second_signals
 from graphnav.gnss.series import RawGnss
-from graphnav.gnss.sigmas import carrier_sigma, code_sigma
+from graphnav.gnss.sigmas import REFLECTED, carrier_sigma, code_sigma, reflection_sigma
 from graphnav.gnss.signals import C
 from graphnav.gnss.single_point import signal_groups
 from graphnav.recording import Recording
 
 WET = "gnss_wet_delay"
 ORBITS = "gnss_satellite_orbits"
-CLOCKS = "gnss_satellite_clocks"
+LASTING = "gnss_carrier_errors"
 _WET, _WET_WALK = 0.1, 1.7e-4  # m, of a standard atmosphere's; m/sqrt(s): 1 cm in an hour (Kouba and Heroux 2001)
 _CODE_BIAS = 1.0  # m: a code's differential bias, half a nanosecond or two, in the combination
 _BIAS_WALK = 1e-5  # m/sqrt(s), a millimetre in three hours
 # m, towards a satellite, for hours: final orbits are good to 2.5 cm (IGS, "Products")
 _ORBIT = 0.025
-_ARCH = 0.25  # of the way between two nodes, for which a clock that is off the line stays off it
-_STEADY = 0.005  # m off a line between two nodes: half of a carrier's noise in the combination, in which it is lost
 
 
 @dataclass(frozen=True)
@@ -181,10 +181,7 @@ class GnssPppCarrier(_Ppp):
     slots: tuple[str, ...] = ()  # names of the ambiguities
     slot: Array = field(default_factory=lambda: np.empty(0, dtype=int))  # (N,) index of `slots`
     begin: Array = field(default_factory=lambda: np.empty(0))  # (N,) s, of the arc
-    clock: Array = field(default_factory=lambda: np.empty(0, dtype=int))  # (N,) of the unsteady ones; -1 of the others
-    off_line: Array = field(
-        default_factory=lambda: np.empty(0)
-    )  # (N,) sigma of such a clock over that between two nodes
+    lasting: Array = field(default_factory=lambda: np.empty(0))  # (N,) m, 1-sigma of what lasts for seconds
 
     @classmethod
     def epochs(cls, recording: Recording, settings: Settings, stationary: Array) -> Array:
@@ -210,18 +207,16 @@ class GnssPppCarrier(_Ppp):
                 ORBITS, np.zeros(size), np.full(size, _ORBIT), "m", correlation_time=hours, spacing=free.found.spacing
             ),
         )
+        common["parameters"] += (
+            Parameter(
+                LASTING, np.zeros(size), np.ones(size), "1", correlation_time=REFLECTED, spacing=free.found.spacing
+            ),
+        )
         noise = raw.clock_noise
-        apart = np.array([noise.get(s, (0.0, 1.0))[1] for s in raw.satellite.tolist()])
+        middle, apart = np.array([noise.get(s, (0.0, 1.0)) for s in raw.satellite.tolist()]).T
         between = np.mod(raw.t + raw.zero, apart) / apart  # nodes are at whole numbers of their spacing
-        unsteady = [s for s in free.found.raw.satellites[0].tolist() if noise.get(s, (0.0, 0.0))[0] > _STEADY]
-        if unsteady:
-            sigma, spacing = np.array([noise[s] for s in unsteady]).T
-            common["parameters"] += (
-                Parameter(
-                    CLOCKS, np.zeros(len(unsteady)), sigma, "m", correlation_time=_ARCH * float(spacing.max()),
-                    spacing=free.found.spacing,
-                ),
-            )  # fmt: skip
+        off_line = 2.0 * middle * np.sqrt(between * (1.0 - between))
+        reflected = rows.growth[used] * reflection_sigma(rows.geometry.elevation[used])
         if scene.settings.raw_gnss.robust == "automatic":  # a slip is no error that a variance can describe
             common["robust"] = "cauchy"
         sigma = rows.growth[used] * carrier_sigma(raw.cn0, rows.geometry.elevation[used], C / raw.frequency)
@@ -231,8 +226,7 @@ class GnssPppCarrier(_Ppp):
             slots=tuple(ambiguity_name(arcs.names[k]) for k in there),
             slot=np.searchsorted(there, arcs.slot[used]),
             begin=arcs.begin[used],
-            clock=np.array([unsteady.index(s) if s in unsteady else -1 for s in raw.satellite.tolist()], dtype=int),
-            off_line=2.0 * np.sqrt(between * (1.0 - between)),
+            lasting=np.hypot(off_line, reflected),
             **common,
         )
 
@@ -240,9 +234,9 @@ class GnssPppCarrier(_Ppp):
         residual, J = self._linearize_free_ranges(states, parameters, rows)
         own, J[ORBITS] = select_columns(parameters[ORBITS], self.which[rows])
         residual, slot = residual + own, self.slot[rows]
-        if CLOCKS in parameters:
-            own, J[CLOCKS] = select_columns(parameters[CLOCKS], self.clock[rows])
-            residual, J[CLOCKS] = residual + self.off_line[rows] * own, self.off_line[rows, None, None] * J[CLOCKS]
+        own, J[LASTING] = select_columns(parameters[LASTING], self.which[rows])
+        lasting = self.lasting[rows]
+        residual, J[LASTING] = residual + lasting * own, lasting[:, None, None] * J[LASTING]
         for k, name in enumerate(self.slots):
             one = (slot == k).astype(float)
             residual = residual + one * parameters[name][:, 0]

@@ -8,18 +8,19 @@ import numpy as np
 import oracle
 import pytest
 import raw_drive
-from helpers import refused
+from helpers import errors, refused
 
 from graphnav.config import settings_from
 from graphnav.core import earth
 from graphnav.core.errors import ConfigError, GraphnavError, RecordingError
 from graphnav.estimation.pipeline import run
 from graphnav.gnss.antex import read_antex, satellite_axes, wind_up
-from graphnav.gnss.atmosphere import niell
+from graphnav.gnss.atmosphere import directions, niell
 from graphnav.gnss.load import Sources, load_raw
 from graphnav.gnss.ppp import ionosphere_free
 from graphnav.gnss.precise import Orbits
 from graphnav.gnss.series import primary
+from graphnav.gnss.sigmas import REFLECTED, reflection_sigma
 from graphnav.gnss.signals import L1, C, satellite_id, satellite_name, signal_id
 from graphnav.gnss.tides import solid_tide, sun_and_moon
 from graphnav.recording import Gnss, Imu, ImuNoise, Recording
@@ -190,6 +191,36 @@ def test_how_far_clocks_are_off_a_line_is_told_by_their_nodes():
     assert apart == 300.0
     assert sigma == pytest.approx(C * np.sqrt(np.mean(middle**2)), rel=0.2)
     assert noise[6][0] < 1e-6
+
+
+def test_reflections_that_last_are_in_the_sigma():
+    """As long and as large as they are taken to be, on both signals of each satellite; three drives."""
+    drive, total = oracle.vehicle_path(120.0), 0.0
+    made, truth = oracle.drive(drive, seed=5, gnss_velocity_sd=(0.1, 0.1, 0.1))
+    plain = raw_drive.with_observations(made, drive, noise=0.3, carrier=0.002, second=True, seed=1).crop(0.0, 110.0)
+    raw = plain.raw_gnss
+    _, elevation = directions(raw.antenna, raw.p)
+    heading = float(np.degrees(truth.rph[0, 2])) % 360.0
+    for seed in range(3):
+        rng, carrier = np.random.default_rng(seed), raw.carrier.copy()
+        for satellite, signal in sorted(set(zip(raw.satellite.tolist(), raw.signal.tolist(), strict=True))):
+            own = (raw.satellite == satellite) & (raw.signal == signal)
+            decay = np.exp(-np.diff(raw.t[own]) / REFLECTED)
+            x = rng.standard_normal(int(own.sum()))
+            for i, a in enumerate(decay):
+                x[i + 1] = a * x[i] + np.sqrt(1.0 - a * a) * x[i + 1]
+            carrier[own] += reflection_sigma(elevation[own]) * x * raw.frequency[own] / C
+        spoilt = replace(plain, raw_gnss=replace(raw, carrier=carrier))
+        chosen = {
+            "raw_gnss": {"ppp": True, "period": 5.0},
+            "noise": {"mode": "stated"},
+            "alignment": {"heading": heading},
+            "keyframes": {"rate": 0.2},
+        }
+        found = run(spoilt, settings_from(chosen), ("ekf",))["ekf"]
+        off = errors(found, truth)[0][-1]
+        total += off @ np.linalg.solve(found.covariance[-1][3:6, 3:6], off)
+    assert 1.15 < total < 27.9  # chi-square of 9, 0.1 and 99.9 %
 
 
 def test_ppp_says_what_it_lacks():

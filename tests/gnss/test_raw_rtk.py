@@ -28,7 +28,7 @@ from graphnav.gnss.differential import with_differences
 from graphnav.gnss.ephemeris import EARTH_RATE
 from graphnav.gnss.integers import decorrelate, find_nearest
 from graphnav.gnss.series import RawGnss
-from graphnav.gnss.sigmas import reflection_sigma
+from graphnav.gnss.sigmas import REFLECTED, reflection_sigma
 from graphnav.gnss.signals import L1, C
 from graphnav.recording.formats import read
 from graphnav.report.satellites import satellite_tables
@@ -314,18 +314,18 @@ def test_reflections_that_last_are_in_the_sigma(drive):
     _, elevation = directions(raw.antenna, raw.p)
     for satellite in np.unique(raw.satellite):
         own = raw.satellite == satellite
-        decay = np.exp(-np.diff(raw.t[own]) / raw_phase._LASTING)
+        decay = np.exp(-np.diff(raw.t[own]) / REFLECTED)
         x = rng.standard_normal(int(own.sum()))
         for i, a in enumerate(decay):
             x[i + 1] = a * x[i] + np.sqrt(1.0 - a * a) * x[i + 1]
-        carrier[own] += reflection_sigma(elevation[own]) * x / WAVELENGTH
+        carrier[own] += np.sqrt(2.0) * reflection_sigma(elevation[own]) * x / WAVELENGTH
     spoilt = replace(recording, raw_gnss=replace(raw, carrier=carrier))
     rows = GnssPhase.build(scene(recording, STATED))
     own = rows.keyframe == rows.keyframe[len(rows) // 2]
     towards = (rows.s_n - rows.nominal)[own]
     L = np.linalg.lstsq(towards / np.linalg.norm(towards, axis=1)[:, None], rows.reflected[own], rcond=None)[0]
     # nothing is better than the mean of such a process, whose variance over a time T is at least 2 tau / (T + 2 tau)
-    least = np.trace(L @ L.T) * 2.0 * raw_phase._LASTING / (np.ptp(raw.t) + 2.0 * raw_phase._LASTING)
+    least = np.trace(L @ L.T) * 2.0 * REFLECTED / (np.ptp(raw.t) + 2.0 * REFLECTED)
     for one in run(spoilt, STATED, ("ekf", "rts")).values():
         off, sigma = errors(one, truth)[:2]
         fixed = one.fixed[one.fixed[:, 1] > 0.0, 0]
