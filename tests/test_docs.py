@@ -85,6 +85,8 @@ def test_the_pages_show_commands_and_python():
 
 @pytest.mark.parametrize("lines", COMMANDS)
 def test_commands_run(lines, clone, capsys):
+    if lines.startswith("graphnav fleet "):  # whose drives are solved by commands of their own
+        shutil.rmtree(clone / "data" / "kamakura_rtk")
     for line in lines.splitlines():
         program, *arguments = shlex.split(line)
         assert program == "graphnav", "a console block holds commands of graphnav and make; use another kind for others"

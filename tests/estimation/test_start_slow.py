@@ -67,7 +67,7 @@ def assert_honest(errors: list[float], sigmas: list[float]) -> None:
 
 
 # the slower, the longer a drive of 40 m
-@pytest.mark.parametrize(("speed", "seeds", "time"), [(0.15, 2, 10.0), (0.4, 3, 1.0), (0.4, 3, 100.0)])
+@pytest.mark.parametrize(("speed", "seeds", "time"), [(0.15, 2, 10.0), (0.4, 2, 1.0), (0.4, 2, 100.0)])
 def test_a_slow_rover_knows_its_heading_as_well_as_it_says(speed: float, seeds: int, time: float) -> None:
     errors, own, prior = [], [], []
     for seed in range(seeds):
@@ -94,7 +94,7 @@ def test_a_real_rover_knows_its_heading_as_well_as_it_says(shared_data: Path, tm
     whole = read(tmp_path, allow_outside=True)
     assert whole.truth is not None
     errors, own = [], []
-    for begin in (30.0, 100.0, 200.0, 300.0):
+    for begin in (30.0, 200.0):
         part = whole.crop(begin, begin + 100.0)
         found = aligned(part)
         errors.append(off(found, part, whole.truth))
@@ -113,7 +113,7 @@ def test_circles_are_motion(shared_data: Path) -> None:
 @pytest.mark.parametrize("time", [1.0, 10.0, 100.0])
 def test_whoever_circles_knows_its_heading_as_well_as_it_says(time: float) -> None:
     errors, own = [], []
-    for seed in range(5):
+    for seed in range(3):
         recording = drive(oracle.winding_path(70.0, 3.7, seed, turn=0.33), seed, 3.0, time).crop(8.0)
         found = aligned(recording, NONE)  # without a shake a steady turn passes for a stop
         assert found.motion is not None
@@ -126,7 +126,7 @@ def test_whoever_circles_knows_its_heading_as_well_as_it_says(time: float) -> No
 
 @pytest.mark.parametrize("time", [1.0, 10.0, 100.0])
 def test_whoever_stands_throughout_is_said_not_to_move(time: float) -> None:
-    for seed in range(5):
+    for seed in range(3):
         recording = drive(oracle.winding_path(300.0, 0.0, seed, turn=0.0), seed, 3.0, time)
         found = aligned(recording)
         assert found.motion is None

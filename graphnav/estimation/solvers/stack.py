@@ -126,7 +126,7 @@ class Stack:
         head, last = part[:-1], part[1:] - 1
         first = np.searchsorted(table[0, head], np.arange(self.K + 1))
         kinds = np.array([_describe(c) for c in self._constraints]).reshape(-1, 3)[table[1, head]]
-        kernel, size = kinds[:, 1:].T.astype(int)
+        kernel, size = np.ascontiguousarray(kinds[:, 1:].T, dtype=int)  # other layouts would be compiled anew
         used = table[7, head].astype(bool)
         return Blocks(
             first, table[4, head], table[5, last], used, kinds[:, 0].copy(), kernel, size, part, *table[:2, head].copy()

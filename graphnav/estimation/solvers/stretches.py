@@ -150,7 +150,7 @@ class StretchFilter:
             predicted, self._P_predicted[own], errors, self._P[own],
             stack.root[own], stack.solved[own], stack.bent[own], Kt, w, SH, self._taken, self._at,
         )  # fmt: skip
-        self._P[k:k1] = turn(self._P[k:k1], T[end])
+        self._P[k:k1] = turn(self._P[k:k1], np.ascontiguousarray(T[end]))
         # what each number adds to y, by the root of all numbers' covariance: (L^T K^T) (L^-1 nu)
         root = np.swapaxes(stack.root[k:k1], -1, -2)
         Kt = Kt[k - own.start :]

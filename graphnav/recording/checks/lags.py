@@ -22,7 +22,8 @@ Lags = Array | float  # s, (L,) or one
 Regressors = Callable[[Index, Lags], Array]  # (rows, lags) -> (L, K, m), of one lag (K, m)
 REACH = 5.0  # s on either side of the first guess: the largest sigma that can result
 _SLOW_CHANGES = 10.0  # s; slower changes are those of the road (as in `graphnav.recording.draft.motion.filter_band`)
-_COARSE, _FINE, _FINEST = 0.1, 0.02, 0.005  # s, of the grids of lags
+# s, of the grids of lags; changes over a second are alike for a second
+_COARSE, _FINE, _FINEST = 0.2, 0.02, 0.005
 _NUMBERS_AT_ONCE = 1 << 16  # rows times lags, to bound the memory in use
 # number of parts, and the variance of Student's t with the degrees of freedom of their scatter
 _PARTS, _STUDENT = 4, 3.0
@@ -129,7 +130,8 @@ def regress_each(x: Array, y: Array) -> Array:
     if x.shape[2] == 1:
         power = np.einsum("lki,lki->li", x, x)
         return np.asarray(np.einsum("lki,k->li", x, y) / np.where(power > 0.0, power, 1.0))
-    return np.asarray(np.linalg.pinv(x, rcond=np.finfo(float).eps * x.shape[1]) @ y)
+    normal = np.linalg.pinv(x.transpose(0, 2, 1) @ x, rcond=np.finfo(float).eps * x.shape[1], hermitian=True)
+    return np.asarray((normal @ (y @ x)[..., None])[..., 0])
 
 
 def remove_slow(t: Array, x: Array) -> Array:

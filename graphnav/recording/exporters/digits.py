@@ -66,6 +66,7 @@ def _write_compiled(table: Array, form: str, last: Array | None) -> bytes:
     if whole:
         table = table.copy()
         table[:, whole] = np.trunc(table[:, whole]) + 0.0  # %d has no negative zero
+    table = np.ascontiguousarray(table)  # other layouts would be compiled anew
     between = _FIELD.split(form)[:: _FIELD.groups + 1]
     literal = np.frombuffer("".join(between).encode("ascii"), np.uint8)
     ends = np.cumsum([0, *map(len, between)])
