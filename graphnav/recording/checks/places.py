@@ -91,7 +91,8 @@ def check_height_unit(recording: Recording, track: Track, forward: Fit | None) -
     if correlation > CLEAR and abs(ratio / FOOT - 1.0) < _FEET:
         hint = 'they are in feet; say units = { height = "ft" } in [gnss]'
         yield Finding("warning", f"{climbs}: {hint}", "gnss.feet")
-    elif correlation > CLEAR and abs(np.log(ratio)) > np.log(_SCALE):
+    # whichever of the two has the noise that makes the correlation less than one
+    elif correlation > CLEAR and abs(np.log(ratio)) + np.log(correlation) > np.log(_SCALE):
         yield Finding("warning", f"{climbs}: look at their unit and column", "gnss.height_scale")
 
 
