@@ -368,6 +368,11 @@ MISTAKES: dict[str, list[Mistake]] = {
             ("accelerometer's sign is reversed", "negate"),
         ),
         Mistake(
+            "the accelerometer's vertical axis reversed",
+            scaled("imu", "az", -1.0),
+            ("accelerometer's vertical axis is reversed", "negate"),
+        ),
+        Mistake(
             "the accelerometer's forward axis reversed",
             scaled("imu", "ay", -1.0),
             ("forward axis is reversed", "no axes in [imu]", "negate ay"),

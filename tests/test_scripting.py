@@ -205,6 +205,8 @@ def test_a_run_can_be_repeated_with_the_settings_in_its_summary(tmp_path):
     [
         ("[keyframes]\n\nrat = 1", "key.unknown", ("line 3", "'keyframes.rat'", "'rate'")),
         ("[keyframes]\nrate = -1", "key.value", ("line 2", "'keyframes.rate' = -1", "Hz")),
+        ("[keyframes]\nrate = true", "key.value", ("line 2", "keyframes.rate")),
+        ("[solver]\nmax_iterations = false", "key.value", ("line 2", "max_iterations")),
         ("[vehicle]\nzero_velocity = false", "key.unknown", ("'zero_velocity'", "[standstill]")),
         ("[detectors.fft]\nstep = 0", "key.value", ("line 2", "'detectors.fft.step' = 0", "0.1")),
         ('profile = "bike"', "key.value", ("line 1", "'profile' = 'bike'", "'car'", "'car+odometer'", "'foot'")),

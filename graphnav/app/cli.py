@@ -6,7 +6,6 @@ Nothing heavy is imported before a command runs, so that help appears at once.
 from __future__ import annotations
 
 import os
-import re
 import sys
 import traceback
 from dataclasses import replace
@@ -51,6 +50,7 @@ from graphnav.app.talk import (
     say,
     show,
 )
+from graphnav.core.complaints import demand
 from graphnav.core.errors import GraphnavError
 from graphnav.core.files import permit_outside
 from graphnav.core.progress import tell
@@ -294,8 +294,7 @@ def _usage(error: Any) -> str:
     said = str(getattr(error, "option_name", ""))
     if said.lstrip("-") in _SPAN and {"--start", "--end"} <= options:
         return f"No such option: {said}; --start and --end choose a part of the recording; see {path} --help"
-    message = re.sub(r"Input should be (.*?)(, unable to .*)?$", r"must be \1", error.format_message().rstrip("."))
-    return f"{message}; see {path} --help"
+    return f"{demand(error.format_message().rstrip('.'))}; see {path} --help"
 
 
 def _internal(error: Exception) -> str:

@@ -106,8 +106,18 @@ def _describe(first: Any, loc: tuple[str, ...], model: type[BaseModel]) -> Note:
         return Note("key.value", f"'{key}': {what}{_describe_key(loc, model)}" if key else what)
     if first["type"] in ("model_type", "model_attributes_type"):
         return Note("key.table", f"'{key}' must be a table: [{key}]")
-    what = f"{first['msg'][0].lower()}{first['msg'][1:]}{_describe_key(loc, model)}"
+    what = f"{demand(first['msg'])}{_describe_key(loc, model)}"
     return Note("key.value", f"'{key}' = {shorten(first['input'])}: {what}")
+
+
+def demand(message: str) -> str:
+    """What Pydantic says that a value should be, as what it must be."""
+    words = re.sub(r"Input should (.*?)(, (unable to|got) .*)?$", r"must \1", message)
+    return (
+        words.replace("a valid string", "a text in quotes")
+        .replace("a valid integer", "a whole number")
+        .replace("a valid ", "a ")
+    )
 
 
 def shorten(value: Any) -> str:

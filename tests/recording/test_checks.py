@@ -18,10 +18,13 @@ import pytest
 from graphnav.app import cli
 from graphnav.estimation.antenna import find_untold_arm, find_wrong_arms
 from graphnav.recording import Recording, take_rows
+from graphnav.recording.checks.crosschecks import fit_yaw
 from graphnav.recording.checks.overview import Inspection, inspect
+from graphnav.recording.checks.tracks import compute_track
 from graphnav.recording.formats import read
 from graphnav.recording.formats.schema import rotation_from_letters
 
+TURNS_LITTLE = (100.0, 160.0)  # s of oracle_drive: it stands, and turns once
 TURNING = ["boulder_drive_20250708", "tokyo_20201105", "dresden_car_20140326", "oracle_drive", "kitti"]
 Change = Callable[[Recording], Recording]
 
@@ -471,3 +474,16 @@ def test_an_imu_that_covers_little_of_the_fixes_is_named(drive: Callable[[str], 
         rows = recording.imu.t < recording.start + share * recording.duration
         cut = replace(recording, imu=take_rows(recording.imu, rows))
         assert ("gnss.beyond_imu" in keys(cut)) == told
+
+
+def test_a_shift_of_clocks_that_one_turn_leaves_open_spoils_no_other_figure(
+    drive: Callable[[str], Recording],
+) -> None:
+    recording = drive("oracle_drive").crop(*TURNS_LITTLE)
+    assert recording.gnss is not None
+    fit = fit_yaw(recording.imu, compute_track(recording.gnss))
+    assert fit is not None
+    assert fit.spread > 1.0
+    assert fit.coefficients == pytest.approx([1.0], abs=0.05)
+    upside = imu(accel=lambda x: x * [1.0, 1.0, -1.0])(recording)
+    assert [one.key for one in inspect(upside).findings if one.severity != "note"] == ["imu.force_sign"]

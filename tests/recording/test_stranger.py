@@ -17,6 +17,7 @@ from test_formats_binary import write_bag, write_ubx
 from graphnav.app import cli
 from graphnav.core.notes import key_of
 from graphnav.core.timescales import between_clocks
+from graphnav.recording.checks.overview import inspect
 from graphnav.recording.draft import draft
 from graphnav.recording.draft.guesses import estimate_noise_density
 from graphnav.recording.draft.plain import read_plain
@@ -81,6 +82,14 @@ def test_the_folder_of_a_phone(tokyo, tmp_path, capsys, total):
     checks = json.loads((tmp_path / "out" / "summary.json").read_text())["checks"]
     assert "gnss.cached" in [check["key"] for check in checks]
     assert rms(errors(drive, tmp_path / "out")) < rms(stranger.fix_errors(folder, drive))
+
+
+def test_heights_of_a_phone_that_wander_are_not_said_to_be_in_another_unit(shared_data, tmp_path):
+    (drive,) = stranger.cuts(shared_data / "tokyo_20201105", [(420.0, 600.0)])
+    folder = stranger.write_phone(tmp_path / "ride", drive)
+    run("init", folder, "-o", folder, "--quiet")
+    found = inspect(read(folder)).findings
+    assert not {"gnss.feet", "gnss.height_scale"} & {one.key for one in found}
 
 
 def test_a_receiver_beside_an_imu_in_other_units(tokyo, tmp_path, capsys):
@@ -250,8 +259,6 @@ def test_what_lies_between_clocks_that_are_known(t, zero, u, other, offset):
 
 def test_advice_is_for_the_log_at_hand(tmp_path):
     """Numbers of types are a matter of CSV files, and keys of a recording.toml."""
-    from graphnav.recording.checks.overview import inspect
-
     bag = write_bag(tmp_path / "a", "db3")
     found = inspect(replace(read(bag), imu=replace(RECORDING.imu, t=read(bag).imu.t, accel=-RECORDING.imu.accel)))
     assert "recording.log" in [f.key for f in found.findings]

@@ -235,7 +235,9 @@ def check_gyro_sign(imu: Imu, track: Track) -> Iterator[Finding]:
     A vehicle that leans into its curves feels none, and which of the two is mirrored is then open.
     """
     if crosschecks.find_up(imu)[2] < 0:
-        what = "the accelerometer's sign is reversed (gyro and course deny its up), it must read +9.8 upward at rest"
+        alone = (crosschecks.correlate_sideways(imu, track) or 0.0) > 0.0  # its other axes agree with the gyro
+        which = "accelerometer's vertical axis" if alone else "accelerometer's sign"
+        what = f"the {which} is reversed (gyro and course deny its up), it must read +9.8 upward at rest"
         yield Finding("warning", f"{what}; negate it in the file", "imu.force_sign")
     elif crosschecks.correlate_sideways(imu, track) is None:
         what = "the gyro turns against the GNSS course: its sign is reversed, or latitudes or longitudes have the wrong"

@@ -173,9 +173,16 @@ def _search(t: Array, y: Array, x_at: lags_of_clocks.Regressors, span: Array, va
         if abs(far) > 5.0 and correlation(far, few) > reached + 0.15:
             coarse = far
     lag, spread = lags_of_clocks.refine_lag(t, y, x_at, valid, many, coarse, MIN_PAIRS)
-    rows = every[valid(lag)]
-    r, b = _regress_inliers(x_at(rows, lag), y[rows]) if len(rows) >= MIN_PAIRS else (0.0, np.zeros(1))
-    return Fit(lag, spread, r, correlation(0.0, every), b)
+
+    def regression(lag: float) -> tuple[float, Array]:
+        rows = every[valid(lag)]
+        return _regress_inliers(x_at(rows, lag), y[rows]) if len(rows) >= MIN_PAIRS else (0.0, np.zeros(1))
+
+    r, b = regression(lag)
+    at_zero = correlation(0.0, every)
+    if abs(lag) < 2.0 * spread and r < at_zero:  # a shift that the data leave open and that explains less than none
+        lag, (r, b) = 0.0, regression(0.0)
+    return Fit(lag, spread, r, at_zero, b)
 
 
 def _fit_imu(imu: Imu, rate: Array, track: Track, i: Index, j: Index, y: Array) -> Fit | None:

@@ -36,9 +36,11 @@ def check_mirroring(recording: Recording, track: Track, as_read: Fit | None, tur
     better = yaw is not None and (not turns_back or as_read is None or yaw.correlation > as_read.correlation)
     if yaw is not None and better and yaw.correlation > 0.8 and abs(yaw.coefficients[0] - 1.0) < 0.2:
         yield describe_exchange("the turns of the gyro")
-    elif (
-        turns_back and (crosschecks.correlate_sideways(recording.imu, track) or 0.0) > 0.0
-    ):  # the gyro agrees with the force
+    elif (  # the gyro agrees with the force, whose up is that of the stated axes
+        turns_back
+        and crosschecks.find_up(recording.imu)[2] > 0.0
+        and (crosschecks.correlate_sideways(recording.imu, track) or 0.0) > 0.0
+    ):
         yield describe_mirroring("latitudes or longitudes have", "the turns of the gyro and the force in curves")
 
 
@@ -89,7 +91,8 @@ def check_height_unit(recording: Recording, track: Track, forward: Fit | None) -
     if correlation > CLEAR and abs(ratio / FOOT - 1.0) < _FEET:
         hint = 'they are in feet; say units = { height = "ft" } in [gnss]'
         yield Finding("warning", f"{climbs}: {hint}", "gnss.feet")
-    elif correlation > CLEAR and abs(np.log(ratio)) > np.log(_SCALE):
+    # whichever of the two has the noise that makes the correlation less than one
+    elif correlation > CLEAR and abs(np.log(ratio)) + np.log(correlation) > np.log(_SCALE):
         yield Finding("warning", f"{climbs}: look at their unit and column", "gnss.height_scale")
 
 

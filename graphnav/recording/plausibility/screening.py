@@ -274,8 +274,8 @@ def drop_contradicted(imu: Imu, start: float, forces: bool) -> tuple[Imu, list[F
     if not bad.any():
         return imu, []
     first = float(imu.t[bad][0]) - start
-    sentence = f"{_list_rows(bad)} that those before and after contradict (the first at {first:.2f} s from the start)"
-    return take_rows(imu, ~bad), [Finding("note", f"{sentence}: left out, as a gap", "imu.contradicted")]
+    sentence = f"{_list_rows(bad)} contradicted by the rows before and after (first {first:.2f} s from the start)"
+    return take_rows(imu, ~bad), [Finding("note", f"{sentence}: treated as a gap", "imu.contradicted")]
 
 
 def _list_rows(bad: NDArray[np.bool_]) -> str:
