@@ -12,12 +12,13 @@ import numpy as np
 from graphnav.core.errors import RecordingError
 from graphnav.core.files import is_inside
 from graphnav.core.rotation import Array
-from graphnav.core.timescales import NEAR, ClockOffset, between_clocks
+from graphnav.core.timescales import NEAR, UNIX, ClockOffset, between_clocks
 from graphnav.recording import Gnss, Odometer
 from graphnav.recording.draft import guesses, motion
 from graphnav.recording.draft.agreement import CLEAR, FAIR, Agreement, compare_with_fixes
 from graphnav.recording.draft.guesses import Guess
 from graphnav.recording.draft.logs import Source
+from graphnav.recording.draft.raw import RawFound, find_raw, write_raw
 from graphnav.recording.draft.sources import (
     JOINED,
     find_logs,
@@ -31,7 +32,6 @@ from graphnav.recording.formats.writer import quote
 
 __all__ = ["Draft", "draft"]
 
-_UNIX = 1e9  # s
 _SMALL = 0.03  # s; smaller clock offsets are left to the smoother, which estimates them
 _SD = "[3.3, 3.3, 6.6]"  # m, assumed of fixes that state none (graphnav.recording.formats.repair.DEFAULT_SD)
 
@@ -59,7 +59,10 @@ def draft(paths: Sequence[Path], folder: Path, name: str | None = None, topics: 
     found = find_logs(paths, topics)
     writer = _Writer(folder, topics)
     writer.decisions += found.notes
-    text = writer.text(found.sensors, name or folder.resolve().name or "drive")
+    imu = found.sensors["imu"]
+    t, zero = (imu.t, None) if imu.log is None else (imu.log.imu.t, imu.log.gps_zero)  # type: ignore[union-attr]
+    raw = find_raw(found.raw, t, zero)
+    text = writer.text(found.sensors, raw, name or folder.resolve().name or "drive")
     return Draft(text, tuple(writer.decisions), writer.made)
 
 
@@ -89,21 +92,30 @@ class _Writer:
         self.decisions: list[str] = []
         self.made: dict[str, dict[str, Array]] = {}
 
-    def text(self, found: dict[str, Source], name: str) -> str:
-        vehicle = "gnss" in found or "odometer" in found
+    def text(self, found: dict[str, Source], raw: RawFound | None, name: str) -> str:
+        vehicle = "gnss" in found or "odometer" in found or raw is not None
         self.lines += [
             "# Drafted by graphnav init. Comments say why each line is what it is; look at those marked CHECK.",
             'format = "graphnav-recording/1"', f"name = {quote(name)}",
         ]  # fmt: skip
         why = "there are fixes or speeds" if vehicle else "CHECK: no fixes and no speed, so it is taken for a walk"
         self._key("platform", '"vehicle"' if vehicle else '"foot"', why)
-        if found["imu"].log is None and found["imu"].t[0] > _UNIX:
+        if raw is not None:
+            self._clock(found["imu"], raw)
+        elif found["imu"].log is None and found["imu"].t[0] > UNIX:
             self._key("clock", '"unix"', "the stamps are dates of this century, s since 1970")
-        agreement, felt = self._imu(found["imu"], found.get("gnss"), vehicle)
+        agreement, felt = self._imu(found["imu"], found.get("gnss"), raw, vehicle)
         course = None
         if "gnss" in found:
             course = motion.compute_course(*read_fixes(found["gnss"]))
             self._gnss(found["gnss"], agreement)
+        if raw is not None:
+            self.lines += ["", "[raw_gnss]"]
+            self.decisions += raw.notes
+            for key, value, why in write_raw(raw, self.folder):
+                self._key(key, value, why)
+            if "gnss" not in found:
+                self._time_offset(agreement)
         if "odometer" in found:
             self._odometer(found["odometer"], course if course is not None and len(course.t) > 50 else None, felt)
         if "barometer" in found:
@@ -112,7 +124,18 @@ class _Writer:
 
     # ---- one table each
 
-    def _imu(self, source: Source, gnss: Source | None, vehicle: bool) -> tuple[Agreement, tuple[Array, Array]]:
+    def _clock(self, imu: Source, raw: RawFound) -> None:
+        """Write what t = 0 of the IMU is, which observations are dated by."""
+        if raw.clock.value is not None:
+            self._key("clock", quote(str(raw.clock.value)), raw.clock.why)
+        elif imu.log is None:
+            words = f'CHECK: say what t = 0 of {imu.path.name} is, as "gps week 2130" or a UTC date'
+            self.lines.append(f'# clock = "..."                             # {words}')
+            self.decisions.append(f"clock: {words}; the observations begin at {raw.begin}")
+
+    def _imu(
+        self, source: Source, gnss: Source | None, raw: RawFound | None, vehicle: bool
+    ) -> tuple[Agreement, tuple[Array, Array]]:
         """Write [imu]; returns the comparison with the fixes, and times and forward forces."""
         self.lines += ["", "[imu]"]
         self._file(source, "imu")
@@ -131,6 +154,8 @@ class _Writer:
             agreement = compare_with_fixes(
                 t, gyro, accel, up, read_fixes(gnss), self.epochs.offset if self.epochs else 0.0
             )
+        elif raw is not None and raw.dated:
+            agreement = compare_with_fixes(t, gyro, accel, up, raw.horizontal, 0.0)
         if source.log is None:
             rate = guesses.guess_gyro_unit(gyro, source.find_unit("gx", "gyro"), agreement.turn, vehicle)
             gyro = gyro * RATE[str(rate.value)]
@@ -226,6 +251,10 @@ class _Writer:
             self.lines.append(f"# {words}")
             self.decisions.append(words)
         self._lever_arm(source.log.gnss if source.log else None, "from the IMU to the antenna: right, forward, up")
+        self._time_offset(agreement)
+
+    def _time_offset(self, agreement: Agreement) -> None:
+        """Write what is to be added to the stamps of the fixes, if that is seen."""
         if agreement.offset is not None:
             seconds, sigma = agreement.offset
             sure = "" if sigma < motion.STEP else "CHECK: "

@@ -16,6 +16,7 @@ from graphnav.recording.draft import guesses, motion
 from graphnav.recording.draft.guesses import Guess
 from graphnav.recording.draft.logs import WANTED, NoSensorError, Source, read_log
 from graphnav.recording.draft.plain import DAY
+from graphnav.recording.draft.raw import RawFiles, separate_raw, tell_kind
 from graphnav.recording.formats import formats
 from graphnav.recording.formats.schema import SPEED
 from graphnav.sensors.tables import ANGLE
@@ -31,6 +32,7 @@ class LogsFound:
 
     sensors: dict[str, Source]
     notes: list[str]
+    raw: RawFiles
 
 
 def find_logs(paths: Sequence[Path], topics: Sequence[str] = ()) -> LogsFound:
@@ -42,7 +44,9 @@ def find_logs(paths: Sequence[Path], topics: Sequence[str] = ()) -> LogsFound:
         If the only file holds nothing that is known, if one of a sensor cannot be read, if two hold the same, or none
         an IMU.
     """
-    files = [file for path in paths for file in _list_files(path)]
+    raw, files = separate_raw([file for path in paths for file in _list_files(path)])
+    if not files:
+        raise RecordingError(f"{paths[0]}: observations of GNSS, and no IMU beside them", key="draft.no_imu")
     every: dict[str, list[Source]] = {}
     left: list[str] = []
     nothing: list[str] = []
@@ -51,7 +55,7 @@ def find_logs(paths: Sequence[Path], topics: Sequence[str] = ()) -> LogsFound:
         try:
             found = read_log(path, topics)
         except NoSensorError as error:
-            if len(files) == 1:
+            if len(files) == 1 and not raw.observed:
                 raise
             nothing.append(path.name if path.exists() else str(error))
             refused += [str(error)] if isinstance(error.__cause__, RecordingError) else []
@@ -86,7 +90,7 @@ def find_logs(paths: Sequence[Path], topics: Sequence[str] = ()) -> LogsFound:
         left.append(f"left out: {air.path.name}: its pressures are not those of air in any unit")
         del sensors["barometer"]
     return LogsFound(
-        {name: sensors[name] for name in ("imu", "gnss", "odometer", "barometer") if name in sensors}, left
+        {name: sensors[name] for name in ("imu", "gnss", "odometer", "barometer") if name in sensors}, left, raw
     )
 
 
@@ -118,7 +122,7 @@ def _list_files(path: Path) -> list[Path]:
     made = {JOINED, "recording.toml"}  # written by an earlier draft
     made |= {name_plain_file(p, sensor) for p in every for sensor in WANTED}
     inside = sorted(p for p in every if p.name not in made)
-    logs = [p for p in inside if p.name.lower().endswith(_TABLES) or _is_known(p)]
+    logs = [p for p in inside if p.name.lower().endswith(_TABLES) or _is_known(p) or tell_kind(p)[0]]
     if not logs:
         raise RecordingError(
             f"{path}: no log in this folder: no CSV file, and none of a kind that is known", key="draft.no_log"

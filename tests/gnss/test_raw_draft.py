@@ -1,0 +1,95 @@
+"""`graphnav init` with raw observations: which file is what, and what t = 0 of the IMU is."""
+
+from __future__ import annotations
+
+import shutil
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers import refused
+
+from graphnav.core.errors import RecordingError
+from graphnav.recording.draft import draft
+from graphnav.recording.formats import read
+
+DATA = Path(__file__).resolve().parents[2] / "data" / "kamakura_rtk"
+WEEK_SECONDS = 282600.0  # of GPS week 2176 at t = 0
+UNIX = 1632292182.0
+LEAP = 18.0
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A drive without a description, its IMU stamped by a given clock."""
+
+    def make(shift: float, *names: str) -> Path:
+        rows = np.loadtxt(DATA / "imu.csv.gz", delimiter=",", skiprows=1)
+        rows[:, 0] += shift
+        np.savetxt(tmp_path / "imu.csv", rows, "%.6f", ",", header="t,gx,gy,gz,ax,ay,az", comments="")
+        for name in names:
+            shutil.copy(DATA / name, tmp_path / name)
+        return tmp_path
+
+    return make
+
+
+@pytest.mark.parametrize(
+    ("rover", "shift", "clock"),
+    [("rover.obs.gz", WEEK_SECONDS, "gps week 2176"), ("rover.ubx", UNIX, "unix")],
+)
+def test_files_are_told_by_what_is_in_them(folder, rover, shift, clock):
+    """A base is what stands; forward is where the accelerations of single-point fixes are felt."""
+    path = folder(shift, rover, "base.obs.gz", "nav.gz")
+    renamed = {rover: "a.bin", "base.obs.gz": "b.bin", "nav.gz": "c.bin"}
+    for old, new in renamed.items():
+        (path / old).rename(path / new)
+    text = draft([path], path).text
+    found = tomllib.loads(text)
+    assert (found["raw_gnss"]["rover"], found["raw_gnss"]["base"], found["raw_gnss"]["nav"]) == tuple(renamed.values())
+    assert found["clock"] == clock
+    assert found["platform"] == "vehicle"
+    assert found["imu"]["axes"] == "RFU"
+    assert "time_offset" not in found["raw_gnss"]
+    (path / "recording.toml").write_text(text)
+    recording = read(path)
+    assert recording.raw_gnss is not None
+    assert np.isfinite(recording.raw_gnss.difference).sum() > 1000
+    assert len(recording.gnss.t) == 41
+
+
+def test_stamps_of_utc_among_seconds_of_the_week_are_told(folder):
+    path = folder(WEEK_SECONDS - LEAP, "rover.obs.gz", "nav.gz")
+    found = tomllib.loads(draft([path], path).text)
+    assert found["raw_gnss"]["time_offset"] == pytest.approx(-LEAP, abs=0.1)
+
+
+def test_a_clock_that_nothing_tells_is_asked_for(folder):
+    path = folder(0.0, "rover.obs.gz", "nav.gz")
+    text = draft([path], path).text
+    assert "clock" not in tomllib.loads(text)
+    (path / "recording.toml").write_text(text)
+    with refused("clock.unknown", RecordingError):
+        read(path)
+
+
+@pytest.mark.parametrize(
+    ("shift", "names", "key"),
+    [
+        (WEEK_SECONDS, ("rover.obs.gz", "rover.ubx", "nav.gz"), "draft.raw_roles"),  # one receiver, twice
+        (WEEK_SECONDS, ("rover.obs.gz", "rover.ubx", "base.obs.gz", "nav.gz"), "draft.raw_roles"),
+        (UNIX + 86400.0, ("rover.obs.gz", "base.obs.gz", "nav.gz"), "draft.raw_time"),
+        (WEEK_SECONDS, ("rover.obs.gz", "base.obs.gz"), "raw.no_ephemerides"),
+    ],
+)
+def test_what_is_not_clear_is_refused(folder, shift, names, key):
+    path = folder(shift, *names)
+    with refused(key, RecordingError):
+        draft([path], path)
+
+
+def test_observations_alone_are_no_recording(tmp_path):
+    shutil.copy(DATA / "rover.obs.gz", tmp_path / "rover.obs.gz")
+    with refused("draft.no_imu", RecordingError, "IMU"):
+        draft([tmp_path], tmp_path)
