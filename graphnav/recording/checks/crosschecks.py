@@ -37,7 +37,6 @@ class Fit:
     lag: float  # s
     spread: float  # s, 1-sigma of the lag (`graphnav.recording.checks.lags`)
     correlation: float
-    at_zero: float  # correlation without a shift
     coefficients: Array  # (m,)
 
 
@@ -175,7 +174,7 @@ def _search(t: Array, y: Array, x_at: lags_of_clocks.Regressors, span: Array, va
     lag, spread = lags_of_clocks.refine_lag(t, y, x_at, valid, many, coarse, MIN_PAIRS)
     rows = every[valid(lag)]
     r, b = _regress_inliers(x_at(rows, lag), y[rows]) if len(rows) >= MIN_PAIRS else (0.0, np.zeros(1))
-    return Fit(lag, spread, r, correlation(0.0, every), b)
+    return Fit(lag, spread, r, b)
 
 
 def _fit_imu(imu: Imu, rate: Array, track: Track, i: Index, j: Index, y: Array) -> Fit | None:
