@@ -46,17 +46,17 @@ def refused(key: str, kind: type[GraphnavError], *names: str) -> Iterator[pytest
 def refuse_command(capsys: pytest.CaptureFixture[str], key: str, *arguments: str | Path) -> str:
     """The one line on stderr of a command that ends with exit code 2 for an error of this key; "" is wrong usage."""
     keys: list[str] = []
-    app = cli.app
+    program = cli.build_program()
 
     def watched(*words: Any, **how: Any) -> Any:
         try:
-            return app(*words, **how)
+            return program(*words, **how)
         except GraphnavError as error:
             keys.append(error.key)
             raise
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(cli, "app", watched)
+        patch.setattr(cli, "build_program", lambda: watched)
         assert cli.run([str(a) for a in arguments]) == 2
     out, said = capsys.readouterr()
     assert out == ""

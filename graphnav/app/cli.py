@@ -8,12 +8,15 @@ from __future__ import annotations
 import os
 import sys
 import traceback
+from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 from typer.core import TyperGroup
+from typer.main import get_command
 
 from graphnav import __version__
 from graphnav.app import cli_fleet, cli_logs, cli_online, cli_solve
@@ -255,6 +258,12 @@ def main() -> None:
     sys.exit(run(sys.argv[1:]))
 
 
+@cache
+def build_program() -> Callable[..., Any]:
+    """The commands with their options, read off the signatures: a tenth of a second, once a process."""
+    return get_command(app)
+
+
 def run(arguments: list[str]) -> int:
     """Run the program on `arguments`; returns the exit code and raises nothing."""
     debug = bool(os.environ.get(DEBUG))
@@ -263,7 +272,7 @@ def run(arguments: list[str]) -> int:
 
         warnings.simplefilter("ignore")
     try:
-        code = app(arguments, prog_name="graphnav", standalone_mode=False, obj=tuple(arguments))
+        code = build_program()(arguments, prog_name="graphnav", standalone_mode=False, obj=tuple(arguments))
     except GraphnavError as error:
         return fail(str(error), BAD_INPUT, debug)
     except Interrupted as error:

@@ -44,11 +44,6 @@ def stand(duration: float) -> Manoeuvre:
     return Manoeuvre(duration, 0.0)
 
 
-def cruise(duration: float, speed: float, turn: float = 0.0, grade: float | None = None) -> Manoeuvre:
-    """Keep (or reach linearly) a speed, possibly in a bend and on a slope."""
-    return Manoeuvre(duration, speed, turn, grade)
-
-
 @dataclass(frozen=True)
 class Path:
     """Speed (m/s, signed), heading, slope, bank and side-slip (rad) as one spline of five channels."""

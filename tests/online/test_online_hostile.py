@@ -49,7 +49,7 @@ def plain(drive: tuple[Recording, Trajectory], rows: list[Row]) -> Trajectory:
     return played(drive[0], rows, QUICK)[1]
 
 
-@pytest.fixture(scope="module", params=[-1000.0, 3600.0])
+@pytest.fixture(scope="module")
 def stepped(
     request: pytest.FixtureRequest, drive: tuple[Recording, Trajectory], rows: list[Row]
 ) -> tuple[list[Row], list[Row], Online, Trajectory]:
@@ -98,7 +98,7 @@ def test_a_velocity_that_no_vehicle_has_leaves_its_fix(
     assert online.sensors.counts["gnss"] == sum(row[0] == "gnss" for row in rows)
 
 
-@pytest.mark.parametrize("at", [36.28, 42.28, 56.52])
+@pytest.mark.parametrize("at", [36.28, 56.52])
 def test_a_reading_that_those_around_contradict_costs_its_interval(
     drive: tuple[Recording, Trajectory], rows: list[Row], at: float
 ) -> None:
@@ -173,7 +173,17 @@ def test_a_fix_before_the_first_imu_row_of_another_clock_counts(
     assert twice.sensors.counts["gnss: repeated"] == 1
 
 
-@pytest.mark.parametrize(("sensor", "which"), [("imu", -1), ("imu", -3), ("imu", 0), ("gnss", -1), ("gnss", 0)])
+@pytest.mark.parametrize(
+    ("stepped", "sensor", "which"),
+    [
+        (-1000.0, "imu", -1),
+        (-1000.0, "imu", 0),
+        (-1000.0, "gnss", -1),
+        (3600.0, "imu", -3),
+        (3600.0, "gnss", 0),
+    ],
+    indirect=["stepped"],
+)
 def test_a_row_that_comes_late_over_a_step_of_the_clock_counts(
     drive: tuple[Recording, Trajectory],
     stepped: tuple[list[Row], list[Row], Online, Trajectory],

@@ -300,8 +300,15 @@ def keys(recording: Recording) -> list[str]:
     return [f.key for f in inspect(recording).findings]
 
 
-@pytest.mark.parametrize("name", ["boulder_drive_20250708", "tokyo_20201105", "comma_highway_20180802"])
-@pytest.mark.parametrize("velocities", [True, False])
+@pytest.mark.parametrize(
+    ("name", "velocities"),
+    [
+        ("boulder_drive_20250708", True),
+        ("tokyo_20201105", False),
+        ("comma_highway_20180802", True),
+        ("comma_highway_20180802", False),
+    ],
+)
 def test_heights_in_feet_are_seen_where_it_goes_up_and_down(
     part: Callable[[str], Recording], name: str, velocities: bool
 ) -> None:

@@ -97,8 +97,16 @@ def test_parts_of_a_drive_keep_to_the_error(shared_data: Path, name: str) -> Non
     assert np.sqrt(np.mean(np.square(z))) < 1.5
 
 
-@pytest.mark.parametrize("name", ["boulder_drive_20250708", "dresden_car_20140326", "oracle_drive"])
-@pytest.mark.parametrize("shift", [-0.6, 0.0, 0.6])
+@pytest.mark.parametrize(
+    ("name", "shift"),
+    [
+        ("boulder_drive_20250708", -0.6),
+        ("boulder_drive_20250708", 0.0),
+        ("dresden_car_20140326", 0.6),
+        ("oracle_drive", 0.0),
+        ("oracle_drive", 0.6),
+    ],
+)
 def test_a_draft_and_the_checks_say_the_same(shared_data: Path, name: str, shift: float) -> None:
     drive = read(shared_data / name).crop(0.0, 300.0)
     imu, gnss = replace(drive.imu, t=drive.imu.t + shift), drive.gnss

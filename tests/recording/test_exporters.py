@@ -183,15 +183,14 @@ def test_parquet_holds_the_columns_of_the_csv_with_all_digits(tmp_path: Path) ->
     assert table["sd_ve"].null_count == len(track)
 
 
-def test_write_all(tmp_path: Path) -> None:
-    exporters.write_all(made(), tmp_path / "out")
-    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == [
-        "trajectory.csv",
-        "trajectory.kml",
-        "trajectory.tum",
-    ]
+def test_all_formats_are_written_in_one_pass(tmp_path: Path) -> None:
+    targets = {one: tmp_path / f"all.{one}" for one in ("csv", "kml", "tum")}
+    exporters.write_parts([made()], targets, made().name)
+    for one, path in targets.items():
+        exporters.write_as(one, made(), tmp_path / f"alone.{one}")
+        assert path.read_bytes() == (tmp_path / f"alone.{one}").read_bytes(), one
     with refused("export.local_frame", RecordingError):
-        exporters.write_all(replace(made(), frame="local"), tmp_path / "local")
+        exporters.write_parts([replace(made(), frame="local")], {"kml": tmp_path / "local.kml"})
 
 
 KF_GINS = """\

@@ -36,7 +36,7 @@ _LEAD_TIME = 10.0  # s of the span before the motion
 _OUTLYING = 6.0  # multiple of the typical deviation of fixes from their running median, or of their sigma
 # rad, of the initial headings that are tried, relative to the first guess
 _HEADINGS_TRIED = (0.0, 0.5 * np.pi, 1.5 * np.pi, np.pi)
-_FIRST_ITERATIONS = 10  # iterations after which a start either has converged or creeps
+_FIRST_ITERATIONS = 6  # iterations after which a start that is nearly right has converged, and others creep
 _UNLIKELY = 14.0  # difference of log-likelihoods at a ratio of one in a million: -ln 1e-6
 
 Smoother = Callable[[Problem, States], Solution]
@@ -191,25 +191,26 @@ def _try_headings(
     where its likelihood is negligible beside the best; `worth` successive fixes are worth one in the worst case, over a
     span with one turn (`graphnav.estimation.alignment.course`).
     """
-    ends = [np.array([*rp, heading + turn]) for turn in _HEADINGS_TRIED]
-    tried = [_try(part, settings, frame, smooth, end, bias) for end in ends[:-1]]
+    *ends, backwards = (np.array([*rp, heading + turn]) for turn in _HEADINGS_TRIED)
+    problem = _build_short(part, settings, frame, ends[0], bias)
+    tried = [_try(problem, smooth, end) for end in ends]
     assert part.gnss is not None
     worth = max(1.0, len(part.gnss.t) / (2.0 * np.pi))
     few = settings.solver.model_copy(update={"max_iterations": min(_FIRST_ITERATIONS, settings.solver.max_iterations)})
-    last = _try(part, settings.model_copy(update={"solver": few}), frame, smooth, ends[-1], bias)
+    brief = replace(problem, settings=problem.settings.model_copy(update={"solver": few}))
+    last = _try(brief, smooth, backwards)
     best = min((one.cost for one in tried if np.isfinite(one.cost)), default=np.inf)
     if last.iterations >= few.max_iterations and last.cost < best + _UNLIKELY * worth:
-        last = _try(part, settings, frame, smooth, ends[-1], bias)
+        last = _try(problem, smooth, backwards)
     return [one for one in (*tried, last) if np.isfinite(one.cost)]
 
 
-def _try(part: Recording, settings: Settings, frame: LocalFrame, smooth: Smoother, rph: Array, bias: Array) -> Solution:
-    """Solve the short problem from one initial attitude."""
+def _build_short(part: Recording, settings: Settings, frame: LocalFrame, rph: Array, bias: Array) -> Problem:
+    """Build the short problem with an initial attitude as the mean of its prior."""
     noise, gnss = part.imu.noise, part.gnss
     assert gnss is not None
-    fixes = frame.from_llh(gnss.llh)
-    R0 = rotation.from_rph(rph)
-    start = States(R0[None], fixes[:1], np.zeros((1, 3)), np.zeros((1, 3)), bias[None])
+    fixes = frame.from_llh(gnss.llh[:1])
+    start = States(rotation.from_rph(rph)[None], fixes, np.zeros((1, 3)), np.zeros((1, 3)), bias[None])
     sigma = np.concatenate(
         [
             [0.3, 0.3, np.pi],
@@ -222,9 +223,17 @@ def _try(part: Recording, settings: Settings, frame: LocalFrame, smooth: Smoothe
     # an outlying fix or a burst must not decide the heading
     robust = settings.gnss.model_copy(update={"robust": "cauchy", "lever_arm_sigma": None, "time_offset_sigma": 0.0})
     # the information of the wheels on the heading is added by `with_course`
-    problem = build_problem(part, settings.without_wheels().model_copy(update={"gnss": robust}), frame, start, sigma)
-    dR, _, _ = prefix(problem.samples, problem.t[0], problem.t[1:], np.zeros(3), bias)
-    t = problem.t
+    return build_problem(part, settings.without_wheels().model_copy(update={"gnss": robust}), frame, start, sigma)
+
+
+def _try(problem: Problem, smooth: Smoother, rph: Array) -> Solution:
+    """Solve the short problem from one initial attitude."""
+    gnss, mean, t = problem.recording.gnss, problem.prior.mean, problem.t
+    assert gnss is not None
+    assert mean is not None
+    R0, fixes, bias = rotation.from_rph(rph), problem.frame.from_llh(gnss.llh), mean.bg[0]
+    problem = replace(problem, prior=replace(problem.prior, mean=replace(mean, R_nb=R0[None])))
+    dR, _, _ = prefix(problem.samples, t[0], t[1:], np.zeros(3), bias)
     p = np.stack([np.interp(t, gnss.t, fixes[:, k]) for k in range(3)], -1)
     v = np.gradient(p, t, axis=0)
     K = len(t)

@@ -37,7 +37,6 @@ class Fit:
     lag: float  # s
     spread: float  # s, 1-sigma of the lag (`graphnav.recording.checks.lags`)
     correlation: float
-    at_zero: float  # correlation without a shift
     coefficients: Array  # (m,)
 
 
@@ -179,10 +178,11 @@ def _search(t: Array, y: Array, x_at: lags_of_clocks.Regressors, span: Array, va
         return _regress_inliers(x_at(rows, lag), y[rows]) if len(rows) >= MIN_PAIRS else (0.0, np.zeros(1))
 
     r, b = regression(lag)
-    at_zero = correlation(0.0, every)
-    if abs(lag) < 2.0 * spread and r < at_zero:  # a shift that the data leave open and that explains less than none
+    if abs(lag) < 2.0 * spread and r < correlation(
+        0.0, every
+    ):  # a shift that the data leave open and that explains less than none
         lag, (r, b) = 0.0, regression(0.0)
-    return Fit(lag, spread, r, at_zero, b)
+    return Fit(lag, spread, r, b)
 
 
 def _fit_imu(imu: Imu, rate: Array, track: Track, i: Index, j: Index, y: Array) -> Fit | None:

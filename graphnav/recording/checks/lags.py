@@ -137,9 +137,15 @@ def regress_each(x: Array, y: Array) -> Array:
 def remove_slow(t: Array, x: Array) -> Array:
     """Columns (N, m) at times t (N,) minus their means over the ten seconds around each, with zero mean."""
     lo, hi = np.searchsorted(t, t - _SLOW_CHANGES / 2), np.searchsorted(t, t + _SLOW_CHANGES / 2, side="right")
-    total = np.concatenate([np.zeros((1, x.shape[1])), np.cumsum(x - x.mean(0), axis=0)])
-    out = x - x.mean(0) - (total[hi] - total[lo]) / (hi - lo)[:, None]
-    return np.asarray(out - out.mean(0))
+    x = x - x.mean(0)
+    total = np.zeros((len(x) + 1, x.shape[1]))
+    np.cumsum(x, axis=0, out=total[1:])
+    slow = total[hi]
+    slow -= total[lo]
+    slow /= (hi - lo)[:, None]
+    x -= slow
+    x -= x.mean(0)
+    return x
 
 
 def _score_lags(

@@ -1,6 +1,6 @@
 """One module per output format, each with ``writing(path, name)``: a file to which trajectories are added in blocks.
 
-`write_all` writes the formats of every run, `write_as` one format by name, `write_parts` any of them in one pass.
+`write_as` writes one format by name, `write_parts` any of them in one pass.
 """
 
 from __future__ import annotations
@@ -27,26 +27,6 @@ class Add(Protocol):
     """Adds rows to a file; `utc` (K,), datetime64, where the clock is known."""
 
     def __call__(self, block: Trajectory, utc: Array | None = None) -> None: ...
-
-
-def write_all(blocks: Trajectory | Iterable[Trajectory], folder: Path, name: str | None = None) -> None:
-    """Write trajectory.csv, trajectory.kml and trajectory.tum into `folder`, which is created if need be.
-
-    Parameters
-    ----------
-    blocks : a trajectory, or its successive parts, only one of which need be in memory.
-    name : name in the files; the trajectory's own if None.
-
-    Raises
-    ------
-    RecordingError
-        If the trajectory is in a local frame, or has no attitude (which TUM cannot leave out).
-    """
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
-    if isinstance(blocks, Trajectory):
-        name, blocks = (blocks.name if name is None else name), [blocks]
-    write_parts(blocks, {one: folder / f"trajectory.{one}" for one in ("csv", "kml", "tum")}, name or "")
 
 
 def write_parts(
