@@ -178,10 +178,10 @@ def _search(t: Array, y: Array, x_at: lags_of_clocks.Regressors, span: Array, va
         return _regress_inliers(x_at(rows, lag), y[rows]) if len(rows) >= MIN_PAIRS else (0.0, np.zeros(1))
 
     r, b = regression(lag)
-    if abs(lag) < 2.0 * spread and r < correlation(
-        0.0, every
-    ):  # a shift that the data leave open and that explains less than none
-        lag, (r, b) = 0.0, regression(0.0)
+    if abs(lag) < 2.0 * spread:  # the data leave it open
+        unshifted, of_it = regression(0.0)
+        if unshifted > r:
+            lag, r, b = 0.0, unshifted, of_it
     return Fit(lag, spread, r, b)
 
 
