@@ -123,6 +123,10 @@ def load_raw(
                 "no ionosphere coefficients in the navigation files: the delay at night is assumed, 5 ns at the zenith",
             )
         )
+    carriers = np.isfinite(raw.carrier)
+    if half := int(np.sum(raw.half & carriers)):
+        sentence = f"carriers that may be off by half a cycle: {half} of {int(carriers.sum())}; none of these is fixed"
+        notes.append(Note("raw.half_cycles", sentence))
     raw, fixes = _correct_times(raw, fixes)
     if sources.base:
         raw, more = _difference_by_base(raw, sources, nav, precise)

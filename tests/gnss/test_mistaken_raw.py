@@ -198,7 +198,9 @@ def test_a_half_cycle_ends_its_own_arc_alone(changed, whole):
         epochs[15] = re.sub(rf"^({name}.{{30}}).", r"\g<1>2", epochs[15], flags=re.MULTILINE)
         return head + "".join(epochs)
 
-    raw = raw_of(changed("rover.obs.gz", half))
+    recording = changed("rover.obs.gz", half)
+    raw = raw_of(recording)
+    assert "raw.half_cycles" in keys(recording)
     of = raw.satellite == satellite_id(name)
     assert same_rows(raw, whole, lambda _: False)
     assert raw.half.sum() == whole.half.sum() + 1
