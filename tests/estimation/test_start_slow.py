@@ -11,6 +11,8 @@ import pytest
 from helpers import Array
 from scipy.stats import chi2
 
+from helpers import at_rate
+
 from graphnav import load
 from graphnav.config import Settings
 from graphnav.core import rotation as ro
@@ -184,3 +186,20 @@ def test_fixes_far_apart_are_enough_for_a_start(every: int) -> None:
     assert found.motion is not None
     assert recording.truth is not None
     assert abs(off(found, recording, recording.truth)) < 3.0 * found.sigma[2]
+
+
+@pytest.mark.parametrize("begin", [426.0, 440.0])
+def test_wheels_tell_the_start_of_a_drive_that_begins_without_fixes(shared_data: Path, begin: float) -> None:
+    """No fix before 476 s; the oracle moves off at 426 s, and drives at a steady 9 m/s from 436 s on."""
+    drive = at_rate(load(shared_data / "oracle_drive").crop(begin, 540.0), 25.0)
+    assert drive.truth is not None
+    assert drive.truth.llh is not None
+    assert drive.truth.v is not None
+    found, frame = aligned(drive), LocalFrame(origin(drive))
+    p, v = (
+        np.array([np.interp(drive.start, drive.truth.t, column) for column in rows.T])
+        for rows in (frame.from_llh(drive.truth.llh), drive.truth.v)
+    )
+    assert np.all(np.abs(found.state.v[0] - v) < found.sigma[6:9])
+    assert np.all(np.abs(found.state.p[0] - p) < found.sigma[3:6])
+    assert np.max(found.sigma[6:9]) < 0.5 + 9.0  # as fast as the wheels say, wherever to

@@ -17,6 +17,8 @@ from graphnav.imu.samples import bridge_gaps
 from graphnav.recording import Imu, Recording
 
 _BASE = 5.0  # s between the fixes that give the first velocity
+_STANDING = 0.5  # m/s, of a vehicle that is taken to stand
+_CHANGE = 2.0  # m/s^2, by which the speed may change where nothing measures it
 
 
 def carry_back(
@@ -37,7 +39,7 @@ def carry_back(
     sd_bg = sd[12:15]
     sd_p, sd_v = np.full(3, 1.0) + 10.0 * sd[3:6], np.full(3, 0.5) + 10.0 * sd[6:9]
     if begin - recording.start > 0.05:
-        still = find_stand_end(imu, recording.start, begin)
+        still = find_stand_end(imu, recording.start, min(begin, _find_first_turn(recording)))
         stood, back = still - recording.start, begin - still
         drift = np.zeros(3)
         if back > 0.05:
@@ -57,7 +59,7 @@ def carry_back(
         if stood > 0.0:
             rest = imu.t <= still
             bg = imu.gyro[rest].mean(axis=0) - solution.frame.omega_n @ R
-            v, sd_v = np.zeros(3), np.minimum(sd_v, 0.5)
+            v, sd_v = np.zeros(3), np.minimum(sd_v, _STANDING)
             drift = np.hypot(drift, noise.gyro_noise_density * np.sqrt(stood))
             notes = (
                 *notes,
@@ -68,6 +70,9 @@ def carry_back(
             )
             sd_bg = np.full(3, noise.gyro_noise_density / np.sqrt(stood) + noise.gyro_bias_walk * np.sqrt(stood))
         p, sd_p, v, sd_v = _refine_by_fixes(recording, solution.frame, R, (p, sd_p, v, sd_v))
+        if recording.odometer is not None:
+            there = solution.states.p[0], 1.0 + 10.0 * sd[3:6]
+            p, sd_p, v, sd_v = _refine_by_wheels(recording, begin, R, bg, wide, there, (p, sd_p, v, sd_v))
         wide = np.hypot(wide, settings.alignment.prior_inflation * drift)
         own = np.hypot(own, np.abs(rotation.rph_jacobian(rotation.to_rph(R))) @ drift)
     sigma = np.concatenate(
@@ -96,9 +101,50 @@ def find_stand_end(imu: Imu, start: float, end: float) -> float:
     return float(imu.t[size * stood - 1]) if stood >= 2 else start
 
 
+def _find_first_turn(recording: Recording) -> float:
+    """When the wheels first turn, s; infinity where nobody knows. A steady drive shakes no more than an engine at idle."""
+    odometer = recording.odometer
+    if odometer is None or not (turning := np.abs(odometer.speed) > _STANDING).any():
+        return np.inf
+    return float(odometer.t[np.argmax(turning)])
+
+
 def _measure_range(x: Array) -> Array:
     """(N, k) maximum minus minimum so far."""
     return np.maximum.accumulate(x, axis=0) - np.minimum.accumulate(x, axis=0)
+
+
+def _refine_by_wheels(
+    recording: Recording,
+    begin: float,
+    R: Array,
+    bg: Array,
+    wide: Array,
+    there: tuple[Array, Array],
+    found: tuple[Array, Array, Array, Array],
+) -> tuple[Array, Array, Array, Array]:
+    """Position and velocity at the start, each with its sigma: as found, or by the odometer if these are better.
+
+    Forwards by what the wheels say, up to `there`, the position at `begin` and its sigma; an attitude that is off by an
+    angle turns the whole way.
+    """
+    p, sd_p, v, sd_v = found
+    odometer = recording.odometer
+    assert odometer is not None
+    inside = (odometer.t >= recording.start) & (odometer.t < begin) & np.isfinite(odometer.speed)
+    t, speed = odometer.t[inside], odometer.speed[inside]
+    if len(t) < 2 or t[0] - recording.start > 1.0:
+        return found
+    off = float(np.max(wide)) + (0.0 if odometer.signed else 2.0)  # rad; of a turn by half, twice the way
+    sd_v_wheels = np.full(3, _STANDING + abs(speed[0]) * off)
+    if np.linalg.norm(sd_v_wheels) < np.linalg.norm(sd_v):
+        v, sd_v = speed[0] * R[:, 1], sd_v_wheels
+    step = np.diff(np.append(t, begin))
+    sd_p_wheels = there[1] + float(np.sum(step * np.abs(speed))) * off
+    if np.linalg.norm(sd_p_wheels) < np.linalg.norm(sd_p):
+        dR, _, _ = prefix(bridge_gaps(recording.imu), recording.start, np.maximum(t, recording.start), np.zeros(3), bg)
+        p, sd_p = there[0] - R @ np.sum(dR[:, :, 1] * (step * speed)[:, None], axis=0), sd_p_wheels
+    return p, sd_p, v, sd_v
 
 
 def _refine_by_fixes(
@@ -118,11 +164,11 @@ def _refine_by_fixes(
     if len(later):
         j, dt = later[0], float(gnss.t[later[0]] - gnss.t[i])
         v_fix = (frame.from_llh(gnss.llh[j]) - frame.from_llh(gnss.llh[i])) / dt
-        sd_v_fix = 3.0 * np.hypot(gnss.sd[i], gnss.sd[j]) / dt + 2.0 * dt  # the speed may change meanwhile, by 2 m/s^2
+        sd_v_fix = 3.0 * np.hypot(gnss.sd[i], gnss.sd[j]) / dt + _CHANGE * dt
     if np.linalg.norm(sd_v_fix) < np.linalg.norm(sd_v):
         v, sd_v = v_fix, sd_v_fix
     away = abs(float(gnss.t[i]) - recording.start)
-    sd_fix = 1.0 + 10.0 * gnss.sd[i] + (np.linalg.norm(v) + sd_v) * away
+    sd_fix = 1.0 + 10.0 * gnss.sd[i] + (np.linalg.norm(v) + sd_v) * away + 0.5 * _CHANGE * away**2
     if np.linalg.norm(sd_fix) < np.linalg.norm(sd_p):
         p, sd_p = fix - v * (gnss.t[i] - recording.start), sd_fix
     return p, sd_p, v, sd_v
