@@ -8,10 +8,8 @@ from pathlib import Path
 import numpy as np
 import oracle
 import pytest
-from helpers import Array
+from helpers import Array, at_rate
 from scipy.stats import chi2
-
-from helpers import at_rate
 
 from graphnav import load
 from graphnav.config import Settings
