@@ -16,7 +16,7 @@ from test_raw_rtk import with_carriers
 
 from graphnav.config import Settings, settings_from
 from graphnav.constraints.raw_phase import WholeCycles
-from graphnav.constraints.raw_ppp import CLOCKS
+from graphnav.constraints.raw_ppp import LASTING
 from graphnav.core.errors import RecordingError
 from graphnav.core.interpolation import interpolate
 from graphnav.core.notes import key_of
@@ -141,7 +141,7 @@ def test_precise_point_positioning_is_that_of_the_recording(two: Recording) -> N
     assert online.tracker is not None
     assert {"gnss_ppp_code", "gnss_ppp_carrier"} < online.tracker.in_force.keys()
     whole = run(two, how, ("rts",))["rts"]
-    assert CLOCKS in whole.parameters
+    assert LASTING in whole.parameters
     at = np.argmin(np.abs(whole.t - track.t[:, None]), axis=1)
     same = np.abs(whole.t[at] - track.t) < 1e-6
     assert same.sum() > 35
