@@ -102,7 +102,7 @@ def find_stand_end(imu: Imu, start: float, end: float) -> float:
 
 
 def _find_first_turn(recording: Recording) -> float:
-    """When the wheels first turn, s, as a steady drive shakes no more than an idle engine; infinity where nobody knows."""
+    """When the wheels first turn, s, inf where nobody knows: a steady drive shakes no more than an idle engine."""
     odometer = recording.odometer
     if odometer is None or not (turning := np.abs(odometer.speed) > _STANDING).any():
         return np.inf
