@@ -156,6 +156,7 @@ def _run(
     return {name: join_solutions([one[name] for one in found], tuple(notes)) for name in solvers}
 
 
+@np.errstate(over="ignore", invalid="ignore", divide="ignore")  # what breaks down raises an error that says so
 def _solve_with_retry(
     recording: Recording,
     settings: Settings,

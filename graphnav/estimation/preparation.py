@@ -132,7 +132,6 @@ def prepare(
     )
 
 
-@np.errstate(over="ignore", invalid="ignore", divide="ignore")  # of candidates that break down
 def _find_noise(
     builder: ProblemBuilder, built: BuiltProblem, progress: Progress | None, passes: Counter[str]
 ) -> tuple[NoiseModel, Points | None, BuiltProblem]:
