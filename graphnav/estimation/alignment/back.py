@@ -131,18 +131,18 @@ def _refine_by_wheels(
     p, sd_p, v, sd_v = found
     odometer = recording.odometer
     assert odometer is not None
-    inside = (odometer.t >= recording.start) & (odometer.t < begin) & np.isfinite(odometer.speed)
+    inside = (odometer.t > recording.start) & (odometer.t < begin) & np.isfinite(odometer.speed)
     t, speed = odometer.t[inside], odometer.speed[inside]
     if len(t) < 2 or t[0] - recording.start > 1.0:
         return found
-    off = float(np.max(wide)) + (0.0 if odometer.signed else 2.0)  # rad; of a turn by half, twice the way
+    off = float(np.max(wide)) + (0.0 if odometer.signed else 2.0)  # rad; what goes backwards is off by twice the way
     sd_v_wheels = np.full(3, _STANDING + abs(speed[0]) * off)
     if np.linalg.norm(sd_v_wheels) < np.linalg.norm(sd_v):
         v, sd_v = speed[0] * R[:, 1], sd_v_wheels
     step = np.diff(np.append(t, begin))
     sd_p_wheels = there[1] + float(np.sum(step * np.abs(speed))) * off
     if np.linalg.norm(sd_p_wheels) < np.linalg.norm(sd_p):
-        dR, _, _ = prefix(bridge_gaps(recording.imu), recording.start, np.maximum(t, recording.start), np.zeros(3), bg)
+        dR, _, _ = prefix(bridge_gaps(recording.imu), recording.start, t, np.zeros(3), bg)
         p, sd_p = there[0] - R @ np.sum(dR[:, :, 1] * (step * speed)[:, None], axis=0), sd_p_wheels
     return p, sd_p, v, sd_v
 
