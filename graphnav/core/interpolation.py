@@ -11,7 +11,6 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from scipy.linalg import solve_banded
 
 from graphnav.core import rotation
 from graphnav.core.earth import LocalFrame
@@ -115,37 +114,16 @@ def differentiate(trajectory: Trajectory, max_gap: float) -> Array:
 
     Those of cubic splines, of which none leads across a gap of more than `max_gap` s; NaN for a row alone.
     """
+    from scipy.interpolate import CubicSpline
+
     p = trajectory.llh if trajectory.frame == "local" else LocalFrame(trajectory.llh[0]).from_llh(trajectory.llh)
     v = np.full(p.shape, np.nan)
     for axis in range(3):
         rows = np.flatnonzero(np.isfinite(p[:, axis]))
         for part in np.split(rows, np.flatnonzero(np.diff(trajectory.t[rows]) > max_gap) + 1):
             if len(part) > 1:
-                v[part, axis] = _find_slopes(trajectory.t[part], p[part, axis])
+                v[part, axis] = CubicSpline(trajectory.t[part], p[part, axis])(trajectory.t[part], 1)
     return v
-
-
-def _find_slopes(t: Array, x: Array) -> Array:
-    """Slopes (N,) at its knots of the cubic spline through x (N,), its first two and last two pieces one cubic each.
-
-    C. de Boor, *A Practical Guide to Splines*, ch. IV. SciPy's splines take a fifth of a second to import.
-    """
-    h = np.diff(t)
-    chord = np.diff(x) / h
-    if len(h) == 1:
-        return np.repeat(chord, 2)
-    banded, right = np.zeros((3, len(t))), np.empty(len(t))
-    banded[0, 2:], banded[1, 1:-1], banded[2, :-2] = h[:-1], 2.0 * (h[:-1] + h[1:]), h[1:]
-    right[1:-1] = 3.0 * (h[1:] * chord[:-1] + h[:-1] * chord[1:])
-    if len(h) == 2:  # the parabola
-        banded[1, [0, -1]] = banded[0, 1] = banded[2, -2] = 1.0
-        right[[0, -1]] = 2.0 * chord
-    else:
-        for end, near, row in ((0, 1, 0), (-1, -2, 2)):
-            both = h[end] + h[near]
-            banded[1, end], banded[row, near] = h[near], both
-            right[end] = ((h[end] + 2.0 * both) * h[near] * chord[end] + h[end] ** 2 * chord[near]) / both
-    return np.asarray(solve_banded((1, 1), banded, right))
 
 
 def full_covariance(trajectory: Trajectory) -> Array | None:

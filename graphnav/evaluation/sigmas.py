@@ -13,7 +13,7 @@ from graphnav.evaluation.metrics import Errors, over_sigmas
 
 _TOO_SMALL, _CAUTIOUS = 1.5, 0.5  # error over sigma; what lies between is acceptable
 PARTS = {"position": "height", "attitude": "heading"}  # judged by themselves as well
-_BY_CHANCE = 0.0027  # outside three standard deviations of a Gaussian
+BY_CHANCE = 0.0027  # outside three standard deviations of a Gaussian
 
 
 @dataclass(frozen=True)
@@ -70,9 +70,9 @@ def _judge(block: str, nees: Array, dof: int, over_sigma: Array) -> BlockVerdict
     size = float(np.sqrt(np.mean(nees) / dof))
     verdict = "fits"
     if size > _TOO_SMALL:
-        verdict = "too small" if size**2 > chi_square_band(dof, effective, _BY_CHANCE)[1] else "unclear"
+        verdict = "too small" if size**2 > chi_square_band(dof, effective, BY_CHANCE)[1] else "unclear"
     elif size < _CAUTIOUS:
         verdict = "cautious"
     return BlockVerdict(
-        block, size, float(np.mean(nees <= chi_square_quantile(1.0 - _BY_CHANCE, dof))), effective, verdict
+        block, size, float(np.mean(nees <= chi_square_quantile(1.0 - BY_CHANCE, dof))), effective, verdict
     )

@@ -13,6 +13,7 @@ from graphnav.core.state import BLOCKS
 from graphnav.estimation.noise.apply import row_weights
 from graphnav.estimation.solution import Solution
 from graphnav.evaluation.against import own_solutions
+from graphnav.evaluation.sigmas import BY_CHANCE
 from graphnav.report.consistency import consistency
 from graphnav.report.wording import and_list
 
@@ -21,7 +22,6 @@ if TYPE_CHECKING:
 
 FEWEST_ROWS = 10  # rows needed to judge a sigma
 _BY_INFORMATION = "batch rts isam2 incremental ekf"  # the most first
-_BY_CHANCE = 0.0027  # outside three standard deviations of a Gaussian
 _BRIEF = (
     0.01  # share of a drive in which what a filter met by chance, an outlier or the first fix after a gap, may show
 )
@@ -50,7 +50,7 @@ def find_departures(solutions: Mapping[str, Solution]) -> dict[str, Note]:
         off, P = off[known], P[known] + _ROUNDING * np.eye(3)
         over = np.sqrt(np.einsum("ki,ki->k", off, np.linalg.solve(P, off[:, :, None])[:, :, 0]))
         size = np.linalg.norm(off, axis=1)
-        beyond = np.flatnonzero(over > np.sqrt(chi_square_quantile(1.0 - _BY_CHANCE, 3)))
+        beyond = np.flatnonzero(over > np.sqrt(chi_square_quantile(1.0 - BY_CHANCE, 3)))
         if len(beyond) > _BRIEF * len(off):
             k = beyond[np.argmax(size[beyond])]
             far = f"up to {size[k]:.2g} m from {best}, {over[k]:.2g} times its own sigma"

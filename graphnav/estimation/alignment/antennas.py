@@ -37,7 +37,7 @@ def measure_baseline_heading(
 
     Parameters
     ----------
-    stationary : (N, 2) s, intervals in which it stands; None: unknown, and a quiet IMU is taken for standing.
+    stationary : (N, 2) s, intervals in which it stands; None: unknown, and a quiet IMU whose wheels do not turn stands.
 
     Returns
     -------
@@ -49,7 +49,7 @@ def measure_baseline_heading(
         return None
     begin, first = recording.start, float(recording.imu.t[0]) + SAME_TIME
     if stationary is None:
-        end = find_stand_end(recording.imu, begin, recording.end)
+        end = find_stand_end(recording, recording.end)
     else:
         end = float(max((b for a, b in stationary if a <= first), default=begin))
     rows = (series.t >= begin - SAME_TIME) & (series.t <= end + SAME_TIME) & np.isfinite(series["heading"])

@@ -13,8 +13,8 @@ from graphnav.core.state import States
 from graphnav.estimation.alignment.first import Alignment
 from graphnav.estimation.solution import Solution
 from graphnav.imu.preintegration import prefix
-from graphnav.imu.samples import bridge_gaps
-from graphnav.recording import Imu, Recording
+from graphnav.imu.samples import Samples, bridge_gaps
+from graphnav.recording import Recording
 
 _BASE = 5.0  # s between the fixes that give the first velocity
 _STANDING = 0.5  # m/s, of a vehicle that is taken to stand
@@ -39,11 +39,11 @@ def carry_back(
     sd_bg = sd[12:15]
     sd_p, sd_v = np.full(3, 1.0) + 10.0 * sd[3:6], np.full(3, 0.5) + 10.0 * sd[6:9]
     if begin - recording.start > 0.05:
-        still = find_stand_end(imu, recording.start, min(begin, _find_first_turn(recording)))
+        still, samples = find_stand_end(recording, begin), bridge_gaps(imu)
         stood, back = still - recording.start, begin - still
         drift = np.zeros(3)
         if back > 0.05:
-            dR, dV, dP = prefix(bridge_gaps(imu), still, np.array([begin]), ba, bg)
+            dR, dV, dP = prefix(samples, still, np.array([begin]), ba, bg)
             R = rotation.exp(solution.frame.omega_n * back) @ R @ dR[0].T  # the Earth has turned meanwhile
             g = solution.frame.gravity_n(p)
             v0 = v - g * back - R @ dV[0]
@@ -72,7 +72,7 @@ def carry_back(
         p, sd_p, v, sd_v = _refine_by_fixes(recording, solution.frame, R, (p, sd_p, v, sd_v))
         if recording.odometer is not None:
             there = solution.states.p[0], 1.0 + 10.0 * sd[3:6]
-            p, sd_p, v, sd_v = _refine_by_wheels(recording, begin, R, bg, wide, there, (p, sd_p, v, sd_v))
+            p, sd_p, v, sd_v = _refine_by_wheels(recording, samples, begin, R, bg, wide, there, (p, sd_p, v, sd_v))
         wide = np.hypot(wide, settings.alignment.prior_inflation * drift)
         own = np.hypot(own, np.abs(rotation.rph_jacobian(rotation.to_rph(R))) @ drift)
     sigma = np.concatenate(
@@ -82,11 +82,15 @@ def carry_back(
     return Alignment(state, np.minimum(sigma, np.r_[[np.pi] * 3, [1e6] * 12]), own, notes)
 
 
-def find_stand_end(imu: Imu, start: float, end: float) -> float:
-    """End of the initial span with nothing but vibration: one-second means hardly differ. `start` if there is none.
+def find_stand_end(recording: Recording, end: float) -> float:
+    """End of the initial span with nothing but vibration: one-second means hardly differ. The start if there is none.
 
-    The last second before the first that differs is left out as well, as motion may have begun in it.
+    The last second before the first that differs is left out as well, as motion may have begun in it. A steady drive
+    shakes no more than an idle engine: it does not stand where its wheels turn.
     """
+    imu, odometer, start = recording.imu, recording.odometer, recording.start
+    if odometer is not None and (turning := np.abs(odometer.speed) > _STANDING).any():
+        end = min(end, float(odometer.t[np.argmax(turning)]))
     rows = imu.t <= end
     blocks = max(1, int(end - start))
     size = np.count_nonzero(rows) // blocks
@@ -101,14 +105,6 @@ def find_stand_end(imu: Imu, start: float, end: float) -> float:
     return float(imu.t[size * stood - 1]) if stood >= 2 else start
 
 
-def _find_first_turn(recording: Recording) -> float:
-    """When the wheels first turn, s, inf where nobody knows: a steady drive shakes no more than an idle engine."""
-    odometer = recording.odometer
-    if odometer is None or not (turning := np.abs(odometer.speed) > _STANDING).any():
-        return np.inf
-    return float(odometer.t[np.argmax(turning)])
-
-
 def _measure_range(x: Array) -> Array:
     """(N, k) maximum minus minimum so far."""
     return np.maximum.accumulate(x, axis=0) - np.minimum.accumulate(x, axis=0)
@@ -116,6 +112,7 @@ def _measure_range(x: Array) -> Array:
 
 def _refine_by_wheels(
     recording: Recording,
+    samples: Samples,
     begin: float,
     R: Array,
     bg: Array,
@@ -142,7 +139,7 @@ def _refine_by_wheels(
     step = np.diff(np.append(t, begin))
     sd_p_wheels = there[1] + float(np.sum(step * np.abs(speed))) * off
     if np.linalg.norm(sd_p_wheels) < np.linalg.norm(sd_p):
-        dR, _, _ = prefix(bridge_gaps(recording.imu), recording.start, t, np.zeros(3), bg)
+        dR, _, _ = prefix(samples, recording.start, t, np.zeros(3), bg)
         p, sd_p = there[0] - R @ np.sum(dR[:, :, 1] * (step * speed)[:, None], axis=0), sd_p_wheels
     return p, sd_p, v, sd_v
 

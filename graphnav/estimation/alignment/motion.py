@@ -36,7 +36,7 @@ _LEAD_TIME = 10.0  # s of the span before the motion
 _OUTLYING = 6.0  # multiple of the typical deviation of fixes from their running median, or of their sigma
 # rad, of the initial headings that are tried, relative to the first guess
 _HEADINGS_TRIED = (0.0, 0.5 * np.pi, 1.5 * np.pi, np.pi)
-_FIRST_ITERATIONS = 6  # iterations after which a start that is nearly right has converged, and others creep
+_FIRST_ITERATIONS = 10  # iterations after which a start either has converged or creeps
 _UNLIKELY = 14.0  # difference of log-likelihoods at a ratio of one in a million: -ln 1e-6
 
 Smoother = Callable[[Problem, States], Solution]

@@ -205,7 +205,7 @@ def _choose_rover(
     if all(a[1] < b[0] for a, b in pairwise(spans)):
         return tuple(paths), None
     names = " and ".join(path.name for path in paths)
-    moved = [_has_moved(path, placing) for path in paths] if len(paths) == 2 else []
+    moved = [_moves(path, placing) for path in paths] if len(paths) == 2 else []
     if sum(moved) != 1:
         why = f", and {'both' if all(moved) else 'neither'} of the antennas moved" if moved else ""
         raise RecordingError(
@@ -217,7 +217,7 @@ def _choose_rover(
     return (rover,), paths[moved.index(False)]
 
 
-def _has_moved(path: Path, placing: dict[str, tuple[Path, ...]]) -> bool:
+def _moves(path: Path, placing: dict[str, tuple[Path, ...]]) -> bool:
     """Whether an antenna was ever further from its median place than its single-point positions are good to."""
     fixes = _solve_alone(path, placing)
     good = np.isfinite(fixes.p[:, 0])

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from graphnav.core.earth import A
 from graphnav.core.rotation import Array
 
-_RADIUS = 6.371e6  # m, of the Earth: nobody minds a third of a percent here
 _MOST_DIGITS = 10  # decimals that degrees in double precision have
 _PARTS = 1.0, 60.0  # of a degree that logs count in: degrees, and minutes as of NMEA
 _FEWEST = 4  # values from which on a step is no chance: of finer ones, one set in ten thousand has it
@@ -18,6 +18,8 @@ _FEWEST = 4  # values from which on a step is no chance: of finer ones, one set 
 
 def measure_rounding(llh: Array) -> tuple[float, ...]:
     """Standard deviation of what places are rounded by, east, north and up, m; 0 where no step shows.
+
+    As on a sphere: good to half a percent.
 
     Parameters
     ----------
@@ -27,7 +29,7 @@ def measure_rounding(llh: Array) -> tuple[float, ...]:
     if not len(llh):
         return (0.0, 0.0, 0.0)
     lat, lon = (
-        _RADIUS * max(np.radians(find_step(np.degrees(column) * parts) / parts) for parts in _PARTS)
+        A * max(np.radians(find_step(np.degrees(column) * parts) / parts) for parts in _PARTS)
         for column in llh[:, :2].T
     )
     return tuple(float(step) / np.sqrt(12.0) for step in (lon * np.cos(llh[0, 0]), lat, find_step(llh[:, 2])))
