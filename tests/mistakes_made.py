@@ -362,6 +362,7 @@ MISTAKES: dict[str, list[Mistake]] = {
         ),
         Mistake("x and y of the accelerometer exchanged", swapped("imu", "ax", "ay"), ("axes",)),
         Mistake("the gyro left-handed", scaled("imu", "gx gy gz", -1.0), ("gyro's sign is reversed", "negate")),
+        Mistake("the gyro's forward axis reversed", scaled("imu", "gy", -1.0), ("gyro rolls against", "negate gy")),
         Mistake(
             "an accelerometer that reads -9.8 at rest",
             scaled("imu", "ax ay az", -1.0),
@@ -376,6 +377,11 @@ MISTAKES: dict[str, list[Mistake]] = {
             "the accelerometer's forward axis reversed",
             scaled("imu", "ay", -1.0),
             ("forward axis is reversed", "no axes in [imu]", "negate ay"),
+        ),
+        Mistake(
+            "the accelerometer's right axis reversed",
+            scaled("imu", "ax", -1.0),
+            ("out of the curves", "no axes in [imu]", "negate ax"),
         ),
         Mistake(
             "the IMU built in the other way round",

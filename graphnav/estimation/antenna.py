@@ -37,9 +37,9 @@ _FEWEST_FIXES = 30  # fixes
 _SURE_SIGMAS = 8.0  # 4 sigmas, doubled because errors of fixes are correlated for minutes
 # Findings by which attitude, times or positions are wrong: what the drive then says of lever arms follows from that.
 _FIRST = {
-    "imu.axes", "imu.clock", "imu.contradicted", "imu.force_sign", "imu.gyro_fast", "imu.gyro_scale", "imu.gyro_sign",
-    "imu.gyro_unit", "imu.up", "gnss.clock", "gnss.feet", "gnss.lat_lon", "gnss.mirrored", "gnss.velocity_axes",
-    "gnss.velocity_down", "gnss.velocity_unit",
+    "imu.axes", "imu.clock", "imu.contradicted", "imu.force_sign", "imu.gyro_axis_sign", "imu.gyro_fast",
+    "imu.gyro_scale", "imu.gyro_sign", "imu.gyro_unit", "imu.sideways_reversed", "imu.up", "gnss.clock", "gnss.feet",
+    "gnss.lat_lon", "gnss.mirrored", "gnss.velocity_axes", "gnss.velocity_down", "gnss.velocity_unit",
 }  # fmt: skip
 
 

@@ -435,6 +435,26 @@ def test_a_sign_is_named_where_it_is_all_that_is_wrong(stated: tuple[float, ...]
     assert [f.key for f in find_wrong_arms(wrong)] == told
 
 
+@pytest.mark.parametrize(
+    ("name", "sensor", "axis", "told"),
+    [
+        ("boulder_drive_20250708", "gyro", 0, "imu.gyro_axis_sign"),
+        ("dresden_car_20140326", "gyro", 1, "imu.gyro_axis_sign"),
+        ("car_circles_boston_20241021", "gyro", 1, "imu.gyro_axis_sign"),
+        ("dresden_car_20140326", "accel", 0, "imu.sideways_reversed"),
+        ("car_circles_boston_20241021", "accel", 0, "imu.sideways_reversed"),
+    ],
+)
+def test_one_reversed_axis_is_told(
+    drive: Callable[[str], Recording], name: str, sensor: str, axis: int, told: str
+) -> None:
+    recording = drive(name)
+    values = getattr(recording.imu, sensor) * np.where(np.arange(3) == axis, -1.0, 1.0)
+    wrong = replace(recording, imu=replace(recording.imu, **{sensor: values}))
+    assert told not in keys(recording)
+    assert told in keys(wrong)
+
+
 @pytest.mark.parametrize("name", ["dresden_car_20140326", "motorbike_dresden_20160809", "car_circles_boston_20241021"])
 @pytest.mark.parametrize("exchanged", [False, True])
 def test_a_reversed_gyro_is_no_exchange_of_latitude_and_longitude(

@@ -22,7 +22,6 @@ from graphnav.recording.odometer.faults import FROZEN, GAP, STUCK, WILD
 from graphnav.sensors.tables import TIME
 
 _CERTAIN_SIGMAS = 4.0  # sigmas
-_NO_BETTER = 0.05  # of a correlation
 _MIN_SPEED = 5.0  # m/s, above which wheel speeds are compared
 _SELDOM = 10.0  # s between fixes; no receiver on a drive is set to a longer period
 
@@ -181,94 +180,6 @@ def check_imu_clock(clock: ClockOffsets, odometer: Fit | None = None) -> Iterato
         f"against speed, +-{max(forward.spread, 0.01):.2f} s): add {mend}",
         "imu.clock",
     )
-
-
-def check_imu_axes(imu: Imu, forward: Fit | None, track: Track | None) -> Iterator[Finding]:
-    """Axes that the drive contradicts: by the mean force, or by a forward force that fits another axis better."""
-    up = crosschecks.find_up(imu)
-    if up[2] > 0.8 and (forward is None or forward.correlation < 0.7):
-        return
-    if forward is None or forward.correlation < 0.7:
-        yield Finding(
-            "warning", f"the mean force points {_describe_direction(up)}, not up: are the axes right?", "imu.up"
-        )
-        return
-    ahead = forward.coefficients / np.linalg.norm(forward.coefficients)
-    if up[2] > 0.8 and ahead[1] > 0.7:
-        return
-    along = crosschecks.fit_along(imu, track) if up[2] > 0.8 and track is not None else None
-    # the proposed axes explain no more than the stated ones: without changes of speed and turns no direction is
-    # determined
-    if along is not None and along.coefficients[0] > 0.5 and along.correlation > forward.correlation - _NO_BETTER:
-        return
-    letters = _write_letters(imu.R_bs, ahead, up)
-    hint = f'; axes = "{letters}" would agree' if letters else ""
-    yield Finding(
-        "warning",
-        f"the axes contradict the drive: forward by the GNSS speed is {_describe_direction(ahead)}, up by gravity is "
-        f"{_describe_direction(up)} in the axes stated{hint}",
-        "imu.axes",
-    )
-
-
-def _describe_direction(v: Array) -> str:
-    names = (("left", "right"), ("backward", "forward"), ("down", "up"))
-    k = int(np.argmax(np.abs(v)))
-    return names[k][int(v[k] > 0)]
-
-
-def _write_letters(R_bs: Array, forward: Array, up: Array) -> str | None:
-    """The three letters of the axes with `forward` and `up` (body axes as loaded); None if none clearly fit."""
-    f, u = R_bs.T @ forward, R_bs.T @ up  # in the file's axes
-    if np.abs(f).max() < 0.8 or np.abs(u).max() < 0.8 or np.argmax(np.abs(f)) == np.argmax(np.abs(u)):
-        return None
-    unit = [np.sign(x) * (np.abs(x) == np.abs(x).max()) for x in (f, u)]
-    rows = np.stack([np.cross(*unit), *unit])  # right, forward, up
-    return "".join(
-        "LBD"[k] if rows[k, axis] < 0 else "RFU"[k] for axis in range(3) for k in [np.argmax(np.abs(rows[:, axis]))]
-    )
-
-
-def check_gyro_sign(imu: Imu, track: Track) -> Iterator[Finding]:
-    """The gyro about the mean force turns opposite to the course: no choice of axes explains that.
-
-    A vehicle that leans into its curves feels none, and which of the two is mirrored is then open.
-    """
-    if crosschecks.find_up(imu)[2] < 0:
-        alone = (crosschecks.correlate_sideways(imu, track) or 0.0) > 0.0  # its other axes agree with the gyro
-        which = "accelerometer's vertical axis" if alone else "accelerometer's sign"
-        what = f"the {which} is reversed (gyro and course deny its up), it must read +9.8 upward at rest"
-        yield Finding("warning", f"{what}; negate it in the file", "imu.force_sign")
-    elif crosschecks.correlate_sideways(imu, track) is None:
-        what = "the gyro turns against the GNSS course: its sign is reversed, or latitudes or longitudes have the wrong"
-        yield Finding(
-            "warning", f"{what} sign (south and west are negative); negate it, or them, in the file", "imu.gyro_sign"
-        )
-    else:
-        what = "the gyro's sign is reversed: it turns against the GNSS course while gravity points as stated"
-        yield Finding("warning", f"{what}; negate it in the file", "imu.gyro_sign")
-
-
-def check_yaw_scale(yaw: Fit | None) -> Iterator[Finding]:
-    if yaw is None or abs(yaw.correlation) < 0.8:
-        return
-    scale = abs(float(yaw.coefficients[0]))
-    if 40.0 < scale < 80.0:
-        yield Finding(
-            "warning",
-            "the gyro is 57 times too small for the GNSS course: it is in rad/s already, leave out units.gyro",
-            "imu.gyro_unit",
-        )
-    elif 1 / 80.0 < scale < 1 / 40.0:
-        yield Finding(
-            "warning",
-            'the gyro is 57 times too large for the GNSS course: say units = { gyro = "deg/s" }',
-            "imu.gyro_unit",
-        )
-    elif abs(scale - 1.0) > 0.1:
-        yield Finding(
-            "warning", f"the course turns {scale:.2f} times as much as the gyro about the vertical", "imu.gyro_scale"
-        )
 
 
 _WORD = {GAP: "gives no readings", STUCK: "is stuck at zero", FROZEN: "is frozen", WILD: "reads against the motion"}

@@ -121,7 +121,7 @@ def _correlate_each(x: Array, y: Array) -> Array:
     return np.asarray(np.where(scale > 0.0, prediction @ y / np.where(scale > 0.0, scale, 1.0), 0.0))
 
 
-def _regress_inliers(x: Array, y: Array) -> tuple[float, Array]:
+def regress_inliers(x: Array, y: Array) -> tuple[float, Array]:
     """`_regress` without rows beyond 5 sigma (by the median), repeated twice: spikes of fixes hide a good fit."""
     x, y = x - np.median(x, axis=0), y - np.median(y)
     keep = np.ones(len(y), dtype=bool)
@@ -175,7 +175,7 @@ def _search(t: Array, y: Array, x_at: lags_of_clocks.Regressors, span: Array, va
 
     def regression(lag: float) -> tuple[float, Array]:
         rows = every[valid(lag)]
-        return _regress_inliers(x_at(rows, lag), y[rows]) if len(rows) >= MIN_PAIRS else (0.0, np.zeros(1))
+        return regress_inliers(x_at(rows, lag), y[rows]) if len(rows) >= MIN_PAIRS else (0.0, np.zeros(1))
 
     r, b = regression(lag)
     if abs(lag) < 2.0 * spread:  # the data leave it open
@@ -313,25 +313,3 @@ def fit_odometer(odometer: Odometer, track: Track) -> tuple[Fit, float] | None:
     if moving.sum() < MIN_PAIRS:
         return None
     return fit, float(np.median(track.speed[rows][moving] / x[moving]))
-
-
-def correlate_sideways(imu: Imu, track: Track) -> float | None:
-    """Correlation of the force to the right with the one that the gyro's rate and the speed require.
-
-    None where there are no curves.
-    """
-    seconds = np.arange(max(track.t[0], imu.t[0]), min(track.t[-1], imu.t[-1]) - 1.0)
-    if len(seconds) < MIN_PAIRS:
-        return None
-    edge = np.searchsorted(imu.t, np.r_[seconds, seconds[-1] + 1.0])
-    count = np.diff(edge)
-    force, turn = (
-        np.diff(np.r_[0.0, np.cumsum(x)][edge]) / np.maximum(count, 1) for x in (imu.accel[:, 0], imu.gyro[:, 2])
-    )
-    wanted = -np.interp(seconds + 0.5, track.t, track.speed) * turn  # to the left in a left curve
-    used = count > 0
-    if used.sum() < MIN_PAIRS or wanted[used].std() == 0.0 or force[used].std() == 0.0:
-        return None
-    alike = float(np.corrcoef(wanted[used], force[used])[0, 1])
-    # 4 sigma of the correlation of as many unrelated values
-    return alike if abs(alike) > 4.0 / np.sqrt(used.sum()) else None

@@ -19,11 +19,15 @@ from graphnav.recording.checks import crosschecks, tracks
 from graphnav.recording.checks.aiding import (
     check_gnss_coverage,
     check_gnss_jumps,
-    check_gyro_sign,
-    check_imu_axes,
     check_odometer,
-    check_yaw_scale,
     measure_overlap,
+)
+from graphnav.recording.checks.axes import (
+    check_gyro_sign,
+    check_gyro_tilt,
+    check_imu_axes,
+    check_sideways,
+    check_yaw_scale,
 )
 from graphnav.recording.checks.clock import measure_clock_offsets
 from graphnav.recording.checks.imu import (
@@ -179,9 +183,12 @@ def inspect(recording: Recording) -> Inspection:
         if not turns_so and (mirrored := list(check_mirroring(recording, track, yaw, turns_back))):
             findings += mirrored
         elif not turned:
-            findings += (
-                check_gyro_sign(recording.imu, track) if turns_back else check_imu_axes(recording.imu, forward, track)
-            )
+            if turns_back:
+                findings += check_gyro_sign(recording.imu, track)
+            else:
+                wrong = list(check_imu_axes(recording.imu, forward, track))
+                wrong = wrong or list(check_sideways(recording.imu, forward, track, yaw))
+                findings += wrong or check_gyro_tilt(recording.imu, track)
             findings += check_yaw_scale(yaw)
             findings += check_height_unit(recording, track, forward)
     elif vehicle and not turned:

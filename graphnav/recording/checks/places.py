@@ -10,7 +10,7 @@ import numpy as np
 from graphnav.core.findings import Finding, period_of
 from graphnav.core.rotation import Array
 from graphnav.recording import Gnss, Imu, Recording
-from graphnav.recording.checks import crosschecks, tracks
+from graphnav.recording.checks import crosschecks, tilt, tracks
 from graphnav.recording.checks.clock import CLEAR, FAIR
 from graphnav.recording.checks.crosschecks import Fit
 from graphnav.recording.checks.imu import STANDARD_GRAVITY
@@ -39,7 +39,7 @@ def check_mirroring(recording: Recording, track: Track, as_read: Fit | None, tur
     elif (  # the gyro agrees with the force, whose up is that of the stated axes
         turns_back
         and crosschecks.find_up(recording.imu)[2] > 0.0
-        and (crosschecks.correlate_sideways(recording.imu, track) or 0.0) > 0.0
+        and (tilt.correlate_sideways(recording.imu, track) or 0.0) > 0.0
     ):
         yield describe_mirroring("latitudes or longitudes have", "the turns of the gyro and the force in curves")
 

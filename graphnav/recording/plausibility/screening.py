@@ -20,9 +20,9 @@ from graphnav.core.notes import Note, format_count
 from graphnav.core.rotation import Array
 from graphnav.recording import Imu, Recording, take_rows
 from graphnav.recording.checks import crosschecks, tracks
-from graphnav.recording.checks.aiding import check_imu_axes, check_imu_clock, measure_overlap
+from graphnav.recording.checks.aiding import check_imu_clock, measure_overlap
+from graphnav.recording.checks.axes import check_forward_sign
 from graphnav.recording.checks.clock import FAIR, ClockOffsets, measure_clock_offsets
-from graphnav.recording.checks.crosschecks import Fit
 from graphnav.recording.checks.series import screen_series
 from graphnav.recording.checks.tracks import Track
 from graphnav.recording.formats.schema import FORCE
@@ -326,8 +326,6 @@ def _is_moving(x: Array, same: Array, least: float) -> bool:
     """Whether an axis moves by many steps of its resolution, continually, and with a sensor's noise.
 
     Its standard deviation is then above `least`. Without noise an axis of a simulation may well be constant.
-
-    Without noise an axis of a simulation may well be constant.
     """
     steps = np.diff(x)
     steps = steps[np.abs(steps) > 1e-12 * np.abs(x).max()]
@@ -336,32 +334,3 @@ def _is_moving(x: Array, same: Array, least: float) -> bool:
     if float(np.ptp(x)) <= _MOVING_STEPS * float(np.abs(steps).min()):
         return False
     return float((steps[1:] * steps[:-1] < 0.0).mean()) > _NOISY
-
-
-_LEAST_CORRELATION = 0.7  # of a correlation, and of a unit vector's component
-
-
-def check_forward_sign(imu: Imu, track: Track | None, forward: Fit | None) -> Iterator[Finding]:
-    """The forward force decreases when the speed increases: one axis of the accelerometer is reversed, or all of the
-    IMU.
-    """
-    up = crosschecks.find_up(imu)
-    if track is None or forward is None or forward.correlation < _LEAST_CORRELATION or up[2] < 0.8:
-        return
-    ahead = forward.coefficients / np.linalg.norm(forward.coefficients)
-    if ahead[1] > -_LEAST_CORRELATION:
-        return
-    along = f"the forward force falls when the speed rises (correlation {-forward.correlation:.2f})"
-    if (
-        side := crosschecks.correlate_sideways(imu, track)
-    ) is not None and side > 0:  # then nothing is rotated: the other axes are right
-        column = "a" + _AXIS[int(np.argmax(np.abs(imu.R_bs[1])))]
-        yield Finding(
-            "refused",
-            f"{along} while the sideways force is right: the accelerometer's forward axis is reversed, which no axes "
-            f"in [imu] can say; negate {column} in the file",
-            "imu.forward_reversed",
-        )
-        return
-    for finding in check_imu_axes(imu, forward, track):
-        yield Finding("refused", f"{along}: {finding.sentence}", "imu.axes_turned")

@@ -1,0 +1,184 @@
+"""Checks of the IMU's axes, signs and scale against the drive."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from graphnav.core.findings import Finding
+from graphnav.core.rotation import Array
+from graphnav.recording import Imu
+from graphnav.recording.checks import crosschecks, tilt
+from graphnav.recording.checks.crosschecks import Fit
+from graphnav.recording.checks.tracks import Track
+
+_CORRELATED = 0.7  # a correlation, or a unit vector's component, that leaves no doubt
+_NO_BETTER = 0.05  # of a correlation
+_REVERSED = (-1.5, -0.5)  # nearer to the slope of a reversed axis, -1, than to none
+
+
+def check_imu_axes(imu: Imu, forward: Fit | None, track: Track | None) -> Iterator[Finding]:
+    """Axes that the drive contradicts: by the mean force, or by a forward force that fits another axis better."""
+    up = crosschecks.find_up(imu)
+    if up[2] > 0.8 and (forward is None or forward.correlation < 0.7):
+        return
+    if forward is None or forward.correlation < _CORRELATED:
+        yield Finding(
+            "warning", f"the mean force points {_describe_direction(up)}, not up: are the axes right?", "imu.up"
+        )
+        return
+    ahead = forward.coefficients / np.linalg.norm(forward.coefficients)
+    if up[2] > 0.8 and ahead[1] > _CORRELATED:
+        return
+    along = crosschecks.fit_along(imu, track) if up[2] > 0.8 and track is not None else None
+    # the proposed axes explain no more than the stated ones: without changes of speed and turns no direction is
+    # determined
+    if along is not None and along.coefficients[0] > 0.5 and along.correlation > forward.correlation - _NO_BETTER:
+        return
+    letters = _write_letters(imu.R_bs, ahead, up)
+    hint = f'; axes = "{letters}" would agree' if letters else ""
+    yield Finding(
+        "warning",
+        f"the axes contradict the drive: forward by the GNSS speed is {_describe_direction(ahead)}, up by gravity is "
+        f"{_describe_direction(up)} in the axes stated{hint}",
+        "imu.axes",
+    )
+
+
+def _describe_direction(v: Array) -> str:
+    names = (("left", "right"), ("backward", "forward"), ("down", "up"))
+    k = int(np.argmax(np.abs(v)))
+    return names[k][int(v[k] > 0)]
+
+
+def _name_column(imu: Imu, axis: int) -> str:
+    """The file's column of which an axis of the body mostly consists: x, y or z."""
+    return "xyz"[int(np.argmax(np.abs(imu.R_bs[axis])))]
+
+
+def _write_letters(R_bs: Array, forward: Array, up: Array) -> str | None:
+    """The three letters of the axes with `forward` and `up` (body axes as loaded); None if none clearly fit."""
+    f, u = R_bs.T @ forward, R_bs.T @ up  # in the file's axes
+    if np.abs(f).max() < 0.8 or np.abs(u).max() < 0.8 or np.argmax(np.abs(f)) == np.argmax(np.abs(u)):
+        return None
+    unit = [np.sign(x) * (np.abs(x) == np.abs(x).max()) for x in (f, u)]
+    rows = np.stack([np.cross(*unit), *unit])  # right, forward, up
+    return "".join(
+        "LBD"[k] if rows[k, axis] < 0 else "RFU"[k] for axis in range(3) for k in [np.argmax(np.abs(rows[:, axis]))]
+    )
+
+
+def check_forward_sign(imu: Imu, track: Track | None, forward: Fit | None) -> Iterator[Finding]:
+    """The forward force decreases when the speed increases: one axis of the accelerometer is reversed, or all of the
+    IMU.
+    """
+    up = crosschecks.find_up(imu)
+    if track is None or forward is None or forward.correlation < _CORRELATED or up[2] < 0.8:
+        return
+    ahead = forward.coefficients / np.linalg.norm(forward.coefficients)
+    if ahead[1] > -_CORRELATED:
+        return
+    along = f"the forward force falls when the speed rises (correlation {-forward.correlation:.2f})"
+    if (
+        side := tilt.correlate_sideways(imu, track)
+    ) is not None and side > 0:  # then nothing is rotated: the other axes are right
+        column = f"a{_name_column(imu, 1)}"
+        yield Finding(
+            "refused",
+            f"{along} while the sideways force is right: the accelerometer's forward axis is reversed, which no axes "
+            f"in [imu] can say; negate {column} in the file",
+            "imu.forward_reversed",
+        )
+        return
+    for finding in check_imu_axes(imu, forward, track):
+        yield Finding("refused", f"{along}: {finding.sentence}", "imu.axes_turned")
+
+
+def check_gyro_sign(imu: Imu, track: Track) -> Iterator[Finding]:
+    """The gyro about the mean force turns opposite to the course: no choice of axes explains that.
+
+    A vehicle that leans into its curves feels none, and which of the two is mirrored is then open.
+    """
+    if crosschecks.find_up(imu)[2] < 0:
+        alone = (tilt.correlate_sideways(imu, track) or 0.0) > 0.0  # its other axes agree with the gyro
+        which = "accelerometer's vertical axis" if alone else "accelerometer's sign"
+        what = f"the {which} is reversed (gyro and course deny its up), it must read +9.8 upward at rest"
+        yield Finding("warning", f"{what}; negate it in the file", "imu.force_sign")
+    elif tilt.correlate_sideways(imu, track) is None:
+        what = "the gyro turns against the GNSS course: its sign is reversed, or latitudes or longitudes have the wrong"
+        yield Finding(
+            "warning", f"{what} sign (south and west are negative); negate it, or them, in the file", "imu.gyro_sign"
+        )
+    else:
+        what = "the gyro's sign is reversed: it turns against the GNSS course while gravity points as stated"
+        yield Finding("warning", f"{what}; negate it in the file", "imu.gyro_sign")
+
+
+def check_yaw_scale(yaw: Fit | None) -> Iterator[Finding]:
+    if yaw is None or abs(yaw.correlation) < 0.8:
+        return
+    scale = abs(float(yaw.coefficients[0]))
+    if 40.0 < scale < 80.0:
+        yield Finding(
+            "warning",
+            "the gyro is 57 times too small for the GNSS course: it is in rad/s already, leave out units.gyro",
+            "imu.gyro_unit",
+        )
+    elif 1 / 80.0 < scale < 1 / 40.0:
+        yield Finding(
+            "warning",
+            'the gyro is 57 times too large for the GNSS course: say units = { gyro = "deg/s" }',
+            "imu.gyro_unit",
+        )
+    elif abs(scale - 1.0) > 0.1:
+        yield Finding(
+            "warning", f"the course turns {scale:.2f} times as much as the gyro about the vertical", "imu.gyro_scale"
+        )
+
+
+def check_sideways(imu: Imu, forward: Fit | None, track: Track, yaw: Fit | None) -> Iterator[Finding]:
+    """The force sideways points out of the curves that the gyro and, where `yaw` could be fitted, the course show."""
+    side = tilt.correlate_sideways(imu, track)
+    if side is None or side > -_CORRELATED:
+        return
+    if yaw is not None and (yaw.correlation < _CORRELATED or yaw.coefficients[0] < 0.0):
+        return
+    up = crosschecks.find_up(imu)
+    out = f"the force sideways points out of the curves (correlation {side:.2f})"
+    if forward is not None and forward.correlation > _CORRELATED and forward.coefficients[1] > 0.0:
+        column = f"a{_name_column(imu, 0)}"
+        yield Finding(
+            "unreliable",
+            f"{out} while the force forward is right: the accelerometer's right axis is reversed, which no axes in "
+            f"[imu] can say; negate {column} in the file",
+            "imu.sideways_reversed",
+        )
+        return
+    letters = _write_letters(imu.R_bs, np.array([0.0, -1.0, 0.0]), up)
+    hint = f' (axes = "{letters}" would agree)' if letters else ""
+    yield Finding(
+        "warning",
+        f"{out}, and no change of speed tells more: the IMU is built in the other way round{hint}, an axis is "
+        "reversed, or the vehicle drives backward",
+        "imu.sideways_reversed",
+    )
+
+
+def check_gyro_tilt(imu: Imu, track: Track) -> Iterator[Finding]:
+    """A gyro that pitches or rolls against the tilt that gravity shows, on a vehicle whose other axes are right.
+
+    One that leans into its curves is not judged: its level turns are about all three axes.
+    """
+    if (tilt.correlate_sideways(imu, track) or 0.0) <= 0.0:
+        return
+    for axis, ((slope, sigma), turn) in enumerate(zip(tilt.fit_tilt(imu, track), ("pitches", "rolls"), strict=False)):
+        if _REVERSED[0] < slope < _REVERSED[1] and slope < -tilt.SIGMAS * sigma:
+            column = f"g{_name_column(imu, axis)}"
+            yield Finding(
+                "unreliable",
+                f"the gyro {turn} against the tilt that the accelerometer shows ({slope:.2f} +- {sigma:.2f} of it, not "
+                f"1), while its turns are right: one axis is reversed, which no axes in [imu] can say; negate {column} "
+                "in the file",
+                "imu.gyro_axis_sign",
+            )

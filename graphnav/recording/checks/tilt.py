@@ -1,0 +1,72 @@
+"""Turns and tilts of a vehicle second by second: the accelerometer's beside those of the gyro."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from graphnav.core.rotation import Array
+from graphnav.recording import Imu
+from graphnav.recording.checks.crosschecks import MIN_PAIRS, regress_inliers
+from graphnav.recording.checks.tracks import Track
+
+SIGMAS = 4.0  # of a correlation, or a slope, that is not by chance
+
+
+def _average_seconds(imu: Imu, track: Track) -> tuple[Array, Array, Array, Array]:
+    """Starts of the seconds of IMU and track with readings of both (K,), speed at their starts and ends (K,), (K,),
+    and the means of the IMU's six axes in them (K, 6): specific force and turn rate.
+    """
+    edges = np.arange(max(track.t[0], imu.t[0]), min(track.t[-1], imu.t[-1]))
+    if len(edges) < 2:
+        return np.empty(0), np.empty(0), np.empty(0), np.empty((0, 6))
+    rows = np.searchsorted(imu.t, edges)
+    count = np.diff(rows)
+    axes = [np.diff(np.r_[0.0, np.cumsum(x)][rows]) / np.maximum(count, 1) for x in (*imu.accel.T, *imu.gyro.T)]
+    after = np.clip(np.searchsorted(track.t, edges), 1, len(track.t) - 1)
+    near = track.t[after] - track.t[after - 1] < 1.5 * max(1.0, track.period)
+    used = (count > 0) & near[1:] & near[:-1]
+    speed = np.interp(edges, track.t, track.speed)
+    return edges[:-1][used], speed[:-1][used], speed[1:][used], np.stack(axes, axis=-1)[used]
+
+
+def correlate_sideways(imu: Imu, track: Track) -> float | None:
+    """Correlation of the force to the right with the one that the gyro's rate and the speed require.
+
+    None where there are no curves.
+    """
+    _, before, after, mean = _average_seconds(imu, track)
+    wanted = -0.5 * (before + after) * mean[:, 5]  # to the left in a left curve
+    if len(wanted) < MIN_PAIRS or wanted.std() == 0.0 or mean[:, 0].std() == 0.0:
+        return None
+    alike = float(np.corrcoef(wanted, mean[:, 0])[0, 1])
+    return alike if abs(alike) > SIGMAS / np.sqrt(len(wanted)) else None
+
+
+def fit_tilt(imu: Imu, track: Track) -> list[tuple[float, float]]:
+    """Regress changes of the tilt by the accelerometer on those by the gyro, of pitch and of roll.
+
+    The force forward less the change of speed is gravity times the pitch; the force to the right less that of the
+    curve is, with the other sign, gravity times the roll.
+
+    Returns
+    -------
+    list of tuple of float
+        Slope and its 1-sigma for pitch (about x, right) and roll (about y, forward): about 1, more or less where the
+        IMU is above or below the axis that the body turns about. Empty where there are too few seconds.
+    """
+    start, before, after, mean = _average_seconds(imu, track)
+    if len(start) < MIN_PAIRS + 1:
+        return []
+    g = float(np.linalg.norm(mean[:, :3].mean(axis=0)))
+    pitch = (mean[:, 1] - (after - before)) / g
+    roll = -(mean[:, 0] + 0.5 * (before + after) * mean[:, 5]) / g
+    pairs = np.diff(start) < 1.5
+    found = []
+    for tilt, rate in ((pitch, mean[:, 3]), (roll, mean[:, 4])):
+        turned, seen = 0.5 * (rate[1:] + rate[:-1])[pairs], np.diff(tilt)[pairs]
+        if len(seen) < MIN_PAIRS:
+            return []
+        r, (slope,) = regress_inliers(turned[:, None], seen)
+        spread = np.sqrt((1.0 / r**2 - 1.0) / (len(seen) - 2)) if r else np.inf
+        found.append((float(slope), float(abs(slope) * spread) if r else np.inf))
+    return found
