@@ -90,6 +90,13 @@ def _dead(column: str) -> Callable[[Path], None]:
     return change("imu", lambda c: {**c, column: np.full(len(c[column]), c[column][0])})
 
 
+def _filled(c: Table) -> None:
+    """A second and a half of the IMU, interpolated and written with the digits of the others."""
+    a, b = 3000, 3000 + int(1.5 / np.median(np.diff(c["t_s"])))
+    for name in ("gx", "gy", "gz", "ax", "ay", "az"):
+        c[name][a : b + 1] = np.round(np.interp(c["t_s"][a : b + 1], c["t_s"][[a, b]], c[name][[a, b]]), 6)
+
+
 def _away(c: Table) -> None:
     c["lon_deg"][0] -= 110.0  # 9000 km
 
@@ -451,6 +458,7 @@ MISTAKES: dict[str, list[Mistake]] = {
     "Sensors": [
         Mistake("one force of 1e4 m/s2", _row("imu", "ax", 3000, 1e4), ("1 IMU row", "1e+04 m/s2", "left out")),
         Mistake("one turn rate of 1e300 rad/s", _row("imu", "gz", 3000, 1e300), ("1 IMU row", "1e+300", "left out")),
+        Mistake("IMU rows filled in over 1.5 s", change("imu", _filled), ("in 1 stretch", "straight lines", "delete")),
         Mistake("an axis of the gyro is dead", _dead("gz"), ("gyro z", "dead", "throughout")),
         Mistake(
             "an axis of the accelerometer is dead, and smoothed all the same",

@@ -12,6 +12,7 @@ from graphnav.core.findings import Finding, describe_gaps, period_of, runs_of
 from graphnav.core.notes import format_count
 from graphnav.core.rotation import Array
 from graphnav.recording import Imu, Recording
+from graphnav.recording.plausibility.readings import RARE
 
 STANDARD_GRAVITY = 9.80665  # m/s^2, where the position is unknown
 
@@ -49,6 +50,41 @@ def check_repeats(imu: Imu) -> Iterator[Finding]:
         yield Finding(
             "warning", f"the IMU repeats one value for {stuck:.1f} s: it was stuck or its log was filled", "imu.stuck"
         )
+
+
+def check_filled(imu: Imu) -> Iterator[Finding]:
+    """Stretches in which all axes follow straight lines, to the last digit: filled in, for a sensor has noise.
+
+    A digit's step of q makes a measured value fit the line through its neighbours with a probability of at most
+    2 q / (sqrt(2 pi) sigma), where sigma is that of the deviations in the quietest tenth of the seconds.
+    """
+    before, after = np.diff(imu.t)[:-1, None], np.diff(imu.t)[1:, None]
+    n = max(5, round(1.0 / period_of(imu.t)))
+    if len(imu.t) < 10 * n:
+        return
+    on_line, log_chance = np.ones(len(imu.t) - 2, dtype=bool), 0.0
+    for values in (imu.gyro @ imu.R_bs, imu.accel @ imu.R_bs):
+        step, most = np.abs(np.diff(values, axis=0)), np.abs(values).max(axis=0)
+        q = np.where(step > 1e-9 * most, step, np.inf).min(axis=0)
+        off = np.abs(values[1:-1] - (values[:-2] * after + values[2:] * before) / (before + after))
+        usual = np.median(off[: len(off) // n * n].reshape(-1, n, 3), axis=1)
+        sigma = np.percentile(usual, 10.0, axis=0) / 0.6745
+        on_line &= (off <= q).all(axis=1)
+        with np.errstate(divide="ignore"):
+            log_chance += float(np.log(np.minimum(2.0 * q / (np.sqrt(2.0 * np.pi) * sigma), 1.0)).sum())
+    runs = [(a, b) for a, b in runs_of(on_line) if (b - a) * log_chance < np.log(RARE / len(imu.t))]
+    # rows between those of a slower sensor are no gaps
+    if not runs or on_line.mean() > 0.5:
+        return
+    first, last = imu.t[[a + 1 for a, _ in runs]], imu.t[[b for _, b in runs]]
+    long = int(np.argmax(last - first))
+    yield Finding(
+        "warning",
+        f"{format_count(sum(b - a for a, b in runs), 'IMU row')} in {format_count(len(runs), 'stretch', 'stretches')}, "
+        f"the longest of {last[long] - first[long]:.2f} s at {first[long] - imu.t[0]:.1f} s, lie on straight lines: "
+        "filled in, not measured, so nothing tells what moved; delete them, and they are bridged as gaps",
+        "imu.filled",
+    )
 
 
 def check_saturation(imu: Imu) -> Iterator[Finding]:

@@ -31,6 +31,7 @@ from graphnav.recording.checks.axes import (
 )
 from graphnav.recording.checks.clock import measure_clock_offsets
 from graphnav.recording.checks.imu import (
+    check_filled,
     check_force_at_rest,
     check_gyro_unit,
     check_imu_time,
@@ -147,6 +148,7 @@ def inspect(recording: Recording) -> Inspection:
     rest = _find_rest(recording, track if overlap else None)
     findings += check_imu_time(recording.imu)
     findings += check_repeats(recording.imu)
+    findings += check_filled(recording.imu)
     findings += check_saturation(recording.imu)
     if "imu.gyro_unit" not in known:
         findings += check_gyro_unit(recording)
