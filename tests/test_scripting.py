@@ -34,8 +34,8 @@ PROGRAM = Path(sys.executable).with_name("graphnav")
 def solved(tmp_path_factory):
     """A minute without fixes, filter and smoother: (folder, what --json printed, the rest)."""
     out = tmp_path_factory.mktemp("tokyo")
-    command = [PROGRAM, "compare", TOKYO, "--without", "gnss:40-100", "--solvers", "ekf,batch", "-o", out, "--json",
-               "--require", "batch:h_rms<0.2", "--require", "span_max_h<0.6"]  # fmt: skip
+    command = [PROGRAM, "compare", TOKYO, "--without", "gnss:40-100", "--solvers", "ekf,batch", "--noise", "stated",
+               "-o", out, "--json", "--require", "batch:h_rms<0.2", "--require", "span_max_h<0.6"]  # fmt: skip
     run = subprocess.run(command, capture_output=True, text=True, timeout=300)
     return out, run
 

@@ -83,7 +83,7 @@ def compared(drive, tmp_path_factory):
     """One run of compare that several tests look at: (folder, the finished process)."""
     out = tmp_path_factory.mktemp("out") / "deep" / "compared"
     span = f"gnss:{WITHHELD[0]:g}-{WITHHELD[1]:g}"
-    return out, program("compare", drive, "--without", span, "--without", "odometer", "-o", out)
+    return out, program("compare", drive, "--without", span, "--without", "odometer", "--noise", "stated", "-o", out)
 
 
 # ------------------------------------------------------------------------------------------------------------- compare
