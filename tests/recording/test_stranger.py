@@ -172,7 +172,7 @@ def test_a_bag_with_two_imus(tokyo, tmp_path, capsys):
     by_key, by_flag = read(tmp_path / "bag.toml"), read(bag, ["/imu/data"])
     assert np.array_equal(by_key.imu.gyro, by_flag.imu.gyro)
     assert by_key.imu.t == pytest.approx(stranger.UNIX + drive.recording.imu.t, abs=1e-5)
-    run("smooth", tmp_path / "bag.toml", "-o", tmp_path / "out", "--solver", "rts", "--quiet")
+    run("smooth", tmp_path / "bag.toml", "-o", tmp_path / "out", *FAST)
     assert rms(errors(drive, tmp_path / "out")) < 0.1
     assert by_flag.imu.noise_assumed  # without covariances: measured where a recording is made of it
     run("convert", bag, "-o", tmp_path / "converted", "--topic", "/imu/data", "--quiet")
