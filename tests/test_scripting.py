@@ -183,7 +183,7 @@ def test_how_noise_is_found_can_be_said_in_a_word():
 
 def test_a_profile_of_another_platform_is_refused_and_a_missing_odometer_is_said(tmp_path, capsys):
     refuse_command(capsys, "profile.platform", "smooth", TOKYO, "--profile", "foot", "-o", tmp_path)
-    options = ["--end", "60", "--solver", "ekf", "-o", str(tmp_path / "o")]
+    options = ["--end", "60", "--solver", "ekf", "--noise", "stated", "-o", str(tmp_path / "o")]
     assert cli.run(["smooth", "kitti", "--profile", "car+odometer", *options]) == 0
     summary = json.loads((tmp_path / "o" / "summary.json").read_text())
     assert "settings.no_odometer" in {message["key"] for message in summary["messages"]}
