@@ -29,6 +29,7 @@ from mistakes import (
 
 SMOOTH = ("smooth", "drive", "-o", "out", "--solver", "ekf")
 CONFIG = (*SMOOTH, "--config", "settings.toml")
+STATED = (*SMOOTH, "--noise", "stated")
 
 
 def _no_gravity(c: Table) -> None:
@@ -620,7 +621,7 @@ MISTAKES: dict[str, list[Mistake]] = {
             ("convert", "drive", "-o", "drive"),
             True,
         ),
-        Mistake("no space left for the results", nothing, ("-o out: cannot be written", "unchanged"), SMOOTH, True),
+        Mistake("no space left for the results", nothing, ("-o out: cannot be written", "unchanged"), STATED, True),
         Mistake(
             "no permission to write there", nothing, ("no permission",), ("smooth", "drive", "-o", "/proc/1/out"), True
         ),

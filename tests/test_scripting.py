@@ -34,8 +34,8 @@ PROGRAM = Path(sys.executable).with_name("graphnav")
 def solved(tmp_path_factory):
     """A minute without fixes, filter and smoother: (folder, what --json printed, the rest)."""
     out = tmp_path_factory.mktemp("tokyo")
-    command = [PROGRAM, "compare", TOKYO, "--without", "gnss:40-100", "--solvers", "ekf,batch", "-o", out, "--json",
-               "--require", "batch:h_rms<0.2", "--require", "span_max_h<0.6"]  # fmt: skip
+    command = [PROGRAM, "compare", TOKYO, "--without", "gnss:40-100", "--solvers", "ekf,batch", "--noise", "stated",
+               "-o", out, "--json", "--require", "batch:h_rms<0.2", "--require", "span_max_h<0.6"]  # fmt: skip
     run = subprocess.run(command, capture_output=True, text=True, timeout=300)
     return out, run
 
@@ -183,7 +183,7 @@ def test_how_noise_is_found_can_be_said_in_a_word():
 
 def test_a_profile_of_another_platform_is_refused_and_a_missing_odometer_is_said(tmp_path, capsys):
     refuse_command(capsys, "profile.platform", "smooth", TOKYO, "--profile", "foot", "-o", tmp_path)
-    options = ["--end", "60", "--solver", "ekf", "-o", str(tmp_path / "o")]
+    options = ["--end", "60", "--solver", "ekf", "--noise", "stated", "-o", str(tmp_path / "o")]
     assert cli.run(["smooth", "kitti", "--profile", "car+odometer", *options]) == 0
     summary = json.loads((tmp_path / "o" / "summary.json").read_text())
     assert "settings.no_odometer" in {message["key"] for message in summary["messages"]}

@@ -83,7 +83,7 @@ def compared(drive, tmp_path_factory):
     """One run of compare that several tests look at: (folder, the finished process)."""
     out = tmp_path_factory.mktemp("out") / "deep" / "compared"
     span = f"gnss:{WITHHELD[0]:g}-{WITHHELD[1]:g}"
-    return out, program("compare", drive, "--without", span, "--without", "odometer", "-o", out)
+    return out, program("compare", drive, "--without", span, "--without", "odometer", "--noise", "stated", "-o", out)
 
 
 # ------------------------------------------------------------------------------------------------------------- compare
@@ -273,7 +273,7 @@ def test_evaluate_prints_a_table_and_writes_nothing_unasked(compared, tmp_path, 
 
 # -------------------------------------------------------------------------------------------------------------- smooth
 def test_smooth_a_part_of_a_real_drive_without_fixes_in_a_span(tmp_path):
-    part = ["--start", 100, "--end", 220, "--without", "gnss:150-170"]
+    part = ["--start", 100, "--end", 220, "--without", "gnss:150-170", "--noise", "stated"]
     assert command("smooth", "kitti", *part, "-o", tmp_path, "--solver", "rts") == 0
     assert {p.name for p in tmp_path.iterdir()} == {*FILES, "run.npz"}
     s = summary(tmp_path)
@@ -288,7 +288,7 @@ def test_smooth_a_part_of_a_real_drive_without_fixes_in_a_span(tmp_path):
 def test_quiet_is_silent_and_a_config_file_counts(drive, tmp_path, capfd):
     config = tmp_path / "settings.toml"
     config.write_text("[keyframes]\nrate = 2.0\n")
-    quiet = ["--quiet", "--config", config]
+    quiet = ["--quiet", "--config", config, "--noise", "stated"]
     assert command("smooth", drive, *quiet, "--end", 120, "--solver", "ekf", "-o", tmp_path / "o") == 0
     assert capfd.readouterr() == ("", "")
     s = summary(tmp_path / "o")

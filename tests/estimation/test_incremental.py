@@ -222,7 +222,7 @@ def test_sigmas_are_true(drive: tuple[Recording, Trajectory]) -> None:
     """NEES of settled positions over drives with other noise: as in test_consistency, of far fewer drives."""
     ratio = []
     for seed in range(4):
-        recording, truth = oracle.drive(oracle.vehicle_path(240.0, 100.0), seed=20 + seed, outages=[(110.0, 150.0)])
+        recording, truth = oracle.drive(oracle.vehicle_path(240.0, 50.0), seed=20 + seed, outages=[(110.0, 150.0)])
         settings = settings_from({"solver": {"lag": 30.0}})
         solution = run(at_rate(recording, 25.0), settings, solvers=("incremental",), noise=STATED)["incremental"]
         i = np.clip(np.searchsorted(truth.t, solution.t - 1e-6), 0, len(truth.t) - 1)

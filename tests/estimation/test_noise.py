@@ -512,8 +512,7 @@ def shifted(recording: Recording, begin: float, end: float, by: tuple[float, flo
     return replace(recording, gnss=replace(gnss, llh=llh)), bad
 
 
-@pytest.mark.parametrize("seed", [0, 1])
-@pytest.mark.parametrize("wheels", [True, False])
+@pytest.mark.parametrize(("seed", "wheels"), [(0, True), (1, False)])
 def test_nothing_is_left_out_of_clean_data(seed: int, wheels: bool) -> None:
     found = solved_clean(seed, wheels)["ekf"]
     assert found.excluded == ()
