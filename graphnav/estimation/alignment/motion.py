@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -20,6 +19,7 @@ from graphnav.estimation.alignment.back import carry_back
 from graphnav.estimation.alignment.course import COURSE_SIGMA, with_course
 from graphnav.estimation.alignment.first import Alignment, level, pick_fixes
 from graphnav.estimation.alignment.travel import average_across, integrate_yaw, measure_travel
+from graphnav.estimation.fixing import split_carriers
 from graphnav.estimation.problem import Problem, build_problem
 from graphnav.estimation.solution import Solution
 from graphnav.imu.preintegration import prefix
@@ -36,10 +36,11 @@ _LEAD_TIME = 10.0  # s of the span before the motion
 _OUTLYING = 6.0  # multiple of the typical deviation of fixes from their running median, or of their sigma
 # rad, of the initial headings that are tried, relative to the first guess
 _HEADINGS_TRIED = (0.0, 0.5 * np.pi, 1.5 * np.pi, np.pi)
-_FIRST_ITERATIONS = 10  # iterations after which a start either has converged or creeps
 _UNLIKELY = 14.0  # difference of log-likelihoods at a ratio of one in a million: -ln 1e-6
 
-Smoother = Callable[[Problem, States], Solution]
+
+class _LostError(Exception):
+    """A heading whose solution will not be likely beside another's."""
 
 
 def drop_implausible(recording: Recording) -> Recording:
@@ -103,7 +104,7 @@ def find_motion_span(recording: Recording, settings: Settings, stationary: Array
 
 
 def align_in_motion(
-    recording: Recording, settings: Settings, frame: LocalFrame, smooth: Smoother, span: tuple[float, float]
+    recording: Recording, settings: Settings, frame: LocalFrame, span: tuple[float, float]
 ) -> Alignment:
     """The first state from the short problem over `span` (s), carried back to the first sample."""
     gnss, imu = recording.gnss, recording.imu
@@ -116,7 +117,7 @@ def align_in_motion(
     bias = _estimate_rate(imu)
     rp = level(recording, begin)
     heading = _fit_heading(part, frame, rp, bias)
-    tried = _try_headings(part, settings, frame, smooth, rp, heading, bias)
+    tried = _try_headings(part, settings, frame, rp, heading, bias)
     if not tried:
         raise EstimationError(
             f"'{recording.name}': no initial attitude explains the GNSS fixes between {begin - recording.start:.0f} "
@@ -183,26 +184,27 @@ def _thin(gnss: Gnss, begin: float, end: float, spacing: float = 0.9) -> Gnss:
 
 
 def _try_headings(
-    part: Recording, settings: Settings, frame: LocalFrame, smooth: Smoother, rp: Array, heading: float, bias: Array
+    part: Recording, settings: Settings, frame: LocalFrame, rp: Array, heading: float, bias: Array
 ) -> list[Solution]:
     """Solutions of the short problem from each of the initial headings.
 
-    The last points backwards and may creep along a saddle, towards the minimum of the others or none. It is abandoned
-    where its likelihood is negligible beside the best; `worth` successive fixes are worth one in the worst case, over a
-    span with one turn (`graphnav.estimation.alignment.course`).
+    Those that point elsewhere may creep along a saddle, towards the minimum of the others or none. They are abandoned
+    where they promise no likelihood that counts beside the best; `worth` successive fixes are worth one in the worst
+    case, over a span with one turn (`graphnav.estimation.alignment.course`).
     """
-    *ends, backwards = (np.array([*rp, heading + turn]) for turn in _HEADINGS_TRIED)
-    problem = _build_short(part, settings, frame, ends[0], bias)
-    tried = [_try(problem, smooth, end) for end in ends]
+    problem = _build_short(part, settings, frame, np.array([*rp, heading]), bias)
     assert part.gnss is not None
     worth = max(1.0, len(part.gnss.t) / (2.0 * np.pi))
-    few = settings.solver.model_copy(update={"max_iterations": min(_FIRST_ITERATIONS, settings.solver.max_iterations)})
-    brief = replace(problem, settings=problem.settings.model_copy(update={"solver": few}))
-    last = _try(brief, smooth, backwards)
-    best = min((one.cost for one in tried if np.isfinite(one.cost)), default=np.inf)
-    if last.iterations >= few.max_iterations and last.cost < best + _UNLIKELY * worth:
-        last = _try(problem, smooth, backwards)
-    return [one for one in (*tried, last) if np.isfinite(one.cost)]
+    tried: list[Solution] = []
+    for turn in _HEADINGS_TRIED:
+        bound = min((one.cost for one in tried), default=np.inf) + _UNLIKELY * worth
+        try:
+            found = _try(problem, np.array([*rp, heading + turn]), bound)
+        except _LostError:
+            continue
+        if np.isfinite(found.cost):
+            tried.append(found)
+    return tried
 
 
 def _build_short(part: Recording, settings: Settings, frame: LocalFrame, rph: Array, bias: Array) -> Problem:
@@ -223,11 +225,20 @@ def _build_short(part: Recording, settings: Settings, frame: LocalFrame, rph: Ar
     # an outlying fix or a burst must not decide the heading
     robust = settings.gnss.model_copy(update={"robust": "cauchy", "lever_arm_sigma": None, "time_offset_sigma": 0.0})
     # the information of the wheels on the heading is added by `with_course`
-    return build_problem(part, settings.without_wheels().model_copy(update={"gnss": robust}), frame, start, sigma)
+    problem = build_problem(part, settings.without_wheels().model_copy(update={"gnss": robust}), frame, start, sigma)
+    return split_carriers(problem)[0]
 
 
-def _try(problem: Problem, smooth: Smoother, rph: Array) -> Solution:
-    """Solve the short problem from one initial attitude."""
+def _try(problem: Problem, rph: Array, bound: float) -> Solution:
+    """Solve the short problem from one initial attitude, while there is hope for a cost below a bound.
+
+    Raises
+    ------
+    _LostError
+        If there is none.
+    """
+    from graphnav.estimation.factor_graph.batch import batch  # and GTSAM with it, which a drive at rest does not need
+
     gnss, mean, t = problem.recording.gnss, problem.prior.mean, problem.t
     assert gnss is not None
     assert mean is not None
@@ -238,4 +249,10 @@ def _try(problem: Problem, smooth: Smoother, rph: Array) -> Solution:
     v = np.gradient(p, t, axis=0)
     K = len(t)
     R = R0 @ np.concatenate([np.eye(3)[None], dR])
-    return smooth(problem, States(R, p, v, np.zeros((K, 3)), np.tile(bias, (K, 1))))
+
+    def give_up(promised: float) -> None:
+        if promised > bound:
+            raise _LostError
+
+    start = States(R, p, v, np.zeros((K, 3)), np.tile(bias, (K, 1)))
+    return batch(problem, start, wanted=(0,), reintegrate=False, creeps=give_up)

@@ -14,7 +14,7 @@ then within sqrt(2 tolerance) sigma in every direction at once.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -51,11 +51,14 @@ def batch(
     progress: Progress | None = None,
     wanted: tuple[int, ...] | None = None,
     reintegrate: bool = True,
+    creeps: Callable[[float], None] | None = None,
 ) -> Solution:
     """Solve a problem from any starting states (K rows) and parameter values.
 
     `wanted` are the keyframes whose covariance is wanted, all when None; others are NaN. `reintegrate`
-    allows intervals to be integrated again when the gyro bias moves far.
+    allows intervals to be integrated again when the gyro bias moves far. `creeps` is told the cost that the
+    next undamped step promises where that fails again and a damped one has not halved the cost; what it raises ends
+    the iterations.
     """
     began = time.perf_counter()
     values = {c.parameter.name: c.mean for c in problem.chains} | (values or {})
@@ -66,7 +69,7 @@ def batch(
         point = _minimise(replace(problem, constraints=tuple(rows)), point, progress, reintegrate).point
     for gentle in _graduate(problem, point):
         point = _minimise(gentle, point, progress, reintegrate, 1).point
-    found = _minimise(problem, point, progress, reintegrate)
+    found = _minimise(problem, point, progress, reintegrate, creeps=creeps)
     problem, point, layout = found.problem, found.point, found.layout
     solved = time.perf_counter()
     if progress is not None:
@@ -133,7 +136,12 @@ def _graduate(problem: Problem, point: Iterate) -> Iterator[Problem]:
 
 
 def _minimise(
-    problem: Problem, point: Iterate, progress: Progress | None, reintegrate: bool, iterations: int | None = None
+    problem: Problem,
+    point: Iterate,
+    progress: Progress | None,
+    reintegrate: bool,
+    iterations: int | None = None,
+    creeps: Callable[[float], None] | None = None,
 ) -> _Minimum:
     settings = problem.settings.solver
     if iterations is not None:
@@ -143,7 +151,7 @@ def _minimise(
         problem, renewed = integrate_again(problem, point.states, point.scale)
     layout = Layout(problem)
     now = cost(problem, point, layout)
-    damping, gentlest = 0.0, _MIN_DAMPING
+    damping, gentlest, slow = 0.0, _MIN_DAMPING, False
     stopped = f"stopped at the limit of {settings.max_iterations} iterations"
     eliminated: Eliminated | None = None
     iteration = 0
@@ -166,6 +174,8 @@ def _minimise(
                 if behind < now:
                     candidate, ahead = beyond, behind
                     break
+                if slow and creeps is not None:
+                    creeps(now - gain)
             refused += 1
             damping = max(gentlest, 10.0 * damping)
             if damping > _MAX_DAMPING:
@@ -178,6 +188,7 @@ def _minimise(
                 point, now = candidate, ahead  # the last small step is free
             stopped = f"converged: one more step would lower the cost by {gain:.1e}"
             break
+        slow = damping > 0.0 and ahead > 0.5 * now
         if ahead < now:
             point, now = candidate, ahead
         eliminated = None
