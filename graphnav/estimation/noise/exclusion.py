@@ -1,7 +1,8 @@
 """Fault detection and exclusion: which measurements are wrong for a span of time, decided by evidence.
 
 Detection. A bank of likelihood-ratio tests (`graphnav.estimation.solvers.watch`) gives the spans in which fixes
-disagree with all other measurements by an error that persists. It does not tell which sensor is wrong.
+disagree with all other measurements by an error that persists. It does not tell which sensor is wrong. Spans in which a
+receiver repeats one position are suspected without a test: it may hold it because it takes a slow vehicle to stand.
 
 Decision. With the noise model as it is, each span is explained by several models, each with its own likelihood of the
 innovations from the start of the span to the start of the next one:
@@ -52,7 +53,9 @@ from graphnav.estimation.noise.spans import (
     join,
     join_faults,
     list_distinct,
+    list_repeats,
     mask_within,
+    split_at_repeats,
     total_length,
     trim,
 )
@@ -113,10 +116,14 @@ def find_faults(base: Problem, found: NoiseEstimate) -> Decision:
     """
     first = decide(base, found, find_spans(base, found.noise, found))
     medians = {name: replace(figure, log_factor=figure.prior) for name, figure in found.noise.figures.items()}
-    masked = find_spans(base, NoiseModel(medians), found)
+    masked = _test(base, NoiseModel(medians), found)
     first = replace(first, passes=first.passes + Counter(filter=2))
     excluded = join(span for kind in FIXES for span in first.noise.excluded.get(kind, ()))
-    return first if are_covered(masked, excluded) else _unmask(base, found, first, masked)
+    # the figures found are of repeated fixes, too: where these are wrong, of wrong ones
+    wrong = any(are_covered([span], excluded) for span in list_repeats(base.recording))
+    if are_covered(masked, excluded) and not wrong:
+        return first
+    return _unmask(base, found, first, split_at_repeats(masked, base.recording))
 
 
 def _unmask(base: Problem, found: NoiseEstimate, first: Decision, masked: list[Span]) -> Decision:
@@ -208,13 +215,18 @@ def _log_evidence(base: Problem, found: NoiseEstimate) -> float:
 
 
 def find_spans(base: Problem, noise: NoiseModel, found: NoiseEstimate) -> list[Span]:
-    """Spans (s) in which the tests find fixes in disagreement with everything else.
+    """Spans (s) in which fixes may be wrong: those that the tests find, and those in which a receiver repeats itself.
 
     Parameters
     ----------
     noise : by which the tests are made; its figures need not be those found.
     found : with the points to linearise at.
     """
+    return split_at_repeats(_test(base, noise, found), base.recording)
+
+
+def _test(base: Problem, noise: NoiseModel, found: NoiseEstimate) -> list[Span]:
+    """Spans (s) in which the tests find fixes in disagreement with everything else."""
     # weights of fixes and of IMU intervals may hide a fault from the tests
     kept = {name: some for name, some in noise.weights.items() if name not in (*FIXES, *INTERVALS)}
     tested = with_noise(base, replace(noise, weights=kept))

@@ -1,0 +1,55 @@
+"""Receivers that hold a position while they take a slow vehicle to stand."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import graphnav
+from graphnav.app.scores import score
+from graphnav.core.earth import LocalFrame
+from graphnav.estimation.noise.spans import list_repeats
+from graphnav.evaluation.metrics import summary
+from graphnav.recording import Recording
+
+_BELOW = 0.9  # m/s
+
+
+@pytest.fixture(scope="module")
+def drive() -> Recording:
+    return graphnav.load("data/tokyo").crop(20.0, 110.0)
+
+
+def held(recording: Recording) -> Recording:
+    """The recording with fixes of one sigma, without velocities, held below a speed."""
+    gnss = recording.gnss
+    assert gnss is not None
+    p = LocalFrame(gnss.llh[0]).from_llh(gnss.llh)
+    speed = np.linalg.norm(np.gradient(p[:, :2], gnss.t, axis=0), axis=1)
+    row = np.arange(len(p))
+    for k in range(1, len(p)):
+        row[k] = row[k - 1] if speed[k] < _BELOW else k
+    some = replace(gnss, llh=gnss.llh[row], v=None, sd_v=None, sd=np.ones_like(gnss.sd))
+    return replace(recording, gnss=some)
+
+
+def test_what_a_receiver_holds_is_left_out(drive: Recording) -> None:
+    used = held(drive)
+    error = {}
+    for noise in ("stated", None):
+        solutions = graphnav.run(used, solvers=("batch",), **({} if noise is None else {"noise": noise}))
+        error[noise] = summary(score(drive, used, solutions, ())[0]["batch"])
+    assert error[None]["h_rms_m"] < 0.5 * error["stated"]["h_rms_m"]
+    assert error[None]["nees_p"] < 3.0
+
+
+def test_repeats_that_digits_explain_are_none(drive: Recording) -> None:
+    used = held(drive)
+    gnss = used.gnss
+    assert gnss is not None
+    coarse = replace(gnss, rounding=(0.3, 0.3, 0.0), sd=np.full_like(gnss.sd, 0.1))
+    assert list_repeats(used) != []
+    assert list_repeats(drive) == []
+    assert list_repeats(replace(used, gnss=coarse)) == []
