@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -39,8 +40,11 @@ _HEADINGS_TRIED = (0.0, 0.5 * np.pi, 1.5 * np.pi, np.pi)
 _UNLIKELY = 14.0  # difference of log-likelihoods at a ratio of one in a million: -ln 1e-6
 
 
-class _LostError(Exception):
-    """A heading whose solution will not be likely beside another's."""
+class _End(Exception):
+    """What becomes of a heading is known before its problem is solved: nothing, or one of the other solutions."""
+
+    def __init__(self, known: Solution | None = None) -> None:
+        self.known = known
 
 
 def drop_implausible(recording: Recording) -> Recording:
@@ -188,23 +192,37 @@ def _try_headings(
 ) -> list[Solution]:
     """Solutions of the short problem from each of the initial headings.
 
-    Those that point elsewhere may creep along a saddle, towards the minimum of the others or none. They are abandoned
-    where they promise no likelihood that counts beside the best; `worth` successive fixes are worth one in the worst
-    case, over a span with one turn (`graphnav.estimation.alignment.course`).
+    Those that point elsewhere mostly lead to the same minimum, and are that solution as soon as they are within a sigma
+    of it. Or they creep along a saddle, towards it or none, and are abandoned where they promise no likelihood that
+    counts beside the best; `worth` successive fixes are worth one in the worst case, over a span with one turn
+    (`graphnav.estimation.alignment.course`).
     """
     problem = _build_short(part, settings, frame, np.array([*rp, heading]), bias)
     assert part.gnss is not None
     worth = max(1.0, len(part.gnss.t) / (2.0 * np.pi))
     tried: list[Solution] = []
+
+    def watch(states: States, cost: float, gain: float, slow: bool) -> None:
+        if slow and cost - gain > min((one.cost for one in tried), default=np.inf) + _UNLIKELY * worth:
+            raise _End
+        for one in tried:
+            if gain < 0.5 and cost - gain > one.cost and _within_a_sigma(states, one):
+                raise _End(one)
+
     for turn in _HEADINGS_TRIED:
-        bound = min((one.cost for one in tried), default=np.inf) + _UNLIKELY * worth
         try:
-            found = _try(problem, np.array([*rp, heading + turn]), bound)
-        except _LostError:
-            continue
-        if np.isfinite(found.cost):
+            found: Solution | None = _try(problem, np.array([*rp, heading + turn]), watch)
+        except _End as end:
+            found = end.known
+        if found is not None and np.isfinite(found.cost):
             tried.append(found)
     return tried
+
+
+def _within_a_sigma(states: States, solution: Solution) -> bool:
+    """Whether the first of the states is that of a solution, but for less than its uncertainty."""
+    e = states[:1].minus(solution.states[:1])[0]
+    return float(e @ np.linalg.solve(solution.covariance[0], e)) < 1.0
 
 
 def _build_short(part: Recording, settings: Settings, frame: LocalFrame, rph: Array, bias: Array) -> Problem:
@@ -229,14 +247,8 @@ def _build_short(part: Recording, settings: Settings, frame: LocalFrame, rph: Ar
     return split_carriers(problem)[0]
 
 
-def _try(problem: Problem, rph: Array, bound: float) -> Solution:
-    """Solve the short problem from one initial attitude, while there is hope for a cost below a bound.
-
-    Raises
-    ------
-    _LostError
-        If there is none.
-    """
+def _try(problem: Problem, rph: Array, watch: Callable[[States, float, float, bool], None]) -> Solution:
+    """Solve the short problem from one initial attitude."""
     from graphnav.estimation.factor_graph.batch import batch  # and GTSAM with it, which a drive at rest does not need
 
     gnss, mean, t = problem.recording.gnss, problem.prior.mean, problem.t
@@ -249,10 +261,5 @@ def _try(problem: Problem, rph: Array, bound: float) -> Solution:
     v = np.gradient(p, t, axis=0)
     K = len(t)
     R = R0 @ np.concatenate([np.eye(3)[None], dR])
-
-    def give_up(promised: float) -> None:
-        if promised > bound:
-            raise _LostError
-
     start = States(R, p, v, np.zeros((K, 3)), np.tile(bias, (K, 1)))
-    return batch(problem, start, wanted=(0,), reintegrate=False, creeps=give_up)
+    return batch(problem, start, wanted=(0,), reintegrate=False, watch=watch)
