@@ -112,7 +112,7 @@ def loaded(*arguments: str) -> set[str]:
 
 @pytest.mark.parametrize("arguments", [("--help",), ("smooth", "--help")])
 def test_help_loads_nothing_heavy(arguments):
-    heavy = {"gtsam", "matplotlib", "numpy", "plotly", "pyarrow", "rich", "scipy", "yaml"}
+    heavy = {"gtsam", "matplotlib", "numpy", "plotly", "pyarrow", "pydantic", "rich", "scipy", "yaml"}
     assert not heavy & loaded(*arguments)
 
 
