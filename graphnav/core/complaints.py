@@ -156,6 +156,8 @@ def split_names(text: str, known: Sequence[str], option: str, what: str) -> tupl
 
 def _list_tables(model: type[BaseModel], at: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], type[BaseModel]]]:
     """Every table of a file by its place, the file's top level first."""
+    from pydantic import BaseModel
+
     yield at, model
     for name, field in model.model_fields.items():
         options = (field.annotation, *getattr(field.annotation, "__args__", ()))
