@@ -33,7 +33,6 @@ from graphnav.config import Settings, settings_from
 from graphnav.core.earth import LocalFrame
 from graphnav.detectors import detect
 from graphnav.estimation.alignment import align
-from graphnav.estimation.factor_graph.batch import batch
 from graphnav.estimation.noise.apply import with_noise
 from graphnav.estimation.noise.estimate import estimate_noise
 from graphnav.estimation.pipeline import origin
@@ -161,7 +160,7 @@ def posed(recording: Recording, settings: Settings, known_from: float = np.inf) 
     `known_from` are the first seconds of it from which the noise model is estimated.
     """
     frame = LocalFrame(origin(recording))
-    found = align(recording, settings, frame, lambda p, x: batch(p, x, wanted=(0,), reintegrate=False))
+    found = align(recording, settings, frame)
 
     def build(part: Recording) -> Problem:
         still = detect(part, settings).stationary

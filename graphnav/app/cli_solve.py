@@ -36,7 +36,7 @@ from graphnav.app.cli_options import (
     collect_withheld,
     pick_one,
 )
-from graphnav.app.talk import bar, insist, show
+from graphnav.app.talk import bar, importing, insist, show
 from graphnav.core.errors import ConfigError
 from graphnav.core.files import permit_outside
 from graphnav.core.progress import tell
@@ -228,13 +228,15 @@ def _solve(
     beside: _Beside | None = None,
     loose: bool = False,
 ) -> None:
-    from graphnav.app import convert, outputs, terminal, workflow
-    from graphnav.app.summary import comparison
-    from graphnav.config import read_settings
-    from graphnav.core.complaints import split_names
-    from graphnav.core.staging import final_path, stage_results
-    from graphnav.evaluation import gates
-    from graphnav.recording.exporters import NAMES
+    with importing():
+        import graphnav.estimation.pipeline  # noqa: F401
+        from graphnav.app import convert, outputs, terminal, workflow
+        from graphnav.app.summary import comparison
+        from graphnav.config import read_settings
+        from graphnav.core.complaints import split_names
+        from graphnav.core.staging import final_path, stage_results
+        from graphnav.evaluation import gates
+        from graphnav.recording.exporters import NAMES
 
     withheld = collect_withheld(asked.without, asked.start, asked.end)
     convert.check_rate(asked.rate)

@@ -7,13 +7,14 @@ import re
 import tomllib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
-
-from pydantic import BaseModel, ValidationError
+from typing import TYPE_CHECKING, Any
 
 from graphnav.core.errors import ConfigError, GraphnavError
 from graphnav.core.files import read_text
 from graphnav.core.notes import Note
+
+if TYPE_CHECKING:
+    from pydantic import BaseModel, ValidationError  # a tenth of a second, which help need not wait for
 
 _TABLE = re.compile(r"\[([^\[\]]+)\]")
 _MAX_NAMES = 30  # names listed in one sentence at most
@@ -155,6 +156,8 @@ def split_names(text: str, known: Sequence[str], option: str, what: str) -> tupl
 
 def _list_tables(model: type[BaseModel], at: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], type[BaseModel]]]:
     """Every table of a file by its place, the file's top level first."""
+    from pydantic import BaseModel
+
     yield at, model
     for name, field in model.model_fields.items():
         options = (field.annotation, *getattr(field.annotation, "__args__", ()))

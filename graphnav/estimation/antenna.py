@@ -163,8 +163,6 @@ def _find_turning(recording: Recording) -> Recording:
 
 def _estimate(recording: Recording) -> tuple[Antenna, tuple[Array, Array, Array] | None]:
     """The antenna, and the forward position of the point that does not slip, (1,) m each: stated, found, sigma."""
-    from graphnav.estimation.factor_graph.batch import batch
-
     if recording.gnss is None or not len(recording.gnss.t):
         raise EstimationError(
             f"'{recording.name}': there is no GNSS whose antenna could be found", key="antenna.no_gnss"
@@ -173,7 +171,7 @@ def _estimate(recording: Recording) -> tuple[Antenna, tuple[Array, Array, Array]
     tell("detection")
     still = detect(recording, settings).stationary
     tell("alignment")
-    aligned = align(recording, settings, frame, lambda p, start: batch(p, start, wanted=(0,), reintegrate=False))
+    aligned = align(recording, settings, frame)
     if aligned.motion is None:
         raise EstimationError(
             f"'{recording.name}': without motion nothing tells where the antenna is", key="antenna.no_motion"

@@ -17,7 +17,7 @@ from graphnav.core.earth import LocalFrame
 from graphnav.core.errors import EstimationError
 from graphnav.core.progress import tell
 from graphnav.core.rotation import Array
-from graphnav.core.state import BLOCKS, States
+from graphnav.core.state import BLOCKS
 from graphnav.detectors import Detections, detect
 from graphnav.estimation.alignment import Alignment, align, with_known_heading
 from graphnav.estimation.alignment.first import pick_fixes
@@ -25,7 +25,6 @@ from graphnav.estimation.fixing import split_carriers
 from graphnav.estimation.noise.exclusion import without_excluded
 from graphnav.estimation.noise.model import NoiseModel
 from graphnav.estimation.problem import Problem, build_problem
-from graphnav.estimation.solution import Solution
 from graphnav.recording import Recording
 
 _DIVERGED_BY = 0.5  # rad between the stated and the found initial attitude, beyond which a filter diverges for a while
@@ -78,7 +77,7 @@ class ProblemBuilder:
         settings = self.settings.model_copy(update={"raw_gnss": codes_alone})
         tell("alignment")
         with self.clock.book("alignment"):
-            return align(recording, settings, self.frame, _smooth, stationary)
+            return align(recording, settings, self.frame, stationary)
 
     def build(self, aligned: Alignment, detections: Detections, parts: bool) -> BuiltProblem:
         """Build the problem; with the contribution of each noise figure to its intervals, if these are to change."""
@@ -148,9 +147,3 @@ def _differ(a: Array, b: Array) -> bool:
     return any(
         not np.any((other[:, 0] < end) & (other[:, 1] > begin)) for one, other in ((a, b), (b, a)) for begin, end in one
     )
-
-
-def _smooth(problem: Problem, start: States) -> Solution:
-    from graphnav.estimation.factor_graph.batch import batch
-
-    return batch(split_carriers(problem)[0], start, wanted=(0,), reintegrate=False)

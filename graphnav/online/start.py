@@ -11,7 +11,6 @@ from graphnav.core.rotation import Array
 from graphnav.detectors import detect
 from graphnav.estimation.alignment import Alignment, align, is_ready, with_known_heading
 from graphnav.estimation.building import start_sigma
-from graphnav.estimation.factor_graph.batch import batch
 from graphnav.estimation.noise.model import NoiseModel
 from graphnav.estimation.solvers.window import make_first_message
 from graphnav.online.raw import codes_alone
@@ -45,8 +44,7 @@ def find_start(recording: Recording, stationary: Array, settings: Settings, fram
     EstimationError
         If the rows do not tell it.
     """
-    return align(recording, codes_alone(settings), frame, lambda problem, start: batch(
-        problem, start, wanted=(0,), reintegrate=False), stationary)  # fmt: skip
+    return align(recording, codes_alone(settings), frame, stationary)
 
 
 def make_tracker(

@@ -15,7 +15,6 @@ from graphnav.core.earth import LocalFrame
 from graphnav.core.notes import key_of
 from graphnav.core.trajectory import Trajectory
 from graphnav.estimation.alignment import Alignment, align, with_known_heading
-from graphnav.estimation.factor_graph.batch import batch
 from graphnav.recording import Recording
 
 DEG = np.pi / 180.0
@@ -23,8 +22,7 @@ DEG = np.pi / 180.0
 
 def aligned(recording: Recording, settings: Settings | None = None) -> tuple[Alignment, LocalFrame]:
     frame = LocalFrame(recording.gnss.llh[0])
-    smooth = lambda problem, start: batch(problem, start, wanted=(0,), reintegrate=False)  # noqa: E731
-    return align(recording, settings or Settings(), frame, smooth), frame
+    return align(recording, settings or Settings(), frame), frame
 
 
 def judged(recording: Recording, truth: Trajectory, body: Array | None = None) -> tuple[Array, Array, Array]:
@@ -149,7 +147,7 @@ def test_a_recording_at_rest_is_levelled_and_its_heading_unknown(path: oracle.Ex
 def test_without_gnss_heading_and_position_count_from_zero(path: oracle.ExactPath) -> None:
     recording, _ = oracle.drive(path, seed=0)
     frame = LocalFrame(recording.gnss.llh[0])
-    found = align(recording.without("gnss"), Settings(), frame, batch)
+    found = align(recording.without("gnss"), Settings(), frame)
     assert found.rph[2] == pytest.approx(0.0)
     assert found.sigma[2] < 1e-3
     np.testing.assert_array_equal(found.state.p, 0.0)

@@ -19,7 +19,6 @@ from graphnav.core.trajectory import Trajectory
 from graphnav.detectors import detect
 from graphnav.estimation import faults
 from graphnav.estimation.alignment import align
-from graphnav.estimation.factor_graph.batch import batch
 from graphnav.estimation.pipeline import origin, run
 from graphnav.estimation.problem import Problem, build_problem
 from graphnav.estimation.solution import Solution
@@ -57,7 +56,7 @@ def posed(drive: tuple[Recording, Trajectory]) -> Problem:
     recording = drive[0]
     settings = settings_from({"gnss": {"time_offset_sigma": 0.0}})
     frame = LocalFrame(origin(recording))
-    found = align(recording, settings, frame, lambda p, s: batch(p, s, wanted=(0,), reintegrate=False))
+    found = align(recording, settings, frame)
     stationary = detect(recording, settings).stationary
     return build_problem(recording, settings, frame, found.state, found.sigma, stationary)
 

@@ -58,7 +58,7 @@ def posed(recording: Recording, settings: Settings | None = None) -> tuple[Probl
     """A problem with stated noise and the parts of its intervals, and what its alignment has seen."""
     settings = settings or Settings()
     frame, stops = LocalFrame(origin(recording)), detect(recording, settings).stationary
-    found = align(recording, settings, frame, lambda p, x: batch(p, x, wanted=(0,), reintegrate=False), stops)
+    found = align(recording, settings, frame, stops)
     return build_problem(recording, settings, frame, found.state, found.sigma, stops, parts_of_noise=True), found.until
 
 

@@ -30,7 +30,7 @@ def posed(shared_data: Path, seed: int) -> Start:
     recording, _ = oracle.oracle_drive(shared_data, seed, odometer=False)
     settings = settings_from({"gnss": WHITE, "vehicle": NO_WHEELS})
     frame = LocalFrame(recording.gnss.llh[0])
-    aligned = align(recording, settings, frame, lambda p, x: batch(p, x, wanted=(0,), reintegrate=False))
+    aligned = align(recording, settings, frame)
     assert aligned.until is not None
     assert aligned.motion < recording.start + 90.0 < aligned.until < recording.start + 140.0
     long, short = (

@@ -42,7 +42,7 @@ def posed() -> Problem:
     )
     settings = Settings()
     frame = LocalFrame(origin(recording))
-    found = align(recording, settings, frame, lambda p, s: batch(p, s, wanted=(0,), reintegrate=False))
+    found = align(recording, settings, frame)
     base = build_problem(recording, settings, frame, found.state, found.sigma, detect(recording, settings).stationary)
     lasting = (f"gnss_position.{time}.{axis}" for time in ("minutes", "hours") for axis in ("horizontal", "up"))
     return with_noise(base, NoiseModel({name: VarianceComponent(float(np.log(0.25))) for name in lasting}))

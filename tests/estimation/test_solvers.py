@@ -260,7 +260,7 @@ def test_the_gain_of_a_step_is_by_what_the_linear_rows_fall(
     rng, layout = np.random.default_rng(6), Layout(problem)
     values = {c.parameter.name: c.mean for c in problem.chains}
     point = Iterate(solution.states.plus(1e-2 * rng.standard_normal((len(problem.t), DIM))), values)
-    rows = whiten(problem, point, layout)
+    rows, _ = whiten(problem, point, layout)
     _, step, gain = solve_rows(rows, layout, damping)
     by_key = [*step[0], *(np.concatenate([step[1][n][j] for n in g.columns]) for g in layout.groups for j in
                           range(len(g.keys)))]  # fmt: skip

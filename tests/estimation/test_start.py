@@ -21,7 +21,6 @@ from graphnav.estimation import preparation
 from graphnav.estimation.alignment import Alignment, align
 from graphnav.estimation.alignment.first import pick_fixes
 from graphnav.estimation.alignment.motion import drop_implausible
-from graphnav.estimation.factor_graph.batch import batch
 from graphnav.estimation.pipeline import origin, run
 from graphnav.estimation.solvers.verdicts import Verdicts
 from graphnav.evaluation.scoring import Errors, errors
@@ -77,8 +76,7 @@ def test_fixes_that_jump_at_rest_are_no_motion(drive: Recording) -> None:
     settings, frame = Settings(), LocalFrame(origin(drive))
 
     def aligned(recording: Recording) -> Alignment:
-        smooth = lambda p, s: batch(p, s, wanted=(0,), reintegrate=False)  # noqa: E731
-        return align(recording, settings, frame, smooth, detect(recording, settings).stationary)
+        return align(recording, settings, frame, detect(recording, settings).stationary)
 
     plain, jumped = aligned(drive), aligned(shifted(drive, 10.0, 30.0, 40.0))
     assert jumped.motion == plain.motion

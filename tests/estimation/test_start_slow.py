@@ -19,7 +19,6 @@ from graphnav.detectors import detect
 from graphnav.detectors.base import NONE
 from graphnav.estimation.alignment import Alignment, align
 from graphnav.estimation.alignment.travel import measure_travel
-from graphnav.estimation.factor_graph.batch import batch
 from graphnav.estimation.pipeline import origin
 from graphnav.recording import Recording, Truth
 from graphnav.recording.formats import read
@@ -31,8 +30,7 @@ SURE = 0.999  # of a chi-square that an honest sigma stays below
 def aligned(recording: Recording, stationary: Array | None = None) -> Alignment:
     settings, frame = Settings(), LocalFrame(origin(recording))
     stationary = detect(recording, settings).stationary if stationary is None else stationary
-    smooth = lambda problem, start: batch(problem, start, wanted=(0,), reintegrate=False)  # noqa: E731
-    return align(recording, settings, frame, smooth, stationary)
+    return align(recording, settings, frame, stationary)
 
 
 def off(found: Alignment, recording: Recording, truth: Truth) -> float:

@@ -28,21 +28,18 @@ from graphnav.detectors.base import NONE
 from graphnav.estimation.alignment.antennas import measure_baseline_heading
 from graphnav.estimation.alignment.course import COURSE_SIGMA
 from graphnav.estimation.alignment.first import Alignment
-from graphnav.estimation.alignment.motion import Smoother, align_in_motion, drop_implausible, find_motion_span
+from graphnav.estimation.alignment.motion import align_in_motion, drop_implausible, find_motion_span
 from graphnav.estimation.alignment.rest import at_rest
 from graphnav.recording import Recording
 
-__all__ = ["COURSE_SIGMA", "Alignment", "Smoother", "align", "is_ready", "with_known_heading"]
+__all__ = ["COURSE_SIGMA", "Alignment", "align", "is_ready", "with_known_heading"]
 
 
-def align(
-    recording: Recording, settings: Settings, frame: LocalFrame, smooth: Smoother, stationary: Array = NONE
-) -> Alignment:
+def align(recording: Recording, settings: Settings, frame: LocalFrame, stationary: Array = NONE) -> Alignment:
     """Find the first state of a recording.
 
     Parameters
     ----------
-    smooth : function that solves a problem from initial states; solvers import this package.
     stationary : (N, 2) s, intervals in which a vehicle stands, where jumps of fixes are
         not motion; of a foot, its stances.
 
@@ -55,7 +52,7 @@ def align(
     span = find_motion_span(recording, settings, stationary)
     if span is None:
         return at_rest(recording, settings, frame, stationary)
-    return replace(align_in_motion(recording, settings, frame, smooth, span), motion=span[0], until=span[1])
+    return replace(align_in_motion(recording, settings, frame, span), motion=span[0], until=span[1])
 
 
 def is_ready(recording: Recording, settings: Settings, stationary: Array | None = None) -> bool:

@@ -20,6 +20,7 @@ from graphnav.estimation.alignment.back import carry_back
 from graphnav.estimation.alignment.course import COURSE_SIGMA, with_course
 from graphnav.estimation.alignment.first import Alignment, level, pick_fixes
 from graphnav.estimation.alignment.travel import average_across, integrate_yaw, measure_travel
+from graphnav.estimation.fixing import split_carriers
 from graphnav.estimation.problem import Problem, build_problem
 from graphnav.estimation.solution import Solution
 from graphnav.imu.preintegration import prefix
@@ -36,10 +37,14 @@ _LEAD_TIME = 10.0  # s of the span before the motion
 _OUTLYING = 6.0  # multiple of the typical deviation of fixes from their running median, or of their sigma
 # rad, of the initial headings that are tried, relative to the first guess
 _HEADINGS_TRIED = (0.0, 0.5 * np.pi, 1.5 * np.pi, np.pi)
-_FIRST_ITERATIONS = 10  # iterations after which a start either has converged or creeps
 _UNLIKELY = 14.0  # difference of log-likelihoods at a ratio of one in a million: -ln 1e-6
 
-Smoother = Callable[[Problem, States], Solution]
+
+class _End(Exception):
+    """What becomes of a heading is known before its problem is solved: nothing, or one of the other solutions."""
+
+    def __init__(self, known: Solution | None = None) -> None:
+        self.known = known
 
 
 def drop_implausible(recording: Recording) -> Recording:
@@ -103,7 +108,7 @@ def find_motion_span(recording: Recording, settings: Settings, stationary: Array
 
 
 def align_in_motion(
-    recording: Recording, settings: Settings, frame: LocalFrame, smooth: Smoother, span: tuple[float, float]
+    recording: Recording, settings: Settings, frame: LocalFrame, span: tuple[float, float]
 ) -> Alignment:
     """The first state from the short problem over `span` (s), carried back to the first sample."""
     gnss, imu = recording.gnss, recording.imu
@@ -116,7 +121,7 @@ def align_in_motion(
     bias = _estimate_rate(imu)
     rp = level(recording, begin)
     heading = _fit_heading(part, frame, rp, bias)
-    tried = _try_headings(part, settings, frame, smooth, rp, heading, bias)
+    tried = _try_headings(part, settings, frame, rp, heading, bias)
     if not tried:
         raise EstimationError(
             f"'{recording.name}': no initial attitude explains the GNSS fixes between {begin - recording.start:.0f} "
@@ -183,26 +188,41 @@ def _thin(gnss: Gnss, begin: float, end: float, spacing: float = 0.9) -> Gnss:
 
 
 def _try_headings(
-    part: Recording, settings: Settings, frame: LocalFrame, smooth: Smoother, rp: Array, heading: float, bias: Array
+    part: Recording, settings: Settings, frame: LocalFrame, rp: Array, heading: float, bias: Array
 ) -> list[Solution]:
     """Solutions of the short problem from each of the initial headings.
 
-    The last points backwards and may creep along a saddle, towards the minimum of the others or none. It is abandoned
-    where its likelihood is negligible beside the best; `worth` successive fixes are worth one in the worst case, over a
-    span with one turn (`graphnav.estimation.alignment.course`).
+    Those that point elsewhere mostly lead to the same minimum, and are that solution as soon as they are within a sigma
+    of it. Or they creep along a saddle, towards it or none, and are abandoned where they promise no likelihood that
+    counts beside the best; `worth` successive fixes are worth one in the worst case, over a span with one turn
+    (`graphnav.estimation.alignment.course`).
     """
-    *ends, backwards = (np.array([*rp, heading + turn]) for turn in _HEADINGS_TRIED)
-    problem = _build_short(part, settings, frame, ends[0], bias)
-    tried = [_try(problem, smooth, end) for end in ends]
+    problem = _build_short(part, settings, frame, np.array([*rp, heading]), bias)
     assert part.gnss is not None
     worth = max(1.0, len(part.gnss.t) / (2.0 * np.pi))
-    few = settings.solver.model_copy(update={"max_iterations": min(_FIRST_ITERATIONS, settings.solver.max_iterations)})
-    brief = replace(problem, settings=problem.settings.model_copy(update={"solver": few}))
-    last = _try(brief, smooth, backwards)
-    best = min((one.cost for one in tried if np.isfinite(one.cost)), default=np.inf)
-    if last.iterations >= few.max_iterations and last.cost < best + _UNLIKELY * worth:
-        last = _try(problem, smooth, backwards)
-    return [one for one in (*tried, last) if np.isfinite(one.cost)]
+    tried: list[Solution] = []
+
+    def watch(states: States, cost: float, gain: float, slow: bool) -> None:
+        if slow and cost - gain > min((one.cost for one in tried), default=np.inf) + _UNLIKELY * worth:
+            raise _End
+        for one in tried:
+            if gain < 0.5 and cost - gain > one.cost and _within_a_sigma(states, one):
+                raise _End(one)
+
+    for turn in _HEADINGS_TRIED:
+        try:
+            found: Solution | None = _try(problem, np.array([*rp, heading + turn]), watch)
+        except _End as end:
+            found = end.known
+        if found is not None and np.isfinite(found.cost):
+            tried.append(found)
+    return tried
+
+
+def _within_a_sigma(states: States, solution: Solution) -> bool:
+    """Whether the first of the states is that of a solution, but for less than its uncertainty."""
+    e = states[:1].minus(solution.states[:1])[0]
+    return float(e @ np.linalg.solve(solution.covariance[0], e)) < 1.0
 
 
 def _build_short(part: Recording, settings: Settings, frame: LocalFrame, rph: Array, bias: Array) -> Problem:
@@ -223,11 +243,14 @@ def _build_short(part: Recording, settings: Settings, frame: LocalFrame, rph: Ar
     # an outlying fix or a burst must not decide the heading
     robust = settings.gnss.model_copy(update={"robust": "cauchy", "lever_arm_sigma": None, "time_offset_sigma": 0.0})
     # the information of the wheels on the heading is added by `with_course`
-    return build_problem(part, settings.without_wheels().model_copy(update={"gnss": robust}), frame, start, sigma)
+    problem = build_problem(part, settings.without_wheels().model_copy(update={"gnss": robust}), frame, start, sigma)
+    return split_carriers(problem)[0]
 
 
-def _try(problem: Problem, smooth: Smoother, rph: Array) -> Solution:
+def _try(problem: Problem, rph: Array, watch: Callable[[States, float, float, bool], None]) -> Solution:
     """Solve the short problem from one initial attitude."""
+    from graphnav.estimation.factor_graph.batch import batch  # and GTSAM with it, which a drive at rest does not need
+
     gnss, mean, t = problem.recording.gnss, problem.prior.mean, problem.t
     assert gnss is not None
     assert mean is not None
@@ -238,4 +261,5 @@ def _try(problem: Problem, smooth: Smoother, rph: Array) -> Solution:
     v = np.gradient(p, t, axis=0)
     K = len(t)
     R = R0 @ np.concatenate([np.eye(3)[None], dR])
-    return smooth(problem, States(R, p, v, np.zeros((K, 3)), np.tile(bias, (K, 1))))
+    start = States(R, p, v, np.zeros((K, 3)), np.tile(bias, (K, 1)))
+    return batch(problem, start, wanted=(0,), reintegrate=False, watch=watch)

@@ -14,7 +14,7 @@ then within sqrt(2 tolerance) sigma in every direction at once.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -35,13 +35,15 @@ from graphnav.estimation.solvers.rows import (
     Step,
     Values,
     compute_column_norms,
-    cost,
     whiten,
 )
 
 _GRADUATION = 1.4  # by which mu grows from step to step
 _SHARP = 100.0  # mu from which on the kernel bends within half a per cent of its scale
 _MIN_DAMPING, _MAX_DAMPING = 1e-4, 1e8
+# of a step: the states it starts from, their cost, by how much it promises to lower that, and whether a damped one
+# before it did not halve it
+Watch = Callable[[States, float, float, bool], None]
 
 
 def batch(
@@ -51,11 +53,13 @@ def batch(
     progress: Progress | None = None,
     wanted: tuple[int, ...] | None = None,
     reintegrate: bool = True,
+    watch: Watch | None = None,
 ) -> Solution:
     """Solve a problem from any starting states (K rows) and parameter values.
 
     `wanted` are the keyframes whose covariance is wanted, all when None; others are NaN. `reintegrate`
-    allows intervals to be integrated again when the gyro bias moves far.
+    allows intervals to be integrated again when the gyro bias moves far. `watch` sees each undamped step
+    before it is made, and what it raises ends the iterations.
     """
     began = time.perf_counter()
     values = {c.parameter.name: c.mean for c in problem.chains} | (values or {})
@@ -66,7 +70,7 @@ def batch(
         point = _minimise(replace(problem, constraints=tuple(rows)), point, progress, reintegrate).point
     for gentle in _graduate(problem, point):
         point = _minimise(gentle, point, progress, reintegrate, 1).point
-    found = _minimise(problem, point, progress, reintegrate)
+    found = _minimise(problem, point, progress, reintegrate, watch=watch)
     problem, point, layout = found.problem, found.point, found.layout
     solved = time.perf_counter()
     if progress is not None:
@@ -133,7 +137,12 @@ def _graduate(problem: Problem, point: Iterate) -> Iterator[Problem]:
 
 
 def _minimise(
-    problem: Problem, point: Iterate, progress: Progress | None, reintegrate: bool, iterations: int | None = None
+    problem: Problem,
+    point: Iterate,
+    progress: Progress | None,
+    reintegrate: bool,
+    iterations: int | None = None,
+    watch: Watch | None = None,
 ) -> _Minimum:
     settings = problem.settings.solver
     if iterations is not None:
@@ -142,8 +151,8 @@ def _minimise(
     if reintegrate:
         problem, renewed = integrate_again(problem, point.states, point.scale)
     layout = Layout(problem)
-    now = cost(problem, point, layout)
-    damping, gentlest = 0.0, _MIN_DAMPING
+    rows, now = whiten(problem, point, layout)
+    damping, gentlest, slow = 0.0, _MIN_DAMPING, False
     stopped = f"stopped at the limit of {settings.max_iterations} iterations"
     eliminated: Eliminated | None = None
     iteration = 0
@@ -151,20 +160,21 @@ def _minimise(
         iteration += 1
         if progress is not None:
             progress("batch", iteration / settings.max_iterations)
-        rows = whiten(problem, point, layout)
         while True:
             eliminated, step, gain = solve_rows(rows, layout, damping)
+            if watch is not None and damping == 0.0:
+                watch(point.states, now, gain, slow)
             candidate = point.moved(step)
-            ahead = cost(problem, candidate, layout)
+            rows_ahead, ahead = whiten(problem, candidate, layout)
             if ahead < now or gain < settings.tolerance:
                 break
             if damping == 0.0:
                 # an early heading swings all that comes after it along tangents, off the track by the square of
                 # the angle; the step after this one takes that back, and only then is it seen what both bring
-                beyond = candidate.moved(solve_rows(whiten(problem, candidate, layout), layout)[1])
-                behind = cost(problem, beyond, layout)
+                beyond = candidate.moved(solve_rows(rows_ahead, layout)[1])
+                rows_beyond, behind = whiten(problem, beyond, layout)
                 if behind < now:
-                    candidate, ahead = beyond, behind
+                    candidate, rows_ahead, ahead = beyond, rows_beyond, behind
                     break
             refused += 1
             damping = max(gentlest, 10.0 * damping)
@@ -178,8 +188,9 @@ def _minimise(
                 point, now = candidate, ahead  # the last small step is free
             stopped = f"converged: one more step would lower the cost by {gain:.1e}"
             break
+        slow = damping > 0.0 and ahead > 0.5 * now
         if ahead < now:
-            point, now = candidate, ahead
+            point, rows, now = candidate, rows_ahead, ahead
         eliminated = None
         # a damped step promises little by construction: convergence is judged by an undamped one
         if damping == gentlest:
@@ -189,10 +200,10 @@ def _minimise(
             problem, again = integrate_again(problem, point.states, point.scale)
             if again:
                 layout = Layout(problem)
-                now = cost(problem, point, layout)
+                rows, now = whiten(problem, point, layout)
                 renewed += again
     if eliminated is None and iterations is None:
-        eliminated = solve_rows(whiten(problem, point, layout), layout)[0]
+        eliminated = solve_rows(rows, layout)[0]
     notes = []
     if refused:
         stopped += f" ({refused} steps taken back and damped)"

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from graphnav.core.rotation import Array, mv
+from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, States
 from graphnav.estimation.problem import ParameterChain, Problem
 from graphnav.estimation.solvers.linearise import Points, find_last_keyframes, linearise, linearise_links
@@ -106,25 +106,30 @@ class Layout:
         return blocks
 
 
-def whiten(problem: Problem, point: Iterate, layout: Layout) -> Rows:
-    """All factors at a point."""
+def whiten(problem: Problem, point: Iterate, layout: Layout) -> tuple[Rows, float]:
+    """All factors at a point, and its cost: half their squared residuals, through the robust kernels."""
     first = np.arange(layout.K - 1)
     start, end, S, b = linearise_links(problem.motion, point.states, point.scale)
     links = [(first, start), (first + 1, end)]
     if point.scale is not None:
         links += layout.parameter_blocks(first, {SCALE: S})
     out: Rows = [(links, b)]
+    total = 0.5 * float(np.sum(b * b))
     points = point.points(problem)
     for rows in (problem.prior, *problem.constraints):
         linear = linearise(rows, points, problem.columns)
-        scale = np.sqrt(linear.kernel()[0])[:, None] / linear.sigma
+        weight, costs = linear.kernel()
+        total += float(np.sum(costs))
+        scale = np.sqrt(weight)[:, None] / linear.sigma
         H = scale[..., None] * linear.H
         weighted = {p.name: H[:, :, problem.columns[p.name]] for p in rows.parameters}
         blocks = [(rows.keyframe, H[:, :, :DIM])]
         out += _touching(blocks + layout.parameter_blocks(rows.keyframe, weighted), -scale * linear.residual)
     for chain in problem.chains:
-        out += linearise_chain(chain, layout.group_of[chain.parameter.name], point.values[chain.parameter.name])
-    return out
+        own = linearise_chain(chain, layout.group_of[chain.parameter.name], point.values[chain.parameter.name])
+        total += sum(0.5 * float(np.sum(b * b)) for _, b in own)
+        out += own
+    return out, total
 
 
 def _touching(blocks: list[tuple[Array, Array]], b: Array) -> Rows:
@@ -141,21 +146,9 @@ def _touching(blocks: list[tuple[Array, Array]], b: Array) -> Rows:
     ]
 
 
-def cost(problem: Problem, point: Iterate, layout: Layout) -> float:
-    """Half the squared whitened residuals of everything, through the robust kernels."""
-    points, r = point.points(problem), problem.motion.residual(point.states, point.scale)
-    total = 0.5 * float(np.sum(mv(problem.motion.whitener, r) ** 2))
-    for rows in (problem.prior, *problem.constraints):
-        total += float(np.sum(linearise(rows, points, problem.columns).kernel()[1]))
-    for chain in problem.chains:
-        for _, b in linearise_chain(chain, layout.group_of[chain.parameter.name], point.values[chain.parameter.name]):
-            total += 0.5 * float(np.sum(b * b))
-    return total
-
-
 def compute_cost_at(problem: Problem, points: Points) -> float:
-    """`cost` at points of all keyframes."""
-    return cost(problem, Iterate(points.states, points.nodes(problem)), Layout(problem))
+    """The cost at points of all keyframes."""
+    return whiten(problem, Iterate(points.states, points.nodes(problem)), Layout(problem))[1]
 
 
 def compute_column_norms(rows: Rows, layout: Layout) -> Array:
