@@ -10,11 +10,11 @@ errors of a low-cost MEMS.
 
 `li`: the experiment of Li 2024, PPP and IMU coupled tightly with zero velocity where the spectrum of the idling engine
 says that the vehicle stands, on the simulated drive of `scripts/reproduce_li2024.py`, stops of 60, 120 and 90 s. Orbits
-and clocks are CODE's of that day; observations of two signals are SIMULATED along the drive, with noise, an ionosphere,
-a wet delay that differs from the standard one, satellites 2.5 cm off and ambiguities; the models of tide, wind-up and
-antenna are those of the estimate. Each stop is run by itself, with GNSS gone from its first second. Printed are the
-share of stopped seconds found (the paper's Table 5) and the changes of position in the stops (its Table 6), and the
-errors of the place before the stop, which the paper does not give.
+and clocks are CODE's of that day; observations of two signals are SIMULATED along the drive, with noise, reflections in
+the carriers, an ionosphere, a wet delay that differs from the standard one, satellites 2.5 cm off and ambiguities; the
+models of tide, wind-up and antenna are those of the estimate. Each stop is run by itself, with GNSS gone from its first
+second. Printed are the share of stopped seconds found (the paper's Table 5) and the changes of position in the stops
+(its Table 6), and the errors of the place before the stop, which the paper does not give.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ from typing import Any
 
 import numpy as np
 from reproduce_li2024 import TABLE_5, TABLE_6, detection, stops_of, variation, without_gnss
+from scipy.signal import lfilter
 
 from graphnav.config import settings_from
 from graphnav.core import earth, rotation
@@ -145,6 +146,7 @@ def static(data: Path, chosen: dict[str, Any], solvers: tuple[str, ...]) -> None
 
 
 CODE, CARRIER, ORBIT, WET, ZENITH = 0.3, 0.003, 0.025, 0.05, 2.0  # m: noise, satellites, wet delay, ionosphere on L1
+REFLECTED, LASTS = 0.003, 20.0  # m towards the zenith (RTKLIB 2.4.3, rtkpos.c, varerr), and s: of carriers
 SECOND = {GPS: "2W", GALILEO: "5Q"}
 
 
@@ -195,10 +197,13 @@ def observed(made: Simulated, orbits: Any, mask: float = 15.0, seed: int = 0) ->
     common = free.known + clock[at] - raw.clock + free.wet * wet[at] + ORBIT * rng.standard_normal(len(names))[of]
     delay = ZENITH / np.maximum(np.sin(free.geometry.elevation), 0.2)
     noisy = []
+    draws = rng.spawn(1)[0]
     for one in (raw, _second_of(raw, other)):
         slower, length = delay * (L1 / one.frequency) ** 2, C / one.frequency
         whole = rng.integers(-(10**6), 10**6, len(names))[of]
-        phase = common - slower + CARRIER * rng.standard_normal(len(raw))
+        size = REFLECTED * np.hypot(1.0, 1.0 / np.sin(free.geometry.elevation))
+        lasting = size * _draw_lasting(draws, len(t), len(names))[at, of]
+        phase = common - slower + lasting + CARRIER * rng.standard_normal(len(raw))
         noisy.append((common + slower + CODE * rng.standard_normal(len(raw)), phase / length + wound + whole))
     raw = _both(raw, other, noisy)
     rough = earth.ecef_to_llh(antenna + 1.5 * rng.standard_normal(antenna.shape))
@@ -206,6 +211,14 @@ def observed(made: Simulated, orbits: Any, mask: float = 15.0, seed: int = 0) ->
     gnss = Gnss(t, rough, np.full((len(t), 3), 1.5), v, np.full((len(t), 3), 0.05), lever, derived=True)
     nominal = earth.llh_to_ecef(rough)[np.searchsorted(t, raw.t)]
     return replace(recording, gnss=gnss, raw_gnss=replace(raw, antenna=nominal), gps_zero=zero)
+
+
+def _draw_lasting(rng: np.random.Generator, epochs: int, series: int) -> Array:
+    """(epochs, series) of unit variance, once a second, that fade over `LASTS`."""
+    kept = np.exp(-1.0 / LASTS)
+    white = rng.standard_normal((epochs, series))
+    white[1:] *= np.sqrt(1.0 - kept**2)
+    return np.asarray(lfilter([1.0], [1.0, -kept], white, axis=0))
 
 
 def _both(raw: RawGnss, other: Array, noisy: list[tuple[Array, Array]] | None = None) -> RawGnss:
@@ -225,10 +238,10 @@ def _second_of(raw: RawGnss, other: Array) -> RawGnss:
     return replace(raw, signal=other, frequency=frequencies(raw.satellite, other))
 
 
-def li(data: Path, solvers: tuple[str, ...], stops: int) -> None:
-    made = simulate("li2024", 0, short=True)
+def li(data: Path, solvers: tuple[str, ...], stops: int, seed: int = 0) -> None:
+    made = simulate("li2024", seed, short=True)
     some = sources(data)
-    recording = observed(made, read_precise(list(some.sp3), list(some.clk)))
+    recording = observed(made, read_precise(list(some.sp3), list(some.clk)), seed=seed)
     rates = detection(replace(made, recording=recording), ["fused", "fft"])
     print("Table 5: % of stopped seconds found, by stop and in all; the paper's, and ours (simulated)")
     print("paper", *TABLE_5)
@@ -269,12 +282,13 @@ def main() -> None:
     parser.add_argument("data", type=Path)
     parser.add_argument("--solver", action="append", default=[])
     parser.add_argument("--stops", type=int, default=3, help="of the vehicle's drive")
+    parser.add_argument("--seed", type=int, default=0, help="of the vehicle's drive and its observations")
     given = parser.parse_args()
     solvers = tuple(given.solver) or ("ekf", "rts", "batch")
     if given.what == "static":
         static(given.data, {}, solvers)
     else:
-        li(given.data, solvers, given.stops)
+        li(given.data, solvers, given.stops, given.seed)
 
 
 if __name__ == "__main__":
