@@ -1,12 +1,16 @@
-"""Precise point positioning with float ambiguities, by real orbits and clocks: a station that stands, and a vehicle.
+"""Precise point positioning with float ambiguities, by real orbits and clocks: antennas that stand, and vehicles.
 
     python scripts/reproduce_ppp.py static ../shared/data/raw_gnss_slac_20210428
     python scripts/reproduce_ppp.py static ../shared/data/cssrlib_2021_078
+    python scripts/reproduce_ppp.py drive ../shared/data/cssrlib_2021_265 --solver ekf --solver rts
     python scripts/reproduce_ppp.py li ../shared/data/raw_gnss_slac_20210428 --solver ekf --solver batch
 
 `static`: an hour of the station SLAC every 30 s, or a quarter of an hour of another antenna every second, CODE's final
 orbits and clocks; errors against the known place, east, north, up, over time. The IMU at rest is SIMULATED, with the
 errors of a low-cost MEMS.
+
+`drive`: six minutes of a vehicle, whole and in halves, against RTKLIB's fixed places, with the simulated IMU of
+`scripts/reproduce_rtk.py`: errors at the end, and the sum of squares of these over their covariance.
 
 `li`: the experiment of Li 2024, PPP and IMU coupled tightly with zero velocity where the spectrum of the idling engine
 says that the vehicle stands, on the simulated drive of `scripts/reproduce_li2024.py`, stops of 60, 120 and 90 s. Orbits
@@ -27,6 +31,7 @@ from typing import Any
 
 import numpy as np
 from reproduce_li2024 import TABLE_5, TABLE_6, detection, stops_of, variation, without_gnss
+from reproduce_rtk import DRIVES, simulate_imu, truth_of
 from scipy.signal import lfilter
 
 from graphnav.config import settings_from
@@ -39,10 +44,11 @@ from graphnav.gnss.ppp import ionosphere_free
 from graphnav.gnss.precise import read_precise
 from graphnav.gnss.series import RawGnss
 from graphnav.gnss.signals import GALILEO, GPS, L1, C, frequencies, signal_id
-from graphnav.gnss.single_point import look
+from graphnav.gnss.single_point import SinglePoint, look
 from graphnav.gnss.tides import sun_and_moon
 from graphnav.recording import Gnss, Imu, ImuNoise, Recording
 from graphnav.simulation import Simulated, simulate
+from graphnav.simulation.inertial import MEMS as CONSUMER
 
 Array = np.ndarray
 # m in e, of the marker in IGS14 on that day. The header's place is of NAD 83 (2011), 1.8 m from it. Of the station's
@@ -114,12 +120,16 @@ def static_recording(data: Path) -> Recording:
     raw, fixes, said = load_raw(sources(data), at.begin)
     for one in said:
         print(one)
-    raw = raw.take((raw.t > 0.0) & (raw.t < at.end - at.begin))
-    good = np.isfinite(fixes.p[:, 0]) & (fixes.t > 0.0) & (fixes.t < at.end - at.begin)
+    return simulated_beside(data.name, raw, fixes, standing(at.end - at.begin, at.place), (0.0, at.end - at.begin))
+
+
+def simulated_beside(name: str, raw: RawGnss, fixes: SinglePoint, imu: Imu, span: tuple[float, float]) -> Recording:
+    """The observations of a span, with a simulated IMU."""
+    good = np.isfinite(fixes.p[:, 0]) & (fixes.t > span[0]) & (fixes.t < span[1])
     sd = np.sqrt(np.diagonal(fixes.covariance[good], axis1=1, axis2=2))
     gnss = Gnss(fixes.t[good], earth.ecef_to_llh(fixes.p[good]), sd, derived=True)
-    imu = standing(at.end - at.begin, at.place)
-    return Recording(f"{data.name}, IMU simulated", "vehicle", imu, gnss, gps_zero=at.begin, raw_gnss=raw)
+    raw = raw.take((raw.t > span[0]) & (raw.t < span[1]))
+    return Recording(f"{name}, IMU simulated", "vehicle", imu, gnss, gps_zero=raw.zero, raw_gnss=raw)
 
 
 def static(data: Path, chosen: dict[str, Any], solvers: tuple[str, ...]) -> None:
@@ -143,6 +153,30 @@ def static(data: Path, chosen: dict[str, Any], solvers: tuple[str, ...]) -> None
             print(f"{name:6} {minutes:5.1f} " + " ".join(f"{x:7.3f}" for x in off[min(k, len(off) - 1)]))
         P = np.sqrt(np.diagonal(one.covariance[-1])[3:6])
         print(f"{name:6} sigma " + " ".join(f"{x:7.3f}" for x in P), flush=True)
+
+
+def drive(data: Path, solvers: tuple[str, ...]) -> None:
+    known = DRIVES[data.name]
+    raw, fixes, said = load_raw(sources(data), 604800.0 * known.week)
+    for one in said:
+        print(one)
+    t, places = truth_of(data, known, raw)
+    at, gyro, accel, _ = simulate_imu(t, places)
+    whole = simulated_beside(data.name, raw, fixes, Imu(at, gyro, accel, CONSUMER.noise), (at[0], at[-1]))
+    settings = settings_from({"raw_gnss": {"coupling": "tight", "ppp": True}})
+    print("m, east, north, up at the end of a span (s from the start); 1-sigma; sum of squares over the covariance")
+    half = 0.5 * whole.duration
+    for span in ((0.0, whole.duration), (0.0, half), (half, whole.duration)):
+        for name, one in run(whole.crop(*span), settings, solvers).items():
+            k = int(np.argmin(np.abs(t - one.t[-1])))
+            off = one.states.p[-1] - one.frame.from_llh(earth.ecef_to_llh(places[k : k + 1]))[0]
+            P = one.covariance[-1][3:6, 3:6]
+            print(
+                f"{name:6} {span[0]:4.0f} to {span[1]:4.0f}",
+                *(f"{x:7.3f}" for x in (*off, *np.sqrt(np.diagonal(P)))),
+                f"{off @ np.linalg.solve(P, off):7.2f}",
+                flush=True,
+            )
 
 
 CODE, CARRIER, ORBIT, WET, ZENITH = 0.3, 0.003, 0.025, 0.05, 2.0  # m: noise, satellites, wet delay, ionosphere on L1
@@ -278,7 +312,7 @@ def li(data: Path, solvers: tuple[str, ...], stops: int, seed: int = 0) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("static", "li"))
+    parser.add_argument("what", choices=("static", "drive", "li"))
     parser.add_argument("data", type=Path)
     parser.add_argument("--solver", action="append", default=[])
     parser.add_argument("--stops", type=int, default=3, help="of the vehicle's drive")
@@ -287,6 +321,8 @@ def main() -> None:
     solvers = tuple(given.solver) or ("ekf", "rts", "batch")
     if given.what == "static":
         static(given.data, {}, solvers)
+    elif given.what == "drive":
+        drive(given.data.resolve(), solvers)
     else:
         li(given.data, solvers, given.stops, given.seed)
 
