@@ -1,20 +1,24 @@
-"""Precise point positioning with float ambiguities, by real orbits and clocks: a station that stands, and a vehicle.
+"""Precise point positioning with float ambiguities, by real orbits and clocks: antennas that stand, and vehicles.
 
     python scripts/reproduce_ppp.py static ../shared/data/raw_gnss_slac_20210428
     python scripts/reproduce_ppp.py static ../shared/data/cssrlib_2021_078
+    python scripts/reproduce_ppp.py drive ../shared/data/cssrlib_2021_265 --solver ekf --solver rts
     python scripts/reproduce_ppp.py li ../shared/data/raw_gnss_slac_20210428 --solver ekf --solver batch
 
 `static`: an hour of the station SLAC every 30 s, or a quarter of an hour of another antenna every second, CODE's final
 orbits and clocks; errors against the known place, east, north, up, over time. The IMU at rest is SIMULATED, with the
 errors of a low-cost MEMS.
 
+`drive`: six minutes of a vehicle, whole and in halves, against RTKLIB's fixed places, with the simulated IMU of
+`scripts/reproduce_rtk.py`: errors at the last epoch, and the sum of squares of these over their covariance.
+
 `li`: the experiment of Li 2024, PPP and IMU coupled tightly with zero velocity where the spectrum of the idling engine
 says that the vehicle stands, on the simulated drive of `scripts/reproduce_li2024.py`, stops of 60, 120 and 90 s. Orbits
-and clocks are CODE's of that day; observations of two signals are SIMULATED along the drive, with noise, an ionosphere,
-a wet delay that differs from the standard one, satellites 2.5 cm off and ambiguities; the models of tide, wind-up and
-antenna are those of the estimate. Each stop is run by itself, with GNSS gone from its first second. Printed are the
-share of stopped seconds found (the paper's Table 5) and the changes of position in the stops (its Table 6), and the
-errors of the place before the stop, which the paper does not give.
+and clocks are CODE's of that day; observations of two signals are SIMULATED along the drive, with noise, reflections in
+the carriers, an ionosphere, a wet delay that differs from the standard one, satellites 2.5 cm off and ambiguities; the
+models of tide, wind-up and antenna are those of the estimate. Each stop is run by itself, with GNSS gone from its first
+second. Printed are the share of stopped seconds found (the paper's Table 5) and the changes of position in the stops
+(its Table 6), and the errors of the place before the stop, which the paper does not give.
 """
 
 from __future__ import annotations
@@ -27,6 +31,8 @@ from typing import Any
 
 import numpy as np
 from reproduce_li2024 import TABLE_5, TABLE_6, detection, stops_of, variation, without_gnss
+from reproduce_rtk import DRIVES, simulate_imu, truth_of
+from scipy.signal import lfilter
 
 from graphnav.config import settings_from
 from graphnav.core import earth, rotation
@@ -38,10 +44,11 @@ from graphnav.gnss.ppp import ionosphere_free
 from graphnav.gnss.precise import read_precise
 from graphnav.gnss.series import RawGnss
 from graphnav.gnss.signals import GALILEO, GPS, L1, C, frequencies, signal_id
-from graphnav.gnss.single_point import look
+from graphnav.gnss.single_point import SinglePoint, look
 from graphnav.gnss.tides import sun_and_moon
 from graphnav.recording import Gnss, Imu, ImuNoise, Recording
 from graphnav.simulation import Simulated, simulate
+from graphnav.simulation.inertial import MEMS as CONSUMER
 
 Array = np.ndarray
 # m in e, of the marker in IGS14 on that day. The header's place is of NAD 83 (2011), 1.8 m from it. Of the station's
@@ -113,12 +120,16 @@ def static_recording(data: Path) -> Recording:
     raw, fixes, said = load_raw(sources(data), at.begin)
     for one in said:
         print(one)
-    raw = raw.take((raw.t > 0.0) & (raw.t < at.end - at.begin))
-    good = np.isfinite(fixes.p[:, 0]) & (fixes.t > 0.0) & (fixes.t < at.end - at.begin)
+    return simulated_beside(data.name, raw, fixes, standing(at.end - at.begin, at.place), (0.0, at.end - at.begin))
+
+
+def simulated_beside(name: str, raw: RawGnss, fixes: SinglePoint, imu: Imu, span: tuple[float, float]) -> Recording:
+    """The observations of a span, with a simulated IMU."""
+    good = np.isfinite(fixes.p[:, 0]) & (fixes.t > span[0]) & (fixes.t < span[1])
     sd = np.sqrt(np.diagonal(fixes.covariance[good], axis1=1, axis2=2))
     gnss = Gnss(fixes.t[good], earth.ecef_to_llh(fixes.p[good]), sd, derived=True)
-    imu = standing(at.end - at.begin, at.place)
-    return Recording(f"{data.name}, IMU simulated", "vehicle", imu, gnss, gps_zero=at.begin, raw_gnss=raw)
+    raw = raw.take((raw.t > span[0]) & (raw.t < span[1]))
+    return Recording(f"{name}, IMU simulated", "vehicle", imu, gnss, gps_zero=raw.zero, raw_gnss=raw)
 
 
 def static(data: Path, chosen: dict[str, Any], solvers: tuple[str, ...]) -> None:
@@ -144,7 +155,34 @@ def static(data: Path, chosen: dict[str, Any], solvers: tuple[str, ...]) -> None
         print(f"{name:6} sigma " + " ".join(f"{x:7.3f}" for x in P), flush=True)
 
 
+def drive(data: Path, solvers: tuple[str, ...]) -> None:
+    known = DRIVES[data.name]
+    raw, fixes, said = load_raw(sources(data), 604800.0 * known.week)
+    for one in said:
+        print(one)
+    t, places = truth_of(data, known, raw)
+    at, gyro, accel, _ = simulate_imu(t, places)
+    whole = simulated_beside(data.name, raw, fixes, Imu(at, gyro, accel, CONSUMER.noise), (at[0], at[-1]))
+    settings = settings_from({"raw_gnss": {"coupling": "tight", "ppp": True}})
+    print(
+        "m, east, north, up at the last epoch of a span (s from the start); 1-sigma; sum of squares over the covariance"
+    )
+    half = 0.5 * whole.duration
+    for span in ((0.0, whole.duration), (0.0, half), (half, whole.duration)):
+        for name, one in run(whole.crop(*span), settings, solvers).items():
+            epochs, k = np.flatnonzero(np.isin(one.t, t)), np.flatnonzero(np.isin(t, one.t))
+            off = one.states.p[epochs[-1]] - one.frame.from_llh(earth.ecef_to_llh(places[k[-1:]]))[0]
+            P = one.covariance[epochs[-1]][3:6, 3:6]
+            print(
+                f"{name:6} {span[0]:4.0f} to {span[1]:4.0f}",
+                *(f"{x:7.3f}" for x in (*off, *np.sqrt(np.diagonal(P)))),
+                f"{off @ np.linalg.solve(P, off):7.2f}",
+                flush=True,
+            )
+
+
 CODE, CARRIER, ORBIT, WET, ZENITH = 0.3, 0.003, 0.025, 0.05, 2.0  # m: noise, satellites, wet delay, ionosphere on L1
+REFLECTED, LASTS = 0.003, 20.0  # m towards the zenith (RTKLIB 2.4.3, rtkpos.c, varerr), and s: of carriers
 SECOND = {GPS: "2W", GALILEO: "5Q"}
 
 
@@ -195,10 +233,13 @@ def observed(made: Simulated, orbits: Any, mask: float = 15.0, seed: int = 0) ->
     common = free.known + clock[at] - raw.clock + free.wet * wet[at] + ORBIT * rng.standard_normal(len(names))[of]
     delay = ZENITH / np.maximum(np.sin(free.geometry.elevation), 0.2)
     noisy = []
+    draws = rng.spawn(1)[0]
     for one in (raw, _second_of(raw, other)):
         slower, length = delay * (L1 / one.frequency) ** 2, C / one.frequency
         whole = rng.integers(-(10**6), 10**6, len(names))[of]
-        phase = common - slower + CARRIER * rng.standard_normal(len(raw))
+        size = REFLECTED * np.hypot(1.0, 1.0 / np.sin(free.geometry.elevation))
+        lasting = size * _draw_lasting(draws, len(t), len(names))[at, of]
+        phase = common - slower + lasting + CARRIER * rng.standard_normal(len(raw))
         noisy.append((common + slower + CODE * rng.standard_normal(len(raw)), phase / length + wound + whole))
     raw = _both(raw, other, noisy)
     rough = earth.ecef_to_llh(antenna + 1.5 * rng.standard_normal(antenna.shape))
@@ -206,6 +247,14 @@ def observed(made: Simulated, orbits: Any, mask: float = 15.0, seed: int = 0) ->
     gnss = Gnss(t, rough, np.full((len(t), 3), 1.5), v, np.full((len(t), 3), 0.05), lever, derived=True)
     nominal = earth.llh_to_ecef(rough)[np.searchsorted(t, raw.t)]
     return replace(recording, gnss=gnss, raw_gnss=replace(raw, antenna=nominal), gps_zero=zero)
+
+
+def _draw_lasting(rng: np.random.Generator, epochs: int, series: int) -> Array:
+    """(epochs, series) of unit variance, once a second, that fade over `LASTS`."""
+    kept = np.exp(-1.0 / LASTS)
+    white = rng.standard_normal((epochs, series))
+    white[1:] *= np.sqrt(1.0 - kept**2)
+    return np.asarray(lfilter([1.0], [1.0, -kept], white, axis=0))
 
 
 def _both(raw: RawGnss, other: Array, noisy: list[tuple[Array, Array]] | None = None) -> RawGnss:
@@ -225,10 +274,10 @@ def _second_of(raw: RawGnss, other: Array) -> RawGnss:
     return replace(raw, signal=other, frequency=frequencies(raw.satellite, other))
 
 
-def li(data: Path, solvers: tuple[str, ...], stops: int) -> None:
-    made = simulate("li2024", 0, short=True)
+def li(data: Path, solvers: tuple[str, ...], stops: int, seed: int = 0) -> None:
+    made = simulate("li2024", seed, short=True)
     some = sources(data)
-    recording = observed(made, read_precise(list(some.sp3), list(some.clk)))
+    recording = observed(made, read_precise(list(some.sp3), list(some.clk)), seed=seed)
     rates = detection(replace(made, recording=recording), ["fused", "fft"])
     print("Table 5: % of stopped seconds found, by stop and in all; the paper's, and ours (simulated)")
     print("paper", *TABLE_5)
@@ -265,16 +314,19 @@ def li(data: Path, solvers: tuple[str, ...], stops: int) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("static", "li"))
+    parser.add_argument("what", choices=("static", "drive", "li"))
     parser.add_argument("data", type=Path)
     parser.add_argument("--solver", action="append", default=[])
     parser.add_argument("--stops", type=int, default=3, help="of the vehicle's drive")
+    parser.add_argument("--seed", type=int, default=0, help="of the vehicle's drive and its observations")
     given = parser.parse_args()
     solvers = tuple(given.solver) or ("ekf", "rts", "batch")
     if given.what == "static":
         static(given.data, {}, solvers)
+    elif given.what == "drive":
+        drive(given.data.resolve(), solvers)
     else:
-        li(given.data, solvers, given.stops)
+        li(given.data, solvers, given.stops, given.seed)
 
 
 if __name__ == "__main__":

@@ -66,7 +66,8 @@ DRIVES = {
     ),
 }
 VARIANTS: dict[str, dict[str, Any]] = {
-    "codes, Doppler": {"carrier": False},
+    "codes, Doppler": {"carrier": False, "differences": False},
+    "and changes of carriers": {"carrier": False},
     "and carriers, float": {"integers": False},
     "and carriers, integers": {},
 }

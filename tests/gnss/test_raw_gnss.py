@@ -131,6 +131,37 @@ def test_glonass_and_geostationary_satellites_are_where_rtklib_has_them(rt, shar
     assert found.v[0] == pytest.approx((ahead - behind) / (2 * h), abs=1e-5)
 
 
+# what cssrlib 1.2.1 (eph2pos, eph2clk; peph2pos) makes of the same files at a true time: s of the week, m, s
+CSSRLIB = {
+    (f"{CSSR}/nav.gz", 2176): (
+        ("G05", 282900.0, (-25062639.0772, 6162624.6250, 6447874.8579), -5.52298397925458e-05),
+        ("E02", 282900.0, (-4343430.5106, -16045297.0867, 24498862.2501), 2.48482747056554e-04),
+        ("J02", 282900.0, (-35386486.3522, 18166850.7573, -9387353.5414), -2.88112476737492e-06),
+    ),
+    (f"{UCR}/nav.gz", 2114): (
+        ("G21", 7200.0, (-7056579.0881, -23684013.3356, 10900458.1454), 2.26330198464384e-05),
+        ("E15", 7200.0, (-8069182.3753, -28088306.8139, 4711281.4574), 8.60326688111377e-04),
+        ("C29", 7200.0, (-20287096.6599, -7044993.1652, 17809521.1228), 2.54716206734158e-04),
+    ),
+    (f"{CSSR}/orbit.sp3.gz", 2176): (
+        ("G05", 282855.0, (-25023892.0025, 6172357.3778, 6583405.1702), -5.52291011499700e-05),
+        ("R07", 282855.0, (-12476953.9146, -16201059.7128, -15184892.3186), -4.10800260194177e-05),
+        ("E02", 282855.0, (-4452102.2962, -16025046.5300, 24492560.8960), 2.48483901393070e-04),
+        ("C30", 282855.0, (-13199519.9576, 11536413.3654, -21720755.5388), 4.81290167481373e-04),
+    ),
+}
+
+
+@pytest.mark.parametrize(("file", "week"), list(CSSRLIB))
+def test_satellites_are_where_cssrlib_has_them(shared_data, file, week):
+    path = shared_data / file
+    orbits = read_precise([path], []) if "sp3" in file else read_navigation([path])
+    for name, at, p, clock in CSSRLIB[file, week]:
+        one = orbits.place(np.array([satellite_id(name)]), np.array([at + clock]), week * 604800.0)
+        assert one.p[0] == pytest.approx(p, abs=1e-3)
+        assert one.clock[0] == pytest.approx(clock, abs=1e-12)
+
+
 def test_precise_orbits_are_their_nodes_and_rtklibs_between(rt, shared_data, tmp_path):
     sp3 = shared_data / SLAC / "COD0MGXFIN_20211180000_01D_05M_ORB.SP3.gz"
     clk = shared_data / SLAC / "COD0MGXFIN_20211180000_01D_30S_CLK.CLK.gz"
