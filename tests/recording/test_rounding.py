@@ -24,8 +24,12 @@ def test_a_step_is_found_in_values_that_are_rounded(digits: int) -> None:
 def test_no_step_is_found_where_there_is_none() -> None:
     x = 35.0 + np.random.default_rng(0).standard_normal(100)
     assert find_step(x) == 0.0
-    assert find_step(np.full(100, 120.0)) == 0.0
+    assert find_step(np.full(100, 120.0)) == 0.0  # of which nothing tells how far the digits go
     assert find_step(np.round(x) / 3.0) == 0.0
+
+
+def test_two_heights_tell_a_step() -> None:
+    assert find_step(np.repeat([39.0, 40.0], 30)) == 1.0
 
 
 def test_a_step_of_minutes_is_found() -> None:

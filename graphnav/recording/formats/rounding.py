@@ -13,7 +13,7 @@ from graphnav.core.rotation import Array
 
 _MOST_DIGITS = 10  # decimals that degrees in double precision have
 _PARTS = 1.0, 60.0  # of a degree that logs count in: degrees, and minutes as of NMEA
-_FEWEST = 4  # values from which on a step is no chance: of finer ones, one set in ten thousand has it
+_FEWEST = 2  # values that tell a step: of finer ones, one pair in a hundred has it, and hardly any fixes are but a pair
 
 
 def measure_rounding(llh: Array) -> tuple[float, ...]:
