@@ -110,7 +110,12 @@ def prepare(
         built = builder.build_without(built, noise, parts=noise != STATED)
     aligned = built.aligned
     problem = without_parts(with_noise(built.problem, noise))
-    forward = ekf(problem, progress, aligned.until)  # its own solution has the time it takes
+    try:
+        forward = ekf(problem, progress, aligned.until)  # its own solution has the time it takes
+    except EstimationError:  # from a rough start its first pass may diverge, where that of the noise model did not
+        if known is None:
+            raise
+        forward = ekf(problem, progress, aligned.until, known)
     with clock.book("smoother"):
         smoothed = backward(problem, forward, progress)
         problem = _without_refused(problem, forward)
