@@ -111,13 +111,12 @@ def prepare(
     aligned = built.aligned
     problem = without_parts(with_noise(built.problem, noise))
     try:
-        forward = ekf(problem, progress, aligned.until)  # its own solution has the time it takes
+        forward, smoothed = _smooth(problem, aligned.until, None, clock, progress)
     except EstimationError:  # from a rough start its first pass may diverge, where that of the noise model did not
         if known is None:
             raise
-        forward = ekf(problem, progress, aligned.until, known)
+        forward, smoothed = _smooth(problem, aligned.until, known, clock, progress)
     with clock.book("smoother"):
-        smoothed = backward(problem, forward, progress)
         problem = _without_refused(problem, forward)
         if any(rows.gate is not None for rows in problem.constraints):
             smoothed = backward(problem, refilter(problem, smoothed, progress), progress)
@@ -135,6 +134,15 @@ def prepare(
     return Prepared(
         problem, noise, start, aligned, built.detections, forward, smoothed, notes, clock.seconds, passes, epochs, arcs
     )
+
+
+def _smooth(
+    problem: Problem, opening: float | None, known: Points | None, clock: Clock, progress: Progress | None
+) -> tuple[FilterPass, SmootherPass]:
+    """Filter, with its opening linearised at known points if there are any, and smooth."""
+    forward = ekf(problem, progress, opening, known)  # its own solution has the time it takes
+    with clock.book("smoother"):
+        return forward, backward(problem, forward, progress)
 
 
 def _find_noise(
