@@ -321,7 +321,7 @@ def test_kernel_is_of_whole_measurements(posed: Problem) -> None:
         bent = replace(rows, p_n=q, robust="gnc", robust_scale=3.0)
         problem = replace(posed, constraints=tuple(bent if c is rows else c for c in posed.constraints))
         at = 1 + [c.name for c in problem.constraints].index(rows.name) + 1  # behind intervals and prior
-        blocks, _ = whiten(problem, point, layout)[at]
+        blocks, _ = whiten(problem, point, layout)[0][at]
         assert bool(np.abs(blocks[0][1][100]).max() == 0.0) is weighed
 
 

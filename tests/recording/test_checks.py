@@ -90,7 +90,8 @@ def declared(axes: str) -> Change:
     ],
 )
 def test_no_false_alarm_on_a_drive(drive: Callable[[str], Recording], name: str) -> None:
-    assert inspect(drive(name)).warnings == ()
+    found = {f.key for f in inspect(drive(name)).findings if f.severity != "note"}
+    assert found == ({"imu.filled"} if name == "kitti" else set())  # eight stretches of straight lines
 
 
 def test_no_false_alarm_on_a_walk(shared_data: Path) -> None:
