@@ -21,7 +21,7 @@ _REVERSED = (-1.5, -0.5)  # nearer to the slope of a reversed axis, -1, than to 
 def check_imu_axes(imu: Imu, forward: Fit | None, track: Track | None) -> Iterator[Finding]:
     """Axes that the drive contradicts: by the mean force, or by a forward force that fits another axis better."""
     up = crosschecks.find_up(imu)
-    if up[2] > 0.8 and (forward is None or forward.correlation < 0.7):
+    if up[2] > 0.8 and (forward is None or forward.correlation < _CORRELATED):
         return
     if forward is None or forward.correlation < _CORRELATED:
         yield Finding(
