@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,12 +15,13 @@ from graphnav.estimation.noise.spans import list_repeats
 from graphnav.evaluation.metrics import summary
 from graphnav.recording import Recording
 
+ROOT = Path(__file__).resolve().parents[2]
 _BELOW = 0.9  # m/s
 
 
 @pytest.fixture(scope="module")
 def drive() -> Recording:
-    return graphnav.load("data/tokyo").crop(20.0, 110.0)
+    return graphnav.load(ROOT / "data" / "tokyo").crop(20.0, 110.0)
 
 
 def held(recording: Recording) -> Recording:
