@@ -459,7 +459,9 @@ MISTAKES: dict[str, list[Mistake]] = {
     "Sensors": [
         Mistake("one force of 1e4 m/s2", _row("imu", "ax", 3000, 1e4), ("1 IMU row", "1e+04 m/s2", "left out")),
         Mistake("one turn rate of 1e300 rad/s", _row("imu", "gz", 3000, 1e300), ("1 IMU row", "1e+300", "left out")),
-        Mistake("IMU rows filled in over 1.5 s", change("imu", _filled), ("in 1 stretch", "straight lines", "delete")),
+        Mistake(
+            "IMU rows filled in over 1.5 s", change("imu", _filled), ("in 1 stretch", "straight lines", "not measured")
+        ),
         Mistake("an axis of the gyro is dead", _dead("gz"), ("gyro z", "dead", "throughout")),
         Mistake(
             "an axis of the accelerometer is dead, and smoothed all the same",

@@ -10,8 +10,7 @@ import numpy as np
 
 from graphnav.core import rotation
 from graphnav.core.rotation import Array
-from graphnav.imu.samples import Samples
-from graphnav.recording import Imu
+from graphnav.core.running import running_sum
 
 _WALK_POINTS = 6  # quadrature points for the effect of bias random walks within an interval
 
@@ -22,27 +21,32 @@ def take_last(x: Array) -> Array:
     return np.ascontiguousarray(x.transpose(x.ndim - 1, *range(x.ndim - 1)))
 
 
-def running_sum(terms: Array) -> Array:
-    """Running sums along the first axis, from zero: one more than there are terms."""
-    out = np.zeros((len(terms) + 1, *terms.shape[1:]))
-    if out[0].size < 100:
-        np.cumsum(terms, axis=0, out=out[1:])
-    else:  # several times faster than NumPy's sums, which run down one column after the other
-        for k, term in enumerate(terms):
-            np.add(out[k], term, out=out[k + 1])
-    return out
-
-
 def white_variances(
-    samples: Samples, imu: Imu, dt: Array, index: Array, edge: Array, cut: Array
+    density: float, extra: Array, dt: Array, index: Array, edge: Array, cut: Array
 ) -> tuple[Array, Array]:
-    """Variances of the integrals of white rate and force noise over each cell between the edges."""
-    h = edge[1:] - edge[:-1]
-    qg, qa = imu.noise.gyro_noise_density**2 * h, imu.noise.accel_noise_density**2 * h
-    if samples.extra_gyro.any() or samples.extra_accel.any():
-        qg += np.diff(running_sum(samples.extra_gyro[index] * dt)[cut], axis=0)
-        qa += np.diff(running_sum(samples.extra_accel[index] * dt)[cut], axis=0)
-    return qg, qa
+    """Variances of the integral of white noise over each cell between the edges.
+
+    Parameters
+    ----------
+    density : of the sensor, alike along all axes.
+    extra : (N, 3) densities squared in addition, along the body's axes, of each sample.
+    dt, index : (pieces, n) of each piece, s, and its sample.
+    edge, cut : (L + 1, n) s and (L + 1,) pieces where cells begin and end.
+
+    Returns
+    -------
+    alike : (L, n)
+        Along all axes.
+    along : (L, 3, n)
+        In addition along each axis of the body; (0, 3, n) where there is none.
+    """
+    alike, n = density**2 * (edge[1:] - edge[:-1]), edge.shape[1]
+    if not extra.any():
+        return alike, np.empty((0, 3, n))
+    along = np.diff(running_sum(np.swapaxes(extra.take(index, axis=0), 1, 2) * dt[:, None])[cut], axis=0)
+    least = along.min(axis=1)
+    along -= least[:, None]
+    return alike + least, along if along.any() else np.empty((0, 3, n))
 
 
 def white_covariance(qg: Array, qa: Array, left: Array, a_edge: Array, b_edge: Array) -> Array:
@@ -71,6 +75,33 @@ def white_covariance(qg: Array, qa: Array, left: Array, a_edge: Array, b_edge: A
     Q[:, p, p] = outer(b, b, (qa * (s * s + dt * dt / 12.0)).sum(0))
     for x, y in ((theta, v), (theta, p), (v, p)):
         Q[:, y, x] = np.swapaxes(Q[:, x, y], -1, -2)
+    return Q
+
+
+def directed_covariance(of_gyro: Array, of_accel: Array, R: Array, left: Array, a: Array, b: Array) -> Array:
+    """Covariance (n, 15, 15), start frame, of white noise with other variances along each axis of the body.
+
+    By the trapezoidal rule: an error by u of the angle at a time moves the velocity at the end by u x a and the
+    position by u x b, one of the velocity the position by that times what is `left`.
+
+    Parameters
+    ----------
+    of_gyro, of_accel : (L, 3, n) variances of the integrals over each cell along the body's axes; L is 0 where there
+        are none.
+    R, left, a, b : (L + 1, 3, 3, n), (L + 1, n) and (L + 1, 3, n) at the edges.
+    """
+    Q = np.zeros((R.shape[-1], 15, 15))
+    effects = np.zeros((2, *R.shape[:1], 9, *R.shape[2:]))
+    effects[0, :, 0:3], effects[1, :, 6:9] = R, R
+    effects[0, :, 3:6], effects[0, :, 6:9] = (np.cross(R, x[:, :, None], axis=1) for x in (b, a))
+    effects[1, :, 3:6] = R * left[:, None, None]
+    for along, effect in zip((of_gyro, of_accel), effects, strict=True):
+        if len(along):
+            weight = np.zeros((len(R), *along.shape[1:]))
+            weight[:-1] += 0.5 * along
+            weight[1:] += 0.5 * along
+            flat = (effect * np.sqrt(weight)[:, None]).transpose(3, 1, 0, 2).reshape(len(Q), 9, -1)
+            Q[:, :9, :9] += flat @ np.swapaxes(flat, -1, -2)
     return Q
 
 

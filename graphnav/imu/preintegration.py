@@ -36,7 +36,14 @@ import numpy as np
 
 from graphnav.core import rotation
 from graphnav.core.rotation import Array
-from graphnav.imu.interval_noise import running_sum, take_last, walk_covariances, white_covariance, white_variances
+from graphnav.core.running import running_sum
+from graphnav.imu.interval_noise import (
+    directed_covariance,
+    take_last,
+    walk_covariances,
+    white_covariance,
+    white_variances,
+)
 from graphnav.imu.samples import MANY, Samples, chunks, pieces_of
 from graphnav.recording import Imu
 
@@ -270,7 +277,13 @@ def _integrate(
     cut = np.append(np.arange(0, L, _CELL if L >= MANY else 1), L)
     A, R, V, P = A[cut], R[cut], V[cut], P[cut]
     edge = running_sum(dt)[cut]
-    qg, qa = white_variances(samples, imu, dt, index, edge, cut)
+    (qg, along_gyro), (qa, along_accel) = (
+        white_variances(density, extra, dt, index, edge, cut)
+        for density, extra in (
+            (imu.noise.gyro_noise_density, samples.extra_gyro),
+            (imu.noise.accel_noise_density, samples.extra_accel),
+        )
+    )
     h = (edge[1:] - edge[:-1])[:, None]
     # dV / d bg = -int [dV]x A, exactly for A linear in a cell: int (t - t_start) dV = h dV - int (V - V_start) dt
     dv = V[1:] - V[:-1]
@@ -288,6 +301,8 @@ def _integrate(
     walks = walk_covariances(edge, left, A, B, PA, PB, a_edge, b_edge)
     of_gyro, of_accel = imu.noise.gyro_bias_walk**2 * walks[0], imu.noise.accel_bias_walk**2 * walks[1]
     Q = white_covariance(qg, qa, left, a_edge, b_edge) + of_gyro + of_accel
+    if len(along_gyro) or len(along_accel):
+        Q += directed_covariance(along_gyro, along_accel, R, left, a_edge, b_edge)
 
     dR, v_ba, v_bg, p_ba, p_bg = (take_last(x) for x in (R, A, B, PA, PB))
     turn = np.zeros((n, 15, 15))  # theta from the start frame to a right perturbation of dR

@@ -9,10 +9,13 @@ import numpy as np
 
 from graphnav.core.findings import period_of
 from graphnav.core.rotation import Array
+from graphnav.core.running import running_sum
 from graphnav.recording import Imu
 
 GAP = 1.5  # sample periods between rows above which there is a gap
 MANY = 64  # pieces above which an interval is processed apart from shorter ones
+_SPANS = 10  # times a gap's length on either side of it: twenty spans tell a variance to a third
+_TINY = np.finfo(float).tiny
 _PIECES_AT_ONCE = 40_000  # pieces processed at once: keeps the working arrays in the processor's cache
 
 
@@ -20,15 +23,15 @@ _PIECES_AT_ONCE = 40_000  # pieces processed at once: keeps the working arrays i
 class Samples:
     """IMU samples as pieces of constant rate and force, with gaps made explicit.
 
-    `extra_gyro`, `extra_accel` are white densities squared ((rad/s)^2/Hz, (m/s^2)^2/Hz) in addition to the sensor's
-    own: where a gap is bridged, and from `graphnav.imu.unresolved` for a foot.
+    `extra_gyro`, `extra_accel` are white densities squared ((rad/s)^2/Hz, (m/s^2)^2/Hz) along the body's axes, in
+    addition to the sensor's own: where a gap is bridged, and from `graphnav.imu.unresolved` for a foot.
     """
 
     t: Array  # (N,) end of each sample's period
     gyro: Array  # (N, 3)
     accel: Array  # (N, 3)
-    extra_gyro: Array  # (N,)
-    extra_accel: Array  # (N,)
+    extra_gyro: Array  # (N, 3)
+    extra_accel: Array  # (N, 3)
     start: float  # start of the first period
     bridged: Array  # (g, 2) start and end of every bridged gap, s
 
@@ -42,41 +45,69 @@ class Samples:
 def bridge_gaps(imu: Imu, factor: float = GAP) -> Samples:
     """Fill every gap with one sample: the mean of its neighbours, with the appropriate noise.
 
-    A row covers only one sample period before its stamp. Over a longer gap g the signal is unknown by as much as it
-    usually changes over g, which the recording shows: half its structure function, D(g)/2 = E|x(t+g) - x(t)|^2 / 2 per
-    axis, is the variance of a guess from the neighbours. That error lasts for the whole gap, so the equivalent white
-    density is D(g)/2 * g.
+    A row covers only one sample period before its stamp. The variance of the mean signal in a gap about that of its
+    neighbours is `_measure_bridge_error`. That error lasts for the whole gap of length g, so the equivalent white
+    density is the variance times g.
     """
     dt = imu.t[1:] - imu.t[:-1]
     period = period_of(imu.t)
     gap = np.flatnonzero(dt > factor * period)
-    zero = np.zeros(len(imu.t))
+    zero = np.broadcast_to(np.zeros(3), (len(imu.t), 3))
     if not len(gap):
         return Samples(imu.t, imu.gyro, imu.accel, zero, zero, float(imu.t[0] - period), np.empty((0, 2)))
     t_fill = imu.t[gap + 1] - period
     length = t_fill - imu.t[gap]
     at = gap + 1  # the added sample precedes the row that ends the gap
     fill = {name: 0.5 * (getattr(imu, name)[gap] + getattr(imu, name)[gap + 1]) for name in ("gyro", "accel")}
-    extra = {name: _compute_structure(getattr(imu, name), length / period) * length for name in ("gyro", "accel")}
+    lost = np.maximum(1, np.rint(length / period)).astype(int)
+    extra = {name: _measure_bridge_error(getattr(imu, name), gap, lost) * length[:, None] for name in ("gyro", "accel")}
     return Samples(
         t=np.insert(imu.t, at, t_fill),
         gyro=np.insert(imu.gyro, at, fill["gyro"], axis=0),
         accel=np.insert(imu.accel, at, fill["accel"], axis=0),
-        extra_gyro=np.insert(zero, at, extra["gyro"]),
-        extra_accel=np.insert(zero, at, extra["accel"]),
+        extra_gyro=np.insert(zero, at, extra["gyro"], axis=0),
+        extra_accel=np.insert(zero, at, extra["accel"], axis=0),
         start=float(imu.t[0] - period),
         bridged=np.stack([imu.t[gap], t_fill], -1),
     )
 
 
-def _compute_structure(x: Array, lags: Array) -> Array:
-    """Half the mean squared change per axis over each lag (in samples)."""
-    steps = np.maximum(1, np.rint(lags)).astype(int)
-    values = {}
-    for n in np.unique(np.minimum(steps, len(x) - 1)):
-        change = x[n:] - x[:-n]
-        values[n] = 0.5 * float(np.mean(change * change))
-    return np.array([values[min(n, len(x) - 1)] for n in steps])
+def _measure_bridge_error(x: Array, gap: Array, lost: Array) -> Array:
+    """Error variance of bridging gaps by the mean of their neighbours, axis by axis.
+
+    It is measured where there are rows, as the mean squared error of bridging as many as were lost, and predicted in
+    three ways: by that near the gap, for a straight road differs from a curve; by the change across the gap, to whose
+    square the error is on average in proportion; and by the level of the neighbours about the mean, in the same way,
+    for a signal changes most where it is large. The mean of the three is returned.
+
+    Parameters
+    ----------
+    x : (N, 3) rows.
+    gap : (g,) the row before each gap.
+    lost : (g,) rows lost in each.
+
+    Returns
+    -------
+    (g, 3)
+    """
+    sums, mean = running_sum(x), x.mean(axis=0)
+    out = np.empty((len(gap), 3))
+    for n in np.unique(lost):
+        here = np.flatnonzero(lost == n)
+        k = gap[here]
+        n = max(1, min(n, len(x) - 2))
+        before, after = x[: -n - 1], x[n + 1 :]
+        error = ((sums[n + 1 : -1] - sums[1 : -n - 1]) / n - 0.5 * (before + after)) ** 2
+        change, level = ((after - before) ** 2).mean(axis=0), ((0.5 * (before + after) - mean) ** 2).mean(axis=0)
+        usual, total = error.mean(axis=0), running_sum(error)
+        first = np.clip([k - (_SPANS + 1) * n, k + 1], 0, len(error))
+        last = np.clip([k - n, k + 1 + _SPANS * n], 0, len(error))
+        count = (last - first).sum(axis=0)[:, None]
+        near = np.where(count > 0, (total[last] - total[first]).sum(axis=0) / np.maximum(count, 1), usual)
+        across = (x[k + 1] - x[k]) ** 2 * usual / np.maximum(change, _TINY)
+        high = (0.5 * (x[k + 1] + x[k]) - mean) ** 2 * usual / np.maximum(level, _TINY)
+        out[here] = (near + across + high) / 3.0
+    return out
 
 
 @dataclass(frozen=True)

@@ -37,11 +37,11 @@ def with_unresolved_motion(samples: Samples, noise: ImuNoise) -> Samples:
 
 
 def _estimate_density(x: Array, white: float, period: float) -> Array:
-    """White density squared (N,) of rows (N, 3); `white` is the sensor's own density."""
+    """White density squared (N, 1), alike along all axes, of rows (N, 3); `white` is the sensor's own density."""
     change = np.sum(np.diff(x, axis=0) ** 2, axis=1) / 3.0
     change = np.maximum(change - 2.0 * white**2 / period, 0.0)
     both = 0.5 * (np.sqrt(np.r_[change[:1], change]) + np.sqrt(np.r_[change, change[-1:]]))
-    return np.asarray(_VARIANCE_SHARE * both**2 / 12.0 * period)
+    return np.asarray(_VARIANCE_SHARE * both**2 / 12.0 * period)[:, None]
 
 
 def with_coning(samples: Samples) -> Samples:

@@ -178,7 +178,10 @@ BROKEN: dict[str, tuple[Change, str]] = {
     "accelerometer reversed": (imu(accel=lambda x: -x), "the accelerometer's sign is reversed"),
     "no overlap": (imu(t=lambda t: t + 1e6), "do not overlap in time.*time_offset"),
     "gyro clipped": (imu(gyro=lambda x: np.clip(x, -0.5, 0.5)), "gyro z .* is saturated"),
-    "stuck": (imu(gyro=lambda x: _stick(x), accel=lambda x: _stick(x)), r"repeats one value for [23]\.\d s"),
+    "stuck": (
+        imu(gyro=lambda x: _stick(x), accel=lambda x: _stick(x)),
+        r"repeat one row .* of 2\.9. s, at 40",
+    ),
     "gap": (lambda r: r.without("odometer") and _gap(r), r"1 gap in the IMU, of 3(\.\d+)? s at 50\.\d s"),
 }
 

@@ -12,7 +12,6 @@ from graphnav.core.findings import Finding, describe_gaps, period_of, runs_of
 from graphnav.core.notes import format_count
 from graphnav.core.rotation import Array
 from graphnav.recording import Imu, Recording
-from graphnav.recording.plausibility.readings import RARE
 
 STANDARD_GRAVITY = 9.80665  # m/s^2, where the position is unknown
 
@@ -45,45 +44,6 @@ def check_repeats(imu: Imu) -> Iterator[Finding]:
             f"{format_count(same.sum(), 'IMU row')} ({100 * same.mean():.1f} %) with the values of the row before",
             "imu.repeats",
         )
-    stuck = max((b - a for a, b in runs_of(same)), default=0) * period_of(imu.t)
-    if stuck > 0.5:
-        yield Finding(
-            "warning", f"the IMU repeats one value for {stuck:.1f} s: it was stuck or its log was filled", "imu.stuck"
-        )
-
-
-def check_filled(imu: Imu) -> Iterator[Finding]:
-    """Stretches in which all axes follow straight lines, to the last digit: filled in, for a sensor has noise.
-
-    A digit's step of q makes a measured value fit the line through its neighbours with a probability of at most
-    2 q / (sqrt(2 pi) sigma), where sigma is that of the deviations in the quietest tenth of the seconds.
-    """
-    n = max(5, round(1.0 / period_of(imu.t)))
-    if len(imu.t) < 10 * n:
-        return
-    share = np.diff(imu.t)[:-1] / (imu.t[2:] - imu.t[:-2])  # of the way from one neighbour to the other
-    on_line, log_chance = np.ones(len(share), dtype=bool), 0.0
-    for axis in range(6):  # one by one: for a day each temporary array takes a hundred megabytes
-        x = (imu.gyro, imu.accel)[axis // 3] @ imu.R_bs[:, axis % 3]
-        step = np.abs(np.diff(x))
-        q = float(step.min(where=step > 1e-9 * np.abs(x).max(), initial=np.inf))
-        off = np.abs(x[1:-1] - (x[:-2] + share * (x[2:] - x[:-2])))
-        sigma = np.percentile(np.median(off[: len(off) // n * n].reshape(-1, n), axis=1), 10.0) / 0.6745
-        on_line &= off <= q
-        log_chance += float(np.log(min(2.0 * q / (np.sqrt(2.0 * np.pi) * sigma), 1.0))) if sigma > 0.0 else 0.0
-    runs = [(a, b) for a, b in runs_of(on_line) if (b - a) * log_chance < np.log(RARE / len(imu.t))]
-    # rows between those of a slower sensor are no gaps
-    if not runs or on_line.mean() > 0.5:
-        return
-    first, last = imu.t[[a + 1 for a, _ in runs]], imu.t[[b for _, b in runs]]
-    long = int(np.argmax(last - first))
-    yield Finding(
-        "warning",
-        f"{format_count(sum(b - a for a, b in runs), 'IMU row')} in {format_count(len(runs), 'stretch', 'stretches')}, "
-        f"the longest of {last[long] - first[long]:.2f} s at {first[long] - imu.t[0]:.1f} s, lie on straight lines: "
-        "filled in, not measured, so nothing tells what moved; delete them, and they are bridged as gaps",
-        "imu.filled",
-    )
 
 
 def check_saturation(imu: Imu) -> Iterator[Finding]:

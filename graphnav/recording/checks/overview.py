@@ -31,7 +31,6 @@ from graphnav.recording.checks.axes import (
 )
 from graphnav.recording.checks.clock import measure_clock_offsets
 from graphnav.recording.checks.imu import (
-    check_filled,
     check_force_at_rest,
     check_gyro_unit,
     check_imu_time,
@@ -130,7 +129,7 @@ def inspect(recording: Recording) -> Inspection:
         Facts by sensor, the recording without impossible rows, and findings: the most severe first, then in the
         order of the checks, beginning with the loader's remarks.
     """
-    whole = screen(recording)
+    stamps, whole = recording.imu, screen(recording)
     recording = whole.recording
     findings = [Finding("note", remark, key_of(remark) or "recording.remark") for remark in recording.remarks]
     findings += whole.findings
@@ -146,9 +145,8 @@ def inspect(recording: Recording) -> Inspection:
     overlap = recording.gnss is not None and measure_overlap(recording) > 0
     track = tracks.compute_track(recording.gnss) if recording.gnss is not None else None
     rest = _find_rest(recording, track if overlap else None)
-    findings += check_imu_time(recording.imu)
+    findings += check_imu_time(stamps)  # those of rows left out are said already
     findings += check_repeats(recording.imu)
-    findings += check_filled(recording.imu)
     findings += check_saturation(recording.imu)
     if "imu.gyro_unit" not in known:
         findings += check_gyro_unit(recording)

@@ -22,6 +22,7 @@ RARE = 1e-3  # expected number of such readings in a recording by chance, below 
 ALONE = 1.0  # s around a single reading without another; several are a real event
 _SINGLE = 0.01  # share of the rows; above it the cause is not in single rows
 _TELL = 5  # multiple of `TAIL`, rows in motion of which these are the largest fifth
+NOISY = 0.05  # share of the steps that reverse the one before; for noise up to a band B and a rate f it is 1.5 B / f
 HOLE = 1.5  # periods between two rows that are not adjacent
 
 

@@ -28,7 +28,8 @@ from graphnav.recording.checks.tracks import Track
 from graphnav.recording.formats.schema import FORCE
 from graphnav.recording.plausibility import fixes as plausibility_gnss
 from graphnav.recording.plausibility import odometer as plausibility_odometer
-from graphnav.recording.plausibility.readings import find_contradicted
+from graphnav.recording.plausibility.filled import find_filled
+from graphnav.recording.plausibility.readings import NOISY, find_contradicted
 
 # Limits of readings: no accelerometer for vehicles or feet has a range beyond 100 g (those for crash tests have 200 g
 # and more, and cannot tell gravity from their own offset), and no gyro for them one beyond 4000 deg/s.
@@ -45,7 +46,6 @@ _DEAD = 10.0  # s; the longest repetition of an axis in thirty real recordings w
 _MOVING_STEPS = 20.0  # steps of its own resolution by which an axis has moved and not only flickered
 # Levels that a moving carrier exceeds by far: a thousandth of g, and the Earth's rate
 _STIRS = {"accelerometer": 1e-3 * _STANDARD_GRAVITY, "gyro": 7.3e-5}  # m/s^2, rad/s
-_NOISY = 0.05  # share of the steps that reverse the one before; for noise up to a band B and a rate f it is 1.5 B / f
 _NO_GRAVITY = "gravity seems to have been removed from the accelerometer; graphnav needs the raw force"
 _AXIS = "xyz"
 _UNIT_FINDINGS = (
@@ -143,8 +143,9 @@ def _drop_impossible(recording: Recording) -> tuple[Recording, list[Finding], li
     of_imu: list[Finding] = list(check_imu_scale(recording))
     if not of_imu:  # where a unit is wrong throughout, single rows cannot be judged
         imu, spikes = drop_spikes(recording.imu, recording.start)
+        imu, filled = drop_filled(imu, recording.start)
         imu, contradicted = drop_contradicted(imu, recording.start, forces=recording.platform != "foot")
-        recording, of_imu = replace(recording, imu=imu), [*spikes, *contradicted]
+        recording, of_imu = replace(recording, imu=imu), [*spikes, *filled, *contradicted]
     recording, of_aiding = screen_series(replace(recording, screened=True))
     track = None
     if recording.gnss is not None and len(recording.gnss.t):
@@ -263,6 +264,23 @@ def drop_spikes(imu: Imu, start: float) -> tuple[Imu, list[Finding]]:
     return take_rows(imu, ~bad), [Finding("warning", f"{sentence}: left out, as a gap", "imu.spike")]
 
 
+def drop_filled(imu: Imu, start: float) -> tuple[Imu, list[Finding]]:
+    """The IMU without rows that no sensor measured; the gaps are bridged."""
+    filled = find_filled(imu)
+    if not filled.any():
+        return imu, []
+    runs = runs_of(filled)
+    longest, first = max((float(imu.t[b - 1] - imu.t[a]), float(imu.t[a])) for a, b in runs)
+    return take_rows(imu, ~filled), [
+        Finding(
+            "warning",
+            f"{_list_rows(filled)} in {format_count(len(runs), 'stretch', 'stretches')} lie on straight lines or "
+            f"repeat one row (the longest, of {longest:.2f} s, at {first - start:.1f} s): not measured, so gaps",
+            "imu.filled",
+        )
+    ]
+
+
 def drop_contradicted(imu: Imu, start: float, forces: bool) -> tuple[Imu, list[Finding]]:
     """The IMU without single rows that the rows before and after contradict; the gaps are bridged.
 
@@ -333,4 +351,4 @@ def _is_moving(x: Array, same: Array, least: float) -> bool:
         return False
     if float(np.ptp(x)) <= _MOVING_STEPS * float(np.abs(steps).min()):
         return False
-    return float((steps[1:] * steps[:-1] < 0.0).mean()) > _NOISY
+    return float((steps[1:] * steps[:-1] < 0.0).mean()) > NOISY
