@@ -15,7 +15,6 @@ from graphnav.recording import Imu
 GAP = 1.5  # sample periods between rows above which there is a gap
 MANY = 64  # pieces above which an interval is processed apart from shorter ones
 _SPANS = 10  # times a gap's length on either side of it: twenty spans tell a variance to a third
-_TINY = np.finfo(float).tiny
 _PIECES_AT_ONCE = 40_000  # pieces processed at once: keeps the working arrays in the processor's cache
 
 
@@ -90,8 +89,10 @@ def _measure_bridge_error(x: Array, gap: Array, lost: Array) -> Array:
     -------
     (g, 3)
     """
+    out = 0.5 * (x[gap + 1] - x[gap]) ** 2
+    if len(x) < 3:
+        return np.asarray(out)
     sums, mean = running_sum(x), x.mean(axis=0)
-    out = np.empty((len(gap), 3))
     for n in np.unique(lost):
         here = np.flatnonzero(lost == n)
         k = gap[here]
@@ -104,10 +105,11 @@ def _measure_bridge_error(x: Array, gap: Array, lost: Array) -> Array:
         last = np.clip([k - n, k + 1 + _SPANS * n], 0, len(error))
         count = (last - first).sum(axis=0)[:, None]
         near = np.where(count > 0, (total[last] - total[first]).sum(axis=0) / np.maximum(count, 1), usual)
-        across = (x[k + 1] - x[k]) ** 2 * usual / np.maximum(change, _TINY)
-        high = (0.5 * (x[k + 1] + x[k]) - mean) ** 2 * usual / np.maximum(level, _TINY)
-        out[here] = (near + across + high) / 3.0
-    return out
+        for_change, for_level = (np.divide(usual, of, out=np.zeros(3), where=of > 0.0) for of in (change, level))
+        by_change = (x[k + 1] - x[k]) ** 2 * for_change
+        by_level = (0.5 * (x[k + 1] + x[k]) - mean) ** 2 * for_level
+        out[here] = (near + by_change + by_level) / 3.0
+    return np.asarray(out)
 
 
 @dataclass(frozen=True)
