@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -447,29 +448,31 @@ def test_shape_by_epochs_and_by_stances() -> None:
 
 
 # --------------------------------------------------------------------------------------------------------- real walks
-@pytest.mark.parametrize(
-    ("walk", "horizontal", "up"),
-    [
-        ("gcp_walks/walk36", 0.20, np.inf),
-        ("openshoe_loops/run34", 0.20, 0.25),
-        ("openshoe_loops/run31", 0.20, 0.25),
-        ("xio_loops/long", 0.15, 0.25),
-    ],
-)
-def test_real_walks(shared_data: Path, walk: str, horizontal: float, up: float) -> None:
-    """Twice as good as a plain zero-velocity filter (0.65, 0.43, 0.40, 0.32 m; up -0.67, -0.67, 0.59 m), by each."""
-    recording = read(shared_data / f"{walk}.toml")
-    solutions = run(recording)
-    for solver, solution in solutions.items():
-        found = walk_errors(recording, solution, 0.03)
-        assert found.horizontal < horizontal, solver
-        assert not abs(found.up) > up, solver
-        if recording.truth is not None and recording.truth.xyz is not None:
-            assert found.stride == pytest.approx(1.0, abs=0.005), solver  # of zero velocity alone 0.975
-    assert solutions["batch"].stopped.startswith("converged")
-    # nothing tells the heading, so what is known of it is the same whatever a solver was linearised at
-    heading = {solver: solution.covariance[-1, 2, 2] ** 0.5 for solver, solution in solutions.items()}
-    assert heading == pytest.approx(dict.fromkeys(heading, heading["batch"]), rel=0.02)
+def test_real_walks(shared_data: Path) -> None:
+    """Twice as good as a plain zero-velocity filter in the mean of four walks, and none worse, by each solver."""
+    plain = {  # m of such a filter, horizontally, and bounds of what is left up
+        "gcp_walks/walk36": (0.65, np.inf),
+        "openshoe_loops/run34": (0.43, 0.25),
+        "openshoe_loops/run31": (0.40, 0.25),
+        "xio_loops/long": (0.32, 0.25),
+    }
+    ratios: dict[str, list[float]] = defaultdict(list)
+    for walk, (horizontal, up) in plain.items():
+        recording = read(shared_data / f"{walk}.toml")
+        solutions = run(recording)
+        for solver, solution in solutions.items():
+            found = walk_errors(recording, solution, 0.03)
+            ratios[solver].append(found.horizontal / horizontal)
+            assert not abs(found.up) > up, (walk, solver)
+            if recording.truth is not None and recording.truth.xyz is not None:
+                assert found.stride == pytest.approx(1.0, abs=0.005), (walk, solver)  # of zero velocity alone 0.975
+        assert solutions["batch"].stopped.startswith("converged")
+        # nothing tells the heading, so what is known of it is the same whatever a solver was linearised at
+        heading = {solver: solution.covariance[-1, 2, 2] ** 0.5 for solver, solution in solutions.items()}
+        assert heading == pytest.approx(dict.fromkeys(heading, heading["batch"]), rel=0.02)
+    for solver, of_walks in ratios.items():
+        assert max(of_walks) < 1.0, solver
+        assert np.exp(np.mean(np.log(of_walks))) < 0.5, solver
 
 
 def test_missing_rows_do_not_make_two_stances_of_one() -> None:
