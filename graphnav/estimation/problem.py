@@ -234,8 +234,8 @@ def _keep_apart(keyframes: bytes, spacing: float) -> Array:
 def _describe_samples(samples: Samples, recording: Recording) -> tuple[str, ...]:
     if not len(samples.bridged):
         return ()
-    begin, end = samples.bridged[:, :2].T
+    begin, end = samples.bridged.T
     sentence = (
-        f"{describe_gaps('the IMU', end - begin, begin - recording.start)}: bridged, with process noise as large "
+        f"{describe_gaps('the IMU', end - begin, begin - recording.start)}: bridged by the mean of the neighbours"
     )
-    return (Note("imu.gaps_bridged", f"{sentence}as the signal typically changes over such a time"),)
+    return (Note("imu.gaps_bridged", f"{sentence}, with the error that this has elsewhere in the recording as noise"),)
