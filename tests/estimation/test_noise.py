@@ -17,6 +17,7 @@ from graphnav.config.gnss import GnssSettings
 from graphnav.constraints.base import Constraint
 from graphnav.constraints.gnss import STAMP_ERROR, STAMPS
 from graphnav.core.earth import LocalFrame
+from graphnav.core.errors import EstimationError
 from graphnav.core.rotation import Array
 from graphnav.core.trajectory import Trajectory
 from graphnav.detectors import detect
@@ -24,9 +25,11 @@ from graphnav.estimation.alignment import align
 from graphnav.estimation.factor_graph.batch import batch
 from graphnav.estimation.faults import weigh_rows
 from graphnav.estimation.names import components
+from graphnav.estimation.noise import estimate
 from graphnav.estimation.noise.apply import row_weights, with_noise, without_parts
 from graphnav.estimation.noise.estimate import NoiseEstimate, estimate_noise
 from graphnav.estimation.noise.explanations import FIXES, WHEELS
+from graphnav.estimation.noise.initial_points import Initial, find_initial_points
 from graphnav.estimation.noise.model import STATED, NoiseModel, RowWeights, VarianceComponent
 from graphnav.estimation.noise.moments import imu_moments, lag_moments, process_moments, row_moments
 from graphnav.estimation.noise.priors import prior
@@ -438,6 +441,20 @@ def test_sensors_in_any_order_give_the_same() -> None:
     assert one.log_posterior == pytest.approx(other.log_posterior, abs=1e-3)
     for name, figure in one.noise.figures.items():
         assert figure.log_factor == pytest.approx(other.noise.figures[name].log_factor, abs=1e-3), name
+
+
+def test_an_estimate_that_cannot_begin_at_the_medians_begins_with_stated_noise(monkeypatch: pytest.MonkeyPatch) -> None:
+    base, opening = posed(load(SHIPPED).crop(0.0, 60.0))
+    usual = estimate_noise(base, opening)
+
+    def find(problem: Problem, until: float | None) -> tuple[list[Initial], int]:
+        if problem is not base:
+            raise EstimationError("the smoother's information broke down")
+        return find_initial_points(problem, until)
+
+    monkeypatch.setattr(estimate, "find_initial_points", find)
+    found = estimate_noise(base, opening)
+    assert found.log_evidence == pytest.approx(usual.log_evidence, abs=0.05 * len(usual.noise.figures))
 
 
 # ---------------------------------------------------------------------------------------------------------- intervals

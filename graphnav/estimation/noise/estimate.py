@@ -158,7 +158,12 @@ def estimate_noise(
     figures = _begin(problem, start, changed)
     if near is not None:
         return _iterate(problem, figures, _carry(*near, with_noise(problem, figures.model())), progress, intervals)
-    initials, passes = find_initial_points(with_noise(problem, figures.model()), opening)
+    used = with_noise(problem, figures.model())
+    try:
+        initials, passes = find_initial_points(used, opening)
+    except BREAKDOWN:  # with the prior's medians; with the noise that is stated it may not
+        initials, passes = find_initial_points(problem, opening)
+        initials = [replace(one, points=_carry(one.points, problem, used)) for one in initials]
     found: list[NoiseEstimate] = []
     for initial in initials:
         figures = _begin(problem, start)
