@@ -37,7 +37,7 @@ def outages(recording: Recording) -> list[Span]:
 
     Each lasts from the last fix to one period before the next: there is still no fix at its end.
     """
-    if recording.gnss is None or not len(recording.gnss.t):
+    if recording.gnss is None or not recording.placed:
         return []
     t = recording.gnss.t[np.isfinite(recording.gnss.llh).all(axis=1)] - recording.start
     t = t[(t >= 0.0) & (t <= recording.duration)]
@@ -86,7 +86,7 @@ def score(
             swings = compared[0].v is not None and arm is not None and bool(np.any(arm))
         at = _choose_epochs(solution, reference)
         wanted = np.union1d(np.union1d(solution.t, at), _thin(reference, solution, _MOST_TURNING)) if swings else at
-        track = _score_at(solution, wanted, placed=used.gnss is not None)
+        track = _score_at(solution, wanted, placed=used.placed)
         epochs = at if len(at) else None
         metrics = evaluate_recording(track, recording, withheld=asked, at=epochs, antenna=antenna)
         if metrics is None:

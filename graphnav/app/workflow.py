@@ -232,7 +232,13 @@ def _run(request: Request, progress: Progress | None) -> Outcome:
     solutions |= _read_others(request, recording, solutions)
     seconds: dict[str, float] = {}
     with _measure_time(seconds, "evaluation"):
-        metrics, against, names = score(recording, used, solutions, moved)
+        try:
+            metrics, against, names = score(recording, used, solutions, moved)
+        except RecordingError as error:
+            if error.key != "truth.too_little":
+                raise
+            metrics, against, names = {}, None, ()
+            findings.append(Note(error.key, f"not compared with the truth: {error}"))
     for found in metrics.values():
         if found.notes:
             findings += [note for note in found.notes if note not in findings]

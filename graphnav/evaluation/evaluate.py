@@ -195,7 +195,7 @@ def evaluate_recording(
     truth, lever_arm = found
     if recording.truth is not None and recording.truth.of == "gnss" and antenna.lever_arm is not None:
         lever_arm = antenna.lever_arm
-    alone = recording.gnss is None
+    alone = trajectory.frame == "local" or not recording.placed
     found_errors = errors(trajectory, truth, lever_arm=lever_arm, max_gap=max_gap, at=at, from_start=alone)
     # spans are on the fixes' own clock, and so are the errors then
     found_errors = replace(found_errors, t=found_errors.t - late)
@@ -251,7 +251,7 @@ def evaluate(
                 )
             return metrics
         truth, arm = found
-        alone = recording.gnss is None
+        alone = trajectory.frame == "local" or not recording.placed
         lever_arm = arm if lever_arm is None else lever_arm
     else:
         truth = read_trajectory(truth_path)

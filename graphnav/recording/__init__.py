@@ -176,6 +176,11 @@ class Recording:
         return self.end - self.start
 
     @property
+    def placed(self) -> bool:
+        """Whether it has fixes, which place it on the Earth."""
+        return self.gnss is not None and len(self.gnss.t) > 0
+
+    @property
     def aiding(self) -> dict[str, Any]:
         """GNSS, odometer and the other sensors present, by name."""
         own = {"gnss": self.gnss, "odometer": self.odometer, **self.sensors}

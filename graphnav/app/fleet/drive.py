@@ -188,7 +188,7 @@ def _collect_figures(outcome: Outcome) -> Row:
             f"noise.{group}": _round_figure(figure.get("variance_factor"))
             for group, figure in summary["noise"]["figures"].items()
         },
-        "placed": outcome.recording.gnss is not None,
+        "placed": outcome.recording.placed,
         "track": _track(outcome, solution),
         "version": graphnav.__version__,
     }

@@ -10,14 +10,13 @@ from graphnav.core.earth import LocalFrame
 from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.core.state import States
-from graphnav.estimation.alignment.first import Alignment
+from graphnav.estimation.alignment.first import STANDING, Alignment
 from graphnav.estimation.solution import Solution
 from graphnav.imu.preintegration import prefix
 from graphnav.imu.samples import Samples, bridge_gaps
 from graphnav.recording import Recording
 
 _BASE = 5.0  # s between the fixes that give the first velocity
-_STANDING = 0.5  # m/s, of a vehicle that is taken to stand
 _CHANGE = 2.0  # m/s^2, by which the speed may change where nothing measures it
 
 
@@ -59,7 +58,7 @@ def carry_back(
         if stood > 0.0:
             rest = imu.t <= still
             bg = imu.gyro[rest].mean(axis=0) - solution.frame.omega_n @ R
-            v, sd_v = np.zeros(3), np.minimum(sd_v, _STANDING)
+            v, sd_v = np.zeros(3), np.minimum(sd_v, STANDING)
             drift = np.hypot(drift, noise.gyro_noise_density * np.sqrt(stood))
             notes = (
                 *notes,
@@ -89,7 +88,7 @@ def find_stand_end(recording: Recording, end: float) -> float:
     shakes no more than an idle engine: it does not stand where its wheels turn.
     """
     imu, odometer, start = recording.imu, recording.odometer, recording.start
-    if odometer is not None and (turning := np.abs(odometer.speed) > _STANDING).any():
+    if odometer is not None and (turning := np.abs(odometer.speed) > STANDING).any():
         end = min(end, float(odometer.t[np.argmax(turning)]))
     rows = imu.t <= end
     blocks = max(1, int(end - start))
@@ -133,7 +132,7 @@ def _refine_by_wheels(
     if len(t) < 2 or t[0] - recording.start > 1.0:
         return found
     off = float(np.max(wide)) + (0.0 if odometer.signed else 2.0)  # rad; what goes backwards is off by twice the way
-    sd_v_wheels = np.full(3, _STANDING + abs(speed[0]) * off)
+    sd_v_wheels = np.full(3, STANDING + abs(speed[0]) * off)
     if np.linalg.norm(sd_v_wheels) < np.linalg.norm(sd_v):
         v, sd_v = speed[0] * R[:, 1], sd_v_wheels
     step = np.diff(np.append(t, begin))

@@ -12,6 +12,7 @@ from graphnav.core.rotation import Array
 from graphnav.core.state import States
 from graphnav.recording import Gnss, Recording
 
+STANDING = 0.5  # m/s, of a vehicle that is taken to stand
 _SIGMAS = 3.0
 
 

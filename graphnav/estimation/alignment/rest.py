@@ -12,13 +12,15 @@ from graphnav.core.rotation import Array
 from graphnav.core.state import States
 from graphnav.detectors.base import NONE
 from graphnav.estimation.alignment.antennas import measure_baseline_heading
-from graphnav.estimation.alignment.first import Alignment, level
+from graphnav.estimation.alignment.back import find_stand_end
+from graphnav.estimation.alignment.first import STANDING, Alignment, level
 from graphnav.imu.preintegration import prefix
 from graphnav.imu.samples import bridge_gaps
 from graphnav.recording import Recording
 
 _FIRST_STANCE = 0.05  # s from the start within which a foot counts as standing there
 _OPENING = 10  # stances of a walk by which tilt and accelerometer bias are separated
+_DRIVING = 20.0  # m/s, 1-sigma of the initial velocity of a vehicle in motion that nothing measures
 _WALKING = 3.0  # m/s, 1-sigma of the initial velocity of a foot in the air
 
 
@@ -39,18 +41,29 @@ def at_rest(recording: Recording, settings: Settings, frame: LocalFrame, station
         R = R @ dR[0].T
         R = rotation.from_rph(rotation.to_rph(R) * [1.0, 1.0, 0.0])
         tilt, sd_v = np.hypot(tilt, sd_bias * (begin - recording.start)), _WALKING
-    own, known = np.array([tilt, tilt, np.pi]), None
-    if gnss is None or not len(gnss.t):
+    v, known = np.zeros(3), None
+    if gnss is None or not recording.placed:
         # without fixes the first pose defines the frame: position and heading are exact by definition
         p, sd_p, sd_heading = np.zeros(3), np.full(3, 1e-3), 1e-4
         note = Note("alignment.no_gnss", "no GNSS: levelled at the start, where position and heading are zero")
+        speed, felt = _measure_motion(recording, seconds)
+        if abs(speed) > STANDING:
+            tilt += felt / 9.8  # levelling takes it for gravity
+            v, sd_v = speed * R[:, 1], STANDING + abs(speed) * settings.alignment.prior_inflation * tilt
+        elif recording.platform == "vehicle" and not speed and find_stand_end(recording, recording.end) <= begin:
+            sd_v = _DRIVING
+            note = Note(
+                "alignment.speed_unknown",
+                "no GNSS and no odometer, and it does not stand at the start: the speed there is unknown; position and "
+                "heading are zero",
+            )
     else:
         sd_p, sd_heading = 10.0 * gnss.sd[0] + 1.0, np.pi
         known = measure_baseline_heading(recording, settings, stationary)
         if known is None:
             note = Note("alignment.no_motion", "no motion in the GNSS fixes: levelled at the start, heading unknown")
         else:
-            own[2], sd_heading = known.sigma, settings.alignment.prior_inflation * known.sigma
+            sd_heading = settings.alignment.prior_inflation * known.sigma
             R = rotation.from_rph(np.array([*rotation.to_rph(R)[:2], known.heading]))
             note = Note(
                 "alignment.antennas",
@@ -60,7 +73,7 @@ def at_rest(recording: Recording, settings: Settings, frame: LocalFrame, station
     state = States(
         R[None],
         p[None],
-        np.zeros((1, 3)),
+        v[None],
         np.zeros((1, 3)),
         bias[None],
     )
@@ -74,9 +87,26 @@ def at_rest(recording: Recording, settings: Settings, frame: LocalFrame, station
             [sd_bias] * 3,
         ]
     )
+    own = np.array([tilt, tilt, np.pi if known is None else known.sigma])
     if known is not None:
         return Alignment(state, sigma, own, (note,), known.until, known.until)
     return Alignment(state, sigma, own, (note,), until=float(stances[:_OPENING][-1, 1]) if len(stances) else None)
+
+
+def _measure_motion(recording: Recording, seconds: float) -> tuple[float, float]:
+    """Speed at the start by the odometer, m/s, and the largest acceleration in the first seconds, m/s^2, which the
+    accelerometer feels beside gravity: of the speed and across it. Zero without an odometer's rows there.
+    """
+    odometer, imu = recording.odometer, recording.imu
+    if odometer is None:
+        return 0.0, 0.0
+    first = (odometer.t >= recording.start) & (odometer.t <= recording.start + seconds) & np.isfinite(odometer.speed)
+    t, speed = odometer.t[first], odometer.speed[first]
+    if len(t) < 2:
+        return 0.0, 0.0
+    turn = np.linalg.norm(imu.gyro[imu.t <= recording.start + seconds].mean(axis=0))
+    along, across = abs(speed[-1] - speed[0]) / (t[-1] - t[0]), float(np.abs(speed).max() * turn)
+    return float(speed[0]), float(np.hypot(along, across))
 
 
 def _find_stand(recording: Recording, stances: Array) -> tuple[float, float]:
