@@ -89,6 +89,10 @@ class ProblemBuilder:
                 self.used, self.settings, self.frame, start.state, start_sigma(start), detections.stationary,
                 parts_of_noise=parts,
             )  # fmt: skip
+        if aligned.motion is None and self.recording.placed and self.settings.alignment.heading is None:
+            # linearised at any heading, a direction of travel would make an unknown one known
+            rows = tuple(c for c in problem.constraints if not c.of_wheels)
+            problem = replace(problem, constraints=rows)
         problem, carriers = split_carriers(problem)  # the noise model depends on the codes
         return BuiltProblem(problem, carriers, aligned, detections)
 

@@ -61,7 +61,11 @@ def at_rest(recording: Recording, settings: Settings, frame: LocalFrame, station
         sd_p, sd_heading = 10.0 * gnss.sd[0] + 1.0, np.pi
         known = measure_baseline_heading(recording, settings, stationary)
         if known is None:
-            note = Note("alignment.no_motion", "no motion in the GNSS fixes: levelled at the start, heading unknown")
+            without = ", so nothing ties it to the direction of travel" if recording.platform == "vehicle" else ""
+            note = Note(
+                "alignment.no_motion",
+                f"no motion in the GNSS fixes: levelled at the start, heading unknown{without}",
+            )
         else:
             sd_heading = settings.alignment.prior_inflation * known.sigma
             R = rotation.from_rph(np.array([*rotation.to_rph(R)[:2], known.heading]))
