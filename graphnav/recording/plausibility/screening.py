@@ -275,7 +275,7 @@ def drop_filled(imu: Imu, start: float) -> tuple[Imu, list[Finding]]:
         Finding(
             "warning",
             f"{_list_rows(filled)} in {format_count(len(runs), 'stretch', 'stretches')} lie on straight lines or "
-            f"repeat one row (the longest, of {longest:.2f} s, at {first - start:.1f} s): not measured, so gaps",
+            f"repeat one row (the longest, of {longest:.2f} s, at {first - start:.1f} s): not measured",
             "imu.filled",
         )
     ]
