@@ -1,6 +1,6 @@
 """Consistency of IMU readings with those before and after them in a running drive.
 
-The test is that of a recording (`graphnav.recording.plausibility.readings`), on the rows so far.
+The tests are those of a recording (`graphnav.recording.plausibility`), on the rows so far.
 """
 
 from __future__ import annotations
@@ -10,7 +10,12 @@ import numpy as np
 from graphnav.core.rotation import Array
 from graphnav.online.buffers import Buffer
 from graphnav.online.sanity import find_period
-from graphnav.recording.plausibility.readings import ALONE, HOLE, Excesses, find_contradicted, measure_excess
+from graphnav.recording.plausibility.filled import Lines, find_filled
+from graphnav.recording.plausibility.readings import ALONE, HOLE, RARE, Excesses, find_contradicted, measure_excess
+
+CONTRADICTED = "contradicted by those around"
+FILLED = "on a straight line between those around"
+_ROWS = 36_000_000  # of a drive, in which one may lie on a line by chance: ten hours at 1000 Hz
 
 
 class Neighbours:
@@ -25,6 +30,7 @@ class Neighbours:
         self._columns = columns
         self._excesses = Excesses(columns)
         self._learnt = -np.inf  # s, up to where rows are in these
+        self._lines: Lines | None = None  # of rows on straight lines, where they can be told
         self._last: tuple[tuple[float, ...], tuple[float, ...]] | None = None  # the newest two rows with their times
 
     def forget_newest(self) -> None:
@@ -35,24 +41,29 @@ class Neighbours:
         """Forget all times: the clock has changed."""
         self._last, self._learnt = None, -np.inf
 
-    def compare(self, t: float, values: tuple[float, ...], imu: Buffer) -> tuple[float, float] | None:
-        """Times of the two rows before the newest, if the newest and the first of them contradict the second."""
+    def compare(self, t: float, values: tuple[float, ...], imu: Buffer) -> tuple[float, float, str] | None:
+        """Times of the two rows before the newest, if no sensor measured the second of them, and why."""
         before, now = self._last, (t, *values)
         self._last = now if before is None else before[1], now
         if before is None:
             return None
-        for a, b, c, limit in zip(before[0][1:], before[1][1:], values, self._excesses.limits, strict=False):
-            if b - max(a, c) > limit or min(a, c) - b > limit:
-                break
+        why = ""
+        if self._lines is not None and self._lines.hold(before[0], before[1], now):
+            why = FILLED
         else:
+            for a, b, c, limit in zip(before[0][1:], before[1][1:], values, self._excesses.limits, strict=False):
+                if b - max(a, c) > limit or min(a, c) - b > limit:
+                    why = CONTRADICTED
+                    break
+        if not why:
             return None
         near = imu.t[-3:]
         if len(imu) < 4 or near[0] != before[0][0] or near[1] != before[1][0]:
             return None  # there is a late row between them
-        if np.diff(near).max() >= HOLE * find_period(imu.t):
+        if why == CONTRADICTED and np.diff(near).max() >= HOLE * find_period(imu.t):
             return None
         self._last = before[0], now
-        return before[0][0], before[1][0]
+        return before[0][0], before[1][0], why
 
     def learn(self, imu: Buffer, until: float, stops: Array) -> None:
         """Learn typical deviations from the rows up to a time (s), except those in stops (M, 2)."""
@@ -64,8 +75,12 @@ class Neighbours:
         moving = ~((t >= stops[:, 0]) & (t <= stops[:, 1])).any(axis=1)
         self._excesses.add(measure_excess(rows[:, 1 : 1 + self._columns])[moving])
 
-    def find(self, imu: Buffer) -> list[float]:
-        """Times of the rows that their neighbours contradict, except the newest, which has no successor yet."""
+    def find(self, imu: Buffer) -> list[tuple[float, str]]:
+        """Times of the rows that no sensor measured, and why, except the newest, which has no successor yet."""
         rows = imu.rows
-        bad = find_contradicted(rows[:, 0], rows[:, 1 : 1 + self._columns].T)
-        return [float(t) for t in rows[bad & (rows[:, 0] < imu.newest - ALONE), 0]]
+        t, known = rows[:, 0], rows[:, 0] < imu.newest - ALONE
+        filled, lines = find_filled(t, rows[:, 1:7].T)
+        self._lines = lines if lines is not None and lines.log_chance < np.log(RARE / _ROWS) else None
+        left = ~(filled & known)
+        bad = find_contradicted(t[left], rows[left, 1 : 1 + self._columns].T) & known[left]
+        return [(float(x), FILLED) for x in t[~left]] + [(float(x), CONTRADICTED) for x in t[left][bad]]

@@ -238,15 +238,15 @@ class Sensors:
         return True
 
     def compare_newest(self) -> float | None:
-        """Remove the IMU row before the newest if its neighbours contradict it; returns the time of the row before
-        that.
+        """Remove the IMU row before the newest if its neighbours show that no sensor measured it; returns the time of
+        the row before that.
         """
         newest = self.imu.rows[-1].tolist()
         found = self._neighbours.compare(newest[0], tuple(newest[1:]), self.imu)
         if found is None:
             return None
-        before, t = found
-        self._take_back([t])
+        before, t, why = found
+        self._take_back([(t, why)])
         return before
 
     def learn(self, until: float, stops: Array) -> None:
@@ -255,16 +255,15 @@ class Sensors:
         """
         self._neighbours.learn(self.imu, until, stops)
 
-    def drop_contradicted(self) -> None:
-        """Remove the IMU rows that their neighbours contradict, as far as that is known."""
+    def drop_unmeasured(self) -> None:
+        """Remove the IMU rows that no sensor measured, by their neighbours, as far as that is known."""
         self._take_back(self._neighbours.find(self.imu))
 
-    def _take_back(self, times: list[float]) -> None:
-        for t in times:
+    def _take_back(self, found: list[tuple[float, str]]) -> None:
+        for t, why in found:
             self.imu.drop(t)
-        if times:
-            self.counts["imu"] -= len(times)
-            self.counts["imu: contradicted by those around"] += len(times)
+            self.counts["imu"] -= 1
+            self.counts[f"imu: {why}"] += 1
 
     def release(self) -> None:
         """No more IMU rows will arrive: release the held rows."""

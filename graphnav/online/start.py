@@ -25,7 +25,7 @@ def take_rows(sensors: Sensors, settings: Settings, now: float, last: bool) -> t
 
     With `last`, no more rows will arrive.
     """
-    sensors.drop_contradicted()
+    sensors.drop_unmeasured()
     recording = sensors.recording(-np.inf, now)
     waits = sensors.setup.gnss is not None and not last
     if waits and (recording.gnss is None or not is_ready(recording, settings)):

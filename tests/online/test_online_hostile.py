@@ -114,6 +114,24 @@ def test_a_reading_that_those_around_contradict_costs_its_interval(
     assert np.abs(error / sd).max() < 6.0
 
 
+@pytest.mark.parametrize("at", [36.28, 56.52])
+def test_rows_filled_in_on_straight_lines_count_as_missing(
+    drive: tuple[Recording, Trajectory], rows: list[Row], at: float
+) -> None:
+    """Half a second, before there is a state, and when there is one, with the digits of all other rows."""
+    written = [(s, t, tuple(round(x, 6) for x in v) if s == "imu" else v) for s, t, v in rows]
+    imu = [row for row in written if row[0] == "imu"]
+    inside = [t for _, t, _ in imu if at < t < at + 0.5]
+    times = np.array([t for _, t, _ in imu if t <= at or t >= at + 0.5])
+    values = np.array([v for _, t, v in imu if t <= at or t >= at + 0.5])
+    line = {t: tuple(round(float(np.interp(t, times, x)), 6) for x in values.T) for t in inside}
+    filled = [(s, t, line[t] if s == "imu" and t in line else v) for s, t, v in written]
+    missing = [row for row in written if row[0] != "imu" or row[1] not in line]
+    online, track = played(drive[0], filled, QUICK)
+    assert online.sensors.counts["imu: on a straight line between those around"] == len(inside)
+    same(track, played(drive[0], missing, QUICK)[1])
+
+
 @pytest.mark.parametrize("k", [0, 30])
 def test_a_fix_far_off_is_left_out_wherever_it_comes(
     drive: tuple[Recording, Trajectory], rows: list[Row], k: int

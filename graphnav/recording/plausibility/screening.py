@@ -266,7 +266,7 @@ def drop_spikes(imu: Imu, start: float) -> tuple[Imu, list[Finding]]:
 
 def drop_filled(imu: Imu, start: float) -> tuple[Imu, list[Finding]]:
     """The IMU without rows that no sensor measured; the gaps are bridged."""
-    filled = find_filled(imu)
+    filled, _ = find_filled(imu.t, _list_axes(imu, True))
     if not filled.any():
         return imu, []
     runs = runs_of(filled)
@@ -287,13 +287,19 @@ def drop_contradicted(imu: Imu, start: float, forces: bool) -> tuple[Imu, list[F
     With `forces`, also of the accelerometer: a hit on tyres and springs lasts for more than a row, unlike one on a
     foot, and no hit turns a body back and forth.
     """
-    sensors = (imu.gyro, imu.accel) if forces else (imu.gyro,)
-    bad = find_contradicted(imu.t, (values @ imu.R_bs[:, axis] for values in sensors for axis in range(3)))
+    bad = find_contradicted(imu.t, _list_axes(imu, forces))
     if not bad.any():
         return imu, []
     first = float(imu.t[bad][0]) - start
     sentence = f"{_list_rows(bad)} contradicted by the rows before and after (first {first:.2f} s from the start)"
     return take_rows(imu, ~bad), [Finding("note", f"{sentence}: treated as a gap", "imu.contradicted")]
+
+
+def _list_axes(imu: Imu, forces: bool) -> Iterator[Array]:
+    """Readings (N,) along each axis of the gyro and, with `forces`, of the accelerometer, in the file's axes."""
+    for values in (imu.gyro, imu.accel) if forces else (imu.gyro,):
+        for axis in range(3):
+            yield values @ imu.R_bs[:, axis]
 
 
 def _list_rows(bad: NDArray[np.bool_]) -> str:
