@@ -389,7 +389,7 @@ MISTAKES: dict[str, list[Mistake]] = {
         Mistake(
             "the accelerometer's right axis reversed",
             scaled("imu", "ax", -1.0),
-            ("out of the curves", "no axes in [imu]", "negate ax"),
+            ("turn rate and speed require", "no axes in [imu]", "negate ax"),
         ),
         Mistake(
             "the IMU built in the other way round",

@@ -11,25 +11,24 @@ from graphnav.core.rotation import Array
 from graphnav.recording import Imu
 from graphnav.recording.checks import crosschecks, tilt
 from graphnav.recording.checks.crosschecks import Fit
+from graphnav.recording.checks.tilt import CORRELATED
 from graphnav.recording.checks.tracks import Track
 
-_CORRELATED = 0.7  # a correlation, or a unit vector's component, that leaves no doubt
 _NO_BETTER = 0.05  # of a correlation
-_REVERSED = (-1.5, -0.5)  # nearer to the slope of a reversed axis, -1, than to none
 
 
 def check_imu_axes(imu: Imu, forward: Fit | None, track: Track | None) -> Iterator[Finding]:
     """Axes that the drive contradicts: by the mean force, or by a forward force that fits another axis better."""
     up = crosschecks.find_up(imu)
-    if up[2] > 0.8 and (forward is None or forward.correlation < _CORRELATED):
+    if up[2] > 0.8 and (forward is None or forward.correlation < CORRELATED):
         return
-    if forward is None or forward.correlation < _CORRELATED:
+    if forward is None or forward.correlation < CORRELATED:
         yield Finding(
             "warning", f"the mean force points {_describe_direction(up)}, not up: are the axes right?", "imu.up"
         )
         return
     ahead = forward.coefficients / np.linalg.norm(forward.coefficients)
-    if up[2] > 0.8 and ahead[1] > _CORRELATED:
+    if up[2] > 0.8 and ahead[1] > CORRELATED:
         return
     along = crosschecks.fit_along(imu, track) if up[2] > 0.8 and track is not None else None
     # the proposed axes explain no more than the stated ones: without changes of speed and turns no direction is
@@ -74,15 +73,13 @@ def check_forward_sign(imu: Imu, track: Track | None, forward: Fit | None) -> It
     IMU.
     """
     up = crosschecks.find_up(imu)
-    if track is None or forward is None or forward.correlation < _CORRELATED or up[2] < 0.8:
+    if track is None or forward is None or forward.correlation < CORRELATED or up[2] < 0.8:
         return
     ahead = forward.coefficients / np.linalg.norm(forward.coefficients)
-    if ahead[1] > -_CORRELATED:
+    if ahead[1] > -CORRELATED:
         return
     along = f"the forward force falls when the speed rises (correlation {-forward.correlation:.2f})"
-    if (
-        side := tilt.correlate_sideways(imu, track)
-    ) is not None and side > 0:  # then nothing is rotated: the other axes are right
+    if tilt.measure_sideways(imu, track) > 0.0:  # then nothing is rotated: the other axes are right
         column = f"a{_name_column(imu, 1)}"
         yield Finding(
             "refused",
@@ -101,11 +98,11 @@ def check_gyro_sign(imu: Imu, track: Track) -> Iterator[Finding]:
     A vehicle that leans into its curves feels none, and which of the two is mirrored is then open.
     """
     if crosschecks.find_up(imu)[2] < 0:
-        alone = (tilt.correlate_sideways(imu, track) or 0.0) > 0.0  # its other axes agree with the gyro
+        alone = tilt.measure_sideways(imu, track) > 0.0  # its other axes agree with the gyro
         which = "accelerometer's vertical axis" if alone else "accelerometer's sign"
         what = f"the {which} is reversed (gyro and course deny its up), it must read +9.8 upward at rest"
         yield Finding("warning", f"{what}; negate it in the file", "imu.force_sign")
-    elif tilt.correlate_sideways(imu, track) is None:
+    elif not tilt.measure_sideways(imu, track):
         what = "the gyro turns against the GNSS course: its sign is reversed, or latitudes or longitudes have the wrong"
         yield Finding(
             "warning", f"{what} sign (south and west are negative); negate it, or them, in the file", "imu.gyro_sign"
@@ -131,7 +128,7 @@ def check_yaw_scale(yaw: Fit | None) -> Iterator[Finding]:
             'the gyro is 57 times too large for the GNSS course: say units = { gyro = "deg/s" }',
             "imu.gyro_unit",
         )
-    elif abs(scale - 1.0) > 0.1:
+    elif abs(scale - 1.0) > max(0.1, tilt.SIGMAS * scale * yaw.relative_sigma):
         yield Finding(
             "warning", f"the course turns {scale:.2f} times as much as the gyro about the vertical", "imu.gyro_scale"
         )
@@ -139,14 +136,14 @@ def check_yaw_scale(yaw: Fit | None) -> Iterator[Finding]:
 
 def check_sideways(imu: Imu, forward: Fit | None, track: Track, yaw: Fit | None) -> Iterator[Finding]:
     """The force sideways points out of the curves that the gyro and, where `yaw` could be fitted, the course show."""
-    side = tilt.correlate_sideways(imu, track)
-    if side is None or side > -_CORRELATED:
+    side = tilt.measure_sideways(imu, track)
+    if side >= 0.0:
         return
-    if yaw is not None and (yaw.correlation < _CORRELATED or yaw.coefficients[0] < 0.0):
+    if yaw is not None and (yaw.correlation < CORRELATED or yaw.coefficients[0] < 0.0):
         return
     up = crosschecks.find_up(imu)
-    out = f"the force sideways points out of the curves (correlation {side:.2f})"
-    if forward is not None and forward.correlation > _CORRELATED and forward.coefficients[1] > 0.0:
+    out = f"the force sideways is {side:.2f} times that which turn rate and speed require"
+    if forward is not None and forward.correlation > CORRELATED and forward.coefficients[1] > 0.0:
         column = f"a{_name_column(imu, 0)}"
         yield Finding(
             "unreliable",
@@ -170,10 +167,10 @@ def check_gyro_tilt(imu: Imu, track: Track) -> Iterator[Finding]:
 
     One that leans into its curves is not judged: its level turns are about all three axes.
     """
-    if (tilt.correlate_sideways(imu, track) or 0.0) <= 0.0:
+    if tilt.measure_sideways(imu, track) <= 0.0:
         return
     for axis, ((slope, sigma), turn) in enumerate(zip(tilt.fit_tilt(imu, track), ("pitches", "rolls"), strict=False)):
-        if _REVERSED[0] < slope < _REVERSED[1] and slope < -tilt.SIGMAS * sigma:
+        if tilt.NEAR_ONE[0] < -slope < tilt.NEAR_ONE[1] and slope < -tilt.SIGMAS * sigma:
             column = f"g{_name_column(imu, axis)}"
             yield Finding(
                 "unreliable",

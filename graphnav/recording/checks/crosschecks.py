@@ -14,12 +14,14 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import betainc
 
 from graphnav.core.rotation import Array, wrap
 from graphnav.recording import Imu, Odometer
 from graphnav.recording.checks import lags as lags_of_clocks
 from graphnav.recording.checks.lags import Lags
 from graphnav.recording.checks.tracks import Track
+from graphnav.recording.plausibility.readings import RARE
 
 Index = NDArray[Any]  # of row numbers
 
@@ -38,6 +40,15 @@ class Fit:
     spread: float  # s, 1-sigma of the lag (`graphnav.recording.checks.lags`)
     correlation: float
     coefficients: Array  # (m,)
+    seconds: int = 0  # in which it has rows: changes over a second that do not overlap
+
+    @property
+    def relative_sigma(self) -> float:
+        """1-sigma of the size of the coefficients, as a share of it."""
+        freedom = self.seconds - len(self.coefficients) - 1
+        return (
+            float(np.sqrt((1.0 / self.correlation**2 - 1.0) / freedom)) if self.correlation and freedom > 0 else np.inf
+        )
 
 
 def _compute_mean(x: Array) -> Array:
@@ -182,7 +193,12 @@ def _search(t: Array, y: Array, x_at: lags_of_clocks.Regressors, span: Array, va
         unshifted, of_it = regression(0.0)
         if unshifted > r:
             lag, r, b = 0.0, unshifted, of_it
-    return Fit(lag, spread, r, b)
+    seconds = len(np.unique(np.floor(t[valid(lag)])))
+    # a correlation that white rows would reach at one of so many lags is none
+    trials = 2.0 * (5.0 if abs(lag) <= 5.0 else reach)
+    freedom = seconds - len(b) - 1
+    chance = betainc(0.5 * freedom, 0.5 * len(b), 1.0 - r * r) if freedom > 0 else 1.0
+    return Fit(lag, spread, r if trials * chance < RARE else 0.0, b, seconds)
 
 
 def _fit_imu(imu: Imu, rate: Array, track: Track, i: Index, j: Index, y: Array) -> Fit | None:

@@ -37,9 +37,7 @@ def check_mirroring(recording: Recording, track: Track, as_read: Fit | None, tur
     if yaw is not None and better and yaw.correlation > 0.8 and abs(yaw.coefficients[0] - 1.0) < 0.2:
         yield describe_exchange("the turns of the gyro")
     elif (  # the gyro agrees with the force, whose up is that of the stated axes
-        turns_back
-        and crosschecks.find_up(recording.imu)[2] > 0.0
-        and (tilt.correlate_sideways(recording.imu, track) or 0.0) > 0.0
+        turns_back and crosschecks.find_up(recording.imu)[2] > 0.0 and tilt.measure_sideways(recording.imu, track) > 0.0
     ):
         yield describe_mirroring("latitudes or longitudes have", "the turns of the gyro and the force in curves")
 

@@ -6,10 +6,12 @@ import numpy as np
 
 from graphnav.core.rotation import Array
 from graphnav.recording import Imu
-from graphnav.recording.checks.crosschecks import MIN_PAIRS, regress_inliers
+from graphnav.recording.checks.crosschecks import MIN_PAIRS, MIN_SPEED, regress_inliers
 from graphnav.recording.checks.tracks import Track
 
-SIGMAS = 4.0  # of a correlation, or a slope, that is not by chance
+CORRELATED = 0.7  # a correlation, or a unit vector's component, that leaves no doubt
+SIGMAS = 4.0  # of a slope that is not by chance
+NEAR_ONE = 0.5, 1.5  # slopes nearer to 1 than to 0 and 2
 
 
 def _average_seconds(imu: Imu, track: Track) -> tuple[Array, Array, Array, Array]:
@@ -29,17 +31,18 @@ def _average_seconds(imu: Imu, track: Track) -> tuple[Array, Array, Array, Array
     return edges[:-1][used], speed[:-1][used], speed[1:][used], np.stack(axes, axis=-1)[used]
 
 
-def correlate_sideways(imu: Imu, track: Track) -> float | None:
-    """Correlation of the force to the right with the one that the gyro's rate and the speed require.
+def measure_sideways(imu: Imu, track: Track) -> float:
+    """The force to the right over that which turn rate and speed require: 1, and -1 where an axis is reversed.
 
-    None where there are no curves.
+    0 where that is open: without curves, where a road's banks are felt more, or if a vehicle leans into its curves.
     """
     _, before, after, mean = _average_seconds(imu, track)
-    wanted = -0.5 * (before + after) * mean[:, 5]  # to the left in a left curve
-    if len(wanted) < MIN_PAIRS or wanted.std() == 0.0 or mean[:, 0].std() == 0.0:
-        return None
-    alike = float(np.corrcoef(wanted, mean[:, 0])[0, 1])
-    return alike if abs(alike) > SIGMAS / np.sqrt(len(wanted)) else None
+    moving = np.minimum(before, after) > MIN_SPEED
+    if moving.sum() < MIN_PAIRS:
+        return 0.0
+    wanted = (-0.5 * (before + after) * mean[:, 5])[moving]  # to the left in a left curve
+    r, (slope,) = regress_inliers(wanted[:, None], mean[moving, 0])
+    return float(slope) if r > CORRELATED and NEAR_ONE[0] < abs(slope) < NEAR_ONE[1] else 0.0
 
 
 def fit_tilt(imu: Imu, track: Track) -> list[tuple[float, float]]:

@@ -178,7 +178,7 @@ def check_sigmas(gnss: Gnss, p: Array) -> Iterator[Finding]:
             "sigmas, or at sd in [gnss]",
             "gnss.sigma_small",
         )
-    elif scatter < _SMOOTH * sd and np.ptp(p[:, :2]) > 0.0:
+    elif _CARRIER <= scatter < _SMOOTH * sd:  # below, positions are held or interpolated, not measured
         yield Finding(
             "warning",
             f"neighbouring fixes scatter by {scatter:.2g} m only where their 1-sigma is {sd:.2g} m: look at the unit "
