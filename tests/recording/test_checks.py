@@ -43,8 +43,8 @@ def drive(shared_data: Path) -> Callable[[str], Recording]:
 
 @pytest.fixture
 def part(drive: Callable[[str], Recording]) -> Callable[[str], Recording]:
-    """The first five minutes of each: enough for what is wrong all along."""
-    return lambda name: drive(name).crop(0.0, 300.0)
+    """The first ten minutes of each: enough for what is wrong all along."""
+    return lambda name: drive(name).crop(0.0, 600.0)
 
 
 def warned(recording: Recording, pattern: str) -> list[str]:
