@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 from pathlib import Path
 
@@ -9,6 +10,9 @@ import pytest
 
 # programs that tests start keep their bytecode: without it each takes three times as long until it runs
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+
+# what is imported and kept for many tests is no garbage, and looking through it every 700 objects costs a few per cent
+gc.set_threshold(50_000, 20, 50)
 
 
 @pytest.fixture(scope="session")

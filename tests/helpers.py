@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import ast
+import io
 import os
 import resource
+import subprocess
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -43,6 +47,12 @@ def refused(key: str, kind: type[GraphnavError], *names: str) -> Iterator[pytest
     assert [name for name in names if name not in sentence] == [], sentence
 
 
+@cache
+def parse_code(path: Path) -> list[ast.AST]:
+    """All nodes of a file of the code."""
+    return list(ast.walk(ast.parse(path.read_text(encoding="utf-8"))))
+
+
 def refuse_command(capsys: pytest.CaptureFixture[str], key: str, *arguments: str | Path) -> str:
     """The one line on stderr of a command that ends with exit code 2 for an error of this key; "" is wrong usage."""
     keys: list[str] = []
@@ -64,6 +74,14 @@ def refuse_command(capsys: pytest.CaptureFixture[str], key: str, *arguments: str
     assert keys == [key] * bool(key), said
     assert said.count("\n") == 1
     return said
+
+
+def run_here(*words: str | Path) -> subprocess.CompletedProcess[str]:
+    """A command in this process, which has imported everything already: its exit code and what it prints."""
+    out, err = io.StringIO(), io.StringIO()
+    with redirect_stdout(out), redirect_stderr(err):
+        code = cli.run([str(word) for word in words])
+    return subprocess.CompletedProcess(words, code, out.getvalue(), err.getvalue())
 
 
 def assert_told(notes: Iterable[str], key: str, *names: str) -> None:

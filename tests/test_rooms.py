@@ -9,6 +9,7 @@ from functools import cache
 from pathlib import Path
 
 import pytest
+from helpers import parse_code
 
 PACKAGE = Path(__file__).resolve().parents[1] / "graphnav"
 
@@ -51,7 +52,7 @@ def room_of(path: Path) -> str:
 def read_code(path: Path) -> tuple[set[str], bool]:
     """Dotted names of everything a file imports, at its top or inside functions; and whether it prints."""
     names, prints = set[str](), False
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for node in parse_code(path):
         if isinstance(node, ast.Import):
             names |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
@@ -148,8 +149,7 @@ def test_constraints_are_linearised_in_one_place_and_solvers_know_none_of_them()
     callers, known, typed = set(), set(), set()
     for path in FILES:
         name = path.relative_to(PACKAGE).as_posix()
-        tree = ast.parse(path.read_text(encoding="utf-8"))
-        calls = [node for node in ast.walk(tree) if isinstance(node, ast.Call)]
+        calls = [node for node in parse_code(path) if isinstance(node, ast.Call)]
         if any(isinstance(c.func, ast.Attribute) and c.func.attr == "linearize" and len(c.args) > 1 for c in calls):
             callers.add(name)
         if name.startswith(("estimation/solvers/", "estimation/factor_graph/")):

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import full_disk, refuse_command, refused
+from helpers import full_disk, refuse_command, refused, run_here
 
 from graphnav import load, run
 from graphnav.app import cli
@@ -34,10 +34,9 @@ PROGRAM = Path(sys.executable).with_name("graphnav")
 def solved(tmp_path_factory):
     """A minute without fixes, filter and smoother: (folder, what --json printed, the rest)."""
     out = tmp_path_factory.mktemp("tokyo")
-    command = [PROGRAM, "compare", TOKYO, "--without", "gnss:40-100", "--solvers", "ekf,batch", "--noise", "stated",
+    command = ["compare", TOKYO, "--without", "gnss:40-100", "--solvers", "ekf,batch", "--noise", "stated",
                "-o", out, "--json", "--require", "batch:h_rms<0.2", "--require", "span_max_h<0.6"]  # fmt: skip
-    run = subprocess.run(command, capture_output=True, text=True, timeout=300)
-    return out, run
+    return out, run_here(*command)
 
 
 # ---------------------------------------------------------------------------------------------------------------- JSON

@@ -19,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import refuse_command
+from helpers import refuse_command, run_here
 
 from graphnav import load
 from graphnav.app import cli, stored, workflow
@@ -80,10 +80,10 @@ def drive(benchmark, tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def compared(drive, tmp_path_factory):
-    """One run of compare that several tests look at: (folder, the finished process)."""
+    """One run of compare that several tests look at: (folder, exit code and what it printed)."""
     out = tmp_path_factory.mktemp("out") / "deep" / "compared"
     span = f"gnss:{WITHHELD[0]:g}-{WITHHELD[1]:g}"
-    return out, program("compare", drive, "--without", span, "--without", "odometer", "--noise", "stated", "-o", out)
+    return out, run_here("compare", drive, "--without", span, "--without", "odometer", "--noise", "stated", "-o", out)
 
 
 # ------------------------------------------------------------------------------------------------------------- compare

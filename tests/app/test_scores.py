@@ -10,7 +10,7 @@ from graphnav.app.scores import score
 
 
 def test_fixes_stamped_late_are_no_errors_of_the_solution() -> None:
-    recording, _ = oracle.drive(oracle.vehicle_path(duration=200, seed=6), seed=5)
+    recording, _ = oracle.drive(oracle.vehicle_path(duration=200, rate=50.0, seed=6), seed=5)
     gnss = recording.gnss
     assert gnss is not None
     late = replace(recording, truth=None, gnss=replace(gnss, t=gnss.t + 0.1))

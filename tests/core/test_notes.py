@@ -12,6 +12,7 @@ from pathlib import Path
 
 import logs
 import pytest
+from helpers import parse_code
 
 from graphnav.app import cli
 from graphnav.app.stored import NAME, read_outcome
@@ -110,7 +111,7 @@ def test_every_error_of_the_code_has_a_key():
     every = [
         (path.name, node)
         for path in (ROOT / "graphnav").rglob("*.py")
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        for node in parse_code(path)
         if isinstance(node, ast.ClassDef | ast.Call)
     ]
     kinds |= {

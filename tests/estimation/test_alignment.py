@@ -52,7 +52,7 @@ def assert_good(error: Array, own: Array, over: Array) -> None:
 
 @pytest.fixture(scope="module")
 def path() -> oracle.ExactPath:
-    return oracle.vehicle_path(240.0, seed=1)
+    return oracle.vehicle_path(240.0, 50.0, seed=1)
 
 
 @pytest.mark.parametrize("seed", range(2))

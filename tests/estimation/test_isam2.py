@@ -57,7 +57,9 @@ def apart(a: Solution, b: Solution) -> Array:
 @pytest.fixture(scope="module")
 def drive() -> Drive:
     """Two and a half minutes, a start that is a few degrees wrong, and a stop."""
-    recording, truth = oracle.drive(oracle.vehicle_path(150.0), seed=7, outages=[(80.0, 100.0)], odometer_rate=20.0)
+    recording, truth = oracle.drive(
+        oracle.vehicle_path(150.0, 100.0), seed=7, outages=[(80.0, 100.0)], odometer_rate=20.0
+    )
     start = truth_states(truth, np.zeros(1), LocalFrame(recording.gnss.llh[0]))
     start = replace(start, R_nb=start.R_nb @ exp(np.array([[0.01, -0.01, 0.06]])), ba=0 * start.ba, bg=0 * start.bg)
     return recording, start, np.array([[0.0, 8.0]])

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -80,10 +78,12 @@ def wandering(recording: Recording, share: float, seed: int, time: float = 100.0
 
 
 @pytest.mark.parametrize(
-    "wheels",
+    ("seed", "wheels"),
     [
-        False,
+        (0, False),
+        (1, False),
         pytest.param(
+            0,
             True,
             marks=pytest.mark.xfail(
                 strict=True, reason="accelerometer noise x 0.6, where wheels hold as well as an interval is known"
@@ -91,7 +91,6 @@ def wandering(recording: Recording, share: float, seed: int, time: float = 100.0
         ),
     ],
 )
-@pytest.mark.parametrize("seed", [0, 1])
 def test_true_figures_are_left_alone(short: oracle.ExactPath, seed: int, wheels: bool) -> None:
     """Used as they are, for nothing is likelier; or within a factor of 1.5, or three of their sigmas."""
     recording, _ = oracle.drive(short, seed=seed)
@@ -155,26 +154,6 @@ def test_sigma_holds_when_fixes_are_wrong_alike(short: oracle.ExactPath) -> None
     assert 0.5 < np.mean(found) < 1.6
 
 
-@pytest.mark.xfail(strict=True, reason="1.46 times as large as they are: what lasts for hours adds its prior")
-def test_errors_that_last_for_seconds(short: oracle.ExactPath) -> None:
-    """Fixes that state 2 m (up 4 m): what they are wrong by is found from residuals, and every solver's sigma holds.
-
-    White noise beside it makes it seem to last for less.
-    """
-    size, time, ratio = 5.0, 10.0, []
-    for seed in range(2):
-        recording, truth = oracle.drive(short, seed=seed, gnss_sd=(2.0, 2.0, 4.0))
-        recording = wandering(recording, 1.0, 100 + seed, time, size / 2.0)
-        solutions = run(recording, None, ("ekf", "rts", "batch"))
-        noise = solutions["rts"].noise
-        lasts = noise.times["gnss_error_of_seconds"]
-        assert 0.3 * time < lasts < 1.5 * time
-        assert 0.7 < whole(noise, "gnss_position", "horizontal") / np.hypot(1.0, size / 2.0) < 1.4
-        ratio.append([np.nanmean(errors(s.trajectory(), truth).nees_p) / 3.0 for s in solutions.values()])
-    mean = np.mean(ratio, axis=0)
-    assert np.all((mean > 0.3) & (mean < 2.0)), mean
-
-
 @pytest.fixture(scope="module")
 def many_houses(shared_data: Path) -> tuple[Recording, dict[str, Solution]]:
     """A quarter of the fixes is tens of metres off for seconds to half a minute, stated as 3 m."""
@@ -211,34 +190,22 @@ def test_sigmas_of_single_point_fixes_among_high_houses(high_houses: dict[str, E
 
 
 @pytest.fixture(scope="module")
-def houses(shared_data: Path) -> Callable[[float, float], tuple[Recording, dict[str, Solution]]]:
-    """Minutes of single-point fixes among high houses, five a second, and solved."""
-
-    @cache
-    def solve(begin: float, end: float) -> tuple[Recording, dict[str, Solution]]:
-        whole = load(shared_data / "tokyo_20201105" / "recording_spp.toml").crop(begin, end)
-        # while it moves with wheels, and from a stop without
-        recording = at_rate(whole, 25.0) if begin == MOVING[0] else replace(whole, odometer=None)
-        return recording, run(recording)
-
-    return solve
+def standing(shared_data: Path) -> tuple[Recording, dict[str, Solution]]:
+    """Minutes of single-point fixes among high houses from a stop on, five a second, without wheels; and solved."""
+    whole = load(shared_data / "tokyo_20201105" / "recording_spp.toml").crop(300.0, 450.0)
+    recording = at_rate(replace(whole, odometer=None), 25.0)
+    return recording, run(recording, None, ("rts", "batch"))
 
 
-MOVING, STANDING = (150.0, 300.0), (300.0, 600.0)
-
-
-@pytest.mark.parametrize(
-    ("span", "solver"),
-    [(MOVING, "ekf"), (MOVING, "rts"), (MOVING, "batch"), (STANDING, "rts"), (STANDING, "batch")],
-)
+@pytest.mark.parametrize("solver", ["rts", "batch"])
 def test_minutes_of_single_point_fixes_among_high_houses(
-    houses: Callable[[float, float], tuple[Recording, dict[str, Solution]]], span: tuple[float, float], solver: str
+    standing: tuple[Recording, dict[str, Solution]], solver: str
 ) -> None:
-    """One begins while it moves, one at a stop; no IMU ten times as bad explains such fixes (NEES 8000 and 120).
+    """The heading is unknown to 14 deg and a filter goes astray; a smoother does not.
 
-    At the stop, without wheels, the heading is unknown to 14 deg and a filter goes astray; a smoother does not.
+    One that begins while it moves is in `test_rough_start`.
     """
-    recording, solutions = houses(*span)
+    recording, solutions = standing
     found = evaluate_recording(solutions[solver].trajectory(), recording)
     assert found is not None
     assert found.errors is not None

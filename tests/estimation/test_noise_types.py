@@ -18,6 +18,7 @@ from graphnav.core.rotation import Array
 from graphnav.core.trajectory import Trajectory
 from graphnav.estimation.noise.model import NoiseModel, VarianceComponent
 from graphnav.estimation.pipeline import run
+from graphnav.estimation.solution import Solution
 from graphnav.evaluation.scoring import errors
 from graphnav.recording import Gnss, Recording
 
@@ -55,24 +56,45 @@ def rms_and_nees(trajectory: Trajectory, truth: Trajectory) -> tuple[float, floa
 # ---- drives
 
 
-@pytest.mark.xfail(strict=True, reason="NEES 0.3 to 0.4: what lasts for hours adds its prior")
-def test_float_fixes_that_scatter_ten_times_as_much(path: oracle.ExactPath) -> None:
-    """The factor is found, sigmas of every solver hold, and the result is that of true sigmas."""
+@pytest.fixture(scope="module")
+def floating(path: oracle.ExactPath) -> tuple[Recording, Trajectory, dict[str, Solution]]:
+    """Float fixes that scatter ten times as much as they state, solved."""
     recording, truth = oracle.drive(path, seed=0)
     made = scattering(recording, 10.0, 100)
-    solutions = run(made, None, ("ekf", "rts", "batch"))
+    return made, truth, run(made, None, ("ekf", "rts", "batch"))
+
+
+@pytest.fixture(scope="module")
+def lasting(path: oracle.ExactPath) -> tuple[Trajectory, dict[str, Solution]]:
+    """Single-point fixes of 2 m that are 5 m wrong for ten seconds at a time, beside fixed ones that are not; solved"""
+    recording, truth = oracle.drive(path, seed=1)
+    single, _ = oracle.drive(path, seed=51, gnss_sd=(2.0, 2.0, 4.0))
+    single = wandering(single, 1.0, 101, 10.0, 2.5)
+    kinds = kinds_of(recording.gnss, 5)
+    mixed = {
+        k: np.where(kinds[:, None] == 5, getattr(single.gnss, k), getattr(recording.gnss, k)) for k in ("llh", "sd")
+    }
+    recording = replace(recording, gnss=replace(recording.gnss, type=kinds, **mixed))
+    return truth, run(recording, None, ("ekf", "rts", "batch", "incremental"))
+
+
+def test_float_fixes_that_scatter_ten_times_as_much(
+    floating: tuple[Recording, Trajectory, dict[str, Solution]],
+) -> None:
+    """The factor is found, no solver's sigmas are too small, and the result is that of true sigmas."""
+    made, truth, solutions = floating
     noise = solutions["rts"].noise
     for axis in ("horizontal", "up"):
-        fixed, floating = (noise.figures[f"gnss_position.{kind}.{axis}"] for kind in ("fixed", "float"))
+        fixed, floats = (noise.figures[f"gnss_position.{kind}.{axis}"] for kind in ("fixed", "float"))
         assert 0.8 < np.sqrt(fixed.factor) < 1.2, axis
         # four of its standard deviations
-        assert abs(floating.log_factor - np.log(100.0)) < 4.0 * floating.sigma, axis
+        assert abs(floats.log_factor - np.log(100.0)) < 4.0 * floats.sigma, axis
     sd = made.gnss.sd * np.where(made.gnss.type == 2, 10.0, 1.0)[:, None]
     best, _ = rms_and_nees(
         run(untyped(replace(made, gnss=replace(made.gnss, sd=sd))), None, ("rts",))["rts"].trajectory(), truth
     )
     found = {name: rms_and_nees(s.trajectory(), truth) for name, s in solutions.items()}
-    assert all(0.5 < nees < 1.6 for _, nees in found.values()), found
+    assert all(nees < 1.6 for _, nees in found.values()), found
     assert found["rts"][0] < 1.15 * best
 
 
@@ -87,25 +109,22 @@ def test_types_that_are_as_good_as_stated_change_little(path: oracle.ExactPath) 
         assert np.sqrt(np.mean((d / sigma) ** 2)) < 0.3, name
 
 
-@pytest.mark.xfail(strict=True, reason="NEES 0.25: what lasts for hours adds its prior")
-def test_errors_of_one_type_that_last(path: oracle.ExactPath) -> None:
-    """Single-point fixes of 2 m that are 5 m wrong for ten seconds at a time, beside fixed ones that are not."""
-    recording, truth = oracle.drive(path, seed=1)
-    single, _ = oracle.drive(path, seed=51, gnss_sd=(2.0, 2.0, 4.0))
-    single = wandering(single, 1.0, 101, 10.0, 2.5)
-    kinds = kinds_of(recording.gnss, 5)
-    mixed = {
-        k: np.where(kinds[:, None] == 5, getattr(single.gnss, k), getattr(recording.gnss, k)) for k in ("llh", "sd")
-    }
-    recording = replace(recording, gnss=replace(recording.gnss, type=kinds, **mixed))
-    solutions = run(recording, None, ("ekf", "rts", "batch", "incremental"))
+def test_errors_of_one_type_that_last(lasting: tuple[Trajectory, dict[str, Solution]]) -> None:
+    truth, solutions = lasting
     noise = solutions["rts"].noise
     assert 0.8 < times(noise, "gnss_position.fixed.horizontal") < 1.2
     assert 2.0 < whole(noise, "gnss_position.single", "horizontal") < 3.8  # true: 2.7
     assert 3.0 < noise.times["gnss_error_of_seconds_single"] < 15.0
     found = {name: rms_and_nees(s.trajectory(), truth) for name, s in solutions.items()}
-    assert all(0.5 < nees < 1.6 for _, nees in found.values()), found
+    assert all(nees < 1.6 for _, nees in found.values()), found
     assert found["rts"][0] < 0.04  # 0.055 with one factor for all
+
+
+@pytest.mark.xfail(strict=True, reason="NEES 0.25 to 0.4: what lasts for hours adds its prior")
+@pytest.mark.parametrize("drive", ["floating", "lasting"])
+def test_sigmas_of_types_are_not_too_large(drive: str, request: pytest.FixtureRequest) -> None:
+    *_, truth, solutions = request.getfixturevalue(drive)
+    assert all(rms_and_nees(s.trajectory(), truth)[1] > 0.5 for s in solutions.values())
 
 
 # ---- rows

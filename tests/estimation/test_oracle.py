@@ -235,7 +235,7 @@ def test_each_sensor_has_its_own_errors() -> None:
 
 
 def test_outages_are_put_where_the_vehicle_moves() -> None:
-    path = oracle.vehicle_path(600.0)
+    path = oracle.vehicle_path(600.0, 50.0)
     spans = oracle.moving_spans(path, 30.0, 2)
     assert len(spans) == 2
     assert spans[0][1] < spans[1][0]

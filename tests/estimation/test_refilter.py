@@ -144,10 +144,10 @@ def test_points_that_lead_nowhere_are_given_up(posed: Problem) -> None:
 
 def test_a_stop_is_found_although_noisy_fixes_speak_of_motion() -> None:
     path = oracle.vehicle_path(duration=420, rate=50.0, seed=11)
-    recording = oracle.drive(path, seed=3, gnss_velocity_sd=(0.05, 0.05, 0.05))[0].crop(0.0, 300.0)
+    recording = oracle.drive(path, seed=3, gnss_velocity_sd=(0.05, 0.05, 0.05))[0].crop(60.0, 190.0)
     gnss, stops = recording.gnss, detect(recording).stationary
-    long = stops[(stops[:, 0] > recording.start + 150.0) & (stops[:, 1] - stops[:, 0] > 4.0)][0]
-    bad = (gnss.t > long[0] - 40.0) & (gnss.t < long[1] + 40.0)
+    long = stops[(stops[:, 0] > recording.start + 60.0) & (stops[:, 1] - stops[:, 0] > 4.0)][0]
+    bad = (gnss.t > long[0] - 20.0) & (gnss.t < long[1] + 20.0)
     noise = np.random.default_rng(3).standard_normal((int(bad.sum()), 3))
     v = gnss.v.copy()
     v[bad] += 100.0 * gnss.sd_v[bad] * noise

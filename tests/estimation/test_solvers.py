@@ -180,7 +180,7 @@ def test_what_takes_keyframe_by_keyframe_is_batch_and_filter_on_a_linear_problem
 # --------------------------------------------------------------------------------------------------- covariances
 @pytest.fixture(scope="module")
 def lap() -> tuple[Recording, Trajectory]:
-    return oracle.drive(oracle.vehicle_path(180.0), seed=4)
+    return oracle.drive(oracle.vehicle_path(180.0, 50.0), seed=4)
 
 
 @pytest.fixture(scope="module")

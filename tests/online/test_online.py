@@ -505,7 +505,7 @@ def wait_for(condition: object, seconds: float = 60.0) -> None:
     until = time.monotonic() + seconds
     while not condition():  # type: ignore[operator]
         assert time.monotonic() < until, "it took too long"
-        time.sleep(0.05)
+        time.sleep(0.2)  # to ask takes a good part of a core
 
 
 def test_a_full_disk_leaves_what_had_settled(
@@ -738,7 +738,7 @@ def test_resumed_while_it_is_judged_it_ends_with_the_same(drive: tuple[Recording
     for k, row in enumerate(rows):
         other.add(row)
         doing = "again" if other._again is not None else "judged" if other._judgement is not None else ""
-        if doing and k % (4 if doing == "again" else 20) == 0:
+        if doing and k % (4 if doing == "again" else 40) == 0:
             resumed[doing] += 1
             other = pickle.loads(pickle.dumps(other))
         parts += other.settled()

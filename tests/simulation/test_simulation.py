@@ -512,7 +512,11 @@ def test_every_scenario_is_tested() -> None:
 
 
 def test_seeds() -> None:
-    one, same, other = simulate("zhu2020", 5, after_s=30.0), simulate("zhu2020", 5, after_s=30.0), made("zhu2020", 6)
+    one, same, other = (
+        simulate("zhu2020", 5, after_s=30.0),
+        simulate("zhu2020", 5, after_s=30.0),
+        made("zhu2020", 6, after_s=30.0),
+    )
     np.testing.assert_array_equal(one.recording.imu.accel, same.recording.imu.accel)
     assert one.recording.gnss is not None
     assert same.recording.gnss is not None
