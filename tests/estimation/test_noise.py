@@ -439,7 +439,7 @@ def test_sensors_in_any_order_give_the_same() -> None:
 
 
 def test_an_estimate_that_cannot_begin_at_the_medians_begins_with_stated_noise(monkeypatch: pytest.MonkeyPatch) -> None:
-    base, opening = posed(load(SHIPPED).crop(0.0, 60.0))
+    base, opening = posed(lap())
     usual = estimate_noise(base, opening)
 
     def find(problem: Problem, until: float | None) -> tuple[list[Initial], int]:
