@@ -12,6 +12,7 @@ from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, States
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import ConstraintRecord, ParameterEstimate, Solution
+from graphnav.estimation.solvers.disturbance import row_covariances
 from graphnav.estimation.solvers.invariant import minus_invariant, plus_invariant
 from graphnav.estimation.solvers.linearise import Points, find_last_keyframes, linearise, shift
 from graphnav.estimation.solvers.recursion import Blocks
@@ -24,13 +25,55 @@ Progress = Callable[[str, float], None]
 
 
 @dataclass(frozen=True)
-class SmootherPass(Points):
-    """A backward pass: states, parameter values and their joint covariance at every keyframe."""
+class DisturbancePass(Points):
+    """A backward pass: states and parameter values, and what it says of the disturbances before each keyframe.
+
+    Of the first n keyframes, which were linearised at given points: P^s = P- - P- N P-.
+    """
+
+    r: Array  # (n, D)
+    N: Array  # (n, 15, 15) of the states
+    N_diagonal: Array  # (n, D)
+
+    @property
+    def variance(self) -> Array:
+        """(K, D) of the errors; of those of parameters without a correlation time it may be unknown."""
+        raise NotImplementedError
+
+    def cover_rows(self, rows: Constraint, H: Array, n: int) -> Array:
+        """H P^s H^T (n, m, m) of the first n rows of a constraint."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True)
+class SmootherPass(DisturbancePass):
+    """A backward pass with the joint covariance of states and parameters at every keyframe."""
 
     P: Array  # (K, D, D)
-    # of the disturbances before each keyframe that was linearised at given points: P^s = P- - P- N P-
-    r: Array  # (n, D)
-    N: Array  # (n, D, D)
+
+    @property
+    def variance(self) -> Array:
+        return np.diagonal(self.P, axis1=1, axis2=2)
+
+    def cover_rows(self, rows: Constraint, H: Array, n: int) -> Array:
+        return row_covariances(H, self.P, rows.keyframe[:n])
+
+
+@dataclass(frozen=True)
+class MomentPass(DisturbancePass):
+    """A backward pass with those covariances only that a noise model is estimated by: at half the price."""
+
+    variances: Array  # (n, D), of parameters with a correlation time
+    of_rows: Array  # (n, M, M) H P^s H^T, where each row stands
+    places: dict[str, tuple[Array, Array]]
+
+    @property
+    def variance(self) -> Array:
+        return self.variances
+
+    def cover_rows(self, rows: Constraint, H: Array, n: int) -> Array:
+        k, place = self.places[rows.name]
+        return self.of_rows[k[:n, :, None], place[:n, :, None], place[:n, None]]
 
 
 @dataclass(frozen=True)
@@ -41,14 +84,19 @@ class Updates:
     Kt: Array  # (n, M, D) gains transposed
     H: Array  # (n, M, D)
     w: Array  # (n, M) S^-1 nu
-    SH: Array  # (n, M, D) S^-1 H
+    inverse: Array  # (n, M, M) S^-1
+    spread: Array  # (n, M) variances of the rows, with the weights of kernels
     taken: Array  # (B,) whether a block was taken in
+    lossy: Array  # (B,) whether with a loss of digits, but for Joseph's form
+    places: dict[str, tuple[Array, Array]]  # of each constraint's rows, as `graphnav.estimation.solvers.stack` has them
 
     @classmethod
-    def none(cls, blocks: Blocks, H: Array) -> Updates:
+    def none(cls, blocks: Blocks, H: Array, places: dict[str, tuple[Array, Array]]) -> Updates:
         """None yet, of rows H (n, M, D)."""
+        n, M, _ = H.shape
+        taken, lossy = np.zeros((2, len(blocks.begin)), dtype=bool)
         return cls(
-            blocks, np.zeros_like(H), H, np.zeros(H.shape[:2]), np.zeros_like(H), np.zeros(len(blocks.begin), bool)
+            blocks, np.zeros_like(H), H, np.zeros((n, M)), np.zeros((n, M, M)), np.ones((n, M)), taken, lossy, places
         )
 
 

@@ -69,7 +69,7 @@ class PointFilter:
         self.r, self._sigma, self.H = linearise_all(problem, stack, points, slice(0, n), of_rows)
         self.variance = (self._sigma / stack.root_weight[:n]) ** 2
         self.used = stack.joint.used.copy()
-        self.updates = Updates.none(stack.joint, self.H)
+        self.updates = Updates.none(stack.joint, self.H, stack.places)
         self._at = np.zeros(1, dtype=int)
 
     def weigh(self, some: RowBlock, used: bool, root_weight: float | Array) -> None:
@@ -101,7 +101,8 @@ class PointFilter:
                 k0, k1, e, P, self.F, self._steps.decay, self.gap, self.Q, self._steps.added,
                 self.r, self.H, self.variance, stack.scale[:n], stack.joint, self.used,
                 out.predicted, out.P_predicted, out.filtered, out.P,
-                stack.root, stack.solved, stack.bent, updates.Kt, updates.w, updates.SH, updates.taken, self._at,
+                stack.root, stack.solved, stack.bent, updates.Kt, updates.w, updates.inverse, updates.spread,
+                updates.taken, updates.lossy, self._at,
             )  # fmt: skip
         except np.linalg.LinAlgError:
             raise explain_rows(stack.block(int(self._at[0])).parts) from None

@@ -113,7 +113,7 @@ class Stack:
             self.root_weight[place], self.scale[place] = weight, scale
         table = np.concatenate(parts, axis=1) if parts else np.empty((8, 0), dtype=int)
         table = table[:, np.argsort(table[0], kind="stable")]
-        self._parts = table[:6].T.tolist()
+        self._parts = table[:6].T
         self.single = self._blocks(table, np.ones(table.shape[1], dtype=bool))
         k, apart = table[0], table[6].astype(bool)
         self.joint = self._blocks(table, np.diff(k, prepend=-1).astype(bool) | apart | np.roll(apart, 1))
@@ -144,7 +144,7 @@ class Stack:
 
     def block(self, b: int) -> RowBlock:
         """Block number b."""
-        some = self._parts[self.joint.part[b] : self.joint.part[b + 1]]
+        some = self._parts[self.joint.part[b] : self.joint.part[b + 1]].tolist()
         parts = [(self._constraints[i], lo, hi) for _, i, lo, hi, _, _ in some]
         return RowBlock(some[0][0], b, some[0][4], some[-1][5], parts)
 
