@@ -257,16 +257,22 @@ def decide(
     inside[INTERVALS] = {name: some for name, some in noise.weights.items() if name in INTERVALS}
     used = with_noise(base, replace(noise, weights=outside))
     weighted = {kinds: with_noise(base, replace(noise, weights=outside | some)) for kinds, some in inside.items()}
+    outliers = {
+        kinds: [
+            sum(count_reduced(one) - count_reduced(drop_within(one, [within])) for one in some.values())
+            for within in (reach if kinds == INTERVALS else spans)
+        ]
+        for kinds, some in inside.items()
+    }
+    among = [kinds for kinds in among if kinds not in _SINGLE or any(outliers[kinds])]
     before, likelihood, passes = evidence(used, found.carry_points(base, used), spans, weighted, among)
     excluded: dict[str, tuple[Span, ...]] = {}
     total = before + found.log_prior
     dropped: dict[str, list[Span]] = {name: [] for name in noise.weights}
     for k, span in enumerate(spans):
         cost = np.array([0.0 if not kinds or kinds in _SINGLE else _FAULT_COST for kinds in EXPLANATIONS])
-        for kinds, some in inside.items():
-            within = reach[k] if kinds == INTERVALS else span
-            outliers = sum(count_reduced(one) - count_reduced(drop_within(one, [within])) for one in some.values())
-            cost[EXPLANATIONS.index(kinds)] += OUTLIER_COST * outliers if outliers or kinds not in _SINGLE else np.inf
+        for kinds, count in outliers.items():
+            cost[EXPLANATIONS.index(kinds)] += OUTLIER_COST * count[k] if count[k] or kinds not in _SINGLE else np.inf
         each = likelihood[k] - cost
         best = EXPLANATIONS[int(np.argmax(each))]
         total += float(np.max(each))

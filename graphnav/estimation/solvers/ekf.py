@@ -26,6 +26,7 @@ throughout.
 from __future__ import annotations
 
 import time
+from collections.abc import Collection
 from functools import partial
 from typing import Any
 
@@ -52,7 +53,7 @@ from graphnav.estimation.solvers.passes import (
     sigmas_of,
     subtract_points,
 )
-from graphnav.estimation.solvers.points import Errors, PointFilter
+from graphnav.estimation.solvers.points import Errors, Linearisation, PointFilter, filter_likelihood
 from graphnav.estimation.solvers.rts import backward
 from graphnav.estimation.solvers.stack import Innovations, Stack
 from graphnav.estimation.solvers.stretches import StretchFilter
@@ -120,6 +121,31 @@ def refilter(
     return _forward(problem, len(about.values), about, progress, watch, drifts)
 
 
+class Comparison:
+    """How likely the innovations are by a problem, and by others that differ from it by weights or by few rows.
+
+    Parameters
+    ----------
+    about : points of all keyframes that all of them are linearised at.
+    """
+
+    def __init__(self, problem: Problem, about: Points) -> None:
+        self._K, self._steps = len(about.values), advance(problem, len(about.values))
+        self._one = Linearisation.of(problem, about, Stack(problem, self._K), self._steps)
+
+    def log_likelihood(self, problem: Problem, about: Points, anew: Collection[str] = ()) -> Array:
+        """(K,) as `ForwardRecord.log_likelihood`, by a problem with the same points of what both have.
+
+        `anew` are the constraints of which the rows differ.
+        """
+        stack, steps = Stack(problem, self._K), advance(problem, self._K)
+        one = self._one.lift(problem, about, stack, anew)
+        x, P = _prior(problem)
+        start = _begin(subtract_points(x, about.first(1))[0], P, stack.records)
+        filter_likelihood(problem, about, stack, steps, one, start)
+        return stack.log_likelihood()
+
+
 def near(
     problem: Problem, about: Points, opening: float | None = None, progress: Progress | None = None
 ) -> tuple[ForwardRecord, SmootherPass]:
@@ -166,9 +192,7 @@ def _forward(
     stack = Stack(problem, K, {c.name for c in fixes})
     ahead, found = Points.allocate(K, D - DIM), Points.allocate(K, D - DIM)
     errors = Errors(np.empty((n, D)), all_Pp, np.empty((n, D)), all_P)
-    assert problem.prior.mean is not None
-    x = Points(problem.prior.mean, np.concatenate([np.empty(0), *(c.mean[0] for c in problem.chains)])[None])
-    P = np.diag(np.concatenate([problem.prior.sigma[0], *(c.sigma[0] for c in problem.chains)]) ** 2)
+    x, P = _prior(problem)
     updates, search = None, None
     if about is not None:
         given = PointFilter(problem, about, stack, steps, all_F, errors)
@@ -217,6 +241,14 @@ def _forward(
         updates,
         log_likelihood,
     )
+
+
+def _prior(problem: Problem) -> tuple[Points, Array]:
+    """Point and covariance before the first keyframe."""
+    assert problem.prior.mean is not None
+    sigma = np.concatenate([problem.prior.sigma[0], *(c.sigma[0] for c in problem.chains)])
+    values = np.concatenate([np.empty(0), *(c.mean[0] for c in problem.chains)])
+    return Points(problem.prior.mean, values[None]), np.diag(sigma**2)
 
 
 def _begin(x: Any, P: Array, records: dict[str, Innovations], search: FaultSearch | None = None) -> tuple[Any, Array]:
