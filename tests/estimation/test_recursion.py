@@ -28,7 +28,7 @@ class Drive:
         n, w = KEYFRAMES, DIM + SCALE
         self.F = np.zeros((n - 1, DIM, w))
         self.F[:, :, :DIM] = np.eye(DIM)
-        self.F += 0.1 * rng.standard_normal(self.F.shape)
+        self.F[:, : recursion.MOVING] += 0.1 * rng.standard_normal((n - 1, recursion.MOVING, w))
         self.decay, self.added = np.ones((n - 1, D - DIM)), np.zeros((n - 1, D - DIM))
         self.decay[::2, SCALE:], self.added[::2, SCALE:] = 0.8, 0.3
         half = rng.standard_normal((n - 1, DIM, DIM))
@@ -70,7 +70,7 @@ class Drive:
             disturbance.smooth_rows(
                 0, n, np.zeros(D), np.zeros((D, D)), self.F, self.decay, out["Kt"], self.H, out["w"], out["inverse"],
                 out["spread"], blocks.first, blocks.begin, blocks.end, taken, lossy,
-                out["ahead"], out["P_ahead"], out["errors"], out["P"], np.arange(D),
+                out["ahead"], out["P_ahead"], out["errors"], out["P"], np.tile(np.arange(D), n), D * np.arange(n + 1),
                 out["r"], out["N"], out["N_diagonal"], out["smoothed"], P_smoothed, out["variance"], out["of_rows"],
             )  # fmt: skip
         out |= {"taken": taken, "lossy": lossy}

@@ -221,7 +221,7 @@ def _iterate(
 
 
 def _smooth_about(problem: Problem, about: Points) -> tuple[ForwardRecord, DisturbancePass]:
-    forward = refilter(problem, about)
+    forward = refilter(problem, about, whole=False)
     return forward, backward_moments(problem, forward)
 
 

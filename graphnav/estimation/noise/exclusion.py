@@ -230,7 +230,7 @@ def _test(base: Problem, noise: NoiseModel, found: NoiseEstimate) -> list[Span]:
     # weights of fixes and of IMU intervals may hide a fault from the tests
     kept = {name: some for name, some in noise.weights.items() if name not in (*FIXES, *INTERVALS)}
     tested = with_noise(base, replace(noise, weights=kept))
-    weights = refilter(tested, found.carry_points(base, tested), watch=True).weights
+    weights = refilter(tested, found.carry_points(base, tested), watch=True, whole=False).weights
     return join_faults(faults.fault_spans(faults.weigh_rows(tested, weights)))
 
 

@@ -13,17 +13,43 @@ import numpy as np
 from graphnav.core.compiled import compiled
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM
+from graphnav.estimation.solvers.recursion import MOVING
 
 
 @compiled
-def move_back(F: Array, decay: Array, X: Array) -> Array:
-    """X (n, D) times the matrix of a step."""
-    w = F.shape[1]
-    out = np.empty(X.shape)
-    top = np.dot(np.ascontiguousarray(X[:, :DIM]), F)
-    np.positive(top[:, :DIM], out[:, :DIM])
-    np.multiply(X[:, DIM:], decay, out[:, DIM:])
-    np.add(out[:, DIM:w], top[:, DIM:], out[:, DIM:w])
+def step_back(F: Array, decay: Array, N: Array) -> Array:
+    """N (D, D) before a step from that behind it."""
+    w, D = F.shape[1], len(N)
+    moving, one, out = F[:MOVING], np.empty((D, D)), np.empty((D, D))
+    top = np.dot(moving.T, N[:MOVING])
+    for i in range(D):
+        d = 1.0 if i < DIM else decay[i - DIM]
+        for j in range(D):
+            one[i, j] = d * N[i, j] if i >= MOVING else 0.0
+        if i < w:
+            for j in range(D):
+                one[i, j] += top[i, j]
+    left = np.dot(np.ascontiguousarray(one[:, :MOVING]), moving)
+    for i in range(D):
+        for j in range(MOVING):
+            out[i, j] = left[i, j]
+        for j in range(MOVING, DIM):
+            out[i, j] = one[i, j] + left[i, j]
+        for j in range(DIM, D):
+            out[i, j] = one[i, j] * decay[j - DIM]
+        for j in range(DIM, w):
+            out[i, j] += left[i, j]
+    return out
+
+
+@compiled
+def step_vector_back(F: Array, decay: Array, r: Array) -> Array:
+    """r (D,) likewise."""
+    out = np.empty(len(r))
+    out[:MOVING] = 0.0
+    out[MOVING:DIM] = r[MOVING:DIM]
+    out[DIM:] = decay * r[DIM:]
+    out[: F.shape[1]] += np.dot(r[:MOVING], F[:MOVING])
     return out
 
 
@@ -37,8 +63,11 @@ def take_back(N: Array, H: Array, Kt: Array, inverse: Array, lossy: bool) -> tup
         out = N - np.dot(G.T, H)
         out += np.dot(H.T, np.dot(inverse, H) - np.dot(Kt, out))
         return out, D
-    half = np.dot(H.T, G - 0.5 * np.dot(D, H))
-    return N - half - half.T, D
+    out = np.dot(H.T, G - 0.5 * np.dot(D, H))
+    for i in range(len(N)):
+        for j in range(i + 1):
+            out[i, j] = out[j, i] = N[i, j] - out[i, j] - out[j, i]
+    return out, D
 
 
 @compiled
@@ -63,7 +92,8 @@ def smooth_rows(
     P_predicted: Array,
     errors: Array,
     P: Array,
-    lasting: Array,
+    wanted: Array,
+    first_wanted: Array,
     r: Array,
     N: Array,
     N_diagonal: Array,
@@ -82,23 +112,22 @@ def smooth_rows(
     ----------
     Kt, H, w, inverse, spread : of the updates: gains transposed, rows, S^-1 nu, S^-1, and the variances of the rows.
     taken, lossy : (B,) whether a block was taken in, and whether with a loss of digits.
-    lasting : columns of which variances are wanted.
     P_smoothed : (n, D, D), filled with covariances of the smoother, if it has any keyframes. If it has none,
-    variance, of_rows : (n, D), (n, M, M), filled with variances of the columns `lasting`, and with H P^s H^T.
+    variance, of_rows : (n, D), (n, M, M), filled with variances and with H P^s H^T.
+    wanted, first_wanted : columns of which variances are wanted, those of keyframe k from `first_wanted[k]` on.
     """
     whole = len(P_smoothed) > 0
     for k in range(k1 - 1, k0 - 1, -1):
         ahead = k < len(F)  # of the last of all the filtered covariance is of errors about the estimate already
         if ahead:
-            r_k = move_back(F[k], decay[k], r_k.reshape(1, -1)).ravel()
-            N_k = move_back(F[k], decay[k], N_k)
-            N_k = move_back(F[k], decay[k], np.ascontiguousarray(N_k.T))
+            r_k = step_vector_back(F[k], decay[k], r_k)
+            N_k = step_back(F[k], decay[k], N_k)
             np.add(errors[k], np.dot(P[k], r_k), smoothed[k])
             N_behind, P_behind = N_k, P[k]
             if whole:
                 cover(P[k], N_k, P_smoothed[k])
             else:
-                vary(P[k], N_k, lasting, variance[k])
+                vary(P[k], N_k, wanted[first_wanted[k] : first_wanted[k + 1]], variance[k])
         else:
             N_behind, P_behind = N_k, P[k]
         for b in range(first[k + 1] - 1, first[k] - 1, -1):
@@ -124,11 +153,12 @@ def smooth_rows(
         for i in range(len(r_k)):
             N_diagonal[k, i] = N_k[i, i]
         if not ahead:
-            np.add(errors_predicted[k], np.dot(P_predicted[k], r_k), smoothed[k])
+            ahead_P = P_predicted[k % len(P_predicted)]
+            np.add(errors_predicted[k], np.dot(ahead_P, r_k), smoothed[k])
             if whole:
-                cover(P_predicted[k], N_k, P_smoothed[k])
+                cover(ahead_P, N_k, P_smoothed[k])
             else:
-                vary(P_predicted[k], N_k, lasting, variance[k])
+                vary(ahead_P, N_k, wanted[first_wanted[k] : first_wanted[k + 1]], variance[k])
     return r_k, N_k
 
 

@@ -108,7 +108,12 @@ def ekf(
 
 
 def refilter(
-    problem: Problem, about: Points, progress: Progress | None = None, watch: bool = False, drifts: bool = True
+    problem: Problem,
+    about: Points,
+    progress: Progress | None = None,
+    watch: bool = False,
+    drifts: bool = True,
+    whole: bool = True,
 ) -> ForwardRecord:
     """Run the filter over the first keyframes, linearised at given points; several times as fast as `ekf`.
 
@@ -117,8 +122,9 @@ def refilter(
     about : of these keyframes, near enough for what is left to be linear: an earlier pass.
     watch : look for errors that last in the rows that are to be watched, and go back to before them.
     drifts : of such errors those that grow as well.
+    whole : False keeps the covariances of two keyframes of those predicted, which `backward_moments` does with.
     """
-    return _forward(problem, len(about.values), about, progress, watch, drifts)
+    return _forward(problem, len(about.values), about, progress, watch, drifts, whole=whole)
 
 
 class Comparison:
@@ -181,11 +187,12 @@ def _forward(
     watch: bool = False,
     drifts: bool = True,
     decide: Decide | None = None,
+    whole: bool = True,
 ) -> ForwardRecord:
     """Filter the first K keyframes, of which the first n are linearised at given points."""
     n, scale, steps = 0 if about is None else len(about.values), problem.columns.get(SCALE), advance(problem, K)
     D = DIM + steps.decay.shape[1]
-    all_P, all_Pp = np.empty((K, D, D)), np.empty((K, D, D))
+    all_P, all_Pp = np.empty((K, D, D)), np.empty((K if whole else 2, D, D))
     all_F = np.empty((K - 1, DIM, DIM if scale is None else scale.stop))
     fixes = [c for c in problem.constraints if watch and c.fix_of]
     watched = [c for c in fixes if c.watched]

@@ -106,7 +106,7 @@ class ForwardRecord(Points):
 
     P: Array  # (K, D, D) filtered
     predicted: Points
-    P_predicted: Array  # (K, D, D)
+    P_predicted: Array  # (K, D, D), or (2, D, D) of the last two keyframes, in their order or the other
     F: Array  # (K-1, 15, w) and
     decay: Array  # (K-1, D-15) of the steps, as `graphnav.estimation.solvers.recursion` has them
     records: dict[str, Innovations]

@@ -159,7 +159,7 @@ def filter_likelihood(
     `start` is what is known of the errors (D,) before the first keyframe, and their covariance.
     """
     n, M, D = one.H.shape
-    e, P, at = np.empty((2, 1, D)), np.empty((2, 1, D, D)), np.zeros(1, dtype=int)
+    e, P, at = np.empty((2, 2, D)), np.empty((2, 2, D, D)), np.zeros(1, dtype=int)
     taken, lossy = np.zeros((2, len(stack.joint.begin)), dtype=bool)
     try:
         filter_rows(

@@ -18,6 +18,7 @@ from graphnav.core.state import DIM
 
 STRETCH = 256  # keyframes from one word of how far it has come to the next
 PASSES = 4  # of re-weighting where a measurement is met for the first time
+MOVING = 9  # of the states; biases stay, so that theirs are rows of a unit matrix in F
 UNUSED = 1e-12  # weight of a row that is not used beside others of its keyframe
 HUBER, CAUCHY = 1, 2
 _LOSSY = 1e4  # times R that H P H^T may be for P - W^T W to keep twelve digits
@@ -50,27 +51,45 @@ def move(F: Array, decay: Array, X: Array) -> Array:
 @compiled
 def predict(P: Array, F: Array, decay: Array, Q: Array, added: Array, out: Array) -> None:
     """The covariance (D, D) after a step, in `out`: with Q (15, 15) of the states and `added` (D-15) of parameters."""
-    w = F.shape[1]
-    top = np.dot(F, P[:w])
-    np.add(np.dot(np.ascontiguousarray(top[:, :w]), F.T), Q, out[:DIM, :DIM])
-    for i in range(DIM):
-        np.multiply(top[i, DIM:], decay, out[i, DIM:])
-    np.positive(out[:DIM, DIM:].T, out[DIM:, :DIM])
-    for i in range(len(decay)):
-        np.multiply(P[DIM + i, DIM:], decay[i] * decay, out[DIM + i, DIM:])
-        out[DIM + i, DIM + i] += added[i]
+    w, D = F.shape[1], len(P)
+    top = np.dot(F[:MOVING], P[:w])
+    own = np.dot(np.ascontiguousarray(top[:, :w]), F[:MOVING].T)
+    for i in range(MOVING):
+        for j in range(i + 1):
+            out[i, j] = out[j, i] = own[i, j] + Q[i, j]
+        for j in range(MOVING, DIM):
+            out[i, j] = top[i, j] + Q[i, j]
+        for j in range(DIM, D):
+            out[i, j] = top[i, j] * decay[j - DIM]
+        for j in range(MOVING, D):
+            out[j, i] = out[i, j]
+    for i in range(MOVING, DIM):
+        for j in range(MOVING, DIM):
+            out[i, j] = P[i, j] + Q[i, j]
+        for j in range(DIM, D):
+            out[i, j] = P[i, j] * decay[j - DIM]
+            out[j, i] = out[i, j]
+    for i in range(DIM, D):
+        d = decay[i - DIM]
+        for j in range(DIM, D):
+            out[i, j] = P[i, j] * (d * decay[j - DIM])
+        out[i, i] += added[i - DIM]
 
 
 @compiled
 def invert_root(L: Array) -> Array:
     """L^-1 of a lower root (m, m)."""
-    out = np.zeros(L.shape)
-    for i in range(len(L)):
-        own = out[i]
-        own[i] = 1.0
+    m = len(L)
+    out = np.zeros((m, m))
+    for i in range(m):
         for j in range(i):
-            own -= L[i, j] * out[j]
-        own /= L[i, i]
+            x = L[i, j]
+            for c in range(j + 1):
+                out[i, c] -= x * out[j, c]
+        x = 1.0 / L[i, i]
+        for c in range(i):
+            out[i, c] *= x
+        out[i, i] = x
     return out
 
 
@@ -109,10 +128,10 @@ def update(P: Array, HP: Array, H: Array, Kt: Array, variance: Array) -> Array:
 def reduce(P: Array, W: Array) -> Array:
     """The covariance after an update, as P - W^T W with W = L^-1 H P: half of the work, and fewer digits."""
     out = np.dot(W.T, W)
-    np.subtract(P, out, out)
-    one = np.empty(P.shape)
-    halve_sum(out, one)
-    return one
+    for i in range(len(P)):
+        for j in range(i + 1):
+            out[i, j] = out[j, i] = P[i, j] - out[i, j]
+    return out
 
 
 @compiled
@@ -177,24 +196,23 @@ def filter_rows(
     used : (B,) whether a block is taken in; of one that is not there is an innovation only.
     root, solved : (n, M, M), (n, M), filled with roots of S and S^-1 (r + H e), before any kernel.
     bent : (n, M), filled with weights of kernels, 0 of rows that a gate refuses.
-    errors_predicted, P_predicted, errors, P_filtered : filled with what is predicted and filtered; of one keyframe
-        each, if nobody will ask.
+    errors_predicted, P_predicted, errors, P_filtered : filled with what is predicted and filtered; of fewer than n,
+        but two at least that are predicted, those of the last keyframes are left.
     Kt, w, inverse, spread : (n, M, D), (n, M), (n, M, M), (n, M), filled with gains transposed, S^-1 nu, S^-1, and the
         variances with the kernels' weights; without a row, if nobody will ask.
     taken, lossy : (B,), filled with whether a block was taken in, and whether P - W^T W would have lost digits.
     at : (1,), the block that is taken in.
     """
-    kept, gains, told = len(P_filtered) >= len(r), len(Kt) > 0, len(inverse) > 0
+    gains, told = len(Kt) > 0, len(inverse) > 0
     for k in range(k0, k1):
-        own_k = k if kept else 0
+        ahead = k % len(P_predicted)
         if k:
             e = gap[k - 1] + move(F[k - 1], decay[k - 1], e.reshape(-1, 1)).ravel()
-            before = P if kept else P.copy()
-            predict(before, F[k - 1], decay[k - 1], Q[k - 1], added[k - 1], P_predicted[own_k])
+            predict(P, F[k - 1], decay[k - 1], Q[k - 1], added[k - 1], P_predicted[ahead])
         else:
-            np.positive(P, P_predicted[own_k])
-        P = P_predicted[own_k]
-        np.positive(e, errors_predicted[own_k])
+            np.positive(P, P_predicted[ahead])
+        P = P_predicted[ahead]
+        np.positive(e, errors_predicted[k % len(errors_predicted)])
         for b in range(blocks.first[k], blocks.first[k + 1]):
             at[0] = b
             lo, hi = blocks.begin[b], blocks.end[b]
@@ -231,8 +249,8 @@ def filter_rows(
                     np.positive(R, spread[k, lo:hi])
                 e = e - np.dot(white, W)
                 P = update(P, HP, own, Kt_b, R) if lossy[b] else reduce(P, W)
-        np.positive(e, errors[own_k])
-        np.positive(P, P_filtered[own_k])
+        np.positive(e, errors[k % len(errors)])
+        np.positive(P, P_filtered[k % len(P_filtered)])
 
 
 @compiled

@@ -30,7 +30,7 @@ from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import Solution
 from graphnav.estimation.solvers.breakdown import explain_smoother
 from graphnav.estimation.solvers.disturbance import smooth_rows
-from graphnav.estimation.solvers.linearise import scale_at
+from graphnav.estimation.solvers.linearise import scale_at, stepping
 from graphnav.estimation.solvers.passes import (
     FilterPass,
     ForwardRecord,
@@ -69,7 +69,7 @@ def backward(problem: Problem, forward: ForwardRecord, progress: Progress | None
             behind = inverse @ away, inverse @ (ahead - P[end]) @ inverse
             found.put(end, *behind)
         if forward.updates is not None:
-            _smooth_points(forward, forward.updates, behind, end, found, np.empty(0, dtype=int), P, progress)
+            _smooth_points(forward, forward.updates, behind, end, found, np.empty((K, 0), dtype=bool), P, progress)
             _restore_digits(forward, P, end)
         first = move_points(forward.about.first(end), found.errors[:end])
         values[:end] = first.values
@@ -84,10 +84,12 @@ def backward_moments(problem: Problem, forward: ForwardRecord) -> MomentPass:
     assert forward.updates is not None
     assert len(forward.about.values) == K
     found, behind = _Disturbances.allocate(K, D), (np.zeros(D), np.zeros((D, D)))
-    lasting = [problem.columns[c.parameter.name] for c in problem.chains if c.parameter.correlation_time is not None]
-    columns = np.concatenate([np.empty(0, dtype=int), *(np.arange(at.start, at.stop) for at in lasting)])
-    none = np.empty((0, D, D))
-    variance, of_rows = _smooth_points(forward, forward.updates, behind, K, found, columns, none)
+    wanted = np.zeros((K, D), dtype=bool)  # at both ends of their steps
+    for chain in problem.chains:
+        if chain.parameter.correlation_time is not None:
+            k, own = stepping(chain, K), problem.columns[chain.parameter.name]
+            wanted[k, own] = wanted[k - 1, own] = True
+    variance, of_rows = _smooth_points(forward, forward.updates, behind, K, found, wanted, np.empty((0, D, D)))
     smoothed = move_points(forward.about, found.errors)
     return MomentPass(
         smoothed.states, smoothed.values, found.r, found.N, found.N_diagonal, variance, of_rows, forward.updates.places
@@ -142,23 +144,24 @@ def _smooth_points(
     behind: tuple[Array, Array],
     end: int,
     out: _Disturbances,
-    lasting: Array,
+    wanted: Array,
     P: Array,
     progress: Progress | None = None,
 ) -> tuple[Array, Array]:
     """Smoothed errors, covariances, r and N of the first keyframes up to `end`, from r and N behind them.
 
-    Where P has no keyframes, variances (end, D) of the columns `lasting` and H P^s H^T (end, M, M) in place of it.
+    Where P has no keyframes, variances (end, D) of the columns `wanted` (K, D) and H P^s H^T (end, M, M) in place of it.
     """
     blocks, (r_k, N_k) = one.blocks, behind
     n, M, D = one.H.shape if not len(P) else (0, 0, 0)
     variance, of_rows = np.zeros((n, D)), np.zeros((n, M, M))
+    columns, first = np.nonzero(wanted)[1], np.append(0, np.cumsum(wanted.sum(axis=1)))
     for hi in range(end, 0, -STRETCH):
         lo = max(hi - STRETCH, 0)
         r_k, N_k = smooth_rows(
             lo, hi, r_k, N_k, forward.F, forward.decay, one.Kt, one.H, one.w, one.inverse, one.spread,
             blocks.first, blocks.begin, blocks.end, one.taken, one.lossy,
-            forward.errors_predicted, forward.P_predicted, forward.errors, forward.P, lasting,
+            forward.errors_predicted, forward.P_predicted, forward.errors, forward.P, columns, first,
             out.r, out.N, out.N_diagonal, out.errors, P, variance, of_rows,
         )  # fmt: skip
         if progress is not None:
