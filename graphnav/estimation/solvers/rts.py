@@ -150,7 +150,7 @@ def _smooth_points(
 ) -> tuple[Array, Array]:
     """Smoothed errors, covariances, r and N of the first keyframes up to `end`, from r and N behind them.
 
-    Where P has no keyframes, variances (end, D) of the columns `wanted` (K, D) and H P^s H^T (end, M, M) in place of it.
+    Where P has no keyframes, variances (end, D) of the columns `wanted` (K, D), and H P^s H^T (end, M, M).
     """
     blocks, (r_k, N_k) = one.blocks, behind
     n, M, D = one.H.shape if not len(P) else (0, 0, 0)
