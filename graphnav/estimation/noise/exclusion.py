@@ -38,7 +38,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from graphnav.estimation import faults
-from graphnav.estimation.noise.apply import row_weights, with_noise
+from graphnav.estimation.noise.apply import row_weights, with_noise, with_weights
 from graphnav.estimation.noise.estimate import NoiseEstimate, estimate_noise
 from graphnav.estimation.noise.explanations import EXPLANATIONS, FIXES, ONE_SENSOR, ROWS, WHEELS, Explanation, evidence
 from graphnav.estimation.noise.model import INTERVALS, NoiseModel, RowWeights
@@ -256,7 +256,6 @@ def decide(
     }
     inside[INTERVALS] = {name: some for name, some in noise.weights.items() if name in INTERVALS}
     used = with_noise(base, replace(noise, weights=outside))
-    weighted = {kinds: with_noise(base, replace(noise, weights=outside | some)) for kinds, some in inside.items()}
     outliers = {
         kinds: [
             sum(count_reduced(one) - count_reduced(drop_within(one, [within])) for one in some.values())
@@ -265,6 +264,9 @@ def decide(
         for kinds, some in inside.items()
     }
     among = [kinds for kinds in among if kinds not in _SINGLE or any(outliers[kinds])]
+    weighted = {kinds: with_weights(used, outside | inside[kinds]) for kinds in (*ONE_SENSOR, ROWS)}
+    if INTERVALS in among:
+        weighted[INTERVALS] = with_noise(base, replace(noise, weights=outside | inside[INTERVALS]))
     before, likelihood, passes = evidence(used, found.carry_points(base, used), spans, weighted, among)
     excluded: dict[str, tuple[Span, ...]] = {}
     total = before + found.log_prior

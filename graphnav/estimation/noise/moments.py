@@ -21,6 +21,7 @@ Vermessungs-Nachrichten 86 (1979); de Jong, JASA 84 (1989); Koopman, Biometrika 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -50,7 +51,16 @@ class ImuMoments:
 
     A: Array  # (n, 4) of `NOISE_FIGURES`
     B: Array  # (n, 4)
-    freedom: Array  # (n, 4), of the chi-square variable that A freedom / B is near to where f is right
+    Q: Array  # (n, 4, 15, 15) what each adds to a step
+    N: Array  # (n, 15, 15)
+
+    @cached_property
+    def freedom(self) -> Array:
+        """(n, 4) of the chi-square variable that A freedom / B is near to where f is right."""
+        QN = self.Q @ self.N[:, None]
+        squared = np.einsum("nfij,nfji->nf", QN, QN)
+        freedom = np.where(self.B > 0.0, self.B**2 / np.maximum(squared, 1e-300), 1.0)
+        return np.maximum(freedom, 1.0)
 
 
 def imu_moments(problem: Problem, forward: ForwardRecord, smoothed: DisturbancePass) -> ImuMoments:
@@ -65,12 +75,9 @@ def imu_moments(problem: Problem, forward: ForwardRecord, smoothed: DisturbanceP
     r = (Lt @ smoothed.r[1:, :DIM, None])[..., 0]
     N = Lt @ smoothed.N[1:] @ L
     Q = problem.intervals.parts[: len(r)]
-    A = np.einsum("ni,nfij,nj->nf", r, Q, r, optimize=True)
-    QN = Q @ N[:, None]
-    B = np.maximum(np.einsum("nfii->nf", QN), 0.0)
-    squared = np.einsum("nfij,nfji->nf", QN, QN)
-    freedom = np.where(B > 0.0, B**2 / np.maximum(squared, 1e-300), 1.0)
-    return ImuMoments(A, B, np.maximum(freedom, 1.0))
+    both = np.stack([r[:, :, None] * r[:, None], np.swapaxes(N, 1, 2)], axis=-1).reshape(len(r), DIM * DIM, 2)
+    A, B = np.moveaxis(Q.reshape(len(r), -1, DIM * DIM) @ both, -1, 0)
+    return ImuMoments(A, np.maximum(B, 0.0), Q, N)
 
 
 def process_moments(
@@ -89,8 +96,7 @@ def row_moments(problem: Problem, rows: Constraint, smoothed: DisturbancePass, n
     at, which = rows.keyframe[:n], slice(0, n)
     values = values_of(problem, smoothed)
     linear = linearise(rows, smoothed, problem.columns, which)
-    H = linear.H
-    HPH = smoothed.cover_rows(rows, H, n)
+    HPH = smoothed.cover_rows(linear, n)
     w = np.ones((n, 1)) if rows.weight is None else rows.weight[:n, None]
     R = linear.stated**2
     B = np.clip(1.0 - w * np.diagonal(HPH, axis1=1, axis2=2) / R, 1e-6, 1.0)
@@ -102,7 +108,7 @@ def row_moments(problem: Problem, rows: Constraint, smoothed: DisturbancePass, n
     error, covariance = linear.residual, R[:, :, None] * np.eye(R.shape[1])
     for p in rows.parameters:
         if p.correlation_time is not None:
-            J = linear.H[:, :, problem.columns[p.name]]
+            J = linear.linear.jacobians[p.name]
             error = error - np.einsum("nij,nj->ni", J, values[p.name][at])
             covariance = covariance + (J * p.sigma**2) @ np.swapaxes(J, 1, 2)
     whole = np.sum(error * np.linalg.solve(covariance, error[..., None])[..., 0], axis=1)

@@ -122,7 +122,7 @@ def refilter(
     about : of these keyframes, near enough for what is left to be linear: an earlier pass.
     watch : look for errors that last in the rows that are to be watched, and go back to before them.
     drifts : of such errors those that grow as well.
-    whole : False keeps the covariances of two keyframes of those predicted, which `backward_moments` does with.
+    whole : False keeps what `backward_moments` needs, predicted covariances of two keyframes, and no innovations.
     """
     return _forward(problem, len(about.values), about, progress, watch, drifts, whole=whole)
 
@@ -226,7 +226,7 @@ def _forward(
         x, P = found.at(slice(k - 1, k)), all_P[k - 1]
         if progress is not None:
             progress("filter", k / K)
-    log_likelihood = stack.finish()
+    log_likelihood = stack.finish() if whole or watch else stack.log_likelihood()
     filtered, predicted = found, ahead
     if about is not None:
         filtered = join_passes([move_points(about, errors.filtered), found.at(slice(n, None))])

@@ -14,7 +14,7 @@ from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import ConstraintRecord, ParameterEstimate, Solution
 from graphnav.estimation.solvers.disturbance import row_covariances
 from graphnav.estimation.solvers.invariant import minus_invariant, plus_invariant
-from graphnav.estimation.solvers.linearise import Points, find_last_keyframes, linearise, shift
+from graphnav.estimation.solvers.linearise import Points, Rows, find_last_keyframes, linearise, shift
 from graphnav.estimation.solvers.recursion import Blocks
 from graphnav.estimation.solvers.robust import weight_and_cost
 from graphnav.estimation.solvers.stack import Innovations
@@ -40,8 +40,8 @@ class DisturbancePass(Points):
         """(K, D) of the errors; of those of parameters without a correlation time it may be unknown."""
         raise NotImplementedError
 
-    def cover_rows(self, rows: Constraint, H: Array, n: int) -> Array:
-        """H P^s H^T (n, m, m) of the first n rows of a constraint."""
+    def cover_rows(self, linear: Rows, n: int) -> Array:
+        """H P^s H^T (n, m, m) of the first n rows of a constraint, linearised."""
         raise NotImplementedError
 
 
@@ -55,8 +55,8 @@ class SmootherPass(DisturbancePass):
     def variance(self) -> Array:
         return np.diagonal(self.P, axis1=1, axis2=2)
 
-    def cover_rows(self, rows: Constraint, H: Array, n: int) -> Array:
-        return row_covariances(H, self.P, rows.keyframe[:n])
+    def cover_rows(self, linear: Rows, n: int) -> Array:
+        return row_covariances(linear.H, self.P, linear.constraint.keyframe[:n])
 
 
 @dataclass(frozen=True)
@@ -71,8 +71,8 @@ class MomentPass(DisturbancePass):
     def variance(self) -> Array:
         return self.variances
 
-    def cover_rows(self, rows: Constraint, H: Array, n: int) -> Array:
-        k, place = self.places[rows.name]
+    def cover_rows(self, linear: Rows, n: int) -> Array:
+        k, place = self.places[linear.constraint.name]
         return self.of_rows[k[:n, :, None], place[:n, :, None], place[:n, None]]
 
 
