@@ -192,18 +192,20 @@ def estimate_disturbed_intervals(base: Problem, found: NoiseEstimate) -> NoiseEs
     base : posed with stated noise and the parts of its intervals' noise.
     found : with all intervals alike.
     """
-    near, passes = found.linearisation(base), found.passes
+    start, near, passes = found.noise, found.linearisation(base), found.passes
     if found.noise.excluded:
         free = estimate_noise(base, None, replace(found.noise, excluded={}), near, intervals=True)
         decision = decide(base, free, find_spans(base, free.noise, free))
         passes = passes + free.passes + decision.passes + Counter(filter=1)
         if decision.noise.excluded:
-            start = replace(free.noise, excluded=decision.noise.excluded)
-            free = estimate_noise(base, None, start, free.linearisation(base), intervals=True)
+            without = replace(free.noise, excluded=decision.noise.excluded)
+            free = estimate_noise(base, None, without, free.linearisation(base), intervals=True)
             passes = passes + free.passes
         if _log_evidence(base, free) > _log_evidence(base, found):
             return replace(free, passes=passes)
-    disturbed = estimate_noise(base, None, found.noise, near, intervals=True)
+        if free.noise.excluded == found.noise.excluded:  # the same model, already on its way
+            start, near = free.noise, free.linearisation(base)
+    disturbed = estimate_noise(base, None, start, near, intervals=True)
     return replace(disturbed, passes=passes + disturbed.passes)
 
 
@@ -264,7 +266,9 @@ def decide(
         for kinds, some in inside.items()
     }
     among = [kinds for kinds in among if kinds not in _SINGLE or any(outliers[kinds])]
-    weighted = {kinds: with_weights(used, outside | inside[kinds]) for kinds in (*ONE_SENSOR, ROWS)}
+    weighted: dict[Explanation, Problem] = {
+        kinds: with_weights(used, outside | inside[kinds]) for kinds in (*ONE_SENSOR, ROWS)
+    }
     if INTERVALS in among:
         weighted[INTERVALS] = with_noise(base, replace(noise, weights=outside | inside[INTERVALS]))
     before, likelihood, passes = evidence(used, found.carry_points(base, used), spans, weighted, among)
