@@ -257,17 +257,21 @@ def filter_rows(
 def divide_covariance(P: Array, X: Array) -> None:
     """X (D, n) <- P^-1 X by Cholesky's root of P (D, D)."""
     L = np.linalg.cholesky(P)
-    D = len(L)
+    D, n = X.shape
     for i in range(D):
-        own = X[i]
         for j in range(i):
-            own -= L[i, j] * X[j]
-        own /= L[i, i]
+            x = L[i, j]
+            for c in range(n):
+                X[i, c] -= x * X[j, c]
+        for c in range(n):
+            X[i, c] /= L[i, i]
     for i in range(D - 1, -1, -1):
-        own = X[i]
         for j in range(i + 1, D):
-            own -= L[j, i] * X[j]
-        own /= L[i, i]
+            x = L[j, i]
+            for c in range(n):
+                X[i, c] -= x * X[j, c]
+        for c in range(n):
+            X[i, c] /= L[i, i]
 
 
 @compiled
