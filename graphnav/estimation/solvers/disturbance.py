@@ -30,15 +30,13 @@ def step_back(F: Array, decay: Array, N: Array) -> Array:
             for j in range(D):
                 one[i, j] += top[i, j]
     left = np.dot(np.ascontiguousarray(one[:, :MOVING]), moving)
-    for i in range(D):
-        for j in range(MOVING):
-            out[i, j] = left[i, j]
-        for j in range(MOVING, DIM):
-            out[i, j] = one[i, j] + left[i, j]
-        for j in range(DIM, D):
-            out[i, j] = one[i, j] * decay[j - DIM]
-        for j in range(DIM, w):
-            out[i, j] += left[i, j]
+    for j in range(D):
+        d = 0.0 if j < MOVING else 1.0 if j < DIM else decay[j - DIM]
+        for i in range(j, D):
+            x = d * one[i, j]
+            if j < w:
+                x += left[i, j]
+            out[i, j] = out[j, i] = x
     return out
 
 
@@ -62,7 +60,7 @@ def take_back(N: Array, H: Array, Kt: Array, inverse: Array, lossy: bool) -> tup
         # from one side after the other: after a first fix what is left of N is smaller by ten orders each time
         out = N - np.dot(G.T, H)
         out += np.dot(H.T, np.dot(inverse, H) - np.dot(Kt, out))
-        return out, D
+        return 0.5 * (out + out.T), D
     out = np.dot(H.T, G - 0.5 * np.dot(D, H))
     for i in range(len(N)):
         for j in range(i + 1):
@@ -148,7 +146,6 @@ def smooth_rows(
                 HP = np.dot(own, P_behind)
                 of_rows[k, lo:hi, lo:hi] = np.dot(HP, own.T) - np.dot(np.dot(HP, N_behind), HP.T)
         np.positive(r_k, r[k])
-        N_k = 0.5 * (N_k + N_k.T)
         np.positive(N_k[:DIM, :DIM], N[k])
         for i in range(len(r_k)):
             N_diagonal[k, i] = N_k[i, i]
