@@ -57,23 +57,28 @@ class Drive:
         out = {name: np.zeros((n, D)) for name in ("ahead", "errors", "r", "smoothed", "N_diagonal", "variance")}
         out |= {name: np.zeros((n, D, D)) for name in ("P_ahead", "P", "P_smoothed")}
         out |= {name: np.zeros((n, ROWS, ROWS)) for name in ("root", "inverse", "of_rows")}
-        out |= {name: np.zeros((n, ROWS)) for name in ("solved", "bent", "w", "spread")}
+        out |= {name: np.zeros((n, ROWS)) for name in ("solved", "bent", "w")}
         out |= {"Kt": np.zeros((n, ROWS, D)), "N": np.zeros((n, DIM, DIM))}
         (taken, lossy), blocks = np.zeros((2, 2 * n), dtype=bool), self.blocks
         recursion.filter_rows(
             0, n, self.e, self.P, self.F, self.decay, self.gap, self.Q, self.added, self.r, self.H, self.variance,
             self.scale, blocks, self.used, out["ahead"], out["P_ahead"], out["errors"], out["P"],
-            out["root"], out["solved"], out["bent"], out["Kt"], out["w"], out["inverse"], out["spread"],
+            out["root"], out["solved"], out["bent"], out["Kt"], out["w"], out["inverse"],
             taken, lossy, np.zeros(1, dtype=int),
         )  # fmt: skip
         for P_smoothed in (out["P_smoothed"], np.empty((0, D, D))):
             disturbance.smooth_rows(
                 0, n, np.zeros(D), np.zeros((D, D)), self.F, self.decay, out["Kt"], self.H, out["w"], out["inverse"],
-                out["spread"], blocks.first, blocks.begin, blocks.end, taken, lossy,
+                blocks.first, blocks.begin, blocks.end, taken, lossy,
                 out["ahead"], out["P_ahead"], out["errors"], out["P"], np.tile(np.arange(D), n), D * np.arange(n + 1),
-                out["r"], out["N"], out["N_diagonal"], out["smoothed"], P_smoothed, out["variance"], out["of_rows"],
+                out["r"], out["N"], out["N_diagonal"], out["smoothed"], P_smoothed, out["variance"],
+                2.0 * self.H, out["of_rows"],
             )  # fmt: skip
-        out |= {"taken": taken, "lossy": lossy}
+        out |= {"taken": taken, "lossy": lossy, "errors_alone": np.zeros((n, D))}
+        disturbance.smooth_errors(
+            self.F, self.decay, out["Kt"], self.H, out["w"], blocks.first, blocks.begin, blocks.end, taken,
+            out["ahead"], out["P_ahead"], out["errors"], out["P"], out["errors_alone"],
+        )  # fmt: skip
         # small, so that turns add up
         moved = 1e-6 * (out["errors"] - out["ahead"])
         half = np.concatenate([np.ones((n, 1)), 0.5 * moved[:, :3]], axis=1)
@@ -118,9 +123,9 @@ def test_filter_and_smoother_are_one_update_of_the_whole_drive() -> None:
     for k in range(n):
         np.testing.assert_allclose(found["P_smoothed"][k], blocks[k, :, k], atol=1e-8)
         np.testing.assert_allclose(found["variance"][k], np.diag(blocks[k, :, k]), atol=1e-8)
-        for lo, hi in ((0, 3), (3, ROWS)):
-            own = drive.H[k, lo:hi]
-            np.testing.assert_allclose(found["of_rows"][k, lo:hi, lo:hi], own @ blocks[k, :, k] @ own.T, atol=1e-8)
+        own = 2.0 * drive.H[k]
+        np.testing.assert_allclose(found["of_rows"][k], own @ blocks[k, :, k] @ own.T, atol=1e-8)
+    np.testing.assert_allclose(found["errors_alone"], found["smoothed"], atol=1e-12)
 
 
 @pytest.mark.parametrize("prior", [1.0, 1e8])

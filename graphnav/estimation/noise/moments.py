@@ -29,7 +29,7 @@ from graphnav.constraints.base import Constraint
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM
 from graphnav.estimation.problem import ParameterChain, Problem
-from graphnav.estimation.solvers.linearise import linearise, shift, stepping
+from graphnav.estimation.solvers.linearise import shift, stepping
 from graphnav.estimation.solvers.passes import DisturbancePass, ForwardRecord, values_of
 
 _FORGOTTEN = 1e-6  # share of a value that is left of it, below which what is left is lost in rounding
@@ -93,9 +93,8 @@ def process_moments(
 
 def row_moments(problem: Problem, rows: Constraint, smoothed: DisturbancePass, n: int) -> RowMoments:
     """Of the first n rows of a constraint."""
-    at, which = rows.keyframe[:n], slice(0, n)
-    values = values_of(problem, smoothed)
-    linear = linearise(rows, smoothed, problem.columns, which)
+    at, values = rows.keyframe[:n], values_of(problem, smoothed)
+    linear = smoothed.linearise(problem, rows, n)
     HPH = smoothed.cover_rows(linear, n)
     w = np.ones((n, 1)) if rows.weight is None else rows.weight[:n, None]
     R = linear.stated**2

@@ -1,9 +1,7 @@
 """The disturbance smoother of a filter linearised at given points, on arrays alone: compiled where Numba is there.
 
-With K the gain and N that behind an update, what an update leaves of a residual e, u = S^-1 nu - K^T r, has the
-covariance D = S^-1 + K^T N K (de Jong 1989; Koopman 1993): the smoothed e is R u, and H P^s H^T = R - R D R. So the
-covariances of residuals, which variances are estimated by, are known without those of the states. Steps and rows are as
-in `graphnav.estimation.solvers.recursion`.
+Bryson and Frazier (1963); de Jong (1989); Koopman (1993). Steps and rows are as in
+`graphnav.estimation.solvers.recursion`.
 """
 
 from __future__ import annotations
@@ -52,20 +50,51 @@ def step_vector_back(F: Array, decay: Array, r: Array) -> Array:
 
 
 @compiled
-def take_back(N: Array, H: Array, Kt: Array, inverse: Array, lossy: bool) -> tuple[Array, Array]:
-    """N (D, D) before an update from that behind it, and D = S^-1 + K^T N K (m, m)."""
+def take_back(N: Array, H: Array, Kt: Array, inverse: Array, lossy: bool) -> Array:
+    """N (D, D) before an update from that behind it."""
     G = np.dot(Kt, N)
-    D = inverse + np.dot(G, Kt.T)
     if lossy:
         # from one side after the other: after a first fix what is left of N is smaller by ten orders each time
         out = N - np.dot(G.T, H)
         out += np.dot(H.T, np.dot(inverse, H) - np.dot(Kt, out))
-        return 0.5 * (out + out.T), D
-    out = np.dot(H.T, G - 0.5 * np.dot(D, H))
+        return 0.5 * (out + out.T)
+    G -= 0.5 * np.dot(inverse + np.dot(G, Kt.T), H)
+    out = np.dot(H.T, G)
     for i in range(len(N)):
         for j in range(i + 1):
             out[i, j] = out[j, i] = N[i, j] - out[i, j] - out[j, i]
-    return out, D
+    return out
+
+
+@compiled
+def smooth_errors(
+    F: Array,
+    decay: Array,
+    Kt: Array,
+    H: Array,
+    w: Array,
+    first: Array,
+    begin: Array,
+    end: Array,
+    taken: Array,
+    errors_predicted: Array,
+    P_predicted: Array,
+    errors: Array,
+    P: Array,
+    smoothed: Array,
+) -> None:
+    """Errors (n, D) of the smoother at all keyframes, as `smooth_rows` has them, and nothing else of it."""
+    r, last = np.zeros(errors.shape[1]), len(errors) - 1
+    for k in range(last, -1, -1):
+        if k < last:
+            r = step_vector_back(F[k], decay[k], r)
+            np.add(errors[k], np.dot(P[k], r), smoothed[k])
+        for b in range(first[k + 1] - 1, first[k] - 1, -1):
+            if taken[b]:
+                lo, hi = begin[b], end[b]
+                r = r + np.dot(w[k, lo:hi] - np.dot(Kt[k, lo:hi], r), H[k, lo:hi])
+        if k == last:
+            np.add(errors_predicted[k], np.dot(P_predicted[k % len(P_predicted)], r), smoothed[k])
 
 
 @compiled
@@ -80,7 +109,6 @@ def smooth_rows(
     H: Array,
     w: Array,
     inverse: Array,
-    spread: Array,
     first: Array,
     begin: Array,
     end: Array,
@@ -98,6 +126,7 @@ def smooth_rows(
     smoothed: Array,
     P_smoothed: Array,
     variance: Array,
+    asked: Array,
     of_rows: Array,
 ) -> tuple[Array, Array]:
     """r (n, D), and of N the states' part (n, 15, 15) and the diagonal (n, D), of keyframes k1 - 1 down to k0.
@@ -108,10 +137,11 @@ def smooth_rows(
 
     Parameters
     ----------
-    Kt, H, w, inverse, spread : of the updates: gains transposed, rows, S^-1 nu, S^-1, and the variances of the rows.
+    Kt, H, w, inverse : of the updates: gains transposed, rows, S^-1 nu and S^-1.
     taken, lossy : (B,) whether a block was taken in, and whether with a loss of digits.
     P_smoothed : (n, D, D), filled with covariances of the smoother, if it has any keyframes. If it has none,
-    variance, of_rows : (n, D), (n, M, M), filled with variances and with H P^s H^T.
+    variance : (n, D), and
+    of_rows : (n, M, M), filled with variances, and with H P^s H^T of rows `asked` (n, M, D).
     wanted, first_wanted : columns of which variances are wanted, those of keyframe k from `first_wanted[k]` on.
     """
     whole = len(P_smoothed) > 0
@@ -121,30 +151,18 @@ def smooth_rows(
             r_k = step_vector_back(F[k], decay[k], r_k)
             N_k = step_back(F[k], decay[k], N_k)
             np.add(errors[k], np.dot(P[k], r_k), smoothed[k])
-            N_behind, P_behind = N_k, P[k]
             if whole:
                 cover(P[k], N_k, P_smoothed[k])
             else:
                 vary(P[k], N_k, wanted[first_wanted[k] : first_wanted[k + 1]], variance[k])
-        else:
-            N_behind, P_behind = N_k, P[k]
+                if first[k] < first[k + 1]:
+                    cover_rows(P[k], N_k, asked[k, : end[first[k + 1] - 1]], of_rows[k])
         for b in range(first[k + 1] - 1, first[k] - 1, -1):
-            lo, hi = begin[b], end[b]
-            own = H[k, lo:hi]
             if taken[b]:
-                gain = Kt[k, lo:hi]
+                lo, hi = begin[b], end[b]
+                own, gain = H[k, lo:hi], Kt[k, lo:hi]
                 r_k = r_k + np.dot(w[k, lo:hi] - np.dot(gain, r_k), own)
-                inverse_b = np.ascontiguousarray(inverse[k, lo:hi, lo:hi])
-                N_k, D = take_back(N_k, own, gain, inverse_b, lossy[b])
-                if not whole:
-                    R = spread[k, lo:hi]
-                    for i in range(hi - lo):
-                        for j in range(hi - lo):
-                            of_rows[k, lo + i, lo + j] = -R[i] * D[i, j] * R[j]
-                        of_rows[k, lo + i, lo + i] += R[i]
-            elif not whole:
-                HP = np.dot(own, P_behind)
-                of_rows[k, lo:hi, lo:hi] = np.dot(HP, own.T) - np.dot(np.dot(HP, N_behind), HP.T)
+                N_k = take_back(N_k, own, gain, np.ascontiguousarray(inverse[k, lo:hi, lo:hi]), lossy[b])
         np.positive(r_k, r[k])
         np.positive(N_k[:DIM, :DIM], N[k])
         for i in range(len(r_k)):
@@ -156,6 +174,8 @@ def smooth_rows(
                 cover(ahead_P, N_k, P_smoothed[k])
             else:
                 vary(ahead_P, N_k, wanted[first_wanted[k] : first_wanted[k + 1]], variance[k])
+                if first[k] < first[k + 1]:
+                    cover_rows(ahead_P, N_k, asked[k, : end[first[k + 1] - 1]], of_rows[k])
     return r_k, N_k
 
 
@@ -175,6 +195,13 @@ def vary(P: Array, N: Array, columns: Array, out: Array) -> None:
     PN = np.dot(own, N)
     for i in range(len(columns)):
         out[columns[i]] = own[i, columns[i]] - np.dot(PN[i], own[i])
+
+
+@compiled
+def cover_rows(P: Array, N: Array, H: Array, out: Array) -> None:
+    """H (P - P N P) H^T of rows H (m, D), in the first of `out` (M, M)."""
+    m, HP = len(H), np.dot(H, P)
+    out[:m, :m] = np.dot(HP, H.T) - np.dot(np.dot(HP, N), HP.T)
 
 
 @compiled

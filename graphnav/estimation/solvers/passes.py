@@ -40,8 +40,12 @@ class DisturbancePass(Points):
         """(K, D) of the errors; of those of parameters without a correlation time it may be unknown."""
         raise NotImplementedError
 
+    def linearise(self, problem: Problem, rows: Constraint, n: int) -> Rows:
+        """The first n rows of a constraint at the smoothed points."""
+        return linearise(rows, self, problem.columns, slice(0, n))
+
     def cover_rows(self, linear: Rows, n: int) -> Array:
-        """H P^s H^T (n, m, m) of the first n rows of a constraint, linearised."""
+        """H P^s H^T (n, m, m) of the first n rows of a constraint, linearised at the smoothed points."""
         raise NotImplementedError
 
 
@@ -64,12 +68,18 @@ class MomentPass(DisturbancePass):
     """A backward pass with those covariances only that a noise model is estimated by: at half the price."""
 
     variances: Array  # (n, D), of parameters with a correlation time
-    of_rows: Array  # (n, M, M) H P^s H^T, where each row stands
+    linear: dict[str, Rows]  # of constraints with variance components, linearised at the smoothed points
+    of_rows: Array  # (n, M, M) H P^s H^T, where each of these stands
     places: dict[str, tuple[Array, Array]]
 
     @property
     def variance(self) -> Array:
         return self.variances
+
+    def linearise(self, problem: Problem, rows: Constraint, n: int) -> Rows:
+        own = self.linear.get(rows.name)
+        same = own is not None and own.constraint is rows and len(own.residual) == n
+        return own if own is not None and same else super().linearise(problem, rows, n)
 
     def cover_rows(self, linear: Rows, n: int) -> Array:
         k, place = self.places[linear.constraint.name]
@@ -85,7 +95,6 @@ class Updates:
     H: Array  # (n, M, D)
     w: Array  # (n, M) S^-1 nu
     inverse: Array  # (n, M, M) S^-1
-    spread: Array  # (n, M) variances of the rows, with the weights of kernels
     taken: Array  # (B,) whether a block was taken in
     lossy: Array  # (B,) whether with a loss of digits, but for Joseph's form
     places: dict[str, tuple[Array, Array]]  # of each constraint's rows, as `graphnav.estimation.solvers.stack` has them
@@ -95,9 +104,7 @@ class Updates:
         """None yet, of rows H (n, M, D)."""
         n, M, _ = H.shape
         taken, lossy = np.zeros((2, len(blocks.begin)), dtype=bool)
-        return cls(
-            blocks, np.zeros_like(H), H, np.zeros((n, M)), np.zeros((n, M, M)), np.ones((n, M)), taken, lossy, places
-        )
+        return cls(blocks, np.zeros_like(H), H, np.zeros((n, M)), np.zeros((n, M, M)), taken, lossy, places)
 
 
 @dataclass(frozen=True)

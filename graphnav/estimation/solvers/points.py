@@ -144,7 +144,7 @@ class PointFilter:
                 k0, k1, e, P, self.F, self._steps.decay, self.gap, self.Q, self._steps.added,
                 self.r, self.H, self.variance, stack.scale[:n], stack.joint, self.used,
                 out.predicted, out.P_predicted, out.filtered, out.P,
-                stack.root, stack.solved, stack.bent, updates.Kt, updates.w, updates.inverse, updates.spread,
+                stack.root, stack.solved, stack.bent, updates.Kt, updates.w, updates.inverse,
                 updates.taken, updates.lossy, self._at,
             )  # fmt: skip
         except np.linalg.LinAlgError:
@@ -166,7 +166,7 @@ def filter_likelihood(
             0, n, *start, one.F, steps.decay, one.gap, one.noise(problem, points), steps.added,
             one.r, one.H, (one.sigma / stack.root_weight) ** 2, stack.scale, stack.joint, stack.joint.used,
             e[0], P[0], e[1], P[1], stack.root, stack.solved, stack.bent,
-            np.empty((0, M, D)), np.empty((0, M)), np.empty((0, M, M)), np.empty((0, M)), taken, lossy, at,
+            np.empty((0, M, D)), np.empty((0, M)), np.empty((0, M, M)), taken, lossy, at,
         )  # fmt: skip
     except np.linalg.LinAlgError:
         raise explain_rows(stack.block(int(at[0])).parts) from None

@@ -181,7 +181,6 @@ def filter_rows(
     Kt: Array,
     w: Array,
     inverse: Array,
-    spread: Array,
     taken: Array,
     lossy: Array,
     at: Array,
@@ -198,8 +197,8 @@ def filter_rows(
     bent : (n, M), filled with weights of kernels, 0 of rows that a gate refuses.
     errors_predicted, P_predicted, errors, P_filtered : filled with what is predicted and filtered; of fewer than n,
         but two at least that are predicted, those of the last keyframes are left.
-    Kt, w, inverse, spread : (n, M, D), (n, M), (n, M, M), (n, M), filled with gains transposed, S^-1 nu, S^-1, and the
-        variances with the kernels' weights; without a row, if nobody will ask.
+    Kt, w, inverse : (n, M, D), (n, M), (n, M, M), filled with gains transposed, S^-1 nu and S^-1; without a row, if
+        nobody will ask.
     taken, lossy : (B,), filled with whether a block was taken in, and whether P - W^T W would have lost digits.
     at : (1,), the block that is taken in.
     """
@@ -246,7 +245,6 @@ def filter_rows(
                     np.negative(w_b, w[k, lo:hi])
                 if told:
                     np.positive(np.dot(one.T, one), inverse[k, lo:hi, lo:hi])
-                    np.positive(R, spread[k, lo:hi])
                 e = e - np.dot(white, W)
                 P = update(P, HP, own, Kt_b, R) if lossy[b] else reduce(P, W)
         np.positive(e, errors[k % len(errors)])

@@ -29,8 +29,8 @@ from graphnav.estimation.dense import dense
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import Solution
 from graphnav.estimation.solvers.breakdown import explain_smoother
-from graphnav.estimation.solvers.disturbance import smooth_rows
-from graphnav.estimation.solvers.linearise import scale_at, stepping
+from graphnav.estimation.solvers.disturbance import smooth_errors, smooth_rows
+from graphnav.estimation.solvers.linearise import linearise, scale_at, stepping
 from graphnav.estimation.solvers.passes import (
     FilterPass,
     ForwardRecord,
@@ -69,7 +69,7 @@ def backward(problem: Problem, forward: ForwardRecord, progress: Progress | None
             behind = inverse @ away, inverse @ (ahead - P[end]) @ inverse
             found.put(end, *behind)
         if forward.updates is not None:
-            _smooth_points(forward, forward.updates, behind, end, found, np.empty((K, 0), dtype=bool), P, progress)
+            _smooth_points(forward, forward.updates, behind, end, found, P, progress=progress)
             _restore_digits(forward, P, end)
         first = move_points(forward.about.first(end), found.errors[:end])
         values[:end] = first.values
@@ -84,15 +84,26 @@ def backward_moments(problem: Problem, forward: ForwardRecord) -> MomentPass:
     assert forward.updates is not None
     assert len(forward.about.values) == K
     found, behind = _Disturbances.allocate(K, D), (np.zeros(D), np.zeros((D, D)))
+    one, blocks = forward.updates, forward.updates.blocks
+    smooth_errors(
+        forward.F, forward.decay, one.Kt, one.H, one.w, blocks.first, blocks.begin, blocks.end, one.taken,
+        forward.errors_predicted, forward.P_predicted, forward.errors, forward.P, found.errors,
+    )  # fmt: skip
+    smoothed = move_points(forward.about, found.errors)
+    linear, asked = {}, np.zeros_like(one.H)
+    for rows in problem.constraints:
+        if rows.noise_groups()[0]:
+            which = slice(0, int(np.searchsorted(rows.keyframe, K)))
+            linear[rows.name] = linearise(rows, smoothed, problem.columns, which)
+            asked[one.places[rows.name]] = linear[rows.name].H
     wanted = np.zeros((K, D), dtype=bool)  # at both ends of their steps
     for chain in problem.chains:
         if chain.parameter.correlation_time is not None:
             k, own = stepping(chain, K), problem.columns[chain.parameter.name]
             wanted[k, own] = wanted[k - 1, own] = True
-    variance, of_rows = _smooth_points(forward, forward.updates, behind, K, found, wanted, np.empty((0, D, D)))
-    smoothed = move_points(forward.about, found.errors)
+    variance, of_rows = _smooth_points(forward, one, behind, K, found, np.empty((0, D, D)), wanted, asked)
     return MomentPass(
-        smoothed.states, smoothed.values, found.r, found.N, found.N_diagonal, variance, of_rows, forward.updates.places
+        smoothed.states, smoothed.values, found.r, found.N, found.N_diagonal, variance, linear, of_rows, one.places
     )
 
 
@@ -144,25 +155,28 @@ def _smooth_points(
     behind: tuple[Array, Array],
     end: int,
     out: _Disturbances,
-    wanted: Array,
     P: Array,
+    wanted: Array | None = None,
+    asked: Array | None = None,
     progress: Progress | None = None,
 ) -> tuple[Array, Array]:
     """Smoothed errors, covariances, r and N of the first keyframes up to `end`, from r and N behind them.
 
-    Where P has no keyframes, variances (end, D) of the columns `wanted` (K, D), and H P^s H^T (end, M, M).
+    Where P has no keyframes, variances (end, D) of the columns `wanted` (K, D), and H P^s H^T (end, M, M) of rows
+    `asked` (K, M, D).
     """
     blocks, (r_k, N_k) = one.blocks, behind
-    n, M, D = one.H.shape if not len(P) else (0, 0, 0)
-    variance, of_rows = np.zeros((n, D)), np.zeros((n, M, M))
+    wanted = np.zeros((0, 0), dtype=bool) if wanted is None else wanted
+    asked = np.empty((0, 0, 0)) if asked is None else asked
+    variance, of_rows = np.zeros(wanted.shape), np.zeros((len(asked), *asked.shape[1:2] * 2))
     columns, first = np.nonzero(wanted)[1], np.append(0, np.cumsum(wanted.sum(axis=1)))
     for hi in range(end, 0, -STRETCH):
         lo = max(hi - STRETCH, 0)
         r_k, N_k = smooth_rows(
-            lo, hi, r_k, N_k, forward.F, forward.decay, one.Kt, one.H, one.w, one.inverse, one.spread,
+            lo, hi, r_k, N_k, forward.F, forward.decay, one.Kt, one.H, one.w, one.inverse,
             blocks.first, blocks.begin, blocks.end, one.taken, one.lossy,
             forward.errors_predicted, forward.P_predicted, forward.errors, forward.P, columns, first,
-            out.r, out.N, out.N_diagonal, out.errors, P, variance, of_rows,
+            out.r, out.N, out.N_diagonal, out.errors, P, variance, asked, of_rows,
         )  # fmt: skip
         if progress is not None:
             progress("smoother", 1.0 - lo / len(forward.P))

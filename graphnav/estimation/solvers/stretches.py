@@ -149,7 +149,7 @@ class StretchFilter:
             r, H, (sigma / stack.root_weight[own]) ** 2, stack.scale[own],
             blocks._replace(first=blocks.first[own.start : k1 + 1]), blocks.used,
             predicted, self._P_predicted[own], errors, self._P[own],
-            stack.root[own], stack.solved[own], stack.bent[own], Kt, w, np.empty((0, 0, 0)), np.empty((0, 0)),
+            stack.root[own], stack.solved[own], stack.bent[own], Kt, w, np.empty((0, 0, 0)),
             self._taken, self._lossy, self._at,
         )  # fmt: skip
         self._P[k:k1] = turn(self._P[k:k1], np.ascontiguousarray(T[end]))
