@@ -255,7 +255,7 @@ def _splice(about: Points, part: Points) -> Points:
     """Points with the first ones replaced."""
     n = len(part.values)
     if n == len(about.values):
-        return Points(part.states, part.values)
+        return part
     states = type(part.states).stack([part.states, about.states[n:]])
     return Points(states, np.concatenate([part.values, about.values[n:]]))
 

@@ -94,7 +94,7 @@ def process_moments(
 def row_moments(problem: Problem, rows: Constraint, smoothed: DisturbancePass, n: int) -> RowMoments:
     """Of the first n rows of a constraint."""
     at, values = rows.keyframe[:n], values_of(problem, smoothed)
-    linear = smoothed.linearise(problem, rows, n)
+    linear = smoothed.linearise(rows, problem.columns, n)
     HPH = smoothed.cover_rows(linear, n)
     w = np.ones((n, 1)) if rows.weight is None else rows.weight[:n, None]
     R = linear.stated**2

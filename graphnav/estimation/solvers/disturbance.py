@@ -201,7 +201,7 @@ def vary(P: Array, N: Array, columns: Array, out: Array) -> None:
 def cover_rows(P: Array, N: Array, H: Array, out: Array) -> None:
     """H (P - P N P) H^T of rows H (m, D), in the first of `out` (M, M)."""
     m, HP = len(H), np.dot(H, P)
-    out[:m, :m] = np.dot(HP, H.T) - np.dot(np.dot(HP, N), HP.T)
+    out[:m, :m] = np.dot(H - np.dot(HP, N), HP.T)
 
 
 @compiled

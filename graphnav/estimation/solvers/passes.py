@@ -14,7 +14,7 @@ from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import ConstraintRecord, ParameterEstimate, Solution
 from graphnav.estimation.solvers.disturbance import row_covariances
 from graphnav.estimation.solvers.invariant import minus_invariant, plus_invariant
-from graphnav.estimation.solvers.linearise import Points, Rows, find_last_keyframes, linearise, shift
+from graphnav.estimation.solvers.linearise import Columns, Points, Rows, find_last_keyframes, linearise, shift
 from graphnav.estimation.solvers.recursion import Blocks
 from graphnav.estimation.solvers.robust import weight_and_cost
 from graphnav.estimation.solvers.stack import Innovations
@@ -39,10 +39,6 @@ class DisturbancePass(Points):
     def variance(self) -> Array:
         """(K, D) of the errors; of those of parameters without a correlation time it may be unknown."""
         raise NotImplementedError
-
-    def linearise(self, problem: Problem, rows: Constraint, n: int) -> Rows:
-        """The first n rows of a constraint at the smoothed points."""
-        return linearise(rows, self, problem.columns, slice(0, n))
 
     def cover_rows(self, linear: Rows, n: int) -> Array:
         """H P^s H^T (n, m, m) of the first n rows of a constraint, linearised at the smoothed points."""
@@ -76,10 +72,11 @@ class MomentPass(DisturbancePass):
     def variance(self) -> Array:
         return self.variances
 
-    def linearise(self, problem: Problem, rows: Constraint, n: int) -> Rows:
-        own = self.linear.get(rows.name)
-        same = own is not None and own.constraint is rows and len(own.residual) == n
-        return own if own is not None and same else super().linearise(problem, rows, n)
+    def linearise(self, constraint: Constraint, columns: Columns, n: int) -> Rows:
+        own = self.linear.get(constraint.name)
+        if own is None or own.columns != columns or own.constraint.keyframe is not constraint.keyframe:
+            return super().linearise(constraint, columns, n)
+        return own.restate(constraint) if len(own.residual) == n else super().linearise(constraint, columns, n)
 
     def cover_rows(self, linear: Rows, n: int) -> Array:
         k, place = self.places[linear.constraint.name]

@@ -64,8 +64,14 @@ class Linearisation:
         gap = np.concatenate([ahead.minus(end), values - points.values[1:]], axis=1)
         turned = rotation.right_jacobian_inverse(gap[:, :3])
         F[:, :3] = turned @ F[:, :3]
-        of_rows = {rows.name: rows.keyframe for rows in problem.constraints}
-        return cls(problem.columns, F, gap, turned, *linearise_all(problem, stack, points, slice(0, n), of_rows))
+        r, sigma = np.zeros((n, stack.M)), np.ones((n, stack.M))
+        H = np.zeros((n, stack.M, DIM + points.values.shape[1]))
+        for rows in problem.constraints:
+            count = int(rows.keyframe.searchsorted(n))
+            place = stack.places[rows.name][0][:count], stack.places[rows.name][1][:count]
+            linear = points.linearise(rows, problem.columns, count)
+            r[place], sigma[place], H[place] = linear.residual, linear.stated, linear.H
+        return cls(problem.columns, F, gap, turned, r, sigma, H)
 
     def lift(self, problem: Problem, points: Points, stack: Stack, anew: Collection[str]) -> Linearisation:
         """Of a problem that differs from this one by the rows of some constraints, and has all of its parameters."""
@@ -187,9 +193,9 @@ def linearise_all(
     points: Points,
     own: slice,
     of_rows: Mapping[str, Array],
-    first: int = 0,
-    offset: int = 0,
-    moved: tuple[Array, Array] | None = None,
+    first: int,
+    offset: int,
+    moved: tuple[Array, Array],
 ) -> tuple[Array, Array, Array]:
     """Residuals, sigmas (n, M) and Jacobians (n, M, D) of the rows of keyframes `own`, from keyframe `first` on.
 
@@ -198,7 +204,7 @@ def linearise_all(
     of_rows : of each constraint the point that each row is at, less `offset`.
     moved : T (n, 9, 9) and m (n, D), where the errors about a point are T (y - m) of the errors y that rows are about.
     """
-    n = own.stop - own.start
+    n, (T, m) = own.stop - own.start, moved
     r, sigma = np.zeros((n, stack.M)), np.ones((n, stack.M))
     H = np.zeros((n, stack.M, DIM + points.values.shape[1]))
     for rows in problem.constraints:
@@ -207,11 +213,9 @@ def linearise_all(
             continue
         at = of_rows[rows.name][which] - offset
         linear = linearise(rows, points, problem.columns, which, at)
-        J, residual = linear.H, linear.residual
-        if moved is not None:
-            T, m = moved
-            J[:, :, :MOVING] = J[:, :, :MOVING] @ T[at]
-            residual = residual - mv(J, m[at])
+        J = linear.H
+        J[:, :, :MOVING] = J[:, :, :MOVING] @ T[at]
+        residual = linear.residual - mv(J, m[at])
         place = rows.keyframe[which, None] - own.start, stack.places[rows.name][1][which]
         r[place], sigma[place], H[place] = residual, linear.stated, J
     return r, sigma, H
