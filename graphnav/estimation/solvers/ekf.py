@@ -136,8 +136,8 @@ class Comparison:
     """
 
     def __init__(self, problem: Problem, about: Points) -> None:
-        self._K, self._steps = len(about.values), advance(problem, len(about.values))
-        self._one = Linearisation.of(problem, about, Stack(problem, self._K), self._steps)
+        self._K = len(about.values)
+        self._one = Linearisation.of(problem, about, Stack(problem, self._K), advance(problem, self._K))
 
     def log_likelihood(self, problem: Problem, about: Points, anew: Collection[str] = ()) -> Array:
         """(K,) as `ForwardRecord.log_likelihood`, by a problem with the same points of what both have.

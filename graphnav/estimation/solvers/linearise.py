@@ -88,6 +88,12 @@ class Rows:
         """(n, m, D) derivative of the residual."""
         return assemble(self.linear, self.columns, self.width)
 
+    @property
+    def states_sigmas(self) -> bool:
+        """Whether its sigmas are those of the constraint, whatever the point."""
+        sigma: Array = self.constraint.sigma  # type: ignore[attr-defined]
+        return bool(np.array_equal(self.stated, sigma[self.which]))
+
     def restate(self, constraint: Constraint) -> Rows:
         """The same of a constraint that a noise model has with other sigmas and weights."""
         sigma: Array = constraint.sigma  # type: ignore[attr-defined]

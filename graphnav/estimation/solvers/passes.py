@@ -76,7 +76,9 @@ class MomentPass(DisturbancePass):
         own = self.linear.get(constraint.name)
         if own is None or own.columns != columns or own.constraint.keyframe is not constraint.keyframe:
             return super().linearise(constraint, columns, n)
-        return own.restate(constraint) if len(own.residual) == n else super().linearise(constraint, columns, n)
+        if len(own.residual) != n or not own.states_sigmas:
+            return super().linearise(constraint, columns, n)
+        return own.restate(constraint)
 
     def cover_rows(self, linear: Rows, n: int) -> Array:
         k, place = self.places[linear.constraint.name]
