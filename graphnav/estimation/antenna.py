@@ -25,7 +25,9 @@ from graphnav.estimation.noise.estimate import estimate_noise
 from graphnav.estimation.pipeline import origin
 from graphnav.estimation.problem import build_problem
 from graphnav.estimation.solvers.breakdown import explain_singular
+from graphnav.estimation.solvers.ekf import refilter
 from graphnav.estimation.solvers.passes import parameters_of, sigmas_of
+from graphnav.estimation.solvers.rts import backward
 from graphnav.recording import Recording, take_rows
 
 _PRIOR_SIGMA = 2.0  # m, 1-sigma before the drive
@@ -179,14 +181,15 @@ def _estimate(recording: Recording) -> tuple[Antenna, tuple[Array, Array, Array]
     unknown = {"gnss": {"lever_arm_sigma": _PRIOR_SIGMA}, "vehicle": {"axle_sigma": _PRIOR_SIGMA}}
     sections = {name: getattr(settings, name).model_copy(update=values) for name, values in unknown.items()}
     settings = settings.model_copy(update=sections)
-    problem = build_problem(recording, settings, frame, aligned.state, aligned.sigma, still, parts_of_noise=True)
+    base = build_problem(recording, settings, frame, aligned.state, aligned.sigma, still, parts_of_noise=True)
     try:
         tell("noise")
-        found = estimate_noise(problem, aligned.until)
+        found = estimate_noise(base, aligned.until)
     except np.linalg.LinAlgError as error:
         raise explain_singular(error) from None
-    problem = with_noise(problem, found.noise)
-    parameters = parameters_of(problem, found.points.values, sigmas_of(found.points.P))
+    problem = with_noise(base, found.noise)
+    smoothed = backward(problem, refilter(problem, found.carry_points(base, problem)))
+    parameters = parameters_of(problem, smoothed.values, sigmas_of(smoothed.P))
     arm, axle = parameters["gnss_lever_arm"], parameters.get(AXLE)
     antenna = Antenna(recording.gnss.lever_arm, arm.value[-1], arm.sigma[-1])
     if axle is None or recording.odometer is None:

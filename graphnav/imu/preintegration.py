@@ -97,8 +97,9 @@ class Intervals:
 
     def with_noise(self, factors: Array) -> Intervals:
         """The intervals with the variances of `NOISE_FIGURES` multiplied by factors (4,) or (n, 4); needs `parts`."""
-        parts = factors[..., None, None] * self.parts
-        return replace(self, covariance=self.covariance + np.sum(parts - self.parts, axis=1), parts=parts)
+        flat = self.parts.reshape(*self.parts.shape[:2], -1)
+        more = ((factors - 1.0)[..., None, :] @ flat).reshape(self.covariance.shape)
+        return replace(self, covariance=self.covariance + more, parts=factors[..., None, None] * self.parts)
 
     def without_parts(self) -> Intervals:
         """The intervals without the contributions of each noise figure, to save memory."""

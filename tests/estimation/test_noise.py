@@ -39,7 +39,7 @@ from graphnav.estimation.solution import Solution
 from graphnav.estimation.solvers.ekf import ekf, refilter
 from graphnav.estimation.solvers.linearise import linearise
 from graphnav.estimation.solvers.passes import ForwardRecord, SmootherPass
-from graphnav.estimation.solvers.rts import backward, rts
+from graphnav.estimation.solvers.rts import backward, backward_moments, rts
 from graphnav.evaluation.scoring import errors
 from graphnav.imu.preintegration import NOISE_FIGURES, preintegrate
 from graphnav.recording import Recording
@@ -152,6 +152,31 @@ def mixed(base: Problem, opening: float | None) -> tuple[Problem, NoiseModel, Sm
     for _ in range(3):
         about = backward(used, refilter(used, about))
     return used, noise, about
+
+
+def test_a_pass_for_a_noise_model_says_what_one_with_all_covariances_says() -> None:
+    """Rows linearised where it leads, of other sigmas too, and the next pass by them."""
+    stated, opening = posed(lap())
+    base, noise, about = mixed(stated, opening)
+    whole = backward(base, refilter(base, about))
+    short = backward_moments(base, refilter(base, about, whole=False))
+    np.testing.assert_allclose(short.states.p, whole.states.p, atol=1e-9)
+    for chain in base.chains:
+        if chain.parameter.correlation_time is not None:
+            at = base.columns[chain.parameter.name]
+            np.testing.assert_allclose(short.variance[1:, at], whole.variance[1:, at], rtol=1e-6)
+    larger = {name: VarianceComponent(figure.log_factor + 1.0) for name, figure in noise.figures.items()}
+    for problem in (base, with_noise(stated, replace(noise, figures=larger))):
+        for rows in problem.constraints:
+            n = len(rows)
+            one, other = (some.linearise(rows, problem.columns, n) for some in (short, whole))
+            for name in ("residual", "stated", "H"):
+                np.testing.assert_allclose(getattr(one, name), getattr(other, name), atol=1e-8)
+            if rows.noise_groups()[0]:
+                found, expected = (some.cover_rows(other, n) for some in (short, whole))
+                np.testing.assert_allclose(found[1:], expected[1:], atol=1e-6 * np.min(other.stated) ** 2)
+        likelihood = [refilter(problem, some).log_likelihood.sum() for some in (short, whole)]
+        assert likelihood[0] == pytest.approx(likelihood[1], abs=1e-4)
 
 
 def test_lag_moments_are_the_derivative_of_the_likelihood_by_the_correlation_time() -> None:

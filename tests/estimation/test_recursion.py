@@ -13,7 +13,7 @@ import pytest
 from graphnav.core import rotation
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM
-from graphnav.estimation.solvers import recursion
+from graphnav.estimation.solvers import disturbance, recursion
 from graphnav.estimation.solvers.robust import weight_and_cost
 
 SCALE, PARAMETERS, KEYFRAMES, ROWS = 6, 5, 7, 8  # D = 26
@@ -28,7 +28,7 @@ class Drive:
         n, w = KEYFRAMES, DIM + SCALE
         self.F = np.zeros((n - 1, DIM, w))
         self.F[:, :, :DIM] = np.eye(DIM)
-        self.F += 0.1 * rng.standard_normal(self.F.shape)
+        self.F[:, : recursion.MOVING] += 0.1 * rng.standard_normal((n - 1, recursion.MOVING, w))
         self.decay, self.added = np.ones((n - 1, D - DIM)), np.zeros((n - 1, D - DIM))
         self.decay[::2, SCALE:], self.added[::2, SCALE:] = 0.8, 0.3
         half = rng.standard_normal((n - 1, DIM, DIM))
@@ -54,24 +54,31 @@ class Drive:
     def solved(self) -> dict[str, Array]:
         """Filter and smoother by the recursions."""
         n = KEYFRAMES
-        out = {name: np.zeros((n, D)) for name in ("ahead", "errors", "r", "smoothed")}
-        out |= {name: np.zeros((n, D, D)) for name in ("P_ahead", "P", "N", "P_smoothed")}
-        out |= {"root": np.zeros((n, ROWS, ROWS))}
+        out = {name: np.zeros((n, D)) for name in ("ahead", "errors", "r", "smoothed", "N_diagonal", "variance")}
+        out |= {name: np.zeros((n, D, D)) for name in ("P_ahead", "P", "P_smoothed")}
+        out |= {name: np.zeros((n, ROWS, ROWS)) for name in ("root", "inverse", "of_rows")}
         out |= {name: np.zeros((n, ROWS)) for name in ("solved", "bent", "w")}
-        out |= {name: np.zeros((n, ROWS, D)) for name in ("Kt", "SH")}
-        taken, blocks = np.zeros(2 * n, dtype=bool), self.blocks
+        out |= {"Kt": np.zeros((n, ROWS, D)), "N": np.zeros((n, DIM, DIM))}
+        (taken, lossy), blocks = np.zeros((2, 2 * n), dtype=bool), self.blocks
         recursion.filter_rows(
             0, n, self.e, self.P, self.F, self.decay, self.gap, self.Q, self.added, self.r, self.H, self.variance,
             self.scale, blocks, self.used, out["ahead"], out["P_ahead"], out["errors"], out["P"],
-            out["root"], out["solved"], out["bent"], out["Kt"], out["w"], out["SH"], taken, np.zeros(1, dtype=int),
+            out["root"], out["solved"], out["bent"], out["Kt"], out["w"], out["inverse"],
+            taken, lossy, np.zeros(1, dtype=int),
         )  # fmt: skip
-        recursion.smooth_rows(
-            0, n, np.zeros(D), np.zeros((D, D)), self.F, self.decay, out["Kt"], self.H, out["w"], out["SH"],
-            blocks.first, blocks.begin, blocks.end, taken,
-            out["ahead"], out["P_ahead"], out["errors"], out["P"],
-            out["r"], out["N"], out["smoothed"], out["P_smoothed"],
+        for P_smoothed in (out["P_smoothed"], np.empty((0, D, D))):
+            disturbance.smooth_rows(
+                0, n, np.zeros(D), np.zeros((D, D)), self.F, self.decay, out["Kt"], self.H, out["w"], out["inverse"],
+                blocks.first, blocks.begin, blocks.end, taken, lossy,
+                out["ahead"], out["P_ahead"], out["errors"], out["P"], np.tile(np.arange(D), n), D * np.arange(n + 1),
+                out["r"], out["N"], out["N_diagonal"], out["smoothed"], P_smoothed, out["variance"],
+                2.0 * self.H, out["of_rows"],
+            )  # fmt: skip
+        out |= {"taken": taken, "lossy": lossy, "errors_alone": np.zeros((n, D))}
+        disturbance.smooth_errors(
+            self.F, self.decay, out["Kt"], self.H, out["w"], blocks.first, blocks.begin, blocks.end, taken,
+            out["ahead"], out["P_ahead"], out["errors"], out["P"], out["errors_alone"],
         )  # fmt: skip
-        out["taken"] = taken
         # small, so that turns add up
         moved = 1e-6 * (out["errors"] - out["ahead"])
         half = np.concatenate([np.ones((n, 1)), 0.5 * moved[:, :3]], axis=1)
@@ -115,6 +122,27 @@ def test_filter_and_smoother_are_one_update_of_the_whole_drive() -> None:
     np.testing.assert_allclose(found["P_back"], found["P_smoothed"], atol=1e-8)
     for k in range(n):
         np.testing.assert_allclose(found["P_smoothed"][k], blocks[k, :, k], atol=1e-8)
+        np.testing.assert_allclose(found["variance"][k], np.diag(blocks[k, :, k]), atol=1e-8)
+        own = 2.0 * drive.H[k]
+        np.testing.assert_allclose(found["of_rows"][k], own @ blocks[k, :, k] @ own.T, atol=1e-8)
+    np.testing.assert_allclose(found["errors_alone"], found["smoothed"], atol=1e-12)
+
+
+@pytest.mark.parametrize("prior", [1.0, 1e8])
+def test_both_forms_of_an_update_are_the_same_where_no_digits_are_lost(prior: float) -> None:
+    """Beside H P H^T = R - R S^-1 R of what is left, which loses none."""
+    drive = Drive()
+    drive.P *= prior
+    H, R = drive.H[0, :3], drive.variance[0, :3]
+    HP = H @ drive.P
+    S = HP @ H.T + np.diag(R)
+    _, inverse = recursion.invert_sum(HP @ H.T, R)
+    joseph = recursion.update(drive.P, HP, H, inverse.T @ (inverse @ HP), R)
+    exact = np.diag(R) - R[:, None] * np.linalg.inv(S) * R
+    np.testing.assert_allclose(H @ joseph @ H.T, exact, atol=1e-6)
+    assert drive.solved()["lossy"][0] == (prior > 1.0)
+    if prior == 1.0:
+        np.testing.assert_allclose(recursion.reduce(drive.P, inverse @ HP), joseph, atol=1e-12)
 
 
 @pytest.mark.parametrize("kernel", ["huber", "cauchy"])
@@ -128,7 +156,7 @@ def test_a_kernel_weighs_rows_by_what_their_update_leaves(kernel: str) -> None:
     found = drive.solved()
     for b in np.flatnonzero(drive.used):
         k, lo, hi = b // 2, drive.blocks.begin[b], drive.blocks.end[b]
-        H, L = drive.H[k, lo:hi], found["root"][k, lo:hi, lo:hi]
+        L = found["root"][k, lo:hi, lo:hi]
         R = np.diag(drive.variance[k, lo:hi])
         HPH, r = L @ L.T - R, L @ (L.T @ found["solved"][k, lo:hi])
         weight, left = np.ones(1), r - HPH @ found["solved"][k, lo:hi]
@@ -138,7 +166,7 @@ def test_a_kernel_weighs_rows_by_what_their_update_leaves(kernel: str) -> None:
             left = r - HPH @ np.linalg.solve(HPH + R / weight, r)
         np.testing.assert_allclose(found["bent"][k, lo:hi], weight[0], rtol=1e-9)
         np.testing.assert_allclose(found["w"][k, lo:hi], -np.linalg.solve(HPH + R / weight, r), rtol=1e-7)
-        np.testing.assert_allclose(found["SH"][k, lo:hi], np.linalg.solve(HPH + R / weight, H), rtol=1e-7)
+        np.testing.assert_allclose(found["inverse"][k, lo:hi, lo:hi], np.linalg.inv(HPH + R / weight), rtol=1e-7)
 
 
 def test_a_gate_refuses_what_its_innovation_says() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -10,7 +11,7 @@ import numpy as np
 from graphnav.constraints.base import SAME_TIME, Constraint
 from graphnav.core.rotation import Array
 from graphnav.core.state import Parameter
-from graphnav.estimation.noise.model import INTERVALS, NoiseModel
+from graphnav.estimation.noise.model import INTERVALS, NoiseModel, RowWeights
 from graphnav.estimation.problem import Problem
 from graphnav.imu.dynamics import ImuFactors
 from graphnav.imu.preintegration import NOISE_FIGURES
@@ -40,6 +41,18 @@ def with_noise(problem: Problem, noise: NoiseModel) -> Problem:
         )
     return replace(
         problem, constraints=_with_common_nodes([_rows(problem, rows, noise) for rows in problem.constraints])
+    )
+
+
+def with_weights(problem: Problem, weights: Mapping[str, RowWeights]) -> Problem:
+    """A problem as a noise model has it, with other weights for the rows of some constraints."""
+    noise = NoiseModel(weights=weights)
+    return replace(
+        problem,
+        constraints=tuple(
+            replace(c, weight=row_weights(problem.t[c.keyframe], noise, c.name)) if c.name in weights else c
+            for c in problem.constraints
+        ),
     )
 
 

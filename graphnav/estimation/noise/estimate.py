@@ -29,14 +29,16 @@ from graphnav.constraints.base import Constraint
 from graphnav.constraints.gnss import TIMES
 from graphnav.core.rotation import Array
 from graphnav.estimation.noise.apply import row_weights, with_noise
-from graphnav.estimation.noise.initial_points import BREAKDOWN, find_initial_points, smooth_about
+from graphnav.estimation.noise.initial_points import BREAKDOWN, find_initial_points
 from graphnav.estimation.noise.model import INTERVALS, NoiseModel, RowWeights, VarianceComponent
 from graphnav.estimation.noise.moments import ImuMoments, imu_moments, lag_moments, process_moments, row_moments
 from graphnav.estimation.noise.outliers import CHANCE, cost_of_outliers, limit_scaled, list_reduced
 from graphnav.estimation.noise.priors import TIME_WITHIN, prior
 from graphnav.estimation.problem import ParameterChain, Problem
+from graphnav.estimation.solvers.ekf import refilter
 from graphnav.estimation.solvers.linearise import Points
-from graphnav.estimation.solvers.passes import ForwardRecord, SmootherPass, points_of, values_of
+from graphnav.estimation.solvers.passes import DisturbancePass, ForwardRecord, points_of, values_of
+from graphnav.estimation.solvers.rts import backward_moments
 from graphnav.imu.preintegration import NOISE_FIGURES
 
 _BOUNDED = 0.05  # probability of a square of an aiding sensor beyond its bound; nearly two rows in five may be wrong
@@ -54,7 +56,7 @@ class NoiseEstimate:
     """A noise model, the smoothed points of its last pass, and how it was found."""
 
     noise: NoiseModel
-    points: SmootherPass
+    points: DisturbancePass
     log_posterior: float
     log_prior: float
     passes: Counter[str]  # over keyframes, of "filter" and "smoother"
@@ -190,14 +192,14 @@ def _iterate(
     """Iterate from initial figures and linearisation points to convergence."""
     passes, total, converged = 0, len(problem.t), False
     ends = [total] if total <= 2 * _FIRST or figures.known else [_FIRST, total]
-    latest: tuple[ForwardRecord, SmootherPass] | None = None
+    latest: tuple[ForwardRecord, DisturbancePass] | None = None
     for end in ends:
         before, converged, figures.extrapolation = -np.inf, False, 1.0
         rounds = _AGAIN if figures.same_data or end != ends[0] else _ROUNDS
         likeliest, most = figures, -np.inf
         for k in range(_MOST):
             used, latest = with_noise(problem, figures.model()), None  # releases the memory of the previous pass
-            latest = smooth_about(used, about.first(end))
+            latest = _smooth_about(used, about.first(end))
             passes += 1
             prior_then = figures.log_prior()
             now = float(np.sum(latest[0].log_likelihood)) + prior_then
@@ -216,11 +218,16 @@ def _iterate(
             figures = likeliest
     if not converged:
         latest = None
-        latest = smooth_about(with_noise(problem, figures.model()), about)
+        latest = _smooth_about(with_noise(problem, figures.model()), about)
         passes, prior_then = passes + 1, figures.log_prior()
         now = float(np.sum(latest[0].log_likelihood)) + prior_then
     assert latest is not None
     return NoiseEstimate(figures.model(), latest[1], now, prior_then, Counter(filter=passes, smoother=passes))
+
+
+def _smooth_about(problem: Problem, about: Points) -> tuple[ForwardRecord, DisturbancePass]:
+    forward = refilter(problem, about, whole=False)
+    return forward, backward_moments(problem, forward)
 
 
 def _begin(problem: Problem, start: NoiseModel | None, changed: bool = False) -> _Components:
@@ -253,7 +260,7 @@ def _splice(about: Points, part: Points) -> Points:
     """Points with the first ones replaced."""
     n = len(part.values)
     if n == len(about.values):
-        return Points(part.states, part.values)
+        return part
     states = type(part.states).stack([part.states, about.states[n:]])
     return Points(states, np.concatenate([part.values, about.values[n:]]))
 
@@ -269,7 +276,7 @@ def _cap(A: Array, B: Array, freedom: int, chance: float) -> tuple[float, float]
 
 
 def _improve(
-    figures: _Components, problem: Problem, forward: ForwardRecord, smoothed: SmootherPass, end: int, intervals: bool
+    figures: _Components, problem: Problem, forward: ForwardRecord, smoothed: DisturbancePass, end: int, intervals: bool
 ) -> None:
     """One step for all figures and weights."""
     imu = imu_moments(problem, forward, smoothed)

@@ -38,7 +38,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from graphnav.estimation import faults
-from graphnav.estimation.noise.apply import row_weights, with_noise
+from graphnav.estimation.noise.apply import row_weights, with_noise, with_weights
 from graphnav.estimation.noise.estimate import NoiseEstimate, estimate_noise
 from graphnav.estimation.noise.explanations import EXPLANATIONS, FIXES, ONE_SENSOR, ROWS, WHEELS, Explanation, evidence
 from graphnav.estimation.noise.model import INTERVALS, NoiseModel, RowWeights
@@ -192,18 +192,20 @@ def estimate_disturbed_intervals(base: Problem, found: NoiseEstimate) -> NoiseEs
     base : posed with stated noise and the parts of its intervals' noise.
     found : with all intervals alike.
     """
-    near, passes = found.linearisation(base), found.passes
+    start, near, passes = found.noise, found.linearisation(base), found.passes
     if found.noise.excluded:
         free = estimate_noise(base, None, replace(found.noise, excluded={}), near, intervals=True)
         decision = decide(base, free, find_spans(base, free.noise, free))
         passes = passes + free.passes + decision.passes + Counter(filter=1)
         if decision.noise.excluded:
-            start = replace(free.noise, excluded=decision.noise.excluded)
-            free = estimate_noise(base, None, start, free.linearisation(base), intervals=True)
+            without = replace(free.noise, excluded=decision.noise.excluded)
+            free = estimate_noise(base, None, without, free.linearisation(base), intervals=True)
             passes = passes + free.passes
         if _log_evidence(base, free) > _log_evidence(base, found):
             return replace(free, passes=passes)
-    disturbed = estimate_noise(base, None, found.noise, near, intervals=True)
+        if free.noise.excluded == found.noise.excluded:  # the same model, already on its way
+            start, near = free.noise, free.linearisation(base)
+    disturbed = estimate_noise(base, None, start, near, intervals=True)
     return replace(disturbed, passes=passes + disturbed.passes)
 
 
@@ -230,7 +232,7 @@ def _test(base: Problem, noise: NoiseModel, found: NoiseEstimate) -> list[Span]:
     # weights of fixes and of IMU intervals may hide a fault from the tests
     kept = {name: some for name, some in noise.weights.items() if name not in (*FIXES, *INTERVALS)}
     tested = with_noise(base, replace(noise, weights=kept))
-    weights = refilter(tested, found.carry_points(base, tested), watch=True).weights
+    weights = refilter(tested, found.carry_points(base, tested), watch=True, whole=False).weights
     return join_faults(faults.fault_spans(faults.weigh_rows(tested, weights)))
 
 
@@ -256,17 +258,27 @@ def decide(
     }
     inside[INTERVALS] = {name: some for name, some in noise.weights.items() if name in INTERVALS}
     used = with_noise(base, replace(noise, weights=outside))
-    weighted = {kinds: with_noise(base, replace(noise, weights=outside | some)) for kinds, some in inside.items()}
+    outliers = {
+        kinds: [
+            sum(count_reduced(one) - count_reduced(drop_within(one, [within])) for one in some.values())
+            for within in (reach if kinds == INTERVALS else spans)
+        ]
+        for kinds, some in inside.items()
+    }
+    among = [kinds for kinds in among if kinds not in _SINGLE or any(outliers[kinds])]
+    weighted: dict[Explanation, Problem] = {
+        kinds: with_weights(used, outside | inside[kinds]) for kinds in (*ONE_SENSOR, ROWS)
+    }
+    if INTERVALS in among:
+        weighted[INTERVALS] = with_noise(base, replace(noise, weights=outside | inside[INTERVALS]))
     before, likelihood, passes = evidence(used, found.carry_points(base, used), spans, weighted, among)
     excluded: dict[str, tuple[Span, ...]] = {}
     total = before + found.log_prior
     dropped: dict[str, list[Span]] = {name: [] for name in noise.weights}
     for k, span in enumerate(spans):
         cost = np.array([0.0 if not kinds or kinds in _SINGLE else _FAULT_COST for kinds in EXPLANATIONS])
-        for kinds, some in inside.items():
-            within = reach[k] if kinds == INTERVALS else span
-            outliers = sum(count_reduced(one) - count_reduced(drop_within(one, [within])) for one in some.values())
-            cost[EXPLANATIONS.index(kinds)] += OUTLIER_COST * outliers if outliers or kinds not in _SINGLE else np.inf
+        for kinds, count in outliers.items():
+            cost[EXPLANATIONS.index(kinds)] += OUTLIER_COST * count[k] if count[k] or kinds not in _SINGLE else np.inf
         each = likelihood[k] - cost
         best = EXPLANATIONS[int(np.argmax(each))]
         total += float(np.max(each))

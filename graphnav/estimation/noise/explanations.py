@@ -16,7 +16,7 @@ from graphnav.core.state import Parameter, States
 from graphnav.estimation.noise.model import INTERVALS
 from graphnav.estimation.noise.spans import Span, mask_within
 from graphnav.estimation.problem import Problem
-from graphnav.estimation.solvers.ekf import refilter
+from graphnav.estimation.solvers.ekf import Comparison
 from graphnav.estimation.solvers.linearise import Points
 from graphnav.estimation.solvers.passes import points_of, values_of
 from graphnav.estimation.solvers.watch import MINUTE, WIDE
@@ -137,20 +137,21 @@ def evidence(
     found: list[Array] = []
     before, passes = 0.0, 0
     present = {rows.name for rows in problem.constraints}
+    comparison = Comparison(problem, about)
     for kinds in EXPLANATIONS:
         possible = present & set(kinds) if kinds == WHEELS else kinds in (INTERVALS, ROWS) or present.issuperset(kinds)
         if not possible or (kinds and kinds not in among):
             found.append(np.full(len(spans), -np.inf))
             continue
         base = weighted.get(kinds, problem)
-        models = [base]
+        models: list[tuple[Problem, Explanation]] = [(base, ())]
         if kinds and kinds not in (INTERVALS, ROWS):
-            models = [with_common_errors(base, spans, kinds)]
+            models = [(with_common_errors(base, spans, kinds), kinds)]
         if kinds and set(kinds) <= set(FIXES):
-            models.append(with_own_errors(base, spans, kinds))
+            models.append((with_own_errors(base, spans, kinds), ()))
         each = []
-        for one in models:
-            likelihood = refilter(one, points_of(one, about.states, known)).log_likelihood
+        for one, anew in models:
+            likelihood = comparison.log_likelihood(one, points_of(one, about.states, known), anew)
             passes += 1
             before = float(np.sum(likelihood[: edges[0]])) if not kinds else before
             each.append([float(np.sum(likelihood[a:b])) for a, b in itertools.pairwise(edges)])

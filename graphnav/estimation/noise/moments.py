@@ -21,6 +21,7 @@ Vermessungs-Nachrichten 86 (1979); de Jong, JASA 84 (1989); Koopman, Biometrika 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -28,9 +29,8 @@ from graphnav.constraints.base import Constraint
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM
 from graphnav.estimation.problem import ParameterChain, Problem
-from graphnav.estimation.solvers.linearise import linearise, shift, stepping
-from graphnav.estimation.solvers.passes import ForwardRecord, SmootherPass, values_of
-from graphnav.estimation.solvers.recursion import row_covariances
+from graphnav.estimation.solvers.linearise import shift, stepping
+from graphnav.estimation.solvers.passes import DisturbancePass, ForwardRecord, values_of
 
 _FORGOTTEN = 1e-6  # share of a value that is left of it, below which what is left is lost in rounding
 
@@ -51,10 +51,19 @@ class ImuMoments:
 
     A: Array  # (n, 4) of `NOISE_FIGURES`
     B: Array  # (n, 4)
-    freedom: Array  # (n, 4), of the chi-square variable that A freedom / B is near to where f is right
+    Q: Array  # (n, 4, 15, 15) what each adds to a step
+    N: Array  # (n, 15, 15)
+
+    @cached_property
+    def freedom(self) -> Array:
+        """(n, 4) of the chi-square variable that A freedom / B is near to where f is right."""
+        QN = self.Q @ self.N[:, None]
+        squared = np.einsum("nfij,nfji->nf", QN, QN)
+        freedom = np.where(self.B > 0.0, self.B**2 / np.maximum(squared, 1e-300), 1.0)
+        return np.maximum(freedom, 1.0)
 
 
-def imu_moments(problem: Problem, forward: ForwardRecord, smoothed: SmootherPass) -> ImuMoments:
+def imu_moments(problem: Problem, forward: ForwardRecord, smoothed: DisturbancePass) -> ImuMoments:
     """Moments of the intervals.
 
     A = |s|^2 with s of covariance M, trace(M) = B, is near to a chi-square variable of B^2 / trace(M^2) degrees of
@@ -64,34 +73,29 @@ def imu_moments(problem: Problem, forward: ForwardRecord, smoothed: SmootherPass
     L = problem.motion.frames(slice(0, len(start)), start)
     Lt = np.swapaxes(L, -1, -2)
     r = (Lt @ smoothed.r[1:, :DIM, None])[..., 0]
-    N = Lt @ smoothed.N[1:, :DIM, :DIM] @ L
+    N = Lt @ smoothed.N[1:] @ L
     Q = problem.intervals.parts[: len(r)]
-    A = np.einsum("ni,nfij,nj->nf", r, Q, r, optimize=True)
-    QN = Q @ N[:, None]
-    B = np.maximum(np.einsum("nfii->nf", QN), 0.0)
-    squared = np.einsum("nfij,nfji->nf", QN, QN)
-    freedom = np.where(B > 0.0, B**2 / np.maximum(squared, 1e-300), 1.0)
-    return ImuMoments(A, B, np.maximum(freedom, 1.0))
+    both = np.stack([r[:, :, None] * r[:, None], np.swapaxes(N, 1, 2)], axis=-1).reshape(len(r), DIM * DIM, 2)
+    A, B = np.moveaxis(Q.reshape(len(r), -1, DIM * DIM) @ both, -1, 0)
+    return ImuMoments(A, np.maximum(B, 0.0), Q, N)
 
 
 def process_moments(
-    problem: Problem, chain: ParameterChain, smoothed: SmootherPass, end: int
+    problem: Problem, chain: ParameterChain, smoothed: DisturbancePass, end: int
 ) -> tuple[Array, Array, Array]:
     """Keyframes (n,) at which a process is driven, and A and B (n, k) there; the first is its steady variance."""
     at = problem.columns[chain.parameter.name]
     k = np.concatenate([[0], stepping(chain, end)])
     q = chain.sigma[chain.node[k]] ** 2
-    N = np.diagonal(smoothed.N[:, at, at], axis1=-2, axis2=-1)[k]
+    N = smoothed.N_diagonal[k, at]
     return k, q * smoothed.r[k, at] ** 2, q * np.maximum(N, 0.0)
 
 
-def row_moments(problem: Problem, rows: Constraint, smoothed: SmootherPass, n: int) -> RowMoments:
+def row_moments(problem: Problem, rows: Constraint, smoothed: DisturbancePass, n: int) -> RowMoments:
     """Of the first n rows of a constraint."""
-    at, which = rows.keyframe[:n], slice(0, n)
-    values = values_of(problem, smoothed)
-    linear = linearise(rows, smoothed, problem.columns, which)
-    H = linear.H
-    HPH = row_covariances(H, smoothed.P, at)
+    at, values = rows.keyframe[:n], values_of(problem, smoothed)
+    linear = smoothed.linearise(rows, problem.columns, n)
+    HPH = smoothed.cover_rows(linear, n)
     w = np.ones((n, 1)) if rows.weight is None else rows.weight[:n, None]
     R = linear.stated**2
     B = np.clip(1.0 - w * np.diagonal(HPH, axis1=1, axis2=2) / R, 1e-6, 1.0)
@@ -103,7 +107,7 @@ def row_moments(problem: Problem, rows: Constraint, smoothed: SmootherPass, n: i
     error, covariance = linear.residual, R[:, :, None] * np.eye(R.shape[1])
     for p in rows.parameters:
         if p.correlation_time is not None:
-            J = linear.H[:, :, problem.columns[p.name]]
+            J = linear.linear.jacobians[p.name]
             error = error - np.einsum("nij,nj->ni", J, values[p.name][at])
             covariance = covariance + (J * p.sigma**2) @ np.swapaxes(J, 1, 2)
     whole = np.sum(error * np.linalg.solve(covariance, error[..., None])[..., 0], axis=1)
@@ -113,7 +117,7 @@ def row_moments(problem: Problem, rows: Constraint, smoothed: SmootherPass, n: i
     return RowMoments(A, share * np.where(w > 0.0, B, 0.0), left_out, whole)
 
 
-def lag_moments(problem: Problem, chain: ParameterChain, smoothed: SmootherPass, end: int) -> tuple[Array, ...]:
+def lag_moments(problem: Problem, chain: ParameterChain, smoothed: DisturbancePass, end: int) -> tuple[Array, ...]:
     """Of a process, from node to node: times between (n,), E[c' c'], E[c' c] and E[c c] (n, k), c' the later.
 
     As c' = a c + w, E[c' c] is half of (E[c' c'] + a^2 E[c c] - E[w w]) / a. Where next to nothing of c is left in c'
@@ -124,9 +128,8 @@ def lag_moments(problem: Problem, chain: ParameterChain, smoothed: SmootherPass,
     k, A, B = process_moments(problem, chain, smoothed, end)
     k, j = k[1:], chain.node[k[1:]]
     driven = chain.sigma[j] ** 2 * (1.0 + A[1:] - B[1:])
-    variance = np.diagonal(smoothed.P[:, at, at], axis1=-2, axis2=-1)
     c0, c1 = smoothed.values[k - 1, own], smoothed.values[k, own]
-    before, later = c0 * c0 + variance[k - 1], c1 * c1 + variance[k]
+    before, later = c0 * c0 + smoothed.variance[k - 1, at], c1 * c1 + smoothed.variance[k, at]
     a = np.maximum(chain.decay[j], _FORGOTTEN)[:, None]
     cross = np.where(a > _FORGOTTEN, 0.5 * (later + a * a * before - driven) / a, c1 * c0)
     return np.diff(chain.t)[j - 1], later, cross, before

@@ -9,7 +9,7 @@ import numpy as np
 
 from graphnav.core.rotation import Array
 from graphnav.estimation.solvers.linearise import Points
-from graphnav.estimation.solvers.recursion import compute_gain, update
+from graphnav.estimation.solvers.recursion import invert_sum, update
 
 
 @dataclass(frozen=True)
@@ -31,5 +31,6 @@ def hold(one: Decision, P: Array) -> tuple[Array, Array]:
     if not len(one.residual):
         return np.zeros(len(P)), P
     HP, variance = one.H @ P, one.sigma**2
-    _, _, Kt = compute_gain(HP, HP @ one.H.T, variance, one.residual)
+    _, inverse = invert_sum(HP @ one.H.T, variance)
+    Kt = inverse.T @ (inverse @ HP)
     return -(one.residual @ Kt), update(P, HP, one.H, Kt, variance)

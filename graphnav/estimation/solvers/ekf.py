@@ -26,6 +26,7 @@ throughout.
 from __future__ import annotations
 
 import time
+from collections.abc import Collection
 from functools import partial
 from typing import Any
 
@@ -52,7 +53,7 @@ from graphnav.estimation.solvers.passes import (
     sigmas_of,
     subtract_points,
 )
-from graphnav.estimation.solvers.points import Errors, PointFilter
+from graphnav.estimation.solvers.points import Errors, Linearisation, PointFilter, filter_likelihood
 from graphnav.estimation.solvers.rts import backward
 from graphnav.estimation.solvers.stack import Innovations, Stack
 from graphnav.estimation.solvers.stretches import StretchFilter
@@ -107,7 +108,12 @@ def ekf(
 
 
 def refilter(
-    problem: Problem, about: Points, progress: Progress | None = None, watch: bool = False, drifts: bool = True
+    problem: Problem,
+    about: Points,
+    progress: Progress | None = None,
+    watch: bool = False,
+    drifts: bool = True,
+    whole: bool = True,
 ) -> ForwardRecord:
     """Run the filter over the first keyframes, linearised at given points; several times as fast as `ekf`.
 
@@ -116,8 +122,34 @@ def refilter(
     about : of these keyframes, near enough for what is left to be linear: an earlier pass.
     watch : look for errors that last in the rows that are to be watched, and go back to before them.
     drifts : of such errors those that grow as well.
+    whole : False keeps what `backward_moments` needs, predicted covariances of two keyframes, and no innovations.
     """
-    return _forward(problem, len(about.values), about, progress, watch, drifts)
+    return _forward(problem, len(about.values), about, progress, watch, drifts, whole=whole)
+
+
+class Comparison:
+    """How likely the innovations are by a problem, and by others that differ from it by weights or by few rows.
+
+    Parameters
+    ----------
+    about : points of all keyframes that all of them are linearised at.
+    """
+
+    def __init__(self, problem: Problem, about: Points) -> None:
+        self._K = len(about.values)
+        self._one = Linearisation.of(problem, about, Stack(problem, self._K), advance(problem, self._K))
+
+    def log_likelihood(self, problem: Problem, about: Points, anew: Collection[str] = ()) -> Array:
+        """(K,) as `ForwardRecord.log_likelihood`, by a problem with the same points of what both have.
+
+        `anew` are the constraints of which the rows differ.
+        """
+        stack, steps = Stack(problem, self._K), advance(problem, self._K)
+        one = self._one.lift(problem, about, stack, anew)
+        x, P = _prior(problem)
+        start = _begin(subtract_points(x, about.first(1))[0], P, stack.records)
+        filter_likelihood(problem, about, stack, steps, one, start)
+        return stack.log_likelihood()
 
 
 def near(
@@ -155,20 +187,19 @@ def _forward(
     watch: bool = False,
     drifts: bool = True,
     decide: Decide | None = None,
+    whole: bool = True,
 ) -> ForwardRecord:
     """Filter the first K keyframes, of which the first n are linearised at given points."""
     n, scale, steps = 0 if about is None else len(about.values), problem.columns.get(SCALE), advance(problem, K)
     D = DIM + steps.decay.shape[1]
-    all_P, all_Pp = np.empty((K, D, D)), np.empty((K, D, D))
+    all_P, all_Pp = np.empty((K, D, D)), np.empty((K if whole else 2, D, D))
     all_F = np.empty((K - 1, DIM, DIM if scale is None else scale.stop))
     fixes = [c for c in problem.constraints if watch and c.fix_of]
     watched = [c for c in fixes if c.watched]
     stack = Stack(problem, K, {c.name for c in fixes})
     ahead, found = Points.allocate(K, D - DIM), Points.allocate(K, D - DIM)
     errors = Errors(np.empty((n, D)), all_Pp, np.empty((n, D)), all_P)
-    assert problem.prior.mean is not None
-    x = Points(problem.prior.mean, np.concatenate([np.empty(0), *(c.mean[0] for c in problem.chains)])[None])
-    P = np.diag(np.concatenate([problem.prior.sigma[0], *(c.sigma[0] for c in problem.chains)]) ** 2)
+    x, P = _prior(problem)
     updates, search = None, None
     if about is not None:
         given = PointFilter(problem, about, stack, steps, all_F, errors)
@@ -195,7 +226,7 @@ def _forward(
         x, P = found.at(slice(k - 1, k)), all_P[k - 1]
         if progress is not None:
             progress("filter", k / K)
-    log_likelihood = stack.finish()
+    log_likelihood = stack.finish() if whole or watch else stack.log_likelihood()
     filtered, predicted = found, ahead
     if about is not None:
         filtered = join_passes([move_points(about, errors.filtered), found.at(slice(n, None))])
@@ -217,6 +248,14 @@ def _forward(
         updates,
         log_likelihood,
     )
+
+
+def _prior(problem: Problem) -> tuple[Points, Array]:
+    """Point and covariance before the first keyframe."""
+    assert problem.prior.mean is not None
+    sigma = np.concatenate([problem.prior.sigma[0], *(c.sigma[0] for c in problem.chains)])
+    values = np.concatenate([np.empty(0), *(c.mean[0] for c in problem.chains)])
+    return Points(problem.prior.mean, values[None]), np.diag(sigma**2)
 
 
 def _begin(x: Any, P: Array, records: dict[str, Innovations], search: FaultSearch | None = None) -> tuple[Any, Array]:

@@ -6,7 +6,7 @@ iSAM2 and the window take from here what they stack, eliminate or update with.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -29,11 +29,15 @@ class Points:
     values: Array  # (K, D-15)
 
     def first(self, n: int) -> Points:
-        return Points(self.states[:n], self.values[:n])
+        return self if n == len(self.values) else Points(self.states[:n], self.values[:n])
 
     def at(self, index: slice | Array) -> Points:
         """Some of them."""
         return Points(self.states[index], self.values[index])
+
+    def linearise(self, constraint: Constraint, columns: Columns, n: int) -> Rows:
+        """The first n rows of a constraint, each at the point of its keyframe."""
+        return linearise(constraint, self, columns, slice(0, n))
 
     def put(self, index: slice, points: Points) -> None:
         """Some of them, replaced."""
@@ -83,6 +87,20 @@ class Rows:
     def H(self) -> Array:
         """(n, m, D) derivative of the residual."""
         return assemble(self.linear, self.columns, self.width)
+
+    @property
+    def states_sigmas(self) -> bool:
+        """Whether its sigmas are those of the constraint, whatever the point."""
+        sigma: Array = self.constraint.sigma  # type: ignore[attr-defined]
+        return bool(np.array_equal(self.stated, sigma[self.which]))
+
+    def restate(self, constraint: Constraint) -> Rows:
+        """The same of a constraint that a noise model has with other sigmas and weights."""
+        sigma: Array = constraint.sigma  # type: ignore[attr-defined]
+        linear = replace(self.linear, sigma=sigma[self.which])
+        out = Rows(constraint, self.which, linear, self.columns, self.width)
+        out.__dict__["H"] = self.H
+        return out
 
     def kernel(self) -> tuple[Array, Array]:
         """Weight and cost (n,) of each row by its robust kernel."""

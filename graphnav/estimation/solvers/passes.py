@@ -12,8 +12,9 @@ from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, States
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import ConstraintRecord, ParameterEstimate, Solution
+from graphnav.estimation.solvers.disturbance import row_covariances
 from graphnav.estimation.solvers.invariant import minus_invariant, plus_invariant
-from graphnav.estimation.solvers.linearise import Points, find_last_keyframes, linearise, shift
+from graphnav.estimation.solvers.linearise import Columns, Points, Rows, find_last_keyframes, linearise, shift
 from graphnav.estimation.solvers.recursion import Blocks
 from graphnav.estimation.solvers.robust import weight_and_cost
 from graphnav.estimation.solvers.stack import Innovations
@@ -24,13 +25,64 @@ Progress = Callable[[str, float], None]
 
 
 @dataclass(frozen=True)
-class SmootherPass(Points):
-    """A backward pass: states, parameter values and their joint covariance at every keyframe."""
+class DisturbancePass(Points):
+    """A backward pass: states and parameter values, and what it says of the disturbances before each keyframe.
+
+    Of the first n keyframes, which were linearised at given points: P^s = P- - P- N P-.
+    """
+
+    r: Array  # (n, D)
+    N: Array  # (n, 15, 15) of the states
+    N_diagonal: Array  # (n, D)
+
+    @property
+    def variance(self) -> Array:
+        """(K, D) of the errors; of those of parameters without a correlation time it may be unknown."""
+        raise NotImplementedError
+
+    def cover_rows(self, linear: Rows, n: int) -> Array:
+        """H P^s H^T (n, m, m) of the first n rows of a constraint, linearised at the smoothed points."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True)
+class SmootherPass(DisturbancePass):
+    """A backward pass with the joint covariance of states and parameters at every keyframe."""
 
     P: Array  # (K, D, D)
-    # of the disturbances before each keyframe that was linearised at given points: P^s = P- - P- N P-
-    r: Array  # (n, D)
-    N: Array  # (n, D, D)
+
+    @property
+    def variance(self) -> Array:
+        return np.diagonal(self.P, axis1=1, axis2=2)
+
+    def cover_rows(self, linear: Rows, n: int) -> Array:
+        return row_covariances(linear.H, self.P, linear.constraint.keyframe[:n])
+
+
+@dataclass(frozen=True)
+class MomentPass(DisturbancePass):
+    """A backward pass with those covariances only that a noise model is estimated by: at half the price."""
+
+    variances: Array  # (n, D), of parameters with a correlation time
+    linear: dict[str, Rows]  # of constraints with variance components, linearised at the smoothed points
+    of_rows: Array  # (n, M, M) H P^s H^T, where each of these stands
+    places: dict[str, tuple[Array, Array]]
+
+    @property
+    def variance(self) -> Array:
+        return self.variances
+
+    def linearise(self, constraint: Constraint, columns: Columns, n: int) -> Rows:
+        own = self.linear.get(constraint.name)
+        if own is None or own.columns != columns or own.constraint.keyframe is not constraint.keyframe:
+            return super().linearise(constraint, columns, n)
+        if len(own.residual) != n or not own.states_sigmas:
+            return super().linearise(constraint, columns, n)
+        return own.restate(constraint)
+
+    def cover_rows(self, linear: Rows, n: int) -> Array:
+        k, place = self.places[linear.constraint.name]
+        return self.of_rows[k[:n, :, None], place[:n, :, None], place[:n, None]]
 
 
 @dataclass(frozen=True)
@@ -41,15 +93,17 @@ class Updates:
     Kt: Array  # (n, M, D) gains transposed
     H: Array  # (n, M, D)
     w: Array  # (n, M) S^-1 nu
-    SH: Array  # (n, M, D) S^-1 H
+    inverse: Array  # (n, M, M) S^-1
     taken: Array  # (B,) whether a block was taken in
+    lossy: Array  # (B,) whether with a loss of digits, but for Joseph's form
+    places: dict[str, tuple[Array, Array]]  # of each constraint's rows, as `graphnav.estimation.solvers.stack` has them
 
     @classmethod
-    def none(cls, blocks: Blocks, H: Array) -> Updates:
+    def none(cls, blocks: Blocks, H: Array, places: dict[str, tuple[Array, Array]]) -> Updates:
         """None yet, of rows H (n, M, D)."""
-        return cls(
-            blocks, np.zeros_like(H), H, np.zeros(H.shape[:2]), np.zeros_like(H), np.zeros(len(blocks.begin), bool)
-        )
+        n, M, _ = H.shape
+        taken, lossy = np.zeros((2, len(blocks.begin)), dtype=bool)
+        return cls(blocks, np.zeros_like(H), H, np.zeros((n, M)), np.zeros((n, M, M)), taken, lossy, places)
 
 
 @dataclass(frozen=True)
@@ -58,7 +112,7 @@ class ForwardRecord(Points):
 
     P: Array  # (K, D, D) filtered
     predicted: Points
-    P_predicted: Array  # (K, D, D)
+    P_predicted: Array  # (K, D, D), or (2, D, D) of the last two keyframes, in their order or the other
     F: Array  # (K-1, 15, w) and
     decay: Array  # (K-1, D-15) of the steps, as `graphnav.estimation.solvers.recursion` has them
     records: dict[str, Innovations]

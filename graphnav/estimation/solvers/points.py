@@ -11,7 +11,7 @@ A pass at given points takes a fraction of the time of one that is linearised wh
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,7 +22,7 @@ from graphnav.core.state import DIM, States
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.breakdown import explain_rows
 from graphnav.estimation.solvers.invariant import MOVING, turn
-from graphnav.estimation.solvers.linearise import Advance, Points, linearise, shift
+from graphnav.estimation.solvers.linearise import Advance, Columns, Points, linearise, shift
 from graphnav.estimation.solvers.passes import Progress, Updates
 from graphnav.estimation.solvers.recursion import STRETCH, filter_rows
 from graphnav.estimation.solvers.stack import RowBlock, Stack
@@ -42,6 +42,63 @@ class Errors:
     P: Array
 
 
+@dataclass(frozen=True)
+class Linearisation:
+    """Steps and rows of a problem at points of its first n keyframes."""
+
+    columns: Columns
+    F: Array  # (n-1, 15, w)
+    gap: Array  # (n-1, D) where a step leads from a point, less the next point
+    turned: Array  # (n-1, 3, 3): Exp(gap) Exp(F e) = Exp(gap + turned F e)
+    r: Array  # (n, M)
+    sigma: Array  # (n, M) as stated
+    H: Array  # (n, M, D)
+
+    @classmethod
+    def of(cls, problem: Problem, points: Points, stack: Stack, steps: Advance) -> Linearisation:
+        """At points that stand in the order of the problem's keyframes."""
+        n = len(points.values)
+        at, begin, end = slice(0, n - 1), points.states[: n - 1], points.states[1:n]
+        ahead, F = predict_states(problem, at, begin, points.values[: n - 1])
+        values = steps.ahead(at, points.values[: n - 1])
+        gap = np.concatenate([ahead.minus(end), values - points.values[1:]], axis=1)
+        turned = rotation.right_jacobian_inverse(gap[:, :3])
+        F[:, :3] = turned @ F[:, :3]
+        r, sigma = np.zeros((n, stack.M)), np.ones((n, stack.M))
+        H = np.zeros((n, stack.M, DIM + points.values.shape[1]))
+        for rows in problem.constraints:
+            count = int(rows.keyframe.searchsorted(n))
+            place = stack.places[rows.name][0][:count], stack.places[rows.name][1][:count]
+            linear = points.linearise(rows, problem.columns, count)
+            r[place], sigma[place], H[place] = linear.residual, linear.stated, linear.H
+        return cls(problem.columns, F, gap, turned, r, sigma, H)
+
+    def lift(self, problem: Problem, points: Points, stack: Stack, anew: Collection[str]) -> Linearisation:
+        """Of a problem that differs from this one by the rows of some constraints, and has all of its parameters."""
+        if not anew and problem.columns == self.columns:
+            return self
+        n, M, _ = self.H.shape
+        moved = [np.arange(DIM), *(np.arange(*problem.columns[name].indices(1 << 30)) for name in self.columns)]
+        own = np.concatenate(moved)
+        gap, H = np.zeros((n - 1, DIM + points.values.shape[1])), np.zeros((n, M, DIM + points.values.shape[1]))
+        gap[:, own], H[:, :, own] = self.gap, self.H
+        r, sigma = self.r.copy(), self.sigma.copy()
+        for rows in problem.constraints:
+            if rows.name in anew:
+                which = slice(*rows.keyframe.searchsorted((0, n)))
+                linear = linearise(rows, points, problem.columns, which)
+                place = stack.places[rows.name]
+                r[place], sigma[place], H[place] = linear.residual, linear.stated, linear.H
+        return Linearisation(problem.columns, self.F, gap, self.turned, r, sigma, H)
+
+    def noise(self, problem: Problem, points: Points) -> Array:
+        """Q (n-1, 15, 15) of the steps."""
+        Q = problem.motion.noise(slice(0, len(self.gap)), points.states.R_nb[: len(self.gap)])
+        Q[:, :3] = self.turned @ Q[:, :3]
+        Q[:, :, :3] = Q[:, :, :3] @ np.swapaxes(self.turned, -1, -2)
+        return Q
+
+
 class PointFilter:
     """Filter the first keyframes linearised at given points.
 
@@ -53,23 +110,15 @@ class PointFilter:
 
     def __init__(self, problem: Problem, points: Points, stack: Stack, steps: Advance, F: Array, out: Errors) -> None:
         n = len(points.values)
-        begin, end, at = points.states[: n - 1], points.states[1:n], slice(0, n - 1)
         self._stack, self._steps, self.out = stack, steps, out
-        ahead, F[: n - 1] = predict_states(problem, at, begin, points.values[: n - 1])
-        self.F, self.Q = F[: n - 1], problem.motion.noise(at, begin.R_nb)
-        values = steps.ahead(at, points.values[: n - 1])
-        self.gap = np.concatenate([ahead.minus(end), values - points.values[1:]], axis=1)
-        # Exp(gap) Exp(F e) = Exp(gap + J_r^-1(gap) F e)
-        turned = rotation.right_jacobian_inverse(self.gap[:, :3])
-        self.F[:, :3] = turned @ self.F[:, :3]
-        self.Q[:, :3] = turned @ self.Q[:, :3]
-        self.Q[:, :, :3] = self.Q[:, :, :3] @ np.swapaxes(turned, -1, -2)
+        one = Linearisation.of(problem, points, stack, steps)
+        F[: n - 1] = one.F
+        self.F, self.Q, self.gap = F[: n - 1], one.noise(problem, points), one.gap
         self.speeds = np.linalg.norm(points.states.v, axis=1)
-        of_rows = {rows.name: rows.keyframe for rows in problem.constraints}
-        self.r, self._sigma, self.H = linearise_all(problem, stack, points, slice(0, n), of_rows)
+        self.r, self._sigma, self.H = one.r, one.sigma, one.H
         self.variance = (self._sigma / stack.root_weight[:n]) ** 2
         self.used = stack.joint.used.copy()
-        self.updates = Updates.none(stack.joint, self.H)
+        self.updates = Updates.none(stack.joint, self.H, stack.places)
         self._at = np.zeros(1, dtype=int)
 
     def weigh(self, some: RowBlock, used: bool, root_weight: float | Array) -> None:
@@ -101,10 +150,32 @@ class PointFilter:
                 k0, k1, e, P, self.F, self._steps.decay, self.gap, self.Q, self._steps.added,
                 self.r, self.H, self.variance, stack.scale[:n], stack.joint, self.used,
                 out.predicted, out.P_predicted, out.filtered, out.P,
-                stack.root, stack.solved, stack.bent, updates.Kt, updates.w, updates.SH, updates.taken, self._at,
+                stack.root, stack.solved, stack.bent, updates.Kt, updates.w, updates.inverse,
+                updates.taken, updates.lossy, self._at,
             )  # fmt: skip
         except np.linalg.LinAlgError:
             raise explain_rows(stack.block(int(self._at[0])).parts) from None
+
+
+def filter_likelihood(
+    problem: Problem, points: Points, stack: Stack, steps: Advance, one: Linearisation, start: tuple[Array, Array]
+) -> None:
+    """Leave the innovations of a filter of all keyframes in the stack, and nothing else of it.
+
+    `start` is what is known of the errors (D,) before the first keyframe, and their covariance.
+    """
+    n, M, D = one.H.shape
+    e, P, at = np.empty((2, 2, D)), np.empty((2, 2, D, D)), np.zeros(1, dtype=int)
+    taken, lossy = np.zeros((2, len(stack.joint.begin)), dtype=bool)
+    try:
+        filter_rows(
+            0, n, *start, one.F, steps.decay, one.gap, one.noise(problem, points), steps.added,
+            one.r, one.H, (one.sigma / stack.root_weight) ** 2, stack.scale, stack.joint, stack.joint.used,
+            e[0], P[0], e[1], P[1], stack.root, stack.solved, stack.bent,
+            np.empty((0, M, D)), np.empty((0, M)), np.empty((0, M, M)), taken, lossy, at,
+        )  # fmt: skip
+    except np.linalg.LinAlgError:
+        raise explain_rows(stack.block(int(at[0])).parts) from None
 
 
 def predict_states(problem: Problem, at: slice, states: States, values: Array) -> tuple[States, Array]:
@@ -122,9 +193,9 @@ def linearise_all(
     points: Points,
     own: slice,
     of_rows: Mapping[str, Array],
-    first: int = 0,
-    offset: int = 0,
-    moved: tuple[Array, Array] | None = None,
+    first: int,
+    offset: int,
+    moved: tuple[Array, Array],
 ) -> tuple[Array, Array, Array]:
     """Residuals, sigmas (n, M) and Jacobians (n, M, D) of the rows of keyframes `own`, from keyframe `first` on.
 
@@ -133,7 +204,7 @@ def linearise_all(
     of_rows : of each constraint the point that each row is at, less `offset`.
     moved : T (n, 9, 9) and m (n, D), where the errors about a point are T (y - m) of the errors y that rows are about.
     """
-    n = own.stop - own.start
+    n, (T, m) = own.stop - own.start, moved
     r, sigma = np.zeros((n, stack.M)), np.ones((n, stack.M))
     H = np.zeros((n, stack.M, DIM + points.values.shape[1]))
     for rows in problem.constraints:
@@ -142,11 +213,9 @@ def linearise_all(
             continue
         at = of_rows[rows.name][which] - offset
         linear = linearise(rows, points, problem.columns, which, at)
-        J, residual = linear.H, linear.residual
-        if moved is not None:
-            T, m = moved
-            J[:, :, :MOVING] = J[:, :, :MOVING] @ T[at]
-            residual = residual - mv(J, m[at])
+        J = linear.H
+        J[:, :, :MOVING] = J[:, :, :MOVING] @ T[at]
+        residual = linear.residual - mv(J, m[at])
         place = rows.keyframe[which, None] - own.start, stack.places[rows.name][1][which]
         r[place], sigma[place], H[place] = residual, linear.stated, J
     return r, sigma, H

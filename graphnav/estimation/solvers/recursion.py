@@ -18,8 +18,10 @@ from graphnav.core.state import DIM
 
 STRETCH = 256  # keyframes from one word of how far it has come to the next
 PASSES = 4  # of re-weighting where a measurement is met for the first time
+MOVING = 9  # of the states; biases stay, so that theirs are rows of a unit matrix in F
 UNUSED = 1e-12  # weight of a row that is not used beside others of its keyframe
 HUBER, CAUCHY = 1, 2
+_LOSSY = 1e4  # times R that H P H^T may be for P - W^T W to keep twelve digits
 
 
 class Blocks(NamedTuple):
@@ -47,60 +49,58 @@ def move(F: Array, decay: Array, X: Array) -> Array:
 
 
 @compiled
-def move_back(F: Array, decay: Array, X: Array) -> Array:
-    """X (n, D) times the matrix of a step."""
-    w = F.shape[1]
-    out = np.empty(X.shape)
-    top = np.dot(np.ascontiguousarray(X[:, :DIM]), F)
-    np.positive(top[:, :DIM], out[:, :DIM])
-    np.multiply(X[:, DIM:], decay, out[:, DIM:])
-    np.add(out[:, DIM:w], top[:, DIM:], out[:, DIM:w])
-    return out
-
-
-@compiled
 def predict(P: Array, F: Array, decay: Array, Q: Array, added: Array, out: Array) -> None:
     """The covariance (D, D) after a step, in `out`: with Q (15, 15) of the states and `added` (D-15) of parameters."""
-    w = F.shape[1]
-    top = np.dot(F, P[:w])
-    np.add(np.dot(np.ascontiguousarray(top[:, :w]), F.T), Q, out[:DIM, :DIM])
-    for i in range(DIM):
-        np.multiply(top[i, DIM:], decay, out[i, DIM:])
-    np.positive(out[:DIM, DIM:].T, out[DIM:, :DIM])
-    for i in range(len(decay)):
-        np.multiply(P[DIM + i, DIM:], decay[i] * decay, out[DIM + i, DIM:])
-        out[DIM + i, DIM + i] += added[i]
+    w, D = F.shape[1], len(P)
+    top = np.dot(F[:MOVING], P[:w])
+    own = np.dot(np.ascontiguousarray(top[:, :w]), F[:MOVING].T)
+    for i in range(MOVING):
+        for j in range(i + 1):
+            out[i, j] = out[j, i] = own[i, j] + Q[i, j]
+        for j in range(MOVING, DIM):
+            out[i, j] = top[i, j] + Q[i, j]
+        for j in range(DIM, D):
+            out[i, j] = top[i, j] * decay[j - DIM]
+        for j in range(MOVING, D):
+            out[j, i] = out[i, j]
+    for i in range(MOVING, DIM):
+        for j in range(MOVING, DIM):
+            out[i, j] = P[i, j] + Q[i, j]
+        for j in range(DIM, D):
+            out[i, j] = P[i, j] * decay[j - DIM]
+            out[j, i] = out[i, j]
+    for i in range(DIM, D):
+        d = decay[i - DIM]
+        for j in range(DIM, D):
+            out[i, j] = P[i, j] * (d * decay[j - DIM])
+        out[i, i] += added[i - DIM]
 
 
 @compiled
 def invert_root(L: Array) -> Array:
     """L^-1 of a lower root (m, m)."""
-    out = np.zeros(L.shape)
-    for i in range(len(L)):
-        own = out[i]
-        own[i] = 1.0
+    m = len(L)
+    out = np.zeros((m, m))
+    for i in range(m):
         for j in range(i):
-            own -= L[i, j] * out[j]
-        own /= L[i, i]
+            x = L[i, j]
+            for c in range(j + 1):
+                out[i, c] -= x * out[j, c]
+        x = 1.0 / L[i, i]
+        for c in range(i):
+            out[i, c] *= x
+        out[i, i] = x
     return out
 
 
 @compiled
-def solve(L: Array, X: Array) -> None:
-    """X (m, n) <- S^-1 X for S = L L^T."""
-    inverse = invert_root(L)
-    np.dot(inverse.T, np.dot(inverse, X), X)
-
-
-@compiled
-def compute_gain(HP: Array, HPHt: Array, variance: Array, r: Array) -> tuple[Array, Array, Array]:
-    """The lower root (m, m) of S = H P H^T + R, S^-1 r, and the gain transposed (m, D)."""
+def invert_sum(HPHt: Array, variance: Array) -> tuple[Array, Array]:
+    """The lower root L (m, m) of S = H P H^T + R, and L^-1."""
     S = HPHt.copy()
     for i in range(len(S)):
         S[i, i] += variance[i]
     L = np.linalg.cholesky(S)
-    inverse = invert_root(L)
-    return L, np.dot(inverse.T, np.dot(inverse, r)), np.dot(inverse.T, np.dot(inverse, HP))
+    return L, invert_root(L)
 
 
 @compiled
@@ -125,8 +125,18 @@ def update(P: Array, HP: Array, H: Array, Kt: Array, variance: Array) -> Array:
 
 
 @compiled
+def reduce(P: Array, W: Array) -> Array:
+    """The covariance after an update, as P - W^T W with W = L^-1 H P: half of the work, and fewer digits."""
+    out = np.dot(W.T, W)
+    for i in range(len(P)):
+        for j in range(i + 1):
+            out[i, j] = out[j, i] = P[i, j] - out[i, j]
+    return out
+
+
+@compiled
 def weigh_robustly(
-    HP: Array, HPHt: Array, variance: Array, r: Array, solved: Array, kernel: int, scale: Array, size: int
+    HPHt: Array, variance: Array, r: Array, solved: Array, kernel: int, scale: Array, size: int
 ) -> Array:
     """Weights (m,) of a kernel for rows of `size` numbers, by what the update leaves: none at first."""
     weight, sigma = np.ones(len(r)), np.sqrt(variance)
@@ -139,7 +149,8 @@ def weigh_robustly(
                 own = k / s if s > k else 1.0
             weight[lo : lo + size] = max(own, UNUSED)
         if last < PASSES - 2:
-            solved = compute_gain(HP, HPHt, variance / weight, r)[1]
+            _, inverse = invert_sum(HPHt, variance / weight)
+            solved = np.dot(inverse.T, np.dot(inverse, r))
     return weight
 
 
@@ -169,8 +180,9 @@ def filter_rows(
     bent: Array,
     Kt: Array,
     w: Array,
-    SH: Array,
+    inverse: Array,
     taken: Array,
+    lossy: Array,
     at: Array,
 ) -> None:
     """Filter keyframes k0 to k1, linearised throughout, from errors e (D,) and P before them.
@@ -183,18 +195,23 @@ def filter_rows(
     used : (B,) whether a block is taken in; of one that is not there is an innovation only.
     root, solved : (n, M, M), (n, M), filled with roots of S and S^-1 (r + H e), before any kernel.
     bent : (n, M), filled with weights of kernels, 0 of rows that a gate refuses.
-    Kt, w, SH : (n, M, D), (n, M), (n, M, D), filled with gains transposed, S^-1 nu and S^-1 H.
-    taken : (B,), filled with whether a block was taken in.
+    errors_predicted, P_predicted, errors, P_filtered : filled with what is predicted and filtered; of fewer than n,
+        but two at least that are predicted, those of the last keyframes are left.
+    Kt, w, inverse : (n, M, D), (n, M), (n, M, M), filled with gains transposed, S^-1 nu and S^-1; without a row, if
+        nobody will ask.
+    taken, lossy : (B,), filled with whether a block was taken in, and whether P - W^T W would have lost digits.
     at : (1,), the block that is taken in.
     """
+    gains, told = len(Kt) > 0, len(inverse) > 0
     for k in range(k0, k1):
+        ahead = k % len(P_predicted)
         if k:
             e = gap[k - 1] + move(F[k - 1], decay[k - 1], e.reshape(-1, 1)).ravel()
-            predict(P, F[k - 1], decay[k - 1], Q[k - 1], added[k - 1], P_predicted[k])
+            predict(P, F[k - 1], decay[k - 1], Q[k - 1], added[k - 1], P_predicted[ahead])
         else:
-            np.positive(P, P_predicted[k])
-        P = P_predicted[k]
-        np.positive(e, errors_predicted[k])
+            np.positive(P, P_predicted[ahead])
+        P = P_predicted[ahead]
+        np.positive(e, errors_predicted[k % len(errors_predicted)])
         for b in range(blocks.first[k], blocks.first[k + 1]):
             at[0] = b
             lo, hi = blocks.begin[b], blocks.end[b]
@@ -202,108 +219,57 @@ def filter_rows(
             HP = np.dot(own, P)
             HPHt = np.dot(HP, own.T)
             left = r[k, lo:hi] + np.dot(own, e)
-            L, w_b, Kt_b = compute_gain(HP, HPHt, R, left)
-            np.positive(w_b, solved[k, lo:hi])
-            np.positive(L, root[k, lo:hi, lo:hi])
-            refused = np.dot(left, w_b) > blocks.gate[b]
+            L, one = invert_sum(HPHt, R)
+            white = np.dot(one, left)
+            refused = np.dot(white, white) > blocks.gate[b]
             taken[b] = used[b] and not refused
             bent[k, lo:hi] = 0.0 if refused else 1.0
+            w_b = np.dot(one.T, white)
+            np.positive(w_b, solved[k, lo:hi])
+            np.positive(L, root[k, lo:hi, lo:hi])
             if taken[b]:
                 if blocks.kernel[b]:
-                    weight = weigh_robustly(HP, HPHt, R, left, w_b, blocks.kernel[b], scale[k, lo:hi], blocks.size[b])
+                    weight = weigh_robustly(HPHt, R, left, w_b, blocks.kernel[b], scale[k, lo:hi], blocks.size[b])
                     np.positive(weight, bent[k, lo:hi])
                     R = R / weight
-                    L, w_b, Kt_b = compute_gain(HP, HPHt, R, left)
-                np.positive(Kt_b, Kt[k, lo:hi])
-                np.negative(w_b, w[k, lo:hi])
-                np.positive(own, SH[k, lo:hi])
-                solve(L, SH[k, lo:hi])
-                e = e - np.dot(left, Kt_b)
-                P = update(P, HP, own, Kt_b, R)
-        np.positive(e, errors[k])
-        np.positive(P, P_filtered[k])
-
-
-@compiled
-def smooth_point(e: Array, P: Array, r: Array, N: Array, smoothed: Array, P_smoothed: Array) -> None:
-    """Errors (D,) and covariance (D, D) of the smoother, from those of the filter and the disturbance behind them."""
-    np.add(e, np.dot(P, r), smoothed)
-    one = np.dot(np.dot(P, N), P)
-    np.subtract(P, one, one)
-    halve_sum(one, P_smoothed)
-
-
-@compiled
-def smooth_rows(
-    k0: int,
-    k1: int,
-    r_k: Array,
-    N_k: Array,
-    F: Array,
-    decay: Array,
-    Kt: Array,
-    H: Array,
-    w: Array,
-    SH: Array,
-    first: Array,
-    begin: Array,
-    end: Array,
-    taken: Array,
-    errors_predicted: Array,
-    P_predicted: Array,
-    errors: Array,
-    P: Array,
-    r: Array,
-    N: Array,
-    smoothed: Array,
-    P_smoothed: Array,
-) -> None:
-    """r (n, D) and N (n, D, D) of keyframes k1 - 1 down to k0, from those of k1, zero where there is none.
-
-    And errors (n, D) and covariances of the smoother there: from the filtered ones, since those predicted, of a place
-    that only the first fix tells, are larger by ten orders than what is left of them.
-
-    Parameters
-    ----------
-    Kt, H, w, SH : of the updates: gains transposed, rows, S^-1 nu and S^-1 H.
-    taken : (B,) whether a block was taken in.
-    """
-    for k in range(k1 - 1, k0 - 1, -1):
-        if k < len(F):
-            r_k = move_back(F[k], decay[k], r_k.reshape(1, -1)).ravel()
-            N_k = move_back(F[k], decay[k], N_k)
-            N_k = move_back(F[k], decay[k], np.ascontiguousarray(N_k.T))
-            smooth_point(errors[k], P[k], r_k, N_k, smoothed[k], P_smoothed[k])
-        for b in range(first[k + 1] - 1, first[k] - 1, -1):
-            if taken[b]:
-                lo, hi = begin[b], end[b]
-                own, gain = H[k, lo:hi], Kt[k, lo:hi]
-                r_k = r_k + np.dot(w[k, lo:hi] - np.dot(gain, r_k), own)
-                # from one side after the other: after a first fix what is left of N is smaller by ten orders each time
-                N_k = N_k - np.dot(np.dot(N_k, gain.T), own)
-                N_k += np.dot(own.T, SH[k, lo:hi] - np.dot(gain, N_k))
-        np.positive(r_k, r[k])
-        halve_sum(N_k, N[k])
-        N_k = N[k]
-        if k == len(F):  # the last of all: its filtered covariance is of errors about the estimate already
-            smooth_point(errors_predicted[k], P_predicted[k], r_k, N_k, smoothed[k], P_smoothed[k])
+                    L, one = invert_sum(HPHt, R)
+                    white = np.dot(one, left)
+                    w_b = np.dot(one.T, white)
+                W = np.dot(one, HP)
+                lossy[b] = False
+                for i in range(hi - lo):
+                    lossy[b] |= HPHt[i, i] > _LOSSY * R[i]
+                Kt_b = np.dot(one.T, W) if gains or lossy[b] else W
+                if gains:
+                    np.positive(Kt_b, Kt[k, lo:hi])
+                    np.negative(w_b, w[k, lo:hi])
+                if told:
+                    np.positive(np.dot(one.T, one), inverse[k, lo:hi, lo:hi])
+                e = e - np.dot(white, W)
+                P = update(P, HP, own, Kt_b, R) if lossy[b] else reduce(P, W)
+        np.positive(e, errors[k % len(errors)])
+        np.positive(P, P_filtered[k % len(P_filtered)])
 
 
 @compiled
 def divide_covariance(P: Array, X: Array) -> None:
     """X (D, n) <- P^-1 X by Cholesky's root of P (D, D)."""
     L = np.linalg.cholesky(P)
-    D = len(L)
+    D, n = X.shape
     for i in range(D):
-        own = X[i]
         for j in range(i):
-            own -= L[i, j] * X[j]
-        own /= L[i, i]
+            x = L[i, j]
+            for c in range(n):
+                X[i, c] -= x * X[j, c]
+        for c in range(n):
+            X[i, c] /= L[i, i]
     for i in range(D - 1, -1, -1):
-        own = X[i]
         for j in range(i + 1, D):
-            own -= L[j, i] * X[j]
-        own /= L[i, i]
+            x = L[j, i]
+            for c in range(n):
+                X[i, c] -= x * X[j, c]
+        for c in range(n):
+            X[i, c] /= L[i, i]
 
 
 @compiled
@@ -360,16 +326,3 @@ def smooth_filtered(
         np.dot(away, Ct, errors[k])
         two = P[k] + np.dot(Ct.T, np.dot(P_smoothed[k + 1] - ahead, Ct))
         halve_sum(two, P_smoothed[k])
-
-
-@compiled
-def row_covariances(H: Array, P: Array, k: Array) -> Array:
-    """(n, m, m) H P_k H^T of rows H (n, m, D) at keyframes k (n,)."""
-    n, m, _ = H.shape
-    out = np.empty((n, m, m))
-    for i in range(n):
-        HP = np.dot(H[i], P[k[i]])
-        for j in range(m):
-            for c in range(j + 1):
-                out[i, j, c] = out[i, c, j] = np.dot(HP[j], H[i, c])
-    return out

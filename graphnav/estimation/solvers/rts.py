@@ -17,6 +17,7 @@ r and N are what the noise model is estimated by (`graphnav.estimation.noise.mom
 from __future__ import annotations
 
 import time
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg.lapack import dposv
@@ -28,10 +29,12 @@ from graphnav.estimation.dense import dense
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import Solution
 from graphnav.estimation.solvers.breakdown import explain_smoother
-from graphnav.estimation.solvers.linearise import scale_at
+from graphnav.estimation.solvers.disturbance import smooth_errors, smooth_rows
+from graphnav.estimation.solvers.linearise import linearise, scale_at, stepping
 from graphnav.estimation.solvers.passes import (
     FilterPass,
     ForwardRecord,
+    MomentPass,
     Progress,
     SmootherPass,
     Updates,
@@ -40,7 +43,7 @@ from graphnav.estimation.solvers.passes import (
     record_residuals,
     sigmas_of,
 )
-from graphnav.estimation.solvers.recursion import STRETCH, move, smooth_filtered, smooth_rows
+from graphnav.estimation.solvers.recursion import STRETCH, move, smooth_filtered
 
 _CANCELLED = 7e4  # times smaller than filtered: P - P N P is good to eps times the square of that, a millionth
 
@@ -51,7 +54,7 @@ def backward(problem: Problem, forward: ForwardRecord, progress: Progress | None
     n = 0 if forward.about is None else len(forward.about.values)
     end = max(n - 1, 0) if n < K else K  # of the keyframes whose errors are from points, and lead to such
     P, values = np.empty((K, D, D)), np.empty((K, D - DIM))
-    r, N = np.empty((n, D)), np.empty((n, D, D))
+    found, behind = _Disturbances.allocate(n, D), (np.zeros(D), np.zeros((D, D)))
     states = []
     if end < K:
         states = [_smooth_filtered(problem, forward, end, values, P, progress)]
@@ -63,15 +66,62 @@ def backward(problem: Problem, forward: ForwardRecord, progress: Progress | None
             _, inverse, info = dposv(ahead, np.eye(D))
             if info:
                 raise explain_smoother(float(problem.t[end]))
-            r[end], N[end] = inverse @ away, inverse @ (ahead - P[end]) @ inverse
-        errors = np.empty((end, D))
+            behind = inverse @ away, inverse @ (ahead - P[end]) @ inverse
+            found.put(end, *behind)
         if forward.updates is not None:
-            _smooth_points(forward, forward.updates, r, N, errors, P, progress)
+            _smooth_points(forward, forward.updates, behind, end, found, P, progress=progress)
             _restore_digits(forward, P, end)
-        first = move_points(forward.about.first(end), errors)
+        first = move_points(forward.about.first(end), found.errors[:end])
         values[:end] = first.values
         states = [first.states, *states]
-    return SmootherPass(States.stack(states), values, P, r, N)
+    return SmootherPass(States.stack(states), values, found.r, found.N, found.N_diagonal, P)
+
+
+def backward_moments(problem: Problem, forward: ForwardRecord) -> MomentPass:
+    """Smooth a forward pass that was linearised at given points throughout, with covariances for a noise model only."""
+    K, D = forward.P.shape[:2]
+    assert forward.about is not None
+    assert forward.updates is not None
+    assert len(forward.about.values) == K
+    found, behind = _Disturbances.allocate(K, D), (np.zeros(D), np.zeros((D, D)))
+    one, blocks = forward.updates, forward.updates.blocks
+    smooth_errors(
+        forward.F, forward.decay, one.Kt, one.H, one.w, blocks.first, blocks.begin, blocks.end, one.taken,
+        forward.errors_predicted, forward.P_predicted, forward.errors, forward.P, found.errors,
+    )  # fmt: skip
+    smoothed = move_points(forward.about, found.errors)
+    linear, asked = {}, np.zeros_like(one.H)
+    for rows in problem.constraints:
+        if rows.noise_groups()[0]:
+            which = slice(0, int(np.searchsorted(rows.keyframe, K)))
+            linear[rows.name] = linearise(rows, smoothed, problem.columns, which)
+            asked[one.places[rows.name]] = linear[rows.name].H
+    wanted = np.zeros((K, D), dtype=bool)  # at both ends of their steps
+    for chain in problem.chains:
+        if chain.parameter.correlation_time is not None:
+            k, own = stepping(chain, K), problem.columns[chain.parameter.name]
+            wanted[k, own] = wanted[k - 1, own] = True
+    variance, of_rows = _smooth_points(forward, one, behind, K, found, np.empty((0, D, D)), wanted, asked)
+    return MomentPass(
+        smoothed.states, smoothed.values, found.r, found.N, found.N_diagonal, variance, linear, of_rows, one.places
+    )
+
+
+@dataclass(frozen=True)
+class _Disturbances:
+    """What the recursion of a disturbance smoother fills, of n keyframes."""
+
+    errors: Array  # (n, D)
+    r: Array  # (n, D)
+    N: Array  # (n, 15, 15)
+    N_diagonal: Array  # (n, D)
+
+    @classmethod
+    def allocate(cls, n: int, D: int) -> _Disturbances:
+        return cls(np.empty((n, D)), np.empty((n, D)), np.empty((n, DIM, DIM)), np.empty((n, D)))
+
+    def put(self, k: int, r: Array, N: Array) -> None:
+        self.r[k], self.N[k], self.N_diagonal[k] = r, N[:DIM, :DIM], np.diagonal(N)
 
 
 def _smooth_filtered(
@@ -100,22 +150,37 @@ def _smooth_filtered(
 
 
 def _smooth_points(
-    forward: ForwardRecord, one: Updates, r: Array, N: Array, errors: Array, P: Array, progress: Progress | None
-) -> None:
-    """Smoothed errors (end, D), covariances, r and N of the first keyframes; r and N behind them known if there are."""
-    end, D = errors.shape
-    r_k, N_k = (r[end], N[end]) if end < len(r) else (np.zeros(D), np.zeros((D, D)))
-    blocks = one.blocks
+    forward: ForwardRecord,
+    one: Updates,
+    behind: tuple[Array, Array],
+    end: int,
+    out: _Disturbances,
+    P: Array,
+    wanted: Array | None = None,
+    asked: Array | None = None,
+    progress: Progress | None = None,
+) -> tuple[Array, Array]:
+    """Smoothed errors, covariances, r and N of the first keyframes up to `end`, from r and N behind them.
+
+    Where P has no keyframes, variances (end, D) of the columns `wanted` (K, D), and H P^s H^T (end, M, M) of rows
+    `asked` (K, M, D).
+    """
+    blocks, (r_k, N_k) = one.blocks, behind
+    wanted = np.zeros((0, 0), dtype=bool) if wanted is None else wanted
+    asked = np.empty((0, 0, 0)) if asked is None else asked
+    variance, of_rows = np.zeros(wanted.shape), np.zeros((len(asked), *asked.shape[1:2] * 2))
+    columns, first = np.nonzero(wanted)[1], np.append(0, np.cumsum(wanted.sum(axis=1)))
     for hi in range(end, 0, -STRETCH):
         lo = max(hi - STRETCH, 0)
-        smooth_rows(
-            lo, hi, r_k, N_k, forward.F, forward.decay, one.Kt, one.H, one.w, one.SH,
-            blocks.first, blocks.begin, blocks.end, one.taken,
-            forward.errors_predicted, forward.P_predicted, forward.errors, forward.P, r, N, errors, P,
+        r_k, N_k = smooth_rows(
+            lo, hi, r_k, N_k, forward.F, forward.decay, one.Kt, one.H, one.w, one.inverse,
+            blocks.first, blocks.begin, blocks.end, one.taken, one.lossy,
+            forward.errors_predicted, forward.P_predicted, forward.errors, forward.P, columns, first,
+            out.r, out.N, out.N_diagonal, out.errors, P, variance, asked, of_rows,
         )  # fmt: skip
-        r_k, N_k = r[lo], N[lo]
         if progress is not None:
             progress("smoother", 1.0 - lo / len(forward.P))
+    return variance, of_rows
 
 
 def _restore_digits(forward: ForwardRecord, P: Array, end: int) -> None:

@@ -113,7 +113,7 @@ class Stack:
             self.root_weight[place], self.scale[place] = weight, scale
         table = np.concatenate(parts, axis=1) if parts else np.empty((8, 0), dtype=int)
         table = table[:, np.argsort(table[0], kind="stable")]
-        self._parts = table[:6].T.tolist()
+        self._parts = table[:6].T
         self.single = self._blocks(table, np.ones(table.shape[1], dtype=bool))
         k, apart = table[0], table[6].astype(bool)
         self.joint = self._blocks(table, np.diff(k, prepend=-1).astype(bool) | apart | np.roll(apart, 1))
@@ -144,21 +144,32 @@ class Stack:
 
     def block(self, b: int) -> RowBlock:
         """Block number b."""
-        some = self._parts[self.joint.part[b] : self.joint.part[b + 1]]
+        some = self._parts[self.joint.part[b] : self.joint.part[b + 1]].tolist()
         parts = [(self._constraints[i], lo, hi) for _, i, lo, hi, _, _ in some]
         return RowBlock(some[0][0], b, some[0][4], some[-1][5], parts)
+
+    def log_likelihood(self) -> Array:
+        """(K,) of the innovations, but for a constant."""
+        return self._weigh((self.solved[:, None] @ self.root)[:, 0])
+
+    def _weigh(self, white: Array) -> Array:
+        """Log-likelihood (K,) of whitened innovations (K, M)."""
+        weighs = np.zeros((self.K, self.M), dtype=bool)
+        for c in self._constraints:
+            place = self.places[c.name]
+            weighs[place] = True if c.weight is None else c.weight[: len(place[0]), None] > 0.0
+        spread = np.where(weighs, np.abs(np.diagonal(self.root, axis1=1, axis2=2)), 1.0)
+        log_determinant = np.sum(np.log(np.where(spread > 0.0, spread, 1.0)), axis=1)
+        return np.asarray(-log_determinant - 0.5 * np.sum(np.where(weighs, white, 0.0) ** 2, axis=1))
 
     def finish(self) -> Array:
         """Work out the innovations of each kind; returns their log-likelihood (K,), but for a constant."""
         kind = np.full((self.K, self.M), -1)
-        weighs = np.zeros((self.K, self.M), dtype=bool)
         for i, c in enumerate(self._constraints):
-            place = self.places[c.name]
-            kind[place] = i
-            weighs[place] = True if c.weight is None else c.weight[: len(place[0]), None] > 0.0
+            kind[self.places[c.name]] = i
         L = self.root
         white = (self.solved[:, None] @ L)[:, 0]
-        spread = np.where(weighs, np.abs(np.diagonal(L, axis1=1, axis2=2)), 1.0)
+        log_likelihood = self._weigh(white)
         L *= kind[:, :, None] == kind[:, None]
         residual, sigma = mv(L, white), np.sqrt(np.einsum("kij,kij->ki", L, L))
         for c in self._constraints:
@@ -169,8 +180,7 @@ class Stack:
             record.nis[:n] = total[k] / np.bincount(k, minlength=self.K)[k]
             bent = self.bent[k, place[1][:, 0]]
             record.weight[:n], record.refused[:n] = record.used[:n] * bent, bent == 0.0
-        log_determinant = np.sum(np.log(np.where(spread > 0.0, spread, 1.0)), axis=1)
-        return -log_determinant - 0.5 * np.sum(np.where(weighs, white, 0.0) ** 2, axis=1)
+        return log_likelihood
 
 
 def _describe(rows: Constraint) -> tuple[float, int, int]:

@@ -64,7 +64,8 @@ class StretchFilter:
             at_k, place = stack.places[rows.name]
             block = np.searchsorted(k * (stack.M + 1) + blocks.begin, (at_k * (stack.M + 1) + place)[:, 0], "right") - 1
             self._of_rows[rows.name] = self._before[block] + rows.iterated
-        self._taken, self._at = np.zeros(len(stack.joint.begin), dtype=bool), np.zeros(1, dtype=int)
+        self._taken, self._lossy = np.zeros((2, len(stack.joint.begin)), dtype=bool)
+        self._at = np.zeros(1, dtype=int)
 
     def run(self, k: int, x: Points, P: Array, predicted: Points, filtered: Points) -> int:
         """Filter a stretch from keyframe k on.
@@ -141,14 +142,15 @@ class StretchFilter:
         gap, Q, F = self._step(k, k1, x, points, start, end, T, m)
         r, sigma, H = linearise_all(self._problem, stack, points, own, self._of_rows, k, self._start[k], (T, m))
         n, D = r.shape[0], H.shape[2]
-        predicted, errors, Kt, SH, w = np.empty((n, D)), np.empty((n, D)), np.zeros_like(H), np.empty_like(H), r.copy()
+        predicted, errors, Kt, w = np.empty((n, D)), np.empty((n, D)), np.zeros_like(H), r.copy()
         steps = slice(own.start, k1 - 1)
         filter_rows(
             k - own.start, n, np.zeros(D), P, F, self._steps.decay[steps], gap, Q, self._steps.added[steps],
             r, H, (sigma / stack.root_weight[own]) ** 2, stack.scale[own],
             blocks._replace(first=blocks.first[own.start : k1 + 1]), blocks.used,
             predicted, self._P_predicted[own], errors, self._P[own],
-            stack.root[own], stack.solved[own], stack.bent[own], Kt, w, SH, self._taken, self._at,
+            stack.root[own], stack.solved[own], stack.bent[own], Kt, w, np.empty((0, 0, 0)),
+            self._taken, self._lossy, self._at,
         )  # fmt: skip
         self._P[k:k1] = turn(self._P[k:k1], np.ascontiguousarray(T[end]))
         # what each number adds to y, by the root of all numbers' covariance: (L^T K^T) (L^-1 nu)

@@ -158,7 +158,7 @@ class _InnovationLevel:
         self.t, self.nis, self.used, self.factor = array("d"), array("d"), array("b"), 1.0
 
     def add(self, t: float, nis: float, used: bool = True) -> None:
-        k = bisect_left(self.t, t)
+        k = bisect_left(self.t, t) if len(self.t) and t <= self.t[-1] else len(self.t)
         if k < len(self.t) and self.t[k] == t:
             self.nis[k], self.used[k] = nis, used
         else:
@@ -166,11 +166,21 @@ class _InnovationLevel:
             self.nis.insert(k, nis)
             self.used.insert(k, used)
         if k % _EVERY == 0:
-            before = np.flatnonzero(np.frombuffer(self.used, dtype=np.int8)[:k])
-            begin = int(before[-1]) + 1 if len(before) else 0
+            begin = k
+            while begin and not self.used[begin - 1]:
+                begin -= 1
             known = begin if begin < k and self.t[k - 1] - self.t[begin] <= PATIENCE else k + 1
             if known:
-                self.factor = max(1.0, float(np.median(np.frombuffer(self.nis)[:known])) / self.median)
+                self.factor = max(1.0, _median(np.frombuffer(self.nis)[:known]) / self.median)
+
+
+def _median(x: Array) -> float:
+    """Of some numbers (n,), as of many small samples: without what `numpy.median` does before."""
+    half = len(x) // 2
+    if len(x) % 2:
+        return float(np.partition(x, half)[half])
+    both = np.partition(x, (half - 1, half))
+    return 0.5 * float(both[half - 1] + both[half])
 
 
 class Bank:
@@ -201,6 +211,8 @@ class Bank:
         self._met = np.isin(np.arange(len(t)), np.concatenate([c.keyframe for c in constraints]))
         self._before, self._keys = np.empty((_REMEMBERED, ends[-1])), np.zeros(_REMEMBERED, dtype=int)
         self._ends = np.zeros(2, dtype=int)
+        self._kind: Array | None = None  # (B,) of each block of the filter, as it is met, and
+        self._limit = np.empty(0)  # (B,) of its T
 
     def go_back(self, k: int) -> None:
         """To before keyframe k; without any onset where that is too long ago."""
@@ -237,16 +249,23 @@ class Bank:
         speeds : (n,) m/s, of the vehicle.
         """
         blocks, names = updates.blocks, list(self._slots)
-        kind, limit = stack.find_kinds(names), np.full(len(blocks.begin), np.inf)
+        if self._kind is None:
+            self._kind, self._limit = stack.find_kinds(names), np.full(len(blocks.begin), np.inf)
+        kind, limit = self._kind, self._limit
         white = (stack.solved[k0:k1, None] @ stack.root[k0:k1])[:, 0]
         levels = []
-        for b in range(blocks.first[k0], blocks.first[k1]):
-            if kind[b] >= 0:
-                slots, k = self._slots[names[kind[b]]], int(blocks.k[b])
-                own = white[k - k0, blocks.begin[b] : blocks.end[b]]
-                slots.typical_sigmas.add(float(self._t[k]), float(own @ own), bool(updates.taken[b]))
-                levels.append((b, slots.typical_sigmas, slots.typical_sigmas.factor))
-                limit[b] = slots.typical_sigmas.factor * slots.threshold
+        some = slice(blocks.first[k0], blocks.first[k1])
+        first = some.start
+        for i, k, begin, end, taken in zip(
+            *(x[some].tolist() for x in (kind, blocks.k, blocks.begin, blocks.end, updates.taken)), strict=True
+        ):
+            if i >= 0:
+                slots = self._slots[names[i]]
+                own, level = white[k - k0, begin:end], slots.typical_sigmas
+                level.add(float(self._t[k]), float(own @ own), taken)
+                levels.append((first, level, level.factor))
+                limit[first] = level.factor * slots.threshold
+            first += 1
         k, b = k0, int(blocks.first[k0])
         while True:
             k, b = follow_filter(

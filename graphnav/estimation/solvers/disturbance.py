@@ -1,0 +1,217 @@
+"""The disturbance smoother of a filter linearised at given points, on arrays alone: compiled where Numba is there.
+
+Bryson and Frazier (1963); de Jong (1989); Koopman (1993). Steps and rows are as in
+`graphnav.estimation.solvers.recursion`.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from graphnav.core.compiled import compiled
+from graphnav.core.rotation import Array
+from graphnav.core.state import DIM
+from graphnav.estimation.solvers.recursion import MOVING
+
+
+@compiled
+def step_back(F: Array, decay: Array, N: Array) -> Array:
+    """N (D, D) before a step from that behind it."""
+    w, D = F.shape[1], len(N)
+    moving, one, out = F[:MOVING], np.empty((D, D)), np.empty((D, D))
+    top = np.dot(moving.T, N[:MOVING])
+    for i in range(D):
+        d = 1.0 if i < DIM else decay[i - DIM]
+        for j in range(D):
+            one[i, j] = d * N[i, j] if i >= MOVING else 0.0
+        if i < w:
+            for j in range(D):
+                one[i, j] += top[i, j]
+    left = np.dot(np.ascontiguousarray(one[:, :MOVING]), moving)
+    for j in range(D):
+        d = 0.0 if j < MOVING else 1.0 if j < DIM else decay[j - DIM]
+        for i in range(j, D):
+            x = d * one[i, j]
+            if j < w:
+                x += left[i, j]
+            out[i, j] = out[j, i] = x
+    return out
+
+
+@compiled
+def step_vector_back(F: Array, decay: Array, r: Array) -> Array:
+    """r (D,) likewise."""
+    out = np.empty(len(r))
+    out[:MOVING] = 0.0
+    out[MOVING:DIM] = r[MOVING:DIM]
+    out[DIM:] = decay * r[DIM:]
+    out[: F.shape[1]] += np.dot(r[:MOVING], F[:MOVING])
+    return out
+
+
+@compiled
+def take_back(N: Array, H: Array, Kt: Array, inverse: Array, lossy: bool) -> Array:
+    """N (D, D) before an update from that behind it."""
+    G = np.dot(Kt, N)
+    if lossy:
+        # from one side after the other: after a first fix what is left of N is smaller by ten orders each time
+        out = N - np.dot(G.T, H)
+        out += np.dot(H.T, np.dot(inverse, H) - np.dot(Kt, out))
+        return 0.5 * (out + out.T)
+    G -= 0.5 * np.dot(inverse + np.dot(G, Kt.T), H)
+    out = np.dot(H.T, G)
+    for i in range(len(N)):
+        for j in range(i + 1):
+            out[i, j] = out[j, i] = N[i, j] - out[i, j] - out[j, i]
+    return out
+
+
+@compiled
+def smooth_errors(
+    F: Array,
+    decay: Array,
+    Kt: Array,
+    H: Array,
+    w: Array,
+    first: Array,
+    begin: Array,
+    end: Array,
+    taken: Array,
+    errors_predicted: Array,
+    P_predicted: Array,
+    errors: Array,
+    P: Array,
+    smoothed: Array,
+) -> None:
+    """Errors (n, D) of the smoother at all keyframes, as `smooth_rows` has them, and nothing else of it."""
+    r, last = np.zeros(errors.shape[1]), len(errors) - 1
+    for k in range(last, -1, -1):
+        if k < last:
+            r = step_vector_back(F[k], decay[k], r)
+            np.add(errors[k], np.dot(P[k], r), smoothed[k])
+        for b in range(first[k + 1] - 1, first[k] - 1, -1):
+            if taken[b]:
+                lo, hi = begin[b], end[b]
+                r = r + np.dot(w[k, lo:hi] - np.dot(Kt[k, lo:hi], r), H[k, lo:hi])
+        if k == last:
+            np.add(errors_predicted[k], np.dot(P_predicted[k % len(P_predicted)], r), smoothed[k])
+
+
+@compiled
+def smooth_rows(
+    k0: int,
+    k1: int,
+    r_k: Array,
+    N_k: Array,
+    F: Array,
+    decay: Array,
+    Kt: Array,
+    H: Array,
+    w: Array,
+    inverse: Array,
+    first: Array,
+    begin: Array,
+    end: Array,
+    taken: Array,
+    lossy: Array,
+    errors_predicted: Array,
+    P_predicted: Array,
+    errors: Array,
+    P: Array,
+    wanted: Array,
+    first_wanted: Array,
+    r: Array,
+    N: Array,
+    N_diagonal: Array,
+    smoothed: Array,
+    P_smoothed: Array,
+    variance: Array,
+    asked: Array,
+    of_rows: Array,
+) -> tuple[Array, Array]:
+    """r (n, D), and of N the states' part (n, 15, 15) and the diagonal (n, D), of keyframes k1 - 1 down to k0.
+
+    From those of k1, zero where there is none; returns those of k0. And errors (n, D) of the smoother there: from the
+    filtered ones, since those predicted, of a place that only the first fix tells, are larger by ten orders than what
+    is left of them.
+
+    Parameters
+    ----------
+    Kt, H, w, inverse : of the updates: gains transposed, rows, S^-1 nu and S^-1.
+    taken, lossy : (B,) whether a block was taken in, and whether with a loss of digits.
+    P_smoothed : (n, D, D), filled with covariances of the smoother, if it has any keyframes. If it has none,
+    variance : (n, D), and
+    of_rows : (n, M, M), filled with variances, and with H P^s H^T of rows `asked` (n, M, D).
+    wanted, first_wanted : columns of which variances are wanted, those of keyframe k from `first_wanted[k]` on.
+    """
+    whole = len(P_smoothed) > 0
+    for k in range(k1 - 1, k0 - 1, -1):
+        ahead = k < len(F)  # of the last of all the filtered covariance is of errors about the estimate already
+        if ahead:
+            r_k = step_vector_back(F[k], decay[k], r_k)
+            N_k = step_back(F[k], decay[k], N_k)
+            np.add(errors[k], np.dot(P[k], r_k), smoothed[k])
+            if whole:
+                cover(P[k], N_k, P_smoothed[k])
+            else:
+                vary(P[k], N_k, wanted[first_wanted[k] : first_wanted[k + 1]], variance[k])
+                if first[k] < first[k + 1]:
+                    cover_rows(P[k], N_k, asked[k, : end[first[k + 1] - 1]], of_rows[k])
+        for b in range(first[k + 1] - 1, first[k] - 1, -1):
+            if taken[b]:
+                lo, hi = begin[b], end[b]
+                own, gain = H[k, lo:hi], Kt[k, lo:hi]
+                r_k = r_k + np.dot(w[k, lo:hi] - np.dot(gain, r_k), own)
+                N_k = take_back(N_k, own, gain, np.ascontiguousarray(inverse[k, lo:hi, lo:hi]), lossy[b])
+        np.positive(r_k, r[k])
+        np.positive(N_k[:DIM, :DIM], N[k])
+        for i in range(len(r_k)):
+            N_diagonal[k, i] = N_k[i, i]
+        if not ahead:
+            ahead_P = P_predicted[k % len(P_predicted)]
+            np.add(errors_predicted[k], np.dot(ahead_P, r_k), smoothed[k])
+            if whole:
+                cover(ahead_P, N_k, P_smoothed[k])
+            else:
+                vary(ahead_P, N_k, wanted[first_wanted[k] : first_wanted[k + 1]], variance[k])
+                if first[k] < first[k + 1]:
+                    cover_rows(ahead_P, N_k, asked[k, : end[first[k + 1] - 1]], of_rows[k])
+    return r_k, N_k
+
+
+@compiled
+def cover(P: Array, N: Array, out: Array) -> None:
+    """P - P N P, in `out`."""
+    one = np.dot(np.dot(P, N), P)
+    np.subtract(P, one, one)
+    np.add(one, one.T, out)
+    np.multiply(0.5, out, out)
+
+
+@compiled
+def vary(P: Array, N: Array, columns: Array, out: Array) -> None:
+    """The diagonal of P - P N P at some columns, in `out` (D,)."""
+    own = P[columns]
+    PN = np.dot(own, N)
+    for i in range(len(columns)):
+        out[columns[i]] = own[i, columns[i]] - np.dot(PN[i], own[i])
+
+
+@compiled
+def cover_rows(P: Array, N: Array, H: Array, out: Array) -> None:
+    """H (P - P N P) H^T of rows H (m, D), in the first of `out` (M, M)."""
+    m, HP = len(H), np.dot(H, P)
+    out[:m, :m] = np.dot(H - np.dot(HP, N), HP.T)
+
+
+@compiled
+def row_covariances(H: Array, P: Array, k: Array) -> Array:
+    """(n, m, m) H P_k H^T of rows H (n, m, D) at keyframes k (n,)."""
+    n, m, _ = H.shape
+    out = np.empty((n, m, m))
+    for i in range(n):
+        HP = np.dot(H[i], P[k[i]])
+        for j in range(m):
+            for c in range(j + 1):
+                out[i, j, c] = out[i, c, j] = np.dot(HP[j], H[i, c])
+    return out
