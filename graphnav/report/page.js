@@ -165,7 +165,8 @@
     if (!target.data) draw(target);
   }), {rootMargin: "200px"});
   places.forEach(place => seen.observe(place));
-  dark.addEventListener("change", () => places.filter(place => place.data).forEach(draw));
+  // in the frame to come, when the styles are those of the new colours
+  dark.addEventListener("change", () => requestAnimationFrame(() => places.filter(place => place.data).forEach(draw)));
 
   // A4 between its margins is 703 pixels wide; three figures stand beside each other there
   addEventListener("beforeprint", () => places.forEach(place => {

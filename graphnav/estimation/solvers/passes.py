@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -25,7 +26,7 @@ Progress = Callable[[str, float], None]
 
 
 @dataclass(frozen=True)
-class DisturbancePass(Points):
+class DisturbancePass(Points, ABC):
     """A backward pass: states and parameter values, and what it says of the disturbances before each keyframe.
 
     Of the first n keyframes, which were linearised at given points: P^s = P- - P- N P-.
@@ -36,13 +37,13 @@ class DisturbancePass(Points):
     N_diagonal: Array  # (n, D)
 
     @property
+    @abstractmethod
     def variance(self) -> Array:
         """(K, D) of the errors; of those of parameters without a correlation time it may be unknown."""
-        raise NotImplementedError
 
+    @abstractmethod
     def cover_rows(self, linear: Rows, n: int) -> Array:
         """H P^s H^T (n, m, m) of the first n rows of a constraint, linearised at the smoothed points."""
-        raise NotImplementedError
 
 
 @dataclass(frozen=True)
