@@ -91,7 +91,7 @@ def _detect(scene: Scene, labels: Labels | None, shown: bool) -> Detection:
     bands, clipped = _select_bands(settings, factor, w.frequencies)
     if clipped:
         notes.append(Note("detectors.fft.bands_cut", clipped))
-    height, where, picture = _measure(w, bands)
+    height, where, kept, spectrogram = _measure(w, bands)
     quotient = _compute_quotients(height, settings)
     asked: Mask = np.asarray(np.isfinite(quotient).any(axis=0))
     if line is not None:
@@ -117,7 +117,14 @@ def _detect(scene: Scene, labels: Labels | None, shown: bool) -> Detection:
         found = np.where(whole, np.nanmax(np.where(asked, quotient, np.nan), axis=1), np.nan)
         found = np.maximum(np.maximum(found, quiet), _divide_speed(t, settings, scene.known))
     mask = found < 1.0
-    details = {"peak_frequency": where, "peak_amplitude": height, "bands": np.array(bands), **picture}
+    details = {
+        "peak_frequency": where,
+        "peak_amplitude": height,
+        "bands": np.array(bands),
+        "spectrogram": spectrogram,
+        "spectrogram_t": t[kept],
+        "spectrogram_frequency": w.frequencies[: spectrogram.shape[1]],
+    }
     if line is not None:
         details["idle_line"] = np.array([line.frequency, line.lowest, line.highest])
     spans = spans_of(mask, t, half)
@@ -169,8 +176,10 @@ def _select_bands(settings: FftSettings, factor: float, frequencies: Array) -> t
     return bands, note
 
 
-def _measure(w: Windows, bands: Sequence[tuple[float, float]]) -> tuple[Array, Array, dict[str, Array]]:
-    """Amplitude and frequency of the peaks (W, 3 channels, 3 bands), and a thinned spectrogram of the up force."""
+def _measure(w: Windows, bands: Sequence[tuple[float, float]]) -> tuple[Array, Array, Array, Array]:
+    """Amplitude and frequency of the peaks (W, 3 channels, 3 bands), and some windows with the spectrogram of the up
+    force in them.
+    """
     height, where = np.full((w.count, 3, 3), np.nan), np.full((w.count, 3, 3), np.nan)
     f = w.frequencies
     shown = int(np.searchsorted(f, _SPECTROGRAM_END))
@@ -181,8 +190,7 @@ def _measure(w: Windows, bands: Sequence[tuple[float, float]]) -> tuple[Array, A
             where[part, :, k], height[part, :, k] = peaks(a, f, low, high)
         inside = keep[(keep >= part.start) & (keep < part.stop)] - part.start
         rows.append(a[inside, 1, :shown])
-    picture = {"spectrogram": np.concatenate(rows), "spectrogram_rows": keep, "spectrogram_frequency": f[:shown]}
-    return height, where, picture
+    return height, where, keep, np.concatenate(rows)
 
 
 def _compute_quotients(height: Array, settings: FftSettings) -> Array:

@@ -148,6 +148,9 @@ def crop_solution(solution: Solution, share: Share) -> Solution:
         spans = np.clip(d.intervals, start, end)
         threshold = d.threshold[some] if isinstance(d.threshold, np.ndarray) and len(d.threshold) == n else d.threshold
         details = {name: x[some] if len(x) == n else x for name, x in d.details.items()}
+        if "spectrogram" in details:
+            shown = inside(d.details["spectrogram_t"])
+            details |= {name: d.details[name][shown] for name in ("spectrogram", "spectrogram_t")}
         return replace(
             d, t=d.t[some], statistic=d.statistic[some], threshold=threshold, mask=d.mask[some],
             intervals=spans[spans[:, 1] > spans[:, 0]], details=details,

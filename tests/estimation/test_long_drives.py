@@ -64,6 +64,11 @@ def test_parts_say_what_the_whole_says(monkeypatch: pytest.MonkeyPatch) -> None:
             one.to_gtsam()
         assert told.value.key == "pieces.none_such"
         assert whole[name].covariance.base is None
+        pictured = [d for d in one.detections if "spectrogram" in d.details]
+        assert pictured
+        for d in pictured:
+            assert len(d.details["spectrogram"]) == len(d.details["spectrogram_t"]) > 1
+            assert np.all((d.details["spectrogram_t"] >= d.t[0]) & (d.details["spectrogram_t"] <= d.t[-1]))
 
 
 def test_a_drive_with_states_of_its_own_for_each_satellite_is_cut_sooner(monkeypatch: pytest.MonkeyPatch) -> None:

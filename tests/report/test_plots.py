@@ -62,7 +62,7 @@ def detected():
     at = START + np.arange(1.0, 600.0)
     spectrum = {
         "spectrogram": np.outer(np.linspace(1.0, 10.0, len(at)), np.ones(20)),
-        "spectrogram_rows": np.arange(len(at)),
+        "spectrogram_t": at,
         "spectrogram_frequency": np.linspace(0.0, 57.0, 20),
         "idle_line": np.array([26.0, 25.0, 27.0]),
     }

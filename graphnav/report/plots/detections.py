@@ -50,7 +50,7 @@ def detections(recording: Recording, found: Sequence[Detection]) -> Figure:
     if speeds:
         rows.append(("speed [m/s]", "m/s", limits([y for _, _, y, _ in speeds]), False))
     rows += [(f"{name}: statistic", "", _statistic_limits(every), True) for name, every in by_name.items()]
-    pictured = [d for d in found if "spectrogram" in d.details and len(d.details["spectrogram_rows"]) > 1]
+    pictured = [d for d in found if "spectrogram" in d.details and len(d.details["spectrogram_t"]) > 1]
     if pictured:
         f = pictured[0].details["spectrogram_frequency"]
         rows.append(("spectrogram of the force along z [Hz]", "Hz", (float(f[0]), float(f[-1])), False))
@@ -117,8 +117,7 @@ def _statistic(panel: Panel, d: Detection, t0: float) -> None:
 
 def _spectrogram(panel: Panel, pictured: Sequence[Detection], t0: float) -> None:
     for d in pictured:
-        rows, f = d.details["spectrogram_rows"], d.details["spectrogram_frequency"]
-        t = d.t[rows] - t0
+        t, f = d.details["spectrogram_t"] - t0, d.details["spectrogram_frequency"]
         level = np.log10(np.maximum(d.details["spectrogram"], 1e-9)).T
         top = float(np.nanquantile(level, 0.999))
         even = np.linspace(t[0], t[-1], min(len(t), BINS))
