@@ -29,6 +29,7 @@ BLOCKS = {
     "bg": slice(12, 15),
 }
 DIM = 15
+MOVING = BLOCKS["v"].stop  # attitude, position and velocity come first; biases stay from step to step
 SECONDS = 3.0  # s, initial correlation time of errors that last for seconds: multipath, tyre slip
 NODE_SPACING = 5.0  # s between the nodes of slow random walks: mounting angles, odometer scale
 

@@ -10,8 +10,7 @@ import numpy as np
 
 from graphnav.core.compiled import compiled
 from graphnav.core.rotation import Array
-from graphnav.core.state import DIM
-from graphnav.estimation.solvers.recursion import MOVING
+from graphnav.core.state import DIM, MOVING
 
 
 @compiled
@@ -144,19 +143,14 @@ def smooth_rows(
     of_rows : (n, M, M), filled with variances, and with H P^s H^T of rows `asked` (n, M, D).
     wanted, first_wanted : columns of which variances are wanted, those of keyframe k from `first_wanted[k]` on.
     """
-    whole = len(P_smoothed) > 0
     for k in range(k1 - 1, k0 - 1, -1):
+        rows = end[first[k + 1] - 1] if first[k] < first[k + 1] else 0
         ahead = k < len(F)  # of the last of all the filtered covariance is of errors about the estimate already
         if ahead:
             r_k = step_vector_back(F[k], decay[k], r_k)
             N_k = step_back(F[k], decay[k], N_k)
             np.add(errors[k], np.dot(P[k], r_k), smoothed[k])
-            if whole:
-                cover(P[k], N_k, P_smoothed[k])
-            else:
-                vary(P[k], N_k, wanted[first_wanted[k] : first_wanted[k + 1]], variance[k])
-                if first[k] < first[k + 1]:
-                    cover_rows(P[k], N_k, asked[k, : end[first[k + 1] - 1]], of_rows[k])
+            fill_covariances(k, P[k], N_k, rows, wanted, first_wanted, asked, P_smoothed, variance, of_rows)
         for b in range(first[k + 1] - 1, first[k] - 1, -1):
             if taken[b]:
                 lo, hi = begin[b], end[b]
@@ -170,13 +164,30 @@ def smooth_rows(
         if not ahead:
             ahead_P = P_predicted[k % len(P_predicted)]
             np.add(errors_predicted[k], np.dot(ahead_P, r_k), smoothed[k])
-            if whole:
-                cover(ahead_P, N_k, P_smoothed[k])
-            else:
-                vary(ahead_P, N_k, wanted[first_wanted[k] : first_wanted[k + 1]], variance[k])
-                if first[k] < first[k + 1]:
-                    cover_rows(ahead_P, N_k, asked[k, : end[first[k + 1] - 1]], of_rows[k])
+            fill_covariances(k, ahead_P, N_k, rows, wanted, first_wanted, asked, P_smoothed, variance, of_rows)
     return r_k, N_k
+
+
+@compiled
+def fill_covariances(
+    k: int,
+    P: Array,
+    N: Array,
+    rows: int,
+    wanted: Array,
+    first_wanted: Array,
+    asked: Array,
+    P_smoothed: Array,
+    variance: Array,
+    of_rows: Array,
+) -> None:
+    """What `smooth_rows` is to fill in of P - P N P at keyframe k, the first of `asked` being as many as `rows`."""
+    if len(P_smoothed) > 0:
+        cover(P, N, P_smoothed[k])
+        return
+    vary(P, N, wanted[first_wanted[k] : first_wanted[k + 1]], variance[k])
+    if rows > 0:
+        cover_rows(P, N, asked[k, :rows], of_rows[k])
 
 
 @compiled

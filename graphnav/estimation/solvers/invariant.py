@@ -27,10 +27,9 @@ import numpy as np
 from graphnav.core import rotation
 from graphnav.core.compiled import compiled
 from graphnav.core.rotation import Array, mv
-from graphnav.core.state import BLOCKS, States
+from graphnav.core.state import BLOCKS, MOVING, States
 
 _THETA, _V = BLOCKS["theta"], BLOCKS["v"]
-MOVING = _V.stop  # numbers of an error state that theta and dv are among
 _I9 = np.eye(MOVING)
 
 

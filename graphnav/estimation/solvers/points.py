@@ -18,10 +18,10 @@ import numpy as np
 
 from graphnav.core import rotation
 from graphnav.core.rotation import Array, mv
-from graphnav.core.state import DIM, States
+from graphnav.core.state import DIM, MOVING, States
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.breakdown import explain_rows
-from graphnav.estimation.solvers.invariant import MOVING, turn
+from graphnav.estimation.solvers.invariant import turn
 from graphnav.estimation.solvers.linearise import Advance, Columns, Points, linearise, shift
 from graphnav.estimation.solvers.passes import Progress, Updates
 from graphnav.estimation.solvers.recursion import STRETCH, filter_rows

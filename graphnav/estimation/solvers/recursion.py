@@ -14,11 +14,10 @@ import numpy as np
 
 from graphnav.core.compiled import compiled
 from graphnav.core.rotation import Array
-from graphnav.core.state import DIM
+from graphnav.core.state import DIM, MOVING
 
 STRETCH = 256  # keyframes from one word of how far it has come to the next
 PASSES = 4  # of re-weighting where a measurement is met for the first time
-MOVING = 9  # of the states; biases stay, so that theirs are rows of a unit matrix in F
 UNUSED = 1e-12  # weight of a row that is not used beside others of its keyframe
 HUBER, CAUCHY = 1, 2
 _LOSSY = 1e4  # times R that H P H^T may be for P - W^T W to keep twelve digits

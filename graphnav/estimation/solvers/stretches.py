@@ -25,10 +25,10 @@ from __future__ import annotations
 import numpy as np
 
 from graphnav.core.rotation import Array, mv
-from graphnav.core.state import DIM, States
+from graphnav.core.state import DIM, MOVING, States
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.breakdown import explain_rows
-from graphnav.estimation.solvers.invariant import MOVING, compute_transport, minus_invariant, turn
+from graphnav.estimation.solvers.invariant import compute_transport, minus_invariant, turn
 from graphnav.estimation.solvers.linearise import Advance, Points, shift
 from graphnav.estimation.solvers.passes import join_passes, move_points
 from graphnav.estimation.solvers.points import linearise_all, predict_states

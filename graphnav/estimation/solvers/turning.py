@@ -25,12 +25,11 @@ import numpy as np
 
 from graphnav.core import rotation
 from graphnav.core.rotation import Array, mv
-from graphnav.core.state import DIM, States
+from graphnav.core.state import DIM, MOVING, States
 from graphnav.estimation.solvers.invariant import turn
 
 _Z = rotation.skew(np.array([0.0, 0.0, 1.0]))
 _I3 = np.eye(3)
-_MOVING = 9  # numbers of an error state that a turn changes: theta, p, v
 
 
 def split_turn(states: States, e: Array) -> tuple[Array, Array]:
@@ -49,7 +48,7 @@ def split_turn(states: States, e: Array) -> tuple[Array, Array]:
     u = states.R_nb[:, 2]
     psi = np.sum(u * e[:, :3], axis=1)
     turned = np.concatenate([u, states.p @ _Z.T, states.v @ _Z.T], axis=1)
-    return psi, e[:, :_MOVING] - psi[:, None] * turned
+    return psi, e[:, :MOVING] - psi[:, None] * turned
 
 
 def plus_turning(states: States, e: Array) -> States:
@@ -86,7 +85,7 @@ def change_of_point(states: States, e: Array) -> Array:
     after = mv(np.swapaxes(rotation.exp(tilt), -1, -2), u)  # the vertical in the body there
     w = np.einsum("ki,kij->kj", u, J)
     w /= np.sum(w * after, axis=1)[:, None]
-    T, back = np.zeros((len(e), _MOVING, _MOVING)), np.swapaxes(_about_vertical(psi), -1, -2)
+    T, back = np.zeros((len(e), MOVING, MOVING)), np.swapaxes(_about_vertical(psi), -1, -2)
     T[:, :3, :3] = u[:, :, None] * w[:, None] + J @ (_I3 - after[:, :, None] * w[:, None])
     for at in (slice(3, 6), slice(6, 9)):
         T[:, at, :3] = -(left[:, at] @ _Z.T)[:, :, None] * w[:, None]
