@@ -54,11 +54,9 @@ def _make_empty(*shape: int) -> Array:
     return np.empty(shape)
 
 
-def _mask_covered(recording: Recording) -> Array:
-    """Mask of the fixes within the IMU's time span."""
-    assert recording.gnss is not None
-    t = recording.gnss.t
-    return (t >= recording.start - SAME_TIME) & (t <= recording.end + SAME_TIME)
+def _mask_covered(recording: Recording, t: Array) -> Array:
+    """Mask of the times (M,) within the IMU's time span."""
+    return np.asarray((t >= recording.start - SAME_TIME) & (t <= recording.end + SAME_TIME))
 
 
 def _build_common(scene: BuildContext, offset: str) -> dict[str, Any]:
@@ -123,7 +121,8 @@ class GnssPosition(Constraint):
     def epochs(cls, recording: Recording, settings: Settings, stationary: Array) -> Array:
         if recording.gnss is None or not settings.gnss.position or recording.tight(settings.raw_gnss.coupling):
             return _make_empty(0)
-        return recording.gnss.t[_mask_covered(recording)]
+        t = recording.gnss.t
+        return t[_mask_covered(recording, t)]
 
     @classmethod
     def build(cls, scene: BuildContext) -> GnssPosition | None:
@@ -252,7 +251,8 @@ class GnssVelocity(Constraint):
         tight = recording.tight(settings.raw_gnss.coupling)
         if gnss is None or gnss.v is None or not settings.gnss.velocity or tight:
             return _make_empty(0)
-        return gnss.t[_mask_covered(recording) & np.isfinite(gnss.v).all(axis=1)]
+        t = gnss.velocity_t
+        return t[_mask_covered(recording, t) & np.isfinite(gnss.v).all(axis=1)]
 
     @classmethod
     def build(cls, scene: BuildContext) -> GnssVelocity | None:
@@ -260,13 +260,15 @@ class GnssVelocity(Constraint):
         tight = scene.recording.tight(scene.settings.raw_gnss.coupling)
         if gnss is None or gnss.v is None or gnss.sd_v is None or not scene.settings.gnss.velocity or tight:
             return None
-        keyframe = scene.keyframe_at(gnss.t)
+        t = gnss.velocity_t
+        keyframe = scene.keyframe_at(t)
         used = (keyframe >= 0) & np.isfinite(gnss.v).all(axis=1)
         if not used.any():
             return None
+        t = t[used]
         lasting = Parameter(
             VELOCITY_ERROR, np.zeros(3), np.ones(3), "sd", correlation_time=SECONDS,
-            spacing=node_spacing((), period(gnss.t[used])),
+            spacing=node_spacing((), period(t)),
             noise_groups=tuple(f"{cls.name}.seconds.{axis}" for axis in cls.noise_axes),
         )  # fmt: skip
         return cls(
@@ -274,13 +276,13 @@ class GnssVelocity(Constraint):
             v_l=gnss.v[used],
             R_ln=earth.enu_axes(gnss.llh[used]) @ scene.frame.R_ne.T,
             sigma=gnss.sd_v[used],
-            gyro=average_around(scene.recording.imu, scene.recording.imu.gyro, gnss.t[used]),
-            accel=average_around(scene.recording.imu, scene.recording.imu.accel, gnss.t[used]),
+            gyro=average_around(scene.recording.imu, scene.recording.imu.gyro, t),
+            accel=average_around(scene.recording.imu, scene.recording.imu.accel, t),
             g_n=scene.frame.gravity_n(scene.frame.from_llh(gnss.llh[used])),
             omega_n=scene.frame.omega_n,
             lever_arm=gnss.lever_arm,
-            unit_error=_compute_running_median(gnss.t[used], gnss.sd_v[used]),
-            processes=(lasting, *_stamp_error(scene.settings, gnss.t[used])),
+            unit_error=_compute_running_median(t, gnss.sd_v[used]),
+            processes=(lasting, *_stamp_error(scene.settings, t)),
             **_build_common(scene, VELOCITY_TIME_OFFSET),
         )
 

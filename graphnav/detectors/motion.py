@@ -120,7 +120,7 @@ def _read_gnss(gnss: Gnss, settings: FusionSettings) -> list[Speeds]:
         if gnss.sd_v is not None:
             stated = gnss.sd_v[there, :2].max(axis=1)
             sigma = np.where(np.isfinite(stated), stated, sigma)
-        found.append(Speeds(gnss.t[there], v[:, :2], np.maximum(settings.max_speed, _SIGMAS * sigma)))
+        found.append(Speeds(gnss.velocity_t[there], v[:, :2], np.maximum(settings.max_speed, _SIGMAS * sigma)))
     there = np.isfinite(gnss.llh).all(axis=1)
     if there.sum() > _MEDIAN and not (found and len(found[0].t) > 0.5 * there.sum()):
         t, p, sd = gnss.t[there], compute_local_positions(gnss)[there, :2], gnss.sd[there, :2].max(axis=1)

@@ -28,19 +28,21 @@ from graphnav.estimation.building import start_sigma
 from graphnav.estimation.long_drives import OVERLAP, crop_solution, shares
 from graphnav.estimation.noise.files import MODES
 from graphnav.estimation.noise.imu_floor import with_measured_floor
-from graphnav.estimation.noise.model import STATED, NoiseModel
+from graphnav.estimation.noise.model import STATED, NoiseModel, StampOffsets
 from graphnav.estimation.noise.words import describe_far
-from graphnav.estimation.preparation import prepare
+from graphnav.estimation.preparation import Prepared, prepare
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.separation import separation
 from graphnav.estimation.solution import Solution, join_solutions
 from graphnav.estimation.solvers.breakdown import explain_singular
 from graphnav.estimation.solvers.ekf import ekf
 from graphnav.estimation.solvers.rts import backward, rts
+from graphnav.estimation.stamps import describe_stamps, find_stamps, may_move, move_stamps, on_imu_clock, on_own_clock
 from graphnav.imu.onboard_offset import without_onboard_offset
 from graphnav.recording import Own, Recording
 from graphnav.recording.checks.aiding import describe_gnss_apart
-from graphnav.recording.plausibility.screening import screen_recording
+from graphnav.recording.checks.clock import ClockOffsets
+from graphnav.recording.plausibility.screening import screen, state_findings
 
 SOLVERS = ("ekf", "rts", "batch")  # run when none is named
 KNOWN = ("ekf", "rts", "incremental", "isam2", "batch")
@@ -96,11 +98,12 @@ def run(
         settings = settings.model_copy(update={"noise": settings.noise.model_copy(update={"mode": noise})})
         noise = None
     recording = with_own(recording, constraints, detectors)
-    recording, found = screen_recording(recording)
+    screened = screen(recording)
+    recording, found = screened.recording, state_findings(recording, screened.findings)
     if (apart := describe_gnss_apart(recording)) is not None:  # it would be solved as if there were no GNSS
         raise RecordingError(f"'{recording.name}': {apart}", key="gnss.apart")
     with listening(progress):
-        solutions = _run(recording, settings, solvers, progress, noise)
+        solutions = _run(recording, settings, solvers, progress, noise, screened.clock)
     return {name: replace(one, notes=(*found, *one.notes)) for name, one in solutions.items()}
 
 
@@ -126,6 +129,7 @@ def _run(
     solvers: tuple[str, ...],
     progress: Progress | None,
     noise: NoiseModel | None,
+    clock: ClockOffsets | None,
 ) -> dict[str, Solution]:
     unknown = [name for name in solvers if name not in KNOWN]
     if unknown:
@@ -143,7 +147,7 @@ def _run(
             # matrices here have thirty rows: threads for them cost more than the work, twenty times as much on a busy
             # machine
             with threadpool_limits(limits=1, user_api="blas"):
-                solved = _solve_with_retry(part.recording, settings, frame, solvers, progress, noise)
+                solved = _solve_with_retry(part.recording, settings, frame, solvers, progress, noise, clock)
             found.append({name: crop_solution(one, part) for name, one in solved.items()})
         except EstimationError as error:
             if len(parts) == 1:
@@ -164,16 +168,17 @@ def _solve_with_retry(
     solvers: tuple[str, ...],
     progress: Progress | None,
     noise: NoiseModel | None,
+    clock: ClockOffsets | None,
 ) -> dict[str, Solution]:
     """`_solve`; where a filter breaks down numerically, again with a simpler model or stated noise."""
     try:
-        return _solve(recording, settings, frame, solvers, progress, noise)
+        return _solve(recording, settings, frame, solvers, progress, noise, clock)
     except (EstimationError, np.linalg.LinAlgError) as error:
         if isinstance(error, EstimationError) and error.key != "solver.breakdown":
             raise
         for other, model, reason in _simplify(settings, noise):
             try:
-                again = _solve(recording, other, frame, solvers, progress, model)
+                again = _solve(recording, other, frame, solvers, progress, model, clock)
             except (EstimationError, np.linalg.LinAlgError):
                 continue
             note = Note(reason.key, f"{reason}: {error}")
@@ -208,14 +213,28 @@ def _solve(
     solvers: tuple[str, ...],
     progress: Progress | None,
     noise: NoiseModel | None,
+    clock: ClockOffsets | None,
 ) -> dict[str, Solution]:
     began = time.perf_counter()
     recording, undone = without_onboard_offset(recording, settings)
     recording, shown = with_measured_floor(recording, settings)
-    tell("detection")
-    detected = detect(recording, settings)
     detection = time.perf_counter() - began
-    found = prepare(recording, settings, frame, detected, noise, progress)
+
+    def prepare_moved(moved: Recording, weigh: bool) -> Prepared:
+        nonlocal detection
+        tell("detection")
+        began = time.perf_counter()
+        detected = detect(moved, settings)
+        detection += time.perf_counter() - began
+        given = None if noise is None else on_imu_clock(noise)
+        return prepare(moved, settings, frame, detected, given, progress, weigh)
+
+    if noise is None and may_move(recording, settings):
+        recording, found, stamps = find_stamps(recording, prepare_moved, clock)
+    else:
+        stamps = StampOffsets() if noise is None else noise.stamps
+        recording = move_stamps(recording, stamps)
+        found = prepare_moved(recording, False)
     problem, forward, smoothed = found.problem, found.forward, found.smoothed
     wrong = faults.fault_spans(problem, smoothed)
     notes = (
@@ -223,6 +242,7 @@ def _solve(
         *undone,
         *shown,
         *found.detections.notes,
+        *describe_stamps(stamps),
         *found.notes,
         *faults.describe_faults(wrong, problem),
     )
@@ -270,7 +290,7 @@ def _solve(
         frame, problem.t, forward.solution.states.p, forward.solution.covariance[:, place, place],
         smoothed.states.p, smoothed.P[:, place, place],
     )  # fmt: skip
-    return {
+    solved = {
         name: replace(
             out[name],
             notes=(*notes, *out[name].notes),
@@ -286,6 +306,7 @@ def _solve(
         )
         for name in solvers
     }
+    return {name: on_own_clock(one, stamps) for name, one in solved.items()}
 
 
 def _bind_graph(problem: Problem, solution: Solution) -> Callable[[], tuple[Any, Any]]:

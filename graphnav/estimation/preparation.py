@@ -28,6 +28,7 @@ from graphnav.estimation.noise.exclusion import (
     estimate_disturbed_intervals,
     estimate_without_faults,
     excluded_share,
+    log_evidence,
 )
 from graphnav.estimation.noise.model import STATED, NoiseModel
 from graphnav.estimation.noise.spacing import space_fixes
@@ -66,6 +67,7 @@ class Prepared:
     passes: Counter[str] = field(default_factory=Counter)
     fixed: dict[str, Array] = field(default_factory=dict)  # `Solution.fixed` of the filter, and of the others ("")
     arcs: dict[str, CarrierArcs] = field(default_factory=dict)  # `Solution.arcs`, the same way
+    log_evidence: float = 0.0  # of all measurements by the estimated noise model, where that is wanted
 
     @property
     def diverged(self) -> bool:
@@ -80,6 +82,7 @@ def prepare(
     detections: Detections,
     noise: NoiseModel | None = None,
     progress: Progress | None = None,
+    weigh: bool = False,
 ) -> Prepared:
     """Align a recording, build its problem and find its noise model.
 
@@ -87,6 +90,7 @@ def prepare(
     ----------
     detections : where the platform stands.
     noise : to be used as it is; estimated, or as stated if the settings say so, when None.
+    weigh : whether the evidence of a noise model that is estimated is wanted.
 
     Raises
     ------
@@ -100,11 +104,11 @@ def prepare(
     if noise is None and (settings.noise.mode == "stated" or aligned.motion is None or not settings.gnss.position):
         noise, spacing = STATED, STATED.spacing
     builder = replace(every, used=space_fixes(recording, spacing)) if spacing else every
-    built, known = builder.build(aligned, detections, parts=noise != STATED), None
+    built, known, evidence = builder.build(aligned, detections, parts=noise != STATED), None, 0.0
     if noise is None:
         tell("noise")
         with clock.book("noise"):
-            noise, known, built = _find_noise(builder, built, progress, passes)
+            noise, known, built, evidence = _find_noise(builder, built, progress, passes, weigh)
             noise = replace(noise, spacing=spacing)
     else:
         built = builder.build_without(built, noise, parts=noise != STATED)
@@ -132,8 +136,9 @@ def prepare(
         arcs = {"ekf": fixed.filtered_arcs, "": fixed.smoothed_arcs}
     start = with_known_heading(aligned, settings)
     return Prepared(
-        problem, noise, start, aligned, built.detections, forward, smoothed, notes, clock.seconds, passes, epochs, arcs
-    )
+        problem, noise, start, aligned, built.detections, forward, smoothed, notes, clock.seconds, passes, epochs, arcs,
+        evidence,
+    )  # fmt: skip
 
 
 def _smooth(
@@ -146,9 +151,11 @@ def _smooth(
 
 
 def _find_noise(
-    builder: ProblemBuilder, built: BuiltProblem, progress: Progress | None, passes: Counter[str]
-) -> tuple[NoiseModel, Points | None, BuiltProblem]:
-    """The noise model, linearisation points, and the problem with a start and stops that rest on no excluded fix."""
+    builder: ProblemBuilder, built: BuiltProblem, progress: Progress | None, passes: Counter[str], weigh: bool
+) -> tuple[NoiseModel, Points | None, BuiltProblem, float]:
+    """The noise model, linearisation points, the problem with a start and stops that rest on no excluded fix, and the
+    logarithm of the evidence where it is wanted.
+    """
     best = _estimate(built, builder.settings, progress)
     if excluded_share(built.problem, best.noise) > _MOST_WRONG:
         # most fixes contradict the start: align again with the fixes behind those that the alignment used
@@ -168,11 +175,12 @@ def _find_noise(
         best = replace(again, passes=best.passes + again.passes)
     best = estimate_disturbed_intervals(built.problem, best)
     passes.update(best.passes + Counter(filter=1))
+    evidence = log_evidence(built.problem, best) if weigh else 0.0
     plain = NoiseModel(excluded=best.noise.excluded)
     if _is_likelier(built.problem, plain, best):
-        return plain, None, built
+        return plain, None, built, evidence
     # the points alone: the covariances of the last pass are half of all memory
-    return best.noise, Points(best.points.states, best.points.values), built
+    return best.noise, Points(best.points.states, best.points.values), built, evidence
 
 
 def _estimate(built: BuiltProblem, settings: Settings, progress: Progress | None) -> NoiseEstimate:

@@ -70,6 +70,12 @@ class Gnss:
     derived: bool = False  # single-point positions computed from the recording's own raw observations
     satellites: Array | None = None  # (M,) number used in each fix, NaN where unknown; only displayed
     rounding: tuple[float, ...] = (0.0, 0.0, 0.0)  # m, east, north, up: standard deviation of the log's last digits
+    velocity_offset: float = 0.0  # s; velocities are of `t` plus this
+
+    @property
+    def velocity_t(self) -> Array:
+        """(M,) s, the times that the velocities are of."""
+        return self.t + self.velocity_offset if self.velocity_offset else self.t
 
     @property
     def types(self) -> dict[str, int]:

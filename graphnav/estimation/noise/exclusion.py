@@ -201,7 +201,7 @@ def estimate_disturbed_intervals(base: Problem, found: NoiseEstimate) -> NoiseEs
             without = replace(free.noise, excluded=decision.noise.excluded)
             free = estimate_noise(base, None, without, free.linearisation(base), intervals=True)
             passes = passes + free.passes
-        if _log_evidence(base, free) > _log_evidence(base, found):
+        if log_evidence(base, free) > log_evidence(base, found):
             return replace(free, passes=passes)
         if free.noise.excluded == found.noise.excluded:  # the same model, already on its way
             start, near = free.noise, free.linearisation(base)
@@ -209,7 +209,7 @@ def estimate_disturbed_intervals(base: Problem, found: NoiseEstimate) -> NoiseEs
     return replace(disturbed, passes=passes + disturbed.passes)
 
 
-def _log_evidence(base: Problem, found: NoiseEstimate) -> float:
+def log_evidence(base: Problem, found: NoiseEstimate) -> float:
     """Of all measurements, excluded ones included; each outlier outside the spans has its cost."""
     spans = join(span for some in found.noise.excluded.values() for span in some)
     whole = decide(base, found, spans, _list_explanations(found.noise)).log_evidence if spans else found.log_posterior
@@ -333,7 +333,8 @@ def without_excluded(recording: Recording, noise: NoiseModel) -> Recording:
     """The recording without the fixes that a noise model leaves out."""
     gnss = recording.gnss
     assert gnss is not None
-    p, v = (row_weights(gnss.t, noise, name)[:, None] for name in ("gnss_position", "gnss_velocity"))
+    p = row_weights(gnss.t, noise, "gnss_position")[:, None]
+    v = row_weights(gnss.velocity_t, noise, "gnss_velocity")[:, None]
     gnss = replace(
         gnss,
         llh=np.where(p > 0.0, gnss.llh, np.nan),

@@ -9,6 +9,7 @@ Under the key "noise", in a file of its own or in the summary.json of a run::
                         (s) of intervals between keyframes with more white noise, and 1 over its variance's factor
     excluded            by constraint: [begin, end] (s) of spans left out
     spacing             s between the fixes that are used, 0 for all
+    stamps              s, offsets of the stamps of positions, velocities and odometer about which rows are linearised
 
     pieces              how many pieces the recording was cut into, the figures being those of the first; for people
 
@@ -21,6 +22,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import Any, get_args
 
@@ -34,13 +36,15 @@ from graphnav.constraints.vehicle import NHC_ERROR, ODOMETER_ERROR
 from graphnav.core.complaints import suggest_nearest
 from graphnav.core.errors import ConfigError
 from graphnav.core.files import parse_json, read_text
-from graphnav.estimation.noise.model import INTERVALS, NoiseModel, RowWeights, VarianceComponent
+from graphnav.estimation.noise.model import INTERVALS, NoiseModel, RowWeights, StampOffsets, VarianceComponent
 from graphnav.imu.preintegration import NOISE_FIGURES
 from graphnav.recording import FIX_TYPES
 
 MODES: tuple[str, ...] = get_args(NoiseSettings.model_fields["mode"].annotation)
 _LEAST = 1e-15  # weight of an interval: one without any would have no end of noise
-_KEYS = ("mode", "pieces", "figures", "correlation_times", "weights", "excluded", "spacing")
+_KEYS = ("mode", "pieces", "figures", "correlation_times", "weights", "excluded", "spacing", "stamps")
+_STAMPS = tuple(one.name for one in fields(StampOffsets))
+_LARGEST_OFFSET = 60.0  # s
 _FIGURE = {"log_factor": "log_factor", "sigma": "sigma", "prior": "prior", "prior_sigma": "prior_sigma",
            "degrees_of_freedom": "freedom"}  # fmt: skip
 _BESIDE = ("variance_factor", "stated", "used", "unit", "correlation_time")
@@ -71,6 +75,7 @@ def noise_values(noise: NoiseModel, mode: str = "estimated") -> dict[str, Any]:
         },
         "excluded": {name: [[float(a), float(b)] for a, b in spans] for name, spans in noise.excluded.items() if spans},
         "spacing": float(noise.spacing),
+        "stamps": {name: float(getattr(noise.stamps, name)) for name in _STAMPS},
     }
 
 
@@ -177,6 +182,7 @@ class _Reader:
             self.each(values, "weights", [*constraints, *INTERVALS], self.weights),
             self.each(values, "excluded", constraints, self.spans),
             self.number("noise.spacing", values.get("spacing", 0.0), 0.0, 60.0, "s between fixes"),
+            StampOffsets(**self.each(values, "stamps", _STAMPS, self.offset)),
         ), mode
 
     def error(self, key: str, value: Any, why: str) -> ConfigError:
@@ -241,6 +247,9 @@ class _Reader:
 
     def time(self, key: str, value: Any) -> float:
         return self.number(key, value, 1e-3, 1e9, "s, a correlation time")
+
+    def offset(self, key: str, value: Any) -> float:
+        return self.number(key, value, -_LARGEST_OFFSET, _LARGEST_OFFSET, "s to be added to stamps")
 
     def weights(self, key: str, value: Any) -> RowWeights:
         if not isinstance(value, Mapping) or set(value) != {"t", "weight"}:

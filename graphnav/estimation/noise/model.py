@@ -49,6 +49,15 @@ class RowWeights:
 
 
 @dataclass(frozen=True)
+class StampOffsets:
+    """Offsets of stamps about which rows are linearised, s, to be added (`graphnav.estimation.stamps`)."""
+
+    positions: float = 0.0
+    velocities: float = 0.0
+    odometer: float = 0.0
+
+
+@dataclass(frozen=True)
 class NoiseModel:
     """How good the sensors are taken to be. Beside what it names, everything is as stated."""
 
@@ -57,6 +66,7 @@ class NoiseModel:
     weights: Mapping[str, RowWeights] = field(default_factory=dict)  # by constraint, and by `INTERVALS`
     excluded: Mapping[str, tuple[tuple[float, float], ...]] = field(default_factory=dict)  # spans (s) by constraint
     spacing: float = 0.0  # s, at least, between the fixes that are used (`graphnav.estimation.noise.spacing`)
+    stamps: StampOffsets = StampOffsets()
 
     def factor(self, group: str, missing: float) -> float:
         """On the variance of a group; `missing` where nothing is said of it."""

@@ -15,8 +15,7 @@ from graphnav.core.timescales import NEAR, WEEK, between_clocks
 from graphnav.recording import Imu, Odometer, Recording
 from graphnav.recording import odometer as wheels
 from graphnav.recording.checks import crosschecks, tracks
-from graphnav.recording.checks.clock import FAIR, ClockOffsets
-from graphnav.recording.checks.crosschecks import Fit
+from graphnav.recording.checks.clock import FAIR, ODOMETER_AGREES, ClockOffsets
 from graphnav.recording.checks.tracks import Track
 from graphnav.recording.odometer.faults import FROZEN, GAP, STUCK, WILD
 from graphnav.sensors.tables import TIME
@@ -152,11 +151,11 @@ def check_gnss_jumps(recording: Recording, track: Track | None) -> Iterator[Find
         )
 
 
-def check_imu_clock(clock: ClockOffsets, odometer: Fit | None = None) -> Iterator[Finding]:
+def check_imu_clock(clock: ClockOffsets) -> Iterator[Finding]:
     """The clock of the IMU by GNSS speed, and by the positions alone, whose stamps differ in some receivers.
 
-    `odometer` is its fit against GNSS, which shows whose clock is off. Offsets beyond the permitted error of the fixes'
-    stamps would distort the solution. The course, which leads or lags with the lever arm, is not used.
+    Offsets beyond the permitted error of the fixes' stamps distort what is solved with the stamps as they are. The
+    course, which leads or lags with the lever arm, is not used.
     """
     if clock.apart is not None:
         yield Finding(
@@ -171,9 +170,8 @@ def check_imu_clock(clock: ClockOffsets, odometer: Fit | None = None) -> Iterato
     lag = forward.lag
     leap = ", the leap seconds between GPS time and UTC" if abs(abs(lag) - 18.0) < 0.5 else ""
     certain = abs(lag) - 4.0 * forward.spread > _CERTAIN_SIGMAS * GnssSettings().time_offset_sigma
-    # an offset that the odometer shows as well is the receiver's
-    own = odometer is None or odometer.correlation < 0.9 or abs(odometer.lag - lag) > 0.5 * abs(lag)
-    mend = f"{-lag:+.2f} to time_offset in [imu]" if own else f"{lag:+.2f} to time_offset in [gnss]"
+    of_fixes = clock.of_imu is False
+    mend = f"{lag:+.2f} to time_offset in [gnss]" if of_fixes else f"{-lag:+.2f} to time_offset in [imu]"
     yield Finding(
         "unreliable" if certain else "warning",
         f"IMU stamps are {'late' if lag > 0 else 'early'} against GNSS by {abs(lag):.2f} s{leap} (forward force "
@@ -256,7 +254,7 @@ def check_odometer(recording: Recording, track: Track | None, facts: dict[str, A
     if found is None:
         return
     fit, scale = found
-    if fit.correlation < 0.9:
+    if fit.correlation < ODOMETER_AGREES:
         return
     facts["true_over_recorded"] = round(scale, 4)
     facts["late_by_s"] = round(fit.lag, 3)

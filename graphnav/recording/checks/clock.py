@@ -9,6 +9,7 @@ from graphnav.recording.checks import crosschecks, tracks
 from graphnav.recording.checks.crosschecks import Fit
 
 CLEAR, FAIR = 0.8, 0.6  # correlations: certain, likely
+ODOMETER_AGREES = 0.9  # correlation of speeds
 _MATTERS = 0.05  # s; the smoother estimates smaller offsets itself (`gnss.time_offset_sigma`, 2.5 sigma)
 _SIGNIFICANT = 3.0  # sigma
 
@@ -20,6 +21,15 @@ class ClockOffsets:
     by_velocity: Fit | None
     by_places: Fit | None
     between: Fit | None  # delay of velocities against positions
+    by_odometer: Fit | None = None  # delay of the odometer's stamps against the fixes'
+
+    @property
+    def of_imu(self) -> bool | None:
+        """Whether the IMU's clock is off, because the odometer agrees with the fixes; None where it tells nothing."""
+        late, odometer = self.late, self.by_odometer
+        if late is None or odometer is None or odometer.correlation < ODOMETER_AGREES:
+            return None
+        return bool(abs(odometer.lag - late.lag) > 0.5 * abs(late.lag))
 
     @property
     def apart(self) -> float | None:

@@ -97,8 +97,19 @@ def screen_recording(recording: Recording) -> tuple[Recording, list[str]]:
         If a sensor is wrong throughout.
     """
     found = screen(recording)
-    refuse(recording, found.findings)
-    return found.recording, [Note(f.key, f.sentence) for f in found.findings]
+    return found.recording, state_findings(recording, found.findings)
+
+
+def state_findings(recording: Recording, findings: tuple[Finding, ...]) -> list[str]:
+    """A sentence with a key for each finding.
+
+    Raises
+    ------
+    RecordingError
+        If a sensor is wrong throughout.
+    """
+    refuse(recording, findings)
+    return [Note(f.key, f.sentence) for f in findings]
 
 
 def screen(recording: Recording) -> Screened:
@@ -127,14 +138,17 @@ def screen(recording: Recording) -> Screened:
         # stamps that are late by now this, now that have no clock
         if track is not None and not any(f.key == "gnss.stamped_on_arrival" for f in findings):
             assert recording.gnss is not None
-            clock = measure_clock_offsets(recording.imu, recording.gnss)
+            odometer = crosschecks.fit_odometer(recording.odometer, track) if recording.odometer is not None else None
+            clock = replace(
+                measure_clock_offsets(recording.imu, recording.gnss),
+                by_odometer=None if odometer is None else odometer[0],
+            )
             forward = clock.by_velocity if track.instant else clock.by_places
         else:
             forward = crosschecks.fit_forward(recording.imu, path) if path is not None else None
         findings += check_forward_sign(recording.imu, path, forward)
-        if clock is not None and track is not None:
-            odometer = crosschecks.fit_odometer(recording.odometer, track) if recording.odometer is not None else None
-            findings += check_imu_clock(clock, None if odometer is None else odometer[0])
+        if clock is not None:
+            findings += check_imu_clock(clock)
     return Screened(recording, tuple(findings), clock)
 
 

@@ -1,0 +1,191 @@
+"""Stamps that are far off: rows of fixes are linearised about where the offsets of their stamps are estimated.
+
+A fix whose stamp is off by d is predicted from the state at the stamp, by v d + a d^2 / 2
+(`graphnav.constraints.gnss`). The acceleration a of a vehicle changes by a few m/s^3, 5 of them when it brakes, so that
+this is off by 5 d^3 / 6: 7 mm for 0.2 s, 0.8 m for a second. So where an offset is estimated farther than that from
+where the rows are linearised, the stamps are moved to the estimate and all is estimated anew, a step of Gauss-Newton,
+until the estimate stays within. Where the clocks of IMU and fixes disagree for certain
+(`graphnav.recording.checks.clock`), the first step is what they disagree by, and the stamps as they are remain the
+other candidate: the likelier stands.
+
+A solution is on the clock of the IMU, and what it says of fixes is on theirs (`on_own_clock`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+from graphnav.config import Settings
+from graphnav.constraints.gnss import TIME_OFFSET, VELOCITY_TIME_OFFSET, GnssPosition, GnssVelocity
+from graphnav.constraints.vehicle import ODOMETER_DELAY
+from graphnav.core.notes import Note
+from graphnav.core.rotation import Array
+from graphnav.estimation.noise.model import NoiseModel, RowWeights, StampOffsets
+from graphnav.estimation.preparation import Prepared
+from graphnav.estimation.solution import ConstraintRecord, ExcludedSpan, ParameterEstimate, Solution
+from graphnav.estimation.solvers.passes import parameters_of, sigmas_of
+from graphnav.recording import Recording
+from graphnav.recording.checks.clock import FAIR, ClockOffsets, is_certain
+
+_LINEAR = 0.2  # s from the linearisation point: above
+_SIGNIFICANT = 3.0  # sigmas
+_ROUNDS = 3  # of moving the stamps
+_AS_THEY_ARE = StampOffsets()
+
+# a recording whose stamps are moved, and whether evidence is wanted -> what its solvers share
+Prepare = Callable[[Recording, bool], Prepared]
+
+
+def may_move(recording: Recording, settings: Settings) -> bool:
+    """Whether offsets of stamps are estimated."""
+    gnss = recording.gnss
+    known = settings.noise.mode == "stated" or not settings.gnss.time_offset_sigma > 0.0
+    return gnss is not None and not known and not recording.tight(settings.raw_gnss.coupling)
+
+
+def find_stamps(
+    recording: Recording, prepare: Prepare, clock: ClockOffsets | None
+) -> tuple[Recording, Prepared, StampOffsets]:
+    """The recording with its stamps where their offsets are estimated, and what its solvers share.
+
+    Parameters
+    ----------
+    clock : offsets between IMU and fixes that the recording shows before any estimation.
+    """
+    guess = None if clock is None else _guess(clock)
+    plain = found = recording, prepare(recording, guess is not None), _AS_THEY_ARE
+    if guess is not None:
+        moved = move_stamps(recording, guess)
+        other = _settle(recording, prepare, (moved, prepare(moved, True), guess))
+        if other is not None and other[1].log_evidence > plain[1].log_evidence:
+            return other
+    found = _settle(recording, prepare, plain)
+    return plain if found is None else found
+
+
+def _settle(
+    recording: Recording, prepare: Prepare, found: tuple[Recording, Prepared, StampOffsets]
+) -> tuple[Recording, Prepared, StampOffsets] | None:
+    """Move the stamps until their offsets are estimated near where they are; None where that does not come about."""
+    for _ in range(_ROUNDS):
+        if (ahead := _estimate(*found[1:])) == found[2]:
+            return found
+        moved = move_stamps(recording, ahead)
+        found = moved, prepare(moved, True), ahead
+    return found if _estimate(*found[1:]) == found[2] else None
+
+
+def _guess(clock: ClockOffsets) -> StampOffsets | None:
+    """Offsets that the clocks of IMU and fixes show, where they are certain and far."""
+    if clock.late is None and clock.apart is None:
+        return None
+    one = clock.by_velocity or clock.by_places
+    known = one is not None and one.correlation >= FAIR and is_certain(one)
+    velocities = one.lag if one is not None and known else 0.0
+    between = 0.0 if clock.apart is None or clock.between is None else clock.between.lag
+    odometer = velocities if clock.of_imu else 0.0
+    guess = _join(StampOffsets(velocities + between, velocities, odometer))
+    return guess if max(abs(guess.positions), abs(guess.velocities)) > _LINEAR else None
+
+
+def _join(offsets: StampOffsets) -> StampOffsets:
+    """Offsets with one for positions and velocities where they hardly differ: each has keyframes of its own else."""
+    near = abs(offsets.velocities - offsets.positions) <= _LINEAR
+    return replace(offsets, velocities=offsets.positions) if near else offsets
+
+
+def _estimate(prepared: Prepared, at: StampOffsets) -> StampOffsets:
+    """The offsets estimated, those that are far and significant; the others as they are."""
+    found = parameters_of(prepared.problem, prepared.smoothed.values, sigmas_of(prepared.smoothed.P))
+    new = {}
+    for key, name in (("positions", TIME_OFFSET), ("velocities", VELOCITY_TIME_OFFSET)):
+        if name in found:
+            off, sigma = float(found[name].value[0, 0]), float(found[name].sigma[0, 0])
+            if abs(off) > max(_LINEAR, _SIGNIFICANT * sigma):
+                new[key] = getattr(at, key) + off
+    return _join(replace(at, **new)) if new else at
+
+
+def move_stamps(recording: Recording, offsets: StampOffsets) -> Recording:
+    """The recording with its stamps moved to the clock of the IMU."""
+    if offsets == _AS_THEY_ARE:
+        return recording
+    changed: dict[str, Any] = {}
+    if recording.gnss is not None:
+        changed["gnss"] = replace(
+            recording.gnss,
+            t=recording.gnss.t + offsets.positions,
+            velocity_offset=offsets.velocities - offsets.positions,
+        )
+    if recording.odometer is not None and offsets.odometer:
+        changed["odometer"] = replace(recording.odometer, t=recording.odometer.t + offsets.odometer)
+    return replace(recording, **changed)
+
+
+def on_imu_clock(noise: NoiseModel) -> NoiseModel:
+    """A noise model as it is of the recording with its stamps moved."""
+    return _shift_noise(noise, 1.0)
+
+
+def on_own_clock(solution: Solution, offsets: StampOffsets) -> Solution:
+    """The solution with what it says of fixes and odometer on their own clocks, and the whole offsets of these."""
+    if offsets == _AS_THEY_ARE:
+        return solution
+    by = _by_constraint(offsets)
+
+    def record(name: str, one: ConstraintRecord) -> ConstraintRecord:
+        return replace(one, t=one.t - by[name]) if name in by else one
+
+    def span(one: ExcludedSpan) -> ExcludedSpan:
+        late = by.get(one.kind, 0.0)
+        return replace(one, t_start=one.t_start - late, t_end=one.t_end - late)
+
+    whole = {
+        TIME_OFFSET: offsets.positions, VELOCITY_TIME_OFFSET: offsets.velocities, ODOMETER_DELAY: -offsets.odometer
+    }  # fmt: skip
+
+    def parameter(name: str, one: ParameterEstimate) -> ParameterEstimate:
+        return replace(one, value=one.value + whole[name]) if name in whole else one
+
+    return replace(
+        solution,
+        records={name: record(name, one) for name, one in solution.records.items()},
+        excluded=tuple(map(span, solution.excluded)),
+        parameters={name: parameter(name, one) for name, one in solution.parameters.items()},
+        noise=_shift_noise(replace(solution.noise, stamps=offsets), -1.0),
+    )
+
+
+def describe_stamps(offsets: StampOffsets) -> tuple[str, ...]:
+    """A note on stamps that were moved."""
+    if offsets == _AS_THEY_ARE:
+        return ()
+    said = f"{offsets.positions:+.2f} s"
+    if offsets.velocities != offsets.positions:
+        said = f"{said} (positions) and {offsets.velocities:+.2f} s (velocities)"
+    if offsets.odometer:
+        said = f"{said}, those of the odometer by {offsets.odometer:+.2f} s"
+    mend = f"state it as time_offset, {offsets.positions:+.2f} in [gnss] or {-offsets.positions:+.2f} in [imu]"
+    sentence = f"stamps of the fixes moved by {said}, at which they agree with the IMU: {mend}"
+    return (Note("gnss.stamps_moved", sentence),)
+
+
+def _by_constraint(offsets: StampOffsets) -> dict[str, float]:
+    return {GnssPosition.name: offsets.positions, GnssVelocity.name: offsets.velocities}
+
+
+def _shift_noise(noise: NoiseModel, sign: float) -> NoiseModel:
+    by = {name: sign * one for name, one in _by_constraint(noise.stamps).items()}
+
+    def moved(t: Array | float, name: str) -> Any:
+        return t + by.get(name, 0.0)
+
+    return replace(
+        noise,
+        weights={name: RowWeights(moved(one.t, name), one.weight) for name, one in noise.weights.items()},
+        excluded={
+            name: tuple((moved(a, name), moved(b, name)) for a, b in spans) for name, spans in noise.excluded.items()
+        },
+    )
