@@ -23,9 +23,9 @@ from graphnav.core.errors import ConfigError, EstimationError, RecordingError
 from graphnav.core.findings import Finding
 from graphnav.core.notes import Note, format_count
 from graphnav.core.progress import Progress, listening, tell
-from graphnav.estimation.noise.model import INTERVALS, NoiseModel
+from graphnav.estimation.noise.model import INTERVALS, NoiseModel, StampOffsets
 from graphnav.estimation.solution import Solution
-from graphnav.evaluation.against import Against, read_against
+from graphnav.evaluation.against import Against, own_solutions, read_against
 from graphnav.recording import ImuNoise, Recording, sources
 from graphnav.recording.exporters import check_names
 
@@ -243,7 +243,7 @@ def _run(request: Request, progress: Progress | None) -> Outcome:
         if found.notes:
             findings += [note for note in found.notes if note not in findings]
     errors = {name: found.errors for name, found in metrics.items() if found.errors is not None}
-    checks = inspection.findings
+    checks = _mitigate(inspection.findings, solutions)
     if request.judge_arms or list_doubts(solutions, errors):  # which takes a second
         from graphnav.estimation.antenna import find_wrong_arms
 
@@ -254,6 +254,13 @@ def _run(request: Request, progress: Progress | None) -> Outcome:
         request, recording, zero, solutions, metrics, against, names, tuple(dict.fromkeys(findings)),
         tuple(f.sentence for f in checks if f.severity != "note"), timings | seconds, checks, densities,
     )  # fmt: skip
+
+
+def _mitigate(findings: tuple[Finding, ...], solutions: Mapping[str, Solution]) -> tuple[Finding, ...]:
+    """Findings; clocks that disagree make no result unreliable where the stamps were moved to what they disagree by."""
+    if all(one.noise.stamps == StampOffsets() for one in own_solutions(solutions).values()):
+        return findings
+    return tuple(replace(f, severity="warning") if f.key == "imu.clock" else f for f in findings)
 
 
 def _name_cause(error: EstimationError, findings: Sequence[Finding]) -> EstimationError:

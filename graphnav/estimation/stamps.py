@@ -55,14 +55,13 @@ def find_stamps(
     clock : offsets between IMU and fixes that the recording shows before any estimation.
     """
     guess = None if clock is None else _guess(clock)
-    plain = found = recording, prepare(recording, guess is not None), _AS_THEY_ARE
+    plain = recording, prepare(recording, guess is not None), _AS_THEY_ARE
     if guess is not None:
         moved = move_stamps(recording, guess)
         other = _settle(recording, prepare, (moved, prepare(moved, True), guess))
         if other is not None and other[1].log_evidence > plain[1].log_evidence:
             return other
-    found = _settle(recording, prepare, plain)
-    return plain if found is None else found
+    return _settle(recording, prepare, plain) or plain
 
 
 def _settle(

@@ -1,0 +1,126 @@
+"""Fixes on another clock than the IMU: solved about stamps moved to where their offsets are estimated."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from graphnav import load, run
+from graphnav.app.workflow import Request, run_request
+from graphnav.config import settings_from
+from graphnav.core.earth import LocalFrame
+from graphnav.core.notes import key_of
+from graphnav.core.rotation import Array
+from graphnav.estimation.noise.files import read_noise, write_noise
+from graphnav.estimation.noise.model import StampOffsets
+from graphnav.estimation.solution import Solution
+from graphnav.estimation.stamps import move_stamps, on_imu_clock, on_own_clock
+from graphnav.recording import Gnss, Recording
+
+TOKYO = Path(__file__).resolve().parents[2] / "data" / "tokyo"
+LATE = 3.0  # s, as a receiver whose fixes are stamped that much later
+
+
+@cache
+def drive() -> Recording:
+    return load(TOKYO).crop(0.0, 110.0)
+
+
+def delay_positions(gnss: Gnss, seconds: float) -> Gnss:
+    """Positions of some time ago at the stamps that there are, velocities as they are."""
+    frame = LocalFrame(gnss.llh[0])
+    p = frame.from_llh(gnss.llh)
+    held = np.stack([np.interp(gnss.t - seconds, gnss.t, x) for x in p.T], axis=-1)
+    return replace(gnss, llh=frame.to_llh(held), rounding=(0.0, 0.0, 0.0))
+
+
+@cache
+def solved(case: str) -> Solution:
+    return run(late(case), solvers=("rts",))["rts"]
+
+
+def late(case: str) -> Recording:
+    recording = drive()
+    gnss = recording.gnss
+    assert gnss is not None
+    if case == "both":
+        return replace(recording, gnss=replace(gnss, t=gnss.t + LATE))
+    return replace(recording, gnss=delay_positions(gnss, LATE)) if case == "positions" else recording
+
+
+def distances(case: str) -> Array:
+    """(K,) m between the path of a case and that of the fixes as they are, at the latter's keyframes."""
+    one, other = solved(case), solved("as it is")
+    p = np.stack([np.interp(other.t, one.t, x) for x in one.states.p.T], axis=-1)
+    frame = LocalFrame(one.frame.to_llh(np.zeros((1, 3)))[0])
+    return np.linalg.norm(p - frame.from_llh(other.frame.to_llh(other.states.p)), axis=1)
+
+
+@pytest.mark.parametrize(("case", "of_velocities"), [("both", -LATE), ("positions", 0.0)])
+def test_fixes_of_another_clock_lead_to_the_same_path(case: str, of_velocities: float) -> None:
+    found = solved(case)
+    known = solved("as it is").parameters
+    for name, offset in (("gnss_time_offset", -LATE), ("gnss_velocity_time_offset", of_velocities)):
+        whole = found.parameters[name].value[0, 0] - known[name].value[0, 0]
+        assert whole == pytest.approx(offset, abs=4.0 * (found.parameters[name].sigma[0, 0] + 0.005)), name
+    assert np.sqrt(np.mean(distances(case)[20:-20] ** 2)) < 0.05  # 5 to 7 m where the stamps stay as they are
+    assert "gnss.stamps_moved" in map(key_of, found.notes)
+
+
+def test_right_stamps_are_left() -> None:
+    assert solved("as it is").noise.stamps == StampOffsets()
+    stated = run(late("both"), solvers=("ekf",), noise="stated")["ekf"]
+    assert stated.noise.stamps == StampOffsets()
+
+
+def test_what_is_said_of_fixes_is_on_their_own_clock() -> None:
+    found, recording = solved("both"), late("both")
+    assert recording.gnss is not None
+    for name in ("gnss_position", "gnss_velocity"):
+        t = found.records[name].t
+        assert np.abs(t[:, None] - recording.gnss.t).min(axis=1).max() < 1e-6
+        weights = found.noise.weights[name]
+        assert np.abs(weights.t[:, None] - t).min(axis=1).max() < 1e-6
+
+
+def test_the_noise_model_of_a_run_gives_the_same_bytes(tmp_path: Path) -> None:
+    found = solved("both")
+    assert found.noise.stamps.positions == pytest.approx(-LATE, abs=0.1)
+    again = run(late("both"), solvers=("rts",), noise=read_noise(write_noise(tmp_path / "noise.json", found.noise)))
+    assert (again["rts"].states.p == found.states.p).all()
+    assert (again["rts"].parameters["gnss_time_offset"].value == found.parameters["gnss_time_offset"].value).all()
+
+
+def test_moved_and_back() -> None:
+    found, offsets = solved("as it is"), StampOffsets(-0.75, 0.25, 0.5)
+    moved = on_own_clock(found, offsets)
+    assert moved.noise.stamps == offsets
+    for name, by in (("gnss_position", -0.75), ("gnss_velocity", 0.25)):
+        assert moved.records[name].t == pytest.approx(found.records[name].t - by)
+        assert on_imu_clock(moved.noise).weights[name].t == pytest.approx(found.noise.weights[name].t)
+    recording = drive()
+    changed = move_stamps(recording, offsets)
+    assert changed.gnss is not None
+    assert recording.gnss is not None
+    assert changed.gnss.t == pytest.approx(recording.gnss.t - 0.75)
+    assert changed.gnss.velocity_t == pytest.approx(recording.gnss.t + 0.25)
+    assert changed.odometer is not None
+    assert recording.odometer is not None
+    assert changed.odometer.t == pytest.approx(recording.odometer.t + 0.5)
+
+
+def test_a_result_about_moved_stamps_is_not_unreliable(tmp_path: Path) -> None:
+    shutil.copytree(TOKYO, tmp_path / "late")
+    table = tmp_path / "late" / "recording.toml"
+    table.write_text(table.read_text().replace("[gnss]\n", f"[gnss]\ntime_offset = {LATE}\n"))
+    severity = {}
+    for mode in ("stated", "estimated"):
+        settings = settings_from({"noise": {"mode": mode}})
+        outcome = run_request(Request(str(table), ("ekf",), settings, end=110.0))
+        severity[mode] = [f.severity for f in outcome.checks if f.key == "imu.clock"]
+    assert severity == {"stated": ["unreliable"], "estimated": ["warning"]}
