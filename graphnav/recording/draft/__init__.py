@@ -324,11 +324,12 @@ class _Writer:
             elif len(topics) > 1:
                 why = (
                     f"CHECK: it has the most messages; there is also {', '.join(topics[1:])}: to use it, draft again "
-                    f"with --topic {topics[1]} --force, since axes and noise are of this one"
-                )
+                    f"with --topic {topics[1]} --force"
+                ) + (", since axes and noise are of this one" if sensor == "imu" else "")
             self._key("topic", quote(topics[0]), why)
         if source.joined_from is None and source.plain is None and not is_inside(source.path, self.folder):
-            self.decisions.append(f"{relative}: lies outside the folder of this file; say --allow-outside to read it")
+            words = f"{relative}: lies outside the folder of this file; say --allow-outside to read it"
+            self.decisions += [words] if words not in self.decisions else []
         names = {o: theirs for o, theirs in source.columns.names.items() if o != theirs and o not in dropped}
         if names:
             pairs = ", ".join(f"{ours} = {quote(theirs)}" for ours, theirs in names.items())

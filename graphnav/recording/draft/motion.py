@@ -101,8 +101,6 @@ def find_lag(t: Array, x: Array, u: Array, y: Array, weight: Array | None = None
     Real signals, or planar vectors as complex numbers, whose `Lag.slope` then gives the rotation of `x` against `y`.
     Outlying samples of `y` at the best lag are left out, and the search is repeated.
 
-    Samples of `y` that fit by far the worst at the best lag are left out, and the best looked for again.
-
     Parameters
     ----------
     weight
