@@ -178,6 +178,7 @@ def _draw_comparison(outcome: Outcome, folder: Path, provenance: Mapping[str, An
         defects=outcome.defects,
         provenance=provenance,
         noise=noise_rows(outcome, next(iter(outcome.solutions.values()))),
+        beside=[f"{name}/report.html" for name in own_solutions(outcome.solutions)],
     )
 
 

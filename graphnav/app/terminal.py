@@ -17,6 +17,7 @@ from graphnav.constraints.gnss import TIMES
 from graphnav.core.notes import format_count, key_of
 from graphnav.core.progress import Progress
 from graphnav.core.staging import defer_interrupts
+from graphnav.estimation.noise.model import TABULATED
 from graphnav.estimation.solution import Solution
 from graphnav.evaluation.metrics import SpanErrors
 
@@ -45,8 +46,8 @@ def run_text(outcome: Outcome, files: Sequence[Path]) -> str:
     lines += [f"  {line}" for line in _describe_noise(outcome)]
     severity = {f.sentence: f.severity for f in outcome.checks}
     for note in dict.fromkeys([*outcome.findings, *notes]):
-        if key_of(note) in ("noise.imu", "noise.rows") or note in outcome.defects:
-            continue  # the report has the full table; what makes a result unreliable is said first
+        if key_of(note) in TABULATED or note in outcome.defects:
+            continue  # what makes a result unreliable is said first
         lines.append(f"  {severity.get(note, 'note')}: {note}")
     lines.append("")
     lines += _tabulate_errors(outcome)

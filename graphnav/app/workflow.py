@@ -21,7 +21,7 @@ from graphnav.constraints.base import SAME_TIME
 from graphnav.core.complaints import suggest_nearest
 from graphnav.core.errors import ConfigError, EstimationError, RecordingError
 from graphnav.core.findings import Finding
-from graphnav.core.notes import Note, format_count
+from graphnav.core.notes import Note, format_count, key_of
 from graphnav.core.progress import Progress, listening, tell
 from graphnav.estimation.noise.model import INTERVALS, NoiseModel
 from graphnav.estimation.solution import Solution
@@ -239,9 +239,10 @@ def _run(request: Request, progress: Progress | None) -> Outcome:
                 raise
             metrics, against, names = {}, None, ()
             findings.append(Note(error.key, f"not compared with the truth: {error}"))
-    for found in metrics.values():
-        if found.notes:
-            findings += [note for note in found.notes if note not in findings]
+    for name, found in metrics.items():
+        for note in found.notes:
+            shared = all(note in other.notes for other in metrics.values())
+            findings.append(note if shared else Note(key_of(note), f"{name}: {note}"))
     errors = {name: found.errors for name, found in metrics.items() if found.errors is not None}
     checks = inspection.findings
     if request.judge_arms or list_doubts(solutions, errors):  # which takes a second

@@ -177,6 +177,7 @@ def write_comparison(
     defects: Sequence[str] = (),
     provenance: Mapping[str, Any] | None = None,
     noise: Sequence[FigureRow] = (),
+    beside: Sequence[str] = (),
 ) -> Path:
     """Several solvers on one recording as one self-contained HTML file; arguments as in `write_report`, per solver."""
     start, end = recording.start, recording.duration
@@ -225,6 +226,7 @@ def write_comparison(
         *_verdicts(solutions, every),
         *(note for name, values in metrics_of.items() for note in words.describe_closure(name, values)),
         words.list_tiles(recording, solutions, every),
+        *summary.links(beside),
     ]
     return _write(path, page.page(f"{recording.name}: comparison", lead, sections, _clocks(recording)))
 

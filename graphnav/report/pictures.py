@@ -376,4 +376,4 @@ def detection_pictures(recording: Recording, found: Sequence[Detection]) -> list
     if not found:
         return []
     note = "Tinted: the intervals in which it stands, all detectors together."
-    return [page.picture(plots.detections(recording, found), "Detectors", note, kind="large")]
+    return [page.picture(plots.detections(recording, found), "Signals, statistics and thresholds", note, kind="large")]

@@ -206,7 +206,7 @@ def left_out(solution: Solution, start: float) -> list[Markup]:
 
 
 def links(files: Sequence[str]) -> list[Markup]:
-    """Links to the files beside the page, for other programs."""
+    """Links to the files beside the page."""
     return [page.links(files)] if files else []
 
 

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from markupsafe import Markup
 
-from graphnav.core.notes import Note
+from graphnav.core.notes import Note, key_of
 from graphnav.core.rotation import Array
 from graphnav.estimation.names import components
-from graphnav.estimation.noise.model import INTERVALS
+from graphnav.estimation.noise.model import INTERVALS, TABULATED
 from graphnav.estimation.solution import ParameterEstimate, Solution
 from graphnav.estimation.stops import stops_of_solution
 from graphnav.evaluation.against import own_solutions
@@ -287,8 +287,9 @@ def run_table(solutions: Mapping[str, Solution]) -> list[Markup]:
     ]
     several = len(solutions) > 1
     notes = [f"{name} stopped: {s.stopped}" for name, s in solutions.items() if s.stopped and several]
-    shared = [note for note in next(iter(solutions.values())).notes if all(note in s.notes for s in solutions.values())]
-    theirs = [f"{name}: {note}" for name, s in every.items() for note in s.notes if note not in shared]
+    own = {name: [note for note in s.notes if key_of(note) not in TABULATED] for name, s in every.items()}
+    shared = [note for note in own[next(iter(solutions))] if all(note in own[name] for name in solutions)]
+    theirs = [f"{name}: {note}" for name, some in own.items() for note in some if note not in shared]
     table = page.table(["stage", *(page.solver(name) for name in solutions)], rows)
     lines = [*notes, *shared, *theirs]
     return [page.columns([[table], [page.bullets(lines)]]) if lines else table]

@@ -20,7 +20,6 @@ _IMU = {
     "imu.accel_bias_walk": "accelerometer bias walk",
 }
 
-
 _IMU_WHITE = dict(zip(INTERVALS, ("gyro noise", "accelerometer noise"), strict=True))
 _FAR = 5.0  # prior sigmas, which chance does not reach
 
