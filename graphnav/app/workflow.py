@@ -123,8 +123,9 @@ def parse_withheld(text: str) -> Withheld:
     """
     found = re.fullmatch(r"([^:]*)(?::([^-]+)-([^-]+))?", text.strip())
     if re.fullmatch(r"[\d.]+-[\d.]+", text.strip()):
-        sensors = " or ".join(f"{source}:{text.strip()}" for source in sources())
-        raise ConfigError(f"--without {text}: say of which sensor: {sensors}", key="option.withheld")
+        first, *others = sources()
+        words = f"{first}:{text.strip()}, or the same of {' or '.join(others)}"
+        raise ConfigError(f"--without {text}: say of which sensor: {words}", key="option.withheld")
     usage = "write SOURCE or SOURCE:FROM-TO in seconds from the start, such as gnss:600-660"
     if found is None:
         raise ConfigError(f"--without {text}: not a source and a span; {usage}", key="option.withheld")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,7 +21,7 @@ from graphnav.report import sentences as words
 from graphnav.report import summary as summary
 from graphnav.report import tables as tables
 from graphnav.report.doubts import list_doubts
-from graphnav.report.plots import Shades, Spans
+from graphnav.report.plots import PALETTE, Shades, Spans
 from graphnav.report.provenance import provenance_tables
 from graphnav.report.satellites import satellite_parts
 from graphnav.report.tables import Withheld
@@ -160,7 +160,7 @@ def write_report(
         page.columns([summary.sigma_table(solution), summary.separation_table(solution)]),
         *summary.left_out(solution, start),
     ]
-    return _write(path, page.page(f"{recording.name}: {name}", lead, sections, _clocks(recording)))
+    return _write(path, page.page(f"{recording.name}: {name}", lead, sections, _clocks(recording), _list_others(only)))
 
 
 def write_comparison(
@@ -228,12 +228,18 @@ def write_comparison(
         words.list_tiles(recording, solutions, every),
         *summary.links(beside),
     ]
-    return _write(path, page.page(f"{recording.name}: comparison", lead, sections, _clocks(recording)))
+    html = page.page(f"{recording.name}: comparison", lead, sections, _clocks(recording), _list_others(solutions))
+    return _write(path, html)
 
 
 def detector_pictures(recording: Recording, solution: Solution) -> list[Markup]:
     """The detectors' statistics, for `write_report`: the same for every solver of a recording."""
     return pictures.detection_pictures(recording, solution.detections)
+
+
+def _list_others(names: Iterable[str]) -> list[str]:
+    """Those without a colour in the palette: other programs, and solvers that few use."""
+    return [name for name in names if name not in PALETTE]
 
 
 def _clocks(recording: Recording) -> list[page.TimeAxis]:

@@ -21,7 +21,7 @@ from typing import Any
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
-from graphnav.report.plots import PALETTE, TIME, Figure, css_colours
+from graphnav.report.plots import TIME, Figure, css_colours, variable
 from graphnav.report.wording import Quantity, show
 
 _HERE = Path(__file__).parent
@@ -42,7 +42,7 @@ bullets, code, columns, digest, download, fold, gallery, heading, links, pairs, 
 
 def solver(name: str) -> Markup:
     """A solver's name in its colour."""
-    return _PARTS.solver(name, name if name in PALETTE else "other")
+    return _PARTS.solver(name, variable(name))
 
 
 def table(head: Sequence[Any], rows: Iterable[Sequence[Any]], best: Sequence[int] = ()) -> Markup:
@@ -113,6 +113,7 @@ def page(
     lead: Sequence[Markup],
     sections: Sequence[tuple[str, Sequence[Markup]]],
     clocks: Sequence[TimeAxis] = (),
+    others: Sequence[str] = (),
 ) -> str:
     """The whole page.
 
@@ -121,12 +122,13 @@ def page(
     lead : between the title and the first section.
     sections : heading and parts; sections without parts are left out.
     clocks : to choose from, beside seconds from the start.
+    others : names of other programs, each with a colour of its own.
     """
     sections = [(head, parts) for head, parts in sections if any(parts)]
     drawn = any("<figure" in part for _, parts in sections for part in parts)
     return _TEMPLATES.get_template("page.html").render(
         title=title, lead=lead, sections=sections, clocks=clocks, time=TIME, library=_library() if drawn else None,
-        style=Markup(css_colours() + _read("page.css")), script=Markup(_read("page.js")),
+        style=Markup(css_colours(others) + _read("page.css")), script=Markup(_read("page.js")),
     )  # fmt: skip
 
 

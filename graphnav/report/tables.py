@@ -123,7 +123,8 @@ def accuracy_tables(
 
 
 def _list_notes(errors: Mapping[str, Errors]) -> list[Markup]:
-    notes = list(dict.fromkeys(note for e in errors.values() for note in e.notes))
+    shared = [note for note in next(iter(errors.values())).notes if all(note in e.notes for e in errors.values())]
+    notes = shared + [f"{name}: {note}" for name, e in errors.items() for note in e.notes if note not in shared]
     return [page.bullets(notes)] if notes else []
 
 

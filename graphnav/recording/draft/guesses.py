@@ -96,9 +96,7 @@ def guess_gyro_unit(gyro: Array, stated: str | None, lag: motion.Lag | None, veh
     large = float(np.percentile(np.abs(gyro), 99.5))
     limit = 2.5 if vehicle else 15.0
     turns = "no turns to check it" if lag is None else f"the turns agree too little (correlation {lag.correlation:.2f})"
-    return Guess(
-        "deg/s" if large > limit else "rad/s", f"99.5 % of the rates are below {large:.3g}; a guess, {turns}"
-    )
+    return Guess("deg/s" if large > limit else "rad/s", f"99.5 % of the rates are below {large:.3g}; a guess, {turns}")
 
 
 def guess_speed_unit(t: Array, speed: Array, course: motion.Course | None, stated: str | None) -> Guess:

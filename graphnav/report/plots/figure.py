@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from graphnav.core.rotation import Array
-from graphnav.report.plots.colours import PALETTE
+from graphnav.report.plots.colours import variable
 from graphnav.report.plots.thinning import BINS, choose_rows, thin, with_breaks
 
 SHADES = {"withheld": "withheld", "no GNSS": "outage", "excluded": "alert", "stands": "stop"}  # span -> colour
@@ -244,7 +244,7 @@ def numbers(values: Array) -> dict[str, str]:
 
 def colour(name: str) -> str:
     """A colour of the page, by the name of a solver or another drawn object."""
-    return f"var(--{name if name in PALETTE else 'other'})"
+    return f"var({variable(name)})"
 
 
 def _axis(letter: str, k: int) -> str:
