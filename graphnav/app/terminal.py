@@ -121,7 +121,7 @@ def _tabulate_errors(outcome: Outcome) -> list[str]:
             for name, m in outcome.metrics.items()
             if m.closure is not None
         ]
-        return [f"errors against {outcome.against}:", *table(["solver", "hor. (m)", "up (m)", "% of way"], rows)]
+        return [f"errors against {outcome.against}:", *table(["solver", "hor. (m)", "up (m)", "% of path"], rows)]
     shown = [one for one in _ERRORS if any(one[1] in m.components for m in outcome.metrics.values())]
     head = ["solver", *(f"{title} ({unit})" for title, _, _, unit in shown), "NEES pos.", "seconds"]
     rows = []
@@ -152,7 +152,7 @@ def _tabulate_spans(outcome: Outcome) -> list[str]:
         if not any(s.n for s in every.values()):
             lines.append("  nothing to compare with in it")
             continue
-        head = ["solver", "hor. end (m)", "hor. max (m)", "up max (m)", "% of way", "NEES pos."]
+        head = ["solver", "hor. end (m)", "hor. max (m)", "up max (m)", "% of path", "NEES pos."]
         lines += table(
             head,
             [

@@ -108,7 +108,7 @@ def _detect(scene: Scene, labels: Labels | None, shown: bool) -> Detection:
             notes.append(
                 Note(
                     "detectors.fft.conditions",
-                    f"not required, because this engine does not meet it at idle: {', '.join(left_out)}",
+                    f"FFT detector: without the conditions that the idling engine does not meet: {', '.join(left_out)}",
                 )
             )
     usable = asked[3:8].any() and (line is not None or not settings.find_line)
@@ -170,7 +170,7 @@ def _select_bands(settings: FftSettings, factor: float, frequencies: Array) -> t
     note = ""
     if ends[-1] > top + frequencies[1]:
         lost = [f"Peak-{k}" for k, (a, b) in enumerate(bands) if b - a < 2.0 * frequencies[1]]
-        note = f"the bands up to {ends[-1]:.3g} Hz are cut at {top:.3g} Hz, half the IMU's rate" + (
+        note = f"FFT detector: its bands up to {ends[-1]:.3g} Hz are cut at {top:.3g} Hz, half the IMU's rate" + (
             f": {' and '.join(lost)} cannot be seen" if lost else ""
         )
     return bands, note

@@ -178,5 +178,5 @@ def describe_closure(name: str, metrics: Mapping[str, Any] | None) -> list[Marku
     if not metrics or metrics.get("closure_h_m") is None:
         return []
     h, up, way, share = (wording.show(metrics.get(f"closure_{k}")) for k in ("h_m", "up_m", "distance_m", "percent"))
-    words = f"the loop of {way} m closes to {h} m horizontally ({share} % of the way) and {up} m in height."
+    words = f"the loop of {way} m closes to {h} m horizontally ({share} % of the path) and {up} m in height."
     return [page.paragraph(f"{name}: {words}", "verdict")]

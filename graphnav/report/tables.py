@@ -55,7 +55,7 @@ def _find_largest(x: Array) -> float:
     return float(x.max()) if x.size else float("nan")
 
 
-COMPARED_SPAN = ("horizontal RMS [m]", "largest [m]", "at the end [m]", "largest, % of way", "up largest [m]",
+COMPARED_SPAN = ("horizontal RMS [m]", "largest [m]", "at the end [m]", "largest, % of path", "up largest [m]",
                  "heading largest [deg]", "error / sigma, RMS")  # fmt: skip
 COMPARED = ("horizontal RMS [m]", "horizontal largest [m]", "up RMS [m]", "speed RMS [m/s]", "roll, pitch RMS [deg]",
             "heading RMS [deg]", "error / sigma, RMS")  # fmt: skip
