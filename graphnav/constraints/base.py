@@ -66,7 +66,7 @@ SAME_TIME = 1e-6  # s; measurements closer together than this share a keyframe
 
 
 @dataclass(frozen=True)
-class UsualSigmas:
+class TypicalSigmas:
     """Typical sigmas stated by the fixes of a running drive: the units of their time-correlated errors."""
 
     overall: Callable[[], Array]  # (3,) m, of positions
@@ -132,7 +132,7 @@ class Constraint(ABC):
         """(m,) typical 1-sigma of a whole error, white and time-correlated, of watched rows."""
         raise NotImplementedError(f"{self.name}: rows that are watched say what their errors usually are")
 
-    def in_units_of(self, usual: UsualSigmas) -> Self:
+    def in_units_of(self, typical: TypicalSigmas) -> Self:
         """The rows with time-correlated errors in the units of the whole drive, of which they are a part; fixes
         only.
         """

@@ -151,8 +151,8 @@ def stops(
     certain = scene.certain
     left = longer_than(subtract_spans(np.array([[recording.start, recording.end]]), certain), d.fusion.min_duration)
     before = np.clip(before, since, until)
-    doubted = any(((certain[:, 0] < b) & (certain[:, 1] > a)).any() for a, b in before if b > a)
-    if not doubted and not ((left[:, 0] < until) & (left[:, 1] > new)).any():
+    in_doubt = any(((certain[:, 0] < b) & (certain[:, 1] > a)).any() for a, b in before if b > a)
+    if not in_doubt and not ((left[:, 0] < until) & (left[:, 1] > new)).any():
         return None
     for one in scene.known:
         if one.half > 0.0 and one.speed[-1] > one.limit[-1]:

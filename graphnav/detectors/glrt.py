@@ -92,15 +92,6 @@ def glrt_statistic(
     return STATISTICS[name](sum_running(rows_for(accel, gyro)).means(window), sigma_a, sigma_w, g)
 
 
-def stance_mask(statistic: Array, threshold: float, window: int) -> np.ndarray:
-    """Rows that lie in a window below the threshold (Ren 2021, eq. 5), (N,) bool for N - window + 1 statistics."""
-    n = len(statistic) + window - 1
-    below = np.r_[0, np.cumsum(statistic < threshold), 0]
-    row = np.arange(n)
-    first, last = np.maximum(row - window + 1, 0), np.minimum(row + 1, len(statistic))
-    return np.asarray(below[last] > below[first])
-
-
 @dataclass(frozen=True)
 class Means:
     """Means over the windows of a recording."""

@@ -102,12 +102,12 @@ def fix(
     known, found = Known(), whole
     for _ in range(_ROUNDS if search else 0):
         before = dict(known.of)
-        _sweep(epochs, whole, smoothed, known)
+        _sweep(epochs, smoothed, known)
         if known.of == before:
             break
         found = _hold_arcs(whole, phase, epochs, known)
         smoothed = backward(found, refilter(found, smoothed, progress), progress)
-        if _let_go(epochs, found, smoothed, known):
+        if _let_go(epochs, smoothed, known):
             found = _hold_arcs(whole, phase, epochs, known)
             smoothed = backward(found, refilter(found, smoothed, progress), progress)
     return Fixed(
@@ -259,7 +259,7 @@ class _Causal:
         return Decision(H, r, np.full(len(r), EXACT), added) if len(r) or held.let_go else None
 
 
-def _sweep(epochs: Epochs, problem: Problem, smoothed: SmootherPass, known: Known) -> None:
+def _sweep(epochs: Epochs, smoothed: SmootherPass, known: Known) -> None:
     """Look at all epochs, those with most arcs first."""
     tried: set[frozenset[frozenset[Arc]]] = set()
     values = np.concatenate([np.zeros((len(smoothed.values), DIM)), smoothed.values], axis=1)
@@ -310,7 +310,7 @@ def with_integers(problem: Problem, phase: GnssPhase, found: Sequence[tuple[int,
     return replace(problem, constraints=tuple(sorted((*problem.constraints, whole), key=lambda c: c.name)))
 
 
-def _let_go(epochs: Epochs, problem: Problem, smoothed: SmootherPass, known: Known) -> bool:
+def _let_go(epochs: Epochs, smoothed: SmootherPass, known: Known) -> bool:
     """Give up arcs that most of their epochs are not consistent with."""
     seen: Counter[Arc] = Counter()
     odd: Counter[Arc] = Counter()

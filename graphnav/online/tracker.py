@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from graphnav.config import Settings
-from graphnav.constraints.base import SAME_TIME, UsualSigmas
+from graphnav.constraints.base import SAME_TIME, TypicalSigmas
 from graphnav.constraints.gnss import node_spacing, period
 from graphnav.constraints.vehicle import REACH
 from graphnav.core.earth import LocalFrame
@@ -365,7 +365,7 @@ class Tracker(Chain):
         A few keyframes do not show the period of the fixes, nor their typical sigmas.
         """
         spacing, fixes = node_spacing(self.settings.gnss.slow_times, period(sensors.gnss.used)), sensors.gnss
-        usual = UsualSigmas(fixes.unit, lambda k: fixes.typical_sigmas(problem.t[k]), spacing)
+        usual = TypicalSigmas(fixes.unit, lambda k: fixes.typical_sigmas(problem.t[k]), spacing)
         rows = tuple(c.in_units_of(usual) for c in problem.constraints)
         return with_noise(replace(problem, constraints=rows), noise or self.noise)
 

@@ -105,7 +105,7 @@ def fix_types(types: Array, numbers: dict[int, int] | None = None) -> NDArray[np
 class Odometer:
     """Forward speed of the point that does not slip sideways.
 
-    Where pulses were counted, `way` is the measured quantity and `speed` its slope at t.
+    Where pulses were counted, `counted` is the measured quantity and `speed` its slope at t.
     """
 
     t: Array  # (M,) s

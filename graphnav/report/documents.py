@@ -45,7 +45,7 @@ def write_report(
     outages: Spans = (),
     findings: Sequence[str] = (),
     defects: Sequence[str] = (),
-    astray: str | None = None,
+    contradicted: str | None = None,
     provenance: Mapping[str, Any] | None = None,
     detectors: Sequence[Markup] | None = None,
     noise: Sequence[FigureRow] = (),
@@ -61,7 +61,7 @@ def write_report(
     outages : s from the start, where the recording itself has no fixes.
     findings : sentences about what was odd in the recording.
     defects : those of them that make the result wrong whatever its sigmas say; the report begins with them.
-    astray : a sentence if another solver of the same run contradicts this one; likewise.
+    contradicted : a sentence if another solver of the same run contradicts this one; likewise.
     provenance : version, input hashes and the like, plain values; `options` are those of the command.
     detectors : of `detector_pictures`, for who writes several reports of one recording; drawn here if None.
     noise : figures of the noise model, of `graphnav.estimation.noise.table.figure_rows`.
@@ -149,7 +149,7 @@ def write_report(
         ("Provenance", provenance_tables(settings, provenance)),
     ]
     lead = [
-        *([] if astray is None else [page.paragraph(astray, "verdict bad")]),
+        *([] if contradicted is None else [page.paragraph(contradicted, "verdict bad")]),
         *_list_doubts(defects, only, every),
         page.paragraph(words.describe_run(recording, only, withheld, outages)),
         summary.verdicts(solution, errors),

@@ -20,7 +20,7 @@ from graphnav.evaluation.against import own_solutions
 from graphnav.recording import FIX_TYPES, Recording
 from graphnav.report import page, plots
 from graphnav.report.plots import Series, Shades, Spans
-from graphnav.report.plots.way import draw_fixes
+from graphnav.report.plots.paths import draw_fixes
 
 if TYPE_CHECKING:
     from graphnav.evaluation.metrics import Errors
@@ -55,21 +55,21 @@ def trajectory_picture(recording: Recording, solutions: Mapping[str, Solution], 
 def profile_picture(recording: Recording, solutions: Mapping[str, Solution]) -> Markup:
     """Heights over the distance travelled."""
     start, first = recording.start, next(iter(solutions.values()))
-    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(first.states.p[:, :2], axis=0), axis=1))])
+    distance = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(first.states.p[:, :2], axis=0), axis=1))])
 
-    def over_way(t: Array, h: Array) -> tuple[Array, Array]:
-        return np.interp(t, first.t, way), h
+    def over_distance(t: Array, h: Array) -> tuple[Array, Array]:
+        return np.interp(t, first.t, distance), h
 
     lines, points = {}, {}
     truth, fixes = _truth(recording, solutions), fixes_of(recording, first)
     base = float(first.frame.origin[2]) if has_place(first) else 0.0
     if truth is not None and truth[1].shape[1] > 2:
-        lines["truth"] = over_way(truth[0], base + truth[1][:, 2])
-    lines |= {name: over_way(s.t, base + s.states.p[:, 2]) for name, s in solutions.items()}
+        lines["truth"] = over_distance(truth[0], base + truth[1][:, 2])
+    lines |= {name: over_distance(s.t, base + s.states.p[:, 2]) for name, s in solutions.items()}
     if fixes is not None:
         for kind, of_it in fixes.kinds.items():
             rows = of_it & ~fixes.excluded
-            points[kind] = over_way(fixes.t[rows] + start, base + fixes.enu[rows, 2])
+            points[kind] = over_distance(fixes.t[rows] + start, base + fixes.enu[rows, 2])
     antenna = "truth and fixes" if "truth" in lines and recording.truth and recording.truth.of == "gnss" else "fixes"
     note = f"Heights above the ellipsoid; {antenna} are of the antenna."
     if not has_place(first):

@@ -82,10 +82,10 @@ def describe_run(recording: Recording, solutions: Mapping[str, Solution], withhe
 def list_tiles(recording: Recording, solutions: Mapping[str, Solution], errors: Mapping[str, Errors]) -> Markup:
     """The key numbers."""
     states = next(iter(solutions.values())).states
-    way = float(np.linalg.norm(np.diff(states.p, axis=0), axis=1).sum())
+    distance = float(np.linalg.norm(np.diff(states.p, axis=0), axis=1).sum())
     out = [
         (f"{recording.duration:.1f} s", "duration"),
-        (f"{way / 1000:.2f} km" if way >= 1000 else f"{way:.1f} m", "distance"),
+        (f"{distance / 1000:.2f} km" if distance >= 1000 else f"{distance:.1f} m", "distance"),
     ]
     spans = next(iter(solutions.values())).stationary
     if len(spans):
@@ -177,6 +177,8 @@ def describe_closure(name: str, metrics: Mapping[str, Any] | None) -> list[Marku
     """The closure error of a loop, where that is the truth."""
     if not metrics or metrics.get("closure_h_m") is None:
         return []
-    h, up, way, share = (wording.show(metrics.get(f"closure_{k}")) for k in ("h_m", "up_m", "distance_m", "percent"))
-    words = f"the loop of {way} m closes to {h} m horizontally ({share} % of the path) and {up} m in height."
+    h, up, distance, share = (
+        wording.show(metrics.get(f"closure_{k}")) for k in ("h_m", "up_m", "distance_m", "percent")
+    )
+    words = f"the loop of {distance} m closes to {h} m horizontally ({share} % of the path) and {up} m in height."
     return [page.paragraph(f"{name}: {words}", "verdict")]

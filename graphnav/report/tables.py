@@ -83,12 +83,12 @@ def span_row(errors: Errors, span: tuple[float, float], start: float) -> list[fl
     if not len(rows):
         return [float("nan")] * len(COMPARED_SPAN)
     h = errors.horizontal[rows]
-    way = float(errors.distance[rows[-1]] - errors.distance[rows[0]])
+    travelled = float(errors.distance[rows[-1]] - errors.distance[rows[0]])
     return [
         rms(h),
         _find_largest(h),
         float(h[-1]),
-        100.0 * _find_largest(h) / way if way >= 1.0 else float("nan"),
+        100.0 * _find_largest(h) / travelled if travelled >= 1.0 else float("nan"),
         _find_largest(errors.p[rows, 2]),
         float(np.degrees(_find_largest(errors.rph[rows, 2]))),
         float(np.sqrt(mean_or_nan(errors.nees_axis[rows]))),

@@ -485,7 +485,7 @@ def test_a_solver_that_the_others_contradict_is_named_first(tmp_path, recording)
     path = write_comparison(tmp_path / "c.html", recording, astray, settings={})
     assert checked(path)[0].keys[0] == "doubt.solver"
     told = find_departures(astray)["ekf"]
-    path = write_report(tmp_path / "r.html", recording, astray["ekf"], settings={}, astray=told)
+    path = write_report(tmp_path / "r.html", recording, astray["ekf"], settings={}, contradicted=told)
     assert checked(path)[0].keys[0] == "doubt.solver"
 
 

@@ -119,7 +119,7 @@ def build_odometer(d: schema.OdometerTable, rows: Table, remarks: Remarks) -> Od
     """Speeds, m/s, from a speed, from several wheels, or from counted pulses."""
     t, scale = rows["t"], schema.SPEED[d.units.speed]
     used = d.readings(tuple(rows.columns))
-    wheels = way = None
+    wheels = distance = None
     if any(name in rows for name in schema.WHEELS):
         wheels = np.stack([rows.get(name, np.full(len(t), np.nan)) for name in schema.WHEELS], -1) * scale
     if d.metres_per_pulse is not None:
@@ -127,10 +127,10 @@ def build_odometer(d: schema.OdometerTable, rows: Table, remarks: Remarks) -> Od
             raise RecordingError(
                 f"{rows.path}: {len(t)} usable row; pulses need at least 2 to make a speed", key="table.few_rows"
             )
-        way = d.metres_per_pulse * count_pulses(rows["pulses"], d.pulses, d.signed, remarks)
+        distance = d.metres_per_pulse * count_pulses(rows["pulses"], d.pulses, d.signed, remarks)
         # over both adjacent periods, so that it is the speed at t and not half a period earlier
         ahead, behind = np.minimum(np.arange(len(t)) + 1, len(t) - 1), np.maximum(np.arange(len(t)) - 1, 0)
-        speed = (way[ahead] - way[behind]) / (t[ahead] - t[behind])
+        speed = (distance[ahead] - distance[behind]) / (t[ahead] - t[behind])
     else:
         speed = rows.stack(*used).mean(axis=-1) * scale
     signed = bool((speed < 0.0).any()) if d.signed is None else d.signed
@@ -139,7 +139,7 @@ def build_odometer(d: schema.OdometerTable, rows: Table, remarks: Remarks) -> Od
         speed,
         np.array(d.lever_arm),
         d.scale_sigma,
-        counted=way,
+        counted=distance,
         pulse=d.metres_per_pulse or 0.0,
         wheels=wheels,
         signed=signed,

@@ -7,9 +7,9 @@ from graphnav.report.plots.colours import PALETTE, css_colours, variable
 from graphnav.report.plots.consistency import nees, residuals, timeline
 from graphnav.report.plots.detections import detections
 from graphnav.report.plots.figure import SHADES, TIME, Figure, Panel, Spans, limits
+from graphnav.report.plots.paths import FIX_COLOURS, Fixes, profile, trajectory
 from graphnav.report.plots.series import Series, Shades, bands, sigmas, span_zoom
 from graphnav.report.plots.thinning import BINS, choose_rows, thin, with_breaks
-from graphnav.report.plots.way import FIX_COLOURS, Fixes, profile, trajectory
 
 __all__ = [
     "BINS", "FIX_COLOURS", "PALETTE", "SHADES", "TIME", "Figure", "Fixes", "Panel", "Series", "Shades", "Spans",
