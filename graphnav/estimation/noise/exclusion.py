@@ -86,7 +86,7 @@ def estimate_without_faults(
 
     Parameters
     ----------
-    base : posed with stated noise and the parts of its intervals' noise.
+    base : built with stated noise and the parts of its intervals' noise.
     opening : as for `graphnav.estimation.solvers.ekf.ekf`.
 
     Raises
@@ -111,7 +111,7 @@ def find_faults(base: Problem, found: NoiseEstimate) -> Decision:
 
     Parameters
     ----------
-    base : posed with stated noise.
+    base : built with stated noise.
     found : estimated with all measurements.
     """
     first = decide(base, found, find_spans(base, found.noise, found))
@@ -189,7 +189,7 @@ def estimate_disturbed_intervals(base: Problem, found: NoiseEstimate) -> NoiseEs
 
     Parameters
     ----------
-    base : posed with stated noise and the parts of its intervals' noise.
+    base : built with stated noise and the parts of its intervals' noise.
     found : with all intervals alike.
     """
     start, near, passes = found.noise, found.linearisation(base), found.passes
