@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers import at_rate
-from test_faults import drive, moved, built, scattered
+from test_faults import built, drive, moved, scattered
 
 from graphnav.config import settings_from
 from graphnav.core.rotation import Array
@@ -24,7 +24,7 @@ from graphnav.estimation.solvers.window import Window, make_first_message
 from graphnav.online import Online, rows_of, without_rows
 from graphnav.recording import Recording
 
-__all__ = ["drive", "built"]  # fixtures
+__all__ = ["built", "drive"]  # fixtures
 
 
 @pytest.fixture(scope="module")
