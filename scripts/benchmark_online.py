@@ -148,13 +148,13 @@ def lazily(recording: Recording) -> Iterator[Row]:
 
 def filter_seconds(recording: Recording, settings: Settings) -> float:
     """Process time of the filter per keyframe."""
-    problem = build(recording, settings)
+    problem = build_with_noise(recording, settings)
     began = time.process_time()
     ekf(problem)
     return (time.process_time() - began) / len(problem.t)
 
 
-def build(recording: Recording, settings: Settings, known_from: float = np.inf) -> Problem:
+def build_with_noise(recording: Recording, settings: Settings, known_from: float = np.inf) -> Problem:
     """A recording aligned and built with its noise model, as for any solver.
 
     `known_from` are the first seconds of it from which the noise model is estimated.

@@ -24,7 +24,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
 import oracle
-from benchmark_online import LAP, RATE, build, memory_mb
+from benchmark_online import LAP, RATE, build_with_noise, memory_mb
 
 from graphnav.config import Settings
 from graphnav.estimation.factor_graph.isam import isam2
@@ -59,7 +59,7 @@ def main() -> None:
     spans = oracle.moving_spans(path, 60.0, max(1, round(options.minutes / 20.0)))
     recording, _ = oracle.drive(path, seed=1, outages=spans, odometer_rate=20.0)
     del path
-    problem = build(recording, Settings(), LAP)
+    problem = build_with_noise(recording, Settings(), LAP)
     runs: dict[str, Run] = {}
     solvers: dict[str, Callable[[Progress], Replay | np.ndarray]] = {
         "filter, means of 256": lambda progress: filtered(problem, progress),
