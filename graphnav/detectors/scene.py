@@ -92,4 +92,9 @@ class Detector(ABC):
         ----------
         labels : what the others find still and moving, to learn from; a detector that decides alone has none.
         shown : whether its statistic is wanted where it decides nothing.
+
+        Returns
+        -------
+        Detection
+            Windows, statistic, threshold, mask and intervals.
         """

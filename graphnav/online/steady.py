@@ -38,8 +38,12 @@ class Online(Smoother):
         self.failures: list[str] = []  # reasons why pieces were abandoned
 
     def add(self, row: Row, released: bool = False) -> None:
-        """Process one row: sensor, time, values and whether it was held, as in
-        `graphnav.online.sensors.Sensors.add`.
+        """Process one row.
+
+        Parameters
+        ----------
+        row : sensor, time (s) and numbers, as `Fix`, `ImuSample`, `WheelSpeed` and `Reading` make them.
+        released : whether it was held back before, until the IMU's clock was known.
 
         Raises
         ------

@@ -97,11 +97,7 @@ def picture(figure: Figure, title: str, note: str = "", kind: str = "") -> Marku
 
 @dataclass(frozen=True)
 class TimeAxis:
-    """A clock for the time axes of figures: its name and its reading at the start, s. `date`: seconds of the calendar
-    since 1970.
-
-    `date`: the seconds are of a day of the calendar, since 1970.
-    """
+    """A clock for the time axes of figures: its name and its reading at the start, s; with `date` since 1970."""
 
     words: str
     start: float

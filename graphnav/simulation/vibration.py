@@ -178,7 +178,6 @@ ROAD = (
 )  # fmt: skip
 # an idling engine shakes the body on its springs: 0.1 mg peaks near 3 Hz in the spectrum of a quarter of an hour, as in
 # table 4 of Li 2024
-# as in table 4 of Li 2024.
 FLOOR = (
     Mode(UP, 3.4, 0.08, 0.011), Mode(FORWARD, 3.2, 0.12, 0.011), Mode(RIGHT, 3.0, 0.12, 0.010),
     Mode(PITCH, 3.5, 0.15, 8e-4), Mode(ROLL, 3.0, 0.15, 2e-3),
