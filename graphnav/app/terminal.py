@@ -208,7 +208,7 @@ _WORK = {
 }  # fmt: skip
 
 
-class Pace:
+class StagePace:
     """Progress of some work by the shares of its stages, and the time left."""
 
     def __init__(self, work: Sequence[str]) -> None:
@@ -239,7 +239,7 @@ def progress_bar(quiet: bool, work: Sequence[str]) -> Iterator[Progress | None]:
     from rich.progress import BarColumn, TextColumn
     from rich.progress import Progress as Bar
 
-    began, pace = time.monotonic(), Pace(work)
+    began, pace = time.monotonic(), StagePace(work)
     bar = Bar(
         TextColumn("{task.description:<14}"), BarColumn(), TextColumn("{task.fields[left]}"),
         console=Console(stderr=True), transient=True,

@@ -22,11 +22,12 @@ from itertools import pairwise
 import numpy as np
 
 from graphnav.config.detectors import FftSettings
+from graphnav.core.earth import MG
 from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.detectors.base import NONE, Detection, Mask, mask_within, spans_of
 from graphnav.detectors.motion import Speeds
-from graphnav.detectors.scene import MG, Detector, Labels, Scene
+from graphnav.detectors.scene import Detector, Labels, Scene
 from graphnav.detectors.spectrum import FEWEST_WINDOWS, LOWEST, IdleLine, Windows, idle_line, peaks
 from graphnav.detectors.thresholds import log_statistic, valley
 

@@ -294,7 +294,7 @@ class Decision:
     spans: Array  # (M, 2) s, stationary
     disturbed: Array  # (L, 2) s, disturbances bridged within them
     notes: tuple[str, ...]
-    found: tuple[Detection, ...]  # number of windows by detector
+    found: tuple[Detection, ...]  # the answer of each detector
 
 
 def decide(scene: Scene, detector: type[Detector], shown: bool) -> Decision:

@@ -19,9 +19,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from graphnav.core.earth import MG
 from graphnav.core.rotation import Array
 from graphnav.detectors.base import NONE, Detection, mask_within, spans_of
-from graphnav.detectors.scene import MG, Detector, Labels, Scene
+from graphnav.detectors.scene import Detector, Labels, Scene
 from graphnav.detectors.thresholds import find_fewest_errors, own_threshold
 from graphnav.detectors.windows import Blocks, find_unbroken, sum_running, window_times
 

@@ -6,10 +6,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from graphnav.core.earth import MG
 from graphnav.core.rotation import Array
 from graphnav.recording import ImuNoise
 from graphnav.simulation.splines import stream
-from graphnav.simulation.vibration import MG, gauss_markov
+from graphnav.simulation.vibration import gauss_markov
 
 _DEG = np.pi / 180.0
 DEG_H = _DEG / 3600.0  # rad/s

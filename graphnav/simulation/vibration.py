@@ -13,6 +13,7 @@ import numpy as np
 from scipy import signal
 from scipy.interpolate import BSpline
 
+from graphnav.core.earth import MG
 from graphnav.core.rotation import Array
 from graphnav.simulation.motion import HEADING, SPEED, Path
 from graphnav.simulation.splines import centres, spline
@@ -23,7 +24,6 @@ DEGREE = 4
 _MODULATION_TIME, _MODULATION_DEGREE = 0.1, 3  # s; correlation time of a line's modulation
 
 Part = Callable[[Array], tuple[Array, Array]]
-MG = 9.80665e-3  # m/s^2
 
 
 @dataclass(frozen=True)

@@ -257,7 +257,7 @@ def fit_along(imu: Imu, track: Track) -> Fit | None:
     return _fit_imu(imu, imu.accel[:, 1:2], track, i, j, y)
 
 
-def fit_yaw(imu: Imu, track: Track) -> Fit | None:
+def fit_yaw_rate(imu: Imu, track: Track) -> Fit | None:
     """Regression of changes of course, counter-clockwise, on the integrated rate about the mean force, (1,).
 
     The coefficient is true over recorded. None without turns.

@@ -176,7 +176,7 @@ def inspect(recording: Recording) -> Inspection:
     upright = not known & {"imu.force_scale", "imu.dead_axis"}  # else no turn about the vertical is known either
     if vehicle and overlap and track is not None and recording.gnss is not None and upright:
         clock = whole.clock or measure_clock_offsets(recording.imu, recording.gnss)
-        yaw = crosschecks.fit_yaw(recording.imu, track)
+        yaw = crosschecks.fit_yaw_rate(recording.imu, track)
         forward = clock.by_velocity if track.instant else clock.by_places
         turns_back = yaw is not None and yaw.correlation > 0.8 and yaw.coefficients[0] < 0
         turns_so = yaw is not None and yaw.correlation > 0.8 and not turns_back

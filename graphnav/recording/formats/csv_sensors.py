@@ -38,8 +38,8 @@ def build_imu(d: schema.ImuTable, rows: Table, remarks: Remarks) -> Imu:
     accel = _turn(rows, ("ax", "ay", "az"), schema.FORCE[d.units.accel], R_bs)
     stated = d.figures
     noise = replace(ImuNoise(), **stated)
-    missing = [key for key in schema.NOISE_FIGURES if key not in stated]
-    if 0 < len(missing) < len(schema.NOISE_FIGURES):
+    missing = [key for key in schema.STATED_FIGURES if key not in stated]
+    if 0 < len(missing) < len(schema.STATED_FIGURES):
         remarks.add(
             "imu.noise_partly", f"[imu.noise] says nothing of {', '.join(missing)}: defaults of a consumer IMU are used"
         )
@@ -50,7 +50,7 @@ def build_imu(d: schema.ImuTable, rows: Table, remarks: Remarks) -> Imu:
             f"(gyro {noise.gyro_noise_density:g} rad/s/sqrt(Hz), "
             f"accelerometer {noise.accel_noise_density:g} m/s2/sqrt(Hz))",
         )
-    return Imu(rows["t"], gyro, accel, noise, R_bs, noise_assumed=len(missing) == len(schema.NOISE_FIGURES))
+    return Imu(rows["t"], gyro, accel, noise, R_bs, noise_assumed=len(missing) == len(schema.STATED_FIGURES))
 
 
 def _turn(rows: Table, names: tuple[str, ...], unit: float, R_bs: Array) -> Array:

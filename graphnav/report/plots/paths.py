@@ -17,7 +17,7 @@ _WIDE, _HIGH = 1080.0, 560  # pixels of the map on a wide screen; narrower pages
 
 
 @dataclass(frozen=True)
-class Fixes:
+class DrawnFixes:
     """GNSS fixes: times (M,) in s from the start, east, north, up (M, 3) in m, and which were excluded (M,).
 
     `kinds` are the rows (M,) bool of each kind of fix, by name: a type, or a stated accuracy.
@@ -40,7 +40,7 @@ FIX_COLOURS = {
 def trajectory(
     tracks: Mapping[str, tuple[Array, Array]],
     *,
-    fixes: Fixes | None = None,
+    fixes: DrawnFixes | None = None,
     truth: Array | None = None,
     spans: Mapping[str, Spans] | None = None,
     stops: Spans = (),
@@ -98,7 +98,7 @@ def profile(lines: Mapping[str, tuple[Array, Array]], points: Mapping[str, tuple
     return figure
 
 
-def draw_fixes(panel: Panel, fixes: Fixes, k: int | None = None) -> None:
+def draw_fixes(panel: Panel, fixes: DrawnFixes, k: int | None = None) -> None:
     """Each kind in its colour, excluded fixes as crosses: on a map, or component k over time."""
     x, y = (fixes.enu[:, 0], fixes.enu[:, 1]) if k is None else (fixes.t, fixes.enu[:, k])
     for kind, of_it in fixes.kinds.items():
