@@ -176,6 +176,11 @@ class Recording:
         return self.end - self.start
 
     @property
+    def has_keys(self) -> bool:
+        """Whether keys of a recording.toml can be set: there is one, or nothing was read from files."""
+        return self.source is None or self.source.suffix == ".toml" or not self.files
+
+    @property
     def placed(self) -> bool:
         """Whether it has fixes, which place it on the Earth."""
         return self.gnss is not None and len(self.gnss.t) > 0

@@ -206,7 +206,7 @@ def inspect(recording: Recording) -> Inspection:
         if recording.truth.closed_loop_sigma:
             facts["truth"] = {"closed_loop_sigma_m": recording.truth.closed_loop_sigma}
         findings += check_truth(recording)
-    if any(f.severity != "note" for f in findings) and not has_keys(recording):
+    if any(f.severity != "note" for f in findings) and not recording.has_keys:
         findings.append(
             Finding(
                 "note",
@@ -217,12 +217,6 @@ def inspect(recording: Recording) -> Inspection:
         )
     findings.sort(key=lambda f: SEVERITIES.index(f.severity))
     return Inspection(recording.name, recording.platform, facts, whole.recording, tuple(findings))
-
-
-def has_keys(recording: Recording) -> bool:
-    """Whether keys of a recording.toml can be set: there is one, or nothing was read from files."""
-    source = recording.source
-    return source is None or source.suffix == ".toml" or not recording.files
 
 
 def _describe_sensors(t: Array) -> dict[str, Any]:

@@ -72,7 +72,8 @@ def refuse(recording: Recording, findings: tuple[Finding, ...]) -> None:
     """
     for finding in findings:
         if finding.severity == "refused":
-            raise RecordingError(f"'{recording.name}': {finding.sentence}", key=finding.key)
+            draft = "" if recording.has_keys else f" (graphnav init {recording.source} drafts a recording.toml)"
+            raise RecordingError(f"'{recording.name}': {finding.sentence}{draft}", key=finding.key)
 
 
 def screen_recording(recording: Recording) -> tuple[Recording, list[str]]:
