@@ -117,7 +117,7 @@ class Chain:
         return Verdicts(times, left).faults()
 
     @property
-    def _judged_imu(self) -> bool:
+    def _estimates_imu(self) -> bool:
         """Whether some figure of the IMU differs from the stated one."""
         return any(self.noise.factor(f"imu.{name}", 1.0) != 1.0 for name in NOISE_FIGURES)
 

@@ -42,7 +42,7 @@ _STEP_DETECTION = 0.5  # s between detections of steps in a walk
 _FINAL_STOPS = 4.0  # s before the newest keyframe up to which the stops are final
 _TRY = 2.0  # s between attempts at an alignment
 _LEVEL = 5.0  # s of rest that determine the level of a vehicle without GNSS
-_JUDGED = 120.0  # s of rows after which the noise model is estimated again
+_ESTIMATED_AFTER = 120.0  # s of rows after which the noise model is estimated again
 _PATIENCE = 300.0  # s of rows kept while there is no motion to align with
 
 
@@ -71,7 +71,7 @@ class Smoother:
         self._tentative = False  # nothing may settle before the noise model has been estimated once
         self._found: Alignment | None = None  # whether the noise model is to be estimated again
         self._notes_on: dict[str, tuple[str, ...]] = {}  # notes that further rows may change, by subject
-        self._judged = 0.0  # s of rows that it was estimated from
+        self._estimated_from = 0.0  # s of rows that it was estimated from
         self._times: list[float] = []  # s, of keyframes that have settled meanwhile
         self._left_out: tuple[ExcludedSpan, ...] = ()  # of other measurements than fixes
         self._fixes: list[float] = []  # s, rows that need a keyframe and are not yet in the graph
@@ -251,7 +251,7 @@ class Smoother:
             self._found, self._tentative = found, True
             sensors.gnss.space(self.settings.noise.spacing)
         self._fixes = [t for t in sensors.list_keyframe_times().tolist() if t >= recording.start - SAME_TIME]
-        self._began, self._judged = recording.start, recording.duration
+        self._began, self._estimated_from = recording.start, recording.duration
         sensors.oldest = recording.start
         self._advance(tracker, sensors.imu.newest)
         if self._found is not None and self.tracker is tracker:
@@ -273,9 +273,9 @@ class Smoother:
         """Estimate the noise model again before a state settles, then from ever more rows until they suffice."""
         span = tracker.newest - self._began
         enough = are_enough(self.sensors, found, span)
-        if not enough and span < max(min(self.settings.solver.lag, _JUDGED), 2.0 * self._judged):
+        if not enough and span < max(min(self.settings.solver.lag, _ESTIMATED_AFTER), 2.0 * self._estimated_from):
             return
-        self._judged = span
+        self._estimated_from = span
         self._found = None if enough else found
         self._begin_judging(found, tracker)
 

@@ -208,7 +208,7 @@ class Tracker(Chain):
         T, start = self.newest, self.window.newest.state
         imu = self._cut_around(sensors, T, sensors.imu.newest).imu
         ends = np.array([T, expected])
-        interval = preintegrate(bridge_gaps(imu), imu, ends, start.ba[0], start.bg[0], self._judged_imu)
+        interval = preintegrate(bridge_gaps(imu), imu, ends, start.ba[0], start.bg[0], self._estimates_imu)
         self._motions[expected] = ImuFactors(interval, self.frame).prepare()
 
     def _is_covered(self, sensors: Sensors, t: float) -> bool:
@@ -352,7 +352,7 @@ class Tracker(Chain):
         known = {t: one for t, one in found if one is not None and not one.intervals.out_of_range(start.bg)[0]}
         problem = build_problem(
             recording, self.settings, self.frame, start, np.ones(DIM), stops, times, speed, usual, known,
-            self._steps.highest, complete, self._judged_imu,
+            self._steps.highest, complete, self._estimates_imu,
         )  # fmt: skip
         for k, t in enumerate(times[1:].tolist()):
             if t not in known:

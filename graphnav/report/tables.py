@@ -242,7 +242,7 @@ def nees_table(errors: Mapping[str, Errors]) -> list[Markup]:
         "fits": "fits",
     }
     for name, e in errors.items():
-        judged = {one.block: one for one in judge_sigmas(e)}
+        verdicts = {one.block: one for one in judge_sigmas(e)}
         nees = {"position": (e.nees_p, e.dof_p), "velocity": (e.nees_v, 3), "attitude": (e.nees_rph, 3)}
         if e.dof_p == 3:
             nees["height"] = (e.nees_axis[:, 2], 1)
@@ -251,7 +251,7 @@ def nees_table(errors: Mapping[str, Errors]) -> list[Markup]:
         for words, (values, dof) in nees.items():
             found = average_nees(values, dof)
             if found is not None:
-                inside, one = Quantity(f"{100 * found.inside:.1f} %"), judged[words]
+                inside, one = Quantity(f"{100 * found.inside:.1f} %"), verdicts[words]
                 worth = Quantity(f"{one.effective:.0f}")
                 rows.append([page.solver(name), words, found.mean, inside, found.n, worth, says[one.verdict]])
     head = ["solver", "of", "mean NEES / dof", "epochs inside 95 %", "epochs", "worth independent", "what it says"]
