@@ -20,7 +20,7 @@ from graphnav.core.errors import ConfigError
 from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.detectors.base import NONE, Detection, Detections, longer_than, mask_inside, subtract_spans
-from graphnav.detectors.fusion import Decision, decide, decide_fused, merge_decisions
+from graphnav.detectors.fusion import StopDecision, decide, decide_fused, merge_decisions
 from graphnav.detectors.glrt import STATISTICS, glrt_statistic
 from graphnav.detectors.scene import Detector, Scene
 from graphnav.detectors.stance import detect_stances
@@ -98,7 +98,7 @@ def detect(recording: Recording, settings: Settings | None = None, since: float 
     return Detections(found.spans, (*found.found, answer), (*d.notes, *found.notes))
 
 
-def _decide(scene: Scene, shown: bool = True) -> Decision:
+def _decide(scene: Scene, shown: bool = True) -> StopDecision:
     """The decision of the detectors that fire."""
     if scene.settings.fire == (FUSED,):
         found = [decide_fused(scene, list_detectors(), shown)]

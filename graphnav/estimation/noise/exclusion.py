@@ -70,7 +70,7 @@ _REFINEMENTS = 2  # estimates without masked spans: the first trims the spans, t
 
 
 @dataclass(frozen=True)
-class Exclusion:
+class Decision:
     """A noise model with what it leaves out, and the evidence of all measurements."""
 
     noise: NoiseModel
@@ -106,7 +106,7 @@ def estimate_without_faults(
     return _readmit(base, replace(again, passes=passes + again.passes))
 
 
-def find_faults(base: Problem, found: NoiseEstimate) -> Exclusion:
+def find_faults(base: Problem, found: NoiseEstimate) -> Decision:
     """Decide which spans of measurements are wrong.
 
     Parameters
@@ -114,7 +114,7 @@ def find_faults(base: Problem, found: NoiseEstimate) -> Exclusion:
     base : built with stated noise.
     found : estimated with all measurements.
     """
-    first = decide_exclusion(base, found, find_spans(base, found.noise, found))
+    first = decide(base, found, find_spans(base, found.noise, found))
     medians = {name: replace(figure, log_factor=figure.prior) for name, figure in found.noise.figures.items()}
     masked = _test(base, NoiseModel(medians), found)
     first = replace(first, passes=first.passes + Counter(filter=2))
@@ -126,7 +126,7 @@ def find_faults(base: Problem, found: NoiseEstimate) -> Exclusion:
     return _unmask(base, found, first, split_at_repeats(masked, base.recording))
 
 
-def _unmask(base: Problem, found: NoiseEstimate, first: Exclusion, masked: list[Span]) -> Exclusion:
+def _unmask(base: Problem, found: NoiseEstimate, first: Decision, masked: list[Span]) -> Decision:
     """Decide by figures that are estimated without spans which the figures found may mask.
 
     Parameters
@@ -144,7 +144,7 @@ def _unmask(base: Problem, found: NoiseEstimate, first: Exclusion, masked: list[
         spans, refined = trim(spans, errors), trim(detected, errors)
         # a slow onset is dated better by the tests, an abrupt end by the errors of single fixes
         for some in list_distinct(spans, trim(spans, errors, FALSE_ALARM), detected):
-            candidate = decide_exclusion(base, _with_outliers(estimate, errors, some), some)
+            candidate = decide(base, _with_outliers(estimate, errors, some), some)
             passes = passes + candidate.passes
             if candidate.log_evidence > best.log_evidence:
                 best, leading = candidate, estimate
@@ -155,13 +155,13 @@ def _unmask(base: Problem, found: NoiseEstimate, first: Exclusion, masked: list[
             free = estimate_noise(base, None, everything, estimate.linearisation(base))
             passes = passes + free.passes
             if free.log_evidence > first.log_evidence:
-                return Exclusion(free.noise, free.log_evidence, passes, free)
+                return Decision(free.noise, free.log_evidence, passes, free)
         if not refined or refined == spans:
             break
         spans, start = refined, replace(start, excluded=dict.fromkeys(FIXES, tuple(refined)))
     if best is not first and not best.noise.excluded:  # the figures that go with these outliers
         free = estimate_noise(base, None, best.noise, leading.linearisation(base))
-        return Exclusion(free.noise, best.log_evidence, passes + free.passes, free)
+        return Decision(free.noise, best.log_evidence, passes + free.passes, free)
     return replace(best, passes=passes)
 
 
@@ -173,7 +173,7 @@ def _readmit(base: Problem, found: NoiseEstimate) -> NoiseEstimate:
     if not narrow or narrow == spans:
         return found
     among = _list_explanations(found.noise)
-    wide, less = (decide_exclusion(base, _with_outliers(found, errors, some), some, among) for some in (spans, narrow))
+    wide, less = (decide(base, _with_outliers(found, errors, some), some, among) for some in (spans, narrow))
     passes = found.passes + wide.passes + less.passes
     if less.log_evidence <= wide.log_evidence:
         return replace(found, passes=passes)
@@ -195,7 +195,7 @@ def estimate_disturbed_intervals(base: Problem, found: NoiseEstimate) -> NoiseEs
     start, near, passes = found.noise, found.linearisation(base), found.passes
     if found.noise.excluded:
         free = estimate_noise(base, None, replace(found.noise, excluded={}), near, intervals=True)
-        decision = decide_exclusion(base, free, find_spans(base, free.noise, free))
+        decision = decide(base, free, find_spans(base, free.noise, free))
         passes = passes + free.passes + decision.passes + Counter(filter=1)
         if decision.noise.excluded:
             without = replace(free.noise, excluded=decision.noise.excluded)
@@ -212,11 +212,7 @@ def estimate_disturbed_intervals(base: Problem, found: NoiseEstimate) -> NoiseEs
 def _log_evidence(base: Problem, found: NoiseEstimate) -> float:
     """Of all measurements, excluded ones included; each outlier outside the spans has its cost."""
     spans = join(span for some in found.noise.excluded.values() for span in some)
-    whole = (
-        decide_exclusion(base, found, spans, _list_explanations(found.noise)).log_evidence
-        if spans
-        else found.log_posterior
-    )
+    whole = decide(base, found, spans, _list_explanations(found.noise)).log_evidence if spans else found.log_posterior
     return whole - OUTLIER_COST * sum(count_reduced(drop_within(some, spans)) for some in found.noise.weights.values())
 
 
@@ -240,9 +236,9 @@ def _test(base: Problem, noise: NoiseModel, found: NoiseEstimate) -> list[Span]:
     return join_faults(faults.fault_spans(faults.weigh_rows(tested, weights)))
 
 
-def decide_exclusion(
+def decide(
     base: Problem, found: NoiseEstimate, spans: list[Span], among: Collection[Explanation] = EXPLANATIONS
-) -> Exclusion:
+) -> Decision:
     """Decide by evidence what is wrong in each span.
 
     Parameters
@@ -251,7 +247,7 @@ def decide_exclusion(
     among : explanations to compare with that nothing is wrong.
     """
     if not spans:
-        return Exclusion(found.noise, found.log_posterior)
+        return Decision(found.noise, found.log_posterior)
     noise = replace(found.noise, excluded={})
     reach = extend_to_next_fix(base, spans, FIXES)
     outside = {name: drop_within(some, reach if name in INTERVALS else spans) for name, some in noise.weights.items()}
@@ -293,7 +289,7 @@ def decide_exclusion(
     present = {rows.name for rows in base.constraints}
     excluded = {name: some for name, some in excluded.items() if name in present}
     weights = {name: drop_within(some, dropped[name]) for name, some in noise.weights.items()}
-    return Exclusion(replace(noise, weights=weights, excluded=excluded), total, Counter(filter=passes))
+    return Decision(replace(noise, weights=weights, excluded=excluded), total, Counter(filter=passes))
 
 
 def _list_explanations(noise: NoiseModel) -> set[Explanation]:
