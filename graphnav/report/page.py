@@ -21,6 +21,7 @@ from typing import Any
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
+from graphnav.core.errors import ConfigError
 from graphnav.report.plots import TIME, Figure, css_colours, variable
 from graphnav.report.wording import Quantity, show
 
@@ -144,7 +145,9 @@ class Packed:
 def _library() -> Packed:
     found = importlib.util.find_spec("plotly")
     if found is None or found.origin is None:
-        raise ModuleNotFoundError("plotly is not installed")
+        raise ConfigError(
+            "a page needs plotly, which is not installed; pip install -e . in the clone", key="package.missing"
+        )
     return _pack((Path(found.origin).parent / "package_data" / "plotly.min.js").read_bytes())
 
 
