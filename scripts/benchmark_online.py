@@ -67,7 +67,7 @@ def main() -> None:
     recording, truth = oracle.drive(path, seed=1, outages=spans, odometer_rate=20.0)
     del path
     filtered = filter_seconds(recording.crop(0.0, min(seconds, 1800.0)), settings)
-    print(f"the filter takes {1e3 * filtered:.2f} ms a keyframe with everything posed beforehand", flush=True)
+    print(f"the filter takes {1e3 * filtered:.2f} ms a keyframe with everything built beforehand", flush=True)
     online = Online(without_rows(recording), settings)
     scale = np.array([6.378e6, 6.378e6 * np.cos(truth.llh[0, 0]), 1.0])
     found: list[list[float]] = []  # s of each update by part, all of it, beside it, and the longest row there
@@ -148,14 +148,14 @@ def lazily(recording: Recording) -> Iterator[Row]:
 
 def filter_seconds(recording: Recording, settings: Settings) -> float:
     """Process time of the filter per keyframe."""
-    problem = posed(recording, settings)
+    problem = build_with_noise(recording, settings)
     began = time.process_time()
     ekf(problem)
     return (time.process_time() - began) / len(problem.t)
 
 
-def posed(recording: Recording, settings: Settings, known_from: float = np.inf) -> Problem:
-    """A recording aligned and posed with its noise model, as for any solver.
+def build_with_noise(recording: Recording, settings: Settings, known_from: float = np.inf) -> Problem:
+    """A recording aligned and built with its noise model, as for any solver.
 
     `known_from` are the first seconds of it from which the noise model is estimated.
     """

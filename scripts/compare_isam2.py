@@ -3,7 +3,7 @@
     python scripts/compare_isam2.py --minutes 60
     python scripts/compare_isam2.py --minutes 600 --no-whole
 
-The same rows of the same simulated drive, posed beforehand with the noise model of the first hour and all vehicle
+The same rows of the same simulated drive, built beforehand with the noise model of the first hour and all vehicle
 constraints at keyframes of 1 Hz; each solver in a process of its own, by blocks of ten minutes. Times are processor
 time of the thread, so that other programs show in them only by what the caches lose. Memory is what the process has
 grown by at the end of a block, with the states and covariances that it has found by then (4 kB a keyframe), and in the
@@ -24,7 +24,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
 import oracle
-from benchmark_online import LAP, RATE, memory_mb, posed
+from benchmark_online import LAP, RATE, build_with_noise, memory_mb
 
 from graphnav.config import Settings
 from graphnav.estimation.factor_graph.isam import isam2
@@ -59,7 +59,7 @@ def main() -> None:
     spans = oracle.moving_spans(path, 60.0, max(1, round(options.minutes / 20.0)))
     recording, _ = oracle.drive(path, seed=1, outages=spans, odometer_rate=20.0)
     del path
-    problem = posed(recording, Settings(), LAP)
+    problem = build_with_noise(recording, Settings(), LAP)
     runs: dict[str, Run] = {}
     solvers: dict[str, Callable[[Progress], Replay | np.ndarray]] = {
         "filter, means of 256": lambda progress: filtered(problem, progress),

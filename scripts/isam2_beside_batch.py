@@ -5,7 +5,7 @@
 All settings are the defaults; the noise model is estimated once for each recording. A state that has settled with two
 minutes of the future knows less than batch does of the whole drive: a third line has what that makes of it. The last
 line is beside batch of what had come when each state settled: every measurement after that has no weight. Within a lag
-all have their intervals integrated about the biases and scale errors that batch comes to, with --as-posed about those
+all have their intervals integrated about the biases and scale errors that batch comes to, with --as-built about those
 that each comes to by itself.
 """
 
@@ -45,7 +45,7 @@ def main() -> None:
     )
     parser.add_argument("--lag", type=float, default=LAG, help="s (%(default)s)")
     parser.add_argument("--groups", type=int, default=8, help="settled together, that are compared (%(default)s)")
-    parser.add_argument("--as-posed", action="store_true", help="intervals integrated about what each comes to itself")
+    parser.add_argument("--as-built", action="store_true", help="intervals integrated about what each comes to itself")
     options = parser.parse_args()
     data, lag = Path(os.environ.get("GRAPHNAV_DATA", "../shared/data")), options.lag
     print("Median / 99 % / most over the keyframes\n")
@@ -59,7 +59,7 @@ def main() -> None:
         best = batch(problem, start, nodes)
         whole = isam2(problem).settled
         tell(name, "batch", (whole.states, whole.covariance), (best.states, best.covariance))
-        if not options.as_posed:
+        if not options.as_built:
             problem = about(problem, best)
         settled, window = isam2(problem, lag).settled, incremental(problem, lag).settled
         own = settled.states, settled.covariance

@@ -18,7 +18,7 @@ from helpers import full_disk, refuse_command, refused, run_here
 
 from graphnav import load, run
 from graphnav.app import cli
-from graphnav.app.terminal import Pace
+from graphnav.app.terminal import StagePace
 from graphnav.config import PROFILES, Settings, read_settings, settings_from, settings_text
 from graphnav.core import staging
 from graphnav.core.errors import ConfigError
@@ -306,7 +306,7 @@ def test_ctrl_c_is_one_line_and_leaves_nothing_half_done(tmp_path):
 
 # ------------------------------------------------------------------------------------------------------------ progress
 def test_the_time_left_is_what_the_pace_says():
-    pace = Pace(("simulate",))
+    pace = StagePace(("simulate",))
     assert pace.estimate_left(10.0) is None
     pace.reach("driving", 0.5)
     half = pace.done

@@ -300,9 +300,9 @@ def _usage(error: Any) -> str:
     context = getattr(error, "ctx", None)
     path = getattr(context, "command_path", "graphnav")
     options = {name for option in getattr(getattr(context, "command", None), "params", ()) for name in option.opts}
-    said = str(getattr(error, "option_name", ""))
-    if said.lstrip("-") in _SPAN and {"--start", "--end"} <= options:
-        return f"No such option: {said}; --start and --end choose a part of the recording; see {path} --help"
+    unknown = str(getattr(error, "option_name", ""))
+    if unknown.lstrip("-") in _SPAN and {"--start", "--end"} <= options:
+        return f"No such option: {unknown}; --start and --end choose a part of the recording; see {path} --help"
     return f"{demand(error.format_message().rstrip('.'))}; see {path} --help"
 
 

@@ -178,7 +178,7 @@ def init(
     from graphnav.recording.draft import draft
     from graphnav.recording.formats.writer import write_csv
 
-    out = out / "recording.toml" if out.is_dir() else out
+    out = out / "recording.toml" if out.is_dir() or not out.suffix else out
     if out.suffix != ".toml":
         raise ConfigError(f"-o {out}: name a .toml file, or a folder for recording.toml", key="output.name")
     if out.exists() and not force:

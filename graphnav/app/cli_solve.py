@@ -127,7 +127,8 @@ def compare(
         typer.Option(
             "--against-shift",
             metavar="S",
-            help="Seconds to add to the stamps of a file of --against; default: found from the data; once for each.",
+            help="Seconds to add to the stamps of a file of --against; default: the difference of the clocks, if any, "
+            "and a second or more where the speeds then agree; once for each.",
         ),
     ] = None,
     loose: Annotated[

@@ -178,6 +178,7 @@ def _draw_comparison(outcome: Outcome, folder: Path, provenance: Mapping[str, An
         defects=outcome.defects,
         provenance=provenance,
         noise=noise_rows(outcome, next(iter(outcome.solutions.values()))),
+        beside=[f"{name}/report.html" for name in own_solutions(outcome.solutions)],
     )
 
 
@@ -224,7 +225,7 @@ def _draw_solver(
     from graphnav.report.doubts import find_departures
 
     solution, metrics = outcome.solutions[name], outcome.metrics.get(name)
-    astray = find_departures(outcome.solutions).get(name)
+    contradicted = find_departures(outcome.solutions).get(name)
     report.write_report(
         folder / "report.html",
         outcome.recording,
@@ -236,7 +237,7 @@ def _draw_solver(
         outages=outages(outcome.recording),
         findings=_list_findings(outcome),
         defects=outcome.defects,
-        astray=astray,
+        contradicted=contradicted,
         provenance=provenance,
         detectors=detectors,
         noise=noise_rows(outcome, solution),
@@ -257,8 +258,8 @@ def _attempt(write: Callable[[Path], object], path: Path) -> dict[Path, str]:
 
 def _insist(failed: Mapping[Path, str]) -> None:
     if failed:
-        said = f"{'; '.join(failed.values())}; all other files are there"
-        raise PartlyWrittenError(said, key="output.partly_written", missing=failed)
+        sentence = f"{'; '.join(failed.values())}; all other files are there"
+        raise PartlyWrittenError(sentence, key="output.partly_written", missing=failed)
 
 
 def write_evaluation(folder: Path, values: Mapping[str, Any], metrics: Metrics) -> None:

@@ -40,8 +40,8 @@ def solver_summary(
         nees = {key: value for key, value in errors.items() if key.startswith("nees_")}
         errors = {key: value for key, value in errors.items() if key not in nees}
     doubts = list_doubts({name: solution}, {} if metrics is None or metrics.errors is None else {name: metrics.errors})
-    astray = find_departures(outcome.solutions).get(name)  # which no solution tells by itself
-    doubts = doubts if astray is None else (astray, *doubts)
+    contradicted = find_departures(outcome.solutions).get(name)  # which no solution tells by itself
+    doubts = doubts if contradicted is None else (contradicted, *doubts)
     timings = {**solution.timings, "evaluation": outcome.timings["evaluation"], **seconds}
     unreliable = [Finding("unreliable", doubt, key_of(doubt)) for doubt in doubts]
     messages = dict.fromkeys([*unreliable, *outcome.checks, *(Finding("note", note, key_of(note)) for note in notes)])

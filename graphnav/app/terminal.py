@@ -17,6 +17,7 @@ from graphnav.constraints.gnss import TIMES
 from graphnav.core.notes import format_count, key_of
 from graphnav.core.progress import Progress
 from graphnav.core.staging import defer_interrupts
+from graphnav.estimation.noise.model import TABULATED
 from graphnav.estimation.solution import Solution
 from graphnav.evaluation.metrics import SpanErrors
 
@@ -45,8 +46,8 @@ def run_text(outcome: Outcome, files: Sequence[Path]) -> str:
     lines += [f"  {line}" for line in _describe_noise(outcome)]
     severity = {f.sentence: f.severity for f in outcome.checks}
     for note in dict.fromkeys([*outcome.findings, *notes]):
-        if key_of(note) in ("noise.imu", "noise.rows") or note in outcome.defects:
-            continue  # the report has the full table; what makes a result unreliable is said first
+        if key_of(note) in TABULATED or note in outcome.defects:
+            continue  # what makes a result unreliable is said first
         lines.append(f"  {severity.get(note, 'note')}: {note}")
     lines.append("")
     lines += _tabulate_errors(outcome)
@@ -120,7 +121,7 @@ def _tabulate_errors(outcome: Outcome) -> list[str]:
             for name, m in outcome.metrics.items()
             if m.closure is not None
         ]
-        return [f"errors against {outcome.against}:", *table(["solver", "hor. (m)", "up (m)", "% of way"], rows)]
+        return [f"errors against {outcome.against}:", *table(["solver", "hor. (m)", "up (m)", "% of path"], rows)]
     shown = [one for one in _ERRORS if any(one[1] in m.components for m in outcome.metrics.values())]
     head = ["solver", *(f"{title} ({unit})" for title, _, _, unit in shown), "NEES pos.", "seconds"]
     rows = []
@@ -151,7 +152,7 @@ def _tabulate_spans(outcome: Outcome) -> list[str]:
         if not any(s.n for s in every.values()):
             lines.append("  nothing to compare with in it")
             continue
-        head = ["solver", "hor. end (m)", "hor. max (m)", "up max (m)", "% of way", "NEES pos."]
+        head = ["solver", "hor. end (m)", "hor. max (m)", "up max (m)", "% of path", "NEES pos."]
         lines += table(
             head,
             [
@@ -207,7 +208,7 @@ _WORK = {
 }  # fmt: skip
 
 
-class Pace:
+class StagePace:
     """Progress of some work by the shares of its stages, and the time left."""
 
     def __init__(self, work: Sequence[str]) -> None:
@@ -238,7 +239,7 @@ def progress_bar(quiet: bool, work: Sequence[str]) -> Iterator[Progress | None]:
     from rich.progress import BarColumn, TextColumn
     from rich.progress import Progress as Bar
 
-    began, pace = time.monotonic(), Pace(work)
+    began, pace = time.monotonic(), StagePace(work)
     bar = Bar(
         TextColumn("{task.description:<14}"), BarColumn(), TextColumn("{task.fields[left]}"),
         console=Console(stderr=True), transient=True,

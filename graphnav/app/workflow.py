@@ -21,7 +21,7 @@ from graphnav.constraints.base import SAME_TIME
 from graphnav.core.complaints import suggest_nearest
 from graphnav.core.errors import ConfigError, EstimationError, RecordingError
 from graphnav.core.findings import Finding
-from graphnav.core.notes import Note, format_count
+from graphnav.core.notes import Note, format_count, key_of
 from graphnav.core.progress import Progress, listening, tell
 from graphnav.estimation.noise.model import INTERVALS, NoiseModel, StampOffsets
 from graphnav.estimation.solution import Solution
@@ -123,8 +123,9 @@ def parse_withheld(text: str) -> Withheld:
     """
     found = re.fullmatch(r"([^:]*)(?::([^-]+)-([^-]+))?", text.strip())
     if re.fullmatch(r"[\d.]+-[\d.]+", text.strip()):
-        sensors = " or ".join(f"{source}:{text.strip()}" for source in sources())
-        raise ConfigError(f"--without {text}: say of which sensor: {sensors}", key="option.withheld")
+        first, *others = sources()
+        words = f"{first}:{text.strip()}, or the same of {' or '.join(others)}"
+        raise ConfigError(f"--without {text}: say of which sensor: {words}", key="option.withheld")
     usage = "write SOURCE or SOURCE:FROM-TO in seconds from the start, such as gnss:600-660"
     if found is None:
         raise ConfigError(f"--without {text}: not a source and a span; {usage}", key="option.withheld")
@@ -239,9 +240,10 @@ def _run(request: Request, progress: Progress | None) -> Outcome:
                 raise
             metrics, against, names = {}, None, ()
             findings.append(Note(error.key, f"not compared with the truth: {error}"))
-    for found in metrics.values():
-        if found.notes:
-            findings += [note for note in found.notes if note not in findings]
+    for name, found in metrics.items():
+        for note in found.notes:
+            shared = all(note in other.notes for other in metrics.values())
+            findings.append(note if shared else Note(key_of(note), f"{name}: {note}"))
     errors = {name: found.errors for name, found in metrics.items() if found.errors is not None}
     checks = _mitigate(inspection.findings, solutions)
     if request.judge_arms or list_doubts(solutions, errors):  # which takes a second

@@ -47,7 +47,7 @@ class VehicleSettings(Outliers):
 class FootSettings(Outliers):
     """Constraints of a foot on the floor and in swing."""
 
-    usual_kernel: ClassVar[str] = "cauchy"
+    default_kernel: ClassVar[str] = "cauchy"
 
     rate: float = Field(20.0, gt=0, le=200, description="Hz, keyframes within a stance and within a swing")
     stance: bool = Field(True, description="where the shoe touches the floor it does not move")

@@ -44,8 +44,8 @@ Gate = Annotated[float | str, BeforeValidator(_check_gate)]
 class Outliers(Section):
     """Treatment of outliers, the same in every solver."""
 
-    usual_kernel: ClassVar[str] = "none"  # "automatic"
-    usual_gate: ClassVar[float | None] = None
+    default_kernel: ClassVar[str] = "none"  # "automatic"
+    default_gate: ClassVar[float | None] = None
 
     robust: Kernel = Field(
         "automatic", description=f"robust kernel in every solver: off, on (cauchy), automatic, {', '.join(KERNELS)}"
@@ -59,13 +59,13 @@ class Outliers(Section):
     @property
     def kernel(self) -> str:
         """The robust kernel in effect, "none" if there is none."""
-        return {"off": "none", "on": "cauchy", "automatic": self.usual_kernel}.get(self.robust, self.robust)
+        return {"off": "none", "on": "cauchy", "automatic": self.default_kernel}.get(self.robust, self.robust)
 
     @property
     def limit(self) -> float | None:
         """The gate in effect, None if there is none."""
         if isinstance(self.gate, str):
-            return {"off": None, "on": 6.0, "automatic": self.usual_gate}[self.gate]
+            return {"off": None, "on": 6.0, "automatic": self.default_gate}[self.gate]
         return self.gate
 
     @property

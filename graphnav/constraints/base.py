@@ -50,12 +50,34 @@ class BuildContext(Shared):
     typical_sigmas: Array | None = None  # (M, 3) m, typical sigma stated by the fixes, where it is available
 
     def series(self, name: str) -> Series | None:
-        """The rows of a sensor of `graphnav.sensors`; None where there are none, or the settings exclude it."""
+        """The rows of a sensor of `graphnav.sensors`.
+
+        Parameters
+        ----------
+        name
+            Of the sensor.
+
+        Returns
+        -------
+        Series or None
+            None where there are none, or the settings exclude it.
+        """
         series = self.recording.sensors.get(name)
         return series if series is not None and len(series) and self.settings.sensor(name).use else None
 
     def keyframe_at(self, t: Array) -> Array:
-        """Index of the keyframe at each time, -1 where there is none."""
+        """Index of the keyframe at each time.
+
+        Parameters
+        ----------
+        t
+            (n,) s.
+
+        Returns
+        -------
+        array
+            (n,) int, -1 where there is none within a microsecond.
+        """
         right = np.clip(np.searchsorted(self.t, t), 0, len(self.t) - 1)
         left = np.maximum(right - 1, 0)
         best = np.where(np.abs(self.t[left] - t) < np.abs(self.t[right] - t), left, right)
@@ -66,7 +88,7 @@ SAME_TIME = 1e-6  # s; measurements closer together than this share a keyframe
 
 
 @dataclass(frozen=True)
-class UsualSigmas:
+class TypicalSigmas:
     """Typical sigmas stated by the fixes of a running drive: the units of their time-correlated errors."""
 
     overall: Callable[[], Array]  # (3,) m, of positions
@@ -132,7 +154,7 @@ class Constraint(ABC):
         """(m,) typical 1-sigma of a whole error, white and time-correlated, of watched rows."""
         raise NotImplementedError(f"{self.name}: rows that are watched say what their errors usually are")
 
-    def in_units_of(self, usual: UsualSigmas) -> Self:
+    def in_units_of(self, typical: TypicalSigmas) -> Self:
         """The rows with time-correlated errors in the units of the whole drive, of which they are a part; fixes
         only.
         """
@@ -144,19 +166,57 @@ class Constraint(ABC):
 
     @classmethod
     def epochs(cls, recording: Recording, settings: Settings, stationary: Array) -> Array:
-        """Times (s) at which the constraint needs keyframes; none by default."""
+        """Times at which the constraint needs keyframes.
+
+        Parameters
+        ----------
+        recording, settings
+            Of the run.
+        stationary
+            (M, 2) s, spans in which the platform is stationary.
+
+        Returns
+        -------
+        array
+            (n,) s on the recording's clock, in any order; none by default.
+        """
         return np.empty(0)
 
     @classmethod
     @abstractmethod
     def build(cls, scene: BuildContext) -> Constraint | None:
-        """Build the rows for a recording, or None when it has no data for this constraint."""
+        """Build the rows for a recording.
+
+        Parameters
+        ----------
+        scene
+            Recording, settings, keyframes, stops and intervals.
+
+        Returns
+        -------
+        Constraint or None
+            Rows with ascending keyframes; None when the recording has no data for this constraint.
+        """
 
     def linearize(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> Linearized:
-        """Linearise rows `rows` at `states` (one per row) and parameter values (n, k), one per row.
+        """Linearise some rows.
 
         A constraint without Jacobians defines `residual` and a field `sigma` (N, m) instead, and is differentiated
         numerically.
+
+        Parameters
+        ----------
+        states
+            n states, that of the keyframe of each row.
+        parameters
+            By name, (n, k) values at each row.
+        rows
+            Which of the N rows these n are.
+
+        Returns
+        -------
+        Linearized
+            Residuals, Jacobians and sigmas of the n rows.
         """
 
         jacobians = {}
@@ -178,7 +238,13 @@ class Constraint(ABC):
         return Linearized(self.residual(states, parameters, rows), jacobians, sigma[rows])
 
     def residual(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> Array:
-        """(n, m) predicted minus measured, for a constraint that is differentiated numerically."""
+        """Residuals of some rows, for a constraint that is differentiated numerically; parameters as of `linearize`.
+
+        Returns
+        -------
+        array
+            (n, m) predicted minus measured.
+        """
         raise NotImplementedError(f"{self.name}: has neither linearize nor residual")
 
 

@@ -173,7 +173,6 @@ class FootLateral(Constraint):
         past = IntervalMotion.of(iv, rows, scene.frame)
         # a swing lies between two stances; its heading change is the integral of the turn rate about the vertical, the
         # direction of the mean force of a swing
-        # vertical, which the force points to in the mean of a swing
         swing = np.searchsorted(scene.stationary[:, 0], iv.t0[rows])
         lasts = np.bincount(swing, weights=iv.T[rows])[swing]
         turned = np.abs(_turn(past, iv.T[rows], swing))[swing]

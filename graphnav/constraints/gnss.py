@@ -27,7 +27,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 
 from graphnav.config import Settings
-from graphnav.constraints.base import SAME_TIME, BuildContext, Constraint, Linearized, UsualSigmas
+from graphnav.constraints.base import SAME_TIME, BuildContext, Constraint, Linearized, TypicalSigmas
 from graphnav.core import earth, rotation
 from graphnav.core.rotation import Array, mv
 from graphnav.core.running import run_median
@@ -112,7 +112,7 @@ class GnssPosition(Constraint):
     unit_error: Array = field(
         default_factory=lambda: _make_empty(0, 3)
     )  # the same, smoothed: unit of the time-correlated errors
-    usual_error: Array = field(
+    drive_error: Array = field(
         default_factory=lambda: np.zeros(3)
     )  # median of these: unit of the errors of minutes and hours
     type: Array | None = None  # (N,) index into graphnav.recording.FIX_TYPES, where there are several types
@@ -159,7 +159,7 @@ class GnssPosition(Constraint):
             unit_error=_compute_running_median(gnss.t[used], sd)
             if scene.typical_sigmas is None
             else scene.typical_sigmas[used],
-            usual_error=np.median(sd if scene.typical_sigmas is None else scene.typical_sigmas, axis=0),
+            drive_error=np.median(sd if scene.typical_sigmas is None else scene.typical_sigmas, axis=0),
             type=kinds,
             lever_arm=gnss.lever_arm,
             gyro=average_around(imu, imu.gyro, gnss.t[used]),
@@ -179,9 +179,9 @@ class GnssPosition(Constraint):
         )
         return names, 2 * which[:, None] + np.array([0, 0, 1])
 
-    def in_units_of(self, usual: UsualSigmas) -> Self:
-        processes = tuple(replace(p, spacing=usual.spacing) for p in self.processes)
-        return replace(self, usual_error=usual.overall(), processes=processes)
+    def in_units_of(self, typical: TypicalSigmas) -> Self:
+        processes = tuple(replace(p, spacing=typical.spacing) for p in self.processes)
+        return replace(self, drive_error=typical.overall(), processes=processes)
 
     def typical_error(self) -> Array:
         return _bound_typical_error(self)
@@ -209,7 +209,7 @@ class GnssPosition(Constraint):
         for name in parameters:
             if name.startswith(ERRORS):
                 # a lasting error in units that change from fix to fix would be observable by these changes
-                unit = self.usual_error if name.startswith(ERRORS[1:]) else self.unit_error[rows]
+                unit = self.drive_error if name.startswith(ERRORS[1:]) else self.unit_error[rows]
                 size = np.broadcast_to(unit, residual.shape) * self._of(name, rows)
                 residual = residual + size * parameters[name]
                 jacobians[name] = size[..., None] * _I3
@@ -286,9 +286,9 @@ class GnssVelocity(Constraint):
             **_build_common(scene, VELOCITY_TIME_OFFSET),
         )
 
-    def in_units_of(self, usual: UsualSigmas) -> Self:
-        processes = tuple(replace(p, spacing=usual.spacing) for p in self.processes)
-        return replace(self, unit_error=usual.around(self.keyframe)[:, 3:], processes=processes)
+    def in_units_of(self, typical: TypicalSigmas) -> Self:
+        processes = tuple(replace(p, spacing=typical.spacing) for p in self.processes)
+        return replace(self, unit_error=typical.around(self.keyframe)[:, 3:], processes=processes)
 
     def typical_error(self) -> Array:
         return _bound_typical_error(self)

@@ -22,6 +22,7 @@ B = A * (1.0 - F)  # semi-minor axis, m
 E2 = F * (2.0 - F)  # first eccentricity squared
 _EP2 = E2 / (1.0 - E2)  # second eccentricity squared
 GM = 3.986004418e14  # m^3/s^2
+STANDARD_GRAVITY, MG = 9.80665, 9.80665e-3  # m/s^2, by definition; of a thousandth of it
 RATE = 7.292115e-5  # rad/s
 _GAMMA_E, _K_SOMIGLIANA = 9.7803253359, 0.00193185265241
 _M = RATE**2 * A**2 * B / GM

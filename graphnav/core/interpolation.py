@@ -25,7 +25,8 @@ def interpolate(
 ) -> tuple[Trajectory, Array]:
     """Interpolate a trajectory to other times, never outside its span and never across a gap.
 
-    Without a covariance one is made of the sigmas (NaN where there are none). Biases are dropped.
+    Without a covariance one is made of the sigmas (NaN where there are none). Biases are dropped; the type of a fix and
+    its satellites are those of the nearest row.
 
     Parameters
     ----------
@@ -101,10 +102,13 @@ def interpolate(
     known = cov_at is not None and bool(np.isfinite(cov_at[:, 6:9, 6:9]).all((1, 2)).any())
     if known and cov_at is not None and swing is not None and rph is not None and R_at is not None:
         cov_at = _move_to_point(cov_at, R_at, rph, np.asarray(lever_arm, dtype=float), swing)
+    near = np.where(s[:, 0] > 0.5, nxt, k)  # the row whose fix it is
     out = replace(
         trajectory, t=t, llh=p_at if frame is None else frame.to_llh(p_at), v=v_at, rph=rph,
         sd_p=_take_sigmas(cov_at, 0, None), sd_v=_take_sigmas(cov_at, 3, None), sd_rph=_take_sigmas(cov_at, 6, None),
         gyro_bias=None, accel_bias=None, covariance=cov_at,
+        fix_type=None if trajectory.fix_type is None else trajectory.fix_type[near],
+        satellites=None if trajectory.satellites is None else trajectory.satellites[near],
     )  # fmt: skip
     return out, ok
 

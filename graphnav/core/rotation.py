@@ -194,21 +194,6 @@ def _right_jacobian_inverse_one(x: float, y: float, z: float) -> Array:
     )
 
 
-def integrals(v: Array) -> tuple[Array, Array]:
-    """Gamma1 and Gamma2 of a constant rotation: int_0^1 Exp(s v) ds and its integral.
-
-    Gamma1 is the left Jacobian of SO(3); both are the factors of a constant force in the exponential of the Galilean
-    group Gal(3) (Kelly, "All about the Galilean group SGal(3)", 2023, eq. 27-28).
-    """
-    v = np.asarray(v, dtype=float)
-    _, b, c, d = coefficients(np.sum(v * v, axis=-1))
-    S = skew(v)
-    S2 = S @ S
-    first = np.eye(3) + b[..., None, None] * S + c[..., None, None] * S2
-    second = 0.5 * np.eye(3) + c[..., None, None] * S + d[..., None, None] * S2
-    return first, second
-
-
 def to_quaternion(R: Array) -> Array:
     """Unit quaternions (w, x, y, z) with w >= 0: (..., 3, 3) -> (..., 4)."""
     R = np.asarray(R, dtype=float)

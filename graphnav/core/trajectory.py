@@ -30,8 +30,8 @@ class Trajectory:
     gyro_bias: Array | None = None  # (K, 3) rad/s, RFU
     accel_bias: Array | None = None  # (K, 3) m/s^2, RFU
     covariance: Array | None = None  # (K, 9, 9)
-    fix_type: Array | None = None  # (K,) of a receiver's trajectory: number of satellites used, NaN where unknown
-    satellites: Array | None = None  # (K,) the same: how many it used
+    fix_type: Array | None = None  # (K,) of a receiver's trajectory: type of each fix, NaN where unknown
+    satellites: Array | None = None  # (K,) of the same: how many it used, NaN where unknown
     gps_zero: float | None = None  # s since the GPS epoch at t = 0, where it is known
     frame: str = "geodetic"  # "local": llh then holds metres x, y, z of unknown origin and yaw
     name: str = ""

@@ -20,7 +20,7 @@ from graphnav.core.errors import ConfigError
 from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.detectors.base import NONE, Detection, Detections, longer_than, mask_inside, subtract_spans
-from graphnav.detectors.fusion import Decision, decide, decide_fused, merge_decisions
+from graphnav.detectors.fusion import StopDecision, decide, decide_fused, merge_decisions
 from graphnav.detectors.glrt import STATISTICS, glrt_statistic
 from graphnav.detectors.scene import Detector, Scene
 from graphnav.detectors.stance import detect_stances
@@ -98,7 +98,7 @@ def detect(recording: Recording, settings: Settings | None = None, since: float 
     return Detections(found.spans, (*found.found, answer), (*d.notes, *found.notes))
 
 
-def _decide(scene: Scene, shown: bool = True) -> Decision:
+def _decide(scene: Scene, shown: bool = True) -> StopDecision:
     """The decision of the detectors that fire."""
     if scene.settings.fire == (FUSED,):
         found = [decide_fused(scene, list_detectors(), shown)]
@@ -151,8 +151,8 @@ def stops(
     certain = scene.certain
     left = longer_than(subtract_spans(np.array([[recording.start, recording.end]]), certain), d.fusion.min_duration)
     before = np.clip(before, since, until)
-    doubted = any(((certain[:, 0] < b) & (certain[:, 1] > a)).any() for a, b in before if b > a)
-    if not doubted and not ((left[:, 0] < until) & (left[:, 1] > new)).any():
+    in_doubt = any(((certain[:, 0] < b) & (certain[:, 1] > a)).any() for a, b in before if b > a)
+    if not in_doubt and not ((left[:, 0] < until) & (left[:, 1] > new)).any():
         return None
     for one in scene.known:
         if one.half > 0.0 and one.speed[-1] > one.limit[-1]:

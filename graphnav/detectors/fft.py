@@ -22,11 +22,12 @@ from itertools import pairwise
 import numpy as np
 
 from graphnav.config.detectors import FftSettings
+from graphnav.core.earth import MG
 from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.detectors.base import NONE, Detection, Mask, mask_within, spans_of
 from graphnav.detectors.motion import Speeds
-from graphnav.detectors.scene import MG, Detector, Labels, Scene
+from graphnav.detectors.scene import Detector, Labels, Scene
 from graphnav.detectors.spectrum import FEWEST_WINDOWS, LOWEST, IdleLine, Windows, idle_line, peaks
 from graphnav.detectors.thresholds import log_statistic, valley
 
@@ -108,7 +109,7 @@ def _detect(scene: Scene, labels: Labels | None, shown: bool) -> Detection:
             notes.append(
                 Note(
                     "detectors.fft.conditions",
-                    f"not required, because this engine does not meet it at idle: {', '.join(left_out)}",
+                    f"FFT detector: without the conditions that the idling engine does not meet: {', '.join(left_out)}",
                 )
             )
     usable = asked[3:8].any() and (line is not None or not settings.find_line)
@@ -170,7 +171,7 @@ def _select_bands(settings: FftSettings, factor: float, frequencies: Array) -> t
     note = ""
     if ends[-1] > top + frequencies[1]:
         lost = [f"Peak-{k}" for k, (a, b) in enumerate(bands) if b - a < 2.0 * frequencies[1]]
-        note = f"the bands up to {ends[-1]:.3g} Hz are cut at {top:.3g} Hz, half the IMU's rate" + (
+        note = f"FFT detector: its bands up to {ends[-1]:.3g} Hz are cut at {top:.3g} Hz, half the IMU's rate" + (
             f": {' and '.join(lost)} cannot be seen" if lost else ""
         )
     return bands, note

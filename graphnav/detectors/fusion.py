@@ -288,27 +288,27 @@ def fuse(b: Blocks, spans: Array, idling: Array, certain: Array, settings: Fusio
 
 
 @dataclass(frozen=True)
-class Decision:
+class StopDecision:
     """A decision on stationary intervals."""
 
     spans: Array  # (M, 2) s, stationary
     disturbed: Array  # (L, 2) s, disturbances bridged within them
     notes: tuple[str, ...]
-    found: tuple[Detection, ...]  # number of windows by detector
+    found: tuple[Detection, ...]  # the answer of each detector
 
 
-def decide(scene: Scene, detector: type[Detector], shown: bool) -> Decision:
+def decide(scene: Scene, detector: type[Detector], shown: bool) -> StopDecision:
     """The decision of a single detector: its intervals, checked against measured speeds and the force between them."""
     found = detector.detect(scene, None, shown)
     still, certain, notes = candidates(scene, found)
     spans, disturbed = fuse(scene.blocks, still, NONE, certain, scene.settings.fusion)
-    return Decision(spans, disturbed, (*found.notes, *notes), (found,))
+    return StopDecision(spans, disturbed, (*found.notes, *notes), (found,))
 
 
-def merge_decisions(parts: Sequence[Decision]) -> Decision:
+def merge_decisions(parts: Sequence[StopDecision]) -> StopDecision:
     """Merge the decisions of several detectors: stationary where any of them says so."""
     notes = dict.fromkeys(note for part in parts for note in part.notes)
-    return Decision(
+    return StopDecision(
         union([part.spans for part in parts]),
         union([part.disturbed for part in parts]),
         tuple(notes),
@@ -316,7 +316,7 @@ def merge_decisions(parts: Sequence[Decision]) -> Decision:
     )
 
 
-def decide_fused(scene: Scene, detectors: Mapping[str, type[Detector]], shown: bool) -> Decision:
+def decide_fused(scene: Scene, detectors: Mapping[str, type[Detector]], shown: bool) -> StopDecision:
     """The fusion: the low-band GLRT proposes, speeds and forces veto, the FFT detector extends the ends of stops.
 
     Parameters
@@ -337,4 +337,4 @@ def decide_fused(scene: Scene, detectors: Mapping[str, type[Detector]], shown: b
         notes += found[-1].notes
         idling = found[-1].intervals
     spans, disturbed = fuse(scene.blocks, still, idling, certain, scene.settings.fusion)
-    return Decision(spans, disturbed, notes, tuple(found))
+    return StopDecision(spans, disturbed, notes, tuple(found))

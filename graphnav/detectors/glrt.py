@@ -19,9 +19,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from graphnav.core.earth import MG
 from graphnav.core.rotation import Array
 from graphnav.detectors.base import NONE, Detection, mask_within, spans_of
-from graphnav.detectors.scene import MG, Detector, Labels, Scene
+from graphnav.detectors.scene import Detector, Labels, Scene
 from graphnav.detectors.thresholds import find_fewest_errors, own_threshold
 from graphnav.detectors.windows import Blocks, find_unbroken, sum_running, window_times
 
@@ -90,15 +91,6 @@ def glrt_statistic(
     if len(accel) < window:
         return np.zeros(0)
     return STATISTICS[name](sum_running(rows_for(accel, gyro)).means(window), sigma_a, sigma_w, g)
-
-
-def stance_mask(statistic: Array, threshold: float, window: int) -> np.ndarray:
-    """Rows that lie in a window below the threshold (Ren 2021, eq. 5), (N,) bool for N - window + 1 statistics."""
-    n = len(statistic) + window - 1
-    below = np.r_[0, np.cumsum(statistic < threshold), 0]
-    row = np.arange(n)
-    first, last = np.maximum(row - window + 1, 0), np.minimum(row + 1, len(statistic))
-    return np.asarray(below[last] > below[first])
 
 
 @dataclass(frozen=True)

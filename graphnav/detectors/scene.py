@@ -10,7 +10,7 @@ from typing import ClassVar
 import numpy as np
 
 from graphnav.config.detectors import DetectorSettings
-from graphnav.core.earth import gravity
+from graphnav.core.earth import STANDARD_GRAVITY, gravity
 from graphnav.core.findings import period_of
 from graphnav.core.rotation import Array
 from graphnav.core.shared import Shared
@@ -18,9 +18,6 @@ from graphnav.detectors.base import Detection
 from graphnav.detectors.motion import Speeds, find_moving, speeds
 from graphnav.detectors.windows import Blocks, LowPassed, blocks, low_pass
 from graphnav.recording import Recording
-
-_STANDARD_GRAVITY = 9.80665
-MG = 9.80665e-3  # m/s^2
 
 
 @dataclass(frozen=True)
@@ -63,7 +60,7 @@ class Scene(Shared):
             there = np.flatnonzero(np.isfinite(gnss.llh).all(axis=1))
             if len(there):
                 return float(gravity(*gnss.llh[there[0], [0, 2]]))
-        return _STANDARD_GRAVITY
+        return STANDARD_GRAVITY
 
 
 @dataclass(frozen=True)
@@ -92,4 +89,9 @@ class Detector(ABC):
         ----------
         labels : what the others find still and moving, to learn from; a detector that decides alone has none.
         shown : whether its statistic is wanted where it decides nothing.
+
+        Returns
+        -------
+        Detection
+            Windows, statistic, threshold, mask and intervals.
         """

@@ -20,7 +20,6 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from graphnav.core.rotation import Array
 
-CHANNELS = ("force y", "force z", "rate x")  # forward, up, pitch
 _WINDOWS_AT_ONCE = 256  # windows at a time: a few MB whatever the length of the recording
 LOWEST, _HIGHEST = 8.0, 50.0  # Hz, where idle lines are looked for
 _FLOOR = 3.0  # Hz on either side of a bin over which the background is taken
@@ -111,8 +110,7 @@ class IdleLine:
     frequency: float  # Hz, median over the windows that show it
     lowest: float  # Hz, 5 % quantile over these windows
     highest: float  # Hz, 95 % quantile over these windows
-    clarity: float  # natural logarithm of the line's power over the spectrum around it
-    harmonic: float  # the same of the second harmonic; NaN above the Nyquist frequency
+    harmonic: float  # natural logarithm of the second harmonic's power over the spectrum around it; NaN above Nyquist
     share: float  # share of the examined windows that show it
 
 
@@ -150,7 +148,7 @@ def idle_line(windows: Windows, still: Array) -> IdleLine | None:
     floor = np.exp(0.5 * _take_local_median(power, reach)[..., best])
     strongest = int(np.median(height[shown] / floor[shown], axis=0).argmax())
     low, middle, high = np.quantile(where[shown, strongest], [0.05, 0.5, 0.95])
-    return IdleLine(float(middle), float(low), float(high), float(line[best]), second(best), float(shown.mean()))
+    return IdleLine(float(middle), float(low), float(high), second(best), float(shown.mean()))
 
 
 def _take_local_median(power: Array, reach: int) -> Array:

@@ -70,8 +70,13 @@ def detect_stances(
         one = found[-1]
         deep = one.intervals[_as_deep_as_others(one.intervals, one.t, one.statistic, settings.threshold)]
         if len(deep) < len(one.intervals):
-            lulls = format_count(len(one.intervals) - len(deep), "short lull")
-            notes.append(Note("detectors.stance.lulls", f"{lulls} less quiet than the stances left out"))
+            short = format_count(len(one.intervals) - len(deep), "interval")
+            notes.append(
+                Note(
+                    "detectors.stance.lulls",
+                    f"{short} less quiet than the stances left out",
+                )
+            )
         begin = int(np.searchsorted(deep[:, 1], since)) if len(deep) else 0
         cut = _without_sliding(deep[begin:], imu, one.t, one.statistic, bias, settings.threshold * _REACH)
         kept.append(np.concatenate([deep[:begin], cut]))

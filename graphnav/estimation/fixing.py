@@ -32,7 +32,7 @@ from graphnav.core.state import BLOCKS, DIM
 from graphnav.estimation.known_arcs import FEWEST, Arc, Epochs, Known
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import CarrierArcs
-from graphnav.estimation.solvers.decision import Decision
+from graphnav.estimation.solvers.decision import DecidedRows
 from graphnav.estimation.solvers.ekf import ekf, refilter
 from graphnav.estimation.solvers.linearise import Points
 from graphnav.estimation.solvers.passes import FilterPass, Progress, SmootherPass, points_of, values_of
@@ -102,12 +102,12 @@ def fix(
     known, found = Known(), whole
     for _ in range(_ROUNDS if search else 0):
         before = dict(known.of)
-        _sweep(epochs, whole, smoothed, known)
+        _sweep(epochs, smoothed, known)
         if known.of == before:
             break
         found = _hold_arcs(whole, phase, epochs, known)
         smoothed = backward(found, refilter(found, smoothed, progress), progress)
-        if _let_go(epochs, found, smoothed, known):
+        if _let_go(epochs, smoothed, known):
             found = _hold_arcs(whole, phase, epochs, known)
             smoothed = backward(found, refilter(found, smoothed, progress), progress)
     return Fixed(
@@ -239,7 +239,7 @@ class _Causal:
         self._unknown = {p.name: float(np.max(p.sigma)) for p in epochs.phase.parameters}
         self._held = Held()
 
-    def __call__(self, k: int, here: Points, P: Array) -> Decision | None:
+    def __call__(self, k: int, here: Points, P: Array) -> DecidedRows | None:
         """Integers to hold from a keyframe on, and ambiguities that are not known any more."""
         epochs = self._epochs
         if k not in epochs.active:
@@ -256,10 +256,10 @@ class _Causal:
             first, second = epochs.columns[a[0]], epochs.columns[b[0]]
             H[i, first], H[i, second] = 1.0, -1.0
             r[i] = values[first - DIM] - values[second - DIM] - n
-        return Decision(H, r, np.full(len(r), EXACT), added) if len(r) or held.let_go else None
+        return DecidedRows(H, r, np.full(len(r), EXACT), added) if len(r) or held.let_go else None
 
 
-def _sweep(epochs: Epochs, problem: Problem, smoothed: SmootherPass, known: Known) -> None:
+def _sweep(epochs: Epochs, smoothed: SmootherPass, known: Known) -> None:
     """Look at all epochs, those with most arcs first."""
     tried: set[frozenset[frozenset[Arc]]] = set()
     values = np.concatenate([np.zeros((len(smoothed.values), DIM)), smoothed.values], axis=1)
@@ -310,7 +310,7 @@ def with_integers(problem: Problem, phase: GnssPhase, found: Sequence[tuple[int,
     return replace(problem, constraints=tuple(sorted((*problem.constraints, whole), key=lambda c: c.name)))
 
 
-def _let_go(epochs: Epochs, problem: Problem, smoothed: SmootherPass, known: Known) -> bool:
+def _let_go(epochs: Epochs, smoothed: SmootherPass, known: Known) -> bool:
     """Give up arcs that most of their epochs are not consistent with."""
     seen: Counter[Arc] = Counter()
     odd: Counter[Arc] = Counter()

@@ -8,7 +8,7 @@ from functools import cache
 from graphnav.constraints import list_constraints
 
 _AXES = ("right", "forward", "up")
-_DEG = 57.29577951308232
+_TO_DEG = 57.29577951308232
 _CROSS = ("right from forward", "right from up", "forward from right", "forward from up", "up from right",
           "up from forward")  # as `graphnav.imu.dynamics` has them  # fmt: skip
 
@@ -36,7 +36,7 @@ def _along(words: str) -> list[Component]:
 
 # The parameters of a calibration; all others belong to the noise of the measurements.
 _NAMED = {
-    "mounting": [Component("mounting, pitch", "deg", _DEG), Component("mounting, heading", "deg", _DEG)],
+    "mounting": [Component("mounting, pitch", "deg", _TO_DEG), Component("mounting, heading", "deg", _TO_DEG)],
     "gnss_lever_arm": _along("antenna lever arm"),
     "axle": [Component("axle without side slip, before the stated place", "m")],
     "gnss_time_offset": [Component("stamps of the positions, to add", "ms", 1e3)],
@@ -44,8 +44,8 @@ _NAMED = {
     "odometer_delay": [Component("delay of the odometer", "ms", 1e3)],
     "odometer_scale": [Component("odometer scale error", "%", 100.0)],
     "slip_squat": [
-        Component("side slip by lateral acceleration", "deg per m/s²", _DEG),
-        Component("squat by forward acceleration", "deg per m/s²", _DEG),
+        Component("side slip by lateral acceleration", "deg per m/s²", _TO_DEG),
+        Component("squat by forward acceleration", "deg per m/s²", _TO_DEG),
     ],
     "pivot": _along("pivot of the foot"),
     "pivot_travel": [
@@ -53,8 +53,8 @@ _NAMED = {
         Component("travel of the pivot, forward", "m"),
     ],
     "foot_axis": [
-        Component("foot's sideways axis, forward part", "deg", _DEG),
-        Component("foot's sideways axis, upward part", "deg", _DEG),
+        Component("foot's sideways axis, forward part", "deg", _TO_DEG),
+        Component("foot's sideways axis, upward part", "deg", _TO_DEG),
     ],
 }
 

@@ -80,13 +80,13 @@ class Problem:
             at += width
         return out
 
-    def complete(self, recording: Recording, usual: Array | None = None) -> Problem:
+    def complete(self, recording: Recording, typical: Array | None = None) -> Problem:
         """Add the constraints that depend on later rows, from a recording that extends far enough.
 
-        `usual` as for `build_problem`.
+        `typical` as for `build_problem`.
         """
         scene = BuildContext(
-            recording, self.settings, self.frame, self.t, np.empty((0, 2)), self.intervals, typical_sigmas=usual
+            recording, self.settings, self.frame, self.t, np.empty((0, 2)), self.intervals, typical_sigmas=typical
         )
         rows = (*self.constraints, *_build_constraints(scene, True))
         return replace(self, recording=recording, constraints=tuple(sorted(rows, key=lambda c: c.name)))
@@ -109,7 +109,7 @@ def build_problem(
     stationary: Array | None = None,
     times: Array | None = None,
     speed: MeanSpeed | None = None,
-    usual: Array | None = None,
+    typical: Array | None = None,
     known: Mapping[float, ImuFactors] | None = None,
     highest: Array | None = None,
     complete: bool = True,
@@ -124,7 +124,7 @@ def build_problem(
     stationary : (M, 2) spans in which the platform stands still, s; none when None.
     times : (K,) keyframes, s, where they are given: measurements at other times are left out.
     speed : of the odometer, where it is known already.
-    usual : (M, 3) m, the unit of the slow errors of the recording's fixes, where it is known already.
+    typical : (M, 3) m, the unit of the slow errors of the recording's fixes, where it is known already.
     known : what intervals between keyframes say that were integrated before, by the time they end at.
     highest : what the IMU has read at other times, as `graphnav.imu.clipping.highest` says.
     complete : False leaves out the constraints that depend on later rows, for `Problem.complete`.
@@ -149,7 +149,7 @@ def build_problem(
         intervals = preintegrate_unknown(samples, recording.imu, t, start.ba[0], start.bg[0], before, parts_of_noise)
         motion = ImuFactors(intervals, frame)
     intervals = motion.intervals
-    scene = BuildContext(recording, settings, frame, t, stops, intervals, speed, usual)
+    scene = BuildContext(recording, settings, frame, t, stops, intervals, speed, typical)
     built = _build_constraints(scene, None if complete else False)
     prior = InitialPrior(keyframe=np.zeros(1, dtype=int), mean=start, sigma=np.asarray(sigma)[None])
     return Problem(

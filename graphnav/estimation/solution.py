@@ -177,6 +177,13 @@ class Solution:
         piece : of a recording that was cut where its IMU was silent for too long. One that was solved in parts because
             of its length has none.
 
+        Returns
+        -------
+        graph : gtsam.NonlinearFactorGraph
+            Of `CustomFactor`s, one for each row, interval and parameter step.
+        values : gtsam.Values
+            The solution.
+
         Raises
         ------
         EstimationError

@@ -159,7 +159,7 @@ def read_against(asked: Against, name: str, recording: Recording, reference: Sol
 def _shift(path: Path, track: Trajectory, recording: Recording, reference: Solution) -> tuple[float, list[str]]:
     """s to add to the stamps of a trajectory, and the reason."""
     known = between_clocks(recording.start, recording.gps_zero, float(track.t[0]), track.gps_zero)
-    own_start = recording.start - float(track.t[0])
+    own_start, on_a_clock = recording.start - float(track.t[0]), True
     notes: list[str] = []
     if track.t[-1] > recording.start and track.t[0] < recording.end:
         shift = 0.0
@@ -169,8 +169,9 @@ def _shift(path: Path, track: Trajectory, recording: Recording, reference: Solut
             [Note("against.clock", f"{path.name}: stamps shifted by {known.offset:+.0f} s: {known.words}")],
         )
     elif abs(track.t[0]) < NEAR:
-        shift, notes = (
+        shift, on_a_clock, notes = (
             own_start,
+            False,
             [
                 Note(
                     "against.clock",
@@ -183,7 +184,7 @@ def _shift(path: Path, track: Trajectory, recording: Recording, reference: Solut
     late = _measure_delay(replace(track, t=track.t + shift), reference)
     if late is None:
         return shift, notes
-    if abs(late) < _APPLIED and shift != own_start:
+    if abs(late) < _APPLIED and on_a_clock:
         word = "early" if late > 0.0 else "late"
         return shift, [
             *notes,
@@ -196,7 +197,8 @@ def _shift(path: Path, track: Trajectory, recording: Recording, reference: Solut
         *notes,
         Note(
             "against.late",
-            f"{path.name}: stamps shifted by another {late:+.3f} s, where its speed agrees with ours{leap}",
+            f"{path.name}: stamps shifted by {'another ' if shift else ''}{late:+.3f} s, where its speed agrees with "
+            f"ours{leap}",
         ),
     ]
 

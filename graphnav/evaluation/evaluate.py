@@ -15,7 +15,7 @@ import numpy as np
 from graphnav.core.errors import RecordingError
 from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
-from graphnav.core.timescales import GPS_TO_UNIX, LEAP
+from graphnav.core.timescales import GPS_TO_UNIX, LEAP, between_clocks
 from graphnav.core.trajectory import Trajectory
 from graphnav.evaluation.metrics import (
     COMPONENTS,
@@ -242,6 +242,7 @@ def evaluate(
         from graphnav.recording import formats
 
         recording = formats.read(truth_path)
+        trajectory, notes = _put_on_clock(trajectory, recording.start, recording.end, recording.gps_zero)
         found = truth_of(recording)
         if found is None:
             metrics = evaluate_recording(trajectory, recording)
@@ -249,12 +250,13 @@ def evaluate(
                 raise RecordingError(
                     f"{truth_path}: the recording has no [truth] to evaluate against", key="truth.none"
                 )
-            return metrics
+            return replace(metrics, notes=(*notes, *metrics.notes))
         truth, arm = found
         alone = trajectory.frame == "local" or not recording.placed
         lever_arm = arm if lever_arm is None else lever_arm
     else:
         truth = read_trajectory(truth_path)
+        trajectory, notes = _put_on_clock(trajectory, float(truth.t[0]), float(truth.t[-1]), truth.gps_zero)
     if trajectory.t[-1] < truth.t[0] or truth.t[-1] < trajectory.t[0]:
         raise RecordingError(
             f"{trajectory_path}: {ranges(trajectory, truth)}{_shift_hint(trajectory, truth)}", key="truth.no_overlap"
@@ -262,8 +264,22 @@ def evaluate(
     found_errors = errors(trajectory, truth, lever_arm=lever_arm, max_gap=max_gap, from_start=alone)
     hint = _leap_hint(found_errors, trajectory, truth, lever_arm, max_gap)
     return measure(
-        replace(found_errors, notes=found_errors.notes + hint), trajectory.name or trajectory_path.stem, spans
+        replace(found_errors, notes=(*notes, *found_errors.notes, *hint)),
+        trajectory.name or trajectory_path.stem,
+        spans,
     )
+
+
+def _put_on_clock(
+    trajectory: Trajectory, start: float, end: float, zero: float | None
+) -> tuple[Trajectory, tuple[str, ...]]:
+    """A trajectory on the clock of a truth from `start` to `end` (s), where both clocks are known and differ."""
+    begin, last = float(trajectory.t[0]), float(trajectory.t[-1])
+    known = between_clocks(start, zero, begin, trajectory.gps_zero)
+    if known is None or (begin <= end and last >= start) or begin + known.offset > end or last + known.offset < start:
+        return trajectory, ()
+    note = Note("against.clock", f"stamps shifted by {known.offset:+.0f} s: {known.words}")
+    return replace(trajectory, t=trajectory.t + known.offset), (note,)
 
 
 def _shift_hint(trajectory: Trajectory, truth: Trajectory) -> str:

@@ -41,12 +41,12 @@ def relative_errors(errors: Errors) -> tuple[Relative, ...]:
     known = np.isfinite(errors.horizontal) & np.isfinite(errors.distance)
     if known.sum() < 2:
         return ()
-    way, e, heading = errors.distance[known], errors.p[known, :2], errors.rph[known, 2]
+    travelled, e, heading = errors.distance[known], errors.p[known, :2], errors.rph[known, 2]
     out = []
     for length in (step * 10.0**k for k in range(1, 6) for step in _STEPS):
-        if (way[-1] - way[0]) / length < _FEWEST_SEGMENTS:
+        if (travelled[-1] - travelled[0]) / length < _FEWEST_SEGMENTS:
             break
-        first, last = _segments(way, length)
+        first, last = _segments(travelled, length)
         if len(first) >= _FEWEST_SEGMENTS:
             off = np.hypot(*(e[last] - e[first]).T)
             turned = np.degrees(np.angle(np.exp(1j * (heading[last] - heading[first]))))
@@ -55,12 +55,12 @@ def relative_errors(errors: Errors) -> tuple[Relative, ...]:
     return tuple(out)
 
 
-def _segments(way: Array, length: float) -> tuple[np.ndarray, np.ndarray]:
+def _segments(travelled: Array, length: float) -> tuple[np.ndarray, np.ndarray]:
     """First and last rows of segments of that length, to a tenth."""
-    last = np.searchsorted(way, way + length)
-    first = np.flatnonzero(last < len(way))
-    first = first[way[last[first]] - way[first] <= 1.1 * length]
-    first = first[np.diff(way[first], prepend=-np.inf) > 0.0]  # a stationary vehicle begins one segment
+    last = np.searchsorted(travelled, travelled + length)
+    first = np.flatnonzero(last < len(travelled))
+    first = first[travelled[last[first]] - travelled[first] <= 1.1 * length]
+    first = first[np.diff(travelled[first], prepend=-np.inf) > 0.0]  # a stationary vehicle begins one segment
     return first, last[first]
 
 

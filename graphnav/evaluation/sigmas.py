@@ -57,9 +57,9 @@ def judge_sigmas(errors: Errors) -> tuple[BlockVerdict, ...]:
     return tuple(out)
 
 
-def select_verdict(judged: Sequence[BlockVerdict], verdict: str) -> list[BlockVerdict]:
+def select_verdict(verdicts: Sequence[BlockVerdict], verdict: str) -> list[BlockVerdict]:
     """The blocks of a verdict; height stands for position, and heading for attitude, where the rest has another."""
-    found = {j.block: j for j in judged if j.verdict == verdict}
+    found = {j.block: j for j in verdicts if j.verdict == verdict}
     explained = {whole for whole, part in PARTS.items() if part in found and whole in found}
     return [j for j in found.values() if j.block not in explained or j.rest == verdict]
 

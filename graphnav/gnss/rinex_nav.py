@@ -104,8 +104,8 @@ def _read(path: Path, found: _Navigation) -> None:
         if system == GLONASS and version >= 3.05:
             count += k + 4 < len(lines) and lines[k + 4][:4] == "    " and bool(lines[k + 4].strip())
         if system < 0 and name[:1].isalpha() and name[1:].isdigit():
-            said = f"of the satellite system {name[0]}, which is not known"
-            found.skipped[said] = found.skipped.get(said, 0) + 1
+            reason = f"of the satellite system {name[0]}, which is not known"
+            found.skipped[reason] = found.skipped.get(reason, 0) + 1
             k = next((j for j in range(k + 1, len(lines)) if lines[j][:3] != "   "), len(lines))
             continue
         if system < 0 or not name[1:].isdigit():

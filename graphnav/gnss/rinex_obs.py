@@ -188,7 +188,7 @@ def _read_version_3(lines: Lines, header: Header, path: Path, remarks: list[str]
     of = np.searchsorted(epoch, own) - 1
     keep = (of >= 0) & (own - epoch[np.maximum(of, 0)] <= count[np.maximum(of, 0)]) & (flag[np.maximum(of, 0)] <= 1)
     own, of = own[keep], of[keep]
-    _say_cut(lines, epoch, own, of, flag, count, path, remarks)
+    _say_cut(epoch, of, flag, count, path, remarks)
     known = system[own] >= 0
     _say_unknown([chr(letter) for letter in first[own[~known]]], path, remarks)
     own, of = own[known], of[known]
@@ -313,8 +313,8 @@ def _read_version_2(lines: Lines, header: Header, path: Path, remarks: list[str]
 
 
 def _say_cut(
-    lines: Lines, epoch: NDArray[np.intp], own: NDArray[np.intp], of: NDArray[np.intp], flag: NDArray[np.intp],
-    count: NDArray[np.intp], path: Path, remarks: list[str],
+    epoch: NDArray[np.intp], of: NDArray[np.intp], flag: NDArray[np.intp], count: NDArray[np.intp], path: Path,
+    remarks: list[str],
 ) -> None:  # fmt: skip
     """Remarks about epochs with fewer lines of satellites than they announce."""
     short = np.flatnonzero((np.bincount(of, minlength=len(epoch)) < count) & (flag <= 1))

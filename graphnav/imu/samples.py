@@ -100,12 +100,12 @@ def _measure_bridge_error(x: Array, gap: Array, lost: Array) -> Array:
         before, after = x[: -n - 1], x[n + 1 :]
         error = ((sums[n + 1 : -1] - sums[1 : -n - 1]) / n - 0.5 * (before + after)) ** 2
         change, level = ((after - before) ** 2).mean(axis=0), ((0.5 * (before + after) - mean) ** 2).mean(axis=0)
-        usual, total = error.mean(axis=0), running_sum(error)
+        average, total = error.mean(axis=0), running_sum(error)
         first = np.clip([k - (_SPANS + 1) * n, k + 1], 0, len(error))
         last = np.clip([k - n, k + 1 + _SPANS * n], 0, len(error))
         count = (last - first).sum(axis=0)[:, None]
-        near = np.where(count > 0, (total[last] - total[first]).sum(axis=0) / np.maximum(count, 1), usual)
-        for_change, for_level = (np.divide(usual, of, out=np.zeros(3), where=of > 0.0) for of in (change, level))
+        near = np.where(count > 0, (total[last] - total[first]).sum(axis=0) / np.maximum(count, 1), average)
+        for_change, for_level = (np.divide(average, of, out=np.zeros(3), where=of > 0.0) for of in (change, level))
         by_change = (x[k + 1] - x[k]) ** 2 * for_change
         by_level = (0.5 * (x[k + 1] + x[k]) - mean) ** 2 * for_level
         out[here] = (near + by_change + by_level) / 3.0

@@ -117,7 +117,7 @@ class Chain:
         return Verdicts(times, left).faults()
 
     @property
-    def _judged_imu(self) -> bool:
+    def _estimates_imu(self) -> bool:
         """Whether some figure of the IMU differs from the stated one."""
         return any(self.noise.factor(f"imu.{name}", 1.0) != 1.0 for name in NOISE_FIGURES)
 
@@ -225,12 +225,12 @@ class Chain:
 
     def _begin_ambiguities(self, problem: Problem, steps: tuple[Step, ...]) -> tuple[Step, ...]:
         """Ambiguities, except those that are reset anyway, are reset about their current estimates."""
-        phase, newest, begun = split_carriers(problem)[1], self.window.newest, {step.name for step in steps}
+        phase, newest, started = split_carriers(problem)[1], self.window.newest, {step.name for step in steps}
         assert phase is not None
         return tuple(
             Step(p.name, newest.value(p.name), p.sigma[0])
             for p in phase.parameters
-            if p.name in phase.slots and p.name in newest.columns and p.name not in begun
+            if p.name in phase.slots and p.name in newest.columns and p.name not in started
         )
 
     def _place(self, problem: Problem, k: int) -> tuple[Place, dict[str, float]]:

@@ -14,7 +14,7 @@ from graphnav.online.buffers import Buffer
 from graphnav.recording import Gnss
 
 _WIDTH, _USED = 19, 19  # the last columns: six typical sigmas, and whether the fix is used
-_USUAL = 60.0  # s over which the typical sigma of fixes is averaged
+_AVERAGED_OVER = 60.0  # s over which the typical sigma of fixes is averaged
 
 
 class Fixes(Buffer):
@@ -44,7 +44,7 @@ class Fixes(Buffer):
         position, velocity = (self._track_sigma(kind, t, values[k : k + 3]) for kind, k in (("p", 3), ("v", 9)))
         return (*values, *position, *velocity, 1.0)
 
-    def forget_usual(self) -> None:
+    def forget_typical(self) -> None:
         """Reset the typical sigmas: what follows is of another receiver or clock."""
         self._means = {}
 
@@ -108,7 +108,7 @@ class Fixes(Buffer):
         last, mean = self._means.get(kind, (-np.inf, sd))
         if not math.isfinite(sum(sd)):
             return mean  # a fix without velocity
-        gain = -np.expm1(-max(t - last, 0.0) / _USUAL) if np.isfinite(last) else 1.0
+        gain = -np.expm1(-max(t - last, 0.0) / _AVERAGED_OVER) if np.isfinite(last) else 1.0
         mean = tuple(float(m + gain * (s - m)) for m, s in zip(mean, sd, strict=True))
         self._means[kind] = max(t, last), mean
         return mean

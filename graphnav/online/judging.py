@@ -90,8 +90,8 @@ def answer(asked: Question) -> Answer:
         estimate = estimate_noise if settings.gnss.faults == "off" else estimate_without_faults
         noise = estimate(base, start.until).noise
         used = with_noise(base, noise)
-        said, wrong = describe(noise, used), faults.fault_spans(used)
-        return Answer(_in_unit(noise, base, asked.unit), said, stationary, wrong, check_rows(asked.every))
+        words, wrong = describe(noise, used), faults.fault_spans(used)
+        return Answer(_in_unit(noise, base, asked.unit), words, stationary, wrong, check_rows(asked.every))
     except np.linalg.LinAlgError as error:
         raise EstimationError(str(error), key="solver.undetermined") from error
 
@@ -136,7 +136,7 @@ def _start(work: Callable[[Question], Answer], asked: Question) -> Future[Answer
 def _level(base: Problem) -> Problem:
     """The problem with a common unit of both horizontal axes for errors that last for minutes and hours."""
     rows = (
-        replace(c, usual_error=compute_unit(c.sigma)) if isinstance(c, GnssPosition) else c for c in base.constraints
+        replace(c, drive_error=compute_unit(c.sigma)) if isinstance(c, GnssPosition) else c for c in base.constraints
     )
     return replace(base, constraints=tuple(rows))
 
@@ -146,7 +146,7 @@ def _in_unit(noise: NoiseModel, base: Problem, unit: Array) -> NoiseModel:
 
     An estimate uses the typical stated sigma so far as its unit; the parameters of a drive keep theirs.
     """
-    own = next((c.usual_error for c in base.constraints if isinstance(c, GnssPosition)), unit)
+    own = next((c.drive_error for c in base.constraints if isinstance(c, GnssPosition)), unit)
     level, up = (2.0 * np.log(own / unit)[1:]).tolist()
     figures = dict(noise.figures)
     for name, one in noise.figures.items():

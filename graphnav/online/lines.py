@@ -153,10 +153,10 @@ def _series_row(cells: list[str]) -> Row:
         t, *numbers = (parse_number(cell) if cell.strip() else float("nan") for cell in cells[1:])
     except ValueError:
         raise ValueError(f"'S,{','.join(cells)[:40]}' holds something that is no number") from None
-    return name, t, tuple(x * _usual(c) for x, c in zip(numbers, sensor.columns, strict=True))
+    return name, t, tuple(x * _tell_scale(c) for x, c in zip(numbers, sensor.columns, strict=True))
 
 
-def _usual(column: Column) -> float:
+def _tell_scale(column: Column) -> float:
     """Size in SI of the default unit of files."""
     return next(iter(column.units.values()))
 
@@ -190,7 +190,7 @@ def line_of(row: Row) -> str:
         return f"R,{t!r},{text_of(values)}"
     if sensor != "gnss":
         columns = list_sensors()[sensor].columns
-        numbers = [x / _usual(column) for x, column in zip(values, columns, strict=True)]
+        numbers = [x / _tell_scale(column) for x, column in zip(values, columns, strict=True)]
         return f"S,{sensor},{t!r}," + ",".join("" if np.isnan(x) else repr(x) for x in numbers)
     lat, lon = float(np.degrees(values[0])), float(np.degrees(values[1]))
     rest = values[2:6] if np.isnan(values[6]) else values[2:]

@@ -10,7 +10,7 @@ import numpy as np
 from graphnav.core.rotation import Array
 from graphnav.online.buffers import Buffer
 from graphnav.online.sanity import find_period
-from graphnav.recording.plausibility.filled import Lines, find_filled
+from graphnav.recording.plausibility.filled import StraightLines, find_filled
 from graphnav.recording.plausibility.readings import ALONE, HOLE, RARE, Excesses, find_contradicted, measure_excess
 
 CONTRADICTED = "contradicted by those around"
@@ -30,7 +30,7 @@ class Neighbours:
         self._columns = columns
         self._excesses = Excesses(columns)
         self._learnt = -np.inf  # s, up to where rows are in these
-        self._lines: Lines | None = None  # of rows on straight lines, where they can be told
+        self._lines: StraightLines | None = None  # of rows on straight lines, where they can be told
         self._last: tuple[tuple[float, ...], tuple[float, ...]] | None = None  # the newest two rows with their times
 
     def forget_newest(self) -> None:

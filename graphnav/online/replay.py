@@ -20,7 +20,7 @@ def without_rows(recording: Recording) -> Recording:
     return replace(
         recording,
         imu=replace(recording.imu, t=none, gyro=rows, accel=rows),
-        gnss=gnss and replace(gnss, t=none, llh=rows, sd=rows, v=None, sd_v=None, type=None),
+        gnss=gnss and replace(gnss, t=none, llh=rows, sd=rows, v=None, sd_v=None, type=None, satellites=None),
         odometer=odometer and replace(odometer, t=none, speed=none, counted=None, wheels=None),
         truth=None,
         raw_gnss=recording.raw_gnss and without_epochs(recording.raw_gnss),

@@ -164,7 +164,7 @@ class Sensors:
                 self.counts["gnss"] -= len(self.gnss)
                 self.counts["gnss: out of reach"] += len(self.gnss) - len(others) + 1
                 self.gnss.drop_before(np.inf)
-                self.gnss.forget_usual()
+                self.gnss.forget_typical()
                 self.moved, self.released = (others[0][1], len(others)), others
                 return False
             values = self.gnss.complete(t, values)
@@ -281,7 +281,7 @@ class Sensors:
     def forget_time(self) -> None:
         """The clock has changed: forget what depends on times of rows."""
         self._reach = Reach()
-        self.gnss.forget_usual()
+        self.gnss.forget_typical()
         self._neighbours.forget_time()
 
     def _find_fault(self, sensor: str, values: tuple[float, ...]) -> str | None:

@@ -66,8 +66,7 @@ class Session:
         self._save()
 
     def add_lines(self, lines: list[str], asked: Callable[[], bool] = bool) -> None:
-        """Process lines of a live source; they are in the journal before they count. Once `asked` to end, the rest
-        stays there.
+        """Process lines of a live source; they are in the journal before they count.
 
         Once `asked` to end, the rest stays there.
         """

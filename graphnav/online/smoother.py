@@ -42,7 +42,7 @@ _STEP_DETECTION = 0.5  # s between detections of steps in a walk
 _FINAL_STOPS = 4.0  # s before the newest keyframe up to which the stops are final
 _TRY = 2.0  # s between attempts at an alignment
 _LEVEL = 5.0  # s of rest that determine the level of a vehicle without GNSS
-_JUDGED = 120.0  # s of rows after which the noise model is estimated again
+_ESTIMATED_AFTER = 120.0  # s of rows after which the noise model is estimated again
 _PATIENCE = 300.0  # s of rows kept while there is no motion to align with
 
 
@@ -70,8 +70,8 @@ class Smoother:
         self._again: CatchUp | None = None  # tracker that processes the unsettled keyframes with the new model
         self._tentative = False  # nothing may settle before the noise model has been estimated once
         self._found: Alignment | None = None  # whether the noise model is to be estimated again
-        self._said: dict[str, tuple[str, ...]] = {}  # notes that further rows may change, by subject
-        self._judged = 0.0  # s of rows that it was estimated from
+        self._notes_on: dict[str, tuple[str, ...]] = {}  # notes that further rows may change, by subject
+        self._estimated_from = 0.0  # s of rows that it was estimated from
         self._times: list[float] = []  # s, of keyframes that have settled meanwhile
         self._left_out: tuple[ExcludedSpan, ...] = ()  # of other measurements than fixes
         self._fixes: list[float] = []  # s, rows that need a keyframe and are not yet in the graph
@@ -211,8 +211,8 @@ class Smoother:
                 self._align(last=True)
             except EstimationError as error:
                 self.notes.append(Note("online.not_aligned", str(error)))
-            if "units" not in self._said:
-                self._say("units", check_rows(self.sensors.recording(every=True)))
+            if "units" not in self._notes_on:
+                self._replace_notes("units", check_rows(self.sensors.recording(every=True)))
         if self.tracker is not None:
             self._judge_at_last()
             self._advance(self.tracker, self.sensors.imu.newest, last=True)
@@ -245,13 +245,13 @@ class Smoother:
             self._wait(now)
             return
         tracker = self.tracker = self._track(found, recording.start, STATED)
-        self._say("units", check_rows(sensors.recording(-np.inf, now, every=True)))
+        self._replace_notes("units", check_rows(sensors.recording(-np.inf, now, every=True)))
         told = found.motion is not None and self.settings.gnss.position and recording.platform != "foot"
         if told and self.settings.noise.mode == "estimated":
             self._found, self._tentative = found, True
             sensors.gnss.space(self.settings.noise.spacing)
         self._fixes = [t for t in sensors.list_keyframe_times().tolist() if t >= recording.start - SAME_TIME]
-        self._began, self._judged = recording.start, recording.duration
+        self._began, self._estimated_from = recording.start, recording.duration
         sensors.oldest = recording.start
         self._advance(tracker, sensors.imu.newest)
         if self._found is not None and self.tracker is tracker:
@@ -264,18 +264,18 @@ class Smoother:
         self.notes += [note for note in notes if note not in self.notes]
         return tracker
 
-    def _say(self, matter: str, said: tuple[str, ...]) -> None:
+    def _replace_notes(self, matter: str, words: tuple[str, ...]) -> None:
         """Note what is known about the noise, the units, ..., replacing the earlier note on the same subject."""
-        self.notes = [note for note in self.notes if note not in self._said.get(matter, ())] + list(said)
-        self._said[matter] = said
+        self.notes = [note for note in self.notes if note not in self._notes_on.get(matter, ())] + list(words)
+        self._notes_on[matter] = words
 
     def _judge_again(self, found: Alignment, tracker: Tracker) -> None:
         """Estimate the noise model again before a state settles, then from ever more rows until they suffice."""
         span = tracker.newest - self._began
         enough = are_enough(self.sensors, found, span)
-        if not enough and span < max(min(self.settings.solver.lag, _JUDGED), 2.0 * self._judged):
+        if not enough and span < max(min(self.settings.solver.lag, _ESTIMATED_AFTER), 2.0 * self._estimated_from):
             return
-        self._judged = span
+        self._estimated_from = span
         self._found = None if enough else found
         self._begin_judging(found, tracker)
 
@@ -293,8 +293,8 @@ class Smoother:
             self.notes.append(Note("online.not_judged", f"noise and faults not estimated again: {error}"))
             self._tentative = False
             return
-        self._say("noise", found.notes)
-        self._say("units", found.doubts)
+        self._replace_notes("noise", found.notes)
+        self._replace_notes("units", found.doubts)
         self._left_out = tuple(fault for fault in found.excluded if fault.kind not in FIXES)
         if tracker.opened:
             self._again = CatchUp(tracker.restart_settled(found.noise, self._setup))
@@ -318,7 +318,7 @@ class Smoother:
     def _wait(self, now: float) -> None:
         """Keep the rows that the next attempt at an alignment may need."""
         if now - float(self.sensors.imu.t[0]) > _PATIENCE:
-            self._say("units", check_rows(self.sensors.recording(every=True)))
+            self._replace_notes("units", check_rows(self.sensors.recording(every=True)))
             self.sensors.drop_before(now - 0.5 * _PATIENCE)
 
     def _restart(self, before: float, why: str) -> None:
@@ -355,13 +355,13 @@ class Smoother:
         if not last and now - odometer < _SILENT:
             limit = min(limit, max(odometer, now - _ODOMETER))
         T = tracker.newest
-        begun = bool(len(tracker.window)) or tracker.opened
-        times = ([] if begun else [T]) + list_keyframes(T, limit, self._fixes, period, last)
+        started = bool(len(tracker.window)) or tracker.opened
+        times = ([] if started else [T]) + list_keyframes(T, limit, self._fixes, period, last)
         late = [t for t in self._fixes if t <= T + SAME_TIME]
-        if late and begun:  # a keyframe of its own, and those after it again
+        if late and started:  # a keyframe of its own, and those after it again
             self._dirty = min(self._dirty, *late)
             times = sorted({*times, *late})
-        if (times and (len(times) > 1 or begun)) or (last and self._dirty < np.inf):
+        if (times and (len(times) > 1 or started)) or (last and self._dirty < np.inf):
             dirty, self._dirty = self._dirty, np.inf
             self._fixes = [t for t in self._fixes if t > limit and t > T + SAME_TIME]
             redone = tracker.update(sensors, np.array(times), dirty)
@@ -369,8 +369,8 @@ class Smoother:
                 self._again.tracker.rewind(redone, tracker)
             self._collect(tracker)
             if tracker.verdicts.anew and not last:
-                said = f"for {LONGEST:.0f} s fixes contradicted all else, until {tracker.newest:.3f} s"
-                self._restart(tracker.newest, said)
+                words = f"for {LONGEST:.0f} s fixes contradicted all else, until {tracker.newest:.3f} s"
+                self._restart(tracker.newest, words)
                 return
         T = tracker.newest
         self._due = min([T + period, *(t for t in self._fixes if t > T)]) + AFTER

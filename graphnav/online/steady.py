@@ -38,8 +38,12 @@ class Online(Smoother):
         self.failures: list[str] = []  # reasons why pieces were abandoned
 
     def add(self, row: Row, released: bool = False) -> None:
-        """Process one row: sensor, time, values and whether it was held, as in
-        `graphnav.online.sensors.Sensors.add`.
+        """Process one row.
+
+        Parameters
+        ----------
+        row : sensor, time (s) and numbers, as `Fix`, `ImuSample`, `WheelSpeed` and `Reading` make them.
+        released : whether it was held back before, until the IMU's clock was known.
 
         Raises
         ------
@@ -50,7 +54,7 @@ class Online(Smoother):
         sensors.check_form(row)
         self._rows += 1
         if self._rows >= _REPORTED_AFTER and not self._rows & (self._rows - 1):  # at powers of two
-            self._say("counts", check_counts(sensors.counts))
+            self._replace_notes("counts", check_counts(sensors.counts))
         while rows:
             try:
                 super().add(*rows.pop(0))
@@ -74,14 +78,14 @@ class Online(Smoother):
             super().finish()
         except Exception as error:
             self._give_up(error)
-        self._say("counts", check_counts(self.sensors.counts))
+        self._replace_notes("counts", check_counts(self.sensors.counts))
 
     def _give_up(self, error: Exception) -> None:
         """Drop the piece that is being smoothed, and start anew with the next rows."""
         now = self.sensors.imu.newest
         at = traceback.extract_tb(error.__traceback__)[-1]
-        said = f"at {now:.3f} s: {type(error).__name__}: {error} in {Path(at.filename).name}:{at.lineno}"
-        self.failures = [*self.failures[-_MOST_FAILURES:], said]
+        failure = f"at {now:.3f} s: {type(error).__name__}: {error} in {Path(at.filename).name}:{at.lineno}"
+        self.failures = [*self.failures[-_MOST_FAILURES:], failure]
         since = self._last_settled
         self.notes.append(
             Note(

@@ -27,7 +27,7 @@ from graphnav.online.steady import Online
 from graphnav.recording.exporters import csv
 
 TRAJECTORY, CHECKPOINT, SUMMARY = "trajectory.csv", "checkpoint", "summary.json"
-_MAGIC = b"graphnav checkpoint 12\n"
+_MAGIC = b"graphnav checkpoint 13\n"
 _DIGEST = hashlib.sha256
 
 _PLAIN = {
@@ -208,9 +208,11 @@ class Store:
             for mend in (lambda: self._file.truncate(self._length), lambda: self._file.seek(self._length)):
                 with contextlib.suppress(OSError):
                     mend()
-            begun = (self.folder / CHECKPOINT).exists()
+            started = (self.folder / CHECKPOINT).exists()
             how = (
-                "what had settled is safe, mend that and go on with --resume" if begun else "mend that and begin again"
+                "what had settled is safe, mend that and go on with --resume"
+                if started
+                else "mend that and begin again"
             )
             raise GraphnavError(
                 f"{self.folder}: cannot be written ({error.strerror}); {how}", key="output.cannot_write"

@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from graphnav.config import Settings
-from graphnav.constraints.base import SAME_TIME, UsualSigmas
+from graphnav.constraints.base import SAME_TIME, TypicalSigmas
 from graphnav.constraints.gnss import node_spacing, period
 from graphnav.constraints.vehicle import REACH
 from graphnav.core.earth import LocalFrame
@@ -208,7 +208,7 @@ class Tracker(Chain):
         T, start = self.newest, self.window.newest.state
         imu = self._cut_around(sensors, T, sensors.imu.newest).imu
         ends = np.array([T, expected])
-        interval = preintegrate(bridge_gaps(imu), imu, ends, start.ba[0], start.bg[0], self._judged_imu)
+        interval = preintegrate(bridge_gaps(imu), imu, ends, start.ba[0], start.bg[0], self._estimates_imu)
         self._motions[expected] = ImuFactors(interval, self.frame).prepare()
 
     def _is_covered(self, sensors: Sensors, t: float) -> bool:
@@ -352,7 +352,7 @@ class Tracker(Chain):
         known = {t: one for t, one in found if one is not None and not one.intervals.out_of_range(start.bg)[0]}
         problem = build_problem(
             recording, self.settings, self.frame, start, np.ones(DIM), stops, times, speed, usual, known,
-            self._steps.highest, complete, self._judged_imu,
+            self._steps.highest, complete, self._estimates_imu,
         )  # fmt: skip
         for k, t in enumerate(times[1:].tolist()):
             if t not in known:
@@ -365,7 +365,7 @@ class Tracker(Chain):
         A few keyframes do not show the period of the fixes, nor their typical sigmas.
         """
         spacing, fixes = node_spacing(self.settings.gnss.slow_times, period(sensors.gnss.used)), sensors.gnss
-        usual = UsualSigmas(fixes.unit, lambda k: fixes.typical_sigmas(problem.t[k]), spacing)
+        usual = TypicalSigmas(fixes.unit, lambda k: fixes.typical_sigmas(problem.t[k]), spacing)
         rows = tuple(c.in_units_of(usual) for c in problem.constraints)
         return with_noise(replace(problem, constraints=rows), noise or self.noise)
 

@@ -58,10 +58,10 @@ def view(session: Session, silent: float = 0.0) -> list[tuple[str, str]]:
     odd = {k: n for k, n in sensors.counts.items() if ":" in k}
     lines.append(("settled", f"{session.rows_settled} keyframes"))
     if late or wrong or odd or session.bad:
-        said = [f"{late} late rows used"] * bool(late) + [f"{n} {k}" for k, n in sorted(odd.items())]
-        said += [f"{format_count(wrong, 'wrong fix', 'wrong fixes')} left out"] * bool(wrong)
-        said += [f"{session.bad} bad lines ({session.complaints[0]})"] if session.complaints else []
-        lines.append(("odd", ", ".join(said)))
+        remarks = [f"{late} late rows used"] * bool(late) + [f"{n} {k}" for k, n in sorted(odd.items())]
+        remarks += [f"{format_count(wrong, 'wrong fix', 'wrong fixes')} left out"] * bool(wrong)
+        remarks += [f"{session.bad} bad lines ({session.complaints[0]})"] if session.complaints else []
+        lines.append(("odd", ", ".join(remarks)))
     if online.failures:
         lines.append(("failed", f"{len(online.failures)} pieces, the last {online.failures[-1]}"))
     if online.notes:

@@ -88,7 +88,7 @@ class Walker(Tracker):
         Up to when there will be keyframes, s; -inf where nothing is to be done.
         """
         self.finish_entering(sensors)
-        shown, begun = (self.window.newest, self.newest), bool(len(self.window)) or self.opened
+        shown, started = (self.window.newest, self.newest), bool(len(self.window)) or self.opened
         times = self._steps_until(sensors, limit, last)
         late = [t for t in fixes if t <= self.newest + SAME_TIME]
         if not len(times) and not (late and len(self.window)):
@@ -96,7 +96,7 @@ class Walker(Tracker):
         self._work = _Work(np.union1d(times, late), min([dirty, self._dirty, *late]), shown)
         self._dirty = np.inf
         newest = max([self.newest, *times.tolist()])
-        if last or not begun:
+        if last or not started:
             self.finish_entering(sensors)
         return newest
 

@@ -111,7 +111,7 @@ def fix_types(types: Array, numbers: dict[int, int] | None = None) -> NDArray[np
 class Odometer:
     """Forward speed of the point that does not slip sideways.
 
-    Where pulses were counted, `way` is the measured quantity and `speed` its slope at t.
+    Where pulses were counted, `counted` is the measured quantity and `speed` its slope at t.
     """
 
     t: Array  # (M,) s
@@ -180,6 +180,11 @@ class Recording:
     def duration(self) -> float:
         """Seconds covered by the IMU."""
         return self.end - self.start
+
+    @property
+    def has_keys(self) -> bool:
+        """Whether keys of a recording.toml can be set: there is one, or nothing was read from files."""
+        return self.source is None or self.source.suffix == ".toml" or not self.files
 
     @property
     def placed(self) -> bool:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,7 +21,7 @@ from graphnav.report import sentences as words
 from graphnav.report import summary as summary
 from graphnav.report import tables as tables
 from graphnav.report.doubts import list_doubts
-from graphnav.report.plots import Shades, Spans
+from graphnav.report.plots import PALETTE, Shades, Spans
 from graphnav.report.provenance import provenance_tables
 from graphnav.report.satellites import satellite_parts
 from graphnav.report.tables import Withheld
@@ -45,7 +45,7 @@ def write_report(
     outages: Spans = (),
     findings: Sequence[str] = (),
     defects: Sequence[str] = (),
-    astray: str | None = None,
+    contradicted: str | None = None,
     provenance: Mapping[str, Any] | None = None,
     detectors: Sequence[Markup] | None = None,
     noise: Sequence[FigureRow] = (),
@@ -61,7 +61,7 @@ def write_report(
     outages : s from the start, where the recording itself has no fixes.
     findings : sentences about what was odd in the recording.
     defects : those of them that make the result wrong whatever its sigmas say; the report begins with them.
-    astray : a sentence if another solver of the same run contradicts this one; likewise.
+    contradicted : a sentence if another solver of the same run contradicts this one; likewise.
     provenance : version, input hashes and the like, plain values; `options` are those of the command.
     detectors : of `detector_pictures`, for who writes several reports of one recording; drawn here if None.
     noise : figures of the noise model, of `graphnav.estimation.noise.table.figure_rows`.
@@ -149,7 +149,7 @@ def write_report(
         ("Provenance", provenance_tables(settings, provenance)),
     ]
     lead = [
-        *([] if astray is None else [page.paragraph(astray, "verdict bad")]),
+        *([] if contradicted is None else [page.paragraph(contradicted, "verdict bad")]),
         *_list_doubts(defects, only, every),
         page.paragraph(words.describe_run(recording, only, withheld, outages)),
         summary.verdicts(solution, errors),
@@ -160,7 +160,7 @@ def write_report(
         page.columns([summary.sigma_table(solution), summary.separation_table(solution)]),
         *summary.left_out(solution, start),
     ]
-    return _write(path, page.page(f"{recording.name}: {name}", lead, sections, _clocks(recording)))
+    return _write(path, page.page(f"{recording.name}: {name}", lead, sections, _clocks(recording), _list_others(only)))
 
 
 def write_comparison(
@@ -177,6 +177,7 @@ def write_comparison(
     defects: Sequence[str] = (),
     provenance: Mapping[str, Any] | None = None,
     noise: Sequence[FigureRow] = (),
+    beside: Sequence[str] = (),
 ) -> Path:
     """Several solvers on one recording as one self-contained HTML file; arguments as in `write_report`, per solver."""
     start, end = recording.start, recording.duration
@@ -225,13 +226,20 @@ def write_comparison(
         *_verdicts(solutions, every),
         *(note for name, values in metrics_of.items() for note in words.describe_closure(name, values)),
         words.list_tiles(recording, solutions, every),
+        *summary.links(beside),
     ]
-    return _write(path, page.page(f"{recording.name}: comparison", lead, sections, _clocks(recording)))
+    html = page.page(f"{recording.name}: comparison", lead, sections, _clocks(recording), _list_others(solutions))
+    return _write(path, html)
 
 
 def detector_pictures(recording: Recording, solution: Solution) -> list[Markup]:
     """The detectors' statistics, for `write_report`: the same for every solver of a recording."""
     return pictures.detection_pictures(recording, solution.detections)
+
+
+def _list_others(names: Iterable[str]) -> list[str]:
+    """Those without a colour in the palette: other programs, and solvers that few use."""
+    return [name for name in names if name not in PALETTE]
 
 
 def _clocks(recording: Recording) -> list[page.TimeAxis]:

@@ -21,7 +21,8 @@ from typing import Any
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
-from graphnav.report.plots import PALETTE, TIME, Figure, css_colours
+from graphnav.core.errors import ConfigError
+from graphnav.report.plots import TIME, Figure, css_colours, variable
 from graphnav.report.wording import Quantity, show
 
 _HERE = Path(__file__).parent
@@ -42,7 +43,7 @@ bullets, code, columns, digest, download, fold, gallery, heading, links, pairs, 
 
 def solver(name: str) -> Markup:
     """A solver's name in its colour."""
-    return _PARTS.solver(name, name if name in PALETTE else "other")
+    return _PARTS.solver(name, variable(name))
 
 
 def table(head: Sequence[Any], rows: Iterable[Sequence[Any]], best: Sequence[int] = ()) -> Markup:
@@ -97,11 +98,7 @@ def picture(figure: Figure, title: str, note: str = "", kind: str = "") -> Marku
 
 @dataclass(frozen=True)
 class TimeAxis:
-    """A clock for the time axes of figures: its name and its reading at the start, s. `date`: seconds of the calendar
-    since 1970.
-
-    `date`: the seconds are of a day of the calendar, since 1970.
-    """
+    """A clock for the time axes of figures: its name and its reading at the start, s; with `date` since 1970."""
 
     words: str
     start: float
@@ -113,6 +110,7 @@ def page(
     lead: Sequence[Markup],
     sections: Sequence[tuple[str, Sequence[Markup]]],
     clocks: Sequence[TimeAxis] = (),
+    others: Sequence[str] = (),
 ) -> str:
     """The whole page.
 
@@ -121,12 +119,13 @@ def page(
     lead : between the title and the first section.
     sections : heading and parts; sections without parts are left out.
     clocks : to choose from, beside seconds from the start.
+    others : names of other programs, each with a colour of its own.
     """
     sections = [(head, parts) for head, parts in sections if any(parts)]
     drawn = any("<figure" in part for _, parts in sections for part in parts)
     return _TEMPLATES.get_template("page.html").render(
         title=title, lead=lead, sections=sections, clocks=clocks, time=TIME, library=_library() if drawn else None,
-        style=Markup(css_colours() + _read("page.css")), script=Markup(_read("page.js")),
+        style=Markup(css_colours(others) + _read("page.css")), script=Markup(_read("page.js")),
     )  # fmt: skip
 
 
@@ -146,7 +145,9 @@ class Packed:
 def _library() -> Packed:
     found = importlib.util.find_spec("plotly")
     if found is None or found.origin is None:
-        raise ModuleNotFoundError("plotly is not installed")
+        raise ConfigError(
+            "a page needs plotly, which is not installed; pip install -e . in the clone", key="package.missing"
+        )
     return _pack((Path(found.origin).parent / "package_data" / "plotly.min.js").read_bytes())
 
 

@@ -19,8 +19,8 @@ from graphnav.estimation.solution import ParameterEstimate, Solution
 from graphnav.evaluation.against import own_solutions
 from graphnav.recording import FIX_TYPES, Recording
 from graphnav.report import page, plots
-from graphnav.report.plots import Series, Shades, Spans
-from graphnav.report.plots.way import draw_fixes
+from graphnav.report.plots import Curve, Shades, Spans
+from graphnav.report.plots.paths import draw_fixes
 
 if TYPE_CHECKING:
     from graphnav.evaluation.metrics import Errors
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 ENU = ("east", "north", "up")
 RPH = ("roll", "pitch", "heading")
 XYZ = ("x right", "y forward", "z up")
-DEG = float(np.degrees(1.0))
+TO_DEG = float(np.degrees(1.0))
 DEG_H = float(np.degrees(3600.0))
 
 
@@ -55,21 +55,21 @@ def trajectory_picture(recording: Recording, solutions: Mapping[str, Solution], 
 def profile_picture(recording: Recording, solutions: Mapping[str, Solution]) -> Markup:
     """Heights over the distance travelled."""
     start, first = recording.start, next(iter(solutions.values()))
-    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(first.states.p[:, :2], axis=0), axis=1))])
+    distance = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(first.states.p[:, :2], axis=0), axis=1))])
 
-    def over_way(t: Array, h: Array) -> tuple[Array, Array]:
-        return np.interp(t, first.t, way), h
+    def over_distance(t: Array, h: Array) -> tuple[Array, Array]:
+        return np.interp(t, first.t, distance), h
 
     lines, points = {}, {}
     truth, fixes = _truth(recording, solutions), fixes_of(recording, first)
     base = float(first.frame.origin[2]) if has_place(first) else 0.0
     if truth is not None and truth[1].shape[1] > 2:
-        lines["truth"] = over_way(truth[0], base + truth[1][:, 2])
-    lines |= {name: over_way(s.t, base + s.states.p[:, 2]) for name, s in solutions.items()}
+        lines["truth"] = over_distance(truth[0], base + truth[1][:, 2])
+    lines |= {name: over_distance(s.t, base + s.states.p[:, 2]) for name, s in solutions.items()}
     if fixes is not None:
         for kind, of_it in fixes.kinds.items():
             rows = of_it & ~fixes.excluded
-            points[kind] = over_way(fixes.t[rows] + start, base + fixes.enu[rows, 2])
+            points[kind] = over_distance(fixes.t[rows] + start, base + fixes.enu[rows, 2])
     antenna = "truth and fixes" if "truth" in lines and recording.truth and recording.truth.of == "gnss" else "fixes"
     note = f"Heights above the ellipsoid; {antenna} are of the antenna."
     if not has_place(first):
@@ -77,7 +77,7 @@ def profile_picture(recording: Recording, solutions: Mapping[str, Solution]) -> 
     return page.picture(plots.profile(lines, points), "Height profile", note, kind="large")
 
 
-def fixes_of(recording: Recording, solution: Solution) -> plots.Fixes | None:
+def fixes_of(recording: Recording, solution: Solution) -> plots.DrawnFixes | None:
     """The fixes in metres, the kind of each, and those that the solver did not use though they were not withheld."""
     if recording.gnss is None or not has_place(solution):
         return None
@@ -102,7 +102,7 @@ def fixes_of(recording: Recording, solution: Solution) -> plots.Fixes | None:
         }
         present = {name: rows for name, rows in classes.items() if rows.any()}
         kinds = present if len(present) > 1 else kinds
-    return plots.Fixes(t - recording.start, solution.frame.from_llh(gnss.llh), out, kinds)
+    return plots.DrawnFixes(t - recording.start, solution.frame.from_llh(gnss.llh), out, kinds)
 
 
 def _truth(recording: Recording, solutions: Mapping[str, Solution]) -> tuple[Array, Array] | None:
@@ -136,17 +136,17 @@ def _lay_on(t: Array, xyz: Array, solution: Solution) -> tuple[Array, Array] | N
     return t[shared], np.asarray((own @ yaw_matrix(yaw).T + offset)[:, : xyz.shape[1]])
 
 
-def error_series(errors: Errors, start: float) -> dict[str, Series]:
+def error_series(errors: Errors, start: float) -> dict[str, Curve]:
     """Error series to draw: position (m), velocity (m/s), attitude (deg), as far as present."""
     t = errors.t - start
     out = {}
     for kind, value, sigma, scale in (
         ("position", errors.p, errors.sd_p, 1.0),
         ("velocity", errors.v, errors.sd_v, 1.0),
-        ("attitude", errors.rph, errors.sd_rph, DEG),
+        ("attitude", errors.rph, errors.sd_rph, TO_DEG),
     ):
         if np.isfinite(value).any():
-            out[kind] = Series(t, scale * value, scale * sigma if np.isfinite(sigma).any() else None)
+            out[kind] = Curve(t, scale * value, scale * sigma if np.isfinite(sigma).any() else None)
     return out
 
 
@@ -166,7 +166,7 @@ def error_pictures(errors: Mapping[str, Errors], start: float, end: float, spans
     return out
 
 
-def _find_known(series: Mapping[str, Series]) -> list[int]:
+def _find_known(series: Mapping[str, Curve]) -> list[int]:
     """The components that any of the series has values of: a truth may have no heights."""
     return [k for k in range(3) if any(np.isfinite(s.value[:, k]).any() for s in series.values())]
 
@@ -175,7 +175,7 @@ def nees_pictures(errors: Mapping[str, Errors], start: float, end: float, spans:
     """Squared errors over their covariance."""
     series, names, dofs = {}, ["position", "velocity", "attitude"], [3, 3, 3]
     for name, e in errors.items():
-        series[name] = Series(e.t - start, np.column_stack([e.nees_p, e.nees_v, e.nees_rph]))
+        series[name] = Curve(e.t - start, np.column_stack([e.nees_p, e.nees_v, e.nees_rph]))
         dofs[0] = e.dof_p
     known = _find_known(series)
     if not known:
@@ -195,11 +195,11 @@ def sigma_pictures(tracks: Mapping[str, Trajectory], start: float, end: float, s
     wanted = (
         ("Position", "sd_p", ENU, "m", 1.0),
         ("Velocity", "sd_v", ENU, "m/s", 1.0),
-        ("Attitude", "sd_rph", RPH, "deg", DEG),
+        ("Attitude", "sd_rph", RPH, "deg", TO_DEG),
     )  # fmt: skip
     for kind, key, parts, unit, scale in wanted:
         series = {
-            name: Series(track.t - start, getattr(track, key) * scale)
+            name: Curve(track.t - start, getattr(track, key) * scale)
             for name, track in tracks.items()
             if getattr(track, key) is not None
         }
@@ -227,10 +227,10 @@ def motion_pictures(recording: Recording, solutions: Mapping[str, Solution], spa
         if gnss is not None and gnss.v is not None and np.isfinite(gnss.v[:, k]).any():
             panel.dots(gnss.t - start, gnss.v[:, k], "ink", "GNSS velocity", 2.5, alpha=0.5)
 
-    place = {name: Series(s.t - start, s.states.p + base, tracks[name].sd_p) for name, s in solutions.items()}
-    speed = {name: Series(t.t - start, t.v, t.sd_v) for name, t in tracks.items() if t.v is not None}
+    place = {name: Curve(s.t - start, s.states.p + base, tracks[name].sd_p) for name, s in solutions.items()}
+    speed = {name: Curve(t.t - start, t.v, t.sd_v) for name, t in tracks.items() if t.v is not None}
     turned = {
-        name: Series(t.t - start, _unwrap(t.rph), None if t.sd_rph is None else DEG * t.sd_rph)
+        name: Curve(t.t - start, _unwrap(t.rph), None if t.sd_rph is None else TO_DEG * t.sd_rph)
         for name, t in tracks.items() if t.rph is not None
     }  # fmt: skip
     out = []
@@ -253,7 +253,7 @@ def separation_pictures(solution: Solution, start: float, end: float, spans: Sha
     found = solution.separation
     if found is None or not np.isfinite(found.value).any():
         return []
-    series = {"ekf": Series(found.t - start, found.value, found.sigma)}
+    series = {"ekf": Curve(found.t - start, found.value, found.sigma)}
     note = "Position of the forward filter less that of all later measurements; it belongs inside the band."
     return [page.picture(plots.bands(series, ENU, "m", end, spans=spans), "Combined separation and 3 sigma", note)]
 
@@ -296,7 +296,7 @@ def bias_pictures(solution: Solution, start: float, end: float, spans: Shades) -
         ("Gyro bias", solution.states.bg, sd[:, 12:15], "deg/h", DEG_H),
         ("Accelerometer bias", solution.states.ba, sd[:, 9:12], "mm/s²", 1000.0),
     ):
-        series = {solution.solver: Series(t, value * scale, sigma * scale)}
+        series = {solution.solver: Curve(t, value * scale, sigma * scale)}
         figure = plots.bands(series, XYZ, unit, end, spans=spans, about_zero=False)
         out.append(page.picture(figure, f"{words} and 3 sigma"))
     return out
@@ -312,7 +312,7 @@ def parameter_pictures(
             told = np.any(p.sigma < 0.5 * p.prior_sigma, axis=0)
             shown = [one for one, drawn in zip(components(name, p.value.shape[1], p.unit), told, strict=True) if drawn]
             scale = np.array([one.scale for one in shown])
-            series = {solver: Series(p.t - start, scale * p.value[:, told], scale * p.sigma[:, told])}
+            series = {solver: Curve(p.t - start, scale * p.value[:, told], scale * p.sigma[:, told])}
             titles, units = [one.words for one in shown], [one.unit for one in shown]
             figure = plots.bands(series, titles, units, end, spans=spans, about_zero=False)
             words = " ".join(one.upper() if one in ("gnss", "imu") else one for one in name.split("_"))
@@ -327,7 +327,7 @@ def zoom_pictures(errors: Mapping[str, Errors], start: float, spans: Spans, what
     series = {}
     for name, e in errors.items():
         s = error_series(e, start)["position"]
-        series[name] = Series(s.t, np.hypot(s.value[:, 0], s.value[:, 1])[:, None])
+        series[name] = Curve(s.t, np.hypot(s.value[:, 0], s.value[:, 1])[:, None])
     figure = plots.span_zoom(series, spans, what)
     return [page.picture(figure, "Horizontal error in and around each span", kind="large" if len(spans) > 1 else "")]
 
@@ -341,7 +341,7 @@ def difference_pictures(solutions: Mapping[str, Solution], start: float, end: fl
             continue
         _, mine, its = np.intersect1d(s.t, reference.t, return_indices=True)
         if len(mine) > 1:
-            series[key] = Series(s.t[mine] - start, s.states.p[mine] - reference.states.p[its])
+            series[key] = Curve(s.t[mine] - start, s.states.p[mine] - reference.states.p[its])
     if not series:
         return []
     figure = plots.bands(series, ENU, "m", end, spans=spans)
@@ -376,4 +376,4 @@ def detection_pictures(recording: Recording, found: Sequence[Detection]) -> list
     if not found:
         return []
     note = "Tinted: the intervals in which it stands, all detectors together."
-    return [page.picture(plots.detections(recording, found), "Detectors", note, kind="large")]
+    return [page.picture(plots.detections(recording, found), "Signals, statistics and thresholds", note, kind="large")]

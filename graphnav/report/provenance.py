@@ -31,8 +31,10 @@ def provenance_tables(settings: Mapping[str, Any], provenance: Mapping[str, Any]
         out.append(page.fold("Settings as resolved", [page.download(SETTINGS, data), page.code(toml, "settings")]))
     inputs = provenance.pop("inputs", {})
     if provenance:
+        noise = provenance.pop("noise", None)
         listed = [f"{key} {wording.show(value)}" for key, value in page.flatten(provenance).items()]
-        out += [page.heading("Versions"), page.paragraph(and_list(listed))]
+        words = [*([and_list(listed)] if listed else []), *([f"noise figures: {noise}"] if noise else [])]
+        out += [page.heading("Versions"), page.paragraph("; ".join(words))]
     if inputs:
         rows = [[name, page.digest(digest)] for name, digest in inputs.items()]
         out += [page.heading("Inputs"), page.table(["file", "sha256"], rows)]

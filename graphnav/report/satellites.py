@@ -29,8 +29,8 @@ def satellite_parts(solution: Solution, start: float, end: float, spans: Shades)
     if not records:
         return []
     kind, first = next(iter(records.items()))
-    said = {r.kind for r in records.values()}
-    what = " and ".join(sorted(f"{one}s" for one in said)).capitalize()
+    kinds = {r.kind for r in records.values()}
+    what = " and ".join(sorted(f"{one}s" for one in kinds)).capitalize()
     seen = [
         page.picture(plots.sky(first, name), f"Sky, by the rows of {kind}", "North is up, the zenith in the middle."),
         page.picture(plots.used_satellites(records, start, end, name, spans=spans), "Rows used and refused"),

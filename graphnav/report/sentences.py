@@ -82,10 +82,10 @@ def describe_run(recording: Recording, solutions: Mapping[str, Solution], withhe
 def list_tiles(recording: Recording, solutions: Mapping[str, Solution], errors: Mapping[str, Errors]) -> Markup:
     """The key numbers."""
     states = next(iter(solutions.values())).states
-    way = float(np.linalg.norm(np.diff(states.p, axis=0), axis=1).sum())
+    distance = float(np.linalg.norm(np.diff(states.p, axis=0), axis=1).sum())
     out = [
         (f"{recording.duration:.1f} s", "duration"),
-        (f"{way / 1000:.2f} km" if way >= 1000 else f"{way:.1f} m", "distance"),
+        (f"{distance / 1000:.2f} km" if distance >= 1000 else f"{distance:.1f} m", "distance"),
     ]
     spans = next(iter(solutions.values())).stationary
     if len(spans):
@@ -110,12 +110,12 @@ def describe_sigma(name: str, errors: Errors) -> Markup:
     """One sentence that compares errors with their sigma (and the truth's own, if stated)."""
     from graphnav.evaluation.sigmas import judge_sigmas, select_verdict
 
-    judged = judge_sigmas(errors)
-    if not judged:
+    verdicts = judge_sigmas(errors)
+    if not verdicts:
         words = f"{name}: no epoch has both an error and a sigma, so sigma cannot be judged."
         return page.paragraph(Note("sigma.not_judged", words), "verdict")
-    worst = select_verdict(judged, "too small") or select_verdict(judged, "unclear")
-    shown = worst or judged
+    worst = select_verdict(verdicts, "too small") or select_verdict(verdicts, "unclear")
+    shown = worst or verdicts
     measured = and_list(
         [f"{j.block} errors are {j.size:.2f} sigma rms, {100 * j.inside:.1f} % within 3 sigma" for j in shown]
     )
@@ -133,10 +133,10 @@ def describe_sigma(name: str, errors: Errors) -> Markup:
             f"they count as {alike} only."
         )
         return page.paragraph(Note("sigma.unclear", words), "verdict")
-    seen = {j.block for j in judged}
+    seen = {j.block for j in verdicts}
     unseen = [what for what in ("position", "velocity", "attitude") if what not in seen]
     rest = f" Nothing is there to judge {and_list(unseen)} by." if unseen else ""
-    if all(j.verdict == "cautious" for j in judged):
+    if all(j.verdict == "cautious" for j in verdicts):
         return page.paragraph(
             Note("sigma.cautious", f"{name}: the stated sigma is cautious: {measured}.{rest}"), "verdict"
         )
@@ -177,6 +177,8 @@ def describe_closure(name: str, metrics: Mapping[str, Any] | None) -> list[Marku
     """The closure error of a loop, where that is the truth."""
     if not metrics or metrics.get("closure_h_m") is None:
         return []
-    h, up, way, share = (wording.show(metrics.get(f"closure_{k}")) for k in ("h_m", "up_m", "distance_m", "percent"))
-    words = f"the loop of {way} m closes to {h} m horizontally ({share} % of the way) and {up} m in height."
+    h, up, distance, share = (
+        wording.show(metrics.get(f"closure_{k}")) for k in ("h_m", "up_m", "distance_m", "percent")
+    )
+    words = f"the loop of {distance} m closes to {h} m horizontally ({share} % of the path) and {up} m in height."
     return [page.paragraph(f"{name}: {words}", "verdict")]

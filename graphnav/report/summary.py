@@ -40,10 +40,10 @@ _SHOWS = {
 
 def verdicts(solution: Solution, errors: Errors | None) -> Markup:
     """Accuracy of position, velocity and attitude, and whether the stated sigma is consistent."""
-    judged = _judge_by_records(solution) | ({} if errors is None else _judge_by_truth(errors))
+    found = _judge_by_records(solution) | ({} if errors is None else _judge_by_truth(errors))
     nothing = ("", "nothing is there to judge it by")
     return page.verdicts(
-        [(kind, block.capitalize(), words) for block in _SHOWS for kind, words in [judged.get(block, nothing)]]
+        [(kind, block.capitalize(), words) for block in _SHOWS for kind, words in [found.get(block, nothing)]]
     )
 
 
@@ -206,7 +206,7 @@ def left_out(solution: Solution, start: float) -> list[Markup]:
 
 
 def links(files: Sequence[str]) -> list[Markup]:
-    """Links to the files beside the page, for other programs."""
+    """Links to the files beside the page."""
     return [page.links(files)] if files else []
 
 

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from markupsafe import Markup
 
-from graphnav.core.notes import Note
+from graphnav.core.notes import Note, key_of
 from graphnav.core.rotation import Array
 from graphnav.estimation.names import components
-from graphnav.estimation.noise.model import INTERVALS
+from graphnav.estimation.noise.model import INTERVALS, TABULATED
 from graphnav.estimation.solution import ParameterEstimate, Solution
 from graphnav.estimation.stops import stops_of_solution
 from graphnav.evaluation.against import own_solutions
@@ -55,7 +55,7 @@ def _find_largest(x: Array) -> float:
     return float(x.max()) if x.size else float("nan")
 
 
-COMPARED_SPAN = ("horizontal RMS [m]", "largest [m]", "at the end [m]", "largest, % of way", "up largest [m]",
+COMPARED_SPAN = ("horizontal RMS [m]", "largest [m]", "at the end [m]", "largest, % of path", "up largest [m]",
                  "heading largest [deg]", "error / sigma, RMS")  # fmt: skip
 COMPARED = ("horizontal RMS [m]", "horizontal largest [m]", "up RMS [m]", "speed RMS [m/s]", "roll, pitch RMS [deg]",
             "heading RMS [deg]", "error / sigma, RMS")  # fmt: skip
@@ -83,12 +83,12 @@ def span_row(errors: Errors, span: tuple[float, float], start: float) -> list[fl
     if not len(rows):
         return [float("nan")] * len(COMPARED_SPAN)
     h = errors.horizontal[rows]
-    way = float(errors.distance[rows[-1]] - errors.distance[rows[0]])
+    travelled = float(errors.distance[rows[-1]] - errors.distance[rows[0]])
     return [
         rms(h),
         _find_largest(h),
         float(h[-1]),
-        100.0 * _find_largest(h) / way if way >= 1.0 else float("nan"),
+        100.0 * _find_largest(h) / travelled if travelled >= 1.0 else float("nan"),
         _find_largest(errors.p[rows, 2]),
         float(np.degrees(_find_largest(errors.rph[rows, 2]))),
         float(np.sqrt(mean_or_nan(errors.nees_axis[rows]))),
@@ -123,7 +123,8 @@ def accuracy_tables(
 
 
 def _list_notes(errors: Mapping[str, Errors]) -> list[Markup]:
-    notes = list(dict.fromkeys(note for e in errors.values() for note in e.notes))
+    shared = [note for note in next(iter(errors.values())).notes if all(note in e.notes for e in errors.values())]
+    notes = shared + [f"{name}: {note}" for name, e in errors.items() for note in e.notes if note not in shared]
     return [page.bullets(notes)] if notes else []
 
 
@@ -241,7 +242,7 @@ def nees_table(errors: Mapping[str, Errors]) -> list[Markup]:
         "fits": "fits",
     }
     for name, e in errors.items():
-        judged = {one.block: one for one in judge_sigmas(e)}
+        verdicts = {one.block: one for one in judge_sigmas(e)}
         nees = {"position": (e.nees_p, e.dof_p), "velocity": (e.nees_v, 3), "attitude": (e.nees_rph, 3)}
         if e.dof_p == 3:
             nees["height"] = (e.nees_axis[:, 2], 1)
@@ -250,7 +251,7 @@ def nees_table(errors: Mapping[str, Errors]) -> list[Markup]:
         for words, (values, dof) in nees.items():
             found = average_nees(values, dof)
             if found is not None:
-                inside, one = Quantity(f"{100 * found.inside:.1f} %"), judged[words]
+                inside, one = Quantity(f"{100 * found.inside:.1f} %"), verdicts[words]
                 worth = Quantity(f"{one.effective:.0f}")
                 rows.append([page.solver(name), words, found.mean, inside, found.n, worth, says[one.verdict]])
     head = ["solver", "of", "mean NEES / dof", "epochs inside 95 %", "epochs", "worth independent", "what it says"]
@@ -287,8 +288,9 @@ def run_table(solutions: Mapping[str, Solution]) -> list[Markup]:
     ]
     several = len(solutions) > 1
     notes = [f"{name} stopped: {s.stopped}" for name, s in solutions.items() if s.stopped and several]
-    shared = [note for note in next(iter(solutions.values())).notes if all(note in s.notes for s in solutions.values())]
-    theirs = [f"{name}: {note}" for name, s in every.items() for note in s.notes if note not in shared]
+    own = {name: [note for note in s.notes if key_of(note) not in TABULATED] for name, s in every.items()}
+    shared = [note for note in own[next(iter(solutions))] if all(note in own[name] for name in solutions)]
+    theirs = [f"{name}: {note}" for name, some in own.items() for note in some if note not in shared]
     table = page.table(["stage", *(page.solver(name) for name in solutions)], rows)
     lines = [*notes, *shared, *theirs]
     return [page.columns([[table], [page.bullets(lines)]]) if lines else table]

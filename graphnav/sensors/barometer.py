@@ -10,13 +10,14 @@ from __future__ import annotations
 import numpy as np
 from pydantic import Field
 
+from graphnav.core.earth import STANDARD_GRAVITY
 from graphnav.core.rotation import Array
 from graphnav.sensors.base import Column, Sensor, Series
 from graphnav.sensors.tables import NotNegative, Positive, TomlTable
 
 ATMOSPHERE = 101325.0  # Pa
 _SCALE_HEIGHT = 288.15 / 6.5e-3  # m
-_POWER = 287.05287 * 6.5e-3 / 9.80665
+_POWER = 287.05287 * 6.5e-3 / STANDARD_GRAVITY
 
 
 class Figures(TomlTable):

@@ -70,6 +70,10 @@ class Sensor:
         made.required, made.optional = ("t",), self.names
         return made  # type: ignore[no-any-return]
 
+    def __getstate__(self) -> dict[str, Any]:
+        """What is stored: not the model, which is made of the rest."""
+        return {name: value for name, value in self.__dict__.items() if name != "table"}
+
     def usable(self, values: Array) -> NDArray[np.bool_]:
         """(N,) whether rows (N, k) are complete in one of the sets of columns that `needs` lists."""
         there, out = np.isfinite(values), np.zeros(len(values), dtype=bool)

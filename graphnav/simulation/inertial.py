@@ -6,10 +6,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from graphnav.core.earth import MG
 from graphnav.core.rotation import Array
 from graphnav.recording import ImuNoise
 from graphnav.simulation.splines import stream
-from graphnav.simulation.vibration import MG, gauss_markov
+from graphnav.simulation.vibration import gauss_markov
 
 _DEG = np.pi / 180.0
 DEG_H = _DEG / 3600.0  # rad/s
@@ -133,14 +134,8 @@ EG370N = SimulatedImu(
 )  # fmt: skip
 # "White noise 0.1 degree/h" and "0.05 mg" are taken as 0.1 deg/sqrt(h) and 50 ug/sqrt(Hz), as data sheets of such
 # sensors state them.
-# sensors have them.
 MIMU = SimulatedImu(
     "MIMU of Zhu 2020, table 1", 400.0,
     gyroscope(0.1, 3.0, instability_deg_h=1.0, scale_ppm=200.0),
     accelerometer(50.0, 0.1, instability_mg=0.03, scale_ppm=150.0),
-)  # fmt: skip
-NAVIGATION = SimulatedImu(
-    "navigation grade", 200.0,
-    gyroscope(0.002, 0.01, instability_deg_h=0.003, scale_ppm=5.0, correlation_time=3600.0),
-    accelerometer(10.0, 0.03, instability_mg=0.01, scale_ppm=30.0, correlation_time=3600.0),
 )  # fmt: skip

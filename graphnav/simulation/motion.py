@@ -39,11 +39,6 @@ class Manoeuvre:
     bank: float | None = None
 
 
-def stand(duration: float) -> Manoeuvre:
-    """Stand still."""
-    return Manoeuvre(duration, 0.0)
-
-
 @dataclass(frozen=True)
 class Path:
     """Speed (m/s, signed), heading, slope, bank and side-slip (rad) as one spline of five channels."""

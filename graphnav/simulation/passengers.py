@@ -14,7 +14,6 @@ from graphnav.simulation.vibration import UP, Part, oscillator, sample_movement,
 
 # Effect of a passenger of 75 kg on a car's suspension (100 kN/m in heave, some 40 kNm/rad in roll and 100 in pitch; the
 # seat 0.4 m to the side and 0.3 m from the middle): the static response, m and rad.
-# pitch; the seat 0.4 m to the side and 0.3 m from the middle): the static answer, m and rad.
 _SINKS, _ROLLS, _PITCHES = 0.0075, 0.0070, 0.0022
 
 

@@ -40,7 +40,18 @@ class Simulated:
         )
 
     def write(self, folder: str | FilePath) -> list[FilePath]:
-        """The recording folder, with `simulated.json` beside it for the stops and facts; returns the files."""
+        """Write a recording folder, and `simulated.json` for the stops and facts.
+
+        Parameters
+        ----------
+        folder
+            Made if it is not there.
+
+        Returns
+        -------
+        list of Path
+            The files.
+        """
         notes = ("Simulated by graphnav: made data, not a measurement.", *(f"{k}: {v}" for k, v in self.facts.items()))
         files = write_folder(self.recording, folder, [" ".join(note.split()) for note in notes])
         facts = {"simulated": True, "stops": self.stops.tolist(), **self.facts}

@@ -13,6 +13,7 @@ import numpy as np
 from scipy import signal
 from scipy.interpolate import BSpline
 
+from graphnav.core.earth import MG
 from graphnav.core.rotation import Array
 from graphnav.simulation.motion import HEADING, SPEED, Path
 from graphnav.simulation.splines import centres, spline
@@ -23,7 +24,6 @@ DEGREE = 4
 _MODULATION_TIME, _MODULATION_DEGREE = 0.1, 3  # s; correlation time of a line's modulation
 
 Part = Callable[[Array], tuple[Array, Array]]
-MG = 9.80665e-3  # m/s^2
 
 
 @dataclass(frozen=True)
@@ -178,7 +178,6 @@ ROAD = (
 )  # fmt: skip
 # an idling engine shakes the body on its springs: 0.1 mg peaks near 3 Hz in the spectrum of a quarter of an hour, as in
 # table 4 of Li 2024
-# as in table 4 of Li 2024.
 FLOOR = (
     Mode(UP, 3.4, 0.08, 0.011), Mode(FORWARD, 3.2, 0.12, 0.011), Mode(RIGHT, 3.0, 0.12, 0.010),
     Mode(PITCH, 3.5, 0.15, 8e-4), Mode(ROLL, 3.0, 0.15, 2e-3),

@@ -5,8 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from helpers import difference, random_rotations
-from scipy.integrate import fixed_quad
-from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
 from graphnav.core import rotation as ro
@@ -76,30 +74,6 @@ def test_right_jacobian_inverse_is_the_derivative_of_log(vectors: np.ndarray) ->
 def test_jacobian_and_its_inverse_are_inverses(vectors: np.ndarray) -> None:
     product = ro.right_jacobian(vectors) @ ro.right_jacobian_inverse(vectors)
     np.testing.assert_allclose(product, np.broadcast_to(np.eye(3), product.shape), atol=1e-12)
-
-
-def test_integrals_against_quadrature(vectors: np.ndarray) -> None:
-    """Gamma1 = int_0^1 Exp(s v) ds; Gamma2 = int_0^1 (1 - s) Exp(s v) ds, after swapping the double integral."""
-
-    def first(s: np.ndarray) -> np.ndarray:
-        return np.moveaxis(ro.exp(s[:, None, None] * vectors), 0, -1)
-
-    one, _ = fixed_quad(first, 0, 1, n=20)
-    two, _ = fixed_quad(lambda s: (1 - s) * first(s), 0, 1, n=20)
-    gamma1, gamma2 = ro.integrals(vectors)
-    np.testing.assert_allclose(gamma1, one, atol=1e-13)
-    np.testing.assert_allclose(gamma2, two, atol=1e-13)
-
-
-def test_integrals_are_those_of_the_matrix_exponential() -> None:
-    """expm of the 9 x 9 chain [S I 0; 0 0 I; 0 0 0] holds both, by SciPy's own scaling and squaring."""
-    v = np.array([0.3, -1.2, 0.8])
-    M = np.zeros((9, 9))
-    M[:3, :3], M[:3, 3:6], M[3:6, 6:] = ro.skew(v), np.eye(3), np.eye(3)
-    E = expm(M)
-    gamma1, gamma2 = ro.integrals(v)
-    np.testing.assert_allclose(gamma1, E[:3, 3:6], atol=1e-14)
-    np.testing.assert_allclose(gamma2, E[:3, 6:], atol=1e-14)
 
 
 def test_skew_and_mv() -> None:

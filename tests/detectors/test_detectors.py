@@ -64,13 +64,6 @@ def test_statistics_are_the_sums_of_skog():
     assert len(glrt.glrt_statistic(accel[:5], gyro[:5], N, s_a, s_w, g)) == 0
 
 
-def test_a_stance_is_every_row_of_a_window_below_the_threshold():
-    statistic = np.array([9.0, 1.0, 9.0, 9.0, 9.0, 1.0])
-    np.testing.assert_array_equal(
-        glrt.stance_mask(statistic, 2.0, 3), [False, True, True, True, False, True, True, True]
-    )
-
-
 def test_running_sums_keep_their_digits_over_hours():
     rng = np.random.default_rng(2)
     rows = 96.0 + 1e-3 * rng.standard_normal((2_000_000, 1))

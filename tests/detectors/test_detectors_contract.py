@@ -144,12 +144,12 @@ def test_each_alone_puts_rows_into_the_problem_of_all_solvers(name: str) -> None
     assert recording.gnss is not None
     frame = LocalFrame(recording.gnss.llh[0])
     spans = detect(recording, settings).stationary
-    posed = build_problem(recording, settings, frame, random_states(np.random.default_rng(0), 1), np.ones(15), spans)
-    rows = {c.name: posed.t[c.keyframe] for c in posed.constraints if c.of_stops}
+    built = build_problem(recording, settings, frame, random_states(np.random.default_rng(0), 1), np.ones(15), spans)
+    rows = {c.name: built.t[c.keyframe] for c in built.constraints if c.of_stops}
     assert set(rows) == {"zero_velocity", "zero_rate", "held_position"}
     for t in rows.values():
         assert ((t > spans[0, 0] - 0.02) & (t < spans[0, 1] + 0.02)).all()
-        assert len(t) >= np.sum((posed.t > spans[0, 0] + 0.02) & (posed.t < spans[0, 1] - 0.02))
+        assert len(t) >= np.sum((built.t > spans[0, 0] + 0.02) & (built.t < spans[0, 1] - 0.02))
 
 
 def test_filter_isam2_and_batch_use_the_rows_of_one_detector() -> None:

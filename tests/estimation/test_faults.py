@@ -51,7 +51,7 @@ def short(drive: tuple[Recording, Trajectory]) -> tuple[Recording, Trajectory]:
 
 
 @pytest.fixture(scope="module")
-def posed(drive: tuple[Recording, Trajectory]) -> Problem:
+def built(drive: tuple[Recording, Trajectory]) -> Problem:
     """The problem of the drive, its fixes taken as they are stated."""
     recording = drive[0]
     settings = settings_from({"gnss": {"time_offset_sigma": 0.0}})
@@ -88,9 +88,9 @@ def left_out(solution: Solution, recording: Recording) -> Array:
 # ---------------------------------------------------------------------------------------------------------- the tests
 
 
-def test_signature_is_the_derivative_of_the_innovations(posed: Problem, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_signature_is_the_derivative_of_the_innovations(built: Problem, monkeypatch: pytest.MonkeyPatch) -> None:
     """G of an error since row 63 that stays, or grows, against two filters whose fixes differ by it."""
-    rows = next(c for c in posed.constraints if c.name == "gnss_position")
+    rows = next(c for c in built.constraints if c.name == "gnss_position")
     kept: list[tuple[Bank, Stack, Updates]] = []
     follow = Bank.follow
 
@@ -99,29 +99,29 @@ def test_signature_is_the_derivative_of_the_innovations(posed: Problem, monkeypa
         return follow(self, k0, k1, F, decay, stack, updates, *more)
 
     monkeypatch.setattr(Bank, "follow", keep)
-    about = ekf(posed)
-    forward = refilter(posed, about, watch=True)
+    about = ekf(built)
+    forward = refilter(built, about, watch=True)
     plain = forward.records[rows.name].residual
     # the same tests a block at a time, with what an error since the 64th fix does to the state: slot 6 begins there
     _, stack, updates = kept[0]
-    bank = Bank([rows], posed.t, forward.P.shape[1])
+    bank = Bank([rows], built.t, forward.P.shape[1])
     own = bank._slots[rows.name]
     layout, room = np.array([0, own.columns.start, own.L, own.m, own.c]), (np.empty((own.L, own.c)), np.empty(own.L))
     seen, begun, fix = dict[int, Array](), 0.0, 0
-    for k in range(len(posed.t)):
+    for k in range(len(built.t)):
         if k:
             bank.X[:] = move(forward.F[k - 1], forward.decay[k - 1], bank.X)
         for some in stack.together(k):
             name = some.parts[0][0].name
             H, Kt, solved, root = (x[some.at] for x in (updates.H, updates.Kt, updates.w, stack.root))
             if name == rows.name:
-                begun = posed.t[k] if fix == 63 else begun
+                begun = built.t[k] if fix == 63 else begun
                 X = np.zeros((H.shape[1], 6)) if fix == 63 else bank.X[:, 36:42]
-                U = np.concatenate([np.eye(3), (posed.t[k] - begun) / MINUTE * np.eye(3)], axis=1)
+                U = np.concatenate([np.eye(3), (built.t[k] - begun) / MINUTE * np.eye(3)], axis=1)
                 seen[fix] = U - H @ X
                 fix += 1
                 update_tests(
-                    bank.X, own.memory, layout, np.array([own.prior, MINUTE]), posed.t[k], H, Kt,
+                    bank.X, own.memory, layout, np.array([own.prior, MINUTE]), built.t[k], H, Kt,
                     root[:, some.at[1]].copy(), solved, *room,
                 )  # fmt: skip
             else:
@@ -130,13 +130,13 @@ def test_signature_is_the_derivative_of_the_innovations(posed: Problem, monkeypa
         mine, followed = (getattr(x._slots[rows.name], one) for x in (bank, kept[0][0]))
         np.testing.assert_allclose(mine, followed, rtol=1e-9, atol=1e-9 * np.abs(mine).max())
     delta = 1e-3
-    minutes = (posed.t[rows.keyframe[63:]] - posed.t[rows.keyframe[63]]) / MINUTE
+    minutes = (built.t[rows.keyframe[63:]] - built.t[rows.keyframe[63]]) / MINUTE
     for column in range(6):
         axis, size = column % 3, np.ones_like(minutes) if column < 3 else minutes
         p = rows.p_n.copy()
         p[63:, axis] += delta * size
         shifted = replace(rows, p_n=p)
-        other = replace(posed, constraints=tuple(shifted if c is rows else c for c in posed.constraints))
+        other = replace(built, constraints=tuple(shifted if c is rows else c for c in built.constraints))
         change = (refilter(other, about).records[rows.name].residual - plain) / delta
         # innovations are the negative of residuals, in axes of the fix
         kind = slice(0, 3) if column < 3 else slice(3, 6)
@@ -144,9 +144,9 @@ def test_signature_is_the_derivative_of_the_innovations(posed: Problem, monkeypa
         assert np.allclose(change[63:160], -G[:, :, axis], atol=0.02), column
 
 
-def test_filter_and_its_tests_are_the_filter_where_nothing_is_wrong(posed: Problem) -> None:
-    about = ekf(posed)
-    watched, plain = refilter(posed, about, watch=True), refilter(posed, about)
+def test_filter_and_its_tests_are_the_filter_where_nothing_is_wrong(built: Problem) -> None:
+    about = ekf(built)
+    watched, plain = refilter(built, about, watch=True), refilter(built, about)
     assert watched.weights
     assert all(np.all(w == 1.0) for w in watched.weights.values())
     np.testing.assert_allclose(watched.states.p, plain.states.p, rtol=0.0, atol=1e-9)
@@ -204,9 +204,9 @@ def test_more_wrong_than_right_is_not_believed(drive: tuple[Recording, Trajector
 # ---------------------------------------------------------------------------------------------------------- parts
 
 
-def test_a_filter_astray_gives_up_what_led_it_there(posed: Problem) -> None:
-    rows = next(c for c in posed.constraints if c.name == "gnss_position")
-    t, used = posed.t[rows.keyframe], np.ones(len(rows))
+def test_a_filter_astray_gives_up_what_led_it_there(built: Problem) -> None:
+    rows = next(c for c in built.constraints if c.name == "gnss_position")
+    t, used = built.t[rows.keyframe], np.ones(len(rows))
     verdicts = Verdicts({rows.name: t}, {rows.name: used})
     verdicts.settle(rows.name, t[100], t[109])  # a fault
     assert not used[100:110].any()
@@ -219,14 +219,14 @@ def test_a_filter_astray_gives_up_what_led_it_there(posed: Problem) -> None:
     assert used[115 : k + 1].all()
 
 
-def test_spans_and_back(posed: Problem) -> None:
-    rows = next(c for c in posed.constraints if c.name == "gnss_position")
+def test_spans_and_back(built: Problem) -> None:
+    rows = next(c for c in built.constraints if c.name == "gnss_position")
     weight = np.ones(len(rows))
     weight[[3, 4, 5, 9]] = 0.0
-    problem = faults.weigh_rows(posed, {rows.name: weight})
+    problem = faults.weigh_rows(built, {rows.name: weight})
     found = faults.fault_spans(problem)
     assert [(f.count, f.kind) for f in found] == [(3, rows.name), (1, rows.name)]
-    t = posed.t[rows.keyframe]
+    t = built.t[rows.keyframe]
     assert [(f.t_start, f.t_end) for f in found] == [(t[3], t[5]), (t[9], t[9])]
 
 
@@ -271,18 +271,18 @@ def test_noise_is_weighed_down_and_not_left_out(short: tuple[Recording, Trajecto
 # ---------------------------------------------------------------------------------------------------------- switches
 
 
-def test_kernel_is_of_whole_measurements(posed: Problem) -> None:
+def test_kernel_is_of_whole_measurements(built: Problem) -> None:
     """A fix with 2 sigma on each of three axes is beyond a scale of 3, one with 2 sigma on one is not."""
-    rows = next(c for c in posed.constraints if c.name == "gnss_position")
-    layout = Layout(posed)
-    point = Iterate(backward(posed, ekf(posed)).states, {c.parameter.name: c.mean for c in posed.chains})
+    rows = next(c for c in built.constraints if c.name == "gnss_position")
+    layout = Layout(built)
+    point = Iterate(backward(built, ekf(built)).states, {c.parameter.name: c.mean for c in built.chains})
     linear = rows.linearize(point.states[rows.keyframe], {}, slice(None))
     p = rows.p_n + np.einsum("nji,nj->ni", rows.R_ln, linear.residual)  # nothing left
     for axes, weighed in ((3, True), (1, False)):
         q = p.copy()
         q[100] -= rows.R_ln[100].T @ (np.arange(3) < axes) * 2.0 * rows.sigma[100]
         bent = replace(rows, p_n=q, robust="gnc", robust_scale=3.0)
-        problem = replace(posed, constraints=tuple(bent if c is rows else c for c in posed.constraints))
+        problem = replace(built, constraints=tuple(bent if c is rows else c for c in built.constraints))
         at = 1 + [c.name for c in problem.constraints].index(rows.name) + 1  # behind intervals and prior
         blocks, _ = whiten(problem, point, layout)[0][at]
         assert bool(np.abs(blocks[0][1][100]).max() == 0.0) is weighed

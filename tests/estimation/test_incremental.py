@@ -61,7 +61,7 @@ def drive() -> tuple[Recording, Trajectory]:
 
 
 @pytest.fixture(scope="module")
-def posed(drive: tuple[Recording, Trajectory]) -> Problem:
+def built(drive: tuple[Recording, Trajectory]) -> Problem:
     """All constraints, slow errors of the fixes, a stop; from a start a few degrees wrong."""
     recording, truth = drive
     frame = LocalFrame(recording.gnss.llh[0])
@@ -75,14 +75,14 @@ def posed(drive: tuple[Recording, Trajectory]) -> Problem:
 
 
 @pytest.fixture(scope="module")
-def solved(posed: Problem) -> Solution:
-    smoothed = backward(posed, ekf(posed))
-    return batch(posed, smoothed.states, smoothed.nodes(posed), reintegrate=False)
+def solved(built: Problem) -> Solution:
+    smoothed = backward(built, ekf(built))
+    return batch(built, smoothed.states, smoothed.nodes(built), reintegrate=False)
 
 
 # ------------------------------------------------------------------------------------------------------- exactness
-def test_with_all_the_future_it_is_the_batch_solution(posed: Problem, solved: Solution) -> None:
-    found = incremental(posed, lag=EVERYTHING).settled
+def test_with_all_the_future_it_is_the_batch_solution(built: Problem, solved: Solution) -> None:
+    found = incremental(built, lag=EVERYTHING).settled
     assert np.abs(apart(found, solved)).max() < 2e-3
     np.testing.assert_allclose(sigmas(found), sigmas(solved), rtol=1e-3)
     for name, p in solved.parameters.items():
@@ -91,11 +91,11 @@ def test_with_all_the_future_it_is_the_batch_solution(posed: Problem, solved: So
         np.testing.assert_allclose(own.sigma, p.sigma, rtol=1e-3, err_msg=name)
 
 
-def test_a_window_is_the_dense_least_squares_solution(drive: tuple[Recording, Trajectory], posed: Problem) -> None:
+def test_a_window_is_the_dense_least_squares_solution(drive: tuple[Recording, Trajectory], built: Problem) -> None:
     """Ten seconds against one QR of all rows as `helpers.factors` makes them, with none of the solver's code."""
-    part = posed.recording.crop(40.0, 50.0)
-    start = truth_states(drive[1], np.round(np.array([part.start]), 6), posed.frame)
-    problem = with_noise(build_problem(part, posed.settings, posed.frame, start, posed.prior.sigma[0]), LASTING)
+    part = built.recording.crop(40.0, 50.0)
+    start = truth_states(drive[1], np.round(np.array([part.start]), 6), built.frame)
+    problem = with_noise(build_problem(part, built.settings, built.frame, start, built.prior.sigma[0]), LASTING)
     found = incremental(problem, lag=EVERYTHING).settled
     parts, widths = factors(problem, found.states, {n: p.value for n, p in found.parameters.items()})
     step, covariance = dense(parts, widths)
@@ -105,18 +105,18 @@ def test_a_window_is_the_dense_least_squares_solution(drive: tuple[Recording, Tr
     np.testing.assert_allclose(sigmas(found).ravel(), sd[: DIM * K], rtol=2e-3)
 
 
-def test_the_live_estimate_is_the_end_of_a_batch_solution_so_far(posed: Problem) -> None:
-    live = incremental(posed, lag=EVERYTHING).live
-    speed = next(rows.speed for rows in posed.constraints if isinstance(rows, OdometerSpeed))
+def test_the_live_estimate_is_the_end_of_a_batch_solution_so_far(built: Problem) -> None:
+    live = incremental(built, lag=EVERYTHING).live
+    speed = next(rows.speed for rows in built.constraints if isinstance(rows, OdometerSpeed))
     for end in (60.0, 130.0, 200.0):  # the second in the outage
         # what the odometer is worth is told from its readings: the same ones
-        part = build_problem(posed.recording.crop(0.0, end), posed.settings, posed.frame, posed.prior.mean,
-                    posed.prior.sigma[0], np.array([[0.0, 8.0]]), speed=speed)  # fmt: skip
+        part = build_problem(built.recording.crop(0.0, end), built.settings, built.frame, built.prior.mean,
+                    built.prior.sigma[0], np.array([[0.0, 8.0]]), speed=speed)  # fmt: skip
         part = with_noise(part, LASTING)
         smoothed = backward(part, ekf(part))
         so_far = batch(part, smoothed.states, smoothed.nodes(part), reintegrate=False)
-        k = int(np.searchsorted(posed.t, part.t[-1] - 1e-6))
-        assert posed.t[k] == pytest.approx(part.t[-1], abs=1e-6)
+        k = int(np.searchsorted(built.t, part.t[-1] - 1e-6))
+        assert built.t[k] == pytest.approx(part.t[-1], abs=1e-6)
         assert np.abs((live.states[k : k + 1].minus(so_far.states[-1:])) / sigmas(so_far)[-1]).max() < 0.1
         np.testing.assert_allclose(sigmas(live)[k], sigmas(so_far)[-1], rtol=0.01)
 
@@ -174,29 +174,29 @@ def fill(window: Window, problem: Problem, first: int, last: int, steps: dict[in
         window.push(Place(float(problem.t[k]), problem, k, steps.get(k, ()), linked=k > 0))
 
 
-def test_taking_keyframes_back_and_adding_them_again_changes_nothing(posed: Problem) -> None:
-    steps = list_node_steps(posed)
-    one, two = (Window(make_first_message(posed.prior.mean, posed.prior.sigma[0]), 1e-3) for _ in range(2))
-    fill(one, posed, 0, 60, steps)
-    fill(two, posed, 0, 60, steps)
+def test_taking_keyframes_back_and_adding_them_again_changes_nothing(built: Problem) -> None:
+    steps = list_node_steps(built)
+    one, two = (Window(make_first_message(built.prior.mean, built.prior.sigma[0]), 1e-3) for _ in range(2))
+    fill(one, built, 0, 60, steps)
+    fill(two, built, 0, 60, steps)
     two.truncate(35)
     assert len(two) == 35
-    fill(two, posed, 35, 60, steps)
+    fill(two, built, 35, 60, steps)
     np.testing.assert_allclose(two.newest.state.minus(one.newest.state), 0.0, atol=1e-12)
     np.testing.assert_allclose(two.newest.covariance, one.newest.covariance, rtol=1e-6, atol=1e-15)
 
 
-def test_size_does_not_grow_with_the_drive(posed: Problem) -> None:
+def test_size_does_not_grow_with_the_drive(built: Problem) -> None:
     """Keyframes in the window and numbers in a stage, over the drive run through three times."""
-    solver = Incremental(Window(make_first_message(posed.prior.mean, posed.prior.sigma[0]), 1e-3), lag=20.0)
-    steps, sizes = list_node_steps(posed), []
-    for k in range(len(posed.t)):
-        solver.add(Place(float(posed.t[k]), posed, k, steps.get(k, ()), linked=k > 0))
+    solver = Incremental(Window(make_first_message(built.prior.mean, built.prior.sigma[0]), 1e-3), lag=20.0)
+    steps, sizes = list_node_steps(built), []
+    for k in range(len(built.t)):
+        solver.add(Place(float(built.t[k]), built, k, steps.get(k, ()), linked=k > 0))
         sizes.append((len(solver.window), solver.window.newest.R.size))
     most = 20 * 1.2 + 3
     assert max(size for size, _ in sizes[40:]) <= most + 3
     assert len({cells for _, cells in sizes}) == 1
-    assert sum(len(part) for part in solver.settled) + len(solver.window) == len(posed.t)
+    assert sum(len(part) for part in solver.settled) + len(solver.window) == len(built.t)
     t = np.concatenate([part.t for part in solver.settled])
     assert np.all(np.diff(t) > 0)
 
@@ -243,10 +243,10 @@ def test_real_program_run(shared_data: Path, name: str) -> None:
     assert "solver.step_times" in map(key_of, a.notes)
 
 
-def test_what_smooths_back_is_the_whole_matrix(posed: Problem) -> None:
+def test_what_smooths_back_is_the_whole_matrix(built: Problem) -> None:
     """Of which a stage keeps the rows that are not those of the identity."""
-    window, steps = Window(make_first_message(posed.prior.mean, posed.prior.sigma[0]), 1e-3), list_node_steps(posed)
-    fill(window, posed, 0, 90, steps)
+    window, steps = Window(make_first_message(built.prior.mean, built.prior.sigma[0]), 1e-3), list_node_steps(built)
+    fill(window, built, 0, 90, steps)
     P = window.newest.covariance
     for stage in reversed(window.stages[1:]):
         G, noise = stage.back(np.eye(len(P))), np.zeros((len(stage.g), len(stage.g)))
@@ -257,36 +257,36 @@ def test_what_smooths_back_is_the_whole_matrix(posed: Problem) -> None:
         np.testing.assert_allclose(P / scale / scale[:, None], expected / scale / scale[:, None], atol=1e-12)
 
 
-def test_covariances_come_in_portions_as_at_once(posed: Problem) -> None:
+def test_covariances_come_in_portions_as_at_once(built: Problem) -> None:
     """Of what was known when the first was asked for; and of what is known now once keyframes were taken back."""
-    steps = list_node_steps(posed)
-    one, two = (Window(make_first_message(posed.prior.mean, posed.prior.sigma[0]), 1e-3) for _ in range(2))
+    steps = list_node_steps(built)
+    one, two = (Window(make_first_message(built.prior.mean, built.prior.sigma[0]), 1e-3) for _ in range(2))
     for window in (one, two):
-        fill(window, posed, 0, 90, steps)
-    fill(two, posed, 90, 100, steps)
+        fill(window, built, 0, 90, steps)
+    fill(two, built, 90, 100, steps)
     two.truncate(90)
     assert not two.smooth_back(20, 7)
     two.truncate(80)
-    fill(two, posed, 80, 90, steps)
+    fill(two, built, 80, 90, steps)
     assert not two.leaving
     while not two.smooth_back(20, 7):
         if len(two) < 95:
-            fill(two, posed, len(two), len(two) + 1, steps)
+            fill(two, built, len(two), len(two) + 1, steps)
     assert two.leaving == 20
     found, expected = two.settle(20).covariance, one.settle(20).covariance
     sd = np.sqrt(np.einsum("kii->ki", expected))  # about states that differ by what came meanwhile
     np.testing.assert_allclose((found - expected) / sd[:, None] / sd[..., None], 0.0, atol=1e-3)
 
 
-def test_linearised_again_in_portions_it_is_the_same(posed: Problem) -> None:
+def test_linearised_again_in_portions_it_is_the_same(built: Problem) -> None:
     """At once and in portions; and while keyframes come and some are taken back and made again."""
-    steps = list_node_steps(posed)
-    whole, parts, moving = (Window(make_first_message(posed.prior.mean, posed.prior.sigma[0]), 1e-3) for _ in range(3))
+    steps = list_node_steps(built)
+    whole, parts, moving = (Window(make_first_message(built.prior.mean, built.prior.sigma[0]), 1e-3) for _ in range(3))
 
     def revise(window: Window) -> bool:
-        # posed anew, as a running drive does: what has been linearised again keeps no rows
+        # built anew, as a running drive does: what has been linearised again keeps no rows
         def places(begin: int, end: int) -> list[Place]:
-            return [Place(float(posed.t[k]), posed, k, steps.get(k, ()), linked=k > 0) for k in range(begin, end)]
+            return [Place(float(built.t[k]), built, k, steps.get(k, ()), linked=k > 0) for k in range(begin, end)]
 
         return window.revise(16, places, always=True)
 
@@ -295,17 +295,17 @@ def test_linearised_again_in_portions_it_is_the_same(posed: Problem) -> None:
         return settled.states.minus(reference), np.sqrt(np.diagonal(settled.covariance, axis1=1, axis2=2))
 
     for window in (whole, parts):
-        fill(window, posed, 0, 90, steps)
-    fill(moving, posed, 0, 60, steps)
+        fill(window, built, 0, 90, steps)
+    fill(moving, built, 0, 60, steps)
     assert whole.converge(always=True) > 0
     while revise(parts):
         assert parts.revising
     for first, last in ((60, 70), (70, 75)):
         assert revise(moving)
-        fill(moving, posed, first, last, steps)
+        fill(moving, built, first, last, steps)
     assert revise(moving)
     moving.truncate(40)  # within what has been made
-    fill(moving, posed, 40, 90, steps)
+    fill(moving, built, 40, 90, steps)
     assert moving.relinearized == 0
     while revise(moving):
         pass

@@ -66,7 +66,7 @@ def drive() -> Drive:
 
 
 @pytest.fixture(scope="module")
-def posed(drive: Drive) -> Problem:
+def built(drive: Drive) -> Problem:
     """With all constraints and errors that last."""
     recording, start, still = drive
     settings = settings_from({"gnss": {"lever_arm_sigma": 0.2}})
@@ -77,13 +77,13 @@ def posed(drive: Drive) -> Problem:
 
 
 @pytest.fixture(scope="module")
-def solved(posed: Problem) -> Solution:
-    smoothed = backward(posed, ekf(posed))
-    return batch(posed, smoothed.states, smoothed.nodes(posed))
+def solved(built: Problem) -> Solution:
+    smoothed = backward(built, ekf(built))
+    return batch(built, smoothed.states, smoothed.nodes(built))
 
 
-def test_over_the_whole_drive_it_is_the_batch_solution(posed: Problem, solved: Solution) -> None:
-    found = isam2(posed).settled
+def test_over_the_whole_drive_it_is_the_batch_solution(built: Problem, solved: Solution) -> None:
+    found = isam2(built).settled
     assert apart(found, solved).max() < 5e-3
     np.testing.assert_allclose(sigmas(found), sigmas(solved), rtol=1e-3)
     for name, p in solved.parameters.items():
@@ -92,21 +92,21 @@ def test_over_the_whole_drive_it_is_the_batch_solution(posed: Problem, solved: S
         np.testing.assert_allclose(own.sigma[last], p.sigma[last], rtol=2e-3, err_msg=name)
 
 
-def test_a_start_that_is_off_by_sixty_degrees_is_mended_by_relinearisation(posed: Problem, solved: Solution) -> None:
-    mean, sigma = posed.prior.mean, posed.prior.sigma.copy()
+def test_a_start_that_is_off_by_sixty_degrees_is_mended_by_relinearisation(built: Problem, solved: Solution) -> None:
+    mean, sigma = built.prior.mean, built.prior.sigma.copy()
     assert mean is not None
     wrong = replace(mean, R_nb=exp(np.array([[0.0, 0.0, np.pi / 3.0]])) @ mean.R_nb)
     sigma[0, 2] = 1.0
-    problem = replace(posed, prior=replace(posed.prior, mean=wrong, sigma=sigma))
+    problem = replace(built, prior=replace(built.prior, mean=wrong, sigma=sigma))
     best = batch(problem, solved.states)
     found = isam2(problem).settled
     assert apart(found, best).max() < 0.02
     assert np.abs(found.states.p - best.states.p).max() < 1e-3
 
 
-def test_within_a_lag_it_is_the_window(posed: Problem, solved: Solution) -> None:
+def test_within_a_lag_it_is_the_window(built: Problem, solved: Solution) -> None:
     # about the right biases: the window does not integrate again
-    problem = posed.reintegrate(solved.states.ba[:-1], solved.states.bg[:-1])
+    problem = built.reintegrate(solved.states.ba[:-1], solved.states.bg[:-1])
     tree, window = isam2(problem, lag=30.0), incremental(problem, lag=30.0)
     assert apart(tree.settled, window.settled).max() < 0.05
     np.testing.assert_allclose(sigmas(tree.settled), sigmas(window.settled), rtol=0.01)
@@ -135,20 +135,20 @@ def _played(problem: Problem, until: int, lag: float = np.inf, every: int = 5) -
     return tree, slots
 
 
-def test_marginalised_keyframes_leave_nothing_behind(posed: Problem) -> None:
+def test_marginalised_keyframes_leave_nothing_behind(built: Problem) -> None:
     """Factors and variables of a fixed lag stay as many as they were, however long it goes on."""
-    tree, slots = _played(posed, len(posed.t), lag=20.0)
+    tree, slots = _played(built, len(built.t), lag=20.0)
     assert max(slots[-40:]) <= 1.2 * max(slots[30:70])
     assert tree.isam.getLinearizationPoint().size() == len(tree.variables)
 
 
-def test_what_leaves_takes_no_parameter_along_that_is_in_force(posed: Problem) -> None:
+def test_what_leaves_takes_no_parameter_along_that_is_in_force(built: Problem) -> None:
     """The place of a stop, of which all rows leave, stands below their states where GTSAM's order has it first."""
-    tree, _ = _played(posed, 40)
+    tree, _ = _played(built, 40)
     stop, _ = tree.keyframes[-1].nodes["stop_position"]
-    count = int(np.searchsorted(posed.t, 12.0))
+    count = int(np.searchsorted(built.t, 12.0))
     order = [(x, 0 if x is stop else 1 + x.last) for x in tree.variables.values()]
-    update_isam(tree.isam, float(posed.t[39]), order=order, anew=tree.variables.values())
+    update_isam(tree.isam, float(built.t[39]), order=order, anew=tree.variables.values())
     before = settle(tree, begin_elimination(tree, len(tree), count))
     tree.marginalise(count)
     after = settle(tree, begin_elimination(tree, len(tree)))
@@ -159,11 +159,11 @@ def test_what_leaves_takes_no_parameter_along_that_is_in_force(posed: Problem) -
         np.testing.assert_allclose(own, known, rtol=1e-6)
 
 
-def test_relinearised_rows_take_the_place_of_the_old(posed: Problem) -> None:
+def test_relinearised_rows_take_the_place_of_the_old(built: Problem) -> None:
     """Whatever was linearised again, the tree holds each row once: as many as if nothing had been."""
-    tree, _ = _played(posed, 40)
+    tree, _ = _played(built, 40)
     assert tree.relinearised > 0
-    never, _ = _played(posed, 40, every=1000)
+    never, _ = _played(built, 40, every=1000)
     assert never.relinearised == 0
     factors = tree.isam.getFactorsUnsafe()
     alive = [i for i in range(factors.size()) if factors.at(i) is not None]
@@ -175,9 +175,9 @@ def test_relinearised_rows_take_the_place_of_the_old(posed: Problem) -> None:
     )
 
 
-def test_taken_back_keyframes_are_as_if_they_had_never_come(posed: Problem) -> None:
-    tree, _ = _played(posed, 60)
-    other, _ = _played(posed, 50)
+def test_taken_back_keyframes_are_as_if_they_had_never_come(built: Problem) -> None:
+    tree, _ = _played(built, 60)
+    other, _ = _played(built, 50)
     tree.truncate(50)
     tree.read(), other.read()
     a, b = tree.newest, other.newest
@@ -212,16 +212,16 @@ def test_keyframes_come_again_after_others_were_taken_back(drive: Drive) -> None
     np.testing.assert_allclose(a.covariance[:, range(15), range(15)], b.covariance[:, range(15), range(15)], rtol=0.01)
 
 
-def test_a_tree_made_again_from_its_rows_goes_on_as_before(posed: Problem) -> None:
+def test_a_tree_made_again_from_its_rows_goes_on_as_before(built: Problem) -> None:
     """What a checkpoint keeps of it, in the middle of a lag, with keyframes already marginalised."""
     import pickle
 
-    tree, _ = _played(posed, 60, lag=20.0)
+    tree, _ = _played(built, 60, lag=20.0)
     again = pickle.loads(pickle.dumps(tree))
-    steps = list_node_steps(posed)
+    steps = list_node_steps(built)
     for k in range(60, 80):
         for one in (tree, again):
-            one.add(Place(float(posed.t[k]), posed, k, steps.get(k, ()), linked=True))
+            one.add(Place(float(built.t[k]), built, k, steps.get(k, ()), linked=True))
             one.relinearise()
     a, b = (settle(one, begin_elimination(one, len(one))) for one in (tree, again))
     np.testing.assert_allclose(a.states.p, b.states.p, atol=1e-6)
@@ -229,10 +229,10 @@ def test_a_tree_made_again_from_its_rows_goes_on_as_before(posed: Problem) -> No
     assert isinstance(a.states, States)
 
 
-def test_covariances_from_the_other_end_are_the_marginals_of_the_tree(posed: Problem) -> None:
+def test_covariances_from_the_other_end_are_the_marginals_of_the_tree(built: Problem) -> None:
     """Of keyframes that are to leave a lag, in portions with others coming meanwhile, and after a relinearisation."""
-    tree, _ = _played(posed, 60, lag=40.0)
-    steps = list_node_steps(posed)
+    tree, _ = _played(built, 60, lag=40.0)
+    steps = list_node_steps(built)
     for again in (False, True):
         leaving, count = eliminate(tree, begin_elimination(tree, 6), 20), 6
         if again:
@@ -241,7 +241,7 @@ def test_covariances_from_the_other_end_are_the_marginals_of_the_tree(posed: Pro
         unit = tree.keyframes[0].state.unit
         if not again:
             k = tree.keyframes[-1].place.k + 1
-            tree.add(Place(float(posed.t[k]), posed, k, steps.get(k, ()), linked=True))
+            tree.add(Place(float(built.t[k]), built, k, steps.get(k, ()), linked=True))
         delta = read_keyframes(tree, 0, count).delta if again else leaving.estimates.delta
         found = settle(tree, leaving)
         own = move_covariance(unit[:, None] * np.array(expected) * unit, delta)

@@ -54,7 +54,7 @@ INERTIAL = settings_from(
 SEEDS = range(3)
 
 
-def posed(recording: Recording, settings: Settings | None = None) -> tuple[Problem, float | None]:
+def built(recording: Recording, settings: Settings | None = None) -> tuple[Problem, float | None]:
     """A problem with stated noise and the parts of its intervals, and what its alignment has seen."""
     settings = settings or Settings()
     frame, stops = LocalFrame(origin(recording)), detect(recording, settings).stationary
@@ -104,7 +104,7 @@ def lap() -> Recording:
 @pytest.mark.parametrize("row", [40, 80])
 def test_what_a_row_is_off_by_is_that_of_a_smoother_without_it(row: int) -> None:
     """Over all axes: a stamp that is wrong moves them all alike, and is no reason for an error across it."""
-    base, opening = posed(lap())
+    base, opening = built(lap())
     used, _, about = mixed(base, opening)
 
     def smooth(without: bool) -> tuple[Constraint, SmootherPass]:
@@ -128,7 +128,7 @@ def test_what_a_row_is_off_by_is_that_of_a_smoother_without_it(row: int) -> None
 
 def test_moments_are_the_derivative_of_the_likelihood() -> None:
     """A - B of every component, against the innovations' likelihood by central differences in ln f."""
-    base, opening = posed(lap())
+    base, opening = built(lap())
     used, noise, about = mixed(base, opening)
     forward = refilter(used, about)
     found = moments(used, forward, backward(used, forward))
@@ -156,7 +156,7 @@ def mixed(base: Problem, opening: float | None) -> tuple[Problem, NoiseModel, Sm
 
 def test_a_pass_for_a_noise_model_says_what_one_with_all_covariances_says() -> None:
     """Rows linearised where it leads, of other sigmas too, and the next pass by them."""
-    stated, opening = posed(lap())
+    stated, opening = built(lap())
     base, noise, about = mixed(stated, opening)
     whole = backward(base, refilter(base, about))
     short = backward_moments(base, refilter(base, about, whole=False))
@@ -181,7 +181,7 @@ def test_a_pass_for_a_noise_model_says_what_one_with_all_covariances_says() -> N
 
 def test_lag_moments_are_the_derivative_of_the_likelihood_by_the_correlation_time() -> None:
     """Fisher's identity: the derivative of what expectation and maximisation goes by is that of the likelihood."""
-    base, opening = posed(lap())
+    base, opening = built(lap())
     used, noise, about = mixed(base, opening)
     forward = refilter(used, about)
     smoothed = backward(used, forward)
@@ -215,7 +215,7 @@ def test_factors_of_the_imu_are_those_of_its_figures() -> None:
     """Covariances from their parts, against intervals of an IMU whose figures are so many times as large."""
     recording = lap().crop(0.0, 60.0)
     imu, factors = recording.imu, np.array([9.0, 0.25, 4.0, 100.0])
-    base, _ = posed(recording)
+    base, _ = built(recording)
     figures = {
         name: float(np.sqrt(f)) * getattr(imu.noise, name) for name, f in zip(NOISE_FIGURES, factors, strict=True)
     }
@@ -241,7 +241,7 @@ def test_factors_of_the_imu_are_those_of_its_figures() -> None:
 
 def test_stated_noise_is_what_recording_and_settings_say() -> None:
     recording = lap().crop(0.0, 60.0)
-    base, _ = posed(recording)
+    base, _ = built(recording)
     used = with_noise(base, STATED)
     assert used.intervals is base.intervals
     assert used.columns == base.columns
@@ -253,7 +253,7 @@ def test_stated_noise_is_what_recording_and_settings_say() -> None:
 
 
 def test_factors_of_rows_and_processes_are_of_their_own_components() -> None:
-    base, _ = posed(lap().crop(0.0, 60.0))
+    base, _ = built(lap().crop(0.0, 60.0))
     noise = NoiseModel(
         {
             "gnss_position.float.up": VarianceComponent(np.log(4.0)),
@@ -344,7 +344,7 @@ def made(path: oracle.ExactPath, seed: int, imu: float = 1.0, fixes: float = 1.0
     recording, truth = oracle.drive(path, seed=seed)
     recording = with_wrong_stamps(with_lasting_errors(recording, SHARES, seed), truth, seed)
     recording = stating(recording, imu, fixes)
-    base, opening = posed(recording, INERTIAL)
+    base, opening = built(recording, INERTIAL)
     true = dict.fromkeys(groups(base), 0.0)
     for name in true:
         of_fixes = name.startswith("gnss") and name != STAMPS
@@ -442,7 +442,7 @@ def test_an_odometer_that_is_wrong_for_seconds(nhc: bool) -> None:
         wrong = 0.3 * markov(odometer.t, 3.0, np.random.default_rng([seed, 5]), 1)[:, 0]
         speed = odometer.speed + wrong * (np.abs(odometer.speed) > 1e-3)
         settings = settings_from({"vehicle": {"nhc": nhc}})
-        base, opening = posed(replace(recording, odometer=replace(odometer, speed=speed)), settings)
+        base, opening = built(replace(recording, odometer=replace(odometer, speed=speed)), settings)
         noise = estimate_noise(base, opening).noise
         process = next(p for c in base.constraints if c.name == "odometer" for p in c.processes)
         found.append(
@@ -454,7 +454,7 @@ def test_an_odometer_that_is_wrong_for_seconds(nhc: bool) -> None:
 
 
 def test_sensors_in_any_order_give_the_same() -> None:
-    base, opening = posed(lap())
+    base, opening = built(lap())
     turned = replace(base, constraints=base.constraints[::-1])
     one, other = estimate_noise(base, opening), estimate_noise(turned, opening)
     assert one.passes == other.passes
@@ -464,7 +464,7 @@ def test_sensors_in_any_order_give_the_same() -> None:
 
 
 def test_an_estimate_that_cannot_begin_at_the_medians_begins_with_stated_noise(monkeypatch: pytest.MonkeyPatch) -> None:
-    base, opening = posed(lap())
+    base, opening = built(lap())
     usual = estimate_noise(base, opening)
 
     def find(problem: Problem, until: float | None) -> tuple[list[Initial], int]:
@@ -485,7 +485,7 @@ def test_disturbances_of_intervals_are_as_large_as_chance_has_them() -> None:
     recording, _ = oracle.drive(
         oracle.vehicle_path(duration=300, rate=50.0, seed=4), seed=2, gnss_velocity_sd=(0.05, 0.05, 0.08)
     )
-    base, opening = posed(recording, INERTIAL)
+    base, opening = built(recording, INERTIAL)
     forward = refilter(base, backward(base, ekf(base, opening=opening)))
     found = imu_moments(base, forward, backward(base, forward))
     for i in range(2):
@@ -497,7 +497,7 @@ def test_disturbances_of_intervals_are_as_large_as_chance_has_them() -> None:
 
 
 def test_intervals_have_factors_that_stay_when_they_are_integrated_anew() -> None:
-    base, _ = posed(lap().crop(0.0, 60.0))
+    base, _ = built(lap().crop(0.0, 60.0))
     noise = NoiseModel(weights={"imu.gyro": RowWeights(base.t[[7]], np.array([0.01]))})
     used = with_noise(base, noise)
     more = used.intervals.covariance - base.intervals.covariance
@@ -650,7 +650,7 @@ def test_stamps_on_arrival_are_an_error_of_time(late: tuple[Recording, Trajector
 
 
 def test_each_fix_has_a_stamp_error_of_its_own(late: tuple[Recording, Trajectory]) -> None:
-    base, _ = posed(late[0])
+    base, _ = built(late[0])
     some = with_noise(base, NoiseModel({STAMPS: VarianceComponent(0.0, 1.0, 0.0, 1.0, 0.0)}))
     rows = next(rows for rows in some.constraints if rows.name == "gnss_position")
     chain = next(chain for chain in some.chains if chain.parameter.name == STAMP_ERROR)
@@ -658,10 +658,10 @@ def test_each_fix_has_a_stamp_error_of_its_own(late: tuple[Recording, Trajectory
 
 
 def test_a_constant_far_beyond_its_prior_is_said(late: tuple[Recording, Trajectory]) -> None:
-    base, opening = posed(late[0])
+    base, opening = built(late[0])
     (line,) = describe_far(base, backward(base, ekf(base, opening=opening)))
     (shown,) = components("gnss_time_offset", 1, "s")
     assert line.startswith(shown.words)
     assert shown.unit in line
-    well, opening = posed(oracle.drive(oracle.vehicle_path(duration=200, rate=50.0, seed=6), seed=5)[0])
+    well, opening = built(oracle.drive(oracle.vehicle_path(duration=200, rate=50.0, seed=6), seed=5)[0])
     assert not describe_far(well, backward(well, ekf(well, opening=opening)))

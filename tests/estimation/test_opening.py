@@ -26,7 +26,7 @@ class Start:
     opening: float
 
 
-def posed(shared_data: Path, seed: int) -> Start:
+def built(shared_data: Path, seed: int) -> Start:
     recording, _ = oracle.oracle_drive(shared_data, seed, odometer=False)
     settings = settings_from({"gnss": WHITE, "vehicle": NO_WHEELS})
     frame = LocalFrame(recording.gnss.llh[0])
@@ -42,7 +42,7 @@ def posed(shared_data: Path, seed: int) -> Start:
 
 @pytest.fixture(scope="module")
 def start(shared_data: Path) -> Start:
-    return posed(shared_data, 0)
+    return built(shared_data, 0)
 
 
 def test_the_smoother_is_the_batch_solution_where_the_vehicle_stood(shared_data: Path) -> None:
@@ -53,7 +53,7 @@ def test_the_smoother_is_the_batch_solution_where_the_vehicle_stood(shared_data:
         solved = batch(start.problem, smoothed.states, {n: p.value for n, p in smoothed.parameters.items()})
         return float(np.abs(smoothed.states.minus(solved.states) / sigmas(solved)).max())
 
-    drives = [posed(shared_data, seed) for seed in range(3)]
+    drives = [built(shared_data, seed) for seed in range(3)]
     assert max(off(drive, None) for drive in drives) > 1.0  # or the test would show nothing
     assert max(off(drive, drive.opening) for drive in drives) < 0.2
 

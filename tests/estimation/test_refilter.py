@@ -32,7 +32,7 @@ from graphnav.imu.dynamics import SCALE
 
 
 @pytest.fixture(scope="module")
-def posed() -> Problem:
+def built() -> Problem:
     """Every constraint of a vehicle, fixes with velocities and errors that last."""
     recording, _ = oracle.drive(
         oracle.vehicle_path(duration=200, rate=50.0, seed=7),
@@ -61,37 +61,37 @@ def derivative(f: object, width: int, eps: float = 1e-5) -> Array:
     return np.stack([(f(e) - f(-e)) / (2.0 * eps) for e in steps], axis=-1)
 
 
-def test_steps_and_rows_at_points_are_those_of_an_estimate_to_first_order(posed: Problem) -> None:
-    smoothed = backward(posed, ekf(posed))
+def test_steps_and_rows_at_points_are_those_of_an_estimate_to_first_order(built: Problem) -> None:
+    smoothed = backward(built, ekf(built))
     rng = np.random.default_rng(1)
     off = np.concatenate(
         [
-            0.05 * rng.standard_normal((len(posed.t), 3)),
-            rng.standard_normal((len(posed.t), 6)),
-            1e-4 * rng.standard_normal((len(posed.t), 6)),
+            0.05 * rng.standard_normal((len(built.t), 3)),
+            rng.standard_normal((len(built.t), 6)),
+            1e-4 * rng.standard_normal((len(built.t), 6)),
         ],
         axis=1,
     )
     points = Points(smoothed.states.plus(off), smoothed.values)
-    K, D = len(posed.t), DIM + points.values.shape[1]
-    stack, steps = Stack(posed, K), advance(posed, K)
-    F = np.empty((K - 1, DIM, posed.columns[SCALE].stop))
+    K, D = len(built.t), DIM + points.values.shape[1]
+    stack, steps = Stack(built, K), advance(built, K)
+    F = np.empty((K - 1, DIM, built.columns[SCALE].stop))
     out = Errors(np.empty((K, D)), np.empty((K, D, D)), np.empty((K, D)), np.empty((K, D, D)))
-    given = PointFilter(posed, points, stack, steps, F, out)
+    given = PointFilter(built, points, stack, steps, F, out)
 
     for k in (3, 60, 150):
 
         def ahead(e: Array, k: int = k) -> Array:
             at, to = slice(k - 1, k), slice(k, k + 1)
             values = points.values[at] + e[DIM:]
-            reached, _ = predict_states(posed, at, points.states[at].plus(e[None, :DIM]), values)
+            reached, _ = predict_states(built, at, points.states[at].plus(e[None, :DIM]), values)
             return np.concatenate([reached.minus(points.states[to]), steps.ahead(at, values) - points.values[to]], 1)[0]
 
         np.testing.assert_allclose(given.gap[k - 1], ahead(np.zeros(D)), atol=1e-9)
         whole = move(given.F[k - 1], steps.decay[k - 1], np.eye(D))
         np.testing.assert_allclose(whole, derivative(ahead, D), atol=2e-5, rtol=1e-4)
         for some in stack.together(k):
-            own = [linearise(rows, points, posed.columns, slice(lo, hi)) for rows, lo, hi in some.parts]
+            own = [linearise(rows, points, built.columns, slice(lo, hi)) for rows, lo, hi in some.parts]
             np.testing.assert_allclose(
                 given.r[some.at], np.concatenate([one.residual.ravel() for one in own]), atol=1e-12
             )
@@ -100,15 +100,15 @@ def test_steps_and_rows_at_points_are_those_of_an_estimate_to_first_order(posed:
             )
 
 
-def test_rows_taken_together_are_those_taken_one_after_another(posed: Problem) -> None:
+def test_rows_taken_together_are_those_taken_one_after_another(built: Problem) -> None:
     """A gate that nothing meets makes the filter decide on every kind by itself."""
     weight = np.where(np.arange(200) % 7 == 3, 0.0, 0.3 + 0.7 * (np.arange(200) % 3 == 0))
     some = tuple(
-        replace(c, weight=np.resize(weight, len(c)) if c.name.startswith("gnss") else None) for c in posed.constraints
+        replace(c, weight=np.resize(weight, len(c)) if c.name.startswith("gnss") else None) for c in built.constraints
     )
-    together = replace(posed, constraints=some)
-    apart = replace(posed, constraints=tuple(replace(c, gate=1e9) for c in some))
-    points = backward(posed, ekf(posed))
+    together = replace(built, constraints=some)
+    apart = replace(built, constraints=tuple(replace(c, gate=1e9) for c in some))
+    points = backward(built, ekf(built))
     one, other = refilter(together, points), refilter(apart, points)
     sigma = np.sqrt(np.diagonal(other.P, axis1=1, axis2=2))
     np.testing.assert_allclose(one.errors / sigma, other.errors / sigma, atol=1e-6)
@@ -122,22 +122,22 @@ def test_rows_taken_together_are_those_taken_one_after_another(posed: Problem) -
         assert np.array_equal(mine.weight, theirs.weight)
 
 
-def test_filtered_again_about_its_own_end_it_is_the_batch_solution(posed: Problem) -> None:
+def test_filtered_again_about_its_own_end_it_is_the_batch_solution(built: Problem) -> None:
     """Bell 1994: the iterated smoother is Gauss and Newton's method on the whole drive."""
-    smoothed = backward(posed, ekf(posed))
-    solved = batch(posed, smoothed.states, smoothed.nodes(posed), reintegrate=False)
+    smoothed = backward(built, ekf(built))
+    solved = batch(built, smoothed.states, smoothed.nodes(built), reintegrate=False)
     for _ in range(3):
-        smoothed = backward(posed, refilter(posed, smoothed))
+        smoothed = backward(built, refilter(built, smoothed))
     apart = np.abs(smoothed.states.minus(solved.states)) / sigmas(solved)
     assert np.max(apart) < 0.02  # where batch stops
     mine = np.sqrt(np.diagonal(smoothed.P[:, :DIM, :DIM], axis1=1, axis2=2))
     np.testing.assert_allclose(mine, sigmas(solved), rtol=1e-3)
 
 
-def test_points_that_lead_nowhere_are_given_up(posed: Problem) -> None:
+def test_points_that_lead_nowhere_are_given_up(built: Problem) -> None:
     """From anywhere at all the drive is found, if need be as a filter would."""
-    plain = backward(posed, ekf(posed))
-    _, found = near(posed, scattered_points(posed, 2))
+    plain = backward(built, ekf(built))
+    _, found = near(built, scattered_points(built, 2))
     sigma = np.sqrt(np.diagonal(plain.P[:, :DIM, :DIM], axis1=1, axis2=2))
     assert np.max(np.abs(found.states.minus(plain.states)) / sigma) < 0.5
 

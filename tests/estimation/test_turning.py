@@ -102,7 +102,7 @@ def walk() -> Online:
     return online
 
 
-def posed(online: Online) -> Problem:
+def built(online: Online) -> Problem:
     """The keyframes of it as one problem."""
     tracker = online.tracker
     assert tracker is not None
@@ -120,7 +120,7 @@ def linearised_again(online: Online) -> Window:
 
 
 def test_no_row_that_says_so_feels_a_turn_but_by_the_earths_rate(walk: Online) -> None:
-    problem, rng = posed(walk), np.random.default_rng(5)
+    problem, rng = built(walk), np.random.default_rng(5)
     tried: set[str] = set()
     for rows in problem.constraints:
         states = random_states(rng, len(problem.t), span=500.0)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers import at_rate
-from test_faults import drive, moved, posed, scattered
+from test_faults import built, drive, moved, scattered
 
 from graphnav.config import settings_from
 from graphnav.core.rotation import Array
@@ -24,7 +24,7 @@ from graphnav.estimation.solvers.window import Window, make_first_message
 from graphnav.online import Online, rows_of, without_rows
 from graphnav.recording import Recording
 
-__all__ = ["drive", "posed"]  # fixtures
+__all__ = ["built", "drive"]  # fixtures
 
 
 @pytest.fixture(scope="module")
@@ -39,10 +39,10 @@ def likelihoods(slots: watch._Slots) -> Array:
     return np.where(np.isnan(slots.first), np.nan, np.sum(slots.score * b, axis=1))
 
 
-def test_tests_beside_a_message_are_those_of_the_filter(posed: Problem, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_tests_beside_a_message_are_those_of_the_filter(built: Problem, monkeypatch: pytest.MonkeyPatch) -> None:
     """Two derivations of one thing: a recursion beside a covariance, and columns of a QR."""
-    rows = next(c for c in posed.constraints if c.name == "gnss_position")
-    problem = replace(posed, constraints=(rows,))
+    rows = next(c for c in built.constraints if c.name == "gnss_position")
+    problem = replace(built, constraints=(rows,))
     kept: list[Bank] = []
     follow = Bank.follow
     monkeypatch.setattr(Bank, "follow", lambda self, *a: (kept.append(self), follow(self, *a))[1])

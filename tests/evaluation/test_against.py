@@ -136,6 +136,16 @@ def test_a_delay_is_told_where_there_is_one(ekf, tmp_path, period, late):
     assert ("against.late" in [key_of(note) for note in found.notes]) == (late > 0.0)
 
 
+def test_a_delay_is_left_where_the_file_begins_with_the_recording(ekf, tmp_path):
+    """Which is no sign that it counts from its own start."""
+    early = moved(0.0, -0.2)
+    t = RECORDING.start + 0.02 * np.arange(round((RECORDING.end - RECORDING.start) / 0.02) - 20)
+    write_as("csv", interpolate(early, t)[0], tmp_path / "its.csv", None)
+    found = read_against(Against(tmp_path / "its.csv"), "its", RECORDING, ekf)
+    assert found.track.t[0] == pytest.approx(RECORDING.start)
+    assert "against.late" in [key_of(note) for note in found.notes]
+
+
 @pytest.mark.parametrize(
     ("more", "key", "name"),
     [

@@ -520,6 +520,37 @@ def test_eighteen_seconds_of_utc_are_recognised(tmp_path: Path) -> None:
         evaluation.evaluate(tmp_path / "short.csv", tmp_path / "far.csv")
 
 
+def test_clocks_that_are_known_are_put_on_one(tmp_path: Path) -> None:
+    """A trajectory in seconds of the GPS week, a truth whose zero is a date."""
+    t = np.arange(0.0, 100.0, 0.5)
+    known = circle(t)
+    nav = replace(known, t=t + 364500.0, gps_zero=2130 * 604800.0, v=known.v, rph=np.zeros((len(t), 3)))
+    write_as("nav", nav, tmp_path / "a.nav")
+    recording = "\n".join(
+        [
+            'format = "graphnav-recording/1"', 'platform = "vehicle"', 'clock = "2020-11-05T05:14:42Z"',
+            '[imu]', 'file = "imu.csv"', '[truth]', 'file = "truth.csv"',
+        ]
+    )  # fmt: skip
+    (tmp_path / "recording.toml").write_text(recording)
+    rows = "".join(f"{x:.2f},0,0,0,0,0,9.81\n" for x in np.arange(0.0, 100.0, 0.1))
+    (tmp_path / "imu.csv").write_text("t,gx,gy,gz,ax,ay,az\n" + rows)
+    write_as("csv", known, tmp_path / "truth.csv")
+    found = evaluation.evaluate(tmp_path / "a.nav", tmp_path)
+    assert "against.clock" in map(key_of, found.notes)
+    assert found.errors is not None
+    assert len(found.errors) == len(t)
+    assert found.errors.horizontal.max() < 1e-3
+
+
+def test_a_denser_truth_may_be_of_fixes_with_types_and_satellites() -> None:
+    dense = circle(np.arange(0.0, 60.0, 0.1))
+    fixes = replace(dense, v=None, fix_type=np.ones(len(dense)), satellites=np.full(len(dense), 17.0))
+    found = evaluation.errors(circle(np.arange(1.0, 58.0, 1.0)), fixes)
+    assert len(found) == 57
+    assert found.horizontal.max() < 1e-3
+
+
 def test_the_oracle_drive_against_a_perturbed_copy(shared_data: Path, tmp_path: Path) -> None:
     file = shared_data / "oracle_drive" / "truth.csv.gz"
     truth = evaluation.read_trajectory(file)

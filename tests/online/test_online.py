@@ -208,7 +208,7 @@ def test_what_is_prepared_beside_the_drive_changes_nothing(
     plain: tuple[Online, Trajectory],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Keyframes are posed and predicted before their fix counts: as if they were made at once."""
+    """Keyframes are built and predicted before their fix counts: as if they were made at once."""
     monkeypatch.setattr(Tracker, "_is_covered", lambda *_: False)
     same(played(drive[0], rows)[1], plain[1])
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pickle
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import oracle
@@ -12,7 +13,7 @@ from helpers import refused
 
 from graphnav.config import Settings
 from graphnav.core.errors import RecordingError
-from graphnav.online import Fix, ImuSample, Online, WheelSpeed, live_setup, live_trajectory, rows_of
+from graphnav.online import Fix, ImuSample, Online, WheelSpeed, live_setup, live_trajectory, rows_of, without_rows
 
 SD = (0.02, 0.02, 0.04)
 
@@ -96,3 +97,18 @@ def test_what_is_no_row_is_refused_and_changes_nothing(row: object) -> None:
 def test_what_cannot_be_is_one_plain_line(make: Callable[[], object], key: str, name: str) -> None:
     with refused(key, RecordingError, name):
         make()
+
+
+def test_the_setup_of_a_recording_holds_no_row() -> None:
+    """Whatever a sensor has for each of its rows is left out, so that it cannot be taken for that of another row."""
+    made, _ = oracle.drive(oracle.vehicle_path(120.0, 50.0), odometer_rate=10.0)
+    recording = made.crop(0.0, 20.0)
+    assert recording.gnss is not None
+    assert recording.odometer is not None
+    n, m = len(recording.gnss.t), len(recording.odometer.t)
+    gnss = replace(recording.gnss, type=np.ones(n, dtype=int), satellites=np.full(n, 9.0))
+    odometer = replace(recording.odometer, counted=np.zeros(m), wheels=np.zeros((m, 4)))
+    setup = without_rows(replace(recording, gnss=gnss, odometer=odometer))
+    for sensor, count in ((setup.gnss, n), (setup.odometer, m), (setup.imu, len(recording.imu.t))):
+        kept = [name for name, x in vars(sensor).items() if isinstance(x, np.ndarray) and len(x) == count]
+        assert kept == []

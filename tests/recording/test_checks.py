@@ -18,7 +18,7 @@ import pytest
 from graphnav.app import cli
 from graphnav.estimation.antenna import find_untold_arm, find_wrong_arms
 from graphnav.recording import Recording, take_rows
-from graphnav.recording.checks.crosschecks import fit_yaw
+from graphnav.recording.checks.crosschecks import fit_yaw_rate
 from graphnav.recording.checks.overview import Inspection, inspect
 from graphnav.recording.checks.tracks import compute_track
 from graphnav.recording.formats import read
@@ -512,7 +512,7 @@ def test_a_shift_of_clocks_that_one_turn_leaves_open_spoils_no_other_figure(
 ) -> None:
     recording = drive("oracle_drive").crop(*TURNS_LITTLE)
     assert recording.gnss is not None
-    fit = fit_yaw(recording.imu, compute_track(recording.gnss))
+    fit = fit_yaw_rate(recording.imu, compute_track(recording.gnss))
     assert fit is not None
     assert fit.spread > 1.0
     assert fit.coefficients == pytest.approx([1.0], abs=0.05)

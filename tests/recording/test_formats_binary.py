@@ -151,8 +151,18 @@ def ros_messages(store):
         yield t, "/gps/vel", types["geometry_msgs/msg/TwistStamped"](header(t, "gps"), twist)
 
 
-def write_bag(path: Path, kind: str) -> Path:
-    return logs.write_bag(path, kind, ros_messages, UNIX)
+def wheel_messages(store):
+    """The same drive with a wheel's speed as well, of which there are more messages than of the velocity."""
+    yield from ros_messages(store)
+    types, header = store.types, logs.ros_header(store, UNIX)
+    V = types["geometry_msgs/msg/Vector3"]
+    for t in RECORDING.imu.t[::2]:
+        twist = types["geometry_msgs/msg/Twist"](V(7.0, 0.0, 0.0), V(0.0, 0.0, 0.0))
+        yield t, "/wheel/twist", types["geometry_msgs/msg/TwistStamped"](header(t, "base_link"), twist)
+
+
+def write_bag(path: Path, kind: str, messages=ros_messages) -> Path:
+    return logs.write_bag(path, kind, messages, UNIX)
 
 
 @pytest.mark.parametrize("kind", ["bag", "db3", "mcap", "mcap file"])
@@ -168,6 +178,13 @@ def test_bags_of_every_kind_hold_the_drive(tmp_path, kind):
     assert recording.gnss.sd == pytest.approx(RECORDING.gnss.sd)
     assert recording.gnss.v == pytest.approx(RECORDING.gnss.v)
     assert recording.gps_zero + UNIX == pytest.approx(logs.WEEK * 604800.0 + logs.TOW, abs=1e-6)
+
+
+def test_a_bag_may_hold_both_a_velocity_over_ground_and_a_speed_of_the_wheels(tmp_path):
+    recording = read(write_bag(tmp_path / "a", "db3", wheel_messages))
+    assert recording.gnss.v == pytest.approx(RECORDING.gnss.v)
+    assert recording.odometer.t == pytest.approx(UNIX + RECORDING.imu.t[::2], abs=1e-6)
+    assert recording.odometer.speed == pytest.approx(7.0)
 
 
 def test_a_broken_bag_is_one_plain_line(tmp_path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import pickle
 import re
 from dataclasses import replace
 
@@ -54,6 +55,14 @@ def test_written_and_read_again(drive, tmp_path):
     same(drive, read(tmp_path / "a"))
     convert_log(str(tmp_path / "a"), tmp_path / "b", None)
     same(drive, read(tmp_path / "b"))
+
+
+def test_read_from_a_file_it_can_be_stored_as_a_checkpoint_does(drive, tmp_path):
+    """Reading makes a model of its table, which cannot be."""
+    write_folder(drive, tmp_path)
+    again = pickle.loads(pickle.dumps(read(tmp_path)))
+    same(drive, again)
+    assert all(series.sensor.table.model_fields for series in again.sensors.values())
 
 
 @pytest.mark.parametrize("name", sorted(list_sensors()))

@@ -13,7 +13,7 @@ from graphnav.core.errors import RecordingError
 from graphnav.recording.formats import read
 from graphnav.recording.formats.figures import EXAMPLES, UNITS, parse_figure
 from graphnav.recording.formats.imu_models import MODELS, find_model
-from graphnav.recording.formats.schema import NOISE_FIGURES
+from graphnav.recording.formats.schema import STATED_FIGURES
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -92,7 +92,7 @@ def test_a_model_gives_its_figures_and_the_file_goes_before_it(tmp_path):
 def test_every_model_is_plausible_and_has_a_source(name):
     model = find_model(name.lower())
     assert model is MODELS[name]
-    assert set(model.noise) <= {*NOISE_FIGURES, "gyro_scale_sigma", "accel_scale_sigma"}
+    assert set(model.noise) <= {*STATED_FIGURES, "gyro_scale_sigma", "accel_scale_sigma"}
     assert 5e-7 < model.noise["gyro_noise_density"] < 1e-3
     assert 1e-4 < model.noise["accel_noise_density"] < 1e-2
     assert len(model.source) > 20

@@ -74,7 +74,7 @@ def detected():
 
 T = np.arange(COUNT, dtype=float)
 THREE = np.random.default_rng(0).normal(size=(COUNT, 3))
-FIXES = plots.Fixes(T, THREE, T > 590, {"fixed": T < 300, "float": T >= 300})
+FIXES = plots.DrawnFixes(T, THREE, T > 590, {"fixed": T < 300, "float": T >= 300})
 END = float(COUNT)
 EVERY = {
     "way": lambda: plots.trajectory(
@@ -86,14 +86,14 @@ EVERY = {
     ),
     "profile": lambda: plots.profile({"batch": (T, THREE[:, 2])}, {"fixed": (T, THREE[:, 2])}),
     "bands": lambda: plots.bands(
-        {"rts": plots.Series(T, THREE, np.ones((COUNT, 3)))}, ("a", "b", "c"), "m", END, spans={"withheld": [(3, 9)]}
+        {"rts": plots.Curve(T, THREE, np.ones((COUNT, 3)))}, ("a", "b", "c"), "m", END, spans={"withheld": [(3, 9)]}
     ),
     "sigmas": lambda: plots.sigmas(
-        {"unknown solver": plots.Series(T, np.abs(THREE))}, ("a", "b", "c"), "m/s", END, spans={}
+        {"unknown solver": plots.Curve(T, np.abs(THREE))}, ("a", "b", "c"), "m/s", END, spans={}
     ),
-    "zoom": lambda: plots.span_zoom({"ekf": plots.Series(T, THREE[:, :1] ** 2)}, [(100, 200), (300, 340)]),
+    "zoom": lambda: plots.span_zoom({"ekf": plots.Curve(T, THREE[:, :1] ** 2)}, [(100, 200), (300, 340)]),
     "residuals": lambda: plots.residuals(record(), START, END, "ekf", spans={"excluded": [(90, 99)]}),
-    "nees": lambda: plots.nees({"ekf": plots.Series(T, THREE**2)}, ("p", "v", "rph"), (3, 3, 3), END, spans={}),
+    "nees": lambda: plots.nees({"ekf": plots.Curve(T, THREE**2)}, ("p", "v", "rph"), (3, 3, 3), END, spans={}),
     "timeline": lambda: plots.timeline({"gnss": record(), "nhc": record(2)}, START, END, "ekf", spans={}),
     "detections": lambda: plots.detections(*detected()),
 }
@@ -127,7 +127,7 @@ def test_long_series_are_thinned_and_keep_their_spikes():
     t = np.arange(200_000.0)
     y = np.sin(t / 1e4)
     y[77_777] = 9.0
-    figure = plots.bands({"ekf": plots.Series(t, y[:, None])}, ("east",), "m", t[-1], spans={})
+    figure = plots.bands({"ekf": plots.Curve(t, y[:, None])}, ("east",), "m", t[-1], spans={})
     (drawn,) = drawn_as(figure, "ekf")
     assert len(x_of(drawn)) <= 4 * plots.BINS
     assert 77_777.0 in x_of(drawn)
@@ -136,7 +136,7 @@ def test_long_series_are_thinned_and_keep_their_spikes():
 def test_lines_and_bands_do_not_lead_across_gaps():
     t = np.concatenate([np.arange(100.0), 500 + np.arange(100.0)])
     value = np.ones((200, 1))
-    figure = plots.bands({"ekf": plots.Series(t, value, value)}, ("east",), "m", t[-1], spans={})
+    figure = plots.bands({"ekf": plots.Curve(t, value, value)}, ("east",), "m", t[-1], spans={})
     (line,) = drawn_as(figure, "ekf")
     assert np.flatnonzero(np.isnan(y_of(line))).tolist() == [100]
     (band,) = drawn_as(figure, "3 sigma")
@@ -148,7 +148,7 @@ def test_lines_and_bands_do_not_lead_across_gaps():
 # ----------------------------------------------------------------------------------------------------------- figures
 def test_bands_draw_the_values_given():
     figure = plots.bands(
-        {"batch": plots.Series(T, THREE, np.full((COUNT, 3), 2.0))}, ("east", "north", "up"), "m", END, spans={}
+        {"batch": plots.Curve(T, THREE, np.full((COUNT, 3), 2.0))}, ("east", "north", "up"), "m", END, spans={}
     )
     drawn = drawn_as(figure, "batch")
     assert [line["yaxis"] for line in drawn] == ["y", "y2", "y3"]
@@ -162,7 +162,7 @@ def test_bands_draw_the_values_given():
 def test_a_spike_does_not_set_the_scale_but_what_lies_in_a_span_does():
     value = np.random.default_rng(2).normal(size=(COUNT, 1))
     value[100] = 500.0
-    series = {"ekf": plots.Series(T, value)}
+    series = {"ekf": plots.Curve(T, value)}
     figure = plots.bands(series, ("east",), "m", END, spans={})
     assert np.abs(np.delete(value, 100)).max() <= y_range(figure)[1] < 10.0
     assert 500.0 in y_of(drawn_as(figure, "ekf")[0])  # it is there to zoom out to
@@ -173,7 +173,7 @@ def test_a_spike_does_not_set_the_scale_but_what_lies_in_a_span_does():
 def test_the_first_sigma_of_a_filter_does_not_set_the_scale():
     value, sigma = np.zeros((COUNT, 1)), np.full((COUNT, 1), 0.1)
     sigma[0] = 1000.0
-    low, high = y_range(plots.bands({"ekf": plots.Series(T, value, sigma)}, ("up",), "m", END, spans={}))
+    low, high = y_range(plots.bands({"ekf": plots.Curve(T, value, sigma)}, ("up",), "m", END, spans={}))
     assert 0.3 < high < 0.4
     assert low == -high
 
@@ -182,7 +182,7 @@ def test_trajectory_is_to_scale_and_marks_what_happened():
     enu = np.stack([3 * T, T, T], -1)
     out = (T == 7) | (T == 9)
     figure = plots.trajectory(
-        {"batch": (T, enu[:, :2])}, fixes=plots.Fixes(T, enu + 1, out, {"fixed": T < 100, "single": T >= 100}),
+        {"batch": (T, enu[:, :2])}, fixes=plots.DrawnFixes(T, enu + 1, out, {"fixed": T < 100, "single": T >= 100}),
         spans={"withheld": [(10, 20)], "no GNSS": [(30, 33)]}, stops=[(40, 42)],
     )  # fmt: skip
     assert figure.json["layout"]["yaxis"]["scaleanchor"] == "x"
@@ -229,7 +229,7 @@ def test_residuals_mark_what_was_rejected_and_weakened():
 
 
 def test_nees_is_drawn_per_degree_of_freedom():
-    series = {"ekf": plots.Series(T, np.full((COUNT, 2), 6.0))}
+    series = {"ekf": plots.Curve(T, np.full((COUNT, 2), 6.0))}
     figure = plots.nees(series, ("position", "attitude"), (2, 3), END, spans={})
     assert [set(y_of(line)) for line in drawn_as(figure, "ekf")] == [{3.0}, {2.0}]
 
@@ -264,7 +264,7 @@ def test_detections_show_statistics_thresholds_and_the_idle_line():
 
 def test_span_zoom_has_a_panel_per_span():
     t = np.arange(1000.0)
-    figure = plots.span_zoom({"ekf": plots.Series(t, t[:, None])}, [(100, 200), (400, 440), (700, 760)])
+    figure = plots.span_zoom({"ekf": plots.Curve(t, t[:, None])}, [(100, 200), (400, 440), (700, 760)])
     drawn = drawn_as(figure, "ekf")
     assert [(x_of(d)[0], x_of(d)[-1]) for d in drawn] == [(65, 235), (386, 454), (679, 781)]
     assert [d["xaxis"] for d in drawn] == ["x", "x2", "x3"]
@@ -283,14 +283,14 @@ def test_plotly_takes_every_figure(name):
     text = json.dumps(figure.json)
     assert "NaN" not in text
     names = set(re.findall(r"var\(--([\w-]+)\)", text))
-    assert names <= {*plots.PALETTE, "soft", "card", "edge", "words"}
+    assert names <= {*plots.PALETTE, "soft", "card", "edge", "words", plots.variable("unknown solver")[2:]}
     go.Figure(json.loads(re.sub(r"var\(--[\w-]+\)([0-9a-f]{2})?", "#112233", text)))
 
 
 def test_figures_load_no_plotting_library():
     code = (
         "import sys, numpy as np, graphnav.report.documents, graphnav.report.plots as p\n"
-        "p.bands({'ekf': p.Series(np.arange(3.0), np.ones((3, 1)))}, ('a',), 'm', 2.0, spans={}).json\n"
+        "p.bands({'ekf': p.Curve(np.arange(3.0), np.ones((3, 1)))}, ('a',), 'm', 2.0, spans={}).json\n"
         "assert not {'matplotlib', 'plotly'} & set(sys.modules)"
     )
     subprocess.run([sys.executable, "-c", code], check=True)

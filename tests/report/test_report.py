@@ -221,6 +221,17 @@ def test_report_holds_what_it_was_given(tmp_path, recording):
         assert words in text, words
 
 
+def test_each_program_of_a_comparison_has_a_colour_of_its_own(tmp_path, recording):
+    names = ["ekf", "isam2", "rtk (2)", "rtk.(2", "slam", "é"]
+    found = {name: replace(solution(name), solver=name) for name in names}
+    path = write_comparison(tmp_path / "c.html", recording, found, settings={})
+    checked(path)
+    html = path.read_text(encoding="utf-8")
+    used = [re.search(rf'background:var\((--[\w-]+)\)"></i>{re.escape(name)}<', html)[1] for name in names]
+    values = [re.search(rf"{name}:([^;]+);", html)[1] for name in used]
+    assert len(set(values)) == len(names)
+
+
 def test_report_without_truth_shows_sigma_instead(tmp_path, recording):
     parser, _ = checked(write(tmp_path, recording))
     assert "no_truth.consistent" in parser.keys
@@ -474,7 +485,7 @@ def test_a_solver_that_the_others_contradict_is_named_first(tmp_path, recording)
     path = write_comparison(tmp_path / "c.html", recording, astray, settings={})
     assert checked(path)[0].keys[0] == "doubt.solver"
     told = find_departures(astray)["ekf"]
-    path = write_report(tmp_path / "r.html", recording, astray["ekf"], settings={}, astray=told)
+    path = write_report(tmp_path / "r.html", recording, astray["ekf"], settings={}, contradicted=told)
     assert checked(path)[0].keys[0] == "doubt.solver"
 
 

@@ -16,7 +16,7 @@ from pyins import sim, strapdown, transform, util
 
 from graphnav.app.cli import run as command
 from graphnav.core import rotation as ro
-from graphnav.core.earth import RATE, LocalFrame, gravity, llh_to_ecef
+from graphnav.core.earth import MG, RATE, LocalFrame, gravity, llh_to_ecef
 from graphnav.core.errors import ConfigError
 from graphnav.core.state import States
 from graphnav.imu.dynamics import ImuFactors as Mechanisation
@@ -33,7 +33,7 @@ from graphnav.simulation.kinematics import Mount, TrueMotion, move
 from graphnav.simulation.motion import HEADING, SLIP, SPEED, Manoeuvre, drive
 from graphnav.simulation.passengers import Boarding, movement
 from graphnav.simulation.scenarios.li2024 import TABLE_4
-from graphnav.simulation.vibration import MG, Shake, road_noise
+from graphnav.simulation.vibration import Shake, road_noise
 
 pytestmark = pytest.mark.filterwarnings("ignore:The copy keyword")  # of pandas, about pyins
 

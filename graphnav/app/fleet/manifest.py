@@ -229,40 +229,40 @@ def _check_columns(names: Iterable[str], where: str) -> None:
 
 def _drive(source: Path, where: str, row: Mapping[str, Any], asked: DriveOptions) -> tuple[str, str, DriveOptions, str]:
     """One row of a manifest; a blank field takes the common value."""
-    said: dict[str, Any] = {}
+    values: dict[str, Any] = {}
     for key in (f.name for f in fields(DriveOptions)):
         value = row.get(key)
         if value is None or value == "":
             continue
         if key in ("start", "end"):
             try:
-                said[key] = float(value)
+                values[key] = float(value)
             except (TypeError, ValueError):
                 raise ConfigError(
                     f"{where}, '{key}': {value!r} is not a number of seconds", key="manifest.value"
                 ) from None
         elif key == "settings" and isinstance(value, Mapping):
-            said[key] = _write(value)
+            values[key] = _write(value)
         elif key == "without" and isinstance(value, list):
-            said[key] = " ".join(map(str, value))
+            values[key] = " ".join(map(str, value))
         elif isinstance(value, str):
-            said[key] = value
+            values[key] = value
         else:
             raise ConfigError(f"{where}, '{key}': {value!r} is not a text", key="manifest.value")
     recording = row.get("recording")
     if not isinstance(recording, str) or not recording:
         raise ConfigError(f"{where}, 'recording': names no recording", key="manifest.no_recording")
-    noise = said.get("noise")
+    noise = values.get("noise")
     if noise is not None and noise not in MODES:
-        said["noise"] = str(_find_beside(source, noise, where, "noise"))
-    if "config" in said:
-        said["config"] = str(_find_beside(source, said["config"], where, "config"))
+        values["noise"] = str(_find_beside(source, noise, where, "noise"))
+    if "config" in values:
+        values["config"] = str(_find_beside(source, values["config"], where, "config"))
     builtin = recording in formats() and formats()[recording].builtin
     path = recording if builtin else str(_find_beside(source, recording, where, "recording"))
     name = row.get("name") or Path(recording.removesuffix("/recording.toml")).name.removesuffix(".toml")
     if not isinstance(name, str):
         raise ConfigError(f"{where}, 'name': {name!r} is not a text", key="manifest.value")
-    return _clean_name(name), path, replace(asked, **said), where
+    return _clean_name(name), path, replace(asked, **values), where
 
 
 def _find_beside(source: Path, name: str, where: str, key: str) -> Path:

@@ -150,9 +150,9 @@ def _map(group: Sequence[tuple[Array, Row]]) -> str:
     lines = []
     for track, row in group:
         x, y = (track[:, 0] - low[0]) * shrink * scale + 5.0, (high[1] - track[:, 1]) * scale + 5.0
-        way = " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(x.tolist(), y.tolist(), strict=True))
+        corners = " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(x.tolist(), y.tolist(), strict=True))
         kind = "track bad" if row.get("verdict") == "doubtful" else "track"
-        line = f'<polyline class="{kind}" points="{way}"><title>{escape(str(row["drive"]))}</title></polyline>'
+        line = f'<polyline class="{kind}" points="{corners}"><title>{escape(str(row["drive"]))}</title></polyline>'
         lines.append(f'<a href="{escape(str(row["report"]))}">{line}</a>' if row.get("report") else line)
     km = size * 111.2
     about = f"{len(group)} tracks about {low[1]:.3f}, {low[0]:.3f} deg; {km:.3g} km across; doubtful ones red"

@@ -114,9 +114,9 @@ def totals(rows: Sequence[Row]) -> dict[str, Any]:
 
 def describe_totals(found: Mapping[str, Any]) -> str:
     """The first line about a fleet."""
-    said = ", ".join(f"{count} {status}" for status, count in found["status"].items())
+    statuses = ", ".join(f"{count} {status}" for status, count in found["status"].items())
     drives = format_count(found["drives"], "drive")
-    return f"{drives}, {found['hours']:.2f} h, {found['km']:.1f} km: {said}; {found['doubtful']} doubtful"
+    return f"{drives}, {found['hours']:.2f} h, {found['km']:.1f} km: {statuses}; {found['doubtful']} doubtful"
 
 
 def describe_unscored(rows: Sequence[Row], withhold: float) -> str:

@@ -78,10 +78,12 @@ class Worker:
             return dict(json.loads(answer))
         code = process.wait()
         self._process = None
-        spent = time.monotonic() - began
+        elapsed = time.monotonic() - began
         if late.is_set():
-            return make_lost_row(task, HUNG, f"ended after {self._limits.seconds:g} s, the --limit of one drive", spent)
-        return make_lost_row(task, CRASHED, f"the process that solved it {_end_of(code)}", spent)
+            return make_lost_row(
+                task, HUNG, f"ended after {self._limits.seconds:g} s, the --limit of one drive", elapsed
+            )
+        return make_lost_row(task, CRASHED, f"the process that solved it {_end_of(code)}", elapsed)
 
     def close(self) -> None:
         """End the process at once."""

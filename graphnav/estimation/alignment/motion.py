@@ -66,8 +66,8 @@ def drop_implausible(recording: Recording) -> Recording:
         dt = gnss.t[end] - gnss.t[[near, far]]
         line = middle[near] + (middle[far] - middle[near]) * dt[0] / (dt[0] - dt[1])
         off[end] = max(0.0, float(np.linalg.norm(p[end] - line)) - 0.5 * GRIP * abs(dt[0] * dt[1]))
-    usual = np.maximum(np.median(off), np.linalg.norm(gnss.sd[:, :2], axis=1))
-    return replace(recording, gnss=pick_fixes(gnss, off <= _OUTLYING * usual))
+    typical = np.maximum(np.median(off), np.linalg.norm(gnss.sd[:, :2], axis=1))
+    return replace(recording, gnss=pick_fixes(gnss, off <= _OUTLYING * typical))
 
 
 def find_motion_span(recording: Recording, settings: Settings, stationary: Array = NONE) -> tuple[float, float] | None:

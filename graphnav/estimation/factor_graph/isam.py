@@ -33,7 +33,7 @@ _ROUNDS = 30
 
 
 class TreeSmoother:
-    """Keyframes in a `Tree`, as an `Engine`.
+    """Keyframes in a `Tree`, as a `LagSmoother`.
 
     Parameters
     ----------
@@ -51,7 +51,7 @@ class TreeSmoother:
         self._portion = 0  # variables that are eliminated for that at a keyframe
 
     def add(self, place: Place) -> tuple[Message, Array]:
-        """As of `Engine`."""
+        """As of `LagSmoother`."""
         tree = self.tree
         turn = tree.add(replace(place, problem=self._problem))
         look = turn > tree.turn or (place.k >= self._look and self._leaving is None)
@@ -77,7 +77,7 @@ class TreeSmoother:
         self._leaving = None
 
     def finish(self, problem: Problem) -> tuple[Problem, int]:
-        """As of `Engine`."""
+        """As of `LagSmoother`."""
         if self._leaving is not None:
             self._settle(self._leaving)
         for _ in range(_ROUNDS):

@@ -18,11 +18,11 @@ from graphnav.imu.preintegration import NOISE_FIGURES
 
 
 def with_noise(problem: Problem, noise: NoiseModel) -> Problem:
-    """A problem posed with stated noise, with a noise model's figures instead.
+    """A problem built with stated noise, with a noise model's figures instead.
 
     Parameters
     ----------
-    problem : as posed; its intervals keep the parts of their covariances if a figure of the IMU differs.
+    problem : as built; its intervals keep the parts of their covariances if a figure of the IMU differs.
     """
     factors = np.array([noise.factor(f"imu.{name}", 1.0) for name in NOISE_FIGURES])
     each = _interval_factors(problem, noise)

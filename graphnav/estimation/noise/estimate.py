@@ -142,7 +142,7 @@ def estimate_noise(
     intervals: bool = False,
     changed: bool = False,
 ) -> NoiseEstimate:
-    """Estimate the noise model of a problem posed with stated noise and with the parts of its intervals' noise.
+    """Estimate the noise model of a problem built with stated noise and with the parts of its intervals' noise.
 
     Parameters
     ----------

@@ -54,7 +54,7 @@ from graphnav.estimation.noise.spans import (
     join_faults,
     list_distinct,
     list_repeats,
-    mask_within,
+    mask_times,
     split_at_repeats,
     total_length,
     trim,
@@ -86,7 +86,7 @@ def estimate_without_faults(
 
     Parameters
     ----------
-    base : posed with stated noise and the parts of its intervals' noise.
+    base : built with stated noise and the parts of its intervals' noise.
     opening : as for `graphnav.estimation.solvers.ekf.ekf`.
 
     Raises
@@ -111,7 +111,7 @@ def find_faults(base: Problem, found: NoiseEstimate) -> Decision:
 
     Parameters
     ----------
-    base : posed with stated noise.
+    base : built with stated noise.
     found : estimated with all measurements.
     """
     first = decide(base, found, find_spans(base, found.noise, found))
@@ -189,7 +189,7 @@ def estimate_disturbed_intervals(base: Problem, found: NoiseEstimate) -> NoiseEs
 
     Parameters
     ----------
-    base : posed with stated noise and the parts of its intervals' noise.
+    base : built with stated noise and the parts of its intervals' noise.
     found : with all intervals alike.
     """
     start, near, passes = found.noise, found.linearisation(base), found.passes
@@ -316,7 +316,7 @@ def _with_outliers(found: NoiseEstimate, errors: LeftOutErrors, spans: list[Span
     for name, (t, squared, m) in errors.items():
         weight = limit_squares(squared, m)
         kept = drop_within(weights.get(name, RowWeights(np.empty(0), np.empty(0))), spans)
-        inside = mask_within(t, spans) & np.isin(t, t[weight < 1.0])  # with all rows of their times
+        inside = mask_times(t, spans) & np.isin(t, t[weight < 1.0])  # with all rows of their times
         both, of_both = np.concatenate([kept.t, t[inside]]), np.concatenate([kept.weight, weight[inside]])
         order = np.argsort(both, kind="stable")
         weights[name] = RowWeights(both[order], of_both[order])

@@ -14,7 +14,7 @@ from graphnav.constraints.base import SAME_TIME, BuildContext, Constraint, Linea
 from graphnav.core.rotation import Array
 from graphnav.core.state import Parameter, States
 from graphnav.estimation.noise.model import INTERVALS
-from graphnav.estimation.noise.spans import Span, mask_within
+from graphnav.estimation.noise.spans import Span, mask_times
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.ekf import Comparison
 from graphnav.estimation.solvers.linearise import Points
@@ -97,7 +97,7 @@ def with_own_errors(problem: Problem, spans: list[Span], kinds: Explanation) -> 
         if rows.name not in kinds:
             return rows
         t = problem.t[rows.keyframe]
-        within = mask_within(t, spans)
+        within = mask_times(t, spans)
         sigma: Array = rows.sigma  # type: ignore[attr-defined]
         weight = np.ones(len(rows)) if rows.weight is None else rows.weight
         wide = np.min(sigma / np.hypot(sigma, WIDE[rows.unit]), axis=1) ** 2

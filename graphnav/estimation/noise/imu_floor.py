@@ -49,13 +49,13 @@ def with_measured_floor(recording: Recording, settings: Settings) -> tuple[Recor
     lower = {name: density for name, density in shown.items() if density < getattr(imu.noise, name)}
     if not lower:
         return recording, ()
-    said = ", ".join(
+    figures = ", ".join(
         f"{_WORDS[name]} {density:.2g} instead of {getattr(imu.noise, name):.2g} {_UNITS[name]}"
         for name, density in lower.items()
     )
     noise: ImuNoise = replace(imu.noise, **lower)
     return replace(recording, imu=replace(imu, noise=noise)), (
-        Note("noise.imu.quieter", f"at rest the IMU is quieter than stated: {said}"),
+        Note("noise.imu.quieter", f"at rest the IMU is quieter than stated: {figures}"),
     )
 
 

@@ -22,6 +22,7 @@ import numpy as np
 from graphnav.core.rotation import Array
 
 INTERVALS = ("imu.gyro", "imu.accel")  # white noise of the IMU, of which single intervals can have more than usual
+TABULATED = ("noise.imu", "noise.rows")  # keys of notes whose figures a report has as a table
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ Span = tuple[float, float]  # s, first and last measurement in it
 LeftOutErrors = Mapping[str, tuple[Array, Array, int]]  # by constraint: (N,) s, (N,) squared errors, degrees of freedom
 
 
-def mask_within(t: Array, spans: Iterable[Span]) -> Array:
+def mask_times(t: Array, spans: Iterable[Span]) -> Array:
     """(N,) mask of times (N,) s in spans, ends included."""
     out = np.zeros(len(t), dtype=bool)
     for begin, end in spans:
@@ -30,7 +30,7 @@ def mask_within(t: Array, spans: Iterable[Span]) -> Array:
 
 def drop_within(some: RowWeights, spans: Iterable[Span]) -> RowWeights:
     """The weights of the rows outside all spans."""
-    keep = ~mask_within(some.t, spans)
+    keep = ~mask_times(some.t, spans)
     return RowWeights(some.t[keep], some.weight[keep])
 
 
@@ -75,7 +75,7 @@ def split_at_repeats(spans: list[Span], recording: Recording) -> list[Span]:
     gnss, repeats = recording.gnss, list_repeats(recording)
     if gnss is None or not repeats:
         return spans
-    rest = mask_within(gnss.t, spans) & ~mask_within(gnss.t, repeats)
+    rest = mask_times(gnss.t, spans) & ~mask_times(gnss.t, repeats)
     others = [(float(gnss.t[a]), float(gnss.t[b - 1])) for a, b in runs_of(rest) if b - a > 1]
     return sorted([*repeats, *others])
 
@@ -119,7 +119,7 @@ def trim(spans: list[Span], errors: LeftOutErrors, chance: float = CHANCE) -> li
     score = np.full(len(t), -np.inf)
     each = [np.minimum(0.5 * (x - float(chdtri(m, chance))), OUTLIER_COST) for _, x, m in errors.values()]
     np.maximum.at(score, number, np.concatenate(each))  # a fix is wrong if its position or its velocity is
-    parts = ((t[within], score[within]) for within in (mask_within(t, [span]) for span in spans))
+    parts = ((t[within], score[within]) for within in (mask_times(t, [span]) for span in spans))
     return [part for some, scores in parts if (part := _find_best_part(some, scores)) is not None]
 
 

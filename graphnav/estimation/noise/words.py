@@ -20,7 +20,6 @@ _IMU = {
     "imu.accel_bias_walk": "accelerometer bias walk",
 }
 
-
 _IMU_WHITE = dict(zip(INTERVALS, ("gyro noise", "accelerometer noise"), strict=True))
 _FAR = 5.0  # prior sigmas, which chance does not reach
 
@@ -37,11 +36,11 @@ def describe_far(problem: Problem, smoothed: Points) -> tuple[str, ...]:
         away = np.abs(value - stated) / sigma
         k = int(np.argmax(away))
         if p.name == MOUNTING and away[k] > _FAR and abs(value[k]) > 0.25 * np.pi:
-            said = (
+            sentence = (
                 f"the IMU's axes are {abs(np.degrees(wrap(value[k]))):.0f} deg from those of a vehicle that travels "
                 "forwards"
             )
-            out.append(Note("doubt.axes", f"The attitude cannot be trusted: {said}; check axes in [imu]"))
+            out.append(Note("doubt.axes", f"The attitude cannot be trusted: {sentence}; check axes in [imu]"))
         elif away[k] > _FAR:
             shown = components(p.name, p.size, p.unit)[k]
             found, given, sd = (float(f"{shown.scale * x:.2g}") for x in (value[k], stated[k], sigma[k]))
@@ -67,8 +66,8 @@ def describe(noise: NoiseModel, problem: Problem) -> tuple[str, ...]:
     more = [f"{_IMU_WHITE[name]} in {len(some.t)}" for name, some in of_imu if len(some.t)]
     if more:
         most = np.sqrt(1.0 / min(float(np.min(some.weight)) for _, some in of_imu if len(some.t)))
-        said = f"larger {' and '.join(more)} of {len(problem.t) - 1} intervals between keyframes"
-        out.append(Note("noise.imu.outliers", f"noise model, IMU: {said}, up to {most:.2g} times the usual"))
+        sentence = f"larger {' and '.join(more)} of {len(problem.t) - 1} intervals between keyframes"
+        out.append(Note("noise.imu.outliers", f"noise model, IMU: {sentence}, up to {most:.2g} times the usual"))
     for rows in problem.constraints:
         names = [g for g in rows.noise_groups()[0] if g in noise.figures]
         errors = [

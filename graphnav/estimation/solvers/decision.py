@@ -13,7 +13,7 @@ from graphnav.estimation.solvers.recursion import invert_sum, update
 
 
 @dataclass(frozen=True)
-class Decision:
+class DecidedRows:
     """What was decided at a keyframe by the estimate there: rows to hold from now on, and what is not to be trusted."""
 
     H: Array  # (m, D)
@@ -22,10 +22,10 @@ class Decision:
     added: Array  # (D,) variance
 
 
-Decide = Callable[[int, Points, Array], Decision | None]  # of a keyframe, the point there and P (D, D)
+Decide = Callable[[int, Points, Array], DecidedRows | None]  # of a keyframe, the point there and P (D, D)
 
 
-def hold(one: Decision, P: Array) -> tuple[Array, Array]:
+def hold(one: DecidedRows, P: Array) -> tuple[Array, Array]:
     """An update with what was decided: how far (D,) it moves the estimate, and the covariance about where it was."""
     P = P + np.diag(one.added)
     if not len(one.residual):

@@ -53,7 +53,7 @@ from graphnav.estimation.solvers.passes import (
     sigmas_of,
     subtract_points,
 )
-from graphnav.estimation.solvers.points import Errors, Linearisation, PointFilter, filter_likelihood
+from graphnav.estimation.solvers.points import FilterErrors, Linearisation, PointFilter, filter_likelihood
 from graphnav.estimation.solvers.rts import backward
 from graphnav.estimation.solvers.stack import Innovations, Stack
 from graphnav.estimation.solvers.stretches import StretchFilter
@@ -198,7 +198,7 @@ def _forward(
     watched = [c for c in fixes if c.watched]
     stack = Stack(problem, K, {c.name for c in fixes})
     ahead, found = Points.allocate(K, D - DIM), Points.allocate(K, D - DIM)
-    errors = Errors(np.empty((n, D)), all_Pp, np.empty((n, D)), all_P)
+    errors = FilterErrors(np.empty((n, D)), all_Pp, np.empty((n, D)), all_P)
     x, P = _prior(problem)
     updates, search = None, None
     if about is not None:
@@ -278,7 +278,7 @@ def _hold(decide: Decide, k0: int, k1: int, found: Points, all_P: Array) -> int:
     return k1
 
 
-def _hold_errors(decide: Decide, about: Points, errors: Errors, k0: int, k1: int) -> int:
+def _hold_errors(decide: Decide, about: Points, errors: FilterErrors, k0: int, k1: int) -> int:
     """As `_hold`, of errors about given points, which stay."""
     for k in range(k0, k1):
         here = move_points(about.at(slice(k, k + 1)), errors.filtered[k : k + 1])

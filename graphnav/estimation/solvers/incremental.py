@@ -29,7 +29,7 @@ _PORTIONS = 8  # of the lag: keyframes settle in groups this long
 FINE = 0.02  # of the usual limits, within which what is left at the end is converged
 
 
-class Engine(Protocol):
+class LagSmoother(Protocol):
     """What smooths keyframes as they come."""
 
     settled: list[SettledStates]  # in turn; whoever reads them may clear them
@@ -61,7 +61,7 @@ class Incremental:
     settled: list[SettledStates] = field(default_factory=list)
 
     def add(self, place: Place) -> tuple[Message, Array]:
-        """As of `Engine`."""
+        """As of `LagSmoother`."""
         if self.window.push(place) > self.window.turn:
             self.window.converge()
         if are_due(self.window.stages[0].place.t, place.t, self.lag):
@@ -72,7 +72,7 @@ class Incremental:
         return newest, newest.covariance[:DIM, :DIM]
 
     def finish(self, problem: Problem) -> tuple[Problem, int]:
-        """As of `Engine`."""
+        """As of `LagSmoother`."""
         if len(self.window):
             self.window.converge(FINE, always=True)
             self.settled.append(self.window.settle(len(self.window)))
@@ -112,7 +112,7 @@ def begin_at(problem: Problem, start: States | None) -> Message:
     return message if start is None else message.moved(start.minus(problem.prior.mean)[0])
 
 
-def replay(problem: Problem, solver: str, engine: Engine, lag: float, progress: Progress | None) -> Replay:
+def replay(problem: Problem, solver: str, engine: LagSmoother, lag: float, progress: Progress | None) -> Replay:
     """Have all keyframes of a problem added in turn, and what is found as solutions."""
     began = time.perf_counter()
     K, steps = len(problem.t), list_node_steps(problem)

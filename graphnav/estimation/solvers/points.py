@@ -33,7 +33,7 @@ Follow = Callable[[int, int], int]  # looks at what was filtered from a keyframe
 
 
 @dataclass(frozen=True)
-class Errors:
+class FilterErrors:
     """Error states (n, D) about given points and their covariances, predicted and filtered."""
 
     predicted: Array
@@ -108,7 +108,9 @@ class PointFilter:
     out : of all n keyframes, to be filled.
     """
 
-    def __init__(self, problem: Problem, points: Points, stack: Stack, steps: Advance, F: Array, out: Errors) -> None:
+    def __init__(
+        self, problem: Problem, points: Points, stack: Stack, steps: Advance, F: Array, out: FilterErrors
+    ) -> None:
         n = len(points.values)
         self._stack, self._steps, self.out = stack, steps, out
         one = Linearisation.of(problem, points, stack, steps)

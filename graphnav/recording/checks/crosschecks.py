@@ -29,7 +29,7 @@ MIN_PAIRS = 20
 MIN_SPEED = 3.0  # m/s, below which a course is undefined
 _FASTEST_CHANGE = 8.0  # m/s^2; a larger acceleration is an error of the fix
 _CHANGES = 0.25  # m/s, rms change of speed, below which a regression on it determines nothing
-_USUAL = 5.0  # s, clock error up to which is searched first
+_NEAR_CLOCKS = 5.0  # s, clock error up to which is searched first
 WIDE = 30.0  # s, largest clock error searched for
 
 
@@ -169,7 +169,7 @@ def _search(t: Array, y: Array, x_at: lags_of_clocks.Regressors, span: Array, va
     few = every[:: max(1, len(y) // 800)]
     many = every[:: max(1, len(y) // 4000)]
     # changes over a second are correlated for about as long: every fourth shift shows where the best fit may be
-    lags = np.arange(-_USUAL, _USUAL + 0.01, 0.1)
+    lags = np.arange(-_NEAR_CLOCKS, _NEAR_CLOCKS + 0.01, 0.1)
     rough = np.argsort(correlations(few, lags[::4]))[-3:] * 4
     close = np.unique(np.clip(rough[:, None] + np.arange(-4, 5), 0, len(lags) - 1))
     c = np.full(len(lags), -np.inf)
@@ -178,10 +178,10 @@ def _search(t: Array, y: Array, x_at: lags_of_clocks.Regressors, span: Array, va
     coarse, reached = near, correlation(near, few)
     # larger shifts only if no small one explains y, and only for a clearly better fit, for there are many of them
     reach = min(WIDE, 0.3 * (span[-1] - span[0]))
-    if reached < 0.6 and reach > _USUAL:
+    if reached < 0.6 and reach > _NEAR_CLOCKS:
         wide = np.arange(-reach, reach + 0.1, 0.2)
         far = _find_peak(wide, correlations(few, wide))
-        if abs(far) > _USUAL and correlation(far, few) > reached + 0.15:
+        if abs(far) > _NEAR_CLOCKS and correlation(far, few) > reached + 0.15:
             coarse = far
     lag, spread = lags_of_clocks.refine_lag(t, y, x_at, valid, many, coarse, MIN_PAIRS)
 
@@ -196,7 +196,7 @@ def _search(t: Array, y: Array, x_at: lags_of_clocks.Regressors, span: Array, va
             lag, r, b = 0.0, unshifted, of_it
     seconds = len(np.unique(np.floor(t[valid(lag)])))
     # a correlation that white rows would reach at one of so many lags is none
-    trials = 2.0 * (_USUAL if abs(lag) <= _USUAL else reach)
+    trials = 2.0 * (_NEAR_CLOCKS if abs(lag) <= _NEAR_CLOCKS else reach)
     freedom = seconds - len(b) - 1
     chance = betainc(0.5 * freedom, 0.5 * len(b), 1.0 - r * r) if freedom > 0 else 1.0
     return Fit(lag, spread, r if trials * chance < RARE else 0.0, b, seconds)
@@ -257,7 +257,7 @@ def fit_along(imu: Imu, track: Track) -> Fit | None:
     return _fit_imu(imu, imu.accel[:, 1:2], track, i, j, y)
 
 
-def fit_yaw(imu: Imu, track: Track) -> Fit | None:
+def fit_yaw_rate(imu: Imu, track: Track) -> Fit | None:
     """Regression of changes of course, counter-clockwise, on the integrated rate about the mean force, (1,).
 
     The coefficient is true over recorded. None without turns.

@@ -7,13 +7,11 @@ from typing import Any, Literal
 
 import numpy as np
 
-from graphnav.core.earth import gravity
+from graphnav.core.earth import STANDARD_GRAVITY, gravity
 from graphnav.core.findings import Finding, describe_gaps, period_of, runs_of
 from graphnav.core.notes import format_count
 from graphnav.core.rotation import Array
 from graphnav.recording import Imu, Recording
-
-STANDARD_GRAVITY = 9.80665  # m/s^2, where the position is unknown
 
 
 def check_imu_time(imu: Imu) -> Iterator[Finding]:

@@ -176,7 +176,7 @@ def inspect(recording: Recording) -> Inspection:
     upright = not known & {"imu.force_scale", "imu.dead_axis"}  # else no turn about the vertical is known either
     if vehicle and overlap and track is not None and recording.gnss is not None and upright:
         clock = whole.clock or measure_clock_offsets(recording.imu, recording.gnss)
-        yaw = crosschecks.fit_yaw(recording.imu, track)
+        yaw = crosschecks.fit_yaw_rate(recording.imu, track)
         forward = clock.by_velocity if track.instant else clock.by_places
         turns_back = yaw is not None and yaw.correlation > 0.8 and yaw.coefficients[0] < 0
         turns_so = yaw is not None and yaw.correlation > 0.8 and not turns_back
@@ -206,7 +206,7 @@ def inspect(recording: Recording) -> Inspection:
         if recording.truth.closed_loop_sigma:
             facts["truth"] = {"closed_loop_sigma_m": recording.truth.closed_loop_sigma}
         findings += check_truth(recording)
-    if any(f.severity != "note" for f in findings) and not has_keys(recording):
+    if any(f.severity != "note" for f in findings) and not recording.has_keys:
         findings.append(
             Finding(
                 "note",
@@ -217,12 +217,6 @@ def inspect(recording: Recording) -> Inspection:
         )
     findings.sort(key=lambda f: SEVERITIES.index(f.severity))
     return Inspection(recording.name, recording.platform, facts, whole.recording, tuple(findings))
-
-
-def has_keys(recording: Recording) -> bool:
-    """Whether keys of a recording.toml can be set: there is one, or nothing was read from files."""
-    source = recording.source
-    return source is None or source.suffix == ".toml" or not recording.files
 
 
 def _describe_sensors(t: Array) -> dict[str, Any]:

@@ -7,13 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 
+from graphnav.core.earth import STANDARD_GRAVITY
 from graphnav.core.findings import Finding, period_of
 from graphnav.core.rotation import Array
 from graphnav.recording import Gnss, Imu, Recording
 from graphnav.recording.checks import crosschecks, tilt, tracks
 from graphnav.recording.checks.clock import CLEAR, FAIR
 from graphnav.recording.checks.crosschecks import Fit
-from graphnav.recording.checks.imu import STANDARD_GRAVITY
 from graphnav.recording.checks.stated import describe_exchange, describe_mirroring, exchange_lat_lon
 from graphnav.recording.checks.tracks import Track, compute_local_positions
 from graphnav.recording.formats.schema import FOOT
@@ -31,8 +31,8 @@ def check_mirroring(recording: Recording, track: Track, as_read: Fit | None, tur
     is its fit to the gyro) after the exchange if they were exchanged, and worse if only a sign is wrong.
     """
     other = exchange_lat_lon(recording.gnss) if recording.gnss is not None else None
-    way = tracks.compute_track(replace(other, v=None)) if other is not None else None
-    yaw = crosschecks.fit_yaw(recording.imu, way) if way is not None else None
+    course = tracks.compute_track(replace(other, v=None)) if other is not None else None
+    yaw = crosschecks.fit_yaw_rate(recording.imu, course) if course is not None else None
     better = yaw is not None and (not turns_back or as_read is None or yaw.correlation > as_read.correlation)
     if yaw is not None and better and yaw.correlation > 0.8 and abs(yaw.coefficients[0] - 1.0) < 0.2:
         yield describe_exchange("the turns of the gyro")
@@ -102,14 +102,14 @@ def fit_climb(imu: Imu, track: Track, gnss: Gnss, forward: Array) -> tuple[float
     too short. A span mostly without fixes has no slope of its own.
     """
     p = tracks.compute_local_positions(gnss)
-    way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(p[:, :2], axis=0).T))])
+    distance = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(p[:, :2], axis=0).T))])
     pull = np.concatenate([[0.0], np.cumsum(imu.accel[1:] @ forward * np.diff(imu.t))])
     a = np.arange(max(track.t[0], imu.t[0]), min(track.t[-1], imu.t[-1]) - _SLOPE_SPAN, _SLOPE_SPAN)
 
     def change(t: Array, x: Array) -> Array:
         return np.asarray(np.interp(a + _SLOPE_SPAN, t, x) - np.interp(a, t, x))
 
-    far = change(gnss.t, way)
+    far = change(gnss.t, distance)
     late = gnss.t[1:][np.diff(gnss.t) > 0.5 * _SLOPE_SPAN]  # the ends of gaps
     early = gnss.t[:-1][np.diff(gnss.t) > 0.5 * _SLOPE_SPAN]
     whole = np.searchsorted(late, a, side="right") == np.searchsorted(early, a + _SLOPE_SPAN)
@@ -130,8 +130,8 @@ def find_mirrored(recording: Recording, wrong: Sequence[Finding]) -> list[Findin
         return list(wrong)
     if not any(f.key == "gnss.velocity_axes" for f in wrong):
         return list(wrong)
-    ways = [tracks.compute_track(one) for one in (gnss, replace(gnss, v=None))]
-    fits = [crosschecks.fit_yaw(recording.imu, way) for way in ways if way is not None]
+    courses = [tracks.compute_track(one) for one in (gnss, replace(gnss, v=None))]
+    fits = [crosschecks.fit_yaw_rate(recording.imu, course) for course in courses if course is not None]
     by_velocity, by_places = (
         [fit.coefficients[0] if fit is not None and fit.correlation > 0.8 else 0.0 for fit in fits]
         if len(fits) == 2

@@ -15,7 +15,7 @@ from graphnav.core.rotation import Array
 from graphnav.core.timescales import NEAR, UNIX, ClockOffset, between_clocks
 from graphnav.recording import Gnss, Odometer
 from graphnav.recording.draft import guesses, motion
-from graphnav.recording.draft.agreement import CLEAR, FAIR, Agreement, compare_with_fixes
+from graphnav.recording.draft.agreement import CLEAR, LIKELY, Agreement, compare_with_fixes
 from graphnav.recording.draft.guesses import Guess
 from graphnav.recording.draft.logs import Source
 from graphnav.recording.draft.raw import RawFound, find_raw, write_raw
@@ -176,7 +176,7 @@ class _Writer:
         lag = agreement.clearest
         if lag is not None and agreement.forward is not None and lag.correlation > 0.3:
             forward = agreement.forward
-            sure = "forward" if lag.correlation > FAIR else "CHECK: forward, not surely,"
+            sure = "forward" if lag.correlation > LIKELY else "CHECK: forward, not surely,"
             words = (
                 f"{sure} is where the accelerations of the fixes are felt (coherence {lag.correlation:.2f}, "
                 f"{abs(lag.slope):.2f} of their size)"
@@ -277,7 +277,7 @@ class _Writer:
             )
             self._units({"t": source.t_unit, "speed": speed})
             lag = _find_odometer_lag(source.t, source.values["speed"] * SPEED[str(speed.value)], felt)
-            if lag is not None and lag.correlation > FAIR and abs(lag.seconds) > _SMALL:
+            if lag is not None and lag.correlation > LIKELY and abs(lag.seconds) > _SMALL:
                 sure = "" if lag.correlation > CLEAR else "CHECK: "
                 self._key("time_offset", f"{-lag.seconds:.2f}", f"{sure}s; {_describe_agreement(lag)}")
                 self._key("delay_sigma", "0.05", "s, what is left of it; it is estimated")
@@ -324,11 +324,12 @@ class _Writer:
             elif len(topics) > 1:
                 why = (
                     f"CHECK: it has the most messages; there is also {', '.join(topics[1:])}: to use it, draft again "
-                    f"with --topic {topics[1]} --force, since axes and noise are of this one"
-                )
+                    f"with --topic {topics[1]} --force"
+                ) + (", since axes and noise are of this one" if sensor == "imu" else "")
             self._key("topic", quote(topics[0]), why)
         if source.joined_from is None and source.plain is None and not is_inside(source.path, self.folder):
-            self.decisions.append(f"{relative}: lies outside the folder of this file; say --allow-outside to read it")
+            words = f"{relative}: lies outside the folder of this file; say --allow-outside to read it"
+            self.decisions += [words] if words not in self.decisions else []
         names = {o: theirs for o, theirs in source.columns.names.items() if o != theirs and o not in dropped}
         if names:
             pairs = ", ".join(f"{ours} = {quote(theirs)}" for ours, theirs in names.items())

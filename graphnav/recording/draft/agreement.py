@@ -11,7 +11,7 @@ from graphnav.recording import Gnss, Imu
 from graphnav.recording.checks.clock import ClockOffsets, measure_clock_offsets
 from graphnav.recording.draft import motion
 
-CLEAR, FAIR = 0.8, 0.5  # correlations: certain, likely
+CLEAR, LIKELY = 0.8, 0.5  # correlations: certain, likely
 _LEAST_CORRELATION = 0.75  # least correlation for the offset of unrelated clocks
 _TWO_CLOCKS = 0.15  # s; velocities with a larger offset from the positions have a latency of their own
 
@@ -65,7 +65,7 @@ class Agreement:
         if not self.far:
             return None
         known = clock.by_velocity or clock.by_places
-        sure = known is not None and known.correlation > FAIR and known.spread < motion.STEP
+        sure = known is not None and known.correlation > LIKELY and known.spread < motion.STEP
         return (known.lag - self.far, known.spread) if sure and known is not None else (-self.far, motion.STEP)
 
 
@@ -96,7 +96,7 @@ def _compare(t: Array, gyro: Array, accel: Array, up: Array, fixes: tuple[Array,
     grid, rate = motion.resample_on_grid(t, gyro @ up[:, None])
     turns = [lag for course in courses if (lag := _find_turn_lag(grid, rate[:, 0], course)) is not None]
     turn = max(turns, key=lambda lag: lag.correlation, default=None)
-    shift = turn.seconds if turn is not None and abs(turn.seconds) > motion.NEAR else 0.0
+    shift = turn.seconds if turn is not None and abs(turn.seconds) > motion.SEARCHED else 0.0
     axes = find_level_axes(up)
     grid, felt = motion.resample_on_grid(t, accel @ np.stack(axes, -1))
     s = motion.filter_band(felt[:, 0]) + 1j * motion.filter_band(felt[:, 1])
@@ -110,7 +110,7 @@ def _compare(t: Array, gyro: Array, accel: Array, up: Array, fixes: tuple[Array,
         # an antenna ahead of the IMU senses sideways what the IMU will sense later; along the course both sense the
         # same
         ahead = motion.find_lag(grid, (s * np.exp(-1j * np.angle(found.slope))).real, one.t - shift, z.real)
-        seconds = ahead.seconds if ahead is not None and ahead.correlation > FAIR else found.seconds
+        seconds = ahead.seconds if ahead is not None and ahead.correlation > LIKELY else found.seconds
         lags.append(motion.Lag(seconds + shift, found.correlation, found.slope))
     position, velocity = (*lags, None)[:2]
     out = Agreement(turn, position, velocity, None, shift, _compare_clocks(t, gyro, accel, fixes, shift))
@@ -136,7 +136,7 @@ def _find_turn_lag(grid: Array, rate: Array, course: motion.Course) -> motion.La
     """The offset of overlapping clocks, unless only an arbitrary one makes the turns agree."""
     overlap = course.t[0] < grid[-1] and course.t[-1] > grid[0] if len(grid) else False
     near = motion.find_lag(grid, rate, course.t, course.turn, course.speed**2) if overlap else None
-    if near is not None and near.correlation > FAIR:
+    if near is not None and near.correlation > LIKELY:
         return near
     far = motion.find_lag(grid, rate, course.t, course.turn, course.speed**2, anywhere=True)
     return far if far is not None and far.correlation > _LEAST_CORRELATION else near

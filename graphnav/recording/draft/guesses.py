@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from graphnav.core.earth import STANDARD_GRAVITY
 from graphnav.core.errors import RecordingError
 from graphnav.core.rotation import Array
 from graphnav.recording.draft import motion
@@ -15,7 +16,6 @@ from graphnav.sensors import barometer
 from graphnav.sensors.barometer import ATMOSPHERE
 from graphnav.sensors.tables import TIME
 
-_G = 9.80665
 _MEAN_SHARE = 0.5  # share of the typical force that is in its mean, even for a swinging foot
 _LIKELY = 0.5  # correlation
 _STRAIGHT = np.cos(np.radians(12.0))  # cosine of the angle to a file axis below which the axis is meant
@@ -69,11 +69,11 @@ def guess_accel_unit(path: Path, accel: Array, stated: str | None) -> Guess:
     size = float(np.median(np.linalg.norm(accel, axis=-1)))
     lasting = float(np.linalg.norm(np.mean(accel, axis=0))) > _MEAN_SHARE * size  # more than a motion alone
     for unit, scale in FORCE.items():
-        if lasting and 0.8 * _G < size * scale < 1.25 * _G:
+        if lasting and 0.8 * STANDARD_GRAVITY < size * scale < 1.25 * STANDARD_GRAVITY:
             return Guess(unit, f"the median force, {size:.4g}, is then that of gravity")
-    if stated is not None and lasting and size * FORCE[stated] > 0.8 * _G:
+    if stated is not None and lasting and size * FORCE[stated] > 0.8 * STANDARD_GRAVITY:
         return Guess(stated, f"as the column's name says, though the median force is {size:.4g}")
-    if size < 0.5 * _G or not lasting:
+    if size < 0.5 * STANDARD_GRAVITY or not lasting:
         raise RecordingError(
             f"{path}: the accelerations are {size:.3g} in size at the median and not lasting: they are without "
             "gravity; log the raw accelerometer (on iOS 'TotalAcceleration')",
@@ -95,10 +95,8 @@ def guess_gyro_unit(gyro: Array, stated: str | None, lag: motion.Lag | None, veh
         return Guess(stated, "as the column's name says")
     large = float(np.percentile(np.abs(gyro), 99.5))
     limit = 2.5 if vehicle else 15.0
-    return Guess(
-        "deg/s" if large > limit else "rad/s",
-        f"99.5 % of the rates are below {large:.3g}; a guess, no turns to check it",
-    )
+    turns = "no turns to check it" if lag is None else f"the turns agree too little (correlation {lag.correlation:.2f})"
+    return Guess("deg/s" if large > limit else "rad/s", f"99.5 % of the rates are below {large:.3g}; a guess, {turns}")
 
 
 def guess_speed_unit(t: Array, speed: Array, course: motion.Course | None, stated: str | None) -> Guess:

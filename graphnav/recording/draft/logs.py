@@ -118,7 +118,8 @@ def read_log(path: Path, topics: Sequence[str] = ()) -> dict[str, Source]:
     try:
         header = read_header(path) if plain is None else list(plain.columns)
     except RecordingError as error:
-        raise NoSensorError(str(error), key=error.key) from error
+        words = f"{path}: no table of a sensor is recognised in it" if error.key == "table.separator" else str(error)
+        raise NoSensorError(words, key=error.key) from error
     columns = matching.match_columns(header, path.name.split(".")[0])
     sensor = columns.sensor
     if sensor is None:

@@ -22,7 +22,7 @@ STEP = 0.1  # s, of the common grid
 _MEAN_OVER = 1.0  # s, of the moving mean over everything
 _LEAST_SPEED = 3.0  # m/s; below, a course is undefined
 _FEWEST_SAMPLES, _TRIMS = 50, 3
-NEAR = 3.0  # s, range of the offset of clocks that overlap already
+SEARCHED = 3.0  # s, range of the offset of clocks that overlap already
 
 
 @dataclass(frozen=True)
@@ -101,8 +101,6 @@ def find_lag(t: Array, x: Array, u: Array, y: Array, weight: Array | None = None
     Real signals, or planar vectors as complex numbers, whose `Lag.slope` then gives the rotation of `x` against `y`.
     Outlying samples of `y` at the best lag are left out, and the search is repeated.
 
-    Samples of `y` that fit by far the worst at the best lag are left out, and the best looked for again.
-
     Parameters
     ----------
     weight
@@ -119,7 +117,7 @@ def find_lag(t: Array, x: Array, u: Array, y: Array, weight: Array | None = None
     if anywhere:
         shifts, r, slope = _list_all_lags(a, b, w)
     else:
-        shifts = np.arange(np.ceil((-NEAR - apart) / STEP), np.floor((NEAR - apart) / STEP) + 1).astype(int)
+        shifts = np.arange(np.ceil((-SEARCHED - apart) / STEP), np.floor((SEARCHED - apart) / STEP) + 1).astype(int)
         r, slope = _list_lags(a, b, w, shifts)
         for _ in range(_TRIMS):
             if not np.isfinite(r).any():

@@ -121,14 +121,16 @@ def find_raw(files: RawFiles, t: Array, zero: float | None) -> RawFound | None:
         base_position=None if stands is None else stands[0],
         **placing,  # type: ignore[arg-type]
     )
-    raw, fixes, said = load_raw(sources, zero)
+    raw, fixes, remarks = load_raw(sources, zero)
     own = {"rover": rover, "base": sources.base, **placing}
     signals = ", ".join(sorted({signal_name(int(s)) for s in np.unique(raw.signal)}))
     begin, end = (float(x) + raw.zero for x in raw.t[[0, -1]])
     notes.append(
         f"observations of {len(np.unique(raw.satellite))} satellites, {_say(begin)} to {_say(end)}; signals {signals}"
     )
-    return RawFound({k: x for k, x in own.items() if x}, raw, fixes, clock, zero is not None, stands, (*notes, *said))
+    return RawFound(
+        {k: x for k, x in own.items() if x}, raw, fixes, clock, zero is not None, stands, (*notes, *remarks)
+    )
 
 
 def write_raw(found: RawFound, folder: Path) -> list[tuple[str, str, str]]:

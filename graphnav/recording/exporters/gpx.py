@@ -31,18 +31,18 @@ _STAMPED = _POINT.replace("</trkpt>", "<time>%sZ</time></trkpt>")
 @contextmanager
 def writing(path: Path, name: str = "") -> Iterator[Add]:
     """A GPX file, with times where UTC is known."""
-    begun = False
+    started = False
     with path.open("wb") as file:
 
         def add(block: Trajectory, utc: Array | None = None) -> None:
-            nonlocal begun
+            nonlocal started
             require_geodetic(block, path)
-            if not begun:
+            if not started:
                 times = "" if utc is not None else "; no times: the clock is not known"
                 about = f"heights above the WGS-84 ellipsoid{times}"
                 head = _HEAD.format(name=escape(name or "trajectory", quote=False), about=about)
                 file.write(head.encode())
-                begun = True
+                started = True
             degrees = np.rad2deg(block.llh[:, :2])
             table = np.column_stack([degrees, block.llh[:, 2]])
             stamps = None if utc is None else np.datetime_as_string(utc, unit="ms").astype("S")

@@ -38,8 +38,8 @@ def build_imu(d: schema.ImuTable, rows: Table, remarks: Remarks) -> Imu:
     accel = _turn(rows, ("ax", "ay", "az"), schema.FORCE[d.units.accel], R_bs)
     stated = d.figures
     noise = replace(ImuNoise(), **stated)
-    missing = [key for key in schema.NOISE_FIGURES if key not in stated]
-    if 0 < len(missing) < len(schema.NOISE_FIGURES):
+    missing = [key for key in schema.STATED_FIGURES if key not in stated]
+    if 0 < len(missing) < len(schema.STATED_FIGURES):
         remarks.add(
             "imu.noise_partly", f"[imu.noise] says nothing of {', '.join(missing)}: defaults of a consumer IMU are used"
         )
@@ -50,7 +50,7 @@ def build_imu(d: schema.ImuTable, rows: Table, remarks: Remarks) -> Imu:
             f"(gyro {noise.gyro_noise_density:g} rad/s/sqrt(Hz), "
             f"accelerometer {noise.accel_noise_density:g} m/s2/sqrt(Hz))",
         )
-    return Imu(rows["t"], gyro, accel, noise, R_bs, noise_assumed=len(missing) == len(schema.NOISE_FIGURES))
+    return Imu(rows["t"], gyro, accel, noise, R_bs, noise_assumed=len(missing) == len(schema.STATED_FIGURES))
 
 
 def _turn(rows: Table, names: tuple[str, ...], unit: float, R_bs: Array) -> Array:
@@ -119,7 +119,7 @@ def build_odometer(d: schema.OdometerTable, rows: Table, remarks: Remarks) -> Od
     """Speeds, m/s, from a speed, from several wheels, or from counted pulses."""
     t, scale = rows["t"], schema.SPEED[d.units.speed]
     used = d.readings(tuple(rows.columns))
-    wheels = way = None
+    wheels = distance = None
     if any(name in rows for name in schema.WHEELS):
         wheels = np.stack([rows.get(name, np.full(len(t), np.nan)) for name in schema.WHEELS], -1) * scale
     if d.metres_per_pulse is not None:
@@ -127,10 +127,10 @@ def build_odometer(d: schema.OdometerTable, rows: Table, remarks: Remarks) -> Od
             raise RecordingError(
                 f"{rows.path}: {len(t)} usable row; pulses need at least 2 to make a speed", key="table.few_rows"
             )
-        way = d.metres_per_pulse * count_pulses(rows["pulses"], d.pulses, d.signed, remarks)
+        distance = d.metres_per_pulse * count_pulses(rows["pulses"], d.pulses, d.signed, remarks)
         # over both adjacent periods, so that it is the speed at t and not half a period earlier
         ahead, behind = np.minimum(np.arange(len(t)) + 1, len(t) - 1), np.maximum(np.arange(len(t)) - 1, 0)
-        speed = (way[ahead] - way[behind]) / (t[ahead] - t[behind])
+        speed = (distance[ahead] - distance[behind]) / (t[ahead] - t[behind])
     else:
         speed = rows.stack(*used).mean(axis=-1) * scale
     signed = bool((speed < 0.0).any()) if d.signed is None else d.signed
@@ -139,7 +139,7 @@ def build_odometer(d: schema.OdometerTable, rows: Table, remarks: Remarks) -> Od
         speed,
         np.array(d.lever_arm),
         d.scale_sigma,
-        counted=way,
+        counted=distance,
         pulse=d.metres_per_pulse or 0.0,
         wheels=wheels,
         signed=signed,

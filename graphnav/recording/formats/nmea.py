@@ -6,7 +6,7 @@ Sentences with the same time of day make one fix. Parsed and checked by pynmeagp
 from __future__ import annotations
 
 import datetime
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -41,7 +41,6 @@ class _Epoch:
     speed: float | None = None  # m/s
     course: float | None = None  # deg
     date: datetime.date | None = None
-    remarks: list[str] = field(default_factory=list)
 
 
 def recognises(path: Path) -> bool:
@@ -196,16 +195,16 @@ def _date_fixes(epochs: list[_Epoch], fixes: list[_Epoch], remarks: Remarks) -> 
     days, day, before = {}, 0, epochs[0].time
     for e in epochs:
         day += e.time < before - 0.5 * _DAY
-        days[id(e)], before = day, e.time
+        days[e.line], before = day, e.time
     dated = next((e for e in epochs if e.date is not None), None)
-    of_day = np.array([e.time + _DAY * days[id(e)] for e in fixes])
+    of_day = np.array([e.time + _DAY * days[e.line] for e in fixes])
     if dated is None or dated.date is None:
         remarks.add(
             "log.clock_unknown",
             "clock: seconds of the UTC day; no RMC or ZDA sentence gives a date, so it is not GPS time",
         )
         return of_day, None
-    midnight = np.datetime64(dated.date, "us") - np.timedelta64(days[id(dated)], "D")
+    midnight = np.datetime64(dated.date, "us") - np.timedelta64(days[dated.line], "D")
     gps = utc_to_gps(midnight + (of_day * 1e6).round().astype("timedelta64[us]"))
     t, zero = of_week(gps)
     ahead = round(float(gps[0] - (midnight - np.datetime64("1980-01-06", "us")) / np.timedelta64(1, "s") - of_day[0]))

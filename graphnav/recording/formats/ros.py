@@ -26,7 +26,7 @@ from graphnav.recording.formats.schema import rotation_from_letters
 
 _IMU, _FIX = "sensor_msgs/msg/Imu", "sensor_msgs/msg/NavSatFix"
 _TWISTS = ("geometry_msgs/msg/TwistStamped", "geometry_msgs/msg/TwistWithCovarianceStamped", "nav_msgs/msg/Odometry")
-_ROLES = {"imu": (_IMU,), "fix": (_FIX,), "twist": _TWISTS}
+_SENSORS = {"imu": "imu", "fix": "gnss", "wheel": "odometer"}  # whose topic a recording.toml may state
 _STATUS = {0: 5, 1: 3, 2: 4}  # of a NavSatFix: unaugmented, of satellites, of a base (carrier phases or not)
 _UNIX = 1e9  # s; stamps above are dates
 _SIDEWAYS = 0.2  # a body moves forward; a velocity with a larger second component is in east-north-up
@@ -70,22 +70,19 @@ def load(path: Path, wanted: Sequence[str] = ()) -> Log:
             raise RecordingError(
                 f"{path}: no topic '{name}' that can be used; {suggest_nearest(name, known)}", key="log.topic_unknown"
             )
-    chosen: dict[str, _Topic] = {}
     ranked: dict[str, list[_Topic]] = {}
-    for role, types in _ROLES.items():
-        found = sorted((t for t in topics if t.kind in types), key=lambda t: (t.name not in wanted, -len(t.rows)))
-        ranked[role] = found
-        if found:
-            chosen[role] = found[0]
+    for topic in sorted(topics, key=lambda t: (t.name not in wanted, -len(t.rows))):
+        ranked.setdefault(_find_role(topic), []).append(topic)
+    for found in ranked.values():
         if len(found) > 1:
             left = ", ".join(t.name for t in found[1:])
             why = "as was asked" if found[0].name in wanted else "having the most messages"
             remarks.add("log.topic", f"{found[0].name} is used, {why}; not {left}")
-    imu = _read_imu(chosen["imu"], remarks) if "imu" in chosen else None
-    gnss = _read_gnss(chosen["fix"], remarks) if "fix" in chosen else None
-    odometer = None
-    if "twist" in chosen:
-        gnss, odometer = _read_twist(chosen["twist"], gnss, remarks)
+    imu = _read_imu(ranked["imu"][0], remarks) if "imu" in ranked else None
+    gnss = _read_gnss(ranked["fix"][0], remarks) if "fix" in ranked else None
+    if "velocity" in ranked:
+        gnss = _add_velocity(ranked["velocity"][0], gnss, remarks)
+    odometer = _read_wheel(ranked["wheel"][0], remarks) if "wheel" in ranked else None
     first = float(next(s.t[0] for s in (imu, gnss, odometer) if s is not None))
     zero = float(unix_to_gps(np.array([first]))[0] - first) if first > _UNIX else None
     remarks.add(
@@ -95,14 +92,19 @@ def load(path: Path, wanted: Sequence[str] = ()) -> Log:
     return Log(
         name, imu, gnss, odometer, gps_zero=zero,
         remarks=tuple(remarks), mount_known=False,
-        topics=_choose_topics(ranked, odometer is not None),
+        topics={_SENSORS[role]: tuple(t.name for t in found) for role, found in ranked.items() if role in _SENSORS},
     )  # fmt: skip
 
 
-def _choose_topics(ranked: dict[str, list[_Topic]], wheel: bool) -> dict[str, tuple[str, ...]]:
-    """By sensor, the topic that is used, and the alternatives."""
-    of = {"imu": "imu", "fix": "gnss"} | ({"twist": "odometer"} if wheel else {})
-    return {of[role]: tuple(t.name for t in found) for role, found in ranked.items() if found and role in of}
+def _find_role(topic: _Topic) -> str:
+    """What a topic holds: imu, fix, velocity over ground, or the speed of a wheel or body."""
+    if topic.kind not in _TWISTS:
+        return "imu" if topic.kind == _IMU else "fix"
+    v = np.array(topic.rows, dtype=float)
+    speed = np.hypot(v[:, 0], v[:, 1])
+    moving = speed > 1.0
+    across = np.median(np.abs(v[moving, 1]) / speed[moving]) if moving.any() else 0.0
+    return "wheel" if topic.kind == _TWISTS[2] or across <= _SIDEWAYS else "velocity"
 
 
 def _read(path: Path) -> tuple[list[_Topic], set[str]]:
@@ -198,23 +200,25 @@ def _read_gnss(topic: _Topic, remarks: Remarks) -> Gnss | None:
     return Gnss(t, np.column_stack([np.radians(rows[:, :2]), rows[:, 2]]), sd, type=kinds)
 
 
-def _read_twist(topic: _Topic, gnss: Gnss | None, remarks: Remarks) -> tuple[Gnss | None, Odometer | None]:
-    """Assign a velocity over ground to the fixes, or a speed of the body to the odometer."""
+def _read_wheel(topic: _Topic, remarks: Remarks) -> Odometer:
     t, rows = _build_table(topic)
     good = np.isfinite(rows).all(-1)
-    t, rows = t[good], rows[good]
-    moving = np.hypot(rows[:, 0], rows[:, 1]) > 1.0
-    across = np.median(np.abs(rows[moving, 1]) / np.hypot(rows[moving, 0], rows[moving, 1])) if moving.any() else 0.0
-    if topic.kind == _TWISTS[2] or across <= _SIDEWAYS:
-        remarks.add("odometer.read_as", f"odometer: {topic.name}, linear.x as forward speed in m/s")
-        remarks.add("odometer.lever_arm_unknown", "odometer: its lever arm is not in the log and taken as zero")
-        return gnss, Odometer(t, rows[:, 0])
+    remarks.add("odometer.read_as", f"odometer: {topic.name}, linear.x as forward speed in m/s")
+    remarks.add("odometer.lever_arm_unknown", "odometer: its lever arm is not in the log and taken as zero")
+    return Odometer(t[good], rows[good, 0])
+
+
+def _add_velocity(topic: _Topic, gnss: Gnss | None, remarks: Remarks) -> Gnss | None:
+    """The fixes with a velocity over ground."""
     if gnss is None:
         remarks.add(
             "gnss.velocity_not_used",
             f"{topic.name} looks like a velocity over ground, but there are no fixes: not used",
         )
-        return None, None
+        return None
+    t, rows = _build_table(topic)
+    good = np.isfinite(rows).all(-1)
+    t, rows = t[good], rows[good]
     k = np.clip(np.searchsorted(t, gnss.t), 1, len(t) - 1)
     near = np.where(np.abs(t[k] - gnss.t) < np.abs(t[k - 1] - gnss.t), k, k - 1)
     same = np.abs(t[near] - gnss.t) < 0.05
@@ -225,7 +229,7 @@ def _read_twist(topic: _Topic, gnss: Gnss | None, remarks: Remarks) -> tuple[Gns
         f"velocity: {topic.name}, taken as east-north-up because it points sideways as well; at {np.sum(same)} of "
         f"{len(gnss.t)} fixes, sigmas of 0.2, 0.2, 0.4 m/s",
     )
-    return replace(gnss, v=v, sd_v=sd_v), None
+    return replace(gnss, v=v, sd_v=sd_v)
 
 
 FORMAT = log_format("ros", "ROS 1 or ROS 2 bags and MCAP files", recognises, load, load)

@@ -32,7 +32,7 @@ _FORMS = {
 
 
 @dataclass(frozen=True)
-class Solution:
+class RtklibSolution:
     """The rows of a .pos file; missing columns are None."""
 
     t: Array  # (K,) s of the GPS week in which the first row lies
@@ -46,7 +46,7 @@ class Solution:
     notes: list[str]
 
 
-def parse_solution(path: Path, head: list[str], rows: Rows) -> Solution:
+def parse_solution(path: Path, head: list[str], rows: Rows) -> RtklibSolution:
     """Parse the lines of a .pos file: its header, with %, and its rows.
 
     Raises
@@ -126,7 +126,7 @@ def parse_solution(path: Path, head: list[str], rows: Rows) -> Solution:
         none = (v == 0.0).all(1) & (sd_v == 0.0).all(1)  # without out-dynamics, and of epochs without Doppler
         v[none], sd_v[none] = np.nan, np.nan
     t, zero = of_week(gps)
-    return Solution(t, zero, llh, sd_p, v, sd_v, take_one("Q"), take_one("ns"), notes)
+    return RtklibSolution(t, zero, llh, sd_p, v, sd_v, take_one("Q"), take_one("ns"), notes)
 
 
 def _base(path: Path, head: list[str]) -> Array:

@@ -20,6 +20,7 @@ from pydantic import (
 from pydantic.types import Strict
 
 from graphnav.core.complaints import complaint, read_toml, suggest_nearest
+from graphnav.core.earth import MG, STANDARD_GRAVITY
 from graphnav.core.errors import RecordingError
 from graphnav.core.rotation import Array
 from graphnav.core.timescales import parse_clock
@@ -50,7 +51,7 @@ Sigmas = Annotated[tuple[float, float, float], BeforeValidator(_three_positive)]
 
 FOOT = 0.3048  # m
 RATE = {"rad/s": 1.0, "deg/s": np.pi / 180.0, "mdeg/s": np.pi / 180e3}
-FORCE = {"m/s2": 1.0, "g": 9.80665, "mg": 9.80665e-3, "ft/s2": FOOT}  # standard gravity, by definition
+FORCE = {"m/s2": 1.0, "g": STANDARD_GRAVITY, "mg": MG, "ft/s2": FOOT}
 HEIGHT = {"m": 1.0, "ft": FOOT}
 SPEED = {"m/s": 1.0, "km/h": 1 / 3.6, "mph": 0.44704, "knots": 1852 / 3600}
 
@@ -92,11 +93,11 @@ class OdometerUnits(TomlTable):
 
 # [imu.noise]: the fields of ImuNoise, None where the file says nothing; only a scale error may be stated as none.
 # A figure is a number in SI, or text with a unit.
-NOISE_FIGURES = tuple(f.name for f in fields(ImuNoise) if not f.name.endswith("_scale_sigma"))
+STATED_FIGURES = tuple(f.name for f in fields(ImuNoise) if not f.name.endswith("_scale_sigma"))
 
 
 def _figure(key: str) -> Any:
-    number = Positive if key in NOISE_FIGURES else NotNegative
+    number = Positive if key in STATED_FIGURES else NotNegative
     return Annotated[number | None, BeforeValidator(partial(parse_figure, key))]
 
 

@@ -19,7 +19,7 @@ from graphnav.recording.plausibility.readings import NOISY, RARE
 
 
 @dataclass(frozen=True)
-class Lines:
+class StraightLines:
     """What tells a row on a line from a measured one."""
 
     steps: tuple[float, ...]  # of the digits of each axis
@@ -34,7 +34,7 @@ class Lines:
         return True
 
 
-def find_filled(t: Array, readings: Iterable[Array]) -> tuple[NDArray[np.bool_], Lines | None]:
+def find_filled(t: Array, readings: Iterable[Array]) -> tuple[NDArray[np.bool_], StraightLines | None]:
     """Which rows no sensor measured: stretches that one in a thousand recordings (`RARE`) would contain by chance.
 
     An axis without noise, as of a simulation, whose deviations seldom change their sign, does not count.
@@ -48,7 +48,7 @@ def find_filled(t: Array, readings: Iterable[Array]) -> tuple[NDArray[np.bool_],
     -------
     filled : (N,)
         True for rows within such stretches. None where most seconds have some: those of a slower sensor, resampled.
-    lines : Lines or None
+    lines : StraightLines or None
         For further rows; None for less than ten seconds, or rows of a slower sensor.
     """
     filled = np.zeros(len(t), dtype=bool)
@@ -75,4 +75,4 @@ def find_filled(t: Array, readings: Iterable[Array]) -> tuple[NDArray[np.bool_],
         if (b - a) * log_chance < np.log(RARE / len(t)):
             # the end of a line is measured, a repetition is not
             filled[a + 1 : b + 1 + repeats[a:b].all()] = True
-    return filled, Lines(tuple(steps), log_chance)
+    return filled, StraightLines(tuple(steps), log_chance)

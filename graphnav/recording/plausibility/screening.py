@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from graphnav.core.earth import gravity
+from graphnav.core.earth import STANDARD_GRAVITY, gravity
 from graphnav.core.errors import RecordingError
 from graphnav.core.findings import Finding, period_of, runs_of
 from graphnav.core.notes import Note, format_count
@@ -35,7 +35,6 @@ from graphnav.recording.plausibility.readings import NOISY, find_contradicted
 # and more, and cannot tell gravity from their own offset), and no gyro for them one beyond 4000 deg/s.
 ACCEL_RANGE = 1000.0  # m/s^2
 GYRO_RANGE = 70.0  # rad/s
-_STANDARD_GRAVITY = 9.80665  # m/s^2, where the position is unknown
 _ISOLATED = 0.01  # share of the rows; above it the cause is not in single rows
 _QUIET_PERCENTILE = 10.0  # percentile of the turn rate up to which a foot stands and a vehicle moves calmly
 # A factor of two is the smallest by which a scale is mistaken (the ranges of a sensor are that far apart): the middle.
@@ -45,7 +44,7 @@ _UNIT_RATIO = 1.2  # ratio of the force found and that of a unit: a biased senso
 _DEAD = 10.0  # s; the longest repetition of an axis in thirty real recordings while others move is 0.08 s
 _MOVING_STEPS = 20.0  # steps of its own resolution by which an axis has moved and not only flickered
 # Levels that a moving carrier exceeds by far: a thousandth of g, and the Earth's rate
-_STIRS = {"accelerometer": 1e-3 * _STANDARD_GRAVITY, "gyro": 7.3e-5}  # m/s^2, rad/s
+_STIRS = {"accelerometer": 1e-3 * STANDARD_GRAVITY, "gyro": 7.3e-5}  # m/s^2, rad/s
 _NO_GRAVITY = "gravity seems to have been removed from the accelerometer; graphnav needs the raw force"
 _AXIS = "xyz"
 _UNIT_FINDINGS = (
@@ -73,7 +72,8 @@ def refuse(recording: Recording, findings: tuple[Finding, ...]) -> None:
     """
     for finding in findings:
         if finding.severity == "refused":
-            raise RecordingError(f"'{recording.name}': {finding.sentence}", key=finding.key)
+            draft = "" if recording.has_keys else f" (graphnav init {recording.source} drafts a recording.toml)"
+            raise RecordingError(f"'{recording.name}': {finding.sentence}{draft}", key=finding.key)
 
 
 def screen_recording(recording: Recording) -> tuple[Recording, list[str]]:
@@ -199,7 +199,7 @@ def check_imu_scale(recording: Recording) -> Iterator[Finding]:
     if (sentence := _find_scale(f)) is not None:
         steady = float(np.linalg.norm(imu.accel[quiet].mean(axis=0))) / max(f, 1e-9)
         sentence = _NO_GRAVITY if _lacks_gravity(recording, f, steady) else sentence
-        g = _STANDARD_GRAVITY if recording.gnss is None else _measure_gravity(recording)
+        g = STANDARD_GRAVITY if recording.gnss is None else _measure_gravity(recording)
         yield Finding(
             "refused",
             f"the specific force where it is calm is {f:.3g} m/s2 (median), not {g:.1f}: {sentence}",
@@ -212,7 +212,7 @@ def _lacks_gravity(recording: Recording, f: float, steady: float) -> bool:
     mean over f, is small), or is of the right size otherwise, as the fixes' accelerations are felt so.
     """
     gnss, imu = recording.gnss, recording.imu
-    if f > _STANDARD_GRAVITY:
+    if f > STANDARD_GRAVITY:
         return False
     if steady < _STEADY and recording.platform == "vehicle":
         return True
@@ -223,19 +223,19 @@ def _lacks_gravity(recording: Recording, f: float, steady: float) -> bool:
     if fit is None or fit.correlation < FAIR:
         return False
     size = float(np.log(np.linalg.norm(fit.coefficients)))  # of the true one over that felt
-    return abs(size) < abs(size + np.log(f / _STANDARD_GRAVITY))
+    return abs(size) < abs(size + np.log(f / STANDARD_GRAVITY))
 
 
 def _measure_gravity(recording: Recording) -> float:
     """Gravity where most fixes are, m/s^2."""
     assert recording.gnss is not None
     there = recording.gnss.llh[np.isfinite(recording.gnss.llh).all(axis=1)]
-    return float(gravity(*np.median(there, axis=0)[[0, 2]])) if len(there) else _STANDARD_GRAVITY
+    return float(gravity(*np.median(there, axis=0)[[0, 2]])) if len(there) else STANDARD_GRAVITY
 
 
 def _find_scale(f: float) -> str | None:
     """The likely unit or scale of a force at rest that is not gravity; None if it is."""
-    g = _STANDARD_GRAVITY
+    g = STANDARD_GRAVITY
     if g / _SCALE_RATIO < f < g * _SCALE_RATIO:
         return None
     units = {g / size: f'the accelerometer seems to be in {name}: say units = {{ accel = "{name}" }}'

@@ -3,16 +3,39 @@
 Times are seconds from the recording's start, as on the command line.
 """
 
-from graphnav.report.plots.colours import PALETTE, css_colours
+from graphnav.report.plots.colours import PALETTE, css_colours, variable
 from graphnav.report.plots.consistency import nees, residuals, timeline
 from graphnav.report.plots.detections import detections
 from graphnav.report.plots.figure import SHADES, TIME, Figure, Panel, Spans, limits
-from graphnav.report.plots.series import Series, Shades, bands, sigmas, span_zoom
+from graphnav.report.plots.paths import FIX_COLOURS, DrawnFixes, profile, trajectory
+from graphnav.report.plots.series import Curve, Shades, bands, sigmas, span_zoom
 from graphnav.report.plots.thinning import BINS, choose_rows, thin, with_breaks
-from graphnav.report.plots.way import FIX_COLOURS, Fixes, profile, trajectory
 
 __all__ = [
-    "BINS", "FIX_COLOURS", "PALETTE", "SHADES", "TIME", "Figure", "Fixes", "Panel", "Series", "Shades", "Spans",
-    "bands", "choose_rows", "css_colours", "detections", "limits", "nees", "profile", "residuals",
-    "sigmas", "span_zoom", "thin", "timeline", "trajectory", "with_breaks",
+    "BINS",
+    "FIX_COLOURS",
+    "PALETTE",
+    "SHADES",
+    "TIME",
+    "Curve",
+    "DrawnFixes",
+    "Figure",
+    "Panel",
+    "Shades",
+    "Spans",
+    "bands",
+    "choose_rows",
+    "css_colours",
+    "detections",
+    "limits",
+    "nees",
+    "profile",
+    "residuals",
+    "sigmas",
+    "span_zoom",
+    "thin",
+    "timeline",
+    "trajectory",
+    "variable",
+    "with_breaks",
 ]  # fmt: skip

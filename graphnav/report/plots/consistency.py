@@ -11,7 +11,7 @@ from graphnav.core.rotation import Array
 from graphnav.core.sample_size import chi_square_quantile
 from graphnav.estimation.solution import ConstraintRecord
 from graphnav.report.plots.figure import Figure, Panel, limits
-from graphnav.report.plots.series import Series, Shades
+from graphnav.report.plots.series import Curve, Shades
 
 _CHI2 = "99 % of chi-square"
 
@@ -66,7 +66,7 @@ def _epochs(panel: Panel, t: Array, y: Array, weight: Array, look: str) -> None:
 
 
 def nees(
-    series: Mapping[str, Series], names: Sequence[str], dofs: Sequence[int], end: float, *, spans: Shades
+    series: Mapping[str, Curve], names: Sequence[str], dofs: Sequence[int], end: float, *, spans: Shades
 ) -> Figure:
     """NEES per degree of freedom, one panel for each of `names`, with the middle 99 % of chi-square for one epoch.
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from graphnav.core.rotation import Array
-from graphnav.report.plots.colours import PALETTE
+from graphnav.report.plots.colours import variable
 from graphnav.report.plots.thinning import BINS, choose_rows, thin, with_breaks
 
 SHADES = {"withheld": "withheld", "no GNSS": "outage", "excluded": "alert", "stands": "stop"}  # span -> colour
@@ -30,10 +30,10 @@ class Panel:
         self.figure, self.unit, self.xlim, self.ylim = figure, unit, xlim, ylim
         self.axes = {"xaxis": figure.x_of(k), "yaxis": _axis("y", k)}
 
-    def _add(self, label: str, trace: dict[str, Any], quiet: bool = False, at: str = "", way: bool = False) -> None:
+    def _add(self, label: str, trace: dict[str, Any], quiet: bool = False, at: str = "", path: bool = False) -> None:
         hover = {"hoverinfo": "skip"}
         if not quiet:
-            place = ("%{x:.2f}, %{y:.2f} " if way else "%{y:.4~g} ") + self.unit
+            place = ("%{x:.2f}, %{y:.2f} " if path else "%{y:.4~g} ") + self.unit
             hover = {"hovertemplate": f"{place.strip()}{at}<extra>{label}</extra>"}
         first = bool(label) and label not in self.figure.labels
         self.figure.labels.add(label)
@@ -54,7 +54,7 @@ class Panel:
         """A horizontal line at y."""
         self.line(np.array(self.xlim), np.full(2, y), "ink", quiet=True, **{"width": 1.0, **kw})
 
-    def way(
+    def path(
         self, xy: Array, name: str, label: str, t: Array | None = None, width: float = 1.8, alpha: float = 1.0
     ) -> None:
         """A line through places (N, 2), reached at t."""
@@ -63,21 +63,21 @@ class Panel:
         look = {"color": colour(name), "width": width}
         places = {"x": numbers(xy[rows, 0]), "y": numbers(xy[rows, 1])}
         words = "<br>at %{customdata:.2f} s" if at else ""
-        self._add(label, {"mode": "lines", "line": look, "opacity": alpha, **places, **at}, t is None, words, way=True)
+        self._add(label, {"mode": "lines", "line": look, "opacity": alpha, **places, **at}, t is None, words, path=True)
 
     def dots(
         self, x: Array, y: Array, name: str, label: str = "", size: float = 4.0, marker: str = "o",
-        alpha: float = 1.0, t: Array | None = None, way: bool = False,
+        alpha: float = 1.0, t: Array | None = None, path: bool = False,
     ) -> None:  # fmt: skip
         """A marker (o, x, s, ^, D) at every row."""
-        rows = choose_rows(x, y) if way else thin(x, y)
+        rows = choose_rows(x, y) if path else thin(x, y)
         look = {"color": colour(name), "size": size, "symbol": _SYMBOLS[marker], "opacity": alpha}
         if marker == "x":
             look["line"] = {"color": colour(name), "width": 2}
         at: dict[str, Any] = {} if t is None else {"customdata": numbers(t[rows])}
         words = "<br>at %{customdata:.2f} s" if at else ""
         places = {"x": numbers(x[rows]), "y": numbers(y[rows])}
-        self._add(label, {"mode": "markers", "marker": look, **places, **at}, at=words, way=way)
+        self._add(label, {"mode": "markers", "marker": look, **places, **at}, at=words, path=path)
 
     def band(self, x: Array, low: Array, high: Array, name: str, label: str = "", alpha: float = 0.18) -> None:
         """A tinted area between two lines, interrupted where x has a gap."""
@@ -244,7 +244,7 @@ def numbers(values: Array) -> dict[str, str]:
 
 def colour(name: str) -> str:
     """A colour of the page, by the name of a solver or another drawn object."""
-    return f"var(--{name if name in PALETTE else 'other'})"
+    return f"var({variable(name)})"
 
 
 def _axis(letter: str, k: int) -> str:

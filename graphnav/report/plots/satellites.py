@@ -52,11 +52,11 @@ def sky(record: ConstraintRecord, solver: str) -> Figure:
     refused = record.weight < HALF
     for name in np.unique(record.satellite):
         own = _some(np.flatnonzero(record.satellite == name), _PLENTY // 8)
-        panel.dots(x[own], y[own], solver, "used", 3.0, t=record.t[own], way=True)
+        panel.dots(x[own], y[own], solver, "used", 3.0, t=record.t[own], path=True)
         panel.words(float(x[own[-1]]), float(y[own[-1]]), str(name), shift=(4, -4))
     if refused.any():
         own = _some(np.flatnonzero(refused))
-        panel.dots(x[own], y[own], "alert", "less than half weight", 4.0, t=record.t[own], way=True)
+        panel.dots(x[own], y[own], "alert", "less than half weight", 4.0, t=record.t[own], path=True)
     return figure
 
 
@@ -108,7 +108,7 @@ def residuals_by_elevation(records: Mapping[str, ConstraintRecord], solver: str)
         for some, look, words, size in ((used, solver, "used", 2.5), (~used, "alert", "less than half weight", 4.0)):
             rows = _some(np.flatnonzero(some))
             if len(rows):
-                panel.dots(x[rows], bounded[rows], look, words, size, alpha=0.4, way=True)
+                panel.dots(x[rows], bounded[rows], look, words, size, alpha=0.4, path=True)
         middle, rms, sigma = _by_elevation(x[used], y[used], record.sigma[used, 0])
         panel.line(middle, rms, "truth", "RMS in steps of 5 deg", width=2.2)
         panel.line(middle, sigma, "withheld", "their sigma", width=2.2, dash=True)
@@ -128,9 +128,14 @@ def residuals_by_satellite(kind: str, record: ConstraintRecord, solver: str) -> 
     gap = np.nan
     for a, b, width, words in ((0, 4, 1.5, "middle 95 %"), (1, 3, 5.0, "middle half")):
         lines = np.array([[q[a], places[n]] for n in parts for q in (parts[n], parts[n][[b] * 5], np.full(5, gap))])
-        panel.way(lines, solver, words, width=width)
+        panel.path(lines, solver, words, width=width)
     panel.dots(
-        np.array([q[2] for q in parts.values()]), np.array([places[n] for n in parts]), "truth", "median", 6.0, way=True
+        np.array([q[2] for q in parts.values()]),
+        np.array([places[n] for n in parts]),
+        "truth",
+        "median",
+        6.0,
+        path=True,
     )
     return figure
 
@@ -143,9 +148,9 @@ def carrier_arcs(arcs: CarrierArcs, start: float, end: float, *, spans: Shades) 
     for some, look, words in ((~arcs.integer, "float", "real number"), (arcs.integer, "fixed", "integer")):
         if some.any():
             x = np.stack([arcs.begin[some], arcs.end[some], np.full(int(some.sum()), np.nan)], -1) - start
-            panel.way(np.stack([x.ravel(), np.repeat(row[some], 3)], -1), look, words, width=5.0)
+            panel.path(np.stack([x.ravel(), np.repeat(row[some], 3)], -1), look, words, width=5.0)
     first = np.unique(np.stack([row, arcs.begin - start], -1), axis=0)
-    panel.dots(first[:, 1], first[:, 0], "truth", "begins", 3.0, "s", way=True)
+    panel.dots(first[:, 1], first[:, 0], "truth", "begins", 3.0, "s", path=True)
     return figure
 
 

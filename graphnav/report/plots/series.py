@@ -14,20 +14,20 @@ Shades = Mapping[str, Spans]  # s from the start, by kind
 
 
 @dataclass(frozen=True)
-class Series:
+class Curve:
     """A quantity of k components over time, with its 1-sigma where known."""
 
     t: Array  # (N,) s from the recording's start
     value: Array  # (N, k)
     sigma: Array | None = None  # (N, k)
 
-    def take(self, components: Sequence[int]) -> Series:
+    def take(self, components: Sequence[int]) -> Curve:
         """Select components."""
-        return Series(self.t, self.value[:, components], None if self.sigma is None else self.sigma[:, components])
+        return Curve(self.t, self.value[:, components], None if self.sigma is None else self.sigma[:, components])
 
 
 def bands(
-    series: Mapping[str, Series], components: Sequence[str], unit: str | Sequence[str], end: float, *, spans: Shades,
+    series: Mapping[str, Curve], components: Sequence[str], unit: str | Sequence[str], end: float, *, spans: Shades,
     about_zero: bool = True, under: Callable[[Panel, int], None] | None = None,
 ) -> Figure:  # fmt: skip
     """One panel per component: the values, and 3 sigma about zero (errors) or about the value (biases).
@@ -41,7 +41,7 @@ def bands(
     under : draws more into the panel of a component.
     """
     if len(series) > 2:
-        series = {name: Series(s.t, s.value) for name, s in series.items()}
+        series = {name: Curve(s.t, s.value) for name, s in series.items()}
     ylims = []
     for k in range(len(components)):
         extremes, always = [], []
@@ -75,7 +75,7 @@ def bands(
     return figure
 
 
-def sigmas(series: Mapping[str, Series], components: Sequence[str], unit: str, end: float, *, spans: Shades) -> Figure:
+def sigmas(series: Mapping[str, Curve], components: Sequence[str], unit: str, end: float, *, spans: Shades) -> Figure:
     """One panel per component with the 1-sigma of every solver on a logarithmic axis (`value` holds the sigma)."""
     positive = {name: np.where(s.value > 0, s.value, np.nan) for name, s in series.items()}
     ylims = [limits([np.log10(v[:, k]) for v in positive.values()], floor=0.5) for k in range(len(components))]
@@ -88,7 +88,7 @@ def sigmas(series: Mapping[str, Series], components: Sequence[str], unit: str, e
     return figure
 
 
-def span_zoom(series: Mapping[str, Series], spans: Spans, what: str = "withheld") -> Figure:
+def span_zoom(series: Mapping[str, Curve], spans: Spans, what: str = "withheld") -> Figure:
     """Horizontal error (m) over time in and around each span, one panel per span (`value` (N, 1))."""
     shown, xlims, ylims = [], [], []
     for a, b in spans:

@@ -17,7 +17,7 @@ _WIDE, _HIGH = 1080.0, 560  # pixels of the map on a wide screen; narrower pages
 
 
 @dataclass(frozen=True)
-class Fixes:
+class DrawnFixes:
     """GNSS fixes: times (M,) in s from the start, east, north, up (M, 3) in m, and which were excluded (M,).
 
     `kinds` are the rows (M,) bool of each kind of fix, by name: a type, or a stated accuracy.
@@ -40,7 +40,7 @@ FIX_COLOURS = {
 def trajectory(
     tracks: Mapping[str, tuple[Array, Array]],
     *,
-    fixes: Fixes | None = None,
+    fixes: DrawnFixes | None = None,
     truth: Array | None = None,
     spans: Mapping[str, Spans] | None = None,
     stops: Spans = (),
@@ -69,11 +69,11 @@ def trajectory(
     if fixes is not None:
         draw_fixes(panel, fixes)
     if truth is not None and len(truth):
-        panel.way(truth, "truth", "truth", width=3.5, alpha=0.5)
+        panel.path(truth, "truth", "truth", width=3.5, alpha=0.5)
     for number, (name, (t, en)) in enumerate(tracks.items()):
         if number == 0:
             _draw_spans(panel, t, en, spans or {})
-        panel.way(en, name, name, t)
+        panel.path(en, name, name, t)
         if number == 0:
             _draw_stops(panel, t, en, stops, standing)
     if tracks:
@@ -94,11 +94,11 @@ def profile(lines: Mapping[str, tuple[Array, Array]], points: Mapping[str, tuple
     for kind, (x_, y) in points.items():
         panel.dots(kilo * x_, y, FIX_COLOURS.get(kind, "ink"), kind, 3.0, alpha=0.6)
     for name, (x_, y) in lines.items():
-        panel.way(np.column_stack([kilo * x_, y]), name, name)
+        panel.path(np.column_stack([kilo * x_, y]), name, name)
     return figure
 
 
-def draw_fixes(panel: Panel, fixes: Fixes, k: int | None = None) -> None:
+def draw_fixes(panel: Panel, fixes: DrawnFixes, k: int | None = None) -> None:
     """Each kind in its colour, excluded fixes as crosses: on a map, or component k over time."""
     x, y = (fixes.enu[:, 0], fixes.enu[:, 1]) if k is None else (fixes.t, fixes.enu[:, k])
     for kind, of_it in fixes.kinds.items():
@@ -106,19 +106,19 @@ def draw_fixes(panel: Panel, fixes: Fixes, k: int | None = None) -> None:
         if rows.any():
             name = FIX_COLOURS.get(kind, "ink")
             size = 5.0 if k is None else 3.0
-            panel.dots(x[rows], y[rows], name, kind, size, alpha=0.6, t=fixes.t[rows], way=k is None)
+            panel.dots(x[rows], y[rows], name, kind, size, alpha=0.6, t=fixes.t[rows], path=k is None)
     out = fixes.excluded & np.isfinite(y)
     if out.any():
-        panel.dots(x[out], y[out], "alert", "excluded fix", 7.0, "x", t=fixes.t[out], way=k is None)
+        panel.dots(x[out], y[out], "alert", "excluded fix", 7.0, "x", t=fixes.t[out], path=k is None)
 
 
 def _draw_spans(panel: Panel, t: Array, en: Array, spans: Mapping[str, Spans]) -> None:
     for what, every in spans.items():
         pieces = [(t > a) & (t < b) for a, b in every]
         gap = np.full((1, 2), np.nan)
-        way = [part for piece in pieces if piece.any() for part in (en[piece], gap)]
-        if way:
-            panel.way(np.concatenate(way), SHADES[what], what, width=8.0, alpha=0.5)
+        path = [part for piece in pieces if piece.any() for part in (en[piece], gap)]
+        if path:
+            panel.path(np.concatenate(path), SHADES[what], what, width=8.0, alpha=0.5)
 
 
 def _draw_stops(panel: Panel, t: Array, en: Array, stops: Spans, standing: str) -> None:
@@ -126,7 +126,7 @@ def _draw_stops(panel: Panel, t: Array, en: Array, stops: Spans, standing: str) 
         return
     begin, end = np.array(stops).T
     x, y = (np.interp(0.5 * (begin + end), t, en[:, k]) for k in (0, 1))
-    panel.dots(x, y, "stop", standing, 8.0 if len(stops) <= _MARKED_STOPS else 5.0, "D", t=begin, way=True)
+    panel.dots(x, y, "stop", standing, 8.0 if len(stops) <= _MARKED_STOPS else 5.0, "D", t=begin, path=True)
 
 
 def _mark_ends(panel: Panel, en: Array, scale: float) -> None:
