@@ -30,7 +30,7 @@ from graphnav.estimation.noise.files import MODES
 from graphnav.estimation.noise.imu_floor import with_measured_floor
 from graphnav.estimation.noise.model import STATED, NoiseModel, StampOffsets
 from graphnav.estimation.noise.words import describe_far
-from graphnav.estimation.preparation import Prepared, prepare
+from graphnav.estimation.preparation import Prepared, Weigh, prepare
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.separation import separation
 from graphnav.estimation.solution import Solution, join_solutions
@@ -220,7 +220,7 @@ def _solve(
     recording, shown = with_measured_floor(recording, settings)
     detection = time.perf_counter() - began
 
-    def prepare_moved(moved: Recording, weigh: bool) -> Prepared:
+    def prepare_moved(moved: Recording, weigh: Weigh | None = None) -> Prepared:
         nonlocal detection
         tell("detection")
         began = time.perf_counter()
@@ -234,7 +234,7 @@ def _solve(
     else:
         stamps = StampOffsets() if noise is None else noise.stamps
         recording = move_stamps(recording, stamps)
-        found = prepare_moved(recording, False)
+        found = prepare_moved(recording)
     problem, forward, smoothed = found.problem, found.forward, found.smoothed
     wrong = faults.fault_spans(problem, smoothed)
     notes = (

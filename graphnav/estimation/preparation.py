@@ -8,6 +8,7 @@ solver its first linearisation point.
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -46,6 +47,9 @@ from graphnav.estimation.solvers.passes import (
 from graphnav.estimation.solvers.rts import backward
 from graphnav.recording import Recording
 
+# whether the evidence of a noise model is wanted, by the problem and the points of its estimate
+Weigh = Callable[[Problem, Points], bool]
+
 _LINEAR = 0.1  # rad between linearisation point and smoothed attitude, up to which the smoother is used
 _ROUNDS = 5  # of filter and smoother about what they found before; where that leads nowhere, a batch is solved
 _MOST_WRONG = 0.5  # share of excluded fixes, beyond which the start is wrong rather than the fixes
@@ -67,7 +71,7 @@ class Prepared:
     passes: Counter[str] = field(default_factory=Counter)
     fixed: dict[str, Array] = field(default_factory=dict)  # `Solution.fixed` of the filter, and of the others ("")
     arcs: dict[str, CarrierArcs] = field(default_factory=dict)  # `Solution.arcs`, the same way
-    log_evidence: float = 0.0  # of all measurements by the estimated noise model, where that is wanted
+    log_evidence: float = np.inf  # of all measurements by the estimated noise model, where that is wanted
 
     @property
     def diverged(self) -> bool:
@@ -82,7 +86,7 @@ def prepare(
     detections: Detections,
     noise: NoiseModel | None = None,
     progress: Progress | None = None,
-    weigh: bool = False,
+    weigh: Weigh | None = None,
 ) -> Prepared:
     """Align a recording, build its problem and find its noise model.
 
@@ -90,7 +94,7 @@ def prepare(
     ----------
     detections : where the platform stands.
     noise : to be used as it is; estimated, or as stated if the settings say so, when None.
-    weigh : whether the evidence of a noise model that is estimated is wanted.
+    weigh : whether the evidence of a noise model that is estimated is wanted; never when None.
 
     Raises
     ------
@@ -104,7 +108,7 @@ def prepare(
     if noise is None and (settings.noise.mode == "stated" or aligned.motion is None or not settings.gnss.position):
         noise, spacing = STATED, STATED.spacing
     builder = replace(every, used=space_fixes(recording, spacing)) if spacing else every
-    built, known, evidence = builder.build(aligned, detections, parts=noise != STATED), None, 0.0
+    built, known, evidence = builder.build(aligned, detections, parts=noise != STATED), None, np.inf
     if noise is None:
         tell("noise")
         with clock.book("noise"):
@@ -151,7 +155,7 @@ def _smooth(
 
 
 def _find_noise(
-    builder: ProblemBuilder, built: BuiltProblem, progress: Progress | None, passes: Counter[str], weigh: bool
+    builder: ProblemBuilder, built: BuiltProblem, progress: Progress | None, passes: Counter[str], weigh: Weigh | None
 ) -> tuple[NoiseModel, Points | None, BuiltProblem, float]:
     """The noise model, linearisation points, the problem with a start and stops that rest on no excluded fix, and the
     logarithm of the evidence where it is wanted.
@@ -175,7 +179,8 @@ def _find_noise(
         best = replace(again, passes=best.passes + again.passes)
     best = estimate_disturbed_intervals(built.problem, best)
     passes.update(best.passes + Counter(filter=1))
-    evidence = log_evidence(built.problem, best) if weigh else 0.0
+    wanted = weigh is not None and weigh(built.problem, best.points)
+    evidence = log_evidence(built.problem, best) if wanted else np.inf
     plain = NoiseModel(excluded=best.noise.excluded)
     if _is_likelier(built.problem, plain, best):
         return plain, None, built, evidence

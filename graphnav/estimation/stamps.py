@@ -5,8 +5,8 @@ A fix whose stamp is off by d is predicted from the state at the stamp, by v d +
 this is off by 5 d^3 / 6: 7 mm for 0.2 s, 0.8 m for a second. So where an offset is estimated farther than that from
 where the rows are linearised, the stamps are moved to the estimate and all is estimated anew, a step of Gauss-Newton,
 until the estimate stays within. Where the clocks of IMU and fixes disagree for certain
-(`graphnav.recording.checks.clock`), the first step is what they disagree by, and the stamps as they are remain the
-other candidate: the likelier stands.
+(`graphnav.recording.checks.clock`), the first step is what they disagree by. The stamps as they are remain a candidate:
+the likelier stands.
 
 A solution is on the clock of the IMU, and what it says of fixes is on theirs (`on_own_clock`).
 """
@@ -18,14 +18,16 @@ from dataclasses import replace
 from typing import Any
 
 from graphnav.config import Settings
-from graphnav.constraints.gnss import TIME_OFFSET, VELOCITY_TIME_OFFSET, GnssPosition, GnssVelocity
+from graphnav.constraints.gnss import OFFSETS, TIME_OFFSET, VELOCITY_TIME_OFFSET, GnssPosition, GnssVelocity
 from graphnav.constraints.vehicle import ODOMETER_DELAY
 from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.estimation.noise.model import NoiseModel, RowWeights, StampOffsets
-from graphnav.estimation.preparation import Prepared
+from graphnav.estimation.preparation import Prepared, Weigh
+from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import ConstraintRecord, ExcludedSpan, ParameterEstimate, Solution
-from graphnav.estimation.solvers.passes import parameters_of, sigmas_of
+from graphnav.estimation.solvers.linearise import Points
+from graphnav.estimation.solvers.passes import parameters_of, sigmas_of, values_of
 from graphnav.recording import Recording
 from graphnav.recording.checks.clock import FAIR, ClockOffsets, is_certain
 
@@ -34,8 +36,9 @@ _SIGNIFICANT = 3.0  # sigmas
 _ROUNDS = 3  # of moving the stamps
 _AS_THEY_ARE = StampOffsets()
 
-# a recording whose stamps are moved, and whether evidence is wanted -> what its solvers share
-Prepare = Callable[[Recording, bool], Prepared]
+# a recording whose stamps are moved, and whether evidence is wanted of an estimate -> what its solvers share
+Prepare = Callable[[Recording, Weigh], Prepared]
+_Candidate = tuple[Recording, Prepared, StampOffsets]
 
 
 def may_move(recording: Recording, settings: Settings) -> bool:
@@ -55,25 +58,37 @@ def find_stamps(
     clock : offsets between IMU and fixes that the recording shows before any estimation.
     """
     guess = None if clock is None else _guess(clock)
-    plain = recording, prepare(recording, guess is not None), _AS_THEY_ARE
-    if guess is not None:
-        moved = move_stamps(recording, guess)
-        other = _settle(recording, prepare, (moved, prepare(moved, True), guess))
-        if other is not None and other[1].log_evidence > plain[1].log_evidence:
-            return other
-    return _settle(recording, prepare, plain) or plain
+    plain: _Candidate = recording, prepare(recording, _is_far if guess is None else _always), _AS_THEY_ARE
+    starts = [] if guess is None else [_move(recording, prepare, guess)]
+    for start in (*starts, plain):
+        found = _settle(recording, prepare, start)
+        if found is not None and found is not plain and found[1].log_evidence > plain[1].log_evidence:
+            return found
+    return plain
 
 
-def _settle(
-    recording: Recording, prepare: Prepare, found: tuple[Recording, Prepared, StampOffsets]
-) -> tuple[Recording, Prepared, StampOffsets] | None:
+def _settle(recording: Recording, prepare: Prepare, found: _Candidate) -> _Candidate | None:
     """Move the stamps until their offsets are estimated near where they are; None where that does not come about."""
     for _ in range(_ROUNDS):
         if (ahead := _estimate(*found[1:])) == found[2]:
             return found
-        moved = move_stamps(recording, ahead)
-        found = moved, prepare(moved, True), ahead
+        found = _move(recording, prepare, ahead)
     return found if _estimate(*found[1:]) == found[2] else None
+
+
+def _move(recording: Recording, prepare: Prepare, offsets: StampOffsets) -> _Candidate:
+    moved = move_stamps(recording, offsets)
+    return moved, prepare(moved, _always), offsets
+
+
+def _always(problem: Problem, points: Points) -> bool:
+    return True
+
+
+def _is_far(problem: Problem, points: Points) -> bool:
+    """Whether an offset is far from where its rows are linearised."""
+    values = values_of(problem, points)
+    return any(abs(float(values[name][0, 0])) > _LINEAR for name in OFFSETS.values() if name in values)
 
 
 def _guess(clock: ClockOffsets) -> StampOffsets | None:
@@ -104,7 +119,10 @@ def _estimate(prepared: Prepared, at: StampOffsets) -> StampOffsets:
             off, sigma = float(found[name].value[0, 0]), float(found[name].sigma[0, 0])
             if abs(off) > max(_LINEAR, _SIGNIFICANT * sigma):
                 new[key] = getattr(at, key) + off
-    return _join(replace(at, **new)) if new else at
+    if not new:
+        return at
+    ahead = replace(at, **new)
+    return _join(ahead) if VELOCITY_TIME_OFFSET in found else replace(ahead, velocities=ahead.positions)
 
 
 def move_stamps(recording: Recording, offsets: StampOffsets) -> Recording:
