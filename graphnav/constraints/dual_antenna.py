@@ -2,8 +2,11 @@
 
 With the baseline b in body axes, corrected by the errors of its direction (delta), and d = R_ln R_nb b::
 
-    heading:   atan2(d_east, d_north) - psi + delta_heading            from -pi to pi
-    pitch:     atan2(d_up, |d_east, d_north|) - theta + delta_pitch
+    heading:   atan2(d_east, d_north) - psi + delta_heading + e        from -pi to pi
+    pitch:     atan2(d_up, |d_east, d_north|) - theta + delta_pitch + e
+
+e is the part of the errors that lasts for minutes, as reflections do while satellites move: a Gauss-Markov process
+whose size and correlation time the noise model estimates.
 """
 
 from __future__ import annotations
@@ -17,6 +20,7 @@ import numpy as np
 
 from graphnav.config import Settings
 from graphnav.constraints.base import SAME_TIME, BuildContext, Constraint, Linearized
+from graphnav.constraints.gnss import TIMES, node_spacing, period
 from graphnav.core import rotation
 from graphnav.core.earth import LocalFrame
 from graphnav.core.rotation import Array
@@ -60,21 +64,34 @@ class Baseline(Constraint):
         if not used.any():
             return None
         figures = series.figures
-        wrong = Parameter(cls._name_error(), np.zeros(1), np.full(1, np.radians(figures.baseline_sigma)), "rad")
+        sigma = series.sigma(cls.column, np.radians(figures.sigma))[used, None]
+        times = scene.settings.gnss.slow_times
+        lasting = Parameter(
+            cls.name_lasting(), np.zeros(1), np.median(sigma, axis=0), "rad", correlation_time=times[0],
+            spacing=node_spacing(times, period(series.t[used])),
+            noise_groups=(f"{cls.name}.{TIMES[1]}.{cls.column}",),
+        )  # fmt: skip
+        wrong = Parameter(cls._name_offset(), np.zeros(1), np.full(1, np.radians(figures.baseline_sigma)), "rad")
         return cls(
             keyframe=keyframe[used],
             measured=series[cls.column][used, None],
-            sigma=series.sigma(cls.column, np.radians(figures.sigma))[used, None],
+            sigma=sigma,
             baseline=np.array(figures.baseline),
             frame=scene.frame,
             parameters=(wrong,) if figures.baseline_sigma > 0.0 else (),
+            processes=(lasting,),
             **s.outliers,
         )
 
     @classmethod
-    def _name_error(cls) -> str:
+    def _name_offset(cls) -> str:
         """Name of the parameter for the error of the baseline's direction."""
         return f"{SENSOR.name}_{cls.column}_offset"
+
+    @classmethod
+    def name_lasting(cls) -> str:
+        """Name of the process of its lasting error."""
+        return f"{cls.name}_error"
 
     def linearize(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> Linearized:
         assert self.frame is not None
@@ -83,9 +100,10 @@ class Baseline(Constraint):
         angle, by_d = self.angle(d)
         residual = angle - self.measured[rows]
         jacobians: dict[str, Any] = {"theta": -by_d[:, None, :] @ C @ rotation.skew(self.baseline)}
-        if self._name_error() in parameters:
-            residual = residual + parameters[self._name_error()]
-            jacobians[self._name_error()] = np.ones((len(residual), 1, 1))
+        for name in (self._name_offset(), self.name_lasting()):
+            if name in parameters:
+                residual = residual + parameters[name]
+                jacobians[name] = np.ones((len(residual), 1, 1))
         return Linearized((residual + np.pi) % (2.0 * np.pi) - np.pi, jacobians, self.sigma[rows])
 
     @abstractmethod

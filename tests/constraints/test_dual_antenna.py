@@ -8,18 +8,22 @@ import numpy as np
 import pytest
 from helpers import refused
 from pydantic import ValidationError
+from scipy.stats import chi2
 from series_drive import SETTINGS, along_truth, errors, rms, shared_drive, smoothed_online, with_series
 
+from graphnav.app.scores import score
 from graphnav.core import rotation
 from graphnav.core.errors import RecordingError
 from graphnav.core.notes import key_of
 from graphnav.detectors import detect
 from graphnav.estimation.alignment.antennas import measure_baseline_heading
 from graphnav.estimation.pipeline import run
+from graphnav.evaluation.metrics import summary
 from graphnav.online import Online, rows_of, without_rows
 from graphnav.recording import Recording
 from graphnav.sensors.dual_antenna import SENSOR, Figures
 from graphnav.simulation import simulate
+from graphnav.simulation.series import DualAntennaModel
 
 SIGMA, TURNED = np.radians(0.2), np.radians(0.6)
 BASELINE = (1.0, 0.0, 0.05)  # across the roof
@@ -108,3 +112,17 @@ def test_a_baseline_that_stands_upright_is_refused():
     assert [error["loc"] for error in caught.value.errors()] == [("baseline",)]
     with refused("sensor.column", RecordingError, "roll"):
         SENSOR.series(np.arange(2.0), {"roll": np.zeros(2)})
+
+
+def test_errors_that_last_are_not_taken_for_white() -> None:
+    """A simulated receiver's reflections last for a minute: taken for white, its headings led a filter astray."""
+    made = simulate("urban", 11, duration=300.0, tunnels=0, antennas=True, rate=50.0)
+    used = made.recording.without("gnss", (100.0, 200.0))
+    solution = run(used, solvers=("ekf",))["ekf"]
+    model = DualAntennaModel()
+    for name, size in ((".heading", model.white), (".minutes.heading", model.slow)):
+        figure = solution.noise.figures[f"dual_antenna_heading{name}"]
+        true = 2.0 * np.log(size / np.hypot(model.white, model.slow))
+        assert abs(figure.log_factor - true) < 3.0 * figure.sigma, name
+    found = score(made.recording, used, {"ekf": solution}, (("gnss", (100.0, 200.0)),))[0]["ekf"]
+    assert summary(found)["nees_p"] < chi2.isf(1e-3, 3) / 3.0  # errors of one outage are one draw of three numbers

@@ -24,7 +24,7 @@ from graphnav.estimation.pipeline import origin, run
 from graphnav.estimation.problem import Problem, build_problem
 from graphnav.estimation.solvers.ekf import ekf, near, refilter
 from graphnav.estimation.solvers.linearise import Points, advance, linearise
-from graphnav.estimation.solvers.points import Errors, PointFilter, predict_states
+from graphnav.estimation.solvers.points import FilterErrors, PointFilter, predict_states
 from graphnav.estimation.solvers.recursion import move
 from graphnav.estimation.solvers.rts import backward
 from graphnav.estimation.solvers.stack import Stack
@@ -76,7 +76,7 @@ def test_steps_and_rows_at_points_are_those_of_an_estimate_to_first_order(built:
     K, D = len(built.t), DIM + points.values.shape[1]
     stack, steps = Stack(built, K), advance(built, K)
     F = np.empty((K - 1, DIM, built.columns[SCALE].stop))
-    out = Errors(np.empty((K, D)), np.empty((K, D, D)), np.empty((K, D)), np.empty((K, D, D)))
+    out = FilterErrors(np.empty((K, D)), np.empty((K, D, D)), np.empty((K, D)), np.empty((K, D, D)))
     given = PointFilter(built, points, stack, steps, F, out)
 
     for k in (3, 60, 150):

@@ -30,6 +30,7 @@ import numpy as np
 
 from graphnav.config.settings import NoiseSettings
 from graphnav.constraints import list_constraints
+from graphnav.constraints.dual_antenna import DualHeading, DualPitch
 from graphnav.constraints.gnss import ERRORS, OFFSETS, STAMP_ERROR, STAMPS, TIMES, VELOCITY_ERROR
 from graphnav.constraints.raw_gnss import CODE_ERRORS, RATE_ERROR
 from graphnav.constraints.vehicle import NHC_ERROR, ODOMETER_ERROR
@@ -161,7 +162,9 @@ def list_groups() -> tuple[str, ...]:
 
 def _list_processes() -> tuple[str, ...]:
     typed = [f"{error}_{kind}" for error in ERRORS for kind in FIX_TYPES.values()]
-    return (*ERRORS, *typed, VELOCITY_ERROR, *CODE_ERRORS, RATE_ERROR, STAMP_ERROR, NHC_ERROR, ODOMETER_ERROR)
+    of_antennas = (kind.name_lasting() for kind in (DualHeading, DualPitch))
+    others = VELOCITY_ERROR, *CODE_ERRORS, RATE_ERROR, STAMP_ERROR, NHC_ERROR, ODOMETER_ERROR
+    return (*ERRORS, *typed, *others, *of_antennas)
 
 
 class _Reader:

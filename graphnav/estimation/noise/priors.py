@@ -16,11 +16,13 @@ import numpy as np
 
 WITHIN = 2.0 * np.log(3.0)  # 1-sigma of the logarithm of a variance: a factor of three in sigma
 _SHARES = {"seconds": 0.25, "minutes": 0.5, "hours": 0.5}  # of a GNSS sensor's stated variance
+_OF_RECEIVER = "gnss", "dual_antenna"
 TIME_WITHIN = np.log(3.0)  # 1-sigma of the logarithm of a correlation time
 
 
 def prior(group: str) -> tuple[float, float]:
     """Median and 1-sigma of the logarithm of a group's variance factor."""
     parts = group.split(".")
-    share = next((_SHARES[part] for part in parts if part in _SHARES), 1.0) if parts[0].startswith("gnss") else 1.0
+    shares = _SHARES if parts[0].startswith(_OF_RECEIVER) else {}
+    share = next((shares[part] for part in parts if part in shares), 1.0)
     return float(np.log(share)), WITHIN

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from graphnav.constraints.dual_antenna import DualHeading, DualPitch
 from graphnav.constraints.gnss import OFFSETS, STAMPS, TIMES, VELOCITY_ERROR
 from graphnav.constraints.vehicle import NHC_ERROR, ODOMETER_ERROR
 from graphnav.core.state import SECONDS
@@ -102,7 +103,9 @@ def _process(source: str, time: str, kind: str | None) -> str:
     """The parameter of a process."""
     if source == "gnss_position":
         return f"gnss_error_of_{time}{f'_{kind}' if kind else ''}"
-    return {"gnss_velocity": VELOCITY_ERROR, "nhc": NHC_ERROR, "odometer": ODOMETER_ERROR}.get(source, source)
+    known = {"gnss_velocity": VELOCITY_ERROR, "nhc": NHC_ERROR, "odometer": ODOMETER_ERROR}
+    known |= {kind.name: kind.name_lasting() for kind in (DualHeading, DualPitch)}
+    return known.get(source, source)
 
 
 def _read_sigma(recording: Recording, source: str, kind: str | None, axis: str) -> float | None:
