@@ -341,3 +341,15 @@ def test_a_run_tells_its_stages_in_order():
         "detection", "alignment", "preintegration", "noise", "filter", "smoother", "batch", "covariances",
     ]  # fmt: skip
     assert found == wanted
+
+
+# ------------------------------------------------------------------------------------------------------------- Python
+def test_a_call_of_run_takes_one_name_and_says_what_it_cannot_take():
+    recording = load(TOKYO).crop(0.0, 40.0)
+    solution = run(recording, Settings(noise={"mode": "stated"}), "rts")["rts"]
+    times, states, covariance = solution.at(np.array([recording.end + 10.0]))
+    assert (len(times), len(states), covariance.shape) == (0, 0, (0, 15, 15))
+    with refused("run.argument", ConfigError, "Recording", "load"):
+        run("data/tokyo")  # type: ignore[arg-type]
+    with refused("run.argument", ConfigError, "Settings", "dict"):
+        run(recording, {"gnss": {"robust": "cauchy"}})  # type: ignore[arg-type]

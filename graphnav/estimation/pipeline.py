@@ -53,7 +53,7 @@ _SHORTEST_PIECE = 5.0  # s; a shorter piece between two cuts cannot be aligned
 def run(
     recording: Recording,
     settings: Settings | None = None,
-    solvers: tuple[str, ...] = SOLVERS,
+    solvers: Sequence[str] | str = SOLVERS,
     progress: Progress | None = None,
     noise: NoiseModel | Literal["stated", "estimated"] | None = None,
     constraints: Sequence[type[Constraint]] = (),
@@ -68,7 +68,7 @@ def run(
     settings
         All settings; the defaults when None.
     solvers
-        Names of solvers: "ekf", "rts", "incremental", "isam2", "batch".
+        Names of solvers, or of one: "ekf", "rts", "incremental", "isam2", "batch".
     progress
         Function called with a stage and the share of it that is done, 0 to 1.
     noise
@@ -88,10 +88,16 @@ def run(
     EstimationError
         If the recording does not determine a trajectory.
     ConfigError
-        If the settings' profile is of another platform, a class of a script is not complete, or `noise` is none of
+        If the settings' profile is of another platform, a class of a script is not complete, or an argument is none of
         these.
     """
     settings = settings or Settings()
+    for given, kind, maker in ((recording, Recording, "load"), (settings, Settings, "read_settings or Settings")):
+        if not isinstance(given, kind):
+            raise ConfigError(
+                f"run: a {type(given).__name__} is no {kind.__name__}; graphnav.{maker} makes one", key="run.argument"
+            )
+    solvers = (solvers,) if isinstance(solvers, str) else tuple(solvers)
     if noise is not None and not isinstance(noise, NoiseModel):
         if noise not in MODES:
             raise ConfigError(f"noise={noise!r}: give a NoiseModel or one of {', '.join(MODES)}", key="noise.mode")

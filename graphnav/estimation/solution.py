@@ -259,6 +259,8 @@ class Solution:
             inside = t[(t >= piece.start) & (t <= piece.end)]
             if len(inside):
                 parts.append((inside, *piece(inside)))
+        if not parts:
+            return t[:0], self.states[:0], self.covariance[:0]
         times, states, covariances = zip(*parts, strict=True)
         return np.concatenate(times), States.stack(list(states)), np.concatenate(covariances)
 

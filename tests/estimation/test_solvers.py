@@ -392,8 +392,11 @@ def test_states_between_keyframes_come_in_parts_just_the_same(
     parts = list(solution.blocks(50.0))
     assert max(len(part) for part in parts) == 37
     for name in ("t", "llh", "v", "rph", "sd_p", "sd_v", "sd_rph", "gyro_bias", "accel_bias"):
-        joined = np.concatenate([getattr(part, name) for part in parts])
-        np.testing.assert_allclose(joined, getattr(whole, name), rtol=1e-12, atol=1e-13, err_msg=name)
+        joined, expected = np.concatenate([getattr(part, name) for part in parts]), getattr(whole, name)
+        if name == "llh":  # heights are differences of 6,400 km, of which the last digit is 1e-9 m
+            np.testing.assert_allclose(joined[:, 2], expected[:, 2], rtol=0.0, atol=4e-9)
+            joined, expected = joined[:, :2], expected[:, :2]
+        np.testing.assert_allclose(joined, expected, rtol=1e-12, atol=1e-13, err_msg=name)
 
 
 @pytest.fixture(scope="module")

@@ -720,7 +720,7 @@ def test_an_imu_is_judged_by_ever_more_rows(drive: tuple[Recording, Trajectory])
     recording = replace(recording, imu=replace(recording.imu, noise=quiet))
     rows, how = rows_of(recording)[1], settings_from({"solver": {"lag": 60.0}})
     online, _ = played(recording, rows, how)
-    used, whole = online.tracker.noise, run(recording.crop(0.0, online._judged), how, ("ekf",))["ekf"].noise
+    used, whole = online.tracker.noise, run(recording.crop(0.0, online._estimated_from), how, ("ekf",))["ekf"].noise
     assert used.factor("imu.gyro_noise_density", 1.0) > 2.0
     told = [name for name, one in whole.figures.items() if one.freedom > 10.0]
     assert len(told) > 5
