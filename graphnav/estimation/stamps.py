@@ -2,9 +2,9 @@
 
 A fix whose stamp is off by d is predicted from the state at the stamp, by v d + a d^2 / 2
 (`graphnav.constraints.gnss`). The acceleration a of a vehicle changes by a few m/s^3, 5 of them when it brakes, so that
-this is off by 5 d^3 / 6: 7 mm for 0.2 s, 0.8 m for a second. So where an offset is estimated farther than that from
-where the rows are linearised, the stamps are moved to the estimate and all is estimated anew, a step of Gauss-Newton,
-until the estimate stays within. Where the clocks of IMU and fixes disagree for certain
+this is off by 5 d^3 / 6: 2 cm for 0.3 s, as the best fixes are, 0.8 m for a second. So where an offset is estimated
+farther than that from where the rows are linearised, the stamps are moved to the estimate and all is estimated anew, a
+step of Gauss-Newton, until the estimate stays within. Where the clocks of IMU and fixes disagree for certain
 (`graphnav.recording.checks.clock`), the first step is what they disagree by. The stamps as they are remain a candidate:
 the likelier stands.
 
@@ -31,7 +31,7 @@ from graphnav.estimation.solvers.passes import parameters_of, sigmas_of, values_
 from graphnav.recording import Recording
 from graphnav.recording.checks.clock import FAIR, ClockOffsets, is_certain
 
-_LINEAR = 0.2  # s from the linearisation point: above
+_LINEAR = 0.3  # s from the linearisation point: above
 _SIGNIFICANT = 3.0  # sigmas
 _ROUNDS = 3  # of moving the stamps
 _AS_THEY_ARE = StampOffsets()
