@@ -143,7 +143,7 @@ def move_stamps(recording: Recording, offsets: StampOffsets) -> Recording:
 
 def on_imu_clock(noise: NoiseModel) -> NoiseModel:
     """A noise model as it is of the recording with its stamps moved."""
-    return _shift_noise(noise, 1.0)
+    return noise if noise.stamps == _AS_THEY_ARE else _shift_noise(noise, 1.0)
 
 
 def on_own_clock(solution: Solution, offsets: StampOffsets) -> Solution:
