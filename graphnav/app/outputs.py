@@ -21,7 +21,8 @@ from graphnav.app.workflow import Outcome
 from graphnav.core.beside import beside
 from graphnav.core.errors import ConfigError, PartlyWrittenError
 from graphnav.core.files import exists
-from graphnav.core.jsonable import peak_memory_mb, write_json
+from graphnav.core.jsonable import write_json
+from graphnav.core.memory import peak_memory_mb
 from graphnav.core.timescales import gps_to_utc
 from graphnav.estimation.solution import ParameterEstimate
 from graphnav.estimation.stops import detections_text

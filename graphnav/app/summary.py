@@ -14,7 +14,7 @@ import graphnav
 from graphnav.app.workflow import Outcome
 from graphnav.core.files import sha256
 from graphnav.core.findings import Finding
-from graphnav.core.jsonable import peak_memory_mb
+from graphnav.core.memory import peak_memory_mb
 from graphnav.core.notes import key_of
 from graphnav.estimation.solution import Solution
 from graphnav.estimation.stops import stops_of_solution

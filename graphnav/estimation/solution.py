@@ -281,7 +281,9 @@ def to_trajectory(
         J = np.zeros((len(t), 9, 9))
         for k, (block, turn) in enumerate(turns.items()):
             J[:, 3 * k : 3 * k + 3, BLOCKS[block]] = np.moveaxis(turn, -1, 0)
-        cov = J @ covariance[:, :_OUT, :_OUT] @ np.swapaxes(J, -1, -2)
+        cov = np.empty((len(t), _OUT, _OUT))
+        for some in (slice(k, k + _BLOCK_ROWS) for k in range(0, len(t), _BLOCK_ROWS)):
+            cov[some] = J[some] @ covariance[some, :_OUT, :_OUT] @ np.swapaxes(J[some], -1, -2)
         covariance = split_covariance(covariance)
     sd_p, sd_v, sd_rph = (_find_sigmas(turn, covariance[block]) for block, turn in turns.items())
     return Trajectory(
