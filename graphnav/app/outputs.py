@@ -6,6 +6,7 @@ import os
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -123,7 +124,10 @@ def write_comparison(outcome: Outcome, folder: Path, pages: bool = True) -> list
 
     # what all have in common takes as long as one of three
     *others, last = own_solutions(outcome.solutions)
-    with beside(partial(write, others)) as written:
+    work = partial(write, others)
+    # a drive that was solved in parts leaves no room for what a copy needs of its own
+    long = any(len(solution.between) > 1 for solution in outcome.solutions.values())
+    with nullcontext(work) if long else beside(work) as written:
         failed = write([last])
         write_comparison_csv(folder / "comparison.csv", comparison(outcome))
         if pages:
