@@ -168,7 +168,7 @@ def _run(
             f"'{recording.name}': no piece between its IMU gaps can be solved", key="pieces.none_solved"
         )
     joined = {}
-    for name in solvers:
+    for name in dict.fromkeys(solvers):
         joined[name] = share_covariances(join_solutions([one.pop(name) for one in found], tuple(notes)))
         if len(parts) > 1:
             return_memory()
