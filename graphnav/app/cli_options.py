@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from graphnav.app.talk import importing
 from graphnav.core.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -165,9 +164,7 @@ def choose_solvers(context: typer.Context, names: str) -> tuple[str, ...]:
         If one is not known, or there is none.
     """
     from graphnav.core.complaints import split_names
-
-    with importing():
-        from graphnav.estimation import pipeline
+    from graphnav.estimation import pipeline
 
     return split_names(names, pipeline.KNOWN, _read_option_name(context), "solver")
 

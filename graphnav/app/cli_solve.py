@@ -37,7 +37,6 @@ from graphnav.app.cli_options import (
     pick_one,
 )
 from graphnav.app.talk import bar, importing, insist, show
-from graphnav.core.beside import allow_beside
 from graphnav.core.errors import ConfigError
 from graphnav.core.files import permit_outside
 from graphnav.core.progress import tell
@@ -272,7 +271,7 @@ def _solve(
         topics=tuple(asked.topic or ()), format=asked.format, against=tuple(against),
         judge_arms=not alone, loose=loose,
     )  # fmt: skip
-    with bar(asked.quiet, *chosen) as progress, allow_beside():
+    with bar(asked.quiet, *chosen) as progress:
         outcome = workflow.run_request(request, progress)
         tell("writing")
         with stage_results(folder) as part:

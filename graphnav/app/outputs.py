@@ -6,9 +6,7 @@ import os
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import nullcontext
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,11 +17,9 @@ from graphnav.app.scores import outages
 from graphnav.app.stored import write_outcome
 from graphnav.app.summary import comparison, gather_provenance, noise_rows, solver_summary
 from graphnav.app.workflow import Outcome
-from graphnav.core.beside import beside
 from graphnav.core.errors import ConfigError, PartlyWrittenError
 from graphnav.core.files import exists
 from graphnav.core.jsonable import write_json
-from graphnav.core.memory import peak_memory_mb
 from graphnav.core.timescales import gps_to_utc
 from graphnav.estimation.solution import ParameterEstimate
 from graphnav.estimation.stops import detections_text
@@ -114,27 +110,13 @@ def write_comparison(outcome: Outcome, folder: Path, pages: bool = True) -> list
         from graphnav.report import documents as report
 
         detectors = report.detector_pictures(outcome.recording, next(iter(outcome.solutions.values())))
-    memory = peak_memory_mb()
-
-    def write(names: Sequence[str]) -> dict[Path, str]:
-        failed: dict[Path, str] = {}
-        for name in names:
-            failed |= write_solver(outcome, name, folder / name, provenance, detectors, pages, memory)
-        return failed
-
-    # what all have in common takes as long as one of three
-    *others, last = own_solutions(outcome.solutions)
-    work = partial(write, others)
-    # a drive that was solved in parts leaves no room for what a copy needs of its own
-    long = any(len(solution.between) > 1 for solution in outcome.solutions.values())
-    with nullcontext(work) if long else beside(work) as written:
-        failed = write([last])
-        write_comparison_csv(folder / "comparison.csv", comparison(outcome))
-        if pages:
-            page = folder / "comparison.html"
-            failed |= _attempt(lambda path: _draw_comparison(outcome, path.parent, provenance), page)
-        failed |= _attempt(lambda path: write_outcome(outcome, provenance, path), folder / stored.NAME)
-        failed = written() | failed
+    failed: dict[Path, str] = {}
+    for name in own_solutions(outcome.solutions):
+        failed |= write_solver(outcome, name, folder / name, provenance, detectors, pages)
+    write_comparison_csv(folder / "comparison.csv", comparison(outcome))
+    if pages:
+        failed |= _attempt(lambda path: _draw_comparison(outcome, path.parent, provenance), folder / "comparison.html")
+    failed |= _attempt(lambda path: write_outcome(outcome, provenance, path), folder / stored.NAME)
     _insist(failed)
     return [*([folder / "comparison.html"] if pages else []), folder / "comparison.csv"]
 
@@ -207,11 +189,8 @@ def write_solver(
     provenance: Mapping[str, Any],
     detectors: Sequence[Markup] | None = None,
     pages: bool = True,
-    memory: float = 0.0,
 ) -> dict[Path, str]:
     """Write the files of one solver; older files of the same names are removed.
-
-    `memory` is the peak so far, MB, of the process that this one may be a copy of.
 
     Returns
     -------
@@ -234,7 +213,7 @@ def write_solver(
     report = folder / "report.html"
     failed = _attempt(lambda _: _draw_solver(outcome, name, folder, provenance, detectors), report) if pages else {}
     seconds = {"writing": done - began, "report": time.perf_counter() - done}
-    write_json(folder / "summary.json", solver_summary(outcome, name, seconds, provenance, memory))
+    write_json(folder / "summary.json", solver_summary(outcome, name, seconds, provenance))
     return failed
 
 

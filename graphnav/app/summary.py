@@ -25,9 +25,9 @@ if TYPE_CHECKING:
 
 
 def solver_summary(
-    outcome: Outcome, name: str, seconds: Mapping[str, float], provenance: Mapping[str, Any], memory: float = 0.0
+    outcome: Outcome, name: str, seconds: Mapping[str, float], provenance: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """The content of summary.json; `seconds` are those of writing, by file, and `memory` the peak so far, MB."""
+    """The content of summary.json; `seconds` are those of writing, by file."""
     from graphnav.evaluation.metrics import summary
     from graphnav.report.doubts import find_departures, list_doubts
 
@@ -66,7 +66,7 @@ def solver_summary(
         "stopped": solution.stopped,
         "final_cost": solution.cost,
         "timings": {stage: round(seconds, 4) for stage, seconds in timings.items()},
-        "peak_memory_mb": max(memory, peak_memory_mb()),
+        "peak_memory_mb": peak_memory_mb(),
         "against": outcome.against,
         "errors": errors,
         "spans": [

@@ -7,10 +7,9 @@ from __future__ import annotations
 
 import re
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,7 +18,6 @@ import numpy as np
 from graphnav.app.scores import Withheld, score
 from graphnav.config import Settings
 from graphnav.constraints.base import SAME_TIME
-from graphnav.core.beside import beside
 from graphnav.core.complaints import suggest_nearest
 from graphnav.core.errors import ConfigError, EstimationError, RecordingError
 from graphnav.core.findings import Finding
@@ -183,11 +181,11 @@ def run_request(request: Request, progress: Progress | None = None) -> Outcome:
     GraphnavError
         In one plain sentence, for anything that cannot be used as it is.
     """
-    with listening(progress), ExitStack() as copies:
-        return _run(request, progress, copies)
+    with listening(progress):
+        return _run(request, progress)
 
 
-def _run(request: Request, progress: Progress | None, copies: ExitStack) -> Outcome:
+def _run(request: Request, progress: Progress | None) -> Outcome:
     from graphnav.recording.checks.overview import inspect
     from graphnav.recording.checks.stated import is_truth_apart
     from graphnav.recording.formats import read
@@ -213,10 +211,6 @@ def _run(request: Request, progress: Progress | None, copies: ExitStack) -> Outc
     from graphnav.estimation.pipeline import run
     from graphnav.report.doubts import list_doubts
 
-    checks = inspection.findings
-    judge_arms: Callable[[], list[Finding]] = partial(_find_wrong_arms, used, checks)
-    if request.judge_arms:
-        judge_arms = copies.enter_context(beside(judge_arms))
     given = request.noise
     model = None if given is None else given.model
     if request.loose and not used.tight(request.settings.raw_gnss.coupling):
@@ -226,7 +220,7 @@ def _run(request: Request, progress: Progress | None, copies: ExitStack) -> Outc
     try:
         solutions = run(used, request.settings, request.solvers, progress, model)
     except EstimationError as error:
-        raise _name_cause(error, checks) from None
+        raise _name_cause(error, inspection.findings) from None
     if request.loose:
         others = run(used, couple_loosely(request.settings), request.solvers, progress, model)
         solutions |= {name + LOOSE: replace(one, solver=name + LOOSE) for name, one in others.items()}
@@ -251,21 +245,17 @@ def _run(request: Request, progress: Progress | None, copies: ExitStack) -> Outc
             shared = all(note in other.notes for other in metrics.values())
             findings.append(note if shared else Note(key_of(note), f"{name}: {note}"))
     errors = {name: found.errors for name, found in metrics.items() if found.errors is not None}
-    checks = _mitigate(checks, solutions)
+    checks = _mitigate(inspection.findings, solutions)
     if request.judge_arms or list_doubts(solutions, errors):  # which takes a second
-        checks = (*judge_arms(), *checks)
+        from graphnav.estimation.antenna import find_wrong_arms
+
+        checks = (*find_wrong_arms(used, checks), *checks)
         findings = [*(f.sentence for f in checks), *findings]
     densities = _find_densities(used, request.settings, solutions)
     return Outcome(
         request, recording, zero, solutions, metrics, against, names, tuple(dict.fromkeys(findings)),
         tuple(f.sentence for f in checks if f.severity != "note"), timings | seconds, checks, densities,
     )  # fmt: skip
-
-
-def _find_wrong_arms(recording: Recording, findings: Sequence[Finding]) -> list[Finding]:
-    from graphnav.estimation.antenna import find_wrong_arms  # which few runs need
-
-    return find_wrong_arms(recording, findings)
 
 
 def _mitigate(findings: tuple[Finding, ...], solutions: Mapping[str, Solution]) -> tuple[Finding, ...]:

@@ -177,8 +177,7 @@ def _find_noise(
         built = without
         again = estimate_noise(built.problem, built.aligned.until, best.noise, progress=progress)
         best = replace(again, passes=best.passes + again.passes)
-    if not best.intervals:
-        best = estimate_disturbed_intervals(built.problem, best)
+    best = estimate_disturbed_intervals(built.problem, best)
     passes.update(best.passes + Counter(filter=1))
     wanted = weigh is not None and weigh(built.problem, best.points)
     evidence = log_evidence(built.problem, best) if wanted else np.inf
@@ -191,9 +190,8 @@ def _find_noise(
 
 def _estimate(built: BuiltProblem, settings: Settings, progress: Progress | None) -> NoiseEstimate:
     """The noise model, without spans of wrong measurements unless the settings keep them."""
-    if settings.gnss.faults == "off":
-        return estimate_noise(built.problem, built.aligned.until, progress=progress)
-    return estimate_without_faults(built.problem, built.aligned.until, progress, intervals=True)
+    estimate = estimate_noise if settings.gnss.faults == "off" else estimate_without_faults
+    return estimate(built.problem, built.aligned.until, progress=progress)
 
 
 def _is_likelier(base: Problem, plain: NoiseModel, found: NoiseEstimate) -> bool:

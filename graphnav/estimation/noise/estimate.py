@@ -56,11 +56,10 @@ class NoiseEstimate:
     """A noise model, the smoothed points of its last pass, and how it was found."""
 
     noise: NoiseModel
-    points: Points  # a `DisturbancePass`, but for an estimate that no other starts from
+    points: DisturbancePass
     log_posterior: float
     log_prior: float
     passes: Counter[str]  # over keyframes, of "filter" and "smoother"
-    intervals: bool = False  # whether single intervals of the IMU may have more noise than the others
 
     @property
     def log_evidence(self) -> float:
@@ -223,8 +222,7 @@ def _iterate(
         passes, prior_then = passes + 1, figures.log_prior()
         now = float(np.sum(latest[0].log_likelihood)) + prior_then
     assert latest is not None
-    counts = Counter(filter=passes, smoother=passes)
-    return NoiseEstimate(figures.model(), latest[1], now, prior_then, counts, intervals)
+    return NoiseEstimate(figures.model(), latest[1], now, prior_then, Counter(filter=passes, smoother=passes))
 
 
 def _smooth_about(problem: Problem, about: Points) -> tuple[ForwardRecord, DisturbancePass]:

@@ -34,11 +34,9 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, field, replace
-from functools import partial
 
 import numpy as np
 
-from graphnav.core.beside import beside
 from graphnav.estimation import faults
 from graphnav.estimation.noise.apply import row_weights, with_noise, with_weights
 from graphnav.estimation.noise.estimate import NoiseEstimate, estimate_noise
@@ -63,8 +61,6 @@ from graphnav.estimation.noise.spans import (
 )
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.ekf import refilter
-from graphnav.estimation.solvers.linearise import Points
-from graphnav.estimation.solvers.passes import DisturbancePass
 from graphnav.estimation.solvers.watch import FALSE_ALARM
 from graphnav.recording import Recording
 
@@ -84,10 +80,7 @@ class Decision:
 
 
 def estimate_without_faults(
-    base: Problem,
-    opening: float | None = None,
-    progress: Callable[[str, float], None] | None = None,
-    intervals: bool = False,
+    base: Problem, opening: float | None = None, progress: Callable[[str, float], None] | None = None
 ) -> NoiseEstimate:
     """Estimate the noise model without the spans of wrong measurements that the evidence leaves out.
 
@@ -95,7 +88,6 @@ def estimate_without_faults(
     ----------
     base : built with stated noise and the parts of its intervals' noise.
     opening : as for `graphnav.estimation.solvers.ekf.ekf`.
-    intervals : whether it may go on as `estimate_disturbed_intervals` does where no span is left out.
 
     Raises
     ------
@@ -103,12 +95,8 @@ def estimate_without_faults(
         If the filter breaks down.
     """
     found = estimate_noise(base, opening, progress=progress)
-    with beside(partial(_go_on, base, found)) as disturbed:
-        decision = find_faults(base, found)
-        passes = found.passes + decision.passes
-        if intervals and not decision.noise.excluded and decision.estimate is None:
-            best = disturbed()
-            return replace(best, passes=best.passes + decision.passes)
+    decision = find_faults(base, found)
+    passes = found.passes + decision.passes
     if not decision.noise.excluded:
         return replace(decision.estimate or found, passes=passes)
     # from the priors: figures that were estimated with the fault among the data are far from where they will end
@@ -116,12 +104,6 @@ def estimate_without_faults(
     near = (decision.estimate or found).linearisation(base)
     again = estimate_noise(base, opening, start, near, progress)
     return _readmit(base, replace(again, passes=passes + again.passes))
-
-
-def _go_on(base: Problem, found: NoiseEstimate) -> NoiseEstimate:
-    """`estimate_disturbed_intervals`, with the points alone: the rest is a hundred times the size."""
-    best = estimate_disturbed_intervals(base, found)
-    return replace(best, points=Points(best.points.states, best.points.values))
 
 
 def find_faults(base: Problem, found: NoiseEstimate) -> Decision:
@@ -321,7 +303,6 @@ def _list_explanations(noise: NoiseModel) -> set[Explanation]:
 
 def _predict_left_out(problem: Problem, found: NoiseEstimate) -> LeftOutErrors:
     """Squared errors of all fixes, each predicted without itself."""
-    assert isinstance(found.points, DisturbancePass)
     fixes = (rows for rows in problem.constraints if rows.name in FIXES)
     return {
         c.name: (problem.t[c.keyframe], row_moments(problem, c, found.points, len(c)).left_out, len(c.axes))
