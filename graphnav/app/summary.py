@@ -14,7 +14,7 @@ import graphnav
 from graphnav.app.workflow import Outcome
 from graphnav.core.files import sha256
 from graphnav.core.findings import Finding
-from graphnav.core.jsonable import peak_memory_mb
+from graphnav.core.memory import peak_memory_mb
 from graphnav.core.notes import key_of
 from graphnav.estimation.solution import Solution
 from graphnav.estimation.stops import stops_of_solution
@@ -143,7 +143,7 @@ def comparison(outcome: Outcome, ours: bool = False) -> list[dict[str, Any]]:
 
 def median_sigmas(solution: Solution) -> dict[str, float]:
     """Medians of a solution's stated sigmas: horizontal and up (m), heading (deg)."""
-    track = solution.trajectory()
+    track = solution.trajectory(joint=False)
     out = {}
     if track.sd_p is not None:
         out["sd_h_median_m"] = float(np.median(np.hypot(track.sd_p[:, 0], track.sd_p[:, 1])))

@@ -1,30 +1,14 @@
-"""Values as plain JSON, and the peak memory of this process."""
+"""Values as plain JSON."""
 
 from __future__ import annotations
 
 import json
 import math
-import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-
-
-def peak_memory_mb() -> float:
-    """Peak memory of this process, MB of 2^20 bytes."""
-    try:
-        # preferred where it exists: ru_maxrss of a forked process includes its parent's memory
-        for line in Path("/proc/self/status").read_text(encoding="ascii").splitlines():
-            if line.startswith("VmHWM:"):
-                return round(int(line.split()[1]) / 1024.0, 1)
-    except (OSError, ValueError):
-        pass
-    import resource  # on Windows
-
-    size = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return round(size / (1024.0**2 if sys.platform == "darwin" else 1024.0), 1)
 
 
 def write_json(path: Path, values: Any) -> None:

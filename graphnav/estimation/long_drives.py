@@ -17,10 +17,11 @@ import numpy as np
 from graphnav.config import Settings
 from graphnav.core.earth import A
 from graphnav.core.rotation import Array
-from graphnav.core.state import States
+from graphnav.core.state import DIM, States
 from graphnav.detectors.base import Detection
+from graphnav.estimation.dense import Dense
 from graphnav.estimation.noise.model import NoiseModel, RowWeights
-from graphnav.estimation.solution import Between, CarrierArcs, ConstraintRecord, ParameterEstimate, Solution
+from graphnav.estimation.solution import CarrierArcs, ConstraintRecord, ParameterEstimate, Solution
 from graphnav.recording import Recording, take_rows
 
 STRAIGHT, _STATES = 10_800.0, 44  # s solved at once at most: 3 GB at a keyframe a second and 44 error states
@@ -95,28 +96,72 @@ def _is_told(recording: Recording, t: float) -> bool:
 
 @dataclass(frozen=True)
 class _Span:
-    """`Solution.between` of a part, restricted to its own span."""
+    """`Solution.between` of a part, restricted to its own span.
 
-    whole: Between
+    Covariances are half of the result: those of the keyframes within are the solution's own, not a copy.
+    """
+
+    bare: Dense  # from the keyframe before the span to the one behind it, without covariances
+    before: Array  # (0 or 1, 15, 15)
+    own: Array  # (n, 15, 15)
+    behind: Array  # (0 or 1, 15, 15)
     start: float
     end: float
 
+    @classmethod
+    def of(cls, whole: Dense, inside: slice, own: Array, start: float, end: float) -> _Span:
+        """A part's, of whose keyframes those `inside`, with covariances `own`, are in the span."""
+        every = slice(max(inside.start - 1, 0), min(inside.stop + 1, len(whole.t)))
+        steps = slice(every.start, every.stop - 1)
+        before, behind = slice(every.start, inside.start), slice(inside.stop, every.stop)
+        bare = replace(
+            whole, t=whole.t[every].copy(), states=States.stack([whole.states[every]]), ba=whole.ba[steps].copy(),
+            bg=whole.bg[steps].copy(), covariance=np.empty((0, DIM, DIM)),
+        )  # fmt: skip
+        P, start, end = whole.covariance, max(whole.start, start), min(whole.end, end)
+        return cls(bare, P[before].copy(), own, P[behind].copy(), start, end)
+
     def times(self, rate: float) -> Array:
         """Times at a rate inside the span."""
-        t = self.whole.times(rate)
+        t = self.bare.times(rate)
         return t[(t >= self.start) & (t <= self.end)]
 
     def __call__(self, t: Array) -> tuple[States, Array]:
         """As for the part."""
-        return self.whole(t)
+        return self._cover()(t)
 
     def apart(self, t: Array) -> tuple[States, dict[str, Array]]:
         """As for the part."""
-        return self.whole.apart(t)
+        return self._cover().apart(t)
+
+    def _cover(self) -> Dense:
+        return replace(self.bare, covariance=np.concatenate([self.before, self.own, self.behind]))
 
 
-def crop_solution(solution: Solution, share: Share) -> Solution:
-    """The solution of a part restricted to its own span, without the graph that it was solved with."""
+def share_covariances(joined: Solution) -> Solution:
+    """A solution joined of parts, whose parts hold no covariances of their own."""
+    between, first = [], 0
+    for one in joined.between:
+        if isinstance(one, _Span):
+            one = replace(one, own=joined.covariance[first : first + len(one.own)])
+            first += len(one.own)
+        between.append(one)
+    return replace(joined, between=tuple(between))
+
+
+def crop_solutions(solutions: dict[str, Solution], share: Share) -> dict[str, Solution]:
+    """The solutions of a part restricted to its own span; what they have in common they keep in common."""
+    out: dict[str, Solution] = {}
+    for name, one in solutions.items():
+        out[name] = crop_solution(one, share, next((other.detections for other in out.values()), None))
+    return out
+
+
+def crop_solution(solution: Solution, share: Share, detections: tuple[Detection, ...] | None = None) -> Solution:
+    """The solution of a part restricted to its own span, without the graph that it was solved with.
+
+    `detections` are those of another solution of the part, restricted likewise.
+    """
     start, end = share.start, share.end
     if np.isneginf(start) and np.isposinf(end):
         return solution
@@ -169,19 +214,21 @@ def crop_solution(solution: Solution, share: Share) -> Solution:
         begin, last = np.maximum(arcs.begin[some], start), np.minimum(arcs.end[some], end)
         return replace(arcs, name=arcs.name[some], begin=begin, end=last, integer=arcs.integer[some])
 
-    some, last = inside(solution.t), np.nextafter(end, -np.inf)
+    some, last = inside(solution.t), float(np.nextafter(end, -np.inf))
+    own = slice(int(some[0]), int(some[-1]) + 1)
+    covariance = solution.covariance[own].copy()
     return replace(
         solution,
         t=solution.t[some],
         states=solution.states[some],
-        covariance=solution.covariance[some],
+        covariance=covariance,
         parameters={name: node(p) for name, p in solution.parameters.items()},
         records={name: record(r) for name, r in solution.records.items()},
-        detections=tuple(detection(d) for d in solution.detections),
+        detections=detections or tuple(detection(d) for d in solution.detections),
         excluded=tuple(fault for fault in solution.excluded if start <= fault.t_start < end),
         noise=noise(solution.noise),
         arcs=stretches(solution.arcs),
         fixed=solution.fixed[inside(solution.fixed[:, 0])] if len(solution.fixed) else solution.fixed,
         graphs=(),  # which hold everything built for the part, ten times the size of the result
-        between=tuple(_Span(b, max(b.start, start), min(b.end, float(last))) for b in solution.between),
+        between=tuple(_Span.of(b, own, covariance, start, last) for b in solution.between if isinstance(b, Dense)),
     )

@@ -18,6 +18,7 @@ from graphnav.constraints.base import Constraint
 from graphnav.constraints.prior import InitialPrior
 from graphnav.core.earth import LocalFrame
 from graphnav.core.errors import ConfigError, EstimationError, RecordingError
+from graphnav.core.memory import return_memory
 from graphnav.core.notes import Note
 from graphnav.core.progress import Progress, listening, tell
 from graphnav.core.state import BLOCKS
@@ -25,7 +26,7 @@ from graphnav.detectors import Detector, detect
 from graphnav.detectors import check_own as check_detectors
 from graphnav.estimation import faults
 from graphnav.estimation.building import start_sigma
-from graphnav.estimation.long_drives import OVERLAP, crop_solution, shares
+from graphnav.estimation.long_drives import OVERLAP, crop_solutions, share_covariances, shares
 from graphnav.estimation.noise.files import MODES
 from graphnav.estimation.noise.imu_floor import with_measured_floor
 from graphnav.estimation.noise.model import STATED, NoiseModel, StampOffsets
@@ -154,7 +155,10 @@ def _run(
             # machine
             with threadpool_limits(limits=1, user_api="blas"):
                 solved = _solve_with_retry(part.recording, settings, frame, solvers, progress, noise, clock)
-            found.append({name: crop_solution(one, part) for name, one in solved.items()})
+            found.append(crop_solutions(solved, part))
+            del solved
+            if len(parts) > 1:
+                return_memory()
         except EstimationError as error:
             if len(parts) == 1:
                 raise
@@ -163,7 +167,12 @@ def _run(
         raise EstimationError(
             f"'{recording.name}': no piece between its IMU gaps can be solved", key="pieces.none_solved"
         )
-    return {name: join_solutions([one[name] for one in found], tuple(notes)) for name in solvers}
+    joined = {}
+    for name in dict.fromkeys(solvers):
+        joined[name] = share_covariances(join_solutions([one.pop(name) for one in found], tuple(notes)))
+        if len(parts) > 1:
+            return_memory()
+    return joined
 
 
 @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # what breaks down raises an error that says so

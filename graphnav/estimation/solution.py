@@ -197,23 +197,25 @@ class Solution:
             )
         return self.graphs[piece]()
 
-    def trajectory(self, rate: float | None = None) -> Trajectory:
+    def trajectory(self, rate: float | None = None, joint: bool = True) -> Trajectory:
         """The solution in geodetic coordinates and local axes.
 
         Parameters
         ----------
         rate
             Hz, from the IMU's samples between the keyframes; at the keyframes when None.
+        joint
+            With (K, 9, 9) covariances of position (m), velocity (m/s) and roll, pitch, heading (rad) beside the sigmas.
 
         Returns
         -------
         Trajectory
-            Of the IMU, with (K, 9, 9) covariances of position (m), velocity (m/s) and roll, pitch, heading (rad).
+            Of the IMU.
         """
         t, states, covariance = self.t, self.states, self.covariance
         if rate is not None:
             t, states, covariance = self.at(np.concatenate([b.times(rate) for b in self.between]))
-        return to_trajectory(self.solver, self.frame, t, states, covariance)
+        return to_trajectory(self.solver, self.frame, t, states, covariance if joint else split_covariance(covariance))
 
     def blocks(self, rate: float | None = None) -> Iterator[Trajectory]:
         """`trajectory` in successive parts, only one of which need be in memory.
@@ -229,7 +231,7 @@ class Solution:
             Of 4096 rows at most each; a single part at the keyframes.
         """
         if rate is None:
-            yield self.trajectory()
+            yield self.trajectory(joint=False)
             return
         for piece in self.between:
             times = piece.times(rate)
@@ -281,7 +283,9 @@ def to_trajectory(
         J = np.zeros((len(t), 9, 9))
         for k, (block, turn) in enumerate(turns.items()):
             J[:, 3 * k : 3 * k + 3, BLOCKS[block]] = np.moveaxis(turn, -1, 0)
-        cov = J @ covariance[:, :_OUT, :_OUT] @ np.swapaxes(J, -1, -2)
+        cov = np.empty((len(t), _OUT, _OUT))
+        for some in (slice(k, k + _BLOCK_ROWS) for k in range(0, len(t), _BLOCK_ROWS)):
+            cov[some] = J[some] @ covariance[some, :_OUT, :_OUT] @ np.swapaxes(J[some], -1, -2)
         covariance = split_covariance(covariance)
     sd_p, sd_v, sd_rph = (_find_sigmas(turn, covariance[block]) for block, turn in turns.items())
     return Trajectory(

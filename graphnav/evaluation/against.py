@@ -60,8 +60,8 @@ class Foreign(Solution):
     # whether the attitude is borrowed from our solution to refer points of the body, and not its own
     borrowed: bool = False
 
-    def trajectory(self, rate: float | None = None) -> Trajectory:
-        """The trajectory at the keyframes of the solution beside it, or at `rate` (Hz)."""
+    def trajectory(self, rate: float | None = None, joint: bool = True) -> Trajectory:
+        """The trajectory at the keyframes of the solution beside it, or at `rate` (Hz), with what it states."""
         t = self.t if rate is None else np.arange(self.track.t[0], self.track.t[-1], 1.0 / rate)
         track = self.track_at(t)
         return replace(track, rph=None, sd_rph=None) if self.borrowed else track

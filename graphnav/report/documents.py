@@ -98,7 +98,7 @@ def write_report(
             "Uncertainty",
             _gallery(
                 [
-                    *pictures.sigma_pictures({name: solution.trajectory()}, start, end, spans),
+                    *pictures.sigma_pictures({name: solution.trajectory(joint=False)}, start, end, spans),
                     *pictures.separation_pictures(solution, start, end, spans),
                     *pictures.quality_pictures(recording, solution, spans),
                 ]
@@ -195,7 +195,7 @@ def write_comparison(
         if kind in solution.records
     ]
     measured = [table for name, values in metrics_of.items() for table in tables.metric_tables(values, name)]
-    tracks = {name: s.trajectory() for name, s in solutions.items()}
+    tracks = {name: s.trajectory(joint=False) for name, s in solutions.items()}
     sections: Sections = [
         (
             "Accuracy",

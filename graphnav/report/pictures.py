@@ -215,7 +215,7 @@ def motion_pictures(recording: Recording, solutions: Mapping[str, Solution], spa
     """
     start, end = recording.start, recording.duration
     first = next(iter(solutions.values()))
-    tracks = {name: s.trajectory() for name, s in solutions.items()}
+    tracks = {name: s.trajectory(joint=False) for name, s in solutions.items()}
     fixes, gnss = fixes_of(recording, first), recording.gnss
     base = np.array([0.0, 0.0, float(first.frame.origin[2]) if has_place(first) else 0.0])
 

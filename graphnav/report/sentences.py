@@ -96,7 +96,7 @@ def list_tiles(recording: Recording, solutions: Mapping[str, Solution], errors: 
             value = f"{wording.number(rms(errors[name].horizontal), 3)} m"
             out.append((value, f"horizontal error, RMS{', ' + name if several else ''}"))
         else:
-            sd = solution.trajectory().sd_p
+            sd = solution.trajectory(joint=False).sd_p
             if sd is not None:
                 value = f"{wording.number(float(np.median(np.hypot(sd[:, 0], sd[:, 1]))), 3)} m"
                 out.append((value, f"horizontal sigma, median{', ' + name if several else ''}"))

@@ -86,7 +86,7 @@ def _judge_by_records(solution: Solution) -> dict[str, tuple[str, str]]:
 
 def sigma_table(solution: Solution) -> list[Markup]:
     """The stated 1-sigma below which half, 95 % and all of the keyframes lie."""
-    track = solution.trajectory()
+    track = solution.trajectory(joint=False)
     rows: list[list[Any]] = []
 
     def add(words: str, unit: str, values: Array) -> None:

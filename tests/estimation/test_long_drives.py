@@ -60,6 +60,8 @@ def test_parts_say_what_the_whole_says(monkeypatch: pytest.MonkeyPatch) -> None:
         every = np.concatenate([b.times(50.0) for b in one.between])
         assert np.all(np.diff(every) > 0.0)  # and nothing is there twice
         assert one.covariance.base is None  # nor held beyond what is said
+        assert all(np.shares_memory(b.own, one.covariance) for b in one.between)  # type: ignore[attr-defined]
+        assert all(d is like for d, like in zip(one.detections, parts["ekf"].detections, strict=True))
         with pytest.raises(EstimationError) as told:
             one.to_gtsam()
         assert told.value.key == "pieces.none_such"

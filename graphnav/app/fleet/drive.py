@@ -23,7 +23,8 @@ from graphnav.app.workflow import Outcome, Request, parse_noise, parse_withheld,
 from graphnav.config.files import settings_from
 from graphnav.core.errors import GraphnavError
 from graphnav.core.files import check_regular, parse_json, permit_outside, read_text, sha256
-from graphnav.core.jsonable import peak_memory_mb, write_json
+from graphnav.core.jsonable import write_json
+from graphnav.core.memory import peak_memory_mb
 from graphnav.core.staging import stage_results
 from graphnav.estimation.noise.apply import row_weights
 from graphnav.estimation.solution import Solution

@@ -75,9 +75,10 @@ def batch(
     solved = time.perf_counter()
     if progress is not None:
         progress("covariances", 0.0)
-    keys = set(layout.keys) if wanted is None else {*wanted, *layout.keys[layout.K :]}
+    keys = list(layout.keys) if wanted is None else [*wanted, *layout.keys[layout.K :]]
     assert found.eliminated is not None
-    marginal = found.eliminated.covariances(keys)
+    of_variables = found.eliminated.covariances(set(layout.variable[keys].tolist()))
+    marginal = dict(zip(keys, layout.split(of_variables, keys), strict=True))
     unknown = np.full((DIM, DIM), np.nan)
     covariance = np.stack([marginal.get(k, unknown) for k in range(layout.K)])
     done = time.perf_counter()
@@ -220,14 +221,16 @@ def _minimise(
 def solve_rows(rows: Rows, layout: Layout, damping: float = 0.0) -> tuple[Eliminated, Step, float]:
     """The rows eliminated, the step that leads to their optimum, and by how much they fall on the way."""
     graph, size = LinearGraph(), np.sqrt(damping) * compute_column_norms(rows, layout) if damping else None
-    for blocks, b in rows:
-        graph.add(blocks, b)
     if size is not None:
+        rows = list(rows)
         for width in sorted(set(layout.width)):
             keys = np.array([k for k in layout.keys if layout.width[k] == width])
-            graph.add([(keys, size[keys, :width, None] * np.eye(width))], np.zeros((len(keys), width)))
+            rows.append(([(keys, size[keys, :width, None] * np.eye(width))], np.zeros((len(keys), width))))
+    for blocks, b in layout.join(rows):
+        graph.add(blocks, b)
     eliminated = graph.eliminate(layout.order)
-    found, gain = eliminated.solve(layout.keys), eliminated.decrease()
+    of_variables = dict(zip(layout.order, eliminated.solve(layout.order), strict=True))
+    found, gain = layout.split(of_variables, layout.keys), eliminated.decrease()
     if size is not None:  # what damping takes from the step is not among the rows
         gain += 0.5 * sum(float(np.sum((s[: len(x)] * x) ** 2)) for s, x in zip(size, found, strict=True))
     return eliminated, layout.unpack(found), gain

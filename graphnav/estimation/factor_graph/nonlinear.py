@@ -30,7 +30,7 @@ from graphnav.core.state import BLOCKS, DIM, States
 from graphnav.estimation.factor_graph.gaussian import make_jacobian_factor
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.linearise import Points, linearise, linearise_links, shift
-from graphnav.estimation.solvers.rows import Iterate, Layout, linearise_chain
+from graphnav.estimation.solvers.rows import Iterate, Layout, linearise_chains
 from graphnav.imu.dynamics import SCALE
 
 _ESTIMATORS: dict[str, Any] = {
@@ -143,17 +143,13 @@ def _make_factors(problem: Problem, layout: Layout) -> Iterator[Any]:
         for i, k in enumerate(rows.keyframe.tolist()):
             if rows.weight is None or rows.weight[i] > 0.0:
                 yield _make_custom(_make_noise(rows, i), layout, (k,), names, _evaluate_row(rows, i, problem))
-    chains = {chain.parameter.name: chain for chain in problem.chains}
-    for group in layout.groups:
-        own, means = [chains[name] for name in group.columns], gtsam.Values()
+    for group, own in zip(layout.groups, layout.chains, strict=True):
+        means = gtsam.Values()
         for key, mean in zip(group.keys.tolist(), np.concatenate([c.mean for c in own], axis=1), strict=True):
             means.insert(_Q(key - layout.K), mean)
-        for alike in zip(*(linearise_chain(c, group, c.mean) for c in own), strict=True):  # of the same nodes
-            keys = [keys for keys, _ in alike[0][0]]
-            A = [np.concatenate([blocks[i][1] for blocks, _ in alike], axis=1) for i in range(len(keys))]
-            b = np.concatenate([b for _, b in alike], axis=1)
+        for blocks, b in linearise_chains(own, group, {c.parameter.name: c.mean for c in own}):
             for n in range(len(b)):
-                touched = [(_Q(int(k[n]) - layout.K), a[n]) for k, a in zip(keys, A, strict=True)]
+                touched = [(_Q(int(keys[n]) - layout.K), A[n]) for keys, A in blocks]
                 yield gtsam.LinearContainerFactor(make_jacobian_factor(touched, b[n]), means)
 
 

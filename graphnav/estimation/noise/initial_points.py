@@ -22,6 +22,7 @@ from graphnav.estimation.solvers.watch import WIDE
 
 BREAKDOWN = EstimationError, np.linalg.LinAlgError  # what a filter raises that has lost its digits
 _COOLING = 3.0  # factor by which the sigmas of an annealing fall in each round
+_STAYS = 1e-3  # sigmas by which points may be off that rows are linearised at: of no account in what is linear
 _ROUNDS = 5  # searches for gross outliers at most; in most drives the second finds what the first found
 
 
@@ -66,7 +67,7 @@ def find_initial_points(problem: Problem, opening: float | None) -> tuple[list[I
         If the filter breaks down with large sigmas of all fixes, too.
     """
     try:
-        plain = about = backward(problem, ekf(problem, opening=opening))
+        plain = about = backward(problem, ekf(problem, opening=opening, stays=_STAYS))
     except BREAKDOWN:  # outliers of hundreds of sigmas leave no digits in its covariance
         initial, passes = _anneal(problem, opening)
         return [initial], passes

@@ -56,7 +56,7 @@ from graphnav.estimation.solvers.passes import (
 from graphnav.estimation.solvers.points import FilterErrors, Linearisation, PointFilter, filter_likelihood
 from graphnav.estimation.solvers.rts import backward
 from graphnav.estimation.solvers.stack import Innovations, Stack
-from graphnav.estimation.solvers.stretches import StretchFilter
+from graphnav.estimation.solvers.stretches import STAYS, StretchFilter
 from graphnav.estimation.solvers.watch import Bank
 from graphnav.imu.dynamics import SCALE
 
@@ -69,6 +69,7 @@ def ekf(
     opening: float | None = None,
     known: Points | None = None,
     decide: Decide | None = None,
+    stays: float = STAYS,
 ) -> FilterPass:
     """Run the filter over all keyframes.
 
@@ -78,12 +79,13 @@ def ekf(
         after it depend on nothing later than themselves.
     known : where the opening is linearised, from its first keyframe on, if that is known better than by a first pass.
     decide : asked after the updates of each keyframe; a smoother is not to rest on what comes of it.
+    stays : sigmas, as for `graphnav.estimation.solvers.stretches.StretchFilter`.
     """
     began = time.perf_counter()
     K, about = len(problem.t), None
     if opening is not None and (n := int(np.searchsorted(problem.t, opening, side="right"))) > 1:
         about = _smooth_about(problem, backward(problem, _forward(problem, n)))[1] if known is None else known.first(n)
-    one = _forward(problem, K, about, progress, decide=decide)
+    one = _forward(problem, K, about, progress, decide=decide, stays=stays)
     seconds = time.perf_counter() - began
     filtered, P = one.states, one.P[:, :DIM, :DIM].copy()  # a view would hold what is known of the parameters too
     if about is not None:
@@ -188,6 +190,7 @@ def _forward(
     drifts: bool = True,
     decide: Decide | None = None,
     whole: bool = True,
+    stays: float = STAYS,
 ) -> ForwardRecord:
     """Filter the first K keyframes, of which the first n are linearised at given points."""
     n, scale, steps = 0 if about is None else len(about.values), problem.columns.get(SCALE), advance(problem, K)
@@ -219,7 +222,7 @@ def _forward(
         P = all_P[n - 1]
     else:
         x, P = _begin(x, P, stack.records)
-    stretches, k = StretchFilter(problem, steps, stack, all_Pp, all_P, all_F), n
+    stretches, k = StretchFilter(problem, steps, stack, all_Pp, all_P, all_F, stays), n
     while k < K:
         on = stretches.run(k, x, P, ahead, found)
         k = on if decide is None else _hold(decide, k, on, found, all_P)

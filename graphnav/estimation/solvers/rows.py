@@ -6,6 +6,7 @@ same nodes: one for the constants, one for the slow ones, one for what begins an
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -55,14 +56,24 @@ class _Group:
 
 
 class Layout:
-    """Keys, their widths, and the order of elimination: along time, each node after its last keyframe."""
+    """Keys, their widths, and the order of elimination: along time, each node after its last keyframe.
+
+    Attributes
+    ----------
+    variable : (n,) the key of the variable that each key is eliminated as a part of, and
+    offset : (n,) where it stands there. A node that governs a single keyframe is eliminated with its state: of two
+        small factorisations in place of one, each would pass through all that both touch.
+    joined_width : (n,) of variables.
+    """
 
     def __init__(self, problem: Problem) -> None:
         self.K = K = len(problem.t)
         self.groups: list[_Group] = []
         self.group_of: dict[str, _Group] = {}
+        self.chains: list[list[ParameterChain]] = []  # of each group
         after: dict[int, list[int]] = {}
-        self.width = [DIM] * K
+        self.width, variable, offset = [DIM] * K, [np.arange(K)], [np.zeros(K, dtype=int)]
+        joined_width = np.full(K, DIM)
         alike: dict[bytes, list[ParameterChain]] = {}
         for chain in problem.chains:
             alike.setdefault(chain.t.tobytes(), []).append(chain)
@@ -77,12 +88,52 @@ class Layout:
             keys = np.arange(len(self.width), len(self.width) + n)
             group = _Group(keys, node, columns, at)
             self.groups.append(group)
+            self.chains.append(chains)
             self.group_of |= dict.fromkeys(columns, group)
             self.width += [at] * n
-            for j, last in enumerate(find_last_keyframes(chains[0])):
-                after.setdefault(int(last), []).append(int(keys[j]))
+            last = find_last_keyframes(chains[0])
+            alone = np.diff(last, prepend=-1) == 1
+            variable.append(np.where(alone, last, keys))
+            offset.append(np.where(alone, joined_width[last], 0))
+            joined_width[last[alone]] += at
+            for key, k in zip(keys[~alone].tolist(), last[~alone].tolist(), strict=True):
+                after.setdefault(k, []).append(key)
+        self.variable, self.offset = np.concatenate(variable), np.concatenate(offset)
+        self.joined_width = np.concatenate([joined_width, np.array(self.width[K:], dtype=int)])
         self.keys = range(len(self.width))
         self.order = [key for k in range(K) for key in (k, *after.get(k, ()))]
+
+    def join(self, rows: Rows) -> Rows:
+        """The same rows, of variables in place of keys."""
+        out: Rows = []
+        for blocks, b in rows:
+            variables, offsets = (np.stack([x[keys] for keys, _ in blocks], -1) for x in (self.variable, self.offset))
+            widths = self.joined_width[variables]
+            # which of the blocks is the first of the same variable
+            first = np.argmax(variables[:, :, None] == variables[:, None], axis=2)
+            kind = np.zeros(len(b), dtype=np.int64)
+            for x in np.concatenate([first, offsets, widths], axis=1).T:
+                kind = np.unique(kind * (1 + x.max(initial=0)) + x, return_inverse=True)[1]
+            for some in (np.flatnonzero(kind == j) for j in range(int(kind.max(initial=-1)) + 1)):
+                place, alike = offsets[some[0]], first[some[0]]
+                joined = []
+                for i in dict.fromkeys(alike.tolist()):
+                    A = np.zeros((len(some), b.shape[1], widths[some[0], i]))
+                    for j in np.flatnonzero(alike == i):
+                        of = blocks[j][1][some]
+                        A[:, :, place[j] : place[j] + of.shape[2]] = of
+                    joined.append((variables[some, i], A))
+                out.append((joined, b[some]))
+        return out
+
+    def split(self, variables: dict[int, Array], keys: Iterable[int]) -> list[Array]:
+        """The vectors or covariances of keys, by those of their variables."""
+        out = []
+        for key in keys:
+            at = slice(self.offset[key], self.offset[key] + self.width[key])
+            one = variables[self.variable[key]]
+            out.append(one[(at,) * one.ndim])
+        return out
 
     def unpack(self, vectors: list[Array]) -> Step:
         """Steps per state and parameter from one vector per key."""
@@ -125,8 +176,8 @@ def whiten(problem: Problem, point: Iterate, layout: Layout) -> tuple[Rows, floa
         weighted = {p.name: H[:, :, problem.columns[p.name]] for p in rows.parameters}
         blocks = [(rows.keyframe, H[:, :, :DIM])]
         out += _touching(blocks + layout.parameter_blocks(rows.keyframe, weighted), -scale * linear.residual)
-    for chain in problem.chains:
-        own = linearise_chain(chain, layout.group_of[chain.parameter.name], point.values[chain.parameter.name])
+    for group, chains in zip(layout.groups, layout.chains, strict=True):
+        own = linearise_chains(chains, group, point.values)
         total += sum(0.5 * float(np.sum(b * b)) for _, b in own)
         out += own
     return out, total
@@ -160,8 +211,17 @@ def compute_column_norms(rows: Rows, layout: Layout) -> Array:
     return np.sqrt(total)
 
 
-def linearise_chain(chain: ParameterChain, group: _Group, value: Array) -> Rows:
-    """The prior on a parameter's first node and its way from node to node."""
+def linearise_chains(chains: Sequence[ParameterChain], group: _Group, values: Values) -> Rows:
+    """The prior on the first node of a group's parameters, and their way from node to node."""
+    out: Rows = []
+    for alike in zip(*(_linearise_chain(c, group, values[c.parameter.name]) for c in chains), strict=True):
+        A = [np.concatenate([blocks[i][1] for blocks, _ in alike], axis=1) for i in range(len(alike[0][0]))]
+        keys = [keys for keys, _ in alike[0][0]]
+        out.append((list(zip(keys, A, strict=True)), np.concatenate([b for _, b in alike], axis=1)))
+    return out
+
+
+def _linearise_chain(chain: ParameterChain, group: _Group, value: Array) -> Rows:
     pick = np.eye(group.width)[group.columns[chain.parameter.name]]  # (k, width)
     keys, off = group.keys, value - chain.mean
     A = pick / chain.sigma[..., None]

@@ -38,7 +38,7 @@ from graphnav.imu.dynamics import SCALE
 
 _SHORTEST, _LONGEST = 16, 256  # keyframes of a stretch
 _MOST = 10  # times that a stretch is linearised: each gains two digits or more
-_STAYS = 1e-8  # sigmas by which a guess that stays may move: a move leaves a tenth at most, so it ends within 1e-9
+STAYS = 1e-8  # sigmas by which a guess that stays may move: a move leaves a tenth at most, so it ends within 1e-9
 
 
 class StretchFilter:
@@ -48,12 +48,16 @@ class StretchFilter:
     ----------
     P_predicted, P : (K, D, D) and
     F : (K-1, 15, w), to be filled.
+    stays : sigmas by which a guess that stays may move.
     """
 
-    def __init__(self, problem: Problem, steps: Advance, stack: Stack, P_predicted: Array, P: Array, F: Array) -> None:
+    def __init__(
+        self, problem: Problem, steps: Advance, stack: Stack, P_predicted: Array, P: Array, F: Array,
+        stays: float = STAYS,
+    ) -> None:  # fmt: skip
         self._problem, self._steps, self._stack = problem, steps, stack
         self._P_predicted, self._P, self._F = P_predicted, P, F
-        self._length, blocks = 2 * _SHORTEST, stack.single
+        self._length, self._stays, blocks = 2 * _SHORTEST, stays, stack.single
         k = np.repeat(np.arange(stack.K), np.diff(blocks.first))
         # points of all keyframes one behind the other: where it is predicted, and where each block leads
         self._start = np.arange(stack.K) + blocks.first[:-1]
@@ -163,7 +167,7 @@ class StretchFilter:
         y[behind] -= added[np.repeat(np.arange(k1 - k), counts - 1), self._stack.single.end[some] - 1]
         e = _turn_errors(T, y - m)
         sigma = np.sqrt(np.diagonal(self._P[k:k1], axis1=1, axis2=2))
-        still = np.all(np.abs(e) <= _STAYS * np.repeat(sigma, counts, axis=0), axis=1)
+        still = np.all(np.abs(e) <= self._stays * np.repeat(sigma, counts, axis=0), axis=1)
         still = np.append(np.logical_and.reduceat(still, start), False)
         return k + int(np.argmin(still)), move_points(points, e)
 

@@ -41,7 +41,7 @@ def detections(recording: Recording, found: Sequence[Detection]) -> Figure:
         by_name = {name: every for name, every in by_name.items() if name in _SHOWN_STATISTICS}
     shown = drawn_rows(imu)
     t = imu.t[shown] - t0
-    force, rate = (size[shown] for size in _sizes(imu))
+    force, rate = _norm(imu.accel[shown]), np.degrees(_norm(imu.gyro[shown]))
     speeds = _speeds(recording)
     rows: list[tuple[str, str, tuple[float, float], bool]] = [
         ("size of the specific force [m/s²]", "m/s²", limits([force]), False),
@@ -83,14 +83,10 @@ def drawn_rows(imu: Imu) -> NDArray[np.intp]:
     return np.union1d(*(thin(imu.t, _norm(x)) for x in (imu.accel, imu.gyro)))
 
 
-def _sizes(imu: Imu) -> tuple[Array, Array]:
-    """Magnitudes of force (m/s^2) and rate (deg/s)."""
-    return _norm(imu.accel), np.degrees(_norm(imu.gyro))
-
-
 def _norm(x: Array) -> Array:
     """(N,) lengths of vectors (N, 3), computed without their squares in memory: for a day these take 400 MB."""
-    return np.sqrt(np.einsum("ij,ij->i", x, x))
+    squared = np.einsum("ij,ij->i", x, x)
+    return np.sqrt(squared, out=squared)
 
 
 def _speeds(recording: Recording) -> list[tuple[str, Array, Array, str]]:
