@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from graphnav.app.talk import importing
 from graphnav.core.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -164,7 +165,9 @@ def choose_solvers(context: typer.Context, names: str) -> tuple[str, ...]:
         If one is not known, or there is none.
     """
     from graphnav.core.complaints import split_names
-    from graphnav.estimation import pipeline
+
+    with importing():
+        from graphnav.estimation import pipeline
 
     return split_names(names, pipeline.KNOWN, _read_option_name(context), "solver")
 
