@@ -180,7 +180,7 @@ def inspect(recording: Recording) -> Inspection:
         forward = clock.by_velocity if track.instant else clock.by_places
         turns_back = yaw is not None and yaw.correlation > 0.8 and yaw.coefficients[0] < 0
         turns_so = yaw is not None and yaw.correlation > 0.8 and not turns_back
-        if not turns_so and (mirrored := list(check_mirroring(recording, track, yaw, turns_back))):
+        if not turns_so and (mirrored := list(check_mirroring(recording, track, turns_back))):
             findings += mirrored
         elif not turned:
             if turns_back:

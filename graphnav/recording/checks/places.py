@@ -24,22 +24,28 @@ _SCALE = np.sqrt(2.0)  # the middle between right and twice as large, the smalle
 _FEET = 0.3  # relative deviation from 0.3048 that the noise of both permits: a ratio of 1 is three times as far off
 
 
-def check_mirroring(recording: Recording, track: Track, as_read: Fit | None, turns_back: bool) -> Iterator[Finding]:
+def check_mirroring(recording: Recording, track: Track, turns_back: bool) -> Iterator[Finding]:
     """A course that turns opposite to the gyro, as positions are mirrored by an exchange or a sign.
 
-    Exchanged positions are also stretched, one way by the cosine of the latitude: the course agrees better (`as_read`
-    is its fit to the gyro) after the exchange if they were exchanged, and worse if only a sign is wrong.
+    Exchanged positions are also stretched, one way by the cosine of the latitude: their course agrees better with the
+    gyro after the exchange if they were exchanged, and worse if only a sign is wrong, or nothing.
     """
-    other = exchange_lat_lon(recording.gnss) if recording.gnss is not None else None
-    course = tracks.compute_track(replace(other, v=None)) if other is not None else None
-    yaw = crosschecks.fit_yaw_rate(recording.imu, course) if course is not None else None
-    better = yaw is not None and (not turns_back or as_read is None or yaw.correlation > as_read.correlation)
+    gnss = recording.gnss
+    other = exchange_lat_lon(gnss) if gnss is not None else None
+    yaw, as_read = (_fit_course(recording.imu, some) for some in (other, gnss))
+    better = as_read is None or (yaw is not None and yaw.correlation > as_read.correlation)
     if yaw is not None and better and yaw.correlation > 0.8 and abs(yaw.coefficients[0] - 1.0) < 0.2:
         yield describe_exchange("the turns of the gyro")
     elif (  # the gyro agrees with the force, whose up is that of the stated axes
         turns_back and crosschecks.find_up(recording.imu)[2] > 0.0 and tilt.measure_sideways(recording.imu, track) > 0.0
     ):
         yield describe_mirroring("latitudes or longitudes have", "the turns of the gyro and the force in curves")
+
+
+def _fit_course(imu: Imu, gnss: Gnss | None) -> Fit | None:
+    """The course by positions alone, fitted to the gyro."""
+    course = tracks.compute_track(replace(gnss, v=None)) if gnss is not None else None
+    return crosschecks.fit_yaw_rate(imu, course) if course is not None else None
 
 
 def check_frozen(recording: Recording) -> Iterator[Finding]:
