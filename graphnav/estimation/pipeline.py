@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
@@ -31,6 +30,7 @@ from graphnav.estimation.noise.files import MODES
 from graphnav.estimation.noise.imu_floor import with_measured_floor
 from graphnav.estimation.noise.model import STATED, NoiseModel, StampOffsets
 from graphnav.estimation.noise.words import describe_far
+from graphnav.estimation.pieces import describe_span, split_pieces
 from graphnav.estimation.preparation import Prepared, Weigh, prepare
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.separation import separation
@@ -48,7 +48,6 @@ from graphnav.recording.plausibility.screening import screen, state_findings
 SOLVERS = ("ekf", "rts", "batch")  # run when none is named
 KNOWN = ("ekf", "rts", "incremental", "isam2", "batch")
 _CLEARLY_BETTER = 10.0  # half chi-square; a likelihood ratio of 22,000
-_SHORTEST_PIECE = 5.0  # s; a shorter piece between two cuts cannot be aligned
 
 
 def run(
@@ -142,7 +141,7 @@ def _run(
     if unknown:
         raise EstimationError(f"no solver '{unknown[0]}'; known: {', '.join(KNOWN)}", key="solver.unknown")
     frame = LocalFrame(origin(recording))
-    pieces, notes = _split_pieces(recording, settings)
+    pieces, notes = split_pieces(recording, settings)
     notes = [*check_profile(recording, settings), *notes]
     found: list[dict[str, Solution]] = []
     parts = [share for piece in pieces for share in shares(piece, settings)]
@@ -162,7 +161,7 @@ def _run(
         except EstimationError as error:
             if len(parts) == 1:
                 raise
-            notes.append(Note("pieces.left_out", f"{_describe_span(recording, part.recording)} left out: {error}"))
+            notes.append(Note("pieces.left_out", f"{describe_span(recording, part.recording)} left out: {error}"))
     if not found:
         raise EstimationError(
             f"'{recording.name}': no piece between its IMU gaps can be solved", key="pieces.none_solved"
@@ -369,36 +368,3 @@ def origin(recording: Recording) -> np.ndarray:
         inside = np.flatnonzero((gnss.t >= recording.start) & (gnss.t <= recording.end))
         return gnss.llh[inside[0] if len(inside) else 0]
     return np.array([np.pi / 4, 0.0, 0.0])
-
-
-def _split_pieces(recording: Recording, settings: Settings) -> tuple[list[Recording], list[str]]:
-    """The recording split at IMU gaps too long to bridge, and a note on each cut."""
-    t = recording.imu.t
-    cuts = np.flatnonzero(np.diff(t) > settings.keyframes.bridge)
-    if not len(cuts):
-        return [recording], []
-    notes: list[str] = [
-        Note(
-            "pieces.cut",
-            f"IMU gap of {t[i + 1] - t[i]:.1f} s at {t[i] - recording.start:.1f} s: cut there, the parts are solved "
-            "apart",
-        )
-        for i in cuts
-    ]
-    edges = np.concatenate([[-1], cuts, [len(t) - 1]])
-    pieces = []
-    for lo, hi in itertools.pairwise(edges):
-        begin, end = t[lo + 1] - recording.start, t[hi] - recording.start
-        if end - begin < _SHORTEST_PIECE:
-            notes.append(
-                Note(
-                    "pieces.too_short", f"{begin:.1f} to {end:.1f} s left out: too short between two gaps to be aligned"
-                )
-            )
-        else:
-            pieces.append(recording.crop(begin - 1e-9, end + 1e-9))
-    return pieces, notes
-
-
-def _describe_span(recording: Recording, piece: Recording) -> str:
-    return f"{piece.start - recording.start:.0f} to {piece.end - recording.start:.0f} s"

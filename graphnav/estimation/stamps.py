@@ -179,13 +179,13 @@ def describe_stamps(offsets: StampOffsets) -> tuple[str, ...]:
     """A note on stamps that were moved."""
     if offsets == _AS_THEY_ARE:
         return ()
-    said = f"{offsets.positions:+.2f} s"
+    by = f"{offsets.positions:+.2f} s"
+    mend = f": state it as time_offset, {offsets.positions:+.2f} in [gnss] or {-offsets.positions:+.2f} in [imu]"
     if offsets.velocities != offsets.positions:
-        said = f"{said} (positions) and {offsets.velocities:+.2f} s (velocities)"
-    if offsets.odometer:
-        said = f"{said}, those of the odometer by {offsets.odometer:+.2f} s"
-    mend = f"state it as time_offset, {offsets.positions:+.2f} in [gnss] or {-offsets.positions:+.2f} in [imu]"
-    sentence = f"stamps of the fixes moved by {said}, at which they agree with the IMU: {mend}"
+        by, mend = f"{by} (positions) and {offsets.velocities:+.2f} s (velocities)", ""
+    elif offsets.odometer:  # it agrees with the fixes
+        mend = f": add {-offsets.positions:+.2f} to time_offset in [imu]"
+    sentence = f"stamps of the fixes moved by {by}, at which they agree with the IMU{mend}"
     return (Note("gnss.stamps_moved", sentence),)
 
 
@@ -196,13 +196,13 @@ def _by_constraint(offsets: StampOffsets) -> dict[str, float]:
 def _shift_noise(noise: NoiseModel, sign: float) -> NoiseModel:
     by = {name: sign * one for name, one in _by_constraint(noise.stamps).items()}
 
-    def moved(t: Array | float, name: str) -> Any:
+    def shift(t: Array | float, name: str) -> Any:
         return t + by.get(name, 0.0)
 
     return replace(
         noise,
-        weights={name: RowWeights(moved(one.t, name), one.weight) for name, one in noise.weights.items()},
+        weights={name: RowWeights(shift(one.t, name), one.weight) for name, one in noise.weights.items()},
         excluded={
-            name: tuple((moved(a, name), moved(b, name)) for a, b in spans) for name, spans in noise.excluded.items()
+            name: tuple((shift(a, name), shift(b, name)) for a, b in spans) for name, spans in noise.excluded.items()
         },
     )

@@ -23,6 +23,7 @@ from graphnav.recording.checks.overview import Inspection, inspect
 from graphnav.recording.checks.tracks import compute_track
 from graphnav.recording.formats import read
 from graphnav.recording.formats.schema import rotation_from_letters
+from graphnav.simulation import simulate
 
 TURNS_LITTLE = (100.0, 160.0)  # s of oracle_drive: it stands, and turns once
 TURNING = ["boulder_drive_20250708", "tokyo_20201105", "dresden_car_20140326", "oracle_drive", "kitti"]
@@ -518,3 +519,13 @@ def test_a_shift_of_clocks_that_one_turn_leaves_open_spoils_no_other_figure(
     assert fit.coefficients == pytest.approx([1.0], abs=0.05)
     upside = imu(accel=lambda x: x * [1.0, 1.0, -1.0])(recording)
     assert [one.key for one in inspect(upside).findings if one.severity != "note"] == ["imu.force_sign"]
+
+
+def test_jumps_of_fixes_are_no_exchange_of_latitude_and_longitude() -> None:
+    """The few turns of a minute, exchanged, agree with the gyro by chance at some delay: less than as they are."""
+    recording = simulate("electric", 8, duration=240.0, tunnels=0, gnss="rtk").recording
+    assert recording.gnss is not None
+    llh = recording.gnss.llh.copy()
+    llh[np.abs(recording.gnss.t - recording.gnss.t[0] - 45.0) < 10.0, 0] += 20.0 / 6.37e6
+    found = inspect(replace(recording, gnss=replace(recording.gnss, llh=llh)).crop(0.0, 60.0))
+    assert not [f.key for f in found.findings if f.severity == "refused"]

@@ -40,12 +40,13 @@ from graphnav.core.files import parse_json, read_text
 from graphnav.estimation.noise.model import INTERVALS, NoiseModel, RowWeights, StampOffsets, VarianceComponent
 from graphnav.imu.preintegration import NOISE_FIGURES
 from graphnav.recording import FIX_TYPES
+from graphnav.recording.checks.crosschecks import WIDE
 
 MODES: tuple[str, ...] = get_args(NoiseSettings.model_fields["mode"].annotation)
 _LEAST = 1e-15  # weight of an interval: one without any would have no end of noise
 _KEYS = ("mode", "pieces", "figures", "correlation_times", "weights", "excluded", "spacing", "stamps")
 _STAMPS = tuple(one.name for one in fields(StampOffsets))
-_LARGEST_OFFSET = 60.0  # s
+_LARGEST_OFFSET = 2.0 * WIDE  # s; estimates go on from what is searched
 _FIGURE = {"log_factor": "log_factor", "sigma": "sigma", "prior": "prior", "prior_sigma": "prior_sigma",
            "degrees_of_freedom": "freedom"}  # fmt: skip
 _BESIDE = ("variance_factor", "stated", "used", "unit", "correlation_time")
