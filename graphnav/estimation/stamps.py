@@ -180,7 +180,7 @@ def describe_stamps(offsets: StampOffsets) -> tuple[str, ...]:
     if offsets == _AS_THEY_ARE:
         return ()
     by = f"{offsets.positions:+.2f} s"
-    mend = f": state it as time_offset, {offsets.positions:+.2f} in [gnss] or {-offsets.positions:+.2f} in [imu]"
+    mend = f": add {offsets.positions:+.2f} to time_offset in [gnss]"
     if offsets.velocities != offsets.positions:
         by, mend = f"{by} (positions) and {offsets.velocities:+.2f} s (velocities)", ""
     elif offsets.odometer:  # it agrees with the fixes
