@@ -57,8 +57,9 @@ _ZENITH = 1.5  # m, 1-sigma of what the model of the ionosphere is wrong by: hal
 _ZENITH_WALK, _BIAS_WALK, _LEVER_WALK = 0.01, 0.003, 1e-4
 AXES = ("horizontal", "horizontal", "up")
 # m, 1-sigma of what lasts for hours, which a drive does not tell from its place: of all satellites, as a shift of the
-# place, where the ionosphere's gradient and the datum of an orbit make a metre or two; and of one satellite
-_HOURS, ONE = np.array([1.0, 1.0, 2.0]), 0.7
+# place, and of one satellite. Sideways it is the gradient of the ionosphere, a metre. Upwards the ionosphere has a
+# parameter, its zenith delay; models of the troposphere leave decimetres in heights (Remote Sensing 13, 2021, 1202)
+_HOURS, ONE = np.array([1.0, 1.0, 0.5]), 0.7
 _ERROR = np.array([1.0, 1.0, 2.0])  # m, unit of what lasts for seconds and minutes
 _DIFFERENCED = 0.1  # of what lasts for hours, against a base station
 # m, 1-sigma of one antenna less another: calibrated models have their phase centres on L1 7 cm above their reference
