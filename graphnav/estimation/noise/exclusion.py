@@ -25,6 +25,10 @@ twice, because the spans shrink to what is wrong. Each set of spans that comes u
 figures, and the decision with the largest evidence stands. If no fault is left by these figures, the estimate that uses
 all measurements and starts from them is one more candidate.
 
+Before or after. The tests run forward in time, so where fixes step from one place to another those behind the step are
+suspected, though those before it may be the wrong ones. So the fixes before each span that is left out, for as long,
+are suspected instead, the same way, and the likelier of both stands.
+
 Readmission. Once the spans are left out, measurements at their ends that agree with the rest are used again, if that
 increases the evidence.
 """
@@ -52,6 +56,7 @@ from graphnav.estimation.noise.spans import (
     extend_to_next_fix,
     join,
     join_faults,
+    list_before,
     list_distinct,
     list_repeats,
     mask_times,
@@ -121,9 +126,13 @@ def find_faults(base: Problem, found: NoiseEstimate) -> Decision:
     excluded = join(span for kind in FIXES for span in first.noise.excluded.get(kind, ()))
     # the figures found are of repeated fixes, too: where these are wrong, of wrong ones
     wrong = any(are_covered([span], excluded) for span in list_repeats(base.recording))
-    if are_covered(masked, excluded) and not wrong:
-        return first
-    return _unmask(base, found, first, split_at_repeats(masked, base.recording))
+    best = first
+    if not are_covered(masked, excluded) or wrong:
+        best = _unmask(base, found, first, split_at_repeats(masked, base.recording))
+    excluded = join(span for kind in FIXES for span in best.noise.excluded.get(kind, ()))
+    rows = [c.keyframe for c in base.constraints if c.name in FIXES]
+    before = list_before(excluded, base.t[np.unique(np.concatenate(rows))]) if excluded else []
+    return _unmask(base, found, best, before) if before else best
 
 
 def _unmask(base: Problem, found: NoiseEstimate, first: Decision, masked: list[Span]) -> Decision:
@@ -132,7 +141,7 @@ def _unmask(base: Problem, found: NoiseEstimate, first: Decision, masked: list[S
     Parameters
     ----------
     first : by the figures found; it stands unless another has more evidence.
-    masked : spans that the tests find with the prior medians of the figures.
+    masked : spans of fixes that are suspected besides those of the first.
     """
     best, leading, estimate, spans, passes = first, found, found, masked, first.passes
     start = NoiseModel(found.noise.figures, found.noise.times, excluded=dict.fromkeys(FIXES, tuple(masked)))

@@ -90,6 +90,13 @@ def are_covered(spans: Iterable[Span], by: list[Span]) -> bool:
     return all(any(a <= begin and end <= b for a, b in by) for begin, end in spans)
 
 
+def list_before(spans: list[Span], t: Array) -> list[Span]:
+    """As long before each of some spans, as far as it overlaps none of them and has measurements at times t (N,), s."""
+    ends = [-np.inf, *(end for _, end in spans[:-1])]
+    before = ((t >= begin - (end - begin)) & (t > e) & (t < begin) for (begin, end), e in zip(spans, ends, strict=True))
+    return [(float(t[some][0]), float(t[some][-1])) for some in before if some.any()]
+
+
 def list_distinct(*candidates: list[Span]) -> list[list[Span]]:
     """Candidates without repetitions and without empty ones."""
     return [list(spans) for spans in dict.fromkeys(tuple(spans) for spans in candidates) if spans]
