@@ -29,16 +29,16 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
 import oracle
 
-from graphnav.config import Settings, settings_from
+from graphnav.config import Settings, parse_settings
 from graphnav.core.earth import LocalFrame
 from graphnav.detectors import detect
 from graphnav.estimation.alignment import align
-from graphnav.estimation.noise.apply import with_noise
+from graphnav.estimation.noise.apply import apply_noise
 from graphnav.estimation.noise.estimate import estimate_noise
-from graphnav.estimation.pipeline import origin
+from graphnav.estimation.pipeline import choose_origin
 from graphnav.estimation.problem import Problem, build_problem
 from graphnav.estimation.solvers.ekf import ekf
-from graphnav.online import Online, Row, rows_of, without_rows
+from graphnav.online import Online, Row, drop_rows, list_rows
 from graphnav.recording import Recording
 from graphnav.simulation import simulate
 
@@ -56,7 +56,7 @@ def main() -> None:
     parser.add_argument("--foot", action="store_true", help="a walk")
     parser.add_argument("--engine", choices=["window", "isam2"], default=Settings().solver.engine)
     options = parser.parse_args()
-    settings = settings_from({"solver": {"lag": options.lag, "engine": options.engine}})
+    settings = parse_settings({"solver": {"lag": options.lag, "engine": options.engine}})
     seconds = 3600.0 * options.hours
     if options.foot:
         walk(seconds, settings)
@@ -68,7 +68,7 @@ def main() -> None:
     del path
     filtered = filter_seconds(recording.crop(0.0, min(seconds, 1800.0)), settings)
     print(f"the filter takes {1e3 * filtered:.2f} ms a keyframe with everything built beforehand", flush=True)
-    online = Online(without_rows(recording), settings)
+    online = Online(drop_rows(recording), settings)
     scale = np.array([6.378e6, 6.378e6 * np.cos(truth.llh[0, 0]), 1.0])
     found: list[list[float]] = []  # s of each update by part, all of it, beside it, and the longest row there
     beside = [0.0]
@@ -107,11 +107,11 @@ def main() -> None:
 def walk(seconds: float, settings: Settings) -> None:
     """Times of the rows of a walk, five minutes after five minutes."""
     recording = simulate("gait", 1, duration=seconds, rate=WALK_RATE).recording
-    online, found = Online(without_rows(recording), settings), []
+    online, found = Online(drop_rows(recording), settings), []
     until, again, began = recording.start + EVERY, 0, time.process_time()
     print("| min | ms a row that does something: median, 99 %, most | of all rows | settled | linearised again", end="")
     print(" | heading, deg | all, s | memory, MB |\n" + "| --- " * 8 + "|", flush=True)
-    for _, t, values in rows_of(recording)[1]:
+    for _, t, values in list_rows(recording)[1]:
         before = time.thread_time()
         online.add(("imu", t, values))
         found.append(time.thread_time() - before)
@@ -143,7 +143,7 @@ def lazily(recording: Recording) -> Iterator[Row]:
             return replace(sensor, **{n: getattr(sensor, n)[keep] for n in names if hasattr(sensor, n)})
 
         parts = {name: part(getattr(recording, name)) for name in ("imu", "gnss", "odometer")}
-        yield from rows_of(replace(recording, **parts))[1]
+        yield from list_rows(replace(recording, **parts))[1]
 
 
 def filter_seconds(recording: Recording, settings: Settings) -> float:
@@ -159,7 +159,7 @@ def build_with_noise(recording: Recording, settings: Settings, known_from: float
 
     `known_from` are the first seconds of it from which the noise model is estimated.
     """
-    frame = LocalFrame(origin(recording))
+    frame = LocalFrame(choose_origin(recording))
     found = align(recording, settings, frame)
 
     def build(part: Recording) -> Problem:
@@ -168,7 +168,7 @@ def build_with_noise(recording: Recording, settings: Settings, known_from: float
 
     base = build(recording)
     first = build(recording.crop(0.0, known_from)) if known_from < recording.end - recording.start else base
-    return with_noise(base, estimate_noise(first, found.until).noise)
+    return apply_noise(base, estimate_noise(first, found.until).noise)
 
 
 def report(hour: int, found: np.ndarray, filtered: float, errors: np.ndarray, cpu: float, rows: int) -> None:

@@ -17,7 +17,7 @@ import numpy as np
 
 import graphnav
 from graphnav.app.scores import score
-from graphnav.config import settings_from
+from graphnav.config import parse_settings
 from graphnav.core.earth import LocalFrame
 from graphnav.recording import Gnss, Recording
 
@@ -100,7 +100,7 @@ def main() -> None:
         used = replace(recording, gnss=damage(recording, recording.gnss, np.random.default_rng(options.seed)))
         cells = []
         for values in (STATED, {}):
-            solutions = graphnav.run(used, settings_from(values), SOLVERS)
+            solutions = graphnav.run(used, parse_settings(values), SOLVERS)
             metrics = score(recording, used, solutions, ())[0]
             cells += [f"{metrics[solver].components['h'].rms:.3f}" for solver in SOLVERS]
             cells.append(f"{metrics['batch'].nees['p'].mean:.1f}")

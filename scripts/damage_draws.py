@@ -28,8 +28,8 @@ from do_no_harm import DRIVES, HERE, load, placed, withheld_of
 
 import graphnav
 from graphnav.app.scores import score
-from graphnav.config import settings_from
-from graphnav.evaluation.metrics import summary
+from graphnav.config import parse_settings
+from graphnav.evaluation.metrics import summarise
 from graphnav.recording import Recording
 
 SOLVERS = ("ekf", "rts", "batch")
@@ -74,13 +74,13 @@ def solve(number: int, options: argparse.Namespace) -> dict[str, Any]:
             part = part.without(source, span)
         began = time.process_time()
         try:
-            solutions = graphnav.run(part, settings_from(values), SOLVERS)
+            solutions = graphnav.run(part, parse_settings(values), SOLVERS)
             row[f"{variant} s"] = round(time.process_time() - began, 2)
             metrics = score(clean, part, solutions, withheld)[0]
         except graphnav.GraphnavError as error:
             row[variant] = {"error": str(error).split("\n")[0]}
             continue
-        found = {solver: summary(metrics[solver]) for solver in SOLVERS}
+        found = {solver: summarise(metrics[solver]) for solver in SOLVERS}
         row[variant] = {
             solver: {"h": x.get("h_rms_m"), "up": x.get("up_rms_m"), "nees": x.get("nees_p")}
             for solver, x in found.items()

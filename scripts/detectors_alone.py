@@ -22,10 +22,10 @@ from withheld_spans import runs_of
 
 from graphnav import load
 from graphnav.app.scores import Withheld, score
-from graphnav.config import Settings, settings_from
+from graphnav.config import Settings, parse_settings
 from graphnav.config.detectors import FUSED
 from graphnav.detectors import detect, list_detectors
-from graphnav.detectors.base import longer_than, mask_inside, spans_of
+from graphnav.detectors.base import drop_short, find_spans, mask_inside
 from graphnav.estimation.noise.model import NoiseModel
 from graphnav.estimation.pipeline import SOLVERS, run
 from graphnav.recording import Recording
@@ -66,15 +66,15 @@ def drives(folder: Path, names: list[str]) -> Iterator[Drive]:
             assert of is not None
             assert of.v is not None
             t, slow = of.t, np.hypot(of.v[:, 0], of.v[:, 1]) < (SLOW if recording.truth is None else EXACT)
-            stops = longer_than(spans_of(slow, t), SHORTEST)
+            stops = drop_short(find_spans(slow, t), SHORTEST)
         known = max(recording.start, t[0]), min(recording.end, t[-1])
         yield Drive(name, recording, np.clip(stops, *known), known)
 
 
 def settings_of(fire: str) -> Settings:
     if fire == NOBODY:
-        return settings_from({"standstill": {"zero_velocity": False, "zero_rate": False, "held_position": False}})
-    return settings_from({"detectors": {"fire": [fire]}})
+        return parse_settings({"standstill": {"zero_velocity": False, "zero_rate": False, "held_position": False}})
+    return parse_settings({"detectors": {"fire": [fire]}})
 
 
 def stationary(recording: Recording, fire: str) -> Array:
@@ -83,8 +83,8 @@ def stationary(recording: Recording, fire: str) -> Array:
         return detect(recording, settings_of(fire)).stationary
     t = np.arange(recording.start, recording.end, STEP)
     votes = [mask_inside(t, detect(recording, settings_of(name)).stationary) for name in list_detectors()]
-    return longer_than(
-        spans_of(np.sum(votes, axis=0) >= int(fire), t), settings_of(FUSED).detectors.fusion.min_duration
+    return drop_short(
+        find_spans(np.sum(votes, axis=0) >= int(fire), t), settings_of(FUSED).detectors.fusion.min_duration
     )
 
 

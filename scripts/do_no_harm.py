@@ -31,13 +31,13 @@ from scipy.stats import chi2
 
 import graphnav
 from graphnav.app.scores import Span, Withheld, score
-from graphnav.config import settings_from
+from graphnav.config import parse_settings
 from graphnav.core.earth import LocalFrame
 from graphnav.core.interpolation import interpolate
 from graphnav.estimation.pipeline import SOLVERS
 from graphnav.estimation.solution import Solution
-from graphnav.evaluation.evaluate import truth_of
-from graphnav.evaluation.metrics import summary
+from graphnav.evaluation.evaluate import find_truth
+from graphnav.evaluation.metrics import summarise
 from graphnav.recording import Recording
 
 HERE = Path(__file__).resolve().parents[1]
@@ -84,7 +84,7 @@ def settings_of(variant: str, sensors: str, doppler: bool = True) -> graphnav.Se
         values["standstill"] = {"zero_velocity": False, "zero_rate": False, "held_position": False}
     values["vehicle"] = {"nhc": sensors != "gnss", "odometer": sensors == "+odometer"}
     values["noise"] = {"mode": variant}
-    return settings_from(values)
+    return parse_settings(values)
 
 
 # ------------------------------------------------------------------------------------------------------- what is solved
@@ -180,7 +180,7 @@ def solve(job: Job) -> list[Row]:
         seconds = time.process_time() - began
         metrics = score(part, used, solutions, withheld)[0]
         for row in rows:
-            said = summary(metrics[row["solver"]])
+            said = summarise(metrics[row["solver"]])
             row |= {"h": said.get("h_rms_m"), "up": said.get("up_rms_m"), "nees": said.get("nees_p")}
             row |= {**left_out(used, solutions[row["solver"]]), "seconds": round(seconds, 2)}
     except Exception as error:  # another kind than GraphnavError is a bug; the table shows it and goes on
@@ -204,7 +204,7 @@ def left_out(recording: Recording, solution: Solution) -> Row:
     out &= there
     velocities = sum(fault.count for fault in solution.excluded if fault.kind == "gnss_velocity")
     found: Row = {"fixes": int(there.sum()), "left_out": int(out.sum()), "left_out_velocities": velocities}
-    reference = truth_of(recording)
+    reference = find_truth(recording)
     if reference is None:
         return found | {"confirmed": None, "confirmed_left_out": None}
     truth, of_antenna = reference[0], reference[1] is not None

@@ -22,7 +22,7 @@ from graphnav.gnss.ephemeris import Ephemerides
 from graphnav.gnss.load import read_rover
 from graphnav.gnss.rinex_nav import read_navigation
 from graphnav.gnss.series import Observations
-from graphnav.gnss.signals import GALILEO, GPS, QZSS, signal_name
+from graphnav.gnss.signals import GALILEO, GPS, QZSS, name_signal
 from graphnav.gnss.ubx import SIGNALS
 
 PI = 3.1415926535898  # of the interface descriptions
@@ -137,7 +137,7 @@ def encode_log(obs: Observations, nav: Ephemerides) -> bytes:
     for k, t in enumerate(np.unique(obs.t)):
         rows, many = b"", 0
         for i in np.flatnonzero(obs.t == t).tolist():
-            satellite, name = int(obs.satellite[i]), signal_name(obs.signal[i])
+            satellite, name = int(obs.satellite[i]), name_signal(obs.signal[i])
             number = numbers.get((NUMBER.get(satellite // 100, -1), name))
             if number is None or not (code[i] or carrier[i]):
                 continue

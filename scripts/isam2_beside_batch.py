@@ -26,12 +26,12 @@ from graphnav.core.state import States
 from graphnav.detectors import detect
 from graphnav.estimation.factor_graph.batch import batch
 from graphnav.estimation.factor_graph.isam import isam2
-from graphnav.estimation.pipeline import origin
+from graphnav.estimation.pipeline import choose_origin
 from graphnav.estimation.preparation import prepare
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import Solution
 from graphnav.estimation.solvers.incremental import are_due, incremental
-from graphnav.imu.dynamics import SCALE, as_biases
+from graphnav.imu.dynamics import SCALE, convert_to_biases
 
 RECORDINGS = ("kitti", "gcp_walks/walk31.toml", "oracle_drive", "tokyo_20201105")
 LONGEST = 600.0  # s that are used of a recording
@@ -53,7 +53,7 @@ def main() -> None:
     print("| --- | --- | --- | --- | --- |", flush=True)
     for name in options.recordings:
         recording = load(data / name if (data / name).exists() else name).crop(0.0, LONGEST)
-        settings, frame = Settings(), LocalFrame(origin(recording))
+        settings, frame = Settings(), LocalFrame(choose_origin(recording))
         found = prepare(recording, settings, frame, detect(recording, settings))
         problem, start, nodes = found.problem, found.smoothed.states, found.smoothed.nodes(found.problem)
         best = batch(problem, start, nodes)
@@ -80,7 +80,7 @@ def about(problem: Problem, best: Solution) -> Problem:
     ba, bg = best.states.ba[:-1], best.states.bg[:-1]
     if SCALE in best.parameters:
         scale = best.parameters[SCALE].value[0]
-        of_accel, of_gyro = as_biases(scale, problem.intervals.force, problem.intervals.rate)
+        of_accel, of_gyro = convert_to_biases(scale, problem.intervals.force, problem.intervals.rate)
         ba, bg = ba + of_accel, bg + of_gyro
     return problem.reintegrate(ba, bg)
 

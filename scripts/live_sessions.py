@@ -26,8 +26,8 @@ sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 
 import oracle  # noqa: E402
 
-from graphnav.online import Row, rows_of  # noqa: E402
-from graphnav.online.lines import END, head_of, line_of  # noqa: E402
+from graphnav.online import Row, list_rows  # noqa: E402
+from graphnav.online.lines import END, format_head, format_line  # noqa: E402
 from graphnav.recording import Recording  # noqa: E402
 from graphnav.recording.formats.trajectories import read_trajectory  # noqa: E402
 from graphnav.simulation import simulate  # noqa: E402
@@ -49,10 +49,10 @@ def main() -> int:
     options = parser.parse_args()
     rng = random.Random(options.seed)
     recording = made(options.who, 3600.0 * options.hours)
-    rows = interrupted(rows_of(recording)[1], recording)
-    plain = [line_of(row) for row in rows]
-    hostile = [line_of(row) for row in spoilt(rows, rng)]
-    head = head_of(recording)
+    rows = interrupted(list_rows(recording)[1], recording)
+    plain = [format_line(row) for row in rows]
+    hostile = [format_line(row) for row in spoilt(rows, rng)]
+    head = format_head(recording)
     print(f"{options.who}: {len(plain)} rows, {len(hostile)} with those that are absurd or come twice", flush=True)
     with tempfile.TemporaryDirectory() as folder:
         out = options.out or Path(folder)

@@ -18,8 +18,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from graphnav.app.workflow import Request, parse_withheld, run_request
-from graphnav.config import Settings, settings_from
-from graphnav.evaluation.evaluate import truth_of
+from graphnav.config import Settings, parse_settings
+from graphnav.evaluation.evaluate import find_truth
 from graphnav.report.plots import PALETTE
 
 AROUND = 15.0  # s drawn before and after the span
@@ -42,10 +42,10 @@ def main() -> None:
     options = parser.parse_args()
     source, span = parse_withheld(options.without)
     assert span is not None, "name a span"
-    settings = settings_from(INERTIAL) if options.inertial else Settings()
+    settings = parse_settings(INERTIAL) if options.inertial else Settings()
     outcome = run_request(Request(options.recording, tuple(NAMES), settings, ((source, span),)))
     recording = outcome.recording
-    found = truth_of(recording)
+    found = find_truth(recording)
     assert found is not None, "the recording has no truth to draw"
     truth, _ = found
     frame = next(iter(outcome.solutions.values())).frame

@@ -22,7 +22,7 @@ from graphnav.core import rotation
 from graphnav.core.state import States
 from graphnav.estimation.pipeline import run
 from graphnav.estimation.solution import Solution
-from graphnav.evaluation.strides import fit_point, shapes
+from graphnav.evaluation.strides import compare_shapes, fit_point
 from graphnav.recording import Imu, Recording
 
 FORCE, TURN, ZERO = 0.5, 0.03, 0.01  # m/s^2, rad/s of a row; m/s
@@ -108,7 +108,7 @@ def measures(recording: Recording, stances: np.ndarray, t: np.ndarray, states: S
     height = states.p[:, 2] - X[:, 2]
     height -= height[t <= t[0] + 1.0].mean()
     of_point, _ = fit_point(states, X * [1.0, 1.0, 0.0])
-    return *shapes(t, states.p, X, stances), of_point, float(np.sqrt(np.mean(height**2)))
+    return *compare_shapes(t, states.p, X, stances), of_point, float(np.sqrt(np.mean(height**2)))
 
 
 if __name__ == "__main__":

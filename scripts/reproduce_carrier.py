@@ -30,15 +30,15 @@ import reproduce_rtk
 from pyins import sim
 from scipy.interpolate import CubicSpline, PchipInterpolator
 
-from graphnav.config import settings_from
+from graphnav.config import parse_settings
 from graphnav.core import earth
 from graphnav.estimation.pipeline import run
 from graphnav.estimation.solution import Solution
 from graphnav.gnss.arcs import find_arcs
-from graphnav.gnss.carrier import consecutive
+from graphnav.gnss.carrier import pair_consecutive
 from graphnav.gnss.load import Sources, load_raw
-from graphnav.gnss.series import RawGnss, primary
-from graphnav.gnss.sigmas import carrier_sigma
+from graphnav.gnss.series import RawGnss, choose_primary
+from graphnav.gnss.sigmas import compute_carrier_sigma
 from graphnav.gnss.signals import C
 from graphnav.gnss.single_point import SinglePoint, choose_coefficients, look
 from graphnav.recording import Gnss, Imu, ImuNoise, Recording, Truth
@@ -65,18 +65,20 @@ def increments(data: Path) -> None:
     """Displacements from epoch to epoch by carriers alone against those of the reference."""
     raw, _, truth = observations(data)
     whole = raw
-    raw = raw.take(primary(raw) & np.isfinite(raw.p[:, 0]) & ~(raw.cn0 < 30.0))
+    raw = raw.take(choose_primary(raw) & np.isfinite(raw.p[:, 0]) & ~(raw.cn0 < 30.0))
     epochs, of = raw.epochs
     true = truth[np.clip(np.round(epochs).astype(int), 0, len(truth) - 1)]
     geometry = look(raw, true[of], choose_coefficients(raw))
     high = geometry.elevation > np.radians(10.0)
     raw, of = raw.take(high), of[high]
     geometry = look(raw, true[of], choose_coefficients(raw))
-    before, after = consecutive(raw, whole)
+    before, after = pair_consecutive(raw, whole)
     level = geometry.distance - geometry.ionosphere + geometry.troposphere - raw.clock
     level -= raw.carrier * C / raw.frequency
     change = level[after] - level[before]
-    sigma = np.hypot(*(carrier_sigma(raw.cn0[k], geometry.elevation[k], C / raw.frequency[k]) for k in (before, after)))
+    sigma = np.hypot(
+        *(compute_carrier_sigma(raw.cn0[k], geometry.elevation[k], C / raw.frequency[k]) for k in (before, after))
+    )
     off = np.full((len(epochs), 3), np.nan)
     for k in range(1, len(epochs)):
         own = np.flatnonzero(of[after] == k)
@@ -190,7 +192,7 @@ def canyon(data: Path, spans: list[int], counts: list[int], solvers: tuple[str, 
         window = whole.crop(begin - BEFORE, begin + SPAN + AFTER)
         span = [(BEFORE, BEFORE + SPAN)]
         for differences in (True, False):
-            settings = settings_from({"raw_gnss": {"coupling": "tight", "differences": differences}})
+            settings = parse_settings({"raw_gnss": {"coupling": "tight", "differences": differences}})
             # a drive is long beside its canyons: how good the sensors are is known from without
             noise = run(window, settings, ("ekf",))["ekf"].noise
             for left in counts:
@@ -226,7 +228,7 @@ def windows(data: Path, spans: list[list[float]], solvers: tuple[str, ...]) -> N
         assert truth is not None
         assert truth.llh is not None
         for differences in (False, True):
-            settings = settings_from({"raw_gnss": {"coupling": "tight", "differences": differences}})
+            settings = parse_settings({"raw_gnss": {"coupling": "tight", "differences": differences}})
             began = time.process_time()
             solutions = run(recording, settings, solvers)
             seconds = time.process_time() - began

@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from graphnav.config import Settings, settings_from
+from graphnav.config import Settings, parse_settings
 from graphnav.detectors import detect
 from graphnav.estimation.pipeline import SOLVERS, run
 from graphnav.estimation.solution import Solution
@@ -71,7 +71,7 @@ def share(spans: Array, seconds: Array) -> Array:
 
 
 def firing(fire: str) -> Settings:
-    return settings_from({"detectors": {"fire": [fire]}})
+    return parse_settings({"detectors": {"fire": [fire]}})
 
 
 def detection(made: Simulated, fires: list[str]) -> dict[str, list[float]]:
@@ -125,7 +125,7 @@ def drifts(made: Simulated, fires: list[str]) -> tuple[dict[str, Array], float]:
             for name, solution in run(replace(part, truth=None), firing(fire)).items():
                 out[f"{name}, {fire} decides"].append(variation(solution, stop))
         if number == 0:
-            free = settings_from({"standstill": OFF, "vehicle": {"nhc": False, "odometer": False}})
+            free = parse_settings({"standstill": OFF, "vehicle": {"nhc": False, "odometer": False}})
             far = float(variation(run(part, free, ("ekf",))["ekf"], stop)[2].max() / 1e5)
     return {name: np.array(rows) for name, rows in out.items()}, far
 

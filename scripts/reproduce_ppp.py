@@ -34,18 +34,18 @@ from reproduce_li2024 import TABLE_5, TABLE_6, detection, stops_of, variation, w
 from reproduce_rtk import DRIVES, simulate_imu, truth_of
 from scipy.signal import lfilter
 
-from graphnav.config import settings_from
+from graphnav.config import parse_settings
 from graphnav.core import earth, rotation
 from graphnav.estimation.pipeline import run
-from graphnav.gnss.antex import satellite_axes, wind_up
+from graphnav.gnss.antex import compute_satellite_axes, compute_wind_up
 from graphnav.gnss.ephemeris import rotate_earth
 from graphnav.gnss.load import Sources, load_raw
-from graphnav.gnss.ppp import ionosphere_free
+from graphnav.gnss.ppp import combine_ionosphere_free
 from graphnav.gnss.precise import read_precise
 from graphnav.gnss.series import RawGnss
-from graphnav.gnss.signals import GALILEO, GPS, L1, C, frequencies, signal_id
+from graphnav.gnss.signals import GALILEO, GPS, L1, C, find_frequencies, number_signal
 from graphnav.gnss.single_point import SinglePoint, look
-from graphnav.gnss.tides import sun_and_moon
+from graphnav.gnss.tides import locate_sun_and_moon
 from graphnav.recording import Gnss, Imu, ImuNoise, Recording
 from graphnav.simulation import Simulated, simulate
 from graphnav.simulation.inertial import MEMS as CONSUMER
@@ -134,7 +134,7 @@ def simulated_beside(name: str, raw: RawGnss, fixes: SinglePoint, imu: Imu, span
 
 def static(data: Path, chosen: dict[str, Any], solvers: tuple[str, ...]) -> None:
     recording = static_recording(data)
-    settings = settings_from(
+    settings = parse_settings(
         {
             "raw_gnss": {"coupling": "tight", "ppp": True, **chosen},
             "alignment": {"heading": 0.0},
@@ -163,7 +163,7 @@ def drive(data: Path, solvers: tuple[str, ...]) -> None:
     t, places = truth_of(data, known, raw)
     at, gyro, accel, _ = simulate_imu(t, places)
     whole = simulated_beside(data.name, raw, fixes, Imu(at, gyro, accel, CONSUMER.noise), (at[0], at[-1]))
-    settings = settings_from({"raw_gnss": {"coupling": "tight", "ppp": True}})
+    settings = parse_settings({"raw_gnss": {"coupling": "tight", "ppp": True}})
     print(
         "m, east, north, up at the last epoch of a span (s from the start); 1-sigma; sum of squares over the covariance"
     )
@@ -210,7 +210,7 @@ def observed(made: Simulated, orbits: Any, mask: float = 15.0, seed: int = 0) ->
     clock = 30.0 + 0.1 * np.cumsum(rng.standard_normal(len(t)))
     nothing = np.zeros(n, dtype=bool)
     raw = RawGnss(
-        t=t[at], satellite=satellite, signal=np.full(n, signal_id("1C"), dtype=np.int16), code=np.zeros(n),
+        t=t[at], satellite=satellite, signal=np.full(n, number_signal("1C"), dtype=np.int16), code=np.zeros(n),
         carrier=np.zeros(n), range_rate=np.full(n, np.nan), cn0=np.full(n, 47.0), slip=nothing, half=nothing,
         frequency=np.full(n, L1), p=found.p, v=found.v, clock=C * found.clock, drift=C * found.drift,
         difference=np.full(n, np.nan), zero=zero, place=tuple(antenna[0]), antenna=antenna[at],
@@ -221,14 +221,14 @@ def observed(made: Simulated, orbits: Any, mask: float = 15.0, seed: int = 0) ->
     at = np.searchsorted(t, raw.t)
     other = np.zeros(len(raw), dtype=np.int16)
     for system, name in SECOND.items():
-        other[raw.satellite // 100 == system] = signal_id(name)
+        other[raw.satellite // 100 == system] = number_signal(name)
     pair = _both(raw, other)
-    free = ionosphere_free(raw, pair)
+    free = combine_ionosphere_free(raw, pair)
     assert free is not None
     assert len(free.which) == len(raw)
     of = np.searchsorted(names, raw.satellite)
-    axes = satellite_axes(free.geometry.s, sun_and_moon(raw.t + zero)[0])
-    wound = wind_up(raw.satellite, raw.t, axes, free.geometry.e, earth.enu_axes(earth.ecef_to_llh(raw.antenna)))
+    axes = compute_satellite_axes(free.geometry.s, locate_sun_and_moon(raw.t + zero)[0])
+    wound = compute_wind_up(raw.satellite, raw.t, axes, free.geometry.e, earth.enu_axes(earth.ecef_to_llh(raw.antenna)))
     wet = WET * (1.0 + 0.2 * np.cumsum(rng.standard_normal(len(t))) / np.sqrt(len(t)))
     common = free.known + clock[at] - raw.clock + free.wet * wet[at] + ORBIT * rng.standard_normal(len(names))[of]
     delay = ZENITH / np.maximum(np.sin(free.geometry.elevation), 0.2)
@@ -271,7 +271,7 @@ def _both(raw: RawGnss, other: Array, noisy: list[tuple[Array, Array]] | None = 
 
 
 def _second_of(raw: RawGnss, other: Array) -> RawGnss:
-    return replace(raw, signal=other, frequency=frequencies(raw.satellite, other))
+    return replace(raw, signal=other, frequency=find_frequencies(raw.satellite, other))
 
 
 def li(data: Path, solvers: tuple[str, ...], stops: int, seed: int = 0) -> None:
@@ -288,7 +288,7 @@ def li(data: Path, solvers: tuple[str, ...], stops: int, seed: int = 0) -> None:
     for number, stop in enumerate(stops_of(made)[:stops]):
         part = without_gnss(recording.crop(0.0, stop[1] - recording.start), [(stop[0] - 0.5, stop[1] + 1.0)])
         for fire in ("fft", "fused"):
-            settings = settings_from(
+            settings = parse_settings(
                 {
                     "raw_gnss": {"coupling": "tight", "ppp": True, "doppler": False, "elevation": 15.0},
                     "detectors": {"fire": [fire]},

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from graphnav.config import Settings, settings_from
+from graphnav.config import Settings, parse_settings
 from graphnav.core import rotation
 from graphnav.core.earth import LocalFrame
 from graphnav.estimation.pipeline import SOLVERS, run
@@ -43,7 +43,7 @@ PAPER = (
 
 def settings_of(case: str, compensated: bool) -> Settings:
     stance, lateral = CASES[case]
-    return settings_from(
+    return parse_settings(
         {
             "foot": {"stance": stance, "lateral": lateral, **(AS_WRITTEN if "IMU" in case else {})},
             "detectors": {"fire": ["glrt"]},

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from scipy.interpolate import PchipInterpolator, make_interp_spline
 
-from graphnav.config import settings_from
+from graphnav.config import parse_settings
 from graphnav.core import earth, rotation
 from graphnav.core.earth import LocalFrame
 from graphnav.core.files import permit_outside
@@ -236,7 +236,7 @@ def main() -> None:
             continue
         began = time.process_time()
         settings = {"raw_gnss": chosen, **(WITHOUT_IMU if given.without_imu else {})}
-        solutions = run(recording, settings_from(settings), solvers)
+        solutions = run(recording, parse_settings(settings), solvers)
         seconds = time.process_time() - began
         for solver, one in solutions.items():
             e = errors(one.t, one.trajectory().llh, t, places)

@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from graphnav.config import settings_from
+from graphnav.config import parse_settings
 from graphnav.core.files import permit_outside
 from graphnav.estimation.pipeline import run
 from graphnav.estimation.solution import Solution
@@ -115,7 +115,7 @@ def main() -> None:
         if given.without_odometer:
             recording = recording.without("odometer")
         began = time.process_time()
-        solutions = run(recording, settings_from({"raw_gnss": chosen}), SOLVERS)
+        solutions = run(recording, parse_settings({"raw_gnss": chosen}), SOLVERS)
         seconds = time.process_time() - began
         for solver, one in solutions.items():
             h50, h95, most, rms, up, flat, whole = score(one, recording)

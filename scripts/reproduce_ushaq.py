@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from graphnav.config import Settings, settings_from
+from graphnav.config import Settings, parse_settings
 from graphnav.core.errors import EstimationError
 from graphnav.estimation.pipeline import run
 from graphnav.estimation.solution import Solution
@@ -74,7 +74,7 @@ COLUMNS = ("inside, RMS m", "max m", "outside, RMS m", "max m", "inside, RMS m/s
 
 def settings_of(variant: str, sources: tuple[str, ...]) -> Settings:
     """The paper knows nothing of wheels; its stops give a velocity and no more; its INS starts aligned."""
-    return settings_from(
+    return parse_settings(
         {
             "alignment": {} if "gnss" in sources else {"heading": 90.0, "heading_sigma": 0.5},
             "vehicle": {"nhc": "nhc" in sources, "odometer": "odometer" in sources},

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from graphnav.config import Settings, settings_from
+from graphnav.config import Settings, parse_settings
 from graphnav.core.earth import LocalFrame
 from graphnav.estimation.pipeline import SOLVERS, run
 from graphnav.estimation.solution import Solution
@@ -44,7 +44,7 @@ def settings_of(case: str) -> Settings:
     """What a case uses; stops are not in the paper."""
     nhc, odometer = CASES[case]
     still = {"zero_velocity": False, "zero_rate": False, "held_position": False}
-    return settings_from({"vehicle": {"nhc": nhc, "odometer": odometer}, "standstill": still})
+    return parse_settings({"vehicle": {"nhc": nhc, "odometer": odometer}, "standstill": still})
 
 
 def errors(solution: Solution, made: Simulated) -> tuple[Array, Array]:

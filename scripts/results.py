@@ -12,7 +12,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-from graphnav.app.terminal import short
+from graphnav.app.terminal import format_short
 
 # folder among the recordings (or built-in name), further options, which span of comparison.csv it is about
 DRIVES = (
@@ -41,7 +41,7 @@ def main() -> None:
                 for row in csv.DictReader(file):
                     values = [row[f"span{span}_{key}"] for _, key in SPAN_COLUMNS]
                     values.append(row[f"span{span}_nees_p"])
-                    rows.append([name, row["solver"], *(short(float(x)) if x else "-" for x in values)])
+                    rows.append([name, row["solver"], *(format_short(float(x)) if x else "-" for x in values)])
     print("\n".join("| " + " | ".join(row) + " |" for row in rows))
 
 

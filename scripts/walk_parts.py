@@ -21,7 +21,7 @@ import numpy as np
 from walks import SETS
 
 from graphnav import load
-from graphnav.config import settings_from
+from graphnav.config import parse_settings
 from graphnav.estimation.pipeline import run
 from graphnav.evaluation.strides import walk_errors
 from graphnav.imu import dynamics
@@ -46,12 +46,12 @@ CASES: dict[str, tuple[Mapping[str, Any], dict[str, Any]]] = {
     "noise as stated": ({"noise": {"mode": "stated"}}, {}),
     "offset as the unit left it": ({"imu": {"onboard_offset": False}}, {}),
     "no noise of heel strikes": (
-        {}, {"graphnav.estimation.problem.with_unresolved_motion": lambda samples, noise: samples}),
+        {}, {"graphnav.estimation.problem.add_unresolved_motion": lambda samples, noise: samples}),
     "axes taken as square": ({}, {"graphnav.imu.dynamics._scale_parameter": lambda noise, _: _square(noise, 3)}),
-    "peaks left cut off": ({}, {"graphnav.estimation.problem.with_whole_peaks": lambda samples, *_: (samples, ())}),
+    "peaks left cut off": ({}, {"graphnav.estimation.problem.restore_peaks": lambda samples, *_: (samples, ())}),
     "no coning": ({"imu": {"coning": False}}, {}),
     "no row doubted": ({"foot": {"robust": "none"}}, {}),
-    "sliding taken for stance": ({}, {"graphnav.detectors.stance._without_sliding": lambda spans, *_: spans}),
+    "sliding taken for stance": ({}, {"graphnav.detectors.stance._cut_sliding": lambda spans, *_: spans}),
     "first steps filtered once": ({}, {"graphnav.estimation.alignment.rest._OPENING": 1}),
 }  # fmt: skip
 
@@ -71,7 +71,7 @@ def replaced(parts: Mapping[str, Any]) -> Iterator[None]:
 
 def errors(recording: Recording, settings: Mapping[str, Any]) -> list[float]:
     """Of batch and filter over the floor, of batch in height; the stride."""
-    found = run(recording, settings_from(settings), ("ekf", "batch"))
+    found = run(recording, parse_settings(settings), ("ekf", "batch"))
     filtered, batch = (walk_errors(recording, found[name]) for name in ("ekf", "batch"))
     return [batch.horizontal, filtered.horizontal, abs(batch.up), batch.stride]
 

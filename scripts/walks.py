@@ -22,9 +22,9 @@ from pathlib import Path
 import numpy as np
 
 from graphnav import load
-from graphnav.config import settings_from
+from graphnav.config import parse_settings
 from graphnav.estimation.pipeline import SOLVERS, run
-from graphnav.evaluation.strides import WalkErrors, floor_sigma, walk_errors
+from graphnav.evaluation.strides import WalkErrors, estimate_floor_sigma, walk_errors
 from graphnav.recording import Recording
 
 # m: how far a coordinate of the truth may be off. None: measured. Points taken by hand where the shoe stood, of a place
@@ -58,7 +58,7 @@ def main() -> None:
     print(" | batch, in stance | batch, stances once | batch, point fitted | batch, bias before", end="")
     print(f" | up, m: {', '.join(SOLVERS)} | stride | NEES hor. | NEES up | s per min |")
     print("|" + " --- |" * (3 + len(CASES) * len(SOLVERS) + 9))
-    for name in options.sets.split(","):
+    for name in options.group_arcs.split(","):
         rows, before = [], None
         for plain, path in zip(PLAIN[name], sorted((folder / name).glob("*.toml")), strict=True):
             row, before = one(path, plain, SETS[name], before)
@@ -86,14 +86,14 @@ def one(path: Path, plain: float, stated: float | None, before: Before | None) -
     spent = 0.0
     for case, lateral in CASES.items():
         began = time.process_time()
-        solutions = run(recording, settings_from({"foot": {"lateral": lateral}}))
+        solutions = run(recording, parse_settings({"foot": {"lateral": lateral}}))
         spent = spent or time.process_time() - began
-        truth_sigma = floor_sigma(recording, solutions["batch"]) if stated is None else stated
+        truth_sigma = estimate_floor_sigma(recording, solutions["batch"]) if stated is None else stated
         for solver, solution in solutions.items():
             found[case, solver] = walk_errors(recording, solution, truth_sigma)
     horizontal = [found[case, solver].horizontal for case in CASES for solver in SOLVERS]
     b = found["without", "batch"]
-    chained = run(recording, settings_from(known_bias(recording, before)), ("batch",))["batch"]
+    chained = run(recording, parse_settings(known_bias(recording, before)), ("batch",))["batch"]
     helped = walk_errors(recording, chained, truth_sigma).horizontal
     R = recording.imu.R_bs
     now = Before(recording.name[:-9], R.T @ chained.states.bg[-1], R.T @ chained.covariance[-1][12:15, 12:15] @ R)

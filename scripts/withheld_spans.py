@@ -17,7 +17,7 @@ import numpy as np
 
 import graphnav
 from graphnav.app.workflow import Request, run_request
-from graphnav.config import settings_from
+from graphnav.config import parse_settings
 from graphnav.core.earth import LocalFrame
 from graphnav.estimation.pipeline import SOLVERS
 
@@ -85,8 +85,8 @@ def main() -> None:
     starts = moving_spans(recording, options.spans, options.length, options.moving)
     print("| with | solver | end, m: median | worst | max, m: median | worst | drift, % of way | NEES |")
     print("| --- | --- | --- | --- | --- | --- | --- | --- |")
-    for name in options.sets.split(","):
-        settings = settings_from({**only(SETS[name]), **json.loads(options.settings)})
+    for name in options.group_arcs.split(","):
+        settings = parse_settings({**only(SETS[name]), **json.loads(options.settings)})
         table: dict[str, list[list[float]]] = {}
         for run in runs_of(starts, options.length):
             withheld = tuple(("gnss", (s, s + options.length)) for s in run)

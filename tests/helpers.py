@@ -22,7 +22,7 @@ from graphnav.app import cli
 from graphnav.core import rotation
 from graphnav.core.earth import LocalFrame
 from graphnav.core.errors import GraphnavError
-from graphnav.core.notes import key_of
+from graphnav.core.notes import get_key
 from graphnav.core.state import BLOCKS, DIM, States
 from graphnav.core.trajectory import Trajectory
 from graphnav.estimation.problem import Problem
@@ -87,8 +87,8 @@ def run_here(*words: str | Path) -> subprocess.CompletedProcess[str]:
 def assert_told(notes: Iterable[str], key: str, *names: str) -> None:
     """Some note has this key and names files, lines and values; its other words are free."""
     notes = list(notes)
-    found = [note for note in notes if key_of(note) == key and all(name in note for name in names)]
-    assert found, [(key_of(note), str(note)) for note in notes]
+    found = [note for note in notes if get_key(note) == key and all(name in note for name in names)]
+    assert found, [(get_key(note), str(note)) for note in notes]
 
 
 def difference(f: Callable[[Array], Array], steps: Array, width: int | None = None) -> Array:

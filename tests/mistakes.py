@@ -18,7 +18,7 @@ import numpy as np
 from helpers import full_disk
 
 from graphnav.app import cli
-from graphnav.core.notes import Note, key_of
+from graphnav.core.notes import Note, get_key
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -170,7 +170,7 @@ def said(mistake: Mistake, lines: list[str]) -> list[str]:
 def finding(mistake: Mistake, lines: list[str]) -> str:
     """Severity and key of what is said, as the page has it."""
     (line, *_) = said(mistake, lines) or lines or [""]
-    return f"{line.split(': ')[0]} `{key}`" if (key := key_of(line)) else _ERROR
+    return f"{line.split(': ')[0]} `{key}`" if (key := get_key(line)) else _ERROR
 
 
 def page(rows: dict[str, dict[str, list[str]]]) -> str:

@@ -12,10 +12,10 @@ from oracle_path import ExactPath
 
 from graphnav.core import earth
 from graphnav.core.rotation import Array
-from graphnav.gnss.atmosphere import NIGHT, directions, klobuchar
+from graphnav.gnss.atmosphere import NIGHT, compute_directions, klobuchar
 from graphnav.gnss.ephemeris import EARTH_RATE
 from graphnav.gnss.series import RawGnss
-from graphnav.gnss.signals import L1, C, satellite_id, signal_id
+from graphnav.gnss.signals import L1, C, number_satellite, number_signal
 from graphnav.recording import Recording
 
 RADIUS, MU = 2.656e7, 3.986004418e14
@@ -84,7 +84,7 @@ def with_observations(
         h = 0.02
         inside = np.clip(t, path.t[0] + h, path.t[-1] - h)
         rate = (observe(llh_of, inside + h, above, k)[0] - observe(llh_of, inside - h, above, k)[0]) / (2.0 * h)
-        azimuth, elevation = directions(antenna, p)
+        azimuth, elevation = compute_directions(antenna, p)
         delay = klobuchar(NIGHT, np.mod(t, 604800.0), llh, azimuth, elevation)
         n, noisy = len(t), noise * rng.standard_normal(len(t))
         bias = BIAS if name[0] == "E" else 0.0
@@ -95,8 +95,8 @@ def with_observations(
                 white = carrier * np.random.default_rng([seed, k]).standard_normal(n)
                 phase = (distance + clock + bias - slower + white) * frequency / C + 1000.0 * k
             own = {
-                "t": t, "carrier": phase, "satellite": np.full(n, satellite_id(name), dtype=np.int16),
-                "signal": np.full(n, signal_id(signal), dtype=np.int16), "frequency": np.full(n, frequency),
+                "t": t, "carrier": phase, "satellite": np.full(n, number_satellite(name), dtype=np.int16),
+                "signal": np.full(n, number_signal(signal), dtype=np.int16), "frequency": np.full(n, frequency),
                 "code": distance + clock + bias + slower + noisy, "p": p, "v": v,
                 "range_rate": rate + drift + 0.05 * noise * rng.standard_normal(n),
                 "high": elevation,

@@ -7,16 +7,16 @@ from pathlib import Path
 
 import numpy as np
 
-from graphnav.config import settings_from
+from graphnav.config import parse_settings
 from graphnav.core.rotation import Array
 from graphnav.core.trajectory import Trajectory
-from graphnav.online import Online, rows_of, without_rows
+from graphnav.online import Online, drop_rows, list_rows
 from graphnav.recording import Recording, Truth
 from graphnav.recording.formats import read
 from graphnav.sensors import Series
 
 # nothing but IMU, fixes and the sensor in question; figures as stated, which is what a test has time for
-SETTINGS = settings_from(
+SETTINGS = parse_settings(
     {"vehicle": {"nhc": False, "odometer": False}, "noise": {"mode": "stated"}, "gnss": {"faults": "off"}}
 )
 
@@ -66,8 +66,8 @@ def errors(track: Trajectory, recording: Recording) -> tuple[Array, Array]:
 
 def smoothed_online(recording: Recording) -> list[Trajectory]:
     """What a replay settles."""
-    online = Online(without_rows(recording), SETTINGS)
-    for row in rows_of(recording)[1]:
+    online = Online(drop_rows(recording), SETTINGS)
+    for row in list_rows(recording)[1]:
         online.add(row)
     online.finish()
     assert not online.failures, online.failures

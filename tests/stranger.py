@@ -17,8 +17,8 @@ from graphnav.core.timescales import unix_to_gps
 from graphnav.core.trajectory import Trajectory
 from graphnav.recording import Gnss, Recording, Truth
 from graphnav.recording.formats import read
-from graphnav.recording.formats.schema import rotation_from_letters
-from graphnav.sensors.barometer import standard_pressure
+from graphnav.recording.formats.schema import parse_axes_letters
+from graphnav.sensors.barometer import compute_standard_pressure
 
 UNIX = 1751990400.0  # s, 8 July 2025, 16:00 UTC, a second after the start of every cut
 G = 9.80665
@@ -105,7 +105,7 @@ def write_phone(folder: Path, drive: Cut, total: bool = True) -> Path:
     )
     slow = t[::100]
     wind = 0.2 * np.random.default_rng(6).normal(size=len(slow))  # m
-    pressure = standard_pressure(np.interp(slow, gnss.t, gnss.llh[:, 2]) + wind) / 100.0  # hPa
+    pressure = compute_standard_pressure(np.interp(slow, gnss.t, gnss.llh[:, 2]) + wind) / 100.0  # hPa
     _write(
         folder / "Barometer.csv",
         "time,seconds_elapsed,relativeAltitude,pressure",
@@ -136,7 +136,7 @@ def write_receiver(folder: Path, drive: Cut) -> Path:
     """A receiver's fixes as .ubx, and an IMU in deg/s, g and Unix ms, x forward, y left."""
     folder.mkdir(parents=True, exist_ok=True)
     imu, gnss = drive.recording.imu, drive.recording.gnss
-    R = rotation_from_letters("FLU").T
+    R = parse_axes_letters("FLU").T
     columns = [[round(1e3 * x) for x in drive.unix], *np.degrees(imu.gyro @ R.T).T, *(imu.accel @ R.T / G).T]
     _write(folder / "imu.csv", "timestamp,gyro_x,gyro_y,gyro_z,acc_x,acc_y,acc_z", columns)
     gps = float(unix_to_gps(np.array([UNIX]))[0])
@@ -193,8 +193,8 @@ def _messages(store, drive: Cut):
     rng, none = np.random.default_rng(7), np.full(9, 0.0)
     camera = np.repeat(imu.t[1:], 2) - np.tile([0.5 * np.median(np.diff(imu.t)), 0.0], len(imu.t) - 1)
     for name, R, t, noise in (
-        ("/imu/data", rotation_from_letters("FLU").T, imu.t, (0.0, 0.0)),
-        ("/camera/imu", rotation_from_letters("RDF").T, camera, (0.02, 0.3)),
+        ("/imu/data", parse_axes_letters("FLU").T, imu.t, (0.0, 0.0)),
+        ("/camera/imu", parse_axes_letters("RDF").T, camera, (0.02, 0.3)),
     ):
         near = np.searchsorted(imu.t, t - 1e-6)
         gyro = imu.gyro[near] @ R.T + noise[0] * rng.normal(size=(len(t), 3))

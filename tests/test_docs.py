@@ -28,7 +28,7 @@ from graphnav.config import Settings, read_settings
 from graphnav.constraints import list_constraints
 from graphnav.constraints.base import BuildContext, assemble
 from graphnav.core.earth import LocalFrame
-from graphnav.core.notes import key_of
+from graphnav.core.notes import get_key
 from graphnav.detectors import detect
 from graphnav.detectors import list_detectors as known_detectors
 from graphnav.detectors.scene import Scene
@@ -215,7 +215,7 @@ def test_own_constraints_and_detectors_are_used_together():
     solution = graphnav.run(recording, stated, ("ekf",), constraints=[constraint], detectors=[detector])["ekf"]
     assert solution.counts["not_steep"] == len(solution.t)
     assert "steady" in [found.name for found in solution.detections]
-    assert "constraint.differences" in map(key_of, solution.notes)
+    assert "constraint.differences" in map(get_key, solution.notes)
 
 
 def test_the_site_builds_and_every_link_in_it_leads_somewhere(tmp_path):

@@ -19,7 +19,7 @@ from helpers import full_disk, refuse_command, refused, run_here
 from graphnav import load, run
 from graphnav.app import cli
 from graphnav.app.terminal import StagePace
-from graphnav.config import PROFILES, Settings, read_settings, settings_from, settings_text
+from graphnav.config import PROFILES, Settings, format_settings, parse_settings, read_settings
 from graphnav.core import staging
 from graphnav.core.errors import ConfigError
 from graphnav.core.progress import listening, tell
@@ -129,7 +129,7 @@ def test_names_of_requirements_are_those_of_the_comparison(solved):
     out, _ = solved
     header = (out / "comparison.csv").read_text().splitlines()[0].split(",")
     columns = {re.sub(r"^span\d+_", "span_", name) for name in header} - {"solver"}
-    assert columns <= set(gates.names())
+    assert columns <= set(gates.list_names())
 
 
 @pytest.mark.parametrize(("sign", "met"), [("<", False), ("<=", True), (">", False), (">=", True)])
@@ -166,7 +166,7 @@ def test_a_profile_is_below_the_file_and_the_flag_above_its_profile(tmp_path):
 @pytest.mark.parametrize("profile", [None, *PROFILES])
 def test_settings_as_text_are_the_same_settings(profile):
     given = read_settings(None, profile)
-    assert settings_from(tomllib.loads(settings_text(given))) == given
+    assert parse_settings(tomllib.loads(format_settings(given))) == given
 
 
 def test_how_noise_is_found_can_be_said_in_a_word():

@@ -1,7 +1,7 @@
 import numpy as np
 
 import graphnav
-from graphnav.detectors.base import NONE, Detection, longer_than, spans_of
+from graphnav.detectors.base import NONE, Detection, drop_short, find_spans
 from graphnav.detectors.scene import Detector
 
 
@@ -19,7 +19,7 @@ class Steady(Detector):
         t = low.t[:whole].reshape(-1, n).mean(axis=1)
         statistic = np.linalg.norm(low.rows[:whole, :3], axis=1).reshape(-1, n).std(axis=1)
         mask = statistic < 0.02
-        return Detection(cls.name, t, statistic, 0.02, mask, longer_than(spans_of(mask, t, 0.5), 2.0))
+        return Detection(cls.name, t, statistic, 0.02, mask, drop_short(find_spans(mask, t, 0.5), 2.0))
 
 
 recording = graphnav.load("data/tokyo").crop(0.0, 60.0)

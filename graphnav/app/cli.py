@@ -47,13 +47,13 @@ from graphnav.app.talk import (
     INTERRUPTED,
     PIPE_CLOSED,
     Interrupted,
-    bar,
     fail,
     insist,
     say,
     show,
+    show_progress,
 )
-from graphnav.core.complaints import demand
+from graphnav.core.complaints import rephrase
 from graphnav.core.errors import GraphnavError
 from graphnav.core.files import permit_outside
 from graphnav.core.progress import tell
@@ -128,7 +128,7 @@ def info(
     from graphnav.recording.checks.overview import inspect
     from graphnav.recording.formats import read
 
-    with bar(quiet, "ekf" if antenna else "info"):
+    with show_progress(quiet, "ekf" if antenna else "info"):
         tell("reading")
         whole = read(pick_one(context, recording), topic or (), allow_outside, format)
         tell("checks")
@@ -163,15 +163,15 @@ def detect(
     """
     from graphnav.app import outputs, workflow
     from graphnav.config import read_settings
-    from graphnav.core.staging import final_path, stage_results
+    from graphnav.core.staging import resolve_final_path, stage_results
     from graphnav.detectors import detect as detected
     from graphnav.recording.plausibility.screening import screen_recording
     from graphnav.report import detections as detection_report
 
     withheld = collect_withheld(without, start, end)
     settings = choose_detectors(read_settings(config), detectors)
-    folder = outputs.output_folder(out)
-    with bar(quiet, "detect"), permit_outside(allow_outside):
+    folder = outputs.check_output_folder(out)
+    with show_progress(quiet, "detect"), permit_outside(allow_outside):
         tell("reading")
         used, notes = screen_recording(
             workflow.read_part(pick_one(context, recording), start, end, withheld, tuple(topic or ()), format)
@@ -182,10 +182,10 @@ def detect(
         tell("writing")
         with stage_results(folder) as part:
             files = detection_report.write(used, found, part)
-    files = final_path(files, part, folder)
+    files = resolve_final_path(files, part, folder)
     show(
-        lambda: detection_report.text(used, found, files),
-        lambda: {**detection_report.values(used, found), "files": files},
+        lambda: detection_report.format_found(used, found, files),
+        lambda: {**detection_report.list_values(used, found), "files": files},
         quiet,
         json,
     )
@@ -213,21 +213,21 @@ def evaluate(
     from graphnav.core.staging import stage_results
     from graphnav.evaluation import gates
     from graphnav.evaluation.evaluate import evaluate as compared
-    from graphnav.evaluation.metrics import comparison_rows, summary, text
+    from graphnav.evaluation.metrics import format_metrics, summarise, tabulate
 
     requirements = [gates.parse_requirement(one) for one in require or ()]
-    folder = None if out is None else outputs.output_folder(out)
-    with bar(quiet, "evaluate"), permit_outside(allow_outside):
+    folder = None if out is None else outputs.check_output_folder(out)
+    with show_progress(quiet, "evaluate"), permit_outside(allow_outside):
         tell("reading")
         metrics = compared(trajectory, truth)
-    values = {"trajectory": str(trajectory), "truth": str(truth), **summary(metrics)}
-    verdicts = gates.judge(requirements, comparison_rows({trajectory.stem: metrics}))
+    values = {"trajectory": str(trajectory), "truth": str(truth), **summarise(metrics)}
+    verdicts = gates.judge(requirements, tabulate({trajectory.stem: metrics}))
     if verdicts:
-        values["requirements"] = gates.values(verdicts)
+        values["requirements"] = gates.list_verdicts(verdicts)
     if folder is not None:
         with stage_results(folder) as part:
             outputs.write_evaluation(part, values, metrics)
-    show(lambda: text(metrics) + gates.text(verdicts), lambda: values, quiet, json)
+    show(lambda: format_metrics(metrics) + gates.format_verdicts(verdicts), lambda: values, quiet, json)
     insist(verdicts)
 
 
@@ -241,10 +241,10 @@ def settings(
 
     The defaults, or those of a profile, a file or an earlier run.
     """
-    from graphnav.config import read_settings, settings_text
+    from graphnav.config import format_settings, read_settings
 
     found = read_settings(config, profile)
-    show(lambda: settings_text(found), found.model_dump, False, json)
+    show(lambda: format_settings(found), found.model_dump, False, json)
 
 
 app.add_typer(cli_solve.commands)
@@ -279,7 +279,7 @@ def run(arguments: list[str]) -> int:
         return fail(str(error), INTERRUPTED, False)
     except (KeyboardInterrupt, typer.Abort) as error:
         if isinstance(error.__cause__, EOFError):  # which typer takes for an abort by the user
-            return fail(_internal(error.__cause__), INTERNAL, debug)
+            return fail(_describe_internal_error(error.__cause__), INTERNAL, debug)
         code = INTERRUPTED
     except MemoryError:
         return fail("out of memory; use a shorter part (--start, --end)", INTERNAL, debug)
@@ -288,14 +288,14 @@ def run(arguments: list[str]) -> int:
         return fail(f"{error.filename or 'input or output'}: {error.strerror or error}", BAD_INPUT, debug)
     except Exception as error:
         if hasattr(error, "format_message"):  # typer's own usage errors
-            return fail(_usage(error), BAD_INPUT, debug)
-        return fail(_internal(error), INTERNAL, debug)
+            return fail(_describe_usage_error(error), BAD_INPUT, debug)
+        return fail(_describe_internal_error(error), INTERNAL, debug)
     if code == INTERRUPTED:
         return fail("interrupted", INTERRUPTED, False)
     return code if isinstance(code, int) else 0
 
 
-def _usage(error: Any) -> str:
+def _describe_usage_error(error: Any) -> str:
     """A usage error, and the command whose help says more."""
     context = getattr(error, "ctx", None)
     path = getattr(context, "command_path", "graphnav")
@@ -303,10 +303,10 @@ def _usage(error: Any) -> str:
     unknown = str(getattr(error, "option_name", ""))
     if unknown.lstrip("-") in _SPAN and {"--start", "--end"} <= options:
         return f"No such option: {unknown}; --start and --end choose a part of the recording; see {path} --help"
-    return f"{demand(error.format_message().rstrip('.'))}; see {path} --help"
+    return f"{rephrase(error.format_message().rstrip('.'))}; see {path} --help"
 
 
-def _internal(error: Exception) -> str:
+def _describe_internal_error(error: Exception) -> str:
     """An internal error, with the last line of graphnav that led to it."""
     frames = traceback.extract_tb(error.__traceback__)
     package = Path(__file__).parents[1]

@@ -82,7 +82,7 @@ def fleet(
     from graphnav.app import convert, outputs
     from graphnav.app.fleet import manifest, page, tables, workers
     from graphnav.app.fleet.drive import DONE, Row
-    from graphnav.core.staging import final_path, stage_results
+    from graphnav.core.staging import resolve_final_path, stage_results
 
     convert.check_rate(rate)
     if withhold is not None and not withhold > 0.0:
@@ -99,7 +99,7 @@ def fleet(
     )
     known: dict[Any, Any] = {}
     manifest.resolve_options(asked, known)  # so that no line of a manifest is blamed for what the command line says
-    folder = outputs.output_folder(out, ("fleet.csv", "fleet.parquet", "fleet.html"), ("drives",)).resolve()
+    folder = outputs.check_output_folder(out, ("fleet.csv", "fleet.parquet", "fleet.html"), ("drives",)).resolve()
     with permit_outside(allow_outside):
         drives = manifest.read_drives(source.resolve(), asked)
     tasks = [
@@ -129,13 +129,13 @@ def fleet(
             files.append(part / "fleet.parquet")
         page.write_page(rows, part / "fleet.html", f"{source.name}: {format_count(len(rows), 'drive')}")
         files.insert(0, part / "fleet.html")
-    files = final_path(files, part, folder)
+    files = resolve_final_path(files, part, folder)
     lacking = "" if withhold is None else tables.describe_unscored(rows, withhold)
     lacking += "" if len(files) > 2 else "\nno fleet.parquet: pyarrow is not installed"
     show(
-        lambda: "\n".join([tables.text(rows) + lacking, "look at", *(f"  {file}" for file in files)]),
+        lambda: "\n".join([tables.format_totals(rows) + lacking, "look at", *(f"  {file}" for file in files)]),
         lambda: {
-            **tables.totals(rows),
+            **tables.compute_totals(rows),
             "rows": [{k: v for k, v in r.items() if k != "track"} for r in rows],
             "files": files,
         },

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from graphnav.app.cli_options import AllowOutside, Export, Format, Json, Point, Quiet, Topic
-from graphnav.app.talk import bar, say, show
+from graphnav.app.talk import say, show, show_progress
 from graphnav.core.errors import ConfigError
 from graphnav.core.files import permit_outside
 from graphnav.core.progress import tell
@@ -49,8 +49,8 @@ def convert(
 ) -> None:
     """Convert a log to a recording, or a trajectory to another format."""
     from graphnav.app import convert as conversion
-    from graphnav.app.outputs import output_folder
-    from graphnav.core.staging import final_path, stage_results
+    from graphnav.app.outputs import check_output_folder
+    from graphnav.core.staging import resolve_final_path, stage_results
 
     if export is not None and format is not None:
         raise ConfigError(
@@ -59,11 +59,11 @@ def convert(
     if export is not None or conversion.is_export(Path(source), out):
         conversion.check_rate(rate)
         alone = bool(out.suffix) and not out.is_dir()
-        folder = output_folder(out.parent if alone else out)
-        with bar(quiet, "convert"), stage_results(folder) as part:
+        folder = check_output_folder(out.parent if alone else out)
+        with show_progress(quiet, "convert"), stage_results(folder) as part:
             target = part / out.name if alone else part
             files, notes = conversion.export_file(source, target, export, point, rate, clock)
-        files = final_path(files, part, folder)
+        files = resolve_final_path(files, part, folder)
         show(
             lambda: "\n".join([*(f"note: {note}" for note in notes), *(f"wrote {file}" for file in files)]),
             lambda: {"notes": notes, "files": files},
@@ -74,8 +74,8 @@ def convert(
     for option, value in (("--point", point), ("--rate", rate), ("--clock", clock)):
         if value is not None:
             raise ConfigError(f"{option}: is for trajectories; a log keeps its own", key="option.not_here")
-    folder = output_folder(out)
-    with bar(quiet, "convert"), permit_outside(allow_outside):
+    folder = check_output_folder(out)
+    with show_progress(quiet, "convert"), permit_outside(allow_outside):
         tell("reading")
         log, files = conversion.convert_log(source, folder, format, topic or (), force)
     show(
@@ -106,16 +106,16 @@ def allan(
 
     They are printed as lines for recording.toml; a page shows the Allan deviations.
     """
-    from graphnav.app.outputs import output_folder
+    from graphnav.app.outputs import check_output_folder
     from graphnav.core.errors import RecordingError
-    from graphnav.core.staging import final_path, stage_results
+    from graphnav.core.staging import resolve_final_path, stage_results
     from graphnav.recording.allan import compute_allan
     from graphnav.recording.draft import read_imu_in_si
     from graphnav.recording.formats import load
     from graphnav.report import allan as pages
 
-    folder = output_folder(out)
-    with bar(quiet, "allan"), permit_outside(allow_outside):
+    folder = check_output_folder(out)
+    with show_progress(quiet, "allan"), permit_outside(allow_outside):
         tell("reading")
         if format is None and log.endswith((".csv", ".csv.gz")):
             t, gyro, accel = read_imu_in_si(Path(log))
@@ -139,7 +139,7 @@ def allan(
         tell("writing")
         with stage_results(folder) as part:
             written = pages.write(result, part)
-    written = final_path(written, part, folder)
+    written = resolve_final_path(written, part, folder)
     lines = [f"{result.duration:.0f} s at rest, {result.rate:.4g} Hz", "", "[imu.noise]", *result.lines(), ""]
     show(
         lambda: "\n".join([*lines, *(f"wrote {path}" for path in written)]),
@@ -173,7 +173,7 @@ def init(
 
     Columns, units, axes and clocks are told from the data; lines to look at are marked CHECK.
     """
-    from graphnav.app.outputs import output_folder
+    from graphnav.app.outputs import check_output_folder
     from graphnav.core.staging import stage_results
     from graphnav.recording.draft import draft
     from graphnav.recording.formats.writer import write_csv
@@ -183,9 +183,9 @@ def init(
         raise ConfigError(f"-o {out}: name a .toml file, or a folder for recording.toml", key="output.name")
     if out.exists() and not force:
         raise ConfigError(f"-o {out}: is there already; name another file, or say --force", key="output.exists")
-    folder = output_folder(out.parent)
+    folder = check_output_folder(out.parent)
     name = name or (out.stem if out.stem != "recording" else None)
-    with bar(quiet, "init"):
+    with show_progress(quiet, "init"):
         tell("reading")
         drafted = draft(logs, folder, name, topic or ())
         for made in drafted.made:
@@ -228,22 +228,22 @@ def simulate(
 ) -> None:
     """Simulate a drive or a walk: a recording with its truth."""
     from graphnav.app import outputs
-    from graphnav.core.staging import final_path, stage_results
-    from graphnav.simulation import catalogue, options_from
+    from graphnav.core.staging import resolve_final_path, stage_results
+    from graphnav.simulation import describe_scenarios, parse_options
     from graphnav.simulation import simulate as simulated
 
     if listing or scenario is None:
-        say(catalogue())
+        say(describe_scenarios())
         return
     if out is None:
         raise ConfigError("say where to write the recording: -o DIR", key="option.missing")
-    folder = outputs.output_folder(out)
-    options = options_from(scenario, option or [])
-    with bar(quiet, "simulate"):
+    folder = outputs.check_output_folder(out)
+    options = parse_options(scenario, option or [])
+    with show_progress(quiet, "simulate"):
         made = simulated(scenario, seed, **options)
         with stage_results(folder) as part:
             files = made.write(part)
-    files = final_path(files, part, folder)
+    files = resolve_final_path(files, part, folder)
     show(
         lambda: "\n".join([made.text(), *(f"  {file}" for file in files)]),
         lambda: {"scenario": scenario, "seed": seed, "options": options, "stops": made.stops, "files": files},

@@ -70,7 +70,7 @@ def online(
 
     A live source sends lines, as docs/online.md describes.
     """
-    from graphnav.app.outputs import output_folder
+    from graphnav.app.outputs import check_output_folder
     from graphnav.config import read_settings
     from graphnav.online.session import Session
     from graphnav.recording.formats import read
@@ -89,14 +89,14 @@ def online(
     settings = choose_detectors(_override(read_settings(config, profile), lag, engine), detectors)
     if resume and out is None:
         raise ConfigError("--resume: say which folder to go on in: -o OUT", key="option.missing")
-    folder = None if out is None else output_folder(out)
+    folder = None if out is None else check_output_folder(out)
     recording = None if live else read(source, topic or (), allow_outside, format)
     session = Session(settings, source, folder, resume, recording)
     shown = LiveView(session, quiet)
     with StopRequest() as asked:
         try:
             if live:
-                follow(session, standard_input() if source == "-" else connections(source), shown, asked)
+                follow(session, read_standard_input() if source == "-" else read_connections(source), shown, asked)
             else:
                 replay(session, Pace(speed), shown, asked)
             if not asked:
@@ -113,22 +113,22 @@ def online(
 
 def _override(settings: Settings, lag: float | None, engine: str | None) -> Settings:
     """The settings, overridden by the options given."""
-    from graphnav.config import settings_from
+    from graphnav.config import parse_settings
 
     if lag is not None and not lag >= 1.0:
         raise ConfigError(f"--lag {lag:g}: must be at least 1 s", key="option.value")
     if engine is not None and engine not in ("window", "isam2"):
         raise ConfigError(f"--engine {engine}: must be window or isam2", key="option.value")
     typed = {key: value for key, value in (("lag", lag), ("engine", engine)) if value is not None}
-    return settings_from(settings.model_dump() | {"solver": settings.solver.model_dump() | typed})
+    return parse_settings(settings.model_dump() | {"solver": settings.solver.model_dump() | typed})
 
 
 def _send(recording: Recording, speed: float) -> None:
     """Print a recording's lines, as its sensors would have sent them."""
-    from graphnav.online.lines import END, lines_of
+    from graphnav.online.lines import END, format_lines
 
     pace = Pace(speed)
-    for t, line in lines_of(recording):
+    for t, line in format_lines(recording):
         pace.wait(t)
         say(line, flush=speed > 0 or line == END)
 
@@ -184,7 +184,7 @@ def follow(session: Session, chunks: Iterator[bytes], shown: LiveView, asked: St
             return
 
 
-def standard_input() -> Iterator[bytes]:
+def read_standard_input() -> Iterator[bytes]:
     while True:
         if select.select([sys.stdin.fileno()], [], [], TICK)[0]:
             chunk = os.read(sys.stdin.fileno(), 1 << 16)
@@ -195,7 +195,7 @@ def standard_input() -> Iterator[bytes]:
             yield b""
 
 
-def connections(source: str) -> Iterator[bytes]:
+def read_connections(source: str) -> Iterator[bytes]:
     """The lines of clients, one client after the other; a client that disconnects may reconnect."""
     port = source.removeprefix("tcp:")
     if not (port.isascii() and port.isdigit() and len(port) < 6 and int(port) < 1 << 16):

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from graphnav.app.talk import importing
+from graphnav.app.talk import pause_collector
 from graphnav.core.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -166,7 +166,7 @@ def choose_solvers(context: typer.Context, names: str) -> tuple[str, ...]:
     """
     from graphnav.core.complaints import split_names
 
-    with importing():
+    with pause_collector():
         from graphnav.estimation import pipeline
 
     return split_names(names, pipeline.KNOWN, _read_option_name(context), "solver")

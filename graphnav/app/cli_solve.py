@@ -36,7 +36,7 @@ from graphnav.app.cli_options import (
     collect_withheld,
     pick_one,
 )
-from graphnav.app.talk import bar, importing, insist, show
+from graphnav.app.talk import insist, pause_collector, show, show_progress
 from graphnav.core.errors import ConfigError
 from graphnav.core.files import permit_outside
 from graphnav.core.progress import tell
@@ -174,18 +174,18 @@ def report(
     After an update of graphnav, or after --no-report.
     """
     from graphnav.app import outputs
-    from graphnav.core.staging import final_path, stage_results
+    from graphnav.core.staging import resolve_final_path, stage_results
 
     if not out.is_dir():
         what = "is a file" if out.exists() else "no such folder"
         raise ConfigError(f"{out}: {what}; name the folder that smooth or compare wrote", key="file.missing")
     if (out / "drives").is_dir():
         raise ConfigError(f"{out}: the results of a fleet; name a folder in {out / 'drives'}", key="results.none")
-    with bar(quiet, "detect"):
+    with show_progress(quiet, "detect"):
         tell("reading")
         with stage_results(out) as part:
             files = outputs.draw_again(out, part)
-    files = final_path(files, part, out)
+    files = resolve_final_path(files, part, out)
     show(lambda: "\n".join(["look at", *(f"  {file}" for file in files)]), lambda: {"files": files}, quiet, json)
 
 
@@ -229,13 +229,13 @@ def _solve(
     beside: _Beside | None = None,
     loose: bool = False,
 ) -> None:
-    with importing():
+    with pause_collector():
         import graphnav.estimation.pipeline  # noqa: F401
         from graphnav.app import convert, outputs, terminal, workflow
-        from graphnav.app.summary import comparison
+        from graphnav.app.summary import tabulate_comparison
         from graphnav.config import read_settings
         from graphnav.core.complaints import split_names
-        from graphnav.core.staging import final_path, stage_results
+        from graphnav.core.staging import resolve_final_path, stage_results
         from graphnav.evaluation import gates
         from graphnav.recording.exporters import NAMES
 
@@ -250,7 +250,7 @@ def _solve(
         "topic": asked.topic,
         "against": (beside and [str(file) for file in beside.files]) or None, "loose": loose or None,
     }  # fmt: skip
-    folder = outputs.output_folder(asked.out, outputs.FILES, () if alone else names)
+    folder = outputs.check_output_folder(asked.out, outputs.FILES, () if alone else names)
     if point is not None and export is None:
         raise ConfigError(f"--point {point}: is of the files of --export; name some", key="option.not_here")
     exported = split_names(export, NAMES, "--export", "format to write") if export is not None else ()
@@ -271,25 +271,25 @@ def _solve(
         topics=tuple(asked.topic or ()), format=asked.format, against=tuple(against),
         judge_arms=not alone, loose=loose,
     )  # fmt: skip
-    with bar(asked.quiet, *chosen) as progress:
+    with show_progress(asked.quiet, *chosen) as progress:
         outcome = workflow.run_request(request, progress)
         tell("writing")
         with stage_results(folder) as part:
             files = (outputs.write_run if alone else outputs.write_comparison)(outcome, part, asked.pages)
-        files = final_path(files, part, folder)
+        files = resolve_final_path(files, part, folder)
         if not asked.pages:
             outputs.remove_pages(folder, () if alone else names)
         if exported:  # in its own right, so that a failing file does not prevent the others
             with stage_results(folder) as part:
                 more = convert.export_run(outcome, part, exported, point, alone)
-            files += final_path(more, part, folder)
-    verdicts = gates.judge(requirements, comparison(outcome, ours=True)) if requirements else []
+            files += resolve_final_path(more, part, folder)
+    verdicts = gates.judge(requirements, tabulate_comparison(outcome, ours=True)) if requirements else []
 
     def values() -> dict[str, Any]:
         places = {name: folder if alone else folder / name for name in names}
         each = {name: loads((at / "summary.json").read_text(encoding="utf-8")) for name, at in places.items()}
         found = each[names[0]] if alone else {"recording": outcome.recording.name, "solvers": each}
-        return {**found, "requirements": gates.values(verdicts), "files": files}
+        return {**found, "requirements": gates.list_verdicts(verdicts), "files": files}
 
-    show(lambda: terminal.run_text(outcome, files) + gates.text(verdicts), values, asked.quiet, asked.json)
+    show(lambda: terminal.run_text(outcome, files) + gates.format_verdicts(verdicts), values, asked.quiet, asked.json)
     insist(verdicts)

@@ -16,13 +16,13 @@ from graphnav.core.files import parse_json, read_text
 from graphnav.core.interpolation import interpolate
 from graphnav.core.notes import Note, format_count
 from graphnav.core.rotation import Array
-from graphnav.core.staging import final_path, stage_results
+from graphnav.core.staging import resolve_final_path, stage_results
 from graphnav.core.timescales import gps_to_utc, parse_clock
 from graphnav.core.trajectory import Trajectory
-from graphnav.estimation.solution import Solution, to_trajectory
-from graphnav.evaluation.against import antenna_lever_arm, own_solutions
+from graphnav.estimation.solution import Solution, make_trajectory
+from graphnav.evaluation.against import find_antenna_lever_arm, select_own
 from graphnav.recording.exporters import NAMES, write_parts
-from graphnav.recording.formats import formats, load
+from graphnav.recording.formats import list_formats, load
 from graphnav.recording.formats.registry import Log
 from graphnav.recording.formats.trajectories import read_trajectory
 from graphnav.recording.formats.writer import write_recording
@@ -65,7 +65,7 @@ def convert_log(
     ConfigError
         If it would be written over itself, or without `force` over another recording.
     """
-    log = _with_measured_noise(load(source, name, topics))
+    log = _add_measured_noise(load(source, name, topics))
     if any(file.resolve().parent == out.resolve() and file.name.endswith((".toml", ".csv.gz")) for file in log.files):
         raise ConfigError(f"-o {out}: the recording is read from there; name another folder", key="output.is_input")
     with stage_results(out) as part:
@@ -73,10 +73,10 @@ def convert_log(
         described = out / "recording.toml"
         if not force and described.exists() and described.read_bytes() != (part / described.name).read_bytes():
             raise ConfigError(f"{described}: is another recording's; say --force to write over it", key="output.exists")
-    return log, final_path(files, part, out)
+    return log, resolve_final_path(files, part, out)
 
 
-def _with_measured_noise(log: Log) -> Log:
+def _add_measured_noise(log: Log) -> Log:
     """The log with the noise densities measured from its IMU, where it states none."""
     imu = log.imu
     if imu is None or not imu.noise_assumed:
@@ -140,7 +140,7 @@ def export_file(
     ConfigError
         For options that cannot be used.
     """
-    file = _trajectory_file(source)
+    file = _find_trajectory_file(source)
     trajectory = read_trajectory(file)
     if out.suffix[1:] in NAMES and not out.is_dir():
         if name is not None and name != out.suffix[1:]:
@@ -170,16 +170,16 @@ def export_file(
         notes.append("t is taken as Unix time: it is above 1e9")
     if gps_zero is None and {"gpx", "nav"} & set(targets):
         notes.append("what t counts from is not known: GPX is written without times, .nav with week 0; --clock says it")
-    parts = at_point(trajectory, None if isinstance(arm, str) else arm, rate)
+    parts = move_to_point(trajectory, None if isinstance(arm, str) else arm, rate)
     return _write(parts, targets, gps_zero, trajectory.name), notes
 
 
-def _trajectory_file(source: str) -> Path:
+def _find_trajectory_file(source: str) -> Path:
     """The trajectory file: the source itself, or the one in a run's folder."""
     path = Path(source)
     if (path / _TRAJECTORY).is_file():
         return path / _TRAJECTORY
-    if any(known.builtin and known.recognises(source) for known in formats().values()) or path.is_dir():
+    if any(known.builtin and known.recognises(source) for known in list_formats().values()) or path.is_dir():
         raise ConfigError(
             f"{source}: is no trajectory; name a file of one, or solve: graphnav smooth {source} --export ... -o OUT",
             key="trajectory.none",
@@ -187,7 +187,7 @@ def _trajectory_file(source: str) -> Path:
     return path
 
 
-def at_point(trajectory: Trajectory, arm: Array | None, rate: float | None = None) -> Iterator[Trajectory]:
+def move_to_point(trajectory: Trajectory, arm: Array | None, rate: float | None = None) -> Iterator[Trajectory]:
     """The trajectory of the point at the end of a lever arm, at its own times or at `rate` (Hz), in parts.
 
     Raises
@@ -246,23 +246,23 @@ def export_run(
     arm = parse_point(point)
     name = "trajectory" if point in (None, "imu") else "antenna" if point == "antenna" else "point"
     files: list[Path] = []
-    for solver, solution in own_solutions(outcome.solutions).items():
+    for solver, solution in select_own(outcome.solutions).items():
         lever_arm = arm
         if isinstance(arm, str) and arm == "antenna":
-            found = antenna_lever_arm(outcome.recording, solution)
+            found = find_antenna_lever_arm(outcome.recording, solution)
             if found is None:
                 raise ConfigError("--point antenna: the recording has no GNSS", key="option.point")
             lever_arm = found
         blocks = solution.blocks(rate)
         if not isinstance(lever_arm, str) and np.any(lever_arm):
-            blocks = _of_point(solution, rate, lever_arm)
+            blocks = _move_parts(solution, rate, lever_arm)
         title = f"{outcome.recording.name}, {solver}" + (f", {name}" if name != "trajectory" else "")
         place = folder if alone else folder / solver
         files += _write(blocks, {one: place / f"{name}.{one}" for one in names}, outcome.recording.gps_zero, title)
     return files
 
 
-def _of_point(solution: Solution, rate: float | None, arm: Array) -> Iterator[Trajectory]:
+def _move_parts(solution: Solution, rate: float | None, arm: Array) -> Iterator[Trajectory]:
     """The trajectory of the point at the end of a lever arm, in parts."""
     # between keyframes a second apart the turn rate, and with it the point's velocity, would be uncertain
     dense = max(rate or 0.0, _DENSE_RATE)
@@ -274,7 +274,7 @@ def _of_point(solution: Solution, rate: float | None, arm: Array) -> Iterator[Tr
             times[max(np.searchsorted(times, t[0]) - 3, 0) : np.searchsorted(times, t[-1], side="right") + 3]
             for times in there
         ]
-        rows = to_trajectory(solution.solver, solution.frame, *solution.at(np.concatenate(around)))
+        rows = make_trajectory(solution.solver, solution.frame, *solution.at(np.concatenate(around)))
         yield interpolate(rows, t, max_gap=_MAX_GAP, lever_arm=arm)[0]
 
 

@@ -13,17 +13,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from graphnav.app import stored
-from graphnav.app.scores import outages
+from graphnav.app.scores import find_outages
 from graphnav.app.stored import write_outcome
-from graphnav.app.summary import comparison, gather_provenance, noise_rows, solver_summary
+from graphnav.app.summary import gather_provenance, summarise_solver, tabulate_comparison, tabulate_noise
 from graphnav.app.workflow import Outcome
 from graphnav.core.errors import ConfigError, PartlyWrittenError
 from graphnav.core.files import exists
 from graphnav.core.jsonable import write_json
 from graphnav.core.timescales import gps_to_utc
 from graphnav.estimation.solution import ParameterEstimate
-from graphnav.estimation.stops import detections_text
-from graphnav.evaluation.against import own_solutions
+from graphnav.estimation.stops import format_detections
+from graphnav.evaluation.against import select_own
 
 if TYPE_CHECKING:
     from markupsafe import Markup
@@ -37,7 +37,7 @@ FILES = (
 )  # fmt: skip
 
 
-def output_folder(path: str | Path, files: Sequence[str] = (), folders: Sequence[str] = ()) -> Path:
+def check_output_folder(path: str | Path, files: Sequence[str] = (), folders: Sequence[str] = ()) -> Path:
     """`path`, checked to be a folder that can be created or written to; it is not created yet.
 
     Parameters
@@ -89,7 +89,7 @@ def write_run(outcome: Outcome, folder: Path, pages: bool = True) -> list[Path]:
 
     Without `pages` none is drawn; `draw_again` can do that later.
     """
-    (name,) = own_solutions(outcome.solutions)
+    (name,) = select_own(outcome.solutions)
     provenance = gather_provenance(outcome)
     failed = write_solver(outcome, name, folder, provenance, pages=pages)
     kept = replace(outcome, alone=True)
@@ -109,11 +109,11 @@ def write_comparison(outcome: Outcome, folder: Path, pages: bool = True) -> list
     if pages:
         from graphnav.report import documents as report
 
-        detectors = report.detector_pictures(outcome.recording, next(iter(outcome.solutions.values())))
+        detectors = report.draw_detectors(outcome.recording, next(iter(outcome.solutions.values())))
     failed: dict[Path, str] = {}
-    for name in own_solutions(outcome.solutions):
+    for name in select_own(outcome.solutions):
         failed |= write_solver(outcome, name, folder / name, provenance, detectors, pages)
-    write_comparison_csv(folder / "comparison.csv", comparison(outcome))
+    write_comparison_csv(folder / "comparison.csv", tabulate_comparison(outcome))
     if pages:
         failed |= _attempt(lambda path: _draw_comparison(outcome, path.parent, provenance), folder / "comparison.html")
     failed |= _attempt(lambda path: write_outcome(outcome, provenance, path), folder / stored.NAME)
@@ -148,9 +148,9 @@ def draw_again(folder: Path, part: Path) -> list[Path]:
 def _draw_pages(outcome: Outcome, provenance: Mapping[str, Any], part: Path, alone: bool) -> list[Path]:
     from graphnav.report import documents as report
 
-    detectors = report.detector_pictures(outcome.recording, next(iter(outcome.solutions.values())))
+    detectors = report.draw_detectors(outcome.recording, next(iter(outcome.solutions.values())))
     files = []
-    for name in own_solutions(outcome.solutions):
+    for name in select_own(outcome.solutions):
         place = part if alone else part / name
         place.mkdir(parents=True, exist_ok=True)
         _draw_solver(outcome, name, place, provenance, detectors)
@@ -162,7 +162,7 @@ def _draw_pages(outcome: Outcome, provenance: Mapping[str, Any], part: Path, alo
 
 
 def _draw_comparison(outcome: Outcome, folder: Path, provenance: Mapping[str, Any]) -> None:
-    from graphnav.evaluation.metrics import summary
+    from graphnav.evaluation.metrics import summarise
     from graphnav.report import documents as report
 
     report.write_comparison(
@@ -170,15 +170,15 @@ def _draw_comparison(outcome: Outcome, folder: Path, provenance: Mapping[str, An
         outcome.recording,
         outcome.solutions,
         settings=outcome.request.settings.model_dump(),
-        metrics={name: summary(m) for name, m in outcome.metrics.items()},
+        metrics={name: summarise(m) for name, m in outcome.metrics.items()},
         errors={name: m.errors for name, m in outcome.metrics.items() if m.errors is not None},
         withheld=outcome.used_withheld,
-        outages=outages(outcome.recording),
+        outages=find_outages(outcome.recording),
         findings=_list_findings(outcome),
         defects=outcome.defects,
         provenance=provenance,
-        noise=noise_rows(outcome, next(iter(outcome.solutions.values()))),
-        beside=[f"{name}/report.html" for name in own_solutions(outcome.solutions)],
+        noise=tabulate_noise(outcome, next(iter(outcome.solutions.values()))),
+        beside=[f"{name}/report.html" for name in select_own(outcome.solutions)],
     )
 
 
@@ -206,21 +206,21 @@ def write_solver(
     folder.mkdir(parents=True, exist_ok=True)
     utc = None if zero is None else lambda t: gps_to_utc(t + zero)
     write_parts(solution.blocks(outcome.request.rate), targets, title, utc)
-    write_json(folder / "calibration.json", {key: _calibration(p) for key, p in solution.parameters.items()})
-    text = detections_text(solution.detections, solution.records)
+    write_json(folder / "calibration.json", {key: _list_calibration(p) for key, p in solution.parameters.items()})
+    text = format_detections(solution.detections, solution.records)
     (folder / "detections.csv").write_text(text, encoding="utf-8")
     done = time.perf_counter()
     report = folder / "report.html"
     failed = _attempt(lambda _: _draw_solver(outcome, name, folder, provenance, detectors), report) if pages else {}
     seconds = {"writing": done - began, "report": time.perf_counter() - done}
-    write_json(folder / "summary.json", solver_summary(outcome, name, seconds, provenance))
+    write_json(folder / "summary.json", summarise_solver(outcome, name, seconds, provenance))
     return failed
 
 
 def _draw_solver(
     outcome: Outcome, name: str, folder: Path, provenance: Mapping[str, Any], detectors: Sequence[Markup] | None
 ) -> None:
-    from graphnav.evaluation.metrics import summary
+    from graphnav.evaluation.metrics import summarise
     from graphnav.report import documents as report
     from graphnav.report.doubts import find_departures
 
@@ -230,17 +230,17 @@ def _draw_solver(
         folder / "report.html",
         outcome.recording,
         solution,
-        settings=outcome.request.settings_of(name).model_dump(),
-        metrics=None if metrics is None else summary(metrics),
+        settings=outcome.request.select_settings(name).model_dump(),
+        metrics=None if metrics is None else summarise(metrics),
         errors=None if metrics is None else metrics.errors,
         withheld=outcome.used_withheld,
-        outages=outages(outcome.recording),
+        outages=find_outages(outcome.recording),
         findings=_list_findings(outcome),
         defects=outcome.defects,
         contradicted=contradicted,
         provenance=provenance,
         detectors=detectors,
-        noise=noise_rows(outcome, solution),
+        noise=tabulate_noise(outcome, solution),
         beside=("trajectory.kml", "trajectory.gpx", "trajectory.csv"),
     )
 
@@ -264,7 +264,7 @@ def _insist(failed: Mapping[Path, str]) -> None:
 
 def write_evaluation(folder: Path, values: Mapping[str, Any], metrics: Metrics) -> None:
     """evaluation.json, and errors.csv with a row per compared epoch where there are any."""
-    from graphnav.recording.exporters.digits import rows_text
+    from graphnav.recording.exporters.digits import format_rows
 
     folder.mkdir(parents=True, exist_ok=True)
     write_json(folder / "evaluation.json", values)
@@ -273,11 +273,11 @@ def write_evaluation(folder: Path, values: Mapping[str, Any], metrics: Metrics) 
         return
     columns = [e.t[:, None], e.p, e.track, e.v, np.degrees(e.rph), e.sd_p]
     head = "t,east,north,up,along,across,ve,vn,vu,roll,pitch,heading,sd_e,sd_n,sd_u\n"
-    body = rows_text(np.concatenate(columns, axis=1), "%.6f" + 14 * ",%.6g")
+    body = format_rows(np.concatenate(columns, axis=1), "%.6f" + 14 * ",%.6g")
     (folder / "errors.csv").write_text(head + body, encoding="utf-8")
 
 
-def _calibration(p: ParameterEstimate) -> dict[str, Any]:
+def _list_calibration(p: ParameterEstimate) -> dict[str, Any]:
     """A constant as its value, a time-varying parameter as its nodes."""
     nodes = slice(None) if len(p.t) > 1 else 0
     return {

@@ -12,8 +12,8 @@ from graphnav.constraints.gnss import LEVER_ARM, TIME_OFFSET
 from graphnav.core import rotation
 from graphnav.core.rotation import Array
 from graphnav.core.trajectory import Trajectory
-from graphnav.estimation.solution import Solution, to_trajectory
-from graphnav.evaluation.against import Foreign, own_solutions, without_attitude
+from graphnav.estimation.solution import Solution, make_trajectory
+from graphnav.evaluation.against import Foreign, drop_attitude, select_own
 from graphnav.evaluation.scoring import MAX_GAP, measure_spacing
 from graphnav.recording import Recording
 
@@ -32,7 +32,7 @@ _SAME, _BETWEEN_ROWS = 1e-4, 0.02
 OUTAGE = 10.0  # s; a longer interval between fixes is scored as an outage
 
 
-def outages(recording: Recording) -> list[Span]:
+def find_outages(recording: Recording) -> list[Span]:
     """Spans of more than `OUTAGE` s without a fix, s from the start; both ends of the recording count too.
 
     Each lasts from the last fix to one period before the next: there is still no fix at its end.
@@ -52,19 +52,19 @@ def score(
     """Metrics per solver against the best available truth, a description of it, and what is missing in each of their
     spans.
     """
-    from graphnav.evaluation.evaluate import evaluate_recording, truth_of, withheld_truth
+    from graphnav.evaluation.evaluate import evaluate_recording, find_truth, make_withheld_truth
 
     spans = [(f"without {source}", span) for source, span in withheld if span is not None]
     truth = recording.truth
     gnss_withheld = any(source == "gnss" for source, _ in withheld)
     if truth is not None and truth.closed_loop_sigma is not None:
-        if any("closed_loop" in solution.records for solution in own_solutions(solutions).values()):
+        if any("closed_loop" in solution.records for solution in select_own(solutions).values()):
             return {}, None, ()  # data that was used is no truth
         against, spans = "the start, where the loop ends", []
     elif truth is not None:
         against = "the recording's truth"
         taken = [span for _, span in spans]
-        spans += [("no GNSS", s) for s in outages(recording) if not any(a < s[1] and b > s[0] for a, b in taken)]
+        spans += [("no GNSS", s) for s in find_outages(recording) if not any(a < s[1] and b > s[0] for a, b in taken)]
     elif gnss_withheld and recording.gnss is not None:
         against = "the withheld GNSS fixes"
         spans = [(name, span) for name, span in spans if name == "without gnss"]
@@ -74,12 +74,12 @@ def score(
     asked: list[Withheld] = [("gnss", span) for _, span in spans]
     if truth is None and any(source == "gnss" and span is None for source, span in withheld):
         asked.append(("gnss", None))
-    with_truth = truth_of(recording)
+    with_truth = find_truth(recording)
     found = {}
     for name, solution in solutions.items():
         antenna, compared = _read_antenna(solution), with_truth
         if truth is None:
-            compared = withheld_truth(recording, "gnss", [span for _, span in asked], antenna)
+            compared = make_withheld_truth(recording, "gnss", [span for _, span in asked], antenna)
         reference, swings = np.empty(0), False
         if compared is not None:
             reference, arm = compared[0].t, compared[1]
@@ -92,7 +92,7 @@ def score(
         if metrics is None:
             return {}, None, ()
         borrowed = isinstance(solution, Foreign) and solution.borrowed
-        found[name] = without_attitude(metrics) if borrowed else metrics
+        found[name] = drop_attitude(metrics) if borrowed else metrics
     return found, against, tuple(name for name, _ in spans)
 
 
@@ -140,7 +140,7 @@ def _score_at(solution: Solution, t: Array, placed: bool) -> Trajectory:
     times, states, covariance = solution.t, solution.states, solution.covariance
     if not np.isin(t, times).all():
         times, states, covariance = solution.at(np.union1d(times[[0, -1]], t))
-    track = to_trajectory(solution.solver, solution.frame, times, states, covariance)
+    track = make_trajectory(solution.solver, solution.frame, times, states, covariance)
     if placed:
         return track
     return replace(track, llh=states.p, v=states.v, rph=rotation.to_rph(states.R_nb), frame="local")

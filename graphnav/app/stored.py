@@ -25,10 +25,10 @@ from graphnav.core.files import check_regular, check_size, exists, parse_json
 from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.core.state import States, split_covariance
-from graphnav.estimation.dense import times_between
+from graphnav.estimation.dense import list_times
 from graphnav.estimation.solution import Solution
 from graphnav.recording import Recording, take_rows
-from graphnav.report.plots.detections import drawn_rows
+from graphnav.report.plots.detections import select_drawn_rows
 from graphnav.report.plots.thinning import BINS
 from graphnav.sensors import Series, list_sensors
 
@@ -58,7 +58,7 @@ class Straight:
 
     def times(self, rate: float) -> Array:
         """The times of output, as of the stored solution."""
-        return times_between(self.start, self.end, rate)
+        return list_times(self.start, self.end, rate)
 
     def apart(self, t: Array) -> tuple[States, dict[str, Array]]:
         """States, with covariances (6, M) of position, velocity and attitude each by itself."""
@@ -128,7 +128,7 @@ def _thin_recording(recording: Recording) -> Recording:
     imu = recording.imu
     shown = np.zeros(len(imu.t), dtype=bool)
     shown[: 4 * BINS + 1] = True  # enough to determine the period, and more than is drawn without thinning
-    shown[drawn_rows(imu)] = True
+    shown[select_drawn_rows(imu)] = True
     return replace(recording, imu=take_rows(imu, shown), raw_gnss=None)
 
 

@@ -12,27 +12,27 @@ import numpy as np
 
 import graphnav
 from graphnav.app.workflow import Outcome
-from graphnav.core.files import sha256
+from graphnav.core.files import hash_file
 from graphnav.core.findings import Finding
-from graphnav.core.memory import peak_memory_mb
-from graphnav.core.notes import key_of
+from graphnav.core.memory import read_peak_memory_mb
+from graphnav.core.notes import get_key
 from graphnav.estimation.solution import Solution
-from graphnav.estimation.stops import stops_of_solution
-from graphnav.evaluation.against import antenna_lever_arm, own_solutions
+from graphnav.estimation.stops import list_solution_stops
+from graphnav.evaluation.against import find_antenna_lever_arm, select_own
 
 if TYPE_CHECKING:
     from graphnav.estimation.noise.table import FigureRow
 
 
-def solver_summary(
+def summarise_solver(
     outcome: Outcome, name: str, seconds: Mapping[str, float], provenance: Mapping[str, Any]
 ) -> dict[str, Any]:
     """The content of summary.json; `seconds` are those of writing, by file."""
-    from graphnav.evaluation.metrics import summary
+    from graphnav.evaluation.metrics import summarise
     from graphnav.report.doubts import find_departures, list_doubts
 
     solution, metrics = outcome.solutions[name], outcome.metrics.get(name)
-    errors = None if metrics is None else summary(metrics)
+    errors = None if metrics is None else summarise(metrics)
     spans = [] if errors is None else errors.pop("spans", [])
     notes = list(solution.notes) if errors is None else [*solution.notes, *errors.pop("notes", [])]
     nees = None
@@ -43,8 +43,8 @@ def solver_summary(
     contradicted = find_departures(outcome.solutions).get(name)  # which no solution tells by itself
     doubts = doubts if contradicted is None else (contradicted, *doubts)
     timings = {**solution.timings, "evaluation": outcome.timings["evaluation"], **seconds}
-    unreliable = [Finding("unreliable", doubt, key_of(doubt)) for doubt in doubts]
-    messages = dict.fromkeys([*unreliable, *outcome.checks, *(Finding("note", note, key_of(note)) for note in notes)])
+    unreliable = [Finding("unreliable", doubt, get_key(doubt)) for doubt in doubts]
+    messages = dict.fromkeys([*unreliable, *outcome.checks, *(Finding("note", note, get_key(note)) for note in notes)])
     rejected = {key: int(np.sum(r.weight <= 1e-9)) for key, r in solution.records.items()}
     return {
         "solver": name,
@@ -56,17 +56,17 @@ def solver_summary(
         "stationary": {
             "stops": len(solution.stationary),
             "seconds": float(np.diff(solution.stationary).sum()),
-            "each": [stop.values() for stop in stops_of_solution(solution)],
+            "each": [stop.values() for stop in list_solution_stops(solution)],
         },
-        "ambiguities": _ambiguities(solution),
+        "ambiguities": _count_ambiguities(solution),
         "iterations": solution.iterations,
         "passes": {"filter": 0, "smoother": 0, **solution.passes, "eliminations": solution.iterations},
-        "noise": noise_summary(outcome, solution),
+        "noise": summarise_noise(outcome, solution),
         "doubts": list(doubts),
         "stopped": solution.stopped,
         "final_cost": solution.cost,
         "timings": {stage: round(seconds, 4) for stage, seconds in timings.items()},
-        "peak_memory_mb": peak_memory_mb(),
+        "peak_memory_mb": read_peak_memory_mb(),
         "against": outcome.against,
         "errors": errors,
         "spans": [
@@ -77,18 +77,18 @@ def solver_summary(
         "parameters": {
             key: {"value": p.value[-1], "sigma": p.sigma[-1], "unit": p.unit} for key, p in solution.parameters.items()
         },
-        "antenna_lever_arm": antenna_lever_arm(outcome.recording, solution),
+        "antenna_lever_arm": find_antenna_lever_arm(outcome.recording, solution),
         "gps_zero": outcome.recording.gps_zero,
         "notes": list(dict.fromkeys(notes)),
         "remarks": list(outcome.findings),
         "checks": [f.values() for f in outcome.checks],
         "messages": [f.values() for f in messages],
-        "settings": outcome.request.settings_of(solution.solver).model_dump(),
+        "settings": outcome.request.select_settings(solution.solver).model_dump(),
         "provenance": provenance,
     }
 
 
-def _ambiguities(solution: Solution) -> dict[str, Any] | None:
+def _count_ambiguities(solution: Solution) -> dict[str, Any] | None:
     """Number of epochs with carriers against a base station that have integer and real-valued ambiguities."""
     epochs = len(solution.fixed)
     if not epochs:
@@ -98,41 +98,41 @@ def _ambiguities(solution: Solution) -> dict[str, Any] | None:
     return {"epochs": epochs, "fixed": int(fixed.sum()), "float": int((~fixed).sum()), "first_fix_s": first}
 
 
-def noise_rows(outcome: Outcome, solution: Solution) -> tuple[FigureRow, ...]:
+def tabulate_noise(outcome: Outcome, solution: Solution) -> tuple[FigureRow, ...]:
     """The figures of a solution's noise model beside the stated ones."""
-    from graphnav.estimation.noise.table import figure_rows
+    from graphnav.estimation.noise.table import tabulate_figures
 
     recording, settings = outcome.recording, outcome.request.settings
     for source, span in outcome.used_withheld:
         if source in recording.aiding:
             recording = recording.without(source, span)
-    return figure_rows(solution.noise, recording, settings.gnss.slow_times, outcome.densities)
+    return tabulate_figures(solution.noise, recording, settings.gnss.slow_times, outcome.densities)
 
 
-def noise_summary(outcome: Outcome, solution: Solution) -> dict[str, Any]:
+def summarise_noise(outcome: Outcome, solution: Solution) -> dict[str, Any]:
     """The noise model in the form that `graphnav.estimation.noise.files.read_noise` reads, with stated and used
     figures.
     """
-    from graphnav.estimation.noise.files import noise_values
+    from graphnav.estimation.noise.files import list_noise
 
-    values = noise_values(solution.noise, outcome.request.settings.noise.mode)
+    values = list_noise(solution.noise, outcome.request.settings.noise.mode)
     if len(solution.between) > 1:
         values["pieces"] = len(solution.between)
-    for row in noise_rows(outcome, solution):
+    for row in tabulate_noise(outcome, solution):
         beside = {"stated": row.stated, "used": row.used, "unit": row.unit, "correlation_time": row.correlation_time}
         values["figures"][row.group] |= beside
     return values
 
 
-def comparison(outcome: Outcome, ours: bool = False) -> list[dict[str, Any]]:
+def tabulate_comparison(outcome: Outcome, ours: bool = False) -> list[dict[str, Any]]:
     """One flat row per solver: errors where there is a truth, stated sigmas, seconds and iterations."""
-    from graphnav.evaluation.metrics import comparison_rows
+    from graphnav.evaluation.metrics import tabulate
 
-    measured = {row["solver"]: row for row in comparison_rows(outcome.metrics)}
+    measured = {row["solver"]: row for row in tabulate(outcome.metrics)}
     rows = []
-    for name, solution in (own_solutions(outcome.solutions) if ours else outcome.solutions).items():
+    for name, solution in (select_own(outcome.solutions) if ours else outcome.solutions).items():
         row = measured.get(name, {"solver": name})
-        row |= {key: _round(value) for key, value in median_sigmas(solution).items()}
+        row |= {key: _round(value) for key, value in compute_median_sigmas(solution).items()}
         row |= {"keyframes": len(solution.t), "iterations": solution.iterations, "final_cost": _round(solution.cost)}
         row["run_time_s"] = _round(sum(solution.timings.values()))
         for key in [k for k in row if k.startswith("span") and k.endswith(("_start_s", "_end_s"))]:
@@ -141,7 +141,7 @@ def comparison(outcome: Outcome, ours: bool = False) -> list[dict[str, Any]]:
     return rows
 
 
-def median_sigmas(solution: Solution) -> dict[str, float]:
+def compute_median_sigmas(solution: Solution) -> dict[str, float]:
     """Medians of a solution's stated sigmas: horizontal and up (m), heading (deg)."""
     track = solution.trajectory(joint=False)
     out = {}
@@ -167,7 +167,7 @@ def gather_provenance(outcome: Outcome) -> dict[str, Any]:
         "scipy": version("scipy"),
         "python": platform.python_version(),
         "noise": used,
-        "inputs": {str(path): sha256(path) for path in files},
+        "inputs": {str(path): hash_file(path) for path in files},
         "options": dict(outcome.request.options),
     }
 

@@ -37,24 +37,24 @@ def insist(verdicts: Sequence[Verdict]) -> None:
 def show(text: Callable[[], str], values: Callable[[], Any], quiet: bool, json: bool) -> None:
     """Print the result of a command: for people, for programs, or not at all."""
     if json:
-        from graphnav.core.jsonable import json_text
+        from graphnav.core.jsonable import format_json
 
-        say(json_text(values()))
+        say(format_json(values()))
     elif not quiet:
         say(text().rstrip("\n"))
 
 
 @contextmanager
-def bar(quiet: bool, *work: str) -> Iterator[Progress | None]:
+def show_progress(quiet: bool, *work: str) -> Iterator[Progress | None]:
     """Progress on a terminal within this context."""
-    from graphnav.app.terminal import progress_bar
+    from graphnav.app.terminal import show_progress_bar
 
-    with progress_bar(quiet, work) as progress, listening(progress):
+    with show_progress_bar(quiet, work) as progress, listening(progress):
         yield progress
 
 
 @contextmanager
-def importing() -> Iterator[None]:
+def pause_collector() -> Iterator[None]:
     """Without a search for garbage in this context, nor later in what is there then: modules stay, and looking through
     them again and again takes a fifth of the time of importing them.
     """

@@ -11,10 +11,10 @@ from pathlib import Path
 
 import numpy as np
 
-from graphnav.app.summary import median_sigmas
+from graphnav.app.summary import compute_median_sigmas
 from graphnav.app.workflow import Outcome
 from graphnav.constraints.gnss import TIMES
-from graphnav.core.notes import format_count, key_of
+from graphnav.core.notes import format_count, get_key
 from graphnav.core.progress import Progress
 from graphnav.core.staging import defer_interrupts
 from graphnav.estimation.noise.model import TABULATED
@@ -46,7 +46,7 @@ def run_text(outcome: Outcome, files: Sequence[Path]) -> str:
     lines += [f"  {line}" for line in _describe_noise(outcome)]
     severity = {f.sentence: f.severity for f in outcome.checks}
     for note in dict.fromkeys([*outcome.findings, *notes]):
-        if key_of(note) in TABULATED or note in outcome.defects:
+        if get_key(note) in TABULATED or note in outcome.defects:
             continue  # what makes a result unreliable is said first
         lines.append(f"  {severity.get(note, 'note')}: {note}")
     lines.append("")
@@ -64,19 +64,19 @@ def _list_doubts(outcome: Outcome) -> tuple[str, ...]:
 
 def _describe_noise(outcome: Outcome) -> list[str]:
     """The noise model in one line: figures that differ from the stated ones."""
-    from graphnav.estimation.noise.table import whole_ratio
+    from graphnav.estimation.noise.table import compute_whole_ratio
 
     noise = next(iter(outcome.solutions.values())).noise
     if not noise.figures:
         return ["noise as stated"]
-    parts = [f"{words} x {short(float(np.exp(0.5 * noise.figures[group].log_factor)))}" for group, words in _IMU.items()
+    parts = [f"{words} x {format_short(float(np.exp(0.5 * noise.figures[group].log_factor)))}" for group, words in _IMU.items()
              if group in noise.figures]  # fmt: skip
     for source in dict.fromkeys(group.rpartition(".")[0] for group in noise.figures if group.startswith("gnss_")):
         if source.rpartition(".")[2] in TIMES:
             continue
         name, _, kind = source.partition(".")
-        ratios = [(axis, whole_ratio(noise, source, axis)) for axis in ("horizontal", "up")]
-        factors = " and ".join(f"x {short(ratio)} {axis}" for axis, ratio in ratios if ratio is not None)
+        ratios = [(axis, compute_whole_ratio(noise, source, axis)) for axis in ("horizontal", "up")]
+        factors = " and ".join(f"x {format_short(ratio)} {axis}" for axis, ratio in ratios if ratio is not None)
         if factors:  # no common figure where each type has its own
             parts.append(f"{_FIXES.get(name, name)}{f' ({kind})' if kind else ''} {factors}")
     given = outcome.request.noise
@@ -111,30 +111,40 @@ def _tabulate_errors(outcome: Outcome) -> list[str]:
     if not outcome.metrics:
         head = ["solver", "keyframes", "sd hor. (m)", "sd up (m)", "sd head. (deg)", "seconds"]
         rows = [
-            [name, str(len(s.t)), *(short(x) for x in _list_sigmas(s)), _format_seconds(s)]
+            [name, str(len(s.t)), *(format_short(x) for x in _list_sigmas(s)), _format_seconds(s)]
             for name, s in outcome.solutions.items()
         ]
-        return ["no truth to compare with; medians of the sigmas stated:", *table(head, rows)]
+        return ["no truth to compare with; medians of the sigmas stated:", *format_table(head, rows)]
     if all(m.closure is not None for m in outcome.metrics.values()):
         rows = [
-            [name, short(m.closure.horizontal), short(m.closure.vertical), short(m.closure.percent)]
+            [
+                name,
+                format_short(m.closure.horizontal),
+                format_short(m.closure.vertical),
+                format_short(m.closure.percent),
+            ]
             for name, m in outcome.metrics.items()
             if m.closure is not None
         ]
-        return [f"errors against {outcome.against}:", *table(["solver", "hor. (m)", "up (m)", "% of path"], rows)]
+        return [
+            f"errors against {outcome.against}:",
+            *format_table(["solver", "hor. (m)", "up (m)", "% of path"], rows),
+        ]
     shown = [one for one in _ERRORS if any(one[1] in m.components for m in outcome.metrics.values())]
     head = ["solver", *(f"{title} ({unit})" for title, _, _, unit in shown), "NEES pos.", "seconds"]
     rows = []
     for name, m in outcome.metrics.items():
-        row = [short(getattr(m.components[key], what)) if key in m.components else "-" for _, key, what, _ in shown]
-        nees = short(m.nees["p"].mean) if "p" in m.nees else "-"
+        row = [
+            format_short(getattr(m.components[key], what)) if key in m.components else "-" for _, key, what, _ in shown
+        ]
+        nees = format_short(m.nees["p"].mean) if "p" in m.nees else "-"
         rows.append([name, *row, nees, _format_seconds(outcome.solutions[name])])
-    return [f"errors against {outcome.against}:", *table(head, rows)]
+    return [f"errors against {outcome.against}:", *format_table(head, rows)]
 
 
 def _list_sigmas(solution: Solution) -> list[float]:
-    """The sigmas of `summary.median_sigmas`, NaN where there are none."""
-    found = median_sigmas(solution)
+    """The sigmas of `summary.compute_median_sigmas`, NaN where there are none."""
+    found = compute_median_sigmas(solution)
     return [found.get(key, float("nan")) for key in ("sd_h_median_m", "sd_u_median_m", "sd_heading_median_deg")]
 
 
@@ -153,10 +163,10 @@ def _tabulate_spans(outcome: Outcome) -> list[str]:
             lines.append("  nothing to compare with in it")
             continue
         head = ["solver", "hor. end (m)", "hor. max (m)", "up max (m)", "% of path", "NEES pos."]
-        lines += table(
+        lines += format_table(
             head,
             [
-                [name, *(short(x) for x in (s.end_h, s.max_h, s.max_up)), _share(s), short(s.nees)]
+                [name, *(format_short(x) for x in (s.end_h, s.max_h, s.max_up)), _share(s), format_short(s.nees)]
                 for name, s in every.items()
             ],
         )
@@ -165,10 +175,10 @@ def _tabulate_spans(outcome: Outcome) -> list[str]:
 
 def _share(span: SpanErrors) -> str:
     """Drift as a share of the distance travelled; undefined for a stationary vehicle."""
-    return short(span.drift_percent) if span.distance >= 1.0 else "-"
+    return format_short(span.drift_percent) if span.distance >= 1.0 else "-"
 
 
-def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+def format_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
     """Lines of a table, the first column left-aligned and numbers right-aligned; not wrapped."""
     from rich.console import Console
     from rich.table import Table
@@ -184,7 +194,7 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
     return [f"  {line.rstrip()}" for line in console.file.getvalue().splitlines()]  # type: ignore[attr-defined]
 
 
-def short(x: float) -> str:
+def format_short(x: float) -> str:
     """Three significant digits, '-' for no number."""
     if not np.isfinite(x):
         return "-"
@@ -230,7 +240,7 @@ class StagePace:
 
 
 @contextmanager
-def progress_bar(quiet: bool, work: Sequence[str]) -> Iterator[Progress | None]:
+def show_progress_bar(quiet: bool, work: Sequence[str]) -> Iterator[Progress | None]:
     """A progress bar with stage and time left, on stderr if that is a terminal, for work of more than half a second."""
     if quiet or not sys.stderr.isatty():
         yield None

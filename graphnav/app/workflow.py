@@ -21,12 +21,12 @@ from graphnav.constraints.base import SAME_TIME
 from graphnav.core.complaints import suggest_nearest
 from graphnav.core.errors import ConfigError, EstimationError, RecordingError
 from graphnav.core.findings import Finding
-from graphnav.core.notes import Note, format_count, key_of
+from graphnav.core.notes import Note, format_count, get_key
 from graphnav.core.progress import Progress, listening, tell
 from graphnav.estimation.noise.model import INTERVALS, NoiseModel, StampOffsets
 from graphnav.estimation.solution import Solution
-from graphnav.evaluation.against import Against, own_solutions, read_against
-from graphnav.recording import ImuNoise, Recording, sources
+from graphnav.evaluation.against import Against, read_against, select_own
+from graphnav.recording import ImuNoise, Recording, list_sources
 from graphnav.recording.exporters import check_names
 
 if TYPE_CHECKING:
@@ -65,7 +65,7 @@ class Request:
     judge_arms: bool = False  # check the signs of lever arms even if nothing is in doubt
     loose: bool = False  # also solve with fixes in place of raw observations
 
-    def settings_of(self, name: str) -> Settings:
+    def select_settings(self, name: str) -> Settings:
         """The settings of the solution of that name."""
         return couple_loosely(self.settings) if name.endswith(LOOSE) else self.settings
 
@@ -123,16 +123,16 @@ def parse_withheld(text: str) -> Withheld:
     """
     found = re.fullmatch(r"([^:]*)(?::([^-]+)-([^-]+))?", text.strip())
     if re.fullmatch(r"[\d.]+-[\d.]+", text.strip()):
-        first, *others = sources()
+        first, *others = list_sources()
         words = f"{first}:{text.strip()}, or the same of {' or '.join(others)}"
         raise ConfigError(f"--without {text}: say of which sensor: {words}", key="option.withheld")
     usage = "write SOURCE or SOURCE:FROM-TO in seconds from the start, such as gnss:600-660"
     if found is None:
         raise ConfigError(f"--without {text}: not a source and a span; {usage}", key="option.withheld")
     source, first, last = found.groups()
-    if source not in sources():
+    if source not in list_sources():
         raise ConfigError(
-            f"--without {text}: no source '{source}' can be withheld; {suggest_nearest(source, sources())}",
+            f"--without {text}: no source '{source}' can be withheld; {suggest_nearest(source, list_sources())}",
             key="option.withheld",
         )
     if first is None:
@@ -243,7 +243,7 @@ def _run(request: Request, progress: Progress | None) -> Outcome:
     for name, found in metrics.items():
         for note in found.notes:
             shared = all(note in other.notes for other in metrics.values())
-            findings.append(note if shared else Note(key_of(note), f"{name}: {note}"))
+            findings.append(note if shared else Note(get_key(note), f"{name}: {note}"))
     errors = {name: found.errors for name, found in metrics.items() if found.errors is not None}
     checks = _mitigate(inspection.findings, solutions)
     if request.judge_arms or list_doubts(solutions, errors):  # which takes a second
@@ -260,7 +260,7 @@ def _run(request: Request, progress: Progress | None) -> Outcome:
 
 def _mitigate(findings: tuple[Finding, ...], solutions: Mapping[str, Solution]) -> tuple[Finding, ...]:
     """Findings; clocks that disagree make no result unreliable where the stamps were moved to what they disagree by."""
-    if all(one.noise.stamps == StampOffsets() for one in own_solutions(solutions).values()):
+    if all(one.noise.stamps == StampOffsets() for one in select_own(solutions).values()):
         return findings
     return tuple(replace(f, severity="warning") if f.key == "imu.clock" else f for f in findings)
 
@@ -277,10 +277,10 @@ def _find_densities(recording: Recording, settings: Settings, solutions: Mapping
         return None
     if not any(group.startswith("imu.") for solution in solutions.values() for group in solution.noise.figures):
         return None
-    from graphnav.estimation.noise.imu_floor import with_measured_floor
-    from graphnav.imu.onboard_offset import without_onboard_offset
+    from graphnav.estimation.noise.imu_floor import apply_measured_floor
+    from graphnav.imu.onboard_offset import remove_onboard_offset
 
-    return with_measured_floor(without_onboard_offset(recording, settings)[0], settings)[0].imu.noise
+    return apply_measured_floor(remove_onboard_offset(recording, settings)[0], settings)[0].imu.noise
 
 
 def _read_others(request: Request, recording: Recording, solutions: Mapping[str, Solution]) -> dict[str, Solution]:

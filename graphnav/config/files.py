@@ -10,13 +10,13 @@ from typing import Any, get_args
 from pydantic import BaseModel, ValidationError
 
 from graphnav.config.settings import PROFILES, Profile, Settings
-from graphnav.core.complaints import complaint, read_toml
+from graphnav.core.complaints import describe_invalid, read_toml
 from graphnav.core.errors import ConfigError
 from graphnav.core.files import parse_json, read_text
 from graphnav.sensors import list_sensors
 
 
-def settings_from(values: Mapping[str, Any], source: str = "settings", text: str = "") -> Settings:
+def parse_settings(values: Mapping[str, Any], source: str = "settings", text: str = "") -> Settings:
     """Validate a nested mapping, that of the file whose `text` is given.
 
     Raises
@@ -27,7 +27,7 @@ def settings_from(values: Mapping[str, Any], source: str = "settings", text: str
     try:
         return Settings.model_validate(dict(values))
     except ValidationError as error:
-        raise ConfigError(complaint(source, error, Settings, text)) from None
+        raise ConfigError(describe_invalid(source, error, Settings, text)) from None
 
 
 def read_settings(path: str | Path | None = None, profile: str | None = None) -> Settings:
@@ -62,7 +62,7 @@ def read_settings(path: str | Path | None = None, profile: str | None = None) ->
                 f"--profile {profile}: no such profile; known: {', '.join(get_args(Profile))}", key="option.value"
             )
         values = {**values, "profile": profile}
-    return settings_from(values, "settings" if path is None else str(path), text)
+    return parse_settings(values, "settings" if path is None else str(path), text)
 
 
 def _take_settings_of_run(path: Path) -> Mapping[str, Any]:
@@ -80,13 +80,13 @@ def _take_settings_of_run(path: Path) -> Mapping[str, Any]:
     return values
 
 
-def settings_text(settings: Settings) -> str:
+def format_settings(settings: Settings) -> str:
     """The text of a file that `read_settings` reads: every key with its unit and description, unset keys as
     comments.
     """
     lines: list[str] = []
 
-    def table(section: BaseModel, at: str) -> None:
+    def format_table(section: BaseModel, at: str) -> None:
         nested: dict[str, BaseModel] = {}
         for name, field in type(section).model_fields.items():
             value = getattr(section, name)
@@ -96,20 +96,20 @@ def settings_text(settings: Settings) -> str:
             if isinstance(value, BaseModel):
                 nested[name] = value
                 continue
-            setting = f"# {name} =" if value is None else f"{name} = {toml_value(value)}"
+            setting = f"# {name} =" if value is None else f"{name} = {format_toml(value)}"
             lines.append(f"{setting:<30} # {field.description}")
         for name, inner in nested.items():
             place = f"{at}.{name}" if at else name
             if any(not isinstance(getattr(inner, key), BaseModel) for key in type(inner).model_fields):
                 lines.extend(["", f"[{place}]"])
-            table(inner, place)
+            format_table(inner, place)
 
-    table(settings, "")
+    format_table(settings, "")
     return "\n".join(lines) + "\n"
 
 
-def toml_value(value: Any) -> str:
+def format_toml(value: Any) -> str:
     """The TOML text of a value; JSON's numbers, strings and lists are valid TOML."""
     if isinstance(value, Mapping):
-        return "{ " + ", ".join(f"{key} = {toml_value(one)}" for key, one in value.items()) + " }"
+        return "{ " + ", ".join(f"{key} = {format_toml(one)}" for key, one in value.items()) + " }"
     return json.dumps(value)

@@ -24,7 +24,7 @@ def list_constraints() -> tuple[type[Constraint], ...]:
     return tuple(found[name] for name in sorted(found))
 
 
-def kinds_for(recording: Recording) -> tuple[type[Constraint], ...]:
+def list_kinds(recording: Recording) -> tuple[type[Constraint], ...]:
     """The constraint classes for a recording: graphnav's own and those that a script adds."""
     return (*list_constraints(), *recording.own.constraints)
 

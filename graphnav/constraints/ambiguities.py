@@ -14,7 +14,7 @@ _PREFIX = "ambiguity."
 _SIGMA = 30.0  # m, 1-sigma about what the codes say: next to nothing known
 
 
-def ambiguities(arcs: Arcs, guess: Array, wavelength: Array, unit: str = "cycles") -> dict[int, Parameter]:
+def make_ambiguities(arcs: Arcs, guess: Array, wavelength: Array, unit: str = "cycles") -> dict[int, Parameter]:
     """A parameter for each slot that has arcs, by slot.
 
     Parameters
@@ -28,15 +28,15 @@ def ambiguities(arcs: Arcs, guess: Array, wavelength: Array, unit: str = "cycles
             own = np.flatnonzero((arcs.slot == slot) & (arcs.arc >= 0))
             first = own[np.unique(arcs.arc[own], return_index=True)[1], None]
             sigma = _SIGMA / wavelength[first]
-            out[slot] = Parameter(ambiguity_name(arcs.names[slot]), guess[first], sigma, unit, begins=begins)
+            out[slot] = Parameter(name_ambiguity(arcs.names[slot]), guess[first], sigma, unit, begins=begins)
     return out
 
 
-def ambiguity_name(slot: str) -> str:
+def name_ambiguity(slot: str) -> str:
     """The name of the parameter of a slot, "G05.1C"."""
     return f"{_PREFIX}{slot}"
 
 
-def slot_names(parameters: Sequence[str]) -> tuple[str, ...]:
-    """The opposite of `ambiguity_name`."""
+def list_slots(parameters: Sequence[str]) -> tuple[str, ...]:
+    """The opposite of `name_ambiguity`."""
     return tuple(name.removeprefix(_PREFIX) for name in parameters)

@@ -22,7 +22,7 @@ from graphnav.core.earth import A, LocalFrame
 from graphnav.core.rotation import Array, mv
 from graphnav.core.state import Parameter, States
 from graphnav.recording import Recording
-from graphnav.sensors.barometer import SENSOR, standard_height
+from graphnav.sensors.barometer import SENSOR, compute_standard_height
 
 OFFSET, SCALE = "barometer_offset", "barometer_scale"
 
@@ -59,7 +59,7 @@ class BarometricHeight(Constraint):
         figures = series.figures
         interval = np.searchsorted(scene.t, series.t - SAME_TIME)  # in the interval that ends at this keyframe
         inside = (interval > 0) & (interval < len(scene.t))
-        interval, t, z = interval[inside], series.t[inside], standard_height(series)[inside]
+        interval, t, z = interval[inside], series.t[inside], compute_standard_height(series)[inside]
         count = np.bincount(interval, minlength=len(scene.t))
         rows = np.flatnonzero(count)
         if not len(rows):

@@ -65,7 +65,7 @@ class BuildContext(Shared):
         series = self.recording.sensors.get(name)
         return series if series is not None and len(series) and self.settings.sensor(name).use else None
 
-    def keyframe_at(self, t: Array) -> Array:
+    def find_keyframes(self, t: Array) -> Array:
         """Index of the keyframe at each time.
 
         Parameters
@@ -154,7 +154,7 @@ class Constraint(ABC):
         """(m,) typical 1-sigma of a whole error, white and time-correlated, of watched rows."""
         raise NotImplementedError(f"{self.name}: rows that are watched say what their errors usually are")
 
-    def in_units_of(self, typical: TypicalSigmas) -> Self:
+    def convert_units(self, typical: TypicalSigmas) -> Self:
         """The rows with time-correlated errors in the units of the whole drive, of which they are a part; fixes
         only.
         """
@@ -222,18 +222,18 @@ class Constraint(ABC):
         jacobians = {}
         for block in self.depends_on:
 
-            def residual_at(step: Array, at: slice = BLOCKS[block]) -> Array:
+            def move_block(step: Array, at: slice = BLOCKS[block]) -> Array:
                 delta = np.zeros((len(states), DIM))
                 delta[:, at] = step
                 return self.residual(states.plus(delta), parameters, rows)
 
-            jacobians[block] = _differentiate(residual_at, np.full(3, _STEPS[block]))
+            jacobians[block] = _differentiate(move_block, np.full(3, _STEPS[block]))
         for p in self.parameters:
 
-            def along(step: Array, name: str = p.name) -> Array:
+            def move_parameter(step: Array, name: str = p.name) -> Array:
                 return self.residual(states, parameters | {name: parameters[name] + step}, rows)
 
-            jacobians[p.name] = _differentiate(along, 1e-3 * np.atleast_2d(p.sigma)[0])
+            jacobians[p.name] = _differentiate(move_parameter, 1e-3 * np.atleast_2d(p.sigma)[0])
         sigma: Array = self.sigma  # type: ignore[attr-defined]
         return Linearized(self.residual(states, parameters, rows), jacobians, sigma[rows])
 

@@ -20,7 +20,7 @@ import numpy as np
 
 from graphnav.config import Settings
 from graphnav.constraints.base import SAME_TIME, BuildContext, Constraint, Linearized
-from graphnav.constraints.gnss import TIMES, node_spacing, period
+from graphnav.constraints.gnss import TIMES, find_fix_period, find_node_spacing
 from graphnav.core import rotation
 from graphnav.core.earth import LocalFrame
 from graphnav.core.rotation import Array
@@ -59,7 +59,7 @@ class Baseline(Constraint):
         series, s = scene.series(SENSOR.name), scene.settings.sensor(SENSOR.name)
         if series is None:
             return None
-        keyframe = scene.keyframe_at(series.t)
+        keyframe = scene.find_keyframes(series.t)
         used = (keyframe >= 0) & np.isfinite(series[cls.column])
         if not used.any():
             return None
@@ -68,7 +68,7 @@ class Baseline(Constraint):
         times = scene.settings.gnss.slow_times
         lasting = Parameter(
             cls.name_lasting(), np.zeros(1), np.median(sigma, axis=0), "rad", correlation_time=times[0],
-            spacing=node_spacing(times, period(series.t[used])),
+            spacing=find_node_spacing(times, find_fix_period(series.t[used])),
             noise_groups=(f"{cls.name}.{TIMES[1]}.{cls.column}",),
         )  # fmt: skip
         wrong = Parameter(cls._name_offset(), np.zeros(1), np.full(1, np.radians(figures.baseline_sigma)), "rad")

@@ -72,7 +72,7 @@ def _build_common(scene: BuildContext, offset: str) -> dict[str, Any]:
     return {"parameters": tuple(parameters), "watched": settings.faults != "off", **settings.outliers}
 
 
-def _stamp_error(settings: Settings, t: Array) -> tuple[Parameter, ...]:
+def _build_stamp_error(settings: Settings, t: Array) -> tuple[Parameter, ...]:
     """Error of the stamps of single fixes, in units of the 1-sigma of their common offset."""
     sigma = np.full(1, settings.gnss.time_offset_sigma)
     if not sigma[0] > 0.0:
@@ -85,7 +85,7 @@ def _stamp_error(settings: Settings, t: Array) -> tuple[Parameter, ...]:
     )
 
 
-def _time_offset(parameters: dict[str, Array], constant: str) -> Array | None:
+def _get_time_offset(parameters: dict[str, Array], constant: str) -> Array | None:
     """(n, 1) s to be added to stamps, and None where no part of it is estimated."""
     some = [parameters[name] for name in (constant, STAMP_ERROR) if name in parameters]
     return np.asarray(sum(some)) if some else None
@@ -130,7 +130,7 @@ class GnssPosition(Constraint):
         tight = scene.recording.tight(scene.settings.raw_gnss.coupling)
         if gnss is None or not scene.settings.gnss.position or tight:
             return None
-        keyframe = scene.keyframe_at(gnss.t)
+        keyframe = scene.find_keyframes(gnss.t)
         used = keyframe >= 0
         if not used.any():
             return None
@@ -140,7 +140,7 @@ class GnssPosition(Constraint):
         common = _build_common(scene, TIME_OFFSET)
         names = [""] if kinds is None else [f".{FIX_TYPES[int(kind)]}" for kind in np.unique(kinds)]
         processes: tuple[Parameter, ...] = ()
-        spacing = node_spacing(scene.settings.gnss.slow_times, period(gnss.t[used]))
+        spacing = find_node_spacing(scene.settings.gnss.slow_times, find_fix_period(gnss.t[used]))
         for name in names:
             for error, time, lasts in zip(ERRORS, TIMES, (SECONDS, *scene.settings.gnss.slow_times), strict=True):
                 groups = tuple(f"{cls.name}{name}.{time}.{axis}" for axis in cls.noise_axes)
@@ -166,7 +166,7 @@ class GnssPosition(Constraint):
             accel=average_around(imu, imu.accel, gnss.t[used]),
             g_n=scene.frame.gravity_n(p_n),
             omega_n=scene.frame.omega_n,
-            processes=(*processes, *_stamp_error(scene.settings, gnss.t[used])),
+            processes=(*processes, *_build_stamp_error(scene.settings, gnss.t[used])),
             **common,
         )
 
@@ -179,7 +179,7 @@ class GnssPosition(Constraint):
         )
         return names, 2 * which[:, None] + np.array([0, 0, 1])
 
-    def in_units_of(self, typical: TypicalSigmas) -> Self:
+    def convert_units(self, typical: TypicalSigmas) -> Self:
         processes = tuple(replace(p, spacing=typical.spacing) for p in self.processes)
         return replace(self, drive_error=typical.overall(), processes=processes)
 
@@ -193,10 +193,10 @@ class GnssPosition(Constraint):
         J = {"theta": -R @ rotation.skew(lever), "p": _I3[None]}
         if LEVER_ARM in parameters:
             J[LEVER_ARM] = R
-        offset = _time_offset(parameters, TIME_OFFSET)
+        offset = _get_time_offset(parameters, TIME_OFFSET)
         if offset is not None:
-            velocity, moved = antenna_velocity(states, self.gyro[rows], self.omega_n, lever)
-            change, bent = acceleration(states, self.accel[rows], self.g_n[rows])
+            velocity, moved = compute_antenna_velocity(states, self.gyro[rows], self.omega_n, lever)
+            change, bent = compute_acceleration(states, self.accel[rows], self.g_n[rows])
             away = away + velocity * offset + change * (0.5 * offset**2)
             for block in ("theta", "v", "bg", LEVER_ARM):
                 if block != LEVER_ARM or LEVER_ARM in parameters:
@@ -261,14 +261,14 @@ class GnssVelocity(Constraint):
         if gnss is None or gnss.v is None or gnss.sd_v is None or not scene.settings.gnss.velocity or tight:
             return None
         t = gnss.velocity_t
-        keyframe = scene.keyframe_at(t)
+        keyframe = scene.find_keyframes(t)
         used = (keyframe >= 0) & np.isfinite(gnss.v).all(axis=1)
         if not used.any():
             return None
         t = t[used]
         lasting = Parameter(
             VELOCITY_ERROR, np.zeros(3), np.ones(3), "sd", correlation_time=SECONDS,
-            spacing=node_spacing((), period(t)),
+            spacing=find_node_spacing((), find_fix_period(t)),
             noise_groups=tuple(f"{cls.name}.seconds.{axis}" for axis in cls.noise_axes),
         )  # fmt: skip
         return cls(
@@ -282,11 +282,11 @@ class GnssVelocity(Constraint):
             omega_n=scene.frame.omega_n,
             lever_arm=gnss.lever_arm,
             unit_error=_compute_running_median(t, gnss.sd_v[used]),
-            processes=(lasting, *_stamp_error(scene.settings, t)),
+            processes=(lasting, *_build_stamp_error(scene.settings, t)),
             **_build_common(scene, VELOCITY_TIME_OFFSET),
         )
 
-    def in_units_of(self, typical: TypicalSigmas) -> Self:
+    def convert_units(self, typical: TypicalSigmas) -> Self:
         processes = tuple(replace(p, spacing=typical.spacing) for p in self.processes)
         return replace(self, unit_error=typical.around(self.keyframe)[:, 3:], processes=processes)
 
@@ -296,12 +296,12 @@ class GnssVelocity(Constraint):
     def linearize(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> Linearized:
         C = self.R_ln[rows]
         lever = parameters.get(LEVER_ARM, self.lever_arm)
-        velocity, moved = antenna_velocity(states, self.gyro[rows], self.omega_n, lever)
+        velocity, moved = compute_antenna_velocity(states, self.gyro[rows], self.omega_n, lever)
         residual = mv(C, velocity) - self.v_l[rows]
         jacobians = {block: C @ J for block, J in moved.items() if block != LEVER_ARM or LEVER_ARM in parameters}
-        offset = _time_offset(parameters, VELOCITY_TIME_OFFSET)
+        offset = _get_time_offset(parameters, VELOCITY_TIME_OFFSET)
         if offset is not None:
-            change, bent = acceleration(states, self.accel[rows], self.g_n[rows])
+            change, bent = compute_acceleration(states, self.accel[rows], self.g_n[rows])
             change = mv(C, change)
             residual = residual + change * offset
             jacobians["theta"] = jacobians["theta"] + C @ bent["theta"] * offset[..., None]
@@ -322,12 +322,12 @@ def _bound_typical_error(rows: GnssPosition | GnssVelocity) -> Array:
     return np.asarray(np.median(np.maximum(whole, rows.unit_error), axis=0))
 
 
-def period(t: Array) -> float:
+def find_fix_period(t: Array) -> float:
     """Usual time between fixes, s."""
     return max(float(np.median(np.diff(t))), 1e-3) if len(t) > 1 else 1.0
 
 
-def node_spacing(slow_times: tuple[float, ...], dt: float) -> float:
+def find_node_spacing(slow_times: tuple[float, ...], dt: float) -> float:
     """Spacing (s) of the nodes of time-correlated errors, between which the value is held.
 
     A process of seconds needs one node per fix, `dt` s apart, up to a fifth of its correlation time.
@@ -340,11 +340,13 @@ def _compute_running_median(t: Array, sigma: Array) -> Array:
 
     A lasting error times a sigma that jumps from fix to fix would jump too, and thus be observable.
     """
-    size = 2 * int(np.clip(_MINUTE / period(t) / 2, 0, (len(t) - 1) // 2)) + 1
+    size = 2 * int(np.clip(_MINUTE / find_fix_period(t) / 2, 0, (len(t) - 1) // 2)) + 1
     return run_median(sigma, size)
 
 
-def antenna_velocity(states: States, gyro: Array, omega_n: Array, lever: Array) -> tuple[Array, dict[str, Array]]:
+def compute_antenna_velocity(
+    states: States, gyro: Array, omega_n: Array, lever: Array
+) -> tuple[Array, dict[str, Array]]:
     """v + R_nb (omega_nb x l) in n, (N, 3), and its derivatives by theta, v, bg and the lever arm."""
     R = states.R_nb
     omega_ie_b = omega_n @ R
@@ -359,7 +361,7 @@ def antenna_velocity(states: States, gyro: Array, omega_n: Array, lever: Array) 
     }
 
 
-def acceleration(states: States, accel: Array, g_n: Array) -> tuple[Array, dict[str, Array]]:
+def compute_acceleration(states: States, accel: Array, g_n: Array) -> tuple[Array, dict[str, Array]]:
     """R_nb (f_b - b_a) + g in n, (N, 3), and its derivatives by theta and ba."""
     R, force = states.R_nb, accel - states.ba
     return mv(R, force) + g_n, {"theta": -R @ rotation.skew(force), "ba": -R}

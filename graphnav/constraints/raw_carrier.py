@@ -41,20 +41,20 @@ from graphnav.constraints.raw_gnss import (
     ONE,
     PER_ROW,
     SatelliteConstraint,
-    common_fields,
-    ionosphere_parameter,
-    range_change,
+    compute_range_change,
+    list_common_fields,
+    make_ionosphere_parameter,
     select_columns,
 )
-from graphnav.constraints.raw_rows import PreparedRows, period_of_epochs, prepare_every
+from graphnav.constraints.raw_rows import PreparedRows, find_epoch_period, prepare_every
 from graphnav.constraints.raw_selection import select_observations
 from graphnav.core import rotation
 from graphnav.core.rotation import Array
 from graphnav.core.state import Parameter, States
 from graphnav.gnss.atmosphere import obliquity
-from graphnav.gnss.carrier import consecutive, number_epochs
-from graphnav.gnss.series import median_of_epochs
-from graphnav.gnss.sigmas import carrier_sigma
+from graphnav.gnss.carrier import number_epochs, pair_consecutive
+from graphnav.gnss.series import compute_epoch_medians
+from graphnav.gnss.sigmas import compute_carrier_sigma
 from graphnav.gnss.signals import L1, C
 from graphnav.recording import Recording
 
@@ -103,7 +103,7 @@ def _pair_rows(scene: BuildContext) -> tuple[PreparedRows, _Pairs] | None:
     if found is None or whole is None or not np.isfinite(found.raw.carrier).any():
         return None
     raw = found.raw
-    before, after = consecutive(raw, whole, period_of_epochs(raw, scene.settings.raw_gnss))
+    before, after = pair_consecutive(raw, whole, find_epoch_period(raw, scene.settings.raw_gnss))
     if not len(after) and raw.catalogue is None:
         return None
     epochs, first, of = np.unique(raw.t, return_index=True, return_inverse=True)
@@ -111,7 +111,7 @@ def _pair_rows(scene: BuildContext) -> tuple[PreparedRows, _Pairs] | None:
     level = found.known - 2.0 * found.ionosphere - raw.clock - raw.carrier * C / raw.frequency
     change = level[after] - level[before]
     clock = np.zeros(len(epochs))
-    clock[of[after]] = -median_of_epochs(raw.t[after], change)
+    clock[of[after]] = -compute_epoch_medians(raw.t[after], change)
     some = found.keyframe[after] >= 0  # of a piece, changes to the epoch before it are there already
     number = number_epochs(raw)[first]
     return found, _Pairs(before[some], after[some], number, epochs, first, change[some], clock)
@@ -151,7 +151,7 @@ class GnssAntennaClone(Constraint):
         own = np.flatnonzero((found.keyframe[pairs.first] >= 0) & (pairs.number >= 0))
         if not len(own):
             return None
-        parameters = [p for p in common_fields(scene, found)["parameters"] if p.name == LEVER_ARM]
+        parameters = [p for p in list_common_fields(scene, found)["parameters"] if p.name == LEVER_ARM]
         return cls(
             keyframe=found.keyframe[pairs.first[own]],
             lever_arm=found.raw.lever_arm,
@@ -205,7 +205,7 @@ class GnssCarrier(SatelliteConstraint):
         raw, j, k = found.raw, pairs.before, pairs.after
         if not len(k):
             return None
-        common: dict[str, Any] = common_fields(scene, found)
+        common: dict[str, Any] = list_common_fields(scene, found)
         common |= {name: common[name][k] for name in PER_ROW}
         if scene.settings.raw_gnss.robust == "automatic":  # a slip is no error that a variance can describe
             common["robust"] = "cauchy"
@@ -219,7 +219,7 @@ class GnssCarrier(SatelliteConstraint):
             Parameter(
                 RATES, np.zeros(many), np.full(many, ONE / hours), "m/s", correlation_time=hours, spacing=found.spacing
             ),
-            ionosphere_parameter(raw, found.spacing),
+            make_ionosphere_parameter(raw, found.spacing),
             *_clone_antennas(found, pairs),
         )
         # of a phase the delay is negative; against a base the parameter is what lies between the two receivers
@@ -229,8 +229,8 @@ class GnssCarrier(SatelliteConstraint):
             noise_groups=tuple(f"{cls.name}.minutes.{axis}" for axis in AXES),
         )  # fmt: skip
         sigma = np.hypot(
-            carrier_sigma(raw.cn0[j], found.elevation[j], C / raw.frequency[j]),
-            carrier_sigma(raw.cn0[k], found.elevation[k], C / raw.frequency[k]),
+            compute_carrier_sigma(raw.cn0[j], found.elevation[j], C / raw.frequency[j]),
+            compute_carrier_sigma(raw.cn0[k], found.elevation[k], C / raw.frequency[k]),
         )
         return cls(
             change=pairs.change,
@@ -250,8 +250,8 @@ class GnssCarrier(SatelliteConstraint):
         antenna, lever = self._place_antenna(states, parameters)
         odd = self.odd[rows]
         before = np.where(odd[:, None] == 0, parameters[CLONES[0]], parameters[CLONES[1]])
-        nearer, e = range_change(self.s_n[rows], antenna, self.nominal[rows])
-        nearer_before, e_before = range_change(self.s_before[rows], before, self.nominal_before[rows])
+        nearer, e = compute_range_change(self.s_n[rows], antenna, self.nominal[rows])
+        nearer_before, e_before = compute_range_change(self.s_before[rows], before, self.nominal_before[rows])
         residual = nearer - nearer_before + self.change[rows] + parameters[CHANGE][:, 0]
         J = {
             "theta": (e[:, None] @ states.R_nb) @ rotation.skew(lever),

@@ -8,7 +8,7 @@ reception, and u = v + R_nb (omega_nb x l) its velocity (Groves 2013, sections 8
 
 b and b' are the receiver's clock and its drift, which begin anew at every epoch; b_s is the bias of the signals of
 another system, z what the model of the ionosphere is wrong by at the zenith and m how that grows towards the horizon; k
-comes of the flight time (`graphnav.gnss.single_point.stretch`). What lasts of the errors: c of all satellites together,
+comes of the flight time (`graphnav.gnss.single_point.compute_stretch`). What lasts of the errors: c of all satellites together,
 as a shift of the antenna in east, north, up, for seconds and minutes, reflections and what a receiver's smoothing of
 its codes leaves, and for hours; d for seconds the same of velocities; q for hours of the one satellite, orbit, clock
 and the atmosphere towards it. How large c and q are for hours is stated: a drive does not tell them from its place.
@@ -31,7 +31,7 @@ import numpy as np
 
 from graphnav.config import Settings
 from graphnav.constraints.base import BuildContext, Constraint, Linearized
-from graphnav.constraints.gnss import LEVER_ARM, TIMES, antenna_velocity, average_around
+from graphnav.constraints.gnss import LEVER_ARM, TIMES, average_around, compute_antenna_velocity
 from graphnav.constraints.raw_rows import CLOCK, PreparedRows, prepare_rows
 from graphnav.constraints.raw_selection import select_observations
 from graphnav.core import rotation
@@ -40,9 +40,9 @@ from graphnav.core.rotation import Array
 from graphnav.core.state import SECONDS, Parameter, States
 from graphnav.gnss.atmosphere import obliquity
 from graphnav.gnss.series import RawGnss
-from graphnav.gnss.sigmas import code_sigma, rate_sigma
-from graphnav.gnss.signals import L1, NAMES, C, satellite_name, signal_name
-from graphnav.gnss.single_point import signal_groups
+from graphnav.gnss.sigmas import compute_code_sigma, compute_rate_sigma
+from graphnav.gnss.signals import L1, NAMES, C, name_satellite, name_signal
+from graphnav.gnss.single_point import group_signals
 from graphnav.recording import Recording
 
 BIASES = "gnss_signal_biases"
@@ -72,7 +72,7 @@ _CLASSES = ("strong", "fair", "weak", "faint")
 PER_ROW = ("keyframe", "s_n", "R_ln", "satellite", "azimuth", "elevation", "level")  # of the fields that are shared
 
 
-def common_fields(scene: BuildContext, found: PreparedRows) -> dict[str, Any]:
+def list_common_fields(scene: BuildContext, found: PreparedRows) -> dict[str, Any]:
     settings, raw = scene.settings, found.raw
     parameters: tuple[Parameter, ...] = (found.clock,)
     if settings.gnss.lever_arm_sigma is not None:
@@ -103,7 +103,7 @@ def common_fields(scene: BuildContext, found: PreparedRows) -> dict[str, Any]:
     }
 
 
-def ionosphere_parameter(raw: RawGnss, spacing: float) -> Parameter:
+def make_ionosphere_parameter(raw: RawGnss, spacing: float) -> Parameter:
     """What the ionosphere's model is wrong by at the zenith; against a base station, between the two."""
     sigma = max(_GRADIENT * raw.baseline, 1e-3) if raw.differenced else _ZENITH
     return Parameter(IONOSPHERE, np.zeros(1), np.full(1, sigma), "m", sigma / _ZENITH * _ZENITH_WALK, spacing=spacing)
@@ -131,7 +131,7 @@ class SatelliteConstraint(Constraint):
     @property
     def labels(self) -> dict[str, Array]:
         known, which = np.unique(self.satellite, return_inverse=True)
-        names = np.array([satellite_name(s) for s in known])[which]
+        names = np.array([name_satellite(s) for s in known])[which]
         return {"satellite": names, "azimuth": self.azimuth, "elevation": self.elevation}
 
     def noise_groups(self) -> tuple[tuple[str, ...], Array]:
@@ -155,7 +155,7 @@ class SatelliteConstraint(Constraint):
         return shift, dict.fromkeys(there, towards[:, None])
 
 
-def range_change(s: Array, antenna: Array, nominal: Array) -> tuple[Array, Array]:
+def compute_range_change(s: Array, antenna: Array, nominal: Array) -> tuple[Array, Array]:
     """|s - antenna| - |s - nominal| (n,) without the digits that a difference of distances loses, and directions."""
     away, from_nominal = s - antenna, s - nominal
     moved = antenna - nominal
@@ -182,7 +182,7 @@ class RangeConstraint(SatelliteConstraint):
     ) -> tuple[Array, dict[str, Array], Array]:
         """Residuals (n,), Jacobians, and directions (n, 3); a parameter delays each row by its factor (n,)."""
         antenna, lever = self._place_antenna(states, parameters)
-        change, e = range_change(self.s_n[rows], antenna, self.nominal[rows])
+        change, e = compute_range_change(self.s_n[rows], antenna, self.nominal[rows])
         residual = change + self.offset[rows] + parameters[CLOCK][:, 0] + factor * parameters[delay][:, 0]
         J = {
             "theta": (e[:, None] @ states.R_nb) @ rotation.skew(lever),
@@ -221,10 +221,10 @@ class GnssCode(RangeConstraint):
         if found is None:
             return None
         raw, settings = found.raw, scene.settings
-        groups, group = signal_groups(raw)
-        common, spacing = common_fields(scene, found), found.spacing
+        groups, group = group_signals(raw)
+        common, spacing = list_common_fields(scene, found), found.spacing
         less = _DIFFERENCED if raw.differenced else 1.0
-        more: tuple[Parameter, ...] = (ionosphere_parameter(raw, spacing),)
+        more: tuple[Parameter, ...] = (make_ionosphere_parameter(raw, spacing),)
         if len(groups) > 1:
             size = len(groups) - 1
             more += (
@@ -239,7 +239,7 @@ class GnssCode(RangeConstraint):
             )
         common["parameters"] += more
         satellites, which = raw.satellites
-        sigma, many = code_sigma(raw.cn0, found.elevation, found.ionosphere), len(satellites)
+        sigma, many = compute_code_sigma(raw.cn0, found.elevation, found.ionosphere), len(satellites)
         minutes, hours = settings.gnss.slow_times
         common["parameters"] += (
             Parameter(CODE_ERRORS[2], np.zeros(3), less * _HOURS, "m", correlation_time=hours, spacing=spacing),
@@ -254,7 +254,7 @@ class GnssCode(RangeConstraint):
             )
             for error, time, lasts in zip(CODE_ERRORS, TIMES, (SECONDS, minutes), strict=False)
         )  # fmt: skip
-        words = [f"{NAMES[system]} {signal_name(signal)}" for system, signal in groups]
+        words = [f"{NAMES[system]} {name_signal(signal)}" for system, signal in groups]
         note = f"gnss_code: {words[0]}"
         note += f", with a bias each of {', '.join(words[1:])}" if words[1:] else ""
         return cls(
@@ -303,7 +303,7 @@ class GnssDoppler(SatelliteConstraint):
         found = scene.share(prepare_rows) if scene.settings.raw_gnss.doppler else None
         if found is None:
             return None
-        raw, common = found.raw, common_fields(scene, found)
+        raw, common = found.raw, list_common_fields(scene, found)
         some = np.isfinite(raw.range_rate) & np.isfinite(raw.drift)
         if not some.any():
             return None
@@ -320,14 +320,14 @@ class GnssDoppler(SatelliteConstraint):
             stretch=found.stretch[some],
             gyro=average_around(imu, imu.gyro, raw.t[some]),
             omega_n=scene.frame.omega_n,
-            sigma=rate_sigma(raw.cn0, found.elevation)[some, None],
+            sigma=compute_rate_sigma(raw.cn0, found.elevation)[some, None],
             processes=(lasting,),
             **common,
         )
 
     def linearize(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> Linearized:
         antenna, lever = self._place_antenna(states, parameters)
-        u, moved = antenna_velocity(states, self.gyro[rows], self.omega_n, lever)
+        u, moved = compute_antenna_velocity(states, self.gyro[rows], self.omega_n, lever)
         away = self.s_n[rows] - antenna
         distance = np.linalg.norm(away, axis=1)[:, None]
         e, w = away / distance, self.v_n[rows] - u

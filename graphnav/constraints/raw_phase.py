@@ -25,16 +25,16 @@ from typing import ClassVar
 import numpy as np
 
 from graphnav.config import Settings
-from graphnav.constraints.ambiguities import ambiguities, ambiguity_name
+from graphnav.constraints.ambiguities import make_ambiguities, name_ambiguity
 from graphnav.constraints.base import SAME_TIME, BuildContext, Constraint, Linearized
-from graphnav.constraints.raw_gnss import IONOSPHERE, RangeConstraint, common_fields, ionosphere_parameter
-from graphnav.constraints.raw_rows import period_of_epochs, prepare_rows
+from graphnav.constraints.raw_gnss import IONOSPHERE, RangeConstraint, list_common_fields, make_ionosphere_parameter
+from graphnav.constraints.raw_rows import find_epoch_period, prepare_rows
 from graphnav.core import rotation
 from graphnav.core.rotation import Array
 from graphnav.core.state import Parameter, States
 from graphnav.gnss.arcs import find_arcs
 from graphnav.gnss.atmosphere import obliquity
-from graphnav.gnss.sigmas import REFLECTED, carrier_difference_sigma, reflection_sigma
+from graphnav.gnss.sigmas import REFLECTED, compute_carrier_difference_sigma, compute_reflection_sigma
 from graphnav.gnss.signals import GLONASS, L1, C
 from graphnav.gnss.single_point import choose_coefficients, look
 from graphnav.recording import Recording
@@ -77,7 +77,7 @@ class GnssPhase(RangeConstraint):
         if found is None or raw is None or not np.isfinite(raw.carrier_difference).any():
             return None
         arcs = find_arcs(raw, base_arc=raw.base_arc)
-        keyframe = scene.keyframe_at(raw.t)
+        keyframe = scene.find_keyframes(raw.t)
         # the epochs of the codes, whose clocks these are; all signals of a satellite
         used = (arcs.arc >= 0) & ~(raw.cn0 < s.cn0) & np.isin(keyframe, found.keyframe)
         used &= (raw.t >= scene.t[0] - SAME_TIME) & (raw.t <= scene.t[-1] + SAME_TIME)
@@ -88,7 +88,7 @@ class GnssPhase(RangeConstraint):
         wavelength = C / raw.frequency
         guess = raw.carrier + (raw.carrier_difference - raw.code - raw.difference) / wavelength
         guess = np.where(np.isfinite(guess), guess, 0.0)
-        own = ambiguities(arcs, guess, wavelength)
+        own = make_ambiguities(arcs, guess, wavelength)
         there = [k for k in sorted(own) if np.any(used & (arcs.slot == k))]
         place = np.full(len(arcs.names), -1)
         place[there] = np.arange(len(there))
@@ -96,7 +96,7 @@ class GnssPhase(RangeConstraint):
         group[arcs.satellite[there] // 100 == GLONASS] = -1  # each satellite has a frequency of its own
         frame, raw = scene.frame, raw.take(used)
         geometry = look(raw, raw.antenna, choose_coefficients(raw))
-        common = common_fields(scene, found)
+        common = list_common_fields(scene, found)
         if s.robust == "automatic":
             common["robust"] = "cauchy"  # for slips that nothing has told of
         common |= {
@@ -111,23 +111,23 @@ class GnssPhase(RangeConstraint):
         lasting = Parameter(
             REFLECTIONS, np.zeros(3), np.ones(3), "1", correlation_time=REFLECTED, spacing=found.spacing
         )
-        common["parameters"] += (ionosphere_parameter(found.raw, found.spacing), lasting, *(own[k] for k in there))
+        common["parameters"] += (make_ionosphere_parameter(found.raw, found.spacing), lasting, *(own[k] for k in there))
         nominal = (raw.antenna - frame.r_e) @ frame.R_ne.T
-        reflection = np.sqrt(2.0) * reflection_sigma(geometry.elevation)  # of two receivers
+        reflection = np.sqrt(2.0) * compute_reflection_sigma(geometry.elevation)  # of two receivers
         known = geometry.distance + geometry.troposphere - geometry.ionosphere
         return cls(
             offset=known - wavelength[used] * raw.carrier - raw.carrier_difference - raw.clock,
             nominal=nominal,
             reflected=_project(common["s_n"] - nominal, reflection, keyframe[used]),
             reflection=reflection / wavelength[used],
-            period=period_of_epochs(found.raw, s),
+            period=find_epoch_period(found.raw, s),
             slant=-obliquity(geometry.elevation) * (L1 / raw.frequency) ** 2,
             wavelength=wavelength[used],
-            sigma=carrier_difference_sigma(raw.cn0, geometry.elevation, wavelength[used])[:, None],
+            sigma=compute_carrier_difference_sigma(raw.cn0, geometry.elevation, wavelength[used])[:, None],
             slot=place[arcs.slot[used]],
             begin=arcs.begin[used],
             whole=~raw.half,
-            slots=tuple(ambiguity_name(arcs.names[k]) for k in there),
+            slots=tuple(name_ambiguity(arcs.names[k]) for k in there),
             group=group,
             **common,
         )
@@ -145,7 +145,7 @@ class GnssPhase(RangeConstraint):
         return Linearized(residual[:, None], J, self.sigma[rows])
 
 
-def variance_left(duration: Array, period: float) -> Array:
+def compute_variance_left(duration: Array, period: float) -> Array:
     """Of reflections of unit variance, what a mean over a time (s) holds of them more than were they white.
 
     The variance of the mean of a Gauss-Markov sequence (Brockwell and Davis 1991, section 7.1) less 1 / n.

@@ -22,19 +22,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphnav.config import Settings
-from graphnav.constraints.ambiguities import ambiguities, ambiguity_name
+from graphnav.constraints.ambiguities import make_ambiguities, name_ambiguity
 from graphnav.constraints.base import BuildContext, Linearized
-from graphnav.constraints.raw_gnss import BIASES, PER_ROW, SATELLITES, RangeConstraint, common_fields, select_columns
+from graphnav.constraints.raw_gnss import (
+    BIASES,
+    PER_ROW,
+    SATELLITES,
+    RangeConstraint,
+    list_common_fields,
+    select_columns,
+)
 from graphnav.constraints.raw_rows import PreparedRows, prepare_rows
 from graphnav.constraints.raw_selection import select_observations
 from graphnav.core.errors import RecordingError
 from graphnav.core.rotation import Array
 from graphnav.core.state import Parameter, States
-from graphnav.gnss.ppp import SECOND, IonosphereFree, ionosphere_free, second_signals
+from graphnav.gnss.ppp import SECOND, IonosphereFree, choose_second_signals, combine_ionosphere_free
 from graphnav.gnss.series import RawGnss
-from graphnav.gnss.sigmas import REFLECTED, carrier_sigma, code_sigma, reflection_sigma
+from graphnav.gnss.sigmas import REFLECTED, compute_carrier_sigma, compute_code_sigma, compute_reflection_sigma
 from graphnav.gnss.signals import C
-from graphnav.gnss.single_point import signal_groups
+from graphnav.gnss.single_point import group_signals
 from graphnav.recording import Recording
 
 WET = "gnss_wet_delay"
@@ -66,12 +73,12 @@ def _combine_free(scene: BuildContext) -> _Free | None:
     if found is None or whole is None:
         return None
     require_precise(scene.recording.name, whole)
-    rows = ionosphere_free(found.raw, whole)
+    rows = combine_ionosphere_free(found.raw, whole)
     if rows is None:
         return None
     every, of = found.raw.satellites
     some = np.isin(every // 100, list(SECOND))
-    systems = [x for x in dict.fromkeys(system for system, _ in signal_groups(found.raw)[0]) if x in SECOND]
+    systems = [x for x in dict.fromkeys(system for system, _ in group_signals(found.raw)[0]) if x in SECOND]
     group = np.array([systems.index(x) for x in (found.raw.satellite[rows.which] // 100).tolist()])
     return _Free(found, rows, int(some.sum()), (np.cumsum(some) - 1)[of[rows.which]], group, len(systems))
 
@@ -89,7 +96,7 @@ def require_precise(name: str, raw: RawGnss) -> None:
             f"{name}: raw_gnss.ppp needs precise orbits and clocks; say sp3 and clk in the recording's [raw_gnss]",
             key="raw.ppp_orbits",
         )
-    if not second_signals(raw):
+    if not choose_second_signals(raw):
         raise RecordingError(
             f"{name}: raw_gnss.ppp needs two signals of a satellite (GPS L1 and L2, Galileo E1 and E5a); this receiver "
             "has one",
@@ -112,7 +119,7 @@ class _Ppp(RangeConstraint):
 
     @staticmethod
     def _collect_shared_fields(scene: BuildContext, free: _Free, used: NDArray[np.intp]) -> dict[str, Any]:
-        rows, common = free.rows, common_fields(scene, free.found)
+        rows, common = free.rows, list_common_fields(scene, free.found)
         at = rows.which[used]
         common |= {name: common[name][at] for name in PER_ROW}
         common["parameters"] += (
@@ -162,7 +169,7 @@ class GnssPppCode(_Ppp):
                 spacing=free.found.spacing,
             ),
         )  # fmt: skip
-        sigma = rows.growth * code_sigma(raw.cn0, rows.geometry.elevation, np.zeros(len(raw)))
+        sigma = rows.growth * compute_code_sigma(raw.cn0, rows.geometry.elevation, np.zeros(len(raw)))
         return cls(offset=rows.known - rows.code, sigma=sigma[:, None], **common)
 
     def linearize(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> Linearized:
@@ -198,7 +205,7 @@ class GnssPppCarrier(_Ppp):
             return None
         raw = free.found.raw.take(rows.which[used])
         common = cls._collect_shared_fields(scene, free, used)
-        own = ambiguities(arcs, rows.carrier - rows.code, np.ones(len(arcs.arc)), "m")
+        own = make_ambiguities(arcs, rows.carrier - rows.code, np.ones(len(arcs.arc)), "m")
         there = sorted(own)
         common["parameters"] += tuple(own[k] for k in there)
         size, hours = free.satellites, scene.settings.gnss.slow_times[1]
@@ -216,14 +223,14 @@ class GnssPppCarrier(_Ppp):
         middle, apart = np.array([noise.get(s, (0.0, 1.0)) for s in raw.satellite.tolist()]).T
         between = np.mod(raw.t + raw.zero, apart) / apart  # nodes are at whole numbers of their spacing
         off_line = 2.0 * middle * np.sqrt(between * (1.0 - between))
-        reflected = rows.growth[used] * reflection_sigma(rows.geometry.elevation[used])
+        reflected = rows.growth[used] * compute_reflection_sigma(rows.geometry.elevation[used])
         if scene.settings.raw_gnss.robust == "automatic":  # a slip is no error that a variance can describe
             common["robust"] = "cauchy"
-        sigma = rows.growth[used] * carrier_sigma(raw.cn0, rows.geometry.elevation[used], C / raw.frequency)
+        sigma = rows.growth[used] * compute_carrier_sigma(raw.cn0, rows.geometry.elevation[used], C / raw.frequency)
         return cls(
             offset=(rows.known - rows.carrier)[used],
             sigma=sigma[:, None],
-            slots=tuple(ambiguity_name(arcs.names[k]) for k in there),
+            slots=tuple(name_ambiguity(arcs.names[k]) for k in there),
             slot=np.searchsorted(there, arcs.slot[used]),
             begin=arcs.begin[used],
             lasting=np.hypot(off_line, reflected),

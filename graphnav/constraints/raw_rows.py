@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from graphnav.config.raw_gnss import RawGnssSettings
 from graphnav.constraints.base import BuildContext
-from graphnav.constraints.gnss import node_spacing, period
+from graphnav.constraints.gnss import find_fix_period, find_node_spacing
 from graphnav.constraints.raw_selection import select_observations
 from graphnav.core import earth
 from graphnav.core.rotation import Array
@@ -17,7 +17,7 @@ from graphnav.core.state import Parameter
 from graphnav.gnss.ephemeris import rotate_earth
 from graphnav.gnss.series import RawGnss
 from graphnav.gnss.signals import C
-from graphnav.gnss.single_point import choose_coefficients, look, stretch
+from graphnav.gnss.single_point import choose_coefficients, compute_stretch, look
 
 CLOCK = "receiver_clock"
 _CLOCK_SIGMA = np.array([100.0, 10.0])  # m, m/s, about the single-point solution: next to nothing known
@@ -67,7 +67,7 @@ def prepare_every(scene: BuildContext) -> PreparedRows | None:
     frame = scene.frame
     return PreparedRows(
         raw=raw,
-        keyframe=scene.keyframe_at(raw.t),
+        keyframe=scene.find_keyframes(raw.t),
         s_n=(geometry.s - frame.r_e) @ frame.R_ne.T,
         v_n=rotate_earth(raw.v, geometry.distance / C) @ frame.R_ne.T,
         R_ln=earth.enu_axes(earth.ecef_to_llh(raw.antenna)) @ frame.R_ne.T,
@@ -76,8 +76,8 @@ def prepare_every(scene: BuildContext) -> PreparedRows | None:
         known=geometry.distance + geometry.ionosphere + geometry.troposphere,
         nominal=(raw.antenna - frame.r_e) @ frame.R_ne.T,
         ionosphere=geometry.ionosphere,
-        stretch=stretch(raw, geometry),
-        spacing=node_spacing(scene.settings.gnss.slow_times, period_of_epochs(raw, scene.settings.raw_gnss)),
+        stretch=compute_stretch(raw, geometry),
+        spacing=find_node_spacing(scene.settings.gnss.slow_times, find_epoch_period(raw, scene.settings.raw_gnss)),
     )
 
 
@@ -90,6 +90,6 @@ def prepare_rows(scene: BuildContext) -> PreparedRows | None:
     return every.take(there) if there.any() else None
 
 
-def period_of_epochs(raw: RawGnss, settings: RawGnssSettings) -> float:
+def find_epoch_period(raw: RawGnss, settings: RawGnssSettings) -> float:
     """s between the epochs that are used; a piece of a series may have too few to tell."""
-    return period(raw.epochs[0]) if raw.catalogue is None else max(raw.catalogue.period, settings.period)
+    return find_fix_period(raw.epochs[0]) if raw.catalogue is None else max(raw.catalogue.period, settings.period)

@@ -9,7 +9,7 @@ from graphnav.config import Settings
 from graphnav.config.raw_gnss import RawGnssSettings
 from graphnav.constraints.base import SAME_TIME
 from graphnav.core.rotation import Array
-from graphnav.gnss.series import RawGnss, primary
+from graphnav.gnss.series import RawGnss, choose_primary
 from graphnav.recording import Recording
 
 EARLY = 0.05  # s by which an epoch may come before the next is due: stamps jitter
@@ -26,7 +26,7 @@ def select_observations(recording: Recording, settings: Settings) -> RawGnss | N
     if s.period > 0.0 and used.any():
         used &= np.isin(raw.t, _keep_apart(np.unique(raw.t[used]), s.period))
     raw = raw.take(used)
-    raw = raw.take(primary(raw))
+    raw = raw.take(choose_primary(raw))
     return raw if len(raw) else None
 
 

@@ -35,12 +35,12 @@ from graphnav.config import Settings
 from graphnav.constraints.base import SAME_TIME, BuildContext, Constraint, Linearized
 from graphnav.core import rotation
 from graphnav.core.earth import LocalFrame
-from graphnav.core.rotation import Array, columns, mv
+from graphnav.core.rotation import Array, mv, stack_columns
 from graphnav.core.state import SECONDS, Parameter, States
-from graphnav.imu.dynamics import SCALE, as_biases, by_scale, scale_parameter
+from graphnav.imu.dynamics import SCALE, convert_to_biases, differentiate_by_scale, scale_parameter
 from graphnav.imu.preintegration import Intervals
 from graphnav.recording import Imu, Odometer, Recording
-from graphnav.recording.odometer import MeanSpeed, ReadingStatistics, faults
+from graphnav.recording.odometer import MeanSpeed, ReadingStatistics, find_faults
 
 MOUNTING = "mounting"
 AXLE = "axle"
@@ -101,7 +101,7 @@ class IntervalMotion:
         da, dg = states.ba - self.ba[rows], states.bg - self.bg[rows]
         if SCALE in parameters:
             scale = parameters[SCALE]
-            of_accel, of_gyro = as_biases(scale, force, rate)
+            of_accel, of_gyro = convert_to_biases(scale, force, rate)
             da, dg = da + of_accel, dg + of_gyro
         seen = np.empty((n, 3, 3))
         seen[:, 0], seen[:, 1] = states.v, self.frame.gravity_n(states.p) - states.v @ W.T
@@ -123,7 +123,9 @@ class IntervalMotion:
         }
         if SCALE in parameters:
             half = scale.shape[-1] // 2
-            J[SCALE] = np.concatenate([by_scale(by_bg, rate, half), by_scale(by_ba, force, half)], axis=-1)
+            J[SCALE] = np.concatenate(
+                [differentiate_by_scale(by_bg, rate, half), differentiate_by_scale(by_ba, force, half)], axis=-1
+            )
         return found, -seen[:, 2], J
 
 
@@ -131,10 +133,10 @@ def _rotate_to_vehicle(u: Array, mounting: Array) -> tuple[Array, Array, Array]:
     """R_vb u (N, 3), R_vb (N, 3, 3), and the derivative of R_vb u by the mounting angles (N, 3, 2)."""
     (ca, cb), (sa, sb) = np.cos(mounting).T, np.sin(mounting).T
     zero = np.zeros_like(ca)
-    R = columns(cb, sb * ca, -sb * sa, -sb, cb * ca, -cb * sa, zero, sa, ca).reshape(-1, 3, 3)
+    R = stack_columns(cb, sb * ca, -sb * sa, -sb, cb * ca, -cb * sa, zero, sa, ca).reshape(-1, 3, 3)
     out = mv(R, u)
     by_pitch = R[:, :, 2] * u[:, 1:2] - R[:, :, 1] * u[:, 2:]
-    return out, R, columns(by_pitch, out @ _BY_HEADING)
+    return out, R, stack_columns(by_pitch, out @ _BY_HEADING)
 
 
 @dataclass(frozen=True)
@@ -200,7 +202,7 @@ def build_interval_motion(scene: BuildContext) -> IntervalMotion:
     return IntervalMotion.of(scene.intervals, scene.share(find_moving_rows), scene.frame)
 
 
-def wheel_parameters(scene: BuildContext) -> tuple[Array, list[Parameter]]:
+def make_wheel_parameters(scene: BuildContext) -> tuple[Array, list[Parameter]]:
     """Lever arm (3,) of the point that does not slip, m, and the parameters of both constraints."""
     s, odometer = scene.settings.vehicle, scene.recording.odometer
     parameters = list(scale_parameter(scene.recording))
@@ -216,7 +218,7 @@ def wheel_parameters(scene: BuildContext) -> tuple[Array, list[Parameter]]:
     return lever, parameters
 
 
-def slow_error_parameter(name: str, density: Array, kind: type[Wheels]) -> Parameter:
+def make_slow_error_parameter(name: str, density: Array, kind: type[Wheels]) -> Parameter:
     """Gauss-Markov process (k,) of wheel errors that last for seconds: camber, wind, load, slip.
 
     Over long times it is equivalent to white noise of the density given (m/s/sqrt(Hz)), whose variance is 2 T sigma^2
@@ -246,7 +248,7 @@ class NonHolonomic(Wheels):
         if scene.recording.platform != "vehicle" or not s.nhc:
             return None
         rows, past = scene.share(find_moving_rows), scene.share(build_interval_motion)
-        lever_arm, parameters = wheel_parameters(scene)
+        lever_arm, parameters = make_wheel_parameters(scene)
         if s.body_sigma > 0:
             parameters.append(
                 Parameter(BODY, np.zeros(2), np.full(2, s.body_sigma), "rad s^2/m, of lateral and forward acceleration")
@@ -258,11 +260,11 @@ class NonHolonomic(Wheels):
         return cls(
             keyframe=rows + 1,
             past=past,
-            sigma=np.hypot(density, columns(right, up)),
-            unscaled=columns(right, up),
+            sigma=np.hypot(density, stack_columns(right, up)),
+            unscaled=stack_columns(right, up),
             lever_arm=lever_arm,
             parameters=tuple(parameters),
-            processes=(slow_error_parameter(NHC_ERROR, np.asarray(s.nhc_density), cls),),
+            processes=(make_slow_error_parameter(NHC_ERROR, np.asarray(s.nhc_density), cls),),
             **s.outliers,
         )
 
@@ -278,7 +280,7 @@ class NonHolonomic(Wheels):
             return Linearized(residual, found.derivatives(_SIDE_UP, parameters) | lasting, self.sigma[rows])
         slip, squat = parameters[BODY].T
         v, w, a = u[:, 1], omega[:, 2], found.forward
-        effect = columns(v * v * w, v * a)
+        effect = stack_columns(v * v * w, v * a)
         A, by_forward = np.repeat(_SIDE_UP, len(v), axis=0), np.zeros((len(v), 2))
         A[:, 0, 1], A[:, 1, 1], by_forward[:, 1] = -2.0 * slip * v * w, -squat * a, -squat * v
         jacobians = found.derivatives(A, parameters, by_forward)
@@ -295,7 +297,7 @@ class NonHolonomic(Wheels):
 
 def _average_speed(odometer: Odometer, imu: Imu) -> MeanSpeed:
     figures = ReadingStatistics.of(odometer)
-    return MeanSpeed.of(odometer, faults(odometer, imu, figures).spans, figures)
+    return MeanSpeed.of(odometer, find_faults(odometer, imu, figures).spans, figures)
 
 
 @dataclass(frozen=True)
@@ -329,7 +331,7 @@ class OdometerSpeed(Wheels):
             past = IntervalMotion.of(scene.intervals, rows, scene.frame)
         if not len(rows):
             return None
-        lever_arm, parameters = wheel_parameters(scene)
+        lever_arm, parameters = make_wheel_parameters(scene)
         walk = s.scale_walk / np.sqrt(60.0)
         parameters.append(Parameter(ODOMETER_SCALE, np.zeros(1), np.full(1, odometer.scale_sigma), "1", walk=walk))
         if odometer.delay_sigma > 0:
@@ -347,7 +349,7 @@ class OdometerSpeed(Wheels):
             reach=reach,
             lever_arm=lever_arm,
             parameters=tuple(parameters),
-            processes=(slow_error_parameter(ODOMETER_ERROR, density, cls),),
+            processes=(make_slow_error_parameter(ODOMETER_ERROR, density, cls),),
             **s.outliers,
         )
 

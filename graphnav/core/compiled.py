@@ -20,7 +20,7 @@ def can_compile() -> bool:
     return os.environ.get("GRAPHNAV_COMPILE") != "0" and find_spec("numba") is not None
 
 
-def compiled(function: F) -> F:
+def compile_once(function: F) -> F:
     """The function, compiled when it is called first.
 
     Those that call each other stand in one module: what is kept on disk is as old as the module it is of.

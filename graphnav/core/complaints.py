@@ -83,14 +83,14 @@ def _leaves(value: Any, key: str = "", depth: int = 0) -> Iterator[tuple[str, An
         yield key, value
 
 
-def complaint(source: str | Path, error: ValidationError, model: type[BaseModel], text: str = "") -> Note:
+def describe_invalid(source: str | Path, error: ValidationError, model: type[BaseModel], text: str = "") -> Note:
     """Describe the first error that pydantic reports; an unknown key before the missing key it may stand for.
 
     `text` is the file's content, for the line number.
     """
     first = min(error.errors(), key=lambda e: e["type"] != "extra_forbidden")
     loc = tuple(str(part) for part in first["loc"])
-    line = _line_of(text, loc)
+    line = _find_line(text, loc)
     where = f"{source}, line {line}: " if line else f"{source}: "
     described = _describe(first, loc, model)
     return Note(described.key, where + _WORD.sub(lambda word: f"{word[0][:_MAX_QUOTED]}...", described))
@@ -107,11 +107,11 @@ def _describe(first: Any, loc: tuple[str, ...], model: type[BaseModel]) -> Note:
         return Note("key.value", f"'{key}': {what}{_describe_key(loc, model)}" if key else what)
     if first["type"] in ("model_type", "model_attributes_type"):
         return Note("key.table", f"'{key}' must be a table: [{key}]")
-    what = f"{demand(first['msg'])}{_describe_key(loc, model)}"
+    what = f"{rephrase(first['msg'])}{_describe_key(loc, model)}"
     return Note("key.value", f"'{key}' = {shorten(first['input'])}: {what}")
 
 
-def demand(message: str) -> str:
+def rephrase(message: str) -> str:
     """What Pydantic says that a value should be, as what it must be."""
     words = re.sub(r"Input should (.*?)(, (unable to|got) .*)?$", r"must \1", message)
     return (
@@ -196,7 +196,7 @@ def _describe_key(loc: tuple[str, ...], model: type[BaseModel]) -> str:
     return ""
 
 
-def _line_of(text: str, loc: tuple[str, ...]) -> int | None:
+def _find_line(text: str, loc: tuple[str, ...]) -> int | None:
     """The line (1-based) of a key, or of the header of its table if the key is absent."""
     table: tuple[str, ...] = ()
     found, depth = None, 0

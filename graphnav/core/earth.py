@@ -14,7 +14,7 @@ from functools import cached_property
 import numpy as np
 
 from graphnav.core import rotation
-from graphnav.core.rotation import Array, columns
+from graphnav.core.rotation import Array, stack_columns
 
 A = 6378137.0  # semi-major axis, m
 F = 1.0 / 298.257223563  # flattening
@@ -34,7 +34,7 @@ def llh_to_ecef(llh: Array) -> Array:
     lat, lon, h = llh[..., 0], llh[..., 1], llh[..., 2]
     s, c = np.sin(lat), np.cos(lat)
     n = A / np.sqrt(1.0 - E2 * s * s)
-    return columns((n + h) * c * np.cos(lon), (n + h) * c * np.sin(lon), (n * (1 - E2) + h) * s)
+    return stack_columns((n + h) * c * np.cos(lon), (n + h) * c * np.sin(lon), (n * (1 - E2) + h) * s)
 
 
 def _find_normal(r: Array) -> tuple[Array, Array, Array]:
@@ -66,7 +66,7 @@ def ecef_to_llh(r: Array) -> Array:
 def enu_axes(llh: Array) -> Array:
     """R_ne: rows are the east, north and up axes in ECEF; (..., 3) -> (..., 3, 3)."""
     lat, lon = np.asarray(llh, dtype=float)[..., 0], np.asarray(llh, dtype=float)[..., 1]
-    return columns(*_list_enu_axes(np.sin(lat), np.cos(lat), np.sin(lon), np.cos(lon))).reshape(*lat.shape, 3, 3)
+    return stack_columns(*_list_enu_axes(np.sin(lat), np.cos(lat), np.sin(lon), np.cos(lon))).reshape(*lat.shape, 3, 3)
 
 
 def _list_enu_axes(sl: Array, cl: Array, so: Array, co: Array) -> tuple[Array, ...]:
@@ -152,10 +152,10 @@ class LocalFrame:
         return enu_axes(self.to_llh(p_n)) @ self.R_ne.T
 
     def level(self, p_n: Array) -> tuple[Array, Array]:
-        """(lat, lon, h) (n, 3) of positions in n, and `R_ln` there by `rotation.components`, (3, 3, n)."""
+        """(lat, lon, h) (n, 3) of positions in n, and `R_ln` there by `rotation.move_components_first`, (3, 3, n)."""
         r = self.r_e + p_n @ self.R_ne
         s, c, p = _find_normal(r)
-        llh = columns(np.arctan2(s, c), np.arctan2(r[:, 1], r[:, 0]), _find_height(r, s, c, p))
+        llh = stack_columns(np.arctan2(s, c), np.arctan2(r[:, 1], r[:, 0]), _find_height(r, s, c, p))
         axes = np.array(_list_enu_axes(s, c, r[:, 1] / p, r[:, 0] / p)).reshape(3, 3, -1)
         return llh, self.R_ne @ axes
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from pathlib import Path
 
-from graphnav.core.notes import key_of
+from graphnav.core.notes import get_key
 
 
 class GraphnavError(Exception):
@@ -20,7 +20,7 @@ class GraphnavError(Exception):
     def __init__(self, sentence: str = "", *, key: str = "") -> None:
         """Take the sentence and its key; a `Note` carries its key already."""
         super().__init__(sentence)
-        self.key = key or key_of(sentence)
+        self.key = key or get_key(sentence)
 
 
 class RecordingError(GraphnavError):

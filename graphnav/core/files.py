@@ -137,7 +137,7 @@ def open_file(path: Path, error: Kind = RecordingError, text: bool = True, limit
     limit : bytes that it may hold unpacked; None: what `GRAPHNAV_MAX_FILE_MB` says.
     """
     check_regular(path, error)
-    most = _limit(MAX_FILE, 10**6) if limit is None else limit
+    most = _read_limit(MAX_FILE, 10**6) if limit is None else limit
     try:
         plain = path.open("rb")
         size = os.fstat(plain.fileno()).st_size
@@ -145,7 +145,7 @@ def open_file(path: Path, error: Kind = RecordingError, text: bool = True, limit
         plain.seek(0)
     except OSError as cause:
         raise error(f"{path}: cannot be read ({cause.strerror})", key="file.unreadable") from None
-    line = _limit(MAX_LINE, 1000) if text else None
+    line = _read_limit(MAX_LINE, 1000) if text else None
     return Opened(_Bounded(path, plain, magic == _GZIP, size, most, line, error), size, magic == _GZIP)
 
 
@@ -163,7 +163,7 @@ def check_size(path: Path, count: int, error: Kind = RecordingError) -> None:
     GraphnavError
         Of the kind given.
     """
-    if count > (most := _limit(MAX_FILE, 10**6)):
+    if count > (most := _read_limit(MAX_FILE, 10**6)):
         raise error(_refuse_size(path, most, packed=True), key="file.large")
 
 
@@ -209,7 +209,7 @@ def _parse_whole(digits: str) -> int:
     return int(digits)
 
 
-def _limit(name: str, unit: int) -> int:
+def _read_limit(name: str, unit: int) -> int:
     """A limit in bytes, from the environment or its default."""
     stated = os.environ.get(name, "")
     if not stated:
@@ -294,7 +294,7 @@ class _Bounded(io.RawIOBase):
         super().close()
 
 
-def sha256(path: Path) -> str:
+def hash_file(path: Path) -> str:
     """The SHA-256 of a file, in hexadecimal digits."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()

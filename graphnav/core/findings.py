@@ -32,7 +32,7 @@ class Finding:
         return {"key": self.key, "severity": self.severity, "sentence": self.sentence}
 
 
-def period_of(t: Array) -> float:
+def compute_period(t: Array) -> float:
     """Median step of time stamps, s; NaN for fewer than two."""
     every = max(1, len(t) // 100_000)  # a hundred thousand steps are enough
     if len(t) < 2:
@@ -43,7 +43,7 @@ def period_of(t: Array) -> float:
     return float(steps[half] if len(steps) % 2 else 0.5 * (steps[half - 1] + steps[half]))
 
 
-def runs_of(mask: NDArray[Any]) -> list[tuple[int, int]]:
+def find_runs(mask: NDArray[Any]) -> list[tuple[int, int]]:
     """[start, end) of every run of True."""
     edges = np.flatnonzero(np.diff(np.r_[0, mask.astype(np.int8), 0]))
     return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))

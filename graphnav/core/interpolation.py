@@ -83,7 +83,7 @@ def interpolate(
             seen = _blend(_apply(np.swapaxes(R[k], -1, -2), v[k]), _apply(np.swapaxes(R[nxt], -1, -2), v[nxt]), s)
             turned = _apply(R_at, seen)
             v_at = np.where(np.isfinite(turned), turned, v_at)
-    cov = full_covariance(trajectory)
+    cov = fill_covariance(trajectory)
     cov_at = None if cov is None else _blend(cov[k], cov[nxt], s[:, :, None])
 
     swing = None
@@ -130,7 +130,7 @@ def differentiate(trajectory: Trajectory, max_gap: float) -> Array:
     return v
 
 
-def full_covariance(trajectory: Trajectory) -> Array | None:
+def fill_covariance(trajectory: Trajectory) -> Array | None:
     """The covariance (K, 9, 9), or a diagonal one made of the sigmas, NaN where they are missing."""
     if trajectory.covariance is not None:
         return trajectory.covariance
@@ -153,21 +153,21 @@ def fit_yaw(source: Array, target: Array) -> tuple[float, Array]:
     a, b = source[:, :2], target[:, :2]
     a0, b0 = a - a.mean(0), b - b.mean(0)
     yaw = float(np.arctan2(np.sum(a0[:, 0] * b0[:, 1] - a0[:, 1] * b0[:, 0]), np.sum(a0 * b0)))
-    offset = b.mean(0) - yaw_matrix(yaw)[:2, :2] @ a.mean(0)
+    offset = b.mean(0) - make_yaw_matrix(yaw)[:2, :2] @ a.mean(0)
     return yaw, np.append(offset, np.mean(target[:, 2] - source[:, 2]))
 
 
-def yaw_matrix(yaw: float) -> Array:
+def make_yaw_matrix(yaw: float) -> Array:
     """Rotation about up by `yaw` rad, anticlockwise, (3, 3)."""
     return rotation.exp(np.array([0.0, 0.0, yaw]))
 
 
 def place_on_earth(trajectory: Trajectory, frame: LocalFrame, yaw: float, offset: Array) -> Trajectory:
     """Place a trajectory of a local frame on the Earth: p_n = Rz(yaw) p + offset in `frame`."""
-    R_nm = yaw_matrix(yaw)
+    R_nm = make_yaw_matrix(yaw)
     p_n = trajectory.llh @ R_nm.T + offset
     R_lm = frame.R_ln(p_n) @ R_nm
-    cov = trajectory.covariance if trajectory.covariance is not None else full_covariance(trajectory)
+    cov = trajectory.covariance if trajectory.covariance is not None else fill_covariance(trajectory)
     if cov is not None:
         turn = np.zeros((9, 9))
         turn[0:3, 0:3] = turn[3:6, 3:6] = R_nm

@@ -13,10 +13,10 @@ import numpy as np
 
 def write_json(path: Path, values: Any) -> None:
     """Write plain JSON: arrays as lists, anything not finite as null."""
-    path.write_text(json_text(values) + "\n", encoding="utf-8")
+    path.write_text(format_json(values) + "\n", encoding="utf-8")
 
 
-def json_text(values: Any) -> str:
+def format_json(values: Any) -> str:
     """Values as the text `write_json` writes: indented, lists of numbers or words on one line."""
     return _write_value(values, "\n")
 

@@ -8,7 +8,7 @@ from contextlib import suppress
 from pathlib import Path
 
 
-def peak_memory_mb() -> float:
+def read_peak_memory_mb() -> float:
     """Peak memory of this process, MB of 2^20 bytes."""
     try:
         # preferred where it exists: ru_maxrss of a forked process includes its parent's memory

@@ -22,7 +22,7 @@ class Note(str):
         return Note, (self.key, str(self))
 
 
-def key_of(sentence: str) -> str:
+def get_key(sentence: str) -> str:
     """The key of a sentence, "" if it has none."""
     return sentence.key if isinstance(sentence, Note) else ""
 

@@ -38,7 +38,7 @@ def skew(v: Array) -> Array:
     return (v @ _GENERATORS).reshape(*v.shape, 3)
 
 
-def columns(*parts: Array) -> Array:
+def stack_columns(*parts: Array) -> Array:
     """``np.stack(parts, axis=-1)``, several times faster for the few rows that a filter asks for."""
     out = np.empty((*np.shape(parts[0]), len(parts)))
     for k, part in enumerate(parts):
@@ -51,7 +51,7 @@ def mv(M: Array, v: Array) -> Array:
     return (M @ v[..., None])[..., 0]
 
 
-def components(M: Array) -> Array:
+def move_components_first(M: Array) -> Array:
     """Matrices or vectors (n, ...) as (..., n), so that operations on a component run over contiguous numbers."""
     return np.ascontiguousarray(np.moveaxis(M, 0, -1))
 
@@ -60,7 +60,7 @@ def multiply(A: Array, B: Array) -> Array:
     """``A @ B`` of (n, 3, 3); several times faster where they are many."""
     if len(A) < _MANY:
         return np.asarray(A @ B)
-    A, B, out = components(A), components(B), np.empty((len(A), 3, 3))
+    A, B, out = move_components_first(A), move_components_first(B), np.empty((len(A), 3, 3))
     for i in range(3):
         for j in range(3):
             out[:, i, j] = A[i, 0] * B[0, j] + A[i, 1] * B[1, j] + A[i, 2] * B[2, j]
@@ -72,7 +72,7 @@ def apply(M: Array, v: Array) -> Array:
     return mv(M, v) if len(M) < _MANY else np.einsum("nij,nj->ni", M, v)
 
 
-def coefficients(theta2: Array) -> tuple[Array, Array, Array, Array]:
+def compute_coefficients(theta2: Array) -> tuple[Array, Array, Array, Array]:
     """sin(x)/x, (1 - cos x)/x^2, (x - sin x)/x^3 and (1/2 - (1 - cos x)/x^2)/x^2 for x^2 = theta2.
 
     The first four coefficients of the series that Exp, its Jacobians and integrals are made of; below
@@ -131,7 +131,7 @@ def log(R: Array) -> Array:
     R = np.asarray(R, dtype=float)
     if R.size == 9 and (one := _log_one(*R.ravel().tolist())) is not None:
         return one.reshape(R.shape[:-1])
-    w = 0.5 * columns(R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1])
+    w = 0.5 * stack_columns(R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1])
     c = 0.5 * (R[..., 0, 0] + R[..., 1, 1] + R[..., 2, 2] - 1.0)
     s = np.sqrt(np.sum(w * w, axis=-1) + _TINY)
     v = w * (np.arctan2(s, c) / s)[..., None]
@@ -159,7 +159,7 @@ def _log_one(
 def right_jacobian(v: Array) -> Array:
     """Jr with Exp(v + d) = Exp(v) Exp(Jr d) to first order; (..., 3) -> (..., 3, 3)."""
     v = np.asarray(v, dtype=float)
-    _, b, c, _ = coefficients(np.sum(v * v, axis=-1))
+    _, b, c, _ = compute_coefficients(np.sum(v * v, axis=-1))
     return _evaluate_polynomial(v, -b, c)
 
 
@@ -169,7 +169,7 @@ def right_jacobian_inverse(v: Array) -> Array:
     if v.size == 3:
         return _right_jacobian_inverse_one(*v.ravel().tolist()).reshape(*v.shape, 3)
     theta2 = np.sum(v * v, axis=-1)
-    a, b, _, _ = coefficients(theta2)
+    a, b, _, _ = compute_coefficients(theta2)
     small = theta2 < 1e-4
     second = np.where(small, 1.0 / 12.0 + theta2 / 720.0, (1.0 - 0.5 * a / b) / np.where(small, 1.0, theta2))
     return _evaluate_polynomial(v, np.full_like(theta2, 0.5), second)
@@ -199,7 +199,7 @@ def to_quaternion(R: Array) -> Array:
     R = np.asarray(R, dtype=float)
     x, y, z = R[..., 0, 0], R[..., 1, 1], R[..., 2, 2]
     trace = x + y + z
-    products = columns(  # of components, four times
+    products = stack_columns(  # of components, four times
         1 + trace, 1 + 2 * x - trace, 1 + 2 * y - trace, 1 + 2 * z - trace,
         R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1],
         R[..., 0, 1] + R[..., 1, 0], R[..., 0, 2] + R[..., 2, 0], R[..., 1, 2] + R[..., 2, 1],
@@ -261,12 +261,12 @@ def _list_rph_jacobian(sr: Array, cr: Array, tp: Array, cp: Array) -> list[list[
 
 
 def find_rph(R_nb: Array, R_ln: Array) -> tuple[Array, Array]:
-    """`to_rph` of R_ln R_nb, (n, 3), and `rph_jacobian` there, (3, 3, n); of `components` (3, 3, n)."""
+    """`to_rph` of R_ln R_nb, (n, 3), and `rph_jacobian` there, (3, 3, n); of `move_components_first` (3, 3, n)."""
     x, y, z = np.einsum("in,ijn->jn", R_ln[2], R_nb)
     cp = np.maximum(np.hypot(x, z), _LEAST_COSINE)
     heading = np.arctan2(*(np.einsum("in,in->n", R_ln[i], R_nb[:, 1]) for i in (0, 1)))
     J: Array = np.array(_list_rph_jacobian(-x / cp, z / cp, y / cp, cp))
-    return columns(np.arctan2(-x, z), np.arctan2(y, cp), np.mod(heading, 2 * np.pi)), J
+    return stack_columns(np.arctan2(-x, z), np.arctan2(y, cp), np.mod(heading, 2 * np.pi)), J
 
 
 def wrap(angle: Array) -> Array:

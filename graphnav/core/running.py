@@ -19,20 +19,20 @@ def run_median(x: Array, size: int) -> Array:
         from scipy.ndimage import median_filter
 
         return np.asarray(median_filter(x, size=(size, *(1,) * (x.ndim - 1)), mode="nearest"))
-    return np.asarray(np.partition(_windows(x, size), size // 2, axis=-1)[..., size // 2])
+    return np.asarray(np.partition(_view_windows(x, size), size // 2, axis=-1)[..., size // 2])
 
 
 def run_mean(x: Array, size: int) -> Array:
     """Of rows x (K,) or (K, n)."""
-    return np.asarray(_windows(x, size).mean(axis=-1))
+    return np.asarray(_view_windows(x, size).mean(axis=-1))
 
 
 def run_maximum(x: Array, size: int) -> Array:
     """Of rows x (K,) or (K, n)."""
-    return np.asarray(_windows(x, size).max(axis=-1))
+    return np.asarray(_view_windows(x, size).max(axis=-1))
 
 
-def running_sum(terms: Array) -> Array:
+def sum_running(terms: Array) -> Array:
     """Running sums along the first axis, from zero: one more than there are terms."""
     out = np.zeros((len(terms) + 1, *terms.shape[1:]))
     if out[0].size < 100:
@@ -43,7 +43,7 @@ def running_sum(terms: Array) -> Array:
     return out
 
 
-def _windows(x: Array, size: int) -> Array:
+def _view_windows(x: Array, size: int) -> Array:
     """(K, ..., size) views of rows."""
     before = size // 2
     padded = np.pad(x, ((before, size - 1 - before), *((0, 0),) * (x.ndim - 1)), mode="edge")

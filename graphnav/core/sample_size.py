@@ -10,7 +10,7 @@ from graphnav.core.rotation import Array
 _NONE = 0.05  # autocorrelation below which it is indistinguishable from zero
 
 
-def effective_size(z: Array) -> float:
+def compute_effective_size(z: Array) -> float:
     """Effective size of evenly spaced columns z (N, m): N over the integrated autocorrelation, summed over the
     columns.
     """
@@ -26,7 +26,7 @@ def effective_size(z: Array) -> float:
     return total
 
 
-def effective_epochs(x: Array) -> float:
+def count_effective_epochs(x: Array) -> float:
     """How many independent epochs errors over their sigmas (N, k), in the order of time, are worth; at least one.
 
     In their mean square, that is: n over 1 + 2 sum r^2 of their autocorrelations r, as squares of Gaussians correlate

@@ -83,6 +83,6 @@ def _list_missing(folder: Path) -> list[Path]:
     return [path for path in (folder, *folder.parents) if not path.exists()]
 
 
-def final_path(files: list[Path], part: Path, folder: Path) -> list[Path]:
+def resolve_final_path(files: list[Path], part: Path, folder: Path) -> list[Path]:
     """Where files of a staged folder are moved to; others stay where they are."""
     return [folder / file.relative_to(part) if file.is_relative_to(part) else file for file in files]

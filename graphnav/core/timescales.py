@@ -32,31 +32,31 @@ _LEAPS = np.array(
 LEAP = float(len(_LEAPS))  # s, GPS time minus UTC since the last of them
 
 
-def leap_seconds(utc: Array) -> Array:
+def count_leap_seconds(utc: Array) -> Array:
     """GPS minus UTC (s) at dates of type datetime64."""
     return np.searchsorted(_LEAPS, utc, side="right").astype(float)
 
 
 def utc_to_gps(utc: Array) -> Array:
     """Seconds since the GPS epoch of UTC dates (datetime64[us])."""
-    return (utc - _EPOCH) / np.timedelta64(1, "us") * 1e-6 + leap_seconds(utc)
+    return (utc - _EPOCH) / np.timedelta64(1, "us") * 1e-6 + count_leap_seconds(utc)
 
 
 def unix_to_gps(t: Array) -> Array:
     """Seconds since the GPS epoch of Unix time."""
     utc = (np.asarray(t) * 1e6).astype("int64").astype("datetime64[us]")
-    return np.asarray(t) - GPS_TO_UNIX + leap_seconds(utc)
+    return np.asarray(t) - GPS_TO_UNIX + count_leap_seconds(utc)
 
 
 def gps_to_utc(t: Array) -> Array:
     """UTC (datetime64[us]) of seconds since the GPS epoch; exact except within the second before a leap."""
     gps = _EPOCH + np.round(np.asarray(t, dtype=float) * 1e6).astype("timedelta64[us]")
-    leap = leap_seconds(gps)
-    leap = leap_seconds(gps - (leap * 1e6).astype("timedelta64[us]"))
+    leap = count_leap_seconds(gps)
+    leap = count_leap_seconds(gps - (leap * 1e6).astype("timedelta64[us]"))
     return np.asarray(gps - (leap * 1e6).astype("timedelta64[us]"))
 
 
-def of_week(gps: Array) -> tuple[Array, float]:
+def date_week_times(gps: Array) -> tuple[Array, float]:
     """Times in seconds of the GPS week of the first, and where that week begins (s since the GPS epoch)."""
     zero = WEEK * np.floor(gps[0] / WEEK)
     return gps - zero, float(zero)
@@ -92,7 +92,7 @@ class ClockOffset:
     words: str
 
 
-def between_clocks(t: float, zero: float | None, u: float, other: float | None) -> ClockOffset | None:
+def compute_clock_offset(t: float, zero: float | None, u: float, other: float | None) -> ClockOffset | None:
     """The offset from a clock that reads `u` to one that reads `t`, s; their zeros (s since the GPS epoch) may be
     known.
 
@@ -111,8 +111,8 @@ def between_clocks(t: float, zero: float | None, u: float, other: float | None) 
     offset = second - first
     week = second if unix[0] else first
     if unix[0] == unix[1] or week % WEEK:
-        return ClockOffset(offset, f"the clocks count from {clock_words(first)} and {clock_words(second)}")
-    leap = float(leap_seconds(gps_to_utc(np.array([week])))[0])
+        return ClockOffset(offset, f"the clocks count from {format_clock(first)} and {format_clock(second)}")
+    leap = float(count_leap_seconds(gps_to_utc(np.array([week])))[0])
     begins = week + GPS_TO_UNIX - leap
     return ClockOffset(
         offset,
@@ -121,7 +121,7 @@ def between_clocks(t: float, zero: float | None, u: float, other: float | None) 
     )
 
 
-def clock_words(gps_zero: float) -> str:
+def format_clock(gps_zero: float) -> str:
     """The words for a clock that `parse_clock` reads: a GPS week, Unix time, or the UTC date of its zero."""
     if -GPS_TO_UNIX <= gps_zero < -GPS_TO_UNIX + 60.0:
         return "unix"

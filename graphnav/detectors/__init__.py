@@ -19,14 +19,14 @@ from graphnav.config.detectors import FUSED
 from graphnav.core.errors import ConfigError
 from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
-from graphnav.detectors.base import NONE, Detection, Detections, longer_than, mask_inside, subtract_spans
+from graphnav.detectors.base import NONE, Detection, Detections, drop_short, mask_inside, subtract_spans
 from graphnav.detectors.fusion import StopDecision, decide, decide_fused, merge_decisions
-from graphnav.detectors.glrt import STATISTICS, glrt_statistic
+from graphnav.detectors.glrt import STATISTICS, compute_glrt
 from graphnav.detectors.scene import Detector, Scene
 from graphnav.detectors.stance import detect_stances
 from graphnav.recording import Recording
 
-__all__ = ["Detection", "Detections", "Detector", "detect", "glrt_statistic", "list_detectors", "stops"]
+__all__ = ["Detection", "Detections", "Detector", "compute_glrt", "detect", "find_stops", "list_detectors"]
 
 _SHORTEST_RECORDING = 3.0  # s, the shortest recording that is examined
 
@@ -133,7 +133,7 @@ def check_own(kinds: Sequence[type[Detector]]) -> tuple[type[Detector], ...]:
     return tuple(sorted(kinds, key=lambda kind: kind.name))
 
 
-def stops(
+def find_stops(
     recording: Recording, settings: Settings, since: float, until: float, before: Array, new: float
 ) -> Array | None:
     """The stationary intervals of a vehicle between two times, (M, 2) s, as `detect` finds them, without its
@@ -149,7 +149,7 @@ def stops(
     if not recording.duration >= _SHORTEST_RECORDING or not scene.period > 0.0:
         return NONE
     certain = scene.certain
-    left = longer_than(subtract_spans(np.array([[recording.start, recording.end]]), certain), d.fusion.min_duration)
+    left = drop_short(subtract_spans(np.array([[recording.start, recording.end]]), certain), d.fusion.min_duration)
     before = np.clip(before, since, until)
     in_doubt = any(((certain[:, 0] < b) & (certain[:, 1] > a)).any() for a, b in before if b > a)
     if not in_doubt and not ((left[:, 0] < until) & (left[:, 1] > new)).any():

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from graphnav.core.rotation import Array, columns
+from graphnav.core.rotation import Array, stack_columns
 
 Mask = NDArray[np.bool_]
 
@@ -50,13 +50,13 @@ class Detections:
         raise KeyError(name)
 
 
-def spans_of(mask: Mask, t: Array, half: float = 0.0) -> Array:
+def find_spans(mask: Mask, t: Array, half: float = 0.0) -> Array:
     """(M, 2) spans covered by runs of True, where each row of t stands for `half` seconds on either side."""
     padded = np.zeros(len(mask) + 2, dtype=bool)
     padded[1:-1] = mask
     edges = np.flatnonzero(padded[1:] != padded[:-1])
     first, last = edges[::2], edges[1::2] - 1
-    return merge_spans(columns(t[first] - half, t[last] + half)) if len(first) else NONE
+    return merge_spans(stack_columns(t[first] - half, t[last] + half)) if len(first) else NONE
 
 
 def merge_spans(spans: Array, gap: float = 0.0) -> Array:
@@ -89,7 +89,7 @@ def subtract_spans(spans: Array, taken: Array) -> Array:
     return np.array(out) if out else NONE
 
 
-def longer_than(spans: Array, shortest: float) -> Array:
+def drop_short(spans: Array, shortest: float) -> Array:
     """The spans that last at least `shortest` seconds."""
     return spans[spans[:, 1] - spans[:, 0] >= shortest] if len(spans) else NONE
 
@@ -110,7 +110,7 @@ def mask_within(t: Array, spans: Array, half: float) -> Mask:
     return np.asarray((k >= 0) & (t + half <= spans[np.maximum(k, 0), 1]))
 
 
-def seconds_in(spans: Array, of: Array) -> Array:
+def measure_overlap(spans: Array, of: Array) -> Array:
     """(M,) s of each span of `of` (M, 2) that is covered by `spans` (ordered, disjoint)."""
     if not len(spans) or not len(of):
         return np.zeros(len(of))
@@ -120,6 +120,6 @@ def seconds_in(spans: Array, of: Array) -> Array:
     return np.asarray(upto[:, 1] - upto[:, 0])
 
 
-def union(parts: Sequence[Array]) -> Array:
+def unite(parts: Sequence[Array]) -> Array:
     """The union of several sets of spans."""
     return merge_spans(np.concatenate(parts)) if parts else NONE

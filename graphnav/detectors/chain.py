@@ -130,7 +130,7 @@ def find_speed_beside(b: Blocks, span: Array, way: int) -> Outwards | None:
     return Outwards(way, t[n0 : n0 + n], speed, tolerance)
 
 
-def at_rest_until(b: Blocks, span: Array, way: int, most: float, limit: float) -> float:
+def find_end_of_rest(b: Blocks, span: Array, way: int, most: float, limit: float) -> float:
     """Time up to which the force, integrated outwards from one end of a stop, stays below a speed.
 
     Parameters
@@ -173,7 +173,7 @@ def _level_force(force: Array, omega: Array, still: int, period: float) -> tuple
     return force @ level - 1j * g * tilt, yaw
 
 
-def moving_by_chain(links: list[Link], known: Array) -> np.ndarray:
+def find_moving_by_chain(links: list[Link], known: Array) -> np.ndarray:
     """Which of M spans move, given the M - 1 links between them and the speeds that are known.
 
     Parameters

@@ -25,11 +25,11 @@ from graphnav.config.detectors import FftSettings
 from graphnav.core.earth import MG
 from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
-from graphnav.detectors.base import NONE, Detection, Mask, mask_within, spans_of
+from graphnav.detectors.base import NONE, Detection, Mask, find_spans, mask_within
 from graphnav.detectors.motion import Speeds
 from graphnav.detectors.scene import Detector, Labels, Scene
-from graphnav.detectors.spectrum import FEWEST_WINDOWS, LOWEST, IdleLine, Windows, idle_line, peaks
-from graphnav.detectors.thresholds import log_statistic, valley
+from graphnav.detectors.spectrum import FEWEST_WINDOWS, LOWEST, IdleLine, Windows, find_idle_line, find_peaks
+from graphnav.detectors.thresholds import find_valley, log_statistic
 
 LINE_OF_THE_PAPER = 12.495  # Hz, the idle line that the paper's bands belong to
 _MET = 0.7  # share of stationary windows that must meet a ratio for it to be required
@@ -82,10 +82,10 @@ def _detect(scene: Scene, labels: Labels | None, shown: bool) -> Detection:
     inner = whole & (
         mask_within(t, labels.still, half) if labels else (quiet < 1.0) & ~mask_within(t, scene.certain, half)
     )
-    line = idle_line(w, np.flatnonzero(inner)) if settings.find_line else None
+    line = find_idle_line(w, np.flatnonzero(inner)) if settings.find_line else None
     notes: list[str] = []
     if settings.find_line and line is None:
-        notes.append(Note("detectors.fft.no_line", _no_line(int(inner.sum()), settings, labels is None)))
+        notes.append(Note("detectors.fft.no_line", _note_no_line(int(inner.sum()), settings, labels is None)))
         if not shown:
             return Detection("fft", t, np.full(w.count, np.nan), 1.0, t < t, NONE, tuple(notes))
     factor = 1.0 if line is None else line.frequency / LINE_OF_THE_PAPER
@@ -128,7 +128,7 @@ def _detect(scene: Scene, labels: Labels | None, shown: bool) -> Detection:
     }
     if line is not None:
         details["idle_line"] = np.array([line.frequency, line.lowest, line.highest])
-    spans = spans_of(mask, t, half)
+    spans = find_spans(mask, t, half)
     return Detection("fft", t, found, 1.0, mask, spans, tuple(notes), details)
 
 
@@ -140,7 +140,7 @@ def _weigh_idling(w: Windows, settings: FftSettings) -> Array:
     """
     height = _measure(w, [(0.0, LOWEST)])[0][:, :, 0]
     x = log_statistic((height / _find_limits(settings)).max(axis=1))
-    split = valley(x, float(np.nanmin(x)), 0.0, FEWEST_WINDOWS)
+    split = find_valley(x, float(np.nanmin(x)), 0.0, FEWEST_WINDOWS)
     return np.asarray(10.0 ** (x - (0.0 if split is None else split)))
 
 
@@ -186,9 +186,9 @@ def _measure(w: Windows, bands: Sequence[tuple[float, float]]) -> tuple[Array, A
     shown = int(np.searchsorted(f, _SPECTROGRAM_END))
     keep = np.unique(np.linspace(0, w.count - 1, _COLUMNS).astype(int))
     rows = []
-    for part, a in w.amplitudes():
+    for part, a in w.compute_amplitudes():
         for k, (low, high) in enumerate(bands):
-            where[part, :, k], height[part, :, k] = peaks(a, f, low, high)
+            where[part, :, k], height[part, :, k] = find_peaks(a, f, low, high)
         inside = keep[(keep >= part.start) & (keep < part.stop)] - part.start
         rows.append(a[inside, 1, :shown])
     return height, where, keep, np.concatenate(rows)
@@ -234,7 +234,7 @@ def _describe(line: IdleLine) -> str:
     return f"idle line at {line.frequency:.2f} Hz{drift}, {second}{rest}"
 
 
-def _no_line(windows: int, settings: FftSettings, alone: bool) -> str:
+def _note_no_line(windows: int, settings: FftSettings, alone: bool) -> str:
     if windows < FEWEST_WINDOWS:
         return f"no idle line: no {settings.window + 2 * settings.step:.3g} s are still enough to look for one"
     return "no idle line from 8 to 50 Hz where the vehicle stands: engine off, electric, or too faint for the IMU; " + (

@@ -25,18 +25,26 @@ from graphnav.core.rotation import Array
 from graphnav.detectors.base import (
     NONE,
     Detection,
-    longer_than,
+    drop_short,
+    find_spans,
     mask_within,
     merge_spans,
-    spans_of,
     subtract_spans,
-    union,
+    unite,
 )
-from graphnav.detectors.chain import LONGEST, Link, Outwards, at_rest_until, find_speed_beside, link, moving_by_chain
-from graphnav.detectors.low_band import Scale, low_band
+from graphnav.detectors.chain import (
+    LONGEST,
+    Link,
+    Outwards,
+    find_end_of_rest,
+    find_moving_by_chain,
+    find_speed_beside,
+    link,
+)
+from graphnav.detectors.low_band import Scale, compute_low_band
 from graphnav.detectors.motion import Speeds, take_median
 from graphnav.detectors.scene import Detector, Labels, Scene
-from graphnav.detectors.windows import Blocks, kernel, share_of, smooth_rows
+from graphnav.detectors.windows import Blocks, make_kernel, share_of, smooth_rows
 
 LOW_BAND, FFT = "low_band_glrt", "fft"
 _EDGE_SEARCH = 3.0  # s about an end in which the edge is sought
@@ -52,9 +60,9 @@ _CLEAR_MOTION = 10.0  # multiple of the low-band GLRT's threshold at which the v
 _REACH = 0.3  # s, of the low-pass filter: closer to the recording's ends no edge can be found
 
 
-def edges(b: Blocks, spans: Array, s: Scale, threshold: float) -> Array:
+def trim_edges(b: Blocks, spans: Array, s: Scale, threshold: float) -> Array:
     """The spans with ends where the low-passed rows depart from their mean just inside."""
-    h = kernel(b.period)
+    h = make_kernel(b.period)
     out = []
     white = np.r_[np.full(3, 1.0 / s.force), np.full(3, 1.0 / s.rate)]
     for start, end in spans:
@@ -94,7 +102,7 @@ def _leave(b: Blocks, h: Array, white: Array, middle: float, end: float, way: in
     return float(t[max(stop - 1, begin)])
 
 
-def _without_speed(b: Blocks, spans: Array, settings: FusionSettings) -> Array:
+def _cut_at_speed(b: Blocks, spans: Array, settings: FusionSettings) -> Array:
     """The spans cut where the force, integrated from `_EDGE_SEARCH` s inside, leads to a speed: braking that looked
     stationary.
     """
@@ -105,30 +113,30 @@ def _without_speed(b: Blocks, spans: Array, settings: FusionSettings) -> Array:
         if inside <= 0.0:
             continue
         first, last = (
-            at_rest_until(b, np.array([start + inside, end]), -1, inside, limit),
-            at_rest_until(b, np.array([start, end - inside]), 1, inside, limit),
+            find_end_of_rest(b, np.array([start + inside, end]), -1, inside, limit),
+            find_end_of_rest(b, np.array([start, end - inside]), 1, inside, limit),
         )
         out[k] = max(start, first), min(end, last)
     return out[out[:, 1] > out[:, 0]]
 
 
-def candidates(scene: Scene, found: Detection) -> tuple[Array, Array, tuple[str, ...]]:
+def find_candidates(scene: Scene, found: Detection) -> tuple[Array, Array, tuple[str, ...]]:
     """Candidates of a detector, with edges and without those that move; spans of certain motion; notes."""
     b, speeds, certain = scene.blocks, scene.known, scene.certain
     by_rows = found.name == LOW_BAND  # its windows are of the rows in which edges are sought
     # a threshold raised by the data applies to windows; an edge is where the noise and sway of single rows end
     limit = min(float(np.max(found.threshold)), _EDGE) if by_rows else _EDGE
-    spans = edges(b, found.intervals, scene.share(low_band)[1], limit)
+    spans = trim_edges(b, found.intervals, scene.share(compute_low_band)[1], limit)
     if not by_rows:
-        spans = _without_speed(b, spans, scene.settings.fusion)
-    spans = merge_spans(longer_than(spans, 3.0 * b.period))
+        spans = _cut_at_speed(b, spans, scene.settings.fusion)
+    spans = merge_spans(drop_short(spans, 3.0 * b.period))
     if not len(spans):
         return NONE, certain, ()
     certain = _screen_motion(b, spans, speeds, certain)
     known = np.array([_find_speed(speeds, span) for span in spans])
-    moves = np.array([_leads_to_speed(b, span, speeds, scene.settings.fusion) for span in spans]) & np.isnan(known)
+    moves = np.array([_contradicts_speed(b, span, speeds, scene.settings.fusion) for span in spans]) & np.isnan(known)
     rest = np.flatnonzero(~moves)  # a moving vehicle may brake steadily: the integral of its force counts, not the mean
-    moves[rest] = moving_by_chain([link(b, *pair) for pair in pairwise(spans[rest])], known[rest])
+    moves[rest] = find_moving_by_chain([link(b, *pair) for pair in pairwise(spans[rest])], known[rest])
     notes = []
     measured = int((np.nan_to_num(known) > 0.0).sum())
     if measured:
@@ -159,7 +167,7 @@ def candidates(scene: Scene, found: Detection) -> tuple[Array, Array, tuple[str,
         )
     spans = subtract_spans(spans[~moves], certain)
     if not by_rows and len(certain):  # ends set by certain motion are as uncertain as its timing
-        spans = _without_speed(b, spans, scene.settings.fusion)
+        spans = _cut_at_speed(b, spans, scene.settings.fusion)
     return spans, certain, tuple(notes)
 
 
@@ -184,7 +192,7 @@ def _share_still_in_motion(found: Detection, certain: Array) -> float:
     return float(found.mask[moving].mean()) if moving.sum() * step > _ENOUGH_MOTION else 0.0
 
 
-def _leads_to_speed(b: Blocks, span: Array, speeds: list[Speeds], settings: FusionSettings) -> bool:
+def _contradicts_speed(b: Blocks, span: Array, speeds: list[Speeds], settings: FusionSettings) -> bool:
     """Whether the speeds last measured before a span, or first after it, contradict a stop there.
 
     Single epochs do not count, as elsewhere, and every speed may be as late as an odometer's.
@@ -230,7 +238,7 @@ def _count(n: int) -> str:
 
 def _find_speed(speeds: list[Speeds], span: Array) -> float:
     """Speed in a span in which nothing changes, by the sensor with the most epochs; NaN if there are none."""
-    found = [s.speed_in(span) for s in speeds]
+    found = [s.measure_speed(span) for s in speeds]
     return float(np.nanmax(found)) if not np.isnan(found).all() else float("nan")
 
 
@@ -265,7 +273,7 @@ def join_idling(b: Blocks, spans: Array, idling: Array, settings: FusionSettings
             further = way * (over[0, side] - span[side]) if len(over) else 0.0
             if further < _WORTH:
                 continue
-            until = at_rest_until(b, span, way, min(further, _FURTHEST), limit)
+            until = find_end_of_rest(b, span, way, min(further, _FURTHEST), limit)
             # one second is left for an acceleration that the integral has only begun to show
             if way * (until - span[side]) > _WORTH:
                 out[k, side] = until - way * _WORTH
@@ -283,8 +291,8 @@ def fuse(b: Blocks, spans: Array, idling: Array, certain: Array, settings: Fusio
         first = np.where(spans[:, 0] - b.t[0] < _REACH, b.t[0], spans[:, 0] + settings.margin)
         last = np.where(b.end[-1] - spans[:, 1] < _REACH, b.end[-1], spans[:, 1] - settings.margin)
         spans = np.stack([first, last], -1)
-    spans = longer_than(spans, settings.min_duration)
-    return spans, longer_than(subtract_spans(spans, still), settings.margin + _REACH)
+    spans = drop_short(spans, settings.min_duration)
+    return spans, drop_short(subtract_spans(spans, still), settings.margin + _REACH)
 
 
 @dataclass(frozen=True)
@@ -300,7 +308,7 @@ class StopDecision:
 def decide(scene: Scene, detector: type[Detector], shown: bool) -> StopDecision:
     """The decision of a single detector: its intervals, checked against measured speeds and the force between them."""
     found = detector.detect(scene, None, shown)
-    still, certain, notes = candidates(scene, found)
+    still, certain, notes = find_candidates(scene, found)
     spans, disturbed = fuse(scene.blocks, still, NONE, certain, scene.settings.fusion)
     return StopDecision(spans, disturbed, (*found.notes, *notes), (found,))
 
@@ -309,8 +317,8 @@ def merge_decisions(parts: Sequence[StopDecision]) -> StopDecision:
     """Merge the decisions of several detectors: stationary where any of them says so."""
     notes = dict.fromkeys(note for part in parts for note in part.notes)
     return StopDecision(
-        union([part.spans for part in parts]),
-        union([part.disturbed for part in parts]),
+        unite([part.spans for part in parts]),
+        unite([part.disturbed for part in parts]),
         tuple(notes),
         tuple(one for part in parts for one in part.found),
     )
@@ -324,10 +332,10 @@ def decide_fused(scene: Scene, detectors: Mapping[str, type[Detector]], shown: b
     detectors : all, by their names; the others learn from these what standing looks like here.
     shown : whether the answers of those that decide nothing are wanted.
     """
-    low, _ = scene.share(low_band)
-    still, certain, notes = candidates(scene, low)
+    low, _ = scene.share(compute_low_band)
+    still, certain, notes = find_candidates(scene, low)
     half = 0.5 * scene.settings.low_band_glrt.window
-    labels = Labels(still, spans_of(low.statistic > _CLEAR_MOTION * low.threshold, low.t, half))
+    labels = Labels(still, find_spans(low.statistic > _CLEAR_MOTION * low.threshold, low.t, half))
     notes = (*low.notes, *notes)
     found, idling = [low], NONE
     if shown:

@@ -21,10 +21,10 @@ import numpy as np
 
 from graphnav.core.earth import MG
 from graphnav.core.rotation import Array
-from graphnav.detectors.base import NONE, Detection, mask_within, spans_of
+from graphnav.detectors.base import NONE, Detection, find_spans, mask_within
 from graphnav.detectors.scene import Detector, Labels, Scene
-from graphnav.detectors.thresholds import find_fewest_errors, own_threshold
-from graphnav.detectors.windows import Blocks, find_unbroken, sum_running, window_times
+from graphnav.detectors.thresholds import choose_threshold, find_fewest_errors
+from graphnav.detectors.windows import Blocks, compute_window_times, find_unbroken, sum_running
 
 _TINY = 1e-300
 _WINDOW_STEP = 0.1  # s between windows
@@ -36,7 +36,7 @@ _AT_NOISE = {
 Statistic = Callable[[Array, float, float, float], Array]
 
 
-def rows_for(accel: Array, gyro: Array) -> Array:
+def collect_rows(accel: Array, gyro: Array) -> Array:
     """[force, rate, |force|, |force|^2, |rate|^2], (N, 9): the rows whose window means the statistics need."""
     squares = np.einsum("nj,nj->n", accel, accel)
     turning = np.einsum("nj,nj->n", gyro, gyro)
@@ -75,7 +75,7 @@ STATISTICS: dict[str, Statistic] = {
 }
 
 
-def glrt_statistic(
+def compute_glrt(
     accel: Array, gyro: Array, window: int, sigma_a: float, sigma_w: float, g: float, name: str = "glrt"
 ) -> Array:
     """The statistic of every window of `window` rows: entry k covers rows k ... k + window - 1, (N - window + 1,).
@@ -90,7 +90,7 @@ def glrt_statistic(
     """
     if len(accel) < window:
         return np.zeros(0)
-    return STATISTICS[name](sum_running(rows_for(accel, gyro)).means(window), sigma_a, sigma_w, g)
+    return STATISTICS[name](sum_running(collect_rows(accel, gyro)).means(window), sigma_a, sigma_w, g)
 
 
 @dataclass(frozen=True)
@@ -99,11 +99,11 @@ class Means:
 
     t: Array  # (W,) s, centre
     half: float  # s, of a window
-    rows: Array  # (W, 9) as in `rows_for`
+    rows: Array  # (W, 9) as in `collect_rows`
     whole: Array  # (W,) bool, False where a window crosses a gap
 
 
-def window_means(b: Blocks, length: float) -> Means | None:
+def compute_window_means(b: Blocks, length: float) -> Means | None:
     """Means over windows of `length` s every tenth of a second; None where there is no window."""
     # the blocks between two windows are summed once for all windows
     group = max(1, min(round(_WINDOW_STEP / b.period), round(0.5 * length / b.period)))
@@ -115,7 +115,7 @@ def window_means(b: Blocks, length: float) -> Means | None:
     if count < window:
         return None
     return Means(
-        window_times(middle, window),
+        compute_window_times(middle, window),
         0.5 * length,
         sum_running(rows).means(window),
         find_unbroken(whole, window, first=0),
@@ -123,7 +123,7 @@ def window_means(b: Blocks, length: float) -> Means | None:
 
 
 def _compute_means(scene: Scene) -> Means | None:
-    return window_means(scene.blocks, scene.settings.glrt.window)
+    return compute_window_means(scene.blocks, scene.settings.glrt.window)
 
 
 class _Windowed(Detector):
@@ -132,7 +132,7 @@ class _Windowed(Detector):
     The threshold minimises wrong decisions between the windows that another detector calls stationary and those it
     calls moving: an idling engine may raise the statistic far above sensor noise. Without stationary windows it is
     twice the statistic's expectation under sensor noise. A detector that decides alone seeks the valley between two
-    populations of its own (`own_threshold`).
+    populations of its own (`choose_threshold`).
     """
 
     edge = 0.3  # s: three steps between windows
@@ -149,7 +149,9 @@ class _Windowed(Detector):
         sigma_a, sigma_w = noise.accel_noise_density * per_row, noise.gyro_noise_density * per_row
         reference = _find_quietest(m) if labels is None else mask_within(m.t, labels.still, m.half)
         at_rest = bool(reference.any())
-        means, g = _centre(m.rows, reference if at_rest else np.ones(len(m.t), dtype=bool), scene.gravity, at_rest)
+        means, g = _subtract_mean_rate(
+            m.rows, reference if at_rest else np.ones(len(m.t), dtype=bool), scene.gravity, at_rest
+        )
         values = np.where(m.whole, STATISTICS[name](means, sigma_a, sigma_w, g), np.nan)
         threshold = least
         notes: tuple[str, ...] = ()
@@ -157,12 +159,12 @@ class _Windowed(Detector):
             threshold = settings.threshold
         elif labels is None:
             most = least + float(STATISTICS[name](_average_idling(scene, g), sigma_a, sigma_w, g)[0])
-            threshold, notes = own_threshold(scene, name, m.t, m.half, values, least, most)
+            threshold, notes = choose_threshold(scene, name, m.t, m.half, values, least, most)
         elif at_rest:
             in_motion = mask_within(m.t, labels.moving, m.half)
             threshold, _ = find_fewest_errors(values[reference & m.whole], values[in_motion & m.whole], least)
         mask = values < threshold
-        return Detection(name, m.t, values, threshold, mask, spans_of(mask, m.t, m.half), notes)
+        return Detection(name, m.t, values, threshold, mask, find_spans(mask, m.t, m.half), notes)
 
 
 class Glrt(_Windowed):
@@ -189,7 +191,7 @@ class AngularRateEnergy(_Windowed):
     name = "angular_rate_energy"
 
 
-def _centre(rows: Array, reference: Array, g: float, at_rest: bool) -> tuple[Array, float]:
+def _subtract_mean_rate(rows: Array, reference: Array, g: float, at_rest: bool) -> tuple[Array, float]:
     """The means without the mean rate of the `reference` windows, and gravity as these read it if they are at rest."""
     means = rows.copy()
     bias = np.median(means[reference, 3:6], axis=0)

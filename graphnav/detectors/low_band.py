@@ -20,10 +20,10 @@ import numpy as np
 from graphnav.config.detectors import LowBandSettings
 from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
-from graphnav.detectors.base import NONE, Detection, longer_than, mask_within, spans_of
+from graphnav.detectors.base import NONE, Detection, drop_short, find_spans, mask_within
 from graphnav.detectors.scene import Detector, Labels, Scene
-from graphnav.detectors.thresholds import FEWEST, MISLABELLED, MISTAKEN, log_statistic, valley
-from graphnav.detectors.windows import LowPassed, find_unbroken, sum_running, window_times
+from graphnav.detectors.thresholds import FEWEST, MISLABELLED, MISTAKEN, find_valley, log_statistic
+from graphnav.detectors.windows import LowPassed, compute_window_times, find_unbroken, sum_running
 from graphnav.recording import ImuNoise
 
 NAME = "low_band_glrt"
@@ -42,10 +42,10 @@ class LowBandGlrt(Detector):
 
     @classmethod
     def detect(cls, scene: Scene, labels: Labels | None = None, shown: bool = True) -> Detection:
-        return scene.share(low_band)[0]
+        return scene.share(compute_low_band)[0]
 
 
-def low_band(scene: Scene) -> tuple[Detection, Scale]:
+def compute_low_band(scene: Scene) -> tuple[Detection, Scale]:
     """The answer of the low-band GLRT, and the scale of a low-passed row at rest, by which edges are found."""
     return detect_low_band(scene.low, scene.recording.imu.noise, scene.settings.low_band_glrt, scene.certain)
 
@@ -107,15 +107,15 @@ def detect_low_band(
         empty = np.zeros(0)
         nothing = Detection(NAME, empty, empty, settings.threshold, empty > 0, NONE)
         return nothing, scale(low, noise, settings, np.zeros((0, 2)))
-    t = window_times(low.t, window)
+    t = compute_window_times(low.t, window)
     spread = measure_spreads(low, window)
     s = scale(low, noise, settings, spread)
     found = compute_statistic(spread, s)
     threshold, notes = _find_threshold(t, found, settings, moving, low.period, s)
     mask = found < threshold
     # a window does not show where in it motion began: stationary is only what all windows over it agree on
-    spans = spans_of(mask, t, 0.5 * settings.window)
-    return Detection(NAME, t, found, threshold, mask, longer_than(spans, settings.window), notes), s
+    spans = find_spans(mask, t, 0.5 * settings.window)
+    return Detection(NAME, t, found, threshold, mask, drop_short(spans, settings.window), notes), s
 
 
 def _find_threshold(
@@ -126,7 +126,7 @@ def _find_threshold(
     x, start = log_statistic(found), float(np.log10(settings.threshold))
     swaying = 0.5 * ((settings.force / s.force) ** 2 + (settings.rate / s.rate) ** 2)
     label = mask_within(t, moving, settings.window) & np.isfinite(x)
-    split = valley(x, start - _DOWN, start + _UP + float(np.log10(s.stated)), round(FEWEST / period))
+    split = find_valley(x, start - _DOWN, start + _UP + float(np.log10(s.stated)), round(FEWEST / period))
     if split is not None and not (label.any() and np.mean(x[label] < split) > MISLABELLED):
         return float(10.0**split), ()
     notes: tuple[str, ...] = ()

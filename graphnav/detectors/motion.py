@@ -13,7 +13,7 @@ import numpy as np
 
 from graphnav.config.detectors import FusionSettings
 from graphnav.core.rotation import Array
-from graphnav.detectors.base import NONE, merge_spans, spans_of, union
+from graphnav.detectors.base import NONE, find_spans, merge_spans, unite
 from graphnav.detectors.windows import share_of
 from graphnav.recording import Gnss, Odometer, Recording
 from graphnav.recording.checks.tracks import compute_local_positions
@@ -41,7 +41,7 @@ class Speeds:
         """(K,) m/s, magnitude."""
         return np.sqrt(np.einsum("kj,kj->k", self.v, self.v))
 
-    def speed_in(self, span: Array) -> float:
+    def measure_speed(self, span: Array) -> float:
         """Speed in a span in which nothing changes, m/s: 0 if it is within the error, NaN without epochs.
 
         The velocity is constant in such a span, so the median over the epochs counts, and a wander within the stated
@@ -61,7 +61,7 @@ class Speeds:
         return float("nan") if self.silent_at_rest else 0.0
 
 
-def speeds(recording: Recording, settings: FusionSettings) -> list[Speeds]:
+def collect_speeds(recording: Recording, settings: FusionSettings) -> list[Speeds]:
     """Speeds of every sensor that measures one."""
     found = []
     if recording.odometer is not None and len(recording.odometer.t) > 2:
@@ -79,8 +79,8 @@ def find_moving(found: list[Speeds]) -> Array:
         k = np.arange(len(excess))
         fast = take_median(excess[np.maximum(k - 1, 0)], excess, excess[np.minimum(k + 1, len(k) - 1)]) > 0.0
         breaks = np.diff(s.t) > _LONGEST_GAP
-        spans = [spans_of(fast[a:b], s.t[a:b]) for a, b in _split_pieces(breaks)]
-        one = union([p for p in spans if len(p)]) if any(len(p) for p in spans) else NONE
+        spans = [find_spans(fast[a:b], s.t[a:b]) for a, b in _split_pieces(breaks)]
+        one = unite([p for p in spans if len(p)]) if any(len(p) for p in spans) else NONE
         if len(one):
             one = one + np.array([s.half, -s.half - s.late])
             parts.append(one[one[:, 1] > one[:, 0]])

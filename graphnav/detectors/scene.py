@@ -11,12 +11,12 @@ import numpy as np
 
 from graphnav.config.detectors import DetectorSettings
 from graphnav.core.earth import STANDARD_GRAVITY, gravity
-from graphnav.core.findings import period_of
+from graphnav.core.findings import compute_period
 from graphnav.core.rotation import Array
 from graphnav.core.shared import Shared
 from graphnav.detectors.base import Detection
-from graphnav.detectors.motion import Speeds, find_moving, speeds
-from graphnav.detectors.windows import Blocks, LowPassed, blocks, low_pass
+from graphnav.detectors.motion import Speeds, collect_speeds, find_moving
+from graphnav.detectors.windows import Blocks, LowPassed, average_blocks, low_pass
 from graphnav.recording import Recording
 
 
@@ -30,12 +30,12 @@ class Scene(Shared):
     @cached_property
     def period(self) -> float:
         """s between IMU rows; not positive where there are too few."""
-        return period_of(self.recording.imu.t)
+        return compute_period(self.recording.imu.t)
 
     @cached_property
     def blocks(self) -> Blocks:
         """Means over blocks of rows."""
-        return blocks(self.recording.imu, self.period)
+        return average_blocks(self.recording.imu, self.period)
 
     @cached_property
     def low(self) -> LowPassed:
@@ -45,7 +45,7 @@ class Scene(Shared):
     @cached_property
     def known(self) -> list[Speeds]:
         """Speeds by odometer and GNSS."""
-        return speeds(self.recording, self.settings.fusion)
+        return collect_speeds(self.recording, self.settings.fusion)
 
     @cached_property
     def certain(self) -> Array:

@@ -47,7 +47,7 @@ class Windows:
         """(F,) Hz"""
         return np.arange(self.length // 2 + 1) * (self.rate / self.length)
 
-    def amplitudes(self, which: Array | None = None) -> Iterator[tuple[slice, Array]]:
+    def compute_amplitudes(self, which: Array | None = None) -> Iterator[tuple[slice, Array]]:
         """Single-sided amplitudes (w, 3, F) of all windows or of some, chunk by chunk, in the columns' units."""
         if self.count <= _WINDOWS_AT_ONCE:  # small enough to be kept
             yield (
@@ -81,7 +81,7 @@ class Windows:
             yield slice(begin, begin + len(some)), out
 
 
-def peaks(amplitude: Array, frequencies: Array, low: float, high: float) -> tuple[Array, Array]:
+def find_peaks(amplitude: Array, frequencies: Array, low: float, high: float) -> tuple[Array, Array]:
     """Highest peak of each spectrum (..., F) with low <= f < high: frequency (Hz) and amplitude, Grandke's."""
     i, j = np.searchsorted(frequencies, [low - 1e-9, high - 1e-9])
     i = max(int(i), 1)
@@ -114,7 +114,7 @@ class IdleLine:
     share: float  # share of the examined windows that show it
 
 
-def idle_line(windows: Windows, still: Array) -> IdleLine | None:
+def find_idle_line(windows: Windows, still: Array) -> IdleLine | None:
     """The line that stands out in the windows numbered `still`, with its second harmonic; None without one.
 
     A quarter of the windows is enough: the engine may be switched off in the others.
@@ -124,7 +124,7 @@ def idle_line(windows: Windows, still: Array) -> IdleLine | None:
     some = still[np.unique(np.linspace(0, len(still) - 1, _LOOKED_AT).astype(int))]
     f = windows.frequencies
     reach = max(2, round(_FLOOR / f[1]))
-    spectra = np.concatenate([a for _, a in windows.amplitudes(some)])
+    spectra = np.concatenate([a for _, a in windows.compute_amplitudes(some)])
     power = 2.0 * np.log(np.maximum(spectra, 1e-12))
     clear = np.asarray((power - _take_local_median(power, reach)).max(axis=1))  # (w, F), the clearest channel
     quarter = max(1, len(some) // 4)
@@ -136,19 +136,19 @@ def idle_line(windows: Windows, still: Array) -> IdleLine | None:
     if not peak:
         return None
 
-    def second(k: int) -> float:
+    def find_second(k: int) -> float:
         return float(line[2 * k - 1 : 2 * k + 2].max()) if 2 * k + 1 < len(f) else float("nan")
 
     # a strong second harmonic is a line too, but has no line at half its frequency
-    best = max(peak, key=lambda k: line[k] + np.nan_to_num(second(k)))
-    where, height = peaks(spectra, f, 0.88 * f[best], 1.12 * f[best] + f[1])
+    best = max(peak, key=lambda k: line[k] + np.nan_to_num(find_second(k)))
+    where, height = find_peaks(spectra, f, 0.88 * f[best], 1.12 * f[best] + f[1])
     shown = clear[:, best - 1 : best + 2].max(axis=1) > _CLEAR
     shown = shown if shown.any() else np.ones(len(some), dtype=bool)
     # in the channel in which it stands out most
     floor = np.exp(0.5 * _take_local_median(power, reach)[..., best])
     strongest = int(np.median(height[shown] / floor[shown], axis=0).argmax())
     low, middle, high = np.quantile(where[shown, strongest], [0.05, 0.5, 0.95])
-    return IdleLine(float(middle), float(low), float(high), second(best), float(shown.mean()))
+    return IdleLine(float(middle), float(low), float(high), find_second(best), float(shown.mean()))
 
 
 def _take_local_median(power: Array, reach: int) -> Array:

@@ -32,8 +32,8 @@ from graphnav.config.detectors import FUSED, StanceSettings
 from graphnav.core import rotation
 from graphnav.core.notes import Note, format_count
 from graphnav.core.rotation import Array
-from graphnav.detectors.base import NONE, Detection, Detections, longer_than, mask_inside, merge_spans, spans_of, union
-from graphnav.detectors.glrt import glrt_statistic
+from graphnav.detectors.base import NONE, Detection, Detections, drop_short, find_spans, mask_inside, merge_spans, unite
+from graphnav.detectors.glrt import compute_glrt
 from graphnav.detectors.windows import find_unbroken, sum_running
 from graphnav.recording import Imu
 
@@ -65,10 +65,10 @@ def detect_stances(
     found: list[Detection] = []
     kept, notes = [], []
     for name in which:
-        e = np.sqrt(glrt_statistic(imu.accel, imu.gyro - bias, window, settings.force_per_rate, 1.0, g, name))
+        e = np.sqrt(compute_glrt(imu.accel, imu.gyro - bias, window, settings.force_per_rate, 1.0, g, name))
         found.append(_find_below(name, e, imu, period, window, settings))
         one = found[-1]
-        deep = one.intervals[_as_deep_as_others(one.intervals, one.t, one.statistic, settings.threshold)]
+        deep = one.intervals[_mask_deep(one.intervals, one.t, one.statistic, settings.threshold)]
         if len(deep) < len(one.intervals):
             short = format_count(len(one.intervals) - len(deep), "interval")
             notes.append(
@@ -78,11 +78,11 @@ def detect_stances(
                 )
             )
         begin = int(np.searchsorted(deep[:, 1], since)) if len(deep) else 0
-        cut = _without_sliding(deep[begin:], imu, one.t, one.statistic, bias, settings.threshold * _REACH)
+        cut = _cut_sliding(deep[begin:], imu, one.t, one.statistic, bias, settings.threshold * _REACH)
         kept.append(np.concatenate([deep[:begin], cut]))
     if not found:
         return Detections(NONE, (), ())
-    spans = union(kept) if len(kept) > 1 else kept[0]
+    spans = unite(kept) if len(kept) > 1 else kept[0]
     first = found[0]
     mask = mask_inside(first.t, spans)
     found.append(Detection(FUSED, first.t, first.statistic, settings.threshold, mask, spans, tuple(notes)))
@@ -95,7 +95,7 @@ def _find_below(name: str, e: Array, imu: Imu, period: float, window: int, setti
     whole = find_unbroken(np.r_[True, np.diff(imu.t) < period + settings.bridge], window)
     e = np.where(whole, e, np.nan)
     below = e < settings.threshold
-    spans = longer_than(merge_spans(spans_of(below, t, 0.5 * period), settings.bridge), settings.shortest)
+    spans = drop_short(merge_spans(find_spans(below, t, 0.5 * period), settings.bridge), settings.shortest)
     # windows lie within the recording: the first and the last stance reach to its ends
     half = 0.5 * window * period
     if len(spans) and spans[0, 0] < imu.t[0] + half:
@@ -117,7 +117,7 @@ def _average_quietest(imu: Imu, period: float) -> tuple[Array, float]:
     return means[k, :3], float(np.linalg.norm(means[k, 3:]))
 
 
-def _as_deep_as_others(spans: Array, t: Array, e: Array, threshold: float) -> Array:
+def _mask_deep(spans: Array, t: Array, e: Array, threshold: float) -> Array:
     """(M,) bool, which spans reach about as low as the others.
 
     Missing rows do not split a stance: the parts would be many, and the stances of the walk the outliers.
@@ -138,7 +138,7 @@ def _as_deep_as_others(spans: Array, t: Array, e: Array, threshold: float) -> Ar
     return np.asarray(depth < middle + _SPREADS * spread)[one]
 
 
-def _without_sliding(spans: Array, imu: Imu, t: Array, e: Array, bias: Array, fastest: float) -> Array:
+def _cut_sliding(spans: Array, imu: Imu, t: Array, e: Array, bias: Array, fastest: float) -> Array:
     """The spans (M, 2), cut where the foot moves at more than `fastest` m/s relative to their quietest moments.
 
     t, e (W,) are of the windows that begin with each row.

@@ -27,7 +27,7 @@ _SMALL_POPULATION = 10.0  # times the fewest values: a smaller population must b
 _EMPTY_BINS = 4  # empty bins that this takes
 
 
-def valley(log_values: Array, low: float, high: float, fewest: int) -> float | None:
+def find_valley(log_values: Array, low: float, high: float, fewest: int) -> float | None:
     """Middle of the lowest part of the density of `log_values` between low and high; None without a clear valley.
 
     Parameters
@@ -65,7 +65,7 @@ def log_statistic(statistic: Array) -> Array:
     return np.log10(np.maximum(statistic, _TINY))
 
 
-def own_threshold(
+def choose_threshold(
     scene: Scene, name: str, t: Array, half: float, values: Array, least: float, most: float
 ) -> tuple[float, tuple[str, ...]]:
     """Threshold of a statistic that decides alone, and notes on it.
@@ -84,7 +84,7 @@ def own_threshold(
     x = log_statistic(values)
     step = float(np.median(np.diff(t))) if len(t) > 1 else 1.0
     moves = mask_within(t, scene.certain, half) & np.isfinite(x)
-    split = valley(x, float(np.log10(least)), float(np.log10(most)), max(2, round(FEWEST / step)))
+    split = find_valley(x, float(np.log10(least)), float(np.log10(most)), max(2, round(FEWEST / step)))
     if split is not None and not (moves.any() and np.mean(x[moves] < split) > MISLABELLED):
         return max(least, float(10.0**split)), ()
     rests = ~mask_within(t, scene.certain, -half) & np.isfinite(x)  # no part of it is certain to move

@@ -43,7 +43,7 @@ class Blocks:
         return self.mean[:, 3:6]
 
 
-def blocks(imu: Imu, row_period: float) -> Blocks:
+def average_blocks(imu: Imu, row_period: float) -> Blocks:
     """Blocks of at most 1/`BLOCK_RATE` s; rows after the last complete block are dropped."""
     size = max(1, int(1.0 / (BLOCK_RATE * row_period) + 1e-6))
     count = len(imu.t) // size
@@ -83,7 +83,7 @@ def sum_running(rows: Array) -> Sums:
     return Sums(total, offset)
 
 
-def window_times(t: Array, length: int, step: int = 1) -> Array:
+def compute_window_times(t: Array, length: int, step: int = 1) -> Array:
     """Centres of the windows of `Sums.means`."""
     first = t[: len(t) - length + 1 : step]
     return np.asarray(0.5 * (first + t[length - 1 :: step]))
@@ -110,7 +110,7 @@ class LowPassed:
     whole: Array  # (K,) bool, False where there is a gap under the kernel
 
 
-def kernel(period: float) -> Array:
+def make_kernel(period: float) -> Array:
     """A Blackman window of `_KERNEL` s, sum 1: -6 dB at 3 Hz, below -58 dB from 7.5 Hz on."""
     n = max(2, round(_KERNEL / period))
     h = np.blackman(n + 2)[1:-1]
@@ -119,7 +119,7 @@ def kernel(period: float) -> Array:
 
 def low_pass(b: Blocks) -> LowPassed:
     """Low-pass the blocks and keep every tenth of a second."""
-    h = kernel(b.period)
+    h = make_kernel(b.period)
     step = max(1, int(1.0 / (_LOW_RATE * b.period) + 1e-6))
     count = max(0, (len(b.t) - len(h)) // step + 1)
     rows = np.zeros((count, 6))
@@ -127,7 +127,7 @@ def low_pass(b: Blocks) -> LowPassed:
     for i, weight in enumerate(h if count else ()):
         rows += weight * b.mean[i : i + stop : step, :6]
     gain = float(np.sqrt((h**2).sum() / b.period))
-    t = window_times(b.t, len(h), step)[:count] if count else np.zeros(0)
+    t = compute_window_times(b.t, len(h), step)[:count] if count else np.zeros(0)
     whole = find_unbroken(b.whole, len(h), step)[:count] if count else np.zeros(0, dtype=bool)
     return LowPassed(t, rows, gain, step * b.period, whole)
 

@@ -20,14 +20,14 @@ from graphnav.core.progress import tell
 from graphnav.core.rotation import Array
 from graphnav.detectors import detect
 from graphnav.estimation.alignment import align
-from graphnav.estimation.noise.apply import with_noise
+from graphnav.estimation.noise.apply import apply_noise
 from graphnav.estimation.noise.estimate import estimate_noise
-from graphnav.estimation.pipeline import origin
+from graphnav.estimation.pipeline import choose_origin
 from graphnav.estimation.problem import build_problem
 from graphnav.estimation.solvers.breakdown import explain_singular
 from graphnav.estimation.solvers.ekf import refilter
-from graphnav.estimation.solvers.passes import parameters_of, sigmas_of
-from graphnav.estimation.solvers.rts import backward
+from graphnav.estimation.solvers.passes import compute_sigmas, estimate_parameters
+from graphnav.estimation.solvers.rts import smooth_backward
 from graphnav.recording import Recording, take_rows
 
 _PRIOR_SIGMA = 2.0  # m, 1-sigma before the drive
@@ -169,7 +169,7 @@ def _estimate(recording: Recording) -> tuple[Antenna, tuple[Array, Array, Array]
         raise EstimationError(
             f"'{recording.name}': there is no GNSS whose antenna could be found", key="antenna.no_gnss"
         )
-    settings, frame = Settings(), LocalFrame(origin(recording))
+    settings, frame = Settings(), LocalFrame(choose_origin(recording))
     tell("detection")
     still = detect(recording, settings).stationary
     tell("alignment")
@@ -187,9 +187,9 @@ def _estimate(recording: Recording) -> tuple[Antenna, tuple[Array, Array, Array]
         found = estimate_noise(base, aligned.until)
     except np.linalg.LinAlgError as error:
         raise explain_singular(error) from None
-    problem = with_noise(base, found.noise)
-    smoothed = backward(problem, refilter(problem, found.carry_points(base, problem)))
-    parameters = parameters_of(problem, smoothed.values, sigmas_of(smoothed.P))
+    problem = apply_noise(base, found.noise)
+    smoothed = smooth_backward(problem, refilter(problem, found.carry_points(base, problem)))
+    parameters = estimate_parameters(problem, smoothed.values, compute_sigmas(smoothed.P))
     arm, axle = parameters["gnss_lever_arm"], parameters.get(AXLE)
     antenna = Antenna(recording.gnss.lever_arm, arm.value[-1], arm.sigma[-1])
     if axle is None or recording.odometer is None:

@@ -19,10 +19,10 @@ from graphnav.core.progress import tell
 from graphnav.core.rotation import Array
 from graphnav.core.state import BLOCKS
 from graphnav.detectors import Detections, detect
-from graphnav.estimation.alignment import Alignment, align, with_known_heading
+from graphnav.estimation.alignment import Alignment, align, use_known_heading
 from graphnav.estimation.alignment.first import pick_fixes
 from graphnav.estimation.fixing import split_carriers
-from graphnav.estimation.noise.exclusion import without_excluded
+from graphnav.estimation.noise.exclusion import drop_excluded
 from graphnav.estimation.noise.model import NoiseModel
 from graphnav.estimation.problem import Problem, build_problem
 from graphnav.recording import Recording
@@ -38,7 +38,7 @@ class Clock:
     seconds: dict[str, float] = field(default_factory=dict)
 
     @contextmanager
-    def book(self, stage: str) -> Iterator[None]:
+    def count_time(self, stage: str) -> Iterator[None]:
         """Count the time within this context for a stage."""
         began = time.perf_counter()
         try:
@@ -76,14 +76,14 @@ class ProblemBuilder:
         codes_alone = self.settings.raw_gnss.model_copy(update={"differences": False})
         settings = self.settings.model_copy(update={"raw_gnss": codes_alone})
         tell("alignment")
-        with self.clock.book("alignment"):
+        with self.clock.count_time("alignment"):
             return align(recording, settings, self.frame, stationary)
 
     def build(self, aligned: Alignment, detections: Detections, parts: bool) -> BuiltProblem:
         """Build the problem; with the contribution of each noise figure to its intervals, if these are to change."""
         tell("preintegration")
-        with self.clock.book("preintegration"):
-            stated = with_known_heading(aligned, self.settings)
+        with self.clock.count_time("preintegration"):
+            stated = use_known_heading(aligned, self.settings)
             start = aligned if has_diverged(aligned, stated) else stated
             problem = build_problem(
                 self.used, self.settings, self.frame, start.state, start_sigma(start), detections.stationary,
@@ -112,7 +112,7 @@ class ProblemBuilder:
         if not noise.excluded or self.recording.gnss is None:
             return built
         aligned, detections = built.aligned, built.detections
-        fixes = without_excluded(self.recording, noise)
+        fixes = drop_excluded(self.recording, noise)
         stops = detect(fixes, self.settings)
         changed = _differ(stops.stationary, detections.stationary)
         stops = stops if changed else detections

@@ -17,12 +17,12 @@ from graphnav.core.earth import LocalFrame
 from graphnav.core.rotation import Array
 from graphnav.core.state import States, split_covariance
 from graphnav.estimation.problem import Problem
-from graphnav.imu.dynamics import EarthMotion, as_biases
-from graphnav.imu.preintegration import within
+from graphnav.imu.dynamics import EarthMotion, convert_to_biases
+from graphnav.imu.preintegration import integrate_within
 from graphnav.imu.samples import Samples
 
 
-def times_between(start: float, end: float, rate: float) -> Array:
+def list_times(start: float, end: float, rate: float) -> Array:
     """Multiples of 1/rate between two times (s), and both ends."""
     steps = np.arange(np.ceil(start * rate), np.floor(end * rate) + 1) / rate
     inner = steps[(steps > start + 1e-6) & (steps < end - 1e-6)]
@@ -54,7 +54,7 @@ class Dense:
 
     def times(self, rate: float) -> Array:
         """Multiples of 1/rate on the recording's clock, and both ends."""
-        return times_between(self.start, self.end, rate)
+        return list_times(self.start, self.end, rate)
 
     def __call__(self, t: Array) -> tuple[States, Array]:
         """States and covariances (M, 15, 15) at ascending times from `start` to `end`."""
@@ -107,7 +107,7 @@ class Dense:
         # only of the intervals needed, so that few times cost little
         first, last = int(k[0]), int(k[-1]) + 1
         samples, used = self.samples.between(self.t[first], self.t[last]), slice(first, last)
-        dR, dV, dP = within(samples, self.t[first : last + 1], t, self.ba[used], self.bg[used])
+        dR, dV, dP = integrate_within(samples, self.t[first : last + 1], t, self.ba[used], self.bg[used])
         return EarthMotion(t - self.t[k], self.frame).reach(slice(None), self.states[used], dR, dP, dV, k - first)
 
 
@@ -130,11 +130,11 @@ def _interpolate(of_keyframes: Array, k: Array, s: Array) -> Array:
     return out
 
 
-def dense(problem: Problem, states: States, covariance: Array, scale: Array | None, smooth: bool) -> Dense:
+def make_dense(problem: Problem, states: States, covariance: Array, scale: Array | None, smooth: bool) -> Dense:
     """Make the states between keyframes of a solution; `scale` is (k,) or, for a filter, (K, k) as of each keyframe."""
     ba, bg = states.ba[:-1], states.bg[:-1]
     if scale is not None:
         scale = np.broadcast_to(scale, (len(states), scale.shape[-1]))[:-1]
-        of_accel, of_gyro = as_biases(scale, problem.intervals.force, problem.intervals.rate)
+        of_accel, of_gyro = convert_to_biases(scale, problem.intervals.force, problem.intervals.rate)
         ba, bg = ba + of_accel, bg + of_gyro
     return Dense(problem.samples, problem.frame, problem.t, states, covariance, ba, bg, smooth)

@@ -14,7 +14,7 @@ from graphnav.estimation.solution import ExcludedSpan
 from graphnav.estimation.solvers.passes import SmootherPass, record_residuals
 
 
-def fault_spans(problem: Problem, smoothed: SmootherPass | None = None) -> tuple[ExcludedSpan, ...]:
+def find_fault_spans(problem: Problem, smoothed: SmootherPass | None = None) -> tuple[ExcludedSpan, ...]:
     """The rows of weight 0, by constraint and ordered by time; with their errors if a smoothed solution is given."""
     out = []
     for rows in problem.constraints:

@@ -24,7 +24,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from graphnav.constraints.ambiguities import slot_names
+from graphnav.constraints.ambiguities import list_slots
 from graphnav.constraints.raw_phase import EXACT, GnssPhase, WholeCycles
 from graphnav.constraints.raw_ppp import GnssPppCarrier
 from graphnav.core.rotation import Array
@@ -35,8 +35,8 @@ from graphnav.estimation.solution import CarrierArcs
 from graphnav.estimation.solvers.decision import DecidedRows
 from graphnav.estimation.solvers.ekf import ekf, refilter
 from graphnav.estimation.solvers.linearise import Points
-from graphnav.estimation.solvers.passes import FilterPass, Progress, SmootherPass, points_of, values_of
-from graphnav.estimation.solvers.rts import backward
+from graphnav.estimation.solvers.passes import FilterPass, Progress, SmootherPass, make_points, split_values
+from graphnav.estimation.solvers.rts import smooth_backward
 from graphnav.gnss.integers import decorrelate, find_nearest
 
 _SUCCESS, _RATIO = 0.999, 3.0
@@ -66,13 +66,13 @@ def split_carriers(problem: Problem) -> tuple[Problem, GnssPhase | None]:
     return replace(problem, constraints=tuple(c for c in problem.constraints if c is not phase)), phase
 
 
-def float_arcs(problem: Problem) -> CarrierArcs:
+def list_float_arcs(problem: Problem) -> CarrierArcs:
     """The arcs of precise point positioning, whose ambiguities are real numbers."""
     rows = next((c for c in problem.constraints if isinstance(c, GnssPppCarrier)), None)
     if rows is None:
         return CarrierArcs()
     none = np.zeros(len(rows), dtype=bool)
-    return CarrierArcs.from_rows(problem.t[rows.keyframe], rows.slot, rows.begin, none, slot_names(rows.slots))
+    return CarrierArcs.from_rows(problem.t[rows.keyframe], rows.slot, rows.begin, none, list_slots(rows.slots))
 
 
 def fix(
@@ -97,8 +97,8 @@ def fix(
     search = whole.settings.raw_gnss.integers
     causal = _Causal(epochs)
     forward = ekf(whole, progress, opening, decide=causal if search else None)
-    points = points_of(whole, about.states, values_of(problem, about))
-    smoothed = backward(whole, refilter(whole, points, progress), progress)
+    points = make_points(whole, about.states, split_values(problem, about))
+    smoothed = smooth_backward(whole, refilter(whole, points, progress), progress)
     known, found = Known(), whole
     for _ in range(_ROUNDS if search else 0):
         before = dict(known.of)
@@ -106,10 +106,10 @@ def fix(
         if known.of == before:
             break
         found = _hold_arcs(whole, phase, epochs, known)
-        smoothed = backward(found, refilter(found, smoothed, progress), progress)
+        smoothed = smooth_backward(found, refilter(found, smoothed, progress), progress)
         if _let_go(epochs, smoothed, known):
             found = _hold_arcs(whole, phase, epochs, known)
-            smoothed = backward(found, refilter(found, smoothed, progress), progress)
+            smoothed = smooth_backward(found, refilter(found, smoothed, progress), progress)
     return Fixed(
         found,
         forward,
@@ -214,7 +214,7 @@ def hold_on(before: Held, epochs: Epochs, k: int, here: Points, covariance: Call
         known = Known() if before.odd else known
         fixed = epochs.differences(k, known) >= FEWEST
         return Held(known, True, let_go=before.odd, fixed=fixed, epoch=True)
-    sets, found = epochs.sets(k, known), []
+    sets, found = epochs.group_arcs(k, known), []
     if any(len(some) > 1 for some in sets.values()):
         values = np.concatenate([np.zeros(DIM), here.values[0]])
         lasting = epochs.lasting(k, lambda arc: float(epochs.time[k]))
@@ -264,7 +264,7 @@ def _sweep(epochs: Epochs, smoothed: SmootherPass, known: Known) -> None:
     tried: set[frozenset[frozenset[Arc]]] = set()
     values = np.concatenate([np.zeros((len(smoothed.values), DIM)), smoothed.values], axis=1)
     for k in sorted(epochs.keyframes, key=lambda k: -len(epochs.active[k])):
-        sets = epochs.sets(k, known)
+        sets = epochs.group_arcs(k, known)
         key = frozenset(frozenset(one) for some in sets.values() for one in some)
         if key in tried or all(len(some) == 1 for some in sets.values()):
             continue
@@ -273,11 +273,11 @@ def _sweep(epochs: Epochs, smoothed: SmootherPass, known: Known) -> None:
         lasting = epochs.lasting(k, epochs.last.__getitem__)
         for a, b, n in _decide(sets, epochs.columns, values[k], smoothed.P[k], known, lasting, impose=True):
             held.join(a, b, n)
-        if len(held.of) > len(known.of) and not epochs.odd(k, _one(smoothed, k), held):
+        if len(held.of) > len(known.of) and not epochs.odd(k, _fix_one(smoothed, k), held):
             known.of = held.of
 
 
-def _one(points: Points, k: int) -> Points:
+def _fix_one(points: Points, k: int) -> Points:
     return Points(points.states[k : k + 1], points.values[k : k + 1])
 
 
@@ -286,17 +286,17 @@ def _hold_arcs(problem: Problem, phase: GnssPhase, epochs: Epochs, known: Known)
     rows: list[tuple[int, str, str, int]] = []
     held = Known()
     for k in epochs.keyframes:
-        for sets in epochs.sets(k, known).values():
+        for sets in epochs.group_arcs(k, known).values():
             for one in sets:
                 for arc in one[1:]:
                     if held.find(arc)[0] != held.find(one[0])[0]:
                         n = known.find(arc)[1] - known.find(one[0])[1]
                         held.join(arc, one[0], n)
                         rows.append((k, arc[0], one[0][0], n))
-    return with_integers(problem, phase, rows)
+    return add_integers(problem, phase, rows)
 
 
-def with_integers(problem: Problem, phase: GnssPhase, found: Sequence[tuple[int, str, str, int]]) -> Problem:
+def add_integers(problem: Problem, phase: GnssPhase, found: Sequence[tuple[int, str, str, int]]) -> Problem:
     """A problem with rows for differences: keyframe, in that order, two ambiguities, and cycles between them."""
     if not found:
         return problem
@@ -316,7 +316,7 @@ def _let_go(epochs: Epochs, smoothed: SmootherPass, known: Known) -> bool:
     odd: Counter[Arc] = Counter()
     for k in epochs.keyframes:
         seen.update(epochs.active[k])
-        odd.update(epochs.odd(k, _one(smoothed, k), known))
+        odd.update(epochs.odd(k, _fix_one(smoothed, k), known))
     gone = {arc for arc, count in odd.items() if 2 * count > seen[arc]}
     for arc in gone:
         known.forget(arc)

@@ -12,8 +12,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.special import gammaincinv  # scipy.stats would take half a second to import
 
-from graphnav.constraints.ambiguities import slot_names
-from graphnav.constraints.raw_phase import GnssPhase, variance_left
+from graphnav.constraints.ambiguities import list_slots
+from graphnav.constraints.raw_phase import GnssPhase, compute_variance_left
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM
 from graphnav.estimation.solution import CarrierArcs
@@ -114,7 +114,7 @@ class Epochs:
         """
         own, arcs = self.rows[k], self.active[k]
         duration = np.array([until(arc) - arc[1] for arc in arcs])
-        more = self.phase.reflection[own] ** 2 * variance_left(np.maximum(duration, 0.0), self.phase.period)
+        more = self.phase.reflection[own] ** 2 * compute_variance_left(np.maximum(duration, 0.0), self.phase.period)
         return dict(zip(arcs, more.tolist(), strict=True))
 
     def fixed(self, known: Mapping[int, Known]) -> Array:
@@ -126,14 +126,14 @@ class Epochs:
         phase = self.phase
         integer = [arc in known[k].of for k in self.keyframes for arc in self.active[k]]
         return CarrierArcs.from_rows(
-            self.time[phase.keyframe], phase.slot, phase.begin, np.array(integer, dtype=bool), slot_names(phase.slots)
+            self.time[phase.keyframe], phase.slot, phase.begin, np.array(integer, dtype=bool), list_slots(phase.slots)
         )
 
     def can(self, arc: Arc) -> bool:
         """Whether it has integers."""
         return self._group[arc[0]] >= 0 and arc in self._whole
 
-    def sets(self, k: int, known: Known) -> dict[int, list[list[Arc]]]:
+    def group_arcs(self, k: int, known: Known) -> dict[int, list[list[Arc]]]:
         """By group, the arcs of an epoch, those together that hang together, the largest set first."""
         out: dict[int, dict[Arc, list[Arc]]] = {}
         for arc in self.active[k]:
@@ -143,4 +143,4 @@ class Epochs:
 
     def differences(self, k: int, known: Known) -> int:
         """How many differences are known at an epoch."""
-        return sum(len(one) - 1 for sets in self.sets(k, known).values() for one in sets)
+        return sum(len(one) - 1 for sets in self.group_arcs(k, known).values() for one in sets)

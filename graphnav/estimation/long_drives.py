@@ -44,7 +44,7 @@ class Share:
     end: float
 
 
-def shares(recording: Recording, settings: Settings) -> list[Share]:
+def split_drive(recording: Recording, settings: Settings) -> list[Share]:
     """The recording in one part, or in parts of equal length that overlap."""
     begin, length = recording.start, recording.end - recording.start
     if length <= _limit_length(recording, settings):
@@ -166,16 +166,16 @@ def crop_solution(solution: Solution, share: Share, detections: tuple[Detection,
     if np.isneginf(start) and np.isposinf(end):
         return solution
 
-    def inside(t: Array) -> Array:
+    def find_inside(t: Array) -> Array:
         return np.flatnonzero((t >= start) & (t < end))
 
-    def node(p: ParameterEstimate) -> ParameterEstimate:
+    def crop_parameter(p: ParameterEstimate) -> ParameterEstimate:
         in_force = np.searchsorted(p.t, start, side="right") - 1  # applies from before the span on
         some = np.flatnonzero((p.t < end) & (np.arange(len(p.t)) >= in_force))
         return replace(p, t=p.t[some], value=p.value[some], sigma=p.sigma[some])
 
-    def record(r: ConstraintRecord) -> ConstraintRecord:
-        some = inside(r.t)
+    def crop_record(r: ConstraintRecord) -> ConstraintRecord:
+        some = find_inside(r.t)
         return replace(
             r,
             t=r.t[some],
@@ -188,33 +188,35 @@ def crop_solution(solution: Solution, share: Share, detections: tuple[Detection,
             elevation=r.elevation[some[: len(r.elevation)]],
         )
 
-    def detection(d: Detection) -> Detection:
-        some, n = inside(d.t), len(d.t)
+    def crop_detection(d: Detection) -> Detection:
+        some, n = find_inside(d.t), len(d.t)
         spans = np.clip(d.intervals, start, end)
         threshold = d.threshold[some] if isinstance(d.threshold, np.ndarray) and len(d.threshold) == n else d.threshold
         details = {name: x[some] if len(x) == n else x for name, x in d.details.items()}
         if "spectrogram" in details:
-            shown = inside(d.details["spectrogram_t"])
+            shown = find_inside(d.details["spectrogram_t"])
             details |= {name: d.details[name][shown] for name in ("spectrogram", "spectrogram_t")}
         return replace(
             d, t=d.t[some], statistic=d.statistic[some], threshold=threshold, mask=d.mask[some],
             intervals=spans[spans[:, 1] > spans[:, 0]], details=details,
         )  # fmt: skip
 
-    def noise(model: NoiseModel) -> NoiseModel:
-        weights = {name: RowWeights(w.t[inside(w.t)], w.weight[inside(w.t)]) for name, w in model.weights.items()}
+    def crop_noise(model: NoiseModel) -> NoiseModel:
+        weights = {
+            name: RowWeights(w.t[find_inside(w.t)], w.weight[find_inside(w.t)]) for name, w in model.weights.items()
+        }
         spans = {
             name: tuple((max(a, start), min(b, end)) for a, b in some if a < end and b >= start)
             for name, some in model.excluded.items()
         }
         return replace(model, weights=weights, excluded=spans)
 
-    def stretches(arcs: CarrierArcs) -> CarrierArcs:
+    def crop_arcs(arcs: CarrierArcs) -> CarrierArcs:
         some = (arcs.begin < end) & (arcs.end >= start)
         begin, last = np.maximum(arcs.begin[some], start), np.minimum(arcs.end[some], end)
         return replace(arcs, name=arcs.name[some], begin=begin, end=last, integer=arcs.integer[some])
 
-    some, last = inside(solution.t), float(np.nextafter(end, -np.inf))
+    some, last = find_inside(solution.t), float(np.nextafter(end, -np.inf))
     own = slice(int(some[0]), int(some[-1]) + 1)
     covariance = solution.covariance[own].copy()
     return replace(
@@ -222,13 +224,13 @@ def crop_solution(solution: Solution, share: Share, detections: tuple[Detection,
         t=solution.t[some],
         states=solution.states[some],
         covariance=covariance,
-        parameters={name: node(p) for name, p in solution.parameters.items()},
-        records={name: record(r) for name, r in solution.records.items()},
-        detections=detections or tuple(detection(d) for d in solution.detections),
+        parameters={name: crop_parameter(p) for name, p in solution.parameters.items()},
+        records={name: crop_record(r) for name, r in solution.records.items()},
+        detections=detections or tuple(crop_detection(d) for d in solution.detections),
         excluded=tuple(fault for fault in solution.excluded if start <= fault.t_start < end),
-        noise=noise(solution.noise),
-        arcs=stretches(solution.arcs),
-        fixed=solution.fixed[inside(solution.fixed[:, 0])] if len(solution.fixed) else solution.fixed,
+        noise=crop_noise(solution.noise),
+        arcs=crop_arcs(solution.arcs),
+        fixed=solution.fixed[find_inside(solution.fixed[:, 0])] if len(solution.fixed) else solution.fixed,
         graphs=(),  # which hold everything built for the part, ten times the size of the result
         between=tuple(_Span.of(b, own, covariance, start, last) for b in solution.between if isinstance(b, Dense)),
     )

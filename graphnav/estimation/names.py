@@ -22,7 +22,7 @@ class Component:
     scale: float = 1.0  # from the parameter's own unit
 
 
-def _scales(each: int) -> list[Component]:
+def _name_scales(each: int) -> list[Component]:
     out = []
     for sensor in ("gyro", "accelerometer"):
         out += [Component(f"{sensor} scale error, {axis}", "ppm", 1e6) for axis in _AXES]
@@ -30,14 +30,14 @@ def _scales(each: int) -> list[Component]:
     return out
 
 
-def _along(words: str) -> list[Component]:
+def _name_axes(words: str) -> list[Component]:
     return [Component(f"{words}, {axis}", "m") for axis in _AXES]
 
 
 # The parameters of a calibration; all others belong to the noise of the measurements.
 _NAMED = {
     "mounting": [Component("mounting, pitch", "deg", _TO_DEG), Component("mounting, heading", "deg", _TO_DEG)],
-    "gnss_lever_arm": _along("antenna lever arm"),
+    "gnss_lever_arm": _name_axes("antenna lever arm"),
     "axle": [Component("axle without side slip, before the stated place", "m")],
     "gnss_time_offset": [Component("stamps of the positions, to add", "ms", 1e3)],
     "gnss_velocity_time_offset": [Component("stamps of the GNSS velocities, to add", "ms", 1e3)],
@@ -47,7 +47,7 @@ _NAMED = {
         Component("side slip by lateral acceleration", "deg per m/s²", _TO_DEG),
         Component("squat by forward acceleration", "deg per m/s²", _TO_DEG),
     ],
-    "pivot": _along("pivot of the foot"),
+    "pivot": _name_axes("pivot of the foot"),
     "pivot_travel": [
         Component("travel of the pivot, right", "m"),
         Component("travel of the pivot, forward", "m"),
@@ -61,18 +61,18 @@ _NAMED = {
 
 def has_names(name: str) -> bool:
     """Whether a parameter belongs to the calibration and its numbers have names."""
-    return name in _NAMED or name == "imu_scale" or name in _by_constraints()
+    return name in _NAMED or name == "imu_scale" or name in _collect_names()
 
 
 @cache
-def _by_constraints() -> dict[str, list[Component]]:
+def _collect_names() -> dict[str, list[Component]]:
     """The names that constraints give their own parameters."""
     return {name: [Component(*one) for one in each] for kind in list_constraints() for name, each in kind.words.items()}
 
 
-def components(name: str, size: int, unit: str) -> list[Component]:
+def name_components(name: str, size: int, unit: str) -> list[Component]:
     """One per number of a parameter; those without a name are numbered."""
-    known = _scales(size // 2) if name == "imu_scale" else (_NAMED | _by_constraints()).get(name, [])
+    known = _name_scales(size // 2) if name == "imu_scale" else (_NAMED | _collect_names()).get(name, [])
     if len(known) == size:
         return known
     if size == 1:

@@ -25,21 +25,28 @@ from graphnav.detectors import Detector, detect
 from graphnav.detectors import check_own as check_detectors
 from graphnav.estimation import faults
 from graphnav.estimation.building import start_sigma
-from graphnav.estimation.long_drives import OVERLAP, crop_solutions, share_covariances, shares
+from graphnav.estimation.long_drives import OVERLAP, crop_solutions, share_covariances, split_drive
 from graphnav.estimation.noise.files import MODES
-from graphnav.estimation.noise.imu_floor import with_measured_floor
+from graphnav.estimation.noise.imu_floor import apply_measured_floor
 from graphnav.estimation.noise.model import STATED, NoiseModel, StampOffsets
 from graphnav.estimation.noise.words import describe_far
 from graphnav.estimation.pieces import describe_span, split_pieces
 from graphnav.estimation.preparation import Prepared, Weigh, prepare
 from graphnav.estimation.problem import Problem
-from graphnav.estimation.separation import separation
+from graphnav.estimation.separation import compute_separation
 from graphnav.estimation.solution import Solution, join_solutions
 from graphnav.estimation.solvers.breakdown import explain_singular
 from graphnav.estimation.solvers.ekf import ekf
-from graphnav.estimation.solvers.rts import backward, rts
-from graphnav.estimation.stamps import describe_stamps, find_stamps, may_move, move_stamps, on_imu_clock, on_own_clock
-from graphnav.imu.onboard_offset import without_onboard_offset
+from graphnav.estimation.solvers.rts import rts, smooth_backward
+from graphnav.estimation.stamps import (
+    describe_stamps,
+    find_stamps,
+    may_move,
+    move_stamps,
+    shift_to_imu_clock,
+    shift_to_own_clocks,
+)
+from graphnav.imu.onboard_offset import remove_onboard_offset
 from graphnav.recording import Own, Recording
 from graphnav.recording.checks.aiding import describe_gnss_apart
 from graphnav.recording.checks.clock import ClockOffsets
@@ -103,7 +110,7 @@ def run(
             raise ConfigError(f"noise={noise!r}: give a NoiseModel or one of {', '.join(MODES)}", key="noise.mode")
         settings = settings.model_copy(update={"noise": settings.noise.model_copy(update={"mode": noise})})
         noise = None
-    recording = with_own(recording, constraints, detectors)
+    recording = add_own(recording, constraints, detectors)
     screened = screen(recording)
     recording, found = screened.recording, state_findings(recording, screened.findings)
     if (apart := describe_gnss_apart(recording)) is not None:  # it would be solved as if there were no GNSS
@@ -113,7 +120,7 @@ def run(
     return {name: replace(one, notes=(*found, *one.notes)) for name, one in solutions.items()}
 
 
-def with_own(
+def add_own(
     recording: Recording, constraints: Sequence[type[Constraint]] = (), detectors: Sequence[type[Detector]] = ()
 ) -> Recording:
     """The recording, or the setup of a live source, with the constraints and detectors of a script added.
@@ -140,11 +147,11 @@ def _run(
     unknown = [name for name in solvers if name not in KNOWN]
     if unknown:
         raise EstimationError(f"no solver '{unknown[0]}'; known: {', '.join(KNOWN)}", key="solver.unknown")
-    frame = LocalFrame(origin(recording))
+    frame = LocalFrame(choose_origin(recording))
     pieces, notes = split_pieces(recording, settings)
     notes = [*check_profile(recording, settings), *notes]
     found: list[dict[str, Solution]] = []
-    parts = [share for piece in pieces for share in shares(piece, settings)]
+    parts = [share for piece in pieces for share in split_drive(piece, settings)]
     if len(parts) > len(pieces):
         sentence = f"too long to be solved at once: solved in {len(parts)} parts that overlap by {OVERLAP:.0f} s"
         notes.append(Note("pieces.parts", sentence))
@@ -230,8 +237,8 @@ def _solve(
     clock: ClockOffsets | None,
 ) -> dict[str, Solution]:
     began = time.perf_counter()
-    recording, undone = without_onboard_offset(recording, settings)
-    recording, shown = with_measured_floor(recording, settings)
+    recording, undone = remove_onboard_offset(recording, settings)
+    recording, shown = apply_measured_floor(recording, settings)
     detection = time.perf_counter() - began
 
     def prepare_moved(moved: Recording, weigh: Weigh | None = None) -> Prepared:
@@ -240,7 +247,7 @@ def _solve(
         began = time.perf_counter()
         detected = detect(moved, settings)
         detection += time.perf_counter() - began
-        given = None if noise is None else on_imu_clock(noise)
+        given = None if noise is None else shift_to_imu_clock(noise)
         return prepare(moved, settings, frame, detected, given, progress, weigh)
 
     if noise is None and may_move(recording, settings):
@@ -250,7 +257,7 @@ def _solve(
         recording = move_stamps(recording, stamps)
         found = prepare_moved(recording)
     problem, forward, smoothed = found.problem, found.forward, found.smoothed
-    wrong = faults.fault_spans(problem, smoothed)
+    wrong = faults.find_fault_spans(problem, smoothed)
     notes = (
         *found.start.notes,
         *undone,
@@ -268,7 +275,7 @@ def _solve(
         )
         problem = replace(problem, prior=prior)
         forward = ekf(problem, progress, found.aligned.until)
-        smoothed = backward(problem, forward, progress)
+        smoothed = smooth_backward(problem, forward, progress)
         passes.update(filter=1, smoother=1)
     out = {"ekf": forward.solution}
     if "rts" in solvers:
@@ -300,7 +307,7 @@ def _solve(
             out["isam2"] = replace(one, notes=(note, *one.notes))
     timings = {"detection": detection, **found.timings}
     place = BLOCKS["p"]
-    apart = separation(
+    apart = compute_separation(
         frame, problem.t, forward.solution.states.p, forward.solution.covariance[:, place, place],
         smoothed.states.p, smoothed.P[:, place, place],
     )  # fmt: skip
@@ -320,7 +327,7 @@ def _solve(
         )
         for name in solvers
     }
-    return {name: on_own_clock(one, stamps) for name, one in solved.items()}
+    return {name: shift_to_own_clocks(one, stamps) for name, one in solved.items()}
 
 
 def _bind_graph(problem: Problem, solution: Solution) -> Callable[[], tuple[Any, Any]]:
@@ -361,7 +368,7 @@ def check_profile(recording: Recording, settings: Settings) -> list[str]:
     return []
 
 
-def origin(recording: Recording) -> np.ndarray:
+def choose_origin(recording: Recording) -> np.ndarray:
     """Origin of the navigation frame: the first fix, or 45 deg north at sea level without any."""
     gnss = recording.gnss
     if gnss is not None and len(gnss.t):

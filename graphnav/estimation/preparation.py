@@ -20,15 +20,15 @@ from graphnav.core.progress import Progress, tell
 from graphnav.core.rotation import Array
 from graphnav.detectors import Detections
 from graphnav.estimation import faults
-from graphnav.estimation.alignment import Alignment, with_known_heading
+from graphnav.estimation.alignment import Alignment, use_known_heading
 from graphnav.estimation.building import BuiltProblem, Clock, ProblemBuilder, has_diverged
-from graphnav.estimation.fixing import fix, float_arcs
-from graphnav.estimation.noise.apply import with_noise, without_parts
+from graphnav.estimation.fixing import fix, list_float_arcs
+from graphnav.estimation.noise.apply import apply_noise, drop_parts
 from graphnav.estimation.noise.estimate import NoiseEstimate, estimate_noise
 from graphnav.estimation.noise.exclusion import (
+    compute_excluded_share,
     estimate_disturbed_intervals,
     estimate_without_faults,
-    excluded_share,
     log_evidence,
 )
 from graphnav.estimation.noise.model import STATED, NoiseModel
@@ -36,15 +36,15 @@ from graphnav.estimation.noise.spacing import space_fixes
 from graphnav.estimation.noise.words import describe
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import CarrierArcs
-from graphnav.estimation.solvers.ekf import ekf, near, refilter
+from graphnav.estimation.solvers.ekf import ekf, refilter, smooth_near
 from graphnav.estimation.solvers.linearise import Points
 from graphnav.estimation.solvers.passes import (
     FilterPass,
     SmootherPass,
-    near_to,
-    points_of_solution,
+    are_near,
+    take_solution_points,
 )
-from graphnav.estimation.solvers.rts import backward
+from graphnav.estimation.solvers.rts import smooth_backward
 from graphnav.recording import Recording
 
 # whether the evidence of a noise model is wanted, by the problem and the points of its estimate
@@ -111,34 +111,34 @@ def prepare(
     built, known, evidence = builder.build(aligned, detections, parts=noise != STATED), None, np.inf
     if noise is None:
         tell("noise")
-        with clock.book("noise"):
+        with clock.count_time("noise"):
             noise, known, built, evidence = _find_noise(builder, built, progress, passes, weigh)
             noise = replace(noise, spacing=spacing)
     else:
         built = builder.build_without(built, noise, parts=noise != STATED)
     aligned = built.aligned
-    problem = without_parts(with_noise(built.problem, noise))
+    problem = drop_parts(apply_noise(built.problem, noise))
     try:
         forward, smoothed = _smooth(problem, aligned.until, None, clock, progress)
     except EstimationError:  # from a rough start its first pass may diverge, where that of the noise model did not
         if known is None:
             raise
         forward, smoothed = _smooth(problem, aligned.until, known, clock, progress)
-    with clock.book("smoother"):
-        problem = _without_refused(problem, forward)
+    with clock.count_time("smoother"):
+        problem = _drop_refused(problem, forward)
         if any(rows.gate is not None for rows in problem.constraints):
-            smoothed = backward(problem, refilter(problem, smoothed, progress), progress)
+            smoothed = smooth_backward(problem, refilter(problem, smoothed, progress), progress)
         forward, smoothed = _relinearise(problem, aligned, known, forward, smoothed, progress, passes)
     passes.update(filter=1, smoother=1)
-    notes, epochs, arcs = describe(noise, problem), {}, {"": float_arcs(problem)}
+    notes, epochs, arcs = describe(noise, problem), {}, {"": list_float_arcs(problem)}
     if built.carriers is not None:
         tell("ambiguities")
-        with clock.book("ambiguities"):
+        with clock.count_time("ambiguities"):
             fixed = fix(problem, built.carriers, smoothed, aligned.until, progress)
         problem, forward, smoothed = fixed.problem, fixed.forward, fixed.smoothed
         notes, epochs = (*notes, *fixed.notes), {"ekf": fixed.filtered_epochs, "": fixed.smoothed_epochs}
         arcs = {"ekf": fixed.filtered_arcs, "": fixed.smoothed_arcs}
-    start = with_known_heading(aligned, settings)
+    start = use_known_heading(aligned, settings)
     return Prepared(
         problem, noise, start, aligned, built.detections, forward, smoothed, notes, clock.seconds, passes, epochs, arcs,
         evidence,
@@ -150,8 +150,8 @@ def _smooth(
 ) -> tuple[FilterPass, SmootherPass]:
     """Filter, with its opening linearised at known points if there are any, and smooth."""
     forward = ekf(problem, progress, opening, known)  # its own solution has the time it takes
-    with clock.book("smoother"):
-        return forward, backward(problem, forward, progress)
+    with clock.count_time("smoother"):
+        return forward, smooth_backward(problem, forward, progress)
 
 
 def _find_noise(
@@ -161,13 +161,13 @@ def _find_noise(
     logarithm of the evidence where it is wanted.
     """
     best = _estimate(built, builder.settings, progress)
-    if excluded_share(built.problem, best.noise) > _MOST_WRONG:
+    if compute_excluded_share(built.problem, best.noise) > _MOST_WRONG:
         # most fixes contradict the start: align again with the fixes behind those that the alignment used
         try:
             later = builder.build_later(built)
             again = _estimate(later, builder.settings, progress)
             total = best.passes + again.passes
-            if excluded_share(later.problem, again.noise) < excluded_share(built.problem, best.noise):
+            if compute_excluded_share(later.problem, again.noise) < compute_excluded_share(built.problem, best.noise):
                 built, best = later, again
             best = replace(best, passes=total)
         except EstimationError:
@@ -199,7 +199,7 @@ def _is_likelier(base: Problem, plain: NoiseModel, found: NoiseEstimate) -> bool
 
     Both leave the same measurements out, so that the likelihoods compare.
     """
-    problem = with_noise(base, plain)
+    problem = apply_noise(base, plain)
     forward = refilter(problem, found.carry_points(base, problem))
     return float(np.sum(forward.log_likelihood)) > found.log_posterior
 
@@ -221,14 +221,14 @@ def _relinearise(
     If the heading is uncertain and fixes weigh little beside wheels, a filter may turn the mounting by half a turn
     instead of the velocity, a local minimum. So the batch is then solved at once, without wheels first.
     """
-    if near_to(smoothed, forward.linearised, _LINEAR):
+    if are_near(smoothed, forward.linearised, _LINEAR):
         return forward, smoothed
     wheels = aligned.motion is not None and any(c.of_wheels for c in problem.constraints)
     about: Points = smoothed if known is None or len(known.states) != len(problem.t) else known
     for _ in range(int(about is known) if wheels else _ROUNDS):
         passes.update(filter=1, smoother=1)
-        smoothed = backward(problem, refilter(problem, about, progress), progress)
-        if near_to(smoothed, about, _LINEAR):
+        smoothed = smooth_backward(problem, refilter(problem, about, progress), progress)
+        if are_near(smoothed, about, _LINEAR):
             passes.update(filter=1)
             return ekf(problem, progress, aligned.until, known=smoothed), smoothed
         about = smoothed
@@ -237,16 +237,16 @@ def _relinearise(
     states = smoothed.states
     if wheels:
         free = replace(problem, constraints=tuple(c for c in problem.constraints if not c.of_wheels))
-        states = backward(free, ekf(free, progress, aligned.until)).states
+        states = smooth_backward(free, ekf(free, progress, aligned.until)).states
         states = batch(free, states, wanted=(), reintegrate=False).states
     solved = batch(problem, states, wanted=(), reintegrate=False)
-    about = points_of_solution(problem, solved, smoothed)
-    _, smoothed = near(problem, about, aligned.until, progress)
+    about = take_solution_points(problem, solved, smoothed)
+    _, smoothed = smooth_near(problem, about, aligned.until, progress)
     passes.update(filter=3, smoother=2)
     return ekf(problem, progress, aligned.until, known=smoothed), smoothed
 
 
-def _without_refused(problem: Problem, forward: FilterPass) -> Problem:
+def _drop_refused(problem: Problem, forward: FilterPass) -> Problem:
     """The problem without the rows that a gate refused in the filter: no solver uses them."""
     refused = {c.name: forward.records[c.name].decided for c in problem.constraints if c.gate is not None}
     return faults.weigh_rows(problem, refused) if refused else problem

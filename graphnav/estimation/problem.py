@@ -9,7 +9,7 @@ from functools import cached_property, lru_cache
 import numpy as np
 
 from graphnav.config import Settings
-from graphnav.constraints import kinds_for
+from graphnav.constraints import list_kinds
 from graphnav.constraints.base import SAME_TIME, BuildContext, Constraint
 from graphnav.constraints.prior import InitialPrior
 from graphnav.core.earth import LocalFrame
@@ -17,11 +17,11 @@ from graphnav.core.findings import describe_gaps
 from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, Parameter, States
-from graphnav.imu.clipping import with_whole_peaks
+from graphnav.imu.clipping import restore_peaks
 from graphnav.imu.dynamics import ImuFactors, scale_parameter
 from graphnav.imu.preintegration import Intervals, preintegrate, preintegrate_unknown
 from graphnav.imu.samples import Samples, bridge_gaps
-from graphnav.imu.unresolved import with_coning, with_unresolved_motion
+from graphnav.imu.unresolved import add_coning, add_unresolved_motion
 from graphnav.recording import ImuNoise, Recording
 from graphnav.recording.odometer import MeanSpeed
 
@@ -126,23 +126,23 @@ def build_problem(
     speed : of the odometer, where it is known already.
     typical : (M, 3) m, the unit of the slow errors of the recording's fixes, where it is known already.
     known : what intervals between keyframes say that were integrated before, by the time they end at.
-    highest : what the IMU has read at other times, as `graphnav.imu.clipping.highest` says.
+    highest : what the IMU has read at other times, as `graphnav.imu.clipping.find_highest` says.
     complete : False leaves out the constraints that depend on later rows, for `Problem.complete`.
     parts_of_noise : keep what each noise figure contributes to the intervals' covariances, for
     `graphnav.estimation.noise`.
     """
-    stops = to_samples(stationary, recording)
+    stops = limit_to_samples(stationary, recording)
     if times is None:
-        wanted = [cls.epochs(recording, settings, stops) for cls in kinds_for(recording)]
+        wanted = [cls.epochs(recording, settings, stops) for cls in list_kinds(recording)]
         epochs = np.concatenate([*wanted, np.empty(0)])
-        times = keyframe_times(recording.start, recording.end, epochs, settings.keyframes.rate)
+        times = choose_keyframes(recording.start, recording.end, epochs, settings.keyframes.rate)
     t = times
     samples = bridge_gaps(recording.imu)
     remarks: tuple[str, ...] = ()
     if recording.platform == "foot":
-        samples, remarks = with_whole_peaks(samples, recording.imu.R_bs, highest)
-        samples = with_unresolved_motion(samples, recording.imu.noise)
-        samples = with_coning(samples) if settings.imu.coning else samples
+        samples, remarks = restore_peaks(samples, recording.imu.R_bs, highest)
+        samples = add_unresolved_motion(samples, recording.imu.noise)
+        samples = add_coning(samples) if settings.imu.coning else samples
     motion = known.get(float(t[1])) if known and len(t) == 2 else None
     if motion is None or motion.intervals.t0[0] != t[0]:
         before = {end: one.intervals for end, one in (known or {}).items()}
@@ -169,7 +169,7 @@ def build_problem(
 
 def _build_constraints(scene: BuildContext, ahead: bool | None) -> tuple[Constraint, ...]:
     """Build the constraints: those that depend on later rows, those that do not, or all (None)."""
-    classes = (cls for cls in kinds_for(scene.recording) if ahead is None or cls.looks_ahead == ahead)
+    classes = (cls for cls in list_kinds(scene.recording) if ahead is None or cls.looks_ahead == ahead)
     rows = tuple(rows for cls in classes if (rows := cls.build(scene)) is not None and len(rows))
     return tuple(_note_differences(one) if type(one).linearize is Constraint.linearize else one for one in rows)
 
@@ -179,7 +179,7 @@ def _note_differences(rows: Constraint) -> Constraint:
     return replace(rows, notes=(*rows.notes, Note("constraint.differences", sentence)))
 
 
-def keyframe_times(start: float, end: float, epochs: Array, rate: float) -> Array:
+def choose_keyframes(start: float, end: float, epochs: Array, rate: float) -> Array:
     """Keyframes at both ends, at every epoch between, and in between at least at `rate`."""
     inside = epochs[(epochs > start + SAME_TIME) & (epochs < end - SAME_TIME)]
     fixed = np.unique(np.concatenate([[start], inside, [end]]))
@@ -190,7 +190,7 @@ def keyframe_times(start: float, end: float, epochs: Array, rate: float) -> Arra
     return np.append(np.repeat(fixed[:-1], parts) + within * step, fixed[-1])
 
 
-def to_samples(stationary: Array | None, recording: Recording) -> Array:
+def limit_to_samples(stationary: Array | None, recording: Recording) -> Array:
     """The parts of stationary spans that a recording covers, (M, 2), limited to IMU samples."""
     if stationary is None or not len(stationary):
         return np.empty((0, 2))

@@ -22,7 +22,9 @@ from graphnav.estimation.solution import Separation
 _TOLD = 1e-4  # share of P_f that the later measurements must remove: a backward sigma a hundred times the forward one
 
 
-def separation(frame: LocalFrame, t: Array, forward: Array, P_f: Array, smoothed: Array, P_s: Array) -> Separation:
+def compute_separation(
+    frame: LocalFrame, t: Array, forward: Array, P_f: Array, smoothed: Array, P_s: Array
+) -> Separation:
     """The separation of positions at keyframes.
 
     Parameters

@@ -215,7 +215,9 @@ class Solution:
         t, states, covariance = self.t, self.states, self.covariance
         if rate is not None:
             t, states, covariance = self.at(np.concatenate([b.times(rate) for b in self.between]))
-        return to_trajectory(self.solver, self.frame, t, states, covariance if joint else split_covariance(covariance))
+        return make_trajectory(
+            self.solver, self.frame, t, states, covariance if joint else split_covariance(covariance)
+        )
 
     def blocks(self, rate: float | None = None) -> Iterator[Trajectory]:
         """`trajectory` in successive parts, only one of which need be in memory.
@@ -237,7 +239,7 @@ class Solution:
             times = piece.times(rate)
             for k in range(0, len(times), _BLOCK_ROWS):
                 t = times[k : k + _BLOCK_ROWS]
-                yield to_trajectory(self.solver, self.frame, t, *piece.apart(t))
+                yield make_trajectory(self.solver, self.frame, t, *piece.apart(t))
 
     def at(self, t: Array) -> tuple[Array, States, Array]:
         """States between the keyframes.
@@ -267,7 +269,7 @@ class Solution:
         return np.concatenate(times), States.stack(list(states)), np.concatenate(covariances)
 
 
-def to_trajectory(
+def make_trajectory(
     name: str, frame: LocalFrame, t: Array, states: States, covariance: Array | Mapping[str, Array]
 ) -> Trajectory:
     """States in the fixed navigation frame, in the local ENU at each point.
@@ -276,7 +278,7 @@ def to_trajectory(
     third of the work.
     """
     llh, R_ln = frame.level(states.p)
-    rph, by_theta = rotation.find_rph(rotation.components(states.R_nb), R_ln)
+    rph, by_theta = rotation.find_rph(rotation.move_components_first(states.R_nb), R_ln)
     turns = {"p": R_ln, "v": R_ln, "theta": by_theta}  # from the error state to local axes
     cov = None
     if isinstance(covariance, np.ndarray):

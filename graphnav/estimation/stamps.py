@@ -8,7 +8,7 @@ step of Gauss-Newton, until the estimate stays within. Where the clocks of IMU a
 (`graphnav.recording.checks.clock`), the first step is what they disagree by. The stamps as they are remain a candidate:
 the likelier stands.
 
-A solution is on the clock of the IMU, and what it says of fixes is on theirs (`on_own_clock`).
+A solution is on the clock of the IMU, and what it says of fixes is on theirs (`shift_to_own_clocks`).
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from graphnav.estimation.preparation import Prepared, Weigh
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import ConstraintRecord, ExcludedSpan, ParameterEstimate, Solution
 from graphnav.estimation.solvers.linearise import Points
-from graphnav.estimation.solvers.passes import parameters_of, sigmas_of, values_of
+from graphnav.estimation.solvers.passes import compute_sigmas, estimate_parameters, split_values
 from graphnav.recording import Recording
 from graphnav.recording.checks.clock import FAIR, ClockOffsets, is_certain
 
@@ -58,7 +58,7 @@ def find_stamps(
     clock : offsets between IMU and fixes that the recording shows before any estimation.
     """
     guess = None if clock is None else _guess(clock)
-    plain: _Candidate = recording, prepare(recording, _is_far if guess is None else _always), _AS_THEY_ARE
+    plain: _Candidate = recording, prepare(recording, _is_far if guess is None else _accept_all), _AS_THEY_ARE
     starts = [] if guess is None else [_move(recording, prepare, guess)]
     for start in (*starts, plain):
         found = _settle(recording, prepare, start)
@@ -78,16 +78,16 @@ def _settle(recording: Recording, prepare: Prepare, found: _Candidate) -> _Candi
 
 def _move(recording: Recording, prepare: Prepare, offsets: StampOffsets) -> _Candidate:
     moved = move_stamps(recording, offsets)
-    return moved, prepare(moved, _always), offsets
+    return moved, prepare(moved, _accept_all), offsets
 
 
-def _always(problem: Problem, points: Points) -> bool:
+def _accept_all(problem: Problem, points: Points) -> bool:
     return True
 
 
 def _is_far(problem: Problem, points: Points) -> bool:
     """Whether an offset is far from where its rows are linearised."""
-    values = values_of(problem, points)
+    values = split_values(problem, points)
     return any(abs(float(values[name][0, 0])) > _LINEAR for name in OFFSETS.values() if name in values)
 
 
@@ -112,7 +112,7 @@ def _join(offsets: StampOffsets) -> StampOffsets:
 
 def _estimate(prepared: Prepared, at: StampOffsets) -> StampOffsets:
     """The offsets estimated, those that are far and significant; the others as they are."""
-    found = parameters_of(prepared.problem, prepared.smoothed.values, sigmas_of(prepared.smoothed.P))
+    found = estimate_parameters(prepared.problem, prepared.smoothed.values, compute_sigmas(prepared.smoothed.P))
     new = {}
     for key, name in (("positions", TIME_OFFSET), ("velocities", VELOCITY_TIME_OFFSET)):
         if name in found:
@@ -141,21 +141,21 @@ def move_stamps(recording: Recording, offsets: StampOffsets) -> Recording:
     return replace(recording, **changed)
 
 
-def on_imu_clock(noise: NoiseModel) -> NoiseModel:
+def shift_to_imu_clock(noise: NoiseModel) -> NoiseModel:
     """A noise model as it is of the recording with its stamps moved."""
     return noise if noise.stamps == _AS_THEY_ARE else _shift_noise(noise, 1.0)
 
 
-def on_own_clock(solution: Solution, offsets: StampOffsets) -> Solution:
+def shift_to_own_clocks(solution: Solution, offsets: StampOffsets) -> Solution:
     """The solution with what it says of fixes and odometer on their own clocks, and the whole offsets of these."""
     if offsets == _AS_THEY_ARE:
         return solution
-    by = _by_constraint(offsets)
+    by = _list_by_constraint(offsets)
 
-    def record(name: str, one: ConstraintRecord) -> ConstraintRecord:
+    def shift_record(name: str, one: ConstraintRecord) -> ConstraintRecord:
         return replace(one, t=one.t - by[name]) if name in by else one
 
-    def span(one: ExcludedSpan) -> ExcludedSpan:
+    def shift_span(one: ExcludedSpan) -> ExcludedSpan:
         late = by.get(one.kind, 0.0)
         return replace(one, t_start=one.t_start - late, t_end=one.t_end - late)
 
@@ -163,14 +163,14 @@ def on_own_clock(solution: Solution, offsets: StampOffsets) -> Solution:
         TIME_OFFSET: offsets.positions, VELOCITY_TIME_OFFSET: offsets.velocities, ODOMETER_DELAY: -offsets.odometer
     }  # fmt: skip
 
-    def parameter(name: str, one: ParameterEstimate) -> ParameterEstimate:
+    def shift_parameter(name: str, one: ParameterEstimate) -> ParameterEstimate:
         return replace(one, value=one.value + whole[name]) if name in whole else one
 
     return replace(
         solution,
-        records={name: record(name, one) for name, one in solution.records.items()},
-        excluded=tuple(map(span, solution.excluded)),
-        parameters={name: parameter(name, one) for name, one in solution.parameters.items()},
+        records={name: shift_record(name, one) for name, one in solution.records.items()},
+        excluded=tuple(map(shift_span, solution.excluded)),
+        parameters={name: shift_parameter(name, one) for name, one in solution.parameters.items()},
         noise=_shift_noise(replace(solution.noise, stamps=offsets), -1.0),
     )
 
@@ -189,12 +189,12 @@ def describe_stamps(offsets: StampOffsets) -> tuple[str, ...]:
     return (Note("gnss.stamps_moved", sentence),)
 
 
-def _by_constraint(offsets: StampOffsets) -> dict[str, float]:
+def _list_by_constraint(offsets: StampOffsets) -> dict[str, float]:
     return {GnssPosition.name: offsets.positions, GnssVelocity.name: offsets.velocities}
 
 
 def _shift_noise(noise: NoiseModel, sign: float) -> NoiseModel:
-    by = {name: sign * one for name, one in _by_constraint(noise.stamps).items()}
+    by = {name: sign * one for name, one in _list_by_constraint(noise.stamps).items()}
 
     def shift(t: Array | float, name: str) -> Any:
         return t + by.get(name, 0.0)

@@ -12,7 +12,7 @@ from graphnav.config.detectors import FUSED
 from graphnav.constraints import list_constraints
 from graphnav.constraints.base import SAME_TIME
 from graphnav.core.rotation import Array
-from graphnav.detectors.base import Detection, seconds_in
+from graphnav.detectors.base import Detection, measure_overlap
 from graphnav.estimation.solution import ConstraintRecord, Solution
 
 HEAD = "start,end,detector,fired,rows"  # columns of detections.csv
@@ -33,7 +33,7 @@ class Stop:
         return {"start": round(self.start, 4), "end": round(self.end, 4), "fired": fired, "rows": dict(self.rows)}
 
 
-def stops_of(found: Sequence[Detection], records: Mapping[str, ConstraintRecord] | None = None) -> tuple[Stop, ...]:
+def list_stops(found: Sequence[Detection], records: Mapping[str, ConstraintRecord] | None = None) -> tuple[Stop, ...]:
     """The stops in order.
 
     Parameters
@@ -43,7 +43,7 @@ def stops_of(found: Sequence[Detection], records: Mapping[str, ConstraintRecord]
     """
     spans = _collect_spans(found, FUSED)
     names = dict.fromkeys(d.name for d in found if d.name != FUSED)
-    seconds = {name: seconds_in(_collect_spans(found, name), spans) for name in names}
+    seconds = {name: measure_overlap(_collect_spans(found, name), spans) for name in names}
     made = {kind.name for kind in list_constraints() if kind.of_stops}
     used = {name: np.sort(record.t[record.weight > 0.0]) for name, record in (records or {}).items() if name in made}
     out = []
@@ -55,19 +55,19 @@ def stops_of(found: Sequence[Detection], records: Mapping[str, ConstraintRecord]
     return tuple(out)
 
 
-def stops_of_solution(solution: Solution) -> tuple[Stop, ...]:
+def list_solution_stops(solution: Solution) -> tuple[Stop, ...]:
     """The stops that a solver used, with its rows."""
-    return stops_of(solution.detections, solution.records)
+    return list_stops(solution.detections, solution.records)
 
 
-def detections_text(found: Sequence[Detection], records: Mapping[str, ConstraintRecord] | None = None) -> str:
+def format_detections(found: Sequence[Detection], records: Mapping[str, ConstraintRecord] | None = None) -> str:
     """The content of detections.csv: a row per interval and detector, the fused one last.
 
     The rows of fused stops state the share that each detector calls stationary, and the number of rows by constraint:
     "low_band_glrt:0.97 fft:0.41" and "zero_velocity:23 zero_rate:23".
     """
     rows = [f"{a:.4f},{b:.4f},{d.name},," for d in found if d.name != FUSED for a, b in d.intervals]
-    for stop in stops_of(found, records):
+    for stop in list_stops(found, records):
         fired = " ".join(f"{name}:{share:.2f}" for name, share in stop.fired.items())
         used = " ".join(f"{name}:{count}" for name, count in stop.rows.items())
         rows.append(f"{stop.start:.4f},{stop.end:.4f},{FUSED},{fired},{used}")

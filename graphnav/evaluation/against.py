@@ -20,7 +20,7 @@ from graphnav.core.interpolation import fit_yaw, interpolate, place_on_earth
 from graphnav.core.notes import Note, format_count
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, States
-from graphnav.core.timescales import LEAP, NEAR, between_clocks
+from graphnav.core.timescales import LEAP, NEAR, compute_clock_offset
 from graphnav.core.trajectory import Trajectory
 from graphnav.estimation.solution import Solution
 from graphnav.evaluation.metrics import Metrics
@@ -76,12 +76,12 @@ class Foreign(Solution):
         return track.t, _build_states(self.frame, track), np.full((len(track), DIM, DIM), np.nan)
 
 
-def own_solutions(solutions: Mapping[str, Solution]) -> dict[str, Solution]:
+def select_own(solutions: Mapping[str, Solution]) -> dict[str, Solution]:
     """The solutions that are not from other programs."""
     return {name: s for name, s in solutions.items() if not isinstance(s, Foreign)}
 
 
-def antenna_lever_arm(recording: Recording, solution: Solution) -> Array | None:
+def find_antenna_lever_arm(recording: Recording, solution: Solution) -> Array | None:
     """Lever arm from the IMU to the antenna, m, RFU: as estimated, else as stated; None without GNSS."""
     if recording.gnss is None:
         return None
@@ -126,7 +126,7 @@ def read_against(asked: Against, name: str, recording: Recording, reference: Sol
         )
     arm = asked.point
     if isinstance(arm, str):
-        stated = antenna_lever_arm(recording, reference) if arm == "antenna" else np.zeros(3)
+        stated = find_antenna_lever_arm(recording, reference) if arm == "antenna" else np.zeros(3)
         if stated is None:
             raise RecordingError(
                 f"{asked.path}: is to be of the antenna, and '{recording.name}' has no GNSS", key="against.no_gnss"
@@ -135,7 +135,7 @@ def read_against(asked: Against, name: str, recording: Recording, reference: Sol
     _require_same_drive(asked, track, recording, reference)
     borrowed = track.rph is None
     if borrowed:
-        track = _with_attitude(track, reference)
+        track = _borrow_attitude(track, reference)
         notes.append(
             Note(
                 "against.no_attitude",
@@ -147,7 +147,7 @@ def read_against(asked: Against, name: str, recording: Recording, reference: Sol
         notes.append(
             Note("against.point", f"{asked.path.name}: moved to the IMU from [{_show(arm)}] m (right, forward, up)")
         )
-    notes += _find_other_point(asked.path, track, arm, antenna_lever_arm(recording, reference), reference)
+    notes += _find_other_point(asked.path, track, arm, find_antenna_lever_arm(recording, reference), reference)
     track = replace(track, name=name)
     _, known = interpolate(track, reference.t, max_gap=_MAX_GAP)
     t = reference.t[known]
@@ -158,7 +158,7 @@ def read_against(asked: Against, name: str, recording: Recording, reference: Sol
 
 def _shift(path: Path, track: Trajectory, recording: Recording, reference: Solution) -> tuple[float, list[str]]:
     """s to add to the stamps of a trajectory, and the reason."""
-    known = between_clocks(recording.start, recording.gps_zero, float(track.t[0]), track.gps_zero)
+    known = compute_clock_offset(recording.start, recording.gps_zero, float(track.t[0]), track.gps_zero)
     own_start, on_a_clock = recording.start - float(track.t[0]), True
     notes: list[str] = []
     if track.t[-1] > recording.start and track.t[0] < recording.end:
@@ -305,14 +305,14 @@ def _measure_delay(track: Trajectory, reference: Solution) -> float | None:
     return fit.lag
 
 
-def _with_attitude(track: Trajectory, reference: Solution) -> Trajectory:
+def _borrow_attitude(track: Trajectory, reference: Solution) -> Trajectory:
     """The part of a trajectory that a solution covers, with the attitude of that solution."""
     inside = track.take((track.t >= reference.t[0]) & (track.t <= reference.t[-1]))
     states = reference.at(inside.t)[1]
     return replace(inside, rph=rotation.to_rph(reference.frame.R_ln(states.p) @ states.R_nb))
 
 
-def without_attitude(metrics: Metrics) -> Metrics:
+def drop_attitude(metrics: Metrics) -> Metrics:
     """The metrics of a trajectory with borrowed attitude, without those of the attitude."""
     errors = metrics.errors
     if errors is not None:

@@ -1,6 +1,6 @@
 """Errors of a trajectory against a truth: at the truth's epochs, at its point, in its axes.
 
-`errors` computes differences, `measure` reduces them to numbers, `summary` and `text` present these; `evaluate` does
+`compute_errors` computes differences, `measure` reduces them to numbers, `summarise` and `text` present these; `evaluate` does
 all of it for two files and `evaluate_recording` for a solution of a recording, with or without a truth of its own.
 """
 
@@ -15,7 +15,7 @@ import numpy as np
 from graphnav.core.errors import RecordingError
 from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
-from graphnav.core.timescales import GPS_TO_UNIX, LEAP, between_clocks
+from graphnav.core.timescales import GPS_TO_UNIX, LEAP, compute_clock_offset
 from graphnav.core.trajectory import Trajectory
 from graphnav.evaluation.metrics import (
     COMPONENTS,
@@ -25,27 +25,46 @@ from graphnav.evaluation.metrics import (
     Nees,
     SpanErrors,
     Statistic,
+    average_ensemble_nees,
     average_nees,
     chi_square_band,
-    comparison_rows,
-    ensemble_nees,
+    format_metrics,
     measure,
-    summary,
-    text,
+    summarise,
+    tabulate,
     write_comparison_csv,
 )
-from graphnav.evaluation.scoring import MAX_GAP, closure, errors, ranges
+from graphnav.evaluation.scoring import MAX_GAP, compute_errors, measure_closure, ranges
 from graphnav.recording import Recording
 from graphnav.recording.formats.trajectories import WEEK, read_trajectory
 
 __all__ = [
-    "COMPONENTS", "AntennaCalibration", "Closure", "Errors", "Metrics", "Nees", "SpanErrors", "Statistic",
-    "average_nees", "chi_square_band", "closure", "comparison_rows", "ensemble_nees", "errors", "evaluate",
-    "evaluate_recording", "measure", "summary", "text", "truth_of", "withheld_truth", "write_comparison_csv",
+    "COMPONENTS",
+    "AntennaCalibration",
+    "Closure",
+    "Errors",
+    "Metrics",
+    "Nees",
+    "SpanErrors",
+    "Statistic",
+    "average_ensemble_nees",
+    "average_nees",
+    "chi_square_band",
+    "compute_errors",
+    "evaluate",
+    "evaluate_recording",
+    "find_truth",
+    "format_metrics",
+    "make_withheld_truth",
+    "measure",
+    "measure_closure",
+    "summarise",
+    "tabulate",
+    "write_comparison_csv",
 ]  # fmt: skip
 
 
-def truth_of(recording: Recording) -> tuple[Trajectory, Array | None] | None:
+def find_truth(recording: Recording) -> tuple[Trajectory, Array | None] | None:
     """The recording's truth and the lever arm from the IMU to its point; None without truth, or for a closed loop.
 
     Raises
@@ -84,7 +103,7 @@ class AntennaCalibration:
 _AS_STATED = AntennaCalibration()
 
 
-def withheld_truth(
+def make_withheld_truth(
     recording: Recording,
     source: str = "gnss",
     spans: Sequence[tuple[float, float] | None] = (None,),
@@ -181,14 +200,14 @@ def evaluate_recording(
     """
     gnss_spans = [span for source, span in withheld if source == "gnss"]
     spans = [span for span in gnss_spans if span is not None]
-    found = truth_of(recording)
+    found = find_truth(recording)
     if found is None and recording.truth is not None and recording.truth.closed_loop_sigma is not None:
         sigma = recording.truth.closed_loop_sigma
         note = Note("truth.closed_loop", f"the only truth is that the drive ends where it starts, to {sigma:g} m")
-        return Metrics(trajectory.name, closure=closure(trajectory), notes=(*trajectory.notes, note))
+        return Metrics(trajectory.name, closure=measure_closure(trajectory), notes=(*trajectory.notes, note))
     late = 0.0
     if found is None and gnss_spans and recording.gnss is not None:
-        found = withheld_truth(recording, "gnss", gnss_spans, antenna)
+        found = make_withheld_truth(recording, "gnss", gnss_spans, antenna)
         late = antenna.clock_offset
     if found is None:
         return None
@@ -196,7 +215,7 @@ def evaluate_recording(
     if recording.truth is not None and recording.truth.of == "gnss" and antenna.lever_arm is not None:
         lever_arm = antenna.lever_arm
     alone = trajectory.frame == "local" or not recording.placed
-    found_errors = errors(trajectory, truth, lever_arm=lever_arm, max_gap=max_gap, at=at, from_start=alone)
+    found_errors = compute_errors(trajectory, truth, lever_arm=lever_arm, max_gap=max_gap, at=at, from_start=alone)
     # spans are on the fixes' own clock, and so are the errors then
     found_errors = replace(found_errors, t=found_errors.t - late)
     return measure(found_errors, trajectory.name, spans, start=recording.start)
@@ -243,7 +262,7 @@ def evaluate(
 
         recording = formats.read(truth_path)
         trajectory, notes = _put_on_clock(trajectory, recording.start, recording.end, recording.gps_zero)
-        found = truth_of(recording)
+        found = find_truth(recording)
         if found is None:
             metrics = evaluate_recording(trajectory, recording)
             if metrics is None:
@@ -261,8 +280,8 @@ def evaluate(
         raise RecordingError(
             f"{trajectory_path}: {ranges(trajectory, truth)}{_shift_hint(trajectory, truth)}", key="truth.no_overlap"
         )
-    found_errors = errors(trajectory, truth, lever_arm=lever_arm, max_gap=max_gap, from_start=alone)
-    hint = _leap_hint(found_errors, trajectory, truth, lever_arm, max_gap)
+    found_errors = compute_errors(trajectory, truth, lever_arm=lever_arm, max_gap=max_gap, from_start=alone)
+    hint = _hint_at_leap(found_errors, trajectory, truth, lever_arm, max_gap)
     return measure(
         replace(found_errors, notes=(*notes, *found_errors.notes, *hint)),
         trajectory.name or trajectory_path.stem,
@@ -275,7 +294,7 @@ def _put_on_clock(
 ) -> tuple[Trajectory, tuple[str, ...]]:
     """A trajectory on the clock of a truth from `start` to `end` (s), where both clocks are known and differ."""
     begin, last = float(trajectory.t[0]), float(trajectory.t[-1])
-    known = between_clocks(start, zero, begin, trajectory.gps_zero)
+    known = compute_clock_offset(start, zero, begin, trajectory.gps_zero)
     if known is None or (begin <= end and last >= start) or begin + known.offset > end or last + known.offset < start:
         return trajectory, ()
     note = Note("against.clock", f"stamps shifted by {known.offset:+.0f} s: {known.words}")
@@ -302,7 +321,7 @@ def _shift_hint(trajectory: Trajectory, truth: Trajectory) -> str:
     return "; put both on one clock"
 
 
-def _leap_hint(
+def _hint_at_leap(
     found: Errors, trajectory: Trajectory, truth: Trajectory, lever_arm: Array | None, max_gap: float
 ) -> tuple[str, ...]:
     """A note if a shift of 18 s would explain most of the error: UTC taken for GPS time or the reverse."""
@@ -311,7 +330,9 @@ def _leap_hint(
         return ()
     for shift in (LEAP, -LEAP):
         try:
-            moved = errors(replace(trajectory, t=trajectory.t + shift), truth, lever_arm=lever_arm, max_gap=max_gap)
+            moved = compute_errors(
+                replace(trajectory, t=trajectory.t + shift), truth, lever_arm=lever_arm, max_gap=max_gap
+            )
         except RecordingError:
             continue
         after = float(np.sqrt(np.nanmean(moved.horizontal**2)))

@@ -18,7 +18,7 @@ estimate states no covariances between epochs. Here errors of position and headi
 which is exact for a filter without fixes, and for a smoother as far as later measurements carry no information about
 earlier states. The later contributions are the growth of the stated covariances. Where these shrink, as where a
 smoother knows the end of a walk better than its middle, the contribution is set to zero, and the covariance of all
-later epochs is larger than stated: a verdict on it is then lenient, and `after_fit` returns by how much.
+later epochs is larger than stated: a verdict on it is then lenient, and `propagate_fit` returns by how much.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _HEADING = 8  # of position, velocity, roll, pitch, heading
 _STATE = (0, 1, 2, _HEADING)
 
 
-def after_fit(cov: Array, p: Array, v: Array | None) -> tuple[Array, float]:
+def propagate_fit(cov: Array, p: Array, v: Array | None) -> tuple[Array, float]:
     """Covariances (N, 9, 9) of errors after a yaw and an offset have been fitted over all of the epochs.
 
     Also how much larger than stated the horizontal sigma had to be taken, rms over the epochs: 1 for dead reckoning.
@@ -57,7 +57,7 @@ def after_fit(cov: Array, p: Array, v: Array | None) -> tuple[Array, float]:
     cov = cov.copy()
     cov[np.ix_(range(n), _STATE, _STATE)] = X * sign[:, None] * sign
     # epochs from i on: their errors contain its error
-    ahead, moved = _from(G), _from(np.einsum("jkl,jl->jk", G, turned))
+    ahead, moved = _sum_from(G), _sum_from(np.einsum("jkl,jl->jk", G, turned))
     moved = moved - np.einsum("ikl,il->ik", ahead, turned)
     K = ahead @ cov[:, :3] - moved[..., None] * cov[:, None, _HEADING]
     # epochs before i: its error contains theirs
@@ -92,7 +92,7 @@ def _rotate(x: Array) -> Array:
     return np.column_stack([-x[:, 1], x[:, 0], np.zeros(len(x))])
 
 
-def _from(x: Array) -> Array:
+def _sum_from(x: Array) -> Array:
     """Sums of the rows from each row on."""
     return np.asarray(np.cumsum(x[::-1], axis=0)[::-1])
 

@@ -19,7 +19,7 @@ _SPAN = ("start_s", "end_s", "n", "distance_m", "end_h_m", "end_3d_m", "max_h_m"
 _UNIT_SUFFIXES = ("_m", "_mps", "_deg", "_s")  # suffixes that may be omitted
 
 
-def names() -> tuple[str, ...]:
+def list_names() -> tuple[str, ...]:
     """All numbers that can be required; those of spans begin with ``span_`` (every span) or ``span2_`` (the second)."""
     errors = [
         f"{key}_{what}_{unit}" for key, (_, unit, _) in COMPONENTS.items() for what in ("rms", "p95", "max", "mean")
@@ -36,7 +36,7 @@ class Requirement:
     """A number and its limit, for one solver or for all that run."""
 
     text: str  # as given
-    name: str  # full name, of `names`, or span2_... for the second span
+    name: str  # full name, of `list_names`, or span2_... for the second span
     sign: str  # <, <=, > or >=
     limit: float
     solver: str | None = None
@@ -89,7 +89,7 @@ def parse_requirement(text: str, solvers: Sequence[str] = ()) -> Requirement:
 
 def _complete_name(name: str, text: str) -> str:
     """The name with its unit, and with the number of its span if it has one."""
-    every = names()
+    every = list_names()
     short = {full.removesuffix(unit): full for unit in _UNIT_SUFFIXES for full in every if full.endswith(unit)}
     known = {**short, **{full: full for full in every}}
     span = re.match(r"span(\d+)_", name)
@@ -104,7 +104,7 @@ def _complete_name(name: str, text: str) -> str:
 
 
 def judge(requirements: Sequence[Requirement], rows: Sequence[Mapping[str, Any]]) -> list[Verdict]:
-    """The verdicts on rows of numbers, one row per solver, as `metrics.comparison_rows` makes them."""
+    """The verdicts on rows of numbers, one row per solver, as `metrics.tabulate` makes them."""
     verdicts = []
     for requirement in requirements:
         for row in rows:
@@ -118,13 +118,13 @@ def judge(requirements: Sequence[Requirement], rows: Sequence[Mapping[str, Any]]
     return verdicts
 
 
-def text(verdicts: Sequence[Verdict]) -> str:
+def format_verdicts(verdicts: Sequence[Verdict]) -> str:
     """The verdicts as lines of text; "" if there are none."""
     lines = [f"  {'met' if verdict.met else 'not met'}: {verdict.sentence}" for verdict in verdicts]
     return "\n".join(["\n", "required", *lines]) if lines else ""
 
 
-def values(verdicts: Sequence[Verdict]) -> list[dict[str, Any]]:
+def list_verdicts(verdicts: Sequence[Verdict]) -> list[dict[str, Any]]:
     """The verdicts for JSON."""
     return [
         {"require": v.requirement.text, "solver": v.solver, "name": v.requirement.name, "value": v.value, "met": v.met}

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from graphnav.core.rotation import Array
-from graphnav.core.sample_size import chi_square_band, chi_square_quantile, effective_epochs
+from graphnav.core.sample_size import chi_square_band, chi_square_quantile, count_effective_epochs
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ class Nees:
 
     `low` and `high` hold the average 95 % of the time if the n epochs are independent. Errors of one
     drive are correlated over seconds to minutes, so a true covariance leaves this band often: `band` is that
-    of as many epochs as they are worth; sharper are independent runs (`ensemble_nees`). `inside` is the share
+    of as many epochs as they are worth; sharper are independent runs (`average_ensemble_nees`). `inside` is the share
     of epochs within the 95 % region of one epoch; its expectation, 0.95, does not need independence.
     """
 
@@ -109,7 +109,7 @@ class Closure:
 
 @dataclass(frozen=True)
 class Metrics:
-    """All numbers that `summary` and `text` present; `errors` is kept for plots."""
+    """All numbers that `summarise` and `format_metrics` present; `errors` is kept for plots."""
 
     name: str
     n: int = 0
@@ -154,7 +154,7 @@ def measure(
         "ve": errors.v[:, 0], "vn": errors.v[:, 1], "vu": errors.v[:, 2],
         "roll": deg[:, 0], "pitch": deg[:, 1], "heading": deg[:, 2],
     }  # fmt: skip
-    p, v, rph = over_sigmas(errors)
+    p, v, rph = scale_by_sigmas(errors)
     values = {
         "p": (errors.nees_p, errors.dof_p, p), "e": (errors.nees_axis[:, 0], 1, p[:, :1]),
         "n": (errors.nees_axis[:, 1], 1, p[:, 1:2]), "up": (errors.nees_axis[:, 2], 1, p[:, 2:]),
@@ -168,7 +168,7 @@ def measure(
         distance=float(errors.distance[-1]) if len(errors) else 0.0,
         components={key: found for key, x in series.items() if (found := compute_statistic(x)) is not None},
         nees={key: mean for key, (x, dof, z) in values.items() if (mean := average_nees(x, dof, z)) is not None},
-        spans=tuple(_span(errors, a, b, start) for a, b in spans),
+        spans=tuple(_measure_span(errors, a, b, start) for a, b in spans),
         notes=errors.notes,
         errors=errors,
     )
@@ -198,13 +198,13 @@ def average_nees(x: Array, dof: int, over_sigma: Array | None = None) -> Nees | 
     x = x[known]
     if not len(x):
         return None
-    effective = float(len(x)) if over_sigma is None else effective_epochs(over_sigma[known])
+    effective = float(len(x)) if over_sigma is None else count_effective_epochs(over_sigma[known])
     low, high = chi_square_band(dof, len(x))
     inside = float(np.mean(x <= chi_square_quantile(0.95, dof)))
     return Nees(float(x.mean()) / dof, dof, len(x), low, high, inside, effective)
 
 
-def ensemble_nees(runs: Sequence[Errors], block: str = "p") -> tuple[Array, Array, float, float]:
+def average_ensemble_nees(runs: Sequence[Errors], block: str = "p") -> tuple[Array, Array, float, float]:
     """NEES averaged over independent runs at each epoch they share: the test that needs no independence in time.
 
     Returns the epochs (T,), the average per degree of freedom (T,), and the 95 % band for this many runs.
@@ -225,7 +225,7 @@ def ensemble_nees(runs: Sequence[Errors], block: str = "p") -> tuple[Array, Arra
     )
 
 
-def _span(errors: Errors, start: float, end: float, origin: float) -> SpanErrors:
+def _measure_span(errors: Errors, start: float, end: float, origin: float) -> SpanErrors:
     t = errors.t - origin
     inside = np.flatnonzero((t >= start) & (t <= end) & np.isfinite(errors.horizontal))
     if not len(inside):
@@ -249,7 +249,7 @@ def _span(errors: Errors, start: float, end: float, origin: float) -> SpanErrors
     )
 
 
-def summary(metrics: Metrics) -> dict[str, Any]:
+def summarise(metrics: Metrics) -> dict[str, Any]:
     """The metrics as a dictionary for JSON: five significant digits, units in the keys, None where unknown."""
     out: dict[str, Any] = {
         "n": metrics.n,
@@ -288,7 +288,7 @@ def summary(metrics: Metrics) -> dict[str, Any]:
     return out
 
 
-def text(metrics: Metrics) -> str:
+def format_metrics(metrics: Metrics) -> str:
     """The metrics as an aligned table for the terminal."""
     lines = []
     if metrics.n:
@@ -318,15 +318,15 @@ def text(metrics: Metrics) -> str:
     return "\n".join(lines)
 
 
-def comparison_rows(results: Mapping[str, Metrics]) -> list[dict[str, Any]]:
-    """One flat row per solver: `solver`, the numbers of `summary`, and span1_..., span2_... for the spans.
+def tabulate(results: Mapping[str, Metrics]) -> list[dict[str, Any]]:
+    """One flat row per solver: `solver`, the numbers of `summarise`, and span1_..., span2_... for the spans.
 
     All rows have the same keys in the same order; None where a solver lacks one.
     """
     rows = []
     for solver, metrics in results.items():
         row: dict[str, Any] = {"solver": solver}
-        for key, value in summary(metrics).items():
+        for key, value in summarise(metrics).items():
             if key == "spans":
                 for k, span in enumerate(value, 1):
                     row |= {f"span{k}_{name}": number for name, number in span.items()}
@@ -338,7 +338,7 @@ def comparison_rows(results: Mapping[str, Metrics]) -> list[dict[str, Any]]:
 
 
 def write_comparison_csv(path: str | Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Write rows of `comparison_rows`, possibly with more columns; a missing value is blank."""
+    """Write rows of `tabulate`, possibly with more columns; a missing value is blank."""
     keys = list(dict.fromkeys(key for row in rows for key in row))
     with Path(path).open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, keys, lineterminator="\n")
@@ -358,7 +358,7 @@ def _format_short(x: float) -> str:
     return f"{x:.0f}" if size >= 1000 else f"{x:.4f}" if size < 1 else f"{x:.{3 - int(math.log10(size))}f}"
 
 
-def over_sigmas(errors: Errors) -> tuple[Array, Array, Array]:
+def scale_by_sigmas(errors: Errors) -> tuple[Array, Array, Array]:
     """Errors of position, velocity, and roll, pitch, heading over their sigmas, (N, 3) each, NaN where unknown."""
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.sign(errors.p) * np.sqrt(errors.nees_axis), errors.v / errors.sd_v, errors.rph / errors.sd_rph

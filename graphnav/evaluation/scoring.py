@@ -9,11 +9,11 @@ import numpy as np
 from graphnav.core import rotation
 from graphnav.core.earth import LocalFrame, enu_axes, llh_to_ecef
 from graphnav.core.errors import RecordingError
-from graphnav.core.interpolation import differentiate, fit_yaw, full_covariance, interpolate, place_on_earth
+from graphnav.core.interpolation import differentiate, fill_covariance, fit_yaw, interpolate, place_on_earth
 from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.core.trajectory import Trajectory
-from graphnav.evaluation.fitted import after_fit
+from graphnav.evaluation.fitted import propagate_fit
 from graphnav.evaluation.metrics import Closure, Errors
 
 MAX_GAP = 3.0  # s; the widest gap that is interpolated over
@@ -21,7 +21,7 @@ _LARGER = 1.05  # ratio to the stated sigma above which it is noted
 _LEAST_SPEED = 0.5  # m/s; below, the direction of travel is undefined
 
 
-def errors(
+def compute_errors(
     trajectory: Trajectory,
     truth: Trajectory,
     *,
@@ -105,18 +105,18 @@ def errors(
         # by the rotation, not the angles: these are strongly nonlinear where a foot points down
         theta = rotation.log(np.swapaxes(rotation.from_rph(estimate.rph), -1, -2) @ rotation.from_rph(seen.rph))
 
-    cov = full_covariance(estimate)
+    cov = fill_covariance(estimate)
     cov = np.full((len(seen), 9, 9), np.nan) if cov is None else cov
     if from_start:
         cov = _subtract_fit(cov, estimate, notes)
-    of_truth = full_covariance(replace(seen, covariance=None))
+    of_truth = fill_covariance(replace(seen, covariance=None))
     if of_truth is not None:
         cov = cov + np.nan_to_num(of_truth)
     dof = 2 if flat else 3
     nees_rph = missing[:, 0]
     if estimate.rph is not None:
         to_theta = np.linalg.inv(rotation.rph_jacobian(estimate.rph))
-        nees_rph = _nees(theta, to_theta @ cov[:, 6:9, 6:9] @ np.swapaxes(to_theta, -1, -2))
+        nees_rph = _compute_nees(theta, to_theta @ cov[:, 6:9, 6:9] @ np.swapaxes(to_theta, -1, -2))
     with np.errstate(divide="ignore", invalid="ignore"):
         per_axis = p**2 / np.diagonal(cov, axis1=-2, axis2=-1)[:, :3]
     if truth.v is None:
@@ -137,19 +137,19 @@ def errors(
         sd_p=missing if estimate.sd_p is None else estimate.sd_p,
         sd_v=missing if estimate.sd_v is None else estimate.sd_v,
         sd_rph=missing if estimate.sd_rph is None else estimate.sd_rph,
-        nees_p=_nees(p[:, :dof], cov[:, :dof, :dof]),
+        nees_p=_compute_nees(p[:, :dof], cov[:, :dof, :dof]),
         nees_axis=np.where(np.isfinite(per_axis), per_axis, np.nan),
-        nees_v=_nees(v, cov[:, 3:6, 3:6]),
+        nees_v=_compute_nees(v, cov[:, 3:6, 3:6]),
         nees_rph=nees_rph,
-        distance=distance_travelled(seen.t, seen.llh),
+        distance=measure_distance(seen.t, seen.llh),
         dof_p=dof,
         epochs=epochs,
         notes=tuple(dict.fromkeys(notes)),
-        nees_heading=_nees(rph[:, 2:], cov[:, 8:, 8:]),
+        nees_heading=_compute_nees(rph[:, 2:], cov[:, 8:, 8:]),
     )
 
 
-def closure(trajectory: Trajectory) -> Closure:
+def measure_closure(trajectory: Trajectory) -> Closure:
     """Distance of the last row from the first, for a loop that ends where it began."""
     p = trajectory.llh if trajectory.frame == "local" else LocalFrame(trajectory.llh[0]).from_llh(trajectory.llh)
     gap, length = p[-1] - p[0], float(np.sum(np.linalg.norm(np.diff(p[:, :2], axis=0), axis=1)))
@@ -157,7 +157,7 @@ def closure(trajectory: Trajectory) -> Closure:
     return Closure(h, float(gap[2]), length, 100.0 * h / length if length > 0 else float("nan"))
 
 
-def distance_travelled(t: Array, llh: Array) -> Array:
+def measure_distance(t: Array, llh: Array) -> Array:
     """Horizontal distance (N,) m since the first of the points (N, 3), along points half a second apart.
 
     Summed over every point, the noise of a standing receiver would count as travel.
@@ -223,7 +223,7 @@ def _subtract_fit(cov: Array, estimate: Trajectory, notes: list[str]) -> Array:
             )
         )
         return cov
-    rest, larger = after_fit(cov, LocalFrame(estimate.llh[0]).from_llh(estimate.llh), estimate.v)
+    rest, larger = propagate_fit(cov, LocalFrame(estimate.llh[0]).from_llh(estimate.llh), estimate.v)
     by = f", which takes sigmas {larger:.2f} times as large as stated" if larger > _LARGER else ""
     notes.append(
         Note(
@@ -269,7 +269,7 @@ def _are_between(t: Array, rows: Array) -> bool:
     return bool((np.minimum(np.abs(t - rows[k]), np.abs(t - rows[k - 1])) > 1e-4).any())
 
 
-def _nees(e: Array, cov: Array) -> Array:
+def _compute_nees(e: Array, cov: Array) -> Array:
     """e' P^-1 e for each row; NaN where something is missing or P is not positive definite."""
     out = np.full(len(e), np.nan)
     rows = np.flatnonzero(np.isfinite(e).all(axis=1) & np.isfinite(cov).all(axis=(1, 2)))

@@ -30,7 +30,7 @@ class Relative:
         return 100.0 * self.rms / self.length
 
 
-def relative_errors(errors: Errors) -> tuple[Relative, ...]:
+def compute_relative_errors(errors: Errors) -> tuple[Relative, ...]:
     """Relative errors of segments of 10, 20, 50, 100 ... m that begin at every scored epoch.
 
     The displacement is compared in east and north, so that a heading which is off counts by what it makes of the
@@ -46,16 +46,16 @@ def relative_errors(errors: Errors) -> tuple[Relative, ...]:
     for length in (step * 10.0**k for k in range(1, 6) for step in _STEPS):
         if (travelled[-1] - travelled[0]) / length < _FEWEST_SEGMENTS:
             break
-        first, last = _segments(travelled, length)
+        first, last = _find_segments(travelled, length)
         if len(first) >= _FEWEST_SEGMENTS:
             off = np.hypot(*(e[last] - e[first]).T)
             turned = np.degrees(np.angle(np.exp(1j * (heading[last] - heading[first]))))
             p95, largest = np.quantile(off, 0.95), off.max()
-            out.append(Relative(length, len(first), rms(off), float(p95), float(largest), rms(turned)))
+            out.append(Relative(length, len(first), compute_rms(off), float(p95), float(largest), compute_rms(turned)))
     return tuple(out)
 
 
-def _segments(travelled: Array, length: float) -> tuple[np.ndarray, np.ndarray]:
+def _find_segments(travelled: Array, length: float) -> tuple[np.ndarray, np.ndarray]:
     """First and last rows of segments of that length, to a tenth."""
     last = np.searchsorted(travelled, travelled + length)
     first = np.flatnonzero(last < len(travelled))
@@ -64,7 +64,7 @@ def _segments(travelled: Array, length: float) -> tuple[np.ndarray, np.ndarray]:
     return first, last[first]
 
 
-def rms(x: Array) -> float:
+def compute_rms(x: Array) -> float:
     """Root mean square of the finite values."""
     x = x[np.isfinite(x)]
     return float(np.sqrt(np.mean(x * x))) if len(x) else float("nan")

@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from graphnav.core.rotation import Array
-from graphnav.core.sample_size import chi_square_band, chi_square_quantile, effective_epochs
-from graphnav.evaluation.metrics import Errors, over_sigmas
+from graphnav.core.sample_size import chi_square_band, chi_square_quantile, count_effective_epochs
+from graphnav.evaluation.metrics import Errors, scale_by_sigmas
 
 _TOO_SMALL, _CAUTIOUS = 1.5, 0.5  # error over sigma; what lies between is acceptable
 PARTS = {"position": "height", "attitude": "heading"}  # judged by themselves as well
@@ -35,7 +35,7 @@ def judge_sigmas(errors: Errors) -> tuple[BlockVerdict, ...]:
     explain it for as many independent epochs. Where it may, as for an error that hardly changes and so counts once, it
     is unclear. Height and heading are judged by themselves as well: an average over three axes would hide a wrong one.
     """
-    p, v, rph = over_sigmas(errors)
+    p, v, rph = scale_by_sigmas(errors)
     nees_p = errors.nees_p
     if not np.isfinite(nees_p).any():  # a covariance that is not invertible still has sigmas
         nees_p = np.sum(errors.nees_axis[:, : errors.dof_p], axis=1)
@@ -66,7 +66,7 @@ def select_verdict(verdicts: Sequence[BlockVerdict], verdict: str) -> list[Block
 
 def _judge(block: str, nees: Array, dof: int, over_sigma: Array) -> BlockVerdict:
     known = np.isfinite(nees)
-    nees, effective = nees[known], effective_epochs(over_sigma[known])
+    nees, effective = nees[known], count_effective_epochs(over_sigma[known])
     size = float(np.sqrt(np.mean(nees) / dof))
     verdict = "fits"
     if size > _TOO_SMALL:

@@ -17,7 +17,7 @@ from graphnav.core.rotation import Array
 from graphnav.core.state import States
 from graphnav.core.trajectory import Trajectory
 from graphnav.estimation.solution import Solution
-from graphnav.evaluation.scoring import closure
+from graphnav.evaluation.scoring import measure_closure
 from graphnav.recording import Recording
 
 _EPOCH_SPACING = 0.1  # s between the epochs compared with a dense truth
@@ -40,7 +40,7 @@ class WalkErrors:
     nees_up: float
 
 
-def floor_sigma(recording: Recording, solution: Solution) -> float:
+def estimate_floor_sigma(recording: Recording, solution: Solution) -> float:
     """1-sigma of a coordinate of a dense truth, m: scatter of its heights between stances on a flat floor.
 
     The first and the last are left out, in which the foot stands differently.
@@ -70,7 +70,7 @@ def walk_errors(recording: Recording, solution: Solution, truth_sigma: float = 0
     """
     truth = recording.truth
     if truth is not None and truth.closed_loop_sigma is not None:
-        return _of_loop(solution, truth.closed_loop_sigma)
+        return _evaluate_loop(solution, truth.closed_loop_sigma)
     if truth is None or truth.xyz is None:
         raise ValueError(f"'{recording.name}' has neither a truth in a local frame nor a closed loop")
     t, X = truth.t, truth.xyz
@@ -101,12 +101,12 @@ def walk_errors(recording: Recording, solution: Solution, truth_sigma: float = 0
         true, mine = (np.linalg.norm(np.diff(x[:, :2], axis=0), axis=1) for x in (X, p))
         stride = float(np.median((mine / true)[true > _A_STRIDE]))
     # surveyed points are measured where a foot stands; a dense truth also covers the swing
-    stances = _stances(solution) if X.shape[1] == 3 else np.empty((0, 2))
-    horizontal, in_stance, of_steps = shapes(t, p, flat, stances)
+    stances = _find_stances(solution) if X.shape[1] == 3 else np.empty((0, 2))
+    horizontal, in_stance, of_steps = compare_shapes(t, p, flat, stances)
     return WalkErrors(horizontal, in_stance, of_steps, of_point, up, stride, float(np.mean(nees_h)), nees_up)
 
 
-def shapes(t: Array, p: Array, truth: Array, stances: Array) -> tuple[float, float, float]:
+def compare_shapes(t: Array, p: Array, truth: Array, stances: Array) -> tuple[float, float, float]:
     """Horizontal rms, m, after fitting yaw and offset: over all epochs, over those in a stance, over means of stances.
 
     Parameters
@@ -116,28 +116,28 @@ def shapes(t: Array, p: Array, truth: Array, stances: Array) -> tuple[float, flo
     """
     rows = [(t >= a) & (t <= b) for a, b in stances]
     inside = np.any(rows, axis=0) if rows else np.zeros(len(t), dtype=bool)
-    everywhere = _shape(p, truth)
+    everywhere = _compare_shape(p, truth)
     if np.count_nonzero(inside) <= _FIT_ITERATIONS:
         return everywhere, everywhere, everywhere
     means = [np.array([x[one].mean(axis=0) for one in rows if one.any()]) for x in (p, truth)]
-    return everywhere, _shape(p[inside], truth[inside]), _shape(*means)
+    return everywhere, _compare_shape(p[inside], truth[inside]), _compare_shape(*means)
 
 
-def _of_loop(solution: Solution, sigma: float) -> WalkErrors:
+def _evaluate_loop(solution: Solution, sigma: float) -> WalkErrors:
     p, P = solution.states.p, solution.covariance[-1][3:6, 3:6] + sigma**2 * np.eye(3)
-    found = closure(Trajectory(solution.t, p, frame="local"))
+    found = measure_closure(Trajectory(solution.t, p, frame="local"))
     off = p[-1] - p[0]
     nees_h = 0.5 * float(off[:2] @ np.linalg.solve(P[:2, :2], off[:2]))
     h, up = found.horizontal, found.vertical
     return WalkErrors(h, h, h, h, up, np.nan, nees_h, float(off[2] ** 2 / P[2, 2]))
 
 
-def _stances(solution: Solution) -> Array:
+def _find_stances(solution: Solution) -> Array:
     """(S, 2) s, the stances; none where they were not detected."""
     return next((d.intervals for d in solution.detections if d.name == "fused"), np.empty((0, 2)))
 
 
-def _shape(p: Array, truth: Array) -> float:
+def _compare_shape(p: Array, truth: Array) -> float:
     flat = truth * [1.0, 1.0, 0.0]
     yaw, offset = fit_yaw(flat, p * [1.0, 1.0, 0.0])
     return float(np.sqrt(np.mean(np.sum((p[:, :2] - _rotate(flat[:, :2], yaw) - offset[:2]) ** 2, axis=1))))

@@ -9,8 +9,8 @@ import numpy as np
 
 from graphnav.core.errors import RecordingError
 from graphnav.core.rotation import Array
-from graphnav.gnss.files import calendar_days, read_bytes
-from graphnav.gnss.signals import SYSTEMS, C, Ids, satellite_id
+from graphnav.gnss.files import count_days, read_bytes
+from graphnav.gnss.signals import SYSTEMS, C, Ids, number_satellite
 
 _ALWAYS = 1e12  # s
 
@@ -57,7 +57,7 @@ def read_antex(path: Path) -> Antennas:
             elif label == "NORTH / EAST / UP":
                 offset[band] = 1e-3 * np.array([line[0:10], line[10:20], line[20:30]], dtype=float)
             elif label == "END OF ANTENNA" and len(name) == 3 and name[0] in SYSTEMS and name[1:].isdigit():
-                out.setdefault(satellite_id(name), []).append(SatelliteAntenna(begin, end, offset))
+                out.setdefault(number_satellite(name), []).append(SatelliteAntenna(begin, end, offset))
         except ValueError:
             raise RecordingError(
                 f"{path}, line {number}: '{line[:60].strip()}' cannot be read as {label}", key="table.cell"
@@ -67,9 +67,7 @@ def read_antex(path: Path) -> Antennas:
     return {one: tuple(many) for one, many in out.items()}
 
 
-def ionosphere_free_offset(
-    antennas: Antennas, satellite: Ids, first: Array, second: Array, bands: Array, gps: Array
-) -> Array:
+def combine_offsets(antennas: Antennas, satellite: Ids, first: Array, second: Array, bands: Array, gps: Array) -> Array:
     """(N, 3) m, in the satellites' axes, of the combination of two signals; NaN where a file says nothing of it.
 
     Parameters
@@ -90,7 +88,7 @@ def ionosphere_free_offset(
     return out
 
 
-def satellite_axes(place: Array, sun: Array) -> Array:
+def compute_satellite_axes(place: Array, sun: Array) -> Array:
     """(N, 3, 3) unit vectors x, y, z, as rows, of satellites that keep their panels to the Sun; m in e (N, 3) each."""
     z = -place / np.linalg.norm(place, axis=1)[:, None]
     to = sun - place
@@ -99,7 +97,7 @@ def satellite_axes(place: Array, sun: Array) -> Array:
     return np.stack([np.cross(y, z), y, z], axis=1)
 
 
-def wind_up(satellite: Ids, epoch: Array, axes: Array, e: Array, enu: Array) -> Array:
+def compute_wind_up(satellite: Ids, epoch: Array, axes: Array, e: Array, enu: Array) -> Array:
     """(N,) cycles by which carriers have been wound up (Wu et al. 1993), continuous for each satellite.
 
     The receiver's own turning is left out: it is the same for all and goes into its clock.
@@ -126,7 +124,7 @@ def wind_up(satellite: Ids, epoch: Array, axes: Array, e: Array, enu: Array) -> 
     return cycles
 
 
-def shapiro_delay(satellite: Array, antenna: Array) -> Array:
+def compute_shapiro_delay(satellite: Array, antenna: Array) -> Array:
     """(N,) m by which the Earth's gravity lengthens ranges (Shapiro; IERS Conventions 2010, equation 11.17)."""
     r, s = np.linalg.norm(antenna, axis=1), np.linalg.norm(satellite, axis=1)
     between = np.linalg.norm(satellite - antenna, axis=1)
@@ -135,7 +133,7 @@ def shapiro_delay(satellite: Array, antenna: Array) -> Array:
 
 def _parse_date(line: str) -> float:
     fields = np.array([line[:43].split()[:6]], dtype=float)
-    days, good = calendar_days(fields)
+    days, good = count_days(fields)
     if not good.all():
         raise ValueError
     since = float((days - np.datetime64("1980-01-06", "D")).astype(np.int64)[0]) * 86400.0

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from graphnav.core.rotation import Array
 from graphnav.gnss.series import RawGnss
-from graphnav.gnss.signals import C, Ids, satellite_name, signal_name
+from graphnav.gnss.signals import C, Ids, name_satellite, name_signal
 from graphnav.gnss.single_point import choose_coefficients, look
 
 _ROUNDS = 20  # of reweighting towards the least sum of absolute residuals
@@ -63,7 +63,7 @@ def find_arcs(
     key = raw.satellite.astype(np.int64) * 1000 + raw.signal
     slots, slot = np.unique(key, return_inverse=True)
     if len(raw.arc_begin):
-        return arcs_by_begin(raw.arc_begin, slot, *_name_slots(slots))  # of a piece of a series
+        return build_arcs(raw.arc_begin, slot, *_name_slots(slots))  # of a piece of a series
     epochs, epoch = raw.epochs
     typical = period or (float(np.median(np.diff(epochs))) if len(epochs) > 1 else np.inf)
     there = np.isfinite(raw.carrier) & np.isfinite(raw.p[:, 0]) & np.isfinite(raw.clock)
@@ -91,7 +91,7 @@ def find_arcs(
     return Arcs(slot, arc, *_name_slots(slots), tuple(raw.t[k] for k in firsts), int(slipped.sum()))
 
 
-def arcs_by_begin(begin: Array, slot: NDArray[np.intp], names: tuple[str, ...], satellite: Ids, signal: Ids) -> Arcs:
+def build_arcs(begin: Array, slot: NDArray[np.intp], names: tuple[str, ...], satellite: Ids, signal: Ids) -> Arcs:
     """The arcs of rows (N,) of which is known when their arc begins (s; NaN where there is no carrier)."""
     arc, begins = np.full(len(begin), -1), []
     for k in range(len(names)):
@@ -105,7 +105,7 @@ def _name_slots(slots: NDArray[np.int64]) -> tuple[tuple[str, ...], Ids, Ids]:
     """Names, satellites and signals of slots."""
     satellites, signals = (slots // 1000).astype(np.int16), (slots % 1000).astype(np.int16)
     return (
-        tuple(f"{satellite_name(s)}.{signal_name(g)}" for s, g in zip(satellites, signals, strict=True)),
+        tuple(f"{name_satellite(s)}.{name_signal(g)}" for s, g in zip(satellites, signals, strict=True)),
         satellites,
         signals,
     )

@@ -18,7 +18,7 @@ _HUMIDITY = 0.7
 _CIRCLE = np.pi  # rad of a semicircle
 
 
-def directions(antenna: Array, satellite: Array) -> tuple[Array, Array]:
+def compute_directions(antenna: Array, satellite: Array) -> tuple[Array, Array]:
     """Azimuth and elevation (N,), rad, of satellites (N, 3) seen from points (N, 3), both in the same e."""
     away = satellite - antenna
     enu = np.einsum("nij,nj->ni", earth.enu_axes(earth.ecef_to_llh(antenna)), away)
@@ -92,7 +92,7 @@ _HEIGHT = np.array([2.53e-5, 5.49e-3, 1.14e-3])
 _YEAR, _COLDEST = 365.25, 28.0  # days; of the year, on the northern half
 
 
-def zenith_delays(llh: Array) -> tuple[Array, Array]:
+def compute_zenith_delays(llh: Array) -> tuple[Array, Array]:
     """Delays (N,) of the dry and the wet troposphere at the zenith, m, as `saastamoinen` has them."""
     upright = np.full(len(llh), np.pi / 2.0)
     whole = saastamoinen(llh, upright)

@@ -15,7 +15,9 @@ _APART = 2.5  # periods, at most: beyond it is a gap
 _JUMP, _THIRD = 2e-3, 1e-5
 
 
-def consecutive(raw: RawGnss, whole: RawGnss, period: float | None = None) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def pair_consecutive(
+    raw: RawGnss, whole: RawGnss, period: float | None = None
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Rows (N,) and (N,) of an arc at one epoch and the next.
 
     Parameters
@@ -24,7 +26,7 @@ def consecutive(raw: RawGnss, whole: RawGnss, period: float | None = None) -> tu
     whole : all that the receiver had: a slip at an epoch that is left out counts.
     period : s between epochs, where the series is too short to tell.
     """
-    arcs, at = find_arcs(whole), rows_in(raw, whole)
+    arcs, at = find_arcs(whole), find_rows(raw, whole)
     of, arc, slot = number_epochs(raw), arcs.arc[at], arcs.slot[at]
     typical = period or (float(np.median(np.diff(raw.epochs[0]))) if len(raw.epochs[0]) > 1 else 1.0)
     good = (
@@ -56,14 +58,14 @@ def number_epochs(raw: RawGnss) -> NDArray[np.intp]:
     return raw.number if len(raw.number) else raw.epochs[1]
 
 
-def rows_in(raw: RawGnss, whole: RawGnss) -> NDArray[np.intp]:
+def find_rows(raw: RawGnss, whole: RawGnss) -> NDArray[np.intp]:
     """(N,) where in a series the rows of a part of it are."""
     epochs = np.unique(whole.t)
 
-    def keys(one: RawGnss) -> NDArray[np.int64]:
+    def make_keys(one: RawGnss) -> NDArray[np.int64]:
         epoch = np.searchsorted(epochs, one.t).astype(np.int64)
         return np.asarray((epoch << 32) + (one.satellite.astype(np.int64) << 16) + one.signal, dtype=np.int64)
 
-    all_keys = keys(whole)
+    all_keys = make_keys(whole)
     order: NDArray[np.intp] = np.argsort(all_keys)
-    return order[np.searchsorted(all_keys[order], keys(raw))]
+    return order[np.searchsorted(all_keys[order], make_keys(raw))]

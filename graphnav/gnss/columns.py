@@ -9,14 +9,14 @@ import numpy as np
 
 from graphnav.core.notes import Note, format_count
 from graphnav.core.rotation import Array
-from graphnav.gnss.series import Observations, once
-from graphnav.gnss.signals import GPS, L1, QZSS, C, signal_id
+from graphnav.gnss.series import Observations, drop_repeated
+from graphnav.gnss.signals import GPS, L1, QZSS, C, number_signal
 
 REQUIRED = ("t", "prn", "code")
 OPTIONAL = ("qzss", "carrier", "doppler", "range_rate", "cn0")
 
 
-def observations(columns: Mapping[str, Array], zero: float, name: str) -> Observations:
+def make_observations(columns: Mapping[str, Array], zero: float, name: str) -> Observations:
     """The observations of columns (N,).
 
     Parameters
@@ -37,7 +37,7 @@ def observations(columns: Mapping[str, Array], zero: float, name: str) -> Observ
     system, prn = np.where(columns.get("qzss", np.zeros(n)) > 0, QZSS, GPS), np.where(known, prn, 0.0)
     obs = Observations(
         zero=zero, t=t, satellite=(100 * system + prn).astype(np.int16),
-        signal=np.full(n, signal_id("1C"), dtype=np.int16), code=columns["code"],
+        signal=np.full(n, number_signal("1C"), dtype=np.int16), code=columns["code"],
         carrier=columns.get("carrier", nothing), doppler=doppler, cn0=columns.get("cn0", nothing),
         slip=np.zeros(n, dtype=bool), half=np.zeros(n, dtype=bool), lock=nothing, files=(name,),
     )  # fmt: skip
@@ -51,4 +51,4 @@ def observations(columns: Mapping[str, Array], zero: float, name: str) -> Observ
                 ),
             ),
         )
-    return once(obs)
+    return drop_repeated(obs)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.gnss.arcs import find_arcs
-from graphnav.gnss.series import RawGnss, median_of_epochs
+from graphnav.gnss.series import RawGnss, compute_epoch_medians
 from graphnav.gnss.signals import C
 from graphnav.gnss.single_point import choose_coefficients, look
 
@@ -27,7 +27,7 @@ _SAME_EPOCH = 2e-3  # s: two receivers that keep their clocks within a milliseco
 _LEAST_ELEVATION = np.radians(5.0)  # elevation of a base's satellites
 
 
-def with_differences(rover: RawGnss, base: RawGnss, position: Array) -> tuple[RawGnss, tuple[str, ...]]:
+def add_differences(rover: RawGnss, base: RawGnss, position: Array) -> tuple[RawGnss, tuple[str, ...]]:
     """The rover's series with what is to be added to its codes, and remarks.
 
     Parameters
@@ -44,7 +44,7 @@ def with_differences(rover: RawGnss, base: RawGnss, position: Array) -> tuple[Ra
     error = known + geometry.ionosphere - base.code
     of_carrier = known - geometry.ionosphere - C / base.frequency * base.carrier
     base, error, of_carrier, arc = base.take(high), error[high], of_carrier[high], arcs.arc[high]
-    common = median_of_epochs(base.t, error)
+    common = compute_epoch_medians(base.t, error)
     error, of_carrier = error - common, of_carrier - common
     difference, carrier_difference = np.full(len(rover), np.nan), np.full(len(rover), np.nan)
     base_arc = np.full(len(rover), -1)

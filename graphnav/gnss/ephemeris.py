@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphnav.core.rotation import Array
-from graphnav.gnss.signals import BEIDOU, GALILEO, GLONASS, GPS, QZSS, C, Ids, system_of
+from graphnav.gnss.signals import BEIDOU, GALILEO, GLONASS, GPS, QZSS, C, Ids, find_system
 
 _MU = {GPS: 3.9860050e14, GALILEO: 3.986004418e14, BEIDOU: 3.986004418e14, QZSS: 3.986005e14}
 _OMEGA = {GPS: 7.2921151467e-5, GALILEO: 7.2921151467e-5, BEIDOU: 7.292115e-5, QZSS: 7.2921151467e-5}
@@ -111,7 +111,7 @@ class Ephemerides:
             remarks,
         )
 
-    def with_more(self, other: Ephemerides) -> Ephemerides:
+    def join(self, other: Ephemerides) -> Ephemerides:
         """These and others; of the same satellite and toe these."""
         kepler = [
             Kepler(**{n: v[k] for n, v in one.kepler.items()})
@@ -191,7 +191,7 @@ class Ephemerides:
         delay[known] = np.nan_to_num(self.kepler["delay"][which[known]])
         fnav = np.zeros(len(t), dtype=bool)
         fnav[known] = self.kepler["fnav"][which[known]] > 0
-        system, band = system_of(satellite), signal // 100
+        system, band = find_system(satellite), signal // 100
         ratio = np.nan_to_num((1575.42e6 / frequency) ** 2)
         out = np.zeros(len(t))
         like_gps = (system == GPS) | (system == QZSS)
@@ -206,7 +206,7 @@ class Ephemerides:
     def _compute_orbit(self, k: NDArray[np.intp], t: Array, zero: float) -> dict[str, Array]:
         """At times of transmission by the satellite's clock, which is off by less than a millisecond."""
         eph = {name: value[k] for name, value in self.kepler.items()}
-        system = system_of(eph["satellite"])
+        system = find_system(eph["satellite"])
         mu, rate = (np.select([system == s for s in table], list(table.values())) for table in (_MU, _OMEGA))
         since = t - (eph["toc"] - zero)
         for _ in range(2):

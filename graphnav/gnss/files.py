@@ -85,7 +85,7 @@ def find_moved_points(block: NDArray[np.uint8]) -> NDArray[np.bool_]:
     return np.asarray(told & (at != typical))
 
 
-def numbers(block: NDArray[np.uint8], width: int) -> Array:
+def parse_numbers(block: NDArray[np.uint8], width: int) -> Array:
     """(n, m) numbers of n rows of m fields of `width` bytes each; NaN for blanks.
 
     Raises
@@ -106,7 +106,7 @@ def numbers(block: NDArray[np.uint8], width: int) -> Array:
     return out
 
 
-def calendar_days(fields: Array) -> tuple[NDArray[np.datetime64], NDArray[np.bool_]]:
+def count_days(fields: Array) -> tuple[NDArray[np.datetime64], NDArray[np.bool_]]:
     """(n,) days of dates (n, 6), year to second, and which of them are dates that a receiver may have had."""
     with np.errstate(invalid="ignore"):
         good = np.all((fields >= _FIRST) & (fields <= _LAST), axis=1)

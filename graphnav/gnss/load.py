@@ -12,14 +12,14 @@ from graphnav.core.errors import RecordingError
 from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.gnss.antex import read_antex
-from graphnav.gnss.differential import with_differences
+from graphnav.gnss.differential import add_differences
 from graphnav.gnss.ephemeris import Ephemerides
 from graphnav.gnss.files import read_bytes
-from graphnav.gnss.placing import Corrected, place, with_own_stamps
+from graphnav.gnss.placing import Corrected, place, restore_own_stamps
 from graphnav.gnss.precise import Orbits, read_precise
 from graphnav.gnss.rinex_nav import read_navigation
 from graphnav.gnss.rinex_obs import parse_observations
-from graphnav.gnss.series import Observations, RawGnss, join_files, primary
+from graphnav.gnss.series import Observations, RawGnss, choose_primary, join_files
 from graphnav.gnss.signals import C
 from graphnav.gnss.single_point import SinglePoint, solve
 from graphnav.gnss.ubx import is_ubx, parse_ubx
@@ -62,7 +62,7 @@ def read_rover(paths: tuple[Path, ...]) -> tuple[Observations, Ephemerides | Non
         data = read_bytes(path)
         if is_ubx(data):
             obs, found = parse_ubx(data, path)
-            sent = found if sent is None else sent.with_more(found)
+            sent = found if sent is None else sent.join(found)
         else:
             obs = parse_observations(data, path)
         parts.append(obs)
@@ -87,7 +87,7 @@ def load_raw(
     obs, sent = read_rover(sources.rover) if observations is None else (observations, None)
     nav = read_navigation(list(sources.nav)) if sources.nav else None
     if sent is not None and sent.satellites:
-        nav = sent if nav is None else nav.with_more(sent)
+        nav = sent if nav is None else nav.join(sent)
     precise = read_precise(list(sources.sp3), list(sources.clk)) if sources.sp3 else None
     if nav is None and precise is None:
         raise RecordingError(
@@ -98,14 +98,14 @@ def load_raw(
         obs = obs.on_clock(zero)
     rover, corrected = _locate_roughly(obs, nav, precise, sources.corrected), sources.corrected
     if sources.nominal_stamps:
-        obs = with_own_stamps(obs, precise or nav, rover, corrected)  # type: ignore[arg-type]
+        obs = restore_own_stamps(obs, precise or nav, rover, corrected)  # type: ignore[arg-type]
     raw, remarks = place(obs, nav, precise, rover, corrected)
     antennas = {satellite: some for path in sources.antex for satellite, some in read_antex(path).items()}
     raw = replace(
         raw, lever_arm=np.array(sources.lever_arm), precise=precise is not None, antennas=antennas if precise else {},
         clock_noise=precise.clock_noise() if precise else {},
     )  # fmt: skip
-    one = primary(raw) & np.isfinite(raw.p[:, 0])
+    one = choose_primary(raw) & np.isfinite(raw.p[:, 0])
     if not one.any():
         raise RecordingError(
             f"{sources.rover[0]}: none of its satellites has an ephemeris at its times", key="raw.no_ephemeris_then"
@@ -131,7 +131,7 @@ def load_raw(
     if sources.base:
         raw, more = _difference_by_base(raw, sources, nav, precise)
         notes += more
-        one = primary(raw) & np.isfinite(raw.difference)
+        one = choose_primary(raw) & np.isfinite(raw.difference)
         if one.any():
             better = raw.take(one)
             fixes = solve(replace(better, code=better.code + better.difference))
@@ -158,7 +158,7 @@ def _difference_by_base(
         )
     away = float(np.linalg.norm(np.median(raw.antenna, axis=0) - position))
     base, _ = place(obs, nav, precise, position)
-    base_fixes = solve(base.take(primary(base) & np.isfinite(base.p[:, 0])))
+    base_fixes = solve(base.take(choose_primary(base) & np.isfinite(base.p[:, 0])))
     notes = list(obs.remarks)
     off = np.nanmedian(np.linalg.norm(base_fixes.p - position, axis=1))
     if not off < _BASE_OFF:
@@ -170,7 +170,7 @@ def _difference_by_base(
         sentence = f"the base's position is that of its header, {off:.1f} m from its own single-point positions"
         notes.append(Note("raw.base_position", sentence))
     base, _ = _correct_times(base, base_fixes)
-    raw, more = with_differences(raw, base, position)
+    raw, more = add_differences(raw, base, position)
     notes += [Note("raw.base", f"codes are differences against a base {away / 1e3:.1f} km away"), *more]
     return raw, notes
 
@@ -206,7 +206,7 @@ def _locate_roughly(obs: Observations, nav: Ephemerides | None, precise: Orbits 
     few = obs.take(np.isin(obs.t, epochs[:: max(1, len(epochs) // _FEW)]))
     start = np.zeros(3) if obs.marker is None else obs.marker
     raw, _ = place(few, nav, precise, start, corrected)
-    raw = raw.take(primary(raw) & np.isfinite(raw.p[:, 0]))
+    raw = raw.take(choose_primary(raw) & np.isfinite(raw.p[:, 0]))
     if not len(raw):
         return start
     if obs.marker is None:  # under its satellites

@@ -10,8 +10,8 @@ from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.gnss.ephemeris import Ephemerides, Placed, rotate_earth
 from graphnav.gnss.precise import Orbits
-from graphnav.gnss.series import Observations, RawGnss, median_of_epochs
-from graphnav.gnss.signals import C, satellite_name
+from graphnav.gnss.series import Observations, RawGnss, compute_epoch_medians
+from graphnav.gnss.signals import C, name_satellite
 
 _FLIGHT = 0.075  # s, of a signal from a satellite of medium height
 _TICK = 1e-3  # s, to which receivers keep their clocks
@@ -69,18 +69,18 @@ def place(
     without = [s for s in lost_all if s not in ill]
     mute = sorted({int(x) for x in np.unique(obs.satellite[np.isnan(frequency)])} - lost)
     if mute:
-        names = ", ".join(satellite_name(x) for x in mute)
+        names = ", ".join(name_satellite(x) for x in mute)
         sentence = f"no frequency channel for {names}: their observations are not used; a GLONASS nav file tells it"
         remarks.append(Note("raw.no_channel", sentence))
     if without:
-        names = ", ".join(satellite_name(s) for s in without)
+        names = ", ".join(name_satellite(s) for s in without)
         remarks.append(Note("raw.no_ephemeris", f"no ephemeris for {names}: their observations are not used"))
     if ill:
-        names = ", ".join(satellite_name(s) for s in ill)
+        names = ", ".join(name_satellite(s) for s in ill)
         remarks.append(Note("raw.unhealthy", f"marked unhealthy in the navigation data, not used: {names}"))
     partly = sorted(lost - set(lost_all))
     if partly:
-        names = ", ".join(satellite_name(s) for s in partly)
+        names = ", ".join(name_satellite(s) for s in partly)
         sentence = f"no ephemeris near enough in time for a part of the observations of {names}"
         remarks.append(Note("raw.no_ephemeris_then", sentence))
     raw = RawGnss(
@@ -94,7 +94,7 @@ def place(
     return raw, tuple(remarks)
 
 
-def with_own_stamps(
+def restore_own_stamps(
     obs: Observations, source: Ephemerides | Orbits, rover: Array, corrected: Corrected = Corrected()
 ) -> Observations:
     """Stamps of nominal epochs turned back into the receiver's own.
@@ -105,5 +105,5 @@ def with_own_stamps(
     found = source.place(obs.satellite, obs.t - _FLIGHT, obs.zero)
     away = np.linalg.norm(rotate_earth(found.p, np.full(len(obs), _FLIGHT)) - rover, axis=1)
     error = (obs.code - away) / C + (0.0 if corrected.clock else found.clock)
-    off = median_of_epochs(obs.t, error)
+    off = compute_epoch_medians(obs.t, error)
     return replace(obs, t=obs.t + _TICK * np.round(np.nan_to_num(off) / _TICK))

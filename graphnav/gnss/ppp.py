@@ -18,21 +18,21 @@ from numpy.typing import NDArray
 from graphnav.core import earth
 from graphnav.core.rotation import Array
 from graphnav.core.timescales import gps_to_utc
-from graphnav.gnss.antex import ionosphere_free_offset, satellite_axes, shapiro_delay, wind_up
-from graphnav.gnss.arcs import Arcs, arcs_by_begin, find_arcs
-from graphnav.gnss.atmosphere import niell, zenith_delays
-from graphnav.gnss.carrier import rows_in
+from graphnav.gnss.antex import combine_offsets, compute_satellite_axes, compute_shapiro_delay, compute_wind_up
+from graphnav.gnss.arcs import Arcs, build_arcs, find_arcs
+from graphnav.gnss.atmosphere import compute_zenith_delays, niell
+from graphnav.gnss.carrier import find_rows
 from graphnav.gnss.series import RawGnss
-from graphnav.gnss.signals import GALILEO, GPS, QZSS, C, signal_id, signal_name
+from graphnav.gnss.signals import GALILEO, GPS, QZSS, C, name_signal, number_signal
 from graphnav.gnss.single_point import Geometry, look
-from graphnav.gnss.tides import solid_tide, sun_and_moon
+from graphnav.gnss.tides import compute_solid_tide, locate_sun_and_moon
 
 # the second band, whose combination with the first the clocks of precise products are of; of BeiDou and GLONASS these
 # are combinations of other signals from product to product
 SECOND = {GPS: 2, GALILEO: 5, QZSS: 2}
 # the code on the first band that these clocks are of, where receivers may have another one beside it: the two are
 # apart by up to a nanosecond, another one for each satellite, and by two and a half times that in the combination
-_OF_CLOCKS = {GPS: signal_id("1W")}
+_OF_CLOCKS = {GPS: number_signal("1W")}
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class IonosphereFree:
     arcs: Arcs  # of N rows, in which neither carrier has slipped; a slot is a pair of signals of a satellite
 
 
-def ionosphere_free(raw: RawGnss, whole: RawGnss) -> IonosphereFree | None:
+def combine_ionosphere_free(raw: RawGnss, whole: RawGnss) -> IonosphereFree | None:
     """The combinations of the rows of a first band.
 
     Parameters
@@ -57,15 +57,15 @@ def ionosphere_free(raw: RawGnss, whole: RawGnss) -> IonosphereFree | None:
     raw : a row for each satellite and epoch, of its first signal.
     whole : all that the receiver has, with the second ones.
     """
-    second = _rows_beside(raw, whole, second_signals(whole), np.isfinite(whole.carrier))
+    second = _find_rows_beside(raw, whole, choose_second_signals(whole), np.isfinite(whole.carrier))
     which = np.flatnonzero(second >= 0)
     if not len(which):
         return None
     one, other = raw.take(which), whole.take(second[which])
     signals = {int(s): _OF_CLOCKS[int(s) // 100] for s in np.unique(one.satellite) if int(s) // 100 in _OF_CLOCKS}
-    better = _rows_beside(one, whole, signals, np.ones(len(whole), dtype=bool))
+    better = _find_rows_beside(one, whole, signals, np.ones(len(whole), dtype=bool))
     code = np.where(better >= 0, whole.code[better], one.code)
-    arcs, first_rows = find_arcs(whole), rows_in(one, whole)
+    arcs, first_rows = find_arcs(whole), find_rows(one, whole)
     f1, f2 = one.frequency, other.frequency
     alpha = f1**2 / (f1**2 - f2**2)
     beta = alpha - 1.0
@@ -75,18 +75,20 @@ def ionosphere_free(raw: RawGnss, whole: RawGnss) -> IonosphereFree | None:
 
     geometry = look(one, one.antenna, None)
     gps = one.t + one.zero
-    sun, moon = sun_and_moon(gps)
+    sun, moon = locate_sun_and_moon(gps)
     place = earth.ecef_to_llh(one.antenna)
-    wound = one.wound if len(one.wound) else wind_up_of(one)
-    extra = shapiro_delay(geometry.s, one.antenna) - np.sum(geometry.e * solid_tide(one.antenna, sun, moon), axis=1)
+    wound = one.wound if len(one.wound) else compute_series_wind_up(one)
+    extra = compute_shapiro_delay(geometry.s, one.antenna) - np.sum(
+        geometry.e * compute_solid_tide(one.antenna, sun, moon), axis=1
+    )
     if raw.antennas:
         bands = np.stack([one.signal // 100, other.signal // 100], -1)
-        offset = ionosphere_free_offset(raw.antennas, one.satellite, f1, f2, bands, gps)
-        told = np.einsum("ni,nij,nj->n", offset, satellite_axes(geometry.s, sun), geometry.e)
+        offset = combine_offsets(raw.antennas, one.satellite, f1, f2, bands, gps)
+        told = np.einsum("ni,nij,nj->n", offset, compute_satellite_axes(geometry.s, sun), geometry.e)
         extra = extra + np.nan_to_num(told)
     utc = gps_to_utc(gps)
     day = (utc - utc.astype("datetime64[Y]")) / np.timedelta64(1, "D")
-    dry, wet = zenith_delays(place)
+    dry, wet = compute_zenith_delays(place)
     if raw.troposphere:  # is taken off already
         dry, wet = np.zeros(len(one)), np.zeros(len(one))
     by_dry, by_wet = niell(place, geometry.elevation, day)
@@ -105,7 +107,7 @@ def ionosphere_free(raw: RawGnss, whole: RawGnss) -> IonosphereFree | None:
     )
 
 
-def second_signals(raw: RawGnss) -> dict[int, int]:
+def choose_second_signals(raw: RawGnss) -> dict[int, int]:
     """The second signal of each satellite that has one: of several of a band that with most carriers."""
     if raw.catalogue is not None:
         return dict(raw.catalogue.second)
@@ -118,14 +120,14 @@ def second_signals(raw: RawGnss) -> dict[int, int]:
     return out
 
 
-def wind_up_of(raw: RawGnss) -> Array:
+def compute_series_wind_up(raw: RawGnss) -> Array:
     """(N,) cycles by which the carriers of a series are wound up, continuous for each satellite."""
     geometry = look(raw, raw.antenna, None)
-    axes = satellite_axes(geometry.s, sun_and_moon(raw.t + raw.zero)[0])
-    return wind_up(raw.satellite, raw.t, axes, geometry.e, earth.enu_axes(earth.ecef_to_llh(raw.antenna)))
+    axes = compute_satellite_axes(geometry.s, locate_sun_and_moon(raw.t + raw.zero)[0])
+    return compute_wind_up(raw.satellite, raw.t, axes, geometry.e, earth.enu_axes(earth.ecef_to_llh(raw.antenna)))
 
 
-def _rows_beside(
+def _find_rows_beside(
     raw: RawGnss, whole: RawGnss, signals: Mapping[int, int], usable: NDArray[np.bool_]
 ) -> NDArray[np.intp]:
     """(N,) the usable row of `whole` with another signal of a satellite, beside a row of its first band; -1: none."""
@@ -144,6 +146,6 @@ def _rows_beside(
 def _join_arcs(arcs: Arcs, first: NDArray[np.intp], second: NDArray[np.intp], good: NDArray[np.bool_]) -> Arcs:
     """The arcs of pairs of rows: each begins where the younger of its two does."""
     pairs, slot = np.unique(np.stack([arcs.slot[first], arcs.slot[second]], -1), axis=0, return_inverse=True)
-    names = tuple(f"{arcs.names[a]}+{signal_name(arcs.signal[b])}" for a, b in pairs.tolist())
+    names = tuple(f"{arcs.names[a]}+{name_signal(arcs.signal[b])}" for a, b in pairs.tolist())
     begin = np.where(good, np.maximum(arcs.begin[first], arcs.begin[second]), np.nan)
-    return arcs_by_begin(begin, slot.reshape(-1), names, arcs.satellite[pairs[:, 0]], arcs.signal[pairs[:, 0]])
+    return build_arcs(begin, slot.reshape(-1), names, arcs.satellite[pairs[:, 0]], arcs.signal[pairs[:, 0]])

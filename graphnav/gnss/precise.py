@@ -18,8 +18,8 @@ from graphnav.core.notes import Note, format_count
 from graphnav.core.rotation import Array
 from graphnav.core.timescales import utc_to_gps
 from graphnav.gnss.ephemeris import Placed, rotate_earth
-from graphnav.gnss.files import Lines, calendar_days, numbers, read_bytes
-from graphnav.gnss.signals import SYSTEMS, C, Ids, satellite_id
+from graphnav.gnss.files import Lines, count_days, parse_numbers, read_bytes
+from graphnav.gnss.signals import SYSTEMS, C, Ids, number_satellite
 
 _NODES = 11  # of the polynomial
 _ABSENT = 0.9  # s; a clock of 999999.999999 us is none
@@ -125,13 +125,13 @@ def _read_sp3(path: Path) -> tuple[Array, Ids, Array, Array]:
     if not lines.whole and own[-1] == len(lines) - 1:
         own = own[:-1]
     try:
-        value = numbers(lines.block(own, 4, 60), 14)
+        value = parse_numbers(lines.block(own, 4, 60), 14)
         names = [bytes(x).decode() for x in lines.block(own, 1, 4)]
         ids = {name: _find_id(name) for name in set(names)}
     except ValueError:
         for k in own:
             try:
-                numbers(lines.block(np.array([k]), 4, 60), 14)
+                parse_numbers(lines.block(np.array([k]), 4, 60), 14)
             except ValueError:
                 text = lines.text(int(k))[:60]
                 raise RecordingError(f"{path}, line {k + 1}: '{text}' is not a position", key="table.cell") from None
@@ -173,7 +173,7 @@ def _find_id(name: str) -> int:
     """The number of a satellite; -1 of one that no receiver observes, as those that carry a receiver."""
     if name[0].isalpha() and name[0] not in SYSTEMS:
         return -1
-    return satellite_id(name if name[0] != " " else "G" + name[1:])
+    return number_satellite(name if name[0] != " " else "G" + name[1:])
 
 
 def _read_stamps(lines: Lines, which: NDArray[np.intp], begin: int, scale: str, path: Path) -> Array:
@@ -197,7 +197,7 @@ def _read_dates(fields: Array, scale: str) -> Array:
     """(n,) s since the GPS epoch of dates (n, 6); ValueError if one is none."""
     if fields.ndim != 2 or fields.shape[1] != 6:
         raise ValueError
-    days, good = calendar_days(fields)
+    days, good = count_days(fields)
     if not good.all():
         raise ValueError
     since = (days - np.datetime64("1980-01-06", "D")).astype(np.int64) * 86400.0

@@ -16,7 +16,7 @@ from graphnav.core.files import parse_number
 from graphnav.core.notes import Note, format_count
 from graphnav.core.timescales import WEEK, utc_to_gps
 from graphnav.gnss.ephemeris import Ephemerides, Glonass, Kepler
-from graphnav.gnss.files import calendar_days, read_bytes
+from graphnav.gnss.files import count_days, read_bytes
 from graphnav.gnss.signals import BEIDOU, GALILEO, GLONASS, GPS, NAVIC, QZSS, SBAS, SYSTEMS
 
 _BDT = 14.0  # s, GPS minus BeiDou time
@@ -142,7 +142,7 @@ def _parse_date(text: str, short: bool) -> np.datetime64:
         raise ValueError
     if short:
         fields[:, 0] += 2000 if fields[0, 0] < 80 else 1900
-    days, good = calendar_days(fields)
+    days, good = count_days(fields)
     if not good[0]:
         raise ValueError
     seconds = float(fields[0, 3:] @ (3600.0, 60.0, 1.0))

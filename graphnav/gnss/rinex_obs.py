@@ -19,9 +19,9 @@ from graphnav.core.files import parse_number
 from graphnav.core.notes import Note, format_count
 from graphnav.core.rotation import Array
 from graphnav.core.timescales import WEEK, utc_to_gps
-from graphnav.gnss.files import Lines, calendar_days, find_moved_points, numbers, read_bytes
+from graphnav.gnss.files import Lines, count_days, find_moved_points, parse_numbers, read_bytes
 from graphnav.gnss.rinex_header import Header, read_header
-from graphnav.gnss.series import Observations, note_cut, once
+from graphnav.gnss.series import Observations, drop_repeated, note_cut
 from graphnav.gnss.signals import (
     BEIDOU,
     GLONASS,
@@ -31,8 +31,8 @@ from graphnav.gnss.signals import (
     SYSTEMS,
     Ids,
     is_known_signal,
-    satellite_id,
-    signal_id,
+    number_satellite,
+    number_signal,
 )
 
 _SYSTEM_OF = np.full(256, -1)
@@ -85,7 +85,7 @@ def parse_observations(data: bytes, path: Path) -> Observations:
             continue
         block = cells(own, len(types)).reshape(len(own), len(types), _WIDTH)
         try:
-            value = numbers(block[:, :, :14].reshape(len(own), -1), 14)
+            value = parse_numbers(block[:, :, :14].reshape(len(own), -1), 14)
             if find_moved_points(block[:, :, :14]).any():
                 raise ValueError
         except ValueError:
@@ -108,7 +108,7 @@ def parse_observations(data: bytes, path: Path) -> Observations:
             parts.append(
                 (
                     stamp[k][there], rows.satellite[own][there],
-                    np.full(int(there.sum()), signal_id(signal), dtype=np.int16),
+                    np.full(int(there.sum()), number_signal(signal), dtype=np.int16),
                     *(one[kind][there] for kind in _KINDS),
                     ((lost & 1 > 0) | (flag[k] == 1))[there], (lost & 2 > 0)[there],
                 )
@@ -121,7 +121,7 @@ def parse_observations(data: bytes, path: Path) -> Observations:
     t, satellite, signal_of, code, carrier, doppler, cn0, slip, half = (
         np.concatenate(x) for x in zip(*parts, strict=True)
     )
-    return once(
+    return drop_repeated(
         Observations(
             zero, t, satellite, signal_of, code, carrier, doppler, cn0, slip, half, np.full(len(t), np.nan),
             header.channels, header.marker, (str(path),), tuple(remarks),
@@ -157,7 +157,7 @@ def _count_since_week(fields: Array, scale: str, used: NDArray[np.bool_]) -> tup
 
     Days and seconds are kept apart: seconds since the epoch are good to 0.2 us only.
     """
-    days, good = calendar_days(fields)
+    days, good = count_days(fields)
     hour, minute, second = np.where(good[:, None], fields, 0.0).T[3:]
     since = (days - np.datetime64("1980-01-06", "D")).astype(np.int64)
     week = int(since[used][0]) // 7
@@ -176,10 +176,10 @@ def _read_version_3(lines: Lines, header: Header, path: Path, remarks: list[str]
         raise RecordingError(f"{path}: holds a header and no observations", key="file.no_rows")
     try:
         fields = _parse_calendar(lines, epoch, 2, 4)
-        flag, count = numbers(lines.block(epoch, 29, 35), 3).T
+        flag, count = parse_numbers(lines.block(epoch, 29, 35), 3).T
     except ValueError:
         raise _refuse_epoch(lines, epoch, path) from None
-    bad = (flag < 0) | (count < 0) | (~calendar_days(fields)[1] & ~(flag > 1))
+    bad = (flag < 0) | (count < 0) | (~count_days(fields)[1] & ~(flag > 1))
     if bad.any():
         raise _refuse_epoch(lines, epoch[bad], path)
     flag, count = np.nan_to_num(flag).astype(int), np.nan_to_num(count).astype(int)
@@ -198,7 +198,7 @@ def _read_version_3(lines: Lines, header: Header, path: Path, remarks: list[str]
         raise RecordingError(f"{path}: holds a header and no observations", key="file.no_rows")
     stamp, zero = _count_since_week(fields, header.scale, flag <= 1)
     try:
-        number = numbers(lines.block(own, 1, 3), 2)[:, 0]
+        number = parse_numbers(lines.block(own, 1, 3), 2)[:, 0]
     except ValueError:
         number = np.full(len(own), np.nan)
     wrong = ~(number >= 1)
@@ -225,12 +225,12 @@ def _take_first(value: Array) -> Array:
 def _parse_calendar(lines: Lines, epoch: NDArray[np.intp], begin: int, year: int) -> Array:
     """(n, 6) date and time of epoch lines, year first."""
     n = len(epoch)
-    whole = [numbers(lines.block(epoch, begin, begin + year), year)]
+    whole = [parse_numbers(lines.block(epoch, begin, begin + year), year)]
     at = begin + year
     for _ in range(4):
-        whole.append(numbers(lines.block(epoch, at, at + 3), 3))
+        whole.append(parse_numbers(lines.block(epoch, at, at + 3), 3))
         at += 3
-    whole.append(numbers(lines.block(epoch, at, at + 11), 11))
+    whole.append(parse_numbers(lines.block(epoch, at, at + 11), 11))
     return np.concatenate(whole, axis=1).reshape(n, 6)
 
 
@@ -273,7 +273,7 @@ def _read_version_2(lines: Lines, header: Header, path: Path, remarks: list[str]
             name = names[3 * i : 3 * i + 3]
             number = SYSTEMS.find(name[:1] if name[:1].strip() else (header.system if header.system != "M" else "G"))
             try:
-                one = satellite_id(SYSTEMS[max(number, 0)] + name[1:])
+                one = number_satellite(SYSTEMS[max(number, 0)] + name[1:])
             except ValueError:
                 raise RecordingError(
                     f"{path}, line {k + 1}: '{name}' names no satellite", key="rinex.satellite"
@@ -298,7 +298,7 @@ def _read_version_2(lines: Lines, header: Header, path: Path, remarks: list[str]
     except ValueError:
         raise _refuse_epoch(lines, epoch, path, 0) from None
     fields[:, 0] += np.where(fields[:, 0] < 80, 2000, 1900)
-    if (bad := ~calendar_days(fields)[1]).any():
+    if (bad := ~count_days(fields)[1]).any():
         raise _refuse_epoch(lines, epoch[bad], path, 0)
     rows = _SatelliteLines(
         np.array(first_line, dtype=np.intp), np.array(of, dtype=np.intp), np.array(satellite, dtype=np.int16)
@@ -351,7 +351,7 @@ def _refuse_epoch(lines: Lines, epoch: NDArray[np.intp], path: Path, begin: int 
             date = np.array([[parse_number(word) for word in text[begin:end].split()]])
             date[:, 0] += 0 if begin else np.where(date[:, 0] < 80, 2000, 1900)
             flag, count = (int(text[at : at + 3].strip() or 0) for at in (end, end + 3))
-            if date.shape == (1, 6) and calendar_days(date)[1].all() and min(flag, count) >= 0:
+            if date.shape == (1, 6) and count_days(date)[1].all() and min(flag, count) >= 0:
                 continue
         except (ValueError, IndexError):
             pass

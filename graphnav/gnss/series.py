@@ -11,7 +11,7 @@ from graphnav.core.errors import RecordingError
 from graphnav.core.notes import Note, format_count
 from graphnav.core.rotation import Array
 from graphnav.gnss.antex import Antennas
-from graphnav.gnss.signals import C, Ids, frequencies
+from graphnav.gnss.signals import C, Ids, find_frequencies
 
 _FARTHEST = 1e9  # m, of a code: satellites are 4.3e7 m away at most, and no clock of a receiver is seconds off
 _FASTEST = 1e6  # Hz, of a Doppler shift: satellites make 1e4, an oscillator off by 1e-4 makes 2e5
@@ -58,7 +58,7 @@ class Observations:
     @property
     def frequency(self) -> Array:
         """(N,) Hz."""
-        return frequencies(self.satellite, self.signal, self.channels)
+        return find_frequencies(self.satellite, self.signal, self.channels)
 
     @property
     def range_rate(self) -> Array:
@@ -83,7 +83,7 @@ def join_files(parts: list[Observations]) -> Observations:
         zero=zero, channels=channels, marker=marker, files=tuple(f for p in parts for f in p.files),
         remarks=tuple(r for p in parts for r in p.remarks), **arrays,
     )  # fmt: skip
-    return once(whole)
+    return drop_repeated(whole)
 
 
 def note_cut(name: str, what: str) -> Note:
@@ -91,7 +91,7 @@ def note_cut(name: str, what: str) -> Note:
     return Note("raw.cut", f"{name}: is cut off in the middle of a {what}; what is whole before it is used")
 
 
-def once(obs: Observations) -> Observations:
+def drop_repeated(obs: Observations) -> Observations:
     """In order of time, satellite and signal, and each of these once: the row that was first.
 
     Raises
@@ -224,7 +224,7 @@ class RawGnss:
         return np.unique(self.t, return_inverse=True)
 
 
-def primary(raw: RawGnss) -> NDArray[np.bool_]:
+def choose_primary(raw: RawGnss) -> NDArray[np.bool_]:
     """(N,) one row for each satellite and epoch: the signal whose group delay is best known, L1 or B1 first."""
     order = np.where(raw.signal // 100 == 1, 0, raw.signal // 100) + np.where(raw.signal % 100 == 2, 0.0, 0.5)
     order = np.where(np.isfinite(raw.code), order, 100.0)
@@ -236,7 +236,7 @@ def primary(raw: RawGnss) -> NDArray[np.bool_]:
     return out & np.isfinite(raw.code)
 
 
-def median_of_epochs(t: Array, value: Array) -> Array:
+def compute_epoch_medians(t: Array, value: Array) -> Array:
     """(N,) the median of the values of each row's epoch; NaN where an epoch has none."""
     epochs, of = np.unique(t, return_inverse=True)
     order = np.lexsort((value, of))  # NaN last

@@ -23,31 +23,31 @@ LEAST = 20.0  # dB-Hz that a signal without a C/N0, or below it, is taken to hav
 _DEFAULT = 45.0  # dB-Hz where a file says nothing of it
 
 
-def code_sigma(cn0: Array, elevation: Array, ionosphere: Array) -> Array:
+def compute_code_sigma(cn0: Array, elevation: Array, ionosphere: Array) -> Array:
     """(N,) m, 1-sigma of a code; `ionosphere` (N,) m is the delay that was modelled."""
     rising = 1.0 / np.maximum(np.sin(elevation), 0.1)
     own = _CODE_POWER * 10.0 ** (-0.1 * _compute_power(cn0)) + (_CODE * rising) ** 2
     return np.asarray(np.sqrt(own + (_IONOSPHERE * ionosphere) ** 2 + (0.1 * _TROPOSPHERE * rising) ** 2))
 
 
-def rate_sigma(cn0: Array, elevation: Array) -> Array:
+def compute_rate_sigma(cn0: Array, elevation: Array) -> Array:
     """(N,) m/s, 1-sigma of a range rate."""
     rising = 1.0 / np.maximum(np.sin(elevation), 0.1)
     return np.asarray(np.sqrt(_RATE_POWER * 10.0 ** (-0.1 * _compute_power(cn0)) + (_RATE * rising) ** 2))
 
 
-def carrier_sigma(cn0: Array, elevation: Array, wavelength: Array) -> Array:
+def compute_carrier_sigma(cn0: Array, elevation: Array, wavelength: Array) -> Array:
     """(N,) m, 1-sigma of a carrier: the loop's thermal noise, wavelength / 2 pi sqrt(B / C/N0), and reflections."""
     rising = 1.0 / np.maximum(np.sin(elevation), 0.1)
     return np.asarray(np.sqrt(_compute_thermal(cn0, wavelength) + (_PHASE * rising) ** 2))
 
 
-def carrier_difference_sigma(cn0: Array, elevation: Array, wavelength: Array) -> Array:
+def compute_carrier_difference_sigma(cn0: Array, elevation: Array, wavelength: Array) -> Array:
     """(N,) m, 1-sigma of the difference of two receivers' carriers."""
-    return np.asarray(np.sqrt(2.0 * (_compute_thermal(cn0, wavelength) + reflection_sigma(elevation) ** 2)))
+    return np.asarray(np.sqrt(2.0 * (_compute_thermal(cn0, wavelength) + compute_reflection_sigma(elevation) ** 2)))
 
 
-def reflection_sigma(elevation: Array) -> Array:
+def compute_reflection_sigma(elevation: Array) -> Array:
     """(N,) m, 1-sigma of what reflections do to a receiver's carrier, for some time alike."""
     rising = 1.0 / np.maximum(np.sin(elevation), 0.1)
     return np.asarray(_CARRIER * np.sqrt(1.0 + rising**2))

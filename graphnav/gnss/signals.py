@@ -41,7 +41,7 @@ _STEP = {1: 0.5625, 2: 0.4375}  # MHz from channel to channel of GLONASS
 L1 = 1575.42e6  # Hz
 
 
-def satellite_id(name: str) -> int:
+def number_satellite(name: str) -> int:
     """The number of a satellite's RINEX name, "G05" or "G 5".
 
     Raises
@@ -57,22 +57,22 @@ def satellite_id(name: str) -> int:
     return 100 * SYSTEMS.index(name[0]) + int(number)
 
 
-def satellite_name(satellite: int) -> str:
+def name_satellite(satellite: int) -> str:
     """Its RINEX name."""
     return f"{SYSTEMS[int(satellite) // 100]}{int(satellite) % 100:02d}"
 
 
-def system_of(satellite: Ids) -> Ids:
+def find_system(satellite: Ids) -> Ids:
     """(N,) place in `SYSTEMS` of each satellite."""
     return satellite // 100
 
 
-def signal_id(name: str) -> int:
+def number_signal(name: str) -> int:
     """The number of a signal's name, band and attribute: "1C"."""
     return 100 * int(name[0]) + ord(name[1]) - ord("A")
 
 
-def signal_name(signal: int) -> str:
+def name_signal(signal: int) -> str:
     """Its RINEX name without the kind of observation: "1C"."""
     return f"{int(signal) // 100}{chr(int(signal) % 100 + ord('A'))}"
 
@@ -82,7 +82,7 @@ def is_known_signal(system: int, name: str) -> bool:
     return len(name) == 2 and name[0].isdecimal() and name[1] in _ATTRIBUTES[system].get(int(name[0]), "")
 
 
-def frequencies(satellite: Ids, signal: Ids, channels: Mapping[int, int] | None = None) -> Array:
+def find_frequencies(satellite: Ids, signal: Ids, channels: Mapping[int, int] | None = None) -> Array:
     """(N,) carrier frequencies, Hz; NaN where the signal is unknown, or a GLONASS satellite's channel.
 
     Parameters
@@ -94,8 +94,8 @@ def frequencies(satellite: Ids, signal: Ids, channels: Mapping[int, int] | None 
         for number, mhz in bands.items():
             table[system, number] = mhz * 1e6
     band = np.asarray(signal) // 100
-    out = np.asarray(table[system_of(satellite), band])
-    divided = (system_of(satellite) == GLONASS) & (band <= 2)
+    out = np.asarray(table[find_system(satellite), band])
+    divided = (find_system(satellite) == GLONASS) & (band <= 2)
     if np.any(divided):
         known = np.full(100, np.nan)
         for one, channel in (channels or {}).items():

@@ -21,10 +21,10 @@ from numpy.typing import NDArray
 
 from graphnav.core import earth
 from graphnav.core.rotation import Array
-from graphnav.gnss.atmosphere import NIGHT, directions, klobuchar, saastamoinen
+from graphnav.gnss.atmosphere import NIGHT, compute_directions, klobuchar, saastamoinen
 from graphnav.gnss.ephemeris import EARTH_RATE, rotate_earth
 from graphnav.gnss.series import RawGnss
-from graphnav.gnss.sigmas import code_sigma, rate_sigma
+from graphnav.gnss.sigmas import compute_code_sigma, compute_rate_sigma
 from graphnav.gnss.signals import L1, C
 
 _ROUNDS, _ATMOSPHERE = 10, 3  # iterations, and from which on the atmosphere is modelled
@@ -68,7 +68,7 @@ class SinglePoint:
     weight: Array  # (N,)
 
 
-def _padding(epoch: NDArray[np.intp], place: NDArray[np.intp], shape: tuple[int, int]) -> Callable[[Array], Array]:
+def _plan_padding(epoch: NDArray[np.intp], place: NDArray[np.intp], shape: tuple[int, int]) -> Callable[[Array], Array]:
     """Lays rows (N, ...) out as (epochs, places, ...), 0 where an epoch has none."""
 
     def pad(rows: Array) -> Array:
@@ -90,7 +90,7 @@ def look(raw: RawGnss, antenna: Array, ionosphere: Array | None) -> Geometry:
     s = rotate_earth(raw.p, flight)
     away = s - antenna
     distance = np.linalg.norm(away, axis=1)
-    azimuth, elevation = directions(antenna, s)
+    azimuth, elevation = compute_directions(antenna, s)
     llh = earth.ecef_to_llh(antenna)
     delay = np.zeros(len(raw))
     if ionosphere is not None:
@@ -99,7 +99,7 @@ def look(raw: RawGnss, antenna: Array, ionosphere: Array | None) -> Geometry:
     return Geometry(s, away / distance[:, None], distance, azimuth, elevation, delay, wet)
 
 
-def stretch(raw: RawGnss, geometry: Geometry) -> Array:
+def compute_stretch(raw: RawGnss, geometry: Geometry) -> Array:
     """(N,) 1 + e.(v_s + omega x s) / c: by how much a range changes less than satellite and antenna move."""
     moving = rotate_earth(raw.v, geometry.distance / C) + np.cross(_OMEGA, geometry.s)
     return np.asarray(1.0 + np.sum(geometry.e * moving, axis=1) / C)
@@ -110,7 +110,7 @@ def choose_coefficients(raw: RawGnss) -> Array:
     return NIGHT if raw.klobuchar is None else np.array(raw.klobuchar)
 
 
-def signal_groups(raw: RawGnss) -> tuple[tuple[tuple[int, int], ...], NDArray[np.intp]]:
+def group_signals(raw: RawGnss) -> tuple[tuple[tuple[int, int], ...], NDArray[np.intp]]:
     """Systems with their signals, the one with most rows first, and which of them each row (N,) has."""
     key = (raw.satellite // 100).astype(np.int64) * 1000 + raw.signal
     if raw.catalogue is not None:
@@ -128,12 +128,12 @@ def solve(raw: RawGnss, mask: float = np.radians(10.0), robust: bool = True) -> 
 
     Parameters
     ----------
-    raw : one row for each satellite and epoch (`graphnav.gnss.series.primary`).
+    raw : one row for each satellite and epoch (`graphnav.gnss.series.choose_primary`).
     mask : rad, elevation below which satellites are not used.
     robust : take weight from rows that are far from the others.
     """
     t, of = raw.epochs
-    groups, group = signal_groups(raw)
+    groups, group = group_signals(raw)
     E, G, n = len(t), len(groups), 3 + len(groups)
     order = np.argsort(of, kind="stable")
     place = np.empty(len(raw), dtype=np.intp)
@@ -142,7 +142,7 @@ def solve(raw: RawGnss, mask: float = np.radians(10.0), robust: bool = True) -> 
     klobuchar_of = choose_coefficients(raw)
     usable = np.isfinite(raw.p).all(axis=1) & np.isfinite(raw.code) & np.isfinite(raw.clock)
 
-    pad = _padding(of, place, (E, S))
+    pad = _plan_padding(of, place, (E, S))
     H = np.zeros((len(raw), n))
     H[:, 3] = 1.0
     other = group > 0
@@ -159,7 +159,7 @@ def solve(raw: RawGnss, mask: float = np.radians(10.0), robust: bool = True) -> 
         if k >= _ATMOSPHERE:
             predicted = predicted + geometry.ionosphere + geometry.troposphere
         r = measured - predicted
-        sigma = code_sigma(raw.cn0, np.maximum(geometry.elevation, 0.05), geometry.ionosphere)
+        sigma = compute_code_sigma(raw.cn0, np.maximum(geometry.elevation, 0.05), geometry.ionosphere)
         good = usable & above
         if robust and k > _ATMOSPHERE:
             weight = 1.0 / (1.0 + (np.nan_to_num(r) / (_KERNEL * sigma)) ** 2)
@@ -199,15 +199,15 @@ def _solve_velocities(
     E, S = shape
     antenna = x[of, :3]
     geometry = look(raw, antenna, None)
-    scale = stretch(raw, geometry)
+    scale = compute_stretch(raw, geometry)
     moving = rotate_earth(raw.v, geometry.distance / C)
-    sigma = rate_sigma(raw.cn0, np.maximum(geometry.elevation, 0.05))
+    sigma = compute_rate_sigma(raw.cn0, np.maximum(geometry.elevation, 0.05))
     H = np.concatenate([-geometry.e / scale[:, None], np.ones((len(raw), 1))], axis=1)
     measured = raw.range_rate + np.nan_to_num(raw.drift) - np.sum(geometry.e * moving, axis=1) / scale
     good = np.isfinite(measured) & np.isfinite(H).all(axis=1) & (geometry.elevation >= mask)
     y, weight = np.zeros((E, 4)), np.ones(len(raw))
 
-    pad = _padding(of, place, (E, S))
+    pad = _plan_padding(of, place, (E, S))
     Hp = pad(np.where(good[:, None], H, 0.0))
     information = np.zeros((E, 4, 4))
     for k in range(6 if robust else 1):

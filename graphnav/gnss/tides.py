@@ -20,7 +20,7 @@ _SUN, _MOON = 332946.05, 0.01230002  # masses, of the Earth's
 _H2, _L2, _H2_LAT, _L2_LAT = 0.6078, 0.0847, -0.0006, 0.0002  # Love and Shida numbers, and how they go with latitude
 
 
-def sun_and_moon(gps: Array) -> tuple[Array, Array]:
+def locate_sun_and_moon(gps: Array) -> tuple[Array, Array]:
     """Places (N, 3) of Sun and Moon, m in e, at times (N,), s since the GPS epoch."""
     utc = (gps_to_utc(gps) - _J2000) / np.timedelta64(1, "us") * 1e-6
     T = (utc + _DYNAMIC) / _DAY / 36525.0
@@ -55,11 +55,11 @@ def sun_and_moon(gps: Array) -> tuple[Array, Array]:
     )  # fmt: skip
     sidereal = np.radians(np.mod(280.46061837 + 360.98564736629 * utc / _DAY, 360.0))
     # longitudes are of the equinox of date, as the sidereal time is
-    sun = _to_earth_fixed(sun_lon, np.zeros_like(sun_lon), sun_range, tilt, sidereal)
-    return sun, _to_earth_fixed(moon_lon, moon_lat, moon_range, tilt, sidereal)
+    sun = _rotate_to_earth_fixed(sun_lon, np.zeros_like(sun_lon), sun_range, tilt, sidereal)
+    return sun, _rotate_to_earth_fixed(moon_lon, moon_lat, moon_range, tilt, sidereal)
 
 
-def _to_earth_fixed(lon: Array, lat: Array, distance: Array, tilt: Array, sidereal: Array) -> Array:
+def _rotate_to_earth_fixed(lon: Array, lat: Array, distance: Array, tilt: Array, sidereal: Array) -> Array:
     """From the ecliptic of date to the Earth-fixed frame."""
     x, y, z = np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)
     y, z = np.cos(tilt) * y - np.sin(tilt) * z, np.sin(tilt) * y + np.cos(tilt) * z
@@ -67,7 +67,7 @@ def _to_earth_fixed(lon: Array, lat: Array, distance: Array, tilt: Array, sidere
     return np.asarray(distance[:, None] * np.stack([c * x + s * y, -s * x + c * y, z], -1))
 
 
-def solid_tide(place: Array, sun: Array, moon: Array) -> Array:
+def compute_solid_tide(place: Array, sun: Array, moon: Array) -> Array:
     """(N, 3) m in e, by which points (N, 3), m in e, are off their place without tides; its constant part is in it."""
     r = np.linalg.norm(place, axis=1)[:, None]
     up = place / r

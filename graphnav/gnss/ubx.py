@@ -16,8 +16,8 @@ from graphnav.core.notes import Note, format_count
 from graphnav.core.timescales import WEEK
 from graphnav.gnss.ephemeris import Ephemerides
 from graphnav.gnss.messages import Decoder
-from graphnav.gnss.series import Observations, note_cut, once
-from graphnav.gnss.signals import BEIDOU, GALILEO, GLONASS, GPS, NAVIC, QZSS, SBAS, signal_id
+from graphnav.gnss.series import Observations, drop_repeated, note_cut
+from graphnav.gnss.signals import BEIDOU, GALILEO, GLONASS, GPS, NAVIC, QZSS, SBAS, number_signal
 
 SYNC = b"\xb5\x62"
 _RAWX, _SFRBX = (0x02, 0x15), (0x02, 0x13)
@@ -75,7 +75,7 @@ def parse_ubx(data: bytes, path: Path) -> tuple[Observations, Ephemerides]:
     rows = np.concatenate(found.rows)
     t = np.repeat(t_of, [len(x) for x in found.rows])
     system = np.array([_SYSTEM.get(int(g), -1) for g in range(256)])[rows["gnss"]]
-    names = {key: signal_id(name) for key, name in SIGNALS.items()}
+    names = {key: number_signal(name) for key, name in SIGNALS.items()}
     signal = np.full(len(rows), -1, dtype=np.int16)
     for (gnss, sig), one in names.items():
         signal[(rows["gnss"] == gnss) & (rows["sig"] == sig)] = one
@@ -102,7 +102,7 @@ def parse_ubx(data: bytes, path: Path) -> tuple[Observations, Ephemerides]:
     for after, payload in found.frames:
         tow, week = found.times[max(after, 0)]
         decoder.add(payload, WEEK * week + tow)
-    return once(obs.take(known)), decoder.ephemerides
+    return drop_repeated(obs.take(known)), decoder.ephemerides
 
 
 def _find_slips(t: np.ndarray, satellite: np.ndarray, signal: np.ndarray, lock: np.ndarray) -> np.ndarray:

@@ -82,13 +82,13 @@ def _find_flat(t: Array, x: Array, least: float, band: float, highest: Array) ->
     return found
 
 
-def highest(imu: Imu) -> Array:
+def find_highest(imu: Imu) -> Array:
     """(2, 3, 2) highest readings of gyro and accelerometer in the sensors' own axes, up and down."""
     both = (imu.gyro @ imu.R_bs, imu.accel @ imu.R_bs)
     return np.array([np.stack([x.max(axis=0, initial=0.0), (-x).max(axis=0, initial=0.0)], -1) for x in both])
 
 
-def first_not_cut(samples: Samples, R_bs: Array, before: Array, now: Array) -> float:
+def find_first_whole_peak(samples: Samples, R_bs: Array, before: Array, now: Array) -> float:
     """Time (s) of the first peak that seemed clipped by the readings `before`, but is not by those of `now`.
 
     Infinite if there is none; both are as `highest` returns them.
@@ -103,7 +103,7 @@ def first_not_cut(samples: Samples, R_bs: Array, before: Array, now: Array) -> f
     return first
 
 
-def with_whole_peaks(samples: Samples, R_bs: Array, known: Array | None = None) -> tuple[Samples, tuple[str, ...]]:
+def restore_peaks(samples: Samples, R_bs: Array, known: Array | None = None) -> tuple[Samples, tuple[str, ...]]:
     """The samples with clipped peaks restored, and notes on them.
 
     Parameters

@@ -56,14 +56,14 @@ def _scale_parameter(noise: ImuNoise, each: int) -> tuple[Parameter, ...]:
     return (Parameter(SCALE, np.zeros(2 * each), sigma, "1"),)
 
 
-def as_biases(scale: Array, force: Array, rate: Array) -> tuple[Array, Array]:
+def convert_to_biases(scale: Array, force: Array, rate: Array) -> tuple[Array, Array]:
     """The biases of accelerometer and gyro, (n, 3) each, that scale errors (k,) or (n, k) amount to at means (n, 3)."""
     half = scale.shape[-1] // 2
     of_accel, of_gyro = scale[..., half:] * force[:, _FROM[:half]], scale[..., :half] * rate[:, _FROM[:half]]
     return (of_accel, of_gyro) if half == 3 else (of_accel @ _INTO, of_gyro @ _INTO)
 
 
-def by_scale(by_bias: Array, mean: Array, k: int) -> Array:
+def differentiate_by_scale(by_bias: Array, mean: Array, k: int) -> Array:
     """(n, r, k): derivative by k scale errors of a triad, from that by its bias (n, r, 3)."""
     return np.asarray(by_bias[..., _TO[:k]] * mean[:, None, _FROM[:k]])
 
@@ -77,7 +77,7 @@ class EarthMotion:
     def __init__(self, T: Array, frame: LocalFrame) -> None:
         self._frame, self._h = frame, T[:, None]
         h = self._h
-        a, b, c, d = rotation.coefficients(float(frame.omega_n @ frame.omega_n) * h * h)
+        a, b, c, d = rotation.compute_coefficients(float(frame.omega_n @ frame.omega_n) * h * h)
         I, W, W2 = (x.ravel() for x in (_I3, frame.W, frame.W2))
         once = b * h * h
         twice = c * h * h * h
@@ -182,7 +182,7 @@ class ImuFactors:
         iv = self.intervals
         delta = np.concatenate([start.ba, start.bg], -1) - self.expected[rows]
         if scale is not None:
-            delta += np.concatenate(as_biases(scale, iv.force[rows], iv.rate[rows]), -1)
+            delta += np.concatenate(convert_to_biases(scale, iv.force[rows], iv.rate[rows]), -1)
         bent = mv(self.bias[rows], delta)
         turn = bent[:, :3]
         return turn, iv.dR[rows] @ rotation.exp(turn), self.step[rows] + bent[:, 3:]
@@ -195,8 +195,8 @@ class ImuFactors:
         """d(end) / d(scale), (n, 15, k): the bias columns of F times what the scale errors multiply."""
         iv, half = self.intervals, k // 2
         out = np.zeros((len(F), DIM, k))
-        out[:, :9, :half] = by_scale(F[:, :9, 12:15], iv.rate[rows], half)
-        out[:, :9, half:] = by_scale(F[:, :9, 9:12], iv.force[rows], half)
+        out[:, :9, :half] = differentiate_by_scale(F[:, :9, 12:15], iv.rate[rows], half)
+        out[:, :9, half:] = differentiate_by_scale(F[:, :9, 9:12], iv.force[rows], half)
         return out
 
     def frames(self, rows: slice, R_nb: Array) -> Array:
@@ -234,13 +234,13 @@ class ImuFactors:
         Jj[:] = np.eye(DIM)
         Jj[:, :3, :3] = inverse
         value = self._body(r, start.R_nb)
-        both, Jj = self.body_rows(both, start.R_nb), self.body_rows(Jj, start.R_nb)
+        both, Jj = self.rotate_to_body(both, start.R_nb), self.rotate_to_body(Jj, start.R_nb)
         # the frame of p and v rotates with the start's attitude
         both[:, 3:6, :3] += rotation.skew(value[:, 3:6])
         both[:, 6:9, :3] += rotation.skew(value[:, 6:9])
         return value, both[:, :, :DIM], Jj, both[:, :, DIM:]
 
-    def body_rows(self, J: Array, R_nb: Array, rows: slice = slice(None)) -> Array:
+    def rotate_to_body(self, J: Array, R_nb: Array, rows: slice = slice(None)) -> Array:
         """Turn the p and v rows of (n, 15, k) back into the start's body axes: inverse of `frames`."""
         Et = np.swapaxes(self.back[rows], -1, -2)
         Rt = np.swapaxes(R_nb, -1, -2) @ Et
@@ -250,7 +250,7 @@ class ImuFactors:
         return out
 
     def _body(self, r: Array, R_nb: Array) -> Array:
-        return self.body_rows(r[..., None], R_nb)[..., 0]
+        return self.rotate_to_body(r[..., None], R_nb)[..., 0]
 
 
 _I6 = np.eye(6)

@@ -10,7 +10,7 @@ import numpy as np
 
 from graphnav.core import rotation
 from graphnav.core.rotation import Array
-from graphnav.core.running import running_sum
+from graphnav.core.running import sum_running
 
 _WALK_POINTS = 6  # quadrature points for the effect of bias random walks within an interval
 
@@ -21,7 +21,7 @@ def take_last(x: Array) -> Array:
     return np.ascontiguousarray(x.transpose(x.ndim - 1, *range(x.ndim - 1)))
 
 
-def white_variances(
+def compute_white_variances(
     density: float, extra: Array, dt: Array, index: Array, edge: Array, cut: Array
 ) -> tuple[Array, Array]:
     """Variances of the integral of white noise over each cell between the edges.
@@ -43,13 +43,13 @@ def white_variances(
     alike, n = density**2 * (edge[1:] - edge[:-1]), edge.shape[1]
     if not extra.any():
         return alike, np.empty((0, 3, n))
-    along = np.diff(running_sum(np.swapaxes(extra.take(index, axis=0), 1, 2) * dt[:, None])[cut], axis=0)
+    along = np.diff(sum_running(np.swapaxes(extra.take(index, axis=0), 1, 2) * dt[:, None])[cut], axis=0)
     least = along.min(axis=1)
     along -= least[:, None]
     return alike + least, along if along.any() else np.empty((0, 3, n))
 
 
-def white_covariance(qg: Array, qa: Array, left: Array, a_edge: Array, b_edge: Array) -> Array:
+def compute_white_covariance(qg: Array, qa: Array, left: Array, a_edge: Array, b_edge: Array) -> Array:
     """Covariance (n, 15, 15), start frame, of white noise with variances qg, qa (L, n) in each cell."""
     ab = np.concatenate([a_edge, b_edge], axis=1)
     ab = 0.5 * (ab[:-1] + ab[1:])
@@ -78,7 +78,7 @@ def white_covariance(qg: Array, qa: Array, left: Array, a_edge: Array, b_edge: A
     return Q
 
 
-def directed_covariance(of_gyro: Array, of_accel: Array, R: Array, left: Array, a: Array, b: Array) -> Array:
+def compute_directed_covariance(of_gyro: Array, of_accel: Array, R: Array, left: Array, a: Array, b: Array) -> Array:
     """Covariance (n, 15, 15), start frame, of white noise with other variances along each axis of the body.
 
     By the trapezoidal rule: an error by u of the angle at a time moves the velocity at the end by u x a and the

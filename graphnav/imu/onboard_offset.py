@@ -24,7 +24,7 @@ import numpy as np
 from graphnav.config import Settings
 from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
-from graphnav.core.sample_size import effective_size
+from graphnav.core.sample_size import compute_effective_size
 from graphnav.recording import Imu, Recording
 
 _AFTER = 5.0  # s of rest after which the correction starts
@@ -35,7 +35,7 @@ _SHORTEST_CORRECTION = 3.0  # s of correction in a rest, below which the bend is
 _ODDS = 100.0  # likelihood ratio above which the correction is undone
 
 
-def without_onboard_offset(recording: Recording, settings: Settings) -> tuple[Recording, tuple[str, ...]]:
+def remove_onboard_offset(recording: Recording, settings: Settings) -> tuple[Recording, tuple[str, ...]]:
     """A walk with the gyro rates before the unit's correction, and a note if there was one.
 
     Drives stay unchanged: on a straight road such a unit takes a slow turn for its offset, and must not be used.
@@ -43,7 +43,7 @@ def without_onboard_offset(recording: Recording, settings: Settings) -> tuple[Re
     if recording.platform != "foot" or not settings.imu.onboard_offset:
         return recording, ()
     imu = recording.imu
-    offset = offset_learnt(imu)
+    offset = estimate_learnt_offset(imu)
     if compute_evidence(imu, offset) < 2.0 * np.log(_ODDS):
         return recording, ()
     most = 1e3 * float(np.abs(offset).max())
@@ -54,7 +54,7 @@ def without_onboard_offset(recording: Recording, settings: Settings) -> tuple[Re
     return replace(recording, imu=replace(imu, gyro=imu.gyro + offset)), (note,)
 
 
-def offset_learnt(imu: Imu) -> Array:
+def estimate_learnt_offset(imu: Imu) -> Array:
     """(N, 3) rad/s, the offset that the unit subtracts beyond that at the start; a rest at the start is taken to have
     begun earlier.
     """
@@ -84,7 +84,7 @@ def compute_evidence(imu: Imu, offset: Array) -> float:
         # in the axes of the walk, not of the unit: force carries no information about the vertical, whose noise differs
         axes = np.linalg.svd(mean[None])[2].T
         for a, b in zip((straight @ axes).T, (corrected @ axes).T, strict=True):
-            n = min(effective_size(a[:, None]), effective_size(b[:, None]))
+            n = min(compute_effective_size(a[:, None]), compute_effective_size(b[:, None]))
             total += n * float(np.log((a @ a) / (b @ b)))
     return total
 

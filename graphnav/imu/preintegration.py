@@ -36,15 +36,15 @@ import numpy as np
 
 from graphnav.core import rotation
 from graphnav.core.rotation import Array
-from graphnav.core.running import running_sum
+from graphnav.core.running import sum_running
 from graphnav.imu.interval_noise import (
-    directed_covariance,
+    compute_directed_covariance,
+    compute_white_covariance,
+    compute_white_variances,
     take_last,
     walk_covariances,
-    white_covariance,
-    white_variances,
 )
-from graphnav.imu.samples import MANY, Samples, chunks, pieces_of
+from graphnav.imu.samples import MANY, Samples, cut_pieces, group_intervals
 from graphnav.recording import Imu
 
 NOISE_FIGURES = ("gyro_noise_density", "accel_noise_density", "gyro_bias_walk", "accel_bias_walk")
@@ -106,7 +106,7 @@ class Intervals:
         n, _, *size = self.parts.shape
         return replace(self, parts=np.empty((n, 0, *size)))
 
-    def out_of_range(self, bg: Array, angle: float = 1e-3) -> Array:
+    def is_out_of_range(self, bg: Array, angle: float = 1e-3) -> Array:
         """(n,) whether the gyro bias moved beyond the range of the first-order correction.
 
         The neglected second-order term turns the force by angle^2/2: 5e-6 m/s at 1e-3 rad over 1 s.
@@ -127,9 +127,9 @@ def preintegrate(samples: Samples, imu: Imu, t: Array, ba: Array, bg: Array, par
     """
     n = len(t) - 1
     ba, bg = np.broadcast_to(ba, (n, 3)), np.broadcast_to(bg, (n, 3))
-    pieces = pieces_of(samples, t)
+    pieces = cut_pieces(samples, t)
     parts: list[tuple[Array, Intervals]] = []
-    for rows in chunks(pieces.count):
+    for rows in group_intervals(pieces.count):
         dt, index = pieces.pad(rows)
         parts.append((rows, _integrate(samples, imu, t, rows, dt, index, ba[rows], bg[rows], parts_of_noise)))
     if n == 1:
@@ -162,22 +162,22 @@ def preintegrate_unknown(
     return Intervals(*(np.concatenate([getattr(part, name) for part in ordered]) for name in names))
 
 
-def prefix(samples: Samples, t0: float, t: Array, ba: Array, bg: Array) -> tuple[Array, Array, Array]:
+def integrate_prefix(samples: Samples, t0: float, t: Array, ba: Array, bg: Array) -> tuple[Array, Array, Array]:
     """dR (M, 3, 3), dV (M, 3), dP (M, 3) from one keyframe to each of the ascending times t > t0 after it."""
-    return within(samples, np.array([t0, t[-1]]), t, ba[None], bg[None])
+    return integrate_within(samples, np.array([t0, t[-1]]), t, ba[None], bg[None])
 
 
-def within(samples: Samples, keyframes: Array, t: Array, ba: Array, bg: Array) -> tuple[Array, Array, Array]:
+def integrate_within(samples: Samples, keyframes: Array, t: Array, ba: Array, bg: Array) -> tuple[Array, Array, Array]:
     """dR (M, 3, 3), dV (M, 3), dP (M, 3) from the keyframe before (never at) each of the times t to that time.
 
     `ba`, `bg` are (K-1, 3), the biases of each interval; t (M,) ascending, after the first keyframe and not
     after the last.
     """
-    pieces = pieces_of(samples, keyframes, t)
+    pieces = cut_pieces(samples, keyframes, t)
     edge = np.searchsorted(pieces.edges, t)
     interval = np.searchsorted(keyframes, t, side="left") - 1
     dR, dV, dP = np.empty((len(t), 3, 3)), np.empty((len(t), 3)), np.empty((len(t), 3))
-    for rows in chunks(pieces.count):
+    for rows in group_intervals(pieces.count):
         dt, index = pieces.pad(rows)
         R, V, P = _integrate_pieces(_unbias(samples.gyro, index, bg[rows]), _unbias(samples.accel, index, ba[rows]), dt)
         place = np.full(len(pieces.count), -1)
@@ -197,7 +197,7 @@ def _unbias(x: Array, index: Array, bias: Array) -> Array:
     return np.ascontiguousarray(np.swapaxes(x.take(index, axis=0), 1, 2)) - bias.T
 
 
-def _cross(a: Array, b: Array) -> Array:
+def _multiply_cross(a: Array, b: Array) -> Array:
     """[a]x b for vectors a (L, 3, n) and vectors or matrices b (L, 3, n) or (L, 3, 3, n)."""
     a = a if b.ndim == 3 else a[:, :, None]
     out = np.empty_like(b)
@@ -218,7 +218,7 @@ def _integrate_pieces(w: Array, f: Array, dt: Array) -> tuple[Array, Array, Arra
     h = dt[:, None]
     phi = w * h
     x2 = phi[:, 0] * phi[:, 0] + phi[:, 1] * phi[:, 1] + phi[:, 2] * phi[:, 2]
-    a, b, c, d = (x[:, None] for x in rotation.coefficients(x2))
+    a, b, c, d = (x[:, None] for x in rotation.compute_coefficients(x2))
     turn = np.empty((L, n, 3, 3))
     step = turn.transpose(0, 2, 3, 1)
     np.multiply((b * phi)[:, :, None], phi[:, None], out=step)
@@ -228,10 +228,10 @@ def _integrate_pieces(w: Array, f: Array, dt: Array) -> tuple[Array, Array, Arra
         step[:, j, i] += sine[:, k]
         step[:, i, j] -= sine[:, k]
     R = np.ascontiguousarray(_multiply_up(turn).transpose(0, 2, 3, 1))
-    one = _cross(phi, f)
-    two = _cross(phi, one)
-    V = running_sum(_rotate(R[:-1], (f + b * one + c * two) * h))
-    P = running_sum(V[:-1] * h + _rotate(R[:-1], (0.5 * f + c * one + d * two) * (h * h)))
+    one = _multiply_cross(phi, f)
+    two = _multiply_cross(phi, one)
+    V = sum_running(_rotate(R[:-1], (f + b * one + c * two) * h))
+    P = sum_running(V[:-1] * h + _rotate(R[:-1], (0.5 * f + c * one + d * two) * (h * h)))
     return R, V, P
 
 
@@ -273,13 +273,13 @@ def _integrate(
     w, f = _unbias(samples.gyro, index, bg), _unbias(samples.accel, index, ba)
     R, V, P = _integrate_pieces(w, f, dt)
     T = dt.sum(0)
-    A = running_sum((-0.5 * dt)[:, None, None] * (R[:-1] + R[1:]))
+    A = sum_running((-0.5 * dt)[:, None, None] * (R[:-1] + R[1:]))
     # the rest in cells of a few pieces, within which A is linear
     cut = np.append(np.arange(0, L, _CELL if L >= MANY else 1), L)
     A, R, V, P = A[cut], R[cut], V[cut], P[cut]
-    edge = running_sum(dt)[cut]
+    edge = sum_running(dt)[cut]
     (qg, along_gyro), (qa, along_accel) = (
-        white_variances(density, extra, dt, index, edge, cut)
+        compute_white_variances(density, extra, dt, index, edge, cut)
         for density, extra in (
             (imu.noise.gyro_noise_density, samples.extra_gyro),
             (imu.noise.accel_noise_density, samples.extra_accel),
@@ -292,18 +292,18 @@ def _integrate(
     late = h * dv - gain
     h = h[:, None]
     slope = (A[1:] - A[:-1]) / np.maximum(h, 1e-12)
-    B = running_sum(-_cross(dv, A[:-1]) - _cross(late, slope))
-    PA = running_sum(0.5 * h * (A[:-1] + A[1:]))  # dP / d ba
+    B = sum_running(-_multiply_cross(dv, A[:-1]) - _multiply_cross(late, slope))
+    PA = sum_running(0.5 * h * (A[:-1] + A[1:]))  # dP / d ba
     # dP / d bg = int B, in a cell B_start h - int [(t_end - t) dV]x A
-    PB = running_sum(h * B[:-1] - _cross(gain, A[:-1] + (h / 3.0) * slope))
+    PB = sum_running(h * B[:-1] - _multiply_cross(gain, A[:-1] + (h / 3.0) * slope))
     left = T - edge  # time left at each edge
     a_edge = V[-1] - V
     b_edge = P[-1] - P - V * left[:, None]
     walks = walk_covariances(edge, left, A, B, PA, PB, a_edge, b_edge)
     of_gyro, of_accel = imu.noise.gyro_bias_walk**2 * walks[0], imu.noise.accel_bias_walk**2 * walks[1]
-    Q = white_covariance(qg, qa, left, a_edge, b_edge) + of_gyro + of_accel
+    Q = compute_white_covariance(qg, qa, left, a_edge, b_edge) + of_gyro + of_accel
     if len(along_gyro) or len(along_accel):
-        Q += directed_covariance(along_gyro, along_accel, R, left, a_edge, b_edge)
+        Q += compute_directed_covariance(along_gyro, along_accel, R, left, a_edge, b_edge)
 
     dR, v_ba, v_bg, p_ba, p_bg = (take_last(x) for x in (R, A, B, PA, PB))
     turn = np.zeros((n, 15, 15))  # theta from the start frame to a right perturbation of dR
@@ -313,18 +313,18 @@ def _integrate(
     parts = np.empty((n, 0, 15, 15))
     if parts_of_noise:
         none, each = np.zeros_like(qg), edge[1:] - edge[:-1]
-        rate = white_covariance(imu.noise.gyro_noise_density**2 * each, none, left, a_edge, b_edge)
-        force = white_covariance(none, imu.noise.accel_noise_density**2 * each, left, a_edge, b_edge)
+        rate = compute_white_covariance(imu.noise.gyro_noise_density**2 * each, none, left, a_edge, b_edge)
+        force = compute_white_covariance(none, imu.noise.accel_noise_density**2 * each, left, a_edge, b_edge)
         parts = turn[:, None] @ np.stack([rate, force, of_gyro, of_accel], 1) @ np.swapaxes(turn, -1, -2)[:, None]
     theta_bg = np.swapaxes(dR, -1, -2) @ v_ba
     mean_rate, mean_force = (np.sum(x * dt[:, None], axis=0).T / T[:, None] for x in (w, f))
     return Intervals(
         t[rows], t[rows + 1], dR, take_last(V), take_last(P), theta_bg, v_ba, v_bg, p_ba, p_bg,
-        np.array(ba), np.array(bg), mean_rate, mean_force, Q, parts, *_mean_velocity_parts(edge, R, V, A),
+        np.array(ba), np.array(bg), mean_rate, mean_force, Q, parts, *_compute_mean_velocity_parts(edge, R, V, A),
     )  # fmt: skip
 
 
-def _mean_velocity_parts(edge: Array, R: Array, V: Array, A: Array) -> tuple[Array, Array, Array, Array]:
+def _compute_mean_velocity_parts(edge: Array, R: Array, V: Array, A: Array) -> tuple[Array, Array, Array, Array]:
     """Terms of the mean velocity over an interval in the axes at its end; by the trapezoidal rule."""
     T = edge[-1]
     h = edge[1:] - edge[:-1]

@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from graphnav.core.findings import period_of
+from graphnav.core.findings import compute_period
 from graphnav.core.rotation import Array
-from graphnav.core.running import running_sum
+from graphnav.core.running import sum_running
 from graphnav.recording import Imu
 
 GAP = 1.5  # sample periods between rows above which there is a gap
@@ -49,7 +49,7 @@ def bridge_gaps(imu: Imu, factor: float = GAP) -> Samples:
     density is the variance times g.
     """
     dt = imu.t[1:] - imu.t[:-1]
-    period = period_of(imu.t)
+    period = compute_period(imu.t)
     gap = np.flatnonzero(dt > factor * period)
     zero = np.broadcast_to(np.zeros(3), (len(imu.t), 3))
     if not len(gap):
@@ -92,7 +92,7 @@ def _measure_bridge_error(x: Array, gap: Array, lost: Array) -> Array:
     out = 0.5 * (x[gap + 1] - x[gap]) ** 2
     if len(x) < 3:
         return np.asarray(out)
-    sums, mean = running_sum(x), x.mean(axis=0)
+    sums, mean = sum_running(x), x.mean(axis=0)
     for n in np.unique(lost):
         here = np.flatnonzero(lost == n)
         k = gap[here]
@@ -100,7 +100,7 @@ def _measure_bridge_error(x: Array, gap: Array, lost: Array) -> Array:
         before, after = x[: -n - 1], x[n + 1 :]
         error = ((sums[n + 1 : -1] - sums[1 : -n - 1]) / n - 0.5 * (before + after)) ** 2
         change, level = ((after - before) ** 2).mean(axis=0), ((0.5 * (before + after) - mean) ** 2).mean(axis=0)
-        average, total = error.mean(axis=0), running_sum(error)
+        average, total = error.mean(axis=0), sum_running(error)
         first = np.clip([k - (_SPANS + 1) * n, k + 1], 0, len(error))
         last = np.clip([k - n, k + 1 + _SPANS * n], 0, len(error))
         count = (last - first).sum(axis=0)[:, None]
@@ -130,7 +130,7 @@ class Pieces:
         return np.where(inside, self.dt[at], 0.0), self.index[at]
 
 
-def pieces_of(samples: Samples, t: Array, extra: Array | None = None) -> Pieces:
+def cut_pieces(samples: Samples, t: Array, extra: Array | None = None) -> Pieces:
     """Pieces between keyframes t, also split at the `extra` times."""
     inner = samples.t[(samples.t > t[0]) & (samples.t < t[-1])]
     # nearly sorted already, which a stable sort exploits
@@ -144,7 +144,7 @@ def pieces_of(samples: Samples, t: Array, extra: Array | None = None) -> Pieces:
     return Pieces(edges, dt, index, starts[:-1], starts[1:] - starts[:-1])
 
 
-def chunks(count: Array) -> Iterator[Array]:
+def group_intervals(count: Array) -> Iterator[Array]:
     """Group intervals of similar length, so that little is padded."""
     order = np.argsort(count, kind="stable")
     start = 0

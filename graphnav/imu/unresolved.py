@@ -26,7 +26,7 @@ from graphnav.recording import ImuNoise
 _VARIANCE_SHARE = 0.25  # share of the variance of a linearly changing signal
 
 
-def with_unresolved_motion(samples: Samples, noise: ImuNoise) -> Samples:
+def add_unresolved_motion(samples: Samples, noise: ImuNoise) -> Samples:
     """The samples with the noise of motion within their periods."""
     period = float(np.median(np.diff(samples.t)))
     return replace(
@@ -44,7 +44,7 @@ def _estimate_density(x: Array, white: float, period: float) -> Array:
     return np.asarray(_VARIANCE_SHARE * both**2 / 12.0 * period)[:, None]
 
 
-def with_coning(samples: Samples) -> Samples:
+def add_coning(samples: Samples) -> Samples:
     """Samples whose rate and force, constant over a period, have the same effect as ones that change linearly over it.
 
     For a rate w and a force f that change evenly, w', f' per second, in a period T (Savage 1998, part 1, eq. 36-49 and

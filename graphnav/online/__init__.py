@@ -1,7 +1,7 @@
 """Online smoothing: rows of sensors in, a live state and a settled trajectory out."""
 
 from graphnav.online.ahead import Live
-from graphnav.online.replay import rows_of, without_rows
+from graphnav.online.replay import drop_rows, list_rows
 from graphnav.online.rows import Fix, ImuSample, Reading, WheelSpeed, live_setup, live_trajectory
 from graphnav.online.sensors import Row, Sensors
 from graphnav.online.session import Session
@@ -19,8 +19,8 @@ __all__ = [
     "Session",
     "Tracker",
     "WheelSpeed",
+    "drop_rows",
+    "list_rows",
     "live_setup",
     "live_trajectory",
-    "rows_of",
-    "without_rows",
 ]

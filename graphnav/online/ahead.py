@@ -14,9 +14,9 @@ from graphnav.core.state import DIM, States
 from graphnav.core.trajectory import Trajectory
 from graphnav.estimation.dense import Dense
 from graphnav.estimation.noise.model import NoiseModel
-from graphnav.estimation.solution import to_trajectory
+from graphnav.estimation.solution import make_trajectory
 from graphnav.estimation.solvers.window import Message, SettledStates
-from graphnav.imu.dynamics import SCALE, ImuFactors, as_biases
+from graphnav.imu.dynamics import SCALE, ImuFactors, convert_to_biases
 from graphnav.imu.preintegration import NOISE_FIGURES, preintegrate
 from graphnav.imu.samples import bridge_gaps
 from graphnav.online.sensors import Sensors
@@ -55,7 +55,7 @@ def live(newest: Message, T: float, frame: LocalFrame, sensors: Sensors, noise: 
     return Live(float(max(now, T)), state, P[:DIM, :DIM], T)
 
 
-def since(
+def predict_since(
     newest: Message, T: float, frame: LocalFrame, sensors: Sensors, noise: NoiseModel
 ) -> tuple[Array, States, Array]:
     """Times (M,), states and covariances (M, 15, 15) at every IMU row since the newest keyframe at T (s).
@@ -71,7 +71,7 @@ def since(
     if SCALE in newest.columns:
         scale, rows = newest.value(SCALE), imu.t > T
         mean = imu.accel[rows].mean(axis=0, keepdims=True) - ba, imu.gyro[rows].mean(axis=0, keepdims=True) - bg
-        of_accel, of_gyro = as_biases(scale, *mean)
+        of_accel, of_gyro = convert_to_biases(scale, *mean)
         ba, bg = ba + of_accel, bg + of_gyro
     ends, both = np.array([T, now.t]), np.stack([newest.covariance[:DIM, :DIM], now.covariance])
     between = Dense(
@@ -88,7 +88,7 @@ def export(settled: SettledStates, rows: NDArray[np.bool_], frame: LocalFrame) -
     FloatingPointError
         If a state is no number.
     """
-    track = to_trajectory("online", frame, settled.t[rows], settled.states[rows], settled.covariance[rows])
+    track = make_trajectory("online", frame, settled.t[rows], settled.states[rows], settled.covariance[rows])
     known = (track.llh, track.v, track.rph, track.sd_p, track.sd_v, track.sd_rph)
     if not all(x is None or np.isfinite(x).all() for x in known):
         raise FloatingPointError("states that are not finite")

@@ -17,9 +17,9 @@ from graphnav.constraints.standstill import PLACE
 from graphnav.core.rotation import Array
 from graphnav.core.state import BLOCKS, Parameter
 from graphnav.estimation.factor_graph.tree_window import TreeWindow
-from graphnav.estimation.fixing import LOST_PLACE, LOST_SPEED, Held, hold_on, split_carriers, with_integers
+from graphnav.estimation.fixing import LOST_PLACE, LOST_SPEED, Held, add_integers, hold_on, split_carriers
 from graphnav.estimation.known_arcs import Epochs
-from graphnav.estimation.noise.apply import row_weights
+from graphnav.estimation.noise.apply import select_weights
 from graphnav.estimation.noise.model import INTERVALS, STATED, NoiseModel
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import ExcludedSpan
@@ -113,7 +113,7 @@ class Chain:
     def excluded(self) -> tuple[ExcludedSpan, ...]:
         """Spans of excluded fixes, by whatever test."""
         times, used = self.verdicts.times, self.verdicts.used
-        left = {name: used[name] * (row_weights(t, self.noise, name) > 0.0) for name, t in times.items()}
+        left = {name: used[name] * (select_weights(t, self.noise, name) > 0.0) for name, t in times.items()}
         return Verdicts(times, left).faults()
 
     @property
@@ -168,7 +168,7 @@ class Chain:
             for i, held in enumerate(self._held[begin:end], begin)
             if held.found or held.let_go
         }
-        return _with_decisions(problem, decided) if decided else problem
+        return _add_decisions(problem, decided) if decided else problem
 
     def _add(
         self, built: Problem, first: int, ahead: Predicted | None = None, begin: int = 0, end: int | None = None
@@ -204,7 +204,7 @@ class Chain:
         held = self._decide(problem, k)
         if held.found or held.let_go:
             self.window.truncate(len(self.window) - 1)
-            place = replace(place, problem=_with_decisions(problem, {place.t: held}))
+            place = replace(place, problem=_add_decisions(problem, {place.t: held}))
             if held.let_go:
                 place = replace(place, steps=(*place.steps, *self._begin_ambiguities(problem, place.steps)))
             turn = max(turn, self.window.push(place))
@@ -299,7 +299,7 @@ def find_turn(setup: Recording, noise: NoiseModel) -> float:
     return compute_turn_limit(replace(stated, accel_noise_density=density))
 
 
-def _with_decisions(problem: Problem, decided: dict[float, Held]) -> Problem:
+def _add_decisions(problem: Problem, decided: dict[float, Held]) -> Problem:
     """A problem with the integers decided at some of its keyframes, by time."""
     phase = split_carriers(problem)[1]
     if phase is None:
@@ -310,7 +310,7 @@ def _with_decisions(problem: Problem, decided: dict[float, Held]) -> Problem:
         if held is not None:
             rows += [(k, a, b, n) for (a, _), (b, _), n in held.found]
             lost[k] = held.let_go
-    problem = with_integers(problem, phase, rows)
+    problem = add_integers(problem, phase, rows)
     if not lost[1:].any():
         return problem
     covariance = problem.intervals.covariance.copy()

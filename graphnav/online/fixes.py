@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from graphnav.constraints.gnss import period
+from graphnav.constraints.gnss import find_fix_period
 from graphnav.core.rotation import Array
-from graphnav.estimation.noise.spacing import best_fixes, grid_start
+from graphnav.estimation.noise.spacing import find_grid_start, select_best_fixes
 from graphnav.online.buffers import Buffer
 from graphnav.recording import Gnss
 
@@ -51,13 +51,13 @@ class Fixes(Buffer):
     def space(self, spacing: float) -> None:
         """Use the best fix of every span of `spacing` (s), as `estimation.noise.spacing` sets it; 0: use all."""
         self.rows[:, _USED], self._grid, self.left = 1.0, None, []
-        gnss = self.between_as_gnss(-np.inf, np.inf)
-        if not spacing or gnss is None or len(gnss.t) < 2 or period(gnss.t) > 0.5 * spacing:
+        gnss = self.select_as_gnss(-np.inf, np.inf)
+        if not spacing or gnss is None or len(gnss.t) < 2 or find_fix_period(gnss.t) > 0.5 * spacing:
             return
-        begin = grid_start(gnss)
+        begin = find_grid_start(gnss)
         self._grid = begin, spacing
         self.rows[:, _USED] = 0.0
-        self.rows[best_fixes(gnss, np.floor((gnss.t - begin) / spacing)), _USED] = 1.0
+        self.rows[select_best_fixes(gnss, np.floor((gnss.t - begin) / spacing)), _USED] = 1.0
 
     def choose(self, t: float) -> bool:
         """Whether the fix at a time is one of the best of its span; those that no longer are go to `left`."""
@@ -67,9 +67,9 @@ class Fixes(Buffer):
         span = np.floor((t - begin) / spacing)
         near = self.rows[slice(*np.searchsorted(self.t, [t - 1.1 * spacing, t + 1.1 * spacing]))]
         rows = np.flatnonzero(np.floor((near[:, 0] - begin) / spacing) == span)
-        gnss = self._as_gnss(near[rows])
+        gnss = self._make_gnss(near[rows])
         assert gnss is not None
-        best = rows[best_fixes(gnss, np.zeros(len(rows)))]
+        best = rows[select_best_fixes(gnss, np.zeros(len(rows)))]
         others = np.setdiff1d(rows, best)
         self.left += [float(x) for x in near[others[near[others, _USED] > 0.0], 0] if x != t]
         near[rows, _USED] = 0.0
@@ -86,12 +86,12 @@ class Fixes(Buffer):
             self._unit = compute_unit(self.rows[self.rows[:, _USED] > 0.0, 4:7])
         return self._unit
 
-    def between_as_gnss(self, begin: float, end: float, every: bool = False) -> Gnss | None:
+    def select_as_gnss(self, begin: float, end: float, every: bool = False) -> Gnss | None:
         """The used fixes between two times (s), both included, or with `every` all of them; None if there are none."""
         rows = self.between(begin, end)
-        return self._as_gnss(rows if every else rows[rows[:, _USED] > 0.0])
+        return self._make_gnss(rows if every else rows[rows[:, _USED] > 0.0])
 
-    def _as_gnss(self, rows: Array) -> Gnss | None:
+    def _make_gnss(self, rows: Array) -> Gnss | None:
         if self._setup is None or not len(rows):
             return None
         v = sd_v = None

@@ -26,7 +26,7 @@ from graphnav.detectors import detect
 from graphnav.estimation import faults
 from graphnav.estimation.alignment import Alignment
 from graphnav.estimation.building import start_sigma
-from graphnav.estimation.noise.apply import with_noise
+from graphnav.estimation.noise.apply import apply_noise
 from graphnav.estimation.noise.estimate import estimate_noise
 from graphnav.estimation.noise.exclusion import estimate_without_faults
 from graphnav.estimation.noise.model import NoiseModel
@@ -35,7 +35,7 @@ from graphnav.estimation.problem import Problem, build_problem
 from graphnav.estimation.solution import ExcludedSpan
 from graphnav.online.checks import check_rows
 from graphnav.online.fixes import compute_unit
-from graphnav.online.raw import without_ambiguities
+from graphnav.online.raw import drop_ambiguities
 from graphnav.online.sensors import Sensors
 from graphnav.online.tracker import Tracker
 from graphnav.recording import Recording
@@ -89,9 +89,9 @@ def answer(asked: Question) -> Answer:
         base = _level(base)
         estimate = estimate_noise if settings.gnss.faults == "off" else estimate_without_faults
         noise = estimate(base, start.until).noise
-        used = with_noise(base, noise)
-        words, wrong = describe(noise, used), faults.fault_spans(used)
-        return Answer(_in_unit(noise, base, asked.unit), words, stationary, wrong, check_rows(asked.every))
+        used = apply_noise(base, noise)
+        words, wrong = describe(noise, used), faults.find_fault_spans(used)
+        return Answer(_convert_unit(noise, base, asked.unit), words, stationary, wrong, check_rows(asked.every))
     except np.linalg.LinAlgError as error:
         raise EstimationError(str(error), key="solver.undetermined") from error
 
@@ -141,7 +141,7 @@ def _level(base: Problem) -> Problem:
     return replace(base, constraints=tuple(rows))
 
 
-def _in_unit(noise: NoiseModel, base: Problem, unit: Array) -> NoiseModel:
+def _convert_unit(noise: NoiseModel, base: Problem, unit: Array) -> NoiseModel:
     """The same model with errors that last for minutes and hours in another unit (3,), m.
 
     An estimate uses the typical stated sigma so far as its unit; the parameters of a drive keep theirs.
@@ -162,7 +162,7 @@ def judge(
     """Start to judge the sensors by their rows up to a time (s); `times` (K,) are the keyframes so far, s."""
     recording, every = (sensors.recording(-np.inf, until, all_of_them) for all_of_them in (False, True))
     due = float(times[-1]) + min(_THINKING * settings.solver.lag, _LONGEST_THOUGHT)
-    settings = without_ambiguities(settings, sensors.setup)
+    settings = drop_ambiguities(settings, sensors.setup)
     return Judgement(Question(recording, every, settings, frame, found, times, sensors.gnss.unit()), due)
 
 

@@ -19,12 +19,12 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, ValidationError, create_model
 
-from graphnav.core.complaints import complaint, suggest_nearest
+from graphnav.core.complaints import describe_invalid, suggest_nearest
 from graphnav.core.errors import RecordingError
 from graphnav.core.files import parse_json, parse_number
 from graphnav.online.raw import RAW
-from graphnav.online.raw_lines import LiveRaw, live_raw, text_of, values_of
-from graphnav.online.replay import rows_of
+from graphnav.online.raw_lines import LiveRaw, format_epoch, live_raw, parse_epoch
+from graphnav.online.replay import list_rows
 from graphnav.online.sensors import Row
 from graphnav.recording import Gnss, Imu, ImuNoise, Odometer, Recording
 from graphnav.recording.formats.schema import Noise
@@ -66,7 +66,7 @@ class _Setup(_Part):
     raw_gnss: LiveRaw | None = None
 
 
-def setup_of(line: str) -> Recording:
+def parse_setup(line: str) -> Recording:
     """The sensors described by the first line of a source.
 
     Raises
@@ -86,7 +86,7 @@ def setup_of(line: str) -> Recording:
     try:
         found = model.model_validate(parse_json(text or "{}"))
     except ValidationError as error:
-        raise RecordingError(complaint("line 1: setup", error, model)) from None
+        raise RecordingError(describe_invalid("line 1: setup", error, model)) from None
     except ValueError as error:
         raise RecordingError(f"line 1: the setup is not JSON ({error})", key="online.setup_json") from None
     stated = found.imu.noise.model_dump(exclude_none=True)  # type: ignore[attr-defined]
@@ -109,7 +109,7 @@ def setup_of(line: str) -> Recording:
     return Recording(found.name, found.platform, imu, gnss, odometer, sensors=sensors, raw_gnss=raw)
 
 
-def row_of(line: str) -> Row | None:
+def parse_row(line: str) -> Row | None:
     """Parse a row; None for an empty line or a comment.
 
     Raises
@@ -122,10 +122,10 @@ def row_of(line: str) -> Row | None:
         return None
     kind, *cells = line.split(",")
     if kind == "S":
-        return _series_row(cells)
+        return _parse_series_row(cells)
     if kind == "R":
         t, _, text = line[2:].partition(",")
-        return RAW, parse_number(t), values_of(text)
+        return RAW, parse_number(t), parse_epoch(text)
     try:
         numbers = [parse_number(cell) if cell.strip() else float("nan") for cell in cells]
     except ValueError:
@@ -143,7 +143,7 @@ def row_of(line: str) -> Row | None:
     )
 
 
-def _series_row(cells: list[str]) -> Row:
+def _parse_series_row(cells: list[str]) -> Row:
     name, sensor = cells[0] if cells else "", list_sensors().get(cells[0] if cells else "")
     if sensor is None:
         raise ValueError(f"no sensor '{name[:20]}' is known; {suggest_nearest(name, tuple(list_sensors()))}")
@@ -161,7 +161,7 @@ def _tell_scale(column: Column) -> float:
     return next(iter(column.units.values()))
 
 
-def head_of(recording: Recording) -> str:
+def format_head(recording: Recording) -> str:
     """The first line that describes the sensors of a recording."""
     setup: dict[str, object] = {"name": recording.name, "platform": recording.platform}
     setup["imu"] = {"noise": asdict(recording.imu.noise)}
@@ -179,7 +179,7 @@ def head_of(recording: Recording) -> str:
     return f"{HEAD} {json.dumps(setup)}"
 
 
-def line_of(row: Row) -> str:
+def format_line(row: Row) -> str:
     """The line of a row; every number reads back exactly."""
     sensor, t, values = row
     if sensor == "imu":
@@ -187,7 +187,7 @@ def line_of(row: Row) -> str:
     if sensor == "odometer":
         return f"O,{t!r},{values[0]!r}"
     if sensor == RAW:
-        return f"R,{t!r},{text_of(values)}"
+        return f"R,{t!r},{format_epoch(values)}"
     if sensor != "gnss":
         columns = list_sensors()[sensor].columns
         numbers = [x / _tell_scale(column) for x, column in zip(values, columns, strict=True)]
@@ -197,11 +197,11 @@ def line_of(row: Row) -> str:
     return f"G,{t!r},{lat!r},{lon!r}," + ",".join("" if np.isnan(x) else repr(x) for x in rest)
 
 
-def lines_of(recording: Recording) -> Iterator[tuple[float, str]]:
+def format_lines(recording: Recording) -> Iterator[tuple[float, str]]:
     """A recording as a live source would send it: time and line, including the first line and the end."""
-    yield recording.start, head_of(recording)
-    for row in rows_of(recording)[1]:
-        yield row[1], line_of(row)
+    yield recording.start, format_head(recording)
+    for row in list_rows(recording)[1]:
+        yield row[1], format_line(row)
     yield recording.end, END
 
 

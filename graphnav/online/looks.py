@@ -11,10 +11,10 @@ import numpy as np
 from graphnav.config import Settings
 from graphnav.constraints.base import SAME_TIME
 from graphnav.core.rotation import Array
-from graphnav.detectors import stops
+from graphnav.detectors import find_stops
 from graphnav.detectors.base import merge_spans
 from graphnav.online.sensors import Sensors
-from graphnav.recording.odometer import ReadingStatistics, faults
+from graphnav.recording.odometer import ReadingStatistics, find_faults
 
 CONTEXT = 30.0  # s of rows before a keyframe that its constraints may use
 SURE = 1.0  # s before now up to which detection is reliable: the end of a stop is known only afterwards
@@ -52,7 +52,7 @@ class Stops:
             self._reviewed, answered = now, since
         self.looked = now
         recording = sensors.recording(-np.inf if whole else now - _DETECTOR_SPAN, now, every=True)
-        self._seen = since, stops(recording, settings, since, now - SURE, self.spans, answered)
+        self._seen = since, find_stops(recording, settings, since, now - SURE, self.spans, answered)
 
     def replace(self, spans: Array, edges: Array) -> None:
         """Replace the spans, cut to keyframes `edges`."""
@@ -89,7 +89,7 @@ class Stops:
                     aligned.append((first, float(inside[-1])))
         before, self.spans = self.spans, np.array(aligned).reshape(-1, 2)
         middle = 0.5 * (edges[1:] + edges[:-1])
-        changed = np.flatnonzero(_within(middle, before) != _within(middle, self.spans))
+        changed = np.flatnonzero(_mask_within(middle, before) != _mask_within(middle, self.spans))
         return float(edges[changed[0]]) if len(changed) else np.inf
 
 
@@ -127,8 +127,8 @@ class Readings:
             every = sensors.recording().odometer
             assert every is not None
             before, self.figures, self._told, lag = self.figures, ReadingStatistics.of(every), self._moving, None
-            self.revised |= before is not None and _other(before.sigmas(o), self.figures.sigmas(o))
-        seen, known = faults(recording.odometer, recording.imu, self.figures, lag), self.wrong
+            self.revised |= before is not None and _differ(before.sigmas(o), self.figures.sigmas(o))
+        seen, known = find_faults(recording.odometer, recording.imu, self.figures, lag), self.wrong
         found, self._lag = seen.spans, seen.lag
         since = float(recording.odometer.t[0]) + (0.0 if whole else 5.0)
         old = known[(known[:, 0] < since) & (known[:, 1] > since - CONTEXT - _WHEELS_LOOK)]
@@ -137,7 +137,7 @@ class Readings:
         return float(new[0, 0]) if len(new) else np.inf
 
 
-def _other(before: tuple[float, ...], now: tuple[float, ...]) -> bool:
+def _differ(before: tuple[float, ...], now: tuple[float, ...]) -> bool:
     """Whether sigmas differ clearly."""
     return any(abs(a - b) > _CLEAR_CHANGE * max(a, b) for a, b in zip(before, now, strict=True))
 
@@ -148,6 +148,6 @@ def clip_spans(spans: Array, begin: float, end: float) -> Array:
     return np.asarray(cut[cut[:, 1] > cut[:, 0]])
 
 
-def _within(t: Array, spans: Array) -> Array:
+def _mask_within(t: Array, spans: Array) -> Array:
     """Which times lie in the spans (M, 2)."""
     return np.asarray(((t[:, None] >= spans[:, 0]) & (t[:, None] <= spans[:, 1])).any(axis=1))

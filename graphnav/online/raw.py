@@ -12,10 +12,10 @@ from graphnav.config.raw_gnss import RawGnssSettings
 from graphnav.constraints.raw_selection import EARLY, select_usable
 from graphnav.core.rotation import Array
 from graphnav.gnss.arcs import find_arcs
-from graphnav.gnss.ppp import wind_up_of
-from graphnav.gnss.series import RawGnss, primary
+from graphnav.gnss.ppp import compute_series_wind_up
+from graphnav.gnss.series import RawGnss, choose_primary
 from graphnav.gnss.single_point import choose_coefficients, look, solve
-from graphnav.online.raw_lines import WIDTH, series_of, take_sane
+from graphnav.online.raw_lines import WIDTH, build_series, take_sane
 from graphnav.recording import Recording
 
 RAW = "raw_gnss"
@@ -27,7 +27,7 @@ class RawEpochs:
 
     Parameters
     ----------
-    setup : as `without_epochs` makes it.
+    setup : as `drop_epochs` makes it.
     """
 
     setup: RawGnss
@@ -55,7 +55,7 @@ class RawEpochs:
         """Newest time, minus infinity without epochs."""
         return self._t[-1] if self._t else -np.inf
 
-    def odds(self, values: tuple[float, ...]) -> str | None:
+    def find_fault(self, values: tuple[float, ...]) -> str | None:
         """The fault of an epoch by itself; None if there is none."""
         assert self.setup.catalogue is not None
         if not values or len(values) % WIDTH:
@@ -64,10 +64,10 @@ class RawEpochs:
         if not np.isin(rows[:, 0], self.setup.catalogue.satellites).all():
             return "of satellites that the setup does not name"
         rows = take_sane(rows)
-        usable = select_usable(series_of([0.0], [rows], self.setup), self.settings)
+        usable = select_usable(build_series([0.0], [rows], self.setup), self.settings)
         return None if usable.any() else "no satellite that is of use"
 
-    def wanted(self, t: float) -> bool:
+    def is_wanted(self, t: float) -> bool:
         """Whether there is no epoch so close to a time that one of the two suffices."""
         k, least = bisect_left(self._t, t), self.settings.period - EARLY
         near = self._t[max(k - 1, 0) : k + 1]
@@ -79,7 +79,7 @@ class RawEpochs:
             return False
         k = bisect_left(self._every, t)
         self._every.insert(k, t)
-        self._rows[t] = self._with_place(t, take_sane(np.reshape(values, (-1, WIDTH))))
+        self._rows[t] = self._fill_place(t, take_sane(np.reshape(values, (-1, WIDTH))))
         if used:
             # numbers given stay: a late epoch has none, and changes of carriers bypass it
             self._number[t] = self._number.get(self.newest, -1) + 1 if t > self.newest else -1
@@ -119,7 +119,7 @@ class RawEpochs:
         """The epochs in use from `begin` to `end`, both included, and the one before, as a series."""
         t = self._t[max(bisect_left(self._t, begin) - 1, 0) : bisect_right(self._t, end)]
         rows = [self._rows[x] for x in t]
-        series = series_of(t, rows, self.setup)
+        series = build_series(t, rows, self.setup)
         if not t:
             return series
         number = np.repeat([self._number[x] for x in t], [len(one) for one in rows])
@@ -127,13 +127,13 @@ class RawEpochs:
         wound = arcs[:, 1] if self.settings.ppp else np.empty(0)
         return replace(series, arc_begin=arcs[:, 0], wound=wound, number=number)
 
-    def _with_place(self, t: float, rows: Array) -> Array:
+    def _fill_place(self, t: float, rows: Array) -> Array:
         """Rows with an approximate antenna position and clock where they have none: of this epoch, or the last."""
         if np.isfinite(rows[:, -5:]).all():
             return rows
         rows = rows.copy()
-        series = series_of([t], [rows], self.setup)
-        found = solve(series.take(primary(series)))
+        series = build_series([t], [rows], self.setup)
+        found = solve(series.take(choose_primary(series)))
         if np.isfinite(found.p).all():
             drift = found.drift[0] if np.isfinite(found.drift[0]) else 0.0
             rows[:, -5:] = [*found.p[0], found.clock[0], drift]
@@ -152,7 +152,7 @@ class RawEpochs:
         s = self.settings
         if not (s.carrier or s.differences or s.ppp):
             return np.full((len(rows), 2), np.nan)
-        series = series_of([*(x for x, _, _ in last), t], [*(row[None] for _, row, _ in last), rows], self.setup)
+        series = build_series([*(x for x, _, _ in last), t], [*(row[None] for _, row, _ in last), rows], self.setup)
         order = np.argsort(series.t, kind="stable")
         series, based = series.take(order), self.setup.catalogue.differenced and s.carrier and not s.ppp
         if not based:
@@ -160,7 +160,7 @@ class RawEpochs:
         period = self.setup.catalogue.period
         found = find_arcs(series, base_arc=series.base_arc if based else None, period=period)
         here = np.empty((len(order), 2))
-        here[order, 0], here[order, 1] = found.begin, wind_up_of(series) if s.ppp else 0.0
+        here[order, 0], here[order, 1] = found.begin, compute_series_wind_up(series) if s.ppp else 0.0
         out = here[len(last) :]
         before = {(row[0], row[1]): (x, arc, now) for (x, row, arc), now in zip(last, here, strict=False)}
         for i, row in enumerate(rows):
@@ -176,16 +176,16 @@ class RawEpochs:
                 self._last[row[0], row[1]] = t, row, arc
 
 
-def codes_alone(settings: Settings) -> Settings:
+def use_codes_alone(settings: Settings) -> Settings:
     """The settings without carriers: a start needs nothing of them."""
     s = settings.raw_gnss
     less = s.model_copy(update={"differences": False, "carrier": False, "ppp": False, "code": s.code or s.ppp})
     return settings.model_copy(update={RAW: less})
 
 
-def without_ambiguities(settings: Settings, setup: Recording) -> Settings:
+def drop_ambiguities(settings: Settings, setup: Recording) -> Settings:
     """The settings for a noise model: changes of carriers have variance components, ambiguities have none."""
     s, raw = settings.raw_gnss, setup.raw_gnss
     if raw is None or not (s.carrier and raw.differenced):
         return settings
-    return codes_alone(settings)
+    return use_codes_alone(settings)

@@ -23,15 +23,23 @@ from dataclasses import fields, replace
 import numpy as np
 from pydantic import BaseModel, ConfigDict
 
-from graphnav.constraints.gnss import period
+from graphnav.constraints.gnss import find_fix_period
 from graphnav.core.errors import RecordingError
 from graphnav.core.files import parse_number
 from graphnav.core.rotation import Array
 from graphnav.gnss.antex import Antennas, SatelliteAntenna
-from graphnav.gnss.ppp import second_signals
-from graphnav.gnss.series import Catalogue, RawGnss, primary
-from graphnav.gnss.signals import NAMES, SYSTEMS, is_known_signal, satellite_id, satellite_name, signal_id, signal_name
-from graphnav.gnss.single_point import signal_groups
+from graphnav.gnss.ppp import choose_second_signals
+from graphnav.gnss.series import Catalogue, RawGnss, choose_primary
+from graphnav.gnss.signals import (
+    NAMES,
+    SYSTEMS,
+    is_known_signal,
+    name_satellite,
+    name_signal,
+    number_satellite,
+    number_signal,
+)
+from graphnav.gnss.single_point import group_signals
 from graphnav.sensors.tables import NotNegative, Positive, Vector
 
 _NUMBERS = (
@@ -50,17 +58,17 @@ _BOUNDS = {
 WIDTH = sum(_WIDTHS.get(name, 1) for name in _NUMBERS)
 
 
-def without_epochs(raw: RawGnss) -> RawGnss:
+def drop_epochs(raw: RawGnss) -> RawGnss:
     """What all epochs of a series have in common."""
     placed = raw.take(np.isfinite(raw.p[:, 0]))
     satellites, _ = placed.satellites
-    groups, _ = signal_groups(placed.take(primary(placed)))
-    second = tuple(second_signals(placed).items())
-    catalogue = Catalogue(tuple(satellites.tolist()), groups, raw.differenced, period(raw.epochs[0]), second)
+    groups, _ = group_signals(placed.take(choose_primary(placed)))
+    second = tuple(choose_second_signals(placed).items())
+    catalogue = Catalogue(tuple(satellites.tolist()), groups, raw.differenced, find_fix_period(raw.epochs[0]), second)
     return replace(_make_empty(_fill_columns(raw)), catalogue=catalogue)
 
 
-def epochs_of(raw: RawGnss) -> list[tuple[float, tuple[float, ...]]]:
+def list_epochs(raw: RawGnss) -> list[tuple[float, tuple[float, ...]]]:
     """Times (s) and numbers of the epochs of a series, those of its satellites that are placed."""
     raw = _fill_columns(raw.take(np.isfinite(raw.p[:, 0])))
     columns = np.column_stack([np.asarray(getattr(raw, name), dtype=float) for name in _NUMBERS])
@@ -70,17 +78,17 @@ def epochs_of(raw: RawGnss) -> list[tuple[float, tuple[float, ...]]]:
     ]
 
 
-def text_of(values: tuple[float, ...]) -> str:
+def format_epoch(values: tuple[float, ...]) -> str:
     """An epoch as a part of a line: place and clock, then its satellites, each after a semicolon."""
     rows = np.reshape(values, (-1, WIDTH))
-    parts = [_cells(rows[0, -5:].tolist())]
+    parts = [_format_cells(rows[0, -5:].tolist())]
     for satellite, signal, *numbers in rows[:, :-5].tolist():
-        parts.append(f"{satellite_name(int(satellite))},{signal_name(int(signal))},{_cells(numbers)}")
+        parts.append(f"{name_satellite(int(satellite))},{name_signal(int(signal))},{_format_cells(numbers)}")
     return ";".join(parts)
 
 
-def values_of(text: str) -> tuple[float, ...]:
-    """What `text_of` made a text of.
+def parse_epoch(text: str) -> tuple[float, ...]:
+    """What `format_epoch` made a text of.
 
     Raises
     ------
@@ -88,15 +96,15 @@ def values_of(text: str) -> tuple[float, ...]:
         In a few words, if it is none.
     """
     first, *satellites = text.split(";")
-    own = _numbers(first, 5, "place and clock")
+    own = _parse_numbers(first, 5, "place and clock")
     out: list[float] = []
     for one in satellites:
         name, signal, *rest = one.split(",", 2)
         try:
-            ids = [satellite_id(name), _known_signal(name[0], signal)]
+            ids = [number_satellite(name), _check_signal(name[0], signal)]
         except (ValueError, IndexError):
             raise ValueError(f"'{one[:12]}' begins with no satellite and signal") from None
-        out += [*ids, *_numbers("".join(rest), WIDTH - 7, name), *own]
+        out += [*ids, *_parse_numbers("".join(rest), WIDTH - 7, name), *own]
     return tuple(out)
 
 
@@ -116,7 +124,7 @@ def take_sane(rows: Array) -> Array:
     return rows if good.all() else rows[good]
 
 
-def _known_signal(system: str, name: str) -> int:
+def _check_signal(system: str, name: str) -> int:
     """The number of a signal that satellites of a system send.
 
     Raises
@@ -126,14 +134,14 @@ def _known_signal(system: str, name: str) -> int:
     """
     if not is_known_signal(SYSTEMS.index(system), name):
         raise ValueError(f"{NAMES[SYSTEMS.index(system)]} has no signal '{name}'")
-    return signal_id(name)
+    return number_signal(name)
 
 
-def _cells(numbers: list[float]) -> str:
+def _format_cells(numbers: list[float]) -> str:
     return ",".join("" if np.isnan(x) else repr(x) for x in numbers)
 
 
-def _numbers(text: str, count: int, what: str) -> list[float]:
+def _parse_numbers(text: str, count: int, what: str) -> list[float]:
     cells = text.split(",")
     if len(cells) != count:
         raise ValueError(f"{what}: needs {count} numbers, not {len(cells)}")
@@ -143,7 +151,7 @@ def _numbers(text: str, count: int, what: str) -> list[float]:
         raise ValueError(f"{what}: '{text[:40]}' holds something that is no number") from None
 
 
-def series_of(t: list[float], rows: list[Array], setup: RawGnss) -> RawGnss:
+def build_series(t: list[float], rows: list[Array], setup: RawGnss) -> RawGnss:
     """The series of epochs at times (s) with numbers (n, WIDTH) each, of a setup."""
     if not t:
         return setup
@@ -208,11 +216,13 @@ class LiveRaw(BaseModel):
             If it names a satellite or signal that there is not.
         """
         try:
-            satellites = tuple(sorted({satellite_id(name) for name in self.satellites}))
-            groups = tuple((SYSTEMS.index(system), _known_signal(system, name)) for system, name in self.signals)
-            second = tuple((satellite_id(name), _known_signal(name[0], signal)) for name, signal in self.second.items())
-            offsets = {satellite_id(name): one for name, one in self.antennas.items()}
-            noise = {satellite_id(name): one for name, one in self.clock_noise.items()}
+            satellites = tuple(sorted({number_satellite(name) for name in self.satellites}))
+            groups = tuple((SYSTEMS.index(system), _check_signal(system, name)) for system, name in self.signals)
+            second = tuple(
+                (number_satellite(name), _check_signal(name[0], signal)) for name, signal in self.second.items()
+            )
+            offsets = {number_satellite(name): one for name, one in self.antennas.items()}
+            noise = {number_satellite(name): one for name, one in self.clock_noise.items()}
         except (ValueError, IndexError) as error:
             raise RecordingError(
                 f'line 1: setup: raw_gnss: {error}; satellites are named as G05, signals as ["G", "1C"]',
@@ -237,21 +247,21 @@ class LiveRaw(BaseModel):
 
 def live_raw(raw: RawGnss) -> dict[str, object]:
     """What the first line of a live source says of a series, or of its setup."""
-    setup = raw if raw.catalogue is not None else without_epochs(raw)
+    setup = raw if raw.catalogue is not None else drop_epochs(raw)
     known = setup.catalogue
     assert known is not None
     antennas = {
-        satellite_name(s): {band: x.tolist() for band, x in one.offset.items()}
+        name_satellite(s): {band: x.tolist() for band, x in one.offset.items()}
         for s in known.satellites
         for one in setup.antennas.get(s, ())
         if one.begin <= setup.zero <= one.end
     }
     return {
         "lever_arm": setup.lever_arm.tolist(), "place": list(setup.place), "zero": setup.zero,
-        "satellites": [satellite_name(s) for s in known.satellites],
-        "signals": [(SYSTEMS[system], signal_name(signal)) for system, signal in known.groups],
+        "satellites": [name_satellite(s) for s in known.satellites],
+        "signals": [(SYSTEMS[system], name_signal(signal)) for system, signal in known.groups],
         "period": known.period, "base": known.differenced, "baseline": setup.baseline, "klobuchar": setup.klobuchar,
         "troposphere": setup.troposphere, "precise": setup.precise,
-        "second": {satellite_name(s): signal_name(g) for s, g in known.second}, "antennas": antennas,
-        "clock_noise": {satellite_name(s): one for s, one in setup.clock_noise.items() if s in known.satellites},
+        "second": {name_satellite(s): name_signal(g) for s, g in known.second}, "antennas": antennas,
+        "clock_noise": {name_satellite(s): one for s, one in setup.clock_noise.items() if s in known.satellites},
     }  # fmt: skip

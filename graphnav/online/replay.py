@@ -8,12 +8,12 @@ import numpy as np
 
 from graphnav.core.rotation import Array
 from graphnav.online.raw import RAW
-from graphnav.online.raw_lines import epochs_of, without_epochs
+from graphnav.online.raw_lines import drop_epochs, list_epochs
 from graphnav.online.sanity import Row
 from graphnav.recording import Recording
 
 
-def without_rows(recording: Recording) -> Recording:
+def drop_rows(recording: Recording) -> Recording:
     """The setup of a recording's sensors."""
     none, rows = np.empty(0), np.empty((0, 3))
     gnss, odometer = recording.gnss, recording.odometer
@@ -23,12 +23,12 @@ def without_rows(recording: Recording) -> Recording:
         gnss=gnss and replace(gnss, t=none, llh=rows, sd=rows, v=None, sd_v=None, type=None, satellites=None),
         odometer=odometer and replace(odometer, t=none, speed=none, counted=None, wheels=None),
         truth=None,
-        raw_gnss=recording.raw_gnss and without_epochs(recording.raw_gnss),
+        raw_gnss=recording.raw_gnss and drop_epochs(recording.raw_gnss),
         sensors={name: replace(s, t=none, values=s.values[:0]) for name, s in recording.sensors.items()},
     )
 
 
-def rows_of(recording: Recording) -> tuple[Array, list[Row]]:
+def list_rows(recording: Recording) -> tuple[Array, list[Row]]:
     """Every row of a recording in the order in which sensors without delay would have sent it, with its time."""
     parts: list[tuple[Array, str, Array]] = []
     if recording.odometer is not None:
@@ -51,7 +51,7 @@ def rows_of(recording: Recording) -> tuple[Array, list[Row]]:
     parts.append((recording.imu.t, "imu", np.concatenate([recording.imu.gyro, recording.imu.accel], axis=1)))
     every: list[Row] = []
     if recording.raw_gnss is not None:
-        every += [(RAW, x, values) for x, values in epochs_of(recording.raw_gnss)]
+        every += [(RAW, x, values) for x, values in list_epochs(recording.raw_gnss)]
     every += [
         (name, x, tuple(row))
         for times, name, rows in parts

@@ -13,7 +13,7 @@ import numpy as np
 from graphnav.core.complaints import suggest_nearest
 from graphnav.core.errors import RecordingError
 from graphnav.core.trajectory import Trajectory
-from graphnav.estimation.solution import to_trajectory
+from graphnav.estimation.solution import make_trajectory
 from graphnav.online.steady import Online
 from graphnav.recording import Gnss, Imu, ImuNoise, Odometer, Recording
 from graphnav.recording.plausibility.fixes import FASTEST
@@ -49,9 +49,9 @@ class ImuSample(_Row):
     __slots__ = ()
 
     def __new__(cls, t: float, gyro: Sequence[float], accel: Sequence[float]) -> ImuSample:
-        rate = _vector(cls, t, "gyro", "rad/s", gyro, GYRO_RANGE, "is it in deg/s?")
-        force = _vector(cls, t, "accel", "m/s2", accel, ACCEL_RANGE, "is it in mg?")
-        return super().__new__(cls, ("imu", _time(cls, t), (*rate, *force)))
+        rate = _check_vector(cls, t, "gyro", "rad/s", gyro, GYRO_RANGE, "is it in deg/s?")
+        force = _check_vector(cls, t, "accel", "m/s2", accel, ACCEL_RANGE, "is it in mg?")
+        return super().__new__(cls, ("imu", _check_time(cls, t), (*rate, *force)))
 
 
 class Fix(_Row):
@@ -78,23 +78,25 @@ class Fix(_Row):
         v: Sequence[float] | None = None,
         sd_v: Sequence[float] | None = None,
     ) -> Fix:
-        place = [_number(cls, t, name, x) for name, x in (("lat", lat), ("lon", lon), ("h", h))]
+        place = [_check_number(cls, t, name, x) for name, x in (("lat", lat), ("lon", lon), ("h", h))]
         if not abs(place[0]) <= 90.0 or not -180.0 <= place[1] <= 360.0:
             raise RecordingError(f"Fix at t = {t}: lat {lat}, lon {lon} is no place in degrees", key="row.place")
         if not _HEIGHTS[0] <= place[2] <= _HEIGHTS[1]:
             raise RecordingError(f"Fix at t = {t}: h {h} is no height of a drive in m", key="row.height")
-        sigmas = _vector(cls, t, "sd", "m", sd, np.inf)
+        sigmas = _check_vector(cls, t, "sd", "m", sd, np.inf)
         speeds, of_speeds = _BLANK, _BLANK
         if (v is None) != (sd_v is None):
             raise RecordingError(f"Fix at t = {t}: v and sd_v go together, m/s east, north, up", key="row.velocity")
         if v is not None and sd_v is not None:
-            speeds = _vector(cls, t, "v", "m/s", v, FASTEST, "is it in km/h or mm/s?")
-            of_speeds = _vector(cls, t, "sd_v", "m/s", sd_v, np.inf)
+            speeds = _check_vector(cls, t, "v", "m/s", v, FASTEST, "is it in km/h or mm/s?")
+            of_speeds = _check_vector(cls, t, "sd_v", "m/s", sd_v, np.inf)
         for name, values in (("sd", sigmas), ("sd_v", of_speeds)):
             if min(values) <= 0.0:
                 raise RecordingError(f"Fix at t = {t}: {name} {values}: 1-sigmas must be above zero", key="row.sigma")
         lat_rad, lon_rad = (float(x) for x in np.radians(place[:2]))
-        return super().__new__(cls, ("gnss", _time(cls, t), (lat_rad, lon_rad, place[2], *sigmas, *speeds, *of_speeds)))
+        return super().__new__(
+            cls, ("gnss", _check_time(cls, t), (lat_rad, lon_rad, place[2], *sigmas, *speeds, *of_speeds))
+        )
 
 
 class WheelSpeed(_Row):
@@ -109,12 +111,12 @@ class WheelSpeed(_Row):
     __slots__ = ()
 
     def __new__(cls, t: float, speed: float) -> WheelSpeed:
-        value = _number(cls, t, "speed", speed)
+        value = _check_number(cls, t, "speed", speed)
         if not abs(value) <= FASTEST:
             raise RecordingError(
                 f"WheelSpeed at t = {t}: {speed} m/s, which no vehicle reaches: is it in km/h or mm/s?", key="row.speed"
             )
-        return super().__new__(cls, ("odometer", _time(cls, t), (value, *_BLANK, *_BLANK[:2])))
+        return super().__new__(cls, ("odometer", _check_time(cls, t), (value, *_BLANK, *_BLANK[:2])))
 
 
 class Reading(_Row):
@@ -134,13 +136,13 @@ class Reading(_Row):
                 raise RecordingError(
                     f"Reading of {sensor.name} at t = {t}: {suggest_nearest(name, sensor.names)}", key="row.name"
                 )
-        values = np.array([_number(cls, t, n, columns[n]) if n in columns else np.nan for n in sensor.names])
-        if not sensor.usable(sensor.within_bounds(values)[None])[0]:
+        values = np.array([_check_number(cls, t, n, columns[n]) if n in columns else np.nan for n in sensor.names])
+        if not sensor.mask_usable(sensor.mask_outside_bounds(values)[None])[0]:
             wanted = " or ".join(" and ".join(some) for some in sensor.needs)
             raise RecordingError(
                 f"Reading of {sensor.name} at t = {t}: needs {wanted}, in SI and within its bounds", key="row.bounds"
             )
-        return super().__new__(cls, (sensor.name, _time(cls, t), tuple(values.tolist())))
+        return super().__new__(cls, (sensor.name, _check_time(cls, t), tuple(values.tolist())))
 
 
 def live_setup(
@@ -175,7 +177,7 @@ def live_setup(
     if platform not in ("vehicle", "foot"):
         raise RecordingError(f"live_setup: platform '{platform}': vehicle or foot", key="row.platform")
     imu = Imu(_NONE, _ROWS, _ROWS, noise or ImuNoise(), noise_assumed=noise is None)
-    arms = [None if arm is None else np.array(_vector(None, 0.0, what, "m", arm, np.inf))
+    arms = [None if arm is None else np.array(_check_vector(None, 0.0, what, "m", arm, np.inf))
             for what, arm in (("antenna", antenna), ("axle", axle))]  # fmt: skip
     gnss = None if arms[0] is None else Gnss(_NONE, _ROWS, _ROWS, lever_arm=arms[0])
     odometer = None if arms[1] is None else Odometer(_NONE, _NONE, arms[1])
@@ -198,28 +200,28 @@ def live_trajectory(online: Online) -> Trajectory | None:
     now = online.live()
     if now is None or online.frame is None:
         return None
-    return to_trajectory("live", online.frame, np.array([now.t]), now.state, now.covariance[None])
+    return make_trajectory("live", online.frame, np.array([now.t]), now.state, now.covariance[None])
 
 
-def _where(kind: type | None, t: float) -> str:
+def _describe_place(kind: type | None, t: float) -> str:
     return "live_setup" if kind is None else f"{kind.__name__} at t = {t}"
 
 
-def _number(kind: type | None, t: float, name: str, value: float) -> float:
+def _check_number(kind: type | None, t: float, name: str, value: float) -> float:
     try:
         found = float(value)
     except (TypeError, ValueError):
-        raise RecordingError(f"{_where(kind, t)}: {name} is no number: {value!r}", key="row.number") from None
+        raise RecordingError(f"{_describe_place(kind, t)}: {name} is no number: {value!r}", key="row.number") from None
     if not np.isfinite(found):
-        raise RecordingError(f"{_where(kind, t)}: {name} is {found}", key="row.number")
+        raise RecordingError(f"{_describe_place(kind, t)}: {name} is {found}", key="row.number")
     return found
 
 
-def _time(kind: type, t: float) -> float:
-    return _number(kind, t, "t", t)
+def _check_time(kind: type, t: float) -> float:
+    return _check_number(kind, t, "t", t)
 
 
-def _vector(
+def _check_vector(
     kind: type | None, t: float, name: str, unit: str, values: Sequence[float], most: float, hint: str = ""
 ) -> tuple[float, float, float]:
     """Check three finite numbers of limited size."""
@@ -228,11 +230,13 @@ def _vector(
     except TypeError:
         count = 1
     if count != 3:
-        raise RecordingError(f"{_where(kind, t)}: {name} needs three numbers in {unit}, not {count}", key="row.three")
-    x, y, z = (_number(kind, t, name, value) for value in values)
+        raise RecordingError(
+            f"{_describe_place(kind, t)}: {name} needs three numbers in {unit}, not {count}", key="row.three"
+        )
+    x, y, z = (_check_number(kind, t, name, value) for value in values)
     if not max(abs(x), abs(y), abs(z)) <= most:
         raise RecordingError(
-            f"{_where(kind, t)}: {name} of {max(x, y, z, key=abs):g} {unit} is beyond any sensor: {hint}",
+            f"{_describe_place(kind, t)}: {name} of {max(x, y, z, key=abs):g} {unit} is beyond any sensor: {hint}",
             key="row.bounds",
         )
     return x, y, z

@@ -69,7 +69,7 @@ def find_fix_fault(values: tuple[float, ...]) -> str | None:
     return None
 
 
-def with_sane_velocity(values: tuple[float, ...]) -> tuple[tuple[float, ...], bool]:
+def drop_insane_velocity(values: tuple[float, ...]) -> tuple[tuple[float, ...], bool]:
     """A fix without an impossible velocity, and whether it had one."""
     v, sd = values[6:9], values[9:12]
     if not math.isfinite(sum(v) + sum(sd)):

@@ -22,8 +22,8 @@ from graphnav.online.sanity import (
     Row,
     can_imu_read,
     can_odometer_read,
+    drop_insane_velocity,
     find_fix_fault,
-    with_sane_velocity,
 )
 from graphnav.recording import Odometer, Recording
 from graphnav.recording.formats.repair import LATEST
@@ -153,7 +153,7 @@ class Sensors:
         if not self._is_in_time(sensor, t, values, (sensor, t, *values[: _TOLD[sensor]]), released):
             return False
         if sensor == "gnss":
-            values, without = with_sane_velocity(values)
+            values, without = drop_insane_velocity(values)
             if without:
                 self.counts["gnss: a velocity that no vehicle has"] += 1
             others = self._reach.take(t, values)
@@ -198,9 +198,9 @@ class Sensors:
         sensor = self.setup.sensors[name].sensor
         row = np.array(values, dtype=float)[None]
         why = None
-        if row.shape[1] != len(sensor.names) or not abs(t) <= LATEST or not sensor.usable(row)[0]:
+        if row.shape[1] != len(sensor.names) or not abs(t) <= LATEST or not sensor.mask_usable(row)[0]:
             why = "not a number"
-        elif not sensor.usable(row := sensor.within_bounds(row))[0]:
+        elif not sensor.mask_usable(row := sensor.mask_outside_bounds(row))[0]:
             why = "beyond any sensor"
         elif not self._is_in_time(name, t, values, _identify(name, t, values), released):
             return False
@@ -214,11 +214,11 @@ class Sensors:
             why: str | None = "fixes are used in place of them"
         elif not abs(t) <= LATEST:
             why = "not a number"
-        elif (why := self.raw.odds(values)) is not None:
+        elif (why := self.raw.find_fault(values)) is not None:
             pass
         elif not self._is_in_time(RAW, t, values, (RAW, t, len(values)), released):
             return False
-        elif not self.raw.wanted(t):
+        elif not self.raw.is_wanted(t):
             why = "closer than they are used"
             self.raw.add(t, values, used=False)
         else:
@@ -293,10 +293,10 @@ class Sensors:
 
     def _add_imu(self, t: float, values: tuple[float, ...]) -> bool:
         if t <= self.oldest or (t < self.imu.newest - SAME and not self._clock.fits(t, self.imu.t)):
-            self.counts[self._passed(t)] += 1
+            self.counts[self._name_passed(t)] += 1
             if self._clock.hold(("imu", t, values)):
                 self.set_back = self._clock.set_back()  # counted when they are processed
-                self.counts -= Counter(self._passed(when) for sensor, when, _ in self.set_back if sensor == "imu")
+                self.counts -= Counter(self._name_passed(when) for sensor, when, _ in self.set_back if sensor == "imu")
                 for name, width in _TOLD.items():
                     rows = getattr(self, name).rows[:, : width + 1].tolist()
                     self._before = {one for one in self._before if one[0] != name} | {(name, *row) for row in rows}
@@ -333,7 +333,7 @@ class Sensors:
         self.counts["imu"] += 1
         return True
 
-    def _passed(self, t: float) -> str:
+    def _name_passed(self, t: float) -> str:
         """The count that an IMU row at a time that has passed belongs to."""
         repeated = t > self.oldest and bool(np.any(np.abs(self.imu.t - t) <= SAME))
         return "imu: repeated" if repeated else "imu: too late"
@@ -356,7 +356,7 @@ class Sensors:
             for row in later[name]:
                 buffer.add(*row)
 
-    def imu_until(self, t: float) -> float:
+    def find_imu_until(self, t: float) -> float:
         """Time of the first IMU row at or after a time, s: only that row shows that the IMU was silent."""
         rows = self.imu.t
         return float(rows[min(int(np.searchsorted(rows, t - SAME)), len(rows) - 1)]) if len(rows) else t
@@ -371,7 +371,7 @@ class Sensors:
             sensors[name] = replace(self.setup.sensors[name], t=rows[:, 0], values=rows[:, 1:])
         raw = None if self.raw is None else self.raw.between(begin, end)
         return replace(
-            self.setup, imu=imu, gnss=self.gnss.between_as_gnss(begin, end, every), odometer=self._odometer(begin, end),
+            self.setup, imu=imu, gnss=self.gnss.select_as_gnss(begin, end, every), odometer=self._odometer(begin, end),
             sensors=sensors, raw_gnss=raw,
         )  # fmt: skip
 

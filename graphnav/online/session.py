@@ -8,10 +8,10 @@ from pathlib import Path
 
 from graphnav.config import Settings
 from graphnav.core.errors import RecordingError
-from graphnav.core.notes import key_of
+from graphnav.core.notes import get_key
 from graphnav.core.trajectory import Trajectory
-from graphnav.online.lines import END, row_of, setup_of
-from graphnav.online.replay import rows_of, without_rows
+from graphnav.online.lines import END, parse_row, parse_setup
+from graphnav.online.replay import drop_rows, list_rows
 from graphnav.online.sensors import Row
 from graphnav.online.steady import Online
 from graphnav.online.store import Store
@@ -46,14 +46,14 @@ class Session:
         self.done = False
         self.complaints: list[str] = []
         self._kept = float("-inf")
-        self.rows: list[Row] = rows_of(recording)[1] if recording is not None else []
+        self.rows: list[Row] = list_rows(recording)[1] if recording is not None else []
         resumed = self.store.resumed if self.store is not None else None
         if resumed is not None:
             self.online, self.done = resumed.online, resumed.done
             self.taken, self.rows_settled, self.bad = (resumed.counts[k] for k in ("taken", "settled", "bad"))
             self._kept = self.online.sensors.imu.newest
         elif recording is not None:
-            self._begin(Online(without_rows(recording), settings))
+            self._begin(Online(drop_rows(recording), settings))
         if self.store is not None and resumed is not None and recording is None:
             self.store.recall()
             self._take_pending(self.store)
@@ -110,7 +110,7 @@ class Session:
     def stop(self) -> None:
         """End before the source does: write a checkpoint."""
         if self.store is not None and self.online is not None and not self.done:
-            self.store.checkpoint(self.online, self._counts())
+            self.store.write_checkpoint(self.online, self._list_counts())
 
     def close(self) -> None:
         """Close the files."""
@@ -138,7 +138,7 @@ class Session:
                 {"kind": f.kind, "from_s": f.t_start, "to_s": f.t_end, "count": f.count} for f in online.excluded
             ],
             "notes": online.notes,
-            "messages": [{"key": key_of(note), "sentence": note} for note in online.notes],
+            "messages": [{"key": get_key(note), "sentence": note} for note in online.notes],
             "lag_s": self.settings.solver.lag,
         }
 
@@ -148,25 +148,25 @@ class Session:
         if tracks:
             store.append(tracks)
         store.begin_piece(online.clocks)
-        store.checkpoint(online, self._counts())
+        store.write_checkpoint(online, self._list_counts())
         self._kept = online.sensors.imu.newest
 
     def _take_pending(self, store: Store, asked: Callable[[], bool] = bool) -> None:
         while store.pending and not asked():
             self._take_line(store.pending.popleft().decode("utf-8", "replace"))
 
-    def _counts(self) -> dict[str, int]:
+    def _list_counts(self) -> dict[str, int]:
         return {"taken": self.taken, "settled": self.rows_settled, "bad": self.bad}
 
     def _begin(self, online: Online) -> None:
         self.online = online
         if self.store is not None:
-            self.store.checkpoint(online, self._counts())
+            self.store.write_checkpoint(online, self._list_counts())
 
     def _take_line(self, line: str) -> None:
         if self.online is None:
             if line.strip() and not line.startswith("#"):
-                self._begin(Online(setup_of(line), self.settings))
+                self._begin(Online(parse_setup(line), self.settings))
             return
         if line.strip() == END:
             self.finish()
@@ -174,7 +174,7 @@ class Session:
         if self.done or line.startswith("graphnav-online/"):
             return  # a sender that restarts
         try:
-            row = row_of(line)
+            row = parse_row(line)
         except ValueError as error:
             self.bad += 1
             if len(self.complaints) < _REPORTED_LINES:
@@ -196,5 +196,5 @@ class Session:
         if tracks:
             self.store.append(tracks)
         if last or newest - self._kept > CHECKPOINTS:  # rows settled since are cut off and computed again on resume
-            self.store.checkpoint(self.online, self._counts(), self.done)
+            self.store.write_checkpoint(self.online, self._list_counts(), self.done)
             self._kept = newest

@@ -20,7 +20,7 @@ from graphnav.core.trajectory import Trajectory
 from graphnav.estimation.alignment import Alignment
 from graphnav.estimation.noise.explanations import FIXES
 from graphnav.estimation.noise.model import STATED, NoiseModel
-from graphnav.estimation.pipeline import origin
+from graphnav.estimation.pipeline import choose_origin
 from graphnav.estimation.solution import ExcludedSpan
 from graphnav.estimation.solvers.watch import LONGEST
 from graphnav.online.ahead import Live, export
@@ -235,7 +235,7 @@ class Smoother:
             return
         recording, stationary = rows
         if self.frame is None:
-            self.frame = LocalFrame(origin(recording))
+            self.frame = LocalFrame(choose_origin(recording))
         try:
             found = find_start(recording, stationary, self.settings, self.frame)
         except EstimationError as error:

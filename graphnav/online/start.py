@@ -9,11 +9,11 @@ from graphnav.constraints.base import SAME_TIME
 from graphnav.core.earth import LocalFrame
 from graphnav.core.rotation import Array
 from graphnav.detectors import detect
-from graphnav.estimation.alignment import Alignment, align, is_ready, with_known_heading
+from graphnav.estimation.alignment import Alignment, align, is_ready, use_known_heading
 from graphnav.estimation.building import start_sigma
 from graphnav.estimation.noise.model import NoiseModel
 from graphnav.estimation.solvers.window import make_first_message
-from graphnav.online.raw import codes_alone
+from graphnav.online.raw import use_codes_alone
 from graphnav.online.sensors import Sensors
 from graphnav.online.tracker import Tracker
 from graphnav.online.walker import Walker
@@ -44,14 +44,14 @@ def find_start(recording: Recording, stationary: Array, settings: Settings, fram
     EstimationError
         If the rows do not tell it.
     """
-    return align(recording, codes_alone(settings), frame, stationary)
+    return align(recording, use_codes_alone(settings), frame, stationary)
 
 
 def make_tracker(
     found: Alignment, start: float, noise: NoiseModel, settings: Settings, frame: LocalFrame, setup: Recording
 ) -> tuple[Tracker, tuple[str, ...]]:
     """A tracker that starts at the first row (s) that an alignment has used, and notes."""
-    stated = with_known_heading(found, settings)
+    stated = use_known_heading(found, settings)
     # whether it determines the heading is only seen later; iSAM2's tree moves its states by itself
     turns = setup.gnss is None and settings.solver.engine == "window"
     message = make_first_message(stated.state, start_sigma(stated), turns)

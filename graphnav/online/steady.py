@@ -5,7 +5,7 @@ from __future__ import annotations
 import traceback
 from pathlib import Path
 
-from graphnav.config import Settings, settings_from
+from graphnav.config import Settings, parse_settings
 from graphnav.core.notes import Note, format_count
 from graphnav.online.checks import check_counts
 from graphnav.online.sensors import Row
@@ -29,7 +29,7 @@ class Online(Smoother):
     def __init__(self, setup: Recording, settings: Settings | None = None, engine: str | None = None) -> None:
         settings = settings or Settings()
         if engine is not None:
-            settings = settings_from(
+            settings = parse_settings(
                 settings.model_dump() | {"solver": settings.solver.model_dump() | {"engine": engine}}
             )
         super().__init__(setup, settings)

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from graphnav.config import Settings
-from graphnav.constraints import kinds_for
+from graphnav.constraints import list_kinds
 from graphnav.constraints.base import SAME_TIME
 from graphnav.core.rotation import Array
 from graphnav.detectors import detect
-from graphnav.estimation.problem import keyframe_times, to_samples
-from graphnav.imu.clipping import first_not_cut, highest
+from graphnav.estimation.problem import choose_keyframes, limit_to_samples
+from graphnav.imu.clipping import find_first_whole_peak, find_highest
 from graphnav.imu.samples import bridge_gaps
 from graphnav.online.looks import SURE, Stops, clip_spans
 from graphnav.online.sensors import Sensors
@@ -25,7 +25,7 @@ class StepCutter:
     """Progress of cutting a walk into steps, and the highest readings of its IMU."""
 
     def __init__(self) -> None:
-        self.highest: Array | None = None  # as returned by `graphnav.imu.clipping.highest`
+        self.highest: Array | None = None  # as returned by `graphnav.imu.clipping.find_highest`
         self._seen = -np.inf  # s, up to where that is known
         self.pieces: float | None = None  # s, beginning of a standing that continues, of which keyframes were made
         self.over: float | None = None  # s, beginning of one that is over: its keyframes are to be made again
@@ -42,7 +42,7 @@ class StepCutter:
             return none
         rows = recording.imu.t  # keyframes are placed where the stances will begin and end
         limit = float(rows[max(int(np.searchsorted(rows, limit + SAME_TIME)) - 1, 0)])
-        spans = clip_spans(to_samples(detect(recording, settings, T - _EDGE).stationary, recording), T, limit)
+        spans = clip_spans(limit_to_samples(detect(recording, settings, T - _EDGE).stationary, recording), T, limit)
         ongoing = bool(len(spans)) and spans[-1, 1] >= limit - SAME_TIME
         if not last and len(spans):
             if ongoing and limit - spans[-1, 0] < _STANDING:
@@ -62,24 +62,24 @@ class StepCutter:
         self.over = pieces if pieces != self.pieces else None
         part = sensors.recording(min(begin, T), limit)
         around = clip_spans(standing.spans, part.start, limit)
-        epochs = [cls.epochs(part, settings, around) for cls in kinds_for(part)]
-        return keyframe_times(T, limit, np.concatenate([*epochs, none]), settings.keyframes.rate)
+        epochs = [cls.epochs(part, settings, around) for cls in list_kinds(part)]
+        return choose_keyframes(T, limit, np.concatenate([*epochs, none]), settings.keyframes.rate)
 
     def read_again(self, t: float) -> None:
         """A row arrived late, at a time (s): its readings count too."""
         self._seen = min(self._seen, float(np.nextafter(t, -np.inf)))
 
-    def changed(self, sensors: Sensors, head: float) -> float:
+    def find_change(self, sensors: Sensors, head: float) -> float:
         """From when on intervals after `head` would now be integrated differently, s.
 
         A peak is clipped at the end of the IMU's range, which is known only from later readings.
         """
         now, fresh = self.highest, sensors.recording(np.nextafter(self._seen, np.inf)).imu
         if len(fresh.t):
-            read, self._seen = highest(fresh), float(fresh.t[-1])
+            read, self._seen = find_highest(fresh), float(fresh.t[-1])
             now = read if now is None else np.maximum(now, read)
         before, self.highest = self.highest, now
         if before is None or now is None or not np.any(now > before):
             return np.inf
         imu = sensors.recording(head).imu
-        return first_not_cut(bridge_gaps(imu), imu.R_bs, before, now) if len(imu.t) > 2 else np.inf
+        return find_first_whole_peak(bridge_gaps(imu), imu.R_bs, before, now) if len(imu.t) > 2 else np.inf

@@ -91,14 +91,14 @@ class Store:
             )
         folder.mkdir(parents=True, exist_ok=True)
         for other in folder.glob("trajectory-*.csv"):  # later than the checkpoint, or of an earlier run
-            if self.resumed is None or _number_of(other) > self.piece:
+            if self.resumed is None or _read_number(other) > self.piece:
                 other.unlink()
         for other in folder.glob("journal-*"):
-            if self.resumed is None or _number_of(other) != self._number:
+            if self.resumed is None or _read_number(other) != self._number:
                 other.unlink()
         path = self.trajectory
         if self.resumed is None:
-            self._file = self._fresh()
+            self._file = self._make_file()
         else:
             self._file = path.open("r+b" if path.exists() else "w+b", buffering=0)
             if self._file.seek(0, os.SEEK_END) < self._length:
@@ -117,9 +117,9 @@ class Store:
         """Continue in another file."""
         self._file.close()
         self.piece = number
-        self._file = self._fresh()
+        self._file = self._make_file()
 
-    def _fresh(self) -> FileIO:
+    def _make_file(self) -> FileIO:
         """The trajectory file with nothing but its header."""
         head = (csv.HEADER + "\n").encode()
         self._length = 0
@@ -130,7 +130,7 @@ class Store:
 
     def recall(self) -> None:
         """Make the complete lines that arrived after the resumed checkpoint pending again."""
-        path = self._path(self._number)
+        path = self._name_journal(self._number)
         if not path.exists():
             return
         whole, _, torn = path.read_bytes().rpartition(b"\n")
@@ -142,14 +142,14 @@ class Store:
     def note(self, lines: list[bytes]) -> None:
         """Write lines of a live source to the journal before they are processed."""
         if self._journal is None:
-            self._journal = self._path(self._number).open("ab", buffering=0)
+            self._journal = self._name_journal(self._number).open("ab", buffering=0)
         journal = self._journal
         self._guard(lambda: journal.write(b"".join(line + b"\n" for line in lines)))
         self.pending.extend(lines)
 
     def append(self, tracks: list[Trajectory]) -> None:
         """Append settled rows."""
-        rows = "".join(csv.rows(track) for track in tracks).encode()
+        rows = "".join(csv.format_trajectory(track) for track in tracks).encode()
 
         def write() -> None:
             done = 0
@@ -160,7 +160,7 @@ class Store:
         self._guard(write)
         self._length += len(rows)
 
-    def checkpoint(self, online: Online, counts: dict[str, int], done: bool = False) -> None:
+    def write_checkpoint(self, online: Online, counts: dict[str, int], done: bool = False) -> None:
         """Write a checkpoint of the smoother; lines of the journal before it are no longer needed."""
         number = self._number + 1
         now = Checkpoint(online, self.source, counts, self._length, number, done, self.piece)
@@ -168,7 +168,7 @@ class Store:
 
         def write() -> None:
             if self.pending:
-                self._path(number).write_bytes(b"".join(line + b"\n" for line in self.pending))
+                self._name_journal(number).write_bytes(b"".join(line + b"\n" for line in self.pending))
             with fresh.open("wb") as file:
                 file.write(_MAGIC + bytes(_DIGEST().digest_size))
                 body = _Digested(file)
@@ -184,7 +184,7 @@ class Store:
         if self._journal is not None:
             self._journal.close()
             self._journal = None
-        self._path(self._number).unlink(missing_ok=True)
+        self._name_journal(self._number).unlink(missing_ok=True)
         self._number = number
 
     def summarise(self, text: str) -> None:
@@ -197,7 +197,7 @@ class Store:
         if self._journal is not None:
             self._journal.close()
 
-    def _path(self, number: int) -> Path:
+    def _name_journal(self, number: int) -> Path:
         return self.folder / f"journal-{number:06d}"
 
     def _guard(self, write: Any) -> None:
@@ -259,7 +259,7 @@ class _Unpickler(pickle.Unpickler):
         raise pickle.UnpicklingError(f"{module}.{name}")
 
 
-def _number_of(path: Path) -> int:
+def _read_number(path: Path) -> int:
     number = path.stem.partition("-")[2]
     return int(number) if number.isdigit() else 0
 

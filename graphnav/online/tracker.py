@@ -19,14 +19,14 @@ import numpy as np
 
 from graphnav.config import Settings
 from graphnav.constraints.base import SAME_TIME, TypicalSigmas
-from graphnav.constraints.gnss import node_spacing, period
+from graphnav.constraints.gnss import find_fix_period, find_node_spacing
 from graphnav.constraints.vehicle import REACH
 from graphnav.core.earth import LocalFrame
-from graphnav.core.findings import period_of
+from graphnav.core.findings import compute_period
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, States
 from graphnav.detectors.base import merge_spans
-from graphnav.estimation.noise.apply import with_noise
+from graphnav.estimation.noise.apply import apply_noise
 from graphnav.estimation.noise.model import STATED, NoiseModel
 from graphnav.estimation.problem import Problem, build_problem
 from graphnav.estimation.solvers.elimination import Predicted
@@ -35,7 +35,7 @@ from graphnav.estimation.solvers.window import Message, SettledStates
 from graphnav.imu.dynamics import ImuFactors
 from graphnav.imu.preintegration import preintegrate
 from graphnav.imu.samples import GAP, bridge_gaps
-from graphnav.online.ahead import Live, live, since
+from graphnav.online.ahead import Live, live, predict_since
 from graphnav.online.chain import BuiltKeyframes, Chain, find_turn
 from graphnav.online.looks import CONTEXT, SURE, Readings, clip_spans
 from graphnav.online.sensors import Sensors
@@ -318,7 +318,7 @@ class Tracker(Chain):
 
     def since(self, sensors: Sensors) -> tuple[Array, States, Array]:
         """Times (M,), states and covariances (M, 15, 15) at every IMU row since the newest keyframe."""
-        return since(self.window.newest, self.newest, self.frame, sensors, self.noise)
+        return predict_since(self.window.newest, self.newest, self.frame, sensors, self.noise)
 
     # ------------------------------------------------------------------------------------------------- keyframes
     def _list_before(self, keep: int, t: float) -> list[float]:
@@ -342,14 +342,14 @@ class Tracker(Chain):
             here = stops[(stops[:, 0] < begin) & (stops[:, 1] > begin)]
             begin = min([begin, *here[:, 0].tolist()])
         recording = self._cut_around(
-            sensors, begin, max(float(times[-1]) + ROWS_AFTER, sensors.imu_until(float(times[-1])))
+            sensors, begin, max(float(times[-1]) + ROWS_AFTER, sensors.find_imu_until(float(times[-1])))
         )
         start, speed = self.window.newest.state, None
         if recording.odometer is not None:
             speed = MeanSpeed.of(recording.odometer, self._readings.wrong, self._readings.figures)
         usual = self._scale_errors(sensors, recording)
         found = ((t, self._motions.get(t)) for t in times[1:].tolist())
-        known = {t: one for t, one in found if one is not None and not one.intervals.out_of_range(start.bg)[0]}
+        known = {t: one for t, one in found if one is not None and not one.intervals.is_out_of_range(start.bg)[0]}
         problem = build_problem(
             recording, self.settings, self.frame, start, np.ones(DIM), stops, times, speed, usual, known,
             self._steps.highest, complete, self._estimates_imu,
@@ -364,10 +364,13 @@ class Tracker(Chain):
 
         A few keyframes do not show the period of the fixes, nor their typical sigmas.
         """
-        spacing, fixes = node_spacing(self.settings.gnss.slow_times, period(sensors.gnss.used)), sensors.gnss
+        spacing, fixes = (
+            find_node_spacing(self.settings.gnss.slow_times, find_fix_period(sensors.gnss.used)),
+            sensors.gnss,
+        )
         usual = TypicalSigmas(fixes.unit, lambda k: fixes.typical_sigmas(problem.t[k]), spacing)
-        rows = tuple(c.in_units_of(usual) for c in problem.constraints)
-        return with_noise(replace(problem, constraints=rows), noise or self.noise)
+        rows = tuple(c.convert_units(usual) for c in problem.constraints)
+        return apply_noise(replace(problem, constraints=rows), noise or self.noise)
 
     def _cut_around(self, sensors: Sensors, begin: float, end: float) -> Recording:
         """The rows that keyframes between two times use.
@@ -376,7 +379,7 @@ class Tracker(Chain):
         """
         near = sensors.recording(begin - _ROWS_BEFORE, end)
         t = near.imu.t
-        whole = len(t) > 2 and float((t[1:] - t[:-1]).max()) < GAP * period_of(t)
+        whole = len(t) > 2 and float((t[1:] - t[:-1]).max()) < GAP * compute_period(t)
         return near if whole else sensors.recording(begin - CONTEXT, end)
 
     def _renew(self, sensors: Sensors, first: int, end: int) -> list[Place] | None:

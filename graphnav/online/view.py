@@ -6,7 +6,7 @@ import numpy as np
 
 from graphnav.core.notes import format_count
 from graphnav.estimation.noise.explanations import FIXES
-from graphnav.estimation.solution import to_trajectory
+from graphnav.estimation.solution import make_trajectory
 from graphnav.online.session import Session
 
 
@@ -31,7 +31,7 @@ def view(session: Session, silent: float = 0.0) -> list[tuple[str, str]]:
     else:
         now = tracker.live(sensors)
         P = now.covariance[None]
-        track = to_trajectory("live", online.frame, np.array([now.t]), now.state, P)
+        track = make_trajectory("live", online.frame, np.array([now.t]), now.state, P)
         assert track.v is not None
         assert track.rph is not None
         assert track.sd_p is not None

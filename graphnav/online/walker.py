@@ -17,7 +17,7 @@ from graphnav.core.state import States
 from graphnav.estimation.noise.model import NoiseModel
 from graphnav.estimation.solvers.stages import Place
 from graphnav.estimation.solvers.window import Message
-from graphnav.online.ahead import Live, live, since
+from graphnav.online.ahead import Live, live, predict_since
 from graphnav.online.chain import BuiltKeyframes
 from graphnav.online.looks import CONTEXT, SURE
 from graphnav.online.sanity import LASTING
@@ -89,7 +89,7 @@ class Walker(Tracker):
         """
         self.finish_entering(sensors)
         shown, started = (self.window.newest, self.newest), bool(len(self.window)) or self.opened
-        times = self._steps_until(sensors, limit, last)
+        times = self._list_steps_until(sensors, limit, last)
         late = [t for t in fixes if t <= self.newest + SAME_TIME]
         if not len(times) and not (late and len(self.window)):
             return -np.inf
@@ -100,7 +100,7 @@ class Walker(Tracker):
             self.finish_entering(sensors)
         return newest
 
-    def _steps_until(self, sensors: Sensors, limit: float, last: bool) -> Array:
+    def _list_steps_until(self, sensors: Sensors, limit: float, last: bool) -> Array:
         """Keyframes of a walk that can be made by now, and their effect on those before."""
         before, newest = self._save_cut, self.newest
         found = times = self._steps.until(sensors, self.settings, self._standing, self.newest, limit, last)
@@ -111,7 +111,7 @@ class Walker(Tracker):
         looks = [one for one in self._looks if one.limit > limit - LASTING - SURE]
         self._looks = (*looks, _Look(limit, newest, before, after, found))
         self._standing.forget(self.head - CONTEXT)
-        dirty = self._steps.changed(sensors, self.head)
+        dirty = self._steps.find_change(sensors, self.head)
         self.note_late_row("imu", dirty)
         self._dirty = min(self._dirty, dirty)
         return times[1:] if len(self.window) or self.opened else times
@@ -207,7 +207,7 @@ class Walker(Tracker):
 
     def since(self, sensors: Sensors) -> tuple[Array, States, Array]:
         """Times (M,), states and covariances (M, 15, 15) at every IMU row since that keyframe."""
-        return since(*self._shown, self.frame, sensors, self.noise)
+        return predict_since(*self._shown, self.frame, sensors, self.noise)
 
     @property
     def _shown(self) -> tuple[Message, float]:

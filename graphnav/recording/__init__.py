@@ -223,9 +223,9 @@ class Recording:
         RecordingError
             If the recording has no such source.
         """
-        if source not in sources():
+        if source not in list_sources():
             raise RecordingError(
-                f"cannot withhold '{source}': only {', '.join(sources())} can be withheld", key="withhold.unknown"
+                f"cannot withhold '{source}': only {', '.join(list_sources())} can be withheld", key="withhold.unknown"
             )
         sensor = self.aiding.get(source)
         if sensor is None:
@@ -289,7 +289,7 @@ class Recording:
         return replace(self, **parts)
 
 
-def sources() -> tuple[str, ...]:
+def list_sources() -> tuple[str, ...]:
     """Names of the sources that can be withheld.
 
     Returns

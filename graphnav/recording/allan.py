@@ -57,14 +57,14 @@ class Allan:
         """The lines for [imu.noise]: root mean squares over the axes."""
         out = []
         for name, noise, unit in (("gyro", self.gyro_noise, "rad/s"), ("accel", self.accel_noise, "m/s2")):
-            out.append(_line(f"{name}_noise_density", _compute_rms(noise.white), f"{unit}/sqrt(Hz)"))
+            out.append(_format_line(f"{name}_noise_density", _compute_rms(noise.white), f"{unit}/sqrt(Hz)"))
             walk, why = _compute_rms(noise.walk), "rate random walk"
             if walk == 0.0:
                 walk, why = (
                     _compute_rms(noise.instability / np.sqrt(noise.floor)),
                     "bias instability over the root of its time",
                 )
-            out.append(_line(f"{name}_bias_walk", walk, f"{unit}/sqrt(s): {why}"))
+            out.append(_format_line(f"{name}_bias_walk", walk, f"{unit}/sqrt(s): {why}"))
         return out
 
 
@@ -155,5 +155,5 @@ def _compute_rms(x: Array) -> float:
     return float(np.sqrt(np.mean(np.square(x))))
 
 
-def _line(key: str, value: float, unit: str) -> str:
+def _format_line(key: str, value: float, unit: str) -> str:
     return f"{key} = {value:.3g}".ljust(36) + f"# {unit}"

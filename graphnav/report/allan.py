@@ -26,17 +26,17 @@ def write(result: Allan, folder: Path) -> list[Path]:
     paths[2].write_text(f"# {title}\n{lines}\n", encoding="utf-8")
     lead = [page.paragraph(title), page.code(lines, "noise")]
     pictures = [
-        page.picture(_picture(result.tau, result.gyro, result.gyro_noise, "rad/s"), "Gyro"),
-        page.picture(_picture(result.tau, result.accel, result.accel_noise, "m/s2"), "Accelerometer"),
+        page.place_picture(_draw_deviations(result.tau, result.gyro, result.gyro_noise, "rad/s"), "Gyro"),
+        page.place_picture(_draw_deviations(result.tau, result.accel, result.accel_noise, "m/s2"), "Accelerometer"),
     ]
-    html = page.page("Allan deviations", lead, [("Deviations", [page.gallery(pictures)])])
+    html = page.make_page("Allan deviations", lead, [("Deviations", [page.gallery(pictures)])])
     paths[0].write_text(html, encoding="utf-8")
     return paths
 
 
-def _picture(tau: Array, deviations: Array, noise: AllanFigures, unit: str) -> Figure:
+def _draw_deviations(tau: Array, deviations: Array, noise: AllanFigures, unit: str) -> Figure:
     """Deviations (M, 3) over averaging times (M,) s, and the model fitted to them."""
-    fit = _model(tau, noise)
+    fit = _compute_model(tau, noise)
     low, high = np.log10([min(deviations.min(), fit.min()), max(deviations.max(), fit.max())])
     figure = Figure(
         [f"Allan deviation, {unit}"], tuple(np.log10(tau[[0, -1]])), [(low - 0.1, high + 0.1)], units=[unit], log=True,
@@ -49,7 +49,7 @@ def _picture(tau: Array, deviations: Array, noise: AllanFigures, unit: str) -> F
     return figure
 
 
-def _model(tau: Array, noise: AllanFigures) -> Array:
+def _compute_model(tau: Array, noise: AllanFigures) -> Array:
     """Deviation of the fitted model, of the root mean square over the axes."""
     N2, B2, K2 = (np.mean(np.square(x)) for x in (noise.white, noise.instability, noise.walk))
     return np.asarray(np.sqrt(N2 / tau + B2 * 2.0 / np.pi * np.log(2.0) + K2 * tau / 3.0))

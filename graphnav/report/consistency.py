@@ -46,7 +46,7 @@ class Consistency:
         return Note("consistency.as_predicted", "innovations as large as predicted: sigma is consistent")
 
 
-def consistency(record: ConstraintRecord) -> Consistency:
+def summarise_record(record: ConstraintRecord) -> Consistency:
     """Summarise a record.
 
     A residual of weight w is divided by the sigma it was used with, larger by 1 / sqrt(w); the normalised square of an
@@ -60,9 +60,9 @@ def consistency(record: ConstraintRecord) -> Consistency:
         count=len(record.t),
         rejected=int(np.sum(~used)),
         reduced=int(np.sum(used & (record.weight < 0.5))),
-        mean_nis=mean_or_nan(weight * record.nis[used]),
+        mean_nis=compute_mean(weight * record.nis[used]),
         dof=record.residual.shape[1],
-        outside=mean_or_nan((white > 3.0).astype(float)),
+        outside=compute_mean((white > 3.0).astype(float)),
         kind=record.kind,
     )
 
@@ -70,12 +70,12 @@ def consistency(record: ConstraintRecord) -> Consistency:
 CONSISTENCY_HEAD = ("used", "rejected", "weight < 0.5", "mean NIS", "components", "outside 3 sigma", "what it says")
 
 
-def consistency_row(c: Consistency) -> list[Any]:
+def tabulate_record(c: Consistency) -> list[Any]:
     """The cells under `CONSISTENCY_HEAD`."""
     outside = f"{100 * c.outside:.2f} %" if np.isfinite(c.outside) else "-"
     return [c.count - c.rejected, c.rejected, c.reduced, float(c.mean_nis), c.dof, Quantity(outside), c.verdict]
 
 
-def mean_or_nan(x: Array) -> float:
+def compute_mean(x: Array) -> float:
     x = x[np.isfinite(x)]
     return float(np.mean(x)) if x.size else float("nan")

@@ -11,9 +11,9 @@ import numpy as np
 from graphnav.core.notes import format_count
 from graphnav.core.rotation import Array
 from graphnav.detectors import Detections
-from graphnav.estimation.stops import Stop, detections_text, stops_of
+from graphnav.estimation.stops import Stop, format_detections, list_stops
 from graphnav.recording import Recording
-from graphnav.recording.exporters.digits import rows_text
+from graphnav.recording.exporters.digits import format_rows
 from graphnav.report import page
 from graphnav.report import pictures as report_pictures
 from graphnav.report.wording import Quantity
@@ -25,16 +25,16 @@ def write(recording: Recording, found: Detections, folder: Path) -> list[Path]:
     """Write all files; times are on the recording's clock, as in trajectory.csv."""
     folder.mkdir(parents=True, exist_ok=True)
     intervals, statistics = (folder / n for n in ("detections.csv", "statistics.csv.gz"))
-    intervals.write_text(detections_text(found.all), encoding="utf-8")
+    intervals.write_text(format_detections(found.all), encoding="utf-8")
     # no name and no time in the header, so that the same recording gives the same bytes
     with statistics.open("wb") as raw, gzip.GzipFile("", "wb", 5, raw, mtime=0) as file:
-        file.write(statistics_text(found).encode())
+        file.write(format_statistics(found).encode())
     html = folder / "detections.html"
-    html.write_text(_page(recording, found), encoding="utf-8")
+    html.write_text(_make_page(recording, found), encoding="utf-8")
     return [html, intervals, statistics]
 
 
-def _page(recording: Recording, found: Detections) -> str:
+def _make_page(recording: Recording, found: Detections) -> str:
     spans = found.stationary - recording.start
     rows = [
         [
@@ -43,15 +43,15 @@ def _page(recording: Recording, found: Detections) -> str:
             Quantity(f"{b - a:.2f} s"),
             format_fired(stop),
         ]
-        for (a, b), stop in zip(spans, stops_of(found.all), strict=True)
+        for (a, b), stop in zip(spans, list_stops(found.all), strict=True)
     ]
-    lead = [page.paragraph(line) for line in _words(recording, found)]
+    lead = [page.paragraph(line) for line in _describe(recording, found)]
     sections = [
-        ("Statistics", [page.gallery(report_pictures.detection_pictures(recording, found.all))]),
-        ("Stationary intervals", [page.table(["from", "to", "for", "share by detector"], rows)] if rows else []),
+        ("Statistics", [page.gallery(report_pictures.draw_detections(recording, found.all))]),
+        ("Stationary intervals", [page.format_table(["from", "to", "for", "share by detector"], rows)] if rows else []),
         ("Notes", [page.bullets(found.notes)] if found.notes else []),
     ]
-    return page.page(f"{recording.name}: detectors", lead, sections)
+    return page.make_page(f"{recording.name}: detectors", lead, sections)
 
 
 def format_fired(stop: Stop) -> str:
@@ -59,7 +59,7 @@ def format_fired(stop: Stop) -> str:
     return ", ".join(f"{name} {100.0 * share:.0f} %" for name, share in stop.fired.items())
 
 
-def statistics_text(found: Detections) -> str:
+def format_statistics(found: Detections) -> str:
     """Every detector's statistic, threshold and mask at the windows of the first; blank where there is none."""
     detections = [d for d in found.all if len(d.t)]
     if not detections:
@@ -73,7 +73,7 @@ def statistics_text(found: Detections) -> str:
             columns.append(np.where(near, values[k], np.nan))
         head += [d.name, f"{d.name}_threshold", f"{d.name}_stationary"]
     form = ",".join(["%.4f", *["%.5g", "%.5g", "%.0f"] * len(detections)])
-    return ",".join(head) + "\n" + rows_text(np.stack(columns, -1), form)
+    return ",".join(head) + "\n" + format_rows(np.stack(columns, -1), form)
 
 
 def _find_nearest(of: Array, t: Array) -> tuple[np.ndarray, np.ndarray]:
@@ -85,22 +85,22 @@ def _find_nearest(of: Array, t: Array) -> tuple[np.ndarray, np.ndarray]:
     return k, np.abs(of[k] - t) <= 0.51 * float(np.median(np.diff(of))) + 1e-6
 
 
-def values(recording: Recording, found: Detections) -> dict[str, Any]:
+def list_values(recording: Recording, found: Detections) -> dict[str, Any]:
     """The detections for JSON; times are on the recording's clock, as in detections.csv."""
     return {
         "recording": recording.name,
         "duration_s": recording.duration,
         "stationary": found.stationary,
-        "stops": [{key: x for key, x in stop.values().items() if key != "rows"} for stop in stops_of(found.all)],
+        "stops": [{key: x for key, x in stop.values().items() if key != "rows"} for stop in list_stops(found.all)],
         "seconds_by_detector": {d.name: float(np.diff(d.intervals).sum()) for d in found.all},
         "notes": found.notes,
     }
 
 
-def text(recording: Recording, found: Detections, files: list[Path]) -> str:
+def format_found(recording: Recording, found: Detections, files: list[Path]) -> str:
     """Stops, seconds, the idle line or why there is none, and the files written."""
     spans = found.stationary - recording.start
-    first, stops, each = _words(recording, found)
+    first, stops, each = _describe(recording, found)
     lines = [first, f"  {stops}"]
     lines += [f"    {a:9.2f} - {b:9.2f}  {b - a:8.2f} s" for a, b in spans[:_MAX_STOPS]]
     if len(spans) > _MAX_STOPS:
@@ -110,7 +110,7 @@ def text(recording: Recording, found: Detections, files: list[Path]) -> str:
     return "\n".join([*lines, "", "look at", *(f"  {file}" for file in files)])
 
 
-def _words(recording: Recording, found: Detections) -> tuple[str, str, str]:
+def _describe(recording: Recording, found: Detections) -> tuple[str, str, str]:
     """What was examined, the stationary share, and the notes of each detector."""
     spans = found.stationary
     seconds = float(np.diff(spans).sum()) if len(spans) else 0.0

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from markupsafe import Markup
 
-from graphnav.core.notes import Note, key_of
+from graphnav.core.notes import Note, get_key
 from graphnav.core.timescales import GPS_TO_UNIX, gps_to_utc
 from graphnav.estimation.names import has_names
 from graphnav.estimation.solution import Solution
@@ -22,8 +22,8 @@ from graphnav.report import summary as summary
 from graphnav.report import tables as tables
 from graphnav.report.doubts import list_doubts
 from graphnav.report.plots import PALETTE, Shades, Spans
-from graphnav.report.provenance import provenance_tables
-from graphnav.report.satellites import satellite_parts
+from graphnav.report.provenance import tabulate_provenance
+from graphnav.report.satellites import make_satellite_parts
 from graphnav.report.tables import Withheld
 
 if TYPE_CHECKING:
@@ -63,15 +63,15 @@ def write_report(
     defects : those of them that make the result wrong whatever its sigmas say; the report begins with them.
     contradicted : a sentence if another solver of the same run contradicts this one; likewise.
     provenance : version, input hashes and the like, plain values; `options` are those of the command.
-    detectors : of `detector_pictures`, for who writes several reports of one recording; drawn here if None.
-    noise : figures of the noise model, of `graphnav.estimation.noise.table.figure_rows`.
+    detectors : of `draw_detectors`, for who writes several reports of one recording; drawn here if None.
+    noise : figures of the noise model, of `graphnav.estimation.noise.table.tabulate_figures`.
     beside : names of files in the same folder to link to.
     """
     name, start, end = solution.solver, recording.start, recording.duration
     only, every = {name: solution}, {} if errors is None else {name: errors}
-    spans = _shades(solution, start, withheld, outages)
+    spans = _list_shades(solution, start, withheld, outages)
     if detectors is None:
-        detectors = detector_pictures(recording, solution)
+        detectors = draw_detectors(recording, solution)
     if not pictures.has_place(solution):  # nor the keyframes after it
         solution = replace(solution, separation=None)
     own, others = ({k: p for k, p in solution.parameters.items() if has_names(k) == of_it} for of_it in (True, False))
@@ -79,39 +79,39 @@ def write_report(
         (
             "Trajectory",
             [
-                page.gallery([pictures.trajectory_picture(recording, only, spans)]),
-                page.gallery([pictures.profile_picture(recording, only)]),
-                *_gallery(pictures.motion_pictures(recording, only, spans)),
+                page.gallery([pictures.draw_trajectory(recording, only, spans)]),
+                page.gallery([pictures.draw_profile(recording, only)]),
+                *_make_gallery(pictures.draw_motion(recording, only, spans)),
             ],
         ),
         (
             "Accuracy",
             [
-                *tables.accuracy_tables(every, withheld, start, outages),
-                *summary.relative_tables(every),
-                *tables.metric_tables(metrics),
-                *_gallery(pictures.error_pictures(every, start, end, spans)),
+                *tables.tabulate_all_accuracy(every, withheld, start, outages),
+                *summary.tabulate_relative_errors(every),
+                *tables.tabulate_metrics(metrics),
+                *_make_gallery(pictures.draw_errors(every, start, end, spans)),
             ],
         ),
-        ("Consistency of sigma", [*_verdicts(only, every), *_consistency(every, start, end, spans)]),
+        ("Consistency of sigma", [*_describe_verdicts(only, every), *_draw_consistency(every, start, end, spans)]),
         (
             "Uncertainty",
-            _gallery(
+            _make_gallery(
                 [
-                    *pictures.sigma_pictures({name: solution.trajectory(joint=False)}, start, end, spans),
-                    *pictures.separation_pictures(solution, start, end, spans),
-                    *pictures.quality_pictures(recording, solution, spans),
+                    *pictures.draw_sigmas({name: solution.trajectory(joint=False)}, start, end, spans),
+                    *pictures.draw_separation(solution, start, end, spans),
+                    *pictures.draw_quality(recording, solution, spans),
                 ]
             ),
         ),
         (
             "Calibration",
             [
-                *tables.parameter_table(own),
-                *_gallery(
+                *tables.tabulate_parameters(own),
+                *_make_gallery(
                     [
-                        *pictures.bias_pictures(solution, start, end, spans),
-                        *pictures.parameter_pictures(own, name, start, end, spans),
+                        *pictures.draw_biases(solution, start, end, spans),
+                        *pictures.draw_parameters(own, name, start, end, spans),
                     ]
                 ),
             ],
@@ -119,48 +119,53 @@ def write_report(
         (
             "Constraints",
             [
-                *_gallery(pictures.timeline_picture(solution, recording, spans)),
-                *tables.constraint_table(solution),
-                *tables.rejected_table(solution, start),
-                *_fold("Residuals of each", _gallery(pictures.record_pictures(solution, start, end, spans))),
+                *_make_gallery(pictures.draw_timeline(solution, recording, spans)),
+                *tables.tabulate_constraints(solution),
+                *tables.tabulate_rejected(solution, start),
+                *_fold("Residuals of each", _make_gallery(pictures.record_pictures(solution, start, end, spans))),
             ],
         ),
-        ("Satellites", satellite_parts(solution, start, end, spans)),
+        ("Satellites", make_satellite_parts(solution, start, end, spans)),
         (
             "Noise model",
             [
-                *tables.noise_tables(noise, solution),
-                *tables.excluded_table(solution, start),
+                *tables.tabulate_noise(noise, solution),
+                *tables.tabulate_excluded(solution, start),
                 *_fold(
                     "Noise processes, node by node",
                     [
-                        *tables.parameter_table(others),
-                        *_gallery(pictures.parameter_pictures(others, name, start, end, spans)),
+                        *tables.tabulate_parameters(others),
+                        *_make_gallery(pictures.draw_parameters(others, name, start, end, spans)),
                     ],
                 ),
             ],
         ),
         (
             "Detectors",
-            [*_gallery(detectors), *tables.stop_table(solution, start, words.describe_deciding(recording, settings))],
+            [
+                *_make_gallery(detectors),
+                *tables.stop_table(solution, start, words.describe_deciding(recording, settings)),
+            ],
         ),
         ("Findings", tables.list_findings(recording, findings)),
         ("Run", tables.run_table(only)),
-        ("Provenance", provenance_tables(settings, provenance)),
+        ("Provenance", tabulate_provenance(settings, provenance)),
     ]
     lead = [
         *([] if contradicted is None else [page.paragraph(contradicted, "verdict bad")]),
         *_list_doubts(defects, only, every),
         page.paragraph(words.describe_run(recording, only, withheld, outages)),
-        summary.verdicts(solution, errors),
+        summary.tabulate_verdicts(solution, errors),
         *words.describe_closure(name, metrics),
         words.list_tiles(recording, only, every),
-        *summary.links(beside),
+        *summary.list_links(beside),
         *summary.fix_table(recording, solution, withheld),
-        page.columns([summary.sigma_table(solution), summary.separation_table(solution)]),
-        *summary.left_out(solution, start),
+        page.columns([summary.tabulate_sigmas(solution), summary.tabulate_separation(solution)]),
+        *summary.describe_excluded(solution, start),
     ]
-    return _write(path, page.page(f"{recording.name}: {name}", lead, sections, _clocks(recording), _list_others(only)))
+    return _write(
+        path, page.make_page(f"{recording.name}: {name}", lead, sections, _list_clocks(recording), _list_others(only))
+    )
 
 
 def write_comparison(
@@ -183,58 +188,64 @@ def write_comparison(
     start, end = recording.start, recording.duration
     every, metrics_of = errors or {}, metrics or {}
     first = next(iter(solutions.values()))
-    spans = _shades(first, start, withheld, outages)
+    spans = _list_shades(first, start, withheld, outages)
     gone = list(dict.fromkeys(span for _, span in withheld if span is not None))
     zooms = pictures.zoom_pictures(every, start, gone)
     if not gone:
         zooms = pictures.zoom_pictures(every, start, outages, "no GNSS")
     rows = [
-        [kind, page.solver(name), *tables.consistency_row(tables.consistency(solution.records[kind]))]
+        [kind, page.format_solver(name), *tables.tabulate_record(tables.summarise_record(solution.records[kind]))]
         for kind in dict.fromkeys(kind for s in solutions.values() for kind in s.records)
         for name, solution in solutions.items()
         if kind in solution.records
     ]
-    measured = [table for name, values in metrics_of.items() for table in tables.metric_tables(values, name)]
+    measured = [table for name, values in metrics_of.items() for table in tables.tabulate_metrics(values, name)]
     tracks = {name: s.trajectory(joint=False) for name, s in solutions.items()}
     sections: Sections = [
         (
             "Accuracy",
-            [*tables.accuracy_tables(every, withheld, start, outages), *summary.relative_tables(every), *measured],
+            [
+                *tables.tabulate_all_accuracy(every, withheld, start, outages),
+                *summary.tabulate_relative_errors(every),
+                *measured,
+            ],
         ),
-        ("Spans without GNSS" if not gone else "Withheld spans", _gallery(zooms)),
+        ("Spans without GNSS" if not gone else "Withheld spans", _make_gallery(zooms)),
         (
             "Trajectory",
             [
-                page.gallery([pictures.trajectory_picture(recording, solutions, spans)]),
-                page.gallery([pictures.profile_picture(recording, solutions)]),
-                *_gallery(pictures.motion_pictures(recording, solutions, spans)),
+                page.gallery([pictures.draw_trajectory(recording, solutions, spans)]),
+                page.gallery([pictures.draw_profile(recording, solutions)]),
+                *_make_gallery(pictures.draw_motion(recording, solutions, spans)),
             ],
         ),
-        ("Errors against truth", _gallery(pictures.error_pictures(every, start, end, spans))),
-        ("Differences between solvers", _gallery(pictures.difference_pictures(solutions, start, end, spans))),
-        ("Consistency of sigma", _consistency(every, start, end, spans)),
-        ("Uncertainty", _gallery(pictures.sigma_pictures(tracks, start, end, spans))),
-        ("Constraints", [page.table(["constraint", "solver", *tables.CONSISTENCY_HEAD], rows)] if rows else []),
-        ("Noise model", [*tables.noise_tables(noise, first), *tables.excluded_table(first, start)]),
+        ("Errors against truth", _make_gallery(pictures.draw_errors(every, start, end, spans))),
+        ("Differences between solvers", _make_gallery(pictures.draw_differences(solutions, start, end, spans))),
+        ("Consistency of sigma", _draw_consistency(every, start, end, spans)),
+        ("Uncertainty", _make_gallery(pictures.draw_sigmas(tracks, start, end, spans))),
+        ("Constraints", [page.format_table(["constraint", "solver", *tables.CONSISTENCY_HEAD], rows)] if rows else []),
+        ("Noise model", [*tables.tabulate_noise(noise, first), *tables.tabulate_excluded(first, start)]),
         ("Findings", tables.list_findings(recording, findings)),
         ("Runs", tables.run_table(solutions)),
-        ("Provenance", provenance_tables(settings, provenance)),
+        ("Provenance", tabulate_provenance(settings, provenance)),
     ]
     lead = [
         *_list_doubts(defects, solutions, every),
         page.paragraph(words.describe_run(recording, solutions, withheld, outages)),
-        *_verdicts(solutions, every),
+        *_describe_verdicts(solutions, every),
         *(note for name, values in metrics_of.items() for note in words.describe_closure(name, values)),
         words.list_tiles(recording, solutions, every),
-        *summary.links(beside),
+        *summary.list_links(beside),
     ]
-    html = page.page(f"{recording.name}: comparison", lead, sections, _clocks(recording), _list_others(solutions))
+    html = page.make_page(
+        f"{recording.name}: comparison", lead, sections, _list_clocks(recording), _list_others(solutions)
+    )
     return _write(path, html)
 
 
-def detector_pictures(recording: Recording, solution: Solution) -> list[Markup]:
+def draw_detectors(recording: Recording, solution: Solution) -> list[Markup]:
     """The detectors' statistics, for `write_report`: the same for every solver of a recording."""
-    return pictures.detection_pictures(recording, solution.detections)
+    return pictures.draw_detections(recording, solution.detections)
 
 
 def _list_others(names: Iterable[str]) -> list[str]:
@@ -242,7 +253,7 @@ def _list_others(names: Iterable[str]) -> list[str]:
     return [name for name in names if name not in PALETTE]
 
 
-def _clocks(recording: Recording) -> list[page.TimeAxis]:
+def _list_clocks(recording: Recording) -> list[page.TimeAxis]:
     """The recording's own clock, and GPS time and UTC where its zero is known."""
     out = [page.TimeAxis("time on the recording's clock [s]", recording.start)]
     if recording.gps_zero is not None:
@@ -252,7 +263,7 @@ def _clocks(recording: Recording) -> list[page.TimeAxis]:
     return out
 
 
-def _shades(solution: Solution, start: float, withheld: Withheld, outages: Spans) -> Shades:
+def _list_shades(solution: Solution, start: float, withheld: Withheld, outages: Spans) -> Shades:
     """Spans of time to be tinted, s from the start, by kind."""
     excluded = [(part.t_start - start, part.t_end - start) for part in solution.excluded]
     gone = list(dict.fromkeys(span for _, span in withheld if span is not None))
@@ -263,11 +274,11 @@ def _list_doubts(
     defects: Sequence[str], solutions: Mapping[str, Solution], errors: Mapping[str, Errors]
 ) -> list[Markup]:
     """Reasons why the result cannot be trusted, if any."""
-    found = [Note(key_of(one), f"This result cannot be trusted: {one}") for one in defects]
+    found = [Note(get_key(one), f"This result cannot be trusted: {one}") for one in defects]
     return [page.paragraph(doubt, "verdict bad") for doubt in (*found, *list_doubts(solutions, errors))]
 
 
-def _verdicts(solutions: Mapping[str, Solution], errors: Mapping[str, Errors]) -> list[Markup]:
+def _describe_verdicts(solutions: Mapping[str, Solution], errors: Mapping[str, Errors]) -> list[Markup]:
     """Per solver, whether its sigma is consistent with its errors."""
     if errors:
         return [words.describe_sigma(name, e) for name, e in errors.items()]
@@ -276,15 +287,15 @@ def _verdicts(solutions: Mapping[str, Solution], errors: Mapping[str, Errors]) -
     return [words.describe_sigma_without_truth(solution) for solution in filters or solutions.values()]
 
 
-def _consistency(errors: Mapping[str, Errors], start: float, end: float, spans: Shades) -> list[Markup]:
-    table = tables.nees_table(errors)
+def _draw_consistency(errors: Mapping[str, Errors], start: float, end: float, spans: Shades) -> list[Markup]:
+    table = tables.tabulate_nees(errors)
     if not table:
         return []
     note = "Errors of one drive are correlated for seconds to minutes, so NEES scatters about 1 where sigma is true."
-    return [*table, page.paragraph(note, "soft"), *_gallery(pictures.nees_pictures(errors, start, end, spans))]
+    return [*table, page.paragraph(note, "soft"), *_make_gallery(pictures.draw_nees(errors, start, end, spans))]
 
 
-def _gallery(images: Sequence[Markup]) -> list[Markup]:
+def _make_gallery(images: Sequence[Markup]) -> list[Markup]:
     return [page.gallery(images)] if images else []
 
 

@@ -7,15 +7,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from graphnav.core.notes import Note, key_of
+from graphnav.core.notes import Note, get_key
 from graphnav.core.sample_size import chi_square_quantile
 from graphnav.core.state import BLOCKS
-from graphnav.estimation.noise.apply import row_weights
+from graphnav.estimation.noise.apply import select_weights
 from graphnav.estimation.solution import Solution
-from graphnav.evaluation.against import own_solutions
+from graphnav.evaluation.against import select_own
 from graphnav.evaluation.sigmas import BY_CHANCE
-from graphnav.report.consistency import consistency
-from graphnav.report.wording import and_list
+from graphnav.report.consistency import summarise_record
+from graphnav.report.wording import join_words
 
 if TYPE_CHECKING:
     from graphnav.evaluation.metrics import Errors
@@ -37,7 +37,7 @@ def find_departures(solutions: Mapping[str, Solution]) -> dict[str, Note]:
     therefore that of the difference or more.
     """
     out = {}
-    solutions = own_solutions(solutions)
+    solutions = select_own(solutions)
     for name, one in solutions.items():
         solver, dash, coupling = name.partition("-")
         others = [better + dash + coupling for better in _BY_INFORMATION.partition(solver)[0].split()]
@@ -63,22 +63,24 @@ def list_doubts(solutions: Mapping[str, Solution], errors: Mapping[str, Errors])
     from graphnav.evaluation.sigmas import judge_sigmas, select_verdict
 
     out: list[str] = list(find_departures(solutions).values())
-    solutions = own_solutions(solutions)
+    solutions = select_own(solutions)
     errors = {name: e for name, e in errors.items() if name in solutions}
     for solution in solutions.values():
         fixes = solution.records.get("gnss_position")
-        left_out = 0.0 if fixes is None else 1.0 - float(np.mean(row_weights(fixes.t, solution.noise, "gnss_position")))
+        left_out = (
+            0.0 if fixes is None else 1.0 - float(np.mean(select_weights(fixes.t, solution.noise, "gnss_position")))
+        )
         if left_out > _LARGEST_EXCLUDED_SHARE:
             words = f"This result cannot be trusted: {100 * left_out:.0f} % of the fixes' information contradicts the "
             out.append(Note("doubt.left_out", words + "other measurements and is left out"))
             break  # all solvers use the same noise model
     notes = dict.fromkeys(note for solution in solutions.values() for note in solution.notes)
-    out += [Note(key, note) for note in notes if (key := key_of(note)) == "doubt.axes"]
+    out += [Note(key, note) for note in notes if (key := get_key(note)) == "doubt.axes"]
     sizes: dict[str, list[str]] = {}
     for name, e in errors.items():
         for j in select_verdict(judge_sigmas(e), "too small"):
             sizes.setdefault(j.block, []).append(f"{j.size:.2g}" + (f" ({name})" if len(errors) > 1 else ""))
-    wrong = [f"{block} errors are {and_list(each)} times their sigma" for block, each in sizes.items()]
+    wrong = [f"{block} errors are {join_words(each)} times their sigma" for block, each in sizes.items()]
     if not errors:
         filters = [s for s in solutions.values() if any(r.kind == "innovation" for r in s.records.values())]
         for solution in filters or solutions.values():
@@ -92,7 +94,7 @@ def list_doubts(solutions: Mapping[str, Solution], errors: Mapping[str, Errors])
 
 def measure_consistency(solution: Solution) -> tuple[str, float, int]:
     """Kind, RMS over sigma and number of rows of each of a solution's records."""
-    every = [consistency(record) for record in solution.records.values() if len(record.t)]
+    every = [summarise_record(record) for record in solution.records.values() if len(record.t)]
     every = [c for c in every if np.isfinite(c.mean_nis)]
     used = sum(c.count - c.rejected for c in every)
     if not used:

@@ -22,7 +22,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
 from graphnav.core.errors import ConfigError
-from graphnav.report.plots import TIME, Figure, css_colours, variable
+from graphnav.report.plots import TIME, Figure, format_css, name_variable
 from graphnav.report.wording import Quantity, show
 
 _HERE = Path(__file__).parent
@@ -41,12 +41,12 @@ bullets, code, columns, digest, download, fold, gallery, heading, links, pairs, 
 )  # fmt: skip
 
 
-def solver(name: str) -> Markup:
+def format_solver(name: str) -> Markup:
     """A solver's name in its colour."""
-    return _PARTS.solver(name, variable(name))
+    return _PARTS.solver(name, name_variable(name))
 
 
-def table(head: Sequence[Any], rows: Iterable[Sequence[Any]], best: Sequence[int] = ()) -> Markup:
+def format_table(head: Sequence[Any], rows: Iterable[Sequence[Any]], best: Sequence[int] = ()) -> Markup:
     """A table, text left and numbers right; in the columns `best` the smallest number is bold.
 
     A column without any number is omitted.
@@ -60,15 +60,15 @@ def table(head: Sequence[Any], rows: Iterable[Sequence[Any]], best: Sequence[int
     }
 
     def kind(k: int, value: Any) -> str:
-        return "best" if k in least and value == least[k] else _kind(value) if k else ""
+        return "best" if k in least and value == least[k] else _choose_class(value) if k else ""
 
     return _PARTS.table(
-        [(head[k], max((_kind(row[k]) for row in rows), default="", key=len) if k else "") for k in columns],
+        [(head[k], max((_choose_class(row[k]) for row in rows), default="", key=len) if k else "") for k in columns],
         [[(row[k], kind(k, row[k])) for k in columns] for row in rows],
     )
 
 
-def _kind(value: Any) -> str:
+def _choose_class(value: Any) -> str:
     """The class of a text cell, wider for a sentence."""
     if isinstance(value, Quantity) or not isinstance(value, str):
         return ""
@@ -86,7 +86,7 @@ def flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     return out
 
 
-def picture(figure: Figure, title: str, note: str = "", kind: str = "") -> Markup:
+def place_picture(figure: Figure, title: str, note: str = "", kind: str = "") -> Markup:
     """A figure with its title above and a note below.
 
     Parameters
@@ -105,7 +105,7 @@ class TimeAxis:
     date: bool = False
 
 
-def page(
+def make_page(
     title: str,
     lead: Sequence[Markup],
     sections: Sequence[tuple[str, Sequence[Markup]]],
@@ -124,8 +124,8 @@ def page(
     sections = [(head, parts) for head, parts in sections if any(parts)]
     drawn = any("<figure" in part for _, parts in sections for part in parts)
     return _TEMPLATES.get_template("page.html").render(
-        title=title, lead=lead, sections=sections, clocks=clocks, time=TIME, library=_library() if drawn else None,
-        style=Markup(css_colours(others) + _read("page.css")), script=Markup(_read("page.js")),
+        title=title, lead=lead, sections=sections, clocks=clocks, time=TIME, library=_read_library() if drawn else None,
+        style=Markup(format_css(others) + _read("page.css")), script=Markup(_read("page.js")),
     )  # fmt: skip
 
 
@@ -142,7 +142,7 @@ class Packed:
 
 
 @lru_cache(maxsize=1)
-def _library() -> Packed:
+def _read_library() -> Packed:
     found = importlib.util.find_spec("plotly")
     if found is None or found.origin is None:
         raise ConfigError(

@@ -10,13 +10,13 @@ import numpy as np
 from markupsafe import Markup
 
 from graphnav.core.earth import LocalFrame
-from graphnav.core.interpolation import fit_yaw, yaw_matrix
+from graphnav.core.interpolation import fit_yaw, make_yaw_matrix
 from graphnav.core.rotation import Array
 from graphnav.core.trajectory import Trajectory
 from graphnav.detectors.base import Detection
-from graphnav.estimation.names import components
+from graphnav.estimation.names import name_components
 from graphnav.estimation.solution import ParameterEstimate, Solution
-from graphnav.evaluation.against import own_solutions
+from graphnav.evaluation.against import select_own
 from graphnav.recording import FIX_TYPES, Recording
 from graphnav.report import page, plots
 from graphnav.report.plots import Curve, Shades, Spans
@@ -32,14 +32,14 @@ TO_DEG = float(np.degrees(1.0))
 DEG_H = float(np.degrees(3600.0))
 
 
-def trajectory_picture(recording: Recording, solutions: Mapping[str, Solution], spans: Shades) -> Markup:
+def draw_trajectory(recording: Recording, solutions: Mapping[str, Solution], spans: Shades) -> Markup:
     """The track from above, with the fixes that were and were not used."""
     start = recording.start
     first = next(iter(solutions.values()))
-    truth = _truth(recording, solutions)
-    figure = plots.trajectory(
+    truth = _find_truth(recording, solutions)
+    figure = plots.plot_trajectory(
         {name: (s.t - start, s.states.p[:, :2]) for name, s in solutions.items()},
-        fixes=fixes_of(recording, first),
+        fixes=select_fixes(recording, first),
         truth=None if truth is None else truth[1][:, :2],
         spans=spans,
         stops=[(a - start, b - start) for a, b in first.stationary],
@@ -49,10 +49,10 @@ def trajectory_picture(recording: Recording, solutions: Mapping[str, Solution], 
     where = f"North is up; the origin is latitude {lat:.6f}, longitude {lon:.6f} deg."
     if not has_place(first):
         where = "Nothing says where on the Earth this is: place and heading count from the start."
-    return page.picture(figure, "Plan view", where, kind="large")
+    return page.place_picture(figure, "Plan view", where, kind="large")
 
 
-def profile_picture(recording: Recording, solutions: Mapping[str, Solution]) -> Markup:
+def draw_profile(recording: Recording, solutions: Mapping[str, Solution]) -> Markup:
     """Heights over the distance travelled."""
     start, first = recording.start, next(iter(solutions.values()))
     distance = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(first.states.p[:, :2], axis=0), axis=1))])
@@ -61,7 +61,7 @@ def profile_picture(recording: Recording, solutions: Mapping[str, Solution]) -> 
         return np.interp(t, first.t, distance), h
 
     lines, points = {}, {}
-    truth, fixes = _truth(recording, solutions), fixes_of(recording, first)
+    truth, fixes = _find_truth(recording, solutions), select_fixes(recording, first)
     base = float(first.frame.origin[2]) if has_place(first) else 0.0
     if truth is not None and truth[1].shape[1] > 2:
         lines["truth"] = over_distance(truth[0], base + truth[1][:, 2])
@@ -74,10 +74,10 @@ def profile_picture(recording: Recording, solutions: Mapping[str, Solution]) -> 
     note = f"Heights above the ellipsoid; {antenna} are of the antenna."
     if not has_place(first):
         note = "Heights count from the start."
-    return page.picture(plots.profile(lines, points), "Height profile", note, kind="large")
+    return page.place_picture(plots.plot_profile(lines, points), "Height profile", note, kind="large")
 
 
-def fixes_of(recording: Recording, solution: Solution) -> plots.DrawnFixes | None:
+def select_fixes(recording: Recording, solution: Solution) -> plots.DrawnFixes | None:
     """The fixes in metres, the kind of each, and those that the solver did not use though they were not withheld."""
     if recording.gnss is None or not has_place(solution):
         return None
@@ -105,7 +105,7 @@ def fixes_of(recording: Recording, solution: Solution) -> plots.DrawnFixes | Non
     return plots.DrawnFixes(t - recording.start, solution.frame.from_llh(gnss.llh), out, kinds)
 
 
-def _truth(recording: Recording, solutions: Mapping[str, Solution]) -> tuple[Array, Array] | None:
+def _find_truth(recording: Recording, solutions: Mapping[str, Solution]) -> tuple[Array, Array] | None:
     """Times (M,) and positions (M, 2 or 3) of the truth, in metres of the first solution's frame."""
     truth, first = recording.truth, next(iter(solutions.values()))
     if truth is None or (truth.llh is None and truth.xyz is None):
@@ -114,7 +114,7 @@ def _truth(recording: Recording, solutions: Mapping[str, Solution]) -> tuple[Arr
         return truth.t, first.frame.from_llh(truth.llh)
     own = truth.xyz if truth.llh is None else LocalFrame(truth.llh[0]).from_llh(truth.llh)
     assert own is not None
-    return _lay_on(truth.t, own, list(own_solutions(solutions).values())[-1])
+    return _lay_on(truth.t, own, list(select_own(solutions).values())[-1])
 
 
 def has_place(solution: Solution) -> bool:
@@ -133,10 +133,10 @@ def _lay_on(t: Array, xyz: Array, solution: Solution) -> tuple[Array, Array] | N
     own = np.zeros_like(p)
     own[:, : xyz.shape[1]] = xyz[shared]
     yaw, offset = fit_yaw(own, p)
-    return t[shared], np.asarray((own @ yaw_matrix(yaw).T + offset)[:, : xyz.shape[1]])
+    return t[shared], np.asarray((own @ make_yaw_matrix(yaw).T + offset)[:, : xyz.shape[1]])
 
 
-def error_series(errors: Errors, start: float) -> dict[str, Curve]:
+def collect_error_series(errors: Errors, start: float) -> dict[str, Curve]:
     """Error series to draw: position (m), velocity (m/s), attitude (deg), as far as present."""
     t = errors.t - start
     out = {}
@@ -150,9 +150,9 @@ def error_series(errors: Errors, start: float) -> dict[str, Curve]:
     return out
 
 
-def error_pictures(errors: Mapping[str, Errors], start: float, end: float, spans: Shades) -> list[Markup]:
+def draw_errors(errors: Mapping[str, Errors], start: float, end: float, spans: Shades) -> list[Markup]:
     """Position, velocity and attitude errors with 3 sigma."""
-    series = {name: error_series(e, start) for name, e in errors.items()}
+    series = {name: collect_error_series(e, start) for name, e in errors.items()}
     out = []
     for kind, parts, unit in (("position", ENU, "m"), ("velocity", ENU, "m/s"), ("attitude", RPH, "deg")):
         chosen = {name: s[kind] for name, s in series.items() if kind in s}
@@ -161,8 +161,8 @@ def error_pictures(errors: Mapping[str, Errors], start: float, end: float, spans
             note = "The line belongs inside the band." if banded else ""
             known = _find_known(chosen)
             cut = {name: s.take(known) for name, s in chosen.items()}
-            figure = plots.bands(cut, [parts[k] for k in known], unit, end, spans=spans)
-            out.append(page.picture(figure, f"{kind.capitalize()} error", note))
+            figure = plots.plot_bands(cut, [parts[k] for k in known], unit, end, spans=spans)
+            out.append(page.place_picture(figure, f"{kind.capitalize()} error", note))
     return out
 
 
@@ -171,7 +171,7 @@ def _find_known(series: Mapping[str, Curve]) -> list[int]:
     return [k for k in range(3) if any(np.isfinite(s.value[:, k]).any() for s in series.values())]
 
 
-def nees_pictures(errors: Mapping[str, Errors], start: float, end: float, spans: Shades) -> list[Markup]:
+def draw_nees(errors: Mapping[str, Errors], start: float, end: float, spans: Shades) -> list[Markup]:
     """Squared errors over their covariance."""
     series, names, dofs = {}, ["position", "velocity", "attitude"], [3, 3, 3]
     for name, e in errors.items():
@@ -181,15 +181,15 @@ def nees_pictures(errors: Mapping[str, Errors], start: float, end: float, spans:
     if not known:
         return []
     cut = {name: s.take(known) for name, s in series.items()}
-    figure = plots.nees(cut, [names[k] for k in known], [dofs[k] for k in known], end, spans=spans)
+    figure = plots.plot_nees(cut, [names[k] for k in known], [dofs[k] for k in known], end, spans=spans)
     note = (
         "Squared error over its covariance, divided by its degrees of freedom: about 1 where sigma is true, above the "
         "band where it is too small."
     )
-    return [page.picture(figure, "NEES over time", note)]
+    return [page.place_picture(figure, "NEES over time", note)]
 
 
-def sigma_pictures(tracks: Mapping[str, Trajectory], start: float, end: float, spans: Shades) -> list[Markup]:
+def draw_sigmas(tracks: Mapping[str, Trajectory], start: float, end: float, spans: Shades) -> list[Markup]:
     """The sigmas stated by the solvers."""
     out = []
     wanted = (
@@ -204,19 +204,19 @@ def sigma_pictures(tracks: Mapping[str, Trajectory], start: float, end: float, s
             if getattr(track, key) is not None
         }
         if series:
-            figure = plots.sigmas(series, parts, unit, end, spans=spans)
-            out.append(page.picture(figure, f"{kind}, 1 sigma as stated"))
+            figure = plots.plot_sigmas(series, parts, unit, end, spans=spans)
+            out.append(page.place_picture(figure, f"{kind}, 1 sigma as stated"))
     return out
 
 
-def motion_pictures(recording: Recording, solutions: Mapping[str, Solution], spans: Shades) -> list[Markup]:
+def draw_motion(recording: Recording, solutions: Mapping[str, Solution], spans: Shades) -> list[Markup]:
     """Estimated position, velocity and attitude with 3 sigma, and the fixes' and the receiver's measurements of
     them.
     """
     start, end = recording.start, recording.duration
     first = next(iter(solutions.values()))
     tracks = {name: s.trajectory(joint=False) for name, s in solutions.items()}
-    fixes, gnss = fixes_of(recording, first), recording.gnss
+    fixes, gnss = select_fixes(recording, first), recording.gnss
     base = np.array([0.0, 0.0, float(first.frame.origin[2]) if has_place(first) else 0.0])
 
     def draw_measured(panel: plots.Panel, k: int) -> None:
@@ -240,42 +240,46 @@ def motion_pictures(recording: Recording, solutions: Mapping[str, Solution], spa
         ("Attitude", turned, RPH, "deg", None),
     ):
         if series:
-            figure = plots.bands(series, parts, unit, end, spans=spans, about_zero=False, under=under)
+            figure = plots.plot_bands(series, parts, unit, end, spans=spans, about_zero=False, under=under)
             note = ""
             if title == "Attitude" and any(np.nanmax(s.value[:, 2], initial=0.0) > 360.0 for s in series.values()):
                 note = "The heading goes on beyond 360 deg, turn by turn."
-            out.append(page.picture(figure, f"{title} and 3 sigma" if len(series) < 3 else title, note))
+            out.append(page.place_picture(figure, f"{title} and 3 sigma" if len(series) < 3 else title, note))
     return out
 
 
-def separation_pictures(solution: Solution, start: float, end: float, spans: Shades) -> list[Markup]:
+def draw_separation(solution: Solution, start: float, end: float, spans: Shades) -> list[Markup]:
     """Forward filter minus the information after each keyframe."""
     found = solution.separation
     if found is None or not np.isfinite(found.value).any():
         return []
     series = {"ekf": Curve(found.t - start, found.value, found.sigma)}
     note = "Position of the forward filter less that of all later measurements; it belongs inside the band."
-    return [page.picture(plots.bands(series, ENU, "m", end, spans=spans), "Combined separation and 3 sigma", note)]
+    return [
+        page.place_picture(
+            plots.plot_bands(series, ENU, "m", end, spans=spans), "Combined separation and 3 sigma", note
+        )
+    ]
 
 
-def quality_pictures(recording: Recording, solution: Solution, spans: Shades) -> list[Markup]:
+def draw_quality(recording: Recording, solution: Solution, spans: Shades) -> list[Markup]:
     """Quality stated by the fixes: 1-sigma, horizontal and up, and satellites."""
-    gnss, fixes = recording.gnss, fixes_of(recording, solution)
+    gnss, fixes = recording.gnss, select_fixes(recording, solution)
     if gnss is None or fixes is None or not len(gnss.t):
         return []
     seen = gnss.satellites is not None
     shown = np.column_stack([np.hypot(gnss.sd[:, 0], gnss.sd[:, 1]), gnss.sd[:, 2]])
     titles, units, log = ["horizontal 1-sigma [m]", "up 1-sigma [m]"], ["m", "m"], [True, True]
-    limits = [plots.limits([np.log10(shown[:, k])], floor=0.5) for k in range(2)]
+    limits = [plots.find_limits([np.log10(shown[:, k])], floor=0.5) for k in range(2)]
     if gnss.satellites is not None:
         shown = np.column_stack([shown, gnss.satellites])
         titles, units, log = [*titles, "satellites"], [*units, ""], [*log, False]
-        limits.append(plots.limits([np.append(gnss.satellites, 0.0)], floor=1.0))
+        limits.append(plots.find_limits([np.append(gnss.satellites, 0.0)], floor=1.0))
     figure = plots.Figure(titles, (0.0, recording.duration), limits, units=units, log=log)
     for k, panel in enumerate(figure.panels):
         panel.shade(spans)
         draw_fixes(panel, replace(fixes, enu=shown), k)
-    return [page.picture(figure, "Fixes: stated accuracy" + (" and satellites" if seen else ""))]
+    return [page.place_picture(figure, "Fixes: stated accuracy" + (" and satellites" if seen else ""))]
 
 
 def _unwrap(rph: Array) -> Array:
@@ -287,7 +291,7 @@ def _unwrap(rph: Array) -> Array:
     return np.asarray(out)
 
 
-def bias_pictures(solution: Solution, start: float, end: float, spans: Shades) -> list[Markup]:
+def draw_biases(solution: Solution, start: float, end: float, spans: Shades) -> list[Markup]:
     """Gyro and accelerometer biases with 3 sigma."""
     sd = np.sqrt(np.maximum(np.diagonal(solution.covariance, axis1=1, axis2=2), 0.0))
     t = solution.t - start
@@ -297,12 +301,12 @@ def bias_pictures(solution: Solution, start: float, end: float, spans: Shades) -
         ("Accelerometer bias", solution.states.ba, sd[:, 9:12], "mm/s²", 1000.0),
     ):
         series = {solution.solver: Curve(t, value * scale, sigma * scale)}
-        figure = plots.bands(series, XYZ, unit, end, spans=spans, about_zero=False)
-        out.append(page.picture(figure, f"{words} and 3 sigma"))
+        figure = plots.plot_bands(series, XYZ, unit, end, spans=spans, about_zero=False)
+        out.append(page.place_picture(figure, f"{words} and 3 sigma"))
     return out
 
 
-def parameter_pictures(
+def draw_parameters(
     parameters: Mapping[str, ParameterEstimate], solver: str, start: float, end: float, spans: Shades
 ) -> list[Markup]:
     """Time-varying parameters with 3 sigma, where the data determined them."""
@@ -310,13 +314,15 @@ def parameter_pictures(
     for name, p in parameters.items():
         if len(p.t) > 2 and np.any(p.sigma < 0.5 * p.prior_sigma):
             told = np.any(p.sigma < 0.5 * p.prior_sigma, axis=0)
-            shown = [one for one, drawn in zip(components(name, p.value.shape[1], p.unit), told, strict=True) if drawn]
+            shown = [
+                one for one, drawn in zip(name_components(name, p.value.shape[1], p.unit), told, strict=True) if drawn
+            ]
             scale = np.array([one.scale for one in shown])
             series = {solver: Curve(p.t - start, scale * p.value[:, told], scale * p.sigma[:, told])}
             titles, units = [one.words for one in shown], [one.unit for one in shown]
-            figure = plots.bands(series, titles, units, end, spans=spans, about_zero=False)
+            figure = plots.plot_bands(series, titles, units, end, spans=spans, about_zero=False)
             words = " ".join(one.upper() if one in ("gnss", "imu") else one for one in name.split("_"))
-            out.append(page.picture(figure, f"{words[:1].upper()}{words[1:]} and 3 sigma"))
+            out.append(page.place_picture(figure, f"{words[:1].upper()}{words[1:]} and 3 sigma"))
     return out
 
 
@@ -326,15 +332,17 @@ def zoom_pictures(errors: Mapping[str, Errors], start: float, spans: Spans, what
         return []
     series = {}
     for name, e in errors.items():
-        s = error_series(e, start)["position"]
+        s = collect_error_series(e, start)["position"]
         series[name] = Curve(s.t, np.hypot(s.value[:, 0], s.value[:, 1])[:, None])
-    figure = plots.span_zoom(series, spans, what)
-    return [page.picture(figure, "Horizontal error in and around each span", kind="large" if len(spans) > 1 else "")]
+    figure = plots.plot_span_zoom(series, spans, what)
+    return [
+        page.place_picture(figure, "Horizontal error in and around each span", kind="large" if len(spans) > 1 else "")
+    ]
 
 
-def difference_pictures(solutions: Mapping[str, Solution], start: float, end: float, spans: Shades) -> list[Markup]:
+def draw_differences(solutions: Mapping[str, Solution], start: float, end: float, spans: Shades) -> list[Markup]:
     """Differences between the solvers and the last of them, at their common keyframes."""
-    name, reference = list(own_solutions(solutions).items())[-1]
+    name, reference = list(select_own(solutions).items())[-1]
     series = {}
     for key, s in solutions.items():
         if key == name:
@@ -344,8 +352,8 @@ def difference_pictures(solutions: Mapping[str, Solution], start: float, end: fl
             series[key] = Curve(s.t[mine] - start, s.states.p[mine] - reference.states.p[its])
     if not series:
         return []
-    figure = plots.bands(series, ENU, "m", end, spans=spans)
-    return [page.picture(figure, f"Position less that of {name}")]
+    figure = plots.plot_bands(series, ENU, "m", end, spans=spans)
+    return [page.place_picture(figure, f"Position less that of {name}")]
 
 
 def record_pictures(solution: Solution, start: float, end: float, spans: Shades) -> list[Markup]:
@@ -354,26 +362,30 @@ def record_pictures(solution: Solution, start: float, end: float, spans: Shades)
     for kind, record in solution.records.items():
         if not len(record.t):
             continue
-        figure = plots.residuals(record, start, end, solution.solver, spans=spans)
+        figure = plots.plot_residuals(record, start, end, solution.solver, spans=spans)
         dof = record.residual.shape[1]
         note = f"The lines are at 3 sigma; NIS is chi-square with {dof} degree{'s' if dof > 1 else ''} of freedom"
         note += "." if record.kind == "innovation" else " at most, as a fit takes up part of the noise."
-        out.append(page.picture(figure, f"{kind}: {record.kind}s over their sigma", note))
+        out.append(page.place_picture(figure, f"{kind}: {record.kind}s over their sigma", note))
     return out
 
 
-def timeline_picture(solution: Solution, recording: Recording, spans: Shades) -> list[Markup]:
+def draw_timeline(solution: Solution, recording: Recording, spans: Shades) -> list[Markup]:
     """Times at which each constraint was used."""
     records = {kind: record for kind, record in solution.records.items() if len(record.t)}
     if not records:
         return []
-    figure = plots.timeline(records, recording.start, recording.duration, solution.solver, spans=spans)
-    return [page.picture(figure, "Use of constraints over time", kind="large")]
+    figure = plots.plot_timeline(records, recording.start, recording.duration, solution.solver, spans=spans)
+    return [page.place_picture(figure, "Use of constraints over time", kind="large")]
 
 
-def detection_pictures(recording: Recording, found: Sequence[Detection]) -> list[Markup]:
+def draw_detections(recording: Recording, found: Sequence[Detection]) -> list[Markup]:
     """Signals and statistics of the detectors."""
     if not found:
         return []
     note = "Tinted: the intervals in which it stands, all detectors together."
-    return [page.picture(plots.detections(recording, found), "Signals, statistics and thresholds", note, kind="large")]
+    return [
+        page.place_picture(
+            plots.plot_detections(recording, found), "Signals, statistics and thresholds", note, kind="large"
+        )
+    ]

@@ -18,63 +18,69 @@ from graphnav.report.wording import Quantity
 _ELEVATIONS = (0.0, 15.0, 30.0, 45.0, 60.0, 90.0)  # deg
 
 
-def satellite_parts(solution: Solution, start: float, end: float, spans: Shades) -> list[Markup]:
+def make_satellite_parts(solution: Solution, start: float, end: float, spans: Shades) -> list[Markup]:
     """The section on satellites, for a solution that has rows of them; empty otherwise.
 
     Parameters
     ----------
     start : of the recording, s on its own clock; `end` of the time axis from there.
     """
-    records, name = satellite_records(solution), solution.solver
+    records, name = select_satellite_records(solution), solution.solver
     if not records:
         return []
     kind, first = next(iter(records.items()))
     kinds = {r.kind for r in records.values()}
     what = " and ".join(sorted(f"{one}s" for one in kinds)).capitalize()
     seen = [
-        page.picture(plots.sky(first, name), f"Sky, by the rows of {kind}", "North is up, the zenith in the middle."),
-        page.picture(plots.used_satellites(records, start, end, name, spans=spans), "Rows used and refused"),
+        page.place_picture(
+            plots.plot_sky(first, name), f"Sky, by the rows of {kind}", "North is up, the zenith in the middle."
+        ),
+        page.place_picture(plots.plot_used_satellites(records, start, end, name, spans=spans), "Rows used and refused"),
     ]
     by_satellite = [
-        page.picture(plots.residuals_by_satellite(one, r, name), f"{one}: {r.kind}s by satellite")
+        page.place_picture(plots.plot_residuals_by_satellite(one, r, name), f"{one}: {r.kind}s by satellite")
         for one, r in records.items()
     ]
     out = [
         page.gallery(seen),
         page.gallery(
             [
-                page.picture(plots.satellite_rows(first, start, end, name, spans=spans), f"{kind}: use by satellite"),
-                page.picture(
-                    plots.residuals_by_elevation(records, name),
+                page.place_picture(
+                    plots.plot_satellite_rows(first, start, end, name, spans=spans), f"{kind}: use by satellite"
+                ),
+                page.place_picture(
+                    plots.plot_residuals_by_elevation(records, name),
                     f"{what} by elevation",
                     "What lies beyond a panel is drawn at its edge.",
                 ),
                 *by_satellite,
             ]
         ),
-        *satellite_tables(solution),
+        *tabulate_satellites(solution),
     ]
     if len(solution.arcs.name):
         note = "An arc ends where the receiver, or the base station's, loses count of the cycles."
-        figure = plots.carrier_arcs(solution.arcs, start, end, spans=spans)
-        out.append(page.gallery([page.picture(figure, "Arcs of carriers, by their ambiguities", note, kind="large")]))
-    return [*out, *ambiguity_table(solution)]
+        figure = plots.plot_carrier_arcs(solution.arcs, start, end, spans=spans)
+        out.append(
+            page.gallery([page.place_picture(figure, "Arcs of carriers, by their ambiguities", note, kind="large")])
+        )
+    return [*out, *tabulate_ambiguities(solution)]
 
 
-def satellite_records(solution: Solution) -> dict[str, ConstraintRecord]:
+def select_satellite_records(solution: Solution) -> dict[str, ConstraintRecord]:
     """The records that have rows of satellites, by constraint."""
     return {kind: r for kind, r in solution.records.items() if len(r.satellite) == len(r.t) > 0}
 
 
-def satellite_tables(solution: Solution) -> list[Markup]:
+def tabulate_satellites(solution: Solution) -> list[Markup]:
     """Residuals of satellite rows, in sigmas as weighted, by satellite and by elevation."""
-    records = satellite_records(solution)
+    records = select_satellite_records(solution)
     if not records:
         return []
     names = sorted({name for r in records.values() for name in r.satellite.tolist()})
     which = {kind: np.searchsorted(names, r.satellite) for kind, r in records.items()}
     by_satellite = [
-        [name, *(cell for kind, r in records.items() for cell in _residual_cells(r, which[kind] == k))]
+        [name, *(cell for kind, r in records.items() for cell in _tabulate_residuals(r, which[kind] == k))]
         for k, name in enumerate(names)
     ]
     by_elevation = [
@@ -83,16 +89,19 @@ def satellite_tables(solution: Solution) -> list[Markup]:
             *(
                 cell
                 for r in records.values()
-                for cell in _residual_cells(r, (np.degrees(r.elevation) >= low) & (np.degrees(r.elevation) < high))
+                for cell in _tabulate_residuals(r, (np.degrees(r.elevation) >= low) & (np.degrees(r.elevation) < high))
             ),
         ]
         for low, high in itertools.pairwise(_ELEVATIONS)
     ]
     head = [cell for kind in records for cell in (f"{kind} rows", "refused", "RMS / sigma")]
-    return [page.table(["satellite", *head], by_satellite), page.table(["elevation", *head], by_elevation)]
+    return [
+        page.format_table(["satellite", *head], by_satellite),
+        page.format_table(["elevation", *head], by_elevation),
+    ]
 
 
-def _residual_cells(record: ConstraintRecord, some: Array) -> list[Any]:
+def _tabulate_residuals(record: ConstraintRecord, some: Array) -> list[Any]:
     """Number of rows, the share with less than half of their weight, and the RMS of the others in sigmas."""
     count = int(np.count_nonzero(some))
     if not count:
@@ -103,7 +112,7 @@ def _residual_cells(record: ConstraintRecord, some: Array) -> list[Any]:
     return [count, Quantity(f"{100.0 * share:.1f} %"), float(np.sqrt(np.mean(nis))) if len(nis) else "-"]
 
 
-def ambiguity_table(solution: Solution) -> list[Markup]:
+def tabulate_ambiguities(solution: Solution) -> list[Markup]:
     """Numbers of epochs with integer and real-valued ambiguities, of those with carriers against a base station."""
     epochs = solution.fixed
     if not len(epochs):
@@ -111,4 +120,4 @@ def ambiguity_table(solution: Solution) -> list[Markup]:
     fixed = int(np.sum(epochs[:, 1] > 0.0))
     share = Quantity(f"{100.0 * fixed / len(epochs):.1f} %")
     head = ["epochs with carriers", "ambiguities fixed as integers", "float", "share fixed"]
-    return [page.table(head, [[len(epochs), fixed, len(epochs) - fixed, share]])]
+    return [page.format_table(head, [[len(epochs), fixed, len(epochs) - fixed, share]])]

@@ -10,14 +10,14 @@ from markupsafe import Markup
 
 from graphnav.core.notes import Note, format_count
 from graphnav.estimation.solution import Solution
-from graphnav.evaluation.against import own_solutions
-from graphnav.evaluation.segments import rms
+from graphnav.evaluation.against import select_own
+from graphnav.evaluation.segments import compute_rms
 from graphnav.recording import Recording
 from graphnav.report import page, wording
 from graphnav.report.doubts import FEWEST_ROWS, TOO_LARGE, measure_consistency
 from graphnav.report.plots import Spans
 from graphnav.report.tables import Withheld
-from graphnav.report.wording import and_list
+from graphnav.report.wording import join_words
 
 if TYPE_CHECKING:
     from graphnav.evaluation.metrics import Errors
@@ -29,7 +29,7 @@ def describe_deciding(recording: Recording, settings: Mapping[str, Any]) -> str:
     """Which detectors decide where the platform stands."""
     fire = settings.get("detectors", {}).get("fire", ("fused",))
     if "fused" not in fire:
-        return f"{and_list(list(fire))}, each by itself"
+        return f"{join_words(list(fire))}, each by itself"
     if recording.platform == "foot":
         return "the GLRT of stances"
     return (
@@ -49,20 +49,20 @@ def describe_run(recording: Recording, solutions: Mapping[str, Solution], withhe
     if used.odometer is not None:
         sources.append(format_count(len(used.odometer.t), "odometer row"))
     sources += [f"{format_count(len(series), 'row')} of {name}" for name, series in used.sensors.items()]
-    others = [name for name in solutions if name not in own_solutions(solutions)]
-    solutions = own_solutions(solutions)
+    others = [name for name in solutions if name not in select_own(solutions)]
+    solutions = select_own(solutions)
     solution = next(iter(solutions.values()))
     several = len(solutions) > 1
-    who = f"The solvers {and_list(list(solutions))}" if several else f"The {solution.solver} solver"
+    who = f"The solvers {join_words(list(solutions))}" if several else f"The {solution.solver} solver"
     words = (
         f"{who} estimated the trajectory of the {recording.platform} recording '{recording.name}' "
-        f"({recording.duration:.1f} s) from {and_list(sources)}, at {format_count(len(solution.t), 'keyframe')}."
+        f"({recording.duration:.1f} s) from {join_words(sources)}, at {format_count(len(solution.t), 'keyframe')}."
     )
     if others:
-        words += f" Beside them, of other programs: {and_list(others)}."
+        words += f" Beside them, of other programs: {join_words(others)}."
     if withheld:
         listed = [f"{source} {span[0]:g} to {span[1]:g} s" if span else f"all of {source}" for source, span in withheld]
-        words += f" Withheld: {and_list(listed)} (seconds from the start)."
+        words += f" Withheld: {join_words(listed)} (seconds from the start)."
     spans = solution.stationary
     if len(spans):
         stops = format_count(len(spans), "stop" if recording.platform == "vehicle" else "stance")
@@ -70,7 +70,7 @@ def describe_run(recording: Recording, solutions: Mapping[str, Solution], withhe
     if outages:
         listed = [f"{a:.0f} to {b:.0f} s" for a, b in outages[:_MAX_OUTAGES]]
         more = [f"{len(outages) - _MAX_OUTAGES} more"] if len(outages) > _MAX_OUTAGES else []
-        words += f" There were no GNSS fixes from {and_list([*listed, *more])}."
+        words += f" There were no GNSS fixes from {join_words([*listed, *more])}."
     excluded = sum(int(part.count) for part in solution.excluded)
     if excluded:
         words += f" Excluded as faulty: {format_count(excluded, 'measurement')}."
@@ -93,12 +93,12 @@ def list_tiles(recording: Recording, solutions: Mapping[str, Solution], errors: 
     several = len(solutions) > 1
     for name, solution in solutions.items():
         if name in errors:
-            value = f"{wording.number(rms(errors[name].horizontal), 3)} m"
+            value = f"{wording.format_number(compute_rms(errors[name].horizontal), 3)} m"
             out.append((value, f"horizontal error, RMS{', ' + name if several else ''}"))
         else:
             sd = solution.trajectory(joint=False).sd_p
             if sd is not None:
-                value = f"{wording.number(float(np.median(np.hypot(sd[:, 0], sd[:, 1]))), 3)} m"
+                value = f"{wording.format_number(float(np.median(np.hypot(sd[:, 0], sd[:, 1]))), 3)} m"
                 out.append((value, f"horizontal sigma, median{', ' + name if several else ''}"))
     if not several:
         seconds = sum(next(iter(solutions.values())).timings.values())
@@ -116,18 +116,18 @@ def describe_sigma(name: str, errors: Errors) -> Markup:
         return page.paragraph(Note("sigma.not_judged", words), "verdict")
     worst = select_verdict(verdicts, "too small") or select_verdict(verdicts, "unclear")
     shown = worst or verdicts
-    measured = and_list(
+    measured = join_words(
         [f"{j.block} errors are {j.size:.2f} sigma rms, {100 * j.inside:.1f} % within 3 sigma" for j in shown]
     )
     measured += " (a Gaussian: 1 and 99.7 %)"
-    blocks = and_list([j.block for j in shown])
+    blocks = join_words([j.block for j in shown])
     if worst and worst[0].verdict == "too small":
         when = " at times" if all(j.inside > 0.9 for j in worst) else ""
         words = f"{name}: the stated sigma is too small{when}, of {blocks}: {measured}."
         words += " Errors of the truth itself count here as well."
         return page.paragraph(Note("sigma.too_small", words), "verdict bad")
     if worst:
-        alike = and_list([format_count(round(j.effective), "independent value") for j in worst])
+        alike = join_words([format_count(round(j.effective), "independent value") for j in worst])
         words = (
             f"{name}: whether sigma of {blocks} is consistent stays open: {measured}, but correlated over so long that "
             f"they count as {alike} only."
@@ -135,7 +135,7 @@ def describe_sigma(name: str, errors: Errors) -> Markup:
         return page.paragraph(Note("sigma.unclear", words), "verdict")
     seen = {j.block for j in verdicts}
     unseen = [what for what in ("position", "velocity", "attitude") if what not in seen]
-    rest = f" Nothing is there to judge {and_list(unseen)} by." if unseen else ""
+    rest = f" Nothing is there to judge {join_words(unseen)} by." if unseen else ""
     if all(j.verdict == "cautious" for j in verdicts):
         return page.paragraph(
             Note("sigma.cautious", f"{name}: the stated sigma is cautious: {measured}.{rest}"), "verdict"

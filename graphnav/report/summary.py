@@ -10,15 +10,15 @@ from markupsafe import Markup
 
 from graphnav.core.notes import Note, format_count
 from graphnav.core.rotation import Array
-from graphnav.estimation.noise.apply import row_weights
+from graphnav.estimation.noise.apply import select_weights
 from graphnav.estimation.solution import Solution
-from graphnav.evaluation.segments import relative_errors, rms
+from graphnav.evaluation.segments import compute_relative_errors, compute_rms
 from graphnav.recording import Recording
 from graphnav.report import page, wording
-from graphnav.report.consistency import consistency
-from graphnav.report.pictures import ENU, fixes_of
+from graphnav.report.consistency import summarise_record
+from graphnav.report.pictures import ENU, select_fixes
 from graphnav.report.tables import Withheld
-from graphnav.report.wording import Quantity, and_list
+from graphnav.report.wording import Quantity, join_words
 
 if TYPE_CHECKING:
     from graphnav.evaluation.metrics import Errors
@@ -38,7 +38,7 @@ _SHOWS = {
 }
 
 
-def verdicts(solution: Solution, errors: Errors | None) -> Markup:
+def tabulate_verdicts(solution: Solution, errors: Errors | None) -> Markup:
     """Accuracy of position, velocity and attitude, and whether the stated sigma is consistent."""
     found = _judge_by_records(solution) | ({} if errors is None else _judge_by_truth(errors))
     nothing = ("", "nothing is there to judge it by")
@@ -51,12 +51,12 @@ def _judge_by_truth(errors: Errors) -> dict[str, tuple[str, str]]:
     from graphnav.evaluation.sigmas import PARTS, judge_sigmas, select_verdict
 
     # a truth may have no heights
-    up = f", {wording.number(rms(errors.p[:, 2]), 3)} m up" if np.isfinite(errors.p[:, 2]).any() else ""
+    up = f", {wording.format_number(compute_rms(errors.p[:, 2]), 3)} m up" if np.isfinite(errors.p[:, 2]).any() else ""
     sizes = {
-        "position": f"{wording.number(rms(errors.horizontal), 3)} m rms horizontal{up}",
-        "velocity": f"{wording.number(rms(np.linalg.norm(errors.v, axis=1)), 3)} m/s rms",
-        "attitude": f"{wording.number(rms(np.degrees(errors.rph[:, :2])), 3)} deg rms roll and pitch, "
-        f"{wording.number(rms(np.degrees(errors.rph[:, 2])), 3)} deg heading",
+        "position": f"{wording.format_number(compute_rms(errors.horizontal), 3)} m rms horizontal{up}",
+        "velocity": f"{wording.format_number(compute_rms(np.linalg.norm(errors.v, axis=1)), 3)} m/s rms",
+        "attitude": f"{wording.format_number(compute_rms(np.degrees(errors.rph[:, :2])), 3)} deg rms roll and pitch, "
+        f"{wording.format_number(compute_rms(np.degrees(errors.rph[:, 2])), 3)} deg heading",
     }
     every = judge_sigmas(errors)
     out = {}
@@ -74,7 +74,7 @@ def _judge_by_records(solution: Solution) -> dict[str, tuple[str, str]]:
     out = {}
     for block, kinds in _SHOWS.items():
         for kind in kinds:
-            c = consistency(solution.records[kind]) if kind in solution.records else None
+            c = summarise_record(solution.records[kind]) if kind in solution.records else None
             if c is None or c.count - c.rejected < 10 or not np.isfinite(c.mean_nis):
                 continue
             bad = c.mean_nis / c.dof > (1.5 if c.kind == "innovation" else 1.3)
@@ -84,7 +84,7 @@ def _judge_by_records(solution: Solution) -> dict[str, tuple[str, str]]:
     return out
 
 
-def sigma_table(solution: Solution) -> list[Markup]:
+def tabulate_sigmas(solution: Solution) -> list[Markup]:
     """The stated 1-sigma below which half, 95 % and all of the keyframes lie."""
     track = solution.trajectory(joint=False)
     rows: list[list[Any]] = []
@@ -102,12 +102,12 @@ def sigma_table(solution: Solution) -> list[Markup]:
         deg = np.degrees(track.sd_rph)
         add("roll, pitch", "deg", np.maximum(deg[:, 0], deg[:, 1]))
         add("heading", "deg", deg[:, 2])
-    return [page.heading("Stated 1-sigma"), page.table(["of", "50 %", "95 %", "largest"], rows)] if rows else []
+    return [page.heading("Stated 1-sigma"), page.format_table(["of", "50 %", "95 %", "largest"], rows)] if rows else []
 
 
 def fix_table(recording: Recording, solution: Solution, withheld: Withheld) -> list[Markup]:
     """Fixes of each kind: number, excluded or used, longest gap, largest residual."""
-    fixes, nan = fixes_of(recording, solution), float("nan")
+    fixes, nan = select_fixes(recording, solution), float("nan")
     if fixes is None:
         return []
     gone = np.zeros(len(fixes.t), dtype=bool)
@@ -115,7 +115,7 @@ def fix_table(recording: Recording, solution: Solution, withheld: Withheld) -> l
         if source == "gnss":
             gone |= True if span is None else (fixes.t >= span[0]) & (fixes.t <= span[1])
     record = solution.records.get("gnss_position")
-    at = _rows_at(fixes.t + recording.start, None if record is None else record.t)
+    at = _find_rows(fixes.t + recording.start, None if record is None else record.t)
     kinds = {**fixes.kinds, **({"all": np.ones(len(gone), bool)} if len(fixes.kinds) > 1 else {})}
     rows = []
     for kind, of_it in kinds.items():
@@ -135,7 +135,7 @@ def fix_table(recording: Recording, solution: Solution, withheld: Withheld) -> l
     head.append("stated [m]")
     if recording.gnss is not None and recording.gnss.satellites is not None:
         head += ["satellites", "fewest"]
-    out = [page.heading("Fixes"), page.table(head, rows)]
+    out = [page.heading("Fixes"), page.format_table(head, rows)]
     if "gnss_code" in solution.records:
         out.append(page.paragraph("Raw observations are used in place of the fixes.", "soft"))
     elif any(row[4] < row[1] - row[3] for row in rows):
@@ -155,7 +155,7 @@ def _list_stated(recording: Recording, rows: Array) -> list[Any]:
     return out
 
 
-def separation_table(solution: Solution) -> list[Markup]:
+def tabulate_separation(solution: Solution) -> list[Markup]:
     """Forward filter minus the information after it, per axis: its size, and that over its own sigma."""
     if solution.separation is None:
         return []
@@ -165,15 +165,17 @@ def separation_table(solution: Solution) -> list[Markup]:
         known = np.isfinite(value)
         if known.any():
             size = np.abs(value[known])
-            rows.append([axis, *(float(np.quantile(size, q)) for q in (0.5, 0.95, 1.0)), rms(size / sigma[known])])
+            rows.append(
+                [axis, *(float(np.quantile(size, q)) for q in (0.5, 0.95, 1.0)), compute_rms(size / sigma[known])]
+            )
     if not rows:
         return []
     note = "Forward filter less what comes after each keyframe; over its sigma it is 1 (rms) where sigma is true."
     head = ["axis", "50 % [m]", "95 % [m]", "largest [m]", "over sigma, rms"]
-    return [page.heading("Combined separation"), page.table(head, rows), page.paragraph(note, "soft")]
+    return [page.heading("Combined separation"), page.format_table(head, rows), page.paragraph(note, "soft")]
 
 
-def _rows_at(t: Array, of: Array | None) -> np.ndarray:
+def _find_rows(t: Array, of: Array | None) -> np.ndarray:
     """Row of `of` at each time, -1 where there is none within a millisecond."""
     if of is None or not len(of):
         return np.full(len(t), -1)
@@ -181,7 +183,7 @@ def _rows_at(t: Array, of: Array | None) -> np.ndarray:
     return np.where(np.abs(of[k] - t) <= 1e-3, k, -1)
 
 
-def left_out(solution: Solution, start: float) -> list[Markup]:
+def describe_excluded(solution: Solution, start: float) -> list[Markup]:
     """What was excluded and why, in three lines: the largest spans, the rest together, what was down-weighted."""
     spans = sorted(solution.excluded, key=lambda p: -p.count)
     some = spans[:_LINES] if len(spans) <= _LINES else spans[: _LINES - 1]
@@ -198,26 +200,35 @@ def left_out(solution: Solution, start: float) -> list[Markup]:
     less = [
         f"{np.count_nonzero((w > 0) & (w < 0.5))} of {name}"
         for name, record in solution.records.items()
-        if np.any(((w := row_weights(record.t, solution.noise, name)) > 0) & (w < 0.5))
+        if np.any(((w := select_weights(record.t, solution.noise, name)) > 0) & (w < 0.5))
     ]
     if less and len(lines) < _LINES:
-        lines.append(f"less than half weight, because they are farther off than chance allows: {and_list(less)}")
+        lines.append(f"less than half weight, because they are farther off than chance allows: {join_words(less)}")
     return [page.heading("Left out"), page.bullets(lines or [Note("left_out.nothing", "Nothing was left out.")])]
 
 
-def links(files: Sequence[str]) -> list[Markup]:
+def list_links(files: Sequence[str]) -> list[Markup]:
     """Links to the files beside the page."""
     return [page.links(files)] if files else []
 
 
-def relative_tables(errors: Mapping[str, Errors]) -> list[Markup]:
+def tabulate_relative_errors(errors: Mapping[str, Errors]) -> list[Markup]:
     """Relative errors by length of segment, where there is a truth."""
     rows = [
-        [page.solver(name), Quantity(f"{r.length:g}"), r.count, r.rms, r.percent, r.p95, r.largest, r.heading_rms]
+        [
+            page.format_solver(name),
+            Quantity(f"{r.length:g}"),
+            r.count,
+            r.rms,
+            r.percent,
+            r.p95,
+            r.largest,
+            r.heading_rms,
+        ]
         for name, e in errors.items()
-        for r in relative_errors(e)
+        for r in compute_relative_errors(e)
     ]
     head = ["solver", "segment [m]", "count", "RMS [m]", "% of length", "95 % [m]", "largest [m]", "heading RMS [deg]"]
     if not rows:
         return []
-    return [page.heading("Relative error by segment length"), page.table(head, rows)]
+    return [page.heading("Relative error by segment length"), page.format_table(head, rows)]

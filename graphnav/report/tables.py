@@ -8,19 +8,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from markupsafe import Markup
 
-from graphnav.core.notes import Note, key_of
+from graphnav.core.notes import Note, get_key
 from graphnav.core.rotation import Array
-from graphnav.estimation.names import components
+from graphnav.estimation.names import name_components
 from graphnav.estimation.noise.model import INTERVALS, TABULATED
 from graphnav.estimation.solution import ParameterEstimate, Solution
-from graphnav.estimation.stops import stops_of_solution
-from graphnav.evaluation.against import own_solutions
-from graphnav.evaluation.segments import rms
+from graphnav.estimation.stops import list_solution_stops
+from graphnav.evaluation.against import select_own
+from graphnav.evaluation.segments import compute_rms
 from graphnav.recording import Recording
 from graphnav.report import page, wording
-from graphnav.report.consistency import CONSISTENCY_HEAD, consistency, consistency_row, mean_or_nan
+from graphnav.report.consistency import CONSISTENCY_HEAD, compute_mean, summarise_record, tabulate_record
 from graphnav.report.plots import Spans
-from graphnav.report.wording import Quantity, and_list
+from graphnav.report.wording import Quantity, join_words
 
 if TYPE_CHECKING:
     from graphnav.estimation.noise.table import FigureRow
@@ -31,12 +31,12 @@ _UNFOLDED_ROWS = 10  # excluded spans and stops shown; the others are folded
 Withheld = Sequence[tuple[str, tuple[float, float] | None]]
 
 
-def constraint_table(solution: Solution) -> list[Markup]:
+def tabulate_constraints(solution: Solution) -> list[Markup]:
     """Counts of everything used, and the consistency of each record."""
     out = []
-    rows = [[kind, *consistency_row(consistency(record))] for kind, record in solution.records.items()]
+    rows = [[kind, *tabulate_record(summarise_record(record))] for kind, record in solution.records.items()]
     if rows:
-        out.append(page.table(["constraint", *CONSISTENCY_HEAD], rows))
+        out.append(page.format_table(["constraint", *CONSISTENCY_HEAD], rows))
         kinds = {r.kind for r in solution.records.values()}
         note = "A Gaussian leaves 0.27 % outside 3 sigma. "
         if "innovation" in kinds:
@@ -45,7 +45,7 @@ def constraint_table(solution: Solution) -> list[Markup]:
             note += "A fit takes up part of the noise: the mean NIS of its residuals lies below the components."
         out.append(page.paragraph(note, "soft"))
     if solution.counts:
-        counted = and_list([f"{count} {kind}" for kind, count in solution.counts.items()])
+        counted = join_words([f"{count} {kind}" for kind, count in solution.counts.items()])
         out.append(page.paragraph(f"Factors or updates by kind: {counted}.", "soft"))
     return out
 
@@ -61,21 +61,21 @@ COMPARED = ("horizontal RMS [m]", "horizontal largest [m]", "up RMS [m]", "speed
             "heading RMS [deg]", "error / sigma, RMS")  # fmt: skip
 
 
-def accuracy_row(errors: Errors) -> list[float]:
+def tabulate_accuracy(errors: Errors) -> list[float]:
     """The numbers under `COMPARED`."""
     rph = np.degrees(errors.rph)
     return [
-        rms(errors.horizontal),
+        compute_rms(errors.horizontal),
         _find_largest(errors.horizontal),
-        rms(errors.p[:, 2]),
-        rms(np.linalg.norm(errors.v, axis=1)),
-        rms(rph[:, :2]),
-        rms(rph[:, 2]),
-        float(np.sqrt(mean_or_nan(errors.nees_axis))),
+        compute_rms(errors.p[:, 2]),
+        compute_rms(np.linalg.norm(errors.v, axis=1)),
+        compute_rms(rph[:, :2]),
+        compute_rms(rph[:, 2]),
+        float(np.sqrt(compute_mean(errors.nees_axis))),
     ]
 
 
-def span_row(errors: Errors, span: tuple[float, float], start: float) -> list[float]:
+def tabulate_span(errors: Errors, span: tuple[float, float], start: float) -> list[float]:
     """The numbers under `COMPARED_SPAN`, over a span in seconds from the recording's start."""
     t = errors.t - start
     rows = np.flatnonzero((t >= span[0]) & (t <= span[1]))
@@ -85,40 +85,42 @@ def span_row(errors: Errors, span: tuple[float, float], start: float) -> list[fl
     h = errors.horizontal[rows]
     travelled = float(errors.distance[rows[-1]] - errors.distance[rows[0]])
     return [
-        rms(h),
+        compute_rms(h),
         _find_largest(h),
         float(h[-1]),
         100.0 * _find_largest(h) / travelled if travelled >= 1.0 else float("nan"),
         _find_largest(errors.p[rows, 2]),
         float(np.degrees(_find_largest(errors.rph[rows, 2]))),
-        float(np.sqrt(mean_or_nan(errors.nees_axis[rows]))),
+        float(np.sqrt(compute_mean(errors.nees_axis[rows]))),
     ]
 
 
-def accuracy_tables(
+def tabulate_all_accuracy(
     errors: Mapping[str, Errors], withheld: Withheld, start: float, outages: Spans = ()
 ) -> list[Markup]:
     """A table of all solvers over the whole run, and one for each withheld span."""
     if not errors:
         return []
-    rows = [[page.solver(name), *accuracy_row(e)] for name, e in errors.items()]
-    out = [page.heading("Whole recording"), page.table(["solver", *COMPARED], rows, best=range(1, 7))]
+    rows = [[page.format_solver(name), *tabulate_accuracy(e)] for name, e in errors.items()]
+    out = [page.heading("Whole recording"), page.format_table(["solver", *COMPARED], rows, best=range(1, 7))]
     gone = list(dict.fromkeys(span for _, span in withheld if span is not None))
     spans = [("Withheld", span) for span in gone]
     spans += [("No GNSS", (a, b)) for a, b in outages if not any(c < b and d > a for c, d in gone)]
     if len(errors) == 1 and spans:
         (only,) = errors.values()
-        rows = [[Quantity(f"{a:.1f} to {b:.1f} s"), what, *span_row(only, (a, b), start)] for what, (a, b) in spans]
+        rows = [
+            [Quantity(f"{a:.1f} to {b:.1f} s"), what, *tabulate_span(only, (a, b), start)] for what, (a, b) in spans
+        ]
         return [
             *out,
             page.heading("Spans without a source"),
-            page.table(["span", "what", *COMPARED_SPAN], rows),
+            page.format_table(["span", "what", *COMPARED_SPAN], rows),
             *_list_notes(errors),
         ]
     for what, (a, b) in spans:
-        rows = [[page.solver(name), *span_row(e, (a, b), start)] for name, e in errors.items()]
+        rows = [[page.format_solver(name), *tabulate_span(e, (a, b), start)] for name, e in errors.items()]
         out.append(page.heading(f"{what} {a:g} to {b:g} s" if what == "Withheld" else f"{what} {a:.1f} to {b:.1f} s"))
-        out.append(page.table(["solver", *COMPARED_SPAN], rows, best=range(1, 7)))
+        out.append(page.format_table(["solver", *COMPARED_SPAN], rows, best=range(1, 7)))
     return [*out, *_list_notes(errors)]
 
 
@@ -133,7 +135,7 @@ NOISE_HEAD = ("figure", "stated", "used", "unit", "times stated sigma", "1-sigma
               "degrees of freedom", "expected beforehand")  # fmt: skip
 
 
-def noise_tables(rows: Sequence[FigureRow], solution: Solution) -> list[Markup]:
+def tabulate_noise(rows: Sequence[FigureRow], solution: Solution) -> list[Markup]:
     """The noise model, and the rows that are down-weighted."""
     noise = solution.noise
     if not rows and not noise.weights:
@@ -154,7 +156,7 @@ def noise_tables(rows: Sequence[FigureRow], solution: Solution) -> list[Markup]:
             ]
             for row in rows
         ]
-        out.append(page.table(NOISE_HEAD, cells))
+        out.append(page.format_table(NOISE_HEAD, cells))
         note = (
             "Stated figures of fixes are medians of their sigmas. The white part and the lasting parts add up as "
             "variances. A figure with few degrees of freedom is mostly what was expected beforehand."
@@ -166,14 +168,14 @@ def noise_tables(rows: Sequence[FigureRow], solution: Solution) -> list[Markup]:
     less = [
         f"Rows of {name} with less weight, because they are off by more than chance allows once in a thousand times: "
         f"{np.count_nonzero(some.weight < 1.0)} of {len(solution.records[name].t)}; the least counts as "
-        f"{wording.number(float(some.weight.min()), 2)} of a row."
+        f"{wording.format_number(float(some.weight.min()), 2)} of a row."
         for name, some in noise.weights.items()
         if len(some.t) and name in solution.records
     ]
     less += [
         f"Intervals between keyframes with more noise of the {_OF_IMU[name]} than chance allows once in a thousand "
         f"times: {len(some.t)} of {len(solution.t) - 1}; at most "
-        f"{wording.number(float(np.sqrt(1.0 / some.weight.min())), 2)} times the usual noise."
+        f"{wording.format_number(float(np.sqrt(1.0 / some.weight.min())), 2)} times the usual noise."
         for name, some in noise.weights.items()
         if len(some.t) and name in _OF_IMU
     ]
@@ -184,11 +186,11 @@ def _format_range(log_factor: float, sigma: float) -> Quantity:
     """1-sigma range of a factor on sigma, from that of the logarithm of the factor on the variance."""
     if sigma <= 0.0:
         return Quantity("-")
-    low, high = (wording.number(float(np.exp(0.5 * (log_factor + s * sigma))), 2) for s in (-1.0, 1.0))
+    low, high = (wording.format_number(float(np.exp(0.5 * (log_factor + s * sigma))), 2) for s in (-1.0, 1.0))
     return Quantity(f"{low} to {high}")
 
 
-def excluded_table(solution: Solution, start: float) -> list[Markup]:
+def tabulate_excluded(solution: Solution, start: float) -> list[Markup]:
     """Measurements that the solver excluded, when and why."""
     parts = solution.excluded
     if not parts:
@@ -196,18 +198,18 @@ def excluded_table(solution: Solution, start: float) -> list[Markup]:
     rows = [
         [Quantity(f"{p.t_start - start:.1f} to {p.t_end - start:.1f} s"), p.kind, int(p.count), p.reason] for p in parts
     ]
-    return [page.heading("What was excluded"), *_long_table(["when", "what", "rows", "why"], rows)]
+    return [page.heading("What was excluded"), *_format_long_table(["when", "what", "rows", "why"], rows)]
 
 
-def _long_table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> list[Markup]:
+def _format_long_table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> list[Markup]:
     """A table whose later rows are folded."""
-    out = [page.table(head, rows[:_UNFOLDED_ROWS])]
+    out = [page.format_table(head, rows[:_UNFOLDED_ROWS])]
     if len(rows) > _UNFOLDED_ROWS:
-        out.append(page.fold(f"{len(rows) - _UNFOLDED_ROWS} more", [page.table(head, rows[_UNFOLDED_ROWS:])]))
+        out.append(page.fold(f"{len(rows) - _UNFOLDED_ROWS} more", [page.format_table(head, rows[_UNFOLDED_ROWS:])]))
     return out
 
 
-def rejected_table(solution: Solution, start: float) -> list[Markup]:
+def tabulate_rejected(solution: Solution, start: float) -> list[Markup]:
     """Every rejected measurement with its time; the largest ones if there are many."""
     rows: list[tuple[float, list[Any]]] = []
     for kind, r in solution.records.items():
@@ -219,7 +221,7 @@ def rejected_table(solution: Solution, start: float) -> list[Markup]:
     if not rows:
         return []
     largest = sorted(rows, key=lambda row: -row[1][3])[:_MAX_ROWS]
-    table = page.table(
+    table = page.format_table(
         ["when", "constraint", "largest component", "over sigma"], [r for _, r in sorted(largest, key=lambda r: r[0])]
     )
     many = len(rows)
@@ -229,7 +231,7 @@ def rejected_table(solution: Solution, start: float) -> list[Markup]:
     return [page.fold(words, [table])]
 
 
-def nees_table(errors: Mapping[str, Errors]) -> list[Markup]:
+def tabulate_nees(errors: Mapping[str, Errors]) -> list[Markup]:
     """Mean NEES per degree of freedom and the share of epochs inside the 95 % region, per solver."""
     from graphnav.evaluation.metrics import average_nees
     from graphnav.evaluation.sigmas import judge_sigmas
@@ -253,28 +255,28 @@ def nees_table(errors: Mapping[str, Errors]) -> list[Markup]:
             if found is not None:
                 inside, one = Quantity(f"{100 * found.inside:.1f} %"), verdicts[words]
                 worth = Quantity(f"{one.effective:.0f}")
-                rows.append([page.solver(name), words, found.mean, inside, found.n, worth, says[one.verdict]])
+                rows.append([page.format_solver(name), words, found.mean, inside, found.n, worth, says[one.verdict]])
     head = ["solver", "of", "mean NEES / dof", "epochs inside 95 %", "epochs", "worth independent", "what it says"]
-    return [page.table(head, rows)] if rows else []
+    return [page.format_table(head, rows)] if rows else []
 
 
-def parameter_table(parameters: Mapping[str, ParameterEstimate]) -> list[Markup]:
+def tabulate_parameters(parameters: Mapping[str, ParameterEstimate]) -> list[Markup]:
     """Constant and slowly varying parameters: last value and sigma, and their priors."""
     rows = []
     for name, p in parameters.items():
-        for k, one in enumerate(components(name, p.value.shape[1], p.unit)):
+        for k, one in enumerate(name_components(name, p.value.shape[1], p.unit)):
             value, sigma = one.scale * float(p.value[-1, k]), one.scale * float(p.sigma[-1, k])
             known = "yes" if p.observable[k] else "no: mostly the prior"
             before = one.scale * float(p.prior_sigma[k])
             shown = [wording.format_to_sigma(value, sigma), wording.format_to_sigma(sigma, sigma), before]
             rows.append([one.words, *shown, one.unit, known])
     head = ["parameter", "value", "sigma", "sigma before", "unit", "seen by the data"]
-    return [page.table(head, rows)] if rows else []
+    return [page.format_table(head, rows)] if rows else []
 
 
 def run_table(solutions: Mapping[str, Solution]) -> list[Markup]:
     """Seconds by stage, iterations and cost, one column per solver; the reason why each stopped."""
-    every, solutions = solutions, own_solutions(solutions)
+    every, solutions = solutions, select_own(solutions)
     stages = list(dict.fromkeys(stage for s in solutions.values() for stage in s.timings))
 
     def seconds(solution: Solution, stage: str) -> Quantity | None:
@@ -288,15 +290,15 @@ def run_table(solutions: Mapping[str, Solution]) -> list[Markup]:
     ]
     several = len(solutions) > 1
     notes = [f"{name} stopped: {s.stopped}" for name, s in solutions.items() if s.stopped and several]
-    own = {name: [note for note in s.notes if key_of(note) not in TABULATED] for name, s in every.items()}
+    own = {name: [note for note in s.notes if get_key(note) not in TABULATED] for name, s in every.items()}
     shared = [note for note in own[next(iter(solutions))] if all(note in own[name] for name in solutions)]
     theirs = [f"{name}: {note}" for name, some in own.items() for note in some if note not in shared]
-    table = page.table(["stage", *(page.solver(name) for name in solutions)], rows)
+    table = page.format_table(["stage", *(page.format_solver(name) for name in solutions)], rows)
     lines = [*notes, *shared, *theirs]
     return [page.columns([[table], [page.bullets(lines)]]) if lines else table]
 
 
-def metric_tables(metrics: Mapping[str, Any] | None, name: str = "") -> list[Markup]:
+def tabulate_metrics(metrics: Mapping[str, Any] | None, name: str = "") -> list[Markup]:
     """All measures of the evaluation, in folded tables."""
     if not metrics:
         return []
@@ -306,13 +308,13 @@ def metric_tables(metrics: Mapping[str, Any] | None, name: str = "") -> list[Mar
     ]
     spans = metrics.get("spans")
     if isinstance(spans, Sequence) and spans and isinstance(spans[0], Mapping):
-        inner.append(page.table(list(spans[0]), [[s.get(k) for k in spans[0]] for s in spans]))
+        inner.append(page.format_table(list(spans[0]), [[s.get(k) for k in spans[0]] for s in spans]))
     return [page.fold(f"All measures{' of ' if name else ''}{name}", inner)]
 
 
 def stop_table(solution: Solution, start: float, decided_by: str) -> list[Markup]:
     """Every stop: the share that each detector found, the number of rows by constraint, and which detectors decide."""
-    stops = stops_of_solution(solution)
+    stops = list_solution_stops(solution)
     if not stops:
         return []
     rows = [
@@ -327,7 +329,10 @@ def stop_table(solution: Solution, start: float, decided_by: str) -> list[Markup
     note = f"Decided by {decided_by}. Share: of the stop that a detector by itself calls stationary."
     if len(stops) > _MAX_ROWS:
         note += f" {len(stops) - _MAX_ROWS} more are in detections.csv."
-    return [*_long_table(["stands from", "for", "share by detector", "rows"], rows), page.paragraph(note, "soft")]
+    return [
+        *_format_long_table(["stands from", "for", "share by detector", "rows"], rows),
+        page.paragraph(note, "soft"),
+    ]
 
 
 def list_findings(recording: Recording, findings: Sequence[str]) -> list[Markup]:

@@ -13,10 +13,10 @@ def show(value: Any) -> Any:
         return "-"
     if isinstance(value, bool):
         return "yes" if value else "no"
-    return number(value) if isinstance(value, float) else value
+    return format_number(value) if isinstance(value, float) else value
 
 
-def number(value: float, digits: int = 4) -> str:
+def format_number(value: float, digits: int = 4) -> str:
     """A number for people: `digits` significant digits, whole from a thousand on, '-' where there is none."""
     if not math.isfinite(value):
         return "-"
@@ -36,11 +36,11 @@ class Quantity(str):
 def format_to_sigma(value: float, sigma: float) -> Quantity:
     """A value with as many decimals as its sigma justifies."""
     if not (math.isfinite(value) and math.isfinite(sigma)) or sigma <= 0:
-        return Quantity(number(value))
+        return Quantity(format_number(value))
     places = 1 - math.floor(math.log10(sigma))
     return Quantity(f"{value:.{max(places, 0)}f}" if places <= 8 else f"{value:.4g}")
 
 
-def and_list(parts: Sequence[str]) -> str:
+def join_words(parts: Sequence[str]) -> str:
     """a, b and c"""
     return parts[0] if len(parts) == 1 else ", ".join(parts[:-1]) + " and " + parts[-1]

@@ -45,12 +45,12 @@ SENSOR = Sensor(
 )
 
 
-def standard_height(series: Series) -> Array:
+def compute_standard_height(series: Series) -> Array:
     """(N,) m in the standard atmosphere, from pressure, or the stated height where a row has no pressure."""
     of_pressure = _SCALE_HEIGHT * (1.0 - (series["pressure"] / ATMOSPHERE) ** _POWER)
     return np.where(np.isfinite(of_pressure), of_pressure, series["height"])
 
 
-def standard_pressure(height: Array) -> Array:
-    """(N,) Pa at heights (N,) m of the standard atmosphere: the inverse of `standard_height`."""
+def compute_standard_pressure(height: Array) -> Array:
+    """(N,) Pa at heights (N,) m of the standard atmosphere: the inverse of `compute_standard_height`."""
     return np.asarray(ATMOSPHERE * (1.0 - height / _SCALE_HEIGHT) ** (1.0 / _POWER))

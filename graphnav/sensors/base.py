@@ -74,14 +74,14 @@ class Sensor:
         """What is stored: not the model, which is made of the rest."""
         return {name: value for name, value in self.__dict__.items() if name != "table"}
 
-    def usable(self, values: Array) -> NDArray[np.bool_]:
+    def mask_usable(self, values: Array) -> NDArray[np.bool_]:
         """(N,) whether rows (N, k) are complete in one of the sets of columns that `needs` lists."""
         there, out = np.isfinite(values), np.zeros(len(values), dtype=bool)
         for some in self.needs:
             out |= there[:, [self.names.index(name) for name in some]].all(axis=1)
         return out
 
-    def within_bounds(self, values: Array) -> Array:
+    def mask_outside_bounds(self, values: Array) -> Array:
         """Rows (N, k) with NaN in place of values outside the bounds."""
         lowest, highest = np.array([(c.lowest, c.highest) for c in self.columns]).T
         with np.errstate(invalid="ignore"):

@@ -27,7 +27,7 @@ Positive = Annotated[float, Strict(), Field(allow_inf_nan=False, gt=0), AfterVal
 NotNegative = Annotated[float, Strict(), Field(allow_inf_nan=False, ge=0), AfterValidator(_is_number)]
 
 
-def three_numbers(value: Any) -> Any:
+def check_three_numbers(value: Any) -> Any:
     """Check a vector of three numbers; ValueError otherwise."""
     if not isinstance(value, list | tuple) or len(value) != 3:
         raise ValueError("must be three numbers in brackets")
@@ -38,7 +38,7 @@ def three_numbers(value: Any) -> Any:
     return tuple(float(x) for x in value)
 
 
-Vector = Annotated[tuple[float, float, float], BeforeValidator(three_numbers)]
+Vector = Annotated[tuple[float, float, float], BeforeValidator(check_three_numbers)]
 
 TIME = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 ANGLE = {"deg": np.pi / 180.0, "rad": 1.0}
@@ -52,11 +52,11 @@ class TomlTable(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
-def _one_or_more(value: Any) -> Any:
+def _check_one_or_more(value: Any) -> Any:
     return (value,) if isinstance(value, str) else value
 
 
-Topics = Annotated[tuple[str, ...], BeforeValidator(_one_or_more)]
+Topics = Annotated[tuple[str, ...], BeforeValidator(_check_one_or_more)]
 
 
 class Keep(TomlTable):

@@ -1,6 +1,6 @@
 """Simulated recordings with exact truth: `simulate("li2024", seed=1)`.
 
-A scenario is a function of a seed and a few options; `scenarios()` lists them. All results are labelled as simulated,
+A scenario is a function of a seed and a few options; `list_scenarios()` lists them. All results are labelled as simulated,
 also in the recording's name.
 """
 
@@ -14,12 +14,12 @@ from typing import Any
 from graphnav.core.complaints import suggest_nearest
 from graphnav.core.errors import ConfigError
 from graphnav.simulation.result import Simulated
-from graphnav.simulation.scenarios import Scenario, scenarios
+from graphnav.simulation.scenarios import Scenario, list_scenarios
 
-__all__ = ["Scenario", "Simulated", "catalogue", "options_from", "scenario", "scenarios", "simulate"]
+__all__ = ["Scenario", "Simulated", "describe_scenarios", "get_scenario", "list_scenarios", "parse_options", "simulate"]
 
 
-def scenario(name: str) -> Scenario:
+def get_scenario(name: str) -> Scenario:
     """The scenario of that name.
 
     Raises
@@ -27,7 +27,7 @@ def scenario(name: str) -> Scenario:
     ConfigError
         If there is none.
     """
-    known = scenarios()
+    known = list_scenarios()
     if name not in known:
         raise ConfigError(f"no scenario '{name}'; {suggest_nearest(name, list(known))}", key="simulation.unknown")
     return known[name]
@@ -55,8 +55,8 @@ def simulate(name: str, seed: int = 0, **options: Any) -> Simulated:
     ConfigError
         For an unknown scenario or option, or an invalid value of an option.
     """
-    one = scenario(name)
-    known = defaults(one)
+    one = get_scenario(name)
+    known = list_defaults(one)
     for key, value in options.items():
         if key not in known:
             raise ConfigError(
@@ -72,7 +72,7 @@ def simulate(name: str, seed: int = 0, **options: Any) -> Simulated:
     return one.run(seed, **options)
 
 
-def defaults(one: Scenario) -> dict[str, Any]:
+def list_defaults(one: Scenario) -> dict[str, Any]:
     """A scenario's options and their defaults."""
     return {p.name: p.default for p in inspect.signature(one.run).parameters.values() if p.name != "seed"}
 
@@ -86,7 +86,7 @@ def _fits_default(value: Any, default: Any) -> bool:
     return isinstance(value, type(default))
 
 
-def options_from(name: str, settings: Sequence[str]) -> dict[str, Any]:
+def parse_options(name: str, settings: Sequence[str]) -> dict[str, Any]:
     """Parse options KEY=VALUE of the command line; values are written as in TOML, text without quotes.
 
     Raises
@@ -94,7 +94,7 @@ def options_from(name: str, settings: Sequence[str]) -> dict[str, Any]:
     ConfigError
         If one is not of that form, or its value is no value.
     """
-    known = defaults(scenario(name))
+    known = list_defaults(get_scenario(name))
     out: dict[str, Any] = {}
     for setting in settings:
         key, sign, text = (part.strip() for part in setting.partition("="))
@@ -110,10 +110,10 @@ def options_from(name: str, settings: Sequence[str]) -> dict[str, Any]:
     return out
 
 
-def catalogue() -> str:
+def describe_scenarios() -> str:
     """Every scenario with its description and options."""
     lines = []
-    for name, one in scenarios().items():
-        options = ", ".join(f"{key}={str(value).lower()}" for key, value in defaults(one).items())
+    for name, one in list_scenarios().items():
+        options = ", ".join(f"{key}={str(value).lower()}" for key, value in list_defaults(one).items())
         lines += [f"{name:<9} {one.about}", f"{'':<9}   --set {options}"]
     return "\n".join(lines)

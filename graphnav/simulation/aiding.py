@@ -11,8 +11,8 @@ from graphnav.core.rotation import Array
 from graphnav.recording import Gnss, Odometer
 from graphnav.simulation.kinematics import Mount, TrueMotion
 from graphnav.simulation.motion import SLIP, Path
-from graphnav.simulation.splines import stream
-from graphnav.simulation.vibration import gauss_markov
+from graphnav.simulation.splines import make_random
+from graphnav.simulation.vibration import draw_gauss_markov
 
 Span = tuple[float, float]
 Three = tuple[float, float, float]
@@ -52,8 +52,8 @@ class GnssModel:
         t0, t1 = motion.t[0], motion.t[-1]
         t = t0 + self.phase + np.arange(int((t1 - t0 - self.phase) * self.rate + 1e-6) + 1) / self.rate
         llh, v = motion.point(t, np.array(self.lever_arm))
-        white, speed = stream(seed, "gnss").standard_normal((2, len(t), 3))
-        slow = gauss_markov(len(t), 1.0 / (self.rate * self.slow_time), stream(seed, "gnss slow"), 3)
+        white, speed = make_random(seed, "gnss").standard_normal((2, len(t), 3))
+        slow = draw_gauss_markov(len(t), 1.0 / (self.rate * self.slow_time), make_random(seed, "gnss slow"), 3)
         gain = np.ones(len(t))
         error = slow * self.slow
         wrong = np.zeros((len(t), 3))
@@ -64,7 +64,7 @@ class GnssModel:
             wrong[inside] += fault.velocity
         error += gain[:, None] * white * self.white
         velocity = None if self.velocity is None else v + wrong + gain[:, None] * speed * self.velocity
-        kept = stream(seed, "gnss dropouts").random(len(t)) >= self.dropouts
+        kept = make_random(seed, "gnss dropouts").random(len(t)) >= self.dropouts
         for a, b in self.outages:
             kept &= ~((t >= a) & (t <= b))
         sd = np.tile(np.hypot(self.white, self.slow), (len(t), 1))
@@ -100,7 +100,7 @@ class OdometerModel:
 
     def read(self, path: Path, mount: Mount, seed: int) -> tuple[Odometer, float]:
         """Simulate the readings of a drive; returns also their scale error."""
-        rng = stream(seed, "odometer")
+        rng = make_random(seed, "odometer")
         scale = self.scale * rng.standard_normal()
         t = path.start + np.arange(int((path.end - path.start) * self.rate + 1e-6) + 1) / self.rate
         half = 0.5 / self.rate

@@ -30,7 +30,7 @@ class Route:
         return xy, np.interp(s, self.s, self.heading)
 
 
-def route(parts: Sequence[tuple[float, float]], heading: float = 0.0) -> Route:
+def make_route(parts: Sequence[tuple[float, float]], heading: float = 0.0) -> Route:
     """From parts (m, deg): each so long, and turning evenly by so much, to the right positive; `heading` in deg."""
     edges = np.concatenate([[0.0], np.cumsum([length for length, _ in parts])])
     turned = heading + np.concatenate([[0.0], np.cumsum([turn for _, turn in parts])])
@@ -41,7 +41,7 @@ def route(parts: Sequence[tuple[float, float]], heading: float = 0.0) -> Route:
     return Route(s, np.concatenate([np.zeros((1, 2)), moved]), psi)
 
 
-def rectangle(perimeter: float, laps: int, corner: float = 0.6, ratio: float = 0.55) -> list[tuple[float, float]]:
+def list_rectangle(perimeter: float, laps: int, corner: float = 0.6, ratio: float = 0.55) -> list[tuple[float, float]]:
     """Parts of a route `laps` times around, to the left, that ends where it began, just after a corner.
 
     `perimeter` counts the arcs of radius `corner`, m; `ratio` is the short side's over the long one's.
@@ -89,7 +89,7 @@ class Cadence:
         return cls(speed, 1.25 * float(np.sqrt(speed)), float(np.clip(0.71 - 0.075 * speed, 0.52, 0.68)))
 
 
-def footsteps(
+def make_footsteps(
     along: Route, cadence: Cadence, start: float, walked: float, end: float, rng: np.random.Generator, *,
     side: float = 0.08, toe_out: float = 6.0, closed: bool = False,
 ) -> Footprints:  # fmt: skip

@@ -23,7 +23,7 @@ from scipy.special import logsumexp
 
 from graphnav.core.rotation import Array
 from graphnav.simulation.footsteps import Footprints
-from graphnav.simulation.splines import centres, spline
+from graphnav.simulation.splines import list_centres, make_spline
 
 STEP = 0.005  # s between coefficients: a shock lasts some 15 ms
 DEGREE = 4  # force and turn acceleration are continuous
@@ -114,10 +114,10 @@ def walk(steps: Footprints, style: Style, sole: Sole, end: float, rng: np.random
     The first stance is rest until the heel lifts, the last is rest after the landing.
     """
     K = len(steps)
-    t = centres(0.0, end, STEP, DEGREE)
+    t = list_centres(0.0, end, STEP, DEGREE)
     strike, off = steps.strike, steps.off
     vary = 1.0 + style.jitter * rng.standard_normal((K, 11))
-    sway = np.deg2rad(0.03) * _sway(len(t), rng, 2)
+    sway = np.deg2rad(0.03) * _draw_sway(len(t), rng, 2)
     # a first and a last stance begin and end as the others do
     typical = float(np.median(off[1:-1] - strike[1:-1]))
     begins = np.where(np.arange(K) == 0, off - typical, strike)
@@ -151,7 +151,7 @@ def walk(steps: Footprints, style: Style, sole: Sole, end: float, rng: np.random
     x = np.column_stack([east, north, up, roll, pitch, psi]) + _make_ring(t, strike[1:], style, rng)
     stances = np.column_stack([begins + _FLAT * (ends - begins), begins + _HEEL_OFF * (ends - begins)])
     stances[0, 0], stances[-1, 1] = 0.0, end
-    return Foot(spline(0.0, STEP, x, DEGREE), 0.0, end, np.column_stack([strike, off]), stances)
+    return Foot(make_spline(0.0, STEP, x, DEGREE), 0.0, end, np.column_stack([strike, off]), stances)
 
 
 def _smooth(t: Array, knots: list[Array], values: list[Array]) -> Array:
@@ -233,7 +233,7 @@ def _make_ring(t: Array, strikes: Array, style: Style, rng: np.random.Generator)
     return out
 
 
-def _sway(count: int, rng: np.random.Generator, columns: int) -> Array:
+def _draw_sway(count: int, rng: np.random.Generator, columns: int) -> Array:
     """(count, columns) of unit size: the sway of a standing person."""
     x = gaussian_filter1d(rng.standard_normal((count, columns)), 0.3 / STEP, axis=0)
     return x / np.sqrt(np.mean(x**2, axis=0))

@@ -9,8 +9,8 @@ import numpy as np
 from graphnav.core.earth import MG
 from graphnav.core.rotation import Array
 from graphnav.recording import ImuNoise
-from graphnav.simulation.splines import stream
-from graphnav.simulation.vibration import gauss_markov
+from graphnav.simulation.splines import make_random
+from graphnav.simulation.vibration import draw_gauss_markov
 
 _DEG = np.pi / 180.0
 DEG_H = _DEG / 3600.0  # rad/s
@@ -48,7 +48,7 @@ class Triad:
         scale = self.scale * rng.standard_normal(3)
         across = self.misalignment * rng.standard_normal((3, 3)) * (1.0 - np.eye(3))
         white = rng.standard_normal((n, 3))
-        drift = gauss_markov(n, dt / self.correlation_time, rng, 3)
+        drift = draw_gauss_markov(n, dt / self.correlation_time, rng, 3)
         steps = rng.standard_normal((n, 3))
         bias = bias + self.instability * drift + self.walk * np.sqrt(dt) * np.cumsum(steps, axis=0)
         M = np.eye(3) + np.diag(scale) + across
@@ -57,7 +57,7 @@ class Triad:
         return (np.round(out / self.step) * self.step if self.step else out), bias
 
 
-def gyroscope(
+def make_gyroscope(
     arw_deg_sqrt_h: float, bias_deg_h: float, *, instability_deg_h: float = 0.0, rrw_deg_h_sqrt_h: float = 0.0,
     scale_ppm: float = 0.0, misalignment_mrad: float = 0.0, range_deg_s: float = np.inf, step_deg_s: float = 0.0,
     correlation_time: float = 300.0,
@@ -70,7 +70,7 @@ def gyroscope(
     )  # fmt: skip
 
 
-def accelerometer(
+def make_accelerometer(
     vrw_ug_sqrt_hz: float, bias_mg: float, *, instability_mg: float = 0.0, walk_mg_sqrt_h: float = 0.0,
     scale_ppm: float = 0.0, misalignment_mrad: float = 0.0, range_g: float = np.inf, step_mg: float = 0.0,
     correlation_time: float = 300.0,
@@ -110,8 +110,8 @@ class SimulatedImu:
 
     def read(self, gyro: Array, accel: Array, seed: int) -> tuple[Array, Array, Array, Array]:
         """(gyro, accel, gyro bias, accel bias), (N, 3) each, of true samples."""
-        g, b_g = self.gyro.read(gyro, self.rate, stream(seed, "gyro"))
-        a, b_a = self.accel.read(accel, self.rate, stream(seed, "accel"))
+        g, b_g = self.gyro.read(gyro, self.rate, make_random(seed, "gyro"))
+        a, b_a = self.accel.read(accel, self.rate, make_random(seed, "accel"))
         return g, a, b_g, b_a
 
     def at(self, rate: float) -> SimulatedImu:
@@ -122,20 +122,20 @@ class SimulatedImu:
 # Consumer-grade, the PwrPak7-E2's EG370N of Li 2024 (table 1), the MIMU of Zhu 2020 (table 1), navigation-grade.
 MEMS = SimulatedImu(
     "MEMS", 100.0,
-    gyroscope(0.3, 700.0, instability_deg_h=8.0, scale_ppm=2000.0, misalignment_mrad=1.0, range_deg_s=250.0,
+    make_gyroscope(0.3, 700.0, instability_deg_h=8.0, scale_ppm=2000.0, misalignment_mrad=1.0, range_deg_s=250.0,
               step_deg_s=250.0 / 32768),
-    accelerometer(150.0, 15.0, instability_mg=0.05, scale_ppm=2000.0, misalignment_mrad=1.0, range_g=4.0,
+    make_accelerometer(150.0, 15.0, instability_mg=0.05, scale_ppm=2000.0, misalignment_mrad=1.0, range_g=4.0,
                   step_mg=4000.0 / 32768),
 )  # fmt: skip
 EG370N = SimulatedImu(
     "MEMS of Li 2024, table 1", 200.0,
-    gyroscope(0.06, 360.0, instability_deg_h=0.8),
-    accelerometer(60.0, 2.0, instability_mg=0.012),
+    make_gyroscope(0.06, 360.0, instability_deg_h=0.8),
+    make_accelerometer(60.0, 2.0, instability_mg=0.012),
 )  # fmt: skip
 # "White noise 0.1 degree/h" and "0.05 mg" are taken as 0.1 deg/sqrt(h) and 50 ug/sqrt(Hz), as data sheets of such
 # sensors state them.
 MIMU = SimulatedImu(
     "MIMU of Zhu 2020, table 1", 400.0,
-    gyroscope(0.1, 3.0, instability_deg_h=1.0, scale_ppm=200.0),
-    accelerometer(50.0, 0.1, instability_mg=0.03, scale_ppm=150.0),
+    make_gyroscope(0.1, 3.0, instability_deg_h=1.0, scale_ppm=200.0),
+    make_accelerometer(50.0, 0.1, instability_mg=0.03, scale_ppm=150.0),
 )  # fmt: skip

@@ -12,9 +12,9 @@ import numpy as np
 from scipy.interpolate import BSpline
 
 from graphnav.core.errors import ConfigError
-from graphnav.core.findings import runs_of
+from graphnav.core.findings import find_runs
 from graphnav.core.rotation import Array
-from graphnav.simulation.splines import centres, spline
+from graphnav.simulation.splines import list_centres, make_spline
 
 STEP = 0.1  # s between coefficients: a driver's hands and feet are no faster
 DEGREE = 3  # the acceleration is smooth, the jerk continuous
@@ -64,11 +64,11 @@ class Path:
         """(M, 2) s: the spans in which the wheels do not turn at all."""
         zero = np.asarray(self.spline.c[:, SPEED] == 0.0)
         whole = np.asarray(np.lib.stride_tricks.sliding_window_view(zero, DEGREE + 1).all(axis=1))
-        spans = [(self.start + a * STEP, min(self.start + b * STEP, self.end)) for a, b in runs_of(whole)]
+        spans = [(self.start + a * STEP, min(self.start + b * STEP, self.end)) for a, b in find_runs(whole)]
         return np.array(spans, dtype=float).reshape(-1, 2)
 
 
-def drive(
+def make_path(
     manoeuvres: Sequence[Manoeuvre], *, start: float = 0.0, heading: float = 0.0, slip_per_accel: float = 0.0
 ) -> Path:
     """The path of `manoeuvres` from a standstill at `start` s, facing `heading` deg from north.
@@ -96,7 +96,7 @@ def drive(
         if m.turn and length[k] == 0:
             raise ConfigError(f"manoeuvre {k}: cannot turn on the spot", key="manoeuvre.on_the_spot")
 
-    t = centres(start, float(edges[-1]), STEP, DEGREE)
+    t = list_centres(start, float(edges[-1]), STEP, DEGREE)
     i = np.clip(np.searchsorted(edges, t, side="right") - 1, 0, len(durations) - 1)
     u = np.clip((t - edges[i]) / durations[i], 0.0, 1.0)
     gain = v1[i] - v0[i]
@@ -117,7 +117,9 @@ def drive(
     slope = np.arctan(along(_fill([m.grade for m in manoeuvres]), 0.0))
     bank = np.deg2rad(along(_fill([m.bank for m in manoeuvres]), 0.0))
     slip = slip_per_accel * speed * np.gradient(psi, STEP)
-    return Path(spline(start, STEP, np.column_stack([speed, psi, slope, bank, slip]), DEGREE), start, float(edges[-1]))
+    return Path(
+        make_spline(start, STEP, np.column_stack([speed, psi, slope, bank, slip]), DEGREE), start, float(edges[-1])
+    )
 
 
 def _fill(values: Sequence[float | None]) -> list[float]:

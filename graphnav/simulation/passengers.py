@@ -10,7 +10,7 @@ from scipy import signal
 
 from graphnav.core.rotation import Array
 from graphnav.simulation.motion import Path
-from graphnav.simulation.vibration import UP, Part, oscillator, sample_movement, shake_times, sway
+from graphnav.simulation.vibration import UP, Part, compute_sway, make_oscillator, sample_movement, shake_times
 
 # Effect of a passenger of 75 kg on a car's suspension (100 kN/m in heave, some 40 kNm/rad in roll and 100 in pitch; the
 # seat 0.4 m to the side and 0.3 m from the middle): the static response, m and rad.
@@ -35,7 +35,7 @@ class Fidget:
     size: float  # share of the weight that moves
 
 
-def movement(
+def simulate_movement(
     path: Path,
     events: Sequence[Boarding | Fidget],
     pivot_to_imu: tuple[float, float, float],
@@ -62,8 +62,8 @@ def movement(
             push += (size * _make_hump(t, at, 0.06))[:, None] * load * (0.3, 0.5, 1.0)
     swung = np.zeros_like(push)
     for k, (hz, damping) in enumerate(((1.4, 0.3), (1.6, 0.3), (1.8, 0.25))):
-        swung[:, k] = signal.lfilter(*oscillator(hz, damping), push[:, k])
-    out = sway(swung[:, 1], swung[:, 2], pivot_to_imu)
+        swung[:, k] = signal.lfilter(*make_oscillator(hz, damping), push[:, k])
+    out = compute_sway(swung[:, 1], swung[:, 2], pivot_to_imu)
     out[:, UP] += swung[:, 0]
     return sample_movement(path, out)
 

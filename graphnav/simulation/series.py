@@ -13,8 +13,8 @@ from graphnav.core.rotation import Array
 from graphnav.sensors import Series, barometer, dual_antenna
 from graphnav.simulation.aiding import Span, Three
 from graphnav.simulation.kinematics import TrueMotion
-from graphnav.simulation.splines import stream
-from graphnav.simulation.vibration import gauss_markov
+from graphnav.simulation.splines import make_random
+from graphnav.simulation.vibration import draw_gauss_markov
 
 
 def _list_epochs(motion: TrueMotion, rate: float) -> Array:
@@ -36,13 +36,13 @@ class BarometerModel:
 
     def read(self, motion: TrueMotion, seed: int) -> tuple[Series, dict[str, float]]:
         """Simulate the readings of a drive; returns also their offset (m, at the start) and scale error."""
-        t, rng = _list_epochs(motion, self.rate), stream(seed, "barometer")
+        t, rng = _list_epochs(motion, self.rate), make_random(seed, "barometer")
         offset, scale = self.weather * rng.standard_normal(), self.scale * rng.standard_normal()
         white, steps = rng.standard_normal((2, len(t)))
         steps[0] = 0.0
         h = motion.point(t, np.zeros(3))[0][:, 2]
         z = h + scale * (h - h[0]) + offset + self.walk / np.sqrt(self.rate) * np.cumsum(steps) + self.white * white
-        columns = {"pressure": np.round(barometer.standard_pressure(z), 2)}
+        columns = {"pressure": np.round(barometer.compute_standard_pressure(z), 2)}
         figures = {"sigma": self.white, "walk": self.walk}
         return barometer.SENSOR.series(np.round(t, 6), columns, **figures), {"offset_m": offset, "scale_error": scale}
 
@@ -65,10 +65,12 @@ class DualAntennaModel:
 
     def read(self, motion: TrueMotion, seed: int) -> tuple[Series, dict[str, float]]:
         """Simulate the readings of a drive; returns also the error of the baseline in heading and pitch, deg."""
-        t, rng = _list_epochs(motion, self.rate), stream(seed, "second antenna")
+        t, rng = _list_epochs(motion, self.rate), make_random(seed, "second antenna")
         turned = np.radians(self.turned) * rng.standard_normal(2)
         white = rng.standard_normal((len(t), 2))
-        slow = gauss_markov(len(t), 1.0 / (self.rate * self.slow_time), stream(seed, "second antenna slow"), 2)
+        slow = draw_gauss_markov(
+            len(t), 1.0 / (self.rate * self.slow_time), make_random(seed, "second antenna slow"), 2
+        )
         b = np.array(self.baseline)
         first, second = (motion.point(t, at)[0] for at in (np.zeros(3), b))
         frame = LocalFrame(first[0])

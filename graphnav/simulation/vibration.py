@@ -16,7 +16,7 @@ from scipy.interpolate import BSpline
 from graphnav.core.earth import MG
 from graphnav.core.rotation import Array
 from graphnav.simulation.motion import HEADING, SPEED, Path
-from graphnav.simulation.splines import centres, spline
+from graphnav.simulation.splines import list_centres, make_spline
 
 RIGHT, FORWARD, UP, PITCH, ROLL = range(5)  # channels: m, m, m, rad, rad
 STEP = 0.02  # s between coefficients: movements up to some 15 Hz
@@ -54,12 +54,12 @@ class Sampled:
 
 def shake_times(path: Path) -> Array:
     """The times (J,) at which `sample_movement` wants its movement."""
-    return centres(path.start, path.end, STEP, DEGREE)
+    return list_centres(path.start, path.end, STEP, DEGREE)
 
 
 def sample_movement(path: Path, movement: Array) -> Sampled:
     """A part from the movement (J, 5) at `shake_times`."""
-    value = spline(path.start, STEP, movement, DEGREE)
+    value = make_spline(path.start, STEP, movement, DEGREE)
     return Sampled(value, value.derivative())
 
 
@@ -102,9 +102,9 @@ class Engine:
 
     def lines(self, path: Path, rate: float, rng: np.random.Generator) -> Part:
         """The vibration of the engine; `rate` is the IMU's, Hz, whose averaging the stated amplitudes include."""
-        t = centres(path.start, path.end, _MODULATION_TIME, _MODULATION_DEGREE)
+        t = list_centres(path.start, path.end, _MODULATION_TIME, _MODULATION_DEGREE)
         v = path.speed(t)
-        wander = self.wander_hz * gauss_markov(len(t), _MODULATION_TIME / self.wander_time, rng)
+        wander = self.wander_hz * draw_gauss_markov(len(t), _MODULATION_TIME / self.wander_time, rng)
         f = self.frequency(v, wander)
         load = 1.0 + (self.moving_gain - 1.0) * v * v / (v * v + 1.0)
         accel, turn = _draw_amplitudes(self.idle, len(t))
@@ -122,8 +122,8 @@ class Engine:
         # forward and pitch are a quarter turn apart, so that gravity on the pitching does not add to the line
         phases = rng.uniform(0.0, 2.0 * np.pi, (len(self.orders), 5))
         phases[:, PITCH] = phases[:, FORWARD] + 0.5 * np.pi
-        phase = spline(path.start, _MODULATION_TIME, 2.0 * np.pi * f, _MODULATION_DEGREE)
-        size = spline(path.start, _MODULATION_TIME, amplitude, _MODULATION_DEGREE)
+        phase = make_spline(path.start, _MODULATION_TIME, 2.0 * np.pi * f, _MODULATION_DEGREE)
+        size = make_spline(path.start, _MODULATION_TIME, amplitude, _MODULATION_DEGREE)
         return _EngineOrders(phase.antiderivative(), phase, size, size.derivative(), np.array(self.orders), phases)
 
 
@@ -184,7 +184,7 @@ FLOOR = (
 )  # fmt: skip
 
 
-def road_noise(path: Path, rng: np.random.Generator, size: float = 1.0, modes: Sequence[Mode] = ROAD) -> Part:
+def simulate_road_noise(path: Path, rng: np.random.Generator, size: float = 1.0, modes: Sequence[Mode] = ROAD) -> Part:
     """Excitation by the road: proportional to the root of the speed, and decreasing faster below walking pace.
 
     The excitation of a road whose slopes are white grows as sqrt(v) (ISO 8608, w = 2); the tyre's contact patch
@@ -194,7 +194,7 @@ def road_noise(path: Path, rng: np.random.Generator, size: float = 1.0, modes: S
     return sample_movement(path, _excite_modes(modes, size * np.sqrt(v / 14.0) * v / (v + 2.0), rng))
 
 
-def idle_floor(path: Path, rng: np.random.Generator, size: float = 1.0, modes: Sequence[Mode] = FLOOR) -> Part:
+def simulate_idle_floor(path: Path, rng: np.random.Generator, size: float = 1.0, modes: Sequence[Mode] = FLOOR) -> Part:
     """The coloured floor below 10 Hz of a body with a running engine."""
     return sample_movement(path, _excite_modes(modes, np.full(len(shake_times(path)), size), rng))
 
@@ -203,7 +203,7 @@ def _excite_modes(modes: Sequence[Mode], envelope: Array, rng: np.random.Generat
     """(J, 5) response of the modes to white noise of changing strength."""
     out = np.zeros((len(envelope), 5))
     for mode in modes:
-        b, a = oscillator(mode.hz, mode.damping)
+        b, a = make_oscillator(mode.hz, mode.damping)
         # rms of the second derivative of the filtered unit noise, from its frequency response
         w, h = signal.freqz(b, a, 4096, fs=2.0 * np.pi / STEP)
         unit = np.sqrt(np.mean(np.abs(h * w**2) ** 2))
@@ -211,13 +211,13 @@ def _excite_modes(modes: Sequence[Mode], envelope: Array, rng: np.random.Generat
     return out
 
 
-def oscillator(hz: float, damping: float) -> tuple[Array, Array]:
+def make_oscillator(hz: float, damping: float) -> tuple[Array, Array]:
     """A mass on spring and damper as a digital filter at 1 / STEP Hz, with unit static response."""
     w = 2.0 * np.pi * hz
     return signal.bilinear([w * w], [1.0, 2.0 * damping * w, w * w], fs=1.0 / STEP)
 
 
-def gauss_markov(count: int, step: float, rng: np.random.Generator, columns: int | None = None) -> Array:
+def draw_gauss_markov(count: int, step: float, rng: np.random.Generator, columns: int | None = None) -> Array:
     """Unit-variance Gauss-Markov noise, (count,) or (count, columns); `step` is in correlation times."""
     shape = count if columns is None else (count, columns)
     decay = np.exp(-step)
@@ -242,14 +242,14 @@ class Springs:
         t = shake_times(path)
         inside = np.clip(t, path.start, path.end)
         x, dx = path.spline(inside), path.spline.derivative()(inside)
-        b, a = oscillator(self.hz, self.damping)
+        b, a = make_oscillator(self.hz, self.damping)
         pitch = signal.lfilter(b, a, np.deg2rad(self.pitch_per_accel) * dx[:, SPEED])
         # an acceleration to the right lowers the left side
         roll = signal.lfilter(b, a, -np.deg2rad(self.roll_per_accel) * x[:, SPEED] * dx[:, HEADING])
-        return sample_movement(path, sway(pitch, roll, (0.0, 0.0, self.height)))
+        return sample_movement(path, compute_sway(pitch, roll, (0.0, 0.0, self.height)))
 
 
-def sway(pitch: Array, roll: Array, pivot_to_imu: tuple[float, float, float]) -> Array:
+def compute_sway(pitch: Array, roll: Array, pivot_to_imu: tuple[float, float, float]) -> Array:
     """(J, 5): turns (J,) about a point of the body and the displacement of the IMU, first order."""
     right, forward, up = pivot_to_imu
     out = np.zeros((len(pitch), 5))

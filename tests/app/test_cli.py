@@ -25,7 +25,7 @@ from graphnav import load
 from graphnav.app import cli, stored, workflow
 from graphnav.estimation.noise.files import write_noise
 from graphnav.estimation.noise.model import NoiseModel
-from graphnav.report.plots.detections import drawn_rows
+from graphnav.report.plots.detections import select_drawn_rows
 from graphnav.sensors.barometer import SENSOR as BAROMETER
 
 PROGRAM = Path(sys.executable).with_name("graphnav")
@@ -224,7 +224,7 @@ def test_a_recording_is_kept_as_far_as_its_pages_show_it(drive):
     assert len(kept.imu.t) < len(whole.imu.t)
     assert (kept.start, kept.end, kept.gps_zero) == (whole.start, whole.end, whole.gps_zero)
     for one in ("t", "gyro", "accel"):
-        drawn = [getattr(r.imu, one)[drawn_rows(r.imu)] for r in (kept, whole)]
+        drawn = [getattr(r.imu, one)[select_drawn_rows(r.imu)] for r in (kept, whole)]
         assert np.array_equal(*drawn)
     assert np.array_equal(kept.gnss.llh, whole.gnss.llh)
     assert np.array_equal(kept.sensors["barometer"].values, height.values, equal_nan=True)

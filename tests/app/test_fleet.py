@@ -21,7 +21,7 @@ from helpers import refused
 from graphnav import load
 from graphnav.app import cli
 from graphnav.app.fleet import page, tables
-from graphnav.app.fleet.drive import CRASHED, DONE, HUNG, REFUSED, hash_task, read_row, spans
+from graphnav.app.fleet.drive import CRASHED, DONE, HUNG, REFUSED, choose_spans, hash_task, read_row
 from graphnav.app.fleet.manifest import DriveOptions, Task, build_task, read_drives
 from graphnav.app.fleet.workers import Limits, Worker, solve_on_cluster
 from graphnav.config import Settings
@@ -254,7 +254,7 @@ def test_drives_in_which_nothing_could_be_withheld_are_counted() -> None:
     parts = [load("kitti").crop(100.0, 100.0 + length) for length in (104.9, 105.1, 300.0, 300.0)]
     parts[2] = replace(parts[2], gnss=None)
     rows = [{"status": DONE, "placed": part.gnss is not None, "duration_s": part.duration} for part in parts]
-    unscored = [row for row, part in zip(rows, parts, strict=True) if not spans(part, 15.0)]
+    unscored = [row for row, part in zip(rows, parts, strict=True) if not choose_spans(part, 15.0)]
     assert unscored == [rows[0], rows[2]]
     assert "2 of 4" in tables.describe_unscored([*rows, {"status": REFUSED}], 15.0)
     assert tables.describe_unscored([rows[1], rows[3]], 15.0) == ""
@@ -262,13 +262,13 @@ def test_drives_in_which_nothing_could_be_withheld_are_counted() -> None:
 
 def test_withheld_spans_are_outages_by_themselves() -> None:
     recording = load("kitti")
-    found = np.array(spans(recording, 30.0, zero=5.0)) - 5.0
+    found = np.array(choose_spans(recording, 30.0, zero=5.0)) - 5.0
     assert len(found) > 3
     assert found[0, 0] >= 60.0
     assert found[-1, 1] <= recording.duration - 30.0
     np.testing.assert_allclose(found[:, 1] - found[:, 0], 30.0)
     assert (found[1:, 0] - found[:-1, 1] >= 30.0).all()
-    assert spans(replace(recording, gnss=None), 30.0) == []
+    assert choose_spans(replace(recording, gnss=None), 30.0) == []
 
 
 def test_the_page_has_the_worst_first_and_takes_no_markup_from_names(tmp_path: Path) -> None:
@@ -279,7 +279,7 @@ def test_the_page_has_the_worst_first_and_takes_no_markup_from_names(tmp_path: P
     doubted = {**good, "drive": "doubted", "verdict": "doubtful", "track": [[139.0, 35.0], [139.1, 35.0]]}
     lost = {"drive": "<b>lost", "status": HUNG, "error": "<script>"}
     rows = [good, bad, doubted, lost]
-    assert [row["drive"] for row in tables.worst_first(rows)] == ["<b>lost", "doubted", "bad", "good"]
+    assert [row["drive"] for row in tables.sort_by_error(rows)] == ["<b>lost", "doubted", "bad", "good"]
     page.write_page(rows, tmp_path / "a.html", "fleet")
     text = (tmp_path / "a.html").read_text()
     assert "<script>" not in text

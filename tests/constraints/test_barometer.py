@@ -8,7 +8,7 @@ from series_drive import SETTINGS, along_truth, errors, rms, shared_drive, smoot
 
 from graphnav.estimation.pipeline import run
 from graphnav.recording import Recording
-from graphnav.sensors.barometer import SENSOR, standard_height
+from graphnav.sensors.barometer import SENSOR, compute_standard_height
 
 OFFSET, SCALE, SIGMA = 40.0, 0.03, 0.2
 
@@ -26,7 +26,7 @@ def drive(shared_data) -> Recording:
 def test_the_standard_atmosphere():
     # ICAO Doc 7488: 89874.6 Pa at 1000 m
     series = SENSOR.series(np.arange(3.0), {"pressure": [101325.0, 89874.6, np.nan], "height": [np.nan, 5.0, 7.0]})
-    np.testing.assert_allclose(standard_height(series), [0.0, 1000.0, 7.0], atol=0.01)
+    np.testing.assert_allclose(compute_standard_height(series), [0.0, 1000.0, 7.0], atol=0.01)
 
 
 def test_heights_hold_without_fixes(drive):

@@ -11,7 +11,7 @@ import pytest
 import raw_drive
 from helpers import STEPS, Array, difference, random_states, truth_states
 
-from graphnav.config import Settings, settings_from
+from graphnav.config import Settings, parse_settings
 from graphnav.constraints import list_constraints
 from graphnav.constraints.base import BuildContext, Constraint, assemble
 from graphnav.constraints.gnss import LEVER_ARM, GnssPosition
@@ -20,9 +20,9 @@ from graphnav.core import rotation as ro
 from graphnav.core.earth import LocalFrame
 from graphnav.core.state import BLOCKS, DIM, States
 from graphnav.estimation.factor_graph.gaussian import LinearGraph
-from graphnav.estimation.problem import Problem, build_problem, keyframe_times
+from graphnav.estimation.problem import Problem, build_problem, choose_keyframes
 from graphnav.estimation.solvers.ekf import ekf
-from graphnav.estimation.solvers.invariant import plus_invariant, transport_covariance
+from graphnav.estimation.solvers.invariant import add_invariant, transport_covariance
 from graphnav.imu.preintegration import preintegrate
 from graphnav.imu.samples import bridge_gaps
 from graphnav.recording import Recording
@@ -33,7 +33,7 @@ STANDING = np.array([[3.0, 14.0], [88.0, 104.0]])  # parts of two stops of the p
 ON_FOOT = {"stance", "foot_lateral", "closed_loop"}  # constraints that only a foot has
 RAW = {"gnss_code", "gnss_doppler", "gnss_carrier", "gnss_antenna_clone"}  # of single satellites
 PPP = {"gnss_ppp_code", "gnss_ppp_carrier"}
-CARRIERS = settings_from({"raw_gnss": {"differences": True}})
+CARRIERS = parse_settings({"raw_gnss": {"differences": True}})
 SIGMA = np.repeat([0.05, 1.0, 0.5, 0.05, 1e-3], 3)
 
 
@@ -61,7 +61,7 @@ def readings(sensor: Sensor, recording: Recording) -> Series:
 def with_parameters(name: str) -> Settings:
     """Everything that can be estimated is estimated."""
     chosen = {"gnss": {"lever_arm_sigma": 0.5}, "foot": {"lateral": True, "closed_loop": 0.01}}
-    return settings_from({**chosen, "raw_gnss": {"ppp": True} if name in PPP else {"differences": True}})
+    return parse_settings({**chosen, "raw_gnss": {"ppp": True} if name in PPP else {"differences": True}})
 
 
 def seen_by(name: str, recording: Recording) -> Recording:
@@ -76,7 +76,7 @@ def scene_of(
 ) -> BuildContext:
     """A scene with the keyframes one constraint asks for."""
     inside = stops[(stops[:, 0] >= recording.start) & (stops[:, 1] <= recording.end)]
-    t = keyframe_times(recording.start, recording.end, cls.epochs(recording, settings, inside), 1.0)
+    t = choose_keyframes(recording.start, recording.end, cls.epochs(recording, settings, inside), 1.0)
     imu = recording.imu
     intervals = preintegrate(bridge_gaps(imu), imu, t, np.full(3, 0.02), np.full(3, 1e-3))
     return BuildContext(recording, settings, frame, t, inside, intervals)
@@ -223,7 +223,7 @@ def test_the_filter_itself_does_that_update(recording: Recording, copies: int) -
     H = np.concatenate(assemble(linear, problem.columns, len(P)))
     gain = P @ H.T @ np.linalg.inv(H @ P @ H.T + np.diag(linear.sigma.ravel() ** 2))
     d = -gain @ linear.residual.ravel()
-    moved = plus_invariant(state, d[None, :DIM])
+    moved = add_invariant(state, d[None, :DIM])
     np.testing.assert_allclose(forward.states[k : k + 1].minus(moved), 0.0, atol=1e-9)
     np.testing.assert_allclose(forward.values[k][at.start - DIM : at.stop - DIM], lever.initial + d[at], atol=1e-9)
     expected = transport_covariance((P - gain @ H @ P)[None], state, moved)[0]
@@ -280,7 +280,7 @@ def test_a_recording_without_the_sensor_has_no_rows(name: str, recording: Record
 @pytest.mark.parametrize("kind", ["position", "velocity"])
 def test_a_switched_off_measurement_has_no_rows(kind: str, recording: Recording) -> None:
     cls = next(c for c in list_constraints() if c.name == f"gnss_{kind}")
-    off = settings_from({"gnss": {kind: False}})
+    off = parse_settings({"gnss": {kind: False}})
     assert len(cls.epochs(recording, off, STANDING)) == 0
     assert cls.build(scene_of(cls, recording, off, LocalFrame(recording.gnss.llh[0]))) is None
 

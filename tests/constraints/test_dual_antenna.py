@@ -14,12 +14,12 @@ from series_drive import SETTINGS, along_truth, errors, rms, shared_drive, smoot
 from graphnav.app.scores import score
 from graphnav.core import rotation
 from graphnav.core.errors import RecordingError
-from graphnav.core.notes import key_of
+from graphnav.core.notes import get_key
 from graphnav.detectors import detect
 from graphnav.estimation.alignment.antennas import measure_baseline_heading
 from graphnav.estimation.pipeline import run
-from graphnav.evaluation.metrics import summary
-from graphnav.online import Online, rows_of, without_rows
+from graphnav.evaluation.metrics import summarise
+from graphnav.online import Online, drop_rows, list_rows
 from graphnav.recording import Recording
 from graphnav.sensors.dual_antenna import SENSOR, Figures
 from graphnav.simulation import simulate
@@ -82,16 +82,16 @@ def test_a_vehicle_that_stands_knows_its_heading(standing):
     assert found.sigma < np.radians(1.5)
     solution = run(standing, SETTINGS, ("batch",))["batch"]
     track = solution.trajectory()
-    assert "alignment.antennas" in map(key_of, solution.notes)
+    assert "alignment.antennas" in map(get_key, solution.notes)
     assert np.all(np.abs(rotation.wrap(track.rph[:, 2] - true)) < 4.0 * track.sd_rph[:, 2])
     assert np.all(track.sd_rph[:, 2] < np.radians(1.5))
     blind = run(standing.without(SENSOR.name), SETTINGS, ("batch",))["batch"]
-    assert "alignment.no_motion" in map(key_of, blind.notes)
+    assert "alignment.no_motion" in map(get_key, blind.notes)
 
 
 def test_its_heading_is_known_live_before_it_moves(standing):
-    online = Online(without_rows(standing), SETTINGS)
-    for row in rows_of(standing)[1]:
+    online = Online(drop_rows(standing), SETTINGS)
+    for row in list_rows(standing)[1]:
         online.add(row)
     now = online.live()
     assert now is not None
@@ -125,4 +125,4 @@ def test_errors_that_last_are_not_taken_for_white() -> None:
         true = 2.0 * np.log(size / np.hypot(model.white, model.slow))
         assert abs(figure.log_factor - true) < 3.0 * figure.sigma, name
     found = score(made.recording, used, {"ekf": solution}, (("gnss", (100.0, 200.0)),))[0]["ekf"]
-    assert summary(found)["nees_p"] < chi2.isf(1e-3, 3) / 3.0  # errors of one outage are one draw of three numbers
+    assert summarise(found)["nees_p"] < chi2.isf(1e-3, 3) / 3.0  # errors of one outage are one draw of three numbers

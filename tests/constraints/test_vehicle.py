@@ -10,7 +10,7 @@ import oracle
 import pytest
 from helpers import Array, truth_states
 
-from graphnav.config import Settings, settings_from
+from graphnav.config import Settings, parse_settings
 from graphnav.constraints.base import BuildContext
 from graphnav.constraints.standstill import PLACE, HeldPosition, ZeroRate, ZeroVelocity
 from graphnav.constraints.vehicle import AXLE, MOUNTING, ODOMETER_DELAY, ODOMETER_SCALE, NonHolonomic, OdometerSpeed
@@ -20,7 +20,7 @@ from graphnav.core.rotation import mv
 from graphnav.core.state import BLOCKS, DIM, States
 from graphnav.core.trajectory import Trajectory
 from graphnav.estimation.pipeline import run
-from graphnav.estimation.problem import keyframe_times
+from graphnav.estimation.problem import choose_keyframes
 from graphnav.estimation.solution import Solution
 from graphnav.imu.preintegration import preintegrate
 from graphnav.imu.samples import bridge_gaps
@@ -43,7 +43,7 @@ def scene_of(
     recording: Recording, settings: Settings, ba: Array | None = None, bg: Array | None = None
 ) -> BuildContext:
     frame = LocalFrame(recording.gnss.llh[40])
-    t = keyframe_times(recording.start, recording.end, np.array(STOP), 1.0)
+    t = choose_keyframes(recording.start, recording.end, np.array(STOP), 1.0)
     zero = np.zeros(3)
     imu = recording.imu
     intervals = preintegrate(bridge_gaps(imu), imu, t, zero if ba is None else ba, zero if bg is None else bg)
@@ -158,7 +158,7 @@ STATED = {"noise": {"mode": "stated"}}  # where what is asked has nothing to do 
 
 
 def estimated(recording: Recording, **settings: dict[str, object]) -> Solution:
-    return run(recording, settings_from(settings), ("batch",))["batch"]
+    return run(recording, parse_settings(settings), ("batch",))["batch"]
 
 
 def test_calibration_is_recovered() -> None:
@@ -227,7 +227,7 @@ def largest(
     recording: Recording, span: tuple[float, float], *solvers: str, **settings: dict[str, object]
 ) -> list[float]:
     """Largest horizontal distance from the withheld fixes that are known to be good, m, of each solver."""
-    found = run(recording.without("gnss", span), settings_from(settings), solvers)
+    found = run(recording.without("gnss", span), parse_settings(settings), solvers)
     return [distance(found[name], recording, span) for name in solvers]
 
 
@@ -273,7 +273,7 @@ def test_the_last_half_minute_of_a_motorway(shared_data: Path) -> None:
 def test_sigma_survives_long_stops_in_the_dark(shared_data: Path) -> None:
     """Eight minutes with nothing but stops: metres on the Earth, millimetres against the place of a stop."""
     recording, _ = oracle.oracle_drive(shared_data, 5, rtk=False, odometer=False, rate=50.0)
-    inertial = settings_from({"vehicle": {"nhc": False}, **STATED})
+    inertial = parse_settings({"vehicle": {"nhc": False}, **STATED})
     found = run(recording.without("gnss", (135.0, 600.0)), inertial)
     for name, solution in found.items():
         variance = np.diagonal(solution.covariance, axis1=1, axis2=2)

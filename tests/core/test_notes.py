@@ -18,7 +18,7 @@ from graphnav.app import cli
 from graphnav.app.stored import NAME, read_outcome
 from graphnav.core import errors
 from graphnav.core.errors import RecordingError
-from graphnav.core.notes import Note, key_of
+from graphnav.core.notes import Note, get_key
 from graphnav.recording.formats import load, read
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -30,7 +30,7 @@ def test_a_note_keeps_its_key():
     for one in (note, copy.deepcopy(note), pickle.loads(pickle.dumps(note))):
         assert (one, one.key) == ("7 rows are outliers", "noise.outliers")
     assert json.dumps({"note": note}) == '{"note": "7 rows are outliers"}'
-    assert key_of("a sentence") == ""
+    assert get_key("a sentence") == ""
 
 
 def test_the_page_lists_every_key_of_the_code():
@@ -54,7 +54,7 @@ def test_what_a_loader_says_has_a_key_for_each_thing(name, tmp_path):
     tmp_path.joinpath("log").mkdir()
     written = LOGS[name](tmp_path / "log", *logs.simulated(20.0))
     remarks = load(written).remarks
-    keys = [key_of(remark) for remark in remarks]
+    keys = [get_key(remark) for remark in remarks]
     assert remarks
     assert [key for key in keys if not KEY.fullmatch(key)] == []
     assert len(set(keys)) == len(keys)
@@ -72,7 +72,7 @@ def test_what_is_repaired_of_a_recording_has_a_key_for_each_sensor(tmp_path):
     gnss = [f"{k},48.0,11.0,500.0" for k in range(1, 10)]
     gnss[3:5] = ["4,0,0,0", "5,,11.0,500.0"]
     (tmp_path / "gnss.csv").write_text("\n".join(["t,lat,lon,h", *gnss]) + "\n")
-    keys = [key_of(remark) for remark in read(tmp_path).remarks]
+    keys = [get_key(remark) for remark in read(tmp_path).remarks]
     assert len(set(keys)) == len(keys)
     assert set(keys) >= {
         *("imu.rows_blank", "imu.rows_unordered", "imu.rows_repeated", "imu.noise_assumed"),
@@ -95,7 +95,7 @@ def test_all_that_a_run_says_has_a_key(tmp_path):
     assert {"alignment.motion", "imu.gaps_bridged", "noise.rows"} <= {m["key"] for m in messages}
     kept, _ = read_outcome(out / NAME)
     notes = kept.solutions["rts"].notes
-    assert [key_of(note) for note in notes] == [m["key"] for m in messages if m["sentence"] in notes]
+    assert [get_key(note) for note in notes] == [m["key"] for m in messages if m["sentence"] in notes]
 
 
 def test_an_error_keeps_its_key():

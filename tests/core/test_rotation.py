@@ -134,7 +134,7 @@ def test_rph_jacobian_numerically() -> None:
 
 def test_of_components_roll_pitch_heading_are_those_of_the_product() -> None:
     R_nb, R_ln = np.split(random_rotations(np.random.default_rng(3), 100), 2)
-    rph, J = ro.find_rph(ro.components(R_nb), ro.components(R_ln))
+    rph, J = ro.find_rph(ro.move_components_first(R_nb), ro.move_components_first(R_ln))
     np.testing.assert_allclose(rph, ro.to_rph(R_ln @ R_nb), atol=1e-13)
     np.testing.assert_allclose(np.moveaxis(J, -1, 0), ro.rph_jacobian(rph), rtol=1e-9, atol=1e-9)
 

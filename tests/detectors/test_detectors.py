@@ -17,8 +17,8 @@ from road import MG, made, with_gnss
 from graphnav.app import cli
 from graphnav.config import Settings
 from graphnav.config.detectors import FftSettings, FusionSettings
-from graphnav.core.notes import key_of
-from graphnav.detectors import base, detect, fft, glrt, motion, spectrum, stops, thresholds, windows
+from graphnav.core.notes import get_key
+from graphnav.detectors import base, detect, fft, find_stops, glrt, motion, spectrum, thresholds, windows
 from graphnav.recording import Imu, ImuNoise, Odometer, Recording
 from graphnav.recording.formats import read
 from graphnav.recording.formats.writing import write_folder
@@ -59,9 +59,9 @@ def test_statistics_are_the_sums_of_skog():
         want["acceleration_magnitude"].append(sum((np.linalg.norm(a) - g) ** 2 for a in f) / s_a**2)
         want["angular_rate_energy"].append(sum(b @ b for b in w) / s_w**2)
     for name, values in want.items():
-        found = glrt.glrt_statistic(accel, gyro, N, s_a, s_w, g, name)
+        found = glrt.compute_glrt(accel, gyro, N, s_a, s_w, g, name)
         np.testing.assert_allclose(found, np.array(values) / N, rtol=1e-9)
-    assert len(glrt.glrt_statistic(accel[:5], gyro[:5], N, s_a, s_w, g)) == 0
+    assert len(glrt.compute_glrt(accel[:5], gyro[:5], N, s_a, s_w, g)) == 0
 
 
 def test_running_sums_keep_their_digits_over_hours():
@@ -83,7 +83,7 @@ def test_noise_alone_makes_of_the_low_band_statistic_what_it_says():
         noise.accel_noise_density * np.sqrt(rate) * rng.standard_normal((n, 3)) + [0, 0, 9.8],
         noise,
     )
-    low = windows.low_pass(windows.blocks(imu, 1.0 / rate))
+    low = windows.low_pass(windows.average_blocks(imu, 1.0 / rate))
     for columns, density in ((slice(0, 3), noise.accel_noise_density), (slice(3, 6), noise.gyro_noise_density)):
         np.testing.assert_allclose(low.rows[:, columns].std(axis=0), low.gain * density, rtol=0.03)
 
@@ -91,7 +91,7 @@ def test_noise_alone_makes_of_the_low_band_statistic_what_it_says():
 @pytest.mark.parametrize("rate", [50.0, 100.0, 104.0, 200.0, 400.0])
 def test_the_low_pass_leaves_nothing_of_an_engine(rate):
     size = max(1, int(rate / windows.BLOCK_RATE + 1e-6))
-    h = windows.kernel(size / rate)
+    h = windows.make_kernel(size / rate)
     f = np.linspace(0.0, 0.5 * rate / size, 2000)
     response = np.abs(np.exp(-2j * np.pi * np.outer(f, np.arange(len(h))) * size / rate) @ h)
     assert abs(response[0] - 1.0) < 1e-12
@@ -102,11 +102,11 @@ def test_the_low_pass_leaves_nothing_of_an_engine(rate):
 def test_a_valley_is_found_between_two_populations_only():
     rng = np.random.default_rng(4)
     low, high = rng.normal(-0.5, 0.2, 800), rng.normal(3.0, 0.6, 9000)
-    found = thresholds.valley(np.concatenate([low, high]), -1.0, 2.0, 30)
+    found = thresholds.find_valley(np.concatenate([low, high]), -1.0, 2.0, 30)
     assert found is not None
     assert low.max() - 0.3 < found < high.min() + 0.5
-    assert thresholds.valley(high, -1.0, 5.0, 30) is None
-    assert thresholds.valley(low, -3.0, 2.0, 30) is None
+    assert thresholds.find_valley(high, -1.0, 5.0, 30) is None
+    assert thresholds.find_valley(low, -3.0, 2.0, 30) is None
 
 
 def test_spans_are_sets():
@@ -126,9 +126,9 @@ def test_spans_are_sets():
     np.testing.assert_array_equal(covered(grid, base.subtract_spans(joined, taken)), in_one & ~in_other)
     assert len(base.subtract_spans(joined, np.array([[-1.0, 200.0]]))) == 0
     shared = [np.sum(in_one & (grid >= a) & (grid <= b)) * 0.013 for a, b in taken]
-    np.testing.assert_allclose(base.seconds_in(joined, taken), shared, atol=0.013 * 2 * len(joined))
-    np.testing.assert_allclose(base.seconds_in(joined, joined), np.diff(joined).ravel())
-    runs = base.spans_of(in_one, grid)
+    np.testing.assert_allclose(base.measure_overlap(joined, taken), shared, atol=0.013 * 2 * len(joined))
+    np.testing.assert_allclose(base.measure_overlap(joined, joined), np.diff(joined).ravel())
+    runs = base.find_spans(in_one, grid)
     assert len(runs) == len(joined)
     assert np.abs(runs - joined).max() < 0.013
 
@@ -142,12 +142,12 @@ def test_a_line_between_two_bins_is_read_as_it_is():
     for frequency in (12.495, 24.991, 14.5, 11.84, 19.1667):
         x = 3.1 * np.sin(2 * np.pi * frequency * t + 0.4)
         w = spectrum.Windows((x, x, x), n, n, rate)
-        ((_, a),) = w.amplitudes()
-        where, height = spectrum.peaks(a[0, 0], w.frequencies, 10.0, 30.0)
+        ((_, a),) = w.compute_amplitudes()
+        where, height = spectrum.find_peaks(a[0, 0], w.frequencies, 10.0, 30.0)
         assert abs(where - frequency) < 0.005
         assert abs(height / 3.1 - 1.0) < 0.005
     # without the interpolation the worst of them reads 15 % low
-    assert spectrum.peaks(a[0, 0], w.frequencies, 10.0, 30.0)[1] > 1.1 * a[0, 0].max()
+    assert spectrum.find_peaks(a[0, 0], w.frequencies, 10.0, 30.0)[1] > 1.1 * a[0, 0].max()
 
 
 def test_braking_does_not_leak_into_the_bands_of_an_engine():
@@ -155,7 +155,7 @@ def test_braking_does_not_leak_into_the_bands_of_an_engine():
     t = np.arange(600) / 200.0
     x = 1.0 / (1.0 + np.exp(-(t - 1.7) / 0.15))
     w = spectrum.Windows((x, x, x), 600, 600, 200.0)
-    ((_, a),) = w.amplitudes()
+    ((_, a),) = w.compute_amplitudes()
     inside = (w.frequencies > 10.0) & (w.frequencies < 30.0)
     assert a[0, 0, inside].max() < 0.1 * MG
     assert np.abs(np.fft.rfft(x))[inside].max() * 2.0 / 600 > 0.7 * MG
@@ -166,7 +166,7 @@ def test_the_idle_line_is_found_wherever_it_is(engine):
     recording, _, _ = made(6, [(60, 0), (8, 12), (30, 12), (8, 0), (40, 0)], engine=engine)
     found = detect(recording)["fft"]
     assert abs(found.details["idle_line"][0] - engine) < 0.03
-    assert "detectors.fft.line" in map(key_of, found.notes)
+    assert "detectors.fft.line" in map(get_key, found.notes)
     stops = np.array([[0.0, 60.0], [106.5, 146.0]])
     right, wrong = rates(found.intervals, stops, 0.0, 146.0)
     assert right > 0.93
@@ -176,7 +176,7 @@ def test_the_idle_line_is_found_wherever_it_is(engine):
 def test_without_an_engine_the_answer_is_a_sentence():
     recording, _, _ = made(7, [(30, 0), (8, 12), (30, 12), (8, 0), (30, 0)], engine=0.0)
     found = detect(recording)
-    assert "detectors.fft.no_line" in map(key_of, found.notes)
+    assert "detectors.fft.no_line" in map(get_key, found.notes)
     assert not found["fft"].mask.any()
     assert len(found.stationary) == 2
 
@@ -184,7 +184,7 @@ def test_without_an_engine_the_answer_is_a_sentence():
 def test_at_fifty_hertz_the_bands_are_cut_and_a_sentence_says_so():
     recording, _, _ = made(8, [(40, 0), (8, 12), (30, 12), (8, 0), (40, 0)], rate=50.0, engine=18.0)
     found = detect(recording)
-    assert "detectors.fft.bands_cut" in map(key_of, found.notes)
+    assert "detectors.fft.bands_cut" in map(get_key, found.notes)
     assert abs(found["fft"].details["idle_line"][0] - 18.0) < 0.05
     assert len(found.stationary) == 2
 
@@ -229,7 +229,7 @@ def test_edges_hold_no_motion():
         found = detect(recording).stationary
         assert len(found) == 3
         assert np.abs(v[covered(t, found)]).max() < 2e-3
-        assert rates(found, base.spans_of(v == 0.0, t), t[0], t[-1])[0] > 0.95
+        assert rates(found, base.find_spans(v == 0.0, t), t[0], t[-1])[0] > 0.95
 
 
 @pytest.mark.parametrize("speed", [0.1, 0.2, 0.3])
@@ -269,8 +269,8 @@ def test_a_measured_speed_overrules_a_smooth_ride():
     for outage in ((np.inf, np.inf), (60.0, 90.0)):
         found = detect(with_gnss(recording, t, v, outage))
         assert np.abs(v[covered(t, found.stationary)]).max() < 2e-3
-        assert rates(found.stationary, base.spans_of(v == 0.0, t), t[0], t[-1])[0] > 0.85
-        assert "detectors.speed_known" in map(key_of, found.notes)
+        assert rates(found.stationary, base.find_spans(v == 0.0, t), t[0], t[-1])[0] > 0.85
+        assert "detectors.speed_known" in map(get_key, found.notes)
 
 
 @pytest.mark.parametrize("stop", [False, True])
@@ -288,8 +288,8 @@ def test_a_smooth_road_without_fixes_is_no_stop_after_a_measured_speed(stop):
     recording = replace(rough, imu=imu)
     found = detect(with_gnss(recording, t, v, (90.0, 130.0)))
     assert np.abs(v[covered(t, found.stationary)]).max() < 2e-3
-    assert rates(found.stationary, base.spans_of(v == 0.0, t), t[0], t[-1])[0] > 0.85
-    assert "detectors.speed_felt" in map(key_of, found.notes)
+    assert rates(found.stationary, base.find_spans(v == 0.0, t), t[0], t[-1])[0] > 0.85
+    assert "detectors.speed_felt" in map(get_key, found.notes)
 
 
 def test_an_odometer_late_quantised_or_unplugged_costs_no_stop():
@@ -310,9 +310,9 @@ def test_what_wanders_as_much_as_it_says_is_no_motion():
     truth = np.tile([8.0, 1.0], (len(t), 1)) + 0.05 * rng.standard_normal((len(t), 2))
     limit = np.full(len(t), 0.15)
     span = np.array([10.0, 40.0])
-    assert motion.Speeds(t, lies, limit).speed_in(span) == 0.0
-    assert abs(motion.Speeds(t, truth, limit).speed_in(span) - np.hypot(8.0, 1.0)) < 0.05
-    assert np.isnan(motion.Speeds(t, truth, limit).speed_in(np.array([70.0, 80.0])))
+    assert motion.Speeds(t, lies, limit).measure_speed(span) == 0.0
+    assert abs(motion.Speeds(t, truth, limit).measure_speed(span) - np.hypot(8.0, 1.0)) < 0.05
+    assert np.isnan(motion.Speeds(t, truth, limit).measure_speed(np.array([70.0, 80.0])))
     assert len(motion.find_moving([motion.Speeds(t, truth, limit)])) == 1
 
 
@@ -336,7 +336,7 @@ def test_nothing_makes_it_fail(rate, rows, what):
     found = detect(recording)
     if recording.duration < 3.0:
         assert len(found.stationary) == 0
-        assert key_of(found.notes[0]) == "detectors.too_short"
+        assert get_key(found.notes[0]) == "detectors.too_short"
     for d in found.all:
         assert len(d.t) == len(d.statistic) == len(d.mask)
         assert d.intervals.shape == (len(d.intervals), 2)
@@ -345,13 +345,13 @@ def test_nothing_makes_it_fail(rate, rows, what):
 
 def test_settings_reach_the_answer():
     recording, _, _ = made(20, [(20, 0), (6, 9), (15, 9), (5, 0), (4, 0), (4, 6), (20, 6)])
-    from graphnav.config import settings_from
+    from graphnav.config import parse_settings
 
     everything = detect(recording).stationary
     assert len(everything) == 2
-    longer = detect(recording, settings_from({"detectors": {"fusion": {"min_duration": 10.0}}})).stationary
+    longer = detect(recording, parse_settings({"detectors": {"fusion": {"min_duration": 10.0}}})).stationary
     np.testing.assert_array_equal(longer, everything[:1])
-    margin = detect(recording, settings_from({"detectors": {"fusion": {"margin": 0.4}}})).stationary
+    margin = detect(recording, parse_settings({"detectors": {"fusion": {"margin": 0.4}}})).stationary
     np.testing.assert_allclose(margin[1] - everything[1], [0.3, -0.3], atol=1e-9)
     assert FusionSettings().margin == 0.1
 
@@ -460,14 +460,14 @@ def test_stops_are_those_of_detect_wherever_they_are_asked_for(shared_data, with
         since, until = look.end - 25.0, look.end - 1.0
         whole = np.clip(detect(look, settings).stationary, since, until)
         whole = whole[whole[:, 1] > whole[:, 0]]
-        found = stops(look, settings, since, until, base.NONE, since)
+        found = find_stops(look, settings, since, until, base.NONE, since)
         if found is None:
             silent += 1
             assert not len(whole)
         else:
             some += len(found) > 0
             np.testing.assert_allclose(found, whole)
-        newer = stops(look, settings, since, until, base.NONE, until - 2.0)
+        newer = find_stops(look, settings, since, until, base.NONE, until - 2.0)
         if newer is None:
             assert not np.any(whole[:, 1] > until - 2.0)
     assert some > 20

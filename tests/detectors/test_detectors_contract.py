@@ -11,14 +11,14 @@ import pytest
 from helpers import random_states
 from road import made, with_gnss
 
-from graphnav.config import Settings, settings_from
+from graphnav.config import Settings, parse_settings
 from graphnav.config.detectors import FUSED, DetectorName
 from graphnav.core.earth import LocalFrame
-from graphnav.core.notes import key_of
-from graphnav.detectors import base, detect, list_detectors, stops
+from graphnav.core.notes import get_key
+from graphnav.detectors import base, detect, find_stops, list_detectors
 from graphnav.estimation.pipeline import run
 from graphnav.estimation.problem import build_problem
-from graphnav.estimation.stops import stops_of_solution
+from graphnav.estimation.stops import list_solution_stops
 from graphnav.recording import Imu, Recording
 
 NAMES = (FUSED, *list_detectors())
@@ -29,7 +29,7 @@ FREE = 0.5  # s about an end, in which neither rest nor motion is asked for: jer
 
 
 def firing(name: str) -> Settings:
-    return settings_from({"detectors": {"fire": [name]}})
+    return parse_settings({"detectors": {"fire": [name]}})
 
 
 @functools.cache
@@ -62,7 +62,7 @@ def test_each_fires_on_a_stop_with_the_engine_idling(name: str, rate: float) -> 
     assert one.t.shape == one.statistic.shape == one.mask.shape
     # whoever decides is said to have fired on every stop
     if name != FUSED:
-        assert (base.seconds_in(one.intervals, found.stationary) > 0.5 * np.diff(found.stationary).ravel()).all()
+        assert (base.measure_overlap(one.intervals, found.stationary) > 0.5 * np.diff(found.stationary).ravel()).all()
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -83,7 +83,7 @@ def test_a_window_while_the_drive_goes_on_says_what_the_recording_says(name: str
     for now in np.arange(35.0, recording.end, 4.0):
         look = recording.crop(now - 30.0, now)
         since, until = look.end - 25.0, look.end - 1.0
-        found = stops(look, settings, since, until, base.NONE, since)
+        found = find_stops(look, settings, since, until, base.NONE, since)
         t = np.arange(since, until, 0.02)
         there = base.mask_inside(t, whole)
         if found is None:
@@ -104,7 +104,7 @@ def test_a_gap_is_not_bridged(name: str) -> None:
     imu = replace(recording.imu, **{k: getattr(recording.imu, k)[keep] for k in ("t", "gyro", "accel")})
     found = detect(replace(recording, imu=imu), firing(name))
     assert not ((found.stationary[:, 0] < 24.0) & (found.stationary[:, 1] > 21.0)).any()
-    assert base.seconds_in(found.stationary, np.array([[0.0, 20.0], [25.0, 40.0]])).min() > 10.0
+    assert base.measure_overlap(found.stationary, np.array([[0.0, 20.0], [25.0, 40.0]])).min() > 10.0
     for one in found.all:
         assert np.isfinite(one.intervals).all()
 
@@ -126,15 +126,15 @@ def test_what_is_too_short_is_said_and_no_error(name: str, platform: str) -> Non
 def test_several_stand_where_one_of_them_says_so() -> None:
     recording = drive()
     each = [detect(recording, firing(name)).stationary for name in ("fft", "glrt")]
-    found = detect(recording, settings_from({"detectors": {"fire": ["fft", "glrt"]}}))
-    np.testing.assert_array_equal(found.stationary, base.union(each))
+    found = detect(recording, parse_settings({"detectors": {"fire": ["fft", "glrt"]}}))
+    np.testing.assert_array_equal(found.stationary, base.unite(each))
     assert [d.name for d in found.all] == ["fft", "glrt", FUSED]
 
 
 def test_the_old_name_of_a_table_is_read_and_said() -> None:
-    old = settings_from({"detectors": {"sway": {"threshold": 4.5}}})
+    old = parse_settings({"detectors": {"sway": {"threshold": 4.5}}})
     assert old.detectors.low_band_glrt.threshold == 4.5
-    assert "settings.renamed" in map(key_of, detect(drive(), old).notes)
+    assert "settings.renamed" in map(get_key, detect(drive(), old).notes)
     assert Settings.model_validate(old.model_dump()).detectors.low_band_glrt.threshold == 4.5
 
 
@@ -159,7 +159,7 @@ def test_filter_isam2_and_batch_use_the_rows_of_one_detector() -> None:
     settings = firing("fft").model_copy(update={"noise": Settings().noise.model_copy(update={"mode": "stated"})})
     used = replace(recording, gnss=replace(recording.gnss, **every))
     for solution in run(used, settings, ("ekf", "isam2", "batch")).values():
-        (stop,) = stops_of_solution(solution)
+        (stop,) = list_solution_stops(solution)
         assert set(stop.fired) == {"fft"}
         assert set(stop.rows) == {"zero_velocity", "zero_rate", "held_position"}
         still = (solution.t > stop.start) & (solution.t < stop.end)

@@ -9,12 +9,12 @@ import oracle
 import pytest
 from helpers import Array, truth_states
 
-from graphnav.config import Settings, settings_from
+from graphnav.config import Settings, parse_settings
 from graphnav.core import rotation as ro
 from graphnav.core.earth import LocalFrame
-from graphnav.core.notes import key_of
+from graphnav.core.notes import get_key
 from graphnav.core.trajectory import Trajectory
-from graphnav.estimation.alignment import Alignment, align, with_known_heading
+from graphnav.estimation.alignment import Alignment, align, use_known_heading
 from graphnav.recording import Recording
 
 DEG = np.pi / 180.0
@@ -108,7 +108,7 @@ def test_fixes_that_come_late(path: oracle.ExactPath, late: float) -> None:
     error, own, over = judged(part, truth)
     assert_good(error, own, over)
     found, _ = aligned(part)
-    assert "alignment.carried_back" in map(key_of, found.notes)
+    assert "alignment.carried_back" in map(get_key, found.notes)
 
 
 def test_own_sigma_is_honest_over_many_drives(path: oracle.ExactPath) -> None:
@@ -126,10 +126,10 @@ def test_own_sigma_is_honest_over_many_drives(path: oracle.ExactPath) -> None:
 def test_a_known_heading_is_taken(path: oracle.ExactPath) -> None:
     recording, _ = oracle.drive(path, seed=0)
     found, _ = aligned(recording)
-    stated = with_known_heading(found, settings_from({"alignment": {"heading": 123.0, "heading_sigma": 7.0}}))
+    stated = use_known_heading(found, parse_settings({"alignment": {"heading": 123.0, "heading_sigma": 7.0}}))
     np.testing.assert_allclose(stated.rph / DEG, [*found.rph[:2] / DEG, 123.0], atol=1e-9)
     assert stated.sigma[2] / DEG == pytest.approx(7.0)
-    assert with_known_heading(found, Settings()) is found
+    assert use_known_heading(found, Settings()) is found
 
 
 def test_a_recording_at_rest_is_levelled_and_its_heading_unknown(path: oracle.ExactPath) -> None:
@@ -151,4 +151,4 @@ def test_without_gnss_heading_and_position_count_from_zero(path: oracle.ExactPat
     assert found.rph[2] == pytest.approx(0.0)
     assert found.sigma[2] < 1e-3
     np.testing.assert_array_equal(found.state.p, 0.0)
-    assert "alignment.no_gnss" in map(key_of, found.notes)
+    assert "alignment.no_gnss" in map(get_key, found.notes)

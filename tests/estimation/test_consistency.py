@@ -12,7 +12,7 @@ import pytest
 from helpers import Array, at_rate, errors
 from scipy.special import chdtri
 
-from graphnav.config import settings_from
+from graphnav.config import parse_settings
 from graphnav.core.trajectory import Trajectory
 from graphnav.estimation.pipeline import SOLVERS, run
 from graphnav.estimation.solution import Solution
@@ -57,7 +57,7 @@ def scored(
     whole: dict[str, list[float]] = {name: [] for name in solvers}
     dark: dict[str, list[float]] = {name: [] for name in solvers}
     for recording, truth in drives:
-        for name, solution in run(at_rate(recording, RATE / 4.0), settings_from(settings), solvers).items():
+        for name, solution in run(at_rate(recording, RATE / 4.0), parse_settings(settings), solvers).items():
             position, sd_p, rph, sd_rph = errors(solution, truth)
             velocity, sd_v = velocity_errors(solution, truth)
             ratio = np.concatenate([position / sd_p, velocity / sd_v, rph / sd_rph], axis=1) ** 2

@@ -11,7 +11,7 @@ import oracle
 import pytest
 from helpers import refused
 
-from graphnav.config import Settings, settings_from
+from graphnav.config import Settings, parse_settings
 from graphnav.core.earth import LocalFrame
 from graphnav.core.errors import ConfigError
 from graphnav.core.rotation import Array
@@ -19,7 +19,7 @@ from graphnav.core.trajectory import Trajectory
 from graphnav.detectors import detect
 from graphnav.estimation import faults
 from graphnav.estimation.alignment import align
-from graphnav.estimation.pipeline import origin, run
+from graphnav.estimation.pipeline import choose_origin, run
 from graphnav.estimation.problem import Problem, build_problem
 from graphnav.estimation.solution import Solution
 from graphnav.estimation.solvers.ekf import ekf, refilter
@@ -27,16 +27,16 @@ from graphnav.estimation.solvers.likelihood_ratio import update_tests
 from graphnav.estimation.solvers.passes import Updates
 from graphnav.estimation.solvers.recursion import move
 from graphnav.estimation.solvers.rows import Iterate, Layout, whiten
-from graphnav.estimation.solvers.rts import backward
+from graphnav.estimation.solvers.rts import smooth_backward
 from graphnav.estimation.solvers.stack import Stack
 from graphnav.estimation.solvers.verdicts import Verdicts
 from graphnav.estimation.solvers.watch import MINUTE, Bank
-from graphnav.evaluation.scoring import errors
+from graphnav.evaluation.scoring import compute_errors
 from graphnav.recording import Recording
 from graphnav.recording.formats import read
 
 # nothing is looked for: everything is what it is stated to be
-OFF = settings_from({"gnss": {"faults": "off"}, "noise": {"mode": "stated"}})
+OFF = parse_settings({"gnss": {"faults": "off"}, "noise": {"mode": "stated"}})
 
 
 @pytest.fixture(scope="module")
@@ -54,8 +54,8 @@ def short(drive: tuple[Recording, Trajectory]) -> tuple[Recording, Trajectory]:
 def built(drive: tuple[Recording, Trajectory]) -> Problem:
     """The problem of the drive, its fixes taken as they are stated."""
     recording = drive[0]
-    settings = settings_from({"gnss": {"time_offset_sigma": 0.0}})
-    frame = LocalFrame(origin(recording))
+    settings = parse_settings({"gnss": {"time_offset_sigma": 0.0}})
+    frame = LocalFrame(choose_origin(recording))
     found = align(recording, settings, frame)
     stationary = detect(recording, settings).stationary
     return build_problem(recording, settings, frame, found.state, found.sigma, stationary)
@@ -63,7 +63,7 @@ def built(drive: tuple[Recording, Trajectory]) -> Problem:
 
 def moved(recording: Recording, rows: Array, by: Array) -> Recording:
     """The recording with some fixes moved, m in east, north and up."""
-    gnss, frame = recording.gnss, LocalFrame(origin(recording))
+    gnss, frame = recording.gnss, LocalFrame(choose_origin(recording))
     assert gnss is not None
     p = frame.from_llh(gnss.llh)
     p[rows] += by
@@ -72,7 +72,7 @@ def moved(recording: Recording, rows: Array, by: Array) -> Recording:
 
 def horizontal(solution: Solution, truth: Trajectory) -> Array:
     """(N,) m of error."""
-    return np.linalg.norm(errors(solution.trajectory(), truth).p[:, :2], axis=1)
+    return np.linalg.norm(compute_errors(solution.trajectory(), truth).p[:, :2], axis=1)
 
 
 def left_out(solution: Solution, recording: Recording) -> Array:
@@ -111,7 +111,7 @@ def test_signature_is_the_derivative_of_the_innovations(built: Problem, monkeypa
     for k in range(len(built.t)):
         if k:
             bank.X[:] = move(forward.F[k - 1], forward.decay[k - 1], bank.X)
-        for some in stack.together(k):
+        for some in stack.stack_keyframe(k):
             name = some.parts[0][0].name
             H, Kt, solved, root = (x[some.at] for x in (updates.H, updates.Kt, updates.w, stack.root))
             if name == rows.name:
@@ -155,7 +155,7 @@ def test_filter_and_its_tests_are_the_filter_where_nothing_is_wrong(built: Probl
 def test_clean_drive_keeps_every_fix() -> None:
     """And nothing else is done to it than where nothing is looked for."""
     recording, _ = oracle.drive(oracle.vehicle_path(duration=140, rate=50.0, seed=21), seed=1)
-    with_tests, without = run(recording), run(recording, settings_from({"gnss": {"faults": "off"}}))
+    with_tests, without = run(recording), run(recording, parse_settings({"gnss": {"faults": "off"}}))
     for name, solution in with_tests.items():
         assert not solution.excluded
         # by chance one in a thousand of 140 weighs less
@@ -224,7 +224,7 @@ def test_spans_and_back(built: Problem) -> None:
     weight = np.ones(len(rows))
     weight[[3, 4, 5, 9]] = 0.0
     problem = faults.weigh_rows(built, {rows.name: weight})
-    found = faults.fault_spans(problem)
+    found = faults.find_fault_spans(problem)
     assert [(f.count, f.kind) for f in found] == [(3, rows.name), (1, rows.name)]
     t = built.t[rows.keyframe]
     assert [(f.t_start, f.t_end) for f in found] == [(t[3], t[5]), (t[9], t[9])]
@@ -275,7 +275,7 @@ def test_kernel_is_of_whole_measurements(built: Problem) -> None:
     """A fix with 2 sigma on each of three axes is beyond a scale of 3, one with 2 sigma on one is not."""
     rows = next(c for c in built.constraints if c.name == "gnss_position")
     layout = Layout(built)
-    point = Iterate(backward(built, ekf(built)).states, {c.parameter.name: c.mean for c in built.chains})
+    point = Iterate(smooth_backward(built, ekf(built)).states, {c.parameter.name: c.mean for c in built.chains})
     linear = rows.linearize(point.states[rows.keyframe], {}, slice(None))
     p = rows.p_n + np.einsum("nji,nj->ni", rows.R_ln, linear.residual)  # nothing left
     for axes, weighed in ((3, True), (1, False)):
@@ -304,14 +304,14 @@ def test_graduation_where_bursts_are_many(
     t = recording.gnss.t - recording.start
     bad = (t > 60.0) & ((t - 60.0) % 60.0 < 20.0)
     wrong = moved(recording, bad, np.array([8.0, -6.0, 0.0]))
-    settings = settings_from({"gnss": {"faults": "off", "robust": kernel}, "noise": {"mode": "stated"}})
+    settings = parse_settings({"gnss": {"faults": "off", "robust": kernel}, "noise": {"mode": "stated"}})
     assert low < horizontal(run(wrong, settings, ("batch",))["batch"], truth).max() < high
 
 
 def test_what_a_gate_refuses_no_solver_uses(drive: tuple[Recording, Trajectory]) -> None:
     recording, _ = drive
     wrong = moved(recording.crop(0.0, 200.0), np.array([120]), np.array([30.0, 0.0, 0.0]))
-    settings = settings_from({"gnss": {"faults": "off", "gate": "on"}, "noise": {"mode": "stated"}})
+    settings = parse_settings({"gnss": {"faults": "off", "gate": "on"}, "noise": {"mode": "stated"}})
     for name, solution in run(wrong, settings, ("ekf", "rts", "batch", "incremental")).items():
         assert solution.records["gnss_position"].weight[120] == 0.0, name
         assert np.sum(solution.records["gnss_position"].weight == 0.0) == 1, name
@@ -326,7 +326,7 @@ def test_what_a_gate_refuses_no_solver_uses(drive: tuple[Recording, Trajectory])
     ],
 )
 def test_settings_of_earlier_versions(given: dict[str, object], is_now: tuple[object, ...]) -> None:
-    gnss = settings_from({"gnss": given}).gnss
+    gnss = parse_settings({"gnss": given}).gnss
     assert (gnss.faults, gnss.robust, gnss.gate) == is_now
 
 
@@ -340,7 +340,7 @@ def test_settings_of_earlier_versions(given: dict[str, object], is_now: tuple[ob
 )
 def test_a_switch_that_is_none_of_its_words(key: str, value: object, names: tuple[str, ...]) -> None:
     with refused("key.value", ConfigError, f"'gnss.{key}'", *names):
-        settings_from({"gnss": {key: value}})
+        parse_settings({"gnss": {key: value}})
 
 
 def test_fixes_that_drift_for_a_minute_are_left_out_and_nothing_else() -> None:

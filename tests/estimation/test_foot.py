@@ -12,21 +12,21 @@ import pytest
 from helpers import Array, assert_told
 
 from graphnav.app.workflow import Request, run_request
-from graphnav.config import Settings, settings_from
+from graphnav.config import Settings, parse_settings
 from graphnav.constraints.base import BuildContext
 from graphnav.constraints.foot import FOOT_AXIS, PATTERN, PIVOT, TRAVEL, FootLateral, Stance
 from graphnav.constraints.standstill import ZeroRate, _estimate_swaying
 from graphnav.core import rotation as ro
 from graphnav.core.earth import LocalFrame
 from graphnav.core.interpolation import interpolate
-from graphnav.core.notes import key_of
+from graphnav.core.notes import get_key
 from graphnav.core.state import States, split_covariance
 from graphnav.detectors import detect
 from graphnav.detectors.base import Detection
 from graphnav.estimation.pipeline import run
-from graphnav.estimation.problem import keyframe_times
+from graphnav.estimation.problem import choose_keyframes
 from graphnav.estimation.solution import Solution
-from graphnav.evaluation.strides import floor_sigma, shapes, walk_errors
+from graphnav.evaluation.strides import compare_shapes, estimate_floor_sigma, walk_errors
 from graphnav.imu.preintegration import preintegrate
 from graphnav.imu.samples import bridge_gaps
 from graphnav.recording import Imu, Recording, Truth
@@ -64,7 +64,7 @@ def scene_of(walk: Simulated, settings: Settings) -> BuildContext:
     recording = walk.recording
     frame = LocalFrame(walk.truth.llh[0])
     spans = detect(recording, settings).stationary
-    t = keyframe_times(recording.start, recording.end, Stance.epochs(recording, settings, spans), 1.0)
+    t = choose_keyframes(recording.start, recording.end, Stance.epochs(recording, settings, spans), 1.0)
     intervals = preintegrate(bridge_gaps(recording.imu), recording.imu, t, np.zeros(3), np.zeros(3))
     return BuildContext(recording, settings, frame, t, spans, intervals)
 
@@ -223,7 +223,7 @@ def test_zero_velocity_alone_makes_strides_too_short() -> None:
     spans = detect(walk.recording).stationary.mean(axis=1)
     for name, sigma, pattern in (("zero velocity", 1e-6, 0.0), ("pivot", 0.1, 0.02)):
         foot = {"pivot_sigma": sigma, "travel_sigma": sigma, "pattern": pattern}
-        solution = run(walk.recording, settings_from({"foot": foot}), ("rts",))
+        solution = run(walk.recording, parse_settings({"foot": foot}), ("rts",))
         p = solution["rts"].at(spans)[1].p
         way[name] = np.sum(np.linalg.norm(np.diff(p[:, :2], axis=0), axis=1))
     at, _ = interpolate(truth, spans)
@@ -236,7 +236,7 @@ def test_zero_velocity_alone_makes_strides_too_short() -> None:
 # ------------------------------------------------------------------------------------------------------------ lateral
 def lateral_rows(course: str) -> tuple[Simulated, BuildContext, FootLateral]:
     walk = made("normal", exact=True, course=course)
-    scene = scene_of(walk, settings_from({"foot": {"lateral": True}}))
+    scene = scene_of(walk, parse_settings({"foot": {"lateral": True}}))
     rows = FootLateral.build(scene)
     assert rows is not None
     return walk, scene, rows
@@ -307,7 +307,7 @@ def test_a_gyro_bias_known_from_before() -> None:
     assert walk.truth.gyro_bias is not None
     known = {"gyro_bias": walk.truth.gyro_bias[-1].tolist(), "gyro_bias_sigma": 1e-4}
     plain = solved()["batch"]
-    helped = run(walk.recording, settings_from({"alignment": known}), ("batch",))["batch"]
+    helped = run(walk.recording, parse_settings({"alignment": known}), ("batch",))["batch"]
     assert helped.covariance[-1, 14, 14] < 0.5 * plain.covariance[-1, 14, 14]
     assert np.abs(helped.states.bg[-1] - walk.truth.gyro_bias[-1]).max() < 2e-4
 
@@ -331,18 +331,18 @@ def test_a_walk_that_starts_in_the_air_is_levelled_in_its_first_stance() -> None
 def test_a_loop_is_closed_only_when_asked() -> None:
     walk = made("normal").recording
     open_ = solved()
-    closed = run(walk, settings_from({"foot": {"closed_loop": 0.01}}), ("rts", "batch"))
+    closed = run(walk, parse_settings({"foot": {"closed_loop": 0.01}}), ("rts", "batch"))
     for solver in ("rts", "batch"):
         assert "closed_loop" not in open_[solver].records
         assert np.linalg.norm(open_[solver].states.p[-1]) > 0.1
         assert np.linalg.norm(closed[solver].states.p[-1]) < 0.05
-        assert "closed_loop.set" in map(key_of, closed[solver].notes)
+        assert "closed_loop.set" in map(get_key, closed[solver].notes)
 
 
 def test_a_loop_that_was_put_in_is_not_scored(shared_data: Path) -> None:
     source = str(shared_data / "openshoe_loops" / "run34.toml")
     stated = {"noise": {"mode": "stated"}}
-    plain, asked = settings_from(stated), settings_from(stated | {"foot": {"closed_loop": 0.01}})
+    plain, asked = parse_settings(stated), parse_settings(stated | {"foot": {"closed_loop": 0.01}})
     assert not run_request(Request(source, ("ekf",), asked)).metrics
     assert run_request(Request(source, ("ekf",), plain)).metrics["ekf"].closure is not None
     assert not run_request(Request(source, ("ekf",), plain, end=15.0)).metrics  # a part of a loop is none
@@ -416,7 +416,7 @@ def test_a_dense_truth_of_another_point_on_the_foot() -> None:
     solution = Solution("made", LocalFrame(np.zeros(3)), t, states, P, detections=(standing,))
     solution = replace(solution, between=(_Rows(t, states, P),))
     recording = replace(line_walk(0.0)[0], truth=Truth(t, xyz=xyz))
-    assert floor_sigma(recording, solution) == pytest.approx(np.std(off[1:-1]), rel=1e-6)
+    assert estimate_floor_sigma(recording, solution) == pytest.approx(np.std(off[1:-1]), rel=1e-6)
     found = walk_errors(recording, solution)
     assert found.horizontal > 0.01
     assert found.of_point < 1e-3
@@ -439,12 +439,12 @@ def test_shape_by_epochs_and_by_stances() -> None:
     inside = [(t >= a) & (t <= b) for a, b in stances]
     means = [np.array([x[one].mean(axis=0) for one in inside]) for x in (p, truth)]
     standing = np.any(inside, axis=0)
-    everywhere, in_stance, of_steps = shapes(t, p, truth, stances)
+    everywhere, in_stance, of_steps = compare_shapes(t, p, truth, stances)
     assert everywhere == pytest.approx(apart(p, truth), rel=1e-6)
     assert in_stance == pytest.approx(apart(p[standing], truth[standing]), rel=1e-6)
     assert of_steps == pytest.approx(apart(*means), rel=1e-6)
     assert of_steps < 0.7 * in_stance  # one place of twenty is off, but half of the epochs
-    assert shapes(t, p, truth, np.empty((0, 2))) == (everywhere, everywhere, everywhere)
+    assert compare_shapes(t, p, truth, np.empty((0, 2))) == (everywhere, everywhere, everywhere)
 
 
 # --------------------------------------------------------------------------------------------------------- real walks

@@ -10,15 +10,15 @@ import oracle
 import pytest
 from helpers import Array, at_rate, dense, errors, factors, random_states, truth_states
 
-from graphnav.config import settings_from
+from graphnav.config import parse_settings
 from graphnav.constraints.vehicle import OdometerSpeed
 from graphnav.core.earth import LocalFrame
-from graphnav.core.notes import key_of
+from graphnav.core.notes import get_key
 from graphnav.core.rotation import exp, right_jacobian_inverse
 from graphnav.core.state import DIM, States
 from graphnav.core.trajectory import Trajectory
 from graphnav.estimation.factor_graph.batch import batch
-from graphnav.estimation.noise.apply import with_noise
+from graphnav.estimation.noise.apply import apply_noise
 from graphnav.estimation.noise.model import STATED, NoiseModel, VarianceComponent
 from graphnav.estimation.pipeline import run
 from graphnav.estimation.problem import Problem, build_problem
@@ -26,7 +26,7 @@ from graphnav.estimation.solution import Solution
 from graphnav.estimation.solvers.ekf import ekf
 from graphnav.estimation.solvers.incremental import Incremental, incremental
 from graphnav.estimation.solvers.linearise import Step, list_node_steps
-from graphnav.estimation.solvers.rts import backward
+from graphnav.estimation.solvers.rts import smooth_backward
 from graphnav.estimation.solvers.stages import Message, Place, rotate_columns
 from graphnav.estimation.solvers.window import Window, make_first_message
 from graphnav.recording import Recording
@@ -67,16 +67,16 @@ def built(drive: tuple[Recording, Trajectory]) -> Problem:
     frame = LocalFrame(recording.gnss.llh[0])
     start = truth_states(truth, np.zeros(1), frame)
     start = replace(start, R_nb=start.R_nb @ exp(np.array([[0.01, -0.01, 0.06]])), ba=0 * start.ba, bg=0 * start.bg)
-    settings = settings_from({"gnss": {"lever_arm_sigma": 0.2}})
+    settings = parse_settings({"gnss": {"lever_arm_sigma": 0.2}})
     still = np.array([[0.0, 8.0]]) if np.linalg.norm(truth.v[truth.t <= 8.0], axis=1).max() < 1e-3 else None
-    return with_noise(
+    return apply_noise(
         build_problem(recording, settings, frame, start, np.repeat([0.1, 1.0, 0.5, 0.05, 5e-3], 3), still), LASTING
     )
 
 
 @pytest.fixture(scope="module")
 def solved(built: Problem) -> Solution:
-    smoothed = backward(built, ekf(built))
+    smoothed = smooth_backward(built, ekf(built))
     return batch(built, smoothed.states, smoothed.nodes(built), reintegrate=False)
 
 
@@ -95,7 +95,7 @@ def test_a_window_is_the_dense_least_squares_solution(drive: tuple[Recording, Tr
     """Ten seconds against one QR of all rows as `helpers.factors` makes them, with none of the solver's code."""
     part = built.recording.crop(40.0, 50.0)
     start = truth_states(drive[1], np.round(np.array([part.start]), 6), built.frame)
-    problem = with_noise(build_problem(part, built.settings, built.frame, start, built.prior.sigma[0]), LASTING)
+    problem = apply_noise(build_problem(part, built.settings, built.frame, start, built.prior.sigma[0]), LASTING)
     found = incremental(problem, lag=EVERYTHING).settled
     parts, widths = factors(problem, found.states, {n: p.value for n, p in found.parameters.items()})
     step, covariance = dense(parts, widths)
@@ -112,8 +112,8 @@ def test_the_live_estimate_is_the_end_of_a_batch_solution_so_far(built: Problem)
         # what the odometer is worth is told from its readings: the same ones
         part = build_problem(built.recording.crop(0.0, end), built.settings, built.frame, built.prior.mean,
                     built.prior.sigma[0], np.array([[0.0, 8.0]]), speed=speed)  # fmt: skip
-        part = with_noise(part, LASTING)
-        smoothed = backward(part, ekf(part))
+        part = apply_noise(part, LASTING)
+        smoothed = smooth_backward(part, ekf(part))
         so_far = batch(part, smoothed.states, smoothed.nodes(part), reintegrate=False)
         k = int(np.searchsorted(built.t, part.t[-1] - 1e-6))
         assert built.t[k] == pytest.approx(part.t[-1], abs=1e-6)
@@ -126,7 +126,7 @@ def test_a_lag_over_the_outage_gives_the_batch_solution_to_a_centimetre(drive: t
 
     def far(lag: float) -> float:
         """m"""
-        settings = settings_from({"solver": {"lag": lag}})
+        settings = parse_settings({"solver": {"lag": lag}})
         found = run(drive[0], settings, solvers=("incremental",), noise=LASTING)["incremental"]
         return float(np.abs(found.states.p - best.states.p).max())
 
@@ -210,7 +210,7 @@ def test_outliers_are_given_up_as_by_the_batch_solver(drive: tuple[Recording, Tr
     rows = np.arange(10, len(p), 12)
     p[rows] += [15.0, -10.0, 5.0]
     bad = replace(recording, gnss=replace(gnss, llh=frame.to_llh(p)))
-    settings = settings_from({"gnss": {"robust": "cauchy"}})
+    settings = parse_settings({"gnss": {"robust": "cauchy"}})
     found = run(bad, settings, solvers=("incremental", "batch"), noise=STATED)
     a, b = found["incremental"], found["batch"]
     far = np.abs(a.states.p - b.states.p)[a.t > a.t[0] + 20.0]
@@ -223,7 +223,7 @@ def test_sigmas_are_true(drive: tuple[Recording, Trajectory]) -> None:
     ratio = []
     for seed in range(4):
         recording, truth = oracle.drive(oracle.vehicle_path(240.0, 50.0), seed=20 + seed, outages=[(110.0, 150.0)])
-        settings = settings_from({"solver": {"lag": 30.0}})
+        settings = parse_settings({"solver": {"lag": 30.0}})
         solution = run(at_rate(recording, 25.0), settings, solvers=("incremental",), noise=STATED)["incremental"]
         i = np.clip(np.searchsorted(truth.t, solution.t - 1e-6), 0, len(truth.t) - 1)
         met = np.abs(truth.t[i] - solution.t) < 1e-6  # not where a stop begins or ends
@@ -240,7 +240,7 @@ def test_real_program_run(shared_data: Path, name: str) -> None:
     # what comes after the lag still tells of errors that last for minutes and hours: as much as variances say
     var = [np.diagonal(one.covariance, axis1=1, axis2=2)[:, 3:6] for one in (a, b)]
     assert np.all(np.abs(a.states.p - b.states.p) < 3.0 * np.sqrt(np.maximum(var[0] - var[1], 0.0)) + 0.001)
-    assert "solver.step_times" in map(key_of, a.notes)
+    assert "solver.step_times" in map(get_key, a.notes)
 
 
 def test_what_smooths_back_is_the_whole_matrix(built: Problem) -> None:

@@ -9,7 +9,7 @@ import pytest
 from helpers import Array, random_states
 
 from graphnav.core.state import BLOCKS, DIM, States
-from graphnav.estimation.solvers.invariant import minus_invariant, plus_invariant, transport_covariance
+from graphnav.estimation.solvers.invariant import add_invariant, subtract_invariant, transport_covariance
 
 Z = np.array([0.0, 0.0, 1.0])
 
@@ -29,18 +29,18 @@ def along(states: States) -> Array:
 
 def test_one_undoes_the_other(moves: tuple[States, Array]) -> None:
     states, e = moves
-    np.testing.assert_allclose(minus_invariant(plus_invariant(states, e), states), e, atol=1e-12)
+    np.testing.assert_allclose(subtract_invariant(add_invariant(states, e), states), e, atol=1e-12)
 
 
 def test_to_first_order_it_is_the_usual_error_state(moves: tuple[States, Array]) -> None:
     states, e = moves
     small = 1e-6 * e
-    np.testing.assert_allclose(plus_invariant(states, small).minus(states.plus(small)), 0.0, atol=1e-10)
+    np.testing.assert_allclose(add_invariant(states, small).minus(states.plus(small)), 0.0, atol=1e-10)
 
 
 def test_a_turn_leaves_the_velocity_in_the_body_however_large(moves: tuple[States, Array]) -> None:
     states, _ = moves
-    turned = plus_invariant(states, 2.0 * along(states))
+    turned = add_invariant(states, 2.0 * along(states))
     np.testing.assert_allclose(turned.R_nb[:, 2], states.R_nb[:, 2], atol=1e-12)  # the vertical in the body
     in_body = [np.einsum("kji,kj->ki", one.R_nb, one.v) for one in (turned, states)]
     np.testing.assert_allclose(*in_body, atol=1e-11)
@@ -49,7 +49,7 @@ def test_a_turn_leaves_the_velocity_in_the_body_however_large(moves: tuple[State
 
 def test_what_is_not_known_of_the_heading_stays_that(moves: tuple[States, Array]) -> None:
     states, e = moves
-    moved = plus_invariant(states, e)
+    moved = add_invariant(states, e)
     before, after = along(states), along(moved)
     P = before[:, :, None] * before[:, None]
     np.testing.assert_allclose(
@@ -59,7 +59,7 @@ def test_what_is_not_known_of_the_heading_stays_that(moves: tuple[States, Array]
 
 def test_back_again_is_the_same_covariance(moves: tuple[States, Array]) -> None:
     states, e = moves
-    moved = plus_invariant(states, e)
+    moved = add_invariant(states, e)
     root = np.random.default_rng(6).standard_normal((6, DIM + 2, DIM + 2))
     P = root @ np.swapaxes(root, 1, 2)
     there = transport_covariance(P, states, moved)
@@ -71,7 +71,7 @@ def test_numbers_beside_attitude_and_velocity_stay(moves: tuple[States, Array]) 
     states, e = moves
     e = e.copy()
     e[:, BLOCKS["theta"]] = e[:, BLOCKS["v"]] = 0.0
-    moved = plus_invariant(states, e)
+    moved = add_invariant(states, e)
     np.testing.assert_allclose(moved.minus(states), e, atol=1e-12)
     P = np.broadcast_to(np.eye(DIM), (6, DIM, DIM))
     np.testing.assert_allclose(transport_covariance(P, states, replace(moved)), P, atol=1e-12)

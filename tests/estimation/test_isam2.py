@@ -9,7 +9,7 @@ import oracle
 import pytest
 from helpers import Array, truth_states
 
-from graphnav.config import settings_from
+from graphnav.config import parse_settings
 from graphnav.core.earth import LocalFrame
 from graphnav.core.rotation import exp
 from graphnav.core.state import States
@@ -24,7 +24,7 @@ from graphnav.estimation.factor_graph.tree_marginals import (
     settle,
 )
 from graphnav.estimation.factor_graph.tree_nodes import update_isam
-from graphnav.estimation.noise.apply import with_noise
+from graphnav.estimation.noise.apply import apply_noise
 from graphnav.estimation.noise.model import NoiseModel, VarianceComponent
 from graphnav.estimation.problem import Problem, build_problem
 from graphnav.estimation.solution import Solution
@@ -32,7 +32,7 @@ from graphnav.estimation.solvers.ekf import ekf
 from graphnav.estimation.solvers.incremental import incremental
 from graphnav.estimation.solvers.linearise import list_node_steps
 from graphnav.estimation.solvers.points import move_covariance
-from graphnav.estimation.solvers.rts import backward
+from graphnav.estimation.solvers.rts import smooth_backward
 from graphnav.estimation.solvers.stages import Place
 from graphnav.estimation.solvers.window import compute_turn_limit, make_first_message
 from graphnav.recording import Recording
@@ -69,16 +69,16 @@ def drive() -> Drive:
 def built(drive: Drive) -> Problem:
     """With all constraints and errors that last."""
     recording, start, still = drive
-    settings = settings_from({"gnss": {"lever_arm_sigma": 0.2}})
+    settings = parse_settings({"gnss": {"lever_arm_sigma": 0.2}})
     sigma = np.repeat([0.1, 1.0, 0.5, 0.05, 5e-3], 3)
-    return with_noise(
+    return apply_noise(
         build_problem(recording, settings, LocalFrame(recording.gnss.llh[0]), start, sigma, still), LASTING
     )
 
 
 @pytest.fixture(scope="module")
 def solved(built: Problem) -> Solution:
-    smoothed = backward(built, ekf(built))
+    smoothed = smooth_backward(built, ekf(built))
     return batch(built, smoothed.states, smoothed.nodes(built))
 
 
@@ -195,7 +195,7 @@ def test_keyframes_come_again_after_others_were_taken_back(drive: Drive) -> None
     recording, start, still = drive
     sigma = np.repeat([0.1, 1.0, 0.5, 0.05, 5e-3], 3)
     frame = LocalFrame(recording.gnss.llh[0])
-    settings = settings_from({"keyframes": {"rate": 10.0}})
+    settings = parse_settings({"keyframes": {"rate": 10.0}})
     stated = build_problem(recording.crop(0.0, 4.0), settings, frame, start, sigma, still)
     never, _ = _played(stated, 36)
     tree, _ = _played(stated, 26, every=1000)

@@ -12,7 +12,7 @@ import pytest
 from graphnav import load
 from graphnav.config import Settings
 from graphnav.core.errors import EstimationError
-from graphnav.core.notes import key_of
+from graphnav.core.notes import get_key
 from graphnav.estimation import long_drives
 from graphnav.estimation.pipeline import run
 from graphnav.recording import take_rows
@@ -27,20 +27,20 @@ def test_parts_say_what_the_whole_says(monkeypatch: pytest.MonkeyPatch) -> None:
     whole = run(recording, settings, ("ekf", "rts"))
     for name, value in (("STRAIGHT", 60.0), ("PART", 40.0), ("OVERLAP", 30.0)):
         monkeypatch.setattr(long_drives, name, value)
-    shares = long_drives.shares(recording, settings)
+    shares = long_drives.split_drive(recording, settings)
     assert len(shares) == 3
     assert all(a.end == b.start for a, b in itertools.pairwise(shares))
     assert all(np.shares_memory(share.recording.imu.gyro, recording.imu.gyro) for share in shares)
-    assert len(long_drives.shares(replace(recording, gnss=None), settings)) == 1
+    assert len(long_drives.split_drive(replace(recording, gnss=None), settings)) == 1
     seam = shares[1].start
     assert recording.gnss is not None
     silent = take_rows(recording.gnss, (recording.gnss.t < seam - 25.0) | (recording.gnss.t > seam))
     monkeypatch.setattr(long_drives, "_SILENCE", 20.0)
-    assert [share.start for share in long_drives.shares(replace(recording, gnss=silent), settings)[1:]] == [
+    assert [share.start for share in long_drives.split_drive(replace(recording, gnss=silent), settings)[1:]] == [
         shares[2].start
     ]
     parts = run(recording, settings, ("ekf", "rts"))
-    assert "pieces.parts" in map(key_of, parts["rts"].notes)
+    assert "pieces.parts" in map(get_key, parts["rts"].notes)
     seams = np.array([share.start for share in shares[1:]])
     for name, one in parts.items():
         other = whole[name]
@@ -79,8 +79,8 @@ def test_a_drive_with_states_of_its_own_for_each_satellite_is_cut_sooner(monkeyp
     for name, value in (("STRAIGHT", 60.0), ("PART", 21.0), ("OVERLAP", 10.0)):
         monkeypatch.setattr(long_drives, name, value)
     monkeypatch.setattr(long_drives, "_is_told", lambda *_: True)
-    assert len(long_drives.shares(replace(recording, raw_gnss=None), settings)) == 1
-    assert len(long_drives.shares(recording, settings)) == 2
+    assert len(long_drives.split_drive(replace(recording, raw_gnss=None), settings)) == 1
+    assert len(long_drives.split_drive(recording, settings)) == 2
     one = run(recording, settings, ("rts",))["rts"]
     assert np.all(np.diff(one.fixed[:, 0]) > 0.5)  # no epoch twice
     assert one.fixed[:, 1].all()

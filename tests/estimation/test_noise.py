@@ -10,7 +10,7 @@ import oracle
 import pytest
 from scipy.special import chdtrc, chdtri
 
-from graphnav.config import Settings, settings_from
+from graphnav.config import Settings, parse_settings
 from graphnav.config.gnss import GnssSettings
 from graphnav.constraints.base import Constraint
 from graphnav.constraints.gnss import STAMP_ERROR, STAMPS
@@ -22,30 +22,35 @@ from graphnav.detectors import detect
 from graphnav.estimation.alignment import align
 from graphnav.estimation.factor_graph.batch import batch
 from graphnav.estimation.faults import weigh_rows
-from graphnav.estimation.names import components
+from graphnav.estimation.names import name_components
 from graphnav.estimation.noise import estimate
-from graphnav.estimation.noise.apply import row_weights, with_noise, without_parts
+from graphnav.estimation.noise.apply import apply_noise, drop_parts, select_weights
 from graphnav.estimation.noise.estimate import NoiseEstimate, estimate_noise
 from graphnav.estimation.noise.explanations import FIXES, WHEELS
 from graphnav.estimation.noise.initial_points import Initial, find_initial_points
 from graphnav.estimation.noise.model import STATED, NoiseModel, RowWeights, VarianceComponent
-from graphnav.estimation.noise.moments import imu_moments, lag_moments, process_moments, row_moments
-from graphnav.estimation.noise.priors import prior
+from graphnav.estimation.noise.moments import (
+    collect_imu_moments,
+    collect_process_moments,
+    collect_row_moments,
+    lag_moments,
+)
+from graphnav.estimation.noise.priors import get_prior
 from graphnav.estimation.noise.spacing import space_fixes
 from graphnav.estimation.noise.words import describe_far
-from graphnav.estimation.pipeline import SOLVERS, origin, run
+from graphnav.estimation.pipeline import SOLVERS, choose_origin, run
 from graphnav.estimation.problem import Problem, build_problem
 from graphnav.estimation.solution import Solution
 from graphnav.estimation.solvers.ekf import ekf, refilter
 from graphnav.estimation.solvers.linearise import linearise
 from graphnav.estimation.solvers.passes import ForwardRecord, SmootherPass
-from graphnav.estimation.solvers.rts import backward, backward_moments, rts
-from graphnav.evaluation.scoring import errors
+from graphnav.estimation.solvers.rts import rts, smooth_backward, smooth_moments
+from graphnav.evaluation.scoring import compute_errors
 from graphnav.imu.preintegration import NOISE_FIGURES, preintegrate
 from graphnav.recording import Recording
 
 # Wheels and stops hold exactly on these drives, which no sigma is made for
-INERTIAL = settings_from(
+INERTIAL = parse_settings(
     {
         "vehicle": {"nhc": False, "odometer": False},
         "standstill": {"zero_velocity": False, "zero_rate": False, "held_position": False},
@@ -57,7 +62,7 @@ SEEDS = range(3)
 def built(recording: Recording, settings: Settings | None = None) -> tuple[Problem, float | None]:
     """A problem with stated noise and the parts of its intervals, and what its alignment has seen."""
     settings = settings or Settings()
-    frame, stops = LocalFrame(origin(recording)), detect(recording, settings).stationary
+    frame, stops = LocalFrame(choose_origin(recording)), detect(recording, settings).stationary
     found = align(recording, settings, frame, stops)
     return build_problem(recording, settings, frame, found.state, found.sigma, stops, parts_of_noise=True), found.until
 
@@ -73,15 +78,15 @@ def groups(problem: Problem) -> list[str]:
 def moments(problem: Problem, forward: ForwardRecord, smoothed: SmootherPass) -> dict[str, tuple[float, float]]:
     """A and B of every component."""
     out: dict[str, tuple[float, float]] = {}
-    imu = imu_moments(problem, forward, smoothed)
+    imu = collect_imu_moments(problem, forward, smoothed)
     out |= {f"imu.{name}": (imu.A[:, i].sum(), imu.B[:, i].sum()) for i, name in enumerate(NOISE_FIGURES)}
     for chain in problem.chains:
-        _, A, B = process_moments(problem, chain, smoothed, len(problem.t))
+        _, A, B = collect_process_moments(problem, chain, smoothed, len(problem.t))
         own = np.array(chain.parameter.noise_groups)
         out |= {g: (A[:, own == g].sum(), B[:, own == g].sum()) for g in chain.parameter.noise_groups}
     for rows in problem.constraints:
         names, index = rows.noise_groups()
-        found = row_moments(problem, rows, smoothed, len(rows))
+        found = collect_row_moments(problem, rows, smoothed, len(rows))
         out |= {g: (found.A[index == i].sum(), found.B[index == i].sum()) for i, g in enumerate(names)}
     return out
 
@@ -112,10 +117,10 @@ def test_what_a_row_is_off_by_is_that_of_a_smoother_without_it(row: int) -> None
         weight = np.ones(len(rows)) if rows.weight is None else rows.weight.copy()
         weight[row] = 0.0 if without else 0.7
         some = weigh_rows(used, {rows.name: weight})
-        return replace(rows, weight=weight), backward(some, refilter(some, about))
+        return replace(rows, weight=weight), smooth_backward(some, refilter(some, about))
 
     rows, smoothed = smooth(without=False)
-    found = row_moments(used, rows, smoothed, len(rows)).left_out[row]
+    found = collect_row_moments(used, rows, smoothed, len(rows)).left_out[row]
     _, without = smooth(without=True)
     linear = linearise(rows, without, used.columns, slice(row, row + 1))
     H, P = linear.H[0], without.P[rows.keyframe[row]]
@@ -131,14 +136,14 @@ def test_moments_are_the_derivative_of_the_likelihood() -> None:
     base, opening = built(lap())
     used, noise, about = mixed(base, opening)
     forward = refilter(used, about)
-    found = moments(used, forward, backward(used, forward))
+    found = moments(used, forward, smooth_backward(used, forward))
     assert set(found) == set(groups(base))
     h = 0.01
     for group, (A, B) in found.items():
         both = []
         for step in (-h, h):
             other = {**noise.figures, group: VarianceComponent(noise.figures[group].log_factor + step)}
-            both.append(refilter(with_noise(base, replace(noise, figures=other)), about).log_likelihood.sum())
+            both.append(refilter(apply_noise(base, replace(noise, figures=other)), about).log_likelihood.sum())
         slope = (both[1] - both[0]) / (2.0 * h)
         assert pytest.approx(slope, abs=2e-4 * (1.0 + A + B)) == 0.5 * (A - B), group
 
@@ -147,10 +152,10 @@ def mixed(base: Problem, opening: float | None) -> tuple[Problem, NoiseModel, Sm
     """With figures that differ, so that no component is all of its noise; and points that smoothing leaves alone."""
     size = np.random.default_rng(1).normal(0.0, 0.5, len(groups(base)))
     noise = NoiseModel({name: VarianceComponent(float(x)) for name, x in zip(groups(base), size, strict=True)})
-    used = with_noise(base, noise)
-    about = backward(used, ekf(used, opening=opening))
+    used = apply_noise(base, noise)
+    about = smooth_backward(used, ekf(used, opening=opening))
     for _ in range(3):
-        about = backward(used, refilter(used, about))
+        about = smooth_backward(used, refilter(used, about))
     return used, noise, about
 
 
@@ -158,15 +163,15 @@ def test_a_pass_for_a_noise_model_says_what_one_with_all_covariances_says() -> N
     """Rows linearised where it leads, of other sigmas too, and the next pass by them."""
     stated, opening = built(lap())
     base, noise, about = mixed(stated, opening)
-    whole = backward(base, refilter(base, about))
-    short = backward_moments(base, refilter(base, about, whole=False))
+    whole = smooth_backward(base, refilter(base, about))
+    short = smooth_moments(base, refilter(base, about, whole=False))
     np.testing.assert_allclose(short.states.p, whole.states.p, atol=1e-9)
     for chain in base.chains:
         if chain.parameter.correlation_time is not None:
             at = base.columns[chain.parameter.name]
             np.testing.assert_allclose(short.variance[1:, at], whole.variance[1:, at], rtol=1e-6)
     larger = {name: VarianceComponent(figure.log_factor + 1.0) for name, figure in noise.figures.items()}
-    for problem in (base, with_noise(stated, replace(noise, figures=larger))):
+    for problem in (base, apply_noise(stated, replace(noise, figures=larger))):
         for rows in problem.constraints:
             n = len(rows)
             one, other = (some.linearise(rows, problem.columns, n) for some in (short, whole))
@@ -184,7 +189,7 @@ def test_lag_moments_are_the_derivative_of_the_likelihood_by_the_correlation_tim
     base, opening = built(lap())
     used, noise, about = mixed(base, opening)
     forward = refilter(used, about)
-    smoothed = backward(used, forward)
+    smoothed = smooth_backward(used, forward)
     h, K = 0.01, len(used.t)
     lasting = [c for c in used.chains if c.parameter.correlation_time is not None]
     assert len(lasting) >= 8
@@ -201,7 +206,7 @@ def test_lag_moments_are_the_derivative_of_the_likelihood_by_the_correlation_tim
         def likelihood(time: float, name: str = p.name) -> float:
             # times of all are given, for nodes to be the same
             times = {c.parameter.name: c.parameter.correlation_time for c in lasting} | {name: time}
-            return float(refilter(with_noise(base, replace(noise, times=times)), about).log_likelihood.sum())
+            return float(refilter(apply_noise(base, replace(noise, times=times)), about).log_likelihood.sum())
 
         both = [(f(p.correlation_time * np.exp(h)) - f(p.correlation_time * np.exp(-h))) / (2.0 * h)
                 for f in (expected, likelihood)]  # fmt: skip
@@ -232,17 +237,17 @@ def test_factors_of_the_imu_are_those_of_its_figures() -> None:
     noise = NoiseModel(
         {f"imu.{name}": VarianceComponent(float(np.log(f))) for name, f in zip(NOISE_FIGURES, factors, strict=True)}
     )
-    used = with_noise(base, noise)
+    used = apply_noise(base, noise)
     np.testing.assert_allclose(used.motion.intervals.covariance / scale, mine.covariance / scale, atol=1e-12)
     assert all(getattr(used.imu_noise, name) == pytest.approx(x) for name, x in figures.items())
-    assert without_parts(used).intervals.parts.shape[1] == 0
-    assert np.array_equal(without_parts(used).motion.intervals.covariance, used.intervals.covariance)
+    assert drop_parts(used).intervals.parts.shape[1] == 0
+    assert np.array_equal(drop_parts(used).motion.intervals.covariance, used.intervals.covariance)
 
 
 def test_stated_noise_is_what_recording_and_settings_say() -> None:
     recording = lap().crop(0.0, 60.0)
     base, _ = built(recording)
-    used = with_noise(base, STATED)
+    used = apply_noise(base, STATED)
     assert used.intervals is base.intervals
     assert used.columns == base.columns
     assert not any(p.name.startswith("gnss_error") for c in used.constraints for p in c.parameters)
@@ -262,7 +267,7 @@ def test_factors_of_rows_and_processes_are_of_their_own_components() -> None:
         },
         times={"gnss_error_of_minutes_float": 40.0},
     )
-    used = {c.name: c for c in with_noise(base, noise).constraints}
+    used = {c.name: c for c in apply_noise(base, noise).constraints}
     stated = {c.name: c for c in base.constraints}
     up = np.where(stated["gnss_position"].type == 2, 2.0, 1.0)
     assert used["gnss_position"].sigma == pytest.approx(
@@ -281,10 +286,10 @@ def test_weights_and_spans_are_of_the_rows_at_their_times() -> None:
     t = np.arange(10.0)
     some = RowWeights(np.array([2.0, 7.0]), np.array([0.5, 0.1]))
     noise = NoiseModel(weights={"a": some}, excluded={"a": ((6.0, 8.0),), "b": ((0.0, 0.0), (9.0, 20.0))})
-    assert row_weights(t, noise, "a").tolist() == [1, 1, 0.5, 1, 1, 1, 0, 0, 0, 1]
-    assert row_weights(t, noise, "b").tolist() == [0, 1, 1, 1, 1, 1, 1, 1, 1, 0]
-    assert row_weights(t, noise, "c").tolist() == [1] * 10
-    assert row_weights(t + 0.5, noise, "b").tolist() == [1] * 9 + [0]
+    assert select_weights(t, noise, "a").tolist() == [1, 1, 0.5, 1, 1, 1, 0, 0, 0, 1]
+    assert select_weights(t, noise, "b").tolist() == [0, 1, 1, 1, 1, 1, 1, 1, 1, 0]
+    assert select_weights(t, noise, "c").tolist() == [1] * 10
+    assert select_weights(t + 0.5, noise, "b").tolist() == [1] * 9 + [0]
 
 
 # ---------------------------------------------------------------------------------------------------------- figures
@@ -348,7 +353,7 @@ def made(path: oracle.ExactPath, seed: int, imu: float = 1.0, fixes: float = 1.0
     true = dict.fromkeys(groups(base), 0.0)
     for name in true:
         of_fixes = name.startswith("gnss") and name != STAMPS
-        true[name] = prior(name)[0] + 2.0 * np.log(fixes if of_fixes else 1.0)
+        true[name] = get_prior(name)[0] + 2.0 * np.log(fixes if of_fixes else 1.0)
     for name in ("gyro", "accel"):
         true[f"imu.{name}_noise_density"] = 2.0 * np.log(imu)
     return Drive(base, opening, truth, true)
@@ -372,10 +377,10 @@ def estimated(request: pytest.FixtureRequest) -> Estimated:
 
 def log_posterior(drive: Drive, noise: NoiseModel) -> float:
     """Log-likelihood of the innovations and logarithm of the priors."""
-    used = with_noise(drive.base, noise)
-    about = backward(used, ekf(used, opening=drive.opening))
-    forward = refilter(used, backward(used, refilter(used, about)))
-    priors = -0.5 * sum(((f.log_factor - prior(g)[0]) / prior(g)[1]) ** 2 for g, f in noise.figures.items())
+    used = apply_noise(drive.base, noise)
+    about = smooth_backward(used, ekf(used, opening=drive.opening))
+    forward = refilter(used, smooth_backward(used, refilter(used, about)))
+    priors = -0.5 * sum(((f.log_factor - get_prior(g)[0]) / get_prior(g)[1]) ** 2 for g, f in noise.figures.items())
     return float(forward.log_likelihood.sum()) + priors
 
 
@@ -393,7 +398,7 @@ def test_no_other_figures_are_likelier(estimated: Estimated) -> None:
 def test_once_more_from_its_end_an_estimate_is_the_same(estimated: Estimated) -> None:
     """Within what chance makes of a log-likelihood."""
     for drive, found in zip(estimated.drives[:2], estimated.found[:2], strict=True):
-        near = found.points, with_noise(drive.base, found.noise)
+        near = found.points, apply_noise(drive.base, found.noise)
         again = estimate_noise(drive.base, drive.opening, found.noise, near)
         assert again.log_posterior - found.log_posterior < 1.0
 
@@ -417,12 +422,12 @@ def test_sigmas_of_the_drive_are_true_with_estimated_figures(
         request.applymarker(pytest.mark.xfail(strict=True, reason=reason))
     ratio = {"ekf": [], "rts": [], "batch": []}
     for drive, found in zip(estimated.drives, estimated.found, strict=True):
-        used = with_noise(drive.base, found.noise)
+        used = apply_noise(drive.base, found.noise)
         forward = ekf(used, opening=drive.opening)
-        smoothed = backward(used, forward)
+        smoothed = smooth_backward(used, forward)
         solutions = forward.solution, rts(used, forward, smoothed), batch(used, smoothed.states, smoothed.nodes(used))
         for solution in solutions:
-            off = errors(solution.trajectory(), drive.truth)
+            off = compute_errors(solution.trajectory(), drive.truth)
             ratio[solution.solver].append(float(np.nanmean(off.nees_p)) / 3.0)
     # three independent numbers a drive: 99.8 % of chi-square
     n = 3 * len(estimated.drives)
@@ -441,7 +446,7 @@ def test_an_odometer_that_is_wrong_for_seconds(nhc: bool) -> None:
         assert odometer is not None
         wrong = 0.3 * markov(odometer.t, 3.0, np.random.default_rng([seed, 5]), 1)[:, 0]
         speed = odometer.speed + wrong * (np.abs(odometer.speed) > 1e-3)
-        settings = settings_from({"vehicle": {"nhc": nhc}})
+        settings = parse_settings({"vehicle": {"nhc": nhc}})
         base, opening = built(replace(recording, odometer=replace(odometer, speed=speed)), settings)
         noise = estimate_noise(base, opening).noise
         process = next(p for c in base.constraints if c.name == "odometer" for p in c.processes)
@@ -486,8 +491,8 @@ def test_disturbances_of_intervals_are_as_large_as_chance_has_them() -> None:
         oracle.vehicle_path(duration=300, rate=50.0, seed=4), seed=2, gnss_velocity_sd=(0.05, 0.05, 0.08)
     )
     base, opening = built(recording, INERTIAL)
-    forward = refilter(base, backward(base, ekf(base, opening=opening)))
-    found = imu_moments(base, forward, backward(base, forward))
+    forward = refilter(base, smooth_backward(base, ekf(base, opening=opening)))
+    found = collect_imu_moments(base, forward, smooth_backward(base, forward))
     for i in range(2):
         likelihood = chdtrc(found.freedom[:, i], found.A[:, i] / found.B[:, i] * found.freedom[:, i])
         told = found.B[:, i] > 0.01
@@ -499,7 +504,7 @@ def test_disturbances_of_intervals_are_as_large_as_chance_has_them() -> None:
 def test_intervals_have_factors_that_stay_when_they_are_integrated_anew() -> None:
     base, _ = built(lap().crop(0.0, 60.0))
     noise = NoiseModel(weights={"imu.gyro": RowWeights(base.t[[7]], np.array([0.01]))})
-    used = with_noise(base, noise)
+    used = apply_noise(base, noise)
     more = used.intervals.covariance - base.intervals.covariance
     assert np.flatnonzero(np.abs(more).max(axis=(1, 2))).tolist() == [6]
     assert more[6] == pytest.approx(99.0 * base.intervals.parts[6, 0], rel=1e-9)
@@ -532,7 +537,7 @@ def test_a_gyro_that_misses_a_turn_is_not_taken_for_fixes(seed: int, wheels: boo
         assert not any(model.excluded.values()), model.excluded
         some = model.weights["imu.gyro"]
         assert 60.0 < some.t[np.argmin(some.weight)] - recording.start < 62.0
-        rms = [float(np.sqrt(np.mean(errors(x[solver].trajectory(), truth).p ** 2))) for x in (plain, found)]
+        rms = [float(np.sqrt(np.mean(compute_errors(x[solver].trajectory(), truth).p ** 2))) for x in (plain, found)]
         assert rms[1] < 1.5 * rms[0], solver
 
 
@@ -642,16 +647,16 @@ def test_stamps_on_arrival_are_an_error_of_time(late: tuple[Recording, Trajector
     stamp = GnssSettings().time_offset_sigma * np.sqrt(found.noise.figures[STAMPS].factor)
     assert stamp == pytest.approx(0.4 / np.sqrt(12.0), rel=0.3)  # of a uniform distribution
     assert found.parameters["gnss_time_offset"].value[-1, 0] == pytest.approx(-0.2, abs=0.05)
-    off = errors(found.trajectory(), truth)
+    off = compute_errors(found.trajectory(), truth)
     assert float(np.nanmean(off.nees_p)) / 3.0 < 2.0
-    known = settings_from({"gnss": {"time_offset_sigma": 0.0}, "noise": {"mode": "stated"}})
-    without = errors(run(recording, known, ("batch",))["batch"].trajectory(), truth)
+    known = parse_settings({"gnss": {"time_offset_sigma": 0.0}, "noise": {"mode": "stated"}})
+    without = compute_errors(run(recording, known, ("batch",))["batch"].trajectory(), truth)
     assert np.mean(off.horizontal**2) < 0.25 * np.mean(without.horizontal**2)
 
 
 def test_each_fix_has_a_stamp_error_of_its_own(late: tuple[Recording, Trajectory]) -> None:
     base, _ = built(late[0])
-    some = with_noise(base, NoiseModel({STAMPS: VarianceComponent(0.0, 1.0, 0.0, 1.0, 0.0)}))
+    some = apply_noise(base, NoiseModel({STAMPS: VarianceComponent(0.0, 1.0, 0.0, 1.0, 0.0)}))
     rows = next(rows for rows in some.constraints if rows.name == "gnss_position")
     chain = next(chain for chain in some.chains if chain.parameter.name == STAMP_ERROR)
     assert len(np.unique(chain.node[rows.keyframe])) == len(rows)
@@ -659,9 +664,9 @@ def test_each_fix_has_a_stamp_error_of_its_own(late: tuple[Recording, Trajectory
 
 def test_a_constant_far_beyond_its_prior_is_said(late: tuple[Recording, Trajectory]) -> None:
     base, opening = built(late[0])
-    (line,) = describe_far(base, backward(base, ekf(base, opening=opening)))
-    (shown,) = components("gnss_time_offset", 1, "s")
+    (line,) = describe_far(base, smooth_backward(base, ekf(base, opening=opening)))
+    (shown,) = name_components("gnss_time_offset", 1, "s")
     assert line.startswith(shown.words)
     assert shown.unit in line
     well, opening = built(oracle.drive(oracle.vehicle_path(duration=200, rate=50.0, seed=6), seed=5)[0])
-    assert not describe_far(well, backward(well, ekf(well, opening=opening)))
+    assert not describe_far(well, smooth_backward(well, ekf(well, opening=opening)))

@@ -17,12 +17,12 @@ from graphnav.app.workflow import list_unused_noise
 from graphnav.config import Settings
 from graphnav.core.earth import LocalFrame
 from graphnav.core.errors import ConfigError
-from graphnav.core.notes import key_of
+from graphnav.core.notes import get_key
 from graphnav.core.rotation import Array
 from graphnav.core.state import States
-from graphnav.estimation.noise.files import list_groups, noise_values, read_noise, read_noise_and_mode, write_noise
+from graphnav.estimation.noise.files import list_groups, list_noise, read_noise, read_noise_and_mode, write_noise
 from graphnav.estimation.noise.model import STATED, NoiseModel, RowWeights, VarianceComponent
-from graphnav.estimation.noise.table import figure_rows, whole_ratio
+from graphnav.estimation.noise.table import compute_whole_ratio, tabulate_figures
 from graphnav.estimation.problem import build_problem
 from graphnav.recording.formats import read as load
 
@@ -72,7 +72,7 @@ def test_every_group_of_a_problem_can_be_written_down() -> None:
 
 def changed(key: str, value: Any) -> dict[str, Any]:
     """The values of a good file with one of them another; a key with dots leads to it."""
-    values = json.loads(json.dumps({"noise": noise_values(some_noise())}))
+    values = json.loads(json.dumps({"noise": list_noise(some_noise())}))
     at = values
     *way, last = key.split("/")
     for part in way:
@@ -188,7 +188,7 @@ def test_rows_stand_beside_what_is_stated() -> None:
         },
         {"nhc_error": 7.0},
     )
-    rows = {row.group: row for row in figure_rows(noise, recording, (90.0, 3000.0))}
+    rows = {row.group: row for row in tabulate_figures(noise, recording, (90.0, 3000.0))}
     walk = rows["imu.accel_bias_walk"]
     assert (walk.stated, walk.correlation_time) == (recording.imu.noise.accel_bias_walk, None)
     assert walk.used == pytest.approx(3.0 * recording.imu.noise.accel_bias_walk)
@@ -198,8 +198,8 @@ def test_rows_stand_beside_what_is_stated() -> None:
     assert rows["gnss_position.minutes.up"].correlation_time == 90.0
     assert rows["nhc.seconds.right"].correlation_time == 7.0
     assert rows["nhc.seconds.right"].stated is None
-    assert whole_ratio(noise, "gnss_position", "up") == pytest.approx(np.sqrt(4.25))
-    assert whole_ratio(noise, "gnss_position", "horizontal") is None
+    assert compute_whole_ratio(noise, "gnss_position", "up") == pytest.approx(np.sqrt(4.25))
+    assert compute_whole_ratio(noise, "gnss_position", "horizontal") is None
 
 
 def test_what_a_noise_model_says_of_nothing_is_told() -> None:
@@ -216,7 +216,7 @@ def test_what_a_noise_model_says_of_nothing_is_told() -> None:
         excluded={"gnss_position": ((2.0, 3.0), (20.0, 30.0))},
     )
     said = list_unused_noise(noise, solution)
-    assert [key_of(one) for one in said] == [f"noise.file.{what}" for what in ("unused", "rows", "spans")]
+    assert [get_key(one) for one in said] == [f"noise.file.{what}" for what in ("unused", "rows", "spans")]
     assert "odometer" in said[0]
     assert [re.findall(r"\d+", one) for one in said[1:]] == [["1", "2"]] * 2
     assert list_unused_noise(NoiseModel({"gnss_position.up": VarianceComponent(0.0)}), solution) == []

@@ -11,17 +11,17 @@ import pytest
 from helpers import at_rate
 
 from graphnav import load
-from graphnav.config import Settings, settings_from
+from graphnav.config import Settings, parse_settings
 from graphnav.core.rotation import Array
 from graphnav.core.trajectory import Trajectory
 from graphnav.estimation.noise.model import NoiseModel
 from graphnav.estimation.pipeline import run
 from graphnav.estimation.solution import Solution
 from graphnav.evaluation.evaluate import evaluate_recording
-from graphnav.evaluation.scoring import Errors, errors
+from graphnav.evaluation.scoring import Errors, compute_errors
 from graphnav.recording import Recording
 
-STATED_ONLY = settings_from({"noise": {"mode": "stated"}})
+STATED_ONLY = parse_settings({"noise": {"mode": "stated"}})
 # Wheels and stops hold exactly on these drives, which no sigma is made for
 INERTIAL = {
     "vehicle": {"nhc": False, "odometer": False},
@@ -94,7 +94,7 @@ def wandering(recording: Recording, share: float, seed: int, time: float = 100.0
 def test_true_figures_are_left_alone(short: oracle.ExactPath, seed: int, wheels: bool) -> None:
     """Used as they are, for nothing is likelier; or within a factor of 1.5, or three of their sigmas."""
     recording, _ = oracle.drive(short, seed=seed)
-    noise = found_in(recording, Settings() if wheels else settings_from(INERTIAL))
+    noise = found_in(recording, Settings() if wheels else parse_settings(INERTIAL))
     assert not any(noise.excluded.values())
     if not noise.figures:
         return
@@ -136,7 +136,7 @@ def test_an_imu_noisier_than_stated() -> None:
 def nees(recording: Recording, truth: Trajectory, settings: Settings | None = None) -> Array:
     """Position NEES per degree of freedom, averaged over the drive."""
     solution = run(recording, settings, ("rts",))["rts"]
-    found = errors(solution.trajectory(), truth)
+    found = compute_errors(solution.trajectory(), truth)
     assert found.nees_p is not None
     return np.nanmean(found.nees_p) / 3.0
 

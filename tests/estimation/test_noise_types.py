@@ -19,7 +19,7 @@ from graphnav.core.trajectory import Trajectory
 from graphnav.estimation.noise.model import NoiseModel, VarianceComponent
 from graphnav.estimation.pipeline import run
 from graphnav.estimation.solution import Solution
-from graphnav.evaluation.scoring import errors
+from graphnav.evaluation.scoring import compute_errors
 from graphnav.recording import Gnss, Recording
 
 
@@ -49,7 +49,7 @@ def untyped(recording: Recording) -> Recording:
 
 def rms_and_nees(trajectory: Trajectory, truth: Trajectory) -> tuple[float, float]:
     """Horizontal RMS (m) and NEES of position per degree of freedom."""
-    found = errors(trajectory, truth)
+    found = compute_errors(trajectory, truth)
     return float(np.sqrt(np.nanmean(np.sum(found.p[:, :2] ** 2, axis=1)))), float(np.nanmean(found.nees_p)) / 3.0
 
 

@@ -10,19 +10,19 @@ import oracle
 import pytest
 from helpers import random_states, refused
 
-from graphnav.config import settings_from
+from graphnav.config import parse_settings
 from graphnav.constraints.base import Constraint, assemble
 from graphnav.constraints.standstill import ZeroVelocity
 from graphnav.core.earth import LocalFrame
 from graphnav.core.errors import ConfigError, EstimationError
-from graphnav.core.notes import key_of
+from graphnav.core.notes import get_key
 from graphnav.core.rotation import Array, mv
 from graphnav.core.state import DIM
 from graphnav.detectors import detect
 from graphnav.detectors.base import Detection
 from graphnav.detectors.scene import Detector
-from graphnav.estimation.factor_graph.nonlinear import Exported, state_at
-from graphnav.estimation.pipeline import run, with_own
+from graphnav.estimation.factor_graph.nonlinear import Exported, get_state
+from graphnav.estimation.pipeline import add_own, run
 from graphnav.estimation.problem import build_problem
 from graphnav.estimation.solvers.rows import Iterate, Layout, whiten
 from graphnav.recording import Recording
@@ -41,7 +41,7 @@ def drive() -> Recording:
 
 
 def test_its_optimum_is_that_of_the_batch_solver(drive):
-    solution = run(drive.crop(0.0, 16.0), settings_from(STATED), ("batch",))["batch"]
+    solution = run(drive.crop(0.0, 16.0), parse_settings(STATED), ("batch",))["batch"]
     graph, values = solution.to_gtsam()
     assert graph.error(values) == pytest.approx(solution.cost, rel=1e-9)
     rng, away = np.random.default_rng(2), gtsam.VectorValues()
@@ -52,7 +52,7 @@ def test_its_optimum_is_that_of_the_batch_solver(drive):
     assert graph.error(start) > 2.0 * solution.cost
     found = gtsam.GaussNewtonOptimizer(graph, start).optimize()
     sigma = np.sqrt(np.diagonal(solution.covariance, axis1=1, axis2=2))
-    off = [state_at(found, k).minus(solution.states[k : k + 1])[0] / sigma[k] for k in range(len(solution.t))]
+    off = [get_state(found, k).minus(solution.states[k : k + 1])[0] / sigma[k] for k in range(len(solution.t))]
     assert np.max(np.abs(off)) < 1e-3
     with refused("pieces.none_such", EstimationError):
         solution.to_gtsam(1)
@@ -61,7 +61,7 @@ def test_its_optimum_is_that_of_the_batch_solver(drive):
 @pytest.mark.parametrize("kernel", ["huber", "cauchy", "geman-mcclure", "tukey", "welsch"])
 def test_kernels_are_those_of_gtsam(drive, kernel):
     frame, start = LocalFrame(drive.gnss.llh[0]), random_states(np.random.default_rng(3), 1)
-    settings = settings_from(STATED | {"gnss": STATED["gnss"] | {"robust": kernel}})
+    settings = parse_settings(STATED | {"gnss": STATED["gnss"] | {"robust": kernel}})
     problem = build_problem(drive.crop(0.0, 5.0), settings, frame, start, np.ones(DIM))
     states = random_states(np.random.default_rng(5), len(problem.t), span=2.0)
     values = {c.parameter.name: c.mean for c in problem.chains}
@@ -99,10 +99,10 @@ class Beginning(Detector):
 
 
 def test_differences_do_what_jacobians_do(drive):
-    settings, standing = settings_from(STATED), np.array([[1.0, 3.0]])
+    settings, standing = parse_settings(STATED), np.array([[1.0, 3.0]])
     frame = LocalFrame(drive.gnss.llh[0])
     states = random_states(np.random.default_rng(3), 1)
-    own = with_own(drive.crop(0.0, 5.0), [Differenced])
+    own = add_own(drive.crop(0.0, 5.0), [Differenced])
     problem = build_problem(own, settings, frame, states, np.ones(DIM), standing)
     rows = {c.name: c for c in problem.constraints}
     assert len(rows["differenced"]) == len(rows["zero_velocity"]) > 1
@@ -110,14 +110,14 @@ def test_differences_do_what_jacobians_do(drive):
     found, exact = (rows[name].linearize(at, {}, slice(None)) for name in ("differenced", "zero_velocity"))
     np.testing.assert_allclose(assemble(found), assemble(exact), rtol=1e-6, atol=1e-6)
     np.testing.assert_array_equal(found.residual, exact.residual)
-    assert "constraint.differences" in map(key_of, problem.notes)
+    assert "constraint.differences" in map(get_key, problem.notes)
 
 
 def test_an_own_detector_suffices_by_itself(drive):
     # a threshold that no window is below leaves the other without a stop
-    settings = settings_from({"detectors": {"fire": ["glrt"], "glrt": {"threshold": 1e-12}}})
+    settings = parse_settings({"detectors": {"fire": ["glrt"], "glrt": {"threshold": 1e-12}}})
     assert not len(detect(drive, settings).stationary)
-    found = detect(with_own(drive, detectors=[Beginning]), settings)
+    found = detect(add_own(drive, detectors=[Beginning]), settings)
     assert len(found.stationary)
     assert found.stationary[-1, 1] <= drive.start + 11.0
     assert {"glrt", "beginning"} <= {d.name for d in found.all}

@@ -10,7 +10,7 @@ import oracle
 import pytest
 from test_solvers import NO_WHEELS, WHITE, nearly_linear, sigmas
 
-from graphnav.config import settings_from
+from graphnav.config import parse_settings
 from graphnav.core.earth import LocalFrame
 from graphnav.estimation.alignment import align
 from graphnav.estimation.factor_graph.batch import batch
@@ -28,7 +28,7 @@ class Start:
 
 def built(shared_data: Path, seed: int) -> Start:
     recording, _ = oracle.oracle_drive(shared_data, seed, odometer=False)
-    settings = settings_from({"gnss": WHITE, "vehicle": NO_WHEELS})
+    settings = parse_settings({"gnss": WHITE, "vehicle": NO_WHEELS})
     frame = LocalFrame(recording.gnss.llh[0])
     aligned = align(recording, settings, frame)
     assert aligned.until is not None

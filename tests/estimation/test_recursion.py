@@ -14,7 +14,7 @@ from graphnav.core import rotation
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM
 from graphnav.estimation.solvers import disturbance, recursion
-from graphnav.estimation.solvers.robust import weight_and_cost
+from graphnav.estimation.solvers.robust import weigh_squares
 
 SCALE, PARAMETERS, KEYFRAMES, ROWS = 6, 5, 7, 8  # D = 26
 D = DIM + SCALE + PARAMETERS
@@ -162,7 +162,7 @@ def test_a_kernel_weighs_rows_by_what_their_update_leaves(kernel: str) -> None:
         weight, left = np.ones(1), r - HPH @ found["solved"][k, lo:hi]
         for _ in range(recursion.PASSES - 1):
             s = np.array([np.sqrt(np.sum(left**2 / np.diag(R)))])
-            weight = weight_and_cost(kernel, s, 1.5)[0]
+            weight = weigh_squares(kernel, s, 1.5)[0]
             left = r - HPH @ np.linalg.solve(HPH + R / weight, r)
         np.testing.assert_allclose(found["bent"][k, lo:hi], weight[0], rtol=1e-9)
         np.testing.assert_allclose(found["w"][k, lo:hi], -np.linalg.solve(HPH + R / weight, r), rtol=1e-7)

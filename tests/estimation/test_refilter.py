@@ -18,15 +18,15 @@ from graphnav.core.state import DIM
 from graphnav.detectors import detect
 from graphnav.estimation.alignment import align
 from graphnav.estimation.factor_graph.batch import batch
-from graphnav.estimation.noise.apply import with_noise
+from graphnav.estimation.noise.apply import apply_noise
 from graphnav.estimation.noise.model import NoiseModel, VarianceComponent
-from graphnav.estimation.pipeline import origin, run
+from graphnav.estimation.pipeline import choose_origin, run
 from graphnav.estimation.problem import Problem, build_problem
-from graphnav.estimation.solvers.ekf import ekf, near, refilter
+from graphnav.estimation.solvers.ekf import ekf, refilter, smooth_near
 from graphnav.estimation.solvers.linearise import Points, advance, linearise
 from graphnav.estimation.solvers.points import FilterErrors, PointFilter, predict_states
 from graphnav.estimation.solvers.recursion import move
-from graphnav.estimation.solvers.rts import backward
+from graphnav.estimation.solvers.rts import smooth_backward
 from graphnav.estimation.solvers.stack import Stack
 from graphnav.imu.dynamics import SCALE
 
@@ -41,11 +41,11 @@ def built() -> Problem:
         odometer_rate=20.0,
     )
     settings = Settings()
-    frame = LocalFrame(origin(recording))
+    frame = LocalFrame(choose_origin(recording))
     found = align(recording, settings, frame)
     base = build_problem(recording, settings, frame, found.state, found.sigma, detect(recording, settings).stationary)
     lasting = (f"gnss_position.{time}.{axis}" for time in ("minutes", "hours") for axis in ("horizontal", "up"))
-    return with_noise(base, NoiseModel({name: VarianceComponent(float(np.log(0.25))) for name in lasting}))
+    return apply_noise(base, NoiseModel({name: VarianceComponent(float(np.log(0.25))) for name in lasting}))
 
 
 def scattered_points(problem: Problem, seed: int) -> Points:
@@ -62,7 +62,7 @@ def derivative(f: object, width: int, eps: float = 1e-5) -> Array:
 
 
 def test_steps_and_rows_at_points_are_those_of_an_estimate_to_first_order(built: Problem) -> None:
-    smoothed = backward(built, ekf(built))
+    smoothed = smooth_backward(built, ekf(built))
     rng = np.random.default_rng(1)
     off = np.concatenate(
         [
@@ -90,7 +90,7 @@ def test_steps_and_rows_at_points_are_those_of_an_estimate_to_first_order(built:
         np.testing.assert_allclose(given.gap[k - 1], ahead(np.zeros(D)), atol=1e-9)
         whole = move(given.F[k - 1], steps.decay[k - 1], np.eye(D))
         np.testing.assert_allclose(whole, derivative(ahead, D), atol=2e-5, rtol=1e-4)
-        for some in stack.together(k):
+        for some in stack.stack_keyframe(k):
             own = [linearise(rows, points, built.columns, slice(lo, hi)) for rows, lo, hi in some.parts]
             np.testing.assert_allclose(
                 given.r[some.at], np.concatenate([one.residual.ravel() for one in own]), atol=1e-12
@@ -108,7 +108,7 @@ def test_rows_taken_together_are_those_taken_one_after_another(built: Problem) -
     )
     together = replace(built, constraints=some)
     apart = replace(built, constraints=tuple(replace(c, gate=1e9) for c in some))
-    points = backward(built, ekf(built))
+    points = smooth_backward(built, ekf(built))
     one, other = refilter(together, points), refilter(apart, points)
     sigma = np.sqrt(np.diagonal(other.P, axis1=1, axis2=2))
     np.testing.assert_allclose(one.errors / sigma, other.errors / sigma, atol=1e-6)
@@ -124,10 +124,10 @@ def test_rows_taken_together_are_those_taken_one_after_another(built: Problem) -
 
 def test_filtered_again_about_its_own_end_it_is_the_batch_solution(built: Problem) -> None:
     """Bell 1994: the iterated smoother is Gauss and Newton's method on the whole drive."""
-    smoothed = backward(built, ekf(built))
+    smoothed = smooth_backward(built, ekf(built))
     solved = batch(built, smoothed.states, smoothed.nodes(built), reintegrate=False)
     for _ in range(3):
-        smoothed = backward(built, refilter(built, smoothed))
+        smoothed = smooth_backward(built, refilter(built, smoothed))
     apart = np.abs(smoothed.states.minus(solved.states)) / sigmas(solved)
     assert np.max(apart) < 0.02  # where batch stops
     mine = np.sqrt(np.diagonal(smoothed.P[:, :DIM, :DIM], axis1=1, axis2=2))
@@ -136,8 +136,8 @@ def test_filtered_again_about_its_own_end_it_is_the_batch_solution(built: Proble
 
 def test_points_that_lead_nowhere_are_given_up(built: Problem) -> None:
     """From anywhere at all the drive is found, if need be as a filter would."""
-    plain = backward(built, ekf(built))
-    _, found = near(built, scattered_points(built, 2))
+    plain = smooth_backward(built, ekf(built))
+    _, found = smooth_near(built, scattered_points(built, 2))
     sigma = np.sqrt(np.diagonal(plain.P[:, :DIM, :DIM], axis1=1, axis2=2))
     assert np.max(np.abs(found.states.minus(plain.states)) / sigma) < 0.5
 

@@ -10,7 +10,7 @@ import numpy as np
 import graphnav
 from graphnav.app.scores import score
 from graphnav.estimation.alignment.first import pick_fixes
-from graphnav.evaluation.metrics import summary
+from graphnav.evaluation.metrics import summarise
 
 
 def test_a_filter_that_diverges_begins_at_what_the_noise_model_was_estimated_with(shared_data: Path) -> None:
@@ -22,5 +22,5 @@ def test_a_filter_that_diverges_begins_at_what_the_noise_model_was_estimated_wit
     found = score(whole, drive, solutions, ())[0]
     assert solutions["ekf"].noise.figures
     for name in ("ekf", "rts"):
-        assert summary(found[name])["nees_p"] < 5.0
-        assert summary(found[name])["h_rms_m"] < 10.0
+        assert summarise(found[name])["nees_p"] < 5.0
+        assert summarise(found[name])["h_rms_m"] < 10.0

@@ -12,7 +12,7 @@ import oracle
 import pytest
 from helpers import Array, Factor, at_rate, dense, errors, factors, truth_states
 
-from graphnav.config import Settings, settings_from
+from graphnav.config import Settings, parse_settings
 from graphnav.constraints.gnss import ERRORS, LEVER_ARM
 from graphnav.constraints.standstill import PLACE
 from graphnav.core.earth import LocalFrame
@@ -21,14 +21,14 @@ from graphnav.core.state import DIM
 from graphnav.core.trajectory import Trajectory
 from graphnav.estimation.factor_graph.batch import batch, solve_rows
 from graphnav.estimation.factor_graph.isam import isam2
-from graphnav.estimation.noise.apply import with_noise
+from graphnav.estimation.noise.apply import apply_noise
 from graphnav.estimation.noise.model import STATED, NoiseModel, VarianceComponent
 from graphnav.estimation.pipeline import run
 from graphnav.estimation.problem import Problem, build_problem
 from graphnav.estimation.solution import Solution
 from graphnav.estimation.solvers.ekf import ekf
 from graphnav.estimation.solvers.incremental import Replay, incremental
-from graphnav.estimation.solvers.robust import weight_and_cost
+from graphnav.estimation.solvers.robust import weigh_squares
 from graphnav.estimation.solvers.rows import Iterate, Layout, whiten
 from graphnav.estimation.solvers.rts import rts
 from graphnav.imu.dynamics import SCALE
@@ -88,9 +88,9 @@ def nearly_linear(kind: str) -> Trio:
     start = truth_states(truth, np.array([recording.start]), frame)
     start = replace(start, ba=np.zeros((1, 3)), bg=np.zeros((1, 3)))
     sigma = np.repeat([2e-6, 0.05, 1e-3, 1e-3, 2e-7], 3)
-    settings = settings_from({"gnss": gnss, "vehicle": NO_WHEELS})
+    settings = parse_settings({"gnss": gnss, "vehicle": NO_WHEELS})
     stops = np.array([[0.5, 2.0], [3.0, 4.5]]) if kind == "stops" else None
-    problem = with_noise(
+    problem = apply_noise(
         build_problem(recording, settings, frame, start, sigma, stops), LASTING if kind == "slow" else STATED
     )
     forward = ekf(problem)
@@ -187,7 +187,7 @@ def lap() -> tuple[Recording, Trajectory]:
 def solved_lap(lap: tuple[Recording, Trajectory]) -> tuple[Problem, Solution]:
     """Half a minute with turns, lever arm, time offset and scale estimated; from a start with ordinary doubt."""
     recording, truth = lap
-    settings = settings_from({"gnss": {"lever_arm_sigma": 0.3}, "vehicle": NO_WHEELS})
+    settings = parse_settings({"gnss": {"lever_arm_sigma": 0.3}, "vehicle": NO_WHEELS})
     part = recording.crop(30.0, 60.0)
     frame = LocalFrame(part.gnss.llh[0])
     start = truth_states(truth, np.round(np.array([part.start]), 6), frame)
@@ -293,17 +293,17 @@ def test_weight_is_the_slope_of_the_cost_over_s(kernel: str, k: float) -> None:
     s = np.concatenate([np.linspace(0.01, 10 * k, 400), [100.0 * k]])
     s = s[np.abs(s - k) > 1e-4]  # the second derivative of some jumps there
     h = 1e-6
-    slope = (weight_and_cost(kernel, s + h, k)[1] - weight_and_cost(kernel, s - h, k)[1]) / (2 * h)
-    weight, _ = weight_and_cost(kernel, s, k)
+    slope = (weigh_squares(kernel, s + h, k)[1] - weigh_squares(kernel, s - h, k)[1]) / (2 * h)
+    weight, _ = weigh_squares(kernel, s, k)
     np.testing.assert_allclose(weight, slope / s, atol=1e-7)
-    at_zero, cost = weight_and_cost(kernel, np.zeros(1), k)
+    at_zero, cost = weigh_squares(kernel, np.zeros(1), k)
     assert at_zero[0] == 1.0
     assert cost[0] == 0.0
 
 
 def test_unknown_kernel() -> None:
     with pytest.raises(ValueError, match="'geman'"):
-        weight_and_cost("geman", np.ones(1), 1.0)
+        weigh_squares("geman", np.ones(1), 1.0)
 
 
 def moved_fixes(recording: Recording, rows: Array, offset: Array) -> Recording:
@@ -322,7 +322,7 @@ def worst(a: Solution, truth: Trajectory) -> float:
 def solve(recording: Recording, kernel: str) -> Solution:
     return run(
         recording,
-        settings_from({"gnss": {**WHITE, "robust": kernel}, "vehicle": NO_WHEELS, "noise": {"mode": "stated"}}),
+        parse_settings({"gnss": {**WHITE, "robust": kernel}, "vehicle": NO_WHEELS, "noise": {"mode": "stated"}}),
         solvers=("batch",),
     )["batch"]
 
@@ -413,7 +413,7 @@ def reference(shipped: Recording) -> Solution:
 def test_a_wrong_start_heading_is_found_out(shipped: Recording, reference: Solution, off: float, sigma: float) -> None:
     """Batch ends in the same optimum: within the prior's own, weak, pull on a heading known to 0.01 deg."""
     heading = np.degrees(reference.trajectory().rph[0, 2]) + off
-    settings = settings_from({"alignment": {"heading": (heading + 180) % 360 - 180, "heading_sigma": sigma}})
+    settings = parse_settings({"alignment": {"heading": (heading + 180) % 360 - 180, "heading_sigma": sigma}})
     solution = run(shipped, settings, solvers=("batch",), noise=LASTING)["batch"]
     assert "converged" in solution.stopped
     d = solution.states.minus(reference.states)
@@ -432,7 +432,7 @@ def test_batch_converges_from_a_wrong_heading(lap: tuple[Recording, Trajectory],
     found = []
     for heading in (0.0, off):
         start = replace(true, R_nb=exp(np.array([0.0, 0.0, np.radians(heading)])) @ true.R_nb, ba=0 * true.ba)
-        problem = build_problem(recording, settings_from({"gnss": WHITE}), frame, start, sigma)
+        problem = build_problem(recording, parse_settings({"gnss": WHITE}), frame, start, sigma)
         smoothed = rts(problem, ekf(problem))
         found.append(batch(problem, smoothed.states, {n: p.value for n, p in smoothed.parameters.items()}))
     assert "converged" in found[1].stopped
@@ -446,7 +446,7 @@ def test_a_wrong_lever_arm_is_found(shipped: Recording) -> None:
     gnss = shipped.gnss
     wrong = np.array([0.3, -0.3, 0.3])
     recording = replace(shipped, gnss=replace(gnss, lever_arm=gnss.lever_arm + wrong))
-    for name, solution in run(recording, settings_from({"gnss": {"lever_arm_sigma": 0.5}})).items():
+    for name, solution in run(recording, parse_settings({"gnss": {"lever_arm_sigma": 0.5}})).items():
         p = solution.parameters[LEVER_ARM]
         error = p.value[-1] - gnss.lever_arm
         assert np.all(np.abs(error) < 3.0 * p.sigma[-1]), name
@@ -464,6 +464,6 @@ def test_fixes_outside_the_imu_do_not_matter(lap: tuple[Recording, Trajectory]) 
 
 def test_smoothed_sigmas_before_the_first_fix_are_those_of_the_batch() -> None:
     recording = oracle.drive(oracle.vehicle_path(duration=120, seed=2), seed=3)[0].without("gnss", (-1.0, 3.5))
-    found = run(recording, settings_from({"noise": {"mode": "stated"}}), ("rts", "batch"))
+    found = run(recording, parse_settings({"noise": {"mode": "stated"}}), ("rts", "batch"))
     variances = [np.diagonal(found[name].covariance, axis1=1, axis2=2)[:, :9] for name in ("rts", "batch")]
     np.testing.assert_allclose(variances[0] / variances[1], 1.0, atol=0.01)  # a batch goes on linearising

@@ -12,14 +12,14 @@ import pytest
 
 from graphnav import load, run
 from graphnav.app.workflow import Request, run_request
-from graphnav.config import settings_from
+from graphnav.config import parse_settings
 from graphnav.core.earth import LocalFrame
-from graphnav.core.notes import key_of
+from graphnav.core.notes import get_key
 from graphnav.core.rotation import Array
 from graphnav.estimation.noise.files import read_noise, write_noise
 from graphnav.estimation.noise.model import StampOffsets
 from graphnav.estimation.solution import Solution
-from graphnav.estimation.stamps import move_stamps, on_imu_clock, on_own_clock
+from graphnav.estimation.stamps import move_stamps, shift_to_imu_clock, shift_to_own_clocks
 from graphnav.recording import Gnss, Recording
 
 TOKYO = Path(__file__).resolve().parents[2] / "data" / "tokyo"
@@ -69,7 +69,7 @@ def test_fixes_of_another_clock_lead_to_the_same_path(case: str, of_velocities: 
         whole = found.parameters[name].value[0, 0] - known[name].value[0, 0]
         assert whole == pytest.approx(offset, abs=4.0 * (found.parameters[name].sigma[0, 0] + 0.005)), name
     assert np.sqrt(np.mean(distances(case)[20:-20] ** 2)) < 0.05  # 5 to 7 m where the stamps stay as they are
-    assert "gnss.stamps_moved" in map(key_of, found.notes)
+    assert "gnss.stamps_moved" in map(get_key, found.notes)
 
 
 def test_right_stamps_are_left() -> None:
@@ -98,11 +98,11 @@ def test_the_noise_model_of_a_run_gives_the_same_bytes(tmp_path: Path) -> None:
 
 def test_moved_and_back() -> None:
     found, offsets = solved("as it is"), StampOffsets(-0.75, 0.25, 0.5)
-    moved = on_own_clock(found, offsets)
+    moved = shift_to_own_clocks(found, offsets)
     assert moved.noise.stamps == offsets
     for name, by in (("gnss_position", -0.75), ("gnss_velocity", 0.25)):
         assert moved.records[name].t == pytest.approx(found.records[name].t - by)
-        assert on_imu_clock(moved.noise).weights[name].t == pytest.approx(found.noise.weights[name].t)
+        assert shift_to_imu_clock(moved.noise).weights[name].t == pytest.approx(found.noise.weights[name].t)
     recording = drive()
     changed = move_stamps(recording, offsets)
     assert changed.gnss is not None
@@ -120,7 +120,7 @@ def test_a_result_about_moved_stamps_is_not_unreliable(tmp_path: Path) -> None:
     table.write_text(table.read_text().replace("[gnss]\n", f"[gnss]\ntime_offset = {LATE}\n"))
     severity = {}
     for mode in ("stated", "estimated"):
-        settings = settings_from({"noise": {"mode": mode}})
+        settings = parse_settings({"noise": {"mode": mode}})
         outcome = run_request(Request(str(table), ("ekf",), settings, end=110.0))
         severity[mode] = [f.severity for f in outcome.checks if f.key == "imu.clock"]
     assert severity == {"stated": ["unreliable"], "estimated": ["warning"]}

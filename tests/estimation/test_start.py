@@ -14,17 +14,17 @@ from graphnav import load
 from graphnav.config import Settings
 from graphnav.core.earth import LocalFrame
 from graphnav.core.errors import EstimationError
-from graphnav.core.notes import key_of
+from graphnav.core.notes import get_key
 from graphnav.core.trajectory import Trajectory
 from graphnav.detectors import detect
 from graphnav.estimation import preparation
 from graphnav.estimation.alignment import Alignment, align
 from graphnav.estimation.alignment.first import pick_fixes
 from graphnav.estimation.alignment.motion import drop_implausible
-from graphnav.estimation.pipeline import origin, run
+from graphnav.estimation.pipeline import choose_origin, run
 from graphnav.estimation.solvers.verdicts import Verdicts
-from graphnav.evaluation.scoring import Errors, errors
-from graphnav.online import Online, rows_of, without_rows
+from graphnav.evaluation.scoring import Errors, compute_errors
+from graphnav.online import Online, drop_rows, list_rows
 from graphnav.recording import Recording
 
 HERE = Path(__file__).resolve().parents[2]
@@ -47,7 +47,7 @@ def shifted(recording: Recording, begin: float, end: float, by: float, each: flo
 def against_truth(track: Trajectory, recording: Recording) -> Errors:
     truth = recording.truth
     assert truth is not None
-    return errors(track, Trajectory(truth.t, truth.llh, v=truth.v, rph=truth.rph))
+    return compute_errors(track, Trajectory(truth.t, truth.llh, v=truth.v, rph=truth.rph))
 
 
 @pytest.mark.parametrize(
@@ -73,7 +73,7 @@ def test_a_start_rests_on_no_fix_that_is_wrong(drive: Recording, begin: float, e
 
 def test_fixes_that_jump_at_rest_are_no_motion(drive: Recording) -> None:
     """The attitude comes from the same stretch as without the jump, and is the same."""
-    settings, frame = Settings(), LocalFrame(origin(drive))
+    settings, frame = Settings(), LocalFrame(choose_origin(drive))
 
     def aligned(recording: Recording) -> Alignment:
         return align(recording, settings, frame, detect(recording, settings).stationary)
@@ -108,15 +108,15 @@ def test_at_the_end_what_is_refused_is_tried_if_it_is_more(right: int, first: bo
     t, used = np.arange(50.0), np.ones(50)
     used[right:] = 0.0
     verdicts = Verdicts({"p": t}, {"p": used})
-    assert verdicts.ended() == (0.0 if first else None)
+    assert verdicts.set_ended() == (0.0 if first else None)
     assert used[:right].any() != first
-    assert verdicts.ended() is None  # once
+    assert verdicts.set_ended() is None  # once
 
 
 def test_as_it_drives_a_jump_at_rest_is_no_motion(drive: Recording) -> None:
     wrong = shifted(drive, 10.0, 30.0, 40.0)
-    online = Online(without_rows(wrong), Settings())
-    for row in rows_of(wrong)[1]:
+    online = Online(drop_rows(wrong), Settings())
+    for row in list_rows(wrong)[1]:
         online.add(row)
     online.finish()
     found = [against_truth(part, drive) for part in online.settled() if len(part) > 1]
@@ -142,7 +142,7 @@ def test_what_breaks_down_while_noise_is_estimated_is_solved_as_stated(
     stated = run(drive, Settings.model_validate(plain), ("ekf",))["ekf"]
     monkeypatch.setattr(preparation, "estimate_without_faults", break_down)
     solution = run(drive, None, ("ekf",))["ekf"]
-    assert "noise.not_estimated" in map(key_of, solution.notes)
+    assert "noise.not_estimated" in map(get_key, solution.notes)
     np.testing.assert_array_equal(solution.covariance, stated.covariance)
 
 
@@ -151,11 +151,11 @@ def test_axes_that_are_a_quarter_turn_off_are_told(shared_data: Path) -> None:
     assert slow.gnss is not None
     slow = replace(slow, gnss=pick_fixes(slow.gnss, np.arange(0, len(slow.gnss.t), 20)))  # one a second
     solution = run(slow, Settings.model_validate({"noise": {"mode": "stated"}}), ("rts",))["rts"]
-    assert "doubt.axes" in map(key_of, solution.notes)
+    assert "doubt.axes" in map(get_key, solution.notes)
     quarter = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     imu = replace(slow.imu, gyro=slow.imu.gyro @ quarter.T, accel=slow.imu.accel @ quarter.T)
     turned = run(replace(slow, imu=imu), Settings.model_validate({"noise": {"mode": "stated"}}), ("rts",))["rts"]
-    assert "doubt.axes" not in map(key_of, turned.notes)
+    assert "doubt.axes" not in map(get_key, turned.notes)
     assert slow.truth is not None
     assert slow.truth.rph is not None
     track = turned.trajectory()

@@ -19,7 +19,7 @@ from graphnav.detectors import detect
 from graphnav.detectors.base import NONE
 from graphnav.estimation.alignment import Alignment, align
 from graphnav.estimation.alignment.travel import measure_travel
-from graphnav.estimation.pipeline import origin
+from graphnav.estimation.pipeline import choose_origin
 from graphnav.recording import Recording, Truth
 from graphnav.recording.formats import read
 
@@ -28,7 +28,7 @@ SURE = 0.999  # of a chi-square that an honest sigma stays below
 
 
 def aligned(recording: Recording, stationary: Array | None = None) -> Alignment:
-    settings, frame = Settings(), LocalFrame(origin(recording))
+    settings, frame = Settings(), LocalFrame(choose_origin(recording))
     stationary = detect(recording, settings).stationary if stationary is None else stationary
     return align(recording, settings, frame, stationary)
 
@@ -192,7 +192,7 @@ def test_wheels_tell_the_start_of_a_drive_that_begins_without_fixes(shared_data:
     assert drive.truth is not None
     assert drive.truth.llh is not None
     assert drive.truth.v is not None
-    found, frame = aligned(drive), LocalFrame(origin(drive))
+    found, frame = aligned(drive), LocalFrame(choose_origin(drive))
     p, v = (
         np.array([np.interp(drive.start, drive.truth.t, column) for column in rows.T])
         for rows in (frame.from_llh(drive.truth.llh), drive.truth.v)

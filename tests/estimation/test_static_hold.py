@@ -12,7 +12,7 @@ import graphnav
 from graphnav.app.scores import score
 from graphnav.core.earth import LocalFrame
 from graphnav.estimation.noise.spans import list_repeats
-from graphnav.evaluation.metrics import summary
+from graphnav.evaluation.metrics import summarise
 from graphnav.recording import Recording
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -42,7 +42,7 @@ def test_what_a_receiver_holds_is_left_out(drive: Recording) -> None:
     error = {}
     for noise in ("stated", None):
         solutions = graphnav.run(used, solvers=("batch",), **({} if noise is None else {"noise": noise}))
-        error[noise] = summary(score(drive, used, solutions, ())[0]["batch"])
+        error[noise] = summarise(score(drive, used, solutions, ())[0]["batch"])
     assert error[None]["h_rms_m"] < 0.5 * error["stated"]["h_rms_m"]
     assert error[None]["nees_p"] < 3.0
 

@@ -16,9 +16,9 @@ from graphnav.core.state import DIM, States
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.linearise import Points, linearise
 from graphnav.estimation.solvers.stages import Message
-from graphnav.estimation.solvers.turning import change_of_point, plus_turning, split_turn, turn_covariance
+from graphnav.estimation.solvers.turning import add_turning, change_of_point, split_turn, turn_covariance
 from graphnav.estimation.solvers.window import Window
-from graphnav.online import Online, rows_of, without_rows
+from graphnav.online import Online, drop_rows, list_rows
 from graphnav.simulation import simulate
 
 Z = np.array([0.0, 0.0, 1.0])
@@ -45,7 +45,7 @@ def moves() -> tuple[States, Array]:
 
 def test_a_common_turn_is_a_turn_however_large(moves: tuple[States, Array]) -> None:
     states, _ = moves
-    np.testing.assert_allclose(plus_turning(states, 2.0 * along(states)).minus(turned(states, 2.0)), 0.0, atol=1e-12)
+    np.testing.assert_allclose(add_turning(states, 2.0 * along(states)).minus(turned(states, 2.0)), 0.0, atol=1e-12)
     psi, left = split_turn(states, 2.0 * along(states))
     np.testing.assert_allclose(psi, 2.0, rtol=1e-14)
     np.testing.assert_allclose(left, 0.0, atol=1e-12)
@@ -53,24 +53,24 @@ def test_a_common_turn_is_a_turn_however_large(moves: tuple[States, Array]) -> N
 
 def test_what_is_beside_a_turn_turns_with_it(moves: tuple[States, Array]) -> None:
     states, e = moves
-    both = turned(plus_turning(states, e), 0.7)
-    np.testing.assert_allclose(plus_turning(states, e + 0.7 * along(states)).minus(both), 0.0, atol=1e-12)
+    both = turned(add_turning(states, e), 0.7)
+    np.testing.assert_allclose(add_turning(states, e + 0.7 * along(states)).minus(both), 0.0, atol=1e-12)
 
 
 def test_near_the_point_it_is_the_usual_error_state(moves: tuple[States, Array]) -> None:
     states, e = moves
-    found = plus_turning(states, 1e-4 * e).minus(states)
+    found = add_turning(states, 1e-4 * e).minus(states)
     np.testing.assert_allclose(found, 1e-4 * e, atol=1e-6)
 
 
 def test_the_change_of_point_is_the_derivative(moves: tuple[States, Array]) -> None:
     states, e = moves
-    there, T, h = plus_turning(states, e), np.tile(np.eye(DIM), (6, 1, 1)), 1e-6
+    there, T, h = add_turning(states, e), np.tile(np.eye(DIM), (6, 1, 1)), 1e-6
     T[:, :9, :9] = change_of_point(states, e)
     for k in range(DIM):
         step = np.zeros((6, DIM))
         step[:, k] = h
-        ways = [plus_turning(there, s * step).minus(plus_turning(states, e + s * h * T[:, :, k])) for s in (1.0, -1.0)]
+        ways = [add_turning(there, s * step).minus(add_turning(states, e + s * h * T[:, :, k])) for s in (1.0, -1.0)]
         np.testing.assert_allclose(ways, 0.0, atol=1e-4 * h)
     rng = np.random.default_rng(1)
     root = rng.standard_normal((6, DIM, DIM))
@@ -96,8 +96,8 @@ def test_a_message_that_knows_no_heading_learns_none_where_its_point_moves(moves
 def walk() -> Online:
     """A minute and more of a walk without fixes, none of which has settled."""
     recording = simulate("gait", 1, duration=60.0, rate=100.0).recording
-    online = Online(without_rows(recording))
-    for row in rows_of(recording)[1]:
+    online = Online(drop_rows(recording))
+    for row in list_rows(recording)[1]:
         online.add(row)
     return online
 

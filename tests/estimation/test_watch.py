@@ -9,11 +9,11 @@ import pytest
 from helpers import at_rate
 from test_faults import built, drive, moved, scattered
 
-from graphnav.config import settings_from
+from graphnav.config import parse_settings
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM
 from graphnav.core.trajectory import Trajectory
-from graphnav.estimation.noise.apply import row_weights
+from graphnav.estimation.noise.apply import select_weights
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers import watch
 from graphnav.estimation.solvers.ekf import ekf, refilter
@@ -21,7 +21,7 @@ from graphnav.estimation.solvers.linearise import list_node_steps
 from graphnav.estimation.solvers.stages import Place
 from graphnav.estimation.solvers.watch import Bank
 from graphnav.estimation.solvers.window import Window, make_first_message
-from graphnav.online import Online, rows_of, without_rows
+from graphnav.online import Online, drop_rows, list_rows
 from graphnav.recording import Recording
 
 __all__ = ["built", "drive"]  # fixtures
@@ -67,9 +67,9 @@ def test_tests_beside_a_message_are_those_of_the_filter(built: Problem, monkeypa
 
 def settled(recording: Recording, **settings: dict[str, object]) -> tuple[Online, Array, Array]:
     """The smoother that runs as it drives, and the times and places (local frame, m) that it settled."""
-    online = Online(without_rows(recording), settings_from(settings))
+    online = Online(drop_rows(recording), parse_settings(settings))
     parts = []
-    for row in rows_of(recording)[1]:
+    for row in list_rows(recording)[1]:
         online.add(row)
         parts += online.settled()
     online.finish()
@@ -104,7 +104,7 @@ def test_as_it_drives_a_burst_and_gross_errors_do_no_harm(live: tuple[Recording,
         found |= (recording.gnss.t >= fault.t_start) & (recording.gnss.t <= fault.t_end)
     # what an estimate has seen and taken for an outlier has hardly any weight
     assert online.tracker is not None
-    found |= row_weights(recording.gnss.t, online.tracker.noise, "gnss_position") < 0.01
+    found |= select_weights(recording.gnss.t, online.tracker.noise, "gnss_position") < 0.01
     assert found[wrong].mean() > 0.95
     assert wrong.size / found.sum() > 0.9
 

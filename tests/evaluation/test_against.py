@@ -17,7 +17,7 @@ from graphnav.config import Settings
 from graphnav.core.earth import LocalFrame
 from graphnav.core.errors import RecordingError
 from graphnav.core.interpolation import interpolate, place_on_earth
-from graphnav.core.notes import key_of
+from graphnav.core.notes import get_key
 from graphnav.core.trajectory import Trajectory
 from graphnav.estimation.pipeline import run
 from graphnav.estimation.solution import Solution
@@ -133,7 +133,7 @@ def test_epochs_of_its_own_cost_a_file_nothing(ekf, tmp_path, kind, period, offs
 def test_a_delay_is_told_where_there_is_one(ekf, tmp_path, period, late):
     write_as("csv", every(period, moved(0.0, late), late), tmp_path / "its.csv", None)
     found = read_against(Against(tmp_path / "its.csv"), "its", RECORDING, ekf)
-    assert ("against.late" in [key_of(note) for note in found.notes]) == (late > 0.0)
+    assert ("against.late" in [get_key(note) for note in found.notes]) == (late > 0.0)
 
 
 def test_a_delay_is_left_where_the_file_begins_with_the_recording(ekf, tmp_path):
@@ -143,7 +143,7 @@ def test_a_delay_is_left_where_the_file_begins_with_the_recording(ekf, tmp_path)
     write_as("csv", interpolate(early, t)[0], tmp_path / "its.csv", None)
     found = read_against(Against(tmp_path / "its.csv"), "its", RECORDING, ekf)
     assert found.track.t[0] == pytest.approx(RECORDING.start)
-    assert "against.late" in [key_of(note) for note in found.notes]
+    assert "against.late" in [get_key(note) for note in found.notes]
 
 
 @pytest.mark.parametrize(
@@ -210,4 +210,4 @@ def test_a_point_that_the_file_is_not_of_is_told(ekf, tmp_path, point, told):
     antenna = interpolate(moved(0.0), every(0.1, moved(0.0)).t, lever_arm=logs.LEVER_ARM)[0]
     write_as("csv", antenna, tmp_path / "its.csv", None)
     found = read_against(Against(tmp_path / "its.csv", point), "its", RECORDING, ekf)
-    assert ("against.other_point" in [key_of(note) for note in found.notes]) == told
+    assert ("against.other_point" in [get_key(note) for note in found.notes]) == told

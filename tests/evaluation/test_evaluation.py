@@ -16,7 +16,7 @@ from graphnav.core import rotation
 from graphnav.core.earth import LocalFrame
 from graphnav.core.errors import RecordingError
 from graphnav.core.interpolation import fit_yaw, interpolate
-from graphnav.core.notes import key_of
+from graphnav.core.notes import get_key
 from graphnav.core.trajectory import Trajectory
 from graphnav.evaluation import evaluate as evaluation
 from graphnav.recording import Gnss, Imu, Recording, Truth
@@ -55,11 +55,11 @@ TIMES = np.arange(0.0, 60.0, 0.1)
 
 def test_a_known_offset_is_the_error_and_every_number_made_of_it() -> None:
     truth = circle(TIMES)
-    found = evaluation.errors(moved(truth, np.array([3.0, -4.0, 12.0])), truth)
+    found = evaluation.compute_errors(moved(truth, np.array([3.0, -4.0, 12.0])), truth)
     np.testing.assert_allclose(found.p, np.tile([3.0, -4.0, 12.0], (len(truth), 1)), atol=1e-6)
     np.testing.assert_allclose(found.v, 0.0, atol=1e-12)
 
-    numbers = evaluation.summary(evaluation.measure(found))
+    numbers = evaluation.summarise(evaluation.measure(found))
     assert numbers["h_rms_m"] == numbers["h_p95_m"] == numbers["h_max_m"] == pytest.approx(5.0, abs=1e-4)
     assert numbers["3d_max_m"] == pytest.approx(13.0, abs=1e-4)
     assert numbers["n_mean_m"] == pytest.approx(-4.0, abs=1e-4)
@@ -73,7 +73,7 @@ def test_compared_at_given_times_only_and_never_between_rows_of_the_estimate() -
     rows = np.arange(0, len(truth), 10)
     estimate = moved(truth.take(rows), np.column_stack([TIMES[rows], *np.zeros((2, len(rows)))]))
     at = np.append(estimate.t[5:20], 7.25)  # the last is no row of the estimate
-    found = evaluation.errors(estimate, truth, at=np.sort(at))
+    found = evaluation.compute_errors(estimate, truth, at=np.sort(at))
     np.testing.assert_array_equal(found.t, estimate.t[5:20])
     np.testing.assert_allclose(found.p[:, 0], found.t, atol=1e-6)
     assert found.epochs == 16
@@ -101,7 +101,7 @@ def test_along_and_across_on_a_circle() -> None:
     heading = OMEGA * TIMES
     ahead = np.column_stack([np.sin(heading), np.cos(heading), 0 * heading])
     right = np.column_stack([np.cos(heading), -np.sin(heading), 0 * heading])
-    found = evaluation.errors(moved(truth, 2.0 * ahead - 0.5 * right), truth)
+    found = evaluation.compute_errors(moved(truth, 2.0 * ahead - 0.5 * right), truth)
     # The circle's plane is level at its start only: 100 m away the axes have turned by 2e-5 rad.
     np.testing.assert_allclose(found.track, np.tile([2.0, -0.5], (len(truth), 1)), atol=1e-4)
 
@@ -109,22 +109,22 @@ def test_along_and_across_on_a_circle() -> None:
 def test_direction_of_travel_is_undefined_when_slow_and_comes_from_positions_without_velocity() -> None:
     truth = circle(TIMES)
     crawling = replace(truth, v=truth.v * 0.04)  # 0.4 m/s
-    assert np.isnan(evaluation.errors(truth, crawling).track).all()
+    assert np.isnan(evaluation.compute_errors(truth, crawling).track).all()
 
     bare = replace(truth, v=None, rph=None)
-    found = evaluation.errors(moved(truth, np.array([1.0, 0.0, 0.0])), bare)
+    found = evaluation.compute_errors(moved(truth, np.array([1.0, 0.0, 0.0])), bare)
     inner = slice(1, -1)  # central differences: exact in direction on a circle, not at the ends
     expected = np.column_stack([np.sin(OMEGA * TIMES), np.cos(OMEGA * TIMES)])
     np.testing.assert_allclose(found.track[inner], expected[inner], atol=1e-4)
-    assert "truth.no_velocity" in map(key_of, found.notes)
+    assert "truth.no_velocity" in map(get_key, found.notes)
 
 
 def test_heading_wraps_at_north() -> None:
     truth = circle(TIMES)
     a = replace(truth, rph=np.tile(np.deg2rad([0.0, 0.0, 359.0]), (len(truth), 1)))
     b = replace(truth, rph=np.tile(np.deg2rad([0.0, 0.0, 2.0]), (len(truth), 1)))
-    np.testing.assert_allclose(np.rad2deg(evaluation.errors(a, b).rph[:, 2]), -3.0, atol=1e-9)
-    np.testing.assert_allclose(np.rad2deg(evaluation.errors(b, a).rph[:, 2]), 3.0, atol=1e-9)
+    np.testing.assert_allclose(np.rad2deg(evaluation.compute_errors(a, b).rph[:, 2]), -3.0, atol=1e-9)
+    np.testing.assert_allclose(np.rad2deg(evaluation.compute_errors(b, a).rph[:, 2]), 3.0, atol=1e-9)
 
 
 def test_attitude_between_359_and_1_degree_is_north() -> None:
@@ -167,7 +167,7 @@ def test_nothing_is_extrapolated_and_no_gap_is_bridged() -> None:
     _, ok = interpolate(estimate, wanted)
     assert ok.tolist() == [False, True, True, True, False, True, True, False]
     # The rows beside the gap are exact; only what lies inside it is out.
-    found = evaluation.errors(estimate, circle(np.arange(-5.0, 35.0, 0.1)))
+    found = evaluation.compute_errors(estimate, circle(np.arange(-5.0, 35.0, 0.1)))
     assert found.t.min() == pytest.approx(0.0, abs=1e-6)
     assert found.t.max() == pytest.approx(29.9, abs=1e-6)
     assert not ((found.t > 9.91) & (found.t < 19.99)).any()
@@ -182,10 +182,10 @@ def test_sparse_keyframes_are_compared_where_they_are() -> None:
     def wobble(x: Trajectory) -> Trajectory:
         return replace(x, rph=x.rph + np.column_stack([0.05 * np.sin(3.0 * x.t), 0 * x.t, 0 * x.t]))
 
-    found = evaluation.errors(wobble(keyframes), wobble(truth))
+    found = evaluation.compute_errors(wobble(keyframes), wobble(truth))
     assert len(found) == len(keyframes)
     np.testing.assert_allclose(found.rph, 0.0, atol=1e-9)
-    assert "truth.interpolated" in map(key_of, found.notes)
+    assert "truth.interpolated" in map(get_key, found.notes)
 
 
 def test_lever_arm_moves_position_velocity_and_covariance() -> None:
@@ -203,7 +203,7 @@ def test_lever_arm_moves_position_velocity_and_covariance() -> None:
     sd = np.deg2rad([0.1, 0.2, 3.0])
     cov = np.zeros((len(t), 9, 9))
     cov[:, range(9), range(9)] = np.concatenate([[0.01, 0.02, 0.03, 0.1, 0.1, 0.1], sd]) ** 2
-    found = evaluation.errors(replace(imu, covariance=cov), antenna, lever_arm=arm)
+    found = evaluation.compute_errors(replace(imu, covariance=cov), antenna, lever_arm=arm)
     np.testing.assert_allclose(found.p, 0.0, atol=1e-7)
     np.testing.assert_allclose(found.v, 0.0, atol=1e-5)
     # At t = 0 right, forward, up are east, north, up, and the arm (2, 1, 0.5) in them. Rolling turns about
@@ -219,8 +219,8 @@ def test_lever_arm_moves_position_velocity_and_covariance() -> None:
 
 def test_missing_attitude_with_a_lever_arm_is_said() -> None:
     truth = circle(TIMES)
-    found = evaluation.errors(replace(truth, rph=None), truth, lever_arm=np.array([0.0, 3.0, 4.0]))
-    assert "truth.lever_arm" in map(key_of, found.notes)
+    found = evaluation.compute_errors(replace(truth, rph=None), truth, lever_arm=np.array([0.0, 3.0, 4.0]))
+    assert "truth.lever_arm" in map(get_key, found.notes)
 
 
 def test_nees_of_draws_from_a_known_covariance_is_in_its_band() -> None:
@@ -234,7 +234,7 @@ def test_nees_of_draws_from_a_known_covariance_is_in_its_band() -> None:
     estimate = replace(
         estimate, v=truth.v + draw[:, 3:6], rph=truth.rph + draw[:, 6:], covariance=np.tile(cov, (n, 1, 1))
     )
-    metrics = evaluation.measure(evaluation.errors(estimate, truth))
+    metrics = evaluation.measure(evaluation.compute_errors(estimate, truth))
     for key in ("p", "e", "n", "up", "v", "rph"):
         nees = metrics.nees[key]
         assert nees.n == n
@@ -243,10 +243,10 @@ def test_nees_of_draws_from_a_known_covariance_is_in_its_band() -> None:
     # Correlations matter here: the sigmas alone, as a file has them, give another number.
     sd = np.sqrt(np.diag(cov))
     alone = replace(estimate, covariance=None, sd_p=np.tile(sd[:3], (n, 1)))
-    found = evaluation.errors(alone, truth)
+    found = evaluation.compute_errors(alone, truth)
     e = found.p
     np.testing.assert_allclose(found.nees_p, np.sum((e / sd[:3]) ** 2, axis=1), rtol=1e-9)
-    assert "nees.no_correlations" in map(key_of, found.notes)
+    assert "nees.no_correlations" in map(get_key, found.notes)
 
 
 def test_an_overconfident_estimate_is_outside_the_band() -> None:
@@ -254,10 +254,10 @@ def test_an_overconfident_estimate_is_outside_the_band() -> None:
     truth = circle(TIMES)
     sd = np.full((len(truth), 3), 1.0)
     estimate = replace(moved(truth, 1.3 * rng.normal(size=sd.shape)), sd_p=sd)
-    nees = evaluation.measure(evaluation.errors(estimate, truth)).nees["p"]
+    nees = evaluation.measure(evaluation.compute_errors(estimate, truth)).nees["p"]
     assert nees.mean > nees.high
     # A truth that is itself uncertain by as much as is missing makes up for it.
-    honest = evaluation.measure(evaluation.errors(estimate, replace(truth, sd_p=np.sqrt(0.69) * sd))).nees["p"]
+    honest = evaluation.measure(evaluation.compute_errors(estimate, replace(truth, sd_p=np.sqrt(0.69) * sd))).nees["p"]
     assert honest.low < honest.mean < honest.high
 
 
@@ -267,7 +267,7 @@ def test_ensemble_nees_averages_runs_not_time() -> None:
     # One draw per run held through the run: as correlated in time as can be.
     draws = chi2.rvs(3, size=runs, random_state=rng)
     found = [_errors_with(np.zeros(n), np.full(n, x)) for x in draws]
-    t, mean, low, high = evaluation.ensemble_nees(found)
+    t, mean, low, high = evaluation.average_ensemble_nees(found)
     assert len(t) == n
     np.testing.assert_allclose(mean, draws.mean() / 3)
     assert low == pytest.approx(chi2.ppf(0.025, 3 * runs) / (3 * runs))
@@ -278,7 +278,7 @@ def test_singular_or_missing_covariance_gives_no_nees() -> None:
     truth = circle(TIMES)
     cov = np.zeros((len(truth), 9, 9))
     cov[:, :3, :3] = 1.0  # rank one
-    found = evaluation.errors(replace(truth, covariance=cov), truth)
+    found = evaluation.compute_errors(replace(truth, covariance=cov), truth)
     assert np.isnan(found.nees_p).all()
     assert np.isnan(found.nees_v).all()
 
@@ -306,14 +306,17 @@ def test_truth_in_a_local_frame_is_fitted_first(flat: bool) -> None:
     truth = Trajectory(
         estimate.t[::10], xyz, rph=np.column_stack([0 * heading, 0 * heading, heading]), frame="local", name="room"
     )
-    found = evaluation.errors(estimate, truth)
+    found = evaluation.compute_errors(estimate, truth)
     np.testing.assert_allclose(found.p[:, :2], 0.0, atol=1e-6)
     np.testing.assert_allclose(found.rph[:, 2], 0.0, atol=1e-4)  # the axes of the local level turn with place
     assert found.dof_p == (2 if flat else 3)
     assert np.isnan(found.p[:, 2]).all() == flat
-    assert any(key_of(note) == "truth.fitted" and "-40.11" in note for note in found.notes)
+    assert any(get_key(note) == "truth.fitted" and "-40.11" in note for note in found.notes)
     # What the fit cannot absorb stays an error: a truth half as large.
-    assert evaluation.measure(evaluation.errors(estimate, replace(truth, llh=truth.llh / 2))).components["h"].rms > 10
+    assert (
+        evaluation.measure(evaluation.compute_errors(estimate, replace(truth, llh=truth.llh / 2))).components["h"].rms
+        > 10
+    )
     assert ("up" in evaluation.measure(found).components) != flat
 
 
@@ -322,7 +325,7 @@ def test_both_in_local_frames() -> None:
     p = FRAME.from_llh(source.llh)
     a = Trajectory(source.t, p, frame="local")
     b = Trajectory(source.t, p @ rotation.exp(np.array([0.0, 0.0, 1.0])).T + 3.0, frame="local")
-    found = evaluation.errors(a, b)
+    found = evaluation.compute_errors(a, b)
     np.testing.assert_allclose(found.p, 0.0, atol=1e-6)
     np.testing.assert_allclose(found.distance[-1], SPEED * 39.9, rtol=1e-3)
 
@@ -331,7 +334,7 @@ def test_a_local_truth_that_does_not_move_cannot_be_fitted() -> None:
     estimate = circle(TIMES)
     truth = Trajectory(TIMES, np.zeros((len(TIMES), 3)), frame="local")
     with refused("truth.too_little", RecordingError):
-        evaluation.errors(estimate, truth)
+        evaluation.compute_errors(estimate, truth)
 
 
 def test_distance_does_not_count_the_noise_of_standing_nor_the_curve_of_the_earth() -> None:
@@ -350,7 +353,7 @@ def test_distance_does_not_count_the_noise_of_standing_nor_the_curve_of_the_eart
 
 def evaluation_distance(t: np.ndarray, llh: np.ndarray) -> float:
     trajectory = Trajectory(t, llh)
-    return float(evaluation.errors(trajectory, trajectory).distance[-1])
+    return float(evaluation.compute_errors(trajectory, trajectory).distance[-1])
 
 
 def test_a_span_reports_end_maximum_and_drift() -> None:
@@ -359,7 +362,7 @@ def test_a_span_reports_end_maximum_and_drift() -> None:
     up = np.where((TIMES >= 20) & (TIMES <= 40), -1.0, 0.0)
     estimate = moved(truth, np.column_stack([growing, 0 * up, up]))
     estimate = replace(estimate, sd_p=np.full((len(truth), 3), 0.5))
-    metrics = evaluation.measure(evaluation.errors(estimate, truth), spans=[(20.0, 40.0), (100.0, 110.0)])
+    metrics = evaluation.measure(evaluation.compute_errors(estimate, truth), spans=[(20.0, 40.0), (100.0, 110.0)])
     span, empty = metrics.spans
     assert span.end_h == span.max_h == pytest.approx(2.0, abs=1e-6)
     assert span.end_3d == pytest.approx(np.sqrt(5.0), abs=1e-6)
@@ -371,14 +374,14 @@ def test_a_span_reports_end_maximum_and_drift() -> None:
     s = np.arange(201) * 0.1
     assert span.nees == pytest.approx((np.mean((0.1 * s) ** 2) + 1.0) / 0.25 / 3, rel=1e-5)
     assert empty.n == 0
-    assert evaluation.summary(metrics)["spans"][1]["max_h_m"] is None
+    assert evaluation.summarise(metrics)["spans"][1]["max_h_m"] is None
 
 
 def test_closure_of_a_loop() -> None:
     t = np.linspace(0.0, 2 * np.pi / OMEGA, 1001)
     loop = circle(t)
     shift = np.linspace(0.0, 1.0, len(t))[:, None] * np.array([0.3, 0.4, -2.0])
-    found = evaluation.closure(moved(loop, shift))
+    found = evaluation.measure_closure(moved(loop, shift))
     assert found.horizontal == pytest.approx(0.5, abs=1e-4)
     assert found.vertical == pytest.approx(-2.0, abs=1e-4)
     assert found.percent == pytest.approx(100 * 0.5 / (2 * np.pi * RADIUS), rel=2e-3)
@@ -404,11 +407,11 @@ def test_withheld_fixes_are_the_truth_of_their_span() -> None:
     assert (span.start, span.end, span.n) == (20.05, 30.05, 10)  # in seconds from the start, as given
     assert span.max_h == pytest.approx(1.0, abs=1e-5)
     assert metrics.components["up"].max < 1e-5  # the lever arm was used
-    assert "truth.lever_arm_sigma" in map(key_of, metrics.notes)
+    assert "truth.lever_arm_sigma" in map(get_key, metrics.notes)
     assert metrics.nees["p"].mean == pytest.approx(1.0 / (0.1**2 + 0.02**2) / 3, rel=1e-4)
     assert evaluation.evaluate_recording(estimate, recording) is None
     with refused("truth.no_withheld_fix", RecordingError):
-        evaluation.withheld_truth(recording, "gnss", [(500.0, 600.0)])
+        evaluation.make_withheld_truth(recording, "gnss", [(500.0, 600.0)])
 
 
 def test_withheld_fixes_are_met_on_the_receivers_clock_and_at_the_antenna_as_estimated() -> None:
@@ -425,7 +428,7 @@ def test_withheld_fixes_are_met_on_the_receivers_clock_and_at_the_antenna_as_est
     assert metrics.spans[0].n == 10  # the span is on the clock of the fixes that were withheld
     assert metrics.spans[0].max_h < 1e-4
     assert metrics.components["up"].max < 1e-4
-    assert "truth.clock_offset" in map(key_of, metrics.notes)
+    assert "truth.clock_offset" in map(get_key, metrics.notes)
     stated = evaluation.evaluate_recording(estimate, recording, withheld=[("gnss", (20.05, 30.05))])
     assert stated is not None
     assert stated.spans[0].max_h > 0.9 * SPEED * late
@@ -451,22 +454,22 @@ def test_truth_of_a_recording() -> None:
     source = circle(t)
     arm = np.array([0.1, 0.2, 0.3])
     gnss = Gnss(t, source.llh, np.ones((len(t), 3)), lever_arm=arm)
-    found = evaluation.truth_of(_recording(t, gnss, Truth(t, llh=source.llh, of="gnss")))
+    found = evaluation.find_truth(_recording(t, gnss, Truth(t, llh=source.llh, of="gnss")))
     assert found is not None
     np.testing.assert_array_equal(found[1], arm)
     with refused("truth.no_lever_arm", RecordingError, "[gnss]"):
-        evaluation.truth_of(_recording(t, None, Truth(t, llh=source.llh, of="gnss")))
-    local = evaluation.truth_of(_recording(t, None, Truth(t, xyz=np.zeros((len(t), 2)))))
+        evaluation.find_truth(_recording(t, None, Truth(t, llh=source.llh, of="gnss")))
+    local = evaluation.find_truth(_recording(t, None, Truth(t, xyz=np.zeros((len(t), 2)))))
     assert local is not None
     assert local[0].frame == "local"
     assert np.isnan(local[0].llh[:, 2]).all()
     loop = _recording(t, None, Truth(t[:0], closed_loop_sigma=0.01))
-    assert evaluation.truth_of(loop) is None
+    assert evaluation.find_truth(loop) is None
     metrics = evaluation.evaluate_recording(source, loop)
     assert metrics is not None
     assert metrics.closure is not None
-    assert "closure_h_m" in evaluation.summary(metrics)
-    assert "closure" in evaluation.text(metrics)
+    assert "closure_h_m" in evaluation.summarise(metrics)
+    assert "closure" in evaluation.format_metrics(metrics)
 
 
 def test_files_in_numbers_out(tmp_path: Path) -> None:
@@ -477,13 +480,13 @@ def test_files_in_numbers_out(tmp_path: Path) -> None:
     metrics = evaluation.evaluate(tmp_path / "a.csv", tmp_path / "truth.csv", spans=[(10.0, 20.0)])
     assert metrics.components["h"].rms == pytest.approx(5.0, abs=2e-5)
     assert metrics.name == "a"
-    table = evaluation.text(metrics)
+    table = evaluation.format_metrics(metrics)
     assert "horizontal           5.000" in table
     assert "10.0-20.0" in table
     local = evaluation.evaluate(tmp_path / "b.tum", tmp_path / "truth.csv")
     assert local.components["3d"].max < 1e-4
 
-    rows = evaluation.comparison_rows({"ekf": metrics, "batch": local})
+    rows = evaluation.tabulate({"ekf": metrics, "batch": local})
     evaluation.write_comparison_csv(tmp_path / "comparison.csv", rows)
     head, first, second = (tmp_path / "comparison.csv").read_text().splitlines()
     assert head.startswith("solver,n,epochs,")
@@ -513,7 +516,7 @@ def test_eighteen_seconds_of_utc_are_recognised(tmp_path: Path) -> None:
     write_as("csv", circle(t), tmp_path / "truth.csv")
     write_as("csv", replace(circle(t), t=t - 18.0), tmp_path / "a.csv")
     notes = evaluation.evaluate(tmp_path / "a.csv", tmp_path / "truth.csv").notes
-    assert "truth.leap_seconds" in map(key_of, notes)
+    assert "truth.leap_seconds" in map(get_key, notes)
     write_as("csv", circle(t[:100]), tmp_path / "short.csv")
     write_as("csv", replace(circle(t[:100]), t=t[:100] + 18.0), tmp_path / "far.csv")
     with refused("truth.no_overlap", RecordingError, "UTC", "18 s"):
@@ -537,7 +540,7 @@ def test_clocks_that_are_known_are_put_on_one(tmp_path: Path) -> None:
     (tmp_path / "imu.csv").write_text("t,gx,gy,gz,ax,ay,az\n" + rows)
     write_as("csv", known, tmp_path / "truth.csv")
     found = evaluation.evaluate(tmp_path / "a.nav", tmp_path)
-    assert "against.clock" in map(key_of, found.notes)
+    assert "against.clock" in map(get_key, found.notes)
     assert found.errors is not None
     assert len(found.errors) == len(t)
     assert found.errors.horizontal.max() < 1e-3
@@ -546,7 +549,7 @@ def test_clocks_that_are_known_are_put_on_one(tmp_path: Path) -> None:
 def test_a_denser_truth_may_be_of_fixes_with_types_and_satellites() -> None:
     dense = circle(np.arange(0.0, 60.0, 0.1))
     fixes = replace(dense, v=None, fix_type=np.ones(len(dense)), satellites=np.full(len(dense), 17.0))
-    found = evaluation.errors(circle(np.arange(1.0, 58.0, 1.0)), fixes)
+    found = evaluation.compute_errors(circle(np.arange(1.0, 58.0, 1.0)), fixes)
     assert len(found) == 57
     assert found.horizontal.max() < 1e-3
 
@@ -607,7 +610,7 @@ def test_an_estimate_in_a_local_frame_brings_velocity_and_covariance_along() -> 
     p, v = FRAME.from_llh(truth.llh), truth.v
     cov = np.tile(np.diag([4.0, 1.0, 9.0, 0.4, 0.1, 0.9, 1e-4, 1e-4, 1e-4]), (len(truth), 1, 1))
     local = Trajectory(truth.t, p @ R_nm, v=v @ R_nm, covariance=cov, frame="local", name="room")
-    found = evaluation.errors(local, truth)
+    found = evaluation.compute_errors(local, truth)
     np.testing.assert_allclose(found.v, 0.0, atol=2e-4)  # 100 m turn the local level by 2e-5 rad
     c, s = np.cos(yaw) ** 2, np.sin(yaw) ** 2
     np.testing.assert_allclose(found.sd_p[0], np.sqrt([4 * c + s, 4 * s + c, 9.0]), rtol=1e-4)
@@ -617,5 +620,7 @@ def test_an_estimate_in_a_local_frame_brings_velocity_and_covariance_along() -> 
 def test_no_direction_of_travel_is_taken_across_a_gap() -> None:
     t = np.concatenate([np.arange(0.0, 10.0, 0.1), np.arange(20.0, 30.0, 0.1)])
     estimate = moved(circle(t), np.array([1.0, 0.0, 0.0]))
-    bare, known = (evaluation.errors(estimate, x).track for x in (replace(circle(t), v=None, rph=None), circle(t)))
+    bare, known = (
+        evaluation.compute_errors(estimate, x).track for x in (replace(circle(t), v=None, rph=None), circle(t))
+    )
     np.testing.assert_allclose(bare, known, atol=1e-3)

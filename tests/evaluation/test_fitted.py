@@ -7,8 +7,8 @@ import pytest
 
 from graphnav.core.interpolation import fit_yaw
 from graphnav.core.trajectory import Trajectory
-from graphnav.evaluation.fitted import after_fit
-from graphnav.evaluation.scoring import errors
+from graphnav.evaluation.fitted import propagate_fit
+from graphnav.evaluation.scoring import compute_errors
 
 N, RUNS = 60, 1500
 POSITION, HEADING, SPEED = 0.02, 0.004, 0.05  # m and rad a step, m/s: 1-sigma of what is added
@@ -52,7 +52,7 @@ def stated(p: np.ndarray, v: np.ndarray) -> np.ndarray:
 def test_the_covariance_of_what_a_fit_leaves() -> None:
     p, v = walk()
     e, ev, yaw = dead_reckoned(np.random.default_rng(1), p, v)
-    cov, larger = after_fit(stated(p, v), p, v)
+    cov, larger = propagate_fit(stated(p, v), p, v)
     assert larger == pytest.approx(1.0, abs=1e-6)
     rest, rest_v, rest_yaw = np.empty_like(e), np.empty_like(ev), np.empty_like(yaw)
     for k in range(RUNS):
@@ -89,7 +89,7 @@ def test_nees_of_a_walk_against_a_truth_of_its_own_frame_is_one(height: bool) ->
             t, p + e[k], v=v + ev[k], rph=rph, sd_p=sd[:, :3], sd_v=sd[:, 3:6], sd_rph=sd[:, 6:], covariance=cov,
             frame="local", name="walk",
         )  # fmt: skip
-        scored = errors(estimate, truth)
+        scored = compute_errors(estimate, truth)
         found.append(scored.nees_p / scored.dof_p)
         assert np.isfinite(scored.nees_p).all()
     assert np.mean(found) == pytest.approx(1.0, abs=0.15)

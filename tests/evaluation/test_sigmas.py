@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from graphnav.core.sample_size import effective_epochs
+from graphnav.core.sample_size import count_effective_epochs
 from graphnav.evaluation.metrics import Errors
 from graphnav.evaluation.sigmas import judge_sigmas, select_verdict
 from graphnav.report.sentences import describe_sigma
@@ -79,8 +79,8 @@ def test_an_axis_that_alone_is_wrong_is_named(axis: int, part: str, whole: str) 
 
 
 def test_an_error_that_does_not_change_is_one() -> None:
-    assert effective_epochs(np.full((N, 3), 1.8)) == pytest.approx(1.0)
-    assert effective_epochs(np.random.default_rng(6).normal(size=(N, 3))) > 0.9 * N
+    assert count_effective_epochs(np.full((N, 3), 1.8)) == pytest.approx(1.0)
+    assert count_effective_epochs(np.random.default_rng(6).normal(size=(N, 3))) > 0.9 * N
     x = lasting(np.random.default_rng(7), 0.0)
     x[:, 8] = 1.8
     judged = {j.block: j for j in judge_sigmas(errors_of(x))}
@@ -92,5 +92,5 @@ def test_an_error_that_does_not_change_is_one() -> None:
 
 def test_how_many_epochs_correlated_errors_are_worth() -> None:
     # of a Gauss-Markov process r = exp(-k/T), so that squares are worth n / coth(1/T)
-    worth = [effective_epochs(lasting(np.random.default_rng(seed), 5.0, 3)) for seed in range(20)]
+    worth = [count_effective_epochs(lasting(np.random.default_rng(seed), 5.0, 3)) for seed in range(20)]
     assert np.median(worth) == pytest.approx(N * np.tanh(0.2), rel=0.25)

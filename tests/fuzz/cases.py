@@ -31,13 +31,13 @@ import raw_cases
 import test_formats_binary as binary
 
 from graphnav.app import cli
-from graphnav.config import read_settings, settings_from, settings_text
+from graphnav.config import format_settings, parse_settings, read_settings
 from graphnav.core.errors import GraphnavError
 from graphnav.core.trajectory import Trajectory
 from graphnav.estimation.noise.files import read_noise, write_noise
 from graphnav.estimation.pipeline import run
 from graphnav.online import Session
-from graphnav.online.lines import lines_of
+from graphnav.online.lines import format_lines
 from graphnav.recording import Recording
 from graphnav.recording.formats import load, read
 from graphnav.recording.formats.schema import read_description
@@ -47,7 +47,7 @@ from graphnav.recording.plausibility.screening import screen_recording
 
 KINDS = ("right", "refused", "traceback", "hang", "silent wrong")
 SECONDS = 10.0  # of a processor
-QUICK = settings_from({"noise": {"mode": "stated"}, "solver": {"lag": 10.0}})
+QUICK = parse_settings({"noise": {"mode": "stated"}, "solver": {"lag": 10.0}})
 _LONGEST = 2000  # characters of a sentence
 
 
@@ -111,8 +111,8 @@ def seeds() -> Path:
     for name in ("csv", "tum"):
         write_as(name, track, folder / f"t.{name}")
     write_as("nav", track, folder / "t.nav", None)
-    write_noise(folder / "noise.json", run(recording, settings_from({}), ("ekf",))["ekf"].noise)
-    (folder / "settings.toml").write_text(settings_text(read_settings()))
+    write_noise(folder / "noise.json", run(recording, parse_settings({}), ("ekf",))["ekf"].noise)
+    (folder / "settings.toml").write_text(format_settings(read_settings()))
     commanded("smooth", folder / "own", "--solver", "ekf", "--noise", "stated", "-o", folder / "out", "--no-report")
     return folder
 
@@ -238,7 +238,7 @@ def of_settings(folder: Path, chance: random.Random) -> None:
     path = Path(shutil.copy(seeds() / "settings.toml", folder))
     spoilt(path, mutators.WRITTEN, chance)
     found = read_settings(path)
-    path.write_text(settings_text(found), encoding="utf-8")
+    path.write_text(format_settings(found), encoding="utf-8")
     insist(read_settings(path) == found, "settings differ when read again")
 
 
@@ -398,7 +398,7 @@ def off(track: Trajectory, truth: Trajectory) -> np.ndarray:
 @cache
 def live() -> tuple[str, ...]:
     recording, _ = drive()
-    return tuple(line for _, line in lines_of(recording))
+    return tuple(line for _, line in format_lines(recording))
 
 
 def of_stream(folder: Path, chance: random.Random) -> None:

@@ -18,7 +18,7 @@ from graphnav.gnss.load import Sources, load_raw
 from graphnav.gnss.rinex_nav import read_navigation
 from graphnav.gnss.rinex_obs import read_observations
 from graphnav.gnss.series import Observations
-from graphnav.gnss.signals import GPS, satellite_name
+from graphnav.gnss.signals import GPS, name_satellite
 
 REAL = Path(__file__).resolve().parents[2] / "data" / "tokyo_raw"
 _EPOCHS = 12
@@ -59,7 +59,7 @@ def write_version_2(obs: Observations, path: Path) -> None:
             f"{'     3    C1    L1    D1':<60}# / TYPES OF OBSERV", f"{'':<60}END OF HEADER"]  # fmt: skip
     for t in np.unique(obs.t):
         own = np.flatnonzero(obs.t == t)
-        names = "".join(satellite_name(one) for one in obs.satellite[own])
+        names = "".join(name_satellite(one) for one in obs.satellite[own])
         begin = " " + date(float(t), obs.zero, "{:4d} {:2d} {:2d} {:2d} {:2d}{:11.7f}")[2:]
         said.append(f"{begin}  0{len(own):3d}{names}")
         for k in own:
@@ -74,7 +74,7 @@ def write_orbits(t: Any, satellite: Any, p: Any, clock: Any, zero: float, folder
     for now in np.unique(t):
         orbits.append(date(float(now), zero, "*  {} {:2d} {:2d} {:2d} {:2d} {:11.8f}"))
         for k in np.flatnonzero(t == now):
-            name = satellite_name(satellite[k])
+            name = name_satellite(satellite[k])
             orbits.append(f"P{name}" + "".join(f"{x:14.6f}" for x in (*(p[k] * 1e-3), clock[k] * 1e6)))
             clocks.append(date(float(now), zero, f"AS {name}  {{}} {{}} {{}} {{}} {{}} {{:.6f}}  1 {clock[k]:.12e}"))
     (folder / "a.sp3").write_text("\n".join([*orbits, "EOF"]) + "\n")

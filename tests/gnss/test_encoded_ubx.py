@@ -10,7 +10,7 @@ import pytest
 
 from graphnav.gnss.load import read_rover
 from graphnav.gnss.rinex_nav import read_navigation
-from graphnav.gnss.signals import satellite_name, signal_name
+from graphnav.gnss.signals import name_satellite, name_signal
 
 ROOT = Path(__file__).resolve().parents[2]
 KAMAKURA = ROOT / "data" / "kamakura_rtk"
@@ -36,7 +36,7 @@ def test_the_log_is_what_the_script_makes(encoder, rinex):
 def test_observations_and_ephemerides_are_those_of_the_rinex(rinex):
     """To the last digit of RINEX, but for what u-blox keeps in whole numbers, and only of signals it has."""
     (obs, nav), (found, sent) = rinex, read_rover((KAMAKURA / "rover.ubx",))
-    assert {signal_name(x) for x in obs.signal} - {signal_name(x) for x in found.signal} == {"1W", "2W", "8Q"}
+    assert {name_signal(x) for x in obs.signal} - {name_signal(x) for x in found.signal} == {"1W", "2W", "8Q"}
     assert not found.remarks
     theirs = {key: i for i, key in enumerate(zip(obs.t + obs.zero, obs.satellite, obs.signal, strict=True))}
     keys = zip(found.t + found.zero, found.satellite, found.signal, strict=True)
@@ -54,7 +54,7 @@ def test_observations_and_ephemerides_are_those_of_the_rinex(rinex):
         for k, (s, toe, fnav) in enumerate(zip(*(nav.kepler[x] for x in ("satellite", "toe", "fnav")), strict=True))
         if not fnav
     }
-    assert {satellite_name(s)[0] for s in sent.satellites} == {"G", "E", "J"}
+    assert {name_satellite(s)[0] for s in sent.satellites} == {"G", "E", "J"}
     for k, key in enumerate(zip(sent.kepler["satellite"], sent.kepler["toe"], strict=True)):
         for name, value in sent.kepler.items():
             if name not in ("accuracy", "delay"):

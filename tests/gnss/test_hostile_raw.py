@@ -18,7 +18,7 @@ sys.path.append(str(Path(__file__).resolve().parents[1] / "fuzz"))
 import raw_cases
 
 from graphnav.core.errors import RecordingError
-from graphnav.gnss.columns import observations
+from graphnav.gnss.columns import make_observations
 from graphnav.gnss.precise import read_precise
 from graphnav.gnss.rinex_nav import read_navigation
 from graphnav.gnss.rinex_obs import read_observations
@@ -152,7 +152,7 @@ def test_clocks_that_are_none(seeds: Path, tmp_path: Path) -> None:
 
 def test_satellites_of_a_table_have_whole_numbers() -> None:
     prn = np.array([5.0, 5.5, -1.0, 0.0, 1e9, np.nan, 32.0])
-    found = observations({"t": np.arange(7.0), "prn": prn, "code": np.full(7, 2e7)}, 0.0, "a.csv")
+    found = make_observations({"t": np.arange(7.0), "prn": prn, "code": np.full(7, 2e7)}, 0.0, "a.csv")
     assert found.satellite.tolist() == [5, 32]
     assert_told(found.remarks, "raw.rows_left_out", "a.csv", "5")
 

@@ -16,11 +16,11 @@ from helpers import refused
 from graphnav.config import Settings
 from graphnav.constraints.raw_gnss import GnssCode
 from graphnav.core.errors import RecordingError
-from graphnav.core.notes import key_of
+from graphnav.core.notes import get_key
 from graphnav.estimation.pipeline import run
 from graphnav.gnss.arcs import find_arcs
 from graphnav.gnss.series import RawGnss
-from graphnav.gnss.signals import satellite_id, signal_id
+from graphnav.gnss.signals import number_satellite, number_signal
 from graphnav.recording import Recording
 from graphnav.recording.checks.aiding import describe_gnss_apart
 from graphnav.recording.formats import read
@@ -58,7 +58,7 @@ def raw_of(recording: Recording) -> RawGnss:
 
 
 def keys(recording: Recording) -> set[str]:
-    return {key_of(remark) for remark in recording.remarks}
+    return {get_key(remark) for remark in recording.remarks}
 
 
 def by_row(raw: RawGnss) -> dict[tuple[int, int, int], tuple[float, float]]:
@@ -86,7 +86,7 @@ def test_a_satellite_without_an_ephemeris_is_named_and_the_others_stay(changed, 
     def without(text: str) -> str:
         return re.sub(r"^G15 .*\n(?:    .*\n){7}", "", text, flags=re.MULTILINE)
 
-    one, gone = changed("nav.gz", without), satellite_id("G15")
+    one, gone = changed("nav.gz", without), number_satellite("G15")
     assert "raw.no_ephemeris" in keys(one)
     raw, own = raw_of(one), raw_of(one).satellite == gone
     assert own.any()
@@ -160,8 +160,8 @@ def test_signals_that_are_not_known_are_named_and_the_others_stay(changed, whole
         return text.replace("C5Q L5Q", f"C{name} L{name}", 1).replace("S5Q", f"S{name}", 1)
 
     one = changed("rover.obs.gz", unknown)
-    raw, signal = raw_of(one), signal_id("5Q")
-    said = next(remark for remark in one.remarks if key_of(remark) == "raw.unknown_signals")
+    raw, signal = raw_of(one), number_signal("5Q")
+    said = next(remark for remark in one.remarks if get_key(remark) == "raw.unknown_signals")
     assert f"G C{name}" in said
     lost = set(np.unique(whole.satellite[whole.signal == signal])) - set(np.unique(raw.satellite[raw.signal == signal]))
     assert lost
@@ -174,18 +174,18 @@ def test_satellites_of_systems_that_are_not_known_are_counted_and_the_others_sta
     def unknown(text: str) -> str:
         return re.sub(rf"^{name}", other, text, flags=re.MULTILINE)
 
-    rows = len(np.unique(whole.t[whole.satellite == satellite_id(name)]))
+    rows = len(np.unique(whole.t[whole.satellite == number_satellite(name)]))
     one = changed("rover.obs.gz", unknown)
-    said = next(remark for remark in one.remarks if key_of(remark) == "raw.unknown_systems")
+    said = next(remark for remark in one.remarks if get_key(remark) == "raw.unknown_systems")
     assert f"{rows} of X" in said
     assert not keys(one) & {"raw.cut", "raw.short_epochs"}
-    assert same_rows(raw_of(one), whole, lambda key: key[1] == satellite_id(name))
+    assert same_rows(raw_of(one), whole, lambda key: key[1] == number_satellite(name))
     ephemeris = changed("nav.gz", unknown)
     assert "raw.unused_messages" in keys(ephemeris)
     assert "raw.broken_records" not in keys(ephemeris)
     raw = raw_of(ephemeris)
     np.testing.assert_array_equal(
-        np.isfinite(raw.p[:, 0]), np.isfinite(whole.p[:, 0]) & (whole.satellite != satellite_id(name))
+        np.isfinite(raw.p[:, 0]), np.isfinite(whole.p[:, 0]) & (whole.satellite != number_satellite(name))
     )
 
 
@@ -201,10 +201,10 @@ def test_a_half_cycle_ends_its_own_arc_alone(changed, whole):
     recording = changed("rover.obs.gz", half)
     raw = raw_of(recording)
     assert "raw.half_cycles" in keys(recording)
-    of = raw.satellite == satellite_id(name)
+    of = raw.satellite == number_satellite(name)
     assert same_rows(raw, whole, lambda _: False)
     assert raw.half.sum() == whole.half.sum() + 1
     arcs, before = arcs_of(raw), arcs_of(whole)
-    own = of & (raw.signal == signal_id("1C"))
+    own = of & (raw.signal == number_signal("1C"))
     np.testing.assert_array_equal(arcs[~own], before[~own])
     assert len(np.unique(arcs[own])) == len(np.unique(before[own])) + 2  # before, half a cycle open, and after

@@ -12,13 +12,13 @@ import raw_drive
 from helpers import errors, truth_states
 from test_raw_rows import scene
 
-from graphnav.config import settings_from
+from graphnav.config import parse_settings
 from graphnav.constraints.raw_carrier import CHANGE, CLONES, RATES, GnssAntennaClone, GnssCarrier
 from graphnav.constraints.raw_gnss import IONOSPHERE
 from graphnav.core import earth
 from graphnav.core.state import States
 from graphnav.estimation.pipeline import run
-from graphnav.gnss.carrier import consecutive, rows_in
+from graphnav.gnss.carrier import find_rows, pair_consecutive
 from graphnav.gnss.load import Sources, load_raw
 from graphnav.gnss.signals import L1, C
 from graphnav.recording import Gnss, Imu, Recording
@@ -71,7 +71,7 @@ def test_a_change_is_the_difference_of_gtsams_carrier_factors(exact):
     moved = {name: value + (0.7 if name in CLONES else 0.0) for name, value in given.items()}
     raw, frame = recording.raw_gnss, where.frame
     model = gtsam.noiseModel.Isotropic.Sigma(1, 1.0)
-    before, after = consecutive(raw, raw)
+    before, after = pair_consecutive(raw, raw)
 
     def error(k, place, attitude, lever):
         pose = gtsam.Pose3(gtsam.Rot3(frame.R_ne.T @ attitude), frame.r_e + frame.R_ne.T @ place)
@@ -120,7 +120,7 @@ def drift(solution, truth):
 
 def settings(differences):
     chosen = {"differences": differences, "coupling": "tight", "doppler": False}
-    return settings_from({"raw_gnss": chosen, "noise": {"mode": "stated"}})
+    return parse_settings({"raw_gnss": chosen, "noise": {"mode": "stated"}})
 
 
 def test_three_satellites_hold_the_place_in_every_solver(street):
@@ -141,7 +141,7 @@ def test_nothing_is_counted_across_slips_half_cycles_other_ephemerides_and_gaps(
     t = np.unique(raw.t)
 
     def across(changed, k):
-        before, after = consecutive(changed, changed)
+        before, after = pair_consecutive(changed, changed)
         own = changed.satellite[after] == raw.satellite[0]
         return bool(np.any(own & (changed.t[before] < t[k] - 0.1) & (changed.t[after] > t[k] - 0.1)))
 
@@ -154,10 +154,10 @@ def test_nothing_is_counted_across_slips_half_cycles_other_ephemerides_and_gaps(
     # a slip at an epoch that is left out
     flagged = replace(raw, slip=raw.slip | at)
     thin = flagged.take(np.isin(raw.t, t[1::2]))
-    after = consecutive(thin, flagged)[1]
+    after = pair_consecutive(thin, flagged)[1]
     own = (thin.satellite[after] == raw.satellite[0]) & (np.abs(thin.t[after] - t[11]) < 0.1)
     assert not own.any()
-    np.testing.assert_array_equal(raw.t[rows_in(thin, raw)], thin.t)
+    np.testing.assert_array_equal(raw.t[find_rows(thin, raw)], thin.t)
 
 
 UCR, UCR_ZERO = "ucr_riverside_20200712", 2114 * 604800.0 + 5784.0

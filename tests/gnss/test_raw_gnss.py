@@ -11,14 +11,14 @@ from helpers import assert_told, refused
 
 from graphnav.core import earth
 from graphnav.core.errors import RecordingError
-from graphnav.gnss.atmosphere import directions, klobuchar, saastamoinen
+from graphnav.gnss.atmosphere import compute_directions, klobuchar, saastamoinen
 from graphnav.gnss.load import Sources, load_raw
 from graphnav.gnss.placing import place
 from graphnav.gnss.precise import read_precise
 from graphnav.gnss.rinex_nav import read_navigation
 from graphnav.gnss.rinex_obs import parse_observations, read_observations
-from graphnav.gnss.series import Observations, primary
-from graphnav.gnss.signals import BEIDOU, GALILEO, GLONASS, GPS, QZSS, C, satellite_id, signal_id, signal_name
+from graphnav.gnss.series import Observations, choose_primary
+from graphnav.gnss.signals import BEIDOU, GALILEO, GLONASS, GPS, QZSS, C, name_signal, number_satellite, number_signal
 from graphnav.gnss.single_point import look, solve
 from graphnav.recording.formats import read
 
@@ -123,7 +123,7 @@ def test_glonass_and_geostationary_satellites_are_where_rtklib_has_them(rt, shar
     time = rt.gpst2time(2176, 283000.0)
     rs = rt.Arr1Ddouble(3)
     rt.eph2pos(time, theirs.eph[0], rs, dts, var)
-    found = ours.place(np.array([satellite_id("C03")]), np.array([283000.0 + dts[0]]), zero)
+    found = ours.place(np.array([number_satellite("C03")]), np.array([283000.0 + dts[0]]), zero)
     assert found.p[0] == pytest.approx([rs[i] for i in range(3)], abs=1e-4)
     # the velocity is the derivative of the position
     h = 0.5
@@ -157,7 +157,7 @@ def test_satellites_are_where_cssrlib_has_them(shared_data, file, week):
     path = shared_data / file
     orbits = read_precise([path], []) if "sp3" in file else read_navigation([path])
     for name, at, p, clock in CSSRLIB[file, week]:
-        one = orbits.place(np.array([satellite_id(name)]), np.array([at + clock]), week * 604800.0)
+        one = orbits.place(np.array([number_satellite(name)]), np.array([at + clock]), week * 604800.0)
         assert one.p[0] == pytest.approx(p, abs=1e-3)
         assert one.clock[0] == pytest.approx(clock, abs=1e-12)
 
@@ -170,7 +170,7 @@ def test_precise_orbits_are_their_nodes_and_rtklibs_between(rt, shared_data, tmp
     rt.readsp3(unpacked(sp3, tmp_path), nav, 0)
     zero = 2155 * 604800.0
     for name in ("G05", "E11", "R07", "C30"):
-        one = satellite_id(name)
+        one = number_satellite(name)
         t, nodes = orbits.orbit[one]
         inside = t[6:-6:5] - zero
         found = orbits.place(np.full(len(inside), one), inside + _clock(orbits, one, inside, zero), zero)
@@ -186,8 +186,8 @@ def test_precise_orbits_are_their_nodes_and_rtklibs_between(rt, shared_data, tmp
             assert own.clock[0] == pytest.approx(dts[0], abs=1e-12)
     # clock files go before orbit files; both are of the same solution
     fine = read_precise([sp3], [clk])
-    t = fine.clock[satellite_id("G05")][0][10:20] - zero + 7.0
-    both = [x.place(np.full(10, satellite_id("G05")), t, zero).clock for x in (orbits, fine)]
+    t = fine.clock[number_satellite("G05")][0][10:20] - zero + 7.0
+    both = [x.place(np.full(10, number_satellite("G05")), t, zero).clock for x in (orbits, fine)]
     assert np.abs(both[0] - both[1]).max() < 1e-9
     assert np.abs(both[0] - both[1]).max() > 0.0
 
@@ -200,12 +200,12 @@ def test_delays_and_distances_are_rtklibs(rt, shared_data):
     obs = read_observations(shared_data / SLAC / "slac1180.21o.gz")
     nav = read_navigation([shared_data / SLAC / "brdc1180.21n.gz"])
     raw, _ = place(obs, nav, None, obs.marker)
-    raw = raw.take(primary(raw) & np.isfinite(raw.p[:, 0]))
+    raw = raw.take(choose_primary(raw) & np.isfinite(raw.p[:, 0]))
     raw = raw.take(np.arange(0, len(raw), 41))
     antenna = np.tile(obs.marker, (len(raw), 1))
     geometry = look(raw, antenna, nav.klobuchar)
     llh = earth.ecef_to_llh(antenna)
-    azimuth, elevation = directions(antenna, geometry.s)
+    azimuth, elevation = compute_directions(antenna, geometry.s)
     place_ = rt.Arr1Ddouble(3)
     azel, e, rs, rr, ion = (rt.Arr1Ddouble(n) for n in (2, 3, 3, 3, 8))
     for i in range(3):
@@ -265,7 +265,7 @@ def test_single_point_positions_are_as_good_as_rtklibs(rt, riverside, shared_dat
         for i, k in enumerate(rows):
             some[i].time, some[i].sat = rt.gpst2time(2114, float(t)), rtklib_number(rt, int(obs.satellite[k]))
             some[i].P[0], some[i].rcv = float(obs.code[k]), 1
-            name = f"{signal_name(int(obs.signal[k]))}"
+            name = f"{name_signal(int(obs.signal[k]))}"
             some[i].code[0] = {"1C": rt.CODE_L1C, "2I": rt.CODE_L2I}[name]
         solution = rt.sol_t()
         assert rt.pntpos(
@@ -337,8 +337,8 @@ def test_fields_flags_and_blanks():
     obs = parsed(LINES)
     assert obs.zero == 2200 * 604800.0
     assert obs.t.tolist() == [0.0, 0.0, 1.0, 1.0]
-    assert obs.satellite.tolist() == [satellite_id("G05"), satellite_id("E11")] * 2
-    assert set(obs.signal) == {signal_id("1C")}
+    assert obs.satellite.tolist() == [number_satellite("G05"), number_satellite("E11")] * 2
+    assert set(obs.signal) == {number_signal("1C")}
     assert obs.code.tolist() == [21000000.125, 23000000.5, 21000001.125, 23000001.5]
     assert obs.carrier[0] == 110000000.25
     assert np.isnan(obs.carrier[1])
@@ -424,13 +424,13 @@ def test_stamps_of_nominal_epochs_are_turned_back(changed):
 def test_one_signal_of_each_satellite_is_used(shared_data):
     obs = read_observations(shared_data / CSSR / "rover.obs.gz")
     raw, _ = place(obs, read_navigation([shared_data / CSSR / "nav.gz"]), None, obs.marker)
-    one = raw.take(primary(raw))
+    one = raw.take(choose_primary(raw))
     pairs = np.stack([np.round(one.t * 10), one.satellite], -1)
     assert len(np.unique(pairs, axis=0)) == len(one)
     lacking = {(t, s) for t, s in zip(raw.t, raw.satellite, strict=True)} - {
-        (t, s) for t, s, g in zip(raw.t, raw.satellite, raw.signal, strict=True) if g == signal_id("1C")
+        (t, s) for t, s, g in zip(raw.t, raw.satellite, raw.signal, strict=True) if g == number_signal("1C")
     }
-    others = {(t, s) for t, s, g in zip(one.t, one.satellite, one.signal, strict=True) if g != signal_id("1C")}
+    others = {(t, s) for t, s, g in zip(one.t, one.satellite, one.signal, strict=True) if g != number_signal("1C")}
     assert others == lacking
     fixes = solve(one.take(np.isfinite(one.p[:, 0])))
     # it stands at first, 2 cm from a place that is known (README)

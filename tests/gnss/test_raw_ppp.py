@@ -10,19 +10,19 @@ import pytest
 import raw_drive
 from helpers import errors, refused
 
-from graphnav.config import settings_from
+from graphnav.config import parse_settings
 from graphnav.core import earth
 from graphnav.core.errors import ConfigError, GraphnavError, RecordingError
 from graphnav.estimation.pipeline import run
-from graphnav.gnss.antex import read_antex, satellite_axes, wind_up
-from graphnav.gnss.atmosphere import directions, niell
+from graphnav.gnss.antex import compute_satellite_axes, compute_wind_up, read_antex
+from graphnav.gnss.atmosphere import compute_directions, niell
 from graphnav.gnss.load import Sources, load_raw
-from graphnav.gnss.ppp import ionosphere_free
+from graphnav.gnss.ppp import combine_ionosphere_free
 from graphnav.gnss.precise import Orbits
-from graphnav.gnss.series import primary
-from graphnav.gnss.sigmas import REFLECTED, reflection_sigma
-from graphnav.gnss.signals import L1, C, satellite_id, satellite_name, signal_id
-from graphnav.gnss.tides import solid_tide, sun_and_moon
+from graphnav.gnss.series import choose_primary
+from graphnav.gnss.sigmas import REFLECTED, compute_reflection_sigma
+from graphnav.gnss.signals import L1, C, name_satellite, number_satellite, number_signal
+from graphnav.gnss.tides import compute_solid_tide, locate_sun_and_moon
 from graphnav.recording import Gnss, Imu, ImuNoise, Recording
 
 DAY = 2155 * 604800.0 + 3 * 86400.0  # 2021-04-28, s since the GPS epoch
@@ -40,7 +40,7 @@ def rtklib():
 def test_the_tide_is_rtklibs(rtklib, hours):
     """Within what it leaves out: the terms out of phase and those that go with frequency."""
     gps = np.full(len(PLACES), DAY + 3600.0 * hours)
-    found = solid_tide(PLACES, *sun_and_moon(gps))
+    found = compute_solid_tide(PLACES, *locate_sun_and_moon(gps))
     time = rtklib.gpst2utc(rtklib.gpst2time(2155, 3 * 86400.0 + 3600.0 * hours))
     for place, ours in zip(PLACES, found, strict=True):
         at, out = rtklib.Arr1Ddouble(3), rtklib.Arr1Ddouble(3)
@@ -70,7 +70,7 @@ def test_wind_up_follows_the_turn_of_a_satellite():
     """A quarter turn of its antenna about its axis is a quarter of a cycle, and whole turns are counted on."""
     n = 9
     place = np.tile([2.6e7, 0.0, 0.0], (n, 1))
-    axes = satellite_axes(place, np.tile([0.0, 1.5e11, 3e10], (n, 1)))
+    axes = compute_satellite_axes(place, np.tile([0.0, 1.5e11, 3e10], (n, 1)))
     assert np.allclose(axes @ np.swapaxes(axes, -1, -2), np.eye(3))
     angle = 0.5 * np.pi * np.arange(n)
     turned = axes.copy()
@@ -78,7 +78,7 @@ def test_wind_up_follows_the_turn_of_a_satellite():
     turned[:, 1] = -np.sin(angle)[:, None] * axes[:, 0] + np.cos(angle)[:, None] * axes[:, 1]
     e = np.tile([1.0, 0.0, 0.0], (n, 1))
     enu = np.tile(earth.enu_axes(np.zeros((1, 3))), (n, 1, 1))
-    cycles = wind_up(np.ones(n, dtype=np.int16), np.arange(float(n)), turned, e, enu)
+    cycles = compute_wind_up(np.ones(n, dtype=np.int16), np.arange(float(n)), turned, e, enu)
     np.testing.assert_allclose(np.abs(np.diff(cycles)), 0.25, atol=1e-9)
     assert abs(cycles[-1] - cycles[0]) == pytest.approx(2.0)
 
@@ -108,16 +108,16 @@ def test_satellites_antennas_bring_them_nearer(tmp_path):
     path = tmp_path / "some.atx"
     path.write_text(ANTEX)
     antennas = read_antex(path)
-    assert set(antennas) == {satellite_id("G01")}
+    assert set(antennas) == {number_satellite("G01")}
     drive = oracle.vehicle_path(120.0)
     made = raw_drive.with_observations(oracle.drive(drive)[0], drive, carrier=0.0, second=True).crop(0.0, 5.0)
     raw = replace(made.raw_gnss, zero=DAY + 3600.0)
-    plain = ionosphere_free(raw.take(primary(raw)), raw)
+    plain = combine_ionosphere_free(raw.take(choose_primary(raw)), raw)
     first = replace(raw, antennas=antennas)
-    known = ionosphere_free(first.take(primary(first)), first)
-    satellite = raw.take(primary(raw)).satellite[plain.which]
+    known = combine_ionosphere_free(first.take(choose_primary(first)), first)
+    satellite = raw.take(choose_primary(raw)).satellite[plain.which]
     nearer = plain.known - known.known
-    one = satellite == satellite_id("G01")
+    one = satellite == number_satellite("G01")
     alpha = 1575.42**2 / (1575.42**2 - 1227.6**2)
     along = alpha * 1.5 - (alpha - 1.0) * 1.6
     assert np.all(nearer[~one] == 0.0)
@@ -132,9 +132,9 @@ def test_the_combination_has_no_ionosphere_and_counts_arcs_of_both():
     drive = oracle.vehicle_path(120.0)
     made = raw_drive.with_observations(oracle.drive(drive)[0], drive, carrier=0.0, second=True).crop(0.0, 20.0)
     raw = made.raw_gnss
-    free = ionosphere_free(raw.take(primary(raw)), raw)
-    rows = raw.take(primary(raw)).take(free.which)
-    names = [satellite_name(x) for x in rows.satellite]
+    free = combine_ionosphere_free(raw.take(choose_primary(raw)), raw)
+    rows = raw.take(choose_primary(raw)).take(free.which)
+    names = [name_satellite(x) for x in rows.satellite]
     cycles = 1000.0 * np.array([raw_drive.SATELLITES.index(x) for x in names])
     f2 = np.array([raw_drive.BANDS[x[0]][1][0] for x in names])
     alpha = L1**2 / (L1**2 - f2**2)
@@ -146,7 +146,7 @@ def test_the_combination_has_no_ionosphere_and_counts_arcs_of_both():
     slip = np.zeros(len(raw), dtype=bool)
     slip[second[8]] = True
     slipped = replace(raw, slip=slip)
-    arcs = ionosphere_free(slipped.take(primary(slipped)), slipped)
+    arcs = combine_ionosphere_free(slipped.take(choose_primary(slipped)), slipped)
     own = rows.satellite == rows.satellite[0]
     assert len(np.unique(arcs.arcs.arc[own])) == len(np.unique(free.arcs.arc[own])) + 1
 
@@ -155,10 +155,10 @@ def test_the_code_that_the_clocks_are_of_goes_before_another():
     drive = oracle.vehicle_path(120.0)
     made = raw_drive.with_observations(oracle.drive(drive)[0], drive, carrier=0.0, second=True).crop(0.0, 20.0)
     raw, off = made.raw_gnss, 3.0
-    gps = np.flatnonzero((raw.satellite < 100) & (raw.signal == signal_id("1C")) & (raw.t < np.median(raw.t)))
+    gps = np.flatnonzero((raw.satellite < 100) & (raw.signal == number_signal("1C")) & (raw.t < np.median(raw.t)))
     more = raw.take(gps)
     more = replace(
-        more, signal=np.full(len(gps), signal_id("1W")), code=more.code + off, carrier=np.full(len(gps), np.nan)
+        more, signal=np.full(len(gps), number_signal("1W")), code=more.code + off, carrier=np.full(len(gps), np.nan)
     )
     order = np.argsort(np.concatenate([raw.t, more.t]), kind="stable")
     arrays = {
@@ -167,8 +167,8 @@ def test_the_code_that_the_clocks_are_of_goes_before_another():
         if isinstance(getattr(raw, f.name), np.ndarray) and len(getattr(raw, f.name)) == len(raw)
     }
     both = replace(raw, **arrays)
-    rows = raw.take(primary(raw))
-    plain, found = ionosphere_free(rows, raw), ionosphere_free(rows, both)
+    rows = raw.take(choose_primary(raw))
+    plain, found = combine_ionosphere_free(rows, raw), combine_ionosphere_free(rows, both)
     one = rows.take(plain.which)
     changed = (one.satellite < 100) & (one.t < np.median(raw.t))
     assert 0 < changed.sum() < len(one)
@@ -199,7 +199,7 @@ def test_reflections_that_last_are_in_the_sigma():
     made, truth = oracle.drive(drive, seed=5, gnss_velocity_sd=(0.1, 0.1, 0.1))
     plain = raw_drive.with_observations(made, drive, noise=0.3, carrier=0.002, second=True, seed=1).crop(0.0, 110.0)
     raw = plain.raw_gnss
-    _, elevation = directions(raw.antenna, raw.p)
+    _, elevation = compute_directions(raw.antenna, raw.p)
     heading = float(np.degrees(truth.rph[0, 2])) % 360.0
     for seed in range(3):
         rng, carrier = np.random.default_rng(seed), raw.carrier.copy()
@@ -209,7 +209,7 @@ def test_reflections_that_last_are_in_the_sigma():
             x = rng.standard_normal(int(own.sum()))
             for i, a in enumerate(decay):
                 x[i + 1] = a * x[i] + np.sqrt(1.0 - a * a) * x[i + 1]
-            carrier[own] += reflection_sigma(elevation[own]) * x * raw.frequency[own] / C
+            carrier[own] += compute_reflection_sigma(elevation[own]) * x * raw.frequency[own] / C
         spoilt = replace(plain, raw_gnss=replace(raw, carrier=carrier))
         chosen = {
             "raw_gnss": {"ppp": True, "period": 5.0},
@@ -217,19 +217,19 @@ def test_reflections_that_last_are_in_the_sigma():
             "alignment": {"heading": heading},
             "keyframes": {"rate": 0.2},
         }
-        found = run(spoilt, settings_from(chosen), ("ekf",))["ekf"]
+        found = run(spoilt, parse_settings(chosen), ("ekf",))["ekf"]
         off = errors(found, truth)[0][-1]
         total += off @ np.linalg.solve(found.covariance[-1][3:6, 3:6], off)
     assert 1.15 < total < 27.9  # chi-square of 9, 0.1 and 99.9 %
 
 
 def test_ppp_says_what_it_lacks():
-    assert not settings_from({"raw_gnss": {"ppp": True}}).raw_gnss.code
+    assert not parse_settings({"raw_gnss": {"ppp": True}}).raw_gnss.code
     with pytest.raises(ConfigError):
-        settings_from({"raw_gnss": {"ppp": "perhaps"}})
+        parse_settings({"raw_gnss": {"ppp": "perhaps"}})
     drive = oracle.vehicle_path(120.0)
     one = raw_drive.with_observations(oracle.drive(drive)[0], drive, carrier=0.0).crop(0.0, 30.0)
-    settings = settings_from({"raw_gnss": {"ppp": True}})
+    settings = parse_settings({"raw_gnss": {"ppp": True}})
     for recording, key in (
         (one, "raw.ppp_signals"),
         (replace(one, raw_gnss=replace(one.raw_gnss, precise=False)), "raw.ppp_orbits"),
@@ -267,7 +267,7 @@ def test_a_station_comes_to_its_place_within_a_decimetre(shared_data):
     gnss = Gnss(fixes.t[good], earth.ecef_to_llh(fixes.p[good]), sd, derived=True)
     recording = Recording("SLAC", "vehicle", Imu(t, gyro, accel, noise), gnss, gps_zero=begin, raw_gnss=raw)
     chosen = {"raw_gnss": {"ppp": True}, "alignment": {"heading": 0.0}, "keyframes": {"rate": 0.1}}
-    found = run(recording, settings_from(chosen), ("ekf",))["ekf"]
+    found = run(recording, parse_settings(chosen), ("ekf",))["ekf"]
     off = found.states.p[-1] - found.frame.from_llh(earth.ecef_to_llh(SLAC[None]))[0] - [0.0, 0.0, PHASE_CENTRE]
     assert np.linalg.norm(off) < 0.1
     assert off @ np.linalg.solve(found.covariance[-1][3:6, 3:6], off) < 16.3  # chi-square of 3, 99.9 %

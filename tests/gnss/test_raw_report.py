@@ -12,7 +12,7 @@ from graphnav.estimation.long_drives import Share, crop_solution
 from graphnav.estimation.pipeline import run
 from graphnav.estimation.solution import CarrierArcs
 from graphnav.report.plots import satellites as plots
-from graphnav.report.satellites import satellite_parts, satellite_records
+from graphnav.report.satellites import make_satellite_parts, select_satellite_records
 
 SPOILT = 201  # Galileo's first satellite, whose carrier is a fifth of a cycle off at one epoch
 
@@ -92,7 +92,7 @@ def test_the_sky_is_drawn_where_the_satellites_are(solved):
     one = replace(
         record, azimuth=np.full(len(record.t), np.radians(90.0)), elevation=np.full(len(record.t), np.radians(30.0))
     )
-    words = {note["text"]: note for note in plots.sky(one, "rts").annotations}
+    words = {note["text"]: note for note in plots.plot_sky(one, "rts").annotations}
     assert words["G01"]["x"] == pytest.approx(60.0)
     assert words["G01"]["y"] == pytest.approx(0.0, abs=1e-9)
     assert words["N"]["y"] > 0.0
@@ -101,12 +101,12 @@ def test_the_sky_is_drawn_where_the_satellites_are(solved):
 def test_pictures_are_of_raw_observations_alone(solved):
     recording, _, solutions = solved
     one = solutions["rts"]
-    kinds = set(satellite_records(one))
+    kinds = set(select_satellite_records(one))
     assert kinds == {"gnss_code", "gnss_doppler", "gnss_phase"}
-    parts = "".join(satellite_parts(one, recording.start, recording.duration, {}))
+    parts = "".join(make_satellite_parts(one, recording.start, recording.duration, {}))
     assert parts.count("<figure") == 5 + len(kinds)
     plain = replace(one, records={k: r for k, r in one.records.items() if k not in kinds})
-    assert satellite_parts(plain, recording.start, recording.duration, {}) == []
+    assert make_satellite_parts(plain, recording.start, recording.duration, {}) == []
 
 
 def test_what_gtsam_gets_is_at_its_optimum(solved):

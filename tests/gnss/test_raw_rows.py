@@ -12,7 +12,7 @@ import pytest
 import raw_drive
 from helpers import errors, truth_states
 
-from graphnav.config import settings_from
+from graphnav.config import parse_settings
 from graphnav.constraints.base import BuildContext
 from graphnav.constraints.gnss import GnssPosition
 from graphnav.constraints.raw_gnss import BIASES, CLOCK, GnssCode, GnssDoppler
@@ -24,7 +24,7 @@ from graphnav.imu.samples import bridge_gaps
 from graphnav.recording.formats import read
 
 DATA = Path(__file__).resolve().parents[2] / "data"
-TIGHT = settings_from({"raw_gnss": {"coupling": "tight"}})
+TIGHT = parse_settings({"raw_gnss": {"coupling": "tight"}})
 
 
 def scene(recording, settings=TIGHT, cls=GnssCode):
@@ -121,7 +121,7 @@ def drive():
 
 def test_every_solver_gets_them(drive):
     recording, truth = drive
-    settings = settings_from({"noise": {"mode": "stated"}})
+    settings = parse_settings({"noise": {"mode": "stated"}})
     solutions = run(recording, settings, ("ekf", "rts", "batch"))
     for name, one in solutions.items():
         assert {"gnss_code", "gnss_doppler"} <= set(one.records), name
@@ -144,7 +144,7 @@ def test_a_satellite_that_is_late_is_let_go_of_by_evidence(drive):
     assert late.sum() > 10
     spoiled = replace(recording, raw_gnss=replace(raw, code=raw.code + 40.0 * late))
     off = {
-        mode: errors(run(spoiled, settings_from({"noise": {"mode": mode}}), ("batch",))["batch"], truth)[0]
+        mode: errors(run(spoiled, parse_settings({"noise": {"mode": mode}}), ("batch",))["batch"], truth)[0]
         for mode in ("stated", "estimated")
     }
     worst = {mode: np.linalg.norm(x[:, :2], axis=1).max() for mode, x in off.items()}
@@ -156,7 +156,7 @@ def test_loose_and_tight_are_one_option_apart():
     recording = read(DATA / "tokyo_raw" / "recording.toml")
     none = np.empty((0, 2))
     for coupling, used, unused in (("loose", GnssPosition, GnssCode), ("tight", GnssCode, GnssPosition)):
-        settings = settings_from({"raw_gnss": {"coupling": coupling}})
+        settings = parse_settings({"raw_gnss": {"coupling": coupling}})
         assert len(used.epochs(recording, settings, none)) > 100
         assert not len(unused.epochs(recording, settings, none))
     assert recording.tight("automatic")

@@ -14,7 +14,7 @@ import raw_drive
 from helpers import errors, truth_states
 from test_raw_rows import scene
 
-from graphnav.config import settings_from
+from graphnav.config import parse_settings
 from graphnav.constraints import raw_phase
 from graphnav.constraints.raw_gnss import CLOCK
 from graphnav.constraints.raw_phase import GnssPhase, WholeCycles
@@ -23,17 +23,17 @@ from graphnav.estimation import fixing
 from graphnav.estimation.known_arcs import Known
 from graphnav.estimation.pipeline import run
 from graphnav.gnss.arcs import find_arcs
-from graphnav.gnss.atmosphere import NIGHT, directions, klobuchar
-from graphnav.gnss.differential import with_differences
+from graphnav.gnss.atmosphere import NIGHT, compute_directions, klobuchar
+from graphnav.gnss.differential import add_differences
 from graphnav.gnss.ephemeris import EARTH_RATE
 from graphnav.gnss.integers import decorrelate, find_nearest
 from graphnav.gnss.series import RawGnss
-from graphnav.gnss.sigmas import REFLECTED, reflection_sigma
+from graphnav.gnss.sigmas import REFLECTED, compute_reflection_sigma
 from graphnav.gnss.signals import L1, C
 from graphnav.recording.formats import read
-from graphnav.report.satellites import satellite_tables
+from graphnav.report.satellites import tabulate_satellites
 
-STATED = settings_from({"noise": {"mode": "stated"}})
+STATED = parse_settings({"noise": {"mode": "stated"}})
 WAVELENGTH = C / L1
 AWAY = np.array([1500.0, -2000.0, 60.0])  # m, from the drive's start to the base
 
@@ -54,7 +54,7 @@ def with_carriers(recording, path, noise, seed=3):
     above = np.array(raw.place)
     llh = path.point(t, lever)[0]
     at = np.searchsorted(t, raw.t)
-    azimuth, elevation = directions(earth.llh_to_ecef(llh)[at], raw.p)
+    azimuth, elevation = compute_directions(earth.llh_to_ecef(llh)[at], raw.p)
     delay = klobuchar(NIGHT, np.mod(raw.t, 604800.0), llh[at], azimuth, elevation)
     true = np.empty(len(raw))
     base = []
@@ -62,12 +62,12 @@ def with_carriers(recording, path, noise, seed=3):
     position = earth.llh_to_ecef(llh[0]) + AWAY @ R
     fixed = earth.ecef_to_llh(position)
     for k, name in enumerate(raw_drive.SATELLITES):
-        own = raw.satellite == raw_drive.satellite_id(name)
+        own = raw.satellite == raw_drive.number_satellite(name)
         if not own.any():
             continue
         true[own] = raw_drive.observe(lambda at: path.point(at, lever)[0], raw.t[own], above, k)[0]
         seen, p, v = raw_drive.observe(lambda at: np.tile(fixed, (len(at), 1)), t, above, k)
-        high = directions(np.tile(position, (len(t), 1)), p)
+        high = compute_directions(np.tile(position, (len(t), 1)), p)
         of_base = klobuchar(NIGHT, np.mod(t, 604800.0), np.tile(fixed, (len(t), 1)), *high)
         clock = -70.0 + 0.3 * t
         base.append((raw.satellite[own][0], seen + clock, of_base, p, v))
@@ -89,7 +89,7 @@ def with_carriers(recording, path, noise, seed=3):
         p=p, v=v, clock=np.zeros(n), drift=np.zeros(n), difference=np.full(n, np.nan), zero=raw.zero,
         place=tuple(position), troposphere=True,
     )  # fmt: skip
-    raw, _ = with_differences(replace(raw, carrier=carrier), of_base, position)
+    raw, _ = add_differences(replace(raw, carrier=carrier), of_base, position)
     return replace(recording, raw_gnss=raw), position
 
 
@@ -198,7 +198,7 @@ def true_values(rows, where, raw, given):
     """Parameters of the truth, up to what all carriers of a signal have in common."""
     out = {p.name: np.tile(p.initial, (len(given), 1)) for p in rows.parameters if p.begins is None}
     out[CLOCK] = np.zeros((len(given), 2))
-    satellites = {name: raw_drive.satellite_id(name.split(".")[1]) for name in rows.slots}
+    satellites = {name: raw_drive.number_satellite(name.split(".")[1]) for name in rows.slots}
     return out | {name: np.full((len(given), 1), float(cycles_of(np.array([k]))[0])) for name, k in satellites.items()}
 
 
@@ -254,7 +254,7 @@ def delay_of(rows, raw, here, row):
     """m, the ionosphere's advance of a carrier at the rover, which GTSAM's has no part of."""
     one = np.array([here])
     antenna = raw.antenna[one]
-    azimuth, elevation = directions(antenna, raw.p[one])
+    azimuth, elevation = compute_directions(antenna, raw.p[one])
     return float(klobuchar(NIGHT, raw.seconds_of_week[one], earth.ecef_to_llh(antenna), azimuth, elevation)[0])
 
 
@@ -311,14 +311,14 @@ def test_reflections_that_last_are_in_the_sigma(drive):
     recording, truth = drive
     raw, rng = recording.raw_gnss, np.random.default_rng(8)
     carrier = raw.carrier.copy()
-    _, elevation = directions(raw.antenna, raw.p)
+    _, elevation = compute_directions(raw.antenna, raw.p)
     for satellite in np.unique(raw.satellite):
         own = raw.satellite == satellite
         decay = np.exp(-np.diff(raw.t[own]) / REFLECTED)
         x = rng.standard_normal(int(own.sum()))
         for i, a in enumerate(decay):
             x[i + 1] = a * x[i] + np.sqrt(1.0 - a * a) * x[i + 1]
-        carrier[own] += np.sqrt(2.0) * reflection_sigma(elevation[own]) * x / WAVELENGTH
+        carrier[own] += np.sqrt(2.0) * compute_reflection_sigma(elevation[own]) * x / WAVELENGTH
     spoilt = replace(recording, raw_gnss=replace(raw, carrier=carrier))
     rows = GnssPhase.build(scene(recording, STATED))
     own = rows.keyframe == rows.keyframe[len(rows) // 2]
@@ -363,7 +363,7 @@ def test_every_solver_is_fixed_and_right(drive):
         assert off[fixed].max() < 0.05, name
     assert off_by(solutions["batch"], truth)[1].all()  # a smoother knows all the time what it knows at the end
     np.testing.assert_allclose(solutions["rts"].states.p, solutions["batch"].states.p, atol=2e-3)
-    real = run(recording, settings_from({"noise": {"mode": "stated"}, "raw_gnss": {"integers": False}}), ("rts",))
+    real = run(recording, parse_settings({"noise": {"mode": "stated"}, "raw_gnss": {"integers": False}}), ("rts",))
     off, fixed = off_by(real["rts"], truth)
     assert not fixed.any()
     assert np.sqrt(np.mean(off**2)) > 2.0 * np.sqrt(np.mean(off_by(solutions["rts"], truth)[0] ** 2))
@@ -418,9 +418,9 @@ def test_records_name_satellites_and_the_report_sums_them_up(drive):
     assert set(record.satellite) <= set(raw_drive.MANY)
     assert len(record.satellite) == len(record.elevation) == len(record.t)
     assert record.elevation.min() > np.radians(9.9)
-    tables = satellite_tables(one)
+    tables = tabulate_satellites(one)
     for name in set(record.satellite):
         own = (record.satellite == name) & (record.weight >= 0.5)
         assert f"{np.sqrt(np.mean(record.nis[own])):.3g}"[:4] in tables[0]
         assert name in tables[0]
-    assert not satellite_tables(replace(one, records={}))
+    assert not tabulate_satellites(replace(one, records={}))

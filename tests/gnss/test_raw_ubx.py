@@ -14,7 +14,7 @@ from graphnav.core.errors import RecordingError
 from graphnav.core.timescales import WEEK
 from graphnav.gnss.load import read_rover
 from graphnav.gnss.messages import Decoder
-from graphnav.gnss.signals import satellite_id, satellite_name, signal_id
+from graphnav.gnss.signals import name_satellite, number_satellite, number_signal
 from graphnav.gnss.ubx import parse_ubx
 
 
@@ -140,17 +140,17 @@ def log() -> bytes:
 def test_measurements_are_named_and_slips_are_told_by_the_time_in_lock(log: bytes, tmp_path: Path) -> None:
     (tmp_path / "drive.ubx").write_bytes(b"$GNGGA,noise*00\r\n" + log)
     obs, nav = read_rover((tmp_path / "drive.ubx",))
-    assert nav.satellites == {satellite_id(name) for name in ("G07", "J02", "E11", "C23")}
+    assert nav.satellites == {number_satellite(name) for name in ("G07", "J02", "E11", "C23")}
     assert obs.zero == WEEK * WEEK_NUMBER
     np.testing.assert_allclose(np.unique(obs.t), [TOW, TOW + 0.2, TOW + 0.4], atol=1e-9)
     for k, (_, _, _, satellite, signal) in enumerate(MEASURED):
-        own = (obs.satellite == satellite_id(satellite)) & (obs.signal == signal_id(signal))
+        own = (obs.satellite == number_satellite(satellite)) & (obs.signal == number_signal(signal))
         np.testing.assert_allclose(obs.code[own], 2.2e7 + 1000.0 * k + TOW + np.array([0.0, 0.2, 0.4]), atol=1e-6)
         np.testing.assert_allclose(obs.doppler[own], -1234.5 + k)
         assert obs.cn0[own].tolist() == [40 + k] * 3
         assert obs.slip[own].tolist() == [False, False, True]
         assert obs.half[own].tolist() == [False, False, True]
-    assert obs.channels == {satellite_id("R05"): 2}
+    assert obs.channels == {number_satellite("R05"): 2}
 
 
 def test_ephemerides_are_those_that_rtklib_decodes(log: bytes) -> None:
@@ -169,7 +169,7 @@ def test_ephemerides_are_those_that_rtklib_decodes(log: bytes) -> None:
     more = rt.Arr1Ddouble(8), rt.Arr1Ddouble(8)
     galileo = rt.eph_t()
     rt.decode_gal_inav(buffer, galileo, *more)
-    ours = {satellite_name(s): k for k, s in enumerate(nav.kepler["satellite"])}
+    ours = {name_satellite(s): k for k, s in enumerate(nav.kepler["satellite"])}
     assert set(ours) == set(systems)
     for name, system in systems.items():
         sat = rt.satno(system, int(name[1:]) + (192 if name[0] == "J" else 0))

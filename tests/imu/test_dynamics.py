@@ -10,7 +10,7 @@ from helpers import FRAME, STEPS, Array, difference, random_imu, random_states
 
 from graphnav.core import rotation as ro
 from graphnav.core.state import DIM, Parameter, States
-from graphnav.imu.dynamics import SCALE, ImuFactors, as_biases, scale_parameter
+from graphnav.imu.dynamics import SCALE, ImuFactors, convert_to_biases, scale_parameter
 from graphnav.imu.preintegration import preintegrate
 from graphnav.imu.samples import bridge_gaps
 from graphnav.recording import Imu, ImuNoise, Recording
@@ -19,7 +19,7 @@ N = 6
 
 
 def near(x: States, ba: float, bg: float) -> States:
-    """With biases where the intervals' first-order correction holds (`Intervals.out_of_range`)."""
+    """With biases where the intervals' first-order correction holds (`Intervals.is_out_of_range`)."""
     return replace(x, ba=ba + 0.05 * x.ba, bg=bg + 0.01 * x.bg)
 
 
@@ -182,9 +182,9 @@ def test_scale_errors_are_like_biases_of_a_matrix() -> None:
     def matrix(s: Array) -> Array:
         return np.array([[s[0], s[3], s[4]], [s[5], s[1], s[6]], [s[7], s[8], s[2]]])
 
-    of_accel, of_gyro = as_biases(scale, force, rate)
+    of_accel, of_gyro = convert_to_biases(scale, force, rate)
     np.testing.assert_allclose(of_gyro, rate @ matrix(scale[:9]).T, rtol=1e-12)
     np.testing.assert_allclose(of_accel, force @ matrix(scale[9:]).T, rtol=1e-12)
-    few = as_biases(np.r_[scale[:3], scale[9:12]], force, rate)
+    few = convert_to_biases(np.r_[scale[:3], scale[9:12]], force, rate)
     np.testing.assert_allclose(few[0], scale[9:12] * force)
     np.testing.assert_allclose(few[1], scale[:3] * rate)

@@ -10,17 +10,17 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from graphnav.config import Settings, settings_from
+from graphnav.config import Settings, parse_settings
 from graphnav.core import rotation as ro
-from graphnav.core.notes import key_of
+from graphnav.core.notes import get_key
 from graphnav.core.rotation import Array
 from graphnav.detectors import detect
-from graphnav.estimation.noise.imu_floor import bound_density, with_measured_floor
-from graphnav.imu.clipping import find_cut_peaks, with_whole_peaks
-from graphnav.imu.onboard_offset import compute_evidence, offset_learnt, without_onboard_offset
+from graphnav.estimation.noise.imu_floor import apply_measured_floor, bound_density
+from graphnav.imu.clipping import find_cut_peaks, restore_peaks
+from graphnav.imu.onboard_offset import compute_evidence, estimate_learnt_offset, remove_onboard_offset
 from graphnav.imu.preintegration import preintegrate
 from graphnav.imu.samples import Samples, bridge_gaps
-from graphnav.imu.unresolved import with_coning, with_unresolved_motion
+from graphnav.imu.unresolved import add_coning, add_unresolved_motion
 from graphnav.recording import Imu, ImuNoise
 from graphnav.recording.formats import read
 from graphnav.simulation import Simulated, simulate
@@ -40,7 +40,7 @@ def test_noise_of_what_happens_within_a_period() -> None:
     zero = np.zeros(100)
     samples = Samples(t, ramp, 2.0 * ramp, zero, zero, 0.0, np.empty((0, 2)))
     quiet = ImuNoise(gyro_noise_density=1e-9, accel_noise_density=1e-9)
-    out = with_unresolved_motion(samples, quiet)
+    out = add_unresolved_motion(samples, quiet)
     np.testing.assert_allclose(out.extra_gyro[60:90], 0.6**2 / 48.0 * 0.01, rtol=1e-9)
     np.testing.assert_allclose(out.extra_accel[60:90], 1.2**2 / 48.0 * 0.01, rtol=1e-9)
     assert np.all(out.extra_gyro[:49] == 0.0)
@@ -53,7 +53,7 @@ def test_the_sensors_own_noise_is_not_counted_twice() -> None:
     t = 0.005 * np.arange(1, 4001)
     gyro, accel = (s / np.sqrt(0.005) * rng.standard_normal((4000, 3)) for s in (1e-3, 2e-3))
     zero = np.zeros(4000)
-    out = with_unresolved_motion(Samples(t, gyro, accel, zero, zero, 0.0, np.empty((0, 2))), noise)
+    out = add_unresolved_motion(Samples(t, gyro, accel, zero, zero, 0.0, np.empty((0, 2))), noise)
     assert out.extra_gyro.mean() < 0.1 * 1e-3**2
     assert out.extra_accel.mean() < 0.1 * 2e-3**2
 
@@ -81,18 +81,18 @@ def test_what_is_too_short_for_a_bound_has_none() -> None:
 def test_figures_stated_too_large_are_lowered_for_a_walk_and_for_nothing_else() -> None:
     walk = made("normal").recording
     true = walk.imu.noise
-    same, said = with_measured_floor(walk, Settings())
+    same, said = apply_measured_floor(walk, Settings())
     assert said == ()
     assert same.imu.noise == true
     tenfold = replace(true, gyro_noise_density=10.0 * true.gyro_noise_density)
     stated = replace(walk, imu=replace(walk.imu, noise=tenfold))
-    found, (sentence,) = with_measured_floor(stated, Settings())
+    found, (sentence,) = apply_measured_floor(stated, Settings())
     assert true.gyro_noise_density < found.imu.noise.gyro_noise_density < 2.0 * true.gyro_noise_density
     assert found.imu.noise.accel_noise_density == true.accel_noise_density
-    assert (key_of(sentence), "gyro" in sentence) == ("noise.imu.quieter", True)
-    assert with_measured_floor(stated, settings_from({"noise": {"mode": "stated"}})) == (stated, ())
+    assert (get_key(sentence), "gyro" in sentence) == ("noise.imu.quieter", True)
+    assert apply_measured_floor(stated, parse_settings({"noise": {"mode": "stated"}})) == (stated, ())
     drive = replace(stated, platform="vehicle")
-    assert with_measured_floor(drive, Settings()) == (drive, ())
+    assert apply_measured_floor(drive, Settings()) == (drive, ())
 
 
 # ------------------------------------------------------------------------- offsets that the unit has taken off itself
@@ -129,7 +129,7 @@ def corrected(t: Array, rate: Array) -> tuple[Array, Array]:
 def test_an_offset_that_the_unit_took_off_is_found_again(seed: int) -> None:
     t, rate, force = swaying(seed, 5e-3)
     rows, taken = corrected(t, rate)
-    away = offset_learnt(Imu(t, rows, force)) - taken
+    away = estimate_learnt_offset(Imu(t, rows, force)) - taken
     near = 2.0 * np.abs(np.diff(taken, axis=0)).max()  # to the row after which five seconds count as over
     assert np.abs(away).max() < near < 0.05 * np.abs(taken).max()
 
@@ -142,8 +142,8 @@ def test_whether_the_unit_corrects_its_offset_is_told_from_rests() -> None:
         for bias in (1e-3, 1e-2):
             t, rate, force = swaying(seed, bias)
             own, of_unit = Imu(t, rate, force), Imu(t, corrected(t, rate)[0], force)
-            plain.append(compute_evidence(own, offset_learnt(own)))
-            served.append(compute_evidence(of_unit, offset_learnt(of_unit)))
+            plain.append(compute_evidence(own, estimate_learnt_offset(own)))
+            served.append(compute_evidence(of_unit, estimate_learnt_offset(of_unit)))
     assert max(plain) < chance
     assert min(served[1::2]) > chance
 
@@ -152,22 +152,22 @@ def test_whether_the_unit_corrects_its_offset_is_told_from_rests() -> None:
 def test_a_unit_that_corrects_its_offset_is_found_out(shared_data: Path, name: str) -> None:
     """Both walks of one unit: the angle of the rests, less the tilt, is a line again; its own figure is 0.02 Hz."""
     walk = read(shared_data / f"{name}.toml")
-    undone, (said,) = without_onboard_offset(walk, Settings())
-    assert key_of(said) == "imu.onboard_offset"
-    offset = offset_learnt(walk.imu)
+    undone, (said,) = remove_onboard_offset(walk, Settings())
+    assert get_key(said) == "imu.onboard_offset"
+    offset = estimate_learnt_offset(walk.imu)
     np.testing.assert_array_equal(undone.imu.gyro, walk.imu.gyro + offset)
     by_rate = [compute_evidence(walk.imu, share * offset) for share in (0.25, 0.5, 1.0, 2.0, 4.0)]
     assert np.argmax(by_rate) in {1, 2}
-    assert without_onboard_offset(walk, settings_from({"imu": {"onboard_offset": False}})) == (walk, ())
-    assert without_onboard_offset(replace(walk, platform="vehicle"), Settings())[1] == ()
+    assert remove_onboard_offset(walk, parse_settings({"imu": {"onboard_offset": False}})) == (walk, ())
+    assert remove_onboard_offset(replace(walk, platform="vehicle"), Settings())[1] == ()
 
 
 def test_units_that_leave_their_offset_alone_are_left_alone(shared_data: Path) -> None:
     for path in sorted((shared_data / "gcp_walks").glob("*.toml")):
         walk = read(path)
-        assert without_onboard_offset(walk, Settings()) == (walk, ())
+        assert remove_onboard_offset(walk, Settings()) == (walk, ())
     parked = read(shared_data / "tokyo_20201105" / "recording.toml").crop(0.0, 600.0)
-    assert compute_evidence(parked.imu, offset_learnt(parked.imu)) < -30.0
+    assert compute_evidence(parked.imu, estimate_learnt_offset(parked.imu)) < -30.0
 
 
 # ------------------------------------------------------------------------------------------------ what rows stand for
@@ -183,7 +183,7 @@ def test_coning_and_sculling_are_made_up_for(rate: float) -> None:
         for name, samples in {
             "true": bridge_gaps(whole.imu),
             "means": bridge_gaps(plain.imu),
-            "made up": with_coning(bridge_gaps(plain.imu)),
+            "made up": add_coning(bridge_gaps(plain.imu)),
         }.items()
     }
     left = {
@@ -207,7 +207,7 @@ def test_whole_peaks_stay_as_they_are(pace: str) -> None:
         for axis in range(3):
             assert not find_cut_peaks(imu.t, x[:, axis], least)
     samples = bridge_gaps(imu)
-    assert with_whole_peaks(samples, np.eye(3)) == (samples, ())
+    assert restore_peaks(samples, np.eye(3)) == (samples, ())
 
 
 def test_cut_peaks_are_put_back_and_doubted() -> None:
@@ -219,13 +219,13 @@ def test_cut_peaks_are_put_back_and_doubted() -> None:
     read_ = np.clip(true, -limit, limit)
     whole = bridge_gaps(replace(imu, gyro=true @ R_bs.T))
     cut = bridge_gaps(replace(imu, gyro=read_ @ R_bs.T))
-    mended, notes = with_whole_peaks(cut, R_bs)
+    mended, notes = restore_peaks(cut, R_bs)
     lost, left = (np.sum(whole.gyro - x.gyro, axis=0) @ R_bs for x in (cut, mended))
     assert abs(lost[0]) > 1.0
     assert abs(left[0]) < 0.5 * abs(lost[0])
     doubted = mended.extra_gyro.any(axis=1)
     assert np.all(np.any(np.abs(read_[doubted]) > 0.97 * limit, axis=1))
-    assert "imu.clipped" in map(key_of, notes)
+    assert "imu.clipped" in map(get_key, notes)
 
 
 def test_a_range_that_ends_softly_is_found_in_every_swing() -> None:
@@ -235,7 +235,7 @@ def test_a_range_that_ends_softly_is_found_in_every_swing() -> None:
     limit = 0.78 * size[:, 0].max()
     bent = limit * (0.97 - 0.03 * np.expm1(-(size / limit - 0.97) / 0.05))
     read_ = np.where(size > 0.97 * limit, np.sign(true) * bent, true)
-    mended, _ = with_whole_peaks(bridge_gaps(replace(imu, gyro=read_)), np.eye(3))
+    mended, _ = restore_peaks(bridge_gaps(replace(imu, gyro=read_)), np.eye(3))
     cut = size[:, 0] > 1.05 * limit
     stride = np.cumsum(np.diff(cut.astype(int), prepend=0) > 0)[cut] - 1
     assert stride[-1] > 20

@@ -9,14 +9,14 @@ import oracle
 import pytest
 from helpers import Array, truth_states
 
-from graphnav.config import settings_from
+from graphnav.config import parse_settings
 from graphnav.core import rotation as ro
 from graphnav.core.earth import LocalFrame
 from graphnav.core.state import States
 from graphnav.core.trajectory import Trajectory
 from graphnav.estimation.pipeline import run
 from graphnav.imu.dynamics import ImuFactors
-from graphnav.imu.preintegration import prefix, preintegrate
+from graphnav.imu.preintegration import integrate_prefix, preintegrate
 from graphnav.imu.samples import bridge_gaps
 from graphnav.recording import Recording
 
@@ -88,11 +88,11 @@ def test_one_interval_of_ten_seconds_is_ten_of_one() -> None:
 
 
 def test_prefix_gives_the_states_in_between() -> None:
-    """A state at any time by `prefix`, wrapped as an interval of its own, as `preintegrate` gives it."""
+    """A state at any time by `integrate_prefix`, wrapped as an interval of its own, as `preintegrate` gives it."""
     recording, _ = exact(30.0)
     samples, zero = bridge_gaps(recording.imu), np.zeros(3)
     t = 100.0 + np.array([0.0, 0.005, 0.5, 1.0, 7.5])
-    dR, dV, dP = prefix(samples, t[0], t[1:], zero, zero)
+    dR, dV, dP = integrate_prefix(samples, t[0], t[1:], zero, zero)
     for k in range(1, len(t)):
         iv = preintegrate(samples, recording.imu, t[[0, k]], zero, zero)
         np.testing.assert_allclose(dR[k - 1], iv.dR[0], atol=1e-12)
@@ -120,7 +120,7 @@ def test_a_hundred_kilometres_straight_keep_level(straight: tuple[Recording, Tra
 def test_a_hundred_kilometres_with_gnss_keep_level(straight: tuple[Recording, Trajectory]) -> None:
     """Through the batch solver: no tilt that grows with the distance from the frame's origin."""
     recording, truth = straight
-    settings = settings_from({"gnss": {"time_offset_sigma": 0.0}, "noise": {"mode": "stated"}})
+    settings = parse_settings({"gnss": {"time_offset_sigma": 0.0}, "noise": {"mode": "stated"}})
     solution = run(recording, settings, solvers=("batch",))["batch"]
     t = np.round(solution.t, 6)
     position, rph = missed(solution.states, truth, t, solution.frame)

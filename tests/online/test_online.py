@@ -24,23 +24,23 @@ from hypothesis import strategies as st
 
 import graphnav
 from graphnav.app import cli, cli_online
-from graphnav.config import Settings, settings_from
+from graphnav.config import Settings, parse_settings
 from graphnav.core.errors import ConfigError, GraphnavError, RecordingError
-from graphnav.core.notes import key_of
+from graphnav.core.notes import get_key
 from graphnav.core.trajectory import Trajectory
 from graphnav.estimation.pipeline import run
-from graphnav.estimation.solution import to_trajectory
+from graphnav.estimation.solution import make_trajectory
 from graphnav.estimation.solvers.window import compute_turn_limit
-from graphnav.online import Online, Row, Session, judging, rows_of, smoother, without_rows
+from graphnav.online import Online, Row, Session, drop_rows, judging, list_rows, smoother
 from graphnav.online.buffers import Buffer
-from graphnav.online.lines import END, head_of, line_of, lines_of, row_of, setup_of
+from graphnav.online.lines import END, format_head, format_line, format_lines, parse_row, parse_setup
 from graphnav.online.tracker import Tracker
 from graphnav.online.view import view
 from graphnav.recording import Recording
 from graphnav.recording.formats import read
 
 ROOT = Path(__file__).resolve().parents[2]
-QUICK = settings_from({"noise": {"mode": "stated"}, "solver": {"lag": 20.0}})
+QUICK = parse_settings({"noise": {"mode": "stated"}, "solver": {"lag": 20.0}})
 
 
 @pytest.fixture(scope="module")
@@ -53,12 +53,12 @@ def drive() -> tuple[Recording, Trajectory]:
 
 @pytest.fixture(scope="module")
 def rows(drive: tuple[Recording, Trajectory]) -> list[Row]:
-    return rows_of(drive[0])[1]
+    return list_rows(drive[0])[1]
 
 
 def played(recording: Recording, rows: Iterable[Row], how: Settings = QUICK) -> tuple[Online, Trajectory]:
     """All rows in, all that settled out."""
-    online, parts = Online(without_rows(recording), how), []
+    online, parts = Online(drop_rows(recording), how), []
     for row in rows:
         online.add(row)
         parts += online.settled()
@@ -73,10 +73,10 @@ def test_isam2_smooths_online_as_the_window_does(drive: tuple[Recording, Traject
     late = [row for row in rows if row[0] != "gnss" or round(row[1]) % 7 != 3]
     for row in (row for row in rows if row[0] == "gnss" and round(row[1]) % 7 == 3):
         late.insert(next((k for k, other in enumerate(late) if other[1] > row[1] + 0.5), len(late)), row)
-    long = settings_from({"noise": {"mode": "stated"}, "solver": {"lag": 1000.0}})
+    long = parse_settings({"noise": {"mode": "stated"}, "solver": {"lag": 1000.0}})
     tracks = []
     for engine in ("window", "isam2"):
-        online = Online(without_rows(recording), long, engine)
+        online = Online(drop_rows(recording), long, engine)
         for row in late:
             online.add(row)
         online.finish()
@@ -92,7 +92,7 @@ def test_isam2_smooths_online_as_the_window_does(drive: tuple[Recording, Traject
 def test_isam2_goes_on_from_its_checkpoint(drive: tuple[Recording, Trajectory], rows: list[Row]) -> None:
     rows, tracks = [row for row in rows if row[1] < 60.0], []
     for every in (len(rows), 600):  # twenty times
-        online, parts = Online(without_rows(drive[0]), QUICK, "isam2"), []
+        online, parts = Online(drop_rows(drive[0]), QUICK, "isam2"), []
         for k, row in enumerate(rows):
             online.add(row)
             parts += online.settled()
@@ -131,7 +131,7 @@ def test_it_aligns_then_runs_and_is_as_good_as_batch(
 ) -> None:
     recording, truth = drive
     online, track = plain
-    assert "alignment.motion" in map(key_of, online.notes)
+    assert "alignment.motion" in map(get_key, online.notes)
     assert np.all(np.diff(track.t) > 0)
     assert track.t[0] == pytest.approx(recording.start, abs=1e-9)
     assert track.t[-1] == pytest.approx(recording.end, abs=1e-9)
@@ -145,7 +145,7 @@ def test_it_aligns_then_runs_and_is_as_good_as_batch(
 
 def test_live_states_at_imu_rate_hold_to_their_sigmas(drive: tuple[Recording, Trajectory], rows: list[Row]) -> None:
     recording, truth = drive
-    online, ratio = Online(without_rows(recording), QUICK), []
+    online, ratio = Online(drop_rows(recording), QUICK), []
     for k, row in enumerate(rows):
         online.add(row)
         if online.tracker is not None and k % 601 == 0:
@@ -165,7 +165,7 @@ def test_live_states_at_imu_rate_hold_to_their_sigmas(drive: tuple[Recording, Tr
 
 def test_portions_do_not_matter(drive: tuple[Recording, Trajectory], rows: list[Row], tmp_path: Path) -> None:
     """The same lines in pieces of any size, and all at once."""
-    lines = [line for _, line in lines_of(drive[0].crop(0.0, 60.0))]
+    lines = [line for _, line in format_lines(drive[0].crop(0.0, 60.0))]
     files = []
     for name, size in (("one", 1), ("many", 977), ("all", len(lines))):
         session = Session(QUICK, "-", tmp_path / name)
@@ -220,8 +220,8 @@ def test_keyframes_are_prepared() -> None:
     """
     path = oracle.vehicle_path(130.0, 100.0)
     recording = oracle.drive(path, seed=3, outages=[(70.0, 80.0)], odometer_rate=10.0)[0].crop(0.0, 100.0)
-    online, ready = Online(without_rows(recording), QUICK), []
-    for row in rows_of(recording)[1]:
+    online, ready = Online(drop_rows(recording), QUICK), []
+    for row in list_rows(recording)[1]:
         before = online.tracker
         known = before is not None and (before.newest, before._ahead is not None)
         online.add(row)
@@ -260,7 +260,7 @@ def test_judging_beside_the_drive_works_on_copies(
 
     monkeypatch.setattr(judging, "answer", answer_seen)
     monkeypatch.setattr(smoother, "judge", judge_seen)
-    online = Online(without_rows(drive[0]), settings_from({"solver": {"lag": 20.0}}))
+    online = Online(drop_rows(drive[0]), parse_settings({"solver": {"lag": 20.0}}))
     for row in rows:
         online.add(row)
     online.finish()
@@ -279,9 +279,9 @@ def test_rows_older_than_the_window_are_counted(drive: tuple[Recording, Trajecto
 
 def test_a_silent_imu_ends_one_piece_and_begins_another(drive: tuple[Recording, Trajectory]) -> None:
     whole, truth = oracle.drive(oracle.vehicle_path(200.0, 50.0), seed=5, odometer_rate=None)
-    rows = [row for row in rows_of(whole)[1] if row[0] != "imu" or not 90.0 < row[1] < 96.0]
+    rows = [row for row in list_rows(whole)[1] if row[0] != "imu" or not 90.0 < row[1] < 96.0]
     online, track = played(whole, rows)
-    assert "online.anew" in map(key_of, online.notes)
+    assert "online.anew" in map(get_key, online.notes)
     assert not np.any((track.t > 90.5) & (track.t < 95.5))
     assert track.t[-1] == pytest.approx(200.0)
     error, sd = off(track, truth, whole)
@@ -297,7 +297,7 @@ def test_a_keyframe_while_the_imu_is_silent_knows_that_it_is(drive: tuple[Record
     imu = recording.imu
     keep = (imu.t < 72.0 + 1e-6) | (imu.t > 73.6)  # in the outage
     part = replace(recording, imu=replace(imu, t=imu.t[keep], gyro=imu.gyro[keep], accel=imu.accel[keep]))
-    _, track = played(part, rows_of(part)[1])
+    _, track = played(part, list_rows(part)[1])
     error, sd = off(track, truth, part)
     k = int(np.flatnonzero(np.abs(track.t - 73.0) < 1e-6)[0])
     best = run(part, QUICK, solvers=("batch",))["batch"].trajectory()
@@ -352,7 +352,7 @@ def test_any_order_and_any_loss(
             come.append((t + delay[sensor] * rng.random(), (sensor, t, values)))
     come.sort(key=lambda one: one[0])
     recording, truth = drive
-    online, parts = Online(without_rows(recording), QUICK), []
+    online, parts = Online(drop_rows(recording), QUICK), []
     for _, row in come:
         online.add(row)
         parts += online.settled()
@@ -389,12 +389,12 @@ def test_a_buffer_is_a_sorted_set(numbers: list[int], begin: int) -> None:
 # ----------------------------------------------------------------------------------------------------------- lines
 def test_lines_read_back_as_they_were(drive: tuple[Recording, Trajectory], rows: list[Row]) -> None:
     recording = drive[0]
-    found = setup_of(head_of(recording))
+    found = parse_setup(format_head(recording))
     assert found.imu.noise == recording.imu.noise
     np.testing.assert_array_equal(found.gnss.lever_arm, recording.gnss.lever_arm)
     np.testing.assert_array_equal(found.odometer.lever_arm, recording.odometer.lever_arm)
     for row in rows[::500]:
-        sensor, t, values = row_of(line_of(row))
+        sensor, t, values = parse_row(format_line(row))
         assert (sensor, t) == row[:2]
         np.testing.assert_allclose(values, row[2], rtol=1e-15)
 
@@ -411,7 +411,7 @@ def test_lines_read_back_as_they_were(drive: tuple[Recording, Trajectory], rows:
 )
 def test_bad_lines_are_named_with_what_they_lack(line: str, named: str) -> None:
     with pytest.raises(ValueError, match=named):
-        row_of(line)
+        parse_row(line)
 
 
 @pytest.mark.parametrize(
@@ -425,7 +425,7 @@ def test_bad_lines_are_named_with_what_they_lack(line: str, named: str) -> None:
 )
 def test_bad_setups_say_why(line: str, key: str, name: str) -> None:
     with refused(key, RecordingError, name):
-        setup_of(line)
+        parse_setup(line)
 
 
 # ------------------------------------------------------------------------------------------------------ nothing lost
@@ -440,7 +440,7 @@ def program(*arguments: str | Path, **more: object) -> subprocess.Popen[bytes]:
 def folder(drive: tuple[Recording, Trajectory], tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The drive as lines in a file."""
     path = tmp_path_factory.mktemp("lines") / "drive.txt"
-    path.write_text("".join(line + "\n" for _, line in lines_of(drive[0])), encoding="utf-8")
+    path.write_text("".join(line + "\n" for _, line in format_lines(drive[0])), encoding="utf-8")
     return path
 
 
@@ -638,11 +638,11 @@ def test_a_source_without_its_first_line_is_refused() -> None:
 
 def test_real_recording_settles_on_the_batch_solution(shared_data: Path) -> None:
     recording = at_rate(read(shared_data / "oracle_drive").crop(80.0, 160.0), 25.0)
-    online, track = played(recording, rows_of(recording)[1], Settings())
+    online, track = played(recording, list_rows(recording)[1], Settings())
     best = run(recording, solvers=("batch",))["batch"]
     t, states, P = best.at(track.t[(track.t >= best.t[0]) & (track.t <= best.t[-1])])
     mine = track.llh[np.isin(track.t, t)]
-    other = to_trajectory("batch", best.frame, t, states, P)
+    other = make_trajectory("batch", best.frame, t, states, P)
     away = (mine - other.llh) * [6.378e6, 5.5e6, 1.0]
     assert np.abs(away).max() < 0.03
     assert replace(recording).start == pytest.approx(track.t[0])
@@ -653,9 +653,9 @@ def test_real_recording_settles_on_the_batch_solution(shared_data: Path) -> None
 def test_a_real_walk_settles_step_by_step(shared_data: Path) -> None:
     """Shoe with nothing but its IMU: stances are found a second after they are over, and it is batch again."""
     walk = read(shared_data / "pyshoe_vicon" / "2017-11-22-11-23-25.toml")
-    online, parts = Online(without_rows(walk), settings_from({"solver": {"lag": 40.0}})), []
+    online, parts = Online(drop_rows(walk), parse_settings({"solver": {"lag": 40.0}})), []
     behind = []
-    for row in rows_of(walk)[1]:
+    for row in list_rows(walk)[1]:
         online.add(row)
         parts += online.settled()
         if online.tracker is not None:
@@ -679,8 +679,8 @@ def test_a_walk_with_lost_packets_settles_on_the_batch_solution(shared_data: Pat
     """
     walk = read(shared_data / "xio_loops" / "short.toml").crop(0.0, 30.0)
     # as a walk that goes on has to take it
-    settings = settings_from({"noise": {"mode": "stated"}, "imu": {"onboard_offset": False}})
-    _, track = played(walk, rows_of(walk)[1], settings)
+    settings = parse_settings({"noise": {"mode": "stated"}, "imu": {"onboard_offset": False}})
+    _, track = played(walk, list_rows(walk)[1], settings)
     best = run(walk, settings, ("batch",))["batch"]
     t, states, P = best.at(track.t)
     away = best.frame.from_llh(track.llh[np.isin(track.t, t)]) - states.p
@@ -699,8 +699,8 @@ def test_wheels_are_judged_with_all_else(drive: tuple[Recording, Trajectory]) ->
     for k in range(1, len(lasting)):
         lasting[k] = np.exp(-0.1 / 3.0) * lasting[k - 1] + 0.1 * np.sqrt(1 - np.exp(-0.2 / 3.0)) * rng.standard_normal()
     wrong = replace(recording, odometer=replace(o, speed=np.where(o.speed > 0.5, o.speed + lasting, o.speed)))
-    how = settings_from({"solver": {"lag": 60.0}})
-    online, track = played(wrong, rows_of(wrong)[1], how)
+    how = parse_settings({"solver": {"lag": 60.0}})
+    online, track = played(wrong, list_rows(wrong)[1], how)
     wheels = online.tracker._parameters["odometer_error"]
     assert wheels.sigma[0] == pytest.approx(0.1, rel=0.5)
     error, sd = off(track, truth, wrong)
@@ -718,7 +718,7 @@ def test_an_imu_is_judged_by_ever_more_rows(drive: tuple[Recording, Trajectory])
     figures = ("gyro_noise_density", "accel_noise_density")
     quiet = replace(noise, **{name: getattr(noise, name) / 3.0 for name in figures})
     recording = replace(recording, imu=replace(recording.imu, noise=quiet))
-    rows, how = rows_of(recording)[1], settings_from({"solver": {"lag": 60.0}})
+    rows, how = list_rows(recording)[1], parse_settings({"solver": {"lag": 60.0}})
     online, _ = played(recording, rows, how)
     used, whole = online.tracker.noise, run(recording.crop(0.0, online._estimated_from), how, ("ekf",))["ekf"].noise
     assert used.factor("imu.gyro_noise_density", 1.0) > 2.0
@@ -727,14 +727,14 @@ def test_an_imu_is_judged_by_ever_more_rows(drive: tuple[Recording, Trajectory])
     for name in told:  # a recording has keyframes where stops begin and end, and so other intervals and rows there
         one = whole.figures[name]
         assert abs(used.figures[name].log_factor - one.log_factor) < 3.0 * one.sigma, name
-    assert sum(key_of(note) == "noise.imu" for note in online.notes) == 1
+    assert sum(get_key(note) == "noise.imu" for note in online.notes) == 1
     assert online.tracker.window.turn > compute_turn_limit(quiet)
 
 
 def test_resumed_while_it_is_judged_it_ends_with_the_same(drive: tuple[Recording, Trajectory], rows: list[Row]) -> None:
     """While the sensors are being judged, and while what has not settled is gone through again."""
-    how, rows = settings_from({"solver": {"lag": 20.0}}), [row for row in rows if row[1] < 60.0]
-    other, parts, resumed = Online(without_rows(drive[0]), how), [], {"judged": 0, "again": 0}
+    how, rows = parse_settings({"solver": {"lag": 20.0}}), [row for row in rows if row[1] < 60.0]
+    other, parts, resumed = Online(drop_rows(drive[0]), how), [], {"judged": 0, "again": 0}
     for k, row in enumerate(rows):
         other.add(row)
         doing = "again" if other._again is not None else "judged" if other._judgement is not None else ""
@@ -754,8 +754,8 @@ def test_smooth_driving_with_positions_alone_is_no_stop() -> None:
     gnss = recording.gnss
     speed = np.linalg.norm(np.diff(gnss.llh, axis=0) * [6.37e6, 4.2e6, 0.0], axis=1) / np.diff(gnss.t)
     # what the IMU is judged to be here makes smooth roads look still
-    online, held = Online(without_rows(recording), Settings()), []
-    for row in rows_of(recording)[1]:
+    online, held = Online(drop_rows(recording), Settings()), []
+    for row in list_rows(recording)[1]:
         online.add(row)
         if row[0] == "gnss" and online.tracker is not None:
             held += online.tracker.stops.tolist()

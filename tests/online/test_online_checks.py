@@ -6,12 +6,12 @@ import numpy as np
 import oracle
 import pytest
 
-from graphnav.config import settings_from
-from graphnav.core.notes import key_of
-from graphnav.online import Online, Row, rows_of, without_rows
+from graphnav.config import parse_settings
+from graphnav.core.notes import get_key
+from graphnav.online import Online, Row, drop_rows, list_rows
 from graphnav.recording import Recording
 
-QUICK = settings_from({"noise": {"mode": "stated"}, "solver": {"lag": 10.0}})
+QUICK = parse_settings({"noise": {"mode": "stated"}, "solver": {"lag": 10.0}})
 TOLD = {"imu.force_scale", "imu.gyro_unit", "gnss.lat_lon", "imu.left_out", "gnss.left_out"}
 
 
@@ -56,12 +56,12 @@ def spoil(row: Row, how: str) -> Row:
     ],
 )
 def test_a_session_in_a_wrong_unit_says_so(drive: Recording, how: str, keys: set[str]) -> None:
-    online = Online(without_rows(drive), QUICK)
-    for row in rows_of(drive)[1]:
+    online = Online(drop_rows(drive), QUICK)
+    for row in list_rows(drive)[1]:
         online.add(spoil(row, how))
-    early = {key_of(note) for note in online.notes} & TOLD
+    early = {get_key(note) for note in online.notes} & TOLD
     online.finish()
-    found = {key_of(note) for note in online.notes} & TOLD
+    found = {get_key(note) for note in online.notes} & TOLD
     assert found == keys
     assert early == found  # while it runs, not only at the end
     assert not online.failures

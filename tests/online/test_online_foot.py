@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 from test_online import joined, same
 
-from graphnav.config import settings_from
+from graphnav.config import parse_settings
 from graphnav.core.trajectory import Trajectory
 from graphnav.detectors import detect
-from graphnav.online import Online, Row, rows_of, steps, walker, without_rows
+from graphnav.online import Online, Row, drop_rows, list_rows, steps, walker
 from graphnav.online.walker import Walker
 from graphnav.recording import Recording
 from graphnav.simulation import simulate
 
-QUICK = settings_from({"solver": {"lag": 4.0}})
+QUICK = parse_settings({"solver": {"lag": 4.0}})
 
 
 @pytest.fixture(scope="module")
@@ -28,7 +28,7 @@ def walk() -> Recording:
 
 @pytest.fixture(scope="module")
 def rows(walk: Recording) -> list[Row]:
-    return rows_of(walk)[1]
+    return list_rows(walk)[1]
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +46,7 @@ def undisturbed(walk: Recording, rows: list[Row]) -> Callable[[frozenset[int]], 
 
 
 def walked(walk: Recording, rows: list[Row]) -> Trajectory:
-    online = Online(without_rows(walk), QUICK)
+    online = Online(drop_rows(walk), QUICK)
     for row in rows:
         online.add(row)
     online.finish()
@@ -57,7 +57,7 @@ def test_a_step_is_spread_over_rows_and_nothing_else_changes(
     walk: Recording, rows: list[Row], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Through a checkpoint while keyframes enter, too; and the state now never goes back to an older keyframe."""
-    online, entered, parts, kept, keyframe = Online(without_rows(walk), QUICK), [], [], False, -np.inf
+    online, entered, parts, kept, keyframe = Online(drop_rows(walk), QUICK), [], [], False, -np.inf
     for row in rows:
         running, before = online.tracker, 0 if online.tracker is None else online.tracker.newest
         made = 0 if running is None else len(running.window)

@@ -18,18 +18,18 @@ from test_online import off, played, same
 
 import graphnav
 from graphnav.app.cli_online import StopRequest, follow
-from graphnav.config import settings_from
+from graphnav.config import parse_settings
 from graphnav.core.errors import ConfigError, GraphnavError, RecordingError
-from graphnav.core.notes import key_of
+from graphnav.core.notes import get_key
 from graphnav.core.trajectory import Trajectory
-from graphnav.online import Online, Row, Session, ahead, rows_of, without_rows
-from graphnav.online.lines import HEAD, line_of, lines_of, setup_of
+from graphnav.online import Online, Row, Session, ahead, drop_rows, list_rows
+from graphnav.online.lines import HEAD, format_line, format_lines, parse_setup
 from graphnav.online.store import _MAGIC, Store
 from graphnav.online.tracker import Tracker
 from graphnav.recording import Recording
 from graphnav.recording.formats.trajectories import read_trajectory
 
-QUICK = settings_from({"noise": {"mode": "stated"}, "solver": {"lag": 10.0}})
+QUICK = parse_settings({"noise": {"mode": "stated"}, "solver": {"lag": 10.0}})
 NAN = (float("nan"),) * 6
 
 
@@ -41,7 +41,7 @@ def drive() -> tuple[Recording, Trajectory]:
 
 @pytest.fixture(scope="module")
 def rows(drive: tuple[Recording, Trajectory]) -> list[Row]:
-    return rows_of(drive[0])[1]
+    return list_rows(drive[0])[1]
 
 
 @pytest.fixture(scope="module")
@@ -151,16 +151,16 @@ def test_a_clock_that_is_set_back_begins_a_piece(
     drive: tuple[Recording, Trajectory], rows: list[Row], plain: Trajectory, tmp_path: Path
 ) -> None:
     """By an hour in the middle, and the drive from its start follows: both are as they would be alone."""
-    lines = [line for _, line in lines_of(drive[0])]
+    lines = [line for _, line in format_lines(drive[0])]
     assert rows[0][0] != "imu"  # what the first instant of the new clock shows waits for the IMU to tell that it is one
     back = [(sensor, t - 3600.0, values) for sensor, t, values in rows]
-    later = [line_of(row) for row in [*back[:3], back[2], *back[3:]]]  # one of them comes twice
+    later = [format_line(row) for row in [*back[:3], back[2], *back[3:]]]  # one of them comes twice
     session = Session(QUICK, "-", tmp_path / "out")
     session.add_lines([*lines[:-1], *later])
     session.finish()
     session.close()
     assert session.online.clocks == 2
-    assert "online.clock_back" in map(key_of, session.online.notes)
+    assert "online.clock_back" in map(get_key, session.online.notes)
     one, two = (read_trajectory(tmp_path / "out" / name) for name in ("trajectory.csv", "trajectory-2.csv"))
     alone = played(drive[0], back, QUICK)[1]
     for track, other in ((one, plain), (two, alone)):
@@ -178,8 +178,8 @@ def test_a_fix_before_the_first_imu_row_of_another_clock_counts(
     first = next(k for k, row in enumerate(rows) if row[0] == "gnss" and row[1] > 24.0)
     assert rows[first + 1][0] == "imu"
     new = [(sensor, t + step, values) for sensor, t, values in rows[first:]]
-    once = Online(without_rows(drive[0]), QUICK)
-    twice = Online(without_rows(drive[0]), QUICK)
+    once = Online(drop_rows(drive[0]), QUICK)
+    twice = Online(drop_rows(drive[0]), QUICK)
     for online, sent in ((once, [*old, *new[:300]]), (twice, [*old, *new[:2], new[0], *new[2:300]])):
         for row in sent:
             online.add(row)
@@ -233,7 +233,7 @@ def test_a_late_fix_that_is_the_last_row_is_used(drive: tuple[Recording, Traject
     """No IMU row follows that could tell of which clock it is."""
     some = [row for row in rows if row[1] <= 26.0]
     late = [row for row in some if row[0] == "gnss"][-4]
-    online = Online(without_rows(drive[0]), QUICK)
+    online = Online(drop_rows(drive[0]), QUICK)
     for row in (*(row for row in some if row is not late), late):
         online.add(row)
     online.finish()
@@ -244,7 +244,7 @@ def test_a_clock_set_back_before_there_is_any_state(drive: tuple[Recording, Traj
     """What had come by then is smoothed as if nothing had followed."""
     short = [row for row in rows if row[1] <= rows[0][1] + 14.0]
     back = [(sensor, t - 3600.0, values) for sensor, t, values in rows if sensor == "imu" and t > 40.0]
-    online = Online(without_rows(drive[0]), QUICK)
+    online = Online(drop_rows(drive[0]), QUICK)
     for row in short:
         online.add(row)
     assert online.status == "aligning"
@@ -332,7 +332,7 @@ def test_a_failure_within_costs_a_piece_and_not_the_session(
     """And what was killed after it is resumed as if nothing had been."""
     failing(monkeypatch, 52.0)
     recording, truth = drive
-    lines = [line for _, line in lines_of(recording)]
+    lines = [line for _, line in format_lines(recording)]
     texts = []
     for name, cuts in (("whole", []), ("parts", [len(lines) // 2 + 20, len(lines) * 3 // 4])):
         session = Session(QUICK, "-", tmp_path / name)
@@ -355,14 +355,14 @@ def test_a_failure_within_costs_a_piece_and_not_the_session(
 def test_states_that_are_no_numbers_are_never_written(
     drive: tuple[Recording, Trajectory], rows: list[Row], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    real = ahead.to_trajectory
+    real = ahead.make_trajectory
 
     def blank(name: str, frame: object, t: np.ndarray, *more: object) -> Trajectory:
         track = real(name, frame, t, *more)
         return replace(track, llh=np.full_like(track.llh, np.nan)) if t[0] < 42.0 else track
 
-    monkeypatch.setattr(ahead, "to_trajectory", blank)
-    online, parts = Online(without_rows(drive[0]), QUICK), []
+    monkeypatch.setattr(ahead, "make_trajectory", blank)
+    online, parts = Online(drop_rows(drive[0]), QUICK), []
     for row in rows:
         online.add(row)
         parts += online.settled()
@@ -397,13 +397,13 @@ def test_states_that_are_no_numbers_are_never_written(
 )
 def test_a_setup_is_checked_as_a_recording_is(setup: str, field: str) -> None:
     with pytest.raises(RecordingError, match=field) as caught:
-        setup_of(f"{HEAD} {setup}")
+        parse_setup(f"{HEAD} {setup}")
     assert len(str(caught.value)) < 1000
 
 
 def test_rows_are_numbers_in_ascii_digits(drive: tuple[Recording, Trajectory]) -> None:
     session = Session(QUICK, "-")
-    session.add_lines([next(lines_of(drive[0]))[1], "I,1_0,0,0,0,0,0,9.8", "O,1,\uff11", "I,1,0,0,0,0,0,9.8"])
+    session.add_lines([next(format_lines(drive[0]))[1], "I,1_0,0,0,0,0,0,9.8", "O,1,\uff11", "I,1,0,0,0,0,0,9.8"])
     assert session.bad == 2
 
 
@@ -433,7 +433,7 @@ def test_a_disk_that_is_full_from_the_start(
     drive: tuple[Recording, Trajectory], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """There is nothing to go on from: it says so, and what lies there does no harm to another run."""
-    lines, real = [line for _, line in lines_of(drive[0])][:400], os.replace
+    lines, real = [line for _, line in format_lines(drive[0])][:400], os.replace
 
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
@@ -457,7 +457,7 @@ def test_a_summary_that_could_not_be_written_is_written_when_resumed(
     drive: tuple[Recording, Trajectory], tmp_path: Path
 ) -> None:
     session = Session(QUICK, "-", tmp_path)
-    session.add_lines([line for _, line in lines_of(drive[0])][:50])
+    session.add_lines([line for _, line in format_lines(drive[0])][:50])
     (tmp_path / "summary.json").mkdir()
     with refused("output.cannot_write", GraphnavError, "--resume"):
         session.finish()
@@ -481,7 +481,7 @@ class _Call:
 
 def test_a_checkpoint_of_a_stranger_runs_nothing(drive: tuple[Recording, Trajectory], tmp_path: Path) -> None:
     """With the right digest, calling what is not graphnav's own data."""
-    lines = [line for _, line in lines_of(drive[0])]
+    lines = [line for _, line in format_lines(drive[0])]
     session = Session(QUICK, "-", tmp_path / "out")
     session.add_lines(lines[: len(lines) * 9 // 10])
     session.stop()
@@ -509,7 +509,7 @@ def test_a_line_that_never_ends_is_one_bad_line(drive: tuple[Recording, Trajecto
         def update_if_due(self, silent: float = 0.0) -> None:
             held.append(tracemalloc.get_traced_memory()[1])
 
-    head, *lines = [line.encode() + b"\n" for _, line in lines_of(drive[0])][:200]
+    head, *lines = [line.encode() + b"\n" for _, line in format_lines(drive[0])][:200]
     tracemalloc.start()
     follow(session, iter([head, *[b"1" * (1 << 20)] * 16, b"\n", b"".join(lines)]), Quiet(), StopRequest())
     tracemalloc.stop()

@@ -14,28 +14,28 @@ import raw_drive
 from helpers import refused
 from test_raw_rtk import with_carriers
 
-from graphnav.config import Settings, settings_from
+from graphnav.config import Settings, parse_settings
 from graphnav.constraints.raw_phase import WholeCycles
 from graphnav.constraints.raw_ppp import LASTING
 from graphnav.core.errors import RecordingError
 from graphnav.core.interpolation import interpolate
-from graphnav.core.notes import key_of
+from graphnav.core.notes import get_key
 from graphnav.core.trajectory import Trajectory
 from graphnav.estimation import fixing
 from graphnav.estimation.pipeline import run
 from graphnav.estimation.solution import Solution
-from graphnav.evaluation.evaluate import truth_of
+from graphnav.evaluation.evaluate import find_truth
 from graphnav.gnss.antex import SatelliteAntenna
 from graphnav.gnss.arcs import find_arcs
-from graphnav.gnss.carrier import consecutive
+from graphnav.gnss.carrier import pair_consecutive
 from graphnav.gnss.integers import find_nearest
 from graphnav.gnss.series import RawGnss
-from graphnav.gnss.signals import satellite_id
-from graphnav.online import Online, Row, rows_of, without_rows
+from graphnav.gnss.signals import number_satellite
+from graphnav.online import Online, Row, drop_rows, list_rows
 from graphnav.online import raw as online_raw
-from graphnav.online.lines import head_of, line_of, row_of, setup_of
+from graphnav.online.lines import format_head, format_line, parse_row, parse_setup
 from graphnav.online.raw import RawEpochs
-from graphnav.online.raw_lines import LiveRaw, epochs_of, live_raw, without_epochs
+from graphnav.online.raw_lines import LiveRaw, drop_epochs, list_epochs, live_raw
 from graphnav.recording import Recording
 
 CODES = {"differences": False, "carrier": False}
@@ -56,7 +56,7 @@ def observed_drive(**more: object) -> Recording:
 
 @pytest.fixture(scope="module")
 def rows(recording: Recording) -> list[Row]:
-    return rows_of(recording)[1]
+    return list_rows(recording)[1]
 
 
 def played(setup: Recording, rows: Iterable[Row], how: Settings, engine: str = "window") -> tuple[Online, Trajectory]:
@@ -76,8 +76,8 @@ def played(setup: Recording, rows: Iterable[Row], how: Settings, engine: str = "
 def test_with_a_long_lag_it_is_the_smoother_of_the_recording(
     recording: Recording, rows: list[Row], engine: str, chosen: dict[str, object]
 ) -> None:
-    how = settings_from(LONG | {"raw_gnss": chosen})
-    online, track = played(without_rows(recording), rows, how, engine)
+    how = parse_settings(LONG | {"raw_gnss": chosen})
+    online, track = played(drop_rows(recording), rows, how, engine)
     assert online.tracker is not None
     assert ("gnss_carrier" in online.tracker.in_force) == (chosen is not CODES)
     whole = run(recording, how, ("batch",))["batch"]
@@ -102,7 +102,7 @@ def test_a_late_epoch_counts_at_its_own_time(recording: Recording, rows: list[Ro
         late.append(row)
         if held and row[1] > held[0][1] + 1.5:
             late.append(held.pop(0))
-    setup, how = without_rows(recording), settings_from(LONG | {"raw_gnss": CODES})
+    setup, how = drop_rows(recording), parse_settings(LONG | {"raw_gnss": CODES})
     plain, delayed = (played(setup, some, how) for some in (kept, late + held))
     assert delayed[0].late["raw_gnss"] >= 2
     np.testing.assert_array_equal(delayed[1].t, plain[1].t)
@@ -112,17 +112,17 @@ def test_a_late_epoch_counts_at_its_own_time(recording: Recording, rows: list[Ro
 
 def test_changes_of_carriers_pass_a_late_epoch_by(recording: Recording) -> None:
     """It comes when the changes around it are counted, each from one of two places that take turns."""
-    setup = without_rows(recording).raw_gnss
+    setup = drop_rows(recording).raw_gnss
     assert setup is not None
     assert recording.raw_gnss is not None
-    kept, used = RawEpochs(setup, Settings().raw_gnss), epochs_of(recording.raw_gnss)[:6]
+    kept, used = RawEpochs(setup, Settings().raw_gnss), list_epochs(recording.raw_gnss)[:6]
     for t, values in (*used[:2], *used[3:5], used[2], used[5]):
         kept.add(t, values)
     series = kept.between(used[1][0], used[5][0])
     t, first = np.unique(series.t, return_index=True)
     np.testing.assert_array_equal(t, [at for at, _ in used])  # with the one before
     assert series.number[first].tolist() == [0, 1, -1, 2, 3, 4]
-    before, after = consecutive(series, series, 1.0)
+    before, after = pair_consecutive(series, series, 1.0)
     pairs = {(float(a), float(b)) for a, b in zip(series.t[before], series.t[after], strict=True)}
     late = t[2]
     assert pairs == {(a, b) for a, b in itertools.pairwise(t[t != late].tolist())}
@@ -131,12 +131,12 @@ def test_changes_of_carriers_pass_a_late_epoch_by(recording: Recording) -> None:
 def test_precise_point_positioning_is_that_of_the_recording(two: Recording) -> None:
     # a stop is found a little later as it drives, which sums of changes of carriers tell
     still = {"zero_velocity": False, "zero_rate": False, "held_position": False}
-    how = settings_from(LONG | {"raw_gnss": PPP, "standstill": still})
-    setup = setup_of(head_of(two))
+    how = parse_settings(LONG | {"raw_gnss": PPP, "standstill": still})
+    setup = parse_setup(format_head(two))
     assert setup.raw_gnss is not None
     assert setup.raw_gnss.antennas.keys() == two.raw_gnss.antennas.keys()
     assert setup.raw_gnss.clock_noise == two.raw_gnss.clock_noise
-    rows = [row_of(line_of(row)) if row[0] == "raw_gnss" else row for row in rows_of(two)[1]]
+    rows = [parse_row(format_line(row)) if row[0] == "raw_gnss" else row for row in list_rows(two)[1]]
     online, track = played(setup, rows, how)
     assert online.tracker is not None
     assert {"gnss_ppp_code", "gnss_ppp_carrier"} < online.tracker.in_force.keys()
@@ -156,22 +156,22 @@ def two() -> Recording:
     """Two signals of each satellite, and of one an antenna a metre off its centre of mass and an unsteady clock."""
     made = observed_drive(second=True).crop(0.0, 45.0)
     antenna = SatelliteAntenna(-np.inf, np.inf, {band: np.array([0.2, 0.0, 1.0 + 0.1 * band]) for band in (1, 2, 5)})
-    g01 = satellite_id("G01")
+    g01 = number_satellite("G01")
     return replace(made, raw_gnss=replace(made.raw_gnss, antennas={g01: (antenna,)}, clock_noise={g01: (0.03, 300.0)}))
 
 
 def test_precise_point_positioning_says_what_it_lacks(recording: Recording, two: Recording) -> None:
-    settings, broadcast = settings_from({"raw_gnss": {"ppp": True}}), replace(two.raw_gnss, precise=False)
+    settings, broadcast = parse_settings({"raw_gnss": {"ppp": True}}), replace(two.raw_gnss, precise=False)
     for one, key in ((recording, "raw.ppp_signals"), (replace(two, raw_gnss=broadcast), "raw.ppp_orbits")):
         with refused(key, RecordingError):
-            Online(without_rows(one), settings)
+            Online(drop_rows(one), settings)
 
 
 def test_it_goes_on_from_its_checkpoint(recording: Recording, rows: list[Row]) -> None:
-    how = settings_from({"noise": {"mode": "stated"}, "solver": {"lag": 20.0}})
+    how = parse_settings({"noise": {"mode": "stated"}, "solver": {"lag": 20.0}})
     kept = [row for row in rows if row[1] < 70.0]
-    _, plain = played(without_rows(recording), kept, how)
-    online, parts = Online(without_rows(recording), how), []
+    _, plain = played(drop_rows(recording), kept, how)
+    online, parts = Online(drop_rows(recording), how), []
     for k, row in enumerate(kept):
         online.add(row)
         parts += online.settled()
@@ -184,7 +184,7 @@ def test_it_goes_on_from_its_checkpoint(recording: Recording, rows: list[Row]) -
 
 def test_epochs_that_are_of_no_use_are_counted(recording: Recording, rows: list[Row]) -> None:
     epochs = [row for row in rows if row[0] == "raw_gnss" and 28.5 < row[1] < 30.0]
-    setup, how = without_rows(recording), settings_from(LONG)
+    setup, how = drop_rows(recording), parse_settings(LONG)
     online = Online(setup, how)
     for row in rows:
         if row[1] < 30.0:
@@ -203,11 +203,11 @@ def test_epochs_that_are_of_no_use_are_counted(recording: Recording, rows: list[
 
 
 def test_loose_coupling_uses_the_fixes(recording: Recording, rows: list[Row]) -> None:
-    loose = settings_from(LONG | {"raw_gnss": {"coupling": "loose"}})
-    online = Online(without_rows(recording), loose)
+    loose = parse_settings(LONG | {"raw_gnss": {"coupling": "loose"}})
+    online = Online(drop_rows(recording), loose)
     for row in rows:
         online.add(row)
-    assert "online.raw" not in map(key_of, online.notes)
+    assert "online.raw" not in map(get_key, online.notes)
     assert not online.sensors.counts["raw_gnss"]
     assert online.tracker is not None
     online.finish()
@@ -231,11 +231,11 @@ def test_wind_up_goes_on_through_whole_cycles_however_epochs_come(
     def unwrapped(raw: RawGnss) -> np.ndarray:  # of a piece: its first value is within half a cycle
         return np.unwrap(np.mod(0.3 * raw.t + 0.5, 1.0) - 0.5, period=1.0)
 
-    monkeypatch.setattr(online_raw, "wind_up_of", unwrapped)
+    monkeypatch.setattr(online_raw, "compute_series_wind_up", unwrapped)
     raw = two.raw_gnss.take(two.raw_gnss.satellite == two.raw_gnss.satellite[0])
-    epochs = epochs_of(raw)
+    epochs = list_epochs(raw)
     for order in (epochs, [*epochs[:3], *epochs[5:8], *epochs[3:5], *epochs[8:]]):
-        buffer = RawEpochs(without_epochs(raw), settings_from({"raw_gnss": {"ppp": True}}).raw_gnss)
+        buffer = RawEpochs(drop_epochs(raw), parse_settings({"raw_gnss": {"ppp": True}}).raw_gnss)
         for t, values in order:
             buffer.add(t, values)
         part = buffer.between(-np.inf, np.inf)
@@ -257,13 +257,13 @@ def test_arcs_are_those_of_the_series_however_its_epochs_come(rtk: Recording) ->
     whole = find_arcs(raw, base_arc=raw.base_arc)
     assert whole.slips >= 1
     assert sum(map(len, whole.begins)) > 3 * len(whole.names)
-    settings = settings_from({"raw_gnss": {"period": 3.0}}).raw_gnss
-    epochs = epochs_of(raw)
+    settings = parse_settings({"raw_gnss": {"period": 3.0}}).raw_gnss
+    epochs = list_epochs(raw)
     shuffled = [epochs[k] for k in np.argsort(np.arange(len(epochs)) + rng.normal(0.0, 1.0, len(epochs)))]
     for order in (epochs, shuffled):
-        buffer = RawEpochs(without_epochs(raw), settings)
+        buffer = RawEpochs(drop_epochs(raw), settings)
         for t, values in order:
-            buffer.add(t, values, used=buffer.wanted(t))
+            buffer.add(t, values, used=buffer.is_wanted(t))
         assert len(buffer) < 0.6 * len(epochs)
         part = buffer.between(-np.inf, np.inf)
         own = np.isin(raw.t, part.t)
@@ -272,12 +272,12 @@ def test_arcs_are_those_of_the_series_however_its_epochs_come(rtk: Recording) ->
 
 @pytest.fixture(scope="module")
 def offline(rtk: Recording) -> dict[str, Solution]:
-    return run(rtk, settings_from({"noise": {"mode": "stated"}}), ("ekf", "rts"))
+    return run(rtk, parse_settings({"noise": {"mode": "stated"}}), ("ekf", "rts"))
 
 
 @pytest.mark.parametrize("engine", ["window", "isam2"])
 def test_integers_online_are_those_of_the_recording(rtk: Recording, offline: dict[str, Solution], engine: str) -> None:
-    online, track = played(without_rows(rtk), rows_of(rtk)[1], settings_from(LONG), engine)
+    online, track = played(drop_rows(rtk), list_rows(rtk)[1], parse_settings(LONG), engine)
     tracker = online.tracker
     assert tracker is not None
     whole, filtered = offline["rts"], offline["ekf"].fixed
@@ -294,12 +294,12 @@ def test_integers_online_are_those_of_the_recording(rtk: Recording, offline: dic
 
 
 def test_integers_are_rows_and_go_on_from_a_checkpoint_and_from_lines(rtk: Recording) -> None:
-    how = settings_from({"noise": {"mode": "stated"}, "solver": {"lag": 10.0}})
-    rows = rows_of(rtk)[1]
-    _, plain = played(without_rows(rtk), rows, how)
-    online, parts, seen = Online(setup_of(head_of(rtk)), how), [], 0
+    how = parse_settings({"noise": {"mode": "stated"}, "solver": {"lag": 10.0}})
+    rows = list_rows(rtk)[1]
+    _, plain = played(drop_rows(rtk), rows, how)
+    online, parts, seen = Online(parse_setup(format_head(rtk)), how), [], 0
     for k, row in enumerate(rows):
-        online.add(row_of(line_of(row)) if row[0] != "gnss" else row)  # degrees round
+        online.add(parse_row(format_line(row)) if row[0] != "gnss" else row)  # degrees round
         parts += online.settled()
         if k % 100 == 99 and online.tracker is not None:
             online = pickle.loads(pickle.dumps(online))
@@ -327,12 +327,12 @@ def test_wrong_integers_are_let_go_of(rtk: Recording, monkeypatch: pytest.Monkey
     monkeypatch.setattr(
         fixing.Epochs, "odd", lambda self, k, *rest: [] if self.time[k] < until else noticed(self, k, *rest)
     )
-    how = settings_from({"noise": {"mode": "stated"}, "solver": {"lag": 5.0}})
-    online, track = played(without_rows(rtk), rows_of(rtk)[1], how, "isam2")
+    how = parse_settings({"noise": {"mode": "stated"}, "solver": {"lag": 5.0}})
+    online, track = played(drop_rows(rtk), list_rows(rtk)[1], how, "isam2")
     tracker = online.tracker
     assert tracker is not None
     # between the truth's rows, which need not be at the keyframes' times
-    true, inside = interpolate(truth_of(rtk)[0], track.t)
+    true, inside = interpolate(find_truth(rtk)[0], track.t)
     assert inside.all()
     h = np.hypot(*((track.llh - true.llh)[:, :2] * 6.37e6 * [1.0, np.cos(true.llh[0, 0])]).T)
     assert h[(track.t > 15.0) & (track.t < until - 1.0)].max() > 0.05
@@ -352,30 +352,30 @@ def test_wrong_integers_are_let_go_of(rtk: Recording, monkeypatch: pytest.Monkey
     ],
 )
 def test_lines_that_are_no_epochs_are_told(rtk: Recording, spoil: Callable[[str], str]) -> None:
-    line = line_of(("raw_gnss", *epochs_of(rtk.raw_gnss)[0]))
+    line = format_line(("raw_gnss", *list_epochs(rtk.raw_gnss)[0]))
     with pytest.raises(ValueError, match=r"\w"):
-        row_of(spoil(line))
+        parse_row(spoil(line))
 
 
 @pytest.mark.parametrize("name", ["1K", "9C", "C"])
 def test_a_source_is_refused_that_names_a_signal_that_its_satellites_do_not_send(rtk: Recording, name: str) -> None:
     said = live_raw(rtk.raw_gnss)
-    assert LiveRaw.model_validate(said).setup().catalogue == without_epochs(rtk.raw_gnss).catalogue
+    assert LiveRaw.model_validate(said).setup().catalogue == drop_epochs(rtk.raw_gnss).catalogue
     with refused("online.raw_names", RecordingError, f"'{name}'"):
         LiveRaw.model_validate(said | {"signals": [("G", name)]}).setup()
-    line = line_of(("raw_gnss", *epochs_of(rtk.raw_gnss)[0]))
+    line = format_line(("raw_gnss", *list_epochs(rtk.raw_gnss)[0]))
     with pytest.raises(ValueError, match=r"\w"):
-        row_of(line.replace(",1C,", f",{name},", 1))
+        parse_row(line.replace(",1C,", f",{name},", 1))
 
 
 def test_a_satellite_that_cannot_be_costs_only_itself(rtk: Recording) -> None:
-    t, values = epochs_of(rtk.raw_gnss)[0]
-    rows, setup = np.reshape(values, (-1, 26)), without_epochs(rtk.raw_gnss)
+    t, values = list_epochs(rtk.raw_gnss)[0]
+    rows, setup = np.reshape(values, (-1, 26)), drop_epochs(rtk.raw_gnss)
     for column, value in ((2, 1e300), (9, np.nan), (9, 1e300), (4, -1e9), (8, 0.0), (12, 1e9), (3, np.inf)):
         spoilt = rows.copy()
         spoilt[1, column] = value
-        buffer = RawEpochs(setup, settings_from({}).raw_gnss)
-        assert buffer.odds(tuple(spoilt.ravel())) is None
+        buffer = RawEpochs(setup, parse_settings({}).raw_gnss)
+        assert buffer.find_fault(tuple(spoilt.ravel())) is None
         buffer.add(t, tuple(spoilt.ravel()))
         left = buffer.between(t, t)
         np.testing.assert_array_equal(left.satellite, np.delete(rows[:, 0], 1).astype(int))

@@ -13,7 +13,7 @@ from helpers import refused
 
 from graphnav.config import Settings
 from graphnav.core.errors import RecordingError
-from graphnav.online import Fix, ImuSample, Online, WheelSpeed, live_setup, live_trajectory, rows_of, without_rows
+from graphnav.online import Fix, ImuSample, Online, WheelSpeed, drop_rows, list_rows, live_setup, live_trajectory
 
 SD = (0.02, 0.02, 0.04)
 
@@ -27,7 +27,7 @@ def test_they_are_the_rows_of_a_recording() -> None:
         "odometer": lambda t, v: WheelSpeed(t, v[0]),
     }
     seen = set()
-    for row in rows_of(recording)[1]:
+    for row in list_rows(recording)[1]:
         sensor, t, values = row
         mine = made[sensor](t, values)
         assert mine[:2] == (sensor, t)
@@ -108,7 +108,7 @@ def test_the_setup_of_a_recording_holds_no_row() -> None:
     n, m = len(recording.gnss.t), len(recording.odometer.t)
     gnss = replace(recording.gnss, type=np.ones(n, dtype=int), satellites=np.full(n, 9.0))
     odometer = replace(recording.odometer, counted=np.zeros(m), wheels=np.zeros((m, 4)))
-    setup = without_rows(replace(recording, gnss=gnss, odometer=odometer))
+    setup = drop_rows(replace(recording, gnss=gnss, odometer=odometer))
     for sensor, count in ((setup.gnss, n), (setup.odometer, m), (setup.imu, len(recording.imu.t))):
         kept = [name for name, x in vars(sensor).items() if isinstance(x, np.ndarray) and len(x) == count]
         assert kept == []

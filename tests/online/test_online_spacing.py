@@ -7,14 +7,14 @@ import oracle
 import pytest
 from test_online import joined
 
-from graphnav.config import settings_from
+from graphnav.config import parse_settings
 from graphnav.core.trajectory import Trajectory
 from graphnav.estimation.noise.spacing import space_fixes
-from graphnav.online import Online, rows_of, without_rows
+from graphnav.online import Online, drop_rows, list_rows
 from graphnav.online.sensors import Sensors
 from graphnav.recording import Gnss, Imu, Recording
 
-QUICK = settings_from({"noise": {"mode": "stated"}, "solver": {"lag": 60.0}})
+QUICK = parse_settings({"noise": {"mode": "stated"}, "solver": {"lag": 60.0}})
 NAN = float("nan")
 
 
@@ -30,7 +30,7 @@ def test_the_same_fixes_are_used_as_of_the_whole_recording(late: int) -> None:
     llh = np.tile([0.6, 0.2, 100.0], (300, 1))
     imu = Imu(t, np.zeros((300, 3)), np.tile([0.0, 0.0, 9.8], (300, 1)))
     recording = Recording("fast", "vehicle", imu, Gnss(t, llh, sd, v=v, sd_v=sd_v))
-    sensors, order = Sensors(without_rows(recording)), np.argsort(np.arange(300) + late * (np.arange(300) % 50 == 49))
+    sensors, order = Sensors(drop_rows(recording)), np.argsort(np.arange(300) + late * (np.arange(300) % 50 == 49))
     for n, k in enumerate(order):
         moves = np.isfinite(v[k, 0])
         sensors.add("gnss", t[k], (*llh[k], *sd[k], *v[k], *(sd_v[k] if moves else [NAN] * 3)))
@@ -47,7 +47,7 @@ def test_the_same_fixes_are_used_as_of_the_whole_recording(late: int) -> None:
 def test_a_fix_that_gives_way_to_a_better_one_leaves_no_trace() -> None:
     recording, _ = oracle.drive(oracle.vehicle_path(130.0, 25.0), seed=3)
     recording = recording.crop(20.0, 63.5)  # the last fix is a better one
-    rows = rows_of(recording)[1]
+    rows = list_rows(recording)[1]
     fixes = [row for row in rows if row[0] == "gnss"]
     worse = {row[1] for row in fixes[::2]}
     rows = [(s, t, (*x[:3], *np.multiply(x[3:6], 1.5), *x[6:])) if s == "gnss" and t in worse else (s, t, x)
@@ -55,7 +55,7 @@ def test_a_fix_that_gives_way_to_a_better_one_leaves_no_trace() -> None:
 
     def smoothed(spaced: bool, sent: bool) -> Trajectory:
         """Two fixes of two seconds, of which the second is better, from when it runs."""
-        online, since = Online(without_rows(recording), QUICK), np.inf
+        online, since = Online(drop_rows(recording), QUICK), np.inf
         for row in rows:
             if row[0] == "gnss" and row[1] > since and row[1] in worse and not sent:
                 continue

@@ -22,7 +22,7 @@ from graphnav.recording.checks.crosschecks import fit_yaw_rate
 from graphnav.recording.checks.overview import Inspection, inspect
 from graphnav.recording.checks.tracks import compute_track
 from graphnav.recording.formats import read
-from graphnav.recording.formats.schema import rotation_from_letters
+from graphnav.recording.formats.schema import parse_axes_letters
 from graphnav.simulation import simulate
 
 TURNS_LITTLE = (100.0, 160.0)  # s of oracle_drive: it stands, and turns once
@@ -67,7 +67,7 @@ def odometer(**changes: Callable[..., np.ndarray]) -> Change:
 
 def declared(axes: str) -> Change:
     """The same file, with other axes stated."""
-    R = rotation_from_letters(axes)
+    R = parse_axes_letters(axes)
 
     def change(r: Recording) -> Recording:
         turn = R @ r.imu.R_bs.T
@@ -159,11 +159,11 @@ def test_leap_seconds_are_found(part: Callable[[str], Recording], name: str, shi
 def test_wrong_axes_are_found_and_the_right_ones_named(part: Callable[[str], Recording], name: str, axes: str) -> None:
     recording = part(name)
     found = warned(declared(axes)(recording), "axes contradict the drive")
-    right = np.array_equal(rotation_from_letters(axes), recording.imu.R_bs)
+    right = np.array_equal(parse_axes_letters(axes), recording.imu.R_bs)
     assert len(found) == (0 if right else 1)
     if found:
         named = re.search(r'axes = "([A-Z]{3})" would agree', found[0])[1]
-        assert np.array_equal(rotation_from_letters(named), recording.imu.R_bs)
+        assert np.array_equal(parse_axes_letters(named), recording.imu.R_bs)
 
 
 DEG = np.degrees(1.0)

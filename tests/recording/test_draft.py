@@ -18,7 +18,7 @@ from graphnav.core.rotation import exp
 from graphnav.recording.draft import columns, draft, guesses, motion
 from graphnav.recording.draft.agreement import find_level_axes
 from graphnav.recording.formats import read
-from graphnav.recording.formats.schema import rotation_from_letters
+from graphnav.recording.formats.schema import parse_axes_letters
 
 DRIVE, _ = oracle.drive(
     oracle.vehicle_path(240.0, 50.0), seed=3, gnss_rate=5.0, gnss_velocity_sd=(0.05, 0.05, 0.1), odometer_rate=20.0
@@ -149,7 +149,7 @@ def test_level_axes_are_right_handed():
 def write_logs(folder, letters="FLU", gyro=1.0, accel=1.0, time=1.0, gnss_late=0.0, speed=1.0, turn=None):
     """The drive as CSV files of a logger, in other axes and units."""
     folder.mkdir(exist_ok=True)
-    R = rotation_from_letters(letters).T if turn is None else turn
+    R = parse_axes_letters(letters).T if turn is None else turn
     imu, gnss, odometer = DRIVE.imu, DRIVE.gnss, DRIVE.odometer
     table = np.column_stack([imu.t * time, imu.gyro @ R.T * gyro, imu.accel @ R.T * accel])
     head = "Timestamp,GyroX,GyroY,GyroZ,AccX,AccY,AccZ"

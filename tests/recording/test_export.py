@@ -113,7 +113,7 @@ def turning() -> Trajectory:
 def test_another_point_moves_around_the_imu() -> None:
     track = turning()
     arm = np.array([0.0, 2.0, 1.0])  # 2 m ahead, 1 m up
-    (moved,) = convert.at_point(track, arm)
+    (moved,) = convert.move_to_point(track, arm)
     p = LocalFrame(track.llh[0]).from_llh(moved.llh)
     heading = track.rph[:, 2]
     assert p == pytest.approx(
@@ -130,7 +130,7 @@ def test_another_point_moves_around_the_imu() -> None:
 
 
 def test_a_trajectory_at_another_rate() -> None:
-    (moved,) = convert.at_point(turning(), None, rate=100.0)
+    (moved,) = convert.move_to_point(turning(), None, rate=100.0)
     assert np.diff(moved.t) == pytest.approx(0.01, abs=1e-9)
     assert moved.rph[:, 2] == pytest.approx(np.mod(0.2 * moved.t, 2 * np.pi), abs=1e-6)
 
@@ -138,9 +138,9 @@ def test_a_trajectory_at_another_rate() -> None:
 @pytest.mark.parametrize("arm", [None, np.array([0.0, 2.0, 1.0])])
 def test_parts_of_a_trajectory_are_those_of_the_whole(arm, monkeypatch) -> None:
     track = turning()
-    (whole,) = convert.at_point(track, arm, rate=33.0)
+    (whole,) = convert.move_to_point(track, arm, rate=33.0)
     monkeypatch.setattr(convert, "_ROWS_AT_ONCE", 100)
-    parts = list(convert.at_point(track, arm, rate=33.0))
+    parts = list(convert.move_to_point(track, arm, rate=33.0))
     assert len(parts) == 10
     for name in ("t", "llh", "v", "rph", "sd_p"):
         np.testing.assert_allclose(

@@ -14,12 +14,12 @@ from helpers import refused
 
 from graphnav.core import rotation
 from graphnav.core.errors import RecordingError
-from graphnav.core.notes import key_of
+from graphnav.core.notes import get_key
 from graphnav.core.timescales import gps_to_utc
 from graphnav.core.trajectory import Trajectory
 from graphnav.recording import exporters
 from graphnav.recording.exporters import digits, write_as
-from graphnav.recording.exporters.digits import rows_text
+from graphnav.recording.exporters.digits import format_rows
 from graphnav.recording.formats.trajectories import read_trajectory
 
 DEG = np.pi / 180
@@ -138,14 +138,14 @@ def test_digits_are_those_of_c(form: str) -> None:
     for x in (half, decimals, spread, 1.7e9 + rng.uniform(size=400), *([e] for e in edges), *([-e] for e in edges)):
         x = np.array(x)[np.isfinite(x)] if form == "%d" else np.array(x)
         wanted = ["" if np.isnan(one) else form % one for one in x]
-        assert rows_text(x[:, None], form).split("\n")[:-1] == wanted
+        assert format_rows(x[:, None], form).split("\n")[:-1] == wanted
         assert digits._write_compiled(x[:, None], form + "\n", None).decode().split("\n")[:-1] == wanted
 
 
 def test_words_end_a_row_of_numbers() -> None:
     table, words = np.array([[0.5, 2.0], [np.nan, -3.25]]), np.array([b"a", b"bcd"])
     wanted = b"<0.5;2>a.\n<;-3.25>bcd.\n"
-    assert digits.rows_bytes(table, "<%.1f;%.6g>%s.", words) == wanted
+    assert digits.encode_rows(table, "<%.1f;%.6g>%s.", words) == wanted
     assert digits._write_compiled(table, "<%.1f;%.6g>%s.\n", words) == wanted
 
 
@@ -287,7 +287,7 @@ def test_repeated_stamps_and_rows_without_position_are_left_out_and_counted(tmp_
     file.write_text("t,lat,lon,h\n0,30,114,20\n0,30,114,21\n1,,,\n2,30,114,23\n")
     found = read_trajectory(file)
     np.testing.assert_allclose(found.llh[:, 2], [20, 23])
-    assert {"trajectory.no_position", "trajectory.repeated"} <= set(map(key_of, found.notes))
+    assert {"trajectory.no_position", "trajectory.repeated"} <= set(map(get_key, found.notes))
 
 
 def test_tum_attitude_is_in_the_frame_of_the_positions(tmp_path: Path) -> None:

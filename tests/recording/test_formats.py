@@ -12,9 +12,9 @@ from helpers import assert_told, refused, same_recording
 
 from graphnav.app import convert
 from graphnav.core.errors import ConfigError, RecordingError
-from graphnav.core.timescales import clock_words, gps_to_utc, leap_seconds, parse_clock, unix_to_gps, utc_to_gps
+from graphnav.core.timescales import count_leap_seconds, format_clock, gps_to_utc, parse_clock, unix_to_gps, utc_to_gps
 from graphnav.recording.formats import load, read
-from graphnav.recording.formats.writer import degrees, write_recording
+from graphnav.recording.formats.writer import convert_to_degrees, write_recording
 
 RECORDING, TRUTH = logs.simulated()
 
@@ -28,19 +28,19 @@ def test_leap_seconds_and_gps_time_of_known_dates():
     assert t.tolist() == [2200 * 604800.0, 0.0]
     assert unix_to_gps(np.array([1646524782.0])).tolist() == [2200 * 604800.0]
     dates = np.array(["2016-12-31T23:59:59", "2017-01-01", "2005-06-01", "1999-08-22"], "datetime64[us]")
-    assert leap_seconds(dates).tolist() == [17, 18, 13, 13]
+    assert count_leap_seconds(dates).tolist() == [17, 18, 13, 13]
     back = gps_to_utc(utc_to_gps(dates))
     assert (back == dates).all()
 
 
 @pytest.mark.parametrize("words", ["gps week 2200", "2024-05-01T12:00:00.000000Z"])
 def test_clock_words_there_and_back(words):
-    assert clock_words(parse_clock(words, 0.0)) == words
+    assert format_clock(parse_clock(words, 0.0)) == words
 
 
 def test_unix_clock_takes_the_leap_seconds_of_its_time():
     assert parse_clock("unix", 1646524782.0) + 1646524782.0 == 2200 * 604800.0
-    assert clock_words(parse_clock("unix", 1646524782.0)) == "unix"
+    assert format_clock(parse_clock("unix", 1646524782.0)) == "unix"
     with pytest.raises(ValueError, match='"unix"'):  # the words there are
         parse_clock("week 2200", 0.0)
 
@@ -270,9 +270,9 @@ def test_degrees_are_those_the_radians_came_from():
     rng = np.random.default_rng(5)
     for digits in (7, 9, 11):
         written = np.round(rng.uniform(-180, 180, 2000), digits)
-        assert np.array_equal(degrees(written * (np.pi / 180)), written)
+        assert np.array_equal(convert_to_degrees(written * (np.pi / 180)), written)
     anything = rng.uniform(-np.pi, np.pi, 2000)
-    assert np.abs(degrees(anything) * (np.pi / 180) - anything).max() <= 4.5e-16
+    assert np.abs(convert_to_degrees(anything) * (np.pi / 180) - anything).max() <= 4.5e-16
 
 
 def test_converted_logs_read_back_the_same(tmp_path, kf_gins):

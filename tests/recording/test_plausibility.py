@@ -14,12 +14,12 @@ from mistakes import ROOT
 
 from graphnav import run
 from graphnav.core.errors import RecordingError
-from graphnav.estimation.solution import to_trajectory
+from graphnav.estimation.solution import make_trajectory
 from graphnav.evaluation.evaluate import evaluate_recording
 from graphnav.recording import Recording, take_rows
 from graphnav.recording.checks.overview import inspect
 from graphnav.recording.formats import read
-from graphnav.recording.formats.repair import Remarks, sigmas
+from graphnav.recording.formats.repair import Remarks, choose_sigmas
 from graphnav.recording.formats.table import Table
 from graphnav.recording.plausibility.fixes import find_out_of_reach
 from graphnav.recording.plausibility.screening import screen, screen_recording
@@ -153,7 +153,7 @@ def test_a_spike_does_not_move_the_answer(oracle: Recording) -> None:
 
     def error(recording: Recording) -> float:
         s = run(recording, solvers=("ekf", "rts"))["rts"]
-        metrics = evaluate_recording(to_trajectory("rts", s.frame, s.t, s.states, s.covariance), short)
+        metrics = evaluate_recording(make_trajectory("rts", s.frame, s.t, s.states, s.covariance), short)
         assert metrics is not None
         return metrics.components["h"].rms
 
@@ -396,7 +396,7 @@ def table(tmp_path: Path, *sd: float) -> Table:
 def test_a_sigma_printed_as_zero_is_floored_and_said(tmp_path: Path, sd: tuple[float, ...], floor: float) -> None:
     rows, remarks = table(tmp_path, *sd), Remarks()
     every = np.ones(len(sd), dtype=bool)
-    got = sigmas(rows, ("sd_e", "sd_n", "sd_u"), None, (1.0, 1.0, 1.0), "GNSS position", every, remarks)
+    got = choose_sigmas(rows, ("sd_e", "sd_n", "sd_u"), None, (1.0, 1.0, 1.0), "GNSS position", every, remarks)
     np.testing.assert_allclose(got[0], floor)
     np.testing.assert_array_equal(got[1:, 0], sd[1:])
     assert len(remarks) == 3
@@ -406,7 +406,9 @@ def test_a_sigma_printed_as_zero_is_floored_and_said(tmp_path: Path, sd: tuple[f
 def test_sigmas_that_are_all_zero_or_below_it_are_refused(tmp_path: Path, sd: tuple[float, ...]) -> None:
     every = np.ones(len(sd), dtype=bool)
     with refused("table.sigma", RecordingError):
-        sigmas(table(tmp_path, *sd), ("sd_e", "sd_n", "sd_u"), None, (1.0, 1.0, 1.0), "GNSS position", every, Remarks())
+        choose_sigmas(
+            table(tmp_path, *sd), ("sd_e", "sd_n", "sd_u"), None, (1.0, 1.0, 1.0), "GNSS position", every, Remarks()
+        )
 
 
 @pytest.mark.parametrize("which", ["mixed", "block"])

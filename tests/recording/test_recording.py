@@ -13,11 +13,11 @@ from test_bad_input import TOML, write_small
 
 from graphnav.core.earth import LocalFrame
 from graphnav.core.errors import RecordingError
-from graphnav.core.notes import key_of
+from graphnav.core.notes import get_key
 from graphnav.recording import ImuNoise
-from graphnav.recording.formats import formats, read
+from graphnav.recording.formats import list_formats, read
 from graphnav.recording.formats.repair import DEFAULT_SD
-from graphnav.recording.formats.schema import rotation_from_letters, rotation_from_vectors
+from graphnav.recording.formats.schema import parse_axes_letters, parse_axes_vectors
 
 IMU_ROWS = "t,gx,gy,gz,ax,ay,az\n0.01,1,2,3,4,5,6\n0.02,1,2,3,4,5,6\n"
 
@@ -48,7 +48,7 @@ def test_half_of_all_letter_triples_are_right_handed_and_those_are_rotations() -
     good, refused = [], 0
     for axes in triples:
         try:
-            good.append(rotation_from_letters(axes))
+            good.append(parse_axes_letters(axes))
         except ValueError:
             refused += 1
     assert (len(good), refused) == (24, 24)
@@ -61,7 +61,7 @@ def test_forward_and_up_vectors_keep_up_and_square_forward() -> None:
         forward, up = rng.normal(size=(2, 3))
         if abs(forward @ up) > 0.9 * np.linalg.norm(forward) * np.linalg.norm(up):
             continue
-        R = rotation_from_vectors(forward, up)
+        R = parse_axes_vectors(forward, up)
         assert np.allclose(R @ R.T, np.eye(3))
         assert np.linalg.det(R) == pytest.approx(1.0)
         assert np.allclose(R @ up / np.linalg.norm(up), [0, 0, 1])
@@ -72,7 +72,7 @@ def test_forward_and_up_vectors_keep_up_and_square_forward() -> None:
 
 def test_vectors_along_the_axes_are_the_letters() -> None:
     # FLU: forward is x, up is z
-    assert np.allclose(rotation_from_vectors((2, 0, 0), (0, 0, 3)), rotation_from_letters("FLU"))
+    assert np.allclose(parse_axes_vectors((2, 0, 0), (0, 0, 3)), parse_axes_letters("FLU"))
 
 
 # ---- units, clocks, columns
@@ -207,7 +207,7 @@ def test_every_real_recording_loads_and_gravity_is_up(shared_data: Path) -> None
             for sensor in ("imu", "gnss")
             for what in ("blank", "repeated", "unordered", "sorted")
         }
-        assert not odd & set(map(key_of, recording.remarks)), file
+        assert not odd & set(map(get_key, recording.remarks)), file
 
 
 def test_boulder_is_turned_shifted_and_keeps_its_own_sigmas(shared_data: Path) -> None:
@@ -232,7 +232,7 @@ def test_tokyo_keeps_trusted_truth_and_epochs_without_velocity(shared_data: Path
 
 def test_kitti_is_built_in() -> None:
     recording = read("kitti")
-    assert formats()["kitti"].builtin
+    assert list_formats()["kitti"].builtin
     assert (len(recording.imu.t), len(recording.gnss.t)) == (46968 - 1, 470 - 1)
     assert np.diff(recording.imu.t).max() < 0.05  # the 1.92-s gap is gone
     assert recording.gnss.t[0] > recording.imu.t[0]

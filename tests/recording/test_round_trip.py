@@ -12,10 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from graphnav.config import read_settings, settings_from, settings_text
+from graphnav.config import format_settings, parse_settings, read_settings
 from graphnav.config.gnss import GnssSettings
 from graphnav.core.rotation import Array
-from graphnav.online.lines import line_of, row_of
+from graphnav.online.lines import format_line, parse_row
 from graphnav.recording import Gnss, Imu, ImuNoise, Odometer
 from graphnav.recording.exporters import write_as
 from graphnav.recording.formats import read
@@ -110,10 +110,10 @@ def test_trajectories_to_the_digits_that_are_written(values: Array, first: float
 )
 @settings(max_examples=40, deadline=None)
 def test_settings(gate: str | float, lag: float, slow: tuple[float, float]) -> None:
-    made = settings_from({"gnss": {"gate": gate, "slow_times": slow}, "solver": {"lag": lag}})
+    made = parse_settings({"gnss": {"gate": gate, "slow_times": slow}, "solver": {"lag": lag}})
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "s.toml"
-        path.write_text(settings_text(made), encoding="utf-8")
+        path.write_text(format_settings(made), encoding="utf-8")
         assert read_settings(path) == made
     assert isinstance(made.gnss, GnssSettings)
 
@@ -123,5 +123,5 @@ def test_settings(gate: str | float, lag: float, slow: tuple[float, float]) -> N
 )
 @settings(max_examples=100, deadline=None)
 def test_lines_of_a_live_source(t: float, values: list[float]) -> None:
-    assert row_of(line_of(("imu", t, tuple(values)))) == ("imu", t, tuple(values))
-    assert row_of(line_of(("odometer", t, tuple(values))))[2][0] == values[0]
+    assert parse_row(format_line(("imu", t, tuple(values)))) == ("imu", t, tuple(values))
+    assert parse_row(format_line(("odometer", t, tuple(values))))[2][0] == values[0]

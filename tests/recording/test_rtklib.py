@@ -13,7 +13,7 @@ from helpers import refused
 from graphnav.app import cli
 from graphnav.core.earth import LocalFrame, llh_to_ecef
 from graphnav.core.errors import RecordingError
-from graphnav.core.notes import key_of
+from graphnav.core.notes import get_key
 from graphnav.core.trajectory import Trajectory
 from graphnav.recording.formats import load, read
 from graphnav.recording.formats.trajectories import read_trajectory
@@ -60,7 +60,7 @@ def test_rtklib_with_week_and_seconds_velocity_and_utc(tmp_path: Path) -> None:
     assert found.gps_zero == 2131 * 604800.0
     np.testing.assert_allclose(found.v[0], [-2.5, 1.5, 0.5])
     np.testing.assert_allclose(found.sd_v[0], [0.2, 0.1, 0.3])
-    assert "trajectory.time_scale" in map(key_of, found.notes)
+    assert "trajectory.time_scale" in map(get_key, found.notes)
 
 
 def test_rtklib_with_commas_is_the_same(tmp_path: Path) -> None:
@@ -80,7 +80,7 @@ def test_rtklib_with_commas_is_the_same(tmp_path: Path) -> None:
 def test_rtklib_heights_above_the_sea_are_said_and_another_datum_is_refused(tmp_path: Path) -> None:
     file = tmp_path / "a.pos"
     file.write_text(POS.replace("WGS84/ellipsoidal", "WGS84/geodetic"))
-    assert "trajectory.height" in map(key_of, read_trajectory(file).notes)
+    assert "trajectory.height" in map(get_key, read_trajectory(file).notes)
     file.write_text(POS.replace("WGS84/ellipsoidal", "Tokyo/ellipsoidal"))
     with refused("rtklib.datum", RecordingError, "out-datum=wgs84"):
         read_trajectory(file)

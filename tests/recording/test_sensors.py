@@ -15,10 +15,10 @@ from helpers import refuse_command, refused
 from graphnav.app import cli
 from graphnav.app.convert import convert_log
 from graphnav.app.workflow import parse_withheld
-from graphnav.config import Settings, read_settings, settings_from, settings_text
+from graphnav.config import Settings, format_settings, parse_settings, read_settings
 from graphnav.core.errors import ConfigError, RecordingError
-from graphnav.online import Sensors, rows_of, without_rows
-from graphnav.online.lines import head_of, line_of, row_of, setup_of
+from graphnav.online import Sensors, drop_rows, list_rows
+from graphnav.online.lines import format_head, format_line, parse_row, parse_setup
 from graphnav.online.rows import Reading
 from graphnav.recording import Recording
 from graphnav.recording.checks.overview import inspect
@@ -93,11 +93,11 @@ def test_what_cannot_be_read_is_left_out_or_refused(drive, name):
 
 
 def test_rows_of_the_line_protocol(drive):
-    setup = setup_of(head_of(drive))
-    same(replace(drive, sensors=without_rows(drive).sensors), setup)
+    setup = parse_setup(format_head(drive))
+    same(replace(drive, sensors=drop_rows(drive).sensors), setup)
     sensors = Sensors(setup)
-    for row in rows_of(drive)[1]:
-        back = row_of(line_of(row))
+    for row in list_rows(drive)[1]:
+        back = parse_row(format_line(row))
         assert back[0] == row[0]
         np.testing.assert_allclose(back[1:][1], row[2], rtol=1e-14)
         if row[0] in drive.sensors or row[0] == "imu":
@@ -112,7 +112,7 @@ def test_rows_of_the_line_protocol(drive):
         ("S", "''"),
     ):
         with pytest.raises(ValueError, match=re.escape(name)):
-            row_of(wrong)
+            parse_row(wrong)
     with refused("row.bounds", RecordingError):
         Reading(1.0, list_sensors()["barometer"], pressure=1.0)
     assert Reading(1.0, list_sensors()["barometer"], pressure=1e5)[0] == "barometer"
@@ -151,11 +151,11 @@ def test_columns_and_units_of_a_file(drive, tmp_path):
 
 def test_settings_of_a_sensor(tmp_path):
     file = tmp_path / "settings.toml"
-    file.write_text(settings_text(settings_from({"sensors": {"barometer": {"use": False}}})))
+    file.write_text(format_settings(parse_settings({"sensors": {"barometer": {"use": False}}})))
     assert not read_settings(file).sensor("barometer").use
     assert Settings().sensor("barometer").use
     with refused("key.value", ConfigError, "barometer"):
-        settings_from({"sensors": {"barometre": {}}})
+        parse_settings({"sensors": {"barometre": {}}})
 
 
 def test_a_name_that_is_taken():

@@ -15,15 +15,15 @@ from helpers import refuse_command
 from test_formats_binary import write_bag, write_ubx
 
 from graphnav.app import cli
-from graphnav.core.notes import key_of
-from graphnav.core.timescales import between_clocks
+from graphnav.core.notes import get_key
+from graphnav.core.timescales import compute_clock_offset
 from graphnav.recording.checks.overview import inspect
 from graphnav.recording.draft import draft
 from graphnav.recording.draft.guesses import estimate_noise_density
 from graphnav.recording.draft.plain import read_plain
 from graphnav.recording.formats import read
 from graphnav.recording.formats.trajectories import read_trajectory
-from graphnav.sensors.barometer import standard_height
+from graphnav.sensors.barometer import compute_standard_height
 
 RECORDING, TRUTH = logs.simulated(60.0)
 FAST = ("--solver", "ekf", "--noise", "stated", "--quiet")
@@ -72,7 +72,7 @@ def test_the_folder_of_a_phone(tokyo, tmp_path, capsys, total):
     assert recording.gps_zero is not None
     air = recording.sensors["barometer"]
     height = np.interp(air.t - stranger.UNIX, drive.recording.gnss.t, drive.recording.gnss.llh[:, 2])
-    assert rms(standard_height(air) - height) < 0.3  # m, of which 0.2 are wind
+    assert rms(compute_standard_height(air) - height) < 0.3  # m, of which 0.2 are wind
     imu = drive.recording.imu
     force = np.interp(recording.imu.t - stranger.UNIX, imu.t, np.linalg.norm(imu.accel, axis=1))
     assert rms(np.linalg.norm(recording.imu.accel, axis=1) - force) < 0.1  # m/s2; between rows 2 ms apart
@@ -253,7 +253,7 @@ def test_a_topic_of_what_is_no_bag_is_one_line(tmp_path, capsys):
     ],
 )  # fmt: skip
 def test_what_lies_between_clocks_that_are_known(t, zero, u, other, offset):
-    found = between_clocks(t, zero, u, other)
+    found = compute_clock_offset(t, zero, u, other)
     assert (found and found.offset) == (None if offset is None else pytest.approx(offset, abs=1e-6))
 
 
@@ -332,4 +332,4 @@ def test_what_a_description_states_is_not_said_to_be_assumed(tokyo, tmp_path):
     assumed = {"imu.axes_assumed", "gnss.lever_arm_unknown"}
     for imu, gnss, said in (("", "", assumed), ('axes = "FLU"\n', "lever_arm = [0.0, 0.0, 0.9]\n", set())):
         (tmp_path / "a.toml").write_text(f'{text}{imu}[gnss]\nfile = "bag"\n{gnss}')
-        assert {key_of(r) for r in read(tmp_path / "a.toml").remarks} & assumed == said
+        assert {get_key(r) for r in read(tmp_path / "a.toml").remarks} & assumed == said

@@ -77,25 +77,25 @@ THREE = np.random.default_rng(0).normal(size=(COUNT, 3))
 FIXES = plots.DrawnFixes(T, THREE, T > 590, {"fixed": T < 300, "float": T >= 300})
 END = float(COUNT)
 EVERY = {
-    "way": lambda: plots.trajectory(
+    "way": lambda: plots.plot_trajectory(
         {"batch": (T, THREE[:, :2]), "ekf": (T, THREE[:, :2] + 1)},
         fixes=FIXES,
         truth=THREE[:, :2],
         spans={"withheld": [(10, 50)], "no GNSS": [(100, 140)]},
         stops=[(200, 220)],
     ),
-    "profile": lambda: plots.profile({"batch": (T, THREE[:, 2])}, {"fixed": (T, THREE[:, 2])}),
-    "bands": lambda: plots.bands(
+    "profile": lambda: plots.plot_profile({"batch": (T, THREE[:, 2])}, {"fixed": (T, THREE[:, 2])}),
+    "bands": lambda: plots.plot_bands(
         {"rts": plots.Curve(T, THREE, np.ones((COUNT, 3)))}, ("a", "b", "c"), "m", END, spans={"withheld": [(3, 9)]}
     ),
-    "sigmas": lambda: plots.sigmas(
+    "sigmas": lambda: plots.plot_sigmas(
         {"unknown solver": plots.Curve(T, np.abs(THREE))}, ("a", "b", "c"), "m/s", END, spans={}
     ),
-    "zoom": lambda: plots.span_zoom({"ekf": plots.Curve(T, THREE[:, :1] ** 2)}, [(100, 200), (300, 340)]),
-    "residuals": lambda: plots.residuals(record(), START, END, "ekf", spans={"excluded": [(90, 99)]}),
-    "nees": lambda: plots.nees({"ekf": plots.Curve(T, THREE**2)}, ("p", "v", "rph"), (3, 3, 3), END, spans={}),
-    "timeline": lambda: plots.timeline({"gnss": record(), "nhc": record(2)}, START, END, "ekf", spans={}),
-    "detections": lambda: plots.detections(*detected()),
+    "zoom": lambda: plots.plot_span_zoom({"ekf": plots.Curve(T, THREE[:, :1] ** 2)}, [(100, 200), (300, 340)]),
+    "residuals": lambda: plots.plot_residuals(record(), START, END, "ekf", spans={"excluded": [(90, 99)]}),
+    "nees": lambda: plots.plot_nees({"ekf": plots.Curve(T, THREE**2)}, ("p", "v", "rph"), (3, 3, 3), END, spans={}),
+    "timeline": lambda: plots.plot_timeline({"gnss": record(), "nhc": record(2)}, START, END, "ekf", spans={}),
+    "detections": lambda: plots.plot_detections(*detected()),
 }
 
 
@@ -127,7 +127,7 @@ def test_long_series_are_thinned_and_keep_their_spikes():
     t = np.arange(200_000.0)
     y = np.sin(t / 1e4)
     y[77_777] = 9.0
-    figure = plots.bands({"ekf": plots.Curve(t, y[:, None])}, ("east",), "m", t[-1], spans={})
+    figure = plots.plot_bands({"ekf": plots.Curve(t, y[:, None])}, ("east",), "m", t[-1], spans={})
     (drawn,) = drawn_as(figure, "ekf")
     assert len(x_of(drawn)) <= 4 * plots.BINS
     assert 77_777.0 in x_of(drawn)
@@ -136,7 +136,7 @@ def test_long_series_are_thinned_and_keep_their_spikes():
 def test_lines_and_bands_do_not_lead_across_gaps():
     t = np.concatenate([np.arange(100.0), 500 + np.arange(100.0)])
     value = np.ones((200, 1))
-    figure = plots.bands({"ekf": plots.Curve(t, value, value)}, ("east",), "m", t[-1], spans={})
+    figure = plots.plot_bands({"ekf": plots.Curve(t, value, value)}, ("east",), "m", t[-1], spans={})
     (line,) = drawn_as(figure, "ekf")
     assert np.flatnonzero(np.isnan(y_of(line))).tolist() == [100]
     (band,) = drawn_as(figure, "3 sigma")
@@ -147,7 +147,7 @@ def test_lines_and_bands_do_not_lead_across_gaps():
 
 # ----------------------------------------------------------------------------------------------------------- figures
 def test_bands_draw_the_values_given():
-    figure = plots.bands(
+    figure = plots.plot_bands(
         {"batch": plots.Curve(T, THREE, np.full((COUNT, 3), 2.0))}, ("east", "north", "up"), "m", END, spans={}
     )
     drawn = drawn_as(figure, "batch")
@@ -163,17 +163,17 @@ def test_a_spike_does_not_set_the_scale_but_what_lies_in_a_span_does():
     value = np.random.default_rng(2).normal(size=(COUNT, 1))
     value[100] = 500.0
     series = {"ekf": plots.Curve(T, value)}
-    figure = plots.bands(series, ("east",), "m", END, spans={})
+    figure = plots.plot_bands(series, ("east",), "m", END, spans={})
     assert np.abs(np.delete(value, 100)).max() <= y_range(figure)[1] < 10.0
     assert 500.0 in y_of(drawn_as(figure, "ekf")[0])  # it is there to zoom out to
-    inside = plots.bands(series, ("east",), "m", END, spans={"withheld": [(90.0, 110.0)]})
+    inside = plots.plot_bands(series, ("east",), "m", END, spans={"withheld": [(90.0, 110.0)]})
     assert y_range(inside)[1] > 500.0
 
 
 def test_the_first_sigma_of_a_filter_does_not_set_the_scale():
     value, sigma = np.zeros((COUNT, 1)), np.full((COUNT, 1), 0.1)
     sigma[0] = 1000.0
-    low, high = y_range(plots.bands({"ekf": plots.Curve(T, value, sigma)}, ("up",), "m", END, spans={}))
+    low, high = y_range(plots.plot_bands({"ekf": plots.Curve(T, value, sigma)}, ("up",), "m", END, spans={}))
     assert 0.3 < high < 0.4
     assert low == -high
 
@@ -181,7 +181,7 @@ def test_the_first_sigma_of_a_filter_does_not_set_the_scale():
 def test_trajectory_is_to_scale_and_marks_what_happened():
     enu = np.stack([3 * T, T, T], -1)
     out = (T == 7) | (T == 9)
-    figure = plots.trajectory(
+    figure = plots.plot_trajectory(
         {"batch": (T, enu[:, :2])}, fixes=plots.DrawnFixes(T, enu + 1, out, {"fixed": T < 100, "single": T >= 100}),
         spans={"withheld": [(10, 20)], "no GNSS": [(30, 33)]}, stops=[(40, 42)],
     )  # fmt: skip
@@ -204,14 +204,16 @@ def test_trajectory_is_to_scale_and_marks_what_happened():
 @pytest.mark.parametrize(("over", "up"), [(30.0, 0.0), (-30.0, 2.0), (25.0, -10.0), (0.0, -25.0), (0.0, 25.0)])
 def test_labels_of_ends_that_are_near_do_not_cover_each_other(over: float, up: float) -> None:
     way = np.array([[0.0, 0.0], [1000.0, 0.0], [1000.0, 500.0], [over, up]])
-    notes = [note for note in plots.trajectory({"batch": (T[:4], way)}).annotations if note["text"] in ("start", "end")]
+    notes = [
+        note for note in plots.plot_trajectory({"batch": (T[:4], way)}).annotations if note["text"] in ("start", "end")
+    ]
     (low, high) = sorted((note["y"] + note["yshift"], note["y"]) for note in notes)  # a metre is about a pixel
     assert high[0] - low[0] >= 14.0  # a line of text
     assert high[1] >= low[1]
 
 
 def test_scale_bar_is_as_long_as_it_says():
-    figure = plots.trajectory({"batch": (T, np.stack([3 * T, T], -1))})
+    figure = plots.plot_trajectory({"batch": (T, np.stack([3 * T, T], -1))})
     words = next(note["text"] for note in figure.annotations if note["text"].endswith((" m", " km")))
     (bar,) = [shape for shape in figure.shapes if shape["type"] == "line"]
     metres = float(words.split()[0]) * (1000 if words.endswith("km") else 1)
@@ -219,7 +221,7 @@ def test_scale_bar_is_as_long_as_it_says():
 
 
 def test_residuals_mark_what_was_rejected_and_weakened():
-    figure = plots.residuals(record(), START, END, "ekf", spans={})
+    figure = plots.plot_residuals(record(), START, END, "ekf", spans={})
     assert [x_of(m) for m in drawn_as(figure, "rejected")] == [[51.0]] * 4
     assert x_of(drawn_as(figure, "weight < 0.5")[0]) == [61.0, 62.0, 63.0]
     # three components, and the NIS with the middle 99 % of chi-square (tables: 0.0717, 12.84)
@@ -230,12 +232,12 @@ def test_residuals_mark_what_was_rejected_and_weakened():
 
 def test_nees_is_drawn_per_degree_of_freedom():
     series = {"ekf": plots.Curve(T, np.full((COUNT, 2), 6.0))}
-    figure = plots.nees(series, ("position", "attitude"), (2, 3), END, spans={})
+    figure = plots.plot_nees(series, ("position", "attitude"), (2, 3), END, spans={})
     assert [set(y_of(line)) for line in drawn_as(figure, "ekf")] == [{3.0}, {2.0}]
 
 
 def test_timeline_has_a_row_per_constraint():
-    figure = plots.timeline({"gnss": record(), "nhc": record(2)}, START, 700.0, "ekf", spans={})
+    figure = plots.plot_timeline({"gnss": record(), "nhc": record(2)}, START, 700.0, "ekf", spans={})
     layout = figure.json["layout"]
     assert layout["xaxis"]["range"] == [0.0, 700.0]
     assert (layout["yaxis"]["tickvals"], layout["yaxis"]["ticktext"]) == ([1.0, 0.0], ["gnss", "nhc"])
@@ -244,7 +246,7 @@ def test_timeline_has_a_row_per_constraint():
 
 def test_detections_show_statistics_thresholds_and_the_idle_line():
     recording, found = detected()
-    figure = plots.detections(recording, found)
+    figure = plots.plot_detections(recording, found)
     assert [y_of(line)[0] for line in drawn_as(figure, "threshold: below it stands")] == [3.0, 1.0]
     tints = [(shape["yref"], shape["x0"], shape["x1"]) for shape in figure.shapes]
     ahead = START - recording.start
@@ -264,7 +266,7 @@ def test_detections_show_statistics_thresholds_and_the_idle_line():
 
 def test_span_zoom_has_a_panel_per_span():
     t = np.arange(1000.0)
-    figure = plots.span_zoom({"ekf": plots.Curve(t, t[:, None])}, [(100, 200), (400, 440), (700, 760)])
+    figure = plots.plot_span_zoom({"ekf": plots.Curve(t, t[:, None])}, [(100, 200), (400, 440), (700, 760)])
     drawn = drawn_as(figure, "ekf")
     assert [(x_of(d)[0], x_of(d)[-1]) for d in drawn] == [(65, 235), (386, 454), (679, 781)]
     assert [d["xaxis"] for d in drawn] == ["x", "x2", "x3"]
@@ -283,7 +285,7 @@ def test_plotly_takes_every_figure(name):
     text = json.dumps(figure.json)
     assert "NaN" not in text
     names = set(re.findall(r"var\(--([\w-]+)\)", text))
-    assert names <= {*plots.PALETTE, "soft", "card", "edge", "words", plots.variable("unknown solver")[2:]}
+    assert names <= {*plots.PALETTE, "soft", "card", "edge", "words", plots.name_variable("unknown solver")[2:]}
     go.Figure(json.loads(re.sub(r"var\(--[\w-]+\)([0-9a-f]{2})?", "#112233", text)))
 
 

@@ -19,12 +19,12 @@ from graphnav.constraints.gnss import LEVER_ARM, TIME_OFFSET, VELOCITY_TIME_OFFS
 from graphnav.constraints.vehicle import AXLE, BODY, MOUNTING, ODOMETER_DELAY, ODOMETER_SCALE
 from graphnav.core import rotation
 from graphnav.core.earth import LocalFrame
-from graphnav.core.notes import Note, key_of
+from graphnav.core.notes import Note, get_key
 from graphnav.core.state import States
 from graphnav.detectors.base import Detection
-from graphnav.estimation.names import components, has_names
+from graphnav.estimation.names import has_names, name_components
 from graphnav.estimation.noise.model import NoiseModel, RowWeights, VarianceComponent
-from graphnav.estimation.noise.table import figure_rows
+from graphnav.estimation.noise.table import tabulate_figures
 from graphnav.estimation.solution import (
     ConstraintRecord,
     ExcludedSpan,
@@ -34,20 +34,20 @@ from graphnav.estimation.solution import (
     join_solutions,
 )
 from graphnav.evaluation.metrics import Errors
-from graphnav.evaluation.segments import relative_errors
+from graphnav.evaluation.segments import compute_relative_errors
 from graphnav.imu.dynamics import SCALE
 from graphnav.recording import Gnss, Imu, Recording, Truth
 from graphnav.recording.allan import compute_allan
 from graphnav.report import allan as allan_page
 from graphnav.report import page, wording
 from graphnav.report import pictures as report_pictures
-from graphnav.report.consistency import consistency
+from graphnav.report.consistency import summarise_record
 from graphnav.report.documents import write_comparison, write_report
 from graphnav.report.doubts import find_departures, list_doubts
-from graphnav.report.provenance import command, toml_text
+from graphnav.report.provenance import format_command, format_toml
 from graphnav.report.sentences import describe_sigma_without_truth
-from graphnav.report.summary import fix_table, left_out, sigma_table, verdicts
-from graphnav.report.tables import accuracy_row, excluded_table, rejected_table, span_row, stop_table
+from graphnav.report.summary import describe_excluded, fix_table, tabulate_sigmas, tabulate_verdicts
+from graphnav.report.tables import stop_table, tabulate_accuracy, tabulate_excluded, tabulate_rejected, tabulate_span
 
 START, COUNT = 1000.0, 600
 NAME = "drive <script>alert('x')</script> & \"co\""
@@ -250,7 +250,7 @@ def test_report_of_next_to_nothing(tmp_path, recording):
 def test_a_truth_without_heights_has_no_panel_of_them():
     flat = errors_of()
     flat.p[:, 2] = np.nan
-    (position, _) = report_pictures.error_pictures({"ekf": flat}, START, COUNT, {})
+    (position, _) = report_pictures.draw_errors({"ekf": flat}, START, COUNT, {})
     (figure,) = (json.loads(unpacked(packed)) for packed in re.findall(r'data-size="\d+">([^<]*)<', position))
     assert len([name for name in figure["layout"] if name.startswith("yaxis")]) == 2
 
@@ -262,7 +262,7 @@ def test_what_was_excluded_is_listed_and_marked(tmp_path, recording):
     for words in ("200.0 to 219.5 s", "jumped by 31 m <sideways>", "20 measurements", "excluded fix"):
         assert words in text, words
     # seconds 200 to 219, and the one that the record says was rejected
-    fixes = report_pictures.fixes_of(recording, found)
+    fixes = report_pictures.select_fixes(recording, found)
     np.testing.assert_allclose(fixes.t[fixes.excluded], [51.0, *np.arange(200.0, 220.0)])
     assert "excluded fix" in checked(write(tmp_path, recording))[1]
     kept = replace(solution(), records={})
@@ -272,15 +272,15 @@ def test_what_was_excluded_is_listed_and_marked(tmp_path, recording):
 def test_of_many_exclusions_ten_are_shown_and_three_lines_say_what_was_left_out(tmp_path, recording):
     parts = tuple(ExcludedSpan("gnss_position", START + 20.0 * k, START + 20.0 * k + 4.0, 5 + k) for k in range(14))
     found = replace(solution(), excluded=parts)
-    (shown, folded) = excluded_table(found, START)[1:]
+    (shown, folded) = tabulate_excluded(found, START)[1:]
     assert shown.count("<tr>") == 11
     assert "<details>" in folded
     assert folded.count("<tr>") == 5
-    lines = left_out(found, START)[1]
+    lines = describe_excluded(found, START)[1]
     assert lines.count("<li>") <= 3
     assert "18 rows from 260.0 to 264.0 s" in lines
     assert f"{sum(range(5, 17))} rows in 12 more spans" in lines
-    assert 'data-key="left_out.nothing"' in left_out(replace(solution(), records={}), START)[1]
+    assert 'data-key="left_out.nothing"' in describe_excluded(replace(solution(), records={}), START)[1]
 
 
 def cells(table):
@@ -308,7 +308,7 @@ def test_fixes_are_counted_and_coloured_by_type(tmp_path, recording):
     assert len(set(colours.values())) == 3
     stated = np.where(np.arange(COUNT) < 9, 5.0, 0.01)[:, None] * np.ones(3)
     unknown = replace(recording, gnss=replace(recording.gnss, sd=stated))
-    assert {name: rows.sum() for name, rows in report_pictures.fixes_of(unknown, found).kinds.items()} == {
+    assert {name: rows.sum() for name, rows in report_pictures.select_fixes(unknown, found).kinds.items()} == {
         "sigma below 0.1 m": COUNT - 9, "sigma 1 m and more": 9,
     }  # fmt: skip
 
@@ -353,20 +353,20 @@ def test_the_time_axis_can_be_read_on_every_clock_that_is_known(tmp_path, record
 
 
 def test_quantiles_of_sigma_are_those_of_the_keyframes():
-    rows = {row[0]: row[1:] for row in cells(sigma_table(solution())[1])}
+    rows = {row[0]: row[1:] for row in cells(tabulate_sigmas(solution())[1])}
     assert [float(x) for x in rows["position, horizontal [m]"]] == pytest.approx([0.2 * np.sqrt(2.0)] * 3, rel=1e-3)
     assert float(rows["heading [deg]"][2]) == pytest.approx(np.degrees(1e-3), rel=1e-2)
 
 
 def test_each_block_is_judged_by_itself():
     e = errors_of(sd=0.02)
-    assert re.findall(r'class="verdict (\w*)"><b>(\w+)', verdicts(solution(), e)) == [
+    assert re.findall(r'class="verdict (\w*)"><b>(\w+)', tabulate_verdicts(solution(), e)) == [
         ("bad", "Position"), ("", "Velocity"), ("", "Attitude"),
     ]  # fmt: skip
     off = record(kind="residual")
     off.nis[60:63], off.weight[60:63] = 1e6, 1e-6  # rows that weigh next to nothing do not speak against the others
     velocities = replace(solution(), records={"gnss_position": off, "gnss_velocity": record(3.0)})
-    assert re.findall(r'class="verdict (\w*)"><b>(\w+)', verdicts(velocities, None)) == [
+    assert re.findall(r'class="verdict (\w*)"><b>(\w+)', tabulate_verdicts(velocities, None)) == [
         ("", "Position"), ("bad", "Velocity"), ("", "Attitude"),
     ]  # fmt: skip
 
@@ -375,12 +375,12 @@ def test_a_calibration_has_names_and_no_index():
     sizes = {SCALE: 6, MOUNTING: 2, AXLE: 1, BODY: 2, ODOMETER_SCALE: 1, ODOMETER_DELAY: 1, LEVER_ARM: 3,
              TIME_OFFSET: 1, VELOCITY_TIME_OFFSET: 1, PIVOT: 3, TRAVEL: 2, FOOT_AXIS: 2}  # fmt: skip
     for name, size in (*sizes.items(), (SCALE, 18)):
-        found = components(name, size, "u")
+        found = name_components(name, size, "u")
         assert has_names(name)
         assert len({c.words for c in found}) == size
         assert not any("[" in c.words for c in found)
     assert not has_names(PATTERN)
-    assert len(components(PATTERN, 15, "m/s")) == 15
+    assert len(name_components(PATTERN, 15, "m/s")) == 15
 
 
 def test_relative_errors_are_those_of_displacements():
@@ -388,17 +388,17 @@ def test_relative_errors_are_those_of_displacements():
     e, way = errors_of(), np.linspace(0.0, 10_000.0, n)
     off = np.column_stack([0.01 * way + 7.0, np.zeros(n), np.zeros(n)])  # 1 % of the way, and an offset that is in none
     drifting = replace(e, t=np.arange(n) * 1.0, p=off, distance=way, rph=np.radians(way / 1000.0)[:, None] * np.ones(3))
-    found = relative_errors(drifting)
+    found = compute_relative_errors(drifting)
     assert [r.length for r in found] == [10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1000.0]
     for r in found:
         assert r.percent == pytest.approx(1.0, rel=1e-6)
         assert r.heading_rms == pytest.approx(r.length / 1000.0, rel=1e-6)
-    assert relative_errors(replace(e, distance=np.full(COUNT, np.nan))) == ()
+    assert compute_relative_errors(replace(e, distance=np.full(COUNT, np.nan))) == ()
 
 
 def test_rejected_measurements_are_listed_with_their_times(tmp_path, recording):
     # of row 50, at 51 s: every component is 40 sigma, which is 20 m
-    (only,) = cells(rejected_table(solution(), START)[0])
+    (only,) = cells(tabulate_rejected(solution(), START)[0])
     assert only[:1] + only[2:] == ["51.00 s", "+20 m, east", "40.00"]
     assert "51.00 s" in checked(write(tmp_path, recording))[1]
 
@@ -431,7 +431,7 @@ def test_sigma_is_judged_by_what_was_met_where_there_is_no_truth(tmp_path, recor
     found = replace(solution(), records={"gnss_position": record(scale, kind)})
     said = describe_sigma_without_truth(found)
     assert re.findall(r'data-key="([^"]*)"', said) == [f"no_truth.{key}"]
-    size = np.sqrt(consistency(found.records["gnss_position"]).mean_nis / 3.0)
+    size = np.sqrt(summarise_record(found.records["gnss_position"]).mean_nis / 3.0)
     assert f"{size:.2f}" in said
     assert f"no_truth.{key}" in checked(write_report(tmp_path / "r.html", recording, found, settings={}))[0].keys
 
@@ -498,7 +498,7 @@ def test_the_noise_model_is_a_table(tmp_path, recording):
         {"gnss_error_of_seconds": 4.25},
         {"gnss_position": RowWeights(record().t[:7], np.full(7, 0.125))},
     )
-    rows = figure_rows(noise, recording, (100.0, 3600.0))
+    rows = tabulate_figures(noise, recording, (100.0, 3600.0))
     found = replace(solution(), noise=noise)
     for text in (
         checked(write_report(tmp_path / "r.html", recording, found, settings={}, noise=rows))[1],
@@ -543,7 +543,7 @@ def test_pieces_keep_all_weights_and_spans_and_the_report_says_whose_figures_it_
     }
     assert whole.noise.excluded == {"gnss_position": ((t[0], t[1]), (t[1], t[2]))}
     assert whole.passes == {"filter": 6, "smoother": 1}
-    rows = figure_rows(whole.noise, recording, (100.0, 3600.0))
+    rows = tabulate_figures(whole.noise, recording, (100.0, 3600.0))
     shown = replace(whole, t=parts[0].t, states=parts[0].states, covariance=parts[0].covariance)
     page, _ = checked(write_report(tmp_path / "r.html", recording, shown, settings={}, noise=rows))
     assert "noise.of_first_piece" in page.keys
@@ -558,17 +558,17 @@ def test_innovations_speak_for_all_solvers(tmp_path, recording):
 def test_a_column_without_any_number_is_left_out():
     nan = float("nan")
     rows = [["ekf", 2.0, nan, nan], ["rts", 1.0, nan, 5.0]]
-    assert page.table(["solver", "a", "b", "c"], rows, best=[1, 2, 3]).count("<td") == 6
-    assert page.table(["solver", "a", "b", "c"], rows, best=[1, 2, 3]).count('class="best"') == 2
-    assert "b" not in re.findall(r"<th[^>]*>(\w+)</th>", page.table(["solver", "a", "b", "c"], rows))
+    assert page.format_table(["solver", "a", "b", "c"], rows, best=[1, 2, 3]).count("<td") == 6
+    assert page.format_table(["solver", "a", "b", "c"], rows, best=[1, 2, 3]).count('class="best"') == 2
+    assert "b" not in re.findall(r"<th[^>]*>(\w+)</th>", page.format_table(["solver", "a", "b", "c"], rows))
 
 
 def test_settings_and_command_come_back_as_they_were():
     settings = Settings().model_dump()
     settings["gnss"]["robust"] = 'a "quoted" \\ word, µ'
-    assert tomllib.loads(toml_text(settings)) == without_none(settings)
+    assert tomllib.loads(format_toml(settings)) == without_none(settings)
     options = {"recording": "a b", "solvers": "ekf,rts", "without": ["gnss:4-6", "odometer"], "rate": 5.0}
-    assert command(options) == (
+    assert format_command(options) == (
         "graphnav compare 'a b' --solvers ekf,rts --without gnss:4-6 --without odometer --rate 5.0 "
         "--config settings.toml -o again"
     )
@@ -599,8 +599,8 @@ def test_comparison_has_a_row_per_solver_and_span(tmp_path, recording):
     parser, text = checked(path)
     for k in range(4):
         # outside the outlier's span RMS and largest are the offset itself
-        assert wording.number(0.111 * (k + 1)) in text
-        assert wording.number(7 * 0.111 * (k + 1)) in text
+        assert wording.format_number(0.111 * (k + 1)) in text
+        assert wording.format_number(7 * 0.111 * (k + 1)) in text
     assert text.count("Withheld 100 to 160 s") == text.count("Withheld 250 to 350 s") == 1
     said = [key.removeprefix("sigma.") for key in parser.keys if key.startswith("sigma.")]
     assert dict(zip(solvers, said, strict=True)) == {
@@ -613,15 +613,15 @@ def test_accuracy_rows():
     e = errors_of(0.25, sd=0.5)
     squares = np.array([0.25**2] * (COUNT - 1) + [(7 * 0.25) ** 2])
     np.testing.assert_allclose(
-        accuracy_row(e),
+        tabulate_accuracy(e),
         [np.sqrt(squares.mean()), 7 * 0.25, 0, np.nan, *np.degrees([0.01, 0.01]), np.sqrt(squares.mean() / 3) / 0.5],
     )
     # 61 epochs, so 60 intervals of 5 m
     np.testing.assert_allclose(
-        span_row(e, (100.0, 160.0), START),
+        tabulate_span(e, (100.0, 160.0), START),
         [0.25, 0.25, 0.25, 100 * 0.25 / 300, 0, np.degrees(0.01), 0.5 / np.sqrt(3)],
     )
-    assert np.isnan(span_row(e, (5000.0, 5001.0), START)).all()
+    assert np.isnan(tabulate_span(e, (5000.0, 5001.0), START)).all()
 
 
 def test_closed_loop_without_errors(tmp_path, recording):
@@ -632,7 +632,7 @@ def test_closed_loop_without_errors(tmp_path, recording):
 
 
 def test_consistency_counts_and_judges():
-    c = consistency(record())
+    c = summarise_record(record())
     assert (c.count, c.rejected, c.reduced, c.dof) == (COUNT, 1, 3, 3)
     white = np.random.default_rng(1).normal(size=(COUNT, 3))
     used = np.arange(COUNT) != 50
@@ -644,7 +644,7 @@ def test_consistency_counts_and_judges():
         (record(0.5), "cautious"), (record(0.5, "residual"), "residuals_within"),
         (record(2.0, "residual"), "residuals_large"),
     ):  # fmt: skip
-        assert consistency(one).verdict.key == f"consistency.{key}"
+        assert summarise_record(one).verdict.key == f"consistency.{key}"
 
 
 def test_an_outlier_that_has_little_weight_says_nothing_against_sigma():
@@ -657,7 +657,7 @@ def test_an_outlier_that_has_little_weight_says_nothing_against_sigma():
     found = {}
     for name, some in (("weighted", rows), ("as good as the others", replace(rows, weight=np.ones(COUNT)))):
         one = replace(solution("rts"), records={"gnss_position": some})
-        found[name] = [key_of(doubt) for doubt in list_doubts({"rts": one}, {})]
+        found[name] = [get_key(doubt) for doubt in list_doubts({"rts": one}, {})]
     assert found == {"weighted": [], "as good as the others": ["doubt.sigma"]}
 
 
@@ -687,7 +687,7 @@ def test_a_truth_on_the_earth_is_laid_onto_a_walk_that_counts_from_its_start(rec
     states = replace(turned.states, p=p)
     walk = replace(turned, states=states, records={"stance": record()})
     walked = replace(recording, gnss=None, truth=replace(recording.truth, llh=far.to_llh(way(turned.t - START))))
-    t, laid = report_pictures._truth(walked, {"ekf": walk})
+    t, laid = report_pictures._find_truth(walked, {"ekf": walk})
     assert t == pytest.approx(turned.t)
     assert laid == pytest.approx(p, abs=0.05)  # the Earth is round
 

@@ -25,7 +25,7 @@ from graphnav.recording import Imu
 from graphnav.recording.checks.overview import inspect
 from graphnav.recording.formats import read
 from graphnav.simulation import Simulated, simulate
-from graphnav.simulation.footsteps import rectangle, route
+from graphnav.simulation.footsteps import list_rectangle, make_route
 from graphnav.simulation.gait import Sole
 from graphnav.simulation.scenarios.ren2021 import WALKS
 
@@ -226,7 +226,7 @@ def test_at_rest_it_feels_gravity() -> None:
 # ------------------------------------------------------------------------------------------------------------ walks
 @pytest.mark.parametrize("laps", [1, 3])
 def test_a_rectangle_is_as_long_as_it_should_be_and_closes(laps: int) -> None:
-    along = route(rectangle(86.0, laps), 30.0)
+    along = make_route(list_rectangle(86.0, laps), 30.0)
     assert along.length == pytest.approx(86.0 * laps)
     assert np.linalg.norm(along.xy[-1]) < 1e-4
     assert (along.heading[-1] - along.heading[0]) / DEG == pytest.approx(-360.0 * laps)

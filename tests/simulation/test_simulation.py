@@ -26,14 +26,14 @@ from graphnav.recording import Imu, Odometer
 from graphnav.recording.checks.overview import inspect
 from graphnav.recording.formats import read
 from graphnav.recording.formats.writing import write_folder
-from graphnav.simulation import Simulated, options_from, scenarios, simulate
+from graphnav.simulation import Simulated, list_scenarios, parse_options, simulate
 from graphnav.simulation.aiding import GnssModel, OdometerModel, SimulatedFault
-from graphnav.simulation.inertial import EG370N, MIMU, Triad, accelerometer, gyroscope
+from graphnav.simulation.inertial import EG370N, MIMU, Triad, make_accelerometer, make_gyroscope
 from graphnav.simulation.kinematics import Mount, TrueMotion, move
-from graphnav.simulation.motion import HEADING, SLIP, SPEED, Manoeuvre, drive
-from graphnav.simulation.passengers import Boarding, movement
+from graphnav.simulation.motion import HEADING, SLIP, SPEED, Manoeuvre, make_path
+from graphnav.simulation.passengers import Boarding, simulate_movement
 from graphnav.simulation.scenarios.li2024 import TABLE_4
-from graphnav.simulation.vibration import Shake, road_noise
+from graphnav.simulation.vibration import Shake, simulate_road_noise
 
 pytestmark = pytest.mark.filterwarnings("ignore:The copy keyword")  # of pandas, about pyins
 
@@ -60,7 +60,7 @@ def made(name: str, seed: int = 0, **options: float) -> Simulated:
 @lru_cache(maxsize=4)
 def smooth(lat: float = 30.5, rate: float = 200.0, slip: float = 0.0) -> TrueMotion:
     """A drive with nothing that shakes."""
-    path = drive(WAY, heading=62.0, slip_per_accel=slip)
+    path = make_path(WAY, heading=62.0, slip_per_accel=slip)
     return move(path, (lat, *ORIGIN[1:]), ASKEW, Shake(), rate)
 
 
@@ -167,7 +167,7 @@ def test_rate_of_sampling_does_not_matter() -> None:
 
 # --------------------------------------------------------------------------------------------------- vehicle motion
 def test_axle_moves_where_the_vehicle_points() -> None:
-    motion, path = smooth(), drive(WAY, heading=62.0)
+    motion, path = smooth(), make_path(WAY, heading=62.0)
     t = np.linspace(0.1, motion.t[-1] - 0.1, 997)
     llh, v = motion.point(t, ASKEW.axle_lever_arm)
     R_lv = ro.from_rph(path.spline(t)[:, [3, 2, 1]])
@@ -178,7 +178,7 @@ def test_axle_moves_where_the_vehicle_points() -> None:
 
 
 def test_side_slip_is_outward_and_as_stated() -> None:
-    path = drive(WAY, heading=62.0, slip_per_accel=0.005)
+    path = make_path(WAY, heading=62.0, slip_per_accel=0.005)
     motion = move(path, ORIGIN, ASKEW, Shake(), 100.0)
     t = np.array([24.0, 35.0])  # to the right, to the left
     _, v = motion.point(t, ASKEW.axle_lever_arm)
@@ -254,7 +254,7 @@ def heading_at(motion: TrueMotion, t: Array) -> Array:
 )
 def test_impossible_manoeuvres(plan: list[Manoeuvre], key: str) -> None:
     with refused(key, ConfigError):
-        drive(plan)
+        make_path(plan)
 
 
 # -------------------------------------------------------------------------------------------------------- vibration
@@ -295,9 +295,9 @@ def test_without_an_engine_there_is_no_line() -> None:
 
 def test_road_dies_with_the_speed() -> None:
     def rms(speed: float) -> Array:
-        path = drive([Manoeuvre(5.0, speed), Manoeuvre(300.0, speed)])
+        path = make_path([Manoeuvre(5.0, speed), Manoeuvre(300.0, speed)])
         t = np.arange(10.0, 300.0, 0.002)
-        rate = road_noise(path, np.random.default_rng(0))(t)[1]
+        rate = simulate_road_noise(path, np.random.default_rng(0))(t)[1]
         return np.std(np.diff(rate, axis=0) / 0.002, axis=0)
 
     # at 14 m/s the sizes of the modes, times v / (v + 2), less what the splines leave out above 10 Hz
@@ -307,8 +307,8 @@ def test_road_dies_with_the_speed() -> None:
 
 
 def test_a_passenger_sinks_the_body_and_only_that() -> None:
-    path = drive([Manoeuvre(40.0, 0.0)])
-    shake = Shake((movement(path, [Boarding(10.0)], (0.0, 0.0, 1.2), np.random.default_rng(0)),))
+    path = make_path([Manoeuvre(40.0, 0.0)])
+    shake = Shake((simulate_movement(path, [Boarding(10.0)], (0.0, 0.0, 1.2), np.random.default_rng(0)),))
     motion = move(path, ORIGIN, Mount((0.0, 1.3, 1.5)), shake, 200.0)
     assert motion.llh[-1, 2] - motion.llh[0, 2] == pytest.approx(-0.0075, abs=2e-4)
     rph = ro.wrap(motion.rph[-1] - motion.rph[0])
@@ -332,14 +332,14 @@ def still(triad: Triad, hours: float, rate: float = 20.0, seed: int = 1) -> Arra
     return triad.read(np.zeros((round(3600 * hours * rate), 3)), rate, np.random.default_rng(seed))[0]
 
 
-@pytest.mark.parametrize("triad", [EG370N.gyro, MIMU.accel, gyroscope(0.3, 100.0)])
+@pytest.mark.parametrize("triad", [EG370N.gyro, MIMU.accel, make_gyroscope(0.3, 100.0)])
 def test_allan_deviation_at_a_second_is_the_noise_density(triad: Triad) -> None:
     assert allan(still(triad, 1.0), 20) == pytest.approx(triad.noise, rel=0.03)
 
 
 def test_instability_has_the_allan_deviation_of_a_gauss_markov_process() -> None:
     """IEEE Std 952-1997, eq. C.16, over the whole range of times."""
-    triad = replace(gyroscope(0.0, 0.0, instability_deg_h=5.0), correlation_time=20.0)
+    triad = replace(make_gyroscope(0.0, 0.0, instability_deg_h=5.0), correlation_time=20.0)
     x = still(triad, 12.0)
     for seconds in (2.0, 20.0, 38.0, 200.0):
         r = seconds / 20.0
@@ -348,7 +348,7 @@ def test_instability_has_the_allan_deviation_of_a_gauss_markov_process() -> None
 
 
 def test_random_walk_has_its_allan_deviation() -> None:
-    triad = gyroscope(0.0, 0.0, rrw_deg_h_sqrt_h=30.0)
+    triad = make_gyroscope(0.0, 0.0, rrw_deg_h_sqrt_h=30.0)
     assert triad.walk == pytest.approx(30.0 / 3600.0 * DEG / 60.0)
     assert allan(still(triad, 6.0), 200) == pytest.approx(triad.walk * np.sqrt(10.0 / 3.0), rel=0.06)
 
@@ -367,7 +367,7 @@ def test_turn_on_bias_scale_and_misalignment_have_their_sizes() -> None:
 
 
 def test_range_and_last_digit() -> None:
-    triad = accelerometer(0.0, 0.0, range_g=2.0, step_mg=1.0)
+    triad = make_accelerometer(0.0, 0.0, range_g=2.0, step_mg=1.0)
     out, _ = triad.read(np.array([[30.0, -30.0, 5.0004]]), 1.0, np.random.default_rng(0))
     assert out[0, :2].tolist() == pytest.approx([2000 * MG, -2000 * MG])
     assert out[0, 2] / MG == pytest.approx(round(out[0, 2] / MG), abs=1e-9)
@@ -395,7 +395,7 @@ def enu_errors(motion: TrueMotion, model: GnssModel, seed: int = 0) -> tuple[Arr
 
 
 def test_gnss_errors_have_their_sizes_and_times() -> None:
-    path = drive([Manoeuvre(4000.0, 0.0)])
+    path = make_path([Manoeuvre(4000.0, 0.0)])
     motion = move(path, ORIGIN, Mount(), Shake(), 5.0)
     model = GnssModel(white=(0.5, 0.6, 0.9), slow=(1.0, 1.0, 2.0), slow_time=5.0, velocity=(0.1, 0.1, 0.2), phase=0.3)
     t, e, dv = enu_errors(motion, model)
@@ -425,7 +425,7 @@ def test_gnss_faults() -> None:
 
 
 def test_odometer_readings() -> None:
-    path = drive(WAY, heading=62.0)
+    path = make_path(WAY, heading=62.0)
     mount = Mount()
     model = OdometerModel(rate=50.0, scale=0.02, white=0.0)
     odometer, scale = model.read(path, mount, 3)
@@ -445,7 +445,7 @@ def test_odometer_readings() -> None:
 
 
 def test_wheel_pulses_are_whole_and_none_is_lost() -> None:
-    path = drive(WAY, heading=62.0)
+    path = make_path(WAY, heading=62.0)
     model = OdometerModel(rate=25.0, scale=0.0, white=0.0, pulse=0.04)
     odometer, _ = model.read(path, Mount(), 0)
     counts = odometer.speed / 25.0 / 0.04
@@ -508,7 +508,7 @@ def test_idling_is_the_only_thing_odd_in_li2024() -> None:
 
 
 def test_every_scenario_is_tested() -> None:
-    assert set(scenarios()) == set(SHORT) | {"gait", "ren2021"}  # walks: test_gait.py
+    assert set(list_scenarios()) == set(SHORT) | {"gait", "ren2021"}  # walks: test_gait.py
 
 
 def test_seeds() -> None:
@@ -566,12 +566,12 @@ def test_bad_options_are_refused(name: str, options: dict[str, object], key: str
 
 
 def test_options_from_the_command_line() -> None:
-    assert options_from("urban", ["gnss=single", "duration=300", "odometer=false"]) == {
+    assert parse_options("urban", ["gnss=single", "duration=300", "odometer=false"]) == {
         "gnss": "single", "duration": 300, "odometer": False,
     }  # fmt: skip
     for bad in ("duration", "duration=soon", "=3"):
         with refused("option.value", ConfigError, "--set"):
-            options_from("urban", [bad])
+            parse_options("urban", [bad])
 
 
 def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -18,15 +18,15 @@ import numpy as np
 import graphnav
 from graphnav.app import outputs
 from graphnav.app.fleet.manifest import Task
-from graphnav.app.summary import median_sigmas, solver_summary
+from graphnav.app.summary import compute_median_sigmas, summarise_solver
 from graphnav.app.workflow import Outcome, Request, parse_noise, parse_withheld, read_part, run_request
-from graphnav.config.files import settings_from
+from graphnav.config.files import parse_settings
 from graphnav.core.errors import GraphnavError
-from graphnav.core.files import check_regular, parse_json, permit_outside, read_text, sha256
+from graphnav.core.files import check_regular, hash_file, parse_json, permit_outside, read_text
 from graphnav.core.jsonable import write_json
-from graphnav.core.memory import peak_memory_mb
+from graphnav.core.memory import read_peak_memory_mb
 from graphnav.core.staging import stage_results
-from graphnav.estimation.noise.apply import row_weights
+from graphnav.estimation.noise.apply import select_weights
 from graphnav.estimation.solution import Solution
 from graphnav.recording import Recording
 
@@ -51,7 +51,7 @@ def solve_drive(task: Task) -> Row:
             key = hash_task(task)
             if not task.again and (there := read_row(folder, key)) is not None:
                 return {**there, "drive": task.name, "source": task.source, "skipped": True}
-            outcome = run_request(_request(task))
+            outcome = run_request(_make_request(task))
             with stage_results(folder) as part:
                 outputs.write_run(outcome, part, task.pages)
             if not task.pages:
@@ -66,7 +66,7 @@ def solve_drive(task: Task) -> Row:
         row["error"] = f"{error.filename or 'input or output'}: {error.strerror or error}"
     except Exception as error:
         row["error"] = f"internal error: {type(error).__name__}: {error}"
-    row |= {"time_s": round(time.perf_counter() - began, 3), "memory_mb": peak_memory_mb()}
+    row |= {"time_s": round(time.perf_counter() - began, 3), "memory_mb": read_peak_memory_mb()}
     keep_row(folder, key, row)
     return row
 
@@ -99,8 +99,8 @@ def read_row(folder: Path, key: str | None = None) -> Row | None:
 def hash_task(task: Task) -> str:
     """Hash of everything a result depends on: this version, all options, and every byte of input."""
     asked = {k: v for k, v in asdict(task).items() if k not in ("name", "source", "folder", "again")}
-    asked |= {"graphnav": graphnav.__version__, "noise": task.noise and sha256(Path(task.noise))}
-    asked["input"] = [(name, sha256(path)) for name, path in _list_inputs(task.source)]
+    asked |= {"graphnav": graphnav.__version__, "noise": task.noise and hash_file(Path(task.noise))}
+    asked["input"] = [(name, hash_file(path)) for name, path in _list_inputs(task.source)]
     return hashlib.sha256(json.dumps(asked, sort_keys=True).encode()).hexdigest()
 
 
@@ -122,27 +122,27 @@ def _list_inputs(source: str) -> Iterator[tuple[str, Path]]:
             values = tomllib.loads(read_text(path))
         except (GraphnavError, tomllib.TOMLDecodeError, RecursionError):
             return  # reported when it is read
-        for name in sorted({text for text in _texts(values) if len(text) < 255 and "\0" not in text}):
+        for name in sorted({text for text in _list_texts(values) if len(text) < 255 and "\0" not in text}):
             if (path.parent / name).is_file():
                 yield name, path.parent / name
 
 
-def _texts(values: Any) -> Iterator[str]:
+def _list_texts(values: Any) -> Iterator[str]:
     if isinstance(values, str):
         yield values
     elif isinstance(values, Mapping | list):
         for one in values.values() if isinstance(values, Mapping) else values:
-            yield from _texts(one)
+            yield from _list_texts(one)
 
 
-def _request(task: Task) -> Request:
+def _make_request(task: Task) -> Request:
     """The request that `smooth` would make."""
-    settings = settings_from(task.settings)
+    settings = parse_settings(task.settings)
     noise = parse_noise(task.noise, settings)[1] if task.noise else None
     withheld = tuple(parse_withheld(one) for one in task.without)
     if task.withhold is not None:
         part = read_part(task.source, task.start, task.end)
-        withheld += tuple(("gnss", span) for span in spans(part, task.withhold, task.start or 0.0))
+        withheld += tuple(("gnss", span) for span in choose_spans(part, task.withhold, task.start or 0.0))
     given = {"recording": task.source, "solver": task.solver, "fleet": True, "withhold": task.withhold}
     return Request(
         task.source, (task.solver,), settings, withheld, task.start, task.end, task.rate,
@@ -150,7 +150,7 @@ def _request(task: Task) -> Request:
     )  # fmt: skip
 
 
-def spans(recording: Recording, length: float, zero: float = 0.0) -> list[tuple[float, float]]:
+def choose_spans(recording: Recording, length: float, zero: float = 0.0) -> list[tuple[float, float]]:
     """Spans (s from the start of a recording of which this part begins at `zero`) whose fixes are withheld and scored.
 
     The first minute is kept, more than a span's length between two spans, so that each is an outage by itself, and half
@@ -165,7 +165,7 @@ def spans(recording: Recording, length: float, zero: float = 0.0) -> list[tuple[
 def _collect_figures(outcome: Outcome) -> Row:
     """The figures of a solved drive for its row."""
     ((name, solution),) = outcome.solutions.items()
-    summary = solver_summary(outcome, name, {}, {})
+    summary = summarise_solver(outcome, name, {}, {})
     measured: Mapping[str, Any] = {**(summary["errors"] or {}), **(summary["nees"] or {})}
     ends = [span["end_h_m"] for span in summary["spans"] if span.get("end_h_m") is not None]
     speed = np.linalg.norm(solution.states.v[:, :2], axis=1)
@@ -179,7 +179,7 @@ def _collect_figures(outcome: Outcome) -> Row:
         "keyframes": len(solution.t),
         "against": outcome.against,
         **{key: measured.get(key) for key in MEASURED},
-        **{key: _round_figure(value) for key, value in median_sigmas(solution).items()},
+        **{key: _round_figure(value) for key, value in compute_median_sigmas(solution).items()},
         "spans": len(ends),
         "span_end_h_median_m": _round_figure(float(np.median(ends))) if ends else None,
         "span_end_h_max_m": max(ends, default=None),
@@ -213,7 +213,7 @@ def _measure_left_out(solution: Solution) -> float | None:
     fixes = solution.records.get("gnss_position")
     if fixes is None or not len(fixes.t):
         return None
-    return round(1.0 - float(np.mean(row_weights(fixes.t, solution.noise, "gnss_position"))), 5)
+    return round(1.0 - float(np.mean(select_weights(fixes.t, solution.noise, "gnss_position"))), 5)
 
 
 def _track(outcome: Outcome, solution: Solution) -> list[list[float]] | None:

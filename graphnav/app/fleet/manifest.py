@@ -16,13 +16,13 @@ from typing import Any
 
 from graphnav.app.workflow import parse_noise, parse_withheld
 from graphnav.config import read_settings
-from graphnav.config.files import settings_from
+from graphnav.config.files import parse_settings
 from graphnav.core.complaints import read_toml, suggest_nearest
 from graphnav.core.errors import ConfigError
 from graphnav.core.files import exists, is_inside, read_text
 from graphnav.estimation.noise.files import MODES
 from graphnav.estimation.pipeline import KNOWN
-from graphnav.recording.formats import formats, is_description
+from graphnav.recording.formats import is_description, list_formats
 
 
 @dataclass(frozen=True)
@@ -85,8 +85,8 @@ def read_drives(source: Path, asked: DriveOptions) -> list[tuple[str, str, Drive
                 key="recording.none",
             )
         return _number_clones(found)
-    rows = _csv_rows(source) if source.suffix == ".csv" else _toml_rows(source)
-    drives = [_drive(source, where, row, asked) for where, row in rows]
+    rows = _parse_csv(source) if source.suffix == ".csv" else _parse_toml(source)
+    drives = [_build_drive(source, where, row, asked) for where, row in rows]
     if not drives:
         raise ConfigError(f"{source}: names no recording", key="manifest.no_recording")
     twice = [name for name, count in Counter(name for name, *_ in drives).items() if count > 1]
@@ -142,7 +142,9 @@ def resolve_options(asked: DriveOptions, known: dict[Any, dict[str, Any]]) -> tu
     if key not in known:
         settings = read_settings(asked.config, asked.profile)
         if asked.settings:
-            settings = settings_from(_overlay(settings.model_dump(exclude_unset=True), _toml(asked.settings)))
+            settings = parse_settings(
+                _overlay(settings.model_dump(exclude_unset=True), _parse_settings(asked.settings))
+            )
         known[key] = parse_noise(asked.noise, settings)[0].model_dump(mode="json")
     return without, known[key]
 
@@ -185,7 +187,7 @@ def _number_clones(drives: list[tuple[str, str, DriveOptions, str]]) -> list[tup
     return out  # type: ignore[return-value]
 
 
-def _csv_rows(path: Path) -> list[tuple[str, Mapping[str, Any]]]:
+def _parse_csv(path: Path) -> list[tuple[str, Mapping[str, Any]]]:
     reader = csv.DictReader(io.StringIO(read_text(path, ConfigError)), strict=True)
     rows: list[tuple[str, Mapping[str, Any]]] = []
     try:
@@ -202,7 +204,7 @@ def _csv_rows(path: Path) -> list[tuple[str, Mapping[str, Any]]]:
     return rows
 
 
-def _toml_rows(path: Path) -> list[tuple[str, Mapping[str, Any]]]:
+def _parse_toml(path: Path) -> list[tuple[str, Mapping[str, Any]]]:
     values, _ = read_toml(path, ConfigError)
     drives = values.get("drive")
     if set(values) != {"drive"} or not isinstance(drives, list) or not all(isinstance(one, dict) for one in drives):
@@ -227,7 +229,9 @@ def _check_columns(names: Iterable[str], where: str) -> None:
         raise ConfigError(f"{where}: 'recording' is missing", key="manifest.no_recording")
 
 
-def _drive(source: Path, where: str, row: Mapping[str, Any], asked: DriveOptions) -> tuple[str, str, DriveOptions, str]:
+def _build_drive(
+    source: Path, where: str, row: Mapping[str, Any], asked: DriveOptions
+) -> tuple[str, str, DriveOptions, str]:
     """One row of a manifest; a blank field takes the common value."""
     values: dict[str, Any] = {}
     for key in (f.name for f in fields(DriveOptions)):
@@ -257,7 +261,7 @@ def _drive(source: Path, where: str, row: Mapping[str, Any], asked: DriveOptions
         values["noise"] = str(_find_beside(source, noise, where, "noise"))
     if "config" in values:
         values["config"] = str(_find_beside(source, values["config"], where, "config"))
-    builtin = recording in formats() and formats()[recording].builtin
+    builtin = recording in list_formats() and list_formats()[recording].builtin
     path = recording if builtin else str(_find_beside(source, recording, where, "recording"))
     name = row.get("name") or Path(recording.removesuffix("/recording.toml")).name.removesuffix(".toml")
     if not isinstance(name, str):
@@ -276,7 +280,7 @@ def _find_beside(source: Path, name: str, where: str, key: str) -> Path:
     return path
 
 
-def _toml(text: str) -> dict[str, Any]:
+def _parse_settings(text: str) -> dict[str, Any]:
     """Parse settings in one cell, with semicolons as line ends."""
     try:
         return tomllib.loads(text if "\n" in text else text.replace(";", "\n"))
@@ -288,11 +292,13 @@ def _toml(text: str) -> dict[str, Any]:
 
 def _write(values: Mapping[str, Any], at: str = "") -> str:
     """A table of settings as lines of dotted keys."""
-    from graphnav.config.files import toml_value
+    from graphnav.config.files import format_toml
 
     lines = []
     for key, value in values.items():
-        lines.append(_write(value, f"{at}{key}.") if isinstance(value, Mapping) else f"{at}{key} = {toml_value(value)}")
+        lines.append(
+            _write(value, f"{at}{key}.") if isinstance(value, Mapping) else f"{at}{key} = {format_toml(value)}"
+        )
     return "\n".join(lines)
 
 

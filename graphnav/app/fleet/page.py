@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from graphnav.app.fleet.drive import DONE, Row
-from graphnav.app.fleet.tables import describe_totals, numbers, totals, worst_first
+from graphnav.app.fleet.tables import collect_numbers, compute_totals, describe_totals, sort_by_error
 from graphnav.core.rotation import Array
 
 _MAX_DRIVES = 1000  # drives in the page's table; the files contain all
@@ -51,15 +51,17 @@ a{color:var(--ink)}
 
 def write_page(rows: Sequence[Row], path: Path, title: str) -> None:
     """Write the page; it links to the reports beside it."""
-    lead = f"{describe_totals(totals(rows))}."
+    lead = f"{describe_totals(compute_totals(rows))}."
     spread = [
-        _draw_histogram(numbers(rows, key), label) for key, label in _HISTOGRAMS.items() if len(numbers(rows, key)) > 1
+        _draw_histogram(collect_numbers(rows, key), label)
+        for key, label in _HISTOGRAMS.items()
+        if len(collect_numbers(rows, key)) > 1
     ]
     parts = [
         f"<h1>{escape(title)}</h1><p>{escape(lead)}</p>",
         f'<h2>How figures are spread</h2><div class="figures">{"".join(spread)}</div>' if spread else "",
         _draw_maps(rows),
-        "<h2>Drives, worst first</h2>" + _table(worst_first(rows)),
+        "<h2>Drives, worst first</h2>" + _format_table(sort_by_error(rows)),
     ]
     body = "".join(parts)
     head = f'<meta charset="utf-8"><meta name="viewport" content="width=device-width"><title>{escape(title)}</title>'
@@ -69,7 +71,7 @@ def write_page(rows: Sequence[Row], path: Path, title: str) -> None:
     )
 
 
-def _table(rows: Sequence[Row]) -> str:
+def _format_table(rows: Sequence[Row]) -> str:
     lines = []
     for row in rows[:_MAX_DRIVES]:
         name = escape(str(row["drive"]))
@@ -133,13 +135,13 @@ def _draw_maps(rows: Sequence[Row]) -> str:
     groups.sort(key=len, reverse=True)
     if not groups:
         return ""
-    figures = "".join(_map(group) for group in groups[:_MAPS])
+    figures = "".join(_draw_map(group) for group in groups[:_MAPS])
     left = sum(bool(row.get("placed")) for row in rows) - sum(map(len, groups[:_MAPS]))
     more = f'<p class="soft">{left} more tracks are not drawn.</p>' if left > 0 else ""
     return f'<h2>Where they drove</h2><div class="figures">{figures}</div>{more}'
 
 
-def _map(group: Sequence[tuple[Array, Row]]) -> str:
+def _draw_map(group: Sequence[tuple[Array, Row]]) -> str:
     points = np.concatenate([track for track, _ in group])
     low, high = points.min(0), points.max(0)
     shrink = math.cos(math.radians(float(points[:, 1].mean())))

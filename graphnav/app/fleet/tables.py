@@ -50,7 +50,7 @@ MEDIANS = {
 _BADNESS = ("span_end_h_median_m", "h_rms_m", "sd_h_median_m")
 
 
-def columns_of(rows: Sequence[Row]) -> list[str]:
+def list_columns(rows: Sequence[Row]) -> list[str]:
     """`COLUMNS`, plus one for the factor of each noise figure that any drive has."""
     return [*COLUMNS, *sorted({key for row in rows for key in row if key.startswith("noise.")})]
 
@@ -58,7 +58,7 @@ def columns_of(rows: Sequence[Row]) -> list[str]:
 def write_csv(rows: Sequence[Row], path: Path) -> None:
     """One line per drive; unknown values are blank."""
     text = io.StringIO()
-    writer = csv.DictWriter(text, columns_of(rows), extrasaction="ignore", lineterminator="\n")
+    writer = csv.DictWriter(text, list_columns(rows), extrasaction="ignore", lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
     path.write_text(text.getvalue(), encoding="utf-8")
@@ -71,44 +71,44 @@ def write_parquet(rows: Sequence[Row], path: Path) -> bool:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    def column(name: str) -> Any:
+    def make_column(name: str) -> Any:
         values = [row.get(name) for row in rows]
         if name in _TEXTS:
             return pa.array(values, pa.string())
         return pa.array([None if value is None else float(value) for value in values], pa.float64())
 
-    names = columns_of(rows)
-    pq.write_table(pa.table({name: column(name) for name in names}), path, compression="zstd")
+    names = list_columns(rows)
+    pq.write_table(pa.table({name: make_column(name) for name in names}), path, compression="zstd")
     return True
 
 
-def worst_first(rows: Sequence[Row]) -> list[Row]:
+def sort_by_error(rows: Sequence[Row]) -> list[Row]:
     """Drives without a result first, then those with a doubtful result, then the rest, each ordered by error."""
 
-    def badness(row: Row) -> tuple[bool, bool, float]:
+    def rank(row: Row) -> tuple[bool, bool, float]:
         off = next((float(row[key]) for key in _BADNESS if row.get(key) is not None), 0.0)
         return row["status"] == DONE, row.get("verdict") != "doubtful", -off
 
-    return sorted(rows, key=badness)
+    return sorted(rows, key=rank)
 
 
-def numbers(rows: Sequence[Row], key: str) -> Array:
+def collect_numbers(rows: Sequence[Row], key: str) -> Array:
     """The finite values of a column."""
     return np.array([float(row[key]) for row in rows if row.get(key) is not None])
 
 
-def totals(rows: Sequence[Row]) -> dict[str, Any]:
+def compute_totals(rows: Sequence[Row]) -> dict[str, Any]:
     """The totals of a fleet."""
     status, solved = Counter(row["status"] for row in rows), [row for row in rows if row["status"] == DONE]
     return {
         "drives": len(rows),
         "status": dict(status),
         "doubtful": sum(row.get("verdict") == "doubtful" for row in rows),
-        "hours": round(float(numbers(solved, "duration_s").sum()) / 3600.0, 4),
-        "km": round(float(numbers(solved, "distance_m").sum()) / 1000.0, 3),
-        "processor_s": round(float(numbers(rows, "time_s").sum()), 1),
-        "memory_mb": float(numbers(rows, "memory_mb").max(initial=0.0)),
-        "medians": {key: float(np.median(x)) for key in MEDIANS if len(x := numbers(rows, key))},
+        "hours": round(float(collect_numbers(solved, "duration_s").sum()) / 3600.0, 4),
+        "km": round(float(collect_numbers(solved, "distance_m").sum()) / 1000.0, 3),
+        "processor_s": round(float(collect_numbers(rows, "time_s").sum()), 1),
+        "memory_mb": float(collect_numbers(rows, "memory_mb").max(initial=0.0)),
+        "medians": {key: float(np.median(x)) for key in MEDIANS if len(x := collect_numbers(rows, key))},
     }
 
 
@@ -130,9 +130,9 @@ def describe_unscored(rows: Sequence[Row], withhold: float) -> str:
     return f"\nnothing withheld by --withhold {withhold:g} in {of}: no GNSS, or shorter than {least:g} s"
 
 
-def text(rows: Sequence[Row], most: int = 10) -> str:
+def format_totals(rows: Sequence[Row], most: int = 10) -> str:
     """The totals, and the failed drives, for a terminal."""
-    found = totals(rows)
+    found = compute_totals(rows)
     lines = [describe_totals(found)]
     if found["medians"]:
         lines.append("medians of the drives:")

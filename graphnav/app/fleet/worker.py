@@ -9,7 +9,7 @@ from contextlib import suppress
 
 from graphnav.app.fleet.drive import solve_drive
 from graphnav.app.fleet.manifest import Task
-from graphnav.core.jsonable import json_text
+from graphnav.core.jsonable import format_json
 
 
 def main() -> None:
@@ -21,7 +21,7 @@ def main() -> None:
     for line in sys.stdin:
         values = json.loads(line)
         row = solve_drive(Task(**{**values, "without": tuple(values["without"])}))
-        out.write(json.dumps(json.loads(json_text(row))) + "\n")
+        out.write(json.dumps(json.loads(format_json(row))) + "\n")
         out.flush()
 
 

@@ -29,10 +29,10 @@ from graphnav.estimation.alignment.antennas import measure_baseline_heading
 from graphnav.estimation.alignment.course import COURSE_SIGMA
 from graphnav.estimation.alignment.first import Alignment
 from graphnav.estimation.alignment.motion import align_in_motion, drop_implausible, find_motion_span
-from graphnav.estimation.alignment.rest import at_rest
+from graphnav.estimation.alignment.rest import level_at_rest
 from graphnav.recording import Recording
 
-__all__ = ["COURSE_SIGMA", "Alignment", "align", "is_ready", "with_known_heading"]
+__all__ = ["COURSE_SIGMA", "Alignment", "align", "is_ready", "use_known_heading"]
 
 
 def align(recording: Recording, settings: Settings, frame: LocalFrame, stationary: Array = NONE) -> Alignment:
@@ -51,7 +51,7 @@ def align(recording: Recording, settings: Settings, frame: LocalFrame, stationar
     recording = drop_implausible(recording)
     span = find_motion_span(recording, settings, stationary)
     if span is None:
-        return at_rest(recording, settings, frame, stationary)
+        return level_at_rest(recording, settings, frame, stationary)
     return replace(align_in_motion(recording, settings, frame, span), motion=span[0], until=span[1])
 
 
@@ -68,7 +68,7 @@ def is_ready(recording: Recording, settings: Settings, stationary: Array | None 
     return recording.gnss is not None and span[1] < recording.gnss.t[-1]
 
 
-def with_known_heading(found: Alignment, settings: Settings) -> Alignment:
+def use_known_heading(found: Alignment, settings: Settings) -> Alignment:
     """The alignment with the initial heading that the user states, if any."""
     known = settings.alignment.heading
     if known is None:

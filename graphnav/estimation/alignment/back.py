@@ -12,7 +12,7 @@ from graphnav.core.rotation import Array
 from graphnav.core.state import States
 from graphnav.estimation.alignment.first import STANDING, Alignment
 from graphnav.estimation.solution import Solution
-from graphnav.imu.preintegration import prefix
+from graphnav.imu.preintegration import integrate_prefix
 from graphnav.imu.samples import Samples, bridge_gaps
 from graphnav.recording import Recording
 
@@ -42,7 +42,7 @@ def carry_back(
         stood, back = still - recording.start, begin - still
         drift = np.zeros(3)
         if back > 0.05:
-            dR, dV, dP = prefix(samples, still, np.array([begin]), ba, bg)
+            dR, dV, dP = integrate_prefix(samples, still, np.array([begin]), ba, bg)
             R = rotation.exp(solution.frame.omega_n * back) @ R @ dR[0].T  # the Earth has turned meanwhile
             g = solution.frame.gravity_n(p)
             v0 = v - g * back - R @ dV[0]
@@ -138,7 +138,7 @@ def _refine_by_wheels(
     step = np.diff(np.append(t, begin))
     sd_p_wheels = there[1] + float(np.sum(step * np.abs(speed))) * off
     if np.linalg.norm(sd_p_wheels) < np.linalg.norm(sd_p):
-        dR, _, _ = prefix(samples, recording.start, t, np.zeros(3), bg)
+        dR, _, _ = integrate_prefix(samples, recording.start, t, np.zeros(3), bg)
         p, sd_p = there[0] - R @ np.sum(dR[:, :, 1] * (step * speed)[:, None], axis=0), sd_p_wheels
     return p, sd_p, v, sd_v
 

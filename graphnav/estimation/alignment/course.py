@@ -28,7 +28,7 @@ class Heading:
     notes: tuple[str, ...] = ()
 
 
-def with_course(tried: list[Solution], fixes: Gnss, own: float, wide: float) -> Heading:
+def use_course(tried: list[Solution], fixes: Gnss, own: float, wide: float) -> Heading:
     """Use that a vehicle's forward axis is its course, forwards or in reverse, to `COURSE_SIGMA`.
 
     Reverse if the accelerations show it at three sigmas; at two the course is not used; forwards otherwise. The

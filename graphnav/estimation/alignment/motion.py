@@ -17,13 +17,13 @@ from graphnav.core.running import run_median
 from graphnav.core.state import States
 from graphnav.detectors.base import NONE, mask_inside
 from graphnav.estimation.alignment.back import carry_back
-from graphnav.estimation.alignment.course import COURSE_SIGMA, with_course
+from graphnav.estimation.alignment.course import COURSE_SIGMA, use_course
 from graphnav.estimation.alignment.first import Alignment, level, pick_fixes
 from graphnav.estimation.alignment.travel import average_across, integrate_yaw, measure_travel
 from graphnav.estimation.fixing import split_carriers
 from graphnav.estimation.problem import Problem, build_problem
 from graphnav.estimation.solution import Solution
-from graphnav.imu.preintegration import prefix
+from graphnav.imu.preintegration import integrate_prefix
 from graphnav.imu.samples import bridge_gaps
 from graphnav.recording import Gnss, Imu, Recording
 from graphnav.recording.plausibility.fixes import GRIP
@@ -136,7 +136,7 @@ def align_in_motion(
     notes: tuple[str, ...] = ()
     if recording.platform == "vehicle":
         assert part.gnss is not None
-        found = with_course(tried, part.gnss, own[2], wide[2])
+        found = use_course(tried, part.gnss, own[2], wide[2])
         R = rotation.exp(np.array([0.0, 0.0, -found.turn])) @ R  # heading is clockwise, rotation about up is not
         own[2], wide[2], notes = found.own, found.wide, found.notes
     notes = (
@@ -162,7 +162,7 @@ def _fit_heading(part: Recording, frame: LocalFrame, rp: Array, bias: Array) -> 
     p = frame.from_llh(gnss.llh)
     v = gnss.v if gnss.v is not None and np.isfinite(gnss.v).all() else np.gradient(p, t, axis=0)
     change = np.diff(v, axis=0) / np.diff(t)[:, None]
-    _, dV, _ = prefix(bridge_gaps(part.imu), part.start, t[1:], np.zeros(3), bias)
+    _, dV, _ = integrate_prefix(bridge_gaps(part.imu), part.start, t[1:], np.zeros(3), bias)
     felt = np.diff(dV @ rotation.from_rph(np.array([*rp, 0.0])).T, axis=0) / np.diff(t[1:])[:, None]
     a = felt[:, 0] + 1j * felt[:, 1]
     b = change[1:, 0] + 1j * change[1:, 1]
@@ -206,7 +206,7 @@ def _try_headings(
         if slow and cost - gain > min((one.cost for one in tried), default=np.inf) + _UNLIKELY * worth:
             raise _End
         for one in tried:
-            if gain < 0.5 and cost - gain > one.cost and _within_a_sigma(states, one):
+            if gain < 0.5 and cost - gain > one.cost and _is_within_a_sigma(states, one):
                 raise _End(one)
 
     for turn in _HEADINGS_TRIED:
@@ -219,7 +219,7 @@ def _try_headings(
     return tried
 
 
-def _within_a_sigma(states: States, solution: Solution) -> bool:
+def _is_within_a_sigma(states: States, solution: Solution) -> bool:
     """Whether the first of the states is that of a solution, but for less than its uncertainty."""
     e = states[:1].minus(solution.states[:1])[0]
     return float(e @ np.linalg.solve(solution.covariance[0], e)) < 1.0
@@ -242,7 +242,7 @@ def _build_short(part: Recording, settings: Settings, frame: LocalFrame, rph: Ar
     )
     # an outlying fix or a burst must not decide the heading
     robust = settings.gnss.model_copy(update={"robust": "cauchy", "lever_arm_sigma": None, "time_offset_sigma": 0.0})
-    # the information of the wheels on the heading is added by `with_course`
+    # the information of the wheels on the heading is added by `use_course`
     problem = build_problem(part, settings.without_wheels().model_copy(update={"gnss": robust}), frame, start, sigma)
     return split_carriers(problem)[0]
 
@@ -256,7 +256,7 @@ def _try(problem: Problem, rph: Array, watch: Callable[[States, float, float, bo
     assert mean is not None
     R0, fixes, bias = rotation.from_rph(rph), problem.frame.from_llh(gnss.llh), mean.bg[0]
     problem = replace(problem, prior=replace(problem.prior, mean=replace(mean, R_nb=R0[None])))
-    dR, _, _ = prefix(problem.samples, t[0], t[1:], np.zeros(3), bias)
+    dR, _, _ = integrate_prefix(problem.samples, t[0], t[1:], np.zeros(3), bias)
     p = np.stack([np.interp(t, gnss.t, fixes[:, k]) for k in range(3)], -1)
     v = np.gradient(p, t, axis=0)
     K = len(t)

@@ -14,7 +14,7 @@ from graphnav.detectors.base import NONE
 from graphnav.estimation.alignment.antennas import measure_baseline_heading
 from graphnav.estimation.alignment.back import find_stand_end
 from graphnav.estimation.alignment.first import STANDING, Alignment, level
-from graphnav.imu.preintegration import prefix
+from graphnav.imu.preintegration import integrate_prefix
 from graphnav.imu.samples import bridge_gaps
 from graphnav.recording import Recording
 
@@ -24,7 +24,7 @@ _DRIVING = 20.0  # m/s, 1-sigma of the initial velocity of a vehicle in motion t
 _WALKING = 3.0  # m/s, 1-sigma of the initial velocity of a foot in the air
 
 
-def at_rest(recording: Recording, settings: Settings, frame: LocalFrame, stationary: Array) -> Alignment:
+def level_at_rest(recording: Recording, settings: Settings, frame: LocalFrame, stationary: Array) -> Alignment:
     """Levelled attitude; the heading is that of two antennas or unknown. For a foot, `stationary` (N, 2) s are its
     stances.
     """
@@ -37,7 +37,7 @@ def at_rest(recording: Recording, settings: Settings, frame: LocalFrame, station
     if settings.alignment.gyro_bias is not None:
         bias, sd_bias = np.array(settings.alignment.gyro_bias), settings.alignment.gyro_bias_sigma
     if begin > recording.start:
-        dR, _, _ = prefix(bridge_gaps(recording.imu), recording.start, np.array([begin]), np.zeros(3), bias)
+        dR, _, _ = integrate_prefix(bridge_gaps(recording.imu), recording.start, np.array([begin]), np.zeros(3), bias)
         R = R @ dR[0].T
         R = rotation.from_rph(rotation.to_rph(R) * [1.0, 1.0, 0.0])
         tilt, sd_v = np.hypot(tilt, sd_bias * (begin - recording.start)), _WALKING

@@ -22,7 +22,7 @@ import numpy as np
 from graphnav.core.notes import Note, format_count
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, States
-from graphnav.estimation.dense import dense
+from graphnav.estimation.dense import make_dense
 from graphnav.estimation.factor_graph.gaussian import Eliminated, LinearGraph
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import ParameterEstimate, Solution
@@ -98,7 +98,7 @@ def batch(
         t=problem.t,
         states=point.states,
         covariance=covariance,
-        parameters=_estimates(problem, layout, point, marginal),
+        parameters=_collect_estimates(problem, layout, point, marginal),
         records=records,
         counts={"initial_prior": 1, "imu": layout.K - 1, **{c.name: len(c) for c in problem.constraints}},
         iterations=found.iterations,
@@ -106,7 +106,7 @@ def batch(
         stopped=found.stopped,
         timings={"batch": solved - began, "covariances": done - solved},
         notes=(*problem.notes, *found.notes, *notes),
-        between=(dense(problem, point.states, covariance, point.scale, smooth=True),),
+        between=(make_dense(problem, point.states, covariance, point.scale, smooth=True),),
     )
 
 
@@ -236,7 +236,7 @@ def solve_rows(rows: Rows, layout: Layout, damping: float = 0.0) -> tuple[Elimin
     return eliminated, layout.unpack(found), gain
 
 
-def _estimates(
+def _collect_estimates(
     problem: Problem, layout: Layout, point: Iterate, covariances: dict[int, Array]
 ) -> dict[str, ParameterEstimate]:
     out = {}

@@ -33,7 +33,7 @@ def make_jacobian_factor(blocks: Sequence[tuple[int, Array]], b: Array) -> gtsam
     rest = [(key, np.asfortranarray(A)) for key, A in blocks]
     make: Any = gtsam.JacobianFactor
     if len(rest) <= 3:
-        return make(*(part for block in rest for part in block), b, _unit(len(b)))
+        return make(*(part for block in rest for part in block), b, _make_unit_noise(len(b)))
     sums: list[int] = []
     graph, ordering, one = gtsam.GaussianFactorGraph(), gtsam.Ordering(), np.eye(len(b))
     while len(rest) > 3:
@@ -49,7 +49,7 @@ def make_jacobian_factor(blocks: Sequence[tuple[int, Array]], b: Array) -> gtsam
 
 
 @cache
-def _unit(m: int) -> gtsam.noiseModel.Unit:
+def _make_unit_noise(m: int) -> gtsam.noiseModel.Unit:
     """The noise of m whitened rows."""
     return gtsam.noiseModel.Unit.Create(m)
 
@@ -63,7 +63,7 @@ class LinearGraph:
     def add(self, blocks: Blocks, b: Array) -> None:
         """N factors of m rows each: sum over blocks of A[n] d[key[n]] = b[n]."""
         n, m = b.shape
-        unit = _unit(m)
+        unit = _make_unit_noise(m)
         # GTSAM keeps matrices by columns: handing them over that way saves it a strided copy
         columns = [np.ascontiguousarray(np.swapaxes(A, 1, 2)).swapaxes(1, 2) for _, A in blocks]
         keys = [k.tolist() for k, _ in blocks]

@@ -65,7 +65,7 @@ class Exported:
             For a robust kernel that GTSAM does not have as a factor.
         """
         layout = Layout(self.problem)
-        known = _with_unlisted(self.problem, self.states, self.values)
+        known = _add_unlisted(self.problem, self.states, self.values)
         values = gtsam.Values()
         states = self.states
         for k in range(len(states)):
@@ -82,7 +82,7 @@ class Exported:
         return graph, values
 
 
-def _with_unlisted(problem: Problem, states: States, values: dict[str, Array]) -> dict[str, Array]:
+def _add_unlisted(problem: Problem, states: States, values: dict[str, Array]) -> dict[str, Array]:
     """The values together with parameters that solutions do not list, places of stops and ambiguities: optimal given
     the rest.
 
@@ -124,7 +124,7 @@ def _with_unlisted(problem: Problem, states: States, values: dict[str, Array]) -
     return out
 
 
-def state_at(values: gtsam.Values, k: int) -> States:
+def get_state(values: gtsam.Values, k: int) -> States:
     """The state of keyframe k as one row."""
     pose, bias = values.atPose3(_X(k)), values.atConstantBias(_B(k))
     place = pose.rotation().matrix(), pose.translation(), values.atVector(_V(k))
@@ -196,7 +196,7 @@ def _make_custom(
     keys = [key(k) for k in keyframes for key in (_X, _V, _B)] + [key for _, key in nodes]
 
     def error(this: Any, values: gtsam.Values, H: Any) -> Array:
-        states = States.stack([state_at(values, k) for k in keyframes])
+        states = States.stack([get_state(values, k) for k in keyframes])
         given = {
             name: values.atVector(key)[None, at] for g, key in nodes for name, at in g.columns.items() if name in names
         }
@@ -204,7 +204,7 @@ def _make_custom(
         if H is not None:
             parts = zip(np.split(J, len(keyframes), axis=1), states.R_nb, strict=True)
             blocks = [block for part, R_nb in parts for block in _split_blocks(part, R_nb)]
-            for k, block in enumerate([*blocks, *(A[0] for _, A in layout.parameter_blocks(first, by_parameter))]):
+            for k, block in enumerate([*blocks, *(A[0] for _, A in layout.find_parameter_blocks(first, by_parameter))]):
                 H[k] = np.asfortranarray(block)
         return residual
 

@@ -31,17 +31,17 @@ from graphnav.estimation.factor_graph.tree_nodes import (
     Made,
     Variable,
     are_leaves,
+    compute_turns,
     fill_keys,
     find_node_limits,
-    fresh_isam,
     is_constant,
     make_factor,
     make_interval_factor,
+    make_isam,
     make_row_factor,
     read_estimates,
     read_factors,
-    states_of,
-    turns_of,
+    read_states,
     update_isam,
     write_factors,
 )
@@ -56,10 +56,10 @@ from graphnav.estimation.solvers.stages import (
     Message,
     Place,
     append_columns,
+    count_columns,
     group_runs,
     measure,
     predict_stage,
-    width,
 )
 
 NODE_EVERY = 30.0  # s from one node of a constant to the next
@@ -78,7 +78,7 @@ class Tree:
     """
 
     def __init__(self, prior: Message, turn: float) -> None:
-        self.isam = fresh_isam()
+        self.isam = make_isam()
         self.turn = turn
         self.keyframes: list[Keyframe] = []
         self.relinearised = 0  # keyframes
@@ -118,7 +118,7 @@ class Tree:
         else:
             state, values, columns, link = ahead.state, ahead.values, ahead.columns, ahead.link
         fresh: list[tuple[Variable, Any]] = []  # variables that begin here, and what is known of parameters among them
-        x = self._variable(np.zeros(DIM), _UNIT, place.t)
+        x = self._add_variable(np.zeros(DIM), _UNIT, place.t)
         nodes = self._open(place, fresh)
         keyframe = Keyframe(self._number, place, x, state, columns, nodes, {})
         for node, _ in nodes.values():
@@ -133,13 +133,13 @@ class Tree:
             fresh.append((x, make_factor([(x, self._prior.R[:, :DIM])], self._prior.z)))
         else:
             fresh.append((x, None))
-            turns = turns_of([self.keyframes[-1], keyframe])
+            turns = compute_turns([self.keyframes[-1], keyframe])
             made.append((keyframe, LINK, make_interval_factor(self.keyframes[-1], x, link, turns)))
         made += [(keyframe, one.name, make_row_factor(keyframe, one, False, np.eye(3))) for one in rows]
         self.keyframes.append(keyframe)
         # along time, where the order is free; CCOLAMD wants labels below the number of variables it is to order
         most = min(3, len({key for _, _, one in made for key in list(one.keys())}) - 1)
-        order = [(v, max(v.last - self._number + most, 0)) for v in self._recent()]
+        order = [(v, max(v.last - self._number + most, 0)) for v in self._find_recent()]
         update_isam(self.isam, place.t, made, order, fresh=fresh)
         self._number += 1
         keyframe.read(self.isam)
@@ -151,10 +151,10 @@ class Tree:
     def _begin(self, place: Place) -> None:
         """Have the message that all goes on from as a keyframe before the first."""
         prior = self._prior
-        x, nodes, fresh = self._variable(np.zeros(DIM), _UNIT, place.t), {}, []
+        x, nodes, fresh = self._add_variable(np.zeros(DIM), _UNIT, place.t), {}, []
         blocks = [(x, prior.R[:, :DIM])]
         if prior.columns:
-            node = self._variable(prior.values, np.ones(len(prior.values)), place.t)
+            node = self._add_variable(prior.values, np.ones(len(prior.values)), place.t)
             fresh.append((node, None))
             node.limit = find_node_limits(prior.columns, place)
             nodes = {name: (node, shift(at)) for name, at in prior.columns.items()}
@@ -172,13 +172,13 @@ class Tree:
         self.held = 1
         self.keyframes[0].read(self.isam)
 
-    def _recent(self) -> Iterable[Variable]:
+    def _find_recent(self) -> Iterable[Variable]:
         for keyframe in self.keyframes[-3:]:
             yield keyframe.state
         yield from {id(n): n for k in self.keyframes[-3:] for n, _ in k.nodes.values()
                     if n.last >= self._number - 2}.values()  # fmt: skip
 
-    def _variable(self, anchor: Array, unit: Array, t: float) -> Variable:
+    def _add_variable(self, anchor: Array, unit: Array, t: float) -> Variable:
         none = np.zeros(len(unit))
         out = Variable(self._key, unit, none.copy(), none, self._number, self._number, t, anchor)
         self.variables[self._key] = out
@@ -203,7 +203,9 @@ class Tree:
             if not own_steps:
                 continue
             columns = append_columns({}, own_steps)
-            node = self._variable(np.zeros(width(columns) - DIM), np.ones(width(columns) - DIM), place.t)
+            node = self._add_variable(
+                np.zeros(count_columns(columns) - DIM), np.ones(count_columns(columns) - DIM), place.t
+            )
             node.limit = find_node_limits(columns, place)
             own_A, old_A = np.zeros((len(node.unit), len(node.unit))), dict[int, tuple[Variable, Array]]()
             for step in own_steps:
@@ -280,7 +282,7 @@ class Tree:
         self.read()
         own = self.keyframes
         scale = scale_at(own[-1].columns, own[-1].values)
-        problem, count = integrate_again(problem, states_of(own), scale, own[0].place.k)
+        problem, count = integrate_again(problem, read_states(own), scale, own[0].place.k)
         if count:
             for k in own:
                 k.place = replace(k.place, problem=problem)
@@ -302,8 +304,8 @@ class Tree:
             # the interval before the oldest keyframe is gone
             places = [p if LINK in k.slots else replace(p, linked=False) for p, k in zip(places, own, strict=True)]
             around = [self.keyframes[max(first - 1, 0)], *own]
-            values, columns, turns = [k.values for k in around], [k.columns for k in own], turns_of(around)
-            for k, linear in linearise_runs(places, states_of(around), values, columns):
+            values, columns, turns = [k.values for k in around], [k.columns for k in own], compute_turns(around)
+            for k, linear in linearise_runs(places, read_states(around), values, columns):
                 i, keyframe = first + k, own[k]
                 if i in links:
                     assert linear.link is not None

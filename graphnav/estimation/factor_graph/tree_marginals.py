@@ -17,7 +17,7 @@ from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, States
 from graphnav.estimation.factor_graph.gaussian import Eliminated
 from graphnav.estimation.factor_graph.tree import Tree
-from graphnav.estimation.factor_graph.tree_nodes import Keyframe, Variable, fill_keys, states_of
+from graphnav.estimation.factor_graph.tree_nodes import Keyframe, Variable, fill_keys, read_states
 from graphnav.estimation.solvers.breakdown import explain_undetermined
 from graphnav.estimation.solvers.linearise import Columns, shift
 from graphnav.estimation.solvers.points import move_covariance
@@ -89,7 +89,7 @@ def read_keyframes(tree: Tree, first: int, count: int) -> Estimates:
     """Keyframes from `first` to `count` as they are known now."""
     tree.read()
     own = tuple(tree.keyframes[first:count])
-    return Estimates(own, np.array([k.state.delta for k in own]), states_of(own), tuple(k.values for k in own))
+    return Estimates(own, np.array([k.state.delta for k in own]), read_states(own), tuple(k.values for k in own))
 
 
 def begin_elimination(tree: Tree, count: int, first: int = 0) -> Elimination:

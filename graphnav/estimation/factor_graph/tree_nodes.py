@@ -77,7 +77,7 @@ class Keyframe:
 Made = tuple[Keyframe, str, Any]  # a factor of a keyframe, by the name of its constraint
 
 
-def fresh_isam() -> gtsam.ISAM2:
+def make_isam() -> gtsam.ISAM2:
     parameters = gtsam.ISAM2Params()
     parameters.setFactorization("QR")
     parameters.enableRelinearization = False  # by GTSAM: it has a linear problem
@@ -165,7 +165,7 @@ def make_factor(blocks: Sequence[tuple[Variable, Array]], b: Array) -> Any:
     return gtsam.LinearContainerFactor(make_jacobian_factor(scaled, b))
 
 
-def turns_of(keyframes: Sequence[Keyframe]) -> Array:
+def compute_turns(keyframes: Sequence[Keyframe]) -> Array:
     """(n, 3, 3) J_r of attitudes about their anchors: rows over a state become rows over errors about its anchor."""
     return rotation.right_jacobian(np.array([k.state.delta[:3] for k in keyframes]))
 
@@ -173,17 +173,17 @@ def turns_of(keyframes: Sequence[Keyframe]) -> Array:
 def make_interval_factor(last: Keyframe, x: Variable, link: Array, turns: Array) -> Any:
     """A factor of an interval's whitened rows (15, 15 + D + 1), from the keyframe before to a state, J_r of both."""
     blocks = [(last.state, turned_by(link[:, :DIM], turns[0])), (x, turned_by(link[:, DIM : 2 * DIM], turns[1]))]
-    return _about(last, blocks, link[:, DIM:-1], link[:, -1])
+    return _make_factor(last, blocks, link[:, DIM:-1], link[:, -1])
 
 
 def make_row_factor(keyframe: Keyframe, one: Measured, weighted: bool, turn: Array) -> Any:
     """A factor of measurements linearised where keyframe, of J_r (3, 3), and parameters are now."""
-    H, b, _ = one.weighted(np.zeros(one.H.shape[-1]), int(weighted))
+    H, b, _ = one.weigh(np.zeros(one.H.shape[-1]), int(weighted))
     H = H.reshape(-1, H.shape[-1])
-    return _about(keyframe, [(keyframe.state, turned_by(H[:, :DIM], turn))], H, b.ravel())
+    return _make_factor(keyframe, [(keyframe.state, turned_by(H[:, :DIM], turn))], H, b.ravel())
 
 
-def _about(keyframe: Keyframe, blocks: list[tuple[Variable, Array]], H: Array, b: Array) -> Any:
+def _make_factor(keyframe: Keyframe, blocks: list[tuple[Variable, Array]], H: Array, b: Array) -> Any:
     """A factor of rows over states' errors about anchors and a keyframe's parameters, H (m, D), as they are now."""
     b = b + sum(A @ x.delta for x, A in blocks)
     touched: dict[int, tuple[Variable, Array]] = {}
@@ -198,7 +198,7 @@ def _about(keyframe: Keyframe, blocks: list[tuple[Variable, Array]], H: Array, b
     return make_factor([*blocks, *touched.values()], b)
 
 
-def states_of(keyframes: Sequence[Keyframe]) -> States:
+def read_states(keyframes: Sequence[Keyframe]) -> States:
     """Their states as they are known now."""
     return States.stack([k.anchor for k in keyframes]).plus(np.array([k.state.delta for k in keyframes]))
 
@@ -231,7 +231,7 @@ def read_factors(rows: Sequence[tuple[int, str]], order: Mapping[Variable, int])
     ----------
     order : when each variable is eliminated.
     """
-    isam, graph = fresh_isam(), gtsam.NonlinearFactorGraph()
+    isam, graph = make_isam(), gtsam.NonlinearFactorGraph()
     new, groups = gtsam.Values(), gtsam.KeyGroupMap()
     first = min(order.values(), default=0)
     for x, number in order.items():

@@ -17,7 +17,7 @@ from graphnav.imu.dynamics import ImuFactors
 from graphnav.imu.preintegration import NOISE_FIGURES
 
 
-def with_noise(problem: Problem, noise: NoiseModel) -> Problem:
+def apply_noise(problem: Problem, noise: NoiseModel) -> Problem:
     """A problem built with stated noise, with a noise model's figures instead.
 
     Parameters
@@ -25,7 +25,7 @@ def with_noise(problem: Problem, noise: NoiseModel) -> Problem:
     problem : as built; its intervals keep the parts of their covariances if a figure of the IMU differs.
     """
     factors = np.array([noise.factor(f"imu.{name}", 1.0) for name in NOISE_FIGURES])
-    each = _interval_factors(problem, noise)
+    each = _compute_interval_factors(problem, noise)
     if each is not None or np.any(factors != 1.0):
         intervals = problem.intervals.with_noise(factors if each is None else factors * each)
         figures = {
@@ -40,33 +40,33 @@ def with_noise(problem: Problem, noise: NoiseModel) -> Problem:
             interval_factors=each,
         )
     return replace(
-        problem, constraints=_with_common_nodes([_rows(problem, rows, noise) for rows in problem.constraints])
+        problem, constraints=_share_nodes([_scale_rows(problem, rows, noise) for rows in problem.constraints])
     )
 
 
-def with_weights(problem: Problem, weights: Mapping[str, RowWeights]) -> Problem:
+def apply_weights(problem: Problem, weights: Mapping[str, RowWeights]) -> Problem:
     """A problem as a noise model has it, with other weights for the rows of some constraints."""
     noise = NoiseModel(weights=weights)
     return replace(
         problem,
         constraints=tuple(
-            replace(c, weight=row_weights(problem.t[c.keyframe], noise, c.name)) if c.name in weights else c
+            replace(c, weight=select_weights(problem.t[c.keyframe], noise, c.name)) if c.name in weights else c
             for c in problem.constraints
         ),
     )
 
 
-def _interval_factors(problem: Problem, noise: NoiseModel) -> Array | None:
+def _compute_interval_factors(problem: Problem, noise: NoiseModel) -> Array | None:
     """(K-1, 4) on the variances of `NOISE_FIGURES`, where single intervals have more noise than usual."""
     if not any(name in noise.weights for name in INTERVALS):
         return None
     factors = np.ones((len(problem.t) - 1, len(NOISE_FIGURES)))
     for i, name in enumerate(INTERVALS):
-        factors[:, i] = 1.0 / row_weights(problem.t[1:], noise, name)
+        factors[:, i] = 1.0 / select_weights(problem.t[1:], noise, name)
     return factors if np.any(factors != 1.0) else None
 
 
-def _with_common_nodes(constraints: list[Constraint]) -> tuple[Constraint, ...]:
+def _share_nodes(constraints: list[Constraint]) -> tuple[Constraint, ...]:
     """The same, with nodes at the same times for all processes that rows depend on: one variable of the graph."""
     closest: dict[str, float] = {}
     for _ in range(2):  # through what two constraints share
@@ -80,16 +80,16 @@ def _with_common_nodes(constraints: list[Constraint]) -> tuple[Constraint, ...]:
     )
 
 
-def _rows(problem: Problem, rows: Constraint, noise: NoiseModel) -> Constraint:
-    own = tuple(_process(p, noise, 1.0) for p in rows.parameters)
-    errors = tuple(_process(p, noise, 0.0) for p in rows.processes)
+def _scale_rows(problem: Problem, rows: Constraint, noise: NoiseModel) -> Constraint:
+    own = tuple(_scale_process(p, noise, 1.0) for p in rows.parameters)
+    errors = tuple(_scale_process(p, noise, 0.0) for p in rows.processes)
     changed: dict[str, Any] = {"parameters": tuple(p for p in (*own, *errors) if p is not None)}
     names, index = rows.noise_groups()
     if names:
         root = np.sqrt([noise.factor(name, 1.0) for name in names])
         changed["sigma"] = _scale_sigma(rows, np.where(index >= 0, root[index], 1.0))
     if rows.name in noise.weights or rows.name in noise.excluded:
-        changed["weight"] = row_weights(problem.t[rows.keyframe], noise, rows.name)
+        changed["weight"] = select_weights(problem.t[rows.keyframe], noise, rows.name)
     return replace(rows, **changed)
 
 
@@ -101,7 +101,7 @@ def _scale_sigma(rows: Constraint, root: Array) -> Array:
     return np.sqrt((sigma**2 - rows.unscaled**2) * root**2 + rows.unscaled**2)
 
 
-def _process(p: Parameter, noise: NoiseModel, missing: float) -> Parameter | None:
+def _scale_process(p: Parameter, noise: NoiseModel, missing: float) -> Parameter | None:
     """A parameter with its factors; None for a process that does not exist."""
     if not p.noise_groups:
         return p
@@ -112,7 +112,7 @@ def _process(p: Parameter, noise: NoiseModel, missing: float) -> Parameter | Non
     return replace(p, sigma=sigma, correlation_time=noise.times.get(p.name, p.correlation_time))
 
 
-def row_weights(t: Array, noise: NoiseModel, name: str) -> Array:
+def select_weights(t: Array, noise: NoiseModel, name: str) -> Array:
     """(N,) weights of a constraint's rows at times t (N,), s; rows of one time, as of satellites, keep their order."""
     out = np.ones(len(t))
     some = noise.weights.get(name)
@@ -126,7 +126,7 @@ def row_weights(t: Array, noise: NoiseModel, name: str) -> Array:
     return out
 
 
-def without_parts(problem: Problem) -> Problem:
+def drop_parts(problem: Problem) -> Problem:
     """The same without what each noise figure contributes, which takes room and nobody asks for any more."""
     intervals = problem.intervals.without_parts()
     return replace(problem, intervals=intervals, motion=ImuFactors(intervals, problem.frame))

@@ -28,17 +28,23 @@ from scipy.special import chdtrc, chdtri
 from graphnav.constraints.base import Constraint
 from graphnav.constraints.gnss import TIMES
 from graphnav.core.rotation import Array
-from graphnav.estimation.noise.apply import row_weights, with_noise
+from graphnav.estimation.noise.apply import apply_noise, select_weights
 from graphnav.estimation.noise.initial_points import BREAKDOWN, find_initial_points
 from graphnav.estimation.noise.model import INTERVALS, NoiseModel, RowWeights, VarianceComponent
-from graphnav.estimation.noise.moments import ImuMoments, imu_moments, lag_moments, process_moments, row_moments
-from graphnav.estimation.noise.outliers import CHANCE, cost_of_outliers, limit_scaled, list_reduced
-from graphnav.estimation.noise.priors import TIME_WITHIN, prior
+from graphnav.estimation.noise.moments import (
+    ImuMoments,
+    collect_imu_moments,
+    collect_process_moments,
+    collect_row_moments,
+    lag_moments,
+)
+from graphnav.estimation.noise.outliers import CHANCE, compute_outlier_cost, limit_scaled, list_reduced
+from graphnav.estimation.noise.priors import TIME_WITHIN, get_prior
 from graphnav.estimation.problem import ParameterChain, Problem
 from graphnav.estimation.solvers.ekf import refilter
 from graphnav.estimation.solvers.linearise import Points
-from graphnav.estimation.solvers.passes import DisturbancePass, ForwardRecord, points_of, values_of
-from graphnav.estimation.solvers.rts import backward_moments
+from graphnav.estimation.solvers.passes import DisturbancePass, ForwardRecord, make_points, split_values
+from graphnav.estimation.solvers.rts import smooth_moments
 from graphnav.imu.preintegration import NOISE_FIGURES
 
 _BOUNDED = 0.05  # probability of a square of an aiding sensor beyond its bound; nearly two rows in five may be wrong
@@ -64,11 +70,11 @@ class NoiseEstimate:
     @property
     def log_evidence(self) -> float:
         """Of the measurements; each row and interval of reduced weight has the cost of an outlier."""
-        return self.log_posterior + cost_of_outliers(self.noise.weights)
+        return self.log_posterior + compute_outlier_cost(self.noise.weights)
 
     def linearisation(self, base: Problem) -> tuple[Points, Problem]:
         """Its points and the problem that they are of, to start another estimate from."""
-        return self.points, with_noise(base, self.noise)
+        return self.points, apply_noise(base, self.noise)
 
     def carry_points(self, base: Problem, problem: Problem) -> Points:
         """Its points for a problem with the same keyframes and another noise model."""
@@ -105,7 +111,7 @@ class _Components:
 
     def prior(self, name: str) -> tuple[float, float]:
         """Median and 1-sigma of a log factor; where the white part of fixes exceeds the stated, so do the others."""
-        m, s = prior(name)
+        m, s = get_prior(name)
         sensor, *kind, axis = name.split(".")
         if sensor == "gnss_position" and kind and kind[-1] in TIMES:
             m += max(0.0, self.log.get(".".join([sensor, *kind[:-1], axis]), 0.0))
@@ -159,8 +165,8 @@ def estimate_noise(
     """
     figures = _begin(problem, start, changed)
     if near is not None:
-        return _iterate(problem, figures, _carry(*near, with_noise(problem, figures.model())), progress, intervals)
-    used = with_noise(problem, figures.model())
+        return _iterate(problem, figures, _carry(*near, apply_noise(problem, figures.model())), progress, intervals)
+    used = apply_noise(problem, figures.model())
     try:
         initials, passes = find_initial_points(used, opening)
     except BREAKDOWN:  # with the prior's medians; with the noise that is stated it may not
@@ -198,14 +204,14 @@ def _iterate(
         rounds = _AGAIN if figures.same_data or end != ends[0] else _ROUNDS
         likeliest, most = figures, -np.inf
         for k in range(_MOST):
-            used, latest = with_noise(problem, figures.model()), None  # releases the memory of the previous pass
+            used, latest = apply_noise(problem, figures.model()), None  # releases the memory of the previous pass
             latest = _smooth_about(used, about.first(end))
             passes += 1
             prior_then = figures.log_prior()
             now = float(np.sum(latest[0].log_likelihood)) + prior_then
             if progress is not None:
                 progress("noise", min((k + 1) / rounds, 1.0))
-            if (evidence := now + cost_of_outliers(figures.weights)) > most:
+            if (evidence := now + compute_outlier_cost(figures.weights)) > most:
                 likeliest, most = figures.copy(), evidence
             _improve(figures, used, *latest, end, intervals)
             about = _splice(about, latest[1])
@@ -218,7 +224,7 @@ def _iterate(
             figures = likeliest
     if not converged:
         latest = None
-        latest = _smooth_about(with_noise(problem, figures.model()), about)
+        latest = _smooth_about(apply_noise(problem, figures.model()), about)
         passes, prior_then = passes + 1, figures.log_prior()
         now = float(np.sum(latest[0].log_likelihood)) + prior_then
     assert latest is not None
@@ -227,7 +233,7 @@ def _iterate(
 
 def _smooth_about(problem: Problem, about: Points) -> tuple[ForwardRecord, DisturbancePass]:
     forward = refilter(problem, about, whole=False)
-    return forward, backward_moments(problem, forward)
+    return forward, smooth_moments(problem, forward)
 
 
 def _begin(problem: Problem, start: NoiseModel | None, changed: bool = False) -> _Components:
@@ -235,7 +241,7 @@ def _begin(problem: Problem, start: NoiseModel | None, changed: bool = False) ->
     for rows in problem.constraints:
         names += [*rows.noise_groups()[0], *(g for p in (*rows.parameters, *rows.processes) for g in p.noise_groups)]
     names += [group for p in problem.parameters.values() for group in p.noise_groups]
-    log = {name: prior(name)[0] for name in dict.fromkeys(names)}
+    log = {name: get_prior(name)[0] for name in dict.fromkeys(names)}
     processes = [p for rows in problem.constraints for p in (*rows.parameters, *rows.processes)]
     times = {p.name: p.correlation_time for p in processes if p.correlation_time is not None}
     if start is None:
@@ -253,7 +259,7 @@ def _begin(problem: Problem, start: NoiseModel | None, changed: bool = False) ->
 
 
 def _carry(points: Points, before: Problem, after: Problem) -> Points:
-    return points_of(after, points.states, values_of(before, points))
+    return make_points(after, points.states, split_values(before, points))
 
 
 def _splice(about: Points, part: Points) -> Points:
@@ -265,7 +271,7 @@ def _splice(about: Points, part: Points) -> Points:
     return Points(states, np.concatenate([part.values, about.values[n:]]))
 
 
-def _cap(A: Array, B: Array, freedom: int, chance: float) -> tuple[float, float]:
+def _bound_squares(A: Array, B: Array, freedom: int, chance: float) -> tuple[float, float]:
     """Sums of bounded squares and of redundancies; the bound's effect on the mean is compensated.
 
     For z^2 chi-square with m degrees of freedom and the limit q, E[min(z^2, q)] = m P(chi2_m+2 < q) + q P(chi2_m > q).
@@ -279,15 +285,15 @@ def _improve(
     figures: _Components, problem: Problem, forward: ForwardRecord, smoothed: DisturbancePass, end: int, intervals: bool
 ) -> None:
     """One step for all figures and weights."""
-    imu = imu_moments(problem, forward, smoothed)
+    imu = collect_imu_moments(problem, forward, smoothed)
     for i, name in enumerate(NOISE_FIGURES):
-        figures.update(f"imu.{name}", *_cap(imu.A[:, i], imu.B[:, i], 3, CHANCE))
+        figures.update(f"imu.{name}", *_bound_squares(imu.A[:, i], imu.B[:, i], 3, CHANCE))
     if intervals:
         _weigh_intervals(figures, problem, imu)
     driven: dict[str, tuple[Array, Array, Array]] = {}
     for chain in problem.chains:
         if chain.parameter.noise_groups:
-            driven[chain.parameter.name] = process_moments(problem, chain, smoothed, end)
+            driven[chain.parameter.name] = collect_process_moments(problem, chain, smoothed, end)
             _improve_process(figures, chain, driven[chain.parameter.name])
             observed = _is_observed(figures, chain)
             if chain.parameter.correlation_time is not None and observed.any():
@@ -297,11 +303,11 @@ def _improve(
         if not names:
             continue
         n = int(np.searchsorted(rows.keyframe, end))
-        found = row_moments(problem, rows, smoothed, n)
+        found = collect_row_moments(problem, rows, smoothed, n)
         for i, name in enumerate(names):
             own = index[:n] == i
             if own.any():
-                figures.update(name, *_cap(found.A[own], found.B[own], 1, _BOUNDED))
+                figures.update(name, *_bound_squares(found.A[own], found.B[own], 1, _BOUNDED))
         _weigh(figures, problem, rows, np.maximum(found.left_out, found.whole), n)
 
 
@@ -314,7 +320,7 @@ def _weigh_intervals(figures: _Components, problem: Problem, imu: ImuMoments) ->
         ratio = imu.A[:, i] / np.maximum(imu.B[:, i], 1e-30) * freedom
         # if half of the intervals are off, it is the variance that has not converged yet
         scale = max(float(np.median(ratio / chdtri(freedom, 0.5))), 1.0)
-        more = 1.0 / row_weights(t, figures.model(), name)
+        more = 1.0 / select_weights(t, figures.model(), name)
         most = np.maximum(lost**2 * problem.intervals.T[:n] / density**2, 1.0)
         more[:n] = np.clip(more[:n] * ratio / chdtri(freedom, CHANCE) / scale, 1.0, most)
         some = more > 1.0
@@ -326,7 +332,7 @@ def _improve_process(figures: _Components, chain: ParameterChain, moments: tuple
     groups = np.array(chain.parameter.noise_groups)
     for group in dict.fromkeys(chain.parameter.noise_groups):
         own = groups == group
-        figures.update(group, *_cap(A[:, own], B[:, own], 1, _BOUNDED))
+        figures.update(group, *_bound_squares(A[:, own], B[:, own], 1, _BOUNDED))
 
 
 def _is_observed(figures: _Components, chain: ParameterChain) -> Array:

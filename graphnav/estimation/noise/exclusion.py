@@ -42,11 +42,19 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from graphnav.estimation import faults
-from graphnav.estimation.noise.apply import row_weights, with_noise, with_weights
+from graphnav.estimation.noise.apply import apply_noise, apply_weights, select_weights
 from graphnav.estimation.noise.estimate import NoiseEstimate, estimate_noise
-from graphnav.estimation.noise.explanations import EXPLANATIONS, FIXES, ONE_SENSOR, ROWS, WHEELS, Explanation, evidence
+from graphnav.estimation.noise.explanations import (
+    EXPLANATIONS,
+    FIXES,
+    ONE_SENSOR,
+    ROWS,
+    WHEELS,
+    Explanation,
+    compute_evidence,
+)
 from graphnav.estimation.noise.model import INTERVALS, NoiseModel, RowWeights
-from graphnav.estimation.noise.moments import row_moments
+from graphnav.estimation.noise.moments import collect_row_moments
 from graphnav.estimation.noise.outliers import OUTLIER_COST, count_reduced, limit_squares
 from graphnav.estimation.noise.spans import (
     LeftOutErrors,
@@ -61,7 +69,7 @@ from graphnav.estimation.noise.spans import (
     list_repeats,
     mask_times,
     split_at_repeats,
-    total_length,
+    sum_lengths,
     trim,
 )
 from graphnav.estimation.problem import Problem
@@ -147,17 +155,17 @@ def _unmask(base: Problem, found: NoiseEstimate, first: Decision, masked: list[S
     start = NoiseModel(found.noise.figures, found.noise.times, excluded=dict.fromkeys(FIXES, tuple(masked)))
     for _ in range(_REFINEMENTS):
         estimate = estimate_noise(base, None, start, estimate.linearisation(base), changed=True)
-        errors = _predict_left_out(with_noise(base, estimate.noise), estimate)
+        errors = _predict_left_out(apply_noise(base, estimate.noise), estimate)
         detected = find_spans(base, replace(estimate.noise, excluded={}), estimate)
         passes = passes + estimate.passes + Counter(filter=1)
         spans, refined = trim(spans, errors), trim(detected, errors)
         # a slow onset is dated better by the tests, an abrupt end by the errors of single fixes
         for some in list_distinct(spans, trim(spans, errors, FALSE_ALARM), detected):
-            candidate = decide(base, _with_outliers(estimate, errors, some), some)
+            candidate = decide(base, _add_outliers(estimate, errors, some), some)
             passes = passes + candidate.passes
             if candidate.log_evidence > best.log_evidence:
                 best, leading = candidate, estimate
-        if total_length(detected) > 2.0 * total_length(masked):  # more seems wrong outside than inside
+        if sum_lengths(detected) > 2.0 * sum_lengths(masked):  # more seems wrong outside than inside
             break
         if not refined:  # single outliers and no fault
             everything = replace(estimate.noise, excluded={})
@@ -177,12 +185,12 @@ def _unmask(base: Problem, found: NoiseEstimate, first: Decision, masked: list[S
 def _readmit(base: Problem, found: NoiseEstimate) -> NoiseEstimate:
     """Use measurements at the ends of excluded spans again that agree with the rest, if that increases the evidence."""
     spans = join(span for some in found.noise.excluded.values() for span in some)
-    errors = _predict_left_out(with_noise(base, found.noise), found)
+    errors = _predict_left_out(apply_noise(base, found.noise), found)
     narrow = trim(spans, errors, FALSE_ALARM)
     if not narrow or narrow == spans:
         return found
     among = _list_explanations(found.noise)
-    wide, less = (decide(base, _with_outliers(found, errors, some), some, among) for some in (spans, narrow))
+    wide, less = (decide(base, _add_outliers(found, errors, some), some, among) for some in (spans, narrow))
     passes = found.passes + wide.passes + less.passes
     if less.log_evidence <= wide.log_evidence:
         return replace(found, passes=passes)
@@ -240,9 +248,9 @@ def _test(base: Problem, noise: NoiseModel, found: NoiseEstimate) -> list[Span]:
     """Spans (s) in which the tests find fixes in disagreement with everything else."""
     # weights of fixes and of IMU intervals may hide a fault from the tests
     kept = {name: some for name, some in noise.weights.items() if name not in (*FIXES, *INTERVALS)}
-    tested = with_noise(base, replace(noise, weights=kept))
+    tested = apply_noise(base, replace(noise, weights=kept))
     weights = refilter(tested, found.carry_points(base, tested), watch=True, whole=False).weights
-    return join_faults(faults.fault_spans(faults.weigh_rows(tested, weights)))
+    return join_faults(faults.find_fault_spans(faults.weigh_rows(tested, weights)))
 
 
 def decide(
@@ -266,7 +274,7 @@ def decide(
         for kinds in (*ONE_SENSOR, ROWS)
     }
     inside[INTERVALS] = {name: some for name, some in noise.weights.items() if name in INTERVALS}
-    used = with_noise(base, replace(noise, weights=outside))
+    used = apply_noise(base, replace(noise, weights=outside))
     outliers = {
         kinds: [
             sum(count_reduced(one) - count_reduced(drop_within(one, [within])) for one in some.values())
@@ -276,11 +284,11 @@ def decide(
     }
     among = [kinds for kinds in among if kinds not in _SINGLE or any(outliers[kinds])]
     weighted: dict[Explanation, Problem] = {
-        kinds: with_weights(used, outside | inside[kinds]) for kinds in (*ONE_SENSOR, ROWS)
+        kinds: apply_weights(used, outside | inside[kinds]) for kinds in (*ONE_SENSOR, ROWS)
     }
     if INTERVALS in among:
-        weighted[INTERVALS] = with_noise(base, replace(noise, weights=outside | inside[INTERVALS]))
-    before, likelihood, passes = evidence(used, found.carry_points(base, used), spans, weighted, among)
+        weighted[INTERVALS] = apply_noise(base, replace(noise, weights=outside | inside[INTERVALS]))
+    before, likelihood, passes = compute_evidence(used, found.carry_points(base, used), spans, weighted, among)
     excluded: dict[str, tuple[Span, ...]] = {}
     total = before + found.log_prior
     dropped: dict[str, list[Span]] = {name: [] for name in noise.weights}
@@ -314,12 +322,12 @@ def _predict_left_out(problem: Problem, found: NoiseEstimate) -> LeftOutErrors:
     """Squared errors of all fixes, each predicted without itself."""
     fixes = (rows for rows in problem.constraints if rows.name in FIXES)
     return {
-        c.name: (problem.t[c.keyframe], row_moments(problem, c, found.points, len(c)).left_out, len(c.axes))
+        c.name: (problem.t[c.keyframe], collect_row_moments(problem, c, found.points, len(c)).left_out, len(c.axes))
         for c in fixes
     }
 
 
-def _with_outliers(found: NoiseEstimate, errors: LeftOutErrors, spans: list[Span]) -> NoiseEstimate:
+def _add_outliers(found: NoiseEstimate, errors: LeftOutErrors, spans: list[Span]) -> NoiseEstimate:
     """The estimate with weights for fixes in spans that it leaves out, so that each may be a single outlier."""
     weights = dict(found.noise.weights)
     for name, (t, squared, m) in errors.items():
@@ -332,18 +340,18 @@ def _with_outliers(found: NoiseEstimate, errors: LeftOutErrors, spans: list[Span
     return replace(found, noise=replace(found.noise, weights=weights))
 
 
-def excluded_share(problem: Problem, noise: NoiseModel) -> float:
+def compute_excluded_share(problem: Problem, noise: NoiseModel) -> float:
     """Share of the information of the positions that a noise model leaves out."""
     rows = next((c for c in problem.constraints if c.name == FIXES[0]), None)
-    return 0.0 if rows is None else 1.0 - float(np.mean(row_weights(problem.t[rows.keyframe], noise, rows.name)))
+    return 0.0 if rows is None else 1.0 - float(np.mean(select_weights(problem.t[rows.keyframe], noise, rows.name)))
 
 
-def without_excluded(recording: Recording, noise: NoiseModel) -> Recording:
+def drop_excluded(recording: Recording, noise: NoiseModel) -> Recording:
     """The recording without the fixes that a noise model leaves out."""
     gnss = recording.gnss
     assert gnss is not None
-    p = row_weights(gnss.t, noise, "gnss_position")[:, None]
-    v = row_weights(gnss.velocity_t, noise, "gnss_velocity")[:, None]
+    p = select_weights(gnss.t, noise, "gnss_position")[:, None]
+    v = select_weights(gnss.velocity_t, noise, "gnss_velocity")[:, None]
     gnss = replace(
         gnss,
         llh=np.where(p > 0.0, gnss.llh, np.nan),

@@ -18,7 +18,7 @@ from graphnav.estimation.noise.spans import Span, mask_times
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.ekf import Comparison
 from graphnav.estimation.solvers.linearise import Points
-from graphnav.estimation.solvers.passes import points_of, values_of
+from graphnav.estimation.solvers.passes import make_points, split_values
 from graphnav.estimation.solvers.watch import MINUTE, WIDE
 from graphnav.recording import Recording
 
@@ -64,14 +64,14 @@ class _CommonError(Constraint):
         return Linearized(residual, linear.jacobians | {self.error: J}, linear.sigma)
 
 
-def with_common_errors(problem: Problem, spans: list[Span], kinds: Explanation) -> Problem:
+def add_common_errors(problem: Problem, spans: list[Span], kinds: Explanation) -> Problem:
     """The problem with one unknown error for each of some constraints in each span (s)."""
     begins, wide = [float(problem.t[0]) - 1.0], [0.0]
     for a, b in spans:
         begins += [a, b + 2.0 * SAME_TIME]  # a node holds from this much before it
         wide += [1.0, 0.0]
 
-    def shifted(rows: Constraint) -> Constraint:
+    def add_error(rows: Constraint) -> Constraint:
         if rows.name not in kinds:
             return rows
         name, m = f"{rows.name}_fault", len(rows.axes)
@@ -87,13 +87,13 @@ def with_common_errors(problem: Problem, spans: list[Span], kinds: Explanation) 
             since=t - np.array(begins)[np.searchsorted(begins, t + SAME_TIME, side="right") - 1],
         )
 
-    return replace(problem, constraints=tuple(shifted(rows) for rows in problem.constraints))
+    return replace(problem, constraints=tuple(add_error(rows) for rows in problem.constraints))
 
 
-def with_own_errors(problem: Problem, spans: list[Span], kinds: Explanation) -> Problem:
+def add_own_errors(problem: Problem, spans: list[Span], kinds: Explanation) -> Problem:
     """The problem with an unknown error for each row of some constraints in the spans (s), as of a frozen receiver."""
 
-    def loose(rows: Constraint) -> Constraint:
+    def widen(rows: Constraint) -> Constraint:
         if rows.name not in kinds:
             return rows
         t = problem.t[rows.keyframe]
@@ -103,10 +103,10 @@ def with_own_errors(problem: Problem, spans: list[Span], kinds: Explanation) -> 
         wide = np.min(sigma / np.hypot(sigma, WIDE[rows.unit]), axis=1) ** 2
         return replace(rows, weight=np.where(within, np.minimum(weight, wide), weight))
 
-    return replace(problem, constraints=tuple(loose(rows) for rows in problem.constraints))
+    return replace(problem, constraints=tuple(widen(rows) for rows in problem.constraints))
 
 
-def evidence(
+def compute_evidence(
     problem: Problem,
     about: Points,
     spans: list[Span],
@@ -133,7 +133,7 @@ def evidence(
         Filter passes.
     """
     edges = np.append(np.searchsorted(problem.t, [a - SAME_TIME for a, _ in spans]), len(problem.t))
-    known = values_of(problem, about)
+    known = split_values(problem, about)
     found: list[Array] = []
     before, passes = 0.0, 0
     present = {rows.name for rows in problem.constraints}
@@ -146,12 +146,12 @@ def evidence(
         base = weighted.get(kinds, problem)
         models: list[tuple[Problem, Explanation]] = [(base, ())]
         if kinds and kinds not in (INTERVALS, ROWS):
-            models = [(with_common_errors(base, spans, kinds), kinds)]
+            models = [(add_common_errors(base, spans, kinds), kinds)]
         if kinds and set(kinds) <= set(FIXES):
-            models.append((with_own_errors(base, spans, kinds), ()))
+            models.append((add_own_errors(base, spans, kinds), ()))
         each = []
         for one, anew in models:
-            likelihood = comparison.log_likelihood(one, points_of(one, about.states, known), anew)
+            likelihood = comparison.log_likelihood(one, make_points(one, about.states, known), anew)
             passes += 1
             before = float(np.sum(likelihood[: edges[0]])) if not kinds else before
             each.append([float(np.sum(likelihood[a:b])) for a, b in itertools.pairwise(edges)])

@@ -53,7 +53,7 @@ _BESIDE = ("variance_factor", "stated", "used", "unit", "correlation_time")
 _TINY, _HUGE = -100.0, 100.0  # of a logarithm: e^100 is beyond what any sensor can be off by
 
 
-def noise_values(noise: NoiseModel, mode: str = "estimated") -> dict[str, Any]:
+def list_noise(noise: NoiseModel, mode: str = "estimated") -> dict[str, Any]:
     """A noise model as plain values, those under the key "noise" of a file.
 
     Parameters
@@ -104,7 +104,7 @@ def write_noise(path: str | Path, noise: NoiseModel, mode: str = "estimated") ->
         If it cannot be written.
     """
     path = Path(path)
-    path.write_text(json.dumps({"noise": noise_values(noise, mode)}, indent=2) + "\n", encoding="utf-8")
+    path.write_text(json.dumps({"noise": list_noise(noise, mode)}, indent=2) + "\n", encoding="utf-8")
     return path
 
 

@@ -20,7 +20,7 @@ import numpy as np
 from scipy.special import gammaincinv  # scipy.stats would take half a second to import
 
 from graphnav.config import Settings
-from graphnav.core.findings import period_of
+from graphnav.core.findings import compute_period
 from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.detectors.windows import sum_running
@@ -34,7 +34,7 @@ _WORDS = {"gyro_noise_density": "gyro", "accel_noise_density": "accelerometer"}
 _UNITS = {"gyro_noise_density": "rad/s/sqrt(Hz)", "accel_noise_density": "m/s^2/sqrt(Hz)"}
 
 
-def with_measured_floor(recording: Recording, settings: Settings) -> tuple[Recording, tuple[str, ...]]:
+def apply_measured_floor(recording: Recording, settings: Settings) -> tuple[Recording, tuple[str, ...]]:
     """A walk with noise densities no larger than its quietest stretch shows, and a sentence on those lowered.
 
     Other recordings, and figures to be taken as stated, are as they were.
@@ -61,7 +61,7 @@ def with_measured_floor(recording: Recording, settings: Settings) -> tuple[Recor
 
 def bound_density(t: Array, x: Array) -> float:
     """Bound from above of the white noise density of rows x (N, 3) at times t (N,), per axis; infinite if too short."""
-    period = period_of(t)
+    period = compute_period(t)
     size = max(1, round(_CLUSTER / period)) if period < _CLUSTER else 1
     count, stretch = len(t) // size, round(_STRETCH / (size * period)) if np.isfinite(period) else 1
     if stretch < 3 or count < stretch:

@@ -10,14 +10,14 @@ from scipy.special import chdtri
 from graphnav.core.errors import EstimationError
 from graphnav.estimation.faults import weigh_rows
 from graphnav.estimation.noise.model import RowWeights
-from graphnav.estimation.noise.moments import row_moments
+from graphnav.estimation.noise.moments import collect_row_moments
 from graphnav.estimation.noise.outliers import limit_scaled, limit_squares, list_reduced
 from graphnav.estimation.problem import Problem
-from graphnav.estimation.solvers.ekf import ekf, near, refilter
+from graphnav.estimation.solvers.ekf import ekf, refilter, smooth_near
 from graphnav.estimation.solvers.linearise import Points, linearise
-from graphnav.estimation.solvers.passes import ForwardRecord, SmootherPass, near_to
-from graphnav.estimation.solvers.robust import weight_and_cost
-from graphnav.estimation.solvers.rts import backward
+from graphnav.estimation.solvers.passes import ForwardRecord, SmootherPass, are_near
+from graphnav.estimation.solvers.robust import weigh_squares
+from graphnav.estimation.solvers.rts import smooth_backward
 from graphnav.estimation.solvers.watch import WIDE
 
 BREAKDOWN = EstimationError, np.linalg.LinAlgError  # what a filter raises that has lost its digits
@@ -38,7 +38,7 @@ class Initial:
 def smooth_about(problem: Problem, about: Points) -> tuple[ForwardRecord, SmootherPass]:
     """One pass of filter and smoother over the first keyframes, linearised at points of them."""
     forward = refilter(problem, about)
-    return forward, backward(problem, forward)
+    return forward, smooth_backward(problem, forward)
 
 
 def find_initial_points(problem: Problem, opening: float | None) -> tuple[list[Initial], int]:
@@ -67,7 +67,7 @@ def find_initial_points(problem: Problem, opening: float | None) -> tuple[list[I
         If the filter breaks down with large sigmas of all fixes, too.
     """
     try:
-        plain = about = backward(problem, ekf(problem, opening=opening, stays=_STAYS))
+        plain = about = smooth_backward(problem, ekf(problem, opening=opening, stays=_STAYS))
     except BREAKDOWN:  # outliers of hundreds of sigmas leave no digits in its covariance
         initial, passes = _anneal(problem, opening)
         return [initial], passes
@@ -77,7 +77,7 @@ def find_initial_points(problem: Problem, opening: float | None) -> tuple[list[I
             found = weigh_rows(problem, refilter(problem, about, watch=True, drifts=False).weights)
             if _list_unused(found) == _list_unused(sound):
                 break
-            sound, (_, about) = found, near(found, about, opening)
+            sound, (_, about) = found, smooth_near(found, about, opening)
             passes += 2
         if sound is problem:
             return [Initial(plain)], passes
@@ -88,9 +88,9 @@ def find_initial_points(problem: Problem, opening: float | None) -> tuple[list[I
     for rows in sound.constraints:
         if rows.weight is not None and np.any(rows.weight == 0.0):
             every = np.ones(len(rows), dtype=bool)
-            weight = limit_scaled(row_moments(sound, rows, about, len(rows)).left_out, len(rows.axes), every)
+            weight = limit_scaled(collect_row_moments(sound, rows, about, len(rows)).left_out, len(rows.axes), every)
             weights[rows.name] = list_reduced(sound.t[rows.keyframe], weight, every)
-    if near_to(other, one):
+    if are_near(other, one):
         return [Initial(one, weights)], passes + 2
     return _add_annealed([Initial(plain), Initial(about, weights)], passes + 2, problem, opening)
 
@@ -121,7 +121,7 @@ def _anneal(problem: Problem, opening: float | None) -> tuple[Initial, int]:
     while True:
         share = {c.name: 1.0 / (1.0 + (WIDE[c.unit] * wider / stated[c.name]) ** 2) for c in fixes}
         eased = weigh_rows(problem, {name: x * weights[name] for name, x in share.items()})
-        about = backward(eased, ekf(eased, opening=opening) if about is None else refilter(eased, about))
+        about = smooth_backward(eased, ekf(eased, opening=opening) if about is None else refilter(eased, about))
         _, about = smooth_about(eased, about)
         passes += 2
         settled = not share or min(np.median(x) for x in share.values()) > 0.5
@@ -129,7 +129,7 @@ def _anneal(problem: Problem, opening: float | None) -> tuple[Initial, int]:
             error = linearise(rows, about, problem.columns)
             m = len(rows.axes)
             squared = share[rows.name] * np.sum((error.residual / error.stated) ** 2, axis=1)
-            weights[rows.name] = weight_and_cost("geman-mcclure", np.sqrt(squared), np.sqrt(m))[0]
+            weights[rows.name] = weigh_squares("geman-mcclure", np.sqrt(squared), np.sqrt(m))[0]
             settled |= bool(np.median(squared) > chdtri(m, 0.5))
             every = np.ones(len(rows), dtype=bool)
             outliers[rows.name] = list_reduced(problem.t[rows.keyframe], limit_squares(squared, m), every)

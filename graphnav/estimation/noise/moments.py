@@ -29,8 +29,8 @@ from graphnav.constraints.base import Constraint
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM
 from graphnav.estimation.problem import ParameterChain, Problem
-from graphnav.estimation.solvers.linearise import shift, stepping
-from graphnav.estimation.solvers.passes import DisturbancePass, ForwardRecord, values_of
+from graphnav.estimation.solvers.linearise import find_stepping, shift
+from graphnav.estimation.solvers.passes import DisturbancePass, ForwardRecord, split_values
 
 _FORGOTTEN = 1e-6  # share of a value that is left of it, below which what is left is lost in rounding
 
@@ -63,7 +63,7 @@ class ImuMoments:
         return np.maximum(freedom, 1.0)
 
 
-def imu_moments(problem: Problem, forward: ForwardRecord, smoothed: DisturbancePass) -> ImuMoments:
+def collect_imu_moments(problem: Problem, forward: ForwardRecord, smoothed: DisturbancePass) -> ImuMoments:
     """Moments of the intervals.
 
     A = |s|^2 with s of covariance M, trace(M) = B, is near to a chi-square variable of B^2 / trace(M^2) degrees of
@@ -80,20 +80,20 @@ def imu_moments(problem: Problem, forward: ForwardRecord, smoothed: DisturbanceP
     return ImuMoments(A, np.maximum(B, 0.0), Q, N)
 
 
-def process_moments(
+def collect_process_moments(
     problem: Problem, chain: ParameterChain, smoothed: DisturbancePass, end: int
 ) -> tuple[Array, Array, Array]:
     """Keyframes (n,) at which a process is driven, and A and B (n, k) there; the first is its steady variance."""
     at = problem.columns[chain.parameter.name]
-    k = np.concatenate([[0], stepping(chain, end)])
+    k = np.concatenate([[0], find_stepping(chain, end)])
     q = chain.sigma[chain.node[k]] ** 2
     N = smoothed.N_diagonal[k, at]
     return k, q * smoothed.r[k, at] ** 2, q * np.maximum(N, 0.0)
 
 
-def row_moments(problem: Problem, rows: Constraint, smoothed: DisturbancePass, n: int) -> RowMoments:
+def collect_row_moments(problem: Problem, rows: Constraint, smoothed: DisturbancePass, n: int) -> RowMoments:
     """Of the first n rows of a constraint."""
-    at, values = rows.keyframe[:n], values_of(problem, smoothed)
+    at, values = rows.keyframe[:n], split_values(problem, smoothed)
     linear = smoothed.linearise(rows, problem.columns, n)
     HPH = smoothed.cover_rows(linear, n)
     w = np.ones((n, 1)) if rows.weight is None else rows.weight[:n, None]
@@ -125,7 +125,7 @@ def lag_moments(problem: Problem, chain: ParameterChain, smoothed: DisturbancePa
     """
     at = problem.columns[chain.parameter.name]
     own = shift(at)
-    k, A, B = process_moments(problem, chain, smoothed, end)
+    k, A, B = collect_process_moments(problem, chain, smoothed, end)
     k, j = k[1:], chain.node[k[1:]]
     driven = chain.sigma[j] ** 2 * (1.0 + A[1:] - B[1:])
     c0, c1 = smoothed.values[k - 1, own], smoothed.values[k, own]

@@ -41,6 +41,6 @@ def count_reduced(some: RowWeights) -> int:
     return int(np.sum(some.weight < 1.0))
 
 
-def cost_of_outliers(weights: Mapping[str, RowWeights]) -> float:
+def compute_outlier_cost(weights: Mapping[str, RowWeights]) -> float:
     """Log-probability beforehand of as many outliers as there are reduced weights."""
     return float(np.log(CHANCE)) * sum(count_reduced(some) for some in weights.values())

@@ -20,7 +20,7 @@ _OF_RECEIVER = "gnss", "dual_antenna"
 TIME_WITHIN = np.log(3.0)  # 1-sigma of the logarithm of a correlation time
 
 
-def prior(group: str) -> tuple[float, float]:
+def get_prior(group: str) -> tuple[float, float]:
     """Median and 1-sigma of the logarithm of a group's variance factor."""
     parts = group.split(".")
     shares = _SHARES if parts[0].startswith(_OF_RECEIVER) else {}

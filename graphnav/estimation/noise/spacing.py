@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from graphnav.constraints.gnss import period
+from graphnav.constraints.gnss import find_fix_period
 from graphnav.core.rotation import Array
 from graphnav.estimation.alignment.first import pick_fixes
 from graphnav.recording import Gnss, Recording
@@ -24,28 +24,30 @@ def space_fixes(recording: Recording, spacing: float) -> Recording:
     have, the best velocity's fix is kept as well.
     """
     gnss = recording.gnss
-    if gnss is None or len(gnss.t) < 2 or period(gnss.t) > 0.5 * spacing:
+    if gnss is None or len(gnss.t) < 2 or find_fix_period(gnss.t) > 0.5 * spacing:
         return recording
-    return replace(recording, gnss=pick_fixes(gnss, best_fixes(gnss, np.floor((gnss.t - grid_start(gnss)) / spacing))))
+    return replace(
+        recording, gnss=pick_fixes(gnss, select_best_fixes(gnss, np.floor((gnss.t - find_grid_start(gnss)) / spacing)))
+    )
 
 
-def grid_start(gnss: Gnss) -> float:
+def find_grid_start(gnss: Gnss) -> float:
     """Where the grid of spans begins of which the fixes are the best, s: between two rows of a steady receiver."""
-    return float(gnss.t[0] - 0.5 * period(gnss.t))
+    return float(gnss.t[0] - 0.5 * find_fix_period(gnss.t))
 
 
-def best_fixes(gnss: Gnss, which: Array) -> Array:
+def select_best_fixes(gnss: Gnss, which: Array) -> Array:
     """The rows that `space_fixes` keeps of each span; `which` (N,) says what span a fix is of."""
-    keep = _best(which, np.linalg.norm(gnss.sd, axis=1))
+    keep = _select_best(which, np.linalg.norm(gnss.sd, axis=1))
     if gnss.v is not None and gnss.sd_v is not None:
         moves = np.asarray(np.isfinite(gnss.v).all(axis=1))
-        best = _best(which, np.where(moves, np.linalg.norm(gnss.sd_v, axis=1), np.inf))
+        best = _select_best(which, np.where(moves, np.linalg.norm(gnss.sd_v, axis=1), np.inf))
         without = np.isin(which[best], which[keep[~moves[keep]]])
         keep = np.union1d(keep, best[without & moves[best]])
     return keep
 
 
-def _best(which: Array, size: Array) -> Array:
+def _select_best(which: Array, size: Array) -> Array:
     """The row of the least size of each group, the first of several, in order."""
     order = np.lexsort((size, which))  # stable: rows are in the order of time
     return np.sort(order[np.concatenate([[True], np.diff(which[order]) > 0])])

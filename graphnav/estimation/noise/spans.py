@@ -8,7 +8,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from graphnav.constraints.base import SAME_TIME
-from graphnav.core.findings import runs_of
+from graphnav.core.findings import find_runs
 from graphnav.core.rotation import Array
 from graphnav.estimation.noise.model import RowWeights
 from graphnav.estimation.noise.outliers import CHANCE, OUTLIER_COST
@@ -65,7 +65,7 @@ def list_repeats(recording: Recording) -> list[Span]:
     same &= (gnss.t >= recording.start) & (gnss.t <= recording.end)
     return [
         (float(gnss.t[a]), float(gnss.t[b - 1]))
-        for a, b in runs_of(same)
+        for a, b in find_runs(same)
         if b - a > 1 and alike[a - 1 : b - 1].sum() < np.log(CHANCE)
     ]
 
@@ -76,11 +76,11 @@ def split_at_repeats(spans: list[Span], recording: Recording) -> list[Span]:
     if gnss is None or not repeats:
         return spans
     rest = mask_times(gnss.t, spans) & ~mask_times(gnss.t, repeats)
-    others = [(float(gnss.t[a]), float(gnss.t[b - 1])) for a, b in runs_of(rest) if b - a > 1]
+    others = [(float(gnss.t[a]), float(gnss.t[b - 1])) for a, b in find_runs(rest) if b - a > 1]
     return sorted([*repeats, *others])
 
 
-def total_length(spans: Iterable[Span]) -> float:
+def sum_lengths(spans: Iterable[Span]) -> float:
     """s"""
     return sum(end - begin for begin, end in spans)
 

@@ -41,7 +41,7 @@ class FigureRow:
     correlation_time: float | None  # s, of a Gauss-Markov process; None for white noise
 
 
-def figure_rows(
+def tabulate_figures(
     noise: NoiseModel, recording: Recording, slow_times: tuple[float, float], imu: ImuNoise | None = None
 ) -> tuple[FigureRow, ...]:
     """All figures of a noise model.
@@ -81,13 +81,13 @@ def figure_rows(
                 sigma,
                 None if sigma is None else root * sigma,
                 {"gnss_position": "m", "gnss_velocity": "m/s"}.get(source, ""),
-                None if time is None else noise.times.get(_process(source, time, kind), lasts[time]),
+                None if time is None else noise.times.get(_find_process(source, time, kind), lasts[time]),
             )
         )
     return tuple(out)
 
 
-def whole_ratio(noise: NoiseModel, source: str, axis: str) -> float | None:
+def compute_whole_ratio(noise: NoiseModel, source: str, axis: str) -> float | None:
     """The sigma of a whole error, white and lasting, over the stated one; None where nothing is known of it.
 
     Parameters
@@ -99,7 +99,7 @@ def whole_ratio(noise: NoiseModel, source: str, axis: str) -> float | None:
     return float(np.sqrt(sum(known))) if known else None
 
 
-def _process(source: str, time: str, kind: str | None) -> str:
+def _find_process(source: str, time: str, kind: str | None) -> str:
     """The parameter of a process."""
     if source == "gnss_position":
         return f"gnss_error_of_{time}{f'_{kind}' if kind else ''}"

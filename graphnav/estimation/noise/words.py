@@ -8,7 +8,7 @@ from graphnav.constraints.gnss import STAMP_ERROR, GnssPosition
 from graphnav.constraints.vehicle import MOUNTING
 from graphnav.core.notes import Note, format_count
 from graphnav.core.rotation import wrap
-from graphnav.estimation.names import components
+from graphnav.estimation.names import name_components
 from graphnav.estimation.noise.model import INTERVALS, NoiseModel
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.linearise import Points, shift
@@ -42,7 +42,7 @@ def describe_far(problem: Problem, smoothed: Points) -> tuple[str, ...]:
             )
             out.append(Note("doubt.axes", f"The attitude cannot be trusted: {sentence}; check axes in [imu]"))
         elif away[k] > _FAR:
-            shown = components(p.name, p.size, p.unit)[k]
+            shown = name_components(p.name, p.size, p.unit)[k]
             found, given, sd = (float(f"{shown.scale * x:.2g}") for x in (value[k], stated[k], sigma[k]))
             out.append(
                 Note(

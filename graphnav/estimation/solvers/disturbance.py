@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from graphnav.core.compiled import compiled
+from graphnav.core.compiled import compile_once
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, MOVING
 
 
-@compiled
+@compile_once
 def step_back(F: Array, decay: Array, N: Array) -> Array:
     """N (D, D) before a step from that behind it."""
     w, D = F.shape[1], len(N)
@@ -37,7 +37,7 @@ def step_back(F: Array, decay: Array, N: Array) -> Array:
     return out
 
 
-@compiled
+@compile_once
 def step_vector_back(F: Array, decay: Array, r: Array) -> Array:
     """r (D,) likewise."""
     out = np.empty(len(r))
@@ -48,7 +48,7 @@ def step_vector_back(F: Array, decay: Array, r: Array) -> Array:
     return out
 
 
-@compiled
+@compile_once
 def take_back(N: Array, H: Array, Kt: Array, inverse: Array, lossy: bool) -> Array:
     """N (D, D) before an update from that behind it."""
     G = np.dot(Kt, N)
@@ -65,7 +65,7 @@ def take_back(N: Array, H: Array, Kt: Array, inverse: Array, lossy: bool) -> Arr
     return out
 
 
-@compiled
+@compile_once
 def smooth_errors(
     F: Array,
     decay: Array,
@@ -96,7 +96,7 @@ def smooth_errors(
             np.add(errors_predicted[k], np.dot(P_predicted[k % len(P_predicted)], r), smoothed[k])
 
 
-@compiled
+@compile_once
 def smooth_rows(
     k0: int,
     k1: int,
@@ -168,7 +168,7 @@ def smooth_rows(
     return r_k, N_k
 
 
-@compiled
+@compile_once
 def fill_covariances(
     k: int,
     P: Array,
@@ -190,7 +190,7 @@ def fill_covariances(
         cover_rows(P, N, asked[k, :rows], of_rows[k])
 
 
-@compiled
+@compile_once
 def cover(P: Array, N: Array, out: Array) -> None:
     """P - P N P, in `out`."""
     one = np.dot(np.dot(P, N), P)
@@ -199,7 +199,7 @@ def cover(P: Array, N: Array, out: Array) -> None:
     np.multiply(0.5, out, out)
 
 
-@compiled
+@compile_once
 def vary(P: Array, N: Array, columns: Array, out: Array) -> None:
     """The diagonal of P - P N P at some columns, in `out` (D,)."""
     own = P[columns]
@@ -208,15 +208,15 @@ def vary(P: Array, N: Array, columns: Array, out: Array) -> None:
         out[columns[i]] = own[i, columns[i]] - np.dot(PN[i], own[i])
 
 
-@compiled
+@compile_once
 def cover_rows(P: Array, N: Array, H: Array, out: Array) -> None:
     """H (P - P N P) H^T of rows H (m, D), in the first of `out` (M, M)."""
     m, HP = len(H), np.dot(H, P)
     out[:m, :m] = np.dot(H - np.dot(HP, N), HP.T)
 
 
-@compiled
-def row_covariances(H: Array, P: Array, k: Array) -> Array:
+@compile_once
+def compute_row_covariances(H: Array, P: Array, k: Array) -> Array:
     """(n, m, m) H P_k H^T of rows H (n, m, D) at keyframes k (n,)."""
     n, m, _ = H.shape
     out = np.empty((n, m, m))

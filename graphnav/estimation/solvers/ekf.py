@@ -34,7 +34,7 @@ import numpy as np
 
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM
-from graphnav.estimation.dense import dense
+from graphnav.estimation.dense import make_dense
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import Solution
 from graphnav.estimation.solvers.decision import Decide, hold
@@ -46,15 +46,15 @@ from graphnav.estimation.solvers.passes import (
     ForwardRecord,
     Progress,
     SmootherPass,
+    are_near,
+    compute_sigmas,
+    estimate_parameters,
     join_passes,
     move_points,
-    near_to,
-    parameters_of,
-    sigmas_of,
     subtract_points,
 )
 from graphnav.estimation.solvers.points import FilterErrors, Linearisation, PointFilter, filter_likelihood
-from graphnav.estimation.solvers.rts import backward
+from graphnav.estimation.solvers.rts import smooth_backward
 from graphnav.estimation.solvers.stack import Innovations, Stack
 from graphnav.estimation.solvers.stretches import STAYS, StretchFilter
 from graphnav.estimation.solvers.watch import Bank
@@ -84,8 +84,12 @@ def ekf(
     began = time.perf_counter()
     K, about = len(problem.t), None
     if opening is not None and (n := int(np.searchsorted(problem.t, opening, side="right"))) > 1:
-        about = _smooth_about(problem, backward(problem, _forward(problem, n)))[1] if known is None else known.first(n)
-    one = _forward(problem, K, about, progress, decide=decide, stays=stays)
+        about = (
+            _smooth_about(problem, smooth_backward(problem, _run_forward(problem, n)))[1]
+            if known is None
+            else known.first(n)
+        )
+    one = _run_forward(problem, K, about, progress, decide=decide, stays=stays)
     seconds = time.perf_counter() - began
     filtered, P = one.states, one.P[:, :DIM, :DIM].copy()  # a view would hold what is known of the parameters too
     if about is not None:
@@ -97,14 +101,14 @@ def ekf(
         t=problem.t,
         states=filtered,
         covariance=P,
-        parameters=parameters_of(problem, one.values, sigmas_of(one.P)),
+        parameters=estimate_parameters(problem, one.values, compute_sigmas(one.P)),
         records={name: r.record(problem) for name, r in one.records.items()},
         counts={"imu": K - 1, **{rows.name: len(rows) for rows in problem.constraints}},
         iterations=1,
         stopped="one pass forward over all keyframes",
         timings={"filter": seconds},
         notes=problem.notes,
-        between=(dense(problem, filtered, P, scale_at(problem.columns, one.values), smooth=False),),
+        between=(make_dense(problem, filtered, P, scale_at(problem.columns, one.values), smooth=False),),
     )
     return FilterPass(**vars(one), solution=solution)
 
@@ -124,9 +128,9 @@ def refilter(
     about : of these keyframes, near enough for what is left to be linear: an earlier pass.
     watch : look for errors that last in the rows that are to be watched, and go back to before them.
     drifts : of such errors those that grow as well.
-    whole : False keeps what `backward_moments` needs, predicted covariances of two keyframes, and no innovations.
+    whole : False keeps what `smooth_moments` needs, predicted covariances of two keyframes, and no innovations.
     """
-    return _forward(problem, len(about.values), about, progress, watch, drifts, whole=whole)
+    return _run_forward(problem, len(about.values), about, progress, watch, drifts, whole=whole)
 
 
 class Comparison:
@@ -148,13 +152,13 @@ class Comparison:
         """
         stack, steps = Stack(problem, self._K), advance(problem, self._K)
         one = self._one.lift(problem, about, stack, anew)
-        x, P = _prior(problem)
+        x, P = _start_from_prior(problem)
         start = _begin(subtract_points(x, about.first(1))[0], P, stack.records)
         filter_likelihood(problem, about, stack, steps, one, start)
         return stack.log_likelihood()
 
 
-def near(
+def smooth_near(
     problem: Problem, about: Points, opening: float | None = None, progress: Progress | None = None
 ) -> tuple[ForwardRecord, SmootherPass]:
     """A drive smoothed again near what is known of it: only figures or weights have changed since.
@@ -165,7 +169,7 @@ def near(
     if stays:
         return forward, smoothed
     forward = ekf(problem, progress, opening)
-    return forward, backward(problem, forward, progress)
+    return forward, smooth_backward(problem, forward, progress)
 
 
 def _smooth_about(
@@ -174,14 +178,14 @@ def _smooth_about(
     """The first keyframes smoothed about points, and about where that leads until attitudes stay, if they do."""
     for _ in range(_PASSES):
         forward = refilter(problem, about, progress)
-        smoothed = backward(problem, forward, progress)
-        if near_to(smoothed, about):
+        smoothed = smooth_backward(problem, forward, progress)
+        if are_near(smoothed, about):
             return forward, smoothed, True
         about = smoothed
     return forward, smoothed, False
 
 
-def _forward(
+def _run_forward(
     problem: Problem,
     K: int,
     about: Points | None = None,
@@ -202,7 +206,7 @@ def _forward(
     stack = Stack(problem, K, {c.name for c in fixes})
     ahead, found = Points.allocate(K, D - DIM), Points.allocate(K, D - DIM)
     errors = FilterErrors(np.empty((n, D)), all_Pp, np.empty((n, D)), all_P)
-    x, P = _prior(problem)
+    x, P = _start_from_prior(problem)
     updates, search = None, None
     if about is not None:
         given = PointFilter(problem, about, stack, steps, all_F, errors)
@@ -253,7 +257,7 @@ def _forward(
     )
 
 
-def _prior(problem: Problem) -> tuple[Points, Array]:
+def _start_from_prior(problem: Problem) -> tuple[Points, Array]:
     """Point and covariance before the first keyframe."""
     assert problem.prior.mean is not None
     sigma = np.concatenate([problem.prior.sigma[0], *(c.sigma[0] for c in problem.chains)])

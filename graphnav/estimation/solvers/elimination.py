@@ -21,7 +21,7 @@ from graphnav.core.state import DIM, States
 from graphnav.estimation.solvers.breakdown import explain_smoother
 from graphnav.estimation.solvers.linearise import shift
 from graphnav.estimation.solvers.recursion import PASSES
-from graphnav.estimation.solvers.stages import Columns, Measured, Message, Place, Stage, rotate_columns, width
+from graphnav.estimation.solvers.stages import Columns, Measured, Message, Place, Stage, count_columns, rotate_columns
 from graphnav.estimation.solvers.watch import Watch
 
 _BLOCK = 8  # reflectors that tpqrt applies at once
@@ -66,7 +66,7 @@ def predict(
     EstimationError
         If the rows do not determine what is eliminated: sigmas or units are wrong.
     """
-    D0, D, R0 = len(before.z), width(columns), before.R
+    D0, D, R0 = len(before.z), count_columns(columns), before.R
     gone = [before.columns[s.name] for s in place.steps if s.name in before.columns]
     lost = np.arange(DIM if place.linked else 0)
     if gone:
@@ -115,11 +115,11 @@ def predict(
         row += k
     R = dgeqrf(A, overwrite_a=1)[0]
     top = np.asfortranarray(R[E : E + D, E:])
-    top[:, :D] *= _upper(D)
+    top[:, :D] *= _mask_upper(D)
     root, info = dtrtri(R[:E, :E]) if E else (np.zeros((0, 0)), 0)
     if info:
         raise explain_smoother(place.t)
-    root = root * _upper(E)
+    root = root * _mask_upper(E)
     g = np.zeros(D0)
     g[DIM:] = values[: D0 - DIM] - before.values
     G, g[lost], noise = -root @ R[:E, E : E + D], root @ R[:E, E + D], root @ root.T
@@ -154,10 +154,10 @@ def update(ahead: Predicted, rows: Sequence[Measured], weighted: bool = False) -
             tail = np.zeros((sum(one.b.size for one in plain), top.shape[1]))
             row = 0
             for one in plain:
-                H, b, _ = one.weighted(y, passes)
+                H, b, _ = one.weigh(y, passes)
                 tail[row : row + b.size, :D], tail[row : row + b.size, D] = H.reshape(-1, D), b.ravel()
                 row += b.size
-            top, _ = _under(top, tail)
+            top, _ = _append_rows(top, tail)
         if tests is not None:
             top, beside, fault = _test(top, tests.copy(), rows, y, passes, place.t, ahead.state)
         y, info = dtrtrs(top[:, :D], top[:, D])
@@ -177,22 +177,22 @@ def _test(
     for one in rows:
         if one.name not in tests or not one.H.any():  # none of those that are left out
             continue
-        H, b, sigma = one.weighted(y, passes)
+        H, b, sigma = one.weigh(y, passes)
         own, columns, errors = tests.begin(one.name, t, sigma)
         tail = np.zeros((len(errors), top.shape[1]))
         tail[:, :D], tail[:, D] = H.reshape(-1, D), b.ravel()
         tail[:, D + 1 :][:, columns] = errors
         top = top.copy(order="F")
         top[:, D + 1 :][:, own] = 0.0
-        top, left = _under(top, tail)
+        top, left = _append_rows(top, tail)
         since = tests.found(one.name, t, left[:, 0], left[:, 1:][:, columns], speed)
         if since is not None and fault is None:
             fault = one.name, since
-    tests.stands(top[:, :D], top[:, D + 1 :])
+    tests.take_message(top[:, :D], top[:, D + 1 :])
     return top, tests, fault
 
 
-def _under(top: Array, tail: Array) -> tuple[Array, Array]:
+def _append_rows(top: Array, tail: Array) -> tuple[Array, Array]:
     """Take rows (m, D + n) in under a triangle with columns beside it (D, D + n): the same again, and what is left.
 
     Left are (m, n) that the states can do nothing about.
@@ -205,6 +205,6 @@ def _under(top: Array, tail: Array) -> tuple[Array, Array]:
 
 
 @cache
-def _upper(n: int) -> Array:
+def _mask_upper(n: int) -> Array:
     """(n, n) 1 in the upper triangle."""
     return np.asfortranarray(np.triu(np.ones((n, n))))

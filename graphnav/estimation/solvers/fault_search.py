@@ -53,7 +53,7 @@ class FaultSearch:
         """Test what was filtered from one keyframe to another; the keyframe to go on from."""
         since = self._test(k0, k1)
         if since is None and k1 == len(self._t):
-            since = self.verdicts.ended()
+            since = self.verdicts.set_ended()
         if since is None:
             return k1
         back = int(np.searchsorted(self._t, since))
@@ -65,21 +65,21 @@ class FaultSearch:
     def _test(self, k0: int, k1: int) -> float | None:
         """When something began to be wrong that was used up to one of k0 to k1."""
         given = self._filter
-        root = self._roots_by_kernels(k0, k1)
+        root = self._weigh_roots(k0, k1)
         fault = self._bank.follow(k0, k1, given.F, self._steps.decay, self._stack, given.updates, root, given.speeds)
         if fault is None:
             return None
         name, at, since = fault
         return self.verdicts.settle(name, since, float(self._t[at]))
 
-    def _roots_by_kernels(self, k0: int, k1: int) -> Array:
+    def _weigh_roots(self, k0: int, k1: int) -> Array:
         """(K, M, M) roots of S, with the weights that kernels have left at keyframes k0 to k1."""
         stack = self._stack
         bent = k0 + np.flatnonzero(np.any(stack.bent[k0:k1] < 1.0, axis=1))
         if not len(bent):
             return stack.root
         out = stack.root.copy()
-        for some in (block for k in bent.tolist() for block in stack.together(k)):
+        for some in (block for k in bent.tolist() for block in stack.stack_keyframe(k)):
             own, weight = (some.k, some.at[1], some.at[1]), stack.bent[some.at]
             if np.any((weight > 0.0) & (weight < 1.0)):
                 root = stack.root[own]
@@ -92,7 +92,7 @@ class FaultSearch:
         for name, was in self._used.items():
             record = self._stack.records[name]
             for k in np.unique(record.rows.keyframe[np.flatnonzero(record.used != was)]).tolist():
-                for some in self._stack.together(k):
+                for some in self._stack.stack_keyframe(k):
                     if some.parts[0][0] is record.rows:
                         self._weigh(some)
             was[:] = record.used

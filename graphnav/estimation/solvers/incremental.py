@@ -16,11 +16,11 @@ import numpy as np
 from graphnav.core.notes import Note, format_count
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, States
-from graphnav.estimation.dense import dense
+from graphnav.estimation.dense import make_dense
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import Solution
 from graphnav.estimation.solvers.linearise import Points, list_node_steps, scale_at, shift
-from graphnav.estimation.solvers.passes import Progress, parameters_of, record_residuals
+from graphnav.estimation.solvers.passes import Progress, estimate_parameters, record_residuals
 from graphnav.estimation.solvers.rows import compute_cost_at
 from graphnav.estimation.solvers.stages import Message, Place
 from graphnav.estimation.solvers.window import SettledStates, Window, compute_turn_limit, make_first_message
@@ -143,7 +143,7 @@ def replay(problem: Problem, solver: str, engine: LagSmoother, lag: float, progr
         t=problem.t,
         states=states,
         covariance=covariance,
-        parameters=parameters_of(problem, values, sigma),
+        parameters=estimate_parameters(problem, values, sigma),
         records=records,
         counts={"initial_prior": 1, "imu": K - 1, **{c.name: len(c) for c in problem.constraints}},
         iterations=1,
@@ -155,7 +155,7 @@ def replay(problem: Problem, solver: str, engine: LagSmoother, lag: float, progr
             Note("solver.step_times", ("" if np.isinf(lag) else f"lag {lag:g} s: ") + describe(seconds)),
             Note("solver.relinearised", f"{format_count(again, 'keyframe')} linearised again"),
         ),
-        between=(dense(problem, states, covariance, scale_at(problem.columns, values), smooth=True),),
+        between=(make_dense(problem, states, covariance, scale_at(problem.columns, values), smooth=True),),
     )
     scale = scale_at(problem.columns, np.array([newest.values for newest in points])[:, order])
     now = replace(
@@ -166,7 +166,7 @@ def replay(problem: Problem, solver: str, engine: LagSmoother, lag: float, progr
         parameters={},
         records={},
         stopped="each keyframe as it was known when it came",
-        between=(dense(problem, live, P, scale, smooth=False),),
+        between=(make_dense(problem, live, P, scale, smooth=False),),
     )
     return Replay(settled, now, seconds)
 

@@ -25,7 +25,7 @@ from __future__ import annotations
 import numpy as np
 
 from graphnav.core import rotation
-from graphnav.core.compiled import compiled
+from graphnav.core.compiled import compile_once
 from graphnav.core.rotation import Array, mv
 from graphnav.core.state import BLOCKS, MOVING, States
 
@@ -33,7 +33,7 @@ _THETA, _V = BLOCKS["theta"], BLOCKS["v"]
 _I9 = np.eye(MOVING)
 
 
-def plus_invariant(states: States, e: Array) -> States:
+def add_invariant(states: States, e: Array) -> States:
     """K states moved by error states (K, 15)."""
     phi, dv = mv(states.R_nb, e[:, _THETA]), e[:, _V]
     exp_phi = rotation.exp(phi)
@@ -46,7 +46,7 @@ def plus_invariant(states: States, e: Array) -> States:
     )
 
 
-def minus_invariant(states: States, other: States) -> Array:
+def subtract_invariant(states: States, other: States) -> Array:
     """The error states (K, 15) with ``plus_invariant(other, e) == states``."""
     theta = rotation.log(np.swapaxes(other.R_nb, -1, -2) @ states.R_nb)
     phi = mv(other.R_nb, theta)
@@ -54,7 +54,7 @@ def minus_invariant(states: States, other: States) -> Array:
     return np.concatenate([theta, states.p - other.p, dv, states.ba - other.ba, states.bg - other.bg], axis=-1)
 
 
-@compiled
+@compile_once
 def turn(P: Array, T: Array) -> Array:
     """Covariances P (K, D, D) of errors of which the first m are now T (K, m, m) times what they were.
 

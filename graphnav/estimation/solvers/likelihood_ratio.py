@@ -13,17 +13,17 @@ from __future__ import annotations
 
 import numpy as np
 
-from graphnav.core.compiled import compiled
+from graphnav.core.compiled import compile_once
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM
 
 
-def memory_size(L: int, c: int) -> int:
+def count_remembered(L: int, c: int) -> int:
     """Numbers that a kind remembers."""
     return L * (1 + c + c * c) + 1
 
 
-@compiled
+@compile_once
 def begin_slot(memory: Array, t: float, L: int, c: int, prior: float) -> int:
     """Begin the slot whose turn it is at a fix; which one that is."""
     memory[-1] += 1.0
@@ -40,7 +40,7 @@ def begin_slot(memory: Array, t: float, L: int, c: int, prior: float) -> int:
     return slot
 
 
-@compiled
+@compile_once
 def add_row(memory: Array, rho: Array, Gamma: Array, L: int, c: int, errors: Array, T: Array) -> None:
     """Add whitened rows (n,) and their signatures (n, L c) to score and info.
 
@@ -80,7 +80,7 @@ def add_row(memory: Array, rho: Array, Gamma: Array, L: int, c: int, errors: Arr
             b[i] /= root[i, i]
 
 
-@compiled
+@compile_once
 def update_tests(
     X: Array,
     memory: Array,
@@ -122,7 +122,7 @@ def update_tests(
     add_row(memory, np.dot(root.T, solved), own, L, c, errors, T)
 
 
-@compiled
+@compile_once
 def remember(k: int, state: Array, before: Array, keys: Array, ends: Array) -> None:
     """Keep the state before keyframe k in a ring `before` (n, size), which holds rows ends[0] to ends[1] of all."""
     n = len(before)
@@ -133,7 +133,7 @@ def remember(k: int, state: Array, before: Array, keys: Array, ends: Array) -> N
     ends[0] = max(ends[0], ends[1] - n)
 
 
-@compiled
+@compile_once
 def follow_filter(
     k0: int,
     k1: int,

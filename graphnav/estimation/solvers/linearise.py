@@ -15,7 +15,7 @@ from graphnav.constraints.base import Constraint, Linearized, assemble, weigh_si
 from graphnav.core.rotation import Array, mv
 from graphnav.core.state import DIM, States
 from graphnav.estimation.problem import ParameterChain, Problem
-from graphnav.estimation.solvers.robust import weight_and_cost
+from graphnav.estimation.solvers.robust import weigh_squares
 from graphnav.imu.dynamics import SCALE, ImuFactors
 
 Columns = dict[str, slice]
@@ -106,7 +106,7 @@ class Rows:
         """Weight and cost (n,) of each row by its robust kernel."""
         c = self.constraint
         s = np.linalg.norm(self.residual / self.sigma, axis=-1)
-        return weight_and_cost(c.robust, s, c.scale_of(self.which), c.graduation)
+        return weigh_squares(c.robust, s, c.scale_of(self.which), c.graduation)
 
 
 @dataclass(frozen=True)
@@ -146,7 +146,7 @@ def advance(problem: Problem, n: int) -> Advance:
     width = sum(at.stop - at.start for at in problem.columns.values())
     out = Advance(*(np.full((n - 1, width), x) for x in (0.0, 0.0, 1.0, 0.0)))
     for chain in problem.chains:
-        k, own = stepping(chain, n), shift(problem.columns[chain.parameter.name])
+        k, own = find_stepping(chain, n), shift(problem.columns[chain.parameter.name])
         j = chain.node[k]
         out.mean[k - 1, own], out.before[k - 1, own] = chain.mean[j], chain.mean[j - 1]
         out.decay[k - 1, own], out.added[k - 1, own] = chain.decay[j, None], chain.sigma[j] ** 2
@@ -159,7 +159,7 @@ def list_node_steps(problem: Problem) -> dict[int, tuple[Step, ...]]:
     for chain in problem.chains:
         name = chain.parameter.name
         out.setdefault(0, []).append(Step(name, chain.mean[0], chain.sigma[0]))
-        for k in stepping(chain).tolist():
+        for k in find_stepping(chain).tolist():
             j = int(chain.node[k])
             step = Step(name, chain.mean[j], chain.sigma[j], float(chain.decay[j]), chain.mean[j - 1])
             out.setdefault(k, []).append(step)
@@ -213,6 +213,6 @@ def find_last_keyframes(chain: ParameterChain) -> Array:
     return np.searchsorted(chain.node, np.arange(len(chain.t)), side="right") - 1
 
 
-def stepping(chain: ParameterChain, n: int | None = None) -> Array:
+def find_stepping(chain: ParameterChain, n: int | None = None) -> Array:
     """Which of the first n keyframes a parameter moves on to its next node at."""
     return np.flatnonzero(np.diff(chain.node[:n])) + 1

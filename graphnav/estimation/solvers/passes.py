@@ -13,13 +13,13 @@ from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, States
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import ConstraintRecord, ParameterEstimate, Solution
-from graphnav.estimation.solvers.disturbance import row_covariances
-from graphnav.estimation.solvers.invariant import minus_invariant, plus_invariant
+from graphnav.estimation.solvers.disturbance import compute_row_covariances
+from graphnav.estimation.solvers.invariant import add_invariant, subtract_invariant
 from graphnav.estimation.solvers.linearise import Columns, Points, Rows, find_last_keyframes, linearise, shift
 from graphnav.estimation.solvers.recursion import Blocks
-from graphnav.estimation.solvers.robust import weight_and_cost
+from graphnav.estimation.solvers.robust import weigh_squares
 from graphnav.estimation.solvers.stack import Innovations
-from graphnav.imu.dynamics import as_biases
+from graphnav.imu.dynamics import convert_to_biases
 
 _TURN = 0.02  # rad; what is linear in an error of attitude is wrong by half its square
 Progress = Callable[[str, float], None]
@@ -57,7 +57,7 @@ class SmootherPass(DisturbancePass):
         return np.diagonal(self.P, axis1=1, axis2=2)
 
     def cover_rows(self, linear: Rows, n: int) -> Array:
-        return row_covariances(linear.H, self.P, linear.constraint.keyframe[:n])
+        return compute_row_covariances(linear.H, self.P, linear.constraint.keyframe[:n])
 
 
 @dataclass(frozen=True)
@@ -150,12 +150,12 @@ class FilterPass(ForwardRecord):
 
 def move_points(points: Points, errors: Array) -> Points:
     """Points moved by error states (K, D)."""
-    return Points(plus_invariant(points.states, errors[:, :DIM]), points.values + errors[:, DIM:])
+    return Points(add_invariant(points.states, errors[:, :DIM]), points.values + errors[:, DIM:])
 
 
 def subtract_points(points: Points, other: Points) -> Array:
     """The error states (K, D) with ``move_points(other, errors) == points``."""
-    return np.concatenate([minus_invariant(points.states, other.states), points.values - other.values], axis=1)
+    return np.concatenate([subtract_invariant(points.states, other.states), points.values - other.values], axis=1)
 
 
 def join_passes(parts: list[Points]) -> Points:
@@ -163,23 +163,23 @@ def join_passes(parts: list[Points]) -> Points:
     return Points(States.stack([part.states for part in parts]), np.concatenate([part.values for part in parts]))
 
 
-def near_to(points: Points, about: Points, turn: float = _TURN) -> bool:
+def are_near(points: Points, about: Points, turn: float = _TURN) -> bool:
     """Whether attitudes are near enough (rad) for what lies between to be linear."""
     turned = points.states.minus(about.states)[:, :3]
     return float(np.max(np.sum(turned * turned, axis=1))) < turn**2
 
 
-def points_of_solution(problem: Problem, solved: Solution, before: Points) -> Points:
+def take_solution_points(problem: Problem, solved: Solution, before: Points) -> Points:
     """Points of a solution of a problem; what it does not tell, places of stops, as before: rows are linear in them."""
     told = {
         c.parameter.name: solved.parameters[c.parameter.name].value[c.node]
         for c in problem.chains
         if c.parameter.name in solved.parameters
     }
-    return points_of(problem, solved.states, values_of(problem, before) | told)
+    return make_points(problem, solved.states, split_values(problem, before) | told)
 
 
-def points_of(problem: Problem, states: States, known: dict[str, Array]) -> Points:
+def make_points(problem: Problem, states: States, known: dict[str, Array]) -> Points:
     """Points of all keyframes: states, and values (K, k) of parameters, expected ones where they are not known."""
     values = [known.get(c.parameter.name, c.mean[c.node]) for c in problem.chains]
     return Points(states, np.concatenate([np.empty((len(states), 0)), *values], axis=1))
@@ -191,7 +191,7 @@ def record_residuals(problem: Problem, rows: Constraint, points: Points, robust:
     nis = np.sum((linear.residual / linear.stated) ** 2, axis=-1)
     weight = np.ones(len(rows)) if rows.weight is None else rows.weight
     if robust:
-        weight = weight * weight_and_cost(rows.robust, np.sqrt(nis), rows.robust_scale)[0]
+        weight = weight * weigh_squares(rows.robust, np.sqrt(nis), rows.robust_scale)[0]
     t = problem.t[rows.keyframe]
     return ConstraintRecord(
         "residual", t, linear.residual, linear.stated, nis, weight, rows.axes, rows.unit, **rows.labels
@@ -211,18 +211,18 @@ def integrate_again(problem: Problem, states: States, scale: Array | None, first
     at = np.minimum(np.arange(len(ba) - first), max(len(states) - 2, 0))
     ba[rows], bg[rows] = states.ba[at], states.bg[at]
     if scale is not None:
-        of_accel, of_gyro = as_biases(scale, problem.intervals.force[rows], problem.intervals.rate[rows])
+        of_accel, of_gyro = convert_to_biases(scale, problem.intervals.force[rows], problem.intervals.rate[rows])
         ba[rows], bg[rows] = ba[rows] + of_accel, bg[rows] + of_gyro
-    far = problem.intervals.out_of_range(bg)
+    far = problem.intervals.is_out_of_range(bg)
     return (problem.reintegrate(ba, bg), int(far.sum())) if far.any() else (problem, 0)
 
 
-def values_of(problem: Problem, points: Points) -> dict[str, Array]:
+def split_values(problem: Problem, points: Points) -> dict[str, Array]:
     """(K, k) per parameter."""
     return {name: points.values[:, shift(at)] for name, at in problem.columns.items()}
 
 
-def parameters_of(problem: Problem, values: Array, sigma: Array) -> dict[str, ParameterEstimate]:
+def estimate_parameters(problem: Problem, values: Array, sigma: Array) -> dict[str, ParameterEstimate]:
     """At each node: the value after the last keyframe that it governs, by those at keyframes (K, D-15)."""
     out = {}
     for chain in problem.chains:
@@ -233,6 +233,6 @@ def parameters_of(problem: Problem, values: Array, sigma: Array) -> dict[str, Pa
     return out
 
 
-def sigmas_of(P: Array) -> Array:
+def compute_sigmas(P: Array) -> Array:
     """(K, D-15) 1-sigma of parameters by covariances (K, D, D)."""
     return np.sqrt(np.maximum(np.diagonal(P, axis1=-2, axis2=-1)[:, DIM:], 0.0))

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from graphnav.core.compiled import compiled
+from graphnav.core.compiled import compile_once
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, MOVING
 
@@ -38,7 +38,7 @@ class Blocks(NamedTuple):
     kind: Array  # (B,) number of the constraint, of the first where several are taken in together
 
 
-@compiled
+@compile_once
 def move(F: Array, decay: Array, X: Array) -> Array:
     """A step of columns X (D, n)."""
     out = np.empty(X.shape)
@@ -47,7 +47,7 @@ def move(F: Array, decay: Array, X: Array) -> Array:
     return out
 
 
-@compiled
+@compile_once
 def predict(P: Array, F: Array, decay: Array, Q: Array, added: Array, out: Array) -> None:
     """The covariance (D, D) after a step, in `out`: with Q (15, 15) of the states and `added` (D-15) of parameters."""
     w, D = F.shape[1], len(P)
@@ -75,7 +75,7 @@ def predict(P: Array, F: Array, decay: Array, Q: Array, added: Array, out: Array
         out[i, i] += added[i - DIM]
 
 
-@compiled
+@compile_once
 def invert_root(L: Array) -> Array:
     """L^-1 of a lower root (m, m)."""
     m = len(L)
@@ -92,7 +92,7 @@ def invert_root(L: Array) -> Array:
     return out
 
 
-@compiled
+@compile_once
 def invert_sum(HPHt: Array, variance: Array) -> tuple[Array, Array]:
     """The lower root L (m, m) of S = H P H^T + R, and L^-1."""
     S = HPHt.copy()
@@ -102,14 +102,14 @@ def invert_sum(HPHt: Array, variance: Array) -> tuple[Array, Array]:
     return L, invert_root(L)
 
 
-@compiled
+@compile_once
 def halve_sum(A: Array, out: Array) -> None:
     """(A + A^T) / 2, in `out`: what rounding has made of a symmetric matrix."""
     np.add(A, A.T, out)
     np.multiply(0.5, out, out)
 
 
-@compiled
+@compile_once
 def update(P: Array, HP: Array, H: Array, Kt: Array, variance: Array) -> Array:
     """The covariance after an update, by Joseph's form: (I - KH) P first, then that (I - KH)^T + K R K^T."""
     one = np.dot(Kt.T, HP)
@@ -123,7 +123,7 @@ def update(P: Array, HP: Array, H: Array, Kt: Array, variance: Array) -> Array:
     return one
 
 
-@compiled
+@compile_once
 def reduce(P: Array, W: Array) -> Array:
     """The covariance after an update, as P - W^T W with W = L^-1 H P: half of the work, and fewer digits."""
     out = np.dot(W.T, W)
@@ -133,7 +133,7 @@ def reduce(P: Array, W: Array) -> Array:
     return out
 
 
-@compiled
+@compile_once
 def weigh_robustly(
     HPHt: Array, variance: Array, r: Array, solved: Array, kernel: int, scale: Array, size: int
 ) -> Array:
@@ -153,7 +153,7 @@ def weigh_robustly(
     return weight
 
 
-@compiled
+@compile_once
 def filter_rows(
     k0: int,
     k1: int,
@@ -250,7 +250,7 @@ def filter_rows(
         np.positive(P, P_filtered[k % len(P_filtered)])
 
 
-@compiled
+@compile_once
 def divide_covariance(P: Array, X: Array) -> None:
     """X (D, n) <- P^-1 X by Cholesky's root of P (D, D)."""
     L = np.linalg.cholesky(P)
@@ -271,7 +271,7 @@ def divide_covariance(P: Array, X: Array) -> None:
             X[i, c] /= L[i, i]
 
 
-@compiled
+@compile_once
 def compose_turns(q: Array, v: Array) -> tuple[float, float, float]:
     """The rotation vector of the rotation of a quaternion q (4,) and, after it, that of a rotation vector v (3,)."""
     n = np.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
@@ -292,7 +292,7 @@ def compose_turns(q: Array, v: Array) -> tuple[float, float, float]:
     return a * x, a * y, a * z
 
 
-@compiled
+@compile_once
 def smooth_filtered(
     k0: int,
     k1: int,

@@ -15,7 +15,16 @@ import numpy as np
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, States
 from graphnav.estimation.solvers.elimination import predict, update
-from graphnav.estimation.solvers.stages import Columns, Linear, Place, Stage, at_points, follows, group_runs, plus
+from graphnav.estimation.solvers.stages import (
+    Columns,
+    Linear,
+    Place,
+    Stage,
+    add_error,
+    follows,
+    group_runs,
+    linearise_keyframes,
+)
 
 if TYPE_CHECKING:
     from graphnav.estimation.solvers.window import Window
@@ -78,7 +87,7 @@ class Revision:
         before = self._made[-1][1].message if self._made else self._before
         around = [before, *(stage.message for stage in old)]
         moves = [np.zeros(len(before.z)), *means]
-        states = plus(States.stack([m.state for m in around]), np.array([e[:DIM] for e in moves]), before.turns)
+        states = add_error(States.stack([m.state for m in around]), np.array([e[:DIM] for e in moves]), before.turns)
         values = [m.values + e[DIM:] for m, e in zip(around, moves, strict=True)]
         columns = [stage.message.columns for stage in old]
         before = replace(before, tests=None)
@@ -110,7 +119,7 @@ def linearise_runs(
     for run in group_runs(range(len(places)), alike):
         linked, end = places[run[0]].linked, run[-1] + 1
         points = slice(run[0] if linked else run[0] + 1, end + 1)
-        linears = at_points(places[run[0] : end], states[points], values[points], columns[run[0]], linked)
+        linears = linearise_keyframes(places[run[0] : end], states[points], values[points], columns[run[0]], linked)
         yield from zip(run, linears, strict=True)
 
 

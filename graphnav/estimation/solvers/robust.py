@@ -20,7 +20,7 @@ def soften(kernel: str) -> str:
     return "cauchy" if kernel in REDESCENDING else kernel
 
 
-def weight_and_cost(kernel: str, s: Array, k: float | Array, mu: float = np.inf) -> tuple[Array, Array]:
+def weigh_squares(kernel: str, s: Array, k: float | Array, mu: float = np.inf) -> tuple[Array, Array]:
     """w(s) and rho(s) for whitened norms s (N,) and a scale k, or scales (N,).
 
     `mu` is of "gnc": 0 is convex, infinity truncated least squares.

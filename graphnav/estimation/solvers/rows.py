@@ -143,7 +143,7 @@ class Layout:
             nodes |= {name: stacked[:, at] for name, at in group.columns.items()}
         return np.stack(vectors[: self.K]), nodes
 
-    def parameter_blocks(self, keyframe: Array, jacobians: dict[str, Array]) -> list[tuple[Array, Array]]:
+    def find_parameter_blocks(self, keyframe: Array, jacobians: dict[str, Array]) -> list[tuple[Array, Array]]:
         """Blocks of the parameter variables that rows at `keyframe` touch."""
         blocks = []
         for group in self.groups:
@@ -163,7 +163,7 @@ def whiten(problem: Problem, point: Iterate, layout: Layout) -> tuple[Rows, floa
     start, end, S, b = linearise_links(problem.motion, point.states, point.scale)
     links = [(first, start), (first + 1, end)]
     if point.scale is not None:
-        links += layout.parameter_blocks(first, {SCALE: S})
+        links += layout.find_parameter_blocks(first, {SCALE: S})
     out: Rows = [(links, b)]
     total = 0.5 * float(np.sum(b * b))
     points = point.points(problem)
@@ -175,7 +175,7 @@ def whiten(problem: Problem, point: Iterate, layout: Layout) -> tuple[Rows, floa
         H = scale[..., None] * linear.H
         weighted = {p.name: H[:, :, problem.columns[p.name]] for p in rows.parameters}
         blocks = [(rows.keyframe, H[:, :, :DIM])]
-        out += _touching(blocks + layout.parameter_blocks(rows.keyframe, weighted), -scale * linear.residual)
+        out += _group_rows(blocks + layout.find_parameter_blocks(rows.keyframe, weighted), -scale * linear.residual)
     for group, chains in zip(layout.groups, layout.chains, strict=True):
         own = linearise_chains(chains, group, point.values)
         total += sum(0.5 * float(np.sum(b * b)) for _, b in own)
@@ -183,7 +183,7 @@ def whiten(problem: Problem, point: Iterate, layout: Layout) -> tuple[Rows, floa
     return out, total
 
 
-def _touching(blocks: list[tuple[Array, Array]], b: Array) -> Rows:
+def _group_rows(blocks: list[tuple[Array, Array]], b: Array) -> Rows:
     """Rows of which each touches few of many variables: those of the same ones together, without blocks of zeros."""
     if len(blocks) <= _FEW:
         return [(blocks, b)]

@@ -25,12 +25,12 @@ from scipy.linalg.lapack import dposv
 from graphnav.core import rotation
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, States
-from graphnav.estimation.dense import dense
+from graphnav.estimation.dense import make_dense
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import Solution
 from graphnav.estimation.solvers.breakdown import explain_smoother
 from graphnav.estimation.solvers.disturbance import smooth_errors, smooth_rows
-from graphnav.estimation.solvers.linearise import linearise, scale_at, stepping
+from graphnav.estimation.solvers.linearise import find_stepping, linearise, scale_at
 from graphnav.estimation.solvers.passes import (
     FilterPass,
     ForwardRecord,
@@ -38,17 +38,17 @@ from graphnav.estimation.solvers.passes import (
     Progress,
     SmootherPass,
     Updates,
+    compute_sigmas,
+    estimate_parameters,
     move_points,
-    parameters_of,
     record_residuals,
-    sigmas_of,
 )
 from graphnav.estimation.solvers.recursion import STRETCH, move, smooth_filtered
 
 _CANCELLED = 7e4  # times smaller than filtered: P - P N P is good to eps times the square of that, a millionth
 
 
-def backward(problem: Problem, forward: ForwardRecord, progress: Progress | None = None) -> SmootherPass:
+def smooth_backward(problem: Problem, forward: ForwardRecord, progress: Progress | None = None) -> SmootherPass:
     """Smooth a forward pass: keyframes linearised where the filter was, and before them those at given points."""
     K, D = forward.P.shape[:2]
     n = 0 if forward.about is None else len(forward.about.values)
@@ -77,7 +77,7 @@ def backward(problem: Problem, forward: ForwardRecord, progress: Progress | None
     return SmootherPass(States.stack(states), values, found.r, found.N, found.N_diagonal, P)
 
 
-def backward_moments(problem: Problem, forward: ForwardRecord) -> MomentPass:
+def smooth_moments(problem: Problem, forward: ForwardRecord) -> MomentPass:
     """Smooth a forward pass that was linearised at given points throughout, with covariances for a noise model only."""
     K, D = forward.P.shape[:2]
     assert forward.about is not None
@@ -99,7 +99,7 @@ def backward_moments(problem: Problem, forward: ForwardRecord) -> MomentPass:
     wanted = np.zeros((K, D), dtype=bool)  # at both ends of their steps
     for chain in problem.chains:
         if chain.parameter.correlation_time is not None:
-            k, own = stepping(chain, K), problem.columns[chain.parameter.name]
+            k, own = find_stepping(chain, K), problem.columns[chain.parameter.name]
             wanted[k, own] = wanted[k - 1, own] = True
     variance, of_rows = _smooth_points(forward, one, behind, K, found, np.empty((0, D, D)), wanted, asked)
     return MomentPass(
@@ -206,7 +206,7 @@ def _restore_digits(forward: ForwardRecord, P: Array, end: int) -> None:
 def rts(problem: Problem, forward: FilterPass, found: SmootherPass | None = None) -> Solution:
     """The smoothed solution; residuals are its own. `found` is the backward pass where it was done before."""
     began = time.perf_counter()
-    found = found or backward(problem, forward)
+    found = found or smooth_backward(problem, forward)
     smoothed, all_values, all_P = found.states, found.values, found.P
     records = {rows.name: record_residuals(problem, rows, found) for rows in problem.constraints}
     covariance = all_P[:, :DIM, :DIM].copy()  # a view would hold what is known of the parameters too
@@ -217,12 +217,12 @@ def rts(problem: Problem, forward: FilterPass, found: SmootherPass | None = None
         t=problem.t,
         states=smoothed,
         covariance=covariance,
-        parameters=parameters_of(problem, all_values, sigmas_of(all_P)),
+        parameters=estimate_parameters(problem, all_values, compute_sigmas(all_P)),
         records=records,
         counts=forward.solution.counts,
         iterations=1,
         stopped="one pass forward and one back",
         timings={**forward.solution.timings, "smoother": seconds},
         notes=problem.notes,
-        between=(dense(problem, smoothed, covariance, scale_at(problem.columns, all_values), smooth=True),),
+        between=(make_dense(problem, smoothed, covariance, scale_at(problem.columns, all_values), smooth=True),),
     )

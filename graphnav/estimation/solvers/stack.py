@@ -132,7 +132,7 @@ class Stack:
             first, table[4, head], table[5, last], used, kinds[:, 0].copy(), kernel, size, part, *table[:2, head].copy()
         )
 
-    def together(self, k: int) -> Iterator[RowBlock]:
+    def stack_keyframe(self, k: int) -> Iterator[RowBlock]:
         """All rows of a keyframe, in the order of the constraints."""
         for b in range(self.joint.first[k], self.joint.first[k + 1]):
             yield self.block(b)

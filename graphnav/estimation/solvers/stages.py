@@ -33,8 +33,8 @@ from graphnav.core.state import DIM, States
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.breakdown import explain_smoother
 from graphnav.estimation.solvers.linearise import Columns, Points, Step, linearise, linearise_links, scale_at, shift
-from graphnav.estimation.solvers.robust import soften, weight_and_cost
-from graphnav.estimation.solvers.turning import change_of_point, plus_turning, split_turn
+from graphnav.estimation.solvers.robust import soften, weigh_squares
+from graphnav.estimation.solvers.turning import add_turning, change_of_point, split_turn
 from graphnav.estimation.solvers.watch import Watch
 from graphnav.imu.dynamics import SCALE, ImuFactors
 
@@ -84,14 +84,14 @@ class Message:
         turns: bool = False,
     ) -> Message:
         """One with R (D, D), of which nothing is looked at below the triangle and its first nine rows."""
-        return cls(state, values, columns, R[_triangle(len(z))], np.array(z), tests, turns)
+        return cls(state, values, columns, R[_list_triangle(len(z))], np.array(z), tests, turns)
 
     @property
     def R(self) -> Array:
         """(D, D)"""
         D = len(self.z)
         out = np.zeros((D, D))
-        out[_triangle(D)] = self.packed
+        out[_list_triangle(D)] = self.packed
         return out
 
     @property
@@ -117,7 +117,7 @@ class Message:
     def moved(self, e: Array, J: Array | None = None) -> Message:
         """The same about the point moved by the error state e (D,); J is `change_of_point`, if known."""
         J = self.change_of_point(e) if J is None else J
-        state = plus(self.state, e[None, :DIM], self.turns)
+        state = add_error(self.state, e[None, :DIM], self.turns)
         values, R = self.values + e[DIM:], self.R
         return Message.of(state, values, self.columns, rotate_columns(R, J), self.z - R @ e, self.tests, self.turns)
 
@@ -139,12 +139,12 @@ class Measured:
     scale: float | Array
     turns: bool = False  # whether a turn of all about the vertical changes nothing of them
 
-    def weighted(self, y: Array, passes: int) -> tuple[Array, Array, Array]:
+    def weigh(self, y: Array, passes: int) -> tuple[Array, Array, Array]:
         """H, b and sigma, by the kernel's weights for the error state y once `passes` is not 0."""
         if self.kernel == "none" or not passes:
             return self.H, self.b, self.sigma
         left = self.b - mv(self.H, np.broadcast_to(y, (len(self.b), len(y))))
-        weight = np.sqrt(weight_and_cost(self.kernel, np.linalg.norm(left, axis=-1), self.scale)[0])[:, None]
+        weight = np.sqrt(weigh_squares(self.kernel, np.linalg.norm(left, axis=-1), self.scale)[0])[:, None]
         with np.errstate(divide="ignore"):
             return self.H * weight[..., None], self.b * weight, self.sigma / weight
 
@@ -191,7 +191,7 @@ class Stage:
 
 
 @cache
-def _triangle(D: int) -> tuple[Array, Array]:
+def _list_triangle(D: int) -> tuple[Array, Array]:
     """Rows and columns of what may be other than zero in R: an upper triangle, and its first nine columns mixed."""
     R = np.triu(np.ones((D, D)))
     R[:9, :9] = 1.0
@@ -199,9 +199,9 @@ def _triangle(D: int) -> tuple[Array, Array]:
     return rows, columns
 
 
-def plus(states: States, e: Array, turns: bool) -> States:
+def add_error(states: States, e: Array, turns: bool) -> States:
     """States moved by error states (K, 15), along the turns about the vertical where nothing tells those."""
-    return plus_turning(states, e) if turns else states.plus(e)
+    return add_turning(states, e) if turns else states.plus(e)
 
 
 def rotate_columns(A: Array, J: Array) -> Array:
@@ -232,7 +232,7 @@ def append_columns(columns: Columns, steps: Sequence[Step]) -> Columns:
     return out
 
 
-def width(columns: Columns) -> int:
+def count_columns(columns: Columns) -> int:
     """D"""
     return max((s.stop for s in columns.values()), default=DIM)
 
@@ -240,7 +240,7 @@ def width(columns: Columns) -> int:
 def predict_stage(before: Message, place: Place) -> tuple[States, Array, Columns, Array | None]:
     """State, parameter values, columns and whitened link rows at a new keyframe, from the point of a message."""
     columns = append_columns(before.columns, place.steps)
-    D = width(columns)
+    D = count_columns(columns)
     values = np.zeros(D - DIM)
     values[: len(before.values)] = before.values
     for step in place.steps:
@@ -264,7 +264,7 @@ def predict_stage(before: Message, place: Place) -> tuple[States, Array, Columns
     if scale is not None:
         at = columns[SCALE]
         link[:, :, DIM + at.start : DIM + at.stop] = -motion.scale_columns(row, F, at.stop - at.start)
-    return ahead, values, columns, (W @ motion.body_rows(link, before.state.R_nb, row))[0]
+    return ahead, values, columns, (W @ motion.rotate_to_body(link, before.state.R_nb, row))[0]
 
 
 def measure(place: Place, state: States, values: Array, columns: Columns, late: bool | None = None) -> Linear:
@@ -273,7 +273,7 @@ def measure(place: Place, state: States, values: Array, columns: Columns, late: 
     rows = place.problem.constraints
     if late is not None:
         rows = tuple(c for c in rows if enters_last(c) == late)
-    return at_points([place], state, [values], columns, linked=False, rows=rows)[0]
+    return linearise_keyframes([place], state, [values], columns, linked=False, rows=rows)[0]
 
 
 def enters_last(rows: Constraint) -> bool:
@@ -305,7 +305,7 @@ def group_runs(which: Iterable[int], alike: Callable[[int, int], bool]) -> list[
     return runs
 
 
-def at_points(
+def linearise_keyframes(
     places: Sequence[Place],
     states: States,
     values: Sequence[Array],
@@ -320,7 +320,7 @@ def at_points(
     """
     problem, first, n = places[0].problem, places[0].k, len(places)
     assert problem is not None
-    D, skip = width(columns), int(linked)
+    D, skip = count_columns(columns), int(linked)
     points = Points(states, pad(values, D - DIM))
     links: list[Array | None] = [None] * n
     if linked:

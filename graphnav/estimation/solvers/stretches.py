@@ -28,7 +28,7 @@ from graphnav.core.rotation import Array, mv
 from graphnav.core.state import DIM, MOVING, States
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.breakdown import explain_rows
-from graphnav.estimation.solvers.invariant import compute_transport, minus_invariant, turn
+from graphnav.estimation.solvers.invariant import compute_transport, subtract_invariant, turn
 from graphnav.estimation.solvers.linearise import Advance, Points, shift
 from graphnav.estimation.solvers.passes import join_passes, move_points
 from graphnav.estimation.solvers.points import linearise_all, predict_states
@@ -194,7 +194,7 @@ def _move_errors(points: Points, first: Array) -> tuple[Array, Array]:
     """T (n, 9, 9) and m (n, D) of points, by errors about the `first` (n,) of each keyframe's."""
     of_first = points.states[first]
     moved = np.zeros((len(first), DIM + points.values.shape[1]))
-    moved[1:, :DIM] = minus_invariant(points.states[1:], points.states[:-1])
+    moved[1:, :DIM] = subtract_invariant(points.states[1:], points.states[:-1])
     moved[1:, DIM:] = np.diff(points.values, axis=0)
     moved[np.unique(first)] = 0.0
     moved[1:] = _turn_errors(compute_transport(points.states[:-1], of_first[:-1]), moved[1:])

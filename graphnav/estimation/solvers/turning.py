@@ -51,10 +51,10 @@ def split_turn(states: States, e: Array) -> tuple[Array, Array]:
     return psi, e[:, :MOVING] - psi[:, None] * turned
 
 
-def plus_turning(states: States, e: Array) -> States:
+def add_turning(states: States, e: Array) -> States:
     """K states moved by error states (K, 15) along the turns about the vertical."""
     psi, left = split_turn(states, e)
-    Rz = _about_vertical(psi)
+    Rz = _rotate_about_vertical(psi)
     return States(
         Rz @ states.R_nb @ rotation.exp(left[:, :3]),
         mv(Rz, states.p + left[:, 3:6]),
@@ -72,7 +72,7 @@ def change_of_point(states: States, e: Array) -> Array:
     Parameters
     ----------
     states : K states, the old points.
-    e : (K, 15) what `plus_turning` moves them by.
+    e : (K, 15) what `add_turning` moves them by.
 
     Returns
     -------
@@ -85,7 +85,7 @@ def change_of_point(states: States, e: Array) -> Array:
     after = mv(np.swapaxes(rotation.exp(tilt), -1, -2), u)  # the vertical in the body there
     w = np.einsum("ki,kij->kj", u, J)
     w /= np.sum(w * after, axis=1)[:, None]
-    T, back = np.zeros((len(e), MOVING, MOVING)), np.swapaxes(_about_vertical(psi), -1, -2)
+    T, back = np.zeros((len(e), MOVING, MOVING)), np.swapaxes(_rotate_about_vertical(psi), -1, -2)
     T[:, :3, :3] = u[:, :, None] * w[:, None] + J @ (_I3 - after[:, :, None] * w[:, None])
     for at in (slice(3, 6), slice(6, 9)):
         T[:, at, :3] = -(left[:, at] @ _Z.T)[:, :, None] * w[:, None]
@@ -98,7 +98,7 @@ def turn_covariance(P: Array, states: States, e: Array) -> Array:
     return np.asarray(turn(P, np.linalg.inv(change_of_point(states, e))))
 
 
-def _about_vertical(psi: Array) -> Array:
+def _rotate_about_vertical(psi: Array) -> Array:
     """(K, 3, 3) Rz"""
     c, s, out = np.cos(psi), np.sin(psi), np.zeros((len(psi), 3, 3))
     out[:, 0, 0], out[:, 0, 1], out[:, 1, 0], out[:, 1, 1], out[:, 2, 2] = c, -s, s, c, 1.0

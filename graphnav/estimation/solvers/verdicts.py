@@ -84,7 +84,7 @@ class Verdicts:
             return self._try(name, before, begin, end)
         return float(t[fault])
 
-    def ended(self) -> float | None:
+    def set_ended(self) -> float | None:
         """The time to go on from once no more fixes come: no more patience is needed then."""
         for name, used in self.used.items():
             end = len(used)

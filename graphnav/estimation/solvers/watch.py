@@ -34,8 +34,8 @@ from graphnav.core.rotation import Array
 from graphnav.estimation.solvers.likelihood_ratio import (
     add_row,
     begin_slot,
+    count_remembered,
     follow_filter,
-    memory_size,
 )
 
 if TYPE_CHECKING:
@@ -68,7 +68,7 @@ class _Slots:
         self.columns = slice(begin, begin + L * self.c)
         self.threshold = float(chdtri(self.c, FALSE_ALARM))
         self.fix_of, self.typical_error, self.prior = rows.fix_of, rows.typical_error(), WIDE[rows.unit] ** -2.0
-        self.memory = np.zeros(memory_size(L, self.c))
+        self.memory = np.zeros(count_remembered(L, self.c))
         self.typical_sigmas = _InnovationLevel(self.m)
         self.forget()
 
@@ -128,7 +128,9 @@ class _Slots:
         return float(np.max(self.first[T.max() - _ONSET / self.threshold <= T]))
 
 
-def _slots(constraints: Iterable[Constraint], t: Array | None, period: float, drifts: bool = True) -> dict[str, _Slots]:
+def _list_slots(
+    constraints: Iterable[Constraint], t: Array | None, period: float, drifts: bool = True
+) -> dict[str, _Slots]:
     """Slots of each constraint, their columns behind each other; t (K,) of the keyframes, s, tells the period."""
     out: dict[str, _Slots] = {}
     end = 0
@@ -141,7 +143,7 @@ def _slots(constraints: Iterable[Constraint], t: Array | None, period: float, dr
     return out
 
 
-def _width(some: Mapping[str, _Slots]) -> int:
+def _count_columns(some: Mapping[str, _Slots]) -> int:
     """How many columns a bank has."""
     return max((slots.columns.stop for slots in some.values()), default=0)
 
@@ -171,10 +173,10 @@ class _InnovationLevel:
                 begin -= 1
             known = begin if begin < k and self.t[k - 1] - self.t[begin] <= PATIENCE else k + 1
             if known:
-                self.factor = max(1.0, _median(np.frombuffer(self.nis)[:known]) / self.median)
+                self.factor = max(1.0, _find_median(np.frombuffer(self.nis)[:known]) / self.median)
 
 
-def _median(x: Array) -> float:
+def _find_median(x: Array) -> float:
     """Of some numbers (n,), as of many small samples: without what `numpy.median` does before."""
     half = len(x) // 2
     if len(x) % 2:
@@ -195,8 +197,8 @@ class Bank:
     """
 
     def __init__(self, constraints: Sequence[Constraint], t: Array, width: int, drifts: bool = True) -> None:
-        self._slots, self._t = _slots(constraints, t, LONGEST, drifts), t
-        some, columns = self._slots.values(), _width(self._slots)
+        self._slots, self._t = _list_slots(constraints, t, LONGEST, drifts), t
+        some, columns = self._slots.values(), _count_columns(self._slots)
         ends = np.cumsum([width * columns, *(len(slots.memory) for slots in some)])
         self._state = np.concatenate([np.zeros(ends[0]), *(slots.memory for slots in some)])
         self.X = self._state[: ends[0]].reshape(width, columns)
@@ -301,8 +303,8 @@ class Watch:
     """
 
     def __init__(self, constraints: Iterable[Constraint], period: float, width: int) -> None:
-        self._slots = _slots(constraints, None, period, drifts=False)
-        self._X: Array | None = np.zeros((width, _width(self._slots)))
+        self._slots = _list_slots(constraints, None, period, drifts=False)
+        self._X: Array | None = np.zeros((width, _count_columns(self._slots)))
         self._stands: tuple[Array, Array] | None = None  # R and R X
 
     @property
@@ -317,7 +319,7 @@ class Watch:
     def X(self, X: Array) -> None:
         self._X, self._stands = X, None
 
-    def stands(self, R: Array, Z: Array) -> None:
+    def take_message(self, R: Array, Z: Array) -> None:
         """The message has come to a triangular R (D, D), with Z = R X (D, C) beside it."""
         self._X, self._stands = None, (R, Z)
 
@@ -328,7 +330,7 @@ class Watch:
         other._slots = {name: slots.copy() for name, slots in self._slots.items()}
         return other
 
-    def forgetful(self) -> Watch:
+    def forget_onsets(self) -> Watch:
         """The same without any onset."""
         other = self.copy()
         other.X = np.zeros_like(self.X)

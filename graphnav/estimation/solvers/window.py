@@ -26,12 +26,12 @@ from graphnav.estimation.solvers.stages import (
     Message,
     Place,
     Stage,
+    add_error,
     append_columns,
+    count_columns,
     measure,
     pad,
-    plus,
     predict_stage,
-    width,
 )
 from graphnav.estimation.solvers.turning import split_turn, turn_covariance
 from graphnav.estimation.solvers.watch import Watch
@@ -163,7 +163,7 @@ class Window:
     def forget_tests(self) -> None:
         """What the tests know of fixes before the window is not true any more."""
         if self.head.tests is not None:
-            self.head = replace(self.head, tests=self.head.tests.forgetful())
+            self.head = replace(self.head, tests=self.head.tests.forget_onsets())
 
     def truncate(self, keep: int) -> None:
         """Forget all but the first `keep` stages: something before what follows has changed."""
@@ -233,7 +233,7 @@ class Window:
         if gone:
             moved, states, turns = np.array([e[:DIM] for e in means]), States.stack(rows), gone[-1].message.turns
             covariance = turn_covariance(covariance, states, moved) if turns else move_covariance(covariance, moved)
-            states = plus(states, moved, turns)
+            states = add_error(states, moved, turns)
             self.head = gone[-1].message
             del self.stages[:count]
             self._means = None
@@ -335,7 +335,7 @@ def make_first_message(state: States, sigma: Array, turns: bool = False) -> Mess
 def find_limits(columns: Columns, place: Place) -> Array:
     """(D-15,) how far each parameter may move before rows are linearised anew; infinite where nothing limits it."""
     assert place.problem is not None
-    parameters, limit = place.problem.parameters, np.full(width(columns) - DIM, np.inf)
+    parameters, limit = place.problem.parameters, np.full(count_columns(columns) - DIM, np.inf)
     for name, at in columns.items():
         if name in parameters:
             limit[shift(at)] = _LIMITS.get(parameters[name].unit, np.inf)

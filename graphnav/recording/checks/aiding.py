@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 
 from graphnav.config.gnss import GnssSettings
-from graphnav.core.findings import Finding, describe_gaps, period_of
+from graphnav.core.findings import Finding, compute_period, describe_gaps
 from graphnav.core.notes import format_count
 from graphnav.core.rotation import Array
-from graphnav.core.timescales import NEAR, WEEK, between_clocks
+from graphnav.core.timescales import NEAR, WEEK, compute_clock_offset
 from graphnav.recording import Imu, Odometer, Recording
 from graphnav.recording import odometer as wheels
 from graphnav.recording.checks import crosschecks, tracks
@@ -52,7 +52,7 @@ def describe_gnss_apart(recording: Recording) -> str | None:
         weeks = round(offset / WEEK)
         near = f", {abs(weeks)} week(s) too {'late' if weeks > 0 else 'early'}" if weeks else ""
         return f"{apart}: the observations' times are GPS time, so what clock says of the IMU's t = 0 is wrong{near}"
-    known = between_clocks(recording.start, recording.gps_zero, float(t[0]), None)
+    known = compute_clock_offset(recording.start, recording.gps_zero, float(t[0]), None)
     if (unit := _guess_stamp_unit(t, recording)) is not None:
         return f'{apart}: the stamps of the fixes are in {unit}; say units = {{ t = "{unit}" }} in [gnss]'
     left = t[0] + known.offset - recording.start if known is not None else np.inf
@@ -114,7 +114,7 @@ def check_gnss_coverage(recording: Recording) -> Iterator[Finding]:
         return
     step = np.diff(gnss.t)
     there = (gnss.t[1:] > recording.start) & (gnss.t[:-1] < recording.end)
-    gaps = np.flatnonzero((step > max(3.5 * period_of(gnss.t), 1.5)) & there)
+    gaps = np.flatnonzero((step > max(3.5 * compute_period(gnss.t), 1.5)) & there)
     if len(gaps):
         yield Finding("note", describe_gaps("GNSS", step[gaps], gnss.t[gaps] - recording.start), "gnss.gap")
 
@@ -191,7 +191,7 @@ def check_odometer_readings(recording: Recording, facts: dict[str, Any]) -> Iter
     odometer = recording.odometer
     assert odometer is not None
     step = wheels.find_quantum(odometer.speed)
-    facts["sigma_mps"] = round(wheels.reading_sigma(odometer), 4)
+    facts["sigma_mps"] = round(wheels.estimate_reading_sigma(odometer), 4)
     if step > 0.0:
         facts["step_mps"] = round(step, 5)
     if odometer.pulse:
@@ -200,7 +200,7 @@ def check_odometer_readings(recording: Recording, facts: dict[str, Any]) -> Iter
         yield Finding("note", f"the odometer reads in steps of {step:.3g} m/s", "odometer.steps")
     if not odometer.signed:
         yield Finding("note", "the odometer never reads below zero: taken as unsigned", "odometer.unsigned")
-    found = wheels.faults(odometer, recording.imu)
+    found = wheels.find_faults(odometer, recording.imu)
     for reason in dict.fromkeys(found.reasons):
         spans = found.spans[[r == reason for r in found.reasons]]
         longest = spans[np.argmax(spans[:, 1] - spans[:, 0])]

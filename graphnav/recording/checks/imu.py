@@ -8,14 +8,14 @@ from typing import Any, Literal
 import numpy as np
 
 from graphnav.core.earth import STANDARD_GRAVITY, gravity
-from graphnav.core.findings import Finding, describe_gaps, period_of, runs_of
+from graphnav.core.findings import Finding, compute_period, describe_gaps, find_runs
 from graphnav.core.notes import format_count
 from graphnav.core.rotation import Array
 from graphnav.recording import Imu, Recording
 
 
 def check_imu_time(imu: Imu) -> Iterator[Finding]:
-    step, period = np.diff(imu.t), period_of(imu.t)
+    step, period = np.diff(imu.t), compute_period(imu.t)
     gaps = np.flatnonzero(step > find_gap_limit(imu.t))
     if len(gaps):
         severity: Literal["note", "warning"] = "warning" if step.max() > 0.2 else "note"
@@ -30,7 +30,7 @@ def check_imu_time(imu: Imu) -> Iterator[Finding]:
 
 
 def find_gap_limit(t: Array) -> float:
-    return 2.5 * period_of(t)
+    return 2.5 * compute_period(t)
 
 
 def check_repeats(imu: Imu) -> Iterator[Finding]:
@@ -54,7 +54,7 @@ def check_saturation(imu: Imu) -> Iterator[Finding]:
                 top = signed.max()
                 if top < smallest or top < 3.0 * signed.std() or top == np.median(signed):
                     continue
-                runs = [b - a for a, b in runs_of(signed > top - 1e-6 * top) if b - a >= 3]
+                runs = [b - a for a, b in find_runs(signed > top - 1e-6 * top) if b - a >= 3]
                 if len(runs) >= 2 or max(runs, default=0) >= 5:
                     yield Finding(
                         "warning",
@@ -99,13 +99,13 @@ def check_force_at_rest(recording: Recording, rest: Array, facts: dict[str, Any]
 
 def check_noise_at_rest(imu: Imu, rest: Array) -> Iterator[Finding]:
     """Allan deviation at 1 s, which for white noise is its density (IEEE Std 952-1997, annex C)."""
-    n = max(5, round(1.0 / period_of(imu.t)))
+    n = max(5, round(1.0 / compute_period(imu.t)))
     for what, x, stated in (
         ("gyro_noise_density", imu.gyro, imu.noise.gyro_noise_density),
         ("accel_noise_density", imu.accel, imu.noise.accel_noise_density),
     ):
         pairs: list[Array] = []
-        for a, b in runs_of(rest):
+        for a, b in find_runs(rest):
             seconds = x[a : a + (b - a) // n * n].reshape(-1, n, 3).mean(axis=1)
             pairs.append(np.diff(seconds, axis=0))
         steps = np.concatenate(pairs)

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from graphnav.core.findings import SEVERITIES, Finding, period_of, runs_of
-from graphnav.core.notes import key_of
+from graphnav.core.findings import SEVERITIES, Finding, compute_period, find_runs
+from graphnav.core.notes import get_key
 from graphnav.core.rotation import Array
 from graphnav.recording import Recording
 from graphnav.recording.checks import crosschecks, tracks
@@ -131,7 +131,7 @@ def inspect(recording: Recording) -> Inspection:
     """
     stamps, whole = recording.imu, screen(recording)
     recording = whole.recording
-    findings = [Finding("note", remark, key_of(remark) or "recording.remark") for remark in recording.remarks]
+    findings = [Finding("note", remark, get_key(remark) or "recording.remark") for remark in recording.remarks]
     findings += whole.findings
     for name, sensor in recording.aiding.items():
         if not len(sensor.t):
@@ -154,7 +154,7 @@ def inspect(recording: Recording) -> Inspection:
     findings += check_lever_arms(recording)
     findings += check_foot_speed(recording, track)
     if rest.any():
-        facts["imu"]["still_s"] = float(rest.sum() * period_of(recording.imu.t))
+        facts["imu"]["still_s"] = float(rest.sum() * compute_period(recording.imu.t))
         findings += check_force_at_rest(recording, rest, facts["imu"])
         if vehicle:  # a standing person sways
             findings += check_noise_at_rest(recording.imu, rest)
@@ -220,7 +220,7 @@ def inspect(recording: Recording) -> Inspection:
 
 
 def _describe_sensors(t: Array) -> dict[str, Any]:
-    return {"rows": len(t), "rate_hz": round(1.0 / period_of(t), 3), "span_s": round(float(t[-1] - t[0]), 3)}
+    return {"rows": len(t), "rate_hz": round(1.0 / compute_period(t), 3), "span_s": round(float(t[-1] - t[0]), 3)}
 
 
 def _describe_imu(recording: Recording) -> dict[str, Any]:
@@ -247,7 +247,7 @@ def _describe_gnss(recording: Recording, track: Track | None) -> dict[str, Any]:
         distance = np.sum((0.5 * (speed[1:] + speed[:-1]) * dt)[near])
         facts["distance_m"] = round(float(distance), 1)
         facts["max_speed_mps"] = round(float(np.percentile(speed[usable], 99.9)), 2) if usable.any() else float("nan")
-        stopped = runs_of(speed < 0.3)
+        stopped = find_runs(speed < 0.3)
         stops = [(a, b) for a, b in stopped if track.t[b - 1] - track.t[a] >= 2.0]
         facts["stops"] = len(stops)
         facts["stopped_s"] = round(float(sum(track.t[b - 1] - track.t[a] for a, b in stops)), 1)
@@ -257,7 +257,7 @@ def _describe_gnss(recording: Recording, track: Track | None) -> dict[str, Any]:
 def _find_rest(recording: Recording, track: Track | None) -> Array:
     """IMU rows in quiet seconds: near the quietest part of the recording, and not moving where the speed is known."""
     imu = recording.imu
-    period = period_of(imu.t)
+    period = compute_period(imu.t)
     n = max(5, round(_REST_WINDOW / period))
     blocks = len(imu.t) // n
     mask = np.zeros(len(imu.t), dtype=bool)

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from graphnav.core.earth import STANDARD_GRAVITY
-from graphnav.core.findings import Finding, period_of
+from graphnav.core.findings import Finding, compute_period
 from graphnav.core.rotation import Array
 from graphnav.recording import Gnss, Imu, Recording
 from graphnav.recording.checks import crosschecks, tilt, tracks
@@ -70,7 +70,7 @@ def check_frozen(recording: Recording) -> Iterator[Finding]:
     else:
         return
     step, speed = np.diff(t), np.minimum(speed[1:], speed[:-1])
-    sure = (step < 5.0 * max(period_of(t), 1.0)) & (t[1:] > gnss.t[0]) & (t[:-1] < gnss.t[-1])
+    sure = (step < 5.0 * max(compute_period(t), 1.0)) & (t[1:] > gnss.t[0]) & (t[:-1] < gnss.t[-1])
     sure &= speed > crosschecks.MIN_SPEED  # no noise of one that stands
     driven = float(np.sum((speed * step)[sure]))
     if driven > 2.0 * np.pi * _TURNING_RADIUS:

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from graphnav.core.findings import Finding, period_of
+from graphnav.core.findings import Finding, compute_period
 from graphnav.gnss.series import RawGnss
-from graphnav.gnss.signals import NAMES, SYSTEMS, satellite_name, signal_name
+from graphnav.gnss.signals import NAMES, SYSTEMS, name_satellite, name_signal
 
 _GAP_PERIODS = 2.5  # periods beyond which a step between epochs is a gap
 _FEW = 5  # satellites, one more than a position with its clock takes
@@ -23,7 +23,7 @@ def describe_raw(raw: RawGnss) -> dict[str, Any]:
     system = raw.satellite // 100
     facts: dict[str, Any] = {"epochs": len(epochs)}
     if len(epochs) > 1:
-        period, step = period_of(epochs), np.diff(epochs)
+        period, step = compute_period(epochs), np.diff(epochs)
         facts |= {"rate_hz": round(1.0 / period, 3), "span_s": round(float(epochs[-1] - epochs[0]), 3)}
         facts["gaps"] = int((step > _GAP_PERIODS * period).sum())
         facts["longest_step_s"] = round(float(step.max()), 3)
@@ -31,7 +31,7 @@ def describe_raw(raw: RawGnss) -> dict[str, Any]:
         if (system == k).any():
             facts[f"satellites_{NAMES[k]}"] = len(np.unique(raw.satellite[system == k]))
     for s, g in np.unique(np.stack([system, raw.signal], -1), axis=0):
-        facts[f"observations_{NAMES[int(s)]}_{signal_name(int(g))}"] = int(((system == s) & (raw.signal == g)).sum())
+        facts[f"observations_{NAMES[int(s)]}_{name_signal(int(g))}"] = int(((system == s) & (raw.signal == g)).sum())
     facts["satellites_at_once"] = int(np.median(by_epoch))
     carrier = np.isfinite(raw.carrier)
     facts["carriers"] = int(carrier.sum())
@@ -44,7 +44,7 @@ def describe_raw(raw: RawGnss) -> dict[str, Any]:
         facts |= {"cn0_low_dbhz": float(low), "cn0_median_dbhz": float(middle), "cn0_high_dbhz": float(high)}
     missing = sorted({int(s) for s in raw.satellite} - {int(s) for s in raw.satellite[placed]})
     if missing:
-        facts["without_ephemeris"] = " ".join(satellite_name(s) for s in missing)
+        facts["without_ephemeris"] = " ".join(name_satellite(s) for s in missing)
     if raw.differenced:
         facts["with_base"] = int(np.isfinite(raw.difference).sum())
     return facts

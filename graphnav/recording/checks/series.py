@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from graphnav.core.findings import Finding, period_of
+from graphnav.core.findings import Finding, compute_period
 from graphnav.recording import Recording, take_rows
 from graphnav.sensors import Series
 
@@ -27,7 +27,7 @@ def screen_series(recording: Recording) -> tuple[Recording, list[Finding]]:
 
 def _screen(series: Series) -> tuple[Series, list[Finding]]:
     sensor, before = series.sensor, np.isfinite(series.values)
-    values = sensor.within_bounds(series.values)
+    values = sensor.mask_outside_bounds(series.values)
     findings = []
     for column, there, left in zip(sensor.columns, before.T, np.isfinite(values).T, strict=True):
         lost = int(there.sum() - left.sum())
@@ -46,14 +46,14 @@ def _screen(series: Series) -> tuple[Series, list[Finding]]:
             findings.append(Finding("note", f"{sentence}: left out", f"{sensor.name}.bounds"))
     if not findings:
         return series, []
-    return take_rows(replace(series, values=values), sensor.usable(values)), findings
+    return take_rows(replace(series, values=values), sensor.mask_usable(values)), findings
 
 
 def describe_series(series: Series) -> dict[str, Any]:
     """Rows, rate, span and the least and largest value of each column, in the units of files."""
     facts: dict[str, Any] = {"rows": len(series)}
     if len(series) > 1:
-        facts |= {"rate_hz": round(1.0 / period_of(series.t), 3), "span_s": round(float(np.ptp(series.t)), 3)}
+        facts |= {"rate_hz": round(1.0 / compute_period(series.t), 3), "span_s": round(float(np.ptp(series.t)), 3)}
     for column in series.sensor.columns:
         unit, size = next(iter(column.units.items()))
         values = series[column.name] / size

@@ -12,7 +12,7 @@ import numpy as np
 from graphnav.core.errors import RecordingError
 from graphnav.core.files import is_inside
 from graphnav.core.rotation import Array
-from graphnav.core.timescales import NEAR, UNIX, ClockOffset, between_clocks
+from graphnav.core.timescales import NEAR, UNIX, ClockOffset, compute_clock_offset
 from graphnav.recording import Gnss, Odometer
 from graphnav.recording.draft import guesses, motion
 from graphnav.recording.draft.agreement import CLEAR, LIKELY, Agreement, compare_with_fixes
@@ -360,7 +360,7 @@ def _find_epoch(imu: Source, gnss: Source) -> ClockOffset | None:
     """Offset between the clocks of two logs, where both are known."""
     first = [_read_first(source, sensor) for source, sensor in ((imu, "imu"), (gnss, "gnss"))]
     zeros = [None if source.log is None else source.log.gps_zero for source in (imu, gnss)]
-    found = between_clocks(first[0], zeros[0], first[1], zeros[1])
+    found = compute_clock_offset(first[0], zeros[0], first[1], zeros[1])
     return found if found is not None and abs(first[1] + found.offset - first[0]) < NEAR else None
 
 

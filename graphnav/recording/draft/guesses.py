@@ -11,7 +11,7 @@ from graphnav.core.earth import STANDARD_GRAVITY
 from graphnav.core.errors import RecordingError
 from graphnav.core.rotation import Array
 from graphnav.recording.draft import motion
-from graphnav.recording.formats.schema import FORCE, RATE, SPEED, rotation_from_letters
+from graphnav.recording.formats.schema import FORCE, RATE, SPEED, parse_axes_letters
 from graphnav.sensors import barometer
 from graphnav.sensors.barometer import ATMOSPHERE
 from graphnav.sensors.tables import TIME
@@ -152,7 +152,7 @@ def guess_axes(up: Array, forward: Array) -> tuple[str | None, tuple[Array, Arra
         for side in "RL":
             word = "".join(letter or side for letter in letters)
             try:
-                rotation_from_letters(word)
+                parse_axes_letters(word)
             except ValueError:
                 continue
             return word, (square, up)

@@ -15,11 +15,11 @@ from graphnav.recording.draft import columns as matching
 from graphnav.recording.draft import guesses
 from graphnav.recording.draft.guesses import Guess
 from graphnav.recording.draft.plain import Plain, read_clock_seconds, read_plain
-from graphnav.recording.formats.folder import other_log
+from graphnav.recording.formats.folder import read_other_log
 from graphnav.recording.formats.registry import Log
-from graphnav.recording.formats.repair import new_fixes
+from graphnav.recording.formats.repair import mask_new_fixes
 from graphnav.recording.formats.schema import WHEELS
-from graphnav.recording.formats.table import Table, first_rows, read_header, read_table
+from graphnav.recording.formats.table import Table, read_first_rows, read_header, read_table
 from graphnav.sensors.tables import ANGLE, TIME
 
 WANTED = {
@@ -111,7 +111,7 @@ def read_log(path: Path, topics: Sequence[str] = ()) -> dict[str, Source]:
     """The sensors of one file."""
     if not path.exists():
         raise RecordingError(f"{path}: no such file", key="file.missing")
-    log = other_log(path, topics)
+    log = read_other_log(path, topics)
     if log is not None:
         return {s: Source(path, log=log) for s in ("imu", "gnss", "odometer") if getattr(log, s) is not None}
     plain = read_plain(path) if path.is_file() else None
@@ -156,7 +156,7 @@ def _add_clock(path: Path, header: list[str], columns: matching.Columns) -> matc
     if len(several) < 2:
         return columns
     best = columns.names["t"]
-    rows = first_rows(path, 100)
+    rows = read_first_rows(path, 100)
     cells = {name: [row[header.index(name)] for row in rows if len(row) == len(header)] for name in several}
     stamps = {name: t for name in several if (t := _read_stamps(cells[name])) is not None}
     if best not in stamps:  # dates in words
@@ -214,7 +214,7 @@ def _read(path: Path, columns: matching.Columns, role: str, plain: Plain | None)
     order = order[np.concatenate([[True], np.diff(values["t"][order]) > 0])]
     values = {ours: v[order] for ours, v in values.items()}
     if role == "gnss":
-        new = new_fixes(values)  # as it will be read
+        new = mask_new_fixes(values)  # as it will be read
         values = {ours: v[new] for ours, v in values.items()}
     step = np.diff(values["t"])
     if step.sum() > _PAUSES * len(step) * np.median(step):

@@ -18,7 +18,7 @@ from graphnav.core.timescales import UNIX, WEEK, gps_to_utc, parse_clock
 from graphnav.gnss.files import read_bytes
 from graphnav.gnss.load import Sources, load_raw, read_rover
 from graphnav.gnss.series import Observations, RawGnss
-from graphnav.gnss.signals import signal_name
+from graphnav.gnss.signals import name_signal
 from graphnav.gnss.single_point import SinglePoint
 from graphnav.gnss.ubx import is_ubx
 from graphnav.recording.draft.guesses import Guess
@@ -101,9 +101,9 @@ def find_raw(files: RawFiles, t: Array, zero: float | None) -> RawFound | None:
         zero = None if clock.value is None else parse_clock(str(clock.value), float(t[0]))
     notes = []
     if zero is not None:
-        there = {path: obs for path, obs in every.items() if _overlap(_span(obs), (t[0] + zero, t[-1] + zero))}
+        there = {path: obs for path, obs in every.items() if _overlap(_find_span(obs), (t[0] + zero, t[-1] + zero))}
         if not there:
-            path, (begin, end) = next((path, _span(obs)) for path, obs in every.items())
+            path, (begin, end) = next((path, _find_span(obs)) for path, obs in every.items())
             raise RecordingError(
                 f"{path}: its observations, {_say(begin)} to {_say(end)}, are not of the time of the IMU, "
                 f"{_say(t[0] + zero)} to {_say(t[-1] + zero)}",
@@ -123,7 +123,7 @@ def find_raw(files: RawFiles, t: Array, zero: float | None) -> RawFound | None:
     )
     raw, fixes, remarks = load_raw(sources, zero)
     own = {"rover": rover, "base": sources.base, **placing}
-    signals = ", ".join(sorted({signal_name(int(s)) for s in np.unique(raw.signal)}))
+    signals = ", ".join(sorted({name_signal(int(s)) for s in np.unique(raw.signal)}))
     begin, end = (float(x) + raw.zero for x in raw.t[[0, -1]])
     notes.append(
         f"observations of {len(np.unique(raw.satellite))} satellites, {_say(begin)} to {_say(end)}; signals {signals}"
@@ -191,7 +191,7 @@ def _guess_clock(t: Array, every: dict[Path, Observations]) -> Guess:
     if t[0] > UNIX:
         return Guess("unix", "the stamps are dates of this century, s since 1970")
     for obs in every.values():
-        begin, end = _span(obs)
+        begin, end = _find_span(obs)
         week = WEEK * np.floor(begin / WEEK)
         if _overlap((t[0] + week, t[-1] + week), (begin, end)):
             return Guess(f"gps week {round(week / WEEK)}", "the stamps are those of the observations, s of that week")
@@ -202,8 +202,8 @@ def _choose_rover(
     every: dict[Path, Observations], placing: dict[str, tuple[Path, ...]]
 ) -> tuple[tuple[Path, ...], Path | None]:
     """Files of the rover, one after another, and that of the base."""
-    paths = sorted(every, key=lambda path: _span(every[path]))
-    spans = [_span(every[path]) for path in paths]
+    paths = sorted(every, key=lambda path: _find_span(every[path]))
+    spans = [_find_span(every[path]) for path in paths]
     if all(a[1] < b[0] for a, b in pairwise(spans)):
         return tuple(paths), None
     names = " and ".join(path.name for path in paths)
@@ -242,7 +242,7 @@ def _guess_base_place(path: Path, obs: Observations, placing: dict[str, tuple[Pa
     return (x, y, z), f"CHECK: m, Earth-centred; that of its header, {off:.1f} m from its single-point positions"
 
 
-def _span(obs: Observations) -> tuple[float, float]:
+def _find_span(obs: Observations) -> tuple[float, float]:
     """s since the GPS epoch."""
     return float(obs.t.min()) + obs.zero, float(obs.t.max()) + obs.zero
 

@@ -17,7 +17,7 @@ from graphnav.recording.draft.guesses import Guess
 from graphnav.recording.draft.logs import WANTED, NoSensorError, Source, read_log
 from graphnav.recording.draft.plain import DAY
 from graphnav.recording.draft.raw import RawFiles, separate_raw, tell_kind
-from graphnav.recording.formats import formats
+from graphnav.recording.formats import list_formats
 from graphnav.recording.formats.schema import SPEED
 from graphnav.sensors.tables import ANGLE
 
@@ -116,7 +116,7 @@ def _find_unix_start(source: Source) -> float | None:
 
 def _list_files(path: Path) -> list[Path]:
     """A log by itself, or those in a folder that is not a log itself."""
-    if not path.is_dir() or any(known.load is not None and known.recognises(path) for known in formats().values()):
+    if not path.is_dir() or any(known.load is not None and known.recognises(path) for known in list_formats().values()):
         return [path]
     every = [p for p in path.iterdir() if not p.name.startswith(".")]
     made = {JOINED, "recording.toml"}  # written by an earlier draft
@@ -137,7 +137,7 @@ def name_plain_file(path: Path, sensor: str) -> str:
 
 def _is_known(path: Path) -> bool:
     return path.suffix != ".toml" and any(
-        known.load is not None and known.recognises(path) for known in formats().values()
+        known.load is not None and known.recognises(path) for known in list_formats().values()
     )
 
 

@@ -53,7 +53,7 @@ def write_parts(
             adders = []
             for one, part in zip(targets, parts.values(), strict=True):
                 module = import_module(f"graphnav.recording.exporters.{one}")
-                adders.append(stack.enter_context(module.writing(part, name)))
+                adders.append(stack.enter_context(module.open_writer(part, name)))
             pool = stack.enter_context(ThreadPoolExecutor(1))
             writing: Future[None] | None = None
             for block in blocks:  # the next one is computed while one is written

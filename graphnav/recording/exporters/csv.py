@@ -11,7 +11,7 @@ import numpy as np
 from graphnav.core.rotation import Array
 from graphnav.core.trajectory import Trajectory
 from graphnav.recording.exporters import Add, require_geodetic
-from graphnav.recording.exporters.digits import rows_bytes
+from graphnav.recording.exporters.digits import encode_rows
 
 HEADER = (
     "t,lat,lon,h,ve,vn,vu,roll,pitch,heading,sd_e,sd_n,sd_u,sd_ve,sd_vn,sd_vu,sd_roll,sd_pitch,sd_heading,"
@@ -20,8 +20,8 @@ HEADER = (
 
 
 @contextmanager
-def writing(path: Path, name: str = "") -> Iterator[Add]:
-    """A file to which successive trajectories are added; digits as in `rows`."""
+def open_writer(path: Path, name: str = "") -> Iterator[Add]:
+    """A file to which successive trajectories are added; digits as in `format_trajectory`."""
     with path.open("wb") as file:
         file.write(HEADER.encode() + b"\n")
 
@@ -32,7 +32,7 @@ def writing(path: Path, name: str = "") -> Iterator[Add]:
         yield add
 
 
-def rows(trajectory: Trajectory) -> str:
+def format_trajectory(trajectory: Trajectory) -> str:
     """The lines of `trajectory`.
 
     Digits: a microsecond, a micrometre on the ground (1e-11 deg), 0.01 mm in height, 0.01 mm/s, 1e-7 deg; sigmas and
@@ -41,7 +41,7 @@ def rows(trajectory: Trajectory) -> str:
     return _write_rows(trajectory).decode("ascii")
 
 
-def columns(trajectory: Trajectory) -> list[tuple[Array | None, str]]:
+def convert_columns(trajectory: Trajectory) -> list[tuple[Array | None, str]]:
     """The columns in the file's units, (K, n) each or None for three blanks, and their number formats."""
     deg = np.rad2deg(1.0)
 
@@ -63,7 +63,7 @@ def columns(trajectory: Trajectory) -> list[tuple[Array | None, str]]:
 
 
 def _write_rows(trajectory: Trajectory) -> bytes:
-    parts = columns(trajectory)
+    parts = convert_columns(trajectory)
     table = np.concatenate([values for values, _ in parts if values is not None], axis=1)
     forms = [form for values, one in parts for form in ([one] * values.shape[1] if values is not None else [""] * 3)]
-    return rows_bytes(table, ",".join(forms))
+    return encode_rows(table, ",".join(forms))

@@ -24,12 +24,12 @@ _COMPILED = "graphnav.recording.exporters.rows"
 _FEW, _SOME, _MANY = 500, 20_000, 2_000_000  # numbers above which loading and calling compiled code pays off
 
 
-def rows_text(table: Array, row_format: str) -> str:
+def format_rows(table: Array, row_format: str) -> str:
     """The rows of `table` (K, n) in one ``%`` format with n fields, one line each; NaN becomes blank."""
-    return rows_bytes(table, row_format).decode("ascii")
+    return encode_rows(table, row_format).decode("ascii")
 
 
-def rows_bytes(table: Array, row_format: str, last: Array | None = None) -> bytes:
+def encode_rows(table: Array, row_format: str, last: Array | None = None) -> bytes:
     """The same as ASCII bytes.
 
     Parameters

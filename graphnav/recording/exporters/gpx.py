@@ -17,7 +17,7 @@ import numpy as np
 from graphnav.core.rotation import Array
 from graphnav.core.trajectory import Trajectory
 from graphnav.recording.exporters import Add, require_geodetic
-from graphnav.recording.exporters.digits import rows_bytes
+from graphnav.recording.exporters.digits import encode_rows
 
 _HEAD = """<?xml version="1.0" encoding="UTF-8"?>
 <gpx version="1.1" creator="graphnav" xmlns="http://www.topografix.com/GPX/1/1">
@@ -29,7 +29,7 @@ _STAMPED = _POINT.replace("</trkpt>", "<time>%sZ</time></trkpt>")
 
 
 @contextmanager
-def writing(path: Path, name: str = "") -> Iterator[Add]:
+def open_writer(path: Path, name: str = "") -> Iterator[Add]:
     """A GPX file, with times where UTC is known."""
     started = False
     with path.open("wb") as file:
@@ -46,7 +46,7 @@ def writing(path: Path, name: str = "") -> Iterator[Add]:
             degrees = np.rad2deg(block.llh[:, :2])
             table = np.column_stack([degrees, block.llh[:, 2]])
             stamps = None if utc is None else np.datetime_as_string(utc, unit="ms").astype("S")
-            file.write(rows_bytes(table, _POINT if utc is None else _STAMPED, stamps))
+            file.write(encode_rows(table, _POINT if utc is None else _STAMPED, stamps))
 
         yield add
         file.write(_TAIL.encode())

@@ -13,7 +13,7 @@ from graphnav.core.earth import LocalFrame
 from graphnav.core.rotation import Array
 from graphnav.core.trajectory import Trajectory
 from graphnav.recording.exporters import Add, require_geodetic
-from graphnav.recording.exporters.digits import rows_text
+from graphnav.recording.exporters.digits import format_rows
 
 _MAX_POINTS = 20000
 _LEAST_SPACING = 0.05  # m, smallest distance between points
@@ -40,7 +40,7 @@ _PLACEMARK = (
 
 
 @contextmanager
-def writing(path: Path, name: str = "") -> Iterator[Add]:
+def open_writer(path: Path, name: str = "") -> Iterator[Add]:
     """A KML file; its path is thinned by distance, so that stops need no points and turns keep their shape."""
     path_so_far = _Thinned()
     with path.open("w", encoding="utf-8") as file:
@@ -56,7 +56,7 @@ def writing(path: Path, name: str = "") -> Iterator[Add]:
             _PLACEMARK.format(name=name, t=kept[k, 0], lat=degrees[k, 0], lon=degrees[k, 1], h=degrees[k, 2])
             for name, k in (("start", 0), ("end", -1))
         )
-        line = rows_text(degrees[:, [1, 0, 2]], "%.9f,%.9f,%.3f")
+        line = format_rows(degrees[:, [1, 0, 2]], "%.9f,%.9f,%.3f")
         file.write(_DOCUMENT.format(name=escape(name or "trajectory", quote=False), line=line, ends=ends))
 
 

@@ -17,11 +17,11 @@ from graphnav.core.rotation import Array
 from graphnav.core.timescales import WEEK, utc_to_gps
 from graphnav.core.trajectory import Trajectory
 from graphnav.recording.exporters import Add, require_geodetic
-from graphnav.recording.exporters.digits import rows_bytes
+from graphnav.recording.exporters.digits import encode_rows
 
 
 @contextmanager
-def writing(path: Path, name: str = "") -> Iterator[Add]:
+def open_writer(path: Path, name: str = "") -> Iterator[Add]:
     """A .nav file; without UTC the trajectory's own times are the seconds and the week is 0, as KF-GINS itself
     writes.
     """
@@ -42,6 +42,6 @@ def writing(path: Path, name: str = "") -> Iterator[Add]:
             deg = np.rad2deg(1.0)
             v, llh = block.v, block.llh
             table = np.column_stack([week, t, llh[:, :2] * deg, llh[:, 2], v[:, 1], v[:, 0], -v[:, 2], block.rph * deg])
-            file.write(rows_bytes(table, "%d %.6f %.11f %.11f %.5f" + 3 * " %.5f" + 3 * " %.7f"))
+            file.write(encode_rows(table, "%d %.6f %.11f %.11f %.5f" + 3 * " %.5f" + 3 * " %.7f"))
 
         yield add

@@ -23,7 +23,7 @@ _KNOTS = 3600 / 1852
 
 
 @contextmanager
-def writing(path: Path, name: str = "") -> Iterator[Add]:
+def open_writer(path: Path, name: str = "") -> Iterator[Add]:
     """An NMEA file; every sentence begins with the time of day, so UTC is needed."""
     with path.open("w", encoding="ascii", newline="") as file:
 
@@ -48,15 +48,15 @@ def _write_sentences(trajectory: Trajectory, utc: Array) -> list[str]:
     text = []
     for k, seconds in enumerate(of_day.tolist()):
         clock, place = _write_clock(seconds), f"{latitude[k]},{longitude[k]}"
-        text.append(sentence(f"GNGGA,{clock},{place},1,,,{trajectory.llh[k, 2]:.4f},M,0.0,M,,"))
-        text.append(sentence(f"GNRMC,{clock},A,{place},{motion[k]},{dates[k]},,,A"))
+        text.append(format_sentence(f"GNGGA,{clock},{place},1,,,{trajectory.llh[k, 2]:.4f},M,0.0,M,,"))
+        text.append(format_sentence(f"GNRMC,{clock},A,{place},{motion[k]},{dates[k]},,,A"))
         if trajectory.sd_p is not None and np.isfinite(trajectory.sd_p[k]).all():
             east, north, up = trajectory.sd_p[k].tolist()
-            text.append(sentence(f"GNGST,{clock},,,,,{north:.4f},{east:.4f},{up:.4f}"))
+            text.append(format_sentence(f"GNGST,{clock},,,,,{north:.4f},{east:.4f},{up:.4f}"))
     return text
 
 
-def sentence(body: str) -> str:
+def format_sentence(body: str) -> str:
     """A sentence with its checksum, the exclusive or of all characters, and its line end."""
     return f"${body}*{reduce(xor, body.encode()):02X}\r\n"
 

@@ -16,11 +16,11 @@ from graphnav.core.errors import RecordingError
 from graphnav.core.rotation import Array
 from graphnav.core.trajectory import Trajectory
 from graphnav.recording.exporters import Add, require_geodetic
-from graphnav.recording.exporters.csv import HEADER, columns
+from graphnav.recording.exporters.csv import HEADER, convert_columns
 
 
 @contextmanager
-def writing(path: Path, name: str = "") -> Iterator[Add]:
+def open_writer(path: Path, name: str = "") -> Iterator[Add]:
     """A Parquet file to which blocks are added; `name` is kept in its metadata.
 
     Raises
@@ -36,7 +36,7 @@ def writing(path: Path, name: str = "") -> Iterator[Add]:
         def add(block: Trajectory, utc: Array | None = None) -> None:
             require_geodetic(block, path)
             table = np.concatenate(
-                [c if c is not None else np.full((len(block), 3), np.nan) for c, _ in columns(block)], 1
+                [c if c is not None else np.full((len(block), 3), np.nan) for c, _ in convert_columns(block)], 1
             )
             arrays = [pa.array(np.ascontiguousarray(x), from_pandas=True) for x in table.T]
             file.write_table(pa.Table.from_arrays(arrays, schema=schema))

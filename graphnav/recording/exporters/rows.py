@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from graphnav.core.compiled import compiled
+from graphnav.core.compiled import compile_once
 from graphnav.core.rotation import Array
 from graphnav.recording.exporters.digits import GENERAL, WORD
 
@@ -23,7 +23,7 @@ _DIGITS = np.frombuffer(b"0123456789", np.uint8)
 _MINUS, _POINT, _ZERO, _E = 45, 46, 48, 101
 
 
-@compiled
+@compile_once
 def write_digits(number: int, count: int, out: Array, at: int) -> int:
     """Write the last `count` digits of a whole number into `out` from `at` on; returns where they end."""
     left = np.uint64(number)  # division of signed numbers takes twice as long
@@ -34,7 +34,7 @@ def write_digits(number: int, count: int, out: Array, at: int) -> int:
     return at + count
 
 
-@compiled
+@compile_once
 def write_fixed(x: float, places: int, out: Array, at: int) -> int:
     """Write ``%.kf``; NaN is blank; -1 where the rounding is undecided."""
     if np.isnan(x):
@@ -62,7 +62,7 @@ def write_fixed(x: float, places: int, out: Array, at: int) -> int:
     return at
 
 
-@compiled
+@compile_once
 def write_general(x: float, out: Array, at: int) -> int:
     """Write ``%.6g``; NaN is blank; -1 where the rounding is undecided."""
     if np.isnan(x):
@@ -106,7 +106,7 @@ def write_general(x: float, out: Array, at: int) -> int:
     return at
 
 
-@compiled
+@compile_once
 def write_rows(
     table: Array, row: int, kinds: Array, words: Array, literal: Array, ends: Array, out: Array
 ) -> tuple[int, int]:

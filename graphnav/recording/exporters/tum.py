@@ -14,11 +14,11 @@ from graphnav.core.errors import RecordingError
 from graphnav.core.rotation import Array
 from graphnav.core.trajectory import Trajectory
 from graphnav.recording.exporters import Add
-from graphnav.recording.exporters.digits import rows_bytes
+from graphnav.recording.exporters.digits import encode_rows
 
 
 @contextmanager
-def writing(path: Path, name: str = "") -> Iterator[Add]:
+def open_writer(path: Path, name: str = "") -> Iterator[Add]:
     """A TUM file in metres of the fixed ENU frame at the first point, and the quaternion from body (RFU) to that
     frame.
     """
@@ -43,7 +43,7 @@ def writing(path: Path, name: str = "") -> Iterator[Add]:
                 R_nb = rotation.multiply(np.swapaxes(R_ln, -1, -2), R_lb)
             q = rotation.to_quaternion(R_nb)
             table = np.column_stack([block.t, p_n, q[:, 1:], q[:, 0]])
-            file.write(rows_bytes(table, " ".join(["%.6f"] + ["%.5f"] * 3 + ["%.10f"] * 4)))
+            file.write(encode_rows(table, " ".join(["%.6f"] + ["%.5f"] * 3 + ["%.10f"] * 4)))
 
         yield add
 

@@ -19,12 +19,12 @@ from graphnav.recording.exporters import NAMES as EXPORTED
 from graphnav.recording.formats.registry import Format, Log
 from graphnav.recording.formats.rounding import measure_rounding
 
-__all__ = ["Format", "Log", "formats", "is_description", "load", "read"]
+__all__ = ["Format", "Log", "is_description", "list_formats", "load", "read"]
 
 _DESCRIPTION = "graphnav-recording"  # contained in every recording.toml
 
 
-def formats() -> dict[str, Format]:
+def list_formats() -> dict[str, Format]:
     """All known formats by name; built-in names come first, so that `kitti` never means a folder."""
     modules = [importlib.import_module(f"{__name__}.{m.name}") for m in pkgutil.iter_modules(__path__)]
     found = [m.FORMAT for m in modules if isinstance(getattr(m, "FORMAT", None), Format)]
@@ -101,7 +101,7 @@ def load(source: str | Path, name: str | None = None, topics: Sequence[str] = ()
 
 def _format_of(source: str | Path, name: str | None) -> Format:
     """The format of that name, or the first that recognises the source."""
-    known = formats()
+    known = list_formats()
     if name is not None and name not in known:
         written = set(name.split(",")) <= set(EXPORTED)
         hint = f"--export {name} writes it" if written else suggest_nearest(name, list(known))

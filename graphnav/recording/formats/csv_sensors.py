@@ -19,10 +19,10 @@ from graphnav.recording.formats.repair import (
     VAGUEST,
     VAGUEST_V,
     Remarks,
+    choose_sigmas,
+    compute_horizontal_velocity,
     convert_geodetic,
-    fixes_by_type,
-    horizontal_velocity,
-    sigmas,
+    parse_fix_types,
 )
 from graphnav.recording.formats.table import Table
 from graphnav.sensors import Sensor, Series
@@ -67,7 +67,7 @@ def build_gnss(d: schema.GnssTable, rows: Table, remarks: Remarks) -> Gnss:
     """Fixes (rad, m) with their sigmas, without those of useless precision; velocities where all axes are given."""
     llh, rows = convert_geodetic(rows, d.units.angle, schema.HEIGHT[d.units.height], "GNSS", remarks)
     every = np.ones(len(rows), dtype=bool)
-    sd = sigmas(rows, ("sd_e", "sd_n", "sd_u"), d.sd, DEFAULT_SD, "GNSS position", every, remarks)
+    sd = choose_sigmas(rows, ("sd_e", "sd_n", "sd_u"), d.sd, DEFAULT_SD, "GNSS position", every, remarks)
     vague = (sd > VAGUEST).any(axis=1)
     if vague.any():
         if vague.all():
@@ -91,7 +91,7 @@ def build_gnss(d: schema.GnssTable, rows: Table, remarks: Remarks) -> Gnss:
         v = rows.stack("ve", "vn", "vu") * scale
         absent = np.isnan(v).any(-1)
         v[absent] = np.nan
-        sd_v = sigmas(rows, ("sd_ve", "sd_vn", "sd_vu"), d.sd_v, DEFAULT_SD_V, "GNSS velocity", ~absent, remarks)
+        sd_v = choose_sigmas(rows, ("sd_ve", "sd_vn", "sd_vu"), d.sd_v, DEFAULT_SD_V, "GNSS velocity", ~absent, remarks)
         absent |= (sd_v > VAGUEST_V).any(-1)
         v[absent] = sd_v[absent] = np.nan
         if absent.all():
@@ -99,7 +99,7 @@ def build_gnss(d: schema.GnssTable, rows: Table, remarks: Remarks) -> Gnss:
             remarks.add("gnss.velocity_blank", "the GNSS velocity columns are blank throughout: no velocities")
     elif "speed" in rows and "course" in rows:
         course = rows["course"] * ANGLE[d.units.angle or "deg"]
-        v, sd_v, sentence = horizontal_velocity(
+        v, sd_v, sentence = compute_horizontal_velocity(
             rows["speed"] * schema.SPEED[d.units.speed], course, d.sd_v or DEFAULT_SD_V
         )
         remarks.add("gnss.velocity_of_course", sentence)
@@ -108,7 +108,7 @@ def build_gnss(d: schema.GnssTable, rows: Table, remarks: Remarks) -> Gnss:
             "gnss.velocity_partly",
             f"GNSS velocities need ve, vn and vu; only {', '.join(there)} is there, so none are used",
         )
-    kinds = fixes_by_type(rows, d.units.type) if "type" in rows else None
+    kinds = parse_fix_types(rows, d.units.type) if "type" in rows else None
     gnss = Gnss(
         rows["t"], llh, sd, v, sd_v, np.array(d.lever_arm), kinds, kinds is not None and d.units.type == "rtklib"
     )
@@ -158,7 +158,7 @@ def list_needed(sensor: Sensor, rows: Table) -> tuple[str, ...]:
     """
     for some in sensor.needs:
         if all(name in rows for name in some):
-            # of several sets a row may have any, which `Sensor.usable` checks
+            # of several sets a row may have any, which `Sensor.mask_usable` checks
             return some if len([s for s in sensor.needs if all(name in rows for name in s)]) == 1 else ()
     sets = " or ".join(" and ".join(some) for some in sensor.needs)
     raise RecordingError(
@@ -172,7 +172,7 @@ def build_series(sensor: Sensor, d: Any, rows: Table, remarks: Remarks) -> Serie
     sizes = [column.units[getattr(d.units, column.name)] for column in sensor.columns]
     values = np.stack([rows.get(name, absent) * size for name, size in zip(sensor.names, sizes, strict=True)], -1)
     figures = sensor.figures(**{name: getattr(d, name) for name in sensor.figures.model_fields})
-    whole = sensor.usable(values)
+    whole = sensor.mask_usable(values)
     if not whole.all():
         remarks.add(
             f"{sensor.name}.rows_blank",

@@ -18,17 +18,17 @@ _SPEED = {"m/s": 1.0, "mm/s": 1e-3, "cm/s": 1e-2, "m/h": 1.0 / _H}
 _FORCE = {"m/s2": 1.0, "mm/s2": 1e-3, "g": _G, "mg": 1e-3 * _G, "ug": 1e-6 * _G, "gal": 1e-2, "mgal": 1e-5}
 
 
-def _per_root(units: dict[str, float], roots: dict[str, float]) -> dict[str, float]:
+def _list_per_root(units: dict[str, float], roots: dict[str, float]) -> dict[str, float]:
     return {f"{u}/sqrt({r})": x / math.sqrt(y) for u, x in units.items() for r, y in roots.items()}
 
 
 # a rate per root of frequency is a rate times a root of time: deg/s/sqrt(Hz) = deg/sqrt(s)
 _HZ = {"hz": 1.0}
-_GYRO_NOISE = _per_root(_RATE_UNITS, _HZ) | _per_root(_ANGLE, _TIME)
-_ACCEL_NOISE = _per_root(_FORCE, _HZ) | _per_root(_SPEED, _TIME)
+_GYRO_NOISE = _list_per_root(_RATE_UNITS, _HZ) | _list_per_root(_ANGLE, _TIME)
+_ACCEL_NOISE = _list_per_root(_FORCE, _HZ) | _list_per_root(_SPEED, _TIME)
 # the same dimension written in two ways: rad/s/sqrt(s), as here, and rad/s2/sqrt(Hz), as in Kalibr
-_GYRO_WALK = _per_root(_RATE_UNITS, _TIME) | _per_root({"rad/s2": 1.0, "deg/s2": _DEG}, _HZ)
-_ACCEL_WALK = _per_root(_FORCE, _TIME) | _per_root({"m/s3": 1.0}, _HZ)
+_GYRO_WALK = _list_per_root(_RATE_UNITS, _TIME) | _list_per_root({"rad/s2": 1.0, "deg/s2": _DEG}, _HZ)
+_ACCEL_WALK = _list_per_root(_FORCE, _TIME) | _list_per_root({"m/s3": 1.0}, _HZ)
 _RATIO = {"%": 1e-2, "ppm": 1e-6}
 
 UNITS: dict[str, dict[str, float]] = {

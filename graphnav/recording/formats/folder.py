@@ -13,7 +13,7 @@ import numpy as np
 from graphnav.core.earth import ecef_to_llh, enu_axes
 from graphnav.core.errors import RecordingError
 from graphnav.core.files import resolve_beside
-from graphnav.core.notes import key_of
+from graphnav.core.notes import get_key
 from graphnav.core.timescales import parse_clock
 from graphnav.gnss.series import RawGnss
 from graphnav.recording import Gnss, Imu, Odometer, Recording, Truth
@@ -87,7 +87,7 @@ def read_folder(source: str | Path) -> Recording:
         if section is None:
             return None
         if section.file not in logs:
-            logs[section.file] = other_log(
+            logs[section.file] = read_other_log(
                 resolve_beside(path, section.file, f"{name}.file"), topics.get(section.file, ())
             )
         log = logs[section.file]
@@ -106,7 +106,7 @@ def read_folder(source: str | Path) -> Recording:
                 raise RecordingError(
                     f"{path}: '{name}.{key}' is only for CSV files, and {section.file} is none", key="key.not_here"
                 )
-        remarks.extend(r for r in log.remarks if r not in remarks and key_of(r) not in settled)
+        remarks.extend(r for r in log.remarks if r not in remarks and get_key(r) not in settled)
         if log.gps_zero is not None:
             zeros.append(log.gps_zero - section.time_offset)
         return of_log(section, held)
@@ -181,7 +181,7 @@ def _load_raw(
         if len(sources.rover) > 1:
             raise RecordingError(f"{path}: 'raw_gnss.rover': one CSV file, not {len(sources.rover)}", key="key.value")
         rows = read_table(sources.rover[0], columns.REQUIRED, columns.OPTIONAL, d.columns)
-        given = columns.observations(rows.columns, zero, sources.rover[0].name)
+        given = columns.make_observations(rows.columns, zero, sources.rover[0].name)
     elif d.columns:
         raise RecordingError(
             f"{path}: 'raw_gnss.columns' is only for a CSV file, and {d.rover[0]} is none", key="key.not_here"
@@ -212,13 +212,13 @@ def _read_truth(d: schema.TruthTable, file: Path, remarks: Remarks) -> Truth:
     return Truth(track.t + d.time_offset, llh, xyz, track.v, track.rph, d.of)
 
 
-def other_log(file: Path, topics: Sequence[str] = ()) -> Log | None:
+def read_other_log(file: Path, topics: Sequence[str] = ()) -> Log | None:
     """The log of another program, or None for a CSV file or a missing one; `topics` are for a ROS bag."""
-    from graphnav.recording.formats import formats  # which imports this module
+    from graphnav.recording.formats import list_formats  # which imports this module
 
     if file.name.endswith((".csv", ".csv.gz")) or not file.exists():
         return None
-    for known in formats().values():
+    for known in list_formats().values():
         if known.load is not None and known.recognises(file):
             return known.choose(file, topics) if topics and known.choose is not None else known.load(file)
     return None

@@ -34,10 +34,10 @@ from graphnav.recording.formats.kfgins_configuration import (
     read_imu_noise,
     read_lever_arm,
 )
-from graphnav.recording.formats.registry import Log, first_bytes, log_format
+from graphnav.recording.formats.registry import Log, log_format, read_first_bytes
 from graphnav.recording.formats.repair import Remarks, is_on_earth
-from graphnav.recording.formats.schema import rotation_from_letters
-from graphnav.recording.formats.text import number_table, text_lines
+from graphnav.recording.formats.schema import parse_axes_letters
+from graphnav.recording.formats.text import parse_table, split_lines
 from graphnav.recording.formats.trajectories import read_trajectory
 
 _GAP_PERIODS = 1.5  # a step of this many periods is a gap: the increments after it are still of one period
@@ -96,7 +96,9 @@ def load(path: Path) -> Log:
         check_inside([nav], folder)
         track = read_trajectory(nav)
         truth = Truth(track.t, track.llh, v=track.v, rph=track.rph)
-        first = next((line.split()[0] for line in text_lines(nav) if line.strip() and line.strip()[0] not in "#%"), "0")
+        first = next(
+            (line.split()[0] for line in split_lines(nav) if line.strip() and line.strip()[0] not in "#%"), "0"
+        )
         week = parse_number(first)
         zero = WEEK * week if 0 < week < 10_000 else None  # KF-GINS itself writes week 0
         files.append(nav)
@@ -121,7 +123,7 @@ def _find_config(folder: Path) -> Path | None:
 
 
 def _names_data(path: Path) -> bool:
-    head = first_bytes(path, 1 << 16).decode("utf-8", errors="replace")
+    head = read_first_bytes(path, 1 << 16).decode("utf-8", errors="replace")
     return any(f"\n{key}:" in f"\n{head}" for key in _IMU_KEYS)
 
 
@@ -146,7 +148,7 @@ def _guess_kind(path: Path) -> str | None:
 
 
 def _read_first_rows(path: Path) -> Array | None:
-    raw = first_bytes(path)
+    raw = read_first_bytes(path)
     if path.suffix.lower() == ".bin":
         return np.frombuffer(raw[: len(raw) // 56 * 56], "<f8").reshape(-1, 7)[:20] if len(raw) >= 112 else None
     if b"\0" in raw:
@@ -211,7 +213,7 @@ def _read_imu(path: Path, remarks: Remarks) -> tuple[Imu, Array | None]:
         at = [f"row {k + 1}" for k in (0, 1)]
     else:
         rows = [
-            (n, line) for n, line in enumerate(text_lines(path), 1) if line.strip() and line.lstrip()[0] not in "#%"
+            (n, line) for n, line in enumerate(split_lines(path), 1) if line.strip() and line.lstrip()[0] not in "#%"
         ]
         if len(rows) < 2:
             raise RecordingError(
@@ -223,7 +225,7 @@ def _read_imu(path: Path, remarks: Remarks) -> tuple[Imu, Array | None]:
                 f"{path}, line {rows[0][0]}: {width} columns where an IMU file has 7 or 8", key="table.fields"
             )
         names = ["t", "dtheta_x", "dtheta_y", "dtheta_z", "dvel_x", "dvel_y", "dvel_z", "odometer", *["other"] * width]
-        table = number_table(path, rows, names[:width], None)
+        table = parse_table(path, rows, names[:width], None)
         at = [f"line {n}" for n, _ in rows]
     t = table[:, 0]
     step = np.diff(t)
@@ -246,7 +248,7 @@ def _read_imu(path: Path, remarks: Remarks) -> tuple[Imu, Array | None]:
             "imu.increments_after_gap",
             f"{format_count(gap.sum(), 'gap')} in the IMU: the increments after each are taken as those of one period",
         )
-    R_bs = rotation_from_letters("FRD")
+    R_bs = parse_axes_letters("FRD")
     remarks.add(
         "imu.read_as",
         f"IMU: angle (rad) and velocity (m/s) increments in forward-right-down, divided by their sample period "
@@ -257,7 +259,7 @@ def _read_imu(path: Path, remarks: Remarks) -> tuple[Imu, Array | None]:
 
 
 def _read_gnss(path: Path, lever_arm: Array, remarks: Remarks) -> Gnss:
-    rows = [(n, line) for n, line in enumerate(text_lines(path), 1) if line.strip() and line.lstrip()[0] not in "#%"]
+    rows = [(n, line) for n, line in enumerate(split_lines(path), 1) if line.strip() and line.lstrip()[0] not in "#%"]
     if not rows:
         raise RecordingError(f"{path}: no rows in it", key="file.no_rows")
     width = len(rows[0][1].split())
@@ -268,7 +270,7 @@ def _read_gnss(path: Path, lever_arm: Array, remarks: Remarks) -> Gnss:
         raise RecordingError(
             f"{path}, line {rows[0][0]}: {width} columns where a GNSS file has 7 (or 13)", key="table.fields"
         )
-    table = dict(zip(names, number_table(path, rows, names, None).T, strict=True))
+    table = dict(zip(names, parse_table(path, rows, names, None).T, strict=True))
     for k in np.flatnonzero(~np.isfinite(table["t"]))[:1]:
         raise RecordingError(f"{path}, line {rows[k][0]}, t: must be a finite number", key="table.cell")
     beyond = np.flatnonzero(~is_on_earth(np.radians(table["lat"]), np.radians(table["lon"]), table["h"]))

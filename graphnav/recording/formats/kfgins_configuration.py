@@ -18,7 +18,7 @@ from graphnav.core.files import is_inside, read_text
 from graphnav.core.rotation import Array
 from graphnav.recording import ImuNoise
 from graphnav.recording.formats.repair import Remarks
-from graphnav.recording.formats.schema import rotation_from_letters
+from graphnav.recording.formats.schema import parse_axes_letters
 
 DEG_PER_H = np.pi / 180 / 3600  # rad/s
 DEG_PER_SQRT_H = np.pi / 180 / 60  # rad/s/sqrt(Hz)
@@ -101,7 +101,7 @@ def read_lever_arm(where: Path, config: dict[str, Any], key: str) -> Array:
             f"{where}, {key}: must be three numbers, forward, right, down in m, of {_MAX_LEVER_ARM:g} m at most",
             key="yaml.value",
         )
-    return rotation_from_letters("FRD") @ np.array(value, dtype=float)
+    return parse_axes_letters("FRD") @ np.array(value, dtype=float)
 
 
 def _is_number(value: Any) -> bool:

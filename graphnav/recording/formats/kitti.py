@@ -17,7 +17,7 @@ from graphnav.core.errors import RecordingError
 from graphnav.core.notes import Note
 from graphnav.recording import Gnss, Imu, ImuNoise, Recording
 from graphnav.recording.formats.registry import Format
-from graphnav.recording.formats.schema import rotation_from_letters
+from graphnav.recording.formats.schema import parse_axes_letters
 
 NOMINAL_ORIGIN = (49.0, 8.4, 115.0)  # deg, deg, m: Karlsruhe; the file holds only local metres
 
@@ -37,7 +37,7 @@ NOISE = ImuNoise(
 SD = (0.1, 0.1, 0.1)  # m
 
 
-def data_folder() -> Path:
+def find_data_folder() -> Path:
     """The folder of the installed gtsam's example data; found without importing gtsam.
 
     Raises
@@ -61,7 +61,7 @@ def read_kitti(source: str | Path = "kitti") -> Recording:
     RecordingError
         If gtsam's example data are not where they are expected.
     """
-    folder = data_folder()
+    folder = find_data_folder()
     files = (folder / "KittiEquivBiasedImu.txt", folder / "KittiGps_converted.txt")
     tables = []
     for file, delimiter in zip(files, (None, ","), strict=True):
@@ -74,7 +74,7 @@ def read_kitti(source: str | Path = "kitti") -> Recording:
     imu = imu[1:]
     early = gps[:, 0] < imu[0, 0]
     gps = gps[~early]
-    R_bs = rotation_from_letters("FLU")
+    R_bs = parse_axes_letters("FLU")
     lat, lon, h = NOMINAL_ORIGIN
     frame = LocalFrame(np.array([np.radians(lat), np.radians(lon), h]))
     return Recording(

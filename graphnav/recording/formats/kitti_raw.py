@@ -19,8 +19,8 @@ from graphnav.core.rotation import Array
 from graphnav.recording import Gnss, Imu, Truth
 from graphnav.recording.formats.registry import Log, log_format
 from graphnav.recording.formats.repair import Remarks, is_on_earth
-from graphnav.recording.formats.schema import rotation_from_letters
-from graphnav.recording.formats.text import text_lines
+from graphnav.recording.formats.schema import parse_axes_letters
+from graphnav.recording.formats.text import split_lines
 
 _FIX_PERIOD = 1.0  # s; the smoothed positions of an INS, used more often, would count as independent fixes
 _COLUMNS = 30
@@ -71,7 +71,7 @@ def load(path: Path) -> Log:
             "log.rows_repeated", f"{format_count(len(t) - len(order), 'sample')} with the time of another dropped"
         )
     t, rows = t[order], rows[order]
-    R_bs = rotation_from_letters("FLU")
+    R_bs = parse_axes_letters("FLU")
     llh = np.column_stack([np.radians(rows[:, :2]), rows[:, 2]])
     v = np.column_stack([rows[:, 7], rows[:, 6], rows[:, 10]])
     roll, pitch, yaw = rows[:, 3:6].T
@@ -112,7 +112,7 @@ def load(path: Path) -> Log:
 def _read_times(path: Path) -> tuple[Array, str]:
     """Seconds since midnight of the first stamp, and that day."""
     stamps = []
-    for number, line in enumerate(text_lines(path), 1):
+    for number, line in enumerate(split_lines(path), 1):
         if line.strip():
             try:
                 stamps.append(np.datetime64(line.strip().replace(" ", "T"), "ns"))
@@ -127,11 +127,11 @@ def _read_times(path: Path) -> tuple[Array, str]:
 
 
 def _parse_row(path: Path) -> list[float]:
-    text = " ".join(text_lines(path))
+    text = " ".join(split_lines(path))
     try:
         values = [parse_number(x) for x in text.split()]
     except ValueError:
-        bad = next(x for x in text.split() if not _number(x))
+        bad = next(x for x in text.split() if not _parse_number(x))
         raise RecordingError(f"{path}, line 1: '{bad[:40]}' is not a number", key="table.cell") from None
     if len(values) != _COLUMNS:
         raise RecordingError(
@@ -140,7 +140,7 @@ def _parse_row(path: Path) -> list[float]:
     return values
 
 
-def _number(text: str) -> bool:
+def _parse_number(text: str) -> bool:
     try:
         parse_number(text)
     except ValueError:

@@ -16,11 +16,11 @@ from graphnav.core.errors import RecordingError
 from graphnav.core.files import parse_number, read_bytes
 from graphnav.core.notes import format_count
 from graphnav.core.rotation import Array
-from graphnav.core.timescales import of_week, utc_to_gps
+from graphnav.core.timescales import date_week_times, utc_to_gps
 from graphnav.recording import Gnss, fix_types
 from graphnav.recording.formats import ubx
-from graphnav.recording.formats.registry import Log, first_bytes, log_format
-from graphnav.recording.formats.repair import DEFAULT_SD, DEFAULT_SD_V, NMEA_TYPES, Remarks, horizontal_velocity
+from graphnav.recording.formats.registry import Log, log_format, read_first_bytes
+from graphnav.recording.formats.repair import DEFAULT_SD, DEFAULT_SD_V, NMEA_TYPES, Remarks, compute_horizontal_velocity
 
 KNOTS = 1852 / 3600  # m/s
 KMH = 1 / 3.6
@@ -47,7 +47,7 @@ def recognises(path: Path) -> bool:
     """Whether one of the first lines is a sentence ($, talker and type, a comma) and the file is not mainly UBX."""
     if ubx.recognises(path):
         return False
-    lines = first_bytes(path).splitlines()[:20]
+    lines = read_first_bytes(path).splitlines()[:20]
     return any(line[:1] == b"$" and line[6:7] == b"," and line[1:6].isalpha() and line[1:2] != b"P" for line in lines)
 
 
@@ -78,8 +78,8 @@ def load(path: Path) -> Log:
             f"{format_count(simulated, 'GGA position')} by dead reckoning, manual input or a simulator left out",
         )
     t, zero = _date_fixes(epochs, fixes, remarks)
-    separation = np.array([_number(e.gga.sep) for e in fixes])
-    height = np.array([_number(e.gga.alt) for e in fixes])
+    separation = np.array([_parse_number(e.gga.sep) for e in fixes])
+    height = np.array([_parse_number(e.gga.alt) for e in fixes])
     if np.isnan(separation).any():
         remarks.add(
             "gnss.height_above_sea",
@@ -91,8 +91,8 @@ def load(path: Path) -> Log:
         )
     llh = np.stack(
         [
-            np.radians([_number(e.gga.lat) for e in fixes]),
-            np.radians([_number(e.gga.lon) for e in fixes]),
+            np.radians([_parse_number(e.gga.lat) for e in fixes]),
+            np.radians([_parse_number(e.gga.lon) for e in fixes]),
             height + np.nan_to_num(separation),
         ],
         -1,
@@ -108,7 +108,7 @@ def load(path: Path) -> Log:
         )
     kinds = fix_types(np.array([e.gga.quality for e in fixes])[order], NMEA_TYPES)
     v, sd_v = (None if x is None else x[order] for x in (v, sd_v))
-    satellites = np.array([_number(e.gga.numSV) for e in fixes])[order]
+    satellites = np.array([_parse_number(e.gga.numSV) for e in fixes])[order]
     gnss = Gnss(t[order], llh[order], sd[order], v, sd_v, type=kinds, satellites=satellites)
     remarks.add(
         "gnss.lever_arm_unknown", "GNSS: position of the antenna; its lever arm is not in the log and taken as zero"
@@ -158,17 +158,17 @@ def _collect_epochs(path: Path) -> tuple[list[_Epoch], list[int], int]:
 def _note(epoch: _Epoch, kind: bytes, message: Any) -> None:
     if kind == b"GGA":
         for value in (message.lat, message.lon, message.alt, message.sep, message.HDOP):
-            _number(value)
+            _parse_number(value)
         if message.lat != "" and (message.NS not in ("N", "S") or message.EW not in ("E", "W")):
             raise ValueError("no hemisphere")
         epoch.gga = message
     elif kind == b"GST":
         for value in (message.stdLong, message.stdLat, message.stdAlt):
-            _number(value)
+            _parse_number(value)
         epoch.gst = message
     elif kind == b"RMC":
         if message.status == "A" and message.spd != "":
-            epoch.speed, epoch.course = _number(message.spd) * KNOTS, _number(message.cog)
+            epoch.speed, epoch.course = _parse_number(message.spd) * KNOTS, _parse_number(message.cog)
         epoch.date = message.date if isinstance(message.date, datetime.date) else None
     elif kind == b"ZDA":
         try:
@@ -177,11 +177,11 @@ def _note(epoch: _Epoch, kind: bytes, message: Any) -> None:
         except (TypeError, ValueError):
             epoch.date = None
     elif epoch.speed is None and (message.sogk != "" or message.sogn != ""):
-        epoch.speed = _number(message.sogk) * KMH if message.sogk != "" else _number(message.sogn) * KNOTS
-        epoch.course = _number(message.cogt)
+        epoch.speed = _parse_number(message.sogk) * KMH if message.sogk != "" else _parse_number(message.sogn) * KNOTS
+        epoch.course = _parse_number(message.cogt)
 
 
-def _number(value: Any) -> float:
+def _parse_number(value: Any) -> float:
     if value in ("", None):
         return float("nan")
     try:
@@ -206,7 +206,7 @@ def _date_fixes(epochs: list[_Epoch], fixes: list[_Epoch], remarks: Remarks) -> 
         return of_day, None
     midnight = np.datetime64(dated.date, "us") - np.timedelta64(days[dated.line], "D")
     gps = utc_to_gps(midnight + (of_day * 1e6).round().astype("timedelta64[us]"))
-    t, zero = of_week(gps)
+    t, zero = date_week_times(gps)
     ahead = round(float(gps[0] - (midnight - np.datetime64("1980-01-06", "us")) / np.timedelta64(1, "s") - of_day[0]))
     remarks.add(
         "log.clock",
@@ -219,14 +219,14 @@ def _read_sigmas(fixes: list[_Epoch], remarks: Remarks) -> Array:
     sd = np.full((len(fixes), 3), np.nan)
     for k, e in enumerate(fixes):
         if e.gst is not None:
-            sd[k] = [_number(e.gst.stdLong), _number(e.gst.stdLat), _number(e.gst.stdAlt)]
+            sd[k] = [_parse_number(e.gst.stdLong), _parse_number(e.gst.stdLat), _parse_number(e.gst.stdAlt)]
     without = ~(sd > 0).all(-1)
     if not without.any():
         remarks.add("gnss.sigma_read_as", "position sigmas: from GST")
         return sd
     for k in np.flatnonzero(without).tolist():
         e = fixes[k].gga
-        hdop = _number(e.HDOP)
+        hdop = _parse_number(e.HDOP)
         axis = _BY_QUALITY.get(e.quality, DEFAULT_SD[0]) * (hdop if hdop > 0 else 1.0)
         sd[k] = axis, axis, 2.0 * axis
     remarks.add(
@@ -242,7 +242,7 @@ def _read_velocities(fixes: list[_Epoch], remarks: Remarks) -> tuple[Array | Non
     course = np.radians([np.nan if e.course is None else e.course for e in fixes])
     if np.isnan(speed).all():
         return None, None
-    v, sd_v, sentence = horizontal_velocity(speed, course, DEFAULT_SD_V)
+    v, sd_v, sentence = compute_horizontal_velocity(speed, course, DEFAULT_SD_V)
     remarks.add("gnss.velocity_of_course", sentence)
     return v, sd_v
 

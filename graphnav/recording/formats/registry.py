@@ -96,7 +96,7 @@ def log_format(
         from graphnav.recording.formats.soundness import drop_unsound_rows  # which imports this module
 
         log = choose(path, topics) if choose is not None and topics else load(path)
-        return replace(_without_nowhere(drop_unsound_rows(log, path)), files=log.files or _list_files(path))
+        return replace(_drop_nowhere(drop_unsound_rows(log, path)), files=log.files or _list_files(path))
 
     return Format(
         name, about, can_read, lambda source: load_log(source).recording(source), load=load_log,
@@ -104,7 +104,7 @@ def log_format(
     )  # fmt: skip
 
 
-def _without_nowhere(log: Log) -> Log:
+def _drop_nowhere(log: Log) -> Log:
     """The log without fixes at latitude and longitude 0, which receivers write when they have none."""
     gnss = log.gnss
     if gnss is None or not (nowhere := (gnss.llh[:, :2] == 0.0).all(axis=1)).any() or nowhere.all():
@@ -122,7 +122,7 @@ def _list_files(path: Path) -> tuple[Path, ...]:
     return tuple(sorted(file for file in path.iterdir() if file.is_file())) if path.is_dir() else (path,)
 
 
-def first_bytes(path: Path, count: int = 4096) -> bytes:
+def read_first_bytes(path: Path, count: int = 4096) -> bytes:
     """The beginning of a file; empty for a folder or an unreadable file."""
     if not path.is_file():
         return b""

@@ -117,7 +117,7 @@ def select_usable_rows(
         rows = rows.take(~repeated)
     if sensor == "imu":
         _check_imu_time(rows, unit)
-    if sensor == "gnss" and not (new := new_fixes(rows.columns)).all():
+    if sensor == "gnss" and not (new := mask_new_fixes(rows.columns)).all():
         rows = rows.take(new)
         remarks.add(
             "gnss.held", f"{_tell_rows(~new, 'GNSS')} with the fix of the row before left out, {len(rows)} kept"
@@ -125,7 +125,7 @@ def select_usable_rows(
     return rows
 
 
-def new_fixes(columns: Mapping[str, Array]) -> NDArray[np.bool_]:
+def mask_new_fixes(columns: Mapping[str, Array]) -> NDArray[np.bool_]:
     """(N,) which rows of fixes are new, for a log that repeats the last fix until there is another.
 
     In such a log most fixes, between two that differ, fill two rows or more, identical except for their time. A
@@ -248,7 +248,7 @@ def _guess_other_form(lat: Array, lon: Array, label: str) -> str:
     return '; if they are metres, name them x and y and say frame = "local"' if label == "truth" else ""
 
 
-def sigmas(
+def choose_sigmas(
     rows: Table,
     names: tuple[str, str, str],
     stated: tuple[float, float, float] | None,
@@ -318,7 +318,7 @@ def _find_floor(positive: Array) -> float | None:
     return float(positive.min())
 
 
-def fixes_by_type(rows: Table, numbers: str) -> NDArray[np.intp] | None:
+def parse_fix_types(rows: Table, numbers: str) -> NDArray[np.intp] | None:
     """Types (N,) of the fixes of a table with such a column, in the numbers of "rtklib" or "nmea".
 
     Raises
@@ -342,7 +342,9 @@ def fixes_by_type(rows: Table, numbers: str) -> NDArray[np.intp] | None:
 _STEEPEST = 0.1
 
 
-def horizontal_velocity(speed: Array, course: Array, sd: tuple[float, float, float]) -> tuple[Array, Array, str]:
+def compute_horizontal_velocity(
+    speed: Array, course: Array, sd: tuple[float, float, float]
+) -> tuple[Array, Array, str]:
     """East-north-up velocities from speed (N,) m/s over ground and course (N,) rad, their sigmas, and notes.
 
     A stationary receiver may leave the course blank; a blank speed gives no velocity.

@@ -22,7 +22,7 @@ from graphnav.core.timescales import unix_to_gps
 from graphnav.recording import Gnss, Imu, ImuNoise, Odometer, fix_types
 from graphnav.recording.formats.registry import Log, log_format
 from graphnav.recording.formats.repair import DEFAULT_SD, DEFAULT_SD_V, Remarks
-from graphnav.recording.formats.schema import rotation_from_letters
+from graphnav.recording.formats.schema import parse_axes_letters
 
 _IMU, _FIX = "sensor_msgs/msg/Imu", "sensor_msgs/msg/NavSatFix"
 _TWISTS = ("geometry_msgs/msg/TwistStamped", "geometry_msgs/msg/TwistWithCovarianceStamped", "nav_msgs/msg/Odometry")
@@ -157,7 +157,7 @@ def _read_imu(topic: _Topic, remarks: Remarks) -> Imu | None:
         remarks.add("imu.topic_not_used", f"{topic.name}: fewer than two usable messages, so it is not used")
         return None
     t, rows = t[good], rows[good]
-    R_bs = rotation_from_letters("FLU")
+    R_bs = parse_axes_letters("FLU")
     remarks.add("imu.read_as", f"IMU: {topic.name}, rad/s and m/s2 with gravity")
     remarks.add("imu.axes_assumed", "IMU: axes taken as forward-left-up (REP 103)")
     white = np.median(rows[:, 6:], axis=0)

@@ -12,7 +12,7 @@ import numpy as np
 from graphnav.core.errors import RecordingError
 from graphnav.core.notes import format_count
 from graphnav.recording import Gnss, fix_types
-from graphnav.recording.formats.registry import Log, first_bytes, log_format
+from graphnav.recording.formats.registry import Log, log_format, read_first_bytes
 from graphnav.recording.formats.repair import Remarks
 from graphnav.recording.formats.trajectories import read_trajectory
 
@@ -22,7 +22,7 @@ _SD_V = (0.2, 0.2, 0.4)
 
 def recognises(path: Path) -> bool:
     """Whether the file begins with comments (%) that name RTKLIB's columns."""
-    head = first_bytes(path, 16384)
+    head = read_first_bytes(path, 16384)
     place = any(name in head for name in (b"latitude(", b"x-ecef(", b"e-baseline("))
     return head[:1] == b"%" and b"Q" in head and b"ns" in head and place
 

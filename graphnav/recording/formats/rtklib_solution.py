@@ -17,8 +17,8 @@ from graphnav.core.earth import LocalFrame, ecef_to_llh, enu_axes
 from graphnav.core.errors import RecordingError
 from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
-from graphnav.core.timescales import GPS_TO_UNIX, WEEK, of_week, unix_to_gps
-from graphnav.recording.formats.text import Rows, number_table
+from graphnav.core.timescales import GPS_TO_UNIX, WEEK, date_week_times, unix_to_gps
+from graphnav.recording.formats.text import Rows, parse_table
 
 _GPS_EPOCH = np.datetime64("1980-01-06T00:00:00", "us")
 _ZONES = {"UTC": 0.0, "JST": 9 * 3600.0}  # s ahead of UTC
@@ -70,7 +70,7 @@ def parse_solution(path: Path, head: list[str], rows: Rows) -> RtklibSolution:
             f"{path}: the RTKLIB header does not name latitude, longitude and height, x, y and z, or a baseline",
             key="rtklib.columns",
         )
-    of_base = _base(path, head) if form == "e-baseline" else None
+    of_base = _parse_base(path, head) if form == "e-baseline" else None
     separator = "," if "," in rows[0][1] else None
     sexagesimal = form == "latitude" and "latitude(d'" in titles
     if sexagesimal:  # three numbers for each angle
@@ -79,7 +79,7 @@ def parse_solution(path: Path, head: list[str], rows: Rows) -> RtklibSolution:
     names = ["date", "time", *columns]
     dated = "/" in rows[0][1].split(separator)[0]
     gps, numeric = _parse_dates(path, rows, separator) if dated else (None, rows)
-    table = number_table(path, numeric, names, separator)
+    table = parse_table(path, numeric, names, separator)
     if gps is None:
         gps = WEEK * table[:, 0] + table[:, 1]
     notes: list[str] = []
@@ -104,7 +104,9 @@ def parse_solution(path: Path, head: list[str], rows: Rows) -> RtklibSolution:
     sd_p, sd_v = (take(*(f"sd{of}{axis}" for axis in axes)) for of in ("", "v"))
     if form == "latitude":
         if sexagesimal:
-            position = np.column_stack([_degrees(take(n, f"{n}'", f"{n}''")) for n in place[:2]] + [position[:, 2]])
+            position = np.column_stack(
+                [_parse_degrees(take(n, f"{n}'", f"{n}''")) for n in place[:2]] + [position[:, 2]]
+            )
         llh = np.column_stack([np.radians(position[:, :2]), position[:, 2]])
         turns = None
     elif of_base is None:
@@ -125,17 +127,17 @@ def parse_solution(path: Path, head: list[str], rows: Rows) -> RtklibSolution:
     if v is not None and sd_v is not None:
         none = (v == 0.0).all(1) & (sd_v == 0.0).all(1)  # without out-dynamics, and of epochs without Doppler
         v[none], sd_v[none] = np.nan, np.nan
-    t, zero = of_week(gps)
+    t, zero = date_week_times(gps)
     return RtklibSolution(t, zero, llh, sd_p, v, sd_v, take_one("Q"), take_one("ns"), notes)
 
 
-def _base(path: Path, head: list[str]) -> Array:
+def _parse_base(path: Path, head: list[str]) -> Array:
     """Latitude, longitude (rad) and height (m) of the base, (3,), by the header; its fields may touch each other."""
     line = next((line.partition(":")[2] for line in head if re.match(r"%\s*ref pos\b", line)), "")
     if found := re.fullmatch(rf"\s*({_NUMBER})\s*,?\s*({_NUMBER})\s*,?\s*({_NUMBER})\s*", line):
         lat, lon, h = (float(x) for x in found.groups())
     elif len(parts := re.findall(_NUMBER, line)) == 7:
-        (lat, lon), h = _degrees(np.array(parts[:6], dtype=float).reshape(2, 3)), float(parts[6])
+        (lat, lon), h = _parse_degrees(np.array(parts[:6], dtype=float).reshape(2, 3)), float(parts[6])
     else:
         raise RecordingError(
             f"{path}: an RTKLIB solution as east-north-up baseline to a base station whose place the header does not "
@@ -145,7 +147,7 @@ def _base(path: Path, head: list[str]) -> Array:
     return np.array([np.radians(lat), np.radians(lon), h])
 
 
-def _degrees(parts: Array | None) -> Array:
+def _parse_degrees(parts: Array | None) -> Array:
     """Degrees from degrees, minutes and seconds (K, 3); the sign is that of the degrees, even of zero."""
     assert parts is not None
     return np.copysign(np.abs(parts[:, 0]) + parts[:, 1] / 60.0 + parts[:, 2] / 3600.0, parts[:, 0])

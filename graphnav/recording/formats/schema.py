@@ -19,7 +19,7 @@ from pydantic import (
 )
 from pydantic.types import Strict
 
-from graphnav.core.complaints import complaint, read_toml, suggest_nearest
+from graphnav.core.complaints import describe_invalid, read_toml, suggest_nearest
 from graphnav.core.earth import MG, STANDARD_GRAVITY
 from graphnav.core.errors import RecordingError
 from graphnav.core.rotation import Array
@@ -36,12 +36,12 @@ from graphnav.sensors.tables import (
     TimeUnit,
     TomlTable,
     Vector,
-    three_numbers,
+    check_three_numbers,
 )
 
 
 def _three_positive(value: Any) -> Any:
-    value = three_numbers(value)
+    value = check_three_numbers(value)
     if min(value) <= 0:
         raise ValueError("must be three numbers above zero: a 1-sigma each for east, north, up")
     return value
@@ -153,8 +153,8 @@ class ImuTable(SensorTable):
     def R_bs(self) -> Array:
         """Body (RFU) from the file's axes, (3, 3); ValueError if they are invalid."""
         if self.forward is not None and self.up is not None:
-            return rotation_from_vectors(self.forward, self.up)
-        return rotation_from_letters(self.axes or "RFU")
+            return parse_axes_vectors(self.forward, self.up)
+        return parse_axes_letters(self.axes or "RFU")
 
 
 class GnssTable(SensorTable):
@@ -312,7 +312,7 @@ class RecordingFile(TomlTable):
         return self
 
 
-def rotation_from_letters(axes: str) -> Array:
+def parse_axes_letters(axes: str) -> Array:
     """R_bs of three letters stating the directions of the file's x, y, z; 'BRU': x backward, y right, z up."""
     if len(axes) != 3 or any(letter not in _LETTERS for letter in axes):
         raise ValueError("must be three capitals out of R/L, F/B, U/D, such as RFU, FLU or FRD")
@@ -326,7 +326,7 @@ def rotation_from_letters(axes: str) -> Array:
     return R_bs
 
 
-def rotation_from_vectors(forward: Sequence[float], up: Sequence[float]) -> Array:
+def parse_axes_vectors(forward: Sequence[float], up: Sequence[float]) -> Array:
     """R_bs of two vectors in the file's axes: up is kept, forward is made perpendicular to it."""
     f, u = np.asarray(forward, dtype=float), np.asarray(up, dtype=float)
     if np.linalg.norm(f) < 1e-6 or np.linalg.norm(u) < 1e-6:
@@ -340,7 +340,7 @@ def rotation_from_vectors(forward: Sequence[float], up: Sequence[float]) -> Arra
     return np.stack([np.cross(f, u), f, u])
 
 
-def recording_file() -> type[RecordingFile]:
+def build_model() -> type[RecordingFile]:
     """The model of recording.toml, with the tables of all known sensors."""
     tables: dict[str, Any] = {name: (sensor.table | None, None) for name, sensor in list_sensors().items()}
     return create_model("RecordingFile", __base__=RecordingFile, **tables)
@@ -355,11 +355,11 @@ def read_description(path: Path) -> RecordingFile:
         Naming the file and the key, and the nearest known key for an unknown one.
     """
     values, text = read_toml(path, RecordingError)
-    model = recording_file()
+    model = build_model()
     try:
         description = model.model_validate(values)
     except ValidationError as error:
-        raise RecordingError(complaint(path, error, model, text)) from None
+        raise RecordingError(describe_invalid(path, error, model, text)) from None
     try:
         _ = description.imu.R_bs
     except ValueError as error:

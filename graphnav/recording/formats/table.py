@@ -145,7 +145,7 @@ def read_header(path: Path) -> list[str]:
     return _read_header(path)[1]
 
 
-def first_rows(path: Path, count: int) -> list[list[str]]:
+def read_first_rows(path: Path, count: int) -> list[list[str]]:
     """The cells of the first rows of a .csv or .csv.gz, as text.
 
     Raises

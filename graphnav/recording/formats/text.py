@@ -14,7 +14,7 @@ from graphnav.core.rotation import Array
 Rows = list[tuple[int, str]]  # line number in the file (from 1) and text
 
 
-def text_lines(path: Path) -> list[str]:
+def split_lines(path: Path) -> list[str]:
     data = read_bytes(path)
     if b"\0" in data[:4096]:
         raise RecordingError(f"{path}: a binary file; expected text", key="file.binary")
@@ -24,7 +24,7 @@ def text_lines(path: Path) -> list[str]:
         raise RecordingError(f"{path}: not a text file (it is not UTF-8)", key="file.text") from None
 
 
-def number_table(
+def parse_table(
     path: Path, rows: list[tuple[int, str]], names: list[str], delimiter: str | None, wanted: set[str] | None = None
 ) -> Array:
     """Numbers (K, n) of text rows, NaN for blanks and for columns not `wanted`, which may hold words.

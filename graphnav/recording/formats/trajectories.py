@@ -30,7 +30,7 @@ from graphnav.core.timescales import WEEK
 from graphnav.core.trajectory import Trajectory
 from graphnav.recording.formats.repair import LATEST
 from graphnav.recording.formats.rtklib_solution import parse_solution
-from graphnav.recording.formats.text import number_table, text_lines
+from graphnav.recording.formats.text import parse_table, split_lines
 
 _MAX_COORDINATE = 1e8  # m, twice around the Earth, whatever the coordinates' origin
 _DEG = np.pi / 180.0
@@ -63,7 +63,7 @@ def read_trajectory(path: str | Path) -> Trajectory:
         If it cannot be read; the message names the file and, if there is one, the line and field.
     """
     path = Path(path)
-    lines = text_lines(path)
+    lines = split_lines(path)
     numbered = [(number, line) for number, line in enumerate(lines, 1) if line.strip()]
     rows = [(number, line) for number, line in numbered if line.lstrip()[0] not in "#%"]
     if not rows:
@@ -174,7 +174,7 @@ def _read_csv(path: Path, rows: list[tuple[int, str]]) -> Trajectory:
             f"{path}, line 1: no column '{missing[0]}'; found {', '.join(names)[:300]}", key="table.column"
         )
     wanted = {names[k] for name, k in columns.items() if name in _KNOWN_COLUMNS}
-    table = number_table(path, rows, names, ",", wanted)
+    table = parse_table(path, rows, names, ",", wanted)
 
     def take(*wanted: str, scale: float = 1.0) -> Array | None:
         if not any(name in columns for name in wanted):
@@ -200,7 +200,7 @@ def _read_csv(path: Path, rows: list[tuple[int, str]]) -> Trajectory:
 
 def _read_kf_gins(path: Path, rows: list[tuple[int, str]]) -> Trajectory:
     names = ["week", "sow", "lat", "lon", "h", "vn", "ve", "vd", "roll", "pitch", "yaw"]
-    table = number_table(path, rows, names, None)
+    table = parse_table(path, rows, names, None)
     t = table[:, 1] + WEEK * (table[:, 0] - table[0, 0])  # KF-GINS itself writes week 0
     position = np.column_stack([table[:, 2:4] * _DEG, table[:, 4]])
     v = np.column_stack([table[:, 6], table[:, 5], -table[:, 7]])
@@ -210,7 +210,7 @@ def _read_kf_gins(path: Path, rows: list[tuple[int, str]]) -> Trajectory:
 
 def _read_tum(path: Path, rows: list[tuple[int, str]]) -> Trajectory:
     names = ["t", "x", "y", "z", "qx", "qy", "qz", "qw"]
-    table = number_table(path, rows, names, None)
+    table = parse_table(path, rows, names, None)
     norm = np.linalg.norm(table[:, 4:8], axis=1)
     if (bad := ~(np.abs(norm - 1.0) <= 1e-2)).any():
         k = int(np.flatnonzero(bad)[0])

@@ -20,7 +20,7 @@ from graphnav.core.notes import format_count
 from graphnav.core.rotation import Array
 from graphnav.core.timescales import WEEK, utc_to_gps
 from graphnav.recording import Gnss, Imu, Odometer, fix_types
-from graphnav.recording.formats.registry import Log, first_bytes, log_format
+from graphnav.recording.formats.registry import Log, log_format, read_first_bytes
 from graphnav.recording.formats.repair import Remarks
 
 _SYNC = b"\xb5\x62"
@@ -44,7 +44,7 @@ class _Content:
 
 def recognises(path: Path) -> bool:
     """Whether there is a frame of one of the used messages in the first bytes, with or without NMEA between frames."""
-    head = first_bytes(path, 1 << 18)
+    head = read_first_bytes(path, 1 << 18)
     return any(_SYNC + bytes(kind) in head for kind in (_PVT, _MEAS, _RAW))
 
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from graphnav.core.progress import tell
 from graphnav.core.rotation import Array
-from graphnav.core.timescales import clock_words
+from graphnav.core.timescales import format_clock
 from graphnav.recording import ImuNoise, Odometer, Recording
 from graphnav.recording.formats.registry import Log
 from graphnav.recording.formats.schema import NOISE_UNITS, WHEELS
@@ -70,7 +70,7 @@ def write_folder(recording: Recording, folder: str | Path, notes: Sequence[str] 
     return write_recording(log, Path(folder))
 
 
-def degrees(angle: Array) -> Array:
+def convert_to_degrees(angle: Array) -> Array:
     """Degrees that, times pi/180, give the radians bit for bit if such exist.
 
     They do where the radians were converted from degrees; those with the fewest digits are chosen. Otherwise the result
@@ -103,7 +103,7 @@ def _write_gnss(log: Log) -> _File | None:
     if log.gnss is None:
         return None
     gnss = log.gnss
-    columns = [gnss.t, *degrees(gnss.llh[:, :2]).T, gnss.llh[:, 2], *gnss.sd.T]
+    columns = [gnss.t, *convert_to_degrees(gnss.llh[:, :2]).T, gnss.llh[:, 2], *gnss.sd.T]
     header = ["t", "lat", "lon", "h", "sd_e", "sd_n", "sd_u"]
     if gnss.v is not None:
         columns += [*gnss.v.T]
@@ -136,7 +136,7 @@ def _write_series(series: Series) -> _File:
     for column in series.sensor.columns:
         values, size = series[column.name], next(iter(column.units.values()))
         if np.isfinite(values).any():
-            columns.append(degrees(values) if size == _DEG else values / size)
+            columns.append(convert_to_degrees(values) if size == _DEG else values / size)
             header.append(column.name)
     return _File(f"{series.sensor.name}.csv.gz", header, columns)
 
@@ -148,14 +148,14 @@ def _write_truth(log: Log) -> _File | None:
     header, columns = ["t"], [truth.t]
     if truth.llh is not None:
         header += ["lat", "lon", "h"]
-        columns += [*degrees(truth.llh[:, :2]).T, truth.llh[:, 2]]
+        columns += [*convert_to_degrees(truth.llh[:, :2]).T, truth.llh[:, 2]]
     elif truth.xyz is not None:
         header += ["x", "y", "z"][: truth.xyz.shape[1]]
         columns += [*truth.xyz.T]
     for names, values in (("ve vn vu", truth.v), ("roll pitch heading", truth.rph)):
         if values is not None:
             header += names.split()
-            columns += [*(values if names[0] == "v" else degrees(values)).T]
+            columns += [*(values if names[0] == "v" else convert_to_degrees(values)).T]
     return _File("truth.csv.gz", header, columns)
 
 
@@ -181,7 +181,7 @@ def _write_toml(log: Log) -> str:
         f'platform = "{log.platform}"',
     ]
     if log.gps_zero is not None:
-        lines.append(f'clock = "{clock_words(log.gps_zero)}"'.ljust(31) + "# what t counts from")
+        lines.append(f'clock = "{format_clock(log.gps_zero)}"'.ljust(31) + "# what t counts from")
     lines += ["", "[imu]"]
     if log.imu is None:
         lines += ['file = "imu.csv"               # missing: the log holds no IMU. t,gx,gy,gz,ax,ay,az; s, rad/s, m/s2']

@@ -40,7 +40,7 @@ def round_recording(recording: Recording) -> Recording:
         v, rph = truth.v, truth.rph
         truth = replace(
             truth, t=_cut(truth.t, _T), llh=_cut_llh(truth.llh), v=None if v is None else _cut(v, _M_S),
-            rph=None if rph is None else _to_degrees(rph) * ANGLE["deg"],
+            rph=None if rph is None else _convert_to_degrees(rph) * ANGLE["deg"],
         )  # fmt: skip
     return replace(recording, imu=imu, gnss=gnss, odometer=odometer, truth=truth)
 
@@ -53,7 +53,7 @@ def _cut_llh(llh: Array) -> Array:
     return np.column_stack([np.round(llh[:, :2] / ANGLE["deg"], _LAT_LON) * ANGLE["deg"], np.round(llh[:, 2], _M)])
 
 
-def _to_degrees(rph: Array) -> Array:
+def _convert_to_degrees(rph: Array) -> Array:
     """Roll and pitch unchanged, heading from 0 to below 360."""
     degrees = _cut(rph / ANGLE["deg"], _DEG)
     degrees[:, 2] = _cut(np.mod(degrees[:, 2], 360.0), _DEG) % 360.0

@@ -2,25 +2,25 @@
 
 from __future__ import annotations
 
-from graphnav.recording.odometer.faults import Faults, faults
+from graphnav.recording.odometer.faults import Faults, find_faults
 from graphnav.recording.odometer.mean import (
     MeanSpeed,
     ReadingStatistics,
+    estimate_reading_sigma,
     find_gaps,
     find_longest_step,
     find_pulse_length,
     find_quantum,
-    reading_sigma,
 )
 
 __all__ = [
     "Faults",
     "MeanSpeed",
     "ReadingStatistics",
-    "faults",
+    "estimate_reading_sigma",
+    "find_faults",
     "find_gaps",
     "find_longest_step",
     "find_pulse_length",
     "find_quantum",
-    "reading_sigma",
 ]

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from graphnav.core.findings import period_of, runs_of
+from graphnav.core.findings import compute_period, find_runs
 from graphnav.core.rotation import Array
 from graphnav.core.running import run_median
 from graphnav.recording import Imu, Odometer
@@ -55,7 +55,7 @@ class Faults:
     lag: float | None = None  # s, delay of the odometer as far as the IMU shows it
 
 
-def faults(
+def find_faults(
     odometer: Odometer, imu: Imu | None = None, figures: ReadingStatistics | None = None, lag: float | None = None
 ) -> Faults:
     """Spans of missing or wrong readings, by the method above, in the odometer's own time.
@@ -137,7 +137,7 @@ def _find_breaks(
     """Pairs of readings between which x changes by more than is possible, the closest ones that show it, ordered."""
     t, v = odometer.t, odometer.speed
     error = figures.step + 6.0 * figures.sigma
-    period = period_of(t)
+    period = compute_period(t)
     part = np.r_[0, np.cumsum(np.diff(t) > figures.longest)]
     found: list[tuple[int, int]] = []
     for window in _WINDOWS:
@@ -188,7 +188,7 @@ def _find_wrong(
 ) -> list[tuple[float, float, str]]:
     t, v = odometer.t, odometer.speed
     breaks = _find_breaks(odometer, motion, figures)
-    equal = [(a - 1, b - 1) for a, b in runs_of(np.r_[False, v[1:] == v[:-1]])]  # first and last of equal readings
+    equal = [(a - 1, b - 1) for a, b in find_runs(np.r_[False, v[1:] == v[:-1]])]  # first and last of equal readings
     stays = [(a, b) for a, b in equal if b - a >= 4 and t[b] - t[a] >= _STAYS]
     bad: list[tuple[int, int, str]] = []  # first wrong reading, first right one
     bad += _find_islands(t, v, motion, breaks, stays, _SPIKE)
@@ -283,7 +283,7 @@ def _find_moving_zeros(
     """Zeros while the vehicle turns, or vibrates as in motion."""
     t, v = odometer.t, odometer.speed
     up = _find_axes(imu)[1]
-    n = max(2, round(1.0 / period_of(imu.t)))
+    n = max(2, round(1.0 / compute_period(imu.t)))
     count = len(imu.t) // n
     gyro, accel = (x[: count * n].reshape(count, n, 3) for x in (imu.gyro, imu.accel))
     second = imu.t[: count * n].reshape(count, n)[:, [0, -1]]
@@ -296,7 +296,7 @@ def _find_moving_zeros(
     if fast.sum() >= 20:
         shakes = [np.linalg.norm(x.std(axis=1), axis=-1) for x in (gyro, accel)]
         like = np.all([x > np.median(x[fast]) for x in shakes], axis=0) & rest
-        for a, b in runs_of(like):
+        for a, b in find_runs(like):
             shaken[a:b] = b - a >= _SHAKEN
     out = []
     for a, b in stays:
@@ -319,5 +319,5 @@ def _merge(t: Array, bad: list[tuple[int, int, str]]) -> list[tuple[float, float
             out[-1] = (first, max(last, end), *((reason, end - begin) if end - begin > size else (why, size)))
         else:
             out.append((begin, end, reason, end - begin))
-    beyond = t[-1] + period_of(t)
+    beyond = t[-1] + compute_period(t)
     return [(float(t[a]), float(t[b]) if b < len(t) else beyond, why) for a, b, why, _ in out]

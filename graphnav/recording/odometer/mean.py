@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from graphnav.core.findings import period_of
+from graphnav.core.findings import compute_period
 from graphnav.core.rotation import Array
 from graphnav.recording import Odometer
 
@@ -49,7 +49,7 @@ def find_quantum(speed: Array) -> float:
     return 0.0
 
 
-def reading_sigma(odometer: Odometer, step: float | None = None) -> float:
+def estimate_reading_sigma(odometer: Odometer, step: float | None = None) -> float:
     """1-sigma of one reading, m/s: as stated, else its scatter, at least that of its resolution.
 
     The scatter is that of third differences in motion, which remove any motion that is smooth over four readings: the
@@ -62,7 +62,7 @@ def reading_sigma(odometer: Odometer, step: float | None = None) -> float:
     if len(t) < 10:
         return rounding
     steps = np.diff(t)
-    even = np.lib.stride_tricks.sliding_window_view(steps < 2.5 * period_of(t), 3).all(axis=1)
+    even = np.lib.stride_tricks.sliding_window_view(steps < 2.5 * compute_period(t), 3).all(axis=1)
     moving = (np.lib.stride_tricks.sliding_window_view(speed, 4) != 0.0).all(axis=1)
     third = np.abs(np.diff(speed, 3))[even & moving]
     scatter = _MAD * float(np.median(third)) / np.sqrt(20.0) if len(third) >= 10 else 0.0
@@ -73,13 +73,13 @@ def find_pulse_length(odometer: Odometer, step: float | None = None) -> float:
     """Metres per pulse where the speeds are pulses counted from row to row, else 0.
 
     Rounding errors of such readings telescope: the error of the mean of n of them is 1/n of that of one, and 1/sqrt(n)
-    if they were independent. Third differences show which, as in `reading_sigma`.
+    if they were independent. Third differences show which, as in `estimate_reading_sigma`.
     """
     t, speed = odometer.t, odometer.speed
     step = find_quantum(speed) if step is None else step
     if odometer.counted is not None or step == 0.0:
         return odometer.pulse
-    even = np.r_[True, np.diff(t) < 1.5 * period_of(t)] & (speed != 0.0)
+    even = np.r_[True, np.diff(t) < 1.5 * compute_period(t)] & (speed != 0.0)
 
     def scatter(n: int) -> float:
         rows = len(t) // n * n
@@ -94,18 +94,18 @@ def find_pulse_length(odometer: Odometer, step: float | None = None) -> float:
     if not step < one < np.inf:
         return 0.0
     telescopes = any(scatter(n) < one * n**-0.75 for n in (2, 4))  # half-way between
-    return step * period_of(t) if telescopes else 0.0
+    return step * compute_period(t) if telescopes else 0.0
 
 
 def find_longest_step(t: Array) -> float:
     """The longest step between stamps that is not a gap, s: jitter and a dropped row or two are common."""
-    return 3.5 * max(period_of(t), float(np.percentile(np.diff(t), 95.0))) if len(t) > 1 else 0.0
+    return 3.5 * max(compute_period(t), float(np.percentile(np.diff(t), 95.0))) if len(t) > 1 else 0.0
 
 
 def find_gaps(t: Array, longest: float | None = None) -> Spans:
     """Spans without readings, from where the first one is missing; `longest` as by `find_longest_step`, if known."""
     k = np.flatnonzero(np.diff(t) > (find_longest_step(t) if longest is None else longest))
-    return np.stack([t[k] + period_of(t), t[k + 1]], -1).reshape(-1, 2)
+    return np.stack([t[k] + compute_period(t), t[k + 1]], -1).reshape(-1, 2)
 
 
 @dataclass(frozen=True)
@@ -113,7 +113,7 @@ class ReadingStatistics:
     """Statistics of a single reading, estimated from many."""
 
     step: float  # m/s, `quantum`
-    sigma: float  # m/s, `reading_sigma`
+    sigma: float  # m/s, `estimate_reading_sigma`
     pulse: float  # m, `counts`
     longest: float  # s, `longest_step`
 
@@ -122,7 +122,10 @@ class ReadingStatistics:
         """Estimate them from these readings."""
         step = find_quantum(odometer.speed)
         return cls(
-            step, reading_sigma(odometer, step), find_pulse_length(odometer, step), find_longest_step(odometer.t)
+            step,
+            estimate_reading_sigma(odometer, step),
+            find_pulse_length(odometer, step),
+            find_longest_step(odometer.t),
         )
 
     def sigmas(self, odometer: Odometer) -> tuple[float, float, float]:

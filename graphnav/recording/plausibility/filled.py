@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from graphnav.core.findings import period_of, runs_of
+from graphnav.core.findings import compute_period, find_runs
 from graphnav.core.rotation import Array
 from graphnav.recording.plausibility.readings import NOISY, RARE
 
@@ -52,7 +52,7 @@ def find_filled(t: Array, readings: Iterable[Array]) -> tuple[NDArray[np.bool_],
         For further rows; None for less than ten seconds, or rows of a slower sensor.
     """
     filled = np.zeros(len(t), dtype=bool)
-    n = max(5, round(1.0 / period_of(t))) if len(t) > 1 else 5
+    n = max(5, round(1.0 / compute_period(t))) if len(t) > 1 else 5
     if len(t) < 10 * n:
         return filled, None
     share = np.diff(t)[:-1] / (t[2:] - t[:-2])  # of the way from one neighbour to the other
@@ -71,7 +71,7 @@ def find_filled(t: Array, readings: Iterable[Array]) -> tuple[NDArray[np.bool_],
             log_chance += float(np.log(min(2.0 * q / (np.sqrt(2.0 * np.pi) * sigma), 1.0)))
     if np.median(on_line[: len(on_line) // n * n].reshape(-1, n).sum(axis=1)) > 0.0:
         return filled, None
-    for a, b in runs_of(on_line):
+    for a, b in find_runs(on_line):
         if (b - a) * log_chance < np.log(RARE / len(t)):
             # the end of a line is measured, a repetition is not
             filled[a + 1 : b + 1 + repeats[a:b].all()] = True

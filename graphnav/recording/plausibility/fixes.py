@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphnav.core.earth import LocalFrame
-from graphnav.core.findings import Finding, runs_of
+from graphnav.core.findings import Finding, find_runs
 from graphnav.core.notes import format_count
 from graphnav.core.rotation import Array
 from graphnav.core.running import run_mean, run_median
@@ -141,7 +141,9 @@ def find_frozen_heights(gnss: Gnss, p: Array) -> list[tuple[int, int]]:
     distance = np.r_[0.0, np.cumsum(np.nan_to_num(np.hypot(*np.diff(p[:, :2], axis=0).T)))]
     lasting, driven = _FROZEN
     return [
-        (a, b + 1) for a, b in runs_of(same) if gnss.t[b] - gnss.t[a] >= lasting and distance[b] - distance[a] >= driven
+        (a, b + 1)
+        for a, b in find_runs(same)
+        if gnss.t[b] - gnss.t[a] >= lasting and distance[b] - distance[a] >= driven
     ]
 
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from graphnav.core.findings import Finding, period_of, runs_of
+from graphnav.core.findings import Finding, compute_period, find_runs
 from graphnav.core.notes import format_count
 from graphnav.core.running import run_median
 from graphnav.recording import Odometer, Recording, take_rows
@@ -40,7 +40,7 @@ def screen(recording: Recording, track: Track | None) -> tuple[Recording, list[F
 
 def build_odometer_track(odometer: Odometer) -> Track | None:
     """The odometer's speed in the form of a GNSS track, for recordings without GNSS."""
-    every = max(1, round(1.0 / (_SPEED_RATE * period_of(odometer.t)))) if len(odometer.t) > 1 else 1
+    every = max(1, round(1.0 / (_SPEED_RATE * compute_period(odometer.t)))) if len(odometer.t) > 1 else 1
     t, speed = odometer.t[::every], odometer.speed[::every]
     if len(t) < 5:
         return None
@@ -84,7 +84,7 @@ def _find_clock_jump(odometer: Odometer, track: Track | None, start: float) -> _
     none = np.zeros(len(t), dtype=bool)
     if track is None:
         return none, None
-    period = period_of(t)
+    period = compute_period(t)
     step = np.diff(t)
     for k in np.flatnonzero(step > max(_CLOCK_STEP, 10.0 * period))[:20]:
         jump = float(step[k] - period)
@@ -111,7 +111,7 @@ def _find_other_scale(odometer: Odometer, track: Track | None, start: float) -> 
     bad = np.zeros(len(t), dtype=bool)
     if track is None:
         return bad, None
-    half = np.maximum(0.5 * track.width, period_of(t))
+    half = np.maximum(0.5 * track.width, compute_period(t))
     meant = np.r_[0.0, np.cumsum(0.5 * (odometer.speed[1:] + odometer.speed[:-1]) * np.diff(t))]
     read = np.abs(np.interp(track.t + half, t, meant) - np.interp(track.t - half, t, meant)) / (2.0 * half)
     k = np.clip(np.searchsorted(t, track.t), 1, len(t) - 1)
@@ -130,7 +130,7 @@ def _find_other_scale(odometer: Odometer, track: Track | None, start: float) -> 
     # two tyres, as large and as small as possible
     wrong = np.abs(typical - own) > max(np.log((1.0 + _RADIUS) / (1.0 - _RADIUS)), 6.0 * noise)
     spans: list[tuple[float, float, float]] = []
-    for a, b in runs_of(wrong):
+    for a, b in find_runs(wrong):
         begin, end = track.t[at[a]], track.t[at[b - 1]]
         factor = float(np.median(off[a:b]))
         # a scale is one factor; fixes among high buildings make speeds of all magnitudes

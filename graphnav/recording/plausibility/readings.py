@@ -14,7 +14,7 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import NDArray
 
-from graphnav.core.findings import period_of
+from graphnav.core.findings import compute_period
 from graphnav.core.rotation import Array
 
 TAIL = 100  # excesses from which the decay is estimated: to a tenth
@@ -71,7 +71,7 @@ def find_contradicted(t: Array, readings: Iterable[Array]) -> NDArray[np.bool_]:
     bad = np.zeros(len(t), dtype=bool)
     if len(t) < TAIL + 3:
         return bad
-    near = np.diff(t) < HOLE * period_of(t)
+    near = np.diff(t) < HOLE * compute_period(t)
     between = near[:-1] & near[1:]
     for x in readings:
         excess = measure_excess(x) * between

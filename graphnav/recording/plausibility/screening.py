@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from graphnav.core.earth import STANDARD_GRAVITY, gravity
 from graphnav.core.errors import RecordingError
-from graphnav.core.findings import Finding, period_of, runs_of
+from graphnav.core.findings import Finding, compute_period, find_runs
 from graphnav.core.notes import Note, format_count
 from graphnav.core.rotation import Array
 from graphnav.recording import Imu, Recording, take_rows
@@ -283,7 +283,7 @@ def drop_filled(imu: Imu, start: float) -> tuple[Imu, list[Finding]]:
     filled, _ = find_filled(imu.t, _list_axes(imu, True))
     if not filled.any():
         return imu, []
-    runs = runs_of(filled)
+    runs = find_runs(filled)
     longest, first = max((float(imu.t[b - 1] - imu.t[a]), float(imu.t[a])) for a, b in runs)
     return take_rows(imu, ~filled), [
         Finding(
@@ -323,12 +323,12 @@ def _list_rows(bad: NDArray[np.bool_]) -> str:
 def check_dead_axes(recording: Recording) -> Iterator[Finding]:
     """An axis that repeats one value while the others of its sensor change."""
     imu = recording.imu
-    period = period_of(imu.t)
+    period = compute_period(imu.t)
     whole = recording.duration
     for name, values in (("gyro", imu.gyro), ("accelerometer", imu.accel)):
         for axis in range(3):
             x, same = _compare_repeats(values @ imu.R_bs[:, axis])
-            a, b = max(runs_of(same), key=lambda run: run[1] - run[0], default=(0, 0))
+            a, b = max(find_runs(same), key=lambda run: run[1] - run[0], default=(0, 0))
             lasts = float(imu.t[b] - imu.t[a])
             if lasts < min(_DEAD, 0.9 * whole) or b - a < _DEAD:
                 continue

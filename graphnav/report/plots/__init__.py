@@ -3,13 +3,13 @@
 Times are seconds from the recording's start, as on the command line.
 """
 
-from graphnav.report.plots.colours import PALETTE, css_colours, variable
-from graphnav.report.plots.consistency import nees, residuals, timeline
-from graphnav.report.plots.detections import detections
-from graphnav.report.plots.figure import SHADES, TIME, Figure, Panel, Spans, limits
-from graphnav.report.plots.paths import FIX_COLOURS, DrawnFixes, profile, trajectory
-from graphnav.report.plots.series import Curve, Shades, bands, sigmas, span_zoom
-from graphnav.report.plots.thinning import BINS, choose_rows, thin, with_breaks
+from graphnav.report.plots.colours import PALETTE, format_css, name_variable
+from graphnav.report.plots.consistency import plot_nees, plot_residuals, plot_timeline
+from graphnav.report.plots.detections import plot_detections
+from graphnav.report.plots.figure import SHADES, TIME, Figure, Panel, Spans, find_limits
+from graphnav.report.plots.paths import FIX_COLOURS, DrawnFixes, plot_profile, plot_trajectory
+from graphnav.report.plots.series import Curve, Shades, plot_bands, plot_sigmas, plot_span_zoom
+from graphnav.report.plots.thinning import BINS, choose_rows, insert_breaks, thin
 
 __all__ = [
     "BINS",
@@ -23,19 +23,19 @@ __all__ = [
     "Panel",
     "Shades",
     "Spans",
-    "bands",
     "choose_rows",
-    "css_colours",
-    "detections",
-    "limits",
-    "nees",
-    "profile",
-    "residuals",
-    "sigmas",
-    "span_zoom",
+    "find_limits",
+    "format_css",
+    "insert_breaks",
+    "name_variable",
+    "plot_bands",
+    "plot_detections",
+    "plot_nees",
+    "plot_profile",
+    "plot_residuals",
+    "plot_sigmas",
+    "plot_span_zoom",
+    "plot_timeline",
+    "plot_trajectory",
     "thin",
-    "timeline",
-    "trajectory",
-    "variable",
-    "with_breaks",
 ]  # fmt: skip

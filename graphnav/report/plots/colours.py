@@ -42,13 +42,13 @@ PALETTE = {
 _OTHERS = [name for name in PALETTE if name.startswith("other")]
 
 
-def variable(name: str) -> str:
+def name_variable(name: str) -> str:
     """The CSS variable with the colour of a solver or another drawn object."""
     return f"--{name}" if name in PALETTE else "--of-" + re.sub(r"[^\w-]", lambda found: f"_{ord(found[0])}", name)
 
 
-def css_colours(others: Sequence[str] = ()) -> str:
+def format_css(others: Sequence[str] = ()) -> str:
     """CSS variables of the palette, for light pages and, where preferred, dark ones, and of other programs."""
     light, dark = ("".join(f"--{name}:{pair[i]};" for name, pair in PALETTE.items()) for i in (0, 1))
-    light += "".join(f"{variable(name)}:var(--{_OTHERS[k % len(_OTHERS)]});" for k, name in enumerate(others))
+    light += "".join(f"{name_variable(name)}:var(--{_OTHERS[k % len(_OTHERS)]});" for k, name in enumerate(others))
     return f":root{{{light}}}\n@media screen and (prefers-color-scheme: dark){{:root{{{dark}}}}}"

@@ -10,13 +10,13 @@ import numpy as np
 from graphnav.core.rotation import Array
 from graphnav.core.sample_size import chi_square_quantile
 from graphnav.estimation.solution import ConstraintRecord
-from graphnav.report.plots.figure import Figure, Panel, limits
+from graphnav.report.plots.figure import Figure, Panel, find_limits
 from graphnav.report.plots.series import Curve, Shades
 
 _CHI2 = "99 % of chi-square"
 
 
-def residuals(record: ConstraintRecord, start: float, end: float, solver: str = "", *, spans: Shades) -> Figure:
+def plot_residuals(record: ConstraintRecord, start: float, end: float, solver: str = "", *, spans: Shades) -> Figure:
     """Whitened components over time between +-3, rejected ones marked; below, the NIS.
 
     Parameters
@@ -44,16 +44,16 @@ def residuals(record: ConstraintRecord, start: float, end: float, solver: str = 
     for k, panel in enumerate(components):
         panel.shade(spans)
         # values beyond the panel are drawn at its edge, so that they are seen
-        _epochs(panel, t, np.clip(white[:, k], -0.98 * tops[k], 0.98 * tops[k]), record.weight, look)
+        _plot_epochs(panel, t, np.clip(white[:, k], -0.98 * tops[k], 0.98 * tops[k]), record.weight, look)
         panel.level(-3.0, dash=True)
         panel.level(3.0, dash=True)
     last.shade(spans)
     last.band(np.array([0.0, end]), np.full(2, lo), np.full(2, hi), "ink", _CHI2)
-    _epochs(last, t, np.clip(nis, 10.0**bottom, 10.0**top), record.weight, look)
+    _plot_epochs(last, t, np.clip(nis, 10.0**bottom, 10.0**top), record.weight, look)
     return figure
 
 
-def _epochs(panel: Panel, t: Array, y: Array, weight: Array, look: str) -> None:
+def _plot_epochs(panel: Panel, t: Array, y: Array, weight: Array, look: str) -> None:
     """Used, down-weighted and rejected epochs, each with its marker."""
     rejected = weight <= 1e-9
     reduced = ~rejected & (weight < 0.5)
@@ -65,7 +65,7 @@ def _epochs(panel: Panel, t: Array, y: Array, weight: Array, look: str) -> None:
         panel.dots(t[rejected], y[rejected], "alert", "rejected", 8.0, "x")
 
 
-def nees(
+def plot_nees(
     series: Mapping[str, Curve], names: Sequence[str], dofs: Sequence[int], end: float, *, spans: Shades
 ) -> Figure:
     """NEES per degree of freedom, one panel for each of `names`, with the middle 99 % of chi-square for one epoch.
@@ -81,7 +81,7 @@ def nees(
     ylims = []
     for k, (low, high) in enumerate(edges):
         values = [np.log10(np.maximum(v[:, k], 0.3 * low)) for v in scaled.values()]
-        ylims.append(limits([*values, np.log10([low, high])], always=[*values, np.log10([low, high])]))
+        ylims.append(find_limits([*values, np.log10([low, high])], always=[*values, np.log10([low, high])]))
     titles = [f"{name} NEES / {dof}" for name, dof in zip(names, dofs, strict=True)]
     figure = Figure(titles, (0.0, end), ylims, log=True)
     for k, panel in enumerate(figure.panels):
@@ -94,7 +94,7 @@ def nees(
     return figure
 
 
-def timeline(
+def plot_timeline(
     records: Mapping[str, ConstraintRecord], start: float, end: float, solver: str = "", *, spans: Shades
 ) -> Figure:
     """A row per constraint: when it was used, down-weighted and rejected; `end` of the time axis from `start`."""
@@ -105,5 +105,5 @@ def timeline(
     panel.shade(spans)
     for row, name in names.items():
         record = records[name]
-        _epochs(panel, record.t - start, np.full(len(record.t), row), record.weight, solver or "batch")
+        _plot_epochs(panel, record.t - start, np.full(len(record.t), row), record.weight, solver or "batch")
     return figure

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from graphnav.core.rotation import Array
 from graphnav.detectors.base import Detection
 from graphnav.recording import Imu, Recording
-from graphnav.report.plots.figure import Figure, Panel, limits
+from graphnav.report.plots.figure import Figure, Panel, find_limits
 from graphnav.report.plots.thinning import BINS, thin
 
 _DYNAMIC = 2.5  # decades of amplitude in the spectrogram
@@ -24,7 +24,7 @@ _SHOWN_STATISTICS = (
 _MAX_STATISTICS = 4
 
 
-def detections(recording: Recording, found: Sequence[Detection]) -> Figure:
+def plot_detections(recording: Recording, found: Sequence[Detection]) -> Figure:
     """Stationary intervals tinted over the signals and statistics they come from; times from the recording's start.
 
     Parameters
@@ -39,17 +39,17 @@ def detections(recording: Recording, found: Sequence[Detection]) -> Figure:
             by_name.setdefault(d.name, []).append(d)
     if len(by_name) > _MAX_STATISTICS:
         by_name = {name: every for name, every in by_name.items() if name in _SHOWN_STATISTICS}
-    shown = drawn_rows(imu)
+    shown = select_drawn_rows(imu)
     t = imu.t[shown] - t0
-    force, rate = _norm(imu.accel[shown]), np.degrees(_norm(imu.gyro[shown]))
-    speeds = _speeds(recording)
+    force, rate = _compute_norms(imu.accel[shown]), np.degrees(_compute_norms(imu.gyro[shown]))
+    speeds = _collect_speeds(recording)
     rows: list[tuple[str, str, tuple[float, float], bool]] = [
-        ("size of the specific force [m/s²]", "m/s²", limits([force]), False),
-        ("size of the angular rate [deg/s]", "deg/s", limits([rate]), False),
+        ("size of the specific force [m/s²]", "m/s²", find_limits([force]), False),
+        ("size of the angular rate [deg/s]", "deg/s", find_limits([rate]), False),
     ]
     if speeds:
-        rows.append(("speed [m/s]", "m/s", limits([y for _, _, y, _ in speeds]), False))
-    rows += [(f"{name}: statistic", "", _statistic_limits(every), True) for name, every in by_name.items()]
+        rows.append(("speed [m/s]", "m/s", find_limits([y for _, _, y, _ in speeds]), False))
+    rows += [(f"{name}: statistic", "", _find_limits(every), True) for name, every in by_name.items()]
     pictured = [d for d in found if "spectrogram" in d.details and len(d.details["spectrogram_t"]) > 1]
     if pictured:
         f = pictured[0].details["spectrogram_frequency"]
@@ -72,24 +72,24 @@ def detections(recording: Recording, found: Sequence[Detection]) -> Figure:
     for every in by_name.values():
         panel = next(panels)
         for d in every:
-            _statistic(panel, d, t0)
+            _plot_statistic(panel, d, t0)
     if pictured:
-        _spectrogram(next(panels), pictured, t0)
+        _plot_spectrogram(next(panels), pictured, t0)
     return figure
 
 
-def drawn_rows(imu: Imu) -> NDArray[np.intp]:
+def select_drawn_rows(imu: Imu) -> NDArray[np.intp]:
     """The rows of an IMU that the figure shows, independent of other rows."""
-    return np.union1d(*(thin(imu.t, _norm(x)) for x in (imu.accel, imu.gyro)))
+    return np.union1d(*(thin(imu.t, _compute_norms(x)) for x in (imu.accel, imu.gyro)))
 
 
-def _norm(x: Array) -> Array:
+def _compute_norms(x: Array) -> Array:
     """(N,) lengths of vectors (N, 3), computed without their squares in memory: for a day these take 400 MB."""
     squared = np.einsum("ij,ij->i", x, x)
     return np.sqrt(squared, out=squared)
 
 
-def _speeds(recording: Recording) -> list[tuple[str, Array, Array, str]]:
+def _collect_speeds(recording: Recording) -> list[tuple[str, Array, Array, str]]:
     """(name, s from the start, m/s, colour) of every sensor that measures a speed."""
     out = []
     gnss, odometer = recording.gnss, recording.odometer
@@ -100,18 +100,18 @@ def _speeds(recording: Recording) -> list[tuple[str, Array, Array, str]]:
     return out
 
 
-def _statistic_limits(every: Sequence[Detection]) -> tuple[float, float]:
+def _find_limits(every: Sequence[Detection]) -> tuple[float, float]:
     values = [np.log10(np.maximum(v, _FLOOR)) for d in every for v in (d.statistic, np.atleast_1d(d.threshold))]
-    return limits(values, floor=0.5, always=values[1::2])
+    return find_limits(values, floor=0.5, always=values[1::2])
 
 
-def _statistic(panel: Panel, d: Detection, t0: float) -> None:
+def _plot_statistic(panel: Panel, d: Detection, t0: float) -> None:
     panel.line(d.t - t0, np.maximum(d.statistic, _FLOOR), "batch", "statistic", width=1.1)
     threshold = np.broadcast_to(d.threshold, d.t.shape)
     panel.line(d.t - t0, threshold, "alert", "threshold: below it stands", dash=True)
 
 
-def _spectrogram(panel: Panel, pictured: Sequence[Detection], t0: float) -> None:
+def _plot_spectrogram(panel: Panel, pictured: Sequence[Detection], t0: float) -> None:
     for d in pictured:
         t, f = d.details["spectrogram_t"] - t0, d.details["spectrogram_frequency"]
         level = np.log10(np.maximum(d.details["spectrogram"], 1e-9)).T

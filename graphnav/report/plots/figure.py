@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from graphnav.core.rotation import Array
-from graphnav.report.plots.colours import variable
-from graphnav.report.plots.thinning import BINS, choose_rows, thin, with_breaks
+from graphnav.report.plots.colours import name_variable
+from graphnav.report.plots.thinning import BINS, choose_rows, insert_breaks, thin
 
 SHADES = {"withheld": "withheld", "no GNSS": "outage", "excluded": "alert", "stands": "stop"}  # span -> colour
 TIME = "time from the start [s]"
@@ -28,7 +28,7 @@ class Panel:
 
     def __init__(self, figure: Figure, k: int, unit: str, xlim: tuple[float, float], ylim: tuple[float, float]) -> None:
         self.figure, self.unit, self.xlim, self.ylim = figure, unit, xlim, ylim
-        self.axes = {"xaxis": figure.x_of(k), "yaxis": _axis("y", k)}
+        self.axes = {"xaxis": figure.x_of(k), "yaxis": _make_axis("y", k)}
 
     def _add(self, label: str, trace: dict[str, Any], quiet: bool = False, at: str = "", path: bool = False) -> None:
         hover = {"hoverinfo": "skip"}
@@ -46,9 +46,13 @@ class Panel:
         dash: bool = False, quiet: bool = False,
     ) -> None:  # fmt: skip
         """A line over ascending x, interrupted where y is not finite or x has a gap."""
-        x, y = with_breaks(x, thin(x, y), y)
-        look = {"color": colour(name), "width": width, "dash": "dash" if dash else "solid"}
-        self._add(label, {"mode": "lines", "x": numbers(x), "y": numbers(y), "line": look, "opacity": alpha}, quiet)
+        x, y = insert_breaks(x, thin(x, y), y)
+        look = {"color": find_colour(name), "width": width, "dash": "dash" if dash else "solid"}
+        self._add(
+            label,
+            {"mode": "lines", "x": encode_numbers(x), "y": encode_numbers(y), "line": look, "opacity": alpha},
+            quiet,
+        )
 
     def level(self, y: float, **kw: Any) -> None:
         """A horizontal line at y."""
@@ -59,9 +63,9 @@ class Panel:
     ) -> None:
         """A line through places (N, 2), reached at t."""
         rows = choose_rows(*xy.T)
-        at: dict[str, Any] = {} if t is None else {"customdata": numbers(t[rows])}
-        look = {"color": colour(name), "width": width}
-        places = {"x": numbers(xy[rows, 0]), "y": numbers(xy[rows, 1])}
+        at: dict[str, Any] = {} if t is None else {"customdata": encode_numbers(t[rows])}
+        look = {"color": find_colour(name), "width": width}
+        places = {"x": encode_numbers(xy[rows, 0]), "y": encode_numbers(xy[rows, 1])}
         words = "<br>at %{customdata:.2f} s" if at else ""
         self._add(label, {"mode": "lines", "line": look, "opacity": alpha, **places, **at}, t is None, words, path=True)
 
@@ -71,26 +75,26 @@ class Panel:
     ) -> None:  # fmt: skip
         """A marker (o, x, s, ^, D) at every row."""
         rows = choose_rows(x, y) if path else thin(x, y)
-        look = {"color": colour(name), "size": size, "symbol": _SYMBOLS[marker], "opacity": alpha}
+        look = {"color": find_colour(name), "size": size, "symbol": _SYMBOLS[marker], "opacity": alpha}
         if marker == "x":
-            look["line"] = {"color": colour(name), "width": 2}
-        at: dict[str, Any] = {} if t is None else {"customdata": numbers(t[rows])}
+            look["line"] = {"color": find_colour(name), "width": 2}
+        at: dict[str, Any] = {} if t is None else {"customdata": encode_numbers(t[rows])}
         words = "<br>at %{customdata:.2f} s" if at else ""
-        places = {"x": numbers(x[rows]), "y": numbers(y[rows])}
+        places = {"x": encode_numbers(x[rows]), "y": encode_numbers(y[rows])}
         self._add(label, {"mode": "markers", "marker": look, **places, **at}, at=words, path=path)
 
     def band(self, x: Array, low: Array, high: Array, name: str, label: str = "", alpha: float = 0.18) -> None:
         """A tinted area between two lines, interrupted where x has a gap."""
-        x, low, high = with_breaks(x, thin(x, high - low, BINS // 2), low, high)
+        x, low, high = insert_breaks(x, thin(x, high - low, BINS // 2), low, high)
         parts = []
         for run in np.ma.clump_unmasked(np.ma.masked_invalid(low + high)):
             outline = np.concatenate([high[run], low[run][::-1]])
             parts += [[np.concatenate([x[run], x[run][::-1]]), outline], np.full((2, 1), np.nan)]
         if parts:
             both = np.concatenate([np.asarray(p) for p in parts[:-1]], axis=1)
-            tint = f"{colour(name)}{round(255 * alpha):02x}"
+            tint = f"{find_colour(name)}{round(255 * alpha):02x}"
             look = {"mode": "lines", "line": {"width": 0, "color": tint}, "fill": "toself", "fillcolor": tint}
-            self._add(label, {"x": numbers(both[0]), "y": numbers(both[1]), **look}, quiet=True)
+            self._add(label, {"x": encode_numbers(both[0]), "y": encode_numbers(both[1]), **look}, quiet=True)
 
     def shade(self, spans: Mapping[str, Spans]) -> None:
         """Tint whole spans of x, by kind (a key of `SHADES`)."""
@@ -98,11 +102,11 @@ class Panel:
             cut = [(max(a, self.xlim[0]), min(b, self.xlim[1])) for a, b in every]
             self.figure.shapes += [
                 {"type": "rect", "xref": self.axes["xaxis"], "yref": f"{self.axes['yaxis']} domain", "x0": a, "x1": b,
-                 "y0": 0, "y1": 1, "fillcolor": f"{colour(SHADES[what])}2b", "line": {"width": 0}, "layer": "below"}
+                 "y0": 0, "y1": 1, "fillcolor": f"{find_colour(SHADES[what])}2b", "line": {"width": 0}, "layer": "below"}
                 for a, b in cut if b > a
             ]  # fmt: skip
             if any(b > a for a, b in cut) and what not in self.figure.labels:
-                look = {"symbol": "square", "size": 11, "color": colour(SHADES[what]), "opacity": 0.4}
+                look = {"symbol": "square", "size": 11, "color": find_colour(SHADES[what]), "opacity": 0.4}
                 self._add(what, {"mode": "markers", "marker": look, "x": [None], "y": [None]}, quiet=True)
 
     def map(self, x: Array, y: Array, values: Array) -> None:
@@ -114,7 +118,13 @@ class Panel:
             "bdata": base64.b64encode(z.tobytes()).decode(),
             "shape": f"{z.shape[0]}, {z.shape[1]}",
         }
-        look = {"type": "heatmap", "colorscale": "Viridis", "showscale": False, "x": numbers(x), "y": numbers(y)}
+        look = {
+            "type": "heatmap",
+            "colorscale": "Viridis",
+            "showscale": False,
+            "x": encode_numbers(x),
+            "y": encode_numbers(y),
+        }
         self._add("", {**look, "z": packed})
 
     def words(
@@ -125,7 +135,7 @@ class Panel:
         self.figure.annotations.append({
             "text": text, "xref": self.axes["xaxis"], "yref": self.axes["yaxis"], "x": x, "y": y, "xanchor": align,
             "yanchor": "bottom", "xshift": shift[0], "yshift": shift[1], "showarrow": False,
-            "font": {"color": colour(name)},
+            "font": {"color": find_colour(name)},
         })  # fmt: skip
 
 
@@ -191,7 +201,7 @@ class Figure:
 
     def x_of(self, k: int) -> str:
         """The x axis of panel k: that of the first, unless panels stand apart."""
-        return _axis("x", k if self.apart else 0)
+        return _make_axis("x", k if self.apart else 0)
 
     @property
     def json(self) -> dict[str, Any]:
@@ -213,7 +223,7 @@ class Figure:
 _STYLE = {"zeroline": False, "gridcolor": "var(--grid)", "linecolor": "var(--ink)", "exponentformat": "none"}
 
 
-def limits(
+def find_limits(
     values: Sequence[Array], floor: float = 0.0, symmetric: bool = False, always: Sequence[Array] = ()
 ) -> tuple[float, float]:
     """Limits of an axis that single outliers do not set, at least `floor` wide.
@@ -237,15 +247,15 @@ def limits(
     return lo - margin, hi + margin
 
 
-def numbers(values: Array) -> dict[str, str]:
+def encode_numbers(values: Array) -> dict[str, str]:
     """A typed array in plotly's form."""
     return {"dtype": "f4", "bdata": base64.b64encode(np.asarray(values, dtype="<f4").tobytes()).decode("ascii")}
 
 
-def colour(name: str) -> str:
+def find_colour(name: str) -> str:
     """A colour of the page, by the name of a solver or another drawn object."""
-    return f"var({variable(name)})"
+    return f"var({name_variable(name)})"
 
 
-def _axis(letter: str, k: int) -> str:
+def _make_axis(letter: str, k: int) -> str:
     return letter if k == 0 else f"{letter}{k + 1}"

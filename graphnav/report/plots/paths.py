@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from graphnav.core.rotation import Array
-from graphnav.report.plots.figure import SHADES, Figure, Panel, Spans, colour, limits
+from graphnav.report.plots.figure import SHADES, Figure, Panel, Spans, find_colour, find_limits
 
 _MARKED_STOPS = 60  # stops that are marked individually
 _LABEL = 120.0  # pixels on a wide screen of a label on a phone
@@ -37,7 +37,7 @@ FIX_COLOURS = {
 }  # fmt: skip
 
 
-def trajectory(
+def plot_trajectory(
     tracks: Mapping[str, tuple[Array, Array]],
     *,
     fixes: DrawnFixes | None = None,
@@ -60,7 +60,7 @@ def trajectory(
     parts += [] if truth is None else [truth]
     both = np.concatenate(parts)
     both = both[np.isfinite(both).all(axis=1)]
-    (west, east), (south, north) = (limits([both[:, k]], floor=1.0, always=[en[:, k] for _, en in tracks.values()])
+    (west, east), (south, north) = (find_limits([both[:, k]], floor=1.0, always=[en[:, k] for _, en in tracks.values()])
                                     for k in (0, 1))  # fmt: skip
     south -= 0.06 * (north - south)  # for the scale bar
     scale = max((east - west) / _WIDE, (north - south) / _HIGH)  # m per pixel, the same on both axes
@@ -82,12 +82,12 @@ def trajectory(
     return figure
 
 
-def profile(lines: Mapping[str, tuple[Array, Array]], points: Mapping[str, tuple[Array, Array]]) -> Figure:
+def plot_profile(lines: Mapping[str, tuple[Array, Array]], points: Mapping[str, tuple[Array, Array]]) -> Figure:
     """Heights (m) over the distance travelled (m): `lines` of solvers and truth, `points` of fixes by kind."""
     reach = max((float(x[-1]) for x, _ in lines.values() if len(x)), default=1.0)
     kilo, unit = (1e-3, "km") if reach >= 2000.0 else (1.0, "m")
     values = [y for _, y in (*lines.values(), *points.values())]
-    ylim = limits(values, floor=1.0, always=[y for name, (_, y) in lines.items() if name != "truth"])
+    ylim = find_limits(values, floor=1.0, always=[y for name, (_, y) in lines.items() if name != "truth"])
     x = f"distance travelled [{unit}]"
     figure = Figure(["height [m]"], (0.0, kilo * max(reach, 1e-3)), [ylim], units=["m"], height=150, x=x)
     (panel,) = figure.panels
@@ -159,7 +159,7 @@ def _scale_bar(figure: Figure, panel: Panel) -> None:
     x = east - 0.01 * (east - west)
     figure.shapes.append({
         "type": "line", "xref": "x", "yref": "paper", "x0": x - metres, "x1": x, "y0": 0.02, "y1": 0.02,
-        "line": {"color": colour("truth"), "width": 3.5},
+        "line": {"color": find_colour("truth"), "width": 3.5},
     })  # fmt: skip
     words = f"{metres / 1000:g} km" if metres >= 1000 else f"{metres:g} m"
     panel.words(x - metres / 2, 0.02, words, "center", (0, 2))

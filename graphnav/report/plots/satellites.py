@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from graphnav.core.rotation import Array
 from graphnav.estimation.solution import CarrierArcs, ConstraintRecord
-from graphnav.report.plots.figure import Figure, colour, limits
+from graphnav.report.plots.figure import Figure, find_colour, find_limits
 from graphnav.report.plots.series import Shades
 from graphnav.report.plots.thinning import BINS
 
@@ -22,7 +22,7 @@ _RINGS = (0.0, 30.0, 60.0)  # deg of elevation
 _BINS = np.arange(0.0, 90.1, 5.0)  # deg of elevation
 
 
-def sky(record: ConstraintRecord, solver: str) -> Figure:
+def plot_sky(record: ConstraintRecord, solver: str) -> Figure:
     """Sky plot: the zenith in the middle, the horizon around, north up; rejected rows marked.
 
     Parameters
@@ -41,7 +41,7 @@ def sky(record: ConstraintRecord, solver: str) -> Figure:
         r = 90.0 - ring
         figure.shapes.append({
             "type": "circle", "xref": "x", "yref": "y", "x0": -r, "x1": r, "y0": -r, "y1": r, "layer": "below",
-            "line": {"color": colour("grid"), "width": 1},
+            "line": {"color": find_colour("grid"), "width": 1},
         })  # fmt: skip
         panel.words(0.0, r, "" if ring == 0.0 else f"{ring:.0f}°", "left", (2, -2), "ink")
     for words, at, align, shift in (
@@ -51,16 +51,16 @@ def sky(record: ConstraintRecord, solver: str) -> Figure:
         panel.words(*at, words, align, shift, "ink")
     refused = record.weight < HALF
     for name in np.unique(record.satellite):
-        own = _some(np.flatnonzero(record.satellite == name), _PLENTY // 8)
+        own = _choose_rows(np.flatnonzero(record.satellite == name), _PLENTY // 8)
         panel.dots(x[own], y[own], solver, "used", 3.0, t=record.t[own], path=True)
         panel.words(float(x[own[-1]]), float(y[own[-1]]), str(name), shift=(4, -4))
     if refused.any():
-        own = _some(np.flatnonzero(refused))
+        own = _choose_rows(np.flatnonzero(refused))
         panel.dots(x[own], y[own], "alert", "less than half weight", 4.0, t=record.t[own], path=True)
     return figure
 
 
-def used_satellites(
+def plot_used_satellites(
     records: Mapping[str, ConstraintRecord], start: float, end: float, solver: str, *, spans: Shades
 ) -> Figure:
     """Numbers of satellites used and rejected at each epoch; a panel for each kind of row."""
@@ -78,10 +78,10 @@ def used_satellites(
     return figure
 
 
-def satellite_rows(record: ConstraintRecord, start: float, end: float, solver: str, *, spans: Shades) -> Figure:
+def plot_satellite_rows(record: ConstraintRecord, start: float, end: float, solver: str, *, spans: Shades) -> Figure:
     """A line for each satellite: when its rows were used, and when rejected."""
     every = sorted(set(record.satellite.tolist()))
-    figure, places = _named_rows(every, (0.0, end), {"spans": spans})
+    figure, places = _plot_named_rows(every, (0.0, end), {"spans": spans})
     (panel,) = figure.panels
     refused = record.weight < HALF
     for name, row in places.items():
@@ -95,34 +95,34 @@ def satellite_rows(record: ConstraintRecord, start: float, end: float, solver: s
     return figure
 
 
-def residuals_by_elevation(records: Mapping[str, ConstraintRecord], solver: str) -> Figure:
+def plot_residuals_by_elevation(records: Mapping[str, ConstraintRecord], solver: str) -> Figure:
     """Every residual over its elevation, and by steps of it their RMS beside the stated sigma."""
     shown = [(kind, np.degrees(r.elevation), r, r.residual[:, 0]) for kind, r in records.items()]
     units = [r.unit for r in records.values()]
-    ylims = [limits([y[r.weight >= HALF]], symmetric=True) for _, _, r, y in shown]
+    ylims = [find_limits([y[r.weight >= HALF]], symmetric=True) for _, _, r, y in shown]
     titles = [f"{kind} [{unit}]" for kind, unit in zip(records, units, strict=True)]
     figure = Figure(titles, (0.0, 90.0), ylims, units=units, x="elevation [deg]")
     for panel, (_, x, record, y) in zip(figure.panels, shown, strict=True):
         used = record.weight >= HALF
         bounded = np.clip(y, 0.98 * panel.ylim[0], 0.98 * panel.ylim[1])
         for some, look, words, size in ((used, solver, "used", 2.5), (~used, "alert", "less than half weight", 4.0)):
-            rows = _some(np.flatnonzero(some))
+            rows = _choose_rows(np.flatnonzero(some))
             if len(rows):
                 panel.dots(x[rows], bounded[rows], look, words, size, alpha=0.4, path=True)
-        middle, rms, sigma = _by_elevation(x[used], y[used], record.sigma[used, 0])
+        middle, rms, sigma = _bin_by_elevation(x[used], y[used], record.sigma[used, 0])
         panel.line(middle, rms, "truth", "RMS in steps of 5 deg", width=2.2)
         panel.line(middle, sigma, "withheld", "their sigma", width=2.2, dash=True)
     return figure
 
 
-def residuals_by_satellite(kind: str, record: ConstraintRecord, solver: str) -> Figure:
+def plot_residuals_by_satellite(kind: str, record: ConstraintRecord, solver: str) -> Figure:
     """For each satellite the median, the middle half and the middle 95 % of its residuals."""
     every = sorted(set(record.satellite.tolist()))
     y, used = record.residual[:, 0], record.weight >= HALF
     parts = {name: np.quantile(own, [0.025, 0.25, 0.5, 0.75, 0.975]) for name in every
              if len(own := y[used & (record.satellite == name)])}  # fmt: skip
-    reach = limits([np.concatenate([*parts.values(), np.zeros(1)])], symmetric=True)
-    figure, places = _named_rows(every, reach, {"x": f"{kind} [{record.unit}]"})
+    reach = find_limits([np.concatenate([*parts.values(), np.zeros(1)])], symmetric=True)
+    figure, places = _plot_named_rows(every, reach, {"x": f"{kind} [{record.unit}]"})
     (panel,) = figure.panels
     panel.line(np.zeros(2), np.array(panel.ylim), "ink", width=0.8, quiet=True)
     gap = np.nan
@@ -140,9 +140,9 @@ def residuals_by_satellite(kind: str, record: ConstraintRecord, solver: str) -> 
     return figure
 
 
-def carrier_arcs(arcs: CarrierArcs, start: float, end: float, *, spans: Shades) -> Figure:
+def plot_carrier_arcs(arcs: CarrierArcs, start: float, end: float, *, spans: Shades) -> Figure:
     """A line for each signal of a satellite: its arcs, with integer and with real-valued ambiguities."""
-    figure, places = _named_rows(sorted(set(arcs.name.tolist())), (0.0, end), {"spans": spans})
+    figure, places = _plot_named_rows(sorted(set(arcs.name.tolist())), (0.0, end), {"spans": spans})
     (panel,) = figure.panels
     row = np.array([places[name] for name in arcs.name.tolist()])
     for some, look, words in ((~arcs.integer, "float", "real number"), (arcs.integer, "fixed", "integer")):
@@ -154,7 +154,9 @@ def carrier_arcs(arcs: CarrierArcs, start: float, end: float, *, spans: Shades) 
     return figure
 
 
-def _named_rows(every: list[str], xlim: tuple[float, float], more: dict[str, Any]) -> tuple[Figure, dict[str, float]]:
+def _plot_named_rows(
+    every: list[str], xlim: tuple[float, float], more: dict[str, Any]
+) -> tuple[Figure, dict[str, float]]:
     """A panel with a line for each name, the first on top, and the positions of these."""
     places = {name: float(len(every) - 1 - k) for k, name in enumerate(every)}
     spans = more.pop("spans", {})
@@ -166,12 +168,12 @@ def _named_rows(every: list[str], xlim: tuple[float, float], more: dict[str, Any
     return figure, places
 
 
-def _some(rows: NDArray[np.intp], most: int = _PLENTY) -> NDArray[np.intp]:
+def _choose_rows(rows: NDArray[np.intp], most: int = _PLENTY) -> NDArray[np.intp]:
     """Evenly chosen rows of a scatter plot: it keeps its shape, which extremes alone would not."""
     return rows[:: -(-len(rows) // most) or 1]
 
 
-def _by_elevation(x: Array, y: Array, sigma: Array) -> tuple[Array, Array, Array]:
+def _bin_by_elevation(x: Array, y: Array, sigma: Array) -> tuple[Array, Array, Array]:
     """Middles (B,) of the steps of elevation that have rows, deg, RMS of these, and of their sigmas."""
     of = np.digitize(x, _BINS)
     steps = [of == k for k in np.unique(of) if np.count_nonzero(of == k) > 1]

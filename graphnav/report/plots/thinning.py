@@ -40,7 +40,7 @@ def thin(t: Array, y: Array, bins: int = BINS) -> np.ndarray:
     return np.flatnonzero(kept)
 
 
-def with_breaks(t: Array, rows: np.ndarray, *columns: Array) -> Any:
+def insert_breaks(t: Array, rows: np.ndarray, *columns: Array) -> Any:
     """t and columns at the kept rows, with a NaN row in every long gap of t, which a line must not cross.
 
     Long is more than 20 median steps and more than one hundredth of the whole.

@@ -7,10 +7,10 @@ import pkgutil
 
 from graphnav.simulation.scenarios.registry import Scenario
 
-__all__ = ["Scenario", "scenarios"]
+__all__ = ["Scenario", "list_scenarios"]
 
 
-def scenarios() -> dict[str, Scenario]:
+def list_scenarios() -> dict[str, Scenario]:
     """Every scenario by name."""
     modules = [importlib.import_module(f"{__name__}.{m.name}") for m in pkgutil.iter_modules(__path__)]
     found = [one for m in modules for one in getattr(m, "SCENARIOS", ())]

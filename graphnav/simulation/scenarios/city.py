@@ -11,14 +11,14 @@ from graphnav.core.rotation import Array
 from graphnav.simulation.aiding import GnssModel, OdometerModel, Span
 from graphnav.simulation.inertial import MEMS
 from graphnav.simulation.kinematics import Mount
-from graphnav.simulation.motion import Manoeuvre, Path, drive
-from graphnav.simulation.passengers import Boarding, Fidget, movement
+from graphnav.simulation.motion import Manoeuvre, Path, make_path
+from graphnav.simulation.passengers import Boarding, Fidget, simulate_movement
 from graphnav.simulation.result import Simulated, record
 from graphnav.simulation.scenarios.registry import Scenario
-from graphnav.simulation.scenarios.town import streets
+from graphnav.simulation.scenarios.town import choose_manoeuvres
 from graphnav.simulation.series import BarometerModel, DualAntennaModel
-from graphnav.simulation.splines import stream
-from graphnav.simulation.vibration import Engine, Idle, Shake, Springs, idle_floor, road_noise
+from graphnav.simulation.splines import make_random
+from graphnav.simulation.vibration import Engine, Idle, Shake, Springs, simulate_idle_floor, simulate_road_noise
 
 # a four-cylinder engine: its second order is the strongest
 FOUR_CYLINDERS = Idle(((0.4, 0.5, 0.8), (1.5, 3.0, 6.0), (0.5, 1.0, 2.0)), (0.02, 0.15, 0.02))
@@ -60,25 +60,28 @@ def _build_town(
         raise ConfigError(f"duration = {duration:g}: a town takes at least 240 s", key="simulation.value")
     if gnss not in ("rtk", "single"):
         raise ConfigError(f"gnss = '{gnss}': must be rtk or single", key="simulation.value")
-    rng = stream(seed, "way")
+    rng = make_random(seed, "way")
     parking = [
         Manoeuvre(4.0, 4.0), Manoeuvre(4.0, 0.0, 15.0), Manoeuvre(3.0, 0.0),
         Manoeuvre(2.0, -1.2), Manoeuvre(4.0, -1.2, 50.0), Manoeuvre(4.0, -1.0, -65.0), Manoeuvre(2.0, 0.0),
         Manoeuvre(2.0, 0.0), Manoeuvre(2.0, 0.5), Manoeuvre(1.0, 0.0), Manoeuvre(15.0, 0.0),
     ]  # fmt: skip
     length = duration - 20.0 - sum(m.duration for m in parking)
-    plan = [Manoeuvre(20.0, 0.0), *streets(length, rng, hills=0.06, pause=0.5), *parking]
-    path = drive(plan, heading=float(rng.uniform(0.0, 360.0)), slip_per_accel=0.005)
+    plan = [Manoeuvre(20.0, 0.0), *choose_manoeuvres(length, rng, hills=0.06, pause=0.5), *parking]
+    path = make_path(plan, heading=float(rng.uniform(0.0, 360.0)), slip_per_accel=0.005)
     mount = Mount(above_axle=(0.1, 1.4, 0.6), angles=(0.8, -1.2, 1.5))
     parts = [
-        road_noise(path, stream(seed, "road")),
+        simulate_road_noise(path, make_random(seed, "road")),
         Springs(height=0.4).lean(path),
-        movement(path, _seat_passengers(path, seed), (0.0, 0.0, 0.4), stream(seed, "passengers")),
+        simulate_movement(path, _seat_passengers(path, seed), (0.0, 0.0, 0.4), make_random(seed, "passengers")),
     ]
     if idle_hz:
         motor = Engine(FOUR_CYLINDERS, idle_hz, ORDERS, wander_hz=0.06)
-        parts += [motor.lines(path, rate, stream(seed, "engine")), idle_floor(path, stream(seed, "idling"))]
-    gaps = spread_gaps(path, tunnels, (20.0, 45.0), stream(seed, "tunnels"))
+        parts += [
+            motor.lines(path, rate, make_random(seed, "engine")),
+            simulate_idle_floor(path, make_random(seed, "idling")),
+        ]
+    gaps = spread_gaps(path, tunnels, (20.0, 45.0), make_random(seed, "tunnels"))
     receiver = replace(RTK if gnss == "rtk" else SINGLE, outages=gaps, dropouts=0.01)
     return record(
         name, seed, path,
@@ -92,7 +95,7 @@ def _build_town(
 
 def _seat_passengers(path: Path, seed: int) -> list[Boarding | Fidget]:
     """Passengers on their seats throughout, and the driver getting out at the end."""
-    rng = stream(seed, "events")
+    rng = make_random(seed, "events")
     times = np.sort(rng.uniform(path.start, path.end, rng.poisson((path.end - path.start) / 60.0)))
     fidgets = [Fidget(float(t), float(rng.uniform(0.02, 0.15))) for t in times]
     return [*fidgets, Boarding(path.end - 9.0, -1.0, -1.0, 1.0)]

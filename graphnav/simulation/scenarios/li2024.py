@@ -8,13 +8,13 @@ from graphnav.core.errors import ConfigError
 from graphnav.simulation.aiding import GnssModel, OdometerModel
 from graphnav.simulation.inertial import EG370N
 from graphnav.simulation.kinematics import Mount
-from graphnav.simulation.motion import SETTLE, Manoeuvre, drive
-from graphnav.simulation.passengers import Boarding, Fidget, movement
+from graphnav.simulation.motion import SETTLE, Manoeuvre, make_path
+from graphnav.simulation.passengers import Boarding, Fidget, simulate_movement
 from graphnav.simulation.result import Simulated, record
 from graphnav.simulation.scenarios.registry import Scenario
-from graphnav.simulation.scenarios.town import streets
-from graphnav.simulation.splines import stream
-from graphnav.simulation.vibration import Engine, Idle, Shake, Springs, idle_floor, road_noise
+from graphnav.simulation.scenarios.town import choose_manoeuvres
+from graphnav.simulation.splines import make_random
+from graphnav.simulation.vibration import Engine, Idle, Shake, Springs, simulate_idle_floor, simulate_road_noise
 
 # Table 2, seconds of 12 October 2021 (GPST); a stop's first and last second are in it
 _CLOCK = ((2, 4, 7), (2, 20, 13), (2, 37, 31), (2, 59, 32), (3, 21, 42), (3, 41, 54))
@@ -54,23 +54,26 @@ def run(
         raise ConfigError(f"engine_hz = {engine_hz:g}: must be from 5 to 50 Hz", key="simulation.value")
     start, end = (START, START + 900.0) if short else (START, END)
     edges = tuple(START + x for x in (150.0, 210.0, 380.0, 500.0, 680.0, 770.0)) if short else STOPS
-    rng = stream(seed, "way")
+    rng = make_random(seed, "way")
     plan, t = [Manoeuvre(15.0, 0.0)], start + 15.0
     # edges of a stop are where the wheels stand to the tenth of a second: the plan accounts for the spline's extent
     for begin, finish in (edges[0:2], edges[2:4], edges[4:6], (end - 5.0, end)):
         still, away = begin - SETTLE, finish + SETTLE if finish < end else end
-        plan += [*streets(still - t, rng), Manoeuvre(away - still, 0.0)]
+        plan += [*choose_manoeuvres(still - t, rng), Manoeuvre(away - still, 0.0)]
         t = away
-    path = drive(plan, start=start, heading=75.0, slip_per_accel=0.003)
+    path = make_path(plan, start=start, heading=75.0, slip_per_accel=0.003)
 
     mount = Mount(above_axle=(0.0, 1.3, 1.5), angles=(0.3, -0.4, 0.5))  # on the roof
-    parts = [road_noise(path, stream(seed, "road")), Springs(height=1.2).lean(path)]
+    parts = [simulate_road_noise(path, make_random(seed, "road")), Springs(height=1.2).lean(path)]
     spans = tuple((a - 5.0, b + 5.0, idle) for a, b, idle in zip(edges[::2], edges[1::2], TABLE_4, strict=True))
     if engine:
         motor = Engine(MEAN, engine_hz, (0.5, 1.0, 2.0), spans)
-        parts += [motor.lines(path, rate, stream(seed, "engine")), idle_floor(path, stream(seed, "idling"))]
+        parts += [
+            motor.lines(path, rate, make_random(seed, "engine")),
+            simulate_idle_floor(path, make_random(seed, "idling")),
+        ]
     events = _list_events(edges, seed) if passengers else []
-    parts.append(movement(path, events, (0.0, 0.0, 1.2), stream(seed, "passengers")))
+    parts.append(simulate_movement(path, events, (0.0, 0.0, 1.2), make_random(seed, "passengers")))
     return record(
         "li2024", seed, path,
         origin=(37.53, 122.06, 20.0), imu=EG370N.at(rate), mount=mount, shake=Shake(tuple(parts)), exact=exact,
@@ -88,7 +91,7 @@ def run(
 
 def _list_events(edges: tuple[float, ...], seed: int) -> list[Boarding | Fidget]:
     """Passengers: a door at stop 1, most at stop 2, two doors at stop 3; no seat is completely still."""
-    rng = stream(seed, "events")
+    rng = make_random(seed, "events")
 
     def at(stop: int, share: float) -> float:
         a, b = edges[2 * stop : 2 * stop + 2]

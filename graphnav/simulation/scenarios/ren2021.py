@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 
 from graphnav.core.errors import ConfigError
-from graphnav.simulation.footsteps import Cadence, footsteps, rectangle, route
+from graphnav.simulation.footsteps import Cadence, list_rectangle, make_footsteps, make_route
 from graphnav.simulation.gait import Sole, Style
 from graphnav.simulation.gait import walk as walk_over
-from graphnav.simulation.inertial import DEG_H, DEG_SQRT_H, SimulatedImu, Triad, accelerometer, gyroscope
+from graphnav.simulation.inertial import DEG_H, DEG_SQRT_H, SimulatedImu, Triad, make_accelerometer, make_gyroscope
 from graphnav.simulation.pedestrian import record_walk
 from graphnav.simulation.result import Simulated
 from graphnav.simulation.scenarios.registry import Scenario
-from graphnav.simulation.splines import stream
+from graphnav.simulation.splines import make_random
 
 DEG = np.pi / 180.0
 # Table 2: perimeter (m), laps, duration (s)
@@ -31,8 +31,8 @@ ELLIPSE2 = SimulatedImu(
 # Of the noise that the recordings of OpenShoe (3DM-GX2) and x-io (NGIMU) have at rest.
 SHOE = SimulatedImu(
     "MEMS in a shoe", 200.0,
-    gyroscope(1.0, 1800.0, instability_deg_h=20.0, scale_ppm=3000.0, misalignment_mrad=3.0, range_deg_s=1200.0),
-    accelerometer(100.0, 6.0, instability_mg=0.05, scale_ppm=3000.0, misalignment_mrad=3.0, range_g=18.0),
+    make_gyroscope(1.0, 1800.0, instability_deg_h=20.0, scale_ppm=3000.0, misalignment_mrad=3.0, range_deg_s=1200.0),
+    make_accelerometer(100.0, 6.0, instability_mg=0.05, scale_ppm=3000.0, misalignment_mrad=3.0, range_g=18.0),
 )  # fmt: skip
 PRESETS = {"ellipse2": ELLIPSE2, "shoe": SHOE}
 PACES = {"slow": 0.8, "normal": 1.2, "fast": 1.75}  # m/s
@@ -47,7 +47,7 @@ def ren2021(
         raise ConfigError(f"walk = {walk}: must be from 1 to {len(WALKS)}", key="simulation.value")
     perimeter, laps, duration = WALKS[walk - 1]
     return _walk(
-        "ren2021", seed, duration, rectangle(perimeter, laps), ELLIPSE2.at(_check_rate(rate)), exact, compensated, True,
+        "ren2021", seed, duration, list_rectangle(perimeter, laps), ELLIPSE2.at(_check_rate(rate)), exact, compensated, True,
         {"walk": walk, "laps": laps},
     )  # fmt: skip
 
@@ -67,10 +67,10 @@ def free(
     if not 20.0 <= duration <= 7200.0:
         raise ConfigError(f"duration = {duration:g}: must be from 20 to 7200 s", key="simulation.value")
     length = PACES[pace] * (duration - _draw_rest(seed).sum())
-    rng = stream(seed, "course")
+    rng = make_random(seed, "course")
     if course == "laps":
         laps = max(1, round(length / 40.0))
-        parts = rectangle(length / laps, laps)
+        parts = list_rectangle(length / laps, laps)
     elif course == "straight":
         parts = [(length, 0.0)]
     elif course == "bends":
@@ -96,7 +96,7 @@ def _check_rate(rate: float) -> float:
 
 def _draw_rest(seed: int) -> np.ndarray:
     """s at rest before and after the walk."""
-    return stream(seed, "rest").uniform([2.0, 1.5], [6.0, 4.0])
+    return make_random(seed, "rest").uniform([2.0, 1.5], [6.0, 4.0])
 
 
 def _walk(
@@ -104,13 +104,15 @@ def _walk(
     compensated: bool, closed: bool, facts: dict[str, object],
 ) -> Simulated:  # fmt: skip
     rest = _draw_rest(seed)
-    rng = stream(seed, "course")
-    along = route(parts, float(rng.uniform(0.0, 360.0)))
+    rng = make_random(seed, "course")
+    along = make_route(parts, float(rng.uniform(0.0, 360.0)))
     walked = duration - float(rest.sum())
     speed = along.length / walked
-    steps = footsteps(along, Cadence.of(speed), float(rest[0]), walked, duration, stream(seed, "steps"), closed=closed)
-    foot = walk_over(steps, Style.of(speed), Sole(), duration, stream(seed, "gait"))
-    angles = stream(seed, "mounting").normal(0.0, [3.0, 4.0, 4.0])
+    steps = make_footsteps(
+        along, Cadence.of(speed), float(rest[0]), walked, duration, make_random(seed, "steps"), closed=closed
+    )
+    foot = walk_over(steps, Style.of(speed), Sole(), duration, make_random(seed, "gait"))
+    angles = make_random(seed, "mounting").normal(0.0, [3.0, 4.0, 4.0])
     mounting = (float(angles[0]), float(angles[1]), float(angles[2]))
     return record_walk(
         name, seed, foot, origin=_ORIGIN, imu=imu, mounting=mounting, exact=exact, compensated=compensated,

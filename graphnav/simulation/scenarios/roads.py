@@ -8,12 +8,12 @@ from graphnav.core.errors import ConfigError
 from graphnav.simulation.aiding import OdometerModel
 from graphnav.simulation.inertial import MEMS
 from graphnav.simulation.kinematics import Mount
-from graphnav.simulation.motion import Manoeuvre, Path, drive
+from graphnav.simulation.motion import Manoeuvre, Path, make_path
 from graphnav.simulation.result import Simulated, record
 from graphnav.simulation.scenarios.city import FOUR_CYLINDERS, ORDERS, RTK, SINGLE, spread_gaps
 from graphnav.simulation.scenarios.registry import Scenario
-from graphnav.simulation.splines import stream
-from graphnav.simulation.vibration import Engine, Shake, Springs, idle_floor, road_noise
+from graphnav.simulation.splines import make_random
+from graphnav.simulation.vibration import Engine, Shake, Springs, simulate_idle_floor, simulate_road_noise
 
 _MOUNT = Mount(above_axle=(0.1, 1.4, 0.6), angles=(0.8, -1.2, 1.5))
 
@@ -21,10 +21,10 @@ _MOUNT = Mount(above_axle=(0.1, 1.4, 0.6), angles=(0.8, -1.2, 1.5))
 def _shake(path: Path, seed: int, rate: float, road: float) -> Shake:
     return Shake(
         (
-            road_noise(path, stream(seed, "road"), road),
+            simulate_road_noise(path, make_random(seed, "road"), road),
             Springs(height=0.4).lean(path),
-            Engine(FOUR_CYLINDERS, 12.1, ORDERS, wander_hz=0.05).lines(path, rate, stream(seed, "engine")),
-            idle_floor(path, stream(seed, "idling")),
+            Engine(FOUR_CYLINDERS, 12.1, ORDERS, wander_hz=0.05).lines(path, rate, make_random(seed, "engine")),
+            simulate_idle_floor(path, make_random(seed, "idling")),
         )
     )
 
@@ -33,7 +33,7 @@ def motorway(seed: int, *, duration: float = 1500.0, exact: bool = False, rate: 
     """Up to 36 m/s for `duration` s: long bends, lane changes, a jam without a stop, two bridges, and a rest area."""
     if duration < 300.0:
         raise ConfigError(f"duration = {duration:g}: a motorway takes at least 300 s", key="simulation.value")
-    rng = stream(seed, "way")
+    rng = make_random(seed, "way")
     plan = [Manoeuvre(20.0, 0.0), Manoeuvre(10.0, 12.0), Manoeuvre(12.0, 14.0, 100.0, 0.02), Manoeuvre(15.0, 30.0)]
     left, v = duration - 57.0 - 65.0, 30.0
     while left > 150.0:
@@ -47,8 +47,8 @@ def motorway(seed: int, *, duration: float = 1500.0, exact: bool = False, rate: 
         plan, v, left = plan + part, speed, left - sum(m.duration for m in part)
     plan += [Manoeuvre(left, 28.0, 0.0, 0.0), Manoeuvre(15.0, 13.0), Manoeuvre(10.0, 10.0, -70.0)]
     plan += [Manoeuvre(10.0, 0.0), Manoeuvre(30.0, 0.0)]
-    path = drive(plan, heading=float(rng.uniform(0.0, 360.0)), slip_per_accel=0.005)
-    gaps = spread_gaps(path, 2, (8.0, 25.0), stream(seed, "tunnels"))
+    path = make_path(plan, heading=float(rng.uniform(0.0, 360.0)), slip_per_accel=0.005)
+    gaps = spread_gaps(path, 2, (8.0, 25.0), make_random(seed, "tunnels"))
     return record(
         "motorway", seed, path,
         origin=(48.35, 11.79, 20.0), imu=MEMS.at(rate), mount=_MOUNT, shake=_shake(path, seed, rate, 1.0), exact=exact,
@@ -72,7 +72,7 @@ def crawl(
         )
     if jam < 120.0:
         raise ConfigError(f"jam = {jam:g}: must be at least 120 s", key="simulation.value")
-    rng = stream(seed, "way")
+    rng = make_random(seed, "way")
 
     def flow() -> list[Manoeuvre]:
         return [
@@ -91,7 +91,7 @@ def crawl(
         used = sum(m.duration for m in plan[-4:])
         t, left = t + used, left - used
     plan += [Manoeuvre(10.0, 0.0), *flow(), Manoeuvre(8.0, 0.0), Manoeuvre(15.0, 0.0)]
-    path = drive(plan, heading=float(rng.uniform(0.0, 360.0)), slip_per_accel=0.005)
+    path = make_path(plan, heading=float(rng.uniform(0.0, 360.0)), slip_per_accel=0.005)
     return record(
         "crawl", seed, path,
         origin=(50.08, 14.43, 20.0), imu=MEMS.at(rate), mount=_MOUNT, shake=_shake(path, seed, rate, 0.5), exact=exact,

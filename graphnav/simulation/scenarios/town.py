@@ -7,7 +7,7 @@ import numpy as np
 from graphnav.simulation.motion import Manoeuvre
 
 
-def streets(
+def choose_manoeuvres(
     duration: float, rng: np.random.Generator, *, fast: tuple[float, float] = (8.0, 15.0), hills: float = 0.03,
     pause: float = 0.3,
 ) -> list[Manoeuvre]:  # fmt: skip

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 from graphnav.core.errors import ConfigError
 from graphnav.simulation.aiding import GnssModel, OdometerModel, SimulatedFault, Span
-from graphnav.simulation.inertial import SimulatedImu, accelerometer, gyroscope
+from graphnav.simulation.inertial import SimulatedImu, make_accelerometer, make_gyroscope
 from graphnav.simulation.kinematics import Mount
-from graphnav.simulation.motion import Manoeuvre, drive
+from graphnav.simulation.motion import Manoeuvre, make_path
 from graphnav.simulation.result import Simulated, record
 from graphnav.simulation.scenarios.registry import Scenario
-from graphnav.simulation.splines import stream
-from graphnav.simulation.vibration import Engine, Idle, Shake, idle_floor, road_noise
+from graphnav.simulation.splines import make_random
+from graphnav.simulation.vibration import Engine, Idle, Shake, simulate_idle_floor, simulate_road_noise
 
 # The paper gives the biases only; noise and instability are those usual of such sensors.
 IMU = SimulatedImu(
     "IMU of Ushaq", 100.0,
-    gyroscope(0.1, 5.0, instability_deg_h=1.0), accelerometer(50.0, 0.2, instability_mg=0.02),
+    make_gyroscope(0.1, 5.0, instability_deg_h=1.0), make_accelerometer(50.0, 0.2, instability_mg=0.02),
 )  # fmt: skip
 FAULTS: tuple[Span, ...] = ((1080.0, 1500.0), (2580.0, 2820.0))  # 18-25 and 43-47 min
 _SPEED, _TURN, _GAIN = 10.0, 12.0, 10.0  # m/s; s of a corner; s to gain or lose the speed
@@ -56,12 +56,12 @@ def run(
         raise ConfigError(f"stops_every = {stops_every:g}: must be 0 or at least 4 min", key="simulation.value")
 
     plan = _drive_square(60.0 * stops_every)
-    path = drive(plan, heading=90.0)
+    path = make_path(plan, heading=90.0)
     shake = Shake(
         (
-            road_noise(path, stream(seed, "road"), 0.5),
-            Engine(_IDLE, 13.0, wander_hz=0.03).lines(path, rate, stream(seed, "engine")),
-            idle_floor(path, stream(seed, "idling")),
+            simulate_road_noise(path, make_random(seed, "road"), 0.5),
+            Engine(_IDLE, 13.0, wander_hz=0.03).lines(path, rate, make_random(seed, "engine")),
+            simulate_idle_floor(path, make_random(seed, "idling")),
         )
     )
     return record(

@@ -8,11 +8,11 @@ from graphnav.core.errors import ConfigError
 from graphnav.simulation.aiding import GnssModel, OdometerModel
 from graphnav.simulation.inertial import MIMU
 from graphnav.simulation.kinematics import Mount
-from graphnav.simulation.motion import Manoeuvre, drive
+from graphnav.simulation.motion import Manoeuvre, make_path
 from graphnav.simulation.result import Simulated, record
 from graphnav.simulation.scenarios.registry import Scenario
-from graphnav.simulation.splines import stream
-from graphnav.simulation.vibration import Engine, Idle, Shake, Springs, idle_floor, road_noise
+from graphnav.simulation.splines import make_random
+from graphnav.simulation.vibration import Engine, Idle, Shake, Springs, simulate_idle_floor, simulate_road_noise
 
 _IDLE = Idle(((1.0, 2.0, 4.0), (0.3, 2.0, 3.0)), (0.25, 0.01))
 
@@ -40,7 +40,7 @@ def run(
     if gnss_s < 40.0 or after_s < 30.0:
         raise ConfigError("gnss_s must be at least 40 s and after_s at least 30 s", key="simulation.value")
     lost, end = float(gnss_s), float(gnss_s + after_s)
-    rng = stream(seed, "way")
+    rng = make_random(seed, "way")
     plan, t, v = [Manoeuvre(8.0, 0.0), Manoeuvre(6.0, 8.0)], 14.0, 8.0
     while end - t > 45.0:
         fast, slope = rng.uniform(9.0, 14.0), rng.uniform(0.01, 0.04) * rng.choice([-1.0, 1.0])
@@ -51,17 +51,17 @@ def run(
         t, v = t + sum(m.duration for m in plan[-4:]), 6.0
     plan += [Manoeuvre(end - t - 10.0, v + 3.0, rng.uniform(-20.0, 20.0)), Manoeuvre(6.0, 0.0, 0.0, 0.0)]
     plan.append(Manoeuvre(4.0, 0.0))
-    path = drive(plan, heading=float(rng.uniform(0.0, 360.0)), slip_per_accel=slip)
+    path = make_path(plan, heading=float(rng.uniform(0.0, 360.0)), slip_per_accel=slip)
 
-    turn = stream(seed, "mounting")
+    turn = make_random(seed, "mounting")
     pitch, heading = turn.uniform(1.0, 2.0, 2) * turn.choice([-1.0, 1.0], 2)
     mount = Mount(above_axle=(0.2, 1.1, 0.5), angles=(0.0, float(pitch), float(heading)))
     shake = Shake(
         (
-            road_noise(path, stream(seed, "road")),
+            simulate_road_noise(path, make_random(seed, "road")),
             Springs(height=0.3).lean(path),
-            Engine(_IDLE, 13.3, wander_hz=0.05).lines(path, rate, stream(seed, "engine")),
-            idle_floor(path, stream(seed, "idling")),
+            Engine(_IDLE, 13.3, wander_hz=0.05).lines(path, rate, make_random(seed, "engine")),
+            simulate_idle_floor(path, make_random(seed, "idling")),
         )
     )
     gap = (lost + 90.0, lost + 105.0)
