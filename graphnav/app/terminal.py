@@ -69,8 +69,8 @@ def _describe_noise(outcome: Outcome) -> list[str]:
     noise = next(iter(outcome.solutions.values())).noise
     if not noise.figures:
         return ["noise as stated"]
-    parts = [f"{words} x {format_short(float(np.exp(0.5 * noise.figures[group].log_factor)))}" for group, words in _IMU.items()
-             if group in noise.figures]  # fmt: skip
+    estimated = {words: noise.figures[group].log_factor for group, words in _IMU.items() if group in noise.figures}
+    parts = [f"{words} x {format_short(float(np.exp(0.5 * factor)))}" for words, factor in estimated.items()]
     for source in dict.fromkeys(group.rpartition(".")[0] for group in noise.figures if group.startswith("gnss_")):
         if source.rpartition(".")[2] in TIMES:
             continue

@@ -8,7 +8,7 @@ reception, and u = v + R_nb (omega_nb x l) its velocity (Groves 2013, sections 8
 
 b and b' are the receiver's clock and its drift, which begin anew at every epoch; b_s is the bias of the signals of
 another system, z what the model of the ionosphere is wrong by at the zenith and m how that grows towards the horizon; k
-comes of the flight time (`graphnav.gnss.single_point.compute_stretch`). What lasts of the errors: c of all satellites together,
+comes of the flight time (`gnss.single_point.compute_stretch`). What lasts of the errors: c of all satellites together,
 as a shift of the antenna in east, north, up, for seconds and minutes, reflections and what a receiver's smoothing of
 its codes leaves, and for hours; d for seconds the same of velocities; q for hours of the one satellite, orbit, clock
 and the atmosphere towards it. How large c and q are for hours is stated: a drive does not tell them from its place.

@@ -1,6 +1,6 @@
 """Simulated recordings with exact truth: `simulate("li2024", seed=1)`.
 
-A scenario is a function of a seed and a few options; `list_scenarios()` lists them. All results are labelled as simulated,
+A scenario is a function of a seed and a few options; see `list_scenarios()`. All results are labelled as simulated,
 also in the recording's name.
 """
 

@@ -102,7 +102,8 @@ class Panel:
             cut = [(max(a, self.xlim[0]), min(b, self.xlim[1])) for a, b in every]
             self.figure.shapes += [
                 {"type": "rect", "xref": self.axes["xaxis"], "yref": f"{self.axes['yaxis']} domain", "x0": a, "x1": b,
-                 "y0": 0, "y1": 1, "fillcolor": f"{find_colour(SHADES[what])}2b", "line": {"width": 0}, "layer": "below"}
+                 "y0": 0, "y1": 1, "fillcolor": f"{find_colour(SHADES[what])}2b", "line": {"width": 0},
+                 "layer": "below"}
                 for a, b in cut if b > a
             ]  # fmt: skip
             if any(b > a for a, b in cut) and what not in self.figure.labels:

@@ -46,9 +46,9 @@ def ren2021(
     if not (isinstance(walk, int) and 1 <= walk <= len(WALKS)):
         raise ConfigError(f"walk = {walk}: must be from 1 to {len(WALKS)}", key="simulation.value")
     perimeter, laps, duration = WALKS[walk - 1]
+    parts, imu = list_rectangle(perimeter, laps), ELLIPSE2.at(_check_rate(rate))
     return _walk(
-        "ren2021", seed, duration, list_rectangle(perimeter, laps), ELLIPSE2.at(_check_rate(rate)), exact, compensated, True,
-        {"walk": walk, "laps": laps},
+        "ren2021", seed, duration, parts, imu, exact, compensated, True, {"walk": walk, "laps": laps}
     )  # fmt: skip
 
 
