@@ -55,7 +55,7 @@ def main() -> None:
         recording = load(data / name if (data / name).exists() else name).crop(0.0, LONGEST)
         settings, frame = Settings(), LocalFrame(choose_origin(recording))
         found = prepare(recording, settings, frame, detect(recording, settings))
-        problem, start, nodes = found.problem, found.smoothed.states, found.smoothed.nodes(found.problem)
+        problem, start, nodes = found.problem, found.smoothed.states, found.smoothed.select_nodes(found.problem)
         best = batch(problem, start, nodes)
         whole = isam2(problem).settled
         tell(name, "batch", (whole.states, whole.covariance), (best.states, best.covariance))

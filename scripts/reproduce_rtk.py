@@ -134,7 +134,7 @@ def simulate_imu(t: Array, places: Array, seed: int = 1) -> tuple[Array, Array, 
     place = np.stack([one(at[:-1] + 0.5 * dt[:, 0]) for one in path], -1)
     force = np.diff(v, axis=0) / dt + 2.0 * np.cross(frame.omega_n, 0.5 * (v[1:] + v[:-1])) - frame.gravity_n(place)
     force = np.einsum("nji,nj->ni", middle, force)
-    gyro, accel, _, _ = MEMS.at(_RATE).read(rate, force, seed)
+    gyro, accel, _, _ = MEMS.change_rate(_RATE).read(rate, force, seed)
     return at[1:], gyro, accel, frame
 
 

@@ -46,7 +46,7 @@ class GroundSpeed(Constraint):
 
 
 drive = graphnav.load("data/tokyo").crop(0.0, 60.0)
-seen = RADAR.series(drive.odometer.t, {"speed": np.abs(drive.odometer.speed)}, sigma=0.2)  # for want of a radar
+seen = RADAR.make_series(drive.odometer.t, {"speed": np.abs(drive.odometer.speed)}, sigma=0.2)  # for want of a radar
 write_folder(replace(drive, odometer=None, sensors={"radar": seen}), "out/radar")
 recording = graphnav.load("out/radar")
 solution = graphnav.run(recording, solvers=("rts",), constraints=[GroundSpeed])["rts"]

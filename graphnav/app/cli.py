@@ -138,7 +138,7 @@ def info(
         more = find_wrong_arms(found.recording, found.findings) if found.trusted and not quick else []
         last = [find_antenna(whole).finding] if antenna else find_untold_arm(found.recording)
         found = replace(found, findings=(*more, *found.findings, *last))
-    show(found.text, found.values, quiet, json)
+    show(found.format, found.to_dict, quiet, json)
 
 
 @app.command(context_settings=SEVERAL, epilog="\b\nExample:\n  graphnav detect kitti -o out/kitti")

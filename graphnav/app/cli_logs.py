@@ -140,13 +140,13 @@ def allan(
         with stage_results(folder) as part:
             written = pages.write(result, part)
     written = resolve_final_path(written, part, folder)
-    lines = [f"{result.duration:.0f} s at rest, {result.rate:.4g} Hz", "", "[imu.noise]", *result.lines(), ""]
+    lines = [f"{result.duration:.0f} s at rest, {result.rate:.4g} Hz", "", "[imu.noise]", *result.format_lines(), ""]
     show(
         lambda: "\n".join([*lines, *(f"wrote {path}" for path in written)]),
         lambda: {
             "duration_s": result.duration,
             "rate_hz": result.rate,
-            "noise": loads("\n".join(result.lines())),
+            "noise": loads("\n".join(result.format_lines())),
             "files": written,
         },
         quiet,
@@ -245,7 +245,7 @@ def simulate(
             files = made.write(part)
     files = resolve_final_path(files, part, folder)
     show(
-        lambda: "\n".join([made.text(), *(f"  {file}" for file in files)]),
+        lambda: "\n".join([made.format(), *(f"  {file}" for file in files)]),
         lambda: {"scenario": scenario, "seed": seed, "options": options, "stops": made.stops, "files": files},
         quiet,
         json,

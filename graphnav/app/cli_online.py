@@ -105,7 +105,7 @@ def online(
                 session.stop()
         finally:
             session.close()
-            shown.last()
+            shown.finish()
     if asked and not session.done:
         raise Interrupted("interrupted" + (f"; go on with --resume -o {folder}" if folder else ""))
     session.require_settled()
@@ -280,7 +280,7 @@ class LiveView:
             table.add_row(label, value)
         self.live.update(table, refresh=True)
 
-    def last(self) -> None:
+    def finish(self) -> None:
         self.update()
         if self.live is not None:
             self.live.stop()

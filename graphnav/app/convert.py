@@ -266,8 +266,8 @@ def _move_parts(solution: Solution, rate: float | None, arm: Array) -> Iterator[
     """The trajectory of the point at the end of a lever arm, in parts."""
     # between keyframes a second apart the turn rate, and with it the point's velocity, would be uncertain
     dense = max(rate or 0.0, _DENSE_RATE)
-    there = [piece.times(dense) for piece in solution.between]
-    wanted = solution.t if rate is None else np.concatenate([piece.times(rate) for piece in solution.between])
+    there = [piece.list_times(dense) for piece in solution.between]
+    wanted = solution.t if rate is None else np.concatenate([piece.list_times(rate) for piece in solution.between])
     for t in np.split(wanted, np.flatnonzero(np.diff(np.floor(wanted * (dense / _ROWS_AT_ONCE)))) + 1):
         # one row on each side for the position, two for the turn rate, and one to spare
         around = [

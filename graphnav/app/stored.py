@@ -56,11 +56,11 @@ class Straight:
         """Last time, s."""
         return float(self.t[-1])
 
-    def times(self, rate: float) -> Array:
+    def list_times(self, rate: float) -> Array:
         """The times of output, as of the stored solution."""
         return list_times(self.start, self.end, rate)
 
-    def apart(self, t: Array) -> tuple[States, dict[str, Array]]:
+    def interpolate_blocks(self, t: Array) -> tuple[States, dict[str, Array]]:
         """States, with covariances (6, M) of position, velocity and attitude each by itself."""
         states, P = self(t)
         return states, split_covariance(P)

@@ -56,7 +56,7 @@ def summarise_solver(
         "stationary": {
             "stops": len(solution.stationary),
             "seconds": float(np.diff(solution.stationary).sum()),
-            "each": [stop.values() for stop in list_solution_stops(solution)],
+            "each": [stop.to_dict() for stop in list_solution_stops(solution)],
         },
         "ambiguities": _count_ambiguities(solution),
         "iterations": solution.iterations,
@@ -81,8 +81,8 @@ def summarise_solver(
         "gps_zero": outcome.recording.gps_zero,
         "notes": list(dict.fromkeys(notes)),
         "remarks": list(outcome.findings),
-        "checks": [f.values() for f in outcome.checks],
-        "messages": [f.values() for f in messages],
+        "checks": [f.to_dict() for f in outcome.checks],
+        "messages": [f.to_dict() for f in messages],
         "settings": outcome.request.select_settings(solution.solver).model_dump(),
         "provenance": provenance,
     }

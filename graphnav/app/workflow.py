@@ -213,7 +213,7 @@ def _run(request: Request, progress: Progress | None) -> Outcome:
 
     given = request.noise
     model = None if given is None else given.model
-    if request.loose and not used.tight(request.settings.raw_gnss.coupling):
+    if request.loose and not used.is_tight(request.settings.raw_gnss.coupling):
         raise ConfigError(
             f"--loose: '{used.name}' has no raw observations that are used in place of fixes", key="option.not_here"
         )

@@ -91,7 +91,7 @@ def format_settings(settings: Settings) -> str:
         for name, field in type(section).model_fields.items():
             value = getattr(section, name)
             if name == "sensors":  # a table for each sensor, whether set or not
-                nested |= {f"{name}.{sensor}": settings.sensor(sensor) for sensor in list_sensors()}
+                nested |= {f"{name}.{sensor}": settings.get_sensor(sensor) for sensor in list_sensors()}
                 continue
             if isinstance(value, BaseModel):
                 nested[name] = value

@@ -128,7 +128,7 @@ class Settings(Section):
         default = SensorSettings()  # not kept, so that settings with and without it are equal
         return {name: one for name, one in sensors.items() if one != default}
 
-    def sensor(self, name: str) -> SensorSettings:
+    def get_sensor(self, name: str) -> SensorSettings:
         """How a sensor is used; the defaults where nothing is set."""
         return self.sensors.get(name, SensorSettings())
 

@@ -48,7 +48,7 @@ def check_own(kinds: Sequence[type[Constraint]]) -> tuple[type[Constraint], ...]
         missing += sorted(kind.__abstractmethods__)
         if kind.linearize is Constraint.linearize and kind.residual is Constraint.residual:
             missing.append("residual (or linearize)")
-        if kind.watched and kind.typical_error is Constraint.typical_error:
+        if kind.watched and kind.compute_typical_error is Constraint.compute_typical_error:
             missing.append("typical_error (it is watched)")
         if missing:
             raise ConfigError(f"{what} lacks {', '.join(missing)}", key="class.incomplete")

@@ -53,7 +53,7 @@ class BarometricHeight(Constraint):
 
     @classmethod
     def build(cls, scene: BuildContext) -> BarometricHeight | None:
-        series, s = scene.series(SENSOR.name), scene.settings.sensor(SENSOR.name)
+        series, s = scene.get_series(SENSOR.name), scene.settings.get_sensor(SENSOR.name)
         if series is None:
             return None
         figures = series.figures

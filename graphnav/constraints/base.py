@@ -49,7 +49,7 @@ class BuildContext(Shared):
     speed: MeanSpeed | None = None  # preintegrated odometer, where it is available
     typical_sigmas: Array | None = None  # (M, 3) m, typical sigma stated by the fixes, where it is available
 
-    def series(self, name: str) -> Series | None:
+    def get_series(self, name: str) -> Series | None:
         """The rows of a sensor of `graphnav.sensors`.
 
         Parameters
@@ -63,7 +63,7 @@ class BuildContext(Shared):
             None where there are none, or the settings exclude it.
         """
         series = self.recording.sensors.get(name)
-        return series if series is not None and len(series) and self.settings.sensor(name).use else None
+        return series if series is not None and len(series) and self.settings.get_sensor(name).use else None
 
     def find_keyframes(self, t: Array) -> Array:
         """Index of the keyframe at each time.
@@ -144,13 +144,13 @@ class Constraint(ABC):
         """
         return {}
 
-    def noise_groups(self) -> tuple[tuple[str, ...], Array]:
+    def list_noise_groups(self) -> tuple[tuple[str, ...], Array]:
         """Names of the variance components of the rows, and the component of each number (N, m); -1 for none."""
         names = tuple(dict.fromkeys(self.noise_axes))
         index = [names.index(axis) for axis in self.noise_axes] or [-1] * len(self.axes)
         return tuple(f"{self.name}.{name}" for name in names), np.tile(index, (len(self), 1))
 
-    def typical_error(self) -> Array:
+    def compute_typical_error(self) -> Array:
         """(m,) typical 1-sigma of a whole error, white and time-correlated, of watched rows."""
         raise NotImplementedError(f"{self.name}: rows that are watched say what their errors usually are")
 

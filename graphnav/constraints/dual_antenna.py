@@ -49,14 +49,14 @@ class Baseline(Constraint):
     @classmethod
     def epochs(cls, recording: Recording, settings: Settings, stationary: Array) -> Array:
         series = recording.sensors.get(SENSOR.name)
-        if series is None or not settings.sensor(SENSOR.name).use:
+        if series is None or not settings.get_sensor(SENSOR.name).use:
             return np.empty(0)
         inside = (series.t >= recording.start - SAME_TIME) & (series.t <= recording.end + SAME_TIME)
         return series.t[inside & np.isfinite(series[cls.column])]
 
     @classmethod
     def build(cls, scene: BuildContext) -> Self | None:
-        series, s = scene.series(SENSOR.name), scene.settings.sensor(SENSOR.name)
+        series, s = scene.get_series(SENSOR.name), scene.settings.get_sensor(SENSOR.name)
         if series is None:
             return None
         keyframe = scene.find_keyframes(series.t)
@@ -64,7 +64,7 @@ class Baseline(Constraint):
         if not used.any():
             return None
         figures = series.figures
-        sigma = series.sigma(cls.column, np.radians(figures.sigma))[used, None]
+        sigma = series.get_sigma(cls.column, np.radians(figures.sigma))[used, None]
         times = scene.settings.gnss.slow_times
         lasting = Parameter(
             cls.name_lasting(), np.zeros(1), np.median(sigma, axis=0), "rad", correlation_time=times[0],
@@ -97,7 +97,7 @@ class Baseline(Constraint):
         assert self.frame is not None
         C = self.frame.R_ln(states.p) @ states.R_nb
         d = C @ self.baseline
-        angle, by_d = self.angle(d)
+        angle, by_d = self.compute_angle(d)
         residual = angle - self.measured[rows]
         jacobians: dict[str, Any] = {"theta": -by_d[:, None, :] @ C @ rotation.skew(self.baseline)}
         for name in (self._name_offset(), self.name_lasting()):
@@ -107,7 +107,7 @@ class Baseline(Constraint):
         return Linearized((residual + np.pi) % (2.0 * np.pi) - np.pi, jacobians, self.sigma[rows])
 
     @abstractmethod
-    def angle(self, d: Array) -> tuple[Array, Array]:
+    def compute_angle(self, d: Array) -> tuple[Array, Array]:
         """The angle (n, 1) of directions d (n, 3) in local axes, and its derivative by them (n, 3)."""
 
 
@@ -120,7 +120,7 @@ class DualHeading(Baseline):
     noise_axes: ClassVar[tuple[str, ...]] = ("heading",)
     column: ClassVar[str] = "heading"
 
-    def angle(self, d: Array) -> tuple[Array, Array]:
+    def compute_angle(self, d: Array) -> tuple[Array, Array]:
         e, n = d[:, 0], d[:, 1]
         level2 = e * e + n * n
         return np.arctan2(e, n)[:, None], np.stack([n / level2, -e / level2, np.zeros_like(e)], -1)
@@ -135,7 +135,7 @@ class DualPitch(Baseline):
     noise_axes: ClassVar[tuple[str, ...]] = ("pitch",)
     column: ClassVar[str] = "pitch"
 
-    def angle(self, d: Array) -> tuple[Array, Array]:
+    def compute_angle(self, d: Array) -> tuple[Array, Array]:
         e, n, u = d.T
         level = np.hypot(e, n)
         whole = level * level + u * u

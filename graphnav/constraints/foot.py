@@ -120,7 +120,7 @@ class Stance(Constraint):
         phase = self.phase[rows][:, None]
         lever = parameters[PIVOT].copy()
         lever[:, :2] += phase * parameters[TRAVEL]
-        found, omega, J = self.past.velocity(states, parameters, rows, lever)
+        found, omega, J = self.past.compute_velocity(states, parameters, rows, lever)
         by_lever = rotation.skew(omega)
         u = found[:, :3]
         J = {name: x[:, :3] for name, x in J.items()} | {PIVOT: by_lever, TRAVEL: phase[..., None] * by_lever[..., :2]}
@@ -190,7 +190,7 @@ class FootLateral(Constraint):
 
     def linearize(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> Linearized:
         assert self.past is not None
-        found, _, J = self.past.velocity(states, parameters, rows, np.zeros((len(states), 3)))
+        found, _, J = self.past.compute_velocity(states, parameters, rows, np.zeros((len(states), 3)))
         u = found[:, :3]
         axis = np.concatenate([np.ones((len(states), 1)), parameters[FOOT_AXIS]], axis=1)[:, None]
         J = {name: axis @ x[:, :3] for name, x in J.items()} | {FOOT_AXIS: u[:, None, 1:]}

@@ -119,7 +119,7 @@ class GnssPosition(Constraint):
 
     @classmethod
     def epochs(cls, recording: Recording, settings: Settings, stationary: Array) -> Array:
-        if recording.gnss is None or not settings.gnss.position or recording.tight(settings.raw_gnss.coupling):
+        if recording.gnss is None or not settings.gnss.position or recording.is_tight(settings.raw_gnss.coupling):
             return _make_empty(0)
         t = recording.gnss.t
         return t[_mask_covered(recording, t)]
@@ -127,7 +127,7 @@ class GnssPosition(Constraint):
     @classmethod
     def build(cls, scene: BuildContext) -> GnssPosition | None:
         gnss = scene.recording.gnss
-        tight = scene.recording.tight(scene.settings.raw_gnss.coupling)
+        tight = scene.recording.is_tight(scene.settings.raw_gnss.coupling)
         if gnss is None or not scene.settings.gnss.position or tight:
             return None
         keyframe = scene.find_keyframes(gnss.t)
@@ -170,9 +170,9 @@ class GnssPosition(Constraint):
             **common,
         )
 
-    def noise_groups(self) -> tuple[tuple[str, ...], Array]:
+    def list_noise_groups(self) -> tuple[tuple[str, ...], Array]:
         if self.type is None:
-            return super().noise_groups()
+            return super().list_noise_groups()
         kinds, which = np.unique(self.type, return_inverse=True)
         names = tuple(
             f"{self.name}.{FIX_TYPES[int(kind)]}.{axis}" for kind in kinds for axis in dict.fromkeys(self.noise_axes)
@@ -183,7 +183,7 @@ class GnssPosition(Constraint):
         processes = tuple(replace(p, spacing=typical.spacing) for p in self.processes)
         return replace(self, drive_error=typical.overall(), processes=processes)
 
-    def typical_error(self) -> Array:
+    def compute_typical_error(self) -> Array:
         return _bound_typical_error(self)
 
     def linearize(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> Linearized:
@@ -210,12 +210,12 @@ class GnssPosition(Constraint):
             if name.startswith(ERRORS):
                 # a lasting error in units that change from fix to fix would be observable by these changes
                 unit = self.drive_error if name.startswith(ERRORS[1:]) else self.unit_error[rows]
-                size = np.broadcast_to(unit, residual.shape) * self._of(name, rows)
+                size = np.broadcast_to(unit, residual.shape) * self._mask_type(name, rows)
                 residual = residual + size * parameters[name]
                 jacobians[name] = size[..., None] * _I3
         return Linearized(residual, jacobians, self.sigma[rows])
 
-    def _of(self, name: str, rows: slice | Array) -> float | Array:
+    def _mask_type(self, name: str, rows: slice | Array) -> float | Array:
         """1 where a process is the error of a fix, 0 where the fix is of another type."""
         if self.type is None:
             return 1.0
@@ -248,7 +248,7 @@ class GnssVelocity(Constraint):
     @classmethod
     def epochs(cls, recording: Recording, settings: Settings, stationary: Array) -> Array:
         gnss = recording.gnss
-        tight = recording.tight(settings.raw_gnss.coupling)
+        tight = recording.is_tight(settings.raw_gnss.coupling)
         if gnss is None or gnss.v is None or not settings.gnss.velocity or tight:
             return _make_empty(0)
         t = gnss.velocity_t
@@ -257,7 +257,7 @@ class GnssVelocity(Constraint):
     @classmethod
     def build(cls, scene: BuildContext) -> GnssVelocity | None:
         gnss = scene.recording.gnss
-        tight = scene.recording.tight(scene.settings.raw_gnss.coupling)
+        tight = scene.recording.is_tight(scene.settings.raw_gnss.coupling)
         if gnss is None or gnss.v is None or gnss.sd_v is None or not scene.settings.gnss.velocity or tight:
             return None
         t = gnss.velocity_t
@@ -290,7 +290,7 @@ class GnssVelocity(Constraint):
         processes = tuple(replace(p, spacing=typical.spacing) for p in self.processes)
         return replace(self, unit_error=typical.around(self.keyframe)[:, 3:], processes=processes)
 
-    def typical_error(self) -> Array:
+    def compute_typical_error(self) -> Array:
         return _bound_typical_error(self)
 
     def linearize(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> Linearized:

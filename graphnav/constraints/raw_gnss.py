@@ -134,7 +134,7 @@ class SatelliteConstraint(Constraint):
         names = np.array([name_satellite(s) for s in known])[which]
         return {"satellite": names, "azimuth": self.azimuth, "elevation": self.elevation}
 
-    def noise_groups(self) -> tuple[tuple[str, ...], Array]:
+    def list_noise_groups(self) -> tuple[tuple[str, ...], Array]:
         there, which = np.unique(self.level, return_inverse=True)
         return tuple(f"{self.name}.{_CLASSES[int(k)]}" for k in there), which[:, None]
 

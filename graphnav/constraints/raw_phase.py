@@ -63,7 +63,7 @@ class GnssPhase(RangeConstraint):
     slots: tuple[str, ...] = ()  # names of the ambiguities
     group: Array = field(default_factory=lambda: np.empty(0, dtype=int))  # (slots,) system and signal; -1: no integers
 
-    def noise_groups(self) -> tuple[tuple[str, ...], Array]:
+    def list_noise_groups(self) -> tuple[tuple[str, ...], Array]:
         return (), np.full((len(self), 1), -1)
 
     @classmethod

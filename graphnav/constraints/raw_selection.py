@@ -18,7 +18,7 @@ EARLY = 0.05  # s by which an epoch may come before the next is due: stamps jitt
 def select_observations(recording: Recording, settings: Settings) -> RawGnss | None:
     """The rows to be used: of one signal for each satellite, strong enough, where the IMU is."""
     s, raw = settings.raw_gnss, recording.raw_gnss
-    if raw is None or not recording.tight(s.coupling) or not len(raw):
+    if raw is None or not recording.is_tight(s.coupling) or not len(raw):
         return None
     used = select_usable(raw, s)
     if raw.catalogue is None:  # a piece of a series has the epoch before it as well, from which carriers change

@@ -88,7 +88,7 @@ class IntervalMotion:
         felt = np.concatenate([-iv.past_dV[rows], iv.force[rows]], axis=1)
         return cls(frame, by_seen, by_ba, felt, *(x[rows] for x in (iv.ba, iv.bg, iv.rate, iv.force)))
 
-    def velocity(
+    def compute_velocity(
         self, states: States, parameters: dict[str, Array], rows: slice | Array, lever: Array
     ) -> tuple[Array, Array, dict[str, Array]]:
         """u (N, 3) at a lever arm and the mean acceleration, (N, 6), turn rate, and the derivatives of the first. All
@@ -153,10 +153,10 @@ class Wheels(Constraint):
     def epochs(cls, recording: Recording, settings: Settings, stationary: Array) -> Array:
         return np.empty(0)  # any keyframe is suitable
 
-    def _velocity(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> _Velocity:
+    def _compute_velocity(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> _Velocity:
         assert self.past is not None
         lever = self.lever_arm + (parameters[AXLE] * _E_Y if AXLE in parameters else np.zeros((len(states), 3)))
-        y, omega, J = self.past.velocity(states, parameters, rows, lever)
+        y, omega, J = self.past.compute_velocity(states, parameters, rows, lever)
         u, R, by_mounting = _rotate_to_vehicle(y[:, :3], parameters.get(MOUNTING, np.zeros((len(states), 2))))
         return _Velocity(u, omega, y[:, 4], R, by_mounting, J)
 
@@ -172,7 +172,9 @@ class _Velocity:
     by_mounting: Array  # (N, 3, 2)
     J: dict[str, Array]  # (N, 6, k) `IntervalMotion.velocity`
 
-    def derivatives(self, A: Array, parameters: dict[str, Array], by_forward: Array | None = None) -> dict[str, Array]:
+    def differentiate(
+        self, A: Array, parameters: dict[str, Array], by_forward: Array | None = None
+    ) -> dict[str, Array]:
         """Derivatives of A u (N, m) for A (N, m, 3), plus `by_forward` (N, m) times the forward acceleration."""
         B = A @ self.R_vb
         if by_forward is None:
@@ -270,20 +272,20 @@ class NonHolonomic(Wheels):
 
     def linearize(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> Linearized:
         assert self.past is not None
-        found = self._velocity(states, parameters, rows)
+        found = self._compute_velocity(states, parameters, rows)
         residual, u, omega = found.u[:, ::2], found.u, found.omega
         lasting = {}
         if NHC_ERROR in parameters:
             residual = residual + parameters[NHC_ERROR]
             lasting = {NHC_ERROR: np.broadcast_to(_I2, (len(u), 2, 2))}
         if BODY not in parameters:
-            return Linearized(residual, found.derivatives(_SIDE_UP, parameters) | lasting, self.sigma[rows])
+            return Linearized(residual, found.differentiate(_SIDE_UP, parameters) | lasting, self.sigma[rows])
         slip, squat = parameters[BODY].T
         v, w, a = u[:, 1], omega[:, 2], found.forward
         effect = stack_columns(v * v * w, v * a)
         A, by_forward = np.repeat(_SIDE_UP, len(v), axis=0), np.zeros((len(v), 2))
         A[:, 0, 1], A[:, 1, 1], by_forward[:, 1] = -2.0 * slip * v * w, -squat * a, -squat * v
-        jacobians = found.derivatives(A, parameters, by_forward)
+        jacobians = found.differentiate(A, parameters, by_forward)
         jacobians[BODY] = -effect[:, :, None] * _I2
         # contribution of the turn rate itself, v v d(omega_z)
         by_w = (slip * v * v)[:, None]
@@ -336,8 +338,10 @@ class OdometerSpeed(Wheels):
         parameters.append(Parameter(ODOMETER_SCALE, np.zeros(1), np.full(1, odometer.scale_sigma), "1", walk=walk))
         if odometer.delay_sigma > 0:
             parameters.append(Parameter(ODOMETER_DELAY, np.zeros(1), np.full(1, odometer.delay_sigma), "s"))
-        density = np.atleast_1d(np.hypot(s.odometer_density, np.median(speed.sigma(begin, end) * np.sqrt(end - begin))))
-        sigma = np.hypot(speed.sigma(begin, end), s.odometer_density / np.sqrt(end - begin))
+        density = np.atleast_1d(
+            np.hypot(s.odometer_density, np.median(speed.compute_sigma(begin, end) * np.sqrt(end - begin)))
+        )
+        sigma = np.hypot(speed.compute_sigma(begin, end), s.odometer_density / np.sqrt(end - begin))
         return cls(
             keyframe=rows + 1,
             past=past,
@@ -361,7 +365,7 @@ class OdometerSpeed(Wheels):
 
     def linearize(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> Linearized:
         assert self.speed is not None
-        found = self._velocity(states, parameters, rows)
+        found = self._compute_velocity(states, parameters, rows)
         if ODOMETER_DELAY in parameters:  # the current speed is read `delay` later
             delay = np.minimum(np.maximum(parameters[ODOMETER_DELAY][:, 0], -self.reach), self.reach)
             read, by_delay = self.speed(self.begin[rows], self.end[rows], delay)
@@ -370,7 +374,7 @@ class OdometerSpeed(Wheels):
         scale, ahead = 1.0 + parameters[ODOMETER_SCALE][:, 0], found.u[:, 1]
         A = _FORWARD if self.signed else np.where(ahead < 0.0, -1.0, 1.0)[:, None, None] * _FORWARD
         residual = (A[:, 0, 1] * ahead - scale * read)[:, None]
-        jacobians = found.derivatives(A, parameters)
+        jacobians = found.differentiate(A, parameters)
         jacobians[ODOMETER_SCALE] = -read[:, None, None]
         if ODOMETER_DELAY in parameters:
             jacobians[ODOMETER_DELAY] = -(scale * by_delay)[:, None, None]

@@ -27,7 +27,7 @@ class Finding:
     sentence: str
     key: str = ""  # a stable identifier, such as "imu.spike"
 
-    def values(self) -> dict[str, str]:
+    def to_dict(self) -> dict[str, str]:
         """The finding as a dictionary, for JSON."""
         return {"key": self.key, "severity": self.severity, "sentence": self.sentence}
 

@@ -86,7 +86,7 @@ class Outwards:
     speed: Array  # (n,) m/s, horizontal
     tolerance: Array  # (n,) m/s, 3 sigma of it
 
-    def within(self, first: float, last: float) -> NDArray[np.bool_] | None:
+    def find_between(self, first: float, last: float) -> NDArray[np.bool_] | None:
         """(n,) which rows lie between two times; None if none does, or if the rows do not reach so far."""
         there = (self.t >= first) & (self.t <= last)
         outer = last if self.way > 0 else first

@@ -216,7 +216,7 @@ def _contradicts_speed(b: Blocks, span: Array, speeds: list[Speeds], settings: F
 
 def _find_excess(beside: Outwards, s: Speeds, k: int, late: float) -> float:
     """m/s by which a measured speed exceeds every speed that a stop permits while it was measured; -inf if unknown."""
-    there = beside.within(s.t[k] - s.half - late, s.t[k] + s.half)
+    there = beside.find_between(s.t[k] - s.half - late, s.t[k] + s.half)
     if there is None:
         return -np.inf
     return float(s.speed[k] - np.max(beside.speed[there] + np.hypot(beside.tolerance[there], s.limit[k])))

@@ -90,7 +90,7 @@ def compute_glrt(
     """
     if len(accel) < window:
         return np.zeros(0)
-    return STATISTICS[name](sum_running(collect_rows(accel, gyro)).means(window), sigma_a, sigma_w, g)
+    return STATISTICS[name](sum_running(collect_rows(accel, gyro)).compute_means(window), sigma_a, sigma_w, g)
 
 
 @dataclass(frozen=True)
@@ -117,7 +117,7 @@ def compute_window_means(b: Blocks, length: float) -> Means | None:
     return Means(
         compute_window_times(middle, window),
         0.5 * length,
-        sum_running(rows).means(window),
+        sum_running(rows).compute_means(window),
         find_unbroken(whole, window, first=0),
     )
 

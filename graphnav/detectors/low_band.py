@@ -63,7 +63,7 @@ class Scale:
 def measure_spreads(low: LowPassed, window: int) -> Array:
     """Variance per axis of force and of rate in every window of low-passed rows, (W, 2); NaN across a gap."""
     rows = low.rows - low.rows.mean(axis=0)
-    sums = sum_running(np.concatenate([rows, rows**2], axis=1)).means(window)
+    sums = sum_running(np.concatenate([rows, rows**2], axis=1)).compute_means(window)
     spread = np.maximum(sums[:, 6:] - sums[:, :6] ** 2, 0.0)
     each = np.stack([spread[:, :3].mean(axis=1), spread[:, 3:].mean(axis=1)], -1)
     return np.where(find_unbroken(low.whole, window)[:, None], each, np.nan)

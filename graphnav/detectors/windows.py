@@ -69,7 +69,7 @@ class Sums:
     total: Array  # (K + 1, c)
     offset: Array  # (c,) subtracted before summing, so that sums over many hours keep their precision
 
-    def means(self, length: int, step: int = 1) -> Array:
+    def compute_means(self, length: int, step: int = 1) -> Array:
         """(W, c) means over windows of `length` rows that begin every `step` rows."""
         last = self.total[length::step]
         return np.asarray((last - self.total[: -length or None : step][: len(last)]) / length + self.offset)

@@ -52,7 +52,7 @@ class Dense:
         """Last keyframe, s."""
         return float(self.t[-1])
 
-    def times(self, rate: float) -> Array:
+    def list_times(self, rate: float) -> Array:
         """Multiples of 1/rate on the recording's clock, and both ends."""
         return list_times(self.start, self.end, rate)
 
@@ -61,7 +61,7 @@ class Dense:
         k, s = self._locate(t)
         return self._reach(t, k, s), _interpolate(self.covariance, k, s)
 
-    def apart(self, t: Array) -> tuple[States, dict[str, Array]]:
+    def interpolate_blocks(self, t: Array) -> tuple[States, dict[str, Array]]:
         """The same with covariances (6, M) of position, velocity and attitude each by itself."""
         k, s = self._locate(t)
         apart = {name: own.take(k, axis=1) + s * change.take(k, axis=1) for name, (own, change) in self._apart.items()}
@@ -106,7 +106,7 @@ class Dense:
         k = np.searchsorted(self.t, t, side="left") - 1
         # only of the intervals needed, so that few times cost little
         first, last = int(k[0]), int(k[-1]) + 1
-        samples, used = self.samples.between(self.t[first], self.t[last]), slice(first, last)
+        samples, used = self.samples.select_between(self.t[first], self.t[last]), slice(first, last)
         dR, dV, dP = integrate_within(samples, self.t[first : last + 1], t, self.ba[used], self.bg[used])
         return EarthMotion(t - self.t[k], self.frame).reach(slice(None), self.states[used], dR, dP, dV, k - first)
 

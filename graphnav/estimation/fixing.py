@@ -114,8 +114,8 @@ def fix(
         found,
         forward,
         smoothed,
-        filtered_epochs=epochs.fixed(causal.known),
-        smoothed_epochs=epochs.fixed(dict.fromkeys(epochs.keyframes, known)),
+        filtered_epochs=epochs.mark_fixed(causal.known),
+        smoothed_epochs=epochs.mark_fixed(dict.fromkeys(epochs.keyframes, known)),
         filtered_arcs=epochs.list_arcs(causal.known),
         smoothed_arcs=epochs.list_arcs(dict.fromkeys(epochs.keyframes, known)),
         notes=(_note(epochs, known),) if search else (),
@@ -210,24 +210,24 @@ class Held:
 def hold_on(before: Held, epochs: Epochs, k: int, here: Points, covariance: Callable[[], Array]) -> Held:
     """Find integers by what is known at a keyframe; let go of all where two epochs in a row contradict them."""
     known = before.known
-    if odd := bool(epochs.odd(k, here, known)):
+    if odd := bool(epochs.find_inconsistent(k, here, known)):
         known = Known() if before.odd else known
-        fixed = epochs.differences(k, known) >= FEWEST
+        fixed = epochs.count_differences(k, known) >= FEWEST
         return Held(known, True, let_go=before.odd, fixed=fixed, epoch=True)
     sets, found = epochs.group_arcs(k, known), []
     if any(len(some) > 1 for some in sets.values()):
         values = np.concatenate([np.zeros(DIM), here.values[0]])
-        lasting = epochs.lasting(k, lambda arc: float(epochs.time[k]))
+        lasting = epochs.compute_lasting(k, lambda arc: float(epochs.time[k]))
         found = _decide(sets, epochs.columns, values, covariance(), known, lasting, impose=False)
     if found:
         held = replace(known, of=known.of.copy())
         for a, b, n in found:
             held.join(a, b, n)
-        if epochs.odd(k, here, held):
+        if epochs.find_inconsistent(k, here, held):
             found = []
         else:
             known = held
-    return Held(known, odd, tuple(found), fixed=epochs.differences(k, known) >= FEWEST, epoch=True)
+    return Held(known, odd, tuple(found), fixed=epochs.count_differences(k, known) >= FEWEST, epoch=True)
 
 
 class _Causal:
@@ -270,10 +270,10 @@ def _sweep(epochs: Epochs, smoothed: SmootherPass, known: Known) -> None:
             continue
         tried.add(key)
         held = replace(known, of=known.of.copy())
-        lasting = epochs.lasting(k, epochs.last.__getitem__)
+        lasting = epochs.compute_lasting(k, epochs.last.__getitem__)
         for a, b, n in _decide(sets, epochs.columns, values[k], smoothed.P[k], known, lasting, impose=True):
             held.join(a, b, n)
-        if len(held.of) > len(known.of) and not epochs.odd(k, _fix_one(smoothed, k), held):
+        if len(held.of) > len(known.of) and not epochs.find_inconsistent(k, _fix_one(smoothed, k), held):
             known.of = held.of
 
 
@@ -316,7 +316,7 @@ def _let_go(epochs: Epochs, smoothed: SmootherPass, known: Known) -> bool:
     odd: Counter[Arc] = Counter()
     for k in epochs.keyframes:
         seen.update(epochs.active[k])
-        odd.update(epochs.odd(k, _fix_one(smoothed, k), known))
+        odd.update(epochs.find_inconsistent(k, _fix_one(smoothed, k), known))
     gone = {arc for arc, count in odd.items() if 2 * count > seen[arc]}
     for arc in gone:
         known.forget(arc)

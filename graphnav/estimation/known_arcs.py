@@ -71,7 +71,7 @@ class Epochs:
             self.rows[k], self.active[k] = slice(lo, hi), arcs[lo:hi]
         self.last = {arc: float(t[k]) for arc, k in zip(arcs, phase.keyframe.tolist(), strict=True)}  # s
 
-    def odd(self, k: int, here: Points, known: Known) -> list[Arc]:
+    def find_inconsistent(self, k: int, here: Points, known: Known) -> list[Arc]:
         """Arcs with integers that an epoch is not consistent with, and is without them.
 
         Parameters
@@ -103,7 +103,7 @@ class Epochs:
             kept[np.flatnonzero(kept)[np.argmax(left**2 / share)]] = False
         return [arcs[i] for i in used[~kept]]
 
-    def lasting(self, k: int, until: Callable[[Arc], float]) -> dict[Arc, float]:
+    def compute_lasting(self, k: int, until: Callable[[Arc], float]) -> dict[Arc, float]:
         """Cycles^2 that reflections add to what ambiguities at an epoch are told to, beyond white noise.
 
         An ambiguity takes up whatever lasts as long as its arc, so no smoother sees it.
@@ -117,9 +117,11 @@ class Epochs:
         more = self.phase.reflection[own] ** 2 * compute_variance_left(np.maximum(duration, 0.0), self.phase.period)
         return dict(zip(arcs, more.tolist(), strict=True))
 
-    def fixed(self, known: Mapping[int, Known]) -> Array:
+    def mark_fixed(self, known: Mapping[int, Known]) -> Array:
         """(E, 2) s, and 1 where enough differences are known; by keyframe."""
-        return np.array([[self.time[k], self.differences(k, known[k]) >= FEWEST] for k in self.keyframes], dtype=float)
+        return np.array(
+            [[self.time[k], self.count_differences(k, known[k]) >= FEWEST] for k in self.keyframes], dtype=float
+        )
 
     def list_arcs(self, known: Mapping[int, Known]) -> CarrierArcs:
         """The arcs, and where their ambiguities are held as integers, by what is known at each keyframe."""
@@ -141,6 +143,6 @@ class Epochs:
                 out.setdefault(self._group[arc[0]], {}).setdefault(known.find(arc)[0], []).append(arc)
         return {group: sorted(sets.values(), key=len, reverse=True) for group, sets in out.items()}
 
-    def differences(self, k: int, known: Known) -> int:
+    def count_differences(self, k: int, known: Known) -> int:
         """How many differences are known at an epoch."""
         return sum(len(one) - 1 for sets in self.group_arcs(k, known).values() for one in sets)

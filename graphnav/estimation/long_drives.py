@@ -68,7 +68,7 @@ def _limit_length(recording: Recording, settings: Settings) -> float:
     own.
     """
     raw, chosen = recording.raw_gnss, settings.raw_gnss
-    if raw is None or not recording.tight(chosen.coupling):
+    if raw is None or not recording.is_tight(chosen.coupling):
         return STRAIGHT
     against_base = (
         np.isfinite(raw.carrier_difference) if len(raw.carrier_difference) else np.zeros(len(raw), dtype=bool)
@@ -121,18 +121,18 @@ class _Span:
         P, start, end = whole.covariance, max(whole.start, start), min(whole.end, end)
         return cls(bare, P[before].copy(), own, P[behind].copy(), start, end)
 
-    def times(self, rate: float) -> Array:
+    def list_times(self, rate: float) -> Array:
         """Times at a rate inside the span."""
-        t = self.bare.times(rate)
+        t = self.bare.list_times(rate)
         return t[(t >= self.start) & (t <= self.end)]
 
     def __call__(self, t: Array) -> tuple[States, Array]:
         """As for the part."""
         return self._cover()(t)
 
-    def apart(self, t: Array) -> tuple[States, dict[str, Array]]:
+    def interpolate_blocks(self, t: Array) -> tuple[States, dict[str, Array]]:
         """As for the part."""
-        return self._cover().apart(t)
+        return self._cover().interpolate_blocks(t)
 
     def _cover(self) -> Dense:
         return replace(self.bare, covariance=np.concatenate([self.before, self.own, self.behind]))

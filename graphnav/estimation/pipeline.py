@@ -284,7 +284,7 @@ def _solve(
     if "batch" in solvers:
         from graphnav.estimation.factor_graph.batch import batch
 
-        out["batch"] = batch(problem, start.states, start.nodes(problem), progress=progress)
+        out["batch"] = batch(problem, start.states, start.select_nodes(problem), progress=progress)
         # includes the attempts before
         out["batch"] = replace(out["batch"], timings={**forward.solution.timings, **out["batch"].timings})
     begin = found.aligned.state if found.diverged else None

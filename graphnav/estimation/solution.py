@@ -34,7 +34,7 @@ class Between(Protocol):
         """Last time, s."""
         ...
 
-    def times(self, rate: float) -> Array:
+    def list_times(self, rate: float) -> Array:
         """Times at a rate, ends included."""
         ...
 
@@ -42,7 +42,7 @@ class Between(Protocol):
         """States and covariances (M, 15, 15) at times within it."""
         ...
 
-    def apart(self, t: Array) -> tuple[States, dict[str, Array]]:
+    def interpolate_blocks(self, t: Array) -> tuple[States, dict[str, Array]]:
         """The same with covariances (6, M) of position, velocity and attitude each by itself."""
         ...
 
@@ -214,7 +214,7 @@ class Solution:
         """
         t, states, covariance = self.t, self.states, self.covariance
         if rate is not None:
-            t, states, covariance = self.at(np.concatenate([b.times(rate) for b in self.between]))
+            t, states, covariance = self.at(np.concatenate([b.list_times(rate) for b in self.between]))
         return make_trajectory(
             self.solver, self.frame, t, states, covariance if joint else split_covariance(covariance)
         )
@@ -236,10 +236,10 @@ class Solution:
             yield self.trajectory(joint=False)
             return
         for piece in self.between:
-            times = piece.times(rate)
+            times = piece.list_times(rate)
             for k in range(0, len(times), _BLOCK_ROWS):
                 t = times[k : k + _BLOCK_ROWS]
-                yield make_trajectory(self.solver, self.frame, t, *piece.apart(t))
+                yield make_trajectory(self.solver, self.frame, t, *piece.interpolate_blocks(t))
 
     def at(self, t: Array) -> tuple[Array, States, Array]:
         """States between the keyframes.

@@ -45,7 +45,7 @@ def may_move(recording: Recording, settings: Settings) -> bool:
     """Whether offsets of stamps are estimated."""
     gnss = recording.gnss
     known = settings.noise.mode == "stated" or not settings.gnss.time_offset_sigma > 0.0
-    return gnss is not None and not known and not recording.tight(settings.raw_gnss.coupling)
+    return gnss is not None and not known and not recording.is_tight(settings.raw_gnss.coupling)
 
 
 def find_stamps(

@@ -27,7 +27,7 @@ class Stop:
     fired: Mapping[str, float]  # share of it that each detector calls stationary; detectors that call none are omitted
     rows: Mapping[str, int]  # number of rows of each constraint that were used because of it
 
-    def values(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, Any]:
         """The stop for JSON."""
         fired = {name: round(share, 3) for name, share in self.fired.items()}
         return {"start": round(self.start, 4), "end": round(self.end, 4), "fired": fired, "rows": dict(self.rows)}

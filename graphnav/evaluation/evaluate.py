@@ -1,7 +1,8 @@
 """Errors of a trajectory against a truth: at the truth's epochs, at its point, in its axes.
 
 `compute_errors` takes differences, `measure` reduces them to numbers, `summarise` and `format_metrics` present these;
-`evaluate` does all of it for two files and `evaluate_recording` for a solution of a recording, with or without a truth of its own.
+`evaluate` does all of it for two files and `evaluate_recording` for a solution of a recording, with or without a truth
+of its own.
 """
 
 from __future__ import annotations

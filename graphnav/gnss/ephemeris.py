@@ -180,7 +180,7 @@ class Ephemerides:
                     getattr(out, name)[own] = value
         return out
 
-    def delay(self, satellite: Ids, signal: Ids, frequency: Array, t: Array, zero: float) -> Array:
+    def compute_delay(self, satellite: Ids, signal: Ids, frequency: Array, t: Array, zero: float) -> Array:
         """(N,) group delay of a signal against the one that the broadcast clock is of, s; to be taken off the clock.
 
         TGD and BGD of the ICDs named above, scaled by frequency; of signals about which they say nothing it is 0.

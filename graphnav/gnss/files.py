@@ -58,16 +58,16 @@ class Lines:
     def __len__(self) -> int:
         return len(self.start)
 
-    def text(self, k: int) -> str:
+    def get_text(self, k: int) -> str:
         """Line k."""
         return bytes(self.data[self.start[k] : self.start[k] + self.length[k]]).decode("latin-1")
 
-    def first(self) -> NDArray[np.uint8]:
+    def list_first_bytes(self) -> NDArray[np.uint8]:
         """(L,) the first byte of each line, 0 of an empty one."""
         at = np.minimum(self.start, len(self.data) - 1)
         return np.where(self.length > 0, self.data[at], 0).astype(np.uint8)
 
-    def block(self, which: NDArray[np.intp], begin: int, end: int) -> NDArray[np.uint8]:
+    def take_block(self, which: NDArray[np.intp], begin: int, end: int) -> NDArray[np.uint8]:
         """(n, end - begin) bytes from column `begin` on of some lines, blanks where a line is shorter."""
         column = np.arange(begin, end)
         at = np.minimum(self.start[which][:, None] + column, len(self.data) - 1)

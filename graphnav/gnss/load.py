@@ -95,7 +95,7 @@ def load_raw(
         )
     _check_dates(obs, nav, precise, sources)
     if zero is not None:
-        obs = obs.on_clock(zero)
+        obs = obs.move_to_clock(zero)
     rover, corrected = _locate_roughly(obs, nav, precise, sources.corrected), sources.corrected
     if sources.nominal_stamps:
         obs = restore_own_stamps(obs, precise or nav, rover, corrected)  # type: ignore[arg-type]
@@ -103,7 +103,7 @@ def load_raw(
     antennas = {satellite: some for path in sources.antex for satellite, some in read_antex(path).items()}
     raw = replace(
         raw, lever_arm=np.array(sources.lever_arm), precise=precise is not None, antennas=antennas if precise else {},
-        clock_noise=precise.clock_noise() if precise else {},
+        clock_noise=precise.compute_clock_noise() if precise else {},
     )  # fmt: skip
     one = choose_primary(raw) & np.isfinite(raw.p[:, 0])
     if not one.any():
@@ -142,7 +142,7 @@ def _difference_by_base(
     raw: RawGnss, sources: Sources, nav: Ephemerides | None, precise: Orbits | None
 ) -> tuple[RawGnss, list[str]]:
     """The series with differences by the base station, and remarks."""
-    obs = read_rover(sources.base)[0].on_clock(raw.zero)
+    obs = read_rover(sources.base)[0].move_to_clock(raw.zero)
     given = sources.base_position
     position = obs.marker if given is None else np.array(given)
     if position is None:

@@ -59,7 +59,7 @@ def place(
         getattr(placed, name)[told] = getattr(found, name)[of]
     delay = np.zeros(len(obs))
     if nav is not None:
-        delay = nav.delay(obs.satellite, obs.signal, frequency, obs.t, obs.zero)
+        delay = nav.compute_delay(obs.satellite, obs.signal, frequency, obs.t, obs.zero)
     clock = np.where(np.isfinite(placed.clock), 0.0, np.nan) if corrected.clock else C * (placed.clock - delay)
     clock[np.isnan(frequency)] = np.nan  # nothing of the ionosphere can be said without
     remarks = [*(nav.remarks if nav is not None else ()), *(precise.remarks if precise is not None else ())]

@@ -54,7 +54,7 @@ class Orbits:
             out.clock[own] = clock - 2.0 * np.sum(p * v, axis=1) / C**2
         return out
 
-    def clock_noise(self) -> dict[int, tuple[float, float]]:
+    def compute_clock_noise(self) -> dict[int, tuple[float, float]]:
         """By satellite how far its clock is off a line between two nodes (m, 1-sigma in the middle), and their spacing.
 
         Between them a clock is a random walk. Of variance q h over a spacing h (s), its second differences have 2 q h
@@ -112,11 +112,11 @@ def _drop_repeated(t: Array, x: Array) -> tuple[Array, Array]:
 def _read_sp3(path: Path) -> tuple[Array, Ids, Array, Array]:
     """Times, satellites, positions (m) and clocks (s) of all position records."""
     lines = Lines(read_bytes(path))
-    head = lines.text(0)
+    head = lines.get_text(0)
     if head[:1] != "#" or head[1:2] not in "abcd":
         raise RecordingError(f"{path}: not an SP3 file; its first line begins '{head[:2]}'", key="file.kind")
-    scale = next((lines.text(k)[9:12] for k in range(min(30, len(lines))) if lines.text(k)[:2] == "%c"), "GPS")
-    first = lines.first()
+    scale = next((lines.get_text(k)[9:12] for k in range(min(30, len(lines))) if lines.get_text(k)[:2] == "%c"), "GPS")
+    first = lines.list_first_bytes()
     epoch = np.flatnonzero(first == ord("*"))
     own = np.flatnonzero(first == ord("P"))
     if not len(epoch) or not len(own):
@@ -125,15 +125,15 @@ def _read_sp3(path: Path) -> tuple[Array, Ids, Array, Array]:
     if not lines.whole and own[-1] == len(lines) - 1:
         own = own[:-1]
     try:
-        value = parse_numbers(lines.block(own, 4, 60), 14)
-        names = [bytes(x).decode() for x in lines.block(own, 1, 4)]
+        value = parse_numbers(lines.take_block(own, 4, 60), 14)
+        names = [bytes(x).decode() for x in lines.take_block(own, 1, 4)]
         ids = {name: _find_id(name) for name in set(names)}
     except ValueError:
         for k in own:
             try:
-                parse_numbers(lines.block(np.array([k]), 4, 60), 14)
+                parse_numbers(lines.take_block(np.array([k]), 4, 60), 14)
             except ValueError:
-                text = lines.text(int(k))[:60]
+                text = lines.get_text(int(k))[:60]
                 raise RecordingError(f"{path}, line {k + 1}: '{text}' is not a position", key="table.cell") from None
         raise RecordingError(f"{path}: names a satellite of an unknown system", key="raw.unknown_system") from None
     satellite = np.array([ids[name] for name in names], dtype=np.int16)
@@ -178,7 +178,7 @@ def _find_id(name: str) -> int:
 
 def _read_stamps(lines: Lines, which: NDArray[np.intp], begin: int, scale: str, path: Path) -> Array:
     """(n,) s since the GPS epoch of lines that hold a date from a column on."""
-    words = [lines.text(k)[begin:].split()[:6] for k in which]
+    words = [lines.get_text(k)[begin:].split()[:6] for k in which]
     try:
         return _read_dates(np.array(words, dtype=float), scale)
     except ValueError:

@@ -32,7 +32,7 @@ def read_header(lines: Lines, path: Path) -> Header:
     """Read up to END OF HEADER."""
     out, system, many = Header(), -1, 0
     for k in range(len(lines)):
-        text = lines.text(k)
+        text = lines.get_text(k)
         label, body = text[60:].strip(), text[:60]
         try:
             if label == "RINEX VERSION / TYPE":

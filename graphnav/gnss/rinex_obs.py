@@ -169,14 +169,14 @@ def _count_since_week(fields: Array, scale: str, used: NDArray[np.bool_]) -> tup
 
 
 def _read_version_3(lines: Lines, header: Header, path: Path, remarks: list[str]) -> _Body:
-    first = lines.first()
+    first = lines.list_first_bytes()
     first[: header.end] = 0
     epoch = np.flatnonzero(first == ord(">"))
     if not len(epoch):
         raise RecordingError(f"{path}: holds a header and no observations", key="file.no_rows")
     try:
         fields = _parse_calendar(lines, epoch, 2, 4)
-        flag, count = parse_numbers(lines.block(epoch, 29, 35), 3).T
+        flag, count = parse_numbers(lines.take_block(epoch, 29, 35), 3).T
     except ValueError:
         raise _refuse_epoch(lines, epoch, path) from None
     bad = (flag < 0) | (count < 0) | (~count_days(fields)[1] & ~(flag > 1))
@@ -184,7 +184,7 @@ def _read_version_3(lines: Lines, header: Header, path: Path, remarks: list[str]
         raise _refuse_epoch(lines, epoch[bad], path)
     flag, count = np.nan_to_num(flag).astype(int), np.nan_to_num(count).astype(int)
     system = _SYSTEM_OF[first]
-    own = np.flatnonzero((system >= 0) | _names_satellite(lines.block(np.arange(len(lines)), 0, 3)))
+    own = np.flatnonzero((system >= 0) | _names_satellite(lines.take_block(np.arange(len(lines)), 0, 3)))
     of = np.searchsorted(epoch, own) - 1
     keep = (of >= 0) & (own - epoch[np.maximum(of, 0)] <= count[np.maximum(of, 0)]) & (flag[np.maximum(of, 0)] <= 1)
     own, of = own[keep], of[keep]
@@ -198,18 +198,20 @@ def _read_version_3(lines: Lines, header: Header, path: Path, remarks: list[str]
         raise RecordingError(f"{path}: holds a header and no observations", key="file.no_rows")
     stamp, zero = _count_since_week(fields, header.scale, flag <= 1)
     try:
-        number = parse_numbers(lines.block(own, 1, 3), 2)[:, 0]
+        number = parse_numbers(lines.take_block(own, 1, 3), 2)[:, 0]
     except ValueError:
         number = np.full(len(own), np.nan)
     wrong = ~(number >= 1)
     if wrong.any():
         k = own[wrong][0]
-        raise RecordingError(f"{path}, line {k + 1}: '{lines.text(k)[:3]}' names no satellite", key="rinex.satellite")
+        raise RecordingError(
+            f"{path}, line {k + 1}: '{lines.get_text(k)[:3]}' names no satellite", key="rinex.satellite"
+        )
     satellite = (100 * system[own] + number).astype(np.int16)
     rows = _SatelliteLines(own, of, satellite)
 
     def cells(which: NDArray[np.intp], types: int) -> NDArray[np.uint8]:
-        return lines.block(rows.line[which], 3, 3 + _WIDTH * types)
+        return lines.take_block(rows.line[which], 3, 3 + _WIDTH * types)
 
     return stamp, zero, flag, rows, cells
 
@@ -225,12 +227,12 @@ def _take_first(value: Array) -> Array:
 def _parse_calendar(lines: Lines, epoch: NDArray[np.intp], begin: int, year: int) -> Array:
     """(n, 6) date and time of epoch lines, year first."""
     n = len(epoch)
-    whole = [parse_numbers(lines.block(epoch, begin, begin + year), year)]
+    whole = [parse_numbers(lines.take_block(epoch, begin, begin + year), year)]
     at = begin + year
     for _ in range(4):
-        whole.append(parse_numbers(lines.block(epoch, at, at + 3), 3))
+        whole.append(parse_numbers(lines.take_block(epoch, at, at + 3), 3))
         at += 3
-    whole.append(parse_numbers(lines.block(epoch, at, at + 11), 11))
+    whole.append(parse_numbers(lines.take_block(epoch, at, at + 11), 11))
     return np.concatenate(whole, axis=1).reshape(n, 6)
 
 
@@ -245,7 +247,7 @@ def _read_version_2(lines: Lines, header: Header, path: Path, remarks: list[str]
     unknown: list[str] = []
     k, cut = header.end, False
     while k < len(lines):
-        text = lines.text(k)
+        text = lines.get_text(k)
         if not text.strip():
             k += 1
             continue
@@ -263,7 +265,7 @@ def _read_version_2(lines: Lines, header: Header, path: Path, remarks: list[str]
             k += 1 + count
             continue
         more = max(1, -(-count // 12))
-        names = "".join(lines.text(j)[32:68].ljust(36) for j in range(k, min(k + more, len(lines))))
+        names = "".join(lines.get_text(j)[32:68].ljust(36) for j in range(k, min(k + more, len(lines))))
         begin = k + more
         whole = min(count, max(0, (len(lines) - begin) // each))
         if whole < count or (begin + count * each == len(lines) and not lines.whole):
@@ -305,7 +307,7 @@ def _read_version_2(lines: Lines, header: Header, path: Path, remarks: list[str]
     )
 
     def cells(which: NDArray[np.intp], types: int) -> NDArray[np.uint8]:
-        parts = [lines.block(rows.line[which] + j, 0, 5 * _WIDTH) for j in range(each)]
+        parts = [lines.take_block(rows.line[which] + j, 0, 5 * _WIDTH) for j in range(each)]
         return np.concatenate(parts, axis=1)[:, : _WIDTH * types]
 
     stamp, zero = _count_since_week(fields, header.scale, np.ones(len(epoch), dtype=bool))
@@ -346,7 +348,7 @@ def _refuse_epoch(lines: Lines, epoch: NDArray[np.intp], path: Path, begin: int 
     """For the first epoch line that is none; its date begins at a column, two digits of the year in version 2."""
     end = begin + 27 if begin else 26
     for k in epoch:
-        text = lines.text(k)
+        text = lines.get_text(k)
         try:
             date = np.array([[parse_number(word) for word in text[begin:end].split()]])
             date[:, 0] += 0 if begin else np.where(date[:, 0] < 80, 2000, 1900)

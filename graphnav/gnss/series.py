@@ -51,7 +51,7 @@ class Observations:
         }
         return replace(self, **own)
 
-    def on_clock(self, zero: float) -> Observations:
+    def move_to_clock(self, zero: float) -> Observations:
         """The same on a clock with another zero (s since the GPS epoch)."""
         return replace(self, t=self.t + (self.zero - zero), zero=zero)
 
@@ -71,7 +71,7 @@ def join_files(parts: list[Observations]) -> Observations:
     if len(parts) == 1:
         return parts[0]
     zero = parts[0].zero
-    parts = [part.on_clock(zero) for part in parts]
+    parts = [part.move_to_clock(zero) for part in parts]
     arrays = {
         f.name: np.concatenate([getattr(part, f.name) for part in parts])
         for f in fields(Observations)

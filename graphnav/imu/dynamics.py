@@ -199,7 +199,7 @@ class ImuFactors:
         out[:, :9, half:] = differentiate_by_scale(F[:, :9, 9:12], iv.force[rows], half)
         return out
 
-    def frames(self, rows: slice, R_nb: Array) -> Array:
+    def compute_frames(self, rows: slice, R_nb: Array) -> Array:
         """(n, 15, 15) from the frames of `Intervals.covariance` to the error state at the end."""
         n = len(R_nb)
         L = np.zeros((n, DIM, DIM))
@@ -208,17 +208,17 @@ class ImuFactors:
         L[:, 9:15, 9:15] = _I6
         return L
 
-    def noise(self, rows: slice, R_nb: Array) -> Array:
+    def compute_noise(self, rows: slice, R_nb: Array) -> Array:
         """Q (n, 15, 15), covariance of the end's error state, for starts with attitudes R_nb."""
         Q, turned = self.intervals.covariance[rows].copy(), self._turn(rows, R_nb)
         Q[:, 3:9] = turned @ Q[:, 3:9]
         Q[:, :, 3:9] = Q[:, :, 3:9] @ np.swapaxes(turned, -1, -2)
         return np.asarray(Q)
 
-    def residual(self, states: States, scale: Array | None = None) -> Array:
+    def compute_residual(self, states: States, scale: Array | None = None) -> Array:
         """(n, 15) end minus prediction for all intervals, in the frames of `Intervals.covariance`."""
         ahead = self.advance(slice(None), states[:-1], scale)
-        return self._body(states[1:].minus(ahead), states.R_nb[:-1])
+        return self._rotate(states[1:].minus(ahead), states.R_nb[:-1])
 
     def linearize(self, states: States, scale: Array | None = None) -> tuple[Array, Array, Array, Array]:
         """`residual` of all intervals, its Jacobians by both ends (n, 15, 15) and by the scale (n, 15, k)."""
@@ -233,7 +233,7 @@ class ImuFactors:
         Jj = np.zeros_like(F)
         Jj[:] = np.eye(DIM)
         Jj[:, :3, :3] = inverse
-        value = self._body(r, start.R_nb)
+        value = self._rotate(r, start.R_nb)
         both, Jj = self.rotate_to_body(both, start.R_nb), self.rotate_to_body(Jj, start.R_nb)
         # the frame of p and v rotates with the start's attitude
         both[:, 3:6, :3] += rotation.skew(value[:, 3:6])
@@ -249,7 +249,7 @@ class ImuFactors:
         out[:, 6:9] = Rt @ (J[:, 6:9] + self.frame.W @ J[:, 3:6])
         return out
 
-    def _body(self, r: Array, R_nb: Array) -> Array:
+    def _rotate(self, r: Array, R_nb: Array) -> Array:
         return self.rotate_to_body(r[..., None], R_nb)[..., 0]
 
 

@@ -34,7 +34,7 @@ class Samples:
     start: float  # start of the first period
     bridged: Array  # (g, 2) start and end of every bridged gap, s
 
-    def between(self, begin: float, end: float) -> Samples:
+    def select_between(self, begin: float, end: float) -> Samples:
         """The samples whose periods overlap the span between two times (s), as views."""
         k = slice(np.searchsorted(self.t, begin, side="left"), np.searchsorted(self.t, end, side="left") + 1)
         rows = {name: getattr(self, name)[k] for name in ("t", "gyro", "accel", "extra_gyro", "extra_accel")}

@@ -37,20 +37,20 @@ def live(newest: Message, T: float, frame: LocalFrame, sensors: Sensors, noise: 
     now = sensors.imu.newest
     state, P = newest.state, newest.covariance
     if now > T + SAME_TIME:
-        imu = sensors.recording(T - 1.0, now).imu
-        factors = np.array([noise.factor(f"imu.{name}", 1.0) for name in NOISE_FIGURES])
+        imu = sensors.make_recording(T - 1.0, now).imu
+        factors = np.array([noise.get_factor(f"imu.{name}", 1.0) for name in NOISE_FIGURES])
         ends, differs = np.array([T, now]), bool(np.any(factors != 1.0))
         intervals = preintegrate(bridge_gaps(imu), imu, ends, state.ba[0], state.bg[0], differs)
         if differs:
             intervals = intervals.with_noise(factors)
         motion, one = ImuFactors(intervals, frame), slice(0, 1)
-        scale = newest.value(SCALE) if SCALE in newest.columns else None
+        scale = newest.get_value(SCALE) if SCALE in newest.columns else None
         ahead, F15 = motion.propagate(one, state, scale)
         F = np.zeros((DIM, len(P)))
         F[:, :DIM] = F15[0]
         if scale is not None:
             F[:, newest.columns[SCALE]] = motion.scale_columns(one, F15, len(scale))[0]
-        P = F @ P @ F.T + motion.noise(one, state.R_nb)[0]
+        P = F @ P @ F.T + motion.compute_noise(one, state.R_nb)[0]
         state = ahead
     return Live(float(max(now, T)), state, P[:DIM, :DIM], T)
 
@@ -66,10 +66,10 @@ def predict_since(
     if not len(t):
         return t, newest.state[:0], np.empty((0, DIM, DIM))
     now = live(newest, T, frame, sensors, noise)
-    imu, start = sensors.recording(T - 1.0, now.t).imu, newest.state
+    imu, start = sensors.make_recording(T - 1.0, now.t).imu, newest.state
     ba, bg = start.ba, start.bg
     if SCALE in newest.columns:
-        scale, rows = newest.value(SCALE), imu.t > T
+        scale, rows = newest.get_value(SCALE), imu.t > T
         mean = imu.accel[rows].mean(axis=0, keepdims=True) - ba, imu.gyro[rows].mean(axis=0, keepdims=True) - bg
         of_accel, of_gyro = convert_to_biases(scale, *mean)
         ba, bg = ba + of_accel, bg + of_gyro

@@ -61,7 +61,7 @@ class Buffer:
         self._end += 1
         return True
 
-    def after(self, t: float) -> list[tuple[float, tuple[float, ...]]]:
+    def list_after(self, t: float) -> list[tuple[float, tuple[float, ...]]]:
         """The rows after a time, as they were added."""
         return [(float(row[0]), tuple(row[1:].tolist())) for row in self.rows[self.t > t]]
 
@@ -79,7 +79,7 @@ class Buffer:
         self._data[at : self._end - 1] = self._data[at + 1 : self._end]
         self._end -= 1
 
-    def between(self, begin: float, end: float) -> Array:
+    def copy_between(self, begin: float, end: float) -> Array:
         """A copy of the rows from `begin` to `end`, both included."""
         lo, hi = np.searchsorted(self.t, begin, side="left"), np.searchsorted(self.t, end, side="right")
         return self.rows[lo:hi].copy()

@@ -114,12 +114,12 @@ class Chain:
         """Spans of excluded fixes, by whatever test."""
         times, used = self.verdicts.times, self.verdicts.used
         left = {name: used[name] * (select_weights(t, self.noise, name) > 0.0) for name, t in times.items()}
-        return Verdicts(times, left).faults()
+        return Verdicts(times, left).list_faults()
 
     @property
     def _estimates_imu(self) -> bool:
         """Whether some figure of the IMU differs from the stated one."""
-        return any(self.noise.factor(f"imu.{name}", 1.0) != 1.0 for name in NOISE_FIGURES)
+        return any(self.noise.get_factor(f"imu.{name}", 1.0) != 1.0 for name in NOISE_FIGURES)
 
     @property
     def _noise_of_rows(self) -> NoiseModel:
@@ -152,7 +152,7 @@ class Chain:
         rows = []
         for c in problem.constraints:
             if c.watched:
-                weight = self.verdicts.weights(c.name, problem.t[c.keyframe])
+                weight = self.verdicts.weigh(c.name, problem.t[c.keyframe])
                 if not (weight == 1.0).all():
                     c = replace(c, weight=weight if c.weight is None else c.weight * weight)
             rows.append(c)
@@ -228,7 +228,7 @@ class Chain:
         phase, newest, started = split_carriers(problem)[1], self.window.newest, {step.name for step in steps}
         assert phase is not None
         return tuple(
-            Step(p.name, newest.value(p.name), p.sigma[0])
+            Step(p.name, newest.get_value(p.name), p.sigma[0])
             for p in phase.parameters
             if p.name in phase.slots and p.name in newest.columns and p.name not in started
         )
@@ -295,7 +295,7 @@ class Chain:
 def find_turn(setup: Recording, noise: NoiseModel) -> float:
     """How far (rad) an attitude may move before rows are relinearised, by the noise of the accelerometer."""
     stated = setup.imu.noise
-    density = stated.accel_noise_density * float(np.sqrt(noise.factor("imu.accel_noise_density", 1.0)))
+    density = stated.accel_noise_density * float(np.sqrt(noise.get_factor("imu.accel_noise_density", 1.0)))
     return compute_turn_limit(replace(stated, accel_noise_density=density))
 
 

@@ -76,11 +76,11 @@ class Fixes(Buffer):
         near[best, _USED] = 1.0
         return bool(np.any(near[best, 0] == t))
 
-    def typical_sigmas(self, t: Array) -> Array:
+    def compute_typical_sigmas(self, t: Array) -> Array:
         """(N, 6) typical sigmas of the fixes at some times, m and m/s: the units of time-correlated errors."""
         return self.rows[np.searchsorted(self.t, t - 1e-6), 13:19]
 
-    def unit(self) -> Array:
+    def compute_unit(self) -> Array:
         """(3,) m, unit of errors that last for minutes and hours; constant from the first call on."""
         if self._unit is None:
             self._unit = compute_unit(self.rows[self.rows[:, _USED] > 0.0, 4:7])
@@ -88,7 +88,7 @@ class Fixes(Buffer):
 
     def select_as_gnss(self, begin: float, end: float, every: bool = False) -> Gnss | None:
         """The used fixes between two times (s), both included, or with `every` all of them; None if there are none."""
-        rows = self.between(begin, end)
+        rows = self.copy_between(begin, end)
         return self._make_gnss(rows if every else rows[rows[:, _USED] > 0.0])
 
     def _make_gnss(self, rows: Array) -> Gnss | None:

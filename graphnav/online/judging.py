@@ -160,10 +160,10 @@ def judge(
     sensors: Sensors, settings: Settings, frame: LocalFrame, found: Alignment, times: Array, until: float
 ) -> Judgement:
     """Start to judge the sensors by their rows up to a time (s); `times` (K,) are the keyframes so far, s."""
-    recording, every = (sensors.recording(-np.inf, until, all_of_them) for all_of_them in (False, True))
+    recording, every = (sensors.make_recording(-np.inf, until, all_of_them) for all_of_them in (False, True))
     due = float(times[-1]) + min(_THINKING * settings.solver.lag, _LONGEST_THOUGHT)
     settings = drop_ambiguities(settings, sensors.setup)
-    return Judgement(Question(recording, every, settings, frame, found, times, sensors.gnss.unit()), due)
+    return Judgement(Question(recording, every, settings, frame, found, times, sensors.gnss.compute_unit()), due)
 
 
 def are_enough(sensors: Sensors, found: Alignment, span: float) -> bool:

@@ -105,7 +105,7 @@ def parse_setup(line: str) -> Recording:
         for name, sensor in known.items()
         if (figures := getattr(found, name)) is not None
     }
-    raw = None if found.raw_gnss is None else found.raw_gnss.setup()
+    raw = None if found.raw_gnss is None else found.raw_gnss.make_setup()
     return Recording(found.name, found.platform, imu, gnss, odometer, sensors=sensors, raw_gnss=raw)
 
 

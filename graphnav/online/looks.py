@@ -40,7 +40,7 @@ class Stops:
         """Whether stops were found that have not been taken over yet."""
         return self._seen is not None
 
-    def due(self, now: float) -> bool:
+    def is_due(self, now: float) -> bool:
         """Whether the next run is due."""
         return self._seen is None and now - self.looked >= _DETECTOR_INTERVAL - SAME_TIME
 
@@ -51,7 +51,7 @@ class Stops:
         if now - self._reviewed >= _REVIEW - SAME_TIME:
             self._reviewed, answered = now, since
         self.looked = now
-        recording = sensors.recording(-np.inf if whole else now - _DETECTOR_SPAN, now, every=True)
+        recording = sensors.make_recording(-np.inf if whole else now - _DETECTOR_SPAN, now, every=True)
         self._seen = since, find_stops(recording, settings, since, now - SURE, self.spans, answered)
 
     def replace(self, spans: Array, edges: Array) -> None:
@@ -109,14 +109,14 @@ class Readings:
         """Whether a check has been made."""
         return bool(np.isfinite(self._looked))
 
-    def due(self, now: float) -> bool:
+    def is_due(self, now: float) -> bool:
         """Whether the next check is due."""
         return now - self._looked >= _WHEELS - SAME_TIME
 
     def look(self, sensors: Sensors, now: float) -> float:
         """Check the readings; returns the start of the first wrong span that was not known before."""
         whole, self._looked = not self.looked, now
-        recording = sensors.recording(-np.inf if whole else now - _WHEELS_LOOK, now)
+        recording = sensors.make_recording(-np.inf if whole else now - _WHEELS_LOOK, now)
         if recording.odometer is None:
             return np.inf
         lag, o = self._lag, recording.odometer
@@ -124,10 +124,10 @@ class Readings:
         self._counted = float(o.t[-1])
         # at increasing intervals, as more readings add little; readings at rest add nothing
         if self.figures is None or self._moving >= 2 * max(self._told, 1):
-            every = sensors.recording().odometer
+            every = sensors.make_recording().odometer
             assert every is not None
             before, self.figures, self._told, lag = self.figures, ReadingStatistics.of(every), self._moving, None
-            self.revised |= before is not None and _differ(before.sigmas(o), self.figures.sigmas(o))
+            self.revised |= before is not None and _differ(before.list_sigmas(o), self.figures.list_sigmas(o))
         seen, known = find_faults(recording.odometer, recording.imu, self.figures, lag), self.wrong
         found, self._lag = seen.spans, seen.lag
         since = float(recording.odometer.t[0]) + (0.0 if whole else 5.0)

@@ -67,7 +67,7 @@ class Neighbours:
 
     def learn(self, imu: Buffer, until: float, stops: Array) -> None:
         """Learn typical deviations from the rows up to a time (s), except those in stops (M, 2)."""
-        rows = imu.between(self._learnt, until)
+        rows = imu.copy_between(self._learnt, until)
         if len(rows) < 3:
             return
         self._learnt = float(rows[-2, 0])

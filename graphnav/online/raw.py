@@ -94,7 +94,7 @@ class RawEpochs:
             self._remember(x)
         return True
 
-    def after(self, t: float) -> list[tuple[float, tuple[float, ...]]]:
+    def list_after(self, t: float) -> list[tuple[float, tuple[float, ...]]]:
         """The epochs after a time."""
         return [(x, tuple(self._rows[x].ravel().tolist())) for x in self._every[bisect_right(self._every, t) :]]
 
@@ -115,7 +115,7 @@ class RawEpochs:
         for x in self._every:
             self._remember(x)
 
-    def between(self, begin: float, end: float) -> RawGnss:
+    def build_between(self, begin: float, end: float) -> RawGnss:
         """The epochs in use from `begin` to `end`, both included, and the one before, as a series."""
         t = self._t[max(bisect_left(self._t, begin) - 1, 0) : bisect_right(self._t, end)]
         rows = [self._rows[x] for x in t]

@@ -207,7 +207,7 @@ class LiveRaw(BaseModel):
     antennas: dict[str, dict[int, Vector]] = {}  # m, in the satellite's axes, of its antenna, by band
     clock_noise: dict[str, tuple[NotNegative, Positive]] = {}  # m off a line between nodes, s apart
 
-    def setup(self) -> RawGnss:
+    def make_setup(self) -> RawGnss:
         """A series without rows.
 
         Raises

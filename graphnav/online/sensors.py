@@ -69,7 +69,7 @@ class Sensors:
         self.gnss = Fixes(self.setup.gnss)
         # for a foot, of rates only: an impact lasts for less than a row
         self._neighbours = Neighbours(3 if self.setup.platform == "foot" else 6)
-        raw, tight = self.setup.raw_gnss, self.setup.tight(self.raw_settings.coupling)
+        raw, tight = self.setup.raw_gnss, self.setup.is_tight(self.raw_settings.coupling)
         self.raw = RawEpochs(raw, self.raw_settings) if raw is not None and tight else None
 
     @property
@@ -106,7 +106,7 @@ class Sensors:
                 key="row.form",
             )
 
-    def newest(self, sensor: str) -> float:
+    def find_newest(self, sensor: str) -> float:
         """Newest time of a sensor, s."""
         if sensor == RAW and self.raw is None:
             return -np.inf
@@ -303,7 +303,7 @@ class Sensors:
                 for name, buffer in self.others.items():
                     again = {_identify(name, t, tuple(values)) for t, *values in buffer.rows.tolist()}
                     self._before = {one for one in self._before if one[0] != name} | again
-                for t_before, values_before in [] if self.raw is None else self.raw.after(-math.inf):
+                for t_before, values_before in [] if self.raw is None else self.raw.list_after(-math.inf):
                     self._before.add((RAW, t_before, len(values_before)))
             self._sort_out()
             return False
@@ -345,7 +345,7 @@ class Sensors:
 
     def cut_after(self, t: float) -> dict[str, list[tuple[float, tuple[float, ...]]]]:
         """Remove the rows after a time (s), by sensor; `put_back` adds them again."""
-        later = {name: buffer.after(t) for name, buffer in self._all.items()}
+        later = {name: buffer.list_after(t) for name, buffer in self._all.items()}
         for buffer in self._all.values():
             buffer.drop_after(t)
         return later
@@ -361,22 +361,26 @@ class Sensors:
         rows = self.imu.t
         return float(rows[min(int(np.searchsorted(rows, t - SAME)), len(rows) - 1)]) if len(rows) else t
 
-    def recording(self, begin: float = -np.inf, end: float = np.inf, every: bool = False) -> Recording:
+    def make_recording(self, begin: float = -np.inf, end: float = np.inf, every: bool = False) -> Recording:
         """The rows between two times as a recording; with `every` also the fixes that are not used."""
-        rows = self.imu.between(begin, end)
+        rows = self.imu.copy_between(begin, end)
         imu = replace(self.setup.imu, t=rows[:, 0], gyro=rows[:, 1:4], accel=rows[:, 4:7])
         sensors = {}
         for name, buffer in self.others.items():
-            rows = buffer.between(begin, end)
+            rows = buffer.copy_between(begin, end)
             sensors[name] = replace(self.setup.sensors[name], t=rows[:, 0], values=rows[:, 1:])
-        raw = None if self.raw is None else self.raw.between(begin, end)
+        raw = None if self.raw is None else self.raw.build_between(begin, end)
         return replace(
-            self.setup, imu=imu, gnss=self.gnss.select_as_gnss(begin, end, every), odometer=self._odometer(begin, end),
-            sensors=sensors, raw_gnss=raw,
-        )  # fmt: skip
+            self.setup,
+            imu=imu,
+            gnss=self.gnss.select_as_gnss(begin, end, every),
+            odometer=self._make_odometer(begin, end),
+            sensors=sensors,
+            raw_gnss=raw,
+        )
 
-    def _odometer(self, begin: float, end: float) -> Odometer | None:
-        rows = self.odometer.between(begin, end)
+    def _make_odometer(self, begin: float, end: float) -> Odometer | None:
+        rows = self.odometer.copy_between(begin, end)
         if self.setup.odometer is None or len(rows) < 2:
             return None
         way = rows[:, 2] if np.isfinite(rows[:, 2]).all() else None

@@ -86,7 +86,7 @@ class Session:
             self.done = True
             self._save(last=True)
         if self.store is not None:  # again where a finished run is resumed: its summary may have been missing
-            self.store.summarise(json.dumps(self.summary(), indent=2) + "\n")
+            self.store.summarise(json.dumps(self.summarise(), indent=2) + "\n")
 
     def require_settled(self) -> None:
         """Refuse a finished run that has no result.
@@ -117,7 +117,7 @@ class Session:
         if self.store is not None:
             self.store.close()
 
-    def summary(self) -> dict[str, object]:
+    def summarise(self) -> dict[str, object]:
         """Counts of rows, and notes."""
         assert self.online is not None
         online = self.online

@@ -59,7 +59,7 @@ class Smoother:
         self._setup = setup
         self.settings = settings or Settings()
         raw, s = setup.raw_gnss, self.settings.raw_gnss
-        if s.ppp and raw is not None and setup.tight(s.coupling):
+        if s.ppp and raw is not None and setup.is_tight(s.coupling):
             require_precise(setup.name, raw)
         self.sensors = Sensors(setup, self.settings.keyframes.bridge, self.settings.raw_gnss)
         self.frame: LocalFrame | None = None
@@ -103,7 +103,7 @@ class Smoother:
         if sensor == "imu" and sensors.add_next(t, values, before):  # as nearly all do
             self._take_newest(t, before)
             return
-        previous = sensors.newest(sensor)
+        previous = sensors.find_newest(sensor)
         if not sensors.add(sensor, t, values, released):
             return
         if sensor == "imu" and (newest := sensors.imu.newest) > before:
@@ -212,7 +212,7 @@ class Smoother:
             except EstimationError as error:
                 self.notes.append(Note("online.not_aligned", str(error)))
             if "units" not in self._notes_on:
-                self._replace_notes("units", check_rows(self.sensors.recording(every=True)))
+                self._replace_notes("units", check_rows(self.sensors.make_recording(every=True)))
         if self.tracker is not None:
             self._judge_at_last()
             self._advance(self.tracker, self.sensors.imu.newest, last=True)
@@ -245,7 +245,7 @@ class Smoother:
             self._wait(now)
             return
         tracker = self.tracker = self._track(found, recording.start, STATED)
-        self._replace_notes("units", check_rows(sensors.recording(-np.inf, now, every=True)))
+        self._replace_notes("units", check_rows(sensors.make_recording(-np.inf, now, every=True)))
         told = found.motion is not None and self.settings.gnss.position and recording.platform != "foot"
         if told and self.settings.noise.mode == "estimated":
             self._found, self._tentative = found, True
@@ -318,7 +318,7 @@ class Smoother:
     def _wait(self, now: float) -> None:
         """Keep the rows that the next attempt at an alignment may need."""
         if now - float(self.sensors.imu.t[0]) > _PATIENCE:
-            self._replace_notes("units", check_rows(self.sensors.recording(every=True)))
+            self._replace_notes("units", check_rows(self.sensors.make_recording(every=True)))
             self.sensors.drop_before(now - 0.5 * _PATIENCE)
 
     def _restart(self, before: float, why: str) -> None:

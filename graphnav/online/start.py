@@ -26,7 +26,7 @@ def take_rows(sensors: Sensors, settings: Settings, now: float, last: bool) -> t
     With `last`, no more rows will arrive.
     """
     sensors.drop_unmeasured()
-    recording = sensors.recording(-np.inf, now)
+    recording = sensors.make_recording(-np.inf, now)
     waits = sensors.setup.gnss is not None and not last
     if waits and (recording.gnss is None or not is_ready(recording, settings)):
         return None
@@ -58,7 +58,7 @@ def make_tracker(
     kind = Walker if setup.platform == "foot" else Tracker
     tracker = kind(settings, frame, message, start, setup, noise)
     if found is not stated:
-        tracker.window.head = message.moved(found.state.minus(stated.state)[0])
+        tracker.window.head = message.move(found.state.minus(stated.state)[0])
     return tracker, tuple(stated.notes)
 
 

@@ -30,14 +30,16 @@ class StepCutter:
         self.pieces: float | None = None  # s, beginning of a standing that continues, of which keyframes were made
         self.over: float | None = None  # s, beginning of one that is over: its keyframes are to be made again
 
-    def until(self, sensors: Sensors, settings: Settings, standing: Stops, T: float, limit: float, last: bool) -> Array:
+    def list_until(
+        self, sensors: Sensors, settings: Settings, standing: Stops, T: float, limit: float, last: bool
+    ) -> Array:
         """Keyframes after T, starting with T: up to the newest stance that has begun or ended, whose spans are kept.
 
         The phase of a moment is known only in complete stances and swings.
         """
         none, self.over = np.empty(0), None
         whole = not np.isfinite(standing.looked)
-        recording = sensors.recording(-np.inf if whole else min(T, limit) - _WALK, limit + SURE)
+        recording = sensors.make_recording(-np.inf if whole else min(T, limit) - _WALK, limit + SURE)
         if recording.duration < _WALK_LEAST:
             return none
         rows = recording.imu.t  # keyframes are placed where the stances will begin and end
@@ -60,7 +62,7 @@ class StepCutter:
         begin = max([T - _WALK, *before[:, 0].tolist()]) if len(before) else T
         pieces, self.pieces = self.pieces, float(standing.spans[-1, 0]) if ongoing and not last else None
         self.over = pieces if pieces != self.pieces else None
-        part = sensors.recording(min(begin, T), limit)
+        part = sensors.make_recording(min(begin, T), limit)
         around = clip_spans(standing.spans, part.start, limit)
         epochs = [cls.epochs(part, settings, around) for cls in list_kinds(part)]
         return choose_keyframes(T, limit, np.concatenate([*epochs, none]), settings.keyframes.rate)
@@ -74,12 +76,12 @@ class StepCutter:
 
         A peak is clipped at the end of the IMU's range, which is known only from later readings.
         """
-        now, fresh = self.highest, sensors.recording(np.nextafter(self._seen, np.inf)).imu
+        now, fresh = self.highest, sensors.make_recording(np.nextafter(self._seen, np.inf)).imu
         if len(fresh.t):
             read, self._seen = find_highest(fresh), float(fresh.t[-1])
             now = read if now is None else np.maximum(now, read)
         before, self.highest = self.highest, now
         if before is None or now is None or not np.any(now > before):
             return np.inf
-        imu = sensors.recording(head).imu
+        imu = sensors.make_recording(head).imu
         return find_first_whole_peak(bridge_gaps(imu), imu.R_bs, before, now) if len(imu.t) > 2 else np.inf

@@ -112,7 +112,7 @@ class Tracker(Chain):
             self._motions = {t: one for t, one in self._motions.items() if t < dirty}
         now = max(self.newest, float(new[-1]) if len(new) else -np.inf)
         if not self.foot:
-            if self._standing.due(now):
+            if self._standing.is_due(now):
                 self._standing.look(sensors, self.settings, now, min([self.head, *new.tolist()]))
             if self._standing.news:
                 dirty = min(dirty, self._standing.take(np.concatenate([self.times, new])))
@@ -135,7 +135,7 @@ class Tracker(Chain):
         """Build the keyframes at the times `new` and those from `dirty` (s) on, which are removed; None if there are
         none.
         """
-        again = [stage.place.t for stage in self.window.since(dirty - SAME_TIME)]
+        again = [stage.place.t for stage in self.window.select_since(dirty - SAME_TIME)]
         if not again and not len(new):
             return None
         times = new
@@ -187,13 +187,13 @@ class Tracker(Chain):
                 self._settle(self.newest - lag)
         elif self.foot:
             return False
-        elif self._readings.due(self.newest):
+        elif self._readings.is_due(self.newest):
             self._dirty = min(self._dirty, self._readings.look(sensors, self.newest))
         elif now < expected or expected <= self.newest:
             return False
         elif expected not in self._motions:
             self._integrate(sensors, expected)
-        elif self._standing.due(expected):
+        elif self._standing.is_due(expected):
             self._standing.look(sensors, self.settings, expected, self.head)
         elif self._standing.news or self._dirty < np.inf:
             self.update(sensors, np.empty(0))
@@ -239,7 +239,7 @@ class Tracker(Chain):
         """The prepared keyframe with its fix, if one was prepared."""
         if ahead is None or len(times) > 1 or len(ahead.problem.t) != len(before) + 1:
             return None
-        recording = sensors.recording(float(ahead.problem.t[0]) - _ROWS_BEFORE, float(times[-1]) + ROWS_AFTER)
+        recording = sensors.make_recording(float(ahead.problem.t[0]) - _ROWS_BEFORE, float(times[-1]) + ROWS_AFTER)
         problem = ahead.problem.complete(recording, self._scale_errors(sensors, recording))
         known = {c.name for c in ahead.problem.constraints}
         late = replace(problem, constraints=tuple(c for c in problem.constraints if c.name not in known))
@@ -286,7 +286,7 @@ class Tracker(Chain):
         """A tracker with another noise model, with the settled states of this one and no keyframes since."""
         other, head = copy.copy(self), self.window.head
         other.noise, other._parameters, other.verdicts = noise, {}, copy.deepcopy(self.verdicts)
-        other.window = type(self.window)(head.moved(head.estimate), find_turn(setup, noise))
+        other.window = type(self.window)(head.move(head.estimate), find_turn(setup, noise))
         other._nodes, other._held, other._motions, other.settled, other._ahead = [], [], {}, [], None
         other._settling = False
         other._standing, other._readings = copy.copy(self._standing), copy.copy(self._readings)
@@ -308,7 +308,7 @@ class Tracker(Chain):
 
     def rewind(self, t: float, other: Tracker) -> None:
         """Remove the keyframes from a time on, where another tracker has redone them with different stops."""
-        self._keep(len(self.window) - len(self.window.since(t - SAME_TIME)))
+        self._keep(len(self.window) - len(self.window.select_since(t - SAME_TIME)))
         self._motions = {end: one for end, one in self._motions.items() if end < t}
         self._standing = copy.copy(other._standing)
 
@@ -316,7 +316,7 @@ class Tracker(Chain):
         """The state at the newest IMU row, predicted from the newest keyframe."""
         return live(self.window.newest, self.newest, self.frame, sensors, self.noise)
 
-    def since(self, sensors: Sensors) -> tuple[Array, States, Array]:
+    def predict_since(self, sensors: Sensors) -> tuple[Array, States, Array]:
         """Times (M,), states and covariances (M, 15, 15) at every IMU row since the newest keyframe."""
         return predict_since(self.window.newest, self.newest, self.frame, sensors, self.noise)
 
@@ -333,7 +333,7 @@ class Tracker(Chain):
         """The unit of time-correlated errors of a recording's fixes, m."""
         if recording.gnss is None:
             return None
-        return sensors.gnss.typical_sigmas(recording.gnss.t)[:, :3]
+        return sensors.gnss.compute_typical_sigmas(recording.gnss.t)[:, :3]
 
     def _build(self, sensors: Sensors, times: Array, complete: bool = True) -> Problem:
         begin, stops = float(times[0]), self.stops
@@ -368,7 +368,7 @@ class Tracker(Chain):
             find_node_spacing(self.settings.gnss.slow_times, find_fix_period(sensors.gnss.used)),
             sensors.gnss,
         )
-        usual = TypicalSigmas(fixes.unit, lambda k: fixes.typical_sigmas(problem.t[k]), spacing)
+        usual = TypicalSigmas(fixes.compute_unit, lambda k: fixes.compute_typical_sigmas(problem.t[k]), spacing)
         rows = tuple(c.convert_units(usual) for c in problem.constraints)
         return apply_noise(replace(problem, constraints=rows), noise or self.noise)
 
@@ -377,10 +377,10 @@ class Tracker(Chain):
 
         Only the noise of bridged IMU gaps depends on the signal of the last half minute.
         """
-        near = sensors.recording(begin - _ROWS_BEFORE, end)
+        near = sensors.make_recording(begin - _ROWS_BEFORE, end)
         t = near.imu.t
         whole = len(t) > 2 and float((t[1:] - t[:-1]).max()) < GAP * compute_period(t)
-        return near if whole else sensors.recording(begin - CONTEXT, end)
+        return near if whole else sensors.make_recording(begin - CONTEXT, end)
 
     def _renew(self, sensors: Sensors, first: int, end: int) -> list[Place] | None:
         """As `_build_again`; None if the work for this row is done, and it is to be called again at the next."""

@@ -103,11 +103,11 @@ class Walker(Tracker):
     def _list_steps_until(self, sensors: Sensors, limit: float, last: bool) -> Array:
         """Keyframes of a walk that can be made by now, and their effect on those before."""
         before, newest = self._save_cut, self.newest
-        found = times = self._steps.until(sensors, self.settings, self._standing, self.newest, limit, last)
+        found = times = self._steps.list_until(sensors, self.settings, self._standing, self.newest, limit, last)
         after = self._save_cut
         if (stood := self._steps.over) is not None:  # the sway of a foot is estimated from all of its standing
-            self._keep(len(self.window) - len(self.window.since(stood + SAME_TIME)))
-            times = self._steps.until(sensors, self.settings, self._standing, self.newest, limit, last)
+            self._keep(len(self.window) - len(self.window.select_since(stood + SAME_TIME)))
+            times = self._steps.list_until(sensors, self.settings, self._standing, self.newest, limit, last)
         looks = [one for one in self._looks if one.limit > limit - LASTING - SURE]
         self._looks = (*looks, _Look(limit, newest, before, after, found))
         self._standing.forget(self.head - CONTEXT)
@@ -129,7 +129,7 @@ class Walker(Tracker):
         looks, now = [one for one in self._looks if one.limit + SURE >= t - SAME_TIME], self._save_cut
         for one in looks:
             self._restore_cut(one.before)
-            found = self._steps.until(sensors, self.settings, self._standing, one.newest, one.limit, False)
+            found = self._steps.list_until(sensors, self.settings, self._standing, one.newest, one.limit, False)
             if not _are_same((found, self._standing.spans), (one.times, one.after[0])):
                 break
         else:
@@ -140,7 +140,7 @@ class Walker(Tracker):
         if one.newest < self._oldest:
             return  # it has settled
         self._restore_cut(one.before)
-        self._keep(len(self.window) - len(self.window.since(one.newest + SAME_TIME)))
+        self._keep(len(self.window) - len(self.window.select_since(one.newest + SAME_TIME)))
         self._motions = {end: motion for end, motion in self._motions.items() if end <= one.newest}
         self._looks, self._renewal = tuple(x for x in self._looks if x.limit < one.limit), _Renewal()
         for again in (x for x in looks if x.limit >= one.limit):
@@ -205,7 +205,7 @@ class Walker(Tracker):
         """The state at the newest IMU row, predicted from the newest keyframe before those that are entering."""
         return live(*self._shown, self.frame, sensors, self.noise)
 
-    def since(self, sensors: Sensors) -> tuple[Array, States, Array]:
+    def predict_since(self, sensors: Sensors) -> tuple[Array, States, Array]:
         """Times (M,), states and covariances (M, 15, 15) at every IMU row since that keyframe."""
         return predict_since(*self._shown, self.frame, sensors, self.noise)
 

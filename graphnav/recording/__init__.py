@@ -197,7 +197,7 @@ class Recording:
         own = {"gnss": self.gnss, "odometer": self.odometer, **self.sensors}
         return {name: sensor for name, sensor in own.items() if sensor is not None}
 
-    def tight(self, coupling: str) -> bool:
+    def is_tight(self, coupling: str) -> bool:
         """Whether raw observations are used in place of the fixes, by `raw_gnss.coupling` of the settings."""
         if self.raw_gnss is None or coupling == "loose":
             return False

@@ -53,7 +53,7 @@ class Allan:
     duration: float  # s
     rate: float  # Hz
 
-    def lines(self) -> list[str]:
+    def format_lines(self) -> list[str]:
         """The lines for [imu.noise]: root mean squares over the axes."""
         out = []
         for name, noise, unit in (("gyro", self.gyro_noise, "rad/s"), ("accel", self.accel_noise, "m/s2")):

@@ -22,7 +22,7 @@ def write(result: Allan, folder: Path) -> list[Path]:
     table = np.column_stack([result.tau, result.gyro, result.accel])
     np.savetxt(paths[1], table, "%.9g", ",", header="tau,gx,gy,gz,ax,ay,az", comments="")
     title = f"Allan variance of {result.duration:.0f} s at rest, {result.rate:.4g} Hz; root mean square of the axes"
-    lines = "\n".join(["[imu.noise]", *result.lines()])
+    lines = "\n".join(["[imu.noise]", *result.format_lines()])
     paths[2].write_text(f"# {title}\n{lines}\n", encoding="utf-8")
     lead = [page.paragraph(title), page.code(lines, "noise")]
     pictures = [
@@ -44,8 +44,8 @@ def _draw_deviations(tau: Array, deviations: Array, noise: AllanFigures, unit: s
     )  # fmt: skip
     (panel,) = figure.panels
     for k, name in enumerate(_COLOURS):
-        panel.line(tau, deviations[:, k], name, "xyz"[k])
-    panel.line(tau, fit, "truth", "fit", dash=True)
+        panel.draw_line(tau, deviations[:, k], name, "xyz"[k])
+    panel.draw_line(tau, fit, "truth", "fit", dash=True)
     return figure
 
 

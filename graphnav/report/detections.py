@@ -91,7 +91,7 @@ def list_values(recording: Recording, found: Detections) -> dict[str, Any]:
         "recording": recording.name,
         "duration_s": recording.duration,
         "stationary": found.stationary,
-        "stops": [{key: x for key, x in stop.values().items() if key != "rows"} for stop in list_stops(found.all)],
+        "stops": [{key: x for key, x in stop.to_dict().items() if key != "rows"} for stop in list_stops(found.all)],
         "seconds_by_detector": {d.name: float(np.diff(d.intervals).sum()) for d in found.all},
         "notes": found.notes,
     }

@@ -225,7 +225,7 @@ def draw_motion(recording: Recording, solutions: Mapping[str, Solution], spans: 
 
     def draw_doppler(panel: plots.Panel, k: int) -> None:
         if gnss is not None and gnss.v is not None and np.isfinite(gnss.v[:, k]).any():
-            panel.dots(gnss.t - start, gnss.v[:, k], "ink", "GNSS velocity", 2.5, alpha=0.5)
+            panel.draw_dots(gnss.t - start, gnss.v[:, k], "ink", "GNSS velocity", 2.5, alpha=0.5)
 
     place = {name: Curve(s.t - start, s.states.p + base, tracks[name].sd_p) for name, s in solutions.items()}
     speed = {name: Curve(t.t - start, t.v, t.sd_v) for name, t in tracks.items() if t.v is not None}

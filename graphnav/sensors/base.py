@@ -87,7 +87,7 @@ class Sensor:
         with np.errstate(invalid="ignore"):
             return np.where((values >= lowest) & (values <= highest), values, np.nan)
 
-    def series(self, t: Array, columns: Mapping[str, Array], **figures: Any) -> Series:
+    def make_series(self, t: Array, columns: Mapping[str, Array], **figures: Any) -> Series:
         """Make a series of arrays, as a script does.
 
         Parameters
@@ -132,7 +132,7 @@ class Series:
         """(N,) values of one column."""
         return np.asarray(self.values[:, self.sensor.names.index(column)])
 
-    def sigma(self, column: str, otherwise: float) -> Array:
+    def get_sigma(self, column: str, otherwise: float) -> Array:
         """(N,) 1-sigma from the column ``sd_...``, `otherwise` where a row states none."""
         stated = self[f"sd_{column}"]
         return np.where(np.isfinite(stated), stated, otherwise)

@@ -106,11 +106,11 @@ class OdometerModel:
         half = 0.5 / self.rate
         edges = np.append(t - half, t[-1] + half) - self.delay
         # a wheel rolls along the vehicle, the axle moves along its course
-        way = path.distance(edges) * (1.0 + scale)
+        way = path.compute_distance(edges) * (1.0 + scale)
         if self.pulse:
             way = np.floor(way / self.pulse + rng.random()) * self.pulse
         speed = np.diff(way) * self.rate * np.cos(path.sample(SLIP, t - self.delay))
-        turning = path.speed(t - self.delay) != 0.0
+        turning = path.compute_speed(t - self.delay) != 0.0
         speed = speed + np.where(turning, self.white * rng.standard_normal(len(t)), 0.0)
         if not self.signed:
             speed = np.abs(speed)

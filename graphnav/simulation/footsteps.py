@@ -24,7 +24,7 @@ class Route:
     def length(self) -> float:
         return float(self.s[-1])
 
-    def at(self, s: Array) -> tuple[Array, Array]:
+    def locate(self, s: Array) -> tuple[Array, Array]:
         """(places (K, 2), headings (K,)) at arc lengths (K,)."""
         xy = np.stack([np.interp(s, self.s, self.xy[:, k]) for k in (0, 1)], -1)
         return xy, np.interp(s, self.s, self.heading)
@@ -102,7 +102,7 @@ def make_footsteps(
     count = max(3, round(along.length / cadence.length + 0.7))
     # the route's curvature over a stride, from equal strides
     even = np.linspace(0.0, along.length, count + 1)
-    turn = np.abs(np.diff(along.at(even)[1]))
+    turn = np.abs(np.diff(along.locate(even)[1]))
     part = 1.0 + cadence.length_jitter * rng.standard_normal(count) - 0.2 * np.minimum(turn / 1.57, 1.0)
     part[[0, -1]] *= 0.65
     s = np.concatenate([[0.0], np.cumsum(part)]) * along.length / part.sum()
@@ -111,7 +111,7 @@ def make_footsteps(
     took *= walked / took.sum()
     swing = (1.0 - cadence.stance) * took * (1.0 + 0.5 * cadence.time_jitter * rng.standard_normal(count))
     lift = start + np.concatenate([[0.0], np.cumsum(took[:-1])]) + 0.4 * took  # of a stride's toes
-    xy, psi = along.at(s)
+    xy, psi = along.locate(s)
     beside = side + cadence.side_jitter * rng.standard_normal(count + 1)
     place = xy + beside[:, None] * np.column_stack([np.cos(psi), -np.sin(psi)])
     psi = psi + np.deg2rad(toe_out + cadence.heading_jitter * rng.standard_normal(count + 1))

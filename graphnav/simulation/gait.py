@@ -52,11 +52,11 @@ class Sole:
         depth = -(np.outer(np.sin(theta), forward) + np.outer(np.cos(theta), up))
         return CubicSpline(theta, self.softness * logsumexp(depth / self.softness, axis=1))
 
-    def height(self, pitch: Array) -> Array:
+    def compute_height(self, pitch: Array) -> Array:
         """Of the IMU over the floor, m, with the shoe just touching it; pitch in rad, nose up positive."""
         return self._height(pitch)
 
-    def forward(self, pitch: Array) -> Array:
+    def compute_forward(self, pitch: Array) -> Array:
         """Of the IMU from the point of the floor under the ball of the flat shoe, m, when rolled to a pitch."""
         whole = self._height.antiderivative()
         return whole(0.0) - whole(pitch) - self.points[self.ball][0]
@@ -137,9 +137,9 @@ def walk(steps: Footprints, style: Style, sole: Sole, end: float, rng: np.random
     # the sole compresses by millimetres, which softens the end of the strike
     share = gaussian_filter1d(share + np.minimum(landing, 0.5)[k] * slope + k, style.give / STEP) - k
     base = steps.place[k] + share[:, None] * ahead[k]
-    h = sole.height(pitch)
+    h = sole.compute_height(pitch)
     aside = h * np.sin(roll) + style.circumduction * vary[k, 1] * np.sin(np.pi * u) ** 2
-    along = sole.forward(pitch)
+    along = sole.compute_forward(pitch)
     clearance = style.clearance * vary[k, 2] * 16.0 * u**2 * (1.0 - u) ** 2
     clearance -= style.landing[1] * vary[1:, 0][k] * took[k] * slope
     # in the air nothing holds the shoe to the floor: heel and toes pass each other smoothly

@@ -114,7 +114,7 @@ class SimulatedImu:
         a, b_a = self.accel.read(accel, self.rate, make_random(seed, "accel"))
         return g, a, b_g, b_a
 
-    def at(self, rate: float) -> SimulatedImu:
+    def change_rate(self, rate: float) -> SimulatedImu:
         """The same sensors sampled at another rate."""
         return replace(self, rate=float(rate))
 

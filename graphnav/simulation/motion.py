@@ -51,16 +51,16 @@ class Path:
         """One channel at times within the path (the nearest end beyond it)."""
         return self.spline(np.clip(t, self.start, self.end))[..., channel]
 
-    def speed(self, t: Array) -> Array:
+    def compute_speed(self, t: Array) -> Array:
         """Signed speed of the rear axle, m/s."""
         return self.sample(SPEED, t)
 
-    def distance(self, t: Array) -> Array:
+    def compute_distance(self, t: Array) -> Array:
         """Distance along the path from the start, m, backward motion counted negative."""
         whole = self.spline.antiderivative()
         return whole(np.clip(t, self.start, self.end))[..., SPEED] - whole(self.start)[SPEED]
 
-    def stops(self) -> Array:
+    def find_stops(self) -> Array:
         """(M, 2) s: the spans in which the wheels do not turn at all."""
         zero = np.asarray(self.spline.c[:, SPEED] == 0.0)
         whole = np.asarray(np.lib.stride_tricks.sliding_window_view(zero, DEGREE + 1).all(axis=1))

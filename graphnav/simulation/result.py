@@ -31,7 +31,7 @@ class Simulated:
     facts: dict[str, Any] = field(default_factory=dict)  # the parameters of the simulation, for JSON
     motion: TrueMotion | None = field(default=None, repr=False)  # with the error-free samples
 
-    def text(self) -> str:
+    def format(self) -> str:
         """One line for people."""
         imu, stopped = self.recording.imu, float(np.sum(np.diff(self.stops)))
         return (
@@ -108,4 +108,4 @@ def record(
         motion.t, motion.llh, motion.v, rph, name="truth",
         gyro_bias=np.vstack([b_g[:1], b_g]), accel_bias=np.vstack([b_a[:1], b_a]),
     )  # fmt: skip
-    return Simulated(round_recording(recording), truth, path.stops(), known, motion)
+    return Simulated(round_recording(recording), truth, path.find_stops(), known, motion)

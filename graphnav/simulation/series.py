@@ -44,7 +44,10 @@ class BarometerModel:
         z = h + scale * (h - h[0]) + offset + self.walk / np.sqrt(self.rate) * np.cumsum(steps) + self.white * white
         columns = {"pressure": np.round(barometer.compute_standard_pressure(z), 2)}
         figures = {"sigma": self.white, "walk": self.walk}
-        return barometer.SENSOR.series(np.round(t, 6), columns, **figures), {"offset_m": offset, "scale_error": scale}
+        return barometer.SENSOR.make_series(np.round(t, 6), columns, **figures), {
+            "offset_m": offset,
+            "scale_error": scale,
+        }
 
 
 @dataclass(frozen=True)
@@ -87,7 +90,7 @@ class DualAntennaModel:
             "heading": np.mod(angles[:, 0], 2.0 * np.pi), "pitch": angles[:, 1], "sd_heading": sd[:, 0],
             "sd_pitch": sd[:, 1],
         }  # fmt: skip
-        series = dual_antenna.SENSOR.series(
+        series = dual_antenna.SENSOR.make_series(
             np.round(t[kept], 6), {name: _cut(x[kept]) for name, x in columns.items()},
             baseline=self.baseline, baseline_sigma=self.turned,
         )  # fmt: skip

@@ -89,7 +89,7 @@ class Engine:
     wander_hz: float = 0.0  # 1-sigma of the idling speed's slow changes
     wander_time: float = 5.0  # s
 
-    def frequency(self, speed: Array, wander: Array) -> Array:
+    def compute_frequency(self, speed: Array, wander: Array) -> Array:
         """Crankshaft frequency, Hz, at speeds (K,) on a regular grid of 0.1 s; `wander` is what idling adds."""
         v = np.abs(speed)
         each = v[:, None] * np.array(self.gears_hz_per_mps)
@@ -100,12 +100,12 @@ class Engine:
         f = signal.convolve(np.pad(f, 3, mode="edge"), np.ones(7) / 7.0, mode="valid")
         return np.where(v == 0.0, idle, f)
 
-    def lines(self, path: Path, rate: float, rng: np.random.Generator) -> Part:
+    def simulate_lines(self, path: Path, rate: float, rng: np.random.Generator) -> Part:
         """The vibration of the engine; `rate` is the IMU's, Hz, whose averaging the stated amplitudes include."""
         t = list_centres(path.start, path.end, _MODULATION_TIME, _MODULATION_DEGREE)
-        v = path.speed(t)
+        v = path.compute_speed(t)
         wander = self.wander_hz * draw_gauss_markov(len(t), _MODULATION_TIME / self.wander_time, rng)
-        f = self.frequency(v, wander)
+        f = self.compute_frequency(v, wander)
         load = 1.0 + (self.moving_gain - 1.0) * v * v / (v * v + 1.0)
         accel, turn = _draw_amplitudes(self.idle, len(t))
         for a, b, idle in self.spans:
@@ -190,7 +190,7 @@ def simulate_road_noise(path: Path, rng: np.random.Generator, size: float = 1.0,
     The excitation of a road whose slopes are white grows as sqrt(v) (ISO 8608, w = 2); the tyre's contact patch
     averages over shorter wavelengths, which at 0.2 m/s are all of them.
     """
-    v = np.abs(path.speed(shake_times(path)))
+    v = np.abs(path.compute_speed(shake_times(path)))
     return sample_movement(path, _excite_modes(modes, size * np.sqrt(v / 14.0) * v / (v + 2.0), rng))
 
 

@@ -216,7 +216,7 @@ def test_the_pages_are_drawn_again_without_solving(compared, tmp_path, capsys):
 def test_a_recording_is_kept_as_far_as_its_pages_show_it(drive):
     """The same rows are drawn of it, and its sensors are there."""
     whole = load(drive)
-    height = BAROMETER.series(whole.gnss.t, {"height": whole.gnss.llh[:, 2]})
+    height = BAROMETER.make_series(whole.gnss.t, {"height": whole.gnss.llh[:, 2]})
     whole = replace(whole, sensors={"barometer": height})
     arrays = []
     packed = json.dumps(stored._pack(stored._thin_recording(whole), arrays))

@@ -20,12 +20,12 @@ def drive(shared_data) -> Recording:
     h = truth.llh[:, 2]
     z = h + SCALE * (h - h[0]) - OFFSET + SIGMA * np.random.default_rng(2).standard_normal(len(t))
     pressure = 101325.0 * (1.0 - 6.5e-3 * z / 288.15) ** 5.25588
-    return with_series(recording, SENSOR.series(t, {"pressure": pressure}, sigma=SIGMA, walk=0.01))
+    return with_series(recording, SENSOR.make_series(t, {"pressure": pressure}, sigma=SIGMA, walk=0.01))
 
 
 def test_the_standard_atmosphere():
     # ICAO Doc 7488: 89874.6 Pa at 1000 m
-    series = SENSOR.series(np.arange(3.0), {"pressure": [101325.0, 89874.6, np.nan], "height": [np.nan, 5.0, 7.0]})
+    series = SENSOR.make_series(np.arange(3.0), {"pressure": [101325.0, 89874.6, np.nan], "height": [np.nan, 5.0, 7.0]})
     np.testing.assert_allclose(compute_standard_height(series), [0.0, 1000.0, 7.0], atol=0.01)
 
 

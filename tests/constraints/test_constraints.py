@@ -55,7 +55,7 @@ def readings(sensor: Sensor, recording: Recording) -> Series:
     """Numbers that a sensor can read, one row in 0.7 s."""
     rng, t = np.random.default_rng(4), np.arange(recording.start + 0.3, recording.end, 0.7)
     inside = {c.name: c.lowest + (c.highest - c.lowest) * rng.uniform(0.1, 0.9, len(t)) for c in sensor.columns}
-    return sensor.series(t, inside)
+    return sensor.make_series(t, inside)
 
 
 def with_parameters(name: str) -> Settings:
@@ -196,7 +196,7 @@ def test_filter_update_is_one_linear_graph_step(case: Case) -> None:
     graph.add([(np.array([i]), white[None, :, part]) for i, part in enumerate(parts)], (-r / sigma)[None])
     solved = graph.eliminate(range(len(parts)))
     np.testing.assert_allclose(np.concatenate(solved.solve(range(len(parts)))), mean, rtol=1e-7, atol=1e-9)
-    for i, C in solved.covariances().items():
+    for i, C in solved.compute_covariances().items():
         d = np.sqrt(np.diag(covariance)[parts[i]])
         np.testing.assert_allclose(C / np.outer(d, d), covariance[parts[i], parts[i]] / np.outer(d, d), atol=1e-7)
 

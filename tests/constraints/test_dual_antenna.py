@@ -39,7 +39,7 @@ def drive(shared_data) -> Recording:
     pitch = np.arctan2(d[:, 2], np.hypot(d[:, 0], d[:, 1])) + SIGMA * white[1]
     pitch[::3] = np.nan  # as of a receiver that does not always tell it
     columns = {"heading": heading % (2.0 * np.pi), "pitch": pitch, "sd_heading": np.full(len(t), SIGMA)}
-    return with_series(recording, SENSOR.series(t, columns, baseline=BASELINE, sigma=0.2))
+    return with_series(recording, SENSOR.make_series(t, columns, baseline=BASELINE, sigma=0.2))
 
 
 def test_heading_holds_without_fixes(drive):
@@ -111,7 +111,7 @@ def test_a_baseline_that_stands_upright_is_refused():
         Figures(baseline=(0.0, 0.0, 1.0))
     assert [error["loc"] for error in caught.value.errors()] == [("baseline",)]
     with refused("sensor.column", RecordingError, "roll"):
-        SENSOR.series(np.arange(2.0), {"roll": np.zeros(2)})
+        SENSOR.make_series(np.arange(2.0), {"roll": np.zeros(2)})
 
 
 def test_errors_that_last_are_not_taken_for_white() -> None:

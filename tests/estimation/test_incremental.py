@@ -77,7 +77,7 @@ def built(drive: tuple[Recording, Trajectory]) -> Problem:
 @pytest.fixture(scope="module")
 def solved(built: Problem) -> Solution:
     smoothed = smooth_backward(built, ekf(built))
-    return batch(built, smoothed.states, smoothed.nodes(built), reintegrate=False)
+    return batch(built, smoothed.states, smoothed.select_nodes(built), reintegrate=False)
 
 
 # ------------------------------------------------------------------------------------------------------- exactness
@@ -114,7 +114,7 @@ def test_the_live_estimate_is_the_end_of_a_batch_solution_so_far(built: Problem)
                     built.prior.sigma[0], np.array([[0.0, 8.0]]), speed=speed)  # fmt: skip
         part = apply_noise(part, LASTING)
         smoothed = smooth_backward(part, ekf(part))
-        so_far = batch(part, smoothed.states, smoothed.nodes(part), reintegrate=False)
+        so_far = batch(part, smoothed.states, smoothed.select_nodes(part), reintegrate=False)
         k = int(np.searchsorted(built.t, part.t[-1] - 1e-6))
         assert built.t[k] == pytest.approx(part.t[-1], abs=1e-6)
         assert np.abs((live.states[k : k + 1].minus(so_far.states[-1:])) / sigmas(so_far)[-1]).max() < 0.1
@@ -145,13 +145,13 @@ def test_a_moved_message_says_the_same() -> None:
     rng = np.random.default_rng(1)
     message = some_message(rng)
     e = 0.2 * rng.standard_normal(19)
-    moved = message.moved(e)
+    moved = message.move(e)
     for _ in range(5):
         d = 1e-5 * rng.standard_normal(19)
         there = moved.state.plus(d[None, :DIM])
         before = np.concatenate([there.minus(message.state)[0], moved.values + d[DIM:] - message.values])
         np.testing.assert_allclose(moved.R @ d - moved.z, message.R @ before - message.z, atol=1e-7)
-    back = moved.moved(-e)
+    back = moved.move(-e)
     np.testing.assert_allclose(back.state.p, message.state.p, atol=1e-12)
 
 
@@ -249,10 +249,10 @@ def test_what_smooths_back_is_the_whole_matrix(built: Problem) -> None:
     fill(window, built, 0, 90, steps)
     P = window.newest.covariance
     for stage in reversed(window.stages[1:]):
-        G, noise = stage.back(np.eye(len(P))), np.zeros((len(stage.g), len(stage.g)))
+        G, noise = stage.smooth_back(np.eye(len(P))), np.zeros((len(stage.g), len(stage.g)))
         noise[stage.lost[:, None], stage.lost] = stage.C
         expected = G @ P @ G.T + noise
-        P = stage.before(P)
+        P = stage.predict_before(P)
         scale = np.sqrt(np.diag(expected))
         np.testing.assert_allclose(P / scale / scale[:, None], expected / scale / scale[:, None], atol=1e-12)
 

@@ -79,7 +79,7 @@ def built(drive: Drive) -> Problem:
 @pytest.fixture(scope="module")
 def solved(built: Problem) -> Solution:
     smoothed = smooth_backward(built, ekf(built))
-    return batch(built, smoothed.states, smoothed.nodes(built))
+    return batch(built, smoothed.states, smoothed.select_nodes(built))
 
 
 def test_over_the_whole_drive_it_is_the_batch_solution(built: Problem, solved: Solution) -> None:

@@ -57,7 +57,7 @@ def test_parts_say_what_the_whole_says(monkeypatch: pytest.MonkeyPatch) -> None:
             assert np.max(np.abs(off) / sd) < 3.0
             assert np.median(np.abs(off) / sd) < 0.5
             assert np.quantile(sd / sd_whole, 0.1) > 0.9
-        every = np.concatenate([b.times(50.0) for b in one.between])
+        every = np.concatenate([b.list_times(50.0) for b in one.between])
         assert np.all(np.diff(every) > 0.0)  # and nothing is there twice
         assert one.covariance.base is None  # nor held beyond what is said
         assert all(np.shares_memory(b.own, one.covariance) for b in one.between)  # type: ignore[attr-defined]

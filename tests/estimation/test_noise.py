@@ -71,7 +71,10 @@ def groups(problem: Problem) -> list[str]:
     """Every variance component of a problem."""
     names = [f"imu.{name}" for name in NOISE_FIGURES]
     for rows in problem.constraints:
-        names += [*rows.noise_groups()[0], *(g for p in (*rows.parameters, *rows.processes) for g in p.noise_groups)]
+        names += [
+            *rows.list_noise_groups()[0],
+            *(g for p in (*rows.parameters, *rows.processes) for g in p.noise_groups),
+        ]
     return list(dict.fromkeys(names))
 
 
@@ -85,7 +88,7 @@ def moments(problem: Problem, forward: ForwardRecord, smoothed: SmootherPass) ->
         own = np.array(chain.parameter.noise_groups)
         out |= {g: (A[:, own == g].sum(), B[:, own == g].sum()) for g in chain.parameter.noise_groups}
     for rows in problem.constraints:
-        names, index = rows.noise_groups()
+        names, index = rows.list_noise_groups()
         found = collect_row_moments(problem, rows, smoothed, len(rows))
         out |= {g: (found.A[index == i].sum(), found.B[index == i].sum()) for i, g in enumerate(names)}
     return out
@@ -177,7 +180,7 @@ def test_a_pass_for_a_noise_model_says_what_one_with_all_covariances_says() -> N
             one, other = (some.linearise(rows, problem.columns, n) for some in (short, whole))
             for name in ("residual", "stated", "H"):
                 np.testing.assert_allclose(getattr(one, name), getattr(other, name), atol=1e-8)
-            if rows.noise_groups()[0]:
+            if rows.list_noise_groups()[0]:
                 found, expected = (some.cover_rows(other, n) for some in (short, whole))
                 np.testing.assert_allclose(found[1:], expected[1:], atol=1e-6 * np.min(other.stated) ** 2)
         likelihood = [refilter(problem, some).log_likelihood.sum() for some in (short, whole)]
@@ -253,7 +256,7 @@ def test_stated_noise_is_what_recording_and_settings_say() -> None:
     assert not any(p.name.startswith("gnss_error") for c in used.constraints for p in c.parameters)
     for one, other in zip(used.constraints, base.constraints, strict=True):
         assert one.weight is other.weight
-        if one.noise_groups()[0]:
+        if one.list_noise_groups()[0]:
             assert np.array_equal(one.sigma, other.sigma)
 
 
@@ -425,7 +428,11 @@ def test_sigmas_of_the_drive_are_true_with_estimated_figures(
         used = apply_noise(drive.base, found.noise)
         forward = ekf(used, opening=drive.opening)
         smoothed = smooth_backward(used, forward)
-        solutions = forward.solution, rts(used, forward, smoothed), batch(used, smoothed.states, smoothed.nodes(used))
+        solutions = (
+            forward.solution,
+            rts(used, forward, smoothed),
+            batch(used, smoothed.states, smoothed.select_nodes(used)),
+        )
         for solution in solutions:
             off = compute_errors(solution.trajectory(), drive.truth)
             ratio[solution.solver].append(float(np.nanmean(off.nees_p)) / 3.0)

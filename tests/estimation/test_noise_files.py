@@ -64,7 +64,7 @@ def test_every_group_of_a_problem_can_be_written_down() -> None:
     zero: Array = np.zeros((1, 3))
     start = States(np.eye(3)[None], zero, zero, zero, zero)
     problem = build_problem(recording, Settings(), frame, start, np.ones(15), np.empty((0, 2)))
-    groups = {g for rows in problem.constraints for g in rows.noise_groups()[0]}
+    groups = {g for rows in problem.constraints for g in rows.list_noise_groups()[0]}
     groups |= {g for rows in problem.constraints for p in (*rows.parameters, *rows.processes) for g in p.noise_groups}
     assert {"odometer.forward", "gnss_velocity.seconds.up", "nhc.seconds.right"} <= groups
     assert groups <= set(list_groups())

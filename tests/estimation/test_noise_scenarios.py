@@ -42,13 +42,13 @@ def found_in(recording: Recording, settings: Settings | None = None) -> NoiseMod
 
 def times(noise: NoiseModel, name: str) -> float:
     """By what factor a sigma is used."""
-    return float(np.sqrt(noise.factor(name, 1.0)))
+    return float(np.sqrt(noise.get_factor(name, 1.0)))
 
 
 def whole(noise: NoiseModel, kind: str, axis: str) -> float:
     """The same for a whole error of fixes: white, seconds, minutes and hours together."""
     names = [f"{kind}.{axis}", *(f"{kind}.{time}.{axis}" for time in ("seconds", "minutes", "hours"))]
-    return float(np.sqrt(sum(noise.factor(name, 0.0) for name in names)))
+    return float(np.sqrt(sum(noise.get_factor(name, 0.0) for name in names)))
 
 
 def stating(recording: Recording, imu: float = 1.0, fixes: float = 1.0) -> Recording:
@@ -130,7 +130,7 @@ def test_an_imu_noisier_than_stated() -> None:
     noise = found_in(stating(recording, imu=4.0))
     for name in ("gyro_noise_density", "accel_noise_density"):
         assert 2.0 < times(noise, f"imu.{name}") < 5.0, name
-    assert found_in(stating(recording, imu=4.0), STATED_ONLY).factor("imu.gyro_noise_density", 1.0) == 1.0
+    assert found_in(stating(recording, imu=4.0), STATED_ONLY).get_factor("imu.gyro_noise_density", 1.0) == 1.0
 
 
 def nees(recording: Recording, truth: Trajectory, settings: Settings | None = None) -> Array:

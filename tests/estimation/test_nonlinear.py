@@ -37,7 +37,7 @@ def drive() -> Recording:
     made = made.crop(0.0, 30.0)
     t = np.arange(made.start + 0.2, made.end, 0.5)
     height = made.gnss.llh[0, 2] + 0.5 * np.random.default_rng(1).standard_normal(len(t))
-    return replace(made, sensors={"barometer": list_sensors()["barometer"].series(t, {"height": height})})
+    return replace(made, sensors={"barometer": list_sensors()["barometer"].make_series(t, {"height": height})})
 
 
 def test_its_optimum_is_that_of_the_batch_solver(drive):

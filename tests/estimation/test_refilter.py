@@ -85,7 +85,9 @@ def test_steps_and_rows_at_points_are_those_of_an_estimate_to_first_order(built:
             at, to = slice(k - 1, k), slice(k, k + 1)
             values = points.values[at] + e[DIM:]
             reached, _ = predict_states(built, at, points.states[at].plus(e[None, :DIM]), values)
-            return np.concatenate([reached.minus(points.states[to]), steps.ahead(at, values) - points.values[to]], 1)[0]
+            return np.concatenate([reached.minus(points.states[to]), steps.predict(at, values) - points.values[to]], 1)[
+                0
+            ]
 
         np.testing.assert_allclose(given.gap[k - 1], ahead(np.zeros(D)), atol=1e-9)
         whole = move(given.F[k - 1], steps.decay[k - 1], np.eye(D))
@@ -125,7 +127,7 @@ def test_rows_taken_together_are_those_taken_one_after_another(built: Problem) -
 def test_filtered_again_about_its_own_end_it_is_the_batch_solution(built: Problem) -> None:
     """Bell 1994: the iterated smoother is Gauss and Newton's method on the whole drive."""
     smoothed = smooth_backward(built, ekf(built))
-    solved = batch(built, smoothed.states, smoothed.nodes(built), reintegrate=False)
+    solved = batch(built, smoothed.states, smoothed.select_nodes(built), reintegrate=False)
     for _ in range(3):
         smoothed = smooth_backward(built, refilter(built, smoothed))
     apart = np.abs(smoothed.states.minus(solved.states)) / sigmas(solved)

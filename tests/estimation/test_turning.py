@@ -86,9 +86,9 @@ def test_a_message_that_knows_no_heading_learns_none_where_its_point_moves(moves
     n = along(state)[0] / np.linalg.norm(along(state)[0])
     R = np.linalg.qr(A - np.outer(A @ n, n))[1]
     message = Message.of(state, np.zeros(0), {}, R, rng.standard_normal(DIM), turns=True)
-    moved = message.moved(e[0])
+    moved = message.move(e[0])
     np.testing.assert_allclose(moved.R @ along(moved.state)[0], 0.0, atol=1e-10)
-    straight = replace(message, turns=False).moved(e[0])
+    straight = replace(message, turns=False).move(e[0])
     assert np.linalg.norm(straight.R @ along(straight.state)[0]) > 1.0
 
 
@@ -160,7 +160,7 @@ def test_a_walk_learns_no_heading_but_what_the_whole_of_it_says(walk: Online) ->
 def test_a_common_turn_is_no_reason_to_linearise_again_and_one_of_some_keyframes_is(walk: Online) -> None:
     window = linearised_again(walk)
     assert window.newest.turns
-    found = window.means()
+    found = window.compute_means()
     try:
         around = [window.head, *(stage.message for stage in window.stages)]
         ways = [np.concatenate([along(m.state)[0], np.zeros(len(m.values))]) for m in around]

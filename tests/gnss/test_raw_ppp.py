@@ -185,7 +185,7 @@ def test_how_far_clocks_are_off_a_line_is_told_by_their_nodes():
     nodes = slice(None, None, 300)
     steady = 1e-4 + 1e-11 * t
     orbits = Orbits({}, {5: (t[nodes], walk[nodes]), 6: (t[nodes], steady[nodes])})
-    noise = orbits.clock_noise()
+    noise = orbits.compute_clock_noise()
     middle = walk[150::300] - 0.5 * (walk[nodes][:-1] + walk[nodes][1:])
     sigma, apart = noise[5]
     assert apart == 300.0

@@ -159,9 +159,9 @@ def test_loose_and_tight_are_one_option_apart():
         settings = parse_settings({"raw_gnss": {"coupling": coupling}})
         assert len(used.epochs(recording, settings, none)) > 100
         assert not len(unused.epochs(recording, settings, none))
-    assert recording.tight("automatic")
+    assert recording.is_tight("automatic")
     own = replace(recording, gnss=replace(recording.gnss, derived=False))
-    assert not own.tight("automatic")
+    assert not own.is_tight("automatic")
     assert recording.without("gnss").raw_gnss is None
     left = recording.without("gnss", (20.0, 40.0)).raw_gnss
     inside = (left.t - recording.start > 20.0) & (left.t - recording.start < 40.0)

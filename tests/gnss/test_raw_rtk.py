@@ -387,7 +387,7 @@ def test_an_unknown_phase_centre_is_in_the_height_and_in_nothing_else(drive):
 def test_a_wrong_integer_is_let_go_of(drive, monkeypatch):
     """Every other number of the first vector that the filter takes is wrong, and nothing is noticed for some epochs."""
     recording, truth = drive
-    found, noticed = [], fixing.Epochs.odd
+    found, noticed = [], fixing.Epochs.find_inconsistent
 
     def wrong(a, decorrelated):
         nearest = find_nearest(a, decorrelated)

@@ -91,13 +91,13 @@ def test_linearize_numerically_at_large_residuals(torn: tuple[ImuFactors, States
     value, Ji, Jj, _ = motion.linearize(x, SCALES)
     assert np.linalg.norm(value[:, :3], axis=1).max() > 1.5
     assert np.abs(value[:, 3:6]).max() > 100.0
-    np.testing.assert_allclose(value, motion.residual(x, SCALES), atol=1e-9)
+    np.testing.assert_allclose(value, motion.compute_residual(x, SCALES), atol=1e-9)
 
     def at(which: int, d: Array) -> Array:
         # only even or only odd states move, so that every interval has one end still
         moved = np.zeros((5, DIM))
         moved[which::2] = d
-        return motion.residual(x.plus(moved), SCALES)
+        return motion.compute_residual(x.plus(moved), SCALES)
 
     even, odd = (difference(lambda d, w=w: at(w, d), STEPS) for w in (0, 1))
     first = np.arange(4) % 2 == 0
@@ -108,7 +108,7 @@ def test_linearize_numerically_at_large_residuals(torn: tuple[ImuFactors, States
         assert np.all(np.abs(J - numerical) < 1e-6 * sizes(numerical) + 1e-6)
     for scale in (SCALES, SQUARE):
         Js = motion.linearize(x, scale)[3]
-        numerical = difference(lambda d, s=scale: motion.residual(x, s + d), np.full(len(scale), 1e-4))
+        numerical = difference(lambda d, s=scale: motion.compute_residual(x, s + d), np.full(len(scale), 1e-4))
         assert np.all(np.abs(Js - numerical) < 1e-6 * sizes(numerical) + 1e-6)
 
 
@@ -118,15 +118,15 @@ def test_residual_of_propagated_states_is_zero(motion: ImuFactors) -> None:
     for k in range(N):
         chain.append(motion.propagate(slice(k, k + 1), chain[-1], SCALES)[0])
     x = States.stack(chain)
-    np.testing.assert_allclose(motion.residual(x, SCALES), 0.0, atol=1e-9)
+    np.testing.assert_allclose(motion.compute_residual(x, SCALES), 0.0, atol=1e-9)
     np.testing.assert_allclose(motion.linearize(x, SCALES)[0], 0.0, atol=1e-9)
-    assert np.abs(motion.residual(x)).max() > 1e-4  # and the scale matters
+    assert np.abs(motion.compute_residual(x)).max() > 1e-4  # and the scale matters
 
 
 def test_transition_is_the_linearization_where_the_residual_is_zero(motion: ImuFactors, start: States) -> None:
     """The filter's F and Q against the graph's Ji and Jj: at zero residual they say the same of every interval."""
     end, F = motion.propagate(slice(None), start)
-    Q = motion.noise(slice(None), start.R_nb)
+    Q = motion.compute_noise(slice(None), start.R_nb)
     for k in range(N):
         one = ImuFactors(motion.intervals[k : k + 1], FRAME)
         _, Ji, Jj, _ = one.linearize(States.stack([start[k : k + 1], end[k : k + 1]]))
@@ -151,7 +151,7 @@ def test_noise_by_monte_carlo(motion: ImuFactors, start: States) -> None:
     end = ImuFactors(disturbed, FRAME).propagate(slice(None), x)[0]
     e = end.minus(exact[np.zeros(runs, dtype=int)])
     e[:, 9:] += d[:, 9:]  # the biases walk by themselves
-    Q = motion.noise(slice(k, k + 1), start.R_nb[k : k + 1])[0]
+    Q = motion.compute_noise(slice(k, k + 1), start.R_nb[k : k + 1])[0]
     white = np.linalg.solve(np.linalg.cholesky(Q), e.T)
     values = np.linalg.eigvalsh(white @ white.T / runs)
     ratio = np.sqrt(15 / runs)

@@ -149,7 +149,7 @@ def test_live_states_at_imu_rate_hold_to_their_sigmas(drive: tuple[Recording, Tr
     for k, row in enumerate(rows):
         online.add(row)
         if online.tracker is not None and k % 601 == 0:
-            t, states, P = online.tracker.since(online.sensors)
+            t, states, P = online.tracker.predict_since(online.sensors)
             now = online.live()
             assert now is not None
             if not len(t):
@@ -544,7 +544,7 @@ def test_a_full_disk_leaves_what_had_settled(
     whole.finish()
     whole.close()
     assert (tmp_path / "out" / "trajectory.csv").read_bytes() == (tmp_path / "whole" / "trajectory.csv").read_bytes()
-    assert again.summary()["settled"] == whole.summary()["settled"]
+    assert again.summarise()["settled"] == whole.summarise()["settled"]
 
 
 def test_folders_and_checkpoints_are_not_mixed_up(drive: tuple[Recording, Trajectory], tmp_path: Path) -> None:
@@ -721,7 +721,7 @@ def test_an_imu_is_judged_by_ever_more_rows(drive: tuple[Recording, Trajectory])
     rows, how = list_rows(recording)[1], parse_settings({"solver": {"lag": 60.0}})
     online, _ = played(recording, rows, how)
     used, whole = online.tracker.noise, run(recording.crop(0.0, online._estimated_from), how, ("ekf",))["ekf"].noise
-    assert used.factor("imu.gyro_noise_density", 1.0) > 2.0
+    assert used.get_factor("imu.gyro_noise_density", 1.0) > 2.0
     told = [name for name, one in whole.figures.items() if one.freedom > 10.0]
     assert len(told) > 5
     for name in told:  # a recording has keyframes where stops begin and end, and so other intervals and rows there

@@ -118,7 +118,7 @@ def test_changes_of_carriers_pass_a_late_epoch_by(recording: Recording) -> None:
     kept, used = RawEpochs(setup, Settings().raw_gnss), list_epochs(recording.raw_gnss)[:6]
     for t, values in (*used[:2], *used[3:5], used[2], used[5]):
         kept.add(t, values)
-    series = kept.between(used[1][0], used[5][0])
+    series = kept.build_between(used[1][0], used[5][0])
     t, first = np.unique(series.t, return_index=True)
     np.testing.assert_array_equal(t, [at for at, _ in used])  # with the one before
     assert series.number[first].tolist() == [0, 1, -1, 2, 3, 4]
@@ -238,7 +238,7 @@ def test_wind_up_goes_on_through_whole_cycles_however_epochs_come(
         buffer = RawEpochs(drop_epochs(raw), parse_settings({"raw_gnss": {"ppp": True}}).raw_gnss)
         for t, values in order:
             buffer.add(t, values)
-        part = buffer.between(-np.inf, np.inf)
+        part = buffer.build_between(-np.inf, np.inf)
         assert np.ptp(part.wound - 0.3 * part.t) < 1e-6
 
 
@@ -265,7 +265,7 @@ def test_arcs_are_those_of_the_series_however_its_epochs_come(rtk: Recording) ->
         for t, values in order:
             buffer.add(t, values, used=buffer.is_wanted(t))
         assert len(buffer) < 0.6 * len(epochs)
-        part = buffer.between(-np.inf, np.inf)
+        part = buffer.build_between(-np.inf, np.inf)
         own = np.isin(raw.t, part.t)
         np.testing.assert_array_equal(part.arc_begin, whole.begin[own])
 
@@ -316,7 +316,7 @@ def test_integers_are_rows_and_go_on_from_a_checkpoint_and_from_lines(rtk: Recor
 
 def test_wrong_integers_are_let_go_of(rtk: Recording, monkeypatch: pytest.MonkeyPatch) -> None:
     """Every other number of the first vector that is found is wrong, and nothing is noticed for some epochs."""
-    found, noticed, until = [], fixing.Epochs.odd, 25.0
+    found, noticed, until = [], fixing.Epochs.find_inconsistent, 25.0
 
     def wrong(a, decorrelated):
         found.append(find_nearest(a, decorrelated))
@@ -360,9 +360,9 @@ def test_lines_that_are_no_epochs_are_told(rtk: Recording, spoil: Callable[[str]
 @pytest.mark.parametrize("name", ["1K", "9C", "C"])
 def test_a_source_is_refused_that_names_a_signal_that_its_satellites_do_not_send(rtk: Recording, name: str) -> None:
     said = live_raw(rtk.raw_gnss)
-    assert LiveRaw.model_validate(said).setup().catalogue == drop_epochs(rtk.raw_gnss).catalogue
+    assert LiveRaw.model_validate(said).make_setup().catalogue == drop_epochs(rtk.raw_gnss).catalogue
     with refused("online.raw_names", RecordingError, f"'{name}'"):
-        LiveRaw.model_validate(said | {"signals": [("G", name)]}).setup()
+        LiveRaw.model_validate(said | {"signals": [("G", name)]}).make_setup()
     line = format_line(("raw_gnss", *list_epochs(rtk.raw_gnss)[0]))
     with pytest.raises(ValueError, match=r"\w"):
         parse_row(line.replace(",1C,", f",{name},", 1))
@@ -377,6 +377,6 @@ def test_a_satellite_that_cannot_be_costs_only_itself(rtk: Recording) -> None:
         buffer = RawEpochs(setup, parse_settings({}).raw_gnss)
         assert buffer.find_fault(tuple(spoilt.ravel())) is None
         buffer.add(t, tuple(spoilt.ravel()))
-        left = buffer.between(t, t)
+        left = buffer.build_between(t, t)
         np.testing.assert_array_equal(left.satellite, np.delete(rows[:, 0], 1).astype(int))
         assert np.isfinite(left.antenna).all()

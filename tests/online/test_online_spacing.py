@@ -40,8 +40,8 @@ def test_the_same_fixes_are_used_as_of_the_whole_recording(late: int) -> None:
     expected = space_fixes(recording, 1.0).gnss
     assert expected is not None
     np.testing.assert_array_equal(sensors.gnss.used, expected.t)
-    assert sensors.recording().gnss.t.tolist() == expected.t.tolist()
-    assert len(sensors.recording(every=True).gnss.t) == 300
+    assert sensors.make_recording().gnss.t.tolist() == expected.t.tolist()
+    assert len(sensors.make_recording(every=True).gnss.t) == 300
 
 
 def test_a_fix_that_gives_way_to_a_better_one_leaves_no_trace() -> None:

@@ -293,7 +293,7 @@ def test_parts_of_a_recording_are_inspected_too(part: Callable[[str], Recording]
 
 def test_the_text_names_sensors_units_and_findings(drive: Callable[[str], Recording]) -> None:
     inspection = inspect(drive("oracle_drive"))
-    text = inspection.text()
+    text = inspection.format()
     assert isinstance(inspection, Inspection)
     assert f"{inspection.facts['imu']['rate_hz']:.4g} Hz" in text
     assert all(finding.sentence in text for finding in inspection.findings)

@@ -127,9 +127,9 @@ def test_ros_status_of_a_base_is_differential(tmp_path):
 def test_info_counts_them():
     recording = with_types(RECORDING)
     inspection = inspect(recording)
-    assert inspection.values()["gnss"]["types"] == recording.gnss.types
+    assert inspection.to_dict()["gnss"]["types"] == recording.gnss.types
     assert sum(recording.gnss.types.values()) == len(recording.gnss.t)
-    assert re.search(rf"\bfixed {recording.gnss.types['fixed']}\b", inspection.text())
+    assert re.search(rf"\bfixed {recording.gnss.types['fixed']}\b", inspection.format())
     assert "types" not in inspect(RECORDING).facts["gnss"]
 
 

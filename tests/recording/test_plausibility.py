@@ -540,7 +540,7 @@ def test_another_scale_throughout_is_not_a_span(tokyo: Recording) -> None:
 def test_findings_have_keys_and_the_gravest_are_first(tokyo: Recording) -> None:
     wild = change(change(tokyo, "imu", accel=put((3000, 0), 1e4)), "gnss", t=lambda t: t + 1.0)
     wild = change(wild, "imu", gyro=put((slice(None), 0), 0.0))
-    values = inspect(wild).values()["findings"]
+    values = inspect(wild).to_dict()["findings"]
     assert values[0]["key"] == "imu.dead_axis"
     assert values[0]["severity"] == "refused"
     ranks = [("refused", "unreliable", "warning", "note").index(one["severity"]) for one in values]

@@ -38,7 +38,7 @@ def drive() -> Recording:
         optional = [c for c in sensor.names if all(c not in some for some in sensor.needs)]
         for column in optional:
             columns[column][::3] = np.nan
-        series[name] = sensor.series(t, columns)
+        series[name] = sensor.make_series(t, columns)
     return replace(made, sensors=series)
 
 
@@ -104,7 +104,7 @@ def test_rows_of_the_line_protocol(drive):
             assert sensors.add(*back)
             if row[0] in drive.sensors:
                 assert not sensors.add(*back), "the same again"
-    same(drive, sensors.recording())
+    same(drive, sensors.make_recording())
     for wrong, name in (
         ("S,barometr,1.0,2.0,", "'barometr'"),
         ("S,barometer,1.0", "'S,barometer'"),
@@ -152,8 +152,8 @@ def test_columns_and_units_of_a_file(drive, tmp_path):
 def test_settings_of_a_sensor(tmp_path):
     file = tmp_path / "settings.toml"
     file.write_text(format_settings(parse_settings({"sensors": {"barometer": {"use": False}}})))
-    assert not read_settings(file).sensor("barometer").use
-    assert Settings().sensor("barometer").use
+    assert not read_settings(file).get_sensor("barometer").use
+    assert Settings().get_sensor("barometer").use
     with refused("key.value", ConfigError, "barometer"):
         parse_settings({"sensors": {"barometre": {}}})
 
@@ -165,7 +165,7 @@ def test_a_name_that_is_taken():
 
 def test_a_command_with_a_sensor_withheld(drive, tmp_path, capsys):
     t = np.arange(drive.start + 0.1, drive.end, 0.25)
-    flat = list_sensors()["barometer"].series(t, {"height": np.full(len(t), 20.0)})
+    flat = list_sensors()["barometer"].make_series(t, {"height": np.full(len(t), 20.0)})
     write_folder(replace(drive, sensors={"barometer": flat}), tmp_path / "in")
     out = tmp_path / "out"
     command = ["smooth", str(tmp_path / "in"), "-o", str(out), "--solver", "ekf", "--no-report", "--noise", "stated"]

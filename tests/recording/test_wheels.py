@@ -152,7 +152,7 @@ def errors_over_sigma(odometer: Odometer, window: float) -> tuple[float, float]:
     mean_speed = MeanSpeed.of(odometer)
     a = np.arange(5.0, odometer.t[-1] - 10.0, 0.37)
     error = mean_speed(a, a + window)[0] - (way_to(a + window) - way_to(a)) / window
-    whitened = error / mean_speed.sigma(a, a + window)
+    whitened = error / mean_speed.compute_sigma(a, a + window)
     return float(np.sqrt(np.mean(whitened**2))), float(np.sqrt(np.mean(error**2)))
 
 
@@ -230,7 +230,7 @@ def test_the_sigma_of_a_mean_does_not_ask_what_comes_after_its_window() -> None:
     t = np.arange(0.0, 10.01, 0.5)
     window = np.array([3.0]), np.array([8.0])
     readings = [Odometer(t[:end], speed_at(t[:end]), speed_sigma=0.1) for end in (17, len(t))]
-    ends, goes_on = (MeanSpeed.of(o).sigma(*window) for o in readings)
+    ends, goes_on = (MeanSpeed.of(o).compute_sigma(*window) for o in readings)
     assert readings[0].t[-1] == window[1]
     np.testing.assert_allclose(ends, 0.1 / np.sqrt(10.0))
     np.testing.assert_array_equal(ends, goes_on)

@@ -292,7 +292,7 @@ def test_plotly_takes_every_figure(name):
 def test_figures_load_no_plotting_library():
     code = (
         "import sys, numpy as np, graphnav.report.documents, graphnav.report.plots as p\n"
-        "p.bands({'ekf': p.Curve(np.arange(3.0), np.ones((3, 1)))}, ('a',), 'm', 2.0, spans={}).json\n"
+        "p.plot_bands({'ekf': p.Curve(np.arange(3.0), np.ones((3, 1)))}, ('a',), 'm', 2.0, spans={}).json\n"
         "assert not {'matplotlib', 'plotly'} & set(sys.modules)"
     )
     subprocess.run([sys.executable, "-c", code], check=True)

@@ -72,12 +72,12 @@ def test_a_sole_rolls_about_the_point_that_touches() -> None:
     sole = Sole(points=((-0.1, -0.09), (0.1, -0.09)), ball=1, softness=1e-4)
     pitch = np.linspace(-60.0, -3.0, 200) * DEG
     forward, up = 0.1, -0.09
-    place = sole.forward(pitch) + forward * np.cos(pitch) - up * np.sin(pitch)
-    height = sole.height(pitch) + forward * np.sin(pitch) + up * np.cos(pitch)
+    place = sole.compute_forward(pitch) + forward * np.cos(pitch) - up * np.sin(pitch)
+    height = sole.compute_height(pitch) + forward * np.sin(pitch) + up * np.cos(pitch)
     assert np.abs(place - place[0]).max() < 1e-6
     assert abs(place[0]) < 1e-3  # under the ball of the flat shoe, but for how soft it is
     assert np.abs(height).max() < 1e-6
-    heel = sole.forward(-pitch) - 0.1 * np.cos(pitch) - 0.09 * np.sin(pitch)
+    heel = sole.compute_forward(-pitch) - 0.1 * np.cos(pitch) - 0.09 * np.sin(pitch)
     assert np.ptp(heel) < 1e-6
     assert heel[0] == pytest.approx(-0.2, abs=1e-3)
 

@@ -172,7 +172,7 @@ def test_axle_moves_where_the_vehicle_points() -> None:
     llh, v = motion.point(t, ASKEW.axle_lever_arm)
     R_lv = ro.from_rph(path.spline(t)[:, [3, 2, 1]])
     forward = np.einsum("kji,kj->ki", R_lv, v)
-    np.testing.assert_allclose(forward, np.column_stack([0 * t, path.speed(t), 0 * t]), atol=1e-8)
+    np.testing.assert_allclose(forward, np.column_stack([0 * t, path.compute_speed(t), 0 * t]), atol=1e-8)
     assert np.abs(llh_to_ecef(llh) - llh_to_ecef(np.column_stack(
         [np.interp(t, motion.t, motion.axle_llh[:, k]) for k in range(3)]))).max() < 2e-5  # fmt: skip
 
@@ -430,16 +430,16 @@ def test_odometer_readings() -> None:
     model = OdometerModel(rate=50.0, scale=0.02, white=0.0)
     odometer, scale = model.read(path, mount, 3)
     assert scale != 0.0
-    np.testing.assert_allclose(odometer.speed, (1.0 + scale) * path.speed(odometer.t), atol=2e-3)
+    np.testing.assert_allclose(odometer.speed, (1.0 + scale) * path.compute_speed(odometer.t), atol=2e-3)
     late, _ = replace(model, delay=0.1).read(path, mount, 3)
-    np.testing.assert_allclose(late.speed, (1.0 + scale) * path.speed(late.t - 0.1), atol=2e-3)
+    np.testing.assert_allclose(late.speed, (1.0 + scale) * path.compute_speed(late.t - 0.1), atol=2e-3)
     unsigned, _ = replace(model, signed=False).read(path, mount, 3)
     np.testing.assert_array_equal(unsigned.speed, np.abs(odometer.speed))
     broken, _ = replace(model, stuck=((20.0, 25.0),), unplugged=((30.0, 35.0),)).read(path, mount, 3)
     assert np.all(broken.speed[(broken.t >= 20.0) & (broken.t <= 25.0)] == 0.0)
     assert not np.any((broken.t >= 30.0) & (broken.t <= 35.0))
     noisy, _ = replace(model, white=0.1).read(path, mount, 3)
-    moving = path.speed(noisy.t) != 0.0
+    moving = path.compute_speed(noisy.t) != 0.0
     assert (noisy.speed - odometer.speed)[moving].std() == pytest.approx(0.1, rel=0.06)
     assert np.all(noisy.speed[~moving] == odometer.speed[~moving])
 
@@ -450,7 +450,7 @@ def test_wheel_pulses_are_whole_and_none_is_lost() -> None:
     odometer, _ = model.read(path, Mount(), 0)
     counts = odometer.speed / 25.0 / 0.04
     np.testing.assert_allclose(counts, np.round(counts), atol=1e-9)
-    total = path.distance(np.array([path.end + 1.0]))[0]
+    total = path.compute_distance(np.array([path.end + 1.0]))[0]
     assert abs(np.sum(odometer.speed) / 25.0 - total) <= 0.04
 
 

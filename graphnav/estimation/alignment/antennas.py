@@ -45,7 +45,7 @@ def measure_baseline_heading(
         None where it does not stand, or where fewer than three readings can be used.
     """
     series = recording.sensors.get(SENSOR.name)
-    if recording.platform != "vehicle" or series is None or not settings.sensor(SENSOR.name).use:
+    if recording.platform != "vehicle" or series is None or not settings.get_sensor(SENSOR.name).use:
         return None
     begin, first = recording.start, float(recording.imu.t[0]) + SAME_TIME
     if stationary is None:
@@ -58,7 +58,7 @@ def measure_baseline_heading(
     of_level = rotation.from_rph(np.array([*level(recording, begin), 0.0])) @ np.array(series.figures.baseline)
     heading = rotation.wrap(series["heading"][rows] - np.arctan2(of_level[0], of_level[1]))
     middle = np.angle(np.mean(np.exp(1j * heading)))
-    one = np.median(series.sigma("heading", np.radians(series.figures.sigma))[rows])
+    one = np.median(series.get_sigma("heading", np.radians(series.figures.sigma))[rows])
     return BaselineHeading(
         float(middle + np.median(rotation.wrap(heading - middle))),
         float(np.hypot(one, np.radians(series.figures.baseline_sigma))),

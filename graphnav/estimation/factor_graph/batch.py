@@ -77,12 +77,12 @@ def batch(
         progress("covariances", 0.0)
     keys = list(layout.keys) if wanted is None else [*wanted, *layout.keys[layout.K :]]
     assert found.eliminated is not None
-    of_variables = found.eliminated.covariances(set(layout.variable[keys].tolist()))
+    of_variables = found.eliminated.compute_covariances(set(layout.variable[keys].tolist()))
     marginal = dict(zip(keys, layout.split(of_variables, keys), strict=True))
     unknown = np.full((DIM, DIM), np.nan)
     covariance = np.stack([marginal.get(k, unknown) for k in range(layout.K)])
     done = time.perf_counter()
-    points, records = point.points(problem), {}
+    points, records = point.make_points(problem), {}
     for constraint in problem.constraints:
         record = records[constraint.name] = record_residuals(problem, constraint, points, robust=True)
         if constraint.robust != "none" and np.mean(record.weight < 0.1) > 0.5:
@@ -125,7 +125,7 @@ class _Minimum:
 def _graduate(problem: Problem, point: Iterate) -> Iterator[Problem]:
     """The problem with its "gnc" kernels convex at first and then ever less so, for a step each."""
     mu: dict[str, float] = {}
-    points = point.points(problem)
+    points = point.make_points(problem)
     for c in problem.constraints:
         if c.robust == "gnc":
             s2 = record_residuals(problem, c, points).nis * (1.0 if c.weight is None else c.weight)
@@ -165,14 +165,14 @@ def _minimise(
             eliminated, step, gain = solve_rows(rows, layout, damping)
             if watch is not None and damping == 0.0:
                 watch(point.states, now, gain, slow)
-            candidate = point.moved(step)
+            candidate = point.move(step)
             rows_ahead, ahead = whiten(problem, candidate, layout)
             if ahead < now or gain < settings.tolerance:
                 break
             if damping == 0.0:
                 # an early heading swings all that comes after it along tangents, off the track by the square of
                 # the angle; the step after this one takes that back, and only then is it seen what both bring
-                beyond = candidate.moved(solve_rows(rows_ahead, layout)[1])
+                beyond = candidate.move(solve_rows(rows_ahead, layout)[1])
                 rows_beyond, behind = whiten(problem, beyond, layout)
                 if behind < now:
                     candidate, rows_ahead, ahead = beyond, rows_beyond, behind

@@ -100,7 +100,7 @@ class Eliminated:
         """How much half the squared residuals fall from no variable moved to the optimum: |R x - d|^2 / 2 at x = 0."""
         return float(self._net.error(gtsam.VectorValues.Zero(self._optimum)))
 
-    def covariances(self, keys: set[int] | None = None) -> dict[int, Array]:
+    def compute_covariances(self, keys: set[int] | None = None) -> dict[int, Array]:
         """Marginal covariance of every variable (or of `keys`).
 
         Backwards through the net: a conditional |R x + S s - d|^2 gives, with U = -R^-1 S and the joint

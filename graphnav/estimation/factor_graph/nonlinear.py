@@ -96,7 +96,7 @@ def _add_unlisted(problem: Problem, states: States, values: dict[str, Array]) ->
     sigma = np.concatenate([c.sigma.ravel() for c in chains])
     mean = at = np.concatenate([c.mean.ravel() for c in chains])
     for k in range(_MAX_ITERATIONS):
-        points = Iterate(states, out).points(problem)
+        points = Iterate(states, out).make_points(problem)
         parts = [(diags_array(1.0 / sigma), (mean - at) / sigma)]
         for rows in problem.constraints:
             names = {p.name for p in rows.parameters}
@@ -104,7 +104,7 @@ def _add_unlisted(problem: Problem, states: States, values: dict[str, Array]) ->
             if own:
                 linear = linearise(rows, points, problem.columns)
                 # at first they are too far off for a kernel to distinguish outliers
-                root = np.sqrt(linear.kernel()[0] if k else np.ones(len(rows)))[:, None] / linear.sigma
+                root = np.sqrt(linear.weigh()[0] if k else np.ones(len(rows)))[:, None] / linear.sigma
                 H = csr_array((root.size, len(sigma)))
                 for name, (c, i) in own.items():
                     block = root[:, :, None] * linear.H[:, :, problem.columns[name]]

@@ -215,7 +215,7 @@ class Tree:
                 own_A[at, at] = np.diag(1.0 / step.sigma)
                 if step.name in self._in_force and step.decay:
                     old, was = self._in_force[step.name]
-                    node.anchor[at] = step.ahead(old.anchor[was])
+                    node.anchor[at] = step.predict(old.anchor[was])
                     _, A = old_A.setdefault(old.key, (old, np.zeros((len(node.unit), len(old.unit)))))
                     A[at, was] = -step.decay * own_A[at, at]
                 in_force[step.name] = node, at

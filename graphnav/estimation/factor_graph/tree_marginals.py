@@ -139,7 +139,7 @@ def settle(tree: Tree, so_far: Elimination, now: bool = False) -> SettledStates:
         raise explain_undetermined(so_far.estimates.keyframes[0].place.t) from None
     assert so_far.net is not None
     one = read_keyframes(tree, so_far.first, so_far.count) if now else so_far.estimates
-    found = Eliminated(so_far.net).covariances()
+    found = Eliminated(so_far.net).compute_covariances()
     marginal = {x.key: x.unit[:, None] * found[x.key] * x.unit for x in so_far.own}
     sigma = []
     for k, values in zip(one.keyframes, one.values, strict=True):

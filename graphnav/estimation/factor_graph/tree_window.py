@@ -53,7 +53,7 @@ class TreeWindow(Window):
     def _adopt(self, stage: Stage) -> Stage:
         """The newest stage about the tree's estimate."""
         now, message = self.tree.newest, stage.message
-        moved = stage.moved(np.concatenate([now.state.minus(message.state)[0], now.values - message.values]))
+        moved = stage.move(np.concatenate([now.state.minus(message.state)[0], now.values - message.values]))
         return replace(moved, message=replace(moved.message, z=np.zeros(len(message.z))))
 
     def _adopt_all(self) -> None:

@@ -24,7 +24,7 @@ def apply_noise(problem: Problem, noise: NoiseModel) -> Problem:
     ----------
     problem : as built; its intervals keep the parts of their covariances if a figure of the IMU differs.
     """
-    factors = np.array([noise.factor(f"imu.{name}", 1.0) for name in NOISE_FIGURES])
+    factors = np.array([noise.get_factor(f"imu.{name}", 1.0) for name in NOISE_FIGURES])
     each = _compute_interval_factors(problem, noise)
     if each is not None or np.any(factors != 1.0):
         intervals = problem.intervals.with_noise(factors if each is None else factors * each)
@@ -84,9 +84,9 @@ def _scale_rows(problem: Problem, rows: Constraint, noise: NoiseModel) -> Constr
     own = tuple(_scale_process(p, noise, 1.0) for p in rows.parameters)
     errors = tuple(_scale_process(p, noise, 0.0) for p in rows.processes)
     changed: dict[str, Any] = {"parameters": tuple(p for p in (*own, *errors) if p is not None)}
-    names, index = rows.noise_groups()
+    names, index = rows.list_noise_groups()
     if names:
-        root = np.sqrt([noise.factor(name, 1.0) for name in names])
+        root = np.sqrt([noise.get_factor(name, 1.0) for name in names])
         changed["sigma"] = _scale_sigma(rows, np.where(index >= 0, root[index], 1.0))
     if rows.name in noise.weights or rows.name in noise.excluded:
         changed["weight"] = select_weights(problem.t[rows.keyframe], noise, rows.name)
@@ -105,7 +105,7 @@ def _scale_process(p: Parameter, noise: NoiseModel, missing: float) -> Parameter
     """A parameter with its factors; None for a process that does not exist."""
     if not p.noise_groups:
         return p
-    factors = np.array([noise.factor(group, missing) for group in p.noise_groups])
+    factors = np.array([noise.get_factor(group, missing) for group in p.noise_groups])
     if not factors.any():
         return None
     sigma = p.sigma * np.sqrt(np.maximum(factors, 1e-12))

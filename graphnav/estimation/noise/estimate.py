@@ -72,13 +72,13 @@ class NoiseEstimate:
         """Of the measurements; each row and interval of reduced weight has the cost of an outlier."""
         return self.log_posterior + compute_outlier_cost(self.noise.weights)
 
-    def linearisation(self, base: Problem) -> tuple[Points, Problem]:
+    def get_linearisation(self, base: Problem) -> tuple[Points, Problem]:
         """Its points and the problem that they are of, to start another estimate from."""
         return self.points, apply_noise(base, self.noise)
 
     def carry_points(self, base: Problem, problem: Problem) -> Points:
         """Its points for a problem with the same keyframes and another noise model."""
-        return _carry(*self.linearisation(base), problem)
+        return _carry(*self.get_linearisation(base), problem)
 
 
 @dataclass
@@ -101,15 +101,15 @@ class _Components:
         times, weights, steps = dict(self.times), dict(self.weights), dict(self.steps)
         return replace(self, log=dict(self.log), freedom=dict(self.freedom), times=times, weights=weights, steps=steps)
 
-    def model(self) -> NoiseModel:
+    def build_model(self) -> NoiseModel:
         figures = {}
         for name, x in self.log.items():
-            m, s = self.prior(name)
+            m, s = self.get_prior(name)
             B = self.freedom.get(name, 0.0)
             figures[name] = VarianceComponent(x, float((0.5 * B + s**-2.0) ** -0.5), m, s, B)
         return NoiseModel(figures, dict(self.times), dict(self.weights), self.excluded)
 
-    def prior(self, name: str) -> tuple[float, float]:
+    def get_prior(self, name: str) -> tuple[float, float]:
         """Median and 1-sigma of a log factor; where the white part of fixes exceeds the stated, so do the others."""
         m, s = get_prior(name)
         sensor, *kind, axis = name.split(".")
@@ -118,11 +118,11 @@ class _Components:
         return m, s
 
     def log_prior(self) -> float:
-        return -0.5 * sum(((x - m) / s) ** 2 for name, x in self.log.items() for m, s in [self.prior(name)])
+        return -0.5 * sum(((x - m) / s) ** 2 for name, x in self.log.items() for m, s in [self.get_prior(name)])
 
     def update(self, name: str, A: float, B: float) -> None:
         """One step of a component with sum of squares A and redundancy B."""
-        m, s = self.prior(name)
+        m, s = self.get_prior(name)
         x, before = 0.0, self.log[name]
         for _ in range(50):
             slope = 0.5 * (A * np.exp(-x) - B) - (before + x - m) / s**2
@@ -165,8 +165,10 @@ def estimate_noise(
     """
     figures = _begin(problem, start, changed)
     if near is not None:
-        return _iterate(problem, figures, _carry(*near, apply_noise(problem, figures.model())), progress, intervals)
-    used = apply_noise(problem, figures.model())
+        return _iterate(
+            problem, figures, _carry(*near, apply_noise(problem, figures.build_model())), progress, intervals
+        )
+    used = apply_noise(problem, figures.build_model())
     try:
         initials, passes = find_initial_points(used, opening)
     except BREAKDOWN:  # with the prior's medians; with the noise that is stated it may not
@@ -204,8 +206,8 @@ def _iterate(
         rounds = _AGAIN if figures.same_data or end != ends[0] else _ROUNDS
         likeliest, most = figures, -np.inf
         for k in range(_MOST):
-            used, latest = apply_noise(problem, figures.model()), None  # releases the memory of the previous pass
-            latest = _smooth_about(used, about.first(end))
+            used, latest = apply_noise(problem, figures.build_model()), None  # releases the memory of the previous pass
+            latest = _smooth_about(used, about.take_first(end))
             passes += 1
             prior_then = figures.log_prior()
             now = float(np.sum(latest[0].log_likelihood)) + prior_then
@@ -224,11 +226,11 @@ def _iterate(
             figures = likeliest
     if not converged:
         latest = None
-        latest = _smooth_about(apply_noise(problem, figures.model()), about)
+        latest = _smooth_about(apply_noise(problem, figures.build_model()), about)
         passes, prior_then = passes + 1, figures.log_prior()
         now = float(np.sum(latest[0].log_likelihood)) + prior_then
     assert latest is not None
-    return NoiseEstimate(figures.model(), latest[1], now, prior_then, Counter(filter=passes, smoother=passes))
+    return NoiseEstimate(figures.build_model(), latest[1], now, prior_then, Counter(filter=passes, smoother=passes))
 
 
 def _smooth_about(problem: Problem, about: Points) -> tuple[ForwardRecord, DisturbancePass]:
@@ -239,7 +241,10 @@ def _smooth_about(problem: Problem, about: Points) -> tuple[ForwardRecord, Distu
 def _begin(problem: Problem, start: NoiseModel | None, changed: bool = False) -> _Components:
     names = [f"imu.{name}" for name in NOISE_FIGURES]
     for rows in problem.constraints:
-        names += [*rows.noise_groups()[0], *(g for p in (*rows.parameters, *rows.processes) for g in p.noise_groups)]
+        names += [
+            *rows.list_noise_groups()[0],
+            *(g for p in (*rows.parameters, *rows.processes) for g in p.noise_groups),
+        ]
     names += [group for p in problem.parameters.values() for group in p.noise_groups]
     log = {name: get_prior(name)[0] for name in dict.fromkeys(names)}
     processes = [p for rows in problem.constraints for p in (*rows.parameters, *rows.processes)]
@@ -299,7 +304,7 @@ def _improve(
             if chain.parameter.correlation_time is not None and observed.any():
                 _improve_time(figures, chain, observed, lag_moments(problem, chain, smoothed, end))
     for rows in problem.constraints:
-        names, index = rows.noise_groups()
+        names, index = rows.list_noise_groups()
         if not names:
             continue
         n = int(np.searchsorted(rows.keyframe, end))
@@ -320,7 +325,7 @@ def _weigh_intervals(figures: _Components, problem: Problem, imu: ImuMoments) ->
         ratio = imu.A[:, i] / np.maximum(imu.B[:, i], 1e-30) * freedom
         # if half of the intervals are off, it is the variance that has not converged yet
         scale = max(float(np.median(ratio / chdtri(freedom, 0.5))), 1.0)
-        more = 1.0 / select_weights(t, figures.model(), name)
+        more = 1.0 / select_weights(t, figures.build_model(), name)
         most = np.maximum(lost**2 * problem.intervals.T[:n] / density**2, 1.0)
         more[:n] = np.clip(more[:n] * ratio / chdtri(freedom, CHANCE) / scale, 1.0, most)
         some = more > 1.0

@@ -114,7 +114,7 @@ def estimate_without_faults(
         return replace(decision.estimate or found, passes=passes)
     # from the priors: figures that were estimated with the fault among the data are far from where they will end
     start = NoiseModel(weights=decision.noise.weights, excluded=decision.noise.excluded)
-    near = (decision.estimate or found).linearisation(base)
+    near = (decision.estimate or found).get_linearisation(base)
     again = estimate_noise(base, opening, start, near, progress)
     return _readmit(base, replace(again, passes=passes + again.passes))
 
@@ -154,7 +154,7 @@ def _unmask(base: Problem, found: NoiseEstimate, first: Decision, masked: list[S
     best, leading, estimate, spans, passes = first, found, found, masked, first.passes
     start = NoiseModel(found.noise.figures, found.noise.times, excluded=dict.fromkeys(FIXES, tuple(masked)))
     for _ in range(_REFINEMENTS):
-        estimate = estimate_noise(base, None, start, estimate.linearisation(base), changed=True)
+        estimate = estimate_noise(base, None, start, estimate.get_linearisation(base), changed=True)
         errors = _predict_left_out(apply_noise(base, estimate.noise), estimate)
         detected = find_spans(base, replace(estimate.noise, excluded={}), estimate)
         passes = passes + estimate.passes + Counter(filter=1)
@@ -169,7 +169,7 @@ def _unmask(base: Problem, found: NoiseEstimate, first: Decision, masked: list[S
             break
         if not refined:  # single outliers and no fault
             everything = replace(estimate.noise, excluded={})
-            free = estimate_noise(base, None, everything, estimate.linearisation(base))
+            free = estimate_noise(base, None, everything, estimate.get_linearisation(base))
             passes = passes + free.passes
             if free.log_evidence > first.log_evidence:
                 return Decision(free.noise, free.log_evidence, passes, free)
@@ -177,7 +177,7 @@ def _unmask(base: Problem, found: NoiseEstimate, first: Decision, masked: list[S
             break
         spans, start = refined, replace(start, excluded=dict.fromkeys(FIXES, tuple(refined)))
     if best is not first and not best.noise.excluded:  # the figures that go with these outliers
-        free = estimate_noise(base, None, best.noise, leading.linearisation(base))
+        free = estimate_noise(base, None, best.noise, leading.get_linearisation(base))
         return Decision(free.noise, best.log_evidence, passes + free.passes, free)
     return replace(best, passes=passes)
 
@@ -194,7 +194,7 @@ def _readmit(base: Problem, found: NoiseEstimate) -> NoiseEstimate:
     passes = found.passes + wide.passes + less.passes
     if less.log_evidence <= wide.log_evidence:
         return replace(found, passes=passes)
-    again = estimate_noise(base, None, less.noise, found.linearisation(base))
+    again = estimate_noise(base, None, less.noise, found.get_linearisation(base))
     return replace(again, passes=passes + again.passes)
 
 
@@ -209,19 +209,19 @@ def estimate_disturbed_intervals(base: Problem, found: NoiseEstimate) -> NoiseEs
     base : built with stated noise and the parts of its intervals' noise.
     found : with all intervals alike.
     """
-    start, near, passes = found.noise, found.linearisation(base), found.passes
+    start, near, passes = found.noise, found.get_linearisation(base), found.passes
     if found.noise.excluded:
         free = estimate_noise(base, None, replace(found.noise, excluded={}), near, intervals=True)
         decision = decide(base, free, find_spans(base, free.noise, free))
         passes = passes + free.passes + decision.passes + Counter(filter=1)
         if decision.noise.excluded:
             without = replace(free.noise, excluded=decision.noise.excluded)
-            free = estimate_noise(base, None, without, free.linearisation(base), intervals=True)
+            free = estimate_noise(base, None, without, free.get_linearisation(base), intervals=True)
             passes = passes + free.passes
         if log_evidence(base, free) > log_evidence(base, found):
             return replace(free, passes=passes)
         if free.noise.excluded == found.noise.excluded:  # the same model, already on its way
-            start, near = free.noise, free.linearisation(base)
+            start, near = free.noise, free.get_linearisation(base)
     disturbed = estimate_noise(base, None, start, near, intervals=True)
     return replace(disturbed, passes=passes + disturbed.passes)
 

@@ -143,7 +143,7 @@ def read_noise_and_mode(path: str | Path) -> tuple[NoiseModel, str]:
         raise ConfigError(f"{path}: not valid JSON ({error}); {what}", key="json.syntax") from None
     if not isinstance(values, Mapping) or not isinstance(values.get("noise"), Mapping):
         raise ConfigError(f"{path}: holds no table 'noise'; {what}", key="noise.no_model")
-    return _Reader(path).model(values["noise"])
+    return _Reader(path).read_model(values["noise"])
 
 
 def list_groups() -> tuple[str, ...]:
@@ -174,53 +174,53 @@ class _Reader:
     def __init__(self, path: Path) -> None:
         self.path = path
 
-    def model(self, values: Mapping[str, Any]) -> tuple[NoiseModel, str]:
-        self.names(values, _KEYS, "noise")
+    def read_model(self, values: Mapping[str, Any]) -> tuple[NoiseModel, str]:
+        self.read_names(values, _KEYS, "noise")
         mode = values.get("mode", "estimated")
         if mode not in MODES:
-            raise self.error("noise.mode", mode, f"must be one of {', '.join(MODES)}")
+            raise self.make_error("noise.mode", mode, f"must be one of {', '.join(MODES)}")
         constraints = [cls.name for cls in list_constraints()]
         return NoiseModel(
-            self.each(values, "figures", list_groups(), self.figure),
-            self.each(values, "correlation_times", _list_processes(), self.time),
-            self.each(values, "weights", [*constraints, *INTERVALS], self.weights),
-            self.each(values, "excluded", constraints, self.spans),
-            self.number("noise.spacing", values.get("spacing", 0.0), 0.0, 60.0, "s between fixes"),
-            StampOffsets(**self.each(values, "stamps", _STAMPS, self.offset)),
+            self.read_each(values, "figures", list_groups(), self.read_figure),
+            self.read_each(values, "correlation_times", _list_processes(), self.read_time),
+            self.read_each(values, "weights", [*constraints, *INTERVALS], self.read_weights),
+            self.read_each(values, "excluded", constraints, self.read_spans),
+            self.read_number("noise.spacing", values.get("spacing", 0.0), 0.0, 60.0, "s between fixes"),
+            StampOffsets(**self.read_each(values, "stamps", _STAMPS, self.read_offset)),
         ), mode
 
-    def error(self, key: str, value: Any, why: str) -> ConfigError:
+    def make_error(self, key: str, value: Any, why: str) -> ConfigError:
         shown = json.dumps(value)
         sentence = f"{self.path}: '{key}' = {shown if len(shown) <= 40 else shown[:37] + '...'}: {why}"
         return ConfigError(sentence, key="key.value")
 
-    def names(self, values: Mapping[str, Any], known: Sequence[str], at: str) -> None:
+    def read_names(self, values: Mapping[str, Any], known: Sequence[str], at: str) -> None:
         for name in values:
             if name not in known:
                 raise ConfigError(
                     f"{self.path}: unknown key '{at}.{name}'; {suggest_nearest(name, known)}", key="key.unknown"
                 )
 
-    def each(
+    def read_each(
         self, values: Mapping[str, Any], key: str, known: Sequence[str], read: Callable[[str, Any], Any]
     ) -> dict[str, Any]:
         table = values.get(key, {})
         if not isinstance(table, Mapping):
-            raise self.error(f"noise.{key}", table, "must be a table by name")
-        self.names(table, known, f"noise.{key}")
+            raise self.make_error(f"noise.{key}", table, "must be a table by name")
+        self.read_names(table, known, f"noise.{key}")
         return {name: read(f"noise.{key}.{name}", value) for name, value in table.items()}
 
-    def number(self, key: str, value: Any, low: float, high: float, what: str) -> float:
+    def read_number(self, key: str, value: Any, low: float, high: float, what: str) -> float:
         if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-            raise self.error(key, value, f"must be a number: {what}")
+            raise self.make_error(key, value, f"must be a number: {what}")
         if not low <= value <= high:
-            raise self.error(key, value, f"must be between {low:g} and {high:g}: {what}")
+            raise self.make_error(key, value, f"must be between {low:g} and {high:g}: {what}")
         return float(value)
 
-    def figure(self, key: str, value: Any) -> VarianceComponent:
+    def read_figure(self, key: str, value: Any) -> VarianceComponent:
         if not isinstance(value, Mapping):
-            raise self.error(key, value, "must be a table with log_factor or variance_factor")
-        self.names(value, (*_FIGURE, *_BESIDE), key)
+            raise self.make_error(key, value, "must be a table with log_factor or variance_factor")
+        self.read_names(value, (*_FIGURE, *_BESIDE), key)
         what = "the natural logarithm of a variance factor"
         if "log_factor" not in value and "variance_factor" not in value:
             raise ConfigError(
@@ -229,12 +229,12 @@ class _Reader:
         given = None
         if "variance_factor" in value:
             given = math.log(
-                self.number(f"{key}.variance_factor", value["variance_factor"], math.exp(_TINY), math.exp(_HUGE),
+                self.read_number(f"{key}.variance_factor", value["variance_factor"], math.exp(_TINY), math.exp(_HUGE),
                             "on the stated variance")
             )  # fmt: skip
         log = given
         if "log_factor" in value:
-            log = self.number(f"{key}.log_factor", value["log_factor"], _TINY, _HUGE, what)
+            log = self.read_number(f"{key}.log_factor", value["log_factor"], _TINY, _HUGE, what)
             if given is not None and abs(given - log) > 1e-9:
                 raise ConfigError(
                     f"{self.path}: '{key}': log_factor and variance_factor disagree; leave one of them out",
@@ -243,28 +243,30 @@ class _Reader:
         assert log is not None
         return VarianceComponent(
             log,
-            self.number(f"{key}.sigma", value.get("sigma", 0.0), 0.0, _HUGE, f"1-sigma of {what}"),
-            self.number(f"{key}.prior", value.get("prior", 0.0), _TINY, _HUGE, f"the prior's median, {what}"),
-            self.number(f"{key}.prior_sigma", value.get("prior_sigma", 0.0), 0.0, _HUGE, f"1-sigma of {what}"),
-            self.number(f"{key}.degrees_of_freedom", value.get("degrees_of_freedom", 0.0), 0.0, math.inf, "a count"),
+            self.read_number(f"{key}.sigma", value.get("sigma", 0.0), 0.0, _HUGE, f"1-sigma of {what}"),
+            self.read_number(f"{key}.prior", value.get("prior", 0.0), _TINY, _HUGE, f"the prior's median, {what}"),
+            self.read_number(f"{key}.prior_sigma", value.get("prior_sigma", 0.0), 0.0, _HUGE, f"1-sigma of {what}"),
+            self.read_number(
+                f"{key}.degrees_of_freedom", value.get("degrees_of_freedom", 0.0), 0.0, math.inf, "a count"
+            ),
         )
 
-    def time(self, key: str, value: Any) -> float:
-        return self.number(key, value, 1e-3, 1e9, "s, a correlation time")
+    def read_time(self, key: str, value: Any) -> float:
+        return self.read_number(key, value, 1e-3, 1e9, "s, a correlation time")
 
-    def offset(self, key: str, value: Any) -> float:
-        return self.number(key, value, -_LARGEST_OFFSET, _LARGEST_OFFSET, "s to be added to stamps")
+    def read_offset(self, key: str, value: Any) -> float:
+        return self.read_number(key, value, -_LARGEST_OFFSET, _LARGEST_OFFSET, "s to be added to stamps")
 
-    def weights(self, key: str, value: Any) -> RowWeights:
+    def read_weights(self, key: str, value: Any) -> RowWeights:
         if not isinstance(value, Mapping) or set(value) != {"t", "weight"}:
-            raise self.error(key, value, "must be a table with the lists t and weight")
+            raise self.make_error(key, value, "must be a table with the lists t and weight")
         lists = {}
         least = _LEAST if key.endswith(INTERVALS) else 0.0
         for name, what, low, high in (("t", "s", -math.inf, math.inf), ("weight", "of information", least, 1.0)):
             some = value[name]
             if not isinstance(some, list):
-                raise self.error(f"{key}.{name}", some, "must be a list of numbers")
-            lists[name] = np.array([self.number(f"{key}.{name}", x, low, high, what) for x in some], dtype=float)
+                raise self.make_error(f"{key}.{name}", some, "must be a list of numbers")
+            lists[name] = np.array([self.read_number(f"{key}.{name}", x, low, high, what) for x in some], dtype=float)
         t, weight = lists["t"], lists["weight"]
         if len(t) != len(weight):
             raise ConfigError(
@@ -277,15 +279,15 @@ class _Reader:
             )
         return RowWeights(t, weight)
 
-    def spans(self, key: str, value: Any) -> tuple[tuple[float, float], ...]:
+    def read_spans(self, key: str, value: Any) -> tuple[tuple[float, float], ...]:
         if not isinstance(value, list):
-            raise self.error(key, value, "must be a list of [begin, end], s")
+            raise self.make_error(key, value, "must be a list of [begin, end], s")
         out = []
         for one in value:
             if not isinstance(one, list) or len(one) != 2:
-                raise self.error(key, one, "must be [begin, end], s")
-            begin, end = (self.number(key, x, -math.inf, math.inf, "s") for x in one)
+                raise self.make_error(key, one, "must be [begin, end], s")
+            begin, end = (self.read_number(key, x, -math.inf, math.inf, "s") for x in one)
             if end < begin:
-                raise self.error(key, one, "ends before it begins")
+                raise self.make_error(key, one, "ends before it begins")
             out.append((begin, end))
         return tuple(out)

@@ -70,5 +70,5 @@ def bound_density(t: Array, x: Array) -> float:
     mean = x[:n].reshape(count, size, 3).mean(axis=1)
     bend = np.sum((mean[2:] - 2.0 * mean[1:-1] + mean[:-2]) ** 2, axis=1) / (3.0 * 6.0) * (size * period)
     degrees = 3.0 * (stretch - 2) * _INDEPENDENT
-    quietest = float(sum_running(bend[:, None]).means(stretch - 2).min())
+    quietest = float(sum_running(bend[:, None]).compute_means(stretch - 2).min())
     return float(np.sqrt(quietest * degrees / (2.0 * gammaincinv(0.5 * degrees, _CHANCE))))

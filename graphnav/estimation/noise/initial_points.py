@@ -136,7 +136,9 @@ def _anneal(problem: Problem, opening: float | None) -> tuple[Initial, int]:
         if settled:
             break
         wider /= _COOLING
-    larger = {group: -float(np.median(np.log(share[rows.name]))) for rows in fixes for group in rows.noise_groups()[0]}
+    larger = {
+        group: -float(np.median(np.log(share[rows.name]))) for rows in fixes for group in rows.list_noise_groups()[0]
+    }
     return Initial(about, outliers, larger), passes
 
 

@@ -69,7 +69,7 @@ class NoiseModel:
     spacing: float = 0.0  # s, at least, between the fixes that are used (`graphnav.estimation.noise.spacing`)
     stamps: StampOffsets = StampOffsets()
 
-    def factor(self, group: str, missing: float) -> float:
+    def get_factor(self, group: str, missing: float) -> float:
         """On the variance of a group; `missing` where nothing is said of it."""
         return self.figures[group].factor if group in self.figures else missing
 

@@ -70,7 +70,7 @@ def collect_imu_moments(problem: Problem, forward: ForwardRecord, smoothed: Dist
     freedom times B over these (Satterthwaite 1946, "An approximate distribution of estimates of variance components").
     """
     start = forward.predicted_from.R_nb
-    L = problem.motion.frames(slice(0, len(start)), start)
+    L = problem.motion.compute_frames(slice(0, len(start)), start)
     Lt = np.swapaxes(L, -1, -2)
     r = (Lt @ smoothed.r[1:, :DIM, None])[..., 0]
     N = Lt @ smoothed.N[1:] @ L

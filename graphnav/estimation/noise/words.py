@@ -69,7 +69,7 @@ def describe(noise: NoiseModel, problem: Problem) -> tuple[str, ...]:
         sentence = f"larger {' and '.join(more)} of {len(problem.t) - 1} intervals between keyframes"
         out.append(Note("noise.imu.outliers", f"noise model, IMU: {sentence}, up to {most:.2g} times the usual"))
     for rows in problem.constraints:
-        names = [g for g in rows.noise_groups()[0] if g in noise.figures]
+        names = [g for g in rows.list_noise_groups()[0] if g in noise.figures]
         errors = [
             p for p in rows.parameters if p.noise_groups and p.correlation_time is not None and p.name != STAMP_ERROR
         ]
@@ -78,7 +78,7 @@ def describe(noise: NoiseModel, problem: Problem) -> tuple[str, ...]:
         parts = [f"{g.removeprefix(rows.name + '.')} {np.sqrt(noise.figures[g].factor):.2g}" for g in names]
         for p in errors:
             sizes = dict.fromkeys(p.noise_groups)
-            each = ", ".join(f"{g.rsplit('.', 1)[-1]} {np.sqrt(noise.factor(g, 0.0)):.2g}" for g in sizes)
+            each = ", ".join(f"{g.rsplit('.', 1)[-1]} {np.sqrt(noise.get_factor(g, 0.0)):.2g}" for g in sizes)
             out_time = f"{p.correlation_time:.2g} s"
             parts.append(f"Gauss-Markov with {out_time}: {each}")
         stamps = next((p for p in rows.parameters if p.name == STAMP_ERROR), None)

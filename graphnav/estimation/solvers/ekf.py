@@ -87,7 +87,7 @@ def ekf(
         about = (
             _smooth_about(problem, smooth_backward(problem, _run_forward(problem, n)))[1]
             if known is None
-            else known.first(n)
+            else known.take_first(n)
         )
     one = _run_forward(problem, K, about, progress, decide=decide, stays=stays)
     seconds = time.perf_counter() - began
@@ -153,7 +153,7 @@ class Comparison:
         stack, steps = Stack(problem, self._K), advance(problem, self._K)
         one = self._one.lift(problem, about, stack, anew)
         x, P = _start_from_prior(problem)
-        start = _begin(subtract_points(x, about.first(1))[0], P, stack.records)
+        start = _begin(subtract_points(x, about.take_first(1))[0], P, stack.records)
         filter_likelihood(problem, about, stack, steps, one, start)
         return stack.log_likelihood()
 
@@ -216,11 +216,11 @@ def _run_forward(
         follow = search.follow if search is not None else None
         if decide is not None:
             follow = partial(_hold_errors, decide, about, errors)
-        start = subtract_points(x, about.first(1))[0]
+        start = subtract_points(x, about.take_first(1))[0]
         given.run(partial(_begin, start, P, stack.records, search), follow, progress)
         updates = given.updates
         # from there on it is linearised where the filter is
-        last = about.at(slice(n - 1, n))
+        last = about.take(slice(n - 1, n))
         x = move_points(last, errors.filtered[n - 1 :])
         all_P[n - 1] = transport_covariance(all_P[n - 1 : n], last.states, x.states)[0]
         P = all_P[n - 1]
@@ -230,14 +230,14 @@ def _run_forward(
     while k < K:
         on = stretches.run(k, x, P, ahead, found)
         k = on if decide is None else _hold(decide, k, on, found, all_P)
-        x, P = found.at(slice(k - 1, k)), all_P[k - 1]
+        x, P = found.take(slice(k - 1, k)), all_P[k - 1]
         if progress is not None:
             progress("filter", k / K)
     log_likelihood = stack.finish() if whole or watch else stack.log_likelihood()
     filtered, predicted = found, ahead
     if about is not None:
-        filtered = join_passes([move_points(about, errors.filtered), found.at(slice(n, None))])
-        predicted = join_passes([move_points(about, errors.predicted), ahead.at(slice(n, None))])
+        filtered = join_passes([move_points(about, errors.filtered), found.take(slice(n, None))])
+        predicted = join_passes([move_points(about, errors.predicted), ahead.take(slice(n, None))])
     return ForwardRecord(
         filtered.states,
         filtered.values,
@@ -275,7 +275,7 @@ def _begin(x: Any, P: Array, records: dict[str, Innovations], search: FaultSearc
 def _hold(decide: Decide, k0: int, k1: int, found: Points, all_P: Array) -> int:
     """Decide at keyframes from k0 to k1, and hold to what is decided first; the keyframe to go on from."""
     for k in range(k0, k1):
-        here = found.at(slice(k, k + 1))
+        here = found.take(slice(k, k + 1))
         if (one := decide(k, here, all_P[k])) is not None:
             d, P = hold(one, all_P[k])
             to = move_points(here, d[None])
@@ -288,7 +288,7 @@ def _hold(decide: Decide, k0: int, k1: int, found: Points, all_P: Array) -> int:
 def _hold_errors(decide: Decide, about: Points, errors: FilterErrors, k0: int, k1: int) -> int:
     """As `_hold`, of errors about given points, which stay."""
     for k in range(k0, k1):
-        here = move_points(about.at(slice(k, k + 1)), errors.filtered[k : k + 1])
+        here = move_points(about.take(slice(k, k + 1)), errors.filtered[k : k + 1])
         if (one := decide(k, here, errors.P[k])) is not None:
             d, errors.P[k] = hold(one, errors.P[k])
             errors.filtered[k] += d

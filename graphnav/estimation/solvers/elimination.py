@@ -103,7 +103,7 @@ def predict(
         if step.name in before.columns and step.decay:
             old = before.columns[step.name]
             head[own, to[old.start : old.stop]] = -step.decay * diagonal
-            expected = step.ahead(before.value(step.name))
+            expected = step.predict(before.get_value(step.name))
         head[own, -1] = (expected - value) * diagonal
         row += k
     if link is not None:
@@ -185,7 +185,7 @@ def _test(
         top = top.copy(order="F")
         top[:, D + 1 :][:, own] = 0.0
         top, left = _append_rows(top, tail)
-        since = tests.found(one.name, t, left[:, 0], left[:, 1:][:, columns], speed)
+        since = tests.find_onset(one.name, t, left[:, 0], left[:, 1:][:, columns], speed)
         if since is not None and fault is None:
             fault = one.name, since
     tests.take_message(top[:, :D], top[:, D + 1 :])

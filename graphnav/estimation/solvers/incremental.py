@@ -109,7 +109,7 @@ def begin_at(problem: Problem, start: States | None) -> Message:
     """The prior of a problem, about its mean or one state to begin at."""
     assert problem.prior.mean is not None
     message = make_first_message(problem.prior.mean, problem.prior.sigma[0])
-    return message if start is None else message.moved(start.minus(problem.prior.mean)[0])
+    return message if start is None else message.move(start.minus(problem.prior.mean)[0])
 
 
 def replay(problem: Problem, solver: str, engine: LagSmoother, lag: float, progress: Progress | None) -> Replay:

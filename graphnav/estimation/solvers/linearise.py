@@ -28,10 +28,10 @@ class Points:
     states: States
     values: Array  # (K, D-15)
 
-    def first(self, n: int) -> Points:
+    def take_first(self, n: int) -> Points:
         return self if n == len(self.values) else Points(self.states[:n], self.values[:n])
 
-    def at(self, index: slice | Array) -> Points:
+    def take(self, index: slice | Array) -> Points:
         """Some of them."""
         return Points(self.states[index], self.values[index])
 
@@ -50,7 +50,7 @@ class Points:
         """None yet, of so many parameters' values."""
         return Points(States(np.empty((n, 3, 3)), *np.empty((4, n, 3))), np.empty((n, width)))
 
-    def nodes(self, problem: Problem) -> dict[str, Array]:
+    def select_nodes(self, problem: Problem) -> dict[str, Array]:
         """(n, k) per parameter: the value of each node after the last keyframe that it governs."""
         return {
             c.parameter.name: self.values[find_last_keyframes(c), shift(problem.columns[c.parameter.name])]
@@ -102,7 +102,7 @@ class Rows:
         out.__dict__["H"] = self.H
         return out
 
-    def kernel(self) -> tuple[Array, Array]:
+    def weigh(self) -> tuple[Array, Array]:
         """Weight and cost (n,) of each row by its robust kernel."""
         c = self.constraint
         s = np.linalg.norm(self.residual / self.sigma, axis=-1)
@@ -119,7 +119,7 @@ class Step:
     decay: float = 0.0
     mean_before: Array | float = 0.0
 
-    def ahead(self, before: Array | float) -> Array:
+    def predict(self, before: Array | float) -> Array:
         """(k,) the value that it is expected to have, by that before."""
         return self.mean + self.decay * (before - self.mean_before)
 
@@ -136,7 +136,7 @@ class Advance:
     decay: Array  # (n-1, D-15)
     added: Array  # (n-1, D-15) variance
 
-    def ahead(self, rows: int | slice, values: Array) -> Array:
+    def predict(self, rows: int | slice, values: Array) -> Array:
         """The values that are expected after the steps `rows`."""
         return np.asarray(self.mean[rows] + self.decay[rows] * (values - self.before[rows]))
 

@@ -60,7 +60,7 @@ class Linearisation:
         n = len(points.values)
         at, begin, end = slice(0, n - 1), points.states[: n - 1], points.states[1:n]
         ahead, F = predict_states(problem, at, begin, points.values[: n - 1])
-        values = steps.ahead(at, points.values[: n - 1])
+        values = steps.predict(at, points.values[: n - 1])
         gap = np.concatenate([ahead.minus(end), values - points.values[1:]], axis=1)
         turned = rotation.right_jacobian_inverse(gap[:, :3])
         F[:, :3] = turned @ F[:, :3]
@@ -91,9 +91,9 @@ class Linearisation:
                 r[place], sigma[place], H[place] = linear.residual, linear.stated, linear.H
         return Linearisation(problem.columns, self.F, gap, self.turned, r, sigma, H)
 
-    def noise(self, problem: Problem, points: Points) -> Array:
+    def compute_noise(self, problem: Problem, points: Points) -> Array:
         """Q (n-1, 15, 15) of the steps."""
-        Q = problem.motion.noise(slice(0, len(self.gap)), points.states.R_nb[: len(self.gap)])
+        Q = problem.motion.compute_noise(slice(0, len(self.gap)), points.states.R_nb[: len(self.gap)])
         Q[:, :3] = self.turned @ Q[:, :3]
         Q[:, :, :3] = Q[:, :, :3] @ np.swapaxes(self.turned, -1, -2)
         return Q
@@ -115,7 +115,7 @@ class PointFilter:
         self._stack, self._steps, self.out = stack, steps, out
         one = Linearisation.of(problem, points, stack, steps)
         F[: n - 1] = one.F
-        self.F, self.Q, self.gap = F[: n - 1], one.noise(problem, points), one.gap
+        self.F, self.Q, self.gap = F[: n - 1], one.compute_noise(problem, points), one.gap
         self.speeds = np.linalg.norm(points.states.v, axis=1)
         self.r, self._sigma, self.H = one.r, one.sigma, one.H
         self.variance = (self._sigma / stack.root_weight[:n]) ** 2
@@ -156,7 +156,7 @@ class PointFilter:
                 updates.taken, updates.lossy, self._at,
             )  # fmt: skip
         except np.linalg.LinAlgError:
-            raise explain_rows(stack.block(int(self._at[0])).parts) from None
+            raise explain_rows(stack.get_block(int(self._at[0])).parts) from None
 
 
 def filter_likelihood(
@@ -171,13 +171,13 @@ def filter_likelihood(
     taken, lossy = np.zeros((2, len(stack.joint.begin)), dtype=bool)
     try:
         filter_rows(
-            0, n, *start, one.F, steps.decay, one.gap, one.noise(problem, points), steps.added,
+            0, n, *start, one.F, steps.decay, one.gap, one.compute_noise(problem, points), steps.added,
             one.r, one.H, (one.sigma / stack.root_weight) ** 2, stack.scale, stack.joint, stack.joint.used,
             e[0], P[0], e[1], P[1], stack.root, stack.solved, stack.bent,
             np.empty((0, M, D)), np.empty((0, M)), np.empty((0, M, M)), taken, lossy, at,
         )  # fmt: skip
     except np.linalg.LinAlgError:
-        raise explain_rows(stack.block(int(at[0])).parts) from None
+        raise explain_rows(stack.get_block(int(at[0])).parts) from None
 
 
 def predict_states(problem: Problem, at: slice, states: States, values: Array) -> tuple[States, Array]:

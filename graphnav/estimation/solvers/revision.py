@@ -38,10 +38,10 @@ class Revision:
 
     def __init__(self, window: Window, first: int) -> None:
         self.window, self.first = window, first
-        e = window.means()[first]
+        e = window.compute_means()[first]
         self._was = window.stages[first - 1] if first else None
-        self._stage = None if self._was is None else self._was.moved(e)  # the one before, where it is in the window
-        self._before = window.head.moved(e) if self._stage is None else self._stage.message
+        self._stage = None if self._was is None else self._was.move(e)  # the one before, where it is in the window
+        self._before = window.head.move(e) if self._stage is None else self._stage.message
         self._made: list[tuple[Stage, Stage]] = []  # what was there, and what is instead
 
     def step(self, count: int, renewed: Renewing | None) -> bool:
@@ -63,7 +63,7 @@ class Revision:
             places = [stage.place for stage in old] if renewed is None else renewed(begin, end)
             if places is None:
                 return False
-            made += zip(old, self._again(old, window.means()[begin + 1 : end + 1], places), strict=True)
+            made += zip(old, self._smooth_again(old, window.compute_means()[begin + 1 : end + 1], places), strict=True)
         if end < len(window):
             return False
         # what an error of the fixes does to the estimate is the same to first order
@@ -82,7 +82,7 @@ class Revision:
                 break  # nor do those before it
             self._made[k] = was, replace(stage, place=replace(stage.place, problem=None))
 
-    def _again(self, old: Sequence[Stage], means: Sequence[Array], places: Sequence[Place]) -> list[Stage]:
+    def _smooth_again(self, old: Sequence[Stage], means: Sequence[Array], places: Sequence[Place]) -> list[Stage]:
         """The stages about where the means of their errors lead, each from the one before."""
         before = self._made[-1][1].message if self._made else self._before
         around = [before, *(stage.message for stage in old)]

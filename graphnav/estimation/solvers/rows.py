@@ -35,11 +35,11 @@ class Iterate:
         """The scale errors of the IMU, (6,), where they are parameters."""
         return self.values[SCALE][0] if SCALE in self.values else None
 
-    def moved(self, step: Step) -> Iterate:
+    def move(self, step: Step) -> Iterate:
         """Move by a step."""
         return Iterate(self.states.plus(step[0]), {name: v + step[1][name] for name, v in self.values.items()})
 
-    def points(self, problem: Problem) -> Points:
+    def make_points(self, problem: Problem) -> Points:
         """The same with the parameters' values at every keyframe."""
         values = [self.values[c.parameter.name][c.node] for c in problem.chains]
         return Points(self.states, np.concatenate([np.empty((len(self.states), 0)), *values], axis=1))
@@ -166,10 +166,10 @@ def whiten(problem: Problem, point: Iterate, layout: Layout) -> tuple[Rows, floa
         links += layout.find_parameter_blocks(first, {SCALE: S})
     out: Rows = [(links, b)]
     total = 0.5 * float(np.sum(b * b))
-    points = point.points(problem)
+    points = point.make_points(problem)
     for rows in (problem.prior, *problem.constraints):
         linear = linearise(rows, points, problem.columns)
-        weight, costs = linear.kernel()
+        weight, costs = linear.weigh()
         total += float(np.sum(costs))
         scale = np.sqrt(weight)[:, None] / linear.sigma
         H = scale[..., None] * linear.H
@@ -199,7 +199,7 @@ def _group_rows(blocks: list[tuple[Array, Array]], b: Array) -> Rows:
 
 def compute_cost_at(problem: Problem, points: Points) -> float:
     """The cost at points of all keyframes."""
-    return whiten(problem, Iterate(points.states, points.nodes(problem)), Layout(problem))[1]
+    return whiten(problem, Iterate(points.states, points.select_nodes(problem)), Layout(problem))[1]
 
 
 def compute_column_norms(rows: Rows, layout: Layout) -> Array:

@@ -71,7 +71,7 @@ def smooth_backward(problem: Problem, forward: ForwardRecord, progress: Progress
         if forward.updates is not None:
             _smooth_points(forward, forward.updates, behind, end, found, P, progress=progress)
             _restore_digits(forward, P, end)
-        first = move_points(forward.about.first(end), found.errors[:end])
+        first = move_points(forward.about.take_first(end), found.errors[:end])
         values[:end] = first.values
         states = [first.states, *states]
     return SmootherPass(States.stack(states), values, found.r, found.N, found.N_diagonal, P)
@@ -92,7 +92,7 @@ def smooth_moments(problem: Problem, forward: ForwardRecord) -> MomentPass:
     smoothed = move_points(forward.about, found.errors)
     linear, asked = {}, np.zeros_like(one.H)
     for rows in problem.constraints:
-        if rows.noise_groups()[0]:
+        if rows.list_noise_groups()[0]:
             which = slice(0, int(np.searchsorted(rows.keyframe, K)))
             linear[rows.name] = linearise(rows, smoothed, problem.columns, which)
             asked[one.places[rows.name]] = linear[rows.name].H
@@ -129,7 +129,7 @@ def _smooth_filtered(
 ) -> States:
     """States from keyframe `end` on, with values and covariances in their places."""
     K, D = forward.P.shape[:2]
-    own, before, some = forward.at(slice(end, K)), forward.predicted.at(slice(end, K)), slice(end, K)
+    own, before, some = forward.take(slice(end, K)), forward.predicted.take(slice(end, K)), slice(end, K)
     moved = np.concatenate([own.states.minus(before.states), own.values - before.values], axis=1)
     turned = rotation.to_quaternion(np.swapaxes(before.states.R_nb, -1, -2) @ own.states.R_nb)
     errors, at = np.zeros((K - end, D)), np.zeros(1, dtype=int)

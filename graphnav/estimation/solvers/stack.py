@@ -114,13 +114,13 @@ class Stack:
         table = np.concatenate(parts, axis=1) if parts else np.empty((8, 0), dtype=int)
         table = table[:, np.argsort(table[0], kind="stable")]
         self._parts = table[:6].T
-        self.single = self._blocks(table, np.ones(table.shape[1], dtype=bool))
+        self.single = self._split_blocks(table, np.ones(table.shape[1], dtype=bool))
         k, apart = table[0], table[6].astype(bool)
-        self.joint = self._blocks(table, np.diff(k, prepend=-1).astype(bool) | apart | np.roll(apart, 1))
+        self.joint = self._split_blocks(table, np.diff(k, prepend=-1).astype(bool) | apart | np.roll(apart, 1))
         # of each update: the lower root of S, S^-1 r, and what a kernel has left of the weights of rows
         self.root, self.solved, self.bent = np.zeros((K, self.M, self.M)), np.zeros((K, self.M)), np.ones((K, self.M))
 
-    def _blocks(self, table: Array, new: Array) -> Blocks:
+    def _split_blocks(self, table: Array, new: Array) -> Blocks:
         """Parts (8, n) in blocks, where `new` (n,) each begins one."""
         part = np.append(np.flatnonzero(new), table.shape[1])
         head, last = part[:-1], part[1:] - 1
@@ -135,14 +135,14 @@ class Stack:
     def stack_keyframe(self, k: int) -> Iterator[RowBlock]:
         """All rows of a keyframe, in the order of the constraints."""
         for b in range(self.joint.first[k], self.joint.first[k + 1]):
-            yield self.block(b)
+            yield self.get_block(b)
 
     def find_kinds(self, names: Sequence[str]) -> Array:
         """(B,) which of some constraints each joint block is of, -1 for none."""
         number = [names.index(c.name) if c.name in names else -1 for c in self._constraints]
         return np.array(number)[self.joint.kind]
 
-    def block(self, b: int) -> RowBlock:
+    def get_block(self, b: int) -> RowBlock:
         """Block number b."""
         some = self._parts[self.joint.part[b] : self.joint.part[b + 1]].tolist()
         parts = [(self._constraints[i], lo, hi) for _, i, lo, hi, _, _ in some]

@@ -114,14 +114,14 @@ class Message:
             return change_of_point(self.state, e[None, :DIM])[0]
         return np.asarray(rotation.right_jacobian_inverse(e[None, :3])[0])
 
-    def moved(self, e: Array, J: Array | None = None) -> Message:
+    def move(self, e: Array, J: Array | None = None) -> Message:
         """The same about the point moved by the error state e (D,); J is `change_of_point`, if known."""
         J = self.change_of_point(e) if J is None else J
         state = add_error(self.state, e[None, :DIM], self.turns)
         values, R = self.values + e[DIM:], self.R
         return Message.of(state, values, self.columns, rotate_columns(R, J), self.z - R @ e, self.tests, self.turns)
 
-    def value(self, name: str) -> Array:
+    def get_value(self, name: str) -> Array:
         """A parameter at the point."""
         at = self.columns[name]
         return self.values[at.start - DIM : at.stop - DIM]
@@ -166,20 +166,20 @@ class Stage:
     fault: tuple[str, float] | None = None  # whose fixes are wrong, and since when (s)
     psi: float = 0.0  # rad, how far its point has turned about the vertical since its rows were linearised
 
-    def moved(self, e: Array) -> Stage:
+    def move(self, e: Array) -> Stage:
         """The same about the point moved by the error state e."""
         J = self.message.change_of_point(e)
-        message, G, g = self.message.moved(e, J), rotate_columns(self.G, J), self.g + self.back(e)
+        message, G, g = self.message.move(e, J), rotate_columns(self.G, J), self.g + self.smooth_back(e)
         psi = self.psi + float(split_turn(self.message.state, e[None])[0][0]) if message.turns else 0.0
         return Stage(self.place, message, G, g, self.lost, self.C, self.measured, self.fault, psi)
 
-    def back(self, A: Array) -> Array:
+    def smooth_back(self, A: Array) -> Array:
         """What smooths back, without g, times A (D, ...)."""
         out = A[: len(self.g)].copy()
         out[self.lost] = self.G @ A
         return out
 
-    def before(self, P: Array) -> Array:
+    def predict_before(self, P: Array) -> Array:
         """The covariance before from that of y."""
         n, lost = len(self.g), self.lost
         cross = self.G @ P
@@ -245,12 +245,12 @@ def predict_stage(before: Message, place: Place) -> tuple[States, Array, Columns
     values[: len(before.values)] = before.values
     for step in place.steps:
         at = shift(columns[step.name])
-        values[at] = step.ahead(before.value(step.name) if step.name in before.columns else step.mean_before)
+        values[at] = step.predict(before.get_value(step.name) if step.name in before.columns else step.mean_before)
     if not place.linked:
         return before.state, values, columns, None
     assert place.problem is not None
     motion, row = place.problem.motion, slice(place.k - 1, place.k)
-    scale = before.value(SCALE) if SCALE in before.columns else None
+    scale = before.get_value(SCALE) if SCALE in before.columns else None
     ahead, F = motion.propagate(row, before.state, scale)
     try:
         W = motion.whitener[row]

@@ -104,17 +104,17 @@ class StretchFilter:
                 stay, points = self._iterate(k, k1, x, P, points)
             except np.linalg.LinAlgError:
                 if alone:
-                    raise explain_rows(self._stack.block(int(self._at[0])).parts) from None
+                    raise explain_rows(self._stack.get_block(int(self._at[0])).parts) from None
                 break  # because the guess is far off, or else a keyframe alone will say so
             if alone and not left:
                 stay = k1
             if stay > k:
                 own = slice(k, stay)
-                predicted.put(own, points.at(self._start[own] - self._start[k]))
-                filtered.put(own, points.at(self._end[own] - self._start[k]))
+                predicted.put(own, points.take(self._start[own] - self._start[k]))
+                filtered.put(own, points.take(self._end[own] - self._start[k]))
                 last = int(self._end[stay - 1] - self._start[k])
-                x, P = points.at(slice(last, last + 1)), self._P[stay - 1]
-                k, points = stay, points.at(slice(last + 1, None))
+                x, P = points.take(slice(last, last + 1)), self._P[stay - 1]
+                k, points = stay, points.take(slice(last + 1, None))
             if k == k1:
                 if not alone:
                     self._length = min(2 * self._length, _LONGEST)
@@ -130,11 +130,11 @@ class StretchFilter:
             if j:
                 at = slice(j - 1, j)
                 states = self._problem.motion.advance(at, states, None if scale is None else values[shift(scale)])
-                values = self._steps.ahead(j - 1, values)
+                values = self._steps.predict(j - 1, values)
             reached.append(states)
             known.append(values)
         each = self._end[k:k1] - self._start[k:k1] + 1
-        return Points(States.stack(reached), np.array(known)).at(np.repeat(np.arange(k1 - k), each))
+        return Points(States.stack(reached), np.array(known)).take(np.repeat(np.arange(k1 - k), each))
 
     def _iterate(self, k: int, k1: int, x: Points, P: Array, points: Points) -> tuple[int, Points]:
         """Filter keyframes k to k1 about points; the first keyframe that does not stay, and the points as found."""
@@ -175,11 +175,15 @@ class StretchFilter:
         self, k: int, k1: int, x: Points, points: Points, start: Array, end: Array, T: Array, m: Array
     ) -> tuple[Array, Array, Array]:
         """Where steps between the keyframes lead from points, (n, D) from the next of them, Q and F (n, 15, w)."""
-        before, ahead, steps = points.at(end[:-1]), points.at(start if k else start[1:]), slice(max(k - 1, 0), k1 - 1)
+        before, ahead, steps = (
+            points.take(end[:-1]),
+            points.take(start if k else start[1:]),
+            slice(max(k - 1, 0), k1 - 1),
+        )
         if k:
             before = join_passes([x, before])
         reached, F = predict_states(self._problem, steps, before.states, before.values)
-        values = self._steps.ahead(steps, before.values)
+        values = self._steps.predict(steps, before.values)
         gap = np.concatenate([reached.minus(ahead.states), values - ahead.values], axis=1)
         self._F[steps] = F
         if len(end) > 1:
@@ -187,7 +191,7 @@ class StretchFilter:
             F[on, :, :MOVING] = F[on, :, :MOVING] @ T[last]
             gap[on, :DIM] -= mv(F[on], m[last, : F.shape[2]])
             gap[on, DIM:] -= self._steps.decay[steps][on] * m[last, DIM:]
-        return gap, self._problem.motion.noise(steps, before.states.R_nb), F
+        return gap, self._problem.motion.compute_noise(steps, before.states.R_nb), F
 
 
 def _move_errors(points: Points, first: Array) -> tuple[Array, Array]:

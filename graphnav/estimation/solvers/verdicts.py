@@ -31,7 +31,7 @@ class Verdicts:
         self._tried: set[tuple[str, float]] = set()
         self._trial: tuple[str, int, int, dict[str, Array]] | None = None  # fixes taken back, and what was used before
 
-    def faults(self) -> tuple[ExcludedSpan, ...]:
+    def list_faults(self) -> tuple[ExcludedSpan, ...]:
         """Spans of fixes that are not used."""
         out = []
         for name, t in self.times.items():
@@ -40,7 +40,7 @@ class Verdicts:
                 out.append(ExcludedSpan(name, float(t[run[0]]), float(t[run[-1]]), len(run)))
         return tuple(sorted(out, key=lambda fault: fault.t_start))
 
-    def weights(self, name: str, t: Array) -> Array:
+    def weigh(self, name: str, t: Array) -> Array:
         """(n,) of fixes at the times t: 0 for what is not used. Fixes that were not known yet are."""
         known, used = self.times.get(name, np.empty(0)), self.used.get(name, np.empty(0))
         at = known.searchsorted(t)

@@ -67,7 +67,7 @@ class _Slots:
         self.L, self.c = L, 2 * self.m if drifts else self.m
         self.columns = slice(begin, begin + L * self.c)
         self.threshold = float(chdtri(self.c, FALSE_ALARM))
-        self.fix_of, self.typical_error, self.prior = rows.fix_of, rows.typical_error(), WIDE[rows.unit] ** -2.0
+        self.fix_of, self.typical_error, self.prior = rows.fix_of, rows.compute_typical_error(), WIDE[rows.unit] ** -2.0
         self.memory = np.zeros(count_remembered(L, self.c))
         self.typical_sigmas = _InnovationLevel(self.m)
         self.forget()
@@ -345,7 +345,7 @@ class Watch:
         inputs = np.eye(slots.m)[:, None] * np.isfinite(slots.first)[:, None]
         return own, slots.columns, (inputs.reshape(slots.m, -1) / sigma[..., None]).reshape(sigma.size, -1)
 
-    def found(self, name: str, t: float, rho: Array, Gamma: Array, speed: float) -> float | None:
+    def find_onset(self, name: str, t: float, rho: Array, Gamma: Array, speed: float) -> float | None:
         """When a fault began, or None, by what a fix has left behind: rho (n m,) and Gamma (n m, L m) of its kind."""
         slots, rho, Gamma = self._slots[name], np.ascontiguousarray(rho), np.ascontiguousarray(Gamma)
         slots.typical_sigmas.add(t, float(rho @ rho))

@@ -78,7 +78,7 @@ class _Covariances:
             if len(self._stages) < self.count:
                 self.found.append(self._P)
             if self._stages:
-                self._P = stage.before(self._P)
+                self._P = stage.predict_before(self._P)
         return len(self.found) == self.count
 
 
@@ -116,7 +116,7 @@ class Window:
         """Times of the keyframes in the window, s."""
         return np.array([stage.place.t for stage in self.stages])
 
-    def since(self, t: float) -> list[Stage]:
+    def select_since(self, t: float) -> list[Stage]:
         """The stages from a time on."""
         first = len(self.stages)
         while first and self.stages[first - 1].place.t >= t:
@@ -136,7 +136,7 @@ class Window:
         are then made.
         """
         stage, e = self._update(self.expect(place) if ahead is None else replace(ahead, place=place))
-        self._append(stage.moved(e))
+        self._append(stage.move(e))
         turn = split_turn(stage.message.state, e[None])[1][0] if stage.message.turns else e
         return float(np.linalg.norm(turn[:3]))
 
@@ -172,9 +172,9 @@ class Window:
         del self.stages[keep:]
         self._means = self._covariances = None
         if self.stages:
-            self.stages[-1] = self.stages[-1].moved(self.stages[-1].message.estimate)
+            self.stages[-1] = self.stages[-1].move(self.stages[-1].message.estimate)
         else:
-            self.head = self.head.moved(self.head.estimate)
+            self.head = self.head.move(self.head.estimate)
 
     def replace_from(self, first: int, before: Message, stage: Stage | None, stages: Sequence[Stage]) -> None:
         """Have other stages from one on, and the message before them, and its stage if it has one, as given."""
@@ -185,17 +185,17 @@ class Window:
             self.stages[first - 1] = replace(stage, message=replace(before, tests=tests))
         self.stages[first:] = stages
         if stages:
-            self.stages[-1] = self.stages[-1].moved(self.stages[-1].message.estimate)
+            self.stages[-1] = self.stages[-1].move(self.stages[-1].message.estimate)
         self._means = self._covariances = None
         self.relinearized += len(stages)
 
-    def means(self) -> list[Array]:
+    def compute_means(self) -> list[Array]:
         """Smoothed error states, one of the message before the window and one of each stage."""
         if self._means is None:
             e = self.newest.estimate
             out = [e]
             for stage in reversed(self.stages):
-                e = stage.back(e)
+                e = stage.smooth_back(e)
                 e += stage.g
                 out.append(e)
             self._means, self._moved = out[::-1], None
@@ -217,7 +217,7 @@ class Window:
 
     def settle(self, count: int) -> SettledStates:
         """Smooth the window and let its first `count` stages go."""
-        gone, means, back = self.stages[:count], self.means()[1 : count + 1], self._covariances
+        gone, means, back = self.stages[:count], self.compute_means()[1 : count + 1], self._covariances
         if back is None or back.count != count:
             back = _Covariances(self.stages, count)
         back.step(len(self.stages))
@@ -238,7 +238,7 @@ class Window:
             del self.stages[:count]
             self._means = None
             if not self.stages:
-                self.head = self.head.moved(self.head.estimate)
+                self.head = self.head.move(self.head.estimate)
         return SettledStates(
             t=np.array([stage.place.t for stage in gone]),
             states=states,
@@ -256,14 +256,14 @@ class Window:
 
     def _moves(self) -> Array:
         """(n,) how far the smoothed states are from their points, 1 at the limit."""
-        means, limit = self.means()[1:], self._limit[1]
+        means, limit = self.compute_means()[1:], self._limit[1]
         if self._moved is None and means:
             e = pad(means, max(len(x) for x in means))
-            turn = self._turned(e) / self.turn
+            turn = self._measure_turns(e) / self.turn
             self._moved = np.maximum(turn, np.abs(e[:, DIM:] / limit[: e.shape[1] - DIM]).max(axis=1, initial=0.0))
         return np.empty(0) if self._moved is None else self._moved
 
-    def _turned(self, e: Array) -> Array:
+    def _measure_turns(self, e: Array) -> Array:
         """(n,) rad, how far attitudes move by e (n, D) from where their rows are linearised.
 
         Of a turn about the vertical only what it has beside that of the keyframe before, where nothing tells headings.
@@ -271,7 +271,7 @@ class Window:
         if not self.newest.turns:
             return np.asarray(np.linalg.norm(e[:, :3], axis=1))
         psi, left = split_turn(States.stack([stage.message.state for stage in self.stages]), e)
-        before = split_turn(self.head.state, self.means()[0][None])[0]
+        before = split_turn(self.head.state, self.compute_means()[0][None])[0]
         beside = psi + [stage.psi for stage in self.stages] - np.concatenate([before, psi[:-1]])
         return np.hypot(np.linalg.norm(left[:, :3], axis=1), beside)
 

@@ -87,12 +87,12 @@ class Inspection:
         """
         refuse(self.recording, self.findings)
 
-    def values(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, Any]:
         """The inspection for JSON."""
-        findings = [f.values() for f in self.findings]
+        findings = [f.to_dict() for f in self.findings]
         return {"name": self.name, "platform": self.platform, **self.facts, "findings": findings}
 
-    def text(self) -> str:
+    def format(self) -> str:
         """The inspection as several lines of text."""
         lines = [f"{self.name} ({self.platform})"]
         for sensor, facts in self.facts.items():

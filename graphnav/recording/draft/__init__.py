@@ -62,7 +62,7 @@ def draft(paths: Sequence[Path], folder: Path, name: str | None = None, topics: 
     imu = found.sensors["imu"]
     t, zero = (imu.t, None) if imu.log is None else (imu.log.imu.t, imu.log.gps_zero)  # type: ignore[union-attr]
     raw = find_raw(found.raw, t, zero)
-    text = writer.text(found.sensors, raw, name or folder.resolve().name or "drive")
+    text = writer.format(found.sensors, raw, name or folder.resolve().name or "drive")
     return Draft(text, tuple(writer.decisions), writer.made)
 
 
@@ -92,53 +92,53 @@ class _Writer:
         self.decisions: list[str] = []
         self.made: dict[str, dict[str, Array]] = {}
 
-    def text(self, found: dict[str, Source], raw: RawFound | None, name: str) -> str:
+    def format(self, found: dict[str, Source], raw: RawFound | None, name: str) -> str:
         vehicle = "gnss" in found or "odometer" in found or raw is not None
         self.lines += [
             "# Drafted by graphnav init. Comments say why each line is what it is; look at those marked CHECK.",
             'format = "graphnav-recording/1"', f"name = {quote(name)}",
         ]  # fmt: skip
         why = "there are fixes or speeds" if vehicle else "CHECK: no fixes and no speed, so it is taken for a walk"
-        self._key("platform", '"vehicle"' if vehicle else '"foot"', why)
+        self._write_key("platform", '"vehicle"' if vehicle else '"foot"', why)
         if raw is not None:
-            self._clock(found["imu"], raw)
+            self._write_clock(found["imu"], raw)
         elif found["imu"].log is None and found["imu"].t[0] > UNIX:
-            self._key("clock", '"unix"', "the stamps are dates of this century, s since 1970")
-        agreement, felt = self._imu(found["imu"], found.get("gnss"), raw, vehicle)
+            self._write_key("clock", '"unix"', "the stamps are dates of this century, s since 1970")
+        agreement, felt = self._write_imu(found["imu"], found.get("gnss"), raw, vehicle)
         course = None
         if "gnss" in found:
             course = motion.compute_course(*read_fixes(found["gnss"]))
-            self._gnss(found["gnss"], agreement)
+            self._write_gnss(found["gnss"], agreement)
         if raw is not None:
             self.lines += ["", "[raw_gnss]"]
             self.decisions += raw.notes
             for key, value, why in write_raw(raw, self.folder):
-                self._key(key, value, why)
+                self._write_key(key, value, why)
             if "gnss" not in found:
-                self._time_offset(agreement)
+                self._write_time_offset(agreement)
         if "odometer" in found:
-            self._odometer(found["odometer"], course if course is not None and len(course.t) > 50 else None, felt)
+            self._write_odometer(found["odometer"], course if course is not None and len(course.t) > 50 else None, felt)
         if "barometer" in found:
-            self._barometer(found["barometer"])
+            self._write_barometer(found["barometer"])
         return "\n".join(self.lines) + "\n"
 
     # ---- one table each
 
-    def _clock(self, imu: Source, raw: RawFound) -> None:
+    def _write_clock(self, imu: Source, raw: RawFound) -> None:
         """Write what t = 0 of the IMU is, which observations are dated by."""
         if raw.clock.value is not None:
-            self._key("clock", quote(str(raw.clock.value)), raw.clock.why)
+            self._write_key("clock", quote(str(raw.clock.value)), raw.clock.why)
         elif imu.log is None:
             words = f'CHECK: say what t = 0 of {imu.path.name} is, as "gps week 2130" or a UTC date'
             self.lines.append(f'# clock = "..."                             # {words}')
             self.decisions.append(f"clock: {words}; the observations begin at {raw.begin}")
 
-    def _imu(
+    def _write_imu(
         self, source: Source, gnss: Source | None, raw: RawFound | None, vehicle: bool
     ) -> tuple[Agreement, tuple[Array, Array]]:
         """Write [imu]; returns the comparison with the fixes, and times and forward forces."""
         self.lines += ["", "[imu]"]
-        self._file(source, "imu")
+        self._write_file(source, "imu")
         if source.log is not None:
             assert source.log.imu is not None
             imu = source.log.imu
@@ -159,19 +159,19 @@ class _Writer:
         if source.log is None:
             rate = guesses.guess_gyro_unit(gyro, source.find_unit("gx", "gyro"), agreement.turn, vehicle)
             gyro = gyro * RATE[str(rate.value)]
-            self._units({"t": source.t_unit, "gyro": rate, "accel": force})
-            front = self._axes(up, up_why, agreement)
+            self._write_units({"t": source.t_unit, "gyro": rate, "accel": force})
+            front = self._write_axes(up, up_why, agreement)
         elif source.log.mount_known or agreement.clearest is None:
             assert source.log.imu is not None
             self.decisions.append(f"IMU: axes and units are those of {source.path.name}")
             front = source.log.imu.R_bs[1]
         else:
-            front = self._axes(up, up_why, agreement)
+            front = self._write_axes(up, up_why, agreement)
         if source.log is None or (source.log.imu is not None and source.log.imu.noise_assumed):
-            self._noise(t, gyro, accel)
+            self._write_noise(t, gyro, accel)
         return agreement, (t, accel @ front)
 
-    def _axes(self, up: Array, up_why: str, agreement: Agreement) -> Array:
+    def _write_axes(self, up: Array, up_why: str, agreement: Agreement) -> Array:
         forward, words = guesses.choose_forward(up), "CHECK: nothing tells which way is forward"
         lag = agreement.clearest
         if lag is not None and agreement.forward is not None and lag.correlation > 0.3:
@@ -183,25 +183,25 @@ class _Writer:
             )
         letters, (front, top) = guesses.guess_axes(up, forward)
         if letters is not None:
-            self._key("axes", f'"{letters}"', f"{up_why}; {words}")
+            self._write_key("axes", f'"{letters}"', f"{up_why}; {words}")
         else:
-            self._key("forward", _format_vector(front), words)
-            self._key("up", _format_vector(top), up_why)
+            self._write_key("forward", _format_vector(front), words)
+            self._write_key("up", _format_vector(top), up_why)
         return front
 
-    def _noise(self, t: Array, gyro: Array, accel: Array) -> None:
+    def _write_noise(self, t: Array, gyro: Array, accel: Array) -> None:
         self.lines += ['# model = "..."                             # the IMU, if docs/imu-models.md has it']
         self.lines += ["", "[imu.noise]                                 # better: the data sheet's figures"]
         for key, samples, unit in (("gyro", gyro, "rad/s/sqrt(Hz)"), ("accel", accel, "m/s2/sqrt(Hz)")):
             value = guesses.estimate_noise_density(t, samples)
             if value > 0:
-                self._key(
+                self._write_key(
                     f"{key}_noise_density",
                     f"{value:.2g}",
                     f"{unit}, measured, between its quietest and usual state",
                 )
 
-    def _gnss(self, source: Source, agreement: Agreement) -> None:
+    def _write_gnss(self, source: Source, agreement: Agreement) -> None:
         self.lines += ["", "[gnss]"]
         values = source.values
         late = agreement.late_velocity
@@ -217,7 +217,7 @@ class _Writer:
         missing = {"sd_e", "sd_n", "sd_u"} - values.keys()
         if missing:  # all three or none
             dropped = (*dropped, "sd_e", "sd_n", "sd_u")
-        self._file(source, "gnss", dropped)
+        self._write_file(source, "gnss", dropped)
         if source.log is None:
             if "h" not in values:
                 raise RecordingError(
@@ -234,7 +234,7 @@ class _Writer:
                 units["speed"] = guess_fix_speed_unit(source)
             elif stated := source.find_unit("ve", "speed"):
                 units["speed"] = Guess(stated, "as the column's name says")
-            self._units(units)
+            self._write_units(units)
             if missing:
                 none = (
                     "none" if len(missing) == 3 else f"none {'of heights' if missing == {'sd_u'} else 'of all three'}"
@@ -242,7 +242,7 @@ class _Writer:
                 why = (
                     f"CHECK: m, 1-sigma east, north, up; the file states {none}, this is a receiver without corrections"
                 )
-                self._key("sd", _SD, why)
+                self._write_key("sd", _SD, why)
             height = source.columns.names["h"]
             if "msl" in height.lower() or "alt" in height.lower():
                 self.decisions.append(f"heights: '{height}' may be above mean sea level; they are used as they are")
@@ -250,10 +250,12 @@ class _Writer:
             words = f"velocities are not used: they come {late:.2f} s after the positions"
             self.lines.append(f"# {words}")
             self.decisions.append(words)
-        self._lever_arm(source.log.gnss if source.log else None, "from the IMU to the antenna: right, forward, up")
-        self._time_offset(agreement)
+        self._write_lever_arm(
+            source.log.gnss if source.log else None, "from the IMU to the antenna: right, forward, up"
+        )
+        self._write_time_offset(agreement)
 
-    def _time_offset(self, agreement: Agreement) -> None:
+    def _write_time_offset(self, agreement: Agreement) -> None:
         """Write what is to be added to the stamps of the fixes, if that is seen."""
         if agreement.offset is not None:
             seconds, sigma = agreement.offset
@@ -266,44 +268,46 @@ class _Writer:
                     why += (
                         f"; the rest, {rest:+.2f} +-{max(sigma, 0.01):.2f}, is what the accelerations agree best with"
                     )
-            self._key("time_offset", f"{seconds:.2f}", why)
+            self._write_key("time_offset", f"{seconds:.2f}", why)
 
-    def _odometer(self, source: Source, course: motion.Course | None, felt: tuple[Array, Array]) -> None:
+    def _write_odometer(self, source: Source, course: motion.Course | None, felt: tuple[Array, Array]) -> None:
         self.lines += ["", "[odometer]"]
-        self._file(source, "odometer")
+        self._write_file(source, "odometer")
         if source.log is None:
             speed = guesses.guess_speed_unit(
                 source.t, source.values["speed"], course, source.find_unit("speed", "speed")
             )
-            self._units({"t": source.t_unit, "speed": speed})
+            self._write_units({"t": source.t_unit, "speed": speed})
             lag = _find_odometer_lag(source.t, source.values["speed"] * SPEED[str(speed.value)], felt)
             if lag is not None and lag.correlation > LIKELY and abs(lag.seconds) > _SMALL:
                 sure = "" if lag.correlation > CLEAR else "CHECK: "
-                self._key("time_offset", f"{-lag.seconds:.2f}", f"{sure}s; {_describe_agreement(lag)}")
-                self._key("delay_sigma", "0.05", "s, what is left of it; it is estimated")
-        self._lever_arm(source.log.odometer if source.log else None, "from the IMU to the middle of the rear axle")
+                self._write_key("time_offset", f"{-lag.seconds:.2f}", f"{sure}s; {_describe_agreement(lag)}")
+                self._write_key("delay_sigma", "0.05", "s, what is left of it; it is estimated")
+        self._write_lever_arm(
+            source.log.odometer if source.log else None, "from the IMU to the middle of the rear axle"
+        )
 
-    def _barometer(self, source: Source) -> None:
+    def _write_barometer(self, source: Source) -> None:
         self.lines += ["", "[barometer]"]
-        self._file(source, "barometer")
+        self._write_file(source, "barometer")
         unit = guess_pressure_unit(source)
         assert unit is not None
-        self._units({"t": source.t_unit, "pressure": unit})
+        self._write_units({"t": source.t_unit, "pressure": unit})
 
-    def _lever_arm(self, sensor: Gnss | Odometer | None, what: str) -> None:
+    def _write_lever_arm(self, sensor: Gnss | Odometer | None, what: str) -> None:
         """Write the lever arm of a log, if it has one."""
         if sensor is not None and np.any(sensor.lever_arm):
-            self._key("lever_arm", _format_vector(sensor.lever_arm), f"m, {what}; as the log says")
+            self._write_key("lever_arm", _format_vector(sensor.lever_arm), f"m, {what}; as the log says")
         else:
-            self._key("lever_arm", "[0.0, 0.0, 0.0]", f"CHECK: m, {what}")
+            self._write_key("lever_arm", "[0.0, 0.0, 0.0]", f"CHECK: m, {what}")
 
     # ---- lines
 
-    def _key(self, key: str, value: str, why: str) -> None:
+    def _write_key(self, key: str, value: str, why: str) -> None:
         self.lines.append(f"{key} = {value}".ljust(43) + f" # {why}")
         self.decisions.append(f"{key} = {value}: {why}")
 
-    def _file(self, source: Source, sensor: str, dropped: Sequence[str] = ()) -> None:
+    def _write_file(self, source: Source, sensor: str, dropped: Sequence[str] = ()) -> None:
         relative = Path(os.path.relpath(source.path.resolve(), self.folder.resolve())).as_posix()
         if source.joined_from is not None:
             relative = JOINED
@@ -326,7 +330,7 @@ class _Writer:
                     f"CHECK: it has the most messages; there is also {', '.join(topics[1:])}: to use it, draft again "
                     f"with --topic {topics[1]} --force"
                 ) + (", since axes and noise are of this one" if sensor == "imu" else "")
-            self._key("topic", quote(topics[0]), why)
+            self._write_key("topic", quote(topics[0]), why)
         if source.joined_from is None and source.plain is None and not is_inside(source.path, self.folder):
             words = f"{relative}: lies outside the folder of this file; say --allow-outside to read it"
             self.decisions += [words] if words not in self.decisions else []
@@ -335,7 +339,7 @@ class _Writer:
             pairs = ", ".join(f"{ours} = {quote(theirs)}" for ours, theirs in names.items())
             self.lines.append(f"columns = {{ {pairs} }}")
 
-    def _units(self, units: dict[str, Guess]) -> None:
+    def _write_units(self, units: dict[str, Guess]) -> None:
         default = {"type": "rtklib", "t": "s", "gyro": "rad/s", "accel": "m/s2", "angle": "deg", "speed": "m/s"}
         default |= {"height": "m", "pressure": "Pa"}
         self.decisions += [f"{key} in {guess.value}: {guess.why}" for key, guess in units.items()]

@@ -50,7 +50,7 @@ def open_writer(path: Path, name: str = "") -> Iterator[Add]:
             path_so_far.add(block)
 
         yield add
-        kept = path_so_far.rows()
+        kept = path_so_far.list_rows()
         degrees = kept[:, 1:4] * np.array([np.rad2deg(1.0), np.rad2deg(1.0), 1.0])
         ends = "\n".join(
             _PLACEMARK.format(name=name, t=kept[k, 0], lat=degrees[k, 0], lon=degrees[k, 1], h=degrees[k, 2])
@@ -84,14 +84,14 @@ class _Thinned:
         self._kept.append(new)
         if sum(map(len, self._kept)) > _SPARE_POINTS * _MAX_POINTS:
             spacing = along[-1] / (_SPARE_POINTS / 2 * _MAX_POINTS)
-            self._kept = [self._at_least(np.concatenate(self._kept), spacing)]
+            self._kept = [self._mask_steps(np.concatenate(self._kept), spacing)]
 
-    def rows(self) -> Array:
+    def list_rows(self) -> Array:
         """Times (s), llh (rad, m) and distance (m) of the points, (N, 5)."""
-        kept = self._at_least(np.concatenate(self._kept), max(self._end[4] / _MAX_POINTS, _LEAST_SPACING))
+        kept = self._mask_steps(np.concatenate(self._kept), max(self._end[4] / _MAX_POINTS, _LEAST_SPACING))
         return kept if kept[-1, 0] == self._end[0] else np.concatenate([kept, self._end[None]])
 
     @staticmethod
-    def _at_least(rows: Array, spacing: float) -> Array:
+    def _mask_steps(rows: Array, spacing: float) -> Array:
         _, first = np.unique(np.floor(rows[:, 4] / spacing), return_index=True)
         return np.asarray(rows[first])

@@ -59,7 +59,7 @@ def read(
     """
     chosen = _format_of(source, name)
     with permit_outside(allow_outside):
-        found = _choose(chosen, source, topics).recording(source) if topics else chosen.read(source)
+        found = _choose(chosen, source, topics).make_recording(source) if topics else chosen.read(source)
     if found.gnss is None:
         return found
     return replace(found, gnss=replace(found.gnss, rounding=measure_rounding(found.gnss.llh)))

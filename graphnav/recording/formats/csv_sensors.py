@@ -118,7 +118,7 @@ def build_gnss(d: schema.GnssTable, rows: Table, remarks: Remarks) -> Gnss:
 def build_odometer(d: schema.OdometerTable, rows: Table, remarks: Remarks) -> Odometer:
     """Speeds, m/s, from a speed, from several wheels, or from counted pulses."""
     t, scale = rows["t"], schema.SPEED[d.units.speed]
-    used = d.readings(tuple(rows.columns))
+    used = d.list_readings(tuple(rows.columns))
     wheels = distance = None
     if any(name in rows for name in schema.WHEELS):
         wheels = np.stack([rows.get(name, np.full(len(t), np.nan)) for name in schema.WHEELS], -1) * scale

@@ -34,7 +34,7 @@ class Log:
     sensors: Mapping[str, Series] = field(default_factory=dict)  # other sensors, by name
     topics: Mapping[str, tuple[str, ...]] = field(default_factory=dict)  # sensor -> topic used, then the alternatives
 
-    def recording(self, source: str | Path) -> Recording:
+    def make_recording(self, source: str | Path) -> Recording:
         """The log as a recording.
 
         Raises
@@ -99,7 +99,7 @@ def log_format(
         return replace(_drop_nowhere(drop_unsound_rows(log, path)), files=log.files or _list_files(path))
 
     return Format(
-        name, about, can_read, lambda source: load_log(source).recording(source), load=load_log,
+        name, about, can_read, lambda source: load_log(source).make_recording(source), load=load_log,
         choose=None if choose is None else load_log,
     )  # fmt: skip
 

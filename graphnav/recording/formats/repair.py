@@ -66,7 +66,7 @@ def select_usable_rows(
             rows = rows.with_column(name, np.where(np.isinf(rows[name]), np.nan, rows[name]))
         elif len(bad):
             what = "no time" if name == "t" else "infinite"
-            raise RecordingError(f"{rows.where(bad[0], name)}: the value is {what}", key="table.not_finite")
+            raise RecordingError(f"{rows.describe_place(bad[0], name)}: the value is {what}", key="table.not_finite")
     if keep is not None:
         rows = rows.take(rows[Table.KEEP] >= keep.at_least)
         if not len(rows):
@@ -221,13 +221,13 @@ def convert_geodetic(rows: Table, unit: str | None, height: float, label: str, r
         k = beyond[0]
         swapped = np.abs(lon * scale).max() <= np.pi / 2
         hint = "; are lat and lon swapped?" if swapped else _guess_other_form(lat, lon, label)
-        raise RecordingError(f"{rows.where(k, 'lat')}: {lat[k]:g} is not a latitude{hint}", key="table.place")
+        raise RecordingError(f"{rows.describe_place(k, 'lat')}: {lat[k]:g} is not a latitude{hint}", key="table.place")
     beyond = np.flatnonzero((lon * scale < -np.pi - 1e-9) | (lon * scale > 2 * np.pi))
     if len(beyond):
         turned = lon.min() * scale >= -2 * np.pi and lon.max() * scale <= 2 * np.pi
         hint = "; is it a whole turn off? Add 360 deg" if turned else _guess_other_form(lat, lon, label)
         raise RecordingError(
-            f"{rows.where(beyond[0], 'lon')}: {lon[beyond[0]]:g} is not a longitude{hint}", key="table.place"
+            f"{rows.describe_place(beyond[0], 'lon')}: {lon[beyond[0]]:g} is not a longitude{hint}", key="table.place"
         )
     beyond = np.flatnonzero((h < _LOWEST) | (h > _SKY))
     if not len(beyond) and np.median(h) > _HIGHEST:
@@ -235,7 +235,9 @@ def convert_geodetic(rows: Table, unit: str | None, height: float, label: str, r
     if len(beyond):
         k = beyond[0]
         hint = "; is it in millimetres?" if abs(h[k]) > _HIGHEST else ""
-        raise RecordingError(f"{rows.where(k, 'h')}: {h[k]:g} m is not the height of a drive{hint}", key="table.height")
+        raise RecordingError(
+            f"{rows.describe_place(k, 'h')}: {h[k]:g} m is not the height of a drive{hint}", key="table.height"
+        )
     lon = np.where(lon * scale > np.pi, lon * scale - 2 * np.pi, lon * scale)
     return np.stack([lat * scale, lon, h], -1), rows
 
@@ -284,7 +286,8 @@ def choose_sigmas(
         bad = np.flatnonzero(used & ((sd[:, k] < 0) | ((sd[:, k] < _SUREST) & ~zero) | (zero & (floor is None))))
         if len(bad):
             raise RecordingError(
-                f"{rows.where(bad[0], name)}: a 1-sigma must be above zero, not {sd[bad[0], k]:g}", key="table.sigma"
+                f"{rows.describe_place(bad[0], name)}: a 1-sigma must be above zero, not {sd[bad[0], k]:g}",
+                key="table.sigma",
             )
         if zero.any():
             sd[zero, k] = floor
@@ -331,7 +334,7 @@ def parse_fix_types(rows: Table, numbers: str) -> NDArray[np.intp] | None:
     if len(bad):
         there = ", ".join(f"{k} {FIX_TYPES[ours]}" for k, ours in known.items() if ours)
         hint = "" if numbers == "nmea" else '; if they are GGA\'s, say units = { type = "nmea" }'
-        where = rows.where(bad[0], "type")
+        where = rows.describe_place(bad[0], "type")
         raise RecordingError(
             f"{where}: {types[bad[0]]:g} is no type of fix: {there}, blank where unknown{hint}", key="gnss.type"
         )

@@ -251,7 +251,7 @@ class OdometerTable(SensorTable):
                 raise ValueError(f"{key} says nothing without metres_per_pulse, the way of one pulse in m")
         return self
 
-    def readings(self, there: Sequence[str]) -> tuple[str, ...]:
+    def list_readings(self, there: Sequence[str]) -> tuple[str, ...]:
         """The columns that the speed comes from, of those present; missing columns that are required are named too."""
         if self.metres_per_pulse is not None:
             return ("pulses",)

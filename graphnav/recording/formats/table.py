@@ -69,7 +69,7 @@ class Table:
         """The table with one column replaced."""
         return replace(self, columns={**self.columns, name: values})
 
-    def where(self, row: int, name: str) -> str:
+    def describe_place(self, row: int, name: str) -> str:
         """'file, line 12, column lat' for an error about one cell."""
         for k, (number, _) in enumerate(_list_lines(self.path)):
             if k == self.rows[row]:

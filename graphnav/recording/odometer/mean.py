@@ -128,7 +128,7 @@ class ReadingStatistics:
             find_longest_step(odometer.t),
         )
 
-    def sigmas(self, odometer: Odometer) -> tuple[float, float, float]:
+    def list_sigmas(self, odometer: Odometer) -> tuple[float, float, float]:
         """`white`, `rounding` and `ends` of a `MeanSpeed`."""
         if odometer.speed_sigma is not None:
             return float(odometer.speed_sigma), 0.0, 0.0
@@ -180,7 +180,7 @@ class MeanSpeed:
         distance = (
             odometer.counted if odometer.counted is not None else _sum_from_zero(0.5 * (speed[1:] + speed[:-1]) * step)
         )
-        white, rounding, ends = figures.sigmas(odometer)
+        white, rounding, ends = figures.list_sigmas(odometer)
         return cls(
             t,
             speed,
@@ -222,7 +222,7 @@ class MeanSpeed:
         covered = (a >= self.t[0]) & (b <= self.t[-1]) & (self.bad[kb + 1] == self.bad[ka])
         return np.where(covered, mean, np.nan), np.where(covered, slope, np.nan)
 
-    def sigma(self, a: Array, b: Array, delay: float | Array = 0.0) -> Array:
+    def compute_sigma(self, a: Array, b: Array, delay: float | Array = 0.0) -> Array:
         """1-sigma of those means, (N,) m/s.
 
         Noise is independent for every reading. A rounding error persists while the reading does not change: a counter

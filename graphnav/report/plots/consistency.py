@@ -48,7 +48,7 @@ def plot_residuals(record: ConstraintRecord, start: float, end: float, solver: s
         panel.level(-3.0, dash=True)
         panel.level(3.0, dash=True)
     last.shade(spans)
-    last.band(np.array([0.0, end]), np.full(2, lo), np.full(2, hi), "ink", _CHI2)
+    last.draw_band(np.array([0.0, end]), np.full(2, lo), np.full(2, hi), "ink", _CHI2)
     _plot_epochs(last, t, np.clip(nis, 10.0**bottom, 10.0**top), record.weight, look)
     return figure
 
@@ -60,9 +60,9 @@ def _plot_epochs(panel: Panel, t: Array, y: Array, weight: Array, look: str) -> 
     used = ~rejected & ~reduced
     for chosen, name, words, size in ((used, look, "used", 3.0), (reduced, "withheld", "weight < 0.5", 5.0)):
         if chosen.any():
-            panel.dots(t[chosen], y[chosen], name, words, size)
+            panel.draw_dots(t[chosen], y[chosen], name, words, size)
     if rejected.any():
-        panel.dots(t[rejected], y[rejected], "alert", "rejected", 8.0, "x")
+        panel.draw_dots(t[rejected], y[rejected], "alert", "rejected", 8.0, "x")
 
 
 def plot_nees(
@@ -87,10 +87,10 @@ def plot_nees(
     for k, panel in enumerate(figure.panels):
         panel.shade(spans)
         band = [np.full(2, e) for e in edges[k]]
-        panel.band(np.array([0.0, end]), band[0], band[1], "ink", _CHI2)
+        panel.draw_band(np.array([0.0, end]), band[0], band[1], "ink", _CHI2)
         panel.level(1.0, dash=True)
         for key, s in series.items():
-            panel.line(s.t, np.maximum(scaled[key][:, k], 10.0 ** panel.ylim[0]), key, key)
+            panel.draw_line(s.t, np.maximum(scaled[key][:, k], 10.0 ** panel.ylim[0]), key, key)
     return figure
 
 

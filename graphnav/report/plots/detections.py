@@ -64,11 +64,11 @@ def plot_detections(recording: Recording, found: Sequence[Detection]) -> Figure:
     panels = iter(figure.panels)
     for y in (force, rate):
         panel = next(panels)
-        panel.line(t, y, "truth", width=1.0)
+        panel.draw_line(t, y, "truth", width=1.0)
     if speeds:
         panel = next(panels)
         for words, at, y, name in speeds:
-            panel.line(at, y, name, words)
+            panel.draw_line(at, y, name, words)
     for every in by_name.values():
         panel = next(panels)
         for d in every:
@@ -106,9 +106,9 @@ def _find_limits(every: Sequence[Detection]) -> tuple[float, float]:
 
 
 def _plot_statistic(panel: Panel, d: Detection, t0: float) -> None:
-    panel.line(d.t - t0, np.maximum(d.statistic, _FLOOR), "batch", "statistic", width=1.1)
+    panel.draw_line(d.t - t0, np.maximum(d.statistic, _FLOOR), "batch", "statistic", width=1.1)
     threshold = np.broadcast_to(d.threshold, d.t.shape)
-    panel.line(d.t - t0, threshold, "alert", "threshold: below it stands", dash=True)
+    panel.draw_line(d.t - t0, threshold, "alert", "threshold: below it stands", dash=True)
 
 
 def _plot_spectrogram(panel: Panel, pictured: Sequence[Detection], t0: float) -> None:
@@ -119,12 +119,12 @@ def _plot_spectrogram(panel: Panel, pictured: Sequence[Detection], t0: float) ->
         even = np.linspace(t[0], t[-1], min(len(t), BINS))
         after = np.clip(np.searchsorted(t, even), 1, len(t) - 1)
         nearest = after - (even - t[after - 1] < t[after] - even)
-        panel.map(even, f, np.clip(np.nan_to_num(level[:, nearest], nan=top - _DYNAMIC), top - _DYNAMIC, top))
+        panel.draw_map(even, f, np.clip(np.nan_to_num(level[:, nearest], nan=top - _DYNAMIC), top - _DYNAMIC, top))
         if "idle_line" in d.details:
             line = float(d.details["idle_line"][0])
             for k, words in ((1, f"idle line {line:.1f} Hz"), (2, "")):
                 if k * line < f[-1]:
-                    panel.line(t[[0, -1]], np.full(2, k * line), "paper", width=1.1, dash=True, quiet=True)
+                    panel.draw_line(t[[0, -1]], np.full(2, k * line), "paper", width=1.1, dash=True, quiet=True)
                     if words:
                         shift = (3, -16 if k * line > 0.8 * f[-1] else 1)
-                        panel.words(float(t[0]), k * line, words, shift=shift, name="paper")
+                        panel.write_words(float(t[0]), k * line, words, shift=shift, name="paper")

@@ -28,7 +28,7 @@ class Panel:
 
     def __init__(self, figure: Figure, k: int, unit: str, xlim: tuple[float, float], ylim: tuple[float, float]) -> None:
         self.figure, self.unit, self.xlim, self.ylim = figure, unit, xlim, ylim
-        self.axes = {"xaxis": figure.x_of(k), "yaxis": _make_axis("y", k)}
+        self.axes = {"xaxis": figure.find_x(k), "yaxis": _make_axis("y", k)}
 
     def _add(self, label: str, trace: dict[str, Any], quiet: bool = False, at: str = "", path: bool = False) -> None:
         hover = {"hoverinfo": "skip"}
@@ -41,7 +41,7 @@ class Panel:
             {"type": "scatter", **self.axes, "name": label, "legendgroup": label, "showlegend": first, **hover, **trace}
         )
 
-    def line(
+    def draw_line(
         self, x: Array, y: Array, name: str, label: str = "", width: float = 1.4, alpha: float = 1.0,
         dash: bool = False, quiet: bool = False,
     ) -> None:  # fmt: skip
@@ -56,9 +56,9 @@ class Panel:
 
     def level(self, y: float, **kw: Any) -> None:
         """A horizontal line at y."""
-        self.line(np.array(self.xlim), np.full(2, y), "ink", quiet=True, **{"width": 1.0, **kw})
+        self.draw_line(np.array(self.xlim), np.full(2, y), "ink", quiet=True, **{"width": 1.0, **kw})
 
-    def path(
+    def draw_path(
         self, xy: Array, name: str, label: str, t: Array | None = None, width: float = 1.8, alpha: float = 1.0
     ) -> None:
         """A line through places (N, 2), reached at t."""
@@ -69,7 +69,7 @@ class Panel:
         words = "<br>at %{customdata:.2f} s" if at else ""
         self._add(label, {"mode": "lines", "line": look, "opacity": alpha, **places, **at}, t is None, words, path=True)
 
-    def dots(
+    def draw_dots(
         self, x: Array, y: Array, name: str, label: str = "", size: float = 4.0, marker: str = "o",
         alpha: float = 1.0, t: Array | None = None, path: bool = False,
     ) -> None:  # fmt: skip
@@ -83,7 +83,7 @@ class Panel:
         places = {"x": encode_numbers(x[rows]), "y": encode_numbers(y[rows])}
         self._add(label, {"mode": "markers", "marker": look, **places, **at}, at=words, path=path)
 
-    def band(self, x: Array, low: Array, high: Array, name: str, label: str = "", alpha: float = 0.18) -> None:
+    def draw_band(self, x: Array, low: Array, high: Array, name: str, label: str = "", alpha: float = 0.18) -> None:
         """A tinted area between two lines, interrupted where x has a gap."""
         x, low, high = insert_breaks(x, thin(x, high - low, BINS // 2), low, high)
         parts = []
@@ -110,7 +110,7 @@ class Panel:
                 look = {"symbol": "square", "size": 11, "color": find_colour(SHADES[what]), "opacity": 0.4}
                 self._add(what, {"mode": "markers", "marker": look, "x": [None], "y": [None]}, quiet=True)
 
-    def map(self, x: Array, y: Array, values: Array) -> None:
+    def draw_map(self, x: Array, y: Array, values: Array) -> None:
         """Colours from dark to light for `values` (len(y), len(x)) at evenly spaced x and y."""
         low, high = float(np.min(values)), float(np.max(values))
         z = np.round(255.0 * (values - low) / max(high - low, 1e-12)).astype(np.uint8)
@@ -128,7 +128,7 @@ class Panel:
         }
         self._add("", {**look, "z": packed})
 
-    def words(
+    def write_words(
         self, x: float, y: float, text: str, align: str = "left", shift: tuple[float, float] = (6, 0),
         name: str = "truth",
     ) -> None:  # fmt: skip
@@ -200,7 +200,7 @@ class Figure:
                 })  # fmt: skip
             self.panels.append(panel)
 
-    def x_of(self, k: int) -> str:
+    def find_x(self, k: int) -> str:
         """The x axis of panel k: that of the first, unless panels stand apart."""
         return _make_axis("x", k if self.apart else 0)
 

@@ -69,11 +69,11 @@ def plot_trajectory(
     if fixes is not None:
         draw_fixes(panel, fixes)
     if truth is not None and len(truth):
-        panel.path(truth, "truth", "truth", width=3.5, alpha=0.5)
+        panel.draw_path(truth, "truth", "truth", width=3.5, alpha=0.5)
     for number, (name, (t, en)) in enumerate(tracks.items()):
         if number == 0:
             _draw_spans(panel, t, en, spans or {})
-        panel.path(en, name, name, t)
+        panel.draw_path(en, name, name, t)
         if number == 0:
             _draw_stops(panel, t, en, stops, standing)
     if tracks:
@@ -92,9 +92,9 @@ def plot_profile(lines: Mapping[str, tuple[Array, Array]], points: Mapping[str, 
     figure = Figure(["height [m]"], (0.0, kilo * max(reach, 1e-3)), [ylim], units=["m"], height=150, x=x)
     (panel,) = figure.panels
     for kind, (x_, y) in points.items():
-        panel.dots(kilo * x_, y, FIX_COLOURS.get(kind, "ink"), kind, 3.0, alpha=0.6)
+        panel.draw_dots(kilo * x_, y, FIX_COLOURS.get(kind, "ink"), kind, 3.0, alpha=0.6)
     for name, (x_, y) in lines.items():
-        panel.path(np.column_stack([kilo * x_, y]), name, name)
+        panel.draw_path(np.column_stack([kilo * x_, y]), name, name)
     return figure
 
 
@@ -106,10 +106,10 @@ def draw_fixes(panel: Panel, fixes: DrawnFixes, k: int | None = None) -> None:
         if rows.any():
             name = FIX_COLOURS.get(kind, "ink")
             size = 5.0 if k is None else 3.0
-            panel.dots(x[rows], y[rows], name, kind, size, alpha=0.6, t=fixes.t[rows], path=k is None)
+            panel.draw_dots(x[rows], y[rows], name, kind, size, alpha=0.6, t=fixes.t[rows], path=k is None)
     out = fixes.excluded & np.isfinite(y)
     if out.any():
-        panel.dots(x[out], y[out], "alert", "excluded fix", 7.0, "x", t=fixes.t[out], path=k is None)
+        panel.draw_dots(x[out], y[out], "alert", "excluded fix", 7.0, "x", t=fixes.t[out], path=k is None)
 
 
 def _draw_spans(panel: Panel, t: Array, en: Array, spans: Mapping[str, Spans]) -> None:
@@ -118,7 +118,7 @@ def _draw_spans(panel: Panel, t: Array, en: Array, spans: Mapping[str, Spans]) -
         gap = np.full((1, 2), np.nan)
         path = [part for piece in pieces if piece.any() for part in (en[piece], gap)]
         if path:
-            panel.path(np.concatenate(path), SHADES[what], what, width=8.0, alpha=0.5)
+            panel.draw_path(np.concatenate(path), SHADES[what], what, width=8.0, alpha=0.5)
 
 
 def _draw_stops(panel: Panel, t: Array, en: Array, stops: Spans, standing: str) -> None:
@@ -126,7 +126,7 @@ def _draw_stops(panel: Panel, t: Array, en: Array, stops: Spans, standing: str) 
         return
     begin, end = np.array(stops).T
     x, y = (np.interp(0.5 * (begin + end), t, en[:, k]) for k in (0, 1))
-    panel.dots(x, y, "stop", standing, 8.0 if len(stops) <= _MARKED_STOPS else 5.0, "D", t=begin, path=True)
+    panel.draw_dots(x, y, "stop", standing, 8.0 if len(stops) <= _MARKED_STOPS else 5.0, "D", t=begin, path=True)
 
 
 def _mark_ends(panel: Panel, en: Array, scale: float) -> None:
@@ -138,13 +138,15 @@ def _mark_ends(panel: Panel, en: Array, scale: float) -> None:
     lower = -int(en[-1, 1] < en[0, 1])  # the row whose label goes below, so that one does not cover the other
     few = max(1, len(en) // 30)
     for row, inner, marker, words in ((0, few, "^", "start"), (-1, max(-1 - few, -len(en)), "s", "end")):
-        panel.dots(en[[row], 0], en[[row], 1], "truth", "", 10.0, marker)
+        panel.draw_dots(en[[row], 0], en[[row], 1], "truth", "", 10.0, marker)
         x = en[row, 0]
         left = bool(x > east - edge or (x < en[min(inner, len(en) - 1), 0] and x > west + edge))
         if not (together and row == 0):
             words = "start and end" if together else words
             down = -18 if near and not together and row == lower else 0
-            panel.words(float(x), float(en[row, 1]), words, "right" if left else "left", (-8 if left else 8, down))
+            panel.write_words(
+                float(x), float(en[row, 1]), words, "right" if left else "left", (-8 if left else 8, down)
+            )
 
 
 def _scale_bar(figure: Figure, panel: Panel) -> None:
@@ -162,5 +164,5 @@ def _scale_bar(figure: Figure, panel: Panel) -> None:
         "line": {"color": find_colour("truth"), "width": 3.5},
     })  # fmt: skip
     words = f"{metres / 1000:g} km" if metres >= 1000 else f"{metres:g} m"
-    panel.words(x - metres / 2, 0.02, words, "center", (0, 2))
+    panel.write_words(x - metres / 2, 0.02, words, "center", (0, 2))
     figure.annotations[-1]["yref"] = "paper"

@@ -43,20 +43,20 @@ def plot_sky(record: ConstraintRecord, solver: str) -> Figure:
             "type": "circle", "xref": "x", "yref": "y", "x0": -r, "x1": r, "y0": -r, "y1": r, "layer": "below",
             "line": {"color": find_colour("grid"), "width": 1},
         })  # fmt: skip
-        panel.words(0.0, r, "" if ring == 0.0 else f"{ring:.0f}°", "left", (2, -2), "ink")
+        panel.write_words(0.0, r, "" if ring == 0.0 else f"{ring:.0f}°", "left", (2, -2), "ink")
     for words, at, align, shift in (
         ("N", (0.0, 90.0), "center", (0, 0)), ("E", (90.0, 0.0), "left", (3, -8)),
         ("S", (0.0, -90.0), "center", (0, -17)), ("W", (-90.0, 0.0), "right", (-3, -8)),
     ):  # fmt: skip
-        panel.words(*at, words, align, shift, "ink")
+        panel.write_words(*at, words, align, shift, "ink")
     refused = record.weight < HALF
     for name in np.unique(record.satellite):
         own = _choose_rows(np.flatnonzero(record.satellite == name), _PLENTY // 8)
-        panel.dots(x[own], y[own], solver, "used", 3.0, t=record.t[own], path=True)
-        panel.words(float(x[own[-1]]), float(y[own[-1]]), str(name), shift=(4, -4))
+        panel.draw_dots(x[own], y[own], solver, "used", 3.0, t=record.t[own], path=True)
+        panel.write_words(float(x[own[-1]]), float(y[own[-1]]), str(name), shift=(4, -4))
     if refused.any():
         own = _choose_rows(np.flatnonzero(refused))
-        panel.dots(x[own], y[own], "alert", "less than half weight", 4.0, t=record.t[own], path=True)
+        panel.draw_dots(x[own], y[own], "alert", "less than half weight", 4.0, t=record.t[own], path=True)
     return figure
 
 
@@ -73,8 +73,8 @@ def plot_used_satellites(
     figure = Figure([f"{kind}: rows of an epoch" for kind in records], (0.0, end), ylims)
     for panel, (t, good, refused) in zip(figure.panels, counts, strict=True):
         panel.shade(spans)
-        panel.line(t, good, solver, "used")
-        panel.line(t, refused, "alert", "less than half weight")
+        panel.draw_line(t, good, solver, "used")
+        panel.draw_line(t, refused, "alert", "less than half weight")
     return figure
 
 
@@ -91,7 +91,7 @@ def plot_satellite_rows(record: ConstraintRecord, start: float, end: float, solv
             (own & refused, "alert", "less than half weight", 5.0),
         ):
             if some.any():
-                panel.dots(record.t[some] - start, np.full(int(some.sum()), row), look, words, size)
+                panel.draw_dots(record.t[some] - start, np.full(int(some.sum()), row), look, words, size)
     return figure
 
 
@@ -108,10 +108,10 @@ def plot_residuals_by_elevation(records: Mapping[str, ConstraintRecord], solver:
         for some, look, words, size in ((used, solver, "used", 2.5), (~used, "alert", "less than half weight", 4.0)):
             rows = _choose_rows(np.flatnonzero(some))
             if len(rows):
-                panel.dots(x[rows], bounded[rows], look, words, size, alpha=0.4, path=True)
+                panel.draw_dots(x[rows], bounded[rows], look, words, size, alpha=0.4, path=True)
         middle, rms, sigma = _bin_by_elevation(x[used], y[used], record.sigma[used, 0])
-        panel.line(middle, rms, "truth", "RMS in steps of 5 deg", width=2.2)
-        panel.line(middle, sigma, "withheld", "their sigma", width=2.2, dash=True)
+        panel.draw_line(middle, rms, "truth", "RMS in steps of 5 deg", width=2.2)
+        panel.draw_line(middle, sigma, "withheld", "their sigma", width=2.2, dash=True)
     return figure
 
 
@@ -124,12 +124,12 @@ def plot_residuals_by_satellite(kind: str, record: ConstraintRecord, solver: str
     reach = find_limits([np.concatenate([*parts.values(), np.zeros(1)])], symmetric=True)
     figure, places = _plot_named_rows(every, reach, {"x": f"{kind} [{record.unit}]"})
     (panel,) = figure.panels
-    panel.line(np.zeros(2), np.array(panel.ylim), "ink", width=0.8, quiet=True)
+    panel.draw_line(np.zeros(2), np.array(panel.ylim), "ink", width=0.8, quiet=True)
     gap = np.nan
     for a, b, width, words in ((0, 4, 1.5, "middle 95 %"), (1, 3, 5.0, "middle half")):
         lines = np.array([[q[a], places[n]] for n in parts for q in (parts[n], parts[n][[b] * 5], np.full(5, gap))])
-        panel.path(lines, solver, words, width=width)
-    panel.dots(
+        panel.draw_path(lines, solver, words, width=width)
+    panel.draw_dots(
         np.array([q[2] for q in parts.values()]),
         np.array([places[n] for n in parts]),
         "truth",
@@ -148,9 +148,9 @@ def plot_carrier_arcs(arcs: CarrierArcs, start: float, end: float, *, spans: Sha
     for some, look, words in ((~arcs.integer, "float", "real number"), (arcs.integer, "fixed", "integer")):
         if some.any():
             x = np.stack([arcs.begin[some], arcs.end[some], np.full(int(some.sum()), np.nan)], -1) - start
-            panel.path(np.stack([x.ravel(), np.repeat(row[some], 3)], -1), look, words, width=5.0)
+            panel.draw_path(np.stack([x.ravel(), np.repeat(row[some], 3)], -1), look, words, width=5.0)
     first = np.unique(np.stack([row, arcs.begin - start], -1), axis=0)
-    panel.dots(first[:, 1], first[:, 0], "truth", "begins", 3.0, "s", path=True)
+    panel.draw_dots(first[:, 1], first[:, 0], "truth", "begins", 3.0, "s", path=True)
     return figure
 
 

@@ -65,11 +65,11 @@ def plot_bands(
                 width = 3.0 * s.sigma[:, k]
                 centre = np.zeros(len(s.t)) if about_zero else s.value[:, k]
                 words, tint = ("3 sigma", 0.22) if len(series) == 1 else (f"{name} 3 sigma", 0.14)
-                panel.band(s.t, centre - width, centre + width, name, words, tint)
+                panel.draw_band(s.t, centre - width, centre + width, name, words, tint)
         if under is not None:
             under(panel, k)
         for name, s in series.items():
-            panel.line(s.t, s.value[:, k], name, name)
+            panel.draw_line(s.t, s.value[:, k], name, name)
         if about_zero:
             panel.level(0.0, width=0.6)
     return figure
@@ -86,7 +86,7 @@ def plot_sigmas(
     for k, panel in enumerate(figure.panels):
         panel.shade(spans)
         for name, s in series.items():
-            panel.line(s.t, positive[name][:, k], name, name)
+            panel.draw_line(s.t, positive[name][:, k], name, name)
     return figure
 
 
@@ -107,5 +107,5 @@ def plot_span_zoom(series: Mapping[str, Curve], spans: Spans, what: str = "withh
         panel.shade({what: [span]})
         for name, (t, y) in cut.items():
             if len(t):
-                panel.line(t, y, name, name, width=1.8)
+                panel.draw_line(t, y, name, name, width=1.8)
     return figure

@@ -78,14 +78,14 @@ def _build_town(
     if idle_hz:
         motor = Engine(FOUR_CYLINDERS, idle_hz, ORDERS, wander_hz=0.06)
         parts += [
-            motor.lines(path, rate, make_random(seed, "engine")),
+            motor.simulate_lines(path, rate, make_random(seed, "engine")),
             simulate_idle_floor(path, make_random(seed, "idling")),
         ]
     gaps = spread_gaps(path, tunnels, (20.0, 45.0), make_random(seed, "tunnels"))
     receiver = replace(RTK if gnss == "rtk" else SINGLE, outages=gaps, dropouts=0.01)
     return record(
         name, seed, path,
-        origin=(45.46, 9.19, 20.0), imu=MEMS.at(rate), mount=mount, shake=Shake(tuple(parts)), exact=exact,
+        origin=(45.46, 9.19, 20.0), imu=MEMS.change_rate(rate), mount=mount, shake=Shake(tuple(parts)), exact=exact,
         gnss=receiver, odometer=OdometerModel(rate=10.0, scale=0.01, white=0.0, pulse=PULSE) if odometer else None,
         barometer=BarometerModel() if barometer else None,
         antennas=DualAntennaModel(outages=gaps) if antennas else None,
@@ -104,7 +104,7 @@ def _seat_passengers(path: Path, seed: int) -> list[Boarding | Fidget]:
 def spread_gaps(path: Path, count: int, length: Span, rng: np.random.Generator) -> tuple[Span, ...]:
     """`count` gaps over the drive, each where the vehicle moves most, of a length between the two given, s."""
     t = np.arange(path.start, path.end)
-    moved: Array = np.abs(path.speed(t))
+    moved: Array = np.abs(path.compute_speed(t))
     gaps = []
     for part in np.array_split(np.arange(len(t))[90:], max(count, 1))[:count]:
         seconds = int(rng.uniform(*length))

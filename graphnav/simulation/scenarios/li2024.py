@@ -69,14 +69,14 @@ def run(
     if engine:
         motor = Engine(MEAN, engine_hz, (0.5, 1.0, 2.0), spans)
         parts += [
-            motor.lines(path, rate, make_random(seed, "engine")),
+            motor.simulate_lines(path, rate, make_random(seed, "engine")),
             simulate_idle_floor(path, make_random(seed, "idling")),
         ]
     events = _list_events(edges, seed) if passengers else []
     parts.append(simulate_movement(path, events, (0.0, 0.0, 1.2), make_random(seed, "passengers")))
     return record(
         "li2024", seed, path,
-        origin=(37.53, 122.06, 20.0), imu=EG370N.at(rate), mount=mount, shake=Shake(tuple(parts)), exact=exact,
+        origin=(37.53, 122.06, 20.0), imu=EG370N.change_rate(rate), mount=mount, shake=Shake(tuple(parts)), exact=exact,
         gnss=GnssModel(white=(0.008, 0.008, 0.016), slow=(0.006, 0.006, 0.012), slow_time=300.0),
         odometer=OdometerModel() if odometer else None,
         facts={

@@ -46,7 +46,7 @@ def ren2021(
     if not (isinstance(walk, int) and 1 <= walk <= len(WALKS)):
         raise ConfigError(f"walk = {walk}: must be from 1 to {len(WALKS)}", key="simulation.value")
     perimeter, laps, duration = WALKS[walk - 1]
-    parts, imu = list_rectangle(perimeter, laps), ELLIPSE2.at(_check_rate(rate))
+    parts, imu = list_rectangle(perimeter, laps), ELLIPSE2.change_rate(_check_rate(rate))
     return _walk(
         "ren2021", seed, duration, parts, imu, exact, compensated, True, {"walk": walk, "laps": laps}
     )  # fmt: skip
@@ -82,10 +82,10 @@ def free(
         parts.append((left, 0.0))
     else:
         raise ConfigError(f"course = '{course}': must be laps, bends or straight", key="simulation.value")
+    sensor = PRESETS[imu].change_rate(_check_rate(rate))
     return _walk(
-        "gait", seed, duration, parts, PRESETS[imu].at(_check_rate(rate)), exact, compensated, course == "laps",
-        {"pace": pace, "course": course},
-    )  # fmt: skip
+        "gait", seed, duration, parts, sensor, exact, compensated, course == "laps", {"pace": pace, "course": course}
+    )
 
 
 def _check_rate(rate: float) -> float:

@@ -23,7 +23,9 @@ def _shake(path: Path, seed: int, rate: float, road: float) -> Shake:
         (
             simulate_road_noise(path, make_random(seed, "road"), road),
             Springs(height=0.4).lean(path),
-            Engine(FOUR_CYLINDERS, 12.1, ORDERS, wander_hz=0.05).lines(path, rate, make_random(seed, "engine")),
+            Engine(FOUR_CYLINDERS, 12.1, ORDERS, wander_hz=0.05).simulate_lines(
+                path, rate, make_random(seed, "engine")
+            ),
             simulate_idle_floor(path, make_random(seed, "idling")),
         )
     )
@@ -51,7 +53,8 @@ def motorway(seed: int, *, duration: float = 1500.0, exact: bool = False, rate: 
     gaps = spread_gaps(path, 2, (8.0, 25.0), make_random(seed, "tunnels"))
     return record(
         "motorway", seed, path,
-        origin=(48.35, 11.79, 20.0), imu=MEMS.at(rate), mount=_MOUNT, shake=_shake(path, seed, rate, 1.0), exact=exact,
+        origin=(48.35, 11.79, 20.0), imu=MEMS.change_rate(rate), mount=_MOUNT, shake=_shake(path, seed, rate, 1.0),
+        exact=exact,
         gnss=replace(SINGLE, rate=5.0, outages=gaps),
         odometer=OdometerModel(rate=50.0, scale=0.01, white=0.05, delay=0.04, signed=False),
         facts={"tunnels_s": [list(gap) for gap in gaps], "odometer_delay_s": 0.04},
@@ -94,7 +97,8 @@ def crawl(
     path = make_path(plan, heading=float(rng.uniform(0.0, 360.0)), slip_per_accel=0.005)
     return record(
         "crawl", seed, path,
-        origin=(50.08, 14.43, 20.0), imu=MEMS.at(rate), mount=_MOUNT, shake=_shake(path, seed, rate, 0.5), exact=exact,
+        origin=(50.08, 14.43, 20.0), imu=MEMS.change_rate(rate), mount=_MOUNT, shake=_shake(path, seed, rate, 0.5),
+        exact=exact,
         gnss=RTK, odometer=OdometerModel(rate=20.0, scale=0.01, white=0.02),
         facts={"creeping_s": creeping},
     )  # fmt: skip

@@ -60,13 +60,13 @@ def run(
     shake = Shake(
         (
             simulate_road_noise(path, make_random(seed, "road"), 0.5),
-            Engine(_IDLE, 13.0, wander_hz=0.03).lines(path, rate, make_random(seed, "engine")),
+            Engine(_IDLE, 13.0, wander_hz=0.03).simulate_lines(path, rate, make_random(seed, "engine")),
             simulate_idle_floor(path, make_random(seed, "idling")),
         )
     )
     return record(
         "ushaq", seed, path,
-        origin=(33.7, 73.1, 20.0), imu=IMU.at(rate), mount=Mount((0.0, 1.2, 0.5)), shake=shake, exact=exact,
+        origin=(33.7, 73.1, 20.0), imu=IMU.change_rate(rate), mount=Mount((0.0, 1.2, 0.5)), shake=shake, exact=exact,
         gnss=GnssModel(white=(25.0, 25.0, 25.0), velocity=(0.1, 0.1, 0.1), outages=outages, faults=faults,
                        lever_arm=(0.0, -0.3, 1.0)),
         odometer=OdometerModel(rate=10.0) if odometer else None,

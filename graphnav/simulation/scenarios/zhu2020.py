@@ -60,14 +60,14 @@ def run(
         (
             simulate_road_noise(path, make_random(seed, "road")),
             Springs(height=0.3).lean(path),
-            Engine(_IDLE, 13.3, wander_hz=0.05).lines(path, rate, make_random(seed, "engine")),
+            Engine(_IDLE, 13.3, wander_hz=0.05).simulate_lines(path, rate, make_random(seed, "engine")),
             simulate_idle_floor(path, make_random(seed, "idling")),
         )
     )
     gap = (lost + 90.0, lost + 105.0)
     return record(
         "zhu2020", seed, path,
-        origin=(32.03, 118.85, 20.0), imu=MIMU.at(rate), mount=mount, shake=shake, exact=exact,
+        origin=(32.03, 118.85, 20.0), imu=MIMU.change_rate(rate), mount=mount, shake=shake, exact=exact,
         gnss=GnssModel(
             white=(0.6, 0.6, 1.2), slow=(0.8, 0.8, 1.6), slow_time=60.0, velocity=(0.05, 0.05, 0.08),
             lever_arm=(0.1, -0.4, 0.9), outages=((lost, np.inf),),
