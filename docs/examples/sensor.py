@@ -34,7 +34,7 @@ class GroundSpeed(Constraint):
 
     @classmethod
     def build(cls, scene):
-        series = scene.series("radar")
+        series = scene.get_series("radar")
         if series is None:
             return None
         speed = np.interp(scene.t, series.t, series["speed"], left=np.nan, right=np.nan)

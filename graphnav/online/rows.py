@@ -162,7 +162,7 @@ def live_setup(
         where there is no GNSS, no odometer.
     platform : "vehicle" or "foot".
     name : name of the recording.
-    sensors : other sensors, without rows: ``SENSOR.series([], {}, sigma=0.3)``.
+    sensors : other sensors, without rows: ``SENSOR.make_series([], {}, sigma=0.3)``.
 
     Returns
     -------

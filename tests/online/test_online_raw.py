@@ -325,7 +325,7 @@ def test_wrong_integers_are_let_go_of(rtk: Recording, monkeypatch: pytest.Monkey
 
     monkeypatch.setattr(fixing, "find_nearest", wrong)
     monkeypatch.setattr(
-        fixing.Epochs, "odd", lambda self, k, *rest: [] if self.time[k] < until else noticed(self, k, *rest)
+        fixing.Epochs, "find_inconsistent", lambda self, k, *rest: [] if self.time[k] < until else noticed(self, k, *rest)
     )
     how = parse_settings({"noise": {"mode": "stated"}, "solver": {"lag": 5.0}})
     online, track = played(drop_rows(rtk), list_rows(rtk)[1], how, "isam2")

@@ -74,7 +74,7 @@ def read_folder(source: str | Path) -> Recording:
             required, optional = (*required, *position), tuple(c for c in optional if c not in position)
         rows = read_table(file, required, optional, section.columns, keep.column if keep else None)
         if name == "odometer":  # the columns needed depend on those present
-            required = (*required, *section.readings(tuple(rows.columns)))
+            required = (*required, *section.list_readings(tuple(rows.columns)))
             if not all(column in rows for column in required):
                 read_table(file, required, (), section.columns)  # raises an error that says what is missing
         if name in known:
