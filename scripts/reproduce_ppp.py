@@ -97,7 +97,7 @@ def standing(duration: float, place: Array, seed: int = 0) -> Imu:
     """A simulated IMU at rest, level, heading north."""
     llh = earth.ecef_to_llh(place[None])[0]
     t = np.arange(1, round(duration * RATE) + 1) / RATE
-    rate = earth.RATE * np.array([0.0, np.cos(llh[0]), np.sin(llh[0])])
+    rate = earth.EARTH_RATE * np.array([0.0, np.cos(llh[0]), np.sin(llh[0])])
     rng, dt = np.random.default_rng(seed), 1.0 / RATE
     values = []
     for true, density, walk, turn_on in (

@@ -134,7 +134,7 @@ def test_names_of_requirements_are_those_of_the_comparison(solved):
 
 @pytest.mark.parametrize(("sign", "met"), [("<", False), ("<=", True), (">", False), (">=", True)])
 def test_limits_themselves(sign, met):
-    (verdict,) = gates.judge([gates.parse_requirement(f"h_rms{sign}0.5")], [{"solver": "batch", "h_rms_m": 0.5}])
+    (verdict,) = gates.judge_all([gates.parse_requirement(f"h_rms{sign}0.5")], [{"solver": "batch", "h_rms_m": 0.5}])
     assert verdict.met is met
 
 
@@ -142,7 +142,7 @@ def test_a_requirement_on_spans_is_of_each_or_of_the_one_that_is_numbered():
     row = {"solver": "batch", "span1_max_h_m": 0.1, "span2_max_h_m": 0.9}
 
     def met(text):
-        return all(v.met for v in gates.judge([gates.parse_requirement(text)], [row]))
+        return all(v.met for v in gates.judge_all([gates.parse_requirement(text)], [row]))
 
     assert not met("span_max_h<0.5")
     assert met("span1_max_h<0.5")

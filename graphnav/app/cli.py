@@ -26,13 +26,13 @@ from graphnav.app.cli_options import (
     Config,
     End,
     Fire,
-    Format,
+    FormatOption,
     Json,
     Out,
-    Profile,
+    ProfileOption,
     Quiet,
     Require,
-    Source,
+    SourceArgument,
     Start,
     Topic,
     Without,
@@ -49,8 +49,8 @@ from graphnav.app.talk import (
     Interrupted,
     fail,
     insist,
+    print_out,
     say,
-    show,
     show_progress,
 )
 from graphnav.core.complaints import rephrase
@@ -71,7 +71,7 @@ _ORDER = (
     "allan", "settings",
 )  # fmt: skip
 # Words of other programs for what --start and --end say.
-_SPAN = ("window", "span", "from", "to", "begin", "stop", "duration", "crop", "trim", "time", "until")
+_SPAN_WORDS = ("window", "span", "from", "to", "begin", "stop", "duration", "crop", "trim", "time", "until")
 
 
 class _InOrder(TyperGroup):
@@ -108,14 +108,14 @@ def _program(
 @app.command(context_settings=SEVERAL, epilog="\b\nExample:\n  graphnav info kitti")
 def info(
     context: typer.Context,
-    recording: Source,
+    recording: SourceArgument,
     antenna: Annotated[
         bool, typer.Option("--antenna", help="Also estimate the antenna's lever arm from the drive.")
     ] = False,
     quick: Annotated[
         bool, typer.Option("--quick", help="Leave out the checks that solve the drive: signs of lever arms.")
     ] = False,
-    format: Format = None,
+    format: FormatOption = None,
     topic: Topic = None,
     allow_outside: AllowOutside = False,
     quiet: Quiet = False,
@@ -138,20 +138,20 @@ def info(
         more = find_wrong_arms(found.recording, found.findings) if found.trusted and not quick else []
         last = [find_antenna(whole).finding] if antenna else find_untold_arm(found.recording)
         found = replace(found, findings=(*more, *found.findings, *last))
-    show(found.format, found.to_dict, quiet, json)
+    print_out(found.format, found.to_dict, quiet, json)
 
 
 @app.command(context_settings=SEVERAL, epilog="\b\nExample:\n  graphnav detect kitti -o out/kitti")
 def detect(
     context: typer.Context,
-    recording: Source,
+    recording: SourceArgument,
     out: Out,
     config: Config = None,
     detectors: Fire = None,
     without: Without = None,
     start: Start = None,
     end: End = None,
-    format: Format = None,
+    format: FormatOption = None,
     topic: Topic = None,
     allow_outside: AllowOutside = False,
     quiet: Quiet = False,
@@ -181,9 +181,9 @@ def detect(
         found = replace(found, notes=(*notes, *found.notes))
         tell("writing")
         with stage_results(folder) as part:
-            files = detection_report.write(used, found, part)
+            files = detection_report.write_detections(used, found, part)
     files = resolve_final_path(files, part, folder)
-    show(
+    print_out(
         lambda: detection_report.format_found(used, found, files),
         lambda: {**detection_report.list_values(used, found), "files": files},
         quiet,
@@ -221,19 +221,19 @@ def evaluate(
         tell("reading")
         metrics = compared(trajectory, truth)
     values = {"trajectory": str(trajectory), "truth": str(truth), **summarise(metrics)}
-    verdicts = gates.judge(requirements, tabulate({trajectory.stem: metrics}))
+    verdicts = gates.judge_all(requirements, tabulate({trajectory.stem: metrics}))
     if verdicts:
         values["requirements"] = gates.list_verdicts(verdicts)
     if folder is not None:
         with stage_results(folder) as part:
             outputs.write_evaluation(part, values, metrics)
-    show(lambda: format_metrics(metrics) + gates.format_verdicts(verdicts), lambda: values, quiet, json)
+    print_out(lambda: format_metrics(metrics) + gates.format_verdicts(verdicts), lambda: values, quiet, json)
     insist(verdicts)
 
 
 @app.command(epilog="\b\nExample:\n  graphnav settings --profile car > settings.toml")
 def settings(
-    profile: Profile = None,
+    profile: ProfileOption = None,
     config: Config = None,
     json: Json = False,
 ) -> None:
@@ -244,7 +244,7 @@ def settings(
     from graphnav.config import format_settings, read_settings
 
     found = read_settings(config, profile)
-    show(lambda: format_settings(found), found.model_dump, False, json)
+    print_out(lambda: format_settings(found), found.model_dump, False, json)
 
 
 app.add_typer(cli_solve.commands)
@@ -301,7 +301,7 @@ def _describe_usage_error(error: Any) -> str:
     path = getattr(context, "command_path", "graphnav")
     options = {name for option in getattr(getattr(context, "command", None), "params", ()) for name in option.opts}
     unknown = str(getattr(error, "option_name", ""))
-    if unknown.lstrip("-") in _SPAN and {"--start", "--end"} <= options:
+    if unknown.lstrip("-") in _SPAN_WORDS and {"--start", "--end"} <= options:
         return f"No such option: {unknown}; --start and --end choose a part of the recording; see {path} --help"
     return f"{rephrase(error.format_message().rstrip('.'))}; see {path} --help"
 

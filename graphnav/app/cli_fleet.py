@@ -13,17 +13,17 @@ from graphnav.app.cli_options import (
     Config,
     End,
     Json,
-    Noise,
+    NoiseOption,
     Out,
     Pages,
-    Profile,
+    ProfileOption,
     Quiet,
     Rate,
     Start,
     Without,
     choose_solver,
 )
-from graphnav.app.talk import Interrupted, say, show
+from graphnav.app.talk import Interrupted, print_out, say
 from graphnav.core.errors import ConfigError
 from graphnav.core.files import permit_outside
 from graphnav.core.notes import format_count
@@ -41,9 +41,9 @@ def fleet(
     solver: Annotated[
         str, typer.Option("--solver", "--solvers", metavar="NAME", help="One of batch, incremental, isam2, rts, ekf.")
     ] = "batch",
-    profile: Profile = None,
+    profile: ProfileOption = None,
     config: Config = None,
-    noise: Noise = None,
+    noise: NoiseOption = None,
     withhold: Annotated[
         float | None,
         typer.Option("--withhold", metavar="S", help="Withhold GNSS for S seconds, repeatedly, and score these spans."),
@@ -81,7 +81,7 @@ def fleet(
     """
     from graphnav.app import convert, outputs
     from graphnav.app.fleet import manifest, page, tables, workers
-    from graphnav.app.fleet.drive import DONE, Row
+    from graphnav.app.fleet.drive import DONE, FleetRow
     from graphnav.core.staging import resolve_final_path, stage_results
 
     convert.check_rate(rate)
@@ -113,7 +113,7 @@ def fleet(
     else:
         count = processes or _count_processors()
         found = workers.solve_here(tasks, count, workers.Limits(limit, memory or workers.share_of_memory(count)))
-    done: dict[str, Row] = {}
+    done: dict[str, FleetRow] = {}
     try:
         for row in found:
             done[row["drive"]] = row if len(done) < page.DRAWN else {**row, "track": None}
@@ -123,7 +123,7 @@ def fleet(
         raise Interrupted(f"interrupted after {len(done)} of {len(tasks)} drives; the same command goes on") from None
     rows = [done[task.name] for task in tasks]
     with stage_results(folder) as part:
-        tables.write_csv(rows, part / "fleet.csv")
+        tables.write_fleet_csv(rows, part / "fleet.csv")
         files = [part / "fleet.csv"]
         if tables.write_parquet(rows, part / "fleet.parquet"):
             files.append(part / "fleet.parquet")
@@ -132,7 +132,7 @@ def fleet(
     files = resolve_final_path(files, part, folder)
     lacking = "" if withhold is None else tables.describe_unscored(rows, withhold)
     lacking += "" if len(files) > 2 else "\nno fleet.parquet: pyarrow is not installed"
-    show(
+    print_out(
         lambda: "\n".join([tables.format_totals(rows) + lacking, "look at", *(f"  {file}" for file in files)]),
         lambda: {
             **tables.compute_totals(rows),

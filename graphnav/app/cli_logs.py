@@ -8,8 +8,8 @@ from typing import Annotated
 
 import typer
 
-from graphnav.app.cli_options import AllowOutside, Export, Format, Json, Point, Quiet, Topic
-from graphnav.app.talk import say, show, show_progress
+from graphnav.app.cli_options import AllowOutside, Export, FormatOption, Json, Point, Quiet, Topic
+from graphnav.app.talk import print_out, say, show_progress
 from graphnav.core.errors import ConfigError
 from graphnav.core.files import permit_outside
 from graphnav.core.progress import tell
@@ -27,7 +27,7 @@ def convert(
     out: Annotated[
         Path, typer.Option("-o", "--out", metavar="OUT", help="Folder to write; of a trajectory also a file.")
     ],
-    format: Format = None,
+    format: FormatOption = None,
     export: Export = None,
     point: Point = None,
     rate: Annotated[
@@ -64,7 +64,7 @@ def convert(
             target = part / out.name if alone else part
             files, notes = conversion.export_file(source, target, export, point, rate, clock)
         files = resolve_final_path(files, part, folder)
-        show(
+        print_out(
             lambda: "\n".join([*(f"note: {note}" for note in notes), *(f"wrote {file}" for file in files)]),
             lambda: {"notes": notes, "files": files},
             quiet,
@@ -78,7 +78,7 @@ def convert(
     with show_progress(quiet, "convert"), permit_outside(allow_outside):
         tell("reading")
         log, files = conversion.convert_log(source, folder, format, topic or (), force)
-    show(
+    print_out(
         lambda: conversion.log_text(log, files),
         lambda: {**conversion.log_values(log), "files": files},
         quiet,
@@ -96,7 +96,7 @@ def allan(
     end: Annotated[
         float | None, typer.Option("--end", metavar="S", help="Use the log up to here, s from its start.")
     ] = None,
-    format: Format = None,
+    format: FormatOption = None,
     topic: Topic = None,
     allow_outside: AllowOutside = False,
     quiet: Quiet = False,
@@ -138,10 +138,10 @@ def allan(
             raise RecordingError(f"{log}: {error}", key=error.key) from None
         tell("writing")
         with stage_results(folder) as part:
-            written = pages.write(result, part)
+            written = pages.write_allan(result, part)
     written = resolve_final_path(written, part, folder)
     lines = [f"{result.duration:.0f} s at rest, {result.rate:.4g} Hz", "", "[imu.noise]", *result.format_lines(), ""]
-    show(
+    print_out(
         lambda: "\n".join([*lines, *(f"wrote {path}" for path in written)]),
         lambda: {
             "duration_s": result.duration,
@@ -198,7 +198,7 @@ def init(
                 write_csv(part / made, list(columns), list(columns.values()))
             (part / out.name).write_text(drafted.text, encoding="utf-8")
     files = [out, *(folder / made for made in drafted.made)]
-    show(
+    print_out(
         lambda: "\n".join(
             [*(f"  {line}" for line in drafted.decisions), f"wrote {out}; look at the lines marked CHECK"]
         ),
@@ -244,7 +244,7 @@ def simulate(
         with stage_results(folder) as part:
             files = made.write(part)
     files = resolve_final_path(files, part, folder)
-    show(
+    print_out(
         lambda: "\n".join([made.format(), *(f"  {file}" for file in files)]),
         lambda: {"scenario": scenario, "seed": seed, "options": options, "stops": made.stops, "files": files},
         quiet,

@@ -18,7 +18,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from graphnav.app.cli_options import AllowOutside, Config, Fire, Format, Profile, Quiet, Topic, choose_detectors
+from graphnav.app.cli_options import (
+    AllowOutside,
+    Config,
+    Fire,
+    FormatOption,
+    ProfileOption,
+    Quiet,
+    Topic,
+    choose_detectors,
+)
 from graphnav.app.talk import Interrupted, say
 from graphnav.core.errors import ConfigError
 
@@ -27,7 +36,7 @@ if TYPE_CHECKING:
     from graphnav.online.session import Session
     from graphnav.recording import Recording
 
-LONGEST = 1 << 20  # bytes of a line
+LONGEST_LINE = 1 << 20  # bytes of a line
 TICK = 0.5  # s between updates of the view, and of each wait for a source
 
 commands = typer.Typer()
@@ -59,9 +68,9 @@ def online(
     send: Annotated[
         bool, typer.Option("--send", help="Print the recording as lines of the protocol instead of smoothing it.")
     ] = False,
-    profile: Profile = None,
+    profile: ProfileOption = None,
     config: Config = None,
-    format: Format = None,
+    format: FormatOption = None,
     topic: Topic = None,
     allow_outside: AllowOutside = False,
     quiet: Quiet = False,
@@ -98,7 +107,7 @@ def online(
             if live:
                 follow(session, read_standard_input() if source == "-" else read_connections(source), shown, asked)
             else:
-                replay(session, Pace(speed), shown, asked)
+                process_recording(session, Pace(speed), shown, asked)
             if not asked:
                 session.finish()
             elif not session.done:
@@ -133,7 +142,7 @@ def _send(recording: Recording, speed: float) -> None:
         say(line, flush=speed > 0 or line == END)
 
 
-def replay(session: Session, pace: Pace, shown: LiveView, asked: StopRequest) -> None:
+def process_recording(session: Session, pace: Pace, shown: LiveView, asked: StopRequest) -> None:
     """Process the rows of a recording as they become due."""
     for row in session.rows[session.taken :]:
         pace.wait(row[1], shown.update, asked)
@@ -175,8 +184,8 @@ def follow(session: Session, chunks: Iterator[bytes], shown: LiveView, asked: St
     for chunk in chunks:
         if chunk:
             *whole, rest = (rest + chunk).split(b"\n")
-            rest = rest[:LONGEST]  # a line without an end is no row, and is reported as one when it does end
-            whole = [line[:LONGEST] for line in whole]
+            rest = rest[:LONGEST_LINE]  # a line without an end is no row, and is reported as one when it does end
+            whole = [line[:LONGEST_LINE] for line in whole]
             session.add_lines([line.decode("utf-8", "replace") for line in whole], asked.__bool__)
             heard = time.monotonic()
         shown.update_if_due(time.monotonic() - heard)

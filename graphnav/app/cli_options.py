@@ -13,14 +13,14 @@ from graphnav.core.errors import ConfigError
 if TYPE_CHECKING:
     from graphnav.config import Settings
 
-Source = Annotated[
+SourceArgument = Annotated[
     str,
     typer.Argument(
         metavar="RECORDING", help="A folder with recording.toml, a .toml, a known log, or kitti (in the gtsam package)."
     ),
 ]
 SEVERAL = {"allow_extra_args": True}  # `pick_one` reports it more clearly than the parser
-Format = Annotated[
+FormatOption = Annotated[
     str | None, typer.Option("--format", metavar="NAME", help="Format of the log, where it is not recognised.")
 ]
 Export = Annotated[
@@ -46,7 +46,7 @@ Config = Annotated[
     Path | None,
     typer.Option("--config", metavar="FILE", help="Settings file (TOML), or the summary.json of an earlier run."),
 ]
-Profile = Annotated[
+ProfileOption = Annotated[
     str | None, typer.Option("--profile", metavar="NAME", help="Settings for car, car+odometer or foot.")
 ]
 Without = Annotated[
@@ -70,7 +70,7 @@ Start = Annotated[
 End = Annotated[
     float | None, typer.Option("--end", metavar="S", help="Use the recording up to here, s from its start.")
 ]
-Noise = Annotated[
+NoiseOption = Annotated[
     str | None,
     typer.Option(
         "--noise",

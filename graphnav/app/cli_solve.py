@@ -16,17 +16,17 @@ from graphnav.app.cli_options import (
     End,
     Export,
     Fire,
-    Format,
+    FormatOption,
     Json,
-    Noise,
+    NoiseOption,
     Out,
     Pages,
     Point,
-    Profile,
+    ProfileOption,
     Quiet,
     Rate,
     Require,
-    Source,
+    SourceArgument,
     Start,
     Topic,
     Without,
@@ -36,7 +36,7 @@ from graphnav.app.cli_options import (
     collect_withheld,
     pick_one,
 )
-from graphnav.app.talk import insist, pause_collector, show, show_progress
+from graphnav.app.talk import insist, pause_collector, print_out, show_progress
 from graphnav.core.errors import ConfigError
 from graphnav.core.files import permit_outside
 from graphnav.core.progress import tell
@@ -47,14 +47,14 @@ commands = typer.Typer()
 @commands.command(context_settings=SEVERAL, epilog="\b\nExample:\n  graphnav smooth kitti -o out/kitti")
 def smooth(
     context: typer.Context,
-    recording: Source,
+    recording: SourceArgument,
     out: Out,
     solver: Annotated[
         str, typer.Option("--solver", "--solvers", metavar="NAME", help="One of batch, incremental, isam2, rts, ekf.")
     ] = "batch",
-    profile: Profile = None,
+    profile: ProfileOption = None,
     config: Config = None,
-    noise: Noise = None,
+    noise: NoiseOption = None,
     detectors: Fire = None,
     without: Without = None,
     rate: Rate = None,
@@ -64,7 +64,7 @@ def smooth(
     point: Point = None,
     pages: Pages = True,
     require: Require = None,
-    format: Format = None,
+    format: FormatOption = None,
     topic: Topic = None,
     allow_outside: AllowOutside = False,
     quiet: Quiet = False,
@@ -87,7 +87,7 @@ def smooth(
 )
 def compare(
     context: typer.Context,
-    recording: Source,
+    recording: SourceArgument,
     out: Out,
     solvers: Annotated[
         str,
@@ -98,9 +98,9 @@ def compare(
             help="Some of ekf, rts, incremental, isam2, batch, with commas.",
         ),
     ] = "ekf,rts,batch",
-    profile: Profile = None,
+    profile: ProfileOption = None,
     config: Config = None,
-    noise: Noise = None,
+    noise: NoiseOption = None,
     detectors: Fire = None,
     without: Without = None,
     rate: Rate = None,
@@ -138,7 +138,7 @@ def compare(
     point: Point = None,
     pages: Pages = True,
     require: Require = None,
-    format: Format = None,
+    format: FormatOption = None,
     topic: Topic = None,
     allow_outside: AllowOutside = False,
     quiet: Quiet = False,
@@ -186,7 +186,7 @@ def report(
         with stage_results(out) as part:
             files = outputs.draw_again(out, part)
     files = resolve_final_path(files, part, out)
-    show(lambda: "\n".join(["look at", *(f"  {file}" for file in files)]), lambda: {"files": files}, quiet, json)
+    print_out(lambda: "\n".join(["look at", *(f"  {file}" for file in files)]), lambda: {"files": files}, quiet, json)
 
 
 @dataclass(frozen=True)
@@ -237,7 +237,7 @@ def _solve(
         from graphnav.core.complaints import split_names
         from graphnav.core.staging import resolve_final_path, stage_results
         from graphnav.evaluation import gates
-        from graphnav.recording.exporters import NAMES
+        from graphnav.recording.exporters import FORMATS
 
     withheld = collect_withheld(asked.without, asked.start, asked.end)
     convert.check_rate(asked.rate)
@@ -253,7 +253,7 @@ def _solve(
     folder = outputs.check_output_folder(asked.out, outputs.FILES, () if alone else names)
     if point is not None and export is None:
         raise ConfigError(f"--point {point}: is of the files of --export; name some", key="option.not_here")
-    exported = split_names(export, NAMES, "--export", "format to write") if export is not None else ()
+    exported = split_names(export, FORMATS, "--export", "format to write") if export is not None else ()
     convert.parse_point(point)
     against = []
     for k, file in enumerate(beside.files if beside is not None else ()):
@@ -275,7 +275,7 @@ def _solve(
         outcome = workflow.run_request(request, progress)
         tell("writing")
         with stage_results(folder) as part:
-            files = (outputs.write_run if alone else outputs.write_comparison)(outcome, part, asked.pages)
+            files = (outputs.write_run if alone else outputs.write_comparison_files)(outcome, part, asked.pages)
         files = resolve_final_path(files, part, folder)
         if not asked.pages:
             outputs.remove_pages(folder, () if alone else names)
@@ -283,7 +283,7 @@ def _solve(
             with stage_results(folder) as part:
                 more = convert.export_run(outcome, part, exported, point, alone)
             files += resolve_final_path(more, part, folder)
-    verdicts = gates.judge(requirements, tabulate_comparison(outcome, ours=True)) if requirements else []
+    verdicts = gates.judge_all(requirements, tabulate_comparison(outcome, ours=True)) if requirements else []
 
     def values() -> dict[str, Any]:
         places = {name: folder if alone else folder / name for name in names}
@@ -291,5 +291,7 @@ def _solve(
         found = each[names[0]] if alone else {"recording": outcome.recording.name, "solvers": each}
         return {**found, "requirements": gates.list_verdicts(verdicts), "files": files}
 
-    show(lambda: terminal.run_text(outcome, files) + gates.format_verdicts(verdicts), values, asked.quiet, asked.json)
+    print_out(
+        lambda: terminal.run_text(outcome, files) + gates.format_verdicts(verdicts), values, asked.quiet, asked.json
+    )
     insist(verdicts)

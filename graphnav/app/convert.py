@@ -21,7 +21,7 @@ from graphnav.core.timescales import gps_to_utc, parse_clock
 from graphnav.core.trajectory import Trajectory
 from graphnav.estimation.solution import Solution, make_trajectory
 from graphnav.evaluation.against import find_antenna_lever_arm, select_own
-from graphnav.recording.exporters import NAMES, write_parts
+from graphnav.recording.exporters import FORMATS, write_parts
 from graphnav.recording.formats import list_formats, load
 from graphnav.recording.formats.registry import Log
 from graphnav.recording.formats.trajectories import read_trajectory
@@ -38,7 +38,7 @@ _MAX_GAP = 3.0  # s; wider gaps of a trajectory are not interpolated
 
 def is_export(source: Path, out: Path) -> bool:
     """Whether a trajectory is to be exported, rather than a log read."""
-    return out.suffix[1:] in NAMES and not out.is_dir() and not source.is_dir()
+    return out.suffix[1:] in FORMATS and not out.is_dir() and not source.is_dir()
 
 
 def check_rate(rate: float | None) -> None:
@@ -142,13 +142,13 @@ def export_file(
     """
     file = _find_trajectory_file(source)
     trajectory = read_trajectory(file)
-    if out.suffix[1:] in NAMES and not out.is_dir():
+    if out.suffix[1:] in FORMATS and not out.is_dir():
         if name is not None and name != out.suffix[1:]:
             raise ConfigError(f"--export {name}: but {out.name} is to be written", key="option.not_here")
         targets = {out.suffix[1:]: out}
     else:
         assert name is not None
-        targets = {one: out / f"{file.stem}.{one}" for one in split_names(name, NAMES, "--export", "format to write")}
+        targets = {one: out / f"{file.stem}.{one}" for one in split_names(name, FORMATS, "--export", "format to write")}
     run = _run(file)
     arm = parse_point(point)
     if isinstance(arm, str) and arm == "antenna":

@@ -15,7 +15,7 @@ import numpy as np
 from graphnav.app import stored
 from graphnav.app.scores import find_outages
 from graphnav.app.stored import write_outcome
-from graphnav.app.summary import gather_provenance, summarise_solver, tabulate_comparison, tabulate_noise
+from graphnav.app.summary import gather_provenance, list_noise_figures, summarise_solver, tabulate_comparison
 from graphnav.app.workflow import Outcome
 from graphnav.core.errors import ConfigError, PartlyWrittenError
 from graphnav.core.files import exists
@@ -93,12 +93,12 @@ def write_run(outcome: Outcome, folder: Path, pages: bool = True) -> list[Path]:
     provenance = gather_provenance(outcome)
     failed = write_solver(outcome, name, folder, provenance, pages=pages)
     kept = replace(outcome, alone=True)
-    failed |= _attempt(lambda path: write_outcome(kept, provenance, path), folder / stored.NAME)
+    failed |= _attempt(lambda path: write_outcome(kept, provenance, path), folder / stored.RUN_FILE)
     _insist(failed)
     return [*([folder / "report.html"] if pages else []), folder / "trajectory.csv", folder / "summary.json"]
 
 
-def write_comparison(outcome: Outcome, folder: Path, pages: bool = True) -> list[Path]:
+def write_comparison_files(outcome: Outcome, folder: Path, pages: bool = True) -> list[Path]:
     """Write all files of each solver under its name, and the table and page that compare them; `pages` as in
     `write_run`.
     """
@@ -116,7 +116,7 @@ def write_comparison(outcome: Outcome, folder: Path, pages: bool = True) -> list
     write_comparison_csv(folder / "comparison.csv", tabulate_comparison(outcome))
     if pages:
         failed |= _attempt(lambda path: _draw_comparison(outcome, path.parent, provenance), folder / "comparison.html")
-    failed |= _attempt(lambda path: write_outcome(outcome, provenance, path), folder / stored.NAME)
+    failed |= _attempt(lambda path: write_outcome(outcome, provenance, path), folder / stored.RUN_FILE)
     _insist(failed)
     return [*([folder / "comparison.html"] if pages else []), folder / "comparison.csv"]
 
@@ -135,12 +135,12 @@ def draw_again(folder: Path, part: Path) -> list[Path]:
     GraphnavError
         If there is none.
     """
-    outcome, provenance = stored.read_outcome(folder / stored.NAME)
+    outcome, provenance = stored.read_outcome(folder / stored.RUN_FILE)
     try:
         return _draw_pages(outcome, provenance, part, outcome.alone)  # the folder may contain an earlier comparison
     except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
         raise ConfigError(
-            f"{folder / stored.NAME}: its parts do not fit together ({type(error).__name__}: {error}); solve again",
+            f"{folder / stored.RUN_FILE}: its parts do not fit together ({type(error).__name__}: {error}); solve again",
             key="results.unfit",
         ) from error
 
@@ -177,7 +177,7 @@ def _draw_comparison(outcome: Outcome, folder: Path, provenance: Mapping[str, An
         findings=_list_findings(outcome),
         defects=outcome.defects,
         provenance=provenance,
-        noise=tabulate_noise(outcome, next(iter(outcome.solutions.values()))),
+        noise=list_noise_figures(outcome, next(iter(outcome.solutions.values()))),
         beside=[f"{name}/report.html" for name in select_own(outcome.solutions)],
     )
 
@@ -240,7 +240,7 @@ def _draw_solver(
         contradicted=contradicted,
         provenance=provenance,
         detectors=detectors,
-        noise=tabulate_noise(outcome, solution),
+        noise=list_noise_figures(outcome, solution),
         beside=("trajectory.kml", "trajectory.gpx", "trajectory.csv"),
     )
 

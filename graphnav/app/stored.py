@@ -32,7 +32,7 @@ from graphnav.report.plots.detections import select_drawn_rows
 from graphnav.report.plots.thinning import BINS
 from graphnav.sensors import Series, list_sensors
 
-NAME = "run.npz"
+RUN_FILE = "run.npz"
 _RUN_FORMAT = "graphnav-run/3"
 _ANEW = ("between", "graphs", "own")  # available only by solving again, and classes of a script
 _PACKAGE = __name__.partition(".")[0]

@@ -98,7 +98,7 @@ def _count_ambiguities(solution: Solution) -> dict[str, Any] | None:
     return {"epochs": epochs, "fixed": int(fixed.sum()), "float": int((~fixed).sum()), "first_fix_s": first}
 
 
-def tabulate_noise(outcome: Outcome, solution: Solution) -> tuple[FigureRow, ...]:
+def list_noise_figures(outcome: Outcome, solution: Solution) -> tuple[FigureRow, ...]:
     """The figures of a solution's noise model beside the stated ones."""
     from graphnav.estimation.noise.table import tabulate_figures
 
@@ -118,7 +118,7 @@ def summarise_noise(outcome: Outcome, solution: Solution) -> dict[str, Any]:
     values = list_noise(solution.noise, outcome.request.settings.noise.mode)
     if len(solution.between) > 1:
         values["pieces"] = len(solution.between)
-    for row in tabulate_noise(outcome, solution):
+    for row in list_noise_figures(outcome, solution):
         beside = {"stated": row.stated, "used": row.used, "unit": row.unit, "correlation_time": row.correlation_time}
         values["figures"][row.group] |= beside
     return values

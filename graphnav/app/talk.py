@@ -34,7 +34,7 @@ def insist(verdicts: Sequence[Verdict]) -> None:
         raise typer.Exit(NOT_MET)
 
 
-def show(text: Callable[[], str], values: Callable[[], Any], quiet: bool, json: bool) -> None:
+def print_out(text: Callable[[], str], values: Callable[[], Any], quiet: bool, json: bool) -> None:
     """Print the result of a command: for people, for programs, or not at all."""
     if json:
         from graphnav.core.jsonable import format_json

@@ -21,7 +21,7 @@ from graphnav.estimation.noise.model import TABULATED
 from graphnav.estimation.solution import Solution
 from graphnav.evaluation.metrics import SpanErrors
 
-_IMU = {
+_OF_IMU = {
     "imu.gyro_noise_density": "gyro", "imu.accel_noise_density": "accelerometer",
     "imu.gyro_bias_walk": "gyro bias walk", "imu.accel_bias_walk": "accelerometer bias walk",
 }  # fmt: skip
@@ -32,7 +32,7 @@ _ERRORS = (
 )  # fmt: skip
 
 
-_WIDEST = 1000  # characters of a table
+_WIDEST_TABLE = 1000  # characters of a table
 
 
 def run_text(outcome: Outcome, files: Sequence[Path]) -> str:
@@ -69,7 +69,7 @@ def _describe_noise(outcome: Outcome) -> list[str]:
     noise = next(iter(outcome.solutions.values())).noise
     if not noise.figures:
         return ["noise as stated"]
-    estimated = {words: noise.figures[group].log_factor for group, words in _IMU.items() if group in noise.figures}
+    estimated = {words: noise.figures[group].log_factor for group, words in _OF_IMU.items() if group in noise.figures}
     parts = [f"{words} x {format_short(float(np.exp(0.5 * factor)))}" for words, factor in estimated.items()]
     for source in dict.fromkeys(group.rpartition(".")[0] for group in noise.figures if group.startswith("gnss_")):
         if source.rpartition(".")[2] in TIMES:
@@ -189,7 +189,7 @@ def format_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str
         grid.add_column(Text(title), justify="left" if k == 0 else "right", no_wrap=True)
     for row in rows:
         grid.add_row(*map(Text, row))
-    console = Console(file=StringIO(), color_system=None, width=_WIDEST)
+    console = Console(file=StringIO(), color_system=None, width=_WIDEST_TABLE)
     console.print(grid)
     return [f"  {line.rstrip()}" for line in console.file.getvalue().splitlines()]  # type: ignore[attr-defined]
 

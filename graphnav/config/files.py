@@ -96,7 +96,7 @@ def format_settings(settings: Settings) -> str:
             if isinstance(value, BaseModel):
                 nested[name] = value
                 continue
-            setting = f"# {name} =" if value is None else f"{name} = {format_toml(value)}"
+            setting = f"# {name} =" if value is None else f"{name} = {format_toml_value(value)}"
             lines.append(f"{setting:<30} # {field.description}")
         for name, inner in nested.items():
             place = f"{at}.{name}" if at else name
@@ -108,8 +108,8 @@ def format_settings(settings: Settings) -> str:
     return "\n".join(lines) + "\n"
 
 
-def format_toml(value: Any) -> str:
+def format_toml_value(value: Any) -> str:
     """The TOML text of a value; JSON's numbers, strings and lists are valid TOML."""
     if isinstance(value, Mapping):
-        return "{ " + ", ".join(f"{key} = {format_toml(one)}" for key, one in value.items()) + " }"
+        return "{ " + ", ".join(f"{key} = {format_toml_value(one)}" for key, one in value.items()) + " }"
     return json.dumps(value)

@@ -227,7 +227,7 @@ class Constraint(ABC):
                 delta[:, at] = step
                 return self.residual(states.plus(delta), parameters, rows)
 
-            jacobians[block] = _differentiate(move_block, np.full(3, _STEPS[block]))
+            jacobians[block] = _differentiate(move_block, np.full(3, _DIFFERENCE_STEPS[block]))
         for p in self.parameters:
 
             def move_parameter(step: Array, name: str = p.name) -> Array:
@@ -249,7 +249,7 @@ class Constraint(ABC):
 
 
 # rad, m, m/s, m/s^2, rad/s: balance truncation error against rounding error of central differences
-_STEPS = {"theta": 1e-5, "p": 1e-1, "v": 1e-2, "ba": 1e-3, "bg": 1e-5}
+_DIFFERENCE_STEPS = {"theta": 1e-5, "p": 1e-1, "v": 1e-2, "ba": 1e-3, "bg": 1e-5}
 
 
 def _differentiate(f: Callable[[Array], Array], steps: Array) -> Array:

@@ -41,7 +41,7 @@ from graphnav.core.state import SECONDS, Parameter, States
 from graphnav.gnss.atmosphere import obliquity
 from graphnav.gnss.series import RawGnss
 from graphnav.gnss.sigmas import compute_code_sigma, compute_rate_sigma
-from graphnav.gnss.signals import L1, NAMES, C, name_satellite, name_signal
+from graphnav.gnss.signals import L1, SYSTEM_NAMES, C, name_satellite, name_signal
 from graphnav.gnss.single_point import group_signals
 from graphnav.recording import Recording
 
@@ -254,7 +254,7 @@ class GnssCode(RangeConstraint):
             )
             for error, time, lasts in zip(CODE_ERRORS, TIMES, (SECONDS, minutes), strict=False)
         )  # fmt: skip
-        words = [f"{NAMES[system]} {name_signal(signal)}" for system, signal in groups]
+        words = [f"{SYSTEM_NAMES[system]} {name_signal(signal)}" for system, signal in groups]
         note = f"gnss_code: {words[0]}"
         note += f", with a bias each of {', '.join(words[1:])}" if words[1:] else ""
         return cls(

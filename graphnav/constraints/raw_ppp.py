@@ -46,7 +46,7 @@ from graphnav.recording import Recording
 
 WET = "gnss_wet_delay"
 ORBITS = "gnss_satellite_orbits"
-LASTING = "gnss_carrier_errors"
+CARRIER_SLOW = "gnss_carrier_errors"
 _WET, _WET_WALK = 0.1, 1.7e-4  # m, of a standard atmosphere's; m/sqrt(s): 1 cm in an hour (Kouba and Heroux 2001)
 _CODE_BIAS = 1.0  # m: a code's differential bias, half a nanosecond or two, in the combination
 _BIAS_WALK = 1e-5  # m/sqrt(s), a millimetre in three hours
@@ -216,7 +216,7 @@ class GnssPppCarrier(_Ppp):
         )
         common["parameters"] += (
             Parameter(
-                LASTING, np.zeros(size), np.ones(size), "1", correlation_time=REFLECTED, spacing=free.found.spacing
+                CARRIER_SLOW, np.zeros(size), np.ones(size), "1", correlation_time=REFLECTED, spacing=free.found.spacing
             ),
         )
         noise = raw.clock_noise
@@ -241,9 +241,9 @@ class GnssPppCarrier(_Ppp):
         residual, J = self._linearize_free_ranges(states, parameters, rows)
         own, J[ORBITS] = select_columns(parameters[ORBITS], self.which[rows])
         residual, slot = residual + own, self.slot[rows]
-        own, J[LASTING] = select_columns(parameters[LASTING], self.which[rows])
+        own, J[CARRIER_SLOW] = select_columns(parameters[CARRIER_SLOW], self.which[rows])
         lasting = self.lasting[rows]
-        residual, J[LASTING] = residual + lasting * own, lasting[:, None, None] * J[LASTING]
+        residual, J[CARRIER_SLOW] = residual + lasting * own, lasting[:, None, None] * J[CARRIER_SLOW]
         for k, name in enumerate(self.slots):
             one = (slot == k).astype(float)
             residual = residual + one * parameters[name][:, 0]

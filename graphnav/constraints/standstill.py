@@ -38,10 +38,10 @@ PLACE = "stop_position"
 _NEIGHBOURS = 5  # intervals over which residual motion is measured
 _SWAY_RATE = 2.0 * np.pi  # rad/s, the slowest sway of a body on springs
 _STILL_V, _STILL_P = 1e-3, 1e-3  # m/s, m: lower limits for any body
-_FASTEST = 60.0  # m/s; times the seconds without a fix: bound on the distance of a stop from the last one
-_ROLLING = 0.1  # rad/s; a foot that rolls over its stance turns faster
+_FASTEST_VEHICLE = 60.0  # m/s; times the seconds without a fix: bound on the distance of a stop from the last one
+_ROLLING_RATE = 0.1  # rad/s; a foot that rolls over its stance turns faster
 _LIFTING = 0.15  # s at either end of standing, in which the heel may have begun to lift
-_STANDING = 0.6  # s; no stance of a walk is that quiet for so long
+_STANDING_SPAN = 0.6  # s; no stance of a walk is that quiet for so long
 _I3 = np.eye(3)
 
 
@@ -66,10 +66,10 @@ def _find_standing(scene: BuildContext, rows: Array, stop: Array) -> tuple[Array
     typical = np.empty((len(rows), 3))
     for one in np.unique(stop):
         typical[stop == one] = np.median(rate[stop == one], axis=0)
-    still = np.linalg.norm(rate - typical, axis=1) < _ROLLING
+    still = np.linalg.norm(rate - typical, axis=1) < _ROLLING_RATE
     run = np.cumsum(np.r_[True, (np.diff(stop) != 0) | (np.diff(still) != 0)][: len(rows)]) - 1
     lasts = np.bincount(run, weights=iv.T[rows])
-    keep = still & (lasts[run] >= _STANDING)
+    keep = still & (lasts[run] >= _STANDING_SPAN)
     begins, ends = np.full(len(lasts), np.inf), np.full(len(lasts), -np.inf)
     np.minimum.at(begins, run, iv.t0[rows])
     np.maximum.at(ends, run, iv.t1[rows])
@@ -232,5 +232,5 @@ def _guess_places(scene: BuildContext, stops: Array) -> Parameter:
         place = np.stack([np.interp(begins, gnss.t, axis) for axis in p.T], -1)
         after = np.clip(np.searchsorted(gnss.t, begins), 1, len(gnss.t) - 1)
         away = np.minimum(np.abs(gnss.t[after] - begins), np.abs(begins - gnss.t[after - 1]))
-    sigma = np.repeat((100.0 + _FASTEST * away)[:, None], 3, axis=1)
+    sigma = np.repeat((100.0 + _FASTEST_VEHICLE * away)[:, None], 3, axis=1)
     return Parameter(PLACE, place, sigma, "m", begins=begins)

@@ -48,9 +48,9 @@ BODY = "slip_squat"
 ODOMETER_SCALE = "odometer_scale"
 ODOMETER_DELAY = "odometer_delay"
 NHC_ERROR, ODOMETER_ERROR = "nhc_error", "odometer_error"
-REACH = 4.0  # sigmas of the delay that the rows cover
+DELAY_SIGMAS = 4.0  # sigmas of the delay that the rows cover
 _SHORTEST_MEAN = 0.02  # s; the mean over a shorter interval carries no information
-_LINEAR = 3.0  # m/s^2, lateral force up to which tyres behave linearly
+_LINEAR_TYRES = 3.0  # m/s^2, lateral force up to which tyres behave linearly
 _BEYOND = 0.1  # m/s of sideways speed per m/s^2 beyond that
 _AXLE_LEFT = 0.2  # m, uncertainty of the axle's place in a turn: front wheels steer, tyres have width
 _HALF_WHEELBASE = 1.3  # m
@@ -256,7 +256,7 @@ class NonHolonomic(Wheels):
                 Parameter(BODY, np.zeros(2), np.full(2, s.body_sigma), "rad s^2/m, of lateral and forward acceleration")
             )
         density = np.asarray(s.nhc_density) / np.sqrt(scene.intervals.T[rows])[:, None]
-        beyond = np.maximum(np.abs(past.force[:, 0]) - _LINEAR, 0.0)
+        beyond = np.maximum(np.abs(past.force[:, 0]) - _LINEAR_TYRES, 0.0)
         right = np.hypot(_BEYOND * beyond, _AXLE_LEFT * past.rate[:, 2])
         up = _HALF_WHEELBASE * past.rate[:, 0]
         return cls(
@@ -326,7 +326,7 @@ class OdometerSpeed(Wheels):
         speed = scene.speed or _average_speed(odometer, scene.recording.imu)
         rows, past = scene.share(find_moving_rows), scene.share(build_interval_motion)
         begin, end = scene.intervals.t0[rows], scene.intervals.t1[rows]
-        reach = REACH * odometer.delay_sigma
+        reach = DELAY_SIGMAS * odometer.delay_sigma
         good = np.all([np.isfinite(speed(begin, end, d)[0]) for d in {-reach, 0.0, reach}], axis=0)
         if not good.all():
             rows, begin, end = rows[good], begin[good], end[good]

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from importlib.util import find_spec
 from typing import Any, TypeVar, cast
 
-F = TypeVar("F", bound=Callable[..., Any])
+Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 def can_compile() -> bool:
@@ -20,7 +20,7 @@ def can_compile() -> bool:
     return os.environ.get("GRAPHNAV_COMPILE") != "0" and find_spec("numba") is not None
 
 
-def compile_once(function: F) -> F:
+def compile_once(function: Function) -> Function:
     """The function, compiled when it is called first.
 
     Those that call each other stand in one module: what is kept on disk is as old as the module it is of.
@@ -30,6 +30,6 @@ def compile_once(function: F) -> F:
     import numba
 
     try:
-        return cast(F, numba.njit(function, cache=True, nogil=True))
+        return cast(Function, numba.njit(function, cache=True, nogil=True))
     except RuntimeError:  # there is no folder to keep it in
-        return cast(F, numba.njit(function, nogil=True))
+        return cast(Function, numba.njit(function, nogil=True))

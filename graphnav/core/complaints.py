@@ -16,11 +16,11 @@ from graphnav.core.notes import Note
 if TYPE_CHECKING:
     from pydantic import BaseModel, ValidationError  # a tenth of a second, which help need not wait for
 
-_TABLE = re.compile(r"\[([^\[\]]+)\]")
+_TABLE_HEAD = re.compile(r"\[([^\[\]]+)\]")
 _MAX_NAMES = 30  # names listed in one sentence at most
 _MAX_QUOTED = 60  # characters of a value quoted in a sentence at most
-_PLACE = re.compile(r" \(at line (\d+), column (\d+)\)$")  # of tomllib's errors
-_WORD = re.compile(rf"\S{{{2 * _MAX_QUOTED},}}")  # a quoted value, as no sentence of graphnav has a word of this length
+_TOML_PLACE = re.compile(r" \(at line (\d+), column (\d+)\)$")  # of tomllib's errors
+_LONG = re.compile(rf"\S{{{2 * _MAX_QUOTED},}}")  # a quoted value, as no sentence of graphnav has a word of this length
 _DEEPEST = 50  # levels of nested tables at most; graphnav's own files have four
 _KEY = re.compile(r"([\w\-.\"']+)\s*=")
 
@@ -51,7 +51,7 @@ def read_toml(path: Path, error: type[GraphnavError]) -> tuple[dict[str, Any], s
         raise error(f"{path}: not valid TOML (nested too deep)", key="toml.syntax") from None
     except ValueError as cause:  # tomllib's own error is one; so is that for an integer of thousands of digits
         where, what = f"{path}", str(cause)
-        if place := _PLACE.search(what):
+        if place := _TOML_PLACE.search(what):
             where, what = f"{path}, line {place[1]}, column {place[2]}", what[: place.start()]
         raise error(f"{where}: not valid TOML: {what[:1].lower()}{what[1:]}", key="toml.syntax") from None
 
@@ -93,7 +93,7 @@ def describe_invalid(source: str | Path, error: ValidationError, model: type[Bas
     line = _find_line(text, loc)
     where = f"{source}, line {line}: " if line else f"{source}: "
     described = _describe(first, loc, model)
-    return Note(described.key, where + _WORD.sub(lambda word: f"{word[0][:_MAX_QUOTED]}...", described))
+    return Note(described.key, where + _LONG.sub(lambda word: f"{word[0][:_MAX_QUOTED]}...", described))
 
 
 def _describe(first: Any, loc: tuple[str, ...], model: type[BaseModel]) -> Note:
@@ -202,7 +202,7 @@ def _find_line(text: str, loc: tuple[str, ...]) -> int | None:
     found, depth = None, 0
     for number, line in enumerate(text.splitlines(), 1):
         at: tuple[str, ...] = ()
-        if opening := _TABLE.match(line.strip()):
+        if opening := _TABLE_HEAD.match(line.strip()):
             at = table = tuple(part.strip(" \"'") for part in opening[1].split("."))
         elif key := _KEY.match(line.strip()):
             at = (*table, *(part.strip("\"'") for part in key[1].split(".")))

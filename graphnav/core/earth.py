@@ -17,15 +17,15 @@ from graphnav.core import rotation
 from graphnav.core.rotation import Array, stack_columns
 
 A = 6378137.0  # semi-major axis, m
-F = 1.0 / 298.257223563  # flattening
-B = A * (1.0 - F)  # semi-minor axis, m
-E2 = F * (2.0 - F)  # first eccentricity squared
+FLATTENING = 1.0 / 298.257223563  # flattening
+B = A * (1.0 - FLATTENING)  # semi-minor axis, m
+E2 = FLATTENING * (2.0 - FLATTENING)  # first eccentricity squared
 _EP2 = E2 / (1.0 - E2)  # second eccentricity squared
 GM = 3.986004418e14  # m^3/s^2
 STANDARD_GRAVITY, MG = 9.80665, 9.80665e-3  # m/s^2, by definition; of a thousandth of it
-RATE = 7.292115e-5  # rad/s
+EARTH_RATE = 7.292115e-5  # rad/s
 _GAMMA_E, _K_SOMIGLIANA = 9.7803253359, 0.00193185265241
-_M = RATE**2 * A**2 * B / GM
+_M = EARTH_RATE**2 * A**2 * B / GM
 
 
 def llh_to_ecef(llh: Array) -> Array:
@@ -81,7 +81,7 @@ def gravity(lat: Array, h: Array) -> Array:
 
 def _compute_gravity(s2: Array, h: Array) -> Array:
     surface = _GAMMA_E * (1.0 + _K_SOMIGLIANA * s2) / np.sqrt(1.0 - E2 * s2)
-    return surface * (1.0 - 2.0 / A * (1.0 + F + _M - 2.0 * F * s2) * h + 3.0 * (h / A) ** 2)
+    return surface * (1.0 - 2.0 / A * (1.0 + FLATTENING + _M - 2.0 * FLATTENING * s2) * h + 3.0 * (h / A) ** 2)
 
 
 def _compute_gravity_one(x: float, y: float, z: float) -> tuple[float, float, float]:
@@ -96,7 +96,7 @@ def _compute_gravity_one(x: float, y: float, z: float) -> tuple[float, float, fl
     root = math.sqrt(1.0 - E2 * s2)
     h = p * c + z * s - A * root
     g = -_GAMMA_E * (1.0 + _K_SOMIGLIANA * s2) / root
-    g *= 1.0 - 2.0 / A * (1.0 + F + _M - 2.0 * F * s2) * h + 3.0 * (h / A) ** 2
+    g *= 1.0 - 2.0 / A * (1.0 + FLATTENING + _M - 2.0 * FLATTENING * s2) * h + 3.0 * (h / A) ** 2
     return g * c / p * x, g * c / p * y, g * s
 
 
@@ -119,7 +119,7 @@ class LocalFrame:
     @cached_property
     def omega_n(self) -> Array:
         """Earth's rotation rate in n, rad/s."""
-        return self.R_ne @ np.array([0.0, 0.0, RATE])
+        return self.R_ne @ np.array([0.0, 0.0, EARTH_RATE])
 
     @cached_property
     def W(self) -> Array:

@@ -10,12 +10,12 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from graphnav.core.rotation import Array
 
-_MANY = 4_000_000  # numbers in all windows, for which SciPy is worth its import
+_MANY_NUMBERS = 4_000_000  # numbers in all windows, for which SciPy is worth its import
 
 
 def run_median(x: Array, size: int) -> Array:
     """Of rows x (K,) or (K, n); of an even `size` the upper of the two in the middle."""
-    if x.size * size > _MANY:
+    if x.size * size > _MANY_NUMBERS:
         from scipy.ndimage import median_filter
 
         return np.asarray(median_filter(x, size=(size, *(1,) * (x.ndim - 1)), mode="nearest"))

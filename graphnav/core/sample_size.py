@@ -7,7 +7,7 @@ from scipy.special import gammaincinv  # importing scipy.stats would take a seco
 
 from graphnav.core.rotation import Array
 
-_NONE = 0.05  # autocorrelation below which it is indistinguishable from zero
+_NEGLIGIBLE_CORRELATION = 0.05  # autocorrelation below which it is indistinguishable from zero
 
 
 def compute_effective_size(z: Array) -> float:
@@ -19,7 +19,7 @@ def compute_effective_size(z: Array) -> float:
         power, length = float(np.mean(x * x)), 1.0
         for lag in range(1, len(x) // 4):
             r = float(np.mean(x[lag:] * x[:-lag])) / power
-            if r < _NONE:
+            if r < _NEGLIGIBLE_CORRELATION:
                 break
             length += 2.0 * r
         total += len(x) / length

@@ -20,7 +20,7 @@ from graphnav.core.errors import ConfigError
 from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.detectors.base import NONE, Detection, Detections, drop_short, mask_inside, subtract_spans
-from graphnav.detectors.fusion import StopDecision, decide, decide_fused, merge_decisions
+from graphnav.detectors.fusion import StopDecision, check_intervals, decide_fused, merge_decisions
 from graphnav.detectors.glrt import STATISTICS, compute_glrt
 from graphnav.detectors.scene import Detector, Scene
 from graphnav.detectors.stance import detect_stances
@@ -103,8 +103,8 @@ def _decide(scene: Scene, shown: bool = True) -> StopDecision:
     if scene.settings.fire == (FUSED,):
         found = [decide_fused(scene, list_detectors(), shown)]
     else:
-        found = [decide(scene, list_detectors()[name], shown) for name in scene.settings.fire]
-    found += [decide(scene, kind, shown) for kind in scene.recording.own.detectors]
+        found = [check_intervals(scene, list_detectors()[name], shown) for name in scene.settings.fire]
+    found += [check_intervals(scene, kind, shown) for kind in scene.recording.own.detectors]
     return found[0] if len(found) == 1 else merge_decisions(found)
 
 

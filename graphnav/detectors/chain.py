@@ -20,16 +20,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphnav.core.rotation import Array
-from graphnav.detectors.windows import Blocks
+from graphnav.detectors.windows import BlockMeans
 
 _INNER = 1.5  # s of a span from which its mean force and rate are taken
-LONGEST = 60.0  # s between spans over which a difference of speed is still informative
+LONGEST_LINK = 60.0  # s between spans over which a difference of speed is still informative
 _LEAST_SIGMA = 0.02  # m/s, smallest 1-sigma of any such difference
 _SIGMAS = 3.0
 _G = 9.81  # m/s^2
 _TURN_ON = 1.0e-4  # rad/s, by which a gyro's bias may differ from its mean over the spans
-_CROSS = 0.01  # share of the yaw that gyro scale factors and axis misalignments turn into tilt
-_STRAIGHT = 0.3  # rad of yaw; beyond, accelerometer biases seen at first act along other axes
+_CROSS_AXIS = 0.01  # share of the yaw that gyro scale factors and axis misalignments turn into tilt
+_STRAIGHT_YAW = 0.3  # rad of yaw; beyond, accelerometer biases seen at first act along other axes
 _MISALIGNED = 0.1  # rad, misalignment of the body's axes with the vehicle's
 
 
@@ -46,18 +46,18 @@ class Link:
 _UNKNOWN_LINK = Link(0.0, float("inf"), float("inf"), float("inf"))
 
 
-def link(b: Blocks, before: Array, after: Array) -> Link:
+def link(b: BlockMeans, before: Array, after: Array) -> Link:
     """Change of speed between two spans, each (2,) s; unknown across a turn or a gap."""
     T = float(after[0] - before[1])
     i = int(np.searchsorted(b.t, max(before[0], before[1] - _INNER)))
     j = int(np.searchsorted(b.t, min(after[1], after[0] + _INNER)))
     n0, n1 = (int(k) - i for k in np.searchsorted(b.t, [before[1], after[0]]))
-    if T > LONGEST or n0 < 3 or j - i - n1 < 3 or not b.whole[i + 1 : j].all():
+    if T > LONGEST_LINK or n0 < 3 or j - i - n1 < 3 or not b.whole[i + 1 : j].all():
         return _UNKNOWN_LINK
     rate = b.rate[i:j]
     bias = 0.5 * (rate[:n0].mean(axis=0) + rate[n1:].mean(axis=0))
     left, yaw = _level_force(b.force[i:j], rate - bias, n0, b.period)
-    if np.abs(yaw).max() > _STRAIGHT:
+    if np.abs(yaw).max() > _STRAIGHT_YAW:
         return _UNKNOWN_LINK
     if n1 <= n0:
         return Link(0.0, _SIGMAS * _LEAST_SIGMA, 0.0, 0.0)
@@ -66,7 +66,7 @@ def link(b: Blocks, before: Array, after: Array) -> Link:
     v = left.sum() * b.period
     doubt = (
         0.5 * _G * _TURN_ON * T**2,
-        _G * _CROSS * float(np.abs(yaw[n0:n1]).sum()) * b.period,
+        _G * _CROSS_AXIS * float(np.abs(yaw[n0:n1]).sum()) * b.period,
         _MISALIGNED * float(np.abs(left.real).sum()) * b.period,
     )
     # what remains at the other end is due to biases and to tilt that the gyro did not measure
@@ -93,7 +93,7 @@ class Outwards:
         return there if there.any() and self.way * (self.t[-1] - outer) >= 0.0 else None
 
 
-def find_speed_beside(b: Blocks, span: Array, way: int) -> Outwards | None:
+def find_speed_beside(b: BlockMeans, span: Array, way: int) -> Outwards | None:
     """Speeds next to a span (2,) s, if it is a stop, up to a gap or a turn; None where there are too few rows.
 
     Rate and force at rest are their means over the span, with the uncertainty given by their scatter in it.
@@ -103,7 +103,7 @@ def find_speed_beside(b: Blocks, span: Array, way: int) -> Outwards | None:
     way : 1 goes on from its end, -1 back from its start.
     """
     end, other = (float(x) for x in (span[::-1] if way > 0 else span))
-    i, k, j = np.searchsorted(b.t, sorted((other, end, end + way * LONGEST)))
+    i, k, j = np.searchsorted(b.t, sorted((other, end, end + way * LONGEST_LINK)))
     torn = np.flatnonzero(~b.whole[i + 1 : j]) + i + 1
     outside = torn[torn >= k] if way > 0 else torn[torn <= k]
     if len(outside):
@@ -113,7 +113,7 @@ def find_speed_beside(b: Blocks, span: Array, way: int) -> Outwards | None:
         return None
     force, rate, t = b.force[i:j][::way], b.rate[i:j][::way], b.t[i:j][::way]
     left, yaw = _level_force(force, way * (rate - rate[:n0].mean(axis=0)), n0, b.period)
-    n = int(np.argmax(np.append(np.abs(yaw[n0:]) > _STRAIGHT, True)))
+    n = int(np.argmax(np.append(np.abs(yaw[n0:]) > _STRAIGHT_YAW, True)))
     left, yaw, T = left[n0 : n0 + n], np.abs(yaw[n0 : n0 + n]), b.period * np.arange(1, n + 1)
     # densities of white noise by the scatter in the span, and the variance they leave in its means
     of_force, of_rate = (float(np.sqrt(x[:n0].var(axis=0).max() * b.period)) for x in (force, rate))
@@ -123,14 +123,14 @@ def find_speed_beside(b: Blocks, span: Array, way: int) -> Outwards | None:
         0.5 * _G * T**2 * np.hypot(_TURN_ON, of_rate * np.sqrt(known)),
         _G * of_rate * np.sqrt(T**3 / 3.0),
         of_force * np.sqrt(T + T**2 * known),
-        _G * _CROSS * np.cumsum(yaw) * b.period,
+        _G * _CROSS_AXIS * np.cumsum(yaw) * b.period,
         _MISALIGNED * np.cumsum(np.abs(left.real)) * b.period,
     )
     speed, tolerance = np.abs(np.cumsum(left)) * b.period, _SIGMAS * np.sqrt(np.sum(np.square(doubt), axis=0))
     return Outwards(way, t[n0 : n0 + n], speed, tolerance)
 
 
-def find_end_of_rest(b: Blocks, span: Array, way: int, most: float, limit: float) -> float:
+def find_end_of_rest(b: BlockMeans, span: Array, way: int, most: float, limit: float) -> float:
     """Time up to which the force, integrated outwards from one end of a stop, stays below a speed.
 
     Parameters

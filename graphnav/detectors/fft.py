@@ -33,16 +33,16 @@ from graphnav.detectors.thresholds import find_valley, log_statistic
 
 LINE_OF_THE_PAPER = 12.495  # Hz, the idle line that the paper's bands belong to
 _MET = 0.7  # share of stationary windows that must meet a ratio for it to be required
-_STRETCH = 0.05  # relative excess of a window's duration at which its frequencies are wrong
+_LONGEST_WINDOW = 0.05  # relative excess of a window's duration at which its frequencies are wrong
 _STRAY = 0.05  # relative deviation of an idle line from those observed
-_COLUMNS = 600  # columns of the spectrogram that is kept for the figure
+_SPECTROGRAM_COLUMNS = 600  # columns of the spectrogram that is kept for the figure
 _SPECTROGRAM_END = 60.0  # Hz, upper end of that spectrogram
 _LOWEST_RATE = 49.0  # Hz, lowest sampling rate at which the detector works
 CONDITIONS = (
     "forward limit", "up limit", "pitch limit",
     "forward Peak-1", "forward Peak-2", "up Peak-1", "up Peak-2", "pitch Peak-1",
 )  # fmt: skip
-_ALWAYS = ("forward limit", "up limit")  # always required: windows that exceed them are shaken as while driving
+_REQUIRED = ("forward limit", "up limit")  # always required: windows that exceed them are shaken as while driving
 
 
 class IdleFft(Detector):
@@ -76,7 +76,7 @@ def _detect(scene: Scene, labels: Labels | None, shown: bool) -> Detection:
             NONE,
             (Note("detectors.fft.not_possible", f"no FFT detection: {reason}"),),
         )
-    whole = t_last - t_first < (1.0 + _STRETCH) * length * period
+    whole = t_last - t_first < (1.0 + _LONGEST_WINDOW) * length * period
     half = 0.5 * length * period
     quiet = _weigh_idling(w, settings) if labels is None and settings.find_line else np.zeros(w.count)
     inner = whole & (
@@ -100,7 +100,7 @@ def _detect(scene: Scene, labels: Labels | None, shown: bool) -> Detection:
         idling = inner & _detect_line(height, where, line)
         met = np.asarray((quotient[idling] < 1.0).mean(axis=0) >= _MET) if idling.any() else asked
         if labels is None:
-            met = met | np.isin(CONDITIONS, _ALWAYS)
+            met = met | np.isin(CONDITIONS, _REQUIRED)
         left_out = [name for name, ok, seen in zip(CONDITIONS, met, asked, strict=True) if seen and not ok]
         asked = asked & met
         quotient = np.column_stack([quotient, _measure_off_line(where, asked, line)])
@@ -184,7 +184,7 @@ def _measure(w: Windows, bands: Sequence[tuple[float, float]]) -> tuple[Array, A
     height, where = np.full((w.count, 3, 3), np.nan), np.full((w.count, 3, 3), np.nan)
     f = w.frequencies
     shown = int(np.searchsorted(f, _SPECTROGRAM_END))
-    keep = np.unique(np.linspace(0, w.count - 1, _COLUMNS).astype(int))
+    keep = np.unique(np.linspace(0, w.count - 1, _SPECTROGRAM_COLUMNS).astype(int))
     rows = []
     for part, a in w.compute_amplitudes():
         for k, (low, high) in enumerate(bands):

@@ -33,7 +33,7 @@ from graphnav.detectors.base import (
     unite,
 )
 from graphnav.detectors.chain import (
-    LONGEST,
+    LONGEST_LINK,
     Link,
     Outwards,
     find_end_of_rest,
@@ -44,12 +44,12 @@ from graphnav.detectors.chain import (
 from graphnav.detectors.low_band import Scale, compute_low_band
 from graphnav.detectors.motion import Speeds, take_median
 from graphnav.detectors.scene import Detector, Labels, Scene
-from graphnav.detectors.windows import Blocks, make_kernel, share_of, smooth_rows
+from graphnav.detectors.windows import BlockMeans, filter_rows, make_kernel, share_of
 
 LOW_BAND, FFT = "low_band_glrt", "fft"
-_EDGE_SEARCH = 3.0  # s about an end in which the edge is sought
+_EDGE_REGION = 3.0  # s about an end in which the edge is sought
 _INNER = 1.5  # s inside a candidate that define its mean force and rate
-_EDGE = 3.0  # the statistic S of a single row at an edge
+_EDGE_STATISTIC = 3.0  # the statistic S of a single row at an edge
 _WORTH = 1.0  # s, the least by which the FFT detector may extend a span
 _FURTHEST = 10.0  # s, the most
 _AWAY = 0.3  # ratio of mean to largest speed of a disturbance above which it moves the vehicle away
@@ -57,10 +57,10 @@ _BLIND = 0.2  # share of moving windows that look stationary above which stillne
 _AROUND = 60.0  # s about a span in which an odometer must have moved for its zero to count
 _ENOUGH_MOTION = 20.0  # s of certain motion needed to estimate that share
 _CLEAR_MOTION = 10.0  # multiple of the low-band GLRT's threshold at which the vehicle clearly moves
-_REACH = 0.3  # s, of the low-pass filter: closer to the recording's ends no edge can be found
+_FILTER_REACH = 0.3  # s, of the low-pass filter: closer to the recording's ends no edge can be found
 
 
-def trim_edges(b: Blocks, spans: Array, s: Scale, threshold: float) -> Array:
+def trim_edges(b: BlockMeans, spans: Array, s: Scale, threshold: float) -> Array:
     """The spans with ends where the low-passed rows depart from their mean just inside."""
     h = make_kernel(b.period)
     out = []
@@ -74,15 +74,15 @@ def trim_edges(b: Blocks, spans: Array, s: Scale, threshold: float) -> Array:
     return np.array(out) if out else NONE
 
 
-def _leave(b: Blocks, h: Array, white: Array, middle: float, end: float, way: int, threshold: float) -> float:
+def _leave(b: BlockMeans, h: Array, white: Array, middle: float, end: float, way: int, threshold: float) -> float:
     """Last time, from the middle towards one end, at which a row still agrees with those before it."""
     inner = min(_INNER, abs(end - middle))
-    lo, hi = sorted((end + way * _EDGE_SEARCH, end - way * (inner + 1.0)))
+    lo, hi = sorted((end + way * _EDGE_REGION, end - way * (inner + 1.0)))
     i, j = np.searchsorted(b.t, [lo, hi])
     i, j = max(i - len(h), 0), min(j + len(h), len(b.t))
     if j - i <= len(h) + 2:
         return middle
-    rows = smooth_rows(b.mean[i:j, :6], h) * white
+    rows = filter_rows(b.mean[i:j, :6], h) * white
     t = 0.5 * (b.t[i : j - len(h) + 1] + b.t[i + len(h) - 1 : j])
     rows, t = (rows, t) if way > 0 else (rows[::-1], t[::-1])
     normal = way * (t - end) < -0.5
@@ -102,14 +102,14 @@ def _leave(b: Blocks, h: Array, white: Array, middle: float, end: float, way: in
     return float(t[max(stop - 1, begin)])
 
 
-def _cut_at_speed(b: Blocks, spans: Array, settings: FusionSettings) -> Array:
-    """The spans cut where the force, integrated from `_EDGE_SEARCH` s inside, leads to a speed: braking that looked
+def _cut_at_speed(b: BlockMeans, spans: Array, settings: FusionSettings) -> Array:
+    """The spans cut where the force, integrated from `_EDGE_REGION` s inside, leads to a speed: braking that looked
     stationary.
     """
     limit = 0.5 * settings.bridge_speed
     out = spans.copy()
     for k, (start, end) in enumerate(spans):
-        inside = min(_EDGE_SEARCH, 0.5 * (end - start - _INNER))
+        inside = min(_EDGE_REGION, 0.5 * (end - start - _INNER))
         if inside <= 0.0:
             continue
         first, last = (
@@ -125,7 +125,7 @@ def find_candidates(scene: Scene, found: Detection) -> tuple[Array, Array, tuple
     b, speeds, certain = scene.blocks, scene.known, scene.certain
     by_rows = found.name == LOW_BAND  # its windows are of the rows in which edges are sought
     # a threshold raised by the data applies to windows; an edge is where the noise and sway of single rows end
-    limit = min(float(np.max(found.threshold)), _EDGE) if by_rows else _EDGE
+    limit = min(float(np.max(found.threshold)), _EDGE_STATISTIC) if by_rows else _EDGE_STATISTIC
     spans = trim_edges(b, found.intervals, scene.share(compute_low_band)[1], limit)
     if not by_rows:
         spans = _cut_at_speed(b, spans, scene.settings.fusion)
@@ -171,7 +171,7 @@ def find_candidates(scene: Scene, found: Detection) -> tuple[Array, Array, tuple
     return spans, certain, tuple(notes)
 
 
-def _screen_motion(b: Blocks, spans: Array, speeds: list[Speeds], certain: Array) -> Array:
+def _screen_motion(b: BlockMeans, spans: Array, speeds: list[Speeds], certain: Array) -> Array:
     """Spans of certain motion, without those inside a stationary-looking span whose speed the force does not explain.
 
     Nothing changes at their ends, so the fixes or the odometer are wrong there.
@@ -192,7 +192,7 @@ def _share_still_in_motion(found: Detection, certain: Array) -> float:
     return float(found.mask[moving].mean()) if moving.sum() * step > _ENOUGH_MOTION else 0.0
 
 
-def _contradicts_speed(b: Blocks, span: Array, speeds: list[Speeds], settings: FusionSettings) -> bool:
+def _contradicts_speed(b: BlockMeans, span: Array, speeds: list[Speeds], settings: FusionSettings) -> bool:
     """Whether the speeds last measured before a span, or first after it, contradict a stop there.
 
     Single epochs do not count, as elsewhere, and every speed may be as late as an odometer's.
@@ -203,7 +203,7 @@ def _contradicts_speed(b: Blocks, span: Array, speeds: list[Speeds], settings: F
             edge = span[0] if way < 0 else span[1]
             at = np.flatnonzero(way * (s.t - edge) > s.half)
             at = at[np.argsort(np.abs(s.t[at] - edge), kind="stable")[:3]]
-            if len(at) < 3 or np.abs(s.t[at] - edge).max() > LONGEST:
+            if len(at) < 3 or np.abs(s.t[at] - edge).max() > LONGEST_LINK:
                 continue
             beside = beside or find_speed_beside(b, span, way)
             if beside is None:
@@ -242,7 +242,7 @@ def _find_speed(speeds: list[Speeds], span: Array) -> float:
     return float(np.nanmax(found)) if not np.isnan(found).all() else float("nan")
 
 
-def bridge_disturbances(b: Blocks, spans: Array, certain: Array, settings: FusionSettings) -> Array:
+def bridge_disturbances(b: BlockMeans, spans: Array, certain: Array, settings: FusionSettings) -> Array:
     """The spans, joined across disturbances in which the vehicle did not move."""
     out = list(spans[:1])
     for span in spans[1:]:
@@ -263,7 +263,7 @@ def _is_only_shaken(one: Link, settings: FusionSettings) -> bool:
     return one.peak < settings.bridge_speed and not away and abs(one.change) < one.tolerance
 
 
-def join_idling(b: Blocks, spans: Array, idling: Array, settings: FusionSettings) -> Array:
+def join_idling(b: BlockMeans, spans: Array, idling: Array, settings: FusionSettings) -> Array:
     """The spans extended by what the FFT detector calls stationary at their ends, as far as the force agrees."""
     out = spans.copy()
     limit = 0.5 * settings.bridge_speed
@@ -280,7 +280,7 @@ def join_idling(b: Blocks, spans: Array, idling: Array, settings: FusionSettings
     return merge_spans(out)
 
 
-def fuse(b: Blocks, spans: Array, idling: Array, certain: Array, settings: FusionSettings) -> tuple[Array, Array]:
+def fuse(b: BlockMeans, spans: Array, idling: Array, certain: Array, settings: FusionSettings) -> tuple[Array, Array]:
     """Stationary intervals from candidates and the FFT detector's answer, and the disturbances within them."""
     still = spans
     if len(spans) and len(idling):
@@ -288,11 +288,11 @@ def fuse(b: Blocks, spans: Array, idling: Array, certain: Array, settings: Fusio
     spans = bridge_disturbances(b, spans, certain, settings)
     if len(spans):
         # a recording that begins or ends in a stop has no edge there
-        first = np.where(spans[:, 0] - b.t[0] < _REACH, b.t[0], spans[:, 0] + settings.margin)
-        last = np.where(b.end[-1] - spans[:, 1] < _REACH, b.end[-1], spans[:, 1] - settings.margin)
+        first = np.where(spans[:, 0] - b.t[0] < _FILTER_REACH, b.t[0], spans[:, 0] + settings.margin)
+        last = np.where(b.end[-1] - spans[:, 1] < _FILTER_REACH, b.end[-1], spans[:, 1] - settings.margin)
         spans = np.stack([first, last], -1)
     spans = drop_short(spans, settings.min_duration)
-    return spans, drop_short(subtract_spans(spans, still), settings.margin + _REACH)
+    return spans, drop_short(subtract_spans(spans, still), settings.margin + _FILTER_REACH)
 
 
 @dataclass(frozen=True)
@@ -305,7 +305,7 @@ class StopDecision:
     found: tuple[Detection, ...]  # the answer of each detector
 
 
-def decide(scene: Scene, detector: type[Detector], shown: bool) -> StopDecision:
+def check_intervals(scene: Scene, detector: type[Detector], shown: bool) -> StopDecision:
     """The decision of a single detector: its intervals, checked against measured speeds and the force between them."""
     found = detector.detect(scene, None, shown)
     still, certain, notes = find_candidates(scene, found)

@@ -24,7 +24,7 @@ from graphnav.core.rotation import Array
 from graphnav.detectors.base import NONE, Detection, find_spans, mask_within
 from graphnav.detectors.scene import Detector, Labels, Scene
 from graphnav.detectors.thresholds import choose_threshold, find_fewest_errors
-from graphnav.detectors.windows import Blocks, compute_window_times, find_unbroken, sum_running
+from graphnav.detectors.windows import BlockMeans, compute_window_times, find_unbroken, sum_running
 
 _TINY = 1e-300
 _WINDOW_STEP = 0.1  # s between windows
@@ -33,7 +33,7 @@ _GRAVITY_ERROR = 0.05  # share of g that an accelerometer's scale and bias may b
 _AT_NOISE = {
     "glrt": 12.0, "acceleration_variance": 6.0, "acceleration_magnitude": 2.0, "angular_rate_energy": 6.0,
 }  # fmt: skip
-Statistic = Callable[[Array, float, float, float], Array]
+StatisticFunction = Callable[[Array, float, float, float], Array]
 
 
 def collect_rows(accel: Array, gyro: Array) -> Array:
@@ -67,7 +67,7 @@ def angular_rate_energy(means: Array, sigma_a: float, sigma_w: float, g: float) 
     return np.asarray(means[:, 8] / sigma_w**2)
 
 
-STATISTICS: dict[str, Statistic] = {
+STATISTICS: dict[str, StatisticFunction] = {
     "glrt": glrt,
     "acceleration_variance": acceleration_variance,
     "acceleration_magnitude": acceleration_magnitude,
@@ -103,7 +103,7 @@ class Means:
     whole: Array  # (W,) bool, False where a window crosses a gap
 
 
-def compute_window_means(b: Blocks, length: float) -> Means | None:
+def compute_window_means(b: BlockMeans, length: float) -> Means | None:
     """Means over windows of `length` s every tenth of a second; None where there is no window."""
     # the blocks between two windows are summed once for all windows
     group = max(1, min(round(_WINDOW_STEP / b.period), round(0.5 * length / b.period)))

@@ -22,7 +22,7 @@ from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.detectors.base import NONE, Detection, drop_short, find_spans, mask_within
 from graphnav.detectors.scene import Detector, Labels, Scene
-from graphnav.detectors.thresholds import FEWEST, MISLABELLED, MISTAKEN, find_valley, log_statistic
+from graphnav.detectors.thresholds import MISLABELLED, MISTAKEN, SHORTEST_POPULATION, find_valley, log_statistic
 from graphnav.detectors.windows import LowPassed, compute_window_times, find_unbroken, sum_running
 from graphnav.recording import ImuNoise
 
@@ -88,7 +88,7 @@ def scale(low: LowPassed, noise: ImuNoise, settings: LowBandSettings, spread: Ar
     return Scale(float(force), float(rate), expected, bool((stated > _OVERSTATED * np.hypot(floor, sway)).any()))
 
 
-def compute_statistic(spread: Array, s: Scale) -> Array:
+def compute_low_band_statistic(spread: Array, s: Scale) -> Array:
     """S of windows with these variances per axis, (W,)."""
     return np.asarray(0.5 * (spread[:, 0] / s.force**2 + spread[:, 1] / s.rate**2))
 
@@ -110,7 +110,7 @@ def detect_low_band(
     t = compute_window_times(low.t, window)
     spread = measure_spreads(low, window)
     s = scale(low, noise, settings, spread)
-    found = compute_statistic(spread, s)
+    found = compute_low_band_statistic(spread, s)
     threshold, notes = _find_threshold(t, found, settings, moving, low.period, s)
     mask = found < threshold
     # a window does not show where in it motion began: stationary is only what all windows over it agree on
@@ -126,7 +126,7 @@ def _find_threshold(
     x, start = log_statistic(found), float(np.log10(settings.threshold))
     swaying = 0.5 * ((settings.force / s.force) ** 2 + (settings.rate / s.rate) ** 2)
     label = mask_within(t, moving, settings.window) & np.isfinite(x)
-    split = find_valley(x, start - _DOWN, start + _UP + float(np.log10(s.stated)), round(FEWEST / period))
+    split = find_valley(x, start - _DOWN, start + _UP + float(np.log10(s.stated)), round(SHORTEST_POPULATION / period))
     if split is not None and not (label.any() and np.mean(x[label] < split) > MISLABELLED):
         return float(10.0**split), ()
     notes: tuple[str, ...] = ()

@@ -21,8 +21,8 @@ from graphnav.recording.checks.tracks import compute_local_positions
 _SIGMAS = 3.0
 _SIGMAS_APART = 6.0  # for differences of positions: their errors wander by more than receivers state
 _MEDIAN = 3  # epochs of the running median
-_LONGEST_GAP = 2.0  # s, longest gap between epochs within a span of motion
-_BASE = 4.0  # s between the positions that are differenced
+_LONGEST_EPOCH_GAP = 2.0  # s, longest gap between epochs within a span of motion
+_DIFFERENCE_SPAN = 4.0  # s between the positions that are differenced
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ def find_moving(found: list[Speeds]) -> Array:
         excess = s.speed - s.limit
         k = np.arange(len(excess))
         fast = take_median(excess[np.maximum(k - 1, 0)], excess, excess[np.minimum(k + 1, len(k) - 1)]) > 0.0
-        breaks = np.diff(s.t) > _LONGEST_GAP
+        breaks = np.diff(s.t) > _LONGEST_EPOCH_GAP
         spans = [find_spans(fast[a:b], s.t[a:b]) for a, b in _split_pieces(breaks)]
         one = unite([p for p in spans if len(p)]) if any(len(p) for p in spans) else NONE
         if len(one):
@@ -124,14 +124,14 @@ def _read_gnss(gnss: Gnss, settings: FusionSettings) -> list[Speeds]:
     there = np.isfinite(gnss.llh).all(axis=1)
     if there.sum() > _MEDIAN and not (found and len(found[0].t) > 0.5 * there.sum()):
         t, p, sd = gnss.t[there], compute_local_positions(gnss)[there, :2], gnss.sd[there, :2].max(axis=1)
-        later = np.searchsorted(t, t + _BASE)
+        later = np.searchsorted(t, t + _DIFFERENCE_SPAN)
         k = np.flatnonzero(later < len(t))
         later = later[k]
-        k, later = k[t[later] - t[k] < 2.0 * _BASE], later[t[later] - t[k] < 2.0 * _BASE]
+        k, later = k[t[later] - t[k] < 2.0 * _DIFFERENCE_SPAN], later[t[later] - t[k] < 2.0 * _DIFFERENCE_SPAN]
         if len(k):
             apart = t[later] - t[k]
             v = (p[later] - p[k]) / apart[:, None]
             limit = _SIGMAS_APART * np.hypot(sd[later], sd[k]) / apart
             middle = 0.5 * (t[later] + t[k])
-            found.append(Speeds(middle, v, np.maximum(settings.max_speed, limit), half=0.5 * _BASE))
+            found.append(Speeds(middle, v, np.maximum(settings.max_speed, limit), half=0.5 * _DIFFERENCE_SPAN))
     return found

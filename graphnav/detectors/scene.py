@@ -16,7 +16,7 @@ from graphnav.core.rotation import Array
 from graphnav.core.shared import Shared
 from graphnav.detectors.base import Detection
 from graphnav.detectors.motion import Speeds, collect_speeds, find_moving
-from graphnav.detectors.windows import Blocks, LowPassed, average_blocks, low_pass
+from graphnav.detectors.windows import BlockMeans, LowPassed, average_blocks, low_pass
 from graphnav.recording import Recording
 
 
@@ -33,7 +33,7 @@ class Scene(Shared):
         return compute_period(self.recording.imu.t)
 
     @cached_property
-    def blocks(self) -> Blocks:
+    def blocks(self) -> BlockMeans:
         """Means over blocks of rows."""
         return average_blocks(self.recording.imu, self.period)
 

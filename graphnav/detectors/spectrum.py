@@ -22,8 +22,8 @@ from graphnav.core.rotation import Array
 
 _WINDOWS_AT_ONCE = 256  # windows at a time: a few MB whatever the length of the recording
 LOWEST, _HIGHEST = 8.0, 50.0  # Hz, where idle lines are looked for
-_FLOOR = 3.0  # Hz on either side of a bin over which the background is taken
-_CLEAR = 2.0  # natural logarithm of power over background at which there is a line
+_BACKGROUND_WIDTH = 3.0  # Hz on either side of a bin over which the background is taken
+_LINE_HEIGHT = 2.0  # natural logarithm of power over background at which there is a line
 FEWEST_WINDOWS = 3
 _LOOKED_AT = 200  # windows at most
 
@@ -123,7 +123,7 @@ def find_idle_line(windows: Windows, still: Array) -> IdleLine | None:
         return None
     some = still[np.unique(np.linspace(0, len(still) - 1, _LOOKED_AT).astype(int))]
     f = windows.frequencies
-    reach = max(2, round(_FLOOR / f[1]))
+    reach = max(2, round(_BACKGROUND_WIDTH / f[1]))
     spectra = np.concatenate([a for _, a in windows.compute_amplitudes(some)])
     power = 2.0 * np.log(np.maximum(spectra, 1e-12))
     clear = np.asarray((power - _take_local_median(power, reach)).max(axis=1))  # (w, F), the clearest channel
@@ -132,7 +132,7 @@ def find_idle_line(windows: Windows, still: Array) -> IdleLine | None:
     # noise alone reaches some level; a line lies above half of the bins
     line = np.maximum(line - np.median(line), 0.0)
     inside = np.flatnonzero((f > LOWEST - f[1]) & (f <= min(_HIGHEST, f[-1] - 2.0 * f[1])))
-    peak = [int(k) for k in inside if line[k] >= line[k - 1] and line[k] >= line[k + 1] and line[k] > _CLEAR]
+    peak = [int(k) for k in inside if line[k] >= line[k - 1] and line[k] >= line[k + 1] and line[k] > _LINE_HEIGHT]
     if not peak:
         return None
 
@@ -142,7 +142,7 @@ def find_idle_line(windows: Windows, still: Array) -> IdleLine | None:
     # a strong second harmonic is a line too, but has no line at half its frequency
     best = max(peak, key=lambda k: line[k] + np.nan_to_num(find_second(k)))
     where, height = find_peaks(spectra, f, 0.88 * f[best], 1.12 * f[best] + f[1])
-    shown = clear[:, best - 1 : best + 2].max(axis=1) > _CLEAR
+    shown = clear[:, best - 1 : best + 2].max(axis=1) > _LINE_HEIGHT
     shown = shown if shown.any() else np.ones(len(some), dtype=bool)
     # in the channel in which it stands out most
     floor = np.exp(0.5 * _take_local_median(power, reach)[..., best])

@@ -19,7 +19,7 @@ absolute deviation, in log e), are discarded.
 e does not show a lasting force: a foot that is carried level to its last footprint and slows down there turns little,
 and the deceleration tilts the mean force more than it lengthens it. But over the whole span it adds up. So from the
 quietest moment near either end the gyro carries the axes outward, and the excess force is integrated; the span ends
-where that velocity exceeds the threshold times `_REACH`, the most that rolling permits.
+where that velocity exceeds the threshold times `_SOLE_REACH`, the most that rolling permits.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ _FEWEST_SPANS = 5  # spans needed for the statistics of their depth
 _LEAST_SPREAD = 0.3  # of log e: least spread between stances
 _SPREADS = 3.0
 _EDGE_SEARCH = 0.8  # s from an end of a span within which its quietest moment is sought: twice the duration of a slide
-_REACH = 0.2  # m, largest distance from an IMU on a shoe to the point of contact with the floor
+_SOLE_REACH = 0.2  # m, largest distance from an IMU on a shoe to the point of contact with the floor
 
 
 def detect_stances(
@@ -78,7 +78,7 @@ def detect_stances(
                 )
             )
         begin = int(np.searchsorted(deep[:, 1], since)) if len(deep) else 0
-        cut = _cut_sliding(deep[begin:], imu, one.t, one.statistic, bias, settings.threshold * _REACH)
+        cut = _cut_sliding(deep[begin:], imu, one.t, one.statistic, bias, settings.threshold * _SOLE_REACH)
         kept.append(np.concatenate([deep[:begin], cut]))
     if not found:
         return Detections(NONE, (), ())

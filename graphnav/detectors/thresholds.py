@@ -16,7 +16,7 @@ from graphnav.detectors.base import mask_within
 from graphnav.detectors.scene import Scene
 
 _TINY = 1e-300
-FEWEST = 1.0  # s, smallest population that counts
+SHORTEST_POPULATION = 1.0  # s, smallest population that counts
 MISLABELLED = 0.2  # share of the moving windows that other sensors may mislabel
 _TELLS = 0.5  # sum of the shares of wrong decisions of either kind; 1 is a statistic without information
 MISTAKEN = 0.05  # share of the moving windows that may be mislabelled
@@ -84,7 +84,7 @@ def choose_threshold(
     x = log_statistic(values)
     step = float(np.median(np.diff(t))) if len(t) > 1 else 1.0
     moves = mask_within(t, scene.certain, half) & np.isfinite(x)
-    split = find_valley(x, float(np.log10(least)), float(np.log10(most)), max(2, round(FEWEST / step)))
+    split = find_valley(x, float(np.log10(least)), float(np.log10(most)), max(2, round(SHORTEST_POPULATION / step)))
     if split is not None and not (moves.any() and np.mean(x[moves] < split) > MISLABELLED):
         return max(least, float(10.0**split)), ()
     rests = ~mask_within(t, scene.certain, -half) & np.isfinite(x)  # no part of it is certain to move

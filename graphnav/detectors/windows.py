@@ -16,13 +16,13 @@ from graphnav.core.rotation import Array
 from graphnav.recording import Imu
 
 BLOCK_RATE = 50.0  # Hz, lowest rate of the blocks
-_KERNEL = 0.4  # s, length of the low-pass filter
+_KERNEL_LENGTH = 0.4  # s, length of the low-pass filter
 _LOW_RATE = 10.0  # Hz, rate of the low-passed rows
-_LONGEST_GAP = 0.2  # s by which a block may last too long and still be valid
+_LONGEST_BLOCK_GAP = 0.2  # s by which a block may last too long and still be valid
 
 
 @dataclass(frozen=True)
-class Blocks:
+class BlockMeans:
     """Means over blocks of rows, [force, rate, |force|, |force|^2, |rate|^2] with force (3) and rate (3)."""
 
     t: Array  # (K,) s, middle of each block
@@ -43,7 +43,7 @@ class Blocks:
         return self.mean[:, 3:6]
 
 
-def average_blocks(imu: Imu, row_period: float) -> Blocks:
+def average_blocks(imu: Imu, row_period: float) -> BlockMeans:
     """Blocks of at most 1/`BLOCK_RATE` s; rows after the last complete block are dropped."""
     size = max(1, int(1.0 / (BLOCK_RATE * row_period) + 1e-6))
     count = len(imu.t) // size
@@ -58,8 +58,8 @@ def average_blocks(imu: Imu, row_period: float) -> Blocks:
             mean[:, 6] = np.sqrt(norms).reshape(count, size).mean(axis=1)
     end = imu.t[size - 1 : n : size]
     start = np.r_[imu.t[0] - row_period, end[:-1]]
-    whole = end - start < size * row_period + max(_LONGEST_GAP, row_period)
-    return Blocks(end - 0.5 * size * row_period, end, mean, size * row_period, row_period, whole)
+    whole = end - start < size * row_period + max(_LONGEST_BLOCK_GAP, row_period)
+    return BlockMeans(end - 0.5 * size * row_period, end, mean, size * row_period, row_period, whole)
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,7 @@ def compute_window_times(t: Array, length: int, step: int = 1) -> Array:
 
 
 def find_unbroken(whole: Array, length: int, step: int = 1, first: int = 1) -> Array:
-    """Which of these windows no gap crosses; `whole` as in `Blocks`.
+    """Which of these windows no gap crosses; `whole` as in `BlockMeans`.
 
     A gap before the first row of a window is harmless, except with `first` 0, where rows are means that may contain it.
     """
@@ -111,13 +111,13 @@ class LowPassed:
 
 
 def make_kernel(period: float) -> Array:
-    """A Blackman window of `_KERNEL` s, sum 1: -6 dB at 3 Hz, below -58 dB from 7.5 Hz on."""
-    n = max(2, round(_KERNEL / period))
+    """A Blackman window of `_KERNEL_LENGTH` s, sum 1: -6 dB at 3 Hz, below -58 dB from 7.5 Hz on."""
+    n = max(2, round(_KERNEL_LENGTH / period))
     h = np.blackman(n + 2)[1:-1]
     return np.asarray(h / h.sum())
 
 
-def low_pass(b: Blocks) -> LowPassed:
+def low_pass(b: BlockMeans) -> LowPassed:
     """Low-pass the blocks and keep every tenth of a second."""
     h = make_kernel(b.period)
     step = max(1, int(1.0 / (_LOW_RATE * b.period) + 1e-6))
@@ -140,6 +140,6 @@ def share_of(x: Array, share: float) -> Array:
     return np.asarray(x[k] + (at - k) * (x[min(k + 1, len(x) - 1)] - x[k]))
 
 
-def smooth_rows(rows: Array, h: Array) -> Array:
+def filter_rows(rows: Array, h: Array) -> Array:
     """All rows filtered with h, (K - len(h) + 1, c): for a short span."""
     return np.asarray(sliding_window_view(rows, len(h), axis=0) @ h)

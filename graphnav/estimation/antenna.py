@@ -31,11 +31,11 @@ from graphnav.estimation.solvers.rts import smooth_backward
 from graphnav.recording import Recording, take_rows
 
 _PRIOR_SIGMA = 2.0  # m, 1-sigma before the drive
-_FINE = 0.3  # m, 1-sigma of fixes that are precise enough
+_PRECISE = 0.3  # m, 1-sigma of fixes that are precise enough
 _LEAST_PART = 0.25  # m, of a component of an arm whose sign matters, or of its error: tape measures are better
 _OPPOSITE = 0.5  # ratio of the distances of the estimate from the opposite sign and from the stated one
 _PART = 240.0  # s
-_FEWEST_FIXES = 30  # fixes
+_FEWEST_FOR_ARM = 30  # fixes
 _SURE_SIGMAS = 8.0  # 4 sigmas, doubled because errors of fixes are correlated for minutes
 # Findings by which attitude, times or positions are wrong: what the drive then says of lever arms follows from that.
 _FIRST = {
@@ -97,9 +97,9 @@ def find_wrong_arms(recording: Recording, findings: Sequence[Finding] = ()) -> l
     gnss = recording.gnss
     if any(f.severity != "note" and f.key in _FIRST for f in findings):
         return []
-    if recording.platform != "vehicle" or gnss is None or len(gnss.t) < _FEWEST_FIXES:
+    if recording.platform != "vehicle" or gnss is None or len(gnss.t) < _FEWEST_FOR_ARM:
         return []
-    if np.median(gnss.sd[:, :2]) > _FINE:
+    if np.median(gnss.sd[:, :2]) > _PRECISE:
         return []
     second = np.floor(gnss.t)
     thin = take_rows(gnss, np.concatenate([[True], np.diff(second) > 0.0]))
@@ -140,7 +140,7 @@ def find_untold_arm(recording: Recording) -> list[Finding]:
     if recording.platform != "vehicle" or gnss is None or np.abs(gnss.lever_arm).max() <= _LEAST_PART:
         return []
     sd = float(np.median(gnss.sd[:, :2])) if len(gnss.t) else 0.0
-    if sd <= _FINE:
+    if sd <= _PRECISE:
         return []
     sentence = (
         f"the fixes' 1-sigma of {sd:.2g} m is too coarse to tell whether lever_arm in [gnss] and its signs are right: "

@@ -29,7 +29,7 @@ from graphnav.constraints.raw_phase import EXACT, GnssPhase, WholeCycles
 from graphnav.constraints.raw_ppp import GnssPppCarrier
 from graphnav.core.rotation import Array
 from graphnav.core.state import BLOCKS, DIM
-from graphnav.estimation.known_arcs import FEWEST, Arc, Epochs, Known
+from graphnav.estimation.known_arcs import ENOUGH, Arc, Epochs, Known
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import CarrierArcs
 from graphnav.estimation.solvers.decision import DecidedRows
@@ -40,7 +40,7 @@ from graphnav.estimation.solvers.rts import smooth_backward
 from graphnav.gnss.integers import decorrelate, find_nearest
 
 _SUCCESS, _RATIO = 0.999, 3.0
-_ROUNDS = 4  # of the smoother: what one finds tells the next, and the last finds next to nothing
+_FIXING_ROUNDS = 4  # of the smoother: what one finds tells the next, and the last finds next to nothing
 LOST_PLACE, LOST_SPEED = 10.0, 1.0  # m, m/s, 1-sigma of what is known where integers were wrong: less than codes tell
 
 
@@ -100,7 +100,7 @@ def fix(
     points = make_points(whole, about.states, split_values(problem, about))
     smoothed = smooth_backward(whole, refilter(whole, points, progress), progress)
     known, found = Known(), whole
-    for _ in range(_ROUNDS if search else 0):
+    for _ in range(_FIXING_ROUNDS if search else 0):
         before = dict(known.of)
         _sweep(epochs, smoothed, known)
         if known.of == before:
@@ -181,7 +181,7 @@ def _decide(
         T[i, place[other]], T[i, place[one]] = 1.0, -1.0
     a, C = T @ x, T @ Q @ T.T
     order = np.argsort(np.diagonal(C), kind="stable")
-    while len(order) and given + len(order) >= FEWEST:
+    while len(order) and given + len(order) >= ENOUGH:
         found = decorrelate(C[np.ix_(order, order)])
         if found.success >= _SUCCESS:
             nearest = find_nearest(a[order], found)
@@ -212,7 +212,7 @@ def hold_on(before: Held, epochs: Epochs, k: int, here: Points, covariance: Call
     known = before.known
     if odd := bool(epochs.find_inconsistent(k, here, known)):
         known = Known() if before.odd else known
-        fixed = epochs.count_differences(k, known) >= FEWEST
+        fixed = epochs.count_differences(k, known) >= ENOUGH
         return Held(known, True, let_go=before.odd, fixed=fixed, epoch=True)
     sets, found = epochs.group_arcs(k, known), []
     if any(len(some) > 1 for some in sets.values()):
@@ -227,7 +227,7 @@ def hold_on(before: Held, epochs: Epochs, k: int, here: Points, covariance: Call
             found = []
         else:
             known = held
-    return Held(known, odd, tuple(found), fixed=epochs.count_differences(k, known) >= FEWEST, epoch=True)
+    return Held(known, odd, tuple(found), fixed=epochs.count_differences(k, known) >= ENOUGH, epoch=True)
 
 
 class _Causal:

@@ -19,7 +19,7 @@ from graphnav.core.state import DIM
 from graphnav.estimation.solution import CarrierArcs
 from graphnav.estimation.solvers.linearise import Points, linearise
 
-FEWEST = 4  # differences of an epoch that is fixed: one more than a position needs, so that they check each other
+ENOUGH = 4  # differences of an epoch that is fixed: one more than a position needs, so that they check each other
 _ALARM = 0.001  # of epochs with right integers that fail the test of consistency
 Arc = tuple[str, float]  # its ambiguity, and when it begins, s
 
@@ -120,7 +120,7 @@ class Epochs:
     def mark_fixed(self, known: Mapping[int, Known]) -> Array:
         """(E, 2) s, and 1 where enough differences are known; by keyframe."""
         return np.array(
-            [[self.time[k], self.count_differences(k, known[k]) >= FEWEST] for k in self.keyframes], dtype=float
+            [[self.time[k], self.count_differences(k, known[k]) >= ENOUGH] for k in self.keyframes], dtype=float
         )
 
     def list_arcs(self, known: Mapping[int, Known]) -> CarrierArcs:

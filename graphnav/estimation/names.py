@@ -7,9 +7,9 @@ from functools import cache
 
 from graphnav.constraints import list_constraints
 
-_AXES = ("right", "forward", "up")
+_AXIS_NAMES = ("right", "forward", "up")
 _TO_DEG = 57.29577951308232
-_CROSS = ("right from forward", "right from up", "forward from right", "forward from up", "up from right",
+_CROSS_NAMES = ("right from forward", "right from up", "forward from right", "forward from up", "up from right",
           "up from forward")  # as `graphnav.imu.dynamics` has them  # fmt: skip
 
 
@@ -25,13 +25,13 @@ class Component:
 def _name_scales(each: int) -> list[Component]:
     out = []
     for sensor in ("gyro", "accelerometer"):
-        out += [Component(f"{sensor} scale error, {axis}", "ppm", 1e6) for axis in _AXES]
-        out += [Component(f"{sensor} misalignment, {pair}", "mrad", 1e3) for pair in _CROSS[: each - 3]]
+        out += [Component(f"{sensor} scale error, {axis}", "ppm", 1e6) for axis in _AXIS_NAMES]
+        out += [Component(f"{sensor} misalignment, {pair}", "mrad", 1e3) for pair in _CROSS_NAMES[: each - 3]]
     return out
 
 
 def _name_axes(words: str) -> list[Component]:
-    return [Component(f"{words}, {axis}", "m") for axis in _AXES]
+    return [Component(f"{words}, {axis}", "m") for axis in _AXIS_NAMES]
 
 
 # The parameters of a calibration; all others belong to the noise of the measurements.

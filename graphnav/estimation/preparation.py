@@ -33,7 +33,7 @@ from graphnav.estimation.noise.exclusion import (
 )
 from graphnav.estimation.noise.model import STATED, NoiseModel
 from graphnav.estimation.noise.spacing import space_fixes
-from graphnav.estimation.noise.words import describe
+from graphnav.estimation.noise.words import describe_noise
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import CarrierArcs
 from graphnav.estimation.solvers.ekf import ekf, refilter, smooth_near
@@ -50,8 +50,8 @@ from graphnav.recording import Recording
 # whether the evidence of a noise model is wanted, by the problem and the points of its estimate
 Weigh = Callable[[Problem, Points], bool]
 
-_LINEAR = 0.1  # rad between linearisation point and smoothed attitude, up to which the smoother is used
-_ROUNDS = 5  # of filter and smoother about what they found before; where that leads nowhere, a batch is solved
+_LINEAR_ATTITUDE = 0.1  # rad between linearisation point and smoothed attitude, up to which the smoother is used
+_SMOOTHINGS = 5  # of filter and smoother about what they found before; where that leads nowhere, a batch is solved
 _MOST_WRONG = 0.5  # share of excluded fixes, beyond which the start is wrong rather than the fixes
 
 
@@ -130,7 +130,7 @@ def prepare(
             smoothed = smooth_backward(problem, refilter(problem, smoothed, progress), progress)
         forward, smoothed = _relinearise(problem, aligned, known, forward, smoothed, progress, passes)
     passes.update(filter=1, smoother=1)
-    notes, epochs, arcs = describe(noise, problem), {}, {"": list_float_arcs(problem)}
+    notes, epochs, arcs = describe_noise(noise, problem), {}, {"": list_float_arcs(problem)}
     if built.carriers is not None:
         tell("ambiguities")
         with clock.count_time("ambiguities"):
@@ -221,14 +221,14 @@ def _relinearise(
     If the heading is uncertain and fixes weigh little beside wheels, a filter may turn the mounting by half a turn
     instead of the velocity, a local minimum. So the batch is then solved at once, without wheels first.
     """
-    if are_near(smoothed, forward.linearised, _LINEAR):
+    if are_near(smoothed, forward.linearised, _LINEAR_ATTITUDE):
         return forward, smoothed
     wheels = aligned.motion is not None and any(c.of_wheels for c in problem.constraints)
     about: Points = smoothed if known is None or len(known.states) != len(problem.t) else known
-    for _ in range(int(about is known) if wheels else _ROUNDS):
+    for _ in range(int(about is known) if wheels else _SMOOTHINGS):
         passes.update(filter=1, smoother=1)
         smoothed = smooth_backward(problem, refilter(problem, about, progress), progress)
-        if are_near(smoothed, about, _LINEAR):
+        if are_near(smoothed, about, _LINEAR_ATTITUDE):
             passes.update(filter=1)
             return ekf(problem, progress, aligned.until, known=smoothed), smoothed
         about = smoothed

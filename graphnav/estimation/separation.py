@@ -19,7 +19,9 @@ from graphnav.core.earth import LocalFrame
 from graphnav.core.rotation import Array
 from graphnav.estimation.solution import Separation
 
-_TOLD = 1e-4  # share of P_f that the later measurements must remove: a backward sigma a hundred times the forward one
+_REMOVED = (
+    1e-4  # share of P_f that the later measurements must remove: a backward sigma a hundred times the forward one
+)
 
 
 def compute_separation(
@@ -42,5 +44,5 @@ def compute_separation(
     apart = np.einsum("kij,kj->ki", R, forward - smoothed)
     before, after = (np.einsum("kij,kjl,kil->ki", R, P, R) for P in (P_f, P_s))
     told = before - after
-    told[told < _TOLD * before] = np.nan
+    told[told < _REMOVED * before] = np.nan
     return Separation(t, before * apart / told, before / np.sqrt(told))

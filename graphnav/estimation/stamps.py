@@ -31,9 +31,9 @@ from graphnav.estimation.solvers.passes import compute_sigmas, estimate_paramete
 from graphnav.recording import Recording
 from graphnav.recording.checks.clock import FAIR, ClockOffsets, is_certain
 
-_LINEAR = 0.3  # s from the linearisation point: above
+_LINEAR_OFFSET = 0.3  # s from the linearisation point: above
 _SIGNIFICANT = 3.0  # sigmas
-_ROUNDS = 3  # of moving the stamps
+_MOVES = 3  # of moving the stamps
 _AS_THEY_ARE = StampOffsets()
 
 # a recording whose stamps are moved, and whether evidence is wanted of an estimate -> what its solvers share
@@ -69,7 +69,7 @@ def find_stamps(
 
 def _settle(recording: Recording, prepare: Prepare, found: _Candidate) -> _Candidate | None:
     """Move the stamps until their offsets are estimated near where they are; None where that does not come about."""
-    for _ in range(_ROUNDS):
+    for _ in range(_MOVES):
         if (ahead := _estimate(*found[1:])) == found[2]:
             return found
         found = _move(recording, prepare, ahead)
@@ -88,7 +88,7 @@ def _accept_all(problem: Problem, points: Points) -> bool:
 def _is_far(problem: Problem, points: Points) -> bool:
     """Whether an offset is far from where its rows are linearised."""
     values = split_values(problem, points)
-    return any(abs(float(values[name][0, 0])) > _LINEAR for name in OFFSETS.values() if name in values)
+    return any(abs(float(values[name][0, 0])) > _LINEAR_OFFSET for name in OFFSETS.values() if name in values)
 
 
 def _guess(clock: ClockOffsets) -> StampOffsets | None:
@@ -101,12 +101,12 @@ def _guess(clock: ClockOffsets) -> StampOffsets | None:
     between = 0.0 if clock.apart is None or clock.between is None else clock.between.lag
     odometer = velocities if clock.of_imu else 0.0
     guess = _join(StampOffsets(velocities + between, velocities, odometer))
-    return guess if max(abs(guess.positions), abs(guess.velocities)) > _LINEAR else None
+    return guess if max(abs(guess.positions), abs(guess.velocities)) > _LINEAR_OFFSET else None
 
 
 def _join(offsets: StampOffsets) -> StampOffsets:
     """Offsets with one for positions and velocities where they hardly differ: each has keyframes of its own else."""
-    near = abs(offsets.velocities - offsets.positions) <= _LINEAR
+    near = abs(offsets.velocities - offsets.positions) <= _LINEAR_OFFSET
     return replace(offsets, velocities=offsets.positions) if near else offsets
 
 
@@ -117,7 +117,7 @@ def _estimate(prepared: Prepared, at: StampOffsets) -> StampOffsets:
     for key, name in (("positions", TIME_OFFSET), ("velocities", VELOCITY_TIME_OFFSET)):
         if name in found:
             off, sigma = float(found[name].value[0, 0]), float(found[name].sigma[0, 0])
-            if abs(off) > max(_LINEAR, _SIGNIFICANT * sigma):
+            if abs(off) > max(_LINEAR_OFFSET, _SIGNIFICANT * sigma):
                 new[key] = getattr(at, key) + off
     if not new:
         return at

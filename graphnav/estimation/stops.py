@@ -15,7 +15,7 @@ from graphnav.core.rotation import Array
 from graphnav.detectors.base import Detection, measure_overlap
 from graphnav.estimation.solution import ConstraintRecord, Solution
 
-HEAD = "start,end,detector,fired,rows"  # columns of detections.csv
+DETECTIONS_HEAD = "start,end,detector,fired,rows"  # columns of detections.csv
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ def format_detections(found: Sequence[Detection], records: Mapping[str, Constrai
         fired = " ".join(f"{name}:{share:.2f}" for name, share in stop.fired.items())
         used = " ".join(f"{name}:{count}" for name, count in stop.rows.items())
         rows.append(f"{stop.start:.4f},{stop.end:.4f},{FUSED},{fired},{used}")
-    return "\n".join([HEAD, *rows]) + "\n"
+    return "\n".join([DETECTIONS_HEAD, *rows]) + "\n"
 
 
 def _collect_spans(found: Sequence[Detection], name: str) -> Array:

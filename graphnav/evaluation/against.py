@@ -32,9 +32,9 @@ from graphnav.recording.formats.trajectories import read_trajectory
 
 _MAX_GAP = 3.0  # s; wider gaps of a trajectory are not filled
 _APPLIED = 1.0  # s; a larger shift is one of the clock
-_FEWEST_ROWS = 10  # rows in common, at least
+_FEWEST_COMMON = 10  # rows in common, at least
 _MATTERS, _SIGNIFICANT = 0.02, 3.0  # s and sigmas; a smaller shift is not reported, or may be chance
-_PLACE = 10_000.0  # m; frames of other datums, and diverging filters, are closer than that to the start
+_FARTHEST = 10_000.0  # m; frames of other datums, and diverging filters, are closer than that to the start
 _CHORD = 10.0  # s; over so long a chord the noise of positions does not hide distance and direction
 _LEAST_SPEED = 1.0  # m/s
 # share of the squared chords, and of the variance of their lengths, that two trajectories of one drive have in common
@@ -107,7 +107,7 @@ def read_against(asked: Against, name: str, recording: Recording, reference: Sol
         track = replace(track, t=track.t + shift)
         notes += words
     inside = (track.t >= reference.t[0]) & (track.t <= reference.t[-1])
-    if inside.sum() < _FEWEST_ROWS:
+    if inside.sum() < _FEWEST_COMMON:
         raise RecordingError(
             f"{asked.path}: {format_count(int(inside.sum()), 'row')} in common with "
             f"'{recording.name}': its time runs from {track.t[0]:.3f} to {track.t[-1]:.3f} s, the "
@@ -214,7 +214,7 @@ def _require_same_drive(asked: Against, track: Trajectory, recording: Recording,
     inside = track.take((track.t >= reference.t[0]) & (track.t <= reference.t[-1]))
     if track.frame == "geodetic":
         apart = np.linalg.norm(reference.frame.from_llh(inside.llh) - reference.at(inside.t)[1].p, axis=1)
-        if np.nanmin(apart) > _PLACE:
+        if np.nanmin(apart) > _FARTHEST:
             raise RecordingError(
                 f"{asked.path}: lies {np.nanmin(apart) / 1e3:.0f} km or more from '{recording.name}': it is of another "
                 "drive, or its latitudes and longitudes are wrong",
@@ -239,14 +239,14 @@ def _moves_otherwise(track: Trajectory, reference: Solution) -> bool:
     last = k[first]
     whole = track.t[last] - track.t[first] < _CHORD + _MAX_GAP
     first, last = first[whole], last[whole]
-    if len(first) < _FEWEST_ROWS:
+    if len(first) < _FEWEST_COMMON:
         return False
     theirs = reference.frame.from_llh(track.llh)[:, :2]
     ours = reference.at(track.t)[1].p[:, :2]
     a, b = (p[last] - p[first] for p in (theirs, ours))
     way_a, way_b = np.linalg.norm(a, axis=1), np.linalg.norm(b, axis=1)
     moving = np.maximum(way_a, way_b) > _LEAST_SPEED * _CHORD
-    if moving.sum() < _FEWEST_ROWS or np.ptp(track.t[first[moving]]) < 3.0 * _CHORD:
+    if moving.sum() < _FEWEST_COMMON or np.ptp(track.t[first[moving]]) < 3.0 * _CHORD:
         return False
     unlike = np.sum((a - b) ** 2, axis=1)[moving] / (way_a**2 + way_b**2)[moving]
     if np.median(unlike) < _COMMON_SHARE:

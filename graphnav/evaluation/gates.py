@@ -14,7 +14,7 @@ from graphnav.evaluation.metrics import COMPONENTS
 
 _REQUIREMENT = re.compile(r"(?:([\w-]+):)?\s*([A-Za-z]\w*)\s*(<=|>=|<|>)\s*(\S+)")
 _COMPARE = {"<": operator.lt, "<=": operator.le, ">": operator.gt, ">=": operator.ge}
-_SPAN = ("start_s", "end_s", "n", "distance_m", "end_h_m", "end_3d_m", "max_h_m", "max_up_m", "drift_mps",
+_SPAN_FIELDS = ("start_s", "end_s", "n", "distance_m", "end_h_m", "end_3d_m", "max_h_m", "max_up_m", "drift_mps",
          "drift_percent", "nees_p")  # fmt: skip
 _UNIT_SUFFIXES = ("_m", "_mps", "_deg", "_s")  # suffixes that may be omitted
 
@@ -28,7 +28,7 @@ def list_names() -> tuple[str, ...]:
     closure = [f"closure_{what}" for what in ("h_m", "up_m", "distance_m", "percent")]
     own = ["n", "epochs", "duration_s", "distance_m", "sd_h_median_m", "sd_u_median_m", "sd_heading_median_deg",
            "keyframes", "iterations", "final_cost", "run_time_s"]  # fmt: skip
-    return (*errors, *nees, *closure, *own, *(f"span_{name}" for name in _SPAN))
+    return (*errors, *nees, *closure, *own, *(f"span_{name}" for name in _SPAN_FIELDS))
 
 
 @dataclass(frozen=True)
@@ -103,7 +103,7 @@ def _complete_name(name: str, text: str) -> str:
     return known[plain].replace("span_", f"span{span[1]}_", 1) if span else known[plain]
 
 
-def judge(requirements: Sequence[Requirement], rows: Sequence[Mapping[str, Any]]) -> list[Verdict]:
+def judge_all(requirements: Sequence[Requirement], rows: Sequence[Mapping[str, Any]]) -> list[Verdict]:
     """The verdicts on rows of numbers, one row per solver, as `metrics.tabulate` makes them."""
     verdicts = []
     for requirement in requirements:

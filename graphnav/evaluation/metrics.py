@@ -166,7 +166,7 @@ def measure(
         epochs=errors.epochs,
         duration=float(errors.t[-1] - errors.t[0]) if len(errors) else 0.0,
         distance=float(errors.distance[-1]) if len(errors) else 0.0,
-        components={key: found for key, x in series.items() if (found := compute_statistic(x)) is not None},
+        components={key: found for key, x in series.items() if (found := summarise_component(x)) is not None},
         nees={key: mean for key, (x, dof, z) in values.items() if (mean := average_nees(x, dof, z)) is not None},
         spans=tuple(_measure_span(errors, a, b, start) for a, b in spans),
         notes=errors.notes,
@@ -174,7 +174,7 @@ def measure(
     )
 
 
-def compute_statistic(x: Array) -> Statistic | None:
+def summarise_component(x: Array) -> Statistic | None:
     """Statistics of the finite values of `x` (N,); None if there are none. The 95 % point is interpolated linearly."""
     x = x[np.isfinite(x)]
     if not len(x):

@@ -10,7 +10,7 @@ from graphnav.core.rotation import Array
 from graphnav.evaluation.metrics import Errors
 
 _FEWEST_SEGMENTS = 10  # segments, at least
-_STEPS = (1.0, 2.0, 5.0)
+_LENGTH_STEPS = (1.0, 2.0, 5.0)
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ def compute_relative_errors(errors: Errors) -> tuple[Relative, ...]:
         return ()
     travelled, e, heading = errors.distance[known], errors.p[known, :2], errors.rph[known, 2]
     out = []
-    for length in (step * 10.0**k for k in range(1, 6) for step in _STEPS):
+    for length in (step * 10.0**k for k in range(1, 6) for step in _LENGTH_STEPS):
         if (travelled[-1] - travelled[0]) / length < _FEWEST_SEGMENTS:
             break
         first, last = _find_segments(travelled, length)

@@ -9,10 +9,10 @@ import numpy as np
 
 from graphnav.core.errors import RecordingError
 from graphnav.core.rotation import Array
-from graphnav.gnss.files import count_days, read_bytes
+from graphnav.gnss.files import count_days, unpack_bytes
 from graphnav.gnss.signals import SYSTEMS, C, Ids, number_satellite
 
-_ALWAYS = 1e12  # s
+_UNLIMITED = 1e12  # s
 
 
 @dataclass(frozen=True)
@@ -35,17 +35,17 @@ def read_antex(path: Path) -> Antennas:
     RecordingError
         If it is none, or a field cannot be read, naming the line.
     """
-    lines = read_bytes(path).decode("latin-1").splitlines()
+    lines = unpack_bytes(path).decode("latin-1").splitlines()
     if not lines or "ANTEX VERSION" not in lines[0]:
         raise RecordingError(f"{path}: not an ANTEX file; its first line names no version", key="file.kind")
     out: dict[int, list[SatelliteAntenna]] = {}
-    name, begin, end, band = "", -_ALWAYS, _ALWAYS, 0
+    name, begin, end, band = "", -_UNLIMITED, _UNLIMITED, 0
     offset: dict[int, Array] = {}
     for number, line in enumerate(lines, 1):
         label = line[60:].strip()
         try:
             if label == "START OF ANTENNA":
-                name, begin, end, offset = "", -_ALWAYS, _ALWAYS, {}
+                name, begin, end, offset = "", -_UNLIMITED, _UNLIMITED, {}
             elif label == "TYPE / SERIAL NO":
                 name = line[20:23].strip()
             elif label == "VALID FROM":

@@ -21,7 +21,7 @@ from graphnav.gnss.series import RawGnss
 from graphnav.gnss.signals import C, Ids, name_satellite, name_signal
 from graphnav.gnss.single_point import choose_coefficients, look
 
-_ROUNDS = 20  # of reweighting towards the least sum of absolute residuals
+_REWEIGHTINGS = 20  # of reweighting towards the least sum of absolute residuals
 _SPARE = 2  # rows beyond the unknowns that have to agree before others are held against them
 _NOISE = 0.01  # m, of a difference of carriers: below it residuals weigh the same
 
@@ -140,7 +140,7 @@ def _find_slips(
     middle = np.array([np.median(one[some]) if some.any() else 0.0 for one, some in zip(y, w > 0.0, strict=True)])
     y = y - middle[:, None]
     r = y
-    for _ in range(_ROUNDS):
+    for _ in range(_REWEIGHTINGS):
         weight = w / np.maximum(np.abs(r), _NOISE)
         N = np.einsum("esi,es,esj->eij", A, weight, A, optimize=True) + 1e-9 * np.eye(unknowns)
         x = np.linalg.solve(N, np.einsum("esi,es->ei", A, weight * y)[..., None])[..., 0]

@@ -88,7 +88,7 @@ _WET = np.array([
     [1.4275268e-3, 1.5138625e-3, 1.4572752e-3, 1.5007428e-3, 1.7599082e-3],
     [4.3472961e-2, 4.6729510e-2, 4.3908931e-2, 4.4626982e-2, 5.4736038e-2],
 ])  # fmt: skip
-_HEIGHT = np.array([2.53e-5, 5.49e-3, 1.14e-3])
+_NIELL_HEIGHT = np.array([2.53e-5, 5.49e-3, 1.14e-3])
 _YEAR, _COLDEST = 365.25, 28.0  # days; of the year, on the northern half
 
 
@@ -112,7 +112,7 @@ def niell(llh: Array, elevation: Array, day: Array) -> tuple[Array, Array]:
         return np.stack([np.interp(lat, _LATITUDES, row) for row in table])
 
     dry = _evaluate_fraction(sin, at(_DRY_MEAN) - at(_DRY_SEASON) * season)
-    higher = (1.0 / sin - _evaluate_fraction(sin, _HEIGHT[:, None])) * llh[:, 2] / 1e3
+    higher = (1.0 / sin - _evaluate_fraction(sin, _NIELL_HEIGHT[:, None])) * llh[:, 2] / 1e3
     return dry + higher, _evaluate_fraction(sin, at(_WET))
 
 

@@ -22,7 +22,7 @@ from graphnav.gnss.series import RawGnss, compute_epoch_medians
 from graphnav.gnss.signals import C
 from graphnav.gnss.single_point import choose_coefficients, look
 
-_OLDEST = 15.0  # s between a base's epochs that a line is drawn through
+_LONGEST_BASE_GAP = 15.0  # s between a base's epochs that a line is drawn through
 _SAME_EPOCH = 2e-3  # s: two receivers that keep their clocks within a millisecond of the nominal epoch
 _LEAST_ELEVATION = np.radians(5.0)  # elevation of a base's satellites
 
@@ -97,7 +97,7 @@ def _draw_within_arcs(t: Array, at: Array, value: Array, arc: NDArray[np.intp]) 
     right = np.clip(np.searchsorted(at, t), 1, len(at) - 1)
     nearest = np.where(np.abs(at[right - 1] - t) < np.abs(at[right] - t), right - 1, right)
     here = np.abs(at[nearest] - t) < _SAME_EPOCH
-    between = (arc[right] == arc[right - 1]) & (at[right] - at[right - 1] <= _OLDEST)
+    between = (arc[right] == arc[right - 1]) & (at[right] - at[right - 1] <= _LONGEST_BASE_GAP)
     between &= (t >= at[right - 1]) & (t <= at[right])
     line = np.where(between, np.interp(t, at, value), value[nearest])
     good = between | here
@@ -108,5 +108,7 @@ def _interpolate(t: Array, at: Array, value: Array) -> Array:
     """(N,) values on lines between times that are near enough, NaN elsewhere."""
     k = np.clip(np.searchsorted(at, t), 1, len(at) - 1)
     out = np.interp(t, at, value)
-    near = (at[k] - at[k - 1] <= _OLDEST) & (t >= at[0] - _OLDEST) & (t <= at[-1] + _OLDEST)
+    near = (
+        (at[k] - at[k - 1] <= _LONGEST_BASE_GAP) & (t >= at[0] - _LONGEST_BASE_GAP) & (t <= at[-1] + _LONGEST_BASE_GAP)
+    )
     return np.asarray(np.where(near, out, np.nan))

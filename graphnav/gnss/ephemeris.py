@@ -20,7 +20,13 @@ from graphnav.gnss.signals import BEIDOU, GALILEO, GLONASS, GPS, QZSS, C, Ids, f
 _MU = {GPS: 3.9860050e14, GALILEO: 3.986004418e14, BEIDOU: 3.986004418e14, QZSS: 3.986005e14}
 _OMEGA = {GPS: 7.2921151467e-5, GALILEO: 7.2921151467e-5, BEIDOU: 7.292115e-5, QZSS: 7.2921151467e-5}
 EARTH_RATE = 7.2921151467e-5  # rad/s, of WGS-84
-_OLDEST = {GPS: 7201.0, GALILEO: 14400.0, BEIDOU: 21601.0, QZSS: 7201.0, GLONASS: 1800.0}  # s from toe; RTKLIB's limits
+_OLDEST_EPHEMERIS = {
+    GPS: 7201.0,
+    GALILEO: 14400.0,
+    BEIDOU: 21601.0,
+    QZSS: 7201.0,
+    GLONASS: 1800.0,
+}  # s from toe; RTKLIB's limits
 _TILT = np.radians(5.0)  # of the frame of geostationary BeiDou satellites
 _MU_R, _J2, _RATE_R, _RADIUS_R = 3.9860044e14, 1.0826257e-3, 7.292115e-5, 6378136.0  # PZ-90
 _INTEGRATION_STEP = 60.0  # s at most, of the integration of GLONASS orbits
@@ -161,9 +167,13 @@ class Ephemerides:
             age = t[own][:, None] - (source["toe"][which] - zero)
             far = np.abs(np.round(age))  # of two as near as each other to the second the later, as RTKLIB has it
             if one // 100 == GALILEO:
-                far = np.where(age < 0.0, far + _OLDEST[GALILEO], far)
+                far = np.where(age < 0.0, far + _OLDEST_EPHEMERIS[GALILEO], far)
             best = far.shape[1] - 1 - np.argmin(far[:, ::-1], axis=1)
-            near = np.abs(age[np.arange(len(own)), best]) <= _OLDEST[one // 100] if one // 100 in _OLDEST else False
+            near = (
+                np.abs(age[np.arange(len(own)), best]) <= _OLDEST_EPHEMERIS[one // 100]
+                if one // 100 in _OLDEST_EPHEMERIS
+                else False
+            )
             out[own] = np.where(near, which[best] + (M if one // 100 == GLONASS else 0), -1)
         return out
 

@@ -15,7 +15,7 @@ from graphnav.core.rotation import Array
 _FIRST, _LAST = np.array([1980, 1, 1, 0, 0, 0.0]), np.array([2099, 12, 31, 24, 59, 61.0])  # of GPS; a leap second
 
 
-def read_bytes(path: Path) -> bytes:
+def unpack_bytes(path: Path) -> bytes:
     """The content of a file, whatever it is packed with.
 
     Raises

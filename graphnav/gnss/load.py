@@ -14,7 +14,7 @@ from graphnav.core.rotation import Array
 from graphnav.gnss.antex import read_antex
 from graphnav.gnss.differential import add_differences
 from graphnav.gnss.ephemeris import Ephemerides
-from graphnav.gnss.files import read_bytes
+from graphnav.gnss.files import unpack_bytes
 from graphnav.gnss.placing import Corrected, place, restore_own_stamps
 from graphnav.gnss.precise import Orbits, read_precise
 from graphnav.gnss.rinex_nav import read_navigation
@@ -24,7 +24,7 @@ from graphnav.gnss.signals import C
 from graphnav.gnss.single_point import SinglePoint, solve
 from graphnav.gnss.ubx import is_ubx, parse_ubx
 
-_FEW = 50  # epochs that a rough place is looked for in
+_ROUGH_EPOCHS = 50  # epochs that a rough place is looked for in
 _BASE_OFF = 100.0  # m from its stated position that a base's single-point position may be
 
 
@@ -59,7 +59,7 @@ def read_rover(paths: tuple[Path, ...]) -> tuple[Observations, Ephemerides | Non
     """
     parts, sent = [], None
     for path in paths:
-        data = read_bytes(path)
+        data = unpack_bytes(path)
         if is_ubx(data):
             obs, found = parse_ubx(data, path)
             sent = found if sent is None else sent.join(found)
@@ -203,7 +203,7 @@ def _check_dates(obs: Observations, nav: Ephemerides | None, precise: Orbits | N
 def _locate_roughly(obs: Observations, nav: Ephemerides | None, precise: Orbits | None, corrected: Corrected) -> Array:
     """(3,) within kilometres of the rover: by the codes of a few epochs."""
     epochs = np.unique(obs.t)
-    few = obs.take(np.isin(obs.t, epochs[:: max(1, len(epochs) // _FEW)]))
+    few = obs.take(np.isin(obs.t, epochs[:: max(1, len(epochs) // _ROUGH_EPOCHS)]))
     start = np.zeros(3) if obs.marker is None else obs.marker
     raw, _ = place(few, nav, precise, start, corrected)
     raw = raw.take(choose_primary(raw) & np.isfinite(raw.p[:, 0]))

@@ -18,12 +18,12 @@ from graphnav.core.notes import Note, format_count
 from graphnav.core.rotation import Array
 from graphnav.core.timescales import utc_to_gps
 from graphnav.gnss.ephemeris import Placed, rotate_earth
-from graphnav.gnss.files import Lines, count_days, parse_numbers, read_bytes
+from graphnav.gnss.files import Lines, count_days, parse_numbers, unpack_bytes
 from graphnav.gnss.signals import SYSTEMS, C, Ids, number_satellite
 
 _NODES = 11  # of the polynomial
 _ABSENT = 0.9  # s; a clock of 999999.999999 us is none
-_LONGEST = 900.0  # s between nodes of a clock that a line is drawn through
+_LONGEST_CLOCK_GAP = 900.0  # s between nodes of a clock that a line is drawn through
 _HALF = 0.5  # s either way, over which velocities are differences
 
 
@@ -111,7 +111,7 @@ def _drop_repeated(t: Array, x: Array) -> tuple[Array, Array]:
 
 def _read_sp3(path: Path) -> tuple[Array, Ids, Array, Array]:
     """Times, satellites, positions (m) and clocks (s) of all position records."""
-    lines = Lines(read_bytes(path))
+    lines = Lines(unpack_bytes(path))
     head = lines.get_text(0)
     if head[:1] != "#" or head[1:2] not in "abcd":
         raise RecordingError(f"{path}: not an SP3 file; its first line begins '{head[:2]}'", key="file.kind")
@@ -145,7 +145,7 @@ def _read_sp3(path: Path) -> tuple[Array, Ids, Array, Array]:
 
 def _read_clk(path: Path) -> tuple[Array, Ids, Array]:
     """Times, satellites and clocks (s) of all satellite records."""
-    text = read_bytes(path)
+    text = unpack_bytes(path)
     if b"CLOCK" not in text[:8000] and b"RINEX VERSION" not in text[:200]:
         raise RecordingError(f"{path}: not a RINEX clock file", key="file.kind")
     scale = "GPS"
@@ -234,5 +234,5 @@ def _interpolate_clocks(clocks: tuple[Array, Array], t: Array, zero: float) -> t
     k = np.clip(np.searchsorted(at, t, side="right") - 1, 0, len(at) - 2)
     step = at[k + 1] - at[k]
     drift = (value[k + 1] - value[k]) / step
-    good = (t >= at[0] - 1.0) & (t <= at[-1] + 1.0) & (step <= _LONGEST)
+    good = (t >= at[0] - 1.0) & (t <= at[-1] + 1.0) & (step <= _LONGEST_CLOCK_GAP)
     return np.where(good, value[k] + drift * (t - at[k]), np.nan), np.where(good, drift, np.nan)

@@ -28,7 +28,7 @@ class Header:
     end: int = 0  # number of lines
 
 
-def read_header(lines: Lines, path: Path) -> Header:
+def read_rinex_header(lines: Lines, path: Path) -> Header:
     """Read up to END OF HEADER."""
     out, system, many = Header(), -1, 0
     for k in range(len(lines)):

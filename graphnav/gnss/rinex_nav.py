@@ -16,12 +16,12 @@ from graphnav.core.files import parse_number
 from graphnav.core.notes import Note, format_count
 from graphnav.core.timescales import WEEK, utc_to_gps
 from graphnav.gnss.ephemeris import Ephemerides, Glonass, Kepler
-from graphnav.gnss.files import count_days, read_bytes
+from graphnav.gnss.files import count_days, unpack_bytes
 from graphnav.gnss.signals import BEIDOU, GALILEO, GLONASS, GPS, NAVIC, QZSS, SBAS, SYSTEMS
 
 _BDT = 14.0  # s, GPS minus BeiDou time
 _BDT_WEEKS = 1356  # from the GPS to the BeiDou epoch
-_LINES = {GLONASS: 4, SBAS: 4}  # of a record; 8 of all others
+_RECORD_LINES = {GLONASS: 4, SBAS: 4}  # of a record; 8 of all others
 _KNOWN = {"LNAV", "INAV", "FNAV", "D1", "D2", "FDMA"}
 _ROOTS = (2530.0, 8192.0)  # sqrt(m), of the semi-major axis: the range that IS-GPS-200N, table 20-III, gives it
 _WEEKS = 6262  # of the GPS until 2100
@@ -67,7 +67,7 @@ def read_navigation(paths: list[Path]) -> Ephemerides:
 
 
 def _read(path: Path, found: _Navigation) -> None:
-    lines = read_bytes(path).decode("latin-1").splitlines()
+    lines = unpack_bytes(path).decode("latin-1").splitlines()
     try:
         version = float(lines[0][:9])
     except ValueError:
@@ -100,7 +100,7 @@ def _read(path: Path, found: _Navigation) -> None:
             continue
         name = (text[:3] if not default else default + text[:2]).replace(" ", "0")
         system = SYSTEMS.find(name[:1])
-        count = _LINES.get(system, 8)
+        count = _RECORD_LINES.get(system, 8)
         if system == GLONASS and version >= 3.05:
             count += k + 4 < len(lines) and lines[k + 4][:4] == "    " and bool(lines[k + 4].strip())
         if system < 0 and name[:1].isalpha() and name[1:].isdigit():

@@ -19,8 +19,8 @@ from graphnav.core.files import parse_number
 from graphnav.core.notes import Note, format_count
 from graphnav.core.rotation import Array
 from graphnav.core.timescales import WEEK, utc_to_gps
-from graphnav.gnss.files import Lines, count_days, find_moved_points, parse_numbers, read_bytes
-from graphnav.gnss.rinex_header import Header, read_header
+from graphnav.gnss.files import Lines, count_days, find_moved_points, parse_numbers, unpack_bytes
+from graphnav.gnss.rinex_header import Header, read_rinex_header
 from graphnav.gnss.series import Observations, drop_repeated, note_cut
 from graphnav.gnss.signals import (
     BEIDOU,
@@ -40,7 +40,7 @@ for _k, _letter in enumerate(SYSTEMS):
     _SYSTEM_OF[ord(_letter)] = _k
 _KINDS = "CLDS"
 _AUXILIARY = "IXT"  # the ionosphere's phase, the receiver's channel, the Doppler shift of Transit
-_WIDTH = 16  # of a field: value F14.3, loss of lock I1, strength I1
+_FIELD_WIDTH = 16  # of a field: value F14.3, loss of lock I1, strength I1
 
 
 @dataclass
@@ -64,13 +64,13 @@ def read_observations(path: Path) -> Observations:
     RecordingError
         If it is no RINEX observation file, or a line of it cannot be read, naming the line.
     """
-    return parse_observations(read_bytes(path), path)
+    return parse_observations(unpack_bytes(path), path)
 
 
 def parse_observations(data: bytes, path: Path) -> Observations:
     """The observations of a RINEX file's content; `path` is only for what is said of it."""
     lines = Lines(data)
-    header = read_header(lines, path)
+    header = read_rinex_header(lines, path)
     remarks: list[str] = []
     stamp, zero, flag, rows, cells = (_read_version_2 if header.version < 3.0 else _read_version_3)(
         lines, header, path, remarks
@@ -83,7 +83,7 @@ def parse_observations(data: bytes, path: Path) -> Observations:
         own = np.flatnonzero(rows.satellite // 100 == system)
         if not len(own):
             continue
-        block = cells(own, len(types)).reshape(len(own), len(types), _WIDTH)
+        block = cells(own, len(types)).reshape(len(own), len(types), _FIELD_WIDTH)
         try:
             value = parse_numbers(block[:, :, :14].reshape(len(own), -1), 14)
             if find_moved_points(block[:, :, :14]).any():
@@ -211,7 +211,7 @@ def _read_version_3(lines: Lines, header: Header, path: Path, remarks: list[str]
     rows = _SatelliteLines(own, of, satellite)
 
     def cells(which: NDArray[np.intp], types: int) -> NDArray[np.uint8]:
-        return lines.take_block(rows.line[which], 3, 3 + _WIDTH * types)
+        return lines.take_block(rows.line[which], 3, 3 + _FIELD_WIDTH * types)
 
     return stamp, zero, flag, rows, cells
 
@@ -307,8 +307,8 @@ def _read_version_2(lines: Lines, header: Header, path: Path, remarks: list[str]
     )
 
     def cells(which: NDArray[np.intp], types: int) -> NDArray[np.uint8]:
-        parts = [lines.take_block(rows.line[which] + j, 0, 5 * _WIDTH) for j in range(each)]
-        return np.concatenate(parts, axis=1)[:, : _WIDTH * types]
+        parts = [lines.take_block(rows.line[which] + j, 0, 5 * _FIELD_WIDTH) for j in range(each)]
+        return np.concatenate(parts, axis=1)[:, : _FIELD_WIDTH * types]
 
     stamp, zero = _count_since_week(fields, header.scale, np.ones(len(epoch), dtype=bool))
     return stamp, zero, np.array(flags), rows, cells

@@ -16,7 +16,9 @@ _RATE, _RATE_POWER = 0.03, 60.0  # m/s; (m/s)^2 Hz: 0.04 m/s at 45 dB-Hz
 _BANDWIDTH = 15.0  # Hz, of a receiver's carrier loop (Kaplan and Hegarty 2006, section 5.6)
 _PHASE = 1e-3  # m at the zenith: reflections and the loop's own, the same source as the codes' rising with the secant
 _IONOSPHERE, _TROPOSPHERE = 0.5, 0.3
-_CARRIER = 0.003  # m at the zenith, of reflections in a receiver's carriers (RTKLIB 2.4.3, rtkpos.c, varerr)
+_CARRIER_REFLECTIONS = (
+    0.003  # m at the zenith, of reflections in a receiver's carriers (RTKLIB 2.4.3, rtkpos.c, varerr)
+)
 # s, correlation time of reflections: by the residuals of two drives 13 and 30 s on the way, longer at rest
 REFLECTED = 20.0
 LEAST = 20.0  # dB-Hz that a signal without a C/N0, or below it, is taken to have
@@ -50,7 +52,7 @@ def compute_carrier_difference_sigma(cn0: Array, elevation: Array, wavelength: A
 def compute_reflection_sigma(elevation: Array) -> Array:
     """(N,) m, 1-sigma of what reflections do to a receiver's carrier, for some time alike."""
     rising = 1.0 / np.maximum(np.sin(elevation), 0.1)
-    return np.asarray(_CARRIER * np.sqrt(1.0 + rising**2))
+    return np.asarray(_CARRIER_REFLECTIONS * np.sqrt(1.0 + rising**2))
 
 
 def _compute_thermal(cn0: Array, wavelength: Array) -> Array:

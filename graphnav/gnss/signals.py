@@ -17,7 +17,7 @@ Ids = NDArray[np.int16]
 
 C = 299792458.0  # m/s
 SYSTEMS = "GRECJIS"
-NAMES = ("GPS", "GLONASS", "Galileo", "BeiDou", "QZSS", "NavIC", "SBAS")
+SYSTEM_NAMES = ("GPS", "GLONASS", "Galileo", "BeiDou", "QZSS", "NavIC", "SBAS")
 GPS, GLONASS, GALILEO, BEIDOU, QZSS, NAVIC, SBAS = range(7)
 _MHZ: dict[int, dict[int, float]] = {
     GPS: {1: 1575.42, 2: 1227.60, 5: 1176.45},

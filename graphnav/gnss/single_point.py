@@ -28,11 +28,11 @@ from graphnav.gnss.sigmas import compute_code_sigma, compute_rate_sigma
 from graphnav.gnss.signals import L1, C
 
 _ROUNDS, _ATMOSPHERE = 10, 3  # iterations, and from which on the atmosphere is modelled
-_KERNEL = 3.0  # sigma at which a row begins to lose weight
+_KERNEL_SCALE = 3.0  # sigma at which a row begins to lose weight
 _WEAK = 1e6  # m, 1-sigma of an unknown before any row
 _LOST = 100.0  # m, rms of residuals beyond which an epoch has no position
-_FLAT = 60.0  # PDOP beyond which a position says nothing
-_OMEGA = np.array([0.0, 0.0, EARTH_RATE])
+_WORST_PDOP = 60.0  # PDOP beyond which a position says nothing
+_OMEGA_E = np.array([0.0, 0.0, EARTH_RATE])
 
 
 @dataclass(frozen=True)
@@ -101,7 +101,7 @@ def look(raw: RawGnss, antenna: Array, ionosphere: Array | None) -> Geometry:
 
 def compute_stretch(raw: RawGnss, geometry: Geometry) -> Array:
     """(N,) 1 + e.(v_s + omega x s) / c: by how much a range changes less than satellite and antenna move."""
-    moving = rotate_earth(raw.v, geometry.distance / C) + np.cross(_OMEGA, geometry.s)
+    moving = rotate_earth(raw.v, geometry.distance / C) + np.cross(_OMEGA_E, geometry.s)
     return np.asarray(1.0 + np.sum(geometry.e * moving, axis=1) / C)
 
 
@@ -162,7 +162,7 @@ def solve(raw: RawGnss, mask: float = np.radians(10.0), robust: bool = True) -> 
         sigma = compute_code_sigma(raw.cn0, np.maximum(geometry.elevation, 0.05), geometry.ionosphere)
         good = usable & above
         if robust and k > _ATMOSPHERE:
-            weight = 1.0 / (1.0 + (np.nan_to_num(r) / (_KERNEL * sigma)) ** 2)
+            weight = 1.0 / (1.0 + (np.nan_to_num(r) / (_KERNEL_SCALE * sigma)) ** 2)
         w = np.where(good, weight / sigma**2, 0.0)
         H[:, :3] = np.nan_to_num(-geometry.e)
         Hp, wp = pad(H), pad(w)
@@ -179,7 +179,7 @@ def solve(raw: RawGnss, mask: float = np.radians(10.0), robust: bool = True) -> 
     found = np.bincount(of, weights=used, minlength=E) >= needed
     R = earth.enu_axes(earth.ecef_to_llh(x[:, :3]))
     cofactor = R @ P[:, :3, :3] @ np.swapaxes(R, -1, -2)
-    found &= (rms < _LOST) & (np.trace(cofactor, axis1=-2, axis2=-1) < _FLAT**2)
+    found &= (rms < _LOST) & (np.trace(cofactor, axis1=-2, axis2=-1) < _WORST_PDOP**2)
     x[~found] = np.nan
     cofactor[~found] = np.nan
     biases = np.where(present, np.concatenate([np.zeros((E, 1)), x[:, 4:]], axis=1), np.nan)
@@ -213,7 +213,7 @@ def _solve_velocities(
     for k in range(6 if robust else 1):
         r = np.where(good, measured - np.sum(np.where(good[:, None], H, 0.0) * y[of], axis=1), 0.0)
         if k:
-            weight = 1.0 / (1.0 + (r / (_KERNEL * sigma)) ** 2)
+            weight = 1.0 / (1.0 + (r / (_KERNEL_SCALE * sigma)) ** 2)
         wp = pad(np.where(good, weight / sigma**2, 0.0))
         information = np.einsum("esi,es,esj->eij", Hp, wp, Hp, optimize=True)
         right = np.einsum("esi,es->ei", Hp, wp * pad(r), optimize=True)

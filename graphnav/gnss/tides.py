@@ -15,7 +15,7 @@ from graphnav.core.timescales import gps_to_utc
 
 _AU, _DAY = 149597870700.0, 86400.0  # m, s
 _J2000 = np.datetime64("2000-01-01T12:00:00", "us")
-_DYNAMIC = 69.2  # s, of terrestrial dynamic time before UTC since 2017: 37 leap seconds and 32.184 s
+_DYNAMIC_OFFSET = 69.2  # s, of terrestrial dynamic time before UTC since 2017: 37 leap seconds and 32.184 s
 _SUN, _MOON = 332946.05, 0.01230002  # masses, of the Earth's
 _H2, _L2, _H2_LAT, _L2_LAT = 0.6078, 0.0847, -0.0006, 0.0002  # Love and Shida numbers, and how they go with latitude
 
@@ -23,7 +23,7 @@ _H2, _L2, _H2_LAT, _L2_LAT = 0.6078, 0.0847, -0.0006, 0.0002  # Love and Shida n
 def locate_sun_and_moon(gps: Array) -> tuple[Array, Array]:
     """Places (N, 3) of Sun and Moon, m in e, at times (N,), s since the GPS epoch."""
     utc = (gps_to_utc(gps) - _J2000) / np.timedelta64(1, "us") * 1e-6
-    T = (utc + _DYNAMIC) / _DAY / 36525.0
+    T = (utc + _DYNAMIC_OFFSET) / _DAY / 36525.0
     tilt = np.radians(23.43929111 - 0.0130042 * T)
     anomaly = np.radians(357.5256 + 35999.049 * T)
     sun_lon = np.radians(282.94 + 1.3972 * T) + anomaly + np.radians(

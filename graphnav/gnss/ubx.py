@@ -29,7 +29,7 @@ SIGNALS = {  # gnssId and sigId
     (3, 8): "5D", (3, 10): "6I", (5, 0): "1C", (5, 1): "1Z", (5, 4): "2S", (5, 5): "2L", (5, 8): "5I", (5, 9): "5Q",
     (5, 12): "1E", (6, 0): "1C", (6, 2): "2C", (7, 0): "5A",
 }  # fmt: skip
-_ROW = np.dtype(
+_ROW_TYPE = np.dtype(
     [
         ("code", "<f8"), ("carrier", "<f8"), ("doppler", "<f4"), ("gnss", "u1"), ("sv", "u1"), ("sig", "u1"),
         ("channel", "u1"), ("lock", "<u2"), ("cn0", "u1"), ("sd_code", "u1"), ("sd_carrier", "u1"),
@@ -145,7 +145,7 @@ def _find_frames(data: bytes) -> _RawMessages:
             week = int.from_bytes(payload[8:10], "little")
             if np.isfinite(tow) and 0.0 <= tow <= WEEK and week:
                 out.times.append((tow, week))
-                out.rows.append(np.frombuffer(payload, _ROW, count=payload[11], offset=16))
+                out.rows.append(np.frombuffer(payload, _ROW_TYPE, count=payload[11], offset=16))
         elif kind == _SFRBX:
             out.frames.append((len(out.times) - 1, payload))
         at = data.find(SYNC, end)

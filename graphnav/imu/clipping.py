@@ -30,9 +30,9 @@ _RANGE_END = 0.95  # share of the highest reading: a limit that some peaks excee
 _BAND = 0.01  # b
 _SOFT_BAND = 0.03  # b of an axis that is known to clip: it may do so softly
 _TOO_FLAT = 2.5  # q
-_FEWEST_ROWS = 3  # rows of a flat top at least
-_LEAST = {"gyro": 4.0, "accel": 19.0}  # rad/s, m/s^2: no range ends lower (250 deg/s, 2 g)
-_DOUBT = 0.5  # 1-sigma as a share of what is added
+_FEWEST_FLAT = 3  # rows of a flat top at least
+_LEAST_RANGE = {"gyro": 4.0, "accel": 19.0}  # rad/s, m/s^2: no range ends lower (250 deg/s, 2 g)
+_RESTORED_SIGMA = 0.5  # 1-sigma as a share of what is added
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ def _find_flat(t: Array, x: Array, least: float, band: float, highest: Array) ->
             top = y[begin:end].max()
             rows = begin + np.flatnonzero(y[begin:end] >= (1.0 - band) * top)
             first, last = int(rows[0]), int(rows[-1]) + 1
-            if last - first < _FEWEST_ROWS or first < 2 or last + 2 > len(y):
+            if last - first < _FEWEST_FLAT or first < 2 or last + 2 > len(y):
                 continue
             up = (y[first - 1] - y[first - 2]) / (t[first - 1] - t[first - 2])
             down = (y[last] - y[last + 1]) / (t[last + 1] - t[last])
@@ -94,10 +94,12 @@ def find_first_whole_peak(samples: Samples, R_bs: Array, before: Array, now: Arr
     Infinite if there is none; both are as `highest` returns them.
     """
     first = np.inf
-    for k, name in enumerate(_LEAST):
+    for k, name in enumerate(_LEAST_RANGE):
         x = getattr(samples, name) @ R_bs
         for axis in range(3):
-            old, new = (find_cut_peaks(samples.t, x[:, axis], _LEAST[name], most[k, axis]) for most in (before, now))
+            old, new = (
+                find_cut_peaks(samples.t, x[:, axis], _LEAST_RANGE[name], most[k, axis]) for most in (before, now)
+            )
             still = {p.first for p in new}
             first = min([first, *(float(samples.t[p.first]) for p in old if p.first not in still)])
     return first
@@ -117,7 +119,7 @@ def restore_peaks(samples: Samples, R_bs: Array, known: Array | None = None) -> 
         x, cut = getattr(samples, name) @ R_bs, False
         extra = getattr(samples, f"extra_{name}").copy()
         for axis in range(3):
-            peaks = find_cut_peaks(samples.t, x[:, axis], _LEAST[name], None if known is None else known[k, axis])
+            peaks = find_cut_peaks(samples.t, x[:, axis], _LEAST_RANGE[name], None if known is None else known[k, axis])
             if not peaks:
                 continue
             cut = True
@@ -126,7 +128,7 @@ def restore_peaks(samples: Samples, R_bs: Array, known: Array | None = None) -> 
                 rows = slice(p.first, p.last)
                 T = samples.t[rows] - samples.t[p.first - 1 : p.last - 1]
                 added = float(np.sum((p.values - x[rows, axis]) * T))
-                extra[rows] += (_DOUBT * added) ** 2 / T.sum()
+                extra[rows] += (_RESTORED_SIGMA * added) ** 2 / T.sum()
                 x[rows, axis] = p.values
             notes.append(
                 Note(

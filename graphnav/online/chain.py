@@ -36,7 +36,7 @@ from graphnav.online.sensors import Sensors
 from graphnav.recording import Recording
 
 _PLACE_SIGMA = 1000.0  # m, 1-sigma of the place of a stop
-_FEWEST_FIXES = 5  # fixes from which their period is known
+_FEWEST_FOR_PERIOD = 5  # fixes from which their period is known
 _ENGINES: dict[str, type[Window]] = {"window": Window, "isam2": TreeWindow}
 
 
@@ -139,7 +139,7 @@ class Chain:
         if (
             self.window.newest.tests is not None
             or self.settings.gnss.faults == "off"
-            or len(sensors.gnss.used) < _FEWEST_FIXES
+            or len(sensors.gnss.used) < _FEWEST_FOR_PERIOD
         ):
             return
         watched = [c for c in problem.constraints if c.watched and c.fix_of]

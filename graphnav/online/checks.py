@@ -11,7 +11,7 @@ from graphnav.core.notes import Note, format_count
 from graphnav.recording import Recording
 from graphnav.recording.checks.overview import inspect
 
-_FEWEST_ROWS = 50  # rows of the IMU, at least
+_FEWEST_IMU_ROWS = 50  # rows of the IMU, at least
 _MOST_LEFT_OUT = 0.5  # share of a sensor's rows; above it they are not single outliers
 # causes of rejected rows, and what makes all rows of a sensor so
 _CAUSES = {
@@ -27,7 +27,7 @@ _CAUSES = {
 
 def check_rows(recording: Recording) -> tuple[Note, ...]:
     """Notes on rows that are impossible or unlikely; none while there are too few rows."""
-    if len(recording.imu.t) < _FEWEST_ROWS:
+    if len(recording.imu.t) < _FEWEST_IMU_ROWS:
         return ()
     try:
         findings = inspect(recording).findings

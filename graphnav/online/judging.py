@@ -30,7 +30,7 @@ from graphnav.estimation.noise.apply import apply_noise
 from graphnav.estimation.noise.estimate import estimate_noise
 from graphnav.estimation.noise.exclusion import estimate_without_faults
 from graphnav.estimation.noise.model import NoiseModel
-from graphnav.estimation.noise.words import describe
+from graphnav.estimation.noise.words import describe_noise
 from graphnav.estimation.problem import Problem, build_problem
 from graphnav.estimation.solution import ExcludedSpan
 from graphnav.online.checks import check_rows
@@ -40,7 +40,7 @@ from graphnav.online.sensors import Sensors
 from graphnav.online.tracker import Tracker
 from graphnav.recording import Recording
 
-_PORTION = 4  # keyframes processed again per row
+_REPLAYED_PORTION = 4  # keyframes processed again per row
 _ENOUGH_FIXES = 600  # fixes in motion, which determine variances to 6 %
 _LONGEST_SPAN = 900.0  # s of rows after which estimation ends where fixes are rare
 # of the lag, and s: time allowed for the estimation, 11 s for 1100 keyframes
@@ -90,7 +90,7 @@ def answer(asked: Question) -> Answer:
         estimate = estimate_noise if settings.gnss.faults == "off" else estimate_without_faults
         noise = estimate(base, start.until).noise
         used = apply_noise(base, noise)
-        words, wrong = describe(noise, used), faults.find_fault_spans(used)
+        words, wrong = describe_noise(noise, used), faults.find_fault_spans(used)
         return Answer(_convert_unit(noise, base, asked.unit), words, stationary, wrong, check_rows(asked.every))
     except np.linalg.LinAlgError as error:
         raise EstimationError(str(error), key="solver.undetermined") from error
@@ -156,7 +156,7 @@ def _convert_unit(noise: NoiseModel, base: Problem, unit: Array) -> NoiseModel:
     return replace(noise, figures=figures)
 
 
-def judge(
+def start_judging(
     sensors: Sensors, settings: Settings, frame: LocalFrame, found: Alignment, times: Array, until: float
 ) -> Judgement:
     """Start to judge the sensors by their rows up to a time (s); `times` (K,) are the keyframes so far, s."""
@@ -186,7 +186,7 @@ class CatchUp:
     def step(self, sensors: Sensors, other: Tracker) -> bool:
         """Process a few more keyframes of the other; True once it has caught up."""
         t, done = other.window.t, len(self.tracker.window)
-        end = min(done + _PORTION, len(t))
+        end = min(done + _REPLAYED_PORTION, len(t))
         while end < len(t) and np.any(np.abs(other.stops[:, 0] - t[end - 1]) < SAME_TIME):
             end += 1  # the beginning of a stop is known only from later rows
         self.tracker.update(sensors, t[done:end])

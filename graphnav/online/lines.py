@@ -31,7 +31,7 @@ from graphnav.recording.formats.schema import Noise
 from graphnav.sensors import Column, Series, list_sensors
 from graphnav.sensors.tables import NotNegative, Positive, Vector
 
-HEAD = "graphnav-online/1"
+PROTOCOL = "graphnav-online/1"
 END = "E"
 _NONE, _ROWS = np.empty(0), np.empty((0, 3))
 _BLANK = (float("nan"),) * 6
@@ -75,9 +75,9 @@ def parse_setup(line: str) -> Recording:
         In one plain sentence, if it is not such a line.
     """
     word, _, text = line.strip().partition(" ")
-    if word != HEAD:
+    if word != PROTOCOL:
         raise RecordingError(
-            f"line 1: a live source begins with '{HEAD}' and a setup as JSON, not with '{line[:40]}'",
+            f"line 1: a live source begins with '{PROTOCOL}' and a setup as JSON, not with '{line[:40]}'",
             key="online.first_line",
         )
     known = list_sensors()
@@ -176,7 +176,7 @@ def format_head(recording: Recording) -> str:
     if recording.raw_gnss is not None:
         setup["raw_gnss"] = live_raw(recording.raw_gnss)
     setup |= {name: series.figures.model_dump() for name, series in recording.sensors.items()}
-    return f"{HEAD} {json.dumps(setup)}"
+    return f"{PROTOCOL} {json.dumps(setup)}"
 
 
 def format_line(row: Row) -> str:

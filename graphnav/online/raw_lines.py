@@ -31,7 +31,7 @@ from graphnav.gnss.antex import Antennas, SatelliteAntenna
 from graphnav.gnss.ppp import choose_second_signals
 from graphnav.gnss.series import Catalogue, RawGnss, choose_primary
 from graphnav.gnss.signals import (
-    NAMES,
+    SYSTEM_NAMES,
     SYSTEMS,
     is_known_signal,
     name_satellite,
@@ -133,7 +133,7 @@ def _check_signal(system: str, name: str) -> int:
         If they send none of that name.
     """
     if not is_known_signal(SYSTEMS.index(system), name):
-        raise ValueError(f"{NAMES[SYSTEMS.index(system)]} has no signal '{name}'")
+        raise ValueError(f"{SYSTEM_NAMES[SYSTEMS.index(system)]} has no signal '{name}'")
     return number_signal(name)
 
 

@@ -21,7 +21,7 @@ from graphnav.recording.plausibility.screening import ACCEL_RANGE, GYRO_RANGE
 from graphnav.sensors import Sensor, Series
 
 _NONE, _ROWS = np.empty(0), np.empty((0, 3))
-_BLANK = (float("nan"),) * 3
+_UNKNOWN = (float("nan"),) * 3
 _HEIGHTS = (-1000.0, 50000.0)  # m, as in files
 
 
@@ -84,7 +84,7 @@ class Fix(_Row):
         if not _HEIGHTS[0] <= place[2] <= _HEIGHTS[1]:
             raise RecordingError(f"Fix at t = {t}: h {h} is no height of a drive in m", key="row.height")
         sigmas = _check_vector(cls, t, "sd", "m", sd, np.inf)
-        speeds, of_speeds = _BLANK, _BLANK
+        speeds, of_speeds = _UNKNOWN, _UNKNOWN
         if (v is None) != (sd_v is None):
             raise RecordingError(f"Fix at t = {t}: v and sd_v go together, m/s east, north, up", key="row.velocity")
         if v is not None and sd_v is not None:
@@ -116,7 +116,7 @@ class WheelSpeed(_Row):
             raise RecordingError(
                 f"WheelSpeed at t = {t}: {speed} m/s, which no vehicle reaches: is it in km/h or mm/s?", key="row.speed"
             )
-        return super().__new__(cls, ("odometer", _check_time(cls, t), (value, *_BLANK, *_BLANK[:2])))
+        return super().__new__(cls, ("odometer", _check_time(cls, t), (value, *_UNKNOWN, *_UNKNOWN[:2])))
 
 
 class Reading(_Row):

@@ -22,11 +22,11 @@ from graphnav.recording.plausibility.screening import ACCEL_RANGE, GYRO_RANGE
 Row = tuple[str, float, tuple[float, ...]]  # sensor, time (s), values
 
 _BLANK = (math.nan,) * 6
-_SUREST = 1e-4  # m, m/s; a tenth of the resolution of a carrier's phase
+_LEAST_SIGMA_LIVE = 1e-4  # m, m/s; a tenth of the resolution of a carrier's phase
 _MOST_FIXES = 600  # fixes: those that contradict so many consistent ones are believed once they are more
-_SET_BACK = 20  # consecutive IMU rows at times that have passed: not late rows, but another clock
-LASTING = 1.2  # s, duration of these: more than a second, so that one falls on a remembered second
-_REMEMBERED = 36_000  # s, ten hours
+_SET_BACK_ROWS = 20  # consecutive IMU rows at times that have passed: not late rows, but another clock
+CERTAIN_SPAN = 1.2  # s, duration of these: more than a second, so that one falls on a remembered second
+_REMEMBERED_SPAN = 36_000  # s, ten hours
 _LONGEST_PERIOD = 0.5  # s between rows of an IMU (as in `graphnav.recording.formats.repair`)
 _HELD = 200  # rows of other sensors held at most
 _OVERTAKING = 10.0  # periods; rows that overtake each other are closer (as in `graphnav.recording.formats.repair`)
@@ -64,7 +64,7 @@ def find_fix_fault(values: tuple[float, ...]) -> str | None:
     lat, lon, h = (np.array([x]) for x in values[:3])
     if not is_on_earth(lat, lon, h)[0] or values[0] == values[1] == 0.0:  # sent by receivers without a fix
         return "nowhere on Earth"
-    if not all(_SUREST <= sd <= VAGUEST for sd in values[3:6]):
+    if not all(_LEAST_SIGMA_LIVE <= sd <= VAGUEST for sd in values[3:6]):
         return "a sigma that says nothing"
     return None
 
@@ -74,7 +74,7 @@ def drop_insane_velocity(values: tuple[float, ...]) -> tuple[tuple[float, ...], 
     v, sd = values[6:9], values[9:12]
     if not math.isfinite(sum(v) + sum(sd)):
         return values, False
-    if math.hypot(*v) <= FASTEST and all(_SUREST <= one <= VAGUEST_V for one in sd):
+    if math.hypot(*v) <= FASTEST and all(_LEAST_SIGMA_LIVE <= one <= VAGUEST_V for one in sd):
         return values, False
     return (*values[:6], *_BLANK), True
 
@@ -151,7 +151,7 @@ class ClockGuard:
             self._second = second
             self._seconds[second] = (t, *values)
             self._ahead, self._sent_again, self._new = [], False, False
-            if len(self._seconds) > _REMEMBERED:
+            if len(self._seconds) > _REMEMBERED_SPAN:
                 del self._seconds[next(iter(self._seconds))]
 
     def fits(self, t: float, times: Array) -> bool:
@@ -171,7 +171,7 @@ class ClockGuard:
         if sensor == "imu":
             if t in times:
                 return False  # repeated
-            if times and t < max(times) - LASTING:  # behind these as well
+            if times and t < max(times) - CERTAIN_SPAN:  # behind these as well
                 self.behind, self._again, times = [one for one in self.behind if one[0] != "imu"], "", []
             second = int(t)
             if (t, *values) == self._seconds.get(second):
@@ -187,7 +187,7 @@ class ClockGuard:
             return False
         if len(self.behind) - len(times) > _HELD:  # the IMU is silent
             self.released.append(self.behind.pop(next(k for k, one in enumerate(self.behind) if one[0] != "imu")))
-        return len(times) >= _SET_BACK and max(times) - min(times) >= LASTING
+        return len(times) >= _SET_BACK_ROWS and max(times) - min(times) >= CERTAIN_SPAN
 
     def hold_early(self, row: Row) -> None:
         """Hold a fix or reading far ahead of the IMU: the clock may have been set ahead, which IMU rows will show."""
@@ -204,7 +204,7 @@ class ClockGuard:
             return None
         self._sent_again |= self._before[int(t)] == (t, *values)
         self._ahead = [] if self._sent_again else [*self._ahead, ("imu", t, values)]
-        if not self._ahead or t - self._ahead[0][1] < LASTING:
+        if not self._ahead or t - self._ahead[0][1] < CERTAIN_SPAN:
             return []
         rows, self._ahead, self._new = self._ahead, [], True
         return rows
@@ -222,7 +222,7 @@ class ClockGuard:
             self._strands = [*self._strands[1 - _STRANDS :], strand]
         if t not in [row[1] for row in strand]:
             bisect.insort(strand, ("imu", t, values), key=lambda row: row[1])
-        if strand[-1][1] - strand[0][1] < LASTING:
+        if strand[-1][1] - strand[0][1] < CERTAIN_SPAN:
             return []
         self.release()
         return strand
@@ -244,7 +244,7 @@ class ClockGuard:
         held = sorted(self.behind, key=lambda row: row[1])
         self.behind, self._strands, self._again, self._onward = [], [], "", 0
         self._before |= self._seconds
-        for second in list(self._before)[:-_REMEMBERED]:
+        for second in list(self._before)[:-_REMEMBERED_SPAN]:
             del self._before[second]
         self._seconds, self._second = {}, -(2**62)
         return held

@@ -29,8 +29,8 @@ from graphnav.recording import Odometer, Recording
 from graphnav.recording.formats.repair import LATEST
 
 AHEAD = 60.0  # s; stamps of other sensors that are further before the IMU's are wrong
-_WIDTH = {"imu": 6, "gnss": 12, "odometer": 6}
-_TOLD = {"gnss": 3, "odometer": 1}  # number of values by which a repeated row is recognised
+_ROW_WIDTH = {"imu": 6, "gnss": 12, "odometer": 6}
+_IDENTIFYING = {"gnss": 3, "odometer": 1}  # number of values by which a repeated row is recognised
 
 
 @dataclass
@@ -48,9 +48,9 @@ class Sensors:
     longest_gap: float = 2.0
     raw_settings: RawGnssSettings = field(default_factory=RawGnssSettings)
     counts: Counter[str] = field(default_factory=Counter)
-    imu: Buffer = field(default_factory=lambda: Buffer(_WIDTH["imu"]))
+    imu: Buffer = field(default_factory=lambda: Buffer(_ROW_WIDTH["imu"]))
     gnss: Fixes = field(init=False)
-    odometer: Buffer = field(default_factory=lambda: Buffer(_WIDTH["odometer"]))
+    odometer: Buffer = field(default_factory=lambda: Buffer(_ROW_WIDTH["odometer"]))
     others: dict[str, Buffer] = field(init=False)  # of the sensors of `Recording.sensors`
     raw: RawEpochs | None = field(init=False)  # of a receiver whose raw observations are used in place of its fixes
     oldest: float = -np.inf  # s; rows up to here are too late
@@ -65,7 +65,7 @@ class Sensors:
 
     def __post_init__(self) -> None:
         self.others = {name: Buffer(len(series.sensor.names)) for name, series in self.setup.sensors.items()}
-        self._widths = _WIDTH | {name: len(series.sensor.names) for name, series in self.setup.sensors.items()}
+        self._widths = _ROW_WIDTH | {name: len(series.sensor.names) for name, series in self.setup.sensors.items()}
         self.gnss = Fixes(self.setup.gnss)
         # for a foot, of rates only: an impact lasts for less than a row
         self._neighbours = Neighbours(3 if self.setup.platform == "foot" else 6)
@@ -150,7 +150,7 @@ class Sensors:
         buffer: Buffer = getattr(self, sensor)
         if sensor == "imu":
             return self._add_imu(t, values)
-        if not self._is_in_time(sensor, t, values, (sensor, t, *values[: _TOLD[sensor]]), released):
+        if not self._is_in_time(sensor, t, values, (sensor, t, *values[: _IDENTIFYING[sensor]]), released):
             return False
         if sensor == "gnss":
             values, without = drop_insane_velocity(values)
@@ -230,7 +230,7 @@ class Sensors:
         """Process an IMU row if it is regular; returns False to leave it to `add`. `newest` is the time before it."""
         if not newest + SAME < t <= newest + self.longest_gap or t <= self.oldest or self._clock.undecided:
             return False
-        if len(values) != _WIDTH["imu"] or not can_imu_read(values):
+        if len(values) != _ROW_WIDTH["imu"] or not can_imu_read(values):
             return False
         self._clock.remember(t, values)
         self.imu.append(t, values)
@@ -297,7 +297,7 @@ class Sensors:
             if self._clock.hold(("imu", t, values)):
                 self.set_back = self._clock.set_back()  # counted when they are processed
                 self.counts -= Counter(self._name_passed(when) for sensor, when, _ in self.set_back if sensor == "imu")
-                for name, width in _TOLD.items():
+                for name, width in _IDENTIFYING.items():
                     rows = getattr(self, name).rows[:, : width + 1].tolist()
                     self._before = {one for one in self._before if one[0] != name} | {(name, *row) for row in rows}
                 for name, buffer in self.others.items():

@@ -22,14 +22,14 @@ from graphnav.estimation.noise.explanations import FIXES
 from graphnav.estimation.noise.model import STATED, NoiseModel
 from graphnav.estimation.pipeline import choose_origin
 from graphnav.estimation.solution import ExcludedSpan
-from graphnav.estimation.solvers.watch import LONGEST
+from graphnav.estimation.solvers.watch import OLDEST
 from graphnav.online.ahead import Live, export
 from graphnav.online.checks import check_rows
-from graphnav.online.judging import CatchUp, Judgement, are_enough, judge
+from graphnav.online.judging import CatchUp, Judgement, are_enough, start_judging
 from graphnav.online.looks import CONTEXT, SURE
 from graphnav.online.sanity import find_period
 from graphnav.online.sensors import Row, Sensors
-from graphnav.online.start import find_start, list_keyframes, make_tracker, take_rows
+from graphnav.online.start import find_start, list_keyframes, make_tracker, take_start_rows
 from graphnav.online.tracker import Tracker
 from graphnav.online.walker import Walker
 from graphnav.recording import Recording
@@ -41,7 +41,7 @@ _SILENT = 2.0  # s of silence after which an odometer is not waited for
 _STEP_DETECTION = 0.5  # s between detections of steps in a walk
 _FINAL_STOPS = 4.0  # s before the newest keyframe up to which the stops are final
 _TRY = 2.0  # s between attempts at an alignment
-_LEVEL = 5.0  # s of rest that determine the level of a vehicle without GNSS
+_LEVELLING_SPAN = 5.0  # s of rest that determine the level of a vehicle without GNSS
 _ESTIMATED_AFTER = 120.0  # s of rows after which the noise model is estimated again
 _PATIENCE = 300.0  # s of rows kept while there is no motion to align with
 
@@ -227,9 +227,9 @@ class Smoother:
         if not last:  # at whole multiples, so that a missing row changes nothing
             now = _TRY * float(np.floor(now / _TRY))
             self._due = now + _TRY
-        if now - first < _LEVEL:
+        if now - first < _LEVELLING_SPAN:
             return
-        rows = take_rows(sensors, self.settings, now, last)
+        rows = take_start_rows(sensors, self.settings, now, last)
         if rows is None:
             self._wait(now)
             return
@@ -282,7 +282,7 @@ class Smoother:
     def _begin_judging(self, found: Alignment, tracker: Tracker) -> None:
         assert self.frame is not None
         times = np.concatenate([self._times, tracker.window.t])
-        self._judgement = judge(self.sensors, self.settings, self.frame, found, times, tracker.newest + AFTER)
+        self._judgement = start_judging(self.sensors, self.settings, self.frame, found, times, tracker.newest + AFTER)
 
     def _use(self, judgement: Judgement, tracker: Tracker) -> None:
         """Start to process the unsettled keyframes with the new noise model."""
@@ -369,7 +369,7 @@ class Smoother:
                 self._again.tracker.rewind(redone, tracker)
             self._collect(tracker)
             if tracker.verdicts.anew and not last:
-                words = f"for {LONGEST:.0f} s fixes contradicted all else, until {tracker.newest:.3f} s"
+                words = f"for {OLDEST:.0f} s fixes contradicted all else, until {tracker.newest:.3f} s"
                 self._restart(tracker.newest, words)
                 return
         T = tracker.newest

@@ -20,7 +20,7 @@ from graphnav.online.walker import Walker
 from graphnav.recording import Recording
 
 
-def take_rows(sensors: Sensors, settings: Settings, now: float, last: bool) -> tuple[Recording, Array] | None:
+def take_start_rows(sensors: Sensors, settings: Settings, now: float, last: bool) -> tuple[Recording, Array] | None:
     """The rows up to a time (s), and stops (M, 2) in them, if an alignment may succeed; None if it is too early.
 
     With `last`, no more rows will arrive.

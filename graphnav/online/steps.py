@@ -17,8 +17,8 @@ from graphnav.online.sensors import Sensors
 
 _WALK, _WALK_LEAST = 30.0, 4.0  # s of a walk that its detector uses, and the least
 _DETECTION_INTERVAL = 0.05  # s between detections of steps that are worth keyframes
-_EDGE = 0.1  # s by which the end of a stance may move once later rows are known: several periods
-_STANDING = 3.0  # s; a longer stance is standing, and need not be over
+_EDGE_TOLERANCE = 0.1  # s by which the end of a stance may move once later rows are known: several periods
+_LONGEST_STANCE = 3.0  # s; a longer stance is standing, and need not be over
 
 
 class StepCutter:
@@ -44,14 +44,16 @@ class StepCutter:
             return none
         rows = recording.imu.t  # keyframes are placed where the stances will begin and end
         limit = float(rows[max(int(np.searchsorted(rows, limit + SAME_TIME)) - 1, 0)])
-        spans = clip_spans(limit_to_samples(detect(recording, settings, T - _EDGE).stationary, recording), T, limit)
+        spans = clip_spans(
+            limit_to_samples(detect(recording, settings, T - _EDGE_TOLERANCE).stationary, recording), T, limit
+        )
         ongoing = bool(len(spans)) and spans[-1, 1] >= limit - SAME_TIME
         if not last and len(spans):
-            if ongoing and limit - spans[-1, 0] < _STANDING:
+            if ongoing and limit - spans[-1, 0] < _LONGEST_STANCE:
                 limit, spans, ongoing = float(spans[-1, 0]), spans[:-1], False
             elif not ongoing:
                 limit = float(spans[-1, 1])
-        elif not last and limit - T < _STANDING:
+        elif not last and limit - T < _LONGEST_STANCE:
             return none
         if limit - T <= _DETECTION_INTERVAL:
             return none

@@ -20,7 +20,7 @@ import numpy as np
 from graphnav.config import Settings
 from graphnav.constraints.base import SAME_TIME, TypicalSigmas
 from graphnav.constraints.gnss import find_fix_period, find_node_spacing
-from graphnav.constraints.vehicle import REACH
+from graphnav.constraints.vehicle import DELAY_SIGMAS
 from graphnav.core.earth import LocalFrame
 from graphnav.core.findings import compute_period
 from graphnav.core.rotation import Array
@@ -48,7 +48,7 @@ _ROWS_BEFORE = 2.0  # s of rows before a keyframe that its constraints use where
 _REBUILT_BEFORE = 6  # keyframes built again with a new one in a stop, so that the stop is recognised
 _PORTIONS = 8  # of the lag: keyframes settle in groups of this duration
 _SMOOTHED = 8  # covariances that can be smoothed in the time of one relinearisation
-_LATEST = 0.5  # of the lag by which settling may be delayed while states still move
+_LATEST_SETTLING = 0.5  # of the lag by which settling may be delayed while states still move
 
 
 @dataclass(frozen=True)
@@ -214,7 +214,7 @@ class Tracker(Chain):
     def _is_covered(self, sensors: Sensors, t: float) -> bool:
         """Whether the odometer's rows reach as far as a keyframe needs them."""
         o = sensors.setup.odometer
-        return o is None or sensors.odometer.newest >= t + REACH * o.delay_sigma
+        return o is None or sensors.odometer.newest >= t + DELAY_SIGMAS * o.delay_sigma
 
     def _prepare(self, sensors: Sensors, expected: float) -> None:
         """Build and predict the expected keyframe, except for the fix."""
@@ -271,7 +271,11 @@ class Tracker(Chain):
             return
         last = until == np.inf
         overdue = self.newest - float(self.window.stages[0].place.t) - self.settings.solver.lag
-        if not last and overdue < _LATEST * self.settings.solver.lag and self.window.find_first_moved() is not None:
+        if (
+            not last
+            and overdue < _LATEST_SETTLING * self.settings.solver.lag
+            and self.window.find_first_moved() is not None
+        ):
             return  # relinearisation is in progress: the next keyframe will do
         if last:
             count = len(self.window)

@@ -20,7 +20,7 @@ from graphnav.estimation.solvers.window import Message
 from graphnav.online.ahead import Live, live, predict_since
 from graphnav.online.chain import BuiltKeyframes
 from graphnav.online.looks import CONTEXT, SURE
-from graphnav.online.sanity import LASTING
+from graphnav.online.sanity import CERTAIN_SPAN
 from graphnav.online.sensors import Sensors
 from graphnav.online.tracker import ROWS_AFTER, Tracker
 from graphnav.recording import Recording
@@ -108,7 +108,7 @@ class Walker(Tracker):
         if (stood := self._steps.over) is not None:  # the sway of a foot is estimated from all of its standing
             self._keep(len(self.window) - len(self.window.select_since(stood + SAME_TIME)))
             times = self._steps.list_until(sensors, self.settings, self._standing, self.newest, limit, last)
-        looks = [one for one in self._looks if one.limit > limit - LASTING - SURE]
+        looks = [one for one in self._looks if one.limit > limit - CERTAIN_SPAN - SURE]
         self._looks = (*looks, _Look(limit, newest, before, after, found))
         self._standing.forget(self.head - CONTEXT)
         dirty = self._steps.find_change(sensors, self.head)

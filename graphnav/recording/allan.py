@@ -21,7 +21,7 @@ from graphnav.core.rotation import Array
 PER_DECADE = 12  # averaging times
 _FEWEST_PERIODS = 9  # periods of the longest averaging time that the log must contain
 _SHORTEST_LOG = 60.0  # s, shortest log that is accepted
-_FLAT = 2.0 / np.pi * np.log(2.0)
+_INSTABILITY_FACTOR = 2.0 / np.pi * np.log(2.0)
 _MEANS_OF = 1.0  # s, over which means are taken to detect motion
 _MOVING_RATE, _MOVING_FORCE = (
     np.radians(1.0),
@@ -140,7 +140,7 @@ def _fit(tau: Array, deviation: Array, count: int) -> AllanFigures:
 
     # relative sigma of a variance from as many independent differences as the log contains
     weight = np.sqrt(np.maximum(count * tau[0] / tau / 2.0 - 1.0, 0.5))
-    terms = np.stack([1.0 / tau, np.full(len(tau), _FLAT), tau / 3.0], -1)
+    terms = np.stack([1.0 / tau, np.full(len(tau), _INSTABILITY_FACTOR), tau / 3.0], -1)
     out = []
     for variance in (deviation**2).T:
         scaled = terms * (weight / variance)[:, None]

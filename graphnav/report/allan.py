@@ -12,10 +12,10 @@ from graphnav.report import page
 from graphnav.report.plots import Figure
 
 _COLOURS = ("batch", "ekf", "incremental")  # of x, y, z
-_HEIGHT = 300  # pixels
+_PICTURE_HEIGHT = 300  # pixels
 
 
-def write(result: Allan, folder: Path) -> list[Path]:
+def write_allan(result: Allan, folder: Path) -> list[Path]:
     """Write allan.html, allan.csv and noise.toml into `folder`, which is made if need be; returns their paths."""
     folder.mkdir(parents=True, exist_ok=True)
     paths = [folder / name for name in ("allan.html", "allan.csv", "noise.toml")]
@@ -40,7 +40,7 @@ def _draw_deviations(tau: Array, deviations: Array, noise: AllanFigures, unit: s
     low, high = np.log10([min(deviations.min(), fit.min()), max(deviations.max(), fit.max())])
     figure = Figure(
         [f"Allan deviation, {unit}"], tuple(np.log10(tau[[0, -1]])), [(low - 0.1, high + 0.1)], units=[unit], log=True,
-        x_log=True, height=_HEIGHT, x="averaging time [s]",
+        x_log=True, height=_PICTURE_HEIGHT, x="averaging time [s]",
     )  # fmt: skip
     (panel,) = figure.panels
     for k, name in enumerate(_COLOURS):

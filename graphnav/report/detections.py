@@ -21,7 +21,7 @@ from graphnav.report.wording import Quantity
 _MAX_STOPS = 30  # stops listed at most
 
 
-def write(recording: Recording, found: Detections, folder: Path) -> list[Path]:
+def write_detections(recording: Recording, found: Detections, folder: Path) -> list[Path]:
     """Write all files; times are on the recording's clock, as in trajectory.csv."""
     folder.mkdir(parents=True, exist_ok=True)
     intervals, statistics = (folder / n for n in ("detections.csv", "statistics.csv.gz"))
@@ -48,7 +48,7 @@ def _make_page(recording: Recording, found: Detections) -> str:
     lead = [page.paragraph(line) for line in _describe(recording, found)]
     sections = [
         ("Statistics", [page.gallery(report_pictures.draw_detections(recording, found.all))]),
-        ("Stationary intervals", [page.format_table(["from", "to", "for", "share by detector"], rows)] if rows else []),
+        ("Stationary intervals", [page.make_table(["from", "to", "for", "share by detector"], rows)] if rows else []),
         ("Notes", [page.bullets(found.notes)] if found.notes else []),
     ]
     return page.make_page(f"{recording.name}: detectors", lead, sections)

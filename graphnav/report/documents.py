@@ -21,10 +21,10 @@ from graphnav.report import sentences as words
 from graphnav.report import summary as summary
 from graphnav.report import tables as tables
 from graphnav.report.doubts import list_doubts
-from graphnav.report.plots import PALETTE, Shades, Spans
+from graphnav.report.plots import PALETTE, Shades, Tinted
 from graphnav.report.provenance import tabulate_provenance
 from graphnav.report.satellites import make_satellite_parts
-from graphnav.report.tables import Withheld
+from graphnav.report.tables import Removed
 
 if TYPE_CHECKING:
     from graphnav.estimation.noise.table import FigureRow
@@ -41,8 +41,8 @@ def write_report(
     settings: Mapping[str, Any],
     metrics: Mapping[str, Any] | None = None,
     errors: Errors | None = None,
-    withheld: Withheld = (),
-    outages: Spans = (),
+    withheld: Removed = (),
+    outages: Tinted = (),
     findings: Sequence[str] = (),
     defects: Sequence[str] = (),
     contradicted: str | None = None,
@@ -176,8 +176,8 @@ def write_comparison(
     settings: Mapping[str, Any],
     metrics: Mapping[str, Mapping[str, Any]] | None = None,
     errors: Mapping[str, Errors] | None = None,
-    withheld: Withheld = (),
-    outages: Spans = (),
+    withheld: Removed = (),
+    outages: Tinted = (),
     findings: Sequence[str] = (),
     defects: Sequence[str] = (),
     provenance: Mapping[str, Any] | None = None,
@@ -223,7 +223,7 @@ def write_comparison(
         ("Differences between solvers", _make_gallery(pictures.draw_differences(solutions, start, end, spans))),
         ("Consistency of sigma", _draw_consistency(every, start, end, spans)),
         ("Uncertainty", _make_gallery(pictures.draw_sigmas(tracks, start, end, spans))),
-        ("Constraints", [page.format_table(["constraint", "solver", *tables.CONSISTENCY_HEAD], rows)] if rows else []),
+        ("Constraints", [page.make_table(["constraint", "solver", *tables.CONSISTENCY_HEAD], rows)] if rows else []),
         ("Noise model", [*tables.tabulate_noise(noise, first), *tables.tabulate_excluded(first, start)]),
         ("Findings", tables.list_findings(recording, findings)),
         ("Runs", tables.run_table(solutions)),
@@ -263,7 +263,7 @@ def _list_clocks(recording: Recording) -> list[page.TimeAxis]:
     return out
 
 
-def _list_shades(solution: Solution, start: float, withheld: Withheld, outages: Spans) -> Shades:
+def _list_shades(solution: Solution, start: float, withheld: Removed, outages: Tinted) -> Shades:
     """Spans of time to be tinted, s from the start, by kind."""
     excluded = [(part.t_start - start, part.t_end - start) for part in solution.excluded]
     gone = list(dict.fromkeys(span for _, span in withheld if span is not None))

@@ -25,7 +25,7 @@ _BY_INFORMATION = "batch rts isam2 incremental ekf"  # the most first
 _BRIEF = (
     0.01  # share of a drive in which what a filter met by chance, an outlier or the first fix after a gap, may show
 )
-_ROUNDING = 1e-12  # m^2, a micrometre
+_NEGLIGIBLE_VARIANCE = 1e-12  # m^2, a micrometre
 _LARGEST_EXCLUDED_SHARE = 0.5  # share of the fixes' information; above it most measurements contradict the result
 TOO_LARGE = {"innovation": 1.5, "residual": 1.15}  # RMS over sigma; a fit reduces residuals
 
@@ -47,7 +47,7 @@ def find_departures(solutions: Mapping[str, Solution]) -> dict[str, Note]:
         off = one.states.p - solutions[best].states.p
         P = one.covariance[:, BLOCKS["p"], BLOCKS["p"]]
         known = np.isfinite(P).all(axis=(1, 2))
-        off, P = off[known], P[known] + _ROUNDING * np.eye(3)
+        off, P = off[known], P[known] + _NEGLIGIBLE_VARIANCE * np.eye(3)
         over = np.sqrt(np.einsum("ki,ki->k", off, np.linalg.solve(P, off[:, :, None])[:, :, 0]))
         size = np.linalg.norm(off, axis=1)
         beyond = np.flatnonzero(over > np.sqrt(chi_square_quantile(1.0 - BY_CHANCE, 3)))

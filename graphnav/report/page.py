@@ -22,15 +22,15 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
 from graphnav.core.errors import ConfigError
-from graphnav.report.plots import TIME, Figure, format_css, name_variable
-from graphnav.report.wording import Quantity, show
+from graphnav.report.plots import TIME_NAME, Figure, format_css, name_variable
+from graphnav.report.wording import Quantity, format_value
 
 _HERE = Path(__file__).parent
-_LEVEL = 5  # of zlib: two thirds of the time of level 6, and less than a hundredth larger
+_ZLIB_LEVEL = 5  # of zlib: two thirds of the time of level 6, and less than a hundredth larger
 
 
 _TEMPLATES = Environment(
-    loader=FileSystemLoader(_HERE), autoescape=True, finalize=show, undefined=StrictUndefined, trim_blocks=True
+    loader=FileSystemLoader(_HERE), autoescape=True, finalize=format_value, undefined=StrictUndefined, trim_blocks=True
 )
 _PARTS: Any = _TEMPLATES.get_template("parts.html").module
 bullets, code, columns, digest, download, fold, gallery, heading, links, pairs, paragraph, tiles, verdicts = (
@@ -46,7 +46,7 @@ def format_solver(name: str) -> Markup:
     return _PARTS.solver(name, name_variable(name))
 
 
-def format_table(head: Sequence[Any], rows: Iterable[Sequence[Any]], best: Sequence[int] = ()) -> Markup:
+def make_table(head: Sequence[Any], rows: Iterable[Sequence[Any]], best: Sequence[int] = ()) -> Markup:
     """A table, text left and numbers right; in the columns `best` the smallest number is bold.
 
     A column without any number is omitted.
@@ -124,7 +124,8 @@ def make_page(
     sections = [(head, parts) for head, parts in sections if any(parts)]
     drawn = any("<figure" in part for _, parts in sections for part in parts)
     return _TEMPLATES.get_template("page.html").render(
-        title=title, lead=lead, sections=sections, clocks=clocks, time=TIME, library=_read_library() if drawn else None,
+        title=title, lead=lead, sections=sections, clocks=clocks, time=TIME_NAME,
+        library=_read_library() if drawn else None,
         style=Markup(format_css(others) + _read("page.css")), script=Markup(_read("page.js")),
     )  # fmt: skip
 
@@ -152,4 +153,4 @@ def _read_library() -> Packed:
 
 
 def _pack(content: bytes) -> Packed:
-    return Packed(len(content), Markup(base64.b64encode(zlib.compress(content, _LEVEL)).decode("ascii")))
+    return Packed(len(content), Markup(base64.b64encode(zlib.compress(content, _ZLIB_LEVEL)).decode("ascii")))

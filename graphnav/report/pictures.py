@@ -19,7 +19,7 @@ from graphnav.estimation.solution import ParameterEstimate, Solution
 from graphnav.evaluation.against import select_own
 from graphnav.recording import FIX_TYPES, Recording
 from graphnav.report import page, plots
-from graphnav.report.plots import Curve, Shades, Spans
+from graphnav.report.plots import Curve, Shades, Tinted
 from graphnav.report.plots.paths import draw_fixes
 
 if TYPE_CHECKING:
@@ -29,7 +29,7 @@ ENU = ("east", "north", "up")
 RPH = ("roll", "pitch", "heading")
 XYZ = ("x right", "y forward", "z up")
 TO_DEG = float(np.degrees(1.0))
-DEG_H = float(np.degrees(3600.0))
+TO_DEG_H = float(np.degrees(3600.0))
 
 
 def draw_trajectory(recording: Recording, solutions: Mapping[str, Solution], spans: Shades) -> Markup:
@@ -297,7 +297,7 @@ def draw_biases(solution: Solution, start: float, end: float, spans: Shades) -> 
     t = solution.t - start
     out = []
     for words, value, sigma, unit, scale in (
-        ("Gyro bias", solution.states.bg, sd[:, 12:15], "deg/h", DEG_H),
+        ("Gyro bias", solution.states.bg, sd[:, 12:15], "deg/h", TO_DEG_H),
         ("Accelerometer bias", solution.states.ba, sd[:, 9:12], "mm/s²", 1000.0),
     ):
         series = {solution.solver: Curve(t, value * scale, sigma * scale)}
@@ -326,7 +326,7 @@ def draw_parameters(
     return out
 
 
-def zoom_pictures(errors: Mapping[str, Errors], start: float, spans: Spans, what: str = "withheld") -> list[Markup]:
+def zoom_pictures(errors: Mapping[str, Errors], start: float, spans: Tinted, what: str = "withheld") -> list[Markup]:
     """Horizontal error in and around each span."""
     if not spans or not errors:
         return []

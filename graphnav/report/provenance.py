@@ -32,12 +32,12 @@ def tabulate_provenance(settings: Mapping[str, Any], provenance: Mapping[str, An
     inputs = provenance.pop("inputs", {})
     if provenance:
         noise = provenance.pop("noise", None)
-        listed = [f"{key} {wording.show(value)}" for key, value in page.flatten(provenance).items()]
+        listed = [f"{key} {wording.format_value(value)}" for key, value in page.flatten(provenance).items()]
         words = [*([join_words(listed)] if listed else []), *([f"noise figures: {noise}"] if noise else [])]
         out += [page.heading("Versions"), page.paragraph("; ".join(words))]
     if inputs:
         rows = [[name, page.digest(digest)] for name, digest in inputs.items()]
-        out += [page.heading("Inputs"), page.format_table(["file", "sha256"], rows)]
+        out += [page.heading("Inputs"), page.make_table(["file", "sha256"], rows)]
     return out
 
 

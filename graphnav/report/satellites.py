@@ -96,8 +96,8 @@ def tabulate_satellites(solution: Solution) -> list[Markup]:
     ]
     head = [cell for kind in records for cell in (f"{kind} rows", "refused", "RMS / sigma")]
     return [
-        page.format_table(["satellite", *head], by_satellite),
-        page.format_table(["elevation", *head], by_elevation),
+        page.make_table(["satellite", *head], by_satellite),
+        page.make_table(["elevation", *head], by_elevation),
     ]
 
 
@@ -120,4 +120,4 @@ def tabulate_ambiguities(solution: Solution) -> list[Markup]:
     fixed = int(np.sum(epochs[:, 1] > 0.0))
     share = Quantity(f"{100.0 * fixed / len(epochs):.1f} %")
     head = ["epochs with carriers", "ambiguities fixed as integers", "float", "share fixed"]
-    return [page.format_table(head, [[len(epochs), fixed, len(epochs) - fixed, share]])]
+    return [page.make_table(head, [[len(epochs), fixed, len(epochs) - fixed, share]])]

@@ -15,8 +15,8 @@ from graphnav.evaluation.segments import compute_rms
 from graphnav.recording import Recording
 from graphnav.report import page, wording
 from graphnav.report.doubts import FEWEST_ROWS, TOO_LARGE, measure_consistency
-from graphnav.report.plots import Spans
-from graphnav.report.tables import Withheld
+from graphnav.report.plots import Tinted
+from graphnav.report.tables import Removed
 from graphnav.report.wording import join_words
 
 if TYPE_CHECKING:
@@ -37,7 +37,7 @@ def describe_deciding(recording: Recording, settings: Mapping[str, Any]) -> str:
     )
 
 
-def describe_run(recording: Recording, solutions: Mapping[str, Solution], withheld: Withheld, outages: Spans) -> str:
+def describe_run(recording: Recording, solutions: Mapping[str, Solution], withheld: Removed, outages: Tinted) -> str:
     """Describe the run in a few sentences."""
     used = recording
     for source, span in withheld:
@@ -178,7 +178,7 @@ def describe_closure(name: str, metrics: Mapping[str, Any] | None) -> list[Marku
     if not metrics or metrics.get("closure_h_m") is None:
         return []
     h, up, distance, share = (
-        wording.show(metrics.get(f"closure_{k}")) for k in ("h_m", "up_m", "distance_m", "percent")
+        wording.format_value(metrics.get(f"closure_{k}")) for k in ("h_m", "up_m", "distance_m", "percent")
     )
     words = f"the loop of {distance} m closes to {h} m horizontally ({share} % of the path) and {up} m in height."
     return [page.paragraph(f"{name}: {words}", "verdict")]

@@ -17,13 +17,13 @@ from graphnav.recording import Recording
 from graphnav.report import page, wording
 from graphnav.report.consistency import summarise_record
 from graphnav.report.pictures import ENU, select_fixes
-from graphnav.report.tables import Withheld
+from graphnav.report.tables import Removed
 from graphnav.report.wording import Quantity, join_words
 
 if TYPE_CHECKING:
     from graphnav.evaluation.metrics import Errors
 
-_LINES = 3  # exclusions listed
+_MAX_LINES = 3  # exclusions listed
 _SAYS = {
     "too small": ("bad", "sigma is too small"),
     "unclear": ("", "consistency of sigma is open: errors are correlated for too long"),
@@ -102,10 +102,10 @@ def tabulate_sigmas(solution: Solution) -> list[Markup]:
         deg = np.degrees(track.sd_rph)
         add("roll, pitch", "deg", np.maximum(deg[:, 0], deg[:, 1]))
         add("heading", "deg", deg[:, 2])
-    return [page.heading("Stated 1-sigma"), page.format_table(["of", "50 %", "95 %", "largest"], rows)] if rows else []
+    return [page.heading("Stated 1-sigma"), page.make_table(["of", "50 %", "95 %", "largest"], rows)] if rows else []
 
 
-def fix_table(recording: Recording, solution: Solution, withheld: Withheld) -> list[Markup]:
+def fix_table(recording: Recording, solution: Solution, withheld: Removed) -> list[Markup]:
     """Fixes of each kind: number, excluded or used, longest gap, largest residual."""
     fixes, nan = select_fixes(recording, solution), float("nan")
     if fixes is None:
@@ -135,7 +135,7 @@ def fix_table(recording: Recording, solution: Solution, withheld: Withheld) -> l
     head.append("stated [m]")
     if recording.gnss is not None and recording.gnss.satellites is not None:
         head += ["satellites", "fewest"]
-    out = [page.heading("Fixes"), page.format_table(head, rows)]
+    out = [page.heading("Fixes"), page.make_table(head, rows)]
     if "gnss_code" in solution.records:
         out.append(page.paragraph("Raw observations are used in place of the fixes.", "soft"))
     elif any(row[4] < row[1] - row[3] for row in rows):
@@ -172,7 +172,7 @@ def tabulate_separation(solution: Solution) -> list[Markup]:
         return []
     note = "Forward filter less what comes after each keyframe; over its sigma it is 1 (rms) where sigma is true."
     head = ["axis", "50 % [m]", "95 % [m]", "largest [m]", "over sigma, rms"]
-    return [page.heading("Combined separation"), page.format_table(head, rows), page.paragraph(note, "soft")]
+    return [page.heading("Combined separation"), page.make_table(head, rows), page.paragraph(note, "soft")]
 
 
 def _find_rows(t: Array, of: Array | None) -> np.ndarray:
@@ -186,7 +186,7 @@ def _find_rows(t: Array, of: Array | None) -> np.ndarray:
 def describe_excluded(solution: Solution, start: float) -> list[Markup]:
     """What was excluded and why, in three lines: the largest spans, the rest together, what was down-weighted."""
     spans = sorted(solution.excluded, key=lambda p: -p.count)
-    some = spans[:_LINES] if len(spans) <= _LINES else spans[: _LINES - 1]
+    some = spans[:_MAX_LINES] if len(spans) <= _MAX_LINES else spans[: _MAX_LINES - 1]
     lines = [
         f"{p.kind}, {format_count(p.count, 'row')} from {p.t_start - start:.1f} to {p.t_end - start:.1f} s: "
         f"{p.reason or 'faulty'}"
@@ -202,7 +202,7 @@ def describe_excluded(solution: Solution, start: float) -> list[Markup]:
         for name, record in solution.records.items()
         if np.any(((w := select_weights(record.t, solution.noise, name)) > 0) & (w < 0.5))
     ]
-    if less and len(lines) < _LINES:
+    if less and len(lines) < _MAX_LINES:
         lines.append(f"less than half weight, because they are farther off than chance allows: {join_words(less)}")
     return [page.heading("Left out"), page.bullets(lines or [Note("left_out.nothing", "Nothing was left out.")])]
 
@@ -231,4 +231,4 @@ def tabulate_relative_errors(errors: Mapping[str, Errors]) -> list[Markup]:
     head = ["solver", "segment [m]", "count", "RMS [m]", "% of length", "95 % [m]", "largest [m]", "heading RMS [deg]"]
     if not rows:
         return []
-    return [page.heading("Relative error by segment length"), page.format_table(head, rows)]
+    return [page.heading("Relative error by segment length"), page.make_table(head, rows)]

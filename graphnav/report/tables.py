@@ -19,7 +19,7 @@ from graphnav.evaluation.segments import compute_rms
 from graphnav.recording import Recording
 from graphnav.report import page, wording
 from graphnav.report.consistency import CONSISTENCY_HEAD, compute_mean, summarise_record, tabulate_record
-from graphnav.report.plots import Spans
+from graphnav.report.plots import Tinted
 from graphnav.report.wording import Quantity, join_words
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 _MAX_ROWS = 40  # rejected measurements and stops listed at most
 _UNFOLDED_ROWS = 10  # excluded spans and stops shown; the others are folded
-Withheld = Sequence[tuple[str, tuple[float, float] | None]]
+Removed = Sequence[tuple[str, tuple[float, float] | None]]
 
 
 def tabulate_constraints(solution: Solution) -> list[Markup]:
@@ -36,7 +36,7 @@ def tabulate_constraints(solution: Solution) -> list[Markup]:
     out = []
     rows = [[kind, *tabulate_record(summarise_record(record))] for kind, record in solution.records.items()]
     if rows:
-        out.append(page.format_table(["constraint", *CONSISTENCY_HEAD], rows))
+        out.append(page.make_table(["constraint", *CONSISTENCY_HEAD], rows))
         kinds = {r.kind for r in solution.records.values()}
         note = "A Gaussian leaves 0.27 % outside 3 sigma. "
         if "innovation" in kinds:
@@ -96,13 +96,13 @@ def tabulate_span(errors: Errors, span: tuple[float, float], start: float) -> li
 
 
 def tabulate_all_accuracy(
-    errors: Mapping[str, Errors], withheld: Withheld, start: float, outages: Spans = ()
+    errors: Mapping[str, Errors], withheld: Removed, start: float, outages: Tinted = ()
 ) -> list[Markup]:
     """A table of all solvers over the whole run, and one for each withheld span."""
     if not errors:
         return []
     rows = [[page.format_solver(name), *tabulate_accuracy(e)] for name, e in errors.items()]
-    out = [page.heading("Whole recording"), page.format_table(["solver", *COMPARED], rows, best=range(1, 7))]
+    out = [page.heading("Whole recording"), page.make_table(["solver", *COMPARED], rows, best=range(1, 7))]
     gone = list(dict.fromkeys(span for _, span in withheld if span is not None))
     spans = [("Withheld", span) for span in gone]
     spans += [("No GNSS", (a, b)) for a, b in outages if not any(c < b and d > a for c, d in gone)]
@@ -114,13 +114,13 @@ def tabulate_all_accuracy(
         return [
             *out,
             page.heading("Spans without a source"),
-            page.format_table(["span", "what", *COMPARED_SPAN], rows),
+            page.make_table(["span", "what", *COMPARED_SPAN], rows),
             *_list_notes(errors),
         ]
     for what, (a, b) in spans:
         rows = [[page.format_solver(name), *tabulate_span(e, (a, b), start)] for name, e in errors.items()]
         out.append(page.heading(f"{what} {a:g} to {b:g} s" if what == "Withheld" else f"{what} {a:.1f} to {b:.1f} s"))
-        out.append(page.format_table(["solver", *COMPARED_SPAN], rows, best=range(1, 7)))
+        out.append(page.make_table(["solver", *COMPARED_SPAN], rows, best=range(1, 7)))
     return [*out, *_list_notes(errors)]
 
 
@@ -156,7 +156,7 @@ def tabulate_noise(rows: Sequence[FigureRow], solution: Solution) -> list[Markup
             ]
             for row in rows
         ]
-        out.append(page.format_table(NOISE_HEAD, cells))
+        out.append(page.make_table(NOISE_HEAD, cells))
         note = (
             "Stated figures of fixes are medians of their sigmas. The white part and the lasting parts add up as "
             "variances. A figure with few degrees of freedom is mostly what was expected beforehand."
@@ -203,9 +203,9 @@ def tabulate_excluded(solution: Solution, start: float) -> list[Markup]:
 
 def _format_long_table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> list[Markup]:
     """A table whose later rows are folded."""
-    out = [page.format_table(head, rows[:_UNFOLDED_ROWS])]
+    out = [page.make_table(head, rows[:_UNFOLDED_ROWS])]
     if len(rows) > _UNFOLDED_ROWS:
-        out.append(page.fold(f"{len(rows) - _UNFOLDED_ROWS} more", [page.format_table(head, rows[_UNFOLDED_ROWS:])]))
+        out.append(page.fold(f"{len(rows) - _UNFOLDED_ROWS} more", [page.make_table(head, rows[_UNFOLDED_ROWS:])]))
     return out
 
 
@@ -221,7 +221,7 @@ def tabulate_rejected(solution: Solution, start: float) -> list[Markup]:
     if not rows:
         return []
     largest = sorted(rows, key=lambda row: -row[1][3])[:_MAX_ROWS]
-    table = page.format_table(
+    table = page.make_table(
         ["when", "constraint", "largest component", "over sigma"], [r for _, r in sorted(largest, key=lambda r: r[0])]
     )
     many = len(rows)
@@ -257,7 +257,7 @@ def tabulate_nees(errors: Mapping[str, Errors]) -> list[Markup]:
                 worth = Quantity(f"{one.effective:.0f}")
                 rows.append([page.format_solver(name), words, found.mean, inside, found.n, worth, says[one.verdict]])
     head = ["solver", "of", "mean NEES / dof", "epochs inside 95 %", "epochs", "worth independent", "what it says"]
-    return [page.format_table(head, rows)] if rows else []
+    return [page.make_table(head, rows)] if rows else []
 
 
 def tabulate_parameters(parameters: Mapping[str, ParameterEstimate]) -> list[Markup]:
@@ -271,7 +271,7 @@ def tabulate_parameters(parameters: Mapping[str, ParameterEstimate]) -> list[Mar
             shown = [wording.format_to_sigma(value, sigma), wording.format_to_sigma(sigma, sigma), before]
             rows.append([one.words, *shown, one.unit, known])
     head = ["parameter", "value", "sigma", "sigma before", "unit", "seen by the data"]
-    return [page.format_table(head, rows)] if rows else []
+    return [page.make_table(head, rows)] if rows else []
 
 
 def run_table(solutions: Mapping[str, Solution]) -> list[Markup]:
@@ -293,7 +293,7 @@ def run_table(solutions: Mapping[str, Solution]) -> list[Markup]:
     own = {name: [note for note in s.notes if get_key(note) not in TABULATED] for name, s in every.items()}
     shared = [note for note in own[next(iter(solutions))] if all(note in own[name] for name in solutions)]
     theirs = [f"{name}: {note}" for name, some in own.items() for note in some if note not in shared]
-    table = page.format_table(["stage", *(page.format_solver(name) for name in solutions)], rows)
+    table = page.make_table(["stage", *(page.format_solver(name) for name in solutions)], rows)
     lines = [*notes, *shared, *theirs]
     return [page.columns([[table], [page.bullets(lines)]]) if lines else table]
 
@@ -308,7 +308,7 @@ def tabulate_metrics(metrics: Mapping[str, Any] | None, name: str = "") -> list[
     ]
     spans = metrics.get("spans")
     if isinstance(spans, Sequence) and spans and isinstance(spans[0], Mapping):
-        inner.append(page.format_table(list(spans[0]), [[s.get(k) for k in spans[0]] for s in spans]))
+        inner.append(page.make_table(list(spans[0]), [[s.get(k) for k in spans[0]] for s in spans]))
     return [page.fold(f"All measures{' of ' if name else ''}{name}", inner)]
 
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 
-def show(value: Any) -> Any:
+def format_value(value: Any) -> Any:
     """A value as text; numbers with four significant digits."""
     if value is None:
         return "-"

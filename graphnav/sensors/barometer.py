@@ -20,7 +20,7 @@ _SCALE_HEIGHT = 288.15 / 6.5e-3  # m
 _POWER = 287.05287 * 6.5e-3 / STANDARD_GRAVITY
 
 
-class Figures(TomlTable):
+class BarometerKeys(TomlTable):
     """Keys of [barometer] beside its file."""
 
     sigma: Positive = Field(0.5, description="m, 1-sigma of one reading; wind and ventilation make most of it")
@@ -41,7 +41,7 @@ SENSOR = Sensor(
         Column("height", {"m": 1.0, "ft": 0.3048}, -1500.0, 10000.0),
     ),
     needs=(("pressure",), ("height",)),
-    figures=Figures,
+    figures=BarometerKeys,
 )
 
 

@@ -9,7 +9,7 @@ from graphnav.sensors.base import Column, Sensor
 from graphnav.sensors.tables import ANGLE, NotNegative, Positive, TomlTable, Vector
 
 
-class Figures(TomlTable):
+class DualAntennaKeys(TomlTable):
     """Keys of [dual_antenna] beside its file."""
 
     baseline: Vector = Field(
@@ -39,6 +39,6 @@ SENSOR = Sensor(
         Column("sd_pitch", ANGLE, *_SIGMA_RANGE),
     ),
     needs=(("heading",),),
-    figures=Figures,
+    figures=DualAntennaKeys,
     keyframes=True,
 )

@@ -9,7 +9,7 @@ import numpy as np
 
 from graphnav.core.rotation import Array
 
-_GRID = 0.005  # m, between the points at which a route is integrated
+_ROUTE_STEP = 0.005  # m, between the points at which a route is integrated
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ def make_route(parts: Sequence[tuple[float, float]], heading: float = 0.0) -> Ro
     """From parts (m, deg): each so long, and turning evenly by so much, to the right positive; `heading` in deg."""
     edges = np.concatenate([[0.0], np.cumsum([length for length, _ in parts])])
     turned = heading + np.concatenate([[0.0], np.cumsum([turn for _, turn in parts])])
-    s = np.linspace(0.0, edges[-1], int(np.ceil(edges[-1] / _GRID)) + 1)
+    s = np.linspace(0.0, edges[-1], int(np.ceil(edges[-1] / _ROUTE_STEP)) + 1)
     psi = np.deg2rad(np.interp(s, edges, turned))
     step = np.column_stack([np.sin(psi), np.cos(psi)])
     moved = np.cumsum(0.5 * (step[1:] + step[:-1]), axis=0) * (s[1] - s[0])

@@ -25,10 +25,10 @@ from graphnav.core.rotation import Array
 from graphnav.simulation.footsteps import Footprints
 from graphnav.simulation.splines import list_centres, make_spline
 
-STEP = 0.005  # s between coefficients: a shock lasts some 15 ms
-DEGREE = 4  # force and turn acceleration are continuous
+GAIT_STEP = 0.005  # s between coefficients: a shock lasts some 15 ms
+GAIT_DEGREE = 4  # force and turn acceleration are continuous
 EAST, NORTH, UP, ROLL, PITCH, HEADING = range(6)  # channels: m, rad
-PLACE = slice(EAST, UP + 1)
+PLACE_CHANNELS = slice(EAST, UP + 1)
 _MUSCLE = 0.012  # s, the shortest time in which a turn rate can change
 _SWING = 0.045  # s, over which the foot's height in the air is smoothed
 
@@ -105,7 +105,7 @@ class Foot:
 
 # Shares of a stance's time and what the pitch is there, in deg: flat after the slap, heel off, rising on the ball.
 _FLAT, _HEEL_OFF = 0.17, 0.58
-_ROLLING = ((_FLAT, 1.6), (0.38, -0.3), (_HEEL_OFF, -2.6), (0.74, -6.5), (0.88, -17.0))
+_ROLLING_PITCH = ((_FLAT, 1.6), (0.38, -0.3), (_HEEL_OFF, -2.6), (0.74, -6.5), (0.88, -17.0))
 
 
 def walk(steps: Footprints, style: Style, sole: Sole, end: float, rng: np.random.Generator) -> Foot:
@@ -114,7 +114,7 @@ def walk(steps: Footprints, style: Style, sole: Sole, end: float, rng: np.random
     The first stance is rest until the heel lifts, the last is rest after the landing.
     """
     K = len(steps)
-    t = list_centres(0.0, end, STEP, DEGREE)
+    t = list_centres(0.0, end, GAIT_STEP, GAIT_DEGREE)
     strike, off = steps.strike, steps.off
     vary = 1.0 + style.jitter * rng.standard_normal((K, 11))
     sway = np.deg2rad(0.03) * _draw_sway(len(t), rng, 2)
@@ -135,7 +135,7 @@ def walk(steps: Footprints, style: Style, sole: Sole, end: float, rng: np.random
     share, slope = _share_of_swing(u), u**6 - u**5  # the latter: of unit slope at its end, else nothing at both
     landing = style.landing[0] * vary[1:, 0] * took / np.maximum(np.linalg.norm(ahead, axis=1), 0.1)
     # the sole compresses by millimetres, which softens the end of the strike
-    share = gaussian_filter1d(share + np.minimum(landing, 0.5)[k] * slope + k, style.give / STEP) - k
+    share = gaussian_filter1d(share + np.minimum(landing, 0.5)[k] * slope + k, style.give / GAIT_STEP) - k
     base = steps.place[k] + share[:, None] * ahead[k]
     h = sole.compute_height(pitch)
     aside = h * np.sin(roll) + style.circumduction * vary[k, 1] * np.sin(np.pi * u) ** 2
@@ -145,13 +145,13 @@ def walk(steps: Footprints, style: Style, sole: Sole, end: float, rng: np.random
     # in the air nothing holds the shoe to the floor: heel and toes pass each other smoothly
     air = np.clip(np.minimum(u / 0.35, (1.0 - u) / 0.3), 0.0, 1.0)
     air = air * air * (3.0 - 2.0 * air)
-    up = h + air * (gaussian_filter1d(h, _SWING / STEP) - h) + gaussian_filter1d(clearance, style.give / STEP)
+    up = h + air * (gaussian_filter1d(h, _SWING / GAIT_STEP) - h) + gaussian_filter1d(clearance, style.give / GAIT_STEP)
     east = base[:, 0] + along * np.sin(psi) + aside * np.cos(psi)
     north = base[:, 1] + along * np.cos(psi) - aside * np.sin(psi)
     x = np.column_stack([east, north, up, roll, pitch, psi]) + _make_ring(t, strike[1:], style, rng)
     stances = np.column_stack([begins + _FLAT * (ends - begins), begins + _HEEL_OFF * (ends - begins)])
     stances[0, 0], stances[-1, 1] = 0.0, end
-    return Foot(make_spline(0.0, STEP, x, DEGREE), 0.0, end, np.column_stack([strike, off]), stances)
+    return Foot(make_spline(0.0, GAIT_STEP, x, GAIT_DEGREE), 0.0, end, np.column_stack([strike, off]), stances)
 
 
 def _smooth(t: Array, knots: list[Array], values: list[Array]) -> Array:
@@ -160,13 +160,13 @@ def _smooth(t: Array, knots: list[Array], values: list[Array]) -> Array:
     order = np.argsort(at, kind="stable")
     curve = PchipInterpolator(at[order], np.concatenate([np.ravel(x) for x in values])[order], extrapolate=False)
     out = curve(np.clip(t, at.min(), at.max()))
-    return gaussian_filter1d(out, _MUSCLE / STEP, mode="nearest")
+    return gaussian_filter1d(out, _MUSCLE / GAIT_STEP, mode="nearest")
 
 
 def _make_pitch(t: Array, steps: Footprints, begins: Array, ends: Array, style: Style, vary: Array) -> Array:
     K, D = len(steps), ends - begins
     knots, values = [steps.strike[1:]], [style.strike_pitch * vary[1:, 3]]
-    for share, value in _ROLLING:
+    for share, value in _ROLLING_PITCH:
         # before it starts and after it ends to walk, the foot is flat
         rows = np.arange(K)[(1 if share < _HEEL_OFF else 0) : (K - 1 if share > _FLAT else K)]
         knots.append(begins[rows] + share * D[rows])
@@ -206,13 +206,13 @@ def _make_roll(t: Array, steps: Footprints, begins: Array, style: Style, vary: A
 
 
 # Bernstein coefficients of the slide's speed: it takes over from the rolling and has nearly ended before the strike
-_SPEED = np.array([0.0, 0.65, 1.05, 1.25, 1.45, 1.0, 0.0])
+_SPEED_CURVE = np.array([0.0, 0.65, 1.05, 1.25, 1.45, 1.0, 0.0])
 
 
 def _share_of_swing(u: Array) -> Array:
     """Share (n,) of the way between two footprints at shares u of the swing's time."""
-    knots = np.repeat([0.0, 1.0], len(_SPEED))
-    return BSpline(knots, _SPEED / _SPEED.mean(), len(_SPEED) - 1).antiderivative()(u)
+    knots = np.repeat([0.0, 1.0], len(_SPEED_CURVE))
+    return BSpline(knots, _SPEED_CURVE / _SPEED_CURVE.mean(), len(_SPEED_CURVE) - 1).antiderivative()(u)
 
 
 def _make_ring(t: Array, strikes: Array, style: Style, rng: np.random.Generator) -> Array:
@@ -235,5 +235,5 @@ def _make_ring(t: Array, strikes: Array, style: Style, rng: np.random.Generator)
 
 def _draw_sway(count: int, rng: np.random.Generator, columns: int) -> Array:
     """(count, columns) of unit size: the sway of a standing person."""
-    x = gaussian_filter1d(rng.standard_normal((count, columns)), 0.3 / STEP, axis=0)
+    x = gaussian_filter1d(rng.standard_normal((count, columns)), 0.3 / GAIT_STEP, axis=0)
     return x / np.sqrt(np.mean(x**2, axis=0))

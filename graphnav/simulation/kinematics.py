@@ -21,7 +21,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from graphnav.core import rotation
-from graphnav.core.earth import E2, RATE, A, ecef_to_llh, enu_axes, gravity, llh_to_ecef
+from graphnav.core.earth import E2, EARTH_RATE, A, ecef_to_llh, enu_axes, gravity, llh_to_ecef
 from graphnav.core.progress import tell
 from graphnav.core.rotation import Array
 from graphnav.simulation.motion import BANK, HEADING, SLIP, SLOPE, SPEED, Path
@@ -125,7 +125,7 @@ def _level(felt: _AxleMotion, lat: Array, h: Array) -> tuple[Array, Array, Array
     north, east = _compute_radii(lat, h)
     ve, vn = felt.v_axle[:, 0], felt.v_axle[:, 1]
     transport = np.column_stack([-vn / north, ve / east, ve * np.tan(lat) / east])
-    earth = RATE * np.column_stack([np.zeros_like(lat), np.cos(lat), np.sin(lat)])
+    earth = EARTH_RATE * np.column_stack([np.zeros_like(lat), np.cos(lat), np.sin(lat)])
     to_base, to_body = np.swapaxes(felt.R_base, -1, -2), np.swapaxes(felt.R_lv, -1, -2)
     omega_base = felt.euler_base + rotation.mv(to_base, transport)
     V_l = felt.v_axle + rotation.mv(felt.R_base, np.cross(omega_base, felt.arm) + felt.arm_rate)
@@ -137,7 +137,7 @@ def _level(felt: _AxleMotion, lat: Array, h: Array) -> tuple[Array, Array, Array
     return V_l, rotation.mv(to_body, V_l), omega, rotation.mv(to_body, earth), rotation.mv(to_body, g_l)
 
 
-def move(path: Path, origin: tuple[float, float, float], mount: Mount, shake: Shake, rate: float) -> TrueMotion:
+def move_vehicle(path: Path, origin: tuple[float, float, float], mount: Mount, shake: Shake, rate: float) -> TrueMotion:
     """Drive `path` from `origin` (deg, deg, m; where the rear axle starts) with an IMU of `rate` Hz.
 
     Two hours at 200 Hz take some fifteen seconds.

@@ -16,9 +16,9 @@ from graphnav.core.findings import find_runs
 from graphnav.core.rotation import Array
 from graphnav.simulation.splines import list_centres, make_spline
 
-STEP = 0.1  # s between coefficients: a driver's hands and feet are no faster
-DEGREE = 3  # the acceleration is smooth, the jerk continuous
-SETTLE = (DEGREE - 1) / 2 * STEP  # s by which the spline of a speed that ends on the grid extends beyond its end
+PATH_STEP = 0.1  # s between coefficients: a driver's hands and feet are no faster
+CUBIC = 3  # the acceleration is smooth, the jerk continuous
+SETTLE = (CUBIC - 1) / 2 * PATH_STEP  # s by which the spline of a speed that ends on the grid extends beyond its end
 
 SPEED, HEADING, SLOPE, BANK, SLIP = range(5)  # channels of Path.spline
 
@@ -63,8 +63,8 @@ class Path:
     def find_stops(self) -> Array:
         """(M, 2) s: the spans in which the wheels do not turn at all."""
         zero = np.asarray(self.spline.c[:, SPEED] == 0.0)
-        whole = np.asarray(np.lib.stride_tricks.sliding_window_view(zero, DEGREE + 1).all(axis=1))
-        spans = [(self.start + a * STEP, min(self.start + b * STEP, self.end)) for a, b in find_runs(whole)]
+        whole = np.asarray(np.lib.stride_tricks.sliding_window_view(zero, CUBIC + 1).all(axis=1))
+        spans = [(self.start + a * PATH_STEP, min(self.start + b * PATH_STEP, self.end)) for a, b in find_runs(whole)]
         return np.array(spans, dtype=float).reshape(-1, 2)
 
 
@@ -96,7 +96,7 @@ def make_path(
         if m.turn and length[k] == 0:
             raise ConfigError(f"manoeuvre {k}: cannot turn on the spot", key="manoeuvre.on_the_spot")
 
-    t = list_centres(start, float(edges[-1]), STEP, DEGREE)
+    t = list_centres(start, float(edges[-1]), PATH_STEP, CUBIC)
     i = np.clip(np.searchsorted(edges, t, side="right") - 1, 0, len(durations) - 1)
     u = np.clip((t - edges[i]) / durations[i], 0.0, 1.0)
     gain = v1[i] - v0[i]
@@ -116,9 +116,9 @@ def make_path(
     psi = np.deg2rad(along(list(turned), heading))
     slope = np.arctan(along(_fill([m.grade for m in manoeuvres]), 0.0))
     bank = np.deg2rad(along(_fill([m.bank for m in manoeuvres]), 0.0))
-    slip = slip_per_accel * speed * np.gradient(psi, STEP)
+    slip = slip_per_accel * speed * np.gradient(psi, PATH_STEP)
     return Path(
-        make_spline(start, STEP, np.column_stack([speed, psi, slope, bank, slip]), DEGREE), start, float(edges[-1])
+        make_spline(start, PATH_STEP, np.column_stack([speed, psi, slope, bank, slip]), CUBIC), start, float(edges[-1])
     )
 
 

@@ -24,7 +24,7 @@ from graphnav.core.rotation import Array, mv
 from graphnav.core.trajectory import Trajectory
 from graphnav.recording import Imu, Recording, Truth
 from graphnav.recording.formats.writing import round_recording
-from graphnav.simulation.gait import HEADING, PITCH, PLACE, ROLL, STEP, Foot
+from graphnav.simulation.gait import GAIT_STEP, HEADING, PITCH, PLACE_CHANNELS, ROLL, Foot
 from graphnav.simulation.inertial import SimulatedImu
 from graphnav.simulation.kinematics import TrueMotion
 from graphnav.simulation.result import Simulated
@@ -50,7 +50,7 @@ def _move_foot(foot: Foot, R_fb: Array, t: Array) -> _FootMotion:
     # each rate about the axis it turns: heading about down, pitch about the unrolled right, roll about forward
     omega = np.column_stack([dx[:, PITCH] * np.cos(roll), dx[:, ROLL], dx[:, PITCH] * np.sin(roll)])
     omega -= dx[:, [HEADING]] * R_nf[:, 2]
-    return _FootMotion(x[:, PLACE], dx[:, PLACE], R_nf @ R_fb, omega @ R_fb)
+    return _FootMotion(x[:, PLACE_CHANNELS], dx[:, PLACE_CHANNELS], R_nf @ R_fb, omega @ R_fb)
 
 
 def move_foot(
@@ -66,7 +66,7 @@ def move_foot(
     dt = 1.0 / rate
     t = foot.start + np.arange(count + 1) * dt
     ends = _move_foot(foot, R_fb, t)
-    parts = max(1, round(2.0 * dt / STEP))  # of a period: half a spline's step at most
+    parts = max(1, round(2.0 * dt / GAIT_STEP))  # of a period: half a spline's step at most
     nodes = ((np.arange(parts)[:, None] + 0.5 + 0.5 * _GAUSS_NODES) * dt / parts).ravel()
     weights = np.tile(0.5 * _GAUSS_WEIGHTS / parts, parts)
     acceleration = foot.spline.derivative(2)
@@ -77,7 +77,7 @@ def move_foot(
         felt = _move_foot(foot, R_fb, inside)
         to_body = np.swapaxes(felt.R_nb, -1, -2)
         coriolis = 2.0 * np.cross(frame.omega_n, felt.v)
-        force = mv(to_body, acceleration(inside)[:, PLACE] + coriolis - frame.gravity_n(felt.p))
+        force = mv(to_body, acceleration(inside)[:, PLACE_CHANNELS] + coriolis - frame.gravity_n(felt.p))
         omega = felt.omega + to_body @ frame.omega_n
         if compensated:
             # attitudes against the first one of the period, in space

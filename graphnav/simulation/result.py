@@ -15,7 +15,7 @@ from graphnav.recording import Imu, Recording, Truth
 from graphnav.recording.formats.writing import round_recording, write_facts, write_folder
 from graphnav.simulation.aiding import GnssModel, OdometerModel
 from graphnav.simulation.inertial import SimulatedImu
-from graphnav.simulation.kinematics import Mount, TrueMotion, move
+from graphnav.simulation.kinematics import Mount, TrueMotion, move_vehicle
 from graphnav.simulation.motion import Path
 from graphnav.simulation.series import BarometerModel, DualAntennaModel
 from graphnav.simulation.vibration import Shake
@@ -76,7 +76,7 @@ def record(
     facts: dict[str, Any] | None = None,
 ) -> Simulated:
     """Drive `path` and read the sensors. `exact` omits the IMU's errors and keeps its stated figures."""
-    motion = move(path, origin, mount, shake, imu.rate)
+    motion = move_vehicle(path, origin, mount, shake, imu.rate)
     gyro, accel = motion.gyro, motion.accel
     b_g, b_a = np.zeros_like(gyro), np.zeros_like(accel)
     if not exact:

@@ -19,8 +19,8 @@ from graphnav.simulation.motion import HEADING, SPEED, Path
 from graphnav.simulation.splines import list_centres, make_spline
 
 RIGHT, FORWARD, UP, PITCH, ROLL = range(5)  # channels: m, m, m, rad, rad
-STEP = 0.02  # s between coefficients: movements up to some 15 Hz
-DEGREE = 4
+SHAKE_STEP = 0.02  # s between coefficients: movements up to some 15 Hz
+SHAKE_DEGREE = 4
 _MODULATION_TIME, _MODULATION_DEGREE = 0.1, 3  # s; correlation time of a line's modulation
 
 Part = Callable[[Array], tuple[Array, Array]]
@@ -54,12 +54,12 @@ class Sampled:
 
 def shake_times(path: Path) -> Array:
     """The times (J,) at which `sample_movement` wants its movement."""
-    return list_centres(path.start, path.end, STEP, DEGREE)
+    return list_centres(path.start, path.end, SHAKE_STEP, SHAKE_DEGREE)
 
 
 def sample_movement(path: Path, movement: Array) -> Sampled:
     """A part from the movement (J, 5) at `shake_times`."""
-    value = make_spline(path.start, STEP, movement, DEGREE)
+    value = make_spline(path.start, SHAKE_STEP, movement, SHAKE_DEGREE)
     return Sampled(value, value.derivative())
 
 
@@ -205,7 +205,7 @@ def _excite_modes(modes: Sequence[Mode], envelope: Array, rng: np.random.Generat
     for mode in modes:
         b, a = make_oscillator(mode.hz, mode.damping)
         # rms of the second derivative of the filtered unit noise, from its frequency response
-        w, h = signal.freqz(b, a, 4096, fs=2.0 * np.pi / STEP)
+        w, h = signal.freqz(b, a, 4096, fs=2.0 * np.pi / SHAKE_STEP)
         unit = np.sqrt(np.mean(np.abs(h * w**2) ** 2))
         out[:, mode.channel] += mode.size / unit * signal.lfilter(b, a, envelope * rng.standard_normal(len(envelope)))
     return out
@@ -214,7 +214,7 @@ def _excite_modes(modes: Sequence[Mode], envelope: Array, rng: np.random.Generat
 def make_oscillator(hz: float, damping: float) -> tuple[Array, Array]:
     """A mass on spring and damper as a digital filter at 1 / STEP Hz, with unit static response."""
     w = 2.0 * np.pi * hz
-    return signal.bilinear([w * w], [1.0, 2.0 * damping * w, w * w], fs=1.0 / STEP)
+    return signal.bilinear([w * w], [1.0, 2.0 * damping * w, w * w], fs=1.0 / SHAKE_STEP)
 
 
 def draw_gauss_markov(count: int, step: float, rng: np.random.Generator, columns: int | None = None) -> Array:

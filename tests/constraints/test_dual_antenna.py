@@ -21,7 +21,7 @@ from graphnav.estimation.pipeline import run
 from graphnav.evaluation.metrics import summarise
 from graphnav.online import Online, drop_rows, list_rows
 from graphnav.recording import Recording
-from graphnav.sensors.dual_antenna import SENSOR, Figures
+from graphnav.sensors.dual_antenna import SENSOR, DualAntennaKeys
 from graphnav.simulation import simulate
 from graphnav.simulation.series import DualAntennaModel
 
@@ -108,7 +108,7 @@ def test_on_the_move_readings_tell_no_start(drive):
 
 def test_a_baseline_that_stands_upright_is_refused():
     with pytest.raises(ValidationError) as caught:
-        Figures(baseline=(0.0, 0.0, 1.0))
+        DualAntennaKeys(baseline=(0.0, 0.0, 1.0))
     assert [error["loc"] for error in caught.value.errors()] == [("baseline",)]
     with refused("sensor.column", RecordingError, "roll"):
         SENSOR.make_series(np.arange(2.0), {"roll": np.zeros(2)})

@@ -15,7 +15,7 @@ from graphnav.constraints.base import BuildContext
 from graphnav.constraints.standstill import PLACE, HeldPosition, ZeroRate, ZeroVelocity
 from graphnav.constraints.vehicle import AXLE, MOUNTING, ODOMETER_DELAY, ODOMETER_SCALE, NonHolonomic, OdometerSpeed
 from graphnav.core import rotation
-from graphnav.core.earth import RATE, LocalFrame
+from graphnav.core.earth import EARTH_RATE, LocalFrame
 from graphnav.core.rotation import mv
 from graphnav.core.state import BLOCKS, DIM, States
 from graphnav.core.trajectory import Trajectory
@@ -136,7 +136,7 @@ def test_a_stop_with_a_speed_left_over_tells_no_heading(exact: tuple[Recording, 
         assert rows.keyframe[0] == first
         linear = rows.linearize(rolling, {PLACE: rolling.p}, slice(0, 1))
         change = sum(mv(J, turn[:, BLOCKS[name]]) for name, J in linear.jacobians.items() if name in BLOCKS)
-        assert np.abs(change).max() < 2.0 * RATE  # the Earth's, turned
+        assert np.abs(change).max() < 2.0 * EARTH_RATE  # the Earth's, turned
 
 
 def test_a_restless_stop_is_believed_less(exact: tuple[Recording, Trajectory]) -> None:

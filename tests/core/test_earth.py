@@ -108,4 +108,4 @@ def test_earth_rate_in_the_local_frame() -> None:
     lat = np.radians(60.0)
     frame = earth.LocalFrame(np.array([lat, 1.0, 0.0]))
     np.testing.assert_allclose(frame.omega_n, 7.292115e-5 * np.array([0.0, 0.5, np.sqrt(0.75)]), atol=1e-18)
-    assert pytest.approx(earth.RATE, rel=1e-9) == pyins_earth.RATE
+    assert pytest.approx(earth.EARTH_RATE, rel=1e-9) == pyins_earth.RATE

@@ -25,7 +25,7 @@ from graphnav.estimation.solution import Solution
 from graphnav.estimation.solvers.ekf import ekf, refilter
 from graphnav.estimation.solvers.likelihood_ratio import update_tests
 from graphnav.estimation.solvers.passes import Updates
-from graphnav.estimation.solvers.recursion import move
+from graphnav.estimation.solvers.recursion import move_columns
 from graphnav.estimation.solvers.rows import Iterate, Layout, whiten
 from graphnav.estimation.solvers.rts import smooth_backward
 from graphnav.estimation.solvers.stack import Stack
@@ -110,7 +110,7 @@ def test_signature_is_the_derivative_of_the_innovations(built: Problem, monkeypa
     seen, begun, fix = dict[int, Array](), 0.0, 0
     for k in range(len(built.t)):
         if k:
-            bank.X[:] = move(forward.F[k - 1], forward.decay[k - 1], bank.X)
+            bank.X[:] = move_columns(forward.F[k - 1], forward.decay[k - 1], bank.X)
         for some in stack.stack_keyframe(k):
             name = some.parts[0][0].name
             H, Kt, solved, root = (x[some.at] for x in (updates.H, updates.Kt, updates.w, stack.root))

@@ -38,7 +38,7 @@ class Drive:
         self.variance = rng.uniform(0.5, 2.0, (n, ROWS))
         self.used = np.arange(2 * n) != 4
         self.scale = np.ones((n, ROWS))
-        self.blocks = recursion.Blocks(
+        self.blocks = recursion.RowBlocks(
             first=2 * np.arange(n + 1), begin=np.tile([0, 3], n), end=np.tile([3, ROWS], n), used=self.used,
             gate=np.full(2 * n, np.inf), kernel=np.zeros(2 * n, dtype=int), size=np.tile([3, 5], n),
             part=np.arange(2 * n + 1), k=np.repeat(np.arange(n), 2), kind=np.tile([0, 1], n),
@@ -137,7 +137,7 @@ def test_both_forms_of_an_update_are_the_same_where_no_digits_are_lost(prior: fl
     HP = H @ drive.P
     S = HP @ H.T + np.diag(R)
     _, inverse = recursion.invert_sum(HP @ H.T, R)
-    joseph = recursion.update(drive.P, HP, H, inverse.T @ (inverse @ HP), R)
+    joseph = recursion.update_covariance(drive.P, HP, H, inverse.T @ (inverse @ HP), R)
     exact = np.diag(R) - R[:, None] * np.linalg.inv(S) * R
     np.testing.assert_allclose(H @ joseph @ H.T, exact, atol=1e-6)
     assert drive.solved()["lossy"][0] == (prior > 1.0)

@@ -25,7 +25,7 @@ from graphnav.estimation.problem import Problem, build_problem
 from graphnav.estimation.solvers.ekf import ekf, refilter, smooth_near
 from graphnav.estimation.solvers.linearise import Points, advance, linearise
 from graphnav.estimation.solvers.points import FilterErrors, PointFilter, predict_states
-from graphnav.estimation.solvers.recursion import move
+from graphnav.estimation.solvers.recursion import move_columns
 from graphnav.estimation.solvers.rts import smooth_backward
 from graphnav.estimation.solvers.stack import Stack
 from graphnav.imu.dynamics import SCALE
@@ -90,7 +90,7 @@ def test_steps_and_rows_at_points_are_those_of_an_estimate_to_first_order(built:
             ]
 
         np.testing.assert_allclose(given.gap[k - 1], ahead(np.zeros(D)), atol=1e-9)
-        whole = move(given.F[k - 1], steps.decay[k - 1], np.eye(D))
+        whole = move_columns(given.F[k - 1], steps.decay[k - 1], np.eye(D))
         np.testing.assert_allclose(whole, derivative(ahead, D), atol=2e-5, rtol=1e-4)
         for some in stack.stack_keyframe(k):
             own = [linearise(rows, points, built.columns, slice(lo, hi)) for rows, lo, hi in some.parts]

@@ -10,7 +10,7 @@ from helpers import Array, random_states
 
 from graphnav.constraints import list_constraints
 from graphnav.constraints.base import Constraint
-from graphnav.core.earth import RATE
+from graphnav.core.earth import EARTH_RATE
 from graphnav.core.rotation import exp
 from graphnav.core.state import DIM, States
 from graphnav.estimation.problem import Problem
@@ -130,7 +130,7 @@ def test_no_row_that_says_so_feels_a_turn_but_by_the_earths_rate(walk: Online) -
         )
         speed = np.linalg.norm(states.v, axis=1).max()
         # the Earth turned by 2 rad is another by twice sin(1) of it; so is what it adds to gravity, over less than 1 s
-        most = 2.0 * RATE * max(1.0, 2.0 * speed)
+        most = 2.0 * EARTH_RATE * max(1.0, 2.0 * speed)
         assert rows.turns
         np.testing.assert_allclose(after, residual, atol=most)
         tried.add(rows.name)

@@ -258,7 +258,7 @@ def test_a_station_comes_to_its_place_within_a_decimetre(shared_data):
     llh = earth.ecef_to_llh(SLAC[None])[0]
     rng = np.random.default_rng(0)
     noise = ImuNoise(1.5e-4, 4e-3, 5e-6, 2e-4, 2e-3, 0.1)
-    rate = earth.RATE * np.array([0.0, np.cos(llh[0]), np.sin(llh[0])])
+    rate = earth.EARTH_RATE * np.array([0.0, np.cos(llh[0]), np.sin(llh[0])])
     gyro = rate + noise.gyro_noise_density * np.sqrt(5.0) * rng.standard_normal((len(t), 3))
     force = np.array([0.0, 0.0, float(earth.gravity(llh[0], llh[2]))])
     accel = force + noise.accel_noise_density * np.sqrt(5.0) * rng.standard_normal((len(t), 3))

@@ -399,7 +399,9 @@ def test_a_wrong_integer_is_let_go_of(drive, monkeypatch):
     begin = recording.raw_gnss.t[0]
     until = begin + 13.0
     monkeypatch.setattr(
-        fixing.Epochs, "find_inconsistent", lambda self, k, *rest: [] if self.time[k] < until else noticed(self, k, *rest)
+        fixing.Epochs,
+        "find_inconsistent",
+        lambda self, k, *rest: [] if self.time[k] < until else noticed(self, k, *rest),
     )
     one = run(recording, STATED, ("ekf",))["ekf"]
     off, fixed = off_by(one, truth)

@@ -248,7 +248,7 @@ def test_judging_beside_the_drive_works_on_copies(
     """A checkpoint is written meanwhile: nothing that stands in it may change under the pen."""
     used: list[judging.Question] = []
     kept: list[judging.Question] = []
-    answer, judge = judging.answer, judging.judge
+    answer, judge = judging.answer, judging.start_judging
 
     def answer_seen(asked: judging.Question) -> judging.Answer:
         used.append(asked)
@@ -259,7 +259,7 @@ def test_judging_beside_the_drive_works_on_copies(
         return out
 
     monkeypatch.setattr(judging, "answer", answer_seen)
-    monkeypatch.setattr(smoother, "judge", judge_seen)
+    monkeypatch.setattr(smoother, "start_judging", judge_seen)
     online = Online(drop_rows(drive[0]), parse_settings({"solver": {"lag": 20.0}}))
     for row in rows:
         online.add(row)

@@ -23,7 +23,7 @@ from graphnav.core.errors import ConfigError, GraphnavError, RecordingError
 from graphnav.core.notes import get_key
 from graphnav.core.trajectory import Trajectory
 from graphnav.online import Online, Row, Session, ahead, drop_rows, list_rows
-from graphnav.online.lines import HEAD, format_line, format_lines, parse_setup
+from graphnav.online.lines import PROTOCOL, format_line, format_lines, parse_setup
 from graphnav.online.store import _MAGIC, Store
 from graphnav.online.tracker import Tracker
 from graphnav.recording import Recording
@@ -397,7 +397,7 @@ def test_states_that_are_no_numbers_are_never_written(
 )
 def test_a_setup_is_checked_as_a_recording_is(setup: str, field: str) -> None:
     with pytest.raises(RecordingError, match=field) as caught:
-        parse_setup(f"{HEAD} {setup}")
+        parse_setup(f"{PROTOCOL} {setup}")
     assert len(str(caught.value)) < 1000
 
 
@@ -407,7 +407,7 @@ def test_rows_are_numbers_in_ascii_digits(drive: tuple[Recording, Trajectory]) -
     assert session.bad == 2
 
 
-SETUP = f'{HEAD} {{"gnss": {{}}}}'
+SETUP = f'{PROTOCOL} {{"gnss": {{}}}}'
 NOTHING = {
     "no line": ([], "online.no_setup"),
     "setup alone": ([SETUP], "online.nothing"),

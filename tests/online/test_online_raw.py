@@ -16,7 +16,7 @@ from test_raw_rtk import with_carriers
 
 from graphnav.config import Settings, parse_settings
 from graphnav.constraints.raw_phase import WholeCycles
-from graphnav.constraints.raw_ppp import LASTING
+from graphnav.constraints.raw_ppp import CARRIER_SLOW
 from graphnav.core.errors import RecordingError
 from graphnav.core.interpolation import interpolate
 from graphnav.core.notes import get_key
@@ -141,7 +141,7 @@ def test_precise_point_positioning_is_that_of_the_recording(two: Recording) -> N
     assert online.tracker is not None
     assert {"gnss_ppp_code", "gnss_ppp_carrier"} < online.tracker.in_force.keys()
     whole = run(two, how, ("rts",))["rts"]
-    assert LASTING in whole.parameters
+    assert CARRIER_SLOW in whole.parameters
     at = np.argmin(np.abs(whole.t - track.t[:, None]), axis=1)
     same = np.abs(whole.t[at] - track.t) < 1e-6
     assert same.sum() > 35
@@ -325,7 +325,9 @@ def test_wrong_integers_are_let_go_of(rtk: Recording, monkeypatch: pytest.Monkey
 
     monkeypatch.setattr(fixing, "find_nearest", wrong)
     monkeypatch.setattr(
-        fixing.Epochs, "find_inconsistent", lambda self, k, *rest: [] if self.time[k] < until else noticed(self, k, *rest)
+        fixing.Epochs,
+        "find_inconsistent",
+        lambda self, k, *rest: [] if self.time[k] < until else noticed(self, k, *rest),
     )
     how = parse_settings({"noise": {"mode": "stated"}, "solver": {"lag": 5.0}})
     online, track = played(drop_rows(rtk), list_rows(rtk)[1], how, "isam2")

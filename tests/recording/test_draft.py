@@ -118,7 +118,7 @@ def test_white_noise_is_measured():
 
 def test_lag_slope_and_angle_of_planar_vectors():
     rng = np.random.default_rng(4)
-    t = np.arange(0, 300, motion.STEP)
+    t = np.arange(0, 300, motion.GRID)
     z = motion.compute_moving_mean(rng.normal(size=len(t))) + 1j * motion.compute_moving_mean(rng.normal(size=len(t)))
     late = 0.37
     y = np.interp(t - late, t, z)
@@ -130,7 +130,7 @@ def test_lag_slope_and_angle_of_planar_vectors():
 
 def test_lag_of_clocks_that_have_nothing_in_common():
     rng = np.random.default_rng(5)
-    t = np.arange(0, 600, motion.STEP)
+    t = np.arange(0, 600, motion.GRID)
     x = motion.compute_moving_mean(rng.normal(size=len(t)), 3.0)
     found = motion.find_lag(t, 57.3 * x, t[1000:5000] + 1.7e6, x[1000:5000], anywhere=True)
     assert found.seconds == pytest.approx(1.7e6, abs=0.02)

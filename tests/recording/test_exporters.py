@@ -152,7 +152,7 @@ def test_words_end_a_row_of_numbers() -> None:
 def test_parts_of_a_trajectory_make_the_files_of_the_whole(tmp_path: Path) -> None:
     whole = made()
     rows = [slice(0, 1), slice(1, 90), slice(90, 200)]
-    names = [name for name in exporters.NAMES if name != "parquet"]
+    names = [name for name in exporters.FORMATS if name != "parquet"]
     for folder, parts in (("whole", [whole]), ("parts", [whole.take(k) for k in rows])):
         targets = {name: tmp_path / folder / f"a.{name}" for name in names}
         (tmp_path / folder).mkdir()

@@ -11,7 +11,7 @@ from test_recording import describe
 
 from graphnav.core.errors import RecordingError
 from graphnav.recording.formats import read
-from graphnav.recording.formats.figures import EXAMPLES, UNITS, parse_figure
+from graphnav.recording.formats.figures import EXAMPLES, FIGURE_UNITS, parse_figure
 from graphnav.recording.formats.imu_models import MODELS, find_model
 from graphnav.recording.formats.schema import STATED_FIGURES
 
@@ -48,7 +48,7 @@ def test_figures_in_data_sheet_units(key, text, si):
     assert parse_figure(key, text) == pytest.approx(si, rel=1e-6)
 
 
-@pytest.mark.parametrize("key", UNITS)
+@pytest.mark.parametrize("key", FIGURE_UNITS)
 def test_the_example_in_every_error_is_understood(key):
     assert parse_figure(key, EXAMPLES[key]) > 0
 

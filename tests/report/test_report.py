@@ -558,9 +558,9 @@ def test_innovations_speak_for_all_solvers(tmp_path, recording):
 def test_a_column_without_any_number_is_left_out():
     nan = float("nan")
     rows = [["ekf", 2.0, nan, nan], ["rts", 1.0, nan, 5.0]]
-    assert page.format_table(["solver", "a", "b", "c"], rows, best=[1, 2, 3]).count("<td") == 6
-    assert page.format_table(["solver", "a", "b", "c"], rows, best=[1, 2, 3]).count('class="best"') == 2
-    assert "b" not in re.findall(r"<th[^>]*>(\w+)</th>", page.format_table(["solver", "a", "b", "c"], rows))
+    assert page.make_table(["solver", "a", "b", "c"], rows, best=[1, 2, 3]).count("<td") == 6
+    assert page.make_table(["solver", "a", "b", "c"], rows, best=[1, 2, 3]).count('class="best"') == 2
+    assert "b" not in re.findall(r"<th[^>]*>(\w+)</th>", page.make_table(["solver", "a", "b", "c"], rows))
 
 
 def test_settings_and_command_come_back_as_they_were():
@@ -697,7 +697,7 @@ def test_the_page_of_an_allan_variance_draws_the_deviations_and_their_fit(tmp_pa
     t = np.arange(1, 6001) / rate
     gyro, accel = rng.normal(0.0, 1e-3, (len(t), 3)), rng.normal([0.0, 0.0, 9.8], 1e-2, (len(t), 3))
     result = compute_allan(t, gyro, accel)
-    path, _, _ = allan_page.write(result, tmp_path)
+    path, _, _ = allan_page.write_allan(result, tmp_path)
     for title, deviation, sigma in (("Gyro", result.gyro, 1e-3), ("Accelerometer", result.accel, 1e-2)):
         figure = figures_of(path)[title]
         *axes, fit = figure["data"]

@@ -6,7 +6,7 @@ import numpy as np
 
 from graphnav.core import rotation
 from graphnav.sensors.barometer import compute_standard_height
-from graphnav.simulation.kinematics import Mount, move
+from graphnav.simulation.kinematics import Mount, move_vehicle
 from graphnav.simulation.motion import Manoeuvre, make_path
 from graphnav.simulation.series import BarometerModel, DualAntennaModel
 from graphnav.simulation.vibration import Shake
@@ -15,7 +15,7 @@ from graphnav.simulation.vibration import Shake
 def test_errors_of_a_barometer_and_a_second_antenna_have_their_sizes() -> None:
     """Over many drives: what is drawn once has the stated size, what is drawn per reading its own."""
     path = make_path([Manoeuvre(20.0, 0.0), Manoeuvre(20.0, 15.0, 60.0, 0.05), Manoeuvre(20.0, 15.0)])
-    motion = move(path, (30.5, 114.3, 20.0), Mount(), Shake(), 50.0)
+    motion = move_vehicle(path, (30.5, 114.3, 20.0), Mount(), Shake(), 50.0)
     once: list[list[float]] = []
     for seed in range(60):
         air, put_in = BarometerModel(walk=0.0).read(motion, seed)

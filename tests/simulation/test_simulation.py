@@ -16,7 +16,7 @@ from pyins import sim, strapdown, transform, util
 
 from graphnav.app.cli import run as command
 from graphnav.core import rotation as ro
-from graphnav.core.earth import MG, RATE, LocalFrame, gravity, llh_to_ecef
+from graphnav.core.earth import EARTH_RATE, MG, LocalFrame, gravity, llh_to_ecef
 from graphnav.core.errors import ConfigError
 from graphnav.core.state import States
 from graphnav.imu.dynamics import ImuFactors as Mechanisation
@@ -29,7 +29,7 @@ from graphnav.recording.formats.writing import write_folder
 from graphnav.simulation import Simulated, list_scenarios, parse_options, simulate
 from graphnav.simulation.aiding import GnssModel, OdometerModel, SimulatedFault
 from graphnav.simulation.inertial import EG370N, MIMU, Triad, make_accelerometer, make_gyroscope
-from graphnav.simulation.kinematics import Mount, TrueMotion, move
+from graphnav.simulation.kinematics import Mount, TrueMotion, move_vehicle
 from graphnav.simulation.motion import HEADING, SLIP, SPEED, Manoeuvre, make_path
 from graphnav.simulation.passengers import Boarding, simulate_movement
 from graphnav.simulation.scenarios.li2024 import TABLE_4
@@ -61,7 +61,7 @@ def made(name: str, seed: int = 0, **options: float) -> Simulated:
 def smooth(lat: float = 30.5, rate: float = 200.0, slip: float = 0.0) -> TrueMotion:
     """A drive with nothing that shakes."""
     path = make_path(WAY, heading=62.0, slip_per_accel=slip)
-    return move(path, (lat, *ORIGIN[1:]), ASKEW, Shake(), rate)
+    return move_vehicle(path, (lat, *ORIGIN[1:]), ASKEW, Shake(), rate)
 
 
 # ------------------------------------------------------------------------------------------------------- exactness
@@ -151,7 +151,7 @@ def test_standing_it_feels_gravity_and_the_earth() -> None:
     lat, h = motion.llh[200, 0], motion.llh[200, 2]
     R = motion.R_lb[200]
     np.testing.assert_allclose(motion.accel[still], np.tile(gravity(lat, h) * R[2], (1700, 1)), atol=1e-8)
-    earth = RATE * R.T @ [0.0, np.cos(lat), np.sin(lat)]
+    earth = EARTH_RATE * R.T @ [0.0, np.cos(lat), np.sin(lat)]
     np.testing.assert_allclose(motion.gyro[still], np.tile(earth, (1700, 1)), atol=1e-12)
     # mounted with roll 1, pitch -2 and heading 3 deg on a level vehicle facing 62 deg; the level of the IMU, a lever
     # arm from the axle, differs from the axle's by 2e-7
@@ -179,7 +179,7 @@ def test_axle_moves_where_the_vehicle_points() -> None:
 
 def test_side_slip_is_outward_and_as_stated() -> None:
     path = make_path(WAY, heading=62.0, slip_per_accel=0.005)
-    motion = move(path, ORIGIN, ASKEW, Shake(), 100.0)
+    motion = move_vehicle(path, ORIGIN, ASKEW, Shake(), 100.0)
     t = np.array([24.0, 35.0])  # to the right, to the left
     _, v = motion.point(t, ASKEW.axle_lever_arm)
     x = path.spline(t)
@@ -309,7 +309,7 @@ def test_road_dies_with_the_speed() -> None:
 def test_a_passenger_sinks_the_body_and_only_that() -> None:
     path = make_path([Manoeuvre(40.0, 0.0)])
     shake = Shake((simulate_movement(path, [Boarding(10.0)], (0.0, 0.0, 1.2), np.random.default_rng(0)),))
-    motion = move(path, ORIGIN, Mount((0.0, 1.3, 1.5)), shake, 200.0)
+    motion = move_vehicle(path, ORIGIN, Mount((0.0, 1.3, 1.5)), shake, 200.0)
     assert motion.llh[-1, 2] - motion.llh[0, 2] == pytest.approx(-0.0075, abs=2e-4)
     rph = ro.wrap(motion.rph[-1] - motion.rph[0])
     np.testing.assert_allclose(rph, [0.0070, -0.0022, 0.0], atol=1e-5)  # right side and nose down
@@ -396,7 +396,7 @@ def enu_errors(motion: TrueMotion, model: GnssModel, seed: int = 0) -> tuple[Arr
 
 def test_gnss_errors_have_their_sizes_and_times() -> None:
     path = make_path([Manoeuvre(4000.0, 0.0)])
-    motion = move(path, ORIGIN, Mount(), Shake(), 5.0)
+    motion = move_vehicle(path, ORIGIN, Mount(), Shake(), 5.0)
     model = GnssModel(white=(0.5, 0.6, 0.9), slow=(1.0, 1.0, 2.0), slow_time=5.0, velocity=(0.1, 0.1, 0.2), phase=0.3)
     t, e, dv = enu_errors(motion, model)
     assert t[0] == pytest.approx(0.3)

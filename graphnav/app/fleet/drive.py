@@ -30,20 +30,20 @@ from graphnav.estimation.noise.apply import select_weights
 from graphnav.estimation.solution import Solution
 from graphnav.recording import Recording
 
-NAME = "drive.json"
+ROW_FILE = "drive.json"
 DONE, REFUSED, FAILED, CRASHED, HUNG = "done", "refused", "failed", "crashed", "hung"
 _FINAL = (DONE, REFUSED)  # statuses that the same program reproduces from the same input
 _POINTS = 200  # points of a track on the map
 FIRST_SPAN, AFTER_SPANS = 60.0, 30.0  # s before the first withheld span and after the last
 
-Row = dict[str, Any]
+FleetRow = dict[str, Any]
 
 
-def solve_drive(task: Task) -> Row:
+def solve_drive(task: Task) -> FleetRow:
     """Solve a drive and write its results, unless that is done already; returns its row in any case."""
     began = time.perf_counter()
     folder = Path(task.folder)
-    row: Row = {"drive": task.name, "status": FAILED, "source": task.source, "solver": task.solver}
+    row: FleetRow = {"drive": task.name, "status": FAILED, "source": task.source, "solver": task.solver}
     key = ""
     _forget_peak()
     try:
@@ -71,9 +71,9 @@ def solve_drive(task: Task) -> Row:
     return row
 
 
-def make_lost_row(task: Task, status: str, error: str, seconds: float) -> Row:
+def make_lost_row(task: Task, status: str, error: str, seconds: float) -> FleetRow:
     """The row of a drive whose process ended and so could not write one."""
-    row: Row = {"drive": task.name, "status": status, "source": task.source, "solver": task.solver, "error": error}
+    row: FleetRow = {"drive": task.name, "status": status, "source": task.source, "solver": task.solver, "error": error}
     row["time_s"] = round(seconds, 3)
     keep_row(Path(task.folder), "", row)
     return row
@@ -82,13 +82,13 @@ def make_lost_row(task: Task, status: str, error: str, seconds: float) -> Row:
 def keep_row(folder: Path, key: str, row: Mapping[str, Any]) -> None:
     """Write the row beside the drive's results; errors are ignored if the folder is not writable."""
     with suppress(GraphnavError), stage_results(folder) as part:
-        write_json(part / NAME, {"key": key, "row": row})
+        write_json(part / ROW_FILE, {"key": key, "row": row})
 
 
-def read_row(folder: Path, key: str | None = None) -> Row | None:
+def read_row(folder: Path, key: str | None = None) -> FleetRow | None:
     """The row of a drive that was solved earlier with the same key; with any key, if `key` is None."""
     try:
-        values = parse_json(read_text(folder / NAME))
+        values = parse_json(read_text(folder / ROW_FILE))
         row = values["row"]
         same = key is None or (values["key"] == key and row["status"] in _FINAL)
         return dict(row) if same else None
@@ -162,7 +162,7 @@ def choose_spans(recording: Recording, length: float, zero: float = 0.0) -> list
     return [(float(zero + s), float(zero + s + length)) for s in starts]
 
 
-def _collect_figures(outcome: Outcome) -> Row:
+def _collect_figures(outcome: Outcome) -> FleetRow:
     """The figures of a solved drive for its row."""
     ((name, solution),) = outcome.solutions.items()
     summary = summarise_solver(outcome, name, {}, {})

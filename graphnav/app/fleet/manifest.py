@@ -59,7 +59,7 @@ class Task:
     outside: bool = False  # whether recordings may name files outside their folders
 
 
-_COLUMNS = ("recording", "name", *(f.name for f in fields(DriveOptions)))
+_KNOWN_COLUMNS = ("recording", "name", *(f.name for f in fields(DriveOptions)))
 
 
 def read_drives(source: Path, asked: DriveOptions) -> list[tuple[str, str, DriveOptions, str]]:
@@ -219,10 +219,10 @@ def _parse_toml(path: Path) -> list[tuple[str, Mapping[str, Any]]]:
 
 
 def _check_columns(names: Iterable[str], where: str) -> None:
-    unknown = [name for name in names if name not in _COLUMNS]
+    unknown = [name for name in names if name not in _KNOWN_COLUMNS]
     if unknown:
         raise ConfigError(
-            f"{where}: no such column '{unknown[0]}'; {suggest_nearest(unknown[0], _COLUMNS)}",
+            f"{where}: no such column '{unknown[0]}'; {suggest_nearest(unknown[0], _KNOWN_COLUMNS)}",
             key="table.column_unknown",
         )
     if "recording" not in names:
@@ -292,12 +292,12 @@ def _parse_settings(text: str) -> dict[str, Any]:
 
 def _write(values: Mapping[str, Any], at: str = "") -> str:
     """A table of settings as lines of dotted keys."""
-    from graphnav.config.files import format_toml
+    from graphnav.config.files import format_toml_value
 
     lines = []
     for key, value in values.items():
         lines.append(
-            _write(value, f"{at}{key}.") if isinstance(value, Mapping) else f"{at}{key} = {format_toml(value)}"
+            _write(value, f"{at}{key}.") if isinstance(value, Mapping) else f"{at}{key} = {format_toml_value(value)}"
         )
     return "\n".join(lines)
 

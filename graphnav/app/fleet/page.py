@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from graphnav.app.fleet.drive import DONE, Row
+from graphnav.app.fleet.drive import DONE, FleetRow
 from graphnav.app.fleet.tables import collect_numbers, compute_totals, describe_totals, sort_by_error
 from graphnav.core.rotation import Array
 
@@ -26,7 +26,7 @@ _HISTOGRAMS = {
     "time_s": "Time (s)",
     "memory_mb": "Most memory (MB)",
 }
-_TABLE = {
+_TABLE_COLUMNS = {
     "status": "status", "verdict": "verdict", "duration_s": "s", "distance_m": "m", "h_rms_m": "h RMS, m",
     "span_end_h_median_m": "span end, m", "nees_p": "NEES", "sd_h_median_m": "sigma h, m", "left_out": "left out",
     "time_s": "time, s", "memory_mb": "MB",
@@ -49,7 +49,7 @@ a{color:var(--ink)}
 """
 
 
-def write_page(rows: Sequence[Row], path: Path, title: str) -> None:
+def write_page(rows: Sequence[FleetRow], path: Path, title: str) -> None:
     """Write the page; it links to the reports beside it."""
     lead = f"{describe_totals(compute_totals(rows))}."
     spread = [
@@ -71,17 +71,17 @@ def write_page(rows: Sequence[Row], path: Path, title: str) -> None:
     )
 
 
-def _format_table(rows: Sequence[Row]) -> str:
+def _format_table(rows: Sequence[FleetRow]) -> str:
     lines = []
     for row in rows[:_MAX_DRIVES]:
         name = escape(str(row["drive"]))
         if row.get("report"):
             name = f'<a href="{escape(str(row["report"]))}">{name}</a>'
-        cells = "".join(f"<td>{escape(_format_value(row.get(key)))}</td>" for key in _TABLE)
+        cells = "".join(f"<td>{escape(_format_value(row.get(key)))}</td>" for key in _TABLE_COLUMNS)
         why = escape(str(row.get("error") or row.get("doubts") or ""))
         kind = "" if row["status"] == DONE else ' class="bad"'
         lines.append(f'<tr><td>{name}</td>{cells}<td class="words"><span{kind}>{why}</span></td></tr>')
-    head = "".join(f"<th>{escape(label)}</th>" for label in _TABLE.values())
+    head = "".join(f"<th>{escape(label)}</th>" for label in _TABLE_COLUMNS.values())
     more = f'<p class="soft">and {len(rows) - _MAX_DRIVES} more in fleet.csv</p>' if len(rows) > _MAX_DRIVES else ""
     return (
         f'<div class="wide"><table><thead><tr><th>drive</th>{head}<th class="words">why</th></tr></thead>'
@@ -122,10 +122,10 @@ def _label(value: float, log: bool) -> str:
     return f"{10.0**value if log else value:.3g}"
 
 
-def _draw_maps(rows: Sequence[Row]) -> str:
+def _draw_maps(rows: Sequence[FleetRow]) -> str:
     """All tracks, those close to each other on one map."""
     placed = [(np.array(row["track"], dtype=float), row) for row in rows if row.get("track")]
-    groups: list[list[tuple[Array, Row]]] = []
+    groups: list[list[tuple[Array, FleetRow]]] = []
     for track, row in placed[:DRAWN]:
         near = next((g for g in groups if np.abs(g[0][0][0] - track[0]).max() < _MAP_DISTANCE), None)
         if near is None:
@@ -141,7 +141,7 @@ def _draw_maps(rows: Sequence[Row]) -> str:
     return f'<h2>Where they drove</h2><div class="figures">{figures}</div>{more}'
 
 
-def _draw_map(group: Sequence[tuple[Array, Row]]) -> str:
+def _draw_map(group: Sequence[tuple[Array, FleetRow]]) -> str:
     points = np.concatenate([track for track, _ in group])
     low, high = points.min(0), points.max(0)
     shrink = math.cos(math.radians(float(points[:, 1].mean())))

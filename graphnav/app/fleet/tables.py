@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from graphnav.app.fleet.drive import AFTER_SPANS, DONE, FIRST_SPAN, MEASURED, Row
+from graphnav.app.fleet.drive import AFTER_SPANS, DONE, FIRST_SPAN, MEASURED, FleetRow
 from graphnav.core.notes import format_count
 from graphnav.core.rotation import Array
 
@@ -50,12 +50,12 @@ MEDIANS = {
 _BADNESS = ("span_end_h_median_m", "h_rms_m", "sd_h_median_m")
 
 
-def list_columns(rows: Sequence[Row]) -> list[str]:
+def list_columns(rows: Sequence[FleetRow]) -> list[str]:
     """`COLUMNS`, plus one for the factor of each noise figure that any drive has."""
     return [*COLUMNS, *sorted({key for row in rows for key in row if key.startswith("noise.")})]
 
 
-def write_csv(rows: Sequence[Row], path: Path) -> None:
+def write_fleet_csv(rows: Sequence[FleetRow], path: Path) -> None:
     """One line per drive; unknown values are blank."""
     text = io.StringIO()
     writer = csv.DictWriter(text, list_columns(rows), extrasaction="ignore", lineterminator="\n")
@@ -64,7 +64,7 @@ def write_csv(rows: Sequence[Row], path: Path) -> None:
     path.write_text(text.getvalue(), encoding="utf-8")
 
 
-def write_parquet(rows: Sequence[Row], path: Path) -> bool:
+def write_parquet(rows: Sequence[FleetRow], path: Path) -> bool:
     """Write the same as Parquet if pyarrow is installed; returns whether it is."""
     if find_spec("pyarrow") is None:
         return False
@@ -82,22 +82,22 @@ def write_parquet(rows: Sequence[Row], path: Path) -> bool:
     return True
 
 
-def sort_by_error(rows: Sequence[Row]) -> list[Row]:
+def sort_by_error(rows: Sequence[FleetRow]) -> list[FleetRow]:
     """Drives without a result first, then those with a doubtful result, then the rest, each ordered by error."""
 
-    def rank(row: Row) -> tuple[bool, bool, float]:
+    def rank(row: FleetRow) -> tuple[bool, bool, float]:
         off = next((float(row[key]) for key in _BADNESS if row.get(key) is not None), 0.0)
         return row["status"] == DONE, row.get("verdict") != "doubtful", -off
 
     return sorted(rows, key=rank)
 
 
-def collect_numbers(rows: Sequence[Row], key: str) -> Array:
+def collect_numbers(rows: Sequence[FleetRow], key: str) -> Array:
     """The finite values of a column."""
     return np.array([float(row[key]) for row in rows if row.get(key) is not None])
 
 
-def compute_totals(rows: Sequence[Row]) -> dict[str, Any]:
+def compute_totals(rows: Sequence[FleetRow]) -> dict[str, Any]:
     """The totals of a fleet."""
     status, solved = Counter(row["status"] for row in rows), [row for row in rows if row["status"] == DONE]
     return {
@@ -119,7 +119,7 @@ def describe_totals(found: Mapping[str, Any]) -> str:
     return f"{drives}, {found['hours']:.2f} h, {found['km']:.1f} km: {statuses}; {found['doubtful']} doubtful"
 
 
-def describe_unscored(rows: Sequence[Row], withhold: float) -> str:
+def describe_unscored(rows: Sequence[FleetRow], withhold: float) -> str:
     """A line about the drives in which no span of `withhold` s could be withheld, "" if there are none."""
     solved = [row for row in rows if row["status"] == DONE]
     least = FIRST_SPAN + withhold + AFTER_SPANS
@@ -130,7 +130,7 @@ def describe_unscored(rows: Sequence[Row], withhold: float) -> str:
     return f"\nnothing withheld by --withhold {withhold:g} in {of}: no GNSS, or shorter than {least:g} s"
 
 
-def format_totals(rows: Sequence[Row], most: int = 10) -> str:
+def format_totals(rows: Sequence[FleetRow], most: int = 10) -> str:
     """The totals, and the failed drives, for a terminal."""
     found = compute_totals(rows)
     lines = [describe_totals(found)]

@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 import graphnav
-from graphnav.app.fleet.drive import CRASHED, HUNG, Row, make_lost_row
+from graphnav.app.fleet.drive import CRASHED, HUNG, FleetRow, make_lost_row
 from graphnav.app.fleet.manifest import Task
 from graphnav.core.errors import ConfigError
 
@@ -52,7 +52,7 @@ class Worker:
         self._limits = limits
         self._process: subprocess.Popen[str] | None = None
 
-    def solve(self, task: Task) -> Row:
+    def solve(self, task: Task) -> FleetRow:
         """The row of a drive, whatever happens to the process."""
         began = time.monotonic()
         process = self._ensure_process()
@@ -115,19 +115,19 @@ def _end_of(code: int) -> str:
     return f"was ended by {name}{' (out of memory, perhaps)' if name == 'SIGKILL' else ''}"
 
 
-def solve_here(tasks: Sequence[Task], processes: int, limits: Limits) -> Iterator[Row]:
+def solve_here(tasks: Sequence[Task], processes: int, limits: Limits) -> Iterator[FleetRow]:
     """Rows of drives as they are solved by a number of processes."""
     own = threading.local()
     workers: list[Worker] = []
 
-    def solve(task: Task) -> Row:
+    def solve(task: Task) -> FleetRow:
         if not hasattr(own, "worker"):
             own.worker = Worker(limits)
             workers.append(own.worker)
         return own.worker.solve(task)
 
     pool = ThreadPoolExecutor(processes)
-    futures: list[Future[Row]] = []
+    futures: list[Future[FleetRow]] = []
     try:
         futures = [pool.submit(solve, task) for task in tasks]
         for future in as_completed(futures):
@@ -143,14 +143,14 @@ def solve_here(tasks: Sequence[Task], processes: int, limits: Limits) -> Iterato
 _OF_THREAD = threading.local()  # one process per thread of a Dask worker
 
 
-def solve_apart(task: Task, limits: Limits) -> Row:
+def solve_apart(task: Task, limits: Limits) -> FleetRow:
     """The row of a drive, solved by this thread's own process."""
     if getattr(_OF_THREAD, "limits", None) != limits:
         _OF_THREAD.worker, _OF_THREAD.limits = Worker(limits), limits
     return _OF_THREAD.worker.solve(task)
 
 
-def solve_on_cluster(tasks: Sequence[Task], scheduler: str, limits: Limits) -> Iterator[Row]:
+def solve_on_cluster(tasks: Sequence[Task], scheduler: str, limits: Limits) -> Iterator[FleetRow]:
     """Rows of drives as they are solved by the workers of a Dask cluster that see the same files.
 
     Raises

@@ -16,7 +16,7 @@ from graphnav.imu.preintegration import integrate_prefix
 from graphnav.imu.samples import Samples, bridge_gaps
 from graphnav.recording import Recording
 
-_BASE = 5.0  # s between the fixes that give the first velocity
+_FIRST_SPAN = 5.0  # s between the fixes that give the first velocity
 _CHANGE = 2.0  # m/s^2, by which the speed may change where nothing measures it
 
 
@@ -154,7 +154,7 @@ def _refine_by_fixes(
     gnss = recording.gnss
     assert gnss is not None
     inside = np.flatnonzero((gnss.t >= recording.start - 0.5) & np.isfinite(gnss.llh).all(axis=1))
-    i, later = inside[0], inside[gnss.t[inside] >= gnss.t[inside[0]] + _BASE]
+    i, later = inside[0], inside[gnss.t[inside] >= gnss.t[inside[0]] + _FIRST_SPAN]
     fix = frame.from_llh(gnss.llh[i]) - R @ gnss.lever_arm
     v_fix, sd_v_fix = v, np.full(3, np.inf)
     if len(later):

@@ -15,7 +15,7 @@ from graphnav.recording import Gnss
 
 COURSE_SIGMA = np.radians(10.0)  # rad, 1-sigma of the stated forward axis against the course: mounting, side slip
 _SIGNIFICANT_SIGMAS = 3.0  # significance at which accelerations show reverse, or contradict the course
-_DOUBT = 2.0  # sigmas in favour of reverse beyond which forwards is not assumed either
+_REVERSE_SIGMAS = 2.0  # sigmas in favour of reverse beyond which forwards is not assumed either
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ def use_course(tried: list[Solution], fixes: Gnss, own: float, wide: float) -> H
         )
     if (
         abs(off) > _SIGNIFICANT_SIGMAS * np.hypot(course, own)
-        or -0.5 * _SIGNIFICANT_SIGMAS**2 < for_forwards < -0.5 * _DOUBT**2
+        or -0.5 * _SIGNIFICANT_SIGMAS**2 < for_forwards < -0.5 * _REVERSE_SIGMAS**2
     ):
         # the axes may be wrong, the accelerations or the course: the sigma has to cover all of them
         notes = (

@@ -31,7 +31,7 @@ from graphnav.recording.plausibility.fixes import GRIP
 # rad, to which the fixes must determine the direction of travel: better than the other contributions
 _DIRECTION = 0.5 * COURSE_SIGMA
 _WANTED_FIXES = 10  # fixes that the short problem should contain
-_FEWEST_FIXES = 3  # fixes without which there is no acceleration
+_FEWEST_FOR_ACCELERATION = 3  # fixes without which there is no acceleration
 _MOVING_SIGMAS = 5.0  # sigmas of travel that count as motion: noise reaches them once in 270 000 fixes, exp(-5^2/2)
 _LEAD_TIME = 10.0  # s of the span before the motion
 _OUTLYING = 6.0  # multiple of the typical deviation of fixes from their running median, or of their sigma
@@ -81,10 +81,10 @@ def find_motion_span(recording: Recording, settings: Settings, stationary: Array
     if gnss is None:
         return None
     used = (gnss.t >= recording.start) & (gnss.t <= recording.end)
-    if np.count_nonzero(used) < _FEWEST_FIXES:
+    if np.count_nonzero(used) < _FEWEST_FOR_ACCELERATION:
         return None
     gnss = _thin(gnss, recording.start, recording.end)
-    if len(gnss.t) < _FEWEST_FIXES:
+    if len(gnss.t) < _FEWEST_FOR_ACCELERATION:
         return None
     t, p = gnss.t, LocalFrame(gnss.llh[0]).from_llh(gnss.llh)[:, :2]
     if recording.platform == "vehicle":
@@ -103,7 +103,7 @@ def find_motion_span(recording: Recording, settings: Settings, stationary: Array
     # at the speed that followed, it took a while to get that far
     speed = np.abs(way.D[last] - way.D[first]) / max(t[last] - t[first], 1.0)
     under_way = np.abs(way.D[first]) / speed if speed > 0.0 else np.inf
-    begin = min(t[first] - _LEAD_TIME - under_way, t[max(last - _FEWEST_FIXES + 1, 0)])
+    begin = min(t[first] - _LEAD_TIME - under_way, t[max(last - _FEWEST_FOR_ACCELERATION + 1, 0)])
     return float(max(t[0], np.round(begin, 3))), float(t[last])  # rounding errors of D must not count
 
 

@@ -29,11 +29,11 @@ from graphnav.estimation.solution import ParameterEstimate, Solution
 from graphnav.estimation.solvers.passes import Progress, integrate_again, record_residuals
 from graphnav.estimation.solvers.robust import REDESCENDING
 from graphnav.estimation.solvers.rows import (
+    Correction,
     Iterate,
     Layout,
-    Rows,
-    Step,
     Values,
+    WhitenedRows,
     compute_column_norms,
     whiten,
 )
@@ -43,7 +43,7 @@ _SHARP = 100.0  # mu from which on the kernel bends within half a per cent of it
 _MIN_DAMPING, _MAX_DAMPING = 1e-4, 1e8
 # of a step: the states it starts from, their cost, by how much it promises to lower that, and whether a damped one
 # before it did not halve it
-Watch = Callable[[States, float, float, bool], None]
+Callback = Callable[[States, float, float, bool], None]
 
 
 def batch(
@@ -53,7 +53,7 @@ def batch(
     progress: Progress | None = None,
     wanted: tuple[int, ...] | None = None,
     reintegrate: bool = True,
-    watch: Watch | None = None,
+    watch: Callback | None = None,
 ) -> Solution:
     """Solve a problem from any starting states (K rows) and parameter values.
 
@@ -143,7 +143,7 @@ def _minimise(
     progress: Progress | None,
     reintegrate: bool,
     iterations: int | None = None,
-    watch: Watch | None = None,
+    watch: Callback | None = None,
 ) -> _Minimum:
     settings = problem.settings.solver
     if iterations is not None:
@@ -218,7 +218,7 @@ def _minimise(
     return _Minimum(problem, point, layout, eliminated, now, iteration, stopped, tuple(notes))
 
 
-def solve_rows(rows: Rows, layout: Layout, damping: float = 0.0) -> tuple[Eliminated, Step, float]:
+def solve_rows(rows: WhitenedRows, layout: Layout, damping: float = 0.0) -> tuple[Eliminated, Correction, float]:
     """The rows eliminated, the step that leads to their optimum, and by how much they fall on the way."""
     graph, size = LinearGraph(), np.sqrt(damping) * compute_column_norms(rows, layout) if damping else None
     if size is not None:

@@ -21,7 +21,7 @@ from graphnav.core.rotation import Array
 from graphnav.estimation.solvers.breakdown import explain_undetermined
 
 _SUMS = 1 << 60  # keys of variables that are eliminated before anybody sees them
-Blocks = Sequence[tuple[Array, Array]]  # (keys (N,), A (N, m, k)) per variable a factor touches
+FactorBlocks = Sequence[tuple[Array, Array]]  # (keys (N,), A (N, m, k)) per variable a factor touches
 
 
 def make_jacobian_factor(blocks: Sequence[tuple[int, Array]], b: Array) -> gtsam.JacobianFactor:
@@ -60,7 +60,7 @@ class LinearGraph:
     def __init__(self) -> None:
         self._graph = gtsam.GaussianFactorGraph()
 
-    def add(self, blocks: Blocks, b: Array) -> None:
+    def add(self, blocks: FactorBlocks, b: Array) -> None:
         """N factors of m rows each: sum over blocks of A[n] d[key[n]] = b[n]."""
         n, m = b.shape
         unit = _make_unit_noise(m)

@@ -21,15 +21,15 @@ from graphnav.estimation.factor_graph.tree_marginals import (
     settle,
 )
 from graphnav.estimation.problem import Problem
-from graphnav.estimation.solvers.incremental import FINE, Replay, are_due, begin_at, replay
+from graphnav.estimation.solvers.incremental import FINE, Replay, are_due, begin_at, solve_in_turn
 from graphnav.estimation.solvers.passes import Progress
 from graphnav.estimation.solvers.stages import Message, Place
 from graphnav.estimation.solvers.window import SettledStates, compute_turn_limit
 
 _SKIP = 10  # keyframes between two looks at what has moved, as GTSAM's relinearizeSkip, at least
 _GROWN = 8  # what a look takes goes with the keyframes there: it comes when there are this part more of them
-_SHARE = 4  # covariances of keyframes are eliminated for in a fourth of the time until the next are to settle
-_ROUNDS = 30
+_SHARE_OF_TIME = 4  # covariances of keyframes are eliminated for in a fourth of the time until the next are to settle
+_MAX_UPDATES = 30
 
 
 class TreeSmoother:
@@ -67,7 +67,7 @@ class TreeSmoother:
             self._problem, _ = tree.integrate_again(self._problem)
             count = int(np.searchsorted(self._problem.t[: place.k], place.t - self.lag)) - oldest.k
             self._leaving = begin_elimination(tree, count)
-            self._portion = 1 + _SHARE * len(self._leaving.behind) // count
+            self._portion = 1 + _SHARE_OF_TIME * len(self._leaving.behind) // count
         return tree.newest, compute_newest_covariance(tree)
 
     def _settle(self, leaving: Elimination) -> None:
@@ -80,7 +80,7 @@ class TreeSmoother:
         """As of `LagSmoother`."""
         if self._leaving is not None:
             self._settle(self._leaving)
-        for _ in range(_ROUNDS):
+        for _ in range(_MAX_UPDATES):
             self._problem, again = self.tree.integrate_again(self._problem)
             if not self.tree.relinearise(FINE) and not again:
                 break
@@ -101,4 +101,4 @@ def isam2(
     lag : s of future that every settled state has seen; infinite smooths the whole drive.
     start : one state to begin at, where that is not the prior's mean.
     """
-    return replay(problem, "isam2", TreeSmoother(begin_at(problem, start), problem, lag), lag, progress)
+    return solve_in_turn(problem, "isam2", TreeSmoother(begin_at(problem, start), problem, lag), lag, progress)

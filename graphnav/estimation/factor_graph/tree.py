@@ -58,7 +58,7 @@ from graphnav.estimation.solvers.stages import (
     append_columns,
     count_columns,
     group_runs,
-    measure,
+    linearise_rows,
     predict_stage,
 )
 
@@ -114,7 +114,7 @@ class Tree:
             self._begin(place)
         if ahead is None:
             state, values, columns, link = predict_stage(self.newest, place)
-            rows = measure(place, state, values, columns).measured
+            rows = linearise_rows(place, state, values, columns).measured
         else:
             state, values, columns, link = ahead.state, ahead.values, ahead.columns, ahead.link
         fresh: list[tuple[Variable, Any]] = []  # variables that begin here, and what is known of parameters among them

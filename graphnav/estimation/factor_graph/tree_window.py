@@ -27,9 +27,9 @@ from graphnav.estimation.solvers.revision import Renewed, Renewing
 from graphnav.estimation.solvers.stages import Message, Place, Stage
 from graphnav.estimation.solvers.window import SettledStates, Window
 
-_ROUNDS = 5
-_PORTION = 48  # variables that are eliminated at one row of the IMU for covariances
-_FINE = 0.02  # of the usual limits, within which the last window is converged
+_MAX_STEPS = 5
+_COVARIANCE_PORTION = 48  # variables that are eliminated at one row of the IMU for covariances
+_CONVERGED = 0.02  # of the usual limits, within which the last window is converged
 
 
 class TreeWindow(Window):
@@ -81,8 +81,8 @@ class TreeWindow(Window):
         if always:
             self.tree.linearise_again(range(self.tree.held, len(self.tree)), renewed)
             self._relinearise(len(self))
-            share, count = min(share, _FINE), 1
-        while count < _ROUNDS and (done := self.tree.relinearise(share, renewed)):
+            share, count = min(share, _CONVERGED), 1
+        while count < _MAX_STEPS and (done := self.tree.relinearise(share, renewed)):
             self._relinearise(done)
             count += 1
         return count
@@ -102,7 +102,7 @@ class TreeWindow(Window):
         """A part of what `settle` does for the first stages, over at most so many; True once it is done."""
         if self._leaving is None:
             self._leaving = begin_elimination(self.tree, self.tree.held + count, self.tree.held)
-        before, self._leaving = self._leaving, eliminate(self.tree, self._leaving, _PORTION)
+        before, self._leaving = self._leaving, eliminate(self.tree, self._leaving, _COVARIANCE_PORTION)
         return self._leaving is before
 
     @property

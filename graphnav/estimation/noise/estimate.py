@@ -13,7 +13,7 @@ once, so none is favoured by the order. The influence of few rows is bounded: a 
 it exceeds once in a thousand times (`CHANCE`), and an outlying row, or a wheel error that lasts for seconds, gets the
 weight at which it would be that large.
 
-The first passes use the first `_FIRST` keyframes only, the last ones all.
+The first passes use the first `_FIRST_KEYFRAMES` keyframes only, the last ones all.
 """
 
 from __future__ import annotations
@@ -48,13 +48,13 @@ from graphnav.estimation.solvers.rts import smooth_moments
 from graphnav.imu.preintegration import NOISE_FIGURES
 
 _BOUNDED = 0.05  # probability of a square of an aiding sensor beyond its bound; nearly two rows in five may be wrong
-_FIRST = 1500  # keyframes: a variance estimated from a thousand numbers is good to a twentieth
+_FIRST_KEYFRAMES = 1500  # keyframes: a variance estimated from a thousand numbers is good to a twentieth
 _ROUNDS, _AGAIN = 8, 3  # passes to convergence, from the priors and from figures that were estimated before
-_MOST = 3 * _ROUNDS  # passes at most
+_MAX_PASSES = 3 * _ROUNDS  # passes at most
 _EXTRAPOLATION = 2.0  # longest step, in steps as computed (Aitken's extrapolation)
 _TIME_RANGE = 30.0  # factor by which a correlation time may differ from its prior median either way
 _MANOEUVRE = 1.0, 10.0  # rad/s, m/s^2, of a vehicle: what is unknown of an interval whose samples are lost
-_GRID = np.linspace(-1.0, 1.0, 21)
+_TIME_GRID = np.linspace(-1.0, 1.0, 21)
 
 
 @dataclass(frozen=True)
@@ -199,13 +199,13 @@ def _iterate(
 ) -> NoiseEstimate:
     """Iterate from initial figures and linearisation points to convergence."""
     passes, total, converged = 0, len(problem.t), False
-    ends = [total] if total <= 2 * _FIRST or figures.known else [_FIRST, total]
+    ends = [total] if total <= 2 * _FIRST_KEYFRAMES or figures.known else [_FIRST_KEYFRAMES, total]
     latest: tuple[ForwardRecord, DisturbancePass] | None = None
     for end in ends:
         before, converged, figures.extrapolation = -np.inf, False, 1.0
         rounds = _AGAIN if figures.same_data or end != ends[0] else _ROUNDS
         likeliest, most = figures, -np.inf
-        for k in range(_MOST):
+        for k in range(_MAX_PASSES):
             used, latest = apply_noise(problem, figures.build_model()), None  # releases the memory of the previous pass
             latest = _smooth_about(used, about.take_first(end))
             passes += 1
@@ -360,18 +360,18 @@ def _improve_time(figures: _Components, chain: ParameterChain, observed: Array, 
         np.stack([np.bincount(first, one, len(dt)) for one in some.T[observed]], axis=-1)
         for some in (later, cross, before, np.ones_like(before))
     )
-    times = p.correlation_time * np.exp(_GRID)
+    times = p.correlation_time * np.exp(_TIME_GRID)
     a = np.exp(-dt[:, None] / times)[..., None]
     q = (1.0 - a * a) * chain.sigma[0, observed] ** 2
     squares = later[:, None] - 2.0 * a * cross[:, None] + a * a * before[:, None]
     value = -0.5 * np.sum(count[:, None] * np.log(q) + squares / q, axis=(0, 2))
     median = figures.prior_times[p.name]
     value -= 0.5 * (np.log(times / median) / TIME_WITHIN) ** 2
-    j = int(np.clip(np.argmax(value), 1, len(_GRID) - 2))
+    j = int(np.clip(np.argmax(value), 1, len(_TIME_GRID) - 2))
     low, here, high = value[j - 1 : j + 2]
     bend = low - 2.0 * here + high
     off = 0.5 * (low - high) / bend if bend < 0.0 else 0.0
-    found = p.correlation_time * np.exp(_GRID[j] + (_GRID[1] - _GRID[0]) * np.clip(off, -1.0, 1.0))
+    found = p.correlation_time * np.exp(_TIME_GRID[j] + (_TIME_GRID[1] - _TIME_GRID[0]) * np.clip(off, -1.0, 1.0))
     figures.times[p.name] = float(np.clip(found, median / _TIME_RANGE, median * _TIME_RANGE))
 
 

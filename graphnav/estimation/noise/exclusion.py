@@ -14,7 +14,7 @@ innovations from the start of the span to the start of the next one:
     IMU         single intervals have more noise, those that the smoother needs it for
     rows        single rows have less weight, those that the estimate found to be outliers
 
-An unknown error has a zero-mean Gaussian prior, as wide as such errors get (`watch.WIDE`), and so has its growth; the
+An unknown error has a zero-mean Gaussian prior, as wide as such errors get (`watch.SIZES`), and so has its growth; the
 likelihood that this width costs is the Occam factor of the model (MacKay 1992, "Bayesian interpolation"). A fault is
 beforehand as improbable as a false alarm of the tests, a single outlier as improbable as `CHANCE`. The most probable
 model decides what is left out.
@@ -77,7 +77,7 @@ from graphnav.estimation.solvers.ekf import refilter
 from graphnav.estimation.solvers.watch import FALSE_ALARM
 from graphnav.recording import Recording
 
-_SINGLE = INTERVALS, ROWS  # explanations by outliers, for which nothing is left out
+_BY_ROWS = INTERVALS, ROWS  # explanations by outliers, for which nothing is left out
 _FAULT_COST = -float(np.log(FALSE_ALARM))  # log-odds of a fault beforehand, negative
 _REFINEMENTS = 2  # estimates without masked spans: the first trims the spans, the second is free of what is wrong
 
@@ -127,7 +127,7 @@ def find_faults(base: Problem, found: NoiseEstimate) -> Decision:
     base : built with stated noise.
     found : estimated with all measurements.
     """
-    first = decide(base, found, find_spans(base, found.noise, found))
+    first = explain(base, found, find_spans(base, found.noise, found))
     medians = {name: replace(figure, log_factor=figure.prior) for name, figure in found.noise.figures.items()}
     masked = _test(base, NoiseModel(medians), found)
     first = replace(first, passes=first.passes + Counter(filter=2))
@@ -161,7 +161,7 @@ def _unmask(base: Problem, found: NoiseEstimate, first: Decision, masked: list[S
         spans, refined = trim(spans, errors), trim(detected, errors)
         # a slow onset is dated better by the tests, an abrupt end by the errors of single fixes
         for some in list_distinct(spans, trim(spans, errors, FALSE_ALARM), detected):
-            candidate = decide(base, _add_outliers(estimate, errors, some), some)
+            candidate = explain(base, _add_outliers(estimate, errors, some), some)
             passes = passes + candidate.passes
             if candidate.log_evidence > best.log_evidence:
                 best, leading = candidate, estimate
@@ -190,7 +190,7 @@ def _readmit(base: Problem, found: NoiseEstimate) -> NoiseEstimate:
     if not narrow or narrow == spans:
         return found
     among = _list_explanations(found.noise)
-    wide, less = (decide(base, _add_outliers(found, errors, some), some, among) for some in (spans, narrow))
+    wide, less = (explain(base, _add_outliers(found, errors, some), some, among) for some in (spans, narrow))
     passes = found.passes + wide.passes + less.passes
     if less.log_evidence <= wide.log_evidence:
         return replace(found, passes=passes)
@@ -212,7 +212,7 @@ def estimate_disturbed_intervals(base: Problem, found: NoiseEstimate) -> NoiseEs
     start, near, passes = found.noise, found.get_linearisation(base), found.passes
     if found.noise.excluded:
         free = estimate_noise(base, None, replace(found.noise, excluded={}), near, intervals=True)
-        decision = decide(base, free, find_spans(base, free.noise, free))
+        decision = explain(base, free, find_spans(base, free.noise, free))
         passes = passes + free.passes + decision.passes + Counter(filter=1)
         if decision.noise.excluded:
             without = replace(free.noise, excluded=decision.noise.excluded)
@@ -229,7 +229,7 @@ def estimate_disturbed_intervals(base: Problem, found: NoiseEstimate) -> NoiseEs
 def log_evidence(base: Problem, found: NoiseEstimate) -> float:
     """Of all measurements, excluded ones included; each outlier outside the spans has its cost."""
     spans = join(span for some in found.noise.excluded.values() for span in some)
-    whole = decide(base, found, spans, _list_explanations(found.noise)).log_evidence if spans else found.log_posterior
+    whole = explain(base, found, spans, _list_explanations(found.noise)).log_evidence if spans else found.log_posterior
     return whole - OUTLIER_COST * sum(count_reduced(drop_within(some, spans)) for some in found.noise.weights.values())
 
 
@@ -253,7 +253,7 @@ def _test(base: Problem, noise: NoiseModel, found: NoiseEstimate) -> list[Span]:
     return join_faults(faults.find_fault_spans(faults.weigh_rows(tested, weights)))
 
 
-def decide(
+def explain(
     base: Problem, found: NoiseEstimate, spans: list[Span], among: Collection[Explanation] = EXPLANATIONS
 ) -> Decision:
     """Decide by evidence what is wrong in each span.
@@ -282,7 +282,7 @@ def decide(
         ]
         for kinds, some in inside.items()
     }
-    among = [kinds for kinds in among if kinds not in _SINGLE or any(outliers[kinds])]
+    among = [kinds for kinds in among if kinds not in _BY_ROWS or any(outliers[kinds])]
     weighted: dict[Explanation, Problem] = {
         kinds: apply_weights(used, outside | inside[kinds]) for kinds in (*ONE_SENSOR, ROWS)
     }
@@ -293,15 +293,15 @@ def decide(
     total = before + found.log_prior
     dropped: dict[str, list[Span]] = {name: [] for name in noise.weights}
     for k, span in enumerate(spans):
-        cost = np.array([0.0 if not kinds or kinds in _SINGLE else _FAULT_COST for kinds in EXPLANATIONS])
+        cost = np.array([0.0 if not kinds or kinds in _BY_ROWS else _FAULT_COST for kinds in EXPLANATIONS])
         for kinds, count in outliers.items():
-            cost[EXPLANATIONS.index(kinds)] += OUTLIER_COST * count[k] if count[k] or kinds not in _SINGLE else np.inf
+            cost[EXPLANATIONS.index(kinds)] += OUTLIER_COST * count[k] if count[k] or kinds not in _BY_ROWS else np.inf
         each = likelihood[k] - cost
         best = EXPLANATIONS[int(np.argmax(each))]
         total += float(np.max(each))
         for name in noise.weights.keys() - inside.get(best, {}).keys():
             dropped[name].append(reach[k] if name in INTERVALS else span)
-        if best not in _SINGLE:
+        if best not in _BY_ROWS:
             excluded |= {name: (*excluded.get(name, ()), span) for name in best}
     present = {rows.name for rows in base.constraints}
     excluded = {name: some for name, some in excluded.items() if name in present}

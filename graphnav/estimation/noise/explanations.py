@@ -19,7 +19,7 @@ from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.ekf import Comparison
 from graphnav.estimation.solvers.linearise import Points
 from graphnav.estimation.solvers.passes import make_points, split_values
-from graphnav.estimation.solvers.watch import MINUTE, WIDE
+from graphnav.estimation.solvers.watch import MINUTE, SIZES
 from graphnav.recording import Recording
 
 FIXES, WHEELS = ("gnss_position", "gnss_velocity"), ("nhc", "odometer")
@@ -27,7 +27,7 @@ ROWS = ("rows",)
 Explanation = tuple[str, ...]  # the constraints whose rows are wrong by it
 EXPLANATIONS: tuple[Explanation, ...] = ((), FIXES[:1], FIXES[1:], FIXES, WHEELS, INTERVALS, ROWS)
 ONE_SENSOR = FIXES[:1], FIXES[1:], WHEELS  # wrong in a span: the others are not, but may have outliers there
-_NONE = 1e-9  # sigma of an error outside its span
+_NEGLIGIBLE_SIGMA = 1e-9  # sigma of an error outside its span
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ def add_common_errors(problem: Problem, spans: list[Span], kinds: Explanation) -
         if rows.name not in kinds:
             return rows
         name, m = f"{rows.name}_fault", len(rows.axes)
-        sigma = np.maximum(np.outer(wide, np.full(2 * m, WIDE[rows.unit])), _NONE)
+        sigma = np.maximum(np.outer(wide, np.full(2 * m, SIZES[rows.unit])), _NEGLIGIBLE_SIGMA)
         own = Parameter(name, np.zeros(sigma.shape), sigma, rows.unit, begins=np.array(begins))
         t = problem.t[rows.keyframe]
         return _CommonError(
@@ -100,7 +100,7 @@ def add_own_errors(problem: Problem, spans: list[Span], kinds: Explanation) -> P
         within = mask_times(t, spans)
         sigma: Array = rows.sigma  # type: ignore[attr-defined]
         weight = np.ones(len(rows)) if rows.weight is None else rows.weight
-        wide = np.min(sigma / np.hypot(sigma, WIDE[rows.unit]), axis=1) ** 2
+        wide = np.min(sigma / np.hypot(sigma, SIZES[rows.unit]), axis=1) ** 2
         return replace(rows, weight=np.where(within, np.minimum(weight, wide), weight))
 
     return replace(problem, constraints=tuple(widen(rows) for rows in problem.constraints))

@@ -40,14 +40,14 @@ from graphnav.core.files import parse_json, read_text
 from graphnav.estimation.noise.model import INTERVALS, NoiseModel, RowWeights, StampOffsets, VarianceComponent
 from graphnav.imu.preintegration import NOISE_FIGURES
 from graphnav.recording import FIX_TYPES
-from graphnav.recording.checks.crosschecks import WIDE
+from graphnav.recording.checks.crosschecks import LARGEST_SHIFT
 
 MODES: tuple[str, ...] = get_args(NoiseSettings.model_fields["mode"].annotation)
-_LEAST = 1e-15  # weight of an interval: one without any would have no end of noise
+_LEAST_WEIGHT = 1e-15  # weight of an interval: one without any would have no end of noise
 _KEYS = ("mode", "pieces", "figures", "correlation_times", "weights", "excluded", "spacing", "stamps")
 _STAMPS = tuple(one.name for one in fields(StampOffsets))
-_LARGEST_OFFSET = 2.0 * WIDE  # s; estimates go on from what is searched
-_FIGURE = {"log_factor": "log_factor", "sigma": "sigma", "prior": "prior", "prior_sigma": "prior_sigma",
+_LARGEST_OFFSET = 2.0 * LARGEST_SHIFT  # s; estimates go on from what is searched
+_FIGURE_KEYS = {"log_factor": "log_factor", "sigma": "sigma", "prior": "prior", "prior_sigma": "prior_sigma",
            "degrees_of_freedom": "freedom"}  # fmt: skip
 _BESIDE = ("variance_factor", "stated", "used", "unit", "correlation_time")
 _TINY, _HUGE = -100.0, 100.0  # of a logarithm: e^100 is beyond what any sensor can be off by
@@ -65,7 +65,7 @@ def list_noise(noise: NoiseModel, mode: str = "estimated") -> dict[str, Any]:
         "figures": {
             group: {
                 "variance_factor": figure.factor,
-                **{key: float(getattr(figure, field)) for key, field in _FIGURE.items()},
+                **{key: float(getattr(figure, field)) for key, field in _FIGURE_KEYS.items()},
             }
             for group, figure in noise.figures.items()
         },
@@ -220,7 +220,7 @@ class _Reader:
     def read_figure(self, key: str, value: Any) -> VarianceComponent:
         if not isinstance(value, Mapping):
             raise self.make_error(key, value, "must be a table with log_factor or variance_factor")
-        self.read_names(value, (*_FIGURE, *_BESIDE), key)
+        self.read_names(value, (*_FIGURE_KEYS, *_BESIDE), key)
         what = "the natural logarithm of a variance factor"
         if "log_factor" not in value and "variance_factor" not in value:
             raise ConfigError(
@@ -261,7 +261,7 @@ class _Reader:
         if not isinstance(value, Mapping) or set(value) != {"t", "weight"}:
             raise self.make_error(key, value, "must be a table with the lists t and weight")
         lists = {}
-        least = _LEAST if key.endswith(INTERVALS) else 0.0
+        least = _LEAST_WEIGHT if key.endswith(INTERVALS) else 0.0
         for name, what, low, high in (("t", "s", -math.inf, math.inf), ("weight", "of information", least, 1.0)):
             some = value[name]
             if not isinstance(some, list):

@@ -27,11 +27,11 @@ from graphnav.detectors.windows import sum_running
 from graphnav.recording import ImuNoise, Recording
 
 _CLUSTER = 0.1  # s
-_STRETCH = 2.0  # s
+_STRETCH_LENGTH = 2.0  # s
 _CHANCE = 1e-3
 _INDEPENDENT = 1.0 / (1.0 + 2.0 * ((4.0 / 6.0) ** 2 + (1.0 / 6.0) ** 2))  # of second differences: (1, -2, 1) overlap
 _WORDS = {"gyro_noise_density": "gyro", "accel_noise_density": "accelerometer"}
-_UNITS = {"gyro_noise_density": "rad/s/sqrt(Hz)", "accel_noise_density": "m/s^2/sqrt(Hz)"}
+_DENSITY_UNITS = {"gyro_noise_density": "rad/s/sqrt(Hz)", "accel_noise_density": "m/s^2/sqrt(Hz)"}
 
 
 def apply_measured_floor(recording: Recording, settings: Settings) -> tuple[Recording, tuple[str, ...]]:
@@ -50,7 +50,7 @@ def apply_measured_floor(recording: Recording, settings: Settings) -> tuple[Reco
     if not lower:
         return recording, ()
     figures = ", ".join(
-        f"{_WORDS[name]} {density:.2g} instead of {getattr(imu.noise, name):.2g} {_UNITS[name]}"
+        f"{_WORDS[name]} {density:.2g} instead of {getattr(imu.noise, name):.2g} {_DENSITY_UNITS[name]}"
         for name, density in lower.items()
     )
     noise: ImuNoise = replace(imu.noise, **lower)
@@ -63,7 +63,7 @@ def bound_density(t: Array, x: Array) -> float:
     """Bound from above of the white noise density of rows x (N, 3) at times t (N,), per axis; infinite if too short."""
     period = compute_period(t)
     size = max(1, round(_CLUSTER / period)) if period < _CLUSTER else 1
-    count, stretch = len(t) // size, round(_STRETCH / (size * period)) if np.isfinite(period) else 1
+    count, stretch = len(t) // size, round(_STRETCH_LENGTH / (size * period)) if np.isfinite(period) else 1
     if stretch < 3 or count < stretch:
         return float("inf")
     n = count * size

@@ -18,12 +18,12 @@ from graphnav.estimation.solvers.linearise import Points, linearise
 from graphnav.estimation.solvers.passes import ForwardRecord, SmootherPass, are_near
 from graphnav.estimation.solvers.robust import weigh_squares
 from graphnav.estimation.solvers.rts import smooth_backward
-from graphnav.estimation.solvers.watch import WIDE
+from graphnav.estimation.solvers.watch import SIZES
 
 BREAKDOWN = EstimationError, np.linalg.LinAlgError  # what a filter raises that has lost its digits
 _COOLING = 3.0  # factor by which the sigmas of an annealing fall in each round
-_STAYS = 1e-3  # sigmas by which points may be off that rows are linearised at: of no account in what is linear
-_ROUNDS = 5  # searches for gross outliers at most; in most drives the second finds what the first found
+_SETTLED = 1e-3  # sigmas by which points may be off that rows are linearised at: of no account in what is linear
+_SEARCHES = 5  # searches for gross outliers at most; in most drives the second finds what the first found
 
 
 @dataclass(frozen=True)
@@ -67,13 +67,13 @@ def find_initial_points(problem: Problem, opening: float | None) -> tuple[list[I
         If the filter breaks down with large sigmas of all fixes, too.
     """
     try:
-        plain = about = smooth_backward(problem, ekf(problem, opening=opening, stays=_STAYS))
+        plain = about = smooth_backward(problem, ekf(problem, opening=opening, stays=_SETTLED))
     except BREAKDOWN:  # outliers of hundreds of sigmas leave no digits in its covariance
         initial, passes = _anneal(problem, opening)
         return [initial], passes
     sound, passes = problem, 1
     try:
-        for _ in range(_ROUNDS):
+        for _ in range(_SEARCHES):
             found = weigh_rows(problem, refilter(problem, about, watch=True, drifts=False).weights)
             if _list_unused(found) == _list_unused(sound):
                 break
@@ -119,7 +119,7 @@ def _anneal(problem: Problem, opening: float | None) -> tuple[Initial, int]:
     stated = {rows.name: np.min(rows.sigma, axis=1) for rows in fixes}  # type: ignore[attr-defined]
     outliers: dict[str, RowWeights] = {}
     while True:
-        share = {c.name: 1.0 / (1.0 + (WIDE[c.unit] * wider / stated[c.name]) ** 2) for c in fixes}
+        share = {c.name: 1.0 / (1.0 + (SIZES[c.unit] * wider / stated[c.name]) ** 2) for c in fixes}
         eased = weigh_rows(problem, {name: x * weights[name] for name, x in share.items()})
         about = smooth_backward(eased, ekf(eased, opening=opening) if about is None else refilter(eased, about))
         _, about = smooth_about(eased, about)

@@ -13,7 +13,7 @@ from graphnav.core.state import SECONDS
 from graphnav.estimation.noise.model import NoiseModel, VarianceComponent
 from graphnav.recording import FIX_TYPES, ImuNoise, Recording
 
-_IMU = {
+_IMU_FIGURES = {
     "gyro_noise_density": ("gyro, noise density", "rad/s/sqrt(Hz)"),
     "accel_noise_density": ("accelerometer, noise density", "m/s^2/sqrt(Hz)"),
     "gyro_bias_walk": ("gyro, bias random walk", "rad/s/sqrt(s)"),
@@ -25,7 +25,7 @@ _OF = {
     "nhc": "non-holonomic constraint",
     "odometer": "odometer",
 }
-_AXES = {"horizontal": slice(0, 2), "up": slice(2, 3)}
+_AXIS_SLICES = {"horizontal": slice(0, 2), "up": slice(2, 3)}
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ def tabulate_figures(
         source, *middle, axis = group.split(".")
         root = float(np.exp(0.5 * figure.log_factor))
         if source == "imu":
-            words, unit = _IMU[axis]
+            words, unit = _IMU_FIGURES[axis]
             stated = float(getattr(recording.imu.noise, axis))
             used = root * float(getattr(imu or recording.imu.noise, axis))
             out.append(FigureRow(group, words, figure, stated, used, unit, None))
@@ -111,7 +111,7 @@ def _find_process(source: str, time: str, kind: str | None) -> str:
 def _read_sigma(recording: Recording, source: str, kind: str | None, axis: str) -> float | None:
     """Median of what fixes state."""
     gnss = recording.gnss
-    if gnss is None or axis not in _AXES:
+    if gnss is None or axis not in _AXIS_SLICES:
         return None
     sd = {"gnss_position": gnss.sd, "gnss_velocity": gnss.sd_v}.get(source)
     if sd is None:
@@ -119,6 +119,6 @@ def _read_sigma(recording: Recording, source: str, kind: str | None, axis: str) 
     own = np.ones(len(gnss.t), dtype=bool)
     if kind is not None and gnss.type is not None:
         own = np.array([FIX_TYPES[int(k)] == kind for k in gnss.type], dtype=bool)
-    some = sd[own][:, _AXES[axis]]
+    some = sd[own][:, _AXIS_SLICES[axis]]
     some = some[np.isfinite(some)]
     return float(np.median(some)) if some.size else None

@@ -13,7 +13,7 @@ from graphnav.estimation.noise.model import INTERVALS, NoiseModel
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.linearise import Points, shift
 
-_IMU = {
+_NAMES = {
     "imu.gyro_noise_density": "gyro noise",
     "imu.accel_noise_density": "accelerometer noise",
     "imu.gyro_bias_walk": "gyro bias walk",
@@ -54,11 +54,11 @@ def describe_far(problem: Problem, smoothed: Points) -> tuple[str, ...]:
     return tuple(out)
 
 
-def describe(noise: NoiseModel, problem: Problem) -> tuple[str, ...]:
+def describe_noise(noise: NoiseModel, problem: Problem) -> tuple[str, ...]:
     """Sentences on the figures used, beside those stated; none where all is as stated."""
     out = []
     imu = [
-        f"{words} {np.sqrt(noise.figures[name].factor):.2g}" for name, words in _IMU.items() if name in noise.figures
+        f"{words} {np.sqrt(noise.figures[name].factor):.2g}" for name, words in _NAMES.items() if name in noise.figures
     ]
     if imu:
         out.append(Note("noise.imu", f"noise model, IMU: stated figures multiplied by: {', '.join(imu)}"))

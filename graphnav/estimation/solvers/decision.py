@@ -9,7 +9,7 @@ import numpy as np
 
 from graphnav.core.rotation import Array
 from graphnav.estimation.solvers.linearise import Points
-from graphnav.estimation.solvers.recursion import invert_sum, update
+from graphnav.estimation.solvers.recursion import invert_sum, update_covariance
 
 
 @dataclass(frozen=True)
@@ -33,4 +33,4 @@ def hold(one: DecidedRows, P: Array) -> tuple[Array, Array]:
     HP, variance = one.H @ P, one.sigma**2
     _, inverse = invert_sum(HP @ one.H.T, variance)
     Kt = inverse.T @ (inverse @ HP)
-    return -(one.residual @ Kt), update(P, HP, one.H, Kt, variance)
+    return -(one.residual @ Kt), update_covariance(P, HP, one.H, Kt, variance)

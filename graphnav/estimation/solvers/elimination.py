@@ -45,7 +45,7 @@ class Predicted:
     measured: tuple[Measured, ...]  # what has been taken in
 
 
-def predict(
+def predict_message(
     before: Message,
     place: Place,
     link: Array | None,
@@ -132,7 +132,7 @@ def predict(
     return Predicted(before, place, state, values, columns, link, top, G, g, lost, noise, tuple(rows))
 
 
-def update(ahead: Predicted, rows: Sequence[Measured], weighted: bool = False) -> tuple[Stage, Array]:
+def update_late(ahead: Predicted, rows: Sequence[Measured], weighted: bool = False) -> tuple[Stage, Array]:
     """The stage with the rows that were waited for, and the error state (D,) that it makes most likely.
 
     Robust rows get the weights they deserve at the point if that is an estimate of all data already (`weighted`);

@@ -102,7 +102,7 @@ def incremental(
     start : one state to begin at, where that is not the prior's mean.
     """
     window = Window(begin_at(problem, start), compute_turn_limit(problem.imu_noise))
-    return replay(problem, "incremental", Incremental(window, lag), lag, progress)
+    return solve_in_turn(problem, "incremental", Incremental(window, lag), lag, progress)
 
 
 def begin_at(problem: Problem, start: States | None) -> Message:
@@ -112,7 +112,7 @@ def begin_at(problem: Problem, start: States | None) -> Message:
     return message if start is None else message.move(start.minus(problem.prior.mean)[0])
 
 
-def replay(problem: Problem, solver: str, engine: LagSmoother, lag: float, progress: Progress | None) -> Replay:
+def solve_in_turn(problem: Problem, solver: str, engine: LagSmoother, lag: float, progress: Progress | None) -> Replay:
     """Have all keyframes of a problem added in turn, and what is found as solutions."""
     began = time.perf_counter()
     K, steps = len(problem.t), list_node_steps(problem)
@@ -152,7 +152,7 @@ def replay(problem: Problem, solver: str, engine: LagSmoother, lag: float, progr
         timings={solver: elapsed},
         notes=(
             *problem.notes,
-            Note("solver.step_times", ("" if np.isinf(lag) else f"lag {lag:g} s: ") + describe(seconds)),
+            Note("solver.step_times", ("" if np.isinf(lag) else f"lag {lag:g} s: ") + describe_times(seconds)),
             Note("solver.relinearised", f"{format_count(again, 'keyframe')} linearised again"),
         ),
         between=(make_dense(problem, states, covariance, scale_at(problem.columns, values), smooth=True),),
@@ -171,7 +171,7 @@ def replay(problem: Problem, solver: str, engine: LagSmoother, lag: float, progr
     return Replay(settled, now, seconds)
 
 
-def describe(seconds: Array) -> str:
+def describe_times(seconds: Array) -> str:
     """What a keyframe took, in words."""
     middle, high, most = 1e3 * np.quantile(seconds, [0.5, 0.99, 1.0])
     return f"a keyframe took {middle:.1f} ms (median), {high:.1f} ms (99 %), {most:.0f} ms (most)"

@@ -16,7 +16,7 @@ from graphnav.estimation.solution import ConstraintRecord, ParameterEstimate, So
 from graphnav.estimation.solvers.disturbance import compute_row_covariances
 from graphnav.estimation.solvers.invariant import add_invariant, subtract_invariant
 from graphnav.estimation.solvers.linearise import Columns, Points, Rows, find_last_keyframes, linearise, shift
-from graphnav.estimation.solvers.recursion import Blocks
+from graphnav.estimation.solvers.recursion import RowBlocks
 from graphnav.estimation.solvers.robust import weigh_squares
 from graphnav.estimation.solvers.stack import Innovations
 from graphnav.imu.dynamics import convert_to_biases
@@ -88,9 +88,9 @@ class MomentPass(DisturbancePass):
 
 @dataclass(frozen=True)
 class Updates:
-    """The updates of n keyframes, block by block as `graphnav.estimation.solvers.recursion.Blocks` has them."""
+    """The updates of n keyframes, block by block as `graphnav.estimation.solvers.recursion.RowBlocks` has them."""
 
-    blocks: Blocks
+    blocks: RowBlocks
     Kt: Array  # (n, M, D) gains transposed
     H: Array  # (n, M, D)
     w: Array  # (n, M) S^-1 nu
@@ -100,7 +100,7 @@ class Updates:
     places: dict[str, tuple[Array, Array]]  # of each constraint's rows, as `graphnav.estimation.solvers.stack` has them
 
     @classmethod
-    def none(cls, blocks: Blocks, H: Array, places: dict[str, tuple[Array, Array]]) -> Updates:
+    def none(cls, blocks: RowBlocks, H: Array, places: dict[str, tuple[Array, Array]]) -> Updates:
         """None yet, of rows H (n, M, D)."""
         n, M, _ = H.shape
         taken, lossy = np.zeros((2, len(blocks.begin)), dtype=bool)

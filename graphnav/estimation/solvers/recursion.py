@@ -23,7 +23,7 @@ HUBER, CAUCHY = 1, 2
 _LOSSY = 1e4  # times R that H P H^T may be for P - W^T W to keep twelve digits
 
 
-class Blocks(NamedTuple):
+class RowBlocks(NamedTuple):
     """Rows that are taken in at once: those of keyframe k are the blocks `first[k]` to `first[k+1]`."""
 
     first: Array  # (K+1,)
@@ -39,7 +39,7 @@ class Blocks(NamedTuple):
 
 
 @compile_once
-def move(F: Array, decay: Array, X: Array) -> Array:
+def move_columns(F: Array, decay: Array, X: Array) -> Array:
     """A step of columns X (D, n)."""
     out = np.empty(X.shape)
     np.dot(F, X[: F.shape[1]], out[:DIM])
@@ -48,7 +48,7 @@ def move(F: Array, decay: Array, X: Array) -> Array:
 
 
 @compile_once
-def predict(P: Array, F: Array, decay: Array, Q: Array, added: Array, out: Array) -> None:
+def predict_covariance(P: Array, F: Array, decay: Array, Q: Array, added: Array, out: Array) -> None:
     """The covariance (D, D) after a step, in `out`: with Q (15, 15) of the states and `added` (D-15) of parameters."""
     w, D = F.shape[1], len(P)
     top = np.dot(F[:MOVING], P[:w])
@@ -110,7 +110,7 @@ def halve_sum(A: Array, out: Array) -> None:
 
 
 @compile_once
-def update(P: Array, HP: Array, H: Array, Kt: Array, variance: Array) -> Array:
+def update_covariance(P: Array, HP: Array, H: Array, Kt: Array, variance: Array) -> Array:
     """The covariance after an update, by Joseph's form: (I - KH) P first, then that (I - KH)^T + K R K^T."""
     one = np.dot(Kt.T, HP)
     np.subtract(P, one, one)
@@ -168,7 +168,7 @@ def filter_rows(
     H: Array,
     variance: Array,
     scale: Array,
-    blocks: Blocks,
+    blocks: RowBlocks,
     used: Array,
     errors_predicted: Array,
     P_predicted: Array,
@@ -189,7 +189,7 @@ def filter_rows(
     Parameters
     ----------
     gap : (n-1, D) where a step leads from a point, less the next point.
-    Q, added : (n-1, 15, 15) and (n-1, D-15) as for `predict`.
+    Q, added : (n-1, 15, 15) and (n-1, D-15) as for `predict_covariance`.
     r, H, variance, scale : (n, M), (n, M, D), (n, M), (n, M) of the rows at the points, and of their kernels.
     used : (B,) whether a block is taken in; of one that is not there is an innovation only.
     root, solved : (n, M, M), (n, M), filled with roots of S and S^-1 (r + H e), before any kernel.
@@ -205,8 +205,8 @@ def filter_rows(
     for k in range(k0, k1):
         ahead = k % len(P_predicted)
         if k:
-            e = gap[k - 1] + move(F[k - 1], decay[k - 1], e.reshape(-1, 1)).ravel()
-            predict(P, F[k - 1], decay[k - 1], Q[k - 1], added[k - 1], P_predicted[ahead])
+            e = gap[k - 1] + move_columns(F[k - 1], decay[k - 1], e.reshape(-1, 1)).ravel()
+            predict_covariance(P, F[k - 1], decay[k - 1], Q[k - 1], added[k - 1], P_predicted[ahead])
         else:
             np.positive(P, P_predicted[ahead])
         P = P_predicted[ahead]
@@ -245,7 +245,7 @@ def filter_rows(
                 if told:
                     np.positive(np.dot(one.T, one), inverse[k, lo:hi, lo:hi])
                 e = e - np.dot(white, W)
-                P = update(P, HP, own, Kt_b, R) if lossy[b] else reduce(P, W)
+                P = update_covariance(P, HP, own, Kt_b, R) if lossy[b] else reduce(P, W)
         np.positive(e, errors[k % len(errors)])
         np.positive(P, P_filtered[k % len(P_filtered)])
 
@@ -320,7 +320,7 @@ def smooth_filtered(
         ahead = P_predicted[k + 1]
         away = moved[k + 1] + errors[k + 1]
         away[0], away[1], away[2] = compose_turns(turned[k + 1], errors[k + 1])
-        Ct = move(F[k], decay[k], P[k])
+        Ct = move_columns(F[k], decay[k], P[k])
         divide_covariance(ahead, Ct)
         np.dot(away, Ct, errors[k])
         two = P[k] + np.dot(Ct.T, np.dot(P_smoothed[k + 1] - ahead, Ct))

@@ -14,7 +14,7 @@ import numpy as np
 
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, States
-from graphnav.estimation.solvers.elimination import predict, update
+from graphnav.estimation.solvers.elimination import predict_message, update_late
 from graphnav.estimation.solvers.stages import (
     Columns,
     Linear,
@@ -95,7 +95,7 @@ class Revision:
         for k, linear in linearise_runs(places, states, values, columns):
             plain, bent = (tuple(m for m in linear.measured if (m.kernel == "none") == one) for one in (True, False))
             point = states[k + 1 : k + 2], values[k + 1], columns[k]
-            stage, _ = update(predict(before, places[k], linear.link, plain, *point), bent, weighted=True)
+            stage, _ = update_late(predict_message(before, places[k], linear.link, plain, *point), bent, weighted=True)
             before = stage.message
             out.append(stage)
         return out

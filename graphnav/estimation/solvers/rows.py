@@ -17,10 +17,10 @@ from graphnav.estimation.problem import ParameterChain, Problem
 from graphnav.estimation.solvers.linearise import Points, find_last_keyframes, linearise, linearise_links
 from graphnav.imu.dynamics import SCALE
 
-_FEW = 6  # blocks of rows, which all of them touch
+_SHARED_BLOCKS = 6  # blocks of rows, which all of them touch
 Values = dict[str, Array]  # parameter name -> (nodes, k)
-Rows = list[tuple[list[tuple[Array, Array]], Array]]  # blocks of (keys, A (N, m, k)), and b (N, m)
-Step = tuple[Array, Values]  # (K, 15) and per parameter
+WhitenedRows = list[tuple[list[tuple[Array, Array]], Array]]  # blocks of (keys, A (N, m, k)), and b (N, m)
+Correction = tuple[Array, Values]  # (K, 15) and per parameter
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class Iterate:
         """The scale errors of the IMU, (6,), where they are parameters."""
         return self.values[SCALE][0] if SCALE in self.values else None
 
-    def move(self, step: Step) -> Iterate:
+    def move(self, step: Correction) -> Iterate:
         """Move by a step."""
         return Iterate(self.states.plus(step[0]), {name: v + step[1][name] for name, v in self.values.items()})
 
@@ -103,9 +103,9 @@ class Layout:
         self.keys = range(len(self.width))
         self.order = [key for k in range(K) for key in (k, *after.get(k, ()))]
 
-    def join(self, rows: Rows) -> Rows:
+    def join(self, rows: WhitenedRows) -> WhitenedRows:
         """The same rows, of variables in place of keys."""
-        out: Rows = []
+        out: WhitenedRows = []
         for blocks, b in rows:
             variables, offsets = (np.stack([x[keys] for keys, _ in blocks], -1) for x in (self.variable, self.offset))
             widths = self.joined_width[variables]
@@ -135,7 +135,7 @@ class Layout:
             out.append(one[(at,) * one.ndim])
         return out
 
-    def unpack(self, vectors: list[Array]) -> Step:
+    def unpack(self, vectors: list[Array]) -> Correction:
         """Steps per state and parameter from one vector per key."""
         nodes: Values = {}
         for group in self.groups:
@@ -157,14 +157,14 @@ class Layout:
         return blocks
 
 
-def whiten(problem: Problem, point: Iterate, layout: Layout) -> tuple[Rows, float]:
+def whiten(problem: Problem, point: Iterate, layout: Layout) -> tuple[WhitenedRows, float]:
     """All factors at a point, and its cost: half their squared residuals, through the robust kernels."""
     first = np.arange(layout.K - 1)
     start, end, S, b = linearise_links(problem.motion, point.states, point.scale)
     links = [(first, start), (first + 1, end)]
     if point.scale is not None:
         links += layout.find_parameter_blocks(first, {SCALE: S})
-    out: Rows = [(links, b)]
+    out: WhitenedRows = [(links, b)]
     total = 0.5 * float(np.sum(b * b))
     points = point.make_points(problem)
     for rows in (problem.prior, *problem.constraints):
@@ -183,9 +183,9 @@ def whiten(problem: Problem, point: Iterate, layout: Layout) -> tuple[Rows, floa
     return out, total
 
 
-def _group_rows(blocks: list[tuple[Array, Array]], b: Array) -> Rows:
+def _group_rows(blocks: list[tuple[Array, Array]], b: Array) -> WhitenedRows:
     """Rows of which each touches few of many variables: those of the same ones together, without blocks of zeros."""
-    if len(blocks) <= _FEW:
+    if len(blocks) <= _SHARED_BLOCKS:
         return [(blocks, b)]
     touched = np.stack([A.any(axis=(1, 2)) for _, A in blocks], -1)
     touched[~touched.any(axis=1), 0] = True  # a row without weight
@@ -202,7 +202,7 @@ def compute_cost_at(problem: Problem, points: Points) -> float:
     return whiten(problem, Iterate(points.states, points.select_nodes(problem)), Layout(problem))[1]
 
 
-def compute_column_norms(rows: Rows, layout: Layout) -> Array:
+def compute_column_norms(rows: WhitenedRows, layout: Layout) -> Array:
     """(keys, widest) root of the diagonal of A^T A."""
     total = np.zeros((len(layout.keys), max(layout.width)))
     for blocks, _ in rows:
@@ -211,9 +211,9 @@ def compute_column_norms(rows: Rows, layout: Layout) -> Array:
     return np.sqrt(total)
 
 
-def linearise_chains(chains: Sequence[ParameterChain], group: _Group, values: Values) -> Rows:
+def linearise_chains(chains: Sequence[ParameterChain], group: _Group, values: Values) -> WhitenedRows:
     """The prior on the first node of a group's parameters, and their way from node to node."""
-    out: Rows = []
+    out: WhitenedRows = []
     for alike in zip(*(_linearise_chain(c, group, values[c.parameter.name]) for c in chains), strict=True):
         A = [np.concatenate([blocks[i][1] for blocks, _ in alike], axis=1) for i in range(len(alike[0][0]))]
         keys = [keys for keys, _ in alike[0][0]]
@@ -221,11 +221,11 @@ def linearise_chains(chains: Sequence[ParameterChain], group: _Group, values: Va
     return out
 
 
-def _linearise_chain(chain: ParameterChain, group: _Group, value: Array) -> Rows:
+def _linearise_chain(chain: ParameterChain, group: _Group, value: Array) -> WhitenedRows:
     pick = np.eye(group.width)[group.columns[chain.parameter.name]]  # (k, width)
     keys, off = group.keys, value - chain.mean
     A = pick / chain.sigma[..., None]
-    out: Rows = [([(keys[:1], A[:1])], -off[:1] / chain.sigma[:1])]
+    out: WhitenedRows = [([(keys[:1], A[:1])], -off[:1] / chain.sigma[:1])]
     if len(keys) > 1:
         decay = chain.decay[1:]
         out.append(([(keys[:-1], -decay[:, None, None] * A[1:]), (keys[1:], A[1:])],

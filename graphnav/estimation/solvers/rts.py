@@ -43,7 +43,7 @@ from graphnav.estimation.solvers.passes import (
     move_points,
     record_residuals,
 )
-from graphnav.estimation.solvers.recursion import STRETCH, move, smooth_filtered
+from graphnav.estimation.solvers.recursion import STRETCH, move_columns, smooth_filtered
 
 _CANCELLED = 7e4  # times smaller than filtered: P - P N P is good to eps times the square of that, a millionth
 
@@ -192,7 +192,7 @@ def _restore_digits(forward: ForwardRecord, P: Array, end: int) -> None:
     lost = np.flatnonzero(np.any(after * _CANCELLED < before, axis=1))
     I = np.eye(P.shape[1])
     for k in lost[lost < len(P) - 1][::-1]:
-        F, Pp = move(forward.F[k], forward.decay[k], I), forward.P_predicted[k + 1]
+        F, Pp = move_columns(forward.F[k], forward.decay[k], I), forward.P_predicted[k + 1]
         FP = F @ forward.P[k]
         _, gain, info = dposv(Pp, FP)
         if info:

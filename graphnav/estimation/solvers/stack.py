@@ -20,7 +20,7 @@ from graphnav.constraints.base import Constraint
 from graphnav.core.rotation import Array, mv
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import ConstraintRecord
-from graphnav.estimation.solvers.recursion import CAUCHY, HUBER, UNUSED, Blocks
+from graphnav.estimation.solvers.recursion import CAUCHY, HUBER, UNUSED, RowBlocks
 from graphnav.estimation.solvers.robust import soften
 
 _KERNELS = {"none": 0, "huber": HUBER, "cauchy": CAUCHY}
@@ -120,7 +120,7 @@ class Stack:
         # of each update: the lower root of S, S^-1 r, and what a kernel has left of the weights of rows
         self.root, self.solved, self.bent = np.zeros((K, self.M, self.M)), np.zeros((K, self.M)), np.ones((K, self.M))
 
-    def _split_blocks(self, table: Array, new: Array) -> Blocks:
+    def _split_blocks(self, table: Array, new: Array) -> RowBlocks:
         """Parts (8, n) in blocks, where `new` (n,) each begins one."""
         part = np.append(np.flatnonzero(new), table.shape[1])
         head, last = part[:-1], part[1:] - 1
@@ -128,7 +128,7 @@ class Stack:
         kinds = np.array([_describe(c) for c in self._constraints]).reshape(-1, 3)[table[1, head]]
         kernel, size = np.ascontiguousarray(kinds[:, 1:].T, dtype=int)  # other layouts would be compiled anew
         used = table[7, head].astype(bool)
-        return Blocks(
+        return RowBlocks(
             first, table[4, head], table[5, last], used, kinds[:, 0].copy(), kernel, size, part, *table[:2, head].copy()
         )
 

@@ -267,7 +267,7 @@ def predict_stage(before: Message, place: Place) -> tuple[States, Array, Columns
     return ahead, values, columns, (W @ motion.rotate_to_body(link, before.state.R_nb, row))[0]
 
 
-def measure(place: Place, state: States, values: Array, columns: Columns, late: bool | None = None) -> Linear:
+def linearise_rows(place: Place, state: States, values: Array, columns: Columns, late: bool | None = None) -> Linear:
     """The rows of a keyframe's measurements at a point, without a link; with `late` those that enter last, or else."""
     assert place.problem is not None
     rows = place.problem.constraints

@@ -37,7 +37,7 @@ from graphnav.estimation.solvers.stack import Stack
 from graphnav.imu.dynamics import SCALE
 
 _SHORTEST, _LONGEST = 16, 256  # keyframes of a stretch
-_MOST = 10  # times that a stretch is linearised: each gains two digits or more
+_MAX_LINEARISATIONS = 10  # times that a stretch is linearised: each gains two digits or more
 STAYS = 1e-8  # sigmas by which a guess that stays may move: a move leaves a tenth at most, so it ends within 1e-9
 
 
@@ -98,7 +98,7 @@ class StretchFilter:
         self, k: int, k1: int, x: Points, P: Array, predicted: Points, filtered: Points, alone: bool = False
     ) -> int:
         points = self._guess(k, k1, x)
-        most = _MOST + int(self._end[k] - self._start[k]) * alone
+        most = _MAX_LINEARISATIONS + int(self._end[k] - self._start[k]) * alone
         for left in range(most - 1, -1, -1):
             try:
                 stay, points = self._iterate(k, k1, x, P, points)

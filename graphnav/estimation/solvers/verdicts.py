@@ -8,9 +8,9 @@ import numpy as np
 
 from graphnav.core.rotation import Array
 from graphnav.estimation.solution import ExcludedSpan
-from graphnav.estimation.solvers.watch import LONGEST, PATIENCE
+from graphnav.estimation.solvers.watch import OLDEST, PATIENCE
 
-_CHANCE = 3  # fixes that agree after a fault, below which the next that does not says that they did by chance
+_FEWEST_AGREEING = 3  # fixes that agree after a fault, below which the next that does not says that they did by chance
 
 
 class Verdicts:
@@ -19,7 +19,7 @@ class Verdicts:
     Unless that outlasts what was used since the fault before, and a minute. Then it is more likely the filter that has
     lost its way with those: it drifts while fixes are refused, and a fault that grows meets it again; or it began with
     wrong ones. So what it used since, of any kind, is given up instead, and the fixes are taken back; this in turn is
-    undone if they are refused even so. After `LONGEST` of a fault the filter begins anew where the fixes are.
+    undone if they are refused even so. After `OLDEST` of a fault the filter begins anew where the fixes are.
 
     The first fix that is used after a long fault meets a filter that knows little, and agrees easily; from then on the
     filter is sure of it. If one of the next does not agree, it was chance, and the fault goes on.
@@ -61,7 +61,7 @@ class Verdicts:
         used[fault:end] = 0.0
         begin = _begin(used, end, 0.0)
         before = _begin(used, begin, 1.0)  # of what was used between two faults
-        if begin - before < min(_CHANCE, before - _begin(used, before, 0.0)):
+        if begin - before < min(_FEWEST_AGREEING, before - _begin(used, before, 0.0)):
             used[before:begin] = 0.0
             fault = min(fault, before)
         if self._trial is not None and self._trial[0] == name:
@@ -76,7 +76,7 @@ class Verdicts:
         begin = _begin(used, end, 0.0)
         before = _begin(used, begin, 1.0)  # of what was used between two faults
         lasted = t[end - 1] - t[begin]
-        if lasted > LONGEST and (name, t[begin]) not in self.anew:
+        if lasted > OLDEST and (name, t[begin]) not in self.anew:
             used[begin:end] = 1.0
             self.anew.add((name, float(t[begin])))
             return float(t[begin])

@@ -49,10 +49,10 @@ _CLOCKS = 0.05  # s, by which the stamps of IMU and receiver may disagree
 _BRAKING = 3.0  # m/s^2, of a usual manoeuvre
 _ONSET = float(chdtri(1, 0.05))  # of T, by which an onset may be less likely than the likeliest: 95 %
 FALSE_ALARM = 1e-7  # per test: one drive in a hundred of an hour, if errors were Gaussian
-WIDE = {"m": 100.0, "m/s": 10.0}  # reflections in a city are off by up to a hundred metres; wheels by their speed
+SIZES = {"m": 100.0, "m/s": 10.0}  # reflections in a city are off by up to a hundred metres; wheels by their speed
 MINUTE = 60.0  # s, in which an error may grow by as much as it can be
-_REMEMBERED = 64  # keyframes with fixes back to which the tests can be taken as they were
-LONGEST = 600.0  # s, about, of the oldest onset: what inertial sensors knew ten minutes ago says little
+_MEMORY = 64  # keyframes with fixes back to which the tests can be taken as they were
+OLDEST = 600.0  # s, about, of the oldest onset: what inertial sensors knew ten minutes ago says little
 
 
 class _Slots:
@@ -67,7 +67,11 @@ class _Slots:
         self.L, self.c = L, 2 * self.m if drifts else self.m
         self.columns = slice(begin, begin + L * self.c)
         self.threshold = float(chdtri(self.c, FALSE_ALARM))
-        self.fix_of, self.typical_error, self.prior = rows.fix_of, rows.compute_typical_error(), WIDE[rows.unit] ** -2.0
+        self.fix_of, self.typical_error, self.prior = (
+            rows.fix_of,
+            rows.compute_typical_error(),
+            SIZES[rows.unit] ** -2.0,
+        )
         self.memory = np.zeros(count_remembered(L, self.c))
         self.typical_sigmas = _InnovationLevel(self.m)
         self.forget()
@@ -137,7 +141,7 @@ def _list_slots(
     for rows in constraints:
         if t is not None and len(rows) > 1:
             period = float(np.median(np.diff(t[rows.keyframe])))
-        L = 1 + int(np.clip(np.log2(LONGEST / max(period, 1e-3)), 0, 12))
+        L = 1 + int(np.clip(np.log2(OLDEST / max(period, 1e-3)), 0, 12))
         out[rows.name] = _Slots(end, L, rows, drifts)
         end = out[rows.name].columns.stop
     return out
@@ -197,7 +201,7 @@ class Bank:
     """
 
     def __init__(self, constraints: Sequence[Constraint], t: Array, width: int, drifts: bool = True) -> None:
-        self._slots, self._t = _list_slots(constraints, t, LONGEST, drifts), t
+        self._slots, self._t = _list_slots(constraints, t, OLDEST, drifts), t
         some, columns = self._slots.values(), _count_columns(self._slots)
         ends = np.cumsum([width * columns, *(len(slots.memory) for slots in some)])
         self._state = np.concatenate([np.zeros(ends[0]), *(slots.memory for slots in some)])
@@ -211,7 +215,7 @@ class Bank:
         most = self._layouts.max(axis=0)
         self._errors, self._T = np.zeros((len(some), most[2], most[4])), np.zeros((len(some), most[2]))
         self._met = np.isin(np.arange(len(t)), np.concatenate([c.keyframe for c in constraints]))
-        self._before, self._keys = np.empty((_REMEMBERED, ends[-1])), np.zeros(_REMEMBERED, dtype=int)
+        self._before, self._keys = np.empty((_MEMORY, ends[-1])), np.zeros(_MEMORY, dtype=int)
         self._ends = np.zeros(2, dtype=int)
         self._kind: Array | None = None  # (B,) of each block of the filter, as it is met, and
         self._limit = np.empty(0)  # (B,) of its T
@@ -219,11 +223,11 @@ class Bank:
     def go_back(self, k: int) -> None:
         """To before keyframe k; without any onset where that is too long ago."""
         begin, end = self._ends
-        while end > begin and self._keys[(end - 1) % _REMEMBERED] > k:
+        while end > begin and self._keys[(end - 1) % _MEMORY] > k:
             end -= 1
-        if end > begin and self._keys[(end - 1) % _REMEMBERED] == k:
+        if end > begin and self._keys[(end - 1) % _MEMORY] == k:
             end -= 1
-            self._state[:] = self._before[end % _REMEMBERED]
+            self._state[:] = self._before[end % _MEMORY]
         else:
             self.X[:] = 0.0
             for slots in self._slots.values():

@@ -17,7 +17,7 @@ import numpy as np
 
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, States
-from graphnav.estimation.solvers.elimination import Predicted, predict, update
+from graphnav.estimation.solvers.elimination import Predicted, predict_message, update_late
 from graphnav.estimation.solvers.linearise import shift
 from graphnav.estimation.solvers.points import move_covariance
 from graphnav.estimation.solvers.revision import Renewed, Renewing, Revision
@@ -29,7 +29,7 @@ from graphnav.estimation.solvers.stages import (
     add_error,
     append_columns,
     count_columns,
-    measure,
+    linearise_rows,
     pad,
     predict_stage,
 )
@@ -38,10 +38,10 @@ from graphnav.estimation.solvers.watch import Watch
 from graphnav.recording import ImuNoise
 
 # of the noise of a second's force that a turn may be neglected for: the same way every second, it adds up
-_SHARE = 0.01
+_NOISE_SHARE = 0.01
 _G = 9.8  # m/s^2
 _DELAY = 0.02  # s, of a delay: 1 mm where speed is known to 5 cm/s
-_ROUNDS = 5
+_MAX_RELINEARISATIONS = 5
 _ALMOST = 0.3  # of the limits: what has moved that far goes with what is beyond them, as it would be next
 _LIMITS = {"rad": 1e-2, "s": _DELAY}
 
@@ -126,8 +126,8 @@ class Window:
     def expect(self, place: Place) -> Predicted:
         """A keyframe, linearised at its prediction, with the rows of its problem that need not be waited for."""
         state, values, columns, link = predict_stage(self.newest, place)
-        rows = measure(place, state, values, columns, late=False).measured
-        return predict(self.newest, place, link, rows, state, values, columns)
+        rows = linearise_rows(place, state, values, columns, late=False).measured
+        return predict_message(self.newest, place, link, rows, state, values, columns)
 
     def push(self, place: Place, ahead: Predicted | None = None) -> float:
         """Add a keyframe; returns by how much its measurements turned it, rad.
@@ -143,7 +143,9 @@ class Window:
     @staticmethod
     def _update(ahead: Predicted) -> tuple[Stage, Array]:
         """A keyframe with all its rows, about its prediction, and the error state (D,) that is most likely there."""
-        return update(ahead, measure(ahead.place, ahead.state, ahead.values, ahead.columns, late=True).measured)
+        return update_late(
+            ahead, linearise_rows(ahead.place, ahead.state, ahead.values, ahead.columns, late=True).measured
+        )
 
     def _append(self, stage: Stage) -> None:
         self.stages.append(stage)
@@ -284,12 +286,12 @@ class Window:
         always : once at least.
         renewed : gives the places of stages, from an index to another, where they no longer know their rows.
         """
-        for count in range(_ROUNDS):
+        for count in range(_MAX_RELINEARISATIONS):
             first = self._find_first_again(share, always and not count)
             if first is None:
                 return count
             Revision(self, first).step(len(self), renewed)
-        return _ROUNDS
+        return _MAX_RELINEARISATIONS
 
     def _find_first_again(self, share: float, every: bool) -> int | None:
         """The first stage to be linearised anew: what has moved almost as far goes with it, as it would be next."""
@@ -308,7 +310,7 @@ class Window:
         """
         if self._revision is None:
             first = self._find_first_again(1.0, always and not self._rounds)
-            if first is None or self._rounds == _ROUNDS:
+            if first is None or self._rounds == _MAX_RELINEARISATIONS:
                 self._rounds = 0
                 return False
             self._revision, self._rounds = Revision(self, first), self._rounds + 1
@@ -324,7 +326,7 @@ def compute_turn_limit(noise: ImuNoise) -> float:
 
     What is neglected of a turn a is a^2/2 of the force it turns: in a second a^2/2 g, against the noise.
     """
-    return float(np.clip(np.sqrt(2.0 * _SHARE * noise.accel_noise_density / _G), 3e-4, 1e-2))
+    return float(np.clip(np.sqrt(2.0 * _NOISE_SHARE * noise.accel_noise_density / _G), 3e-4, 1e-2))
 
 
 def make_first_message(state: States, sigma: Array, turns: bool = False) -> Message:

@@ -18,7 +18,7 @@ from graphnav.recording.checks import crosschecks, tracks
 from graphnav.recording.checks.clock import FAIR, ODOMETER_AGREES, ClockOffsets
 from graphnav.recording.checks.tracks import Track
 from graphnav.recording.odometer.faults import FROZEN, GAP, STUCK, WILD
-from graphnav.sensors.tables import TIME
+from graphnav.sensors.tables import TIME_UNITS
 
 _CERTAIN_SIGMAS = 4.0  # sigmas
 _MIN_SPEED = 5.0  # m/s, above which wheel speeds are compared
@@ -83,7 +83,7 @@ def _describe_large_steps(t: Array, recording: Recording) -> str | None:
 
 def _guess_stamp_unit(t: Array, recording: Recording) -> str | None:
     """The unit of stamps with which they would lie within the recording, if they do not in s."""
-    for unit, scale in TIME.items():
+    for unit, scale in TIME_UNITS.items():
         inside = (scale * t > recording.start) & (scale * t < recording.end)
         if unit != "s" and inside.mean() > 0.5:
             return unit
@@ -180,7 +180,12 @@ def check_imu_clock(clock: ClockOffsets) -> Iterator[Finding]:
     )
 
 
-_WORD = {GAP: "gives no readings", STUCK: "is stuck at zero", FROZEN: "is frozen", WILD: "reads against the motion"}
+_FAULT_WORDS = {
+    GAP: "gives no readings",
+    STUCK: "is stuck at zero",
+    FROZEN: "is frozen",
+    WILD: "reads against the motion",
+}
 _COARSE = 0.1  # m/s, a resolution that is reported
 _WHEEL = 0.02  # relative difference of a wheel that is reported: worn tyres differ by half of it
 _WHEELS = ("front left", "front right", "rear left", "rear right")
@@ -210,7 +215,7 @@ def check_odometer_readings(recording: Recording, facts: dict[str, Any]) -> Iter
             where = f"in {len(spans)} spans, the longest of {size:.2f} s at {at:.1f} s from the start"
         yield Finding(
             "note" if reason == GAP else "warning",
-            f"the odometer {_WORD[reason]} {where}: not used there",
+            f"the odometer {_FAULT_WORDS[reason]} {where}: not used there",
             f"odometer.{reason.replace(' ', '_')}",
         )
     if odometer.wheels is not None:

@@ -30,7 +30,7 @@ MIN_SPEED = 3.0  # m/s, below which a course is undefined
 _FASTEST_CHANGE = 8.0  # m/s^2; a larger acceleration is an error of the fix
 _CHANGES = 0.25  # m/s, rms change of speed, below which a regression on it determines nothing
 _NEAR_CLOCKS = 5.0  # s, clock error up to which is searched first
-WIDE = 30.0  # s, largest clock error searched for
+LARGEST_SHIFT = 30.0  # s, largest clock error searched for
 
 
 @dataclass(frozen=True)
@@ -177,7 +177,7 @@ def _search(t: Array, y: Array, x_at: lags_of_clocks.Regressors, span: Array, va
     near = _find_peak(lags, c)
     coarse, reached = near, correlation(near, few)
     # larger shifts only if no small one explains y, and only for a clearly better fit, for there are many of them
-    reach = min(WIDE, 0.3 * (span[-1] - span[0]))
+    reach = min(LARGEST_SHIFT, 0.3 * (span[-1] - span[0]))
     if reached < 0.6 and reach > _NEAR_CLOCKS:
         wide = np.arange(-reach, reach + 0.1, 0.2)
         far = _find_peak(wide, correlations(few, wide))

@@ -20,7 +20,7 @@ from graphnav.core.rotation import Array
 Index = NDArray[Any]  # of row numbers
 Lags = Array | float  # s, (L,) or one
 Regressors = Callable[[Index, Lags], Array]  # (rows, lags) -> (L, K, m), of one lag (K, m)
-REACH = 5.0  # s on either side of the first guess: the largest sigma that can result
+LAG_REACH = 5.0  # s on either side of the first guess: the largest sigma that can result
 _SLOW_CHANGES = 10.0  # s; slower changes are those of the road (as in `graphnav.recording.draft.motion.filter_band`)
 # s, of the grids of lags; changes over a second are alike for a second
 _COARSE, _FINE, _FINEST = 0.2, 0.02, 0.005
@@ -82,24 +82,24 @@ def refine_lag(
     for _ in range(2):  # spikes of fixes hide a good fit
         found = at(guess, rows)
         if found is None:
-            return guess, REACH
+            return guess, LAG_REACH
         off = np.abs(found.e - np.median(found.e))
         rows = found.rows[off <= _OUTLYING * np.median(off) / 0.6745]
 
     def profile(lags: Array) -> Array:
         return np.array([np.nan if one is None else one.unexplained for one in at_each(lags, rows)])
 
-    wide = guess + np.arange(-REACH, REACH + _COARSE / 2, _COARSE)
+    wide = guess + np.arange(-LAG_REACH, LAG_REACH + _COARSE / 2, _COARSE)
     seen = profile(wide)
     if not np.isfinite(seen).any():
-        return guess, REACH
+        return guess, LAG_REACH
     near = wide[int(np.nanargmin(seen))] + np.arange(-_COARSE, _COARSE + _FINE / 2, _FINE)
     close = profile(near)
     lag = _find_lowest(near, close)
     best = at(lag, rows)
     scores = None if best is None else _score_lags(t, x_at, valid, best, lag)
     if best is None or scores is None:
-        return lag, REACH
+        return lag, LAG_REACH
     variance, information = scores
     spread = np.sqrt(variance) / information  # by the curvature
     worth = len(best.e) * min(1.0, float(np.mean(best.e**2)) * information / variance)  # independent rows

@@ -103,14 +103,14 @@ class Inspection:
         return "\n".join(lines)
 
 
-_UNITS = {"hz": "Hz", "s": "s", "m": "m", "mps": "m/s", "mps2": "m/s2", "dbhz": "dB-Hz"}
+_VALUE_UNITS = {"hz": "Hz", "s": "s", "m": "m", "mps": "m/s", "mps2": "m/s2", "dbhz": "dB-Hz"}
 
 
 def _show(name: str, value: Any) -> str:
     if isinstance(value, dict):
         return ", ".join(_show(*one) for one in value.items())
     words = name.split("_")
-    unit = _UNITS.get(words[-1], "") if len(words) > 1 else ""
+    unit = _VALUE_UNITS.get(words[-1], "") if len(words) > 1 else ""
     number = f"{value:.6g}" if isinstance(value, float) else str(value)
     return f"{' '.join(words[:-1] if unit else words)} {number} {unit}".rstrip()
 

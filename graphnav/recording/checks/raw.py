@@ -9,10 +9,10 @@ import numpy as np
 
 from graphnav.core.findings import Finding, compute_period
 from graphnav.gnss.series import RawGnss
-from graphnav.gnss.signals import NAMES, SYSTEMS, name_satellite, name_signal
+from graphnav.gnss.signals import SYSTEM_NAMES, SYSTEMS, name_satellite, name_signal
 
-_GAP_PERIODS = 2.5  # periods beyond which a step between epochs is a gap
-_FEW = 5  # satellites, one more than a position with its clock takes
+_EPOCH_GAP_PERIODS = 2.5  # periods beyond which a step between epochs is a gap
+_FEWEST_SATELLITES = 5  # satellites, one more than a position with its clock takes
 
 
 def describe_raw(raw: RawGnss) -> dict[str, Any]:
@@ -25,13 +25,15 @@ def describe_raw(raw: RawGnss) -> dict[str, Any]:
     if len(epochs) > 1:
         period, step = compute_period(epochs), np.diff(epochs)
         facts |= {"rate_hz": round(1.0 / period, 3), "span_s": round(float(epochs[-1] - epochs[0]), 3)}
-        facts["gaps"] = int((step > _GAP_PERIODS * period).sum())
+        facts["gaps"] = int((step > _EPOCH_GAP_PERIODS * period).sum())
         facts["longest_step_s"] = round(float(step.max()), 3)
     for k in range(len(SYSTEMS)):
         if (system == k).any():
-            facts[f"satellites_{NAMES[k]}"] = len(np.unique(raw.satellite[system == k]))
+            facts[f"satellites_{SYSTEM_NAMES[k]}"] = len(np.unique(raw.satellite[system == k]))
     for s, g in np.unique(np.stack([system, raw.signal], -1), axis=0):
-        facts[f"observations_{NAMES[int(s)]}_{name_signal(int(g))}"] = int(((system == s) & (raw.signal == g)).sum())
+        facts[f"observations_{SYSTEM_NAMES[int(s)]}_{name_signal(int(g))}"] = int(
+            ((system == s) & (raw.signal == g)).sum()
+        )
     facts["satellites_at_once"] = int(np.median(by_epoch))
     carrier = np.isfinite(raw.carrier)
     facts["carriers"] = int(carrier.sum())
@@ -53,11 +55,11 @@ def describe_raw(raw: RawGnss) -> dict[str, Any]:
 def check_raw(raw: RawGnss) -> Iterator[Finding]:
     """What a tightly coupled solution suffers from."""
     by_epoch = _count_satellites(raw, np.isfinite(raw.p[:, 0]))
-    few = float(np.mean(by_epoch < _FEW))
+    few = float(np.mean(by_epoch < _FEWEST_SATELLITES))
     if few > 0.5:
         yield Finding(
             "warning",
-            f"raw GNSS: fewer than {_FEW} satellites have a place in {100.0 * few:.0f} % of the epochs",
+            f"raw GNSS: fewer than {_FEWEST_SATELLITES} satellites have a place in {100.0 * few:.0f} % of the epochs",
             "raw_gnss.few_satellites",
         )
     if not np.isfinite(raw.range_rate).any():

@@ -22,12 +22,12 @@ from graphnav.recording.draft.raw import RawFound, find_raw, write_raw
 from graphnav.recording.draft.sources import (
     JOINED,
     find_logs,
+    guess_file_pressure_unit,
     guess_fix_speed_unit,
-    guess_pressure_unit,
     name_plain_file,
     read_fixes,
 )
-from graphnav.recording.formats.schema import FORCE, RATE, SPEED
+from graphnav.recording.formats.schema import FORCE, RATE_UNITS, SPEED
 from graphnav.recording.formats.writer import quote
 
 __all__ = ["Draft", "draft"]
@@ -78,7 +78,7 @@ def read_imu_in_si(path: Path) -> tuple[Array, Array, Array]:
     gyro, accel = source.stack("gx", "gy", "gz"), source.stack("ax", "ay", "az")
     force = guesses.guess_accel_unit(path, accel, source.find_unit("ax", "accel"))
     rate = guesses.guess_gyro_unit(gyro, source.find_unit("gx", "gyro"), None, vehicle=False)
-    return source.t, gyro * RATE[str(rate.value)], accel * FORCE[str(force.value)]
+    return source.t, gyro * RATE_UNITS[str(rate.value)], accel * FORCE[str(force.value)]
 
 
 class _Writer:
@@ -158,7 +158,7 @@ class _Writer:
             agreement = compare_with_fixes(t, gyro, accel, up, raw.horizontal, 0.0)
         if source.log is None:
             rate = guesses.guess_gyro_unit(gyro, source.find_unit("gx", "gyro"), agreement.turn, vehicle)
-            gyro = gyro * RATE[str(rate.value)]
+            gyro = gyro * RATE_UNITS[str(rate.value)]
             self._write_units({"t": source.t_unit, "gyro": rate, "accel": force})
             front = self._write_axes(up, up_why, agreement)
         elif source.log.mount_known or agreement.clearest is None:
@@ -259,7 +259,7 @@ class _Writer:
         """Write what is to be added to the stamps of the fixes, if that is seen."""
         if agreement.offset is not None:
             seconds, sigma = agreement.offset
-            sure = "" if sigma < motion.STEP else "CHECK: "
+            sure = "" if sigma < motion.GRID else "CHECK: "
             why = f"{sure}s, +-{max(sigma, 0.01):.2f}; the accelerations agree best with the IMU's so"
             if self.epochs is not None:
                 rest = seconds - self.epochs.offset
@@ -290,7 +290,7 @@ class _Writer:
     def _write_barometer(self, source: Source) -> None:
         self.lines += ["", "[barometer]"]
         self._write_file(source, "barometer")
-        unit = guess_pressure_unit(source)
+        unit = guess_file_pressure_unit(source)
         assert unit is not None
         self._write_units({"t": source.t_unit, "pressure": unit})
 
@@ -355,8 +355,8 @@ def _find_odometer_lag(t: Array, speed: Array, felt: tuple[Array, Array]) -> mot
     if len(t) < 50:
         return None
     grid, forward = motion.resample_on_grid(felt[0], felt[1][:, None])
-    even = np.arange(t[0], t[-1], motion.STEP)
-    pull = np.gradient(motion.compute_moving_mean(np.interp(even, t, speed)), motion.STEP)
+    even = np.arange(t[0], t[-1], motion.GRID)
+    pull = np.gradient(motion.compute_moving_mean(np.interp(even, t, speed)), motion.GRID)
     return motion.find_lag(grid, motion.filter_band(forward[:, 0]), even, motion.filter_band(pull))
 
 

@@ -65,8 +65,8 @@ class Agreement:
         if not self.far:
             return None
         known = clock.by_velocity or clock.by_places
-        sure = known is not None and known.correlation > LIKELY and known.spread < motion.STEP
-        return (known.lag - self.far, known.spread) if sure and known is not None else (-self.far, motion.STEP)
+        sure = known is not None and known.correlation > LIKELY and known.spread < motion.GRID
+        return (known.lag - self.far, known.spread) if sure and known is not None else (-self.far, motion.GRID)
 
 
 def find_level_axes(up: Array) -> tuple[Array, Array]:

@@ -70,7 +70,7 @@ _PATTERNS: dict[str, tuple[str, ...]] = {
     ),
 }  # fmt: skip
 
-UNITS = {
+NAMED_UNITS = {
     "s": ("t", "s"), "sec": ("t", "s"), "seconds": ("t", "s"), "ms": ("t", "ms"), "us": ("t", "us"), "ns": ("t", "ns"),
     "dps": ("gyro", "deg/s"), "deg_s": ("gyro", "deg/s"), "degps": ("gyro", "deg/s"), "deg_sec": ("gyro", "deg/s"),
     "rad_s": ("gyro", "rad/s"), "rps": ("gyro", "rad/s"), "rads": ("gyro", "rad/s"), "mdps": ("gyro", "mdeg/s"),
@@ -86,11 +86,11 @@ UNITS = {
     "inhg": ("pressure", "inHg"),
     "ft": ("length", "ft"), "feet": ("length", "ft"), "foot": ("length", "ft"),
 }  # fmt: skip
-_AXES = ("gx", "gy", "gz", "ax", "ay", "az")
+_AXIS_COLUMNS = ("gx", "gy", "gz", "ax", "ay", "az")
 
 
 @dataclass(frozen=True)
-class Columns:
+class FileColumns:
     """Columns of one file: our name -> the file's, and our name -> the unit stated in its name."""
 
     names: dict[str, str]
@@ -114,7 +114,7 @@ class Columns:
         return "odometer" if wheel else "barometer" if "pressure" in self.names else None
 
 
-def match_columns(header: Sequence[str], stem: str = "") -> Columns:
+def match_columns(header: Sequence[str], stem: str = "") -> FileColumns:
     """Match a file's columns to ours; `stem`, the file's name, shows what bare x, y, z are of."""
     spelt = [(name, *split_unit(name)) for name in header]
     certain = [some for some in spelt if not _UNCERTAIN.fullmatch(some[1])]
@@ -141,7 +141,7 @@ def match_columns(header: Sequence[str], stem: str = "") -> Columns:
         if not all(f"{kind}{x}" in names for x in "xyz"):
             for x in "xyz":
                 names.pop(f"{kind}{x}", None)
-    return Columns(names, units)
+    return FileColumns(names, units)
 
 
 def find_clocks(header: Sequence[str]) -> list[str]:
@@ -164,12 +164,12 @@ def split_unit(name: str) -> tuple[str, str]:
     for count in (3, 2, 1):
         unit = "_".join(words[-count:])
         # "a_g" may be anything; "g" and "s" alone are names
-        if len(words) > count and unit in UNITS:
+        if len(words) > count and unit in NAMED_UNITS:
             return "_".join(words[:-count]), unit
     return plain, ""
 
 
-def find_stated_unit(columns: Columns, ours: str, kind: str) -> str | None:
+def find_stated_unit(columns: FileColumns, ours: str, kind: str) -> str | None:
     """The unit of recording.toml that a column's name states, if it is one of that kind."""
-    found = UNITS.get(columns.units.get(ours, ""))
+    found = NAMED_UNITS.get(columns.units.get(ours, ""))
     return found[1] if found and found[0] == kind else None

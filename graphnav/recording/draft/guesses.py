@@ -11,14 +11,14 @@ from graphnav.core.earth import STANDARD_GRAVITY
 from graphnav.core.errors import RecordingError
 from graphnav.core.rotation import Array
 from graphnav.recording.draft import motion
-from graphnav.recording.formats.schema import FORCE, RATE, SPEED, parse_axes_letters
+from graphnav.recording.formats.schema import FORCE, RATE_UNITS, SPEED, parse_axes_letters
 from graphnav.sensors import barometer
 from graphnav.sensors.barometer import ATMOSPHERE
-from graphnav.sensors.tables import TIME
+from graphnav.sensors.tables import TIME_UNITS
 
 _MEAN_SHARE = 0.5  # share of the typical force that is in its mean, even for a swinging foot
 _LIKELY = 0.5  # correlation
-_STRAIGHT = np.cos(np.radians(12.0))  # cosine of the angle to a file axis below which the axis is meant
+_STRAIGHT_COSINE = np.cos(np.radians(12.0))  # cosine of the angle to a file axis below which the axis is meant
 _QUIET_SPAN = 5.0  # s
 _LARGEST_STEP = 100.0  # s; larger steps between stamps mean a smaller unit
 _FIXED = 0.15  # m; only fixed carrier phases state less
@@ -40,10 +40,10 @@ def guess_time_unit(t: Array, stated: str | None, imu: bool) -> Guess:
         return Guess(unit, f"{t[0]:.0f} is then a date of this century in Unix time")
     step = float(np.median(np.diff(t))) if len(t) > 1 else 1.0
     low, high = (5e-4, 0.11) if imu else (0.02, 11.0)
-    fits = [unit for unit, scale in TIME.items() if low <= step * scale <= high]
+    fits = [unit for unit, scale in TIME_UNITS.items() if low <= step * scale <= high]
     if not fits:
         return Guess("s", f"rows are {step:g} apart, which fits no unit: a guess")
-    return Guess(fits[0], f"rows are then {step * TIME[fits[0]]:.4g} s apart")
+    return Guess(fits[0], f"rows are then {step * TIME_UNITS[fits[0]]:.4g} s apart")
 
 
 def is_date(t: Array) -> bool:
@@ -54,7 +54,8 @@ def is_date(t: Array) -> bool:
 def _guess_unix_unit(t: Array) -> str | None:
     step = float(np.median(np.diff(t))) if len(t) > 1 else 0.0
     return next(
-        (u for u, scale in TIME.items() if 1e9 <= float(t[0]) * scale < 3e9 and step * scale < _LARGEST_STEP), None
+        (u for u, scale in TIME_UNITS.items() if 1e9 <= float(t[0]) * scale < 3e9 and step * scale < _LARGEST_STEP),
+        None,
     )
 
 
@@ -88,7 +89,7 @@ def guess_accel_unit(path: Path, accel: Array, stated: str | None) -> Guess:
 def guess_gyro_unit(gyro: Array, stated: str | None, lag: motion.Lag | None, vehicle: bool) -> Guess:
     """rad/s or deg/s: by the turns of the course if there are any, by the name, by the magnitude."""
     if lag is not None and abs(lag.correlation) > _LIKELY:
-        for unit, scale in RATE.items():
+        for unit, scale in RATE_UNITS.items():
             if 0.6 < abs(lag.slope) * scale < 1.6:
                 return Guess(unit, f"the turns are then those of the course (correlation {abs(lag.correlation):.2f})")
     if stated is not None:
@@ -144,7 +145,7 @@ def guess_axes(up: Array, forward: Array) -> tuple[str | None, tuple[Array, Arra
     """Three letters if both vectors are close to file axes, and in any case the two vectors."""
     square = forward - (forward @ up) * up
     square /= np.linalg.norm(square)
-    if np.abs(up).max() > _STRAIGHT and np.abs(square).max() > _STRAIGHT:
+    if np.abs(up).max() > _STRAIGHT_COSINE and np.abs(square).max() > _STRAIGHT_COSINE:
         letters = ["", "", ""]
         for vector, positive, negative in ((up, "U", "D"), (square, "F", "B")):
             k = int(np.abs(vector).argmax())

@@ -19,8 +19,8 @@ from graphnav.recording.formats.folder import read_other_log
 from graphnav.recording.formats.registry import Log
 from graphnav.recording.formats.repair import mask_new_fixes
 from graphnav.recording.formats.schema import WHEELS
-from graphnav.recording.formats.table import Table, read_first_rows, read_header, read_table
-from graphnav.sensors.tables import ANGLE, TIME
+from graphnav.recording.formats.table import Table, read_column_names, read_first_rows, read_table
+from graphnav.sensors.tables import ANGLE, TIME_UNITS
 
 WANTED = {
     "imu": ("t", "gx", "gy", "gz", "ax", "ay", "az"),
@@ -59,7 +59,7 @@ class Source:
     """One sensor's log: columns by our names in the file's units, or the log of a known program."""
 
     path: Path
-    columns: matching.Columns = field(default_factory=lambda: matching.Columns({}))
+    columns: matching.FileColumns = field(default_factory=lambda: matching.FileColumns({}))
     values: dict[str, Array] = field(default_factory=dict)
     log: Log | None = None
     t_unit: Guess = field(default_factory=lambda: Guess("s", ""))
@@ -78,7 +78,7 @@ class Source:
     @property
     def t(self) -> Array:
         """Times of the rows of a CSV file, s."""
-        return self.values["t"] * TIME[str(self.t_unit.value)]
+        return self.values["t"] * TIME_UNITS[str(self.t_unit.value)]
 
     def stack(self, *names: str) -> Array:
         """Columns side by side, (N, len(names))."""
@@ -116,7 +116,7 @@ def read_log(path: Path, topics: Sequence[str] = ()) -> dict[str, Source]:
         return {s: Source(path, log=log) for s in ("imu", "gnss", "odometer") if getattr(log, s) is not None}
     plain = read_plain(path) if path.is_file() else None
     try:
-        header = read_header(path) if plain is None else list(plain.columns)
+        header = read_column_names(path) if plain is None else list(plain.columns)
     except RecordingError as error:
         words = f"{path}: no table of a sensor is recognised in it" if error.key == "table.separator" else str(error)
         raise NoSensorError(words, key=error.key) from error
@@ -132,7 +132,7 @@ def read_log(path: Path, topics: Sequence[str] = ()) -> dict[str, Source]:
         columns = _add_clock(path, header, columns)
     elif stamps := plain.dated or (plain.daily if columns.names["t"] == plain.daily else None):
         units = {ours: unit for ours, unit in columns.units.items() if ours != "t"}
-        columns = matching.Columns({**columns.names, "t": stamps}, units)
+        columns = matching.FileColumns({**columns.names, "t": stamps}, units)
     roles = [sensor]
     if sensor == "imu" and {"lat", "lon"} <= columns.names.keys():
         roles.append("gnss")
@@ -150,7 +150,7 @@ def _read_stamps(cells: list[str]) -> Array | None:
     return t if len(t) > 1 and (np.diff(t) > 0.0).all() else None
 
 
-def _add_clock(path: Path, header: list[str], columns: matching.Columns) -> matching.Columns:
+def _add_clock(path: Path, header: list[str], columns: matching.FileColumns) -> matching.FileColumns:
     """The columns with the time column that dates the rows, if one of several does, else with a numerical one."""
     several = matching.find_clocks(header)
     if len(several) < 2:
@@ -167,7 +167,7 @@ def _add_clock(path: Path, header: list[str], columns: matching.Columns) -> matc
     units = {ours: unit for ours, unit in columns.units.items() if ours != "t"}
     if unit := matching.split_unit(best)[1]:
         units["t"] = unit
-    return matching.Columns({**columns.names, "t": best}, units)
+    return matching.FileColumns({**columns.names, "t": best}, units)
 
 
 def _read_numbers(path: Path, name: str, plain: Plain | None) -> bool:
@@ -180,7 +180,7 @@ def _read_numbers(path: Path, name: str, plain: Plain | None) -> bool:
         return False
 
 
-def _read(path: Path, columns: matching.Columns, role: str, plain: Plain | None) -> Source:
+def _read(path: Path, columns: matching.FileColumns, role: str, plain: Plain | None) -> Source:
     """The columns of one sensor: rows complete in what it needs, in order of time."""
     wanted = WANTED[role]
     names = {ours: theirs for ours, theirs in columns.names.items() if ours in wanted}
@@ -227,8 +227,8 @@ def _read(path: Path, columns: matching.Columns, role: str, plain: Plain | None)
     if role == "odometer" and "speed" not in values:  # as it will be read
         rear = [w for w in WHEELS[2:] if w in values] or [w for w in WHEELS if w in values]
         values["speed"] = np.mean([values[w] for w in rear], axis=0)
-        columns = matching.Columns(columns.names, {**columns.units, "speed": columns.units.get(rear[0], "")})
-    source = Source(path, matching.Columns(names, columns.units), values, plain=plain)
+        columns = matching.FileColumns(columns.names, {**columns.units, "speed": columns.units.get(rear[0], "")})
+    source = Source(path, matching.FileColumns(names, columns.units), values, plain=plain)
     inertial = role not in ("gnss", "odometer", "barometer")
     source.t_unit = guesses.guess_time_unit(source.values["t"], source.find_unit("t", "t"), inertial)
     return source

@@ -18,7 +18,7 @@ import numpy as np
 from graphnav.core.earth import LocalFrame
 from graphnav.core.rotation import Array
 
-STEP = 0.1  # s, of the common grid
+GRID = 0.1  # s, of the common grid
 _MEAN_OVER = 1.0  # s, of the moving mean over everything
 _LEAST_SPEED = 3.0  # m/s; below, a course is undefined
 _FEWEST_SAMPLES, _TRIMS = 50, 3
@@ -51,20 +51,20 @@ def compute_course(t: Array, llh: Array, v: Array | None) -> Course:
     if v is None or np.isnan(v[:, :2]).all():
         keep = np.concatenate([[True], np.diff(t) > 0])
         t, p = t[keep], p[keep]
-        grid = np.arange(t[0], t[-1], STEP)
+        grid = np.arange(t[0], t[-1], GRID)
         east, north = (
-            compute_moving_mean(np.gradient(compute_moving_mean(np.interp(grid, t, p[:, k])), STEP)) for k in (0, 1)
+            compute_moving_mean(np.gradient(compute_moving_mean(np.interp(grid, t, p[:, k])), GRID)) for k in (0, 1)
         )
     else:
         known = ~np.isnan(v[:, :2]).any(-1)
         t, v = t[known], v[known]
-        grid = np.arange(t[0], t[-1], STEP)
+        grid = np.arange(t[0], t[-1], GRID)
         east, north = (compute_moving_mean(np.interp(grid, t, v[:, k])) for k in (0, 1))
     # unknown inside gaps, and where the means extend into them or beyond an end
     gap = compute_moving_mean(_mask_gaps(grid, t).astype(float), 4.0 * _MEAN_OVER) > 0.0
     gap |= (grid < grid[0] + 2.0 * _MEAN_OVER) | (grid > grid[-1] - 2.0 * _MEAN_OVER)
     speed = np.hypot(east, north)
-    ae, an = np.gradient(east, STEP), np.gradient(north, STEP)
+    ae, an = np.gradient(east, GRID), np.gradient(north, GRID)
     slow = (speed < _LEAST_SPEED) | gap
     safe = np.where(slow, np.inf, speed)
     forward, left = (east * ae + north * an) / safe, (east * an - north * ae) / safe
@@ -77,7 +77,7 @@ def compute_course(t: Array, llh: Array, v: Array | None) -> Course:
 def resample_on_grid(t: Array, x: Array) -> tuple[Array, Array]:
     """Samples (N, k) as means over a second on an even grid; NaN inside gaps."""
     cumulative = np.concatenate([np.zeros((1, x.shape[1])), np.cumsum(x[1:] * np.diff(t)[:, None], axis=0)])
-    grid = np.arange(t[0] + _MEAN_OVER / 2, t[-1] - _MEAN_OVER / 2, STEP)
+    grid = np.arange(t[0] + _MEAN_OVER / 2, t[-1] - _MEAN_OVER / 2, GRID)
     if not len(grid):
         return grid, np.empty((0, x.shape[1]))
     both = [np.stack([np.interp(grid + side * _MEAN_OVER / 2, t, c) for c in cumulative.T], -1) for side in (-1, 1)]
@@ -88,7 +88,7 @@ def resample_on_grid(t: Array, x: Array) -> tuple[Array, Array]:
 
 def compute_moving_mean(x: Array, window: float = _MEAN_OVER) -> Array:
     """Moving mean over some seconds, of the grid."""
-    n = 2 * round(window / STEP / 2)
+    n = 2 * round(window / GRID / 2)
     kernel = np.ones(n + 1)
     kernel[[0, -1]] = 0.5
     within = slice(n // 2, n // 2 + len(x))  # "same" has the length of the longer, which may be the kernel
@@ -96,7 +96,7 @@ def compute_moving_mean(x: Array, window: float = _MEAN_OVER) -> Array:
 
 
 def find_lag(t: Array, x: Array, u: Array, y: Array, weight: Array | None = None, anywhere: bool = False) -> Lag | None:
-    """Delay of `y` at `u` behind `x` at `t` (both on grids of `STEP`) at the best agreement; None without one.
+    """Delay of `y` at `u` behind `x` at `t` (both on grids of `GRID`) at the best agreement; None without one.
 
     Real signals, or planar vectors as complex numbers, whose `Lag.slope` then gives the rotation of `x` against `y`.
     Outlying samples of `y` at the best lag are left out, and the search is repeated.
@@ -117,7 +117,7 @@ def find_lag(t: Array, x: Array, u: Array, y: Array, weight: Array | None = None
     if anywhere:
         shifts, r, slope = _list_all_lags(a, b, w)
     else:
-        shifts = np.arange(np.ceil((-SEARCHED - apart) / STEP), np.floor((SEARCHED - apart) / STEP) + 1).astype(int)
+        shifts = np.arange(np.ceil((-SEARCHED - apart) / GRID), np.floor((SEARCHED - apart) / GRID) + 1).astype(int)
         r, slope = _list_lags(a, b, w, shifts)
         for _ in range(_TRIMS):
             if not np.isfinite(r).any():
@@ -133,7 +133,7 @@ def find_lag(t: Array, x: Array, u: Array, y: Array, weight: Array | None = None
         left, top, right = np.abs(r[best - 1 : best + 2])
         bend = left - 2 * top + right
         peak = 0.5 * (left - right) / bend if bend < 0 else 0.0
-    return Lag(float(apart + (shifts[best] + peak) * STEP), float(r[best]), complex(slope[best]))
+    return Lag(float(apart + (shifts[best] + peak) * GRID), float(r[best]), complex(slope[best]))
 
 
 def filter_band(x: Array) -> Array:
@@ -149,12 +149,12 @@ def filter_band(x: Array) -> Array:
 
 
 def _resample_evenly(t: Array, x: Array) -> Array:
-    grid = t[0] + STEP * np.arange(round((t[-1] - t[0]) / STEP) + 1)
+    grid = t[0] + GRID * np.arange(round((t[-1] - t[0]) / GRID) + 1)
     known = np.isfinite(x)
     if not known.any():
         return np.full(len(grid), np.nan)
     out = np.interp(grid, t[known], x[known])
-    k = np.clip(np.round((grid - t[0]) / STEP).astype(int), 0, len(x) - 1)
+    k = np.clip(np.round((grid - t[0]) / GRID).astype(int), 0, len(x) - 1)
     out[~np.isfinite(x[k])] = np.nan
     return out
 

@@ -14,7 +14,7 @@ import numpy as np
 from graphnav.core.errors import RecordingError
 from graphnav.core.files import open_file, parse_number, read_bytes
 from graphnav.core.rotation import Array
-from graphnav.recording.draft.columns import UNITS, match_columns, split_unit
+from graphnav.recording.draft.columns import NAMED_UNITS, match_columns, split_unit
 
 DAY = 86400.0  # s
 _START = 1 << 16  # bytes that contain the header
@@ -23,9 +23,9 @@ _COMMENT = re.compile(r"\s*(?:#|%|//)+\s?")
 _DAY_FIRST = re.compile(r"(\d{1,2})\.(\d{1,2})\.(\d{4})(.*)")  # 08.07.2025
 _YEAR_FIRST = re.compile(r"(\d{4})[-/.](\d{1,2})[-/.](\d{1,2})(.*)")  # 2025-07-08
 _SLASHES = re.compile(r"(\d{1,2})/(\d{1,2})/(\d{4})(.*)")  # 07/08/2025, where one number may identify the month
-_CLOCK = re.compile(r"(\d{1,2}):(\d{2}):(\d{2})(?:[.,:](\d{1,9}))?\s*([AaPp][Mm])?")
+_TIME_OF_DAY = re.compile(r"(\d{1,2}):(\d{2}):(\d{2})(?:[.,:](\d{1,9}))?\s*([AaPp][Mm])?")
 
-Lines = list[tuple[int, str]]  # line number in the file, from 1, and text
+NumberedLines = list[tuple[int, str]]  # line number in the file, from 1, and text
 
 
 @dataclass(frozen=True)
@@ -123,7 +123,7 @@ def _decode(data: bytes) -> tuple[str, list[str]]:
         return data.decode("cp1252", errors="replace"), ["text of Windows"]
 
 
-def _read_lines(text: Sequence[str]) -> Lines:
+def _read_lines(text: Sequence[str]) -> NumberedLines:
     """Numbers and text of non-empty lines; after the first row without comments."""
     lines = [(k, line) for k, line in enumerate(text, 1) if line.strip()]
     first = _find_first_row(lines)
@@ -153,7 +153,7 @@ def _is_value(cell: str) -> bool:
     )
 
 
-def _find_first_row(lines: Lines) -> int | None:
+def _find_first_row(lines: NumberedLines) -> int | None:
     """Index of the first of two consecutive lines that are rows of one table."""
     for k in range(len(lines) - 1):
         if _find_mark([line for _, line in lines[k : k + 2]]) != "":
@@ -174,7 +174,7 @@ def _find_mark(rows: Sequence[str]) -> str | None:
     return max(found, key=lambda one: one[0])[1] if found else ""
 
 
-def _lay_out(path: Path, lines: Lines) -> _Layout | None:
+def _lay_out(path: Path, lines: NumberedLines) -> _Layout | None:
     """The layout of a table; None for a CSV file or no table with a header."""
     first = _find_first_row(lines)
     if not first:  # none, or no line before it
@@ -213,7 +213,7 @@ def _lay_out(path: Path, lines: Lines) -> _Layout | None:
 def _are_units(cells: Sequence[str]) -> bool:
     """Whether a line under the names holds units."""
     spelt = [split_unit(f"x [{cell.strip('[]()')}]")[1] for cell in cells if cell.strip("[]()-")]
-    return sum(unit in UNITS for unit in spelt) > 0.5 * len(spelt)
+    return sum(unit in NAMED_UNITS for unit in spelt) > 0.5 * len(spelt)
 
 
 def _parse_numbers(cells: Sequence[str]) -> Array | None:
@@ -301,7 +301,7 @@ def _parse_date(text: str) -> datetime | None:
 
 def _parse_clock(text: str) -> float | None:
     """A time of day, s since midnight; None if it is none."""
-    found = _CLOCK.fullmatch(text)
+    found = _TIME_OF_DAY.fullmatch(text)
     if found is None:
         return None
     hours, minutes, seconds = (int(part) for part in found.groups()[:3])

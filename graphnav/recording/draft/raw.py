@@ -15,7 +15,7 @@ from graphnav.core.errors import RecordingError
 from graphnav.core.files import open_file
 from graphnav.core.rotation import Array
 from graphnav.core.timescales import UNIX, WEEK, gps_to_utc, parse_clock
-from graphnav.gnss.files import read_bytes
+from graphnav.gnss.files import unpack_bytes
 from graphnav.gnss.load import Sources, load_raw, read_rover
 from graphnav.gnss.series import Observations, RawGnss
 from graphnav.gnss.signals import name_signal
@@ -25,9 +25,9 @@ from graphnav.recording.draft.guesses import Guess
 
 _PVT = b"\xb5\x62\x01\x07"
 _PACKED = (".gz", ".z", ".zip", ".bz2")
-_TABLES = (".csv", ".tsv")
-_HEAD = 1 << 18  # bytes that tell what a file is
-Place = tuple[float, float, float]
+_TABLE_ENDINGS = (".csv", ".tsv")
+_HEAD_BYTES = 1 << 18  # bytes that tell what a file is
+Llh = tuple[float, float, float]
 _MOVED = 5.0  # sigmas of a single-point position that an antenna is off its median, which moves
 
 
@@ -48,7 +48,7 @@ class RawFound:
     fixes: SinglePoint
     clock: Guess  # of the recording, the words of `parse_clock`; None where nothing tells, or the IMU's log does
     dated: bool  # whether the times of the IMU are known
-    base: tuple[Place, str] | None  # place of the base, m in e, and why
+    base: tuple[Llh, str] | None  # place of the base, m in e, and why
     notes: tuple[str, ...]
 
     @property
@@ -162,15 +162,15 @@ def tell_kind(path: Path) -> tuple[str | None, bool]:
     name = path.name.lower()
     for packed in _PACKED:
         name = name.removesuffix(packed)
-    if not path.is_file() or name.endswith(_TABLES):
+    if not path.is_file() or name.endswith(_TABLE_ENDINGS):
         return None, False
     try:
         with open_file(path, text=False) as file:
-            data = file.read(_HEAD)
+            data = file.read(_HEAD_BYTES)
         if data[:2] in (b"\x1f\x9d", b"PK", b"BZ"):
-            data = read_bytes(path)
+            data = unpack_bytes(path)
         if is_ubx(data):
-            return "observed", _PVT in read_bytes(path)
+            return "observed", _PVT in unpack_bytes(path)
     except RecordingError:  # said where the file is read
         return None, False
     first = data[:200].partition(b"\n")[0].decode("latin-1")
@@ -232,7 +232,7 @@ def _solve_alone(path: Path, placing: dict[str, tuple[Path, ...]]) -> SinglePoin
     return load_raw(Sources(rover=(path,), **placing))[1]  # type: ignore[arg-type]
 
 
-def _guess_base_place(path: Path, obs: Observations, placing: dict[str, tuple[Path, ...]]) -> tuple[Place, str]:
+def _guess_base_place(path: Path, obs: Observations, placing: dict[str, tuple[Path, ...]]) -> tuple[Llh, str]:
     """Where the base stands, m in e, and why."""
     x, y, z = np.nanmedian(_solve_alone(path, placing).p, axis=0).tolist()
     if obs.marker is None:

@@ -23,7 +23,7 @@ from graphnav.sensors.tables import ANGLE
 
 JOINED = "joined_imu.csv.gz"  # the file combined from a gyro's and an accelerometer's; no log has this name
 
-_TABLES = (".csv", ".csv.gz", ".txt", ".tsv", ".dat", ".asc", ".log")  # files of a folder that are considered
+_TEXT_ENDINGS = (".csv", ".csv.gz", ".txt", ".tsv", ".dat", ".asc", ".log")  # files of a folder that are considered
 
 
 @dataclass
@@ -86,7 +86,7 @@ def find_logs(paths: Sequence[Path], topics: Sequence[str] = ()) -> LogsFound:
     parts = [s.path.name for name in ("gyro", "accel", "gravity") for s in every.get(name, ())]
     if "imu" in every and parts:
         left.append(f"left out: {', '.join(parts)}: {sensors['imu'].path.name} holds both")
-    if (air := sensors.get("barometer")) is not None and guess_pressure_unit(air) is None:
+    if (air := sensors.get("barometer")) is not None and guess_file_pressure_unit(air) is None:
         left.append(f"left out: {air.path.name}: its pressures are not those of air in any unit")
         del sensors["barometer"]
     return LogsFound(
@@ -122,7 +122,7 @@ def _list_files(path: Path) -> list[Path]:
     made = {JOINED, "recording.toml"}  # written by an earlier draft
     made |= {name_plain_file(p, sensor) for p in every for sensor in WANTED}
     inside = sorted(p for p in every if p.name not in made)
-    logs = [p for p in inside if p.name.lower().endswith(_TABLES) or _is_known(p) or tell_kind(p)[0]]
+    logs = [p for p in inside if p.name.lower().endswith(_TEXT_ENDINGS) or _is_known(p) or tell_kind(p)[0]]
     if not logs:
         raise RecordingError(
             f"{path}: no log in this folder: no CSV file, and none of a kind that is known", key="draft.no_log"
@@ -194,7 +194,7 @@ def _join_imu(gyro: Source, accel: Source) -> Source:
     values = {"t": t[inside], **{f"g{x}": gyro.values[f"g{x}"][inside] for x in "xyz"}}
     values |= {f"a{x}": np.interp(t[inside], at, accel.values[f"a{x}"]) for x in "xyz"}
     units = {k: u for s in (gyro, accel) for k, u in s.columns.units.items() if k != "t"}
-    joined = Source(gyro.path, matching.Columns({name: name for name in values}, units), values)
+    joined = Source(gyro.path, matching.FileColumns({name: name for name in values}, units), values)
     joined.joined_from = (gyro.path, accel.path)
     joined.t_unit = Guess("s", f"made of {gyro.columns.names['t']} in {gyro.t_unit.value}: {gyro.t_unit.why}")
     return joined
@@ -222,7 +222,7 @@ def guess_fix_speed_unit(source: Source) -> Guess:
     return guesses.guess_speed_unit(source.t, source.values["speed"], course, source.find_unit("speed", "speed"))
 
 
-def guess_pressure_unit(source: Source) -> Guess | None:
+def guess_file_pressure_unit(source: Source) -> Guess | None:
     """The unit of a barometer's pressures; None where they are not those of air in any."""
     pressure = source.values["pressure"]
     return guesses.guess_pressure_unit(pressure, source.find_unit("pressure", "pressure"))

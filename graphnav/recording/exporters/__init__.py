@@ -20,7 +20,7 @@ from graphnav.core.errors import RecordingError
 from graphnav.core.rotation import Array
 from graphnav.core.trajectory import Trajectory
 
-NAMES = ("csv", "tum", "kml", "gpx", "nav", "nmea", "parquet")  # which are also the file suffixes
+FORMATS = ("csv", "tum", "kml", "gpx", "nav", "nmea", "parquet")  # which are also the file suffixes
 
 
 class Add(Protocol):
@@ -100,7 +100,7 @@ def check_names(names: Sequence[str], gps_zero: float | None) -> None:
 
 
 def write_as(name: str, trajectory: Trajectory, path: Path, utc: Array | None = None) -> None:
-    """Write a trajectory in one of the formats `NAMES`.
+    """Write a trajectory in one of the formats `FORMATS`.
 
     Parameters
     ----------

@@ -18,7 +18,7 @@ from graphnav.core.rotation import Array
 GENERAL, WORD = -1, -2  # kinds of fields: %.6g and %s; others are the decimals of %.kf
 _FIELD = re.compile(r"%(?:\.(\d+)(f|g)|d|s)")
 _MOST_PLACES = 11  # for which 10^k 2^-53 is far below a half
-_WIDEST = 28  # bytes of a number: a sign, 15 digits, a point and eleven more
+_WIDEST_NUMBER = 28  # bytes of a number: a sign, 15 digits, a point and eleven more
 _ROWS_AT_ONCE = 512  # rows at once: their text stays in the processor's cache
 _COMPILED = "graphnav.recording.exporters.rows"
 _FEW, _SOME, _MANY = 500, 20_000, 2_000_000  # numbers above which loading and calling compiled code pays off
@@ -73,7 +73,7 @@ def _write_compiled(table: Array, form: str, last: Array | None) -> bytes:
     words = np.empty((len(table), 0), np.uint8)
     if last is not None:
         words = np.ascontiguousarray(last).view(np.uint8).reshape(len(table), -1)
-    out = np.empty(len(table) * (len(literal) + _WIDEST * table.shape[1] + words.shape[1]), np.uint8)
+    out = np.empty(len(table) * (len(literal) + _WIDEST_NUMBER * table.shape[1] + words.shape[1]), np.uint8)
     parts, row = [], 0
     while row < len(table):
         row, size = rows.write_rows(table, row, kinds, words, literal, ends, out)

@@ -19,7 +19,7 @@ from graphnav.core.trajectory import Trajectory
 from graphnav.recording.exporters import Add, require_geodetic
 from graphnav.recording.exporters.digits import encode_rows
 
-_HEAD = """<?xml version="1.0" encoding="UTF-8"?>
+_GPX_HEAD = """<?xml version="1.0" encoding="UTF-8"?>
 <gpx version="1.1" creator="graphnav" xmlns="http://www.topografix.com/GPX/1/1">
 <trk><name>{name}</name><desc>{about}</desc><trkseg>
 """
@@ -40,7 +40,7 @@ def open_writer(path: Path, name: str = "") -> Iterator[Add]:
             if not started:
                 times = "" if utc is not None else "; no times: the clock is not known"
                 about = f"heights above the WGS-84 ellipsoid{times}"
-                head = _HEAD.format(name=escape(name or "trajectory", quote=False), about=about)
+                head = _GPX_HEAD.format(name=escape(name or "trajectory", quote=False), about=about)
                 file.write(head.encode())
                 started = True
             degrees = np.rad2deg(block.llh[:, :2])

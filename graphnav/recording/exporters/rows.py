@@ -13,9 +13,9 @@ from graphnav.core.compiled import compile_once
 from graphnav.core.rotation import Array
 from graphnav.recording.exporters.digits import GENERAL, WORD
 
-_ROUNDING = 2.0**-52  # of a product, which may be off by half of that
+_ROUNDING_UNIT = 2.0**-52  # of a product, which may be off by half of that
 _MOST_WHOLE = 1e15
-_TENS = 10.0 ** np.arange(23)  # exact
+_FLOAT_TENS = 10.0 ** np.arange(23)  # exact
 _WHOLE_TENS = 10 ** np.arange(17)
 _FALLING = 10.0 ** np.arange(4, -18, -1.0)
 _TEN = np.uint64(10)
@@ -43,9 +43,9 @@ def write_fixed(x: float, places: int, out: Array, at: int) -> int:
     if not size < _MOST_WHOLE:
         return -1
     whole = int(size)
-    scaled = (size - whole) * _TENS[places]
+    scaled = (size - whole) * _FLOAT_TENS[places]
     rest = int(scaled + 0.5)
-    if abs(scaled - rest) >= 0.5 - _ROUNDING * scaled:
+    if abs(scaled - rest) >= 0.5 - _ROUNDING_UNIT * scaled:
         return -1
     if rest >= _WHOLE_TENS[places]:
         whole, rest = whole + 1, 0
@@ -75,9 +75,9 @@ def write_general(x: float, out: Array, at: int) -> int:
         exponent = 4
         while size < _FALLING[4 - exponent]:
             exponent -= 1
-        scaled = size * _TENS[5 - exponent]
+        scaled = size * _FLOAT_TENS[5 - exponent]
         number = int(scaled + 0.5)
-        if abs(scaled - number) >= 0.5 - _ROUNDING * scaled or scaled < 99_999.5 or number > 1_000_000:
+        if abs(scaled - number) >= 0.5 - _ROUNDING_UNIT * scaled or scaled < 99_999.5 or number > 1_000_000:
             return -1
     if number == 1_000_000:
         number, exponent = 100_000, exponent + 1

@@ -15,7 +15,7 @@ from graphnav.core.complaints import suggest_nearest
 from graphnav.core.errors import RecordingError
 from graphnav.core.files import exists, permit_outside
 from graphnav.recording import Recording
-from graphnav.recording.exporters import NAMES as EXPORTED
+from graphnav.recording.exporters import FORMATS as EXPORTED
 from graphnav.recording.formats.registry import Format, Log
 from graphnav.recording.formats.rounding import measure_rounding
 

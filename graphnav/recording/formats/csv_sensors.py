@@ -34,7 +34,7 @@ _ROWS_AT_ONCE = 1 << 16  # rows at once
 def build_imu(d: schema.ImuTable, rows: Table, remarks: Remarks) -> Imu:
     """Samples in body axes RFU, rad/s and m/s^2, with the stated noise figures, else a consumer IMU's."""
     R_bs = d.R_bs
-    gyro = _turn(rows, ("gx", "gy", "gz"), schema.RATE[d.units.gyro], R_bs)
+    gyro = _turn(rows, ("gx", "gy", "gz"), schema.RATE_UNITS[d.units.gyro], R_bs)
     accel = _turn(rows, ("ax", "ay", "az"), schema.FORCE[d.units.accel], R_bs)
     stated = d.figures
     noise = replace(ImuNoise(), **stated)

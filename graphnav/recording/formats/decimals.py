@@ -20,9 +20,9 @@ _BLOCK_SIZE = 1 << 18  # bytes processed at once: keeps the working arrays in th
 _SLAB = 1 << 22  # rows of a column in one allocation: 32 MB, which are returned to the system when released
 _COMMA, _MINUS, _POINT, _LINE = b",-.\n"
 _PAD = 16  # bytes before a block, for words that extend back beyond it
-_MOST_DIGITS = 16  # digits parsed on each side of the decimal point
+_PARSED_DIGITS = 16  # digits parsed on each side of the decimal point
 _U = np.uint64
-_TENS = 10 ** np.arange(19, dtype=_U)
+_INTEGER_TENS = 10 ** np.arange(19, dtype=_U)
 _LAST_BYTES = np.array([2**64 - 2 ** (64 - 8 * k) for k in range(9)], _U)  # the last k bytes of a word
 
 
@@ -72,11 +72,11 @@ def _parse_columns(text: bytes, width: int, use: list[int]) -> Array:
     negative = b[first] == _MINUS
     n_whole, n_part = point - first - negative, np.maximum(stop - point - 1, 0)
     digits = n_whole + n_part
-    plain = (n_whole <= _MOST_DIGITS) & (n_part <= _MOST_DIGITS) & (digits > 0) & (digits < len(_TENS))
+    plain = (n_whole <= _PARSED_DIGITS) & (n_part <= _PARSED_DIGITS) & (digits > 0) & (digits < len(_INTEGER_TENS))
     n_whole, n_part = n_whole * plain, n_part * plain
     whole, whole_plain = _parse_digits(text, point, n_whole)
     part, part_plain = _parse_digits(text, stop, n_part)
-    scale = _TENS[n_part]
+    scale = _INTEGER_TENS[n_part]
     number = whole * scale + part
     value = number / scale
     np.negative(value, out=value, where=negative)

@@ -14,7 +14,7 @@ _TIME = {"s": 1.0, "min": 60.0, "h": _H}
 _ANGLE = {"rad": 1.0, "mrad": 1e-3, "urad": 1e-6, "deg": _DEG, "mdeg": 1e-3 * _DEG}
 _RATE_UNITS = {f"{a}/{t}": x / y for a, x in _ANGLE.items() for t, y in _TIME.items()}
 _RATE_UNITS |= {"dps": _DEG, "mdps": 1e-3 * _DEG, "dph": _DEG / _H}
-_SPEED = {"m/s": 1.0, "mm/s": 1e-3, "cm/s": 1e-2, "m/h": 1.0 / _H}
+_SPEED_UNITS = {"m/s": 1.0, "mm/s": 1e-3, "cm/s": 1e-2, "m/h": 1.0 / _H}
 _FORCE = {"m/s2": 1.0, "mm/s2": 1e-3, "g": _G, "mg": 1e-3 * _G, "ug": 1e-6 * _G, "gal": 1e-2, "mgal": 1e-5}
 
 
@@ -25,13 +25,13 @@ def _list_per_root(units: dict[str, float], roots: dict[str, float]) -> dict[str
 # a rate per root of frequency is a rate times a root of time: deg/s/sqrt(Hz) = deg/sqrt(s)
 _HZ = {"hz": 1.0}
 _GYRO_NOISE = _list_per_root(_RATE_UNITS, _HZ) | _list_per_root(_ANGLE, _TIME)
-_ACCEL_NOISE = _list_per_root(_FORCE, _HZ) | _list_per_root(_SPEED, _TIME)
+_ACCEL_NOISE = _list_per_root(_FORCE, _HZ) | _list_per_root(_SPEED_UNITS, _TIME)
 # the same dimension written in two ways: rad/s/sqrt(s), as here, and rad/s2/sqrt(Hz), as in Kalibr
 _GYRO_WALK = _list_per_root(_RATE_UNITS, _TIME) | _list_per_root({"rad/s2": 1.0, "deg/s2": _DEG}, _HZ)
 _ACCEL_WALK = _list_per_root(_FORCE, _TIME) | _list_per_root({"m/s3": 1.0}, _HZ)
 _RATIO = {"%": 1e-2, "ppm": 1e-6}
 
-UNITS: dict[str, dict[str, float]] = {
+FIGURE_UNITS: dict[str, dict[str, float]] = {
     "gyro_noise_density": _GYRO_NOISE,
     "accel_noise_density": _ACCEL_NOISE,
     "gyro_bias_walk": _GYRO_WALK,
@@ -51,7 +51,7 @@ EXAMPLES = {
     "gyro_scale_sigma": "300 ppm",
     "accel_scale_sigma": "0.1 %",
 }
-_FIGURE = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*([^\s\d.].*?)\s*")
+_FIGURE_PATTERN = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*([^\s\d.].*?)\s*")
 
 
 def parse_figure(key: str, value: Any) -> Any:
@@ -64,15 +64,15 @@ def parse_figure(key: str, value: Any) -> Any:
     """
     if not isinstance(value, str):
         return value
-    found = _FIGURE.fullmatch(value)
+    found = _FIGURE_PATTERN.fullmatch(value)
     if found is None:
         raise ValueError(f"'{value}' is not a number and a unit, such as \"{EXAMPLES[key]}\"")
     number, unit = found.groups()
-    factor = UNITS[key].get(_normalise_unit(unit))
+    factor = FIGURE_UNITS[key].get(_normalise_unit(unit))
     if factor is None:
         other = [
             name
-            for name, units in UNITS.items()
+            for name, units in FIGURE_UNITS.items()
             if _normalise_unit(unit) in units and name.split("_")[0] == key.split("_")[0]
         ]
         hint = f"; that is a unit of {other[0]}" if other else ""

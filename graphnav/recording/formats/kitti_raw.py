@@ -23,7 +23,7 @@ from graphnav.recording.formats.schema import parse_axes_letters
 from graphnav.recording.formats.text import split_lines
 
 _FIX_PERIOD = 1.0  # s; the smoothed positions of an INS, used more often, would count as independent fixes
-_COLUMNS = 30
+_FIELDS = 30
 
 
 def _find_oxts(path: Path) -> Path | None:
@@ -133,10 +133,8 @@ def _parse_row(path: Path) -> list[float]:
     except ValueError:
         bad = next(x for x in text.split() if not _parse_number(x))
         raise RecordingError(f"{path}, line 1: '{bad[:40]}' is not a number", key="table.cell") from None
-    if len(values) != _COLUMNS:
-        raise RecordingError(
-            f"{path}, line 1: {len(values)} numbers where {_COLUMNS} were expected", key="table.fields"
-        )
+    if len(values) != _FIELDS:
+        raise RecordingError(f"{path}, line 1: {len(values)} numbers where {_FIELDS} were expected", key="table.fields")
     return values
 
 

@@ -11,16 +11,16 @@ from graphnav.core.errors import RecordingError
 from graphnav.core.notes import Note, format_count
 from graphnav.core.rotation import Array
 from graphnav.recording import FIX_TYPES, fix_types
-from graphnav.recording.formats.table import Mask, Table
-from graphnav.sensors.tables import TIME, Keep
+from graphnav.recording.formats.table import Selection, Table
+from graphnav.sensors.tables import TIME_UNITS, Keep
 
-_LABEL = {"imu": "IMU", "gnss": "GNSS", "odometer": "odometer", "truth": "truth"}
+_SENSOR_LABELS = {"imu": "IMU", "gnss": "GNSS", "odometer": "odometer", "truth": "truth"}
 LATEST = 1e11  # s, either sign: three thousand years
 VAGUEST, VAGUEST_V = 1e5, 1e4  # m, m/s; a fix with a larger sigma carries no information
-_SUREST = 1e-9  # m, m/s; a smaller sigma is not meant as one
+_LEAST_SIGMA = 1e-9  # m, m/s; a smaller sigma is not meant as one
 _HIGHEST = 9000.0  # m, highest drive on Earth
 _LOWEST, _SKY = -1000.0, 50000.0  # m, range of valid heights
-_SET_BACK = 10.0  # periods; rows that overtake each other are closer
+_SET_BACK_PERIODS = 10.0  # periods; rows that overtake each other are closer
 _RADIANS = (1.58, 3.15)  # |lat|, |lon| that angles in radians cannot exceed
 
 
@@ -55,9 +55,9 @@ def select_usable_rows(
         For infinite values but in an odometer's log, if too few rows are left, if the time steps cannot be seconds, or
         if the stamps run over the same times twice.
     """
-    label = _LABEL.get(sensor, sensor)
+    label = _SENSOR_LABELS.get(sensor, sensor)
     with np.errstate(over="ignore"):
-        t = rows["t"] * TIME[unit] + offset
+        t = rows["t"] * TIME_UNITS[unit] + offset
     # a stamp of thousands of years is invalid, like an infinite one
     rows = rows.with_column("t", np.where(np.abs(t) > LATEST, np.inf, rows["t"]))
     for name in rows.columns:
@@ -73,7 +73,7 @@ def select_usable_rows(
             raise RecordingError(
                 f"{rows.path}: no row has {keep.column} of at least {keep.at_least:g} (keep)", key="table.keep"
             )
-    rows = rows.with_column("t", rows["t"] * TIME[unit] + offset)
+    rows = rows.with_column("t", rows["t"] * TIME_UNITS[unit] + offset)
 
     blank = np.zeros(len(rows), dtype=bool)
     for name in needed:
@@ -144,14 +144,14 @@ def _check_passes(rows: Table, label: str) -> None:
     """Refuse a clock that was set back: the stamps before and after it are then interleaved."""
     t = rows["t"]
     period = float(np.median(np.abs(np.diff(t))))
-    back = np.flatnonzero(np.diff(t) < -_SET_BACK * period)
+    back = np.flatnonzero(np.diff(t) < -_SET_BACK_PERIODS * period)
     for k in back[:20]:
         again, before = float(t[k + 1]), t[: k + 1]
         before = before[before >= again]
         after = t[k + 1 :][t[k + 1 :] <= t[k]]
         # rows that were only written late fill the gap that they left
         shared = min(before.max(), after.max()) - max(before.min(), after.min())
-        if shared > 0.5 * (t[k] - again) and shared > _SET_BACK * period:
+        if shared > 0.5 * (t[k] - again) and shared > _SET_BACK_PERIODS * period:
             jump = float(t[k] - again + period)
             leap = " (GPS time and UTC are 18 s apart)" if abs(jump - 18.0) < 0.5 else ""
             raise RecordingError(
@@ -161,7 +161,7 @@ def _check_passes(rows: Table, label: str) -> None:
             )
 
 
-def _tell_rows(mask: Mask, label: str) -> str:
+def _tell_rows(mask: Selection, label: str) -> str:
     return format_count(mask.sum(), f"{label} row".strip())
 
 
@@ -173,7 +173,7 @@ def _check_imu_time(rows: Table, unit: str) -> None:
     step = float(np.median(np.diff(rows["t"])))
     if 1e-5 < step < 0.5:
         return
-    fitting = [u for u in TIME if 2.5e-4 <= step / TIME[unit] * TIME[u] <= 0.1 and u != unit]
+    fitting = [u for u in TIME_UNITS if 2.5e-4 <= step / TIME_UNITS[unit] * TIME_UNITS[u] <= 0.1 and u != unit]
     hint = f'; if t is in {fitting[0]}, say units = {{ t = "{fitting[0]}" }}' if fitting else ""
     if step == 1.0:
         hint += "; if it counts rows, write times instead"
@@ -182,7 +182,7 @@ def _check_imu_time(rows: Table, unit: str) -> None:
     )
 
 
-def is_on_earth(lat: Array, lon: Array, h: Array) -> Mask:
+def is_on_earth(lat: Array, lon: Array, h: Array) -> Selection:
     """Which of the places (N,) in rad and m are possible on a drive."""
     with np.errstate(invalid="ignore"):
         near = (np.abs(lat) <= np.pi / 2) & (np.abs(lon) <= 2 * np.pi) & (h >= _LOWEST) & (h <= _SKY)
@@ -256,7 +256,7 @@ def choose_sigmas(
     stated: tuple[float, float, float] | None,
     default: tuple[float, float, float],
     what: str,
-    used: Mask,
+    used: Selection,
     remarks: Remarks,
 ) -> Array:
     """The 1-sigmas of `used` rows (N, 3): the file's, else the .toml's, else a default that is remarked on.
@@ -283,7 +283,7 @@ def choose_sigmas(
     for k, name in enumerate(names):
         zero = used & (sd[:, k] == 0)
         floor = _find_floor(sd[used & (sd[:, k] > 0), k])
-        bad = np.flatnonzero(used & ((sd[:, k] < 0) | ((sd[:, k] < _SUREST) & ~zero) | (zero & (floor is None))))
+        bad = np.flatnonzero(used & ((sd[:, k] < 0) | ((sd[:, k] < _LEAST_SIGMA) & ~zero) | (zero & (floor is None))))
         if len(bad):
             raise RecordingError(
                 f"{rows.describe_place(bad[0], name)}: a 1-sigma must be above zero, not {sd[bad[0], k]:g}",
@@ -304,7 +304,7 @@ def choose_sigmas(
     return np.where(blank, fallback, sd)
 
 
-_FINEST = 5  # decimals in deliberate use; with more, a column is not rounded
+_DELIBERATE_DECIMALS = 5  # decimals in deliberate use; with more, a column is not rounded
 
 
 def _find_floor(positive: Array) -> float | None:
@@ -314,7 +314,7 @@ def _find_floor(positive: Array) -> float | None:
     """
     if not len(positive):
         return None
-    for digits in range(_FINEST + 1):
+    for digits in range(_DELIBERATE_DECIMALS + 1):
         scaled = positive * 10.0**digits
         if np.abs(scaled - np.round(scaled)).max() < 1e-6 * max(1.0, scaled.max()):
             return float(0.5 * 10.0**-digits)

@@ -11,8 +11,8 @@ import numpy as np
 from graphnav.core.earth import A
 from graphnav.core.rotation import Array
 
-_MOST_DIGITS = 10  # decimals that degrees in double precision have
-_PARTS = 1.0, 60.0  # of a degree that logs count in: degrees, and minutes as of NMEA
+_MEANT_DIGITS = 10  # decimals that degrees in double precision have
+_DEGREE_PARTS = 1.0, 60.0  # of a degree that logs count in: degrees, and minutes as of NMEA
 _FEWEST = 2  # values that tell a step: of finer ones, one pair in a hundred has it, and hardly any fixes are but a pair
 
 
@@ -29,7 +29,7 @@ def measure_rounding(llh: Array) -> tuple[float, ...]:
     if not len(llh):
         return (0.0, 0.0, 0.0)
     lat, lon = (
-        A * max(np.radians(find_step(np.degrees(column) * parts) / parts) for parts in _PARTS)
+        A * max(np.radians(find_step(np.degrees(column) * parts) / parts) for parts in _DEGREE_PARTS)
         for column in llh[:, :2].T
     )
     return tuple(float(step) / np.sqrt(12.0) for step in (lon * np.cos(llh[0, 0]), lat, find_step(llh[:, 2])))
@@ -38,7 +38,7 @@ def measure_rounding(llh: Array) -> tuple[float, ...]:
 def find_step(x: Array) -> float:
     """The power of ten that values (N,) are whole multiples of; 0 where there is none, or too few differ to tell."""
     x = np.unique(x)
-    for digits in range(_MOST_DIGITS + 1):
+    for digits in range(_MEANT_DIGITS + 1):
         steps = x * 10.0**digits
         off = np.abs(steps - np.round(steps))
         if np.all(off <= 1e-9 + 1e-15 * np.abs(steps)):

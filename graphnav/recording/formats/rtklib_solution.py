@@ -18,7 +18,7 @@ from graphnav.core.errors import RecordingError
 from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.core.timescales import GPS_TO_UNIX, WEEK, date_week_times, unix_to_gps
-from graphnav.recording.formats.text import Rows, parse_table
+from graphnav.recording.formats.text import NumberedLines, parse_table
 
 _GPS_EPOCH = np.datetime64("1980-01-06T00:00:00", "us")
 _ZONES = {"UTC": 0.0, "JST": 9 * 3600.0}  # s ahead of UTC
@@ -46,7 +46,7 @@ class RtklibSolution:
     notes: list[str]
 
 
-def parse_solution(path: Path, head: list[str], rows: Rows) -> RtklibSolution:
+def parse_solution(path: Path, head: list[str], rows: NumberedLines) -> RtklibSolution:
     """Parse the lines of a .pos file: its header, with %, and its rows.
 
     Raises
@@ -164,7 +164,7 @@ def _turn_sigmas(turns: Array, sd: Array | None, mixed: Array | None) -> Array |
     return np.sqrt(np.maximum(np.einsum("kij,kjl,kil->ki", turns, P, turns), 0.0))
 
 
-def _parse_dates(path: Path, rows: Rows, separator: str | None) -> tuple[Array, Rows]:
+def _parse_dates(path: Path, rows: NumberedLines, separator: str | None) -> tuple[Array, NumberedLines]:
     """Seconds since the GPS epoch of dates and times, and the rows without these, so that they are numbers."""
     joint = separator or " "
     stamps, rest = [], []

@@ -50,7 +50,7 @@ def _three_positive(value: Any) -> Any:
 Sigmas = Annotated[tuple[float, float, float], BeforeValidator(_three_positive)]
 
 FOOT = 0.3048  # m
-RATE = {"rad/s": 1.0, "deg/s": np.pi / 180.0, "mdeg/s": np.pi / 180e3}
+RATE_UNITS = {"rad/s": 1.0, "deg/s": np.pi / 180.0, "mdeg/s": np.pi / 180e3}
 FORCE = {"m/s2": 1.0, "g": STANDARD_GRAVITY, "mg": MG, "ft/s2": FOOT}
 HEIGHT = {"m": 1.0, "ft": FOOT}
 SPEED = {"m/s": 1.0, "km/h": 1 / 3.6, "mph": 0.44704, "knots": 1852 / 3600}

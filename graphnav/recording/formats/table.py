@@ -20,12 +20,12 @@ from graphnav.core.notes import format_count
 from graphnav.core.rotation import Array
 from graphnav.recording.formats.decimals import read_decimals
 
-_BLANK = re.compile(r"(?m)(?:(?<=,)|^(?=[ \t]*,))[ \t]*(?=,|$)")  # an empty cell of a line that is not empty
+_BLANK_CELL = re.compile(r"(?m)(?:(?<=,)|^(?=[ \t]*,))[ \t]*(?=,|$)")  # an empty cell of a line that is not empty
 _EMPTY = "is empty; copy the log again, or leave this file out"
 _MARKS = {";": "a semicolon", "\t": "a tab", " ": "blanks"}  # separators, in the order of their tests
 
 
-Mask = Any  # an array of bool, or of row numbers
+Selection = Any  # an array of bool, or of row numbers
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class Table:
         for name in names:
             del self.columns[name]
 
-    def take(self, mask: Mask) -> Table:
+    def take(self, mask: Selection) -> Table:
         """Select rows by a mask or an index array."""
         return replace(self, columns={n: c[mask] for n, c in self.columns.items()}, rows=self.rows[mask])
 
@@ -134,7 +134,7 @@ def _list_names(header: list[str]) -> str:
     return ", ".join(names if len(names) == len(header) else [*names, "..."])
 
 
-def read_header(path: Path) -> list[str]:
+def read_column_names(path: Path) -> list[str]:
     """The column names of a .csv or .csv.gz.
 
     Raises
@@ -254,7 +254,7 @@ def _load_text(text: str, skip: int, header: list[str], use: list[int]) -> Array
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # no rows: reported by the caller
         values = np.loadtxt(
-            io.StringIO(_BLANK.sub("nan", text)),
+            io.StringIO(_BLANK_CELL.sub("nan", text)),
             delimiter=",",
             comments="#",
             skiprows=skip,

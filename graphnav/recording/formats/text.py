@@ -11,7 +11,7 @@ from graphnav.core.files import parse_number, read_bytes
 from graphnav.core.notes import format_count
 from graphnav.core.rotation import Array
 
-Rows = list[tuple[int, str]]  # line number in the file (from 1) and text
+NumberedLines = list[tuple[int, str]]  # line number in the file (from 1) and text
 
 
 def split_lines(path: Path) -> list[str]:

@@ -34,13 +34,13 @@ from graphnav.recording.formats.text import parse_table, split_lines
 
 _MAX_COORDINATE = 1e8  # m, twice around the Earth, whatever the coordinates' origin
 _DEG = np.pi / 180.0
-_UNITS = {"t": "s", "lat": "deg", "lon": "deg", "h": "m", "x": "m", "y": "m", "z": "m"} | dict.fromkeys(
+_COLUMN_UNITS = {"t": "s", "lat": "deg", "lon": "deg", "h": "m", "x": "m", "y": "m", "z": "m"} | dict.fromkeys(
     ("ve", "vn", "vu", "vd"), "mps"
 )
-_UNITS |= dict.fromkeys(("roll", "pitch", "heading"), "deg")
+_COLUMN_UNITS |= dict.fromkeys(("roll", "pitch", "heading"), "deg")
 _SIGMA_COLUMNS = "sd_e sd_n sd_u sd_ve sd_vn sd_vu sd_roll sd_pitch sd_heading"
 # columns that are read; others may hold anything
-_KNOWN_COLUMNS = {*_UNITS, *_SIGMA_COLUMNS.split(), *["bgx", "bgy", "bgz", "bax", "bay", "baz"]}
+_KNOWN_COLUMNS = {*_COLUMN_UNITS, *_SIGMA_COLUMNS.split(), *["bgx", "bgy", "bgz", "bax", "bay", "baz"]}
 
 
 def read_trajectory(path: str | Path) -> Trajectory:
@@ -165,7 +165,7 @@ def _read_csv(path: Path, rows: list[tuple[int, str]]) -> Trajectory:
     if not rows:
         raise RecordingError(f"{path}: a header and no rows", key="file.no_rows")
     # a unit of ours may be part of the name; any other is left in the name, which is then not found
-    columns = {(base if _UNITS.get(base := name.rpartition("_")[0]) == name.rpartition("_")[2] else name): k
+    columns = {(base if _COLUMN_UNITS.get(base := name.rpartition("_")[0]) == name.rpartition("_")[2] else name): k
                for k, name in enumerate(names)}  # fmt: skip
     local = "lat" not in columns and {"x", "y"} <= columns.keys()
     needed = ("t", "x", "y") if local else ("t", "lat", "lon", "h")

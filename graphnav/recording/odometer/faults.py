@@ -31,14 +31,14 @@ _G = 9.81  # m/s^2
 _GRIP = 1.2 * _G  # m/s^2, above the grip of tyres on any road
 _FORCE_ERROR = 0.05 * _G  # m/s^2, uncertainty of the force: 3 degrees of pitch
 _LAG_ERROR = 0.5  # s; shorter windows are no more certain, as the delay is known to some hundredths only
-_RADIUS = 0.05  # of the speed: scale, and tyres on bumps
+_SCALING = 0.05  # of the speed: scale, and tyres on bumps
 _DEAF = 1.0  # m/s, below which passive sensors do not detect a turning wheel (ABS: about 3 km/h)
 _BACKWARD = 6.0  # m/s, fastest speed in reverse
 _WINDOWS = (0.0, 0.5, 1.0, 2.0, 4.0)  # s over which x is compared; 0: adjacent readings
 _TIMES_TYPICAL = 6.0  # multiple of the 90th percentile of the drive itself: an IMU or axes that are worse than assumed
-_LATEST = 1.5  # s, largest delay of an odometer (or a third of it early)
-_ALIKE = 0.05  # m/s per second, on average: no significant change
-_STAYS = 0.5  # s of equal readings (five at least) that may be stuck
+_LARGEST_DELAY = 1.5  # s, largest delay of an odometer (or a third of it early)
+_UNCHANGING = 0.05  # m/s per second, on average: no significant change
+_STUCK_SPAN = 0.5  # s of equal readings (five at least) that may be stuck
 _LONGER = 5.0  # multiple of the duration that 99 % of repetitions stay below
 _SPIKE = 1.0  # s
 _ISLAND = 10.0  # s that the IMU can bridge
@@ -98,7 +98,7 @@ def _compute_motion(odometer: Odometer, imu: Imu, known: float | None) -> _Inert
     pitch = np.cumsum((imu.gyro @ right - np.median(imu.gyro @ right)) * dt)
     force = imu.accel @ ahead - _G * pitch
     gained = np.cumsum(force * dt)
-    begin, end = max(t[0], imu.t[0] + _LATEST), min(t[-1], imu.t[-1] - _LATEST)
+    begin, end = max(t[0], imu.t[0] + _LARGEST_DELAY), min(t[-1], imu.t[-1] - _LARGEST_DELAY)
     seconds = np.arange(begin, end - 1.0)
     if len(seconds) < 10:
         return None
@@ -112,11 +112,11 @@ def _compute_motion(odometer: Odometer, imu: Imu, known: float | None) -> _Inert
     def size(off: Array) -> float:
         return float(np.mean(np.minimum(np.abs(off), 1.0)))  # outliers count no more than 1 m/s
 
-    lags = np.arange(-_LATEST / 3.0, _LATEST + 0.01, 0.05) if known is None else np.array([known])
+    lags = np.arange(-_LARGEST_DELAY / 3.0, _LARGEST_DELAY + 0.01, 0.05) if known is None else np.array([known])
     misfits = [size(np.subtract(*missing(lag))) for lag in lags]
     lag, left = float(lags[int(np.argmin(misfits))]), min(misfits)
     # unrelated clocks or wrong axes: the force does not explain the changes of speed
-    if left > max(0.5 * size(change), _ALIKE) and size(change) > _ALIKE:
+    if left > max(0.5 * size(change), _UNCHANGING) and size(change) > _UNCHANGING:
         return None
     slow = missing(lag)[1]
     # the sum of c, at the middles of the seconds; extrapolated beyond them
@@ -147,7 +147,7 @@ def _find_breaks(
         i, j = i[part[i] == part[j]], j[part[i] == part[j]]
         dt = t[j] - t[i]
         fast = np.maximum(np.abs(v[i]), np.abs(v[j]))
-        allowed = error + _RADIUS * fast + np.where((v[i] == 0.0) | (v[j] == 0.0), _DEAF, 0.0)
+        allowed = error + _SCALING * fast + np.where((v[i] == 0.0) | (v[j] == 0.0), _DEAF, 0.0)
         off = np.abs(v[j] - v[i])
         bad = off > allowed + _GRIP * (dt + period)
         if motion is not None:
@@ -189,7 +189,7 @@ def _find_wrong(
     t, v = odometer.t, odometer.speed
     breaks = _find_breaks(odometer, motion, figures)
     equal = [(a - 1, b - 1) for a, b in find_runs(np.r_[False, v[1:] == v[:-1]])]  # first and last of equal readings
-    stays = [(a, b) for a, b in equal if b - a >= 4 and t[b] - t[a] >= _STAYS]
+    stays = [(a, b) for a, b in equal if b - a >= 4 and t[b] - t[a] >= _STUCK_SPAN]
     bad: list[tuple[int, int, str]] = []  # first wrong reading, first right one
     bad += _find_islands(t, v, motion, breaks, stays, _SPIKE)
     bad += _find_stuck(t, v, motion, breaks, stays)
@@ -207,7 +207,7 @@ def _can_follow(t: Array, v: Array, motion: _InertialMotion | None, i: int, j: i
     gained = 0.0 if motion is None else motion.force[j] - motion.force[i]
     if motion is None or abs(gained) > 1e5:
         return bool(abs(v[j] - v[i]) <= _GRIP * apart)
-    return bool(abs(v[j] - v[i] - gained) <= _FORCE_ERROR * max(apart, _LAG_ERROR) + _RADIUS * max(v[i], v[j]) + 1e-9)
+    return bool(abs(v[j] - v[i] - gained) <= _FORCE_ERROR * max(apart, _LAG_ERROR) + _SCALING * max(v[i], v[j]) + 1e-9)
 
 
 def _find_islands(

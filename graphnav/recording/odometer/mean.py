@@ -18,9 +18,9 @@ from graphnav.recording import Odometer
 
 Spans = Array  # (M, 2) s, [first bad reading, next good one)
 
-_FINEST = 1e-7  # m/s; smaller differences are rounding of floating point
+_FINEST_STEP = 1e-7  # m/s; smaller differences are rounding of floating point
 _MAD = 1.4826  # sigma over the median magnitude of a normal variable
-_ROUNDING = np.sqrt(1.0 / 12.0)  # 1-sigma of a rounding error, in steps
+_ROUNDING_SIGMA = np.sqrt(1.0 / 12.0)  # 1-sigma of a rounding error, in steps
 
 
 def find_quantum(speed: Array) -> float:
@@ -30,7 +30,7 @@ def find_quantum(speed: Array) -> float:
     still found, and an offset does not matter.
     """
     size = np.abs(np.diff(speed))
-    size = size[np.isfinite(size) & (size > _FINEST)]
+    size = size[np.isfinite(size) & (size > _FINEST_STEP)]
     if len(size) < 10:
         return 0.0
     # the coarsest that explains them: finer ones may be digits of a file, or a converted unit
@@ -58,7 +58,7 @@ def estimate_reading_sigma(odometer: Odometer, step: float | None = None) -> flo
     if odometer.speed_sigma is not None:
         return odometer.speed_sigma
     t, speed = odometer.t, odometer.speed
-    rounding = _ROUNDING * (find_quantum(speed) if step is None else step)
+    rounding = _ROUNDING_SIGMA * (find_quantum(speed) if step is None else step)
     if len(t) < 10:
         return rounding
     steps = np.diff(t)
@@ -133,8 +133,8 @@ class ReadingStatistics:
         if odometer.speed_sigma is not None:
             return float(odometer.speed_sigma), 0.0, 0.0
         if self.pulse:  # each end of a count has an error of up to one pulse, uniform: a difference of two
-            return 0.0, 0.0, float(np.sqrt(2.0) * _ROUNDING * self.pulse)
-        rounding = _ROUNDING * self.step
+            return 0.0, 0.0, float(np.sqrt(2.0) * _ROUNDING_SIGMA * self.pulse)
+        rounding = _ROUNDING_SIGMA * self.step
         return float(np.sqrt(max(self.sigma**2 - rounding**2, 0.0))), rounding, 0.0
 
 

@@ -21,7 +21,7 @@ MISLED = 440.0  # m
 _CACHED = 60.0  # s; a receiver that is switched on outputs fixes at least that often
 _FROZEN = (60.0, 300.0)  # s, and m driven: within these a road or receiver noise changes a height
 _STEEPEST = 0.1  # steepest road: bound on the deviation of a height
-_CARRIER = 1e-3  # m: a two-hundredth of the carrier's wavelength (0.19 m), the resolution of its phase
+_FINEST_PHASE = 1e-3  # m: a two-hundredth of the carrier's wavelength (0.19 m), the resolution of its phase
 _WAVE = 0.19  # m, of L1
 _ACCELERATION = 2.0  # m/s^2, typical acceleration of vehicles
 _UNBELIEVED = 10.0  # ratio to the scatter of adjacent fixes that no true sigma has: errors last, scatter is smaller
@@ -29,12 +29,12 @@ _SMOOTH = 2e-3  # of the sigma; filtered fixes of phones scatter by five thousan
 GRIP = 8.0  # m/s^2, grip of tyres
 _MEAN_OF = 11  # fixes in a window in which most steps are right even where half of the fixes are off
 _MINORITY = 0.2  # share of the fixes: smaller groups are outvoted by the rest
-_ISOLATED = 0.01  # share of the steps
-_ALIKE = 0.25  # relative spread of the steps between two groups; those of multipath vary more
+_ISOLATED_STEPS = 0.01  # share of the steps
+_STEP_SPREAD = 0.25  # relative spread of the steps between two groups; those of multipath vary more
 _LEAST_SPEED = 3.0  # m/s, below which a step carries little information on its duration
 
 
-def screen(recording: Recording) -> tuple[Recording, list[Finding]]:
+def screen_fixes(recording: Recording) -> tuple[Recording, list[Finding]]:
     """The recording without fixes out of reach and with large sigmas for frozen heights, and findings."""
     gnss = recording.gnss
     assert gnss is not None
@@ -166,11 +166,11 @@ def check_sigmas(gnss: Gnss, p: Array) -> Iterator[Finding]:
     # white errors of s have second differences of s sqrt(6)
     scatter = float(np.median(np.abs(bend))) / 0.6745 / np.sqrt(6.0) if len(bend) >= 10 else float("nan")
     driven = _ACCELERATION * period**2 / np.sqrt(6.0)
-    if sd < _CARRIER:
+    if sd < _FINEST_PHASE:
         yield Finding(
             "warning",
-            f"the 1-sigma of the fixes is {sd:.2g} m, less than a carrier's phase can be measured to ({_CARRIER:g} m): "
-            "look at the unit of the sigmas",
+            f"the 1-sigma of the fixes is {sd:.2g} m, less than a carrier's phase can be measured to "
+            f"({_FINEST_PHASE:g} m): look at the unit of the sigmas",
             "gnss.sigma_small",
         )
     elif scatter - driven > _UNBELIEVED * sd:
@@ -180,7 +180,7 @@ def check_sigmas(gnss: Gnss, p: Array) -> Iterator[Finding]:
             "sigmas, or at sd in [gnss]",
             "gnss.sigma_small",
         )
-    elif _CARRIER <= scatter < _SMOOTH * sd:  # below, positions are held or interpolated, not measured
+    elif _FINEST_PHASE <= scatter < _SMOOTH * sd:  # below, positions are held or interpolated, not measured
         yield Finding(
             "warning",
             f"neighbouring fixes scatter by {scatter:.2g} m only where their 1-sigma is {sd:.2g} m: look at the unit "
@@ -220,7 +220,7 @@ def check_two_groups(gnss: Gnss, p: Array) -> Iterator[Finding]:
         group = _find_groups(jump @ (step / size), size)
         jump = _find_jumps(p - group[:, None] * step, dt)
     left = np.linalg.norm(jump, axis=1)
-    alike = float((left[np.diff(group) != 0] < _ALIKE * size).mean())
+    alike = float((left[np.diff(group) != 0] < _STEP_SPREAD * size).mean())
     share = np.array([(group == 0).mean(), (group == 1).mean()])
     if (left > limit).sum() > _MINORITY * len(big) or alike < 1.0 - _MINORITY or share.min() < _MINORITY:
         return
@@ -283,8 +283,8 @@ def check_arrival_stamps(gnss: Gnss, p: Array) -> Iterator[Finding]:
     ahead = np.clip(ahead, -3.0, 3.0)
     slope = float(uneven @ ahead / (uneven @ uneven))
     error = float(np.std(ahead - slope * uneven)) / float(np.linalg.norm(uneven))
-    if slope + 4.0 * error < 0.5 or back > _ISOLATED:  # closer to no part than to the full part in the advance
-        seen = f"go back in {100 * back:.0f} % of the steps" if back > _ISOLATED else "advance evenly"
+    if slope + 4.0 * error < 0.5 or back > _ISOLATED_STEPS:  # closer to no part than to the full part in the advance
+        seen = f"go back in {100 * back:.0f} % of the steps" if back > _ISOLATED_STEPS else "advance evenly"
         yield Finding(
             "warning",
             f"the stamps of the fixes are uneven by {late:.2g} s where the positions {seen}: they are "

@@ -16,14 +16,14 @@ from graphnav.recording.checks.tracks import Track
 from graphnav.recording.plausibility.fixes import FASTEST
 
 _CLOCK_STEP = 1.0  # s, and ten periods: a silence of the odometer that may be a jump of its clock
-_RADIUS = 0.1  # relative difference of tyre radii: wear, load, pressure, a spare wheel
+_RADIUS_SPREAD = 0.1  # relative difference of tyre radii: wear, load, pressure, a spare wheel
 _LEAST_SPEED = 5.0  # m/s, above which speeds are compared
 _SHORTEST_SPAN = 10.0  # s; shorter ones are slip, or an error of a fix
-_CLEAR = 4.0  # ratio of the misfits of two clocks (white errors: one in thousands with 20 of them a side)
+_CLEAR_RATIO = 4.0  # ratio of the misfits of two clocks (white errors: one in thousands with 20 of them a side)
 _SPEED_RATE = 10.0  # Hz needed for changes of speed
 
 
-def screen(recording: Recording, track: Track | None) -> tuple[Recording, list[Finding]]:
+def screen_odometer(recording: Recording, track: Track | None) -> tuple[Recording, list[Finding]]:
     """The recording without impossible readings, and findings; `track` is the velocity by GNSS."""
     findings: list[Finding] = []
     for one in (_find_beyond, _find_clock_jump, _find_other_scale):
@@ -93,7 +93,7 @@ def _find_clock_jump(odometer: Odometer, track: Track | None, start: float) -> _
             shift = -jump if after else jump
             as_read, moved = _measure_misfit(odometer, track, side, 0.0), _measure_misfit(odometer, track, side, shift)
             other = _measure_misfit(odometer, track, ~side, 0.0)
-            if moved * _CLEAR < as_read and (np.isnan(other) or other * _CLEAR < as_read):
+            if moved * _CLEAR_RATIO < as_read and (np.isnan(other) or other * _CLEAR_RATIO < as_read):
                 leap = ", the leap seconds between GPS time and UTC" if abs(jump - 18.0) < 0.5 else ""
                 return side, Finding(
                     "warning",
@@ -122,20 +122,20 @@ def _find_other_scale(odometer: Odometer, track: Track | None, start: float) -> 
     off = np.log(read[at] / track.speed[at])
     seconds = max(1, round(_SHORTEST_SPAN / track.period))
     typical = run_median(off, min(seconds + 1 - seconds % 2, len(off)))
-    right = np.abs(typical) < np.log1p(_RADIUS)
+    right = np.abs(typical) < np.log1p(_RADIUS_SPREAD)
     if right.sum() * track.period < _SHORTEST_SPAN:
         return bad, None  # another unit, or another wheel, throughout
     own = float(np.median(off[right]))
     noise = float(np.median(np.abs(off[right] - own))) / 0.6745
     # two tyres, as large and as small as possible
-    wrong = np.abs(typical - own) > max(np.log((1.0 + _RADIUS) / (1.0 - _RADIUS)), 6.0 * noise)
+    wrong = np.abs(typical - own) > max(np.log((1.0 + _RADIUS_SPREAD) / (1.0 - _RADIUS_SPREAD)), 6.0 * noise)
     spans: list[tuple[float, float, float]] = []
     for a, b in find_runs(wrong):
         begin, end = track.t[at[a]], track.t[at[b - 1]]
         factor = float(np.median(off[a:b]))
         # a scale is one factor; fixes among high buildings make speeds of all magnitudes
         scatter = float(np.median(np.abs(off[a:b] - factor))) / 0.6745
-        if end - begin < _SHORTEST_SPAN - 2.0 * track.period or scatter > np.log1p(_RADIUS):
+        if end - begin < _SHORTEST_SPAN - 2.0 * track.period or scatter > np.log1p(_RADIUS_SPREAD):
             continue
         # up to the adjacent right readings: what lies between is unknown
         low = track.t[at[a - 1]] if a > 0 else -np.inf

@@ -20,7 +20,7 @@ from graphnav.core.rotation import Array
 TAIL = 100  # excesses from which the decay is estimated: to a tenth
 RARE = 1e-3  # expected number of such readings in a recording by chance, below which a reading is rejected
 ALONE = 1.0  # s around a single reading without another; several are a real event
-_SINGLE = 0.01  # share of the rows; above it the cause is not in single rows
+_ISOLATED = 0.01  # share of the rows; above it the cause is not in single rows
 _TELL = 5  # multiple of `TAIL`, rows in motion of which these are the largest fifth
 NOISY = 0.05  # share of the steps that reverse the one before; for noise up to a band B and a rate f it is 1.5 B / f
 HOLE = 1.5  # periods between two rows that are not adjacent
@@ -85,7 +85,7 @@ def find_contradicted(t: Array, readings: Iterable[Array]) -> NDArray[np.bool_]:
 def _find_limit(excess: Array) -> float:
     """The largest excess (of N) due to motion; sought from the smallest upwards, so that no outlier hides another."""
     found = excess[excess > 0.0]
-    most = min(int(_SINGLE * len(excess)), len(found) - TAIL - 1)
+    most = min(int(_ISOLATED * len(excess)), len(found) - TAIL - 1)
     if most < 1:
         return np.inf
     resolution = float(found.min())

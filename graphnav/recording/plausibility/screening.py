@@ -163,14 +163,14 @@ def _drop_impossible(recording: Recording) -> tuple[Recording, list[Finding], li
     recording, of_aiding = screen_series(replace(recording, screened=True))
     track = None
     if recording.gnss is not None and len(recording.gnss.t):
-        recording, more = plausibility_gnss.screen(recording)
+        recording, more = plausibility_gnss.screen_fixes(recording)
         of_aiding += more
         assert recording.gnss is not None
         track = tracks.compute_track(recording.gnss)
         if track is not None and measure_overlap(recording) <= 0:
             track = None
     if recording.odometer is not None and len(recording.odometer.t):
-        recording, more = plausibility_odometer.screen(recording, track)
+        recording, more = plausibility_odometer.screen_odometer(recording, track)
         of_aiding += more
     return recording, of_imu, of_aiding, track
 

@@ -13,8 +13,8 @@ from graphnav.recording import Imu, Recording
 from graphnav.report.plots.figure import Figure, Panel, find_limits
 from graphnav.report.plots.thinning import BINS, thin
 
-_DYNAMIC = 2.5  # decades of amplitude in the spectrogram
-_FLOOR = 1e-6  # lower limit of a statistic on its logarithmic axis
+_DECADES = 2.5  # decades of amplitude in the spectrogram
+_LOWEST = 1e-6  # lower limit of a statistic on its logarithmic axis
 _FUSED = "fused"
 _SHOWN_STATISTICS = (
     "low_band_glrt",
@@ -101,12 +101,12 @@ def _collect_speeds(recording: Recording) -> list[tuple[str, Array, Array, str]]
 
 
 def _find_limits(every: Sequence[Detection]) -> tuple[float, float]:
-    values = [np.log10(np.maximum(v, _FLOOR)) for d in every for v in (d.statistic, np.atleast_1d(d.threshold))]
+    values = [np.log10(np.maximum(v, _LOWEST)) for d in every for v in (d.statistic, np.atleast_1d(d.threshold))]
     return find_limits(values, floor=0.5, always=values[1::2])
 
 
 def _plot_statistic(panel: Panel, d: Detection, t0: float) -> None:
-    panel.draw_line(d.t - t0, np.maximum(d.statistic, _FLOOR), "batch", "statistic", width=1.1)
+    panel.draw_line(d.t - t0, np.maximum(d.statistic, _LOWEST), "batch", "statistic", width=1.1)
     threshold = np.broadcast_to(d.threshold, d.t.shape)
     panel.draw_line(d.t - t0, threshold, "alert", "threshold: below it stands", dash=True)
 
@@ -119,7 +119,7 @@ def _plot_spectrogram(panel: Panel, pictured: Sequence[Detection], t0: float) ->
         even = np.linspace(t[0], t[-1], min(len(t), BINS))
         after = np.clip(np.searchsorted(t, even), 1, len(t) - 1)
         nearest = after - (even - t[after - 1] < t[after] - even)
-        panel.draw_map(even, f, np.clip(np.nan_to_num(level[:, nearest], nan=top - _DYNAMIC), top - _DYNAMIC, top))
+        panel.draw_map(even, f, np.clip(np.nan_to_num(level[:, nearest], nan=top - _DECADES), top - _DECADES, top))
         if "idle_line" in d.details:
             line = float(d.details["idle_line"][0])
             for k, words in ((1, f"idle line {line:.1f} Hz"), (2, "")):

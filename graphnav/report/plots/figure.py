@@ -17,8 +17,8 @@ from graphnav.report.plots.colours import name_variable
 from graphnav.report.plots.thinning import BINS, choose_rows, insert_breaks, thin
 
 SHADES = {"withheld": "withheld", "no GNSS": "outage", "excluded": "alert", "stands": "stop"}  # span -> colour
-TIME = "time from the start [s]"
-Spans = Sequence[tuple[float, float]]
+TIME_NAME = "time from the start [s]"
+Tinted = Sequence[tuple[float, float]]
 _PANEL, _GAP, _ABOVE, _BELOW, _LEFT, _RIGHT = 104, 30, 20, 42, 58, 10  # pixels
 _SYMBOLS = {"o": "circle", "x": "x-thin", "s": "square", "^": "triangle-up", "D": "diamond"}
 
@@ -96,7 +96,7 @@ class Panel:
             look = {"mode": "lines", "line": {"width": 0, "color": tint}, "fill": "toself", "fillcolor": tint}
             self._add(label, {"x": encode_numbers(both[0]), "y": encode_numbers(both[1]), **look}, quiet=True)
 
-    def shade(self, spans: Mapping[str, Spans]) -> None:
+    def shade(self, spans: Mapping[str, Tinted]) -> None:
         """Tint whole spans of x, by kind (a key of `SHADES`)."""
         for what, every in spans.items():
             cut = [(max(a, self.xlim[0]), min(b, self.xlim[1])) for a, b in every]
@@ -148,18 +148,18 @@ class Figure:
     titles, ylims : of the panels; limits are decimal logarithms where `log`, and those of x where `x_log`.
     xlim : of all of them, or a list with that of each where they stand `apart`.
     height : of a panel, pixels.
-    x : title of the x axis; a figure over `TIME` is zoomed together with all such figures of a page.
+    x : title of the x axis; a figure over `TIME_NAME` is zoomed together with all such figures of a page.
     names : instead of numbers on the y axis.
     """
 
     def __init__(
         self, titles: Sequence[str], xlim: Any, ylims: Sequence[tuple[float, float]], *, units: Sequence[str] = (),
-        log: Sequence[bool] | bool = False, height: int = _PANEL, x: str = TIME, apart: bool = False,
+        log: Sequence[bool] | bool = False, height: int = _PANEL, x: str = TIME_NAME, apart: bool = False,
         names: Mapping[float, str] | None = None, equal: bool = False, columns: int = 1, x_log: bool = False,
     ) -> None:  # fmt: skip
         count = len(titles)
         rows = -(-count // columns)
-        self.apart, self.time = apart, x == TIME and not apart
+        self.apart, self.time = apart, x == TIME_NAME and not apart
         gap = _GAP + 16 * apart  # room for numbers under every panel
         inner = rows * height + (rows - 1) * gap
         self.height = _ABOVE + _BELOW + inner

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from graphnav.core.rotation import Array
-from graphnav.report.plots.figure import SHADES, Figure, Panel, Spans, find_colour, find_limits
+from graphnav.report.plots.figure import SHADES, Figure, Panel, Tinted, find_colour, find_limits
 
 _MARKED_STOPS = 60  # stops that are marked individually
-_LABEL = 120.0  # pixels on a wide screen of a label on a phone
+_LABEL_WIDTH = 120.0  # pixels on a wide screen of a label on a phone
 _WIDE, _HIGH = 1080.0, 560  # pixels of the map on a wide screen; narrower pages show more of the north
 
 
@@ -42,8 +42,8 @@ def plot_trajectory(
     *,
     fixes: DrawnFixes | None = None,
     truth: Array | None = None,
-    spans: Mapping[str, Spans] | None = None,
-    stops: Spans = (),
+    spans: Mapping[str, Tinted] | None = None,
+    stops: Tinted = (),
     standing: str = "stop",
 ) -> Figure:
     """The track, to scale, north up.
@@ -112,7 +112,7 @@ def draw_fixes(panel: Panel, fixes: DrawnFixes, k: int | None = None) -> None:
         panel.draw_dots(x[out], y[out], "alert", "excluded fix", 7.0, "x", t=fixes.t[out], path=k is None)
 
 
-def _draw_spans(panel: Panel, t: Array, en: Array, spans: Mapping[str, Spans]) -> None:
+def _draw_spans(panel: Panel, t: Array, en: Array, spans: Mapping[str, Tinted]) -> None:
     for what, every in spans.items():
         pieces = [(t > a) & (t < b) for a, b in every]
         gap = np.full((1, 2), np.nan)
@@ -121,7 +121,7 @@ def _draw_spans(panel: Panel, t: Array, en: Array, spans: Mapping[str, Spans]) -
             panel.draw_path(np.concatenate(path), SHADES[what], what, width=8.0, alpha=0.5)
 
 
-def _draw_stops(panel: Panel, t: Array, en: Array, stops: Spans, standing: str) -> None:
+def _draw_stops(panel: Panel, t: Array, en: Array, stops: Tinted, standing: str) -> None:
     if not len(stops) or len(t) < 2:
         return
     begin, end = np.array(stops).T
@@ -134,7 +134,7 @@ def _mark_ends(panel: Panel, en: Array, scale: float) -> None:
     west, east = panel.xlim
     edge = 0.12 * (east - west)  # room for labels on a phone
     together = bool(np.linalg.norm(en[-1] - en[0]) < 16.0 * scale)
-    near = bool(np.linalg.norm(en[-1] - en[0]) < _LABEL * scale)
+    near = bool(np.linalg.norm(en[-1] - en[0]) < _LABEL_WIDTH * scale)
     lower = -int(en[-1, 1] < en[0, 1])  # the row whose label goes below, so that one does not cover the other
     few = max(1, len(en) // 30)
     for row, inner, marker, words in ((0, few, "^", "start"), (-1, max(-1 - few, -len(en)), "s", "end")):

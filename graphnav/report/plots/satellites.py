@@ -16,7 +16,7 @@ from graphnav.report.plots.thinning import BINS
 
 HALF = 0.5  # weight of a row below which it counts as rejected
 _SKY = 320  # pixels
-_ROW = 15  # pixels per satellite or signal
+_ROW_HEIGHT = 15  # pixels per satellite or signal
 _PLENTY = 4 * BINS  # points of a scatter plot that are drawn without thinning
 _RINGS = (0.0, 30.0, 60.0)  # deg of elevation
 _BINS = np.arange(0.0, 90.1, 5.0)  # deg of elevation
@@ -161,7 +161,7 @@ def _plot_named_rows(
     places = {name: float(len(every) - 1 - k) for k, name in enumerate(every)}
     spans = more.pop("spans", {})
     figure = Figure(
-        [""], xlim, [(-0.7, len(every) - 0.3)], height=max(_ROW * len(every), 60),
+        [""], xlim, [(-0.7, len(every) - 0.3)], height=max(_ROW_HEIGHT * len(every), 60),
         names={row: name for name, row in places.items()}, **more,
     )  # fmt: skip
     figure.panels[0].shade(spans)

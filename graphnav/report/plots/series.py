@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from graphnav.core.rotation import Array
-from graphnav.report.plots.figure import Figure, Panel, Spans, find_limits
+from graphnav.report.plots.figure import Figure, Panel, Tinted, find_limits
 
-Shades = Mapping[str, Spans]  # s from the start, by kind
+Shades = Mapping[str, Tinted]  # s from the start, by kind
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,7 @@ def plot_sigmas(
     return figure
 
 
-def plot_span_zoom(series: Mapping[str, Curve], spans: Spans, what: str = "withheld") -> Figure:
+def plot_span_zoom(series: Mapping[str, Curve], spans: Tinted, what: str = "withheld") -> Figure:
     """Horizontal error (m) over time in and around each span, one panel per span (`value` (N, 1))."""
     shown, xlims, ylims = [], [], []
     for a, b in spans:

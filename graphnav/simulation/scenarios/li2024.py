@@ -17,9 +17,9 @@ from graphnav.simulation.splines import make_random
 from graphnav.simulation.vibration import Engine, Idle, Shake, Springs, simulate_idle_floor, simulate_road_noise
 
 # Table 2, seconds of 12 October 2021 (GPST); a stop's first and last second are in it
-_CLOCK = ((2, 4, 7), (2, 20, 13), (2, 37, 31), (2, 59, 32), (3, 21, 42), (3, 41, 54))
+_STOP_TIMES = ((2, 4, 7), (2, 20, 13), (2, 37, 31), (2, 59, 32), (3, 21, 42), (3, 41, 54))
 START, END = 6920.0, 13845.0  # 01:55:20, 03:50:45
-STOPS = tuple(3600.0 * h + 60.0 * m + s for h, m, s in _CLOCK)
+STOPS = tuple(3600.0 * h + 60.0 * m + s for h, m, s in _STOP_TIMES)
 # Table 4, mg and deg/s, for half, once and twice the crankshaft's frequency; right is not in the table: figure 3 shows
 # one line there, near 12.5 Hz, and more noise. The half order is the 6.248 Hz that the table finds below 10 Hz.
 _HALF_ORDER = (0.03, 0.085, 0.03)
@@ -34,7 +34,7 @@ MEAN = Idle((_HALF_ORDER, (1.3, 2.509, 4.389), (0.2, 3.078, 3.592)), (0.002, 0.2
 IDLE_HZ = 12.49585
 
 
-def run(
+def li2024(
     seed: int,
     *,
     engine_hz: float = IDLE_HZ,
@@ -111,5 +111,7 @@ def _list_events(edges: tuple[float, ...], seed: int) -> list[Boarding | Fidget]
 
 
 SCENARIOS = [
-    Scenario("li2024", "two hours of town, three stops of 16 to 22 min with the engine idling, 200-Hz MEMS, RTK", run)
+    Scenario(
+        "li2024", "two hours of town, three stops of 16 to 22 min with the engine idling, 200-Hz MEMS, RTK", li2024
+    )
 ]

@@ -22,7 +22,7 @@ _SPEED, _TURN, _GAIN = 10.0, 12.0, 10.0  # m/s; s of a corner; s to gain or lose
 _IDLE = Idle(((0.3, 0.4, 0.6), (1.0, 2.0, 4.0)), (0.02, 0.15))
 
 
-def run(
+def ushaq(
     seed: int,
     *,
     fault: str = "none",
@@ -96,5 +96,5 @@ def _drive_square(every: float) -> list[Manoeuvre]:
 
 
 SCENARIOS = [
-    Scenario("ushaq", "an hour on a square of 6 km: GNSS of 25 m with faults, stops of a minute, 5 deg/h", run)
+    Scenario("ushaq", "an hour on a square of 6 km: GNSS of 25 m with faults, stops of a minute, 5 deg/h", ushaq)
 ]

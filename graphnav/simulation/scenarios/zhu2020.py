@@ -17,7 +17,7 @@ from graphnav.simulation.vibration import Engine, Idle, Shake, Springs, simulate
 _IDLE = Idle(((1.0, 2.0, 4.0), (0.3, 2.0, 3.0)), (0.25, 0.01))
 
 
-def run(
+def zhu2020(
     seed: int,
     *,
     gnss_s: float = 75.0,
@@ -81,6 +81,8 @@ def run(
 
 SCENARIOS = [
     Scenario(
-        "zhu2020", "75 s with GNSS and 150 s without, 400-Hz MIMU mounted askew, odometer unplugged for 15 s of it", run
+        "zhu2020",
+        "75 s with GNSS and 150 s without, 400-Hz MIMU mounted askew, odometer unplugged for 15 s of it",
+        zhu2020,
     )
 ]
