@@ -13,7 +13,7 @@ from oracle_path import ExactPath
 from graphnav.core import earth
 from graphnav.core.rotation import Array
 from graphnav.gnss.atmosphere import NIGHT, compute_directions, klobuchar
-from graphnav.gnss.ephemeris import EARTH_RATE
+from graphnav.gnss.ephemeris import OMEGA_WGS84
 from graphnav.gnss.series import RawGnss
 from graphnav.gnss.signals import L1, C, number_satellite, number_signal
 from graphnav.recording import Recording
@@ -45,14 +45,14 @@ def in_space(k: int, t: Array, above: Array) -> Array:
 
 def observe(llh_of, t: Array, above: Array, k: int) -> tuple[Array, Array, Array]:
     """Ranges c tau (n,), and satellites at transmission, positions and velocities in the Earth-fixed frame of then."""
-    antenna = turn(earth.llh_to_ecef(llh_of(t)), EARTH_RATE * t)
+    antenna = turn(earth.llh_to_ecef(llh_of(t)), OMEGA_WGS84 * t)
     tau = np.full(len(t), 0.07)
     for _ in range(8):
         tau = np.linalg.norm(in_space(k, t - tau, above) - antenna, axis=1) / C
     sent = t - tau
 
     def fixed(at: Array) -> Array:
-        return turn(in_space(k, at, above), -EARTH_RATE * at)
+        return turn(in_space(k, at, above), -OMEGA_WGS84 * at)
 
     return C * tau, fixed(sent), (fixed(sent + 0.5) - fixed(sent - 0.5))
 

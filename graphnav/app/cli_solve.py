@@ -285,13 +285,13 @@ def _solve(
             files += resolve_final_path(more, part, folder)
     verdicts = gates.judge_all(requirements, tabulate_comparison(outcome, ours=True)) if requirements else []
 
-    def values() -> dict[str, Any]:
+    def make_json() -> dict[str, Any]:
         places = {name: folder if alone else folder / name for name in names}
         each = {name: loads((at / "summary.json").read_text(encoding="utf-8")) for name, at in places.items()}
         found = each[names[0]] if alone else {"recording": outcome.recording.name, "solvers": each}
         return {**found, "requirements": gates.list_verdicts(verdicts), "files": files}
 
     print_out(
-        lambda: terminal.run_text(outcome, files) + gates.format_verdicts(verdicts), values, asked.quiet, asked.json
+        lambda: terminal.run_text(outcome, files) + gates.format_verdicts(verdicts), make_json, asked.quiet, asked.json
     )
     insist(verdicts)

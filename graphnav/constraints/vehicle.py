@@ -40,7 +40,7 @@ from graphnav.core.state import SECONDS, Parameter, States
 from graphnav.imu.dynamics import SCALE, convert_to_biases, differentiate_by_scale, scale_parameter
 from graphnav.imu.preintegration import Intervals
 from graphnav.recording import Imu, Odometer, Recording
-from graphnav.recording.odometer import MeanSpeed, ReadingStatistics, find_faults
+from graphnav.recording.odometer import MeanSpeed, ReadingStatistics, find_wrong_readings
 
 MOUNTING = "mounting"
 AXLE = "axle"
@@ -299,7 +299,7 @@ class NonHolonomic(Wheels):
 
 def _average_speed(odometer: Odometer, imu: Imu) -> MeanSpeed:
     figures = ReadingStatistics.of(odometer)
-    return MeanSpeed.of(odometer, find_faults(odometer, imu, figures).spans, figures)
+    return MeanSpeed.of(odometer, find_wrong_readings(odometer, imu, figures).spans, figures)
 
 
 @dataclass(frozen=True)

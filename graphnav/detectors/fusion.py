@@ -44,7 +44,7 @@ from graphnav.detectors.chain import (
 from graphnav.detectors.low_band import Scale, compute_low_band
 from graphnav.detectors.motion import Speeds, take_median
 from graphnav.detectors.scene import Detector, Labels, Scene
-from graphnav.detectors.windows import BlockMeans, filter_rows, make_kernel, share_of
+from graphnav.detectors.windows import BlockMeans, low_pass_rows, make_kernel, share_of
 
 LOW_BAND, FFT = "low_band_glrt", "fft"
 _EDGE_REGION = 3.0  # s about an end in which the edge is sought
@@ -82,7 +82,7 @@ def _leave(b: BlockMeans, h: Array, white: Array, middle: float, end: float, way
     i, j = max(i - len(h), 0), min(j + len(h), len(b.t))
     if j - i <= len(h) + 2:
         return middle
-    rows = filter_rows(b.mean[i:j, :6], h) * white
+    rows = low_pass_rows(b.mean[i:j, :6], h) * white
     t = 0.5 * (b.t[i : j - len(h) + 1] + b.t[i + len(h) - 1 : j])
     rows, t = (rows, t) if way > 0 else (rows[::-1], t[::-1])
     normal = way * (t - end) < -0.5

@@ -24,7 +24,7 @@ from graphnav.core.rotation import Array
 from graphnav.detectors.base import NONE, Detection, find_spans, mask_within
 from graphnav.detectors.scene import Detector, Labels, Scene
 from graphnav.detectors.thresholds import choose_threshold, find_fewest_errors
-from graphnav.detectors.windows import BlockMeans, compute_window_times, find_unbroken, sum_running
+from graphnav.detectors.windows import BlockMeans, compute_window_times, find_unbroken, sum_rows
 
 _TINY = 1e-300
 _WINDOW_STEP = 0.1  # s between windows
@@ -90,7 +90,7 @@ def compute_glrt(
     """
     if len(accel) < window:
         return np.zeros(0)
-    return STATISTICS[name](sum_running(collect_rows(accel, gyro)).compute_means(window), sigma_a, sigma_w, g)
+    return STATISTICS[name](sum_rows(collect_rows(accel, gyro)).compute_means(window), sigma_a, sigma_w, g)
 
 
 @dataclass(frozen=True)
@@ -117,7 +117,7 @@ def compute_window_means(b: BlockMeans, length: float) -> Means | None:
     return Means(
         compute_window_times(middle, window),
         0.5 * length,
-        sum_running(rows).compute_means(window),
+        sum_rows(rows).compute_means(window),
         find_unbroken(whole, window, first=0),
     )
 

@@ -23,7 +23,7 @@ from graphnav.core.rotation import Array
 from graphnav.detectors.base import NONE, Detection, drop_short, find_spans, mask_within
 from graphnav.detectors.scene import Detector, Labels, Scene
 from graphnav.detectors.thresholds import MISLABELLED, MISTAKEN, SHORTEST_POPULATION, find_valley, log_statistic
-from graphnav.detectors.windows import LowPassed, compute_window_times, find_unbroken, sum_running
+from graphnav.detectors.windows import LowPassed, compute_window_times, find_unbroken, sum_rows
 from graphnav.recording import ImuNoise
 
 NAME = "low_band_glrt"
@@ -63,7 +63,7 @@ class Scale:
 def measure_spreads(low: LowPassed, window: int) -> Array:
     """Variance per axis of force and of rate in every window of low-passed rows, (W, 2); NaN across a gap."""
     rows = low.rows - low.rows.mean(axis=0)
-    sums = sum_running(np.concatenate([rows, rows**2], axis=1)).compute_means(window)
+    sums = sum_rows(np.concatenate([rows, rows**2], axis=1)).compute_means(window)
     spread = np.maximum(sums[:, 6:] - sums[:, :6] ** 2, 0.0)
     each = np.stack([spread[:, :3].mean(axis=1), spread[:, 3:].mean(axis=1)], -1)
     return np.where(find_unbroken(low.whole, window)[:, None], each, np.nan)

@@ -34,7 +34,7 @@ from graphnav.core.notes import Note, format_count
 from graphnav.core.rotation import Array
 from graphnav.detectors.base import NONE, Detection, Detections, drop_short, find_spans, mask_inside, merge_spans, unite
 from graphnav.detectors.glrt import compute_glrt
-from graphnav.detectors.windows import find_unbroken, sum_running
+from graphnav.detectors.windows import find_unbroken, sum_rows
 from graphnav.recording import Imu
 
 _QUIET_SPAN = 1.0  # s; the quietest second of the recording defines bias and gravity
@@ -109,7 +109,7 @@ def _average_quietest(imu: Imu, period: float) -> tuple[Array, float]:
     """Mean rate (3,) and magnitude of the mean force of the second in which both scatter least."""
     n = min(len(imu.t), max(2, round(_QUIET_SPAN / period)))
     rows = np.column_stack([imu.gyro, imu.accel])
-    means, squares = sum_running(rows).compute_means(n), sum_running(rows**2).compute_means(n)
+    means, squares = sum_rows(rows).compute_means(n), sum_rows(rows**2).compute_means(n)
     scatter = squares - means**2
     # each divided by its own typical scatter, so that neither unit dominates
     total = np.sum(scatter / np.maximum(np.median(scatter, axis=0), 1e-12), axis=1)
@@ -145,7 +145,7 @@ def _cut_sliding(spans: Array, imu: Imu, t: Array, e: Array, bias: Array, fastes
     """
     out = spans.copy()
     window = len(imu.t) - len(t) + 1
-    force = sum_running(imu.accel).compute_means(window)
+    force = sum_rows(imu.accel).compute_means(window)
     T = np.diff(imu.t, prepend=2.0 * imu.t[0] - imu.t[1])
     ways = []  # from a quiet moment outward: the span, its end, the window, the first row and the number of rows
     for side, way in ((0, -1), (1, 1)):

@@ -75,7 +75,7 @@ class Sums:
         return np.asarray((last - self.total[: -length or None : step][: len(last)]) / length + self.offset)
 
 
-def sum_running(rows: Array) -> Sums:
+def sum_rows(rows: Array) -> Sums:
     """Running sums down the rows, (K, c)."""
     offset = rows.mean(axis=0) if len(rows) else np.zeros(rows.shape[1])
     total = np.zeros((len(rows) + 1, rows.shape[1]))
@@ -140,6 +140,6 @@ def share_of(x: Array, share: float) -> Array:
     return np.asarray(x[k] + (at - k) * (x[min(k + 1, len(x) - 1)] - x[k]))
 
 
-def filter_rows(rows: Array, h: Array) -> Array:
+def low_pass_rows(rows: Array, h: Array) -> Array:
     """All rows filtered with h, (K - len(h) + 1, c): for a short span."""
     return np.asarray(sliding_window_view(rows, len(h), axis=0) @ h)

@@ -319,7 +319,7 @@ def join_solutions(parts: list[Solution], notes: tuple[str, ...] = ()) -> Soluti
     if len(parts) == 1:
         return replace(first, notes=(*notes, *first.notes))
 
-    def rows(name: str) -> ConstraintRecord:
+    def join_rows(name: str) -> ConstraintRecord:
         have = [part.records[name] for part in parts if name in part.records]
         arrays: dict[str, Any] = {
             key: np.concatenate([getattr(r, key) for r in have])
@@ -338,7 +338,7 @@ def join_solutions(parts: list[Solution], notes: tuple[str, ...] = ()) -> Soluti
         states=States.stack([p.states for p in parts]),
         covariance=np.concatenate([p.covariance for p in parts]),
         parameters=parameters,
-        records={name: rows(name) for name in dict.fromkeys(key for part in parts for key in part.records)},
+        records={name: join_rows(name) for name in dict.fromkeys(key for part in parts for key in part.records)},
         counts=_add_counts([p.counts for p in parts]),
         timings=_add_counts([p.timings for p in parts]),
         iterations=sum(p.iterations for p in parts),

@@ -35,7 +35,7 @@ from graphnav.evaluation.metrics import (
     tabulate,
     write_comparison_csv,
 )
-from graphnav.evaluation.scoring import MAX_GAP, compute_errors, measure_closure, ranges
+from graphnav.evaluation.scoring import MAX_GAP, compute_errors, list_ranges, measure_closure
 from graphnav.recording import Recording
 from graphnav.recording.formats.trajectories import WEEK, read_trajectory
 
@@ -279,7 +279,8 @@ def evaluate(
         trajectory, notes = _put_on_clock(trajectory, float(truth.t[0]), float(truth.t[-1]), truth.gps_zero)
     if trajectory.t[-1] < truth.t[0] or truth.t[-1] < trajectory.t[0]:
         raise RecordingError(
-            f"{trajectory_path}: {ranges(trajectory, truth)}{_shift_hint(trajectory, truth)}", key="truth.no_overlap"
+            f"{trajectory_path}: {list_ranges(trajectory, truth)}{_shift_hint(trajectory, truth)}",
+            key="truth.no_overlap",
         )
     found_errors = compute_errors(trajectory, truth, lever_arm=lever_arm, max_gap=max_gap, from_start=alone)
     hint = _hint_at_leap(found_errors, trajectory, truth, lever_arm, max_gap)

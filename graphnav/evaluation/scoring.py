@@ -287,14 +287,14 @@ def _compute_nees(e: Array, cov: Array) -> Array:
 def _explain_no_overlap(trajectory: Trajectory, truth: Trajectory, max_gap: float) -> str:
     name = trajectory.name or "the trajectory"
     if trajectory.t[-1] < truth.t[0] or truth.t[-1] < trajectory.t[0]:
-        return f"{name}: {ranges(trajectory, truth)}"
+        return f"{name}: {list_ranges(trajectory, truth)}"
     return (
         f"{name}: nothing to compare; no row of the sparser file lies between two rows of the other at most "
         f"{max_gap:g} s apart"
     )
 
 
-def ranges(trajectory: Trajectory, truth: Trajectory) -> str:
+def list_ranges(trajectory: Trajectory, truth: Trajectory) -> str:
     return (
         f"its times {trajectory.t[0]:.3f} to {trajectory.t[-1]:.3f} s do not overlap the truth's "
         f"{truth.t[0]:.3f} to {truth.t[-1]:.3f} s"

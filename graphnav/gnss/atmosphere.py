@@ -108,12 +108,12 @@ def niell(llh: Array, elevation: Array, day: Array) -> tuple[Array, Array]:
     season = np.cos(2.0 * np.pi * ((day - _COLDEST) / _YEAR + np.where(llh[:, 0] < 0.0, 0.5, 0.0)))
     sin = np.sin(np.maximum(elevation, np.radians(1.0)))
 
-    def at(table: Array) -> Array:
+    def interpolate_at(table: Array) -> Array:
         return np.stack([np.interp(lat, _LATITUDES, row) for row in table])
 
-    dry = _evaluate_fraction(sin, at(_DRY_MEAN) - at(_DRY_SEASON) * season)
+    dry = _evaluate_fraction(sin, interpolate_at(_DRY_MEAN) - interpolate_at(_DRY_SEASON) * season)
     higher = (1.0 / sin - _evaluate_fraction(sin, _NIELL_HEIGHT[:, None])) * llh[:, 2] / 1e3
-    return dry + higher, _evaluate_fraction(sin, at(_WET))
+    return dry + higher, _evaluate_fraction(sin, interpolate_at(_WET))
 
 
 def _evaluate_fraction(sin: Array, coefficients: Array) -> Array:

@@ -19,7 +19,7 @@ from graphnav.gnss.signals import BEIDOU, GALILEO, GLONASS, GPS, QZSS, C, Ids, f
 
 _MU = {GPS: 3.9860050e14, GALILEO: 3.986004418e14, BEIDOU: 3.986004418e14, QZSS: 3.986005e14}
 _OMEGA = {GPS: 7.2921151467e-5, GALILEO: 7.2921151467e-5, BEIDOU: 7.292115e-5, QZSS: 7.2921151467e-5}
-EARTH_RATE = 7.2921151467e-5  # rad/s, of WGS-84
+OMEGA_WGS84 = 7.2921151467e-5  # rad/s, of WGS-84
 _OLDEST_EPHEMERIS = {
     GPS: 7201.0,
     GALILEO: 14400.0,
@@ -315,7 +315,7 @@ def _turn_about_x(x: Array) -> Array:
 
 def rotate_earth(p: Array, seconds: Array) -> Array:
     """Earth-fixed coordinates (N, 3) of one time in the Earth-fixed frame so many seconds (N,) later."""
-    return _turn_about_z(p, EARTH_RATE * seconds)
+    return _turn_about_z(p, OMEGA_WGS84 * seconds)
 
 
 def _derive_glonass(x: Array, a: Array) -> Array:

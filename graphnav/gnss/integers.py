@@ -91,10 +91,10 @@ def find_nearest(a: Array, found: Decorrelated) -> Nearest:
     first, second = _search(z, found.L, found.D)
     back = np.linalg.inv(found.Z.astype(float)).T
 
-    def original(x: list[int]) -> Integers:
+    def transform_back(x: list[int]) -> Integers:
         return np.rint(back @ np.array(x, dtype=float) + whole).astype(np.int64)
 
-    return Nearest(original(first[1]), original(second[1]), first[0], second[0])
+    return Nearest(transform_back(first[1]), transform_back(second[1]), first[0], second[0])
 
 
 def _search(z: Array, L: Array, D: Array) -> tuple[tuple[float, list[int]], tuple[float, list[int]]]:

@@ -230,30 +230,30 @@ class Decoder:
             whole = Bits(whole.value << 300 | parts[k].value, whole.size + 300)
         parts.clear()
 
-        def at(page: int, *places: tuple[int, int]) -> list[tuple[int, int]]:
+        def join_parts(page: int, *places: tuple[int, int]) -> list[tuple[int, int]]:
             return [(300 * (page - 1) + first, many) for first, many in places]
 
         u, s = whole.u, whole.s
-        toes, toc = u(*at(7, (80, 2), (90, 15))) * 8.0, u(*at(1, (77, 5), (90, 12))) * 8.0
+        toes, toc = u(*join_parts(7, (80, 2), (90, 15))) * 8.0, u(*join_parts(1, (77, 5), (90, 12))) * 8.0
         self._add(
             satellite, _unroll_week(toes + _BDT, gps), _unroll_week(toc + _BDT, gps), toes,
             clock=(
-                s(*at(3, (100, 12), (120, 12))) * 2.0**-33,
-                s(*at(3, (132, 4)), *at(4, (46, 6), (60, 12))) * 2.0**-50, s(*at(4, (72, 10), (90, 1))) * 2.0**-66,
+                s(*join_parts(3, (100, 12), (120, 12))) * 2.0**-33,
+                s(*join_parts(3, (132, 4)), *join_parts(4, (46, 6), (60, 12))) * 2.0**-50, s(*join_parts(4, (72, 10), (90, 1))) * 2.0**-66,
             ),
-            iode=u(*at(4, (91, 5))), crs=s(*at(8, (91, 18))) * 2.0**-6, delta_n=s(*at(4, (96, 16))) * 2.0**-43 * _PI,
-            m0=s(*at(5, (50, 2), (60, 22), (90, 8))) * 2.0**-31 * _PI,
-            cuc=s(*at(4, (120, 14)), *at(5, (46, 4))) * 2.0**-31,
-            e=u(*at(5, (124, 10)), *at(6, (46, 6), (60, 16))) * 2.0**-33, cus=s(*at(5, (98, 14), (120, 4))) * 2.0**-31,
-            root_a=u(*at(6, (76, 6), (90, 22), (120, 4))) * 2.0**-19,
-            cic=s(*at(6, (124, 10)), *at(7, (46, 6), (60, 2))) * 2.0**-31,
-            omega0=s(*at(9, (51, 1), (60, 22), (90, 9))) * 2.0**-31 * _PI, cis=s(*at(7, (62, 18))) * 2.0**-31,
-            i0=s(*at(7, (105, 7), (120, 14)), *at(8, (46, 6), (60, 5))) * 2.0**-31 * _PI,
-            crc=s(*at(8, (65, 17), (90, 1))) * 2.0**-6,
-            omega=s(*at(9, (99, 13), (120, 14)), *at(10, (46, 5))) * 2.0**-31 * _PI,
-            omega_dot=s(*at(8, (109, 3), (120, 16)), *at(9, (46, 5))) * 2.0**-43 * _PI,
-            idot=s(*at(10, (51, 1), (60, 13))) * 2.0**-43 * _PI, healthy=u(*at(1, (46, 1))) == 0,
-            delay=(s(*at(1, (102, 10))) * 1e-10, s(*at(1, (120, 10))) * 1e-10),
+            iode=u(*join_parts(4, (91, 5))), crs=s(*join_parts(8, (91, 18))) * 2.0**-6, delta_n=s(*join_parts(4, (96, 16))) * 2.0**-43 * _PI,
+            m0=s(*join_parts(5, (50, 2), (60, 22), (90, 8))) * 2.0**-31 * _PI,
+            cuc=s(*join_parts(4, (120, 14)), *join_parts(5, (46, 4))) * 2.0**-31,
+            e=u(*join_parts(5, (124, 10)), *join_parts(6, (46, 6), (60, 16))) * 2.0**-33, cus=s(*join_parts(5, (98, 14), (120, 4))) * 2.0**-31,
+            root_a=u(*join_parts(6, (76, 6), (90, 22), (120, 4))) * 2.0**-19,
+            cic=s(*join_parts(6, (124, 10)), *join_parts(7, (46, 6), (60, 2))) * 2.0**-31,
+            omega0=s(*join_parts(9, (51, 1), (60, 22), (90, 9))) * 2.0**-31 * _PI, cis=s(*join_parts(7, (62, 18))) * 2.0**-31,
+            i0=s(*join_parts(7, (105, 7), (120, 14)), *join_parts(8, (46, 6), (60, 5))) * 2.0**-31 * _PI,
+            crc=s(*join_parts(8, (65, 17), (90, 1))) * 2.0**-6,
+            omega=s(*join_parts(9, (99, 13), (120, 14)), *join_parts(10, (46, 5))) * 2.0**-31 * _PI,
+            omega_dot=s(*join_parts(8, (109, 3), (120, 16)), *join_parts(9, (46, 5))) * 2.0**-43 * _PI,
+            idot=s(*join_parts(10, (51, 1), (60, 13))) * 2.0**-43 * _PI, healthy=u(*join_parts(1, (46, 1))) == 0,
+            delay=(s(*join_parts(1, (102, 10))) * 1e-10, s(*join_parts(1, (120, 10))) * 1e-10),
         )  # fmt: skip
 
     def _parse_string(self, satellite: int, bits: Bits, gps: float) -> None:

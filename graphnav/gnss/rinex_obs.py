@@ -210,10 +210,10 @@ def _read_version_3(lines: Lines, header: Header, path: Path, remarks: list[str]
     satellite = (100 * system[own] + number).astype(np.int16)
     rows = _SatelliteLines(own, of, satellite)
 
-    def cells(which: NDArray[np.intp], types: int) -> NDArray[np.uint8]:
+    def read_cells(which: NDArray[np.intp], types: int) -> NDArray[np.uint8]:
         return lines.take_block(rows.line[which], 3, 3 + _FIELD_WIDTH * types)
 
-    return stamp, zero, flag, rows, cells
+    return stamp, zero, flag, rows, read_cells
 
 
 def _take_first(value: Array) -> Array:
@@ -306,12 +306,12 @@ def _read_version_2(lines: Lines, header: Header, path: Path, remarks: list[str]
         np.array(first_line, dtype=np.intp), np.array(of, dtype=np.intp), np.array(satellite, dtype=np.int16)
     )
 
-    def cells(which: NDArray[np.intp], types: int) -> NDArray[np.uint8]:
+    def read_cells(which: NDArray[np.intp], types: int) -> NDArray[np.uint8]:
         parts = [lines.take_block(rows.line[which] + j, 0, 5 * _FIELD_WIDTH) for j in range(each)]
         return np.concatenate(parts, axis=1)[:, : _FIELD_WIDTH * types]
 
     stamp, zero = _count_since_week(fields, header.scale, np.ones(len(epoch), dtype=bool))
-    return stamp, zero, np.array(flags), rows, cells
+    return stamp, zero, np.array(flags), rows, read_cells
 
 
 def _say_cut(

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from graphnav.core import earth
 from graphnav.core.rotation import Array
 from graphnav.gnss.atmosphere import NIGHT, compute_directions, klobuchar, saastamoinen
-from graphnav.gnss.ephemeris import EARTH_RATE, rotate_earth
+from graphnav.gnss.ephemeris import OMEGA_WGS84, rotate_earth
 from graphnav.gnss.series import RawGnss
 from graphnav.gnss.sigmas import compute_code_sigma, compute_rate_sigma
 from graphnav.gnss.signals import L1, C
@@ -32,7 +32,7 @@ _KERNEL_SCALE = 3.0  # sigma at which a row begins to lose weight
 _WEAK = 1e6  # m, 1-sigma of an unknown before any row
 _LOST = 100.0  # m, rms of residuals beyond which an epoch has no position
 _WORST_PDOP = 60.0  # PDOP beyond which a position says nothing
-_OMEGA_E = np.array([0.0, 0.0, EARTH_RATE])
+_OMEGA_E = np.array([0.0, 0.0, OMEGA_WGS84])
 
 
 @dataclass(frozen=True)

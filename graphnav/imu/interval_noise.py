@@ -62,17 +62,17 @@ def compute_white_covariance(qg: Array, qa: Array, left: Array, a_edge: Array, b
     theta, p, v = slice(0, 3), slice(3, 6), slice(6, 9)
     a, b = slice(0, 3), slice(3, 6)
 
-    def outer(x: slice, y: slice, own: Array) -> Array:
+    def sum_outer(x: slice, y: slice, own: Array) -> Array:
         """sum qg ([x]x [y]x^T) = sum qg (x.y I - y x^T), and a variance on the diagonal"""
         yx = products[:, y, x]
         return (np.trace(yx, axis1=-2, axis2=-1) + own)[:, None, None] * eye - yx
 
     Q[:, theta, theta] = qg.sum(0)[:, None, None] * eye
     Q[:, theta, v], Q[:, theta, p] = rotation.skew(moment[:, a]), rotation.skew(moment[:, b])
-    Q[:, v, v] = outer(a, a, qa.sum(0))
-    Q[:, v, p] = outer(a, b, (qa * s).sum(0))
+    Q[:, v, v] = sum_outer(a, a, qa.sum(0))
+    Q[:, v, p] = sum_outer(a, b, (qa * s).sum(0))
     # force noise inside a cell also moves the position: dt^2/12 keeps one-cell intervals regular
-    Q[:, p, p] = outer(b, b, (qa * (s * s + dt * dt / 12.0)).sum(0))
+    Q[:, p, p] = sum_outer(b, b, (qa * (s * s + dt * dt / 12.0)).sum(0))
     for x, y in ((theta, v), (theta, p), (v, p)):
         Q[:, y, x] = np.swapaxes(Q[:, x, y], -1, -2)
     return Q

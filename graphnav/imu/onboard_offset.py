@@ -44,7 +44,7 @@ def remove_onboard_offset(recording: Recording, settings: Settings) -> tuple[Rec
         return recording, ()
     imu = recording.imu
     offset = estimate_learnt_offset(imu)
-    if compute_evidence(imu, offset) < 2.0 * np.log(_ODDS):
+    if compare_offsets(imu, offset) < 2.0 * np.log(_ODDS):
         return recording, ()
     most = 1e3 * float(np.abs(offset).max())
     note = Note(
@@ -64,7 +64,7 @@ def estimate_learnt_offset(imu: Imu) -> Array:
     return np.asarray(np.cumsum(imu.gyro * (_KAPPA * active * _find_periods(imu))[:, None], axis=0))
 
 
-def compute_evidence(imu: Imu, offset: Array) -> float:
+def compare_offsets(imu: Imu, offset: Array) -> float:
     """Twice the log likelihood ratio of the rows with `offset` (N, 3) subtracted by the unit against without."""
     T = _find_periods(imu)[:, None]
     angle, bent = np.cumsum(imu.gyro * T, axis=0), np.cumsum(offset * T, axis=0)

@@ -14,7 +14,7 @@ from graphnav.core.rotation import Array
 from graphnav.detectors import find_stops
 from graphnav.detectors.base import merge_spans
 from graphnav.online.sensors import Sensors
-from graphnav.recording.odometer import ReadingStatistics, find_faults
+from graphnav.recording.odometer import ReadingStatistics, find_wrong_readings
 
 CONTEXT = 30.0  # s of rows before a keyframe that its constraints may use
 SURE = 1.0  # s before now up to which detection is reliable: the end of a stop is known only afterwards
@@ -128,7 +128,7 @@ class Readings:
             assert every is not None
             before, self.figures, self._told, lag = self.figures, ReadingStatistics.of(every), self._moving, None
             self.revised |= before is not None and _differ(before.list_sigmas(o), self.figures.list_sigmas(o))
-        seen, known = find_faults(recording.odometer, recording.imu, self.figures, lag), self.wrong
+        seen, known = find_wrong_readings(recording.odometer, recording.imu, self.figures, lag), self.wrong
         found, self._lag = seen.spans, seen.lag
         since = float(recording.odometer.t[0]) + (0.0 if whole else 5.0)
         old = known[(known[:, 0] < since) & (known[:, 1] > since - CONTEXT - _WHEELS_LOOK)]

@@ -15,7 +15,7 @@ from graphnav.gnss.arcs import find_arcs
 from graphnav.gnss.ppp import compute_series_wind_up
 from graphnav.gnss.series import RawGnss, choose_primary
 from graphnav.gnss.single_point import choose_coefficients, look, solve
-from graphnav.online.raw_lines import WIDTH, build_series, take_sane
+from graphnav.online.raw_lines import WIDTH, build_raw_series, take_sane
 from graphnav.recording import Recording
 
 RAW = "raw_gnss"
@@ -64,7 +64,7 @@ class RawEpochs:
         if not np.isin(rows[:, 0], self.setup.catalogue.satellites).all():
             return "of satellites that the setup does not name"
         rows = take_sane(rows)
-        usable = select_usable(build_series([0.0], [rows], self.setup), self.settings)
+        usable = select_usable(build_raw_series([0.0], [rows], self.setup), self.settings)
         return None if usable.any() else "no satellite that is of use"
 
     def is_wanted(self, t: float) -> bool:
@@ -119,7 +119,7 @@ class RawEpochs:
         """The epochs in use from `begin` to `end`, both included, and the one before, as a series."""
         t = self._t[max(bisect_left(self._t, begin) - 1, 0) : bisect_right(self._t, end)]
         rows = [self._rows[x] for x in t]
-        series = build_series(t, rows, self.setup)
+        series = build_raw_series(t, rows, self.setup)
         if not t:
             return series
         number = np.repeat([self._number[x] for x in t], [len(one) for one in rows])
@@ -132,7 +132,7 @@ class RawEpochs:
         if np.isfinite(rows[:, -5:]).all():
             return rows
         rows = rows.copy()
-        series = build_series([t], [rows], self.setup)
+        series = build_raw_series([t], [rows], self.setup)
         found = solve(series.take(choose_primary(series)))
         if np.isfinite(found.p).all():
             drift = found.drift[0] if np.isfinite(found.drift[0]) else 0.0
@@ -152,7 +152,7 @@ class RawEpochs:
         s = self.settings
         if not (s.carrier or s.differences or s.ppp):
             return np.full((len(rows), 2), np.nan)
-        series = build_series([*(x for x, _, _ in last), t], [*(row[None] for _, row, _ in last), rows], self.setup)
+        series = build_raw_series([*(x for x, _, _ in last), t], [*(row[None] for _, row, _ in last), rows], self.setup)
         order = np.argsort(series.t, kind="stable")
         series, based = series.take(order), self.setup.catalogue.differenced and s.carrier and not s.ppp
         if not based:

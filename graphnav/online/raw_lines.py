@@ -151,7 +151,7 @@ def _parse_numbers(text: str, count: int, what: str) -> list[float]:
         raise ValueError(f"{what}: '{text[:40]}' holds something that is no number") from None
 
 
-def build_series(t: list[float], rows: list[Array], setup: RawGnss) -> RawGnss:
+def build_raw_series(t: list[float], rows: list[Array], setup: RawGnss) -> RawGnss:
     """The series of epochs at times (s) with numbers (n, WIDTH) each, of a setup."""
     if not t:
         return setup

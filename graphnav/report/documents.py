@@ -148,7 +148,7 @@ def write_report(
             ],
         ),
         ("Findings", tables.list_findings(recording, findings)),
-        ("Run", tables.run_table(only)),
+        ("Run", tables.tabulate_run(only)),
         ("Provenance", tabulate_provenance(settings, provenance)),
     ]
     lead = [
@@ -226,7 +226,7 @@ def write_comparison(
         ("Constraints", [page.make_table(["constraint", "solver", *tables.CONSISTENCY_HEAD], rows)] if rows else []),
         ("Noise model", [*tables.tabulate_noise(noise, first), *tables.tabulate_excluded(first, start)]),
         ("Findings", tables.list_findings(recording, findings)),
-        ("Runs", tables.run_table(solutions)),
+        ("Runs", tables.tabulate_run(solutions)),
         ("Provenance", tabulate_provenance(settings, provenance)),
     ]
     lead = [

@@ -59,12 +59,12 @@ def make_table(head: Sequence[Any], rows: Iterable[Sequence[Any]], best: Sequenc
         for k in (best if len(rows) > 1 else ())
     }
 
-    def kind(k: int, value: Any) -> str:
+    def choose_class(k: int, value: Any) -> str:
         return "best" if k in least and value == least[k] else _choose_class(value) if k else ""
 
     return _PARTS.table(
         [(head[k], max((_choose_class(row[k]) for row in rows), default="", key=len) if k else "") for k in columns],
-        [[(row[k], kind(k, row[k])) for k in columns] for row in rows],
+        [[(row[k], choose_class(k, row[k])) for k in columns] for row in rows],
     )
 
 

@@ -57,19 +57,19 @@ def draw_profile(recording: Recording, solutions: Mapping[str, Solution]) -> Mar
     start, first = recording.start, next(iter(solutions.values()))
     distance = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(first.states.p[:, :2], axis=0), axis=1))])
 
-    def over_distance(t: Array, h: Array) -> tuple[Array, Array]:
+    def interpolate_over_distance(t: Array, h: Array) -> tuple[Array, Array]:
         return np.interp(t, first.t, distance), h
 
     lines, points = {}, {}
     truth, fixes = _find_truth(recording, solutions), select_fixes(recording, first)
     base = float(first.frame.origin[2]) if has_place(first) else 0.0
     if truth is not None and truth[1].shape[1] > 2:
-        lines["truth"] = over_distance(truth[0], base + truth[1][:, 2])
-    lines |= {name: over_distance(s.t, base + s.states.p[:, 2]) for name, s in solutions.items()}
+        lines["truth"] = interpolate_over_distance(truth[0], base + truth[1][:, 2])
+    lines |= {name: interpolate_over_distance(s.t, base + s.states.p[:, 2]) for name, s in solutions.items()}
     if fixes is not None:
         for kind, of_it in fixes.kinds.items():
             rows = of_it & ~fixes.excluded
-            points[kind] = over_distance(fixes.t[rows] + start, base + fixes.enu[rows, 2])
+            points[kind] = interpolate_over_distance(fixes.t[rows] + start, base + fixes.enu[rows, 2])
     antenna = "truth and fixes" if "truth" in lines and recording.truth and recording.truth.of == "gnss" else "fixes"
     note = f"Heights above the ellipsoid; {antenna} are of the antenna."
     if not has_place(first):
@@ -270,11 +270,11 @@ def draw_quality(recording: Recording, solution: Solution, spans: Shades) -> lis
     seen = gnss.satellites is not None
     shown = np.column_stack([np.hypot(gnss.sd[:, 0], gnss.sd[:, 1]), gnss.sd[:, 2]])
     titles, units, log = ["horizontal 1-sigma [m]", "up 1-sigma [m]"], ["m", "m"], [True, True]
-    limits = [plots.find_limits([np.log10(shown[:, k])], floor=0.5) for k in range(2)]
+    limits = [plots.find_axis_limits([np.log10(shown[:, k])], floor=0.5) for k in range(2)]
     if gnss.satellites is not None:
         shown = np.column_stack([shown, gnss.satellites])
         titles, units, log = [*titles, "satellites"], [*units, ""], [*log, False]
-        limits.append(plots.find_limits([np.append(gnss.satellites, 0.0)], floor=1.0))
+        limits.append(plots.find_axis_limits([np.append(gnss.satellites, 0.0)], floor=1.0))
     figure = plots.Figure(titles, (0.0, recording.duration), limits, units=units, log=log)
     for k, panel in enumerate(figure.panels):
         panel.shade(spans)

@@ -274,15 +274,17 @@ def tabulate_parameters(parameters: Mapping[str, ParameterEstimate]) -> list[Mar
     return [page.make_table(head, rows)] if rows else []
 
 
-def run_table(solutions: Mapping[str, Solution]) -> list[Markup]:
+def tabulate_run(solutions: Mapping[str, Solution]) -> list[Markup]:
     """Seconds by stage, iterations and cost, one column per solver; the reason why each stopped."""
     every, solutions = solutions, select_own(solutions)
     stages = list(dict.fromkeys(stage for s in solutions.values() for stage in s.timings))
 
-    def seconds(solution: Solution, stage: str) -> Quantity | None:
+    def format_seconds(solution: Solution, stage: str) -> Quantity | None:
         return Quantity(f"{solution.timings[stage]:.3f}") if stage in solution.timings else None
 
-    rows: list[list[Any]] = [[f"{stage} [s]", *(seconds(s, stage) for s in solutions.values())] for stage in stages]
+    rows: list[list[Any]] = [
+        [f"{stage} [s]", *(format_seconds(s, stage) for s in solutions.values())] for stage in stages
+    ]
     rows += [
         ["sum [s]", *(Quantity(f"{sum(s.timings.values()):.3f}") for s in solutions.values())],
         ["iterations", *(s.iterations for s in solutions.values())],

@@ -174,7 +174,7 @@ def move_vehicle(path: Path, origin: tuple[float, float, float], mount: Mount, s
         llh[rows], turn = _move(axle[rows], arm[rows])
         v[rows], R_lb[rows] = rotation.mv(turn, V[rows]), turn @ R[rows] @ R_vb
 
-    def point(times: Array, lever_arm_b: Array) -> tuple[Array, Array]:
+    def compute_point(times: Array, lever_arm_b: Array) -> tuple[Array, Array]:
         """(llh, velocity in local ENU) of a point fixed to the IMU, at times within the drive, (M, 3) each."""
         times = np.clip(np.asarray(times, dtype=float), t[0], t[-1])
         felt = _derive_axle_motion(path, shake, mount, times)
@@ -190,7 +190,7 @@ def move_vehicle(path: Path, origin: tuple[float, float, float], mount: Mount, s
         llh, turn = _move(place, offset)
         return llh, rotation.mv(turn, V_l + rotation.mv(felt.R_lv, np.cross(omega, lever)))
 
-    return TrueMotion(t, llh, v, R_lb, omega_eb @ R_vb, gyro @ R_vb, accel @ R_vb, axle, point)
+    return TrueMotion(t, llh, v, R_lb, omega_eb @ R_vb, gyro @ R_vb, accel @ R_vb, axle, compute_point)
 
 
 def _compute_means(x: Array) -> Array:

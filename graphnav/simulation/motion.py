@@ -106,16 +106,16 @@ def make_path(
     share = np.divide(covered, length[i], out=np.zeros_like(t), where=length[i] != 0)
     share = share * share * (3.0 - 2.0 * share)
 
-    def along(ends: Sequence[float], first: float) -> Array:
+    def place_along(ends: Sequence[float], first: float) -> Array:
         last, before = np.array(ends, dtype=float), np.r_[first, ends[:-1]]
         # where no distance is covered, nothing can change
         last = np.where(length == 0, before, last)
         return before[i] + (last - before)[i] * share
 
     turned = heading + np.cumsum([m.turn for m in manoeuvres])
-    psi = np.deg2rad(along(list(turned), heading))
-    slope = np.arctan(along(_fill([m.grade for m in manoeuvres]), 0.0))
-    bank = np.deg2rad(along(_fill([m.bank for m in manoeuvres]), 0.0))
+    psi = np.deg2rad(place_along(list(turned), heading))
+    slope = np.arctan(place_along(_fill([m.grade for m in manoeuvres]), 0.0))
+    bank = np.deg2rad(place_along(_fill([m.bank for m in manoeuvres]), 0.0))
     slip = slip_per_accel * speed * np.gradient(psi, PATH_STEP)
     return Path(
         make_spline(start, PATH_STEP, np.column_stack([speed, psi, slope, bank, slip]), CUBIC), start, float(edges[-1])

@@ -92,7 +92,7 @@ def move_foot(
             accel[rows] = np.einsum("kjc,j->kc", force.reshape(-1, len(nodes), 3), weights)
     R_ln = frame.R_ln(ends.p)
 
-    def point(times: Array, lever_arm_b: Array) -> tuple[Array, Array]:
+    def compute_point(times: Array, lever_arm_b: Array) -> tuple[Array, Array]:
         """(llh, velocity in local ENU) of a point fixed to the IMU, at times within the walk, (M, 3) each."""
         felt = _move_foot(foot, R_fb, np.clip(np.asarray(times, dtype=float), t[0], t[-1]))
         arm = np.asarray(lever_arm_b, dtype=float)
@@ -100,7 +100,7 @@ def move_foot(
         return frame.to_llh(p), mv(frame.R_ln(p), felt.v + mv(felt.R_nb, np.cross(felt.omega, arm)))
 
     llh = frame.to_llh(ends.p)
-    return TrueMotion(t, llh, mv(R_ln, ends.v), R_ln @ ends.R_nb, ends.omega, gyro, accel, llh, point)
+    return TrueMotion(t, llh, mv(R_ln, ends.v), R_ln @ ends.R_nb, ends.omega, gyro, accel, llh, compute_point)
 
 
 def record_walk(

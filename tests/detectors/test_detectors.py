@@ -67,7 +67,7 @@ def test_statistics_are_the_sums_of_skog():
 def test_running_sums_keep_their_digits_over_hours():
     rng = np.random.default_rng(2)
     rows = 96.0 + 1e-3 * rng.standard_normal((2_000_000, 1))
-    means = windows.sum_running(rows).compute_means(50)
+    means = windows.sum_rows(rows).compute_means(50)
     assert np.abs(means[-1] - rows[-50:].mean()) < 1e-9
     assert len(means) == len(rows) - 49
 

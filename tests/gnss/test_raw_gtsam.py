@@ -15,7 +15,7 @@ from test_raw_rtk import STATED, WAVELENGTH, delay_of, true_values, with_carrier
 
 from graphnav.constraints.raw_gnss import BIASES, CLOCK, IONOSPHERE, GnssCode
 from graphnav.constraints.raw_phase import GnssPhase
-from graphnav.gnss.ephemeris import EARTH_RATE
+from graphnav.gnss.ephemeris import OMEGA_WGS84
 from graphnav.gnss.signals import C
 
 UNIT = gtsam.noiseModel.Unit.Create(1)
@@ -107,7 +107,7 @@ def test_differences_of_code_rows_are_gtsams_double_differences(off_the_truth):
             continue
         # the base's codes are its distances, which GTSAM turns; what they are off by is in the rover's
         p = raw.p[[a, b]]
-        turned = EARTH_RATE / C * (p[:, 0] * position[1] - p[:, 1] * position[0])
+        turned = OMEGA_WGS84 / C * (p[:, 0] * position[1] - p[:, 1] * position[0])
         away = np.linalg.norm(p - position, axis=1) + turned
         own = [measured(rows, raw, row, here) for row, here in ((i, a), (j, b))]
         factor = gtsam.DoubleDifferencePseudorangeFactorArm(

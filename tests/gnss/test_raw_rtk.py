@@ -25,7 +25,7 @@ from graphnav.estimation.pipeline import run
 from graphnav.gnss.arcs import find_arcs
 from graphnav.gnss.atmosphere import NIGHT, compute_directions, klobuchar
 from graphnav.gnss.differential import add_differences
-from graphnav.gnss.ephemeris import EARTH_RATE
+from graphnav.gnss.ephemeris import OMEGA_WGS84
 from graphnav.gnss.integers import decorrelate, find_nearest
 from graphnav.gnss.series import RawGnss
 from graphnav.gnss.sigmas import REFLECTED, compute_reflection_sigma
@@ -229,7 +229,7 @@ def test_differences_of_carrier_rows_are_gtsams_double_differences(exact):
                 here = np.flatnonzero((np.abs(raw.t - where.t[k]) < 1e-6) & (raw.satellite == rows.satellite[row]))[0]
                 p = raw.p[here]
                 # the base as our difference has it: what its carrier is off by, against its distance, which GTSAM turns
-                earth_turned = EARTH_RATE / C * (p[0] * position[1] - p[1] * position[0])
+                earth_turned = OMEGA_WGS84 / C * (p[0] * position[1] - p[1] * position[0])
                 away = np.linalg.norm(p - position) + earth_turned
                 known = WAVELENGTH * raw.carrier[here] + raw.carrier_difference[here]
                 meters.append((known + delay_of(rows, raw, here, row), away))

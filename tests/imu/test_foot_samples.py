@@ -17,7 +17,7 @@ from graphnav.core.rotation import Array
 from graphnav.detectors import detect
 from graphnav.estimation.noise.imu_floor import apply_measured_floor, bound_density
 from graphnav.imu.clipping import find_cut_peaks, restore_peaks
-from graphnav.imu.onboard_offset import compute_evidence, estimate_learnt_offset, remove_onboard_offset
+from graphnav.imu.onboard_offset import compare_offsets, estimate_learnt_offset, remove_onboard_offset
 from graphnav.imu.preintegration import preintegrate
 from graphnav.imu.samples import Samples, bridge_gaps
 from graphnav.imu.unresolved import add_coning, add_unresolved_motion
@@ -142,8 +142,8 @@ def test_whether_the_unit_corrects_its_offset_is_told_from_rests() -> None:
         for bias in (1e-3, 1e-2):
             t, rate, force = swaying(seed, bias)
             own, of_unit = Imu(t, rate, force), Imu(t, corrected(t, rate)[0], force)
-            plain.append(compute_evidence(own, estimate_learnt_offset(own)))
-            served.append(compute_evidence(of_unit, estimate_learnt_offset(of_unit)))
+            plain.append(compare_offsets(own, estimate_learnt_offset(own)))
+            served.append(compare_offsets(of_unit, estimate_learnt_offset(of_unit)))
     assert max(plain) < chance
     assert min(served[1::2]) > chance
 
@@ -156,7 +156,7 @@ def test_a_unit_that_corrects_its_offset_is_found_out(shared_data: Path, name: s
     assert get_key(said) == "imu.onboard_offset"
     offset = estimate_learnt_offset(walk.imu)
     np.testing.assert_array_equal(undone.imu.gyro, walk.imu.gyro + offset)
-    by_rate = [compute_evidence(walk.imu, share * offset) for share in (0.25, 0.5, 1.0, 2.0, 4.0)]
+    by_rate = [compare_offsets(walk.imu, share * offset) for share in (0.25, 0.5, 1.0, 2.0, 4.0)]
     assert np.argmax(by_rate) in {1, 2}
     assert remove_onboard_offset(walk, parse_settings({"imu": {"onboard_offset": False}})) == (walk, ())
     assert remove_onboard_offset(replace(walk, platform="vehicle"), Settings())[1] == ()
@@ -167,7 +167,7 @@ def test_units_that_leave_their_offset_alone_are_left_alone(shared_data: Path) -
         walk = read(path)
         assert remove_onboard_offset(walk, Settings()) == (walk, ())
     parked = read(shared_data / "tokyo_20201105" / "recording.toml").crop(0.0, 600.0)
-    assert compute_evidence(parked.imu, estimate_learnt_offset(parked.imu)) < -30.0
+    assert compare_offsets(parked.imu, estimate_learnt_offset(parked.imu)) < -30.0
 
 
 # ------------------------------------------------------------------------------------------------ what rows stand for

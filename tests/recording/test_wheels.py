@@ -17,10 +17,10 @@ from graphnav.recording.formats import read
 from graphnav.recording.odometer import (
     MeanSpeed,
     estimate_reading_sigma,
-    find_faults,
     find_gaps,
     find_pulse_length,
     find_quantum,
+    find_wrong_readings,
 )
 from graphnav.recording.odometer.faults import FROZEN, GAP, STUCK, WILD
 from graphnav.simulation import simulate
@@ -240,7 +240,7 @@ def test_few_readings_give_no_means() -> None:
     for n in (0, 1):
         o = Odometer(np.zeros(n), np.zeros(n))
         assert np.isnan(MeanSpeed.of(o)(np.zeros(3), np.ones(3))[0]).all()
-        assert len(find_faults(o).spans) == 0
+        assert len(find_wrong_readings(o).spans) == 0
 
 
 # --- what is wrong ---------------------------------------------------------------------------------------------
@@ -286,8 +286,8 @@ def test_nothing_is_wrong_with_a_sound_odometer(
     town: Callable[[int], Recording], seed: int, variant: Callable[[Odometer], Odometer]
 ) -> None:
     o = variant(odometer_of(town(seed)))
-    assert find_faults(o, town(seed).imu).reasons == ()
-    assert find_faults(o).reasons == ()
+    assert find_wrong_readings(o, town(seed).imu).reasons == ()
+    assert find_wrong_readings(o).reasons == ()
 
 
 @pytest.mark.parametrize("name", REAL)
@@ -295,7 +295,7 @@ def test_nothing_is_wrong_with_real_odometers(shared_data: Path, name: str) -> N
     recording = read(shared_data / name)
     o = odometer_of(recording)
     for variant in (o, replace(o, t=o.t + 0.65), replace(o, t=o.t[::5], speed=o.speed[::5], signed=False)):
-        assert find_faults(variant, recording.imu).reasons == ()
+        assert find_wrong_readings(variant, recording.imu).reasons == ()
 
 
 def moving_at(o: Odometer, speed: float, seconds: float, rng: np.random.Generator) -> int:
@@ -313,7 +313,7 @@ def test_stuck_at_zero_is_found_to_the_reading(town: Callable[[int], Recording],
     i = moving_at(o, 4.0, 8.0, np.random.default_rng(seed))
     j = i + 70
     stuck = replace(o, speed=np.where((np.arange(len(o.t)) >= i) & (np.arange(len(o.t)) < j), 0.0, o.speed))
-    for found in (find_faults(stuck, imu), find_faults(stuck)):
+    for found in (find_wrong_readings(stuck, imu), find_wrong_readings(stuck)):
         assert found.reasons == (STUCK,)
         assert np.allclose(found.spans, [[o.t[i], o.t[j]]], atol=0.11)
 
@@ -324,7 +324,7 @@ def test_unplugged_at_a_stop_and_back_in_motion(town: Callable[[int], Recording]
     k = next(k for k in starts if (o.speed[k + 40 : k + 60] > 4.0).all() and (o.speed[k - 20 : k] == 0.0).all())
     speed = o.speed.copy()
     speed[k - 10 : k + 50] = 0.0
-    found = find_faults(replace(o, speed=speed), imu)
+    found = find_wrong_readings(replace(o, speed=speed), imu)
     assert found.reasons == (STUCK,)
     # what it read at the stop was true; a stop is told from a slow start only when that has reached a walking speed
     assert found.spans[0, 0] > o.t[k] - 1.5
@@ -341,7 +341,7 @@ def test_a_frozen_odometer_is_found(town: Callable[[int], Recording], seed: int)
     i, j = stop - 50, stop + 30
     speed = o.speed.copy()
     speed[i:j] = o.speed[i - 1]
-    found = find_faults(replace(o, speed=speed), imu)
+    found = find_wrong_readings(replace(o, speed=speed), imu)
     assert found.reasons == (FROZEN,)
     assert np.allclose(found.spans, [[o.t[i], o.t[j]]], atol=0.25)
 
@@ -349,14 +349,14 @@ def test_a_frozen_odometer_is_found(town: Callable[[int], Recording], seed: int)
 def test_a_noisy_odometer_that_freezes_at_even_speed_is_found_by_its_silence() -> None:
     t = np.arange(0.0, 300.0, 0.05)
     speed = 20.0 + 0.05 * np.random.default_rng(2).standard_normal(len(t))
-    assert find_faults(Odometer(t, speed)).reasons == ()
+    assert find_wrong_readings(Odometer(t, speed)).reasons == ()
     speed[1000:1040] = speed[999]
-    found = find_faults(Odometer(t, speed))
+    found = find_wrong_readings(Odometer(t, speed))
     assert found.reasons == (FROZEN,)
     assert np.allclose(found.spans, [[t[1000], t[1040]]])
     # every reading logged five times over, as a fast logger does with a slow sensor
     slow = np.repeat(20.0 + 0.05 * np.random.default_rng(2).standard_normal(1200), 5)
-    assert find_faults(Odometer(t, slow)).reasons == ()
+    assert find_wrong_readings(Odometer(t, slow)).reasons == ()
 
 
 def test_spikes_and_gaps(town: Callable[[int], Recording]) -> None:
@@ -365,22 +365,22 @@ def test_spikes_and_gaps(town: Callable[[int], Recording]) -> None:
     speed = o.speed.copy()
     speed[i : i + 3] = 45.0
     kept = (np.arange(len(o.t)) < i + 20) | (np.arange(len(o.t)) > i + 50)
-    found = find_faults(_rows(replace(o, speed=speed), kept), imu)
+    found = find_wrong_readings(_rows(replace(o, speed=speed), kept), imu)
     assert found.reasons == (WILD, GAP)
     assert np.allclose(found.spans, [[o.t[i], o.t[i + 3]], [o.t[i + 20], o.t[i + 51]]], atol=0.11)
 
 
 def test_clocks_far_apart_or_wrong_axes_do_not_accuse_the_odometer(town: Callable[[int], Recording]) -> None:
     o, imu = odometer_of(town(0)), town(0).imu
-    assert find_faults(replace(o, t=o.t + 18.0), imu).reasons == ()
+    assert find_wrong_readings(replace(o, t=o.t + 18.0), imu).reasons == ()
     turned = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
-    assert find_faults(o, replace(imu, accel=imu.accel @ turned, gyro=imu.gyro @ turned)).reasons == ()
-    assert find_faults(o, replace(imu, accel=0.0 * imu.accel, gyro=0.0 * imu.gyro)).reasons == ()
+    assert find_wrong_readings(o, replace(imu, accel=imu.accel @ turned, gyro=imu.gyro @ turned)).reasons == ()
+    assert find_wrong_readings(o, replace(imu, accel=0.0 * imu.accel, gyro=0.0 * imu.gyro)).reasons == ()
 
 
 def test_an_odometer_that_never_turns_is_found(town: Callable[[int], Recording]) -> None:
     o = odometer_of(town(0))
-    found = find_faults(replace(o, speed=np.zeros(len(o.t))), town(0).imu)
+    found = find_wrong_readings(replace(o, speed=np.zeros(len(o.t))), town(0).imu)
     assert found.reasons == (STUCK,)
     assert float(np.sum(np.diff(found.spans))) > 0.8 * (o.t[-1] - o.t[0])
 
@@ -393,7 +393,7 @@ def test_real_odometers_with_made_faults(shared_data: Path) -> None:
         i, j = np.searchsorted(o.t, [at, at + seconds])
         speed = o.speed.copy()
         speed[i:j] = speed[i - 1] if value is None else value
-        found = find_faults(replace(o, speed=speed), recording.imu)
+        found = find_wrong_readings(replace(o, speed=speed), recording.imu)
         assert found.reasons == (reason,)
         assert np.allclose(found.spans, [[o.t[i], o.t[j]]], atol=0.1)
 

@@ -175,14 +175,14 @@ def solve_on_cluster(tasks: Sequence[Task], scheduler: str, limits: Limits) -> I
         waiting = iter(tasks)
         of: dict[str, Task] = {}
 
-        def next_few(count: int) -> list[Any]:
+        def take_next(count: int) -> list[Any]:
             few = list(islice(waiting, count))
             futures = client.map(solve_apart, few, limits=limits, pure=False)
             of.update((future.key, task) for future, task in zip(futures, few, strict=True))
             return list(futures)
 
         # a scheduler that is given all drives at once keeps them all in memory
-        under_way = completed(next_few(max(_SUBMITTED_AHEAD, _SUBMITTED_AHEAD * sum(client.nthreads().values()))))
+        under_way = completed(take_next(max(_SUBMITTED_AHEAD, _SUBMITTED_AHEAD * sum(client.nthreads().values()))))
         try:
             for future in under_way:
                 task = of.pop(future.key)
@@ -191,6 +191,6 @@ def solve_on_cluster(tasks: Sequence[Task], scheduler: str, limits: Limits) -> I
                 else:
                     why = future.exception() if future.status == "error" else future.status
                     yield make_lost_row(task, CRASHED, f"the cluster: {type(why).__name__}: {why}", 0.0)
-                under_way.update(next_few(1))
+                under_way.update(take_next(1))
         finally:
             client.cancel([*under_way.futures])

@@ -195,7 +195,7 @@ def _make_custom(
     ]
     keys = [key(k) for k in keyframes for key in (_X, _V, _B)] + [key for _, key in nodes]
 
-    def error(this: Any, values: gtsam.Values, H: Any) -> Array:
+    def compute_error(this: Any, values: gtsam.Values, H: Any) -> Array:
         states = States.stack([get_state(values, k) for k in keyframes])
         given = {
             name: values.atVector(key)[None, at] for g, key in nodes for name, at in g.columns.items() if name in names
@@ -208,7 +208,7 @@ def _make_custom(
                 H[k] = np.asfortranarray(block)
         return residual
 
-    return gtsam.CustomFactor(noise, keys, error)
+    return gtsam.CustomFactor(noise, keys, compute_error)
 
 
 def _split_blocks(J: Array, R_nb: Array) -> tuple[Array, Array, Array]:

@@ -17,7 +17,7 @@ from graphnav.estimation.solvers.breakdown import explain_smoother
 from graphnav.estimation.solvers.linearise import Columns, shift
 from graphnav.estimation.solvers.stages import Measured, Place
 from graphnav.estimation.solvers.stages import rotate_columns as turned_by
-from graphnav.estimation.solvers.window import find_limits
+from graphnav.estimation.solvers.window import find_parameter_limits
 
 LINK = "imu"  # among the constraints of a keyframe: the interval before it
 _WILDFIRE = np.inf  # what the newest keyframe changes of older ones is passed on when they are read
@@ -211,7 +211,7 @@ def is_constant(place: Place, name: str) -> bool:
 
 def find_node_limits(columns: Columns, place: Place) -> Array:
     """How far parameters of a node may move, empty where nothing limits any of them."""
-    found = find_limits(columns, place)
+    found = find_parameter_limits(columns, place)
     return found if np.isfinite(found).any() else np.zeros(0)
 
 

@@ -90,12 +90,12 @@ class TreeWindow(Window):
     def revise(self, count: int, renewed: Renewing, always: bool = False) -> bool:
         """As `converge`, all at once; False, as nothing is left to do."""
 
-        def at_once(first: int, end: int) -> Sequence[Place]:
+        def solve_at_once(first: int, end: int) -> Sequence[Place]:
             while (places := renewed(first, end)) is None:
                 pass
             return places
 
-        self.converge(always=always, renewed=at_once)
+        self.converge(always=always, renewed=solve_at_once)
         return False
 
     def smooth_back(self, count: int, most: int) -> bool:

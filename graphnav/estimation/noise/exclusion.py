@@ -108,7 +108,7 @@ def estimate_without_faults(
         If the filter breaks down.
     """
     found = estimate_noise(base, opening, progress=progress)
-    decision = find_faults(base, found)
+    decision = decide_faults(base, found)
     passes = found.passes + decision.passes
     if not decision.noise.excluded:
         return replace(decision.estimate or found, passes=passes)
@@ -119,7 +119,7 @@ def estimate_without_faults(
     return _readmit(base, replace(again, passes=passes + again.passes))
 
 
-def find_faults(base: Problem, found: NoiseEstimate) -> Decision:
+def decide_faults(base: Problem, found: NoiseEstimate) -> Decision:
     """Decide which spans of measurements are wrong.
 
     Parameters
@@ -127,7 +127,7 @@ def find_faults(base: Problem, found: NoiseEstimate) -> Decision:
     base : built with stated noise.
     found : estimated with all measurements.
     """
-    first = explain(base, found, find_spans(base, found.noise, found))
+    first = explain(base, found, find_suspects(base, found.noise, found))
     medians = {name: replace(figure, log_factor=figure.prior) for name, figure in found.noise.figures.items()}
     masked = _test(base, NoiseModel(medians), found)
     first = replace(first, passes=first.passes + Counter(filter=2))
@@ -156,7 +156,7 @@ def _unmask(base: Problem, found: NoiseEstimate, first: Decision, masked: list[S
     for _ in range(_REFINEMENTS):
         estimate = estimate_noise(base, None, start, estimate.get_linearisation(base), changed=True)
         errors = _predict_left_out(apply_noise(base, estimate.noise), estimate)
-        detected = find_spans(base, replace(estimate.noise, excluded={}), estimate)
+        detected = find_suspects(base, replace(estimate.noise, excluded={}), estimate)
         passes = passes + estimate.passes + Counter(filter=1)
         spans, refined = trim(spans, errors), trim(detected, errors)
         # a slow onset is dated better by the tests, an abrupt end by the errors of single fixes
@@ -212,7 +212,7 @@ def estimate_disturbed_intervals(base: Problem, found: NoiseEstimate) -> NoiseEs
     start, near, passes = found.noise, found.get_linearisation(base), found.passes
     if found.noise.excluded:
         free = estimate_noise(base, None, replace(found.noise, excluded={}), near, intervals=True)
-        decision = explain(base, free, find_spans(base, free.noise, free))
+        decision = explain(base, free, find_suspects(base, free.noise, free))
         passes = passes + free.passes + decision.passes + Counter(filter=1)
         if decision.noise.excluded:
             without = replace(free.noise, excluded=decision.noise.excluded)
@@ -233,7 +233,7 @@ def log_evidence(base: Problem, found: NoiseEstimate) -> float:
     return whole - OUTLIER_COST * sum(count_reduced(drop_within(some, spans)) for some in found.noise.weights.values())
 
 
-def find_spans(base: Problem, noise: NoiseModel, found: NoiseEstimate) -> list[Span]:
+def find_suspects(base: Problem, noise: NoiseModel, found: NoiseEstimate) -> list[Span]:
     """Spans (s) in which fixes may be wrong: those that the tests find, and those in which a receiver repeats itself.
 
     Parameters

@@ -23,7 +23,7 @@ from graphnav.config import Settings
 from graphnav.core.findings import compute_period
 from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
-from graphnav.detectors.windows import sum_running
+from graphnav.detectors.windows import sum_rows
 from graphnav.recording import ImuNoise, Recording
 
 _CLUSTER = 0.1  # s
@@ -70,5 +70,5 @@ def bound_density(t: Array, x: Array) -> float:
     mean = x[:n].reshape(count, size, 3).mean(axis=1)
     bend = np.sum((mean[2:] - 2.0 * mean[1:-1] + mean[:-2]) ** 2, axis=1) / (3.0 * 6.0) * (size * period)
     degrees = 3.0 * (stretch - 2) * _INDEPENDENT
-    quietest = float(sum_running(bend[:, None]).compute_means(stretch - 2).min())
+    quietest = float(sum_rows(bend[:, None]).compute_means(stretch - 2).min())
     return float(np.sqrt(quietest * degrees / (2.0 * gammaincinv(0.5 * degrees, _CHANCE))))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,7 +21,6 @@ from graphnav.estimation.solvers.stack import Innovations
 from graphnav.imu.dynamics import convert_to_biases
 
 _TURN = 0.02  # rad; what is linear in an error of attitude is wrong by half its square
-Progress = Callable[[str, float], None]
 
 
 @dataclass(frozen=True)

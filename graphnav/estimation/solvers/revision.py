@@ -112,11 +112,11 @@ def linearise_runs(
     states, values : of the keyframe before them, and of them: n + 1.
     """
 
-    def alike(last: int, k: int) -> bool:
+    def are_alike(last: int, k: int) -> bool:
         same = places[k].linked == places[last].linked and columns[k] == columns[last]
         return same and follows(places[k], places[last])
 
-    for run in group_runs(range(len(places)), alike):
+    for run in group_runs(range(len(places)), are_alike):
         linked, end = places[run[0]].linked, run[-1] + 1
         points = slice(run[0] if linked else run[0] + 1, end + 1)
         linears = linearise_keyframes(places[run[0] : end], states[points], values[points], columns[run[0]], linked)

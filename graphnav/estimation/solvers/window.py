@@ -152,7 +152,7 @@ class Window:
         self._means = None
         columns = stage.message.columns
         if columns != self._limit[0]:
-            self._limit = columns, find_limits(columns, stage.place)
+            self._limit = columns, find_parameter_limits(columns, stage.place)
 
     def watch(self, tests: Watch) -> None:
         """Have the fixes from the next keyframe on tested."""
@@ -334,7 +334,7 @@ def make_first_message(state: States, sigma: Array, turns: bool = False) -> Mess
     return Message.of(state, np.zeros(0), {}, np.diag(1.0 / sigma), np.zeros(DIM), turns=turns)
 
 
-def find_limits(columns: Columns, place: Place) -> Array:
+def find_parameter_limits(columns: Columns, place: Place) -> Array:
     """(D-15,) how far each parameter may move before rows are linearised anew; infinite where nothing limits it."""
     assert place.problem is not None
     parameters, limit = place.problem.parameters, np.full(count_columns(columns) - DIM, np.inf)

@@ -25,7 +25,7 @@ _MIN_SPEED = 5.0  # m/s, above which wheel speeds are compared
 _SELDOM = 10.0  # s between fixes; no receiver on a drive is set to a longer period
 
 
-def measure_overlap(recording: Recording) -> float:
+def measure_common_time(recording: Recording) -> float:
     """How long fixes and IMU overlap, s; below zero if they do not, or only by stamps in another unit."""
     assert recording.gnss is not None
     t = recording.gnss.t
@@ -205,7 +205,7 @@ def check_odometer_readings(recording: Recording, facts: dict[str, Any]) -> Iter
         yield Finding("note", f"the odometer reads in steps of {step:.3g} m/s", "odometer.steps")
     if not odometer.signed:
         yield Finding("note", "the odometer never reads below zero: taken as unsigned", "odometer.unsigned")
-    found = wheels.find_faults(odometer, recording.imu)
+    found = wheels.find_wrong_readings(odometer, recording.imu)
     for reason in dict.fromkeys(found.reasons):
         spans = found.spans[[r == reason for r in found.reasons]]
         longest = spans[np.argmax(spans[:, 1] - spans[:, 0])]

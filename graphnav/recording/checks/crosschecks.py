@@ -82,7 +82,7 @@ def _make_sampler(t: Array, rate: Array) -> Callable[[Array, Array], Array]:
     integral = cache(lambda twice: _integrate(t, rate, twice))
     period = (t[-1] - t[0]) / (len(t) - 1)
 
-    def columns(at: Array, values: Array) -> Array:
+    def take_columns(at: Array, values: Array) -> Array:
         # rows are evenly spaced except after gaps
         k = np.clip(np.ceil((at - t[0]) / period).astype(int), 1, len(t) - 1)
         off = (t[k - 1] > at) | (t[k] < at)
@@ -91,13 +91,13 @@ def _make_sampler(t: Array, rate: Array) -> Callable[[Array, Array], Array]:
         s = np.clip((at - t[k - 1]) / (t[k] - t[k - 1]), 0.0, 1.0)[:, None]
         return np.asarray((1.0 - s) * values.take(k - 1, axis=0) + s * values.take(k, axis=0))
 
-    def mean(at: Array, width: Array) -> Array:
+    def take_means(at: Array, width: Array) -> Array:
         if not width.any():
-            return columns(at, integral(False))
+            return take_columns(at, integral(False))
         second = integral(True)
-        return (columns(at + width / 2, second) - columns(at - width / 2, second)) / width[:, None]
+        return (take_columns(at + width / 2, second) - take_columns(at - width / 2, second)) / width[:, None]
 
-    return mean
+    return take_means
 
 
 def _pair_times(track: Track) -> tuple[Index, Index]:
@@ -156,42 +156,42 @@ def _search(t: Array, y: Array, x_at: lags_of_clocks.Regressors, span: Array, va
     """The time shift at which x explains y best; `x_at(rows, lags)`, and `valid(lag)` a mask of the rows."""
     every = np.arange(len(y))
 
-    def correlations(rows: Index, lags: Array) -> Array:
+    def correlate_all(rows: Index, lags: Array) -> Array:
         found = []
         for r, of in lags_of_clocks.share_rows(lags, rows, valid):
             few = len(r) < MIN_PAIRS
             found.append(np.zeros(len(of)) if few else _correlate_each(x_at(r, of), y[r]))
         return np.concatenate(found)
 
-    def correlation(lag: float, rows: Index) -> float:
-        return float(correlations(rows, np.array([lag]))[0])
+    def correlate(lag: float, rows: Index) -> float:
+        return float(correlate_all(rows, np.array([lag]))[0])
 
     few = every[:: max(1, len(y) // 800)]
     many = every[:: max(1, len(y) // 4000)]
     # changes over a second are correlated for about as long: every fourth shift shows where the best fit may be
     lags = np.arange(-_NEAR_CLOCKS, _NEAR_CLOCKS + 0.01, 0.1)
-    rough = np.argsort(correlations(few, lags[::4]))[-3:] * 4
+    rough = np.argsort(correlate_all(few, lags[::4]))[-3:] * 4
     close = np.unique(np.clip(rough[:, None] + np.arange(-4, 5), 0, len(lags) - 1))
     c = np.full(len(lags), -np.inf)
-    c[close] = correlations(few, lags[close])
+    c[close] = correlate_all(few, lags[close])
     near = _find_peak(lags, c)
-    coarse, reached = near, correlation(near, few)
+    coarse, reached = near, correlate(near, few)
     # larger shifts only if no small one explains y, and only for a clearly better fit, for there are many of them
     reach = min(LARGEST_SHIFT, 0.3 * (span[-1] - span[0]))
     if reached < 0.6 and reach > _NEAR_CLOCKS:
         wide = np.arange(-reach, reach + 0.1, 0.2)
-        far = _find_peak(wide, correlations(few, wide))
-        if abs(far) > _NEAR_CLOCKS and correlation(far, few) > reached + 0.15:
+        far = _find_peak(wide, correlate_all(few, wide))
+        if abs(far) > _NEAR_CLOCKS and correlate(far, few) > reached + 0.15:
             coarse = far
     lag, spread = lags_of_clocks.refine_lag(t, y, x_at, valid, many, coarse, MIN_PAIRS)
 
-    def regression(lag: float) -> tuple[float, Array]:
+    def regress(lag: float) -> tuple[float, Array]:
         rows = every[valid(lag)]
         return regress_inliers(x_at(rows, lag), y[rows]) if len(rows) >= MIN_PAIRS else (0.0, np.zeros(1))
 
-    r, b = regression(lag)
+    r, b = regress(lag)
     if abs(lag) < 2.0 * spread:  # the data leave it open
-        unshifted, of_it = regression(0.0)
+        unshifted, of_it = regress(0.0)
         if unshifted > r:
             lag, r, b = 0.0, unshifted, of_it
     seconds = len(np.unique(np.floor(t[valid(lag)])))
@@ -208,7 +208,7 @@ def _fit_imu(imu: Imu, rate: Array, track: Track, i: Index, j: Index, y: Array) 
     mean = _make_sampler(imu.t, rate)
     ti, tj, wi, wj = track.t[i], track.t[j], track.width[i], track.width[j]
 
-    def x_at(rows: Index, lag: Lags) -> Array:
+    def sample_x(rows: Index, lag: Lags) -> Array:
         used = np.zeros(len(track.t), dtype=bool)  # most ends of one pair begin another
         used[i[rows]] = used[j[rows]] = True
         place = np.cumsum(used) - 1
@@ -216,10 +216,10 @@ def _fit_imu(imu: Imu, rate: Array, track: Track, i: Index, j: Index, y: Array) 
         values = mean(at.ravel(), np.broadcast_to(track.width[used], at.shape).ravel()).reshape(*at.shape, -1)
         return np.asarray(values.take(place[j[rows]], axis=-2) - values.take(place[i[rows]], axis=-2))
 
-    def valid(lag: float) -> Array:
+    def mask_valid(lag: float) -> Array:
         return (ti + lag - wi / 2 > imu.t[0]) & (tj + lag + wj / 2 < imu.t[-1])
 
-    return _search(0.5 * (ti + tj), y, x_at, track.t, valid)
+    return _search(0.5 * (ti + tj), y, sample_x, track.t, mask_valid)
 
 
 def find_up(imu: Imu) -> Array:
@@ -281,19 +281,19 @@ def fit_velocity(track: Track, places: Track) -> Fit | None:
     t, travelled = track.t, np.zeros((len(track.t), 2))
     travelled[1:] = np.cumsum(0.5 * (track.v[1:, :2] + track.v[:-1, :2]) * np.diff(t)[:, None], axis=0)
 
-    def speed(of: Index, lag: Lags) -> Array:
+    def interpolate_speed(of: Index, lag: Lags) -> Array:
         a, b = (np.add.outer(lag, places.t[of] + side * places.width[of] / 2) for side in (-1.0, 1.0))
         gone = [np.interp(b, t, axis) - np.interp(a, t, axis) for axis in travelled.T]
         return np.asarray(np.hypot(*gone) / places.width[of])
 
-    def x_at(rows: Index, lag: Lags) -> Array:
-        return (speed(j[rows], lag) - speed(i[rows], lag))[..., None]
+    def sample_x(rows: Index, lag: Lags) -> Array:
+        return (interpolate_speed(j[rows], lag) - interpolate_speed(i[rows], lag))[..., None]
 
-    def valid(lag: float) -> Array:
+    def mask_valid(lag: float) -> Array:
         first, last = places.t[i] - places.width[i] / 2 + lag, places.t[j] + places.width[j] / 2 + lag
         return np.asarray((first > t[0]) & (last < t[-1]))
 
-    return _search(0.5 * (places.t[i] + places.t[j]), y, x_at, places.t, valid)
+    return _search(0.5 * (places.t[i] + places.t[j]), y, sample_x, places.t, mask_valid)
 
 
 def fit_odometer(odometer: Odometer, track: Track) -> tuple[Fit, float] | None:
@@ -304,28 +304,28 @@ def fit_odometer(odometer: Odometer, track: Track) -> tuple[Fit, float] | None:
     distance = np.r_[0.0, np.cumsum(0.5 * (odometer.speed[1:] + odometer.speed[:-1]) * np.diff(t))]
     width = np.maximum(track.width, 4.0 * float(np.median(np.diff(t))))
 
-    def x_at(rows: Index, lag: Lags) -> Array:
+    def sample_x(rows: Index, lag: Lags) -> Array:
         at, w = np.add.outer(lag, track.t[rows]), width[rows]
         return np.asarray((np.interp(at + w / 2, t, distance) - np.interp(at - w / 2, t, distance)) / w)[..., None]
 
-    def valid(lag: float) -> Array:
+    def mask_valid(lag: float) -> Array:
         inside = (track.t + lag - width / 2 > t[0]) & (track.t + lag + width / 2 < t[-1])
         return inside & usable
 
     usable = np.ones(len(track.t), dtype=bool)
     every = np.arange(len(track.t))
-    inside = valid(0.0)
+    inside = mask_valid(0.0)
     if inside.sum() < MIN_PAIRS:
         return None
     # spikes of fixes would bias the fit: leave out what lies far from a first line
-    x = x_at(every, 0.0)[:, 0]
+    x = sample_x(every, 0.0)[:, 0]
     slope = _regress(x[inside, None], track.speed[inside])[1][0]
     off = track.speed - slope * x
     off = np.abs(off - np.median(off[inside]))
     usable = off < 6.0 * np.median(off[inside]) + 0.5
-    fit = _search(track.t, track.speed, x_at, track.t, valid)
-    rows = every[valid(fit.lag)]
-    x = x_at(rows, fit.lag)[:, 0]
+    fit = _search(track.t, track.speed, sample_x, track.t, mask_valid)
+    rows = every[mask_valid(fit.lag)]
+    x = sample_x(rows, fit.lag)[:, 0]
     moving = (np.abs(x) > 0.3 * np.abs(x).max()) & (track.speed[rows] > MIN_SPEED)
     if moving.sum() < MIN_PAIRS:
         return None

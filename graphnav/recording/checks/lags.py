@@ -61,7 +61,7 @@ def refine_lag(
     fewest : rows that make a regression.
     """
 
-    def at_each(lags: Array, some: Index) -> list[_At | None]:
+    def interpolate_each(lags: Array, some: Index) -> list[_At | None]:
         every: list[_At | None] = []
         for kept, of in share_rows(lags, some, valid):
             if len(kept) < fewest:
@@ -76,27 +76,27 @@ def refine_lag(
             every += [_At(kept, x[k], left, b[k], e[k]) for k in range(L)]
         return every
 
-    def at(lag: float, some: Index) -> _At | None:
-        return at_each(np.array([lag]), some)[0]
+    def interpolate_at(lag: float, some: Index) -> _At | None:
+        return interpolate_each(np.array([lag]), some)[0]
 
     for _ in range(2):  # spikes of fixes hide a good fit
-        found = at(guess, rows)
+        found = interpolate_at(guess, rows)
         if found is None:
             return guess, LAG_REACH
         off = np.abs(found.e - np.median(found.e))
         rows = found.rows[off <= _OUTLYING * np.median(off) / 0.6745]
 
-    def profile(lags: Array) -> Array:
-        return np.array([np.nan if one is None else one.unexplained for one in at_each(lags, rows)])
+    def compute_profile(lags: Array) -> Array:
+        return np.array([np.nan if one is None else one.unexplained for one in interpolate_each(lags, rows)])
 
     wide = guess + np.arange(-LAG_REACH, LAG_REACH + _COARSE / 2, _COARSE)
-    seen = profile(wide)
+    seen = compute_profile(wide)
     if not np.isfinite(seen).any():
         return guess, LAG_REACH
     near = wide[int(np.nanargmin(seen))] + np.arange(-_COARSE, _COARSE + _FINE / 2, _FINE)
-    close = profile(near)
+    close = compute_profile(near)
     lag = _find_lowest(near, close)
-    best = at(lag, rows)
+    best = interpolate_at(lag, rows)
     scores = None if best is None else _score_lags(t, x_at, valid, best, lag)
     if best is None or scores is None:
         return lag, LAG_REACH
@@ -104,7 +104,7 @@ def refine_lag(
     spread = np.sqrt(variance) / information  # by the curvature
     worth = len(best.e) * min(1.0, float(np.mean(best.e**2)) * information / variance)  # independent rows
     peak = lag + np.arange(-10, 11) * _FINEST
-    lags, depth = np.concatenate([wide, near, peak]), np.concatenate([seen, close, profile(peak)])
+    lags, depth = np.concatenate([wide, near, peak]), np.concatenate([seen, close, compute_profile(peak)])
     lags, order = np.unique(lags, return_index=True)
     depth = depth[order]
     lags, depth = lags[np.isfinite(depth)], depth[np.isfinite(depth)]

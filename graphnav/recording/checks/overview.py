@@ -20,7 +20,7 @@ from graphnav.recording.checks.aiding import (
     check_gnss_coverage,
     check_gnss_jumps,
     check_odometer,
-    measure_overlap,
+    measure_common_time,
 )
 from graphnav.recording.checks.axes import (
     check_gyro_sign,
@@ -142,7 +142,7 @@ def inspect(recording: Recording) -> Inspection:
     known = {f.key for f in whole.findings}
     facts: dict[str, dict[str, Any]] = {"imu": _describe_imu(recording)}
     vehicle = recording.platform == "vehicle"
-    overlap = recording.gnss is not None and measure_overlap(recording) > 0
+    overlap = recording.gnss is not None and measure_common_time(recording) > 0
     track = tracks.compute_track(recording.gnss) if recording.gnss is not None else None
     rest = _find_rest(recording, track if overlap else None)
     findings += check_imu_time(stamps)  # those of rows left out are said already
@@ -264,11 +264,11 @@ def _find_rest(recording: Recording, track: Track | None) -> Array:
     if blocks < 3:
         return mask
 
-    def scatter(x: Array) -> Array:
+    def measure_scatter(x: Array) -> Array:
         axes = np.ascontiguousarray(x[: blocks * n].T).reshape(3, blocks, n)
         return np.linalg.norm(axes.std(axis=-1), axis=0)
 
-    force, rate = scatter(imu.accel), scatter(imu.gyro)
+    force, rate = measure_scatter(imu.accel), measure_scatter(imu.gyro)
     quiet = (force < 4.0 * np.percentile(force, 2) + 0.02) & (rate < 4.0 * np.percentile(rate, 2) + 0.002)
     middle = imu.t[: blocks * n].reshape(blocks, n).mean(axis=1)
     if recording.odometer is not None:

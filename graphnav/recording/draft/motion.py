@@ -202,12 +202,12 @@ def _list_all_lags(a: Array, b: Array, w: Array) -> tuple[Array, Array, Array]:
     a, b = np.nan_to_num(a), np.nan_to_num(b)
     n = 1 << int(np.ceil(np.log2(len(a) + len(b))))
 
-    def cross(x: Array, y: Array) -> Array:
+    def correlate(x: Array, y: Array) -> Array:
         c = np.fft.irfft(np.conj(np.fft.rfft(x, n)) * np.fft.rfft(y, n), n)
         return np.concatenate([c[-(len(a) - 1) :], c[: len(b)]])
 
     shifts = np.arange(-(len(a) - 1), len(b))
-    xy, xx, yy, seen = cross(a, b * wb), cross(a * a, wb), cross(wa, b * b * wb), cross(wa, wb)
+    xy, xx, yy, seen = correlate(a, b * wb), correlate(a * a, wb), correlate(wa, b * b * wb), correlate(wa, wb)
     good = (seen > 0.5 * min(wb.sum(), wb.max() * wa.sum())) & (xx > 1e-12) & (yy > 1e-12)
     with np.errstate(divide="ignore", invalid="ignore"):
         return shifts, np.where(good, xy / np.sqrt(np.abs(xx * yy)), np.nan), np.where(good, xy / yy, np.nan)

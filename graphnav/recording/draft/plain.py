@@ -15,6 +15,7 @@ from graphnav.core.errors import RecordingError
 from graphnav.core.files import open_file, parse_number, read_bytes
 from graphnav.core.rotation import Array
 from graphnav.recording.draft.columns import NAMED_UNITS, match_columns, split_unit
+from graphnav.recording.formats.text import NumberedLines
 
 DAY = 86400.0  # s
 _START = 1 << 16  # bytes that contain the header
@@ -24,8 +25,6 @@ _DAY_FIRST = re.compile(r"(\d{1,2})\.(\d{1,2})\.(\d{4})(.*)")  # 08.07.2025
 _YEAR_FIRST = re.compile(r"(\d{4})[-/.](\d{1,2})[-/.](\d{1,2})(.*)")  # 2025-07-08
 _SLASHES = re.compile(r"(\d{1,2})/(\d{1,2})/(\d{4})(.*)")  # 07/08/2025, where one number may identify the month
 _TIME_OF_DAY = re.compile(r"(\d{1,2}):(\d{2}):(\d{2})(?:[.,:](\d{1,9}))?\s*([AaPp][Mm])?")
-
-NumberedLines = list[tuple[int, str]]  # line number in the file, from 1, and text
 
 
 @dataclass(frozen=True)

@@ -91,7 +91,7 @@ def _list_kinds(form: str) -> tuple[int | None, ...]:
     write.
     """
 
-    def kind(one: re.Match[str]) -> int | None:
+    def choose_kind(one: re.Match[str]) -> int | None:
         if one[2] is None:
             return WORD if one[0] == "%s" else 0
         places = int(one[1])
@@ -99,4 +99,4 @@ def _list_kinds(form: str) -> tuple[int | None, ...]:
             return GENERAL if places == 6 else None
         return places if places <= _MOST_PLACES else None
 
-    return tuple(kind(one) for one in _FIELD.finditer(form))
+    return tuple(choose_kind(one) for one in _FIELD.finditer(form))

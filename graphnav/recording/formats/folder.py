@@ -64,7 +64,7 @@ def read_folder(source: str | Path) -> Recording:
             topics[section.file] = (*topics.get(section.file, ()), *section.topic)
             settled |= {f"{name}.{figure}" for figure, keys in _SETTLED.items() if keys & section.model_fields_set}
 
-    def table(name: str) -> Table:
+    def parse_table(name: str) -> Table:
         section = getattr(d, name)
         file = resolve_beside(path, section.file, f"{name}.file")
         files.append(file)
@@ -81,7 +81,7 @@ def read_folder(source: str | Path) -> Recording:
             required = (*required, *list_needed(known[name], rows))
         return select_usable_rows(rows, name, required, keep, section.units.t, section.time_offset, remarks)
 
-    def sensor(name: str, of_table: Callable[[Any, Table, Remarks], Any], of_log: Callable[[Any, Any], Any]) -> Any:
+    def read_one(name: str, of_table: Callable[[Any, Table, Remarks], Any], of_log: Callable[[Any, Any], Any]) -> Any:
         """The sensor of a table of the .toml: from its CSV file, or from the log of another program."""
         section = getattr(d, name)
         if section is None:
@@ -96,7 +96,7 @@ def read_folder(source: str | Path) -> Recording:
                 f"{path}: '{name}.topic' is only for ROS bags, and {section.file} is none", key="key.not_here"
             )
         if log is None:
-            return of_table(section, table(name), remarks)
+            return of_table(section, parse_table(name), remarks)
         files.extend(file for file in log.files if file not in files)
         held = log.sensors.get(name) if name in known else getattr(log, name)
         if held is None:
@@ -111,11 +111,11 @@ def read_folder(source: str | Path) -> Recording:
             zeros.append(log.gps_zero - section.time_offset)
         return of_log(section, held)
 
-    imu = sensor("imu", build_imu, _complete_imu)
-    gnss = sensor("gnss", build_gnss, _complete_gnss)
-    odometer = sensor("odometer", build_odometer, _complete_odometer)
+    imu = read_one("imu", build_imu, _complete_imu)
+    gnss = read_one("gnss", build_gnss, _complete_gnss)
+    odometer = read_one("odometer", build_odometer, _complete_odometer)
     sensors = {
-        name: sensor(name, partial(build_series, one), lambda _, held: held)
+        name: read_one(name, partial(build_series, one), lambda _, held: held)
         for name, one in known.items()
         if getattr(d, name) is not None
     }
@@ -135,7 +135,7 @@ def read_folder(source: str | Path) -> Recording:
         files.append(resolve_beside(path, d.truth.file, "truth.file"))
         truth = _read_truth(d.truth, files[-1], remarks)
     elif d.truth:
-        truth = build_truth(d.truth, table("truth"), remarks)
+        truth = build_truth(d.truth, parse_table("truth"), remarks)
     name = d.name or (path.resolve().parent.name if path.name == "recording.toml" else path.stem)
     return Recording(
         name,

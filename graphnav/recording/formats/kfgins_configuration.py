@@ -115,7 +115,7 @@ def read_imu_noise(where: Path, config: dict[str, Any], remarks: Remarks) -> Imu
     if not isinstance(section, dict):
         raise RecordingError(f"{where}: no table imunoise (KF-GINS) or imumodel (OB_GINS)", key="yaml.table")
 
-    def figure(key: str, table: dict[str, Any] = section) -> float:
+    def read_figure(key: str, table: dict[str, Any] = section) -> float:
         value = table.get(key)
         stated: list[Any] = value if isinstance(value, list) else [value]
         numbers = [float(x) for x in stated if _is_number(x) and _LEAST <= x <= _MOST]
@@ -129,9 +129,9 @@ def read_imu_noise(where: Path, config: dict[str, Any], remarks: Remarks) -> Imu
             remarks.add("imu.noise_axes", f"{key} differs between the axes; the root mean square is used for all")
         return float(np.sqrt(np.mean(np.square(numbers))))
 
-    root = np.sqrt(2.0 / (figure("corrtime") * 3600.0))
-    gyro, accel = figure("gbstd") * DEG_PER_H, figure("abstd") * MGAL
-    scales = {ours: figure(theirs) * 1e-6 for ours, theirs in
+    root = np.sqrt(2.0 / (read_figure("corrtime") * 3600.0))
+    gyro, accel = read_figure("gbstd") * DEG_PER_H, read_figure("abstd") * MGAL
+    scales = {ours: read_figure(theirs) * 1e-6 for ours, theirs in
               (("gyro_scale_sigma", "gsstd"), ("accel_scale_sigma", "asstd")) if theirs in section}  # fmt: skip
     remarks.add(
         "imu.noise_read_as",
@@ -139,12 +139,12 @@ def read_imu_noise(where: Path, config: dict[str, Any], remarks: Remarks) -> Imu
         "walk of s sqrt(2/T) that starts from s",
     )
     return ImuNoise(
-        gyro_noise_density=figure("arw") * DEG_PER_SQRT_H,
-        accel_noise_density=figure("vrw") / 60.0,
+        gyro_noise_density=read_figure("arw") * DEG_PER_SQRT_H,
+        accel_noise_density=read_figure("vrw") / 60.0,
         gyro_bias_walk=float(gyro * root),
         accel_bias_walk=float(accel * root),
-        gyro_bias_sigma=figure("initbgstd", config) * DEG_PER_H if config.get("initbgstd") else gyro,
-        accel_bias_sigma=figure("initbastd", config) * MGAL if config.get("initbastd") else accel,
+        gyro_bias_sigma=read_figure("initbgstd", config) * DEG_PER_H if config.get("initbgstd") else gyro,
+        accel_bias_sigma=read_figure("initbastd", config) * MGAL if config.get("initbastd") else accel,
         **scales,
     )
 

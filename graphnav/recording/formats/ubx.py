@@ -211,7 +211,7 @@ def _read_sensors(path: Path, content: _Content, remarks: Remarks) -> tuple[Imu 
         return None, None
     tick, offset = _fit_clock(content, remarks)
 
-    def times(tags: Array) -> Array:
+    def unwrap_times(tags: Array) -> Array:
         return tags * tick + offset
 
     imu = None
@@ -219,7 +219,7 @@ def _read_sensors(path: Path, content: _Content, remarks: Remarks) -> tuple[Imu 
         base = np.unique(series[_GYRO[0]][0])
         columns = [np.interp(base, *_drop_repeated(series[k])) for k in (*_GYRO, *_ACCEL)]
         table = np.column_stack(columns)
-        imu = Imu(times(base), table[:, :3], table[:, 3:], noise_assumed=True)
+        imu = Imu(unwrap_times(base), table[:, :3], table[:, 3:], noise_assumed=True)
         remarks.add("imu.read_as", "IMU: ESF rates and forces in the receiver's own axes; no noise figures in the log")
         remarks.add("imu.axes_assumed", "IMU: the receiver's axes taken as right-forward-up")
     elif there:
@@ -230,7 +230,7 @@ def _read_sensors(path: Path, content: _Content, remarks: Remarks) -> tuple[Imu 
     odometer = None
     if _SPEED in series:
         tags, speed = _drop_repeated(series[_SPEED])
-        odometer = Odometer(times(tags), speed)
+        odometer = Odometer(unwrap_times(tags), speed)
         remarks.add("odometer.read_as", "odometer: ESF speed")
         remarks.add("odometer.lever_arm_unknown", "odometer: its lever arm is not in the log and taken as zero")
     return imu, odometer

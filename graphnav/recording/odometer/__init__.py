@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from graphnav.recording.odometer.faults import Faults, find_faults
+from graphnav.recording.odometer.faults import Faults, find_wrong_readings
 from graphnav.recording.odometer.mean import (
     MeanSpeed,
     ReadingStatistics,
@@ -18,9 +18,9 @@ __all__ = [
     "MeanSpeed",
     "ReadingStatistics",
     "estimate_reading_sigma",
-    "find_faults",
     "find_gaps",
     "find_longest_step",
     "find_pulse_length",
     "find_quantum",
+    "find_wrong_readings",
 ]

@@ -55,7 +55,7 @@ class Faults:
     lag: float | None = None  # s, delay of the odometer as far as the IMU shows it
 
 
-def find_faults(
+def find_wrong_readings(
     odometer: Odometer, imu: Imu | None = None, figures: ReadingStatistics | None = None, lag: float | None = None
 ) -> Faults:
     """Spans of missing or wrong readings, by the method above, in the odometer's own time.
@@ -104,21 +104,21 @@ def _compute_motion(odometer: Odometer, imu: Imu, known: float | None) -> _Inert
         return None
     change = np.interp(seconds + 1.0, t, speed) - np.interp(seconds, t, speed)
 
-    def missing(lag: float) -> tuple[Array, Array]:
+    def count_missing(lag: float) -> tuple[Array, Array]:
         gain = np.interp(seconds + 1.0 - lag, imu.t, gained) - np.interp(seconds - lag, imu.t, gained)
         off = change - gain
         return off, run_median(off, min(31, len(off) // 2 * 2 - 1))
 
-    def size(off: Array) -> float:
+    def measure_size(off: Array) -> float:
         return float(np.mean(np.minimum(np.abs(off), 1.0)))  # outliers count no more than 1 m/s
 
     lags = np.arange(-_LARGEST_DELAY / 3.0, _LARGEST_DELAY + 0.01, 0.05) if known is None else np.array([known])
-    misfits = [size(np.subtract(*missing(lag))) for lag in lags]
+    misfits = [measure_size(np.subtract(*count_missing(lag))) for lag in lags]
     lag, left = float(lags[int(np.argmin(misfits))]), min(misfits)
     # unrelated clocks or wrong axes: the force does not explain the changes of speed
-    if left > max(0.5 * size(change), _UNCHANGING) and size(change) > _UNCHANGING:
+    if left > max(0.5 * measure_size(change), _UNCHANGING) and measure_size(change) > _UNCHANGING:
         return None
-    slow = missing(lag)[1]
+    slow = count_missing(lag)[1]
     # the sum of c, at the middles of the seconds; extrapolated beyond them
     at = t - lag
     ends = np.r_[min(at[0], seconds[0]) - 1.0 - lag, seconds + 0.5 - lag, max(at[-1], seconds[-1]) + 2.0]

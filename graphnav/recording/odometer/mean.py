@@ -81,7 +81,7 @@ def find_pulse_length(odometer: Odometer, step: float | None = None) -> float:
         return odometer.pulse
     even = np.r_[True, np.diff(t) < 1.5 * compute_period(t)] & (speed != 0.0)
 
-    def scatter(n: int) -> float:
+    def measure_scatter(n: int) -> float:
         rows = len(t) // n * n
         whole = np.lib.stride_tricks.sliding_window_view(even[:rows].reshape(-1, n).all(axis=1), 4).all(axis=1)
         third = np.abs(np.diff(speed[:rows].reshape(-1, n).mean(axis=1), 3))[whole]
@@ -89,11 +89,11 @@ def find_pulse_length(odometer: Odometer, step: float | None = None) -> float:
 
     if len(t) < 800:
         return 0.0
-    one = scatter(1)
+    one = measure_scatter(1)
     # counts alternate by their step from row to row; those over many periods hardly change
     if not step < one < np.inf:
         return 0.0
-    telescopes = any(scatter(n) < one * n**-0.75 for n in (2, 4))  # half-way between
+    telescopes = any(measure_scatter(n) < one * n**-0.75 for n in (2, 4))  # half-way between
     return step * compute_period(t) if telescopes else 0.0
 
 

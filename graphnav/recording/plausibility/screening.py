@@ -20,7 +20,7 @@ from graphnav.core.notes import Note, format_count
 from graphnav.core.rotation import Array
 from graphnav.recording import Imu, Recording, take_rows
 from graphnav.recording.checks import crosschecks, tracks
-from graphnav.recording.checks.aiding import check_imu_clock, measure_overlap
+from graphnav.recording.checks.aiding import check_imu_clock, measure_common_time
 from graphnav.recording.checks.axes import check_forward_sign
 from graphnav.recording.checks.clock import FAIR, ClockOffsets, measure_clock_offsets
 from graphnav.recording.checks.series import screen_series
@@ -167,7 +167,7 @@ def _drop_impossible(recording: Recording) -> tuple[Recording, list[Finding], li
         of_aiding += more
         assert recording.gnss is not None
         track = tracks.compute_track(recording.gnss)
-        if track is not None and measure_overlap(recording) <= 0:
+        if track is not None and measure_common_time(recording) <= 0:
             track = None
     if recording.odometer is not None and len(recording.odometer.t):
         recording, more = plausibility_odometer.screen_odometer(recording, track)
@@ -216,7 +216,7 @@ def _lacks_gravity(recording: Recording, f: float, steady: float) -> bool:
         return False
     if steady < _STEADY and recording.platform == "vehicle":
         return True
-    if gnss is None or measure_overlap(recording) <= 0:
+    if gnss is None or measure_common_time(recording) <= 0:
         return False
     track = tracks.compute_track(gnss) if (np.abs(imu.accel) < ACCEL_RANGE).all() else None
     fit = None if track is None else crosschecks.fit_force(imu, track)

@@ -10,7 +10,7 @@ import numpy as np
 from graphnav.core.rotation import Array
 from graphnav.core.sample_size import chi_square_quantile
 from graphnav.estimation.solution import ConstraintRecord
-from graphnav.report.plots.figure import Figure, Panel, find_limits
+from graphnav.report.plots.figure import Figure, Panel, find_axis_limits
 from graphnav.report.plots.series import Curve, Shades
 
 _CHI2 = "99 % of chi-square"
@@ -81,7 +81,7 @@ def plot_nees(
     ylims = []
     for k, (low, high) in enumerate(edges):
         values = [np.log10(np.maximum(v[:, k], 0.3 * low)) for v in scaled.values()]
-        ylims.append(find_limits([*values, np.log10([low, high])], always=[*values, np.log10([low, high])]))
+        ylims.append(find_axis_limits([*values, np.log10([low, high])], always=[*values, np.log10([low, high])]))
     titles = [f"{name} NEES / {dof}" for name, dof in zip(names, dofs, strict=True)]
     figure = Figure(titles, (0.0, end), ylims, log=True)
     for k, panel in enumerate(figure.panels):

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from graphnav.core.rotation import Array
 from graphnav.detectors.base import Detection
 from graphnav.recording import Imu, Recording
-from graphnav.report.plots.figure import Figure, Panel, find_limits
+from graphnav.report.plots.figure import Figure, Panel, find_axis_limits
 from graphnav.report.plots.thinning import BINS, thin
 
 _DECADES = 2.5  # decades of amplitude in the spectrogram
@@ -44,11 +44,11 @@ def plot_detections(recording: Recording, found: Sequence[Detection]) -> Figure:
     force, rate = _compute_norms(imu.accel[shown]), np.degrees(_compute_norms(imu.gyro[shown]))
     speeds = _collect_speeds(recording)
     rows: list[tuple[str, str, tuple[float, float], bool]] = [
-        ("size of the specific force [m/s²]", "m/s²", find_limits([force]), False),
-        ("size of the angular rate [deg/s]", "deg/s", find_limits([rate]), False),
+        ("size of the specific force [m/s²]", "m/s²", find_axis_limits([force]), False),
+        ("size of the angular rate [deg/s]", "deg/s", find_axis_limits([rate]), False),
     ]
     if speeds:
-        rows.append(("speed [m/s]", "m/s", find_limits([y for _, _, y, _ in speeds]), False))
+        rows.append(("speed [m/s]", "m/s", find_axis_limits([y for _, _, y, _ in speeds]), False))
     rows += [(f"{name}: statistic", "", _find_limits(every), True) for name, every in by_name.items()]
     pictured = [d for d in found if "spectrogram" in d.details and len(d.details["spectrogram_t"]) > 1]
     if pictured:
@@ -102,7 +102,7 @@ def _collect_speeds(recording: Recording) -> list[tuple[str, Array, Array, str]]
 
 def _find_limits(every: Sequence[Detection]) -> tuple[float, float]:
     values = [np.log10(np.maximum(v, _LOWEST)) for d in every for v in (d.statistic, np.atleast_1d(d.threshold))]
-    return find_limits(values, floor=0.5, always=values[1::2])
+    return find_axis_limits(values, floor=0.5, always=values[1::2])
 
 
 def _plot_statistic(panel: Panel, d: Detection, t0: float) -> None:

@@ -224,7 +224,7 @@ class Figure:
 _STYLE = {"zeroline": False, "gridcolor": "var(--grid)", "linecolor": "var(--ink)", "exponentformat": "none"}
 
 
-def find_limits(
+def find_axis_limits(
     values: Sequence[Array], floor: float = 0.0, symmetric: bool = False, always: Sequence[Array] = ()
 ) -> tuple[float, float]:
     """Limits of an axis that single outliers do not set, at least `floor` wide.

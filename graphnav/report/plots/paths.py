@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from graphnav.core.rotation import Array
-from graphnav.report.plots.figure import SHADES, Figure, Panel, Tinted, find_colour, find_limits
+from graphnav.report.plots.figure import SHADES, Figure, Panel, Tinted, find_axis_limits, find_colour
 
 _MARKED_STOPS = 60  # stops that are marked individually
 _LABEL_WIDTH = 120.0  # pixels on a wide screen of a label on a phone
@@ -60,7 +60,7 @@ def plot_trajectory(
     parts += [] if truth is None else [truth]
     both = np.concatenate(parts)
     both = both[np.isfinite(both).all(axis=1)]
-    (west, east), (south, north) = (find_limits([both[:, k]], floor=1.0, always=[en[:, k] for _, en in tracks.values()])
+    (west, east), (south, north) = (find_axis_limits([both[:, k]], floor=1.0, always=[en[:, k] for _, en in tracks.values()])
                                     for k in (0, 1))  # fmt: skip
     south -= 0.06 * (north - south)  # for the scale bar
     scale = max((east - west) / _WIDE, (north - south) / _HIGH)  # m per pixel, the same on both axes
@@ -87,7 +87,7 @@ def plot_profile(lines: Mapping[str, tuple[Array, Array]], points: Mapping[str, 
     reach = max((float(x[-1]) for x, _ in lines.values() if len(x)), default=1.0)
     kilo, unit = (1e-3, "km") if reach >= 2000.0 else (1.0, "m")
     values = [y for _, y in (*lines.values(), *points.values())]
-    ylim = find_limits(values, floor=1.0, always=[y for name, (_, y) in lines.items() if name != "truth"])
+    ylim = find_axis_limits(values, floor=1.0, always=[y for name, (_, y) in lines.items() if name != "truth"])
     x = f"distance travelled [{unit}]"
     figure = Figure(["height [m]"], (0.0, kilo * max(reach, 1e-3)), [ylim], units=["m"], height=150, x=x)
     (panel,) = figure.panels

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from graphnav.core.rotation import Array
 from graphnav.estimation.solution import CarrierArcs, ConstraintRecord
-from graphnav.report.plots.figure import Figure, find_colour, find_limits
+from graphnav.report.plots.figure import Figure, find_axis_limits, find_colour
 from graphnav.report.plots.series import Shades
 from graphnav.report.plots.thinning import BINS
 
@@ -99,7 +99,7 @@ def plot_residuals_by_elevation(records: Mapping[str, ConstraintRecord], solver:
     """Every residual over its elevation, and by steps of it their RMS beside the stated sigma."""
     shown = [(kind, np.degrees(r.elevation), r, r.residual[:, 0]) for kind, r in records.items()]
     units = [r.unit for r in records.values()]
-    ylims = [find_limits([y[r.weight >= HALF]], symmetric=True) for _, _, r, y in shown]
+    ylims = [find_axis_limits([y[r.weight >= HALF]], symmetric=True) for _, _, r, y in shown]
     titles = [f"{kind} [{unit}]" for kind, unit in zip(records, units, strict=True)]
     figure = Figure(titles, (0.0, 90.0), ylims, units=units, x="elevation [deg]")
     for panel, (_, x, record, y) in zip(figure.panels, shown, strict=True):
@@ -121,7 +121,7 @@ def plot_residuals_by_satellite(kind: str, record: ConstraintRecord, solver: str
     y, used = record.residual[:, 0], record.weight >= HALF
     parts = {name: np.quantile(own, [0.025, 0.25, 0.5, 0.75, 0.975]) for name in every
              if len(own := y[used & (record.satellite == name)])}  # fmt: skip
-    reach = find_limits([np.concatenate([*parts.values(), np.zeros(1)])], symmetric=True)
+    reach = find_axis_limits([np.concatenate([*parts.values(), np.zeros(1)])], symmetric=True)
     figure, places = _plot_named_rows(every, reach, {"x": f"{kind} [{record.unit}]"})
     (panel,) = figure.panels
     panel.draw_line(np.zeros(2), np.array(panel.ylim), "ink", width=0.8, quiet=True)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from graphnav.core.rotation import Array
-from graphnav.report.plots.figure import Figure, Panel, Tinted, find_limits
+from graphnav.report.plots.figure import Figure, Panel, Tinted, find_axis_limits
 
 Shades = Mapping[str, Tinted]  # s from the start, by kind
 
@@ -54,7 +54,7 @@ def plot_bands(
                 width = np.minimum(width, np.nanquantile(width, 0.97) if np.isfinite(width).any() else 0.0)
                 centre = 0.0 if about_zero else s.value[:, k]
                 extremes += [centre - width, centre + width]
-        ylims.append(find_limits(extremes, symmetric=about_zero, always=always))
+        ylims.append(find_axis_limits(extremes, symmetric=about_zero, always=always))
     units = [unit] * len(components) if isinstance(unit, str) else unit
     titles = [f"{c} [{u}]" for c, u in zip(components, units, strict=True)]
     figure = Figure(titles, (0.0, end), ylims, units=units)
@@ -80,7 +80,9 @@ def plot_sigmas(
 ) -> Figure:
     """One panel per component with the 1-sigma of every solver on a logarithmic axis (`value` holds the sigma)."""
     positive = {name: np.where(s.value > 0, s.value, np.nan) for name, s in series.items()}
-    ylims = [find_limits([np.log10(v[:, k]) for v in positive.values()], floor=0.5) for k in range(len(components))]
+    ylims = [
+        find_axis_limits([np.log10(v[:, k]) for v in positive.values()], floor=0.5) for k in range(len(components))
+    ]
     titles = [f"{component} [{unit}]" for component in components]
     figure = Figure(titles, (0.0, end), ylims, units=[unit] * len(components), log=True)
     for k, panel in enumerate(figure.panels):
@@ -99,7 +101,7 @@ def plot_span_zoom(series: Mapping[str, Curve], spans: Tinted, what: str = "with
         inside = {name: (s.t >= xlims[-1][0]) & (s.t <= xlims[-1][1]) for name, s in series.items()}
         shown.append({name: (s.t[inside[name]], s.value[inside[name], 0]) for name, s in series.items()})
         values = [y for _, y in shown[-1].values()]
-        ylims.append((0.0, find_limits(values, floor=1e-3, always=values)[1]))
+        ylims.append((0.0, find_axis_limits(values, floor=1e-3, always=values)[1]))
     columns = 1 if len(shown) < 2 else 2
     titles = ["horizontal error [m]", *[""] * (len(shown) - 1)]
     figure = Figure(titles, xlims, ylims, units=["m"] * len(shown), height=150, apart=True, columns=columns)

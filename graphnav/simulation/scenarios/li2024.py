@@ -93,16 +93,16 @@ def _list_events(edges: tuple[float, ...], seed: int) -> list[Boarding | Fidget]
     """Passengers: a door at stop 1, most at stop 2, two doors at stop 3; no seat is completely still."""
     rng = make_random(seed, "events")
 
-    def at(stop: int, share: float) -> float:
+    def place_event(stop: int, share: float) -> float:
         a, b = edges[2 * stop : 2 * stop + 2]
         return float(a + 8.0 + share * (b - a - 24.0) + rng.uniform(-1.0, 1.0))
 
     events: list[Boarding | Fidget] = [
-        Boarding(at(0, 0.6), 0.0, 1.0, 1.0),
-        Boarding(at(1, 0.2), -1.0, 1.0, -1.0), Boarding(at(1, 0.45), 0.0, 1.0, -1.0),
-        Boarding(at(1, 0.7), -1.0, -1.0, 1.0), Boarding(at(1, 0.85), 1.0, -1.0, 1.0),
-        Boarding(at(1, 0.98), 1.0, 1.0, -1.0),
-        Boarding(at(2, 0.3), 0.0, -1.0, 1.0), Boarding(at(2, 0.8), 0.0, -1.0, 1.0),
+        Boarding(place_event(0, 0.6), 0.0, 1.0, 1.0),
+        Boarding(place_event(1, 0.2), -1.0, 1.0, -1.0), Boarding(place_event(1, 0.45), 0.0, 1.0, -1.0),
+        Boarding(place_event(1, 0.7), -1.0, -1.0, 1.0), Boarding(place_event(1, 0.85), 1.0, -1.0, 1.0),
+        Boarding(place_event(1, 0.98), 1.0, 1.0, -1.0),
+        Boarding(place_event(2, 0.3), 0.0, -1.0, 1.0), Boarding(place_event(2, 0.8), 0.0, -1.0, 1.0),
     ]  # fmt: skip
     for a, b in (edges[0:2], edges[2:4], edges[4:6]):
         for t in a + np.sort(rng.uniform(5.0, b - a - 5.0, rng.poisson((b - a) / 120.0))):

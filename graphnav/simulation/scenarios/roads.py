@@ -77,13 +77,13 @@ def crawl(
         raise ConfigError(f"jam = {jam:g}: must be at least 120 s", key="simulation.value")
     rng = make_random(seed, "way")
 
-    def flow() -> list[Manoeuvre]:
+    def drive_on() -> list[Manoeuvre]:
         return [
             Manoeuvre(8.0, 11.0), Manoeuvre(15.0, 12.0, 20.0), Manoeuvre(5.0, 6.0),
             Manoeuvre(8.0, 6.0, rng.choice([-1.0, 1.0]) * 90.0), Manoeuvre(6.0, 12.0), Manoeuvre(15.0, 12.0, -25.0),
         ]  # fmt: skip
 
-    plan, left = [Manoeuvre(20.0, 0.0), *flow(), *flow(), Manoeuvre(8.0, 0.0)], jam
+    plan, left = [Manoeuvre(20.0, 0.0), *drive_on(), *drive_on(), Manoeuvre(8.0, 0.0)], jam
     creeping = []
     t = sum(m.duration for m in plan)
     while left > 0.0:
@@ -93,7 +93,7 @@ def crawl(
         creeping.append([round(t + halt, 3), round(t + halt + creep + 3.5, 3)])
         used = sum(m.duration for m in plan[-4:])
         t, left = t + used, left - used
-    plan += [Manoeuvre(10.0, 0.0), *flow(), Manoeuvre(8.0, 0.0), Manoeuvre(15.0, 0.0)]
+    plan += [Manoeuvre(10.0, 0.0), *drive_on(), Manoeuvre(8.0, 0.0), Manoeuvre(15.0, 0.0)]
     path = make_path(plan, heading=float(rng.uniform(0.0, 360.0)), slip_per_accel=0.005)
     return record(
         "crawl", seed, path,
