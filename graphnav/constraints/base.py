@@ -12,19 +12,25 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import ClassVar, Self
+from functools import cached_property
+from typing import TYPE_CHECKING, ClassVar, Self
 
 import numpy as np
 
 from graphnav.config import Settings
 from graphnav.core.earth import LocalFrame
 from graphnav.core.rotation import Array
-from graphnav.core.shared import Shared
 from graphnav.core.state import BLOCKS, DIM, Parameter, States
 from graphnav.imu.preintegration import Intervals
 from graphnav.recording import Recording
 from graphnav.recording.odometer import MeanSpeed
 from graphnav.sensors import Series
+
+if TYPE_CHECKING:
+    from graphnav.constraints.raw_carrier import CarrierPairs
+    from graphnav.constraints.raw_ppp import FreeRows
+    from graphnav.constraints.raw_rows import PreparedRows
+    from graphnav.constraints.vehicle import IntervalMotion
 
 
 @dataclass(frozen=True)
@@ -37,7 +43,7 @@ class Linearized:
 
 
 @dataclass(frozen=True)
-class BuildContext(Shared):
+class BuildContext:
     """Everything from which a constraint builds its rows."""
 
     recording: Recording
@@ -48,6 +54,50 @@ class BuildContext(Shared):
     intervals: Intervals  # (K-1) intervals between the keyframes
     speed: MeanSpeed | None = None  # preintegrated odometer, where it is available
     typical_sigmas: Array | None = None  # (M, 3) m, typical sigma stated by the fixes, where it is available
+
+    # what several constraints are made of, derived once; their files import this one
+
+    @cached_property
+    def moving_rows(self) -> Array:
+        """Intervals in which the vehicle moves, as `vehicle.find_moving_rows` says."""
+        from graphnav.constraints.vehicle import find_moving_rows
+
+        return find_moving_rows(self)
+
+    @cached_property
+    def interval_motion(self) -> IntervalMotion:
+        """Mean motion over these intervals."""
+        from graphnav.constraints.vehicle import IntervalMotion
+
+        return IntervalMotion.of(self.intervals, self.moving_rows, self.frame)
+
+    @cached_property
+    def satellites(self) -> PreparedRows | None:
+        """Rows of raw observations, those of epochs without a keyframe too, as `raw_rows.prepare_every` says."""
+        from graphnav.constraints.raw_rows import prepare_every
+
+        return prepare_every(self)
+
+    @cached_property
+    def satellite_rows(self) -> PreparedRows | None:
+        """Those of epochs that have keyframes."""
+        from graphnav.constraints.raw_rows import select_rows
+
+        return select_rows(self.satellites)
+
+    @cached_property
+    def carrier_pairs(self) -> tuple[PreparedRows, CarrierPairs] | None:
+        """Carriers of an arc at one epoch and the next, as `raw_carrier.pair_rows` says."""
+        from graphnav.constraints.raw_carrier import pair_rows
+
+        return pair_rows(self)
+
+    @cached_property
+    def ionosphere_free(self) -> FreeRows | None:
+        """Rows of two signals without the ionosphere, as `raw_ppp.combine_rows` says."""
+        from graphnav.constraints.raw_ppp import combine_rows
+
+        return combine_rows(self)
 
     def get_series(self, name: str) -> Series | None:
         """The rows of a sensor of `graphnav.sensors`.

@@ -46,7 +46,7 @@ from graphnav.constraints.raw_gnss import (
     make_ionosphere_parameter,
     select_columns,
 )
-from graphnav.constraints.raw_rows import PreparedRows, find_epoch_period, prepare_every
+from graphnav.constraints.raw_rows import PreparedRows, find_epoch_period
 from graphnav.constraints.raw_selection import select_observations
 from graphnav.core import rotation
 from graphnav.core.rotation import Array
@@ -70,7 +70,7 @@ _DRIFT = np.array([5e-4, 5e-4, 1e-3])
 
 
 @dataclass(frozen=True)
-class _Pairs:
+class CarrierPairs:
     """Rows of one satellite and signal at two epochs next to each other, made once for a scene."""
 
     before: NDArray[np.intp]  # (N,) of the prepared rows
@@ -96,10 +96,10 @@ def _use_differences(recording: Recording, settings: Settings) -> bool:
     return not (s.carrier and s.code and based)
 
 
-def _pair_rows(scene: BuildContext) -> tuple[PreparedRows, _Pairs] | None:
+def pair_rows(scene: BuildContext) -> tuple[PreparedRows, CarrierPairs] | None:
     if not _use_differences(scene.recording, scene.settings):
         return None
-    found, whole = scene.share(prepare_every), scene.recording.raw_gnss
+    found, whole = scene.satellites, scene.recording.raw_gnss
     if found is None or whole is None or not np.isfinite(found.raw.carrier).any():
         return None
     raw = found.raw
@@ -114,10 +114,10 @@ def _pair_rows(scene: BuildContext) -> tuple[PreparedRows, _Pairs] | None:
     clock[of[after]] = -compute_epoch_medians(raw.t[after], change)
     some = found.keyframe[after] >= 0  # of a piece, changes to the epoch before it are there already
     number = number_epochs(raw)[first]
-    return found, _Pairs(before[some], after[some], number, epochs, first, change[some], clock)
+    return found, CarrierPairs(before[some], after[some], number, epochs, first, change[some], clock)
 
 
-def _clone_antennas(found: PreparedRows, pairs: _Pairs) -> tuple[Parameter, ...]:
+def _clone_antennas(found: PreparedRows, pairs: CarrierPairs) -> tuple[Parameter, ...]:
     out = []
     for k, name in enumerate(CLONES):
         own = np.flatnonzero((pairs.number >= 0) & (pairs.number % 2 == k))
@@ -144,7 +144,7 @@ class GnssAntennaClone(Constraint):
 
     @classmethod
     def build(cls, scene: BuildContext) -> GnssAntennaClone | None:
-        both = scene.share(_pair_rows)
+        both = scene.carrier_pairs
         if both is None:
             return None
         found, pairs = both
@@ -198,7 +198,7 @@ class GnssCarrier(SatelliteConstraint):
 
     @classmethod
     def build(cls, scene: BuildContext) -> GnssCarrier | None:
-        both = scene.share(_pair_rows)
+        both = scene.carrier_pairs
         if both is None:
             return None
         found, pairs = both

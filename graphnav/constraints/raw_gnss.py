@@ -32,7 +32,7 @@ import numpy as np
 from graphnav.config import Settings
 from graphnav.constraints.base import BuildContext, Constraint, Linearized
 from graphnav.constraints.gnss import LEVER_ARM, TIMES, average_around, compute_antenna_velocity
-from graphnav.constraints.raw_rows import CLOCK, PreparedRows, prepare_rows
+from graphnav.constraints.raw_rows import CLOCK, PreparedRows
 from graphnav.constraints.raw_selection import select_observations
 from graphnav.core import rotation
 from graphnav.core.notes import Note
@@ -217,7 +217,7 @@ class GnssCode(RangeConstraint):
 
     @classmethod
     def build(cls, scene: BuildContext) -> GnssCode | None:
-        found = scene.share(prepare_rows) if scene.settings.raw_gnss.code else None
+        found = scene.satellite_rows if scene.settings.raw_gnss.code else None
         if found is None:
             return None
         raw, settings = found.raw, scene.settings
@@ -300,7 +300,7 @@ class GnssDoppler(SatelliteConstraint):
 
     @classmethod
     def build(cls, scene: BuildContext) -> GnssDoppler | None:
-        found = scene.share(prepare_rows) if scene.settings.raw_gnss.doppler else None
+        found = scene.satellite_rows if scene.settings.raw_gnss.doppler else None
         if found is None:
             return None
         raw, common = found.raw, list_common_fields(scene, found)

@@ -28,7 +28,7 @@ from graphnav.config import Settings
 from graphnav.constraints.ambiguities import make_ambiguities, name_ambiguity
 from graphnav.constraints.base import SAME_TIME, BuildContext, Constraint, Linearized
 from graphnav.constraints.raw_gnss import IONOSPHERE, RangeConstraint, list_common_fields, make_ionosphere_parameter
-from graphnav.constraints.raw_rows import find_epoch_period, prepare_rows
+from graphnav.constraints.raw_rows import find_epoch_period
 from graphnav.core import rotation
 from graphnav.core.rotation import Array
 from graphnav.core.state import Parameter, States
@@ -73,7 +73,7 @@ class GnssPhase(RangeConstraint):
     @classmethod
     def build(cls, scene: BuildContext) -> GnssPhase | None:
         s, raw = scene.settings.raw_gnss, scene.recording.raw_gnss
-        found = scene.share(prepare_rows) if s.carrier and s.code else None
+        found = scene.satellite_rows if s.carrier and s.code else None
         if found is None or raw is None or not np.isfinite(raw.carrier_difference).any():
             return None
         arcs = find_arcs(raw, base_arc=raw.base_arc)

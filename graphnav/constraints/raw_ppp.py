@@ -32,7 +32,7 @@ from graphnav.constraints.raw_gnss import (
     list_common_fields,
     select_columns,
 )
-from graphnav.constraints.raw_rows import PreparedRows, prepare_rows
+from graphnav.constraints.raw_rows import PreparedRows
 from graphnav.constraints.raw_selection import select_observations
 from graphnav.core.errors import RecordingError
 from graphnav.core.rotation import Array
@@ -55,7 +55,7 @@ _ORBIT = 0.025
 
 
 @dataclass(frozen=True)
-class _Free:
+class FreeRows:
     """What both kinds of rows need; made once for a scene."""
 
     found: PreparedRows
@@ -66,10 +66,10 @@ class _Free:
     groups: int
 
 
-def _combine_free(scene: BuildContext) -> _Free | None:
+def combine_rows(scene: BuildContext) -> FreeRows | None:
     if not scene.settings.raw_gnss.ppp:
         return None
-    found, whole = scene.share(prepare_rows), scene.recording.raw_gnss
+    found, whole = scene.satellite_rows, scene.recording.raw_gnss
     if found is None or whole is None:
         return None
     require_precise(scene.recording.name, whole)
@@ -80,7 +80,7 @@ def _combine_free(scene: BuildContext) -> _Free | None:
     some = np.isin(every // 100, list(SECOND))
     systems = [x for x in dict.fromkeys(system for system, _ in group_signals(found.raw)[0]) if x in SECOND]
     group = np.array([systems.index(x) for x in (found.raw.satellite[rows.which] // 100).tolist()])
-    return _Free(found, rows, int(some.sum()), (np.cumsum(some) - 1)[of[rows.which]], group, len(systems))
+    return FreeRows(found, rows, int(some.sum()), (np.cumsum(some) - 1)[of[rows.which]], group, len(systems))
 
 
 def require_precise(name: str, raw: RawGnss) -> None:
@@ -118,7 +118,7 @@ class _Ppp(RangeConstraint):
         return np.empty(0) if raw is None else np.unique(raw.t)
 
     @staticmethod
-    def _collect_shared_fields(scene: BuildContext, free: _Free, used: NDArray[np.intp]) -> dict[str, Any]:
+    def _collect_shared_fields(scene: BuildContext, free: FreeRows, used: NDArray[np.intp]) -> dict[str, Any]:
         rows, common = free.rows, list_common_fields(scene, free.found)
         at = rows.which[used]
         common |= {name: common[name][at] for name in PER_ROW}
@@ -157,7 +157,7 @@ class GnssPppCode(_Ppp):
 
     @classmethod
     def build(cls, scene: BuildContext) -> GnssPppCode | None:
-        free = scene.share(_combine_free)
+        free = scene.ionosphere_free
         if free is None:
             return None
         rows, raw = free.rows, free.found.raw.take(free.rows.which)
@@ -196,7 +196,7 @@ class GnssPppCarrier(_Ppp):
 
     @classmethod
     def build(cls, scene: BuildContext) -> GnssPppCarrier | None:
-        free = scene.share(_combine_free)
+        free = scene.ionosphere_free
         if free is None:
             return None
         rows, arcs = free.rows, free.rows.arcs

@@ -81,9 +81,8 @@ def prepare_every(scene: BuildContext) -> PreparedRows | None:
     )
 
 
-def prepare_rows(scene: BuildContext) -> PreparedRows | None:
+def select_rows(every: PreparedRows | None) -> PreparedRows | None:
     """The rows of epochs that have keyframes."""
-    every = scene.share(prepare_every)
     if every is None or (every.keyframe >= 0).all():
         return every
     there = every.keyframe >= 0

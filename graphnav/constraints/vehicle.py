@@ -199,11 +199,6 @@ def find_moving_rows(scene: BuildContext) -> Array:
     return np.flatnonzero(usable)
 
 
-def build_interval_motion(scene: BuildContext) -> IntervalMotion:
-    """Mean motion over the intervals of `moving_rows`."""
-    return IntervalMotion.of(scene.intervals, scene.share(find_moving_rows), scene.frame)
-
-
 def make_wheel_parameters(scene: BuildContext) -> tuple[Array, list[Parameter]]:
     """Lever arm (3,) of the point that does not slip, m, and the parameters of both constraints."""
     s, odometer = scene.settings.vehicle, scene.recording.odometer
@@ -249,7 +244,7 @@ class NonHolonomic(Wheels):
         s = scene.settings.vehicle
         if scene.recording.platform != "vehicle" or not s.nhc:
             return None
-        rows, past = scene.share(find_moving_rows), scene.share(build_interval_motion)
+        rows, past = scene.moving_rows, scene.interval_motion
         lever_arm, parameters = make_wheel_parameters(scene)
         if s.body_sigma > 0:
             parameters.append(
@@ -324,7 +319,7 @@ class OdometerSpeed(Wheels):
         if scene.recording.platform != "vehicle" or odometer is None or not s.odometer:
             return None
         speed = scene.speed or _average_speed(odometer, scene.recording.imu)
-        rows, past = scene.share(find_moving_rows), scene.share(build_interval_motion)
+        rows, past = scene.moving_rows, scene.interval_motion
         begin, end = scene.intervals.t0[rows], scene.intervals.t1[rows]
         reach = DELAY_SIGMAS * odometer.delay_sigma
         good = np.all([np.isfinite(speed(begin, end, d)[0]) for d in {-reach, 0.0, reach}], axis=0)

@@ -120,13 +120,15 @@ def _cut_at_speed(b: BlockMeans, spans: Array, settings: FusionSettings) -> Arra
     return out[out[:, 1] > out[:, 0]]
 
 
-def find_candidates(scene: Scene, found: Detection) -> tuple[Array, Array, tuple[str, ...]]:
-    """Candidates of a detector, with edges and without those that move; spans of certain motion; notes."""
+def find_candidates(scene: Scene, found: Detection, row: Scale) -> tuple[Array, Array, tuple[str, ...]]:
+    """Candidates of a detector, with edges, where `row` is that at rest, and without those that move; spans of certain
+    motion; notes.
+    """
     b, speeds, certain = scene.blocks, scene.known, scene.certain
     by_rows = found.name == LOW_BAND  # its windows are of the rows in which edges are sought
     # a threshold raised by the data applies to windows; an edge is where the noise and sway of single rows end
     limit = min(float(np.max(found.threshold)), _EDGE_STATISTIC) if by_rows else _EDGE_STATISTIC
-    spans = trim_edges(b, found.intervals, scene.share(compute_low_band)[1], limit)
+    spans = trim_edges(b, found.intervals, row, limit)
     if not by_rows:
         spans = _cut_at_speed(b, spans, scene.settings.fusion)
     spans = merge_spans(drop_short(spans, 3.0 * b.period))
@@ -308,7 +310,7 @@ class StopDecision:
 def check_intervals(scene: Scene, detector: type[Detector], shown: bool) -> StopDecision:
     """The decision of a single detector: its intervals, checked against measured speeds and the force between them."""
     found = detector.detect(scene, None, shown)
-    still, certain, notes = find_candidates(scene, found)
+    still, certain, notes = find_candidates(scene, found, compute_low_band(scene)[1])
     spans, disturbed = fuse(scene.blocks, still, NONE, certain, scene.settings.fusion)
     return StopDecision(spans, disturbed, (*found.notes, *notes), (found,))
 
@@ -332,8 +334,8 @@ def decide_fused(scene: Scene, detectors: Mapping[str, type[Detector]], shown: b
     detectors : all, by their names; the others learn from these what standing looks like here.
     shown : whether the answers of those that decide nothing are wanted.
     """
-    low, _ = scene.share(compute_low_band)
-    still, certain, notes = find_candidates(scene, low)
+    low, row = compute_low_band(scene)
+    still, certain, notes = find_candidates(scene, low, row)
     half = 0.5 * scene.settings.low_band_glrt.window
     labels = Labels(still, find_spans(low.statistic > _CLEAR_MOTION * low.threshold, low.t, half))
     notes = (*low.notes, *notes)

@@ -15,7 +15,6 @@ Multiplied out, all of them need no more than the window's means of f, |f|, |f|^
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -24,10 +23,9 @@ from graphnav.core.rotation import Array
 from graphnav.detectors.base import NONE, Detection, find_spans, mask_within
 from graphnav.detectors.scene import Detector, Labels, Scene
 from graphnav.detectors.thresholds import choose_threshold, find_fewest_errors
-from graphnav.detectors.windows import BlockMeans, compute_window_times, find_unbroken, sum_rows
+from graphnav.detectors.windows import WINDOW_STEP, WindowMeans, sum_rows
 
 _TINY = 1e-300
-_WINDOW_STEP = 0.1  # s between windows
 _GRAVITY_ERROR = 0.05  # share of g that an accelerometer's scale and bias may be off
 # twice the expectation under noise alone: three axes of each sensor, one direction of the magnitude
 _AT_NOISE = {
@@ -93,39 +91,6 @@ def compute_glrt(
     return STATISTICS[name](sum_rows(collect_rows(accel, gyro)).compute_means(window), sigma_a, sigma_w, g)
 
 
-@dataclass(frozen=True)
-class Means:
-    """Means over the windows of a recording."""
-
-    t: Array  # (W,) s, centre
-    half: float  # s, of a window
-    rows: Array  # (W, 9) as in `collect_rows`
-    whole: Array  # (W,) bool, False where a window crosses a gap
-
-
-def compute_window_means(b: BlockMeans, length: float) -> Means | None:
-    """Means over windows of `length` s every tenth of a second; None where there is no window."""
-    # the blocks between two windows are summed once for all windows
-    group = max(1, min(round(_WINDOW_STEP / b.period), round(0.5 * length / b.period)))
-    count = len(b.t) // group
-    rows = b.mean[: count * group].reshape(count, group, -1).mean(axis=1)
-    middle = b.t[: count * group].reshape(count, group).mean(axis=1)
-    whole = np.asarray(b.whole[: count * group].reshape(count, group).all(axis=1))
-    window = max(2, round(length / (group * b.period)))
-    if count < window:
-        return None
-    return Means(
-        compute_window_times(middle, window),
-        0.5 * length,
-        sum_rows(rows).compute_means(window),
-        find_unbroken(whole, window, first=0),
-    )
-
-
-def _compute_means(scene: Scene) -> Means | None:
-    return compute_window_means(scene.blocks, scene.settings.glrt.window)
-
-
 class _Windowed(Detector):
     """One statistic of the recording with its own threshold.
 
@@ -140,7 +105,7 @@ class _Windowed(Detector):
     @classmethod
     def detect(cls, scene: Scene, labels: Labels | None = None, shown: bool = True) -> Detection:
         name, settings, noise = cls.name, scene.settings.glrt, scene.recording.imu.noise
-        m = scene.share(_compute_means)
+        m = scene.means
         least = _AT_NOISE[name]
         if m is None:
             none = np.zeros(0)
@@ -200,7 +165,7 @@ def _subtract_mean_rate(rows: Array, reference: Array, g: float, at_rest: bool) 
     return means, measured if at_rest and abs(measured / g - 1.0) < _GRAVITY_ERROR else g
 
 
-def _find_quietest(m: Means) -> Array:
+def _find_quietest(m: WindowMeans) -> Array:
     """(W,) bool, the second of windows in which force and rate scatter least: the likeliest rest.
 
     Each is divided by its own typical scatter, so that neither unit dominates.
@@ -209,7 +174,7 @@ def _find_quietest(m: Means) -> Array:
     rate = m.rows[:, 8] - np.einsum("wj,wj->w", m.rows[:, 3:6], m.rows[:, 3:6])
     scatter = force / max(float(np.median(force)), _TINY) + rate / max(float(np.median(rate)), _TINY)
     scatter = np.where(m.whole, scatter, np.inf)
-    few = min(round(1.0 / _WINDOW_STEP), len(scatter)) - 1
+    few = min(round(1.0 / WINDOW_STEP), len(scatter)) - 1
     return np.asarray(scatter <= np.partition(scatter, few)[few])
 
 

@@ -42,7 +42,7 @@ class LowBandGlrt(Detector):
 
     @classmethod
     def detect(cls, scene: Scene, labels: Labels | None = None, shown: bool = True) -> Detection:
-        return scene.share(compute_low_band)[0]
+        return compute_low_band(scene)[0]
 
 
 def compute_low_band(scene: Scene) -> tuple[Detection, Scale]:

@@ -13,15 +13,21 @@ from graphnav.config.detectors import DetectorSettings
 from graphnav.core.earth import STANDARD_GRAVITY, gravity
 from graphnav.core.findings import compute_period
 from graphnav.core.rotation import Array
-from graphnav.core.shared import Shared
 from graphnav.detectors.base import Detection
 from graphnav.detectors.motion import Speeds, collect_speeds, find_moving
-from graphnav.detectors.windows import BlockMeans, LowPassed, average_blocks, low_pass
+from graphnav.detectors.windows import (
+    BlockMeans,
+    LowPassed,
+    WindowMeans,
+    average_blocks,
+    compute_window_means,
+    low_pass,
+)
 from graphnav.recording import Recording
 
 
 @dataclass(frozen=True)
-class Scene(Shared):
+class Scene:
     """A recording, or a window of one, with quantities that several detectors need."""
 
     recording: Recording
@@ -41,6 +47,11 @@ class Scene(Shared):
     def low(self) -> LowPassed:
         """The IMU below about 2 Hz."""
         return low_pass(self.blocks)
+
+    @cached_property
+    def means(self) -> WindowMeans | None:
+        """Means over the windows of the GLRT and related statistics; None where there is no window."""
+        return compute_window_means(self.blocks, self.settings.glrt.window)
 
     @cached_property
     def known(self) -> list[Speeds]:

@@ -16,6 +16,7 @@ from graphnav.core.rotation import Array
 from graphnav.recording import Imu
 
 BLOCK_RATE = 50.0  # Hz, lowest rate of the blocks
+WINDOW_STEP = 0.1  # s between windows
 _KERNEL_LENGTH = 0.4  # s, length of the low-pass filter
 _LOW_RATE = 10.0  # Hz, rate of the low-passed rows
 _LONGEST_BLOCK_GAP = 0.2  # s by which a block may last too long and still be valid
@@ -97,6 +98,35 @@ def find_unbroken(whole: Array, length: int, step: int = 1, first: int = 1) -> A
     broken = np.r_[0, np.cumsum(~whole)]
     begin = np.arange(0, len(whole) - length + 1, step)
     return np.asarray(broken[begin + length] - broken[begin + first] == 0)
+
+
+@dataclass(frozen=True)
+class WindowMeans:
+    """Means over the windows of a recording."""
+
+    t: Array  # (W,) s, centre
+    half: float  # s, of a window
+    rows: Array  # (W, 9) [force, rate, |force|, |force|^2, |rate|^2]
+    whole: Array  # (W,) bool, False where a window crosses a gap
+
+
+def compute_window_means(b: BlockMeans, length: float) -> WindowMeans | None:
+    """Means over windows of `length` s every tenth of a second; None where there is no window."""
+    # the blocks between two windows are summed once for all windows
+    group = max(1, min(round(WINDOW_STEP / b.period), round(0.5 * length / b.period)))
+    count = len(b.t) // group
+    rows = b.mean[: count * group].reshape(count, group, -1).mean(axis=1)
+    middle = b.t[: count * group].reshape(count, group).mean(axis=1)
+    whole = np.asarray(b.whole[: count * group].reshape(count, group).all(axis=1))
+    window = max(2, round(length / (group * b.period)))
+    if count < window:
+        return None
+    return WindowMeans(
+        compute_window_times(middle, window),
+        0.5 * length,
+        sum_rows(rows).compute_means(window),
+        find_unbroken(whole, window, first=0),
+    )
 
 
 @dataclass(frozen=True)

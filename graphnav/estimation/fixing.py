@@ -27,6 +27,7 @@ import numpy as np
 from graphnav.constraints.ambiguities import list_slots
 from graphnav.constraints.raw_phase import EXACT, GnssPhase, WholeCycles
 from graphnav.constraints.raw_ppp import GnssPppCarrier
+from graphnav.core.progress import Progress
 from graphnav.core.rotation import Array
 from graphnav.core.state import BLOCKS, DIM
 from graphnav.estimation.known_arcs import ENOUGH, Arc, Epochs, Known
@@ -35,7 +36,7 @@ from graphnav.estimation.solution import CarrierArcs
 from graphnav.estimation.solvers.decision import DecidedRows
 from graphnav.estimation.solvers.ekf import ekf, refilter
 from graphnav.estimation.solvers.linearise import Points
-from graphnav.estimation.solvers.passes import FilterPass, Progress, SmootherPass, make_points, split_values
+from graphnav.estimation.solvers.passes import FilterPass, SmootherPass, make_points, split_values
 from graphnav.estimation.solvers.rts import smooth_backward
 from graphnav.gnss.integers import decorrelate, find_nearest
 

@@ -230,30 +230,31 @@ class Decoder:
             whole = Bits(whole.value << 300 | parts[k].value, whole.size + 300)
         parts.clear()
 
-        def join_parts(page: int, *places: tuple[int, int]) -> list[tuple[int, int]]:
+        def cut(page: int, *places: tuple[int, int]) -> list[tuple[int, int]]:
             return [(300 * (page - 1) + first, many) for first, many in places]
 
         u, s = whole.u, whole.s
-        toes, toc = u(*join_parts(7, (80, 2), (90, 15))) * 8.0, u(*join_parts(1, (77, 5), (90, 12))) * 8.0
+        toes, toc = u(*cut(7, (80, 2), (90, 15))) * 8.0, u(*cut(1, (77, 5), (90, 12))) * 8.0
         self._add(
             satellite, _unroll_week(toes + _BDT, gps), _unroll_week(toc + _BDT, gps), toes,
             clock=(
-                s(*join_parts(3, (100, 12), (120, 12))) * 2.0**-33,
-                s(*join_parts(3, (132, 4)), *join_parts(4, (46, 6), (60, 12))) * 2.0**-50, s(*join_parts(4, (72, 10), (90, 1))) * 2.0**-66,
+                s(*cut(3, (100, 12), (120, 12))) * 2.0**-33,
+                s(*cut(3, (132, 4)), *cut(4, (46, 6), (60, 12))) * 2.0**-50, s(*cut(4, (72, 10), (90, 1))) * 2.0**-66,
             ),
-            iode=u(*join_parts(4, (91, 5))), crs=s(*join_parts(8, (91, 18))) * 2.0**-6, delta_n=s(*join_parts(4, (96, 16))) * 2.0**-43 * _PI,
-            m0=s(*join_parts(5, (50, 2), (60, 22), (90, 8))) * 2.0**-31 * _PI,
-            cuc=s(*join_parts(4, (120, 14)), *join_parts(5, (46, 4))) * 2.0**-31,
-            e=u(*join_parts(5, (124, 10)), *join_parts(6, (46, 6), (60, 16))) * 2.0**-33, cus=s(*join_parts(5, (98, 14), (120, 4))) * 2.0**-31,
-            root_a=u(*join_parts(6, (76, 6), (90, 22), (120, 4))) * 2.0**-19,
-            cic=s(*join_parts(6, (124, 10)), *join_parts(7, (46, 6), (60, 2))) * 2.0**-31,
-            omega0=s(*join_parts(9, (51, 1), (60, 22), (90, 9))) * 2.0**-31 * _PI, cis=s(*join_parts(7, (62, 18))) * 2.0**-31,
-            i0=s(*join_parts(7, (105, 7), (120, 14)), *join_parts(8, (46, 6), (60, 5))) * 2.0**-31 * _PI,
-            crc=s(*join_parts(8, (65, 17), (90, 1))) * 2.0**-6,
-            omega=s(*join_parts(9, (99, 13), (120, 14)), *join_parts(10, (46, 5))) * 2.0**-31 * _PI,
-            omega_dot=s(*join_parts(8, (109, 3), (120, 16)), *join_parts(9, (46, 5))) * 2.0**-43 * _PI,
-            idot=s(*join_parts(10, (51, 1), (60, 13))) * 2.0**-43 * _PI, healthy=u(*join_parts(1, (46, 1))) == 0,
-            delay=(s(*join_parts(1, (102, 10))) * 1e-10, s(*join_parts(1, (120, 10))) * 1e-10),
+            iode=u(*cut(4, (91, 5))), crs=s(*cut(8, (91, 18))) * 2.0**-6, delta_n=s(*cut(4, (96, 16))) * 2.0**-43 * _PI,
+            m0=s(*cut(5, (50, 2), (60, 22), (90, 8))) * 2.0**-31 * _PI,
+            cuc=s(*cut(4, (120, 14)), *cut(5, (46, 4))) * 2.0**-31,
+            e=u(*cut(5, (124, 10)), *cut(6, (46, 6), (60, 16))) * 2.0**-33,
+            cus=s(*cut(5, (98, 14), (120, 4))) * 2.0**-31,
+            root_a=u(*cut(6, (76, 6), (90, 22), (120, 4))) * 2.0**-19,
+            cic=s(*cut(6, (124, 10)), *cut(7, (46, 6), (60, 2))) * 2.0**-31,
+            omega0=s(*cut(9, (51, 1), (60, 22), (90, 9))) * 2.0**-31 * _PI, cis=s(*cut(7, (62, 18))) * 2.0**-31,
+            i0=s(*cut(7, (105, 7), (120, 14)), *cut(8, (46, 6), (60, 5))) * 2.0**-31 * _PI,
+            crc=s(*cut(8, (65, 17), (90, 1))) * 2.0**-6,
+            omega=s(*cut(9, (99, 13), (120, 14)), *cut(10, (46, 5))) * 2.0**-31 * _PI,
+            omega_dot=s(*cut(8, (109, 3), (120, 16)), *cut(9, (46, 5))) * 2.0**-43 * _PI,
+            idot=s(*cut(10, (51, 1), (60, 13))) * 2.0**-43 * _PI, healthy=u(*cut(1, (46, 1))) == 0,
+            delay=(s(*cut(1, (102, 10))) * 1e-10, s(*cut(1, (120, 10))) * 1e-10),
         )  # fmt: skip
 
     def _parse_string(self, satellite: int, bits: Bits, gps: float) -> None:

@@ -20,13 +20,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from graphnav.core.notes import Note, format_count
+from graphnav.core.progress import Progress
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, States
 from graphnav.estimation.dense import make_dense
 from graphnav.estimation.factor_graph.gaussian import Eliminated, LinearGraph
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import ParameterEstimate, Solution
-from graphnav.estimation.solvers.passes import Progress, integrate_again, record_residuals
+from graphnav.estimation.solvers.passes import integrate_again, record_residuals
 from graphnav.estimation.solvers.robust import REDESCENDING
 from graphnav.estimation.solvers.rows import (
     Correction,

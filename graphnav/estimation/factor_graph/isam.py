@@ -10,6 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from graphnav.core.progress import Progress
 from graphnav.core.rotation import Array
 from graphnav.core.state import States
 from graphnav.estimation.factor_graph.tree import Tree
@@ -22,7 +23,6 @@ from graphnav.estimation.factor_graph.tree_marginals import (
 )
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.incremental import FINE, Replay, are_due, begin_at, solve_in_turn
-from graphnav.estimation.solvers.passes import Progress
 from graphnav.estimation.solvers.stages import Message, Place
 from graphnav.estimation.solvers.window import SettledStates, compute_turn_limit
 

@@ -32,6 +32,7 @@ from typing import Any
 
 import numpy as np
 
+from graphnav.core.progress import Progress
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM
 from graphnav.estimation.dense import make_dense
@@ -44,7 +45,6 @@ from graphnav.estimation.solvers.linearise import Points, advance, scale_at
 from graphnav.estimation.solvers.passes import (
     FilterPass,
     ForwardRecord,
-    Progress,
     SmootherPass,
     are_near,
     compute_sigmas,

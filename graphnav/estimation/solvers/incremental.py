@@ -14,13 +14,14 @@ from typing import Protocol
 import numpy as np
 
 from graphnav.core.notes import Note, format_count
+from graphnav.core.progress import Progress
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, States
 from graphnav.estimation.dense import make_dense
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import Solution
 from graphnav.estimation.solvers.linearise import Points, list_node_steps, scale_at, shift
-from graphnav.estimation.solvers.passes import Progress, estimate_parameters, record_residuals
+from graphnav.estimation.solvers.passes import estimate_parameters, record_residuals
 from graphnav.estimation.solvers.rows import compute_cost_at
 from graphnav.estimation.solvers.stages import Message, Place
 from graphnav.estimation.solvers.window import SettledStates, Window, compute_turn_limit, make_first_message

@@ -59,14 +59,27 @@ class Points:
 
 
 @dataclass(frozen=True)
+class Jacobian:
+    """Derivatives of rows by all D error states, assembled when they are asked for."""
+
+    linear: Linearized
+    columns: Columns
+    width: int
+
+    @cached_property
+    def H(self) -> Array:
+        """(n, m, D) derivative of the residual."""
+        return assemble(self.linear, self.columns, self.width)
+
+
+@dataclass(frozen=True)
 class Rows:
     """Some rows of a constraint at points: residual (n, m), its Jacobian over D error states, sigma."""
 
     constraint: Constraint
     which: slice | Array
     linear: Linearized
-    columns: Columns
-    width: int
+    jacobian: Jacobian
 
     @property
     def residual(self) -> Array:
@@ -83,10 +96,15 @@ class Rows:
         """(n, m) sigmas with the rows' weights in them: infinite where a row is not used."""
         return weigh_sigma(self.constraint, self.linear.sigma, self.which)
 
-    @cached_property
+    @property
     def H(self) -> Array:
         """(n, m, D) derivative of the residual."""
-        return assemble(self.linear, self.columns, self.width)
+        return self.jacobian.H
+
+    @property
+    def columns(self) -> Columns:
+        """Columns of the parameters in H."""
+        return self.jacobian.columns
 
     @property
     def states_sigmas(self) -> bool:
@@ -98,9 +116,7 @@ class Rows:
         """The same of a constraint that a noise model has with other sigmas and weights."""
         sigma: Array = constraint.sigma  # type: ignore[attr-defined]
         linear = replace(self.linear, sigma=sigma[self.which])
-        out = Rows(constraint, self.which, linear, self.columns, self.width)
-        out.__dict__["H"] = self.H
-        return out
+        return replace(self, constraint=constraint, linear=linear)
 
     def weigh(self) -> tuple[Array, Array]:
         """Weight and cost (n,) of each row by its robust kernel."""
@@ -185,7 +201,8 @@ def linearise(
     if len(at) != 1 or len(values) != 1:
         values, states = values.take(at, axis=0), states[at]
     given = {p.name: values[:, shift(columns[p.name])] for p in constraint.parameters}
-    return Rows(constraint, which, constraint.linearize(states, given, which), columns, DIM + values.shape[1])
+    linear = constraint.linearize(states, given, which)
+    return Rows(constraint, which, linear, Jacobian(linear, columns, DIM + values.shape[1]))
 
 
 def linearise_links(motion: ImuFactors, states: States, scale: Array | None) -> tuple[Array, Array, Array, Array]:

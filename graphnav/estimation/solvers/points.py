@@ -17,13 +17,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from graphnav.core import rotation
+from graphnav.core.progress import Progress
 from graphnav.core.rotation import Array, mv
 from graphnav.core.state import DIM, MOVING, States
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.breakdown import explain_rows
 from graphnav.estimation.solvers.invariant import turn
 from graphnav.estimation.solvers.linearise import Advance, Columns, Points, linearise, shift
-from graphnav.estimation.solvers.passes import Progress, Updates
+from graphnav.estimation.solvers.passes import Updates
 from graphnav.estimation.solvers.recursion import STRETCH, filter_rows
 from graphnav.estimation.solvers.stack import RowBlock, Stack
 from graphnav.imu.dynamics import SCALE

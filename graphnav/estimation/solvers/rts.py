@@ -23,6 +23,7 @@ import numpy as np
 from scipy.linalg.lapack import dposv
 
 from graphnav.core import rotation
+from graphnav.core.progress import Progress
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, States
 from graphnav.estimation.dense import make_dense
@@ -35,7 +36,6 @@ from graphnav.estimation.solvers.passes import (
     FilterPass,
     ForwardRecord,
     MomentPass,
-    Progress,
     SmootherPass,
     Updates,
     compute_sigmas,

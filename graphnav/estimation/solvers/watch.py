@@ -23,6 +23,7 @@ from __future__ import annotations
 from array import array
 from bisect import bisect_left
 from collections.abc import Iterable, Mapping, Sequence
+from copy import copy
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -93,8 +94,7 @@ class _Slots:
 
     def copy(self) -> _Slots:
         """The same, on its own."""
-        other = object.__new__(_Slots)
-        other.__dict__ |= self.__dict__
+        other = copy(self)
         other.memory = self.memory.copy()
         return other
 
@@ -329,8 +329,7 @@ class Watch:
 
     def copy(self) -> Watch:
         """The same, on its own."""
-        other = object.__new__(Watch)
-        other.__dict__ |= self.__dict__
+        other = copy(self)
         other._slots = {name: slots.copy() for name, slots in self._slots.items()}
         return other
 

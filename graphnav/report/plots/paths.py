@@ -60,8 +60,9 @@ def plot_trajectory(
     parts += [] if truth is None else [truth]
     both = np.concatenate(parts)
     both = both[np.isfinite(both).all(axis=1)]
-    (west, east), (south, north) = (find_axis_limits([both[:, k]], floor=1.0, always=[en[:, k] for _, en in tracks.values()])
-                                    for k in (0, 1))  # fmt: skip
+    (west, east), (south, north) = (
+        find_axis_limits([both[:, k]], floor=1.0, always=[en[:, k] for _, en in tracks.values()]) for k in (0, 1)
+    )
     south -= 0.06 * (north - south)  # for the scale bar
     scale = max((east - west) / _WIDE, (north - south) / _HIGH)  # m per pixel, the same on both axes
     figure = Figure(["north [m]"], (west, east), [(south, north)], units=["m"], height=_HIGH, x="east [m]", equal=True)
