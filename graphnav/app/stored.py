@@ -25,7 +25,7 @@ from graphnav.core.files import check_regular, check_size, exists, parse_json
 from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.core.state import States, split_covariance
-from graphnav.estimation.dense import list_times
+from graphnav.estimation.dense import AtKeyframes
 from graphnav.estimation.solution import Solution
 from graphnav.recording import Recording, take_rows
 from graphnav.report.plots.detections import select_drawn_rows
@@ -39,26 +39,8 @@ _PACKAGE = __name__.partition(".")[0]
 
 
 @dataclass(frozen=True)
-class Straight:
+class Straight(AtKeyframes):
     """States between keyframes by linear interpolation, for one piece of a recording."""
-
-    t: Array  # (K,) s
-    states: States
-    covariance: Array  # (K, 15, 15)
-
-    @property
-    def start(self) -> float:
-        """First time, s."""
-        return float(self.t[0])
-
-    @property
-    def end(self) -> float:
-        """Last time, s."""
-        return float(self.t[-1])
-
-    def list_times(self, rate: float) -> Array:
-        """The times of output, as of the stored solution."""
-        return list_times(self.start, self.end, rate)
 
     def interpolate_blocks(self, t: Array) -> tuple[States, dict[str, Array]]:
         """States, with covariances (6, M) of position, velocity and attitude each by itself."""

@@ -30,17 +30,12 @@ def list_times(start: float, end: float, rate: float) -> Array:
 
 
 @dataclass(frozen=True)
-class Dense:
-    """Callable for `Solution.between`."""
+class AtKeyframes:
+    """What states between the keyframes of one piece of a recording are made of."""
 
-    samples: Samples
-    frame: LocalFrame
-    t: Array  # (K,)
+    t: Array  # (K,) s
     states: States
     covariance: Array  # (K, 15, 15)
-    ba: Array  # (K-1, 3) biases with scale errors, as each interval saw them
-    bg: Array  # (K-1, 3)
-    smooth: bool
 
     @property
     def start(self) -> float:
@@ -55,6 +50,17 @@ class Dense:
     def list_times(self, rate: float) -> Array:
         """Multiples of 1/rate on the recording's clock, and both ends."""
         return list_times(self.start, self.end, rate)
+
+
+@dataclass(frozen=True)
+class Dense(AtKeyframes):
+    """Callable for `Solution.between`."""
+
+    samples: Samples
+    frame: LocalFrame
+    ba: Array  # (K-1, 3) biases with scale errors, as each interval saw them
+    bg: Array  # (K-1, 3)
+    smooth: bool
 
     def __call__(self, t: Array) -> tuple[States, Array]:
         """States and covariances (M, 15, 15) at ascending times from `start` to `end`."""
@@ -137,4 +143,4 @@ def make_dense(problem: Problem, states: States, covariance: Array, scale: Array
         scale = np.broadcast_to(scale, (len(states), scale.shape[-1]))[:-1]
         of_accel, of_gyro = convert_to_biases(scale, problem.intervals.force, problem.intervals.rate)
         ba, bg = ba + of_accel, bg + of_gyro
-    return Dense(problem.samples, problem.frame, problem.t, states, covariance, ba, bg, smooth)
+    return Dense(problem.t, states, covariance, problem.samples, problem.frame, ba, bg, smooth)

@@ -6,6 +6,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -55,6 +56,8 @@ from graphnav.recording.plausibility.screening import screen, state_findings
 SOLVERS = ("ekf", "rts", "batch")  # run when none is named
 KNOWN = ("ekf", "rts", "incremental", "isam2", "batch")
 _CLEARLY_BETTER = 10.0  # half chi-square; a likelihood ratio of 22,000
+
+Attempt = Callable[[Settings, NoiseModel | None], dict[str, Solution]]  # to solve with these
 
 
 def run(
@@ -160,7 +163,8 @@ def _run(
             # matrices here have thirty rows: threads for them cost more than the work, twenty times as much on a busy
             # machine
             with threadpool_limits(limits=1, user_api="blas"):
-                solved = _solve_with_retry(part.recording, settings, frame, solvers, progress, noise, clock)
+                attempt = partial(_solve, part.recording, frame, solvers, progress, clock)
+                solved = _solve_with_retry(attempt, settings, noise)
             found.append(crop_solutions(solved, part))
             del solved
             if len(parts) > 1:
@@ -182,24 +186,16 @@ def _run(
 
 
 @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # what breaks down raises an error that says so
-def _solve_with_retry(
-    recording: Recording,
-    settings: Settings,
-    frame: LocalFrame,
-    solvers: tuple[str, ...],
-    progress: Progress | None,
-    noise: NoiseModel | None,
-    clock: ClockOffsets | None,
-) -> dict[str, Solution]:
-    """`_solve`; where a filter breaks down numerically, again with a simpler model or stated noise."""
+def _solve_with_retry(attempt: Attempt, settings: Settings, noise: NoiseModel | None) -> dict[str, Solution]:
+    """An attempt; where a filter breaks down numerically, again with a simpler model or stated noise."""
     try:
-        return _solve(recording, settings, frame, solvers, progress, noise, clock)
+        return attempt(settings, noise)
     except (EstimationError, np.linalg.LinAlgError) as error:
         if isinstance(error, EstimationError) and error.key != "solver.breakdown":
             raise
         for other, model, reason in _simplify(settings, noise):
             try:
-                again = _solve(recording, other, frame, solvers, progress, model, clock)
+                again = attempt(other, model)
             except (EstimationError, np.linalg.LinAlgError):
                 continue
             note = Note(reason.key, f"{reason}: {error}")
@@ -229,12 +225,12 @@ def _simplify(settings: Settings, noise: NoiseModel | None) -> Iterator[tuple[Se
 
 def _solve(
     recording: Recording,
-    settings: Settings,
     frame: LocalFrame,
     solvers: tuple[str, ...],
     progress: Progress | None,
-    noise: NoiseModel | None,
     clock: ClockOffsets | None,
+    settings: Settings,
+    noise: NoiseModel | None,
 ) -> dict[str, Solution]:
     began = time.perf_counter()
     recording, undone = remove_onboard_offset(recording, settings)

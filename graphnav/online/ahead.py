@@ -74,9 +74,8 @@ def predict_since(
         of_accel, of_gyro = convert_to_biases(scale, *mean)
         ba, bg = ba + of_accel, bg + of_gyro
     ends, both = np.array([T, now.t]), np.stack([newest.covariance[:DIM, :DIM], now.covariance])
-    between = Dense(
-        bridge_gaps(imu), frame, ends, States.stack([start, now.state]), both, ba, bg, smooth=False
-    )  # fmt: skip
+    states = States.stack([start, now.state])
+    between = Dense(ends, states, both, bridge_gaps(imu), frame, ba, bg, smooth=False)
     return t, *between(t)
 
 
