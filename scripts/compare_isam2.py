@@ -27,12 +27,12 @@ import oracle
 from benchmark_online import LAP, RATE, build_with_noise, memory_mb
 
 from graphnav.config import Settings
+from graphnav.core.progress import Progress
 from graphnav.estimation.factor_graph.isam import isam2
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import Solution
 from graphnav.estimation.solvers.ekf import ekf
 from graphnav.estimation.solvers.incremental import Replay, incremental
-from graphnav.estimation.solvers.passes import Progress
 
 LAG = 120.0
 BLOCK = 600.0  # s

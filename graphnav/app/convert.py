@@ -93,7 +93,7 @@ def _add_measured_noise(log: Log) -> Log:
     figures = ", ".join(f"{key} = {value:g}" for key, value in found.items())
     remark = Note(
         "imu.noise_measured",
-        f"noise: {figures} measured, between its quietest and usual state; the other figures are of a consumer IMU",
+        f"noise: {figures} measured between its quietest and usual state; the other figures are of a consumer IMU",
     )
     noise = replace(imu.noise, **found)
     return replace(log, imu=replace(imu, noise=noise, noise_assumed=False), remarks=(*log.remarks, remark))

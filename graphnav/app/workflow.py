@@ -299,7 +299,7 @@ def list_unused_noise(noise: NoiseModel, solution: Solution) -> list[str]:
     have = dict.fromkeys(INTERVALS, solution.t) | {name: record.t for name, record in solution.records.items()}
     named = {group.split(".")[0] for group in noise.figures} - {"imu"} | set(noise.weights) | set(noise.excluded)
     notes: list[str] = [
-        Note("noise.file.unused", f"noise model: figures of {name}, which this recording does not use")
+        Note("noise.file.unused", f"noise model: figures of {name}, which are not used for this recording")
         for name in sorted(named - set(have))
     ]
     for name, some in noise.weights.items():

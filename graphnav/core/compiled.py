@@ -23,7 +23,8 @@ def can_compile() -> bool:
 def compile_once(function: Function) -> Function:
     """The function, compiled when it is called first.
 
-    Those that call each other stand in one module: what is kept on disk is as old as the module it is of.
+    Those that call each other stand in one module: what is kept on disk is as old as the module it is of. They take
+    numbers and arrays only: what is kept for another type names its class, and fails where that has another name now.
     """
     if not can_compile():
         return function

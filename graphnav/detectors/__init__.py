@@ -69,9 +69,7 @@ def detect(recording: Recording, settings: Settings | None = None, since: float 
         idle = [name for name in d.fire if name not in fire and name != FUSED]
         stances = detect_stances(recording.imu, scene.period, d.stance, fire, since)
         idle += [kind.name for kind in recording.own.detectors]
-        more = (
-            (Note("detectors.vehicles_only", f"{', '.join(idle)}: of vehicles only, finds no stance"),) if idle else ()
-        )
+        more = (Note("detectors.vehicles_only", f"{', '.join(idle)}: not used on a foot"),) if idle else ()
         return Detections(stances.stationary, stances.all, (*d.notes, *more, *stances.notes))
     if not recording.duration >= _SHORTEST_RECORDING or not scene.period > 0.0:
         return Detections(

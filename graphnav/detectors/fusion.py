@@ -162,8 +162,8 @@ def find_candidates(scene: Scene, found: Detection, row: Scale) -> tuple[Array, 
         notes.append(
             Note(
                 "detectors.still_in_motion",
-                f"{100.0 * share:.0f} % of the seconds in certain motion are as still as a stop (a simulation without "
-                "road?): a stop needs a measured speed as well, which leaves out "
+                f"{100.0 * share:.0f} % of the seconds in certain motion are as quiet as a stop (a simulation without "
+                "a road?): a stop needs a measured speed as well, which leaves out "
                 f"{format_count(int(unseen.sum()), 'stretch', 'stretches')}",
             )
         )

@@ -74,7 +74,7 @@ def detect_stances(
             notes.append(
                 Note(
                     "detectors.stance.lulls",
-                    f"{short} less quiet than the stances left out",
+                    f"{short} left out: less quiet than the stances",
                 )
             )
         begin = int(np.searchsorted(deep[:, 1], since)) if len(deep) else 0

@@ -29,7 +29,7 @@ def find_fault_spans(problem: Problem, smoothed: SmootherPass | None = None) -> 
         for run in np.split(lost, np.flatnonzero(np.diff(lost) > 1) + 1):
             reason = ""
             if off is not None:
-                reason = f"{np.median(off[run]):.2g} {rows.unit} from where everything else puts it"
+                reason = f"{np.median(off[run]):.2g} {rows.unit} from the solution without it"
                 if len(run) > 1:
                     reason += f", {np.max(off[run]):.2g} at most"
             out.append(ExcludedSpan(rows.name, float(t[run[0]]), float(t[run[-1]]), len(run), reason))

@@ -22,8 +22,8 @@ def split_pieces(recording: Recording, settings: Settings) -> tuple[list[Recordi
     notes: list[str] = [
         Note(
             "pieces.cut",
-            f"IMU gap of {t[i + 1] - t[i]:.1f} s at {t[i] - recording.start:.1f} s: cut there, the parts are solved "
-            "apart",
+            f"IMU gap of {t[i + 1] - t[i]:.1f} s at {t[i] - recording.start:.1f} s: divided there, each part is solved "
+            "by itself",
         )
         for i in cuts
     ]

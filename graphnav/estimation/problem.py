@@ -175,7 +175,7 @@ def _build_constraints(scene: BuildContext, ahead: bool | None) -> tuple[Constra
 
 
 def _note_differences(rows: Constraint) -> Constraint:
-    sentence = f"{rows.name}: gives no Jacobians, so they are made of differences, which takes longer"
+    sentence = f"{rows.name}: has no Jacobians; they are computed numerically, which takes longer"
     return replace(rows, notes=(*rows.notes, Note("constraint.differences", sentence)))
 
 
@@ -238,4 +238,8 @@ def _describe_samples(samples: Samples, recording: Recording) -> tuple[str, ...]
     sentence = (
         f"{describe_gaps('the IMU', end - begin, begin - recording.start)}: bridged by the mean of the neighbours"
     )
-    return (Note("imu.gaps_bridged", f"{sentence}, with the error that this has elsewhere in the recording as noise"),)
+    return (
+        Note(
+            "imu.gaps_bridged", f"{sentence}, with the error of such a bridge elsewhere in the recording as its noise"
+        ),
+    )

@@ -175,7 +175,7 @@ def _shift(path: Path, track: Trajectory, recording: Recording, reference: Solut
             [
                 Note(
                     "against.clock",
-                    f"{path.name}: stamps shifted by {own_start:+.3f} s: they count from the file's own start",
+                    f"{path.name}: stamps shifted by {own_start:+.3f} s: they are counted from the start of the file",
                 )
             ],
         )

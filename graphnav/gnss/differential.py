@@ -68,7 +68,7 @@ def add_differences(rover: RawGnss, base: RawGnss, position: Array) -> tuple[Raw
     missing = np.isnan(difference) & np.isfinite(rover.code) & np.isfinite(rover.p[:, 0])
     notes: tuple[str, ...] = ()
     if missing.any():
-        sentence = f"codes not used because the base has no counterpart: {int(missing.sum())} of {len(rover)}"
+        sentence = f"codes without a counterpart at the base, not used: {int(missing.sum())} of {len(rover)}"
         notes = (Note("raw.without_base", sentence),)
     away = float(np.linalg.norm(np.median(rover.antenna, axis=0) - position))
     return replace(

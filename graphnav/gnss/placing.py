@@ -70,7 +70,9 @@ def place(
     mute = sorted({int(x) for x in np.unique(obs.satellite[np.isnan(frequency)])} - lost)
     if mute:
         names = ", ".join(name_satellite(x) for x in mute)
-        sentence = f"no frequency channel for {names}: their observations are not used; a GLONASS nav file tells it"
+        sentence = (
+            f"no frequency channel for {names}: their observations are not used; a GLONASS navigation file has it"
+        )
         remarks.append(Note("raw.no_channel", sentence))
     if without:
         names = ", ".join(name_satellite(s) for s in without)
@@ -81,7 +83,7 @@ def place(
     partly = sorted(lost - set(lost_all))
     if partly:
         names = ", ".join(name_satellite(s) for s in partly)
-        sentence = f"no ephemeris near enough in time for a part of the observations of {names}"
+        sentence = f"no ephemeris close enough in time for some observations of {names}"
         remarks.append(Note("raw.no_ephemeris_then", sentence))
     raw = RawGnss(
         t=obs.t, satellite=obs.satellite, signal=obs.signal, code=obs.code, carrier=obs.carrier,

@@ -88,7 +88,7 @@ def join_files(parts: list[Observations]) -> Observations:
 
 def note_cut(name: str, what: str) -> Note:
     """Of a file that ends in the middle of a record."""
-    return Note("raw.cut", f"{name}: is cut off in the middle of a {what}; what is whole before it is used")
+    return Note("raw.cut", f"{name}: ends in the middle of a {what}; everything before it is used")
 
 
 def drop_repeated(obs: Observations) -> Observations:

@@ -119,23 +119,23 @@ def describe_sigma(name: str, errors: Errors) -> Markup:
     measured = join_words(
         [f"{j.block} errors are {j.size:.2f} sigma rms, {100 * j.inside:.1f} % within 3 sigma" for j in shown]
     )
-    measured += " (a Gaussian: 1 and 99.7 %)"
+    measured += " (1 and 99.7 % for Gaussian errors)"
     blocks = join_words([j.block for j in shown])
     if worst and worst[0].verdict == "too small":
         when = " at times" if all(j.inside > 0.9 for j in worst) else ""
         words = f"{name}: the stated sigma is too small{when}, of {blocks}: {measured}."
-        words += " Errors of the truth itself count here as well."
+        words += " Errors of the truth itself are included."
         return page.paragraph(Note("sigma.too_small", words), "verdict bad")
     if worst:
         alike = join_words([format_count(round(j.effective), "independent value") for j in worst])
         words = (
-            f"{name}: whether sigma of {blocks} is consistent stays open: {measured}, but correlated over so long that "
-            f"they count as {alike} only."
+            f"{name}: whether sigma of {blocks} is consistent cannot be told: {measured}, but the errors are "
+            f"correlated for so long that they amount to {alike}."
         )
         return page.paragraph(Note("sigma.unclear", words), "verdict")
     seen = {j.block for j in verdicts}
     unseen = [what for what in ("position", "velocity", "attitude") if what not in seen]
-    rest = f" Nothing is there to judge {join_words(unseen)} by." if unseen else ""
+    rest = f" Not judged: {join_words(unseen)}." if unseen else ""
     if all(j.verdict == "cautious" for j in verdicts):
         return page.paragraph(
             Note("sigma.cautious", f"{name}: the stated sigma is cautious: {measured}.{rest}"), "verdict"
@@ -150,7 +150,7 @@ def describe_sigma_without_truth(solution: Solution) -> Markup:
     missing = f"{solution.solver}: there is no truth to compare with"
     larger, mark = size > TOO_LARGE[kind], ""
     if used < FEWEST_ROWS:
-        note = Note("no_truth.few", f"{missing}, and too few measurements to judge sigma by.")
+        note = Note("no_truth.few", f"{missing}, and there are too few measurements to judge sigma.")
     elif kind == "innovation":
         measured = f"they are {size:.2f} times as large as predicted (RMS; 1 where sigma is true)"
         if larger:
@@ -160,7 +160,7 @@ def describe_sigma_without_truth(solution: Solution) -> Markup:
             words = f"{missing}; the stated sigma looks cautious for the innovations: {measured}."
             note = Note("no_truth.cautious", words)
         else:
-            words, mark = f"{missing}. Innovations speak for the stated sigma: {measured}.", "good"
+            words, mark = f"{missing}. The innovations agree with the stated sigma: {measured}.", "good"
             note = Note("no_truth.consistent", words)
     else:
         measured = f"residuals are {size:.2f} times the measurements' sigma"
@@ -168,7 +168,8 @@ def describe_sigma_without_truth(solution: Solution) -> Markup:
         if larger:
             note, mark = Note("no_truth.residuals_large", f"{missing}, and sigma looks too small: {measured}."), "bad"
         else:
-            words = f"{missing}, and residuals of a fit tell little; a filter's innovations tell more. The {measured}."
+            words = f"{missing}, and the residuals of a fit are a weak test; a filter's innovations are a better one."
+            words += f" The {measured}."
             note = Note("no_truth.residuals_only", words)
     return page.paragraph(note, f"verdict {mark}".strip())
 

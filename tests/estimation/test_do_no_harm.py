@@ -160,7 +160,7 @@ def test_a_share_is_drawn_cell_by_cell(script, tmp_path):
 @pytest.mark.parametrize("doppler", [True, False])
 @pytest.mark.parametrize("sensors", ["gnss", "+nhc", "+odometer"])
 def test_settings_differ_in_what_the_cells_differ_in(script, sensors, doppler):
-    stated, estimated = (script.select_settings(variant, sensors, doppler) for variant in script.VARIANTS)
+    stated, estimated = (script.settings_of(variant, sensors, doppler) for variant in script.VARIANTS)
     for one in (stated, estimated):
         assert one.gnss.velocity is doppler
         assert one.standstill.zero_velocity is one.standstill.held_position is (sensors != "gnss")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -62,7 +63,7 @@ class Drive:
         (taken, lossy), blocks = np.zeros((2, 2 * n), dtype=bool), self.blocks
         recursion.filter_rows(
             0, n, self.e, self.P, self.F, self.decay, self.gap, self.Q, self.added, self.r, self.H, self.variance,
-            self.scale, blocks, self.used, out["ahead"], out["P_ahead"], out["errors"], out["P"],
+            self.scale, *blocks.arrays, self.used, out["ahead"], out["P_ahead"], out["errors"], out["P"],
             out["root"], out["solved"], out["bent"], out["Kt"], out["w"], out["inverse"],
             taken, lossy, np.zeros(1, dtype=int),
         )  # fmt: skip
@@ -152,7 +153,7 @@ def test_a_kernel_weighs_rows_by_what_their_update_leaves(kernel: str) -> None:
     code = {"huber": recursion.HUBER, "cauchy": recursion.CAUCHY}[kernel]
     drive.r *= 5.0
     drive.scale[:] = 1.5
-    drive.blocks = drive.blocks._replace(kernel=np.full(2 * KEYFRAMES, code))
+    drive.blocks = replace(drive.blocks, kernel=np.full(2 * KEYFRAMES, code))
     found = drive.solved()
     for b in np.flatnonzero(drive.used):
         k, lo, hi = b // 2, drive.blocks.begin[b], drive.blocks.end[b]
@@ -180,7 +181,7 @@ def test_a_gate_refuses_what_its_innovation_says() -> None:
     first = int(np.argmax(np.where(drive.used, nis, 0.0)))
     gate = np.full(2 * KEYFRAMES, np.inf)
     gate[first] = 0.99 * nis[first]
-    drive.blocks = drive.blocks._replace(gate=gate)
+    drive.blocks = replace(drive.blocks, gate=gate)
     found = drive.solved()
     assert np.array_equal(found["taken"], drive.used & (np.arange(2 * KEYFRAMES) != first))
     without = Drive()

@@ -45,7 +45,7 @@ def level_at_rest(recording: Recording, settings: Settings, frame: LocalFrame, s
     if gnss is None or not recording.placed:
         # without fixes the first pose defines the frame: position and heading are exact by definition
         p, sd_p, sd_heading = np.zeros(3), np.full(3, 1e-3), 1e-4
-        note = Note("alignment.no_gnss", "no GNSS: levelled at the start, where position and heading are zero")
+        note = Note("alignment.no_gnss", "no GNSS: levelled at the start; position and heading are set to zero there")
         speed, felt = _measure_motion(recording, seconds)
         if abs(speed) > STANDING:
             tilt += felt / 9.8  # levelling takes it for gravity
@@ -54,8 +54,8 @@ def level_at_rest(recording: Recording, settings: Settings, frame: LocalFrame, s
             sd_v = _DRIVING
             note = Note(
                 "alignment.speed_unknown",
-                "no GNSS and no odometer, and it does not stand at the start: the speed there is unknown; position and "
-                "heading are zero",
+                "no GNSS and no odometer, and in motion at the start: the speed there is unknown; position and "
+                "heading are set to zero",
             )
     else:
         sd_p, sd_heading = 10.0 * gnss.sd[0] + 1.0, np.pi

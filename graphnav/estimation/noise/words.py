@@ -48,7 +48,7 @@ def describe_far(problem: Problem, smoothed: Points) -> tuple[str, ...]:
                 Note(
                     "noise.far_from_stated",
                     f"{shown.words}: estimated {found:g} {shown.unit}, stated {given:g} +- {sd:g}, "
-                    f"{away[k]:.0f} sigmas apart: what is stated is wrong, or it absorbs an error of another kind",
+                    f"{away[k]:.0f} sigmas apart: the stated value is wrong, or another error is absorbed by it",
                 )
             )
     return tuple(out)

@@ -151,7 +151,7 @@ class PointFilter:
         try:
             filter_rows(
                 k0, k1, e, P, self.F, self._steps.decay, self.gap, self.Q, self._steps.added,
-                self.r, self.H, self.variance, stack.scale[:n], stack.joint, self.used,
+                self.r, self.H, self.variance, stack.scale[:n], *stack.joint.arrays, self.used,
                 out.predicted, out.P_predicted, out.filtered, out.P,
                 stack.root, stack.solved, stack.bent, updates.Kt, updates.w, updates.inverse,
                 updates.taken, updates.lossy, self._at,
@@ -173,7 +173,7 @@ def filter_likelihood(
     try:
         filter_rows(
             0, n, *start, one.F, steps.decay, one.gap, one.compute_noise(problem, points), steps.added,
-            one.r, one.H, (one.sigma / stack.root_weight) ** 2, stack.scale, stack.joint, stack.joint.used,
+            one.r, one.H, (one.sigma / stack.root_weight) ** 2, stack.scale, *stack.joint.arrays, stack.joint.used,
             e[0], P[0], e[1], P[1], stack.root, stack.solved, stack.bent,
             np.empty((0, M, D)), np.empty((0, M)), np.empty((0, M, M)), taken, lossy, at,
         )  # fmt: skip

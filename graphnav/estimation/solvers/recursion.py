@@ -8,7 +8,7 @@ themselves and on the scale errors of the IMU behind them; each parameter beyond
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -23,7 +23,8 @@ HUBER, CAUCHY = 1, 2
 _LOSSY = 1e4  # times R that H P H^T may be for P - W^T W to keep twelve digits
 
 
-class RowBlocks(NamedTuple):
+@dataclass(frozen=True)
+class RowBlocks:
     """Rows that are taken in at once: those of keyframe k are the blocks `first[k]` to `first[k+1]`."""
 
     first: Array  # (K+1,)
@@ -36,6 +37,11 @@ class RowBlocks(NamedTuple):
     part: Array  # (B+1,) the first of the parts that each is made of
     k: Array  # (B,) keyframe
     kind: Array  # (B,) number of the constraint, of the first where several are taken in together
+
+    @property
+    def arrays(self) -> tuple[Array, Array, Array, Array, Array, Array]:
+        """What `filter_rows` is given: machine code that is kept on disk names no class."""
+        return self.first, self.begin, self.end, self.gate, self.kernel, self.size
 
 
 @compile_once
@@ -168,7 +174,12 @@ def filter_rows(
     H: Array,
     variance: Array,
     scale: Array,
-    blocks: RowBlocks,
+    first: Array,
+    begin: Array,
+    end: Array,
+    gate: Array,
+    kernel: Array,
+    size: Array,
     used: Array,
     errors_predicted: Array,
     P_predicted: Array,
@@ -191,6 +202,7 @@ def filter_rows(
     gap : (n-1, D) where a step leads from a point, less the next point.
     Q, added : (n-1, 15, 15) and (n-1, D-15) as for `predict_covariance`.
     r, H, variance, scale : (n, M), (n, M, D), (n, M), (n, M) of the rows at the points, and of their kernels.
+    first, begin, end, gate, kernel, size : `RowBlocks.arrays`.
     used : (B,) whether a block is taken in; of one that is not there is an innovation only.
     root, solved : (n, M, M), (n, M), filled with roots of S and S^-1 (r + H e), before any kernel.
     bent : (n, M), filled with weights of kernels, 0 of rows that a gate refuses.
@@ -211,24 +223,24 @@ def filter_rows(
             np.positive(P, P_predicted[ahead])
         P = P_predicted[ahead]
         np.positive(e, errors_predicted[k % len(errors_predicted)])
-        for b in range(blocks.first[k], blocks.first[k + 1]):
+        for b in range(first[k], first[k + 1]):
             at[0] = b
-            lo, hi = blocks.begin[b], blocks.end[b]
+            lo, hi = begin[b], end[b]
             own, R = H[k, lo:hi], variance[k, lo:hi]
             HP = np.dot(own, P)
             HPHt = np.dot(HP, own.T)
             left = r[k, lo:hi] + np.dot(own, e)
             L, one = invert_sum(HPHt, R)
             white = np.dot(one, left)
-            refused = np.dot(white, white) > blocks.gate[b]
+            refused = np.dot(white, white) > gate[b]
             taken[b] = used[b] and not refused
             bent[k, lo:hi] = 0.0 if refused else 1.0
             w_b = np.dot(one.T, white)
             np.positive(w_b, solved[k, lo:hi])
             np.positive(L, root[k, lo:hi, lo:hi])
             if taken[b]:
-                if blocks.kernel[b]:
-                    weight = weigh_robustly(HPHt, R, left, w_b, blocks.kernel[b], scale[k, lo:hi], blocks.size[b])
+                if kernel[b]:
+                    weight = weigh_robustly(HPHt, R, left, w_b, kernel[b], scale[k, lo:hi], size[b])
                     np.positive(weight, bent[k, lo:hi])
                     R = R / weight
                     L, one = invert_sum(HPHt, R)

@@ -151,7 +151,7 @@ class StretchFilter:
         filter_rows(
             k - own.start, n, np.zeros(D), P, F, self._steps.decay[steps], gap, Q, self._steps.added[steps],
             r, H, (sigma / stack.root_weight[own]) ** 2, stack.scale[own],
-            blocks._replace(first=blocks.first[own.start : k1 + 1]), blocks.used,
+            blocks.first[own.start : k1 + 1], *blocks.arrays[1:], blocks.used,
             predicted, self._P_predicted[own], errors, self._P[own],
             stack.root[own], stack.solved[own], stack.bent[own], Kt, w, np.empty((0, 0, 0)),
             self._taken, self._lossy, self._at,

@@ -240,7 +240,7 @@ def _compare_wheels(odometer: Odometer, imu: Imu) -> Iterator[Finding]:
             more = "faster" if ratio > 1.0 else "slower"
             yield Finding(
                 "warning",
-                f"the {name} wheel is {100 * abs(ratio - 1):.1f} % {more} than the others on the straight: "
+                f"the {name} wheel is {100 * abs(ratio - 1):.1f} % {more} than the others when driving straight: "
                 "say use in [odometer], to leave its axle out",
                 "odometer.wheel",
             )

@@ -39,7 +39,7 @@ def check_imu_axes(imu: Imu, forward: Fit | None, track: Track | None) -> Iterat
     hint = f'; axes = "{letters}" would agree' if letters else ""
     yield Finding(
         "warning",
-        f"the axes contradict the drive: forward by the GNSS speed is {_describe_direction(ahead)}, up by gravity is "
+        f"the axes disagree with the motion: forward by GNSS speed is {_describe_direction(ahead)}, up by gravity is "
         f"{_describe_direction(up)} in the axes stated{hint}",
         "imu.axes",
     )
@@ -83,8 +83,8 @@ def check_forward_sign(imu: Imu, track: Track | None, forward: Fit | None) -> It
         column = f"a{_name_column(imu, 1)}"
         yield Finding(
             "refused",
-            f"{along} while the sideways force is right: the accelerometer's forward axis is reversed, which no axes "
-            f"in [imu] can say; negate {column} in the file",
+            f"{along} while the sideways force is right: the accelerometer's forward axis is reversed, which axes "
+            f"in [imu] cannot express: negate {column} in the file",
             "imu.forward_reversed",
         )
         return
@@ -147,8 +147,8 @@ def check_sideways(imu: Imu, forward: Fit | None, track: Track, yaw: Fit | None)
         column = f"a{_name_column(imu, 0)}"
         yield Finding(
             "unreliable",
-            f"{out} while the force forward is right: the accelerometer's right axis is reversed, which no axes in "
-            f"[imu] can say; negate {column} in the file",
+            f"{out} while the force forward is right: the accelerometer's right axis is reversed, which axes in "
+            f"[imu] cannot express: negate {column} in the file",
             "imu.sideways_reversed",
         )
         return
@@ -156,7 +156,7 @@ def check_sideways(imu: Imu, forward: Fit | None, track: Track, yaw: Fit | None)
     hint = f' (axes = "{letters}" would agree)' if letters else ""
     yield Finding(
         "warning",
-        f"{out}, and no change of speed tells more: the IMU is built in the other way round{hint}, an axis is "
+        f"{out}, and changes of speed do not show which: the IMU is mounted the other way round{hint}, an axis is "
         "reversed, or the vehicle drives backward",
         "imu.sideways_reversed",
     )
@@ -175,7 +175,7 @@ def check_gyro_tilt(imu: Imu, track: Track) -> Iterator[Finding]:
             yield Finding(
                 "unreliable",
                 f"the gyro {turn} against the tilt that the accelerometer shows ({slope:.2f} +- {sigma:.2f} of it, not "
-                f"1), while its turns are right: one axis is reversed, which no axes in [imu] can say; negate {column} "
+                f"1), while its turns are right: one axis is reversed; axes in [imu] cannot say that: negate {column} "
                 "in the file",
                 "imu.gyro_axis_sign",
             )

@@ -125,9 +125,7 @@ def read_folder(source: str | Path) -> Recording:
         raw, fixes = _load_raw(d.raw_gnss, path, gps_zero, remarks, files)
         if gnss is None:
             gnss = fixes
-            remarks.add(
-                "gnss.of_raw", f"no [gnss]: {len(fixes.t)} single-point fixes of the raw observations stand in for it"
-            )
+            remarks.add("gnss.of_raw", f"no [gnss]: {len(fixes.t)} single-point fixes of the raw observations are used")
     truth = None
     if d.truth and d.truth.closed_loop_sigma:
         truth = Truth(imu.t[[0, -1]], of=d.truth.of, closed_loop_sigma=d.truth.closed_loop_sigma)

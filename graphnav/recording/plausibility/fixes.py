@@ -227,7 +227,7 @@ def check_two_groups(gnss: Gnss, p: Array) -> Iterator[Finding]:
     yield Finding(
         "unreliable",
         f"the fixes are of two groups {size:.0f} m apart ({100 * share.min():.0f} and {100 * share.max():.0f} % of "
-        "them), each consistent in itself: nothing tells which is right, and the result is not to be trusted",
+        "them), each consistent in itself: which of them is right is unknown, and the result cannot be trusted",
         "gnss.two_groups",
     )
 

@@ -345,8 +345,8 @@ def check_dead_axes(recording: Recording) -> Iterator[Finding]:
             unit = "rad/s" if name == "gyro" else "m/s2"
             yield Finding(
                 "refused",
-                f"{name} {_AXIS[axis]} (file axes) reads {value:.4g} {unit} {when} while the others move: it is dead "
-                "or its column was not logged"
+                f"{name} {_AXIS[axis]} (file axes) reads {value:.4g} {unit} {when} while the others vary: it is "
+                "defective or its column was not logged"
                 + ("" if when == "throughout" else "; use what lies before or after (--start, --end)"),
                 "imu.dead_axis",
             )
