@@ -104,11 +104,38 @@ def estimate_without_faults(
     passes = found.passes + decision.passes
     if not decision.noise.excluded:
         return replace(decision.estimate or found, passes=passes)
+    best = _estimate_without(base, opening, decision, found, progress)
+    passes = passes + best.passes
+    before = _list_before(base, best.noise)
+    if before:
+        other = _unmask(base, found, Decision(best.noise, -np.inf), before)
+        passes = passes + other.passes
+        if other.noise.excluded != best.noise.excluded:
+            alternative = other.estimate or _estimate_without(base, opening, other, found, progress)
+            passes = passes + (Counter() if other.estimate else alternative.passes) + Counter(filter=2)
+            best = max(best, alternative, key=lambda one: log_evidence(base, one))
+    return replace(best, passes=passes)
+
+
+def _estimate_without(
+    base: Problem,
+    opening: float | None,
+    decision: Decision,
+    found: NoiseEstimate,
+    progress: Callable[[str, float], None] | None,
+) -> NoiseEstimate:
+    """Estimate without the spans of a decision, and decide again at their ends."""
     # from the priors: figures that were estimated with the fault among the data are far from where they will end
     start = NoiseModel(weights=decision.noise.weights, excluded=decision.noise.excluded)
     near = (decision.estimate or found).linearisation(base)
-    again = estimate_noise(base, opening, start, near, progress)
-    return _readmit(base, replace(again, passes=passes + again.passes))
+    return _readmit(base, estimate_noise(base, opening, start, near, progress))
+
+
+def _list_before(base: Problem, noise: NoiseModel) -> list[Span]:
+    """Spans of fixes before those that a noise model leaves out."""
+    excluded = join(span for kind in FIXES for span in noise.excluded.get(kind, ()))
+    rows = [c.keyframe for c in base.constraints if c.name in FIXES]
+    return list_before(excluded, base.t[np.unique(np.concatenate(rows))]) if excluded else []
 
 
 def find_faults(base: Problem, found: NoiseEstimate) -> Decision:
@@ -126,13 +153,9 @@ def find_faults(base: Problem, found: NoiseEstimate) -> Decision:
     excluded = join(span for kind in FIXES for span in first.noise.excluded.get(kind, ()))
     # the figures found are of repeated fixes, too: where these are wrong, of wrong ones
     wrong = any(are_covered([span], excluded) for span in list_repeats(base.recording))
-    best = first
-    if not are_covered(masked, excluded) or wrong:
-        best = _unmask(base, found, first, split_at_repeats(masked, base.recording))
-    excluded = join(span for kind in FIXES for span in best.noise.excluded.get(kind, ()))
-    rows = [c.keyframe for c in base.constraints if c.name in FIXES]
-    before = list_before(excluded, base.t[np.unique(np.concatenate(rows))]) if excluded else []
-    return _unmask(base, found, best, before) if before else best
+    if are_covered(masked, excluded) and not wrong:
+        return first
+    return _unmask(base, found, first, split_at_repeats(masked, base.recording))
 
 
 def _unmask(base: Problem, found: NoiseEstimate, first: Decision, masked: list[Span]) -> Decision:
