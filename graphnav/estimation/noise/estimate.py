@@ -32,7 +32,7 @@ from graphnav.estimation.noise.apply import row_weights, with_noise
 from graphnav.estimation.noise.initial_points import BREAKDOWN, find_initial_points
 from graphnav.estimation.noise.model import INTERVALS, NoiseModel, RowWeights, VarianceComponent
 from graphnav.estimation.noise.moments import ImuMoments, imu_moments, lag_moments, process_moments, row_moments
-from graphnav.estimation.noise.outliers import CHANCE, cost_of_outliers, limit_scaled, list_reduced
+from graphnav.estimation.noise.outliers import CHANCE, cost_of_outliers, count_rows, limit_scaled, list_reduced
 from graphnav.estimation.noise.priors import TIME_WITHIN, prior
 from graphnav.estimation.problem import ParameterChain, Problem
 from graphnav.estimation.solvers.ekf import refilter
@@ -59,12 +59,8 @@ class NoiseEstimate:
     points: DisturbancePass
     log_posterior: float
     log_prior: float
+    log_evidence: float  # of the measurements: the same less the cost of rows and intervals of reduced weight
     passes: Counter[str]  # over keyframes, of "filter" and "smoother"
-
-    @property
-    def log_evidence(self) -> float:
-        """Of the measurements; each row and interval of reduced weight has the cost of an outlier."""
-        return self.log_posterior + cost_of_outliers(self.noise.weights)
 
     def linearisation(self, base: Problem) -> tuple[Points, Problem]:
         """Its points and the problem that they are of, to start another estimate from."""
@@ -190,7 +186,7 @@ def _iterate(
     intervals: bool,
 ) -> NoiseEstimate:
     """Iterate from initial figures and linearisation points to convergence."""
-    passes, total, converged = 0, len(problem.t), False
+    passes, total, converged, totals = 0, len(problem.t), False, count_rows(problem)
     ends = [total] if total <= 2 * _FIRST or figures.known else [_FIRST, total]
     latest: tuple[ForwardRecord, DisturbancePass] | None = None
     for end in ends:
@@ -205,7 +201,7 @@ def _iterate(
             now = float(np.sum(latest[0].log_likelihood)) + prior_then
             if progress is not None:
                 progress("noise", min((k + 1) / rounds, 1.0))
-            if (evidence := now + cost_of_outliers(figures.weights)) > most:
+            if (evidence := now - cost_of_outliers(figures.weights, totals)) > most:
                 likeliest, most = figures.copy(), evidence
             _improve(figures, used, *latest, end, intervals)
             about = _splice(about, latest[1])
@@ -222,7 +218,8 @@ def _iterate(
         passes, prior_then = passes + 1, figures.log_prior()
         now = float(np.sum(latest[0].log_likelihood)) + prior_then
     assert latest is not None
-    return NoiseEstimate(figures.model(), latest[1], now, prior_then, Counter(filter=passes, smoother=passes))
+    evidence = now - cost_of_outliers(figures.weights, totals)
+    return NoiseEstimate(figures.model(), latest[1], now, prior_then, evidence, Counter(filter=passes, smoother=passes))
 
 
 def _smooth_about(problem: Problem, about: Points) -> tuple[ForwardRecord, DisturbancePass]:

@@ -47,7 +47,7 @@ from graphnav.estimation.noise.estimate import NoiseEstimate, estimate_noise
 from graphnav.estimation.noise.explanations import EXPLANATIONS, FIXES, ONE_SENSOR, ROWS, WHEELS, Explanation, evidence
 from graphnav.estimation.noise.model import INTERVALS, NoiseModel, RowWeights
 from graphnav.estimation.noise.moments import row_moments
-from graphnav.estimation.noise.outliers import OUTLIER_COST, count_reduced, limit_squares
+from graphnav.estimation.noise.outliers import cost_of_one, cost_of_outliers, count_reduced, count_rows, limit_squares
 from graphnav.estimation.noise.spans import (
     LeftOutErrors,
     Span,
@@ -245,7 +245,8 @@ def log_evidence(base: Problem, found: NoiseEstimate) -> float:
     """Of all measurements, excluded ones included; each outlier outside the spans has its cost."""
     spans = join(span for some in found.noise.excluded.values() for span in some)
     whole = decide(base, found, spans, _list_explanations(found.noise)).log_evidence if spans else found.log_posterior
-    return whole - OUTLIER_COST * sum(count_reduced(drop_within(some, spans)) for some in found.noise.weights.values())
+    outside = {name: drop_within(some, spans) for name, some in found.noise.weights.items()}
+    return whole - cost_of_outliers(outside, count_rows(base))
 
 
 def find_spans(base: Problem, noise: NoiseModel, found: NoiseEstimate) -> list[Span]:
@@ -290,9 +291,15 @@ def decide(
     }
     inside[INTERVALS] = {name: some for name, some in noise.weights.items() if name in INTERVALS}
     used = with_noise(base, replace(noise, weights=outside))
+    totals = count_rows(base)
+    each = {name: cost_of_one(some, totals[name]) for name, some in noise.weights.items() if name in totals}
     outliers = {
         kinds: [
-            sum(count_reduced(one) - count_reduced(drop_within(one, [within])) for one in some.values())
+            sum(
+                each[name] * (count_reduced(one) - count_reduced(drop_within(one, [within])))
+                for name, one in some.items()
+                if name in each
+            )
             for within in (reach if kinds == INTERVALS else spans)
         ]
         for kinds, some in inside.items()
@@ -309,11 +316,11 @@ def decide(
     dropped: dict[str, list[Span]] = {name: [] for name in noise.weights}
     for k, span in enumerate(spans):
         cost = np.array([0.0 if not kinds or kinds in _SINGLE else _FAULT_COST for kinds in EXPLANATIONS])
-        for kinds, count in outliers.items():
-            cost[EXPLANATIONS.index(kinds)] += OUTLIER_COST * count[k] if count[k] or kinds not in _SINGLE else np.inf
-        each = likelihood[k] - cost
-        best = EXPLANATIONS[int(np.argmax(each))]
-        total += float(np.max(each))
+        for kinds, more in outliers.items():
+            cost[EXPLANATIONS.index(kinds)] += more[k] if more[k] or kinds not in _SINGLE else np.inf
+        posterior = likelihood[k] - cost
+        best = EXPLANATIONS[int(np.argmax(posterior))]
+        total += float(np.max(posterior))
         for name in noise.weights.keys() - inside.get(best, {}).keys():
             dropped[name].append(reach[k] if name in INTERVALS else span)
         if best not in _SINGLE:
