@@ -290,3 +290,16 @@ def test_estimated_noise_does_no_harm(script, verdict, shared_data, tmp_path):
     rows = [row for job in jobs for row in script.solve(job)]
     found = [one for one in verdict.broken(rows) if one.bound != "time"]
     assert not found, "\n".join(map(str, found))
+
+
+@pytest.mark.parametrize(("start", "sensors"), [(693.1, "+odometer"), (701.3, "gnss")])
+def test_fixes_before_a_step_may_be_the_wrong_ones(script, shared_data, start, sensors):
+    """Reflections move single-point fixes for ten seconds, slowly at first, until they step back to where they belong:
+    those behind the step are right.
+    """
+    part = graphnav.load(str(shared_data / "tokyo_20201105" / "recording_spp.toml")).crop(start, start + 100.0)
+    part = part if sensors == "+odometer" else part.without("odometer")
+    found = graphnav.run(part, script.settings_of("estimated", sensors), ("ekf",))["ekf"]
+    counted = script.left_out(part, found)
+    assert counted["left_out"] > 0
+    assert counted["confirmed_left_out"] <= 0.01 * counted["confirmed"]

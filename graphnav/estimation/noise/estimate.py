@@ -38,7 +38,7 @@ from graphnav.estimation.noise.moments import (
     collect_row_moments,
     lag_moments,
 )
-from graphnav.estimation.noise.outliers import CHANCE, compute_outlier_cost, limit_scaled, list_reduced
+from graphnav.estimation.noise.outliers import CHANCE, compute_outlier_cost, count_rows, limit_scaled, list_reduced
 from graphnav.estimation.noise.priors import TIME_WITHIN, get_prior
 from graphnav.estimation.problem import ParameterChain, Problem
 from graphnav.estimation.solvers.ekf import refilter
@@ -65,12 +65,8 @@ class NoiseEstimate:
     points: DisturbancePass
     log_posterior: float
     log_prior: float
+    log_evidence: float  # of the measurements: the same less the cost of rows and intervals of reduced weight
     passes: Counter[str]  # over keyframes, of "filter" and "smoother"
-
-    @property
-    def log_evidence(self) -> float:
-        """Of the measurements; each row and interval of reduced weight has the cost of an outlier."""
-        return self.log_posterior + compute_outlier_cost(self.noise.weights)
 
     def get_linearisation(self, base: Problem) -> tuple[Points, Problem]:
         """Its points and the problem that they are of, to start another estimate from."""
@@ -198,7 +194,7 @@ def _iterate(
     intervals: bool,
 ) -> NoiseEstimate:
     """Iterate from initial figures and linearisation points to convergence."""
-    passes, total, converged = 0, len(problem.t), False
+    passes, total, converged, totals = 0, len(problem.t), False, count_rows(problem)
     ends = [total] if total <= 2 * _FIRST_KEYFRAMES or figures.known else [_FIRST_KEYFRAMES, total]
     latest: tuple[ForwardRecord, DisturbancePass] | None = None
     for end in ends:
@@ -213,7 +209,7 @@ def _iterate(
             now = float(np.sum(latest[0].log_likelihood)) + prior_then
             if progress is not None:
                 progress("noise", min((k + 1) / rounds, 1.0))
-            if (evidence := now + compute_outlier_cost(figures.weights)) > most:
+            if (evidence := now - compute_outlier_cost(figures.weights, totals)) > most:
                 likeliest, most = figures.copy(), evidence
             _improve(figures, used, *latest, end, intervals)
             about = _splice(about, latest[1])
@@ -230,7 +226,10 @@ def _iterate(
         passes, prior_then = passes + 1, figures.log_prior()
         now = float(np.sum(latest[0].log_likelihood)) + prior_then
     assert latest is not None
-    return NoiseEstimate(figures.build_model(), latest[1], now, prior_then, Counter(filter=passes, smoother=passes))
+    evidence = now - compute_outlier_cost(figures.weights, totals)
+    return NoiseEstimate(
+        figures.build_model(), latest[1], now, prior_then, evidence, Counter(filter=passes, smoother=passes)
+    )
 
 
 def _smooth_about(problem: Problem, about: Points) -> tuple[ForwardRecord, DisturbancePass]:

@@ -55,7 +55,13 @@ from graphnav.estimation.noise.explanations import (
 )
 from graphnav.estimation.noise.model import INTERVALS, NoiseModel, RowWeights
 from graphnav.estimation.noise.moments import collect_row_moments
-from graphnav.estimation.noise.outliers import OUTLIER_COST, count_reduced, limit_squares
+from graphnav.estimation.noise.outliers import (
+    compute_outlier_cost,
+    cost_of_one,
+    count_reduced,
+    count_rows,
+    limit_squares,
+)
 from graphnav.estimation.noise.spans import (
     LeftOutErrors,
     Span,
@@ -112,11 +118,38 @@ def estimate_without_faults(
     passes = found.passes + decision.passes
     if not decision.noise.excluded:
         return replace(decision.estimate or found, passes=passes)
+    best = _estimate_without(base, opening, decision, found, progress)
+    passes = passes + best.passes
+    before = _list_before(base, best.noise)
+    if before:
+        other = _unmask(base, found, Decision(best.noise, -np.inf), before)
+        passes = passes + other.passes
+        if other.noise.excluded != best.noise.excluded:
+            alternative = other.estimate or _estimate_without(base, opening, other, found, progress)
+            passes = passes + (Counter() if other.estimate else alternative.passes) + Counter(filter=2)
+            best = max(best, alternative, key=lambda one: log_evidence(base, one))
+    return replace(best, passes=passes)
+
+
+def _estimate_without(
+    base: Problem,
+    opening: float | None,
+    decision: Decision,
+    found: NoiseEstimate,
+    progress: Callable[[str, float], None] | None,
+) -> NoiseEstimate:
+    """Estimate without the spans of a decision, and decide again at their ends."""
     # from the priors: figures that were estimated with the fault among the data are far from where they will end
     start = NoiseModel(weights=decision.noise.weights, excluded=decision.noise.excluded)
     near = (decision.estimate or found).get_linearisation(base)
-    again = estimate_noise(base, opening, start, near, progress)
-    return _readmit(base, replace(again, passes=passes + again.passes))
+    return _readmit(base, estimate_noise(base, opening, start, near, progress))
+
+
+def _list_before(base: Problem, noise: NoiseModel) -> list[Span]:
+    """Spans of fixes before those that a noise model leaves out."""
+    excluded = join(span for kind in FIXES for span in noise.excluded.get(kind, ()))
+    rows = [c.keyframe for c in base.constraints if c.name in FIXES]
+    return list_before(excluded, base.t[np.unique(np.concatenate(rows))]) if excluded else []
 
 
 def decide_faults(base: Problem, found: NoiseEstimate) -> Decision:
@@ -134,13 +167,9 @@ def decide_faults(base: Problem, found: NoiseEstimate) -> Decision:
     excluded = join(span for kind in FIXES for span in first.noise.excluded.get(kind, ()))
     # the figures found are of repeated fixes, too: where these are wrong, of wrong ones
     wrong = any(are_covered([span], excluded) for span in list_repeats(base.recording))
-    best = first
-    if not are_covered(masked, excluded) or wrong:
-        best = _unmask(base, found, first, split_at_repeats(masked, base.recording))
-    excluded = join(span for kind in FIXES for span in best.noise.excluded.get(kind, ()))
-    rows = [c.keyframe for c in base.constraints if c.name in FIXES]
-    before = list_before(excluded, base.t[np.unique(np.concatenate(rows))]) if excluded else []
-    return _unmask(base, found, best, before) if before else best
+    if are_covered(masked, excluded) and not wrong:
+        return first
+    return _unmask(base, found, first, split_at_repeats(masked, base.recording))
 
 
 def _unmask(base: Problem, found: NoiseEstimate, first: Decision, masked: list[Span]) -> Decision:
@@ -230,7 +259,8 @@ def log_evidence(base: Problem, found: NoiseEstimate) -> float:
     """Of all measurements, excluded ones included; each outlier outside the spans has its cost."""
     spans = join(span for some in found.noise.excluded.values() for span in some)
     whole = explain(base, found, spans, _list_explanations(found.noise)).log_evidence if spans else found.log_posterior
-    return whole - OUTLIER_COST * sum(count_reduced(drop_within(some, spans)) for some in found.noise.weights.values())
+    outside = {name: drop_within(some, spans) for name, some in found.noise.weights.items()}
+    return whole - compute_outlier_cost(outside, count_rows(base))
 
 
 def find_suspects(base: Problem, noise: NoiseModel, found: NoiseEstimate) -> list[Span]:
@@ -275,9 +305,15 @@ def explain(
     }
     inside[INTERVALS] = {name: some for name, some in noise.weights.items() if name in INTERVALS}
     used = apply_noise(base, replace(noise, weights=outside))
+    totals = count_rows(base)
+    each = {name: cost_of_one(some, totals[name]) for name, some in noise.weights.items() if name in totals}
     outliers = {
         kinds: [
-            sum(count_reduced(one) - count_reduced(drop_within(one, [within])) for one in some.values())
+            sum(
+                each[name] * (count_reduced(one) - count_reduced(drop_within(one, [within])))
+                for name, one in some.items()
+                if name in each
+            )
             for within in (reach if kinds == INTERVALS else spans)
         ]
         for kinds, some in inside.items()
@@ -294,11 +330,11 @@ def explain(
     dropped: dict[str, list[Span]] = {name: [] for name in noise.weights}
     for k, span in enumerate(spans):
         cost = np.array([0.0 if not kinds or kinds in _BY_ROWS else _FAULT_COST for kinds in EXPLANATIONS])
-        for kinds, count in outliers.items():
-            cost[EXPLANATIONS.index(kinds)] += OUTLIER_COST * count[k] if count[k] or kinds not in _BY_ROWS else np.inf
-        each = likelihood[k] - cost
-        best = EXPLANATIONS[int(np.argmax(each))]
-        total += float(np.max(each))
+        for kinds, more in outliers.items():
+            cost[EXPLANATIONS.index(kinds)] += more[k] if more[k] or kinds not in _BY_ROWS else np.inf
+        posterior = likelihood[k] - cost
+        best = EXPLANATIONS[int(np.argmax(posterior))]
+        total += float(np.max(posterior))
         for name in noise.weights.keys() - inside.get(best, {}).keys():
             dropped[name].append(reach[k] if name in INTERVALS else span)
         if best not in _BY_ROWS:

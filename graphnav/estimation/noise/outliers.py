@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from scipy.special import chdtri
+from scipy.special import betaln, chdtri
 
 from graphnav.core.rotation import Array
-from graphnav.estimation.noise.model import RowWeights
+from graphnav.estimation.noise.model import INTERVALS, RowWeights
+from graphnav.estimation.problem import Problem
 
 CHANCE = 1e-3  # probability of a larger squared error, below which a row is an outlier
 OUTLIER_COST = -float(np.log(CHANCE))  # negative log-probability of one outlier beforehand
@@ -41,6 +42,22 @@ def count_reduced(some: RowWeights) -> int:
     return int(np.sum(some.weight < 1.0))
 
 
-def compute_outlier_cost(weights: Mapping[str, RowWeights]) -> float:
-    """Log-probability beforehand of as many outliers as there are reduced weights."""
-    return float(np.log(CHANCE)) * sum(count_reduced(some) for some in weights.values())
+def count_rows(problem: Problem) -> dict[str, int]:
+    """How many rows may be outliers, by constraint and by `INTERVALS`."""
+    return {c.name: len(c) for c in problem.constraints} | dict.fromkeys(INTERVALS, len(problem.t) - 1)
+
+
+def compute_outlier_cost(weights: Mapping[str, RowWeights], totals: Mapping[str, int]) -> float:
+    """Negative log-probability beforehand of as many outliers as there are reduced weights, less that of none.
+
+    How often a sensor has outliers is unknown. With a Beta prior of 1 and 1 / `CHANCE`, its mean `CHANCE`, k given ones
+    of n rows are outliers with a probability of B(k + 1, n - k + 1 / `CHANCE`) / B(1, 1 / `CHANCE`).
+    """
+    some = [(float(count_reduced(one)), totals[name] + 1.0 / CHANCE) for name, one in weights.items() if name in totals]
+    return sum((float(betaln(1.0, n) - betaln(k + 1.0, n - k)) for k, n in some), 0.0)
+
+
+def cost_of_one(some: RowWeights, total: int) -> float:
+    """The cost of the latest of some outliers among all rows of a sensor."""
+    k = max(count_reduced(some), 1)
+    return float(np.log((total - k + 1.0 / CHANCE) / k))
