@@ -14,6 +14,7 @@ from graphnav import load
 from graphnav.config import Settings, parse_settings
 from graphnav.core.rotation import Array
 from graphnav.core.trajectory import Trajectory
+from graphnav.estimation.noise.apply import row_weights
 from graphnav.estimation.noise.model import NoiseModel
 from graphnav.estimation.pipeline import run
 from graphnav.estimation.solution import Solution
@@ -183,7 +184,6 @@ def test_single_point_fixes_among_high_houses(high_houses: dict[str, Errors], na
     assert float(np.nanmean(high_houses[name].nees_p)) / 3.0 < 2.0
 
 
-@pytest.mark.xfail(strict=True, reason="NEES 0.11 and 0.25: of two explanations the one with more that lasts for hours")
 @pytest.mark.parametrize("name", ["ekf", "batch"])
 def test_sigmas_of_single_point_fixes_among_high_houses(high_houses: dict[str, Errors], name: str) -> None:
     assert float(np.nanmean(high_houses[name].nees_p)) / 3.0 > 0.25
@@ -229,8 +229,10 @@ def test_an_imu_far_worse_than_stated_is_not_taken_for_bad_fixes(shared_data: Pa
 
 def test_wheels_tell_errors_that_last_from_a_bad_imu(many_houses: tuple[Recording, dict[str, Solution]]) -> None:
     """Most fixes contradict the filter; the other explanation is an IMU ten times as bad."""
-    noise = many_houses[1]["batch"].noise
-    assert whole(noise, "gnss_position", "horizontal") > 2.0
+    recording, solutions = many_houses
+    noise = solutions["batch"].noise
+    assert recording.gnss is not None
+    assert np.mean(row_weights(recording.gnss.t, noise, "gnss_position") < 0.5) > 0.1
     assert 2.0 < noise.times["gnss_error_of_seconds"] < 8.0
     assert times(noise, "imu.gyro_noise_density") < 2.0
     assert times(noise, "imu.accel_noise_density") < 7.0
