@@ -241,12 +241,15 @@ def test_the_reference_says_what_goes_in_and_comes_out(name):
     """Of every function: each parameter by its name, and what is returned; of every class and field: something."""
     found = pkgutil.resolve_name(name)
     own = [v for k, v in vars(found).items() if not k.startswith("_") and getattr(v, "__module__", "") == name]
-    for one in own if inspect.ismodule(found) else [found]:
+    own = own if inspect.ismodule(found) else [found]
+    methods = [getattr(c, k) for c in own if inspect.isclass(c) for k in vars(c) if not k.startswith("_")]
+    for one in (*own, *(m for m in methods if inspect.isfunction(m) or inspect.ismethod(m))):
         text = inspect.getdoc(one) or ""
         assert text, one
-        if inspect.isfunction(one):
+        if inspect.isfunction(one) or inspect.ismethod(one):
             signature = inspect.signature(one)
-            missing = [p for p in signature.parameters if not re.search(rf"^\*?\*?(?:\w+, )*{p}\b", text, re.MULTILINE)]
+            given = [p for p in signature.parameters if p not in ("self", "cls")]
+            missing = [p for p in given if not re.search(rf"^\*?\*?(?:\w+, )*{p}\b", text, re.MULTILINE)]
             assert not missing, f"{one.__name__}: {missing}"
             assert "Returns\n-------" in text or signature.return_annotation == "None", one.__name__
 

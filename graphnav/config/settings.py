@@ -129,7 +129,18 @@ class Settings(Section):
         return {name: one for name, one in sensors.items() if one != default}
 
     def get_sensor(self, name: str) -> SensorSettings:
-        """How a sensor is used; the defaults where nothing is set."""
+        """How a sensor is used.
+
+        Parameters
+        ----------
+        name
+            Of the sensor.
+
+        Returns
+        -------
+        SensorSettings
+            Defaults where nothing is set.
+        """
         return self.sensors.get(name, SensorSettings())
 
     @model_validator(mode="before")
@@ -146,5 +157,11 @@ class Settings(Section):
         return merged
 
     def without_wheels(self) -> Settings:
-        """The same settings without any assumption about wheels."""
+        """The settings without any assumption about wheels.
+
+        Returns
+        -------
+        Settings
+            Neither odometer nor NHC.
+        """
         return self.model_copy(update={"vehicle": self.vehicle.model_copy(update={"nhc": False, "odometer": False})})

@@ -49,7 +49,7 @@ def check_own(kinds: Sequence[type[Constraint]]) -> tuple[type[Constraint], ...]
         if kind.linearize is Constraint.linearize and kind.residual is Constraint.residual:
             missing.append("residual (or linearize)")
         if kind.watched and kind.compute_typical_error is Constraint.compute_typical_error:
-            missing.append("typical_error (it is watched)")
+            missing.append("compute_typical_error (it is watched)")
         if missing:
             raise ConfigError(f"{what} lacks {', '.join(missing)}", key="class.incomplete")
         if kind.name in taken:

@@ -195,23 +195,56 @@ class Constraint(ABC):
         return {}
 
     def list_noise_groups(self) -> tuple[tuple[str, ...], Array]:
-        """Names of the variance components of the rows, and the component of each number (N, m); -1 for none."""
+        """The variance components of the rows.
+
+        Returns
+        -------
+        names : tuple of str
+        component : array
+            (N, m) number of that of each number, -1 for none.
+        """
         names = tuple(dict.fromkeys(self.noise_axes))
         index = [names.index(axis) for axis in self.noise_axes] or [-1] * len(self.axes)
         return tuple(f"{self.name}.{name}" for name in names), np.tile(index, (len(self), 1))
 
     def compute_typical_error(self) -> Array:
-        """(m,) typical 1-sigma of a whole error, white and time-correlated, of watched rows."""
+        """Typical error of watched rows.
+
+        Returns
+        -------
+        array
+            (m,) 1-sigma of the whole error, white and time-correlated.
+        """
         raise NotImplementedError(f"{self.name}: rows that are watched say what their errors usually are")
 
     def convert_units(self, typical: TypicalSigmas) -> Self:
-        """The rows with time-correlated errors in the units of the whole drive, of which they are a part; fixes
-        only.
+        """Rows of a part of a drive with time-correlated errors in the units of the whole; fixes only.
+
+        Parameters
+        ----------
+        typical
+            Typical sigmas of the drive.
+
+        Returns
+        -------
+        Constraint
+            These rows, where they are none of fixes.
         """
         return self
 
     def scale_of(self, rows: slice | Array) -> float | Array:
-        """Scale of the kernel for some rows."""
+        """Scale of the robust kernel.
+
+        Parameters
+        ----------
+        rows
+            Which of the N rows.
+
+        Returns
+        -------
+        float or array
+            One for all, or (n,).
+        """
         return self.robust_scale[rows] if isinstance(self.robust_scale, np.ndarray) else self.robust_scale
 
     @classmethod
@@ -288,7 +321,12 @@ class Constraint(ABC):
         return Linearized(self.residual(states, parameters, rows), jacobians, sigma[rows])
 
     def residual(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> Array:
-        """Residuals of some rows, for a constraint that is differentiated numerically; parameters as of `linearize`.
+        """Residuals of some rows, for a constraint that is differentiated numerically.
+
+        Parameters
+        ----------
+        states, parameters, rows
+            As of `linearize`.
 
         Returns
         -------

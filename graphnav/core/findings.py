@@ -28,7 +28,13 @@ class Finding:
     key: str = ""  # a stable identifier, such as "imu.spike"
 
     def to_dict(self) -> dict[str, str]:
-        """The finding as a dictionary, for JSON."""
+        """The finding for JSON.
+
+        Returns
+        -------
+        dict
+            key, severity and sentence.
+        """
         return {"key": self.key, "severity": self.severity, "sentence": self.sentence}
 
 

@@ -154,5 +154,16 @@ class States:
 
     @staticmethod
     def stack(rows: list[States]) -> States:
-        """Stack single states into one struct of arrays."""
+        """Stack states.
+
+        Parameters
+        ----------
+        rows
+            Of one keyframe or several each.
+
+        Returns
+        -------
+        States
+            One struct of arrays.
+        """
         return States(*(np.concatenate([getattr(s, f) for s in rows]) for f in ("R_nb", "p", "v", "ba", "bg")))

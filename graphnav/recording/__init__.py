@@ -198,7 +198,18 @@ class Recording:
         return {name: sensor for name, sensor in own.items() if sensor is not None}
 
     def is_tight(self, coupling: str) -> bool:
-        """Whether raw observations are used in place of the fixes, by `raw_gnss.coupling` of the settings."""
+        """Whether raw observations are used in place of the fixes.
+
+        Parameters
+        ----------
+        coupling
+            `raw_gnss.coupling` of the settings.
+
+        Returns
+        -------
+        bool
+            True for tight coupling.
+        """
         if self.raw_gnss is None or coupling == "loose":
             return False
         return coupling == "tight" or self.gnss is None or self.gnss.derived

@@ -32,7 +32,13 @@ class Simulated:
     motion: TrueMotion | None = field(default=None, repr=False)  # with the error-free samples
 
     def format(self) -> str:
-        """One line for people."""
+        """The drive in words.
+
+        Returns
+        -------
+        str
+            One line.
+        """
         imu, stopped = self.recording.imu, float(np.sum(np.diff(self.stops)))
         return (
             f"{self.recording.name}: {self.recording.duration:.1f} s, IMU at {1.0 / np.median(np.diff(imu.t)):.4g} Hz, "

@@ -131,7 +131,7 @@ def test_an_own_detector_suffices_by_itself(drive):
         ([Differenced, Differenced], [], "name_taken", "differenced"),
         ([type("Nameless", (Differenced,), {"name": "nhc"})], [], "name_taken", "nhc"),
         ([type("Unfinished", (Constraint,), {"name": "u", "axes": ("x",), "unit": "m"})], [], "incomplete", "build"),
-        ([type("Silent", (Differenced,), {"name": "s", "watched": True})], [], "incomplete", "typical_error"),
+        ([type("Silent", (Differenced,), {"name": "s", "watched": True})], [], "incomplete", "compute_typical_error"),
     ],
 )
 def test_what_is_not_complete_is_refused(drive, constraints, detectors, key, name):

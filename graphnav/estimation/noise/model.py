@@ -70,7 +70,20 @@ class NoiseModel:
     stamps: StampOffsets = StampOffsets()
 
     def get_factor(self, group: str, missing: float) -> float:
-        """On the variance of a group; `missing` where nothing is said of it."""
+        """The factor on the variance of a group.
+
+        Parameters
+        ----------
+        group
+            Name of a variance component.
+        missing
+            What is returned where the model has no figure of it.
+
+        Returns
+        -------
+        float
+            Estimated over stated variance.
+        """
         return self.figures[group].factor if group in self.figures else missing
 
 

@@ -88,12 +88,24 @@ class Inspection:
         refuse(self.recording, self.findings)
 
     def to_dict(self) -> dict[str, Any]:
-        """The inspection for JSON."""
+        """The inspection for JSON.
+
+        Returns
+        -------
+        dict
+            Facts by sensor, and findings.
+        """
         findings = [f.to_dict() for f in self.findings]
         return {"name": self.name, "platform": self.platform, **self.facts, "findings": findings}
 
     def format(self) -> str:
-        """The inspection as several lines of text."""
+        """The inspection for a terminal.
+
+        Returns
+        -------
+        str
+            Several lines.
+        """
         lines = [f"{self.name} ({self.platform})"]
         for sensor, facts in self.facts.items():
             shown = ", ".join(_show(name, value) for name, value in facts.items())
