@@ -98,6 +98,7 @@ class Detector(ABC):
 
         Parameters
         ----------
+        scene : the recording, and what several detectors need of it.
         labels : what the others find still and moving, to learn from; a detector that decides alone has none.
         shown : whether its statistic is wanted where it decides nothing.
 
