@@ -1,7 +1,7 @@
 """On which drive does a chosen constant hang? Each halved and doubled over windows of all drives, one left out in turn.
 
     python scripts/constants.py --data ../shared/data
-    python scripts/constants.py --data ../shared/data --only CHANCE,WIDE --length 300
+    python scripts/constants.py --data ../shared/data --only CHANCE,SIZES --length 300
 
 The figures that are estimated from a recording rest on some that are not: probabilities, priors, physics, and how long
 the computing may take. The table shows for each of these the horizontal errors of filter and smoother (the geometric
@@ -70,7 +70,7 @@ CONSTANTS = (
     ),
     Constant(
         f"{NOISE}.estimate",
-        "_FIRST",
+        "_FIRST_KEYFRAMES",
         "computing: figures from so many keyframes are good to a twentieth",
         2.0,
         whole=True,
@@ -91,18 +91,18 @@ CONSTANTS = (
         f"{SOLVERS}.watch", "FALSE_ALARM", "probability: one drive in a hundred of an hour, of Gaussian errors", 100.0
     ),
     Constant(f"{SOLVERS}.watch", "_ONSET", "95 % of chi-square of one degree of freedom"),
-    Constant(f"{SOLVERS}.watch", "WIDE", "m, m/s: reflections in a city, and speeds in one"),
+    Constant(f"{SOLVERS}.watch", "SIZES", "m, m/s: reflections in a city, and speeds in one"),
     Constant(f"{SOLVERS}.watch", "MINUTE", "s, in which an error may grow by as much as it can be"),
-    Constant(f"{SOLVERS}.watch", "LONGEST", "s: what inertial sensors knew before says little"),
+    Constant(f"{SOLVERS}.watch", "OLDEST", "s: what inertial sensors knew before says little"),
     Constant(f"{SOLVERS}.watch", "PATIENCE", "s, after which inertial sensors of any grade have lost a position"),
     Constant(f"{SOLVERS}.watch", "LARGE", "sigmas: less is no fault, however certain"),
     Constant(f"{SOLVERS}.watch", "_CLOCKS", "s, between the stamps of IMU and receiver"),
     Constant(f"{SOLVERS}.watch", "_BRAKING", "m/s^2, of a usual manoeuvre"),
-    Constant(f"{SOLVERS}.verdicts", "_CHANCE", "fixes that agree by chance", 2.0, whole=True),
+    Constant(f"{SOLVERS}.verdicts", "_FEWEST_AGREEING", "fixes that agree by chance", 2.0, whole=True),
     Constant("graphnav.estimation.building", "_FAR_AWAY", "m, single fixes in a city"),
     Constant(
         "graphnav.estimation.preparation",
-        "_LINEAR",
+        "_LINEAR_ATTITUDE",
         "rad: half its square is the share of a vector that linearising loses",
     ),
     Constant("graphnav.estimation.preparation", "_MOST_WRONG", "the larger part"),

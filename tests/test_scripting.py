@@ -22,7 +22,7 @@ from graphnav.app.terminal import StagePace
 from graphnav.config import PROFILES, Settings, format_settings, parse_settings, read_settings
 from graphnav.core import staging
 from graphnav.core.errors import ConfigError
-from graphnav.core.progress import listening, tell
+from graphnav.core.progress import send_progress, tell
 from graphnav.evaluation import gates
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -323,9 +323,9 @@ def test_the_time_left_is_what_the_pace_says():
 def test_work_tells_whoever_listens():
     heard = []
     tell("nobody", 0.1)
-    with listening(lambda stage, share: heard.append((stage, share))):
+    with send_progress(lambda stage, share: heard.append((stage, share))):
         tell("one", 0.5)
-        with listening(None):
+        with send_progress(None):
             tell("two")
     tell("nobody")
     assert heard == [("one", 0.5)]

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from graphnav.core.progress import Progress, listening
+from graphnav.core.progress import Progress, send_progress
 
 if TYPE_CHECKING:
     from graphnav.evaluation.gates import Verdict
@@ -49,7 +49,7 @@ def show_progress(quiet: bool, *work: str) -> Iterator[Progress | None]:
     """Progress on a terminal within this context."""
     from graphnav.app.terminal import show_progress_bar
 
-    with show_progress_bar(quiet, work) as progress, listening(progress):
+    with show_progress_bar(quiet, work) as progress, send_progress(progress):
         yield progress
 
 

@@ -22,7 +22,7 @@ from graphnav.core.complaints import suggest_nearest
 from graphnav.core.errors import ConfigError, EstimationError, RecordingError
 from graphnav.core.findings import Finding
 from graphnav.core.notes import Note, format_count, get_key
-from graphnav.core.progress import Progress, listening, tell
+from graphnav.core.progress import Progress, send_progress, tell
 from graphnav.estimation.noise.model import INTERVALS, NoiseModel, StampOffsets
 from graphnav.estimation.solution import Solution
 from graphnav.evaluation.against import Against, read_against, select_own
@@ -181,7 +181,7 @@ def run_request(request: Request, progress: Progress | None = None) -> Outcome:
     GraphnavError
         In one plain sentence, for anything that cannot be used as it is.
     """
-    with listening(progress):
+    with send_progress(progress):
         return _run(request, progress)
 
 

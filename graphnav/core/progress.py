@@ -12,7 +12,7 @@ _LISTENER: ContextVar[Progress | None] = ContextVar("graphnav_progress", default
 
 
 @contextmanager
-def listening(listener: Progress | None) -> Iterator[None]:
+def send_progress(listener: Progress | None) -> Iterator[None]:
     """Within this context, reports go to `listener`."""
     token = _LISTENER.set(listener)
     try:

@@ -44,7 +44,7 @@ from graphnav.detectors.chain import (
 from graphnav.detectors.low_band import Scale, compute_low_band
 from graphnav.detectors.motion import Speeds, take_median
 from graphnav.detectors.scene import Detector, Labels, Scene
-from graphnav.detectors.windows import BlockMeans, low_pass_rows, make_kernel, share_of
+from graphnav.detectors.windows import BlockMeans, compute_share, low_pass_rows, make_kernel
 
 LOW_BAND, FFT = "low_band_glrt", "fft"
 _EDGE_REGION = 3.0  # s about an end in which the edge is sought
@@ -91,9 +91,9 @@ def _leave(b: BlockMeans, h: Array, white: Array, middle: float, end: float, way
         normal = np.abs(t - middle) <= max(0.25, 2.0 * b.period)
         if not normal.any():
             return middle
-    off = ((rows - share_of(rows[normal], 0.5)) ** 2).sum(axis=1) / 6.0
+    off = ((rows - compute_share(rows[normal], 0.5)) ** 2).sum(axis=1) / 6.0
     # normal scatter must not end the stop: twice its upper quantile, at least the detector's own limit
-    limit = max(threshold, 2.0 * float(share_of(off[normal], 0.95)))
+    limit = max(threshold, 2.0 * float(compute_share(off[normal], 0.95)))
     begin = int(np.argmax(normal))
     beyond = np.flatnonzero(off[begin:] > limit)
     # a gap in the recording ends every interval

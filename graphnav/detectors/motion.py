@@ -14,7 +14,7 @@ import numpy as np
 from graphnav.config.detectors import FusionSettings
 from graphnav.core.rotation import Array
 from graphnav.detectors.base import NONE, find_spans, merge_spans, unite
-from graphnav.detectors.windows import share_of
+from graphnav.detectors.windows import compute_share
 from graphnav.recording import Gnss, Odometer, Recording
 from graphnav.recording.checks.tracks import compute_local_positions
 
@@ -53,10 +53,10 @@ class Speeds:
         if there.sum() < _MEDIAN:
             return float("nan")
         v = self.v[there]
-        middle = share_of(v, 0.5)
-        wander = float(np.linalg.norm(share_of(np.abs(v - middle), 0.5))) / 0.6745
+        middle = compute_share(v, 0.5)
+        wander = float(np.linalg.norm(compute_share(np.abs(v - middle), 0.5))) / 0.6745
         speed = float(np.linalg.norm(middle))
-        if speed > max(float(share_of(self.limit[there], 0.5)), 2.0 * wander):
+        if speed > max(float(compute_share(self.limit[there], 0.5)), 2.0 * wander):
             return speed
         return float("nan") if self.silent_at_rest else 0.0
 

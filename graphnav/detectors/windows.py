@@ -162,7 +162,7 @@ def low_pass(b: BlockMeans) -> LowPassed:
     return LowPassed(t, rows, gain, step * b.period, whole)
 
 
-def share_of(x: Array, share: float) -> Array:
+def compute_share(x: Array, share: float) -> Array:
     """`np.quantile` along the first axis, several times faster for a few hundred rows."""
     x = np.sort(x, axis=0)
     at = share * (len(x) - 1)

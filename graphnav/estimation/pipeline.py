@@ -20,7 +20,7 @@ from graphnav.core.earth import LocalFrame
 from graphnav.core.errors import ConfigError, EstimationError, RecordingError
 from graphnav.core.memory import return_memory
 from graphnav.core.notes import Note
-from graphnav.core.progress import Progress, listening, tell
+from graphnav.core.progress import Progress, send_progress, tell
 from graphnav.core.state import BLOCKS
 from graphnav.detectors import Detector, detect
 from graphnav.detectors import check_own as check_detectors
@@ -118,7 +118,7 @@ def run(
     recording, found = screened.recording, state_findings(recording, screened.findings)
     if (apart := describe_gnss_apart(recording)) is not None:  # it would be solved as if there were no GNSS
         raise RecordingError(f"'{recording.name}': {apart}", key="gnss.apart")
-    with listening(progress):
+    with send_progress(progress):
         solutions = _run(recording, settings, solvers, progress, noise, screened.clock)
     return {name: replace(one, notes=(*found, *one.notes)) for name, one in solutions.items()}
 

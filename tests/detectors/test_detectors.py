@@ -479,4 +479,4 @@ def test_a_share_is_a_quantile():
     for shape in ((7,), (100, 3), (1, 2)):
         x = rng.standard_normal(shape)
         for share in (0.0, 0.3, 0.5, 0.95, 1.0):
-            np.testing.assert_allclose(windows.share_of(x, share), np.quantile(x, share, axis=0), atol=1e-14)
+            np.testing.assert_allclose(windows.compute_share(x, share), np.quantile(x, share, axis=0), atol=1e-14)

@@ -78,7 +78,7 @@ def read_drives(source: Path, asked: DriveOptions) -> list[tuple[str, str, Drive
     if not exists(source, ConfigError):
         raise ConfigError(f"{source}: no such folder or manifest", key="file.missing")
     if source.is_dir():
-        found = [(_name_of(path, source), str(path), asked, str(path)) for path in _find_recordings(source)]
+        found = [(_name_drive(path, source), str(path), asked, str(path)) for path in _find_recordings(source)]
         if not found:
             raise ConfigError(
                 f'{source}: holds no recording; each is a .toml that says format = "graphnav-recording/1"',
@@ -162,7 +162,7 @@ def _find_recordings(folder: Path) -> list[Path]:
     return found
 
 
-def _name_of(path: Path, folder: Path) -> str:
+def _name_drive(path: Path, folder: Path) -> str:
     parts = path.relative_to(folder).with_suffix("").parts
     parts = parts[:-1] if parts[-1] == "recording" and len(parts) > 1 else parts
     return _clean_name("_".join(parts))

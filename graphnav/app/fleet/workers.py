@@ -83,7 +83,7 @@ class Worker:
             return make_lost_row(
                 task, HUNG, f"ended after {self._limits.seconds:g} s, the --limit of one drive", elapsed
             )
-        return make_lost_row(task, CRASHED, f"the process that solved it {_end_of(code)}", elapsed)
+        return make_lost_row(task, CRASHED, f"the process that solved it {_describe_end(code)}", elapsed)
 
     def close(self) -> None:
         """End the process at once."""
@@ -105,7 +105,7 @@ class Worker:
         return self._process
 
 
-def _end_of(code: int) -> str:
+def _describe_end(code: int) -> str:
     if code >= 0:
         return f"ended with {code}"
     try:

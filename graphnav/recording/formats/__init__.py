@@ -57,7 +57,7 @@ def read(
     RecordingError
         If the source does not exist, is of unknown format, or cannot be used, or if there is no format of that name.
     """
-    chosen = _format_of(source, name)
+    chosen = _find_format(source, name)
     with permit_outside(allow_outside):
         found = _choose(chosen, source, topics).make_recording(source) if topics else chosen.read(source)
     if found.gnss is None:
@@ -87,7 +87,7 @@ def load(source: str | Path, name: str | None = None, topics: Sequence[str] = ()
     RecordingError
         As `read`, and for a name that no format has.
     """
-    chosen = _format_of(source, name)
+    chosen = _find_format(source, name)
     if topics:
         return _choose(chosen, source, topics)
     if chosen.load is not None:
@@ -99,7 +99,7 @@ def load(source: str | Path, name: str | None = None, topics: Sequence[str] = ()
     )  # fmt: skip
 
 
-def _format_of(source: str | Path, name: str | None) -> Format:
+def _find_format(source: str | Path, name: str | None) -> Format:
     """The format of that name, or the first that recognises the source."""
     known = list_formats()
     if name is not None and name not in known:
