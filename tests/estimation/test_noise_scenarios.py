@@ -14,7 +14,7 @@ from graphnav import load
 from graphnav.config import Settings, parse_settings
 from graphnav.core.rotation import Array
 from graphnav.core.trajectory import Trajectory
-from graphnav.estimation.noise.apply import row_weights
+from graphnav.estimation.noise.apply import select_weights
 from graphnav.estimation.noise.model import NoiseModel
 from graphnav.estimation.pipeline import run
 from graphnav.estimation.solution import Solution
@@ -232,7 +232,7 @@ def test_wheels_tell_errors_that_last_from_a_bad_imu(many_houses: tuple[Recordin
     recording, solutions = many_houses
     noise = solutions["batch"].noise
     assert recording.gnss is not None
-    assert np.mean(row_weights(recording.gnss.t, noise, "gnss_position") < 0.5) > 0.1
+    assert np.mean(select_weights(recording.gnss.t, noise, "gnss_position") < 0.5) > 0.1
     assert 2.0 < noise.times["gnss_error_of_seconds"] < 8.0
     assert times(noise, "imu.gyro_noise_density") < 2.0
     assert times(noise, "imu.accel_noise_density") < 7.0
