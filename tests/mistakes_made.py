@@ -384,12 +384,12 @@ MISTAKES: dict[str, list[Mistake]] = {
         Mistake(
             "the accelerometer's forward axis reversed",
             scaled("imu", "ay", -1.0),
-            ("forward axis is reversed", "no axes in [imu]", "negate ay"),
+            ("forward axis is reversed", "cannot express", "negate ay"),
         ),
         Mistake(
             "the accelerometer's right axis reversed",
             scaled("imu", "ax", -1.0),
-            ("turn rate and speed require", "no axes in [imu]", "negate ax"),
+            ("turn rate and speed require", "cannot express", "negate ax"),
         ),
         Mistake(
             "the IMU built in the other way round",
@@ -462,11 +462,11 @@ MISTAKES: dict[str, list[Mistake]] = {
         Mistake(
             "IMU rows filled in over 1.5 s", change("imu", _filled), ("in 1 stretch", "straight lines", "not measured")
         ),
-        Mistake("an axis of the gyro is dead", _dead("gz"), ("gyro z", "dead", "throughout")),
+        Mistake("an axis of the gyro is dead", _dead("gz"), ("gyro z", "defective", "throughout")),
         Mistake(
             "an axis of the accelerometer is dead, and smoothed all the same",
             _dead("ay"),
-            ("accelerometer y", "dead"),
+            ("accelerometer y", "defective"),
             SMOOTH,
             True,
         ),
@@ -474,7 +474,7 @@ MISTAKES: dict[str, list[Mistake]] = {
         Mistake(
             "every other fix is 50 m off, all the same way",
             change("gnss", _two_groups),
-            ("two groups 50 m apart", "not to be trusted"),
+            ("two groups 50 m apart", "cannot be trusted"),
         ),
         Mistake("the heights freeze", change("gnss", _frozen), ("heights", "frozen", "sigma of")),
         Mistake(
