@@ -35,6 +35,7 @@ increases the evidence.
 
 from __future__ import annotations
 
+import contextlib
 from collections import Counter
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, field, replace
@@ -53,11 +54,12 @@ from graphnav.estimation.noise.explanations import (
     Explanation,
     compute_evidence,
 )
+from graphnav.estimation.noise.initial_points import BREAKDOWN
 from graphnav.estimation.noise.model import INTERVALS, NoiseModel, RowWeights
 from graphnav.estimation.noise.moments import collect_row_moments
 from graphnav.estimation.noise.outliers import (
+    compute_latest_cost,
     compute_outlier_cost,
-    cost_of_one,
     count_reduced,
     count_rows,
     limit_squares,
@@ -120,15 +122,38 @@ def estimate_without_faults(
         return replace(decision.estimate or found, passes=passes)
     best = _estimate_without(base, opening, decision, found, progress)
     passes = passes + best.passes
-    before = _list_before(base, best.noise)
+    before, other = _list_before(base, best.noise), None
     if before:
-        other = _unmask(base, found, Decision(best.noise, -np.inf), before)
-        passes = passes + other.passes
-        if other.noise.excluded != best.noise.excluded:
-            alternative = other.estimate or _estimate_without(base, opening, other, found, progress)
-            passes = passes + (Counter() if other.estimate else alternative.passes) + Counter(filter=2)
-            best = max(best, alternative, key=lambda one: log_evidence(base, one))
+        with contextlib.suppress(*BREAKDOWN):  # of a filter that is led by what is wrong
+            other = _estimate_other(base, opening, found, best, before, progress)
+    if other is not None:
+        passes = passes + other.passes + Counter(filter=2)
+        best = max(best, other, key=lambda one: log_evidence(base, one))
     return replace(best, passes=passes)
+
+
+def _estimate_other(
+    base: Problem,
+    opening: float | None,
+    found: NoiseEstimate,
+    best: NoiseEstimate,
+    suspected: list[Span],
+    progress: Callable[[str, float], None] | None,
+) -> NoiseEstimate | None:
+    """Estimate without what is wrong where other spans are suspected; None if that is the same as before.
+
+    Parameters
+    ----------
+    found : with all measurements.
+    best : without the spans that were suspected before.
+    """
+    decision = _unmask(base, found, Decision(best.noise, -np.inf), suspected)
+    if decision.noise.excluded == best.noise.excluded:
+        return None
+    if decision.estimate is not None:
+        return replace(decision.estimate, passes=decision.passes)
+    other = _estimate_without(base, opening, decision, found, progress)
+    return replace(other, passes=decision.passes + other.passes)
 
 
 def _estimate_without(
@@ -306,7 +331,7 @@ def explain(
     inside[INTERVALS] = {name: some for name, some in noise.weights.items() if name in INTERVALS}
     used = apply_noise(base, replace(noise, weights=outside))
     totals = count_rows(base)
-    each = {name: cost_of_one(some, totals[name]) for name, some in noise.weights.items() if name in totals}
+    each = {name: compute_latest_cost(some, totals[name]) for name, some in noise.weights.items() if name in totals}
     outliers = {
         kinds: [
             sum(

@@ -57,7 +57,7 @@ def compute_outlier_cost(weights: Mapping[str, RowWeights], totals: Mapping[str,
     return sum((float(betaln(1.0, n) - betaln(k + 1.0, n - k)) for k, n in some), 0.0)
 
 
-def cost_of_one(some: RowWeights, total: int) -> float:
+def compute_latest_cost(some: RowWeights, total: int) -> float:
     """The cost of the latest of some outliers among all rows of a sensor."""
     k = max(count_reduced(some), 1)
     return float(np.log((total - k + 1.0 / CHANCE) / k))
