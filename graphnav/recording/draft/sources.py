@@ -58,7 +58,8 @@ def find_logs(paths: Sequence[Path], topics: Sequence[str] = ()) -> LogsFound:
             if len(files) == 1 and not raw.observed:
                 raise
             nothing.append(path.name if path.exists() else str(error))
-            refused += [str(error)] if isinstance(error.__cause__, RecordingError) else []
+            if isinstance(error.__cause__, RecordingError) or error.key == "draft.no_time":
+                refused.append(str(error))
             continue
         for sensor, source in found.items():
             every.setdefault(sensor, []).append(source)
@@ -78,6 +79,9 @@ def find_logs(paths: Sequence[Path], topics: Sequence[str] = ()) -> LogsFound:
     if "imu" not in sensors:
         there = ", ".join(sensors) or "nothing"
         unread = f" ({refused[0]})" if refused else ""
+        others = sorted({p.name for path in paths if path.is_dir() for p in path.iterdir()} - {p.name for p in files})
+        if others and not refused:
+            unread = f" (not read: {', '.join(others[:5])}{', ...' if len(others) > 5 else ''})"
         raise RecordingError(
             f"{paths[0]}: no IMU in these logs (found: {there}); three gyro and three force columns are one{unread}",
             key="draft.no_imu",
@@ -111,7 +115,7 @@ def _find_unix_start(source: Source) -> float | None:
     if source.log is None:
         return float(source.t[0]) if guesses.is_date(source.t) else None
     begin = next(sensor.t[0] for sensor in source.held)
-    return None if source.log.gps_zero is None else float(source.log.gps_zero + begin + GPS_TO_UNIX)
+    return None if source.gps_zero is None else float(source.gps_zero + begin + GPS_TO_UNIX)
 
 
 def _list_files(path: Path) -> list[Path]:
@@ -124,8 +128,9 @@ def _list_files(path: Path) -> list[Path]:
     inside = sorted(p for p in every if p.name not in made)
     logs = [p for p in inside if p.name.lower().endswith(_TABLES) or _is_known(p) or tell_kind(p)[0]]
     if not logs:
+        there = f" ({', '.join(p.name for p in inside[:5])})" if inside else ""
         raise RecordingError(
-            f"{path}: no log in this folder: no CSV file, and none of a kind that is known", key="draft.no_log"
+            f"{path}: no log in this folder: no CSV file, and none of a kind that is known{there}", key="draft.no_log"
         )
     return logs
 
