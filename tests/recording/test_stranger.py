@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import json
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -167,6 +168,34 @@ def test_clocks_that_start_again_and_stamps_in_two_columns(tokyo, tmp_path, stam
     assert recording.gnss.t - first == pytest.approx(drive.recording.gnss.t, abs=1e-4)
     if names.startswith(("GPS", "week")):
         assert recording.gps_zero == 2373 * 604800.0
+
+
+def test_a_folder_of_what_loggers_leave_there(tokyo, tmp_path, capsys):
+    """NMEA with a terminal's times before it, a packed table with semicolons, axes in brackets; the rest is named."""
+    drive = tokyo[2]
+    (_, rows), _ = stranger.tables(drive, 0.0)
+    text = "\n".join(["t;gyro(x);gyro(y);gyro(z);accel(x);accel(y);accel(z)", *(";".join(row) for row in rows)])
+    gps = replace(drive.recording.gnss, t=drive.recording.gnss.t + logs.TOW)
+    path = logs.write_nmea(tmp_path / "a.txt", replace(drive.recording, gnss=gps))
+    sentences = path.read_text()
+    path.write_text(
+        "".join(f"[16:00:01] {line}\n" for line in sentences.splitlines()) + "[16:00:09] $GNGG" + "\0" * 900
+    )
+    (tmp_path / "imu.csv.gz").write_bytes(gzip.compress(text.replace(".", ",").encode()))
+    (tmp_path / "ride.gpx").write_text("<gpx/>")
+    run("init", tmp_path, "-o", tmp_path)
+    assert "ride.gpx" in capsys.readouterr().out
+    recording = read(tmp_path)
+    assert recording.imu.gyro == pytest.approx(drive.recording.imu.gyro, abs=1e-6)
+    assert len(recording.gnss.t) == len(drive.recording.gnss.t)
+
+
+def test_one_velocity_is_no_course(tokyo, tmp_path):
+    imu, (header, rows) = stranger.tables(tokyo[2])
+    some = [[*row, *(("1.0", "2.0", "0.0") if k == 20 else ("", "", ""))] for k, row in enumerate(rows)]
+    folder = stranger.write_tables(tmp_path / "log", imu, (f"{header},ve,vn,vu", some))
+    run("init", folder, "-o", folder, "--quiet")
+    assert np.isfinite(read(folder).gnss.v).all(1).sum() == 1
 
 
 @pytest.mark.parametrize(

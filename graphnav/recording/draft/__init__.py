@@ -223,7 +223,8 @@ class _Writer:
         if source.log is None:
             if "h" not in values:
                 raise RecordingError(
-                    f"{source.path}: no column of heights beside {source.columns.names['lat']}", key="draft.no_heights"
+                    f"{source.path}: no column of heights beside {source.columns.names['lat']}; log them too",
+                    key="draft.no_heights",
                 )
             units = {"t": source.t_unit}
             if numbers is not None and numbers.value is not None:

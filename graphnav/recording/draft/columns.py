@@ -20,7 +20,8 @@ _OF_WEEK = r"(?:gps_?)?time_of_week|gps_?time|(?:gps_?)?[st]ow|i_?tow|gps_?sec(?
 _WHEEL, _SPEED = r"(?:wheel_?|speed_?|wheel_?speed_?)*", r"(?:_?wheel)?(?:_?speed)?"
 _PATTERNS: dict[str, tuple[str, ...]] = {
     "t": (
-        r"t", r"seconds_elapsed", r"time_elapsed|elapsed_time|elapsed|time_since_start|rel_?time",
+        r"t", r"seconds_elapsed",
+        r"time_elapsed|elapsed_time|elapsed|time_since_start(?:_in)?|rel_?time|time_(?:since_)?boot",
         r"(?:.*_)?header_stamp", r"time(?:stamp)?", _OF_WEEK,
         r"(?:unix|epoch|utc|sensor|logging|local)_?time\w*",
         r"sec(?:onds?)?|stamp|(?:.*_)time(?:stamp)?",
@@ -157,6 +158,7 @@ def find_clocks(header: Sequence[str]) -> list[str]:
 
 def split_unit(name: str) -> tuple[str, str]:
     """The normalised name and the unit in it ('' if none)."""
+    name = re.sub(r"[(\[]\s*([xyz]|lat|lon|alt)\s*[)\]]\s*$", r"_\1", name, flags=re.IGNORECASE)  # a part, no unit
     bracket = re.search(r"[(\[]([^)\]]*)[)\]]\s*$", name)
     base = name[: bracket.start()] if bracket else name
     base = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", base)

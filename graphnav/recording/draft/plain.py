@@ -76,13 +76,13 @@ def read_plain(path: Path) -> Plain | None:
     """
     with open_file(path) as raw:
         start = raw.read(_START).rstrip(b"\0")
-    if path.suffix == ".gz" or b"\0" in start:
+    if b"\0" in start:
         return None
     # most likely cut off within a line
     begin, _ = _decode(start.rpartition(b"\n")[0] if len(start) == _START else start)
     layout = _lay_out(path, _read_lines(begin.splitlines()))
-    if layout is None:
-        return None
+    if layout is None or (path.suffix == ".gz" and layout.mark == "," and not layout.done):
+        return None  # what is packed is large, and no spreadsheet's
     text, encoding = _decode(read_bytes(path).rstrip(b"\0"))
     lines = _read_lines(text.splitlines())
     rows = [_split(line, layout.mark) for _, line in lines[layout.first :]]

@@ -292,6 +292,8 @@ def _suggest_cause(cell: str, cells: list[str], header: list[str], use: list[int
         return "; the header is there again: cut the file in two there, or take the line out"
     if re.fullmatch(r"(\d+-\d+-\d+[T ])?\d{1,2}:\d{2}(:\d{2}([.,]\d*)?)?Z?", cell):
         return "; it is a time of day: write seconds, or let graphnav init do it"
+    if re.match(r"\d+[-/.]\d+[-/.]\d+\b", cell):
+        return "; it is a date: write seconds, or year-month-day, of which graphnav init makes them"
     if not any(_is_number(cells[k].strip('"')) for k in use):
         return "; if the line holds units, take it out"
     return ""
