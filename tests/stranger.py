@@ -167,6 +167,29 @@ def write_spreadsheet(folder: Path, drive: Cut) -> Path:
     return folder
 
 
+Columns = tuple[str, list[list[str]]]  # the header, and the cells of each row
+
+
+def tables(drive: Cut, unix: float = UNIX) -> tuple[Columns, Columns]:
+    """The IMU's and the fixes' tables, as text, with the Unix time in s."""
+    imu, gnss = drive.recording.imu, drive.recording.gnss
+    rows = np.column_stack([unix + imu.t, imu.gyro, imu.accel])
+    places = np.column_stack([unix + gnss.t, np.degrees(gnss.llh[:, :2]), gnss.llh[:, 2]])
+    return (
+        ("t,gx,gy,gz,ax,ay,az", [[f"{x:.8f}" for x in row] for row in rows]),
+        ("t,lat,lon,h", [[f"{x:.8f}" for x in row] for row in places]),
+    )
+
+
+def write_tables(folder: Path, *both: Columns, mark: str = ",", end: bytes = b"\n") -> Path:
+    """`imu.csv` and `gnss.csv`; `end` is what is there behind the last line."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, (header, rows) in zip(("imu.csv", "gnss.csv"), both, strict=True):
+        lines = [header.replace(",", mark), *(mark.join(row) for row in rows)]
+        (folder / name).write_bytes("\n".join(lines).encode() + end)
+    return folder
+
+
 def write_one_file(folder: Path, drive: Cut) -> Path:
     """A logger's one file: a row for each sample of the IMU, in which the last fix stands until there is another."""
     folder.mkdir(parents=True, exist_ok=True)

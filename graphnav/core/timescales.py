@@ -13,7 +13,9 @@ import numpy as np
 
 from graphnav.core.rotation import Array
 
-WEEK = 604800.0  # s
+DAY, WEEK = 86400.0, 604800.0  # s
+_COUNTS = 2.0**32  # of a counter of 32 bits
+_WHOLE = 0.99  # of a period; a clock that starts again steps back by no less
 NEAR = 3600.0  # s; logs of one drive begin within this of each other
 UNIX = 1e9  # s; larger stamps are Unix time of this century
 GPS_TO_UNIX = 315964800.0  # s from the Unix to the GPS epoch, leap seconds excluded
@@ -82,6 +84,28 @@ def parse_clock(text: str, t: float) -> float:
         return float(utc_to_gps(np.array([text.removesuffix("Z")], dtype="datetime64[us]"))[0])
     except ValueError:
         raise ValueError('must be "unix", "gps week 2313" or a UTC date such as "2024-05-01T12:00:00Z"') from None
+
+
+def find_restarts(t: Array, unit: float = 1.0) -> Array | None:
+    """What is to be added to the stamps of a clock that starts again from 0 after a day, a GPS week or 2^32 counts.
+
+    Parameters
+    ----------
+    t : (N,) in the order of the file, in its unit.
+    unit : s of one count.
+
+    Returns
+    -------
+    (N,) in the unit of `t`, None where the clock does not start again.
+    """
+    step = np.diff(t)
+    for period in (DAY / unit, WEEK / unit, _COUNTS):
+        back = step < -_WHOLE * period
+        if back.any() and t.min() >= 0.0 and t.max() < period:
+            # a row that was only written late is of the turn before
+            turns = np.cumsum(back.astype(float) - (step > _WHOLE * period))
+            return np.asarray(period * np.concatenate([[0.0], turns]))
+    return None
 
 
 @dataclass(frozen=True)

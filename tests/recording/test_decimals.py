@@ -28,17 +28,17 @@ def test_every_number_is_the_one_that_float_reads(monkeypatch: pytest.MonkeyPatc
     written = [*cells(7993), "-0.0", "-.5", "5.", "007", "9007199254740993", "0.1234567890123456", "nan"]
     text = line_end.join(",".join(written[k : k + 4]) for k in range(0, len(written), 4))
     expected = np.array([float(cell) for cell in written]).reshape(-1, 4)
-    found = np.array(read_decimals(io.BytesIO(text.encode()), 4, (3, 0, 1)))
+    found = np.array(read_decimals(io.BytesIO(text.encode()), 4, (3, 0, 1))[0])
     np.testing.assert_array_equal(found.view(np.int64), np.ascontiguousarray(expected[:, [3, 0, 1]].T).view(np.int64))
 
 
 def test_column_without_points() -> None:
-    found = read_decimals(io.BytesIO(b"1,2.5,-3\n40,0.25,0\n"), 3, (0, 1, 2))
+    found, _ = read_decimals(io.BytesIO(b"1,2.5,-3\n40,0.25,0\n"), 3, (0, 1, 2))
     np.testing.assert_array_equal(found, [[1, 40], [2.5, 0.25], [-3, 0]])
 
 
 @pytest.mark.parametrize(
-    "text", ["1,2\n3", "1,2\n3,4,5", "1,,2", "1,x", "1,1.2.3", "1,-", "1,--2", "1,2-3", "1,2\n\n3,4", "1, 2", '1,"2"']
+    "text", ["1,2\n3\n", "1,2\n3,4,5", "1,,2", "1,x", "1,1.2.3", "1,-", "1,--2", "1,2-3", "1,2\n\n3,4", "1, 2", '1,"2"']
 )
 def test_anything_else_is_left_to_others(text: str) -> None:
     with pytest.raises(ValueError):  # noqa: PT011 - NumPy's own among them
@@ -46,4 +46,4 @@ def test_anything_else_is_left_to_others(text: str) -> None:
 
 
 def test_no_lines() -> None:
-    assert [len(column) for column in read_decimals(io.BytesIO(b""), 3, (0, 2))] == [0, 0]
+    assert [len(column) for column in read_decimals(io.BytesIO(b""), 3, (0, 2))[0]] == [0, 0]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import json
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -26,6 +27,7 @@ from graphnav.recording.formats.trajectories import read_trajectory
 from graphnav.sensors.barometer import compute_standard_height
 
 RECORDING, TRUTH = logs.simulated(60.0)
+UNIX = stranger.UNIX
 FAST = ("--solver", "ekf", "--noise", "stated", "--quiet")
 
 
@@ -128,6 +130,137 @@ def test_a_fix_that_stands_in_every_row_of_the_imu_counts_once(tokyo, tmp_path):
     place = np.column_stack([np.degrees(gnss.llh[:, :2]), gnss.llh[:, 2]])
     differ = 1 + np.sum((np.diff(np.round(place, 8), axis=0) != 0.0).any(axis=1))
     assert len(recording.gnss.t) == differ  # some repeat the one before at a stop
+
+
+def _wrapped(period: float, first: float, form: str = "{:.6f}"):
+    """Stamps of a clock that begins at `first` and starts again from 0 after `period`."""
+    return lambda t: [form.format((first + t) % period)]
+
+
+def _week(t: float) -> list[str]:
+    week, second = divmod(2374 * 604800.0 - 30.0 + t, 604800.0)
+    return [f"{week:.0f}", f"{second:.6f}"]
+
+
+@pytest.mark.parametrize(
+    ("stamp", "names", "first"),
+    [
+        (_wrapped(86400.0, 86370.0), "t", 86370.0),
+        (_week, "GPSWeek,GPSTime", 604770.0),
+        (_week, "week,tow", 604770.0),
+        (lambda t: _wrapped(2.0**32, 2.0**32 - 3e7, "{:.0f}")(1e6 * t), "micros", 4264.967296),
+        (lambda t: [f"{UNIX + t // 1:.0f}", f"{t % 1 * 1e9:.0f}"], "stamp.sec,stamp.nanosec", UNIX),
+        (lambda t: [f'"{1e3 * (600 + t):,.1f}"'], "time ms", 600.0),
+    ],
+    ids=["day", "week", "tow", "32 bits", "nanoseconds", "thousands"],
+)
+def test_clocks_that_start_again_and_stamps_in_two_columns(tokyo, tmp_path, stamp, names, first):
+    drive = tokyo[2]
+    (_, imu), (_, fixes) = stranger.tables(drive, 0.0)
+    both = [
+        (header.replace("t,", f"{names},", 1), [[*stamp(float(t)), *rest] for t, *rest in rows])
+        for header, rows in (("t,gx,gy,gz,ax,ay,az", imu), ("t,lat,lon,h", fixes))
+    ]
+    folder = stranger.write_tables(tmp_path / "log", *both)
+    run("init", folder, "-o", folder, "--quiet")
+    recording = read(folder)
+    assert recording.imu.t - first == pytest.approx(drive.recording.imu.t, abs=1e-4)
+    assert recording.gnss.t - first == pytest.approx(drive.recording.gnss.t, abs=1e-4)
+    if names.startswith(("GPS", "week")):
+        assert recording.gps_zero == 2373 * 604800.0
+
+
+def test_a_folder_of_what_loggers_leave_there(tokyo, tmp_path, capsys):
+    """NMEA with a terminal's times before it, a packed table with semicolons, axes in brackets; the rest is named."""
+    drive = tokyo[2]
+    (_, rows), _ = stranger.tables(drive, 0.0)
+    text = "\n".join(["t;gyro(x);gyro(y);gyro(z);accel(x);accel(y);accel(z)", *(";".join(row) for row in rows)])
+    gps = replace(drive.recording.gnss, t=drive.recording.gnss.t + logs.TOW)
+    path = logs.write_nmea(tmp_path / "a.txt", replace(drive.recording, gnss=gps))
+    sentences = path.read_text()
+    path.write_text(
+        "".join(f"[16:00:01] {line}\n" for line in sentences.splitlines()) + "[16:00:09] $GNGG" + "\0" * 900
+    )
+    (tmp_path / "imu.csv.gz").write_bytes(gzip.compress(text.replace(".", ",").encode()))
+    (tmp_path / "ride.gpx").write_text("<gpx/>")
+    run("init", tmp_path, "-o", tmp_path)
+    assert "ride.gpx" in capsys.readouterr().out
+    recording = read(tmp_path)
+    assert recording.imu.gyro == pytest.approx(drive.recording.imu.gyro, abs=1e-6)
+    assert len(recording.gnss.t) == len(drive.recording.gnss.t)
+
+
+def test_one_velocity_is_no_course(tokyo, tmp_path):
+    imu, (header, rows) = stranger.tables(tokyo[2])
+    some = [[*row, *(("1.0", "2.0", "0.0") if k == 20 else ("", "", ""))] for k, row in enumerate(rows)]
+    folder = stranger.write_tables(tmp_path / "log", imu, (f"{header},ve,vn,vu", some))
+    run("init", folder, "-o", folder, "--quiet")
+    assert np.isfinite(read(folder).gnss.v).all(1).sum() == 1
+
+
+@pytest.mark.parametrize(
+    ("text", "numbers"),
+    [
+        ('t,x\n"600,020",0.5\n"1,600,040",1.5\n', [[600020.0, 1600040.0], [0.5, 1.5]]),
+        ('t,x\n"600,020",5\n"600,040",6\n', [[600020.0, 600040.0], [5.0, 6.0]]),
+        ("t;x\n600.020,5;-0,25\n600.040,5;1,5\n", [[600020.5, 600040.5], [-0.25, 1.5]]),
+        ("t;x\n600,020;5\n600,040;6\n", [[600.02, 600.04], [5.0, 6.0]]),
+        ("t;x\n1'600'020;1.5\n1'600'040;2.5\n", [[1600020.0, 1600040.0], [1.5, 2.5]]),
+        ("t;x\n600\u00a0020,5;1,5\n600\u00a0040,5;2,5\n", [[600020.5, 600040.5], [1.5, 2.5]]),
+    ],
+)
+def test_marks_between_thousands_are_no_decimal_marks(tmp_path, text, numbers):
+    (tmp_path / "a.csv").write_text(text, encoding="utf-8")
+    assert [x.tolist() for x in read_plain(tmp_path / "a.csv").columns.values()] == numbers
+
+
+@pytest.mark.parametrize("end", [b"\n12.5,0.", b"\n12.5" + bytes(5000), b"\n" + bytes(5000), b""])
+def test_a_log_that_a_loss_of_power_ended_is_read_to_there(tokyo, tmp_path, end):
+    drive = tokyo[2]
+    folder = stranger.write_tables(tmp_path / "log", *stranger.tables(drive), end=end)
+    run("init", folder, "-o", folder, "--quiet")
+    for made in folder.glob("*-*.csv.gz"):  # the file itself, as a description by hand has it
+        made.unlink()
+    text = (folder / "recording.toml").read_text()
+    (folder / "recording.toml").write_text(
+        text.replace("imu-imu.csv.gz", "imu.csv").replace("gnss-gnss.csv.gz", "gnss.csv")
+    )
+    recording = read(folder)
+    assert len(recording.imu.t) == len(drive.recording.imu.t)
+    assert len(recording.gnss.t) == len(drive.recording.gnss.t)
+    assert {"imu.cut", "gnss.cut"} <= set(map(get_key, recording.remarks)) or end == b""
+
+
+def test_zeros_in_the_middle_of_a_log_are_named(tokyo, tmp_path, capsys):
+    folder = stranger.write_tables(tmp_path / "log", *stranger.tables(tokyo[2]))
+    data = (folder / "imu.csv").read_bytes()
+    half = len(data) // 2
+    (folder / "imu.csv").write_bytes(data[:half] + bytes(300) + data[half + 300 :])
+    assert "imu.csv, line " in refuse_command(capsys, "table.fields", "init", folder, "-o", folder)
+
+
+def test_places_that_are_none_are_no_fixes_and_units_of_a_receiver_are_named(tokyo, tmp_path, capsys):
+    drive = tokyo[2]
+    imu, (header, rows) = stranger.tables(drive)
+    none = [[t, *(["-9999"] * 3)] if k % 7 == 3 else [t, *rest] for k, (t, *rest) in enumerate(rows)]
+    folder = stranger.write_tables(tmp_path / "none", imu, (header, none))
+    run("init", folder, "-o", folder, "--quiet")
+    assert len(read(folder).gnss.t) == sum(row[1] != "-9999" for row in none)
+    scaled = [[t, f"{1e7 * float(lat):.0f}", f"{1e7 * float(lon):.0f}", h] for t, lat, lon, h in rows]
+    folder = stranger.write_tables(tmp_path / "scaled", imu, (header, scaled))
+    assert "1e-7 deg" in refuse_command(capsys, "table.place", "init", folder, "-o", folder)
+
+
+def test_stamps_that_are_no_times_and_files_that_are_not_read_are_named(tokyo, tmp_path, capsys):
+    imu, fixes = stranger.tables(tokyo[2])
+    folder = stranger.write_tables(tmp_path / "one", (imu[0], [["1.751990e9", *rest] for _, *rest in imu[1]]), fixes)
+    assert "imu.csv, column 't'" in refuse_command(capsys, "table.times_repeated", "init", folder, "-o", folder)
+    stranger.write_tables(folder, (imu[0].replace("t,", "tick tock,", 1), imu[1]), fixes)
+    assert "tick tock" in refuse_command(capsys, "draft.no_imu", "init", folder, "-o", folder)
+    stranger.write_tables(folder, (imu[0], [["a while ago;", *rest] for _, *rest in imu[1]]), fixes)
+    assert "imu.csv" in refuse_command(capsys, "table.cell", "init", folder, "-o", folder)
+    (folder / "imu.csv").rename(folder / "imu.parquet")
+    assert "imu.parquet" in refuse_command(capsys, "draft.no_imu", "init", folder, "-o", folder)
 
 
 @pytest.mark.parametrize(

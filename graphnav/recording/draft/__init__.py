@@ -60,8 +60,8 @@ def draft(paths: Sequence[Path], folder: Path, name: str | None = None, topics: 
     writer = _Writer(folder, topics)
     writer.decisions += found.notes
     imu = found.sensors["imu"]
-    t, zero = (imu.t, None) if imu.log is None else (imu.log.imu.t, imu.log.gps_zero)  # type: ignore[union-attr]
-    raw = find_raw(found.raw, t, zero)
+    t = imu.t if imu.log is None else imu.log.imu.t  # type: ignore[union-attr]
+    raw = find_raw(found.raw, t, imu.gps_zero)
     text = writer.format(found.sensors, raw, name or folder.resolve().name or "drive")
     return Draft(text, tuple(writer.decisions), writer.made)
 
@@ -104,6 +104,8 @@ class _Writer:
             self._write_clock(found["imu"], raw)
         elif found["imu"].log is None and found["imu"].t[0] > UNIX:
             self._write_key("clock", '"unix"', "the stamps are dates of this century, s since 1970")
+        elif found["imu"].week is not None:
+            self._write_key("clock", f'"gps week {found["imu"].week}"', "as a column of the IMU's file says")
         agreement, felt = self._write_imu(found["imu"], found.get("gnss"), raw, vehicle)
         course = None
         if "gnss" in found:
@@ -221,7 +223,8 @@ class _Writer:
         if source.log is None:
             if "h" not in values:
                 raise RecordingError(
-                    f"{source.path}: no column of heights beside {source.columns.names['lat']}", key="draft.no_heights"
+                    f"{source.path}: no column of heights beside {source.columns.names['lat']}; log them too",
+                    key="draft.no_heights",
                 )
             units = {"t": source.t_unit}
             if numbers is not None and numbers.value is not None:
@@ -363,8 +366,7 @@ def _find_odometer_lag(t: Array, speed: Array, felt: tuple[Array, Array]) -> mot
 def _find_epoch(imu: Source, gnss: Source) -> ClockOffset | None:
     """Offset between the clocks of two logs, where both are known."""
     first = [_read_first(source, sensor) for source, sensor in ((imu, "imu"), (gnss, "gnss"))]
-    zeros = [None if source.log is None else source.log.gps_zero for source in (imu, gnss)]
-    found = compute_clock_offset(first[0], zeros[0], first[1], zeros[1])
+    found = compute_clock_offset(first[0], imu.gps_zero, first[1], gnss.gps_zero)
     return found if found is not None and abs(first[1] + found.offset - first[0]) < NEAR else None
 
 

@@ -16,15 +16,18 @@ _OF_SPEED = r"sd_?v|sd_?speed|(?:.*_)?(?:s_?acc|(?:speed|velocity|vel)_?acc\w*)|
 _UNCERTAIN = re.compile(
     r"(?:.*_)?(?:sd|std|stdev|sigma|var|variance|cov\w*|accuracy|[hvpgt]dop|err\w*|uncertainty|ep[hves])(?:_.*)?|.*_acc"
 )
+_OF_WEEK = r"(?:gps_?)?time_of_week|gps_?time|(?:gps_?)?[st]ow|i_?tow|gps_?sec(?:onds?)?|gnss_time"
 _WHEEL, _SPEED = r"(?:wheel_?|speed_?|wheel_?speed_?)*", r"(?:_?wheel)?(?:_?speed)?"
 _PATTERNS: dict[str, tuple[str, ...]] = {
     "t": (
-        r"t", r"seconds_elapsed", r"time_elapsed|elapsed_time|elapsed|time_since_start|rel_?time",
-        r"(?:.*_)?header_stamp", r"time(?:stamp)?", r"gps_?time|gps_?sow|sow|i_?tow|gnss_time",
+        r"t", r"seconds_elapsed",
+        r"time_elapsed|elapsed_time|elapsed|time_since_start(?:_in)?|rel_?time|time_(?:since_)?boot",
+        r"(?:.*_)?header_stamp", r"time(?:stamp)?", _OF_WEEK,
         r"(?:unix|epoch|utc|sensor|logging|local)_?time\w*",
         r"sec(?:onds?)?|stamp|(?:.*_)time(?:stamp)?",
-        r"date_?time|unix|epoch|utc|(?:uhr)?zeit(?:stempel)?|clock|hora|heure|date|datum",
+        r"date_?time|unix|epoch|utc|(?:uhr)?zeit(?:stempel)?|clock|hora|heure|date|datum|millis|micros",
     ),
+    "week": (r"(?:gps_?)?(?:week|wn)(?:_?(?:no|num|number))?",),
     **{f"g{x}": (rf"{_GYRO}{x}",) for x in "xyz"},
     **{f"a{x}": (rf"{_ACCEL}{x}",) for x in "xyz"},
     "lat": (r"(?:.*_)?lat(?:itude)?", r"breite(?:ngrad)?"),
@@ -136,6 +139,8 @@ def match_columns(header: Sequence[str], stem: str = "") -> FileColumns:
             names[f"{kind}{x}"] = bare[x][0]
             if bare[x][1]:
                 units[f"{kind}{x}"] = bare[x][1]
+    if "week" in names and not re.fullmatch(_OF_WEEK, split_unit(names.get("t", ""))[0]):
+        del names["week"]
     # a single letter is not enough when the triple is incomplete
     for kind in "ga":
         if not all(f"{kind}{x}" in names for x in "xyz"):
@@ -153,6 +158,7 @@ def find_clocks(header: Sequence[str]) -> list[str]:
 
 def split_unit(name: str) -> tuple[str, str]:
     """The normalised name and the unit in it ('' if none)."""
+    name = re.sub(r"[(\[]\s*([xyz]|lat|lon|alt)\s*[)\]]\s*$", r"_\1", name, flags=re.IGNORECASE)  # a part, no unit
     bracket = re.search(r"[(\[]([^)\]]*)[)\]]\s*$", name)
     base = name[: bracket.start()] if bracket else name
     base = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", base)

@@ -10,6 +10,7 @@ import numpy as np
 
 from graphnav.core.errors import RecordingError
 from graphnav.core.rotation import Array
+from graphnav.core.timescales import WEEK, find_restarts
 from graphnav.recording import Gnss, Imu, Odometer
 from graphnav.recording.draft import columns as matching
 from graphnav.recording.draft import guesses
@@ -17,7 +18,7 @@ from graphnav.recording.draft.guesses import Guess
 from graphnav.recording.draft.plain import Plain, read_clock_seconds, read_plain
 from graphnav.recording.formats.folder import read_other_log
 from graphnav.recording.formats.registry import Log
-from graphnav.recording.formats.repair import mask_new_fixes
+from graphnav.recording.formats.repair import check_angles, find_places, find_repeated, mask_new_fixes
 from graphnav.recording.formats.schema import WHEELS
 from graphnav.recording.formats.table import Table, read_column_names, read_first_rows, read_table
 from graphnav.sensors.tables import ANGLE, TIME_UNITS
@@ -64,6 +65,7 @@ class Source:
     log: Log | None = None
     t_unit: Guess = field(default_factory=lambda: Guess("s", ""))
     joined_from: tuple[Path, Path] | None = None  # files of a gyro and an accelerometer, whose rows are combined
+    week: int | None = None  # the GPS week of the first row, where a column has it beside the seconds
     plain: Plain | None = None  # a table that is not a CSV file of numbers, which is converted into one
 
     def __len__(self) -> int:
@@ -74,6 +76,13 @@ class Source:
         """The sensors in the log of a known program."""
         log = self.log
         return [] if log is None else [s for s in (log.gnss, log.imu, log.odometer) if s is not None]
+
+    @property
+    def gps_zero(self) -> float | None:
+        """Where the clock begins, s since the GPS epoch, if that is known; Unix time is known by its size."""
+        if self.log is None:
+            return None if self.week is None else WEEK * self.week
+        return self.log.gps_zero
 
     @property
     def t(self) -> Array:
@@ -122,6 +131,8 @@ def read_log(path: Path, topics: Sequence[str] = ()) -> dict[str, Source]:
         raise NoSensorError(words, key=error.key) from error
     columns = matching.match_columns(header, path.name.split(".")[0])
     sensor = columns.sensor
+    if sensor is None and "t" not in columns.names and matching.FileColumns({**columns.names, "t": ""}).sensor:
+        raise _refuse_without_times(path, header, {} if plain is None else plain.words_in)
     if sensor is None:
         raise NoSensorError(
             f"{path}, line 1: no sensor is recognised in the columns {', '.join(header[:12])}; "
@@ -139,6 +150,17 @@ def read_log(path: Path, topics: Sequence[str] = ()) -> dict[str, Source]:
     elif sensor == "imu" and "speed" in columns.names:
         roles.append("odometer")
     return {role: _read(path, columns, role, plain) for role in roles}
+
+
+def _refuse_without_times(path: Path, header: list[str], words: dict[str, str]) -> NoSensorError:
+    """The error of a sensor's table without times: none of its columns is called so, or its cells are no numbers."""
+    clock = matching.match_columns(list(words)).names.get("t")
+    if clock is not None:
+        return NoSensorError(f"{path}, column '{clock}': '{words[clock][:40]}' is no time", key="draft.no_time")
+    names = ", ".join(header[:12])
+    return NoSensorError(
+        f"{path}, line 1: no times are recognised in the columns {names}; call theirs t", key="draft.no_time"
+    )
 
 
 def _read_stamps(cells: list[str]) -> Array | None:
@@ -164,6 +186,7 @@ def _add_clock(path: Path, header: list[str], columns: matching.FileColumns) -> 
     best = next((name for name, t in stamps.items() if guesses.is_date(t)), best)
     if best == columns.names["t"]:
         return columns
+    columns.names.pop("week", None)
     units = {ours: unit for ours, unit in columns.units.items() if ours != "t"}
     if unit := matching.split_unit(best)[1]:
         units["t"] = unit
@@ -184,7 +207,9 @@ def _read(path: Path, columns: matching.FileColumns, role: str, plain: Plain | N
     """The columns of one sensor: rows complete in what it needs, in order of time."""
     wanted = WANTED[role]
     names = {ours: theirs for ours, theirs in columns.names.items() if ours in wanted}
-    for extra in ("type", "satellites"):
+    if role in ("imu", "gnss") and "week" in columns.names:
+        names["week"] = columns.names["week"]
+    for extra in ("type", "satellites", "week"):
         if extra in names and not _read_numbers(path, names[extra], plain):
             del names[extra]
     if plain is None:
@@ -193,25 +218,37 @@ def _read(path: Path, columns: matching.FileColumns, role: str, plain: Plain | N
         own = {ours: plain.columns[theirs] for ours, theirs in names.items()}
         table = Table(path, own, names, np.arange(len(own["t"])))
     needed = [n for n in wanted[: _NEEDED.get(role, len(wanted))] if n in names]
-    whole = np.isfinite(table.stack(*needed)).all(-1)
+    whole = np.asarray(np.isfinite(table.stack(*needed)).all(-1))
     if role == "gnss":
-        fixed = (table["lat"] != 0.0) | (table["lon"] != 0.0)  # as it will be read
+        fixed = (table["lat"] != 0.0) | (table["lon"] != 0.0)
         if whole.any() and not (whole & fixed).any():
             raise RecordingError(
                 f"{path}: every row is at 0, 0: the receiver had no fix, or its positions are in other columns",
                 key="draft.no_fix",
             )
-        whole &= fixed
+        whole[whole] = find_places(table["lat"][whole], table["lon"][whole], ANGLE["deg"])  # as it will be read
+        check_angles(table.take(whole), ANGLE["deg"], "GNSS")
     if whole.sum() < 2:
         raise RecordingError(
             f"{path}: fewer than two rows hold all of {', '.join(names[n] for n in needed)}", key="table.few_rows"
         )
     values = {ours: table[ours][whole] for ours in names}
+    names.pop("week", None)
+    weeks = values.pop("week", np.empty(0))
     if (seconds := read_clock_seconds(values["t"])) is not None:
         words = f"times of day of '{names['t']}', hhmmss, as s since midnight"
         values["t"], plain = seconds, Plain({}, words, daily=names["t"])
+    inertial = role not in ("gnss", "odometer", "barometer")
+    unit = guesses.guess_time_unit(values["t"], matching.find_stated_unit(columns, "t", "t"), inertial)
+    if (later := find_restarts(values["t"], TIME_UNITS[str(unit.value)])) is not None:  # as it will be read
+        values["t"] = values["t"] + later
     order = np.argsort(values["t"], kind="stable")
-    order = order[np.concatenate([[True], np.diff(values["t"][order]) > 0])]
+    order = order[~find_repeated(path, values["t"][order])]
+    if len(order) < 2:
+        raise RecordingError(
+            f"{path}, column '{names['t']}': every row has the time {values['t'][0]:.10g}; log it with milliseconds",
+            key="table.times_repeated",
+        )
     values = {ours: v[order] for ours, v in values.items()}
     if role == "gnss":
         new = mask_new_fixes(values)  # as it will be read
@@ -228,7 +265,5 @@ def _read(path: Path, columns: matching.FileColumns, role: str, plain: Plain | N
         rear = [w for w in WHEELS[2:] if w in values] or [w for w in WHEELS if w in values]
         values["speed"] = np.mean([values[w] for w in rear], axis=0)
         columns = matching.FileColumns(columns.names, {**columns.units, "speed": columns.units.get(rear[0], "")})
-    source = Source(path, matching.FileColumns(names, columns.units), values, plain=plain)
-    inertial = role not in ("gnss", "odometer", "barometer")
-    source.t_unit = guesses.guess_time_unit(source.values["t"], source.find_unit("t", "t"), inertial)
-    return source
+    week = int(weeks[0]) if len(weeks) and weeks[0] > 0 and np.isfinite(weeks[0]) else None
+    return Source(path, matching.FileColumns(names, columns.units), values, t_unit=unit, week=week, plain=plain)

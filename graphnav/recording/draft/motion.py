@@ -48,7 +48,7 @@ class Lag:
 def compute_course(t: Array, llh: Array, v: Array | None) -> Course:
     """Course and accelerations of fixes: from velocities (N, 2 or 3) where they are known, else from positions."""
     p = LocalFrame(llh[0]).from_llh(llh)
-    if v is None or np.isnan(v[:, :2]).all():
+    if v is None or (~np.isnan(v[:, :2]).any(-1)).sum() < 2:
         keep = np.concatenate([[True], np.diff(t) > 0])
         t, p = t[keep], p[keep]
         grid = np.arange(t[0], t[-1], GRID)

@@ -25,6 +25,12 @@ _DAY_FIRST = re.compile(r"(\d{1,2})\.(\d{1,2})\.(\d{4})(.*)")  # 08.07.2025
 _YEAR_FIRST = re.compile(r"(\d{4})[-/.](\d{1,2})[-/.](\d{1,2})(.*)")  # 2025-07-08
 _SLASHES = re.compile(r"(\d{1,2})/(\d{1,2})/(\d{4})(.*)")  # 07/08/2025, where one number may identify the month
 _TIME_OF_DAY = re.compile(r"(\d{1,2}):(\d{2}):(\d{2})(?:[.,:](\d{1,9}))?\s*([AaPp][Mm])?")
+_MARKED = re.compile(r"[+-]?\d[\d.,'\u2019\u00a0\u202f ]*(?:[eE][+-]?\d+)?")  # a number in some country
+_SPACED = re.compile(r"(?<=\d)['\u2019\u00a0\u202f ](?=\d{3}(?!\d))")  # marks that are only ever between thousands
+_GROUPED = {
+    mark: re.compile(rf"[+-]?[1-9]\d{{0,2}}(?:\{mark}\d{{3}})+(?:\{other}\d+)?") for mark, other in (",.", ".,")
+}
+_NANOSECONDS = re.compile(r"(.*?)n(?:ano)?_?sec(?:ond)?s?", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
@@ -35,6 +41,7 @@ class Plain:
     words: str
     dated: str | None = None  # the column that was dates: Unix time, s
     daily: str | None = None  # the column that was times of day: s since midnight before the first row
+    words_in: dict[str, str] = field(default_factory=dict)  # a cell of each column that holds no numbers
 
 
 @dataclass(frozen=True)
@@ -67,24 +74,27 @@ def read_plain(path: Path) -> Plain | None:
         If it cannot be read, or a row has more or fewer fields than the header, naming its line.
     """
     with open_file(path) as raw:
-        start = raw.read(_START)
-    if path.suffix == ".gz" or b"\0" in start:
+        start = raw.read(_START).rstrip(b"\0")
+    if b"\0" in start:
         return None
     # most likely cut off within a line
     begin, _ = _decode(start.rpartition(b"\n")[0] if len(start) == _START else start)
     layout = _lay_out(path, _read_lines(begin.splitlines()))
-    if layout is None:
-        return None
-    text, encoding = _decode(read_bytes(path))
+    if layout is None or (path.suffix == ".gz" and layout.mark == "," and not layout.done):
+        return None  # what is packed is large, and no spreadsheet's
+    text, encoding = _decode(read_bytes(path).rstrip(b"\0"))
     lines = _read_lines(text.splitlines())
     rows = [_split(line, layout.mark) for _, line in lines[layout.first :]]
     names, done = layout.names, [*layout.done, *encoding]
     if len(rows[0]) == len(names) + 1 and not any(row[-1] for row in rows if len(row) > len(names)):
         rows = [row[: len(names)] for row in rows]
         done.append("an empty field at the end")
+    if len(rows) > 1 and len(rows[-1]) < len(names) and not text.endswith(("\n", "\r")):
+        del rows[-1]
+        done.append("it ends within a line, which is left out")
     wrong = next((k for k, row in enumerate(rows) if len(row) != len(names)), None)
-    if wrong is not None and match_columns(names, path.stem).sensor is None:
-        return None  # notes, not numbers
+    if wrong is not None and (not done or match_columns(names, path.stem).sensor is None):
+        return None  # a CSV file, whose reader says what is wrong, or notes
     if wrong is not None:
         raise RecordingError(
             f"{path}, line {lines[layout.first + wrong][0]}: has {len(rows[wrong])} fields where the header has "
@@ -92,11 +102,14 @@ def read_plain(path: Path) -> Plain | None:
             key="table.fields",
         )
     cells = dict(zip(names, map(list, zip(*rows, strict=True)), strict=True))
-    if any("," in cell for cell in rows[0]):
-        done.append("decimal commas")
+    if layout.mark != "," or '"' in text:  # else no number has a comma in it
+        cells, style = _write_plainly(cells, layout.mark)
+        done += style
     columns = {name: x for name, some in cells.items() if (x := _parse_numbers(some)) is not None}
+    done += _add_nanoseconds(columns)
     dated, daily, more = _parse_times(cells, columns, layout.above)
-    return Plain(columns, ", ".join([*done, *more]), dated, daily) if done or more else None
+    words = {name: next(filter(None, some), "") for name, some in cells.items() if name not in columns}
+    return Plain(columns, ", ".join([*done, *more]), dated, daily, words) if done or more else None
 
 
 def read_clock_seconds(t: Array) -> Array | None:
@@ -147,6 +160,7 @@ def _read_values(line: str, mark: str | None) -> tuple[float, int]:
 def _is_value(cell: str) -> bool:
     return (
         _parse_numbers([cell]) is not None
+        or _MARKED.fullmatch(cell) is not None
         or _parse_clock(cell) is not None
         or bool(_parse_date(cell) or _SLASHES.fullmatch(cell))
     )
@@ -213,6 +227,49 @@ def _are_units(cells: Sequence[str]) -> bool:
     """Whether a line under the names holds units."""
     spelt = [split_unit(f"x [{cell.strip('[]()')}]")[1] for cell in cells if cell.strip("[]()-")]
     return sum(unit in NAMED_UNITS for unit in spelt) > 0.5 * len(spelt)
+
+
+def _write_plainly(cells: dict[str, list[str]], mark: str | None) -> tuple[dict[str, list[str]], list[str]]:
+    """Numbers with decimal commas or marks between thousands written with a decimal point alone, and notes.
+
+    One program wrote the table, so one mark is the decimal's in all of it: that of numbers that no grouping by three
+    explains; where there is none, the point in a table with commas between its fields, as where these are decimal it
+    needs others.
+    """
+    marked = [cell for some in cells.values() for cell in some if _MARKED.fullmatch(cell)]
+    if not any("," in cell or cell.count(".") > 1 or _SPACED.search(cell) for cell in marked):
+        return cells, []
+    bare = [_SPACED.sub("", cell) for cell in marked]
+    commas, points = (
+        sum(cell.count(x) == 1 and cell.rfind(x) > cell.rfind(y) and not _GROUPED[x].fullmatch(cell) for cell in bare)
+        for x, y in (",.", ".,")
+    )
+    between = "." if commas > points or (commas == points and mark != ",") else ","
+    grouped = bare != marked or any(_GROUPED[between].fullmatch(cell) for cell in bare)
+
+    def rewrite(cell: str) -> str:
+        if not _MARKED.fullmatch(cell):
+            return cell
+        cell = _SPACED.sub("", cell)
+        return (cell.replace(between, "") if _GROUPED[between].fullmatch(cell) else cell).replace(",", ".")
+
+    notes = ["decimal commas"] if between == "." else []
+    notes += ["marks between thousands"] if grouped else []
+    return {name: [rewrite(cell) for cell in some] for name, some in cells.items()}, notes
+
+
+def _add_nanoseconds(columns: dict[str, Array]) -> list[str]:
+    """Add a column of nanoseconds to that of whole seconds of the same name, as of a ROS stamp; returns a note."""
+    for name in list(columns):
+        found = _NANOSECONDS.fullmatch(name)
+        if found is None:
+            continue
+        whole = re.compile(rf"{re.escape(found[1])}sec(?:ond)?s?", re.IGNORECASE)
+        seconds = next((other for other in columns if whole.fullmatch(other)), None)
+        if seconds is not None:
+            columns[seconds] = columns[seconds] + 1e-9 * columns.pop(name)
+            return [f"seconds of '{seconds}' and '{name}' together"]
+    return []
 
 
 def _parse_numbers(cells: Sequence[str]) -> Array | None:

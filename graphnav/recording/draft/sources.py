@@ -58,10 +58,14 @@ def find_logs(paths: Sequence[Path], topics: Sequence[str] = ()) -> LogsFound:
             if len(files) == 1 and not raw.observed:
                 raise
             nothing.append(path.name if path.exists() else str(error))
-            refused += [str(error)] if isinstance(error.__cause__, RecordingError) else []
+            if isinstance(error.__cause__, RecordingError) or error.key == "draft.no_time":
+                refused.append(str(error))
             continue
         for sensor, source in found.items():
             every.setdefault(sensor, []).append(source)
+    others = _name_others(paths, files)
+    if others:
+        left.append(f"{others}: no logs of a kind that is known")
     if nothing:
         left.append(f"left out: {', '.join(nothing)}: no sensor is recognised in the columns")
     sensors = {sensor: chosen for sensor, some in every.items() if (chosen := _choose(sensor, some, left)) is not None}
@@ -78,6 +82,8 @@ def find_logs(paths: Sequence[Path], topics: Sequence[str] = ()) -> LogsFound:
     if "imu" not in sensors:
         there = ", ".join(sensors) or "nothing"
         unread = f" ({refused[0]})" if refused else ""
+        if others and not refused:
+            unread = f" ({others})"
         raise RecordingError(
             f"{paths[0]}: no IMU in these logs (found: {there}); three gyro and three force columns are one{unread}",
             key="draft.no_imu",
@@ -111,7 +117,7 @@ def _find_unix_start(source: Source) -> float | None:
     if source.log is None:
         return float(source.t[0]) if guesses.is_date(source.t) else None
     begin = next(sensor.t[0] for sensor in source.held)
-    return None if source.log.gps_zero is None else float(source.log.gps_zero + begin + GPS_TO_UNIX)
+    return None if source.gps_zero is None else float(source.gps_zero + begin + GPS_TO_UNIX)
 
 
 def _list_files(path: Path) -> list[Path]:
@@ -124,15 +130,24 @@ def _list_files(path: Path) -> list[Path]:
     inside = sorted(p for p in every if p.name not in made)
     logs = [p for p in inside if p.name.lower().endswith(_TEXT_ENDINGS) or _is_known(p) or tell_kind(p)[0]]
     if not logs:
+        there = f" ({others})" if (others := _name_others([path], [])) else ""
         raise RecordingError(
-            f"{path}: no log in this folder: no CSV file, and none of a kind that is known", key="draft.no_log"
+            f"{path}: no log in this folder: no CSV file, and none of a kind that is known{there}", key="draft.no_log"
         )
     return logs
 
 
 def name_plain_file(path: Path, sensor: str) -> str:
     """The CSV file for a sensor's part of a table of another form."""
-    return f"{path.stem}-{sensor}.csv.gz"
+    return f"{Path(path.name.removesuffix('.gz')).stem}-{sensor}.csv.gz"
+
+
+def _name_others(paths: Sequence[Path], files: Sequence[Path]) -> str:
+    """The files of folders that are no logs, in words; '' where there are none."""
+    known = {*(p.name for p in files), *(name_plain_file(p, s) for p in files for s in WANTED), JOINED}
+    every = {p.name for path in paths if path.is_dir() and path not in files for p in path.iterdir() if p.is_file()}
+    others = sorted(name for name in every - known if not name.startswith(".") and not name.endswith(".toml"))
+    return f"not read: {', '.join(others[:5])}{', ...' if len(others) > 5 else ''}" if others else ""
 
 
 def _is_known(path: Path) -> bool:

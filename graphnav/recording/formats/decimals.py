@@ -26,8 +26,10 @@ _INTEGER_TENS = 10 ** np.arange(19, dtype=_U)
 _LAST_BYTES = np.array([2**64 - 2 ** (64 - 8 * k) for k in range(9)], _U)  # the last k bytes of a word
 
 
-def read_decimals(file: IO[bytes], width: int, use: Sequence[int]) -> list[Array]:
-    """The columns `use`, (N,) each, of lines of `width` cells; only one of them is in memory twice at a time.
+def read_decimals(file: IO[bytes], width: int, use: Sequence[int]) -> tuple[list[Array], bool]:
+    """The columns `use`, (N,) each, of lines of `width` cells, and whether the last line was cut off and left out.
+
+    Only one column is in memory twice at a time.
 
     Raises
     ------
@@ -35,9 +37,12 @@ def read_decimals(file: IO[bytes], width: int, use: Sequence[int]) -> list[Array
         If a line has another number of cells or a cell is not a number; a slower reader says which.
     """
     slabs: list[list[Array]] = [[] for _ in use]
-    rows = 0
+    rows, cut = 0, False
     while block := file.read(_BLOCK_SIZE):
-        found = _parse_columns(block + file.readline(), width, list(use))
+        text = block + file.readline()
+        if not text.endswith(b"\n"):
+            text, cut = drop_cut_line(text, width)
+        found = _parse_columns(text, width, list(use))
         done = 0
         while done < found.shape[1]:
             at = rows % _SLAB
@@ -53,7 +58,16 @@ def read_decimals(file: IO[bytes], width: int, use: Sequence[int]) -> list[Array
             column[-1] = column[-1][: (rows - 1) % _SLAB + 1]
         columns.append(np.concatenate([np.empty(0), *column]))
         column.clear()
-    return columns
+    return columns, cut
+
+
+def drop_cut_line(text: bytes, width: int) -> tuple[bytes, bool]:
+    """The end of a table without what a loss of power leaves: a line of too few cells, zeros; and whether it had it."""
+    kept = text.rstrip(b"\0")
+    begin = kept.rfind(b"\n") + 1
+    if kept[begin:].strip()[:1] not in (b"", b"#") and kept.count(b",", begin) < width - 1:
+        kept = kept[:begin]
+    return kept, kept != text
 
 
 def _parse_columns(text: bytes, width: int, use: list[int]) -> Array:

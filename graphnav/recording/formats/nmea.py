@@ -6,6 +6,7 @@ Sentences with the same time of day make one fix. Parsed and checked by pynmeagp
 from __future__ import annotations
 
 import datetime
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,7 @@ from graphnav.recording.formats.repair import DEFAULT_SD, DEFAULT_SD_V, NMEA_TYP
 KNOTS = 1852 / 3600  # m/s
 KMH = 1 / 3.6
 _DAY = 86400.0
+_SENTENCE = re.compile(rb"(?:^|[\s>\])|:])\$(?!P)[A-Za-z]{5},")
 # 1-sigma (m, one horizontal axis) by GGA's quality, multiplied by HDOP, where there is no GST: user range errors of
 # the standard service and of corrections of the code; fixed and float carrier phases as receivers state them
 _BY_QUALITY = {1: 2.5, 2: 1.0, 4: 0.02, 5: 0.4}
@@ -44,11 +46,14 @@ class _Epoch:
 
 
 def recognises(path: Path) -> bool:
-    """Whether one of the first lines is a sentence ($, talker and type, a comma) and the file is not mainly UBX."""
+    """Whether one of the first lines holds a sentence ($, talker and type, a comma) and the file is not mainly UBX.
+
+    A logger may have put the time before it.
+    """
     if ubx.recognises(path):
         return False
     lines = read_first_bytes(path).splitlines()[:20]
-    return any(line[:1] == b"$" and line[6:7] == b"," and line[1:6].isalpha() and line[1:2] != b"P" for line in lines)
+    return any(_SENTENCE.search(line) for line in lines)
 
 
 def load(path: Path) -> Log:
@@ -70,7 +75,9 @@ def load(path: Path) -> Log:
     fixes = [e for e in epochs if e.gga is not None and e.gga.quality not in (0, 6, 7, 8) and e.gga.lat != ""]
     if not fixes:
         at = f", line {broken[0]}: not a sound sentence (checksum or form), and" if broken else ":"
-        raise RecordingError(f"{path}{at} no GGA sentence with a position is in it", key="log.no_positions")
+        raise RecordingError(
+            f"{path}{at} no GGA sentence with a position and a right checksum is in it", key="log.no_positions"
+        )
     simulated = sum(e.gga is not None and e.gga.quality in (6, 7, 8) for e in epochs)
     if simulated:
         remarks.add(

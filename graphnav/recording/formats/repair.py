@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 from graphnav.core.errors import RecordingError
 from graphnav.core.notes import Note, format_count
 from graphnav.core.rotation import Array
+from graphnav.core.timescales import find_restarts
 from graphnav.recording import FIX_TYPES, fix_types
 from graphnav.recording.formats.table import Selection, Table
 from graphnav.sensors.tables import TIME_UNITS, Keep
@@ -21,6 +23,7 @@ _LEAST_SIGMA = 1e-9  # m, m/s; a smaller sigma is not meant as one
 _HIGHEST = 9000.0  # m, highest drive on Earth
 _LOWEST, _SKY = -1000.0, 50000.0  # m, range of valid heights
 _SET_BACK_PERIODS = 10.0  # periods; rows that overtake each other are closer
+_REPEATED = 0.6  # share of the rows with the time of the row before that no log has
 _RADIANS = (1.58, 3.15)  # |lat|, |lon| that angles in radians cannot exceed
 
 
@@ -56,6 +59,8 @@ def select_usable_rows(
         if the stamps run over the same times twice.
     """
     label = _SENSOR_LABELS.get(sensor, sensor)
+    if rows.cut:
+        remarks.add(f"{sensor}.cut", f"{rows.path.name} ends within a line, as after a loss of power: it is left out")
     with np.errstate(over="ignore"):
         t = rows["t"] * TIME_UNITS[unit] + offset
     # a stamp of thousands of years is invalid, like an infinite one
@@ -89,6 +94,13 @@ def select_usable_rows(
         remarks.add(f"{sensor}.rows_blank", f"{_tell_rows(blank, label)} with {what} values dropped{at}")
         rows = rows.take(~blank)
 
+    scale = TIME_UNITS[unit]
+    if (later := find_restarts((rows["t"] - offset) / scale, scale)) is not None:
+        remarks.add(
+            f"{sensor}.clock_again",
+            f"the clock of the {label} starts again from 0: {later.max() * scale:g} s are added after it",
+        )
+        rows = rows.with_column("t", rows["t"] + later * scale)
     t = rows["t"]
     step = np.diff(t)
     if (step < 0).any():
@@ -101,13 +113,7 @@ def select_usable_rows(
         )
         rows = rows.take(np.argsort(t, kind="stable"))
         t = rows["t"]
-    repeated = np.r_[False, np.diff(t) == 0]
-    if repeated.mean() > 0.6 and (~repeated).sum() > 1:
-        raise RecordingError(
-            f"{rows.path}: {_tell_rows(repeated, '')} of {len(rows)} with the time of the row before: the fraction of "
-            "the seconds was lost; log t with milliseconds",
-            key="table.times_repeated",
-        )
+    repeated = find_repeated(rows.path, t)
     if repeated.any():
         remarks.add(
             f"{sensor}.rows_repeated",
@@ -123,6 +129,24 @@ def select_usable_rows(
             "gnss.held", f"{_tell_rows(~new, 'GNSS')} with the fix of the row before left out, {len(rows)} kept"
         )
     return rows
+
+
+def find_repeated(path: Path, t: Array) -> NDArray[np.bool_]:
+    """(N,) which of the stamps, in order, are those of the row before.
+
+    Raises
+    ------
+    RecordingError
+        If most are.
+    """
+    repeated = np.r_[False, np.diff(t) == 0]
+    if repeated.mean() > _REPEATED and (~repeated).sum() > 1:
+        raise RecordingError(
+            f"{path}: {_tell_rows(repeated, '')} of {len(t)} with the time of the row before: the fraction of the "
+            "seconds was lost; log t with milliseconds",
+            key="table.times_repeated",
+        )
+    return repeated
 
 
 def mask_new_fixes(columns: Mapping[str, Array]) -> NDArray[np.bool_]:
@@ -182,6 +206,19 @@ def _check_imu_time(rows: Table, unit: str) -> None:
     )
 
 
+def find_places(lat: Array, lon: Array, scale: float) -> Selection:
+    """Which rows (N,), with angles in units of `scale` rad, are a place: neither 0, 0 nor beyond the poles.
+
+    All rows, where fewer than half are: it is then the unit that is wrong, not the rows.
+    """
+    with np.errstate(invalid="ignore"):
+        possible = np.abs(lat) * scale <= np.pi / 2
+    if possible.mean() < 0.5:
+        possible = np.ones(len(lat), dtype=bool)
+    there = (lat != 0) | (lon != 0)
+    return np.asarray(possible & (there | ~there.any()))
+
+
 def is_on_earth(lat: Array, lon: Array, h: Array) -> Selection:
     """Which of the places (N,) in rad and m are possible on a drive."""
     with np.errstate(invalid="ignore"):
@@ -200,35 +237,24 @@ def convert_geodetic(rows: Table, unit: str | None, height: float, label: str, r
     RecordingError
         For positions that are nowhere on Earth, naming the line and the likely mistake.
     """
-    nowhere = (rows["lat"] == 0) & (rows["lon"] == 0)
-    if nowhere.any() and not nowhere.all():
-        first = rows["t"][nowhere][0]
+    scale = 1.0 if unit == "rad" else np.pi / 180.0
+    nowhere = ~find_places(rows["lat"], rows["lon"], scale)
+    if nowhere.any():
+        k = np.flatnonzero(nowhere)[0]
+        where = f"{rows['lat'][k]:g}, {rows['lon'][k]:g}"
         remarks.add(
             f"{label.lower()}.nowhere",
-            f"{_tell_rows(nowhere, label)} at 0, 0 (no fix) dropped (first at t = {first:.3f} s)",
+            f"{_tell_rows(nowhere, label)} at {where} (no fix) dropped (first at t = {rows['t'][k]:.3f} s)",
         )
         rows = rows.take(~nowhere)
     lat, lon, h = rows["lat"], rows["lon"], height * rows["h"]
-    scale = 1.0 if unit == "rad" else np.pi / 180.0
     if unit is None and np.abs(lat).max() < _RADIANS[0] and np.abs(lon).max() < _RADIANS[1]:
         raise RecordingError(
             f"{rows.path}: lat and lon look like radians (first {lat[0]:g}, {lon[0]:g}); say "
             'units = { angle = "rad" } if they are, { angle = "deg" } if the drive really is there',
             key="table.radians",
         )
-    beyond = np.flatnonzero(np.abs(lat) * scale > np.pi / 2)
-    if len(beyond):
-        k = beyond[0]
-        swapped = np.abs(lon * scale).max() <= np.pi / 2
-        hint = "; are lat and lon swapped?" if swapped else _guess_other_form(lat, lon, label)
-        raise RecordingError(f"{rows.describe_place(k, 'lat')}: {lat[k]:g} is not a latitude{hint}", key="table.place")
-    beyond = np.flatnonzero((lon * scale < -np.pi - 1e-9) | (lon * scale > 2 * np.pi))
-    if len(beyond):
-        turned = lon.min() * scale >= -2 * np.pi and lon.max() * scale <= 2 * np.pi
-        hint = "; is it a whole turn off? Add 360 deg" if turned else _guess_other_form(lat, lon, label)
-        raise RecordingError(
-            f"{rows.describe_place(beyond[0], 'lon')}: {lon[beyond[0]]:g} is not a longitude{hint}", key="table.place"
-        )
+    check_angles(rows, scale, label)
     beyond = np.flatnonzero((h < _LOWEST) | (h > _SKY))
     if not len(beyond) and np.median(h) > _HIGHEST:
         beyond = np.flatnonzero(h > _HIGHEST)
@@ -242,8 +268,34 @@ def convert_geodetic(rows: Table, unit: str | None, height: float, label: str, r
     return np.stack([lat * scale, lon, h], -1), rows
 
 
+def check_angles(rows: Table, scale: float, label: str) -> None:
+    """Refuse latitudes and longitudes, in units of `scale` rad, that are none.
+
+    Raises
+    ------
+    RecordingError
+        Naming the line and the likely mistake.
+    """
+    lat, lon = rows["lat"], rows["lon"]
+    beyond = np.flatnonzero(np.abs(lat) * scale > np.pi / 2)
+    if len(beyond):
+        k = beyond[0]
+        swapped = np.abs(lon * scale).max() <= np.pi / 2
+        hint = "; are lat and lon swapped?" if swapped else _guess_other_form(lat, lon, label)
+        raise RecordingError(f"{rows.describe_place(k, 'lat')}: {lat[k]:g} is not a latitude{hint}", key="table.place")
+    beyond = np.flatnonzero((lon * scale < -np.pi - 1e-9) | (lon * scale > 2 * np.pi))
+    if len(beyond):
+        turned = lon.min() * scale >= -2 * np.pi and lon.max() * scale <= 2 * np.pi
+        hint = "; is it a whole turn off? Add 360 deg" if turned else _guess_other_form(lat, lon, label)
+        raise RecordingError(
+            f"{rows.describe_place(beyond[0], 'lon')}: {lon[beyond[0]]:g} is not a longitude{hint}", key="table.place"
+        )
+
+
 def _guess_other_form(lat: Array, lon: Array, label: str) -> str:
     """The likely mistake behind latitudes and longitudes out of range."""
+    if (np.abs(lat) <= 90e7).all() and np.median(np.abs(lat)) > 1e5 and (np.abs(lon) <= 360e7).all():
+        return "; in units of 1e-7 deg, as u-blox and MAVLink have them? Write degrees"
     if all((np.abs(x) % 100.0 < 60.0).all() and np.abs(x).max() < 100.0 * top for x, top in ((lat, 91), (lon, 181))):
         whole, minutes = divmod(abs(lat[0]), 100.0)
         return f"; degrees and minutes together, as in NMEA? {lat[0]:g} is then {whole:g} deg {minutes:g} min"

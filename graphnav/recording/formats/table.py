@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import re
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
@@ -18,7 +18,7 @@ from graphnav.core.errors import RecordingError
 from graphnav.core.files import exists, open_file, parse_number
 from graphnav.core.notes import format_count
 from graphnav.core.rotation import Array
-from graphnav.recording.formats.decimals import read_decimals
+from graphnav.recording.formats.decimals import drop_cut_line, read_decimals
 
 _BLANK_CELL = re.compile(r"(?m)(?:(?<=,)|^(?=[ \t]*,))[ \t]*(?=,|$)")  # an empty cell of a line that is not empty
 _EMPTY = "is empty; copy the log again, or leave this file out"
@@ -36,6 +36,7 @@ class Table:
     columns: dict[str, Array]  # each (N,)
     file_names: dict[str, str]  # our name -> the file's
     rows: NDArray[np.intp]  # (N,) row numbers in the file
+    cut: bool = False  # whether the file ends within a line, which is left out
 
     KEEP: ClassVar[str] = "keep"  # name of the column of `keep`
 
@@ -71,9 +72,10 @@ class Table:
 
     def describe_place(self, row: int, name: str) -> str:
         """'file, line 12, column lat' for an error about one cell."""
-        for k, (number, _) in enumerate(_list_lines(self.path)):
-            if k == self.rows[row]:
-                return f"{self.path}, line {number}, column '{self.file_names[name]}'"
+        with _open(self.path) as file:
+            for k, (number, _) in enumerate(_list_lines(file)):
+                if k == self.rows[row]:
+                    return f"{self.path}, line {number}, column '{self.file_names[name]}'"
         return f"{self.path}, column '{self.file_names[name]}'"
 
 
@@ -120,12 +122,12 @@ def read_table(
                 f"{path}: no column '{theirs}' (there are: {_list_names(header)}){hint}", key="table.column"
             )
     use = [header.index(theirs) for theirs in file_names.values()]
-    values = _parse(path, skip, header, use)
+    values, cut = _parse(path, skip, header, use)
     if not len(values[0]):
         raise RecordingError(
             f"{path}: holds a header and no rows; copy the log again, or leave this file out", key="file.no_rows"
         )
-    return Table(path, dict(zip(file_names, values, strict=True)), file_names, np.arange(len(values[0])))
+    return Table(path, dict(zip(file_names, values, strict=True)), file_names, np.arange(len(values[0])), cut)
 
 
 def _list_names(header: list[str]) -> str:
@@ -154,11 +156,13 @@ def read_first_rows(path: Path, count: int) -> list[list[str]]:
         If the file cannot be read.
     """
     try:
-        return [[cell.strip().strip('"') for cell in line.split(",")] for _, line in islice(_list_lines(path), count)]
+        with _open(path) as file:
+            lines = [line for _, line in islice(_list_lines(file), count)]
     except UnicodeDecodeError:
         raise RecordingError(
             f"{path}: holds bytes that are not UTF-8 text; save it as UTF-8", key="file.text"
         ) from None
+    return [[cell.strip().strip('"') for cell in line.split(",")] for line in lines]
 
 
 def _open(path: Path) -> IO[str]:
@@ -193,7 +197,7 @@ def _read_header(path: Path) -> tuple[int, list[str]]:
         start = raw.read(1 << 16)
     if start[:2] in (b"\xff\xfe", b"\xfe\xff"):
         raise RecordingError(f"{path}: is UTF-16 text; save it as UTF-8", key="file.text")
-    if b"\0" in start:
+    if b"\0" in start.partition(b"\n")[0]:  # later ones a loss of power leaves
         raise RecordingError(f"{path}: is a binary file, not a CSV table; save it as CSV", key="file.binary")
     text = start.decode("utf-8-sig", errors="replace")
     for number, line in enumerate(text.splitlines(), 1):
@@ -227,8 +231,8 @@ def _is_number(text: str) -> bool:
     return True
 
 
-def _parse(path: Path, skip: int, header: list[str], use: list[int]) -> list[Array]:
-    """The requested columns, (N,) each: plain numbers, else as NumPy parses them, else cell by cell."""
+def _parse(path: Path, skip: int, header: list[str], use: list[int]) -> tuple[list[Array], bool]:
+    """The requested columns, (N,) each: plain numbers, else as NumPy parses them, else cell by cell; if it was cut."""
     try:
         with _open_bytes(path) as raw:
             head = b"".join(raw.readline() for _ in range(skip))
@@ -236,13 +240,20 @@ def _parse(path: Path, skip: int, header: list[str], use: list[int]) -> list[Arr
                 return read_decimals(raw, len(header), use)
     except ValueError:
         pass
+    cut = False
     try:
-        with _open(path) as file:
-            text = file.read()
+        with _open_bytes(path) as raw:
+            data = raw.read()
+        if not data.endswith(b"\n"):
+            data, cut = drop_cut_line(data, len(header))
+        text = io.TextIOWrapper(io.BytesIO(data), encoding="utf-8-sig").read()
+    except UnicodeDecodeError:
+        raise RecordingError(f"{path}: is not UTF-8 text; save it as UTF-8", key="file.text") from None
+    try:
         values = _load_text(text, skip, header, use)
     except ValueError:
-        values = _parse_cells(path, header, use)
-    return list(np.ascontiguousarray(values.T))
+        values = _parse_cells(path, text, header, use)
+    return list(np.ascontiguousarray(values.T)), cut
 
 
 def _load_text(text: str, skip: int, header: list[str], use: list[int]) -> Array:
@@ -265,15 +276,14 @@ def _load_text(text: str, skip: int, header: list[str], use: list[int]) -> Array
     return values.reshape(-1, len(use))
 
 
-def _list_lines(path: Path) -> Iterator[tuple[int, str]]:
+def _list_lines(lines: Iterable[str]) -> Iterator[tuple[int, str]]:
     """(line number, text) of every non-empty line after the header."""
-    with _open(path) as file:
-        seen_header = False
-        for number, line in enumerate(file, 1):
-            line = line.split("#")[0].strip()
-            if line and seen_header:
-                yield number, line
-            seen_header = seen_header or bool(line)
+    seen_header = False
+    for number, line in enumerate(lines, 1):
+        line = line.split("#")[0].strip()
+        if line and seen_header:
+            yield number, line
+        seen_header = seen_header or bool(line)
 
 
 def _suggest_cause(cell: str, cells: list[str], header: list[str], use: list[int]) -> str:
@@ -282,34 +292,34 @@ def _suggest_cause(cell: str, cells: list[str], header: list[str], use: list[int
         return "; the header is there again: cut the file in two there, or take the line out"
     if re.fullmatch(r"(\d+-\d+-\d+[T ])?\d{1,2}:\d{2}(:\d{2}([.,]\d*)?)?Z?", cell):
         return "; it is a time of day: write seconds, or let graphnav init do it"
+    if re.match(r"\d+[-/.]\d+[-/.]\d+\b", cell):
+        return "; it is a date: write seconds, or year-month-day, of which graphnav init makes them"
     if not any(_is_number(cells[k].strip('"')) for k in use):
         return "; if the line holds units, take it out"
     return ""
 
 
-def _parse_cells(path: Path, header: list[str], use: list[int]) -> Array:
+def _parse_cells(path: Path, text: str, header: list[str], use: list[int]) -> Array:
     """The slow parser, which reports what is wrong and where."""
     rows = []
-    try:
-        for number, line in _list_lines(path):
-            cells = [cell.strip() for cell in line.split(",")]
-            if len(cells) != len(header):
-                many = format_count(len(cells), "field")
+    for number, line in _list_lines(text.splitlines()):
+        cells = [cell.strip() for cell in line.split(",")]
+        if len(cells) != len(header):
+            many = format_count(len(cells), "field")
+            zeros = "; it holds bytes that are 0, as after a loss of power: take the line out" if "\0" in line else ""
+            raise RecordingError(
+                f"{path}, line {number}: has {many} where the header has {len(header)}{zeros}", key="table.fields"
+            )
+        row = []
+        for column in use:
+            cell = cells[column].strip('"')
+            try:
+                row.append(parse_number(cell) if cell else np.nan)
+            except ValueError:
                 raise RecordingError(
-                    f"{path}, line {number}: has {many} where the header has {len(header)}", key="table.fields"
-                )
-            row = []
-            for column in use:
-                cell = cells[column].strip('"')
-                try:
-                    row.append(parse_number(cell) if cell else np.nan)
-                except ValueError:
-                    raise RecordingError(
-                        f"{path}, line {number}, column '{header[column]}': '{cell[:40]}' is not a number"
-                        f"{_suggest_cause(cell, cells, header, use)}",
-                        key="table.cell",
-                    ) from None
-            rows.append(row)
-    except UnicodeDecodeError:
-        raise RecordingError(f"{path}: is not UTF-8 text; save it as UTF-8", key="file.text") from None
+                    f"{path}, line {number}, column '{header[column]}': '{cell[:40]}' is not a number"
+                    f"{_suggest_cause(cell, cells, header, use)}",
+                    key="table.cell",
+                ) from None
+        rows.append(row)
     return np.array(rows, dtype=float).reshape(-1, len(use))

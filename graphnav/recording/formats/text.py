@@ -51,7 +51,8 @@ def parse_table(
         fields = line.split(delimiter)
         if len(fields) != len(names):
             raise RecordingError(
-                f"{path}, line {number}: {format_count(len(fields), 'field')} where {len(names)} were expected",
+                f"{path}, line {number}: {format_count(len(fields), 'field')} where {len(names)} were expected"
+                f"{'; it is the last line: if it was cut off, take it out' if number == rows[-1][0] else ''}",
                 key="table.fields",
             )
         for k in use:
