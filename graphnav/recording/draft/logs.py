@@ -132,7 +132,7 @@ def read_log(path: Path, topics: Sequence[str] = ()) -> dict[str, Source]:
     columns = matching.match_columns(header, path.name.split(".")[0])
     sensor = columns.sensor
     if sensor is None and "t" not in columns.names and matching.FileColumns({**columns.names, "t": ""}).sensor:
-        raise _refuse_without_times(path, header, {} if plain is None else plain.words_in)
+        raise _make_times_error(path, header, {} if plain is None else plain.words_in)
     if sensor is None:
         raise NoSensorError(
             f"{path}, line 1: no sensor is recognised in the columns {', '.join(header[:12])}; "
@@ -152,7 +152,7 @@ def read_log(path: Path, topics: Sequence[str] = ()) -> dict[str, Source]:
     return {role: _read(path, columns, role, plain) for role in roles}
 
 
-def _refuse_without_times(path: Path, header: list[str], words: dict[str, str]) -> NoSensorError:
+def _make_times_error(path: Path, header: list[str], words: dict[str, str]) -> NoSensorError:
     """The error of a sensor's table without times: none of its columns is called so, or its cells are no numbers."""
     clock = matching.match_columns(list(words)).names.get("t")
     if clock is not None:
