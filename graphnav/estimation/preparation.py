@@ -24,12 +24,12 @@ from graphnav.estimation.alignment import Alignment, use_known_heading
 from graphnav.estimation.building import BuiltProblem, Clock, ProblemBuilder, has_diverged
 from graphnav.estimation.fixing import fix, list_float_arcs
 from graphnav.estimation.noise.apply import apply_noise, drop_parts
+from graphnav.estimation.noise.decision import log_evidence
 from graphnav.estimation.noise.estimate import NoiseEstimate, estimate_noise
 from graphnav.estimation.noise.exclusion import (
     compute_excluded_share,
     estimate_disturbed_intervals,
     estimate_without_faults,
-    log_evidence,
 )
 from graphnav.estimation.noise.model import STATED, NoiseModel
 from graphnav.estimation.noise.spacing import space_fixes

@@ -37,31 +37,22 @@ from __future__ import annotations
 
 import contextlib
 from collections import Counter
-from collections.abc import Callable, Collection
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
 from graphnav.estimation import faults
-from graphnav.estimation.noise.apply import apply_noise, apply_weights, select_weights
+from graphnav.estimation.noise.apply import apply_noise, select_weights
+from graphnav.estimation.noise.decision import Decision, explain, list_explanations, log_evidence
 from graphnav.estimation.noise.estimate import NoiseEstimate, estimate_noise
 from graphnav.estimation.noise.explanations import (
-    EXPLANATIONS,
     FIXES,
-    ONE_SENSOR,
-    ROWS,
-    WHEELS,
-    Explanation,
-    compute_evidence,
 )
 from graphnav.estimation.noise.initial_points import BREAKDOWN
 from graphnav.estimation.noise.model import INTERVALS, NoiseModel, RowWeights
 from graphnav.estimation.noise.moments import collect_row_moments
 from graphnav.estimation.noise.outliers import (
-    compute_latest_cost,
-    compute_outlier_cost,
-    count_reduced,
-    count_rows,
     limit_squares,
 )
 from graphnav.estimation.noise.spans import (
@@ -69,7 +60,6 @@ from graphnav.estimation.noise.spans import (
     Span,
     are_covered,
     drop_within,
-    extend_to_next_fix,
     join,
     join_faults,
     list_before,
@@ -85,19 +75,7 @@ from graphnav.estimation.solvers.ekf import refilter
 from graphnav.estimation.solvers.watch import FALSE_ALARM
 from graphnav.recording import Recording
 
-_BY_ROWS = INTERVALS, ROWS  # explanations by outliers, for which nothing is left out
-_FAULT_COST = -float(np.log(FALSE_ALARM))  # log-odds of a fault beforehand, negative
 _REFINEMENTS = 2  # estimates without masked spans: the first trims the spans, the second is free of what is wrong
-
-
-@dataclass(frozen=True)
-class Decision:
-    """A noise model with what it leaves out, and the evidence of all measurements."""
-
-    noise: NoiseModel
-    log_evidence: float
-    passes: Counter[str] = field(default_factory=Counter)
-    estimate: NoiseEstimate | None = None  # with this noise, where nothing is left out but figures were estimated again
 
 
 def estimate_without_faults(
@@ -243,7 +221,7 @@ def _readmit(base: Problem, found: NoiseEstimate) -> NoiseEstimate:
     narrow = trim(spans, errors, FALSE_ALARM)
     if not narrow or narrow == spans:
         return found
-    among = _list_explanations(found.noise)
+    among = list_explanations(found.noise)
     wide, less = (explain(base, _add_outliers(found, errors, some), some, among) for some in (spans, narrow))
     passes = found.passes + wide.passes + less.passes
     if less.log_evidence <= wide.log_evidence:
@@ -280,14 +258,6 @@ def estimate_disturbed_intervals(base: Problem, found: NoiseEstimate) -> NoiseEs
     return replace(disturbed, passes=passes + disturbed.passes)
 
 
-def log_evidence(base: Problem, found: NoiseEstimate) -> float:
-    """Of all measurements, excluded ones included; each outlier outside the spans has its cost."""
-    spans = join(span for some in found.noise.excluded.values() for span in some)
-    whole = explain(base, found, spans, _list_explanations(found.noise)).log_evidence if spans else found.log_posterior
-    outside = {name: drop_within(some, spans) for name, some in found.noise.weights.items()}
-    return whole - compute_outlier_cost(outside, count_rows(base))
-
-
 def find_suspects(base: Problem, noise: NoiseModel, found: NoiseEstimate) -> list[Span]:
     """Spans (s) in which fixes may be wrong: those that the tests find, and those in which a receiver repeats itself.
 
@@ -306,77 +276,6 @@ def _test(base: Problem, noise: NoiseModel, found: NoiseEstimate) -> list[Span]:
     tested = apply_noise(base, replace(noise, weights=kept))
     weights = refilter(tested, found.carry_points(base, tested), watch=True, whole=False).weights
     return join_faults(faults.find_fault_spans(faults.weigh_rows(tested, weights)))
-
-
-def explain(
-    base: Problem, found: NoiseEstimate, spans: list[Span], among: Collection[Explanation] = EXPLANATIONS
-) -> Decision:
-    """Decide by evidence what is wrong in each span.
-
-    Parameters
-    ----------
-    found : the figures, and weights of rows.
-    among : explanations to compare with that nothing is wrong.
-    """
-    if not spans:
-        return Decision(found.noise, found.log_posterior)
-    noise = replace(found.noise, excluded={})
-    reach = extend_to_next_fix(base, spans, FIXES)
-    outside = {name: drop_within(some, reach if name in INTERVALS else spans) for name, some in noise.weights.items()}
-    # weights inside the spans, by explanation: where one sensor is wrong, the others keep their outliers
-    inside: dict[Explanation, dict[str, RowWeights]] = {
-        kinds: {name: some for name, some in noise.weights.items() if name not in (*kinds, *INTERVALS)}
-        for kinds in (*ONE_SENSOR, ROWS)
-    }
-    inside[INTERVALS] = {name: some for name, some in noise.weights.items() if name in INTERVALS}
-    used = apply_noise(base, replace(noise, weights=outside))
-    totals = count_rows(base)
-    each = {name: compute_latest_cost(some, totals[name]) for name, some in noise.weights.items() if name in totals}
-    outliers = {
-        kinds: [
-            sum(
-                each[name] * (count_reduced(one) - count_reduced(drop_within(one, [within])))
-                for name, one in some.items()
-                if name in each
-            )
-            for within in (reach if kinds == INTERVALS else spans)
-        ]
-        for kinds, some in inside.items()
-    }
-    among = [kinds for kinds in among if kinds not in _BY_ROWS or any(outliers[kinds])]
-    weighted: dict[Explanation, Problem] = {
-        kinds: apply_weights(used, outside | inside[kinds]) for kinds in (*ONE_SENSOR, ROWS)
-    }
-    if INTERVALS in among:
-        weighted[INTERVALS] = apply_noise(base, replace(noise, weights=outside | inside[INTERVALS]))
-    before, likelihood, passes = compute_evidence(used, found.carry_points(base, used), spans, weighted, among)
-    excluded: dict[str, tuple[Span, ...]] = {}
-    total = before + found.log_prior
-    dropped: dict[str, list[Span]] = {name: [] for name in noise.weights}
-    for k, span in enumerate(spans):
-        cost = np.array([0.0 if not kinds or kinds in _BY_ROWS else _FAULT_COST for kinds in EXPLANATIONS])
-        for kinds, more in outliers.items():
-            cost[EXPLANATIONS.index(kinds)] += more[k] if more[k] or kinds not in _BY_ROWS else np.inf
-        posterior = likelihood[k] - cost
-        best = EXPLANATIONS[int(np.argmax(posterior))]
-        total += float(np.max(posterior))
-        for name in noise.weights.keys() - inside.get(best, {}).keys():
-            dropped[name].append(reach[k] if name in INTERVALS else span)
-        if best not in _BY_ROWS:
-            excluded |= {name: (*excluded.get(name, ()), span) for name in best}
-    present = {rows.name for rows in base.constraints}
-    excluded = {name: some for name, some in excluded.items() if name in present}
-    weights = {name: drop_within(some, dropped[name]) for name, some in noise.weights.items()}
-    return Decision(replace(noise, weights=weights, excluded=excluded), total, Counter(filter=passes))
-
-
-def _list_explanations(noise: NoiseModel) -> set[Explanation]:
-    """The explanations by which a noise model leaves spans out."""
-    found = set[Explanation]()
-    for span in {span for some in noise.excluded.values() for span in some}:
-        names = {name for name, some in noise.excluded.items() if span in some}
-        found.add(WHEELS if names & set(WHEELS) else tuple(name for name in FIXES if name in names))
-    return found
 
 
 def _predict_left_out(problem: Problem, found: NoiseEstimate) -> LeftOutErrors:
