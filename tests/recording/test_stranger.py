@@ -231,11 +231,12 @@ def test_a_log_that_a_loss_of_power_ended_is_read_to_there(tokyo, tmp_path, end)
     assert {"imu.cut", "gnss.cut"} <= set(map(get_key, recording.remarks)) or end == b""
 
 
-def test_zeros_in_the_middle_of_a_log_are_named(tokyo, tmp_path, capsys):
+@pytest.mark.parametrize("count", [3, 300])  # within a cell, over several
+def test_zeros_in_the_middle_of_a_log_are_named(tokyo, tmp_path, capsys, count):
     folder = stranger.write_tables(tmp_path / "log", *stranger.tables(tokyo[2]))
     data = (folder / "imu.csv").read_bytes()
-    half = len(data) // 2
-    (folder / "imu.csv").write_bytes(data[:half] + bytes(300) + data[half + 300 :])
+    half = data.index(b".", len(data) // 2) + 1
+    (folder / "imu.csv").write_bytes(data[:half] + bytes(count) + data[half + count :])
     assert "imu.csv, line " in refuse_command(capsys, "table.fields", "init", folder, "-o", folder)
 
 

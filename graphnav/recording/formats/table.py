@@ -304,11 +304,15 @@ def _parse_cells(path: Path, text: str, header: list[str], use: list[int]) -> Ar
     rows = []
     for number, line in _list_lines(text.splitlines()):
         cells = [cell.strip() for cell in line.split(",")]
+        if "\0" in line:
+            raise RecordingError(
+                f"{path}, line {number}: holds bytes that are 0, as after a loss of power: take the line out",
+                key="table.fields",
+            )
         if len(cells) != len(header):
             many = format_count(len(cells), "field")
-            zeros = "; it holds bytes that are 0, as after a loss of power: take the line out" if "\0" in line else ""
             raise RecordingError(
-                f"{path}, line {number}: has {many} where the header has {len(header)}{zeros}", key="table.fields"
+                f"{path}, line {number}: has {many} where the header has {len(header)}", key="table.fields"
             )
         row = []
         for column in use:
