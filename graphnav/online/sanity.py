@@ -15,7 +15,8 @@ import numpy as np
 
 from graphnav.core.earth import llh_to_ecef
 from graphnav.core.rotation import Array
-from graphnav.recording.formats.repair import VAGUEST, VAGUEST_V, is_on_earth
+from graphnav.recording.formats.places import is_on_earth
+from graphnav.recording.formats.repair import VAGUEST, VAGUEST_V
 from graphnav.recording.plausibility.fixes import FASTEST, MISLED
 from graphnav.recording.plausibility.screening import ACCEL_RANGE, GYRO_RANGE
 

@@ -17,8 +17,9 @@ from graphnav.recording.draft import guesses
 from graphnav.recording.draft.guesses import Guess
 from graphnav.recording.draft.plain import Plain, read_clock_seconds, read_plain
 from graphnav.recording.formats.folder import read_other_log
+from graphnav.recording.formats.places import check_angles, find_places
 from graphnav.recording.formats.registry import Log
-from graphnav.recording.formats.repair import check_angles, find_places, find_repeated, mask_new_fixes
+from graphnav.recording.formats.repair import find_repeated, mask_new_fixes
 from graphnav.recording.formats.schema import WHEELS
 from graphnav.recording.formats.table import Table, read_column_names, read_first_rows, read_table
 from graphnav.sensors.tables import ANGLE, TIME_UNITS

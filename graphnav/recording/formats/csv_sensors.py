@@ -12,6 +12,7 @@ from graphnav.core.notes import format_count
 from graphnav.core.rotation import Array
 from graphnav.recording import Gnss, Imu, ImuNoise, Odometer, Truth
 from graphnav.recording.formats import schema
+from graphnav.recording.formats.places import convert_geodetic
 from graphnav.recording.formats.pulses import count_pulses
 from graphnav.recording.formats.repair import (
     DEFAULT_SD,
@@ -21,7 +22,6 @@ from graphnav.recording.formats.repair import (
     Remarks,
     choose_sigmas,
     compute_horizontal_velocity,
-    convert_geodetic,
     parse_fix_types,
 )
 from graphnav.recording.formats.table import Table

@@ -34,8 +34,9 @@ from graphnav.recording.formats.kfgins_configuration import (
     read_imu_noise,
     read_lever_arm,
 )
+from graphnav.recording.formats.places import is_on_earth
 from graphnav.recording.formats.registry import Log, log_format, read_first_bytes
-from graphnav.recording.formats.repair import Remarks, is_on_earth
+from graphnav.recording.formats.repair import Remarks
 from graphnav.recording.formats.schema import parse_axes_letters
 from graphnav.recording.formats.text import parse_table, split_lines
 from graphnav.recording.formats.trajectories import read_trajectory

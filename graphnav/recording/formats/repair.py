@@ -20,11 +20,8 @@ _SENSOR_LABELS = {"imu": "IMU", "gnss": "GNSS", "odometer": "odometer", "truth":
 LATEST = 1e11  # s, either sign: three thousand years
 VAGUEST, VAGUEST_V = 1e5, 1e4  # m, m/s; a fix with a larger sigma carries no information
 _LEAST_SIGMA = 1e-9  # m, m/s; a smaller sigma is not meant as one
-_HIGHEST = 9000.0  # m, highest drive on Earth
-_LOWEST, _SKY = -1000.0, 50000.0  # m, range of valid heights
 _SET_BACK_PERIODS = 10.0  # periods; rows that overtake each other are closer
 _REPEATED = 0.6  # share of the rows with the time of the row before that no log has
-_RADIANS = (1.58, 3.15)  # |lat|, |lon| that angles in radians cannot exceed
 
 
 # 1-sigma where a recording states none, from the GPS Standard Positioning Service Performance Standard (5th ed.,
@@ -91,7 +88,7 @@ def select_usable_rows(
         first = np.flatnonzero(blank)[0]
         at = f" (first at t = {rows['t'][first]:.3f} s)" if np.isfinite(rows["t"][first]) else ""
         what = "blank, NaN or infinite" if sensor == "odometer" else "blank or NaN"
-        remarks.add(f"{sensor}.rows_blank", f"{_tell_rows(blank, label)} with {what} values dropped{at}")
+        remarks.add(f"{sensor}.rows_blank", f"{format_row_count(blank, label)} with {what} values dropped{at}")
         rows = rows.take(~blank)
 
     scale = TIME_UNITS[unit]
@@ -117,7 +114,7 @@ def select_usable_rows(
     if repeated.any():
         remarks.add(
             f"{sensor}.rows_repeated",
-            f"{_tell_rows(repeated, label)} with the time of the row before dropped "
+            f"{format_row_count(repeated, label)} with the time of the row before dropped "
             f"(first at t = {t[repeated][0]:.3f} s)",
         )
         rows = rows.take(~repeated)
@@ -125,9 +122,8 @@ def select_usable_rows(
         _check_imu_time(rows, unit)
     if sensor == "gnss" and not (new := mask_new_fixes(rows.columns)).all():
         rows = rows.take(new)
-        remarks.add(
-            "gnss.held", f"{_tell_rows(~new, 'GNSS')} with the fix of the row before left out, {len(rows)} kept"
-        )
+        held = format_row_count(~new, "GNSS")
+        remarks.add("gnss.held", f"{held} with the fix of the row before left out, {len(rows)} kept")
     return rows
 
 
@@ -142,8 +138,8 @@ def find_repeated(path: Path, t: Array) -> NDArray[np.bool_]:
     repeated = np.r_[False, np.diff(t) == 0]
     if repeated.mean() > _REPEATED and (~repeated).sum() > 1:
         raise RecordingError(
-            f"{path}: {_tell_rows(repeated, '')} of {len(t)} with the time of the row before: the fraction of the "
-            "seconds was lost; log t with milliseconds",
+            f"{path}: {format_row_count(repeated, '')} of {len(t)} with the time of the row before: the fraction of "
+            "the seconds was lost; log t with milliseconds",
             key="table.times_repeated",
         )
     return repeated
@@ -185,7 +181,8 @@ def _check_passes(rows: Table, label: str) -> None:
             )
 
 
-def _tell_rows(mask: Selection, label: str) -> str:
+def format_row_count(mask: Selection, label: str) -> str:
+    """How many rows (N,) are meant, and of what."""
     return format_count(mask.sum(), f"{label} row".strip())
 
 
@@ -204,102 +201,6 @@ def _check_imu_time(rows: Table, unit: str) -> None:
     raise RecordingError(
         f"{rows.path}: IMU rows are {step:g} s apart, which no usable IMU is{hint}", key="imu.time_unit"
     )
-
-
-def find_places(lat: Array, lon: Array, scale: float) -> Selection:
-    """Which rows (N,), with angles in units of `scale` rad, are a place: neither 0, 0 nor beyond the poles.
-
-    All rows, where fewer than half are: it is then the unit that is wrong, not the rows.
-    """
-    with np.errstate(invalid="ignore"):
-        possible = np.abs(lat) * scale <= np.pi / 2
-    if possible.mean() < 0.5:
-        possible = np.ones(len(lat), dtype=bool)
-    there = (lat != 0) | (lon != 0)
-    return np.asarray(possible & (there | ~there.any()))
-
-
-def is_on_earth(lat: Array, lon: Array, h: Array) -> Selection:
-    """Which of the places (N,) in rad and m are possible on a drive."""
-    with np.errstate(invalid="ignore"):
-        near = (np.abs(lat) <= np.pi / 2) & (np.abs(lon) <= 2 * np.pi) & (h >= _LOWEST) & (h <= _SKY)
-    return np.asarray(near)
-
-
-def convert_geodetic(rows: Table, unit: str | None, height: float, label: str, remarks: Remarks) -> tuple[Array, Table]:
-    """(lat, lon, h) in rad, rad, m of rows with usable position, and those rows.
-
-    `unit` is that of the angles; None means degrees, and angles that are all small enough to be radians are refused.
-    `height` is the unit of the heights, in m.
-
-    Raises
-    ------
-    RecordingError
-        For positions that are nowhere on Earth, naming the line and the likely mistake.
-    """
-    scale = 1.0 if unit == "rad" else np.pi / 180.0
-    nowhere = ~find_places(rows["lat"], rows["lon"], scale)
-    if nowhere.any():
-        k = np.flatnonzero(nowhere)[0]
-        where = f"{rows['lat'][k]:g}, {rows['lon'][k]:g}"
-        remarks.add(
-            f"{label.lower()}.nowhere",
-            f"{_tell_rows(nowhere, label)} at {where} (no fix) dropped (first at t = {rows['t'][k]:.3f} s)",
-        )
-        rows = rows.take(~nowhere)
-    lat, lon, h = rows["lat"], rows["lon"], height * rows["h"]
-    if unit is None and np.abs(lat).max() < _RADIANS[0] and np.abs(lon).max() < _RADIANS[1]:
-        raise RecordingError(
-            f"{rows.path}: lat and lon look like radians (first {lat[0]:g}, {lon[0]:g}); say "
-            'units = { angle = "rad" } if they are, { angle = "deg" } if the drive really is there',
-            key="table.radians",
-        )
-    check_angles(rows, scale, label)
-    beyond = np.flatnonzero((h < _LOWEST) | (h > _SKY))
-    if not len(beyond) and np.median(h) > _HIGHEST:
-        beyond = np.flatnonzero(h > _HIGHEST)
-    if len(beyond):
-        k = beyond[0]
-        hint = "; is it in millimetres?" if abs(h[k]) > _HIGHEST else ""
-        raise RecordingError(
-            f"{rows.describe_place(k, 'h')}: {h[k]:g} m is not the height of a drive{hint}", key="table.height"
-        )
-    lon = np.where(lon * scale > np.pi, lon * scale - 2 * np.pi, lon * scale)
-    return np.stack([lat * scale, lon, h], -1), rows
-
-
-def check_angles(rows: Table, scale: float, label: str) -> None:
-    """Refuse latitudes and longitudes, in units of `scale` rad, that are none.
-
-    Raises
-    ------
-    RecordingError
-        Naming the line and the likely mistake.
-    """
-    lat, lon = rows["lat"], rows["lon"]
-    beyond = np.flatnonzero(np.abs(lat) * scale > np.pi / 2)
-    if len(beyond):
-        k = beyond[0]
-        swapped = np.abs(lon * scale).max() <= np.pi / 2
-        hint = "; are lat and lon swapped?" if swapped else _guess_other_form(lat, lon, label)
-        raise RecordingError(f"{rows.describe_place(k, 'lat')}: {lat[k]:g} is not a latitude{hint}", key="table.place")
-    beyond = np.flatnonzero((lon * scale < -np.pi - 1e-9) | (lon * scale > 2 * np.pi))
-    if len(beyond):
-        turned = lon.min() * scale >= -2 * np.pi and lon.max() * scale <= 2 * np.pi
-        hint = "; is it a whole turn off? Add 360 deg" if turned else _guess_other_form(lat, lon, label)
-        raise RecordingError(
-            f"{rows.describe_place(beyond[0], 'lon')}: {lon[beyond[0]]:g} is not a longitude{hint}", key="table.place"
-        )
-
-
-def _guess_other_form(lat: Array, lon: Array, label: str) -> str:
-    """The likely mistake behind latitudes and longitudes out of range."""
-    if (np.abs(lat) <= 90e7).all() and np.median(np.abs(lat)) > 1e5 and (np.abs(lon) <= 360e7).all():
-        return "; in units of 1e-7 deg, as u-blox and MAVLink have them? Write degrees"
-    if all((np.abs(x) % 100.0 < 60.0).all() and np.abs(x).max() < 100.0 * top for x, top in ((lat, 91), (lon, 181))):
-        whole, minutes = divmod(abs(lat[0]), 100.0)
-        return f"; degrees and minutes together, as in NMEA? {lat[0]:g} is then {whole:g} deg {minutes:g} min"
-    return '; if they are metres, name them x and y and say frame = "local"' if label == "truth" else ""
 
 
 def choose_sigmas(

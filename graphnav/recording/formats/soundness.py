@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from graphnav.core.errors import RecordingError
 from graphnav.core.notes import Note, format_count
 from graphnav.recording import Gnss, take_rows
+from graphnav.recording.formats.places import is_on_earth
 from graphnav.recording.formats.registry import Log
-from graphnav.recording.formats.repair import LATEST, VAGUEST, VAGUEST_V, is_on_earth
+from graphnav.recording.formats.repair import LATEST, VAGUEST, VAGUEST_V
 
 
 def drop_unsound_rows(log: Log, path: Path) -> Log:
