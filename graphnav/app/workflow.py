@@ -249,7 +249,10 @@ def _run(request: Request, progress: Progress | None) -> Outcome:
     if request.judge_arms or list_doubts(solutions, errors):  # which takes a second
         from graphnav.estimation.antenna import find_wrong_arms
 
-        checks = (*find_wrong_arms(used, checks), *checks)
+        arms = find_wrong_arms(used, checks)
+        if any(one.noise.lever_arm is not None for one in select_own(solutions).values()):  # it is not used as stated
+            arms = [f for f in arms if not f.key.startswith("gnss.")]
+        checks = (*arms, *checks)
         findings = [*(f.sentence for f in checks), *findings]
     densities = _find_densities(used, request.settings, solutions)
     return Outcome(

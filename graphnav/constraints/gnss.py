@@ -376,3 +376,10 @@ def average_around(imu: Imu, x: Array, t: Array) -> Array:
     lo, hi = np.minimum(lo, len(imu.t) - 1), np.minimum(hi, len(imu.t))
     total = np.concatenate([np.zeros((1, 3)), np.cumsum(x, axis=0)])
     return (total[hi] - total[lo]) / (hi - lo)[:, None]
+
+
+def free_lever_arm(rows: Constraint, value: Array, sigma: Array) -> Constraint:
+    """Rows of fixes with their lever arm (3,), m, as a parameter with a prior sigma (3,)."""
+    others = tuple(p for p in rows.parameters if p.name != LEVER_ARM)
+    changed: dict[str, Any] = {"lever_arm": value, "parameters": (Parameter(LEVER_ARM, value, sigma, "m"), *others)}
+    return replace(rows, **changed)

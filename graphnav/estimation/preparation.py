@@ -23,6 +23,7 @@ from graphnav.estimation import faults
 from graphnav.estimation.alignment import Alignment, use_known_heading
 from graphnav.estimation.building import BuiltProblem, Clock, ProblemBuilder, has_diverged
 from graphnav.estimation.fixing import fix, list_float_arcs
+from graphnav.estimation.lever_arm import describe_arm, find_contradicted_arm, free_arm, narrow_arm
 from graphnav.estimation.noise.apply import apply_noise, drop_parts
 from graphnav.estimation.noise.decision import log_evidence
 from graphnav.estimation.noise.estimate import NoiseEstimate, estimate_noise
@@ -31,7 +32,8 @@ from graphnav.estimation.noise.exclusion import (
     estimate_disturbed_intervals,
     estimate_without_faults,
 )
-from graphnav.estimation.noise.model import STATED, NoiseModel
+from graphnav.estimation.noise.initial_points import BREAKDOWN
+from graphnav.estimation.noise.model import STATED, LeverArm, NoiseModel
 from graphnav.estimation.noise.spacing import space_fixes
 from graphnav.estimation.noise.words import describe_noise
 from graphnav.estimation.problem import Problem
@@ -116,6 +118,7 @@ def prepare(
             noise = replace(noise, spacing=spacing)
     else:
         built = builder.build_without(built, noise, parts=noise != STATED)
+        built = replace(built, problem=free_arm(built.problem, noise.lever_arm))
     aligned = built.aligned
     problem = drop_parts(apply_noise(built.problem, noise))
     try:
@@ -130,7 +133,8 @@ def prepare(
             smoothed = smooth_backward(problem, refilter(problem, smoothed, progress), progress)
         forward, smoothed = _relinearise(problem, aligned, known, forward, smoothed, progress, passes)
     passes.update(filter=1, smoother=1)
-    notes, epochs, arcs = describe_noise(noise, problem), {}, {"": list_float_arcs(problem)}
+    notes = (*describe_arm(noise.lever_arm, recording), *describe_noise(noise, problem))
+    epochs, arcs = {}, {"": list_float_arcs(problem)}
     if built.carriers is not None:
         tell("ambiguities")
         with clock.count_time("ambiguities"):
@@ -177,21 +181,51 @@ def _find_noise(
         built = without
         again = estimate_noise(built.problem, built.aligned.until, best.noise, progress=progress)
         best = replace(again, passes=best.passes + again.passes)
+    built, best, arm = _free_contradicted_arm(builder, built, best, progress)
     best = estimate_disturbed_intervals(built.problem, best)
+    if arm is not None:
+        arm = narrow_arm(built.problem, best, arm)
+        built = replace(built, problem=free_arm(built.problem, arm))
+        best = replace(best, noise=replace(best.noise, lever_arm=arm))
     passes.update(best.passes + Counter(filter=1))
     wanted = weigh is not None and weigh(built.problem, best.points)
     evidence = log_evidence(built.problem, best) if wanted else np.inf
-    plain = NoiseModel(excluded=best.noise.excluded)
+    plain = NoiseModel(excluded=best.noise.excluded, lever_arm=best.noise.lever_arm)
     if _is_likelier(built.problem, plain, best):
         return plain, None, built, evidence
     # the points alone: the covariances of the last pass are half of all memory
     return best.noise, Points(best.points.states, best.points.values), built, evidence
 
 
-def _estimate(built: BuiltProblem, settings: Settings, progress: Progress | None) -> NoiseEstimate:
+def _estimate(
+    built: BuiltProblem,
+    settings: Settings,
+    progress: Progress | None,
+    near: tuple[Points, Problem] | None = None,
+) -> NoiseEstimate:
     """The noise model, without spans of wrong measurements unless the settings keep them."""
     estimate = estimate_noise if settings.gnss.faults == "off" else estimate_without_faults
-    return estimate(built.problem, built.aligned.until, progress=progress)
+    return estimate(built.problem, built.aligned.until, near=near, progress=progress)
+
+
+def _free_contradicted_arm(
+    builder: ProblemBuilder, built: BuiltProblem, best: NoiseEstimate, progress: Progress | None
+) -> tuple[BuiltProblem, NoiseEstimate, LeverArm | None]:
+    """The estimate with the antenna's lever arm as a parameter, where the drive contradicts the one that is stated.
+
+    Returns the same objects and None where it does not.
+    """
+    problem = apply_noise(built.problem, best.noise)
+    arm = find_contradicted_arm(problem, best.points)
+    passes = best.passes + Counter(filter=1)
+    if arm is None:
+        return built, replace(best, passes=passes), None
+    freed = replace(built, problem=free_arm(built.problem, arm))
+    try:
+        found = _estimate(freed, builder.settings, progress, (best.points, problem))
+    except BREAKDOWN:
+        return built, replace(best, passes=passes), None
+    return freed, replace(found, passes=passes + found.passes + Counter(filter=1)), arm
 
 
 def _is_likelier(base: Problem, plain: NoiseModel, found: NoiseEstimate) -> bool:

@@ -43,7 +43,7 @@ from graphnav.estimation.noise.priors import TIME_WITHIN, get_prior
 from graphnav.estimation.problem import ParameterChain, Problem
 from graphnav.estimation.solvers.ekf import refilter
 from graphnav.estimation.solvers.linearise import Points
-from graphnav.estimation.solvers.passes import DisturbancePass, ForwardRecord, make_points, split_values
+from graphnav.estimation.solvers.passes import DisturbancePass, ForwardRecord, reuse_points
 from graphnav.estimation.solvers.rts import smooth_moments
 from graphnav.imu.preintegration import NOISE_FIGURES
 
@@ -74,7 +74,7 @@ class NoiseEstimate:
 
     def carry_points(self, base: Problem, problem: Problem) -> Points:
         """Its points for a problem with the same keyframes and another noise model."""
-        return _carry(*self.get_linearisation(base), problem)
+        return reuse_points(*self.get_linearisation(base), problem)
 
 
 @dataclass
@@ -162,14 +162,14 @@ def estimate_noise(
     figures = _begin(problem, start, changed)
     if near is not None:
         return _iterate(
-            problem, figures, _carry(*near, apply_noise(problem, figures.build_model())), progress, intervals
+            problem, figures, reuse_points(*near, apply_noise(problem, figures.build_model())), progress, intervals
         )
     used = apply_noise(problem, figures.build_model())
     try:
         initials, passes = find_initial_points(used, opening)
     except BREAKDOWN:  # with the prior's medians; with the noise that is stated it may not
         initials, passes = find_initial_points(problem, opening)
-        initials = [replace(one, points=_carry(one.points, problem, used)) for one in initials]
+        initials = [replace(one, points=reuse_points(one.points, problem, used)) for one in initials]
     found: list[NoiseEstimate] = []
     for initial in initials:
         figures = _begin(problem, start)
@@ -260,10 +260,6 @@ def _begin(problem: Problem, start: NoiseModel | None, changed: bool = False) ->
         known=bool(start.figures),
         same_data=bool(start.figures) and not changed,
     )
-
-
-def _carry(points: Points, before: Problem, after: Problem) -> Points:
-    return make_points(after, points.states, split_values(before, points))
 
 
 def _splice(about: Points, part: Points) -> Points:

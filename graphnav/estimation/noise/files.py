@@ -10,6 +10,7 @@ Under the key "noise", in a file of its own or in the summary.json of a run::
     excluded            by constraint: [begin, end] (s) of spans left out
     spacing             s between the fixes that are used, 0 for all
     stamps              s, offsets of the stamps of positions, velocities and odometer about which rows are linearised
+    lever_arm           m, only where the antenna's is not used as stated: value (right, forward, up) and its sigma
 
     pieces              how many pieces the recording was cut into, the figures being those of the first; for people
 
@@ -37,16 +38,18 @@ from graphnav.constraints.vehicle import NHC_ERROR, ODOMETER_ERROR
 from graphnav.core.complaints import suggest_nearest
 from graphnav.core.errors import ConfigError
 from graphnav.core.files import parse_json, read_text
-from graphnav.estimation.noise.model import INTERVALS, NoiseModel, RowWeights, StampOffsets, VarianceComponent
+from graphnav.estimation.noise.model import INTERVALS, LeverArm, NoiseModel, RowWeights, StampOffsets, VarianceComponent
 from graphnav.imu.preintegration import NOISE_FIGURES
 from graphnav.recording import FIX_TYPES
 from graphnav.recording.checks.crosschecks import LARGEST_SHIFT
 
 MODES: tuple[str, ...] = get_args(NoiseSettings.model_fields["mode"].annotation)
 _LEAST_WEIGHT = 1e-15  # weight of an interval: one without any would have no end of noise
-_KEYS = ("mode", "pieces", "figures", "correlation_times", "weights", "excluded", "spacing", "stamps")
+_KEYS = ("mode", "pieces", "figures", "correlation_times", "weights", "excluded", "spacing", "stamps", "lever_arm")
+_ARM = tuple(one.name for one in fields(LeverArm))
 _STAMPS = tuple(one.name for one in fields(StampOffsets))
 _LARGEST_OFFSET = 2.0 * LARGEST_SHIFT  # s; estimates go on from what is searched
+_LONGEST_ARM, _LEAST_ARM_SIGMA = 100.0, 1e-6  # m
 _FIGURE_KEYS = {"log_factor": "log_factor", "sigma": "sigma", "prior": "prior", "prior_sigma": "prior_sigma",
            "degrees_of_freedom": "freedom"}  # fmt: skip
 _BESIDE = ("variance_factor", "stated", "used", "unit", "correlation_time")
@@ -78,7 +81,7 @@ def list_noise(noise: NoiseModel, mode: str = "estimated") -> dict[str, Any]:
         "excluded": {name: [[float(a), float(b)] for a, b in spans] for name, spans in noise.excluded.items() if spans},
         "spacing": float(noise.spacing),
         "stamps": {name: float(getattr(noise.stamps, name)) for name in _STAMPS},
-    }
+    } | ({} if noise.lever_arm is None else {"lever_arm": {n: list(getattr(noise.lever_arm, n)) for n in _ARM}})
 
 
 def write_noise(path: str | Path, noise: NoiseModel, mode: str = "estimated") -> Path:
@@ -187,6 +190,7 @@ class _Reader:
             self.read_each(values, "excluded", constraints, self.read_spans),
             self.read_number("noise.spacing", values.get("spacing", 0.0), 0.0, 60.0, "s between fixes"),
             StampOffsets(**self.read_each(values, "stamps", _STAMPS, self.read_offset)),
+            self.read_arm(values),
         ), mode
 
     def make_error(self, key: str, value: Any, why: str) -> ConfigError:
@@ -256,6 +260,21 @@ class _Reader:
 
     def read_offset(self, key: str, value: Any) -> float:
         return self.read_number(key, value, -_LARGEST_OFFSET, _LARGEST_OFFSET, "s to be added to stamps")
+
+    def read_arm(self, values: Mapping[str, Any]) -> LeverArm | None:
+        found = self.read_each(values, "lever_arm", _ARM, self.read_axes)
+        if not found:
+            return None
+        missing = next((name for name in _ARM if name not in found), None)
+        if missing:
+            raise ConfigError(f"{self.path}: 'noise.lever_arm' has no {missing}; give it", key="key.missing")
+        return LeverArm(**found)
+
+    def read_axes(self, key: str, value: Any) -> tuple[float, ...]:
+        if not isinstance(value, list) or len(value) != 3:
+            raise self.make_error(key, value, "must be a list of three numbers, m: right, forward, up")
+        low = _LEAST_ARM_SIGMA if key.endswith("sigma") else -_LONGEST_ARM
+        return tuple(self.read_number(key, x, low, _LONGEST_ARM, "m") for x in value)
 
     def read_weights(self, key: str, value: Any) -> RowWeights:
         if not isinstance(value, Mapping) or set(value) != {"t", "weight"}:

@@ -59,6 +59,14 @@ class StampOffsets:
 
 
 @dataclass(frozen=True)
+class LeverArm:
+    """The antenna's lever arm that is used instead of a stated one (`graphnav.estimation.lever_arm`)."""
+
+    value: tuple[float, ...]  # m, right, forward, up of the IMU
+    sigma: tuple[float, ...]  # m, of its prior
+
+
+@dataclass(frozen=True)
 class NoiseModel:
     """How good the sensors are taken to be. Beside what it names, everything is as stated."""
 
@@ -68,6 +76,7 @@ class NoiseModel:
     excluded: Mapping[str, tuple[tuple[float, float], ...]] = field(default_factory=dict)  # spans (s) by constraint
     spacing: float = 0.0  # s, at least, between the fixes that are used (`graphnav.estimation.noise.spacing`)
     stamps: StampOffsets = StampOffsets()
+    lever_arm: LeverArm | None = None
 
     def get_factor(self, group: str, missing: float) -> float:
         """The factor on the variance of a group.

@@ -183,6 +183,11 @@ def make_points(problem: Problem, states: States, known: dict[str, Array]) -> Po
     return Points(states, np.concatenate([np.empty((len(states), 0)), *values], axis=1))
 
 
+def reuse_points(points: Points, before: Problem, after: Problem) -> Points:
+    """Points for another problem with the same keyframes."""
+    return make_points(after, points.states, split_values(before, points))
+
+
 def record_residuals(problem: Problem, rows: Constraint, points: Points, robust: bool = False) -> ConstraintRecord:
     """What is left of a constraint at the solution; `robust` has the kernel's weights in the rows'."""
     linear = linearise(rows, points, problem.columns)
