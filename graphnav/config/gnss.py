@@ -17,7 +17,10 @@ class GnssSettings(Outliers):
         description="find fixes, and spans of fixes, that are wrong, and leave them out: off, on, automatic",
     )
     lever_arm_sigma: float | None = Field(
-        None, gt=0, description="m, 1-sigma of the stated lever arm; given, the lever arm is estimated"
+        None,
+        gt=0,
+        description="m, 1-sigma of the stated lever arm; given, it is estimated by this prior; otherwise it is used as "
+        "stated unless the drive contradicts it",
     )
     slow_times: tuple[float, float] = Field(
         (100.0, 3600.0),

@@ -73,12 +73,23 @@ def find_contradicted_arm(problem: Problem, about: Points) -> LeverArm | None:
         P = P[np.ix_(some, some)] - gain @ P[np.ix_(~some, some)]
     else:
         P = P[np.ix_(some, some)]
-    width = np.linalg.slogdet(P)[1] - 2.0 * len(P) * np.log(ARM_SIGMA)
-    if off[some] @ np.linalg.solve(P, off[some]) + width <= 0.0:
+    if compute_evidence_gain(off[some], P) <= 0.0:
         return None
     sigma = np.full(3, _KNOWN)
     sigma[some] = _WIDER * np.sqrt(np.diagonal(P))
     return LeverArm(tuple((stated + off).tolist()), tuple(sigma.tolist()))
+
+
+def compute_evidence_gain(change: Array, P: Array) -> float:
+    """By how much the logarithm of the evidence rises where components of an arm are free.
+
+    Parameters
+    ----------
+    change : (k,) m, what the filter finds of them beside the stated arm, from a prior of `ARM_SIGMA`.
+    P : (k, k) m^2, its covariance.
+    """
+    narrowed = np.linalg.slogdet(P)[1] - 2.0 * len(P) * np.log(ARM_SIGMA)
+    return 0.5 * float(change @ np.linalg.solve(P, change) + narrowed)
 
 
 def narrow_arm(base: Problem, found: NoiseEstimate, arm: LeverArm) -> LeverArm:
