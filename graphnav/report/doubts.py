@@ -20,6 +20,7 @@ from graphnav.report.wording import join_words
 if TYPE_CHECKING:
     from graphnav.evaluation.metrics import Errors
 
+_FAR = 3.0  # sigma, rms, of a separation; one that is nearer, but no chance, is in the verdict alone
 FEWEST_ROWS = 10  # rows needed to judge a sigma
 _BY_INFORMATION = "batch rts isam2 incremental ekf"  # the most first
 _BRIEF = (
@@ -60,7 +61,7 @@ def find_departures(solutions: Mapping[str, Solution]) -> dict[str, Note]:
 
 def list_doubts(solutions: Mapping[str, Solution], errors: Mapping[str, Errors]) -> tuple[str, ...]:
     """Reasons why a result cannot be trusted, as sentences; none if there are none."""
-    from graphnav.evaluation.sigmas import judge_sigmas, select_verdict
+    from graphnav.evaluation.sigmas import find_separation, judge_sigmas, select_verdict
 
     out: list[str] = list(find_departures(solutions).values())
     solutions = select_own(solutions)
@@ -87,6 +88,10 @@ def list_doubts(solutions: Mapping[str, Solution], errors: Mapping[str, Errors])
             kind, size, used = measure_consistency(solution)
             if used >= FEWEST_ROWS and size > TOO_LARGE[kind]:
                 wrong.append(f"{solution.solver}: {kind}s are {size:.2f} times their sigma")
+        apart = find_separation(next((s.separation for s in solutions.values()), None))  # the same for all solvers
+        if apart is not None and apart.size > _FAR:
+            words = f"forward filter and later measurements are {apart.size:.2g} times their sigma apart"
+            wrong.append(f"{words} ({apart.block})")
     if wrong:
         out.append(Note("doubt.sigma", f"The result's sigmas cannot be trusted: {'; '.join(wrong)}"))
     return tuple(out)
