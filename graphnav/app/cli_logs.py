@@ -176,7 +176,9 @@ def init(
     from graphnav.app.outputs import check_output_folder
     from graphnav.core.staging import stage_results
     from graphnav.recording.draft import draft
+    from graphnav.recording.formats import read
     from graphnav.recording.formats.writer import write_csv
+    from graphnav.recording.plausibility.screening import refuse, screen
 
     out = out / "recording.toml" if out.is_dir() or not out.suffix else out
     if out.suffix != ".toml":
@@ -206,6 +208,9 @@ def init(
         quiet,
         json,
     )
+    with show_progress(quiet, "init"), permit_outside(True):  # the logs are where the user said
+        tell("checking")
+        refuse(recording := read(out), screen(recording).findings)
 
 
 @commands.command(epilog="\b\nExample:\n  graphnav simulate urban -o out/urban --seed 1")
