@@ -199,6 +199,9 @@ def init(
             for made, columns in drafted.made.items():
                 write_csv(part / made, list(columns), list(columns.values()))
             (part / out.name).write_text(drafted.text, encoding="utf-8")
+        tell("checking")
+        with permit_outside(True):  # the logs are where the user says
+            refuse(recording := read(out), screen(recording).findings)
     files = [out, *(folder / made for made in drafted.made)]
     print_out(
         lambda: "\n".join(
@@ -208,9 +211,6 @@ def init(
         quiet,
         json,
     )
-    with show_progress(quiet, "init"), permit_outside(True):  # the logs are where the user said
-        tell("checking")
-        refuse(recording := read(out), screen(recording).findings)
 
 
 @commands.command(epilog="\b\nExample:\n  graphnav simulate urban -o out/urban --seed 1")

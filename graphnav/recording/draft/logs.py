@@ -278,8 +278,8 @@ def _read(path: Path, columns: matching.FileColumns, role: str, plain: Plain | N
     if step.sum() > _PAUSES * len(step) * np.median(step):
         k = int(np.argmax(step))
         raise RecordingError(
-            f"{path}, {names['t']}: the stamps jump from {values['t'][k]:g} to {values['t'][k + 1]:g}, which no log "
-            "does; take out what lies beyond",
+            f"{path}, {names['t']}: the stamps jump from {values['t'][k]:.12g} to {values['t'][k + 1]:.12g}, which "
+            "no log does; take out what lies beyond",
             key="table.time_jump",
         )
     if role == "odometer" and "speed" not in values:  # as it will be read
