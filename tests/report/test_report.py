@@ -730,3 +730,13 @@ def test_the_page_of_an_allan_variance_draws_the_deviations_and_their_fit(tmp_pa
 def typed(packed):
     """The numbers of an array as plotly is given it."""
     return np.frombuffer(base64.b64decode(packed["bdata"]), "<f4")
+
+
+def test_a_drive_whose_fixes_leave_its_direction_open_is_doubted():
+    """Two fixes: nothing tells which way the vehicle went between them."""
+    moved = solution("rts")
+    P = moved.covariance.copy()
+    P[:, 2, 2] = np.radians(40.0) ** 2
+    found = [get_key(d) for d in list_doubts({"rts": replace(moved, covariance=P)}, {"rts": errors_of(sd=0.3)})]
+    assert found == ["doubt.heading"]
+    assert list_doubts({"rts": moved}, {"rts": errors_of(sd=0.3)}) == ()

@@ -22,7 +22,7 @@ def read_clock_seconds(t: Array) -> Array | None:
     if not ((t >= 0.0) & (t < 240_000.0) & (minutes < 60.0) & (seconds < 60.0)).all():
         return None
     over = np.flatnonzero(np.diff(minutes))
-    if not len(over) or np.abs(np.diff(t)[over]).min() < 40.0:
+    if not 0 < 2 * len(over) < len(t) or np.abs(np.diff(t)[over]).min() < 40.0:
         return None
     out = np.asarray(3600.0 * hours + 60.0 * minutes + seconds)
     out += DAY * np.cumsum(np.diff(out, prepend=out[:1]) < -0.5 * DAY)
