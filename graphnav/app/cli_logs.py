@@ -176,7 +176,9 @@ def init(
     from graphnav.app.outputs import check_output_folder
     from graphnav.core.staging import stage_results
     from graphnav.recording.draft import draft
+    from graphnav.recording.formats import read
     from graphnav.recording.formats.writer import write_csv
+    from graphnav.recording.plausibility.screening import refuse, screen
 
     out = out / "recording.toml" if out.is_dir() or not out.suffix else out
     if out.suffix != ".toml":
@@ -197,6 +199,9 @@ def init(
             for made, columns in drafted.made.items():
                 write_csv(part / made, list(columns), list(columns.values()))
             (part / out.name).write_text(drafted.text, encoding="utf-8")
+        tell("checking")
+        with permit_outside(True):  # the logs are where the user says
+            refuse(recording := read(out), screen(recording).findings)
     files = [out, *(folder / made for made in drafted.made)]
     print_out(
         lambda: "\n".join(

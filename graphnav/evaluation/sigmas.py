@@ -9,9 +9,11 @@ import numpy as np
 
 from graphnav.core.rotation import Array
 from graphnav.core.sample_size import chi_square_band, chi_square_quantile, count_effective_epochs
+from graphnav.estimation.solution import Separation
 from graphnav.evaluation.metrics import Errors, scale_by_sigmas
 
 _TOO_SMALL, _CAUTIOUS = 1.5, 0.5  # error over sigma; what lies between is acceptable
+_FEWEST_EPOCHS = 10  # of a separation, to judge it
 PARTS = {"position": "height", "attitude": "heading"}  # judged by themselves as well
 BY_CHANCE = 0.0027  # outside three standard deviations of a Gaussian
 
@@ -20,7 +22,7 @@ BY_CHANCE = 0.0027  # outside three standard deviations of a Gaussian
 class BlockVerdict:
     """The verdict on the sigmas of one block of errors."""
 
-    block: str  # position, height, velocity, attitude or heading
+    block: str  # position, height, velocity, attitude or heading; of a separation east, north or up
     size: float  # error over sigma, rms
     inside: float  # share of epochs within the region that holds 99.7 % of a Gaussian's
     effective: float  # number of independent epochs that they are equivalent to
@@ -62,6 +64,23 @@ def select_verdict(verdicts: Sequence[BlockVerdict], verdict: str) -> list[Block
     found = {j.block: j for j in verdicts if j.verdict == verdict}
     explained = {whole for whole, part in PARTS.items() if part in found and whole in found}
     return [j for j in found.values() if j.block not in explained or j.rest == verdict]
+
+
+def find_separation(separation: Separation | None) -> BlockVerdict | None:
+    """The axis on which forward filter and later measurements are farthest apart, in sigmas, if that is no chance.
+
+    Both have the same model. Where it is wrong, as with a clock that drifts, axes that are not as stated or errors of
+    fixes that last, each side fits it to its own measurements, and only their difference shows it.
+    """
+    if separation is None:
+        return None
+    over = separation.value / separation.sigma
+    axes = [
+        _judge(axis, z**2, 1, z[:, None])
+        for axis, z in zip(("east", "north", "up"), over.T, strict=True)
+        if np.isfinite(z).sum() >= _FEWEST_EPOCHS
+    ]
+    return max((j for j in axes if j.verdict == "too small"), key=lambda j: j.size, default=None)
 
 
 def _judge(block: str, nees: Array, dof: int, over_sigma: Array) -> BlockVerdict:

@@ -20,6 +20,8 @@ from graphnav.report.wording import join_words
 if TYPE_CHECKING:
     from graphnav.evaluation.metrics import Errors
 
+_FAR = 3.0  # sigma, rms, of a separation; one that is nearer, but no chance, is in the verdict alone
+_MOVING, _DIRECTED = 1.0, np.radians(30.0)  # m/s; 1-sigma of a heading that tells a direction, a twelfth of a turn
 FEWEST_ROWS = 10  # rows needed to judge a sigma
 _BY_INFORMATION = "batch rts isam2 incremental ekf"  # the most first
 _BRIEF = (
@@ -60,7 +62,7 @@ def find_departures(solutions: Mapping[str, Solution]) -> dict[str, Note]:
 
 def list_doubts(solutions: Mapping[str, Solution], errors: Mapping[str, Errors]) -> tuple[str, ...]:
     """Reasons why a result cannot be trusted, as sentences; none if there are none."""
-    from graphnav.evaluation.sigmas import judge_sigmas, select_verdict
+    from graphnav.evaluation.sigmas import find_separation, judge_sigmas, select_verdict
 
     out: list[str] = list(find_departures(solutions).values())
     solutions = select_own(solutions)
@@ -76,6 +78,10 @@ def list_doubts(solutions: Mapping[str, Solution], errors: Mapping[str, Errors])
             break  # all solvers use the same noise model
     notes = dict.fromkeys(note for solution in solutions.values() for note in solution.notes)
     out += [Note(key, note) for note in notes if (key := get_key(note)) == "doubt.axes"]
+    for solution in solutions.values():
+        if (vague := _describe_vague(solution)) is not None:
+            out.append(vague)
+            break
     sizes: dict[str, list[str]] = {}
     for name, e in errors.items():
         for j in select_verdict(judge_sigmas(e), "too small"):
@@ -87,9 +93,27 @@ def list_doubts(solutions: Mapping[str, Solution], errors: Mapping[str, Errors])
             kind, size, used = measure_consistency(solution)
             if used >= FEWEST_ROWS and size > TOO_LARGE[kind]:
                 wrong.append(f"{solution.solver}: {kind}s are {size:.2f} times their sigma")
+        apart = find_separation(next((s.separation for s in solutions.values()), None))  # the same for all solvers
+        if apart is not None and apart.size > _FAR:
+            words = f"forward filter and later measurements are {apart.size:.2g} times their sigma apart"
+            wrong.append(f"{words} ({apart.block})")
     if wrong:
         out.append(Note("doubt.sigma", f"The result's sigmas cannot be trusted: {'; '.join(wrong)}"))
     return tuple(out)
+
+
+def _describe_vague(solution: Solution) -> Note | None:
+    """A doubt where fixes leave open which way a vehicle in motion went."""
+    track = solution.trajectory(joint=False)
+    moving = np.linalg.norm(solution.states.v, axis=1) > _MOVING
+    if "gnss_position" not in solution.records or track.sd_rph is None or track.sd_p is None or moving.mean() < 0.5:
+        return None
+    heading = float(np.median(track.sd_rph[:, 2]))
+    if not heading > _DIRECTED:
+        return None
+    far = float(np.median(np.hypot(track.sd_p[:, 0], track.sd_p[:, 1])))
+    words = f"the fixes do not determine the heading: its 1-sigma is {np.degrees(heading):.0f} deg in the median"
+    return Note("doubt.heading", f"This result cannot be trusted: {words}, and that of the position {far:.2g} m")
 
 
 def measure_consistency(solution: Solution) -> tuple[str, float, int]:

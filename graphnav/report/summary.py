@@ -40,7 +40,14 @@ _SHOWS = {
 
 def tabulate_verdicts(solution: Solution, errors: Errors | None) -> Markup:
     """Accuracy of position, velocity and attitude, and whether the stated sigma is consistent."""
+    from graphnav.evaluation.sigmas import find_separation
+
     found = _judge_by_records(solution) | ({} if errors is None else _judge_by_truth(errors))
+    if (apart := find_separation(solution.separation)) is not None and "position" in found:
+        kind, words = found["position"]  # errors of a truth decide, but nothing is good that is that far apart
+        kind = "bad" if errors is None else kind.replace("good", "")
+        words += f"; forward filter and later measurements are {apart.size:.1f} sigma apart (rms, {apart.block})"
+        found["position"] = kind, words
     nothing = ("", "nothing is there to judge it by")
     return page.verdicts(
         [(kind, block.capitalize(), words) for block in _SHOWS for kind, words in [found.get(block, nothing)]]

@@ -211,3 +211,11 @@ def test_rtklibs_own_solution_stands_beside_ours(tmp_path):
     off = np.linalg.norm((frame.from_llh(track.llh) - true)[:, :2], axis=1)
     assert off[track.fix_type == 1.0].max() < 0.01  # fixed; the truth is another program's of the same files
     assert float(theirs["h_max_m"]) == pytest.approx(off.max(), abs=0.01)
+
+
+def test_a_solution_that_ends_within_a_line_is_read_to_there(tmp_path):
+    for name, text in (("whole", POS), ("cut", POS[:-60])):
+        (tmp_path / f"{name}.pos").write_text(text)
+    want, found = (read_trajectory(tmp_path / f"{name}.pos") for name in ("whole", "cut"))
+    assert np.array_equal(found.llh, want.llh[:-1])
+    assert [get_key(note) for note in found.notes] == ["trajectory.cut"]

@@ -285,7 +285,11 @@ def test_words_with_dates_do_not_stop_a_draft_and_what_is_no_table_is_named(toky
     folder = stranger.write_spreadsheet(tmp_path / "ride", tokyo[1])
     (folder / "notes.csv").write_text("time,text\n2025-07-08T16:00:00Z,a turn\n2025-07-08T16:00:09Z,left, then right\n")
     run("init", folder, "-o", folder, "--quiet")
+    before = read(folder).imu
     (folder / "imu.csv").write_bytes((folder / "imu.csv").read_text("utf-8").encode("utf-16"))
+    run("init", folder, "-o", folder, "--force", "--quiet")
+    assert np.array_equal(read(folder).imu.accel, before.accel)
+    (folder / "imu.csv").write_bytes(bytes(range(256)) * 50)
     said = refuse_command(capsys, "draft.no_imu", "init", folder, "-o", folder, "--force", "--quiet")
     assert "imu.csv" in said
 

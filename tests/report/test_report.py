@@ -680,6 +680,24 @@ def test_separation_satellites_and_stated_accuracy_are_shown(tmp_path, recording
     )
 
 
+def test_a_separation_that_is_no_chance_is_in_the_verdict_and_above_it():
+    """Of independent epochs, on one axis; one that lasts for all of them counts once, and may be chance."""
+    rng, one = np.random.default_rng(5), solution("rts")
+    value = rng.normal(size=(len(one.t), 3))
+    along = np.array([1.0, 4.0, 1.0])
+    fits, near, far = (Separation(one.t, value * x, np.ones_like(value)) for x in (1.0, along / 2.0, along))
+    lasts = Separation(one.t, np.full_like(value, 2.0), np.ones_like(value))
+    seen = replace(one, records={"gnss_position": record(0.9, "innovation")})
+    for apart, truth, kind, keys in (
+        (fits, None, "good", []), (near, None, "bad", []), (far, None, "bad", ["doubt.sigma"]),
+        (lasts, None, "good", []), (far, errors_of(sd=0.3), "", []),
+    ):  # fmt: skip
+        found = replace(seen, separation=apart)
+        assert re.findall(r'class="verdict (\w*)"><b>Position', tabulate_verdicts(found, truth)) == [kind]
+        errors = {} if truth is None else {"rts": truth}
+        assert [get_key(doubt) for doubt in list_doubts({"rts": found}, errors)] == keys
+
+
 def test_a_truth_on_the_earth_is_laid_onto_a_walk_that_counts_from_its_start(recording):
     """The solution's frame stands anywhere and is turned; the truth lies elsewhere on the Earth."""
     turned, far = solution(offset=0.0), LocalFrame(np.array([0.9, 1.4, 300.0]))
@@ -712,3 +730,13 @@ def test_the_page_of_an_allan_variance_draws_the_deviations_and_their_fit(tmp_pa
 def typed(packed):
     """The numbers of an array as plotly is given it."""
     return np.frombuffer(base64.b64decode(packed["bdata"]), "<f4")
+
+
+def test_a_drive_whose_fixes_leave_its_direction_open_is_doubted():
+    """Two fixes: nothing tells which way the vehicle went between them."""
+    moved = solution("rts")
+    P = moved.covariance.copy()
+    P[:, 2, 2] = np.radians(40.0) ** 2
+    found = [get_key(d) for d in list_doubts({"rts": replace(moved, covariance=P)}, {"rts": errors_of(sd=0.3)})]
+    assert found == ["doubt.heading"]
+    assert list_doubts({"rts": moved}, {"rts": errors_of(sd=0.3)}) == ()

@@ -6,7 +6,7 @@ first (`graphnav.recording.plausibility.screening`), and the rest is checked wit
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -188,6 +188,8 @@ def inspect(recording: Recording) -> Inspection:
     upright = not known & {"imu.force_scale", "imu.dead_axis"}  # else no turn about the vertical is known either
     if vehicle and overlap and track is not None and recording.gnss is not None and upright:
         clock = whole.clock or measure_clock_offsets(recording.imu, recording.gnss)
+        if any(f.key == "gnss.velocity_axes" for f in wrong):  # they say nothing of the IMU
+            track = tracks.compute_track(replace(recording.gnss, v=None)) or track
         yaw = crosschecks.fit_yaw_rate(recording.imu, track)
         forward = clock.by_velocity if track.instant else clock.by_places
         turns_back = yaw is not None and yaw.correlation > 0.8 and yaw.coefficients[0] < 0

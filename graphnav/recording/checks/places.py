@@ -36,6 +36,8 @@ def check_mirroring(recording: Recording, track: Track, turns_back: bool) -> Ite
     better = as_read is None or (yaw is not None and yaw.correlation > as_read.correlation)
     if yaw is not None and better and yaw.correlation > 0.8 and abs(yaw.coefficients[0] - 1.0) < 0.2:
         yield describe_exchange("the turns of the gyro")
+    elif as_read is not None and as_read.correlation > 0.8 and as_read.coefficients[0] > 0.0:
+        return  # the positions turn as the gyro does: what does not are their velocities
     elif (  # the gyro agrees with the force, whose up is that of the stated axes
         turns_back and crosschecks.find_up(recording.imu)[2] > 0.0 and tilt.measure_sideways(recording.imu, track) > 0.0
     ):

@@ -77,7 +77,7 @@ def read_imu_in_si(path: Path) -> tuple[Array, Array, Array]:
     source = find_logs([path]).sensors["imu"]
     gyro, accel = source.stack("gx", "gy", "gz"), source.stack("ax", "ay", "az")
     force = guesses.guess_accel_unit(path, accel, source.find_unit("ax", "accel"))
-    rate = guesses.guess_gyro_unit(gyro, source.find_unit("gx", "gyro"), None, vehicle=False)
+    rate = guesses.guess_gyro_unit(path, gyro, source.find_unit("gx", "gyro"), None, vehicle=False)
     return source.t, gyro * RATE_UNITS[str(rate.value)], accel * FORCE[str(force.value)]
 
 
@@ -159,7 +159,8 @@ class _Writer:
         elif raw is not None and raw.dated:
             agreement = compare_with_fixes(t, gyro, accel, up, raw.horizontal, 0.0)
         if source.log is None:
-            rate = guesses.guess_gyro_unit(gyro, source.find_unit("gx", "gyro"), agreement.turn, vehicle)
+            stated = source.find_unit("gx", "gyro")
+            rate = guesses.guess_gyro_unit(source.path, gyro, stated, agreement.turn, vehicle)
             gyro = gyro * RATE_UNITS[str(rate.value)]
             self._write_units({"t": source.t_unit, "gyro": rate, "accel": force})
             front = self._write_axes(up, up_why, agreement)
@@ -324,6 +325,10 @@ class _Writer:
             self.lines.append(f"# {words}")
             self.decisions.append(f"{relative}: {words}")
         self.lines.append(f"file = {quote(relative)}")
+        if source.second:
+            words = f"CHECK: {source.second} may be of another sensor of this kind; to use that, give those in columns"
+            self.lines.append(f"# {words}")
+            self.decisions.append(f"{relative}: {words}")
         if source.log is not None and (topics := source.log.topics.get(sensor, ())):
             why = "the only one"
             if len(topics) > 1 and topics[0] in self.asked:

@@ -7,8 +7,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 # A name is normalised first: lower case, words separated by _, the unit removed. Earlier patterns take precedence.
-_GYRO = r"(?:.*_)?(?:gyr\w*?|angular_(?:velocity|rate)|ang_vel|omega|rotation_rate|rot_rate|imu_w|w|turn_rate|g)_?"
-_ACCEL = r"(?:.*_)?(?:acc\w*?|linear_acceleration|total_acceleration|specific_force|imu_a|imu_f|force|a|f)_?"
+_TURNING = (
+    "angular_(?:velocity|rate)|drehrate|winkelgeschwindigkeit|vitesse_angulaire|velocidad_angular|gir(?:o|oscopio)"
+)
+_GYRO = rf"(?:.*_)?(?:gyr\w*?|{_TURNING}|ang_vel|omega|rotation_rate|rot_rate|imu_w|w|turn_rate|g)_?"
+_ACCEL = (
+    r"(?:.*_)?(?:acc\w*?|beschleunigung|acel\w*?|linear_acceleration|total_acceleration|specific_force|imu_a|imu_f|force"
+    r"|a|f)_?"
+)
 _HORIZONTAL = r"sd_?h|(?:.*_)?(?:h_?acc\w*|horizontal_accuracy)|accuracy|eph|epe(?:_m)?"
 _VERTICAL = r"sd_?v|(?:.*_)?(?:v_?acc\w*|vertical_accuracy)|altitude_accuracy|epv"
 _OF_SPEED = r"sd_?v|sd_?speed|(?:.*_)?(?:s_?acc|(?:speed|velocity|vel)_?acc\w*)|eps"
@@ -25,17 +31,17 @@ _PATTERNS: dict[str, tuple[str, ...]] = {
         r"(?:.*_)?header_stamp", r"time(?:stamp)?", _OF_WEEK,
         r"(?:unix|epoch|utc|sensor|logging|local)_?time\w*",
         r"sec(?:onds?)?|stamp|(?:.*_)time(?:stamp)?",
-        r"date_?time|unix|epoch|utc|(?:uhr)?zeit(?:stempel)?|clock|hora|heure|date|datum|millis|micros",
+        r"date_?time|unix|epoch|utc|(?:uhr)?zeit(?:stempel)?|clock|hora|heure|tiempo|temps|date|datum|millis|micros|ms|us|ns",
     ),
     "week": (r"(?:gps_?)?(?:week|wn)(?:_?(?:no|num|number))?",),
     **{f"g{x}": (rf"{_GYRO}{x}",) for x in "xyz"},
     **{f"a{x}": (rf"{_ACCEL}{x}",) for x in "xyz"},
-    "lat": (r"(?:.*_)?lat(?:itude)?", r"breite(?:ngrad)?"),
-    "lon": (r"(?:.*_)?(?:lon|lng|long|longitude)", r"l_nge(?:ngrad)?|laenge(?:ngrad)?"),
+    "lat": (r"(?:.*_)?lat(?:itude?)?", r"breite(?:ngrad)?"),
+    "lon": (r"(?:.*_)?(?:lon|lng|long|longitude?)", r"l_nge(?:ngrad)?|laenge(?:ngrad)?"),
     "h": (
         r"h|h_?ell|height_?(?:ell\w*)?|ell\w*_height|alt_?ell\w*",
-        r"(?:.*_)?(?:alt(?:itude)?|height|h_?msl|elevation|ele)",
-        r"(?:.*_)?(?:alt(?:itude)?|height|h)_?(?:msl|wgs84)?", r"h_he|hoehe",
+        r"(?:.*_)?(?:alt(?:itude?)?|height|h_?msl|elevation|ele)",
+        r"(?:.*_)?(?:alt(?:itude)?|height|h)_?(?:msl|wgs84)?", r"h_he|hoehe|hauteur|altura",
     ),
     "ve": (r"ve|v_?east|vel_?e(?:ast)?|east_vel\w*|velocity_e(?:ast)?|e_vel",),
     "vn": (r"vn|v_?north|vel_?n(?:orth)?|north_vel\w*|velocity_n(?:orth)?|n_vel",),

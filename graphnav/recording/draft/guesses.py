@@ -17,7 +17,7 @@ from graphnav.sensors.barometer import ATMOSPHERE
 from graphnav.sensors.tables import TIME_UNITS
 
 _MEAN_SHARE = 0.5  # share of the typical force that is in its mean, even for a swinging foot
-_LIKELY = 0.5  # correlation
+_LIKELY, _CLEAR = 0.5, 0.9  # correlation
 _STRAIGHT_COSINE = np.cos(np.radians(12.0))  # cosine of the angle to a file axis below which the axis is meant
 _QUIET_SPAN = 5.0  # s
 _LARGEST_STEP = 100.0  # s; larger steps between stamps mean a smaller unit
@@ -86,12 +86,27 @@ def guess_accel_unit(path: Path, accel: Array, stated: str | None) -> Guess:
     )
 
 
-def guess_gyro_unit(gyro: Array, stated: str | None, lag: motion.Lag | None, vehicle: bool) -> Guess:
-    """rad/s or deg/s: by the turns of the course if there are any, by the name, by the magnitude."""
+def guess_gyro_unit(path: Path, gyro: Array, stated: str | None, lag: motion.Lag | None, vehicle: bool) -> Guess:
+    """rad/s or deg/s: by the turns of the course if there are any, by the name, by the magnitude.
+
+    Raises
+    ------
+    RecordingError
+        If the turns are clearly those of the course, but in no unit: the numbers are raw counts.
+    """
     if lag is not None and abs(lag.correlation) > _LIKELY:
         for unit, scale in RATE_UNITS.items():
             if 0.6 < abs(lag.slope) * scale < 1.6:
-                return Guess(unit, f"the turns are then those of the course (correlation {abs(lag.correlation):.2f})")
+                words = f"the turns are then those of the course (correlation {lag.correlation:.2f})"
+                if lag.correlation < 0.0:
+                    words = f"CHECK: {words}: the other way round; the sign of latitudes, longitudes or rates is wrong"
+                return Guess(unit, words)
+        if abs(lag.correlation) > _CLEAR:
+            raise RecordingError(
+                f"{path}: the rates are {abs(lag.slope):.3g} times the turns of the fixes in rad/s, which is no "
+                "unit: raw counts?",
+                key="draft.raw_counts",
+            )
     if stated is not None:
         return Guess(stated, "as the column's name says")
     large = float(np.percentile(np.abs(gyro), 99.5))

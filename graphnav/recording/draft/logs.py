@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,8 +14,10 @@ from graphnav.core.timescales import WEEK, find_restarts
 from graphnav.recording import Gnss, Imu, Odometer
 from graphnav.recording.draft import columns as matching
 from graphnav.recording.draft import guesses
+from graphnav.recording.draft.clocks import read_clock_seconds, read_serial_days
 from graphnav.recording.draft.guesses import Guess
-from graphnav.recording.draft.plain import Plain, read_clock_seconds, read_plain
+from graphnav.recording.draft.motion import is_course_in_radians
+from graphnav.recording.draft.plain import Plain, read_plain
 from graphnav.recording.formats.folder import read_other_log
 from graphnav.recording.formats.places import check_angles, find_places
 from graphnav.recording.formats.registry import Log
@@ -67,6 +69,7 @@ class Source:
     t_unit: Guess = field(default_factory=lambda: Guess("s", ""))
     joined_from: tuple[Path, Path] | None = None  # files of a gyro and an accelerometer, whose rows are combined
     week: int | None = None  # the GPS week of the first row, where a column has it beside the seconds
+    second: str = ""  # columns of the file that might be this sensor's too, in words
     plain: Plain | None = None  # a table that is not a CSV file of numbers, which is converted into one
 
     def __len__(self) -> int:
@@ -150,7 +153,17 @@ def read_log(path: Path, topics: Sequence[str] = ()) -> dict[str, Source]:
         roles.append("gnss")
     elif sensor == "imu" and "speed" in columns.names:
         roles.append("odometer")
-    return {role: _read(path, columns, role, plain) for role in roles}
+    found = {role: _read(path, columns, role, plain) for role in roles}
+    for role, source in found.items():
+        source.second = _find_second(header, columns, WANTED[role][1:3] if role == "gnss" else WANTED[role][1:])
+    return found
+
+
+def _find_second(header: list[str], columns: matching.FileColumns, core: Sequence[str]) -> str:
+    """The columns of another sensor of the kind that is told by its `core`, in words; '' where there is none."""
+    rest = matching.match_columns([name for name in header if name not in columns.names.values()]).names
+    names = [rest[ours] for ours in core if ours in rest]
+    return f"{names[0]} to {names[-1]}" if len(names) == len(core) else ""
 
 
 def _make_times_error(path: Path, header: list[str], words: dict[str, str]) -> NoSensorError:
@@ -239,6 +252,9 @@ def _read(path: Path, columns: matching.FileColumns, role: str, plain: Plain | N
     if (seconds := read_clock_seconds(values["t"])) is not None:
         words = f"times of day of '{names['t']}', hhmmss, as s since midnight"
         values["t"], plain = seconds, Plain({}, words, daily=names["t"])
+    elif (seconds := read_serial_days(values["t"])) is not None:
+        words = f"days of '{names['t']}', as a spreadsheet counts them, as Unix time in s; CHECK: taken as UTC"
+        values["t"], plain = seconds, Plain({}, words)
     inertial = role not in ("gnss", "odometer", "barometer")
     unit = guesses.guess_time_unit(values["t"], matching.find_stated_unit(columns, "t", "t"), inertial)
     if (later := find_restarts(values["t"], TIME_UNITS[str(unit.value)])) is not None:  # as it will be read
@@ -254,12 +270,16 @@ def _read(path: Path, columns: matching.FileColumns, role: str, plain: Plain | N
     if role == "gnss":
         new = mask_new_fixes(values)  # as it will be read
         values = {ours: v[new] for ours, v in values.items()}
+        if "course" in values and is_course_in_radians(values["lat"], values["lon"], values["course"]):
+            values["course"] = np.degrees(values["course"])
+            words = f"'{names['course']}' is in rad, by the positions; made deg"
+            plain = replace(plain, words=f"{plain.words}, {words}") if plain is not None else Plain({}, words)
     step = np.diff(values["t"])
     if step.sum() > _PAUSES * len(step) * np.median(step):
         k = int(np.argmax(step))
         raise RecordingError(
-            f"{path}, {names['t']}: the stamps jump from {values['t'][k]:g} to {values['t'][k + 1]:g}, which no log "
-            "does; take out what lies beyond",
+            f"{path}, {names['t']}: the stamps jump from {values['t'][k]:.12g} to {values['t'][k + 1]:.12g}, which "
+            "no log does; take out what lies beyond",
             key="table.time_jump",
         )
     if role == "odometer" and "speed" not in values:  # as it will be read

@@ -22,6 +22,8 @@ GRID = 0.1  # s, of the common grid
 _MEAN_OVER = 1.0  # s, of the moving mean over everything
 _LEAST_SPEED = 3.0  # m/s; below, a course is undefined
 _FEWEST_SAMPLES, _TRIMS = 50, 3
+_ROUNDED = 0.01  # rad, of a whole turn
+_SAME_WAY = 0.2  # rad, of a course from that of the positions
 SEARCHED = 3.0  # s, range of the offset of clocks that overlap already
 
 
@@ -53,7 +55,7 @@ def compute_course(t: Array, llh: Array, v: Array | None) -> Course:
         t, p = t[keep], p[keep]
         grid = np.arange(t[0], t[-1], GRID)
         east, north = (
-            compute_moving_mean(np.gradient(compute_moving_mean(np.interp(grid, t, p[:, k])), GRID)) for k in (0, 1)
+            compute_moving_mean(_differentiate(compute_moving_mean(np.interp(grid, t, p[:, k])))) for k in (0, 1)
         )
     else:
         known = ~np.isnan(v[:, :2]).any(-1)
@@ -64,7 +66,7 @@ def compute_course(t: Array, llh: Array, v: Array | None) -> Course:
     gap = compute_moving_mean(_mask_gaps(grid, t).astype(float), 4.0 * _MEAN_OVER) > 0.0
     gap |= (grid < grid[0] + 2.0 * _MEAN_OVER) | (grid > grid[-1] - 2.0 * _MEAN_OVER)
     speed = np.hypot(east, north)
-    ae, an = np.gradient(east, GRID), np.gradient(north, GRID)
+    ae, an = _differentiate(east), _differentiate(north)
     slow = (speed < _LEAST_SPEED) | gap
     safe = np.where(slow, np.inf, speed)
     forward, left = (east * ae + north * an) / safe, (east * an - north * ae) / safe
@@ -72,6 +74,22 @@ def compute_course(t: Array, llh: Array, v: Array | None) -> Course:
     for x in (forward, left, turn):
         x[slow] = np.nan
     return Course(grid, np.where(gap, np.nan, speed), turn, forward, left)
+
+
+def is_course_in_radians(lat: Array, lon: Array, course: Array) -> bool:
+    """Whether courses (N,) are in rad where places (N,), deg, move as they do then, and not as they do in deg."""
+    known = np.isfinite(course)
+    if not known.any() or np.abs(course[known]).max() > 2.0 * np.pi + _ROUNDED:
+        return False
+    north, east = np.diff(lat), np.diff(lon) * np.cos(np.radians(lat[1:]))
+    step = np.hypot(north, east)
+    moving = known[1:] & (step > 0.5 * step.max())
+    along = np.arctan2(east, north)[moving]
+    in_rad, in_deg = (
+        float(np.median(np.abs((c[1:][moving] - along + np.pi) % (2.0 * np.pi) - np.pi)))
+        for c in (course, np.radians(course))
+    )
+    return in_rad < _SAME_WAY < in_deg
 
 
 def resample_on_grid(t: Array, x: Array) -> tuple[Array, Array]:
@@ -84,6 +102,11 @@ def resample_on_grid(t: Array, x: Array) -> tuple[Array, Array]:
     out = (both[1] - both[0]) / _MEAN_OVER
     out[_mask_gaps(grid, t)] = np.nan
     return grid, out
+
+
+def _differentiate(x: Array) -> Array:
+    """Derivative of values on the grid; NaN of a single one."""
+    return np.gradient(x, GRID) if len(x) > 1 else np.full(len(x), np.nan)
 
 
 def compute_moving_mean(x: Array, window: float = _MEAN_OVER) -> Array:

@@ -12,14 +12,16 @@ from pathlib import Path
 import numpy as np
 
 from graphnav.core.errors import RecordingError
-from graphnav.core.files import open_file, parse_number, read_bytes
+from graphnav.core.files import is_blank, open_file, parse_number, read_bytes
 from graphnav.core.rotation import Array
+from graphnav.recording.draft.angles import read_angles
+from graphnav.recording.draft.clocks import DAY
 from graphnav.recording.draft.columns import NAMED_UNITS, match_columns, split_unit
 from graphnav.recording.formats.text import NumberedLines
 
-DAY = 86400.0  # s
 _START = 1 << 16  # bytes that contain the header
 _MARKS = {"\t": "a tab", ";": "a semicolon", ",": "a comma", "|": "a bar", None: "blanks"}
+_WIDE = (b"\xff\xfe", b"\xfe\xff")  # marks at the start of UTF-16
 _COMMENT = re.compile(r"\s*(?:#|%|//)+\s?")
 _DAY_FIRST = re.compile(r"(\d{1,2})\.(\d{1,2})\.(\d{4})(.*)")  # 08.07.2025
 _YEAR_FIRST = re.compile(r"(\d{4})[-/.](\d{1,2})[-/.](\d{1,2})(.*)")  # 2025-07-08
@@ -74,15 +76,17 @@ def read_plain(path: Path) -> Plain | None:
         If it cannot be read, or a row has more or fewer fields than the header, naming its line.
     """
     with open_file(path) as raw:
-        start = raw.read(_START).rstrip(b"\0")
-    if b"\0" in start:
+        start = raw.read(_START)
+    start = start if start[:2] in _WIDE else start.rstrip(b"\0")
+    if b"\0" in start and start[:2] not in _WIDE:
         return None
-    # most likely cut off within a line
-    begin, _ = _decode(start.rpartition(b"\n")[0] if len(start) == _START else start)
+    if len(start) == _START:  # most likely cut off within a line
+        start = start[: start.rindex(b"\n")] if b"\n" in start else start
+    begin, _ = _decode(start)
     layout = _lay_out(path, _read_lines(begin.splitlines()))
     if layout is None or (path.suffix == ".gz" and layout.mark == "," and not layout.done):
         return None  # what is packed is large, and no spreadsheet's
-    text, encoding = _decode(read_bytes(path).rstrip(b"\0"))
+    text, encoding = _decode(read_bytes(path))
     lines = _read_lines(text.splitlines())
     rows = [_split(line, layout.mark) for _, line in lines[layout.first :]]
     names, done = layout.names, [*layout.done, *encoding]
@@ -106,29 +110,17 @@ def read_plain(path: Path) -> Plain | None:
         cells, style = _write_plainly(cells, layout.mark)
         done += style
     columns = {name: x for name, some in cells.items() if (x := _parse_numbers(some)) is not None}
-    done += _add_nanoseconds(columns)
+    done += [*_add_nanoseconds(columns), *read_angles(cells, columns)]
     dated, daily, more = _parse_times(cells, columns, layout.above)
     words = {name: next(filter(None, some), "") for name, some in cells.items() if name not in columns}
     return Plain(columns, ", ".join([*done, *more]), dated, daily, words) if done or more else None
 
 
-def read_clock_seconds(t: Array) -> Array | None:
-    """Seconds since midnight of times of day written as one number, hhmmss.ss; None where these are none.
-
-    They are where no stamp has more than 59 minutes or seconds, and 40 s are missing between successive minutes.
-    """
-    hours, minutes, seconds = t // 10_000, t // 100 % 100, t % 100
-    if not ((t >= 0.0) & (t < 240_000.0) & (minutes < 60.0) & (seconds < 60.0)).all():
-        return None
-    over = np.flatnonzero(np.diff(minutes))
-    if not len(over) or np.abs(np.diff(t)[over]).min() < 40.0:
-        return None
-    out = np.asarray(3600.0 * hours + 60.0 * minutes + seconds)
-    return out + DAY * np.cumsum(np.diff(out, prepend=out[:1]) < -0.5 * DAY)
-
-
 def _decode(data: bytes) -> tuple[str, list[str]]:
     """The text, and its encoding in words where it is not UTF-8."""
+    if data[:2] in _WIDE:
+        return data[: len(data) // 2 * 2].decode("utf-16", errors="replace"), ["UTF-16 text"]
+    data = data.rstrip(b"\0")
     try:
         return data.decode("utf-8-sig"), []
     except UnicodeDecodeError:
@@ -273,9 +265,11 @@ def _add_nanoseconds(columns: dict[str, Array]) -> list[str]:
 
 
 def _parse_numbers(cells: Sequence[str]) -> Array | None:
-    """A column as numbers, NaN where blank; None where it contains anything else."""
+    """A column as numbers, NaN where blank; None where it contains anything else, or only words for nothing."""
+    if all(map(is_blank, cells)) and any(cells):
+        return None
     try:
-        return np.array([parse_number(c.replace(",", ".")) if c else np.nan for c in cells])
+        return np.array([np.nan if is_blank(c) else parse_number(c.replace(",", ".")) for c in cells])
     except ValueError:
         return None
 

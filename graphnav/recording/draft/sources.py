@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,9 +14,10 @@ from graphnav.core.rotation import Array
 from graphnav.core.timescales import GPS_TO_UNIX
 from graphnav.recording.draft import columns as matching
 from graphnav.recording.draft import guesses, motion
+from graphnav.recording.draft.clocks import DAY
 from graphnav.recording.draft.guesses import Guess
 from graphnav.recording.draft.logs import WANTED, NoSensorError, Source, read_log
-from graphnav.recording.draft.plain import DAY
+from graphnav.recording.draft.parts import join_parts
 from graphnav.recording.draft.raw import RawFiles, separate_raw, tell_kind
 from graphnav.recording.formats import list_formats
 from graphnav.recording.formats.schema import SPEED
@@ -24,6 +26,9 @@ from graphnav.sensors.tables import ANGLE
 JOINED = "joined_imu.csv.gz"  # the file combined from a gyro's and an accelerometer's; no log has this name
 
 _TEXT_ENDINGS = (".csv", ".csv.gz", ".txt", ".tsv", ".dat", ".asc", ".log")  # files of a folder that are considered
+
+_TRACKS = (".gpx", ".kml", ".kmz", ".fit", ".tcx", ".geojson")
+_POSITIONS = re.compile(r"(?:^|[^a-z])(?:gnss|gps|rtk|location|position|track|fix)(?:$|[^a-rt-z])", re.IGNORECASE)
 
 
 @dataclass
@@ -88,6 +93,8 @@ def find_logs(paths: Sequence[Path], topics: Sequence[str] = ()) -> LogsFound:
             f"{paths[0]}: no IMU in these logs (found: {there}); three gyro and three force columns are one{unread}",
             key="draft.no_imu",
         )
+    if not sensors.keys() & {"gnss", "odometer"} and not raw.observed:
+        _check_unread(paths, [path for path in files if path.name in nothing])
     _date_times_of_day(sensors)
     parts = [s.path.name for name in ("gyro", "accel", "gravity") for s in every.get(name, ())]
     if "imu" in every and parts:
@@ -110,6 +117,24 @@ def _date_times_of_day(sensors: dict[str, Source]) -> None:
             source.values["t"] = source.values["t"] + DAY * days
             words = f"{source.plain.words}; CHECK: taken as UTC, of the date of {path.name}"
             source.plain = replace(source.plain, words=words)
+
+
+def _check_unread(paths: Sequence[Path], tables: Sequence[Path]) -> None:
+    """Refuse to take for a walk without fixes what has positions in a form that is not read.
+
+    Raises
+    ------
+    RecordingError
+        Naming the file.
+    """
+    inside = [p for path in paths if path.is_dir() for p in sorted(path.iterdir())]
+    unread = [p for p in inside if p.suffix.lower() in _TRACKS] + [p for p in tables if _POSITIONS.search(p.name)]
+    if unread:
+        raise RecordingError(
+            f"{unread[0]}: its positions are not read; write them as CSV with t, lat and lon in deg and h in m, or "
+            "take the file out of the folder",
+            key="draft.positions_unread",
+        )
 
 
 def _find_unix_start(source: Source) -> float | None:
@@ -166,9 +191,12 @@ def _choose(sensor: str, some: list[Source], left: list[str]) -> Source | None:
         some = with_gravity
     if not some:
         return None
+    if len(some) > 1 and (whole := join_parts(some)) is not None:
+        return whole
     if sensor == "imu" and len(some) > 1:
         raise RecordingError(
-            f"{some[1].path}: a second imu, after {some[0].path}; name only one of them", key="draft.two_imus"
+            f"{some[1].path}: a second imu, at the same time as {some[0].path}; name only one of them",
+            key="draft.two_imus",
         )
     # uncorrected readings come second: they are the same, in other units on some phones
     best = min(some, key=lambda s: ("uncalibrated" in s.path.name.lower(), -len(s)))

@@ -21,6 +21,8 @@ LATEST = 1e11  # s, either sign: three thousand years
 VAGUEST, VAGUEST_V = 1e5, 1e4  # m, m/s; a fix with a larger sigma carries no information
 _LEAST_SIGMA = 1e-9  # m, m/s; a smaller sigma is not meant as one
 _SET_BACK_PERIODS = 10.0  # periods; rows that overtake each other are closer
+_PAUSE = 1.0  # s; longer steps of an IMU are gaps
+_BURST = 0.3  # share of the mean step that the middle one is where rows come in bursts
 _REPEATED = 0.6  # share of the rows with the time of the row before that no log has
 
 
@@ -191,7 +193,15 @@ def _check_imu_time(rows: Table, unit: str) -> None:
         raise RecordingError(
             f"{rows.path}: {len(rows)} usable row; an IMU recording needs at least 2", key="table.few_rows"
         )
-    step = float(np.median(np.diff(rows["t"])))
+    every = np.diff(rows["t"])
+    step = float(np.median(every))
+    usual = float(np.mean(every[every < _PAUSE])) if (every < _PAUSE).any() else step
+    if step < _BURST * usual:
+        raise RecordingError(
+            f"{rows.path}: most IMU rows are {step:.2g} s apart, but {usual:.2g} s in the mean: they come in "
+            "bursts, with the times of their arrival; write the times at which they were measured",
+            key="imu.bursts",
+        )
     if 1e-5 < step < 0.5:
         return
     fitting = [u for u in TIME_UNITS if 2.5e-4 <= step / TIME_UNITS[unit] * TIME_UNITS[u] <= 0.1 and u != unit]

@@ -72,6 +72,11 @@ def parse_solution(path: Path, head: list[str], rows: NumberedLines) -> RtklibSo
         )
     of_base = _parse_base(path, head) if form == "e-baseline" else None
     separator = "," if "," in rows[0][1] else None
+    notes: list[str] = []
+    if len(rows) > 1 and len(rows[-1][1].split(separator)) < len(rows[-2][1].split(separator)):
+        sentence = f"{path.name} ends within a line, as after a loss of power: it is left out"
+        notes.append(Note("trajectory.cut", sentence))
+        rows = rows[:-1]
     sexagesimal = form == "latitude" and "latitude(d'" in titles
     if sexagesimal:  # three numbers for each angle
         at = columns.index("latitude")
@@ -82,7 +87,6 @@ def parse_solution(path: Path, head: list[str], rows: NumberedLines) -> RtklibSo
     table = parse_table(path, numeric, names, separator)
     if gps is None:
         gps = WEEK * table[:, 0] + table[:, 1]
-    notes: list[str] = []
     if scale in _ZONES:
         gps = unix_to_gps(gps + GPS_TO_UNIX - _ZONES[scale])
         sentence = f"{path.name}: times were in {scale}; the leap seconds of their date make them GPS time"

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphnav.core.errors import RecordingError
-from graphnav.core.files import exists, open_file, parse_number
+from graphnav.core.files import exists, is_blank, open_file, parse_number
 from graphnav.core.notes import format_count
 from graphnav.core.rotation import Array
 from graphnav.recording.formats.decimals import drop_cut_line, read_decimals
@@ -318,7 +318,7 @@ def _parse_cells(path: Path, text: str, header: list[str], use: list[int]) -> Ar
         for column in use:
             cell = cells[column].strip('"')
             try:
-                row.append(parse_number(cell) if cell else np.nan)
+                row.append(np.nan if is_blank(cell) else parse_number(cell))
             except ValueError:
                 raise RecordingError(
                     f"{path}, line {number}, column '{header[column]}': '{cell[:40]}' is not a number"

@@ -1,0 +1,164 @@
+"""Tables as more loggers write them: each is read as the same drive in a plain CSV file, or refused by its key."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import stranger
+from helpers import refuse_command
+
+from graphnav.app import cli
+from graphnav.recording.draft import draft
+from graphnav.recording.draft.clocks import read_clock_seconds, read_serial_days
+from graphnav.recording.formats import read
+from graphnav.recording.formats.table import read_table
+
+Rows = list[list[str]]
+
+
+@pytest.fixture(scope="module")
+def plain(shared_data):
+    """The IMU's and the fixes' tables of a minute with turns: header and rows of text."""
+    return stranger.tables(stranger.cuts(shared_data / "tokyo_20201105", [(600.0, 660.0)])[0])
+
+
+def read_drafted(folder: Path, *tables):
+    """What is read from tables after `init`."""
+    stranger.write_tables(folder, *tables)
+    assert cli.run(["init", str(folder), "-o", str(folder), "--quiet"]) == 0
+    return read(folder)
+
+
+def write_dms(angle: float, sides: str) -> str:
+    whole, rest = divmod(abs(angle) * 3600.0, 3600.0)
+    minutes, seconds = divmod(rest, 60.0)
+    return f"{whole:.0f}°{minutes:02.0f}'{seconds:.6f}\"{sides[angle < 0.0]}"
+
+
+@pytest.mark.parametrize("form", ["letter", "degrees", "column"])
+def test_hemispheres_and_minutes_are_read_as_signs_and_degrees(plain, tmp_path, form):
+    """South and west: whoever drops these is on the other side of the Earth."""
+    imu, (header, rows) = plain
+    imu = imu[0], [[t, *w[:2], f"{-float(w[2])}", *f] for t, *w, f1, f2, f3 in imu[1] for f in [(f1, f2, f3)]]
+    south = [[t, f"-{lat}", lon, h] for t, lat, lon, h in rows]  # mirrored once, so turns are, too
+    if form == "column":
+        shown = "t,lat,N/S,lon,E/W,h", [[t, lat, "S", lon, "E", h] for t, lat, lon, h in rows]
+    elif form == "letter":
+        shown = header, [[t, f"{lat}S", f"{lon}E", h] for t, lat, lon, h in rows]
+    else:
+        shown = header, [[t, write_dms(-float(lat), "NS"), write_dms(float(lon), "EW"), h] for t, lat, lon, h in rows]
+    want = read_drafted(tmp_path / "plain", imu, (header, south)).gnss
+    assert want.llh[0, 0] < 0.0
+    assert read_drafted(tmp_path / "shown", imu, shown).gnss.llh == pytest.approx(want.llh, abs=1e-10)
+
+
+@pytest.mark.parametrize(
+    ("imu_header", "gnss_header"),
+    [
+        (
+            "Zeit,Drehrate X,Drehrate Y,Drehrate Z,Beschleunigung X,Beschleunigung Y,Beschleunigung Z",
+            "Zeit,Breitengrad,Längengrad,Höhe",
+        ),
+        (
+            "Temps (s),Vitesse angulaire x (rad/s),Vitesse angulaire y (rad/s),Vitesse angulaire z (rad/s),"
+            "Accélération x (m/s²),Accélération y (m/s²),Accélération z (m/s²)",
+            "Temps (s),Latitude (°),Longitude (°),Altitude (m)",
+        ),
+        ("tiempo,giro_x,giro_y,giro_z,aceleracion_x,aceleracion_y,aceleracion_z", "tiempo,latitud,longitud,altitud"),
+    ],
+)
+def test_headers_in_other_languages(plain, tmp_path, imu_header, gnss_header):
+    (_, rows), (_, fixes) = plain
+    want, found = (
+        read_drafted(tmp_path / name, (imu, rows), (gnss, fixes))
+        for name, imu, gnss in (("plain", plain[0][0], plain[1][0]), ("other", imu_header, gnss_header))
+    )
+    assert np.array_equal(found.imu.gyro, want.imu.gyro)
+    assert np.array_equal(found.imu.accel, want.imu.accel)
+    assert np.array_equal(found.gnss.llh, want.gnss.llh)
+
+
+@pytest.mark.parametrize("sensor", [0, 1])
+def test_files_that_follow_on_each_other_are_one(plain, tmp_path, sensor):
+    want = read_drafted(tmp_path / "whole", *plain)
+    folder = stranger.write_tables(tmp_path / "parts", *plain)
+    header, rows = plain[sensor]
+    whole = folder / ("imu.csv", "gnss.csv")[sensor]
+    whole.unlink()
+    for name, part in (("b_first", rows[: len(rows) // 2]), ("a_second", rows[len(rows) // 2 :])):
+        (folder / f"{name}.csv").write_text("\n".join([header, *(",".join(row) for row in part)]) + "\n")
+    assert cli.run(["init", str(folder), "-o", str(folder), "--quiet"]) == 0
+    found = read(folder)
+    assert np.array_equal(found.imu.t, want.imu.t)
+    assert np.array_equal(found.gnss.t, want.gnss.t)
+
+
+def test_two_imus_at_once_are_refused_and_a_second_in_the_same_file_is_named(plain, tmp_path, capsys):
+    (header, rows), fixes = plain
+    folder = stranger.write_tables(tmp_path / "files", (header, rows), fixes)
+    (folder / "imu_2.csv").write_bytes((folder / "imu.csv").read_bytes())
+    refuse_command(capsys, "draft.two_imus", "init", folder, "-o", folder)
+    names = [f"{one}_{kind}_{x}" for one in ("front", "rear") for kind in ("gyro", "acc") for x in "xyz"]
+    folder = stranger.write_tables(tmp_path / "file", (",".join(["t", *names]), [r + r[1:] for r in rows]), fixes)
+    drafted = draft([folder], folder)
+    assert [line for line in drafted.decisions if "rear_gyro_x" in line and "rear_acc_z" in line and "CHECK" in line]
+
+
+@pytest.mark.parametrize(("name", "text"), [("track.gpx", "<gpx/>"), ("gps.csv", "t,easting,northing\n0,1,2\n1,2,3\n")])
+def test_positions_that_are_not_read_do_not_make_a_walk(plain, tmp_path, capsys, name, text):
+    folder = stranger.write_tables(tmp_path, plain[0], plain[1])
+    (folder / name).write_text(text)
+    assert cli.run(["init", str(folder), "-o", str(folder), "--quiet"]) == 0  # beside others they may be
+    (folder / "gnss.csv").unlink()
+    assert name in refuse_command(capsys, "draft.positions_unread", "init", folder, "-o", folder, "--force")
+
+
+@pytest.mark.parametrize(
+    ("change", "key"),
+    [
+        (lambda t, w, f: [t, *(f"{7506 * float(x):.0f}" for x in w), *f], "draft.raw_counts"),
+        (lambda t, w, f: [f"{np.floor(float(t) * 5.0) / 5.0 + 1e-2 * (float(t) % 0.2):.6f}", *w, *f], "imu.bursts"),
+    ],
+)
+def test_rates_in_counts_and_stamps_of_arrival_are_refused_when_they_are_drafted(plain, tmp_path, capsys, change, key):
+    (header, rows), fixes = plain
+    changed = [change(row[0], row[1:4], row[4:]) for row in rows]
+    folder = stranger.write_tables(tmp_path, (header, changed), fixes)
+    refuse_command(capsys, key, "init", folder, "-o", folder)
+
+
+def test_what_info_would_refuse_is_refused_by_init_as_well(plain, tmp_path, capsys):
+    imu, (header, rows) = plain
+    folder = stranger.write_tables(tmp_path, imu, (header, [[*row[:3], f"{1e3 * float(row[3])}"] for row in rows]))
+    refuse_command(capsys, "table.height", "init", folder, "-o", folder)
+
+
+def test_a_course_in_radians_is_told_by_the_positions(plain, tmp_path):
+    imu, (header, rows) = plain
+    p = np.array(rows, dtype=float)
+    north, east = np.gradient(p[:, 1]) * 111e3, np.gradient(p[:, 2]) * 111e3 * np.cos(np.radians(p[0, 1]))
+    course, speed = np.arctan2(east, north) % (2.0 * np.pi), np.hypot(east, north)
+    found = [
+        read_drafted(
+            tmp_path / name, imu,
+            (f"{header},speed,course", [[*row, f"{a}", f"{b}"] for row, a, b in zip(rows, speed, one, strict=True)]),
+        ).gnss.v
+        for name, one in (("deg", np.degrees(course)), ("rad", course))
+    ]  # fmt: skip
+    assert found[1] == pytest.approx(found[0], abs=1e-6)
+
+
+def test_stamps_that_are_one_number():
+    t = np.arange(0.0, 150.0, 0.01)
+    assert read_clock_seconds(t[(t < 50.0) | (t >= 110.0)]) is None  # a pause of a minute
+    clock = 100_000.0 + 100.0 * (t // 60.0) + t % 60.0
+    assert read_clock_seconds(clock) == pytest.approx(36000.0 + t)
+    assert read_serial_days(25569.0 + (1.7e9 + t) / 86400.0) == pytest.approx(1.7e9 + t, abs=1e-5)
+    assert read_serial_days(45000.0 + t) is None
+
+
+def test_words_for_nothing_are_blank(tmp_path):
+    (tmp_path / "a.csv").write_text("t,x\n1,N/A\n2,--\n3,null\n4,5\n")
+    assert np.array_equal(read_table(tmp_path / "a.csv", ("x",))["x"], [np.nan, np.nan, np.nan, 5.0], equal_nan=True)
