@@ -21,13 +21,14 @@ from graphnav.gnss.precise import Orbits, read_precise
 from graphnav.gnss.rinex_nav import read_navigation
 from graphnav.gnss.rinex_obs import parse_observations
 from graphnav.gnss.series import Observations, RawGnss, choose_primary, join_files
-from graphnav.gnss.signals import C
+from graphnav.gnss.signals import C, name_signal
 from graphnav.gnss.single_point import SinglePoint, solve
 from graphnav.gnss.ubx import is_ubx, parse_ubx
 
 _ROUGH_EPOCHS = 50  # epochs that a rough place is looked for in
 # 1-sigma of a base's single-point position that it may be from the stated one, and beyond which (0.1 %) that is told
 _BASE_OFF, _BASE_ODD = 10.0, 4.0
+_FARTHEST = 1e8  # m, of codes: twice as far as satellites are
 _LOST = ("raw.impossible", "raw.no_ephemeris", "raw.no_ephemeris_then", "raw.unhealthy", "raw.no_channel")
 
 
@@ -116,6 +117,11 @@ def load_raw(
     fixes = solve(raw.take(one))
     if not np.isfinite(fixes.p[:, 0]).any():
         left_out = "".join(f"; {note}" for note in (*obs.remarks, *remarks) if get_key(note) in _LOST)
+        for signal in np.unique(obs.signal).tolist():
+            if (typical := float(np.nanmedian(obs.code[obs.signal == signal]))) > _FARTHEST:
+                left_out += (
+                    f"; codes {name_signal(signal)} of {typical:.3g} m are no way to a satellite: see the header"
+                )
         raise RecordingError(
             f"{sources.rover[0]}: no epoch has enough satellites for a position{left_out}", key="raw.few_satellites"
         )
@@ -181,16 +187,21 @@ def _difference_by_base(
         )
     away = float(np.linalg.norm(np.median(raw.antenna, axis=0) - position))
     base, _ = place(obs, nav, precise, position)
-    base_fixes = solve(base.take(choose_primary(base) & np.isfinite(base.p[:, 0])))
-    notes = [*obs.remarks, *_check_base(sources.base[0], base_fixes, position, stated=given is not None)]
+    one = base.take(choose_primary(base) & np.isfinite(base.p[:, 0]))
+    base_fixes = solve(one)
+    off, more = _check_base(sources.base[0], one, base_fixes, position)
+    notes = [*obs.remarks, *more]
+    if given is None:
+        notes.append(Note("raw.base_position", "the base's position is that of its header"))
     base, _ = _correct_times(base, base_fixes)
-    raw, more = add_differences(raw, base, position)
-    notes += [Note("raw.base", f"codes are differences against a base {away / 1e3:.1f} km away"), *more]
+    raw, others = add_differences(raw, base, position)
+    sentence = f"codes are differences against a base {away / 1e3:.1f} km away"
+    notes += [Note("raw.base", f"{sentence}, {off:.1f} m from its own single-point positions"), *others]
     return raw, notes
 
 
-def _check_base(path: Path, fixes: SinglePoint, position: Array, stated: bool) -> list[Note]:
-    """Remarks about where a base is, by its own single-point positions.
+def _check_base(path: Path, base: RawGnss, fixes: SinglePoint, position: Array) -> tuple[float, list[Note]]:
+    """How far a base's own single-point positions are from where it is stated to be, m, and remarks.
 
     Raises
     ------
@@ -200,6 +211,7 @@ def _check_base(path: Path, fixes: SinglePoint, position: Array, stated: bool) -
     good = np.isfinite(fixes.p[:, 0])
     if not good.any():
         raise RecordingError(f"{path}: no epoch has enough satellites for a position", key="raw.few_satellites")
+    _check_agreement(base, fixes, path)
     away = (fixes.p[good] - position) @ earth.enu_axes(earth.ecef_to_llh(position)).T
     sigma = np.sqrt(np.median(np.diagonal(fixes.covariance[good], axis1=1, axis2=2), axis=0))
     low, off, high = np.percentile(away, [5.0, 50.0, 95.0], axis=0)
@@ -220,11 +232,8 @@ def _check_base(path: Path, fixes: SinglePoint, position: Array, stated: bool) -
             f"{path.name} puts the base {far:.0f} m from its position, {in_sigmas:.0f} sigmas: the rover is off by as "
             "much as base_position is"
         )
-        return [Note("raw.base_off", sentence)]
-    if not stated:
-        sentence = f"the base's position is that of its header, {far:.1f} m from its own single-point positions"
-        return [Note("raw.base_position", sentence)]
-    return []
+        return float(far), [Note("raw.base_off", sentence)]
+    return float(far), []
 
 
 def _check_dates(obs: Observations, nav: Ephemerides | None, precise: Orbits | None, sources: Sources) -> None:

@@ -90,8 +90,8 @@ def read_precise(sp3: list[Path], clk: list[Path]) -> Orbits:
         t, satellite, clock = (np.concatenate(x) for x in zip(*(_read_clk(path) for path in clk), strict=True))
         if (apart := max(t.min() - end, begin - t.max())) > 0.0:
             raise RecordingError(
-                f"{clk[0]}: its clocks are {apart / 86400.0:.1f} days from the orbits of {sp3[0].name}; they must be of "
-                "the same day",
+                f"{clk[0]}: its clocks are {apart / 86400.0:.1f} days from the orbits of {sp3[0].name}; they must be "
+                "of the same day",
                 key="raw.clock_day",
             )
         clocks |= {
