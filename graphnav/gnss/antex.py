@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +22,7 @@ class SatelliteAntenna:
     begin: float  # s since the GPS epoch
     end: float
     offset: dict[int, Array]  # (3,) m, in the satellite's axes
+    variation: dict[int, Array] = field(default_factory=dict)  # (M,) m longer, at 0, 1, 2, ... deg off the nadir
 
 
 Antennas = dict[int, tuple[SatelliteAntenna, ...]]
@@ -39,25 +40,27 @@ def read_antex(path: Path) -> Antennas:
     if not lines or "ANTEX VERSION" not in lines[0]:
         raise RecordingError(f"{path}: not an ANTEX file; its first line names no version", key="file.kind")
     out: dict[int, list[SatelliteAntenna]] = {}
-    name, begin, end, band = "", -_UNLIMITED, _UNLIMITED, 0
-    offset: dict[int, Array] = {}
+    name, band, angles = "", 0, np.zeros(2)
+    one = SatelliteAntenna(-_UNLIMITED, _UNLIMITED, {})
     for number, line in enumerate(lines, 1):
-        label = line[60:].strip()
+        label = line[60:].strip() if line[:8] != "   NOAZI" else "NOAZI"
         try:
-            if label == "START OF ANTENNA":
-                name, begin, end, offset = "", -_UNLIMITED, _UNLIMITED, {}
-            elif label == "TYPE / SERIAL NO":
-                name = line[20:23].strip()
+            if label == "TYPE / SERIAL NO":  # not every antenna has a line before that says that it begins
+                name, band, one = line[20:23].strip(), 0, SatelliteAntenna(-_UNLIMITED, _UNLIMITED, {})
             elif label == "VALID FROM":
-                begin = _parse_date(line)
+                one = replace(one, begin=_parse_date(line))
             elif label == "VALID UNTIL":
-                end = _parse_date(line)
-            elif label == "START OF FREQUENCY":
-                band = int(line[4:6])
-            elif label == "NORTH / EAST / UP":
-                offset[band] = 1e-3 * np.array([line[0:10], line[10:20], line[20:30]], dtype=float)
+                one = replace(one, end=_parse_date(line))
+            elif label == "ZEN1 / ZEN2 / DZEN":
+                angles = np.array([line[2:8], line[14:20]], dtype=float)
+            elif label in ("START OF FREQUENCY", "START OF FREQ RMS"):  # sigmas have the same lines
+                band = int(line[4:6]) if label == "START OF FREQUENCY" else 0
+            elif label == "NORTH / EAST / UP" and band:
+                one.offset[band] = 1e-3 * np.array([line[0:10], line[10:20], line[20:30]], dtype=float)
+            elif label == "NOAZI" and band:
+                one.variation[band] = _parse_variation(line, *angles)
             elif label == "END OF ANTENNA" and len(name) == 3 and name[0] in SYSTEMS and name[1:].isdigit():
-                out.setdefault(number_satellite(name), []).append(SatelliteAntenna(begin, end, offset))
+                out.setdefault(number_satellite(name), []).append(one)
         except ValueError:
             raise RecordingError(
                 f"{path}, line {number}: '{line[:60].strip()}' cannot be read as {label}", key="table.cell"
@@ -67,24 +70,37 @@ def read_antex(path: Path) -> Antennas:
     return {one: tuple(many) for one, many in out.items()}
 
 
-def combine_offsets(antennas: Antennas, satellite: Ids, first: Array, second: Array, bands: Array, gps: Array) -> Array:
-    """(N, 3) m, in the satellites' axes, of the combination of two signals; NaN where a file says nothing of it.
+def compute_antenna_paths(
+    antennas: Antennas, satellite: Ids, frequencies: Array, bands: Array, gps: Array, axes: Array, e: Array
+) -> Array:
+    """(N,) m that signals of the combination of two have longer ways than from the centre of mass; NaN if not known.
 
     Parameters
     ----------
-    first, second : (N,) Hz.
+    frequencies : (N, 2) Hz.
     bands : (N, 2) of RINEX.
     gps : (N,) s since the GPS epoch.
+    axes : (N, 3, 3) of the satellites, rows.
+    e : (N, 3) unit vectors from the receiver to the satellites.
     """
-    out = np.full((len(satellite), 3), np.nan)
+    out = np.full(len(satellite), np.nan)
+    toward = np.einsum("nij,nj->ni", axes, e)
+    nadir = np.degrees(np.arccos(np.clip(-toward[:, 2], -1.0, 1.0)))
+    alpha = frequencies[:, 0] ** 2 / (frequencies[:, 0] ** 2 - frequencies[:, 1] ** 2)
     for one, many in antennas.items():
         for antenna in many:
             own = (satellite == one) & (gps >= antenna.begin) & (gps <= antenna.end)
-            for a, b in np.unique(bands[own], axis=0):
-                if a in antenna.offset and b in antenna.offset:
-                    some = np.flatnonzero(own & (bands[:, 0] == a) & (bands[:, 1] == b))
-                    alpha = (first[some] ** 2 / (first[some] ** 2 - second[some] ** 2))[:, None]
-                    out[some] = alpha * antenna.offset[a] - (alpha - 1.0) * antenna.offset[b]
+            for both in np.unique(bands[own], axis=0):
+                if not antenna.offset.keys() >= set(both.tolist()):
+                    continue
+                some = np.flatnonzero(own & np.all(bands == both, axis=1))
+                ways = []
+                for band in both.tolist():
+                    varied = antenna.variation.get(band, np.zeros(1))
+                    ways.append(
+                        toward[some] @ antenna.offset[band] + np.interp(nadir[some], np.arange(len(varied)), varied)
+                    )
+                out[some] = alpha[some] * ways[0] - (alpha[some] - 1.0) * ways[1]
     return out
 
 
@@ -138,3 +154,12 @@ def _parse_date(line: str) -> float:
         raise ValueError
     since = float((days - np.datetime64("1980-01-06", "D")).astype(np.int64)[0]) * 86400.0
     return since + float(fields[0, 3:] @ np.array([3600.0, 60.0, 1.0]))
+
+
+def _parse_variation(line: str, begin: float, step: float) -> Array:
+    """(M,) m at whole degrees, of values (mm) that are so many degrees apart."""
+    values = np.array([line[i : i + 8] for i in range(8, len(line.rstrip()), 8)], dtype=float)
+    at = begin + step * np.arange(len(values))
+    if not (step > 0.0 and len(at) and at[-1] <= 90.0 and np.isfinite(values).all()):
+        raise ValueError
+    return 1e-3 * np.interp(np.arange(np.ceil(at[-1]) + 1.0), at, values)

@@ -22,7 +22,8 @@ from graphnav.gnss.series import RawGnss, compute_epoch_medians
 from graphnav.gnss.signals import C
 from graphnav.gnss.single_point import choose_coefficients, look
 
-_LONGEST_BASE_GAP = 15.0  # s between a base's epochs that a line is drawn through
+_LONGEST_BASE_GAP = 15.0  # s between a base's epochs that a line is drawn through its carriers
+_LONGEST_CODE_GAP = 60.0  # s, through its codes: the clocks of satellites leave it by less than codes are good to
 _SAME_EPOCH = 2e-3  # s: two receivers that keep their clocks within a millisecond of the nominal epoch
 _LEAST_ELEVATION = np.radians(5.0)  # elevation of a base's satellites
 
@@ -109,6 +110,6 @@ def _interpolate(t: Array, at: Array, value: Array) -> Array:
     k = np.clip(np.searchsorted(at, t), 1, len(at) - 1)
     out = np.interp(t, at, value)
     near = (
-        (at[k] - at[k - 1] <= _LONGEST_BASE_GAP) & (t >= at[0] - _LONGEST_BASE_GAP) & (t <= at[-1] + _LONGEST_BASE_GAP)
+        (at[k] - at[k - 1] <= _LONGEST_CODE_GAP) & (t >= at[0] - _LONGEST_CODE_GAP) & (t <= at[-1] + _LONGEST_CODE_GAP)
     )
     return np.asarray(np.where(near, out, np.nan))

@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from graphnav.core import earth
 from graphnav.core.errors import RecordingError
-from graphnav.core.notes import Note
+from graphnav.core.notes import Note, get_key
 from graphnav.core.rotation import Array
 from graphnav.gnss.antex import read_antex
 from graphnav.gnss.differential import add_differences
@@ -20,12 +21,15 @@ from graphnav.gnss.precise import Orbits, read_precise
 from graphnav.gnss.rinex_nav import read_navigation
 from graphnav.gnss.rinex_obs import parse_observations
 from graphnav.gnss.series import Observations, RawGnss, choose_primary, join_files
-from graphnav.gnss.signals import C
+from graphnav.gnss.signals import C, name_signal
 from graphnav.gnss.single_point import SinglePoint, solve
 from graphnav.gnss.ubx import is_ubx, parse_ubx
 
 _ROUGH_EPOCHS = 50  # epochs that a rough place is looked for in
-_BASE_OFF = 100.0  # m from its stated position that a base's single-point position may be
+# 1-sigma of a base's single-point position that it may be from the stated one, and beyond which (0.1 %) that is told
+_BASE_OFF, _BASE_ODD = 10.0, 4.0
+_FARTHEST = 1e8  # m, of codes: twice as far as satellites are
+_LOST = ("raw.impossible", "raw.no_ephemeris", "raw.no_ephemeris_then", "raw.unhealthy", "raw.no_channel")
 
 
 @dataclass(frozen=True)
@@ -112,9 +116,16 @@ def load_raw(
         )
     fixes = solve(raw.take(one))
     if not np.isfinite(fixes.p[:, 0]).any():
+        left_out = "".join(f"; {note}" for note in (*obs.remarks, *remarks) if get_key(note) in _LOST)
+        for signal in np.unique(obs.signal).tolist():
+            if (typical := float(np.nanmedian(obs.code[obs.signal == signal]))) > _FARTHEST:
+                left_out += (
+                    f"; codes {name_signal(signal)} of {typical:.3g} m are no way to a satellite: see the header"
+                )
         raise RecordingError(
-            f"{sources.rover[0]}: no epoch has enough satellites for a position", key="raw.few_satellites"
+            f"{sources.rover[0]}: no epoch has enough satellites for a position{left_out}", key="raw.few_satellites"
         )
+    _check_agreement(raw.take(one), fixes, sources.rover[0])
     notes = [*obs.remarks, *remarks]
     if raw.klobuchar is None:
         notes.append(
@@ -134,8 +145,26 @@ def load_raw(
         one = choose_primary(raw) & np.isfinite(raw.difference)
         if one.any():
             better = raw.take(one)
-            fixes = solve(replace(better, code=better.code + better.difference))
+            fixes = solve(replace(better, code=better.code + better.difference), differential=True)
     return raw, fixes, tuple(notes)
+
+
+def _check_agreement(raw: RawGnss, fixes: SinglePoint, path: Path) -> None:
+    """Whether most codes of an epoch tell of one position.
+
+    Raises
+    ------
+    RecordingError
+        If in most epochs they do not.
+    """
+    there = np.bincount(raw.epochs[1], minlength=len(fixes.t))
+    share = float(np.median(fixes.satellites[np.isfinite(fixes.p[:, 0])] / there[np.isfinite(fixes.p[:, 0])]))
+    if share < 0.5:
+        raise RecordingError(
+            f"{path}: only {100.0 * share:.0f} % of an epoch's codes tell of one position: its stamps are not in the "
+            "time system that its header says, or the ephemerides are of other satellites",
+            key="raw.contradictory",
+        )
 
 
 def _difference_by_base(
@@ -158,21 +187,53 @@ def _difference_by_base(
         )
     away = float(np.linalg.norm(np.median(raw.antenna, axis=0) - position))
     base, _ = place(obs, nav, precise, position)
-    base_fixes = solve(base.take(choose_primary(base) & np.isfinite(base.p[:, 0])))
-    notes = list(obs.remarks)
-    off = np.nanmedian(np.linalg.norm(base_fixes.p - position, axis=1))
-    if not off < _BASE_OFF:
+    one = base.take(choose_primary(base) & np.isfinite(base.p[:, 0]))
+    base_fixes = solve(one)
+    off, more = _check_base(sources.base[0], one, base_fixes, position)
+    notes = [*obs.remarks, *more]
+    if given is None:
+        notes.append(Note("raw.base_position", "the base's position is that of its header"))
+    base, _ = _correct_times(base, base_fixes)
+    raw, others = add_differences(raw, base, position)
+    sentence = f"codes are differences against a base {away / 1e3:.1f} km away"
+    notes += [Note("raw.base", f"{sentence}, {off:.1f} m from its own single-point positions"), *others]
+    return raw, notes
+
+
+def _check_base(path: Path, base: RawGnss, fixes: SinglePoint, position: Array) -> tuple[float, list[Note]]:
+    """How far a base's own single-point positions are from where it is stated to be, m, and remarks.
+
+    Raises
+    ------
+    RecordingError
+        If they move, or are elsewhere.
+    """
+    good = np.isfinite(fixes.p[:, 0])
+    if not good.any():
+        raise RecordingError(f"{path}: no epoch has enough satellites for a position", key="raw.few_satellites")
+    _check_agreement(base, fixes, path)
+    away = (fixes.p[good] - position) @ earth.enu_axes(earth.ecef_to_llh(position)).T
+    sigma = np.sqrt(np.median(np.diagonal(fixes.covariance[good], axis1=1, axis2=2), axis=0))
+    low, off, high = np.percentile(away, [5.0, 50.0, 95.0], axis=0)
+    if np.any(high - low > _BASE_OFF * sigma):
         raise RecordingError(
-            f"{sources.base[0]}: its observations put the base {off:.0f} m from its stated position; see base_position",
+            f"{path}: its antenna moves, by {np.linalg.norm(high - low):.0f} m; a base stands: are rover and base "
+            "swapped?",
+            key="raw.base_moves",
+        )
+    far, in_sigmas = np.linalg.norm(off), np.linalg.norm(off / sigma)
+    if in_sigmas > _BASE_OFF:
+        raise RecordingError(
+            f"{path}: its observations put the base {far:.0f} m from its stated position; see base_position",
             key="raw.base_position",
         )
-    if given is None:
-        sentence = f"the base's position is that of its header, {off:.1f} m from its own single-point positions"
-        notes.append(Note("raw.base_position", sentence))
-    base, _ = _correct_times(base, base_fixes)
-    raw, more = add_differences(raw, base, position)
-    notes += [Note("raw.base", f"codes are differences against a base {away / 1e3:.1f} km away"), *more]
-    return raw, notes
+    if in_sigmas > _BASE_ODD:
+        sentence = (
+            f"{path.name} puts the base {far:.0f} m from its position, {in_sigmas:.0f} sigmas: the rover is off by as "
+            "much as base_position is"
+        )
+        return float(far), [Note("raw.base_off", sentence)]
+    return float(far), []
 
 
 def _check_dates(obs: Observations, nav: Ephemerides | None, precise: Orbits | None, sources: Sources) -> None:

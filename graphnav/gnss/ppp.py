@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from graphnav.core import earth
 from graphnav.core.rotation import Array
 from graphnav.core.timescales import gps_to_utc
-from graphnav.gnss.antex import combine_offsets, compute_satellite_axes, compute_shapiro_delay, compute_wind_up
+from graphnav.gnss.antex import compute_antenna_paths, compute_satellite_axes, compute_shapiro_delay, compute_wind_up
 from graphnav.gnss.arcs import Arcs, build_arcs, find_arcs
 from graphnav.gnss.atmosphere import compute_zenith_delays, niell
 from graphnav.gnss.carrier import find_rows
@@ -82,9 +82,9 @@ def combine_ionosphere_free(raw: RawGnss, whole: RawGnss) -> IonosphereFree | No
         geometry.e * compute_solid_tide(one.antenna, sun, moon), axis=1
     )
     if raw.antennas:
-        bands = np.stack([one.signal // 100, other.signal // 100], -1)
-        offset = combine_offsets(raw.antennas, one.satellite, f1, f2, bands, gps)
-        told = np.einsum("ni,nij,nj->n", offset, compute_satellite_axes(geometry.s, sun), geometry.e)
+        bands, both = np.stack([one.signal // 100, other.signal // 100], -1), np.stack([f1, f2], -1)
+        axes = compute_satellite_axes(geometry.s, sun)
+        told = compute_antenna_paths(raw.antennas, one.satellite, both, bands, gps, axes, geometry.e)
         extra = extra + np.nan_to_num(told)
     utc = gps_to_utc(gps)
     day = (utc - utc.astype("datetime64[Y]")) / np.timedelta64(1, "D")

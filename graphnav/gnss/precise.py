@@ -86,7 +86,14 @@ def read_precise(sp3: list[Path], clk: list[Path]) -> Orbits:
         if told.any():
             clocks[int(one)] = _drop_repeated(t[told], clock[told])
     if clk:
+        begin, end = t.min(), t.max()
         t, satellite, clock = (np.concatenate(x) for x in zip(*(_read_clk(path) for path in clk), strict=True))
+        if (apart := max(t.min() - end, begin - t.max())) > 0.0:
+            raise RecordingError(
+                f"{clk[0]}: its clocks are {apart / 86400.0:.1f} days from the orbits of {sp3[0].name}; they must be "
+                "of the same day",
+                key="raw.clock_day",
+            )
         clocks |= {
             int(one): _drop_repeated(t[satellite == one], clock[satellite == one]) for one in np.unique(satellite)
         }

@@ -12,6 +12,8 @@ from graphnav.core.rotation import Array
 from graphnav.gnss.files import Lines
 from graphnav.gnss.signals import GLONASS, SYSTEMS
 
+# of time; RINEX 4.01, table 2, in which GLO and UTC count leap seconds
+_SCALES = ("GPS", "GLO", "GAL", "BDT", "QZS", "IRN", "UTC")
 _MOST_TYPES = 200  # of a system; RINEX 4.01 has some 80
 
 
@@ -55,6 +57,8 @@ def read_rinex_header(lines: Lines, path: Path) -> Header:
                 out.marker = place if len(place) == 3 and 6e6 < np.linalg.norm(place) < 7e6 else None
             elif label == "TIME OF FIRST OBS":
                 out.scale = body[48:51].strip() or ("GLO" if out.system == "R" else "GPS")
+                if out.scale not in _SCALES:
+                    raise ValueError
             elif label == "GLONASS SLOT / FRQ #":
                 words = body[3:].split()
                 out.channels |= {

@@ -87,7 +87,9 @@ def _read(path: Path, found: _Navigation) -> None:
             message = words[2] if len(words) > 2 else ""
             if words[:1] != ["EPH"] or message not in _KNOWN:
                 end = next((j for j in range(k + 1, len(lines)) if lines[j].startswith(">")), len(lines))
-                if words[:1] == ["ION"] and message == "LNAV":
+                if (
+                    words[:1] == ["ION"] and message == "LNAV" and words[1][:1] == "G"
+                ):  # those of QZSS are another region's
                     _take_ionosphere(lines[k + 1 : end], found)
                 elif words[:1] == ["EPH"]:
                     found.skipped[message] = found.skipped.get(message, 0) + 1

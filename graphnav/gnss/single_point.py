@@ -123,7 +123,7 @@ def group_signals(raw: RawGnss) -> tuple[tuple[tuple[int, int], ...], NDArray[np
     return tuple((int(found[k]) // 1000, int(found[k]) % 1000) for k in order), rank[of]
 
 
-def solve(raw: RawGnss, mask: float = np.radians(10.0), robust: bool = True) -> SinglePoint:
+def solve(raw: RawGnss, mask: float = np.radians(10.0), robust: bool = True, differential: bool = False) -> SinglePoint:
     """Positions and velocities of all epochs.
 
     Parameters
@@ -131,6 +131,7 @@ def solve(raw: RawGnss, mask: float = np.radians(10.0), robust: bool = True) -> 
     raw : one row for each satellite and epoch (`graphnav.gnss.series.choose_primary`).
     mask : rad, elevation below which satellites are not used.
     robust : take weight from rows that are far from the others.
+    differential : the codes are corrected by a base, which sees the same ionosphere.
     """
     t, of = raw.epochs
     groups, group = group_signals(raw)
@@ -159,7 +160,8 @@ def solve(raw: RawGnss, mask: float = np.radians(10.0), robust: bool = True) -> 
         if k >= _ATMOSPHERE:
             predicted = predicted + geometry.ionosphere + geometry.troposphere
         r = measured - predicted
-        sigma = compute_code_sigma(raw.cn0, np.maximum(geometry.elevation, 0.05), geometry.ionosphere)
+        delay = np.zeros(len(raw)) if differential else geometry.ionosphere
+        sigma = compute_code_sigma(raw.cn0, np.maximum(geometry.elevation, 0.05), delay)
         good = usable & above
         if robust and k > _ATMOSPHERE:
             weight = 1.0 / (1.0 + (np.nan_to_num(r) / (_KERNEL_SCALE * sigma)) ** 2)

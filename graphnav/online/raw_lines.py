@@ -19,9 +19,10 @@ In the line protocol (`graphnav.online.lines`) each satellite and signal of an e
 from __future__ import annotations
 
 from dataclasses import fields, replace
+from typing import Annotated
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, Field
 
 from graphnav.constraints.gnss import find_fix_period
 from graphnav.core.errors import RecordingError
@@ -187,6 +188,9 @@ def _make_empty(raw: RawGnss) -> RawGnss:
     return replace(raw, **none)
 
 
+_Way = Annotated[float, Field(ge=-100.0, le=100.0)]  # m, of an antenna's phase centre
+
+
 class LiveRaw(BaseModel):
     """What the first line of a live source says of raw observations."""
 
@@ -204,7 +208,8 @@ class LiveRaw(BaseModel):
     troposphere: bool = False  # taken off the codes already
     precise: bool = False  # placed by precise orbits and clocks
     second: dict[str, str] = {}  # of precise point positioning: the second signal of each satellite
-    antennas: dict[str, dict[int, Vector]] = {}  # m, in the satellite's axes, of its antenna, by band
+    # m, by band: in the satellite's axes, and then `SatelliteAntenna.variation`
+    antennas: dict[str, dict[int, Annotated[tuple[_Way, ...], Field(min_length=3, max_length=94)]]] = {}
     clock_noise: dict[str, tuple[NotNegative, Positive]] = {}  # m off a line between nodes, s apart
 
     def make_setup(self) -> RawGnss:
@@ -230,8 +235,9 @@ class LiveRaw(BaseModel):
             ) from None
         antennas: Antennas = {}
         for satellite, one in offsets.items():
-            by_band = {band: np.array(x) for band, x in one.items()}
-            antennas[satellite] = (SatelliteAntenna(-np.inf, np.inf, by_band),)
+            by_band = {band: np.array(x[:3]) for band, x in one.items()}
+            varied = {band: np.array(x[3:]) for band, x in one.items() if len(x) > 3}
+            antennas[satellite] = (SatelliteAntenna(-np.inf, np.inf, by_band, varied),)
         none, rows, ids = np.empty(0), np.empty((0, 3)), np.empty(0, dtype=np.int16)
         flags = np.empty(0, dtype=bool)
         return RawGnss(
@@ -251,7 +257,7 @@ def live_raw(raw: RawGnss) -> dict[str, object]:
     known = setup.catalogue
     assert known is not None
     antennas = {
-        name_satellite(s): {band: x.tolist() for band, x in one.offset.items()}
+        name_satellite(s): {band: [*x.tolist(), *one.variation.get(band, ())] for band, x in one.offset.items()}
         for s in known.satellites
         for one in setup.antennas.get(s, ())
         if one.begin <= setup.zero <= one.end

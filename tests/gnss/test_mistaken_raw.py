@@ -5,7 +5,7 @@ from __future__ import annotations
 import gzip
 import re
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,10 +19,12 @@ from graphnav.core.errors import RecordingError
 from graphnav.core.notes import get_key
 from graphnav.estimation.pipeline import run
 from graphnav.gnss.arcs import find_arcs
+from graphnav.gnss.precise import read_precise
 from graphnav.gnss.series import RawGnss
 from graphnav.gnss.signals import number_satellite, number_signal
 from graphnav.recording import Recording
 from graphnav.recording.checks.aiding import describe_gnss_apart
+from graphnav.recording.checks.raw import check_raw
 from graphnav.recording.formats import read
 
 DRIVE = Path(__file__).resolve().parents[2] / "data" / "kamakura_rtk"
@@ -208,3 +210,119 @@ def test_a_half_cycle_ends_its_own_arc_alone(changed, whole):
     own = of & (raw.signal == number_signal("1C"))
     np.testing.assert_array_equal(arcs[~own], before[~own])
     assert len(np.unique(arcs[own])) == len(np.unique(before[own])) + 2  # before, half a cycle open, and after
+
+
+# ------------------------------------------------------------------------- of another place, time or kind than stated
+def move_base(metres: float) -> Change:
+    return lambda text: text.replace("-3959400.631", f"{-3959400.631 - metres:.3f}")
+
+
+def test_a_base_that_is_elsewhere_is_refused_and_how_far_it_is_off_is_told(changed):
+    for metres in (1000.0, 60.0):
+        with refused("raw.base_position", RecordingError, "base.obs.gz", " m from"):
+            changed("recording.toml", move_base(metres))
+    one = changed("recording.toml", move_base(15.0))
+    (told,) = (str(remark) for remark in one.remarks if get_key(remark) == "raw.base")
+    assert float(re.search(r"([\d.]+) m from its own", told).group(1)) == pytest.approx(15.0, abs=4.0)
+
+
+def test_a_rover_in_the_place_of_the_base_is_found_out(changed):
+    def swap(text: str) -> str:
+        return text.replace("rover.obs", "X").replace("base.obs", "rover.obs").replace("X", "base.obs")
+
+    for position in (r"^$", r"base_position.*\n"):
+        with refused("raw.base_moves", RecordingError, "rover.obs.gz"):
+            changed("recording.toml", lambda text, own=position: re.sub(own, "", swap(text), flags=re.MULTILINE))
+
+
+@pytest.mark.parametrize("every", [15, 30])
+def test_codes_of_a_slow_base_are_used(changed, whole, every):
+    raw = raw_of(changed("base.obs.gz", lambda text: "".join([blocks(text)[0], *blocks(text)[1][::every]])))
+    both = np.isfinite(raw.difference) & np.isfinite(whole.difference) & (raw.t < raw.t[0] + 30.0)
+    assert both.sum() > 0.9 * np.sum(np.isfinite(whole.difference) & (whole.t < whole.t[0] + 30.0))
+    # noise of single codes of the base, and no more
+    assert np.sqrt(np.mean((raw.difference - whole.difference)[both] ** 2)) < 0.5
+    carriers = np.isfinite(raw.carrier_difference) & np.isfinite(whole.carrier_difference)
+    assert carriers.any()
+
+
+@pytest.mark.parametrize("scale", ["GLO", "BDT"])
+@pytest.mark.parametrize("name", ["rover.obs.gz", "base.obs.gz"])
+def test_a_time_system_that_is_not_that_of_the_stamps_is_found_out(changed, name, scale):
+    with refused("raw.contradictory", RecordingError, name):
+        changed(name, lambda text: text.replace("GPS         TIME OF FIRST", f"{scale}         TIME OF FIRST"))
+
+
+def test_a_time_system_that_there_is_not_is_told_with_its_line(changed):
+    with refused("rinex.header", RecordingError, "rover.obs.gz, line"):
+        changed("rover.obs.gz", lambda text: text.replace("GPS         TIME OF FIRST", "XYZ         TIME OF FIRST"))
+
+
+def test_a_header_that_takes_carriers_for_codes_is_told(changed):
+    with refused("raw.few_satellites", RecordingError, "rover.obs.gz", "1C"):
+        changed("rover.obs.gz", lambda text: text.replace("C1C L1C", "L1C C1C"))
+
+
+def test_carriers_under_the_name_of_another_frequency_are_no_integers(changed):
+    """That of L2 as L5: each epoch slips against the others, and nothing of it is fixed."""
+    one = changed("rover.obs.gz", lambda text: text.replace("C2W L2W S2W", "C5X L5X S5X", 1))
+    raw = raw_of(one)
+    wrong = (raw.satellite < 100) & (raw.signal == number_signal("5X")) & np.isfinite(raw.carrier)
+    arcs = find_arcs(raw, base_arc=raw.base_arc)
+    assert len(np.unique(raw.t[wrong])) > 30
+    assert sum(len(arcs.begins[k]) for k, name in enumerate(arcs.names) if name.startswith("G") and "5X" in name) > 60
+
+
+def test_an_interval_that_changes_keeps_all_epochs(changed, whole):
+    raw = raw_of(changed("rover.obs.gz", lambda t: "".join([blocks(t)[0], *blocks(t)[1][:20], *blocks(t)[1][20::5]])))
+    assert same_rows(raw, whole, lambda key: key[0] not in {round(t * 100) for t in raw.t})
+    assert len(np.unique(raw.t)) == 25
+
+
+def test_observations_without_carriers_are_codes(changed):
+    raw = raw_of(
+        changed(
+            "rover.obs.gz", lambda text: re.sub(r" L(?=\d[A-Z] )", " X", blocks(text)[0]) + "".join(blocks(text)[1])
+        )
+    )
+    assert np.isfinite(raw.difference).any()
+    assert not np.isfinite(raw.carrier).any()
+
+
+def clocks(satellites: Iterable[str], day: str) -> str:
+    """A clock file, all of them right to the microsecond."""
+    head = f"{'     3.00           C':<60}RINEX VERSION / TYPE\n{'':60}END OF HEADER\n"
+    return head + "".join(
+        f"AS {one}  {day} 06 {minute:02d}  0.000000  1   {1e-6:.12E}\n" for one in satellites for minute in (25, 30, 35)
+    )
+
+
+def test_clocks_of_another_day_or_of_few_satellites(tmp_path, shared_data):
+    """Satellites that a clock file lacks keep the clocks of the orbit file."""
+    sp3 = shared_data / "cssrlib_2021_265" / "orbit.sp3.gz"
+    (tmp_path / "a.clk").write_text(clocks(["G05", "G13"], "2021 09 21"))
+    with refused("raw.clock_day", RecordingError, "a.clk", "orbit.sp3.gz"):
+        read_precise([sp3], [tmp_path / "a.clk"])
+    (tmp_path / "a.clk").write_text(clocks(["G05", "G13"], "2021 09 22"))
+    found, plain = read_precise([sp3], [tmp_path / "a.clk"]), read_precise([sp3], [])
+    assert {one for one in plain.clock if len(found.clock[one][0]) != len(plain.clock[one][0])} == {5, 13}
+
+
+def test_orbits_and_ephemerides_of_another_day_or_constellation(changed, shared_data, tmp_path):
+    slac = next((shared_data / "raw_gnss_slac_20210428").glob("*SP3.gz"))
+    shutil.copytree(DRIVE, tmp_path / "drive", dirs_exist_ok=True)
+    shutil.copy(slac, tmp_path / "drive" / "orbit.sp3.gz")
+    with refused("raw.ephemeris_day", RecordingError, "orbit.sp3.gz"):
+        changed("recording.toml", lambda text: text.replace('nav = "nav.gz"', 'nav = "nav.gz"\nsp3 = "orbit.sp3.gz"'))
+
+    def only(system: str) -> Change:
+        return lambda text: (
+            "".join(re.split(r"(END OF HEADER.*\n)", text)[:2])
+            + "".join(re.findall(rf"^{system}\d\d .*\n(?:    .*\n)*", text, flags=re.MULTILINE))
+        )
+
+    one = changed("nav.gz", only("J"))
+    assert {"raw.no_ephemeris", "raw.base"} <= keys(one)
+    assert "raw_gnss.few_satellites" in {finding.key for finding in check_raw(raw_of(one))}
+    with refused("raw.no_ephemerides", RecordingError, "nav.gz"):
+        changed("nav.gz", only("C"))

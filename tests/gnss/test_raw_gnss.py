@@ -309,7 +309,7 @@ def test_rinex_2_and_3_hold_what_their_readmes_say(shared_data):
     ucr = read_observations(shared_data / UCR / "rover.obs.gz")
     by_system = [int((ucr.satellite // 100 == s).sum()) for s in (GPS, GALILEO, BEIDOU)]
     assert by_system == [25850, 16798, 13483]
-    assert int(ucr.slip.sum()), int(ucr.half.sum()) == (416 + 567, 763 + 567)
+    assert (int(ucr.slip.sum()), int(ucr.half.sum())) == (416 + 567, 763 + 567)
     assert len(np.unique(ucr.t)) == 2400
 
 

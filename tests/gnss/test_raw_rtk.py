@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import itertools
 from dataclasses import replace
 from pathlib import Path
@@ -145,6 +146,62 @@ def test_real_epochs_are_soon_fixed_and_their_integers_are_rtklibs(monkeypatch):
         p = np.stack([np.interp(t, one.t, one.states.p[:, i]) for i in range(3)], -1)
         off = (one.frame.from_llh(recording.truth.llh) - p)[(t > recording.start + 2.0) & (t < recording.end)]
         assert np.hypot(off[:, 0], off[:, 1]).max() < 0.05  # m, what the reference is good to
+
+
+def locate_by_rtklib(rt, folder, base):
+    """(E, 5) of RTKLIB's kinematic solution: s of the week, its state, and place in e."""
+    obs, nav = rt.obs_t(), rt.nav_t()
+    for name, number in (("rover.obs", 1), ("base.obs", 2), ("nav", 0)):
+        (folder / name).write_bytes(gzip.decompress((KAMAKURA / f"{name}.gz").read_bytes()))
+        rt.readrnx(str(folder / name), number, "", obs, nav, rt.sta_t())
+    rt.sortobs(obs)
+    rt.uniqnav(nav)
+    how, state = rt.prcopt_default, rt.rtk_t()  # of which there is one: others find it as it was
+    chosen = {
+        "mode": rt.PMODE_KINEMA,
+        "nf": 2,
+        "navsys": rt.SYS_GPS | rt.SYS_GAL,
+        "elmin": np.radians(10.0),
+        "modear": 3,
+    }
+    before = {name: getattr(how, name) for name in chosen}
+    for name, value in chosen.items():
+        setattr(how, name, value)
+    rt.rtkinit(state, how)
+    for name, value in before.items():
+        setattr(how, name, value)
+    for i in range(3):
+        state.opt.rb[i] = state.rb[i] = base[i]
+    rows = [obs.data[k] for k in range(obs.n)]
+    second = np.round([rt.timediff(one.time, rt.gpst2time(2176, 0.0)) for one in rows])
+    found = []
+    for t in np.unique(second):
+        own = sorted(np.flatnonzero(second == t), key=lambda k: rows[k].rcv)
+        if len({rows[k].rcv for k in own}) < 2:
+            continue
+        here = rt.Arr1Dobsd_t(len(own))
+        for i, k in enumerate(own):
+            here[i] = rows[k]
+        rt.rtkpos(state, here.ptr, len(own), nav)
+        found.append((t, state.sol.stat, *(state.sol.rr[i] for i in range(3))))
+    return np.array(found)
+
+
+def test_places_with_integers_are_rtklibs(tmp_path):
+    """Where RTKLIB has integers, by two of the three frequencies, which it has later than filter and smoother."""
+    rt = pytest.importorskip("pyrtklib")
+    theirs = locate_by_rtklib(rt, tmp_path, (-3959400.631, 3385704.533, 3667523.111))
+    theirs = theirs[theirs[:, 1] == rt.SOLQ_FIX]
+    recording = read(KAMAKURA)
+    solutions = run(recording, STATED, ("ekf", "rts"))
+    assert len(theirs) > 20
+    for one in solutions.values():
+        t = theirs[:, 0] - 282600.0
+        assert one.fixed[one.fixed[:, 0] > recording.start + 2.0, 1].all()
+        p = np.stack([np.interp(t, one.t, one.states.p[:, i]) for i in range(3)], -1)
+        off = (p - one.frame.from_llh(earth.ecef_to_llh(theirs[:, 2:])))[t > recording.start + 2.0]
+        assert np.hypot(off[:, 0], off[:, 1]).max() < 0.03
+        assert np.abs(off[:, 2]).max() < 0.07  # two sigmas of unknown phase centres, of which it states none
 
 
 def test_what_is_known_of_arcs_holds_however_they_were_joined():

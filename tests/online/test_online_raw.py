@@ -155,7 +155,12 @@ def test_precise_point_positioning_is_that_of_the_recording(two: Recording) -> N
 def two() -> Recording:
     """Two signals of each satellite, and of one an antenna a metre off its centre of mass and an unsteady clock."""
     made = observed_drive(second=True).crop(0.0, 45.0)
-    antenna = SatelliteAntenna(-np.inf, np.inf, {band: np.array([0.2, 0.0, 1.0 + 0.1 * band]) for band in (1, 2, 5)})
+    antenna = SatelliteAntenna(
+        -np.inf,
+        np.inf,
+        {band: np.array([0.2, 0.0, 1.0 + 0.1 * band]) for band in (1, 2, 5)},
+        {1: np.array([0.01, 0.02, -0.03])},
+    )
     g01 = number_satellite("G01")
     return replace(made, raw_gnss=replace(made.raw_gnss, antennas={g01: (antenna,)}, clock_noise={g01: (0.03, 300.0)}))
 
