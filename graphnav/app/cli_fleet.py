@@ -25,7 +25,6 @@ from graphnav.app.cli_options import (
 )
 from graphnav.app.talk import Interrupted, print_out, say
 from graphnav.core.errors import ConfigError
-from graphnav.core.files import permit_outside
 from graphnav.core.notes import format_count
 
 commands = typer.Typer()
@@ -100,11 +99,10 @@ def fleet(
     known: dict[Any, Any] = {}
     manifest.resolve_options(asked, known)  # so that no line of a manifest is blamed for what the command line says
     folder = outputs.check_output_folder(out, ("fleet.csv", "fleet.parquet", "fleet.html"), ("drives",)).resolve()
-    with permit_outside(allow_outside):
-        drives = manifest.read_drives(source.resolve(), asked)
+    drives = manifest.read_drives(source.resolve(), asked, allow_outside)
     tasks = [
         manifest.build_task(
-            drive, folder, known, withhold=withhold, rate=rate, pages=pages, again=again, outside=allow_outside
+            drive, folder, known, withhold=withhold, rate=rate, pages=pages, again=again, allow_outside=allow_outside
         )
         for drive in drives
     ]

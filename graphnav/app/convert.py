@@ -54,7 +54,12 @@ def check_rate(rate: float | None) -> None:
 
 
 def convert_log(
-    source: str, out: Path, name: str | None, topics: Sequence[str] = (), force: bool = False
+    source: str,
+    out: Path,
+    name: str | None,
+    topics: Sequence[str] = (),
+    force: bool = False,
+    allow_outside: bool = False,
 ) -> tuple[Log, list[Path]]:
     """Read a log of any known kind and write it as a recording folder.
 
@@ -65,7 +70,7 @@ def convert_log(
     ConfigError
         If it would be written over itself, or without `force` over another recording.
     """
-    log = _add_measured_noise(load(source, name, topics))
+    log = _add_measured_noise(load(source, name, topics, allow_outside))
     if any(file.resolve().parent == out.resolve() and file.name.endswith((".toml", ".csv.gz")) for file in log.files):
         raise ConfigError(f"-o {out}: the recording is read from there; name another folder", key="output.is_input")
     with stage_results(out) as part:

@@ -60,6 +60,7 @@ class Request:
     against: tuple[Against, ...] = ()  # trajectories of other programs to compare with
     topics: tuple[str, ...] = ()  # of a ROS bag, for `graphnav.recording.formats.read`
     format: str | None = None  # of a log, likewise
+    allow_outside: bool = False  # likewise
     exported: tuple[str, ...] = ()  # additional output formats, for `point`
     point: str | None = None  # "antenna", "imu" or a lever arm
     judge_arms: bool = False  # check the signs of lever arms even if nothing is in doubt
@@ -192,7 +193,7 @@ def _run(request: Request, progress: Progress | None) -> Outcome:
 
     timings: dict[str, float] = {}
     with _measure_time(timings, "reading"):
-        whole = read(request.source, request.topics, name=request.format)
+        whole = read(request.source, request.topics, request.allow_outside, request.format)
     check_names(request.exported, whole.gps_zero)
     if request.point == "antenna" and whole.gnss is None:
         raise ConfigError("--point antenna: the recording has no GNSS", key="option.point")
@@ -336,10 +337,11 @@ def read_part(
     withheld: tuple[Withheld, ...] = (),
     topics: tuple[str, ...] = (),
     name: str | None = None,
+    allow_outside: bool = False,
 ) -> Recording:
     """The requested part of a recording, without what is withheld; times in s from the recording's start.
 
-    `topics` and `name` are those of `graphnav.recording.formats.read`.
+    `topics`, `name` and `allow_outside` are those of `graphnav.recording.formats.read`.
 
     Raises
     ------
@@ -348,7 +350,7 @@ def read_part(
     """
     from graphnav.recording.formats import read
 
-    whole = read(source, topics, name=name)
+    whole = read(source, topics, allow_outside, name)
     part = _crop(whole, Request(source, (), start=start, end=end))
     zero = part.start - whole.start if part is not whole else 0.0
     return _withhold(part, _move(withheld, zero), zero)[0]

@@ -35,8 +35,12 @@ def _find_oxts(path: Path) -> Path | None:
     return None
 
 
-def load(path: Path) -> Log:
+def load(path: Path, allow_outside: bool = False) -> Log:
     """Read the IMU, positions and velocities of the INS once a second as fixes, and its whole solution as the truth.
+
+    Parameters
+    ----------
+    allow_outside : whether its files may be links to somewhere else.
 
     Raises
     ------
@@ -48,7 +52,8 @@ def load(path: Path) -> Log:
         raise RecordingError(f"{path}: no KITTI folder 'oxts' with timestamps.txt and data in it", key="log.no_folder")
     remarks = Remarks()
     samples = sorted((folder / "data").glob("*.txt"))
-    check_inside([folder / "timestamps.txt", *samples], path)
+    if not allow_outside:
+        check_inside([folder / "timestamps.txt", *samples], path)
     t, zero = _read_times(folder / "timestamps.txt")
     if len(samples) != len(t):
         raise RecordingError(

@@ -254,4 +254,4 @@ def _read_velocities(fixes: list[_Epoch], remarks: Remarks) -> tuple[Array | Non
     return v, sd_v
 
 
-FORMAT = log_format("nmea", "NMEA 0183 sentences of a receiver", recognises, load)
+FORMAT = log_format("nmea", "NMEA 0183 sentences of a receiver", recognises, lambda path, _: load(path))

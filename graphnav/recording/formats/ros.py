@@ -232,4 +232,4 @@ def _add_velocity(topic: _Topic, gnss: Gnss | None, remarks: Remarks) -> Gnss | 
     return replace(gnss, v=v, sd_v=sd_v)
 
 
-FORMAT = log_format("ros", "ROS 1 or ROS 2 bags and MCAP files", recognises, load, load)
+FORMAT = log_format("ros", "ROS 1 or ROS 2 bags and MCAP files", recognises, lambda path, _: load(path), load)

@@ -262,4 +262,9 @@ def _fit_clock(content: _Content, remarks: Remarks) -> tuple[float, float]:
     return tick, float(np.median(t - tick * tags))
 
 
-FORMAT = log_format("ubx", "u-blox UBX messages: NAV-PVT and, where present, ESF-MEAS or ESF-RAW", recognises, load)
+FORMAT = log_format(
+    "ubx",
+    "u-blox UBX messages: NAV-PVT and, where present, ESF-MEAS or ESF-RAW",
+    recognises,
+    lambda path, _: load(path),
+)
