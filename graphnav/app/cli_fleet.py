@@ -116,7 +116,7 @@ def fleet(
         for row in found:
             done[row["drive"]] = row if len(done) < page.DRAWN else {**row, "track": None}
             if not (quiet or json):
-                say(f"[{len(done)}/{len(tasks)}] {row['drive']}: {_describe(row)}")
+                say(f"[{len(done)}/{len(tasks)}] {row['drive']}: {_format_drive(row)}")
     except KeyboardInterrupt:
         raise Interrupted(f"interrupted after {len(done)} of {len(tasks)} drives; the same command goes on") from None
     rows = [done[task.name] for task in tasks]
@@ -156,7 +156,7 @@ def _resolve_noise(noise: str) -> str:
     return str(Path(noise).resolve()) if Path(noise).is_file() else noise
 
 
-def _describe(row: dict[str, Any]) -> str:
+def _format_drive(row: dict[str, Any]) -> str:
     """One line about a drive."""
     if row["status"] != "done":
         return f"{row['status']}: {row.get('error')}"

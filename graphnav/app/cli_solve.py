@@ -77,7 +77,7 @@ def smooth(
         pick_one(context, recording), out, profile, config, noise, detectors, without, rate, start, end, require,
         format, topic, allow_outside, quiet, json, pages,
     )  # fmt: skip
-    _solve(asked, choose_solver(context, solver), True, export, point)
+    _solve_and_write(asked, choose_solver(context, solver), True, export, point)
 
 
 @commands.command(
@@ -157,7 +157,7 @@ def compare(
                 f"{option} {values[-1]}: say one for each of the {len(beside.files)} files of --against",
                 key="option.count",
             )
-    _solve(asked, choose_solvers(context, solvers), False, export, point, beside, loose)
+    _solve_and_write(asked, choose_solvers(context, solvers), False, export, point, beside, loose)
 
 
 @commands.command(epilog="\b\nExample:\n  graphnav report out/kitti")
@@ -218,7 +218,7 @@ class _Beside:
     shifts: list[float]
 
 
-def _solve(
+def _solve_and_write(
     asked: _Options,
     chosen: tuple[str, ...],
     alone: bool,

@@ -101,7 +101,7 @@ class Outcome:
     @property
     def used_withheld(self) -> tuple[Withheld, ...]:
         """The withheld spans, in s from the start of `recording`."""
-        return _move(self.request.withheld, self.zero)
+        return _shift_spans(self.request.withheld, self.zero)
 
 
 def name_runs(solvers: tuple[str, ...], loose: bool) -> tuple[str, ...]:
@@ -183,10 +183,10 @@ def run_request(request: Request, progress: Progress | None = None) -> Outcome:
         In one plain sentence, for anything that cannot be used as it is.
     """
     with send_progress(progress):
-        return _run(request, progress)
+        return _solve_request(request, progress)
 
 
-def _run(request: Request, progress: Progress | None) -> Outcome:
+def _solve_request(request: Request, progress: Progress | None) -> Outcome:
     from graphnav.recording.checks.overview import inspect
     from graphnav.recording.checks.stated import is_truth_apart
     from graphnav.recording.formats import read
@@ -199,7 +199,7 @@ def _run(request: Request, progress: Progress | None) -> Outcome:
         raise ConfigError("--point antenna: the recording has no GNSS", key="option.point")
     recording = _crop(whole, request)
     zero = recording.start - whole.start if recording is not whole else 0.0
-    moved = _move(request.withheld, zero)
+    moved = _shift_spans(request.withheld, zero)
     with _measure_time(timings, "checks"):
         inspection = inspect(recording)
         inspection.refuse()
@@ -353,7 +353,7 @@ def read_part(
     whole = read(source, topics, allow_outside, name)
     part = _crop(whole, Request(source, (), start=start, end=end))
     zero = part.start - whole.start if part is not whole else 0.0
-    return _withhold(part, _move(withheld, zero), zero)[0]
+    return _withhold(part, _shift_spans(withheld, zero), zero)[0]
 
 
 @contextmanager
@@ -375,7 +375,7 @@ def _crop(whole: Recording, request: Request) -> Recording:
     return whole.crop(request.start, request.end)
 
 
-def _move(withheld: tuple[Withheld, ...], by: float) -> tuple[Withheld, ...]:
+def _shift_spans(withheld: tuple[Withheld, ...], by: float) -> tuple[Withheld, ...]:
     return tuple((source, span and (span[0] - by, span[1] - by)) for source, span in withheld)
 
 

@@ -77,7 +77,7 @@ class Store:
         if resume:
             if not path.exists():
                 raise ConfigError(f"--resume: {folder} holds no checkpoint to go on from", key="checkpoint.none")
-            self.resumed = _read(path)
+            self.resumed = _read_checkpoint(path)
             if self.resumed.source != source:
                 raise ConfigError(
                     f"--resume: {folder} was made from '{self.resumed.source}', not from '{source}'",
@@ -230,7 +230,7 @@ class _Digested:
         return self._file.write(data)
 
 
-def _read(path: Path) -> Checkpoint:
+def _read_checkpoint(path: Path) -> Checkpoint:
     found = None
     with path.open("rb") as file:
         magic, told = file.read(len(_MAGIC)), file.read(_DIGEST().digest_size)

@@ -249,7 +249,7 @@ def _build_drive(
                     f"{where}, '{key}': {value!r} is not a number of seconds", key="manifest.value"
                 ) from None
         elif key == "settings" and isinstance(value, Mapping):
-            values[key] = _write(value)
+            values[key] = _format_settings(value)
         elif key == "without" and isinstance(value, list):
             values[key] = " ".join(map(str, value))
         elif isinstance(value, str):
@@ -293,14 +293,16 @@ def _parse_settings(text: str) -> dict[str, Any]:
         ) from None
 
 
-def _write(values: Mapping[str, Any], at: str = "") -> str:
+def _format_settings(values: Mapping[str, Any], at: str = "") -> str:
     """A table of settings as lines of dotted keys."""
     from graphnav.config.files import format_toml_value
 
     lines = []
     for key, value in values.items():
         lines.append(
-            _write(value, f"{at}{key}.") if isinstance(value, Mapping) else f"{at}{key} = {format_toml_value(value)}"
+            _format_settings(value, f"{at}{key}.")
+            if isinstance(value, Mapping)
+            else f"{at}{key} = {format_toml_value(value)}"
         )
     return "\n".join(lines)
 

@@ -105,7 +105,7 @@ def read_plain(path: Path) -> Plain | None:
     if layout.mark != "," or '"' in text:  # else no number has a comma in it
         cells, style = _write_plainly(cells, layout.mark)
         done += style
-    columns = {name: x for name, some in cells.items() if (x := _parse_numbers(some)) is not None}
+    columns = {name: x for name, some in cells.items() if (x := _parse_column(some)) is not None}
     done += _add_nanoseconds(columns)
     dated, daily, more = _parse_times(cells, columns, layout.above)
     words = {name: next(filter(None, some), "") for name, some in cells.items() if name not in columns}
@@ -159,7 +159,7 @@ def _read_values(line: str, mark: str | None) -> tuple[float, int]:
 
 def _is_value(cell: str) -> bool:
     return (
-        _parse_numbers([cell]) is not None
+        _parse_column([cell]) is not None
         or _MARKED.fullmatch(cell) is not None
         or _parse_clock(cell) is not None
         or bool(_parse_date(cell) or _SLASHES.fullmatch(cell))
@@ -272,7 +272,7 @@ def _add_nanoseconds(columns: dict[str, Array]) -> list[str]:
     return []
 
 
-def _parse_numbers(cells: Sequence[str]) -> Array | None:
+def _parse_column(cells: Sequence[str]) -> Array | None:
     """A column as numbers, NaN where blank; None where it contains anything else."""
     try:
         return np.array([parse_number(c.replace(",", ".")) if c else np.nan for c in cells])

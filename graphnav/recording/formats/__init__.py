@@ -58,7 +58,7 @@ def read(
         If the source does not exist, is of unknown format, or cannot be used, or if there is no format of that name.
     """
     chosen = _find_format(source, name)
-    log = _choose(chosen, source, topics) if topics else None
+    log = _load_topics(chosen, source, topics) if topics else None
     found = chosen.read(source, allow_outside) if log is None else log.make_recording(source)
     if found.gnss is None:
         return found
@@ -89,7 +89,7 @@ def load(source: str | Path, name: str | None = None, topics: Sequence[str] = ()
     """
     chosen = _find_format(source, name)
     if topics:
-        return _choose(chosen, source, topics)
+        return _load_topics(chosen, source, topics)
     if chosen.load is not None:
         return chosen.load(source, allow_outside)
     r = chosen.read(source, allow_outside)
@@ -117,7 +117,7 @@ def _find_format(source: str | Path, name: str | None) -> Format:
     return chosen
 
 
-def _choose(chosen: Format, source: str | Path, topics: Sequence[str]) -> Log:
+def _load_topics(chosen: Format, source: str | Path, topics: Sequence[str]) -> Log:
     """Read the log with these topics."""
     if chosen.choose is None:
         raise RecordingError(

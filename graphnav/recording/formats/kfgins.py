@@ -95,7 +95,7 @@ def load(path: Path, allow_outside: bool = False) -> Log:
                 "odometer.read_as", "the eighth column of the IMU file is taken as the odometer's forward speed in m/s"
             )
     if gnss_file is not None:
-        gnss = _read_gnss(gnss_file, read_lever_arm(where, config, "antlever"), remarks)
+        gnss = _read_fixes(gnss_file, read_lever_arm(where, config, "antlever"), remarks)
     folder = where.parent if config else where
     if nav := _find_truth(folder, remarks) if folder.is_dir() else None:
         if not allow_outside:
@@ -264,7 +264,7 @@ def _read_imu(path: Path, remarks: Remarks) -> tuple[Imu, Array | None]:
     return imu, table[:, 7].copy() if table.shape[1] == 8 else None
 
 
-def _read_gnss(path: Path, lever_arm: Array, remarks: Remarks) -> Gnss:
+def _read_fixes(path: Path, lever_arm: Array, remarks: Remarks) -> Gnss:
     rows = [(n, line) for n, line in enumerate(split_lines(path), 1) if line.strip() and line.lstrip()[0] not in "#%"]
     if not rows:
         raise RecordingError(f"{path}: no rows in it", key="file.no_rows")

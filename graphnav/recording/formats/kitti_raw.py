@@ -137,14 +137,14 @@ def _parse_row(path: Path) -> list[float]:
     try:
         values = [parse_number(x) for x in text.split()]
     except ValueError:
-        bad = next(x for x in text.split() if not _parse_number(x))
+        bad = next(x for x in text.split() if not _is_number(x))
         raise RecordingError(f"{path}, line 1: '{bad[:40]}' is not a number", key="table.cell") from None
     if len(values) != _FIELDS:
         raise RecordingError(f"{path}, line 1: {len(values)} numbers where {_FIELDS} were expected", key="table.fields")
     return values
 
 
-def _parse_number(text: str) -> bool:
+def _is_number(text: str) -> bool:
     try:
         parse_number(text)
     except ValueError:
