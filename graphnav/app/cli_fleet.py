@@ -118,7 +118,7 @@ def fleet(
             if not (quiet or json):
                 say(f"[{len(done)}/{len(tasks)}] {row['drive']}: {_format_drive(row)}")
     except KeyboardInterrupt:
-        raise Interrupted(f"interrupted after {len(done)} of {len(tasks)} drives; the same command goes on") from None
+        raise Interrupted(f"interrupted after {len(done)} of {len(tasks)} drives; the same command continues") from None
     rows = [done[task.name] for task in tasks]
     with stage_results(folder) as part:
         tables.write_fleet_csv(rows, part / "fleet.csv")

@@ -53,7 +53,8 @@ def convert(
 
     if export is not None and format is not None:
         raise ConfigError(
-            f"--format {format}: is for logs; what a trajectory is, is seen from its content", key="option.not_here"
+            f"--format {format}: is for logs; the format of a trajectory is recognised from its content",
+            key="option.not_here",
         )
     if export is not None or conversion.is_export(Path(source), out):
         conversion.check_rate(rate)

@@ -174,7 +174,9 @@ def export_file(
         gps_zero = parse_clock("unix", float(trajectory.t[0]))
         notes.append("t is taken as Unix time: it is above 1e9")
     if gps_zero is None and {"gpx", "nav"} & set(targets):
-        notes.append("what t counts from is not known: GPX is written without times, .nav with week 0; --clock says it")
+        notes.append(
+            "the zero of t is not known: GPX is written without times, .nav with week 0; state it with --clock"
+        )
     parts = move_to_point(trajectory, None if isinstance(arm, str) else arm, rate)
     return _write_tracks(parts, targets, gps_zero, trajectory.name), notes
 

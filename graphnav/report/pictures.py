@@ -243,7 +243,7 @@ def draw_motion(recording: Recording, solutions: Mapping[str, Solution], spans: 
             figure = plots.plot_bands(series, parts, unit, end, spans=spans, about_zero=False, under=under)
             note = ""
             if title == "Attitude" and any(np.nanmax(s.value[:, 2], initial=0.0) > 360.0 for s in series.values()):
-                note = "The heading goes on beyond 360 deg, turn by turn."
+                note = "The heading is continued beyond 360 deg."
             out.append(page.place_picture(figure, f"{title} and 3 sigma" if len(series) < 3 else title, note))
     return out
 

@@ -41,7 +41,7 @@ _SHOWS = {
 def tabulate_verdicts(solution: Solution, errors: Errors | None) -> Markup:
     """Accuracy of position, velocity and attitude, and whether the stated sigma is consistent."""
     found = _judge_by_records(solution) | ({} if errors is None else _judge_by_truth(errors))
-    nothing = ("", "nothing is there to judge it by")
+    nothing = ("", "there is nothing to assess it by")
     return page.verdicts(
         [(kind, block.capitalize(), words) for block in _SHOWS for kind, words in [found.get(block, nothing)]]
     )

@@ -41,7 +41,7 @@ def build_imu(d: schema.ImuTable, rows: Table, remarks: Remarks) -> Imu:
     missing = [key for key in schema.STATED_FIGURES if key not in stated]
     if 0 < len(missing) < len(schema.STATED_FIGURES):
         remarks.add(
-            "imu.noise_partly", f"[imu.noise] says nothing of {', '.join(missing)}: defaults of a consumer IMU are used"
+            "imu.noise_partly", f"[imu.noise] does not state {', '.join(missing)}: defaults of a consumer IMU are used"
         )
     elif missing:
         remarks.add(
@@ -72,7 +72,7 @@ def build_gnss(d: schema.GnssTable, rows: Table, remarks: Remarks) -> Gnss:
     if vague.any():
         if vague.all():
             raise RecordingError(
-                f"{rows.path}: every fix has a sigma of more than {VAGUEST:g} m and says nothing",
+                f"{rows.path}: every fix has a sigma of more than {VAGUEST:g} m and carries no information",
                 key="gnss.sigma_all_vague",
             )
         remarks.add(

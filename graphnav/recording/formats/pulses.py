@@ -54,5 +54,5 @@ def _count_steps(pulses: Array, step: Array, signed: bool | None, remarks: Remar
     for mask, what in ((ran_over & ~anew, f"ran over ({modulus:.0f})"), (anew, "began anew")):
         if mask.any():
             times = "once" if mask.sum() == 1 else f"{mask.sum()} times"
-            remarks.add("odometer.counter_mended", f"the odometer's counter {what} {times}: mended")
+            remarks.add("odometer.counter_mended", f"the odometer's counter {what} {times}: corrected")
     return whole
