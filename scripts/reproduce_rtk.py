@@ -24,7 +24,6 @@ from scipy.interpolate import PchipInterpolator, make_interp_spline
 from graphnav.config import parse_settings
 from graphnav.core import earth, rotation
 from graphnav.core.earth import LocalFrame
-from graphnav.core.files import permit_outside
 from graphnav.estimation.pipeline import run
 from graphnav.estimation.solution import Solution
 from graphnav.gnss.load import Sources, load_raw
@@ -160,8 +159,7 @@ def recording_of(data: Path, folder: Path, with_base: bool = True) -> tuple[Reco
         base_file=drive.base_file,
     )
     (folder / f"{data.name}.toml").write_text(text, encoding="utf-8")
-    with permit_outside():
-        return read(folder / f"{data.name}.toml"), t, places
+    return read(folder / f"{data.name}.toml", allow_outside=True), t, places
 
 
 def errors(t: Array, llh: Array, at: Array, places: Array) -> Array:

@@ -55,7 +55,6 @@ from graphnav.app.talk import (
 )
 from graphnav.core.complaints import rephrase
 from graphnav.core.errors import GraphnavError
-from graphnav.core.files import permit_outside
 from graphnav.core.progress import tell
 
 __all__ = ["DEBUG", "PIPE_CLOSED", "app", "main", "run"]
@@ -171,10 +170,12 @@ def detect(
     withheld = collect_withheld(without, start, end)
     settings = choose_detectors(read_settings(config), detectors)
     folder = outputs.check_output_folder(out)
-    with show_progress(quiet, "detect"), permit_outside(allow_outside):
+    with show_progress(quiet, "detect"):
         tell("reading")
         used, notes = screen_recording(
-            workflow.read_part(pick_one(context, recording), start, end, withheld, tuple(topic or ()), format)
+            workflow.read_part(
+                pick_one(context, recording), start, end, withheld, tuple(topic or ()), format, allow_outside
+            )
         )
         tell("detection")
         found = detected(used, settings)
@@ -217,9 +218,9 @@ def evaluate(
 
     requirements = [gates.parse_requirement(one) for one in require or ()]
     folder = None if out is None else outputs.check_output_folder(out)
-    with show_progress(quiet, "evaluate"), permit_outside(allow_outside):
+    with show_progress(quiet, "evaluate"):
         tell("reading")
-        metrics = compared(trajectory, truth)
+        metrics = compared(trajectory, truth, allow_outside=allow_outside)
     values = {"trajectory": str(trajectory), "truth": str(truth), **summarise(metrics)}
     verdicts = gates.judge_all(requirements, tabulate({trajectory.stem: metrics}))
     if verdicts:

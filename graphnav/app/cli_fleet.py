@@ -25,7 +25,6 @@ from graphnav.app.cli_options import (
 )
 from graphnav.app.talk import Interrupted, print_out, say
 from graphnav.core.errors import ConfigError
-from graphnav.core.files import permit_outside
 from graphnav.core.notes import format_count
 
 commands = typer.Typer()
@@ -100,11 +99,10 @@ def fleet(
     known: dict[Any, Any] = {}
     manifest.resolve_options(asked, known)  # so that no line of a manifest is blamed for what the command line says
     folder = outputs.check_output_folder(out, ("fleet.csv", "fleet.parquet", "fleet.html"), ("drives",)).resolve()
-    with permit_outside(allow_outside):
-        drives = manifest.read_drives(source.resolve(), asked)
+    drives = manifest.read_drives(source.resolve(), asked, allow_outside)
     tasks = [
         manifest.build_task(
-            drive, folder, known, withhold=withhold, rate=rate, pages=pages, again=again, outside=allow_outside
+            drive, folder, known, withhold=withhold, rate=rate, pages=pages, again=again, allow_outside=allow_outside
         )
         for drive in drives
     ]
@@ -118,9 +116,9 @@ def fleet(
         for row in found:
             done[row["drive"]] = row if len(done) < page.DRAWN else {**row, "track": None}
             if not (quiet or json):
-                say(f"[{len(done)}/{len(tasks)}] {row['drive']}: {_describe(row)}")
+                say(f"[{len(done)}/{len(tasks)}] {row['drive']}: {_format_drive(row)}")
     except KeyboardInterrupt:
-        raise Interrupted(f"interrupted after {len(done)} of {len(tasks)} drives; the same command goes on") from None
+        raise Interrupted(f"interrupted after {len(done)} of {len(tasks)} drives; the same command continues") from None
     rows = [done[task.name] for task in tasks]
     with stage_results(folder) as part:
         tables.write_fleet_csv(rows, part / "fleet.csv")
@@ -158,7 +156,7 @@ def _resolve_noise(noise: str) -> str:
     return str(Path(noise).resolve()) if Path(noise).is_file() else noise
 
 
-def _describe(row: dict[str, Any]) -> str:
+def _format_drive(row: dict[str, Any]) -> str:
     """One line about a drive."""
     if row["status"] != "done":
         return f"{row['status']}: {row.get('error')}"

@@ -11,7 +11,6 @@ import typer
 from graphnav.app.cli_options import AllowOutside, Export, FormatOption, Json, Point, Quiet, Topic
 from graphnav.app.talk import print_out, say, show_progress
 from graphnav.core.errors import ConfigError
-from graphnav.core.files import permit_outside
 from graphnav.core.progress import tell
 
 commands = typer.Typer()
@@ -54,7 +53,8 @@ def convert(
 
     if export is not None and format is not None:
         raise ConfigError(
-            f"--format {format}: is for logs; what a trajectory is, is seen from its content", key="option.not_here"
+            f"--format {format}: is for logs; the format of a trajectory is recognised from its content",
+            key="option.not_here",
         )
     if export is not None or conversion.is_export(Path(source), out):
         conversion.check_rate(rate)
@@ -75,9 +75,9 @@ def convert(
         if value is not None:
             raise ConfigError(f"{option}: is for trajectories; a log keeps its own", key="option.not_here")
     folder = check_output_folder(out)
-    with show_progress(quiet, "convert"), permit_outside(allow_outside):
+    with show_progress(quiet, "convert"):
         tell("reading")
-        log, files = conversion.convert_log(source, folder, format, topic or (), force)
+        log, files = conversion.convert_log(source, folder, format, topic or (), force, allow_outside)
     print_out(
         lambda: conversion.log_text(log, files),
         lambda: {**conversion.log_values(log), "files": files},
@@ -115,12 +115,12 @@ def allan(
     from graphnav.report import allan as pages
 
     folder = check_output_folder(out)
-    with show_progress(quiet, "allan"), permit_outside(allow_outside):
+    with show_progress(quiet, "allan"):
         tell("reading")
         if format is None and log.endswith((".csv", ".csv.gz")):
             t, gyro, accel = read_imu_in_si(Path(log))
         else:
-            imu = load(log, format, topic or ()).imu
+            imu = load(log, format, topic or (), allow_outside).imu
             if imu is None:
                 raise RecordingError(f"{log}: holds no IMU", key="log.no_imu")
             t, gyro, accel = imu.t, imu.gyro, imu.accel

@@ -58,7 +58,9 @@ def online(
     ] = 0.0,
     lag: Annotated[
         float | None,
-        typer.Option("--lag", metavar="S", help="Lag of the smoothed states: how much of the future they have seen."),
+        typer.Option(
+            "--lag", metavar="S", help="Lag of the smoothed states: the span of later measurements that each includes."
+        ),
     ] = None,
     engine: Annotated[
         str | None, typer.Option("--engine", metavar="NAME", help="Smoother: window (default), or GTSAM's isam2.")

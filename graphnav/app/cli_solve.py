@@ -38,7 +38,6 @@ from graphnav.app.cli_options import (
 )
 from graphnav.app.talk import insist, pause_collector, print_out, show_progress
 from graphnav.core.errors import ConfigError
-from graphnav.core.files import permit_outside
 from graphnav.core.progress import tell
 
 commands = typer.Typer()
@@ -76,10 +75,9 @@ def smooth(
     """
     asked = _Options(
         pick_one(context, recording), out, profile, config, noise, detectors, without, rate, start, end, require,
-        format, topic, quiet, json, pages,
+        format, topic, allow_outside, quiet, json, pages,
     )  # fmt: skip
-    with permit_outside(allow_outside):
-        _solve(asked, choose_solver(context, solver), True, export, point)
+    _solve_and_write(asked, choose_solver(context, solver), True, export, point)
 
 
 @commands.command(
@@ -150,7 +148,7 @@ def compare(
     """
     asked = _Options(
         pick_one(context, recording), out, profile, config, noise, detectors, without, rate, start, end, require,
-        format, topic, quiet, json, pages,
+        format, topic, allow_outside, quiet, json, pages,
     )  # fmt: skip
     beside = _Beside(against or [], against_point or [], against_shift or [])
     for option, values in (("--against-point", beside.points), ("--against-shift", beside.shifts)):
@@ -159,8 +157,7 @@ def compare(
                 f"{option} {values[-1]}: say one for each of the {len(beside.files)} files of --against",
                 key="option.count",
             )
-    with permit_outside(allow_outside):
-        _solve(asked, choose_solvers(context, solvers), False, export, point, beside, loose)
+    _solve_and_write(asked, choose_solvers(context, solvers), False, export, point, beside, loose)
 
 
 @commands.command(epilog="\b\nExample:\n  graphnav report out/kitti")
@@ -206,6 +203,7 @@ class _Options:
     require: list[str] | None
     format: str | None
     topic: list[str] | None
+    allow_outside: bool
     quiet: bool
     json: bool
     pages: bool
@@ -220,7 +218,7 @@ class _Beside:
     shifts: list[float]
 
 
-def _solve(
+def _solve_and_write(
     asked: _Options,
     chosen: tuple[str, ...],
     alone: bool,
@@ -268,7 +266,7 @@ def _solve(
     request = workflow.Request(
         asked.recording, chosen, settings, withheld, asked.start, asked.end, asked.rate,
         {k: v for k, v in given.items() if v is not None}, noise, exported=exported, point=point,
-        topics=tuple(asked.topic or ()), format=asked.format, against=tuple(against),
+        topics=tuple(asked.topic or ()), format=asked.format, allow_outside=asked.allow_outside, against=tuple(against),
         judge_arms=not alone, loose=loose,
     )  # fmt: skip
     with show_progress(asked.quiet, *chosen) as progress:

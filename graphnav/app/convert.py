@@ -54,7 +54,12 @@ def check_rate(rate: float | None) -> None:
 
 
 def convert_log(
-    source: str, out: Path, name: str | None, topics: Sequence[str] = (), force: bool = False
+    source: str,
+    out: Path,
+    name: str | None,
+    topics: Sequence[str] = (),
+    force: bool = False,
+    allow_outside: bool = False,
 ) -> tuple[Log, list[Path]]:
     """Read a log of any known kind and write it as a recording folder.
 
@@ -65,7 +70,7 @@ def convert_log(
     ConfigError
         If it would be written over itself, or without `force` over another recording.
     """
-    log = _add_measured_noise(load(source, name, topics))
+    log = _add_measured_noise(load(source, name, topics, allow_outside))
     if any(file.resolve().parent == out.resolve() and file.name.endswith((".toml", ".csv.gz")) for file in log.files):
         raise ConfigError(f"-o {out}: the recording is read from there; name another folder", key="output.is_input")
     with stage_results(out) as part:
@@ -149,7 +154,7 @@ def export_file(
     else:
         assert name is not None
         targets = {one: out / f"{file.stem}.{one}" for one in split_names(name, FORMATS, "--export", "format to write")}
-    run = _run(file)
+    run = _read_summary(file)
     arm = parse_point(point)
     if isinstance(arm, str) and arm == "antenna":
         stated = run.get("antenna_lever_arm")
@@ -169,9 +174,11 @@ def export_file(
         gps_zero = parse_clock("unix", float(trajectory.t[0]))
         notes.append("t is taken as Unix time: it is above 1e9")
     if gps_zero is None and {"gpx", "nav"} & set(targets):
-        notes.append("what t counts from is not known: GPX is written without times, .nav with week 0; --clock says it")
+        notes.append(
+            "the zero of t is not known: GPX is written without times, .nav with week 0; state it with --clock"
+        )
     parts = move_to_point(trajectory, None if isinstance(arm, str) else arm, rate)
-    return _write(parts, targets, gps_zero, trajectory.name), notes
+    return _write_tracks(parts, targets, gps_zero, trajectory.name), notes
 
 
 def _find_trajectory_file(source: str) -> Path:
@@ -258,7 +265,9 @@ def export_run(
             blocks = _move_parts(solution, rate, lever_arm)
         title = f"{outcome.recording.name}, {solver}" + (f", {name}" if name != "trajectory" else "")
         place = folder if alone else folder / solver
-        files += _write(blocks, {one: place / f"{name}.{one}" for one in names}, outcome.recording.gps_zero, title)
+        files += _write_tracks(
+            blocks, {one: place / f"{name}.{one}" for one in names}, outcome.recording.gps_zero, title
+        )
     return files
 
 
@@ -278,14 +287,16 @@ def _move_parts(solution: Solution, rate: float | None, arm: Array) -> Iterator[
         yield interpolate(rows, t, max_gap=_MAX_GAP, lever_arm=arm)[0]
 
 
-def _write(blocks: Iterable[Trajectory], targets: dict[str, Path], gps_zero: float | None, name: str) -> list[Path]:
+def _write_tracks(
+    blocks: Iterable[Trajectory], targets: dict[str, Path], gps_zero: float | None, name: str
+) -> list[Path]:
     for path in targets.values():
         path.parent.mkdir(parents=True, exist_ok=True)
     write_parts(blocks, targets, name, None if gps_zero is None else lambda t: gps_to_utc(t + gps_zero))
     return list(targets.values())
 
 
-def _run(source: Path) -> dict[str, Any]:
+def _read_summary(source: Path) -> dict[str, Any]:
     """The summary beside a trajectory, which states its points and its clock."""
     path = source.parent / SUMMARY
     try:

@@ -85,7 +85,9 @@ def score(
             reference, arm = compared[0].t, compared[1]
             swings = compared[0].v is not None and arm is not None and bool(np.any(arm))
         at = _choose_epochs(solution, reference)
-        wanted = np.union1d(np.union1d(solution.t, at), _thin(reference, solution, _MOST_TURNING)) if swings else at
+        wanted = (
+            np.union1d(np.union1d(solution.t, at), _choose_times(reference, solution, _MOST_TURNING)) if swings else at
+        )
         track = _score_at(solution, wanted, placed=used.placed)
         epochs = at if len(at) else None
         metrics = evaluate_recording(track, recording, withheld=asked, at=epochs, antenna=antenna)
@@ -122,10 +124,10 @@ def _choose_epochs(solution: Solution, truth: Array) -> Array:
         there = (np.minimum(np.abs(before), np.abs(after)) <= _SAME) | (before + after <= _BETWEEN_ROWS)
         if not foreign and there.sum() >= max(_ENOUGH_KEYFRAMES, 0.8 * len(t)):
             return np.asarray(t[there])
-    return _thin(truth, solution, _MOST)
+    return _choose_times(truth, solution, _MOST)
 
 
-def _thin(t: Array, solution: Solution, most: int) -> Array:
+def _choose_times(t: Array, solution: Solution, most: int) -> Array:
     """At most `most` of the times within a solution, none closer than `_DENSEST`."""
     spacing = max(_DENSEST, (solution.t[-1] - solution.t[0]) / most)
     _, apart = np.unique(np.floor(t / spacing), return_index=True)

@@ -60,6 +60,7 @@ class Request:
     against: tuple[Against, ...] = ()  # trajectories of other programs to compare with
     topics: tuple[str, ...] = ()  # of a ROS bag, for `graphnav.recording.formats.read`
     format: str | None = None  # of a log, likewise
+    allow_outside: bool = False  # likewise
     exported: tuple[str, ...] = ()  # additional output formats, for `point`
     point: str | None = None  # "antenna", "imu" or a lever arm
     judge_arms: bool = False  # check the signs of lever arms even if nothing is in doubt
@@ -100,7 +101,7 @@ class Outcome:
     @property
     def used_withheld(self) -> tuple[Withheld, ...]:
         """The withheld spans, in s from the start of `recording`."""
-        return _move(self.request.withheld, self.zero)
+        return _shift_spans(self.request.withheld, self.zero)
 
 
 def name_runs(solvers: tuple[str, ...], loose: bool) -> tuple[str, ...]:
@@ -182,23 +183,23 @@ def run_request(request: Request, progress: Progress | None = None) -> Outcome:
         In one plain sentence, for anything that cannot be used as it is.
     """
     with send_progress(progress):
-        return _run(request, progress)
+        return _solve_request(request, progress)
 
 
-def _run(request: Request, progress: Progress | None) -> Outcome:
+def _solve_request(request: Request, progress: Progress | None) -> Outcome:
     from graphnav.recording.checks.overview import inspect
     from graphnav.recording.checks.stated import is_truth_apart
     from graphnav.recording.formats import read
 
     timings: dict[str, float] = {}
     with _measure_time(timings, "reading"):
-        whole = read(request.source, request.topics, name=request.format)
+        whole = read(request.source, request.topics, request.allow_outside, request.format)
     check_names(request.exported, whole.gps_zero)
     if request.point == "antenna" and whole.gnss is None:
         raise ConfigError("--point antenna: the recording has no GNSS", key="option.point")
     recording = _crop(whole, request)
     zero = recording.start - whole.start if recording is not whole else 0.0
-    moved = _move(request.withheld, zero)
+    moved = _shift_spans(request.withheld, zero)
     with _measure_time(timings, "checks"):
         inspection = inspect(recording)
         inspection.refuse()
@@ -339,10 +340,11 @@ def read_part(
     withheld: tuple[Withheld, ...] = (),
     topics: tuple[str, ...] = (),
     name: str | None = None,
+    allow_outside: bool = False,
 ) -> Recording:
     """The requested part of a recording, without what is withheld; times in s from the recording's start.
 
-    `topics` and `name` are those of `graphnav.recording.formats.read`.
+    `topics`, `name` and `allow_outside` are those of `graphnav.recording.formats.read`.
 
     Raises
     ------
@@ -351,10 +353,10 @@ def read_part(
     """
     from graphnav.recording.formats import read
 
-    whole = read(source, topics, name=name)
+    whole = read(source, topics, allow_outside, name)
     part = _crop(whole, Request(source, (), start=start, end=end))
     zero = part.start - whole.start if part is not whole else 0.0
-    return _withhold(part, _move(withheld, zero), zero)[0]
+    return _withhold(part, _shift_spans(withheld, zero), zero)[0]
 
 
 @contextmanager
@@ -376,7 +378,7 @@ def _crop(whole: Recording, request: Request) -> Recording:
     return whole.crop(request.start, request.end)
 
 
-def _move(withheld: tuple[Withheld, ...], by: float) -> tuple[Withheld, ...]:
+def _shift_spans(withheld: tuple[Withheld, ...], by: float) -> tuple[Withheld, ...]:
     return tuple((source, span and (span[0] - by, span[1] - by)) for source, span in withheld)
 
 

@@ -33,7 +33,7 @@ class VehicleSettings(Outliers):
         (0.0, 0.0), description="deg, expected pitch and heading of the IMU against the vehicle"
     )
     mounting_sigma: float = Field(6.0, ge=0, description="deg, 1-sigma of those; 0 = exact, not estimated")
-    mounting_walk: float = Field(0.05, ge=0, description="deg in a minute, how they wander: load, wind, road crown")
+    mounting_walk: float = Field(0.05, ge=0, description="deg, 1-sigma change in a minute: load, wind, road crown")
     axle_sigma: float = Field(
         0.3, ge=0, description="m, 1-sigma of where along the vehicle the point lies that does not slip"
     )
@@ -41,7 +41,9 @@ class VehicleSettings(Outliers):
     body_sigma: float = Field(
         0.006, ge=0, description="rad per m/s^2, 1-sigma of side slip and squat; 0 = none, not estimated"
     )
-    scale_walk: float = Field(1e-4, ge=0, description="1 in a minute, how the odometer's scale wanders: tyres, load")
+    scale_walk: float = Field(
+        1e-4, ge=0, description="1, 1-sigma change of the odometer's scale in a minute: tyres, load"
+    )
 
 
 class FootSettings(Outliers):

@@ -81,7 +81,7 @@ class SolverSettings(Section):
     """Iterations of the batch solver, and lags of the incremental solvers."""
 
     lag: float = Field(
-        120.0, ge=1, description="s of future that a state has seen when the incremental solver lets it settle"
+        120.0, ge=1, description="s of later measurements that a state includes when the incremental solver settles it"
     )
     isam2_lag: float = Field(0.0, ge=0, description="s as `lag`, of the solver isam2; 0 smooths the whole drive")
     engine: Literal["window", "isam2"] = Field(

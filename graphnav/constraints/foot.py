@@ -175,7 +175,7 @@ class FootLateral(Constraint):
         # direction of the mean force of a swing
         swing = np.searchsorted(scene.stationary[:, 0], iv.t0[rows])
         lasts = np.bincount(swing, weights=iv.T[rows])[swing]
-        turned = np.abs(_turn(past, iv.T[rows], swing))[swing]
+        turned = np.abs(_compute_swing_turn(past, iv.T[rows], swing))[swing]
         sigma = s.sideways * (1.0 + turned / np.radians(s.turn)) * np.sqrt(np.maximum(1.0, lasts / iv.T[rows]))
         return cls(
             keyframe=rows + 1,
@@ -197,7 +197,7 @@ class FootLateral(Constraint):
         return Linearized(mv(axis, u), J, self.sigma[rows])
 
 
-def _turn(past: IntervalMotion, T: Array, swing: Array) -> Array:
+def _compute_swing_turn(past: IntervalMotion, T: Array, swing: Array) -> Array:
     """Angle (M,) by which the foot's heading changes in each swing, rad, from the rates of its intervals (N,)."""
     count = int(swing.max()) + 1 if len(swing) else 0
     total = np.zeros((count, 2, 3))

@@ -24,7 +24,7 @@ def select_observations(recording: Recording, settings: Settings) -> RawGnss | N
     if raw.catalogue is None:  # a piece of a series has the epoch before it as well, from which carriers change
         used &= (raw.t >= recording.start - SAME_TIME) & (raw.t <= recording.end + SAME_TIME)
     if s.period > 0.0 and used.any():
-        used &= np.isin(raw.t, _keep_apart(np.unique(raw.t[used]), s.period))
+        used &= np.isin(raw.t, _thin_times(np.unique(raw.t[used]), s.period))
     raw = raw.take(used)
     raw = raw.take(choose_primary(raw))
     return raw if len(raw) else None
@@ -36,7 +36,7 @@ def select_usable(raw: RawGnss, settings: RawGnssSettings) -> NDArray[np.bool_]:
     return used & np.isfinite(raw.difference) if raw.differenced else used
 
 
-def _keep_apart(t: Array, least: float) -> Array:
+def _thin_times(t: Array, least: float) -> Array:
     """Those of some times that are so far apart at least."""
     out = [float(t[0])]
     for x in t.tolist():

@@ -92,11 +92,11 @@ def describe_invalid(source: str | Path, error: ValidationError, model: type[Bas
     loc = tuple(str(part) for part in first["loc"])
     line = _find_line(text, loc)
     where = f"{source}, line {line}: " if line else f"{source}: "
-    described = _describe(first, loc, model)
+    described = _describe_error(first, loc, model)
     return Note(described.key, where + _LONG.sub(lambda word: f"{word[0][:_MAX_QUOTED]}...", described))
 
 
-def _describe(first: Any, loc: tuple[str, ...], model: type[BaseModel]) -> Note:
+def _describe_error(first: Any, loc: tuple[str, ...], model: type[BaseModel]) -> Note:
     key = ".".join(loc)
     if first["type"] == "extra_forbidden":
         return Note("key.unknown", f"unknown key '{key}'{_suggest(loc, model)}")

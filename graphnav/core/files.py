@@ -4,7 +4,7 @@ Anything wrong with a file (a pipe or device, damaged compression, more bytes th
 the error class that the caller names. The limits are the environment variables `GRAPHNAV_MAX_FILE_MB` and
 `GRAPHNAV_MAX_LINE_KB`; SECURITY.md states their defaults.
 
-Files named inside other files are read only from the folder of the naming file or below, unless `permit_outside`.
+Files named inside other files are read only from the folder of the naming file or below, unless `allow_outside`.
 """
 
 from __future__ import annotations
@@ -17,9 +17,7 @@ import math
 import os
 import stat
 import zlib
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
-from contextvars import ContextVar
+from collections.abc import Iterable
 from pathlib import Path
 from typing import IO, Any
 
@@ -34,29 +32,19 @@ _READ_SIZE = 1 << 16
 _GZIP = b"\x1f\x8b"
 
 Kind = type[GraphnavError]
-_outside: ContextVar[bool] = ContextVar("outside", default=False)
 
 
-@contextmanager
-def permit_outside(allowed: bool = True) -> Iterator[None]:
-    """Within this context, files named in other files may lie anywhere if `allowed`."""
-    before = _outside.set(allowed or _outside.get())
-    try:
-        yield
-    finally:
-        _outside.reset(before)
-
-
-def resolve_beside(source: Path, name: str, key: str, error: Kind = RecordingError) -> Path:
+def resolve_beside(source: Path, name: str, key: str, allow_outside: bool, error: Kind = RecordingError) -> Path:
     """The path of a file that is named in `source` under `key`.
 
     Raises
     ------
     GraphnavError
-        Of the kind given, if it lies outside the folder of `source`, symbolic links followed, or is no path at all.
+        Of the kind given, if it is no path at all, or lies outside the folder of `source`, symbolic links followed, and
+        may not.
     """
     path = source.parent / name
-    if not is_inside(path, source.parent, error):
+    if not is_inside(path, source.parent, error) and not allow_outside:
         raise error(
             f"{source}: '{key}' names a file outside the folder that it lies in; move it there, or say --allow-outside "
             "if you trust who wrote this",
@@ -67,9 +55,9 @@ def resolve_beside(source: Path, name: str, key: str, error: Kind = RecordingErr
 
 
 def is_inside(path: Path, folder: Path, error: Kind = RecordingError) -> bool:
-    """Whether a path named by a file in `folder` may be read."""
+    """Whether a path lies in a folder or below it, symbolic links followed."""
     try:
-        return _outside.get() or path.resolve().is_relative_to(folder.resolve())
+        return path.resolve().is_relative_to(folder.resolve())
     except (OSError, ValueError, RuntimeError):  # too long, a null character, or a loop of links
         raise error(f"{_shorten(path)}: is no path of a file", key="file.name") from None
 

@@ -87,7 +87,7 @@ def parse_clock(text: str, t: float) -> float:
 
 
 def find_restarts(t: Array, unit: float = 1.0) -> Array | None:
-    """What is to be added to the stamps of a clock that starts again from 0 after a day, a GPS week or 2^32 counts.
+    """What is to be added to the stamps of a clock that restarts at 0 after a day, a GPS week or 2^32 counts.
 
     Parameters
     ----------

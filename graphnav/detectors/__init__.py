@@ -86,7 +86,7 @@ def detect(recording: Recording, settings: Settings | None = None, since: float 
             (),
             (*d.notes, Note("detectors.too_slow", f"no detection: an IMU at {1.0 / scene.period:.3g} Hz is too slow")),
         )
-    found = _decide(scene)
+    found = _decide_stops(scene)
     reference = found.found[0]
     mask = mask_inside(reference.t, found.spans)
     answer = Detection(
@@ -96,7 +96,7 @@ def detect(recording: Recording, settings: Settings | None = None, since: float 
     return Detections(found.spans, (*found.found, answer), (*d.notes, *found.notes))
 
 
-def _decide(scene: Scene, shown: bool = True) -> StopDecision:
+def _decide_stops(scene: Scene, shown: bool = True) -> StopDecision:
     """The decision of the detectors that fire."""
     if scene.settings.fire == (FUSED,):
         found = [decide_fused(scene, list_detectors(), shown)]
@@ -157,5 +157,5 @@ def find_stops(
             until = max(min(until, float(one.t[-1]) - one.half), since)
     if not len(scene.low.t):
         return NONE
-    spans = np.clip(_decide(scene, shown=False).spans, since, until)
+    spans = np.clip(_decide_stops(scene, shown=False).spans, since, until)
     return np.asarray(spans[spans[:, 1] > spans[:, 0]])

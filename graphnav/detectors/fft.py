@@ -96,7 +96,7 @@ def _detect(scene: Scene, labels: Labels | None, shown: bool) -> Detection:
     quotient = _compute_quotients(height, settings)
     asked: Mask = np.asarray(np.isfinite(quotient).any(axis=0))
     if line is not None:
-        notes.append(Note("detectors.fft.line", _describe(line)))
+        notes.append(Note("detectors.fft.line", _describe_idling(line)))
         idling = inner & _detect_line(height, where, line)
         met = np.asarray((quotient[idling] < 1.0).mean(axis=0) >= _MET) if idling.any() else asked
         if labels is None:
@@ -139,7 +139,7 @@ def _weigh_idling(w: Windows, settings: FftSettings) -> Array:
     their amplitude there, the lower one.
     """
     height = _measure(w, [(0.0, LOWEST)])[0][:, :, 0]
-    x = log_statistic((height / _find_limits(settings)).max(axis=1))
+    x = log_statistic((height / _list_peak_limits(settings)).max(axis=1))
     split = find_valley(x, float(np.nanmin(x)), 0.0, FEWEST_WINDOWS)
     return np.asarray(10.0 ** (x - (0.0 if split is None else split)))
 
@@ -196,7 +196,7 @@ def _measure(w: Windows, bands: Sequence[tuple[float, float]]) -> tuple[Array, A
 
 def _compute_quotients(height: Array, settings: FftSettings) -> Array:
     """(W, 8) in the order of `CONDITIONS`: all below 1 means stationary, NaN where a peak cannot be observed."""
-    limit = _find_limits(settings)
+    limit = _list_peak_limits(settings)
     # fmax ignores a peak that cannot be observed
     size = np.fmax(np.fmax(height[..., 0], height[..., 1]), height[..., 2]) / limit
     peak0 = height[:, :, 0]
@@ -205,7 +205,7 @@ def _compute_quotients(height: Array, settings: FftSettings) -> Array:
     return np.column_stack([size, *ratios])
 
 
-def _find_limits(settings: FftSettings) -> Array:
+def _list_peak_limits(settings: FftSettings) -> Array:
     """(3,) m/s^2, m/s^2, rad/s: upper limits for the peaks of forward force, up force and pitch rate."""
     return np.array([settings.force_limit * MG, settings.force_limit * MG, np.radians(settings.rate_limit)])
 
@@ -224,7 +224,7 @@ def _divide_speed(t: Array, settings: FftSettings, speeds: Sequence[Speeds]) -> 
     return out
 
 
-def _describe(line: IdleLine) -> str:
+def _describe_idling(line: IdleLine) -> str:
     drift = "" if line.highest - line.lowest < 0.5 else f" (from {line.lowest:.1f} to {line.highest:.1f})"
     if np.isnan(line.harmonic):
         second = "its second harmonic lies above half the IMU's rate"

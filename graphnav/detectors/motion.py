@@ -67,7 +67,7 @@ def collect_speeds(recording: Recording, settings: FusionSettings) -> list[Speed
     if recording.odometer is not None and len(recording.odometer.t) > 2:
         found.append(_read_odometer(recording.odometer, settings))
     if recording.gnss is not None and len(recording.gnss.t) > 2:
-        found += _read_gnss(recording.gnss, settings)
+        found += _list_fix_speeds(recording.gnss, settings)
     return [s for s in found if len(s.t) >= _MEDIAN]
 
 
@@ -111,7 +111,7 @@ def _read_odometer(o: Odometer, settings: FusionSettings) -> Speeds:
     return Speeds(o.t, o.speed[:, None], np.full(len(o.t), limit), settings.odometer_delay)
 
 
-def _read_gnss(gnss: Gnss, settings: FusionSettings) -> list[Speeds]:
+def _list_fix_speeds(gnss: Gnss, settings: FusionSettings) -> list[Speeds]:
     found = []
     if gnss.v is not None:
         there = np.isfinite(gnss.v[:, :2]).all(axis=1)

@@ -145,7 +145,9 @@ def read_against(asked: Against, name: str, recording: Recording, reference: Sol
     if np.any(arm):
         track = interpolate(track, track.t, max_gap=_MAX_GAP, lever_arm=-arm)[0]
         notes.append(
-            Note("against.point", f"{asked.path.name}: moved to the IMU from [{_show(arm)}] m (right, forward, up)")
+            Note(
+                "against.point", f"{asked.path.name}: moved to the IMU from [{_format_arm(arm)}] m (right, forward, up)"
+            )
         )
     notes += _find_other_point(asked.path, track, arm, find_antenna_lever_arm(recording, reference), reference)
     track = replace(track, name=name)
@@ -271,10 +273,10 @@ def _find_other_point(
         # a stationary vehicle adds little
         return float(np.mean(np.linalg.norm(left - np.median(left, axis=0), axis=1)))
 
-    points = {f"[{_show(-arm)}] m, the arm with the other signs": -arm, "the IMU": np.zeros(3)}
+    points = {f"[{_format_arm(-arm)}] m, the arm with the other signs": -arm, "the IMU": np.zeros(3)}
     if antenna is not None:
         points["the antenna"] = antenna
-        points[f"[{_show(-antenna)}] m, the antenna's arm with the other signs"] = -antenna
+        points[f"[{_format_arm(-antenna)}] m, the antenna's arm with the other signs"] = -antenna
     misses = {name: miss(point) for name, point in points.items()}
     best = min(misses, key=lambda name: misses[name])
     if not misses[best] < _MENDED * miss(arm):
@@ -288,7 +290,7 @@ def _find_other_point(
     ]
 
 
-def _show(arm: Array) -> str:
+def _format_arm(arm: Array) -> str:
     return ", ".join(f"{x:.2f}" for x in arm)
 
 

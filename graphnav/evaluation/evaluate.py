@@ -229,6 +229,7 @@ def evaluate(
     lever_arm: Array | None = None,
     spans: Sequence[tuple[float, float]] = (),
     max_gap: float = MAX_GAP,
+    allow_outside: bool = False,
 ) -> Metrics:
     """Metrics of one file against another, each of any kind that `read_trajectory` reads.
 
@@ -244,6 +245,8 @@ def evaluate(
         s on the files' clock, each scored separately.
     max_gap
         s, longest gap between rows that is interpolated.
+    allow_outside
+        Whether files that a recording names may lie outside its folder.
 
     Returns
     -------
@@ -261,7 +264,7 @@ def evaluate(
     if truth_path.is_dir() or truth_path.suffix == ".toml":
         from graphnav.recording import formats
 
-        recording = formats.read(truth_path)
+        recording = formats.read(truth_path, allow_outside=allow_outside)
         trajectory, notes = _put_on_clock(trajectory, recording.start, recording.end, recording.gps_zero)
         found = find_truth(recording)
         if found is None:

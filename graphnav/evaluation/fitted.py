@@ -44,7 +44,7 @@ def propagate_fit(cov: Array, p: Array, v: Array | None) -> tuple[Array, float]:
     n = len(p)
     v = np.zeros((n, 3)) if v is None else np.nan_to_num(v)
     a = p - p.mean(axis=0)
-    turned, turned_v = _rotate(a), _rotate(v)
+    turned, turned_v = _rotate_quarter(a), _rotate_quarter(v)
     size = float(np.sum(a[:, :2] ** 2))
     G = np.zeros((n, 4, 3))
     G[:, :3] = np.eye(3) / n
@@ -87,7 +87,7 @@ def _propagate_dead_reckoning(X: Array, turned: Array) -> Array:
     return out
 
 
-def _rotate(x: Array) -> Array:
+def _rotate_quarter(x: Array) -> Array:
     """(N, 3) rotated anticlockwise by a quarter turn in the horizontal plane."""
     return np.column_stack([-x[:, 1], x[:, 0], np.zeros(len(x))])
 

@@ -84,7 +84,7 @@ def compute_errors(
     fitted = "local" in (trajectory.frame, truth.frame)
     from_start = fitted and (trajectory.frame == "local" if from_start is None else from_start)
     if trajectory.frame == "local" or truth.frame == "local":
-        trajectory, truth = _fit(trajectory, truth, lever_arm, max_gap, at, notes)
+        trajectory, truth = _fit_frames(trajectory, truth, lever_arm, max_gap, at, notes)
     estimate, seen, travel, epochs = _pair_epochs(trajectory, truth, lever_arm, max_gap, at)
     if measure_spacing(truth.t) < measure_spacing(trajectory.t) if at is None else _are_between(seen.t, truth.t):
         notes.append(
@@ -170,7 +170,7 @@ def measure_distance(t: Array, llh: Array) -> Array:
     return np.interp(t, t[knots], np.concatenate([[0.0], np.cumsum(np.sqrt(np.maximum(steps, 0.0)))]))
 
 
-def _fit(
+def _fit_frames(
     trajectory: Trajectory,
     truth: Trajectory,
     lever_arm: Array | None,

@@ -88,7 +88,7 @@ def walk_errors(recording: Recording, solution: Solution, truth_sigma: float = 0
     q = p if X.shape[1] == 2 else p + states.R_nb @ arm
     at_start = q[0] if X.shape[1] == 2 else q[t <= t[0] + _INITIAL_STANCE].mean(axis=0)
     a, b = X[:, :2] - first[:2], (q - at_start)[:, :2]
-    anchored = _rotate(a, float(np.arctan2(np.sum(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]), np.sum(a * b))))
+    anchored = _rotate_by_yaw(a, float(np.arctan2(np.sum(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]), np.sum(a * b))))
     e = b - anchored
     R = truth_sigma**2
     nees_h = 0.5 * np.einsum("ni,nij,nj->n", e, np.linalg.inv(P[:, :2, :2] + R * np.eye(2)), e)
@@ -140,7 +140,7 @@ def _find_stances(solution: Solution) -> Array:
 def _compare_shape(p: Array, truth: Array) -> float:
     flat = truth * [1.0, 1.0, 0.0]
     yaw, offset = fit_yaw(flat, p * [1.0, 1.0, 0.0])
-    return float(np.sqrt(np.mean(np.sum((p[:, :2] - _rotate(flat[:, :2], yaw) - offset[:2]) ** 2, axis=1))))
+    return float(np.sqrt(np.mean(np.sum((p[:, :2] - _rotate_by_yaw(flat[:, :2], yaw) - offset[:2]) ** 2, axis=1))))
 
 
 def fit_point(states: States, flat: Array) -> tuple[float, Array]:
@@ -150,11 +150,11 @@ def fit_point(states: States, flat: Array) -> tuple[float, Array]:
     for _ in range(_FIT_ITERATIONS):
         p = np.column_stack([states.p[:, :2] + level @ arm, np.zeros(len(flat))])
         yaw, offset = fit_yaw(flat, p)
-        e = p[:, :2] - (_rotate(flat[:, :2], yaw) + offset[:2])
+        e = p[:, :2] - (_rotate_by_yaw(flat[:, :2], yaw) + offset[:2])
         arm = arm - np.linalg.lstsq((level - level.mean(axis=0)).reshape(-1, 3), e.ravel(), rcond=1e-3)[0]
     return float(np.sqrt(np.mean(np.sum(e**2, axis=1)))), arm
 
 
-def _rotate(x: Array, yaw: float) -> Array:
+def _rotate_by_yaw(x: Array, yaw: float) -> Array:
     c, s = np.cos(yaw), np.sin(yaw)
     return x @ np.array([[c, s], [-s, c]])

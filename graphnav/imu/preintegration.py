@@ -207,7 +207,7 @@ def _multiply_cross(a: Array, b: Array) -> Array:
     return out
 
 
-def _rotate(R: Array, x: Array) -> Array:
+def _multiply(R: Array, x: Array) -> Array:
     """Matrix times vector, (L, 3, 3, n) and (L, 3, n)."""
     return R[:, :, 0] * x[:, None, 0] + R[:, :, 1] * x[:, None, 1] + R[:, :, 2] * x[:, None, 2]
 
@@ -230,8 +230,8 @@ def _integrate_pieces(w: Array, f: Array, dt: Array) -> tuple[Array, Array, Arra
     R = np.ascontiguousarray(_multiply_up(turn).transpose(0, 2, 3, 1))
     one = _multiply_cross(phi, f)
     two = _multiply_cross(phi, one)
-    V = sum_running(_rotate(R[:-1], (f + b * one + c * two) * h))
-    P = sum_running(V[:-1] * h + _rotate(R[:-1], (0.5 * f + c * one + d * two) * (h * h)))
+    V = sum_running(_multiply(R[:-1], (f + b * one + c * two) * h))
+    P = sum_running(V[:-1] * h + _multiply(R[:-1], (0.5 * f + c * one + d * two) * (h * h)))
     return R, V, P
 
 

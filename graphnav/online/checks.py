@@ -20,7 +20,7 @@ _CAUSES = {
     "too late": "are all times in s, and of one clock?",
     "beyond any sensor": "are rates in rad/s, forces in m/s^2, speeds in m/s?",
     "not a number": "are all fields there, and the sigmas above zero?",
-    "a sigma that says nothing": "are the sigmas in m, and standard deviations?",
+    "a sigma too large to carry information": "are the sigmas in m, and standard deviations?",
     "out of reach": "are they of one place, and latitude and longitude in their order?",
 }
 

@@ -86,7 +86,7 @@ def answer(asked: Question) -> Answer:
             asked.recording, settings, asked.frame, start.state, start_sigma(start), stationary, asked.times,
             parts_of_noise=True,
         )  # fmt: skip
-        base = _level(base)
+        base = _share_horizontal_unit(base)
         estimate = estimate_noise if settings.gnss.faults == "off" else estimate_without_faults
         noise = estimate(base, start.until).noise
         used = apply_noise(base, noise)
@@ -133,7 +133,7 @@ def _start(work: Callable[[Question], Answer], asked: Question) -> Future[Answer
     return out
 
 
-def _level(base: Problem) -> Problem:
+def _share_horizontal_unit(base: Problem) -> Problem:
     """The problem with a common unit of both horizontal axes for errors that last for minutes and hours."""
     rows = (
         replace(c, drive_error=compute_unit(c.sigma)) if isinstance(c, GnssPosition) else c for c in base.constraints

@@ -127,7 +127,7 @@ class Readings:
             every = sensors.make_recording().odometer
             assert every is not None
             before, self.figures, self._told, lag = self.figures, ReadingStatistics.of(every), self._moving, None
-            self.revised |= before is not None and _differ(before.list_sigmas(o), self.figures.list_sigmas(o))
+            self.revised |= before is not None and _sigmas_differ(before.list_sigmas(o), self.figures.list_sigmas(o))
         seen, known = find_wrong_readings(recording.odometer, recording.imu, self.figures, lag), self.wrong
         found, self._lag = seen.spans, seen.lag
         since = float(recording.odometer.t[0]) + (0.0 if whole else 5.0)
@@ -137,7 +137,7 @@ class Readings:
         return float(new[0, 0]) if len(new) else np.inf
 
 
-def _differ(before: tuple[float, ...], now: tuple[float, ...]) -> bool:
+def _sigmas_differ(before: tuple[float, ...], now: tuple[float, ...]) -> bool:
     """Whether sigmas differ clearly."""
     return any(abs(a - b) > _CLEAR_CHANGE * max(a, b) for a, b in zip(before, now, strict=True))
 

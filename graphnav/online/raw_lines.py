@@ -97,7 +97,7 @@ def parse_epoch(text: str) -> tuple[float, ...]:
         In a few words, if it is none.
     """
     first, *satellites = text.split(";")
-    own = _parse_numbers(first, 5, "place and clock")
+    own = _parse_cells(first, 5, "place and clock")
     out: list[float] = []
     for one in satellites:
         name, signal, *rest = one.split(",", 2)
@@ -105,7 +105,7 @@ def parse_epoch(text: str) -> tuple[float, ...]:
             ids = [number_satellite(name), _check_signal(name[0], signal)]
         except (ValueError, IndexError):
             raise ValueError(f"'{one[:12]}' begins with no satellite and signal") from None
-        out += [*ids, *_parse_numbers("".join(rest), WIDTH - 7, name), *own]
+        out += [*ids, *_parse_cells("".join(rest), WIDTH - 7, name), *own]
     return tuple(out)
 
 
@@ -142,7 +142,7 @@ def _format_cells(numbers: list[float]) -> str:
     return ",".join("" if np.isnan(x) else repr(x) for x in numbers)
 
 
-def _parse_numbers(text: str, count: int, what: str) -> list[float]:
+def _parse_cells(text: str, count: int, what: str) -> list[float]:
     cells = text.split(",")
     if len(cells) != count:
         raise ValueError(f"{what}: needs {count} numbers, not {len(cells)}")

@@ -66,7 +66,7 @@ def find_fix_fault(values: tuple[float, ...]) -> str | None:
     if not is_on_earth(lat, lon, h)[0] or values[0] == values[1] == 0.0:  # sent by receivers without a fix
         return "nowhere on Earth"
     if not all(_LEAST_SIGMA_LIVE <= sd <= VAGUEST for sd in values[3:6]):
-        return "a sigma that says nothing"
+        return "a sigma too large to carry information"
     return None
 
 

@@ -290,7 +290,7 @@ class Smoother:
         try:
             found = judgement.answer()
         except Exception as error:
-            self.notes.append(Note("online.not_judged", f"noise and faults not estimated again: {error}"))
+            self.notes.append(Note("online.not_judged", f"noise and faults not re-estimated: {error}"))
             self._tentative = False
             return
         self._replace_notes("noise", found.notes)

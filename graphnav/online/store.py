@@ -76,8 +76,8 @@ class Store:
         self.resumed: Checkpoint | None = None
         if resume:
             if not path.exists():
-                raise ConfigError(f"--resume: {folder} holds no checkpoint to go on from", key="checkpoint.none")
-            self.resumed = _read(path)
+                raise ConfigError(f"--resume: {folder} holds no checkpoint to continue from", key="checkpoint.none")
+            self.resumed = _read_checkpoint(path)
             if self.resumed.source != source:
                 raise ConfigError(
                     f"--resume: {folder} was made from '{self.resumed.source}', not from '{source}'",
@@ -103,7 +103,7 @@ class Store:
             self._file = path.open("r+b" if path.exists() else "w+b", buffering=0)
             if self._file.seek(0, os.SEEK_END) < self._length:
                 raise ConfigError(
-                    f"--resume: {path} is shorter than its checkpoint knows it", key="checkpoint.journal_short"
+                    f"--resume: {path} is shorter than its checkpoint states", key="checkpoint.journal_short"
                 )
             self._file.truncate(self._length)
             self._file.seek(self._length)
@@ -210,9 +210,9 @@ class Store:
                     mend()
             started = (self.folder / CHECKPOINT).exists()
             how = (
-                "what had settled is safe, mend that and go on with --resume"
+                "what had settled is safe; remove the cause and continue with --resume"
                 if started
-                else "mend that and begin again"
+                else "remove the cause and start again"
             )
             raise GraphnavError(
                 f"{self.folder}: cannot be written ({error.strerror}); {how}", key="output.cannot_write"
@@ -230,7 +230,7 @@ class _Digested:
         return self._file.write(data)
 
 
-def _read(path: Path) -> Checkpoint:
+def _read_checkpoint(path: Path) -> Checkpoint:
     found = None
     with path.open("rb") as file:
         magic, told = file.read(len(_MAGIC)), file.read(_DIGEST().digest_size)

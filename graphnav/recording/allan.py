@@ -100,7 +100,7 @@ def compute_allan(t: Array, gyro: Array, accel: Array) -> Allan:
     m = list_averaging(len(t))
     tau = m * period
     devs = [compute_deviations(x, period, m) for x in (gyro, accel)]
-    noises = [_fit(tau, d, len(t)) for d in devs]
+    noises = [_fit_figures(tau, d, len(t)) for d in devs]
     return Allan(tau, devs[0], devs[1], noises[0], noises[1], duration, 1.0 / period)
 
 
@@ -134,7 +134,7 @@ def compute_deviations(x: Array, period: float, m: Array) -> Array:
     return out
 
 
-def _fit(tau: Array, deviation: Array, count: int) -> AllanFigures:
+def _fit_figures(tau: Array, deviation: Array, count: int) -> AllanFigures:
     """N, B and K of each axis."""
     from scipy.optimize import nnls
 

@@ -29,7 +29,7 @@ class Consistency:
     def verdict(self) -> Note:
         """One sentence on the consistency of sigma."""
         if self.count - self.rejected < 10 or not np.isfinite(self.mean_nis):
-            return Note("consistency.few", "too few to judge")
+            return Note("consistency.few", "too few to assess")
         ratio = self.mean_nis / self.dof
         if self.kind == "residual":
             # a fit absorbs part of the noise, so a smoother's residuals may be below their sigma, never above

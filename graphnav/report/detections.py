@@ -45,7 +45,7 @@ def _make_page(recording: Recording, found: Detections) -> str:
         ]
         for (a, b), stop in zip(spans, list_stops(found.all), strict=True)
     ]
-    lead = [page.paragraph(line) for line in _describe(recording, found)]
+    lead = [page.paragraph(line) for line in _list_figures(recording, found)]
     sections = [
         ("Statistics", [page.gallery(report_pictures.draw_detections(recording, found.all))]),
         ("Stationary intervals", [page.make_table(["from", "to", "for", "share by detector"], rows)] if rows else []),
@@ -100,7 +100,7 @@ def list_values(recording: Recording, found: Detections) -> dict[str, Any]:
 def format_found(recording: Recording, found: Detections, files: list[Path]) -> str:
     """Stops, seconds, the idle line or why there is none, and the files written."""
     spans = found.stationary - recording.start
-    first, stops, each = _describe(recording, found)
+    first, stops, each = _list_figures(recording, found)
     lines = [first, f"  {stops}"]
     lines += [f"    {a:9.2f} - {b:9.2f}  {b - a:8.2f} s" for a, b in spans[:_MAX_STOPS]]
     if len(spans) > _MAX_STOPS:
@@ -110,7 +110,7 @@ def format_found(recording: Recording, found: Detections, files: list[Path]) -> 
     return "\n".join([*lines, "", "look at", *(f"  {file}" for file in files)])
 
 
-def _describe(recording: Recording, found: Detections) -> tuple[str, str, str]:
+def _list_figures(recording: Recording, found: Detections) -> tuple[str, str, str]:
     """What was examined, the stationary share, and the notes of each detector."""
     spans = found.stationary
     seconds = float(np.diff(spans).sum()) if len(spans) else 0.0

@@ -153,7 +153,7 @@ def write_report(
     ]
     lead = [
         *([] if contradicted is None else [page.paragraph(contradicted, "verdict bad")]),
-        *_list_doubts(defects, only, every),
+        *_list_reasons(defects, only, every),
         page.paragraph(words.describe_run(recording, only, withheld, outages)),
         summary.tabulate_verdicts(solution, errors),
         *words.describe_closure(name, metrics),
@@ -163,7 +163,7 @@ def write_report(
         page.columns([summary.tabulate_sigmas(solution), summary.tabulate_separation(solution)]),
         *summary.describe_excluded(solution, start),
     ]
-    return _write(
+    return _write_html(
         path, page.make_page(f"{recording.name}: {name}", lead, sections, _list_clocks(recording), _list_others(only))
     )
 
@@ -230,7 +230,7 @@ def write_comparison(
         ("Provenance", tabulate_provenance(settings, provenance)),
     ]
     lead = [
-        *_list_doubts(defects, solutions, every),
+        *_list_reasons(defects, solutions, every),
         page.paragraph(words.describe_run(recording, solutions, withheld, outages)),
         *_describe_verdicts(solutions, every),
         *(note for name, values in metrics_of.items() for note in words.describe_closure(name, values)),
@@ -240,7 +240,7 @@ def write_comparison(
     html = page.make_page(
         f"{recording.name}: comparison", lead, sections, _list_clocks(recording), _list_others(solutions)
     )
-    return _write(path, html)
+    return _write_html(path, html)
 
 
 def draw_detectors(recording: Recording, solution: Solution) -> list[Markup]:
@@ -270,7 +270,7 @@ def _list_shades(solution: Solution, start: float, withheld: Removed, outages: T
     return {"withheld": gone, "no GNSS": list(outages), "excluded": excluded}
 
 
-def _list_doubts(
+def _list_reasons(
     defects: Sequence[str], solutions: Mapping[str, Solution], errors: Mapping[str, Errors]
 ) -> list[Markup]:
     """Reasons why the result cannot be trusted, if any."""
@@ -303,7 +303,7 @@ def _fold(title: str, parts: Sequence[Markup]) -> list[Markup]:
     return [page.fold(title, parts)] if parts else []
 
 
-def _write(path: str | Path, html: str) -> Path:
+def _write_html(path: str | Path, html: str) -> Path:
     path = Path(path)
     path.write_text(html, encoding="utf-8")
     return path

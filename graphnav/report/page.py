@@ -93,7 +93,7 @@ def place_picture(figure: Figure, title: str, note: str = "", kind: str = "") ->
     ----------
     kind : "large" takes the whole width; empty shares the width with others.
     """
-    return _PARTS.picture(figure, title, _pack(json.dumps(figure.json, separators=(",", ":")).encode()), note, kind)
+    return _PARTS.picture(figure, title, _compress(json.dumps(figure.json, separators=(",", ":")).encode()), note, kind)
 
 
 @dataclass(frozen=True)
@@ -126,11 +126,11 @@ def make_page(
     return _TEMPLATES.get_template("page.html").render(
         title=title, lead=lead, sections=sections, clocks=clocks, time=TIME_NAME,
         library=_read_library() if drawn else None,
-        style=Markup(format_css(others) + _read("page.css")), script=Markup(_read("page.js")),
+        style=Markup(format_css(others) + _read_asset("page.css")), script=Markup(_read_asset("page.js")),
     )  # fmt: skip
 
 
-def _read(name: str) -> str:
+def _read_asset(name: str) -> str:
     return (_HERE / name).read_text(encoding="utf-8")
 
 
@@ -149,8 +149,8 @@ def _read_library() -> Packed:
         raise ConfigError(
             "a page needs plotly, which is not installed; pip install -e . in the clone", key="package.missing"
         )
-    return _pack((Path(found.origin).parent / "package_data" / "plotly.min.js").read_bytes())
+    return _compress((Path(found.origin).parent / "package_data" / "plotly.min.js").read_bytes())
 
 
-def _pack(content: bytes) -> Packed:
+def _compress(content: bytes) -> Packed:
     return Packed(len(content), Markup(base64.b64encode(zlib.compress(content, _ZLIB_LEVEL)).decode("ascii")))

@@ -230,7 +230,7 @@ def draw_motion(recording: Recording, solutions: Mapping[str, Solution], spans: 
     place = {name: Curve(s.t - start, s.states.p + base, tracks[name].sd_p) for name, s in solutions.items()}
     speed = {name: Curve(t.t - start, t.v, t.sd_v) for name, t in tracks.items() if t.v is not None}
     turned = {
-        name: Curve(t.t - start, _unwrap(t.rph), None if t.sd_rph is None else TO_DEG * t.sd_rph)
+        name: Curve(t.t - start, _convert_angles(t.rph), None if t.sd_rph is None else TO_DEG * t.sd_rph)
         for name, t in tracks.items() if t.rph is not None
     }  # fmt: skip
     out = []
@@ -243,7 +243,7 @@ def draw_motion(recording: Recording, solutions: Mapping[str, Solution], spans: 
             figure = plots.plot_bands(series, parts, unit, end, spans=spans, about_zero=False, under=under)
             note = ""
             if title == "Attitude" and any(np.nanmax(s.value[:, 2], initial=0.0) > 360.0 for s in series.values()):
-                note = "The heading goes on beyond 360 deg, turn by turn."
+                note = "The heading is continued beyond 360 deg."
             out.append(page.place_picture(figure, f"{title} and 3 sigma" if len(series) < 3 else title, note))
     return out
 
@@ -282,7 +282,7 @@ def draw_quality(recording: Recording, solution: Solution, spans: Shades) -> lis
     return [page.place_picture(figure, "Fixes: stated accuracy" + (" and satellites" if seen else ""))]
 
 
-def _unwrap(rph: Array) -> Array:
+def _convert_angles(rph: Array) -> Array:
     """Roll, pitch, heading (N, 3) in deg; the heading starts within 0 to 360 and has no jumps."""
     out = np.degrees(rph)
     known = np.isfinite(out[:, 2])

@@ -58,7 +58,7 @@ def format_command(options: Mapping[str, Any], settings: bool = True) -> str:
 
 def format_toml(values: Mapping[str, Any], table: str = "") -> str:
     """Nested plain values as TOML; None is omitted, as TOML cannot express it."""
-    plain = [f"{key} = {_format_value(value)}" for key, value in values.items()
+    plain = [f"{key} = {_format_toml(value)}" for key, value in values.items()
              if value is not None and not isinstance(value, Mapping)]  # fmt: skip
     head = [f"[{table}]"] if table and (plain or not values) else []
     parts = ["\n".join([*head, *plain])] if head or plain else []
@@ -68,8 +68,8 @@ def format_toml(values: Mapping[str, Any], table: str = "") -> str:
     return "\n\n".join(part for part in parts if part) + "\n" if any(parts) else ""
 
 
-def _format_value(value: Any) -> str:
+def _format_toml(value: Any) -> str:
     if isinstance(value, list | tuple):
-        return f"[{', '.join(_format_value(one) for one in value)}]"
+        return f"[{', '.join(_format_toml(one) for one in value)}]"
     # JSON's numbers, booleans and strings are valid TOML
     return json.dumps(value, ensure_ascii=False)

@@ -112,7 +112,7 @@ def describe_sigma(name: str, errors: Errors) -> Markup:
 
     verdicts = judge_sigmas(errors)
     if not verdicts:
-        words = f"{name}: no epoch has both an error and a sigma, so sigma cannot be judged."
+        words = f"{name}: no epoch has both an error and a sigma, so sigma cannot be assessed."
         return page.paragraph(Note("sigma.not_judged", words), "verdict")
     worst = select_verdict(verdicts, "too small") or select_verdict(verdicts, "unclear")
     shown = worst or verdicts
@@ -129,13 +129,13 @@ def describe_sigma(name: str, errors: Errors) -> Markup:
     if worst:
         alike = join_words([format_count(round(j.effective), "independent value") for j in worst])
         words = (
-            f"{name}: whether sigma of {blocks} is consistent cannot be told: {measured}, but the errors are "
+            f"{name}: whether sigma of {blocks} is consistent cannot be decided: {measured}, but the errors are "
             f"correlated for so long that they amount to {alike}."
         )
         return page.paragraph(Note("sigma.unclear", words), "verdict")
     seen = {j.block for j in verdicts}
     unseen = [what for what in ("position", "velocity", "attitude") if what not in seen]
-    rest = f" Not judged: {join_words(unseen)}." if unseen else ""
+    rest = f" Not assessed: {join_words(unseen)}." if unseen else ""
     if all(j.verdict == "cautious" for j in verdicts):
         return page.paragraph(
             Note("sigma.cautious", f"{name}: the stated sigma is cautious: {measured}.{rest}"), "verdict"
@@ -150,7 +150,7 @@ def describe_sigma_without_truth(solution: Solution) -> Markup:
     missing = f"{solution.solver}: there is no truth to compare with"
     larger, mark = size > TOO_LARGE[kind], ""
     if used < FEWEST_ROWS:
-        note = Note("no_truth.few", f"{missing}, and there are too few measurements to judge sigma.")
+        note = Note("no_truth.few", f"{missing}, and there are too few measurements to assess sigma.")
     elif kind == "innovation":
         measured = f"they are {size:.2f} times as large as predicted (RMS; 1 where sigma is true)"
         if larger:

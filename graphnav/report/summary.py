@@ -48,7 +48,7 @@ def tabulate_verdicts(solution: Solution, errors: Errors | None) -> Markup:
         kind = "bad" if errors is None else kind.replace("good", "")
         words += f"; forward filter and later measurements are {apart.size:.1f} sigma apart (rms, {apart.block})"
         found["position"] = kind, words
-    nothing = ("", "nothing is there to judge it by")
+    nothing = ("", "there is nothing to assess it by")
     return page.verdicts(
         [(kind, block.capitalize(), words) for block in _SHOWS for kind, words in [found.get(block, nothing)]]
     )

@@ -154,7 +154,7 @@ def walk(steps: Footprints, style: Style, sole: Sole, end: float, rng: np.random
     return Foot(make_spline(0.0, GAIT_STEP, x, GAIT_DEGREE), 0.0, end, np.column_stack([strike, off]), stances)
 
 
-def _smooth(t: Array, knots: list[Array], values: list[Array]) -> Array:
+def _interpolate_stride(t: Array, knots: list[Array], values: list[Array]) -> Array:
     """A smooth curve through values (K, ...) at times (K, ...), each list in order of time within a stride."""
     at = np.concatenate([np.ravel(x) for x in knots])
     order = np.argsort(at, kind="stable")
@@ -178,7 +178,7 @@ def _make_pitch(t: Array, steps: Footprints, begins: Array, ends: Array, style: 
     # at rest, level except for the compression of the sole
     knots += [np.array([-1.0, begins[0] + 0.35 * D[0]]), np.array([begins[-1] + 0.4 * D[-1], steps.off[-1] + 1.0])]
     values += [np.full(2, -0.3), np.full(2, -0.3)]
-    return np.deg2rad(_smooth(t, knots, values))
+    return np.deg2rad(_interpolate_stride(t, knots, values))
 
 
 def _make_heading(t: Array, steps: Footprints, begins: Array, style: Style, vary: Array) -> Array:
@@ -190,7 +190,7 @@ def _make_heading(t: Array, steps: Footprints, begins: Array, style: Style, vary
     values = [steps.land[1:], steps.land[:-1], steps.leave[:-1], middle]
     knots += [np.array([-1.0, 0.0]), np.array([steps.strike[-1] + 0.1, steps.off[-1] + 1.0])]
     values += [np.full(2, steps.land[0]), np.full(2, steps.land[-1])]
-    return _smooth(t, knots, values)
+    return _interpolate_stride(t, knots, values)
 
 
 def _make_roll(t: Array, steps: Footprints, begins: Array, style: Style, vary: Array) -> Array:
@@ -202,7 +202,7 @@ def _make_roll(t: Array, steps: Footprints, begins: Array, style: Style, vary: A
     values = [3.0 * vary[1:, 9], 0.4 * (vary[rows, 10] - 1.0) / 0.06, 0.2 * vary[rows, 10], -3.0 * vary[rows, 9]]
     knots += [steps.off[:-1] + 0.45 * S, np.array([-1.0, 0.0]), np.array([steps.strike[-1] + 0.15, t[-1]])]
     values += [style.swing_roll * vary[:-1, 10], np.zeros(2), np.zeros(2)]
-    return np.deg2rad(_smooth(t, knots, values))
+    return np.deg2rad(_interpolate_stride(t, knots, values))
 
 
 # Bernstein coefficients of the slide's speed: it takes over from the rolling and has nearly ended before the strike

@@ -171,7 +171,7 @@ def move_vehicle(path: Path, origin: tuple[float, float, float], mount: Mount, s
     llh, v, R_lb = np.empty_like(axle), np.empty_like(axle), np.empty_like(R)
     for a in range(0, count + 1, _SAMPLES_AT_ONCE):
         rows = slice(a, a + _SAMPLES_AT_ONCE)
-        llh[rows], turn = _move(axle[rows], arm[rows])
+        llh[rows], turn = _move_points(axle[rows], arm[rows])
         v[rows], R_lb[rows] = rotation.mv(turn, V[rows]), turn @ R[rows] @ R_vb
 
     def compute_point(times: Array, lever_arm_b: Array) -> tuple[Array, Array]:
@@ -187,7 +187,7 @@ def move_vehicle(path: Path, origin: tuple[float, float, float], mount: Mount, s
         V_l, _, omega, _, _ = _level(felt, place[:, 0], place[:, 2])
         lever = R_vb @ np.asarray(lever_arm_b, dtype=float)
         offset = rotation.mv(felt.R_base, felt.arm) + felt.R_lv @ lever
-        llh, turn = _move(place, offset)
+        llh, turn = _move_points(place, offset)
         return llh, rotation.mv(turn, V_l + rotation.mv(felt.R_lv, np.cross(omega, lever)))
 
     return TrueMotion(t, llh, v, R_lb, omega_eb @ R_vb, gyro @ R_vb, accel @ R_vb, axle, compute_point)
@@ -215,7 +215,7 @@ def _travel(start: Array, v: Array, dt: float) -> Array:
     return llh[1:]
 
 
-def _move(llh: Array, offset_l: Array) -> tuple[Array, Array]:
+def _move_points(llh: Array, offset_l: Array) -> tuple[Array, Array]:
     """Points moved by vectors in their local ENU: (llh (n, 3), new local ENU from the old (n, 3, 3))."""
     R_le = enu_axes(llh)
     moved = ecef_to_llh(llh_to_ecef(llh) + rotation.mv(np.swapaxes(R_le, -1, -2), offset_l))

@@ -114,15 +114,15 @@ def make_path(
 
     turned = heading + np.cumsum([m.turn for m in manoeuvres])
     psi = np.deg2rad(place_along(list(turned), heading))
-    slope = np.arctan(place_along(_fill([m.grade for m in manoeuvres]), 0.0))
-    bank = np.deg2rad(place_along(_fill([m.bank for m in manoeuvres]), 0.0))
+    slope = np.arctan(place_along(_hold_last([m.grade for m in manoeuvres]), 0.0))
+    bank = np.deg2rad(place_along(_hold_last([m.bank for m in manoeuvres]), 0.0))
     slip = slip_per_accel * speed * np.gradient(psi, PATH_STEP)
     return Path(
         make_spline(start, PATH_STEP, np.column_stack([speed, psi, slope, bank, slip]), CUBIC), start, float(edges[-1])
     )
 
 
-def _fill(values: Sequence[float | None]) -> list[float]:
+def _hold_last(values: Sequence[float | None]) -> list[float]:
     """Values with None replaced by the one before, 0 at first."""
     out, last = [], 0.0
     for value in values:

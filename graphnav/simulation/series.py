@@ -17,7 +17,7 @@ from graphnav.simulation.splines import make_random
 from graphnav.simulation.vibration import draw_gauss_markov
 
 
-def _list_epochs(motion: TrueMotion, rate: float) -> Array:
+def _list_whole_periods(motion: TrueMotion, rate: float) -> Array:
     """Whole periods from the start of a drive on, s."""
     t0, t1 = motion.t[0], motion.t[-1]
     return np.asarray(t0 + np.arange(int((t1 - t0) * rate + 1e-6) + 1) / rate)
@@ -36,7 +36,7 @@ class BarometerModel:
 
     def read(self, motion: TrueMotion, seed: int) -> tuple[Series, dict[str, float]]:
         """Simulate the readings of a drive; returns also their offset (m, at the start) and scale error."""
-        t, rng = _list_epochs(motion, self.rate), make_random(seed, "barometer")
+        t, rng = _list_whole_periods(motion, self.rate), make_random(seed, "barometer")
         offset, scale = self.weather * rng.standard_normal(), self.scale * rng.standard_normal()
         white, steps = rng.standard_normal((2, len(t)))
         steps[0] = 0.0
@@ -68,7 +68,7 @@ class DualAntennaModel:
 
     def read(self, motion: TrueMotion, seed: int) -> tuple[Series, dict[str, float]]:
         """Simulate the readings of a drive; returns also the error of the baseline in heading and pitch, deg."""
-        t, rng = _list_epochs(motion, self.rate), make_random(seed, "second antenna")
+        t, rng = _list_whole_periods(motion, self.rate), make_random(seed, "second antenna")
         turned = np.radians(self.turned) * rng.standard_normal(2)
         white = rng.standard_normal((len(t), 2))
         slow = draw_gauss_markov(
@@ -91,12 +91,12 @@ class DualAntennaModel:
             "sd_pitch": sd[:, 1],
         }  # fmt: skip
         series = dual_antenna.SENSOR.make_series(
-            np.round(t[kept], 6), {name: _cut(x[kept]) for name, x in columns.items()},
+            np.round(t[kept], 6), {name: _round_angle(x[kept]) for name, x in columns.items()},
             baseline=self.baseline, baseline_sigma=self.turned,
         )  # fmt: skip
         return series, {"heading_deg": float(np.degrees(turned[0])), "pitch_deg": float(np.degrees(turned[1]))}
 
 
-def _cut(angle: Array) -> Array:
+def _round_angle(angle: Array) -> Array:
     """Rounded to the digits of a file: a ten-thousandth of a degree."""
     return np.radians(np.round(np.degrees(angle), 4))

@@ -513,3 +513,23 @@ def test_no_command_shows_help(capsys):
 def test_spans_of_the_command_line():
     assert workflow.parse_withheld("gnss:600-660.5") == ("gnss", (600.0, 660.5))
     assert workflow.parse_withheld("odometer") == ("odometer", None)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("smooth", "--solver", "ekf", "--no-report", "--end", "20"),
+        ("detect", "--end", "20"),
+        ("convert",),
+    ],
+)
+def test_every_command_that_writes_takes_the_permission(tmp_path: Path, words: tuple[str, ...]) -> None:
+    folder = tmp_path / "drive"
+    shutil.copytree(Path(__file__).resolve().parents[2] / "data" / "tokyo", folder)
+    (folder / "imu.csv.gz").rename(tmp_path / "imu.csv.gz")
+    described = folder / "recording.toml"
+    described.write_text(described.read_text().replace('"imu.csv.gz"', '"../imu.csv.gz"'))
+    name, *options = words
+    given = [name, folder, "-o", tmp_path / "out", *options, "--quiet"]
+    assert command(*given) == 2
+    assert command(*given, "--allow-outside") == 0

@@ -9,6 +9,7 @@ import resource
 import signal
 import struct
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import logs
@@ -20,6 +21,8 @@ from test_bad_input import TOML, content, line, toml, write_small
 from test_formats_binary import nav_pvt
 
 from graphnav.app import cli, convert, outputs
+from graphnav.app.fleet.drive import solve_drive
+from graphnav.app.fleet.manifest import Task
 from graphnav.config import read_settings
 from graphnav.core.errors import ConfigError, GraphnavError, RecordingError
 from graphnav.core.files import MAX_FILE, MAX_LINE, open_file
@@ -408,6 +411,16 @@ def test_outside_is_read_where_that_is_allowed(stranger: Path, capsys: pytest.Ca
     assert len(read(stranger, allow_outside=True).gnss.t) == 5
     with pytest.raises(RecordingError):
         read(stranger)
+
+
+def test_a_drive_of_a_fleet_takes_the_permission(tmp_path: Path, stranger: Path) -> None:
+    (stranger / "gnss.csv").rename(stranger.parent / "gnss.csv")
+    toml('"gnss.csv"', '"../gnss.csv"')(stranger)
+    task = Task("drive", str(stranger), str(tmp_path / "out"), "ekf", {}, pages=False)
+    refused_row, row = (solve_drive(replace(task, allow_outside=allowed)) for allowed in (False, True))
+    assert refused_row["status"] == "refused"
+    assert "gnss.file" in refused_row["error"]
+    assert row["status"] == "done"
 
 
 def test_a_configuration_reads_below_its_own_folder(kf_gins: Path) -> None:

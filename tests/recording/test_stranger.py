@@ -133,7 +133,7 @@ def test_a_fix_that_stands_in_every_row_of_the_imu_counts_once(tokyo, tmp_path):
 
 
 def _wrapped(period: float, first: float, form: str = "{:.6f}"):
-    """Stamps of a clock that begins at `first` and starts again from 0 after `period`."""
+    """Stamps of a clock that begins at `first` and restarts at 0 after `period`."""
     return lambda t: [form.format((first + t) % period)]
 
 

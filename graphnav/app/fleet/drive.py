@@ -22,7 +22,7 @@ from graphnav.app.summary import compute_median_sigmas, summarise_solver
 from graphnav.app.workflow import Outcome, Request, parse_noise, parse_withheld, read_part, run_request
 from graphnav.config.files import parse_settings
 from graphnav.core.errors import GraphnavError
-from graphnav.core.files import check_regular, hash_file, parse_json, permit_outside, read_text
+from graphnav.core.files import check_regular, hash_file, parse_json, read_text
 from graphnav.core.jsonable import write_json
 from graphnav.core.memory import read_peak_memory_mb
 from graphnav.core.staging import stage_results
@@ -47,15 +47,14 @@ def solve_drive(task: Task) -> FleetRow:
     key = ""
     _forget_peak()
     try:
-        with permit_outside(task.outside):
-            key = hash_task(task)
-            if not task.again and (there := read_row(folder, key)) is not None:
-                return {**there, "drive": task.name, "source": task.source, "skipped": True}
-            outcome = run_request(_make_request(task))
-            with stage_results(folder) as part:
-                outputs.write_run(outcome, part, task.pages)
-            if not task.pages:
-                outputs.remove_pages(folder)
+        key = hash_task(task)
+        if not task.again and (there := read_row(folder, key)) is not None:
+            return {**there, "drive": task.name, "source": task.source, "skipped": True}
+        outcome = run_request(_make_request(task))
+        with stage_results(folder) as part:
+            outputs.write_run(outcome, part, task.pages)
+        if not task.pages:
+            outputs.remove_pages(folder)
         row |= {"status": DONE, **_collect_figures(outcome)}
         row["report"] = str(Path("drives") / task.name / "report.html") if task.pages else None
     except GraphnavError as error:
@@ -141,12 +140,12 @@ def _make_request(task: Task) -> Request:
     noise = parse_noise(task.noise, settings)[1] if task.noise else None
     withheld = tuple(parse_withheld(one) for one in task.without)
     if task.withhold is not None:
-        part = read_part(task.source, task.start, task.end)
+        part = read_part(task.source, task.start, task.end, allow_outside=task.allow_outside)
         withheld += tuple(("gnss", span) for span in choose_spans(part, task.withhold, task.start or 0.0))
     given = {"recording": task.source, "solver": task.solver, "fleet": True, "withhold": task.withhold}
     return Request(
         task.source, (task.solver,), settings, withheld, task.start, task.end, task.rate,
-        {k: v for k, v in given.items() if v is not None}, noise,
+        {k: v for k, v in given.items() if v is not None}, noise, allow_outside=task.allow_outside,
     )  # fmt: skip
 
 

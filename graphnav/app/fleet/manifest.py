@@ -56,19 +56,22 @@ class Task:
     rate: float | None = None
     pages: bool = True
     again: bool = False  # solve again even if it is done
-    outside: bool = False  # whether recordings may name files outside their folders
+    allow_outside: bool = False  # whether recordings may name files outside their folders
 
 
 _KNOWN_COLUMNS = ("recording", "name", *(f.name for f in fields(DriveOptions)))
 
 
-def read_drives(source: Path, asked: DriveOptions) -> list[tuple[str, str, DriveOptions, str]]:
+def read_drives(
+    source: Path, asked: DriveOptions, allow_outside: bool = False
+) -> list[tuple[str, str, DriveOptions, str]]:
     """Name, recording, options, and the source of these, of every drive.
 
     Parameters
     ----------
     source : a folder, in which recordings are looked for at any depth; or a manifest, .csv or .toml.
     asked : what holds where the manifest says nothing.
+    allow_outside : whether files that a manifest names may lie outside its folder.
 
     Raises
     ------
@@ -86,7 +89,7 @@ def read_drives(source: Path, asked: DriveOptions) -> list[tuple[str, str, Drive
             )
         return _number_clones(found)
     rows = _parse_csv(source) if source.suffix == ".csv" else _parse_toml(source)
-    drives = [_build_drive(source, where, row, asked) for where, row in rows]
+    drives = [_build_drive(source, where, row, asked, allow_outside) for where, row in rows]
     if not drives:
         raise ConfigError(f"{source}: names no recording", key="manifest.no_recording")
     twice = [name for name, count in Counter(name for name, *_ in drives).items() if count > 1]
@@ -230,7 +233,7 @@ def _check_columns(names: Iterable[str], where: str) -> None:
 
 
 def _build_drive(
-    source: Path, where: str, row: Mapping[str, Any], asked: DriveOptions
+    source: Path, where: str, row: Mapping[str, Any], asked: DriveOptions, allow_outside: bool
 ) -> tuple[str, str, DriveOptions, str]:
     """One row of a manifest; a blank field takes the common value."""
     values: dict[str, Any] = {}
@@ -246,7 +249,7 @@ def _build_drive(
                     f"{where}, '{key}': {value!r} is not a number of seconds", key="manifest.value"
                 ) from None
         elif key == "settings" and isinstance(value, Mapping):
-            values[key] = _write(value)
+            values[key] = _format_settings(value)
         elif key == "without" and isinstance(value, list):
             values[key] = " ".join(map(str, value))
         elif isinstance(value, str):
@@ -258,21 +261,21 @@ def _build_drive(
         raise ConfigError(f"{where}, 'recording': names no recording", key="manifest.no_recording")
     noise = values.get("noise")
     if noise is not None and noise not in MODES:
-        values["noise"] = str(_find_beside(source, noise, where, "noise"))
+        values["noise"] = str(_find_beside(source, noise, where, "noise", allow_outside))
     if "config" in values:
-        values["config"] = str(_find_beside(source, values["config"], where, "config"))
+        values["config"] = str(_find_beside(source, values["config"], where, "config", allow_outside))
     builtin = recording in list_formats() and list_formats()[recording].builtin
-    path = recording if builtin else str(_find_beside(source, recording, where, "recording"))
+    path = recording if builtin else str(_find_beside(source, recording, where, "recording", allow_outside))
     name = row.get("name") or Path(recording.removesuffix("/recording.toml")).name.removesuffix(".toml")
     if not isinstance(name, str):
         raise ConfigError(f"{where}, 'name': {name!r} is not a text", key="manifest.value")
     return _clean_name(name), path, replace(asked, **values), where
 
 
-def _find_beside(source: Path, name: str, where: str, key: str) -> Path:
-    """A file named by a manifest; it must be in the manifest's folder or below unless the command permits otherwise."""
+def _find_beside(source: Path, name: str, where: str, key: str, allow_outside: bool) -> Path:
+    """A file named by a manifest; it must be in the manifest's folder or below unless `allow_outside`."""
     path = source.parent / name
-    if not is_inside(path, source.parent, ConfigError):
+    if not is_inside(path, source.parent, ConfigError) and not allow_outside:
         raise ConfigError(
             f"{where}, '{key}': {name} lies outside its folder; say --allow-outside if you trust who wrote it",
             key="file.outside",
@@ -290,14 +293,16 @@ def _parse_settings(text: str) -> dict[str, Any]:
         ) from None
 
 
-def _write(values: Mapping[str, Any], at: str = "") -> str:
+def _format_settings(values: Mapping[str, Any], at: str = "") -> str:
     """A table of settings as lines of dotted keys."""
     from graphnav.config.files import format_toml_value
 
     lines = []
     for key, value in values.items():
         lines.append(
-            _write(value, f"{at}{key}.") if isinstance(value, Mapping) else f"{at}{key} = {format_toml_value(value)}"
+            _format_settings(value, f"{at}{key}.")
+            if isinstance(value, Mapping)
+            else f"{at}{key} = {format_toml_value(value)}"
         )
     return "\n".join(lines)
 

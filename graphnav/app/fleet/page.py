@@ -77,7 +77,7 @@ def _format_table(rows: Sequence[FleetRow]) -> str:
         name = escape(str(row["drive"]))
         if row.get("report"):
             name = f'<a href="{escape(str(row["report"]))}">{name}</a>'
-        cells = "".join(f"<td>{escape(_format_value(row.get(key)))}</td>" for key in _TABLE_COLUMNS)
+        cells = "".join(f"<td>{escape(_format_cell(row.get(key)))}</td>" for key in _TABLE_COLUMNS)
         why = escape(str(row.get("error") or row.get("doubts") or ""))
         kind = "" if row["status"] == DONE else ' class="bad"'
         lines.append(f'<tr><td>{name}</td>{cells}<td class="words"><span{kind}>{why}</span></td></tr>')
@@ -89,7 +89,7 @@ def _format_table(rows: Sequence[FleetRow]) -> str:
     )
 
 
-def _format_value(value: object) -> str:
+def _format_cell(value: object) -> str:
     if isinstance(value, float):
         return f"{value:.4g}"
     return "" if value is None else str(value)

@@ -213,7 +213,7 @@ def _minimise(
         notes.append(
             Note(
                 "solver.integrated_again",
-                f"{format_count(renewed, 'interval')} integrated again because the gyro bias had moved",
+                f"{format_count(renewed, 'interval')} re-integrated because the gyro bias estimate had changed",
             )
         )
     return _Minimum(problem, point, layout, eliminated, now, iteration, stopped, tuple(notes))

@@ -154,7 +154,7 @@ def solve_in_turn(problem: Problem, solver: str, engine: LagSmoother, lag: float
         notes=(
             *problem.notes,
             Note("solver.step_times", ("" if np.isinf(lag) else f"lag {lag:g} s: ") + describe_times(seconds)),
-            Note("solver.relinearised", f"{format_count(again, 'keyframe')} linearised again"),
+            Note("solver.relinearised", f"{format_count(again, 'keyframe')} relinearised"),
         ),
         between=(make_dense(problem, states, covariance, scale_at(problem.columns, values), smooth=True),),
     )

@@ -57,7 +57,7 @@ def _compute_mean(x: Array) -> Array:
     return np.asarray(np.full(len(x), 1.0 / len(x)) @ x)
 
 
-def _integrate(t: Array, rate: Array, twice: bool) -> Array:
+def _integrate_means(t: Array, rate: Array, twice: bool) -> Array:
     """Integral, at the ends of the periods, of rows that are means over them, minus their mean; or its own integral.
 
     Axis by axis and in place: for a day each temporary array takes a hundred megabytes.
@@ -79,7 +79,7 @@ def _integrate(t: Array, rate: Array, twice: bool) -> Array:
 
 def _make_sampler(t: Array, rate: Array) -> Callable[[Array, Array], Array]:
     """Sampler mean(at, width) of the integral of `rate`; width 0 gives the value at that time."""
-    integral = cache(lambda twice: _integrate(t, rate, twice))
+    integral = cache(lambda twice: _integrate_means(t, rate, twice))
     period = (t[-1] - t[0]) / (len(t) - 1)
 
     def take_columns(at: Array, values: Array) -> Array:
@@ -152,7 +152,9 @@ def _find_peak(lags: Array, c: Array) -> float:
     return float(lags[k])
 
 
-def _search(t: Array, y: Array, x_at: lags_of_clocks.Regressors, span: Array, valid: Callable[[float], Array]) -> Fit:
+def _search_shift(
+    t: Array, y: Array, x_at: lags_of_clocks.Regressors, span: Array, valid: Callable[[float], Array]
+) -> Fit:
     """The time shift at which x explains y best; `x_at(rows, lags)`, and `valid(lag)` a mask of the rows."""
     every = np.arange(len(y))
 
@@ -219,7 +221,7 @@ def _fit_imu(imu: Imu, rate: Array, track: Track, i: Index, j: Index, y: Array) 
     def mask_valid(lag: float) -> Array:
         return (ti + lag - wi / 2 > imu.t[0]) & (tj + lag + wj / 2 < imu.t[-1])
 
-    return _search(0.5 * (ti + tj), y, sample_x, track.t, mask_valid)
+    return _search_shift(0.5 * (ti + tj), y, sample_x, track.t, mask_valid)
 
 
 def find_up(imu: Imu) -> Array:
@@ -293,7 +295,7 @@ def fit_velocity(track: Track, places: Track) -> Fit | None:
         first, last = places.t[i] - places.width[i] / 2 + lag, places.t[j] + places.width[j] / 2 + lag
         return np.asarray((first > t[0]) & (last < t[-1]))
 
-    return _search(0.5 * (places.t[i] + places.t[j]), y, sample_x, places.t, mask_valid)
+    return _search_shift(0.5 * (places.t[i] + places.t[j]), y, sample_x, places.t, mask_valid)
 
 
 def fit_odometer(odometer: Odometer, track: Track) -> tuple[Fit, float] | None:
@@ -323,7 +325,7 @@ def fit_odometer(odometer: Odometer, track: Track) -> tuple[Fit, float] | None:
     off = track.speed - slope * x
     off = np.abs(off - np.median(off[inside]))
     usable = off < 6.0 * np.median(off[inside]) + 0.5
-    fit = _search(track.t, track.speed, sample_x, track.t, mask_valid)
+    fit = _search_shift(track.t, track.speed, sample_x, track.t, mask_valid)
     rows = every[mask_valid(fit.lag)]
     x = sample_x(rows, fit.lag)[:, 0]
     moving = (np.abs(x) > 0.3 * np.abs(x).max()) & (track.speed[rows] > MIN_SPEED)

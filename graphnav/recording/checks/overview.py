@@ -108,7 +108,7 @@ class Inspection:
         """
         lines = [f"{self.name} ({self.platform})"]
         for sensor, facts in self.facts.items():
-            shown = ", ".join(_show(name, value) for name, value in facts.items())
+            shown = ", ".join(_format_number(name, value) for name, value in facts.items())
             lines.append(f"  {sensor:<9} {shown}")
         for finding in self.findings:
             lines.append(f"  {finding.severity}: {finding.sentence}")
@@ -118,9 +118,9 @@ class Inspection:
 _VALUE_UNITS = {"hz": "Hz", "s": "s", "m": "m", "mps": "m/s", "mps2": "m/s2", "dbhz": "dB-Hz"}
 
 
-def _show(name: str, value: Any) -> str:
+def _format_number(name: str, value: Any) -> str:
     if isinstance(value, dict):
-        return ", ".join(_show(*one) for one in value.items())
+        return ", ".join(_format_number(*one) for one in value.items())
     words = name.split("_")
     unit = _VALUE_UNITS.get(words[-1], "") if len(words) > 1 else ""
     number = f"{value:.6g}" if isinstance(value, float) else str(value)

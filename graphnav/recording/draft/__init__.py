@@ -98,7 +98,7 @@ class _Writer:
             "# Drafted by graphnav init. Comments say why each line is what it is; look at those marked CHECK.",
             'format = "graphnav-recording/1"', f"name = {quote(name)}",
         ]  # fmt: skip
-        why = "there are fixes or speeds" if vehicle else "CHECK: no fixes and no speed, so it is taken for a walk"
+        why = "there are fixes or speeds" if vehicle else "CHECK: no fixes and no speed, so a walk is assumed"
         self._write_key("platform", '"vehicle"' if vehicle else '"foot"', why)
         if raw is not None:
             self._write_clock(found["imu"], raw)
@@ -181,7 +181,7 @@ class _Writer:
             forward = agreement.forward
             sure = "forward" if lag.correlation > LIKELY else "CHECK: forward, not surely,"
             words = (
-                f"{sure} is where the accelerations of the fixes are felt (coherence {lag.correlation:.2f}, "
+                f"{sure} is the direction of the accelerations of the fixes (coherence {lag.correlation:.2f}, "
                 f"{abs(lag.slope):.2f} of their size)"
             )
         letters, (front, top) = guesses.guess_axes(up, forward)

@@ -153,7 +153,10 @@ def guess_up(accel: Array) -> tuple[Array, str]:
     up = mean / np.linalg.norm(mean)
     tilt = np.degrees(np.arccos(np.clip(np.abs(up).max(), 0, 1)))
     axis = int(np.abs(up).argmax())
-    return up, f"gravity is felt along {'+' if up[axis] > 0 else '-'}{'xyz'[axis]}, {tilt:.0f} deg off it on average"
+    return (
+        up,
+        f"gravity is measured along {'+' if up[axis] > 0 else '-'}{'xyz'[axis]}, {tilt:.0f} deg off it on average",
+    )
 
 
 def guess_axes(up: Array, forward: Array) -> tuple[str | None, tuple[Array, Array]]:

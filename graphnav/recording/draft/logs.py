@@ -153,6 +153,7 @@ def read_log(path: Path, topics: Sequence[str] = ()) -> dict[str, Source]:
         roles.append("gnss")
     elif sensor == "imu" and "speed" in columns.names:
         roles.append("odometer")
+<<<<<<< HEAD
     found = {role: _read(path, columns, role, plain) for role in roles}
     for role, source in found.items():
         source.second = _find_second(header, columns, WANTED[role][1:3] if role == "gnss" else WANTED[role][1:])
@@ -164,6 +165,9 @@ def _find_second(header: list[str], columns: matching.FileColumns, core: Sequenc
     rest = matching.match_columns([name for name in header if name not in columns.names.values()]).names
     names = [rest[ours] for ours in core if ours in rest]
     return f"{names[0]} to {names[-1]}" if len(names) == len(core) else ""
+=======
+    return {role: _read_sensor(path, columns, role, plain) for role in roles}
+>>>>>>> work-T
 
 
 def _make_times_error(path: Path, header: list[str], words: dict[str, str]) -> NoSensorError:
@@ -177,7 +181,7 @@ def _make_times_error(path: Path, header: list[str], words: dict[str, str]) -> N
     )
 
 
-def _read_stamps(cells: list[str]) -> Array | None:
+def _parse_stamps(cells: list[str]) -> Array | None:
     """Increasing stamps as numbers; None where these are none."""
     try:
         t = np.array([float(cell) for cell in cells])
@@ -194,7 +198,7 @@ def _add_clock(path: Path, header: list[str], columns: matching.FileColumns) -> 
     best = columns.names["t"]
     rows = read_first_rows(path, 100)
     cells = {name: [row[header.index(name)] for row in rows if len(row) == len(header)] for name in several}
-    stamps = {name: t for name in several if (t := _read_stamps(cells[name])) is not None}
+    stamps = {name: t for name in several if (t := _parse_stamps(cells[name])) is not None}
     if best not in stamps:  # dates in words
         best = next(iter(stamps), best)
     best = next((name for name, t in stamps.items() if guesses.is_date(t)), best)
@@ -217,7 +221,7 @@ def _read_numbers(path: Path, name: str, plain: Plain | None) -> bool:
         return False
 
 
-def _read(path: Path, columns: matching.FileColumns, role: str, plain: Plain | None) -> Source:
+def _read_sensor(path: Path, columns: matching.FileColumns, role: str, plain: Plain | None) -> Source:
     """The columns of one sensor: rows complete in what it needs, in order of time."""
     wanted = WANTED[role]
     names = {ours: theirs for ours, theirs in columns.names.items() if ours in wanted}

@@ -49,7 +49,7 @@ def find_logs(paths: Sequence[Path], topics: Sequence[str] = ()) -> LogsFound:
         If the only file holds nothing that is known, if one of a sensor cannot be read, if two hold the same, or none
         an IMU.
     """
-    raw, files = separate_raw([file for path in paths for file in _list_files(path)])
+    raw, files = separate_raw([file for path in paths for file in _list_logs(path)])
     if not files:
         raise RecordingError(f"{paths[0]}: observations of GNSS, and no IMU beside them", key="draft.no_imu")
     every: dict[str, list[Source]] = {}
@@ -73,7 +73,9 @@ def find_logs(paths: Sequence[Path], topics: Sequence[str] = ()) -> LogsFound:
         left.append(f"{others}: no logs of a kind that is known")
     if nothing:
         left.append(f"left out: {', '.join(nothing)}: no sensor is recognised in the columns")
-    sensors = {sensor: chosen for sensor, some in every.items() if (chosen := _choose(sensor, some, left)) is not None}
+    sensors = {
+        sensor: chosen for sensor, some in every.items() if (chosen := _choose_source(sensor, some, left)) is not None
+    }
     if "imu" not in sensors and "gyro" in sensors:
         if "accel" not in sensors and "accel" in every and "gravity" in sensors:
             sensors["accel"] = _add_gravity(every["accel"][0], sensors["gravity"], left)
@@ -145,7 +147,7 @@ def _find_unix_start(source: Source) -> float | None:
     return None if source.gps_zero is None else float(source.gps_zero + begin + GPS_TO_UNIX)
 
 
-def _list_files(path: Path) -> list[Path]:
+def _list_logs(path: Path) -> list[Path]:
     """A log by itself, or those in a folder that is not a log itself."""
     if not path.is_dir() or any(known.load is not None and known.recognises(path) for known in list_formats().values()):
         return [path]
@@ -181,7 +183,7 @@ def _is_known(path: Path) -> bool:
     )
 
 
-def _choose(sensor: str, some: list[Source], left: list[str]) -> Source | None:
+def _choose_source(sensor: str, some: list[Source], left: list[str]) -> Source | None:
     """The log to use of several of one sensor; the others are noted with the reason."""
     if sensor == "accel":
         with_gravity = [s for s in some if _has_gravity(s)]

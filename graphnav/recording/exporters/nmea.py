@@ -31,7 +31,7 @@ def open_writer(path: Path, name: str = "") -> Iterator[Add]:
             require_geodetic(block, path)
             if utc is None:
                 raise RecordingError(
-                    f"{path}: NMEA needs the time of day, and what t counts from is not known; give --clock",
+                    f"{path}: NMEA needs the time of day, and the zero of t is not known; give --clock",
                     key="export.time_of_day",
                 )
             file.write("".join(_write_sentences(block, utc)))

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from graphnav.core.complaints import suggest_nearest
 from graphnav.core.errors import RecordingError
-from graphnav.core.files import exists, permit_outside
+from graphnav.core.files import exists
 from graphnav.recording import Recording
 from graphnav.recording.exporters import FORMATS as EXPORTED
 from graphnav.recording.formats.registry import Format, Log
@@ -58,14 +58,14 @@ def read(
         If the source does not exist, is of unknown format, or cannot be used, or if there is no format of that name.
     """
     chosen = _find_format(source, name)
-    with permit_outside(allow_outside):
-        found = _choose(chosen, source, topics).make_recording(source) if topics else chosen.read(source)
+    log = _load_topics(chosen, source, topics) if topics else None
+    found = chosen.read(source, allow_outside) if log is None else log.make_recording(source)
     if found.gnss is None:
         return found
     return replace(found, gnss=replace(found.gnss, rounding=measure_rounding(found.gnss.llh)))
 
 
-def load(source: str | Path, name: str | None = None, topics: Sequence[str] = ()) -> Log:
+def load(source: str | Path, name: str | None = None, topics: Sequence[str] = (), allow_outside: bool = False) -> Log:
     """Read whatever a source contains: a whole recording or one sensor's log.
 
     Parameters
@@ -74,7 +74,7 @@ def load(source: str | Path, name: str | None = None, topics: Sequence[str] = ()
         A path, or a built-in name.
     name
         The format; recognised from the content if None.
-    topics
+    topics, allow_outside
         As for `read`.
 
     Returns
@@ -89,10 +89,10 @@ def load(source: str | Path, name: str | None = None, topics: Sequence[str] = ()
     """
     chosen = _find_format(source, name)
     if topics:
-        return _choose(chosen, source, topics)
+        return _load_topics(chosen, source, topics)
     if chosen.load is not None:
-        return chosen.load(source)
-    r = chosen.read(source)
+        return chosen.load(source, allow_outside)
+    r = chosen.read(source, allow_outside)
     return Log(
         r.name, r.imu, r.gnss, r.odometer, r.truth, r.platform, gps_zero=r.gps_zero, files=r.files, remarks=r.remarks,
         sensors=r.sensors,
@@ -117,7 +117,7 @@ def _find_format(source: str | Path, name: str | None) -> Format:
     return chosen
 
 
-def _choose(chosen: Format, source: str | Path, topics: Sequence[str]) -> Log:
+def _load_topics(chosen: Format, source: str | Path, topics: Sequence[str]) -> Log:
     """Read the log with these topics."""
     if chosen.choose is None:
         raise RecordingError(

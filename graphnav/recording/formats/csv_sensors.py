@@ -34,14 +34,14 @@ _ROWS_AT_ONCE = 1 << 16  # rows at once
 def build_imu(d: schema.ImuTable, rows: Table, remarks: Remarks) -> Imu:
     """Samples in body axes RFU, rad/s and m/s^2, with the stated noise figures, else a consumer IMU's."""
     R_bs = d.R_bs
-    gyro = _turn(rows, ("gx", "gy", "gz"), schema.RATE_UNITS[d.units.gyro], R_bs)
-    accel = _turn(rows, ("ax", "ay", "az"), schema.FORCE[d.units.accel], R_bs)
+    gyro = _take_in_body(rows, ("gx", "gy", "gz"), schema.RATE_UNITS[d.units.gyro], R_bs)
+    accel = _take_in_body(rows, ("ax", "ay", "az"), schema.FORCE[d.units.accel], R_bs)
     stated = d.figures
     noise = replace(ImuNoise(), **stated)
     missing = [key for key in schema.STATED_FIGURES if key not in stated]
     if 0 < len(missing) < len(schema.STATED_FIGURES):
         remarks.add(
-            "imu.noise_partly", f"[imu.noise] says nothing of {', '.join(missing)}: defaults of a consumer IMU are used"
+            "imu.noise_partly", f"[imu.noise] does not state {', '.join(missing)}: defaults of a consumer IMU are used"
         )
     elif missing:
         remarks.add(
@@ -53,7 +53,7 @@ def build_imu(d: schema.ImuTable, rows: Table, remarks: Remarks) -> Imu:
     return Imu(rows["t"], gyro, accel, noise, R_bs, noise_assumed=len(missing) == len(schema.STATED_FIGURES))
 
 
-def _turn(rows: Table, names: tuple[str, ...], unit: float, R_bs: Array) -> Array:
+def _take_in_body(rows: Table, names: tuple[str, ...], unit: float, R_bs: Array) -> Array:
     """Columns (N, 3) in body axes, removed from the table: for a day of rows nothing is held twice."""
     out = np.empty((len(rows), 3))
     for k in range(0, len(out), _ROWS_AT_ONCE):
@@ -72,7 +72,7 @@ def build_gnss(d: schema.GnssTable, rows: Table, remarks: Remarks) -> Gnss:
     if vague.any():
         if vague.all():
             raise RecordingError(
-                f"{rows.path}: every fix has a sigma of more than {VAGUEST:g} m and says nothing",
+                f"{rows.path}: every fix has a sigma of more than {VAGUEST:g} m and carries no information",
                 key="gnss.sigma_all_vague",
             )
         remarks.add(

@@ -40,8 +40,12 @@ _SETTLED = {  # assumptions of a log's reader, and the keys that replace them
 _RAW_FILES = ("rover", "nav", "sp3", "clk", "antex", "base")
 
 
-def read_folder(source: str | Path) -> Recording:
+def read_folder(source: str | Path, allow_outside: bool = False) -> Recording:
     """Read a recording from a folder with recording.toml, or from such a .toml.
+
+    Parameters
+    ----------
+    allow_outside : whether files that it names may lie outside its folder.
 
     Raises
     ------
@@ -66,7 +70,7 @@ def read_folder(source: str | Path) -> Recording:
 
     def parse_table(name: str) -> Table:
         section = getattr(d, name)
-        file = resolve_beside(path, section.file, f"{name}.file")
+        file = resolve_beside(path, section.file, f"{name}.file", allow_outside)
         files.append(file)
         required, optional, keep = section.required, section.optional, section.keep
         if name == "truth":
@@ -87,9 +91,8 @@ def read_folder(source: str | Path) -> Recording:
         if section is None:
             return None
         if section.file not in logs:
-            logs[section.file] = read_other_log(
-                resolve_beside(path, section.file, f"{name}.file"), topics.get(section.file, ())
-            )
+            file = resolve_beside(path, section.file, f"{name}.file", allow_outside)
+            logs[section.file] = read_other_log(file, topics.get(section.file, ()), allow_outside)
         log = logs[section.file]
         if section.topic and not (log and log.topics):
             raise RecordingError(
@@ -122,7 +125,7 @@ def read_folder(source: str | Path) -> Recording:
     gps_zero = parse_clock(d.clock, float(imu.t[0])) if d.clock else next(iter(zeros), None)
     raw = None
     if d.raw_gnss is not None:
-        raw, fixes = _load_raw(d.raw_gnss, path, gps_zero, remarks, files)
+        raw, fixes = _load_raw(d.raw_gnss, path, gps_zero, allow_outside, remarks, files)
         if gnss is None:
             gnss = fixes
             remarks.add("gnss.of_raw", f"no [gnss]: {len(fixes.t)} single-point fixes of the raw observations are used")
@@ -130,7 +133,7 @@ def read_folder(source: str | Path) -> Recording:
     if d.truth and d.truth.closed_loop_sigma:
         truth = Truth(imu.t[[0, -1]], of=d.truth.of, closed_loop_sigma=d.truth.closed_loop_sigma)
     elif d.truth and d.truth.file and Path(d.truth.file).suffix in (".nav", ".pos", ".tum"):
-        files.append(resolve_beside(path, d.truth.file, "truth.file"))
+        files.append(resolve_beside(path, d.truth.file, "truth.file", allow_outside))
         truth = _read_truth(d.truth, files[-1], remarks)
     elif d.truth:
         truth = build_truth(d.truth, parse_table("truth"), remarks)
@@ -152,7 +155,7 @@ def read_folder(source: str | Path) -> Recording:
 
 
 def _load_raw(
-    d: schema.RawGnssTable, path: Path, zero: float | None, remarks: Remarks, files: list[Path]
+    d: schema.RawGnssTable, path: Path, zero: float | None, allow_outside: bool, remarks: Remarks, files: list[Path]
 ) -> tuple[RawGnss, Gnss]:
     """The raw observations of [raw_gnss], and single-point fixes computed from them."""
     if zero is None:
@@ -165,7 +168,7 @@ def _load_raw(
     from graphnav.gnss.placing import Corrected
 
     some = {
-        name: tuple(resolve_beside(path, file, f"raw_gnss.{name}") for file in getattr(d, name) or ())
+        name: tuple(resolve_beside(path, file, f"raw_gnss.{name}", allow_outside) for file in getattr(d, name) or ())
         for name in _RAW_FILES
     }
     corrected = Corrected(clock="clock" in d.corrected, troposphere="troposphere" in d.corrected)
@@ -210,15 +213,23 @@ def _read_truth(d: schema.TruthTable, file: Path, remarks: Remarks) -> Truth:
     return Truth(track.t + d.time_offset, llh, xyz, track.v, track.rph, d.of)
 
 
-def read_other_log(file: Path, topics: Sequence[str] = ()) -> Log | None:
-    """The log of another program, or None for a CSV file or a missing one; `topics` are for a ROS bag."""
+def read_other_log(file: Path, topics: Sequence[str] = (), allow_outside: bool = False) -> Log | None:
+    """The log of another program, or None for a CSV file or a missing one.
+
+    Parameters
+    ----------
+    topics : for a ROS bag.
+    allow_outside : whether files that it names may lie outside its folder.
+    """
     from graphnav.recording.formats import list_formats  # which imports this module
 
     if file.name.endswith((".csv", ".csv.gz")) or not file.exists():
         return None
     for known in list_formats().values():
         if known.load is not None and known.recognises(file):
-            return known.choose(file, topics) if topics and known.choose is not None else known.load(file)
+            if topics and known.choose is not None:
+                return known.choose(file, topics)
+            return known.load(file, allow_outside)
     return None
 
 

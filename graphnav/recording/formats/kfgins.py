@@ -55,8 +55,12 @@ def recognises(path: Path) -> bool:
     return path.is_file() and _guess_kind(path) is not None
 
 
-def load(path: Path) -> Log:
+def load(path: Path, allow_outside: bool = False) -> Log:
     """Read a data set by its configuration, a folder of its files, or a single IMU or GNSS file.
+
+    Parameters
+    ----------
+    allow_outside : whether files outside the folder may be read.
 
     Raises
     ------
@@ -68,8 +72,8 @@ def load(path: Path) -> Log:
     config_file = path if path.suffix.lower() in (".yaml", ".yml") else _find_config(path) if path.is_dir() else None
     if config_file is not None:
         config = read_configuration(config_file)
-        imu_file = find_file(config_file, config, _IMU_KEYS)
-        gnss_file = find_file(config_file, config, _GNSS_KEYS)
+        imu_file = find_file(config_file, config, _IMU_KEYS, allow_outside)
+        gnss_file = find_file(config_file, config, _GNSS_KEYS, allow_outside)
     else:
         imu_file, gnss_file = _find_pair(path)
         remarks.add(
@@ -77,7 +81,7 @@ def load(path: Path) -> Log:
             "no configuration (.yaml) of KF-GINS or OB_GINS beside it: the antenna's lever arm is taken as zero",
         )
     files = [f for f in (config_file, imu_file, gnss_file) if f is not None]
-    if path.is_dir():
+    if path.is_dir() and not allow_outside:
         check_inside(files, path)
     where = config_file or path
     imu = odometer = gnss = truth = zero = None
@@ -91,10 +95,11 @@ def load(path: Path) -> Log:
                 "odometer.read_as", "the eighth column of the IMU file is taken as the odometer's forward speed in m/s"
             )
     if gnss_file is not None:
-        gnss = _read_gnss(gnss_file, read_lever_arm(where, config, "antlever"), remarks)
+        gnss = _read_fixes(gnss_file, read_lever_arm(where, config, "antlever"), remarks)
     folder = where.parent if config else where
     if nav := _find_truth(folder, remarks) if folder.is_dir() else None:
-        check_inside([nav], folder)
+        if not allow_outside:
+            check_inside([nav], folder)
         track = read_trajectory(nav)
         truth = Truth(track.t, track.llh, v=track.v, rph=track.rph)
         first = next(
@@ -259,7 +264,7 @@ def _read_imu(path: Path, remarks: Remarks) -> tuple[Imu, Array | None]:
     return imu, table[:, 7].copy() if table.shape[1] == 8 else None
 
 
-def _read_gnss(path: Path, lever_arm: Array, remarks: Remarks) -> Gnss:
+def _read_fixes(path: Path, lever_arm: Array, remarks: Remarks) -> Gnss:
     rows = [(n, line) for n, line in enumerate(split_lines(path), 1) if line.strip() and line.lstrip()[0] not in "#%"]
     if not rows:
         raise RecordingError(f"{path}: no rows in it", key="file.no_rows")

@@ -68,7 +68,7 @@ def _check_tokens(path: Path, yaml: Any, text: str) -> None:
             )
 
 
-def find_file(config_file: Path, config: dict[str, Any], keys: tuple[str, ...]) -> Path | None:
+def find_file(config_file: Path, config: dict[str, Any], keys: tuple[str, ...], allow_outside: bool) -> Path | None:
     """The file that a key names: as written, below any folder above the configuration, or beside it."""
     key = next((k for k in keys if k in config), None)
     if key is None:
@@ -82,7 +82,7 @@ def find_file(config_file: Path, config: dict[str, Any], keys: tuple[str, ...]) 
         *(above / stated for above in (folder, *folder.parents)),
         config_file.parent / stated.name,
     ]:
-        if is_inside(candidate, folder) and candidate.is_file():
+        if (allow_outside or is_inside(candidate, folder)) and candidate.is_file():
             return candidate
     raise RecordingError(
         f"{config_file}, {key}: no file {str(stated)[:200]} beside the configuration or below it; elsewhere none is "

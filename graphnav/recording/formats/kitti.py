@@ -105,6 +105,6 @@ FORMAT = Format(
     name="kitti",
     about="the KITTI drive carried by GTSAM's own wheel",
     recognises=lambda source: str(source) == "kitti",
-    read=read_kitti,
+    read=lambda source, _: read_kitti(source),
     builtin=True,
 )

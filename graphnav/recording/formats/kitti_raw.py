@@ -35,8 +35,12 @@ def _find_oxts(path: Path) -> Path | None:
     return None
 
 
-def load(path: Path) -> Log:
+def load(path: Path, allow_outside: bool = False) -> Log:
     """Read the IMU, positions and velocities of the INS once a second as fixes, and its whole solution as the truth.
+
+    Parameters
+    ----------
+    allow_outside : whether its files may be links to somewhere else.
 
     Raises
     ------
@@ -48,7 +52,8 @@ def load(path: Path) -> Log:
         raise RecordingError(f"{path}: no KITTI folder 'oxts' with timestamps.txt and data in it", key="log.no_folder")
     remarks = Remarks()
     samples = sorted((folder / "data").glob("*.txt"))
-    check_inside([folder / "timestamps.txt", *samples], path)
+    if not allow_outside:
+        check_inside([folder / "timestamps.txt", *samples], path)
     t, zero = _read_times(folder / "timestamps.txt")
     if len(samples) != len(t):
         raise RecordingError(
@@ -132,14 +137,14 @@ def _parse_row(path: Path) -> list[float]:
     try:
         values = [parse_number(x) for x in text.split()]
     except ValueError:
-        bad = next(x for x in text.split() if not _parse_number(x))
+        bad = next(x for x in text.split() if not _is_number(x))
         raise RecordingError(f"{path}, line 1: '{bad[:40]}' is not a number", key="table.cell") from None
     if len(values) != _FIELDS:
         raise RecordingError(f"{path}, line 1: {len(values)} numbers where {_FIELDS} were expected", key="table.fields")
     return values
 
 
-def _parse_number(text: str) -> bool:
+def _is_number(text: str) -> bool:
     try:
         parse_number(text)
     except ValueError:

@@ -85,8 +85,8 @@ def load(path: Path) -> Log:
             f"{format_count(simulated, 'GGA position')} by dead reckoning, manual input or a simulator left out",
         )
     t, zero = _date_fixes(epochs, fixes, remarks)
-    separation = np.array([_parse_number(e.gga.sep) for e in fixes])
-    height = np.array([_parse_number(e.gga.alt) for e in fixes])
+    separation = np.array([_parse_field(e.gga.sep) for e in fixes])
+    height = np.array([_parse_field(e.gga.alt) for e in fixes])
     if np.isnan(separation).any():
         remarks.add(
             "gnss.height_above_sea",
@@ -98,8 +98,8 @@ def load(path: Path) -> Log:
         )
     llh = np.stack(
         [
-            np.radians([_parse_number(e.gga.lat) for e in fixes]),
-            np.radians([_parse_number(e.gga.lon) for e in fixes]),
+            np.radians([_parse_field(e.gga.lat) for e in fixes]),
+            np.radians([_parse_field(e.gga.lon) for e in fixes]),
             height + np.nan_to_num(separation),
         ],
         -1,
@@ -115,7 +115,7 @@ def load(path: Path) -> Log:
         )
     kinds = fix_types(np.array([e.gga.quality for e in fixes])[order], NMEA_TYPES)
     v, sd_v = (None if x is None else x[order] for x in (v, sd_v))
-    satellites = np.array([_parse_number(e.gga.numSV) for e in fixes])[order]
+    satellites = np.array([_parse_field(e.gga.numSV) for e in fixes])[order]
     gnss = Gnss(t[order], llh[order], sd[order], v, sd_v, type=kinds, satellites=satellites)
     remarks.add(
         "gnss.lever_arm_unknown", "GNSS: position of the antenna; its lever arm is not in the log and taken as zero"
@@ -156,26 +156,26 @@ def _collect_epochs(path: Path) -> tuple[list[_Epoch], list[int], int]:
         elif kind != b"VTG" or not epochs:
             continue
         try:
-            _note(epochs[-1], kind, message)
+            _add_sentence(epochs[-1], kind, message)
         except (AttributeError, TypeError, ValueError):  # no number, or a missing field, despite a correct checksum
             broken.append(number)
     return epochs, broken, count
 
 
-def _note(epoch: _Epoch, kind: bytes, message: Any) -> None:
+def _add_sentence(epoch: _Epoch, kind: bytes, message: Any) -> None:
     if kind == b"GGA":
         for value in (message.lat, message.lon, message.alt, message.sep, message.HDOP):
-            _parse_number(value)
+            _parse_field(value)
         if message.lat != "" and (message.NS not in ("N", "S") or message.EW not in ("E", "W")):
             raise ValueError("no hemisphere")
         epoch.gga = message
     elif kind == b"GST":
         for value in (message.stdLong, message.stdLat, message.stdAlt):
-            _parse_number(value)
+            _parse_field(value)
         epoch.gst = message
     elif kind == b"RMC":
         if message.status == "A" and message.spd != "":
-            epoch.speed, epoch.course = _parse_number(message.spd) * KNOTS, _parse_number(message.cog)
+            epoch.speed, epoch.course = _parse_field(message.spd) * KNOTS, _parse_field(message.cog)
         epoch.date = message.date if isinstance(message.date, datetime.date) else None
     elif kind == b"ZDA":
         try:
@@ -184,11 +184,11 @@ def _note(epoch: _Epoch, kind: bytes, message: Any) -> None:
         except (TypeError, ValueError):
             epoch.date = None
     elif epoch.speed is None and (message.sogk != "" or message.sogn != ""):
-        epoch.speed = _parse_number(message.sogk) * KMH if message.sogk != "" else _parse_number(message.sogn) * KNOTS
-        epoch.course = _parse_number(message.cogt)
+        epoch.speed = _parse_field(message.sogk) * KMH if message.sogk != "" else _parse_field(message.sogn) * KNOTS
+        epoch.course = _parse_field(message.cogt)
 
 
-def _parse_number(value: Any) -> float:
+def _parse_field(value: Any) -> float:
     if value in ("", None):
         return float("nan")
     try:
@@ -226,14 +226,14 @@ def _read_sigmas(fixes: list[_Epoch], remarks: Remarks) -> Array:
     sd = np.full((len(fixes), 3), np.nan)
     for k, e in enumerate(fixes):
         if e.gst is not None:
-            sd[k] = [_parse_number(e.gst.stdLong), _parse_number(e.gst.stdLat), _parse_number(e.gst.stdAlt)]
+            sd[k] = [_parse_field(e.gst.stdLong), _parse_field(e.gst.stdLat), _parse_field(e.gst.stdAlt)]
     without = ~(sd > 0).all(-1)
     if not without.any():
         remarks.add("gnss.sigma_read_as", "position sigmas: from GST")
         return sd
     for k in np.flatnonzero(without).tolist():
         e = fixes[k].gga
-        hdop = _parse_number(e.HDOP)
+        hdop = _parse_field(e.HDOP)
         axis = _BY_QUALITY.get(e.quality, DEFAULT_SD[0]) * (hdop if hdop > 0 else 1.0)
         sd[k] = axis, axis, 2.0 * axis
     remarks.add(
@@ -254,4 +254,4 @@ def _read_velocities(fixes: list[_Epoch], remarks: Remarks) -> tuple[Array | Non
     return v, sd_v
 
 
-FORMAT = log_format("nmea", "NMEA 0183 sentences of a receiver", recognises, load)
+FORMAT = log_format("nmea", "NMEA 0183 sentences of a receiver", recognises, lambda path, _: load(path))

@@ -31,10 +31,10 @@ def count_pulses(
         )
     if kind == "per_row":  # those of row k were counted between rows k-1 and k
         return np.cumsum(pulses) - pulses[0]
-    return np.r_[0.0, np.cumsum(_unwrap(pulses, step, signed, remarks))]
+    return np.r_[0.0, np.cumsum(_count_steps(pulses, step, signed, remarks))]
 
 
-def _unwrap(pulses: Array, step: Array, signed: bool | None, remarks: Remarks) -> Array:
+def _count_steps(pulses: Array, step: Array, signed: bool | None, remarks: Remarks) -> Array:
     """Steps between rows without the jumps of a counter that overflowed or restarted."""
     back = step < 0.0
     if not back.any() or pulses.min() < 0.0:
@@ -54,5 +54,5 @@ def _unwrap(pulses: Array, step: Array, signed: bool | None, remarks: Remarks) -
     for mask, what in ((ran_over & ~anew, f"ran over ({modulus:.0f})"), (anew, "began anew")):
         if mask.any():
             times = "once" if mask.sum() == 1 else f"{mask.sum()} times"
-            remarks.add("odometer.counter_mended", f"the odometer's counter {what} {times}: mended")
+            remarks.add("odometer.counter_mended", f"the odometer's counter {what} {times}: corrected")
     return whole

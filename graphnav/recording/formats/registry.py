@@ -60,14 +60,15 @@ class Format:
     """A format in which a recording, or a part of one, is stored.
 
     `recognises` must be fast and must not raise; `read` and `load` raise RecordingError for anything they cannot use.
+    Both are also told whether files that the source names may lie outside its folder.
     """
 
     name: str
     about: str  # one sentence
     recognises: Callable[[str | Path], bool]
-    read: Callable[[str | Path], Recording]
+    read: Callable[[str | Path, bool], Recording]
     builtin: bool = False  # a name that is always available, such as "kitti", rather than a path
-    load: Callable[[str | Path], Log] | None = None  # for logs of other programs
+    load: Callable[[str | Path, bool], Log] | None = None  # for logs of other programs
     # `load` with named topics, for logs that have topics
     choose: Callable[[str | Path, Sequence[str]], Log] | None = None
 
@@ -76,10 +77,10 @@ def log_format(
     name: str,
     about: str,
     recognises: Callable[[Path], bool],
-    load: Callable[[Path], Log],
+    load: Callable[[Path, bool], Log],
     choose: Callable[[Path, Sequence[str]], Log] | None = None,
 ) -> Format:
-    """Make the `Format` of another program's log."""
+    """Make the `Format` of another program's log; parameters as of `Format`."""
 
     def can_read(source: str | Path) -> bool:
         try:
@@ -87,7 +88,7 @@ def log_format(
         except (OSError, RecordingError):
             return False
 
-    def load_log(source: str | Path, topics: Sequence[str] = ()) -> Log:
+    def load_checked(source: str | Path, load_path: Callable[[Path], Log]) -> Log:
         path = Path(source)
         if not exists(path):
             raise RecordingError(f"{path}: no such file or folder", key="file.missing")
@@ -95,13 +96,20 @@ def log_format(
             check_regular(path)
         from graphnav.recording.formats.soundness import drop_unsound_rows  # which imports this module
 
-        log = choose(path, topics) if choose is not None and topics else load(path)
+        log = load_path(path)
         return replace(_drop_nowhere(drop_unsound_rows(log, path)), files=log.files or _list_files(path))
 
-    return Format(
-        name, about, can_read, lambda source: load_log(source).make_recording(source), load=load_log,
-        choose=None if choose is None else load_log,
-    )  # fmt: skip
+    def load_log(source: str | Path, allow_outside: bool) -> Log:
+        return load_checked(source, lambda path: load(path, allow_outside))
+
+    def read_log(source: str | Path, allow_outside: bool) -> Recording:
+        return load_log(source, allow_outside).make_recording(source)
+
+    def load_topics(source: str | Path, topics: Sequence[str]) -> Log:
+        assert choose is not None
+        return load_checked(source, lambda path: choose(path, topics))
+
+    return Format(name, about, can_read, read_log, load=load_log, choose=None if choose is None else load_topics)
 
 
 def _drop_nowhere(log: Log) -> Log:

@@ -97,7 +97,7 @@ def select_usable_rows(
     if (later := find_restarts((rows["t"] - offset) / scale, scale)) is not None:
         remarks.add(
             f"{sensor}.clock_again",
-            f"the clock of the {label} starts again from 0: {later.max() * scale:g} s are added after it",
+            f"the clock of the {label} restarts at 0: {later.max() * scale:g} s are added after it",
         )
         rows = rows.with_column("t", rows["t"] + later * scale)
     t = rows["t"]

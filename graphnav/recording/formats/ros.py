@@ -58,7 +58,7 @@ def load(path: Path, wanted: Sequence[str] = ()) -> Log:
         If the bag cannot be read or holds none of these.
     """
     remarks = Remarks()
-    topics, others = _read(path)
+    topics, others = _read_topics(path)
     if not topics:
         kinds = ", ".join(sorted(others)[:6]) or "nothing"
         raise RecordingError(
@@ -78,8 +78,8 @@ def load(path: Path, wanted: Sequence[str] = ()) -> Log:
             left = ", ".join(t.name for t in found[1:])
             why = "as was asked" if found[0].name in wanted else "having the most messages"
             remarks.add("log.topic", f"{found[0].name} is used, {why}; not {left}")
-    imu = _read_imu(ranked["imu"][0], remarks) if "imu" in ranked else None
-    gnss = _read_gnss(ranked["fix"][0], remarks) if "fix" in ranked else None
+    imu = _make_imu(ranked["imu"][0], remarks) if "imu" in ranked else None
+    gnss = _make_gnss(ranked["fix"][0], remarks) if "fix" in ranked else None
     if "velocity" in ranked:
         gnss = _add_velocity(ranked["velocity"][0], gnss, remarks)
     odometer = _read_wheel(ranked["wheel"][0], remarks) if "wheel" in ranked else None
@@ -107,7 +107,7 @@ def _find_role(topic: _Topic) -> str:
     return "wheel" if topic.kind == _TWISTS[2] or across <= _SIDEWAYS else "velocity"
 
 
-def _read(path: Path) -> tuple[list[_Topic], set[str]]:
+def _read_topics(path: Path) -> tuple[list[_Topic], set[str]]:
     """The usable topics with their rows, and the types of the others."""
     from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
@@ -150,7 +150,7 @@ def _build_table(topic: _Topic) -> tuple[Array, Array]:
     return t, rows[first]
 
 
-def _read_imu(topic: _Topic, remarks: Remarks) -> Imu | None:
+def _make_imu(topic: _Topic, remarks: Remarks) -> Imu | None:
     t, rows = _build_table(topic)
     good = np.isfinite(rows[:, :6]).all(-1)
     if good.sum() < 2:
@@ -174,7 +174,7 @@ def _read_imu(topic: _Topic, remarks: Remarks) -> Imu | None:
     return Imu(t, rows[:, :3] @ R_bs.T, rows[:, 3:6] @ R_bs.T, noise, R_bs, assumed)
 
 
-def _read_gnss(topic: _Topic, remarks: Remarks) -> Gnss | None:
+def _make_gnss(topic: _Topic, remarks: Remarks) -> Gnss | None:
     t, rows = _build_table(topic)
     good = np.isfinite(rows[:, :3]).all(-1) & (rows[:, 6] >= 0) & (rows[:, :2] != 0).any(-1)
     if not good.any():
@@ -232,4 +232,4 @@ def _add_velocity(topic: _Topic, gnss: Gnss | None, remarks: Remarks) -> Gnss | 
     return replace(gnss, v=v, sd_v=sd_v)
 
 
-FORMAT = log_format("ros", "ROS 1 or ROS 2 bags and MCAP files", recognises, load, load)
+FORMAT = log_format("ros", "ROS 1 or ROS 2 bags and MCAP files", recognises, lambda path, _: load(path), load)

@@ -66,4 +66,4 @@ def load(path: Path) -> Log:
     return Log(path.stem, gnss=gnss, gps_zero=track.gps_zero, remarks=tuple(remarks))
 
 
-FORMAT = log_format("rtklib", "positions computed by RTKLIB, .pos", recognises, load)
+FORMAT = log_format("rtklib", "positions computed by RTKLIB, .pos", recognises, lambda path, _: load(path))

@@ -217,9 +217,9 @@ class RawGnssTable(TomlTable):
     @model_validator(mode="after")
     def _check_place(self) -> RawGnssTable:
         if self.clk is not None and self.sp3 is None:
-            raise ValueError("clk says nothing without sp3")
+            raise ValueError("clk has no effect without sp3")
         if self.antex is not None and self.sp3 is None:
-            raise ValueError("antex says nothing without sp3")
+            raise ValueError("antex has no effect without sp3")
         return self
 
 
@@ -248,7 +248,7 @@ class OdometerTable(SensorTable):
             raise ValueError("say either metres_per_pulse (pulses are used) or use (the speeds of wheels are)")
         for key, needs in (("pulses", self.pulses is not None), ("columns.pulses", "pulses" in self.columns)):
             if needs and self.metres_per_pulse is None:
-                raise ValueError(f"{key} says nothing without metres_per_pulse, the way of one pulse in m")
+                raise ValueError(f"{key} has no effect without metres_per_pulse, the way of one pulse in m")
         return self
 
     def list_readings(self, there: Sequence[str]) -> tuple[str, ...]:

@@ -103,7 +103,7 @@ def read_table(
         Naming file, line, column and cell, for anything that is not a table of numbers.
     """
     renamed = dict(renamed or {})
-    skip, header = _read_header(path)
+    skip, header = _find_header(path)
     if keep is not None:
         required, renamed = (*required, Table.KEEP), {**renamed, Table.KEEP: keep}
     file_names = {}
@@ -144,7 +144,7 @@ def read_column_names(path: Path) -> list[str]:
     RecordingError
         If the file is none.
     """
-    return _read_header(path)[1]
+    return _find_header(path)[1]
 
 
 def read_first_rows(path: Path, count: int) -> list[list[str]]:
@@ -191,7 +191,7 @@ def _open_bytes(path: Path) -> IO[bytes]:
     return file
 
 
-def _read_header(path: Path) -> tuple[int, list[str]]:
+def _find_header(path: Path) -> tuple[int, list[str]]:
     """Number of lines before the data, and the column names."""
     with _open_bytes(path) as raw:
         start = raw.read(1 << 16)

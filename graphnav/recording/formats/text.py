@@ -36,7 +36,8 @@ def parse_table(
     whole = delimiter is None or all(line.count(delimiter) == len(names) - 1 for line in lines)
     if delimiter == "," and whole:
         lines = [
-            _fill(line) if ",," in line or line.rstrip()[-1:] == "," or line[:1] == "," else line for line in lines
+            _fill_blanks(line) if ",," in line or line.rstrip()[-1:] == "," or line[:1] == "," else line
+            for line in lines
         ]
     try:
         if whole:
@@ -65,5 +66,5 @@ def parse_table(
     raise RecordingError(f"{path}: cannot be read as a table of numbers", key="table.unreadable")
 
 
-def _fill(line: str) -> str:
+def _fill_blanks(line: str) -> str:
     return ",".join(field.strip() or "nan" for field in line.split(","))

@@ -72,7 +72,7 @@ def load(path: Path) -> Log:
     zero = dated[0] if dated else None
     if fixes and zero is None:
         remarks.add("log.clock_unknown", "clock: no NAV-PVT has a date, so the GPS week is not known")
-    gnss = _read_gnss(fixes, content, remarks) if fixes else None
+    gnss = _make_gnss(fixes, content, remarks) if fixes else None
     imu, odometer = _read_sensors(path, content, remarks)
     if zero is not None:
         remarks.add("log.clock", "clock: seconds of the GPS week (iTOW)")
@@ -114,11 +114,11 @@ def _collect_messages(path: Path) -> _Content:
             elif kind == _HP:
                 content.precise[message.iTOW] = message
             else:
-                tag = _note(content, message, kind == _RAW) or tag
+                tag = _add_message(content, message, kind == _RAW) or tag
     return content
 
 
-def _note(content: _Content, message: Any, is_raw: bool) -> int | None:
+def _add_message(content: _Content, message: Any, is_raw: bool) -> int | None:
     """Add the samples of one ESF message; returns its newest time tag."""
     tag = None if is_raw else int(message.timeTag)
     count = 0
@@ -160,7 +160,7 @@ def _unroll_tow(messages: list[Any]) -> Array:
     return np.asarray(t + WEEK * np.cumsum(np.concatenate([[0.0], np.diff(t) < -0.5 * WEEK])))
 
 
-def _read_gnss(fixes: list[Any], content: _Content, remarks: Remarks) -> Gnss:
+def _make_gnss(fixes: list[Any], content: _Content, remarks: Remarks) -> Gnss:
     t = _unroll_tow(fixes)
     best = [content.precise.get(m.iTOW, m) for m in fixes]
     best = [m if p is not m and getattr(p, "invalidLlh", False) else p for p, m in zip(best, fixes, strict=True)]
@@ -262,4 +262,9 @@ def _fit_clock(content: _Content, remarks: Remarks) -> tuple[float, float]:
     return tick, float(np.median(t - tick * tags))
 
 
-FORMAT = log_format("ubx", "u-blox UBX messages: NAV-PVT and, where present, ESF-MEAS or ESF-RAW", recognises, load)
+FORMAT = log_format(
+    "ubx",
+    "u-blox UBX messages: NAV-PVT and, where present, ESF-MEAS or ESF-RAW",
+    recognises,
+    lambda path, _: load(path),
+)

@@ -196,16 +196,20 @@ def _write_toml(log: Log) -> str:
             "[gnss]",
             'file = "gnss.csv.gz"           # t,lat,lon,h,...; s, deg, m, m/s; 1-sigmas in m and m/s',
         ]
-        lines += [f"lever_arm = {_show(log.gnss.lever_arm)}    # from the IMU to the antenna, m: right, forward, up"]
+        lines += [
+            f"lever_arm = {_format_list(log.gnss.lever_arm)}    # from the IMU to the antenna, m: right, forward, up"
+        ]
     if log.odometer is not None:
         lines += ["", "[odometer]", 'file = "odometer.csv.gz"       # t,speed; s, m/s, forward positive']
-        lines += [f"lever_arm = {_show(log.odometer.lever_arm)}    # to the point that does not slip sideways, m"]
+        lines += [
+            f"lever_arm = {_format_list(log.odometer.lever_arm)}    # to the point that does not slip sideways, m"
+        ]
         lines += _write_odometer_keys(log.odometer)
     for name, series in log.sensors.items():
         units = ", ".join(f"{c.name} in {next(iter(c.units))}" for c in series.sensor.columns)
         lines += ["", f"[{name}]", f'file = "{name}.csv.gz"'.ljust(31) + f"# t in s; {units}"]
         lines += [
-            f"{key} = {_format_value(value)}" for key, value in series.figures.model_dump(exclude_none=True).items()
+            f"{key} = {_format_toml(value)}" for key, value in series.figures.model_dump(exclude_none=True).items()
         ]
     if log.truth is not None:
         lines += ["", "[truth]                        # only for evaluation"]
@@ -244,12 +248,12 @@ def _write_noise(noise: ImuNoise, assumed: bool) -> list[str]:
     return lines
 
 
-def _format_value(value: Any) -> str:
+def _format_toml(value: Any) -> str:
     """JSON's numbers, strings and lists are valid TOML."""
     return quote(value) if isinstance(value, str) else json.dumps(value)
 
 
-def _show(values: Array) -> str:
+def _format_list(values: Array) -> str:
     return "[" + ", ".join(repr(float(x)) for x in values) + "]"
 
 

@@ -25,38 +25,38 @@ _T, _RATE, _FORCE, _LAT_LON, _M, _M_S, _DEG = 6, 9, 7, 10, 4, 5, 7
 def round_recording(recording: Recording) -> Recording:
     """The recording rounded to the digits of its files: what is written is what is read again."""
     imu = recording.imu
-    imu = replace(imu, t=_cut(imu.t, _T), gyro=_cut(imu.gyro, _RATE), accel=_cut(imu.accel, _FORCE))
+    imu = replace(imu, t=_round_to(imu.t, _T), gyro=_round_to(imu.gyro, _RATE), accel=_round_to(imu.accel, _FORCE))
     gnss, odometer, truth = recording.gnss, recording.odometer, recording.truth
     if gnss is not None:
-        v, sd_v, llh = gnss.v, gnss.sd_v, _cut_llh(gnss.llh)
+        v, sd_v, llh = gnss.v, gnss.sd_v, _round_llh(gnss.llh)
         gnss = replace(
-            gnss, t=_cut(gnss.t, _T), llh=llh, sd=_cut(gnss.sd, _M), rounding=measure_rounding(llh),
-            v=None if v is None else _cut(v, _M_S), sd_v=None if sd_v is None else _cut(sd_v, _M_S),
+            gnss, t=_round_to(gnss.t, _T), llh=llh, sd=_round_to(gnss.sd, _M), rounding=measure_rounding(llh),
+            v=None if v is None else _round_to(v, _M_S), sd_v=None if sd_v is None else _round_to(sd_v, _M_S),
         )  # fmt: skip
     if odometer is not None:
-        wheels = None if odometer.wheels is None else _cut(odometer.wheels, _M_S)
-        odometer = replace(odometer, t=_cut(odometer.t, _T), speed=_cut(odometer.speed, _M_S), wheels=wheels)
+        wheels = None if odometer.wheels is None else _round_to(odometer.wheels, _M_S)
+        odometer = replace(odometer, t=_round_to(odometer.t, _T), speed=_round_to(odometer.speed, _M_S), wheels=wheels)
     if truth is not None and truth.llh is not None:
         v, rph = truth.v, truth.rph
         truth = replace(
-            truth, t=_cut(truth.t, _T), llh=_cut_llh(truth.llh), v=None if v is None else _cut(v, _M_S),
+            truth, t=_round_to(truth.t, _T), llh=_round_llh(truth.llh), v=None if v is None else _round_to(v, _M_S),
             rph=None if rph is None else _convert_to_degrees(rph) * ANGLE["deg"],
         )  # fmt: skip
     return replace(recording, imu=imu, gnss=gnss, odometer=odometer, truth=truth)
 
 
-def _cut(values: Array, digits: int) -> Array:
+def _round_to(values: Array, digits: int) -> Array:
     return np.round(values, digits)
 
 
-def _cut_llh(llh: Array) -> Array:
+def _round_llh(llh: Array) -> Array:
     return np.column_stack([np.round(llh[:, :2] / ANGLE["deg"], _LAT_LON) * ANGLE["deg"], np.round(llh[:, 2], _M)])
 
 
 def _convert_to_degrees(rph: Array) -> Array:
     """Roll and pitch unchanged, heading from 0 to below 360."""
-    degrees = _cut(rph / ANGLE["deg"], _DEG)
-    degrees[:, 2] = _cut(np.mod(degrees[:, 2], 360.0), _DEG) % 360.0
+    degrees = _round_to(rph / ANGLE["deg"], _DEG)
+    degrees[:, 2] = _round_to(np.mod(degrees[:, 2], 360.0), _DEG) % 360.0
     return degrees
 
 

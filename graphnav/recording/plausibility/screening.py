@@ -127,7 +127,7 @@ def screen(recording: Recording) -> Screened:
     """
     if recording.screened:
         return Screened(recording)
-    recording, of_imu, of_aiding, track = _drop_impossible(recording)
+    recording, of_imu, of_aiding, track = _screen_rows(recording)
     dead, clock = list(check_dead_axes(recording)), None
     findings = [*of_imu, *dead, *of_aiding]
     wrong_unit = any(f.key in _UNIT_FINDINGS for f in of_imu)
@@ -152,7 +152,7 @@ def screen(recording: Recording) -> Screened:
     return Screened(recording, tuple(findings), clock)
 
 
-def _drop_impossible(recording: Recording) -> tuple[Recording, list[Finding], list[Finding], Track | None]:
+def _screen_rows(recording: Recording) -> tuple[Recording, list[Finding], list[Finding], Track | None]:
     """The recording without impossible rows, findings on the IMU and on the others, and the track by the fixes."""
     of_imu: list[Finding] = list(check_imu_scale(recording))
     if not of_imu:  # where a unit is wrong throughout, single rows cannot be judged

@@ -49,7 +49,7 @@ def plot_detections(recording: Recording, found: Sequence[Detection]) -> Figure:
     ]
     if speeds:
         rows.append(("speed [m/s]", "m/s", find_axis_limits([y for _, _, y, _ in speeds]), False))
-    rows += [(f"{name}: statistic", "", _find_limits(every), True) for name, every in by_name.items()]
+    rows += [(f"{name}: statistic", "", _find_axis_limits(every), True) for name, every in by_name.items()]
     pictured = [d for d in found if "spectrogram" in d.details and len(d.details["spectrogram_t"]) > 1]
     if pictured:
         f = pictured[0].details["spectrogram_frequency"]
@@ -100,7 +100,7 @@ def _collect_speeds(recording: Recording) -> list[tuple[str, Array, Array, str]]
     return out
 
 
-def _find_limits(every: Sequence[Detection]) -> tuple[float, float]:
+def _find_axis_limits(every: Sequence[Detection]) -> tuple[float, float]:
     values = [np.log10(np.maximum(v, _LOWEST)) for d in every for v in (d.statistic, np.atleast_1d(d.threshold))]
     return find_axis_limits(values, floor=0.5, always=values[1::2])
 
