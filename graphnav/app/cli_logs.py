@@ -200,8 +200,8 @@ def init(
                 write_csv(part / made, list(columns), list(columns.values()))
             (part / out.name).write_text(drafted.text, encoding="utf-8")
         tell("checking")
-        with permit_outside(True):  # the logs are where the user says
-            refuse(recording := read(out), screen(recording).findings)
+        # the logs are where the user says
+        refuse(recording := read(out, allow_outside=True), screen(recording).findings)
     files = [out, *(folder / made for made in drafted.made)]
     print_out(
         lambda: "\n".join(

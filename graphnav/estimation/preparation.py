@@ -33,7 +33,7 @@ from graphnav.estimation.noise.exclusion import (
     estimate_without_faults,
 )
 from graphnav.estimation.noise.initial_points import BREAKDOWN
-from graphnav.estimation.noise.model import STATED, LeverArm, NoiseModel
+from graphnav.estimation.noise.model import STATED, NoiseModel
 from graphnav.estimation.noise.spacing import space_fixes
 from graphnav.estimation.noise.words import describe_noise
 from graphnav.estimation.problem import Problem
@@ -181,12 +181,8 @@ def _find_noise(
         built = without
         again = estimate_noise(built.problem, built.aligned.until, best.noise, progress=progress)
         best = replace(again, passes=best.passes + again.passes)
-    built, best, arm = _free_contradicted_arm(builder, built, best, progress)
     best = estimate_disturbed_intervals(built.problem, best)
-    if arm is not None:
-        arm = narrow_arm(built.problem, best, arm)
-        built = replace(built, problem=free_arm(built.problem, arm))
-        best = replace(best, noise=replace(best.noise, lever_arm=arm))
+    built, best = _free_contradicted_arm(builder, built, best, progress)
     passes.update(best.passes + Counter(filter=1))
     wanted = weigh is not None and weigh(built.problem, best.points)
     evidence = log_evidence(built.problem, best) if wanted else np.inf
@@ -210,22 +206,27 @@ def _estimate(
 
 def _free_contradicted_arm(
     builder: ProblemBuilder, built: BuiltProblem, best: NoiseEstimate, progress: Progress | None
-) -> tuple[BuiltProblem, NoiseEstimate, LeverArm | None]:
+) -> tuple[BuiltProblem, NoiseEstimate]:
     """The estimate with the antenna's lever arm as a parameter, where the drive contradicts the one that is stated.
 
-    Returns the same objects and None where it does not.
+    Returns the same problem where it does not. To be asked when all else that may be wrong is known: a gyro that misses
+    a turn looks like an arm.
     """
     problem = apply_noise(built.problem, best.noise)
     arm = find_contradicted_arm(problem, best.points)
     passes = best.passes + Counter(filter=1)
     if arm is None:
-        return built, replace(best, passes=passes), None
+        return built, replace(best, passes=passes)
     freed = replace(built, problem=free_arm(built.problem, arm))
     try:
         found = _estimate(freed, builder.settings, progress, (best.points, problem))
+        found = estimate_disturbed_intervals(freed.problem, found)
     except BREAKDOWN:
-        return built, replace(best, passes=passes), None
-    return freed, replace(found, passes=passes + found.passes + Counter(filter=1)), arm
+        return built, replace(best, passes=passes)
+    arm = narrow_arm(freed.problem, found, arm)
+    noise = replace(found.noise, lever_arm=arm)
+    best = replace(found, noise=noise, passes=passes + found.passes + Counter(filter=1))
+    return replace(freed, problem=free_arm(freed.problem, arm)), best
 
 
 def _is_likelier(base: Problem, plain: NoiseModel, found: NoiseEstimate) -> bool:

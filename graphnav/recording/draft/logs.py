@@ -153,8 +153,7 @@ def read_log(path: Path, topics: Sequence[str] = ()) -> dict[str, Source]:
         roles.append("gnss")
     elif sensor == "imu" and "speed" in columns.names:
         roles.append("odometer")
-<<<<<<< HEAD
-    found = {role: _read(path, columns, role, plain) for role in roles}
+    found = {role: _read_sensor(path, columns, role, plain) for role in roles}
     for role, source in found.items():
         source.second = _find_second(header, columns, WANTED[role][1:3] if role == "gnss" else WANTED[role][1:])
     return found
@@ -165,9 +164,6 @@ def _find_second(header: list[str], columns: matching.FileColumns, core: Sequenc
     rest = matching.match_columns([name for name in header if name not in columns.names.values()]).names
     names = [rest[ours] for ours in core if ours in rest]
     return f"{names[0]} to {names[-1]}" if len(names) == len(core) else ""
-=======
-    return {role: _read_sensor(path, columns, role, plain) for role in roles}
->>>>>>> work-T
 
 
 def _make_times_error(path: Path, header: list[str], words: dict[str, str]) -> NoSensorError:

@@ -109,13 +109,8 @@ def read_plain(path: Path) -> Plain | None:
     if layout.mark != "," or '"' in text:  # else no number has a comma in it
         cells, style = _write_plainly(cells, layout.mark)
         done += style
-<<<<<<< HEAD
-    columns = {name: x for name, some in cells.items() if (x := _parse_numbers(some)) is not None}
-    done += [*_add_nanoseconds(columns), *read_angles(cells, columns)]
-=======
     columns = {name: x for name, some in cells.items() if (x := _parse_column(some)) is not None}
-    done += _add_nanoseconds(columns)
->>>>>>> work-T
+    done += [*_add_nanoseconds(columns), *read_angles(cells, columns)]
     dated, daily, more = _parse_times(cells, columns, layout.above)
     words = {name: next(filter(None, some), "") for name, some in cells.items() if name not in columns}
     return Plain(columns, ", ".join([*done, *more]), dated, daily, words) if done or more else None
@@ -269,15 +264,10 @@ def _add_nanoseconds(columns: dict[str, Array]) -> list[str]:
     return []
 
 
-<<<<<<< HEAD
-def _parse_numbers(cells: Sequence[str]) -> Array | None:
+def _parse_column(cells: Sequence[str]) -> Array | None:
     """A column as numbers, NaN where blank; None where it contains anything else, or only words for nothing."""
     if all(map(is_blank, cells)) and any(cells):
         return None
-=======
-def _parse_column(cells: Sequence[str]) -> Array | None:
-    """A column as numbers, NaN where blank; None where it contains anything else."""
->>>>>>> work-T
     try:
         return np.array([np.nan if is_blank(c) else parse_number(c.replace(",", ".")) for c in cells])
     except ValueError:
