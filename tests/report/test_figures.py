@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import math
 from pathlib import Path
 
 import pytest
@@ -50,7 +51,14 @@ def test_figures_in_data_sheet_units(key, text, si):
 
 @pytest.mark.parametrize("key", FIGURE_UNITS)
 def test_the_example_in_every_error_is_understood(key):
-    assert parse_figure(key, EXAMPLES[key]) > 0
+    deg, g, hour = math.pi / 180.0, 9.80665, 3600.0
+    known = {
+        "gyro_noise_density": 0.15 * deg / 60.0, "accel_noise_density": 60e-6 * g,
+        "gyro_bias_walk": 2.0 * deg / hour / 60.0, "accel_bias_walk": 20e-6 * g / 60.0,
+        "gyro_bias_sigma": 7.0 * deg / hour, "accel_bias_sigma": 5e-3 * g,
+        "gyro_scale_sigma": 300e-6, "accel_scale_sigma": 1e-3,
+    }  # fmt: skip
+    assert parse_figure(key, EXAMPLES[key]) == pytest.approx(known[key], rel=1e-12)
 
 
 @pytest.mark.parametrize(
