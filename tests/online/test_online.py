@@ -490,10 +490,10 @@ def test_killed_and_resumed_it_ends_with_the_same(
 
 def consumed(out: Path) -> int:
     """IMU rows in the checkpoint and the journal after it, roughly: enough to know that all came."""
-    from graphnav.online.store import CHECKPOINT, _read
+    from graphnav.online.store import CHECKPOINT, _read_checkpoint
 
     try:
-        found = _read(out / CHECKPOINT)
+        found = _read_checkpoint(out / CHECKPOINT)
         journal = out / f"journal-{found.journal:06d}"
         more = journal.read_bytes().count(b"I,") if journal.exists() else 0
     except (OSError, ConfigError):
