@@ -213,17 +213,16 @@ def _free_contradicted_arm(
     a turn looks like an arm.
     """
     problem = apply_noise(built.problem, best.noise)
-    arm = find_contradicted_arm(problem, best.points)
     passes = best.passes + Counter(filter=1)
-    if arm is None:
-        return built, replace(best, passes=passes)
-    freed = replace(built, problem=free_arm(built.problem, arm))
     try:
+        if (arm := find_contradicted_arm(problem, best.points)) is None:
+            return built, replace(best, passes=passes)
+        freed = replace(built, problem=free_arm(built.problem, arm))
         found = _estimate(freed, builder.settings, progress, (best.points, problem))
         found = estimate_disturbed_intervals(freed.problem, found)
+        arm = narrow_arm(freed.problem, found, arm)
     except BREAKDOWN:
         return built, replace(best, passes=passes)
-    arm = narrow_arm(freed.problem, found, arm)
     noise = replace(found.noise, lever_arm=arm)
     best = replace(found, noise=noise, passes=passes + found.passes + Counter(filter=1))
     return replace(freed, problem=free_arm(freed.problem, arm)), best
