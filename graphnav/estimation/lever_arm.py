@@ -7,7 +7,8 @@ more evidence: with m and P what the filter finds of the change, and S its prior
 
     ln p(z | freed) - ln p(z | stated) = (m^T P^-1 m + ln |P| - ln |S|) / 2
 
-as all is linear and Gaussian in it (MacKay 1992, "Bayesian interpolation"). Then all is estimated anew.
+as all is linear and Gaussian in it (MacKay 1992, "Bayesian interpolation"). Then all is estimated anew, which stands if
+the evidence of the measurements is no smaller than before.
 
 A filter that does not know the arm before the first bend is worse than one that has it wrong by a decimetre. So the arm
 is used as the whole drive finds it, like the figures of the noise model, with a prior `_WIDER` times as wide as what is

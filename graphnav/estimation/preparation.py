@@ -36,6 +36,7 @@ from graphnav.estimation.noise.initial_points import BREAKDOWN
 from graphnav.estimation.noise.model import STATED, NoiseModel
 from graphnav.estimation.noise.spacing import space_fixes
 from graphnav.estimation.noise.words import describe_noise
+from graphnav.estimation.offsets import is_offset_far
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import CarrierArcs
 from graphnav.estimation.solvers.ekf import ekf, refilter, smooth_near
@@ -210,8 +211,10 @@ def _free_contradicted_arm(
     """The estimate with the antenna's lever arm as a parameter, where the drive contradicts the one that is stated.
 
     Returns the same problem where it does not. To be asked when all else that may be wrong is known: a gyro that misses
-    a turn looks like an arm.
+    a turn looks like an arm, and so do stamps that are still to be moved.
     """
+    if is_offset_far(built.problem, best.points):
+        return built, best
     problem = apply_noise(built.problem, best.noise)
     passes = best.passes + Counter(filter=1)
     try:
@@ -220,11 +223,15 @@ def _free_contradicted_arm(
         freed = replace(built, problem=free_arm(built.problem, arm))
         found = _estimate(freed, builder.settings, progress, (best.points, problem))
         found = estimate_disturbed_intervals(freed.problem, found)
+        passes = passes + found.passes + Counter(filter=1)
+        # by other figures the freed arm may lead to an optimum that is worse than the one with the arm as stated
+        if log_evidence(freed.problem, found) < log_evidence(built.problem, best):
+            return built, replace(best, passes=passes)
         arm = narrow_arm(freed.problem, found, arm)
     except BREAKDOWN:
         return built, replace(best, passes=passes)
     noise = replace(found.noise, lever_arm=arm)
-    best = replace(found, noise=noise, passes=passes + found.passes + Counter(filter=1))
+    best = replace(found, noise=noise, passes=passes)
     return replace(freed, problem=free_arm(freed.problem, arm)), best
 
 

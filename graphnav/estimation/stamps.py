@@ -18,20 +18,20 @@ from dataclasses import replace
 from typing import Any
 
 from graphnav.config import Settings
-from graphnav.constraints.gnss import OFFSETS, TIME_OFFSET, VELOCITY_TIME_OFFSET, GnssPosition, GnssVelocity
+from graphnav.constraints.gnss import TIME_OFFSET, VELOCITY_TIME_OFFSET, GnssPosition, GnssVelocity
 from graphnav.constraints.vehicle import ODOMETER_DELAY
 from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.estimation.noise.model import NoiseModel, RowWeights, StampOffsets
+from graphnav.estimation.offsets import LINEAR_OFFSET, is_offset_far
 from graphnav.estimation.preparation import Prepared, Weigh
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import ConstraintRecord, ExcludedSpan, ParameterEstimate, Solution
 from graphnav.estimation.solvers.linearise import Points
-from graphnav.estimation.solvers.passes import compute_sigmas, estimate_parameters, split_values
+from graphnav.estimation.solvers.passes import compute_sigmas, estimate_parameters
 from graphnav.recording import Recording
 from graphnav.recording.checks.clock import FAIR, ClockOffsets, is_certain
 
-_LINEAR_OFFSET = 0.3  # s from the linearisation point: above
 _SIGNIFICANT = 3.0  # sigmas
 _MOVES = 3  # of moving the stamps
 _AS_THEY_ARE = StampOffsets()
@@ -58,7 +58,7 @@ def find_stamps(
     clock : offsets between IMU and fixes that the recording shows before any estimation.
     """
     guess = None if clock is None else _guess(clock)
-    plain: _Candidate = recording, prepare(recording, _is_far if guess is None else _accept_all), _AS_THEY_ARE
+    plain: _Candidate = recording, prepare(recording, is_offset_far if guess is None else _accept_all), _AS_THEY_ARE
     starts = [] if guess is None else [_move(recording, prepare, guess)]
     for start in (*starts, plain):
         found = _settle(recording, prepare, start)
@@ -85,12 +85,6 @@ def _accept_all(problem: Problem, points: Points) -> bool:
     return True
 
 
-def _is_far(problem: Problem, points: Points) -> bool:
-    """Whether an offset is far from where its rows are linearised."""
-    values = split_values(problem, points)
-    return any(abs(float(values[name][0, 0])) > _LINEAR_OFFSET for name in OFFSETS.values() if name in values)
-
-
 def _guess(clock: ClockOffsets) -> StampOffsets | None:
     """Offsets that the clocks of IMU and fixes show, where they are certain and far."""
     if clock.late is None and clock.apart is None:
@@ -101,12 +95,12 @@ def _guess(clock: ClockOffsets) -> StampOffsets | None:
     between = 0.0 if clock.apart is None or clock.between is None else clock.between.lag
     odometer = velocities if clock.of_imu else 0.0
     guess = _join(StampOffsets(velocities + between, velocities, odometer))
-    return guess if max(abs(guess.positions), abs(guess.velocities)) > _LINEAR_OFFSET else None
+    return guess if max(abs(guess.positions), abs(guess.velocities)) > LINEAR_OFFSET else None
 
 
 def _join(offsets: StampOffsets) -> StampOffsets:
     """Offsets with one for positions and velocities where they hardly differ: each has keyframes of its own else."""
-    near = abs(offsets.velocities - offsets.positions) <= _LINEAR_OFFSET
+    near = abs(offsets.velocities - offsets.positions) <= LINEAR_OFFSET
     return replace(offsets, velocities=offsets.positions) if near else offsets
 
 
@@ -117,7 +111,7 @@ def _estimate(prepared: Prepared, at: StampOffsets) -> StampOffsets:
     for key, name in (("positions", TIME_OFFSET), ("velocities", VELOCITY_TIME_OFFSET)):
         if name in found:
             off, sigma = float(found[name].value[0, 0]), float(found[name].sigma[0, 0])
-            if abs(off) > max(_LINEAR_OFFSET, _SIGNIFICANT * sigma):
+            if abs(off) > max(LINEAR_OFFSET, _SIGNIFICANT * sigma):
                 new[key] = getattr(at, key) + off
     if not new:
         return at
