@@ -20,6 +20,7 @@ from graphnav.core.progress import tell
 from graphnav.core.rotation import Array
 from graphnav.detectors import detect
 from graphnav.estimation.alignment import align
+from graphnav.estimation.lever_arm import ARM_SIGMA
 from graphnav.estimation.noise.apply import apply_noise
 from graphnav.estimation.noise.estimate import estimate_noise
 from graphnav.estimation.pipeline import choose_origin
@@ -30,7 +31,6 @@ from graphnav.estimation.solvers.passes import compute_sigmas, estimate_paramete
 from graphnav.estimation.solvers.rts import smooth_backward
 from graphnav.recording import Recording, take_rows
 
-_PRIOR_SIGMA = 2.0  # m, 1-sigma before the drive
 _PRECISE = 0.3  # m, 1-sigma of fixes that are precise enough
 _LEAST_PART = 0.25  # m, of a component of an arm whose sign matters, or of its error: tape measures are better
 _OPPOSITE = 0.5  # ratio of the distances of the estimate from the opposite sign and from the stated one
@@ -178,7 +178,7 @@ def _estimate(recording: Recording) -> tuple[Antenna, tuple[Array, Array, Array]
         raise EstimationError(
             f"'{recording.name}': without motion nothing tells where the antenna is", key="antenna.no_motion"
         )
-    unknown = {"gnss": {"lever_arm_sigma": _PRIOR_SIGMA}, "vehicle": {"axle_sigma": _PRIOR_SIGMA}}
+    unknown = {"gnss": {"lever_arm_sigma": ARM_SIGMA}, "vehicle": {"axle_sigma": ARM_SIGMA}}
     sections = {name: getattr(settings, name).model_copy(update=values) for name, values in unknown.items()}
     settings = settings.model_copy(update=sections)
     base = build_problem(recording, settings, frame, aligned.state, aligned.sigma, still, parts_of_noise=True)

@@ -67,13 +67,11 @@ def find_contradicted_arm(problem: Problem, about: Points) -> LeverArm | None:
     some = np.abs(off) > _SIGNIFICANT * np.sqrt(np.diagonal(P))
     if not some.any():
         return None
-    if not some.all():  # given that the others are as stated
-        gain = P[np.ix_(some, ~some)] @ np.linalg.inv(P[np.ix_(~some, ~some)])
-        off[some] -= gain @ off[~some]
-        off[~some] = 0.0
-        P = P[np.ix_(some, some)] - gain @ P[np.ix_(~some, some)]
-    else:
-        P = P[np.ix_(some, some)]
+    # given that the others, if any, are as stated
+    gain = P[np.ix_(some, ~some)] @ np.linalg.inv(P[np.ix_(~some, ~some)])
+    off[some] -= gain @ off[~some]
+    off[~some] = 0.0
+    P = P[np.ix_(some, some)] - gain @ P[np.ix_(~some, some)]
     if compute_evidence_gain(off[some], P) <= 0.0:
         return None
     sigma = np.full(3, _KNOWN)

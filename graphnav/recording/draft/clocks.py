@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from graphnav.core.rotation import Array
+from graphnav.core.timescales import DAY
 
-DAY = 86400.0  # s
 _EPOCH = 25569.0  # 1 January 1970 as a spreadsheet counts days
 _DAYS = 30000.0, 80000.0  # of the years 1982 to 2119
 _LARGEST_STEP = 10.0 / DAY  # days between rows of a log; in s none has so little

@@ -11,10 +11,9 @@ import numpy as np
 
 from graphnav.core.errors import RecordingError
 from graphnav.core.rotation import Array
-from graphnav.core.timescales import GPS_TO_UNIX
+from graphnav.core.timescales import DAY, GPS_TO_UNIX
 from graphnav.recording.draft import columns as matching
 from graphnav.recording.draft import guesses, motion
-from graphnav.recording.draft.clocks import DAY
 from graphnav.recording.draft.guesses import Guess
 from graphnav.recording.draft.logs import WANTED, NoSensorError, Source, read_log
 from graphnav.recording.draft.parts import join_parts

@@ -88,7 +88,7 @@ def log_format(
         except (OSError, RecordingError):
             return False
 
-    def load_checked(source: str | Path, load_path: Callable[[Path], Log]) -> Log:
+    def check_and_load(source: str | Path, load_path: Callable[[Path], Log]) -> Log:
         path = Path(source)
         if not exists(path):
             raise RecordingError(f"{path}: no such file or folder", key="file.missing")
@@ -100,14 +100,14 @@ def log_format(
         return replace(_drop_nowhere(drop_unsound_rows(log, path)), files=log.files or _list_files(path))
 
     def load_log(source: str | Path, allow_outside: bool) -> Log:
-        return load_checked(source, lambda path: load(path, allow_outside))
+        return check_and_load(source, lambda path: load(path, allow_outside))
 
     def read_log(source: str | Path, allow_outside: bool) -> Recording:
         return load_log(source, allow_outside).make_recording(source)
 
     def load_topics(source: str | Path, topics: Sequence[str]) -> Log:
         assert choose is not None
-        return load_checked(source, lambda path: choose(path, topics))
+        return check_and_load(source, lambda path: choose(path, topics))
 
     return Format(name, about, can_read, read_log, load=load_log, choose=None if choose is None else load_topics)
 
