@@ -159,7 +159,7 @@ def build_with_noise(recording: Recording, settings: Settings, known_from: float
 
     `known_from` are the first seconds of it from which the noise model is estimated.
     """
-    frame = LocalFrame(choose_origin(recording))
+    frame = LocalFrame(choose_origin(recording), recording.start)
     found = align(recording, settings, frame)
 
     def build(part: Recording) -> Problem:

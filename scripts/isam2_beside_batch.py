@@ -53,7 +53,7 @@ def main() -> None:
     print("| --- | --- | --- | --- | --- |", flush=True)
     for name in options.recordings:
         recording = load(data / name if (data / name).exists() else name).crop(0.0, LONGEST)
-        settings, frame = Settings(), LocalFrame(choose_origin(recording))
+        settings, frame = Settings(), LocalFrame(choose_origin(recording), recording.start)
         found = prepare(recording, settings, frame, detect(recording, settings))
         problem, start, nodes = found.problem, found.smoothed.states, found.smoothed.select_nodes(found.problem)
         best = batch(problem, start, nodes)

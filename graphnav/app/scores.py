@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from graphnav.constraints.gnss import LEVER_ARM, TIME_OFFSET
+from graphnav.constraints.gnss import CLOCK_RATE, LEVER_ARM, TIME_OFFSET
 from graphnav.core import rotation
 from graphnav.core.rotation import Array
 from graphnav.core.trajectory import Trajectory
@@ -102,8 +102,9 @@ def _read_antenna(solution: Solution) -> AntennaCalibration:
     """The last estimates of the antenna; as stated where there are none, as in another program's trajectory."""
     from graphnav.evaluation.evaluate import AntennaCalibration
 
-    offset, lever = solution.parameters.get(TIME_OFFSET), solution.parameters.get(LEVER_ARM)
-    return AntennaCalibration(float(offset.value[-1, 0]) if offset else 0.0, lever.value[-1] if lever else None)
+    offset, rate, lever = (solution.parameters.get(name) for name in (TIME_OFFSET, CLOCK_RATE, LEVER_ARM))
+    begin, drift = (float(one.value[-1, 0]) if one else 0.0 for one in (offset, rate))
+    return AntennaCalibration(begin, drift, lever.value[-1] if lever else None)
 
 
 def _choose_epochs(solution: Solution, truth: Array) -> Array:

@@ -29,3 +29,9 @@ class GnssSettings(Outliers):
     time_offset_sigma: float = Field(
         0.02, ge=0, description="s, 1-sigma of what the stamps of the fixes may be off; 0 = exact, not estimated"
     )
+    clock_rate_sigma: float = Field(
+        1e-4,
+        ge=0,
+        description="s/s, 1-sigma of the rate of the IMU's clock beside the receiver's, as a crystal keeps it; 0 = one "
+        "clock, not estimated",
+    )

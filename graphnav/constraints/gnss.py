@@ -7,9 +7,11 @@ ENU at the fix, where receivers state their sigmas::
     r_v = R_ln (u + a d) - v_meas                                a = R_nb (f_b - b_a) + g
     omega_nb = omega_b - b_g - R_nb^T omega_ie
 
-d is added to the stamps of the fixes, one constant for positions and one for velocities: a receiver's filters delay
-them differently (boulder's differ by 0.1 s, dresden's by 0.7 s). Where fixes are stamped on arrival, each stamp has an
-error of its own as well: white, and common to the position and velocity of a fix.
+d is added to the stamps of the fixes. It is a constant, one for positions and one for velocities, as a receiver's
+filters delay them differently (boulder's differ by 0.1 s, dresden's by 0.7 s), and what the clocks of IMU and receiver
+drift apart: the rate of one beside the other, by the time since the drive began. Crystals keep it within some 1e-4
+(boulder's 3e-4): 0.2 s in half an hour. Where fixes are stamped on arrival, each stamp has an error of its own as
+well: white, and common to the position and velocity of a fix.
 
 e is the time-correlated part of a position's error: errors of one receiver's fixes seconds apart are nearly equal, so a
 thousand fixes are not a thousand independent measurements. It is the sum of three Gauss-Markov processes in units of
@@ -37,13 +39,14 @@ from graphnav.recording import FIX_TYPES, Imu, Recording
 LEVER_ARM = "gnss_lever_arm"
 TIME_OFFSET = "gnss_time_offset"
 VELOCITY_TIME_OFFSET = "gnss_velocity_time_offset"
+CLOCK_RATE = "gnss_clock_rate"
 TIMES = ("seconds", "minutes", "hours")  # correlation times of the processes of a position's error
 ERRORS = tuple(f"gnss_error_of_{time}" for time in TIMES)
 VELOCITY_ERROR = "gnss_velocity_error"
 STAMP_ERROR = "gnss_stamp_error"
 STAMPS = "gnss_position.stamps"  # variance component of the stamp errors
 # variance components of the offsets' priors
-OFFSETS = {f"prior.{name}": name for name in (TIME_OFFSET, VELOCITY_TIME_OFFSET)}
+OFFSETS = {f"prior.{name}": name for name in (TIME_OFFSET, VELOCITY_TIME_OFFSET, CLOCK_RATE)}
 _I3 = np.eye(3)
 _MINUTE = 60.0  # s
 _WHITE = 1e-3  # s, a correlation time at which nothing is left from one fix to the next
@@ -69,6 +72,9 @@ def _build_common(scene: BuildContext, offset: str) -> dict[str, Any]:
     if settings.time_offset_sigma > 0:
         sigma = np.full(1, settings.time_offset_sigma)
         parameters.append(Parameter(offset, np.zeros(1), sigma, "s", noise_groups=(f"prior.{offset}",)))
+        if settings.clock_rate_sigma > 0:
+            sigma = np.full(1, settings.clock_rate_sigma)
+            parameters.append(Parameter(CLOCK_RATE, np.zeros(1), sigma, "s/s", noise_groups=(f"prior.{CLOCK_RATE}",)))
     return {"parameters": tuple(parameters), "watched": settings.faults != "off", **settings.outliers}
 
 
@@ -85,10 +91,15 @@ def _build_stamp_error(settings: Settings, t: Array) -> tuple[Parameter, ...]:
     )
 
 
-def _get_time_offset(parameters: dict[str, Array], constant: str) -> Array | None:
-    """(n, 1) s to be added to stamps, and None where no part of it is estimated."""
-    some = [parameters[name] for name in (constant, STAMP_ERROR) if name in parameters]
-    return np.asarray(sum(some)) if some else None
+def _split_time_offset(
+    parameters: dict[str, Array], constant: str, elapsed: Array
+) -> tuple[Array | None, dict[str, Array | float]]:
+    """(n, 1) s to be added to stamps `elapsed` (n,) s after the drive began, and its derivatives by its parts; None
+    where no part of it is estimated.
+    """
+    by: dict[str, Array | float] = {constant: 1.0, CLOCK_RATE: elapsed[:, None], STAMP_ERROR: 1.0}
+    by = {name: one for name, one in by.items() if name in parameters}
+    return (np.asarray(sum(one * parameters[name] for name, one in by.items())) if by else None), by
 
 
 @dataclass(frozen=True)
@@ -104,6 +115,7 @@ class GnssPosition(Constraint):
     p_n: Array = field(default_factory=lambda: _make_empty(0, 3))  # fixes in the navigation frame
     R_ln: Array = field(default_factory=lambda: _make_empty(0, 3, 3))
     sigma: Array = field(default_factory=lambda: _make_empty(0, 3))
+    elapsed: Array = field(default_factory=lambda: _make_empty(0))  # s since the epoch of the navigation frame
     lever_arm: Array = field(default_factory=lambda: np.zeros(3))
     gyro: Array = field(default_factory=lambda: _make_empty(0, 3))  # measured rate at the fix
     accel: Array = field(default_factory=lambda: _make_empty(0, 3))  # measured force at the fix
@@ -161,6 +173,7 @@ class GnssPosition(Constraint):
             else scene.typical_sigmas[used],
             drive_error=np.median(sd if scene.typical_sigmas is None else scene.typical_sigmas, axis=0),
             type=kinds,
+            elapsed=gnss.t[used] - scene.frame.epoch,
             lever_arm=gnss.lever_arm,
             gyro=average_around(imu, imu.gyro, gnss.t[used]),
             accel=average_around(imu, imu.accel, gnss.t[used]),
@@ -193,7 +206,7 @@ class GnssPosition(Constraint):
         J = {"theta": -R @ rotation.skew(lever), "p": _I3[None]}
         if LEVER_ARM in parameters:
             J[LEVER_ARM] = R
-        offset = _get_time_offset(parameters, TIME_OFFSET)
+        offset, by = _split_time_offset(parameters, TIME_OFFSET, self.elapsed[rows])
         if offset is not None:
             velocity, moved = compute_antenna_velocity(states, self.gyro[rows], self.omega_n, lever)
             change, bent = compute_acceleration(states, self.accel[rows], self.g_n[rows])
@@ -203,8 +216,8 @@ class GnssPosition(Constraint):
                     J[block] = J.get(block, 0.0) + moved[block] * offset[..., None]
             J["theta"] = J["theta"] + bent["theta"] * (0.5 * offset**2)[..., None]
             J["ba"] = bent["ba"] * (0.5 * offset**2)[..., None]
-            later = (velocity + change * offset)[..., None]
-            J |= {name: later for name in (TIME_OFFSET, STAMP_ERROR) if name in parameters}
+            later = velocity + change * offset
+            J |= {name: (later * one)[..., None] for name, one in by.items()}
         residual, jacobians = mv(C, away), {block: C @ x for block, x in J.items()}
         for name in parameters:
             if name.startswith(ERRORS):
@@ -236,6 +249,7 @@ class GnssVelocity(Constraint):
     v_l: Array = field(default_factory=lambda: _make_empty(0, 3))
     R_ln: Array = field(default_factory=lambda: _make_empty(0, 3, 3))
     sigma: Array = field(default_factory=lambda: _make_empty(0, 3))
+    elapsed: Array = field(default_factory=lambda: _make_empty(0))  # s since the epoch of the navigation frame
     gyro: Array = field(default_factory=lambda: _make_empty(0, 3))  # measured rate at the fix
     accel: Array = field(default_factory=lambda: _make_empty(0, 3))  # measured force at the fix
     g_n: Array = field(default_factory=lambda: _make_empty(0, 3))  # gravity there
@@ -276,6 +290,7 @@ class GnssVelocity(Constraint):
             v_l=gnss.v[used],
             R_ln=earth.enu_axes(gnss.llh[used]) @ scene.frame.R_ne.T,
             sigma=gnss.sd_v[used],
+            elapsed=t - scene.frame.epoch,
             gyro=average_around(scene.recording.imu, scene.recording.imu.gyro, t),
             accel=average_around(scene.recording.imu, scene.recording.imu.accel, t),
             g_n=scene.frame.gravity_n(scene.frame.from_llh(gnss.llh[used])),
@@ -299,15 +314,14 @@ class GnssVelocity(Constraint):
         velocity, moved = compute_antenna_velocity(states, self.gyro[rows], self.omega_n, lever)
         residual = mv(C, velocity) - self.v_l[rows]
         jacobians = {block: C @ J for block, J in moved.items() if block != LEVER_ARM or LEVER_ARM in parameters}
-        offset = _get_time_offset(parameters, VELOCITY_TIME_OFFSET)
+        offset, by = _split_time_offset(parameters, VELOCITY_TIME_OFFSET, self.elapsed[rows])
         if offset is not None:
             change, bent = compute_acceleration(states, self.accel[rows], self.g_n[rows])
             change = mv(C, change)
             residual = residual + change * offset
             jacobians["theta"] = jacobians["theta"] + C @ bent["theta"] * offset[..., None]
             jacobians["ba"] = C @ bent["ba"] * offset[..., None]
-            some = (VELOCITY_TIME_OFFSET, STAMP_ERROR)
-            jacobians |= {name: change[..., None] for name in some if name in parameters}
+            jacobians |= {name: (change * one)[..., None] for name, one in by.items()}
         if VELOCITY_ERROR in parameters:
             size = self.unit_error[rows]
             residual = residual + size * parameters[VELOCITY_ERROR]

@@ -105,6 +105,7 @@ class LocalFrame:
     """One fixed ENU tangent frame (n) with its origin at `origin` = (lat, lon, h) in rad, rad, m."""
 
     origin: Array
+    epoch: float = 0.0  # s, from which on what drifts over a drive is counted
 
     @cached_property
     def R_ne(self) -> Array:

@@ -169,7 +169,7 @@ def _estimate(recording: Recording) -> tuple[Antenna, tuple[Array, Array, Array]
         raise EstimationError(
             f"'{recording.name}': there is no GNSS whose antenna could be found", key="antenna.no_gnss"
         )
-    settings, frame = Settings(), LocalFrame(choose_origin(recording))
+    settings, frame = Settings(), LocalFrame(choose_origin(recording), recording.start)
     tell("detection")
     still = detect(recording, settings).stationary
     tell("alignment")

@@ -41,6 +41,7 @@ _NAMED = {
     "axle": [Component("axle without side slip, before the stated place", "m")],
     "gnss_time_offset": [Component("stamps of the positions, to add", "ms", 1e3)],
     "gnss_velocity_time_offset": [Component("stamps of the GNSS velocities, to add", "ms", 1e3)],
+    "gnss_clock_rate": [Component("clock of the IMU, fast by", "ppm", 1e6)],
     "odometer_delay": [Component("delay of the odometer", "ms", 1e3)],
     "odometer_scale": [Component("odometer scale error", "%", 100.0)],
     "slip_squat": [

@@ -1,16 +1,35 @@
-"""Whether offsets of stamps are estimated near enough to where the rows of fixes are linearised in them."""
+"""Offsets of stamps where a drive begins and where it ends, and whether they are near enough to where the rows of fixes
+are linearised in them."""
 
 from __future__ import annotations
 
-from graphnav.constraints.gnss import OFFSETS
+import numpy as np
+
+from graphnav.constraints.gnss import CLOCK_RATE, TIME_OFFSET, VELOCITY_TIME_OFFSET
+from graphnav.core.rotation import Array
+from graphnav.core.state import DIM
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.linearise import Points
-from graphnav.estimation.solvers.passes import split_values
 
 LINEAR_OFFSET = 0.3  # s from the linearisation point (`graphnav.estimation.stamps`)
 
 
 def is_offset_far(problem: Problem, points: Points) -> bool:
     """Whether an offset is far from where its rows are linearised, by points of all keyframes."""
-    values = split_values(problem, points)
-    return any(abs(float(values[name][0, 0])) > LINEAR_OFFSET for name in OFFSETS.values() if name in values)
+    ends = list_end_rows(problem).values()
+    return any(float(np.abs(row @ points.values[0]).max()) > LINEAR_OFFSET for row in ends)
+
+
+def list_end_rows(problem: Problem) -> dict[str, Array]:
+    """Rows (2, D-15) that make offsets of stamps of parameters, where the drive begins and where it ends, by the
+    parameter that an offset is without the rate of the clocks.
+    """
+    columns, out = problem.columns, {}
+    for name in (TIME_OFFSET, VELOCITY_TIME_OFFSET):
+        if name in columns:
+            rows = np.zeros((2, sum(at.stop - at.start for at in columns.values())))
+            rows[:, columns[name].start - DIM] = 1.0
+            if CLOCK_RATE in columns:
+                rows[1, columns[CLOCK_RATE].start - DIM] = problem.t[-1] - problem.frame.epoch
+            out[name] = rows
+    return out

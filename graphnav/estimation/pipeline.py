@@ -150,7 +150,7 @@ def _run(
     unknown = [name for name in solvers if name not in KNOWN]
     if unknown:
         raise EstimationError(f"no solver '{unknown[0]}'; known: {', '.join(KNOWN)}", key="solver.unknown")
-    frame = LocalFrame(choose_origin(recording))
+    frame = LocalFrame(choose_origin(recording), recording.start)
     pieces, notes = split_pieces(recording, settings)
     notes = [*check_profile(recording, settings), *notes]
     found: list[dict[str, Solution]] = []

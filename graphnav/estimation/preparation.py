@@ -185,7 +185,7 @@ def _find_noise(
     best = estimate_disturbed_intervals(built.problem, best)
     built, best = _free_contradicted_arm(builder, built, best, progress)
     passes.update(best.passes + Counter(filter=1))
-    wanted = weigh is not None and weigh(built.problem, best.points)
+    wanted = weigh is not None and weigh(apply_noise(built.problem, best.noise), best.points)
     evidence = log_evidence(built.problem, best) if wanted else np.inf
     plain = NoiseModel(excluded=best.noise.excluded, lever_arm=best.noise.lever_arm)
     if _is_likelier(built.problem, plain, best):
@@ -213,9 +213,9 @@ def _free_contradicted_arm(
     Returns the same problem where it does not. To be asked when all else that may be wrong is known: a gyro that misses
     a turn looks like an arm, and so do stamps that are still to be moved.
     """
-    if is_offset_far(built.problem, best.points):
-        return built, best
     problem = apply_noise(built.problem, best.noise)
+    if is_offset_far(problem, best.points):
+        return built, best
     passes = best.passes + Counter(filter=1)
     try:
         if (arm := find_contradicted_arm(problem, best.points)) is None:

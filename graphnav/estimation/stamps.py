@@ -3,10 +3,10 @@
 A fix whose stamp is off by d is predicted from the state at the stamp, by v d + a d^2 / 2
 (`graphnav.constraints.gnss`). The acceleration a of a vehicle changes by a few m/s^3, 5 of them when it brakes, so that
 this is off by 5 d^3 / 6: 2 cm for 0.3 s, as the best fixes are, 0.8 m for a second. So where an offset is estimated
-farther than that from where the rows are linearised, the stamps are moved to the estimate and all is estimated anew, a
-step of Gauss-Newton, until the estimate stays within. Where the clocks of IMU and fixes disagree for certain
-(`graphnav.recording.checks.clock`), the first step is what they disagree by. The stamps as they are remain a candidate:
-the likelier stands.
+farther than that from where the rows are linearised, the stamps are moved to the estimate, that of the clocks' rate
+with it, and all is estimated anew, a step of Gauss-Newton, until the estimate stays within. Where the clocks of IMU and
+fixes disagree for certain (`graphnav.recording.checks.clock`), the first step is what they disagree by. The stamps as
+they are remain a candidate: the likelier stands.
 
 A solution is on the clock of the IMU, and what it says of fixes is on theirs (`shift_to_own_clocks`).
 """
@@ -17,23 +17,26 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
+
 from graphnav.config import Settings
-from graphnav.constraints.gnss import TIME_OFFSET, VELOCITY_TIME_OFFSET, GnssPosition, GnssVelocity
+from graphnav.constraints.gnss import CLOCK_RATE, TIME_OFFSET, VELOCITY_TIME_OFFSET, GnssPosition, GnssVelocity
 from graphnav.constraints.vehicle import ODOMETER_DELAY
 from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
+from graphnav.core.state import DIM
 from graphnav.estimation.noise.model import NoiseModel, RowWeights, StampOffsets
-from graphnav.estimation.offsets import LINEAR_OFFSET, is_offset_far
+from graphnav.estimation.offsets import LINEAR_OFFSET, is_offset_far, list_end_rows
 from graphnav.estimation.preparation import Prepared, Weigh
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import ConstraintRecord, ExcludedSpan, ParameterEstimate, Solution
-from graphnav.estimation.solvers.linearise import Points
-from graphnav.estimation.solvers.passes import compute_sigmas, estimate_parameters
+from graphnav.estimation.solvers.linearise import Points, shift
 from graphnav.recording import Recording
 from graphnav.recording.checks.clock import FAIR, ClockOffsets, is_certain
 
 _SIGNIFICANT = 3.0  # sigmas
 _MOVES = 3  # of moving the stamps
+_A_PPM = 1e-6
 _AS_THEY_ARE = StampOffsets()
 
 # a recording whose stamps are moved, and whether evidence is wanted of an estimate -> what its solvers share
@@ -106,17 +109,22 @@ def _join(offsets: StampOffsets) -> StampOffsets:
 
 def _estimate(prepared: Prepared, at: StampOffsets) -> StampOffsets:
     """The offsets estimated, those that are far and significant; the others as they are."""
-    found = estimate_parameters(prepared.problem, prepared.smoothed.values, compute_sigmas(prepared.smoothed.P))
-    new = {}
+    problem = prepared.problem
+    values, P = prepared.smoothed.values[0], prepared.smoothed.P[0][DIM:, DIM:]
+    ends, new = list_end_rows(problem), {}
     for key, name in (("positions", TIME_OFFSET), ("velocities", VELOCITY_TIME_OFFSET)):
-        if name in found:
-            off, sigma = float(found[name].value[0, 0]), float(found[name].sigma[0, 0])
-            if abs(off) > max(LINEAR_OFFSET, _SIGNIFICANT * sigma):
-                new[key] = getattr(at, key) + off
+        if name in ends:
+            rows = ends[name]
+            sigma = np.sqrt(np.einsum("ij,jk,ik->i", rows, P, rows))
+            if (np.abs(rows @ values) > np.maximum(LINEAR_OFFSET, _SIGNIFICANT * sigma)).any():
+                new[key] = getattr(at, key) + float(rows[0] @ values)
     if not new:
         return at
+    if CLOCK_RATE in problem.columns:
+        rate = at.rate + float(values[shift(problem.columns[CLOCK_RATE])][0])
+        new |= {"rate": rate, "since": problem.frame.epoch}
     ahead = replace(at, **new)
-    return _join(ahead) if VELOCITY_TIME_OFFSET in found else replace(ahead, velocities=ahead.positions)
+    return _join(ahead) if VELOCITY_TIME_OFFSET in ends else replace(ahead, velocities=ahead.positions)
 
 
 def move_stamps(recording: Recording, offsets: StampOffsets) -> Recording:
@@ -127,7 +135,7 @@ def move_stamps(recording: Recording, offsets: StampOffsets) -> Recording:
     if recording.gnss is not None:
         changed["gnss"] = replace(
             recording.gnss,
-            t=recording.gnss.t + offsets.positions,
+            t=_shift(recording.gnss.t, offsets.positions, offsets),
             velocity_offset=offsets.velocities - offsets.positions,
         )
     if recording.odometer is not None and offsets.odometer:
@@ -137,7 +145,7 @@ def move_stamps(recording: Recording, offsets: StampOffsets) -> Recording:
 
 def shift_to_imu_clock(noise: NoiseModel) -> NoiseModel:
     """A noise model as it is of the recording with its stamps moved."""
-    return noise if noise.stamps == _AS_THEY_ARE else _shift_noise(noise, 1.0)
+    return noise if noise.stamps == _AS_THEY_ARE else _shift_noise(noise, _shift)
 
 
 def shift_to_own_clocks(solution: Solution, offsets: StampOffsets) -> Solution:
@@ -147,14 +155,17 @@ def shift_to_own_clocks(solution: Solution, offsets: StampOffsets) -> Solution:
     by = _list_by_constraint(offsets)
 
     def shift_record(name: str, one: ConstraintRecord) -> ConstraintRecord:
-        return replace(one, t=one.t - by[name]) if name in by else one
+        return replace(one, t=_shift_back(one.t, by[name], offsets)) if name in by else one
 
     def shift_span(one: ExcludedSpan) -> ExcludedSpan:
-        late = by.get(one.kind, 0.0)
-        return replace(one, t_start=one.t_start - late, t_end=one.t_end - late)
+        if one.kind not in by:
+            return one
+        begin, end = (_shift_back(t, by[one.kind], offsets) for t in (one.t_start, one.t_end))
+        return replace(one, t_start=begin, t_end=end)
 
     whole = {
-        TIME_OFFSET: offsets.positions, VELOCITY_TIME_OFFSET: offsets.velocities, ODOMETER_DELAY: -offsets.odometer
+        TIME_OFFSET: offsets.positions, VELOCITY_TIME_OFFSET: offsets.velocities, CLOCK_RATE: offsets.rate,
+        ODOMETER_DELAY: -offsets.odometer,
     }  # fmt: skip
 
     def shift_parameter(name: str, one: ParameterEstimate) -> ParameterEstimate:
@@ -165,7 +176,7 @@ def shift_to_own_clocks(solution: Solution, offsets: StampOffsets) -> Solution:
         records={name: shift_record(name, one) for name, one in solution.records.items()},
         excluded=tuple(map(shift_span, solution.excluded)),
         parameters={name: shift_parameter(name, one) for name, one in solution.parameters.items()},
-        noise=_shift_noise(replace(solution.noise, stamps=offsets), -1.0),
+        noise=_shift_noise(replace(solution.noise, stamps=offsets), _shift_back),
     )
 
 
@@ -175,7 +186,9 @@ def describe_stamps(offsets: StampOffsets) -> tuple[str, ...]:
         return ()
     by = f"{offsets.positions:+.2f} s"
     mend = f": add {offsets.positions:+.2f} to time_offset in [gnss]"
-    if offsets.velocities != offsets.positions:
+    if abs(offsets.rate) >= _A_PPM:
+        by, mend = f"{by} where the drive begins and {offsets.rate / _A_PPM:+.0f} ppm of the time since", ""
+    elif offsets.velocities != offsets.positions:
         by, mend = f"{by} (positions) and {offsets.velocities:+.2f} s (velocities)", ""
     elif offsets.odometer:  # it agrees with the fixes
         mend = f": add {-offsets.positions:+.2f} to time_offset in [imu]"
@@ -187,16 +200,26 @@ def _list_by_constraint(offsets: StampOffsets) -> dict[str, float]:
     return {GnssPosition.name: offsets.positions, GnssVelocity.name: offsets.velocities}
 
 
-def _shift_noise(noise: NoiseModel, sign: float) -> NoiseModel:
-    by = {name: sign * one for name, one in _list_by_constraint(noise.stamps).items()}
+def _shift(t: Any, by: float, offsets: StampOffsets) -> Any:
+    """Stamps on the clock of the IMU, by offsets that are `by` (s) where the drive begins."""
+    return t + by + offsets.rate * (t - offsets.since)
 
-    def shift(t: Array | float, name: str) -> Any:
-        return t + by.get(name, 0.0)
+
+def _shift_back(t: Any, by: float, offsets: StampOffsets) -> Any:
+    """Stamps on their own clock again."""
+    return offsets.since + (t - by - offsets.since) / (1.0 + offsets.rate)
+
+
+def _shift_noise(noise: NoiseModel, change: Callable[[Any, float, StampOffsets], Any]) -> NoiseModel:
+    by = _list_by_constraint(noise.stamps)
+
+    def move(t: Array | float, name: str) -> Any:
+        return change(t, by[name], noise.stamps) if name in by else t
 
     return replace(
         noise,
-        weights={name: RowWeights(shift(one.t, name), one.weight) for name, one in noise.weights.items()},
+        weights={name: RowWeights(move(one.t, name), one.weight) for name, one in noise.weights.items()},
         excluded={
-            name: tuple((shift(a, name), shift(b, name)) for a, b in spans) for name, spans in noise.excluded.items()
+            name: tuple((move(a, name), move(b, name)) for a, b in spans) for name, spans in noise.excluded.items()
         },
     )

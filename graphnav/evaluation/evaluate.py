@@ -98,6 +98,7 @@ class AntennaCalibration:
     """The calibration of the antenna in the solution that is compared with withheld fixes."""
 
     clock_offset: float = 0.0  # s, to be added to the fixes' stamps
+    clock_rate: float = 0.0  # s/s, and by the time since the recording's start
     lever_arm: Array | None = None  # (3,) m, right, forward, up; None: that of the recording
 
 
@@ -151,10 +152,10 @@ def make_withheld_truth(
             f"'{recording.name}': no GNSS fix in the withheld spans to compare with", key="truth.no_withheld_fix"
         )
     notes = [Note("truth.withheld_gnss", "the truth is the withheld GNSS itself")]
-    if antenna.clock_offset:
+    if antenna.clock_offset or antenna.clock_rate:
         notes.append(Note("truth.clock_offset", "the stamps of the withheld fixes are moved as estimated"))
     truth = Trajectory(
-        gnss.t[mask] + antenna.clock_offset, gnss.llh[mask], sd_p=gnss.sd[mask],
+        gnss.t[mask] + antenna.clock_offset + antenna.clock_rate * t[mask], gnss.llh[mask], sd_p=gnss.sd[mask],
         v=None if gnss.v is None else gnss.v[mask],
         sd_v=None if gnss.sd_v is None else gnss.sd_v[mask], name="withheld GNSS",
         notes=tuple(notes),
@@ -206,10 +207,10 @@ def evaluate_recording(
         sigma = recording.truth.closed_loop_sigma
         note = Note("truth.closed_loop", f"the only truth is that the drive ends where it starts, to {sigma:g} m")
         return Metrics(trajectory.name, closure=measure_closure(trajectory), notes=(*trajectory.notes, note))
-    late = 0.0
+    late = rate = 0.0
     if found is None and gnss_spans and recording.gnss is not None:
         found = make_withheld_truth(recording, "gnss", gnss_spans, antenna)
-        late = antenna.clock_offset
+        late, rate = antenna.clock_offset, antenna.clock_rate
     if found is None:
         return None
     truth, lever_arm = found
@@ -218,7 +219,8 @@ def evaluate_recording(
     alone = trajectory.frame == "local" or not recording.placed
     found_errors = compute_errors(trajectory, truth, lever_arm=lever_arm, max_gap=max_gap, at=at, from_start=alone)
     # spans are on the fixes' own clock, and so are the errors then
-    found_errors = replace(found_errors, t=found_errors.t - late)
+    own = recording.start + (found_errors.t - recording.start - late) / (1.0 + rate)
+    found_errors = replace(found_errors, t=own)
     return measure(found_errors, trajectory.name, spans, start=recording.start)
 
 

@@ -235,7 +235,7 @@ class Smoother:
             return
         recording, stationary = rows
         if self.frame is None:
-            self.frame = LocalFrame(choose_origin(recording))
+            self.frame = LocalFrame(choose_origin(recording), recording.start)
         try:
             found = find_start(recording, stationary, self.settings, self.frame)
         except EstimationError as error:

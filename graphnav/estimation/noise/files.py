@@ -49,6 +49,7 @@ _KEYS = ("mode", "pieces", "figures", "correlation_times", "weights", "excluded"
 _ARM = tuple(one.name for one in fields(LeverArm))
 _STAMPS = tuple(one.name for one in fields(StampOffsets))
 _LARGEST_OFFSET = 2.0 * LARGEST_SHIFT  # s; estimates go on from what is searched
+_LARGEST_RATE = 0.1  # s/s; a clock that is off by more is no clock
 _LONGEST_ARM, _LEAST_ARM_SIGMA = 100.0, 1e-6  # m
 _FIGURE_KEYS = {"log_factor": "log_factor", "sigma": "sigma", "prior": "prior", "prior_sigma": "prior_sigma",
            "degrees_of_freedom": "freedom"}  # fmt: skip
@@ -259,6 +260,10 @@ class _Reader:
         return self.read_number(key, value, 1e-3, 1e9, "s, a correlation time")
 
     def read_offset(self, key: str, value: Any) -> float:
+        if key.endswith(".since"):
+            return self.read_number(key, value, -math.inf, math.inf, "s, a stamp")
+        if key.endswith(".rate"):
+            return self.read_number(key, value, -_LARGEST_RATE, _LARGEST_RATE, "s/s, of the clocks of IMU and receiver")
         return self.read_number(key, value, -_LARGEST_OFFSET, _LARGEST_OFFSET, "s to be added to stamps")
 
     def read_arm(self, values: Mapping[str, Any]) -> LeverArm | None:

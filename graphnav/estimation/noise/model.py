@@ -56,6 +56,8 @@ class StampOffsets:
     positions: float = 0.0
     velocities: float = 0.0
     odometer: float = 0.0
+    rate: float = 0.0  # s/s, of those of positions and velocities
+    since: float = 0.0  # s, the stamp from which on the rate is counted
 
 
 @dataclass(frozen=True)
