@@ -420,7 +420,7 @@ def test_withheld_fixes_are_met_on_the_receivers_clock_and_at_the_antenna_as_est
     fixes = moved(circle(t - 1000.0), arm).take(slice(None, None, 10))
     recording = _recording(t, Gnss(fixes.t + 1000.0 + late, fixes.llh, np.full((60, 3), 0.02)))
     estimate = replace(circle(t - 1000.0), t=t)
-    antenna = evaluation.AntennaCalibration(-late, arm)
+    antenna = evaluation.AntennaCalibration(-late, lever_arm=arm)
     metrics = evaluation.evaluate_recording(
         estimate, recording, withheld=[("gnss", (20.05 + late, 30.05 + late))], antenna=antenna
     )
