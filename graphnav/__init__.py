@@ -37,6 +37,7 @@ _HOME = {
     "Solution": ("graphnav.estimation.solution", "Solution"),
     "Trajectory": ("graphnav.core.trajectory", "Trajectory"),
     "GraphnavError": ("graphnav.core.errors", "GraphnavError"),
+    "evaluate_recording": ("graphnav.evaluation.evaluate", "evaluate_recording"),
 }
 __all__ = [
     "GraphnavError",
@@ -45,6 +46,7 @@ __all__ = [
     "Solution",
     "Trajectory",
     "__version__",
+    "evaluate_recording",
     "load",
     "read_settings",
     "run",
@@ -56,6 +58,7 @@ if TYPE_CHECKING:
     from graphnav.core.trajectory import Trajectory
     from graphnav.estimation.pipeline import run
     from graphnav.estimation.solution import Solution
+    from graphnav.evaluation.evaluate import evaluate_recording
     from graphnav.recording import Recording
     from graphnav.recording.formats import read as load
 

@@ -24,7 +24,7 @@ from graphnav.recording import Gnss, Recording
 
 TOKYO = Path(__file__).resolve().parents[2] / "data" / "tokyo"
 LATE = 3.0  # s, as a receiver whose fixes are stamped that much later
-END = 110.0  # s
+END = 80.0  # s
 
 
 @cache
