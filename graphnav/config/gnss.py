@@ -30,8 +30,8 @@ class GnssSettings(Outliers):
         0.02, ge=0, description="s, 1-sigma of what the stamps of the fixes may be off; 0 = exact, not estimated"
     )
     clock_rate_sigma: float = Field(
-        1e-4,
+        0.0,
         ge=0,
-        description="s/s, 1-sigma of the rate of the IMU's clock beside the receiver's, as a crystal keeps it; 0 = one "
+        description="s/s, 1-sigma of the rate of the IMU's clock beside the receiver's, 1e-4 for crystals; 0 = one "
         "clock, not estimated",
     )
