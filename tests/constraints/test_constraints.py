@@ -211,7 +211,9 @@ def test_the_filter_itself_does_that_update(recording: Recording, copies: int) -
     rows = replace(
         rows,
         keyframe=np.full(copies, k),
-        **{n: getattr(rows, n)[pick] for n in ("p_n", "R_ln", "sigma", "unit_error", "elapsed", "gyro", "accel", "g_n")},
+        **{
+            n: getattr(rows, n)[pick] for n in ("p_n", "R_ln", "sigma", "unit_error", "elapsed", "gyro", "accel", "g_n")
+        },
     )
     problem = replace(problem, constraints=(rows,))
     forward = ekf(problem)
