@@ -104,7 +104,7 @@ def _read_antenna(solution: Solution) -> AntennaCalibration:
 
     offset, rate, lever = (solution.parameters.get(name) for name in (TIME_OFFSET, CLOCK_RATE, LEVER_ARM))
     begin, drift = (float(one.value[-1, 0]) if one else 0.0 for one in (offset, rate))
-    return AntennaCalibration(begin, drift, lever.value[-1] if lever else None)
+    return AntennaCalibration(begin, lever.value[-1] if lever else None, drift)
 
 
 def _choose_epochs(solution: Solution, truth: Array) -> Array:

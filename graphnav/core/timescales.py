@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -32,6 +33,18 @@ _LEAPS = np.array(
 
 
 LEAP = float(len(_LEAPS))  # s, GPS time minus UTC since the last of them
+
+
+def shift_stamps(t: Any, offset: float, rate: float, since: float) -> Any:
+    """Stamps (s, a number or an array) on another clock, which is ahead by `offset` (s) at the stamp `since` and gains
+    on it by `rate` (s/s).
+    """
+    return t + offset + rate * (t - since)
+
+
+def shift_stamps_back(t: Any, offset: float, rate: float, since: float) -> Any:
+    """The inverse of `shift_stamps`."""
+    return since + (t - offset - since) / (1.0 + rate)
 
 
 def count_leap_seconds(utc: Array) -> Array:

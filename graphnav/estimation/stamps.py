@@ -25,6 +25,7 @@ from graphnav.constraints.vehicle import ODOMETER_DELAY
 from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM
+from graphnav.core.timescales import shift_stamps, shift_stamps_back
 from graphnav.estimation.noise.model import NoiseModel, RowWeights, StampOffsets
 from graphnav.estimation.offsets import LINEAR_OFFSET, is_offset_far, list_end_rows
 from graphnav.estimation.preparation import Prepared, Weigh
@@ -135,7 +136,7 @@ def move_stamps(recording: Recording, offsets: StampOffsets) -> Recording:
     if recording.gnss is not None:
         changed["gnss"] = replace(
             recording.gnss,
-            t=_shift(recording.gnss.t, offsets.positions, offsets),
+            t=shift_stamps(recording.gnss.t, offsets.positions, offsets.rate, offsets.since),
             velocity_offset=offsets.velocities - offsets.positions,
         )
     if recording.odometer is not None and offsets.odometer:
@@ -145,7 +146,7 @@ def move_stamps(recording: Recording, offsets: StampOffsets) -> Recording:
 
 def shift_to_imu_clock(noise: NoiseModel) -> NoiseModel:
     """A noise model as it is of the recording with its stamps moved."""
-    return noise if noise.stamps == _AS_THEY_ARE else _shift_noise(noise, _shift)
+    return noise if noise.stamps == _AS_THEY_ARE else _shift_noise(noise, shift_stamps)
 
 
 def shift_to_own_clocks(solution: Solution, offsets: StampOffsets) -> Solution:
@@ -154,13 +155,16 @@ def shift_to_own_clocks(solution: Solution, offsets: StampOffsets) -> Solution:
         return solution
     by = _list_by_constraint(offsets)
 
+    def shift_back(t: Any, late: float) -> Any:
+        return shift_stamps_back(t, late, offsets.rate, offsets.since)
+
     def shift_record(name: str, one: ConstraintRecord) -> ConstraintRecord:
-        return replace(one, t=_shift_back(one.t, by[name], offsets)) if name in by else one
+        return replace(one, t=shift_back(one.t, by[name])) if name in by else one
 
     def shift_span(one: ExcludedSpan) -> ExcludedSpan:
         if one.kind not in by:
             return one
-        begin, end = (_shift_back(t, by[one.kind], offsets) for t in (one.t_start, one.t_end))
+        begin, end = (shift_back(t, by[one.kind]) for t in (one.t_start, one.t_end))
         return replace(one, t_start=begin, t_end=end)
 
     whole = {
@@ -176,7 +180,7 @@ def shift_to_own_clocks(solution: Solution, offsets: StampOffsets) -> Solution:
         records={name: shift_record(name, one) for name, one in solution.records.items()},
         excluded=tuple(map(shift_span, solution.excluded)),
         parameters={name: shift_parameter(name, one) for name, one in solution.parameters.items()},
-        noise=_shift_noise(replace(solution.noise, stamps=offsets), _shift_back),
+        noise=_shift_noise(replace(solution.noise, stamps=offsets), shift_stamps_back),
     )
 
 
@@ -200,21 +204,11 @@ def _list_by_constraint(offsets: StampOffsets) -> dict[str, float]:
     return {GnssPosition.name: offsets.positions, GnssVelocity.name: offsets.velocities}
 
 
-def _shift(t: Any, by: float, offsets: StampOffsets) -> Any:
-    """Stamps on the clock of the IMU, by offsets that are `by` (s) where the drive begins."""
-    return t + by + offsets.rate * (t - offsets.since)
-
-
-def _shift_back(t: Any, by: float, offsets: StampOffsets) -> Any:
-    """Stamps on their own clock again."""
-    return offsets.since + (t - by - offsets.since) / (1.0 + offsets.rate)
-
-
-def _shift_noise(noise: NoiseModel, change: Callable[[Any, float, StampOffsets], Any]) -> NoiseModel:
-    by = _list_by_constraint(noise.stamps)
+def _shift_noise(noise: NoiseModel, change: Callable[[Any, float, float, float], Any]) -> NoiseModel:
+    by, stamps = _list_by_constraint(noise.stamps), noise.stamps
 
     def move(t: Array | float, name: str) -> Any:
-        return change(t, by[name], noise.stamps) if name in by else t
+        return change(t, by[name], stamps.rate, stamps.since) if name in by else t
 
     return replace(
         noise,

@@ -16,7 +16,7 @@ import numpy as np
 from graphnav.core.errors import RecordingError
 from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
-from graphnav.core.timescales import GPS_TO_UNIX, LEAP, compute_clock_offset
+from graphnav.core.timescales import GPS_TO_UNIX, LEAP, compute_clock_offset, shift_stamps, shift_stamps_back
 from graphnav.core.trajectory import Trajectory
 from graphnav.evaluation.metrics import (
     COMPONENTS,
@@ -98,8 +98,8 @@ class AntennaCalibration:
     """The calibration of the antenna in the solution that is compared with withheld fixes."""
 
     clock_offset: float = 0.0  # s, to be added to the fixes' stamps
-    clock_rate: float = 0.0  # s/s, and by the time since the recording's start
     lever_arm: Array | None = None  # (3,) m, right, forward, up; None: that of the recording
+    clock_rate: float = 0.0  # s/s, to be added to the fixes' stamps by the time since the recording's start
 
 
 _AS_STATED = AntennaCalibration()
@@ -155,7 +155,8 @@ def make_withheld_truth(
     if antenna.clock_offset or antenna.clock_rate:
         notes.append(Note("truth.clock_offset", "the stamps of the withheld fixes are moved as estimated"))
     truth = Trajectory(
-        gnss.t[mask] + antenna.clock_offset + antenna.clock_rate * t[mask], gnss.llh[mask], sd_p=gnss.sd[mask],
+        shift_stamps(gnss.t[mask], antenna.clock_offset, antenna.clock_rate, recording.start),
+        gnss.llh[mask], sd_p=gnss.sd[mask],
         v=None if gnss.v is None else gnss.v[mask],
         sd_v=None if gnss.sd_v is None else gnss.sd_v[mask], name="withheld GNSS",
         notes=tuple(notes),
@@ -219,8 +220,7 @@ def evaluate_recording(
     alone = trajectory.frame == "local" or not recording.placed
     found_errors = compute_errors(trajectory, truth, lever_arm=lever_arm, max_gap=max_gap, at=at, from_start=alone)
     # spans are on the fixes' own clock, and so are the errors then
-    own = recording.start + (found_errors.t - recording.start - late) / (1.0 + rate)
-    found_errors = replace(found_errors, t=own)
+    found_errors = replace(found_errors, t=shift_stamps_back(found_errors.t, late, rate, recording.start))
     return measure(found_errors, trajectory.name, spans, start=recording.start)
 
 

@@ -60,7 +60,10 @@ def readings(sensor: Sensor, recording: Recording) -> Series:
 
 def with_parameters(name: str) -> Settings:
     """Everything that can be estimated is estimated."""
-    chosen = {"gnss": {"lever_arm_sigma": 0.5}, "foot": {"lateral": True, "closed_loop": 0.01}}
+    chosen = {
+        "gnss": {"lever_arm_sigma": 0.5, "clock_rate_sigma": 1e-4},
+        "foot": {"lateral": True, "closed_loop": 0.01},
+    }
     return parse_settings({**chosen, "raw_gnss": {"ppp": True} if name in PPP else {"differences": True}})
 
 

@@ -414,13 +414,16 @@ def test_withheld_fixes_are_the_truth_of_their_span() -> None:
         evaluation.make_withheld_truth(recording, "gnss", [(500.0, 600.0)])
 
 
-def test_withheld_fixes_are_met_on_the_receivers_clock_and_at_the_antenna_as_estimated() -> None:
+@pytest.mark.parametrize("rate", [0.0, 1e-3])
+def test_withheld_fixes_are_met_on_the_receivers_clock_and_at_the_antenna_as_estimated(rate: float) -> None:
     t = 1000.0 + np.arange(0.0, 60.0, 0.1)
     arm, late = np.array([0.0, 0.0, 1.5]), 0.3
     fixes = moved(circle(t - 1000.0), arm).take(slice(None, None, 10))
-    recording = _recording(t, Gnss(fixes.t + 1000.0 + late, fixes.llh, np.full((60, 3), 0.02)))
+    begin = t[0] - 0.1  # of the first sample
+    stamps = begin + (fixes.t + 1000.0 + late - begin) / (1.0 + rate)
+    recording = _recording(t, Gnss(stamps, fixes.llh, np.full((60, 3), 0.02)))
     estimate = replace(circle(t - 1000.0), t=t)
-    antenna = evaluation.AntennaCalibration(-late, lever_arm=arm)
+    antenna = evaluation.AntennaCalibration(-late, arm, rate)
     metrics = evaluation.evaluate_recording(
         estimate, recording, withheld=[("gnss", (20.05 + late, 30.05 + late))], antenna=antenna
     )
