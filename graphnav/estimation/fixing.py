@@ -135,11 +135,13 @@ def _add_phase(problem: Problem, phase: GnssPhase) -> Problem:
 def _split_arcs(phase: GnssPhase, t: Array, anew: Sequence[tuple[Arc, int]]) -> GnssPhase:
     """Carriers of which some arcs end, and others begin, at keyframes."""
     begin, own = phase.begin.copy(), {p.name: p for p in phase.parameters}
-    for (name, since), k in anew:
+    for (name, since), k in sorted(anew, key=lambda one: one[1]):
         rows = (phase.slot == phase.slots.index(name)) & (phase.begin == since) & (phase.keyframe >= k)
-        begin[rows] = t[k]
         p = own[name]
         assert p.begins is not None
+        if t[k] in p.begins:
+            continue
+        begin[rows] = t[k]
         at = int(np.searchsorted(p.begins, t[k]))
         initial, sigma = (np.insert(x, at, x[at - 1], axis=0) for x in (p.initial, p.sigma))
         own[name] = replace(p, begins=np.insert(p.begins, at, t[k]), initial=initial, sigma=sigma)
@@ -282,7 +284,8 @@ class _Causal:
         self.known = {k: Known() for k in epochs.keyframes}  # behind each epoch
         self._unknown = {p.name: float(np.max(p.sigma)) for p in epochs.phase.parameters}
         self._held = Held()
-        self.anew: list[tuple[Arc, int]] = []  # arcs that began anew, and at which keyframes
+        self.anew: list[tuple[Arc, int]] = []  # arcs that begin anew, and at which keyframes: the first that is odd
+        self._before = -1  # keyframe of the epoch before
 
     def __call__(self, k: int, here: Points, P: Array) -> DecidedRows | None:
         """Integers to hold from a keyframe on, and ambiguities that are not known any more."""
@@ -292,6 +295,9 @@ class _Causal:
         held = self._held = hold_on(self._held, epochs, k, here, lambda: P)
         self.known[k] = held.known
         self.anew += [(arc, k) for arc in held.anew]
+        if held.let_go:
+            self.anew += [(arc, self._before) for arc in epochs.active[self._before]]
+        self._before = k
         added, values = np.zeros(len(P)), here.values[0]
         if held.let_go:
             for name, at in epochs.columns.items():

@@ -7,7 +7,7 @@ Within an arc a carrier is a range but for one unknown number of cycles, its amb
 * the base station's arc of that signal ends,
 * the change since the epoch before is off by more than a quarter of a cycle from what those of all satellites agree
   upon, a displacement and the clock: a slip is half a cycle at least, so beyond a quarter it is nearer than none,
-* there is such a change, and too few others agree, or not to within their sigmas: any of them may have slipped.
+* there is such a change, and too few others agree, less than half, or not to within their sigmas: any may have slipped.
 """
 
 from __future__ import annotations
@@ -162,6 +162,7 @@ def _find_slips(
     x = np.linalg.solve(N, np.einsum("esi,es->ei", A, weight * y)[..., None])[..., 0]
     left = np.sum(weight * (y - np.einsum("esi,ei->es", A, x)) ** 2, axis=1)
     told = (freedom >= _SPARE) & (left <= 2.0 * gammaincinv(0.5 * np.maximum(freedom, 1), 1.0 - _ALARM))
+    told &= near.sum(axis=1) > far.sum(axis=1)  # half wrong is what a sum of absolute residuals stands at most
     every = far.any(axis=1) & ~told
     out = np.zeros(len(now), dtype=bool)
     out[order] = (far | (every[:, None] & (w > 0.0)))[of, place]
