@@ -243,7 +243,7 @@ def hold_on(before: Held, epochs: Epochs, k: int, here: Points, covariance: Call
     estimates are of no arc, and begin anew.
     """
     known, since = before.known, before.since
-    if odd := bool(epochs.find_inconsistent(k, here, known)):
+    if epochs.find_inconsistent(k, here, known):
         known = Known() if before.odd else known
         fixed = epochs.count_differences(k, known) >= ENOUGH
         return Held(known, True, let_go=before.odd, since=since, fixed=fixed, epoch=True)
@@ -252,7 +252,8 @@ def hold_on(before: Held, epochs: Epochs, k: int, here: Points, covariance: Call
         values = np.concatenate([np.zeros(DIM), here.values[0]])
         lasting = epochs.compute_lasting(k, lambda arc: float(epochs.time[k]), since)
         found = _decide(sets, epochs.columns, values, covariance(), known, lasting, impose=False)
-    suspects, anew = frozenset[Arc](), ()
+    suspects: frozenset[Arc] = frozenset()
+    anew: tuple[Arc, ...] = ()
     if found:
         held = known.copy()
         for a, b, n in found:
@@ -261,19 +262,16 @@ def hold_on(before: Held, epochs: Epochs, k: int, here: Points, covariance: Call
         if not suspects:
             known = held
         else:
-            found, anew = [], tuple(sorted(suspects & before.suspects))
+            found = []
             for arc in suspects:
                 held.forget(arc)
-            if anew and epochs.count_differences(k, held) >= ENOUGH:
-                known, since = known.copy(), {**since, **dict.fromkeys(anew, float(epochs.time[k]))}
-                for arc in anew:
-                    known.forget(arc)
-            else:
-                anew = ()
+            if epochs.count_differences(k, held) >= ENOUGH:
+                anew = tuple(sorted(suspects & before.suspects))
+            known, since = known.copy(), {**since, **dict.fromkeys(anew, float(epochs.time[k]))}
+            for arc in anew:
+                known.forget(arc)
     fixed = epochs.count_differences(k, known) >= ENOUGH
-    return Held(
-        known, False, tuple(found), suspects=suspects, anew=anew, since=since, fixed=fixed, epoch=True
-    )
+    return Held(known, False, tuple(found), suspects=suspects, anew=anew, since=since, fixed=fixed, epoch=True)
 
 
 class _Causal:
