@@ -5,8 +5,7 @@
 
 Of each, horizontal errors against the truth (95 %, m), and places beside those of batch: the largest difference in
 batch's sigmas (an axis at a time), and the mean square, horizontally and of height, of differences over those of the
-covariances, where the solver knows less than batch: 1 if both are right. The first seconds, in which an online run still
-aligns, are left out for all.
+covariances, where the solver knows less than batch: 1 if both are right.
 """
 
 from __future__ import annotations
