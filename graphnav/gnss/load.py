@@ -88,7 +88,7 @@ def load_raw(
         If a file cannot be used, or the observations determine no position.
     """
     obs, sent = read_rover(sources.rover) if observations is None else (observations, None)
-    nav = read_navigation(list(sources.nav)) if sources.nav else None
+    nav = _read_ephemerides(sources.nav)
     if sent is not None and sent.satellites:
         nav = sent if nav is None else nav.join(sent)
     precise = read_precise(list(sources.sp3), list(sources.clk)) if sources.sp3 else None
@@ -146,6 +146,15 @@ def load_raw(
             better = raw.take(one)
             fixes = solve(replace(better, code=better.code + better.difference), differential=True)
     return raw, fixes, tuple(notes)
+
+
+def _read_ephemerides(paths: tuple[Path, ...]) -> Ephemerides | None:
+    """What navigation files hold, and UBX files with what satellites sent."""
+    logs = tuple(path for path in paths if is_ubx(unpack_bytes(path)))
+    rinex = [path for path in paths if path not in logs]
+    nav = read_navigation(rinex) if rinex else None
+    sent = read_rover(logs)[1] if logs else None
+    return nav if sent is None else sent if nav is None else nav.join(sent)
 
 
 def _check_agreement(raw: RawGnss, fixes: SinglePoint, path: Path) -> None:
