@@ -76,9 +76,7 @@ def main() -> None:
     folder.mkdir(parents=True, exist_ok=True)
     whole, t, places = recording_of(given.data.resolve(), folder)
     stated = parse_settings({"noise": {"mode": "stated"}})
-    print(
-        f"{'begin':>6} {'of':>3} {'slip':>4} {'draws':>5} {'found':>7}   ekf: float, wrong, max   rts: float, wrong, max"
-    )
+    print(f"{'begin':>6} {'of':>3} {'slip':>4} {'draws':>5} {'found':>7}   ekf: float wrong max   rts: the same")
     for begin in given.begin or [0.0]:
         recording, at = stretch_of(whole, begin)
         raw = recording.raw_gnss
