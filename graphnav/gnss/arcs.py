@@ -20,7 +20,7 @@ from scipy.special import gammaincinv
 
 from graphnav.core.rotation import Array
 from graphnav.gnss.series import RawGnss
-from graphnav.gnss.sigmas import compute_carrier_difference_sigma, compute_carrier_sigma
+from graphnav.gnss.sigmas import compute_carrier_difference_sigma
 from graphnav.gnss.signals import C, Ids, name_satellite, name_signal
 from graphnav.gnss.single_point import choose_coefficients, look
 
@@ -170,6 +170,6 @@ def _find_slips(
 
 
 def _compute_change_sigma(raw: RawGnss, elevation: Array, wavelength: Array) -> Array:
-    """(N,) m, 1-sigma of what a carrier changes by between epochs, without a slip."""
-    compute = compute_carrier_difference_sigma if len(raw.carrier_difference) else compute_carrier_sigma
-    return np.sqrt(2.0) * compute(raw.cn0, elevation, wavelength)
+    """(N,) m, 1-sigma of what a carrier, or its difference from the base's, changes by without a slip."""
+    receivers = 2.0 if len(raw.carrier_difference) else 1.0
+    return np.asarray(np.sqrt(receivers) * compute_carrier_difference_sigma(raw.cn0, elevation, wavelength))
