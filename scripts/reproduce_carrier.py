@@ -90,10 +90,14 @@ def increments(data: Path) -> None:
     h, up = np.hypot(d[:, 0], d[:, 1]), np.abs(d[:, 2])
     slips = find_arcs(whole).slips
     print(f"{len(after)} changes of carriers, {slips} slips without a flag, {np.isfinite(h).sum()} epochs")
-    print("mm against the reference's increments: 50 %, 95 %, 99 %, rms")
+    print("mm against the reference's increments: 50 %, 95 %, 99 %, rms, and % of the epochs within 1 cm")
     for name, x in (("horizontal", h), ("up", up)):
         at = [*np.nanpercentile(x, [50, 95, 99]), np.sqrt(np.nanmean(x**2))]
-        print(f"{name:10} " + " ".join(f"{1e3 * v:6.1f}" for v in at))
+        share = np.mean(x[np.isfinite(x)] < 0.01)
+        print(f"{name:10} " + " ".join(f"{1e3 * v:6.1f}" for v in at) + f" {100.0 * share:6.1f}")
+    both = np.isfinite(d[1:, 0]) & np.isfinite(d[:-1, 0])
+    alike = [np.corrcoef(d[1:, i][both], d[:-1, i][both])[0, 1] for i in range(3)]
+    print("correlation of an epoch's errors and the next's, east, north, up: " + " ".join(f"{x:.2f}" for x in alike))
 
 
 def simulated_imu(t: Array, place: Array, seed: int = 0) -> tuple[Imu, Array, Array, Array]:

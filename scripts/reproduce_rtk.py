@@ -36,7 +36,7 @@ Array = np.ndarray
 _RATE = 50.0  # Hz of the simulated IMU
 _GAP = 20.0  # s
 _NO_IMU = 5.0  # m/s^2/sqrt(Hz): 5 m/s of velocity in a second, more than a car's brakes
-_WRONG = 0.1  # m, half a wavelength: farther off horizontally a fixed epoch is wrong
+WRONG = 0.1  # m, half a wavelength: farther off horizontally a fixed epoch is wrong
 
 
 @dataclass(frozen=True)
@@ -190,7 +190,7 @@ def shares(solution: Solution, t: Array, e: Array) -> str:
     k = np.argmin(np.abs(solution.fixed[None, :, 0] - t[:, None]), axis=1)
     fixed = (solution.fixed[k, 1] > 0.0) & (np.abs(solution.fixed[k, 0] - t) < 2e-3)
     h = np.hypot(e[:, 0], e[:, 1])
-    wrong = np.mean(h[fixed] > _WRONG) if fixed.any() else 0.0
+    wrong = np.mean(h[fixed] > WRONG) if fixed.any() else 0.0
     first = t[fixed][0] - t[0] if fixed.any() else np.nan
     some = f", their H95 {np.nanpercentile(h[fixed], 95):.3f}" if fixed.any() else ""
     return f"   fixed {100.0 * fixed.mean():.1f} %, wrong {100.0 * wrong:.2f} %, first after {first:.0f} s{some}"

@@ -24,6 +24,7 @@ import numpy as np
 from graphnav.config import parse_settings
 from graphnav.estimation.pipeline import run
 from graphnav.estimation.solution import Solution
+from graphnav.evaluation.against import find_antenna_lever_arm
 from graphnav.recording import Recording
 from graphnav.recording.formats import read
 
@@ -80,12 +81,13 @@ def score(solution: Solution, recording: Recording) -> tuple[float, ...]:
     truth, frame = recording.truth, solution.frame
     assert truth is not None
     assert truth.llh is not None
-    assert recording.gnss is not None
+    arm = find_antenna_lever_arm(recording, solution)
+    assert arm is not None
     used = (truth.t >= solution.t[0]) & (truth.t <= min(solution.t[-1], LAST))
     t = truth.t[used]
     k = np.clip(np.searchsorted(solution.t, t), 0, len(solution.t) - 1)
     p = np.stack([np.interp(t, solution.t, solution.states.p[:, i]) for i in range(3)], -1)
-    e = p + solution.states.R_nb[k] @ recording.gnss.lever_arm - frame.from_llh(truth.llh[used])
+    e = p + solution.states.R_nb[k] @ arm - frame.from_llh(truth.llh[used])
     P = solution.covariance[k][:, 3:6, 3:6]
     h = np.hypot(e[:, 0], e[:, 1])
     whole = np.einsum("ni,nij,nj->n", e, np.linalg.inv(P), e) / 3.0

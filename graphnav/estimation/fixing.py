@@ -19,7 +19,7 @@ that an epoch is consistent without (data snooping: Baarda 1968) for half of the
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -93,11 +93,16 @@ def fix(
     """
     own = tuple(problem.parameters.get(p.name, p) for p in phase.parameters)
     phase = replace(phase, parameters=own)
-    whole = replace(problem, constraints=tuple(sorted((*problem.constraints, phase), key=lambda c: c.name)))
+    whole = _add_phase(problem, phase)
     epochs = Epochs(phase, whole.columns, whole.t)
     search = whole.settings.raw_gnss.integers
     causal = _Causal(epochs)
     forward = ekf(whole, progress, opening, decide=causal if search else None)
+    filtered = epochs.mark_fixed(causal.known), epochs.list_arcs(causal.known)
+    if causal.anew:
+        phase = _split_arcs(phase, problem.t, causal.anew)
+        whole = _add_phase(problem, phase)
+        epochs = Epochs(phase, whole.columns, whole.t)
     points = make_points(whole, about.states, split_values(problem, about))
     smoothed = smooth_backward(whole, refilter(whole, points, progress), progress)
     known, found = Known(), whole
@@ -115,12 +120,32 @@ def fix(
         found,
         forward,
         smoothed,
-        filtered_epochs=epochs.mark_fixed(causal.known),
+        filtered_epochs=filtered[0],
         smoothed_epochs=epochs.mark_fixed(dict.fromkeys(epochs.keyframes, known)),
-        filtered_arcs=epochs.list_arcs(causal.known),
+        filtered_arcs=filtered[1],
         smoothed_arcs=epochs.list_arcs(dict.fromkeys(epochs.keyframes, known)),
         notes=(_note(epochs, known),) if search else (),
     )
+
+
+def _add_phase(problem: Problem, phase: GnssPhase) -> Problem:
+    return replace(problem, constraints=tuple(sorted((*problem.constraints, phase), key=lambda c: c.name)))
+
+
+def _split_arcs(phase: GnssPhase, t: Array, anew: Sequence[tuple[Arc, int]]) -> GnssPhase:
+    """Carriers of which some arcs end, and others begin, at keyframes."""
+    begin, own = phase.begin.copy(), {p.name: p for p in phase.parameters}
+    for (name, since), k in sorted(anew, key=lambda one: one[1]):
+        rows = (phase.slot == phase.slots.index(name)) & (phase.begin == since) & (phase.keyframe >= k)
+        p = own[name]
+        assert p.begins is not None
+        if t[k] in p.begins:
+            continue
+        begin[rows] = t[k]
+        at = int(np.searchsorted(p.begins, t[k]))
+        initial, sigma = (np.insert(x, at, x[at - 1], axis=0) for x in (p.initial, p.sigma))
+        own[name] = replace(p, begins=np.insert(p.begins, at, t[k]), initial=initial, sigma=sigma)
+    return replace(phase, begin=begin, parameters=tuple(own.values()))
 
 
 def _note(epochs: Epochs, known: Known) -> str:
@@ -200,35 +225,53 @@ class Held:
     odd: bool = False  # the epoch is not consistent with what is known
     found: tuple[tuple[Arc, Arc, int], ...] = ()  # differences that were found there
     let_go: bool = False  # of all that was known
+    suspects: frozenset[Arc] = frozenset()  # what was found, or is known, is consistent without these alone
+    anew: tuple[Arc, ...] = ()  # suspects twice, whose ambiguities begin anew
+    since: Mapping[Arc, float] = field(default_factory=dict)  # s, of arcs that began anew
     fixed: bool = False
     epoch: bool = False  # there are carriers
 
     def go_on(self) -> Held:
         """The same behind a keyframe without carriers."""
-        return replace(self, found=(), let_go=False, epoch=False) if self.epoch else self
+        return replace(self, found=(), let_go=False, anew=(), epoch=False) if self.epoch else self
 
 
 def hold_on(before: Held, epochs: Epochs, k: int, here: Points, covariance: Callable[[], Array]) -> Held:
-    """Find integers by what is known at a keyframe; let go of all where two epochs in a row contradict them."""
-    known = before.known
-    if odd := bool(epochs.find_inconsistent(k, here, known)):
+    """Find integers by what is known at a keyframe; let go of all where two epochs in a row contradict them.
+
+    Where two epochs in a row find integers that are consistent but for the same arcs, cycles have slipped there: their
+    estimates are of no arc, and begin anew.
+    """
+    known, since = before.known, before.since
+    if epochs.find_inconsistent(k, here, known):
         known = Known() if before.odd else known
         fixed = epochs.count_differences(k, known) >= ENOUGH
-        return Held(known, True, let_go=before.odd, fixed=fixed, epoch=True)
+        return Held(known, True, let_go=before.odd, since=since, fixed=fixed, epoch=True)
     sets, found = epochs.group_arcs(k, known), []
     if any(len(some) > 1 for some in sets.values()):
         values = np.concatenate([np.zeros(DIM), here.values[0]])
-        lasting = epochs.compute_lasting(k, lambda arc: float(epochs.time[k]))
+        lasting = epochs.compute_lasting(k, lambda arc: float(epochs.time[k]), since)
         found = _decide(sets, epochs.columns, values, covariance(), known, lasting, impose=False)
+    suspects: frozenset[Arc] = frozenset()
+    anew: tuple[Arc, ...] = ()
     if found:
-        held = replace(known, of=known.of.copy())
+        held = known.copy()
         for a, b, n in found:
             held.join(a, b, n)
-        if epochs.find_inconsistent(k, here, held):
-            found = []
-        else:
+        suspects = frozenset(epochs.find_inconsistent(k, here, held))
+        if not suspects:
             known = held
-    return Held(known, odd, tuple(found), fixed=epochs.count_differences(k, known) >= ENOUGH, epoch=True)
+        else:
+            found = []
+            for arc in suspects:
+                held.forget(arc)
+            if epochs.count_differences(k, held) >= ENOUGH:
+                anew = tuple(sorted(suspects & before.suspects))
+            known, since = known.copy(), {**since, **dict.fromkeys(anew, float(epochs.time[k]))}
+            for arc in anew:
+                known.forget(arc)
+    fixed = epochs.count_differences(k, known) >= ENOUGH
+    return Held(known, False, tuple(found), suspects=suspects, anew=anew, since=since, fixed=fixed, epoch=True)
 
 
 class _Causal:
@@ -239,6 +282,8 @@ class _Causal:
         self.known = {k: Known() for k in epochs.keyframes}  # behind each epoch
         self._unknown = {p.name: float(np.max(p.sigma)) for p in epochs.phase.parameters}
         self._held = Held()
+        self.anew: list[tuple[Arc, int]] = []  # arcs that begin anew, and at which keyframes: the first that is odd
+        self._before = -1  # keyframe of the epoch before
 
     def __call__(self, k: int, here: Points, P: Array) -> DecidedRows | None:
         """Integers to hold from a keyframe on, and ambiguities that are not known any more."""
@@ -247,17 +292,23 @@ class _Causal:
             return None
         held = self._held = hold_on(self._held, epochs, k, here, lambda: P)
         self.known[k] = held.known
+        self.anew += [(arc, k) for arc in held.anew]
+        if held.let_go:
+            self.anew += [(arc, self._before) for arc in epochs.active[self._before]]
+        self._before = k
         added, values = np.zeros(len(P)), here.values[0]
         if held.let_go:
             for name, at in epochs.columns.items():
                 added[at] = self._unknown[name] ** 2
             added[BLOCKS["p"]], added[BLOCKS["v"]] = LOST_PLACE**2, LOST_SPEED**2
+        for name, _ in held.anew:
+            added[epochs.columns[name]] = self._unknown[name] ** 2
         H, r = np.zeros((len(held.found), len(P))), np.zeros(len(held.found))
         for i, (a, b, n) in enumerate(held.found):
             first, second = epochs.columns[a[0]], epochs.columns[b[0]]
             H[i, first], H[i, second] = 1.0, -1.0
             r[i] = values[first - DIM] - values[second - DIM] - n
-        return DecidedRows(H, r, np.full(len(r), EXACT), added) if len(r) or held.let_go else None
+        return DecidedRows(H, r, np.full(len(r), EXACT), added) if len(r) or added.any() else None
 
 
 def _sweep(epochs: Epochs, smoothed: SmootherPass, known: Known) -> None:
@@ -270,7 +321,7 @@ def _sweep(epochs: Epochs, smoothed: SmootherPass, known: Known) -> None:
         if key in tried or all(len(some) == 1 for some in sets.values()):
             continue
         tried.add(key)
-        held = replace(known, of=known.of.copy())
+        held = known.copy()
         lasting = epochs.compute_lasting(k, epochs.last.__getitem__)
         for a, b, n in _decide(sets, epochs.columns, values[k], smoothed.P[k], known, lasting, impose=True):
             held.join(a, b, n)

@@ -31,6 +31,10 @@ class Known:
     of: dict[Arc, tuple[Arc, int]] = field(default_factory=dict)  # N_arc - N_first
     let_go: set[Arc] = field(default_factory=set)
 
+    def copy(self) -> Known:
+        """The same, to be changed."""
+        return Known(self.of.copy(), self.let_go.copy())
+
     def find(self, arc: Arc) -> tuple[Arc, int]:
         """The first arc of those that this one hangs together with, and the difference from it."""
         return self.of.get(arc, (arc, 0))
@@ -103,7 +107,9 @@ class Epochs:
             kept[np.flatnonzero(kept)[np.argmax(left**2 / share)]] = False
         return [arcs[i] for i in used[~kept]]
 
-    def compute_lasting(self, k: int, until: Callable[[Arc], float]) -> dict[Arc, float]:
+    def compute_lasting(
+        self, k: int, until: Callable[[Arc], float], since: Mapping[Arc, float] | None = None
+    ) -> dict[Arc, float]:
         """Cycles^2 that reflections add to what ambiguities at an epoch are told to, beyond white noise.
 
         An ambiguity takes up whatever lasts as long as its arc, so no smoother sees it.
@@ -111,9 +117,10 @@ class Epochs:
         Parameters
         ----------
         until : s, of the last of an arc's carriers that tell of it.
+        since : s, of the first, where that is not the arc's.
         """
         own, arcs = self.rows[k], self.active[k]
-        duration = np.array([until(arc) - arc[1] for arc in arcs])
+        duration = np.array([until(arc) - (since or {}).get(arc, arc[1]) for arc in arcs])
         more = self.phase.reflection[own] ** 2 * compute_variance_left(np.maximum(duration, 0.0), self.phase.period)
         return dict(zip(arcs, more.tolist(), strict=True))
 

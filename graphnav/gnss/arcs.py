@@ -6,7 +6,8 @@ Within an arc a carrier is a range but for one unknown number of cycles, its amb
 * the signal is absent for an epoch, or all are, unless its counter of lock time covers the gap,
 * the base station's arc of that signal ends,
 * the change since the epoch before is off by more than a quarter of a cycle from what those of all satellites agree
-  upon, a displacement and the clock: a slip is half a cycle at least, so beyond a quarter it is nearer than none.
+  upon, a displacement and the clock: a slip is half a cycle at least, so beyond a quarter it is nearer than none,
+* there is such a change, and too few others agree, less than half, or not to within their sigmas: any may have slipped.
 """
 
 from __future__ import annotations
@@ -15,14 +16,17 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import gammaincinv
 
 from graphnav.core.rotation import Array
 from graphnav.gnss.series import RawGnss
+from graphnav.gnss.sigmas import compute_carrier_difference_sigma
 from graphnav.gnss.signals import C, Ids, name_satellite, name_signal
 from graphnav.gnss.single_point import choose_coefficients, look
 
 _REWEIGHTINGS = 20  # of reweighting towards the least sum of absolute residuals
 _SPARE = 2  # rows beyond the unknowns that have to agree before others are held against them
+_ALARM = 0.001  # of epochs in which those without a slip do not agree within their sigmas
 _NOISE = 0.01  # m, of a difference of carriers: below it residuals weigh the same
 
 
@@ -148,7 +152,24 @@ def _find_slips(
     limit = np.zeros(shape)
     limit[of, place] = 0.25 * wavelength[now[order]]
     far = (np.abs(r) > limit) & (w > 0.0)
-    agreed = np.sum((w > 0.0) & ~far, axis=1) >= unknowns + _SPARE
+    near = (w > 0.0) & ~far
+    sigma = np.ones(shape)
+    sigma[of, place] = _compute_change_sigma(raw, geometry.elevation, wavelength)[now[order]]
+    freedom = near.sum(axis=1) - unknowns
+    # of the rows that agree with each other by least squares, which are no further off than by the sum of absolutes
+    weight = np.where(near, sigma**-2.0, 0.0)
+    N = np.einsum("esi,es,esj->eij", A, weight, A, optimize=True) + 1e-9 * np.eye(unknowns)
+    x = np.linalg.solve(N, np.einsum("esi,es->ei", A, weight * y)[..., None])[..., 0]
+    left = np.sum(weight * (y - np.einsum("esi,ei->es", A, x)) ** 2, axis=1)
+    told = (freedom >= _SPARE) & (left <= 2.0 * gammaincinv(0.5 * np.maximum(freedom, 1), 1.0 - _ALARM))
+    told &= near.sum(axis=1) > far.sum(axis=1)  # half wrong is what a sum of absolute residuals stands at most
+    every = far.any(axis=1) & ~told
     out = np.zeros(len(now), dtype=bool)
-    out[order] = (far & agreed[:, None])[of, place]
+    out[order] = (far | (every[:, None] & (w > 0.0)))[of, place]
     return out
+
+
+def _compute_change_sigma(raw: RawGnss, elevation: Array, wavelength: Array) -> Array:
+    """(N,) m, 1-sigma of what a carrier, or its difference from the base's, changes by without a slip."""
+    receivers = 2.0 if len(raw.carrier_difference) else 1.0
+    return np.asarray(np.sqrt(receivers) * compute_carrier_difference_sigma(raw.cn0, elevation, wavelength))

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
+from graphnav.core.compiled import compile_once
 from graphnav.core.rotation import Array
 
 Integers = NDArray[np.int64]
@@ -59,8 +60,15 @@ def decorrelate(Q: Array) -> Decorrelated:
     # Q = L^T D L is a Cholesky factorisation from the last row up
     root = np.linalg.cholesky(Q[::-1, ::-1])[::-1, ::-1].T
     diagonal = np.diagonal(root).copy()
-    L, D = root / diagonal[:, None], diagonal**2
-    Z = np.eye(n, dtype=np.int64)
+    L, D, Z = root / diagonal[:, None], diagonal**2, np.eye(n, dtype=np.int64)
+    _reduce(L, D, Z)
+    return Decorrelated(Z, L, D)
+
+
+@compile_once
+def _reduce(L: Array, D: Array, Z: Integers) -> None:
+    """Transform L, D and Z, in place, until D is sorted as far as it can be."""
+    n = len(D)
     j = untouched = n - 2
     while j >= 0:
         if j <= untouched:
@@ -76,12 +84,12 @@ def decorrelate(Q: Array) -> Decorrelated:
             upper, lower = L[j, :j].copy(), L[j + 1, :j].copy()
             L[j, :j], L[j + 1, :j] = lower - L[j + 1, j] * upper, eta * upper + lam * lower
             L[j + 1, j] = lam
-            L[j + 2 :, [j, j + 1]] = L[j + 2 :, [j + 1, j]]
-            Z[:, [j, j + 1]] = Z[:, [j + 1, j]]
+            left, column = L[j + 2 :, j].copy(), Z[:, j].copy()
+            L[j + 2 :, j], L[j + 2 :, j + 1] = L[j + 2 :, j + 1], left
+            Z[:, j], Z[:, j + 1] = Z[:, j + 1], column
             untouched, j = j, n - 2
         else:
             j -= 1
-    return Decorrelated(Z, L, D)
 
 
 def find_nearest(a: Array, found: Decorrelated) -> Nearest:

@@ -178,6 +178,8 @@ class RawGnss:
     carrier_difference: Array = field(default_factory=lambda: np.empty(0))
     base_arc: NDArray[np.intp] = field(default_factory=lambda: np.empty(0, dtype=int))
     baseline: float = 0.0  # m, to the base station
+    # m, east, north, up: its own single-point position less the stated one, and 1-sigma; none without a base
+    base_off: tuple[tuple[float, ...], ...] = ()
     arc_begin: Array = field(default_factory=lambda: np.empty(0))  # (N,) s, of the carrier's arc, where it is known
     wound: Array = field(default_factory=lambda: np.empty(0))  # (N,) cycles of wind-up, where they are known
     # (N,) of the epoch among all that are used, of a piece of a series; -1 for one that came late

@@ -202,11 +202,10 @@ class Chain:
         place, nodes = self._place(problem, k)
         turn = self.window.push(place, ahead if ahead is not None and ahead.before is self.window.newest else None)
         held = self._decide(problem, k)
-        if held.found or held.let_go:
+        if held.found or held.let_go or held.anew:
             self.window.truncate(len(self.window) - 1)
             place = replace(place, problem=_add_decisions(problem, {place.t: held}))
-            if held.let_go:
-                place = replace(place, steps=(*place.steps, *self._begin_ambiguities(problem, place.steps)))
+            place = replace(place, steps=(*place.steps, *self._begin_ambiguities(problem, place.steps, held)))
             turn = max(turn, self.window.push(place))
         self._nodes.append(nodes)
         self._held.append(held)
@@ -223,14 +222,15 @@ class Chain:
         here = Points(newest.state, newest.values[None])
         return hold_on(held, Epochs(phase, newest.columns, problem.t), k, here, lambda: newest.covariance)
 
-    def _begin_ambiguities(self, problem: Problem, steps: tuple[Step, ...]) -> tuple[Step, ...]:
-        """Ambiguities, except those that are reset anyway, are reset about their current estimates."""
+    def _begin_ambiguities(self, problem: Problem, steps: tuple[Step, ...], held: Held) -> tuple[Step, ...]:
+        """Ambiguities that begin anew, except those that do anyway, about their current estimates."""
         phase, newest, started = split_carriers(problem)[1], self.window.newest, {step.name for step in steps}
         assert phase is not None
         return tuple(
             Step(p.name, newest.get_value(p.name), p.sigma[0])
             for p in phase.parameters
             if p.name in phase.slots and p.name in newest.columns and p.name not in started
+            if held.let_go or any(name == p.name for name, _ in held.anew)
         )
 
     def _place(self, problem: Problem, k: int) -> tuple[Place, dict[str, float]]:

@@ -221,9 +221,17 @@ def test_a_base_that_is_elsewhere_is_refused_and_how_far_it_is_off_is_told(chang
     for metres in (1000.0, 60.0):
         with refused("raw.base_position", RecordingError, "base.obs.gz", " m from"):
             changed("recording.toml", move_base(metres))
-    one = changed("recording.toml", move_base(15.0))
-    (told,) = (str(remark) for remark in one.remarks if get_key(remark) == "raw.base")
-    assert float(re.search(r"([\d.]+) m from its own", told).group(1)) == pytest.approx(15.0, abs=4.0)
+    raw = raw_of(changed("recording.toml", move_base(15.0)))
+    off, sigma = np.linalg.norm(raw.base_off, axis=1)
+    assert off == pytest.approx(15.0, abs=sigma)
+    assert [f.severity for f in check_raw(raw) if f.key == "raw_gnss.base_off"] == ["unreliable"]
+
+
+@pytest.mark.parametrize("name", ["kamakura_rtk", "tokyo_raw"])
+def test_a_base_where_it_is_stated_to_be_is_believed(name):
+    raw = raw_of(read(DRIVE.parent / name))
+    assert len(raw.base_off) == 2
+    assert "raw_gnss.base_off" not in {f.key for f in check_raw(raw)}
 
 
 def test_a_rover_in_the_place_of_the_base_is_found_out(changed):

@@ -11,6 +11,7 @@ import pytest
 from helpers import refused
 
 from graphnav.core.errors import RecordingError
+from graphnav.gnss.load import Sources, load_raw
 from graphnav.recording.draft import draft
 from graphnav.recording.formats import read
 
@@ -57,6 +58,30 @@ def test_files_are_told_by_what_is_in_them(folder, rover, shift, clock):
     assert recording.raw_gnss is not None
     assert np.isfinite(recording.raw_gnss.difference).sum() > 1000
     assert len(recording.gnss.t) == 41
+
+
+@pytest.mark.parametrize("moving", [True, False])
+def test_what_a_log_holds_of_satellites_places_those_of_the_other_file(folder, moving):
+    """No navigation file, and ephemerides in one of two files: the rover's log, or a base's beside a rover's RINEX."""
+    path = folder(UNIX, "rover.ubx", "base.obs.gz" if moving else "rover.obs.gz")
+    if moving:
+        found = tomllib.loads(draft([path], path).text)["raw_gnss"]
+        assert (found["rover"], found["base"], found.get("nav")) == ("rover.ubx", "base.obs.gz", None)
+    else:  # the same antenna moves in both
+        with refused("draft.raw_roles", RecordingError, "both"):
+            draft([path], path)
+
+
+def test_a_log_may_be_given_for_its_ephemerides(folder):
+    """As `nav`: to a rover whose own file has none, the same places as by a navigation file."""
+    placed = []
+    for nav in ("rover.ubx", "nav.gz"):
+        path = folder(0.0, "rover.obs.gz", nav)
+        sources = Sources(rover=(path / "rover.obs.gz",), nav=(path / nav,))
+        placed.append(load_raw(sources)[1])
+    far = np.linalg.norm(placed[0].p - placed[1].p, axis=1)
+    assert np.isfinite(far).sum() > 35
+    assert np.nanmedian(far) < 2.0  # of fewer satellites, whose messages were all received
 
 
 def test_stamps_of_utc_among_seconds_of_the_week_are_told(folder):

@@ -6,6 +6,7 @@ import gzip
 import itertools
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import gtsam
 import numpy as np
@@ -249,6 +250,79 @@ def test_an_arc_ends_at_flags_gaps_half_cycles_and_slips(exact):
         np.testing.assert_allclose(begins.pop(int(satellite)), epochs[[0, at]])
     assert arcs.slips == 1
     assert all(len(b) == 1 for b in begins.values())
+
+
+@pytest.mark.parametrize("share", [0.3, 0.7])
+def test_where_no_few_satellites_can_be_told_to_have_slipped_all_arcs_end(exact, share):
+    """Cycles of both signs at one epoch: of few they are told apart, of most of them only that there are some."""
+    raw, rng = exact[0].raw_gnss, np.random.default_rng(4)
+    at = raw.epochs[0][15]
+    satellites = rng.permutation(np.unique(raw.satellite[raw.t == at]))
+    chosen = satellites[: round(share * len(satellites))]
+    sign = {int(satellite): 1.0 - 2.0 * (k % 2) for k, satellite in enumerate(chosen)}
+    cycles = np.array([sign.get(int(satellite), 0.0) for satellite in raw.satellite])
+    arcs = find_arcs(replace(raw, carrier=raw.carrier + cycles * (raw.t >= at)), base_arc=raw.base_arc)
+    begun = {int(arcs.satellite[k]) for k, begins in enumerate(arcs.begins) if at in begins}
+    assert begun == set((chosen if share < 0.5 else satellites).tolist())
+
+
+class SlippedEpochs:
+    """Ten arcs of one signal, of which some are never consistent with the others, as an epoch that is looked at."""
+
+    def __init__(self, slipped):
+        self.columns = {}
+        self.arcs, self.slipped, self.time = [(f"ambiguity.{k}", 0.0) for k in range(10)], slipped, np.arange(9.0)
+
+    def group_arcs(self, k, known):
+        sets = {}
+        for arc in self.arcs:
+            sets.setdefault(known.find(arc)[0], []).append(arc)
+        return {0: sorted(sets.values(), key=len, reverse=True)}
+
+    def find_inconsistent(self, k, here, known):
+        return [self.arcs[i] for i in self.slipped if self.arcs[i] in known.of]
+
+    def count_differences(self, k, known):
+        return sum(len(one) - 1 for one in self.group_arcs(k, known)[0])
+
+    def compute_lasting(self, k, until, since):
+        return {}
+
+
+@pytest.mark.parametrize(("slipped", "begins"), [([2, 7], True), ([1, 3, 4, 6, 8, 9], False)])
+def test_arcs_that_integers_are_twice_not_consistent_with_begin_anew(monkeypatch, slipped, begins):
+    """Where enough others are consistent with each other; of fewer it cannot be told which are wrong."""
+    epochs = SlippedEpochs(slipped)
+    every = [(arc, epochs.arcs[0], 0) for arc in epochs.arcs[1:]]
+    monkeypatch.setattr(fixing, "_decide", lambda *given, **_: every)
+    here = SimpleNamespace(values=np.zeros((1, 0)))
+    held = [fixing.Held()]
+    for k in range(2):
+        held.append(fixing.hold_on(held[-1], epochs, k, here, lambda: np.zeros((0, 0))))
+    first, second = held[1:]
+    wrong = {epochs.arcs[i] for i in slipped}
+    assert first.suspects == wrong
+    assert not first.anew
+    assert set(second.anew) == (wrong if begins else set())
+    assert second.since == (dict.fromkeys(wrong, 1.0) if begins else {})
+    epochs.slipped = []
+    third = fixing.hold_on(second.go_on(), epochs, 2, here, lambda: np.zeros((0, 0)))
+    assert third.fixed
+    assert not third.anew
+
+
+def test_an_arc_that_begins_anew_is_another_from_there_on(exact):
+    where = scene(exact[0], STATED)
+    rows = GnssPhase.build(where)
+    k = int(np.unique(rows.keyframe)[6])
+    of = rows.slot == 2
+    arc = rows.slots[2], float(rows.begin[of][0])
+    split = fixing._split_arcs(rows, where.t, [(arc, k), (arc, k)])
+    np.testing.assert_array_equal(split.begin[of], np.where(rows.keyframe[of] < k, arc[1], where.t[k]))
+    np.testing.assert_array_equal(split.begin[~of], rows.begin[~of])
+    before, own = ({p.name: p for p in one.parameters}[arc[0]] for one in (rows, split))
+    np.testing.assert_array_equal(own.begins, [*before.begins, where.t[k]])
+    np.testing.assert_array_equal(own.sigma, np.tile(before.sigma, (2, 1)))
 
 
 def true_values(rows, where, raw, given):

@@ -228,8 +228,10 @@ def _run_forward(
         x, P = _begin(x, P, stack.records)
     stretches, k = StretchFilter(problem, steps, stack, all_Pp, all_P, all_F, stays), n
     while k < K:
-        on = stretches.run(k, x, P, ahead, found)
-        k = on if decide is None else _hold(decide, k, on, found, all_P)
+        before, k = k, stretches.run(k, x, P, ahead, found)
+        if decide is not None and (on := _hold(decide, before, k, found, all_P)) < k:
+            stretches.shorten(on - before)
+            k = on
         x, P = found.take(slice(k - 1, k)), all_P[k - 1]
         if progress is not None:
             progress("filter", k / K)

@@ -94,6 +94,10 @@ class StretchFilter:
         # where guessing leads nowhere a keyframe alone does: its blocks are right one after the other
         return self._run(k, k + 1, x, P, predicted, filtered, alone=True)
 
+    def shorten(self, length: int) -> None:
+        """The next stretch is about as long as what was used of the last one."""
+        self._length = max(min(self._length, length), _SHORTEST)
+
     def _run(
         self, k: int, k1: int, x: Points, P: Array, predicted: Points, filtered: Points, alone: bool = False
     ) -> int:

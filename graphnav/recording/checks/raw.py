@@ -12,6 +12,7 @@ from graphnav.gnss.series import RawGnss
 from graphnav.gnss.signals import SYSTEM_NAMES, SYSTEMS, name_satellite, name_signal
 
 _EPOCH_GAP_PERIODS = 2.5  # periods beyond which a step between epochs is a gap
+_BASE_ODD = 4.0  # 1-sigma of its own position that a base is from the stated one by chance in 0.1 %
 _FEWEST_SATELLITES = 5  # satellites, one more than a position with its clock takes
 
 
@@ -49,6 +50,9 @@ def describe_raw(raw: RawGnss) -> dict[str, Any]:
         facts["without_ephemeris"] = " ".join(name_satellite(s) for s in missing)
     if raw.differenced:
         facts["with_base"] = int(np.isfinite(raw.difference).sum())
+        if raw.base_off:
+            off, sigma = raw.base_off
+            facts |= {"base_off_m": float(np.linalg.norm(off)), "base_off_sigma_m": float(np.linalg.norm(sigma))}
     return facts
 
 
@@ -62,6 +66,16 @@ def check_raw(raw: RawGnss) -> Iterator[Finding]:
             f"raw GNSS: fewer than {_FEWEST_SATELLITES} satellites have a place in {100.0 * few:.0f} % of the epochs",
             "raw_gnss.few_satellites",
         )
+    if raw.base_off:
+        off, sigma = np.array(raw.base_off)
+        if np.linalg.norm(off / sigma) > _BASE_ODD:
+            each = ", ".join(f"{x:.1f} +- {s:.1f}" for x, s in zip(off, sigma, strict=True))
+            yield Finding(
+                "unreliable",
+                f"the base's own codes put it {np.linalg.norm(off):.0f} m from its stated position (east, north, up "
+                f"{each} m, 1-sigma): all positions are off by as much as base_position is",
+                "raw_gnss.base_off",
+            )
     if not np.isfinite(raw.range_rate).any():
         yield Finding("note", "raw GNSS: no Doppler shifts, so no velocities", "raw_gnss.no_doppler")
 

@@ -94,7 +94,8 @@ def find_raw(files: RawFiles, t: Array, zero: float | None) -> RawFound | None:
     """
     if not files.observed:
         return None
-    every = {path: read_rover((path,))[0] for path in files.observed}
+    held = {path: read_rover((path,)) for path in files.observed}
+    every = {path: obs for path, (obs, _) in held.items()}
     clock = Guess(None, "")
     if zero is None:
         clock = _guess_clock(t, every)
@@ -113,8 +114,12 @@ def find_raw(files: RawFiles, t: Array, zero: float | None) -> RawFound | None:
             notes.append(f"left out: {', '.join(left)}: not of the time of the IMU")
         every = there
     placing = {key: tuple(some) for key, some in files.placing.items()}
-    rover, base = _choose_rover(every, placing)
-    stands = None if base is None else _guess_base_place(base, every[base], placing)
+    sent = tuple(path for path, (_, ephemerides) in held.items() if ephemerides is not None and ephemerides.satellites)
+    every_nav = {**placing, "nav": (*placing.get("nav", ()), *sent)}
+    rover, base = _choose_rover(every, every_nav)
+    stands = None if base is None else _guess_base_place(base, every[base], every_nav)
+    if not set(rover) & set(sent):
+        placing = every_nav
     sources = Sources(
         rover=rover,
         base=() if base is None else (base,),
