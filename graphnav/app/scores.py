@@ -103,7 +103,8 @@ def _read_antenna(solution: Solution) -> AntennaCalibration:
     from graphnav.evaluation.evaluate import AntennaCalibration
 
     offset, rate, lever = (solution.parameters.get(name) for name in (TIME_OFFSET, CLOCK_RATE, LEVER_ARM))
-    begin, drift = (float(one.value[-1, 0]) if one else 0.0 for one in (offset, rate))
+    begin = float(offset.value[-1, 0]) if offset else 0.0
+    drift = float(rate.value[-1, 0]) if rate else solution.noise.stamps.rate
     return AntennaCalibration(begin, lever.value[-1] if lever else None, drift)
 
 

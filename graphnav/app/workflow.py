@@ -18,6 +18,7 @@ import numpy as np
 from graphnav.app.scores import Withheld, score
 from graphnav.config import Settings
 from graphnav.constraints.base import SAME_TIME
+from graphnav.constraints.gnss import LEVER_ARM
 from graphnav.core.complaints import suggest_nearest
 from graphnav.core.errors import ConfigError, EstimationError, RecordingError
 from graphnav.core.findings import Finding
@@ -251,7 +252,7 @@ def _solve_request(request: Request, progress: Progress | None) -> Outcome:
         from graphnav.estimation.antenna import find_wrong_arms
 
         arms = find_wrong_arms(used, checks)
-        if any(one.noise.lever_arm is not None for one in select_own(solutions).values()):  # it is not used as stated
+        if any(LEVER_ARM in one.noise.freed for one in select_own(solutions).values()):  # it is not used as stated
             arms = [f for f in arms if not f.key.startswith("gnss.")]
         checks = (*arms, *checks)
         findings = [*(f.sentence for f in checks), *findings]

@@ -29,9 +29,9 @@ class GnssSettings(Outliers):
     time_offset_sigma: float = Field(
         0.02, ge=0, description="s, 1-sigma of what the stamps of the fixes may be off; 0 = exact, not estimated"
     )
-    clock_rate_sigma: float = Field(
-        0.0,
+    clock_rate_sigma: float | None = Field(
+        None,
         ge=0,
-        description="s/s, 1-sigma of the rate of the IMU's clock beside the receiver's, 1e-4 for crystals; 0 = one "
-        "clock, not estimated",
+        description="s/s, 1-sigma of the rate of the IMU's clock beside the receiver's, 1e-4 for crystals; given, it "
+        "is estimated by this prior, with 0 never; otherwise only where the drive shows that they drift apart",
     )

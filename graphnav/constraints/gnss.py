@@ -23,6 +23,7 @@ errors of fixed and of single-point solutions are unrelated. With stated noise t
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, Self
 
@@ -40,6 +41,7 @@ LEVER_ARM = "gnss_lever_arm"
 TIME_OFFSET = "gnss_time_offset"
 VELOCITY_TIME_OFFSET = "gnss_velocity_time_offset"
 CLOCK_RATE = "gnss_clock_rate"
+_UNITS = {LEVER_ARM: "m", CLOCK_RATE: "s/s"}
 TIMES = ("seconds", "minutes", "hours")  # correlation times of the processes of a position's error
 ERRORS = tuple(f"gnss_error_of_{time}" for time in TIMES)
 VELOCITY_ERROR = "gnss_velocity_error"
@@ -68,11 +70,11 @@ def _build_common(scene: BuildContext, offset: str) -> dict[str, Any]:
     assert gnss is not None
     parameters: list[Parameter] = []
     if settings.lever_arm_sigma is not None:
-        parameters.append(Parameter(LEVER_ARM, gnss.lever_arm, np.full(3, settings.lever_arm_sigma), "m"))
+        parameters.append(Parameter(LEVER_ARM, gnss.lever_arm, np.full(3, settings.lever_arm_sigma), _UNITS[LEVER_ARM]))
     if settings.time_offset_sigma > 0:
         sigma = np.full(1, settings.time_offset_sigma)
         parameters.append(Parameter(offset, np.zeros(1), sigma, "s", noise_groups=(f"prior.{offset}",)))
-        if settings.clock_rate_sigma > 0:
+        if settings.clock_rate_sigma:
             sigma = np.full(1, settings.clock_rate_sigma)
             parameters.append(Parameter(CLOCK_RATE, np.zeros(1), sigma, "s/s", noise_groups=(f"prior.{CLOCK_RATE}",)))
     return {"parameters": tuple(parameters), "watched": settings.faults != "off", **settings.outliers}
@@ -392,8 +394,16 @@ def average_around(imu: Imu, x: Array, t: Array) -> Array:
     return (total[hi] - total[lo]) / (hi - lo)[:, None]
 
 
-def free_lever_arm(rows: Constraint, value: Array, sigma: Array) -> Constraint:
-    """Rows of fixes with their lever arm (3,), m, as a parameter with a prior sigma (3,)."""
-    others = tuple(p for p in rows.parameters if p.name != LEVER_ARM)
-    changed: dict[str, Any] = {"lever_arm": value, "parameters": (Parameter(LEVER_ARM, value, sigma, "m"), *others)}
+def free_constants(rows: Constraint, priors: Mapping[str, tuple[Array, Array]]) -> Constraint:
+    """Rows of fixes with constants as parameters: the lever arm (m), the rate of the clocks (s/s).
+
+    Parameters
+    ----------
+    priors : value and 1-sigma (k,), by the parameter's name.
+    """
+    own = [Parameter(name, value, sigma, _UNITS[name]) for name, (value, sigma) in priors.items()]
+    others = [p for p in rows.parameters if p.name not in priors]
+    changed: dict[str, Any] = {"parameters": (*own, *others)}
+    if LEVER_ARM in priors:
+        changed["lever_arm"] = priors[LEVER_ARM][0]
     return replace(rows, **changed)

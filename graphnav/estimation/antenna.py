@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from graphnav.config import Settings
+from graphnav.constraints.gnss import LEVER_ARM
 from graphnav.constraints.vehicle import AXLE
 from graphnav.core.earth import LocalFrame
 from graphnav.core.errors import EstimationError
@@ -20,7 +21,7 @@ from graphnav.core.progress import tell
 from graphnav.core.rotation import Array
 from graphnav.detectors import detect
 from graphnav.estimation.alignment import align
-from graphnav.estimation.lever_arm import ARM_SIGMA
+from graphnav.estimation.contradictions import PRIOR_SIGMA
 from graphnav.estimation.noise.apply import apply_noise
 from graphnav.estimation.noise.estimate import estimate_noise
 from graphnav.estimation.pipeline import choose_origin
@@ -178,7 +179,8 @@ def _estimate(recording: Recording) -> tuple[Antenna, tuple[Array, Array, Array]
         raise EstimationError(
             f"'{recording.name}': without motion nothing tells where the antenna is", key="antenna.no_motion"
         )
-    unknown = {"gnss": {"lever_arm_sigma": ARM_SIGMA}, "vehicle": {"axle_sigma": ARM_SIGMA}}
+    wide = PRIOR_SIGMA[LEVER_ARM]
+    unknown = {"gnss": {"lever_arm_sigma": wide}, "vehicle": {"axle_sigma": wide}}
     sections = {name: getattr(settings, name).model_copy(update=values) for name, values in unknown.items()}
     settings = settings.model_copy(update=sections)
     base = build_problem(recording, settings, frame, aligned.state, aligned.sigma, still, parts_of_noise=True)
@@ -190,7 +192,7 @@ def _estimate(recording: Recording) -> tuple[Antenna, tuple[Array, Array, Array]
     problem = apply_noise(base, found.noise)
     smoothed = smooth_backward(problem, refilter(problem, found.carry_points(base, problem)))
     parameters = estimate_parameters(problem, smoothed.values, compute_sigmas(smoothed.P))
-    arm, axle = parameters["gnss_lever_arm"], parameters.get(AXLE)
+    arm, axle = parameters[LEVER_ARM], parameters.get(AXLE)
     antenna = Antenna(recording.gnss.lever_arm, arm.value[-1], arm.sigma[-1])
     if axle is None or recording.odometer is None:
         return antenna, None

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from graphnav.config import Settings
+from graphnav.constraints.gnss import CLOCK_RATE, LEVER_ARM
 from graphnav.core.earth import LocalFrame
 from graphnav.core.errors import EstimationError
 from graphnav.core.progress import Progress, tell
@@ -22,8 +23,14 @@ from graphnav.detectors import Detections
 from graphnav.estimation import faults
 from graphnav.estimation.alignment import Alignment, use_known_heading
 from graphnav.estimation.building import BuiltProblem, Clock, ProblemBuilder, has_diverged
+from graphnav.estimation.contradictions import (
+    compute_prior_cost,
+    describe_freed,
+    find_contradicted,
+    free,
+    narrow,
+)
 from graphnav.estimation.fixing import fix, list_float_arcs
-from graphnav.estimation.lever_arm import describe_arm, find_contradicted_arm, free_arm, narrow_arm
 from graphnav.estimation.noise.apply import apply_noise, drop_parts
 from graphnav.estimation.noise.decision import log_evidence
 from graphnav.estimation.noise.estimate import NoiseEstimate, estimate_noise
@@ -119,7 +126,7 @@ def prepare(
             noise = replace(noise, spacing=spacing)
     else:
         built = builder.build_without(built, noise, parts=noise != STATED)
-        built = replace(built, problem=free_arm(built.problem, noise.lever_arm))
+        built = replace(built, problem=free(built.problem, noise.freed))
     aligned = built.aligned
     problem = drop_parts(apply_noise(built.problem, noise))
     try:
@@ -134,7 +141,7 @@ def prepare(
             smoothed = smooth_backward(problem, refilter(problem, smoothed, progress), progress)
         forward, smoothed = _relinearise(problem, aligned, known, forward, smoothed, progress, passes)
     passes.update(filter=1, smoother=1)
-    notes = (*describe_arm(noise.lever_arm, recording), *describe_noise(noise, problem))
+    notes = (*describe_freed(noise.freed, recording), *describe_noise(noise, problem))
     epochs, arcs = {}, {"": list_float_arcs(problem)}
     if built.carriers is not None:
         tell("ambiguities")
@@ -183,11 +190,11 @@ def _find_noise(
         again = estimate_noise(built.problem, built.aligned.until, best.noise, progress=progress)
         best = replace(again, passes=best.passes + again.passes)
     best = estimate_disturbed_intervals(built.problem, best)
-    built, best = _free_contradicted_arm(builder, built, best, progress)
+    built, best, cost = _free_contradicted(builder, built, best, progress)
     passes.update(best.passes + Counter(filter=1))
     wanted = weigh is not None and weigh(apply_noise(built.problem, best.noise), best.points)
-    evidence = log_evidence(built.problem, best) if wanted else np.inf
-    plain = NoiseModel(excluded=best.noise.excluded, lever_arm=best.noise.lever_arm)
+    evidence = log_evidence(built.problem, best) - cost if wanted else np.inf
+    plain = NoiseModel(excluded=best.noise.excluded, freed=best.noise.freed)
     if _is_likelier(built.problem, plain, best):
         return plain, None, built, evidence
     # the points alone: the covariances of the last pass are half of all memory
@@ -205,34 +212,36 @@ def _estimate(
     return estimate(built.problem, built.aligned.until, near=near, progress=progress)
 
 
-def _free_contradicted_arm(
+def _free_contradicted(
     builder: ProblemBuilder, built: BuiltProblem, best: NoiseEstimate, progress: Progress | None
-) -> tuple[BuiltProblem, NoiseEstimate]:
-    """The estimate with the antenna's lever arm as a parameter, where the drive contradicts the one that is stated.
+) -> tuple[BuiltProblem, NoiseEstimate, float]:
+    """The estimate with constants as parameters that the drive contradicts as stated, and what their priors cost in
+    evidence.
 
-    Returns the same problem where it does not. To be asked when all else that may be wrong is known: a gyro that misses
-    a turn looks like an arm, and so do stamps that are still to be moved.
+    Returns the same problem where there are none. To be asked when all else that may be wrong is known: a gyro that
+    misses a turn looks like an arm, and so do stamps that are still to be moved.
     """
     problem = apply_noise(built.problem, best.noise)
-    if is_offset_far(problem, best.points):
-        return built, best
+    names = {CLOCK_RATE} if builder.settings.gnss.clock_rate_sigma is None else set[str]()
+    if not is_offset_far(problem, best.points):
+        names.add(LEVER_ARM)
     passes = best.passes + Counter(filter=1)
     try:
-        if (arm := find_contradicted_arm(problem, best.points)) is None:
-            return built, replace(best, passes=passes)
-        freed = replace(built, problem=free_arm(built.problem, arm))
-        found = _estimate(freed, builder.settings, progress, (best.points, problem))
-        found = estimate_disturbed_intervals(freed.problem, found)
+        if not (freed := find_contradicted(problem, best.points, names)):
+            return built, replace(best, passes=passes), 0.0
+        other = replace(built, problem=free(built.problem, freed))
+        found = _estimate(other, builder.settings, progress, (best.points, problem))
+        found = estimate_disturbed_intervals(other.problem, found)
         passes = passes + found.passes + Counter(filter=1)
-        # by other figures the freed arm may lead to an optimum that is worse than the one with the arm as stated
-        if log_evidence(freed.problem, found) < log_evidence(built.problem, best):
-            return built, replace(best, passes=passes)
-        arm = narrow_arm(freed.problem, found, arm)
+        # by other figures what is freed may lead to an optimum that is worse than the one with all as stated
+        cost = compute_prior_cost(problem, freed)
+        if log_evidence(other.problem, found) - cost < log_evidence(built.problem, best):
+            return built, replace(best, passes=passes), 0.0
+        freed = narrow(other.problem, found, freed)
     except BREAKDOWN:
-        return built, replace(best, passes=passes)
-    noise = replace(found.noise, lever_arm=arm)
-    best = replace(found, noise=noise, passes=passes)
-    return replace(freed, problem=free_arm(freed.problem, arm)), best
+        return built, replace(best, passes=passes), 0.0
+    best = replace(found, noise=replace(found.noise, freed=freed), passes=passes)
+    return replace(other, problem=free(other.problem, freed)), best, cost
 
 
 def _is_likelier(base: Problem, plain: NoiseModel, found: NoiseEstimate) -> bool:

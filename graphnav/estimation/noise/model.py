@@ -61,11 +61,11 @@ class StampOffsets:
 
 
 @dataclass(frozen=True)
-class LeverArm:
-    """The antenna's lever arm that is used instead of a stated one (`graphnav.estimation.lever_arm`)."""
+class FreedConstant:
+    """What is used in place of a stated constant, as a parameter (`graphnav.estimation.contradictions`)."""
 
-    value: tuple[float, ...]  # m, right, forward, up of the IMU
-    sigma: tuple[float, ...]  # m, of its prior
+    value: tuple[float, ...]
+    sigma: tuple[float, ...]  # 1-sigma of its prior
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ class NoiseModel:
     excluded: Mapping[str, tuple[tuple[float, float], ...]] = field(default_factory=dict)  # spans (s) by constraint
     spacing: float = 0.0  # s, at least, between the fixes that are used (`graphnav.estimation.noise.spacing`)
     stamps: StampOffsets = StampOffsets()
-    lever_arm: LeverArm | None = None
+    freed: Mapping[str, FreedConstant] = field(default_factory=dict)  # by the parameter's name
 
     def get_factor(self, group: str, missing: float) -> float:
         """The factor on the variance of a group.

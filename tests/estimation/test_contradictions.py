@@ -1,4 +1,4 @@
-"""The antenna is found where it is, whatever the recording says of it."""
+"""The antenna is found where it is, whatever the recording says of it, and so is the rate of the clocks."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from helpers import refused
 
 from graphnav import run
 from graphnav.config import parse_settings
-from graphnav.constraints.gnss import LEVER_ARM
+from graphnav.constraints.gnss import CLOCK_RATE, LEVER_ARM
+from graphnav.core.earth import LocalFrame
 from graphnav.core.errors import EstimationError
 from graphnav.core.notes import get_key
 from graphnav.estimation import preparation
 from graphnav.estimation.antenna import find_antenna
-from graphnav.estimation.lever_arm import ARM_SIGMA, compute_evidence_gain, free_arm, get_stated_arm
+from graphnav.estimation.contradictions import compute_evidence_gain, free, widen
 from graphnav.estimation.noise.files import read_noise, write_noise
-from graphnav.estimation.noise.model import LeverArm
 from graphnav.estimation.solvers.ekf import refilter
 from graphnav.estimation.solvers.linearise import shift
 from graphnav.estimation.solvers.passes import reuse_points
@@ -57,24 +57,51 @@ def test_a_drive_with_a_wrong_arm_is_solved_as_with_the_right_one(drive, off):
     right, wrong = (run(state_arm(drive, np.array(x))) for x in ((0.0, 0.0, 0.0), off))
     stated = run(state_arm(drive, np.array(off)), noise="stated")
     for name in ("ekf", "rts", "batch"):
-        assert right[name].noise.lever_arm is None
+        assert not right[name].noise.freed
         apart, before = (
             np.linalg.norm((x[name].states.p - right[name].states.p)[:, :2], axis=1) for x in (wrong, stated)
         )
         assert np.sqrt(np.mean(before**2)) > 0.3
         assert np.sqrt(np.mean(apart**2)) < 0.05
         one = wrong[name].parameters[LEVER_ARM]
-        freed = np.array(wrong[name].noise.lever_arm.sigma) > 0.002
+        freed = np.array(wrong[name].noise.freed[LEVER_ARM].sigma) > 0.002
         assert (np.abs(one.value[-1] - ARM)[freed] < 4.0 * one.sigma[-1][freed]).all()
         assert "gnss.lever_arm_used" in map(get_key, wrong[name].notes)
-        assert stated[name].noise.lever_arm is None
+        assert not stated[name].noise.freed
 
 
-def test_an_arm_that_was_freed_is_in_the_noise_model_of_the_run(drive, tmp_path):
-    recording = state_arm(drive, np.array([0.5, 0.0, 0.0]))
+def stretch_stamps(recording, rate):
+    """The recording with a receiver whose clock gains on the IMU's."""
+    return replace(recording, gnss=replace(recording.gnss, t=recording.gnss.t + rate * recording.gnss.t))
+
+
+def interpolate_path(solution):
+    """(N, 3) m, every tenth of a second from 5 to 175 s."""
+    found = solution.trajectory(rate=50.0)
+    p = LocalFrame(np.array([0.0, 0.0, 0.0])).from_llh(found.llh)
+    return np.stack([np.interp(np.arange(5.0, 175.0, 0.1), found.t - found.t[0], x) for x in p.T], axis=-1)
+
+
+@pytest.mark.parametrize("rate", [2e-4, -1e-3])
+def test_clocks_that_drift_apart_are_solved_as_one_clock(drive, rate):
+    right, apart = (run(one, solvers=("ekf", "rts")) for one in (drive, stretch_stamps(drive, rate)))
+    stated = run(stretch_stamps(drive, rate), parse_settings({"gnss": {"clock_rate_sigma": 0.0}}), ("rts",))["rts"]
+    for name in ("ekf", "rts"):
+        freed = apart[name].noise.freed[CLOCK_RATE]
+        assert freed.value[0] == pytest.approx(-rate, abs=4.0 * freed.sigma[0])
+        path, true = (interpolate_path(x[name]) for x in (apart, right))
+        assert np.sqrt(np.mean((path - true) ** 2)) < 0.02
+        assert "gnss.clock_rate_used" in map(get_key, apart[name].notes)
+    assert not right["rts"].noise.freed
+    assert CLOCK_RATE not in stated.noise.freed
+
+
+@pytest.mark.parametrize("wrong", ["arm", "clocks"])
+def test_what_was_freed_is_in_the_noise_model_of_the_run(drive, tmp_path, wrong):
+    recording = state_arm(drive, np.array([0.5, 0.0, 0.0])) if wrong == "arm" else stretch_stamps(drive, 2e-4)
     found = run(recording, solvers=("rts",))["rts"]
     noise = read_noise(write_noise(tmp_path / "noise.json", found.noise))
-    assert noise.lever_arm == found.noise.lever_arm
+    assert noise.freed == found.noise.freed
     again = run(recording, solvers=("rts",), noise=noise)["rts"]
     assert (again.states.p == found.states.p).all()
 
@@ -82,22 +109,25 @@ def test_an_arm_that_was_freed_is_in_the_noise_model_of_the_run(drive, tmp_path)
 def test_an_arm_whose_prior_is_stated_is_estimated_by_it(drive):
     settings = parse_settings({"gnss": {"lever_arm_sigma": 0.01}})
     found = run(state_arm(drive, np.array([0.5, 0.0, 0.0])), settings, ("rts",))["rts"]
-    assert found.noise.lever_arm is None
+    assert LEVER_ARM not in found.noise.freed
     assert found.parameters[LEVER_ARM].prior_sigma == pytest.approx(0.01)
 
 
-@pytest.mark.parametrize("off", [(0.0, 0.0, 0.0), (0.3, -0.4, 0.0)])
-def test_evidence_of_a_free_arm_is_that_of_the_innovations(drive, monkeypatch, off):
-    """The closed form against filters of all keyframes, with and without the arm as a parameter."""
+@pytest.mark.parametrize(("off", "rate"), [((0.0, 0.0, 0.0), 0.0), ((0.3, -0.4, 0.0), 0.0), ((0.0, 0.0, 0.0), 5e-4)])
+def test_evidence_of_what_is_freed_is_that_of_the_innovations(drive, monkeypatch, off, rate):
+    """The closed form against filters of all keyframes, with and without the constants as parameters."""
     asked = []
-    monkeypatch.setattr(preparation, "find_contradicted_arm", lambda *given: asked.append(given))
-    run(state_arm(drive.crop(0.0, 90.0), np.array(off)), solvers=("ekf",))
-    ((problem, about),) = asked
-    stated = get_stated_arm(problem)
-    freed = free_arm(problem, LeverArm(tuple(stated), (ARM_SIGMA,) * 3))
+    monkeypatch.setattr(preparation, "find_contradicted", lambda *given: asked.append(given))
+    run(stretch_stamps(state_arm(drive.crop(0.0, 90.0), np.array(off)), rate), solvers=("ekf",))
+    ((problem, about, _),) = asked
+    wide = widen(problem, {CLOCK_RATE if rate else LEVER_ARM})
+    freed = free(problem, wide)
     one, other = refilter(problem, about), refilter(freed, reuse_points(about, problem, freed))
-    at = freed.columns[LEVER_ARM]
-    change = other.values[-1, shift(at)] - stated
+    ((name, prior),) = wide.items()
+    at = freed.columns[name]
+    change = other.values[-1, shift(at)] - prior.value
     gain = other.log_likelihood.sum() - one.log_likelihood.sum()
-    assert compute_evidence_gain(change, other.P[-1, at, at]) == pytest.approx(gain, abs=0.02 + 0.002 * abs(gain))
-    assert (gain > 0.0) == any(off)
+    assert compute_evidence_gain(change, other.P[-1, at, at], np.array(prior.sigma)) == pytest.approx(
+        gain, abs=0.02 + 0.002 * abs(gain)
+    )
+    assert (gain > 0.0) == (any(off) or rate != 0.0)
