@@ -206,6 +206,12 @@ def one_sigma(gnss: Gnss, rng: Rng) -> tuple[Gnss, str]:
     return replace(gnss, sd=np.full_like(gnss.sd, sd), sd_v=sd_v), f"all sigmas {sd:.1f} m"
 
 
+def drifting_clock(gnss: Gnss, rng: Rng) -> tuple[Gnss, str]:
+    """A logger stamps fixes by another crystal than the IMU's."""
+    rate = float(np.exp(rng.uniform(np.log(2e-5), np.log(1e-3))) * rng.choice([-1.0, 1.0]))
+    return replace(gnss, t=gnss.t + rate * (gnss.t - gnss.t[0])), f"clocks drift apart by {1e6 * rate:.0f} ppm"
+
+
 def level_velocity(gnss: Gnss, rng: Rng) -> tuple[Gnss, str]:
     if gnss.v is None:
         return gnss, "no velocity"
@@ -258,5 +264,6 @@ HABITS = (
     Fault("imu", 0.2, lost_samples),
     Fault("imu", 0.2, jitter),
     Fault("odometer", 0.5, ticks),
+    Fault("gnss", 0.3, drifting_clock),
 )
 FAMILIES = {"faults": FAULTS, "habits": HABITS}
