@@ -29,7 +29,7 @@ from graphnav.online.judging import CatchUp, Judgement, are_enough, start_judgin
 from graphnav.online.looks import CONTEXT, SURE
 from graphnav.online.sanity import find_period
 from graphnav.online.sensors import Row, Sensors
-from graphnav.online.start import find_start, list_keyframes, make_tracker, take_start_rows
+from graphnav.online.start import find_start, let_clocks_drift, list_keyframes, make_tracker, take_start_rows
 from graphnav.online.tracker import Tracker
 from graphnav.online.walker import Walker
 from graphnav.recording import Recording
@@ -57,7 +57,7 @@ class Smoother:
 
     def __init__(self, setup: Recording, settings: Settings | None = None) -> None:
         self._setup = setup
-        self.settings = settings or Settings()
+        self.settings = let_clocks_drift(settings or Settings())
         raw, s = setup.raw_gnss, self.settings.raw_gnss
         if s.ppp and raw is not None and setup.is_tight(s.coupling):
             require_precise(setup.name, raw)
@@ -234,8 +234,8 @@ class Smoother:
             self._wait(now)
             return
         recording, stationary = rows
-        if self.frame is None:
-            self.frame = LocalFrame(choose_origin(recording), recording.start)
+        origin = choose_origin(recording) if self.frame is None else self.frame.origin
+        self.frame = LocalFrame(origin, recording.start)  # clocks that were set anew drift from there
         try:
             found = find_start(recording, stationary, self.settings, self.frame)
         except EstimationError as error:

@@ -19,6 +19,19 @@ from graphnav.online.tracker import Tracker
 from graphnav.online.walker import Walker
 from graphnav.recording import Recording
 
+_CRYSTALS = 1e-4  # s/s, 1-sigma of what two of them drift apart
+
+
+def let_clocks_drift(settings: Settings) -> Settings:
+    """The settings with the rate between the clocks of IMU and receiver as a parameter, unless they say so or not.
+
+    A drive that is recorded shows as a whole whether there is one (`graphnav.estimation.contradictions`); online an
+    offset that is held constant is a third of a second wrong an hour later, by crystals as they are.
+    """
+    if settings.gnss.clock_rate_sigma is not None:
+        return settings
+    return settings.model_copy(update={"gnss": settings.gnss.model_copy(update={"clock_rate_sigma": _CRYSTALS})})
+
 
 def take_start_rows(sensors: Sensors, settings: Settings, now: float, last: bool) -> tuple[Recording, Array] | None:
     """The rows up to a time (s), and stops (M, 2) in them, if an alignment may succeed; None if it is too early.
