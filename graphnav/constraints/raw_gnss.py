@@ -115,7 +115,7 @@ class SatelliteConstraint(Constraint):
 
     axes: ClassVar[tuple[str, ...]] = ("range",)
     words: ClassVar[Mapping[str, tuple[tuple[str, str, float], ...]]] = {
-        CLOCK: (("receiver clock, ahead of GPS time", "µs", 1e6 / C), ("drift of the receiver clock", "m/s", 1.0))
+        CLOCK: (("receiver ahead of GPS time", "µs", 1e6 / C), ("drift of the receiver clock", "m/s", 1.0))
     }
     noise_axes: ClassVar[tuple[str, ...]] = (*_CLASSES, "horizontal", "up")  # of white parts, and of what lasts
 

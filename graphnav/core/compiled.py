@@ -9,8 +9,11 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from functools import cache
 from importlib.util import find_spec
 from typing import Any, TypeVar, cast
+
+from graphnav.core.progress import tell
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -30,7 +33,23 @@ def compile_once(function: Function) -> Function:
         return function
     import numba
 
+    _report_compiling()
     try:
         return cast(Function, numba.njit(function, cache=True, nogil=True))
     except RuntimeError:  # there is no folder to keep it in
         return cast(Function, numba.njit(function, nogil=True))
+
+
+@cache
+def _report_compiling() -> None:
+    """From now on compiling, a minute where nothing is kept on disk yet, is a stage of its own of the progress."""
+    from numba.core import event
+
+    class Report(event.Listener):  # type: ignore[misc]
+        def on_start(self, event: object) -> None:
+            tell("compiling (once)")
+
+        def on_end(self, event: object) -> None:
+            pass
+
+    event.register("numba:compile", Report())

@@ -25,7 +25,7 @@ from graphnav.core.errors import ConfigError, GraphnavError, RecordingError
 
 MAX_FILE, MAX_LINE = "GRAPHNAV_MAX_FILE_MB", "GRAPHNAV_MAX_LINE_KB"
 _DEFAULTS = {MAX_FILE: 2000, MAX_LINE: 1000}
-_NOTHING = {"na", "n/a", "null", "none", "nil", "-", "--", "nan(ind)", "-nan(ind)"}
+_NOTHING = {"na", "n/a", "#n/a", "null", "none", "nil", "-", "--", "nan(ind)", "-nan(ind)"}
 _WRITTEN = 64 << 20  # bytes at most of a file that is read as a whole: settings, descriptions, summaries
 _RATIO, _SMALL = 200, 8 << 20  # the size check of a packed log matters only beyond this many bytes
 _READ_SIZE = 1 << 16

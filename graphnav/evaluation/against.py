@@ -149,6 +149,16 @@ def read_against(asked: Against, name: str, recording: Recording, reference: Sol
                 "against.point", f"{asked.path.name}: moved to the IMU from [{_format_arm(arm)}] m (right, forward, up)"
             )
         )
+    if reference.noise.lever_arm is not None and recording.truth is not None and recording.truth.of == "gnss":
+        found = find_antenna_lever_arm(recording, reference)
+        assert found is not None
+        notes.append(
+            Note(
+                "against.lever_arm",
+                f"{asked.path.name}: compared with the antenna's truth at lever_arm as stated, ours at "
+                f"[{_format_arm(found)}] m as found",
+            )
+        )
     notes += _find_other_point(asked.path, track, arm, find_antenna_lever_arm(recording, reference), reference)
     track = replace(track, name=name)
     _, known = interpolate(track, reference.t, max_gap=_MAX_GAP)

@@ -103,9 +103,13 @@ def list_doubts(solutions: Mapping[str, Solution], errors: Mapping[str, Errors])
 
 
 def _describe_vague(solution: Solution) -> Note | None:
-    """A doubt where fixes leave open which way a vehicle in motion went."""
+    """A doubt where nothing has moved, or fixes leave open which way a vehicle in motion went."""
     track = solution.trajectory(joint=False)
     moving = np.linalg.norm(solution.states.v, axis=1) > _MOVING
+    if not moving.any() and any(get_key(note) == "alignment.no_motion" for note in solution.notes):
+        # linearised, a turn of what noise moves is information: at rest it adds up to a sigma of degrees
+        words = "nothing moved that tells it, whatever its sigma; a lever arm moves the position with it"
+        return Note("doubt.heading", f"The heading cannot be trusted: {words}")
     if "gnss_position" not in solution.records or track.sd_rph is None or track.sd_p is None or moving.mean() < 0.5:
         return None
     heading = float(np.median(track.sd_rph[:, 2]))

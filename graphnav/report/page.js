@@ -168,13 +168,16 @@
   // in the frame to come, when the styles are those of the new colours
   dark.addEventListener("change", () => requestAnimationFrame(() => places.filter(place => place.data).forEach(draw)));
 
-  // A4 between its margins is 703 pixels wide; three figures stand beside each other there
+  // A4 between its margins is 703 pixels wide; three figures stand beside each other there, or four without more
   addEventListener("beforeprint", () => places.forEach(place => {
     if (place.closest("details:not([open])")) return;
     draw(place);
     place.dataset.height ||= place.style.height;
     const whole = place.closest(".large, figure:only-child"), height = parseFloat(place.dataset.height);
-    const size = {width: whole ? 700 : 226, height: Math.min(whole ? 260 : 200, 0.65 * height)};
+    const {tickvals: named, scaleanchor: map} = place.layout.yaxis;  // a line for each name; the sky
+    const most = whole ? (named ? 600 : 220) : map ? 200 : 160;
+    const beside = place.closest(".figures").children.length === 4 ? 4 : 3;
+    const size = {width: whole ? 700 : 712 / beside - 12, height: Math.min(most, 0.65 * height)};
     place.style.height = `${size.height}px`;
     Plotly.relayout(place, {autosize: false, "font.size": 8, "margin.t": 15, "margin.b": 30, ...size});
   }));

@@ -175,8 +175,10 @@ def draw_nees(errors: Mapping[str, Errors], start: float, end: float, spans: Sha
     """Squared errors over their covariance."""
     series, names, dofs = {}, ["position", "velocity", "attitude"], [3, 3, 3]
     for name, e in errors.items():
-        series[name] = Curve(e.t - start, np.column_stack([e.nees_p, e.nees_v, e.nees_rph]))
-        dofs[0] = e.dof_p
+        values = np.column_stack([e.nees_p, e.nees_v, e.nees_rph])
+        if np.isfinite(values).any():  # another program's file may have no sigmas
+            series[name] = Curve(e.t - start, values)
+            dofs[0] = e.dof_p
     known = _find_known(series)
     if not known:
         return []

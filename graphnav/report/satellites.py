@@ -64,7 +64,7 @@ def make_satellite_parts(solution: Solution, start: float, end: float, spans: Sh
         out.append(
             page.gallery([page.place_picture(figure, "Arcs of carriers, by their ambiguities", note, kind="large")])
         )
-    return [*out, *tabulate_ambiguities(solution)]
+    return out
 
 
 def select_satellite_records(solution: Solution) -> dict[str, ConstraintRecord]:
@@ -94,6 +94,7 @@ def tabulate_satellites(solution: Solution) -> list[Markup]:
         ]
         for low, high in itertools.pairwise(_ELEVATIONS)
     ]
+    by_elevation = [row for row in by_elevation if any(cell != "-" for cell in row[1:])]
     head = [cell for kind in records for cell in (f"{kind} rows", "refused", "RMS / sigma")]
     return [
         page.make_table(["satellite", *head], by_satellite),
@@ -112,12 +113,21 @@ def _tabulate_residuals(record: ConstraintRecord, some: Array) -> list[Any]:
     return [count, Quantity(f"{100.0 * share:.1f} %"), float(np.sqrt(np.mean(nis))) if len(nis) else "-"]
 
 
-def tabulate_ambiguities(solution: Solution) -> list[Markup]:
-    """Numbers of epochs with integer and real-valued ambiguities, of those with carriers against a base station."""
-    epochs = solution.fixed
-    if not len(epochs):
+def tabulate_epochs(solution: Solution) -> list[Markup]:
+    """Epochs with rows of satellites, how many are used, and with carriers against a base the ambiguities' kind."""
+    records = select_satellite_records(solution)
+    if not records:
         return []
-    fixed = int(np.sum(epochs[:, 1] > 0.0))
-    share = Quantity(f"{100.0 * fixed / len(epochs):.1f} %")
-    head = ["epochs with carriers", "ambiguities fixed as integers", "float", "share fixed"]
-    return [page.make_table(head, [[len(epochs), fixed, len(epochs) - fixed, share]])]
+    t, name, weight = (
+        np.concatenate([getattr(r, key) for r in records.values()]) for key in ("t", "satellite", "weight")
+    )
+    (epochs, of), (_, which) = (np.unique(x, return_inverse=True) for x in (t, name))
+    pairs = np.unique(np.stack([of, which])[:, weight >= plots.HALF], axis=1)
+    many = np.bincount(pairs[0], minlength=len(epochs))
+    head = ["epochs", "satellites used, median", "fewest"]
+    row: list[Any] = [len(epochs), Quantity(f"{np.median(many):.0f}"), int(many.min())]
+    if len(kinds := solution.fixed):
+        fixed = int(np.sum(kinds[:, 1] > 0.0))
+        head += ["integer ambiguities", "real ambiguities", "share of integer"]
+        row += [fixed, len(kinds) - fixed, Quantity(f"{100.0 * fixed / len(kinds):.1f} %")]
+    return [page.heading("Raw GNSS"), page.make_table(head, [row])]

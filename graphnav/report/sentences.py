@@ -16,6 +16,7 @@ from graphnav.recording import Recording
 from graphnav.report import page, wording
 from graphnav.report.doubts import FEWEST_ROWS, TOO_LARGE, measure_consistency
 from graphnav.report.plots import Tinted
+from graphnav.report.satellites import select_satellite_records
 from graphnav.report.tables import Removed
 from graphnav.report.wording import join_words
 
@@ -44,7 +45,10 @@ def describe_run(recording: Recording, solutions: Mapping[str, Solution], withhe
         if source in used.aiding:
             used = used.without(source, span)
     sources = [f"an IMU at {1.0 / used.imu.period:.4g} Hz"]
-    if used.gnss is not None:
+    raw = [r.t for s in solutions.values() for r in select_satellite_records(s).values()]
+    if raw:
+        sources.append(f"raw GNSS of {format_count(len(np.unique(np.concatenate(raw))), 'epoch')}")
+    if used.gnss is not None and (not raw or any("gnss_position" in s.records for s in solutions.values())):
         sources.append(format_count(len(used.gnss.t), "GNSS fix", "GNSS fixes"))
     if used.odometer is not None:
         sources.append(format_count(len(used.odometer.t), "odometer row"))

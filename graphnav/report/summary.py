@@ -10,13 +10,13 @@ from markupsafe import Markup
 
 from graphnav.core.notes import Note, format_count
 from graphnav.core.rotation import Array
-from graphnav.estimation.noise.apply import select_weights
 from graphnav.estimation.solution import Solution
 from graphnav.evaluation.segments import compute_relative_errors, compute_rms
 from graphnav.recording import Recording
 from graphnav.report import page, wording
 from graphnav.report.consistency import summarise_record
 from graphnav.report.pictures import ENU, select_fixes
+from graphnav.report.satellites import tabulate_epochs
 from graphnav.report.tables import Removed
 from graphnav.report.wording import Quantity, join_words
 
@@ -113,8 +113,11 @@ def tabulate_sigmas(solution: Solution) -> list[Markup]:
 
 
 def fix_table(recording: Recording, solution: Solution, withheld: Removed) -> list[Markup]:
-    """Fixes of each kind: number, excluded or used, longest gap, largest residual."""
+    """Fixes of each kind: number, excluded or used, longest gap, largest residual; or epochs of raw observations."""
     fixes, nan = select_fixes(recording, solution), float("nan")
+    raw = tabulate_epochs(solution)
+    if raw:
+        return [*raw, page.paragraph("Raw observations are used in place of the fixes.", "soft")]
     if fixes is None:
         return []
     gone = np.zeros(len(fixes.t), dtype=bool)
@@ -143,9 +146,7 @@ def fix_table(recording: Recording, solution: Solution, withheld: Removed) -> li
     if recording.gnss is not None and recording.gnss.satellites is not None:
         head += ["satellites", "fewest"]
     out = [page.heading("Fixes"), page.make_table(head, rows)]
-    if "gnss_code" in solution.records:
-        out.append(page.paragraph("Raw observations are used in place of the fixes.", "soft"))
-    elif any(row[4] < row[1] - row[3] for row in rows):
+    if any(row[4] < row[1] - row[3] for row in rows):
         out.append(page.paragraph("Of fixes that come more often than noise.spacing, the best one is used.", "soft"))
     return out
 
@@ -205,9 +206,9 @@ def describe_excluded(solution: Solution, start: float) -> list[Markup]:
             f"{format_count(sum(int(p.count) for p in rest), 'row')} in {len(rest)} more spans: see the noise model"
         )
     less = [
-        f"{np.count_nonzero((w > 0) & (w < 0.5))} of {name}"
+        f"{count} of {name}"
         for name, record in solution.records.items()
-        if np.any(((w := select_weights(record.t, solution.noise, name)) > 0) & (w < 0.5))
+        if (count := np.count_nonzero((record.weight > 0) & (record.weight < 0.5)))
     ]
     if less and len(lines) < _MAX_LINES:
         lines.append(f"less than half weight, because they are farther off than chance allows: {join_words(less)}")

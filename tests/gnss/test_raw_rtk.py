@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import itertools
+import re
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -33,7 +34,7 @@ from graphnav.gnss.series import RawGnss
 from graphnav.gnss.sigmas import REFLECTED, compute_reflection_sigma
 from graphnav.gnss.signals import L1, C
 from graphnav.recording.formats import read
-from graphnav.report.satellites import tabulate_satellites
+from graphnav.report.satellites import tabulate_epochs, tabulate_satellites
 
 STATED = parse_settings({"noise": {"mode": "stated"}})
 WAVELENGTH = C / L1
@@ -556,4 +557,10 @@ def test_records_name_satellites_and_the_report_sums_them_up(drive):
         own = (record.satellite == name) & (record.weight >= 0.5)
         assert f"{np.sqrt(np.mean(record.nis[own])):.3g}"[:4] in tables[0]
         assert name in tables[0]
+    fixed = int((one.fixed[:, 1] > 0).sum())
+    cells = re.findall(r"<td[^>]*>([^<]*)</td>", tabulate_epochs(one)[1])
+    assert cells[0] == str(len(np.unique(one.records["gnss_code"].t)))
+    assert 4 <= int(cells[2]) <= int(cells[1]) <= len(set(record.satellite))
+    assert cells[3:5] == [str(fixed), str(len(one.fixed) - fixed)]
     assert not tabulate_satellites(replace(one, records={}))
+    assert not tabulate_epochs(replace(one, records={}))

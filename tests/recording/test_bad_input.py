@@ -168,6 +168,10 @@ BROKEN: dict[str, tuple[Break, tuple[str, ...]]] = {
         line("imu.csv", 7, "0.06,0,0,0,0,oops,9.8"),
         ("table.cell", "imu.csv, line 7", "'ay'", "'oops'"),
     ),
+    "error of a spreadsheet": (
+        line("imu.csv", 7, "0.06,0,0,0,0,#DIV/0!,9.8"),
+        ("table.cell", "imu.csv, line 7", "'ay'", "'#DIV/0!'"),
+    ),
     "decimal comma": (line("odometer.csv", 3, "0,1,0,5"), ("table.fields", "odometer.csv, line 3")),
     "short row": (line("imu.csv", 5, "0.04,0,0,0"), ("table.fields", "imu.csv, line 5")),
     "all rows short": (content("imu.csv", b"t,gx,gy,gz,ax,ay,az\n1,2\n3,4\n"), ("table.fields", "imu.csv, line 2")),

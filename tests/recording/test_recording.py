@@ -99,7 +99,7 @@ def test_speed_units(tmp_path: Path, unit: str, mps: float) -> None:
 def test_gnss_velocities_and_their_sigmas_share_the_unit(tmp_path: Path) -> None:
     (tmp_path / "g.csv").write_text(
         "t,lat,lon,h,sd_e,sd_n,sd_u,ve,vn,vu,sd_ve,sd_vn,sd_vu\n"
-        "0,50,8,100,1,2,3,36,72,0,3.6,3.6,3.6\n1,50,8,100,1,2,3,36,,0,3.6,3.6,3.6\n2,50,8,100,,2,3,0,0,0,3.6,,3.6\n"
+        "0,50,8,100,1,2,3,36,72,0,3.6,3.6,3.6\n1,50,8,100,1,2,3,36,#N/A,0,3.6,3.6,3.6\n2,50,8,100,,2,3,0,0,0,3.6,,3.6\n"
     )
     rest = '[gnss]\nfile = "g.csv"\nunits = { speed = "km/h" }\nsd = [9.0, 9.0, 9.0]\nsd_v = [0.5, 0.6, 0.7]'
     gnss = read(describe(tmp_path, rest=rest)).gnss
@@ -129,11 +129,24 @@ def test_positions_in_radians_and_longitudes_beyond_180(tmp_path: Path) -> None:
         IMU_ROWS.replace("\n", "\r\n"),
         IMU_ROWS.rstrip("\n"),
         "# a comment\n\n" + IMU_ROWS + "\n# the end\n",
+        IMU_ROWS.replace("\n", " # more, and more\n"),
+        "az,note,ay,ax,gz,gy,gx,t\n6,#N/A,5,4,3,2,1,0.01\n6,# 7,5,4,3,2,1,0.02#\n",
         " t , gx,gy ,gz,ax,ay, az\n 0.01, 1,2,3,4,5,6\n0.02 ,1,2,3,4,5,6 \n",
         "az,note,ay,ax,gz,gy,gx,t\n6,first,5,4,3,2,1,0.01\n6,,5,4,3,2,1,0.02\n",
         '"t","gx","gy","gz","ax","ay","az"\n0.01,1,2,3,4,5,6\n0.02,1,2,3,4,5,6\n',
     ],
-    ids=["plain", "bom", "crlf", "no-last-newline", "comments", "spaces", "any-order-and-text", "quoted-header"],
+    ids=[
+        "plain",
+        "bom",
+        "crlf",
+        "no-last-newline",
+        "comments",
+        "comments-in-lines",
+        "hashes-in-cells",
+        "spaces",
+        "any-order-and-text",
+        "quoted-header",
+    ],
 )
 def test_ways_to_write_the_same_table(tmp_path: Path, rows: str) -> None:
     describe(tmp_path)

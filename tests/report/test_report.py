@@ -9,10 +9,12 @@ import tomllib
 import zlib
 from dataclasses import replace
 from html.parser import HTMLParser
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from graphnav import load, run
 from graphnav.config import Settings
 from graphnav.constraints.foot import FOOT_AXIS, PATTERN, PIVOT, TRAVEL
 from graphnav.constraints.gnss import LEVER_ARM, TIME_OFFSET, VELOCITY_TIME_OFFSET
@@ -740,3 +742,10 @@ def test_a_drive_whose_fixes_leave_its_direction_open_is_doubted():
     found = [get_key(d) for d in list_doubts({"rts": replace(moved, covariance=P)}, {"rts": errors_of(sd=0.3)})]
     assert found == ["doubt.heading"]
     assert list_doubts({"rts": moved}, {"rts": errors_of(sd=0.3)}) == ()
+
+
+@pytest.mark.parametrize(("begin", "end", "told"), [(24.0, 50.0, True), (24.0, 75.0, False)])
+def test_a_car_that_only_stands_has_no_heading(begin, end, told):
+    drive = load(Path(__file__).resolve().parents[2] / "data" / "tokyo").crop(begin, end)
+    found = run(drive, Settings.model_validate({"noise": {"mode": "stated"}}), ("batch",))
+    assert ("doubt.heading" in [get_key(d) for d in list_doubts(found, {})]) == told

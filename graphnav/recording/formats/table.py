@@ -21,6 +21,7 @@ from graphnav.core.rotation import Array
 from graphnav.recording.formats.decimals import drop_cut_line, read_decimals
 
 _BLANK_CELL = re.compile(r"(?m)(?:(?<=,)|^(?=[ \t]*,))[ \t]*(?=,|$)")  # an empty cell of a line that is not empty
+_COMMENT = re.compile(r"(?m)(^|[^,\s])[ \t]*#.*")  # what follows a comma is a cell: #N/A
 _EMPTY = "is empty; copy the log again, or leave this file out"
 _MARKS = {";": "a semicolon", "\t": "a tab", " ": "blanks"}  # separators, in the order of their tests
 
@@ -201,7 +202,7 @@ def _find_header(path: Path) -> tuple[int, list[str]]:
         raise RecordingError(f"{path}: is a binary file, not a CSV table; save it as CSV", key="file.binary")
     text = start.decode("utf-8-sig", errors="replace")
     for number, line in enumerate(text.splitlines(), 1):
-        line = line.split("#")[0].strip()
+        line = _COMMENT.sub(r"\1", line).strip()
         if not line:
             continue
         names = [name.strip().strip('"') for name in line.split(",")]
@@ -257,9 +258,11 @@ def _parse(path: Path, skip: int, header: list[str], use: list[int]) -> tuple[li
 
 
 def _load_text(text: str, skip: int, header: list[str], use: list[int]) -> Array:
+    if "#" in text:
+        text = _COMMENT.sub(r"\1", text)
     # with usecols NumPy checks only that no row is too short for those
     for line in text.splitlines()[skip:]:
-        cells = line.partition("#")[0].strip()
+        cells = line.strip()
         if cells and cells.count(",") != len(header) - 1:
             raise ValueError("rows and header differ in length")
     with warnings.catch_warnings():
@@ -267,7 +270,7 @@ def _load_text(text: str, skip: int, header: list[str], use: list[int]) -> Array
         values = np.loadtxt(
             io.StringIO(_BLANK_CELL.sub("nan", text)),
             delimiter=",",
-            comments="#",
+            comments=None,
             skiprows=skip,
             usecols=use,
             ndmin=2,
@@ -280,7 +283,7 @@ def _list_lines(lines: Iterable[str]) -> Iterator[tuple[int, str]]:
     """(line number, text) of every non-empty line after the header."""
     seen_header = False
     for number, line in enumerate(lines, 1):
-        line = line.split("#")[0].strip()
+        line = _COMMENT.sub(r"\1", line).strip()
         if line and seen_header:
             yield number, line
         seen_header = seen_header or bool(line)

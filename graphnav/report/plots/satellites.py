@@ -19,6 +19,7 @@ _SKY = 320  # pixels
 _ROW_HEIGHT = 15  # pixels per satellite or signal
 _PLENTY = 4 * BINS  # points of a scatter plot that are drawn without thinning
 _RINGS = (0.0, 30.0, 60.0)  # deg of elevation
+_NAME = (22.0, 8.0)  # deg of a sky plot that a satellite's name is wide and high
 _BINS = np.arange(0.0, 90.1, 5.0)  # deg of elevation
 
 
@@ -32,8 +33,7 @@ def plot_sky(record: ConstraintRecord, solver: str) -> Figure:
     """
     off = 90.0 - np.degrees(record.elevation)
     x, y = off * np.sin(record.azimuth), off * np.cos(record.azimuth)
-    wide = (-180.0, 180.0)
-    figure = Figure([""], wide, [(-97.0, 97.0)], height=_SKY, x="", equal=True)
+    figure = Figure([""], (-105.0, 105.0), [(-97.0, 97.0)], height=_SKY, x="", equal=True)
     (panel,) = figure.panels
     for name in figure.axes:
         figure.axes[name] |= {"visible": False}
@@ -50,14 +50,24 @@ def plot_sky(record: ConstraintRecord, solver: str) -> Figure:
     ):  # fmt: skip
         panel.write_words(*at, words, align, shift, "ink")
     refused = record.weight < HALF
+    named = [(_NAME[0] / 2, 90.0 - ring) for ring in _RINGS]  # middles of words
     for name in np.unique(record.satellite):
         own = _choose_rows(np.flatnonzero(record.satellite == name), _PLENTY // 8)
         panel.draw_dots(x[own], y[own], solver, "used", 3.0, t=record.t[own], path=True)
-        panel.write_words(float(x[own[-1]]), float(y[own[-1]]), str(name), shift=(4, -4))
+        at = float(x[own[-1]]), float(y[own[-1]])
+        right, left = ((at[0] + side * _NAME[0] / 2, at[1]) for side in (1.0, -1.0))
+        turned = _find_room(left, named) > _find_room(right, named)
+        panel.write_words(*at, str(name), "right" if turned else "left", (-4 if turned else 4, -4))
+        named.append(left if turned else right)
     if refused.any():
         own = _choose_rows(np.flatnonzero(refused))
         panel.draw_dots(x[own], y[own], "alert", "less than half weight", 4.0, t=record.t[own], path=True)
     return figure
+
+
+def _find_room(place: tuple[float, float], named: list[tuple[float, float]]) -> float:
+    """How far a name there is from the next of its line, deg, up to its own width."""
+    return min([_NAME[0], *(abs(place[0] - x) for x, y in named if abs(place[1] - y) < _NAME[1])])
 
 
 def plot_used_satellites(
