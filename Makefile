@@ -11,18 +11,23 @@ export OPENBLAS_NUM_THREADS := 1
 # machine code of the filter and the smoother, kept on disk
 COMPILE := $(BIN)/python -c "from graphnav import load, run; run(load('data/tokyo').crop(0.0, 60.0))"
 
-.PHONY: demo test check suite docs clean
+.PHONY: demo test check suite compile collect docs clean
 
 demo: $(VENV)/installed
 	$(BIN)/graphnav compare kitti --without gnss:400-460 -o out/demo
 
-# with `make -j2` side by side: mypy has the core that the suite's last tests leave idle
-test: check suite
+# with `make -j2` side by side: check has the core that compile leaves idle
+test: suite check
 
-# compiled before, or every worker would compile the same
-suite: $(VENV)/installed-dev
-	@$(COMPILE)
+# compiled before, machine code and the tests themselves, or every worker would compile the same
+suite: compile collect
 	$(BIN)/pytest -n $(JOBS) --dist worksteal
+
+compile: $(VENV)/installed-dev
+	@$(COMPILE)
+
+collect: $(VENV)/installed-dev
+	@$(BIN)/pytest --collect-only >/dev/null || true  # the suite says what fails
 
 check: $(VENV)/installed-dev
 	$(BIN)/ruff format --check .

@@ -60,7 +60,7 @@ def decorrelate(Q: Array) -> Decorrelated:
     # Q = L^T D L is a Cholesky factorisation from the last row up
     root = np.linalg.cholesky(Q[::-1, ::-1])[::-1, ::-1].T
     diagonal = np.diagonal(root).copy()
-    L, D, Z = root / diagonal[:, None], diagonal**2, np.eye(n, dtype=np.int64)
+    L, D, Z = np.ascontiguousarray(root / diagonal[:, None]), diagonal**2, np.eye(n, dtype=np.int64)
     _reduce(L, D, Z)
     return Decorrelated(Z, L, D)
 

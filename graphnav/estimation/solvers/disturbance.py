@@ -40,11 +40,11 @@ def step_back(F: Array, decay: Array, N: Array) -> Array:
 @compile_once
 def step_vector_back(F: Array, decay: Array, r: Array) -> Array:
     """r (D,) likewise."""
-    out = np.empty(len(r))
-    out[:MOVING] = 0.0
-    out[MOVING:DIM] = r[MOVING:DIM]
-    out[DIM:] = decay * r[DIM:]
-    out[: F.shape[1]] += np.dot(r[:MOVING], F[:MOVING])
+    out, moving = np.empty(len(r)), np.dot(r[:MOVING], F[:MOVING])
+    for i in range(len(r)):
+        out[i] = 0.0 if i < MOVING else r[i] if i < DIM else decay[i - DIM] * r[i]
+        if i < len(moving):
+            out[i] += moving[i]
     return out
 
 
@@ -212,7 +212,10 @@ def vary(P: Array, N: Array, columns: Array, out: Array) -> None:
 def cover_rows(P: Array, N: Array, H: Array, out: Array) -> None:
     """H (P - P N P) H^T of rows H (m, D), in the first of `out` (M, M)."""
     m, HP = len(H), np.dot(H, P)
-    out[:m, :m] = np.dot(H - np.dot(HP, N), HP.T)
+    found = np.dot(H - np.dot(HP, N), HP.T)
+    for i in range(m):
+        for j in range(m):
+            out[i, j] = found[i, j]
 
 
 @compile_once

@@ -117,8 +117,8 @@ def update_tests(
     own = G[:, column : column + L * c].copy()
     for i in range(n):
         for j in range(i):
-            own[i] -= root[i, j] * own[j]
-        own[i] /= root[i, i]
+            np.subtract(own[i], root[i, j] * own[j], own[i])
+        np.divide(own[i], root[i, i], own[i])
     add_row(memory, np.dot(root.T, solved), own, L, c, errors, T)
 
 
@@ -180,8 +180,8 @@ def follow_filter(
             if k:
                 top = np.dot(F[k - 1], X[:w])
                 for i in range(D - DIM):
-                    X[DIM + i] *= decay[k - 1, i]
-                X[:DIM] = top
+                    np.multiply(X[DIM + i], decay[k - 1, i], X[DIM + i])
+                np.positive(top, X[:DIM])
         for b in range(max(first[k], b0), first[k + 1]):
             if not taken[b]:
                 continue

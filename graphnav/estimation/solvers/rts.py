@@ -169,7 +169,8 @@ def _smooth_points(
     wanted = np.zeros((0, 0), dtype=bool) if wanted is None else wanted
     asked = np.empty((0, 0, 0)) if asked is None else asked
     variance, of_rows = np.zeros(wanted.shape), np.zeros((len(asked), *asked.shape[1:2] * 2))
-    columns, first = np.nonzero(wanted)[1], np.append(0, np.cumsum(wanted.sum(axis=1)))
+    # in one piece as an empty one is: of another layout `smooth_rows` would be compiled a second time
+    columns, first = np.ascontiguousarray(np.nonzero(wanted)[1]), np.append(0, np.cumsum(wanted.sum(axis=1)))
     for hi in range(end, 0, -STRETCH):
         lo = max(hi - STRETCH, 0)
         r_k, N_k = smooth_rows(
