@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from graphnav.constraints.gnss import LEVER_ARM
 from graphnav.core import rotation
 from graphnav.core.earth import LocalFrame
 from graphnav.core.errors import RecordingError
@@ -85,7 +86,7 @@ def find_antenna_lever_arm(recording: Recording, solution: Solution) -> Array | 
     """Lever arm from the IMU to the antenna, m, RFU: as estimated, else as stated; None without GNSS."""
     if recording.gnss is None:
         return None
-    estimated = solution.parameters.get("gnss_lever_arm")
+    estimated = solution.parameters.get(LEVER_ARM)
     return recording.gnss.lever_arm if estimated is None else estimated.value[-1]
 
 
@@ -149,7 +150,7 @@ def read_against(asked: Against, name: str, recording: Recording, reference: Sol
                 "against.point", f"{asked.path.name}: moved to the IMU from [{_format_arm(arm)}] m (right, forward, up)"
             )
         )
-    if reference.noise.lever_arm is not None and recording.truth is not None and recording.truth.of == "gnss":
+    if LEVER_ARM in reference.noise.freed and recording.truth is not None and recording.truth.of == "gnss":
         found = find_antenna_lever_arm(recording, reference)
         assert found is not None
         notes.append(
