@@ -88,7 +88,7 @@ def widen(problem: Problem, names: Collection[str] = tuple(PRIOR_SIGMA)) -> dict
     }
 
 
-def find_contradicted(problem: Problem, about: Points, names: Collection[str]) -> dict[str, FreedConstant]:
+def find_contradicted_constants(problem: Problem, about: Points, names: Collection[str]) -> dict[str, FreedConstant]:
     """What fixes show of the constants that they contradict, with the sigmas of the priors to use.
 
     Parameters

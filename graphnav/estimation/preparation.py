@@ -26,7 +26,7 @@ from graphnav.estimation.building import BuiltProblem, Clock, ProblemBuilder, ha
 from graphnav.estimation.contradictions import (
     compute_prior_cost,
     describe_freed,
-    find_contradicted,
+    find_contradicted_constants,
     free,
     narrow,
 )
@@ -227,7 +227,7 @@ def _free_contradicted(
         names.add(LEVER_ARM)
     passes = best.passes + Counter(filter=1)
     try:
-        if not (freed := find_contradicted(problem, best.points, names)):
+        if not (freed := find_contradicted_constants(problem, best.points, names)):
             return built, replace(best, passes=passes), 0.0
         other = replace(built, problem=free(built.problem, freed))
         found = _estimate(other, builder.settings, progress, (best.points, problem))

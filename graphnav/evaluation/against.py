@@ -13,7 +13,6 @@ from pathlib import Path
 
 import numpy as np
 
-from graphnav.constraints.gnss import LEVER_ARM
 from graphnav.core import rotation
 from graphnav.core.earth import LocalFrame
 from graphnav.core.errors import RecordingError
@@ -31,6 +30,7 @@ from graphnav.recording.checks.clock import CLEAR
 from graphnav.recording.checks.tracks import Track
 from graphnav.recording.formats.trajectories import read_trajectory
 
+_ARM = "gnss_lever_arm"  # parameter of a solution
 _MAX_GAP = 3.0  # s; wider gaps of a trajectory are not filled
 _APPLIED = 1.0  # s; a larger shift is one of the clock
 _FEWEST_COMMON = 10  # rows in common, at least
@@ -86,7 +86,7 @@ def find_antenna_lever_arm(recording: Recording, solution: Solution) -> Array | 
     """Lever arm from the IMU to the antenna, m, RFU: as estimated, else as stated; None without GNSS."""
     if recording.gnss is None:
         return None
-    estimated = solution.parameters.get(LEVER_ARM)
+    estimated = solution.parameters.get(_ARM)
     return recording.gnss.lever_arm if estimated is None else estimated.value[-1]
 
 
@@ -150,7 +150,7 @@ def read_against(asked: Against, name: str, recording: Recording, reference: Sol
                 "against.point", f"{asked.path.name}: moved to the IMU from [{_format_arm(arm)}] m (right, forward, up)"
             )
         )
-    if LEVER_ARM in reference.noise.freed and recording.truth is not None and recording.truth.of == "gnss":
+    if _ARM in reference.noise.freed and recording.truth is not None and recording.truth.of == "gnss":
         found = find_antenna_lever_arm(recording, reference)
         assert found is not None
         notes.append(

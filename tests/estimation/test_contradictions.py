@@ -117,7 +117,7 @@ def test_an_arm_whose_prior_is_stated_is_estimated_by_it(drive):
 def test_evidence_of_what_is_freed_is_that_of_the_innovations(drive, monkeypatch, off, rate):
     """The closed form against filters of all keyframes, with and without the constants as parameters."""
     asked = []
-    monkeypatch.setattr(preparation, "find_contradicted", lambda *given: asked.append(given))
+    monkeypatch.setattr(preparation, "find_contradicted_constants", lambda *given: asked.append(given))
     run(stretch_stamps(state_arm(drive.crop(0.0, 90.0), np.array(off)), rate), solvers=("ekf",))
     ((problem, about, _),) = asked
     wide = widen(problem, {CLOCK_RATE if rate else LEVER_ARM})

@@ -14,12 +14,13 @@ from helpers import refuse_command, refused
 from graphnav.app import cli
 from graphnav.app.scores import score
 from graphnav.config import Settings
+from graphnav.constraints.gnss import LEVER_ARM
 from graphnav.core.earth import LocalFrame
 from graphnav.core.errors import RecordingError
 from graphnav.core.interpolation import interpolate, place_on_earth
 from graphnav.core.notes import get_key
 from graphnav.core.trajectory import Trajectory
-from graphnav.estimation.noise.model import LeverArm
+from graphnav.estimation.noise.model import FreedConstant
 from graphnav.estimation.pipeline import run
 from graphnav.estimation.solution import Solution
 from graphnav.evaluation.against import Against, read_against
@@ -216,8 +217,8 @@ def test_a_point_that_the_file_is_not_of_is_told(ekf, tmp_path, point, told):
 
 @pytest.mark.parametrize(("of", "used", "told"), [("gnss", True, True), ("gnss", False, False), ("imu", True, False)])
 def test_an_arm_that_only_ours_is_compared_with_is_told(ekf, tmp_path, of, used, told):
-    arm = LeverArm((0.5, 0.2, 1.0), (0.01, 0.01, 0.01)) if used else None
-    reference = replace(ekf, noise=replace(ekf.noise, lever_arm=arm))
+    freed = {LEVER_ARM: FreedConstant((0.5, 0.2, 1.0), (0.01, 0.01, 0.01))} if used else {}
+    reference = replace(ekf, noise=replace(ekf.noise, freed=freed))
     truth = Truth(TRUTH.t, TRUTH.llh, None, TRUTH.v, TRUTH.rph, of=of)
     write_as("csv", moved(0.0), tmp_path / "its.csv", None)
     found = read_against(Against(tmp_path / "its.csv"), "its", replace(RECORDING, truth=truth), reference)
