@@ -73,6 +73,8 @@ DAMAGES: dict[str, Damage] = {
     "sigmas ten times": lambda recording, gnss, rng: replace(gnss, sd=gnss.sd * 10.0),
     "stamps 0.2 s late": lambda recording, gnss, rng: replace(gnss, t=gnss.t + 0.2),
     "stamped on arrival": stamped_on_arrival,
+    "clocks 500 ppm apart": lambda recording, gnss, rng: replace(gnss, t=gnss.t + 5e-4 * (gnss.t - recording.start)),
+    "lever arm 0.7 m off": lambda recording, gnss, rng: replace(gnss, lever_arm=gnss.lever_arm + [0.5, -0.5, 0.0]),
     "one in ten off by 20 m": outliers,
     "bursts": bursts,
     "frozen": frozen,
