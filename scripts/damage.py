@@ -21,6 +21,7 @@ from graphnav.config import parse_settings
 from graphnav.core.earth import LocalFrame
 from graphnav.recording import Gnss, Recording
 
+WRONG = np.array([0.5, -0.5, 0.0])  # m
 Damage = Callable[[Recording, Gnss, np.random.Generator], Gnss]
 SOLVERS = ("ekf", "batch")
 STATED = {"noise": {"mode": "stated"}, "gnss": {"faults": "off"}}
@@ -74,7 +75,7 @@ DAMAGES: dict[str, Damage] = {
     "stamps 0.2 s late": lambda recording, gnss, rng: replace(gnss, t=gnss.t + 0.2),
     "stamped on arrival": stamped_on_arrival,
     "clocks 500 ppm apart": lambda recording, gnss, rng: replace(gnss, t=gnss.t + 5e-4 * (gnss.t - recording.start)),
-    "lever arm 0.7 m off": lambda recording, gnss, rng: replace(gnss, lever_arm=gnss.lever_arm + [0.5, -0.5, 0.0]),
+    "lever arm 0.7 m off": lambda recording, gnss, rng: replace(gnss, lever_arm=gnss.lever_arm + WRONG),
     "one in ten off by 20 m": outliers,
     "bursts": bursts,
     "frozen": frozen,

@@ -41,7 +41,7 @@ LEVER_ARM = "gnss_lever_arm"
 TIME_OFFSET = "gnss_time_offset"
 VELOCITY_TIME_OFFSET = "gnss_velocity_time_offset"
 CLOCK_RATE = "gnss_clock_rate"
-_UNITS = {LEVER_ARM: "m", CLOCK_RATE: "s/s"}
+_UNITS = {LEVER_ARM: "m", TIME_OFFSET: "s", VELOCITY_TIME_OFFSET: "s", CLOCK_RATE: "s/s"}
 TIMES = ("seconds", "minutes", "hours")  # correlation times of the processes of a position's error
 ERRORS = tuple(f"gnss_error_of_{time}" for time in TIMES)
 VELOCITY_ERROR = "gnss_velocity_error"
@@ -395,13 +395,14 @@ def average_around(imu: Imu, x: Array, t: Array) -> Array:
 
 
 def free_constants(rows: Constraint, priors: Mapping[str, tuple[Array, Array]]) -> Constraint:
-    """Rows of fixes with constants as parameters: the lever arm (m), the rate of the clocks (s/s).
+    """Rows of fixes with constants as parameters: the lever arm (m), offsets of stamps (s), the rate of clocks (s/s).
 
     Parameters
     ----------
-    priors : value and 1-sigma (k,), by the parameter's name.
+    priors : value and 1-sigma (k,), by the parameter's name; of offsets only those of the rows are taken.
     """
-    own = [Parameter(name, value, sigma, _UNITS[name]) for name, (value, sigma) in priors.items()]
+    there = {LEVER_ARM, CLOCK_RATE, *(p.name for p in rows.parameters)}
+    own = [Parameter(name, value, sigma, _UNITS[name]) for name, (value, sigma) in priors.items() if name in there]
     others = [p for p in rows.parameters if p.name not in priors]
     changed: dict[str, Any] = {"parameters": (*own, *others)}
     if LEVER_ARM in priors:

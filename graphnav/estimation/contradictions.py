@@ -1,16 +1,17 @@
-"""Constants that are stated, the drive contradicts, and are then estimated: the antenna's lever arm, and that the
-clocks of IMU and fixes run at one rate.
+"""Constants that are stated, the drive contradicts, and are then estimated: the antenna's lever arm, what stamps of
+fixes are late by, and that the clocks of IMU and fixes run at one rate.
 
 A wrong arm turns with the vehicle: it contradicts every bend, and every change of pitch and roll. Two crystals drift
-apart by up to some 1e-4, and what stamps are off by then grows all along the drive. Whether either is so is asked of
-one filter pass with both as parameters of wide priors, by the noise model that was estimated with them as stated.
-Components that differ by more than three sigmas are freed, the others stay, and only if that has more evidence: with m
-and P what the filter finds of the change, and S its prior,
+apart by up to some 1e-4, and what stamps are off by then grows all along the drive. Whether any is so is asked of one
+filter pass with all as parameters of wide priors, by the noise model that was estimated with them as stated. Components
+that differ from what is stated by more than three sigmas are freed, the others stay, and only if that has more
+evidence. With Lambda and eta the information matrix and vector of the measurements about the components, and D the
+diagonal matrix of the 1-sigmas of a prior (0 of what is known), the logarithm of the evidence is, but for a constant,
 
-    ln p(z | freed) - ln p(z | stated) = (m^T P^-1 m + ln |P| - ln |S|) / 2
+    -ln |I + D Lambda D| / 2 + (D eta)^T (I + D Lambda D)^-1 (D eta) / 2
 
-as all is linear and Gaussian in it (MacKay 1992, "Bayesian interpolation"). Then all is estimated anew, which stands if
-the evidence of the measurements is no smaller than before.
+as all is linear and Gaussian in them (MacKay 1992, "Bayesian interpolation"). Then all is estimated anew, which stands
+if the evidence of the measurements is no smaller than before.
 
 A filter that does not know the arm before the first bend is worse than one that has it wrong by a decimetre. So what
 is freed is used as the whole drive finds it, like the figures of the noise model, with a prior `_WIDER` times as wide
@@ -27,7 +28,9 @@ import numpy as np
 from graphnav.constraints.gnss import (
     CLOCK_RATE,
     LEVER_ARM,
+    OFFSETS,
     TIME_OFFSET,
+    VELOCITY_TIME_OFFSET,
     GnssPosition,
     GnssVelocity,
     free_constants,
@@ -38,17 +41,19 @@ from graphnav.core.state import DIM
 from graphnav.estimation.noise.apply import apply_noise
 from graphnav.estimation.noise.estimate import NoiseEstimate
 from graphnav.estimation.noise.model import FreedConstant
+from graphnav.estimation.offsets import LINEAR_OFFSET
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.ekf import refilter
 from graphnav.estimation.solvers.linearise import Points
 from graphnav.estimation.solvers.passes import reuse_points
 from graphnav.recording import Recording
 
+_STAMPS = {TIME_OFFSET: "positions", VELOCITY_TIME_OFFSET: "velocities"}
 Freed = Mapping[str, FreedConstant]  # by the parameter's name
 
-# 1-sigma of a component before the drive. An arm, m: how large a car is. A rate, s/s: crystals are good to 1e-4,
-# ceramic resonators to 5e-3
-PRIOR_SIGMA = {LEVER_ARM: 2.0, CLOCK_RATE: 1e-3}
+# 1-sigma of a component before the drive. An arm, m: how large a car is. An offset, s: where stamps are moved instead.
+# A rate, s/s: crystals are good to 1e-4, ceramic resonators to 5e-3
+PRIOR_SIGMA = {LEVER_ARM: 2.0, TIME_OFFSET: LINEAR_OFFSET, VELOCITY_TIME_OFFSET: LINEAR_OFFSET, CLOCK_RATE: 1e-3}
 _SIGNIFICANT = 3.0  # sigmas
 _WIDER = 2.0  # sigmas of the estimate, of the prior that it is used with
 _KNOWN = 5e-4  # of that 1-sigma: what a component that stays as stated has
@@ -77,59 +82,65 @@ def widen(problem: Problem, names: Collection[str] = tuple(PRIOR_SIGMA)) -> dict
     if rows is None:
         return {}
     stated: dict[str, Array] = {}
-    if problem.recording.platform == "vehicle":
+    if problem.recording.platform == "vehicle" and LEVER_ARM not in problem.parameters:
         stated[LEVER_ARM] = rows.lever_arm
-    if TIME_OFFSET in problem.parameters:
-        stated[CLOCK_RATE] = np.zeros(1)
+    stated |= {name: p.initial for name, p in problem.parameters.items() if name in OFFSETS.values()}
+    if stated.keys() & OFFSETS.values():
+        stated.setdefault(CLOCK_RATE, np.zeros(1))
     return {
         name: FreedConstant(tuple(one.tolist()), (PRIOR_SIGMA[name],) * len(one))
         for name, one in stated.items()
-        if name in names and name not in problem.parameters
+        if name in names
     }
 
 
-def find_contradicted_constants(problem: Problem, about: Points, names: Collection[str]) -> dict[str, FreedConstant]:
+def find_contradicted_constants(base: Problem, best: NoiseEstimate, names: Collection[str]) -> dict[str, FreedConstant]:
     """What fixes show of the constants that they contradict, with the sigmas of the priors to use.
 
     Parameters
     ----------
-    problem : with its noise model.
-    about : points of all keyframes near the solution.
+    base : with stated noise.
+    best : its noise model, and points of all keyframes near the solution.
     names : of the constants to ask about.
     """
-    asked = widen(problem, names)
+    problem = apply_noise(base, best.noise)
+    asked = widen(base, names)
     if not asked:
         return {}
-    found, P = _estimate(free(problem, asked), problem, about, asked)
-    stated, prior = _stack(asked, "value"), _stack(asked, "sigma")
-    off = found - stated
-    some = np.abs(off) > _SIGNIFICANT * np.sqrt(np.diagonal(P))
-    if not some.any():
+    found, P = _estimate(free(problem, asked), problem, best.points, asked)
+    stated, prior, known = _stack(asked, "value"), _stack(asked, "sigma"), _stack_stated(base, asked)
+    some = np.abs(found - stated) > _SIGNIFICANT * np.sqrt(np.diagonal(P) + known**2)
+    used = np.where(some, prior, known)
+    if not some.any() or compute_evidence_gain(found - stated, P, prior, used, known) <= 0.0:
         return {}
-    # given that the others, if any, are as stated
-    gain = P[np.ix_(some, ~some)] @ np.linalg.inv(P[np.ix_(~some, ~some)])
-    off[some] -= gain @ off[~some]
-    off[~some] = 0.0
-    P = P[np.ix_(some, some)] - gain @ P[np.ix_(~some, some)]
-    if compute_evidence_gain(off[some], P, prior[some]) <= 0.0:
-        return {}
-    sigma = _KNOWN * prior
-    sigma[some] = _WIDER * np.sqrt(np.diagonal(P))
-    freed = _split(asked, stated + off, sigma)
+    off, P, _ = _change_prior(found - stated, P, prior, used)
+    value = np.where(some, stated + off, stated)
+    freed = _split(asked, value, np.where(some, _WIDER * np.sqrt(np.diagonal(P)), _KNOWN * prior))
     return {name: one for name, one in freed.items() if one.value != asked[name].value}
 
 
-def compute_evidence_gain(change: Array, P: Array, prior: Array) -> float:
-    """By how much the logarithm of the evidence rises where components of constants are free.
+def compute_evidence_gain(change: Array, P: Array, prior: Array, one: Array, other: Array) -> float:
+    """By how much the logarithm of the evidence is larger with one prior of constants than with another.
 
     Parameters
     ----------
     change : (k,) what the filter finds of them beside what is stated.
     P : (k, k) its covariance.
-    prior : (k,) 1-sigma beforehand.
+    prior : (k,) 1-sigmas that it was found with.
+    one, other : (k,) 1-sigmas of the two priors, 0 for what is known.
     """
-    narrowed = np.linalg.slogdet(P)[1] - 2.0 * np.sum(np.log(prior))
-    return 0.5 * float(change @ np.linalg.solve(P, change) + narrowed)
+    return _change_prior(change, P, prior, one)[2] - _change_prior(change, P, prior, other)[2]
+
+
+def _change_prior(change: Array, P: Array, prior: Array, sigma: Array) -> tuple[Array, Array, float]:
+    """Estimate (k,) and covariance (k, k) with another prior, and the logarithm of its evidence but for a constant."""
+    information = np.linalg.inv(P)
+    of_measurements = information - np.diag(prior**-2.0)
+    scaled = np.eye(len(P)) + sigma[:, None] * of_measurements * sigma
+    covariance = sigma[:, None] * np.linalg.solve(scaled, np.diag(sigma))
+    vector = information @ change
+    log_evidence = 0.5 * float(vector @ covariance @ vector - np.linalg.slogdet(scaled)[1])
+    return covariance @ vector, covariance, log_evidence
 
 
 def compute_prior_cost(problem: Problem, freed: Freed) -> float:
@@ -175,14 +186,29 @@ def describe_freed(freed: Freed, recording: Recording) -> tuple[str, ...]:
             "m (right, forward, up of the IMU), as it finds it: measure it, or state what was found"
         )
         notes.append(Note("gnss.lever_arm_used", sentence))
-    if CLOCK_RATE in freed:
-        by = freed[CLOCK_RATE].value[0] * 1e6
+    late = [(words, freed[name].value[0]) for name, words in _STAMPS.items() if name in freed]
+    if late:
+        by = " and ".join(f"{seconds:+.3f} s ({words})" for words, seconds in late)
         sentence = (
-            f"clocks of IMU and fixes drift apart: the IMU's gains {by:.0f} ppm on that of the fixes, as the drive "
+            f"stamps of the fixes: the drive is solved with {by}, as it finds it: add it to time_offset in [gnss]"
+        )
+        notes.append(Note("gnss.time_offset_used", sentence))
+    if CLOCK_RATE in freed:
+        ppm = freed[CLOCK_RATE].value[0] * 1e6
+        sentence = (
+            f"clocks of IMU and fixes drift apart: the IMU's gains {ppm:.0f} ppm on that of the fixes, as the drive "
             "finds it, and their stamps are corrected by it"
         )
         notes.append(Note("gnss.clock_rate_used", sentence))
     return tuple(notes)
+
+
+def _stack_stated(problem: Problem, asked: Freed) -> Array:
+    """(n,) 1-sigmas as stated: of a parameter its prior's, 0 of what is none."""
+    parameters = problem.parameters
+    return np.concatenate(
+        [parameters[name].sigma if name in parameters else np.zeros(len(one.value)) for name, one in asked.items()]
+    )
 
 
 def _stack(freed: Freed, of: str) -> Array:

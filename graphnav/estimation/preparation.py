@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from graphnav.config import Settings
-from graphnav.constraints.gnss import CLOCK_RATE, LEVER_ARM
+from graphnav.constraints.gnss import CLOCK_RATE, LEVER_ARM, TIME_OFFSET, VELOCITY_TIME_OFFSET
 from graphnav.core.earth import LocalFrame
 from graphnav.core.errors import EstimationError
 from graphnav.core.progress import Progress, tell
@@ -224,10 +224,10 @@ def _free_contradicted(
     problem = apply_noise(built.problem, best.noise)
     names = {CLOCK_RATE} if builder.settings.gnss.clock_rate_sigma is None else set[str]()
     if not is_offset_far(problem, best.points):
-        names.add(LEVER_ARM)
+        names |= {LEVER_ARM, TIME_OFFSET, VELOCITY_TIME_OFFSET}
     passes = best.passes + Counter(filter=1)
     try:
-        if not (freed := find_contradicted_constants(problem, best.points, names)):
+        if not (freed := find_contradicted_constants(built.problem, best, names)):
             return built, replace(best, passes=passes), 0.0
         other = replace(built, problem=free(built.problem, freed))
         found = _estimate(other, builder.settings, progress, (best.points, problem))

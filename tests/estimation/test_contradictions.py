@@ -11,13 +11,14 @@ from helpers import refused
 
 from graphnav import run
 from graphnav.config import parse_settings
-from graphnav.constraints.gnss import CLOCK_RATE, LEVER_ARM
+from graphnav.constraints.gnss import CLOCK_RATE, LEVER_ARM, TIME_OFFSET
 from graphnav.core.earth import LocalFrame
 from graphnav.core.errors import EstimationError
 from graphnav.core.notes import get_key
 from graphnav.estimation import preparation
 from graphnav.estimation.antenna import find_antenna
 from graphnav.estimation.contradictions import compute_evidence_gain, free, widen
+from graphnav.estimation.noise.apply import apply_noise
 from graphnav.estimation.noise.files import read_noise, write_noise
 from graphnav.estimation.solvers.ekf import refilter
 from graphnav.estimation.solvers.linearise import shift
@@ -113,21 +114,45 @@ def test_an_arm_whose_prior_is_stated_is_estimated_by_it(drive):
     assert found.parameters[LEVER_ARM].prior_sigma == pytest.approx(0.01)
 
 
-@pytest.mark.parametrize(("off", "rate"), [((0.0, 0.0, 0.0), 0.0), ((0.3, -0.4, 0.0), 0.0), ((0.0, 0.0, 0.0), 5e-4)])
-def test_evidence_of_what_is_freed_is_that_of_the_innovations(drive, monkeypatch, off, rate):
-    """The closed form against filters of all keyframes, with and without the constants as parameters."""
+@pytest.mark.parametrize(
+    ("name", "off", "rate", "late"),
+    [
+        (LEVER_ARM, 0.0, 0.0, 0.0),
+        (LEVER_ARM, 0.4, 0.0, 0.0),
+        (CLOCK_RATE, 0.0, 5e-4, 0.0),
+        (TIME_OFFSET, 0.0, 0.0, 0.0),
+        (TIME_OFFSET, 0.0, 0.0, 0.1),
+    ],
+)
+def test_evidence_of_what_is_freed_is_that_of_the_innovations(drive, monkeypatch, name, off, rate, late):
+    """The closed form against filters of all keyframes, with one prior of the constants and with the other."""
     asked = []
     monkeypatch.setattr(preparation, "find_contradicted_constants", lambda *given: asked.append(given))
-    run(stretch_stamps(state_arm(drive.crop(0.0, 90.0), np.array(off)), rate), solvers=("ekf",))
-    ((problem, about, _),) = asked
-    wide = widen(problem, {CLOCK_RATE if rate else LEVER_ARM})
+    damaged = stretch_stamps(state_arm(drive.crop(0.0, 90.0), np.array([0.3, -off, 0.0]) if off else 0.0), rate)
+    run(replace(damaged, gnss=replace(damaged.gnss, t=damaged.gnss.t + late)), solvers=("ekf",))
+    ((base, best, _),) = asked
+    problem, about = apply_noise(base, best.noise), best.points
+    wide = widen(problem, {name})
     freed = free(problem, wide)
     one, other = refilter(problem, about), refilter(freed, reuse_points(about, problem, freed))
-    ((name, prior),) = wide.items()
-    at = freed.columns[name]
-    change = other.values[-1, shift(at)] - prior.value
+    at, prior = freed.columns[name], np.array(wide[name].sigma)
+    change, known = other.values[-1, shift(at)] - wide[name].value, np.zeros(len(prior))
+    if name in problem.parameters:
+        known = problem.parameters[name].sigma
     gain = other.log_likelihood.sum() - one.log_likelihood.sum()
-    assert compute_evidence_gain(change, other.P[-1, at, at], np.array(prior.sigma)) == pytest.approx(
-        gain, abs=0.02 + 0.002 * abs(gain)
-    )
-    assert (gain > 0.0) == (any(off) or rate != 0.0)
+    found = compute_evidence_gain(change, other.P[-1, at, at], prior, prior, known)
+    assert found == pytest.approx(gain, abs=0.02 + 0.002 * abs(gain))
+    if name != TIME_OFFSET:  # its prior is as wide as the noise model has it
+        assert (gain > 0.0) == bool(off or rate)
+
+
+@pytest.mark.parametrize("late", [0.12, -0.2])
+def test_late_stamps_are_known_to_the_filter(drive, late):
+    right = run(drive, solvers=("ekf",))["ekf"]
+    wrong = replace(drive, gnss=replace(drive.gnss, t=drive.gnss.t + late)).crop(0.0, drive.duration)
+    found = run(wrong, solvers=("ekf",))["ekf"]
+    freed = found.noise.freed[TIME_OFFSET]
+    assert freed.value[0] == pytest.approx(-late, abs=4.0 * freed.sigma[0])
+    assert not right.noise.freed
+    assert "gnss.time_offset_used" in map(get_key, found.notes)
+    assert np.sqrt(np.mean((interpolate_path(found) - interpolate_path(right))[100:] ** 2)) < 0.1 * 10.0 * abs(late)

@@ -39,14 +39,17 @@ from graphnav.constraints.gnss import (
     OFFSETS,
     STAMP_ERROR,
     STAMPS,
+    TIME_OFFSET,
     TIMES,
     VELOCITY_ERROR,
+    VELOCITY_TIME_OFFSET,
 )
 from graphnav.constraints.raw_gnss import CODE_ERRORS, RATE_ERROR
 from graphnav.constraints.vehicle import NHC_ERROR, ODOMETER_ERROR
 from graphnav.core.complaints import suggest_nearest
 from graphnav.core.errors import ConfigError
 from graphnav.core.files import parse_json, read_text
+from graphnav.core.notes import format_count
 from graphnav.estimation.noise.model import (
     INTERVALS,
     FreedConstant,
@@ -61,13 +64,20 @@ from graphnav.recording.checks.crosschecks import LARGEST_SHIFT
 
 MODES: tuple[str, ...] = get_args(NoiseSettings.model_fields["mode"].annotation)
 _LEAST_WEIGHT = 1e-15  # weight of an interval: one without any would have no end of noise
-_FREED = {"lever_arm": LEVER_ARM, "clock_rate": CLOCK_RATE}  # parameter by the key
-_KEYS = ("mode", "pieces", "figures", "correlation_times", "weights", "excluded", "spacing", "stamps", *_FREED)
 _PRIOR = tuple(one.name for one in fields(FreedConstant))
 _STAMPS = tuple(one.name for one in fields(StampOffsets))
 _LARGEST_OFFSET = 2.0 * LARGEST_SHIFT  # s; estimates go on from what is searched
-_LARGEST_RATE, _LEAST_RATE_SIGMA = 0.1, 1e-12  # s/s; a clock that is off by more is no clock
-_LONGEST_ARM, _LEAST_ARM_SIGMA = 100.0, 1e-6  # m
+_LARGEST_RATE = 0.1  # s/s; a clock that is off by more is no clock
+_LONGEST_ARM = 100.0  # m
+# by the key: parameter, how many numbers, how large they are at most, and what they are
+_FREED = {
+    "lever_arm": (LEVER_ARM, 3, _LONGEST_ARM, "m: right, forward, up"),
+    "time_offset": (TIME_OFFSET, 1, _LARGEST_OFFSET, "s to be added to stamps"),
+    "velocity_time_offset": (VELOCITY_TIME_OFFSET, 1, _LARGEST_OFFSET, "s to be added to stamps"),
+    "clock_rate": (CLOCK_RATE, 1, _LARGEST_RATE, "s/s, of the clocks of IMU and receiver"),
+}
+_KEYS = ("mode", "pieces", "figures", "correlation_times", "weights", "excluded", "spacing", "stamps", *_FREED)
+_LEAST_SIGMA = 1e-9  # of what is the most: nothing is better known
 _FIGURE_KEYS = {"log_factor": "log_factor", "sigma": "sigma", "prior": "prior", "prior_sigma": "prior_sigma",
            "degrees_of_freedom": "freedom"}  # fmt: skip
 _BESIDE = ("variance_factor", "stated", "used", "unit", "correlation_time")
@@ -101,7 +111,7 @@ def list_noise(noise: NoiseModel, mode: str = "estimated") -> dict[str, Any]:
         "stamps": {name: float(getattr(noise.stamps, name)) for name in _STAMPS},
     } | {
         key: {of: list(getattr(noise.freed[name], of)) for of in _PRIOR}
-        for key, name in _FREED.items()
+        for key, (name, *_) in _FREED.items()
         if name in noise.freed
     }
 
@@ -212,7 +222,7 @@ class _Reader:
             self.read_each(values, "excluded", constraints, self.read_spans),
             self.read_number("noise.spacing", values.get("spacing", 0.0), 0.0, 60.0, "s between fixes"),
             StampOffsets(**self.read_each(values, "stamps", _STAMPS, self.read_offset)),
-            {name: self.read_constant(key, values) for key, name in _FREED.items() if values.get(key)},
+            {name: self.read_constant(key, values) for key, (name, *_) in _FREED.items() if values.get(key)},
         ), mode
 
     def make_error(self, key: str, value: Any, why: str) -> ConfigError:
@@ -288,23 +298,19 @@ class _Reader:
         return self.read_number(key, value, -_LARGEST_OFFSET, _LARGEST_OFFSET, "s to be added to stamps")
 
     def read_constant(self, key: str, values: Mapping[str, Any]) -> FreedConstant:
-        found = self.read_each(values, key, _PRIOR, self.read_axes if key == "lever_arm" else self.read_rate)
+        _, count, most, what = _FREED[key]
+
+        def read_numbers(key: str, value: Any) -> tuple[float, ...]:
+            if not isinstance(value, list) or len(value) != count:
+                raise self.make_error(key, value, f"must be a list of {format_count(count, 'number')}, {what}")
+            low = _LEAST_SIGMA * most if key.endswith("sigma") else -most
+            return tuple(self.read_number(key, x, low, most, what) for x in value)
+
+        found = self.read_each(values, key, _PRIOR, read_numbers)
         missing = next((name for name in _PRIOR if name not in found), None)
         if missing:
             raise ConfigError(f"{self.path}: 'noise.{key}' has no {missing}; give it", key="key.missing")
         return FreedConstant(**found)
-
-    def read_axes(self, key: str, value: Any) -> tuple[float, ...]:
-        if not isinstance(value, list) or len(value) != 3:
-            raise self.make_error(key, value, "must be a list of three numbers, m: right, forward, up")
-        low = _LEAST_ARM_SIGMA if key.endswith("sigma") else -_LONGEST_ARM
-        return tuple(self.read_number(key, x, low, _LONGEST_ARM, "m") for x in value)
-
-    def read_rate(self, key: str, value: Any) -> tuple[float, ...]:
-        if not isinstance(value, list) or len(value) != 1:
-            raise self.make_error(key, value, "must be a list of one number, s/s")
-        low = _LEAST_RATE_SIGMA if key.endswith("sigma") else -_LARGEST_RATE
-        return (self.read_number(key, value[0], low, _LARGEST_RATE, "s/s, of the clocks of IMU and receiver"),)
 
     def read_weights(self, key: str, value: Any) -> RowWeights:
         if not isinstance(value, Mapping) or set(value) != {"t", "weight"}:
