@@ -35,7 +35,10 @@ def make_satellite_parts(solution: Solution, start: float, end: float, spans: Sh
         page.place_picture(
             plots.plot_sky(first, name), f"Sky, by the rows of {kind}", "North is up, the zenith in the middle."
         ),
-        page.place_picture(plots.plot_used_satellites(records, start, end, name, spans=spans), "Rows used and refused"),
+        page.place_picture(
+            plots.plot_used_satellites(records, start, end, name, spans=spans),
+            "Rows used, and with less than half weight",
+        ),
     ]
     by_satellite = [
         page.place_picture(plots.plot_residuals_by_satellite(one, r, name), f"{one}: {r.kind}s by satellite")
@@ -95,7 +98,7 @@ def tabulate_satellites(solution: Solution) -> list[Markup]:
         for low, high in itertools.pairwise(_ELEVATIONS)
     ]
     by_elevation = [row for row in by_elevation if any(cell != "-" for cell in row[1:])]
-    head = [cell for kind in records for cell in (f"{kind} rows", "refused", "RMS / sigma")]
+    head = [cell for kind in records for cell in (f"{kind} rows", "weight < 0.5", "RMS / sigma")]
     return [
         page.make_table(["satellite", *head], by_satellite),
         page.make_table(["elevation", *head], by_elevation),

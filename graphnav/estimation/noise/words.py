@@ -7,11 +7,11 @@ import numpy as np
 from graphnav.constraints.gnss import STAMP_ERROR, GnssPosition
 from graphnav.constraints.vehicle import MOUNTING
 from graphnav.core.notes import Note, format_count
-from graphnav.core.rotation import wrap
 from graphnav.estimation.names import name_components
 from graphnav.estimation.noise.model import INTERVALS, NoiseModel
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.linearise import Points, shift
+from graphnav.recording.checks.axes import write_letters
 
 _NAMES = {
     "imu.gyro_noise_density": "gyro noise",
@@ -36,11 +36,16 @@ def describe_far(problem: Problem, smoothed: Points) -> tuple[str, ...]:
         away = np.abs(value - stated) / sigma
         k = int(np.argmax(away))
         if p.name == MOUNTING and away[k] > _FAR and abs(value[k]) > 0.25 * np.pi:
-            sentence = (
-                f"the IMU's axes are {abs(np.degrees(wrap(value[k]))):.0f} deg from those of a vehicle that travels "
-                "forwards"
-            )
-            out.append(Note("doubt.axes", f"The attitude cannot be trusted: {sentence}; check axes in [imu]"))
+            (a, b), states = value, smoothed.states
+            up = np.array([0.0, np.sin(a), np.cos(a)])
+            ahead = np.array([-np.sin(b), np.cos(b) * np.cos(a), -np.cos(b) * np.sin(a)])
+            if np.einsum("i,kji,kj", ahead, states.R_nb, states.v) < 0.0:  # which no sideways velocity tells
+                ahead = -ahead
+            letters = write_letters(problem.recording.imu.R_bs, ahead, up)
+            hint = f' (axes = "{letters}" would agree)' if letters else ""
+            off = np.degrees(np.arccos(np.clip(ahead[1], -1.0, 1.0)))
+            sentence = f"the IMU's axes are {off:.0f} deg from those of a vehicle that travels forwards"
+            out.append(Note("doubt.axes", f"The attitude cannot be trusted: {sentence}; check axes in [imu]{hint}"))
         elif away[k] > _FAR:
             shown = name_components(p.name, p.size, p.unit)[k]
             found, given, sd = (float(f"{shown.scale * x:.2g}") for x in (value[k], stated[k], sigma[k]))

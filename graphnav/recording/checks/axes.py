@@ -35,7 +35,7 @@ def check_imu_axes(imu: Imu, forward: Fit | None, track: Track | None) -> Iterat
     # determined
     if along is not None and along.coefficients[0] > 0.5 and along.correlation > forward.correlation - _NO_BETTER:
         return
-    letters = _write_letters(imu.R_bs, ahead, up)
+    letters = write_letters(imu.R_bs, ahead, up)
     hint = f'; axes = "{letters}" would agree' if letters else ""
     yield Finding(
         "warning",
@@ -56,7 +56,7 @@ def _name_column(imu: Imu, axis: int) -> str:
     return "xyz"[int(np.argmax(np.abs(imu.R_bs[axis])))]
 
 
-def _write_letters(R_bs: Array, forward: Array, up: Array) -> str | None:
+def write_letters(R_bs: Array, forward: Array, up: Array) -> str | None:
     """The three letters of the axes with `forward` and `up` (body axes as loaded); None if none clearly fit."""
     f, u = R_bs.T @ forward, R_bs.T @ up  # in the file's axes
     if np.abs(f).max() < 0.8 or np.abs(u).max() < 0.8 or np.argmax(np.abs(f)) == np.argmax(np.abs(u)):
@@ -152,7 +152,7 @@ def check_sideways(imu: Imu, forward: Fit | None, track: Track, yaw: Fit | None)
             "imu.sideways_reversed",
         )
         return
-    letters = _write_letters(imu.R_bs, np.array([0.0, -1.0, 0.0]), up)
+    letters = write_letters(imu.R_bs, np.array([0.0, -1.0, 0.0]), up)
     hint = f' (axes = "{letters}" would agree)' if letters else ""
     yield Finding(
         "warning",
