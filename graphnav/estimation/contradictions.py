@@ -76,7 +76,7 @@ def widen(problem: Problem, names: Collection[str] = tuple(PRIOR_SIGMA)) -> dict
 
     Parameters
     ----------
-    names : of those to ask about; what the problem has no fixes for, or has as a parameter already, is not in it.
+    names : of those to ask about. None without fixes, no offset that is exact, and no arm that has a prior already.
     """
     rows = next((rows for rows in problem.constraints if isinstance(rows, GnssPosition)), None)
     if rows is None:
@@ -190,7 +190,8 @@ def describe_freed(freed: Freed, recording: Recording) -> tuple[str, ...]:
     if late:
         by = " and ".join(f"{seconds:+.3f} s ({words})" for words, seconds in late)
         sentence = (
-            f"stamps of the fixes: the drive is solved with {by}, as it finds it: add it to time_offset in [gnss]"
+            f"stamps of the fixes: the drive contradicts them and is solved with {by} added: add it to time_offset in "
+            "[gnss]"
         )
         notes.append(Note("gnss.time_offset_used", sentence))
     if CLOCK_RATE in freed:
