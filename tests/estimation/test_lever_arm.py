@@ -33,6 +33,12 @@ def drive():
     return recording
 
 
+@pytest.fixture(scope="module")
+def right(drive):
+    """What every solver makes of it; nothing changes a solution."""
+    return run(drive)
+
+
 @pytest.mark.parametrize("stated", [ARM, -ARM, np.zeros(3)], ids=["right", "signs", "none"])
 def test_the_antenna_is_found(drive, stated):
     found = find_antenna(replace(drive, gnss=replace(drive.gnss, lever_arm=stated)))
@@ -53,8 +59,8 @@ def state_arm(recording, off):
 
 
 @pytest.mark.parametrize("off", [(0.5, 0.0, 0.0), (-0.3, 0.8, 0.5)])
-def test_a_drive_with_a_wrong_arm_is_solved_as_with_the_right_one(drive, off):
-    right, wrong = (run(state_arm(drive, np.array(x))) for x in ((0.0, 0.0, 0.0), off))
+def test_a_drive_with_a_wrong_arm_is_solved_as_with_the_right_one(drive, right, off):
+    wrong = run(state_arm(drive, np.array(off)))
     stated = run(state_arm(drive, np.array(off)), noise="stated")
     for name in ("ekf", "rts", "batch"):
         assert right[name].noise.lever_arm is None
