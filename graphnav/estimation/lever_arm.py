@@ -36,7 +36,7 @@ from graphnav.recording import Recording
 ARM_SIGMA = 2.0  # m, 1-sigma of a component before the drive: how large a car is
 _SIGNIFICANT = 3.0  # sigmas
 _WIDER = 2.0  # sigmas of the estimate, of the prior that it is used with
-_KNOWN = 1e-3  # m, 1-sigma of a component that stays as stated
+_KNOWN_SIGMA = 1e-3  # m, 1-sigma of a component that stays as stated
 
 
 def free_arm(problem: Problem, arm: LeverArm | None) -> Problem:
@@ -74,7 +74,7 @@ def find_contradicted_arm(problem: Problem, about: Points) -> LeverArm | None:
     P = P[np.ix_(some, some)] - gain @ P[np.ix_(~some, some)]
     if compute_evidence_gain(off[some], P) <= 0.0:
         return None
-    sigma = np.full(3, _KNOWN)
+    sigma = np.full(3, _KNOWN_SIGMA)
     sigma[some] = _WIDER * np.sqrt(np.diagonal(P))
     return LeverArm(tuple((stated + off).tolist()), tuple(sigma.tolist()))
 
@@ -100,7 +100,7 @@ def narrow_arm(base: Problem, found: NoiseEstimate, arm: LeverArm) -> LeverArm:
     """
     problem = apply_noise(base, found.noise)
     value, P = _estimate_arm(problem, problem, found.points)
-    sigma = np.where(np.array(arm.sigma) > _KNOWN, _WIDER * np.sqrt(np.diagonal(P)), _KNOWN)
+    sigma = np.where(np.array(arm.sigma) > _KNOWN_SIGMA, _WIDER * np.sqrt(np.diagonal(P)), _KNOWN_SIGMA)
     return LeverArm(tuple(value.tolist()), tuple(sigma.tolist()))
 
 
