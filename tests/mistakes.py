@@ -62,11 +62,8 @@ def _parsed(packed: bytes) -> Table:
 
 def write(folder: Path, name: str, columns: Table, separator: str = ",") -> None:
     """Write a sensor's file."""
-    rows = [
-        separator.join("" if np.isnan(x) else repr(float(x)) for x in row)
-        for row in zip(*columns.values(), strict=True)
-    ]
-    text = "\n".join([separator.join(columns), *rows]) + "\n"
+    rows = [separator.join(map(repr, row)) for row in np.column_stack(list(columns.values())).tolist()]
+    text = "\n".join([separator.join(columns), *rows]).replace("nan", "") + "\n"
     (folder / f"{name}.csv.gz").write_bytes(gzip.compress(text.encode(), 1))
 
 

@@ -180,11 +180,16 @@ class StopRequest:
         self.so = True
 
 
-def follow(session: Session, chunks: Iterator[bytes], shown: LiveView, asked: StopRequest) -> None:
-    """Process lines until the source ends or an end is requested; b"" means that nothing arrived for a while."""
+def follow(session: Session, chunks: Iterator[bytes | None], shown: LiveView, asked: StopRequest) -> None:
+    """Process lines until the source ends or an end is requested.
+
+    b"" means that nothing arrived for a while, None that the sender is gone and its last line may be cut.
+    """
     rest, heard = b"", time.monotonic()
     for chunk in chunks:
-        if chunk:
+        if chunk is None:
+            rest = b""  # cut in its last number it would pass for a row
+        elif chunk:
             *whole, rest = (rest + chunk).split(b"\n")
             rest = rest[:LONGEST_LINE]  # a line without an end is no row, and is reported as one when it does end
             whole = [line[:LONGEST_LINE] for line in whole]
@@ -206,7 +211,7 @@ def read_standard_input() -> Iterator[bytes]:
             yield b""
 
 
-def read_connections(source: str) -> Iterator[bytes]:
+def read_connections(source: str) -> Iterator[bytes | None]:
     """The lines of clients, one client after the other; a client that disconnects may reconnect."""
     port = source.removeprefix("tcp:")
     if not (port.isascii() and port.isdigit() and len(port) < 6 and int(port) < 1 << 16):
@@ -233,7 +238,7 @@ def read_connections(source: str) -> Iterator[bytes]:
                     except OSError:
                         chunk = b""
                     if not chunk:
-                        yield b"\n"  # an incomplete line is dropped
+                        yield None
                         break
                     yield chunk
 

@@ -39,7 +39,7 @@ _PART = 240.0  # s
 _FEWEST_FOR_ARM = 30  # fixes
 _SURE_SIGMAS = 8.0  # 4 sigmas, doubled because errors of fixes are correlated for minutes
 # Findings by which attitude, times or positions are wrong: what the drive then says of lever arms follows from that.
-_FIRST = {
+_MENDED_FIRST = {
     "imu.axes", "imu.clock", "imu.contradicted", "imu.force_sign", "imu.gyro_axis_sign", "imu.gyro_fast",
     "imu.gyro_scale", "imu.gyro_sign", "imu.gyro_unit", "imu.sideways_reversed", "imu.up", "gnss.clock", "gnss.feet",
     "gnss.lat_lon", "gnss.mirrored", "gnss.velocity_axes", "gnss.velocity_down", "gnss.velocity_unit",
@@ -86,7 +86,7 @@ def find_antenna(recording: Recording) -> Antenna:
     EstimationError
         Without GNSS, or if the drive cannot be aligned.
     """
-    return _estimate(recording)[0]
+    return _estimate_antenna(recording)[0]
 
 
 def find_wrong_arms(recording: Recording, findings: Sequence[Finding] = ()) -> list[Finding]:
@@ -96,7 +96,7 @@ def find_wrong_arms(recording: Recording, findings: Sequence[Finding] = ()) -> l
     where one of the `findings` is the cause.
     """
     gnss = recording.gnss
-    if any(f.severity != "note" and f.key in _FIRST for f in findings):
+    if any(f.severity != "note" and f.key in _MENDED_FIRST for f in findings):
         return []
     if recording.platform != "vehicle" or gnss is None or len(gnss.t) < _FEWEST_FOR_ARM:
         return []
@@ -105,7 +105,7 @@ def find_wrong_arms(recording: Recording, findings: Sequence[Finding] = ()) -> l
     second = np.floor(gnss.t)
     thin = take_rows(gnss, np.concatenate([[True], np.diff(second) > 0.0]))
     try:
-        antenna, axle = _estimate(_find_turning(replace(recording, gnss=thin)))
+        antenna, axle = _estimate_antenna(_find_turning(replace(recording, gnss=thin)))
     except EstimationError:
         return []
     out = []
@@ -164,7 +164,7 @@ def _find_turning(recording: Recording) -> Recording:
     return recording.crop(best, best + _PART)
 
 
-def _estimate(recording: Recording) -> tuple[Antenna, tuple[Array, Array, Array] | None]:
+def _estimate_antenna(recording: Recording) -> tuple[Antenna, tuple[Array, Array, Array] | None]:
     """The antenna, and the forward position of the point that does not slip, (1,) m each: stated, found, sigma."""
     if recording.gnss is None or not len(recording.gnss.t):
         raise EstimationError(

@@ -65,7 +65,7 @@ class Dense(AtKeyframes):
     def __call__(self, t: Array) -> tuple[States, Array]:
         """States and covariances (M, 15, 15) at ascending times from `start` to `end`."""
         k, s = self._locate(t)
-        return self._reach(t, k, s), _interpolate(self.covariance, k, s)
+        return self._reach(t, k, s), _interpolate_covariance(self.covariance, k, s)
 
     def interpolate_blocks(self, t: Array) -> tuple[States, dict[str, Array]]:
         """The same with covariances (6, M) of position, velocity and attitude each by itself."""
@@ -87,17 +87,17 @@ class Dense(AtKeyframes):
         first, t, k, s = self.states[k[:begin]], t[begin:], k[begin:], s[begin:]
         if not len(t):
             return first
-        reached = self._smooth(t, k, s) if self.smooth else self._filter(t, k, s)
+        reached = self._smooth_between(t, k, s) if self.smooth else self._filter_between(t, k, s)
         return States.stack([first, reached]) if begin else reached
 
-    def _filter(self, t: Array, k: Array, s: Array) -> States:
+    def _filter_between(self, t: Array, k: Array, s: Array) -> States:
         reached = self._predict(t)
         exact = np.flatnonzero(np.isclose(s, 1.0, rtol=0.0, atol=1e-9))
         for name in States.__dataclass_fields__:
             getattr(reached, name)[exact] = getattr(self.states, name)[k[exact] + 1]
         return reached
 
-    def _smooth(self, t: Array, k: Array, s: Array) -> States:
+    def _smooth_between(self, t: Array, k: Array, s: Array) -> States:
         # predicted as well: the end of every interval that contains a time, for the difference there
         touched, interval = np.unique(k, return_inverse=True)
         ends = self.t[touched + 1]
@@ -126,7 +126,7 @@ def _distribute(miss: Array, s: Array, T: Array) -> Array:
     return out
 
 
-def _interpolate(of_keyframes: Array, k: Array, s: Array) -> Array:
+def _interpolate_covariance(of_keyframes: Array, k: Array, s: Array) -> Array:
     """Covariances between keyframes k and those behind them."""
     w = s[:, None, None]
     out, after = of_keyframes.take(k, axis=0), of_keyframes.take(k + 1, axis=0)

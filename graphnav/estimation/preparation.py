@@ -130,11 +130,11 @@ def prepare(
     aligned = built.aligned
     problem = drop_parts(apply_noise(built.problem, noise))
     try:
-        forward, smoothed = _smooth(problem, aligned.until, None, clock, progress)
+        forward, smoothed = _filter_and_smooth(problem, aligned.until, None, clock, progress)
     except EstimationError:  # from a rough start its first pass may diverge, where that of the noise model did not
         if known is None:
             raise
-        forward, smoothed = _smooth(problem, aligned.until, known, clock, progress)
+        forward, smoothed = _filter_and_smooth(problem, aligned.until, known, clock, progress)
     with clock.count_time("smoother"):
         problem = _drop_refused(problem, forward)
         if any(rows.gate is not None for rows in problem.constraints):
@@ -157,7 +157,7 @@ def prepare(
     )  # fmt: skip
 
 
-def _smooth(
+def _filter_and_smooth(
     problem: Problem, opening: float | None, known: Points | None, clock: Clock, progress: Progress | None
 ) -> tuple[FilterPass, SmootherPass]:
     """Filter, with its opening linearised at known points if there are any, and smooth."""
@@ -172,12 +172,12 @@ def _find_noise(
     """The noise model, linearisation points, the problem with a start and stops that rest on no excluded fix, and the
     logarithm of the evidence where it is wanted.
     """
-    best = _estimate(built, builder.settings, progress)
+    best = _estimate_noise(built, builder.settings, progress)
     if compute_excluded_share(built.problem, best.noise) > _MOST_WRONG:
         # most fixes contradict the start: align again with the fixes behind those that the alignment used
         try:
             later = builder.build_later(built)
-            again = _estimate(later, builder.settings, progress)
+            again = _estimate_noise(later, builder.settings, progress)
             total = best.passes + again.passes
             if compute_excluded_share(later.problem, again.noise) < compute_excluded_share(built.problem, best.noise):
                 built, best = later, again
@@ -201,7 +201,7 @@ def _find_noise(
     return best.noise, Points(best.points.states, best.points.values), built, evidence
 
 
-def _estimate(
+def _estimate_noise(
     built: BuiltProblem,
     settings: Settings,
     progress: Progress | None,
@@ -230,7 +230,7 @@ def _free_contradicted(
         if not (freed := find_contradicted_constants(built.problem, best, names)):
             return built, replace(best, passes=passes), 0.0
         other = replace(built, problem=free(built.problem, freed))
-        found = _estimate(other, builder.settings, progress, (best.points, problem))
+        found = _estimate_noise(other, builder.settings, progress, (best.points, problem))
         found = estimate_disturbed_intervals(other.problem, found)
         passes = passes + found.passes + Counter(filter=1)
         # by other figures what is freed may lead to an optimum that is worse than the one with all as stated

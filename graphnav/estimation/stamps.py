@@ -61,23 +61,23 @@ def find_stamps(
     ----------
     clock : offsets between IMU and fixes that the recording shows before any estimation.
     """
-    guess = None if clock is None else _guess(clock)
+    guess = None if clock is None else _guess_offsets(clock)
     plain: _Candidate = recording, prepare(recording, is_offset_far if guess is None else _accept_all), _AS_THEY_ARE
     starts = [] if guess is None else [_move(recording, prepare, guess)]
     for start in (*starts, plain):
-        found = _settle(recording, prepare, start)
+        found = _move_until_near(recording, prepare, start)
         if found is not None and found is not plain and found[1].log_evidence > plain[1].log_evidence:
             return found
     return plain
 
 
-def _settle(recording: Recording, prepare: Prepare, found: _Candidate) -> _Candidate | None:
+def _move_until_near(recording: Recording, prepare: Prepare, found: _Candidate) -> _Candidate | None:
     """Move the stamps until their offsets are estimated near where they are; None where that does not come about."""
     for _ in range(_MOVES):
-        if (ahead := _estimate(*found[1:])) == found[2]:
+        if (ahead := _estimate_offsets(*found[1:])) == found[2]:
             return found
         found = _move(recording, prepare, ahead)
-    return found if _estimate(*found[1:]) == found[2] else None
+    return found if _estimate_offsets(*found[1:]) == found[2] else None
 
 
 def _move(recording: Recording, prepare: Prepare, offsets: StampOffsets) -> _Candidate:
@@ -89,7 +89,7 @@ def _accept_all(problem: Problem, points: Points) -> bool:
     return True
 
 
-def _guess(clock: ClockOffsets) -> StampOffsets | None:
+def _guess_offsets(clock: ClockOffsets) -> StampOffsets | None:
     """Offsets that the clocks of IMU and fixes show, where they are certain and far."""
     if clock.late is None and clock.apart is None:
         return None
@@ -108,7 +108,7 @@ def _join(offsets: StampOffsets) -> StampOffsets:
     return replace(offsets, velocities=offsets.positions) if near else offsets
 
 
-def _estimate(prepared: Prepared, at: StampOffsets) -> StampOffsets:
+def _estimate_offsets(prepared: Prepared, at: StampOffsets) -> StampOffsets:
     """The offsets estimated, those that are far and significant; the others as they are."""
     problem = prepared.problem
     values, P = prepared.smoothed.values[0], prepared.smoothed.P[0][DIM:, DIM:]

@@ -12,7 +12,10 @@ from graphnav.core import files
 from graphnav.core.errors import RecordingError
 from graphnav.core.rotation import Array
 
-_FIRST, _LAST = np.array([1980, 1, 1, 0, 0, 0.0]), np.array([2099, 12, 31, 24, 59, 61.0])  # of GPS; a leap second
+_FIRST_DATE, _LAST_DATE = (
+    np.array([1980, 1, 1, 0, 0, 0.0]),
+    np.array([2099, 12, 31, 24, 59, 61.0]),
+)  # of GPS; a leap second
 
 
 def unpack_bytes(path: Path) -> bytes:
@@ -109,9 +112,9 @@ def parse_numbers(block: NDArray[np.uint8], width: int) -> Array:
 def count_days(fields: Array) -> tuple[NDArray[np.datetime64], NDArray[np.bool_]]:
     """(n,) days of dates (n, 6), year to second, and which of them are dates that a receiver may have had."""
     with np.errstate(invalid="ignore"):
-        good = np.all((fields >= _FIRST) & (fields <= _LAST), axis=1)
+        good = np.all((fields >= _FIRST_DATE) & (fields <= _LAST_DATE), axis=1)
         good &= np.all(fields[:, :5] == np.floor(fields[:, :5]), axis=1)
-    year, month, day = np.where(good[:, None], fields, _FIRST).astype(int).T[:3]
+    year, month, day = np.where(good[:, None], fields, _FIRST_DATE).astype(int).T[:3]
     months = (year - 1970).astype("datetime64[Y]").astype("datetime64[M]") + (month - 1)
     days = months.astype("datetime64[D]") + (day - 1)
     return days, good & (days.astype("datetime64[M]") == months)

@@ -27,8 +27,8 @@ from graphnav.gnss.ubx import is_ubx, parse_ubx
 
 _ROUGH_EPOCHS = 50  # epochs that a rough place is looked for in
 _BASE_OFF = 10.0  # 1-sigma of a base's single-point position that it may be from the stated one
-_FARTHEST = 1e8  # m, of codes: twice as far as satellites are
-_LOST = ("raw.impossible", "raw.no_ephemeris", "raw.no_ephemeris_then", "raw.unhealthy", "raw.no_channel")
+_LARGEST_TYPICAL_CODE = 1e8  # m, of codes: twice as far as satellites are
+_LOST_KEYS = ("raw.impossible", "raw.no_ephemeris", "raw.no_ephemeris_then", "raw.unhealthy", "raw.no_channel")
 
 
 @dataclass(frozen=True)
@@ -115,9 +115,9 @@ def load_raw(
         )
     fixes = solve(raw.take(one))
     if not np.isfinite(fixes.p[:, 0]).any():
-        left_out = "".join(f"; {note}" for note in (*obs.remarks, *remarks) if get_key(note) in _LOST)
+        left_out = "".join(f"; {note}" for note in (*obs.remarks, *remarks) if get_key(note) in _LOST_KEYS)
         for signal in np.unique(obs.signal).tolist():
-            if (typical := float(np.nanmedian(obs.code[obs.signal == signal]))) > _FARTHEST:
+            if (typical := float(np.nanmedian(obs.code[obs.signal == signal]))) > _LARGEST_TYPICAL_CODE:
                 left_out += (
                     f"; codes {name_signal(signal)} of {typical:.3g} m are no way to a satellite: see the header"
                 )

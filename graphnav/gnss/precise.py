@@ -24,7 +24,7 @@ from graphnav.gnss.signals import SYSTEMS, C, Ids, number_satellite
 _NODES = 11  # of the polynomial
 _ABSENT = 0.9  # s; a clock of 999999.999999 us is none
 _LONGEST_CLOCK_GAP = 900.0  # s between nodes of a clock that a line is drawn through
-_HALF = 0.5  # s either way, over which velocities are differences
+_HALF_SPAN = 0.5  # s either way, over which velocities are differences
 
 
 @dataclass(frozen=True)
@@ -47,8 +47,8 @@ class Orbits:
             for _ in range(2):
                 true = t[own] - np.nan_to_num(_interpolate_clocks(clocks, true, zero)[0])
             p = _interpolate_orbit(nodes, true, zero)
-            ahead, behind = (_interpolate_orbit(nodes, true + h, zero) for h in (_HALF, -_HALF))
-            v = (ahead - behind) / (2.0 * _HALF)
+            ahead, behind = (_interpolate_orbit(nodes, true + h, zero) for h in (_HALF_SPAN, -_HALF_SPAN))
+            v = (ahead - behind) / (2.0 * _HALF_SPAN)
             clock, drift = _interpolate_clocks(clocks, true, zero)
             out.p[own], out.v[own], out.drift[own] = p, v, drift
             out.clock[own] = clock - 2.0 * np.sum(p * v, axis=1) / C**2

@@ -22,7 +22,7 @@ from graphnav.gnss.signals import BEIDOU, GALILEO, GLONASS, GPS, NAVIC, QZSS, SB
 _BDT = 14.0  # s, GPS minus BeiDou time
 _BDT_WEEKS = 1356  # from the GPS to the BeiDou epoch
 _RECORD_LINES = {GLONASS: 4, SBAS: 4}  # of a record; 8 of all others
-_KNOWN = {"LNAV", "INAV", "FNAV", "D1", "D2", "FDMA"}
+_KNOWN_MESSAGES = {"LNAV", "INAV", "FNAV", "D1", "D2", "FDMA"}
 _ROOTS = (2530.0, 8192.0)  # sqrt(m), of the semi-major axis: the range that IS-GPS-200N, table 20-III, gives it
 _WEEKS = 6262  # of the GPS until 2100
 _EPOCH = np.datetime64("1980-01-06T00:00:00", "us")
@@ -85,7 +85,7 @@ def _read(path: Path, found: _Navigation) -> None:
         if text.startswith(">"):  # version 4: what comes next
             words = text[1:].split()
             message = words[2] if len(words) > 2 else ""
-            if words[:1] != ["EPH"] or message not in _KNOWN:
+            if words[:1] != ["EPH"] or message not in _KNOWN_MESSAGES:
                 end = next((j for j in range(k + 1, len(lines)) if lines[j].startswith(">")), len(lines))
                 if (
                     words[:1] == ["ION"] and message == "LNAV" and words[1][:1] == "G"

@@ -13,10 +13,10 @@ from graphnav.core.rotation import Array
 from graphnav.gnss.antex import Antennas
 from graphnav.gnss.signals import C, Ids, find_frequencies
 
-_FARTHEST = 1e9  # m, of a code: satellites are 4.3e7 m away at most, and no clock of a receiver is seconds off
+_LARGEST_CODE = 1e9  # m, of a code: satellites are 4.3e7 m away at most, and no clock of a receiver is seconds off
 _LARGEST_DOPPLER = 1e6  # Hz, of a Doppler shift: satellites make 1e4, an oscillator off by 1e-4 makes 2e5
 _MOST_CYCLES = 1e11  # of a carrier: more than F14.3 holds
-_YEAR = 3.15e7  # s, a year
+_LONGEST_SPAN = 3.15e7  # s, a year
 
 
 @dataclass(frozen=True)
@@ -101,7 +101,7 @@ def drop_repeated(obs: Observations) -> Observations:
     """
     obs = _drop_impossible(obs)
     span = float(np.ptp(obs.t)) if len(obs) else 0.0
-    if not span <= _YEAR:
+    if not span <= _LONGEST_SPAN:
         raise RecordingError(
             f"{obs.files[0]}: its observations span {span / 86400.0:.3g} days; is a date wrong?", key="raw.span"
         )
@@ -127,7 +127,7 @@ def _drop_impossible(obs: Observations) -> Observations:
     """Without the values that no receiver can have measured."""
     with np.errstate(invalid="ignore"):
         bad = (
-            (np.abs(obs.code) > _FARTHEST)
+            (np.abs(obs.code) > _LARGEST_CODE)
             | (np.abs(obs.doppler) > _LARGEST_DOPPLER)
             | (np.abs(obs.carrier) > _MOST_CYCLES)
         )

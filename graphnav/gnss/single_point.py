@@ -27,10 +27,10 @@ from graphnav.gnss.series import RawGnss
 from graphnav.gnss.sigmas import compute_code_sigma, compute_rate_sigma
 from graphnav.gnss.signals import L1, C
 
-_ROUNDS, _ATMOSPHERE = 10, 3  # iterations, and from which on the atmosphere is modelled
+_ITERATIONS, _ATMOSPHERE = 10, 3  # iterations, and from which on the atmosphere is modelled
 _KERNEL_SCALE = 3.0  # sigma at which a row begins to lose weight
 _WEAK = 1e6  # m, 1-sigma of an unknown before any row
-_LOST = 100.0  # m, rms of residuals beyond which an epoch has no position
+_LOST_RMS = 100.0  # m, rms of residuals beyond which an epoch has no position
 _WORST_PDOP = 60.0  # PDOP beyond which a position says nothing
 _OMEGA_E = np.array([0.0, 0.0, OMEGA_WGS84])
 
@@ -153,7 +153,7 @@ def solve(raw: RawGnss, mask: float = np.radians(10.0), robust: bool = True, dif
     weight = np.ones(len(raw))
     information = np.zeros((E, n, n))
     measured = raw.code + np.nan_to_num(raw.clock)
-    for k in range(_ROUNDS):
+    for k in range(_ITERATIONS):
         geometry = look(raw, x[of, :3], klobuchar_of if k >= _ATMOSPHERE else None)
         above = geometry.elevation >= mask if k >= _ATMOSPHERE else np.ones(len(raw), dtype=bool)
         predicted = geometry.distance + np.sum(H[:, 3:] * x[of, 3:], axis=1)
@@ -181,7 +181,7 @@ def solve(raw: RawGnss, mask: float = np.radians(10.0), robust: bool = True, dif
     found = np.bincount(of, weights=used, minlength=E) >= needed
     R = earth.enu_axes(earth.ecef_to_llh(x[:, :3]))
     cofactor = R @ P[:, :3, :3] @ np.swapaxes(R, -1, -2)
-    found &= (rms < _LOST) & (np.trace(cofactor, axis1=-2, axis2=-1) < _WORST_PDOP**2)
+    found &= (rms < _LOST_RMS) & (np.trace(cofactor, axis1=-2, axis2=-1) < _WORST_PDOP**2)
     x[~found] = np.nan
     cofactor[~found] = np.nan
     biases = np.where(present, np.concatenate([np.zeros((E, 1)), x[:, 4:]], axis=1), np.nan)

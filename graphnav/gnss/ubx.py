@@ -36,7 +36,7 @@ _ROW_TYPE = np.dtype(
         ("sd_doppler", "u1"), ("status", "u1"), ("reserved", "u1"),
     ]
 )  # fmt: skip
-_CODE, _CARRIER, _HALF = 1, 2, 4  # bits of the status: code valid, carrier valid, half cycle resolved
+_CODE_BIT, _CARRIER_BIT, _HALF_BIT = 1, 2, 4  # bits of the status: code valid, carrier valid, half cycle resolved
 
 
 @dataclass
@@ -86,12 +86,12 @@ def parse_ubx(data: bytes, path: Path) -> tuple[Observations, Ephemerides]:
     number = np.where(rows["gnss"] == 1, rows["sv"].astype(int) - 100, rows["sv"])
     satellite = (100 * system + number).astype(np.int16)
     status, lock = rows["status"], rows["lock"] * 1e-3
-    has_carrier = (status & _CARRIER > 0) & (rows["carrier"] != 0.0)
+    has_carrier = (status & _CARRIER_BIT > 0) & (rows["carrier"] != 0.0)
     obs = Observations(
         zero=WEEK * week0, t=t, satellite=satellite, signal=signal,
-        code=np.where(status & _CODE > 0, rows["code"], np.nan),
+        code=np.where(status & _CODE_BIT > 0, rows["code"], np.nan),
         carrier=np.where(has_carrier, rows["carrier"], np.nan), doppler=rows["doppler"].astype(float),
-        cn0=rows["cn0"].astype(float), slip=_find_slips(t, satellite, signal, lock), half=status & _HALF == 0,
+        cn0=rows["cn0"].astype(float), slip=_find_lock_losses(t, satellite, signal, lock), half=status & _HALF_BIT == 0,
         lock=lock,
         channels={
             100 * GLONASS + int(r["sv"]): int(r["channel"]) - 7 for r in rows[(rows["gnss"] == 6) & known]
@@ -105,7 +105,7 @@ def parse_ubx(data: bytes, path: Path) -> tuple[Observations, Ephemerides]:
     return drop_repeated(obs.take(known)), decoder.ephemerides
 
 
-def _find_slips(t: np.ndarray, satellite: np.ndarray, signal: np.ndarray, lock: np.ndarray) -> np.ndarray:
+def _find_lock_losses(t: np.ndarray, satellite: np.ndarray, signal: np.ndarray, lock: np.ndarray) -> np.ndarray:
     """(N,) whether the carrier has been in lock for less than since the epoch before."""
     order = np.lexsort((t, signal, satellite))
     s, g, x, at = satellite[order], signal[order], lock[order], t[order]

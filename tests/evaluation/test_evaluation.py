@@ -12,6 +12,7 @@ from helpers import refused
 from pymap3d.vincenty import vdist
 from scipy.stats import chi2
 
+import graphnav
 from graphnav.core import rotation
 from graphnav.core.earth import LocalFrame
 from graphnav.core.errors import RecordingError
@@ -450,6 +451,21 @@ def test_a_truth_of_the_antenna_is_met_at_the_antenna_as_estimated() -> None:
         assert metrics is not None
         assert metrics.components["h"].rms == pytest.approx(right, abs=1e-4)
         assert metrics.components["up"].rms == pytest.approx(up, abs=1e-4)
+
+
+def test_a_solution_is_scored_against_the_truth_of_its_recording_by_the_public_name() -> None:
+    t = np.arange(0.0, 60.0, 0.1)
+    source = circle(t)
+    recording = _recording(t, None, Truth(t, llh=source.llh, v=source.v, rph=source.rph))
+    estimate = replace(moved(source, np.array([3.0, -4.0, 12.0])), sd_p=np.tile([3.0, 4.0, 6.0], (len(t), 1)))
+    metrics = graphnav.evaluate_recording(estimate, recording)
+    assert metrics is not None
+    assert metrics.n == len(t)
+    assert metrics.components["h"].rms == pytest.approx(5.0, abs=1e-4)
+    assert metrics.components["up"].rms == pytest.approx(12.0, abs=1e-4)
+    assert metrics.nees["p"].mean == pytest.approx((1.0 + 1.0 + 4.0) / 3.0, rel=1e-4)
+    assert graphnav.evaluate_recording(estimate, recording, at=t[5:15]).n == 10
+    assert graphnav.evaluate_recording(estimate, replace(recording, truth=None)) is None
 
 
 def test_truth_of_a_recording() -> None:

@@ -46,4 +46,6 @@ def test_anything_else_is_left_to_others(text: str) -> None:
 
 
 def test_no_lines() -> None:
-    assert [len(column) for column in read_decimals(io.BytesIO(b""), 3, (0, 2))[0]] == [0, 0]
+    found, cut = read_decimals(io.BytesIO(b""), 3, (0, 2))
+    assert [len(column) for column in found] == [0, 0]
+    assert not cut

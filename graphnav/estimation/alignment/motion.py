@@ -211,7 +211,7 @@ def _try_headings(
 
     for turn in _HEADINGS_TRIED:
         try:
-            found: Solution | None = _try(problem, np.array([*rp, heading + turn]), watch)
+            found: Solution | None = _solve_from(problem, np.array([*rp, heading + turn]), watch)
         except _End as end:
             found = end.known
         if found is not None and np.isfinite(found.cost):
@@ -247,7 +247,7 @@ def _build_short(part: Recording, settings: Settings, frame: LocalFrame, rph: Ar
     return split_carriers(problem)[0]
 
 
-def _try(problem: Problem, rph: Array, watch: Callable[[States, float, float, bool], None]) -> Solution:
+def _solve_from(problem: Problem, rph: Array, watch: Callable[[States, float, float, bool], None]) -> Solution:
     """Solve the short problem from one initial attitude."""
     from graphnav.estimation.factor_graph.batch import batch  # and GTSAM with it, which a drive at rest does not need
 

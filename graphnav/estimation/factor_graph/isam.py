@@ -58,7 +58,7 @@ class TreeSmoother:
         if self._leaving is not None:
             before, self._leaving = self._leaving, eliminate(tree, self._leaving, self._portion)
             if look or self._leaving is before:
-                self._settle(self._leaving)
+                self._drop_leaving(self._leaving)
         if look:
             tree.relinearise()
             self._look = place.k + max(_SKIP, len(tree) // _GROWN)
@@ -70,7 +70,7 @@ class TreeSmoother:
             self._portion = 1 + _SHARE_OF_TIME * len(self._leaving.behind) // count
         return tree.newest, compute_newest_covariance(tree)
 
-    def _settle(self, leaving: Elimination) -> None:
+    def _drop_leaving(self, leaving: Elimination) -> None:
         """Let its keyframes go."""
         self.settled.append(settle(self.tree, leaving))
         self.tree.marginalise(leaving.count)
@@ -79,7 +79,7 @@ class TreeSmoother:
     def finish(self, problem: Problem) -> tuple[Problem, int]:
         """As of `LagSmoother`."""
         if self._leaving is not None:
-            self._settle(self._leaving)
+            self._drop_leaving(self._leaving)
         for _ in range(_MAX_UPDATES):
             self._problem, again = self.tree.integrate_again(self._problem)
             if not self.tree.relinearise(FINE) and not again:

@@ -203,7 +203,7 @@ def _make_custom(
         residual, J, by_parameter = evaluate(states, given)
         if H is not None:
             parts = zip(np.split(J, len(keyframes), axis=1), states.R_nb, strict=True)
-            blocks = [block for part, R_nb in parts for block in _split_blocks(part, R_nb)]
+            blocks = [block for part, R_nb in parts for block in _split_jacobian(part, R_nb)]
             for k, block in enumerate([*blocks, *(A[0] for _, A in layout.find_parameter_blocks(first, by_parameter))]):
                 H[k] = np.asfortranarray(block)
         return residual
@@ -211,7 +211,7 @@ def _make_custom(
     return gtsam.CustomFactor(noise, keys, compute_error)
 
 
-def _split_blocks(J: Array, R_nb: Array) -> tuple[Array, Array, Array]:
+def _split_jacobian(J: Array, R_nb: Array) -> tuple[Array, Array, Array]:
     """(m, 15) by our error state as the blocks of Pose3, velocity and bias; GTSAM moves positions in body axes."""
     turned = J[:, BLOCKS["p"]] @ R_nb
     return np.hstack([J[:, BLOCKS["theta"]], turned]), J[:, BLOCKS["v"]], J[:, BLOCKS["ba"].start :]

@@ -111,7 +111,7 @@ class Tree:
         ahead, rows : what it is predicted to be from `newest`, and its rows there, where that is known already.
         """
         if not self.keyframes and place.linked:
-            self._begin(place)
+            self._add_first_keyframe(place)
         if ahead is None:
             state, values, columns, link = predict_stage(self.newest, place)
             rows = linearise_rows(place, state, values, columns).measured
@@ -148,7 +148,7 @@ class Tree:
             keyframe.read(self.isam)
         return float(np.linalg.norm(x.delta[:3]))
 
-    def _begin(self, place: Place) -> None:
+    def _add_first_keyframe(self, place: Place) -> None:
         """Have the message that all goes on from as a keyframe before the first."""
         prior = self._prior
         x, nodes, fresh = self._add_variable(np.zeros(DIM), _UNIT, place.t), {}, []

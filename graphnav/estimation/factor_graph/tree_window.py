@@ -29,7 +29,7 @@ from graphnav.estimation.solvers.window import SettledStates, Window
 
 _MAX_STEPS = 5
 _COVARIANCE_PORTION = 48  # variables that are eliminated at one row of the IMU for covariances
-_CONVERGED = 0.02  # of the usual limits, within which the last window is converged
+_CONVERGED_SHARE = 0.02  # of the usual limits, within which the last window is converged
 
 
 class TreeWindow(Window):
@@ -80,10 +80,10 @@ class TreeWindow(Window):
         count = 0
         if always:
             self.tree.linearise_again(range(self.tree.held, len(self.tree)), renewed)
-            self._relinearise(len(self))
-            share, count = min(share, _CONVERGED), 1
+            self._relinearise_keyframes(len(self))
+            share, count = min(share, _CONVERGED_SHARE), 1
         while count < _MAX_STEPS and (done := self.tree.relinearise(share, renewed)):
-            self._relinearise(done)
+            self._relinearise_keyframes(done)
             count += 1
         return count
 
@@ -114,7 +114,7 @@ class TreeWindow(Window):
         """All but what has been done for stages that are to leave, which is made again."""
         return {**self.__dict__, "_leaving": None}
 
-    def _relinearise(self, count: int) -> None:
+    def _relinearise_keyframes(self, count: int) -> None:
         self.relinearized += count
         self._adopt_all()
 

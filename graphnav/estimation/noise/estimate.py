@@ -308,7 +308,7 @@ def _improve(
             own = index[:n] == i
             if own.any():
                 figures.update(name, *_bound_squares(found.A[own], found.B[own], 1, _BOUNDED))
-        _weigh(figures, problem, rows, np.maximum(found.left_out, found.whole), n)
+        _weigh_rows(figures, problem, rows, np.maximum(found.left_out, found.whole), n)
 
 
 def _weigh_intervals(figures: _Components, problem: Problem, imu: ImuMoments) -> None:
@@ -370,7 +370,7 @@ def _improve_time(figures: _Components, chain: ParameterChain, observed: Array, 
     figures.times[p.name] = float(np.clip(found, median / _TIME_RANGE, median * _TIME_RANGE))
 
 
-def _weigh(figures: _Components, problem: Problem, rows: Constraint, squared: Array, n: int) -> None:
+def _weigh_rows(figures: _Components, problem: Problem, rows: Constraint, squared: Array, n: int) -> None:
     """Weights of the first n rows by their squared errors (n,)."""
     before = np.ones(len(rows)) if rows.weight is None else rows.weight
     used = before > 0.0

@@ -170,7 +170,7 @@ def decide_faults(base: Problem, found: NoiseEstimate) -> Decision:
     """
     first = explain(base, found, find_suspects(base, found.noise, found))
     medians = {name: replace(figure, log_factor=figure.prior) for name, figure in found.noise.figures.items()}
-    masked = _test(base, NoiseModel(medians), found)
+    masked = _find_disagreements(base, NoiseModel(medians), found)
     first = replace(first, passes=first.passes + Counter(filter=2))
     excluded = join(span for kind in FIXES for span in first.noise.excluded.get(kind, ()))
     # the figures found are of repeated fixes, too: where these are wrong, of wrong ones
@@ -271,10 +271,10 @@ def find_suspects(base: Problem, noise: NoiseModel, found: NoiseEstimate) -> lis
     noise : by which the tests are made; its figures need not be those found.
     found : with the points to linearise at.
     """
-    return split_at_repeats(_test(base, noise, found), base.recording)
+    return split_at_repeats(_find_disagreements(base, noise, found), base.recording)
 
 
-def _test(base: Problem, noise: NoiseModel, found: NoiseEstimate) -> list[Span]:
+def _find_disagreements(base: Problem, noise: NoiseModel, found: NoiseEstimate) -> list[Span]:
     """Spans (s) in which the tests find fixes in disagreement with everything else."""
     # weights of fixes and of IMU intervals may hide a fault from the tests
     kept = {name: some for name, some in noise.weights.items() if name not in (*FIXES, *INTERVALS)}

@@ -85,7 +85,7 @@ def ekf(
     K, about = len(problem.t), None
     if opening is not None and (n := int(np.searchsorted(problem.t, opening, side="right"))) > 1:
         about = (
-            _smooth_about(problem, smooth_backward(problem, _run_forward(problem, n)))[1]
+            _smooth_first(problem, smooth_backward(problem, _run_forward(problem, n)))[1]
             if known is None
             else known.take_first(n)
         )
@@ -153,7 +153,7 @@ class Comparison:
         stack, steps = Stack(problem, self._K), advance(problem, self._K)
         one = self._one.lift(problem, about, stack, anew)
         x, P = _start_from_prior(problem)
-        start = _begin(subtract_points(x, about.take_first(1))[0], P, stack.records)
+        start = _get_start(subtract_points(x, about.take_first(1))[0], P, stack.records)
         filter_likelihood(problem, about, stack, steps, one, start)
         return stack.log_likelihood()
 
@@ -165,14 +165,14 @@ def smooth_near(
 
     Where attitudes do not stay, it is smoothed from the start as a filter would be, with `opening` as for `ekf`.
     """
-    forward, smoothed, stays = _smooth_about(problem, about, progress)
+    forward, smoothed, stays = _smooth_first(problem, about, progress)
     if stays:
         return forward, smoothed
     forward = ekf(problem, progress, opening)
     return forward, smooth_backward(problem, forward, progress)
 
 
-def _smooth_about(
+def _smooth_first(
     problem: Problem, about: Points, progress: Progress | None = None
 ) -> tuple[ForwardRecord, SmootherPass, bool]:
     """The first keyframes smoothed about points, and about where that leads until attitudes stay, if they do."""
@@ -217,7 +217,7 @@ def _run_forward(
         if decide is not None:
             follow = partial(_hold_errors, decide, about, errors)
         start = subtract_points(x, about.take_first(1))[0]
-        given.run(partial(_begin, start, P, stack.records, search), follow, progress)
+        given.run(partial(_get_start, start, P, stack.records, search), follow, progress)
         updates = given.updates
         # from there on it is linearised where the filter is
         last = about.take(slice(n - 1, n))
@@ -225,7 +225,7 @@ def _run_forward(
         all_P[n - 1] = transport_covariance(all_P[n - 1 : n], last.states, x.states)[0]
         P = all_P[n - 1]
     else:
-        x, P = _begin(x, P, stack.records)
+        x, P = _get_start(x, P, stack.records)
     stretches, k = StretchFilter(problem, steps, stack, all_Pp, all_P, all_F, stays), n
     while k < K:
         before, k = k, stretches.run(k, x, P, ahead, found)
@@ -267,7 +267,9 @@ def _start_from_prior(problem: Problem) -> tuple[Points, Array]:
     return Points(problem.prior.mean, values[None]), np.diag(sigma**2)
 
 
-def _begin(x: Any, P: Array, records: dict[str, Innovations], search: FaultSearch | None = None) -> tuple[Any, Array]:
+def _get_start(
+    x: Any, P: Array, records: dict[str, Innovations], search: FaultSearch | None = None
+) -> tuple[Any, Array]:
     """What is known at the start, but for the place where the first fix, which tells it, is not used."""
     first = [one.used[0] for one in records.values() if one.rows.fix_of == "p" and len(one.used)]
     less = np.zeros(len(P)) if search is None else search.at_start

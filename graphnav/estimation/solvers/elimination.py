@@ -159,7 +159,7 @@ def update_late(ahead: Predicted, rows: Sequence[Measured], weighted: bool = Fal
                 row += b.size
             top, _ = _append_rows(top, tail)
         if tests is not None:
-            top, beside, fault = _test(top, tests.copy(), rows, y, passes, place.t, ahead.state)
+            top, beside, fault = _add_tested_rows(top, tests.copy(), rows, y, passes, place.t, ahead.state)
         y, info = dtrtrs(top[:, :D], top[:, D])
         if info:
             raise explain_smoother(place.t)
@@ -169,7 +169,7 @@ def update_late(ahead: Predicted, rows: Sequence[Measured], weighted: bool = Fal
     return Stage(place, message, ahead.G, ahead.g, ahead.lost, ahead.C, measured, fault=fault), y
 
 
-def _test(
+def _add_tested_rows(
     top: Array, tests: Watch, rows: Sequence[Measured], y: Array, passes: int, t: float, state: States
 ) -> tuple[Array, Watch, tuple[str, float] | None]:
     """Add the measurements that have tests to the rows [R z Z] of a message, Z = R X (D, C)."""

@@ -51,7 +51,7 @@ class FaultSearch:
 
     def follow(self, k0: int, k1: int) -> int:
         """Test what was filtered from one keyframe to another; the keyframe to go on from."""
-        since = self._test(k0, k1)
+        since = self._find_onset(k0, k1)
         if since is None and k1 == len(self._t):
             since = self.verdicts.set_ended()
         if since is None:
@@ -62,7 +62,7 @@ class FaultSearch:
         self._begin_anew()
         return back
 
-    def _test(self, k0: int, k1: int) -> float | None:
+    def _find_onset(self, k0: int, k1: int) -> float | None:
         """When something began to be wrong that was used up to one of k0 to k1."""
         given = self._filter
         root = self._weigh_roots(k0, k1)

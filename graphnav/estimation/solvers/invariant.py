@@ -29,13 +29,13 @@ from graphnav.core.compiled import compile_once
 from graphnav.core.rotation import Array, mv
 from graphnav.core.state import BLOCKS, MOVING, States
 
-_THETA, _V = BLOCKS["theta"], BLOCKS["v"]
+_THETA, _VELOCITY = BLOCKS["theta"], BLOCKS["v"]
 _I9 = np.eye(MOVING)
 
 
 def add_invariant(states: States, e: Array) -> States:
     """K states moved by error states (K, 15)."""
-    phi, dv = mv(states.R_nb, e[:, _THETA]), e[:, _V]
+    phi, dv = mv(states.R_nb, e[:, _THETA]), e[:, _VELOCITY]
     exp_phi = rotation.exp(phi)
     return States(
         exp_phi @ states.R_nb,
@@ -87,5 +87,5 @@ def compute_transport(states: States, moved: States) -> Array:
     T = np.zeros((len(states), MOVING, MOVING))
     T[:] = _I9
     T[:, _THETA, _THETA] = np.swapaxes(moved.R_nb, -1, -2) @ states.R_nb
-    T[:, _V, _THETA] = rotation.skew(states.v - moved.v) @ states.R_nb
+    T[:, _VELOCITY, _THETA] = rotation.skew(states.v - moved.v) @ states.R_nb
     return T

@@ -29,7 +29,7 @@ from graphnav.estimation.solvers.recursion import STRETCH, filter_rows
 from graphnav.estimation.solvers.stack import RowBlock, Stack
 from graphnav.imu.dynamics import SCALE
 
-_SHORTEST = 4  # keyframes that are filtered at once, behind one at which something was found
+_STRETCH_AFTER_FAULT = 4  # keyframes that are filtered at once, behind one at which something was found
 Follow = Callable[[int, int], int]  # looks at what was filtered from a keyframe to another, and says where to go on
 
 
@@ -141,7 +141,7 @@ class PointFilter:
             self._filter(k, end, begin)
             on = end if follow is None else follow(k, end)
             # where one fault has been found the next is near, and what was filtered beyond it was in vain
-            k, length = on, min(2 * length, STRETCH) if on == end else _SHORTEST
+            k, length = on, min(2 * length, STRETCH) if on == end else _STRETCH_AFTER_FAULT
             if progress is not None:
                 progress("filter", k / self._stack.K)
 

@@ -150,9 +150,9 @@ class Stack:
 
     def log_likelihood(self) -> Array:
         """(K,) of the innovations, but for a constant."""
-        return self._weigh((self.solved[:, None] @ self.root)[:, 0])
+        return self._compute_likelihood((self.solved[:, None] @ self.root)[:, 0])
 
-    def _weigh(self, white: Array) -> Array:
+    def _compute_likelihood(self, white: Array) -> Array:
         """Log-likelihood (K,) of whitened innovations (K, M)."""
         weighs = np.zeros((self.K, self.M), dtype=bool)
         for c in self._constraints:
@@ -169,7 +169,7 @@ class Stack:
             kind[self.places[c.name]] = i
         L = self.root
         white = (self.solved[:, None] @ L)[:, 0]
-        log_likelihood = self._weigh(white)
+        log_likelihood = self._compute_likelihood(white)
         L *= kind[:, :, None] == kind[:, None]
         residual, sigma = mv(L, white), np.sqrt(np.einsum("kij,kij->ki", L, L))
         for c in self._constraints:

@@ -89,23 +89,23 @@ class StretchFilter:
         EstimationError
             If the covariance of an innovation is not positive definite.
         """
-        if (on := self._run(k, min(k + self._length, self._stack.K), x, P, predicted, filtered)) > k:
+        if (on := self._run_stretch(k, min(k + self._length, self._stack.K), x, P, predicted, filtered)) > k:
             return on
         # where guessing leads nowhere a keyframe alone does: its blocks are right one after the other
-        return self._run(k, k + 1, x, P, predicted, filtered, alone=True)
+        return self._run_stretch(k, k + 1, x, P, predicted, filtered, alone=True)
 
     def shorten(self, length: int) -> None:
         """The next stretch is about as long as what was used of the last one."""
         self._length = max(min(self._length, length), _SHORTEST)
 
-    def _run(
+    def _run_stretch(
         self, k: int, k1: int, x: Points, P: Array, predicted: Points, filtered: Points, alone: bool = False
     ) -> int:
-        points = self._guess(k, k1, x)
+        points = self._guess_points(k, k1, x)
         most = _MAX_LINEARISATIONS + int(self._end[k] - self._start[k]) * alone
         for left in range(most - 1, -1, -1):
             try:
-                stay, points = self._iterate(k, k1, x, P, points)
+                stay, points = self._filter_about(k, k1, x, P, points)
             except np.linalg.LinAlgError:
                 if alone:
                     raise explain_rows(self._stack.get_block(int(self._at[0])).parts) from None
@@ -126,7 +126,7 @@ class StretchFilter:
         self._length = max(self._length // 2, _SHORTEST)
         return k
 
-    def _guess(self, k: int, k1: int, x: Points) -> Points:
+    def _guess_points(self, k: int, k1: int, x: Points) -> Points:
         """Where the IMU alone leads."""
         states, values, scale = x.states, x.values[0], self._problem.columns.get(SCALE)
         reached, known = [], []
@@ -140,7 +140,7 @@ class StretchFilter:
         each = self._end[k:k1] - self._start[k:k1] + 1
         return Points(States.stack(reached), np.array(known)).take(np.repeat(np.arange(k1 - k), each))
 
-    def _iterate(self, k: int, k1: int, x: Points, P: Array, points: Points) -> tuple[int, Points]:
+    def _filter_about(self, k: int, k1: int, x: Points, P: Array, points: Points) -> tuple[int, Points]:
         """Filter keyframes k to k1 about points; the first keyframe that does not stay, and the points as found."""
         stack, blocks, own = self._stack, self._stack.joint, slice(max(k - 1, 0), k1)
         start, end = self._start[k:k1] - self._start[k], self._end[k:k1] - self._start[k]

@@ -59,9 +59,9 @@ class Verdicts:
         t, used = self.times[name], self.used[name]
         fault, end = int(np.searchsorted(t, since)), int(np.searchsorted(t, now, side="right"))
         used[fault:end] = 0.0
-        begin = _begin(used, end, 0.0)
-        before = _begin(used, begin, 1.0)  # of what was used between two faults
-        if begin - before < min(_FEWEST_AGREEING, before - _begin(used, before, 0.0)):
+        begin = _find_run_begin(used, end, 0.0)
+        before = _find_run_begin(used, begin, 1.0)  # of what was used between two faults
+        if begin - before < min(_FEWEST_AGREEING, before - _find_run_begin(used, before, 0.0)):
             used[before:begin] = 0.0
             fault = min(fault, before)
         if self._trial is not None and self._trial[0] == name:
@@ -72,16 +72,16 @@ class Verdicts:
                 self._trial = None
                 for other, was in were.items():
                     self.used[other][: len(was)] = was
-                return float(t[_begin(used, _begin(used, begin, 1.0), 0.0)])
-        begin = _begin(used, end, 0.0)
-        before = _begin(used, begin, 1.0)  # of what was used between two faults
+                return float(t[_find_run_begin(used, _find_run_begin(used, begin, 1.0), 0.0)])
+        begin = _find_run_begin(used, end, 0.0)
+        before = _find_run_begin(used, begin, 1.0)  # of what was used between two faults
         lasted = t[end - 1] - t[begin]
         if lasted > OLDEST and (name, t[begin]) not in self.anew:
             used[begin:end] = 1.0
             self.anew.add((name, float(t[begin])))
             return float(t[begin])
         if lasted > PATIENCE and self._outlasts(name, before, begin, end):
-            return self._try(name, before, begin, end)
+            return self._take_fixes_back(name, before, begin, end)
         return float(t[fault])
 
     def set_ended(self) -> float | None:
@@ -89,29 +89,29 @@ class Verdicts:
         for name, used in self.used.items():
             end = len(used)
             if end and used[-1] == 0.0:
-                begin = _begin(used, end, 0.0)
-                before = _begin(used, begin, 1.0)
+                begin = _find_run_begin(used, end, 0.0)
+                before = _find_run_begin(used, begin, 1.0)
                 if self._outlasts(name, before, begin, end):
-                    return self._try(name, before, begin, end)
+                    return self._take_fixes_back(name, before, begin, end)
         return None
 
     def _outlasts(self, name: str, before: int, begin: int, end: int) -> bool:
         """Whether fixes begin..end, refused, are more than before..begin, which were used, and were not tried yet."""
         return 0 < begin - before < end - begin and (name, self.times[name][begin]) not in self._tried
 
-    def _try(self, name: str, before: int, begin: int, end: int) -> float:
+    def _take_fixes_back(self, name: str, before: int, begin: int, end: int) -> float:
         """Take fixes back, without what of any kind was used since the fault before; the time to go on from."""
         t, used = self.times[name], self.used[name]
         self._tried.add((name, float(t[begin])))
         self._trial = name, begin, end, {other: u.copy() for other, u in self.used.items()}
         used[begin:end] = 1.0
-        first = float(t[_begin(used, before, 0.0)])
+        first = float(t[_find_run_begin(used, before, 0.0)])
         for other, at in self.times.items():
             self.used[other][(at >= first) & (at < t[begin])] = 0.0
         return first
 
 
-def _begin(used: Array, end: int, value: float) -> int:
+def _find_run_begin(used: Array, end: int, value: float) -> int:
     """First of the rows before `end` that are all used, or all not."""
     other = np.flatnonzero((used[:end] > 0.0) != (value > 0.0))
     return int(other[-1]) + 1 if len(other) else 0
