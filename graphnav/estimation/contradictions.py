@@ -71,7 +71,7 @@ def free(problem: Problem, freed: Freed) -> Problem:
     return replace(problem, constraints=tuple(rows))
 
 
-def widen(problem: Problem, names: Collection[str] = tuple(PRIOR_SIGMA)) -> dict[str, FreedConstant]:
+def widen(problem: Problem, names: Collection[str]) -> dict[str, FreedConstant]:
     """Stated constants with the wide priors that they are asked about with.
 
     Parameters

@@ -222,7 +222,7 @@ class _Reader:
             self.read_each(values, "excluded", constraints, self.read_spans),
             self.read_number("noise.spacing", values.get("spacing", 0.0), 0.0, 60.0, "s between fixes"),
             StampOffsets(**self.read_each(values, "stamps", _STAMPS, self.read_offset)),
-            {name: self.read_constant(key, values) for key, (name, *_) in _FREED.items() if values.get(key)},
+            {name: self.read_constant(key, values) for key, (name, *_) in _FREED.items() if key in values},
         ), mode
 
     def make_error(self, key: str, value: Any, why: str) -> ConfigError:
