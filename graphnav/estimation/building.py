@@ -21,6 +21,7 @@ from graphnav.core.state import BLOCKS
 from graphnav.detectors import Detections, detect
 from graphnav.estimation.alignment import Alignment, align, use_known_heading
 from graphnav.estimation.alignment.first import pick_fixes
+from graphnav.estimation.contradictions import use_freed
 from graphnav.estimation.fixing import split_carriers
 from graphnav.estimation.noise.exclusion import drop_excluded
 from graphnav.estimation.noise.model import NoiseModel
@@ -105,11 +106,12 @@ class ProblemBuilder:
         return self.build(self.align(rest, built.detections.stationary), built.detections, parts=True)
 
     def build_without(self, built: BuiltProblem, noise: NoiseModel, parts: bool) -> BuiltProblem:
-        """The problem with a start and stops that do not depend on fixes excluded by a noise model.
+        """The problem with a start and stops that depend on no fix that a noise model excludes, and on no constant as
+        stated that it frees.
 
         Returns the same object where these are unchanged.
         """
-        if not noise.excluded or self.recording.gnss is None:
+        if not (noise.excluded or noise.freed) or self.recording.gnss is None:
             return built
         aligned, detections = built.aligned, built.detections
         fixes = drop_excluded(self.recording, noise)
@@ -117,12 +119,12 @@ class ProblemBuilder:
         changed = _differ(stops.stationary, detections.stationary)
         stops = stops if changed else detections
         seen = self.recording.end if aligned.until is None else aligned.until
-        if any(begin <= seen for spans in noise.excluded.values() for begin, _ in spans):
+        if noise.freed or any(begin <= seen for spans in noise.excluded.values() for begin, _ in spans):
             try:
-                found = self.align(fixes, stops.stationary)
+                found = self.align(use_freed(fixes, noise.freed, self.frame.epoch), stops.stationary)
             except EstimationError:
                 found = aligned
-            if found.motion is not None and found.contradicts(aligned):
+            if found.motion is not None and (noise.freed or found.contradicts(aligned)):
                 aligned, changed = found, True
         return self.build(aligned, stops, parts) if changed else built
 

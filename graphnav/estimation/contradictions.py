@@ -4,8 +4,8 @@ fixes are late by, and that the clocks of IMU and fixes run at one rate.
 A wrong arm turns with the vehicle: it contradicts every bend, and every change of pitch and roll. Two crystals drift
 apart by up to some 1e-4, and what stamps are off by then grows all along the drive. Whether any is so is asked of one
 filter pass with all as parameters of wide priors, by the noise model that was estimated with them as stated. Components
-that differ from what is stated by more than three sigmas are freed, the others stay, and only if that has more
-evidence. With Lambda and eta the information matrix and vector of the measurements about the components, and D the
+are freed one by one, each time the one by which the evidence gains most, as long as it gains and the component differs
+from what is stated by more than three sigmas; the others stay. With Lambda and eta the information matrix and vector of the measurements about the components, and D the
 diagonal matrix of the 1-sigmas of a prior (0 of what is known), the logarithm of the evidence is, but for a constant,
 
     -ln |I + D Lambda D| / 2 + (D eta)^T (I + D Lambda D)^-1 (D eta) / 2
@@ -40,8 +40,8 @@ from graphnav.core.rotation import Array
 from graphnav.core.state import DIM
 from graphnav.estimation.noise.apply import apply_noise
 from graphnav.estimation.noise.estimate import NoiseEstimate
-from graphnav.estimation.noise.model import FreedConstant
-from graphnav.estimation.offsets import LINEAR_OFFSET
+from graphnav.estimation.noise.model import FreedConstant, StampOffsets
+from graphnav.estimation.offsets import LINEAR_OFFSET, move_stamps
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.ekf import refilter
 from graphnav.estimation.solvers.linearise import Points
@@ -69,6 +69,21 @@ def free(problem: Problem, freed: Freed) -> Problem:
         for one in problem.constraints
     ]
     return replace(problem, constraints=tuple(rows))
+
+
+def use_freed(recording: Recording, freed: Freed, since: float) -> Recording:
+    """The recording with freed constants in place of what is stated.
+
+    Parameters
+    ----------
+    since : stamp from which on the rate of the clocks is counted, s.
+    """
+    value = {name: one.value for name, one in freed.items()}
+    late, of_velocities, rate = (value.get(name, (0.0,))[0] for name in (TIME_OFFSET, VELOCITY_TIME_OFFSET, CLOCK_RATE))
+    moved = move_stamps(recording, StampOffsets(late, of_velocities, rate=rate, since=since))
+    if moved.gnss is None or LEVER_ARM not in value:
+        return moved
+    return replace(moved, gnss=replace(moved.gnss, lever_arm=np.array(value[LEVER_ARM])))
 
 
 def widen(problem: Problem, names: Collection[str]) -> dict[str, FreedConstant]:
@@ -109,14 +124,40 @@ def find_contradicted_constants(base: Problem, best: NoiseEstimate, names: Colle
         return {}
     found, P = _estimate(free(problem, asked), problem, best.points, asked)
     stated, prior, known = _stack(asked, "value"), _stack(asked, "sigma"), _stack_stated(base, asked)
-    some = np.abs(found - stated) > _SIGNIFICANT * np.sqrt(np.diagonal(P) + known**2)
-    used = np.where(some, prior, known)
-    if not some.any() or compute_evidence_gain(found - stated, P, prior, used, known) <= 0.0:
+    some = select_contradicted(found - stated, P, prior, known)
+    if not some.any():
         return {}
-    off, P, _ = _change_prior(found - stated, P, prior, used)
+    off, P, _ = _change_prior(found - stated, P, prior, np.where(some, prior, known))
     value = np.where(some, stated + off, stated)
     freed = _split(asked, value, np.where(some, _WIDER * np.sqrt(np.diagonal(P)), _KNOWN * prior))
     return {name: one for name, one in freed.items() if one.value != asked[name].value}
+
+
+def select_contradicted(change: Array, P: Array, prior: Array, known: Array) -> Array:
+    """Components (k,) that are better free than as stated, found one by one: each time the one with the largest gain in
+    evidence, as long as it has one and is significant.
+
+    Parameters
+    ----------
+    change : (k,) what the filter finds beside what is stated.
+    P : (k, k) its covariance.
+    prior : (k,) 1-sigmas that it was found with, of what is free.
+    known : (k,) 1-sigmas of what is as stated, 0 where it is exact.
+    """
+    some = np.zeros(len(change), dtype=bool)
+    while not some.all():
+        gains = np.full(len(change), -np.inf)
+        for k in np.flatnonzero(~some):
+            more = some | (np.arange(len(change)) == k)
+            used = np.where(more, prior, known)
+            off, left, _ = _change_prior(change, P, prior, used)
+            if np.abs(off[k]) > _SIGNIFICANT * np.hypot(np.sqrt(left[k, k]), known[k]):
+                gains[k] = compute_evidence_gain(change, P, prior, used, np.where(some, prior, known))
+        best = int(np.argmax(gains))
+        if gains[best] <= 0.0:
+            break
+        some[best] = True
+    return some
 
 
 def compute_evidence_gain(change: Array, P: Array, prior: Array, one: Array, other: Array) -> float:

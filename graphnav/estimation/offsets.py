@@ -1,16 +1,23 @@
-"""Offsets of stamps where a drive begins and where it ends, and whether they are near enough to where the rows of fixes
-are linearised in them."""
+"""Offsets of stamps: a recording with its stamps moved by them, and whether where a drive begins and ends they are near
+enough to where the rows of fixes are linearised in them."""
 
 from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from graphnav.constraints.gnss import CLOCK_RATE, TIME_OFFSET, VELOCITY_TIME_OFFSET
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM
+from graphnav.core.timescales import shift_stamps
+from graphnav.estimation.noise.model import StampOffsets
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.linearise import Points
+from graphnav.recording import Recording
 
+AS_STATED = StampOffsets()
 LINEAR_OFFSET = 0.3  # s from the linearisation point (`graphnav.estimation.stamps`)
 
 
@@ -33,3 +40,19 @@ def list_end_rows(problem: Problem) -> dict[str, Array]:
                 rows[1, columns[CLOCK_RATE].start - DIM] = problem.t[-1] - problem.frame.epoch
             out[name] = rows
     return out
+
+
+def move_stamps(recording: Recording, offsets: StampOffsets) -> Recording:
+    """The recording with its stamps moved to the clock of the IMU."""
+    if offsets == AS_STATED:
+        return recording
+    changed: dict[str, Any] = {}
+    if recording.gnss is not None:
+        changed["gnss"] = replace(
+            recording.gnss,
+            t=shift_stamps(recording.gnss.t, offsets.positions, offsets.rate, offsets.since),
+            velocity_offset=recording.gnss.velocity_offset + offsets.velocities - offsets.positions,
+        )
+    if recording.odometer is not None and offsets.odometer:
+        changed["odometer"] = replace(recording.odometer, t=recording.odometer.t + offsets.odometer)
+    return replace(recording, **changed)

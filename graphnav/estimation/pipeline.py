@@ -31,6 +31,7 @@ from graphnav.estimation.noise.files import MODES
 from graphnav.estimation.noise.imu_floor import apply_measured_floor
 from graphnav.estimation.noise.model import STATED, NoiseModel, StampOffsets
 from graphnav.estimation.noise.words import describe_far
+from graphnav.estimation.offsets import move_stamps
 from graphnav.estimation.pieces import describe_span, split_pieces
 from graphnav.estimation.preparation import Prepared, Weigh, prepare
 from graphnav.estimation.problem import Problem
@@ -43,7 +44,6 @@ from graphnav.estimation.stamps import (
     describe_stamps,
     find_stamps,
     may_move,
-    move_stamps,
     shift_to_imu_clock,
     shift_to_own_clocks,
 )

@@ -241,7 +241,12 @@ def _free_contradicted(
     except BREAKDOWN:
         return built, replace(best, passes=passes), 0.0
     best = replace(found, noise=replace(found.noise, freed=freed), passes=passes)
-    return replace(other, problem=free(other.problem, freed)), best, cost
+    again = builder.build_without(built, best.noise, parts=True)
+    problem = free(again.problem, freed)
+    if not np.array_equal(problem.t, other.problem.t):
+        found = estimate_noise(problem, again.aligned.until, best.noise, progress=progress)
+        best = replace(found, noise=replace(found.noise, freed=freed), passes=passes + found.passes)
+    return replace(again, problem=problem), best, cost
 
 
 def _is_likelier(base: Problem, plain: NoiseModel, found: NoiseEstimate) -> bool:

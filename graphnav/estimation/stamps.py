@@ -27,7 +27,7 @@ from graphnav.core.rotation import Array
 from graphnav.core.state import DIM
 from graphnav.core.timescales import shift_stamps, shift_stamps_back
 from graphnav.estimation.noise.model import NoiseModel, RowWeights, StampOffsets
-from graphnav.estimation.offsets import LINEAR_OFFSET, is_offset_far, list_end_rows
+from graphnav.estimation.offsets import AS_STATED, LINEAR_OFFSET, is_offset_far, list_end_rows, move_stamps
 from graphnav.estimation.preparation import Prepared, Weigh
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import ConstraintRecord, ExcludedSpan, ParameterEstimate, Solution
@@ -38,7 +38,6 @@ from graphnav.recording.checks.clock import FAIR, ClockOffsets, is_certain
 _SIGNIFICANT = 3.0  # sigmas
 _MOVES = 3  # of moving the stamps
 _A_PPM = 1e-6
-_AS_THEY_ARE = StampOffsets()
 
 # a recording whose stamps are moved, and whether evidence is wanted of an estimate -> what its solvers share
 Prepare = Callable[[Recording, Weigh], Prepared]
@@ -62,7 +61,7 @@ def find_stamps(
     clock : offsets between IMU and fixes that the recording shows before any estimation.
     """
     guess = None if clock is None else _guess_offsets(clock)
-    plain: _Candidate = recording, prepare(recording, is_offset_far if guess is None else _accept_all), _AS_THEY_ARE
+    plain: _Candidate = recording, prepare(recording, is_offset_far if guess is None else _accept_all), AS_STATED
     starts = [] if guess is None else [_move(recording, prepare, guess)]
     for start in (*starts, plain):
         found = _move_until_near(recording, prepare, start)
@@ -128,30 +127,14 @@ def _estimate_offsets(prepared: Prepared, at: StampOffsets) -> StampOffsets:
     return _join(ahead) if VELOCITY_TIME_OFFSET in ends else replace(ahead, velocities=ahead.positions)
 
 
-def move_stamps(recording: Recording, offsets: StampOffsets) -> Recording:
-    """The recording with its stamps moved to the clock of the IMU."""
-    if offsets == _AS_THEY_ARE:
-        return recording
-    changed: dict[str, Any] = {}
-    if recording.gnss is not None:
-        changed["gnss"] = replace(
-            recording.gnss,
-            t=shift_stamps(recording.gnss.t, offsets.positions, offsets.rate, offsets.since),
-            velocity_offset=offsets.velocities - offsets.positions,
-        )
-    if recording.odometer is not None and offsets.odometer:
-        changed["odometer"] = replace(recording.odometer, t=recording.odometer.t + offsets.odometer)
-    return replace(recording, **changed)
-
-
 def shift_to_imu_clock(noise: NoiseModel) -> NoiseModel:
     """A noise model as it is of the recording with its stamps moved."""
-    return noise if noise.stamps == _AS_THEY_ARE else _shift_noise(noise, shift_stamps)
+    return noise if noise.stamps == AS_STATED else _shift_noise(noise, shift_stamps)
 
 
 def shift_to_own_clocks(solution: Solution, offsets: StampOffsets) -> Solution:
     """The solution with what it says of fixes and odometer on their own clocks, and the whole offsets of these."""
-    if offsets == _AS_THEY_ARE:
+    if offsets == AS_STATED:
         return solution
     by = _list_by_constraint(offsets)
 
@@ -186,7 +169,7 @@ def shift_to_own_clocks(solution: Solution, offsets: StampOffsets) -> Solution:
 
 def describe_stamps(offsets: StampOffsets) -> tuple[str, ...]:
     """A note on stamps that were moved."""
-    if offsets == _AS_THEY_ARE:
+    if offsets == AS_STATED:
         return ()
     by = f"{offsets.positions:+.2f} s"
     mend = f": add {offsets.positions:+.2f} to time_offset in [gnss]"

@@ -82,11 +82,11 @@ def stretch_stamps(recording, rate):
     return replace(recording, gnss=replace(recording.gnss, t=recording.gnss.t + rate * recording.gnss.t))
 
 
-def interpolate_path(solution):
-    """(N, 3) m, every tenth of a second from 5 to 175 s."""
+def interpolate_path(solution, begin=5.0, end=175.0):
+    """(N, 3) m, every tenth of a second from the drive's `begin` to its `end` (s)."""
     found = solution.trajectory(rate=50.0)
     p = LocalFrame(np.array([0.0, 0.0, 0.0])).from_llh(found.llh)
-    return np.stack([np.interp(np.arange(5.0, 175.0, 0.1), found.t - found.t[0], x) for x in p.T], axis=-1)
+    return np.stack([np.interp(np.arange(begin, end, 0.1), found.t - found.t[0], x) for x in p.T], axis=-1)
 
 
 @pytest.mark.parametrize("rate", [2e-4, -1e-3])
@@ -103,9 +103,24 @@ def test_clocks_that_drift_apart_are_solved_as_one_clock(drive, right, rate):
     assert CLOCK_RATE not in stated.noise.freed
 
 
-@pytest.mark.parametrize("wrong", ["arm", "clocks"])
+def test_late_stamps_spoil_neither_the_start_nor_another_constant():
+    whole, _ = oracle.drive(oracle.vehicle_path(180.0, 50.0), seed=6, lever_arm=tuple(ARM))
+    moving = whole.crop(60.0, 180.0)
+    right = run(moving, solvers=("ekf", "rts"))
+    late = run(replace(moving, gnss=replace(moving.gnss, t=moving.gnss.t + 0.28)), solvers=("ekf",))["ekf"]
+    assert list(late.noise.freed) == [TIME_OFFSET]
+    assert late.noise.freed[TIME_OFFSET].value[0] == pytest.approx(-0.28, abs=0.005)
+    true, clean, path = (interpolate_path(one, 2.0, 30.0) for one in (right["rts"], right["ekf"], late))
+    assert np.sqrt(np.mean((path - true) ** 2)) < 1.1 * np.sqrt(np.mean((clean - true) ** 2))
+
+
+@pytest.mark.parametrize("wrong", ["arm", "clocks", "stamps"])
 def test_what_was_freed_is_in_the_noise_model_of_the_run(drive, tmp_path, wrong):
-    recording = state_arm(drive, np.array([0.5, 0.0, 0.0])) if wrong == "arm" else stretch_stamps(drive, 2e-4)
+    recording = {
+        "arm": state_arm(drive, np.array([0.5, 0.0, 0.0])),
+        "clocks": stretch_stamps(drive, 2e-4),
+        "stamps": replace(drive, gnss=replace(drive.gnss, t=drive.gnss.t + 0.1)),
+    }[wrong]
     found = run(recording, solvers=("rts",))["rts"]
     noise = read_noise(write_noise(tmp_path / "noise.json", found.noise))
     assert noise.freed == found.noise.freed

@@ -18,8 +18,9 @@ from graphnav.core.notes import get_key
 from graphnav.core.rotation import Array
 from graphnav.estimation.noise.files import read_noise, write_noise
 from graphnav.estimation.noise.model import StampOffsets
+from graphnav.estimation.offsets import move_stamps
 from graphnav.estimation.solution import Solution
-from graphnav.estimation.stamps import move_stamps, shift_to_imu_clock, shift_to_own_clocks
+from graphnav.estimation.stamps import shift_to_imu_clock, shift_to_own_clocks
 from graphnav.recording import Gnss, Recording
 
 TOKYO = Path(__file__).resolve().parents[2] / "data" / "tokyo"
