@@ -5,8 +5,9 @@ A wrong arm turns with the vehicle: it contradicts every bend, and every change 
 apart by up to some 1e-4, and what stamps are off by then grows all along the drive. Whether any is so is asked of one
 filter pass with all as parameters of wide priors, by the noise model that was estimated with them as stated. Components
 are freed one by one, each time the one by which the evidence gains most, as long as it gains and the component differs
-from what is stated by more than three sigmas; the others stay. With Lambda and eta the information matrix and vector of the measurements about the components, and D the
-diagonal matrix of the 1-sigmas of a prior (0 of what is known), the logarithm of the evidence is, but for a constant,
+from what is stated by more than three sigmas; the others stay. With Lambda and eta the information matrix and vector of
+the measurements about the components, and D the diagonal matrix of the 1-sigmas of a prior (0 of what is known), the
+logarithm of the evidence is, but for a constant,
 
     -ln |I + D Lambda D| / 2 + (D eta)^T (I + D Lambda D)^-1 (D eta) / 2
 
