@@ -105,13 +105,18 @@ class ProblemBuilder:
         rest = replace(self.recording, gnss=pick_fixes(gnss, gnss.t > until))
         return self.build(self.align(rest, built.detections.stationary), built.detections, parts=True)
 
-    def build_without(self, built: BuiltProblem, noise: NoiseModel, parts: bool) -> BuiltProblem:
+    def build_without(self, built: BuiltProblem, noise: NoiseModel, parts: bool, anew: bool = False) -> BuiltProblem:
         """The problem with a start and stops that depend on no fix that a noise model excludes, and on no constant as
         stated that it frees.
 
         Returns the same object where these are unchanged.
+
+        Parameters
+        ----------
+        anew : whether the start is sought again even if it depends on no excluded fix, and used even if the present one
+            does not contradict it.
         """
-        if not (noise.excluded or noise.freed) or self.recording.gnss is None:
+        if not (noise.excluded or anew) or self.recording.gnss is None:
             return built
         aligned, detections = built.aligned, built.detections
         fixes = drop_excluded(self.recording, noise)
@@ -119,12 +124,12 @@ class ProblemBuilder:
         changed = _differ(stops.stationary, detections.stationary)
         stops = stops if changed else detections
         seen = self.recording.end if aligned.until is None else aligned.until
-        if noise.freed or any(begin <= seen for spans in noise.excluded.values() for begin, _ in spans):
+        if anew or any(begin <= seen for spans in noise.excluded.values() for begin, _ in spans):
             try:
                 found = self.align(use_freed(fixes, noise.freed, self.frame.epoch), stops.stationary)
             except EstimationError:
                 found = aligned
-            if found.motion is not None and (noise.freed or found.contradicts(aligned)):
+            if found.motion is not None and (anew or found.contradicts(aligned)):
                 aligned, changed = found, True
         return self.build(aligned, stops, parts) if changed else built
 

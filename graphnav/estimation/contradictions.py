@@ -45,7 +45,6 @@ from graphnav.estimation.noise.model import FreedConstant, StampOffsets
 from graphnav.estimation.offsets import LINEAR_OFFSET, move_stamps
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.ekf import refilter
-from graphnav.estimation.solvers.linearise import Points
 from graphnav.estimation.solvers.passes import reuse_points
 from graphnav.recording import Recording
 
@@ -110,28 +109,62 @@ def widen(problem: Problem, names: Collection[str]) -> dict[str, FreedConstant]:
     }
 
 
-def find_contradicted_constants(base: Problem, best: NoiseEstimate, names: Collection[str]) -> dict[str, FreedConstant]:
+def find_contradicted_constants(base: Problem, best: NoiseEstimate, freed: Freed, names: Collection[str]) -> Freed:
     """What fixes show of the constants that they contradict, with the sigmas of the priors to use.
 
     Parameters
     ----------
-    base : with stated noise.
+    base : with stated noise, and constants as stated.
     best : its noise model, and points of all keyframes near the solution.
+    freed : constants that are parameters of `best`.
     names : of the constants to ask about.
     """
-    problem = apply_noise(base, best.noise)
     asked = widen(base, names)
     if not asked:
         return {}
-    found, P = _estimate(free(problem, asked), problem, best.points, asked)
-    stated, prior, known = _stack(asked, "value"), _stack(asked, "sigma"), _stack_stated(base, asked)
-    some = select_contradicted(found - stated, P, prior, known)
-    if not some.any():
-        return {}
-    off, P, _ = _change_prior(found - stated, P, prior, np.where(some, prior, known))
-    value = np.where(some, stated + off, stated)
-    freed = _split(asked, value, np.where(some, _WIDER * np.sqrt(np.diagonal(P)), _KNOWN * prior))
-    return {name: one for name, one in freed.items() if one.value != asked[name].value}
+    change, P = _ask(base, best, freed, asked)
+    some = select_contradicted(change, P, _stack(asked, "sigma"), _stack_stated(base, asked))
+    found = _use(base, asked, change, P, some)
+    return {name: one for name, one in found.items() if one.value != asked[name].value}
+
+
+def update(base: Problem, best: NoiseEstimate, freed: Freed) -> Freed:
+    """The same constants as an estimate of the noise model has them.
+
+    Parameters
+    ----------
+    base, best : as for `find_contradicted_constants`.
+    """
+    asked = widen(base, freed)
+    return _use(base, asked, *_ask(base, best, freed, asked), mark_free(base, freed))
+
+
+def mark_free(base: Problem, freed: Freed) -> Array:
+    """Mask (k,) of the components of freed constants that are free."""
+    return np.asarray(_stack(freed, "sigma") > _KNOWN * _stack(widen(base, freed), "sigma"))
+
+
+def are_same(one: Freed, other: Freed, base: Problem) -> bool:
+    """Whether the same components are free."""
+    if not (one and other):
+        return one == other
+    return one.keys() == other.keys() and bool((mark_free(base, one) == mark_free(base, other)).all())
+
+
+def _ask(base: Problem, best: NoiseEstimate, freed: Freed, asked: Freed) -> tuple[Array, Array]:
+    """What a filter finds of constants beside what is stated (k,), and its covariance (k, k)."""
+    problem, before = (apply_noise(one, best.noise) for one in (free(base, asked), free(base, freed)))
+    forward = refilter(problem, reuse_points(best.points, before, problem), whole=False)
+    at = np.concatenate([np.arange(problem.columns[name].start, problem.columns[name].stop) for name in asked])
+    return forward.values[-1, at - DIM] - _stack(asked, "value"), forward.P[-1][np.ix_(at, at)]
+
+
+def _use(base: Problem, asked: Freed, change: Array, P: Array, some: Array) -> dict[str, FreedConstant]:
+    """Constants to be used with some components (k,) as found, the others as stated."""
+    stated, prior = _stack(asked, "value"), _stack(asked, "sigma")
+    off, left, _ = _change_prior(change, P, prior, np.where(some, prior, _stack_stated(base, asked)))
+    sigma = np.where(some, _WIDER * np.sqrt(np.diagonal(left)), _KNOWN * prior)
+    return _split(asked, np.where(some, stated + off, stated), sigma)
 
 
 def select_contradicted(change: Array, P: Array, prior: Array, known: Array) -> Array:
@@ -185,7 +218,7 @@ def _change_prior(change: Array, P: Array, prior: Array, sigma: Array) -> tuple[
     return covariance @ vector, covariance, log_evidence
 
 
-def compute_prior_cost(problem: Problem, freed: Freed) -> float:
+def compute_prior_cost(base: Problem, freed: Freed) -> float:
     """By how much the evidence of an estimate is too large because the priors of freed constants are about what the
     drive finds of them, and narrow, in place of those that they are asked about with.
 
@@ -193,28 +226,15 @@ def compute_prior_cost(problem: Problem, freed: Freed) -> float:
 
     Parameters
     ----------
-    problem : with all as stated.
+    base : with all as stated.
     """
-    asked = widen(problem, freed)
-    used, prior = _stack(freed, "sigma"), _stack(asked, "sigma")
-    some = used > _KNOWN * prior
-    change, told = (_stack(freed, "value") - _stack(asked, "value"))[some], (used[some] / _WIDER) ** 2
-    narrow, wide = told + used[some] ** 2, told + prior[some] ** 2
+    if not freed:
+        return 0.0
+    asked, some = widen(base, freed), mark_free(base, freed)
+    used, prior = _stack(freed, "sigma")[some], _stack(asked, "sigma")[some]
+    change, told = (_stack(freed, "value") - _stack(asked, "value"))[some], (used / _WIDER) ** 2
+    narrow, wide = told + used**2, told + prior**2
     return 0.5 * float(np.sum(np.log(wide / narrow) + change**2 / wide))
-
-
-def narrow(base: Problem, found: NoiseEstimate, freed: Freed) -> dict[str, FreedConstant]:
-    """The constants as an estimate has them, for the solvers.
-
-    Parameters
-    ----------
-    base : as the noise model was estimated with, the constants freed.
-    """
-    problem = apply_noise(base, found.noise)
-    value, P = _estimate(problem, problem, found.points, freed)
-    least = _KNOWN * np.concatenate([np.full(len(one.value), PRIOR_SIGMA[name]) for name, one in freed.items()])
-    known = _stack(freed, "sigma") <= least
-    return _split(freed, value, np.where(known, least, _WIDER * np.sqrt(np.diagonal(P))))
 
 
 def describe_freed(freed: Freed, recording: Recording) -> tuple[str, ...]:
@@ -264,10 +284,3 @@ def _split(freed: Freed, value: Array, sigma: Array) -> dict[str, FreedConstant]
     ends = np.cumsum([len(one.value) for one in freed.values()])[:-1]
     each = zip(freed, np.split(value, ends), np.split(sigma, ends), strict=True)
     return {name: FreedConstant(tuple(x.tolist()), tuple(s.tolist())) for name, x, s in each}
-
-
-def _estimate(problem: Problem, before: Problem, about: Points, freed: Freed) -> tuple[Array, Array]:
-    """(n,) and covariance (n, n) of constants, filtered about points that are of another problem."""
-    forward = refilter(problem, reuse_points(about, before, problem), whole=False)
-    at = np.concatenate([np.arange(problem.columns[name].start, problem.columns[name].stop) for name in freed])
-    return forward.values[-1, at - DIM], forward.P[-1][np.ix_(at, at)]

@@ -24,11 +24,13 @@ from graphnav.estimation import faults
 from graphnav.estimation.alignment import Alignment, use_known_heading
 from graphnav.estimation.building import BuiltProblem, Clock, ProblemBuilder, has_diverged
 from graphnav.estimation.contradictions import (
+    Freed,
+    are_same,
     compute_prior_cost,
     describe_freed,
     find_contradicted_constants,
     free,
-    narrow,
+    update,
 )
 from graphnav.estimation.fixing import fix, list_float_arcs
 from graphnav.estimation.noise.apply import apply_noise, drop_parts
@@ -125,7 +127,7 @@ def prepare(
             noise, known, built, evidence = _find_noise(builder, built, progress, passes, weigh)
             noise = replace(noise, spacing=spacing)
     else:
-        built = builder.build_without(built, noise, parts=noise != STATED)
+        built = builder.build_without(built, noise, parts=noise != STATED, anew=bool(noise.freed))
         built = replace(built, problem=free(built.problem, noise.freed))
     aligned = built.aligned
     problem = drop_parts(apply_noise(built.problem, noise))
@@ -166,87 +168,137 @@ def _filter_and_smooth(
         return forward, smooth_backward(problem, forward, progress)
 
 
+@dataclass(frozen=True)
+class _Found:
+    """A noise model, and the constants that are parameters in it instead of as stated."""
+
+    built: BuiltProblem  # all constants as stated
+    freed: Freed
+    estimate: NoiseEstimate
+
+    @property
+    def base(self) -> Problem:
+        """The problem with stated noise that the noise model is of."""
+        return free(self.built.problem, self.freed)
+
+    @property
+    def noise(self) -> NoiseModel:
+        return replace(self.estimate.noise, freed=self.freed)
+
+    @property
+    def excluded_share(self) -> float:
+        return compute_excluded_share(self.built.problem, self.estimate.noise)
+
+    def compute_evidence(self) -> float:
+        """The logarithm of the evidence of the measurements."""
+        return log_evidence(self.base, self.estimate) - compute_prior_cost(self.built.problem, self.freed)
+
+    def count(self, passes: Counter[str]) -> _Found:
+        """The same after this many passes."""
+        return replace(self, estimate=replace(self.estimate, passes=passes))
+
+
+# a problem with stated noise, first points and the problem that they are of -> its noise model
+Estimate = Callable[[Problem, tuple[Points, Problem] | None], NoiseEstimate]
+
+
 def _find_noise(
     builder: ProblemBuilder, built: BuiltProblem, progress: Progress | None, passes: Counter[str], weigh: Weigh | None
 ) -> tuple[NoiseModel, Points | None, BuiltProblem, float]:
     """The noise model, linearisation points, the problem with a start and stops that rest on no excluded fix, and the
     logarithm of the evidence where it is wanted.
     """
-    best = _estimate_noise(built, builder.settings, progress)
-    if compute_excluded_share(built.problem, best.noise) > _MOST_WRONG:
+    leave_out = _keep_all if builder.settings.gnss.faults == "off" else estimate_without_faults
+    found = _estimate_noise(builder, built, leave_out, progress)
+    if found.excluded_share > _MOST_WRONG:
         # most fixes contradict the start: align again with the fixes behind those that the alignment used
         try:
-            later = builder.build_later(built)
-            again = _estimate_noise(later, builder.settings, progress)
-            total = best.passes + again.passes
-            if compute_excluded_share(later.problem, again.noise) < compute_excluded_share(built.problem, best.noise):
-                built, best = later, again
-            best = replace(best, passes=total)
+            later = _estimate_noise(builder, builder.build_later(built), leave_out, progress)
+            total = found.estimate.passes + later.estimate.passes
+            found = min(found, later, key=lambda one: one.excluded_share).count(total)
         except EstimationError:
             pass  # nothing moves later on
-    without = builder.build_without(built, best.noise, parts=True)
-    if without is not built:
-        built = without
-        again = estimate_noise(built.problem, built.aligned.until, best.noise, progress=progress)
-        best = replace(again, passes=best.passes + again.passes)
-    best = estimate_disturbed_intervals(built.problem, best)
-    built, best, cost = _free_contradicted(builder, built, best, progress)
-    passes.update(best.passes + Counter(filter=1))
+    if found.noise.excluded:
+        without = builder.build_without(found.built, found.noise, parts=True)
+        if without is not found.built:
+            total = found.estimate.passes
+            found = replace(found, built=without)
+            again = estimate_noise(found.base, without.aligned.until, found.estimate.noise, progress=progress)
+            found = replace(found, estimate=again).count(total + again.passes)
+    found = replace(found, estimate=estimate_disturbed_intervals(found.base, found.estimate))
+
+    until = found.built.aligned.until
+
+    def estimate(base: Problem, near: tuple[Points, Problem] | None) -> NoiseEstimate:
+        one = estimate_noise(base, until, near=near, progress=progress)
+        return estimate_disturbed_intervals(base, leave_out(base, one, until, progress))
+
+    found = _free_contradicted(builder, found, estimate)
+    passes.update(found.estimate.passes + Counter(filter=1))
+    best, built = found.estimate, replace(found.built, problem=found.base)
     wanted = weigh is not None and weigh(apply_noise(built.problem, best.noise), best.points)
-    evidence = log_evidence(built.problem, best) - cost if wanted else np.inf
-    plain = NoiseModel(excluded=best.noise.excluded, freed=best.noise.freed)
+    evidence = found.compute_evidence() if wanted else np.inf
+    plain = NoiseModel(excluded=best.noise.excluded, freed=found.freed)
     if _is_likelier(built.problem, plain, best):
         return plain, None, built, evidence
     # the points alone: the covariances of the last pass are half of all memory
-    return best.noise, Points(best.points.states, best.points.values), built, evidence
+    return found.noise, Points(best.points.states, best.points.values), built, evidence
+
+
+def _keep_all(base: Problem, found: NoiseEstimate, *_: object) -> NoiseEstimate:
+    return found
 
 
 def _estimate_noise(
+    builder: ProblemBuilder,
     built: BuiltProblem,
-    settings: Settings,
+    leave_out: Callable[[Problem, NoiseEstimate, float | None, Progress | None], NoiseEstimate],
     progress: Progress | None,
-    near: tuple[Points, Problem] | None = None,
-) -> NoiseEstimate:
-    """The noise model, without spans of wrong measurements unless the settings keep them."""
-    estimate = estimate_noise if settings.gnss.faults == "off" else estimate_without_faults
-    return estimate(built.problem, built.aligned.until, near=near, progress=progress)
+) -> _Found:
+    """The noise model, with constants free that the drive contradicts, and without spans of wrong measurements.
 
-
-def _free_contradicted(
-    builder: ProblemBuilder, built: BuiltProblem, best: NoiseEstimate, progress: Progress | None
-) -> tuple[BuiltProblem, NoiseEstimate, float]:
-    """The estimate with constants as parameters that the drive contradicts as stated, and what their priors cost in
-    evidence.
-
-    Returns the same problem where there are none. To be asked when all else that may be wrong is known: a gyro that
-    misses a turn looks like an arm, and so do stamps that are still to be moved.
+    Constants first: what is wrong of them is in all measurements, and would be taken for faults of some.
     """
-    problem = apply_noise(built.problem, best.noise)
+
+    def estimate(base: Problem, near: tuple[Points, Problem] | None) -> NoiseEstimate:
+        return estimate_noise(base, built.aligned.until, near=near, progress=progress)
+
+    found = _free_contradicted(builder, _Found(built, {}, estimate(built.problem, None)), estimate)
+    return replace(found, estimate=leave_out(found.base, found.estimate, built.aligned.until, progress))
+
+
+def _free_contradicted(builder: ProblemBuilder, found: _Found, estimate: Estimate) -> _Found:
+    """Free the constants that the drive contradicts as stated, and no others, and estimate the noise model anew.
+
+    The same is returned where these are free already. To be asked again when all else that may be wrong is known: a
+    gyro that misses a turn looks like an arm, and so do fixes that are wrong and stamps that are still to be moved.
+    """
+    base, before = found.built.problem, found.freed
+    near = found.estimate.get_linearisation(found.base)
     names = {CLOCK_RATE} if builder.settings.gnss.clock_rate_sigma is None else set[str]()
-    if not is_offset_far(problem, best.points):
+    if not is_offset_far(near[1], found.estimate.points):
         names |= {LEVER_ARM, TIME_OFFSET, VELOCITY_TIME_OFFSET}
-    passes = best.passes + Counter(filter=1)
+    passes = found.estimate.passes + Counter(filter=1)
     try:
-        if not (freed := find_contradicted_constants(built.problem, best, names)):
-            return built, replace(best, passes=passes), 0.0
-        other = replace(built, problem=free(built.problem, freed))
-        found = _estimate_noise(other, builder.settings, progress, (best.points, problem))
-        found = estimate_disturbed_intervals(other.problem, found)
-        passes = passes + found.passes + Counter(filter=1)
-        # by other figures what is freed may lead to an optimum that is worse than the one with all as stated
-        cost = compute_prior_cost(problem, freed)
-        if log_evidence(other.problem, found) - cost < log_evidence(built.problem, best):
-            return built, replace(best, passes=passes), 0.0
-        freed = narrow(other.problem, found, freed)
+        freed = find_contradicted_constants(base, found.estimate, before, names)
+        if not are_same(freed, before, base):
+            other = replace(found, freed=freed, estimate=estimate(free(base, freed), near))
+            passes = passes + other.estimate.passes + Counter(filter=1)
+            # by other figures what is freed may lead to an optimum that is worse than the one with all as stated
+            if other.compute_evidence() < found.compute_evidence():
+                return found.count(passes)
+            found, freed = other, update(base, other.estimate, freed)
     except BREAKDOWN:
-        return built, replace(best, passes=passes), 0.0
-    best = replace(found, noise=replace(found.noise, freed=freed), passes=passes)
-    again = builder.build_without(built, best.noise, parts=True)
-    problem = free(again.problem, freed)
-    if not np.array_equal(problem.t, other.problem.t):
-        found = estimate_noise(problem, again.aligned.until, best.noise, progress=progress)
-        best = replace(found, noise=replace(found.noise, freed=freed), passes=passes + found.passes)
-    return replace(again, problem=problem), best, cost
+        return found.count(passes)
+    found = replace(found, freed=freed).count(passes)
+    if not (freed or before):
+        return found
+    built = builder.build_without(found.built, found.noise, parts=True, anew=True)
+    again = replace(found, built=built)
+    if not np.array_equal(built.problem.t, base.t):
+        best = estimate_noise(again.base, built.aligned.until, found.estimate.noise)
+        again = replace(again, estimate=best).count(passes + best.passes)
+    return again
 
 
 def _is_likelier(base: Problem, plain: NoiseModel, found: NoiseEstimate) -> bool:

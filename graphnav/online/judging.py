@@ -87,8 +87,10 @@ def answer(asked: Question) -> Answer:
             parts_of_noise=True,
         )  # fmt: skip
         base = _share_horizontal_unit(base)
-        estimate = estimate_noise if settings.gnss.faults == "off" else estimate_without_faults
-        noise = estimate(base, start.until).noise
+        estimate = estimate_noise(base, start.until)
+        if settings.gnss.faults != "off":
+            estimate = estimate_without_faults(base, estimate, start.until)
+        noise = estimate.noise
         used = apply_noise(base, noise)
         words, wrong = describe_noise(noise, used), faults.find_fault_spans(used)
         return Answer(_convert_unit(noise, base, asked.unit), words, stationary, wrong, check_rows(asked.every))

@@ -148,10 +148,10 @@ def test_an_arm_whose_prior_is_stated_is_estimated_by_it(drive):
 def test_evidence_of_what_is_freed_is_that_of_the_innovations(drive, monkeypatch, name, off, rate, late):
     """The closed form against filters of all keyframes, with one prior of the constants and with the other."""
     asked = []
-    monkeypatch.setattr(preparation, "find_contradicted_constants", lambda *given: asked.append(given))
+    monkeypatch.setattr(preparation, "find_contradicted_constants", lambda *given: asked.append(given) or {})
     damaged = stretch_stamps(state_arm(drive.crop(0.0, 90.0), np.array([0.3, -off, 0.0]) if off else 0.0), rate)
     run(replace(damaged, gnss=replace(damaged.gnss, t=damaged.gnss.t + late)), solvers=("ekf",))
-    ((base, best, _),) = asked
+    base, best, _, _ = asked[-1]
     problem, about = apply_noise(base, best.noise), best.points
     wide = widen(problem, {name})
     freed = free(problem, wide)

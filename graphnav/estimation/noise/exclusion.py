@@ -72,7 +72,6 @@ from graphnav.estimation.noise.spans import (
 )
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.ekf import refilter
-from graphnav.estimation.solvers.linearise import Points
 from graphnav.estimation.solvers.watch import FALSE_ALARM
 from graphnav.recording import Recording
 
@@ -81,8 +80,8 @@ _REFINEMENTS = 2  # estimates without masked spans: the first trims the spans, t
 
 def estimate_without_faults(
     base: Problem,
+    found: NoiseEstimate,
     opening: float | None = None,
-    near: tuple[Points, Problem] | None = None,
     progress: Callable[[str, float], None] | None = None,
 ) -> NoiseEstimate:
     """Estimate the noise model without the spans of wrong measurements that the evidence leaves out.
@@ -90,15 +89,14 @@ def estimate_without_faults(
     Parameters
     ----------
     base : built with stated noise and the parts of its intervals' noise.
+    found : with all measurements.
     opening : as for `graphnav.estimation.solvers.ekf.ekf`.
-    near : as for `graphnav.estimation.noise.estimate.estimate_noise`.
 
     Raises
     ------
     EstimationError
         If the filter breaks down.
     """
-    found = estimate_noise(base, opening, near=near, progress=progress)
     decision = decide_faults(base, found)
     passes = found.passes + decision.passes
     if not decision.noise.excluded:
