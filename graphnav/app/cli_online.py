@@ -99,7 +99,7 @@ def online(
         return
     settings = choose_detectors(_override(read_settings(config, profile), lag, engine), detectors)
     if resume and out is None:
-        raise ConfigError("--resume: say which folder to go on in: -o OUT", key="option.missing")
+        raise ConfigError("--resume: name the folder to continue in: -o OUT", key="option.missing")
     folder = None if out is None else check_output_folder(out)
     recording = None if live else read(source, topic or (), allow_outside, format)
     session = Session(settings, source, folder, resume, recording)

@@ -154,7 +154,7 @@ def compare(
     for option, values in (("--against-point", beside.points), ("--against-shift", beside.shifts)):
         if values and len(values) != len(beside.files):
             raise ConfigError(
-                f"{option} {values[-1]}: say one for each of the {len(beside.files)} files of --against",
+                f"{option} {values[-1]}: give one for each of the {len(beside.files)} files of --against",
                 key="option.count",
             )
     _solve_and_write(asked, choose_solvers(context, solvers), False, export, point, beside, loose)

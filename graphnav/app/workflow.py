@@ -127,7 +127,7 @@ def parse_withheld(text: str) -> Withheld:
     if re.fullmatch(r"[\d.]+-[\d.]+", text.strip()):
         first, *others = list_sources()
         words = f"{first}:{text.strip()}, or the same of {' or '.join(others)}"
-        raise ConfigError(f"--without {text}: say of which sensor: {words}", key="option.withheld")
+        raise ConfigError(f"--without {text}: name the sensor: {words}", key="option.withheld")
     usage = "write SOURCE or SOURCE:FROM-TO in seconds from the start, such as gnss:600-660"
     if found is None:
         raise ConfigError(f"--without {text}: not a source and a span; {usage}", key="option.withheld")

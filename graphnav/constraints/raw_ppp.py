@@ -94,7 +94,7 @@ def require_precise(name: str, raw: RawGnss) -> None:
     """
     if not raw.precise:
         raise RecordingError(
-            f"{name}: raw_gnss.ppp needs precise orbits and clocks; say sp3 and clk in the recording's [raw_gnss]",
+            f"{name}: raw_gnss.ppp needs precise orbits and clocks; set sp3 and clk in the recording's [raw_gnss]",
             key="raw.ppp_orbits",
         )
     if not choose_second_signals(raw):

@@ -94,7 +94,7 @@ def load_raw(
     precise = read_precise(list(sources.sp3), list(sources.clk)) if sources.sp3 else None
     if nav is None and precise is None:
         raise RecordingError(
-            f"{sources.rover[0]}: holds no ephemerides; say nav or sp3 in [raw_gnss]", key="raw.no_ephemerides"
+            f"{sources.rover[0]}: holds no ephemerides; set nav or sp3 in [raw_gnss]", key="raw.no_ephemerides"
         )
     _check_dates(obs, nav, precise, sources)
     if zero is not None:
@@ -184,7 +184,7 @@ def _difference_by_base(
     position = obs.marker if given is None else np.array(given)
     if position is None:
         raise RecordingError(
-            f"{sources.base[0]}: states no position; say base_position in [raw_gnss]", key="raw.base_position"
+            f"{sources.base[0]}: states no position; set base_position in [raw_gnss]", key="raw.base_position"
         )
     apart = max(obs.t[0] - raw.t[-1], raw.t[0] - obs.t[-1])
     if apart > 0.0:

@@ -277,7 +277,7 @@ def _find_beside(source: Path, name: str, where: str, key: str, allow_outside: b
     path = source.parent / name
     if not is_inside(path, source.parent, ConfigError) and not allow_outside:
         raise ConfigError(
-            f"{where}, '{key}': {name} lies outside its folder; say --allow-outside if you trust who wrote it",
+            f"{where}, '{key}': {name} lies outside its folder; use --allow-outside if you trust who wrote it",
             key="file.outside",
         )
     return path
