@@ -49,7 +49,7 @@ _THINKING, _LONGEST_THOUGHT = 1.0 / 8.0, 20.0
 
 @dataclass(frozen=True)
 class Answer:
-    """Result of a judgement of the sensors."""
+    """Result of a noise estimation."""
 
     noise: NoiseModel
     notes: tuple[str, ...]
@@ -60,24 +60,24 @@ class Answer:
 
 @dataclass(frozen=True)
 class Question:
-    """What a judgement of the sensors is of."""
+    """Input of a noise estimation."""
 
     recording: Recording
-    every: Recording  # with the fixes, too, that are not used
+    every: Recording  # including fixes that are not used
     settings: Settings
     frame: LocalFrame
     found: Alignment
     times: Array  # (K,) s, keyframes, the first at the start of the recording: weights of rows hold at these
-    unit: Array  # (3,) m, in which the answer is to tell errors of the fixes that last for minutes and hours
+    unit: Array  # (3,) m, unit of the result for errors of the fixes over minutes and hours
 
 
 def answer(asked: Question) -> Answer:
-    """Judge the sensors.
+    """Estimate the noise model.
 
     Raises
     ------
     EstimationError
-        If the rows do not tell.
+        If the rows do not determine it.
     """
     settings, start = asked.settings, asked.found
     try:
@@ -97,14 +97,14 @@ def answer(asked: Question) -> Answer:
 
 
 class Judgement:
-    """An answer that is worked out in a thread of its own, from a copy of the question.
+    """A noise estimation in a thread of its own, from a copy of its input.
 
-    The copy is because values computed at first use must not appear in the question while a checkpoint is written.
-    A checkpoint keeps the question; it is asked again on resuming.
+    The copy keeps values computed at first use out of the input while a checkpoint is written.
+    A checkpoint keeps the input; the estimation runs again on resuming.
 
     Parameters
     ----------
-    due : s, when the answer is to be used.
+    due : s, when the result is to be used.
     """
 
     def __init__(self, asked: Question, due: float) -> None:
@@ -159,7 +159,7 @@ def _convert_unit(noise: NoiseModel, base: Problem, unit: Array) -> NoiseModel:
 def start_judging(
     sensors: Sensors, settings: Settings, frame: LocalFrame, found: Alignment, times: Array, until: float
 ) -> Judgement:
-    """Start to judge the sensors by their rows up to a time (s); `times` (K,) are the keyframes so far, s."""
+    """Start a noise estimation from the rows up to a time (s); `times` (K,) are the keyframes so far, s."""
     recording, every = (sensors.make_recording(-np.inf, until, all_of_them) for all_of_them in (False, True))
     due = float(times[-1]) + min(_THINKING * settings.solver.lag, _LONGEST_THOUGHT)
     settings = drop_ambiguities(settings, sensors.setup)

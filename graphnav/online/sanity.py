@@ -24,7 +24,8 @@ Row = tuple[str, float, tuple[float, ...]]  # sensor, time (s), values
 
 _BLANK = (math.nan,) * 6
 _LEAST_SIGMA_LIVE = 1e-4  # m, m/s; a tenth of the resolution of a carrier's phase
-_MOST_FIXES = 600  # fixes: those that contradict so many consistent ones are believed once they are more
+# fixes: consistent ones that contradict earlier ones are accepted once they are more than these, up to so many
+_MOST_FIXES = 600
 _SET_BACK_ROWS = 20  # consecutive IMU rows at times that have passed: not late rows, but another clock
 CERTAIN_SPAN = 1.2  # s, duration of these: more than a second, so that one falls on a remembered second
 _REMEMBERED_SPAN = 36_000  # s, ten hours
@@ -82,8 +83,8 @@ def drop_insane_velocity(values: tuple[float, ...]) -> tuple[tuple[float, ...], 
 
 @dataclass
 class Reach:
-    """Whether fixes can be reached from the previous ones; once consistent unreachable fixes outnumber these, they
-    replace them.
+    """Whether fixes can be reached from the previous ones; once consistent unreachable fixes outnumber the earlier
+    ones, they replace them.
     """
 
     _t: float = -math.inf

@@ -100,7 +100,7 @@ class Smoother:
         sensor, t, values = row
         sensors = self.sensors
         before = sensors.imu.newest
-        if sensor == "imu" and sensors.add_next(t, values, before):  # as nearly all do
+        if sensor == "imu" and sensors.add_next(t, values, before):  # the common case
             self._take_newest(t, before)
             return
         previous = sensors.find_newest(sensor)
@@ -235,7 +235,7 @@ class Smoother:
             return
         recording, stationary = rows
         origin = choose_origin(recording) if self.frame is None else self.frame.origin
-        self.frame = LocalFrame(origin, recording.start)  # clocks that were set anew drift from there
+        self.frame = LocalFrame(origin, recording.start)  # a clock that was set drifts from that time on
         try:
             found = find_start(recording, stationary, self.settings, self.frame)
         except EstimationError as error:
@@ -330,7 +330,7 @@ class Smoother:
         self._faults = self.excluded
         self._begin_anew(before)
         sensors.put_back(later)
-        sensors.gnss.space(0.0)  # all of them, until there is a new start
+        sensors.gnss.space(0.0)  # all of them, until the next alignment
 
     def _begin_anew(self, oldest: float) -> None:
         """Drop all rows and states; rows up to a time (s) are too late from now on."""
