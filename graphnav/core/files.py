@@ -241,8 +241,7 @@ class _Bounded(io.RawIOBase):
         self, path: Path, plain: IO[bytes], packed: bool, size: int, most: int, line: int | None, error: Kind
     ) -> None:
         self.path, self.error, self._plain = path, error, plain
-        # type: ignore[assignment]
-        self._source: IO[bytes] = gzip.GzipFile(fileobj=plain, mode="rb") if packed else plain
+        self._source: IO[bytes] = gzip.GzipFile(fileobj=plain, mode="rb") if packed else plain  # type: ignore[assignment]
         self._size, self._most, self._longest, self._packed = size, most, line, packed
         self._count = self._run = 0
 
