@@ -183,12 +183,12 @@ class StopRequest:
 def follow(session: Session, chunks: Iterator[bytes | None], shown: LiveView, asked: StopRequest) -> None:
     """Process lines until the source ends or an end is requested.
 
-    b"" means that nothing arrived for a while, None that the sender is gone and its last line may be cut.
+    b"" means that nothing arrived for a while, None that the sender has disconnected and its last line may be cut.
     """
     rest, heard = b"", time.monotonic()
     for chunk in chunks:
         if chunk is None:
-            rest = b""  # cut in its last number it would pass for a row
+            rest = b""  # a line cut within its last number would still parse as a row
         elif chunk:
             *whole, rest = (rest + chunk).split(b"\n")
             rest = rest[:LONGEST_LINE]  # a line without an end is no row, and is reported as one when it does end

@@ -277,7 +277,7 @@ def _solve_and_write(
         files = resolve_final_path(files, part, folder)
         if not asked.pages:
             outputs.remove_pages(folder, () if alone else names)
-        if exported:  # in its own right, so that a failing file does not prevent the others
+        if exported:  # separately, so that a failing file does not prevent the others
             with stage_results(folder) as part:
                 more = convert.export_run(outcome, part, exported, point, alone)
             files += resolve_final_path(more, part, folder)

@@ -59,8 +59,8 @@ def write_report(
     metrics, errors : of `graphnav.evaluation.evaluate`, where there is a truth.
     withheld : (source, span), span in s from the recording's start or None for all of it.
     outages : s from the start, where the recording itself has no fixes.
-    findings : sentences about what was odd in the recording.
-    defects : those of them that make the result wrong whatever its sigmas say; the report begins with them.
+    findings : sentences about the recording.
+    defects : those that make the result wrong whatever its sigmas; the report begins with them.
     contradicted : a sentence if another solver of the same run contradicts this one; likewise.
     provenance : version, input hashes and the like, plain values; `options` are those of the command.
     detectors : of `draw_detectors`, for who writes several reports of one recording; drawn here if None.
