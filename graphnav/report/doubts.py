@@ -25,9 +25,7 @@ _FAR = 3.0  # sigmas, rms, of a separation; smaller significant ones are only in
 _MOVING, _DIRECTED = 1.0, np.radians(30.0)
 FEWEST_ROWS = 10  # rows needed to judge a sigma
 _BY_INFORMATION = "batch rts isam2 incremental ekf"  # the most first
-_BRIEF = (
-    0.01  # share of a drive in which chance events of a filter, an outlier or the first fix after a gap, are tolerated
-)
+_BRIEF = 0.01  # share of a drive in which chance events of a filter (an outlier, a gap's first fix) are tolerated
 _NEGLIGIBLE_VARIANCE = 1e-12  # m^2, a micrometre
 _LARGEST_EXCLUDED_SHARE = 0.5  # share of the fixes' information; above it most measurements contradict the result
 TOO_LARGE = {"innovation": 1.5, "residual": 1.15}  # RMS over sigma; a fit reduces residuals
