@@ -47,8 +47,8 @@ LONG = parse_settings({"noise": {"mode": "stated"}, "solver": {"lag": 1000.0}})
 
 @pytest.fixture(scope="module")
 def drive() -> tuple[Recording, Trajectory]:
-    """A hundred seconds at 50 Hz, so that the tests are quick."""
-    path = oracle.vehicle_path(130.0, 50.0)
+    """A hundred seconds at 25 Hz, so that the tests are quick."""
+    path = oracle.vehicle_path(130.0, 25.0)
     recording, truth = oracle.drive(path, seed=3, outages=[(70.0, 80.0)], odometer_rate=10.0)
     return recording.crop(0.0, 100.0), truth
 
@@ -149,7 +149,7 @@ def test_live_states_at_imu_rate_hold_to_their_sigmas(drive: tuple[Recording, Tr
     online, ratio = Online(drop_rows(recording), QUICK), []
     for k, row in enumerate(rows):
         online.add(row)
-        if online.tracker is not None and k % 601 == 0:
+        if online.tracker is not None and k % 301 == 0:
             t, states, P = online.tracker.predict_since(online.sensors)
             now = online.live()
             assert now is not None
@@ -751,7 +751,7 @@ def test_resumed_while_it_is_judged_it_ends_with_the_same(drive: tuple[Recording
     for k, row in enumerate(rows):
         other.add(row)
         doing = "again" if other._catch_up is not None else "judged" if other._estimation is not None else ""
-        if doing and k % (4 if doing == "again" else 40) == 0:
+        if doing and k % (4 if doing == "again" else 20) == 0:
             resumed[doing] += 1
             other = pickle.loads(pickle.dumps(other))
         parts += other.settled()

@@ -49,7 +49,7 @@ def recording() -> Recording:
 
 
 def observed_drive(**more: object) -> Recording:
-    path = oracle.vehicle_path(130.0, 50.0)
+    path = oracle.vehicle_path(130.0, 25.0)
     made, _ = oracle.drive(path, seed=3, outages=[(60.0, 75.0)], gnss_velocity_sd=(0.1, 0.1, 0.1))
     return raw_drive.with_observations(made, path, noise=1.0, seed=2, carrier=0.003, **more)
 
