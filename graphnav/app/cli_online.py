@@ -185,7 +185,7 @@ def follow(session: Session, chunks: Iterator[bytes | None], shown: LiveView, as
 
     b"" means that nothing arrived for a while, None that the sender has disconnected and its last line may be cut.
     """
-    rest, heard = b"", time.monotonic()
+    rest, last_row = b"", time.monotonic()
     for chunk in chunks:
         if chunk is None:
             rest = b""  # a line cut within its last number would still parse as a row
@@ -194,8 +194,8 @@ def follow(session: Session, chunks: Iterator[bytes | None], shown: LiveView, as
             rest = rest[:LONGEST_LINE]  # a line without an end is no row, and is reported as one when it does end
             whole = [line[:LONGEST_LINE] for line in whole]
             session.add_lines([line.decode("utf-8", "replace") for line in whole], asked.__bool__)
-            heard = time.monotonic()
-        shown.update_if_due(time.monotonic() - heard)
+            last_row = time.monotonic()
+        shown.update_if_due(time.monotonic() - last_row)
         if session.done or asked:
             return
 

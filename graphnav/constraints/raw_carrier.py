@@ -52,7 +52,7 @@ from graphnav.constraints.raw_selection import select_observations
 from graphnav.core import rotation
 from graphnav.core.rotation import Array
 from graphnav.core.state import Parameter, States
-from graphnav.gnss.atmosphere import obliquity
+from graphnav.gnss.atmosphere import compute_obliquity
 from graphnav.gnss.carrier import number_epochs, pair_consecutive
 from graphnav.gnss.series import compute_epoch_medians
 from graphnav.gnss.sigmas import compute_carrier_sigma
@@ -224,7 +224,7 @@ class GnssCarrier(SatelliteConstraint):
             *_clone_antennas(found, pairs),
         )
         # a phase is advanced, not delayed; against a base the parameter is the difference between the two receivers
-        delay = -obliquity(found.elevation) * (0.0 if raw.differenced else (L1 / raw.frequency) ** 2)
+        delay = -compute_obliquity(found.elevation) * (0.0 if raw.differenced else (L1 / raw.frequency) ** 2)
         drift = Parameter(
             DRIFT, np.zeros(3), _DRIFT, "m/s", correlation_time=minutes, spacing=found.spacing,
             noise_groups=tuple(f"{cls.name}.minutes.{axis}" for axis in AXES),

@@ -38,7 +38,7 @@ from graphnav.core import rotation
 from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.core.state import SECONDS, Parameter, States
-from graphnav.gnss.atmosphere import obliquity
+from graphnav.gnss.atmosphere import compute_obliquity
 from graphnav.gnss.series import RawGnss
 from graphnav.gnss.sigmas import compute_code_sigma, compute_rate_sigma
 from graphnav.gnss.signals import L1, SYSTEM_NAMES, C, name_satellite, name_signal
@@ -263,7 +263,7 @@ class GnssCode(RangeConstraint):
             offset=found.known - raw.code - raw.clock - (raw.difference if raw.differenced else 0.0),
             nominal=found.nominal,
             group=group,
-            slant=obliquity(found.elevation) * (L1 / raw.frequency) ** 2,
+            slant=compute_obliquity(found.elevation) * (L1 / raw.frequency) ** 2,
             sigma=sigma[:, None],
             which=which,
             processes=processes,

@@ -34,7 +34,7 @@ from graphnav.core import rotation
 from graphnav.core.rotation import Array
 from graphnav.core.state import Parameter, States
 from graphnav.gnss.arcs import find_arcs
-from graphnav.gnss.atmosphere import obliquity
+from graphnav.gnss.atmosphere import compute_obliquity
 from graphnav.gnss.sigmas import REFLECTED, compute_carrier_difference_sigma, compute_reflection_sigma
 from graphnav.gnss.signals import GLONASS, L1, C
 from graphnav.gnss.single_point import choose_coefficients, look
@@ -123,7 +123,7 @@ class GnssPhase(RangeConstraint):
             reflected=_project(common["s_n"] - nominal, reflection, keyframe[used]),
             reflection=reflection / wavelength[used],
             period=find_epoch_period(found.raw, s),
-            slant=-obliquity(geometry.elevation) * (L1 / raw.frequency) ** 2,
+            slant=-compute_obliquity(geometry.elevation) * (L1 / raw.frequency) ** 2,
             wavelength=wavelength[used],
             sigma=compute_carrier_difference_sigma(raw.cn0, geometry.elevation, wavelength[used])[:, None],
             slot=place[arcs.slot[used]],

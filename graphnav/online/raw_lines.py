@@ -251,7 +251,7 @@ class LiveRaw(BaseModel):
         )  # fmt: skip
 
 
-def live_raw(raw: RawGnss) -> dict[str, object]:
+def describe_live_raw(raw: RawGnss) -> dict[str, object]:
     """The part of a live source's first line for a series, or for its setup."""
     setup = raw if raw.catalogue is not None else drop_epochs(raw)
     known = setup.catalogue

@@ -85,7 +85,7 @@ class Gnss:
         return {name: n for k, name in FIX_TYPES.items() if (n := int(np.count_nonzero(self.type == k)))}
 
 
-def fix_types(types: Array, numbers: dict[int, int] | None = None) -> NDArray[np.intp] | None:
+def convert_fix_types(types: Array, numbers: dict[int, int] | None = None) -> NDArray[np.intp] | None:
     """Types of fixes by the numbers of `FIX_TYPES`.
 
     Parameters

@@ -144,7 +144,7 @@ def write_report(
             "Detectors",
             [
                 *_make_gallery(detectors),
-                *tables.stop_table(solution, start, words.describe_deciding(recording, settings)),
+                *tables.tabulate_stops(solution, start, words.describe_deciding(recording, settings)),
             ],
         ),
         ("Findings", tables.list_findings(recording, findings)),
@@ -159,7 +159,7 @@ def write_report(
         *words.describe_closure(name, metrics),
         words.list_tiles(recording, only, every),
         *summary.list_links(beside),
-        *summary.fix_table(recording, solution, withheld),
+        *summary.tabulate_fixes(recording, solution, withheld),
         page.columns([summary.tabulate_sigmas(solution), summary.tabulate_separation(solution)]),
         *summary.describe_excluded(solution, start),
     ]

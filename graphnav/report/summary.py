@@ -113,7 +113,7 @@ def tabulate_sigmas(solution: Solution) -> list[Markup]:
     return [page.heading("Stated 1-sigma"), page.make_table(["of", "50 %", "95 %", "largest"], rows)] if rows else []
 
 
-def fix_table(recording: Recording, solution: Solution, withheld: Removed) -> list[Markup]:
+def tabulate_fixes(recording: Recording, solution: Solution, withheld: Removed) -> list[Markup]:
     """Fixes of each kind: number, excluded or used, longest gap, largest residual; or epochs of raw observations."""
     fixes, nan = select_fixes(recording, solution), float("nan")
     raw = tabulate_epochs(solution)

@@ -314,7 +314,7 @@ def tabulate_metrics(metrics: Mapping[str, Any] | None, name: str = "") -> list[
     return [page.fold(f"All measures{' of ' if name else ''}{name}", inner)]
 
 
-def stop_table(solution: Solution, start: float, decided_by: str) -> list[Markup]:
+def tabulate_stops(solution: Solution, start: float, decided_by: str) -> list[Markup]:
     """Every stop: the share that each detector found, the number of rows by constraint, and which detectors decide."""
     stops = list_solution_stops(solution)
     if not stops:

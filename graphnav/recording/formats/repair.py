@@ -12,7 +12,7 @@ from graphnav.core.errors import RecordingError
 from graphnav.core.notes import Note, format_count
 from graphnav.core.rotation import Array
 from graphnav.core.timescales import find_restarts
-from graphnav.recording import FIX_TYPES, fix_types
+from graphnav.recording import FIX_TYPES, convert_fix_types
 from graphnav.recording.formats.table import Selection, Table
 from graphnav.sensors.tables import TIME_UNITS, Keep
 
@@ -301,7 +301,7 @@ def parse_fix_types(rows: Table, numbers: str) -> NDArray[np.intp] | None:
         raise RecordingError(
             f"{where}: {types[bad[0]]:g} is no type of fix: {there}, blank where unknown{hint}", key="gnss.type"
         )
-    return fix_types(types, known)
+    return convert_fix_types(types, known)
 
 
 # 1-sigma of a vertical velocity that is taken as zero because a receiver gives only speed and course: a slope of 10 %
