@@ -61,7 +61,7 @@ from graphnav.recording import Recording
 Weigh = Callable[[Problem, Points], bool]
 
 _LINEAR_ATTITUDE = 0.1  # rad between linearisation point and smoothed attitude, up to which the smoother is used
-_SMOOTHINGS = 5  # of filter and smoother about what they found before; where that leads nowhere, a batch is solved
+_SMOOTHINGS = 5  # passes of filter and smoother about their previous points; without convergence a batch is solved
 _MOST_WRONG = 0.5  # share of excluded fixes, beyond which the start is wrong rather than the fixes
 
 
@@ -103,7 +103,7 @@ def prepare(
     Parameters
     ----------
     detections : where the platform stands.
-    noise : to be used as it is; estimated, or as stated if the settings say so, when None.
+    noise : used as it is; when None it is estimated, or stated, according to the settings.
     weigh : whether the evidence of a noise model that is estimated is wanted; never when None.
 
     Raises
@@ -183,7 +183,7 @@ def _find_noise(
                 built, best = later, again
             best = replace(best, passes=total)
         except EstimationError:
-            pass  # nothing moves later on
+            pass  # no motion later on
     without = builder.build_without(built, best.noise, parts=True)
     if without is not built:
         built = without
@@ -215,11 +215,10 @@ def _estimate_noise(
 def _free_contradicted(
     builder: ProblemBuilder, built: BuiltProblem, best: NoiseEstimate, progress: Progress | None
 ) -> tuple[BuiltProblem, NoiseEstimate, float]:
-    """The estimate with constants as parameters that the drive contradicts as stated, and what their priors cost in
-    evidence.
+    """The estimate with contradicted constants as parameters, and the cost of their priors in evidence.
 
-    Returns the same problem where there are none. To be asked when all else that may be wrong is known: a gyro that
-    misses a turn looks like an arm, and so do stamps that are still to be moved.
+    Returns the same problem where there are none. Tested last, once all other faults are known: a gyro that misses a
+    turn looks like a wrong lever arm, and so do stamps that are still to be moved.
     """
     problem = apply_noise(built.problem, best.noise)
     names = {CLOCK_RATE} if builder.settings.gnss.clock_rate_sigma is None else set[str]()
@@ -233,7 +232,7 @@ def _free_contradicted(
         found = _estimate_noise(other, builder.settings, progress, (best.points, problem))
         found = estimate_disturbed_intervals(other.problem, found)
         passes = passes + found.passes + Counter(filter=1)
-        # by other figures what is freed may lead to an optimum that is worse than the one with all as stated
+        # with other figures, freed constants may lead to a worse optimum than with all as stated
         cost = compute_prior_cost(problem, freed)
         if log_evidence(other.problem, found) - cost < log_evidence(built.problem, best):
             return built, replace(best, passes=passes), 0.0
@@ -282,7 +281,7 @@ def _relinearise(
             passes.update(filter=1)
             return ekf(problem, progress, aligned.until, known=smoothed), smoothed
         about = smoothed
-    from graphnav.estimation.factor_graph.batch import batch  # and GTSAM with it, which few runs of a filter need
+    from graphnav.estimation.factor_graph.batch import batch  # imports GTSAM, which few filter runs need
 
     states = smoothed.states
     if wheels:

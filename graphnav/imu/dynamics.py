@@ -40,7 +40,7 @@ _INTO = np.eye(3)[_TO]
 _I3 = np.eye(3)
 
 
-def scale_parameter(recording: Recording) -> tuple[Parameter, ...]:
+def make_scale_parameter(recording: Recording) -> tuple[Parameter, ...]:
     """Scale errors (gyro x y z, accelerometer x y z), where the noise figures leave them open.
 
     For a foot, which turns and is shaken about all axes, also the cross-axis terms: 9 and 9, the scale errors first.
