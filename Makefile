@@ -16,8 +16,9 @@ COMPILE := $(BIN)/python -c "from graphnav import load, run; run(load('data/toky
 demo: $(VENV)/installed
 	$(BIN)/graphnav compare kitti --without gnss:400-460 -o out/demo
 
-# with `make -j2` side by side: check has the core that compile leaves idle
-test: suite check
+# side by side: check has the core that compile leaves idle
+test: $(VENV)/installed-dev
+	@$(MAKE) --no-print-directory -j$(JOBS) suite check
 
 # compiled before, machine code and the tests themselves, or every worker would compile the same
 suite: compile collect

@@ -6,7 +6,7 @@ are of the thread, not of the clock on the wall; a busy machine shows in them by
 
 An update is everything that the row of the IMU sets off which makes a keyframe, until there is a new state; what is
 done beside, at rows before and after it, is told by keyframe and by the longest that a row took. `all, s` is of the
-whole process: rows that wait for nothing, and judging in its own thread, are in it.
+whole process: rows that wait for nothing, and noise estimation in its own thread, are in it.
 
     python scripts/benchmark_online.py --hours 10
 

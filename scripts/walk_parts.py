@@ -23,7 +23,7 @@ from walks import SETS
 from graphnav import load
 from graphnav.config import parse_settings
 from graphnav.estimation.pipeline import run
-from graphnav.evaluation.strides import walk_errors
+from graphnav.evaluation.strides import compute_walk_errors
 from graphnav.imu import dynamics
 from graphnav.recording import Recording
 
@@ -72,7 +72,7 @@ def replaced(parts: Mapping[str, Any]) -> Iterator[None]:
 def errors(recording: Recording, settings: Mapping[str, Any]) -> list[float]:
     """Of batch and filter over the floor, of batch in height; the stride."""
     found = run(recording, parse_settings(settings), ("ekf", "batch"))
-    filtered, batch = (walk_errors(recording, found[name]) for name in ("ekf", "batch"))
+    filtered, batch = (compute_walk_errors(recording, found[name]) for name in ("ekf", "batch"))
     return [batch.horizontal, filtered.horizontal, abs(batch.up), batch.stride]
 
 

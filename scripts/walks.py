@@ -24,7 +24,7 @@ import numpy as np
 from graphnav import load
 from graphnav.config import parse_settings
 from graphnav.estimation.pipeline import SOLVERS, run
-from graphnav.evaluation.strides import WalkErrors, estimate_floor_sigma, walk_errors
+from graphnav.evaluation.strides import WalkErrors, compute_walk_errors, estimate_floor_sigma
 from graphnav.recording import Recording
 
 # m: how far a coordinate of the truth may be off. None: measured. Points taken by hand where the shoe stood, of a place
@@ -90,11 +90,11 @@ def one(path: Path, plain: float, stated: float | None, before: Before | None) -
         spent = spent or time.process_time() - began
         truth_sigma = estimate_floor_sigma(recording, solutions["batch"]) if stated is None else stated
         for solver, solution in solutions.items():
-            found[case, solver] = walk_errors(recording, solution, truth_sigma)
+            found[case, solver] = compute_walk_errors(recording, solution, truth_sigma)
     horizontal = [found[case, solver].horizontal for case in CASES for solver in SOLVERS]
     b = found["without", "batch"]
     chained = run(recording, parse_settings(known_bias(recording, before)), ("batch",))["batch"]
-    helped = walk_errors(recording, chained, truth_sigma).horizontal
+    helped = compute_walk_errors(recording, chained, truth_sigma).horizontal
     R = recording.imu.R_bs
     now = Before(recording.name[:-9], R.T @ chained.states.bg[-1], R.T @ chained.covariance[-1][12:15, 12:15] @ R)
     rate = 60.0 * spent / recording.duration

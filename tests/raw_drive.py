@@ -12,7 +12,7 @@ from oracle_path import ExactPath
 
 from graphnav.core import earth
 from graphnav.core.rotation import Array
-from graphnav.gnss.atmosphere import NIGHT, compute_directions, klobuchar
+from graphnav.gnss.atmosphere import NIGHT, compute_directions, compute_klobuchar_delay
 from graphnav.gnss.ephemeris import OMEGA_WGS84
 from graphnav.gnss.series import RawGnss
 from graphnav.gnss.signals import L1, C, number_satellite, number_signal
@@ -85,7 +85,7 @@ def with_observations(
         inside = np.clip(t, path.t[0] + h, path.t[-1] - h)
         rate = (observe(llh_of, inside + h, above, k)[0] - observe(llh_of, inside - h, above, k)[0]) / (2.0 * h)
         azimuth, elevation = compute_directions(antenna, p)
-        delay = klobuchar(NIGHT, np.mod(t, 604800.0), llh, azimuth, elevation)
+        delay = compute_klobuchar_delay(NIGHT, np.mod(t, 604800.0), llh, azimuth, elevation)
         n, noisy = len(t), noise * rng.standard_normal(len(t))
         bias = BIAS if name[0] == "E" else 0.0
         for frequency, signal in BANDS[name[0]][: 1 + second]:

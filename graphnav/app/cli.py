@@ -61,15 +61,15 @@ __all__ = ["DEBUG", "PIPE_CLOSED", "app", "main", "run"]
 
 # before NumPy is imported; `graphnav.estimation.pipeline` limits threads for all other callers
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-# Before the settings are: looking through all that is installed for plugins of Pydantic takes as long as they do.
+# Before the settings are imported: the search for Pydantic plugins takes as long as that import.
 os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
 
-# Commands as they are met: from a log to a result, then what else there is.
+# Commands in the order of use: from a log to a result, then the others.
 _ORDER = (
     "init", "info", "smooth", "compare", "report", "evaluate", "convert", "detect", "online", "fleet", "simulate",
     "allan", "settings",
 )  # fmt: skip
-# Words of other programs for what --start and --end say.
+# Other programs' names for --start and --end.
 _SPAN_WORDS = ("window", "span", "from", "to", "begin", "stop", "duration", "crop", "trim", "time", "until")
 
 
@@ -120,7 +120,7 @@ def info(
     quiet: Quiet = False,
     json: Json = False,
 ) -> None:
-    """Check a recording: what it holds, and what is wrong with it.
+    """Check a recording: its contents, and errors in it.
 
     Clocks, units, axes and lever arms of the sensors are checked against each other.
     """
@@ -156,7 +156,7 @@ def detect(
     quiet: Quiet = False,
     json: Json = False,
 ) -> None:
-    """Find where the vehicle stands.
+    """Detect stops of the vehicle.
 
     The intervals, the statistics of each detector and a page of figures are written.
     """

@@ -97,7 +97,8 @@ def fleet(
         end,
     )
     known: dict[Any, Any] = {}
-    manifest.resolve_options(asked, known)  # so that no line of a manifest is blamed for what the command line says
+    # so that errors of the command line are not reported for a line of the manifest
+    manifest.resolve_options(asked, known)
     folder = outputs.check_output_folder(out, ("fleet.csv", "fleet.parquet", "fleet.html"), ("drives",)).resolve()
     drives = manifest.read_drives(source.resolve(), asked, allow_outside)
     tasks = [

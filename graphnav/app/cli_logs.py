@@ -184,7 +184,7 @@ def init(
     if out.suffix != ".toml":
         raise ConfigError(f"-o {out}: name a .toml file, or a folder for recording.toml", key="output.name")
     if out.exists() and not force:
-        raise ConfigError(f"-o {out}: is there already; name another file, or say --force", key="output.exists")
+        raise ConfigError(f"-o {out}: is there already; name another file, or use --force", key="output.exists")
     folder = check_output_folder(out.parent)
     name = name or (out.stem if out.stem != "recording" else None)
     with show_progress(quiet, "init"):
@@ -193,7 +193,7 @@ def init(
         for made in drafted.made:
             if (folder / made).exists() and not force:
                 raise ConfigError(
-                    f"{folder / made}: is there already; say --force to write over it", key="output.exists"
+                    f"{folder / made}: is there already; use --force to write over it", key="output.exists"
                 )
         with stage_results(folder) as part:
             for made, columns in drafted.made.items():
@@ -241,7 +241,7 @@ def simulate(
         say(describe_scenarios())
         return
     if out is None:
-        raise ConfigError("say where to write the recording: -o DIR", key="option.missing")
+        raise ConfigError("name the folder to write to: -o DIR", key="option.missing")
     folder = outputs.check_output_folder(out)
     options = parse_options(scenario, option or [])
     with show_progress(quiet, "simulate"):

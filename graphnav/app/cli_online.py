@@ -99,7 +99,7 @@ def online(
         return
     settings = choose_detectors(_override(read_settings(config, profile), lag, engine), detectors)
     if resume and out is None:
-        raise ConfigError("--resume: say which folder to go on in: -o OUT", key="option.missing")
+        raise ConfigError("--resume: name the folder to continue in: -o OUT", key="option.missing")
     folder = None if out is None else check_output_folder(out)
     recording = None if live else read(source, topic or (), allow_outside, format)
     session = Session(settings, source, folder, resume, recording)
@@ -183,19 +183,19 @@ class StopRequest:
 def follow(session: Session, chunks: Iterator[bytes | None], shown: LiveView, asked: StopRequest) -> None:
     """Process lines until the source ends or an end is requested.
 
-    b"" means that nothing arrived for a while, None that the sender is gone and its last line may be cut.
+    b"" means that nothing arrived for a while, None that the sender has disconnected and its last line may be cut.
     """
-    rest, heard = b"", time.monotonic()
+    rest, last_row = b"", time.monotonic()
     for chunk in chunks:
         if chunk is None:
-            rest = b""  # cut in its last number it would pass for a row
+            rest = b""  # a line cut within its last number would still parse as a row
         elif chunk:
             *whole, rest = (rest + chunk).split(b"\n")
             rest = rest[:LONGEST_LINE]  # a line without an end is no row, and is reported as one when it does end
             whole = [line[:LONGEST_LINE] for line in whole]
             session.add_lines([line.decode("utf-8", "replace") for line in whole], asked.__bool__)
-            heard = time.monotonic()
-        shown.update_if_due(time.monotonic() - heard)
+            last_row = time.monotonic()
+        shown.update_if_due(time.monotonic() - last_row)
         if session.done or asked:
             return
 

@@ -19,7 +19,7 @@ SourceArgument = Annotated[
         metavar="RECORDING", help="A folder with recording.toml, a .toml, a known log, or kitti (in the gtsam package)."
     ),
 ]
-SEVERAL = {"allow_extra_args": True}  # `pick_one` reports it more clearly than the parser
+SEVERAL = {"allow_extra_args": True}  # `pick_one` reports several more clearly than the parser
 FormatOption = Annotated[
     str | None, typer.Option("--format", metavar="NAME", help="Format of the log, where it is not recognised.")
 ]

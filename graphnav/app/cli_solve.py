@@ -154,7 +154,7 @@ def compare(
     for option, values in (("--against-point", beside.points), ("--against-shift", beside.shifts)):
         if values and len(values) != len(beside.files):
             raise ConfigError(
-                f"{option} {values[-1]}: say one for each of the {len(beside.files)} files of --against",
+                f"{option} {values[-1]}: give one for each of the {len(beside.files)} files of --against",
                 key="option.count",
             )
     _solve_and_write(asked, choose_solvers(context, solvers), False, export, point, beside, loose)
@@ -277,7 +277,7 @@ def _solve_and_write(
         files = resolve_final_path(files, part, folder)
         if not asked.pages:
             outputs.remove_pages(folder, () if alone else names)
-        if exported:  # in its own right, so that a failing file does not prevent the others
+        if exported:  # separately, so that a failing file does not prevent the others
             with stage_results(folder) as part:
                 more = convert.export_run(outcome, part, exported, point, alone)
             files += resolve_final_path(more, part, folder)

@@ -77,7 +77,7 @@ def convert_log(
         files = write_recording(log, part)
         described = out / "recording.toml"
         if not force and described.exists() and described.read_bytes() != (part / described.name).read_bytes():
-            raise ConfigError(f"{described}: is another recording's; say --force to write over it", key="output.exists")
+            raise ConfigError(f"{described}: is another recording's; use --force to write over it", key="output.exists")
     return log, resolve_final_path(files, part, out)
 
 
@@ -160,7 +160,7 @@ def export_file(
         stated = run.get("antenna_lever_arm")
         if stated is None:
             raise ConfigError(
-                f"--point antenna: no {SUMMARY} beside {file.name} says where it is; say x,y,z", key="option.point"
+                f"--point antenna: no {SUMMARY} beside {file.name} says where it is; give x,y,z", key="option.point"
             )
         arm = np.array(stated, dtype=float)
     gps_zero = run.get("gps_zero")
@@ -234,7 +234,7 @@ def _interpolate_parts(trajectory: Trajectory, arm: Array | None, rate: float | 
         if len(moved):
             yield moved
     if not found:
-        raise ConfigError(f"--rate {rate:g}: leaves no row of this trajectory; say a higher one", key="output.no_row")
+        raise ConfigError(f"--rate {rate:g}: leaves no row of this trajectory; give a higher one", key="output.no_row")
 
 
 def export_run(

@@ -55,7 +55,7 @@ def check_output_folder(path: str | Path, files: Sequence[str] = (), folders: Se
         there = there.parent
     broken = next((place for place in (folder, *folder.parents) if place.is_symlink() and not place.exists()), None)
     if broken is not None:
-        raise ConfigError(f"-o {folder}: {broken} is a link to nothing", key="output.cannot_write")
+        raise ConfigError(f"-o {folder}: {broken} is a broken link", key="output.cannot_write")
     if not there.is_dir():
         what = "is a file; name a folder to write into" if there == folder else f"cannot be made, {there} is a file"
         raise ConfigError(f"-o {folder}: {what}", key="output.cannot_write")
@@ -195,7 +195,7 @@ def write_solver(
     Returns
     -------
     dict
-        What could not be written, and why: a picture that fails takes no number with it.
+        What could not be written, and why: a failing picture does not prevent the numbers.
     """
     from graphnav.recording.exporters import write_parts
 

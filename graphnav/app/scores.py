@@ -59,7 +59,7 @@ def score(
     gnss_withheld = any(source == "gnss" for source, _ in withheld)
     if truth is not None and truth.closed_loop_sigma is not None:
         if any("closed_loop" in solution.records for solution in select_own(solutions).values()):
-            return {}, None, ()  # data that was used is no truth
+            return {}, None, ()  # data that was used cannot be the truth
         against, spans = "the start, where the loop ends", []
     elif truth is not None:
         against = "the recording's truth"

@@ -40,7 +40,7 @@ def summarise_solver(
         nees = {key: value for key, value in errors.items() if key.startswith("nees_")}
         errors = {key: value for key, value in errors.items() if key not in nees}
     doubts = list_doubts({name: solution}, {} if metrics is None or metrics.errors is None else {name: metrics.errors})
-    contradicted = find_departures(outcome.solutions).get(name)  # which no solution tells by itself
+    contradicted = find_departures(outcome.solutions).get(name)  # which no solution holds by itself
     doubts = doubts if contradicted is None else (contradicted, *doubts)
     timings = {**solution.timings, "evaluation": outcome.timings["evaluation"], **seconds}
     unreliable = [Finding("unreliable", doubt, get_key(doubt)) for doubt in doubts]

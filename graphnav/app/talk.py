@@ -1,4 +1,4 @@
-"""Output of the program: for people, for programs, or none; progress; one line for an error."""
+"""Console output: text, JSON or none; progress; one line for an error."""
 
 from __future__ import annotations
 
@@ -55,8 +55,8 @@ def show_progress(quiet: bool, *work: str) -> Iterator[Progress | None]:
 
 @contextmanager
 def pause_collector() -> Iterator[None]:
-    """Without a search for garbage in this context, nor later in what is there then: modules stay, and looking through
-    them again and again takes a fifth of the time of importing them.
+    """Disable garbage collection in this context, and freeze what exists at its end: modules are permanent, and
+    scanning them repeatedly takes a fifth of the time of importing them.
     """
     searched = gc.isenabled()
     gc.disable()

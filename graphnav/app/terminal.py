@@ -47,7 +47,7 @@ def run_text(outcome: Outcome, files: Sequence[Path]) -> str:
     severity = {f.sentence: f.severity for f in outcome.checks}
     for note in dict.fromkeys([*outcome.findings, *notes]):
         if get_key(note) in TABULATED or note in outcome.defects:
-            continue  # what makes a result unreliable is said first
+            continue  # unreliable findings come first
         lines.append(f"  {severity.get(note, 'note')}: {note}")
     lines.append("")
     lines += _tabulate_errors(outcome)

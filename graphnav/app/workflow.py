@@ -96,7 +96,7 @@ class Outcome:
 
     @property
     def defects(self) -> tuple[str, ...]:
-        """What makes the results wrong altogether, whatever their sigmas say."""
+        """Findings that make the results wrong, whatever their sigmas."""
         return tuple(Note(f.key, f.sentence) for f in self.checks if f.severity == "unreliable")
 
     @property
@@ -127,7 +127,7 @@ def parse_withheld(text: str) -> Withheld:
     if re.fullmatch(r"[\d.]+-[\d.]+", text.strip()):
         first, *others = list_sources()
         words = f"{first}:{text.strip()}, or the same of {' or '.join(others)}"
-        raise ConfigError(f"--without {text}: say of which sensor: {words}", key="option.withheld")
+        raise ConfigError(f"--without {text}: name the sensor: {words}", key="option.withheld")
     usage = "write SOURCE or SOURCE:FROM-TO in seconds from the start, such as gnss:600-660"
     if found is None:
         raise ConfigError(f"--without {text}: not a source and a span; {usage}", key="option.withheld")
@@ -252,7 +252,8 @@ def _solve_request(request: Request, progress: Progress | None) -> Outcome:
         from graphnav.estimation.antenna import find_wrong_arms
 
         arms = find_wrong_arms(used, checks)
-        if any(LEVER_ARM in one.noise.freed for one in select_own(solutions).values()):  # it is not used as stated
+        # the stated lever arm is not used
+        if any(LEVER_ARM in one.noise.freed for one in select_own(solutions).values()):
             arms = [f for f in arms if not f.key.startswith("gnss.")]
         checks = (*arms, *checks)
         findings = [*(f.sentence for f in checks), *findings]
@@ -271,7 +272,7 @@ def _mitigate(findings: tuple[Finding, ...], solutions: Mapping[str, Solution]) 
 
 
 def _name_cause(error: EstimationError, findings: Sequence[Finding]) -> EstimationError:
-    """The error with the gravest of what the checks found, which may be why."""
+    """The error with the gravest finding of the checks, as its likely cause."""
     grave = [f.sentence for f in findings if f.severity != "note"]
     return EstimationError(f"{error}; the likely cause: {grave[0]}", key=error.key) if grave else error
 

@@ -62,7 +62,7 @@ class FusionSettings(Section):
     bridge: float = Field(
         30.0, ge=0, description="s, the longest disturbance that is bridged where the force integrates to no motion"
     )
-    bridge_speed: float = Field(0.1, gt=0, description="m/s, of that integral above which the vehicle did move")
+    bridge_speed: float = Field(0.1, gt=0, description="m/s, of that integral, above which the vehicle has moved")
     max_speed: float = Field(0.15, gt=0, description="m/s, of a measured speed that is not yet motion")
     odometer_delay: float = Field(0.7, ge=0, description="s, by which an odometer may be late")
 
@@ -78,7 +78,7 @@ class DetectorSettings(Section):
     """Detection of when the vehicle is stationary."""
 
     fire: tuple[DetectorName, ...] = Field(
-        (FUSED,), min_length=1, description="who decides: fused, or names of detectors, each of which then suffices"
+        (FUSED,), min_length=1, description="detectors that decide: fused, or names, any one of which then suffices"
     )
     low_band_glrt: LowBandSettings = LowBandSettings()
     glrt: GlrtSettings = GlrtSettings()

@@ -14,7 +14,7 @@ class GnssSettings(Outliers):
     velocity: bool = Field(True, description="use the velocities where there are any")
     faults: Switch = Field(
         "automatic",
-        description="find fixes, and spans of fixes, that are wrong, and leave them out: off, on, automatic",
+        description="fault detection and exclusion of fixes and spans of fixes: off, on, automatic",
     )
     lever_arm_sigma: float | None = Field(
         None,
@@ -27,7 +27,7 @@ class GnssSettings(Outliers):
         description="s, correlation times of what changes over minutes and over hours in a position's error",
     )
     time_offset_sigma: float = Field(
-        0.02, ge=0, description="s, 1-sigma of what the stamps of the fixes may be off; 0 = exact, not estimated"
+        0.02, ge=0, description="s, 1-sigma of the offset of the fixes' stamps; 0 = exact, not estimated"
     )
     clock_rate_sigma: float | None = Field(
         None,

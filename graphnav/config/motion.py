@@ -35,7 +35,7 @@ class VehicleSettings(Outliers):
     mounting_sigma: float = Field(6.0, ge=0, description="deg, 1-sigma of those; 0 = exact, not estimated")
     mounting_walk: float = Field(0.05, ge=0, description="deg, 1-sigma change in a minute: load, wind, road crown")
     axle_sigma: float = Field(
-        0.3, ge=0, description="m, 1-sigma of where along the vehicle the point lies that does not slip"
+        0.3, ge=0, description="m, 1-sigma of the forward position of the point that does not slip"
     )
     unstated_axle_sigma: float = Field(1.5, ge=0, description="m, the same where no odometer lever arm is given")
     body_sigma: float = Field(
@@ -59,7 +59,7 @@ class FootSettings(Outliers):
     pivot_sigma: float = Field(0.1, gt=0, description="m, 1-sigma of the pivot's place about the IMU, estimated")
     travel_sigma: float = Field(0.1, gt=0, description="m, 1-sigma of how far it travels either way, estimated")
     pattern: float = Field(
-        0.02, ge=0, description="m/s, 1-sigma of the velocity that comes back in every stance, estimated; 0: without"
+        0.02, ge=0, description="m/s, 1-sigma of a velocity pattern that repeats in every stance, estimated; 0: without"
     )
     half_stance: float = Field(0.2, gt=0, description="s after landing and before leaving in which the pivot travels")
     lateral: bool = Field(False, description="no sideways speed in swing")

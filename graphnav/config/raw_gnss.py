@@ -11,7 +11,7 @@ from graphnav.config.outliers import Outliers
 
 
 class RawGnssSettings(Outliers):
-    """How codes and Doppler shifts are used."""
+    """Use of raw GNSS observations: codes, Doppler shifts and carrier phases."""
 
     coupling: Literal["automatic", "tight", "loose"] = Field(
         "automatic",
@@ -21,7 +21,7 @@ class RawGnssSettings(Outliers):
     code: bool = Field(True, description="use the codes")
     doppler: bool = Field(True, description="use the Doppler shifts")
     differences: bool = Field(
-        True, description="use what the carriers change by from epoch to epoch, where they have no ambiguities"
+        True, description="use time-differenced carrier phases, where their ambiguities are not estimated"
     )
     ppp: bool = Field(
         False,
@@ -29,11 +29,11 @@ class RawGnssSettings(Outliers):
         "place of single codes and changes of carriers",
     )
     carrier: bool = Field(
-        True, description="use the carriers, with their ambiguities, where the recording has a base station"
+        True, description="use carrier phases with ambiguities, where the recording has a base station"
     )
-    integers: bool = Field(True, description="find the ambiguities as integers; without, they stay real numbers")
+    integers: bool = Field(True, description="fix ambiguities to integers; without, they remain float")
     elevation: float = Field(10.0, ge=0, lt=90, description="deg, below which satellites are not used")
-    cn0: float = Field(30.0, ge=0, description="dB-Hz, below which signals are not used: most are reflections")
+    cn0: float = Field(30.0, ge=0, description="dB-Hz, below which signals are not used: most are multipath")
     period: float = Field(1.0, ge=0, description="s between the epochs that are used, at least; 0 = all")
     bias_sigma: float = Field(
         30.0, gt=0, description="m, 1-sigma of the bias of another system's signals against the first's"

@@ -38,9 +38,9 @@ class KeyframeSettings(Section):
 class AlignmentSettings(Section):
     """Initial attitude."""
 
-    window: float = Field(30.0, gt=1, description="s of motion used to find the first attitude")
+    window: float = Field(30.0, gt=1, description="s of motion used for the initial attitude")
     prior_inflation: float = Field(
-        5.0, ge=1, description="how many times wider than its own sigma the alignment enters as a prior"
+        5.0, ge=1, description="factor on the alignment's own sigma for the prior of the first state"
     )
     heading: float | None = Field(None, ge=-360, le=360, description="deg, a start heading that is known")
     heading_sigma: float = Field(10.0, gt=0, description="deg, 1-sigma of the known start heading")
@@ -55,10 +55,10 @@ class ImuSettings(Section):
     """Use of the IMU."""
 
     coning: bool = Field(
-        True, description="of a foot: rows are plain means; false for a unit that makes up for coning and sculling"
+        True, description="of a foot: rows are plain means; false for a unit that compensates coning and sculling"
     )
     onboard_offset: bool = Field(
-        True, description="of a foot: where rests show that the unit corrected its gyro's offset in them, undo it"
+        True, description="of a foot: undo the unit's own gyro offset correction where the rests show one"
     )
 
 
@@ -85,7 +85,7 @@ class SolverSettings(Section):
     )
     isam2_lag: float = Field(0.0, ge=0, description="s as `lag`, of the solver isam2; 0 smooths the whole drive")
     engine: Literal["window", "isam2"] = Field(
-        "window", description="what smooths online: the window's own elimination, or GTSAM's iSAM2 with the same lag"
+        "window", description="online smoother: graphnav's own fixed-lag window, or GTSAM's iSAM2 with the same lag"
     )
     max_iterations: int = Field(30, ge=1, description="Levenberg-Marquardt iterations")
     tolerance: float = Field(

@@ -1,4 +1,4 @@
-"""Ambiguities of carriers as parameters: one for each signal of a satellite, which begins anew with every arc."""
+"""Carrier-phase ambiguities as parameters: one per satellite signal, reset at the start of every arc."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from graphnav.core.state import Parameter
 from graphnav.gnss.arcs import Arcs
 
 _PREFIX = "ambiguity."
-_SIGMA = 30.0  # m, 1-sigma about what the codes say: next to nothing known
+_SIGMA = 30.0  # m, prior 1-sigma about the value from the codes: uninformative
 
 
 def make_ambiguities(arcs: Arcs, guess: Array, wavelength: Array, unit: str = "cycles") -> dict[int, Parameter]:
-    """A parameter for each slot that has arcs, by slot.
+    """Make a parameter for each slot that has arcs.
 
     Parameters
     ----------
-    guess : (N,) what the codes say the ambiguities are; that of an arc's first row is taken.
+    guess : (N,) ambiguities by the codes; an arc takes that of its first row.
     wavelength : (N,) m, of the unit.
     """
     out = {}
@@ -38,5 +38,5 @@ def name_ambiguity(slot: str) -> str:
 
 
 def list_slots(parameters: Sequence[str]) -> tuple[str, ...]:
-    """The opposite of `name_ambiguity`."""
+    """Slots of parameter names: the inverse of `name_ambiguity`."""
     return tuple(name.removeprefix(_PREFIX) for name in parameters)

@@ -1,27 +1,28 @@
-"""What carriers of single satellites change by from one epoch to the next: range differences to millimetres.
+"""Time-differenced carrier phases: range changes of single satellites between epochs, to millimetres.
 
-A carrier counts cycles from an unknown number on; between two epochs without a slip that number stays and the change is
+A carrier phase is a range plus an ambiguity that is constant between two epochs without a cycle slip, so its change is
 a range change (van Graas and Soloviev 2004, "Precise velocity estimation using a stand-alone GPS receiver"). With a the
-place of the antenna at the epoch before and p_a = p + R_nb l that of now::
+antenna position at the previous epoch and p_a = p + R_nb l the current one::
 
     r = |s - p_a| - |s' - a| + w + [T - I - dt] - [m] z + (h - e_l.g) (t - t') - lambda [phi]
 
-[x] is the change of x, w that of the receiver's clock, which is anew at every epoch, z what the model of the ionosphere
-is wrong by at the zenith, the same as in the codes. g is what the atmosphere, satellites' clocks and orbits do to all
-of them together over minutes, as a velocity in east, north, up, and h what they do to one satellite for hours. Without
-h and z the sum of changes over minutes would be known to centimetres, and so would the place: directions to satellites
-turn by a hundredth in a minute, so a place a metre off changes ranges by a centimetre, and so do these errors.
+[x] is the change of x, w the change of the receiver clock (independent at every epoch), z the zenith error of the
+ionosphere model, the same parameter as for the codes, and m its mapping function. g is the drift of atmosphere and
+satellite clock and orbit errors common to all satellites, over minutes, as a velocity in east, north, up; h is that of
+a single satellite, over hours. Without h and z the sum of the changes over minutes would be stated to centimetres, and
+so would the position: directions to satellites turn by a hundredth of a radian in a minute, so a position error of a
+metre changes ranges by a centimetre, as much as these errors do.
 
-Errors of single changes are white here. What a carrier is off by at one epoch cancels in the sum of two changes, but
-reflections and the ionosphere add up like a random walk of 2 mm in the root of a second over 20 to 300 s (measured on
-ucr_riverside_20200712), which is what white changes make.
+The remaining error of a single change is modelled as white. White phase noise would cancel in the sum of two changes;
+multipath and ionosphere, however, accumulate like a random walk of 2 mm/sqrt(s) over 20 to 300 s (measured on
+ucr_riverside_20200712), which is what white changes amount to.
 
-The place a is a parameter that begins anew at every other epoch, two of them in turn, and is tied to the state of its
-own epoch by rows of its own (stochastic cloning: Roumeliotis and Burdick 2002), so that a row knows both places, both
-attitudes through the lever arm and how far each is certain, in every solver.
+The position a is a clone (stochastic cloning: Roumeliotis and Burdick 2002): a parameter that is reset at every other
+epoch, two of them alternating, and tied to the state of its own epoch by separate rows. So every solver accounts for
+both positions, both attitudes through the lever arm, and their correlation.
 
-Slips end an arc (`graphnav.gnss.arcs`), by the receiver's flags and by the other satellites of the epoch; one that
-neither tells meets the kernel, which judges it by what all other rows and the IMU say.
+Arcs end at cycle slips found by the receiver's flags or by comparison with the other satellites of the epoch
+(`graphnav.gnss.arcs`); the robust kernel handles slips that neither of them finds.
 """
 
 from __future__ import annotations
@@ -51,7 +52,7 @@ from graphnav.constraints.raw_selection import select_observations
 from graphnav.core import rotation
 from graphnav.core.rotation import Array
 from graphnav.core.state import Parameter, States
-from graphnav.gnss.atmosphere import obliquity
+from graphnav.gnss.atmosphere import compute_obliquity
 from graphnav.gnss.carrier import number_epochs, pair_consecutive
 from graphnav.gnss.series import compute_epoch_medians
 from graphnav.gnss.sigmas import compute_carrier_sigma
@@ -62,24 +63,24 @@ CHANGE = "receiver_clock_change"
 CLONES = ("gnss_antenna_of_even_epochs", "gnss_antenna_of_odd_epochs")
 DRIFT = "gnss_carrier_drift"
 RATES = "gnss_satellite_rates"
-_CHANGE_SIGMA = 100.0  # m, about the median over the satellites at places that may be that far off
-_ANYWHERE = 1e3  # m, 1-sigma of an antenna's place before its tie: nothing known
-_TIE = 5e-4  # m, a tenth of what a carrier's change is good to
-# m/s, 1-sigma, of the ionosphere and broadcast clocks: Klobuchar's delay goes from 1.5 to 10 m in six hours
+_CHANGE_SIGMA = 100.0  # m, about the median over the satellites, computed at positions with errors of this size
+_ANYWHERE = 1e3  # m, prior 1-sigma of a cloned antenna position: uninformative
+_TIE = 5e-4  # m, 1-sigma of a tie: a tenth of that of a carrier-phase change
+# m/s, 1-sigma of the drift by ionosphere and broadcast clocks: Klobuchar's delay rises from 1.5 to 10 m in six hours
 _DRIFT = np.array([5e-4, 5e-4, 1e-3])
 
 
 @dataclass(frozen=True)
 class CarrierPairs:
-    """Rows of one satellite and signal at two epochs next to each other, made once for a scene."""
+    """Pairs of rows of one satellite and signal at successive epochs, computed once per scene."""
 
-    before: NDArray[np.intp]  # (N,) of the prepared rows
+    before: NDArray[np.intp]  # (N,) indices into the prepared rows
     after: NDArray[np.intp]
-    number: NDArray[np.intp]  # (E,) of the epochs, -1 for one that changes are not counted to
+    number: NDArray[np.intp]  # (E,) number of each epoch, -1 for epochs that are not differenced
     epochs: Array  # (E,) s
-    first: NDArray[np.intp]  # (E,) a prepared row of each epoch
-    change: Array  # (N,) m, all that does not depend on the estimate
-    clock: Array  # (E,) m, of the receiver since the epoch before, roughly
+    first: NDArray[np.intp]  # (E,) index of a prepared row of each epoch
+    change: Array  # (N,) m, the part that does not depend on the estimate
+    clock: Array  # (E,) m, approximate receiver clock change since the previous epoch
 
 
 def _list_epochs(recording: Recording, settings: Settings) -> Array:
@@ -88,7 +89,7 @@ def _list_epochs(recording: Recording, settings: Settings) -> Array:
 
 
 def _use_differences(recording: Recording, settings: Settings) -> bool:
-    """Not where the carriers are used with their ambiguities: both kinds of rows are of the same numbers."""
+    """Whether changes are used: not beside ambiguities, for both kinds of rows come from the same observations."""
     s, raw = settings.raw_gnss, recording.raw_gnss
     if raw is None or not s.differences:
         return False
@@ -107,12 +108,12 @@ def pair_rows(scene: BuildContext) -> tuple[PreparedRows, CarrierPairs] | None:
     if not len(after) and raw.catalogue is None:
         return None
     epochs, first, of = np.unique(raw.t, return_index=True, return_inverse=True)
-    # of a phase the ionosphere's delay is negative
+    # the ionosphere advances the carrier phase
     level = found.known - 2.0 * found.ionosphere - raw.clock - raw.carrier * C / raw.frequency
     change = level[after] - level[before]
     clock = np.zeros(len(epochs))
     clock[of[after]] = -compute_epoch_medians(raw.t[after], change)
-    some = found.keyframe[after] >= 0  # of a piece, changes to the epoch before it are there already
+    some = found.keyframe[after] >= 0  # in a piece, changes at earlier epochs are in use already
     number = number_epochs(raw)[first]
     return found, CarrierPairs(before[some], after[some], number, epochs, first, change[some], clock)
 
@@ -121,7 +122,7 @@ def _clone_antennas(found: PreparedRows, pairs: CarrierPairs) -> tuple[Parameter
     out = []
     for k, name in enumerate(CLONES):
         own = np.flatnonzero((pairs.number >= 0) & (pairs.number % 2 == k))
-        own = own if len(own) else np.zeros(1, dtype=int)  # a piece may have none: any begin will do
+        own = own if len(own) else np.zeros(1, dtype=int)  # a piece may have none: any start serves
         sigma = np.full((len(own), 3), _ANYWHERE)
         out.append(Parameter(name, found.nominal[pairs.first[own]], sigma, "m", begins=pairs.epochs[own]))
     return tuple(out)
@@ -129,14 +130,14 @@ def _clone_antennas(found: PreparedRows, pairs: CarrierPairs) -> tuple[Parameter
 
 @dataclass(frozen=True)
 class GnssAntennaClone(Constraint):
-    """The antenna's place at an epoch, kept for the next."""
+    """Tie of a cloned antenna position to the state of its epoch."""
 
     name: ClassVar[str] = "gnss_antenna_clone"
     axes: ClassVar[tuple[str, ...]] = ("east", "north", "up")
     unit: ClassVar[str] = "m"
 
     lever_arm: Array = field(default_factory=lambda: np.zeros(3))
-    odd: Array = field(default_factory=lambda: np.empty(0, dtype=int))  # (N,) which of `CLONES`
+    odd: Array = field(default_factory=lambda: np.empty(0, dtype=int))  # (N,) index into `CLONES`
 
     @classmethod
     def epochs(cls, recording: Recording, settings: Settings, stationary: Array) -> Array:
@@ -178,19 +179,19 @@ class GnssAntennaClone(Constraint):
 
 @dataclass(frozen=True)
 class GnssCarrier(SatelliteConstraint):
-    """A satellite's carrier has counted on since the epoch before."""
+    """Change of a satellite's carrier phase since the previous epoch."""
 
     name: ClassVar[str] = "gnss_carrier"
     unit: ClassVar[str] = "m"
 
-    change: Array = field(default_factory=lambda: np.empty(0))  # (N,) m, all that does not depend on the estimate
+    change: Array = field(default_factory=lambda: np.empty(0))  # (N,) m, the part that does not depend on the estimate
     nominal: Array = field(default_factory=lambda: np.empty((0, 3)))  # (N, 3) m, antenna
-    s_before: Array = field(default_factory=lambda: np.empty((0, 3)))  # (N, 3) m, satellite at the epoch before
+    s_before: Array = field(default_factory=lambda: np.empty((0, 3)))  # (N, 3) m, satellite at the previous epoch
     nominal_before: Array = field(default_factory=lambda: np.empty((0, 3)))
-    time: Array = field(default_factory=lambda: np.empty(0))  # (N,) s since the epoch before
-    odd: Array = field(default_factory=lambda: np.empty(0, dtype=int))  # (N,) which of `CLONES` is of that epoch
-    which: Array = field(default_factory=lambda: np.empty(0, dtype=int))  # (N,) satellite, in the order of their rates
-    slant: Array = field(default_factory=lambda: np.empty(0))  # (N,) change of the ionosphere's delay over the zenith's
+    time: Array = field(default_factory=lambda: np.empty(0))  # (N,) s since the previous epoch
+    odd: Array = field(default_factory=lambda: np.empty(0, dtype=int))  # (N,) index into `CLONES`, of that epoch
+    which: Array = field(default_factory=lambda: np.empty(0, dtype=int))  # (N,) satellite, index into their rates
+    slant: Array = field(default_factory=lambda: np.empty(0))  # (N,) change of the ionospheric mapping function
 
     @classmethod
     def epochs(cls, recording: Recording, settings: Settings, stationary: Array) -> Array:
@@ -207,7 +208,7 @@ class GnssCarrier(SatelliteConstraint):
             return None
         common: dict[str, Any] = list_common_fields(scene, found)
         common |= {name: common[name][k] for name in PER_ROW}
-        if scene.settings.raw_gnss.robust == "automatic":  # a slip is no error that a variance can describe
+        if scene.settings.raw_gnss.robust == "automatic":  # a cycle slip is not an error that a variance can describe
             common["robust"] = "cauchy"
         E = len(pairs.epochs)
         satellites, which = raw.take(k).satellites
@@ -215,15 +216,15 @@ class GnssCarrier(SatelliteConstraint):
         minutes, hours = scene.settings.gnss.slow_times
         common["parameters"] = (
             Parameter(CHANGE, pairs.clock[:, None], np.full((E, 1), _CHANGE_SIGMA), "m", begins=pairs.epochs),
-            # what has a size and a correlation time changes by the one in the other
+            # a Gauss-Markov error changes by about its sigma within its correlation time
             Parameter(
                 RATES, np.zeros(many), np.full(many, ONE / hours), "m/s", correlation_time=hours, spacing=found.spacing
             ),
             make_ionosphere_parameter(raw, found.spacing),
             *_clone_antennas(found, pairs),
         )
-        # of a phase the delay is negative; against a base the parameter is what lies between the two receivers
-        delay = -obliquity(found.elevation) * (0.0 if raw.differenced else (L1 / raw.frequency) ** 2)
+        # a phase is advanced, not delayed; against a base the parameter is the difference between the two receivers
+        delay = -compute_obliquity(found.elevation) * (0.0 if raw.differenced else (L1 / raw.frequency) ** 2)
         drift = Parameter(
             DRIFT, np.zeros(3), _DRIFT, "m/s", correlation_time=minutes, spacing=found.spacing,
             noise_groups=tuple(f"{cls.name}.minutes.{axis}" for axis in AXES),

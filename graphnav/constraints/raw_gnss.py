@@ -1,4 +1,4 @@
-"""Codes and Doppler shifts of single satellites, at an antenna at a lever arm from the IMU.
+"""Codes and Doppler shifts of single satellites, for an antenna at a lever arm from the IMU.
 
 With p_a = p + R_nb l the antenna, e the unit vector from it to the satellite s in the Earth-fixed frame of the
 reception, and u = v + R_nb (omega_nb x l) its velocity (Groves 2013, sections 8.4.1, 9.4.1 and 14.1.2)::
@@ -6,19 +6,19 @@ reception, and u = v + R_nb (omega_nb x l) its velocity (Groves 2013, sections 8
     r_code    = |s - p_a| + b + b_s + m z + I + T - dt - e_l.c + q - P
     r_doppler = e.(v_s - u) / k + b' - dt' - e_l.d - D
 
-b and b' are the receiver's clock and its drift, which begin anew at every epoch; b_s is the bias of the signals of
-another system, z what the model of the ionosphere is wrong by at the zenith and m how that grows towards the horizon; k
-comes of the flight time (`gnss.single_point.compute_stretch`). What lasts of the errors: c of all satellites together,
-as a shift of the antenna in east, north, up, for seconds and minutes, reflections and what a receiver's smoothing of
-its codes leaves, and for hours; d for seconds the same of velocities; q for hours of the one satellite, orbit, clock
-and the atmosphere towards it. How large c and q are for hours is stated: a drive does not tell them from its place.
-The rest the noise model estimates.
+b and b' are receiver clock and drift, independent at every epoch; b_s is the inter-system (inter-signal) bias, z the
+zenith error of the ionosphere model and m its mapping function; k accounts for the change of the flight time
+(`gnss.single_point.compute_stretch`). Time-correlated errors are c, common to all satellites and expressed as a shift
+of the antenna in east, north, up: over seconds and minutes multipath and the receiver's code smoothing, and a part
+over hours; d, the same for velocities over seconds; and q, of one satellite over hours: orbit, clock and atmosphere
+along its line of sight. The sizes of c and q over hours are stated, because a drive does not separate them from its
+position; the noise model estimates the others.
 
-Against a base station both kinds of ranges have - h sin(elevation) as well: signals are received at the antennas' phase
-centres, and h is by how much more the rover's is above the point that its lever arm states than the base's above its
-position. A drive does not tell it from its height.
+Against a base station ranges also have the term - h sin(elevation): signals are received at the antennas' phase
+centres, and h is the height of the rover's phase centre above the point given by its lever arm, less that of the base's
+above its stated position. A drive does not separate it from its height.
 
-Distances are differences against a nominal place of each epoch, so that no digits are lost.
+Ranges are computed as differences against a nominal position of each epoch, which keeps their precision.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from graphnav.core import rotation
 from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.core.state import SECONDS, Parameter, States
-from graphnav.gnss.atmosphere import obliquity
+from graphnav.gnss.atmosphere import compute_obliquity
 from graphnav.gnss.series import RawGnss
 from graphnav.gnss.sigmas import compute_code_sigma, compute_rate_sigma
 from graphnav.gnss.signals import L1, SYSTEM_NAMES, C, name_satellite, name_signal
@@ -51,25 +51,26 @@ PHASE_CENTRES = "gnss_phase_centres"
 CODE_ERRORS = tuple(f"gnss_code_error_of_{time}" for time in TIMES)
 SATELLITES = "gnss_satellite_errors"
 RATE_ERROR = "gnss_doppler_error"
-_ZENITH = 1.5  # m, 1-sigma of what the model of the ionosphere is wrong by: half of the delay on an ordinary day
-# unit/sqrt(s), of what changes over hours. Even a lever arm walks, by a centimetre in three hours: all that rows depend
-# on beside states and clocks has its nodes in common then, one variable of the graph
+_ZENITH = 1.5  # m, 1-sigma of the zenith error of the ionosphere model: half of the delay on an ordinary day
+# unit/sqrt(s), random walks over hours. The lever arm has one as well, of a centimetre in three hours, so that all
+# parameters of the rows except states and clocks share their nodes and form one variable of the graph
 _ZENITH_WALK, _BIAS_WALK, _LEVER_WALK = 0.01, 0.003, 1e-4
 AXES = ("horizontal", "horizontal", "up")
-# m, 1-sigma of what lasts for hours, which a drive does not tell from its place: of all satellites, as a shift of the
-# place, and of one satellite. Sideways it is the gradient of the ionosphere, a metre. Upwards the ionosphere has a
-# parameter, its zenith delay; models of the troposphere leave decimetres in heights (Remote Sensing 13, 2021, 1202)
+# m, 1-sigma of errors over hours, which a drive does not separate from its position: common to all satellites, as a
+# shift of the position, and of one satellite. Horizontally it is the ionosphere's gradient, a metre. Vertically the
+# ionosphere has its own parameter, and troposphere models leave decimetres (Remote Sensing 13, 2021, 1202)
 _HOURS, ONE = np.array([1.0, 1.0, 0.5]), 0.7
-_ERROR = np.array([1.0, 1.0, 2.0])  # m, unit of what lasts for seconds and minutes
-_DIFFERENCED = 0.1  # of what lasts for hours, against a base station
-# m, 1-sigma of one antenna less another: calibrated models have their phase centres on L1 7 cm above their reference
-# points, with a standard deviation of 2.5 cm (National Geodetic Survey, absolute calibrations)
+_ERROR = np.array([1.0, 1.0, 2.0])  # m, unit of the errors over seconds and minutes
+_DIFFERENCED = 0.1  # factor on the errors over hours against a base station
+# m, 1-sigma of the difference of two antennas: calibrated models have their phase centres on L1 7 cm above their
+# reference points, with a standard deviation of 2.5 cm (National Geodetic Survey, absolute calibrations)
 _PHASE_CENTRES, _CENTRES_WALK = 0.035, 1e-5
-_GRADIENT = 2e-6  # of the zenith's delay over the distance to a base station, on an ordinary day (Odijk 2002)
+_GRADIENT = 2e-6  # zenith delay difference per distance to a base station, on an ordinary day (Odijk 2002)
 _RATE_ERROR = np.array([0.05, 0.05, 0.1])  # m/s
-_LEVELS = (45.0, 40.0, 35.0)  # dB-Hz, between the classes of signals that have a variance factor of their own
+_LEVELS = (45.0, 40.0, 35.0)  # dB-Hz, limits of the classes of signals, each with its own variance factor
 _CLASSES = ("strong", "fair", "weak", "faint")
-PER_ROW = ("keyframe", "s_n", "R_ln", "satellite", "azimuth", "elevation", "level")  # of the fields that are shared
+# shared fields with one entry per row
+PER_ROW = ("keyframe", "s_n", "R_ln", "satellite", "azimuth", "elevation", "level")
 
 
 def list_common_fields(scene: BuildContext, found: PreparedRows) -> dict[str, Any]:
@@ -104,7 +105,7 @@ def list_common_fields(scene: BuildContext, found: PreparedRows) -> dict[str, An
 
 
 def make_ionosphere_parameter(raw: RawGnss, spacing: float) -> Parameter:
-    """What the ionosphere's model is wrong by at the zenith; against a base station, between the two."""
+    """Zenith error of the ionosphere model; against a base station, its difference between the two."""
     sigma = max(_GRADIENT * raw.baseline, 1e-3) if raw.differenced else _ZENITH
     return Parameter(IONOSPHERE, np.zeros(1), np.full(1, sigma), "m", sigma / _ZENITH * _ZENITH_WALK, spacing=spacing)
 
@@ -146,7 +147,8 @@ class SatelliteConstraint(Constraint):
     def _sum_lasting_errors(
         self, parameters: dict[str, Array], names: tuple[str, ...], rows: slice | Array, e: Array
     ) -> tuple[Array | float, dict[str, Array]]:
-        """What errors that all have in common, shifts in east, north, up, do to the rows (n,), and by how much."""
+        """Effect on the rows (n,) of errors common to all satellites, as shifts in east, north, up, and its
+        derivatives."""
         there = [name for name in names if name in parameters]
         if not there:
             return 0.0, {}
@@ -156,7 +158,7 @@ class SatelliteConstraint(Constraint):
 
 
 def compute_range_change(s: Array, antenna: Array, nominal: Array) -> tuple[Array, Array]:
-    """|s - antenna| - |s - nominal| (n,) without the digits that a difference of distances loses, and directions."""
+    """|s - antenna| - |s - nominal| (n,) without cancellation of digits, and unit vectors to the satellites."""
     away, from_nominal = s - antenna, s - nominal
     moved = antenna - nominal
     distance = np.linalg.norm(away, axis=1)
@@ -165,16 +167,16 @@ def compute_range_change(s: Array, antenna: Array, nominal: Array) -> tuple[Arra
 
 
 def select_columns(values: Array, which: Array) -> tuple[Array, Array]:
-    """Of values (n, k) the one of each row's column (n,), 0 for the column -1; and the derivatives (n, 1, k)."""
+    """Select each row's column (n,) from values (n, k), 0 for column -1; and the derivatives (n, 1, k)."""
     own = which[:, None] == np.arange(values.shape[1])
     return np.sum(own * values, axis=1), own[:, None].astype(float)
 
 
 @dataclass(frozen=True)
 class RangeConstraint(SatelliteConstraint):
-    """Rows of distances to satellites."""
+    """Rows of ranges to satellites."""
 
-    offset: Array = field(default_factory=lambda: np.empty(0))  # (N,) m, all that does not depend on the estimate
+    offset: Array = field(default_factory=lambda: np.empty(0))  # (N,) m, the part that does not depend on the estimate
     nominal: Array = field(default_factory=lambda: np.empty((0, 3)))  # (N, 3) m
 
     def _linearize_ranges(
@@ -201,14 +203,14 @@ class RangeConstraint(SatelliteConstraint):
 
 @dataclass(frozen=True)
 class GnssCode(RangeConstraint):
-    """A satellite's code was received by the antenna."""
+    """Code of one satellite at the antenna."""
 
     name: ClassVar[str] = "gnss_code"
     unit: ClassVar[str] = "m"
 
-    group: Array = field(default_factory=lambda: np.empty(0, dtype=int))  # (N,) of the signals, 0 the reference
-    which: Array = field(default_factory=lambda: np.empty(0, dtype=int))  # (N,) satellite, in the order of their errors
-    slant: Array = field(default_factory=lambda: np.empty(0))  # (N,) of the ionosphere's delay over that at the zenith
+    group: Array = field(default_factory=lambda: np.empty(0, dtype=int))  # (N,) group of the signal, 0 the reference
+    which: Array = field(default_factory=lambda: np.empty(0, dtype=int))  # (N,) satellite, index into their errors
+    slant: Array = field(default_factory=lambda: np.empty(0))  # (N,) ionospheric mapping function
 
     @classmethod
     def epochs(cls, recording: Recording, settings: Settings, stationary: Array) -> Array:
@@ -261,7 +263,7 @@ class GnssCode(RangeConstraint):
             offset=found.known - raw.code - raw.clock - (raw.difference if raw.differenced else 0.0),
             nominal=found.nominal,
             group=group,
-            slant=obliquity(found.elevation) * (L1 / raw.frequency) ** 2,
+            slant=compute_obliquity(found.elevation) * (L1 / raw.frequency) ** 2,
             sigma=sigma[:, None],
             which=which,
             processes=processes,
@@ -282,7 +284,7 @@ class GnssCode(RangeConstraint):
 
 @dataclass(frozen=True)
 class GnssDoppler(SatelliteConstraint):
-    """A satellite's signal was received with a Doppler shift."""
+    """Doppler shift of one satellite's signal at the antenna."""
 
     name: ClassVar[str] = "gnss_doppler"
     unit: ClassVar[str] = "m/s"

@@ -1,20 +1,21 @@
-"""Carriers against a base station, with an ambiguity for each arc; and what is known of ambiguities as integers.
+"""Carrier phases against a base station, with an ambiguity for each arc, and integer ambiguities.
 
-With what `graphnav.constraints.raw_gnss` says of codes, and N the difference of rover's and base's ambiguity (cycles),
+With the quantities of `graphnav.constraints.raw_gnss`, and N the difference of rover's and base's ambiguity (cycles),
 
     r_phase   = |s - p_a| + b - m z + T - dt - lambda (phi - N) + e.L c - h sin(elevation)
 
-b is the same clock as that of the codes. Rows stay one for each satellite and signal rather than differences between
-satellites: sigmas are then independent, a kernel meets one satellite, and none of them is the reference. What receivers
-delay a signal by is in all ambiguities of a system's signal alike; so integers are the differences of two of them,
+b is the clock of the codes. There is one row per satellite and signal instead of double differences: sigmas are then
+independent, a robust kernel concerns a single satellite, and no satellite is a reference. Receiver phase biases are
+common to all ambiguities of one signal of a system; integers are therefore differences of two of them,
 
     r_integer = N_i - N_j - n_ij
 
-(Teunissen and Montenbruck 2017, chapters 21, 23, 26). Rows are against a base: without one there are none.
+(Teunissen and Montenbruck 2017, chapters 21, 23, 26). Rows exist only with a base station.
 
-Reflections last: residuals at right integers stay alike for ten seconds and more, and do not average out as noise does.
-L c is what they shift a place by, c a process of unit variance in the axes of n, and L L^T the covariance of an epoch's
-place where reflections alone are wrong. What of them is no shift stays in the sigma of the rows.
+Multipath is time-correlated: residuals at correct integers are correlated over ten seconds and more and do not average
+out like white noise. L c is its effect expressed as a shift of the position, with c a process of unit variance in the
+axes of n, and L L^T the covariance of an epoch's position due to multipath alone. The part of multipath that is no
+shift stays in the sigma of the rows.
 """
 
 from __future__ import annotations
@@ -33,32 +34,33 @@ from graphnav.core import rotation
 from graphnav.core.rotation import Array
 from graphnav.core.state import Parameter, States
 from graphnav.gnss.arcs import find_arcs
-from graphnav.gnss.atmosphere import obliquity
+from graphnav.gnss.atmosphere import compute_obliquity
 from graphnav.gnss.sigmas import REFLECTED, compute_carrier_difference_sigma, compute_reflection_sigma
 from graphnav.gnss.signals import GLONASS, L1, C
 from graphnav.gnss.single_point import choose_coefficients, look
 from graphnav.recording import Recording
 
 REFLECTIONS = "gnss_reflections"
-_WEAKEST = 1e-3  # of the information on a place in its best direction; where there is less, satellites do not tell
-EXACT = 1e-3  # cycles, 1-sigma of a difference that is known as an integer: a tenth of a carrier's noise
+# share of the position information in the best-observed direction; directions with less count as unobserved
+_WEAKEST = 1e-3
+EXACT = 1e-3  # cycles, 1-sigma of an ambiguity difference fixed to an integer: a tenth of the phase noise
 
 
 @dataclass(frozen=True)
 class GnssPhase(RangeConstraint):
-    """A satellite's carrier was received by the antenna, and by a base station's."""
+    """Carrier phase of one satellite at the antenna, differenced with a base station's."""
 
     name: ClassVar[str] = "gnss_phase"
     unit: ClassVar[str] = "m"
     noise_axes: ClassVar[tuple[str, ...]] = ()
 
-    slant: Array = field(default_factory=lambda: np.empty(0))  # (N,) of the ionosphere's delay over that at the zenith
+    slant: Array = field(default_factory=lambda: np.empty(0))  # (N,) ionospheric mapping function
     wavelength: Array = field(default_factory=lambda: np.empty(0))  # (N,) m
     slot: Array = field(default_factory=lambda: np.empty(0, dtype=int))  # (N,) index of `slots`
-    begin: Array = field(default_factory=lambda: np.empty(0))  # (N,) s, of the arc
-    whole: Array = field(default_factory=lambda: np.empty(0, dtype=bool))  # (N,) no half cycle is open in the arc
+    begin: Array = field(default_factory=lambda: np.empty(0))  # (N,) s, start of the arc
+    whole: Array = field(default_factory=lambda: np.empty(0, dtype=bool))  # (N,) no unresolved half cycle in the arc
     reflected: Array = field(default_factory=lambda: np.empty((0, 3)))  # (N, 3) m, e.L
-    reflection: Array = field(default_factory=lambda: np.empty(0))  # (N,) cycles, 1-sigma of what lasts of an arc
+    reflection: Array = field(default_factory=lambda: np.empty(0))  # (N,) cycles, 1-sigma of an arc's mean multipath
     period: float = 1.0  # s between epochs
     slots: tuple[str, ...] = ()  # names of the ambiguities
     group: Array = field(default_factory=lambda: np.empty(0, dtype=int))  # (slots,) system and signal; -1: no integers
@@ -78,7 +80,7 @@ class GnssPhase(RangeConstraint):
             return None
         arcs = find_arcs(raw, base_arc=raw.base_arc)
         keyframe = scene.find_keyframes(raw.t)
-        # the epochs of the codes, whose clocks these are; all signals of a satellite
+        # the codes' epochs, with which the clocks are shared; all signals of a satellite
         used = (arcs.arc >= 0) & ~(raw.cn0 < s.cn0) & np.isin(keyframe, found.keyframe)
         used &= (raw.t >= scene.t[0] - SAME_TIME) & (raw.t <= scene.t[-1] + SAME_TIME)
         geometry = look(raw, raw.antenna, choose_coefficients(raw))
@@ -93,12 +95,12 @@ class GnssPhase(RangeConstraint):
         place = np.full(len(arcs.names), -1)
         place[there] = np.arange(len(there))
         group = arcs.satellite[there].astype(int) // 100 * 1000 + arcs.signal[there]
-        group[arcs.satellite[there] // 100 == GLONASS] = -1  # each satellite has a frequency of its own
+        group[arcs.satellite[there] // 100 == GLONASS] = -1  # FDMA: each satellite has its own frequency
         frame, raw = scene.frame, raw.take(used)
         geometry = look(raw, raw.antenna, choose_coefficients(raw))
         common = list_common_fields(scene, found)
         if s.robust == "automatic":
-            common["robust"] = "cauchy"  # for slips that nothing has told of
+            common["robust"] = "cauchy"  # for undetected cycle slips
         common |= {
             "keyframe": keyframe[used],
             "s_n": (geometry.s - frame.r_e) @ frame.R_ne.T,
@@ -121,7 +123,7 @@ class GnssPhase(RangeConstraint):
             reflected=_project(common["s_n"] - nominal, reflection, keyframe[used]),
             reflection=reflection / wavelength[used],
             period=find_epoch_period(found.raw, s),
-            slant=-obliquity(geometry.elevation) * (L1 / raw.frequency) ** 2,
+            slant=-compute_obliquity(geometry.elevation) * (L1 / raw.frequency) ** 2,
             wavelength=wavelength[used],
             sigma=compute_carrier_difference_sigma(raw.cn0, geometry.elevation, wavelength[used])[:, None],
             slot=place[arcs.slot[used]],
@@ -146,7 +148,7 @@ class GnssPhase(RangeConstraint):
 
 
 def compute_variance_left(duration: Array, period: float) -> Array:
-    """Of reflections of unit variance, what a mean over a time (s) holds of them more than were they white.
+    """Excess variance of the mean of unit-variance multipath over a time (s), beyond that of white noise.
 
     The variance of the mean of a Gauss-Markov sequence (Brockwell and Davis 1991, section 7.1) less 1 / n.
     """
@@ -155,7 +157,8 @@ def compute_variance_left(duration: Array, period: float) -> Array:
 
 
 def _project(towards: Array, sigma: Array, keyframe: Array) -> Array:
-    """(N, 3) m, e.L of each row: L L^T is the covariance of an epoch's place by errors of these sigmas and a clock.
+    """(N, 3) m, e.L of each row: L L^T is the covariance of an epoch's position, with a clock, for errors of these
+    sigmas.
 
     Parameters
     ----------
@@ -175,15 +178,13 @@ def _project(towards: Array, sigma: Array, keyframe: Array) -> Array:
     told, axes = np.linalg.eigh(information)
     known = told > _WEAKEST * told[:, -1:]
     size = np.where(known, 1.0 / np.sqrt(np.where(known, told, 1.0)), 0.0)
-    root = (axes * size[:, None]) @ np.swapaxes(
-        axes, -1, -2
-    )  # the symmetric one turns with the sky, not with its order
+    root = (axes * size[:, None]) @ np.swapaxes(axes, -1, -2)  # symmetric: independent of the eigenvectors' order
     return np.asarray(rotation.mv(root[which], e))
 
 
 @dataclass(frozen=True)
 class WholeCycles(Constraint):
-    """Two ambiguities of a signal differ by an integer that has been found (`graphnav.integers`)."""
+    """Difference of two ambiguities of a signal, fixed to an integer (`graphnav.gnss.integers`)."""
 
     name: ClassVar[str] = "gnss_integers"
     axes: ClassVar[tuple[str, ...]] = ("cycles",)
@@ -199,7 +200,7 @@ class WholeCycles(Constraint):
 
     @classmethod
     def build(cls, scene: BuildContext) -> WholeCycles | None:
-        return None  # found from an estimate, not from a recording
+        return None  # fixed from an estimate, not from a recording
 
     def linearize(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> Linearized:
         pair, residual = self.pair[rows], -self.cycles[rows]

@@ -1,16 +1,16 @@
-"""Precise point positioning, with float ambiguities: codes and carriers of two signals, without the ionosphere.
+"""Precise point positioning with float ambiguities: ionosphere-free codes and carrier phases.
 
-With the models of `graphnav.gnss.ppp` and z the wet delay at the zenith, a random walk, m how it grows, q what a
-satellite's codes are wrong by (its code biases), N the ambiguity of a carrier's arc::
+With the models of `graphnav.gnss.ppp`, z the zenith wet delay (a random walk) and m its mapping function, q the code
+biases of a satellite and N the ambiguity of a carrier-phase arc::
 
     r_code    = |s - p_a| + b + b_s + m z + q + [...] - dt - P
     r_carrier = |s - p_a| + b + b_s + m z + N + o + d + [...] - dt - Phi
 
-o is what a satellite's orbit is off by, for hours; d what lasts for seconds: reflections, and what its clock is off the
-line between two nodes of the product. Both are far larger than the white noise of a carrier, and what float
-ambiguities tell of a place are changes of millimetres: without d a single satellite moves it by decimetres. Clock b,
-lever arm and ambiguities are parameters as those of `graphnav.constraints.raw_gnss`; the bias of another system is a
-constant.
+o is the orbit error of a satellite over hours, d the errors over seconds: multipath, and the interpolation error of its
+clock between two nodes of the product. Both are far larger than the white noise of a carrier phase, and float
+ambiguities carry position information through changes of millimetres: without d a single satellite would shift the
+position by decimetres. Clock b, lever arm and ambiguities are parameters as in `graphnav.constraints.raw_gnss`; the
+inter-system bias is a constant.
 """
 
 from __future__ import annotations
@@ -47,22 +47,23 @@ from graphnav.recording import Recording
 WET = "gnss_wet_delay"
 ORBITS = "gnss_satellite_orbits"
 CARRIER_SLOW = "gnss_carrier_errors"
-_WET, _WET_WALK = 0.1, 1.7e-4  # m, of a standard atmosphere's; m/sqrt(s): 1 cm in an hour (Kouba and Heroux 2001)
-_CODE_BIAS = 1.0  # m: a code's differential bias, half a nanosecond or two, in the combination
+# m, about that of a standard atmosphere; m/sqrt(s): 1 cm in an hour (Kouba and Heroux 2001)
+_WET, _WET_WALK = 0.1, 1.7e-4
+_CODE_BIAS = 1.0  # m: differential code bias of half to two nanoseconds, in the combination
 _BIAS_WALK = 1e-5  # m/sqrt(s), a millimetre in three hours
-# m, towards a satellite, for hours: final orbits are good to 2.5 cm (IGS, "Products")
+# m, orbit error along the line of sight, over hours: final orbits are good to 2.5 cm (IGS, "Products")
 _ORBIT = 0.025
 
 
 @dataclass(frozen=True)
 class FreeRows:
-    """What both kinds of rows need; made once for a scene."""
+    """Data common to both kinds of rows, computed once per scene."""
 
     found: PreparedRows
     rows: IonosphereFree
     satellites: int  # of the systems that are used
     which: NDArray[np.intp]  # (N,) satellite
-    group: NDArray[np.intp]  # (N,) system, 0 that with most rows
+    group: NDArray[np.intp]  # (N,) system index, 0 the one with most rows
     groups: int
 
 
@@ -84,16 +85,16 @@ def combine_rows(scene: BuildContext) -> FreeRows | None:
 
 
 def require_precise(name: str, raw: RawGnss) -> None:
-    """Whether a recording's series has what precise point positioning needs.
+    """Check that a recording's series has what precise point positioning needs.
 
     Raises
     ------
     RecordingError
-        If it has not.
+        If it lacks precise orbits and clocks, or second signals.
     """
     if not raw.precise:
         raise RecordingError(
-            f"{name}: raw_gnss.ppp needs precise orbits and clocks; say sp3 and clk in the recording's [raw_gnss]",
+            f"{name}: raw_gnss.ppp needs precise orbits and clocks; set sp3 and clk in the recording's [raw_gnss]",
             key="raw.ppp_orbits",
         )
     if not choose_second_signals(raw):
@@ -106,7 +107,7 @@ def require_precise(name: str, raw: RawGnss) -> None:
 
 @dataclass(frozen=True)
 class _Ppp(RangeConstraint):
-    """Rows of single satellites without the ionosphere."""
+    """Ionosphere-free rows of single satellites."""
 
     wet: Array = field(default_factory=lambda: np.empty(0))  # (N,)
     group: Array = field(default_factory=lambda: np.empty(0, dtype=int))  # (N,) system, 0 the reference
@@ -150,7 +151,7 @@ class _Ppp(RangeConstraint):
 
 @dataclass(frozen=True)
 class GnssPppCode(_Ppp):
-    """Codes of two signals of a satellite were received by the antenna."""
+    """Ionosphere-free code of one satellite at the antenna."""
 
     name: ClassVar[str] = "gnss_ppp_code"
     unit: ClassVar[str] = "m"
@@ -180,15 +181,15 @@ class GnssPppCode(_Ppp):
 
 @dataclass(frozen=True)
 class GnssPppCarrier(_Ppp):
-    """Carriers of two signals of a satellite were received by the antenna."""
+    """Ionosphere-free carrier phase of one satellite at the antenna."""
 
     name: ClassVar[str] = "gnss_ppp_carrier"
     unit: ClassVar[str] = "m"
 
     slots: tuple[str, ...] = ()  # names of the ambiguities
     slot: Array = field(default_factory=lambda: np.empty(0, dtype=int))  # (N,) index of `slots`
-    begin: Array = field(default_factory=lambda: np.empty(0))  # (N,) s, of the arc
-    lasting: Array = field(default_factory=lambda: np.empty(0))  # (N,) m, 1-sigma of what lasts for seconds
+    begin: Array = field(default_factory=lambda: np.empty(0))  # (N,) s, start of the arc
+    lasting: Array = field(default_factory=lambda: np.empty(0))  # (N,) m, 1-sigma of the errors over seconds
 
     @classmethod
     def epochs(cls, recording: Recording, settings: Settings, stationary: Array) -> Array:
@@ -224,7 +225,7 @@ class GnssPppCarrier(_Ppp):
         between = np.mod(raw.t + raw.zero, apart) / apart  # nodes are at whole numbers of their spacing
         off_line = 2.0 * middle * np.sqrt(between * (1.0 - between))
         reflected = rows.growth[used] * compute_reflection_sigma(rows.geometry.elevation[used])
-        if scene.settings.raw_gnss.robust == "automatic":  # a slip is no error that a variance can describe
+        if scene.settings.raw_gnss.robust == "automatic":  # a cycle slip is not an error that a variance can describe
             common["robust"] = "cauchy"
         sigma = rows.growth[used] * compute_carrier_sigma(raw.cn0, rows.geometry.elevation[used], C / raw.frequency)
         return cls(

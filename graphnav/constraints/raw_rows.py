@@ -1,4 +1,4 @@
-"""Satellites seen from the places of a drive: what all kinds of rows of raw observations are made of."""
+"""Satellite geometry at the positions of a drive, common to all constraints on raw observations."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from graphnav.gnss.signals import C
 from graphnav.gnss.single_point import choose_coefficients, compute_stretch, look
 
 CLOCK = "receiver_clock"
-_CLOCK_SIGMA = np.array([100.0, 10.0])  # m, m/s, about the single-point solution: next to nothing known
+_CLOCK_SIGMA = np.array([100.0, 10.0])  # m, m/s, about the single-point solution: uninformative
 
 
 @dataclass(frozen=True)
 class PreparedRows:
-    """What all kinds of rows need, of the rows that are used; made once for a scene."""
+    """Data common to all kinds of rows, for the rows in use; computed once per scene."""
 
     raw: RawGnss
     keyframe: Array
@@ -34,15 +34,15 @@ class PreparedRows:
     R_ln: Array  # (N, 3, 3)
     azimuth: Array  # (N,) rad, from north to the east
     elevation: Array  # (N,) rad
-    known: Array  # (N,) m, distance from the nominal antenna with the delays of the atmosphere
+    known: Array  # (N,) m, range from the nominal antenna with atmospheric delays
     nominal: Array  # (N, 3) m
     ionosphere: Array  # (N,) m
     stretch: Array  # (N,)
-    spacing: float  # s from node to node of whatever changes slowly
+    spacing: float  # s between nodes of slowly varying parameters
 
     @property
     def clock(self) -> Parameter:
-        """The receiver's, anew at every epoch."""
+        """Receiver clock, independent at every epoch."""
         epochs, first = np.unique(self.raw.t, return_index=True)
         sigma = np.tile(_CLOCK_SIGMA, (len(epochs), 1))
         return Parameter(CLOCK, self.raw.receiver_clock[first], sigma, "m, m/s", begins=epochs, reported=True)
@@ -54,7 +54,7 @@ class PreparedRows:
 
 
 def prepare_every(scene: BuildContext) -> PreparedRows | None:
-    """The rows that are used, with those of epochs that have no keyframe, which is -1 then."""
+    """Prepare all rows in use; those of epochs without a keyframe have keyframe -1."""
     raw = select_observations(scene.recording, scene.settings)
     if raw is None:
         return None
@@ -90,5 +90,5 @@ def select_rows(every: PreparedRows | None) -> PreparedRows | None:
 
 
 def find_epoch_period(raw: RawGnss, settings: RawGnssSettings) -> float:
-    """s between the epochs that are used; a piece of a series may have too few to tell."""
+    """s between the epochs in use; from the catalogue for a piece of a series with too few epochs."""
     return find_fix_period(raw.epochs[0]) if raw.catalogue is None else max(raw.catalogue.period, settings.period)

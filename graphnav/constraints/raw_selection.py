@@ -1,4 +1,4 @@
-"""Which raw observations are used."""
+"""Selection of the raw observations in use."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from graphnav.core.rotation import Array
 from graphnav.gnss.series import RawGnss, choose_primary
 from graphnav.recording import Recording
 
-EARLY = 0.05  # s by which an epoch may come before the next is due: stamps jitter
+EARLY = 0.05  # s by which an epoch may be early: stamps jitter
 
 
 def select_observations(recording: Recording, settings: Settings) -> RawGnss | None:
-    """The rows to be used: of one signal for each satellite, strong enough, where the IMU is."""
+    """Select the rows to use: one signal per satellite, strong enough, within the time of the IMU."""
     s, raw = settings.raw_gnss, recording.raw_gnss
     if raw is None or not recording.is_tight(s.coupling) or not len(raw):
         return None
     used = select_usable(raw, s)
-    if raw.catalogue is None:  # a piece of a series has the epoch before it as well, from which carriers change
+    if raw.catalogue is None:  # a piece of a series also holds the previous epoch, for carrier-phase changes
         used &= (raw.t >= recording.start - SAME_TIME) & (raw.t <= recording.end + SAME_TIME)
     if s.period > 0.0 and used.any():
         used &= np.isin(raw.t, _thin_times(np.unique(raw.t[used]), s.period))
@@ -31,13 +31,13 @@ def select_observations(recording: Recording, settings: Settings) -> RawGnss | N
 
 
 def select_usable(raw: RawGnss, settings: RawGnssSettings) -> NDArray[np.bool_]:
-    """(N,) which rows are placed, strong enough and, with a base station, seen by it."""
+    """(N,) mask of rows with a satellite position, strong enough and, with a base station, observed by it."""
     used = np.isfinite(raw.p[:, 0]) & np.isfinite(raw.clock) & ~(raw.cn0 < settings.cn0)
     return used & np.isfinite(raw.difference) if raw.differenced else used
 
 
 def _thin_times(t: Array, least: float) -> Array:
-    """Those of some times that are so far apart at least."""
+    """Select times that are at least `least` s apart."""
     out = [float(t[0])]
     for x in t.tolist():
         if x - out[-1] >= least - EARLY:

@@ -37,7 +37,7 @@ from graphnav.core import rotation
 from graphnav.core.earth import LocalFrame
 from graphnav.core.rotation import Array, mv, stack_columns
 from graphnav.core.state import SECONDS, Parameter, States
-from graphnav.imu.dynamics import SCALE, convert_to_biases, differentiate_by_scale, scale_parameter
+from graphnav.imu.dynamics import SCALE, convert_to_biases, differentiate_by_scale, make_scale_parameter
 from graphnav.imu.preintegration import Intervals
 from graphnav.recording import Imu, Odometer, Recording
 from graphnav.recording.odometer import MeanSpeed, ReadingStatistics, find_wrong_readings
@@ -202,7 +202,7 @@ def find_moving_rows(scene: BuildContext) -> Array:
 def make_wheel_parameters(scene: BuildContext) -> tuple[Array, list[Parameter]]:
     """Lever arm (3,) of the point that does not slip, m, and the parameters of both constraints."""
     s, odometer = scene.settings.vehicle, scene.recording.odometer
-    parameters = list(scale_parameter(scene.recording))
+    parameters = list(make_scale_parameter(scene.recording))
     lever = np.zeros(3) if odometer is None else odometer.lever_arm
     if s.mounting_sigma > 0:
         sigma, walk = np.radians(s.mounting_sigma), np.radians(s.mounting_walk) / 60.0

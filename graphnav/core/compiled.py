@@ -1,7 +1,7 @@
 """Functions on arrays, compiled to machine code where Numba is installed.
 
-One text serves both: without Numba, or with the environment variable GRAPHNAV_COMPILE=0, the same functions run as
-they stand, several times more slowly. Machine code is kept on disk: in NUMBA_CACHE_DIR if that is set, beside the
+The same source serves both: without Numba, or with the environment variable GRAPHNAV_COMPILE=0, the same functions run
+as they stand, several times more slowly. Machine code is kept on disk: in NUMBA_CACHE_DIR if that is set, beside the
 module, or where that folder cannot be written in the user's folder for caches.
 """
 
@@ -26,8 +26,9 @@ def can_compile() -> bool:
 def compile_once(function: Function) -> Function:
     """The function, compiled when it is called first.
 
-    Those that call each other stand in one module: what is kept on disk is as old as the module it is of. They take
-    numbers and arrays only: what is kept for another type names its class, and fails where that has another name now.
+    Functions that call each other must be in one module, because the cache on disk is only checked against that
+    module's file. Arguments must be numbers and arrays: for other types the cache holds the name of their class and
+    fails once it is renamed.
     """
     if not can_compile():
         return function
@@ -42,7 +43,7 @@ def compile_once(function: Function) -> Function:
 
 @cache
 def _report_compiling() -> None:
-    """From now on compiling, a minute where nothing is kept on disk yet, is a stage of its own of the progress."""
+    """Report compilation, which takes a minute without a cache on disk, as a stage of the progress."""
     from numba.core import event
 
     class Report(event.Listener):  # type: ignore[misc]

@@ -112,7 +112,7 @@ def _describe_error(first: Any, loc: tuple[str, ...], model: type[BaseModel]) ->
 
 
 def rephrase(message: str) -> str:
-    """What Pydantic says that a value should be, as what it must be."""
+    """Rephrase Pydantic's "should be" as "must be"."""
     words = re.sub(r"Input should (.*?)(, (unable to|got) .*)?$", r"must \1", message)
     return (
         words.replace("a valid string", "a text in quotes")

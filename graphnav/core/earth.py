@@ -105,7 +105,7 @@ class LocalFrame:
     """One fixed ENU tangent frame (n) with its origin at `origin` = (lat, lon, h) in rad, rad, m."""
 
     origin: Array
-    epoch: float = 0.0  # s, from which on what drifts over a drive is counted
+    epoch: float = 0.0  # s, reference time of clock drifts
 
     @cached_property
     def R_ne(self) -> Array:
@@ -134,7 +134,8 @@ class LocalFrame:
 
     @cached_property
     def gravity_gradient(self) -> Array:
-        """Gradient of Newtonian gravity, -(g/r)(I - 3 u u^T), 1/s^2: small, but without it long outages drift."""
+        """Gradient of Newtonian gravity, -(g/r)(I - 3 u u^T), 1/s^2: small, but its omission causes drift in long
+        outages."""
         g = self.gravity_n(np.zeros(3))
         size = float(np.linalg.norm(g))
         up = -g / size
@@ -167,7 +168,7 @@ class LocalFrame:
         most) is left out.
         """
         r = self.r_e + np.asarray(p_n, dtype=float) @ self.R_ne
-        if r.size == 3:  # a filter asks for single points
+        if r.size == 3:  # fast path for the single points of a filter
             return (np.array(_compute_gravity_one(*r.ravel().tolist())) @ self.R_ne.T).reshape(r.shape)
         s, c, p = _find_normal(r)
         size = -_compute_gravity(s * s, _find_height(r, s, c, p))

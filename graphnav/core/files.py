@@ -46,7 +46,7 @@ def resolve_beside(source: Path, name: str, key: str, allow_outside: bool, error
     path = source.parent / name
     if not is_inside(path, source.parent, error) and not allow_outside:
         raise error(
-            f"{source}: '{key}' names a file outside the folder that it lies in; move it there, or say --allow-outside "
+            f"{source}: '{key}' names a file outside the folder that it lies in; move it there, or use --allow-outside "
             "if you trust who wrote this",
             key="file.outside",
         )
@@ -74,13 +74,13 @@ def check_inside(files: Iterable[Path], source: Path, error: Kind = RecordingErr
     for file in files:
         if file.is_symlink() and not is_inside(file, folder, error):
             raise error(
-                f"{file}: is a link to outside of {folder}; say --allow-outside if you trust who made it",
+                f"{file}: is a link to outside of {folder}; use --allow-outside if you trust who made it",
                 key="file.outside",
             )
 
 
 def exists(path: Path, error: Kind = RecordingError) -> bool:
-    """Whether the path exists.
+    """Check whether a path exists.
 
     Raises
     ------

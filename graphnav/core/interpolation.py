@@ -1,8 +1,8 @@
 """A trajectory at other times and at another point of the body, with its covariance.
 
-Positions by the cubic Hermite polynomial through both ends and their velocities (off by at most
-dt^4 / 384 max |p''''|, e.g. Stoer and Bulirsch, *Introduction to Numerical Analysis*, 2.1.5), velocity
-as the body sees it turned by the interpolated attitude, attitude along the shortest arc.
+Positions by the cubic Hermite polynomial through both ends and their velocities (off by at most dt^4 / 384 max |p''''|,
+e.g. Stoer and Bulirsch, *Introduction to Numerical Analysis*, 2.1.5), velocity in body axes, rotated by the
+interpolated attitude, and attitude along the shortest arc.
 """
 
 from __future__ import annotations
@@ -102,7 +102,7 @@ def interpolate(
     known = cov_at is not None and bool(np.isfinite(cov_at[:, 6:9, 6:9]).all((1, 2)).any())
     if known and cov_at is not None and swing is not None and rph is not None and R_at is not None:
         cov_at = _move_to_point(cov_at, R_at, rph, np.asarray(lever_arm, dtype=float), swing)
-    near = np.where(s[:, 0] > 0.5, nxt, k)  # the row whose fix it is
+    near = np.where(s[:, 0] > 0.5, nxt, k)  # the nearest row, whose fix type is taken
     out = replace(
         trajectory, t=t, llh=p_at if frame is None else frame.to_llh(p_at), v=v_at, rph=rph,
         sd_p=_take_sigmas(cov_at, 0, None), sd_v=_take_sigmas(cov_at, 3, None), sd_rph=_take_sigmas(cov_at, 6, None),
@@ -116,7 +116,7 @@ def interpolate(
 def differentiate(trajectory: Trajectory, max_gap: float) -> Array:
     """Velocities (K, 3) in m/s of a trajectory's positions, in its local frame or that of its first row.
 
-    Those of cubic splines, of which none leads across a gap of more than `max_gap` s; NaN for a row alone.
+    By cubic splines that end at gaps of more than `max_gap` s; NaN for a single row.
     """
     from scipy.interpolate import CubicSpline
 

@@ -26,7 +26,7 @@ _ENCODER = json.JSONEncoder(ensure_ascii=False, allow_nan=False)
 
 
 def _write_value(value: Any, line: str) -> str:
-    """A value as JSON; `line` is the end of a line and the indent of the next."""
+    """A value as JSON; `line` is a line end with the indentation of the next line."""
     deeper = line + "  "
     if isinstance(value, Mapping):
         inner = [f"{_ENCODER.encode(str(key))}: {_write_value(one, deeper)}" for key, one in value.items()]

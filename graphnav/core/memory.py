@@ -24,6 +24,6 @@ def read_peak_memory_mb() -> float:
 
 
 def return_memory() -> None:
-    """Give the system back what is free: by itself the C library keeps the room of arrays of less than 32 MB."""
+    """Return free memory to the system; by itself the C library keeps that of arrays of less than 32 MB."""
     with suppress(AttributeError, OSError, TypeError):  # of another C library
         ctypes.CDLL(None).malloc_trim(0)

@@ -32,14 +32,14 @@ _TINY = 1e-300  # makes sin(x)/x = 1 at x = 0 without a separate case
 def skew(v: Array) -> Array:
     """Cross-product matrix: ``skew(a) @ b == cross(a, b)``; (..., 3) -> (..., 3, 3)."""
     v = np.asarray(v, dtype=float)
-    if v.size == 3:  # a filter asks for single vectors, for which general array code costs more than the work itself
+    if v.size == 3:  # fast path for the single vectors of a filter, where general array code is mostly overhead
         x, y, z = v.ravel().tolist()
         return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]).reshape(*v.shape, 3)
     return (v @ _GENERATORS).reshape(*v.shape, 3)
 
 
 def stack_columns(*parts: Array) -> Array:
-    """``np.stack(parts, axis=-1)``, several times faster for the few rows that a filter asks for."""
+    """``np.stack(parts, axis=-1)``, several times faster for few rows."""
     out = np.empty((*np.shape(parts[0]), len(parts)))
     for k, part in enumerate(parts):
         out[..., k] = part
@@ -68,7 +68,7 @@ def multiply(A: Array, B: Array) -> Array:
 
 
 def apply(M: Array, v: Array) -> Array:
-    """`mv` of (n, 3, 3) and (n, 3), the same way."""
+    """`mv` of (n, 3, 3) and (n, 3), faster where they are many."""
     return mv(M, v) if len(M) < _MANY_MATRICES else np.einsum("nij,nj->ni", M, v)
 
 

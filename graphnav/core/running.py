@@ -10,7 +10,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from graphnav.core.rotation import Array
 
-_MANY_NUMBERS = 4_000_000  # numbers in all windows, for which SciPy is worth its import
+_MANY_NUMBERS = 4_000_000  # number of values in all windows above which SciPy is imported
 
 
 def run_median(x: Array, size: int) -> Array:

@@ -1,7 +1,8 @@
 """GPS time, UTC and the leap seconds between them.
 
-GPS time runs on since 6 January 1980 UTC; each leap second since then puts it one further ahead (IERS Bulletin C; the
-table of IS-GPS-200 applications). No leap second has been added since 2017, and none will be before 2027.
+GPS time has no leap seconds since 6 January 1980 UTC; each later leap second of UTC increases GPS - UTC by one second
+(IERS Bulletin C; the table of IS-GPS-200 applications). No leap second has been added since 2017, and none will be
+before 2027.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from graphnav.core.rotation import Array
 
 DAY, WEEK = 86400.0, 604800.0  # s
 _COUNTS = 2.0**32  # of a counter of 32 bits
-_WHOLE = 0.99  # of a period; a clock that starts again steps back by no less
+_WHOLE = 0.99  # share of the period; a restarting clock steps back by at least that
 NEAR = 3600.0  # s; logs of one drive begin within this of each other
 UNIX = 1e9  # s; larger stamps are Unix time of this century
 GPS_TO_UNIX = 315964800.0  # s from the Unix to the GPS epoch, leap seconds excluded
@@ -36,8 +37,8 @@ LEAP = float(len(_LEAPS))  # s, GPS time minus UTC since the last of them
 
 
 def shift_stamps(t: Any, offset: float, rate: float, since: float) -> Any:
-    """Stamps (s, a number or an array) on another clock, which is ahead by `offset` (s) at the stamp `since` and gains
-    on it by `rate` (s/s).
+    """Stamps (s, a number or an array) on another clock, ahead by `offset` (s) at the stamp `since` and drifting by
+    `rate` (s/s).
     """
     return t + offset + rate * (t - since)
 
@@ -100,7 +101,7 @@ def parse_clock(text: str, t: float) -> float:
 
 
 def find_restarts(t: Array, unit: float = 1.0) -> Array | None:
-    """What is to be added to the stamps of a clock that restarts at 0 after a day, a GPS week or 2^32 counts.
+    """Increments that make the stamps of a clock continuous that restarts at 0 after a day, a GPS week or 2^32 counts.
 
     Parameters
     ----------
@@ -109,13 +110,13 @@ def find_restarts(t: Array, unit: float = 1.0) -> Array | None:
 
     Returns
     -------
-    (N,) in the unit of `t`, None where the clock does not start again.
+    (N,) in the unit of `t`, None where the clock does not restart.
     """
     step = np.diff(t)
     for period in (DAY / unit, WEEK / unit, _COUNTS):
         back = step < -_WHOLE * period
         if back.any() and t.min() >= 0.0 and t.max() < period:
-            # a row that was only written late is of the turn before
+            # a row that was written late belongs to the period before
             turns = np.cumsum(back.astype(float) - (step > _WHOLE * period))
             return np.asarray(period * np.concatenate([[0.0], turns]))
     return None
@@ -134,7 +135,7 @@ def compute_clock_offset(t: float, zero: float | None, u: float, other: float | 
     known.
 
     Stamps above 1e9 are Unix time; those below a week are seconds of the GPS week of the others, where these are known.
-    None where this does not tell, or the clocks are the same.
+    None where this does not determine it, or the clocks are the same.
     """
     unix = [x > UNIX for x in (t, u)]
     first = parse_clock("unix", t) if unix[0] else zero

@@ -1,8 +1,8 @@
 """The change of speed between stationary-looking spans, by the IMU.
 
-A span in which nothing changes is a stop or a smooth cruise: an IMU by itself cannot tell which. But no vehicle passes
-from one to the other without acceleration. The specific force between two such spans, levelled with the tilt that the
-gyro measured, integrates to the difference of their speeds:
+A span in which nothing changes is a stop or a smooth cruise: an IMU by itself cannot distinguish them. But no vehicle
+passes from one to the other without acceleration. The specific force between two such spans, levelled with the tilt
+that the gyro measured, integrates to the difference of their speeds:
 
     dv = integral (f_y - f_y0 + g dpitch) dt,     dpitch = integral (omega_x - bias) dt
 
@@ -178,7 +178,7 @@ def find_moving_by_chain(links: list[Link], known: Array) -> np.ndarray:
 
     Parameters
     ----------
-    known : (M,) m/s, NaN where no sensor knows a speed; 0 where it is none.
+    known : (M,) m/s, speed by another sensor, NaN where there is none.
     """
     M = len(known)
     out = np.nan_to_num(known) > 0.0

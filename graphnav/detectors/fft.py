@@ -10,8 +10,8 @@ amplitudes from 0 to 10, 10 to 20 and 20 to 30 Hz. A window is stationary if
 The statistic is the largest of these quotients, so that it is below 1 where all conditions hold. The paper's bands
 belong to an idle line at 12.5 Hz. Here the line is found in windows that other detectors call stationary or, without
 them, in windows that are calm below any idle line; the bands are scaled with it. A ratio that this engine does not meet
-while idling (no second harmonic, no pitch) is not required. When the detector decides alone, every window must be that
-calm, because an engine also idles while a vehicle rolls.
+while idling (no second harmonic, no pitch) is not required. When the detector decides alone, every window must meet the
+limits of calm windows, because an engine also idles while a vehicle rolls.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ CONDITIONS = (
     "forward limit", "up limit", "pitch limit",
     "forward Peak-1", "forward Peak-2", "up Peak-1", "up Peak-2", "pitch Peak-1",
 )  # fmt: skip
-_REQUIRED = ("forward limit", "up limit")  # always required: windows that exceed them are shaken as while driving
+_REQUIRED = ("forward limit", "up limit")  # always required: vibration above these limits occurs only while driving
 
 
 class IdleFft(Detector):

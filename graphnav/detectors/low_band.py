@@ -30,7 +30,7 @@ NAME = "low_band_glrt"
 _DOWN, _UP = 1.5, 0.7  # decades by which the data may lower or raise the threshold
 _LEAST_MOTION = 30.0  # s of certain motion needed to bound the threshold
 _QUIETEST = 1.0  # s of the quietest windows, which bound the noise from above
-_TRUSTED = 0.05  # least share of the stated noise that is believed
+_TRUSTED = 0.05  # least share of the stated noise that is accepted
 _OVERSTATED = 2.0  # ratio to the noise of the quietest windows above which stated noise is too large
 
 
@@ -131,7 +131,7 @@ def _find_threshold(
         return float(10.0**split), ()
     notes: tuple[str, ...] = ()
     if s.overstated and np.mean(found < settings.threshold) < 0.5:
-        # noise that would hide so much is not believed, and no population stands out: 3 sigma of the sway remains
+        # stated noise that would hide so much is not used, and no population stands out: 3 sigma of the sway remains
         start = min(start, float(np.log10(9.0 * swaying)))
         notes = (
             Note(

@@ -1,6 +1,6 @@
 """Certain motion by odometer and GNSS: spans in which a speed exceeds its own error.
 
-A zero of an odometer proves nothing (unplugged, or slower than its first pulse), a fix can be wrong for a few epochs,
+A zero of an odometer is no evidence (unplugged, or slower than its first pulse), a fix can be wrong for a few epochs,
 and both may be late. So single epochs never count, and only motion is concluded from them, never rest.
 """
 
@@ -47,7 +47,7 @@ class Speeds:
         The velocity is constant in such a span, so the median over the epochs counts, and a wander within the stated
         error is not motion.
         """
-        # what a late sensor says first belongs to the time before
+        # the first readings of a late sensor belong to the time before
         first = min(span[0] + self.late, 0.5 * (span[0] + span[1]) + self.late)
         there = (self.t - self.half >= first) & (self.t + self.half <= span[1] + self.late)
         if there.sum() < _MEDIAN:

@@ -10,11 +10,11 @@ the biases. e is the turn rate of a foot that moves that much. c, m/s^2 per rad/
 weighs as much as a turn rate of 1; it follows from Skog's sigmas, 0.01 m/s^2 and 0.1 deg/s.
 
 In swing e is several rad/s, in the middle of a stance some tenths. The threshold lies between them, at 1.5 rad/s, where
-an IMU 10 cm above the floor moves at 0.15 m/s, a twentieth of its speed in swing. It need not be sharp, because the
-rows of `graphnav.constraints.foot` model the rolling and weigh less the stronger it is. What must not happen is that a
-part of a swing passes for a stance: in the slow first step of a walk force and rate are low for a moment, but less low
-than in stances. So spans whose lowest e is an outlier among those of all spans, by three of their spreads (median
-absolute deviation, in log e), are discarded.
+an IMU 10 cm above the floor moves at 0.15 m/s, a twentieth of its speed in swing. It need not be exact, because the
+rows of `graphnav.constraints.foot` model the rolling and are weighted down the stronger it is. But no part of a swing
+may be taken for a stance: in the slow first step of a walk force and rate are low for a moment, but less low than in
+stances. So spans whose lowest e is an outlier among those of all spans, by three of their spreads (median absolute
+deviation, in log e), are discarded.
 
 e does not show a lasting force: a foot that is carried level to its last footprint and slows down there turns little,
 and the deceleration tilts the mean force more than it lengthens it. But over the whole span it adds up. So from the

@@ -38,7 +38,7 @@ _OPPOSITE = 0.5  # ratio of the distances of the estimate from the opposite sign
 _PART = 240.0  # s
 _FEWEST_FOR_ARM = 30  # fixes
 _SURE_SIGMAS = 8.0  # 4 sigmas, doubled because errors of fixes are correlated for minutes
-# Findings by which attitude, times or positions are wrong: what the drive then says of lever arms follows from that.
+# Findings by which attitude, times or positions are wrong; lever arms cannot be assessed then.
 _MENDED_FIRST = {
     "imu.axes", "imu.clock", "imu.contradicted", "imu.force_sign", "imu.gyro_axis_sign", "imu.gyro_fast",
     "imu.gyro_scale", "imu.gyro_sign", "imu.gyro_unit", "imu.sideways_reversed", "imu.up", "gnss.clock", "gnss.feet",
@@ -117,7 +117,7 @@ def find_wrong_arms(recording: Recording, findings: Sequence[Finding] = ()) -> l
         nearer = np.abs(found + stated) < _OPPOSITE * np.abs(found - stated)
         wrong = sure & (np.abs(stated) > _LEAST_PART) & (found * stated < 0.0) & nearer
         rest = np.abs(np.where(wrong, -stated, stated) - found) - _SURE_SIGMAS * sigma
-        if (rest > _LEAST_PART).any():  # the signs are not all of it
+        if (rest > _LEAST_PART).any():  # more than the signs is wrong
             continue
         for k in np.flatnonzero(wrong):
             out.append(
@@ -177,7 +177,7 @@ def _estimate_antenna(recording: Recording) -> tuple[Antenna, tuple[Array, Array
     aligned = align(recording, settings, frame)
     if aligned.motion is None:
         raise EstimationError(
-            f"'{recording.name}': without motion nothing tells where the antenna is", key="antenna.no_motion"
+            f"'{recording.name}': without motion the position of the antenna is not observable", key="antenna.no_motion"
         )
     wide = PRIOR_SIGMA[LEVER_ARM]
     unknown = {"gnss": {"lever_arm_sigma": wide}, "vehicle": {"axle_sigma": wide}}

@@ -73,7 +73,7 @@ class ProblemBuilder:
 
     def align(self, recording: Recording, stationary: Array) -> Alignment:
         """The first state of the recording, or of a part of it."""
-        # an alignment needs no carriers, and solves dozens of problems
+        # an alignment needs no carrier phases, and solves dozens of problems
         codes_alone = self.settings.raw_gnss.model_copy(update={"differences": False})
         settings = self.settings.model_copy(update={"raw_gnss": codes_alone})
         tell("alignment")
@@ -91,7 +91,7 @@ class ProblemBuilder:
                 parts_of_noise=parts,
             )  # fmt: skip
         if aligned.motion is None and self.recording.placed and self.settings.alignment.heading is None:
-            # linearised at any heading, a direction of travel would make an unknown one known
+            # linearised at an arbitrary heading, a direction of travel would make an unknown heading appear known
             rows = tuple(c for c in problem.constraints if not c.of_wheels)
             problem = replace(problem, constraints=rows)
         problem, carriers = split_carriers(problem)  # the noise model depends on the codes

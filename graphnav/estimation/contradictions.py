@@ -1,22 +1,22 @@
-"""Constants that are stated, the drive contradicts, and are then estimated: the antenna's lever arm, what stamps of
-fixes are late by, and that the clocks of IMU and fixes run at one rate.
+"""Stated constants that the drive contradicts, and that are therefore estimated: the antenna's lever arm, delays of the
+fixes' stamps, and equal rates of the clocks of IMU and fixes.
 
-A wrong arm turns with the vehicle: it contradicts every bend, and every change of pitch and roll. Two crystals drift
-apart by up to some 1e-4, and what stamps are off by then grows all along the drive. Whether any is so is asked of one
-filter pass with all as parameters of wide priors, by the noise model that was estimated with them as stated. Components
-are freed one by one, each time the one by which the evidence gains most, as long as it gains and the component differs
-from what is stated by more than three sigmas; the others stay. With Lambda and eta the information matrix and vector of
-the measurements about the components, and D the diagonal matrix of the 1-sigmas of a prior (0 of what is known), the
-logarithm of the evidence is, but for a constant,
+A wrong lever arm rotates with the vehicle and contradicts every turn. Two crystals drift apart by up to some 1e-4, so
+that stamp errors grow throughout the drive. The test is one filter pass with all of these constants as parameters with
+wide priors, and the noise model estimated with them as stated. Components are freed one by one, each time the one with
+the largest gain in evidence, as long as there is a gain and the component differs from the stated value by more than
+three sigmas; the others are kept. With Lambda and eta the information matrix and vector of the measurements about the
+components, and D the diagonal matrix of the 1-sigmas of a prior (0 of what is known), the logarithm of the evidence is,
+up to a constant,
 
     -ln |I + D Lambda D| / 2 + (D eta)^T (I + D Lambda D)^-1 (D eta) / 2
 
-as all is linear and Gaussian in them (MacKay 1992, "Bayesian interpolation"). Then all is estimated anew, which stands
-if the evidence of the measurements is no smaller than before.
+because the problem is linear and Gaussian in them (MacKay 1992, "Bayesian interpolation"). Then everything is estimated
+again, and the result is kept if the evidence of the measurements is no smaller than before.
 
-A filter that does not know the arm before the first bend is worse than one that has it wrong by a decimetre. So what
-is freed is used as the whole drive finds it, like the figures of the noise model, with a prior `_WIDER` times as wide
-as what is left of its uncertainty: what the drive says of it then counts for a quarter more than it should.
+A filter with an unknown lever arm before the first turn is worse than one with an error of a decimetre. So freed
+constants are used as estimated from the whole drive, like the figures of the noise model, with a prior `_WIDER` times
+as wide as their posterior sigma: the drive's information on them then counts a quarter too much.
 """
 
 from __future__ import annotations
@@ -55,8 +55,8 @@ Freed = Mapping[str, FreedConstant]  # by the parameter's name
 # A rate, s/s: crystals are good to 1e-4, ceramic resonators to 5e-3
 PRIOR_SIGMA = {LEVER_ARM: 2.0, TIME_OFFSET: LINEAR_OFFSET, VELOCITY_TIME_OFFSET: LINEAR_OFFSET, CLOCK_RATE: 1e-3}
 _SIGNIFICANT = 3.0  # sigmas
-_WIDER = 2.0  # sigmas of the estimate, of the prior that it is used with
-_KNOWN = 5e-4  # of that 1-sigma: what a component that stays as stated has
+_WIDER = 2.0  # prior sigma of a freed constant, in sigmas of its estimate
+_KNOWN = 5e-4  # share of that 1-sigma for a component that stays as stated
 
 
 def free(problem: Problem, freed: Freed) -> Problem:
@@ -87,11 +87,11 @@ def use_freed(recording: Recording, freed: Freed, since: float) -> Recording:
 
 
 def widen(problem: Problem, names: Collection[str]) -> dict[str, FreedConstant]:
-    """Stated constants with the wide priors that they are asked about with.
+    """The stated constants with wide priors, for the test.
 
     Parameters
     ----------
-    names : of those to ask about. None without fixes, no offset that is exact, and no arm that has a prior already.
+    names : constants to test. Excluded are all without fixes, exact offsets, and a lever arm that has a prior already.
     """
     rows = next((rows for rows in problem.constraints if isinstance(rows, GnssPosition)), None)
     if rows is None:
@@ -110,14 +110,14 @@ def widen(problem: Problem, names: Collection[str]) -> dict[str, FreedConstant]:
 
 
 def find_contradicted_constants(base: Problem, best: NoiseEstimate, freed: Freed, names: Collection[str]) -> Freed:
-    """What fixes show of the constants that they contradict, with the sigmas of the priors to use.
+    """Estimates of the constants that the fixes contradict, with the sigmas of the priors to use.
 
     Parameters
     ----------
     base : with stated noise, and constants as stated.
     best : its noise model, and points of all keyframes near the solution.
     freed : constants that are parameters of `best`.
-    names : of the constants to ask about.
+    names : constants to test.
     """
     asked = widen(base, names)
     if not asked:
@@ -195,20 +195,20 @@ def select_contradicted(change: Array, P: Array, prior: Array, known: Array) -> 
 
 
 def compute_evidence_gain(change: Array, P: Array, prior: Array, one: Array, other: Array) -> float:
-    """By how much the logarithm of the evidence is larger with one prior of constants than with another.
+    """Difference of the log evidence between two priors of the constants.
 
     Parameters
     ----------
-    change : (k,) what the filter finds of them beside what is stated.
+    change : (k,) estimates minus stated values.
     P : (k, k) its covariance.
     prior : (k,) 1-sigmas that it was found with.
-    one, other : (k,) 1-sigmas of the two priors, 0 for what is known.
+    one, other : (k,) 1-sigmas of the two priors, 0 for known components.
     """
     return _change_prior(change, P, prior, one)[2] - _change_prior(change, P, prior, other)[2]
 
 
 def _change_prior(change: Array, P: Array, prior: Array, sigma: Array) -> tuple[Array, Array, float]:
-    """Estimate (k,) and covariance (k, k) with another prior, and the logarithm of its evidence but for a constant."""
+    """Estimate (k,) and covariance (k, k) with another prior, and its log evidence up to a constant."""
     information = np.linalg.inv(P)
     of_measurements = information - np.diag(prior**-2.0)
     scaled = np.eye(len(P)) + sigma[:, None] * of_measurements * sigma
@@ -219,10 +219,10 @@ def _change_prior(change: Array, P: Array, prior: Array, sigma: Array) -> tuple[
 
 
 def compute_prior_cost(base: Problem, freed: Freed) -> float:
-    """By how much the evidence of an estimate is too large because the priors of freed constants are about what the
-    drive finds of them, and narrow, in place of those that they are asked about with.
+    """Excess of the evidence of an estimate, because the priors of freed constants are narrow and about their
+    estimates, in place of the wide ones of the test.
 
-    With P = Q / `_WIDER`^2 what the data tell, Q the prior that is used: ln N(0; 0, P + Q) - ln N(m; 0, P + S).
+    With P = Q / `_WIDER`^2 the posterior covariance and Q the prior in use: ln N(0; 0, P + Q) - ln N(m; 0, P + S).
 
     Parameters
     ----------
@@ -267,7 +267,7 @@ def describe_freed(freed: Freed, recording: Recording) -> tuple[str, ...]:
 
 
 def _stack_stated(problem: Problem, asked: Freed) -> Array:
-    """(n,) 1-sigmas as stated: of a parameter its prior's, 0 of what is none."""
+    """(n,) 1-sigmas as stated: a parameter's prior sigma, 0 for constants that are not parameters."""
     parameters = problem.parameters
     return np.concatenate(
         [parameters[name].sigma if name in parameters else np.zeros(len(one.value)) for name, one in asked.items()]

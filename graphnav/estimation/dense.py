@@ -31,7 +31,7 @@ def list_times(start: float, end: float, rate: float) -> Array:
 
 @dataclass(frozen=True)
 class AtKeyframes:
-    """What states between the keyframes of one piece of a recording are made of."""
+    """Data for states between the keyframes of one piece of a recording."""
 
     t: Array  # (K,) s
     states: States
@@ -58,7 +58,7 @@ class Dense(AtKeyframes):
 
     samples: Samples
     frame: LocalFrame
-    ba: Array  # (K-1, 3) biases with scale errors, as each interval saw them
+    ba: Array  # (K-1, 3) biases, scale errors included, of each interval
     bg: Array  # (K-1, 3)
     smooth: bool
 
@@ -78,7 +78,7 @@ class Dense(AtKeyframes):
         return {block: (own, np.diff(own, axis=1)) for block, own in split_covariance(self.covariance).items()}
 
     def _locate(self, t: Array) -> tuple[Array, Array]:
-        """The keyframe before each time, and the share of the interval behind it that has gone by."""
+        """The keyframe before each time, and the elapsed fraction of the interval after it."""
         k = np.clip(np.searchsorted(self.t, t, side="left") - 1, 0, len(self.t) - 2)
         return k, (t - self.t[k]) / np.diff(self.t)[k]
 
@@ -110,7 +110,7 @@ class Dense(AtKeyframes):
     def _predict(self, t: Array) -> States:
         """Prediction from the keyframe before each time."""
         k = np.searchsorted(self.t, t, side="left") - 1
-        # only of the intervals needed, so that few times cost little
+        # only for the intervals needed, so that few times cost little
         first, last = int(k[0]), int(k[-1]) + 1
         samples, used = self.samples.select_between(self.t[first], self.t[last]), slice(first, last)
         dR, dV, dP = integrate_within(samples, self.t[first : last + 1], t, self.ba[used], self.bg[used])

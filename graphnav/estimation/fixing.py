@@ -1,19 +1,19 @@
-"""Ambiguities found as integers: in the filter as it goes, and on the smoother's joint covariance.
+"""Integer ambiguity resolution: causally in the filter, and on the smoother's joint covariance.
 
-What is found is always the difference of two arcs of a system's signal. A set of differences is taken at once where
+Ambiguities are fixed as differences of two arcs of a system's signal. A set of differences is fixed at once where
 
-* rounding it would be right with a probability of 0.999 at least (Teunissen 1998),
+* its bootstrapped success rate is at least 0.999 (Teunissen 1998),
 * the second best vector is three times as far away as the best (ratio test: Euler and Schaffrin 1991),
 
-and if not, that without the most uncertain of its arcs (partial fixing), down to four differences with those that are
-known already: one more than a position needs, so that they check each other. The filter decides by what it has seen
-when it comes to an epoch, and holds it from then on. The smoother looks at every epoch with all of the drive behind it,
-holds what it finds over the whole of an arc, and looks again.
+otherwise the set without its most uncertain arc is tried (partial fixing), down to four differences together with those
+fixed before: one more than a position needs, so that they check each other. The filter decides with the measurements up
+to an epoch and holds the integers from then on. The smoother tests every epoch with the whole drive, holds what it
+fixes over the whole of an arc, and tests again.
 
-Integers that are right leave the carriers of an epoch consistent with one place and one clock for each signal, to
-millimetres: by a chi-square test, without which nothing is held. Where two epochs in a row fail it later on, the filter
-lets go of all that it holds, and of what it knew of the place by it, and finds integers again; the smoother of the arcs
-that an epoch is consistent without (data snooping: Baarda 1968) for half of their time, which stay real numbers.
+Correct integers leave the carrier phases of an epoch consistent with one position and one clock per signal, to
+millimetres; sets that fail this chi-square test are not held. Where two successive epochs fail it later, the filter
+releases all integers together with the position information that they gave, and searches again; the smoother releases
+the arcs without which most of their epochs are consistent (data snooping: Baarda 1968), which stay float.
 """
 
 from __future__ import annotations
@@ -41,13 +41,14 @@ from graphnav.estimation.solvers.rts import smooth_backward
 from graphnav.gnss.integers import decorrelate, find_nearest
 
 _SUCCESS, _RATIO = 0.999, 3.0
-_FIXING_ROUNDS = 4  # of the smoother: what one finds tells the next, and the last finds next to nothing
-LOST_PLACE, LOST_SPEED = 10.0, 1.0  # m, m/s, 1-sigma of what is known where integers were wrong: less than codes tell
+_FIXING_ROUNDS = 4  # of the smoother: each sweep uses the integers of the one before; the last finds hardly any
+# m, m/s, 1-sigma of position and velocity after wrong integers: wider than from the codes
+LOST_PLACE, LOST_SPEED = 10.0, 1.0
 
 
 @dataclass(frozen=True)
 class Fixed:
-    """A problem with carriers: filtered, smoothed, and which of its epochs have ambiguities that are integers."""
+    """A problem with carrier phases: filtered, smoothed, and the epochs with integer ambiguities."""
 
     problem: Problem
     forward: FilterPass
@@ -60,7 +61,7 @@ class Fixed:
 
 
 def split_carriers(problem: Problem) -> tuple[Problem, GnssPhase | None]:
-    """A problem without its carriers, and these."""
+    """Split a problem into one without carrier phases, and these."""
     phase = next((c for c in problem.constraints if isinstance(c, GnssPhase)), None)
     if phase is None:
         return problem, None
@@ -68,7 +69,7 @@ def split_carriers(problem: Problem) -> tuple[Problem, GnssPhase | None]:
 
 
 def list_float_arcs(problem: Problem) -> CarrierArcs:
-    """The arcs of precise point positioning, whose ambiguities are real numbers."""
+    """The arcs of precise point positioning, whose ambiguities stay float."""
     rows = next((c for c in problem.constraints if isinstance(c, GnssPppCarrier)), None)
     if rows is None:
         return CarrierArcs()
@@ -83,7 +84,7 @@ def fix(
     opening: float | None = None,
     progress: Progress | None = None,
 ) -> Fixed:
-    """Carriers added to a problem, their ambiguities found as far as they can be.
+    """Add carrier phases to a problem and fix their ambiguities as far as possible.
 
     Parameters
     ----------
@@ -133,7 +134,7 @@ def _add_phase(problem: Problem, phase: GnssPhase) -> Problem:
 
 
 def _split_arcs(phase: GnssPhase, t: Array, anew: Sequence[tuple[Arc, int]]) -> GnssPhase:
-    """Carriers of which some arcs end, and others begin, at keyframes."""
+    """Split arcs of the carrier phases at keyframes."""
     begin, own = phase.begin.copy(), {p.name: p for p in phase.parameters}
     for (name, since), k in sorted(anew, key=lambda one: one[1]):
         rows = (phase.slot == phase.slots.index(name)) & (phase.begin == since) & (phase.keyframe >= k)
@@ -165,14 +166,14 @@ def _decide(
     lasting: dict[Arc, float],
     impose: bool,
 ) -> list[tuple[Arc, Arc, int]]:
-    """Differences that can be told at an epoch.
+    """Decide the differences that can be fixed at an epoch.
 
     Parameters
     ----------
     at : column of each ambiguity.
     values, P : parameters with as many zeros in front as there are states, and the joint covariance.
-    lasting : cycles^2 that P lacks of arcs, as long as nothing is known of them.
-    impose : whether P is without what is known.
+    lasting : cycles^2, variance of time-correlated errors that P lacks, for arcs without integers.
+    impose : whether P does not include the known integers.
     """
     arcs = [arc for some in sets.values() for one in some for arc in one]
     place = {arc: i for i, arc in enumerate(arcs)}
@@ -196,7 +197,7 @@ def _decide(
         apart = [[place[arc] for arc in one] for one in some]
         spread = np.diagonal(Q)[:, None] + np.diagonal(Q)[None] - 2.0 * Q
         first = apart[0][0]
-        if len(apart[0]) == 1:  # none is known: the one that the others are told best against
+        if len(apart[0]) == 1:  # none is known: the reference against which the others are best determined
             ends = [one[0] for one in apart]
             first = ends[int(np.argmin(np.median(spread[np.ix_(ends, ends)], axis=1)))]
         pairs += [(arcs[first], arcs[one[0]]) for one in apart if first not in one]
@@ -219,28 +220,28 @@ def _decide(
 
 @dataclass(frozen=True)
 class Held:
-    """What is held behind an epoch, and what was decided there; nothing of it changes."""
+    """Integers held after an epoch, and the decisions there; immutable."""
 
     known: Known = field(default_factory=Known)
-    odd: bool = False  # the epoch is not consistent with what is known
+    odd: bool = False  # the epoch is not consistent with the known integers
     found: tuple[tuple[Arc, Arc, int], ...] = ()  # differences that were found there
     let_go: bool = False  # of all that was known
-    suspects: frozenset[Arc] = frozenset()  # what was found, or is known, is consistent without these alone
-    anew: tuple[Arc, ...] = ()  # suspects twice, whose ambiguities begin anew
-    since: Mapping[Arc, float] = field(default_factory=dict)  # s, of arcs that began anew
+    suspects: frozenset[Arc] = frozenset()  # suspects: the integers are consistent only without these arcs
+    anew: tuple[Arc, ...] = ()  # arcs suspected twice, whose ambiguities are reset
+    since: Mapping[Arc, float] = field(default_factory=dict)  # s, start of the arcs that were reset
     fixed: bool = False
-    epoch: bool = False  # there are carriers
+    epoch: bool = False  # whether there are carrier phases
 
     def go_on(self) -> Held:
-        """The same behind a keyframe without carriers."""
+        """The same after a keyframe without carrier phases."""
         return replace(self, found=(), let_go=False, anew=(), epoch=False) if self.epoch else self
 
 
 def hold_on(before: Held, epochs: Epochs, k: int, here: Points, covariance: Callable[[], Array]) -> Held:
-    """Find integers by what is known at a keyframe; let go of all where two epochs in a row contradict them.
+    """Fix integers with the estimate at a keyframe; release all where two successive epochs contradict them.
 
-    Where two epochs in a row find integers that are consistent but for the same arcs, cycles have slipped there: their
-    estimates are of no arc, and begin anew.
+    Where the integers of two successive epochs are consistent except for the same arcs, undetected cycle slips occurred
+    there: these ambiguities are reset.
     """
     known, since = before.known, before.since
     if epochs.find_inconsistent(k, here, known):
@@ -275,18 +276,18 @@ def hold_on(before: Held, epochs: Epochs, k: int, here: Points, covariance: Call
 
 
 class _Causal:
-    """What the filter does at a keyframe: find integers, hold them, let go of those that do not hold."""
+    """Actions of the filter at a keyframe: fix integers, hold them, release contradicted ones."""
 
     def __init__(self, epochs: Epochs) -> None:
         self._epochs = epochs
-        self.known = {k: Known() for k in epochs.keyframes}  # behind each epoch
+        self.known = {k: Known() for k in epochs.keyframes}  # after each epoch
         self._unknown = {p.name: float(np.max(p.sigma)) for p in epochs.phase.parameters}
         self._held = Held()
-        self.anew: list[tuple[Arc, int]] = []  # arcs that begin anew, and at which keyframes: the first that is odd
-        self._before = -1  # keyframe of the epoch before
+        self.anew: list[tuple[Arc, int]] = []  # arcs that are reset, and the keyframes from which they are suspected
+        self._before = -1  # keyframe of the previous epoch
 
     def __call__(self, k: int, here: Points, P: Array) -> DecidedRows | None:
-        """Integers to hold from a keyframe on, and ambiguities that are not known any more."""
+        """Integers to hold from a keyframe on, and ambiguities to reset."""
         epochs = self._epochs
         if k not in epochs.active:
             return None
@@ -312,7 +313,7 @@ class _Causal:
 
 
 def _sweep(epochs: Epochs, smoothed: SmootherPass, known: Known) -> None:
-    """Look at all epochs, those with most arcs first."""
+    """Test all epochs, those with most arcs first."""
     tried: set[frozenset[frozenset[Arc]]] = set()
     values = np.concatenate([np.zeros((len(smoothed.values), DIM)), smoothed.values], axis=1)
     for k in sorted(epochs.keyframes, key=lambda k: -len(epochs.active[k])):
@@ -334,7 +335,7 @@ def _fix_one(points: Points, k: int) -> Points:
 
 
 def _hold_arcs(problem: Problem, phase: GnssPhase, epochs: Epochs, known: Known) -> Problem:
-    """A problem with rows for what is known: each arc is held to the first other where both are there at once."""
+    """A problem with rows for the known integers: each arc is held to the first other one at a common epoch."""
     rows: list[tuple[int, str, str, int]] = []
     held = Known()
     for k in epochs.keyframes:
@@ -363,7 +364,7 @@ def add_integers(problem: Problem, phase: GnssPhase, found: Sequence[tuple[int, 
 
 
 def _let_go(epochs: Epochs, smoothed: SmootherPass, known: Known) -> bool:
-    """Give up arcs that most of their epochs are not consistent with."""
+    """Release arcs that most of their epochs contradict."""
     seen: Counter[Arc] = Counter()
     odd: Counter[Arc] = Counter()
     for k in epochs.keyframes:

@@ -1,7 +1,7 @@
-"""Which arcs of carriers there are at each epoch, and what is known of their ambiguities as integers.
+"""Carrier-phase arcs at each epoch, and the integers known of their ambiguities.
 
-`graphnav.estimation.fixing` finds the integers; here they are kept, put together, and held against the carriers of an
-epoch.
+`graphnav.estimation.fixing` finds the integers; here they are stored, combined, and tested against the carrier phases
+of an epoch.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from graphnav.core.state import DIM
 from graphnav.estimation.solution import CarrierArcs
 from graphnav.estimation.solvers.linearise import Points, linearise
 
-ENOUGH = 4  # differences of an epoch that is fixed: one more than a position needs, so that they check each other
-_ALARM = 0.001  # of epochs with right integers that fail the test of consistency
-Arc = tuple[str, float]  # its ambiguity, and when it begins, s
+ENOUGH = 4  # differences of a fixed epoch: one more than a position needs, so that they check each other
+_ALARM = 0.001  # share of epochs with correct integers that fail the consistency test
+Arc = tuple[str, float]  # its ambiguity, and its start, s
 
 
 @dataclass
 class Known:
-    """Differences that have been found: each arc with an integer against the first of those it hangs together with."""
+    """Known differences: each arc with an integer relative to the first of its connected set."""
 
     of: dict[Arc, tuple[Arc, int]] = field(default_factory=dict)  # N_arc - N_first
     let_go: set[Arc] = field(default_factory=set)
@@ -36,11 +36,11 @@ class Known:
         return Known(self.of.copy(), self.let_go.copy())
 
     def find(self, arc: Arc) -> tuple[Arc, int]:
-        """The first arc of those that this one hangs together with, and the difference from it."""
+        """The first arc of the connected set of an arc, and the difference from it."""
         return self.of.get(arc, (arc, 0))
 
     def join(self, a: Arc, b: Arc, cycles: int) -> None:
-        """N_a - N_b is so many cycles."""
+        """Record that N_a - N_b is an integer."""
         (first, of_a), (other, of_b) = self.find(a), self.find(b)
         if first == other:
             return
@@ -49,7 +49,7 @@ class Known:
         self.of |= {first: (first, 0), other: (first, moved)}
 
     def forget(self, arc: Arc) -> None:
-        """It is not known any more; what hangs together through it still does."""
+        """Forget an arc; arcs connected through it stay connected."""
         root, _ = self.of.pop(arc, (None, 0))
         if root == arc:
             rest = [(other, n) for other, (first, n) in self.of.items() if first == arc]
@@ -58,7 +58,7 @@ class Known:
 
 
 class Epochs:
-    """Which arcs there are at each keyframe with carriers, and where their numbers stand."""
+    """Arcs at each keyframe with carrier phases, and the positions of their rows."""
 
     def __init__(self, phase: GnssPhase, columns: dict[str, slice], t: Array) -> None:
         self.phase, self._all_columns = phase, columns
@@ -76,7 +76,7 @@ class Epochs:
         self.last = {arc: float(t[k]) for arc, k in zip(arcs, phase.keyframe.tolist(), strict=True)}  # s
 
     def find_inconsistent(self, k: int, here: Points, known: Known) -> list[Arc]:
-        """Arcs with integers that an epoch is not consistent with, and is without them.
+        """Arcs with integers without which an inconsistent epoch is consistent.
 
         Parameters
         ----------
@@ -91,7 +91,7 @@ class Epochs:
         sets = [known.find(arcs[i])[0] for i in used]
         clocks = (np.array([sets.index(one) for one in sets])[:, None] == np.arange(len(sets))).astype(float)
         A = np.concatenate([rows.linear.jacobians["p"][used, 0], clocks[:, clocks.any(axis=0)]], axis=1)
-        # with the integers in place of the estimates; what they have in common is a clock's
+        # with the integers in place of the estimates; a common offset belongs to the clock
         at = np.array([self.columns[arcs[i][0]] for i in used]) - DIM
         off = np.array([known.find(arcs[i])[1] for i in used]) - here.values[0, at]
         r = rows.residual[used, 0] + self.phase.wavelength[own][used] * off
@@ -103,21 +103,21 @@ class Epochs:
             freedom = int(kept.sum()) - Q.shape[1]
             if freedom < 1 or left @ left <= 2.0 * gammaincinv(0.5 * freedom, 1.0 - _ALARM):
                 break
-            share = np.maximum(1.0 - np.sum(Q * Q, axis=1), 1e-9)  # of its own error that is left in a residual
+            share = np.maximum(1.0 - np.sum(Q * Q, axis=1), 1e-9)  # share of its own error that remains in a residual
             kept[np.flatnonzero(kept)[np.argmax(left**2 / share)]] = False
         return [arcs[i] for i in used[~kept]]
 
     def compute_lasting(
         self, k: int, until: Callable[[Arc], float], since: Mapping[Arc, float] | None = None
     ) -> dict[Arc, float]:
-        """Cycles^2 that reflections add to what ambiguities at an epoch are told to, beyond white noise.
+        """Variance, cycles^2, that time-correlated multipath adds to ambiguities at an epoch beyond white noise.
 
-        An ambiguity takes up whatever lasts as long as its arc, so no smoother sees it.
+        An ambiguity absorbs errors that last as long as its arc, so a smoother does not observe them.
 
         Parameters
         ----------
-        until : s, of the last of an arc's carriers that tell of it.
-        since : s, of the first, where that is not the arc's.
+        until : s, the last carrier phase of an arc in use.
+        since : s, the first, where that is not the start of the arc.
         """
         own, arcs = self.rows[k], self.active[k]
         duration = np.array([until(arc) - (since or {}).get(arc, arc[1]) for arc in arcs])
@@ -131,7 +131,7 @@ class Epochs:
         )
 
     def list_arcs(self, known: Mapping[int, Known]) -> CarrierArcs:
-        """The arcs, and where their ambiguities are held as integers, by what is known at each keyframe."""
+        """The arcs, and the epochs at which their ambiguities are held as integers."""
         phase = self.phase
         integer = [arc in known[k].of for k in self.keyframes for arc in self.active[k]]
         return CarrierArcs.from_rows(
@@ -143,7 +143,7 @@ class Epochs:
         return self._group[arc[0]] >= 0 and arc in self._whole
 
     def group_arcs(self, k: int, known: Known) -> dict[int, list[list[Arc]]]:
-        """By group, the arcs of an epoch, those together that hang together, the largest set first."""
+        """By group, the arcs of an epoch in connected sets, the largest first."""
         out: dict[int, dict[Arc, list[Arc]]] = {}
         for arc in self.active[k]:
             if self.can(arc) and arc not in known.let_go:

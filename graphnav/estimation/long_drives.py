@@ -27,7 +27,7 @@ from graphnav.recording import Recording, take_rows
 STRAIGHT, _STATES = 10_800.0, 44  # s solved at once at most: 3 GB at a keyframe a second and 44 error states
 PART = 3_600.0  # s of a part at most: twice the keyframes that the estimation of noise needs
 OVERLAP = (
-    # s: information of inertial sensors ten minutes ago is negligible (`graphnav.estimation.solvers.watch.OLDEST`)
+    # s: inertial information from ten minutes ago is negligible (`graphnav.estimation.solvers.watch.OLDEST`)
     600.0
 )
 
@@ -82,7 +82,7 @@ def _limit_length(recording: Recording, settings: Settings) -> float:
 
 
 def _is_told(recording: Recording, t: float) -> bool:
-    """Whether there are fixes throughout the overlap before a time (s), and their course determines the heading."""
+    """Whether fixes cover the overlap before a time (s), and their course determines the heading."""
     gnss = recording.gnss
     if gnss is None:
         return False
@@ -150,7 +150,7 @@ def share_covariances(joined: Solution) -> Solution:
 
 
 def crop_solutions(solutions: dict[str, Solution], share: Share) -> dict[str, Solution]:
-    """The solutions of a part restricted to its own span; what they have in common they keep in common."""
+    """The solutions of a part restricted to its own span; shared objects stay shared."""
     out: dict[str, Solution] = {}
     for name, one in solutions.items():
         out[name] = crop_solution(one, share, next((other.detections for other in out.values()), None))

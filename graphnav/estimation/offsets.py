@@ -1,5 +1,5 @@
-"""Offsets of stamps: a recording with its stamps moved by them, and whether where a drive begins and ends they are near
-enough to where the rows of fixes are linearised in them."""
+"""Stamp offsets: a recording with its stamps moved by them, and whether they are close enough to the linearisation point
+of the fixes' rows, at the start and the end of a drive."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ LINEAR_OFFSET = 0.3  # s from the linearisation point (`graphnav.estimation.stam
 
 
 def is_offset_far(problem: Problem, points: Points) -> bool:
-    """Whether an offset is far from where its rows are linearised, by points of all keyframes."""
+    """Whether an offset is far from the linearisation point of its rows, by points of all keyframes."""
     ends = list_end_rows(problem).values()
     return any(float(np.abs(row @ points.values[0]).max()) > LINEAR_OFFSET for row in ends)
 
 
 def list_end_rows(problem: Problem) -> dict[str, Array]:
-    """Rows (2, D-15) that make offsets of stamps of parameters, where the drive begins and where it ends, by the
-    parameter that an offset is without the rate of the clocks.
+    """Rows (2, D-15) that map parameters to stamp offsets at the start and the end of the drive, by the parameter of
+    the constant offset.
     """
     columns, out = problem.columns, {}
     for name in (TIME_OFFSET, VELOCITY_TIME_OFFSET):

@@ -160,8 +160,7 @@ def _run(
         notes.append(Note("pieces.parts", sentence))
     for part in parts:
         try:
-            # matrices here have thirty rows: threads for them cost more than the work, twenty times as much on a busy
-            # machine
+            # matrices here have thirty rows: threading costs more than the work, twenty times as much on a busy machine
             with threadpool_limits(limits=1, user_api="blas"):
                 attempt = partial(_solve, part.recording, frame, solvers, progress, clock)
                 solved = _solve_with_retry(attempt, settings, noise)
@@ -185,7 +184,7 @@ def _run(
     return joined
 
 
-@np.errstate(over="ignore", invalid="ignore", divide="ignore")  # what breaks down raises an error that says so
+@np.errstate(over="ignore", invalid="ignore", divide="ignore")  # breakdowns raise errors
 def _solve_with_retry(attempt: Attempt, settings: Settings, noise: NoiseModel | None) -> dict[str, Solution]:
     """An attempt; where a filter breaks down numerically, again with a simpler model or stated noise."""
     try:

@@ -63,7 +63,7 @@ from graphnav.recording import Recording
 Weigh = Callable[[Problem, Points], bool]
 
 _LINEAR_ATTITUDE = 0.1  # rad between linearisation point and smoothed attitude, up to which the smoother is used
-_SMOOTHINGS = 5  # of filter and smoother about what they found before; where that leads nowhere, a batch is solved
+_SMOOTHINGS = 5  # passes of filter and smoother about their previous points; without convergence a batch is solved
 _MOST_WRONG = 0.5  # share of excluded fixes, beyond which the start is wrong rather than the fixes
 
 
@@ -105,7 +105,7 @@ def prepare(
     Parameters
     ----------
     detections : where the platform stands.
-    noise : to be used as it is; estimated, or as stated if the settings say so, when None.
+    noise : used as it is; when None it is estimated, or stated, according to the settings.
     weigh : whether the evidence of a noise model that is estimated is wanted; never when None.
 
     Raises
@@ -217,7 +217,7 @@ def _find_noise(
             total = found.estimate.passes + later.estimate.passes
             found = min(found, later, key=lambda one: one.excluded_share).count(total)
         except EstimationError:
-            pass  # nothing moves later on
+            pass  # no motion later on
     if found.noise.excluded:
         without = builder.build_without(found.built, found.noise, parts=True)
         if without is not found.built:
@@ -226,7 +226,6 @@ def _find_noise(
             again = estimate_noise(found.base, without.aligned.until, found.estimate.noise, progress=progress)
             found = replace(found, estimate=again).count(total + again.passes)
     found = replace(found, estimate=estimate_disturbed_intervals(found.base, found.estimate))
-
     until = found.built.aligned.until
 
     def estimate(base: Problem, near: tuple[Points, Problem] | None) -> NoiseEstimate:
@@ -257,7 +256,7 @@ def _estimate_noise(
 ) -> _Found:
     """The noise model, with constants free that the drive contradicts, and without spans of wrong measurements.
 
-    Constants first: what is wrong of them is in all measurements, and would be taken for faults of some.
+    Constants are tested first: their errors are in all measurements, and would be taken for faults of some of them.
     """
 
     def estimate(base: Problem, near: tuple[Points, Problem] | None) -> NoiseEstimate:
@@ -270,8 +269,8 @@ def _estimate_noise(
 def _free_contradicted(builder: ProblemBuilder, found: _Found, estimate: Estimate) -> _Found:
     """Free the constants that the drive contradicts as stated, and no others, and estimate the noise model anew.
 
-    The same is returned where these are free already. To be asked again when all else that may be wrong is known: a
-    gyro that misses a turn looks like an arm, and so do fixes that are wrong and stamps that are still to be moved.
+    Where these are free already, the estimate stays. Tested again once all other faults are known: a gyro that misses a
+    turn looks like a wrong lever arm, and so do wrong fixes and stamps that are still to be moved.
     """
     base, before = found.built.problem, found.freed
     near = found.estimate.get_linearisation(found.base)
@@ -284,7 +283,7 @@ def _free_contradicted(builder: ProblemBuilder, found: _Found, estimate: Estimat
         if not are_same(freed, before, base):
             other = replace(found, freed=freed, estimate=estimate(free(base, freed), near))
             passes = passes + other.estimate.passes + Counter(filter=1)
-            # by other figures what is freed may lead to an optimum that is worse than the one with all as stated
+            # with other figures, freed constants may lead to a worse optimum than with all as stated
             if other.compute_evidence() < found.compute_evidence():
                 return found.count(passes)
             found, freed = other, update(base, other.estimate, freed)
@@ -339,7 +338,7 @@ def _relinearise(
             passes.update(filter=1)
             return ekf(problem, progress, aligned.until, known=smoothed), smoothed
         about = smoothed
-    from graphnav.estimation.factor_graph.batch import batch  # and GTSAM with it, which few runs of a filter need
+    from graphnav.estimation.factor_graph.batch import batch  # imports GTSAM, which few filter runs need
 
     states = smoothed.states
     if wheels:

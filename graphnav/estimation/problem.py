@@ -18,7 +18,7 @@ from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, Parameter, States
 from graphnav.imu.clipping import restore_peaks
-from graphnav.imu.dynamics import ImuFactors, scale_parameter
+from graphnav.imu.dynamics import ImuFactors, make_scale_parameter
 from graphnav.imu.preintegration import Intervals, preintegrate, preintegrate_unknown
 from graphnav.imu.samples import Samples, bridge_gaps
 from graphnav.imu.unresolved import add_coning, add_unresolved_motion
@@ -62,7 +62,7 @@ class Problem:
     @cached_property
     def parameters(self) -> dict[str, Parameter]:
         """The parameters estimated beside the states, by name."""
-        own = (*scale_parameter(self.recording), *(p for rows in self.constraints for p in rows.parameters))
+        own = (*make_scale_parameter(self.recording), *(p for rows in self.constraints for p in rows.parameters))
         return {p.name: p for p in own}
 
     @cached_property
@@ -125,8 +125,8 @@ def build_problem(
     times : (K,) keyframes, s, where they are given: measurements at other times are left out.
     speed : of the odometer, where it is known already.
     typical : (M, 3) m, the unit of the slow errors of the recording's fixes, where it is known already.
-    known : what intervals between keyframes say that were integrated before, by the time they end at.
-    highest : what the IMU has read at other times, as `graphnav.imu.clipping.find_highest` says.
+    known : intervals between keyframes that were integrated before, by their end times.
+    highest : highest readings of the IMU at other times, as of `graphnav.imu.clipping.find_highest`.
     complete : False leaves out the constraints that depend on later rows, for `Problem.complete`.
     parts_of_noise : keep what each noise figure contributes to the intervals' covariances, for
     `graphnav.estimation.noise`.

@@ -38,7 +38,7 @@ def compute_separation(
     Returns
     -------
     Separation
-        In the local east, north and up; NaN where later measurements tell next to nothing, as at the end.
+        In the local east, north and up; NaN where later measurements carry hardly any information, as at the end.
     """
     R = frame.R_ln(smoothed)
     apart = np.einsum("kij,kj->ki", R, forward - smoothed)

@@ -68,7 +68,7 @@ class Foreign(Solution):
         return replace(track, rph=None, sd_rph=None) if self.borrowed else track
 
     def track_at(self, t: Array) -> Trajectory:
-        """The trajectory at those of the times (M,) that it can be interpolated to."""
+        """The trajectory at those times (M,) at which it can be interpolated."""
         return interpolate(self.track, t, max_gap=_MAX_GAP)[0]
 
     def at(self, t: Array) -> tuple[Array, States, Array]:

@@ -18,7 +18,7 @@ estimate states no covariances between epochs. Here errors of position and headi
 which is exact for a filter without fixes, and for a smoother as far as later measurements carry no information about
 earlier states. The later contributions are the growth of the stated covariances. Where these shrink, as where a
 smoother knows the end of a walk better than its middle, the contribution is set to zero, and the covariance of all
-later epochs is larger than stated: a verdict on it is then lenient, and `propagate_fit` returns by how much.
+later epochs is larger than stated: a test against it is then lenient, and `propagate_fit` returns by how much.
 """
 
 from __future__ import annotations

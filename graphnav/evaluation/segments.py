@@ -33,10 +33,10 @@ class Relative:
 def compute_relative_errors(errors: Errors) -> tuple[Relative, ...]:
     """Relative errors of segments of 10, 20, 50, 100 ... m that begin at every scored epoch.
 
-    The displacement is compared in east and north, so that a heading which is off counts by what it makes of the
-    position. Lengths of which there are fewer than ten segments that do not overlap are left out; for more than that
-    the whole way is too short. The idea is that of the relative pose error (Sturm et al., "A benchmark for the
-    evaluation of RGB-D SLAM systems", 2012) and of KITTI's odometry benchmark (Geiger et al., 2012).
+    The displacement is compared in east and north, so that a heading error counts by its effect on the position.
+    Lengths with fewer than ten segments that do not overlap are left out. The idea is that of the relative pose error
+    (Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems", 2012) and of KITTI's odometry benchmark
+    (Geiger et al., 2012).
     """
     known = np.isfinite(errors.horizontal) & np.isfinite(errors.distance)
     if known.sum() < 2:

@@ -14,7 +14,7 @@ from graphnav.evaluation.metrics import Errors, scale_by_sigmas
 
 _TOO_SMALL, _CAUTIOUS = 1.5, 0.5  # error over sigma; what lies between is acceptable
 _FEWEST_EPOCHS = 10  # of a separation, to judge it
-PARTS = {"position": "height", "attitude": "heading"}  # judged by themselves as well
+PARTS = {"position": "height", "attitude": "heading"}  # also tested separately
 BY_CHANCE = 0.0027  # outside three standard deviations of a Gaussian
 
 
@@ -31,11 +31,11 @@ class BlockVerdict:
 
 
 def judge_sigmas(errors: Errors) -> tuple[BlockVerdict, ...]:
-    """Judge the sigmas of each block; blocks without errors or without sigmas are left out.
+    """Test the sigmas of each block; blocks without errors or without sigmas are left out.
 
     A sigma is too small where errors are more than 1.5 times as large and chance (three standard deviations) does not
     explain it for as many independent epochs. Where it may, as for an error that hardly changes and so counts once, it
-    is unclear. Height and heading are judged by themselves as well: an average over three axes would hide a wrong one.
+    is unclear. Height and heading are also tested separately: an average over three axes would hide a wrong one.
     """
     p, v, rph = scale_by_sigmas(errors)
     nees_p = errors.nees_p
@@ -67,7 +67,7 @@ def select_verdict(verdicts: Sequence[BlockVerdict], verdict: str) -> list[Block
 
 
 def find_separation(separation: Separation | None) -> BlockVerdict | None:
-    """The axis on which forward filter and later measurements are farthest apart, in sigmas, if that is no chance.
+    """The axis on which forward filter and later measurements are farthest apart, in sigmas, if that is significant.
 
     Both have the same model. Where it is wrong, as with a clock that drifts, axes that are not as stated or errors of
     fixes that last, each side fits it to its own measurements, and only their difference shows it.

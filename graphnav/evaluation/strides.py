@@ -53,7 +53,7 @@ def estimate_floor_sigma(recording: Recording, solution: Solution) -> float:
     return float(np.std([truth.xyz[rows, 2].mean() for rows in inside if rows.any()]))
 
 
-def walk_errors(recording: Recording, solution: Solution, truth_sigma: float = 0.0) -> WalkErrors:
+def compute_walk_errors(recording: Recording, solution: Solution, truth_sigma: float = 0.0) -> WalkErrors:
     """Errors of a walk against the recording's truth.
 
     Of a dense truth the NEES is of the point that it is of: with a lever arm fitted.

@@ -1,4 +1,4 @@
-"""Antennas of satellites by ANTEX 1.4: where their phase centres are from the centre of mass."""
+"""Satellite antennas from ANTEX 1.4 files: phase centre offsets and variations relative to the centre of mass."""
 
 from __future__ import annotations
 
@@ -17,24 +17,24 @@ _UNLIMITED = 1e12  # s
 
 @dataclass(frozen=True)
 class SatelliteAntenna:
-    """Of one satellite in one time, by its band."""
+    """Phase centre of one satellite over a span of validity, by frequency band."""
 
     begin: float  # s since the GPS epoch
     end: float
     offset: dict[int, Array]  # (3,) m, in the satellite's axes
-    variation: dict[int, Array] = field(default_factory=dict)  # (M,) m longer, at 0, 1, 2, ... deg off the nadir
+    variation: dict[int, Array] = field(default_factory=dict)  # (M,) m, longer, at nadir angles of 0, 1, 2, ... deg
 
 
 Antennas = dict[int, tuple[SatelliteAntenna, ...]]
 
 
 def read_antex(path: Path) -> Antennas:
-    """The satellites of an ANTEX file.
+    """Read the satellite antennas of an ANTEX file.
 
     Raises
     ------
     RecordingError
-        If it is none, or a field cannot be read, naming the line.
+        If it is not an ANTEX file, or a field cannot be read, naming the line.
     """
     lines = unpack_bytes(path).decode("latin-1").splitlines()
     if not lines or "ANTEX VERSION" not in lines[0]:
@@ -45,7 +45,7 @@ def read_antex(path: Path) -> Antennas:
     for number, line in enumerate(lines, 1):
         label = line[60:].strip() if line[:8] != "   NOAZI" else "NOAZI"
         try:
-            if label == "TYPE / SERIAL NO":  # not every antenna has a line before that says that it begins
+            if label == "TYPE / SERIAL NO":  # not every antenna is preceded by a START OF ANTENNA line
                 name, band, one = line[20:23].strip(), 0, SatelliteAntenna(-_UNLIMITED, _UNLIMITED, {})
             elif label == "VALID FROM":
                 one = replace(one, begin=_parse_date(line))
@@ -53,7 +53,7 @@ def read_antex(path: Path) -> Antennas:
                 one = replace(one, end=_parse_date(line))
             elif label == "ZEN1 / ZEN2 / DZEN":
                 angles = np.array([line[2:8], line[14:20]], dtype=float)
-            elif label in ("START OF FREQUENCY", "START OF FREQ RMS"):  # sigmas have the same lines
+            elif label in ("START OF FREQUENCY", "START OF FREQ RMS"):  # the sigmas have lines with the same labels
                 band = int(line[4:6]) if label == "START OF FREQUENCY" else 0
             elif label == "NORTH / EAST / UP" and band:
                 one.offset[band] = 1e-3 * np.array([line[0:10], line[10:20], line[20:30]], dtype=float)
@@ -73,7 +73,7 @@ def read_antex(path: Path) -> Antennas:
 def compute_antenna_paths(
     antennas: Antennas, satellite: Ids, frequencies: Array, bands: Array, gps: Array, axes: Array, e: Array
 ) -> Array:
-    """(N,) m that signals of the combination of two have longer ways than from the centre of mass; NaN if not known.
+    """(N,) m, extra path of a two-signal combination from the phase centres, over the centre of mass; NaN if unknown.
 
     Parameters
     ----------
@@ -105,7 +105,7 @@ def compute_antenna_paths(
 
 
 def compute_satellite_axes(place: Array, sun: Array) -> Array:
-    """(N, 3, 3) unit vectors x, y, z, as rows, of satellites that keep their panels to the Sun; m in e (N, 3) each."""
+    """(N, 3, 3) body axes x, y, z (rows) of satellites at (N, 3), m in e, in nominal yaw-steering attitude."""
     z = -place / np.linalg.norm(place, axis=1)[:, None]
     to = sun - place
     y = np.cross(z, to)
@@ -114,9 +114,9 @@ def compute_satellite_axes(place: Array, sun: Array) -> Array:
 
 
 def compute_wind_up(satellite: Ids, epoch: Array, axes: Array, e: Array, enu: Array) -> Array:
-    """(N,) cycles by which carriers have been wound up (Wu et al. 1993), continuous for each satellite.
+    """(N,) cycles of phase wind-up (Wu et al. 1993), continuous for each satellite.
 
-    The receiver's own turning is left out: it is the same for all and goes into its clock.
+    Rotation of the receiver's antenna is left out: it is common to all satellites and absorbed by the clock.
 
     Parameters
     ----------
@@ -141,7 +141,7 @@ def compute_wind_up(satellite: Ids, epoch: Array, axes: Array, e: Array, enu: Ar
 
 
 def compute_shapiro_delay(satellite: Array, antenna: Array) -> Array:
-    """(N,) m by which the Earth's gravity lengthens ranges (Shapiro; IERS Conventions 2010, equation 11.17)."""
+    """(N,) m, relativistic path range correction (Shapiro delay; IERS Conventions 2010, equation 11.17)."""
     r, s = np.linalg.norm(antenna, axis=1), np.linalg.norm(satellite, axis=1)
     between = np.linalg.norm(satellite - antenna, axis=1)
     return np.asarray(2.0 * 3.986004418e14 / C**2 * np.log((r + s + between) / (r + s - between)))
@@ -157,7 +157,7 @@ def _parse_date(line: str) -> float:
 
 
 def _parse_variation(line: str, begin: float, step: float) -> Array:
-    """(M,) m at whole degrees, of values (mm) that are so many degrees apart."""
+    """(M,) m at whole degrees, interpolated from values (mm) at a given spacing in degrees."""
     values = np.array([line[i : i + 8] for i in range(8, len(line.rstrip()), 8)], dtype=float)
     at = begin + step * np.arange(len(values))
     if not (step > 0.0 and len(at) and at[-1] <= 90.0 and np.isfinite(values).all()):

@@ -1,13 +1,13 @@
-"""Arcs of carriers: the stretches over which a receiver counts the cycles of a signal without losing one.
+"""Carrier-phase arcs: spans in which a receiver tracks a signal without a cycle slip.
 
-Within an arc a carrier is a range but for one unknown number of cycles, its ambiguity. A new arc begins where
+Within an arc the carrier phase is a range plus one constant, the ambiguity. A new arc begins where
 
-* the receiver flags a loss of lock, or says otherwise that half a cycle is open or is no more (RINEX 3.05, table A2),
-* the signal is absent for an epoch, or all are, unless its counter of lock time covers the gap,
+* the receiver flags a loss of lock, or its half-cycle flag changes (RINEX 3.05, table A2),
+* the signal, or every signal, is absent for an epoch, unless the lock time counter covers the gap,
 * the base station's arc of that signal ends,
-* the change since the epoch before is off by more than a quarter of a cycle from what those of all satellites agree
-  upon, a displacement and the clock: a slip is half a cycle at least, so beyond a quarter it is nearer than none,
-* there is such a change, and too few others agree, less than half, or not to within their sigmas: any may have slipped.
+* the change since the previous epoch deviates by more than a quarter of a cycle from the displacement and clock change
+  common to all satellites: a slip is at least half a cycle, so beyond a quarter a slip is the nearer explanation,
+* there is such a change, and fewer than half of the others agree to within their sigmas: any may have slipped.
 """
 
 from __future__ import annotations
@@ -24,27 +24,27 @@ from graphnav.gnss.sigmas import compute_carrier_difference_sigma
 from graphnav.gnss.signals import C, Ids, name_satellite, name_signal
 from graphnav.gnss.single_point import choose_coefficients, look
 
-_REWEIGHTINGS = 20  # of reweighting towards the least sum of absolute residuals
-_SPARE = 2  # rows beyond the unknowns that have to agree before others are held against them
-_ALARM = 0.001  # of epochs in which those without a slip do not agree within their sigmas
-_NOISE = 0.01  # m, of a difference of carriers: below it residuals weigh the same
+_REWEIGHTINGS = 20  # iterations of reweighting, for the least sum of absolute residuals
+_SPARE = 2  # least redundancy of the rows that others are tested against
+_ALARM = 0.001  # false alarm probability of the test whether the other rows agree
+_NOISE = 0.01  # m, of a carrier-phase difference: smaller residuals have equal weight
 
 
 @dataclass(frozen=True)
 class Arcs:
-    """Which arc each of N rows is of; a slot is a signal of a satellite."""
+    """The arc of each of N rows; a slot is one signal of one satellite."""
 
     slot: NDArray[np.intp]  # (N,)
-    arc: NDArray[np.intp]  # (N,) counted from 0 within its slot; -1 where there is no carrier
+    arc: NDArray[np.intp]  # (N,) counted from 0 within its slot; -1 without carrier phase
     names: tuple[str, ...]  # (S,) of the slots: "G05.1C"
     satellite: Ids  # (S,)
     signal: Ids  # (S,)
     begins: tuple[Array, ...]  # (S,) of (n,) s: first times of the arcs
-    slips: int  # that no flag tells
+    slips: int  # slips without a flag
 
     @property
     def begin(self) -> Array:
-        """(N,) s, of each row's arc; NaN where there is no carrier."""
+        """(N,) s, start of each row's arc; NaN without carrier phase."""
         out = np.full(len(self.arc), np.nan)
         for slot, begins in enumerate(self.begins):
             own = (self.slot == slot) & (self.arc >= 0)
@@ -55,13 +55,13 @@ class Arcs:
 def find_arcs(
     raw: RawGnss, still: bool = False, base_arc: NDArray[np.intp] | None = None, period: float | None = None
 ) -> Arcs:
-    """The arcs of a receiver's carriers.
+    """Find the arcs of a receiver's carrier phases.
 
     Parameters
     ----------
-    raw : all epochs and signals that the receiver has, with nominal antennas; rows that are left out later keep theirs.
-    still : the antenna stands at its nominal place, as that of a base station does.
-    base_arc : (N,) a number that changes for a slot where the base station's arc does.
+    raw : all epochs and signals of the receiver, with nominal antenna positions, before any rows are left out.
+    still : the antenna is fixed at its nominal position, as a base station's is.
+    base_arc : (N,) number of the base station's arc of the slot.
     period : s between epochs, where the series is too short to tell.
     """
     key = raw.satellite.astype(np.int64) * 1000 + raw.signal
@@ -96,7 +96,7 @@ def find_arcs(
 
 
 def build_arcs(begin: Array, slot: NDArray[np.intp], names: tuple[str, ...], satellite: Ids, signal: Ids) -> Arcs:
-    """The arcs of rows (N,) of which is known when their arc begins (s; NaN where there is no carrier)."""
+    """Number the arcs of rows (N,) from the start time of each row's arc (s; NaN without carrier phase)."""
     arc, begins = np.full(len(begin), -1), []
     for k in range(len(names)):
         own = np.flatnonzero((slot == k) & np.isfinite(begin))
@@ -118,7 +118,7 @@ def _name_slots(slots: NDArray[np.int64]) -> tuple[tuple[str, ...], Ids, Ids]:
 def _find_slips(
     raw: RawGnss, now: NDArray[np.intp], before: NDArray[np.intp], epoch: NDArray[np.intp], still: bool
 ) -> NDArray[np.bool_]:
-    """Which of the changes from rows `before` to rows `now` hold a slip."""
+    """Mask of the changes from rows `before` to rows `now` that contain a cycle slip."""
     if not len(now):
         return np.zeros(0, dtype=bool)
     geometry = look(raw, raw.antenna, choose_coefficients(raw))
@@ -128,7 +128,7 @@ def _find_slips(
     if len(raw.carrier_difference):
         off = off + raw.carrier_difference
     change = off[now] - off[before]
-    # rows of an epoch side by side; a receiver's clock and the displacement are what they have in common
+    # rows grouped by epoch; receiver clock and displacement are their common unknowns
     order = np.lexsort((raw.satellite[now], epoch[now]))
     epochs, of = np.unique(epoch[now[order]], return_inverse=True)
     place = np.arange(len(order)) - np.searchsorted(of, of)
@@ -140,7 +140,7 @@ def _find_slips(
         row[:, 1:] = -geometry.e[now[order]]
     usable = np.isfinite(change[order])
     A[of, place], y[of, place], w[of, place] = row, np.where(usable, change[order], 0.0), usable
-    # the clock's change may be 1e5 m, which would leave the weights without digits
+    # the clock may change by 1e5 m, at which the weights would lose all digits
     middle = np.array([np.median(one[some]) if some.any() else 0.0 for one, some in zip(y, w > 0.0, strict=True)])
     y = y - middle[:, None]
     r = y
@@ -156,13 +156,13 @@ def _find_slips(
     sigma = np.ones(shape)
     sigma[of, place] = _compute_change_sigma(raw, geometry.elevation, wavelength)[now[order]]
     freedom = near.sum(axis=1) - unknowns
-    # of the rows that agree with each other by least squares, which are no further off than by the sum of absolutes
+    # least squares over the rows that agree, whose residuals are no larger than those of the L1 solution
     weight = np.where(near, sigma**-2.0, 0.0)
     N = np.einsum("esi,es,esj->eij", A, weight, A, optimize=True) + 1e-9 * np.eye(unknowns)
     x = np.linalg.solve(N, np.einsum("esi,es->ei", A, weight * y)[..., None])[..., 0]
     left = np.sum(weight * (y - np.einsum("esi,ei->es", A, x)) ** 2, axis=1)
     told = (freedom >= _SPARE) & (left <= 2.0 * gammaincinv(0.5 * np.maximum(freedom, 1), 1.0 - _ALARM))
-    told &= near.sum(axis=1) > far.sum(axis=1)  # half wrong is what a sum of absolute residuals stands at most
+    told &= near.sum(axis=1) > far.sum(axis=1)  # L1 estimation has a breakdown point of one half
     every = far.any(axis=1) & ~told
     out = np.zeros(len(now), dtype=bool)
     out[order] = (far | (every[:, None] & (w > 0.0)))[of, place]
@@ -170,6 +170,6 @@ def _find_slips(
 
 
 def _compute_change_sigma(raw: RawGnss, elevation: Array, wavelength: Array) -> Array:
-    """(N,) m, 1-sigma of what a carrier, or its difference from the base's, changes by without a slip."""
+    """(N,) m, 1-sigma of the change of a carrier phase, or of its difference from the base's, without a slip."""
     receivers = 2.0 if len(raw.carrier_difference) else 1.0
     return np.asarray(np.sqrt(receivers) * compute_carrier_difference_sigma(raw.cn0, elevation, wavelength))

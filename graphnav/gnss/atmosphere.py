@@ -12,7 +12,7 @@ from graphnav.core import earth
 from graphnav.core.rotation import Array
 from graphnav.gnss.signals import C
 
-# where no coefficients are broadcast: Klobuchar's constant part, 5 ns at the zenith, which is all there is at night
+# without broadcast coefficients: Klobuchar's constant night-time delay, 5 ns at the zenith
 NIGHT = np.zeros((2, 4))
 _HUMIDITY = 0.7
 _CIRCLE = np.pi  # rad of a semicircle
@@ -26,8 +26,8 @@ def compute_directions(antenna: Array, satellite: Array) -> tuple[Array, Array]:
     return np.arctan2(enu[:, 0], enu[:, 1]), np.arctan2(enu[:, 2], flat)
 
 
-def klobuchar(coefficients: Array, gps: Array, llh: Array, azimuth: Array, elevation: Array) -> Array:
-    """(N,) delay of the code on L1, m.
+def compute_klobuchar_delay(coefficients: Array, gps: Array, llh: Array, azimuth: Array, elevation: Array) -> Array:
+    """Ionospheric delay of the code on L1, (N,) m, by Klobuchar's model.
 
     Parameters
     ----------
@@ -41,7 +41,7 @@ def klobuchar(coefficients: Array, gps: Array, llh: Array, azimuth: Array, eleva
     lon = llh[:, 1] / _CIRCLE + angle * np.sin(azimuth) / np.cos(lat * _CIRCLE)
     magnetic = lat + 0.064 * np.cos((lon - 1.617) * _CIRCLE)
     local = np.mod(43200.0 * lon + gps, 86400.0)
-    slant = obliquity(elevation)
+    slant = compute_obliquity(elevation)
     powers = magnetic[:, None] ** np.arange(4)
     amplitude = np.maximum(powers @ coefficients[0], 0.0)
     period = np.maximum(powers @ coefficients[1], 72000.0)
@@ -50,13 +50,13 @@ def klobuchar(coefficients: Array, gps: Array, llh: Array, azimuth: Array, eleva
     return np.asarray(C * slant * np.where(np.abs(x) < 1.57, day, 5e-9))
 
 
-def obliquity(elevation: Array) -> Array:
-    """(N,) delay of the ionosphere at elevations (N,), rad, over that at the zenith."""
+def compute_obliquity(elevation: Array) -> Array:
+    """Ionospheric mapping function at elevations (N,), rad: slant delay over zenith delay."""
     return np.asarray(1.0 + 16.0 * (0.53 - np.maximum(elevation, 0.0) / _CIRCLE) ** 3)
 
 
-def saastamoinen(llh: Array, elevation: Array) -> Array:
-    """(N,) delay of the troposphere, m, at elevations (N,), rad; 0 below the horizon and outside the troposphere."""
+def compute_saastamoinen_delay(llh: Array, elevation: Array) -> Array:
+    """Tropospheric delay, (N,) m, at elevations (N,), rad; 0 below the horizon and above the troposphere."""
     height = np.clip(llh[:, 2], 0.0, 10000.0)
     pressure = 1013.25 * (1.0 - 2.2557e-5 * height) ** 5.2568  # hPa
     kelvin = 15.0 - 6.5e-3 * height + 273.16
@@ -71,7 +71,7 @@ def saastamoinen(llh: Array, elevation: Array) -> Array:
 
 
 # Niell (1996), "Global mapping functions for the atmosphere delay at radio wavelengths", tables 3 and 4: a, b, c by
-# latitudes of 15, 30, 45, 60, 75 degrees; of the dry part its mean and how far it goes with the season, and the wet
+# latitude 15, 30, 45, 60, 75 degrees; mean and seasonal amplitude of the dry part, and the wet
 _LATITUDES = np.array([15.0, 30.0, 45.0, 60.0, 75.0])
 _DRY_MEAN = np.array([
     [1.2769934e-3, 1.2683230e-3, 1.2465397e-3, 1.2196049e-3, 1.2045996e-3],
@@ -89,21 +89,21 @@ _WET = np.array([
     [4.3472961e-2, 4.6729510e-2, 4.3908931e-2, 4.4626982e-2, 5.4736038e-2],
 ])  # fmt: skip
 _NIELL_HEIGHT = np.array([2.53e-5, 5.49e-3, 1.14e-3])
-_YEAR, _COLDEST = 365.25, 28.0  # days; of the year, on the northern half
+_YEAR, _COLDEST = 365.25, 28.0  # days of a year; day of minimum temperature, northern hemisphere
 
 
 def compute_zenith_delays(llh: Array) -> tuple[Array, Array]:
-    """Delays (N,) of the dry and the wet troposphere at the zenith, m, as `saastamoinen` has them."""
+    """Delays (N,) of the dry and the wet troposphere at the zenith, m, as `compute_saastamoinen_delay` has them."""
     upright = np.full(len(llh), np.pi / 2.0)
-    whole = saastamoinen(llh, upright)
+    whole = compute_saastamoinen_delay(llh, upright)
     height = np.clip(llh[:, 2], 0.0, 10000.0)
     pressure = 1013.25 * (1.0 - 2.2557e-5 * height) ** 5.2568
     dry = 0.0022768 * pressure / (1.0 - 0.00266 * np.cos(2.0 * llh[:, 0]) - 0.00028 * height / 1e3)
     return dry, whole - dry
 
 
-def niell(llh: Array, elevation: Array, day: Array) -> tuple[Array, Array]:
-    """How the dry and the wet delay (N,) grow from the zenith to elevations (N,), rad; `day` (N,) of the year."""
+def compute_niell_mapping(llh: Array, elevation: Array, day: Array) -> tuple[Array, Array]:
+    """Dry and wet mapping functions (N,) of Niell at elevations (N,), rad; `day` (N,) of the year."""
     lat = np.degrees(np.abs(llh[:, 0]))
     season = np.cos(2.0 * np.pi * ((day - _COLDEST) / _YEAR + np.where(llh[:, 0] < 0.0, 0.5, 0.0)))
     sin = np.sin(np.maximum(elevation, np.radians(1.0)))

@@ -1,4 +1,4 @@
-"""Carriers from epoch to epoch: which pairs of observations are of one count of cycles and one ephemeris."""
+"""Time-differenced carrier phases: pairs of observations of one arc and one ephemeris."""
 
 from __future__ import annotations
 
@@ -9,21 +9,21 @@ from graphnav.gnss.arcs import find_arcs
 from graphnav.gnss.series import RawGnss
 from graphnav.gnss.signals import C
 
-_APART = 2.5  # periods, at most: beyond it is a gap
-# m and m/s^3, of a satellite's way between epochs against the mean of its velocities: rounding, and a third derivative
-# of 1e-4 m/s^3 over 12; more is another ephemeris, whose orbit and clock are apart from those before
+_APART = 2.5  # periods between the two epochs at most
+# m and m/s^3: largest departure of a satellite's displacement from the trapezoidal rule on its velocities, from
+# rounding and from a third derivative of 1e-4 m/s^3 (over 12). A larger one is the step from one ephemeris to the next
 _JUMP, _THIRD = 2e-3, 1e-5
 
 
 def pair_consecutive(
     raw: RawGnss, whole: RawGnss, period: float | None = None
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Rows (N,) and (N,) of an arc at one epoch and the next.
+    """Rows (N,) and (N,) of one arc at successive epochs.
 
     Parameters
     ----------
     raw : some of the rows of `whole`, with epochs left out or all.
-    whole : all that the receiver had: a slip at an epoch that is left out counts.
+    whole : all rows of the receiver: a slip at an epoch that is left out counts, too.
     period : s between epochs, where the series is too short to tell.
     """
     arcs, at = find_arcs(whole), find_rows(raw, whole)
@@ -54,12 +54,12 @@ def pair_consecutive(
 
 
 def number_epochs(raw: RawGnss) -> NDArray[np.intp]:
-    """(N,) number of each row's epoch among those that are used; -1 for one that changes are not counted to."""
+    """(N,) number of each row's epoch among those in use; -1 for epochs that are not differenced."""
     return raw.number if len(raw.number) else raw.epochs[1]
 
 
 def find_rows(raw: RawGnss, whole: RawGnss) -> NDArray[np.intp]:
-    """(N,) where in a series the rows of a part of it are."""
+    """(N,) indices in a series of the rows of a part of it."""
     epochs = np.unique(whole.t)
 
     def make_keys(one: RawGnss) -> NDArray[np.int64]:

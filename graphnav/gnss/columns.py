@@ -1,4 +1,4 @@
-"""Observations of a table of numbers: GPS, and QZSS where a column says so, on L1 C/A."""
+"""Observations from a numerical table: L1 C/A of GPS, and of QZSS where a column marks it."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ OPTIONAL = ("qzss", "carrier", "doppler", "range_rate", "cn0")
 
 
 def make_observations(columns: Mapping[str, Array], zero: float, name: str) -> Observations:
-    """The observations of columns (N,).
+    """Make observations from columns (N,).
 
     Parameters
     ----------
-    columns : t (s), prn, code (m), and where there are any qzss (0 or 1), carrier (cycles), doppler (Hz) or range_rate
-        (m/s), cn0 (dB-Hz).
+    columns : t (s), prn, code (m); optional qzss (0 or 1), carrier (cycles), doppler (Hz) or range_rate (m/s), cn0
+        (dB-Hz).
     zero : s since the GPS epoch at t = 0.
     """
     t, n = columns["t"], len(columns["t"])

@@ -1,11 +1,11 @@
-"""What the codes of a base station at a known place are wrong by, for the rover's codes of the same satellites.
+"""Differential corrections for the rover's observations, from a base station at a known position.
 
-Orbits, clocks and the atmosphere do nearly the same to both; models are applied to both first, so that what differs
-between the two, height above all, is taken care of. The base's clock is taken off by a median over its satellites of
-each epoch; what is left of it is the same for all of them, codes and carriers, and goes into the rover's.
+Errors of orbits, satellite clocks and atmosphere are nearly common to both. The atmospheric models are applied to both
+first, because of the difference in height. The base's receiver clock is removed as the median over the satellites of an
+epoch; its residual is common to all codes and carrier phases and is absorbed by the rover's clock.
 
-Carriers of the base are drawn through in the same way, but only within an arc: what a rover's carrier is then off by
-is the difference of two ambiguities, and ends with the arc of either.
+The base's carrier phases are interpolated like its codes, but only within an arc: a differenced carrier phase has the
+difference of both ambiguities, and its arc ends with that of either receiver.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from graphnav.gnss.series import RawGnss, compute_epoch_medians
 from graphnav.gnss.signals import C
 from graphnav.gnss.single_point import choose_coefficients, look
 
-_LONGEST_BASE_GAP = 15.0  # s between a base's epochs that a line is drawn through its carriers
-_LONGEST_CODE_GAP = 60.0  # s, through its codes: the clocks of satellites leave it by less than codes are good to
-_SAME_EPOCH = 2e-3  # s: two receivers that keep their clocks within a millisecond of the nominal epoch
-_LEAST_ELEVATION = np.radians(5.0)  # elevation of a base's satellites
+_LONGEST_BASE_GAP = 15.0  # s between base epochs, largest over which its carrier phases are interpolated linearly
+_LONGEST_CODE_GAP = 60.0  # s, the same of its codes: satellite clocks depart from a line by less than code noise
+_SAME_EPOCH = 2e-3  # s: both receivers keep their clocks within a millisecond of the nominal epoch
+_LEAST_ELEVATION = np.radians(5.0)  # elevation mask of the base
 
 
 def add_differences(rover: RawGnss, base: RawGnss, position: Array) -> tuple[RawGnss, tuple[str, ...]]:
-    """The rover's series with what is to be added to its codes, and remarks.
+    """The rover's series with the corrections to its codes and carrier phases, and remarks.
 
     Parameters
     ----------
@@ -60,7 +60,7 @@ def add_differences(rover: RawGnss, base: RawGnss, position: Array) -> tuple[Raw
             )
         if (satellite, signal) in alike:
             there &= base.signal == signal
-        else:  # another code on the same carrier: apart by a constant, which is of all satellites of the system
+        else:  # another code on the same carrier: its bias is common to all satellites of the system
             some = base.signal[there & (base.signal // 100 == signal // 100)]
             there &= base.signal == (some[0] if len(some) else -1)
         if there.sum() < 2:
@@ -78,10 +78,10 @@ def add_differences(rover: RawGnss, base: RawGnss, position: Array) -> tuple[Raw
 
 
 def _find_partner(base: RawGnss, arc: NDArray[np.intp], system: int, signal: int) -> int:
-    """The base's signal whose carriers stand against those of a rover's signal, the same for all of a system.
+    """Choose the base's signal to difference a rover's signal with, one for all satellites of a system.
 
-    The same one, else that of the same frequency that the base has most of: by how much of a cycle they are apart is
-    then the same for all satellites, and in none of the differences between these.
+    The same signal, else the most frequent one of the base on the same frequency: the fractional phase bias between the
+    two is then common to all satellites and cancels in differences between satellites.
     """
     own = base.signal[(base.satellite // 100 == system) & (base.signal // 100 == signal // 100) & (arc >= 0)]
     if not len(own) or np.any(own == signal):
@@ -91,9 +91,9 @@ def _find_partner(base: RawGnss, arc: NDArray[np.intp], system: int, signal: int
 
 
 def _draw_within_arcs(t: Array, at: Array, value: Array, arc: NDArray[np.intp]) -> tuple[Array, NDArray[np.intp]]:
-    """Values (N,) on lines between times of one arc, and that arc; NaN and -1 between two arcs and far from any time.
+    """Linear interpolation of values (N,) within arcs, and the arc; NaN and -1 between arcs and far from any epoch.
 
-    At a base's own epoch, but for the milliseconds that clocks are apart by, its value holds without a line.
+    At an epoch of the base, to within the milliseconds between the clocks, its value is taken as it is.
     """
     right = np.clip(np.searchsorted(at, t), 1, len(at) - 1)
     nearest = np.where(np.abs(at[right - 1] - t) < np.abs(at[right] - t), right - 1, right)
@@ -106,7 +106,7 @@ def _draw_within_arcs(t: Array, at: Array, value: Array, arc: NDArray[np.intp]) 
 
 
 def _interpolate(t: Array, at: Array, value: Array) -> Array:
-    """(N,) values on lines between times that are near enough, NaN elsewhere."""
+    """(N,) values, interpolated linearly across short steps, NaN elsewhere."""
     k = np.clip(np.searchsorted(at, t), 1, len(at) - 1)
     out = np.interp(t, at, value)
     near = (

@@ -1,4 +1,4 @@
-"""Where satellites are, how they move and what their clocks read, from broadcast ephemerides, for all rows at once.
+"""Satellite positions, velocities and clocks from broadcast ephemerides, for all rows at once.
 
 GPS, Galileo, BeiDou and QZSS broadcast Kepler elements with corrections (IS-GPS-200N, 20.3.3.4.3 and table 20-IV;
 Galileo OS SIS ICD 2.1, section 5.1; BDS-SIS-ICD-B1I 3.0, section 5.2.4.12, whose geostationary satellites are in a
@@ -27,7 +27,7 @@ _OLDEST_EPHEMERIS = {
     QZSS: 7201.0,
     GLONASS: 1800.0,
 }  # s from toe; RTKLIB's limits
-_TILT = np.radians(5.0)  # of the frame of geostationary BeiDou satellites
+_TILT = np.radians(5.0)  # inclination of the frame of geostationary BeiDou satellites
 _MU_R, _J2, _RATE_R, _RADIUS_R = 3.9860044e14, 1.0826257e-3, 7.292115e-5, 6378136.0  # PZ-90
 _INTEGRATION_STEP = 60.0  # s at most, of the integration of GLONASS orbits
 
@@ -89,14 +89,14 @@ class Placed:
 
     @staticmethod
     def unknown(n: int) -> Placed:
-        """Nothing known."""
+        """All rows unknown."""
         one = np.full(n, np.nan)
         return Placed(np.full((n, 3), np.nan), np.full((n, 3), np.nan), one, one.copy())
 
 
 @dataclass(frozen=True)
 class Ephemerides:
-    """All that was broadcast, by satellite and toe."""
+    """Broadcast ephemerides of all satellites, by satellite and toe."""
 
     kepler: dict[str, Array]  # fields of `Kepler`, (M,) or (M, k)
     glonass: dict[str, Array]
@@ -107,7 +107,7 @@ class Ephemerides:
     def of(
         kepler: list[Kepler], glonass: list[Glonass], klobuchar: Array | None = None, remarks: tuple[str, ...] = ()
     ) -> Ephemerides:
-        """From single messages, in any order; what was sent twice is kept once."""
+        """From single messages, in any order; repeated ones are kept once."""
         same = {(k.satellite, k.toe, k.toc, k.fnav): k for k in kepler}
         alike = {(g.satellite, g.toe): g for g in glonass}
         return Ephemerides(
@@ -118,7 +118,7 @@ class Ephemerides:
         )
 
     def join(self, other: Ephemerides) -> Ephemerides:
-        """These and others; of the same satellite and toe these."""
+        """These and others; where satellite and toe are the same, these."""
         kepler = [
             Kepler(**{n: v[k] for n, v in one.kepler.items()})
             for one in (other, self)
@@ -140,20 +140,20 @@ class Ephemerides:
 
     @property
     def satellites(self) -> set[int]:
-        """Those that have an ephemeris."""
+        """Satellites that have an ephemeris."""
         return {int(s) for s in (*self.kepler["satellite"], *self.glonass["satellite"])}
 
     @property
     def unhealthy(self) -> set[int]:
-        """Those that are said to be unhealthy in all of their ephemerides."""
+        """Satellites marked unhealthy in all of their ephemerides."""
         some = [(one["satellite"], one["healthy"]) for one in (self.kepler, self.glonass)]
         bad = {int(x) for s, h in some for x in s[~h.astype(bool)]}
         return bad - {int(x) for s, h in some for x in s[h.astype(bool)]}
 
     def choose(self, satellite: Ids, t: Array, zero: float) -> NDArray[np.intp]:
-        """(N,) the ephemeris of each row: that whose toe is nearest, of Galileo the latest I/NAV before; -1 for none.
+        """(N,) the ephemeris of each row: nearest in toe, for Galileo the latest I/NAV before; -1 for none.
 
-        Numbers beyond those of the Kepler ephemerides are of GLONASS.
+        Indices beyond the Kepler ephemerides are of GLONASS.
         """
         out = np.full(len(t), -1, dtype=np.intp)
         M = len(self.kepler["toe"])
@@ -165,7 +165,7 @@ class Ephemerides:
             if not len(which):
                 continue
             age = t[own][:, None] - (source["toe"][which] - zero)
-            far = np.abs(np.round(age))  # of two as near as each other to the second the later, as RTKLIB has it
+            far = np.abs(np.round(age))  # of two equally near, to the second, the later, as in RTKLIB
             if one // 100 == GALILEO:
                 far = np.where(age < 0.0, far + _OLDEST_EPHEMERIS[GALILEO], far)
             best = far.shape[1] - 1 - np.argmin(far[:, ::-1], axis=1)
@@ -191,9 +191,9 @@ class Ephemerides:
         return out
 
     def compute_delay(self, satellite: Ids, signal: Ids, frequency: Array, t: Array, zero: float) -> Array:
-        """(N,) group delay of a signal against the one that the broadcast clock is of, s; to be taken off the clock.
+        """(N,) s, group delay of a signal relative to the broadcast clock's; to be subtracted from the clock.
 
-        TGD and BGD of the ICDs named above, scaled by frequency; of signals about which they say nothing it is 0.
+        TGD and BGD of the ICDs named above, scaled by frequency; 0 for signals that they do not cover.
         """
         which = self.choose(satellite, t, zero)
         known = (which >= 0) & (which < len(self.kepler["toe"]))
@@ -214,7 +214,7 @@ class Ephemerides:
         return out
 
     def _compute_orbit(self, k: NDArray[np.intp], t: Array, zero: float) -> dict[str, Array]:
-        """At times of transmission by the satellite's clock, which is off by less than a millisecond."""
+        """Orbit at times of transmission by the satellite's clock, which is off by less than a millisecond."""
         eph = {name: value[k] for name, value in self.kepler.items()}
         system = find_system(eph["satellite"])
         mu, rate = (np.select([system == s for s in table], list(table.values())) for table in (_MU, _OMEGA))
@@ -314,7 +314,7 @@ def _turn_about_x(x: Array) -> Array:
 
 
 def rotate_earth(p: Array, seconds: Array) -> Array:
-    """Earth-fixed coordinates (N, 3) of one time in the Earth-fixed frame so many seconds (N,) later."""
+    """Earth-fixed coordinates (N, 3) in the Earth-fixed frame of a time (N,) s later."""
     return _turn_about_z(p, OMEGA_WGS84 * seconds)
 
 

@@ -19,7 +19,7 @@ _FIRST_DATE, _LAST_DATE = (
 
 
 def unpack_bytes(path: Path) -> bytes:
-    """The content of a file, whatever it is packed with.
+    """The content of a file, unpacked if it is compressed.
 
     Raises
     ------
@@ -37,7 +37,7 @@ def unpack_bytes(path: Path) -> bytes:
             ) from None
         try:
             data = hatanaka.decompress(data)
-        except Exception as error:  # its own kinds, and those of the packers it calls
+        except Exception as error:  # its own exceptions, and those of the decompressors it calls
             raise RecordingError(f"{path}: cannot be unpacked ({str(error)[:80]})", key="file.damaged") from None
         files.check_size(path, len(data))
     if not data.strip():
@@ -46,7 +46,7 @@ def unpack_bytes(path: Path) -> bytes:
 
 
 class Lines:
-    """Text as an array of bytes, with where its lines begin and how long they are."""
+    """Text as an array of bytes, with the offsets and lengths of its lines."""
 
     def __init__(self, data: bytes) -> None:
         self.data = np.frombuffer(data, dtype=np.uint8)
@@ -78,9 +78,9 @@ class Lines:
 
 
 def find_moved_points(block: NDArray[np.uint8]) -> NDArray[np.bool_]:
-    """(n, m) whether the decimal point of a field (n, m, width) stands elsewhere than in most of its column.
+    """(n, m) whether the decimal point of a field (n, m, width) is not where most of its column have it.
 
-    In a line that has lost a character or has one more, fields are parts of two numbers.
+    In a line with a missing or extra character, fields are parts of two numbers.
     """
     there = block == ord(".")
     at, told = there.argmax(axis=-1), there.any(axis=-1)
@@ -97,7 +97,7 @@ def parse_numbers(block: NDArray[np.uint8], width: int) -> Array:
         If a field is no number.
     """
     n, total = block.shape
-    if (block == ord("_")).any():  # which Python reads over
+    if (block == ord("_")).any():  # which Python's float accepts
         raise ValueError
     cells = np.ascontiguousarray(block).view(f"S{width}").reshape(n, total // width)
     blank = np.all(block.reshape(n, -1, width) == 32, axis=-1)
@@ -110,7 +110,7 @@ def parse_numbers(block: NDArray[np.uint8], width: int) -> Array:
 
 
 def count_days(fields: Array) -> tuple[NDArray[np.datetime64], NDArray[np.bool_]]:
-    """(n,) days of dates (n, 6), year to second, and which of them are dates that a receiver may have had."""
+    """(n,) day numbers of dates (n, 6), year to second, and a mask of plausible ones."""
     with np.errstate(invalid="ignore"):
         good = np.all((fields >= _FIRST_DATE) & (fields <= _LAST_DATE), axis=1)
         good &= np.all(fields[:, :5] == np.floor(fields[:, :5]), axis=1)

@@ -1,8 +1,8 @@
-"""Integer least squares: the whole numbers that an estimate with a covariance is nearest to.
+"""Integer least squares: the integer vectors nearest to a float estimate in the metric of its covariance.
 
-The LAMBDA method (Teunissen 1995): a unimodular Z makes the numbers nearly independent, from Q = L^T D L with L unit
-lower triangular, by integer Gauss transformations and permutations that sort D (de Jonge and Tiberius 1996; Chang, Yang
-and Zhou 2005); then a search through the ellipsoid, nearest first, which shrinks with what it finds.
+The LAMBDA method (Teunissen 1995): a unimodular Z makes the ambiguities nearly uncorrelated, from Q = L^T D L with L
+unit lower triangular, by integer Gauss transformations and permutations that sort D (de Jonge and Tiberius 1996; Chang,
+Yang and Zhou 2005); then a search through an ellipsoid, nearest first, which shrinks with every candidate.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class Nearest:
 
     @property
     def ratio(self) -> float:
-        """How much farther the second is than the best."""
+        """Ratio of the squared distances of second best and best."""
         return self.distance_second / max(self.distance, 1e-12)
 
 
@@ -44,12 +44,12 @@ class Decorrelated:
 
     @property
     def success(self) -> float:
-        """Probability that rounding one after the other is right, a bound from below (Teunissen 1998)."""
+        """Success rate of integer bootstrapping, a lower bound for integer least squares (Teunissen 1998)."""
         return float(np.prod(2.0 * ndtr(0.5 / np.sqrt(self.D)) - 1.0))
 
 
 def decorrelate(Q: Array) -> Decorrelated:
-    """Integers with a covariance Q (n, n) made nearly independent.
+    """Decorrelate ambiguities of covariance Q (n, n) by the LAMBDA transformation.
 
     Raises
     ------
@@ -67,7 +67,7 @@ def decorrelate(Q: Array) -> Decorrelated:
 
 @compile_once
 def _reduce(L: Array, D: Array, Z: Integers) -> None:
-    """Transform L, D and Z, in place, until D is sorted as far as it can be."""
+    """Transform L, D and Z in place until D is sorted as far as possible."""
     n = len(D)
     j = untouched = n - 2
     while j >= 0:
@@ -93,8 +93,8 @@ def _reduce(L: Array, D: Array, Z: Integers) -> None:
 
 
 def find_nearest(a: Array, found: Decorrelated) -> Nearest:
-    """The two vectors of integers nearest to an estimate a (n,) whose covariance was decorrelated."""
-    whole = np.floor(a)  # the search needs only what is left of cycles that may be millions
+    """Find the two integer vectors nearest to a float estimate a (n,) whose covariance was decorrelated."""
+    whole = np.floor(a)  # only the fractional part is searched: ambiguities may be millions of cycles
     z = (a - whole) @ found.Z
     first, second = _search(z, found.L, found.D)
     back = np.linalg.inv(found.Z.astype(float)).T
@@ -110,7 +110,7 @@ def _search(z: Array, L: Array, D: Array) -> tuple[tuple[float, list[int]], tupl
     n = len(z)
     weight, own = (1.0 / D).tolist(), z.tolist()
     centre, given = own.copy(), [0] * n
-    step, reached = [0] * n, [0.0] * (n + 1)  # reached[k]: distance of levels k and above
+    step, reached = [0] * n, [0.0] * (n + 1)  # reached[k]: squared distance accumulated over levels k and above
     best: list[tuple[float, list[int]]] = []
     columns = [L[k + 1 :, k].tolist() for k in range(n)]
 

@@ -1,4 +1,4 @@
-"""A rover's files to its series, with times, places and clocks of its own single-point solutions."""
+"""From a rover's files to its series, with times, positions and clocks from its own single-point solutions."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ from graphnav.gnss.signals import C, name_signal
 from graphnav.gnss.single_point import SinglePoint, solve
 from graphnav.gnss.ubx import is_ubx, parse_ubx
 
-_ROUGH_EPOCHS = 50  # epochs that a rough place is looked for in
-_BASE_OFF = 10.0  # 1-sigma of a base's single-point position that it may be from the stated one
-_LARGEST_TYPICAL_CODE = 1e8  # m, of codes: twice as far as satellites are
+_ROUGH_EPOCHS = 50  # epochs from which an approximate position is computed
+_BASE_OFF = 10.0  # largest offset of a base's single-point position from the stated one, in sigmas
+_LARGEST_TYPICAL_CODE = 1e8  # m, of codes: twice the distance of the satellites
 _LOST_KEYS = ("raw.impossible", "raw.no_ephemeris", "raw.no_ephemeris_then", "raw.unhealthy", "raw.no_channel")
 
 
 @dataclass(frozen=True)
 class Sources:
-    """The files that a series is made of."""
+    """The files of a series."""
 
     rover: tuple[Path, ...]
     nav: tuple[Path, ...] = ()
@@ -53,7 +53,7 @@ class Sources:
 
 
 def read_rover(paths: tuple[Path, ...]) -> tuple[Observations, Ephemerides | None]:
-    """The observations of RINEX or UBX files of one receiver, and the ephemerides that UBX files hold.
+    """Read the observations of one receiver from RINEX or UBX files, and the ephemerides in UBX files.
 
     Raises
     ------
@@ -94,7 +94,7 @@ def load_raw(
     precise = read_precise(list(sources.sp3), list(sources.clk)) if sources.sp3 else None
     if nav is None and precise is None:
         raise RecordingError(
-            f"{sources.rover[0]}: holds no ephemerides; say nav or sp3 in [raw_gnss]", key="raw.no_ephemerides"
+            f"{sources.rover[0]}: holds no ephemerides; set nav or sp3 in [raw_gnss]", key="raw.no_ephemerides"
         )
     _check_dates(obs, nav, precise, sources)
     if zero is not None:
@@ -119,7 +119,7 @@ def load_raw(
         for signal in np.unique(obs.signal).tolist():
             if (typical := float(np.nanmedian(obs.code[obs.signal == signal]))) > _LARGEST_TYPICAL_CODE:
                 left_out += (
-                    f"; codes {name_signal(signal)} of {typical:.3g} m are no way to a satellite: see the header"
+                    f"; codes {name_signal(signal)} of {typical:.3g} m are no ranges to satellites: see the header"
                 )
         raise RecordingError(
             f"{sources.rover[0]}: no epoch has enough satellites for a position{left_out}", key="raw.few_satellites"
@@ -149,7 +149,7 @@ def load_raw(
 
 
 def _read_ephemerides(paths: tuple[Path, ...]) -> Ephemerides | None:
-    """What navigation files hold, and UBX files with what satellites sent."""
+    """Read the ephemerides of navigation files and of UBX files."""
     logs = tuple(path for path in paths if is_ubx(unpack_bytes(path)))
     rinex = [path for path in paths if path not in logs]
     nav = read_navigation(rinex) if rinex else None
@@ -158,7 +158,7 @@ def _read_ephemerides(paths: tuple[Path, ...]) -> Ephemerides | None:
 
 
 def _check_agreement(raw: RawGnss, fixes: SinglePoint, path: Path) -> None:
-    """Whether most codes of an epoch tell of one position.
+    """Check that most codes of an epoch agree on one position.
 
     Raises
     ------
@@ -169,7 +169,7 @@ def _check_agreement(raw: RawGnss, fixes: SinglePoint, path: Path) -> None:
     share = float(np.median(fixes.satellites[np.isfinite(fixes.p[:, 0])] / there[np.isfinite(fixes.p[:, 0])]))
     if share < 0.5:
         raise RecordingError(
-            f"{path}: only {100.0 * share:.0f} % of an epoch's codes tell of one position: its stamps are not in the "
+            f"{path}: only {100.0 * share:.0f} % of an epoch's codes agree on one position: its stamps are not in the "
             "time system that its header says, or the ephemerides are of other satellites",
             key="raw.contradictory",
         )
@@ -184,7 +184,7 @@ def _difference_by_base(
     position = obs.marker if given is None else np.array(given)
     if position is None:
         raise RecordingError(
-            f"{sources.base[0]}: states no position; say base_position in [raw_gnss]", key="raw.base_position"
+            f"{sources.base[0]}: states no position; set base_position in [raw_gnss]", key="raw.base_position"
         )
     apart = max(obs.t[0] - raw.t[-1], raw.t[0] - obs.t[-1])
     if apart > 0.0:
@@ -210,9 +210,9 @@ def _difference_by_base(
 
 
 def _measure_base(path: Path, base: RawGnss, fixes: SinglePoint, position: Array) -> tuple[Array, Array]:
-    """How far (3,) a base's own single-point positions are from where it is stated to be, and 1-sigma; m, ENU.
+    """Offset (3,) of a base's single-point position from its stated one, and its 1-sigma; m, ENU.
 
-    The sigma is that of one epoch: most of its errors last for as long as a drive, so a median is hardly better.
+    The sigma is that of one epoch: most errors are correlated over a whole drive, so a median is hardly better.
 
     Raises
     ------
@@ -242,7 +242,7 @@ def _measure_base(path: Path, base: RawGnss, fixes: SinglePoint, position: Array
 
 
 def _check_dates(obs: Observations, nav: Ephemerides | None, precise: Orbits | None, sources: Sources) -> None:
-    """Whether observations and ephemerides are of the same days.
+    """Check that observations and ephemerides are of the same days.
 
     Raises
     ------
@@ -267,7 +267,7 @@ def _check_dates(obs: Observations, nav: Ephemerides | None, precise: Orbits | N
 
 
 def _locate_roughly(obs: Observations, nav: Ephemerides | None, precise: Orbits | None, corrected: Corrected) -> Array:
-    """(3,) within kilometres of the rover: by the codes of a few epochs."""
+    """(3,) m in e, approximate position of the rover, from the codes of a few epochs."""
     epochs = np.unique(obs.t)
     few = obs.take(np.isin(obs.t, epochs[:: max(1, len(epochs) // _ROUGH_EPOCHS)]))
     start = np.zeros(3) if obs.marker is None else obs.marker
@@ -284,11 +284,11 @@ def _locate_roughly(obs: Observations, nav: Ephemerides | None, precise: Orbits 
 
 
 def _correct_times(raw: RawGnss, fixes: SinglePoint) -> tuple[RawGnss, SinglePoint]:
-    """Both at the times at which the antenna was there: the receiver's stamps less its clock error."""
+    """Series and solutions at the true times of reception: the receiver's stamps less its clock error."""
     epochs, of = raw.epochs
     clock = _take_nearest(
         epochs, fixes.t, fixes.clock
-    )  # not between two: a receiver's clock jumps by whole milliseconds
+    )  # not interpolated: a receiver's clock jumps by whole milliseconds
     drift = _take_nearest(epochs, fixes.t, fixes.drift) if np.isfinite(fixes.drift).any() else np.zeros(len(epochs))
     true = epochs - clock / C
     fixes = replace(fixes, t=true[np.searchsorted(epochs, fixes.t)])
@@ -300,7 +300,7 @@ def _correct_times(raw: RawGnss, fixes: SinglePoint) -> tuple[RawGnss, SinglePoi
 
 
 def _take_nearest(t: Array, known: Array, value: Array) -> Array:
-    """(N,) at times t what is known at the nearest time."""
+    """(N,) at times t the value of the nearest known time."""
     known, value = known[np.isfinite(value)], value[np.isfinite(value)]
     right = np.clip(np.searchsorted(known, t), 0, len(known) - 1)
     left = np.maximum(right - 1, 0)

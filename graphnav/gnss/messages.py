@@ -1,8 +1,8 @@
-"""Navigation messages as satellites send them, word by word: ephemerides out of bits.
+"""Decoder of navigation messages: ephemerides from the transmitted words.
 
 GPS and QZSS LNAV (IS-GPS-200N, 20.3.3), Galileo I/NAV and F/NAV (OS SIS ICD 2.1, 4.3 and 4.2), BeiDou D1 and, of
 geostationary satellites, D2 (BDS-SIS-ICD-B1I 3.0, 5.2 and 5.3) and GLONASS (ICD GLONASS L1/L2 5.1, 4.4). A message is
-complete once its parts are of one issue.
+complete once its parts are of one issue of data.
 """
 
 from __future__ import annotations
@@ -16,47 +16,47 @@ from graphnav.gnss.signals import BEIDOU, GALILEO, GLONASS, GPS, QZSS
 
 _PI = 3.1415926535898  # of the interface descriptions
 _LNAV_DAY = 86400.0
-_E5A, _FNAV = 3, 10_000  # sigId of the signal with F/NAV, and what keeps its parts from those of I/NAV
+_E5A, _FNAV = 3, 10_000  # sigId of the signal with F/NAV, and the offset that separates its parts from those of I/NAV
 _UBLOX = {0: GPS, 2: GALILEO, 3: BEIDOU, 5: QZSS, 6: GLONASS}
 _BDT = 14.0
 _MOSCOW = 3 * 3600.0
 
 
 class Bits:
-    """Numbers out of a string of bits, most significant first."""
+    """Reader of numbers in a bit string, most significant bit first."""
 
     def __init__(self, value: int, size: int) -> None:
         self.value, self.size = value, size
 
     @staticmethod
     def of(words: list[int], width: int, drop: int = 0) -> Bits:
-        """Words of `width` bits one after the other, without their last `drop` bits."""
+        """Concatenate words of `width` bits without their last `drop` bits."""
         value, keep = 0, width - drop
         for word in words:
             value = value << keep | word >> drop & (1 << keep) - 1
         return Bits(value, keep * len(words))
 
     def u(self, *parts: tuple[int, int]) -> int:
-        """Unsigned, of parts (first bit, number of bits) one after the other."""
+        """Unsigned integer of concatenated parts (first bit, number of bits)."""
         out = 0
         for at, n in parts:
             out = out << n | self.value >> self.size - at - n & (1 << n) - 1
         return out
 
     def s(self, *parts: tuple[int, int]) -> int:
-        """The same in two's complement."""
+        """Signed integer in two's complement."""
         n = sum(x for _, x in parts)
         value = self.u(*parts)
         return value - (1 << n) if value >> n - 1 else value
 
     def g(self, at: int, n: int) -> int:
-        """Sign and magnitude."""
+        """Signed integer in sign-magnitude form."""
         value = self.u((at + 1, n - 1))
         return -value if self.u((at, 1)) else value
 
 
 class Decoder:
-    """Collects the parts of messages, and the ephemerides they make."""
+    """Collects parts of messages and assembles ephemerides."""
 
     def __init__(self) -> None:
         self._parts: dict[int, dict[int, Bits]] = {}
@@ -67,11 +67,11 @@ class Decoder:
 
     @property
     def ephemerides(self) -> Ephemerides:
-        """All so far."""
+        """All ephemerides decoded so far."""
         return Ephemerides.of(self._kepler, self._glonass, self._klobuchar)
 
     def add(self, payload: bytes, gps: float) -> None:
-        """One RXM-SFRBX message, received at about `gps`, s since the GPS epoch."""
+        """Add one RXM-SFRBX message, received at about `gps`, s since the GPS epoch."""
         if len(payload) < 8 or len(payload) < 8 + 4 * payload[4]:
             return
         system, number = _UBLOX.get(payload[0]), payload[1]
@@ -124,7 +124,7 @@ class Decoder:
         )  # fmt: skip
 
     def _parse_inav(self, satellite: int, page: Bits, gps: float) -> None:
-        # an even and an odd page of 128 bits each, padded; alert pages hold none of this
+        # an even and an odd page of 128 bits each, padded; alert pages carry no ephemeris
         if page.u((0, 2)) != 0 or page.u((128, 2)) != 2:
             return
         word = Bits(page.u((2, 112), (130, 16)), 128)
@@ -222,7 +222,7 @@ class Decoder:
         parts[page] = bits
         sent = {k: x.u((18, 8), (30, 12)) for k, x in parts.items()}
         for k in [k for k in parts if sent[k] - sent[page] != 3 * (k - page)]:
-            del parts[k]  # of another round
+            del parts[k]  # of another issue
         if len(parts) < 10:
             return
         whole = Bits(0, 0)
@@ -274,7 +274,7 @@ class Decoder:
             x = parts[k]
             states.append((x.g(50, 27) * 2.0**-11, x.g(21, 24) * 2.0**-20, x.g(45, 5) * 2.0**-30))
         p, v, a = (np.array([one[i] for one in states]) * 1e3 for i in range(3))
-        # the time is that of a day in Moscow, by quarters of an hour
+        # tb counts quarters of an hour of the day in Moscow time
         day = gps_to_utc(np.array([gps + _MOSCOW]))[0].astype("datetime64[D]")
         utc = day.astype("datetime64[us]") + np.timedelta64(int(parts[2].u((9, 7)) * 900.0 - _MOSCOW), "s")
         toe = float(utc_to_gps(np.array([utc]))[0])
@@ -294,5 +294,5 @@ class Decoder:
 
 
 def _unroll_week(seconds: float, gps: float) -> float:
-    """Seconds of a week as s since the GPS epoch, in the week that brings them nearest to a time."""
+    """Seconds of the week as s since the GPS epoch, in the week in which they are nearest to a time."""
     return float(seconds + WEEK * np.round((gps - seconds) / WEEK))

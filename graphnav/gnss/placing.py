@@ -1,4 +1,4 @@
-"""From observations to a rover's series with satellites placed."""
+"""Satellite states for a rover's observations: the series with satellites placed."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from graphnav.gnss.precise import Orbits
 from graphnav.gnss.series import Observations, RawGnss, compute_epoch_medians
 from graphnav.gnss.signals import C, name_satellite
 
-_FLIGHT = 0.075  # s, of a signal from a satellite of medium height
-_TICK = 1e-3  # s, to which receivers keep their clocks
+_FLIGHT = 0.075  # s, flight time of a signal from a medium Earth orbit
+_TICK = 1e-3  # s, within which receivers steer their clocks
 
 
 @dataclass(frozen=True)
 class Corrected:
-    """What is already taken off the codes of a file."""
+    """Corrections already applied to the codes of a file."""
 
-    clock: bool = False  # of the satellites, with their group delays
+    clock: bool = False  # of satellite clocks, with group delays
     troposphere: bool = False
 
 
@@ -32,25 +32,25 @@ def place(
     rover: Array,
     corrected: Corrected = Corrected(),
 ) -> tuple[RawGnss, tuple[str, ...]]:
-    """The series with satellites placed, and remarks about those that cannot be.
+    """Compute satellite positions, velocities and clocks; remarks name satellites that have none.
 
     Parameters
     ----------
-    obs : on the clock wanted, stamps the receiver's own.
+    obs : on the target clock, with the receiver's own stamps.
     nav : broadcast ephemerides; with `precise` only for group delays and ionosphere.
     rover : (3,) m in e, within kilometres of the rover.
     """
     if nav is not None and nav.channels:
         obs = replace(obs, channels={**nav.channels, **obs.channels})
     frequency = obs.frequency
-    # one time of transmission for all signals of a satellite: codes differ by metres, a tenth of a millimetre of orbit
+    # one time of transmission for all signals of a satellite: codes differ by metres, in which it moves 0.1 mm
     told = np.flatnonzero(np.isfinite(obs.code))  # in order of time and satellite
     new = np.concatenate([[True], (np.diff(obs.t[told]) != 0.0) | (np.diff(obs.satellite[told]) != 0)])
     rows, of = told[new[: len(told)]], np.cumsum(new[: len(told)]) - 1
     sent = obs.t[rows] - obs.code[rows] / C
     source = precise if precise is not None else nav
     assert source is not None
-    if corrected.clock:  # the code is without the satellite's clock: its time of transmission is GPS time
+    if corrected.clock:  # the satellite clock is already removed from the code: its time of transmission is GPS time
         found = source.place(obs.satellite[rows], sent, obs.zero)
         sent = sent + np.nan_to_num(found.clock)
     found = source.place(obs.satellite[rows], sent, obs.zero)
@@ -61,7 +61,7 @@ def place(
     if nav is not None:
         delay = nav.compute_delay(obs.satellite, obs.signal, frequency, obs.t, obs.zero)
     clock = np.where(np.isfinite(placed.clock), 0.0, np.nan) if corrected.clock else C * (placed.clock - delay)
-    clock[np.isnan(frequency)] = np.nan  # nothing of the ionosphere can be said without
+    clock[np.isnan(frequency)] = np.nan  # needed for the ionospheric delay
     remarks = [*(nav.remarks if nav is not None else ()), *(precise.remarks if precise is not None else ())]
     lost = {int(s) for s in np.unique(obs.satellite[told[np.isnan(placed.p[told, 0])]])}
     lost_all = sorted(s for s in lost if not np.isfinite(placed.p[(obs.satellite == s), 0]).any())
@@ -99,10 +99,10 @@ def place(
 def restore_own_stamps(
     obs: Observations, source: Ephemerides | Orbits, rover: Array, corrected: Corrected = Corrected()
 ) -> Observations:
-    """Stamps of nominal epochs turned back into the receiver's own.
+    """Restore the receiver's own stamps from nominal epochs.
 
-    A receiver keeps its clock in whole milliseconds and sets it so that it measures within half of one of the nominal
-    epoch; codes are of its own stamp. So the milliseconds are those of its clock error, told by the codes themselves.
+    A receiver adjusts its clock by whole milliseconds and measures within half a millisecond of the nominal epoch;
+    codes refer to its own stamp. So the whole milliseconds are those of its clock error, which the codes determine.
     """
     found = source.place(obs.satellite, obs.t - _FLIGHT, obs.zero)
     away = np.linalg.norm(rotate_earth(found.p, np.full(len(obs), _FLIGHT)) - rover, axis=1)

@@ -1,10 +1,10 @@
-"""Codes and carriers of two signals as one without the ionosphere, with all that is known to centimetres taken off.
+"""Ionosphere-free combinations of codes and carrier phases, with corrections for precise point positioning.
 
-The ionosphere delays codes, and advances carriers, by the inverse square of the frequency, so that of two signals
-f1^2 / (f1^2 - f2^2) times the first less f2^2 / (f1^2 - f2^2) times the second has none of it. What is modelled, beside
-distance and clocks: where the satellites' antennas are (ANTEX), wind-up, the solid Earth's tide, the bending of signals
-by the Earth, the dry troposphere, and the wet one of a standard atmosphere (Kouba and Heroux 2001, "Precise point
-positioning using IGS orbit and clock products").
+The ionosphere delays codes, and advances carriers, by the inverse square of the frequency, so the combination f1^2 /
+(f1^2 - f2^2) times the first less f2^2 / (f1^2 - f2^2) times the second is free of it. Modelled beside range and clocks
+are the satellites' phase centres (ANTEX), phase wind-up, the solid Earth tide, the Shapiro delay, and the dry and wet
+troposphere of a standard atmosphere (Kouba and Heroux 2001, "Precise point positioning using IGS orbit and clock
+products").
 """
 
 from __future__ import annotations
@@ -20,42 +20,41 @@ from graphnav.core.rotation import Array
 from graphnav.core.timescales import gps_to_utc
 from graphnav.gnss.antex import compute_antenna_paths, compute_satellite_axes, compute_shapiro_delay, compute_wind_up
 from graphnav.gnss.arcs import Arcs, build_arcs, find_arcs
-from graphnav.gnss.atmosphere import compute_zenith_delays, niell
+from graphnav.gnss.atmosphere import compute_niell_mapping, compute_zenith_delays
 from graphnav.gnss.carrier import find_rows
 from graphnav.gnss.series import RawGnss
 from graphnav.gnss.signals import GALILEO, GPS, QZSS, C, name_signal, number_signal
 from graphnav.gnss.single_point import Geometry, look
 from graphnav.gnss.tides import compute_solid_tide, locate_sun_and_moon
 
-# the second band, whose combination with the first the clocks of precise products are of; of BeiDou and GLONASS these
-# are combinations of other signals from product to product
+# the second band of the combination that precise clocks refer to; for BeiDou and GLONASS it differs between products
 SECOND = {GPS: 2, GALILEO: 5, QZSS: 2}
-# the code on the first band that these clocks are of, where receivers may have another one beside it: the two are
-# apart by up to a nanosecond, another one for each satellite, and by two and a half times that in the combination
+# the code on the first band that these clocks refer to, where receivers may also have another: the differential code
+# bias is up to a nanosecond for each satellite, and two and a half times that in the combination
 _OF_CLOCKS = {GPS: number_signal("1W")}
 
 
 @dataclass(frozen=True)
 class IonosphereFree:
-    """N rows: those of a first signal that have a second one beside them."""
+    """N rows: those of a first signal for which the satellite also has a second one."""
 
-    which: NDArray[np.intp]  # (N,) of the rows given
+    which: NDArray[np.intp]  # (N,) indices into the given rows
     geometry: Geometry
-    known: Array  # (N,) m, distance from the nominal antenna, with all that is modelled
+    known: Array  # (N,) m, range from the nominal antenna plus all modelled corrections
     code: Array  # (N,) m, with the satellite's clock
-    carrier: Array  # (N,) m, with the satellite's clock; NaN where one of the two carriers is missing
-    wet: Array  # (N,) how the wet delay grows from the zenith
-    growth: Array  # (N,) of white noise that is alike on both signals
-    arcs: Arcs  # of N rows, in which neither carrier has slipped; a slot is a pair of signals of a satellite
+    carrier: Array  # (N,) m, with the satellite's clock; NaN where one of the two carrier phases is missing
+    wet: Array  # (N,) wet mapping function
+    growth: Array  # (N,) amplification of white noise of equal size on both signals
+    arcs: Arcs  # arcs in which neither carrier phase has slipped; a slot is a pair of signals of a satellite
 
 
 def combine_ionosphere_free(raw: RawGnss, whole: RawGnss) -> IonosphereFree | None:
-    """The combinations of the rows of a first band.
+    """Combine the rows of a first band with those of the second signal.
 
     Parameters
     ----------
     raw : a row for each satellite and epoch, of its first signal.
-    whole : all that the receiver has, with the second ones.
+    whole : all rows of the receiver, second signals included.
     """
     second = _find_rows_beside(raw, whole, choose_second_signals(whole), np.isfinite(whole.carrier))
     which = np.flatnonzero(second >= 0)
@@ -89,9 +88,9 @@ def combine_ionosphere_free(raw: RawGnss, whole: RawGnss) -> IonosphereFree | No
     utc = gps_to_utc(gps)
     day = (utc - utc.astype("datetime64[Y]")) / np.timedelta64(1, "D")
     dry, wet = compute_zenith_delays(place)
-    if raw.troposphere:  # is taken off already
+    if raw.troposphere:  # has been subtracted already
         dry, wet = np.zeros(len(one)), np.zeros(len(one))
-    by_dry, by_wet = niell(place, geometry.elevation, day)
+    by_dry, by_wet = compute_niell_mapping(place, geometry.elevation, day)
     carrier = free(one.carrier * C / f1, other.carrier * C / f2) + one.clock
     carrier -= wound * C / (f1 + f2)
     good = (arcs.arc[first_rows] >= 0) & (arcs.arc[second[which]] >= 0) & ~one.half & ~other.half
@@ -108,7 +107,7 @@ def combine_ionosphere_free(raw: RawGnss, whole: RawGnss) -> IonosphereFree | No
 
 
 def choose_second_signals(raw: RawGnss) -> dict[int, int]:
-    """The second signal of each satellite that has one: of several of a band that with most carriers."""
+    """The second signal of each satellite that has one; of several of a band the one with most carrier phases."""
     if raw.catalogue is not None:
         return dict(raw.catalogue.second)
     useful, out = np.isfinite(raw.carrier) & np.isfinite(raw.code) & np.isfinite(raw.clock), {}
@@ -121,7 +120,7 @@ def choose_second_signals(raw: RawGnss) -> dict[int, int]:
 
 
 def compute_series_wind_up(raw: RawGnss) -> Array:
-    """(N,) cycles by which the carriers of a series are wound up, continuous for each satellite."""
+    """(N,) cycles of phase wind-up of a series, continuous for each satellite."""
     geometry = look(raw, raw.antenna, None)
     axes = compute_satellite_axes(geometry.s, locate_sun_and_moon(raw.t + raw.zero)[0])
     return compute_wind_up(raw.satellite, raw.t, axes, geometry.e, earth.enu_axes(earth.ecef_to_llh(raw.antenna)))
@@ -130,7 +129,7 @@ def compute_series_wind_up(raw: RawGnss) -> Array:
 def _find_rows_beside(
     raw: RawGnss, whole: RawGnss, signals: Mapping[int, int], usable: NDArray[np.bool_]
 ) -> NDArray[np.intp]:
-    """(N,) the usable row of `whole` with another signal of a satellite, beside a row of its first band; -1: none."""
+    """(N,) the usable row of `whole` with the second signal of the same satellite and epoch; -1: none."""
     out = np.full(len(raw), -1, dtype=np.intp)
     epochs = np.unique(whole.t)
     useful = usable & np.isfinite(whole.code) & np.isfinite(whole.clock)
@@ -144,7 +143,7 @@ def _find_rows_beside(
 
 
 def _join_arcs(arcs: Arcs, first: NDArray[np.intp], second: NDArray[np.intp], good: NDArray[np.bool_]) -> Arcs:
-    """The arcs of pairs of rows: each begins where the younger of its two does."""
+    """Arcs of pairs of rows: each begins where the later of its two arcs does."""
     pairs, slot = np.unique(np.stack([arcs.slot[first], arcs.slot[second]], -1), axis=0, return_inverse=True)
     names = tuple(f"{arcs.names[a]}+{name_signal(arcs.signal[b])}" for a, b in pairs.tolist())
     begin = np.where(good, np.maximum(arcs.begin[first], arcs.begin[second]), np.nan)

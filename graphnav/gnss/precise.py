@@ -1,8 +1,8 @@
 """Precise orbits and clocks: SP3-a, -c and -d (Hilla 2016) and RINEX clock files 2 to 3.04.
 
-Positions between the nodes are those of the polynomial through the eleven nearest, which are turned to the Earth-fixed
-frame of the time asked for (Schenewerk 2003); clocks are linear between theirs, with the relativistic effect that
-products leave out, -2 r.v / c^2.
+Positions between nodes are interpolated by the polynomial through the eleven nearest, rotated to the Earth-fixed frame
+of the requested time (Schenewerk 2003); clocks are interpolated linearly, plus the relativistic effect that products
+leave out, -2 r.v / c^2.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from graphnav.gnss.signals import SYSTEMS, C, Ids, number_satellite
 
 _NODES = 11  # of the polynomial
 _ABSENT = 0.9  # s; a clock of 999999.999999 us is none
-_LONGEST_CLOCK_GAP = 900.0  # s between nodes of a clock that a line is drawn through
-_HALF_SPAN = 0.5  # s either way, over which velocities are differences
+_LONGEST_CLOCK_GAP = 900.0  # s, longest step between nodes of a clock that is interpolated
+_HALF_SPAN = 0.5  # s on either side, for velocities by central differences
 
 
 @dataclass(frozen=True)
@@ -55,10 +55,10 @@ class Orbits:
         return out
 
     def compute_clock_noise(self) -> dict[int, tuple[float, float]]:
-        """By satellite how far its clock is off a line between two nodes (m, 1-sigma in the middle), and their spacing.
+        """Interpolation error of each satellite's clock (m, 1-sigma midway between nodes), and the node spacing.
 
-        Between them a clock is a random walk. Of variance q h over a spacing h (s), its second differences have 2 q h
-        and the middle of a line has q h / 4; a median of their sizes says q.
+        Between nodes a clock is a random walk of variance q h over a spacing h (s): its second differences have the
+        variance 2 q h, the midpoint of a linear interpolation q h / 4; q follows from their median magnitude.
         """
         out = {}
         for one, (t, clock) in self.clock.items():
@@ -69,7 +69,7 @@ class Orbits:
 
 
 def read_precise(sp3: list[Path], clk: list[Path]) -> Orbits:
-    """Orbits and clocks of some files; those of clock files go before those of orbit files.
+    """Read orbits and clocks; clocks of clock files take precedence over those of orbit files.
 
     Raises
     ------
@@ -177,14 +177,14 @@ def _read_clk(path: Path) -> tuple[Array, Ids, Array]:
 
 
 def _find_id(name: str) -> int:
-    """The number of a satellite; -1 of one that no receiver observes, as those that carry a receiver."""
+    """The number of a satellite; -1 for names that are none, such as satellites in low Earth orbit."""
     if name[0].isalpha() and name[0] not in SYSTEMS:
         return -1
     return number_satellite(name if name[0] != " " else "G" + name[1:])
 
 
 def _read_stamps(lines: Lines, which: NDArray[np.intp], begin: int, scale: str, path: Path) -> Array:
-    """(n,) s since the GPS epoch of lines that hold a date from a column on."""
+    """(n,) s since the GPS epoch, from lines with a date at a given column."""
     words = [lines.get_text(k)[begin:].split()[:6] for k in which]
     try:
         return _read_dates(np.array(words, dtype=float), scale)
@@ -201,7 +201,7 @@ def _read_stamps(lines: Lines, which: NDArray[np.intp], begin: int, scale: str, 
 
 
 def _read_dates(fields: Array, scale: str) -> Array:
-    """(n,) s since the GPS epoch of dates (n, 6); ValueError if one is none."""
+    """(n,) s since the GPS epoch of dates (n, 6); ValueError for an invalid one."""
     if fields.ndim != 2 or fields.shape[1] != 6:
         raise ValueError
     days, good = count_days(fields)
@@ -234,7 +234,7 @@ def _interpolate_orbit(nodes: tuple[Array, Array], t: Array, zero: float) -> Arr
 
 
 def _interpolate_clocks(clocks: tuple[Array, Array], t: Array, zero: float) -> tuple[Array, Array]:
-    """Clocks and their drifts (N,) on lines between nodes; NaN outside them and in gaps."""
+    """Clocks and drifts (N,) by linear interpolation; NaN outside the nodes and in gaps."""
     at, value = clocks[0] - zero, clocks[1]
     if len(at) < 2:
         return np.full(len(t), np.nan), np.full(len(t), np.nan)

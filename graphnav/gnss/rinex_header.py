@@ -19,7 +19,7 @@ _MOST_TYPES = 200  # of a system; RINEX 4.01 has some 80
 
 @dataclass
 class Header:
-    """What the header of an observation file says."""
+    """Contents of the header of an observation file."""
 
     version: float = 0.0
     system: str = "G"
@@ -31,7 +31,7 @@ class Header:
 
 
 def read_rinex_header(lines: Lines, path: Path) -> Header:
-    """Read up to END OF HEADER."""
+    """Read the header, up to END OF HEADER."""
     out, system, many = Header(), -1, 0
     for k in range(len(lines)):
         text = lines.get_text(k)

@@ -21,7 +21,7 @@ from graphnav.gnss.signals import BEIDOU, GALILEO, GLONASS, GPS, NAVIC, QZSS, SB
 
 _BDT = 14.0  # s, GPS minus BeiDou time
 _BDT_WEEKS = 1356  # from the GPS to the BeiDou epoch
-_RECORD_LINES = {GLONASS: 4, SBAS: 4}  # of a record; 8 of all others
+_RECORD_LINES = {GLONASS: 4, SBAS: 4}  # lines of a record by system; 8 for all others
 _KNOWN_MESSAGES = {"LNAV", "INAV", "FNAV", "D1", "D2", "FDMA"}
 _ROOTS = (2530.0, 8192.0)  # sqrt(m), of the semi-major axis: the range that IS-GPS-200N, table 20-III, gives it
 _WEEKS = 6262  # of the GPS until 2100
@@ -38,7 +38,7 @@ class _Navigation:
 
 
 def read_navigation(paths: list[Path]) -> Ephemerides:
-    """All ephemerides of some files.
+    """Read all ephemerides of some files.
 
     Raises
     ------
@@ -82,14 +82,14 @@ def _read(path: Path, found: _Navigation) -> None:
     message = ""
     while k < len(lines):
         text = lines[k]
-        if text.startswith(">"):  # version 4: what comes next
+        if text.startswith(">"):  # version 4: type of the next record
             words = text[1:].split()
             message = words[2] if len(words) > 2 else ""
             if words[:1] != ["EPH"] or message not in _KNOWN_MESSAGES:
                 end = next((j for j in range(k + 1, len(lines)) if lines[j].startswith(">")), len(lines))
                 if (
                     words[:1] == ["ION"] and message == "LNAV" and words[1][:1] == "G"
-                ):  # those of QZSS are another region's
+                ):  # those of QZSS are for another region
                     _take_ionosphere(lines[k + 1 : end], found)
                 elif words[:1] == ["EPH"]:
                     found.skipped[message] = found.skipped.get(message, 0) + 1
@@ -127,7 +127,7 @@ def _read(path: Path, found: _Navigation) -> None:
 
 
 def _parse_values(rows: list[tuple[str, int]]) -> list[float]:
-    """Clock terms of the first line, then four a line; NaN for blanks."""
+    """Clock terms of the first line, then four values per line; NaN for blanks."""
     out = []
     for number, (line, begin) in enumerate(rows):
         for i in range(3 if number == 0 else 4):
@@ -181,7 +181,7 @@ def _add(found: _Navigation, system: int, number: int, date: np.datetime64, v: l
         raise ValueError
     if not _ROOTS[0] <= v[10] <= _ROOTS[1]:
         raise ValueError
-    toe += WEEK * np.round((toc - toe) / WEEK)  # a week that rolled over or is that of the transmission
+    toe += WEEK * np.round((toc - toe) / WEEK)  # a week number that rolled over, or is that of the transmission
     source = int(v[20]) if np.isfinite(v[20]) else 0
     health = v[24] if np.isfinite(v[24]) else 0.0
     if system == QZSS:
@@ -228,7 +228,7 @@ def _parse_coefficients(body: str) -> list[float]:
 
 
 def _take_ionosphere(lines: list[str], found: _Navigation) -> None:
-    """Klobuchar's coefficients of version 4, if they are whole."""
+    """Klobuchar coefficients of version 4, if complete."""
     if len(lines) < 3:
         return
     try:

@@ -1,8 +1,8 @@
 """RINEX observation files, versions 2.11, 3 and 4, read as whole arrays.
 
-Lines are sorted by what they are (epochs, satellites of each system), and the fields of all lines of a kind are turned
-into numbers at once. The formats: RINEX 2.11 (Gurtner and Estey 2007), 3.05 and 4.01 (IGS/RTCM). Types of version 2
-are given names of version 3 as RTKLIB 2.4.3 does (rinex.c, convcode).
+Lines are sorted by kind (epochs, satellites of each system), and the fields of all lines of a kind are parsed at once.
+The formats: RINEX 2.11 (Gurtner and Estey 2007), 3.05 and 4.01 (IGS/RTCM). Observation types of version 2 are renamed
+as in RTKLIB 2.4.3 (rinex.c, convcode).
 """
 
 from __future__ import annotations
@@ -45,19 +45,19 @@ _FIELD_WIDTH = 16  # of a field: value F14.3, loss of lock I1, strength I1
 
 @dataclass
 class _SatelliteLines:
-    """Lines of satellites: their epoch and satellite, and where their fields are."""
+    """Satellite lines: epoch, satellite, and the positions of their fields."""
 
     line: NDArray[np.intp]
     epoch: NDArray[np.intp]
     satellite: Ids
 
 
-Cells = Callable[[NDArray[np.intp], int], NDArray[np.uint8]]  # the fields of some rows, so many of each
+Cells = Callable[[NDArray[np.intp], int], NDArray[np.uint8]]  # reads a number of fields of given rows
 _Body = tuple[Array, float, NDArray[np.intp], _SatelliteLines, Cells]  # stamps, their zero, flags of the epochs
 
 
 def read_observations(path: Path) -> Observations:
-    """The observations of a RINEX file.
+    """Read the observations of a RINEX file.
 
     Raises
     ------
@@ -68,7 +68,7 @@ def read_observations(path: Path) -> Observations:
 
 
 def parse_observations(data: bytes, path: Path) -> Observations:
-    """The observations of a RINEX file's content; `path` is only for what is said of it."""
+    """Parse the content of a RINEX file; `path` is only for messages."""
     lines = Lines(data)
     header = read_rinex_header(lines, path)
     remarks: list[str] = []
@@ -137,7 +137,7 @@ def _translate_name(name: str, system: int, version: float) -> str:
     """A type by its name of version 3.05."""
     if version >= 3.0:
         if system == BEIDOU and name[1:] in (("1I", "1Q", "1X") if version < 3.035 else ("1I", "1Q")):
-            return name[0] + "2" + name[2:]  # B1I until 3.03, and of programs that never changed; 1X is B1C since
+            return name[0] + "2" + name[2:]  # B1I until 3.03, and in files of programs that kept it; 1X is B1C since
         return name
     kind, band = ("C", name[1:]) if name[0] in "CP" else (name[0], name[1:])
     if name[0] == "P":
@@ -153,9 +153,9 @@ def _translate_name(name: str, system: int, version: float) -> str:
 
 
 def _count_since_week(fields: Array, scale: str, used: NDArray[np.bool_]) -> tuple[Array, float]:
-    """Seconds (n,) of the GPS week of the first used of some dates (n, 6), and where it begins (s since the GPS epoch).
+    """Seconds (n,) of the GPS week of the first used date (n, 6), and that week's start (s since the GPS epoch).
 
-    Days and seconds are kept apart: seconds since the epoch are good to 0.2 us only.
+    Days and seconds are kept separate: in double precision, seconds since the epoch resolve 0.2 us only.
     """
     days, good = count_days(fields)
     hour, minute, second = np.where(good[:, None], fields, 0.0).T[3:]
@@ -217,7 +217,7 @@ def _read_version_3(lines: Lines, header: Header, path: Path, remarks: list[str]
 
 
 def _take_first(value: Array) -> Array:
-    """(n,) the first number in each row of (n, m) that is there, else NaN."""
+    """(n,) the first finite number of each row of (n, m), else NaN."""
     out = np.full(len(value), np.nan)
     for column in value.T[::-1]:
         out = np.where(np.isnan(column), out, column)
@@ -329,7 +329,7 @@ def _say_cut(
 
 
 def _names_satellite(name: NDArray[np.uint8]) -> NDArray[np.bool_]:
-    """(n,) which of some names (n, 3) are a letter and a number, of whatever system."""
+    """(n,) which names (n, 3) are a letter and a number, whatever the system."""
     letter, tens, ones = name.T
     digit = (ones >= ord("0")) & (ones <= ord("9"))
     ten = (tens == ord(" ")) | ((tens >= ord("0")) & (tens <= ord("9")))
@@ -345,7 +345,7 @@ def _say_unknown(letters: list[str], path: Path, remarks: list[str]) -> None:
 
 
 def _refuse_epoch(lines: Lines, epoch: NDArray[np.intp], path: Path, begin: int = 2) -> RecordingError:
-    """For the first epoch line that is none; its date begins at a column, two digits of the year in version 2."""
+    """The error for the first invalid epoch line; dates begin at column `begin`, 0 in version 2 (two-digit years)."""
     end = begin + 27 if begin else 26
     for k in epoch:
         text = lines.get_text(k)
@@ -364,7 +364,7 @@ def _refuse_epoch(lines: Lines, epoch: NDArray[np.intp], path: Path, begin: int 
 def _refuse_field(
     rows: _SatelliteLines, own: NDArray[np.intp], types: list[str], block: NDArray[np.uint8], path: Path
 ) -> RecordingError:
-    """For the first field that is no number, of those (n, m, 14) of some rows."""
+    """The error for the first field that is not a number, of the fields (n, m, 14) of some rows."""
     for k, cells, elsewhere in zip(own, block, find_moved_points(block), strict=True):
         for name, cell, wrong in zip(types, cells, elsewhere, strict=True):
             text = bytes(cell).decode("latin-1").strip()

@@ -13,8 +13,8 @@ from graphnav.core.rotation import Array
 from graphnav.gnss.antex import Antennas
 from graphnav.gnss.signals import C, Ids, find_frequencies
 
-_LARGEST_CODE = 1e9  # m, of a code: satellites are 4.3e7 m away at most, and no clock of a receiver is seconds off
-_LARGEST_DOPPLER = 1e6  # Hz, of a Doppler shift: satellites make 1e4, an oscillator off by 1e-4 makes 2e5
+_LARGEST_CODE = 1e9  # m, of a code: satellites are 4.3e7 m away at most, and receiver clocks are not seconds off
+_LARGEST_DOPPLER = 1e6  # Hz, of a Doppler shift: satellite motion causes 1e4, an oscillator off by 1e-4 2e5
 _MOST_CYCLES = 1e11  # of a carrier: more than F14.3 holds
 _LONGEST_SPAN = 3.15e7  # s, a year
 
@@ -29,11 +29,11 @@ class Observations:
     signal: Ids  # (N,)
     code: Array  # (N,) m
     carrier: Array  # (N,) cycles
-    doppler: Array  # (N,) Hz, positive where the satellite comes nearer
+    doppler: Array  # (N,) Hz, positive for an approaching satellite
     cn0: Array  # (N,) dB-Hz
-    slip: NDArray[np.bool_]  # (N,) the carrier lost lock since the epoch before
-    half: NDArray[np.bool_]  # (N,) the carrier may be off by half a cycle
-    lock: Array  # (N,) s that the carrier has been in lock, where the receiver says so
+    slip: NDArray[np.bool_]  # (N,) loss of lock since the previous epoch
+    half: NDArray[np.bool_]  # (N,) unresolved half cycle
+    lock: Array  # (N,) s, lock time of the carrier phase, where the receiver reports it
     channels: dict[int, int] = field(default_factory=dict)  # of GLONASS satellites
     marker: Array | None = None  # (3,) m in e, rough position of the antenna as the file states it
     files: tuple[str, ...] = ()
@@ -67,7 +67,7 @@ class Observations:
 
 
 def join_files(parts: list[Observations]) -> Observations:
-    """Several files of one receiver as one series, in order of time; what two of them hold is taken once."""
+    """Join files of one receiver in order of time; rows contained in two files are taken once."""
     if len(parts) == 1:
         return parts[0]
     zero = parts[0].zero
@@ -87,12 +87,12 @@ def join_files(parts: list[Observations]) -> Observations:
 
 
 def note_cut(name: str, what: str) -> Note:
-    """Of a file that ends in the middle of a record."""
+    """Make the remark on a file that ends within a record."""
     return Note("raw.cut", f"{name}: ends in the middle of a {what}; everything before it is used")
 
 
 def drop_repeated(obs: Observations) -> Observations:
-    """In order of time, satellite and signal, and each of these once: the row that was first.
+    """Sort by time, satellite and signal; of repeated rows the first is kept.
 
     Raises
     ------
@@ -124,7 +124,7 @@ def drop_repeated(obs: Observations) -> Observations:
 
 
 def _drop_impossible(obs: Observations) -> Observations:
-    """Without the values that no receiver can have measured."""
+    """Drop values beyond what a receiver can measure."""
     with np.errstate(invalid="ignore"):
         bad = (
             (np.abs(obs.code) > _LARGEST_CODE)
@@ -141,7 +141,7 @@ def _drop_impossible(obs: Observations) -> Observations:
 
 @dataclass(frozen=True)
 class Catalogue:
-    """What a series has rows of, for pieces of it: they number satellites and signals alike."""
+    """Satellites and signals of a series, so that pieces of it number them identically."""
 
     satellites: tuple[int, ...]  # ascending
     groups: tuple[tuple[int, int], ...]  # systems with their signals, the reference first
@@ -166,33 +166,33 @@ class RawGnss:
     frequency: Array  # (N,) Hz
     p: Array  # (N, 3) m, satellite in the Earth-fixed frame of the time of transmission; NaN where unknown
     v: Array  # (N, 3) m/s
-    clock: Array  # (N,) m that the satellite's clock is ahead, group delays taken off; 0 where the code is without it
+    clock: Array  # (N,) m, satellite clock ahead of GPS time, less group delay; 0 where the code is already corrected
     drift: Array  # (N,) m/s of it
-    difference: Array  # (N,) m to add to the code by a base station; NaN where there is none
+    difference: Array  # (N,) m, differential correction of the code; NaN without a counterpart at the base
     zero: float  # s since the GPS epoch at t = 0
     place: tuple[float, float, float]  # m in e, within kilometres of the rover
-    klobuchar: tuple[tuple[float, ...], ...] | None = None  # coefficients that were broadcast
-    troposphere: bool = False  # already taken off the codes
-    lock: Array = field(default_factory=lambda: np.empty(0))  # (N,) s that the carrier has been in lock
-    # (N,) m to add to the carrier by a base station, and which of its arcs that is of; NaN and -1 where there is none
+    klobuchar: tuple[tuple[float, ...], ...] | None = None  # broadcast Klobuchar coefficients
+    troposphere: bool = False  # corrections already applied to the codes
+    lock: Array = field(default_factory=lambda: np.empty(0))  # (N,) s, lock time of the carrier phase
+    # (N,) m, differential correction of the carrier phase, and the base's arc; NaN and -1 without one
     carrier_difference: Array = field(default_factory=lambda: np.empty(0))
     base_arc: NDArray[np.intp] = field(default_factory=lambda: np.empty(0, dtype=int))
     baseline: float = 0.0  # m, to the base station
     # m, east, north, up: its own single-point position less the stated one, and 1-sigma; none without a base
     base_off: tuple[tuple[float, ...], ...] = ()
-    arc_begin: Array = field(default_factory=lambda: np.empty(0))  # (N,) s, of the carrier's arc, where it is known
-    wound: Array = field(default_factory=lambda: np.empty(0))  # (N,) cycles of wind-up, where they are known
-    # (N,) of the epoch among all that are used, of a piece of a series; -1 for one that came late
+    arc_begin: Array = field(default_factory=lambda: np.empty(0))  # (N,) s, start of the carrier-phase arc, where known
+    wound: Array = field(default_factory=lambda: np.empty(0))  # (N,) cycles of phase wind-up, where known
+    # (N,) number of the epoch among all in use, for a piece of a series; -1 for one received late
     number: NDArray[np.intp] = field(default_factory=lambda: np.empty(0, dtype=int))
     antenna: Array = field(default_factory=lambda: np.empty((0, 3)))  # (N, 3) m in e, single-point, of each epoch
     receiver_clock: Array = field(default_factory=lambda: np.empty((0, 2)))  # (N, 2) m and m/s, single-point
     lever_arm: Array = field(default_factory=lambda: np.zeros(3))  # m, RFU, from the IMU
     files: tuple[str, ...] = ()
     precise: bool = False  # placed by precise orbits and clocks
-    antennas: Antennas = field(default_factory=dict)  # of the satellites, where an ANTEX file is given
+    antennas: Antennas = field(default_factory=dict)  # satellite antennas, where an ANTEX file is given
     # by satellite, as `graphnav.gnss.precise.Orbits.clock_noise` says
     clock_noise: dict[int, tuple[float, float]] = field(default_factory=dict)
-    catalogue: Catalogue | None = None  # of the series that this is a piece of
+    catalogue: Catalogue | None = None  # of the whole series, for a piece of it
 
     def __len__(self) -> int:
         return len(self.t)
@@ -213,7 +213,7 @@ class RawGnss:
 
     @property
     def satellites(self) -> tuple[Ids, NDArray[np.intp]]:
-        """Satellites (S,), ascending, and which of them each row is of."""
+        """Satellites (S,), ascending, and the index of each row's."""
         if self.catalogue is None:
             return np.unique(self.satellite, return_inverse=True)
         every = np.array(self.catalogue.satellites, dtype=self.satellite.dtype)
@@ -226,12 +226,12 @@ class RawGnss:
 
     @property
     def epochs(self) -> tuple[Array, NDArray[np.intp]]:
-        """Times (E,) of the epochs, and which of them each row is of."""
+        """Times (E,) of the epochs, and the index of each row's."""
         return np.unique(self.t, return_inverse=True)
 
 
 def choose_primary(raw: RawGnss) -> NDArray[np.bool_]:
-    """(N,) one row for each satellite and epoch: the signal whose group delay is best known, L1 or B1 first."""
+    """(N,) mask of one row per satellite and epoch: the signal with the best-known group delay, L1 or B1 first."""
     order = np.where(raw.signal // 100 == 1, 0, raw.signal // 100) + np.where(raw.signal % 100 == 2, 0.0, 0.5)
     order = np.where(np.isfinite(raw.code), order, 100.0)
     sorted_rows = np.lexsort((order, raw.satellite, raw.t))

@@ -1,7 +1,7 @@
-"""How good a code and a Doppler shift are taken to be before the data say more.
+"""Prior sigmas of codes, Doppler shifts and carrier phases.
 
 Noise falls with the signal's power (sigma-epsilon: Hartinger and Brunner 1999, "Variances of GPS phase observations"),
-reflections with elevation; the models of the atmosphere are good to half of Klobuchar's delay (IS-GPS-200N) and to a
+multipath with elevation; the models of the atmosphere are good to half of Klobuchar's delay (IS-GPS-200N) and to a
 few decimetres of Saastamoinen's (RTKLIB 2.4.3, pntpos.c, varerr).
 """
 
@@ -14,15 +14,13 @@ from graphnav.core.rotation import Array
 _CODE, _CODE_POWER = 0.3, 1.1e4  # m at the zenith; m^2 Hz of a consumer receiver: 0.6 m at 45 dB-Hz
 _RATE, _RATE_POWER = 0.03, 60.0  # m/s; (m/s)^2 Hz: 0.04 m/s at 45 dB-Hz
 _BANDWIDTH = 15.0  # Hz, of a receiver's carrier loop (Kaplan and Hegarty 2006, section 5.6)
-_PHASE = 1e-3  # m at the zenith: reflections and the loop's own, the same source as the codes' rising with the secant
+_PHASE = 1e-3  # m at the zenith: multipath and the loop's other errors; grows with 1 / sin(elevation)
 _IONOSPHERE, _TROPOSPHERE = 0.5, 0.3
-_CARRIER_REFLECTIONS = (
-    0.003  # m at the zenith, of reflections in a receiver's carriers (RTKLIB 2.4.3, rtkpos.c, varerr)
-)
-# s, correlation time of reflections: by the residuals of two drives 13 and 30 s on the way, longer at rest
+_CARRIER_REFLECTIONS = 0.003  # m at the zenith, of carrier-phase multipath (RTKLIB 2.4.3, rtkpos.c, varerr)
+# s, correlation time of multipath: 13 and 30 s by the residuals of two drives in motion, longer at rest
 REFLECTED = 20.0
-LEAST = 20.0  # dB-Hz that a signal without a C/N0, or below it, is taken to have
-_DEFAULT = 45.0  # dB-Hz where a file says nothing of it
+LEAST = 20.0  # dB-Hz, lower bound of C/N0, and the value where none is reported
+_DEFAULT = 45.0  # dB-Hz where a file has no C/N0
 
 
 def compute_code_sigma(cn0: Array, elevation: Array, ionosphere: Array) -> Array:
@@ -39,18 +37,18 @@ def compute_rate_sigma(cn0: Array, elevation: Array) -> Array:
 
 
 def compute_carrier_sigma(cn0: Array, elevation: Array, wavelength: Array) -> Array:
-    """(N,) m, 1-sigma of a carrier: the loop's thermal noise, wavelength / 2 pi sqrt(B / C/N0), and reflections."""
+    """(N,) m, 1-sigma of a carrier phase: thermal noise, wavelength / 2 pi sqrt(B / C/N0), and multipath."""
     rising = 1.0 / np.maximum(np.sin(elevation), 0.1)
     return np.asarray(np.sqrt(_compute_thermal(cn0, wavelength) + (_PHASE * rising) ** 2))
 
 
 def compute_carrier_difference_sigma(cn0: Array, elevation: Array, wavelength: Array) -> Array:
-    """(N,) m, 1-sigma of the difference of two receivers' carriers."""
+    """(N,) m, 1-sigma of the between-receiver difference of carrier phases."""
     return np.asarray(np.sqrt(2.0 * (_compute_thermal(cn0, wavelength) + compute_reflection_sigma(elevation) ** 2)))
 
 
 def compute_reflection_sigma(elevation: Array) -> Array:
-    """(N,) m, 1-sigma of what reflections do to a receiver's carrier, for some time alike."""
+    """(N,) m, 1-sigma of the time-correlated multipath error of a receiver's carrier phase."""
     rising = 1.0 / np.maximum(np.sin(elevation), 0.1)
     return np.asarray(_CARRIER_REFLECTIONS * np.sqrt(1.0 + rising**2))
 

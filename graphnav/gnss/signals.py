@@ -58,7 +58,7 @@ def number_satellite(name: str) -> int:
 
 
 def name_satellite(satellite: int) -> str:
-    """Its RINEX name."""
+    """RINEX name of a satellite."""
     return f"{SYSTEMS[int(satellite) // 100]}{int(satellite) % 100:02d}"
 
 
@@ -73,7 +73,7 @@ def number_signal(name: str) -> int:
 
 
 def name_signal(signal: int) -> str:
-    """Its RINEX name without the kind of observation: "1C"."""
+    """RINEX name of a signal, without the kind of observation: "1C"."""
     return f"{int(signal) // 100}{chr(int(signal) % 100 + ord('A'))}"
 
 

@@ -7,8 +7,8 @@ reception,
     rho' (1 + e.(v_s + omega x s) / c) = e.(v_s - v)          e: unit vector from the antenna to the satellite s
     D = rho' + b' - dt'
 
-(Groves 2013, sections 8.4.1, 9.4.1; the denominator is what the flight time changes by). All epochs are solved at once.
-Rows that are far from the others of their epoch lose weight as Cauchy's kernel has it.
+(Groves 2013, sections 8.4.1, 9.4.1; the denominator accounts for the change of the flight time). All epochs are solved
+at once. Outlying rows of an epoch are down-weighted by Cauchy's kernel.
 """
 
 from __future__ import annotations
@@ -21,23 +21,23 @@ from numpy.typing import NDArray
 
 from graphnav.core import earth
 from graphnav.core.rotation import Array
-from graphnav.gnss.atmosphere import NIGHT, compute_directions, klobuchar, saastamoinen
+from graphnav.gnss.atmosphere import NIGHT, compute_directions, compute_klobuchar_delay, compute_saastamoinen_delay
 from graphnav.gnss.ephemeris import OMEGA_WGS84, rotate_earth
 from graphnav.gnss.series import RawGnss
 from graphnav.gnss.sigmas import compute_code_sigma, compute_rate_sigma
 from graphnav.gnss.signals import L1, C
 
-_ITERATIONS, _ATMOSPHERE = 10, 3  # iterations, and from which on the atmosphere is modelled
-_KERNEL_SCALE = 3.0  # sigma at which a row begins to lose weight
-_WEAK = 1e6  # m, 1-sigma of an unknown before any row
+_ITERATIONS, _ATMOSPHERE = 10, 3  # iterations, and the first in which the atmosphere is modelled
+_KERNEL_SCALE = 3.0  # sigmas, scale of Cauchy's kernel
+_WEAK = 1e6  # m, prior 1-sigma of an unknown
 _LOST_RMS = 100.0  # m, rms of residuals beyond which an epoch has no position
-_WORST_PDOP = 60.0  # PDOP beyond which a position says nothing
+_WORST_PDOP = 60.0  # PDOP beyond which a position carries no information
 _OMEGA_E = np.array([0.0, 0.0, OMEGA_WGS84])
 
 
 @dataclass(frozen=True)
 class Geometry:
-    """Rows seen from places of the antenna (N, 3), e."""
+    """Line-of-sight geometry of rows, from antenna positions (N, 3), m in e."""
 
     s: Array  # (N, 3) m, satellites in the Earth-fixed frame of the reception
     e: Array  # (N, 3) unit vectors to them
@@ -52,15 +52,15 @@ class Geometry:
 class SinglePoint:
     """Solutions of E epochs; NaN where there is none."""
 
-    t: Array  # (E,) s, as the rows have it
+    t: Array  # (E,) s, stamps of the rows
     p: Array  # (E, 3) m in e
     clock: Array  # (E,) m
-    biases: Array  # (E, G) m of each group of signals against the first; NaN where it has no satellites
+    biases: Array  # (E, G) m, bias of each group of signals relative to the first; NaN without satellites
     covariance: Array  # (E, 3, 3) m^2 in east, north, up, by the stated sigmas
     v: Array  # (E, 3) m/s in e
     drift: Array  # (E,) m/s
     covariance_v: Array  # (E, 3, 3)
-    satellites: NDArray[np.intp]  # (E,) with a weight above a half
+    satellites: NDArray[np.intp]  # (E,) number of rows with a weight above one half
     rms: Array  # (E,) of whitened, weighted residuals
     groups: tuple[tuple[int, int], ...]  # system and signal, the reference first
     group: NDArray[np.intp]  # (N,) of each row
@@ -69,7 +69,7 @@ class SinglePoint:
 
 
 def _plan_padding(epoch: NDArray[np.intp], place: NDArray[np.intp], shape: tuple[int, int]) -> Callable[[Array], Array]:
-    """Lays rows (N, ...) out as (epochs, places, ...), 0 where an epoch has none."""
+    """Return a function that pads rows (N, ...) to (epochs, rows per epoch, ...) with zeros."""
 
     def pad(rows: Array) -> Array:
         out = np.zeros((*shape, *rows.shape[1:]))
@@ -80,7 +80,7 @@ def _plan_padding(epoch: NDArray[np.intp], place: NDArray[np.intp], shape: tuple
 
 
 def look(raw: RawGnss, antenna: Array, ionosphere: Array | None) -> Geometry:
-    """Directions, distances and delays of all rows from places of the antenna (N, 3).
+    """Compute directions, distances and delays of all rows from antenna positions (N, 3), m in e.
 
     Parameters
     ----------
@@ -94,24 +94,25 @@ def look(raw: RawGnss, antenna: Array, ionosphere: Array | None) -> Geometry:
     llh = earth.ecef_to_llh(antenna)
     delay = np.zeros(len(raw))
     if ionosphere is not None:
-        delay = klobuchar(ionosphere, raw.seconds_of_week, llh, azimuth, elevation) * (L1 / raw.frequency) ** 2
-    wet = np.zeros(len(raw)) if raw.troposphere else saastamoinen(llh, elevation)
+        on_l1 = compute_klobuchar_delay(ionosphere, raw.seconds_of_week, llh, azimuth, elevation)
+        delay = on_l1 * (L1 / raw.frequency) ** 2
+    wet = np.zeros(len(raw)) if raw.troposphere else compute_saastamoinen_delay(llh, elevation)
     return Geometry(s, away / distance[:, None], distance, azimuth, elevation, delay, wet)
 
 
 def compute_stretch(raw: RawGnss, geometry: Geometry) -> Array:
-    """(N,) 1 + e.(v_s + omega x s) / c: by how much a range changes less than satellite and antenna move."""
+    """(N,) 1 + e.(v_s + omega x s) / c: ratio of the relative velocity along the line of sight to the range rate."""
     moving = rotate_earth(raw.v, geometry.distance / C) + np.cross(_OMEGA_E, geometry.s)
     return np.asarray(1.0 + np.sum(geometry.e * moving, axis=1) / C)
 
 
 def choose_coefficients(raw: RawGnss) -> Array:
-    """Klobuchar's coefficients: those broadcast, else those of the night."""
+    """Klobuchar's coefficients: those broadcast, else those of the night-time delay."""
     return NIGHT if raw.klobuchar is None else np.array(raw.klobuchar)
 
 
 def group_signals(raw: RawGnss) -> tuple[tuple[tuple[int, int], ...], NDArray[np.intp]]:
-    """Systems with their signals, the one with most rows first, and which of them each row (N,) has."""
+    """Groups of system and signal, the one with most rows first, and the group of each row (N,)."""
     key = (raw.satellite // 100).astype(np.int64) * 1000 + raw.signal
     if raw.catalogue is not None:
         known = np.array([1000 * system + signal for system, signal in raw.catalogue.groups])
@@ -130,7 +131,7 @@ def solve(raw: RawGnss, mask: float = np.radians(10.0), robust: bool = True, dif
     ----------
     raw : one row for each satellite and epoch (`graphnav.gnss.series.choose_primary`).
     mask : rad, elevation below which satellites are not used.
-    robust : take weight from rows that are far from the others.
+    robust : down-weight outlying rows.
     differential : the codes are corrected by a base, which sees the same ionosphere.
     """
     t, of = raw.epochs

@@ -1,8 +1,8 @@
-"""Sun, Moon and the tide that they raise in the solid Earth, to a centimetre's tenth.
+"""Sun, Moon and the solid Earth tide, to half a centimetre.
 
-Sun and Moon by the series of low precision of Montenbruck and Gill (2000, section 3.3.2: a minute and some minutes of
-arc), the tide by the terms of degree two that are in phase, with the Love numbers of IERS Conventions 2010 (section
-7.1.1, equation 7.5), which are 5 mm at most from the whole of it.
+Sun and Moon by the low-precision series of Montenbruck and Gill (2000, section 3.3.2: one and some minutes of arc), the
+tide by the in-phase terms of degree two with the Love numbers of IERS Conventions 2010 (section 7.1.1, equation 7.5);
+the terms left out are 5 mm at most.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from graphnav.core.timescales import gps_to_utc
 
 _AU, _DAY = 149597870700.0, 86400.0  # m, s
 _J2000 = np.datetime64("2000-01-01T12:00:00", "us")
-_DYNAMIC_OFFSET = 69.2  # s, of terrestrial dynamic time before UTC since 2017: 37 leap seconds and 32.184 s
-_SUN, _MOON = 332946.05, 0.01230002  # masses, of the Earth's
-_H2, _L2, _H2_LAT, _L2_LAT = 0.6078, 0.0847, -0.0006, 0.0002  # Love and Shida numbers, and how they go with latitude
+_DYNAMIC_OFFSET = 69.2  # s, terrestrial time minus UTC since 2017: 37 leap seconds and 32.184 s
+_SUN, _MOON = 332946.05, 0.01230002  # masses over that of the Earth
+_H2, _L2, _H2_LAT, _L2_LAT = 0.6078, 0.0847, -0.0006, 0.0002  # Love and Shida numbers, and their dependence on latitude
 
 
 def locate_sun_and_moon(gps: Array) -> tuple[Array, Array]:
@@ -68,7 +68,7 @@ def _rotate_to_earth_fixed(lon: Array, lat: Array, distance: Array, tilt: Array,
 
 
 def compute_solid_tide(place: Array, sun: Array, moon: Array) -> Array:
-    """(N, 3) m in e, by which points (N, 3), m in e, are off their place without tides; its constant part is in it."""
+    """(N, 3) m in e, tidal displacement of points (N, 3), m in e, permanent part included."""
     r = np.linalg.norm(place, axis=1)[:, None]
     up = place / r
     flat = 1.5 * up[:, 2:] ** 2 - 0.5

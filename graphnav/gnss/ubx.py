@@ -1,7 +1,6 @@
 """u-blox logs: raw measurements of RXM-RAWX and navigation messages of RXM-SFRBX.
 
-Layouts are those of u-blox's interface descriptions (M8, F9); what the words of the navigation messages hold is in
-`graphnav.gnss.messages`.
+Layouts are those of u-blox's interface descriptions (M8, F9); `graphnav.gnss.messages` decodes the navigation messages.
 """
 
 from __future__ import annotations
@@ -43,19 +42,19 @@ _CODE_BIT, _CARRIER_BIT, _HALF_BIT = 1, 2, 4  # bits of the status: code valid, 
 class _RawMessages:
     times: list[tuple[float, int]] = field(default_factory=list)  # of the epochs: s of the week, week
     rows: list[np.ndarray] = field(default_factory=list)
-    frames: list[tuple[int, bytes]] = field(default_factory=list)  # SFRBX, and after which epoch
+    frames: list[tuple[int, bytes]] = field(default_factory=list)  # SFRBX, and the epoch that precedes it
     broken: int = 0
     cut: bool = False
 
 
 def is_ubx(data: bytes) -> bool:
-    """Whether a frame of raw measurements is in the first bytes of a log."""
+    """Whether the first bytes of a log contain a frame of raw measurements."""
     head = data[: 1 << 18]
     return any(SYNC + bytes(kind) in head for kind in (_RAWX, _SFRBX))
 
 
 def parse_ubx(data: bytes, path: Path) -> tuple[Observations, Ephemerides]:
-    """The observations of a log, and the ephemerides that its satellites sent (none, perhaps).
+    """Parse the observations of a log, and the broadcast ephemerides if it has any.
 
     Raises
     ------
@@ -106,11 +105,11 @@ def parse_ubx(data: bytes, path: Path) -> tuple[Observations, Ephemerides]:
 
 
 def _find_lock_losses(t: np.ndarray, satellite: np.ndarray, signal: np.ndarray, lock: np.ndarray) -> np.ndarray:
-    """(N,) whether the carrier has been in lock for less than since the epoch before."""
+    """(N,) whether the lock time is shorter than the time since the previous epoch."""
     order = np.lexsort((t, signal, satellite))
     s, g, x, at = satellite[order], signal[order], lock[order], t[order]
     same = (np.diff(s) == 0) & (np.diff(g) == 0)
-    full = x >= 64.5  # s, beyond which the counter stands still
+    full = x >= 64.5  # s, at which the lock time counter saturates
     lost = np.concatenate([[False], same & ((np.diff(x) < 0.0) | ((x[1:] + 1e-3 < np.diff(at)) & ~full[1:]))])
     out = np.zeros(len(t), dtype=bool)
     out[order] = lost | (x == 0.0)
@@ -118,7 +117,7 @@ def _find_lock_losses(t: np.ndarray, satellite: np.ndarray, signal: np.ndarray, 
 
 
 def _find_frames(data: bytes) -> _RawMessages:
-    """All messages that are used, their check sums tested."""
+    """Find all messages in use, with checksums verified."""
     out = _RawMessages()
     at = data.find(SYNC)
     while at >= 0:
@@ -129,7 +128,7 @@ def _find_frames(data: bytes) -> _RawMessages:
         size = int.from_bytes(data[at + 4 : at + 6], "little")
         end = at + 8 + size
         if kind not in (_RAWX, _SFRBX):
-            # other messages are passed over whole, if another frame or anything but UBX follows them
+            # other messages are skipped whole if another frame or non-UBX data follows
             at = data.find(SYNC, end if data[end : end + 2] == SYNC else at + 2)
             continue
         if end > len(data):
@@ -154,6 +153,6 @@ def _find_frames(data: bytes) -> _RawMessages:
 
 
 def _check_sums(body: bytes, stated: bytes) -> bool:
-    """Fletcher's sums of a frame."""
+    """Verify the Fletcher checksum of a frame."""
     x = np.frombuffer(body, dtype=np.uint8).astype(np.int64)
     return stated == bytes((int(x.sum()) & 0xFF, int(np.sum(x * np.arange(len(x), 0, -1))) & 0xFF))

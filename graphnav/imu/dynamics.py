@@ -6,7 +6,7 @@ In the fixed local frame n the vehicle obeys (Groves 2013, eq. 5.18-5.29, with n
 
 with gravity g and Earth rate omega. Let E(s) = Exp(omega s) and y = E(s) p, the position seen from axes
 that stand still in inertial space and coincide with n at the interval's start. Then y'' = E(s) (R f + G)
-with G = g(p) + omega x (omega x p), and the Coriolis force is gone. Over an interval of length T::
+with G = g(p) + omega x (omega x p), and the Coriolis force does not appear. Over an interval of length T::
 
     R_j = E^T R_i dR
     p_j = E^T (p_i + (v_i + omega x p_i) T + iint E G + R_i dP)
@@ -40,7 +40,7 @@ _INTO = np.eye(3)[_TO]
 _I3 = np.eye(3)
 
 
-def scale_parameter(recording: Recording) -> tuple[Parameter, ...]:
+def make_scale_parameter(recording: Recording) -> tuple[Parameter, ...]:
     """Scale errors (gyro x y z, accelerometer x y z), where the noise figures leave them open.
 
     For a foot, which turns and is shaken about all axes, also the cross-axis terms: 9 and 9, the scale errors first.
@@ -178,7 +178,7 @@ class ImuFactors:
         return self._earth.reach(rows, start, dR, moved[:, :3], moved[:, 3:])
 
     def _correct(self, rows: slice, start: States, scale: Array | None) -> tuple[Array, Array, Array]:
-        """What errors of biases and scale turn dR by (n, 3), dR, and dP with dV (n, 6), as the states have them."""
+        """Rotation (n, 3) by bias and scale errors, and dR, (dP, dV) (n, 6) corrected for them."""
         iv = self.intervals
         delta = np.concatenate([start.ba, start.bg], -1) - self.expected[rows]
         if scale is not None:

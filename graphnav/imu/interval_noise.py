@@ -105,7 +105,7 @@ def compute_directed_covariance(of_gyro: Array, of_accel: Array, R: Array, left:
     return Q
 
 
-def walk_covariances(
+def compute_walk_covariances(
     edge: Array, left: Array, A: Array, B: Array, PA: Array, PB: Array, a: Array, b: Array
 ) -> tuple[Array, Array]:
     """Covariances (n, 15, 15), start frame, of bias random walks of unit density within the interval, by midpoint

@@ -39,10 +39,10 @@ from graphnav.core.rotation import Array
 from graphnav.core.running import sum_running
 from graphnav.imu.interval_noise import (
     compute_directed_covariance,
+    compute_walk_covariances,
     compute_white_covariance,
     compute_white_variances,
     take_last,
-    walk_covariances,
 )
 from graphnav.imu.samples import MANY, Samples, cut_pieces, group_intervals
 from graphnav.recording import Imu
@@ -299,7 +299,7 @@ def _integrate(
     left = T - edge  # time left at each edge
     a_edge = V[-1] - V
     b_edge = P[-1] - P - V * left[:, None]
-    walks = walk_covariances(edge, left, A, B, PA, PB, a_edge, b_edge)
+    walks = compute_walk_covariances(edge, left, A, B, PA, PB, a_edge, b_edge)
     of_gyro, of_accel = imu.noise.gyro_bias_walk**2 * walks[0], imu.noise.accel_bias_walk**2 * walks[1]
     Q = compute_white_covariance(qg, qa, left, a_edge, b_edge) + of_gyro + of_accel
     if len(along_gyro) or len(along_accel):

@@ -14,7 +14,7 @@ from graphnav.recording import Imu
 
 GAP = 1.5  # sample periods between rows above which there is a gap
 MANY = 64  # pieces above which an interval is processed apart from shorter ones
-_SPANS = 10  # times a gap's length on either side of it: twenty spans tell a variance to a third
+_SPANS = 10  # times a gap's length on either side of it: twenty spans determine a variance to a third
 _PIECES_AT_ONCE = 40_000  # pieces processed at once: keeps the working arrays in the processor's cache
 
 

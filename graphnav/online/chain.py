@@ -35,7 +35,7 @@ from graphnav.online.looks import Stops
 from graphnav.online.sensors import Sensors
 from graphnav.recording import Recording
 
-_PLACE_SIGMA = 1000.0  # m, 1-sigma of the place of a stop
+_PLACE_SIGMA = 1000.0  # m, prior 1-sigma of the position of a stop
 _FEWEST_FOR_PERIOD = 5  # fixes from which their period is known
 _ENGINES: dict[str, type[Window]] = {"window": Window, "isam2": TreeWindow}
 
@@ -58,7 +58,7 @@ class Chain:
     ----------
     message, t0 : the prior and the time it is for.
     setup : of the sensors.
-    noise : how good the sensors are taken to be.
+    noise : the noise model in use.
     """
 
     def __init__(
@@ -76,7 +76,8 @@ class Chain:
         self._head_held = Held()
         self.epochs = self.fixed = 0  # settled keyframes with carriers, and those of them that are fixed
         self._parameters: dict[str, Parameter] = {}
-        self._turned = False  # whether some state has moved so far that it may need to be relinearised
+        # whether some state has moved so far from its linearisation point that it may have to be relinearised
+        self._turned = False
 
     @property
     def busy(self) -> bool:
@@ -84,10 +85,10 @@ class Chain:
         return False
 
     def go_on(self, sensors: Sensors) -> None:
-        """Let some more of them enter."""
+        """Let a few more keyframes enter."""
 
     def finish_entering(self, sensors: Sensors) -> None:
-        """Let all of them enter at once."""
+        """Let all remaining keyframes enter at once."""
 
     def note_missed_row(self, sensors: Sensors, sensor: str, t: float) -> bool:
         """Record a row that came late, at a time (s): whether keyframes exist that would have used it."""
@@ -223,7 +224,7 @@ class Chain:
         return hold_on(held, Epochs(phase, newest.columns, problem.t), k, here, lambda: newest.covariance)
 
     def _begin_ambiguities(self, problem: Problem, steps: tuple[Step, ...], held: Held) -> tuple[Step, ...]:
-        """Ambiguities that begin anew, except those that do anyway, about their current estimates."""
+        """Reset ambiguities about their current estimates, except those that begin anew in any case."""
         phase, newest, started = split_carriers(problem)[1], self.window.newest, {step.name for step in steps}
         assert phase is not None
         return tuple(
@@ -274,7 +275,7 @@ class Chain:
         del self._nodes[count:], self._held[count:]
 
     def _leave(self, count: int) -> SettledStates:
-        """Let the first keyframes settle."""
+        """Settle the first keyframes (marginalise them out of the window)."""
         self.epochs += sum(held.epoch for held in self._held[:count])
         self.fixed += sum(held.epoch and held.fixed for held in self._held[:count])
         self._head_nodes, self._head_held = self._nodes[count - 1], self._held[count - 1].go_on()
@@ -284,7 +285,7 @@ class Chain:
         return settled
 
     def _forget(self) -> None:
-        """Drop what stages know of the origin of their rows; it is rebuilt when needed."""
+        """Drop the records of where the rows of stages come from; they are rebuilt when needed."""
         stages = self.window.stages
         for k in range(len(stages) - 1, -1, -1):
             if stages[k].place.problem is None:
@@ -293,7 +294,7 @@ class Chain:
 
 
 def find_turn(setup: Recording, noise: NoiseModel) -> float:
-    """How far (rad) an attitude may move before rows are relinearised, by the noise of the accelerometer."""
+    """Largest change of attitude (rad) without relinearisation, by the noise of the accelerometer."""
     stated = setup.imu.noise
     density = stated.accel_noise_density * float(np.sqrt(noise.get_factor("imu.accel_noise_density", 1.0)))
     return compute_turn_limit(replace(stated, accel_noise_density=density))

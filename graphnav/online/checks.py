@@ -21,7 +21,7 @@ _CAUSES = {
     "beyond any sensor": "are rates in rad/s, forces in m/s^2, speeds in m/s?",
     "not a number": "are all fields there, and the sigmas above zero?",
     "a sigma too large to carry information": "are the sigmas in m, and standard deviations?",
-    "out of reach": "are they of one place, and latitude and longitude in their order?",
+    "out of reach": "are they positions of one drive, with latitude and longitude in their order?",
 }
 
 

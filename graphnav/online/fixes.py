@@ -40,7 +40,7 @@ class Fixes(Buffer):
         return self.rows[self.rows[:, _USED] > 0.0, 0]
 
     def complete(self, t: float, values: tuple[float, ...]) -> tuple[float, ...]:
-        """The row of a fix at a time (s): its own values, typical sigmas, and that it is used."""
+        """The row of a fix at a time (s): its values, typical sigmas, and the mark that it is used."""
         position, velocity = (self._track_sigma(kind, t, values[k : k + 3]) for kind, k in (("p", 3), ("v", 9)))
         return (*values, *position, *velocity, 1.0)
 
@@ -60,7 +60,7 @@ class Fixes(Buffer):
         self.rows[select_best_fixes(gnss, np.floor((gnss.t - begin) / spacing)), _USED] = 1.0
 
     def choose(self, t: float) -> bool:
-        """Whether the fix at a time is one of the best of its span; those that no longer are go to `left`."""
+        """Whether the fix at a time is among the best of its span; fixes that no longer are go to `left`."""
         if self._grid is None:
             return True
         begin, spacing = self._grid

@@ -23,7 +23,7 @@ from graphnav.core.complaints import describe_invalid, suggest_nearest
 from graphnav.core.errors import RecordingError
 from graphnav.core.files import parse_json, parse_number
 from graphnav.online.raw import RAW
-from graphnav.online.raw_lines import LiveRaw, format_epoch, live_raw, parse_epoch
+from graphnav.online.raw_lines import LiveRaw, describe_live_raw, format_epoch, parse_epoch
 from graphnav.online.replay import list_rows
 from graphnav.online.sensors import Row
 from graphnav.recording import Gnss, Imu, ImuNoise, Odometer, Recording
@@ -174,7 +174,7 @@ def format_head(recording: Recording) -> str:
             "speed_sigma": o.speed_sigma, "delay_sigma": o.delay_sigma,
         }  # fmt: skip
     if recording.raw_gnss is not None:
-        setup["raw_gnss"] = live_raw(recording.raw_gnss)
+        setup["raw_gnss"] = describe_live_raw(recording.raw_gnss)
     setup |= {name: series.figures.model_dump() for name, series in recording.sensors.items()}
     return f"{PROTOCOL} {json.dumps(setup)}"
 

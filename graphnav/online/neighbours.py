@@ -30,7 +30,7 @@ class Neighbours:
         self._columns = columns
         self._excesses = Excesses(columns)
         self._learnt = -np.inf  # s, up to where rows are in these
-        self._lines: StraightLines | None = None  # of rows on straight lines, where they can be told
+        self._lines: StraightLines | None = None  # statistics of rows on straight lines, where they can be determined
         self._last: tuple[tuple[float, ...], tuple[float, ...]] | None = None  # the newest two rows with their times
 
     def forget_newest(self) -> None:

@@ -23,7 +23,7 @@ RAW = "raw_gnss"
 
 @dataclass
 class RawEpochs:
-    """Epochs in order of time; epochs that are too close to be used still show where arcs of carriers end.
+    """Epochs in order of time; epochs too close together to be used still show where carrier-phase arcs end.
 
     Parameters
     ----------
@@ -35,9 +35,9 @@ class RawEpochs:
     _t: list[float] = field(default_factory=list)  # s, of the epochs in use
     _every: list[float] = field(default_factory=list)  # s
     _rows: dict[float, Array] = field(default_factory=dict)  # (n, WIDTH), by time
-    # (n, 2), of their carriers: s, begins of the arcs, and cycles of wind-up
+    # (n, 2) of the carrier phases: start of the arc, s, and phase wind-up, cycles
     _arcs: dict[float, Array] = field(default_factory=dict)
-    _number: dict[float, int] = field(default_factory=dict)  # of those that are used; -1 of one that came late
+    _number: dict[float, int] = field(default_factory=dict)  # number among the epochs in use; -1 for one received late
     _last: dict[tuple[float, float], tuple[float, Array, Array]] = field(
         default_factory=dict
     )  # with a carrier, by slot
@@ -65,10 +65,10 @@ class RawEpochs:
             return "of satellites that the setup does not name"
         rows = take_sane(rows)
         usable = select_usable(build_raw_series([0.0], [rows], self.setup), self.settings)
-        return None if usable.any() else "no satellite that is of use"
+        return None if usable.any() else "no usable satellite"
 
     def is_wanted(self, t: float) -> bool:
-        """Whether there is no epoch so close to a time that one of the two suffices."""
+        """Whether an epoch at this time is wanted: none in use is too close to it."""
         k, least = bisect_left(self._t, t), self.settings.period - EARLY
         near = self._t[max(k - 1, 0) : k + 1]
         return t not in self._rows and all(abs(x - t) >= least and x != t for x in near)
@@ -81,7 +81,7 @@ class RawEpochs:
         self._every.insert(k, t)
         self._rows[t] = self._fill_place(t, take_sane(np.reshape(values, (-1, WIDTH))))
         if used:
-            # numbers given stay: a late epoch has none, and changes of carriers bypass it
+            # numbers are final: a late epoch gets none, and carrier-phase changes bypass it
             self._number[t] = self._number.get(self.newest, -1) + 1 if t > self.newest else -1
             insort(self._t, t)
         later = self._every[k:]
@@ -146,7 +146,7 @@ class RawEpochs:
         return rows
 
     def _find_arcs(self, t: float) -> Array:
-        """(n, 2) of an epoch's carriers: s, begins of their arcs, NaN where there is none; and cycles of wind-up."""
+        """(n, 2) of an epoch's carrier phases: start of the arc, s (NaN without one), and phase wind-up, cycles."""
         assert self.setup.catalogue is not None
         rows, last = self._rows[t], list(self._last.values())
         s = self.settings
@@ -177,14 +177,14 @@ class RawEpochs:
 
 
 def use_codes_alone(settings: Settings) -> Settings:
-    """The settings without carriers: a start needs nothing of them."""
+    """The settings without carrier phases, for the alignment, which needs none."""
     s = settings.raw_gnss
     less = s.model_copy(update={"differences": False, "carrier": False, "ppp": False, "code": s.code or s.ppp})
     return settings.model_copy(update={RAW: less})
 
 
 def drop_ambiguities(settings: Settings, setup: Recording) -> Settings:
-    """The settings for a noise model: changes of carriers have variance components, ambiguities have none."""
+    """The settings for noise estimation: carrier-phase changes have variance components, ambiguities have none."""
     s, raw = settings.raw_gnss, setup.raw_gnss
     if raw is None or not (s.carrier and raw.differenced):
         return settings

@@ -1,7 +1,7 @@
 """Epochs of raw observations as rows of a stream, and as text.
 
 An epoch is one row: the numbers of its satellites one after the other, each placed by the ephemerides that were known
-when the source began. Which satellites and signals there may be, and what all epochs have in common, says the setup.
+when the source began. The setup states the possible satellites and signals, and what all epochs have in common.
 
 In the line protocol (`graphnav.online.lines`) each satellite and signal of an epoch is, with commas between:
 
@@ -48,7 +48,7 @@ _NUMBERS = (
     "drift", "difference", "carrier_difference", "base_arc", "lock", "antenna", "receiver_clock",
 )  # fmt: skip
 _WIDTHS = {"p": 3, "v": 3, "antenna": 3, "receiver_clock": 2}
-# least and most that can be, in SI, and whether a row needs it
+# smallest and largest valid value, SI, and whether a row needs it
 _BOUNDS = {
     "code": (-1e9, 1e9, False), "carrier": (-1e11, 1e11, False), "range_rate": (-1e6, 1e6, False),
     "cn0": (0.0, 100.0, False), "frequency": (1e9, 3e9, True), "p": (1e7, 1e8, True), "v": (0.0, 2e4, True),
@@ -60,7 +60,7 @@ WIDTH = sum(_WIDTHS.get(name, 1) for name in _NUMBERS)
 
 
 def drop_epochs(raw: RawGnss) -> RawGnss:
-    """What all epochs of a series have in common."""
+    """The series without epochs: what all of them have in common."""
     placed = raw.take(np.isfinite(raw.p[:, 0]))
     satellites, _ = placed.satellites
     groups, _ = group_signals(placed.take(choose_primary(placed)))
@@ -70,7 +70,7 @@ def drop_epochs(raw: RawGnss) -> RawGnss:
 
 
 def list_epochs(raw: RawGnss) -> list[tuple[float, tuple[float, ...]]]:
-    """Times (s) and numbers of the epochs of a series, those of its satellites that are placed."""
+    """Times (s) and numbers of the epochs of a series, for satellites with a position."""
     raw = _fill_columns(raw.take(np.isfinite(raw.p[:, 0])))
     columns = np.column_stack([np.asarray(getattr(raw, name), dtype=float) for name in _NUMBERS])
     t, first = np.unique(raw.t, return_index=True)
@@ -89,12 +89,12 @@ def format_epoch(values: tuple[float, ...]) -> str:
 
 
 def parse_epoch(text: str) -> tuple[float, ...]:
-    """What `format_epoch` made a text of.
+    """Parse the text of `format_epoch`.
 
     Raises
     ------
     ValueError
-        In a few words, if it is none.
+        With a short reason, if the text is invalid.
     """
     first, *satellites = text.split(";")
     own = _parse_cells(first, 5, "place and clock")
@@ -110,7 +110,7 @@ def parse_epoch(text: str) -> tuple[float, ...]:
 
 
 def take_sane(rows: Array) -> Array:
-    """Rows that a receiver can have sent, of each satellite and signal the first."""
+    """Keep plausible rows, the first of each satellite and signal."""
     good = np.ones(len(rows), dtype=bool)
     at = 0
     for name in _NUMBERS:
@@ -192,20 +192,20 @@ _Way = Annotated[float, Field(ge=-100.0, le=100.0)]  # m, of an antenna's phase 
 
 
 class LiveRaw(BaseModel):
-    """What the first line of a live source says of raw observations."""
+    """The raw observations' part of a live source's first line."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     lever_arm: Vector = (0.0, 0.0, 0.0)
     place: Vector  # m in e, within kilometres of the rover
-    zero: float = 0.0  # s since the GPS epoch at t = 0: of the ionosphere's hour
+    zero: float = 0.0  # s since the GPS epoch at t = 0: the ionosphere depends on the time of day
     satellites: tuple[str, ...]  # that there may be
-    signals: tuple[tuple[str, str], ...]  # system and signal that codes are used of, the reference first
+    signals: tuple[tuple[str, str], ...]  # systems and signals whose codes are used, the reference first
     period: Positive = 1.0  # s between epochs
     base: bool = False  # rows have differences against a base station
     baseline: NotNegative = 0.0  # m, to it
     klobuchar: tuple[tuple[float, float, float, float], tuple[float, float, float, float]] | None = None
-    troposphere: bool = False  # taken off the codes already
+    troposphere: bool = False  # corrections already applied to the codes
     precise: bool = False  # placed by precise orbits and clocks
     second: dict[str, str] = {}  # of precise point positioning: the second signal of each satellite
     # m, by band: in the satellite's axes, and then `SatelliteAntenna.variation`
@@ -218,7 +218,7 @@ class LiveRaw(BaseModel):
         Raises
         ------
         RecordingError
-            If it names a satellite or signal that there is not.
+            If it names an unknown satellite or signal.
         """
         try:
             satellites = tuple(sorted({number_satellite(name) for name in self.satellites}))
@@ -251,8 +251,8 @@ class LiveRaw(BaseModel):
         )  # fmt: skip
 
 
-def live_raw(raw: RawGnss) -> dict[str, object]:
-    """What the first line of a live source says of a series, or of its setup."""
+def describe_live_raw(raw: RawGnss) -> dict[str, object]:
+    """The part of a live source's first line for a series, or for its setup."""
     setup = raw if raw.catalogue is not None else drop_epochs(raw)
     known = setup.catalogue
     assert known is not None

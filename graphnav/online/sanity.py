@@ -24,7 +24,8 @@ Row = tuple[str, float, tuple[float, ...]]  # sensor, time (s), values
 
 _BLANK = (math.nan,) * 6
 _LEAST_SIGMA_LIVE = 1e-4  # m, m/s; a tenth of the resolution of a carrier's phase
-_MOST_FIXES = 600  # fixes: those that contradict so many consistent ones are believed once they are more
+# fixes: consistent ones that contradict earlier ones are accepted once they are more than these, up to so many
+_MOST_FIXES = 600
 _SET_BACK_ROWS = 20  # consecutive IMU rows at times that have passed: not late rows, but another clock
 CERTAIN_SPAN = 1.2  # s, duration of these: more than a second, so that one falls on a remembered second
 _REMEMBERED_SPAN = 36_000  # s, ten hours
@@ -82,8 +83,8 @@ def drop_insane_velocity(values: tuple[float, ...]) -> tuple[tuple[float, ...], 
 
 @dataclass
 class Reach:
-    """Whether fixes can be reached from the previous ones; once consistent unreachable fixes outnumber these, they
-    replace them.
+    """Whether fixes can be reached from the previous ones; once consistent unreachable fixes outnumber the earlier
+    ones, they replace them.
     """
 
     _t: float = -math.inf
@@ -132,7 +133,7 @@ class ClockGuard:
     ahead: list[Row] = field(default_factory=list)  # fixes and readings far ahead of the IMU, held likewise
     released: list[Row] = field(default_factory=list)  # held rows that proved to be of the current clock
     known: list[Row] = field(default_factory=list)  # held rows that proved to be of an earlier clock
-    _again: Literal["", "this", "before"] = ""  # the clock that the rows behind are known to be of, if any
+    _behind_clock: Literal["", "this", "before"] = ""  # the clock that the rows behind are known to be of, if any
     _before: dict[int, tuple[float, ...]] = field(default_factory=dict)  # as `_seconds`, of earlier clocks
     _ahead: list[Row] = field(default_factory=list)  # rows far ahead at times of an earlier clock, held likewise
     _sent_again: bool = False  # whether these are known to be of that clock
@@ -173,18 +174,18 @@ class ClockGuard:
             if t in times:
                 return False  # repeated
             if times and t < max(times) - CERTAIN_SPAN:  # behind these as well
-                self.behind, self._again, times = [one for one in self.behind if one[0] != "imu"], "", []
+                self.behind, self._behind_clock, times = [one for one in self.behind if one[0] != "imu"], "", []
             second = int(t)
             if (t, *values) == self._seconds.get(second):
-                self._again = "this"
+                self._behind_clock = "this"
             elif (t, *values) == self._before.get(second):
-                self._again = "before"
+                self._behind_clock = "before"
             times.append(t)
         self.behind.append(row)
-        if self._again:
+        if self._behind_clock:
             others = [one for one in self.behind if one[0] != "imu"]
             self.behind = [row] if sensor == "imu" else []
-            (self.released if self._again == "this" else self.known).extend(others)
+            (self.released if self._behind_clock == "this" else self.known).extend(others)
             return False
         if len(self.behind) - len(times) > _HELD:  # the IMU is silent
             self.released.append(self.behind.pop(next(k for k, one in enumerate(self.behind) if one[0] != "imu")))
@@ -232,18 +233,18 @@ class ClockGuard:
         """Count a regular row: once these outnumber the held rows, the clock was not set."""
         self._onward += 1
         held = sum(row[0] == "imu" for row in self.behind) + sum(map(len, self._strands))
-        if self._again or self._onward >= held:
+        if self._behind_clock or self._onward >= held:
             self.release()
 
     def release(self) -> None:
         """The held fixes and readings are of this clock, or of none."""
         self.released += [row for row in self.behind if row[0] != "imu"] + self.ahead
-        self.behind, self.ahead, self._strands, self._again, self._onward = [], [], [], "", 0
+        self.behind, self.ahead, self._strands, self._behind_clock, self._onward = [], [], [], "", 0
 
     def set_back(self) -> list[Row]:
         """The rows of the new clock in order; what is remembered is of the old one from now on."""
         held = sorted(self.behind, key=lambda row: row[1])
-        self.behind, self._strands, self._again, self._onward = [], [], "", 0
+        self.behind, self._strands, self._behind_clock, self._onward = [], [], "", 0
         self._before |= self._seconds
         for second in list(self._before)[:-_REMEMBERED_SPAN]:
             del self._before[second]

@@ -55,7 +55,8 @@ class Sensors:
     raw: RawEpochs | None = field(init=False)  # of a receiver whose raw observations are used in place of its fixes
     oldest: float = -np.inf  # s; rows up to here are too late
     set_back: list[Row] = field(default_factory=list)  # the first rows of a clock that was set back
-    moved: tuple[float, int] | None = None  # since when (s), and how many fixes are elsewhere than all before
+    # time (s) from which fixes are out of reach of all earlier ones, and their number
+    moved: tuple[float, int] | None = None
     released: list[Row] = field(default_factory=list)  # held rows that are to be processed now
     _clock: ClockGuard = field(default_factory=ClockGuard)
     _reach: Reach = field(default_factory=Reach)
@@ -160,7 +161,7 @@ class Sensors:
             if others is None:
                 self.counts["gnss: out of reach"] += 1
                 return False
-            if others:  # the vehicle is there, and the fixes before were wrong
+            if others:  # the vehicle is at the new position, and the earlier fixes were wrong
                 self.counts["gnss"] -= len(self.gnss)
                 self.counts["gnss: out of reach"] += len(self.gnss) - len(others) + 1
                 self.gnss.drop_before(np.inf)

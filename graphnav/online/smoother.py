@@ -25,8 +25,8 @@ from graphnav.estimation.solution import ExcludedSpan
 from graphnav.estimation.solvers.watch import OLDEST
 from graphnav.online.ahead import Live, export
 from graphnav.online.checks import check_rows
-from graphnav.online.judging import CatchUp, Judgement, are_enough, start_judging
 from graphnav.online.looks import CONTEXT, SURE
+from graphnav.online.noise_estimation import BackgroundEstimation, CatchUp, are_enough, start_estimation
 from graphnav.online.sanity import find_period
 from graphnav.online.sensors import Row, Sensors
 from graphnav.online.start import find_start, let_clocks_drift, list_keyframes, make_tracker, take_start_rows
@@ -66,8 +66,8 @@ class Smoother:
         self.tracker: Tracker | None = None
         self.notes: list[str] = []
         self.late: Counter[str] = Counter()  # used rows that arrived after the keyframe they should have entered
-        self._judgement: Judgement | None = None  # estimation of the noise model in progress
-        self._again: CatchUp | None = None  # tracker that processes the unsettled keyframes with the new model
+        self._estimation: BackgroundEstimation | None = None  # estimation of the noise model in progress
+        self._catch_up: CatchUp | None = None  # tracker that processes the unsettled keyframes with the new model
         self._tentative = False  # nothing may settle before the noise model has been estimated once
         self._found: Alignment | None = None  # whether the noise model is to be estimated again
         self._notes_on: dict[str, tuple[str, ...]] = {}  # notes that further rows may change, by subject
@@ -100,7 +100,7 @@ class Smoother:
         sensor, t, values = row
         sensors = self.sensors
         before = sensors.imu.newest
-        if sensor == "imu" and sensors.add_next(t, values, before):  # as nearly all do
+        if sensor == "imu" and sensors.add_next(t, values, before):  # the common case
             self._take_newest(t, before)
             return
         previous = sensors.find_newest(sensor)
@@ -173,17 +173,17 @@ class Smoother:
         elif now >= self._due - SAME_TIME:
             self._advance(tracker, now)
             self._awake = now
-        elif self._again is not None:
-            self._go_through(self._again, tracker)
-        elif self._judgement is not None and tracker.newest >= self._judgement.due:
-            self._use(self._judgement, tracker)
+        elif self._catch_up is not None:
+            self._step_catch_up(self._catch_up, tracker)
+        elif self._estimation is not None and tracker.newest >= self._estimation.due:
+            self._use(self._estimation, tracker)
         elif tracker.work_ahead(self.sensors, expected := self._predict_keyframe(tracker), not self._tentative):
             self._collect(tracker)
         elif tracker.stale and not self._tentative:
-            self._again = CatchUp(tracker.restart_settled(tracker.noise, self._setup))
+            self._catch_up = CatchUp(tracker.restart_settled(tracker.noise, self._setup))
         else:
-            if self._found is not None and self._judgement is None and not self._tentative:
-                self._judge_again(self._found, tracker)
+            if self._found is not None and self._estimation is None and not self._tentative:
+                self._estimate_again(self._found, tracker)
             self._awake = expected if now < expected else self._due
 
     def _predict_keyframe(self, tracker: Tracker) -> float:
@@ -214,7 +214,7 @@ class Smoother:
             if "units" not in self._notes_on:
                 self._replace_notes("units", check_rows(self.sensors.make_recording(every=True)))
         if self.tracker is not None:
-            self._judge_at_last()
+            self._finish_estimation()
             self._advance(self.tracker, self.sensors.imu.newest, last=True)
             self.tracker.settle(self.sensors)
             self._collect(self.tracker)
@@ -235,7 +235,7 @@ class Smoother:
             return
         recording, stationary = rows
         origin = choose_origin(recording) if self.frame is None else self.frame.origin
-        self.frame = LocalFrame(origin, recording.start)  # clocks that were set anew drift from there
+        self.frame = LocalFrame(origin, recording.start)  # a clock that was set drifts from that time on
         try:
             found = find_start(recording, stationary, self.settings, self.frame)
         except EstimationError as error:
@@ -255,7 +255,7 @@ class Smoother:
         sensors.oldest = recording.start
         self._advance(tracker, sensors.imu.newest)
         if self._found is not None and self.tracker is tracker:
-            self._begin_judging(self._found, tracker)
+            self._begin_estimation(self._found, tracker)
 
     def _track(self, found: Alignment, start: float, noise: NoiseModel) -> Tracker:
         """Start tracking at the first row that an alignment has used, s."""
@@ -269,7 +269,7 @@ class Smoother:
         self.notes = [note for note in self.notes if note not in self._notes_on.get(matter, ())] + list(words)
         self._notes_on[matter] = words
 
-    def _judge_again(self, found: Alignment, tracker: Tracker) -> None:
+    def _estimate_again(self, found: Alignment, tracker: Tracker) -> None:
         """Estimate the noise model again before a state settles, then from ever more rows until they suffice."""
         span = tracker.newest - self._began
         enough = are_enough(self.sensors, found, span)
@@ -277,18 +277,20 @@ class Smoother:
             return
         self._estimated_from = span
         self._found = None if enough else found
-        self._begin_judging(found, tracker)
+        self._begin_estimation(found, tracker)
 
-    def _begin_judging(self, found: Alignment, tracker: Tracker) -> None:
+    def _begin_estimation(self, found: Alignment, tracker: Tracker) -> None:
         assert self.frame is not None
         times = np.concatenate([self._times, tracker.window.t])
-        self._judgement = start_judging(self.sensors, self.settings, self.frame, found, times, tracker.newest + AFTER)
+        self._estimation = start_estimation(
+            self.sensors, self.settings, self.frame, found, times, tracker.newest + AFTER
+        )
 
-    def _use(self, judgement: Judgement, tracker: Tracker) -> None:
+    def _use(self, estimation: BackgroundEstimation, tracker: Tracker) -> None:
         """Start to process the unsettled keyframes with the new noise model."""
-        self._judgement = None
+        self._estimation = None
         try:
-            found = judgement.answer()
+            found = estimation.wait()
         except Exception as error:
             self.notes.append(Note("online.not_judged", f"noise and faults not re-estimated: {error}"))
             self._tentative = False
@@ -297,23 +299,23 @@ class Smoother:
         self._replace_notes("units", found.doubts)
         self._left_out = tuple(fault for fault in found.excluded if fault.kind not in FIXES)
         if tracker.opened:
-            self._again = CatchUp(tracker.restart_settled(found.noise, self._setup))
+            self._catch_up = CatchUp(tracker.restart_settled(found.noise, self._setup))
         else:
-            again = self._track(judgement.asked.found, self._began, found.noise)
-            again.adopt(tracker, found.stationary, float(judgement.asked.times[-1]))
-            self._again = CatchUp(again)
+            again = self._track(estimation.task.found, self._began, found.noise)
+            again.adopt(tracker, found.stationary, float(estimation.task.times[-1]))
+            self._catch_up = CatchUp(again)
 
-    def _go_through(self, again: CatchUp, tracker: Tracker) -> None:
+    def _step_catch_up(self, catch_up: CatchUp, tracker: Tracker) -> None:
         """Process some of them; the new tracker takes over once it has caught up."""
-        if again.step(self.sensors, tracker):
-            self.tracker, self._again, self._tentative = again.tracker, None, False
+        if catch_up.step(self.sensors, tracker):
+            self.tracker, self._catch_up, self._tentative = catch_up.tracker, None, False
 
-    def _judge_at_last(self) -> None:
+    def _finish_estimation(self) -> None:
         """End of the input: do not wait for an estimation in progress."""
-        if self._judgement is not None and self.tracker is not None:
-            self._use(self._judgement, self.tracker)
-        while self._again is not None and self.tracker is not None:
-            self._go_through(self._again, self.tracker)
+        if self._estimation is not None and self.tracker is not None:
+            self._use(self._estimation, self.tracker)
+        while self._catch_up is not None and self.tracker is not None:
+            self._step_catch_up(self._catch_up, self.tracker)
 
     def _wait(self, now: float) -> None:
         """Keep the rows that the next attempt at an alignment may need."""
@@ -330,11 +332,11 @@ class Smoother:
         self._faults = self.excluded
         self._begin_anew(before)
         sensors.put_back(later)
-        sensors.gnss.space(0.0)  # all of them, until there is a new start
+        sensors.gnss.space(0.0)  # all of them, until the next alignment
 
     def _begin_anew(self, oldest: float) -> None:
         """Drop all rows and states; rows up to a time (s) are too late from now on."""
-        self.tracker = self._found = self._judgement = self._again = None
+        self.tracker = self._found = self._estimation = self._catch_up = None
         self._tentative, self._times, self._left_out = False, [], ()
         self.sensors.drop_before(np.inf)
         self.sensors.gnss.space(0.0)
@@ -365,8 +367,8 @@ class Smoother:
             dirty, self._dirty = self._dirty, np.inf
             self._fixes = [t for t in self._fixes if t > limit and t > T + SAME_TIME]
             redone = tracker.update(sensors, np.array(times), dirty)
-            if self._again is not None and redone < np.inf:
-                self._again.tracker.rewind(redone, tracker)
+            if self._catch_up is not None and redone < np.inf:
+                self._catch_up.tracker.rewind(redone, tracker)
             self._collect(tracker)
             if tracker.verdicts.anew and not last:
                 words = f"for {OLDEST:.0f} s fixes contradicted all else, until {tracker.newest:.3f} s"
@@ -395,5 +397,5 @@ class Smoother:
         tracker.settled.clear()
         self.sensors.oldest = max(self.sensors.oldest, tracker.head)
         begin = min([tracker.head, *(max(t, tracker.head - 10.0 * CONTEXT) for t in tracker.stops[:1, 0].tolist())])
-        if self._found is None and self._judgement is None:  # otherwise it is still to be estimated from them
+        if self._found is None and self._estimation is None:  # otherwise it is still to be estimated from them
             self.sensors.drop_before(begin - CONTEXT - 5.0)

@@ -19,14 +19,15 @@ from graphnav.online.tracker import Tracker
 from graphnav.online.walker import Walker
 from graphnav.recording import Recording
 
-_CRYSTALS = 1e-4  # s/s, 1-sigma of what two of them drift apart
+_CRYSTALS = 1e-4  # s/s, 1-sigma of the relative drift of two crystals
 
 
 def let_clocks_drift(settings: Settings) -> Settings:
-    """The settings with the rate between the clocks of IMU and receiver as a parameter, unless they say so or not.
+    """The settings with the rate between the clocks of IMU and receiver as a parameter, unless they state it
+    themselves.
 
-    A drive that is recorded shows as a whole whether there is one (`graphnav.estimation.contradictions`); online an
-    offset that is held constant is a third of a second wrong an hour later, by crystals as they are.
+    A recorded drive shows as a whole whether the clocks drift apart (`graphnav.estimation.contradictions`); online,
+    with ordinary crystals, a constant offset is wrong by a third of a second after an hour.
     """
     if settings.gnss.clock_rate_sigma is not None:
         return settings
@@ -55,7 +56,7 @@ def find_start(recording: Recording, stationary: Array, settings: Settings, fram
     Raises
     ------
     EstimationError
-        If the rows do not tell it.
+        If the rows do not determine it.
     """
     return align(recording, use_codes_alone(settings), frame, stationary)
 

@@ -58,7 +58,7 @@ class Online(Smoother):
         while rows:
             try:
                 super().add(*rows.pop(0))
-            except Exception as error:  # whatever fails, rows keep arriving
+            except Exception as error:  # no failure may end the session
                 self._give_up(error)
             if sensors.set_back:
                 rows += [(one, False) for one in self._go_back()]

@@ -1,11 +1,11 @@
 """Files of an online run, so that nothing that has settled is lost however the run ends.
 
-    trajectory.csv    grows as keyframes settle, by whole rows, each time made sure of (fsync)
+    trajectory.csv    grows as keyframes settle, by whole rows, each time flushed to disk (fsync)
     checkpoint        the smoother as it was at most a minute ago, and how far the source was read; replaced in one step
-    trajectory-2.csv  the same after the clock of the IMU was set back, whose times go over the same again
+    trajectory-2.csv  the same after the IMU's clock was set back, when times repeat
     journal-N         of a live source: the lines taken in since that checkpoint
 
-To resume is to cut trajectory.csv to the length that the checkpoint knows and to go on from there: the same rows in
+To resume, trajectory.csv is cut to the length in the checkpoint and continued from there: the same rows in
 the same order make the same trajectory.
 """
 

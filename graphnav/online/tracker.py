@@ -47,7 +47,7 @@ ROWS_AFTER = 0.1  # s of rows that keyframes use after the last of them
 _ROWS_BEFORE = 2.0  # s of rows before a keyframe that its constraints use where the IMU has no gap; else `CONTEXT`
 _REBUILT_BEFORE = 6  # keyframes built again with a new one in a stop, so that the stop is recognised
 _PORTIONS = 8  # of the lag: keyframes settle in groups of this duration
-_SMOOTHED = 8  # covariances that can be smoothed in the time of one relinearisation
+_SMOOTHED = 8  # covariances smoothed in the time of one relinearisation
 _LATEST_SETTLING = 0.5  # of the lag by which settling may be delayed while states still move
 
 
@@ -68,7 +68,7 @@ class Tracker(Chain):
     ----------
     message, t0 : the prior and the time it is for.
     setup : of the sensors.
-    noise : how good they are taken to be.
+    noise : the noise model in use.
     """
 
     at_a_row = 64  # keyframes relinearised per row of the IMU

@@ -26,7 +26,7 @@ from graphnav.online.tracker import ROWS_AFTER, Tracker
 from graphnav.recording import Recording
 
 _ENTERING = 4  # keyframes that enter per row: half of the 4 ms between rows of an IMU at 250 Hz
-_AGAIN = 8  # relinearised per row, by the same measure
+_AGAIN = 8  # keyframes relinearised per row, by the same limit
 _RENEWED = 64  # built again at once for that: those around them, which come with them, are twelve
 
 
@@ -138,7 +138,7 @@ class Walker(Tracker):
         self._restore_cut(now)
         self.finish_entering(sensors)
         if one.newest < self._oldest:
-            return  # it has settled
+            return  # already settled
         self._restore_cut(one.before)
         self._keep(len(self.window) - len(self.window.select_since(one.newest + SAME_TIME)))
         self._motions = {end: motion for end, motion in self._motions.items() if end <= one.newest}

@@ -67,7 +67,7 @@ class Gnss:
     lever_arm: Array = field(default_factory=lambda: np.zeros(3))  # m, RFU, from the IMU
     type: NDArray[np.intp] | None = None  # (M,) of FIX_TYPES; None: no fix states its type
     type_assumed: bool = False  # True when they are numbers of a CSV file, which were taken for RTKLIB's
-    derived: bool = False  # single-point positions computed from the recording's own raw observations
+    derived: bool = False  # whether these are single-point positions computed from the recording's raw observations
     satellites: Array | None = None  # (M,) number used in each fix, NaN where unknown; only displayed
     rounding: tuple[float, ...] = (0.0, 0.0, 0.0)  # m, east, north, up: standard deviation of the log's last digits
     velocity_offset: float = 0.0  # s; velocities are of `t` plus this
@@ -85,7 +85,7 @@ class Gnss:
         return {name: n for k, name in FIX_TYPES.items() if (n := int(np.count_nonzero(self.type == k)))}
 
 
-def fix_types(types: Array, numbers: dict[int, int] | None = None) -> NDArray[np.intp] | None:
+def convert_fix_types(types: Array, numbers: dict[int, int] | None = None) -> NDArray[np.intp] | None:
     """Types of fixes by the numbers of `FIX_TYPES`.
 
     Parameters

@@ -105,9 +105,7 @@ def compute_allan(t: Array, gyro: Array, accel: Array) -> Allan:
 
 
 def find_motion(t: Array, gyro: Array, accel: Array) -> float | None:
-    """The first time (s from the start) at which means over a second deviate from the median of the log; None at
-    rest.
-    """
+    """The first time (s from the start) at which a mean over a second deviates from the log's median; None at rest."""
     n = max(round(_MEANS_OF / float(np.median(np.diff(t)))), 1)
     for samples, limit in ((gyro, _MOVING_RATE), (accel, _MOVING_FORCE)):
         means = samples[: len(samples) // n * n].reshape(-1, n, 3).mean(1)

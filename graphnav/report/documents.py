@@ -59,8 +59,8 @@ def write_report(
     metrics, errors : of `graphnav.evaluation.evaluate`, where there is a truth.
     withheld : (source, span), span in s from the recording's start or None for all of it.
     outages : s from the start, where the recording itself has no fixes.
-    findings : sentences about what was odd in the recording.
-    defects : those of them that make the result wrong whatever its sigmas say; the report begins with them.
+    findings : sentences about the recording.
+    defects : those that make the result wrong whatever its sigmas; the report begins with them.
     contradicted : a sentence if another solver of the same run contradicts this one; likewise.
     provenance : version, input hashes and the like, plain values; `options` are those of the command.
     detectors : of `draw_detectors`, for who writes several reports of one recording; drawn here if None.
@@ -144,7 +144,7 @@ def write_report(
             "Detectors",
             [
                 *_make_gallery(detectors),
-                *tables.stop_table(solution, start, words.describe_deciding(recording, settings)),
+                *tables.tabulate_stops(solution, start, words.describe_deciding(recording, settings)),
             ],
         ),
         ("Findings", tables.list_findings(recording, findings)),
@@ -159,7 +159,7 @@ def write_report(
         *words.describe_closure(name, metrics),
         words.list_tiles(recording, only, every),
         *summary.list_links(beside),
-        *summary.fix_table(recording, solution, withheld),
+        *summary.tabulate_fixes(recording, solution, withheld),
         page.columns([summary.tabulate_sigmas(solution), summary.tabulate_separation(solution)]),
         *summary.describe_excluded(solution, start),
     ]

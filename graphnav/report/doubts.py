@@ -1,4 +1,4 @@
-"""Reasons why a result cannot be trusted, without anything that draws."""
+"""Reasons why a result cannot be trusted; imports nothing that draws."""
 
 from __future__ import annotations
 
@@ -20,13 +20,12 @@ from graphnav.report.wording import join_words
 if TYPE_CHECKING:
     from graphnav.evaluation.metrics import Errors
 
-_FAR = 3.0  # sigma, rms, of a separation; one that is nearer, but no chance, is in the verdict alone
-_MOVING, _DIRECTED = 1.0, np.radians(30.0)  # m/s; 1-sigma of a heading that tells a direction, a twelfth of a turn
+_FAR = 3.0  # sigmas, rms, of a separation; smaller significant ones are only in the verdict
+# m/s; largest 1-sigma of a heading that counts as known, a twelfth of a turn
+_MOVING, _DIRECTED = 1.0, np.radians(30.0)
 FEWEST_ROWS = 10  # rows needed to judge a sigma
 _BY_INFORMATION = "batch rts isam2 incremental ekf"  # the most first
-_BRIEF = (
-    0.01  # share of a drive in which what a filter met by chance, an outlier or the first fix after a gap, may show
-)
+_BRIEF = 0.01  # share of a drive in which chance events of a filter (an outlier, a gap's first fix) are tolerated
 _NEGLIGIBLE_VARIANCE = 1e-12  # m^2, a micrometre
 _LARGEST_EXCLUDED_SHARE = 0.5  # share of the fixes' information; above it most measurements contradict the result
 TOO_LARGE = {"innovation": 1.5, "residual": 1.15}  # RMS over sigma; a fit reduces residuals
@@ -35,8 +34,8 @@ TOO_LARGE = {"innovation": 1.5, "residual": 1.15}  # RMS over sigma; a fit reduc
 def find_departures(solutions: Mapping[str, Solution]) -> dict[str, Note]:
     """The solvers whose positions are farther from those of the most informed solver than chance allows, and how far.
 
-    Solvers of one recording use the same measurements: what one knows less than another is in its covariance, which is
-    therefore that of the difference or more.
+    Solvers of one recording use the same measurements, so the covariance of the less informed one bounds that of the
+    difference.
     """
     out = {}
     solutions = select_own(solutions)
@@ -103,12 +102,14 @@ def list_doubts(solutions: Mapping[str, Solution], errors: Mapping[str, Errors])
 
 
 def _describe_vague(solution: Solution) -> Note | None:
-    """A doubt where nothing has moved, or fixes leave open which way a vehicle in motion went."""
+    """A reservation where nothing has moved, or the fixes do not determine the heading of a moving vehicle."""
     track = solution.trajectory(joint=False)
     moving = np.linalg.norm(solution.states.v, axis=1) > _MOVING
     if not moving.any() and any(get_key(note) == "alignment.no_motion" for note in solution.notes):
-        # linearised, a turn of what noise moves is information: at rest it adds up to a sigma of degrees
-        words = "nothing moved that tells it, whatever its sigma; a lever arm moves the position with it"
+        # linearisation at noisy states yields spurious heading information: at rest it adds up to a sigma of degrees
+        words = (
+            "without motion it is not observable, whatever its sigma; a lever arm carries the error into the position"
+        )
         return Note("doubt.heading", f"The heading cannot be trusted: {words}")
     if "gnss_position" not in solution.records or track.sd_rph is None or track.sd_p is None or moving.mean() < 0.5:
         return None

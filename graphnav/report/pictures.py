@@ -48,7 +48,7 @@ def draw_trajectory(recording: Recording, solutions: Mapping[str, Solution], spa
     lat, lon = np.degrees(first.frame.origin[:2])
     where = f"North is up; the origin is latitude {lat:.6f}, longitude {lon:.6f} deg."
     if not has_place(first):
-        where = "Nothing says where on the Earth this is: place and heading count from the start."
+        where = "The place on the Earth is unknown: position and heading count from the start."
     return page.place_picture(figure, "Plan view", where, kind="large")
 
 
@@ -158,7 +158,7 @@ def draw_errors(errors: Mapping[str, Errors], start: float, end: float, spans: S
         chosen = {name: s[kind] for name, s in series.items() if kind in s}
         if chosen:
             banded = len(chosen) < 3 and any(s.sigma is not None for s in chosen.values())
-            note = "The line belongs inside the band." if banded else ""
+            note = "The line should lie within the band." if banded else ""
             known = _find_known(chosen)
             cut = {name: s.take(known) for name, s in chosen.items()}
             figure = plots.plot_bands(cut, [parts[k] for k in known], unit, end, spans=spans)
@@ -256,7 +256,7 @@ def draw_separation(solution: Solution, start: float, end: float, spans: Shades)
     if found is None or not np.isfinite(found.value).any():
         return []
     series = {"ekf": Curve(found.t - start, found.value, found.sigma)}
-    note = "Position of the forward filter less that of all later measurements; it belongs inside the band."
+    note = "Position of the forward filter less that of all later measurements; it should lie within the band."
     return [
         page.place_picture(
             plots.plot_bands(series, ENU, "m", end, spans=spans), "Combined separation and 3 sigma", note

@@ -32,10 +32,8 @@ def describe_deciding(recording: Recording, settings: Mapping[str, Any]) -> str:
     if "fused" not in fire:
         return f"{join_words(list(fire))}, each by itself"
     if recording.platform == "foot":
-        return "the GLRT of stances"
-    return (
-        "the fusion: the low-band GLRT, held against speeds and integrated forces, and the FFT beside what that finds"
-    )
+        return "the stance GLRT"
+    return "the fusion: the low-band GLRT, checked against speeds and integrated forces, extended by the FFT detector"
 
 
 def describe_run(recording: Recording, solutions: Mapping[str, Solution], withheld: Removed, outages: Tinted) -> str:

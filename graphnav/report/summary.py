@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 _MAX_LINES = 3  # exclusions listed
 _SAYS = {
     "too small": ("bad", "sigma is too small"),
-    "unclear": ("", "consistency of sigma is open: errors are correlated for too long"),
+    "unclear": ("", "consistency of sigma is undecided: errors are correlated for too long"),
     "cautious": ("", "sigma is cautious"),
     "fits": ("good", "sigma is consistent"),
 }
@@ -44,7 +44,8 @@ def tabulate_verdicts(solution: Solution, errors: Errors | None) -> Markup:
 
     found = _judge_by_records(solution) | ({} if errors is None else _judge_by_truth(errors))
     if (apart := find_separation(solution.separation)) is not None and "position" in found:
-        kind, words = found["position"]  # errors of a truth decide, but nothing is good that is that far apart
+        # errors against a truth decide, except where filter and later measurements are this far apart
+        kind, words = found["position"]
         kind = "bad" if errors is None else kind.replace("good", "")
         words += f"; forward filter and later measurements are {apart.size:.1f} sigma apart (rms, {apart.block})"
         found["position"] = kind, words
@@ -112,7 +113,7 @@ def tabulate_sigmas(solution: Solution) -> list[Markup]:
     return [page.heading("Stated 1-sigma"), page.make_table(["of", "50 %", "95 %", "largest"], rows)] if rows else []
 
 
-def fix_table(recording: Recording, solution: Solution, withheld: Removed) -> list[Markup]:
+def tabulate_fixes(recording: Recording, solution: Solution, withheld: Removed) -> list[Markup]:
     """Fixes of each kind: number, excluded or used, longest gap, largest residual; or epochs of raw observations."""
     fixes, nan = select_fixes(recording, solution), float("nan")
     raw = tabulate_epochs(solution)
@@ -211,7 +212,7 @@ def describe_excluded(solution: Solution, start: float) -> list[Markup]:
         if (count := np.count_nonzero((record.weight > 0) & (record.weight < 0.5)))
     ]
     if less and len(lines) < _MAX_LINES:
-        lines.append(f"less than half weight, because they are farther off than chance allows: {join_words(less)}")
+        lines.append(f"less than half weight, because their residuals exceed what chance allows: {join_words(less)}")
     return [page.heading("Left out"), page.bullets(lines or [Note("left_out.nothing", "Nothing was left out.")])]
 
 

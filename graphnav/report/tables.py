@@ -40,7 +40,7 @@ def tabulate_constraints(solution: Solution) -> list[Markup]:
         kinds = {r.kind for r in solution.records.values()}
         note = "A Gaussian leaves 0.27 % outside 3 sigma. "
         if "innovation" in kinds:
-            note += "The mean NIS of honest innovations is the number of components. "
+            note += "The mean NIS of consistent innovations is the number of components. "
         if "residual" in kinds:
             note += "A fit takes up part of the noise: the mean NIS of its residuals lies below the components."
         out.append(page.paragraph(note, "soft"))
@@ -159,7 +159,7 @@ def tabulate_noise(rows: Sequence[FigureRow], solution: Solution) -> list[Markup
         out.append(page.make_table(NOISE_HEAD, cells))
         note = (
             "Stated figures of fixes are medians of their sigmas. The white part and the lasting parts add up as "
-            "variances. A figure with few degrees of freedom is mostly what was expected beforehand."
+            "variances. A figure with few degrees of freedom is mostly its prior."
         )
         if len(solution.between) > 1:
             cut = f"The recording was cut into {len(solution.between)} pieces: these are the figures of the first."
@@ -314,7 +314,7 @@ def tabulate_metrics(metrics: Mapping[str, Any] | None, name: str = "") -> list[
     return [page.fold(f"All measures{' of ' if name else ''}{name}", inner)]
 
 
-def stop_table(solution: Solution, start: float, decided_by: str) -> list[Markup]:
+def tabulate_stops(solution: Solution, start: float, decided_by: str) -> list[Markup]:
     """Every stop: the share that each detector found, the number of rows by constraint, and which detectors decide."""
     stops = list_solution_stops(solution)
     if not stops:
@@ -342,4 +342,4 @@ def list_findings(recording: Recording, findings: Sequence[str]) -> list[Markup]
     lines = list(dict.fromkeys([*recording.remarks, *findings]))
     if recording.imu.noise_assumed:
         lines.append("The recording states no IMU noise figures; consumer-grade ones were assumed.")
-    return [page.bullets(lines)] if lines else [page.paragraph("Nothing odd was found in the recording.")]
+    return [page.bullets(lines)] if lines else [page.paragraph("Nothing unusual was found in the recording.")]

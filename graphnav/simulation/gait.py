@@ -1,10 +1,10 @@
 """Motion of a foot: rolling over the floor from heel to toes, then through the air to its next footprint.
 
-On the floor a shoe is a convex body that rolls without slipping. With h(theta) the height of the IMU over the floor
-at pitch theta (the support function of the sole as seen from the IMU), a turn by d theta carries the IMU forward by
--h d theta, about the point that touches. So heel strike, the slow rolling of mid stance, heel-off about the ball and
-lift-off about the toes are one function of the pitch, and the IMU is never quite at rest.
-In the air the footprint under the foot slides to the next one while the pitch goes on, and a clearance is added.
+On the floor a shoe is a convex body that rolls without slipping. With h(theta) the height of the IMU over the floor at
+pitch theta (the support function of the sole as seen from the IMU), a turn by d theta carries the IMU forward by -h d
+theta, about the point that touches. So heel strike, the slow rolling in mid stance, heel-off about the ball and
+lift-off about the toes are one function of the pitch, and the IMU is never exactly at rest. In the air the footprint
+under the foot slides to the next one while the pitch goes on, and a clearance is added.
 
 Angles and timing follow gait laboratories (Perry and Burnfield, *Gait Analysis*, 2nd ed., ch. 3-4) and the
 recordings with motion capture that graphnav is tried on: turn rates of 350 to 550 deg/s, 10 to 25 deg/s in mid
@@ -142,7 +142,7 @@ def walk(steps: Footprints, style: Style, sole: Sole, end: float, rng: np.random
     along = sole.compute_forward(pitch)
     clearance = style.clearance * vary[k, 2] * 16.0 * u**2 * (1.0 - u) ** 2
     clearance -= style.landing[1] * vary[1:, 0][k] * took[k] * slope
-    # in the air nothing holds the shoe to the floor: heel and toes pass each other smoothly
+    # in the air heel and toes need not touch the floor: the pitch changes smoothly
     air = np.clip(np.minimum(u / 0.35, (1.0 - u) / 0.3), 0.0, 1.0)
     air = air * air * (3.0 - 2.0 * air)
     up = h + air * (gaussian_filter1d(h, _SWING / GAIT_STEP) - h) + gaussian_filter1d(clearance, style.give / GAIT_STEP)

@@ -99,7 +99,7 @@ class SimulatedImu:
         return ImuNoise(
             gyro_noise_density=self.gyro.noise,
             accel_noise_density=self.accel.noise,
-            # a filter needs some random walk; none is smaller than a change of 1 % of the bias in an hour
+            # a filter needs some random walk; at least a change of 1 % of the bias in an hour
             gyro_bias_walk=max(self.gyro.bias_walk, 1e-2 * self.gyro.bias / 60.0),
             accel_bias_walk=max(self.accel.bias_walk, 1e-2 * self.accel.bias / 60.0),
             gyro_bias_sigma=self.gyro.bias,

@@ -9,7 +9,7 @@ so the mean over a period is the difference of V_b at its ends, plus a mean of p
 rule gives (Abramowitz and Stegun 25.4.32, error of the order dt^6): nothing is differentiated numerically.
 The rate is the Euler angles' rate plus the turning of the local level and of the Earth.
 
-The way is that of the rear axle on the road's plane. The sprung body moves against it by a `Shake`, by
+The path is that of the rear axle on the road's plane. The sprung body moves against it by a `Shake`, by
 displacements of the IMU and by turns about it.
 """
 
@@ -63,7 +63,7 @@ class TrueMotion:
     omega_eb: Array  # (N + 1, 3) rad/s, over the Earth, in the IMU's axes
     gyro: Array  # (N, 3) rad/s, mean over the period that ends at t[1:]
     accel: Array  # (N, 3) m/s^2
-    axle_llh: Array = field(repr=False)  # (N + 1, 3) the rear axle's way
+    axle_llh: Array = field(repr=False)  # (N + 1, 3) path of the rear axle
     point: Callable[[Array, Array], tuple[Array, Array]] = field(repr=False)
 
     @property

@@ -16,7 +16,7 @@ from graphnav.core.findings import find_runs
 from graphnav.core.rotation import Array
 from graphnav.simulation.splines import list_centres, make_spline
 
-PATH_STEP = 0.1  # s between coefficients: a driver's hands and feet are no faster
+PATH_STEP = 0.1  # s between coefficients: a driver does not act faster
 CUBIC = 3  # the acceleration is smooth, the jerk continuous
 SETTLE = (CUBIC - 1) / 2 * PATH_STEP  # s by which the spline of a speed that ends on the grid extends beyond its end
 
@@ -73,13 +73,12 @@ def make_path(
 ) -> Path:
     """The path of `manoeuvres` from a standstill at `start` s, facing `heading` deg from north.
 
-    `slip_per_accel`, rad/(m/s^2): by how much the rear axle moves outward of where the vehicle points, per
-    lateral acceleration.
+    `slip_per_accel`, rad/(m/s^2): side slip of the rear axle, outward, per lateral acceleration.
 
     Raises
     ------
     ConfigError
-        If a manoeuvre turns on the spot, changes between forward and reverse, or takes no time.
+        If a manoeuvre turns on the spot, changes between forward and reverse, or has no duration.
     """
     durations = np.array([m.duration for m in manoeuvres], dtype=float)
     if len(durations) == 0 or durations.min() <= 0:

@@ -5,10 +5,10 @@ With the acceleration of the splines, as exact as their positions,
 
     f_b = R_nb^T (dv_n/dt + 2 Omega_n x v_n - g_n)                                    (Groves 2013, eq. 5.36 and 5.53)
 
-and what a sample holds is an integral over its period, by Gauss's three-point rule between the splines' knots.
-A foot turns by four degrees in a hundredth of a second, now about this axis, now about that one: the means of rate and
-force over a period are then not all there is to know (coning and sculling; Savage 1998). Inertial units with a fast
-processor give instead what leads from one attitude and velocity to the next, as a constant rate and force would.
+and what a sample holds is an integral over its period, by Gauss's three-point rule between the splines' knots. A foot
+turns by four degrees in a hundredth of a second about changing axes: means of rate and force over a period then lose
+information (coning and sculling; Savage 1998). Inertial units with a fast processor instead output the constant rate
+and force that lead from one attitude and velocity to the next.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ def move_foot(
     dt = 1.0 / rate
     t = foot.start + np.arange(count + 1) * dt
     ends = _move_foot(foot, R_fb, t)
-    parts = max(1, round(2.0 * dt / GAIT_STEP))  # of a period: half a spline's step at most
+    parts = max(1, round(2.0 * dt / GAIT_STEP))  # share of a period: at most half a step of the spline
     nodes = ((np.arange(parts)[:, None] + 0.5 + 0.5 * _GAUSS_NODES) * dt / parts).ravel()
     weights = np.tile(0.5 * _GAUSS_WEIGHTS / parts, parts)
     acceleration = foot.spline.derivative(2)

@@ -23,7 +23,7 @@ from graphnav.simulation.vibration import Shake
 
 @dataclass(frozen=True)
 class Simulated:
-    """A recording as its files would contain it, and everything about it that no sensor measures."""
+    """A recording as its files would contain it, with truth and facts that no sensor measures."""
 
     recording: Recording
     truth: Trajectory  # of the IMU at the start and every sample, biases included (of the period that ends there)

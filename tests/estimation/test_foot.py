@@ -26,7 +26,7 @@ from graphnav.detectors.base import Detection
 from graphnav.estimation.pipeline import run
 from graphnav.estimation.problem import choose_keyframes
 from graphnav.estimation.solution import Solution
-from graphnav.evaluation.strides import compare_shapes, estimate_floor_sigma, walk_errors
+from graphnav.evaluation.strides import compare_shapes, compute_walk_errors, estimate_floor_sigma
 from graphnav.imu.preintegration import preintegrate
 from graphnav.imu.samples import bridge_gaps
 from graphnav.recording import Imu, Recording, Truth
@@ -384,11 +384,11 @@ class _Rows:
 
 
 def test_strides_and_shape_of_a_walk() -> None:
-    exact = walk_errors(*line_walk(0.0))
+    exact = compute_walk_errors(*line_walk(0.0))
     assert exact.horizontal == pytest.approx(0.0, abs=1e-9)
     assert exact.nees_h == pytest.approx(0.0, abs=1e-9)
     assert exact.of_point == pytest.approx(0.0, abs=1e-6)
-    long = walk_errors(*line_walk(0.02))
+    long = compute_walk_errors(*line_walk(0.02))
     assert long.stride == pytest.approx(1.02, rel=1e-6)
     # 2 % of the distance from the centre; and, against a sigma of 0.1 m, of that from the start
     recording, _ = line_walk(0.0)
@@ -417,7 +417,7 @@ def test_a_dense_truth_of_another_point_on_the_foot() -> None:
     solution = replace(solution, between=(_Rows(t, states, P),))
     recording = replace(line_walk(0.0)[0], truth=Truth(t, xyz=xyz))
     assert estimate_floor_sigma(recording, solution) == pytest.approx(np.std(off[1:-1]), rel=1e-6)
-    found = walk_errors(recording, solution)
+    found = compute_walk_errors(recording, solution)
     assert found.horizontal > 0.01
     assert found.of_point < 1e-3
     assert found.nees_h < 0.01
@@ -461,7 +461,7 @@ def test_real_walks(shared_data: Path) -> None:
         recording = read(shared_data / f"{walk}.toml")
         solutions = run(recording)
         for solver, solution in solutions.items():
-            found = walk_errors(recording, solution, 0.03)
+            found = compute_walk_errors(recording, solution, 0.03)
             ratios[solver].append(found.horizontal / horizontal)
             assert not abs(found.up) > up, (walk, solver)
             if recording.truth is not None and recording.truth.xyz is not None:

@@ -15,7 +15,7 @@ from graphnav.core import earth
 from graphnav.core.errors import ConfigError, GraphnavError, RecordingError
 from graphnav.estimation.pipeline import run
 from graphnav.gnss.antex import compute_satellite_axes, compute_wind_up, read_antex
-from graphnav.gnss.atmosphere import compute_directions, niell
+from graphnav.gnss.atmosphere import compute_directions, compute_niell_mapping
 from graphnav.gnss.load import Sources, load_raw
 from graphnav.gnss.ppp import combine_ionosphere_free
 from graphnav.gnss.precise import Orbits
@@ -62,7 +62,7 @@ def test_the_mapping_function_is_rtklibs(rtklib):
                 pos[i] = float(place[i])
             azel[0], azel[1] = 0.3, float(np.radians(degrees))
             dry = rtklib.tropmapf(time, pos, azel, wet)
-            ours = niell(place[None], np.radians([degrees]), np.array([117.0]))
+            ours = compute_niell_mapping(place[None], np.radians([degrees]), np.array([117.0]))
             np.testing.assert_allclose([ours[0][0], ours[1][0]], [dry, wet[0]], rtol=2e-4)
 
 

@@ -26,7 +26,7 @@ from graphnav.estimation import fixing
 from graphnav.estimation.known_arcs import Known
 from graphnav.estimation.pipeline import run
 from graphnav.gnss.arcs import find_arcs
-from graphnav.gnss.atmosphere import NIGHT, compute_directions, klobuchar
+from graphnav.gnss.atmosphere import NIGHT, compute_directions, compute_klobuchar_delay
 from graphnav.gnss.differential import add_differences
 from graphnav.gnss.ephemeris import OMEGA_WGS84
 from graphnav.gnss.integers import decorrelate, find_nearest
@@ -58,7 +58,7 @@ def with_carriers(recording, path, noise, seed=3):
     llh = path.point(t, lever)[0]
     at = np.searchsorted(t, raw.t)
     azimuth, elevation = compute_directions(earth.llh_to_ecef(llh)[at], raw.p)
-    delay = klobuchar(NIGHT, np.mod(raw.t, 604800.0), llh[at], azimuth, elevation)
+    delay = compute_klobuchar_delay(NIGHT, np.mod(raw.t, 604800.0), llh[at], azimuth, elevation)
     true = np.empty(len(raw))
     base = []
     R = earth.enu_axes(llh[0])
@@ -71,7 +71,7 @@ def with_carriers(recording, path, noise, seed=3):
         true[own] = raw_drive.observe(lambda at: path.point(at, lever)[0], raw.t[own], above, k)[0]
         seen, p, v = raw_drive.observe(lambda at: np.tile(fixed, (len(at), 1)), t, above, k)
         high = compute_directions(np.tile(position, (len(t), 1)), p)
-        of_base = klobuchar(NIGHT, np.mod(t, 604800.0), np.tile(fixed, (len(t), 1)), *high)
+        of_base = compute_klobuchar_delay(NIGHT, np.mod(t, 604800.0), np.tile(fixed, (len(t), 1)), *high)
         clock = -70.0 + 0.3 * t
         base.append((raw.satellite[own][0], seen + clock, of_base, p, v))
     clock = 150.0 + 1.0 * raw.t - 40.0 * np.cos(0.05 * raw.t)
@@ -387,7 +387,9 @@ def delay_of(rows, raw, here, row):
     one = np.array([here])
     antenna = raw.antenna[one]
     azimuth, elevation = compute_directions(antenna, raw.p[one])
-    return float(klobuchar(NIGHT, raw.seconds_of_week[one], earth.ecef_to_llh(antenna), azimuth, elevation)[0])
+    return float(
+        compute_klobuchar_delay(NIGHT, raw.seconds_of_week[one], earth.ecef_to_llh(antenna), azimuth, elevation)[0]
+    )
 
 
 def test_derivatives_are_those_of_differences(exact):

@@ -10,7 +10,7 @@ from helpers import FRAME, STEPS, Array, difference, random_imu, random_states
 
 from graphnav.core import rotation as ro
 from graphnav.core.state import DIM, Parameter, States
-from graphnav.imu.dynamics import SCALE, ImuFactors, convert_to_biases, scale_parameter
+from graphnav.imu.dynamics import SCALE, ImuFactors, convert_to_biases, make_scale_parameter
 from graphnav.imu.preintegration import preintegrate
 from graphnav.imu.samples import bridge_gaps
 from graphnav.recording import Imu, ImuNoise, Recording
@@ -162,7 +162,7 @@ def test_noise_by_monte_carlo(motion: ImuFactors, start: States) -> None:
 def test_scale_parameter() -> None:
     def of(noise: ImuNoise, platform: str = "vehicle") -> tuple[Parameter, ...]:
         imu = Imu(np.empty(0), np.empty((0, 3)), np.empty((0, 3)), noise)
-        return scale_parameter(Recording("none", platform, imu))
+        return make_scale_parameter(Recording("none", platform, imu))
 
     noise = ImuNoise(gyro_scale_sigma=1e-3, accel_scale_sigma=2e-3)
     assert of(ImuNoise(gyro_scale_sigma=0.0, accel_scale_sigma=0.0)) == ()

@@ -32,7 +32,7 @@ from graphnav.estimation.pipeline import run
 from graphnav.estimation.solution import make_trajectory
 from graphnav.estimation.solvers.window import compute_turn_limit
 from graphnav.evaluation.scoring import compute_errors
-from graphnav.online import Online, Row, Session, drop_rows, judging, list_rows, smoother
+from graphnav.online import Online, Row, Session, drop_rows, list_rows, noise_estimation, smoother
 from graphnav.online.buffers import Buffer
 from graphnav.online.lines import END, format_head, format_line, format_lines, parse_row, parse_setup
 from graphnav.online.tracker import Tracker
@@ -47,8 +47,8 @@ LONG = parse_settings({"noise": {"mode": "stated"}, "solver": {"lag": 1000.0}})
 
 @pytest.fixture(scope="module")
 def drive() -> tuple[Recording, Trajectory]:
-    """A hundred seconds at 50 Hz, so that the tests are quick."""
-    path = oracle.vehicle_path(130.0, 50.0)
+    """A hundred seconds at 25 Hz, so that the tests are quick."""
+    path = oracle.vehicle_path(130.0, 25.0)
     recording, truth = oracle.drive(path, seed=3, outages=[(70.0, 80.0)], odometer_rate=10.0)
     return recording.crop(0.0, 100.0), truth
 
@@ -149,7 +149,7 @@ def test_live_states_at_imu_rate_hold_to_their_sigmas(drive: tuple[Recording, Tr
     online, ratio = Online(drop_rows(recording), QUICK), []
     for k, row in enumerate(rows):
         online.add(row)
-        if online.tracker is not None and k % 601 == 0:
+        if online.tracker is not None and k % 301 == 0:
             t, states, P = online.tracker.predict_since(online.sensors)
             now = online.live()
             assert now is not None
@@ -236,7 +236,7 @@ def test_keyframes_are_prepared() -> None:
         before = online.tracker
         known = before is not None and (before.newest, before._ahead is not None)
         online.add(row)
-        if known and online.tracker is before and before.newest > known[0] and online._again is None:
+        if known and online.tracker is before and before.newest > known[0] and online._catch_up is None:
             ready.append(known[1])
     assert len(ready) > 40
     assert np.mean(ready) > 0.9
@@ -253,24 +253,24 @@ def test_a_reading_that_comes_when_its_keyframe_is_prepared_counts(
     same(played(drive[0], [rows[k] for k in order])[1], plain[1])
 
 
-def test_judging_beside_the_drive_works_on_copies(
+def test_noise_estimation_beside_the_drive_works_on_copies(
     drive: tuple[Recording, Trajectory], rows: list[Row], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A checkpoint is written meanwhile: nothing that stands in it may change under the pen."""
-    used: list[judging.Question] = []
-    kept: list[judging.Question] = []
-    answer, judge = judging.answer, judging.start_judging
+    used: list[noise_estimation.EstimationTask] = []
+    kept: list[noise_estimation.EstimationTask] = []
+    run, start = noise_estimation.run_estimation, noise_estimation.start_estimation
 
-    def answer_seen(asked: judging.Question) -> judging.Answer:
-        used.append(asked)
-        return answer(asked)
+    def run_seen(task: noise_estimation.EstimationTask) -> noise_estimation.EstimationResult:
+        used.append(task)
+        return run(task)
 
-    def judge_seen(*given: Any) -> judging.Judgement:
-        kept.append((out := judge(*given)).asked)
+    def start_seen(*given: Any) -> noise_estimation.BackgroundEstimation:
+        kept.append((out := start(*given)).task)
         return out
 
-    monkeypatch.setattr(judging, "answer", answer_seen)
-    monkeypatch.setattr(smoother, "start_judging", judge_seen)
+    monkeypatch.setattr(noise_estimation, "run_estimation", run_seen)
+    monkeypatch.setattr(smoother, "start_estimation", start_seen)
     online = Online(drop_rows(drive[0]), parse_settings({"solver": {"lag": 20.0}}))
     for row in rows:
         online.add(row)
@@ -750,8 +750,8 @@ def test_resumed_while_it_is_judged_it_ends_with_the_same(drive: tuple[Recording
     other, parts, resumed = Online(drop_rows(drive[0]), how), [], {"judged": 0, "again": 0}
     for k, row in enumerate(rows):
         other.add(row)
-        doing = "again" if other._again is not None else "judged" if other._judgement is not None else ""
-        if doing and k % (4 if doing == "again" else 40) == 0:
+        doing = "again" if other._catch_up is not None else "judged" if other._estimation is not None else ""
+        if doing and k % (4 if doing == "again" else 20) == 0:
             resumed[doing] += 1
             other = pickle.loads(pickle.dumps(other))
         parts += other.settled()

@@ -35,7 +35,7 @@ from graphnav.online import Online, Row, drop_rows, list_rows
 from graphnav.online import raw as online_raw
 from graphnav.online.lines import format_head, format_line, parse_row, parse_setup
 from graphnav.online.raw import RawEpochs
-from graphnav.online.raw_lines import LiveRaw, drop_epochs, list_epochs, live_raw
+from graphnav.online.raw_lines import LiveRaw, describe_live_raw, drop_epochs, list_epochs
 from graphnav.recording import Recording
 
 CODES = {"differences": False, "carrier": False}
@@ -49,7 +49,7 @@ def recording() -> Recording:
 
 
 def observed_drive(**more: object) -> Recording:
-    path = oracle.vehicle_path(130.0, 50.0)
+    path = oracle.vehicle_path(130.0, 25.0)
     made, _ = oracle.drive(path, seed=3, outages=[(60.0, 75.0)], gnss_velocity_sd=(0.1, 0.1, 0.1))
     return raw_drive.with_observations(made, path, noise=1.0, seed=2, carrier=0.003, **more)
 
@@ -366,7 +366,7 @@ def test_lines_that_are_no_epochs_are_told(rtk: Recording, spoil: Callable[[str]
 
 @pytest.mark.parametrize("name", ["1K", "9C", "C"])
 def test_a_source_is_refused_that_names_a_signal_that_its_satellites_do_not_send(rtk: Recording, name: str) -> None:
-    said = live_raw(rtk.raw_gnss)
+    said = describe_live_raw(rtk.raw_gnss)
     assert LiveRaw.model_validate(said).make_setup().catalogue == drop_epochs(rtk.raw_gnss).catalogue
     with refused("online.raw_names", RecordingError, f"'{name}'"):
         LiveRaw.model_validate(said | {"signals": [("G", name)]}).make_setup()

@@ -19,7 +19,7 @@ SD = (0.02, 0.02, 0.04)
 
 
 def test_they_are_the_rows_of_a_recording() -> None:
-    recording, _ = oracle.drive(oracle.vehicle_path(120.0, 50.0), odometer_rate=10.0, gnss_velocity_sd=(0.1, 0.1, 0.2))
+    recording, _ = oracle.drive(oracle.vehicle_path(120.0, 25.0), odometer_rate=10.0, gnss_velocity_sd=(0.1, 0.1, 0.2))
     recording = recording.crop(0.0, 10.0)
     made = {
         "imu": lambda t, v: ImuSample(t, v[:3], v[3:]),
@@ -101,7 +101,7 @@ def test_what_cannot_be_is_one_plain_line(make: Callable[[], object], key: str, 
 
 def test_the_setup_of_a_recording_holds_no_row() -> None:
     """Whatever a sensor has for each of its rows is left out, so that it cannot be taken for that of another row."""
-    made, _ = oracle.drive(oracle.vehicle_path(120.0, 50.0), odometer_rate=10.0)
+    made, _ = oracle.drive(oracle.vehicle_path(120.0, 25.0), odometer_rate=10.0)
     recording = made.crop(0.0, 20.0)
     assert recording.gnss is not None
     assert recording.odometer is not None

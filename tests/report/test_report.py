@@ -48,8 +48,14 @@ from graphnav.report.documents import write_comparison, write_report
 from graphnav.report.doubts import find_departures, list_doubts
 from graphnav.report.provenance import format_command, format_toml
 from graphnav.report.sentences import describe_sigma_without_truth
-from graphnav.report.summary import describe_excluded, fix_table, tabulate_sigmas, tabulate_verdicts
-from graphnav.report.tables import stop_table, tabulate_accuracy, tabulate_excluded, tabulate_rejected, tabulate_span
+from graphnav.report.summary import describe_excluded, tabulate_fixes, tabulate_sigmas, tabulate_verdicts
+from graphnav.report.tables import (
+    tabulate_accuracy,
+    tabulate_excluded,
+    tabulate_rejected,
+    tabulate_span,
+    tabulate_stops,
+)
 
 START, COUNT = 1000.0, 600
 NAME = "drive <script>alert('x')</script> & \"co\""
@@ -294,7 +300,7 @@ def test_fixes_are_counted_and_coloured_by_type(tmp_path, recording):
     kinds[100:150] = 2
     typed = replace(recording, gnss=replace(recording.gnss, type=kinds))
     found = replace(solution(), t=solution().t)
-    rows = {row[0]: row for row in cells(fix_table(typed, found, [("gnss", (200.5, 230.5))])[1])}
+    rows = {row[0]: row for row in cells(tabulate_fixes(typed, found, [("gnss", (200.5, 230.5))])[1])}
     # row 50 was rejected, and 30 are withheld; every row has a record, of which the largest is what the fit left there
     assert [rows[k][1:5] for k in ("fixed", "float", "all")] == [
         ["520", "30", "1", "519"], ["50", "0", "0", "50"], ["570", "30", "1", "569"],
@@ -411,7 +417,7 @@ def test_stops_and_outages_are_told(tmp_path, recording):
     still = Detection("low_band_glrt", t, np.full(len(t), 0.5), 3.0, t > 0, spans)
     found = replace(solution(), detections=(still, replace(still, name="fused")))
     parser, text = checked(write_report(tmp_path / "r.html", recording, found, settings={}, outages=[(200.0, 230.0)]))
-    assert [row[:2] for row in cells(stop_table(found, START, "fused")[0])] == [
+    assert [row[:2] for row in cells(tabulate_stops(found, START, "fused")[0])] == [
         ["100.00 s", "30.00 s"],
         ["400.00 s", "12.00 s"],
     ]

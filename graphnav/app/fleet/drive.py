@@ -34,7 +34,7 @@ ROW_FILE = "drive.json"
 DONE, REFUSED, FAILED, CRASHED, HUNG = "done", "refused", "failed", "crashed", "hung"
 _FINAL = (DONE, REFUSED)  # statuses that the same program reproduces from the same input
 _POINTS = 200  # points of a track on the map
-FIRST_SPAN, AFTER_SPANS = 60.0, 30.0  # s before the first withheld span and after the last
+FIRST_SPAN, AFTER_SPANS = 60.0, 30.0  # s without withheld spans at the start and at the end
 
 FleetRow = dict[str, Any]
 

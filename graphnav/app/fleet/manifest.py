@@ -70,13 +70,13 @@ def read_drives(
     Parameters
     ----------
     source : a folder, in which recordings are looked for at any depth; or a manifest, .csv or .toml.
-    asked : what holds where the manifest says nothing.
+    asked : values for what the manifest does not set.
     allow_outside : whether files that a manifest names may lie outside its folder.
 
     Raises
     ------
     ConfigError
-        If there are none, or the manifest says something that cannot be: naming the file, the line and the field.
+        If there are none, or the manifest is invalid: naming the file, the line and the field.
     """
     if not exists(source, ConfigError):
         raise ConfigError(f"{source}: no such folder or manifest", key="file.missing")
@@ -109,7 +109,7 @@ def build_task(
     Raises
     ------
     ConfigError
-        Naming where it was said.
+        Naming the place of the invalid setting.
     """
     name, source, asked, where = drive
     try:
@@ -277,7 +277,7 @@ def _find_beside(source: Path, name: str, where: str, key: str, allow_outside: b
     path = source.parent / name
     if not is_inside(path, source.parent, ConfigError) and not allow_outside:
         raise ConfigError(
-            f"{where}, '{key}': {name} lies outside its folder; say --allow-outside if you trust who wrote it",
+            f"{where}, '{key}': {name} lies outside its folder; use --allow-outside if you trust who wrote it",
             key="file.outside",
         )
     return path

@@ -17,7 +17,7 @@ from graphnav.imu.samples import Samples, bridge_gaps
 from graphnav.recording import Recording
 
 _FIRST_SPAN = 5.0  # s between the fixes that give the first velocity
-_CHANGE = 2.0  # m/s^2, by which the speed may change where nothing measures it
+_CHANGE = 2.0  # m/s^2, bound on the change of speed where it is not measured
 
 
 def carry_back(
@@ -121,8 +121,8 @@ def _refine_by_wheels(
 ) -> tuple[Array, Array, Array, Array]:
     """Position and velocity at the start, each with its sigma: as found, or by the odometer if these are better.
 
-    Forwards by what the wheels say, up to `there`, the position at `begin` and its sigma; an attitude that is off by an
-    angle turns the whole way.
+    Dead reckoning by the odometer up to `there`, the position at `begin` and its sigma; an attitude error rotates the
+    whole path.
     """
     p, sd_p, v, sd_v = found
     odometer = recording.odometer
@@ -131,7 +131,7 @@ def _refine_by_wheels(
     t, speed = odometer.t[inside], odometer.speed[inside]
     if len(t) < 2 or t[0] - recording.start > 1.0:
         return found
-    off = float(np.max(wide)) + (0.0 if odometer.signed else 2.0)  # rad; what goes backwards is off by twice the way
+    off = float(np.max(wide)) + (0.0 if odometer.signed else 2.0)  # rad; motion in reverse is off by twice the distance
     sd_v_wheels = np.full(3, STANDING + abs(speed[0]) * off)
     if np.linalg.norm(sd_v_wheels) < np.linalg.norm(sd_v):
         v, sd_v = speed[0] * R[:, 1], sd_v_wheels

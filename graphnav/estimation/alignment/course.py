@@ -37,7 +37,7 @@ def use_course(tried: list[Solution], fixes: Gnss, own: float, wide: float) -> H
     Parameters
     ----------
     tried : solutions of the stretch of motion from several start headings; that of least cost counts.
-    fixes : those they are of.
+    fixes : the fixes of that stretch.
     own, wide : rad, 1-sigma of its heading, and that of the prior it becomes.
     """
     least = int(np.argmin([one.cost for one in tried]))

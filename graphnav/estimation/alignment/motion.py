@@ -41,7 +41,7 @@ _UNLIKELY = 14.0  # difference of log-likelihoods at a ratio of one in a million
 
 
 class _End(Exception):
-    """What becomes of a heading is known before its problem is solved: nothing, or one of the other solutions."""
+    """Raised to end a solution early: its heading leads nowhere, or to another solution."""
 
     def __init__(self, known: Solution | None = None) -> None:
         self.known = known
@@ -193,8 +193,8 @@ def _try_headings(
     """Solutions of the short problem from each of the initial headings.
 
     Those that point elsewhere mostly lead to the same minimum, and are that solution as soon as they are within a sigma
-    of it. Or they creep along a saddle, towards it or none, and are abandoned where they promise no likelihood that
-    counts beside the best; `worth` successive fixes are worth one in the worst case, over a span with one turn
+    of it. Or they move slowly along a saddle, and are abandoned where the likelihood they can still reach is negligible
+    beside the best; `worth` successive fixes are worth one in the worst case, over a span with one turn
     (`graphnav.estimation.alignment.course`).
     """
     problem = _build_short(part, settings, frame, np.array([*rp, heading]), bias)
@@ -220,7 +220,7 @@ def _try_headings(
 
 
 def _is_within_a_sigma(states: States, solution: Solution) -> bool:
-    """Whether the first of the states is that of a solution, but for less than its uncertainty."""
+    """Whether the first of the states agrees with that of a solution to within a sigma."""
     e = states[:1].minus(solution.states[:1])[0]
     return float(e @ np.linalg.solve(solution.covariance[0], e)) < 1.0
 
@@ -249,7 +249,7 @@ def _build_short(part: Recording, settings: Settings, frame: LocalFrame, rph: Ar
 
 def _solve_from(problem: Problem, rph: Array, watch: Callable[[States, float, float, bool], None]) -> Solution:
     """Solve the short problem from one initial attitude."""
-    from graphnav.estimation.factor_graph.batch import batch  # and GTSAM with it, which a drive at rest does not need
+    from graphnav.estimation.factor_graph.batch import batch  # imports GTSAM, which a recording at rest does not need
 
     gnss, mean, t = problem.recording.gnss, problem.prior.mean, problem.t
     assert gnss is not None

@@ -98,8 +98,8 @@ def level_at_rest(recording: Recording, settings: Settings, frame: LocalFrame, s
 
 
 def _measure_motion(recording: Recording, seconds: float) -> tuple[float, float]:
-    """Speed at the start by the odometer, m/s, and the largest acceleration in the first seconds, m/s^2, which the
-    accelerometer feels beside gravity: of the speed and across it. Zero without an odometer's rows there.
+    """Speed at the start by the odometer, m/s, and the largest acceleration in the first seconds, m/s^2, beside
+    gravity, along and across the direction of travel. Zero without an odometer's rows there.
     """
     odometer, imu = recording.odometer, recording.imu
     if odometer is None:

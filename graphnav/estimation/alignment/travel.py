@@ -54,7 +54,7 @@ def measure_travel(p: Array, sd: Array, yaw: Array, still: NDArray[np.bool_] | N
     p : (N, 2) m, east and north.
     sd : (N,) m, 1-sigma of a point along one axis.
     yaw : (N,) rad, what a level axis of the body has turned counter-clockwise, whole circles included.
-    still : (N,) points at which the platform stands; between two of them no way is counted.
+    still : (N,) points at which the platform stands; between two of them no distance is counted.
     """
     moves = np.ones(len(p) - 1) if still is None else 1.0 - (still[1:] & still[:-1])
     angle = moves * np.abs(np.diff(yaw))

@@ -1,4 +1,4 @@
-"""What GTSAM does: the batch problem's elimination, iSAM2's tree, and problems as its graphs. Nothing else imports it.
+"""GTSAM: elimination of the batch problem, iSAM2's tree, and export of problems as its graphs. Nothing else imports it.
 
 The rows come from `graphnav.estimation.solvers`, which knows nothing of this package.
 """

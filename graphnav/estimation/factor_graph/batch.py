@@ -4,11 +4,10 @@ Minimises, over all keyframe states and parameter nodes,
 
     1/2 |prior|^2 + 1/2 sum |interval residual|^2_Q + sum rho(|constraint residual|_R)
 
-Each iteration linearises everything at once in NumPy, hands the whitened rows to GTSAM as Gaussian
-factors, eliminates with QR and moves the states on their manifold. A step that raises the cost is taken
-back and damped (Marquardt's scaling: lambda times the column norms). Converged means that the quadratic
-model promises less than `tolerance` from another step, in units of half squared sigmas: the optimum is
-then within sqrt(2 tolerance) sigma in every direction at once.
+Each iteration linearises everything at once in NumPy, hands the whitened rows to GTSAM as Gaussian factors, eliminates
+with QR and moves the states on their manifold. A step that raises the cost is rejected and damped (Marquardt's scaling:
+lambda times the column norms). Converged means that the quadratic model promises less than `tolerance` from another
+step, in units of half squared sigmas: the optimum is then within sqrt(2 tolerance) sigma in every direction at once.
 """
 
 from __future__ import annotations
@@ -66,7 +65,7 @@ def batch(
     values = {c.parameter.name: c.mean for c in problem.chains} | (values or {})
     point, notes = Iterate(start, values), []
     if any(c.robust in REDESCENDING and c.robust != "gnc" for c in problem.constraints):
-        # such a kernel gives up on whatever is far from the start; Cauchy's never quite does, and leads there
+        # a redescending kernel ignores rows far from the start; Cauchy's keeps some of their influence and leads there
         rows = (replace(c, robust="cauchy") if c.robust in REDESCENDING else c for c in problem.constraints)
         point = _minimise(replace(problem, constraints=tuple(rows)), point, progress, reintegrate).point
     for gentle in _graduate(problem, point):
@@ -171,8 +170,8 @@ def _minimise(
             if ahead < now or gain < settings.tolerance:
                 break
             if damping == 0.0:
-                # an early heading swings all that comes after it along tangents, off the track by the square of
-                # the angle; the step after this one takes that back, and only then is it seen what both bring
+                # a correction of an early heading moves all later positions along tangents, off the track by the square
+                # of the angle; the next step corrects that, so both are assessed together
                 beyond = candidate.move(solve_rows(rows_ahead, layout)[1])
                 rows_beyond, behind = whiten(problem, beyond, layout)
                 if behind < now:
@@ -196,7 +195,7 @@ def _minimise(
         eliminated = None
         # a damped step promises little by construction: convergence is judged by an undamped one
         if damping == gentlest:
-            gentlest /= 10.0  # more would have been possible: a long valley is not crept along
+            gentlest /= 10.0  # a larger step would have been possible: less damping in a long valley
         damping = 0.0 if damping <= _MIN_DAMPING or gain < settings.tolerance else damping / 10.0
         if reintegrate:
             problem, again = integrate_again(problem, point.states, point.scale)
@@ -220,7 +219,7 @@ def _minimise(
 
 
 def solve_rows(rows: WhitenedRows, layout: Layout, damping: float = 0.0) -> tuple[Eliminated, Correction, float]:
-    """The rows eliminated, the step that leads to their optimum, and by how much they fall on the way."""
+    """Eliminate the rows; the step to their optimum, and the decrease of their cost by it."""
     graph, size = LinearGraph(), np.sqrt(damping) * compute_column_norms(rows, layout) if damping else None
     if size is not None:
         rows = list(rows)
@@ -232,7 +231,7 @@ def solve_rows(rows: WhitenedRows, layout: Layout, damping: float = 0.0) -> tupl
     eliminated = graph.eliminate(layout.order)
     of_variables = dict(zip(layout.order, eliminated.solve(layout.order), strict=True))
     found, gain = layout.split(of_variables, layout.keys), eliminated.decrease()
-    if size is not None:  # what damping takes from the step is not among the rows
+    if size is not None:  # the damping rows are not part of the cost
         gain += 0.5 * sum(float(np.sum((s[: len(x)] * x) ** 2)) for s, x in zip(size, found, strict=True))
     return eliminated, layout.unpack(found), gain
 

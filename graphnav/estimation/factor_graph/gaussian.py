@@ -20,7 +20,7 @@ from scipy.linalg.lapack import dtrtri
 from graphnav.core.rotation import Array
 from graphnav.estimation.solvers.breakdown import explain_undetermined
 
-_SUMS = 1 << 60  # keys of variables that are eliminated before anybody sees them
+_SUMS = 1 << 60  # keys of auxiliary variables, which are eliminated at once
 FactorBlocks = Sequence[tuple[Array, Array]]  # (keys (N,), A (N, m, k)) per variable a factor touches
 
 
@@ -108,10 +108,10 @@ class Eliminated:
 
             P_x = R^-1 R^-T + U P_s U^T        P_xs = U P_s
 
-        Of the joint covariance of what is done only the block is kept that variables still to come have among their
-        parents (Kaess and Dellaert 2009, eq. 20-21): the order runs along a chain, so that is one keyframe and the
-        parameters in force. It is kept as a root M, P = M^T M: a vehicle that stands, known to a millimetre against
-        the place of its stop and to a hundred metres on the Earth, would leave P itself without a digit.
+        Of the joint covariance only the block of variables that are parents of later ones is kept (Kaess and Dellaert
+        2009, eq. 20-21): the order runs along a chain, so that is one keyframe and the parameters in force. It is kept
+        as a root M, P = M^T M: at a stop, whose position is known to a millimetre relative to the held place and to a
+        hundred metres on the Earth, P itself would lose all digits.
 
         Raises
         ------
@@ -122,7 +122,7 @@ class Eliminated:
         where: dict[int, range] = {}  # columns of the joint block, per variable in it
         root = np.zeros((0, 0))
         conditionals = [self._net.at(i) for i in range(self._net.size())]
-        first: dict[int, int] = {}  # the first to be eliminated that has a variable as parent: the last to ask for it
+        first: dict[int, int] = {}  # the first eliminated variable that has it as parent: the last one that needs it
         for i, conditional in enumerate(conditionals):
             for parent in conditional.keys()[1:]:
                 first.setdefault(parent, i)

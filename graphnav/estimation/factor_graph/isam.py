@@ -1,4 +1,4 @@
-"""A recorded drive through GTSAM's iSAM2, keyframe by keyframe: its own answer, live and settled.
+"""A recorded drive solved by GTSAM's iSAM2, keyframe by keyframe: its own live and settled estimates.
 
 The rows are those of every solver; the tree is that of `graphnav.estimation.factor_graph.tree`. With a lag, keyframes
 older than it are settled and marginalised; without one, the whole drive is relinearised until nothing moves any more.
@@ -26,9 +26,10 @@ from graphnav.estimation.solvers.incremental import FINE, Replay, are_due, begin
 from graphnav.estimation.solvers.stages import Message, Place
 from graphnav.estimation.solvers.window import SettledStates, compute_turn_limit
 
-_SKIP = 10  # keyframes between two looks at what has moved, as GTSAM's relinearizeSkip, at least
-_GROWN = 8  # what a look takes goes with the keyframes there: it comes when there are this part more of them
-_SHARE_OF_TIME = 4  # covariances of keyframes are eliminated for in a fourth of the time until the next are to settle
+_SKIP = 10  # least number of keyframes between relinearisation checks, as GTSAM's relinearizeSkip
+# the cost of a check is proportional to the keyframes in the tree: one follows when they have grown by one part in this many
+_GROWN = 8
+_SHARE_OF_TIME = 4  # covariances are eliminated in one part in this many of the time between settlings
 _MAX_UPDATES = 30
 
 
@@ -46,9 +47,9 @@ class TreeSmoother:
         self.tree, self.lag = Tree(prior, compute_turn_limit(problem.imu_noise)), lag
         self.settled: list[SettledStates] = []
         self._problem = problem
-        self._look = _SKIP  # the keyframe at which to look next at what has moved
-        self._leaving: Elimination | None = None  # of what is to settle
-        self._portion = 0  # variables that are eliminated for that at a keyframe
+        self._look = _SKIP  # the keyframe of the next relinearisation check
+        self._leaving: Elimination | None = None  # elimination for the keyframes to settle
+        self._portion = 0  # variables eliminated for that per keyframe
 
     def add(self, place: Place) -> tuple[Message, Array]:
         """As of `LagSmoother`."""

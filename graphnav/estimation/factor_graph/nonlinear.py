@@ -103,7 +103,7 @@ def _add_unlisted(problem: Problem, states: States, values: dict[str, Array]) ->
             own = {c.parameter.name: (c, i) for c, i in zip(chains, first, strict=False) if c.parameter.name in names}
             if own:
                 linear = linearise(rows, points, problem.columns)
-                # at first they are too far off for a kernel to distinguish outliers
+                # initially they are too far off for a kernel to distinguish outliers
                 root = np.sqrt(linear.weigh()[0] if k else np.ones(len(rows)))[:, None] / linear.sigma
                 H = csr_array((root.size, len(sigma)))
                 for name, (c, i) in own.items():

@@ -1,17 +1,17 @@
-"""GTSAM's iSAM2 (Kaess et al. 2012) over error states: keyframes come, are linearised again, and leave.
+"""GTSAM's iSAM2 (Kaess et al. 2012) over error states: keyframes are added, relinearised and marginalised.
 
-Each variable is the error e of a state or of parameters about an anchor X0 that stays: X = X0 [+] e. Rows linearised
+Each variable is the error e of a state or of parameters about a fixed anchor X0: X = X0 [+] e. Rows linearised
 where the errors are d, A (X [-] (X0 [+] d)) = b, are rows of e to first order,
 
     A J (e - d) = b      J = J_r(d) in the columns of the attitude, else the identity
 
-so that GTSAM has a linear problem, and no factor of it calls back into Python. Relinearisation is fluid as there: a
-variable that has moved beyond a threshold from where its rows were linearised has them linearised anew, in NumPy and
-all at once, and they take the place of the old ones in the tree by their indices.
+so that GTSAM has a linear problem without factors that call back into Python. Relinearisation is fluid as in iSAM2:
+rows of a variable that has moved beyond a threshold from its linearisation point are linearised again, in NumPy and all
+at once, and replace the old factors by their indices.
 
-Constants are chains with a node every half minute: what is the same all through the drive would tie every update to
-all of it. Keyframes older than a lag are marginalised: variables are ordered along time, so they are leaves of the
-tree, and what is known of them becomes a factor on what they touched. It stays as it is, linear about the anchors.
+Constants are chains with a node every half minute: a single variable for the whole drive would involve all of it in
+every update. Keyframes older than a lag are marginalised: variables are ordered along time, so they are leaves of the
+tree, and their marginal becomes a factor on the variables they touched, which stays linear about the anchors.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ from graphnav.estimation.solvers.stages import (
 NODE_EVERY = 30.0  # s from one node of a constant to the next
 _TIED = 1e-5  # of its prior sigma, by which a constant may differ from node to node: 0.03 % of it in ten hours
 _UNIT = np.repeat([1e-3, 1.0, 0.1, 1e-3, 1e-5], 3)  # of a state's errors, so that one threshold fits them all
-_ALMOST = 0.3  # what has moved almost as far goes with what has: it would be next
+_ALMOST = 0.3  # share of the threshold from which variables are relinearised along with those beyond it
 
 
 class Tree:
@@ -97,14 +97,14 @@ class Tree:
     # --------------------------------------------------------------------------------------------------- entering
     @property
     def newest(self) -> Message:
-        """State and parameter values of the newest keyframe as they are known now, without what is known of them."""
+        """State and parameter values of the newest keyframe as estimated now, without covariance."""
         if not self.keyframes:
             return self._prior
         last, none = self.keyframes[-1], np.empty(0)
         return Message(last.estimate, last.values, last.columns, none, none)
 
     def add(self, place: Place, ahead: Predicted | None = None, rows: Sequence[Measured] = ()) -> float:
-        """Take in one more keyframe; returns by how much its rows turned it, rad.
+        """Add a keyframe; returns by how much its rows turned its attitude, rad.
 
         Parameters
         ----------
@@ -117,7 +117,7 @@ class Tree:
             rows = linearise_rows(place, state, values, columns).measured
         else:
             state, values, columns, link = ahead.state, ahead.values, ahead.columns, ahead.link
-        fresh: list[tuple[Variable, Any]] = []  # variables that begin here, and what is known of parameters among them
+        fresh: list[tuple[Variable, Any]] = []  # new variables, and priors of parameters among them
         x = self._add_variable(np.zeros(DIM), _UNIT, place.t)
         nodes = self._open(place, fresh)
         keyframe = Keyframe(self._number, place, x, state, columns, nodes, {})
@@ -149,7 +149,7 @@ class Tree:
         return float(np.linalg.norm(x.delta[:3]))
 
     def _add_first_keyframe(self, place: Place) -> None:
-        """Have the message that all goes on from as a keyframe before the first."""
+        """Add the initial message as a keyframe before the first."""
         prior = self._prior
         x, nodes, fresh = self._add_variable(np.zeros(DIM), _UNIT, place.t), {}, []
         blocks = [(x, prior.R[:, :DIM])]
@@ -225,7 +225,7 @@ class Tree:
 
     def _replace(self, made: Sequence[Made], gone: Sequence[int], first: int) -> None:
         """Have factors in place of others, on keyframes from number `first` on."""
-        # the order stays that of time; once it has much to do, GTSAM makes the whole tree anew
+        # elimination order is that of time; with much to do, GTSAM rebuilds the whole tree
         late = [v for v in self.variables.values() if v.last >= first]
         every = 2 * len(late) > len(self.variables)
         if every:
@@ -267,7 +267,7 @@ class Tree:
         return moves
 
     def relinearise(self, share: float = 1.0, renewed: Renewed | None = None) -> int:
-        """Linearise anew what has moved beyond a share of the limits; returns how many keyframes that are."""
+        """Relinearise keyframes that have moved beyond a share of the limits; returns their number."""
         self.read()
         moves = self.find_moves()
         if not (moves > share).any():
@@ -329,13 +329,13 @@ class Tree:
 
     # ---------------------------------------------------------------------------------------------------- leaving
     def truncate(self, keep: int) -> None:
-        """Forget all but the first keyframes: something before what follows has changed."""
+        """Remove all but the first keyframes, because something before the others has changed."""
         if keep >= len(self):
             return
         del self.keyframes[keep:]
         last = self.keyframes[-1]
         self._number, self._in_force = last.number + 1, last.nodes
-        # whatever touches a variable that began later goes with it
+        # factors on variables that began later are removed as well
         late = {x.key for x in self.variables.values() if x.first > last.number}
         factors = self.isam.getFactorsUnsafe()
         alive = ((i, factors.at(i)) for i in range(factors.size()))
@@ -364,7 +364,7 @@ class Tree:
             k.slots = {name: now[i] for name, i in k.slots.items()}
 
     def marginalise(self, count: int) -> None:
-        """Let the first keyframes go, and the parameters' nodes that only they touch."""
+        """Marginalise the first keyframes, and the parameters' nodes that only they touch."""
         first = self.keyframes[count].number
         gone = [x for x in self.variables.values() if x.last < first]
         stay = [x for x in self.variables.values() if x.last >= first]

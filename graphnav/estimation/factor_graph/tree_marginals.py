@@ -1,8 +1,8 @@
 """Covariances of a `graphnav.estimation.factor_graph.tree.Tree`, all of errors about the estimates.
 
-The newest keyframe stands in the root of GTSAM's Bayes tree, where a marginal costs next to nothing. One deep in the
-tree it finds clique by clique from the root, and anew after each update. So those of the oldest are found by
-eliminating the tree's factors from the other end, the newest first: what is left is all that is known of the oldest.
+The newest keyframe is in the root of GTSAM's Bayes tree, where a marginal costs next to nothing. Deep in the tree a
+marginal is computed clique by clique from the root, again after each update. So covariances of the oldest keyframes are
+found by eliminating the tree's factors from the other end, the newest first, which leaves the marginal of the oldest.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def compute_newest_root(tree: Tree, columns: Columns) -> Array:
         for b in variables:
             A, B = into[a.key] * a.unit, into[b.key] * b.unit
             P += A @ joint.at(a.key, b.key) @ B.T
-    # of the correlations, so that a gyro's bias and a place have the same digits
+    # of correlations, so that gyro bias and position have the same number of digits
     sd = np.sqrt(np.diag(P))
     w, V = np.linalg.eigh(P / sd[:, None] / sd)
     return np.asarray(np.linalg.qr((V / np.sqrt(np.maximum(w, np.finfo(float).eps))).T, "r") / sd)
@@ -62,7 +62,7 @@ def compute_newest_root(tree: Tree, columns: Columns) -> Array:
 
 @dataclass(frozen=True)
 class Estimates:
-    """Keyframes of a tree as it knew them at some time, without covariances."""
+    """Estimates of a tree's keyframes at some time, without covariances."""
 
     keyframes: tuple[Keyframe, ...]
     delta: Array  # (n, 15) of their states
@@ -72,7 +72,7 @@ class Estimates:
 
 @dataclass(frozen=True)
 class Elimination:
-    """What is known of the oldest keyframes of a tree, once all behind them are eliminated: so far or to the end."""
+    """Elimination of all later keyframes of a tree, in progress or complete, for the marginal of the oldest."""
 
     first: int  # keyframes from here
     count: int  # to here
@@ -86,7 +86,7 @@ class Elimination:
 
 
 def read_keyframes(tree: Tree, first: int, count: int) -> Estimates:
-    """Keyframes from `first` to `count` as they are known now."""
+    """Estimates of the keyframes from `first` to `count`."""
     tree.read()
     own = tuple(tree.keyframes[first:count])
     return Estimates(own, np.array([k.state.delta for k in own]), read_states(own), tuple(k.values for k in own))
@@ -111,7 +111,7 @@ def begin_elimination(tree: Tree, count: int, first: int = 0) -> Elimination:
 def eliminate(tree: Tree, so_far: Elimination, most: int) -> Elimination:
     """At most so many variables of the keyframes behind eliminated, and at last those that leave; then it is the same.
 
-    Keyframes that came since it began do not count; where rows have been linearised anew, it begins anew.
+    Keyframes added since it began do not count; after a relinearisation it starts again.
     """
     if tree.find_oldest_relinearised(so_far.version) <= so_far.newest:
         so_far = begin_elimination(tree, so_far.count, so_far.first)

@@ -1,4 +1,4 @@
-"""What a `tree.Tree` is made of: variables about anchors, keyframes, factors, and their text."""
+"""Elements of a `tree.Tree`: variables about anchors, keyframes, factors, and their serialisation."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from graphnav.estimation.solvers.stages import rotate_columns as turned_by
 from graphnav.estimation.solvers.window import find_parameter_limits
 
 LINK = "imu"  # among the constraints of a keyframe: the interval before it
-_WILDFIRE = np.inf  # what the newest keyframe changes of older ones is passed on when they are read
+_WILDFIRE = np.inf  # updates of older keyframes are propagated when these are read
 
 
 @dataclass(eq=False)
@@ -95,7 +95,7 @@ def update_isam(
     fresh: Sequence[tuple[Variable, Any]] = (),
     anew: Iterable[Variable] | None = None,
 ) -> None:
-    """Have factors in a tree, and others not any more.
+    """Add factors to a tree and remove others.
 
     Parameters
     ----------

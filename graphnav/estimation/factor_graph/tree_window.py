@@ -1,9 +1,9 @@
 """The window of an online run on GTSAM's iSAM2: its keyframes are smoothed, relinearised and marginalised in a tree.
 
-What enters is made as in `graphnav.estimation.solvers.window`: a keyframe is predicted, its innovations tested, robust
-rows weighed, all of it from a message of the newest keyframe. From there on the tree holds the rows. Live and settled
-estimates are its own, and so is the message that the next keyframe is predicted from once the past has been linearised
-anew. The keyframe that settled last stays in the tree, so that all behind it can be taken back.
+Keyframes are prepared as in `graphnav.estimation.solvers.window`: predicted from a message of the newest keyframe,
+innovations tested, robust rows weighted. From then on the tree holds the rows. Live and settled estimates are its own,
+and so is the message that the next keyframe is predicted from once the past has been linearised anew. The keyframe that
+settled last stays in the tree, so that all behind it can be taken back.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class TreeWindow(Window):
         return replace(moved, message=replace(moved.message, z=np.zeros(len(message.z))))
 
     def _adopt_all(self) -> None:
-        """Have the newest message as the tree knows it, with what it says of its errors."""
+        """Replace the newest message by the tree's, with its error state."""
         stage = self._adopt(self.stages[-1])
         m = stage.message
         R = compute_newest_root(self.tree, m.columns)

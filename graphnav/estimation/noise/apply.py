@@ -1,4 +1,4 @@
-"""A problem as a noise model has it."""
+"""Application of a noise model to a problem."""
 
 from __future__ import annotations
 
@@ -117,7 +117,7 @@ def select_weights(t: Array, noise: NoiseModel, name: str) -> Array:
     out = np.ones(len(t))
     some = noise.weights.get(name)
     if some is not None and len(some.t):
-        number = np.arange(len(t)) - np.searchsorted(t, t - SAME_TIME)  # among the rows of its time
+        number = np.arange(len(t)) - np.searchsorted(t, t - SAME_TIME)  # index among the rows of its time
         at = np.clip(np.searchsorted(some.t, t - SAME_TIME) + number, 0, len(some.t) - 1)
         same = np.abs(some.t[at] - t) <= SAME_TIME
         out[same] = some.weight[at[same]]
@@ -127,6 +127,6 @@ def select_weights(t: Array, noise: NoiseModel, name: str) -> Array:
 
 
 def drop_parts(problem: Problem) -> Problem:
-    """The same without what each noise figure contributes, which takes room and nobody asks for any more."""
+    """The same without the contributions of each noise figure, which take memory and are no longer needed."""
     intervals = problem.intervals.without_parts()
     return replace(problem, intervals=intervals, motion=ImuFactors(intervals, problem.frame))

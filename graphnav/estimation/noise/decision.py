@@ -1,4 +1,4 @@
-"""What is wrong in spans of measurements, decided by the evidence of models of it."""
+"""Decision between fault models of spans of measurements, by their evidence."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.watch import FALSE_ALARM
 
 _BY_ROWS = INTERVALS, ROWS  # explanations by outliers, for which nothing is left out
-_FAULT_COST = -float(np.log(FALSE_ALARM))  # log-odds of a fault beforehand, negative
+_FAULT_COST = -float(np.log(FALSE_ALARM))  # negative prior log-odds of a fault
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class Decision:
 def explain(
     base: Problem, found: NoiseEstimate, spans: list[Span], among: Collection[Explanation] = EXPLANATIONS
 ) -> Decision:
-    """Decide by evidence what is wrong in each span.
+    """Choose the most probable fault model of each span.
 
     Parameters
     ----------

@@ -47,13 +47,14 @@ from graphnav.estimation.solvers.passes import DisturbancePass, ForwardRecord, r
 from graphnav.estimation.solvers.rts import smooth_moments
 from graphnav.imu.preintegration import NOISE_FIGURES
 
-_BOUNDED = 0.05  # probability of a square of an aiding sensor beyond its bound; nearly two rows in five may be wrong
+# probability of a square of an aiding sensor beyond its bound; up to nearly two rows in five may be wrong
+_BOUNDED = 0.05
 _FIRST_KEYFRAMES = 1500  # keyframes: a variance estimated from a thousand numbers is good to a twentieth
 _ROUNDS, _AGAIN = 8, 3  # passes to convergence, from the priors and from figures that were estimated before
 _MAX_PASSES = 3 * _ROUNDS  # passes at most
 _EXTRAPOLATION = 2.0  # longest step, in steps as computed (Aitken's extrapolation)
 _TIME_RANGE = 30.0  # factor by which a correlation time may differ from its prior median either way
-_MANOEUVRE = 1.0, 10.0  # rad/s, m/s^2, of a vehicle: what is unknown of an interval whose samples are lost
+_MANOEUVRE = 1.0, 10.0  # rad/s, m/s^2, of a vehicle: uncertainty of an interval whose samples are lost
 _TIME_GRID = np.linspace(-1.0, 1.0, 21)
 
 
@@ -167,7 +168,7 @@ def estimate_noise(
     used = apply_noise(problem, figures.build_model())
     try:
         initials, passes = find_initial_points(used, opening)
-    except BREAKDOWN:  # with the prior's medians; with the noise that is stated it may not
+    except BREAKDOWN:  # with the prior's medians; with stated noise it may not
         initials, passes = find_initial_points(problem, opening)
         initials = [replace(one, points=reuse_points(one.points, problem, used)) for one in initials]
     found: list[NoiseEstimate] = []
@@ -178,7 +179,7 @@ def estimate_noise(
             figures.log[name] += more
         try:
             found.append(_iterate(problem, figures, initial.points, progress, intervals))
-        except BREAKDOWN:  # from these points; others may do
+        except BREAKDOWN:  # from these points; others may succeed
             if initial is initials[-1] and not found:
                 raise
     best = max(found, key=lambda one: one.log_evidence)
@@ -218,7 +219,7 @@ def _iterate(
             if converged:
                 break
             before, figures.extrapolation = now, _EXTRAPOLATION if k > 1 and now > before else 1.0
-        if not converged:  # oscillating, or still on their way
+        if not converged:  # oscillating, or not yet converged
             figures = likeliest
     if not converged:
         latest = None

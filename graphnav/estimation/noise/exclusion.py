@@ -105,7 +105,7 @@ def estimate_without_faults(
     passes = passes + best.passes
     before, other = _list_before(base, best.noise), None
     if before:
-        with contextlib.suppress(*BREAKDOWN):  # of a filter that is led by what is wrong
+        with contextlib.suppress(*BREAKDOWN):  # from a filter that follows the wrong fixes
             other = _estimate_other(base, opening, found, best, before, progress)
     if other is not None:
         passes = passes + other.passes + Counter(filter=2)
@@ -121,7 +121,7 @@ def _estimate_other(
     suspected: list[Span],
     progress: Callable[[str, float], None] | None,
 ) -> NoiseEstimate | None:
-    """Estimate without what is wrong where other spans are suspected; None if that is the same as before.
+    """Estimate without other suspected spans; None if the result is the same as before.
 
     Parameters
     ----------
@@ -145,7 +145,7 @@ def _estimate_without(
     progress: Callable[[str, float], None] | None,
 ) -> NoiseEstimate:
     """Estimate without the spans of a decision, and decide again at their ends."""
-    # from the priors: figures that were estimated with the fault among the data are far from where they will end
+    # from the priors: figures estimated with the fault among the data are far from their final values
     start = NoiseModel(weights=decision.noise.weights, excluded=decision.noise.excluded)
     near = (decision.estimate or found).get_linearisation(base)
     return _readmit(base, estimate_noise(base, opening, start, near, progress))
@@ -171,7 +171,7 @@ def decide_faults(base: Problem, found: NoiseEstimate) -> Decision:
     masked = _find_disagreements(base, NoiseModel(medians), found)
     first = replace(first, passes=first.passes + Counter(filter=2))
     excluded = join(span for kind in FIXES for span in first.noise.excluded.get(kind, ()))
-    # the figures found are of repeated fixes, too: where these are wrong, of wrong ones
+    # the figures found also rest on repeated fixes, which may be wrong
     wrong = any(are_covered([span], excluded) for span in list_repeats(base.recording))
     if are_covered(masked, excluded) and not wrong:
         return first
@@ -200,7 +200,7 @@ def _unmask(base: Problem, found: NoiseEstimate, first: Decision, masked: list[S
             passes = passes + candidate.passes
             if candidate.log_evidence > best.log_evidence:
                 best, leading = candidate, estimate
-        if sum_lengths(detected) > 2.0 * sum_lengths(masked):  # more seems wrong outside than inside
+        if sum_lengths(detected) > 2.0 * sum_lengths(masked):  # more fixes seem wrong outside the span than inside
             break
         if not refined:  # single outliers and no fault
             everything = replace(estimate.noise, excluded={})
@@ -255,7 +255,7 @@ def estimate_disturbed_intervals(base: Problem, found: NoiseEstimate) -> NoiseEs
             passes = passes + free.passes
         if log_evidence(base, free) > log_evidence(base, found):
             return replace(free, passes=passes)
-        if free.noise.excluded == found.noise.excluded:  # the same model, already on its way
+        if free.noise.excluded == found.noise.excluded:  # the same model, already converging
             start, near = free.noise, free.get_linearisation(base)
     disturbed = estimate_noise(base, None, start, near, intervals=True)
     return replace(disturbed, passes=passes + disturbed.passes)

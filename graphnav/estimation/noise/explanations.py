@@ -1,4 +1,4 @@
-"""What may be wrong in a span: each explanation as a problem of its own, and how likely it makes the measurements."""
+"""Fault models of a span: each as a problem of its own, with the likelihood of the measurements."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ FIXES, WHEELS = ("gnss_position", "gnss_velocity"), ("nhc", "odometer")
 ROWS = ("rows",)
 Explanation = tuple[str, ...]  # the constraints whose rows are wrong by it
 EXPLANATIONS: tuple[Explanation, ...] = ((), FIXES[:1], FIXES[1:], FIXES, WHEELS, INTERVALS, ROWS)
-ONE_SENSOR = FIXES[:1], FIXES[1:], WHEELS  # wrong in a span: the others are not, but may have outliers there
+ONE_SENSOR = FIXES[:1], FIXES[1:], WHEELS  # faulty as a whole in a span; other sensors may only have outliers there
 _NEGLIGIBLE_SIGMA = 1e-9  # sigma of an error outside its span
 
 

@@ -1,4 +1,4 @@
-"""A noise model as JSON, and back: what a run found can be used again, to the last digit.
+"""A noise model as JSON, and back, to the last digit: a run can use the noise model of another.
 
 Under the key "noise", in a file of its own or in the summary.json of a run::
 
@@ -14,8 +14,7 @@ Under the key "noise", in a file of its own or in the summary.json of a run::
 
     pieces              how many pieces the recording was cut into, the figures being those of the first; for people
 
-What else stands beside a figure (the stated one, the one used) is for people. Numbers are written with as many digits
-as bring them back exactly.
+Other values beside a figure (the stated one, the one used) are for people. Numbers are written with all digits.
 """
 
 from __future__ import annotations
@@ -63,11 +62,11 @@ from graphnav.recording import FIX_TYPES
 from graphnav.recording.checks.crosschecks import LARGEST_SHIFT
 
 MODES: tuple[str, ...] = get_args(NoiseSettings.model_fields["mode"].annotation)
-_LEAST_WEIGHT = 1e-15  # weight of an interval: one without any would have no end of noise
+_LEAST_WEIGHT = 1e-15  # least weight of an interval: zero would mean infinite noise
 _PRIOR = tuple(one.name for one in fields(FreedConstant))
 _STAMPS = tuple(one.name for one in fields(StampOffsets))
 _LARGEST_OFFSET = 2.0 * LARGEST_SHIFT  # s; estimates go on from what is searched
-_LARGEST_RATE = 0.1  # s/s; a clock that is off by more is no clock
+_LARGEST_RATE = 0.1  # s/s; larger clock rates are invalid
 _LONGEST_ARM = 100.0  # m
 # by the key: parameter, how many numbers, how large they are at most, and what they are
 _FREED = {
@@ -81,7 +80,7 @@ _LEAST_SIGMA = 1e-9  # of what is the most: nothing is better known
 _FIGURE_KEYS = {"log_factor": "log_factor", "sigma": "sigma", "prior": "prior", "prior_sigma": "prior_sigma",
            "degrees_of_freedom": "freedom"}  # fmt: skip
 _BESIDE = ("variance_factor", "stated", "used", "unit", "correlation_time")
-_TINY, _HUGE = -100.0, 100.0  # of a logarithm: e^100 is beyond what any sensor can be off by
+_TINY, _HUGE = -100.0, 100.0  # of a logarithm: e^100 is beyond any sensor's error
 
 
 def list_noise(noise: NoiseModel, mode: str = "estimated") -> dict[str, Any]:

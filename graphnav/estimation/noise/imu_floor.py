@@ -1,15 +1,15 @@
-"""The white noise that an IMU on a shoe has of its own, where the figures stated are larger than it shows.
+"""Upper bound of a shoe-mounted IMU's white noise from the quietest stretch of a walk, where stated figures are larger.
 
-Figures written down for a foot are often generous, because heel strikes make more noise than any data sheet says. But
-those have their own place (`graphnav.imu.unresolved`), and a gyro that is called ten times noisier than it is leaves
-its bias ten times less known by the rests at both ends of a walk. So the quietest stretch of the recording is asked:
-means over `_CLUSTER`, and of them the second differences, in which a slow sway cancels. White noise of a density q
-leaves 6 q^2 / `_CLUSTER` in each of their squares (Allan variance has first differences, 2 q^2 / `_CLUSTER`). A person
-who stands adds to that, so it is a bound from above; but the quietest of many stretches is quiet by chance as well, and
-the figure is one that true noise would show less than in `_CHANCE` of them.
+Figures stated for foot-mounted IMUs are often generous because heel strikes are noisier than any data sheet. But heel
+strikes are modelled separately (`graphnav.imu.unresolved`), and a gyro noise stated ten times too large leaves the gyro
+bias ten times less known from the rests at both ends of a walk. So the noise is measured in the quietest stretch of the
+recording: means over `_CLUSTER`, and of them second differences, in which a slow sway cancels. White noise of density q
+gives each squared second difference the expectation 6 q^2 / `_CLUSTER` (the Allan variance has first differences, 2 q^2
+/ `_CLUSTER`). The sway of a standing person adds to that, so the result is an upper bound; but the quietest of many
+stretches is also quiet by chance, and the bound is one that true noise would undercut in less than `_CHANCE` of them.
 
-A drive is not asked: while its engine runs it vibrates as it never does at rest. Nor is a walk that is still going on:
-its longest rest may be yet to come.
+Drives are excluded: with a running engine a vehicle vibrates differently than at rest. So are walks in progress, whose
+longest rest may be yet to come.
 """
 
 from __future__ import annotations

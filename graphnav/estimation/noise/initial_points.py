@@ -1,4 +1,4 @@
-"""Where the estimate of a noise model starts: linearisation points, and weights of gross outliers."""
+"""Start of a noise estimate: linearisation points, and weights of gross outliers."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from graphnav.estimation.solvers.robust import weigh_squares
 from graphnav.estimation.solvers.rts import smooth_backward
 from graphnav.estimation.solvers.watch import SIZES
 
-BREAKDOWN = EstimationError, np.linalg.LinAlgError  # what a filter raises that has lost its digits
+BREAKDOWN = EstimationError, np.linalg.LinAlgError  # errors of a filter with a numerically singular covariance
 _COOLING = 3.0  # factor by which the sigmas of an annealing fall in each round
-_SETTLED = 1e-3  # sigmas by which points may be off that rows are linearised at: of no account in what is linear
-_SEARCHES = 5  # searches for gross outliers at most; in most drives the second finds what the first found
+_SETTLED = 1e-3  # sigmas by which linearisation points may be off without effect
+_SEARCHES = 5  # searches for gross outliers at most; in most drives the second finds the same ones
 
 
 @dataclass(frozen=True)
@@ -44,10 +44,10 @@ def smooth_about(problem: Problem, about: Points) -> tuple[ForwardRecord, Smooth
 def find_initial_points(problem: Problem, opening: float | None) -> tuple[list[Initial], int]:
     """Points of a filter that uses all measurements, and others if leaving gross outliers out leads elsewhere.
 
-    Gross outliers take a filter that uses everything too far from the truth to be linearised there. So they are left
-    out, and searched for again with the filter that does without them, until the same ones are found. Growing errors
-    are not searched for: while the heading is still uncertain, the filter itself drifts against the fixes. If that
-    leads elsewhere, or the filter breaks down, points that rest on few outliers are found by annealing.
+    Gross outliers lead a filter that uses all measurements too far from the truth for linearisation. So they are left
+    out, and searched again with the filter without them, until the same ones are found. Growing errors are not searched
+    for: while the heading is still uncertain, the filter itself drifts against the fixes. If that leads elsewhere, or
+    the filter breaks down, points that rest on few outliers are found by annealing.
 
     Parameters
     ----------
@@ -68,7 +68,7 @@ def find_initial_points(problem: Problem, opening: float | None) -> tuple[list[I
     """
     try:
         plain = about = smooth_backward(problem, ekf(problem, opening=opening, stays=_SETTLED))
-    except BREAKDOWN:  # outliers of hundreds of sigmas leave no digits in its covariance
+    except BREAKDOWN:  # outliers of hundreds of sigmas make its covariance numerically singular
         initial, passes = _anneal(problem, opening)
         return [initial], passes
     sound, passes = problem, 1
@@ -107,7 +107,7 @@ def _add_annealed(
 
 
 def _anneal(problem: Problem, opening: float | None) -> tuple[Initial, int]:
-    """Points and figures that no outlier leads astray, by deterministic annealing, and the passes it took.
+    """Points and figures that are robust against outliers, by deterministic annealing, and the number of passes.
 
     The errors of fixes are assumed to be as large as they get, then a third of that in each round, with weights by the
     residuals of the round before; until half of them are no smaller than assumed, or the stated sigmas are reached.

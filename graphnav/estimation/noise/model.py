@@ -1,4 +1,4 @@
-"""The noise model: by what factor each stated variance is used, how long errors last, and which rows weigh less.
+"""The noise model: variance factors, correlation times, and weights of rows.
 
 A variance component is a group of numbers whose stated variances are wrong by one common factor:
 
@@ -8,8 +8,8 @@ A variance component is a group of numbers whose stated variances are wrong by o
     nhc.right, odometer.forward ...       and the same of wheels and of the receiver's velocities
 
 Factors are in units of what is stated; that of a process is in units of the stated white variance of its fixes, or of
-the process that the settings of the wheels state. A process with factor 0 does not exist: with `STATED`, no factor
-differs from 1 and no process exists, so a problem is what recording and settings say.
+the process that the settings of the wheels state. A process with factor 0 does not exist: with `STATED`, all factors
+are 1 and no process exists, so a problem is as recording and settings state.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class VarianceComponent:
     sigma: float = 0.0  # 1-sigma of `log_factor`
     prior: float = 0.0  # median of the prior, log
     prior_sigma: float = 0.0
-    freedom: float = 0.0  # degrees of freedom that the data tell it by
+    freedom: float = 0.0  # degrees of freedom of the data
 
     @property
     def factor(self) -> float:
@@ -43,7 +43,7 @@ class VarianceComponent:
 
 @dataclass(frozen=True)
 class RowWeights:
-    """Rows of a constraint, or intervals of an IMU, that have less information than their sigmas say."""
+    """Rows of a constraint, or intervals of an IMU, with less information than their sigmas state."""
 
     t: Array  # (n,) s, ascending; where a time has several rows, all of them; of an interval its end
     weight: Array  # (n,) in (0, 1]
@@ -62,7 +62,7 @@ class StampOffsets:
 
 @dataclass(frozen=True)
 class FreedConstant:
-    """What is used in place of a stated constant, as a parameter (`graphnav.estimation.contradictions`)."""
+    """Value and prior sigma of a parameter that replaces a stated constant (`graphnav.estimation.contradictions`)."""
 
     value: tuple[float, ...]
     sigma: tuple[float, ...]  # 1-sigma of its prior
@@ -70,7 +70,7 @@ class FreedConstant:
 
 @dataclass(frozen=True)
 class NoiseModel:
-    """How good the sensors are taken to be. Beside what it names, everything is as stated."""
+    """Noise model of all sensors; whatever it does not name is as stated."""
 
     figures: Mapping[str, VarianceComponent] = field(default_factory=dict)
     times: Mapping[str, float] = field(default_factory=dict)  # s, correlation time of a process by its parameter

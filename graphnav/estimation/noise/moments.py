@@ -1,4 +1,4 @@
-"""What a smoother says of every variance component, and of every row.
+"""Smoothed moments of every variance component and every row.
 
 The innovation log-likelihood L of a linear Gaussian problem has, by the logarithm of the variance factor f of a
 component that adds the covariance f Q_i to a step or to rows, the derivative
@@ -10,8 +10,8 @@ with r and N of the disturbance smoother (Koopman 1993, "Disturbance smoother fo
     r = P-^-1 (x^s - x-)           N = P-^-1 (P- - P^s) P-^-1
 
 and at rows with residual e and Jacobian H at the smoothed state, r = R^-1 e and N = R^-1 - R^-1 H P^s H^T R^-1. B is
-the component's redundancy, the degrees of freedom that the data tell it by (Foerstner 1979; MacKay 1992 calls it the
-number of well-determined parameters), and E[A] = B where f is right.
+the component's redundancy, its degrees of freedom in the data (Foerstner 1979; MacKay 1992 calls it the number of
+well-determined parameters), and E[A] = B where f is right.
 
 Bryson and Frazier, "Smoothing for linear and nonlinear dynamic systems" (1963); Foerstner, Allgemeine
 Vermessungs-Nachrichten 86 (1979); de Jong, JASA 84 (1989); Koopman, Biometrika 80 (1993); MacKay, Neural Computation 4
@@ -32,7 +32,7 @@ from graphnav.estimation.problem import ParameterChain, Problem
 from graphnav.estimation.solvers.linearise import find_stepping, shift
 from graphnav.estimation.solvers.passes import DisturbancePass, ForwardRecord, split_values
 
-_FORGOTTEN = 1e-6  # share of a value that is left of it, below which what is left is lost in rounding
+_FORGOTTEN = 1e-6  # relative remainder of a difference below which it is rounding error
 
 
 @dataclass(frozen=True)
@@ -41,8 +41,8 @@ class RowMoments:
 
     A: Array  # (N, m) w e^2 / R
     B: Array  # (N, m) redundancy
-    left_out: Array  # (N,) squared residual against its covariance, predicted without the row, as if its weight were 1
-    whole: Array  # (N,) squared whole error, what lasts included, against its steady covariance
+    left_out: Array  # (N,) squared residual over its covariance, predicted without the row, at weight 1
+    whole: Array  # (N,) squared total error, time-correlated part included, over its stationary covariance
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,7 @@ def collect_row_moments(problem: Problem, rows: Constraint, smoothed: Disturbanc
     w = np.ones((n, 1)) if rows.weight is None else rows.weight[:n, None]
     R = linear.stated**2
     B = np.clip(1.0 - w * np.diagonal(HPH, axis1=1, axis2=2) / R, 1e-6, 1.0)
-    # in axes in which the whitened covariance is diagonal: a stamp that is wrong moves all components alike
+    # in axes that diagonalise the whitened covariance: a stamp error affects all components together
     each, axes = np.linalg.eigh(HPH / (linear.stated[:, :, None] * linear.stated[:, None]))
     free = np.clip(1.0 - w * each, 1e-6, 1.0)
     predicted = np.einsum("nji,nj->ni", axes, linear.residual / linear.stated) / free
@@ -120,8 +120,8 @@ def collect_row_moments(problem: Problem, rows: Constraint, smoothed: Disturbanc
 def lag_moments(problem: Problem, chain: ParameterChain, smoothed: DisturbancePass, end: int) -> tuple[Array, ...]:
     """Of a process, from node to node: times between (n,), E[c' c'], E[c' c] and E[c c] (n, k), c' the later.
 
-    As c' = a c + w, E[c' c] is half of (E[c' c'] + a^2 E[c c] - E[w w]) / a. Where next to nothing of c is left in c'
-    (`_FORGOTTEN`), the two are taken for independent.
+    As c' = a c + w, E[c' c] is half of (E[c' c'] + a^2 E[c c] - E[w w]) / a. Where the correlation is negligible
+    (`_FORGOTTEN`), the two are taken as independent.
     """
     at = problem.columns[chain.parameter.name]
     own = shift(at)

@@ -12,7 +12,7 @@ from graphnav.estimation.noise.model import INTERVALS, RowWeights
 from graphnav.estimation.problem import Problem
 
 CHANCE = 1e-3  # probability of a larger squared error, below which a row is an outlier
-OUTLIER_COST = -float(np.log(CHANCE))  # negative log-probability of one outlier beforehand
+OUTLIER_COST = -float(np.log(CHANCE))  # negative prior log-probability of one outlier
 
 
 def limit_squares(squared: Array, m: int) -> Array:
@@ -23,7 +23,7 @@ def limit_squares(squared: Array, m: int) -> Array:
 def limit_scaled(squared: Array, m: int, used: Array) -> Array:
     """The same weights, with the squared errors scaled to the expected median where the median is larger than that.
 
-    If half of the rows in use (N,) are off, it is the variance that has not converged yet, and not the rows.
+    If half of the rows in use (N,) are off, the variance has not converged yet.
     """
     some = squared[used]
     scale = float(np.median(some)) / float(chdtri(m, 0.5)) if len(some) else 1.0
@@ -48,7 +48,7 @@ def count_rows(problem: Problem) -> dict[str, int]:
 
 
 def compute_outlier_cost(weights: Mapping[str, RowWeights], totals: Mapping[str, int]) -> float:
-    """Negative log-probability beforehand of as many outliers as there are reduced weights, less that of none.
+    """Negative prior log-probability of as many outliers as there are reduced weights, less that of none.
 
     How often a sensor has outliers is unknown. With a Beta prior of 1 and 1 / `CHANCE`, its mean `CHANCE`, k given ones
     of n rows are outliers with a probability of B(k + 1, n - k + 1 / `CHANCE`) / B(1, 1 / `CHANCE`).

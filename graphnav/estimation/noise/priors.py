@@ -1,13 +1,12 @@
 """Priors of the variance factors: log-normal, with a median and a 1-sigma of the logarithm.
 
-A stated figure holds within a factor of three either way (1-sigma): data sheets give the sensor on a
-bench and not in a car, receivers print sigmas for the whole of an error or for its noise alone. That is one figure for
-all sensors, so that no sensor is believed before another; where the data tell a figure by tens of degrees of freedom
-it has no weight, where they tell nothing it is what is used.
+A stated figure holds within a factor of three either way (1-sigma): data sheets give the sensor on a bench and not in a
+car, receivers print sigmas for the whole of an error or for its noise alone. It is the same for all sensors, so that
+none is favoured; with tens of degrees of freedom in the data the prior has no weight, with none it is used as it is.
 
 A receiver's sigma is meant to hold for the whole of its error. What part of that is white is not stated: the medians
 of the processes give it half to hours, half to minutes, and a quarter to seconds, in units of the stated variance, and
-the white part starts at all of it; the data then part it.
+the white part starts at all of it; the data separate them.
 """
 
 from __future__ import annotations

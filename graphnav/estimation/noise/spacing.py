@@ -1,8 +1,8 @@
-"""Fixes of a receiver that reports faster than its errors change, one of a second.
+"""Thinning of fixes to one a second, where a receiver reports faster than its errors change.
 
 A receiver's tracking loops and its own filter smooth over about a second: of ten fixes in one, nine repeat the error of
-the first, smoothly. A white variance that is told by such fixes is far too small, and an IMU that does not follow their
-smooth errors is called worse than it is.
+the first, smoothly. A white variance estimated from such fixes is far too small, and an IMU that does not follow their
+smooth errors gets too large a noise.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def find_grid_start(gnss: Gnss) -> float:
 
 
 def select_best_fixes(gnss: Gnss, which: Array) -> Array:
-    """The rows that `space_fixes` keeps of each span; `which` (N,) says what span a fix is of."""
+    """The rows that `space_fixes` keeps of each span; `which` (N,) is the span of each fix."""
     keep = _select_best(which, np.linalg.norm(gnss.sd, axis=1))
     if gnss.v is not None and gnss.sd_v is not None:
         moves = np.asarray(np.isfinite(gnss.v).all(axis=1))

@@ -1,4 +1,4 @@
-"""Spans of time in which measurements are suspected: joined, compared, and trimmed to what is wrong in them."""
+"""Spans of time in which measurements are suspected: joined, compared, and trimmed to the wrong fixes in them."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def join(spans: Iterable[Span]) -> list[Span]:
 
 
 def join_faults(faults: Iterable[ExcludedSpan]) -> list[Span]:
-    """Spans of several measurements; a single one is judged by its weight instead."""
+    """Spans of several measurements; single ones are handled by their weights."""
     return join((fault.t_start, fault.t_end) for fault in faults if fault.count > 1)
 
 
@@ -71,7 +71,7 @@ def list_repeats(recording: Recording) -> list[Span]:
 
 
 def split_at_repeats(spans: list[Span], recording: Recording) -> list[Span]:
-    """Repeats and, apart from them, what is left of other spans: one may be wrong and the other not."""
+    """Repeats and, separately, the rest of other spans: one may be wrong and the other not."""
     gnss, repeats = recording.gnss, list_repeats(recording)
     if gnss is None or not repeats:
         return spans
@@ -112,8 +112,8 @@ def extend_to_next_fix(problem: Problem, spans: list[Span], fixes: tuple[str, ..
 def trim(spans: list[Span], errors: LeftOutErrors, chance: float = CHANCE) -> list[Span]:
     """Spans without the correct fixes at their ends.
 
-    The tests run forward in time and leave out too much: they date a fault by one of a few onsets, and the fixes behind
-    it meet a filter that the fault has led astray. Of each span the part with the largest sum of scores is kept, where
+    The tests run forward in time and leave out too much: they date a fault by one of a few onsets, and the fixes after
+    it are tested with a filter biased by the fault. Of each span the part with the largest sum of scores is kept, where
     a fix scores half of what its squared error exceeds the limit by, at most the cost of a single outlier.
 
     Parameters

@@ -33,7 +33,7 @@ class FigureRow:
     """A variance component beside what is stated."""
 
     group: str
-    words: str  # what it is, for people
+    words: str  # description
     figure: VarianceComponent
     stated: float | None  # where it is one number: of an IMU, or the median sigma that fixes state
     used: float | None
@@ -69,7 +69,7 @@ def tabulate_figures(
             continue
         time = next((part for part in middle if part in lasts), None)
         kind = next((part for part in middle if part not in lasts), None)
-        # what lasts for minutes and hours has one unit, whatever the type of a fix
+        # errors over minutes and hours have one unit, whatever the fix type
         sigma = _read_sigma(recording, source, None if time in TIMES[1:] else kind, axis)
         words = f"{_OF.get(source, source)}{f' ({kind})' if kind else ''}, {axis}"
         words += ", white" if time is None else f", lasting {time}"
@@ -88,7 +88,7 @@ def tabulate_figures(
 
 
 def compute_whole_ratio(noise: NoiseModel, source: str, axis: str) -> float | None:
-    """The sigma of a whole error, white and lasting, over the stated one; None where nothing is known of it.
+    """Sigma of the total error, white and time-correlated, over the stated one; None where unknown.
 
     Parameters
     ----------

@@ -21,11 +21,11 @@ _NAMES = {
 }
 
 _IMU_WHITE = dict(zip(INTERVALS, ("gyro noise", "accelerometer noise"), strict=True))
-_FAR = 5.0  # prior sigmas, which chance does not reach
+_FAR = 5.0  # prior sigmas, beyond chance
 
 
 def describe_far(problem: Problem, smoothed: Points) -> tuple[str, ...]:
-    """Sentences on parameters that the data put farther from what is stated of them than they can be."""
+    """Sentences on parameters whose estimates are implausibly far from their stated values."""
     out = []
     for chain in problem.chains:
         p = chain.parameter

@@ -1,4 +1,4 @@
-"""What somebody decides by a filter's estimate, and the filter then holds to."""
+"""Decisions from a filter's estimate, such as integers, and their constraints on the filter."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from graphnav.estimation.solvers.recursion import invert_sum, update_covariance
 
 @dataclass(frozen=True)
 class DecidedRows:
-    """What was decided at a keyframe by the estimate there: rows to hold from now on, and what is not to be trusted."""
+    """A decision at a keyframe: rows to hold from now on, and variance to add."""
 
     H: Array  # (m, D)
     residual: Array  # (m,)
@@ -26,7 +26,7 @@ Decide = Callable[[int, Points, Array], DecidedRows | None]  # of a keyframe, th
 
 
 def hold(one: DecidedRows, P: Array) -> tuple[Array, Array]:
-    """An update with what was decided: how far (D,) it moves the estimate, and the covariance about where it was."""
+    """Update with decided rows: the correction (D,) of the estimate, and the covariance about its old point."""
     P = P + np.diag(one.added)
     if not len(one.residual):
         return np.zeros(len(P)), P

@@ -53,7 +53,7 @@ def take_back(N: Array, H: Array, Kt: Array, inverse: Array, lossy: bool) -> Arr
     """N (D, D) before an update from that behind it."""
     G = np.dot(Kt, N)
     if lossy:
-        # from one side after the other: after a first fix what is left of N is smaller by ten orders each time
+        # from one side after the other: after a first fix the result is smaller by ten orders each time
         out = N - np.dot(G.T, H)
         out += np.dot(H.T, np.dot(inverse, H) - np.dot(Kt, out))
         return 0.5 * (out + out.T)
@@ -131,8 +131,8 @@ def smooth_rows(
     """r (n, D), and of N the states' part (n, 15, 15) and the diagonal (n, D), of keyframes k1 - 1 down to k0.
 
     From those of k1, zero where there is none; returns those of k0. And errors (n, D) of the smoother there: from the
-    filtered ones, since those predicted, of a place that only the first fix tells, are larger by ten orders than what
-    is left of them.
+    filtered ones, because predicted errors of a position that only the first fix determines are larger by ten orders
+    than their smoothed values.
 
     Parameters
     ----------
@@ -145,7 +145,7 @@ def smooth_rows(
     """
     for k in range(k1 - 1, k0 - 1, -1):
         rows = end[first[k + 1] - 1] if first[k] < first[k + 1] else 0
-        ahead = k < len(F)  # of the last of all the filtered covariance is of errors about the estimate already
+        ahead = k < len(F)  # at the last keyframe the filtered covariance already is of errors about the estimate
         if ahead:
             r_k = step_vector_back(F[k], decay[k], r_k)
             N_k = step_back(F[k], decay[k], N_k)

@@ -11,13 +11,12 @@ and updates with the rows of every constraint there, nu = -r,
 
 (closed loop: the error state is moved into x at once; Joseph's form keeps P symmetric and positive).
 
-The opening is the part that the alignment has seen. Before a vehicle moves nothing tells its
-heading, the filter's wanders by degrees until the first motion puts it right, and Jacobians taken along the way
-contradict those taken afterwards: heading, tilt and accelerometer bias get correlations that were never measured.
-So the opening is filtered and smoothed until attitudes stay, and filtered again from the same prior, linearised at the
-points that are left (`graphnav.estimation.solvers.points`). So are the first steps of a walk, which tell tilt and
-accelerometer bias apart. Later keyframes are linearised where the filter is, and their covariances move along with it
-(`graphnav.estimation.solvers.invariant`).
+The opening is the part that the alignment used. Before the first motion the heading is not observable and drifts by
+degrees; Jacobians evaluated there contradict later ones, and create correlations between heading, tilt and
+accelerometer bias that were never measured. So the opening is filtered and smoothed until attitudes converge, and
+filtered again from the same prior, linearised at these points (`graphnav.estimation.solvers.points`). So are the first
+steps of a walk, which separate tilt from accelerometer bias. Later keyframes are linearised at the filter's estimate,
+and their covariances are transported with it (`graphnav.estimation.solvers.invariant`).
 
 Where only figures or weights have changed since the drive was filtered, `refilter` is linearised at given points
 throughout.
@@ -60,7 +59,7 @@ from graphnav.estimation.solvers.stretches import STAYS, StretchFilter
 from graphnav.estimation.solvers.watch import Bank
 from graphnav.imu.dynamics import SCALE
 
-_PASSES = 4  # about where the pass before led
+_PASSES = 4  # passes of the opening, each about the points of the one before
 
 
 def ekf(
@@ -75,10 +74,11 @@ def ekf(
 
     Parameters
     ----------
-    opening : s, the end of what the alignment has seen of the recording; up to there the filter runs twice. Estimates
+    opening : s, end of the span used by the alignment; up to there the filter runs twice. Estimates
         after it depend on nothing later than themselves.
-    known : where the opening is linearised, from its first keyframe on, if that is known better than by a first pass.
-    decide : asked after the updates of each keyframe; a smoother is not to rest on what comes of it.
+    known : linearisation points of the opening, from its first keyframe on, if better ones than a first pass's are
+        known.
+    decide : called after the updates of each keyframe; a smoother must not use the result.
     stays : sigmas, as for `graphnav.estimation.solvers.stretches.StretchFilter`.
     """
     began = time.perf_counter()
@@ -91,7 +91,8 @@ def ekf(
         )
     one = _run_forward(problem, K, about, progress, decide=decide, stays=stays)
     seconds = time.perf_counter() - began
-    filtered, P = one.states, one.P[:, :DIM, :DIM].copy()  # a view would hold what is known of the parameters too
+    # a copy: a view would keep the parameters' covariance in memory
+    filtered, P = one.states, one.P[:, :DIM, :DIM].copy()
     if about is not None:
         n = len(about.values) - 1
         P[:n] = transport_covariance(P[:n], about.states[:n], filtered[:n])
@@ -125,16 +126,16 @@ def refilter(
 
     Parameters
     ----------
-    about : of these keyframes, near enough for what is left to be linear: an earlier pass.
-    watch : look for errors that last in the rows that are to be watched, and go back to before them.
-    drifts : of such errors those that grow as well.
+    about : points of these keyframes from an earlier pass, close enough for the rest to be linear.
+    watch : test watched rows for persistent errors, and go back to before their onset.
+    drifts : test for growing errors as well.
     whole : False keeps what `smooth_moments` needs, predicted covariances of two keyframes, and no innovations.
     """
     return _run_forward(problem, len(about.values), about, progress, watch, drifts, whole=whole)
 
 
 class Comparison:
-    """How likely the innovations are by a problem, and by others that differ from it by weights or by few rows.
+    """Innovation likelihoods of a problem and of variants that differ by weights or by few rows.
 
     Parameters
     ----------
@@ -148,7 +149,7 @@ class Comparison:
     def log_likelihood(self, problem: Problem, about: Points, anew: Collection[str] = ()) -> Array:
         """(K,) as `ForwardRecord.log_likelihood`, by a problem with the same points of what both have.
 
-        `anew` are the constraints of which the rows differ.
+        `anew` are the constraints whose rows differ.
         """
         stack, steps = Stack(problem, self._K), advance(problem, self._K)
         one = self._one.lift(problem, about, stack, anew)
@@ -161,7 +162,7 @@ class Comparison:
 def smooth_near(
     problem: Problem, about: Points, opening: float | None = None, progress: Progress | None = None
 ) -> tuple[ForwardRecord, SmootherPass]:
-    """A drive smoothed again near what is known of it: only figures or weights have changed since.
+    """Smooth a drive again near a known solution, after a change of figures or weights only.
 
     Where attitudes do not stay, it is smoothed from the start as a filter would be, with `opening` as for `ekf`.
     """
@@ -175,7 +176,7 @@ def smooth_near(
 def _smooth_first(
     problem: Problem, about: Points, progress: Progress | None = None
 ) -> tuple[ForwardRecord, SmootherPass, bool]:
-    """The first keyframes smoothed about points, and about where that leads until attitudes stay, if they do."""
+    """Smooth the first keyframes about points, repeatedly until attitudes converge, if they do."""
     for _ in range(_PASSES):
         forward = refilter(problem, about, progress)
         smoothed = smooth_backward(problem, forward, progress)
@@ -219,7 +220,7 @@ def _run_forward(
         start = subtract_points(x, about.take_first(1))[0]
         given.run(partial(_get_start, start, P, stack.records, search), follow, progress)
         updates = given.updates
-        # from there on it is linearised where the filter is
+        # from there on it is linearised at the filter's estimate
         last = about.take(slice(n - 1, n))
         x = move_points(last, errors.filtered[n - 1 :])
         all_P[n - 1] = transport_covariance(all_P[n - 1 : n], last.states, x.states)[0]
@@ -270,14 +271,14 @@ def _start_from_prior(problem: Problem) -> tuple[Points, Array]:
 def _get_start(
     x: Any, P: Array, records: dict[str, Innovations], search: FaultSearch | None = None
 ) -> tuple[Any, Array]:
-    """What is known at the start, but for the place where the first fix, which tells it, is not used."""
+    """State and covariance at the start, with an unknown position where the first fix is not used."""
     first = [one.used[0] for one in records.values() if one.rows.fix_of == "p" and len(one.used)]
     less = np.zeros(len(P)) if search is None else search.at_start
     return x, P + np.diag(less + free(len(P), "p") if first and first[0] == 0.0 else less)
 
 
 def _hold(decide: Decide, k0: int, k1: int, found: Points, all_P: Array) -> int:
-    """Decide at keyframes from k0 to k1, and hold to what is decided first; the keyframe to go on from."""
+    """Decide at keyframes k0 to k1, and apply the first decision; returns the keyframe to continue from."""
     for k in range(k0, k1):
         here = found.take(slice(k, k + 1))
         if (one := decide(k, here, all_P[k])) is not None:
@@ -290,7 +291,7 @@ def _hold(decide: Decide, k0: int, k1: int, found: Points, all_P: Array) -> int:
 
 
 def _hold_errors(decide: Decide, about: Points, errors: FilterErrors, k0: int, k1: int) -> int:
-    """As `_hold`, of errors about given points, which stay."""
+    """As `_hold`, for errors about given points, which stay fixed."""
     for k in range(k0, k1):
         here = move_points(about.take(slice(k, k + 1)), errors.filtered[k : k + 1])
         if (one := decide(k, here, errors.P[k])) is not None:

@@ -1,10 +1,10 @@
-"""A keyframe enters the window in two steps, as in any filter: prediction, and the rows that had to be waited for.
+"""A keyframe enters the window in two steps, as in any filter: prediction, and update with late rows.
 
-Prediction puts under the message of the keyframe before the rows of the interval, of parameters that move on, and of
-those measurements that the interval itself tells; QR eliminates what only they touch (see
-`graphnav.estimation.solvers.stages`). What smooths back is known from then on, because nothing that comes later touches
-the keyframe before. What is left is a triangle, and a fix adds a few rows under it: a QR of that shape (LAPACK's tpqrt)
-costs a fraction of the first.
+Prediction stacks the rows of the interval, of stepping parameters, and of measurements given by the interval itself
+under the message of the previous keyframe; QR eliminates the variables that only they touch (see
+`graphnav.estimation.solvers.stages`). The smoothing gains are final then, because no later row touches the previous
+keyframe. A triangle remains, under which a fix adds a few rows: a QR of that shape (LAPACK's tpqrt) costs a fraction of
+the first.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ _BLOCK = 8  # reflectors that tpqrt applies at once
 
 @dataclass(frozen=True)
 class Predicted:
-    """A keyframe that lacks only the rows it waits for, about a point of its own; `Stage` says what G, g, C are."""
+    """A keyframe that lacks only its late rows, about a point of its own; G, g, C as of `Stage`."""
 
-    before: Message  # what it was predicted from
+    before: Message  # the message it was predicted from
     place: Place
     state: States
     values: Array
@@ -42,7 +42,7 @@ class Predicted:
     g: Array
     lost: Array
     C: Array
-    measured: tuple[Measured, ...]  # what has been taken in
+    measured: tuple[Measured, ...]  # rows in use
 
 
 def predict_message(
@@ -54,7 +54,7 @@ def predict_message(
     values: Array,
     columns: Columns,
 ) -> Predicted:
-    """Go on from a message to the next keyframe, linearised at a point of its own.
+    """Predict the next keyframe from a message, linearised at a point of its own.
 
     Parameters
     ----------
@@ -84,7 +84,7 @@ def predict_message(
     if tests is not None:
         A[:D0, E + D + 1 :] = R0 @ tests.X
     apart = np.zeros(DIM) if place.linked else state.minus(before.state)[0]
-    if np.any(apart):  # one and the same state, but about its new point
+    if np.any(apart):  # the same state, about its new point
         head[:D0, -1] -= R0[:, :DIM] @ apart
         J = before.change_of_point(apart)
         head[:D0, E : E + len(J)] = head[:D0, E : E + len(J)] @ J
@@ -123,7 +123,7 @@ def predict_message(
     g = np.zeros(D0)
     g[DIM:] = values[: D0 - DIM] - before.values
     G, g[lost], noise = -root @ R[:E, E : E + D], root @ R[:E, E + D], root @ root.T
-    if not place.linked:  # nothing is eliminated of the state, but its attitude is about another point
+    if not place.linked:  # no part of the state is eliminated, but its attitude is about another point
         J = before.change_of_point(apart)
         k = len(J)
         J = rotate_columns(np.eye(k, D), J)
@@ -133,10 +133,10 @@ def predict_message(
 
 
 def update_late(ahead: Predicted, rows: Sequence[Measured], weighted: bool = False) -> tuple[Stage, Array]:
-    """The stage with the rows that were waited for, and the error state (D,) that it makes most likely.
+    """The stage with its late rows, and the most likely error state (D,).
 
-    Robust rows get the weights they deserve at the point if that is an estimate of all data already (`weighted`);
-    else none at first, then those of what comes of it, a few times over.
+    Robust rows are weighted at the point if that is an estimate from all data already (`weighted`); otherwise they are
+    unweighted at first, then reweighted a few times.
 
     Raises
     ------

@@ -1,6 +1,6 @@
-"""The tests for errors that last beside a filter at given points, by the gains and innovations that it leaves.
+"""Tests for persistent errors alongside a filter at given points, from its gains and innovations.
 
-Where they find a fault, filter and tests go back to before it, and on without what is wrong.
+After a detection, filter and tests go back to before the onset and continue without the faulty rows.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from graphnav.estimation.solvers.watch import Bank
 
 
 class FaultSearch:
-    """Find the fixes that are wrong, and weigh them in a filter.
+    """Find faulty fixes, and set their weights in a filter.
 
     Parameters
     ----------
-    watched : whose errors are looked for.
+    watched : the constraints that are tested.
     given : the filter.
     t : (K,) s, of all keyframes of the problem.
     """
@@ -46,11 +46,11 @@ class FaultSearch:
         )
         self._used = {c.name: records[c.name].used.copy() for c in watched}
         self._bank = bank
-        self._free: set[tuple[str, float]] = set()  # where nothing is known any more
-        self.at_start = np.zeros(given.H.shape[2])  # (D,) variance by which less is known at the start
+        self._free: set[tuple[str, float]] = set()  # where the filter is reset
+        self.at_start = np.zeros(given.H.shape[2])  # (D,) variance added at the start
 
     def follow(self, k0: int, k1: int) -> int:
-        """Test what was filtered from one keyframe to another; the keyframe to go on from."""
+        """Test the filtered keyframes from one to another; returns the keyframe to continue from."""
         since = self._find_onset(k0, k1)
         if since is None and k1 == len(self._t):
             since = self.verdicts.set_ended()
@@ -63,7 +63,7 @@ class FaultSearch:
         return back
 
     def _find_onset(self, k0: int, k1: int) -> float | None:
-        """When something began to be wrong that was used up to one of k0 to k1."""
+        """Onset of a fault detected between keyframes k0 and k1."""
         given = self._filter
         root = self._weigh_roots(k0, k1)
         fault = self._bank.follow(k0, k1, given.F, self._steps.decay, self._stack, given.updates, root, given.speeds)
@@ -88,7 +88,7 @@ class FaultSearch:
         return out
 
     def _reweigh(self) -> None:
-        """Take the blocks in, or not, as fixes are used now."""
+        """Update which blocks are used, by the fixes in use now."""
         for name, was in self._used.items():
             record = self._stack.records[name]
             for k in np.unique(record.rows.keyframe[np.flatnonzero(record.used != was)]).tolist():
@@ -104,7 +104,7 @@ class FaultSearch:
         self._filter.weigh(some, bool(used.any()), np.repeat(np.sqrt(weight), len(rows.axes)))
 
     def _begin_anew(self) -> None:
-        """Where fixes of a fault that does not end are taken back nothing is known any more of what they measure."""
+        """Where fixes of a persistent fault are used again, the states that they measure are reset."""
         for rows in self._watched:
             for name, t in self.verdicts.anew - self._free:
                 k = int(np.searchsorted(self._t, t))
@@ -116,7 +116,7 @@ class FaultSearch:
 
 
 def free(D: int, block: str) -> Array:
-    """(D,) variance of an error state with nothing known of a block, but for what moves with it."""
+    """(D,) variance that resets a block of the error state, coupled parameters included."""
     out = np.zeros(D)
     out[BLOCKS[block]] = 1e6
     return out

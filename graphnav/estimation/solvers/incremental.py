@@ -1,8 +1,8 @@
-"""Incremental smoother: the graph of the batch solver, solved while the drive happens.
+"""Incremental fixed-lag smoother: the batch problem, solved keyframe by keyframe.
 
-`Incremental` takes the keyframes of a problem one by one. After each it has a live estimate, which knows only what
-came before, and keyframes older than the lag settle, each with at least the lag's future in it. See
-`graphnav.estimation.solvers.window` for how; `graphnav.online` feeds it from sensors instead of a recording.
+`Incremental` takes the keyframes of a problem one by one. After each there is a live estimate from past measurements,
+and keyframes older than the lag settle, each with at least the lag's future measurements. The algorithm is that of
+`graphnav.estimation.solvers.window`; `graphnav.online` feeds it from sensors instead of a recording.
 """
 
 from __future__ import annotations
@@ -27,19 +27,19 @@ from graphnav.estimation.solvers.stages import Message, Place
 from graphnav.estimation.solvers.window import SettledStates, Window, compute_turn_limit, make_first_message
 
 _PORTIONS = 8  # of the lag: keyframes settle in groups this long
-FINE = 0.02  # of the usual limits, within which what is left at the end is converged
+FINE = 0.02  # share of the usual limits to which the remaining keyframes converge at the end
 
 
 class LagSmoother(Protocol):
-    """What smooths keyframes as they come."""
+    """Interface of a smoother that takes keyframes one by one."""
 
-    settled: list[SettledStates]  # in turn; whoever reads them may clear them
+    settled: list[SettledStates]  # in order; readers may clear them
 
     def add(self, place: Place) -> tuple[Message, Array]:
-        """Take in one more keyframe: it as it is known now, and the covariance (15, 15) of its state."""
+        """Add a keyframe; returns its live estimate and the covariance (15, 15) of its state."""
 
     def finish(self, problem: Problem) -> tuple[Problem, int]:
-        """Nothing more will come: settle all; the problem as it was solved, and how many keyframes again."""
+        """End of input: settle all; returns the problem as solved, and the number of relinearised keyframes."""
 
 
 def are_due(first: float, last: float, lag: float) -> bool:
@@ -82,7 +82,7 @@ class Incremental:
 
 @dataclass(frozen=True)
 class Replay:
-    """A whole problem solved incrementally: what settled, what was known live, and what each keyframe took."""
+    """A whole problem solved incrementally: settled states, live states, and the time of each keyframe."""
 
     settled: Solution
     live: Solution
@@ -114,7 +114,7 @@ def begin_at(problem: Problem, start: States | None) -> Message:
 
 
 def solve_in_turn(problem: Problem, solver: str, engine: LagSmoother, lag: float, progress: Progress | None) -> Replay:
-    """Have all keyframes of a problem added in turn, and what is found as solutions."""
+    """Add all keyframes of a problem in order, and return the results as solutions."""
     began = time.perf_counter()
     K, steps = len(problem.t), list_node_steps(problem)
     points, P, seconds = [], np.empty((K, DIM, DIM)), np.empty(K)
@@ -173,6 +173,6 @@ def solve_in_turn(problem: Problem, solver: str, engine: LagSmoother, lag: float
 
 
 def describe_times(seconds: Array) -> str:
-    """What a keyframe took, in words."""
+    """Processing time per keyframe, in words."""
     middle, high, most = 1e3 * np.quantile(seconds, [0.5, 0.99, 1.0])
     return f"a keyframe took {middle:.1f} ms (median), {high:.1f} ms (99 %), {most:.0f} ms (most)"

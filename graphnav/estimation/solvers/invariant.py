@@ -1,23 +1,23 @@
-"""Errors of attitude and velocity that stay what they are wherever the filter's estimate moves to.
+"""Errors of attitude and velocity that are invariant to changes of the filter's estimate.
 
-Nothing but its motion tells a vehicle's heading: at rest, and for all that is said in the axes of the body, a state
-turned about the vertical is as good as before. As an error state added as in `graphnav.core.state.States.plus`, a turn
-by psi is theta = psi R_nb^T z and dv = psi z x v: another one at each estimate. So a filter that moves its estimate and
-keeps its covariance as it was takes what it does not know of the heading for something else, say a tilt; gravity tells
-it of that, and it ends sure of a heading that nothing has shown (Huang, Mourikis, Roumeliotis 2010,
-"Observability-based rules for designing consistent EKF SLAM estimators").
+The heading of a vehicle is observable only through its motion: at rest, and for all measurements in body axes, a state
+rotated about the vertical fits equally well. As an error state of `graphnav.core.state.States.plus`, a rotation by psi
+is theta = psi R_nb^T z and dv = psi z x v, which depends on the estimate. So a filter that moves its estimate and keeps
+its covariance mistakes an unknown heading for another error, say a tilt, which gravity determines, and ends certain of
+a heading that was never measured (Huang, Mourikis, Roumeliotis 2010, "Observability-based rules for designing
+consistent EKF SLAM estimators").
 
-With the errors of attitude and velocity in n, turned together (Barrau, Bonnabel 2017, "The invariant extended Kalman
+With the errors of attitude and velocity in n, rotated together (Barrau, Bonnabel 2017, "The invariant extended Kalman
 filter as a stable observer"),
 
     phi = R_nb theta     nu = dv - phi x v
 
-a turn is phi = psi z and nu = 0 at every estimate, the velocity in the body is linear in nu, and a state moves to
+a rotation is phi = psi z and nu = 0 at every estimate, the velocity in the body is linear in nu, and a state moves to
 
     R_nb <- Exp(phi) R_nb     v <- Exp(phi) (v + nu)     p <- p + dp
 
-The place is not turned: fixes tell it. To first order this is `States.plus`, so the Jacobians of rows and steps stay;
-only how states and covariances move is another.
+The position is not rotated: fixes determine it. To first order this is `States.plus`, so the Jacobians of rows and
+steps stay; only the motion of states and covariances differs.
 """
 
 from __future__ import annotations

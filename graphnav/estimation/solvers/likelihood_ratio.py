@@ -1,7 +1,7 @@
 """The tests of `graphnav.estimation.solvers.watch`, on arrays alone: compiled where Numba is there.
 
-What all tests of a filter know is one vector, so that it is remembered and taken back by copying: X (D, C), and behind
-it the memory of each kind of rows, with L slots of c numbers:
+The state of all tests of a filter is one vector, so that it is saved and restored by copying: X (D, C), followed by the
+memory of each kind of rows, with L slots of c numbers:
 
     first (L,)     score (L, c)     info (L, c, c)     how many fixes have been seen
 

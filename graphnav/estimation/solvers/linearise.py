@@ -127,7 +127,7 @@ class Rows:
 
 @dataclass(frozen=True)
 class Step:
-    """A parameter that moves on to its next node, or begins: value - mean = decay (before - mean_before) + noise."""
+    """A parameter that steps to its next node, or begins: value - mean = decay (before - mean_before) + noise."""
 
     name: str
     mean: Array  # (k,)
@@ -231,5 +231,5 @@ def find_last_keyframes(chain: ParameterChain) -> Array:
 
 
 def find_stepping(chain: ParameterChain, n: int | None = None) -> Array:
-    """Which of the first n keyframes a parameter moves on to its next node at."""
+    """Which of the first n keyframes a parameter steps to its next node at."""
     return np.flatnonzero(np.diff(chain.node[:n])) + 1

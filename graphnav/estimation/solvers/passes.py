@@ -1,4 +1,4 @@
-"""What a pass over all keyframes leaves behind, forward or back, and what is said of it."""
+"""Results of forward and backward passes over all keyframes."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class SmootherPass(DisturbancePass):
 
 @dataclass(frozen=True)
 class MomentPass(DisturbancePass):
-    """A backward pass with those covariances only that a noise model is estimated by: at half the price."""
+    """A backward pass with only the covariances that noise estimation needs, at half the cost."""
 
     variances: Array  # (n, D), of parameters with a correlation time
     linear: dict[str, Rows]  # of constraints with variance components, linearised at the smoothed points
@@ -116,12 +116,12 @@ class ForwardRecord(Points):
     decay: Array  # (K-1, D-15) of the steps, as `graphnav.estimation.solvers.recursion` has them
     records: dict[str, Innovations]
     weights: dict[str, Array]  # (N,) of fixes: 0 where a fault was found, less than 1 where noisy
-    anew: bool  # it began anew somewhere, which no other solver can: its estimates are not to be used
+    anew: bool  # the filter was reset somewhere, which no other solver can: its estimates must not be used
     about: Points | None  # where the first n keyframes were linearised; up to the last of them P is of errors about
     errors: Array  # (n, D) these points, and the filtered
     errors_predicted: Array  # (n, D) and the predicted state is these errors away from them
     updates: Updates | None  # of the keyframes there
-    log_likelihood: Array  # (K,) of the innovations at each keyframe, but for a constant
+    log_likelihood: Array  # (K,) of the innovations at each keyframe, up to a constant
 
     @property
     def predicted_from(self) -> States:
@@ -168,7 +168,8 @@ def are_near(points: Points, about: Points, turn: float = _TURN) -> bool:
 
 
 def take_solution_points(problem: Problem, solved: Solution, before: Points) -> Points:
-    """Points of a solution of a problem; what it does not tell, places of stops, as before: rows are linear in them."""
+    """Points of a solution; unlisted parameters, such as places of stops, keep their values: rows are linear in
+    them."""
     told = {
         c.parameter.name: solved.parameters[c.parameter.name].value[c.node]
         for c in problem.chains
@@ -189,7 +190,7 @@ def reuse_points(points: Points, before: Problem, after: Problem) -> Points:
 
 
 def record_residuals(problem: Problem, rows: Constraint, points: Points, robust: bool = False) -> ConstraintRecord:
-    """What is left of a constraint at the solution; `robust` has the kernel's weights in the rows'."""
+    """Residuals of a constraint at the solution; with `robust`, weights include the kernel's."""
     linear = linearise(rows, points, problem.columns)
     nis = np.sum((linear.residual / linear.stated) ** 2, axis=-1)
     weight = np.ones(len(rows)) if rows.weight is None else rows.weight

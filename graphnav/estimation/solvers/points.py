@@ -5,8 +5,8 @@ one step of the iterated smoother):
 
     e_{k+1} <- f(X_k) [-] X_{k+1} + F e_k     nu = -(r(X) + H e)
 
-A pass at given points takes a fraction of the time of one that is linearised where it is
-(`graphnav.estimation.solvers.stretches`), and is the better one wherever the filter has gone astray.
+A pass at given points takes a fraction of the time of one linearised at its own estimates
+(`graphnav.estimation.solvers.stretches`), and is more accurate wherever the filter diverged.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from graphnav.estimation.solvers.stack import RowBlock, Stack
 from graphnav.imu.dynamics import SCALE
 
 _STRETCH_AFTER_FAULT = 4  # keyframes that are filtered at once, behind one at which something was found
-Follow = Callable[[int, int], int]  # looks at what was filtered from a keyframe to another, and says where to go on
+Follow = Callable[[int, int], int]  # checks the filtered keyframes from one to another, and returns where to continue
 
 
 @dataclass(frozen=True)
@@ -130,17 +130,17 @@ class PointFilter:
         self.variance[some.at] = (self._sigma[some.at] / root_weight) ** 2
 
     def run(self, begin: Callable[[], tuple[Array, Array]], follow: Follow | None, progress: Progress | None) -> None:
-        """Filter all keyframes, from what `begin` says of the errors (D,) and P before the first.
+        """Filter all keyframes, from `begin`: errors (D,) and P before the first.
 
-        Nothing that follows changes a filter until it has found something. So the filter goes ahead a stretch of
-        keyframes, and `follow` comes after; where it finds something, both go on from there.
+        The filter runs ahead by a stretch of keyframes, and `follow` checks it afterwards; at a detection both continue
+        from there.
         """
         n, k, length = len(self.out.filtered), 0, STRETCH
         while k < n:
             end = min(k + length, n)
             self._filter(k, end, begin)
             on = end if follow is None else follow(k, end)
-            # where one fault has been found the next is near, and what was filtered beyond it was in vain
+            # after a fault the next one is likely near, so shorter stretches waste less
             k, length = on, min(2 * length, STRETCH) if on == end else _STRETCH_AFTER_FAULT
             if progress is not None:
                 progress("filter", k / self._stack.K)
@@ -163,9 +163,9 @@ class PointFilter:
 def filter_likelihood(
     problem: Problem, points: Points, stack: Stack, steps: Advance, one: Linearisation, start: tuple[Array, Array]
 ) -> None:
-    """Leave the innovations of a filter of all keyframes in the stack, and nothing else of it.
+    """Filter all keyframes for the innovations in the stack only.
 
-    `start` is what is known of the errors (D,) before the first keyframe, and their covariance.
+    `start`: errors (D,) before the first keyframe, and their covariance.
     """
     n, M, D = one.H.shape
     e, P, at = np.empty((2, 2, D)), np.empty((2, 2, D, D)), np.zeros(1, dtype=int)

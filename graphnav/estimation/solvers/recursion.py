@@ -2,7 +2,7 @@
 
 A step moves the D error states by a matrix of which F (15, w) are the rows of the fifteen states, which depend on
 themselves and on the scale errors of the IMU behind them; each parameter beyond shrinks by a factor of its own, `decay`
-(D-15). Rows of a keyframe stand one behind the other and are taken in block by block, block b from `begin[b]` to
+(D-15). Rows of a keyframe are stacked and processed block by block, block b from `begin[b]` to
 `end[b]`, those of keyframe k being `first[k]` to `first[k+1]`. Covariances are symmetric and C-contiguous.
 """
 
@@ -16,8 +16,8 @@ from graphnav.core.compiled import compile_once
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, MOVING
 
-STRETCH = 256  # keyframes from one word of how far it has come to the next
-PASSES = 4  # of re-weighting where a measurement is met for the first time
+STRETCH = 256  # keyframes between progress reports
+PASSES = 4  # iterations of reweighting at the first use of a measurement
 UNUSED = 1e-12  # weight of a row that is not used beside others of its keyframe
 HUBER, CAUCHY = 1, 2
 _LOSSY = 1e4  # times R that H P H^T may be for P - W^T W to keep twelve digits
@@ -25,13 +25,13 @@ _LOSSY = 1e4  # times R that H P H^T may be for P - W^T W to keep twelve digits
 
 @dataclass(frozen=True)
 class RowBlocks:
-    """Rows that are taken in at once: those of keyframe k are the blocks `first[k]` to `first[k+1]`."""
+    """Rows of joint updates: those of keyframe k are the blocks `first[k]` to `first[k+1]`."""
 
     first: Array  # (K+1,)
     begin: Array  # (B,) place in the keyframe of the first number, and behind the last
     end: Array
     used: Array  # (B,) rows of weight 0 are not
-    gate: Array  # (B,) normalised innovation squared beyond which it is refused
+    gate: Array  # (B,) normalised innovation squared beyond which it is rejected
     kernel: Array  # (B,) 0, `HUBER` or `CAUCHY`
     size: Array  # (B,) numbers of one row
     part: Array  # (B+1,) the first of the parts that each is made of
@@ -40,7 +40,7 @@ class RowBlocks:
 
     @property
     def arrays(self) -> tuple[Array, Array, Array, Array, Array, Array]:
-        """What `filter_rows` is given: machine code that is kept on disk names no class."""
+        """Arguments of `filter_rows`: compiled code on disk must not depend on classes."""
         return self.first, self.begin, self.end, self.gate, self.kernel, self.size
 
 
@@ -110,7 +110,7 @@ def invert_sum(HPHt: Array, variance: Array) -> tuple[Array, Array]:
 
 @compile_once
 def halve_sum(A: Array, out: Array) -> None:
-    """(A + A^T) / 2, in `out`: what rounding has made of a symmetric matrix."""
+    """(A + A^T) / 2, in `out`: restores the symmetry lost by rounding."""
     np.add(A, A.T, out)
     np.multiply(0.5, out, out)
 
@@ -124,7 +124,7 @@ def update_covariance(P: Array, HP: Array, H: Array, Kt: Array, variance: Array)
     left -= variance.reshape(-1, 1) * Kt
     two = np.dot(left.T, Kt)
     np.subtract(one, two, two)
-    # rounding's asymmetry would grow, past what a stop leaves between its place and the state
+    # asymmetry from rounding would grow beyond the covariance between state and held place at a stop
     halve_sum(two, one)
     return one
 
@@ -143,7 +143,7 @@ def reduce(P: Array, W: Array) -> Array:
 def weigh_robustly(
     HPHt: Array, variance: Array, r: Array, solved: Array, kernel: int, scale: Array, size: int
 ) -> Array:
-    """Weights (m,) of a kernel for rows of `size` numbers, by what the update leaves: none at first."""
+    """Weights (m,) of a kernel for rows of `size` numbers, by the residuals after the update, starting unweighted."""
     weight, sigma = np.ones(len(r)), np.sqrt(variance)
     for last in range(PASSES - 1):
         left = (r - np.dot(HPHt, solved)) / sigma

@@ -1,7 +1,7 @@
-"""Linearising again: stages of a window made anew about the smoothed states, a portion at a time if need be.
+"""Relinearisation: stages of a window rebuilt about the smoothed states, in portions if need be.
 
-A window of some hundred keyframes takes a tenth of a second, in which others may have come. So what is made anew stands
-beside the window until it has caught up with the newest keyframe, and takes the place of what was there in one step.
+A window of some hundred keyframes takes a tenth of a second, in which others may arrive. So the rebuilt stages are kept
+beside the window until they have caught up with the newest keyframe, and replace the old ones in one step.
 """
 
 from __future__ import annotations
@@ -42,10 +42,10 @@ class Revision:
         self._was = window.stages[first - 1] if first else None
         self._stage = None if self._was is None else self._was.move(e)  # the one before, where it is in the window
         self._before = window.head.move(e) if self._stage is None else self._stage.message
-        self._made: list[tuple[Stage, Stage]] = []  # what was there, and what is instead
+        self._made: list[tuple[Stage, Stage]] = []  # old stages, and their replacements
 
     def step(self, count: int, renewed: Renewing | None) -> bool:
-        """Make at most so many stages; True once they are in their place, or are not wanted any more.
+        """Rebuild at most so many stages; True once they are in place, or no longer wanted.
 
         Parameters
         ----------
@@ -66,7 +66,7 @@ class Revision:
             made += zip(old, self._smooth_again(old, window.compute_means()[begin + 1 : end + 1], places), strict=True)
         if end < len(window):
             return False
-        # what an error of the fixes does to the estimate is the same to first order
+        # the effect of an error of the fixes on the estimate is the same to first order
         stages = [
             new if now.message.tests is None else replace(new, message=replace(new.message, tests=now.message.tests))
             for now, (_, new) in zip(window.stages[self.first :], made, strict=True)
@@ -75,7 +75,7 @@ class Revision:
         return True
 
     def forget(self) -> None:
-        """Stages made so far need not know where their rows came from: each would keep the rows of all around it."""
+        """Drop references to the rows of stages rebuilt so far: each would keep those of its neighbours in memory."""
         for k in range(len(self._made) - 1, -1, -1):
             was, stage = self._made[k]
             if stage.place.problem is None:
@@ -83,7 +83,7 @@ class Revision:
             self._made[k] = was, replace(stage, place=replace(stage.place, problem=None))
 
     def _smooth_again(self, old: Sequence[Stage], means: Sequence[Array], places: Sequence[Place]) -> list[Stage]:
-        """The stages about where the means of their errors lead, each from the one before."""
+        """The stages about their smoothed means, each from the one before."""
         before = self._made[-1][1].message if self._made else self._before
         around = [before, *(stage.message for stage in old)]
         moves = [np.zeros(len(before.z)), *means]

@@ -1,7 +1,7 @@
 """A problem linearised at a point: whitened rows over graph variables, and its cost there.
 
 Variables are one fifteen-dimensional error state per keyframe, and one vector per node of all parameters with the
-same nodes: one for the constants, one for the slow ones, one for what begins anew at stops.
+same nodes: one for the constants, one for slow parameters, one for those that are reset at stops.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from graphnav.estimation.problem import ParameterChain, Problem
 from graphnav.estimation.solvers.linearise import Points, find_last_keyframes, linearise, linearise_links
 from graphnav.imu.dynamics import SCALE
 
-_SHARED_BLOCKS = 6  # blocks of rows, which all of them touch
+_SHARED_BLOCKS = 6  # blocks of rows with the same variables
 Values = dict[str, Array]  # parameter name -> (nodes, k)
 WhitenedRows = list[tuple[list[tuple[Array, Array]], Array]]  # blocks of (keys, A (N, m, k)), and b (N, m)
 Correction = tuple[Array, Values]  # (K, 15) and per parameter
@@ -188,7 +188,7 @@ def _group_rows(blocks: list[tuple[Array, Array]], b: Array) -> WhitenedRows:
     if len(blocks) <= _SHARED_BLOCKS:
         return [(blocks, b)]
     touched = np.stack([A.any(axis=(1, 2)) for _, A in blocks], -1)
-    touched[~touched.any(axis=1), 0] = True  # a row without weight
+    touched[~touched.any(axis=1), 0] = True  # a row of weight zero
     patterns, of = np.unique(touched, axis=0, return_inverse=True)
     rows = [np.flatnonzero(of.ravel() == j) for j in range(len(patterns))]
     return [
@@ -212,7 +212,7 @@ def compute_column_norms(rows: WhitenedRows, layout: Layout) -> Array:
 
 
 def linearise_chains(chains: Sequence[ParameterChain], group: _Group, values: Values) -> WhitenedRows:
-    """The prior on the first node of a group's parameters, and their way from node to node."""
+    """Prior on the first node of a group's parameters, and their process model."""
     out: WhitenedRows = []
     for alike in zip(*(_linearise_chain(c, group, values[c.parameter.name]) for c in chains), strict=True):
         A = [np.concatenate([blocks[i][1] for blocks, _ in alike], axis=1) for i in range(len(alike[0][0]))]

@@ -1,4 +1,4 @@
-"""Rauch-Tung-Striebel smoother: what a filter's pass forward is worth with all that came later.
+"""Rauch-Tung-Striebel smoother: the filter's forward pass combined with all later measurements.
 
 Backwards, with C = P_k F^T P^-_{k+1}^-1 (Rauch, Tung, Striebel 1965),
 
@@ -10,8 +10,8 @@ the disturbance smoother (Bryson and Frazier 1963; Koopman 1993), through every 
     r <- (I - K H)^T r + H^T S^-1 nu     N <- (I - K H)^T N (I - K H) + H^T S^-1 H     r <- F^T r     N <- F^T N F
     x^s_k = x^-_k + P^-_k r_k            P^s_k = P^-_k - P^-_k N_k P^-_k
 
-and likewise of x_k, P_k and the r and N behind the updates of k, which leave more digits after a first fix.
-r and N are what the noise model is estimated by (`graphnav.estimation.noise.moments`).
+and likewise from x_k, P_k and the r and N after the updates of k, which is numerically better after a first fix.
+The noise model is estimated from r and N (`graphnav.estimation.noise.moments`).
 """
 
 from __future__ import annotations
@@ -45,21 +45,22 @@ from graphnav.estimation.solvers.passes import (
 )
 from graphnav.estimation.solvers.recursion import STRETCH, move_columns, smooth_filtered
 
-_CANCELLED = 7e4  # times smaller than filtered: P - P N P is good to eps times the square of that, a millionth
+# largest ratio of filtered to smoothed sigma: P - P N P has a relative error of eps times its square, a millionth
+_CANCELLED = 7e4
 
 
 def smooth_backward(problem: Problem, forward: ForwardRecord, progress: Progress | None = None) -> SmootherPass:
-    """Smooth a forward pass: keyframes linearised where the filter was, and before them those at given points."""
+    """Smooth a forward pass: keyframes linearised at the filter's estimates, and before them those at given points."""
     K, D = forward.P.shape[:2]
     n = 0 if forward.about is None else len(forward.about.values)
-    end = max(n - 1, 0) if n < K else K  # of the keyframes whose errors are from points, and lead to such
+    end = max(n - 1, 0) if n < K else K  # for keyframes whose errors are about points
     P, values = np.empty((K, D, D)), np.empty((K, D - DIM))
     found, behind = _Disturbances.allocate(n, D), (np.zeros(D), np.zeros((D, D)))
     states = []
     if end < K:
         states = [_smooth_filtered(problem, forward, end, values, P, progress)]
     if forward.about is not None:
-        if n == end + 1:  # what comes after, as a disturbance of the prediction
+        if n == end + 1:  # later information, as a disturbance of the prediction
             away = states[0][:1].minus(forward.about.states[end:n])[0]
             away = np.concatenate([away, values[end] - forward.about.values[end]]) - forward.errors_predicted[end]
             ahead = forward.P_predicted[end]
@@ -109,7 +110,7 @@ def smooth_moments(problem: Problem, forward: ForwardRecord) -> MomentPass:
 
 @dataclass(frozen=True)
 class _Disturbances:
-    """What the recursion of a disturbance smoother fills, of n keyframes."""
+    """Results of the disturbance smoother's recursion for n keyframes."""
 
     errors: Array  # (n, D)
     r: Array  # (n, D)
@@ -169,7 +170,7 @@ def _smooth_points(
     wanted = np.zeros((0, 0), dtype=bool) if wanted is None else wanted
     asked = np.empty((0, 0, 0)) if asked is None else asked
     variance, of_rows = np.zeros(wanted.shape), np.zeros((len(asked), *asked.shape[1:2] * 2))
-    # in one piece as an empty one is: of another layout `smooth_rows` would be compiled a second time
+    # contiguous, like an empty one: another layout would compile `smooth_rows` a second time
     columns, first = np.ascontiguousarray(np.nonzero(wanted)[1]), np.append(0, np.cumsum(wanted.sum(axis=1)))
     for hi in range(end, 0, -STRETCH):
         lo = max(hi - STRETCH, 0)
@@ -185,7 +186,7 @@ def _smooth_points(
 
 
 def _restore_digits(forward: ForwardRecord, P: Array, end: int) -> None:
-    """Covariances anew where P - P N P has lost its digits, as before a first fix, by steps that lose none.
+    """Recompute covariances where P - P N P lost its digits, as before a first fix, by stable steps.
 
     With C and P^s of the next keyframe, in Joseph's form: (I - C F) P_k (I - C F)^T + C (P^s + Q) C^T.
     """
@@ -210,7 +211,7 @@ def rts(problem: Problem, forward: FilterPass, found: SmootherPass | None = None
     found = found or smooth_backward(problem, forward)
     smoothed, all_values, all_P = found.states, found.values, found.P
     records = {rows.name: record_residuals(problem, rows, found) for rows in problem.constraints}
-    covariance = all_P[:, :DIM, :DIM].copy()  # a view would hold what is known of the parameters too
+    covariance = all_P[:, :DIM, :DIM].copy()  # a copy: a view would keep the parameters' covariance in memory
     seconds = time.perf_counter() - began
     return Solution(
         solver="rts",

@@ -1,8 +1,8 @@
-"""Rows of all constraints keyframe by keyframe: which a filter takes in at once, and the innovations it finds.
+"""Rows of all constraints keyframe by keyframe: joint updates of a filter, and their innovations.
 
-Rows linearised at given points about which nothing is to be decided are taken in together, several kinds of a keyframe
-with one gain. What each would have shown after those before it comes from the root of their common covariance
-S = L L^T all the same: with w = L^-1 r, and L_jj what the kind j has on the diagonal,
+Rows linearised at given points that need no decision are processed jointly, several kinds of a keyframe with one gain.
+The sequential innovations of each kind follow from the root of their joint covariance S = L L^T: with w = L^-1 r, and
+L_jj the diagonal block of kind j,
 
     r_j = L_jj w_j      S_jj = L_jj L_jj^T      NIS_j = w_j^T w_j      all of them given the kinds before
 
@@ -27,7 +27,7 @@ _KERNELS = {"none": 0, "huber": HUBER, "cauchy": CAUCHY}
 
 
 class Innovations:
-    """One constraint's innovations, and what the filter has made of them."""
+    """One constraint's innovations, with the weights used by the filter."""
 
     def __init__(self, rows: Constraint) -> None:
         self.rows = rows
@@ -62,7 +62,7 @@ class Innovations:
 
 @dataclass(slots=True)
 class RowBlock:
-    """Rows of a keyframe that are taken in at once, numbers `begin` to `end` of those it has."""
+    """Rows of a keyframe in one joint update, numbers `begin` to `end` of the keyframe's."""
 
     k: int
     number: int  # of the block among all
@@ -79,8 +79,8 @@ class RowBlock:
 class Stack:
     """The rows of the first K keyframes, at most M numbers each.
 
-    `alone` are the names of constraints whose rows are taken in without others; those of weight 0 and those about which
-    something is to be decided are anyway.
+    `alone` are the names of constraints whose rows are processed separately, as are rows of weight 0 and rows that need
+    a decision.
     """
 
     def __init__(self, problem: Problem, K: int, alone: Collection[str] = ()) -> None:
@@ -103,7 +103,7 @@ class Stack:
             apart |= c.name in alone or c.gate is not None or c.robust != "none"
             parts.append(np.stack([here, np.full(len(here), i), lo, hi, *numbers, apart, used]))
             filled += m * np.diff(first)
-            # what is not used beside others of its kind weighs next to nothing; alone it has an innovation only
+            # an unused row among others of its kind gets a negligible weight; alone it only has an innovation
             weight = np.where(np.repeat(used, hi - lo), np.maximum(weight, UNUSED), 1.0)
             weights.append(np.sqrt(weight)[:, None])
             scales.append(np.broadcast_to(c.scale_of(slice(0, len(k))), len(k))[:, None])
@@ -117,7 +117,7 @@ class Stack:
         self.single = self._split_blocks(table, np.ones(table.shape[1], dtype=bool))
         k, apart = table[0], table[6].astype(bool)
         self.joint = self._split_blocks(table, np.diff(k, prepend=-1).astype(bool) | apart | np.roll(apart, 1))
-        # of each update: the lower root of S, S^-1 r, and what a kernel has left of the weights of rows
+        # of each update: the lower root of S, S^-1 r, and the kernel's weights of rows
         self.root, self.solved, self.bent = np.zeros((K, self.M, self.M)), np.zeros((K, self.M)), np.ones((K, self.M))
 
     def _split_blocks(self, table: Array, new: Array) -> RowBlocks:
@@ -126,7 +126,7 @@ class Stack:
         head, last = part[:-1], part[1:] - 1
         first = np.searchsorted(table[0, head], np.arange(self.K + 1))
         kinds = np.array([_describe(c) for c in self._constraints]).reshape(-1, 3)[table[1, head]]
-        kernel, size = np.ascontiguousarray(kinds[:, 1:].T, dtype=int)  # other layouts would be compiled anew
+        kernel, size = np.ascontiguousarray(kinds[:, 1:].T, dtype=int)  # other layouts would be compiled separately
         used = table[7, head].astype(bool)
         return RowBlocks(
             first, table[4, head], table[5, last], used, kinds[:, 0].copy(), kernel, size, part, *table[:2, head].copy()
@@ -149,7 +149,7 @@ class Stack:
         return RowBlock(some[0][0], b, some[0][4], some[-1][5], parts)
 
     def log_likelihood(self) -> Array:
-        """(K,) of the innovations, but for a constant."""
+        """(K,) of the innovations, up to a constant."""
         return self._compute_likelihood((self.solved[:, None] @ self.root)[:, 0])
 
     def _compute_likelihood(self, white: Array) -> Array:
@@ -163,7 +163,7 @@ class Stack:
         return np.asarray(-log_determinant - 0.5 * np.sum(np.where(weighs, white, 0.0) ** 2, axis=1))
 
     def finish(self) -> Array:
-        """Work out the innovations of each kind; returns their log-likelihood (K,), but for a constant."""
+        """Compute the innovations of each kind; returns their log-likelihood (K,), up to a constant."""
         kind = np.full((self.K, self.M), -1)
         for i, c in enumerate(self._constraints):
             kind[self.places[c.name]] = i

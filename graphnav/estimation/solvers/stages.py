@@ -1,19 +1,19 @@
-"""One stage of a time-ordered elimination: what a new keyframe adds, and what of the one before it can go.
+"""One stage of a time-ordered elimination: the rows of a new keyframe, and elimination of the previous one.
 
-With y = [x, theta] the error states of a keyframe and of the parameters in force there, all that earlier keyframes
-have to say of y_{k-1} is a square-root message R y_{k-1} = z. A stage puts under it the rows of the interval from
-k-1 to k, those of parameters that move on to their next node, and those of the measurements at k, and eliminates
-with QR (Bierman 1977, ch. VI; Dellaert and Kaess 2006) what only they touch: x_{k-1} and the nodes left behind:
+With y = [x, theta] the error states of a keyframe and of the parameters in force there, the information of all earlier
+keyframes on y_{k-1} is a square-root message R y_{k-1} = z. A stage stacks under it the rows of the interval from k-1
+to k, those of parameters that step to their next node, and those of the measurements at k, and eliminates by QR
+(Bierman 1977, ch. VI; Dellaert and Kaess 2006) the variables that only they touch, x_{k-1} and past nodes:
 
     [ R            0  ]           [ R_e  S   d ]     e   = R_e^-1 (d - S y_k)     what smooths back
     [ A_{k-1}     A_k ]   - QR ->  [      R'  z']     R' y_k = z'                  the next message
     [ 0           H_k ]
 
-For a chain this is the elimination that GTSAM does in the same order, on matrices that are dense anyway. Here are the
-rows and what comes of them; `graphnav.estimation.solvers.elimination` does it.
+For a chain this is GTSAM's elimination in the same order, on matrices that are dense anyway. This module has the rows
+and the results; `graphnav.estimation.solvers.elimination` performs it.
 
-A message may have tests beside it (`graphnav.estimation.solvers.watch`) that look for errors of fixes that last: more
-columns on the right, which go through the same QR.
+A message may carry tests (`graphnav.estimation.solvers.watch`) for persistent errors of fixes: additional columns on
+the right, which go through the same QR.
 """
 
 from __future__ import annotations
@@ -43,24 +43,24 @@ _I = np.eye(DIM)
 
 @dataclass(frozen=True)
 class Place:
-    """A keyframe: its time, the parameters that step there, and where its rows come from.
+    """A keyframe: its time, the parameters that step there, and the origin of its rows.
 
-    These are keyframe `k` of a problem, and the interval that ends there; None once nobody will ask again.
+    The origin is keyframe `k` of a problem, and the interval that ends there; None once it is no longer needed.
     """
 
     t: float  # s
     problem: Problem | None
     k: int = 0
     steps: tuple[Step, ...] = ()
-    linked: bool = True  # to the keyframe before; the first of all is not
+    linked: bool = True  # linked to the previous keyframe; the first is not
 
 
 @dataclass(frozen=True)
 class Message:
     """R y = z about a point; `columns` says where the parameters stand behind the fifteen states.
 
-    R is a triangle whose first nine columns may have been mixed: its point has moved. A window of hundreds of keyframes
-    is made of such matrices, so of each is kept what may be other than zero (`Message.of`).
+    R is a triangle whose first nine columns may be full because its point has moved. A window has hundreds of such
+    matrices, so only their possible non-zeros are stored (`Message.of`).
     """
 
     state: States  # one
@@ -69,7 +69,7 @@ class Message:
     packed: Array  # (D (D + 1) / 2 + 36,) of R, row by row
     z: Array  # (D,)
     tests: Watch | None = None
-    # whether nothing that it was made of, but for the prior, changes when all is turned about the vertical
+    # whether all rows in it, except the prior, are invariant to a rotation about the vertical
     turns: bool = False
 
     @classmethod
@@ -83,7 +83,7 @@ class Message:
         tests: Watch | None = None,
         turns: bool = False,
     ) -> Message:
-        """One with R (D, D), of which nothing is looked at below the triangle and its first nine rows."""
+        """Make one from R (D, D); entries below the triangle and its first nine rows are ignored."""
         return cls(state, values, columns, R[_list_triangle(len(z))], np.array(z), tests, turns)
 
     @property
@@ -97,7 +97,7 @@ class Message:
     @property
     def estimate(self) -> Array:
         """(D,) the error state that it makes most likely."""
-        found, info = dgesv(self.R, self.z)[2:]  # not triangular any more once its point has turned
+        found, info = dgesv(self.R, self.z)[2:]  # no longer triangular once its point has turned
         if info:
             raise explain_smoother()
         return np.asarray(found)
@@ -137,7 +137,7 @@ class Measured:
     sigma: Array  # (n, m) that they were whitened with
     kernel: str
     scale: float | Array
-    turns: bool = False  # whether a turn of all about the vertical changes nothing of them
+    turns: bool = False  # whether they are invariant to a rotation about the vertical
 
     def weigh(self, y: Array, passes: int) -> tuple[Array, Array, Array]:
         """H, b and sigma, by the kernel's weights for the error state y once `passes` is not 0."""
@@ -151,9 +151,9 @@ class Measured:
 
 @dataclass(frozen=True)
 class Stage:
-    """A keyframe in the window. Smoothing back, y_before = g + y, but g + G y + noise of covariance C in rows `lost`.
+    """A keyframe in the window. Backward smoothing: y_before = g + y, in rows `lost` g + G y + noise of covariance C.
 
-    What was not eliminated is the same at both.
+    Variables that were not eliminated are the same at both.
     """
 
     place: Place
@@ -163,7 +163,7 @@ class Stage:
     lost: Array  # rows that were eliminated, or are about another point
     C: Array  # (lost, lost)
     measured: tuple[Measured, ...] = ()
-    fault: tuple[str, float] | None = None  # whose fixes are wrong, and since when (s)
+    fault: tuple[str, float] | None = None  # constraint with a detected fault, and its onset (s)
     psi: float = 0.0  # rad, how far its point has turned about the vertical since its rows were linearised
 
     def move(self, e: Array) -> Stage:
@@ -174,7 +174,7 @@ class Stage:
         return Stage(self.place, message, G, g, self.lost, self.C, self.measured, self.fault, psi)
 
     def smooth_back(self, A: Array) -> Array:
-        """What smooths back, without g, times A (D, ...)."""
+        """Backward smoothing, without g, of A (D, ...)."""
         out = A[: len(self.g)].copy()
         out[self.lost] = self.G @ A
         return out
@@ -192,7 +192,7 @@ class Stage:
 
 @cache
 def _list_triangle(D: int) -> tuple[Array, Array]:
-    """Rows and columns of what may be other than zero in R: an upper triangle, and its first nine columns mixed."""
+    """Rows and columns of possible non-zeros in R: an upper triangle, and full first nine columns."""
     R = np.triu(np.ones((D, D)))
     R[:9, :9] = 1.0
     rows, columns = np.nonzero(R)
@@ -200,7 +200,7 @@ def _list_triangle(D: int) -> tuple[Array, Array]:
 
 
 def add_error(states: States, e: Array, turns: bool) -> States:
-    """States moved by error states (K, 15), along the turns about the vertical where nothing tells those."""
+    """States moved by error states (K, 15), along rotations about the vertical where these are unobservable."""
     return add_turning(states, e) if turns else states.plus(e)
 
 
@@ -223,7 +223,7 @@ class Linear:
 
 
 def append_columns(columns: Columns, steps: Sequence[Step]) -> Columns:
-    """The columns with those of parameters that begin behind them."""
+    """The columns followed by those of new parameters."""
     out, at = dict(columns), max((s.stop for s in columns.values()), default=DIM)
     for step in steps:
         if step.name not in out:
@@ -256,7 +256,7 @@ def predict_stage(before: Message, place: Place) -> tuple[States, Array, Columns
         W = motion.whitener[row]
     except np.linalg.LinAlgError:
         raise EstimationError(
-            f"the noise of the IMU before {place.t:.3f} s is none: check its figures", key="solver.no_imu_noise"
+            f"the noise of the IMU before {place.t:.3f} s is zero: check its figures", key="solver.no_imu_noise"
         ) from None
     link = np.zeros((1, DIM, DIM + D + 1))
     link[:, :, :DIM] = -F
@@ -268,7 +268,8 @@ def predict_stage(before: Message, place: Place) -> tuple[States, Array, Columns
 
 
 def linearise_rows(place: Place, state: States, values: Array, columns: Columns, late: bool | None = None) -> Linear:
-    """The rows of a keyframe's measurements at a point, without a link; with `late` those that enter last, or else."""
+    """The rows of a keyframe's measurements at a point, without a link; with `late` only those that enter last, or the
+    others."""
     assert place.problem is not None
     rows = place.problem.constraints
     if late is not None:
@@ -277,7 +278,7 @@ def linearise_rows(place: Place, state: States, values: Array, columns: Columns,
 
 
 def enters_last(rows: Constraint) -> bool:
-    """Whether rows enter last: those that look ahead, and those whose weights an estimate tells."""
+    """Whether rows enter last: those that depend on later rows, and robust ones, whose weights need an estimate."""
     return rows.looks_ahead or rows.robust != "none"
 
 

@@ -1,22 +1,21 @@
-"""The filter at its own estimates, a stretch of keyframes at once.
+"""The filter linearised at its own estimates, for a stretch of keyframes at once.
 
-A filter that is linearised where it is must know where it is before it asks a constraint for its rows: one keyframe at
-a time, one kind of rows after the other. For few rows the asking costs far more than the arithmetic. So where the
-filter will be is guessed, by the IMU alone, for a stretch of keyframes: X_0 where a keyframe is predicted, and X_i
-behind the i-th kind of its rows. All rows and steps are linearised at the guess together, and filtered as rows at given
-points are, by errors y about X_0. An error about X_i is
+A filter linearised at its own estimates needs the estimate before it can linearise the next rows: one keyframe at a
+time, one kind of rows after the other. For few rows the calls cost far more than the arithmetic. So the estimates are
+guessed, by the IMU alone, for a stretch of keyframes: X_0 at the prediction of a keyframe, and X_i after the i-th kind
+of its rows. All rows and steps are linearised at the guess together, and filtered as rows at given points are, by
+errors y about X_0. An error about X_i is
 
     e_i = T_i (y - m_i)      m_i = sum over j <= i of T_(j-1)^-1 (X_j [-] X_(j-1))
 
-with T_i what moving from X_0 to X_i makes of errors (`graphnav.estimation.solvers.invariant`), so that rows and steps
-linearised at X_i have r - H T_i m_i and H T_i. The guess moves by the e_i that are found, and so on until it stays. It
-stays where they are zero: there each row has been linearised where the filter was, and what is found is what a filter
-finds that goes step by step (Picard's iteration; Lelarasmee, Ruehli and Sangiovanni-Vincentelli 1982, "The waveform
-relaxation method for time-domain analysis of large scale integrated circuits"). What the first keyframes come to
-depends on nothing behind them: they are done once they stay, whatever those behind them do. A keyframe alone always
-comes to stay, one kind of rows after the other.
+with T_i the transformation of errors from X_0 to X_i (`graphnav.estimation.solvers.invariant`), so that rows and steps
+linearised at X_i have r - H T_i m_i and H T_i. The guess is corrected by the e_i until it converges. At convergence
+they are zero: each row is linearised at the filter's estimate, and the result is that of a sequential filter (Picard's
+iteration; Lelarasmee, Ruehli and Sangiovanni-Vincentelli 1982, "The waveform relaxation method for time-domain analysis
+of large scale integrated circuits"). The first keyframes do not depend on later ones: they are final once they have
+converged. A single keyframe always converges, one kind of rows after the other.
 
-Rows that are strongly nonlinear over what the filter does not know are linearised at X_i itself, where they lead: the
+Rows that are strongly nonlinear over the filter's uncertainty are linearised at X_i after their own update: the
 iterated Kalman filter (Jazwinski 1970, theorem 8.2), which is Gauss and Newton's method on the update.
 """
 
@@ -37,8 +36,9 @@ from graphnav.estimation.solvers.stack import Stack
 from graphnav.imu.dynamics import SCALE
 
 _SHORTEST, _LONGEST = 16, 256  # keyframes of a stretch
-_MAX_LINEARISATIONS = 10  # times that a stretch is linearised: each gains two digits or more
-STAYS = 1e-8  # sigmas by which a guess that stays may move: a move leaves a tenth at most, so it ends within 1e-9
+_MAX_LINEARISATIONS = 10  # iterations of a stretch: each gains two digits or more
+# convergence threshold in sigmas: an iteration reduces a correction at least tenfold, so the error is within 1e-9
+STAYS = 1e-8
 
 
 class StretchFilter:
@@ -48,7 +48,7 @@ class StretchFilter:
     ----------
     P_predicted, P : (K, D, D) and
     F : (K-1, 15, w), to be filled.
-    stays : sigmas by which a guess that stays may move.
+    stays : convergence threshold of the guess, sigmas.
     """
 
     def __init__(
@@ -59,7 +59,7 @@ class StretchFilter:
         self._P_predicted, self._P, self._F = P_predicted, P, F
         self._length, self._stays, blocks = 2 * _SHORTEST, stays, stack.single
         k = np.repeat(np.arange(stack.K), np.diff(blocks.first))
-        # points of all keyframes one behind the other: where it is predicted, and where each block leads
+        # points of all keyframes in order: the prediction, and the estimate after each block
         self._start = np.arange(stack.K) + blocks.first[:-1]
         self._end = np.arange(stack.K) + blocks.first[1:]
         self._before = np.arange(len(k)) + k  # of each block: behind it is the next
@@ -91,11 +91,11 @@ class StretchFilter:
         """
         if (on := self._run_stretch(k, min(k + self._length, self._stack.K), x, P, predicted, filtered)) > k:
             return on
-        # where guessing leads nowhere a keyframe alone does: its blocks are right one after the other
+        # where the iteration diverges, a single keyframe converges, block after block
         return self._run_stretch(k, k + 1, x, P, predicted, filtered, alone=True)
 
     def shorten(self, length: int) -> None:
-        """The next stretch is about as long as what was used of the last one."""
+        """The next stretch is about as long as the converged part of the last one."""
         self._length = max(min(self._length, length), _SHORTEST)
 
     def _run_stretch(
@@ -109,7 +109,7 @@ class StretchFilter:
             except np.linalg.LinAlgError:
                 if alone:
                     raise explain_rows(self._stack.get_block(int(self._at[0])).parts) from None
-                break  # because the guess is far off, or else a keyframe alone will say so
+                break  # because the guess is far off; otherwise a single keyframe will raise the error
             if alone and not left:
                 stay = k1
             if stay > k:
@@ -127,7 +127,7 @@ class StretchFilter:
         return k
 
     def _guess_points(self, k: int, k1: int, x: Points) -> Points:
-        """Where the IMU alone leads."""
+        """Prediction by the IMU alone."""
         states, values, scale = x.states, x.values[0], self._problem.columns.get(SCALE)
         reached, known = [], []
         for j in range(k, k1):
@@ -141,7 +141,8 @@ class StretchFilter:
         return Points(States.stack(reached), np.array(known)).take(np.repeat(np.arange(k1 - k), each))
 
     def _filter_about(self, k: int, k1: int, x: Points, P: Array, points: Points) -> tuple[int, Points]:
-        """Filter keyframes k to k1 about points; the first keyframe that does not stay, and the points as found."""
+        """Filter keyframes k to k1 about points; returns the first keyframe that has not converged, and the new
+        points."""
         stack, blocks, own = self._stack, self._stack.joint, slice(max(k - 1, 0), k1)
         start, end = self._start[k:k1] - self._start[k], self._end[k:k1] - self._start[k]
         counts = end - start + 1

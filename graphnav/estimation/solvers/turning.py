@@ -1,12 +1,11 @@
-"""Moving states by an error state so that a turn of them all about the vertical stays what it is.
+"""State updates along rotations about the vertical, for problems in which the heading is unobservable.
 
-Without fixes nothing tells the heading: IMU and stances say the same of a trajectory that is turned as a whole about
-the vertical at the origin of n. Their rows, linear in an error state e, say it too, but of the tangent: where the
-heading is known to 20 deg, a correction bends what it should only turn; and of two rows, one linearised at the old
-point and one where it has moved to, each is blind to another turn, so that together they pretend to know the heading
+Without fixes the heading is unobservable: IMU and stances are invariant to a rotation of the whole trajectory about the
+vertical at the origin of n. Rows linear in an error state e have this invariance for the tangent only: with a heading
+uncertainty of 20 deg a correction distorts what it should only rotate; and of two rows, one linearised at the old point
+and one at the new, each is invariant to a different rotation, so that together they create spurious heading information
 (Huang, Mourikis, Roumeliotis 2010, "Observability-based rules for designing consistent EKF SLAM estimators"). So e is
-followed along the turn. With u = R_nb^T z the vertical in the body, psi = u . theta, and with what is left of e beside
-the turn,
+applied along the rotation. With u = R_nb^T z the vertical in the body, psi = u . theta, and the remainder of e
 
     theta' = theta - psi u     p' = dp - psi z x p     v' = dv - psi z x v
 
@@ -14,9 +13,9 @@ a state moves to
 
     R_nb <- Rz(psi) R_nb Exp(theta')     p <- Rz(psi) (p + p')     v <- Rz(psi) (v + v')
 
-which to first order is `graphnav.core.state.States.plus`. A row that no turn changes depends on theta', p', v' alone,
-so with its old Jacobian it is as good after any turn as before, and two points on the way have the turn in common.
-The rate of the Earth does change, by less than a turn of its own size.
+which to first order is `graphnav.core.state.States.plus`. An invariant row depends on theta', p', v' alone, so its old
+Jacobian remains valid after any rotation, and two points on the way have the rotation in common. The Earth's rate
+breaks the invariance, by less than a rotation of its own size.
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ _I3 = np.eye(3)
 
 
 def split_turn(states: States, e: Array) -> tuple[Array, Array]:
-    """An error state as a turn about the vertical and what is left beside it.
+    """Split an error state into a rotation about the vertical and the remainder.
 
     Parameters
     ----------
@@ -65,7 +64,7 @@ def add_turning(states: States, e: Array) -> States:
 
 
 def change_of_point(states: States, e: Array) -> Array:
-    """How error states about a moved point are error states about the point it was moved from.
+    """Transformation of error states about a moved point into error states about the old point.
 
     Moved from there by e + T x, a state is where x moves it from the new point, to first order in x.
 

@@ -1,4 +1,4 @@
-"""What a filter gives up, and takes back, when the tests of `graphnav.estimation.solvers.watch` find a fault."""
+"""Exclusion and readmission of fixes when the tests of `graphnav.estimation.solvers.watch` detect a fault."""
 
 from __future__ import annotations
 
@@ -10,26 +10,27 @@ from graphnav.core.rotation import Array
 from graphnav.estimation.solution import ExcludedSpan
 from graphnav.estimation.solvers.watch import OLDEST, PATIENCE
 
-_FEWEST_AGREEING = 3  # fixes that agree after a fault, below which the next that does not says that they did by chance
+# least number of fixes that agree after a fault; with fewer, a further disagreement continues the fault
+_FEWEST_AGREEING = 3
 
 
 class Verdicts:
-    """Which fixes to give up when a fault is found: those from its onset on.
+    """Fixes to exclude when a fault is detected: those from its onset on.
 
-    Unless that outlasts what was used since the fault before, and a minute. Then it is more likely the filter that has
-    lost its way with those: it drifts while fixes are refused, and a fault that grows meets it again; or it began with
-    wrong ones. So what it used since, of any kind, is given up instead, and the fixes are taken back; this in turn is
-    undone if they are refused even so. After `OLDEST` of a fault the filter begins anew where the fixes are.
+    Unless the fault lasts longer than the span used since the previous fault, and a minute. Then the filter itself is
+    more likely wrong: it drifts while fixes are excluded, and the drift appears as another growing fault; or it started
+    with wrong fixes. So all measurements used since are excluded instead, and the fixes readmitted; this is undone if
+    they are rejected again. After `OLDEST` of a fault the filter is reset to the fixes.
 
-    The first fix that is used after a long fault meets a filter that knows little, and agrees easily; from then on the
-    filter is sure of it. If one of the next does not agree, it was chance, and the fault goes on.
+    The first fix used after a long fault agrees easily, because the filter's covariance is large; afterwards the filter
+    is certain of it. If one of the next fixes disagrees, the agreement was chance, and the fault continues.
     """
 
     def __init__(self, times: Mapping[str, Array], used: Mapping[str, Array]) -> None:
         self.times, self.used = dict(times), dict(used)  # (N,) each; `used` is changed in place
-        self.anew: set[tuple[str, float]] = set()  # kinds and times at which the filter begins anew
+        self.anew: set[tuple[str, float]] = set()  # kinds and times at which the filter is reset
         self._tried: set[tuple[str, float]] = set()
-        self._trial: tuple[str, int, int, dict[str, Array]] | None = None  # fixes taken back, and what was used before
+        self._trial: tuple[str, int, int, dict[str, Array]] | None = None  # readmitted fixes, and the rows used before
 
     def list_faults(self) -> tuple[ExcludedSpan, ...]:
         """Spans of fixes that are not used."""
@@ -41,7 +42,7 @@ class Verdicts:
         return tuple(sorted(out, key=lambda fault: fault.t_start))
 
     def weigh(self, name: str, t: Array) -> Array:
-        """(n,) of fixes at the times t: 0 for what is not used. Fixes that were not known yet are."""
+        """(n,) weights of fixes at the times t: 0 for unused ones, 1 for fixes not seen before."""
         known, used = self.times.get(name, np.empty(0)), self.used.get(name, np.empty(0))
         at = known.searchsorted(t)
         new = at == len(known)
@@ -55,12 +56,12 @@ class Verdicts:
         return np.asarray(used[at])
 
     def settle(self, name: str, since: float, now: float) -> float:
-        """Take from use what a fault of fixes `since` (s) up to `now` gives reason to; the time to go on from."""
+        """Exclude measurements for a fault of fixes from `since` (s) to `now`; returns the time to continue from."""
         t, used = self.times[name], self.used[name]
         fault, end = int(np.searchsorted(t, since)), int(np.searchsorted(t, now, side="right"))
         used[fault:end] = 0.0
         begin = _find_run_begin(used, end, 0.0)
-        before = _find_run_begin(used, begin, 1.0)  # of what was used between two faults
+        before = _find_run_begin(used, begin, 1.0)  # of the rows used between two faults
         if begin - before < min(_FEWEST_AGREEING, before - _find_run_begin(used, before, 0.0)):
             used[before:begin] = 0.0
             fault = min(fault, before)
@@ -74,7 +75,7 @@ class Verdicts:
                     self.used[other][: len(was)] = was
                 return float(t[_find_run_begin(used, _find_run_begin(used, begin, 1.0), 0.0)])
         begin = _find_run_begin(used, end, 0.0)
-        before = _find_run_begin(used, begin, 1.0)  # of what was used between two faults
+        before = _find_run_begin(used, begin, 1.0)  # of the rows used between two faults
         lasted = t[end - 1] - t[begin]
         if lasted > OLDEST and (name, t[begin]) not in self.anew:
             used[begin:end] = 1.0
@@ -85,7 +86,7 @@ class Verdicts:
         return float(t[fault])
 
     def set_ended(self) -> float | None:
-        """The time to go on from once no more fixes come: no more patience is needed then."""
+        """The time to continue from at the end of the fixes, where no later ones can confirm a fault."""
         for name, used in self.used.items():
             end = len(used)
             if end and used[-1] == 0.0:
@@ -96,11 +97,11 @@ class Verdicts:
         return None
 
     def _outlasts(self, name: str, before: int, begin: int, end: int) -> bool:
-        """Whether fixes begin..end, refused, are more than before..begin, which were used, and were not tried yet."""
+        """Whether the excluded fixes begin..end outnumber the used ones before..begin, and were not readmitted yet."""
         return 0 < begin - before < end - begin and (name, self.times[name][begin]) not in self._tried
 
     def _take_fixes_back(self, name: str, before: int, begin: int, end: int) -> float:
-        """Take fixes back, without what of any kind was used since the fault before; the time to go on from."""
+        """Readmit fixes, and exclude all rows used since the previous fault; returns the time to continue from."""
         t, used = self.times[name], self.used[name]
         self._tried.add((name, float(t[begin])))
         self._trial = name, begin, end, {other: u.copy() for other, u in self.used.items()}

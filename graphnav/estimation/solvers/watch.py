@@ -1,21 +1,21 @@
-"""Watches a filter's fixes for errors that last: a bank of generalised likelihood ratio tests.
+"""Tests of a filter's fixes for persistent errors: a bank of generalised likelihood ratio tests.
 
-A fault that grows slowly passes every test of one fix: the filter follows it. What it cannot do is follow without
-having been pushed in the same direction again and again. If the fixes have had an error U b since fix s, of which b are
-a part that stays and one that grows, U = [I, I (t - s)], the innovations have the mean G b, where G is what that does
-to them through the filter (Willsky and Jones 1976, "A generalized likelihood ratio approach to the detection and
-estimation of jumps in linear systems"; Willsky 1976, "A survey of design methods for failure detection", of ramps),
+A slowly growing fault passes every test of a single fix, because the filter follows it; but its innovations then have a
+consistent sign. If the fixes have had an error U b since fix s, of which b are a part that stays and one that grows, U
+= [I, I (t - s)], the innovations have the mean G b, with G the response of the innovations through the filter (Willsky
+and Jones 1976, "A generalized likelihood ratio approach to the detection and estimation of jumps in linear systems";
+Willsky 1976, "A survey of design methods for failure detection", of ramps),
 
     X <- F X                       its effect on the predicted state
     G = U - H X    X <- X + K G    at a fix since s (without U at other measurements)
 
-and with nu ~ N(0, S) white but for that, the error most likely and how much more likely it makes the innovations are
+and with nu ~ N(0, S) otherwise white, the most likely error and its log-likelihood ratio (times two) are
 
     score = sum G^T S^-1 nu    info = W^-2 + sum G^T S^-1 G    b = info^-1 score    T = score^T info^-1 score
 
-with W, how large such errors get, for what one fix cannot tell. Without a fault T is chi-square with twice as many
-degrees of freedom as a fix has components, or less. Onsets are 1, 2, 4 ... fixes old, more or less: slot l of the bank
-begins anew at every odd multiple of 2^l.
+with W the prior size of such errors. Without a fault T is chi-square with twice as many degrees of freedom as a fix has
+components, or less. Onsets are 1, 2, 4 ... fixes old, more or less: slot l of the bank restarts at every odd multiple
+of 2^l.
 """
 
 from __future__ import annotations
@@ -43,17 +43,17 @@ if TYPE_CHECKING:
     from graphnav.estimation.solvers.passes import Updates
     from graphnav.estimation.solvers.stack import Stack
 
-PATIENCE = 60.0  # s, after which fixes that are refused may be the ones that are right
-_EVERY = 8  # fixes between two looks at what is usual
-LARGE = 3.0  # sigmas that are stated or that clocks can be off: less is no fault, however certain
+PATIENCE = 60.0  # s, after which rejected fixes may be the correct ones
+_EVERY = 8  # fixes between updates of the innovation level
+LARGE = 3.0  # in sigmas of stated and clock errors: smaller errors are no fault, however significant
 _CLOCKS = 0.05  # s, by which the stamps of IMU and receiver may disagree
 _BRAKING = 3.0  # m/s^2, of a usual manoeuvre
-_ONSET = float(chdtri(1, 0.05))  # of T, by which an onset may be less likely than the likeliest: 95 %
+_ONSET = float(chdtri(1, 0.05))  # of T, by which an onset may be less likely than the most likely one: 95 %
 FALSE_ALARM = 1e-7  # per test: one drive in a hundred of an hour, if errors were Gaussian
-SIZES = {"m": 100.0, "m/s": 10.0}  # reflections in a city are off by up to a hundred metres; wheels by their speed
-MINUTE = 60.0  # s, in which an error may grow by as much as it can be
-_MEMORY = 64  # keyframes with fixes back to which the tests can be taken as they were
-OLDEST = 600.0  # s, about, of the oldest onset: what inertial sensors knew ten minutes ago says little
+SIZES = {"m": 100.0, "m/s": 10.0}  # multipath errors in a city reach a hundred metres; wheel errors their speed
+MINUTE = 60.0  # s, in which an error may grow to its prior size
+_MEMORY = 64  # keyframes with fixes for which the state of the tests is kept
+OLDEST = 600.0  # s, about, of the oldest onset: inertial information from ten minutes ago is negligible
 
 
 class _Slots:
@@ -99,7 +99,7 @@ class _Slots:
         return other
 
     def forget(self) -> None:
-        """Begin none again until its turn."""
+        """Clear all slots until they restart in turn."""
         self.first[:], self.score[:], self.info[:] = np.nan, 0.0, self.prior * np.eye(self.c)
 
     def begin(self, t: float) -> slice:
@@ -108,12 +108,12 @@ class _Slots:
         return slice(self.columns.start + self.c * slot, self.columns.start + self.c * (slot + 1))
 
     def find(self, t: float, errors: Array, T: Array, factor: float, speed: float) -> float | None:
-        """When a fault began that the fix at t, s, adds enough to be sure of, or None.
+        """Onset of a fault that is significant with the fix at t, s, or None.
 
         Parameters
         ----------
         errors, T : (L, c) and (L,), the errors most likely, and how much more likely they make the innovations.
-        factor : by which these are usually larger than the filter says.
+        factor : typical ratio of the innovations to the filter's prediction.
         """
         T = T / self.threshold
         if T.max() <= factor:
@@ -122,13 +122,13 @@ class _Slots:
         if self.c > self.m:
             minutes = np.where(np.isnan(self.first), 0.0, (t - self.first) / MINUTE)
             now = now + minutes[:, None] * errors[:, self.m :]
-        # a position is off by what the vehicle moves while clocks are
+        # clock errors shift a position by the distance travelled in them
         clocks = _CLOCKS * (speed if self.fix_of == "p" else _BRAKING)
-        large = np.sum(now**2 / (self.typical_error**2 + clocks**2), axis=-1) > LARGE**2  # if not, no fault
+        large = np.sum(now**2 / (self.typical_error**2 + clocks**2), axis=-1) > LARGE**2  # otherwise it is no fault
         T = np.where(large, T, 0.0)
         if T.max() <= factor:
             return None
-        # of the onsets that are about as likely the latest: it takes least
+        # of about equally likely onsets the latest: it excludes least
         return float(np.max(self.first[T.max() - _ONSET / self.threshold <= T]))
 
 
@@ -153,10 +153,10 @@ def _count_columns(some: Mapping[str, _Slots]) -> int:
 
 
 class _InnovationLevel:
-    """By how much the innovations of a kind are usually larger than the filter says; all copies of a bank share it.
+    """Typical ratio of a kind's innovations to the filter's prediction; shared by all copies of a bank.
 
-    What half of all fixes do, those not used included, is no fault: the filter has lost its way. But for those of a
-    fault that goes on and has not lasted for long: soon after the start they are half of all by themselves.
+    A level that half of all fixes reach, unused ones included, is no fault but a divergence of the filter. Fixes of a
+    recent, continuing fault are excepted: soon after the start they alone are half of all.
     """
 
     def __init__(self, m: int) -> None:
@@ -190,7 +190,7 @@ def _find_median(x: Array) -> float:
 
 
 class Bank:
-    """All tests of a filter, and how they were before the latest keyframes with fixes.
+    """All tests of a filter, and their states before the latest keyframes with fixes.
 
     Parameters
     ----------
@@ -221,7 +221,7 @@ class Bank:
         self._limit = np.empty(0)  # (B,) of its T
 
     def go_back(self, k: int) -> None:
-        """To before keyframe k; without any onset where that is too long ago."""
+        """Restore the state before keyframe k; without any onset where that is no longer kept."""
         begin, end = self._ends
         while end > begin and self._keys[(end - 1) % _MEMORY] > k:
             end -= 1
@@ -245,12 +245,12 @@ class Bank:
         root: Array,
         speeds: Array,
     ) -> tuple[str, int, float] | None:
-        """Follow a filter from keyframe k0 to k1: the kind that finds a fault, where, and when it began, if one does.
+        """Follow a filter from keyframe k0 to k1; returns kind, keyframe and onset of a detected fault, if any.
 
         Parameters
         ----------
         F, decay : of its steps, as `graphnav.estimation.solvers.recursion` has them.
-        updates : what it has taken in, as `stack` has it, with roots and innovations of all blocks there.
+        updates : of the filter, as in `stack`, with roots and innovations of all blocks.
         root : (K, M, M) of those, with the weights by which they were taken in.
         speeds : (n,) m/s, of the vehicle.
         """
@@ -285,7 +285,7 @@ class Bank:
             errors, T = self._errors[i, : slots.L, : slots.c], self._T[i, : slots.L]
             since = slots.find(float(self._t[k]), errors, T, limit[b] / slots.threshold, float(speeds[k]))
             if since is not None:
-                for at, level, factor in levels:  # what is behind it is not known yet
+                for at, level, factor in levels:  # later blocks are not known yet
                     if at <= b:
                         level.factor = factor
                 return names[i], k, since
@@ -295,7 +295,7 @@ class Bank:
 class Watch:
     """The same tests beside a square-root message R y = z, which is then R y = z - R X b for errors b since each onset.
 
-    Of errors that stay alone: one that grows may as well be the IMU's, and no evidence decides as it drives. With
+    Only for constant errors: a growing one may as well be the IMU's, and no evidence decides that online. With
     columns B = U / sigma for them at a fix, the QR that takes in its rows leaves behind, below those of the message,
     rho - Gamma b ~ N(0, 1): rho^T rho is its NIS, and Gamma^T rho and Gamma^T Gamma add to score and info.
 
@@ -324,7 +324,7 @@ class Watch:
         self._X, self._stands = X, None
 
     def take_message(self, R: Array, Z: Array) -> None:
-        """The message has come to a triangular R (D, D), with Z = R X (D, C) beside it."""
+        """Take over the new message, a triangular R (D, D), with Z = R X (D, C) beside it."""
         self._X, self._stands = None, (R, Z)
 
     def copy(self) -> Watch:
@@ -349,7 +349,7 @@ class Watch:
         return own, slots.columns, (inputs.reshape(slots.m, -1) / sigma[..., None]).reshape(sigma.size, -1)
 
     def find_onset(self, name: str, t: float, rho: Array, Gamma: Array, speed: float) -> float | None:
-        """When a fault began, or None, by what a fix has left behind: rho (n m,) and Gamma (n m, L m) of its kind."""
+        """Onset of a fault, or None, by the residual rows of a fix: rho (n m,) and Gamma (n m, L m) of its kind."""
         slots, rho, Gamma = self._slots[name], np.ascontiguousarray(rho), np.ascontiguousarray(Gamma)
         slots.typical_sigmas.add(t, float(rho @ rho))
         errors, T = np.empty((slots.L, slots.c)), np.empty(slots.L)

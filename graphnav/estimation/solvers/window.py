@@ -1,11 +1,11 @@
-"""A window over the newest keyframes: exact smoothing with bounded time and memory.
+"""Fixed-lag window over the newest keyframes: exact smoothing with bounded time and memory.
 
-Keyframes enter one by one (`graphnav.estimation.solvers.stages`); the newest message is what a filter would hold. Back
-through the stages go means and covariances (Rauch, Tung, Striebel in information form). A keyframe that is older than
-the lag leaves the window: its state is settled, and the message behind it is the marginal of all the past, a Gaussian
-on what the future still touches. Where a state has moved so far that its rows should be linearised anew, the stages
-from there on are made again about the smoothed states: Gauss-Newton on the window. A measurement that comes late
-does the same from its own time on. With a lag longer than the drive this is the batch solution.
+Keyframes enter one by one (`graphnav.estimation.solvers.stages`); the newest message corresponds to a filter's
+estimate. Means and covariances are smoothed backwards through the stages (Rauch, Tung, Striebel in information form). A
+keyframe older than the lag is marginalised: its state is settled, and the message after it is the marginal of all the
+past. Where a state has moved too far from its linearisation point, the stages from there on are rebuilt about the
+smoothed states: Gauss-Newton on the window. A late measurement does the same from its own time on. With a lag longer
+than the drive this is the batch solution.
 """
 
 from __future__ import annotations
@@ -37,18 +37,18 @@ from graphnav.estimation.solvers.turning import split_turn, turn_covariance
 from graphnav.estimation.solvers.watch import Watch
 from graphnav.recording import ImuNoise
 
-# of the noise of a second's force that a turn may be neglected for: the same way every second, it adds up
+# share of the noise of a second's force that a neglected turn may cause: as it is systematic, it accumulates
 _NOISE_SHARE = 0.01
 _G = 9.8  # m/s^2
 _DELAY = 0.02  # s, of a delay: 1 mm where speed is known to 5 cm/s
 _MAX_RELINEARISATIONS = 5
-_ALMOST = 0.3  # of the limits: what has moved that far goes with what is beyond them, as it would be next
+_ALMOST = 0.3  # share of the limits from which stages are relinearised along with those beyond them
 _LIMITS = {"rad": 1e-2, "s": _DELAY}
 
 
 @dataclass(frozen=True)
 class SettledStates:
-    """Some keyframes with all that the window knows: states, covariances, and the parameters there."""
+    """Settled keyframes: smoothed states, covariances, and parameters."""
 
     t: Array  # (n,)
     states: States
@@ -93,11 +93,11 @@ class Window:
 
     def __init__(self, prior: Message, turn: float) -> None:
         self.turn = turn
-        self.head = prior  # all that is known before the first stage
+        self.head = prior  # information before the first stage
         self.stages: list[Stage] = []
         self.relinearized = 0  # stages made anew
         self._limit: tuple[Columns, Array] = {}, np.empty(0)
-        self._covariances: _Covariances | None = None  # of stages that are to leave
+        self._covariances: _Covariances | None = None  # covariances of stages to be settled
         self._means: list[Array] | None = None
         self._moved: Array | None = None  # `_moves`, of these
         self._revision: Revision | None = None
@@ -108,7 +108,7 @@ class Window:
 
     @property
     def newest(self) -> Message:
-        """What is known of the newest keyframe: the live estimate is its point."""
+        """The message of the newest keyframe: the live estimate is its point."""
         return self.stages[-1].message if self.stages else self.head
 
     @property
@@ -124,7 +124,7 @@ class Window:
         return self.stages[first:]
 
     def expect(self, place: Place) -> Predicted:
-        """A keyframe, linearised at its prediction, with the rows of its problem that need not be waited for."""
+        """Predict a keyframe, linearised at its prediction, with the rows that are available already."""
         state, values, columns, link = predict_stage(self.newest, place)
         rows = linearise_rows(place, state, values, columns, late=False).measured
         return predict_message(self.newest, place, link, rows, state, values, columns)
@@ -132,8 +132,7 @@ class Window:
     def push(self, place: Place, ahead: Predicted | None = None) -> float:
         """Add a keyframe; returns by how much its measurements turned it, rad.
 
-        `ahead` is what was expected of it after the newest, if known already: only the rows that had to be waited for
-        are then made.
+        `ahead` is its prediction after the newest keyframe, if prepared already: only late rows are then added.
         """
         stage, e = self._update(self.expect(place) if ahead is None else replace(ahead, place=place))
         self._append(stage.move(e))
@@ -155,7 +154,7 @@ class Window:
             self._limit = columns, find_parameter_limits(columns, stage.place)
 
     def watch(self, tests: Watch) -> None:
-        """Have the fixes from the next keyframe on tested."""
+        """Start testing fixes, from the next keyframe on."""
         if self.stages:
             newest = self.stages[-1]
             self.stages[-1] = replace(newest, message=replace(newest.message, tests=tests))
@@ -163,12 +162,12 @@ class Window:
             self.head = replace(self.head, tests=tests)
 
     def forget_tests(self) -> None:
-        """What the tests know of fixes before the window is not true any more."""
+        """Clear the tests' memory of fixes before the window, which is no longer valid."""
         if self.head.tests is not None:
             self.head = replace(self.head, tests=self.head.tests.forget_onsets())
 
     def truncate(self, keep: int) -> None:
-        """Forget all but the first `keep` stages: something before what follows has changed."""
+        """Remove all but the first `keep` stages, because something before the others has changed."""
         if keep >= len(self.stages):
             return
         del self.stages[keep:]
@@ -179,7 +178,7 @@ class Window:
             self.head = self.head.move(self.head.estimate)
 
     def replace_from(self, first: int, before: Message, stage: Stage | None, stages: Sequence[Stage]) -> None:
-        """Have other stages from one on, and the message before them, and its stage if it has one, as given."""
+        """Replace the stages from one on, the message before them, and its stage if it has one."""
         if stage is None:
             self.head = replace(before, tests=self.head.tests)
         else:
@@ -204,9 +203,9 @@ class Window:
         return self._means
 
     def smooth_back(self, count: int, most: int) -> bool:
-        """A part of what `settle` does for the first stages, over at most so many; True once it is done.
+        """A portion of `settle` for the first stages, over at most so many; True once it is done.
 
-        Keyframes that come meanwhile do not count; when some are taken back, it begins anew.
+        Keyframes that arrive meanwhile do not count; when some are removed, it starts again.
         """
         if self._covariances is None:
             self._covariances = _Covariances(self.stages, count)
@@ -214,11 +213,11 @@ class Window:
 
     @property
     def leaving(self) -> int:
-        """How many stages `smooth_back` is about, 0 if it has not begun."""
+        """Number of stages that `smooth_back` is working on, 0 if it has not started."""
         return 0 if self._covariances is None else self._covariances.count
 
     def settle(self, count: int) -> SettledStates:
-        """Smooth the window and let its first `count` stages go."""
+        """Smooth the window and marginalise its first `count` stages."""
         gone, means, back = self.stages[:count], self.compute_means()[1 : count + 1], self._covariances
         if back is None or back.count != count:
             back = _Covariances(self.stages, count)
@@ -268,7 +267,8 @@ class Window:
     def _measure_turns(self, e: Array) -> Array:
         """(n,) rad, how far attitudes move by e (n, D) from where their rows are linearised.
 
-        Of a turn about the vertical only what it has beside that of the keyframe before, where nothing tells headings.
+        Of rotations about the vertical only the change since the previous keyframe counts, where the heading is
+        unobservable.
         """
         if not self.newest.turns:
             return np.asarray(np.linalg.norm(e[:, :3], axis=1))
@@ -284,7 +284,7 @@ class Window:
         ----------
         share : of the usual limits.
         always : once at least.
-        renewed : gives the places of stages, from an index to another, where they no longer know their rows.
+        renewed : returns the places of stages between two indices, where these no longer hold their rows.
         """
         for count in range(_MAX_RELINEARISATIONS):
             first = self._find_first_again(share, always and not count)
@@ -294,19 +294,19 @@ class Window:
         return _MAX_RELINEARISATIONS
 
     def _find_first_again(self, share: float, every: bool) -> int | None:
-        """The first stage to be linearised anew: what has moved almost as far goes with it, as it would be next."""
+        """The first stage to be relinearised, stages that have moved almost as far included."""
         first = 0 if every else self.find_first_moved(share)
         return min(first, self.find_first_moved(_ALMOST * share) or 0) if first else first
 
     @property
     def revising(self) -> bool:
-        """Whether `revise` is not through."""
+        """Whether `revise` is in progress."""
         return self._revision is not None or self._rounds > 0
 
     def revise(self, count: int, renewed: Renewing, always: bool = False) -> bool:
-        """A part of what `converge` does, at most so many stages of it; False once there is nothing left to do.
+        """A portion of `converge`, of at most so many stages; False once there is nothing left to do.
 
-        Keyframes may come and go before the next part, and what has been made of them goes with them.
+        Keyframes may be added and removed before the next portion; rebuilt stages of removed ones are discarded.
         """
         if self._revision is None:
             first = self._find_first_again(1.0, always and not self._rounds)
@@ -324,7 +324,7 @@ class Window:
 def compute_turn_limit(noise: ImuNoise) -> float:
     """How far an attitude may move (rad) before rows are linearised anew.
 
-    What is neglected of a turn a is a^2/2 of the force it turns: in a second a^2/2 g, against the noise.
+    The neglected second-order term of a turn a is a^2/2 of the force: a^2/2 g in a second, compared with the noise.
     """
     return float(np.clip(np.sqrt(2.0 * _NOISE_SHARE * noise.accel_noise_density / _G), 3e-4, 1e-2))
 

@@ -37,7 +37,7 @@ def measure_common_time(recording: Recording) -> float:
 def describe_gnss_apart(recording: Recording) -> str | None:
     """A finding that GNSS and IMU share no time, with a likely remedy; None if they do."""
     gnss, raw = recording.gnss, recording.raw_gnss
-    own = gnss is not None and not gnss.derived  # from a receiver's fixes; no raw observations are used in their place
+    own = gnss is not None and not gnss.derived  # computed by a receiver, not from raw observations
     t = raw.t if raw is not None and not own else gnss.t if gnss is not None else np.empty(0)
     if not len(t):
         return None
@@ -48,28 +48,28 @@ def describe_gnss_apart(recording: Recording) -> str | None:
         f"GNSS ({t[0]:.3f} to {t[-1]:.3f} s) and IMU ({recording.start:.3f} to {recording.end:.3f} s) do not "
         "overlap in time"
     )
-    if not own:  # from raw observations, whose receiver knows the date
+    if not own:  # from raw observations, which carry the date
         weeks = round(offset / WEEK)
         near = f", {abs(weeks)} week(s) too {'late' if weeks > 0 else 'early'}" if weeks else ""
-        return f"{apart}: the observations' times are GPS time, so what clock says of the IMU's t = 0 is wrong{near}"
+        return f"{apart}: the observations' times are GPS time, so clock, the date of the IMU's t = 0, is wrong{near}"
     known = compute_clock_offset(recording.start, recording.gps_zero, float(t[0]), None)
     if (unit := _guess_stamp_unit(t, recording)) is not None:
-        return f'{apart}: the stamps of the fixes are in {unit}; say units = {{ t = "{unit}" }} in [gnss]'
+        return f'{apart}: the stamps of the fixes are in {unit}; set units = {{ t = "{unit}" }} in [gnss]'
     left = t[0] + known.offset - recording.start if known is not None else np.inf
     if known is not None and abs(left) < NEAR:
         return (
-            f"{apart}: {known.words}; say time_offset = {known.offset:.0f} in [gnss], with which "
+            f"{apart}: {known.words}; set time_offset = {known.offset:.0f} in [gnss], with which "
             f"GNSS starts {abs(left):.2f} s {'after' if left > 0 else 'before'} the IMU"
         )
     hours = round(offset / 1800.0) / 2.0
     local = (
         f"; {abs(hours):g} h apart, one may be in local time" if hours and abs(offset - 3600.0 * hours) < 60.0 else ""
     )
-    return f"{apart}; if their clocks differ, say time_offset in [gnss] ({offset:.3f} would start both together){local}"
+    return f"{apart}; if their clocks differ, set time_offset in [gnss] ({offset:.3f} would start both together){local}"
 
 
 def _describe_large_steps(t: Array, recording: Recording) -> str | None:
-    """That most fixes lie outside the IMU's time and, in another unit than s, within it; None where that is not so."""
+    """Report that most fixes lie outside the IMU's time, but within it with stamps in another unit; else None."""
     unit = _guess_stamp_unit(t, recording)
     outside = float(np.mean((t < recording.start) | (t > recording.end)))
     if unit is None or outside < 0.5 or len(t) < 2 or not np.median(np.diff(t)) > _SELDOM:
@@ -77,7 +77,7 @@ def _describe_large_steps(t: Array, recording: Recording) -> str | None:
     return (
         f"{100 * outside:.0f} % of the fixes lie outside the time of the IMU ({recording.start:.3f} to "
         f"{recording.end:.3f} s), and within it if their stamps are in {unit}: "
-        f'say units = {{ t = "{unit}" }} in [gnss]'
+        f'set units = {{ t = "{unit}" }} in [gnss]'
     )
 
 
@@ -241,7 +241,7 @@ def _compare_wheels(odometer: Odometer, imu: Imu) -> Iterator[Finding]:
             yield Finding(
                 "warning",
                 f"the {name} wheel is {100 * abs(ratio - 1):.1f} % {more} than the others when driving straight: "
-                "say use in [odometer], to leave its axle out",
+                "set use in [odometer], to leave its axle out",
                 "odometer.wheel",
             )
 
@@ -251,7 +251,7 @@ def check_odometer(recording: Recording, track: Track | None, facts: dict[str, A
     assert odometer is not None
     if min(odometer.t[-1], recording.end) <= max(odometer.t[0], recording.start):
         unit = _guess_stamp_unit(odometer.t, recording)
-        hint = f'; its stamps are in {unit}: say units = {{ t = "{unit}" }} in [odometer]' if unit else ""
+        hint = f'; its stamps are in {unit}: set units = {{ t = "{unit}" }} in [odometer]' if unit else ""
         yield Finding("warning", f"odometer and IMU do not overlap in time{hint}", "odometer.clock")
         return
     yield from check_odometer_readings(recording, facts)
@@ -267,7 +267,7 @@ def check_odometer(recording: Recording, track: Track | None, facts: dict[str, A
     for factor, unit in units.items():
         if abs(scale / factor - 1.0) < 0.06:
             say = (
-                f'the odometer is in {unit}: say units = {{ speed = "{unit}" }}'
+                f'the odometer is in {unit}: set units = {{ speed = "{unit}" }}'
                 if factor < 1
                 else f"the odometer is in {unit}"
             )

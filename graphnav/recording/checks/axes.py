@@ -32,7 +32,7 @@ def check_imu_axes(imu: Imu, forward: Fit | None, track: Track | None) -> Iterat
         return
     along = crosschecks.fit_along(imu, track) if up[2] > 0.8 and track is not None else None
     # the proposed axes explain no more than the stated ones: without changes of speed and turns no direction is
-    # determined
+    # observable
     if along is not None and along.coefficients[0] > 0.5 and along.correlation > forward.correlation - _NO_BETTER:
         return
     letters = write_letters(imu.R_bs, ahead, up)
@@ -79,7 +79,7 @@ def check_forward_sign(imu: Imu, track: Track | None, forward: Fit | None) -> It
     if ahead[1] > -CORRELATED:
         return
     along = f"the forward force falls when the speed rises (correlation {-forward.correlation:.2f})"
-    if tilt.measure_sideways(imu, track) > 0.0:  # then nothing is rotated: the other axes are right
+    if tilt.measure_sideways(imu, track) > 0.0:  # then this is no rotation: the other axes are right
         column = f"a{_name_column(imu, 1)}"
         yield Finding(
             "refused",
@@ -95,12 +95,12 @@ def check_forward_sign(imu: Imu, track: Track | None, forward: Fit | None) -> It
 def check_gyro_sign(imu: Imu, track: Track) -> Iterator[Finding]:
     """The gyro about the mean force turns opposite to the course: no choice of axes explains that.
 
-    A vehicle that leans into its curves feels none, and which of the two is mirrored is then open.
+    A vehicle that leans into its curves has no lateral force, so which of the two is mirrored remains open.
     """
     if crosschecks.find_up(imu)[2] < 0:
         alone = tilt.measure_sideways(imu, track) > 0.0  # its other axes agree with the gyro
         which = "accelerometer's vertical axis" if alone else "accelerometer's sign"
-        what = f"the {which} is reversed (gyro and course deny its up), it must read +9.8 upward at rest"
+        what = f"the {which} is reversed (gyro and course contradict it), it must read +9.8 upward at rest"
         yield Finding("warning", f"{what}; negate it in the file", "imu.force_sign")
     elif not tilt.measure_sideways(imu, track):
         what = "the gyro turns against the GNSS course: its sign is reversed, or latitudes or longitudes have the wrong"
@@ -125,7 +125,7 @@ def check_yaw_scale(yaw: Fit | None) -> Iterator[Finding]:
     elif 1 / 80.0 < scale < 1 / 40.0:
         yield Finding(
             "warning",
-            'the gyro is 57 times too large for the GNSS course: say units = { gyro = "deg/s" }',
+            'the gyro is 57 times too large for the GNSS course: set units = { gyro = "deg/s" }',
             "imu.gyro_unit",
         )
     elif abs(scale - 1.0) > max(0.1, tilt.SIGMAS * scale * yaw.relative_sigma):
@@ -175,7 +175,7 @@ def check_gyro_tilt(imu: Imu, track: Track) -> Iterator[Finding]:
             yield Finding(
                 "unreliable",
                 f"the gyro {turn} against the tilt that the accelerometer shows ({slope:.2f} +- {sigma:.2f} of it, not "
-                f"1), while its turns are right: one axis is reversed; axes in [imu] cannot say that: negate {column} "
-                "in the file",
+                f"1), while its turns are right: one axis is reversed; axes in [imu] cannot express that: negate "
+                f"{column} in the file",
                 "imu.gyro_axis_sign",
             )

@@ -192,7 +192,7 @@ def _search_shift(
         return regress_inliers(x_at(rows, lag), y[rows]) if len(rows) >= MIN_PAIRS else (0.0, np.zeros(1))
 
     r, b = regress(lag)
-    if abs(lag) < 2.0 * spread:  # the data leave it open
+    if abs(lag) < 2.0 * spread:  # the data do not determine it
         unshifted, of_it = regress(0.0)
         if unshifted > r:
             lag, r, b = 0.0, unshifted, of_it
@@ -247,7 +247,7 @@ def fit_forward(imu: Imu, track: Track) -> Fit | None:
 
 
 def fit_force(imu: Imu, track: Track) -> Fit | None:
-    """The same of the whole force, which may lack gravity: nothing is level then. Coefficients (3,)."""
+    """Regression of the same on the whole force, from which gravity may have been removed. Coefficients (3,)."""
     i, j, y = _pair_possible(track)
     fit = _fit_imu(imu, imu.accel, track, i, j, y) if len(y) and y.std() >= _CHANGES else None
     return fit if fit is not None and len(fit.coefficients) == 3 else None

@@ -72,7 +72,7 @@ def check_gyro_unit(recording: Recording) -> Iterator[Finding]:
         yield Finding(
             "warning",
             f"the gyro reaches {rate:.3g} rad/s, too fast for a {recording.platform}: if it is deg/s, "
-            'say units = { gyro = "deg/s" }' + ('; if it is on a foot, platform = "foot"' if rate < 35.0 else ""),
+            'set units = { gyro = "deg/s" }' + ('; if it is on a foot, platform = "foot"' if rate < 35.0 else ""),
             "imu.gyro_fast",
         )
 

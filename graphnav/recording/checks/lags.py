@@ -1,9 +1,9 @@
 """Offset between two clocks from two recordings of one signal, and its sigma.
 
 In y = b x(lag) + misfit the misfit is not white noise: slopes of the road last for seconds, the overshoot of smoothed
-fixes as long as their filter. So means over ten seconds are subtracted from everything, and the remaining rows count as
-many as their autocorrelation leaves independent. The sigma follows from the likelihood of every lag within reach, not
-only from the curvature at the best one: where speed hardly changes, several lags explain it nearly as well.
+fixes as long as their filter. So means over ten seconds are subtracted from everything, and the remaining rows count by
+their effective number (by autocorrelation). The sigma follows from the likelihood of every lag within reach, not only
+from the curvature at the best one: where speed hardly changes, several lags explain it nearly as well.
 """
 
 from __future__ import annotations

@@ -157,7 +157,7 @@ def inspect(recording: Recording) -> Inspection:
     overlap = recording.gnss is not None and measure_common_time(recording) > 0
     track = tracks.compute_track(recording.gnss) if recording.gnss is not None else None
     rest = _find_rest(recording, track if overlap else None)
-    findings += check_imu_time(stamps)  # those of rows left out are said already
+    findings += check_imu_time(stamps)  # rows left out have been reported already
     findings += check_repeats(recording.imu)
     findings += check_saturation(recording.imu)
     if "imu.gyro_unit" not in known:
@@ -183,12 +183,13 @@ def inspect(recording: Recording) -> Inspection:
     if recording.raw_gnss is not None and len(recording.raw_gnss):
         facts["raw_gnss"] = describe_raw(recording.raw_gnss)
         findings += check_raw(recording.raw_gnss)
-    # with wrong axes, or forces without gravity, gravity proves nothing
+    # with wrong axes, or forces without gravity, this test does not apply
     turned = known & {"imu.forward_reversed", "imu.axes_turned", "imu.dead_axis", "imu.force_scale"}
-    upright = not known & {"imu.force_scale", "imu.dead_axis"}  # else no turn about the vertical is known either
+    # otherwise the turn rate about the vertical is unknown as well
+    upright = not known & {"imu.force_scale", "imu.dead_axis"}
     if vehicle and overlap and track is not None and recording.gnss is not None and upright:
         clock = whole.clock or measure_clock_offsets(recording.imu, recording.gnss)
-        if any(f.key == "gnss.velocity_axes" for f in wrong):  # they say nothing of the IMU
+        if any(f.key == "gnss.velocity_axes" for f in wrong):  # their comparison with the IMU is meaningless
             track = tracks.compute_track(replace(recording.gnss, v=None)) or track
         yaw = crosschecks.fit_yaw_rate(recording.imu, track)
         forward = clock.by_velocity if track.instant else clock.by_places

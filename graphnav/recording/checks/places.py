@@ -73,7 +73,7 @@ def check_frozen(recording: Recording) -> Iterator[Finding]:
         return
     step, speed = np.diff(t), np.minimum(speed[1:], speed[:-1])
     sure = (step < 5.0 * max(compute_period(t), 1.0)) & (t[1:] > gnss.t[0]) & (t[:-1] < gnss.t[-1])
-    sure &= speed > crosschecks.MIN_SPEED  # no noise of one that stands
+    sure &= speed > crosschecks.MIN_SPEED  # above the noise of a stationary receiver
     driven = float(np.sum((speed * step)[sure]))
     if driven > 2.0 * np.pi * _TURNING_RADIUS:
         yield Finding(
@@ -95,7 +95,7 @@ def check_height_unit(recording: Recording, track: Track, forward: Fit | None) -
     climbs = f"the heights climb {1.0 / ratio:.2g} times as much as the slopes that the IMU measures (correlation "
     climbs += f"{correlation:.2f})"
     if correlation > CLEAR and abs(ratio / FOOT - 1.0) < _FEET:
-        hint = 'they are in feet; say units = { height = "ft" } in [gnss]'
+        hint = 'they are in feet; set units = { height = "ft" } in [gnss]'
         yield Finding("warning", f"{climbs}: {hint}", "gnss.feet")
     # whichever of the two has the noise that makes the correlation less than one
     elif correlation > CLEAR and abs(np.log(ratio)) + np.log(correlation) > np.log(_SCALE):

@@ -1,4 +1,4 @@
-"""What raw GNSS observations hold: satellites, signals, gaps, slips and signal strengths, and what is missing."""
+"""Contents of raw GNSS observations: satellites, signals, gaps, cycle slips, signal strengths, and what is missing."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from graphnav.gnss.series import RawGnss
 from graphnav.gnss.signals import SYSTEM_NAMES, SYSTEMS, name_satellite, name_signal
 
 _EPOCH_GAP_PERIODS = 2.5  # periods beyond which a step between epochs is a gap
-_BASE_ODD = 4.0  # 1-sigma of its own position that a base is from the stated one by chance in 0.1 %
+_BASE_ODD = 4.0  # sigmas of its own position by which a base is off its stated one with a probability of 0.1 %
 _FEWEST_SATELLITES = 5  # satellites, one more than a position with its clock takes
 
 
@@ -57,7 +57,7 @@ def describe_raw(raw: RawGnss) -> dict[str, Any]:
 
 
 def check_raw(raw: RawGnss) -> Iterator[Finding]:
-    """What a tightly coupled solution suffers from."""
+    """Findings on what degrades a tightly coupled solution."""
     by_epoch = _count_satellites(raw, np.isfinite(raw.p[:, 0]))
     few = float(np.mean(by_epoch < _FEWEST_SATELLITES))
     if few > 0.5:

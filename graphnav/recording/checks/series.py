@@ -40,7 +40,7 @@ def _screen(series: Series) -> tuple[Series, list[Finding]]:
         )
         needed = any(column.name in some for some in sensor.needs)
         if needed and lost > max(_ISOLATED * there.sum(), 1):
-            hint = f"say units = {{ {column.name} = ... }}, one of {', '.join(column.units)}"
+            hint = f"set units = {{ {column.name} = ... }}, one of {', '.join(column.units)}"
             findings.append(Finding("refused", f"{sentence}: if it is another unit, {hint}", f"{sensor.name}.unit"))
         else:
             findings.append(Finding("note", f"{sentence}: left out", f"{sensor.name}.bounds"))
@@ -63,7 +63,7 @@ def describe_series(series: Series) -> dict[str, Any]:
 
 
 def check_series(recording: Recording) -> Iterator[Finding]:
-    """Sensors on another clock, and sensors that stand still while everything else changes."""
+    """Sensors on another clock, and sensors whose readings do not change while others do."""
     for name, series in recording.sensors.items():
         if not len(series):
             continue

@@ -35,7 +35,7 @@ def check_stated_noise(noise: ImuNoise) -> Iterator[Finding]:
         if value > limit:
             yield Finding(
                 "warning",
-                f'{key} = {value:g} {unit} is more than any IMU has; if it is {meant}, say "{value:g} {meant}"',
+                f'{key} = {value:g} {unit} is more than any IMU has; if it is {meant}, write "{value:g} {meant}"',
                 "imu.noise_unit",
             )
 
@@ -59,7 +59,7 @@ def check_foot_speed(recording: Recording, track: Track | None) -> Iterator[Find
         if speed > _RUN:
             yield Finding(
                 "warning",
-                f'the fixes move at {speed:.3g} m/s, too fast for a foot: if it is a car, say platform = "vehicle"',
+                f'the fixes move at {speed:.3g} m/s, too fast for a foot: if it is a car, set platform = "vehicle"',
                 "recording.platform",
             )
 
@@ -88,7 +88,7 @@ def check_fix_types(gnss: Gnss) -> Iterator[Finding]:
 
     if (guess := guess_fix_numbers(gnss.type, gnss.sd[:, 0])).value == "nmea":
         sentence = (
-            f'types of the fixes look like GGA\'s qualities: {guess.why}; say units = {{ type = "nmea" }} in [gnss]'
+            f'types of the fixes look like GGA\'s qualities: {guess.why}; set units = {{ type = "nmea" }} in [gnss]'
         )
         yield Finding("warning", sentence, "gnss.type_numbers")
 
@@ -157,7 +157,7 @@ def describe_mirroring(which: str, sensor: str) -> Finding:
 
 
 def _compute_horizontal(moved: Array, stated: Array) -> Iterator[Finding]:
-    """The change of velocities (N, 2) that makes them agree with displacements (N, 2), if they do not themselves."""
+    """Find the change of velocities (N, 2) that makes them agree with displacements (N, 2), where they disagree."""
 
     def miss(change: Array) -> float:
         return float(np.median(np.linalg.norm(moved - stated @ change.T, axis=1)))
@@ -170,7 +170,7 @@ def _compute_horizontal(moved: Array, stated: Array) -> Iterator[Finding]:
     ]
     turned = len(changes)  # the others are of units
     for factor, unit in _SPEEDS.items():
-        hint = f'say units = {{ speed = "{unit}" }}' if factor < 1.0 else "leave out units.speed"
+        hint = f'set units = {{ speed = "{unit}" }}' if factor < 1.0 else "leave out units.speed"
         changes.append((factor * np.eye(2), f"the velocities are in {unit}: {hint} in [gnss]"))
     misses = [miss(change) for change, _ in changes]
     best = int(np.argmin(misses))
@@ -217,7 +217,7 @@ def check_truth(recording: Recording) -> Iterator[Finding]:
             "truth.leap_seconds",
         )
     elif off > 100.0 + 10.0 * float(np.median(gnss.sd[:, :2])):
-        metres = ', or in metres (name the columns x and y, say frame = "local")' if off > 1e6 else ""
+        metres = ', or in metres (name the columns x and y, set frame = "local")' if off > 1e6 else ""
         yield Finding(
             "warning", f"the truth lies {off / 1e3:.3g} km from the fixes: is it of this drive{metres}?", "truth.far"
         )

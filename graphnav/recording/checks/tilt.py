@@ -9,8 +9,8 @@ from graphnav.recording import Imu
 from graphnav.recording.checks.crosschecks import MIN_PAIRS, MIN_SPEED, regress_inliers
 from graphnav.recording.checks.tracks import Track
 
-CORRELATED = 0.7  # a correlation, or a unit vector's component, that leaves no doubt
-SIGMAS = 4.0  # of a slope that is not by chance
+CORRELATED = 0.7  # threshold of a correlation, or of a unit vector's component, for a decision
+SIGMAS = 4.0  # significance of a slope, in sigmas
 NEAR_ONE = 0.5, 1.5  # slopes nearer to 1 than to 0 and 2
 
 
@@ -34,7 +34,7 @@ def _average_seconds(imu: Imu, track: Track) -> tuple[Array, Array, Array, Array
 def measure_sideways(imu: Imu, track: Track) -> float:
     """The force to the right over that which turn rate and speed require: 1, and -1 where an axis is reversed.
 
-    0 where that is open: without curves, where a road's banks are felt more, or if a vehicle leans into its curves.
+    0 where undetermined: without curves, where the bank of the road dominates, or for a vehicle that leans into curves.
     """
     _, before, after, mean = _average_seconds(imu, track)
     moving = np.minimum(before, after) > MIN_SPEED

@@ -1,4 +1,4 @@
-"""Velocities of the vehicle as a sensor tells them: means over the time that each of them is about."""
+"""Velocities of the vehicle by a sensor, each a mean over an averaging time."""
 
 from __future__ import annotations
 

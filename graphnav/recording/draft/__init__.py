@@ -131,7 +131,7 @@ class _Writer:
         if raw.clock.value is not None:
             self._write_key("clock", quote(str(raw.clock.value)), raw.clock.why)
         elif imu.log is None:
-            words = f'CHECK: say what t = 0 of {imu.path.name} is, as "gps week 2130" or a UTC date'
+            words = f'CHECK: state what t = 0 of {imu.path.name} is, as "gps week 2130" or a UTC date'
             self.lines.append(f'# clock = "..."                             # {words}')
             self.decisions.append(f"clock: {words}; the observations begin at {raw.begin}")
 
@@ -340,7 +340,7 @@ class _Writer:
                 ) + (", since axes and noise are of this one" if sensor == "imu" else "")
             self._write_key("topic", quote(topics[0]), why)
         if source.joined_from is None and source.plain is None and not is_inside(source.path, self.folder):
-            words = f"{relative}: lies outside the folder of this file; say --allow-outside to read it"
+            words = f"{relative}: lies outside the folder of this file; use --allow-outside to read it"
             self.decisions += [words] if words not in self.decisions else []
         names = {o: theirs for o, theirs in source.columns.names.items() if o != theirs and o not in dropped}
         if names:

@@ -11,12 +11,12 @@ from graphnav.core.rotation import Array
 from graphnav.recording.draft.columns import match_columns
 
 _MARKS = re.compile("[\\s:°º'\u2032\u2019\"\u2033\u201d]+")  # of degrees, minutes and seconds
-_MARKED = re.compile(r"[NSEW°º]", re.IGNORECASE)  # what no time of day has
+_MARKED = re.compile(r"[NSEW°º]", re.IGNORECASE)  # characters that no time of day has
 _SIDES = {"lat": ("N", "S"), "lon": ("E", "W")}  # positive, negative
 
 
 def read_angles(cells: Mapping[str, Sequence[str]], columns: dict[str, Array]) -> list[str]:
-    """Add columns of angles written in words, and give those beside a column of hemispheres their signs.
+    """Parse columns of angles with degree signs, and apply the signs of hemisphere columns.
 
     Parameters
     ----------
@@ -52,7 +52,7 @@ def _hold_only(cells: Sequence[str], positive: str, negative: str) -> bool:
 
 
 def _parse_angles(cells: Sequence[str]) -> Array | None:
-    """A column of angles (N,) in deg, NaN where blank; None where one is none, or none has a mark of angles."""
+    """Parse a column of angles (N,) in deg, NaN where blank; None if a cell is no angle, or none has marks."""
     if not any(_MARKED.search(cell) for cell in cells):
         return None
     found = [_parse_angle(cell) if cell else np.nan for cell in cells]
@@ -60,7 +60,7 @@ def _parse_angles(cells: Sequence[str]) -> Array | None:
 
 
 def _parse_angle(cell: str) -> float | None:
-    """Degrees, with minutes and seconds where they are there; None where the cell is no angle."""
+    """Parse degrees, with optional minutes and seconds; None where the cell is no angle."""
     side = next((letter for letter in (cell[0].upper(), cell[-1].upper()) if letter in "NSEW"), "")
     parts = [part for part in _MARKS.split(cell.upper().strip(side) if side else cell) if part]
     if not 1 <= len(parts) <= 3 or any(re.fullmatch(r"\d+(?:\.\d*)?", part.lstrip("+-")) is None for part in parts):

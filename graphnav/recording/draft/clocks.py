@@ -1,4 +1,4 @@
-"""Stamps that are one number, but no count of seconds or parts of them: times of day, and a spreadsheet's days."""
+"""Numerical stamps that are not a count of seconds: times of day (hhmmss), and a spreadsheet's days."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from graphnav.core.timescales import DAY
 
 _EPOCH = 25569.0  # 1 January 1970 as a spreadsheet counts days
 _DAYS = 30000.0, 80000.0  # of the years 1982 to 2119
-_LARGEST_STEP = 10.0 / DAY  # days between rows of a log; in s none has so little
+_LARGEST_STEP = 10.0 / DAY  # days, longest step between rows of a log; stamps in s have longer ones
 
 
 def read_clock_seconds(t: Array) -> Array | None:
-    """Seconds since midnight of times of day written as one number, hhmmss.ss; None where these are none.
+    """Seconds since midnight from times of day as one number, hhmmss.ss; None if they are not.
 
-    They are where no stamp has more than 59 minutes or seconds, 40 s are missing between successive minutes, and these
-    then follow on each other as other rows do: a pause, too, may be of 40 s or more.
+    They are times of day where minutes and seconds never exceed 59, steps over a full minute are 40 s too long, and are
+    regular once read as hhmmss: a pause may also be of 40 s or more.
     """
     hours, minutes, seconds = t // 10_000, t // 100 % 100, t % 100
     if not ((t >= 0.0) & (t < 240_000.0) & (minutes < 60.0) & (seconds < 60.0)).all():
@@ -31,7 +31,7 @@ def read_clock_seconds(t: Array) -> Array | None:
 
 
 def read_serial_days(t: Array) -> Array | None:
-    """Unix time (s) of a spreadsheet's dates, days since 1900 as one number; None where these are none."""
+    """Unix time (s) from a spreadsheet's dates, days since 1900; None if they are not."""
     if len(t) < 2 or not ((t > _DAYS[0]) & (t < _DAYS[1])).all():
         return None
     return DAY * (t - _EPOCH) if 0.0 < float(np.median(np.abs(np.diff(t)))) < _LARGEST_STEP else None

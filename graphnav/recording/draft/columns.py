@@ -147,7 +147,7 @@ def match_columns(header: Sequence[str], stem: str = "") -> FileColumns:
                 units[f"{kind}{x}"] = bare[x][1]
     if "week" in names and not re.fullmatch(_OF_WEEK, split_unit(names.get("t", ""))[0]):
         del names["week"]
-    # a single letter is not enough when the triple is incomplete
+    # a single letter does not identify an incomplete triple
     for kind in "ga":
         if not all(f"{kind}{x}" in names for x in "xyz"):
             for x in "xyz":
@@ -164,7 +164,8 @@ def find_clocks(header: Sequence[str]) -> list[str]:
 
 def split_unit(name: str) -> tuple[str, str]:
     """The normalised name and the unit in it ('' if none)."""
-    name = re.sub(r"[(\[]\s*([xyz]|lat|lon|alt)\s*[)\]]\s*$", r"_\1", name, flags=re.IGNORECASE)  # a part, no unit
+    # part of the name, not a unit
+    name = re.sub(r"[(\[]\s*([xyz]|lat|lon|alt)\s*[)\]]\s*$", r"_\1", name, flags=re.IGNORECASE)
     bracket = re.search(r"[(\[]([^)\]]*)[)\]]\s*$", name)
     base = name[: bracket.start()] if bracket else name
     base = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", base)

@@ -1,4 +1,4 @@
-"""Guesses from magnitude and course of the numbers: units, axes, clock offsets, noise; each with its confidence."""
+"""Guesses of units, axes, clock offsets and noise from magnitude and time course; each with its confidence."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def guess_accel_unit(path: Path, accel: Array, stated: str | None) -> Guess:
         If gravity has been taken out, or the numbers are raw counts.
     """
     size = float(np.median(np.linalg.norm(accel, axis=-1)))
-    lasting = float(np.linalg.norm(np.mean(accel, axis=0))) > _MEAN_SHARE * size  # more than a motion alone
+    lasting = float(np.linalg.norm(np.mean(accel, axis=0))) > _MEAN_SHARE * size  # more than motion alone causes
     for unit, scale in FORCE.items():
         if lasting and 0.8 * STANDARD_GRAVITY < size * scale < 1.25 * STANDARD_GRAVITY:
             return Guess(unit, f"the median force, {size:.4g}, is then that of gravity")
@@ -137,14 +137,16 @@ def guess_fix_numbers(types: Array, sd: Array | None) -> Guess:
     A fixed solution is 1 or 4, and nothing else is that precise; the other numbers must be consistent with it.
     """
     if sd is None:
-        return Guess(None, "no sigmas tell whose numbers they are")
+        return Guess(None, "there are no sigmas to identify the convention")
     typical = {int(k): float(np.median(sd[types == k])) for k in np.unique(types[np.isfinite(types)])}
     precise = {k for k, s in typical.items() if s < _FIXED}
     for whose, fixed, known in (("rtklib", 1, range(7)), ("nmea", 4, (0, 1, 2, 4, 5, 9))):
         floats = {2} if whose == "rtklib" else {5}  # converged ones may state as little
         if fixed in precise and precise <= {fixed} | floats and set(typical) <= set(known):
-            return Guess(whose, f"fixes of {fixed} state {typical[fixed]:.2g} m at the median, as fixed ones do")
-    return Guess(None, "its numbers and the sigmas do not tell whose they are")
+            return Guess(
+                whose, f"fixes of type {fixed} have a median sigma of {typical[fixed]:.2g} m, as fixed solutions do"
+            )
+    return Guess(None, "neither its numbers nor the sigmas identify the convention")
 
 
 def guess_up(accel: Array) -> tuple[Array, str]:

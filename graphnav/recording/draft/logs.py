@@ -160,7 +160,7 @@ def read_log(path: Path, topics: Sequence[str] = ()) -> dict[str, Source]:
 
 
 def _find_second(header: list[str], columns: matching.FileColumns, core: Sequence[str]) -> str:
-    """The columns of another sensor of the kind that is told by its `core`, in words; '' where there is none."""
+    """Name the columns of a second sensor of the same kind, recognised by its `core`; '' if there is none."""
     rest = matching.match_columns([name for name in header if name not in columns.names.values()]).names
     names = [rest[ours] for ours in core if ours in rest]
     return f"{names[0]} to {names[-1]}" if len(names) == len(core) else ""

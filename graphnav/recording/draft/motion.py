@@ -1,8 +1,8 @@
 """Two sensors of the same motion: clock offset, unit, and forward direction.
 
 The turn rate about up, of the gyro and of the course over ground, is the same signal whatever the mount: the ratio of
-the two is the gyro's unit and, for unrelated clocks, the best agreement gives a rough offset. It is not precise: ahead
-of the rear axle the course turns before the body does, by the distance over the speed.
+the two is the gyro's unit and, for unrelated clocks, the best agreement gives a rough offset. It is not precise: the
+course of a point ahead of the rear axle leads the heading by the distance over the speed.
 
 The accelerations along and across the course are those that the accelerometer measured in its own horizontal plane,
 rotated by the angle of the mount: planar vectors as complex numbers, least squares, at the clock offset of best
@@ -29,7 +29,7 @@ SEARCHED = 3.0  # s, range of the offset of clocks that overlap already
 
 @dataclass(frozen=True)
 class Course:
-    """Motion over ground on an even grid: NaN turn rate and acceleration where it is too slow to have a course."""
+    """Motion over ground on an even grid; turn rate and acceleration are NaN at speeds too low for a course."""
 
     t: Array  # (K,) s
     speed: Array  # (K,) m/s

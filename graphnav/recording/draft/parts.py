@@ -12,7 +12,7 @@ from graphnav.recording.draft.plain import Plain
 
 
 def join_parts(some: Sequence[Source]) -> Source | None:
-    """One log of several with the same columns, each beginning after the end of the one before; None of others."""
+    """Join logs with the same columns, each beginning after the end of the one before; None if they are not such."""
     first, *rest = parts = sorted(some, key=lambda s: 0.0 if s.log is not None else float(s.t[0]))
     alike = all(s.log is None and _describe(s) == _describe(first) for s in parts)
     if not alike or any(after.t[0] <= before.t[-1] for before, after in zip(parts, rest, strict=False)):
@@ -24,6 +24,6 @@ def join_parts(some: Sequence[Source]) -> Source | None:
 
 
 def _describe(source: Source) -> tuple[object, ...]:
-    """What parts of one log have in common; times of day begin again, so they tell nothing of the order."""
+    """Properties common to the parts of one log; times of day restart and so do not define the order."""
     daily = source.path if source.plain is not None and source.plain.daily else None
     return source.columns.names, source.columns.units, source.t_unit.value, source.week, daily

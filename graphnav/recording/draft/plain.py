@@ -80,7 +80,7 @@ def read_plain(path: Path) -> Plain | None:
     start = start if start[:2] in _WIDE else start.rstrip(b"\0")
     if b"\0" in start and start[:2] not in _WIDE:
         return None
-    if len(start) == _START:  # most likely cut off within a line
+    if len(start) == _START:  # probably cut off within a line
         start = start[: start.rindex(b"\n")] if b"\n" in start else start
     begin, _ = _decode(start)
     layout = _lay_out(path, _read_lines(begin.splitlines()))
@@ -98,7 +98,7 @@ def read_plain(path: Path) -> Plain | None:
         done.append("it ends within a line, which is left out")
     wrong = next((k for k, row in enumerate(rows) if len(row) != len(names)), None)
     if wrong is not None and (not done or match_columns(names, path.stem).sensor is None):
-        return None  # a CSV file, whose reader says what is wrong, or notes
+        return None  # a CSV file: its reader reports errors and notes
     if wrong is not None:
         raise RecordingError(
             f"{path}, line {lines[layout.first + wrong][0]}: has {len(rows[wrong])} fields where the header has "
@@ -224,9 +224,8 @@ def _are_units(cells: Sequence[str]) -> bool:
 def _write_plainly(cells: dict[str, list[str]], mark: str | None) -> tuple[dict[str, list[str]], list[str]]:
     """Numbers with decimal commas or marks between thousands written with a decimal point alone, and notes.
 
-    One program wrote the table, so one mark is the decimal's in all of it: that of numbers that no grouping by three
-    explains; where there is none, the point in a table with commas between its fields, as where these are decimal it
-    needs others.
+    A table has one decimal mark throughout: that of numbers which are no grouping by three; where there are none, the
+    point if commas separate the fields.
     """
     marked = [cell for some in cells.values() for cell in some if _MARKED.fullmatch(cell)]
     if not any("," in cell or cell.count(".") > 1 or _SPACED.search(cell) for cell in marked):

@@ -1,4 +1,4 @@
-"""Raw observations among the logs of a draft: files by their first bytes, and which is the rover and which the base."""
+"""Raw observations among the logs of a draft: recognition by first bytes, and roles of rover and base."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ from graphnav.recording.draft.guesses import Guess
 _PVT = b"\xb5\x62\x01\x07"
 _PACKED = (".gz", ".z", ".zip", ".bz2")
 _TABLE_ENDINGS = (".csv", ".tsv")
-_HEAD_BYTES = 1 << 18  # bytes that tell what a file is
+_HEAD_BYTES = 1 << 18  # number of first bytes by which a file is recognised
 Llh = tuple[float, float, float]
-_MOVED = 5.0  # sigmas of a single-point position that an antenna is off its median, which moves
+_MOVED = 5.0  # sigmas of a single-point position from its median above which an antenna moves
 
 
 @dataclass
@@ -41,14 +41,14 @@ class RawFiles:
 
 @dataclass(frozen=True)
 class RawFound:
-    """What [raw_gnss] is drafted from."""
+    """Data for the draft of [raw_gnss]."""
 
     files: dict[str, tuple[Path, ...]]
     raw: RawGnss
     fixes: SinglePoint
-    clock: Guess  # of the recording, the words of `parse_clock`; None where nothing tells, or the IMU's log does
+    clock: Guess  # clock of the recording in the form of `parse_clock`; None where unknown, or known from the IMU's log
     dated: bool  # whether the times of the IMU are known
-    base: tuple[Llh, str] | None  # place of the base, m in e, and why
+    base: tuple[Llh, str] | None  # position of the base, m in e, and the reason
     notes: tuple[str, ...]
 
     @property
@@ -163,7 +163,7 @@ _WHY = {
 
 
 def tell_kind(path: Path) -> tuple[str | None, bool]:
-    """The key of [raw_gnss] that a file is for, and whether it is a log of fixes as well."""
+    """The key of [raw_gnss] that a file belongs to, and whether it is a log of fixes as well."""
     name = path.name.lower()
     for packed in _PACKED:
         name = name.removesuffix(packed)
@@ -176,7 +176,7 @@ def tell_kind(path: Path) -> tuple[str | None, bool]:
             data = unpack_bytes(path)
         if is_ubx(data):
             return "observed", _PVT in unpack_bytes(path)
-    except RecordingError:  # said where the file is read
+    except RecordingError:  # reported where the file is read
         return None, False
     first = data[:200].partition(b"\n")[0].decode("latin-1")
     label, kind = first[60:80].strip(), first[20:21]
@@ -192,7 +192,7 @@ def tell_kind(path: Path) -> tuple[str | None, bool]:
 
 
 def _guess_clock(t: Array, every: dict[Path, Observations]) -> Guess:
-    """What t = 0 of the IMU is, by the times of the observations."""
+    """Guess the date of the IMU's t = 0 from the times of the observations."""
     if t[0] > UNIX:
         return Guess("unix", "the stamps are dates of this century, s since 1970")
     for obs in every.values():
@@ -225,7 +225,7 @@ def _choose_rover(
 
 
 def _moves(path: Path, placing: dict[str, tuple[Path, ...]]) -> bool:
-    """Whether an antenna was ever further from its median place than its single-point positions are good to."""
+    """Whether an antenna moves: a single-point position is farther from the median than its sigma allows."""
     fixes = _solve_alone(path, placing)
     good = np.isfinite(fixes.p[:, 0])
     away = np.linalg.norm(fixes.p[good] - np.median(fixes.p[good], axis=0), axis=1)
@@ -238,7 +238,7 @@ def _solve_alone(path: Path, placing: dict[str, tuple[Path, ...]]) -> SinglePoin
 
 
 def _guess_base_place(path: Path, obs: Observations, placing: dict[str, tuple[Path, ...]]) -> tuple[Llh, str]:
-    """Where the base stands, m in e, and why."""
+    """Position of the base, m in e, and the reason."""
     x, y, z = np.nanmedian(_solve_alone(path, placing).p, axis=0).tolist()
     if obs.marker is None:
         return (x, y, z), "CHECK: m, Earth-centred; its header has none, this is its single-point position"

@@ -199,7 +199,7 @@ def _choose_source(sensor: str, some: list[Source], left: list[str]) -> Source |
             f"{some[1].path}: a second imu, at the same time as {some[0].path}; name only one of them",
             key="draft.two_imus",
         )
-    # uncorrected readings come second: they are the same, in other units on some phones
+    # uncalibrated readings come second: they are the same sensor, on some phones in other units
     best = min(some, key=lambda s: ("uncalibrated" in s.path.name.lower(), -len(s)))
     if sensor == "odometer":
         best = some[0]  # a receiver's speed beside a wheel's

@@ -90,7 +90,7 @@ def check_names(names: Sequence[str], gps_zero: float | None) -> None:
     """
     if "nmea" in names and gps_zero is None:
         raise RecordingError(
-            "--export nmea: needs the time of day, and the zero of t is not known; say clock in recording.toml",
+            "--export nmea: needs the time of day, and the zero of t is not known; set clock in recording.toml",
             key="export.time_of_day",
         )
     if "parquet" in names and find_spec("pyarrow") is None:

@@ -121,7 +121,7 @@ def _load_topics(chosen: Format, source: str | Path, topics: Sequence[str]) -> L
     """Read the log with these topics."""
     if chosen.choose is None:
         raise RecordingError(
-            f"--topic {topics[0]}: {source} is no ROS bag; in a recording.toml say topic in the sensor's table",
+            f"--topic {topics[0]}: {source} is no ROS bag; in a recording.toml set topic in the sensor's table",
             key="option.not_here",
         )
     return chosen.choose(source, topics)

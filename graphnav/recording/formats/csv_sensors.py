@@ -162,7 +162,7 @@ def list_needed(sensor: Sensor, rows: Table) -> tuple[str, ...]:
             return some if len([s for s in sensor.needs if all(name in rows for name in s)]) == 1 else ()
     sets = " or ".join(" and ".join(some) for some in sensor.needs)
     raise RecordingError(
-        f'{rows.path}: no column {sets}; if it has another name, say columns = {{ name = "..." }}', key="table.column"
+        f'{rows.path}: no column {sets}; if it has another name, set columns = {{ name = "..." }}', key="table.column"
     )
 
 

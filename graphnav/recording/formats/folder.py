@@ -160,7 +160,7 @@ def _load_raw(
     """The raw observations of [raw_gnss], and single-point fixes computed from them."""
     if zero is None:
         raise RecordingError(
-            f"{path}: 'clock': [raw_gnss] needs to know what t = 0 is: say clock = \"gps week 2130\" or a UTC date",
+            f"{path}: 'clock': [raw_gnss] needs to know what t = 0 is: set clock = \"gps week 2130\" or a UTC date",
             key="clock.unknown",
         )
     from graphnav.gnss import columns

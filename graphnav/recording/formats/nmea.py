@@ -18,7 +18,7 @@ from graphnav.core.files import parse_number, read_bytes
 from graphnav.core.notes import format_count
 from graphnav.core.rotation import Array
 from graphnav.core.timescales import date_week_times, utc_to_gps
-from graphnav.recording import Gnss, fix_types
+from graphnav.recording import Gnss, convert_fix_types
 from graphnav.recording.formats import ubx
 from graphnav.recording.formats.registry import Log, log_format, read_first_bytes
 from graphnav.recording.formats.repair import DEFAULT_SD, DEFAULT_SD_V, NMEA_TYPES, Remarks, compute_horizontal_velocity
@@ -113,7 +113,7 @@ def load(path: Path) -> Log:
             "gnss.rows_left_out",
             f"left out {format_count(len(t) - len(order), 'fix', 'fixes')} without a height or with another's time",
         )
-    kinds = fix_types(np.array([e.gga.quality for e in fixes])[order], NMEA_TYPES)
+    kinds = convert_fix_types(np.array([e.gga.quality for e in fixes])[order], NMEA_TYPES)
     v, sd_v = (None if x is None else x[order] for x in (v, sd_v))
     satellites = np.array([_parse_field(e.gga.numSV) for e in fixes])[order]
     gnss = Gnss(t[order], llh[order], sd[order], v, sd_v, type=kinds, satellites=satellites)

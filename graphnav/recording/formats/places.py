@@ -1,4 +1,4 @@
-"""Places as a file has them: which rows hold one, and latitude, longitude and height of those in rad and m."""
+"""Positions of a file: usable rows, and their latitude, longitude and height in rad and m."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _RADIANS = (1.58, 3.15)  # |lat|, |lon| that angles in radians cannot exceed
 def find_places(lat: Array, lon: Array, scale: float) -> Selection:
     """Which rows (N,), with angles in units of `scale` rad, are a place: neither 0, 0 nor beyond the poles.
 
-    All rows, where fewer than half are: it is then the unit that is wrong, not the rows.
+    All rows, where fewer than half are: then the unit is wrong, not the rows.
     """
     with np.errstate(invalid="ignore"):
         possible = np.abs(lat) * scale <= np.pi / 2
@@ -58,7 +58,7 @@ def convert_geodetic(rows: Table, unit: str | None, height: float, label: str, r
     lat, lon, h = rows["lat"], rows["lon"], height * rows["h"]
     if unit is None and np.abs(lat).max() < _RADIANS[0] and np.abs(lon).max() < _RADIANS[1]:
         raise RecordingError(
-            f"{rows.path}: lat and lon look like radians (first {lat[0]:g}, {lon[0]:g}); say "
+            f"{rows.path}: lat and lon look like radians (first {lat[0]:g}, {lon[0]:g}); set "
             'units = { angle = "rad" } if they are, { angle = "deg" } if the drive really is there',
             key="table.radians",
         )
@@ -107,4 +107,4 @@ def _guess_other_form(lat: Array, lon: Array, label: str) -> str:
     if all((np.abs(x) % 100.0 < 60.0).all() and np.abs(x).max() < 100.0 * top for x, top in ((lat, 91), (lon, 181))):
         whole, minutes = divmod(abs(lat[0]), 100.0)
         return f"; degrees and minutes together, as in NMEA? {lat[0]:g} is then {whole:g} deg {minutes:g} min"
-    return '; if they are metres, name them x and y and say frame = "local"' if label == "truth" else ""
+    return '; if they are metres, name them x and y and set frame = "local"' if label == "truth" else ""

@@ -27,7 +27,7 @@ def count_pulses(
         remarks.add(
             "odometer.pulses_read_as",
             f"the odometer's pulses are taken as {'a running count' if kind == 'cumulative' else 'counts per row'}; "
-            f'if they are not, say pulses = "{"per_row" if kind == "cumulative" else "cumulative"}"',
+            f'if they are not, set pulses = "{"per_row" if kind == "cumulative" else "cumulative"}"',
         )
     if kind == "per_row":  # those of row k were counted between rows k-1 and k
         return np.cumsum(pulses) - pulses[0]

@@ -12,7 +12,7 @@ from graphnav.core.errors import RecordingError
 from graphnav.core.notes import Note, format_count
 from graphnav.core.rotation import Array
 from graphnav.core.timescales import find_restarts
-from graphnav.recording import FIX_TYPES, fix_types
+from graphnav.recording import FIX_TYPES, convert_fix_types
 from graphnav.recording.formats.table import Selection, Table
 from graphnav.sensors.tables import TIME_UNITS, Keep
 
@@ -22,8 +22,8 @@ VAGUEST, VAGUEST_V = 1e5, 1e4  # m, m/s; a fix with a larger sigma carries no in
 _LEAST_SIGMA = 1e-9  # m, m/s; a smaller sigma is not meant as one
 _SET_BACK_PERIODS = 10.0  # periods; rows that overtake each other are closer
 _PAUSE = 1.0  # s; longer steps of an IMU are gaps
-_BURST = 0.3  # share of the mean step that the middle one is where rows come in bursts
-_REPEATED = 0.6  # share of the rows with the time of the row before that no log has
+_BURST = 0.3  # ratio of median to mean step below which rows come in bursts
+_REPEATED = 0.6  # share of rows with the stamp of the previous row above which the log is refused
 
 
 # 1-sigma where a recording states none, from the GPS Standard Positioning Service Performance Standard (5th ed.,
@@ -130,7 +130,7 @@ def select_usable_rows(
 
 
 def find_repeated(path: Path, t: Array) -> NDArray[np.bool_]:
-    """(N,) which of the stamps, in order, are those of the row before.
+    """(N,) mask of stamps, in order, that equal the previous one.
 
     Raises
     ------
@@ -184,7 +184,7 @@ def _check_passes(rows: Table, label: str) -> None:
 
 
 def format_row_count(mask: Selection, label: str) -> str:
-    """How many rows (N,) are meant, and of what."""
+    """The number of rows in a mask (N,), with the sensor's label."""
     return format_count(mask.sum(), f"{label} row".strip())
 
 
@@ -205,7 +205,7 @@ def _check_imu_time(rows: Table, unit: str) -> None:
     if 1e-5 < step < 0.5:
         return
     fitting = [u for u in TIME_UNITS if 2.5e-4 <= step / TIME_UNITS[unit] * TIME_UNITS[u] <= 0.1 and u != unit]
-    hint = f'; if t is in {fitting[0]}, say units = {{ t = "{fitting[0]}" }}' if fitting else ""
+    hint = f'; if t is in {fitting[0]}, set units = {{ t = "{fitting[0]}" }}' if fitting else ""
     if step == 1.0:
         hint += "; if it counts rows, write times instead"
     raise RecordingError(
@@ -296,12 +296,12 @@ def parse_fix_types(rows: Table, numbers: str) -> NDArray[np.intp] | None:
     bad = np.flatnonzero(~np.isnan(types) & ~np.isin(types, list(known)))
     if len(bad):
         there = ", ".join(f"{k} {FIX_TYPES[ours]}" for k, ours in known.items() if ours)
-        hint = "" if numbers == "nmea" else '; if they are GGA\'s, say units = { type = "nmea" }'
+        hint = "" if numbers == "nmea" else '; if they are GGA\'s, set units = { type = "nmea" }'
         where = rows.describe_place(bad[0], "type")
         raise RecordingError(
             f"{where}: {types[bad[0]]:g} is no type of fix: {there}, blank where unknown{hint}", key="gnss.type"
         )
-    return fix_types(types, known)
+    return convert_fix_types(types, known)
 
 
 # 1-sigma of a vertical velocity that is taken as zero because a receiver gives only speed and course: a slope of 10 %

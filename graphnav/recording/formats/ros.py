@@ -19,7 +19,7 @@ from graphnav.core.errors import RecordingError
 from graphnav.core.notes import format_count
 from graphnav.core.rotation import Array
 from graphnav.core.timescales import unix_to_gps
-from graphnav.recording import Gnss, Imu, ImuNoise, Odometer, fix_types
+from graphnav.recording import Gnss, Imu, ImuNoise, Odometer, convert_fix_types
 from graphnav.recording.formats.registry import Log, log_format
 from graphnav.recording.formats.repair import DEFAULT_SD, DEFAULT_SD_V, Remarks
 from graphnav.recording.formats.schema import parse_axes_letters
@@ -196,7 +196,7 @@ def _make_gnss(topic: _Topic, remarks: Remarks) -> Gnss | None:
     remarks.add("gnss.read_as", f"GNSS: {topic.name}; heights above the ellipsoid")
     remarks.add("gnss.lever_arm_unknown", "GNSS: the antenna's lever arm is not in the log and taken as zero")
     # many drivers always write 0: without any other status it carries no information
-    kinds = fix_types(rows[:, 6], _STATUS) if rows[:, 6].any() else None
+    kinds = convert_fix_types(rows[:, 6], _STATUS) if rows[:, 6].any() else None
     return Gnss(t, np.column_stack([np.radians(rows[:, :2]), rows[:, 2]]), sd, type=kinds)
 
 

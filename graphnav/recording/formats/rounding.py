@@ -1,4 +1,4 @@
-"""What the digits of a log round off.
+"""Rounding errors of the positions in a log.
 
 A value rounded to a step is off by an error that is uniform over the step, of a standard deviation of step / sqrt(12)
 (Widrow, Kollar and Liu 1996, "Statistical theory of quantization"). No variance factor scales it.
@@ -11,15 +11,15 @@ import numpy as np
 from graphnav.core.earth import A
 from graphnav.core.rotation import Array
 
-_MEANT_DIGITS = 10  # decimals that degrees in double precision have
-_DEGREE_PARTS = 1.0, 60.0  # of a degree that logs count in: degrees, and minutes as of NMEA
-_FEWEST = 2  # values that tell a step: of finer ones, one pair in a hundred has it, and hardly any fixes are but a pair
+_MEANT_DIGITS = 10  # decimals of degrees in double precision
+_DEGREE_PARTS = 1.0, 60.0  # units of logs, as a share of a degree: degrees, and minutes as in NMEA
+_FEWEST = 2  # values that determine a step: with finer ones a pair in a hundred has it by chance
 
 
 def measure_rounding(llh: Array) -> tuple[float, ...]:
-    """Standard deviation of what places are rounded by, east, north and up, m; 0 where no step shows.
+    """Standard deviation of the rounding error of positions, east, north and up, m; 0 where no step is found.
 
-    As on a sphere: good to half a percent.
+    For a spherical Earth: accurate to half a per cent.
 
     Parameters
     ----------
@@ -36,7 +36,7 @@ def measure_rounding(llh: Array) -> tuple[float, ...]:
 
 
 def find_step(x: Array) -> float:
-    """The power of ten that values (N,) are whole multiples of; 0 where there is none, or too few differ to tell."""
+    """The power of ten of which values (N,) are whole multiples; 0 without one, or with too few distinct values."""
     x = np.unique(x)
     for digits in range(_MEANT_DIGITS + 1):
         steps = x * 10.0**digits

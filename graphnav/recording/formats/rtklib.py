@@ -11,7 +11,7 @@ import numpy as np
 
 from graphnav.core.errors import RecordingError
 from graphnav.core.notes import format_count
-from graphnav.recording import Gnss, fix_types
+from graphnav.recording import Gnss, convert_fix_types
 from graphnav.recording.formats.registry import Log, log_format, read_first_bytes
 from graphnav.recording.formats.repair import Remarks
 from graphnav.recording.formats.trajectories import read_trajectory
@@ -57,7 +57,7 @@ def load(path: Path) -> Log:
         remarks.add(
             "gnss.velocity_sigma_assumed", "velocity sigmas of 0.2, 0.2, 0.4 m/s are assumed: the file states none"
         )
-    kinds = None if track.fix_type is None else fix_types(track.fix_type)
+    kinds = None if track.fix_type is None else convert_fix_types(track.fix_type)
     remarks.add(
         "gnss.lever_arm_unknown", "GNSS: position of the antenna; its lever arm is not in the file and taken as zero"
     )

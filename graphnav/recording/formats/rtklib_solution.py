@@ -158,7 +158,7 @@ def _parse_degrees(parts: Array | None) -> Array:
 
 
 def _turn_sigmas(turns: Array, sd: Array | None, mixed: Array | None) -> Array | None:
-    """Sigmas (K, 3) along the axes of rotations (K, 3, 3), from variances and covariances of axes 01, 12 and 20."""
+    """Sigmas (K, 3) along the axes of rotations (K, 3, 3), from variances and the covariances 01, 12 and 20."""
     if sd is None:
         return None
     P = np.zeros((len(sd), 3, 3))

@@ -137,7 +137,7 @@ class ImuTable(SensorTable):
     @model_validator(mode="after")
     def _one_mount(self) -> ImuTable:
         if self.axes is not None and (self.forward is not None or self.up is not None):
-            raise ValueError("say either axes or forward and up, not both")
+            raise ValueError("give either axes or forward and up, not both")
         if (self.forward is None) != (self.up is None):
             raise ValueError("forward and up belong together: give both")
         return self
@@ -190,7 +190,7 @@ class RawGnssTable(TomlTable):
     )  # fmt: skip
 
     rover: Files = Field(description="RINEX or UBX files, or one CSV file")
-    nav: Files | None = Field(None, description="RINEX navigation files; UBX files may hold what they would")
+    nav: Files | None = Field(None, description="RINEX navigation files; UBX files may hold the ephemerides themselves")
     sp3: Files | None = Field(None, description="precise orbits")
     clk: Files | None = Field(None, description="precise clocks")
     antex: Files | None = Field(None, description="antennas of the satellites, for precise orbits")
@@ -199,7 +199,9 @@ class RawGnssTable(TomlTable):
     lever_arm: Vector = Field((0.0, 0.0, 0.0), description="m from the IMU: right, forward, up")
     time_offset: Number = Field(0.0, description="s, added to the receiver's stamps on the recording's clock")
     columns: dict[str, str] = Field({}, description="of a CSV file: our name = the file's")
-    corrected: tuple[Literal["clock", "troposphere"], ...] = Field((), description="already taken off the codes")
+    corrected: tuple[Literal["clock", "troposphere"], ...] = Field(
+        (), description="corrections already applied to the codes"
+    )
     stamps: Literal["receiver", "nominal"] = Field(
         "receiver", description="nominal: rounded to the epoch, while codes are of the receiver's own clock"
     )
@@ -245,7 +247,7 @@ class OdometerTable(SensorTable):
     @model_validator(mode="after")
     def _one_source(self) -> OdometerTable:
         if self.metres_per_pulse is not None and self.use is not None:
-            raise ValueError("say either metres_per_pulse (pulses are used) or use (the speeds of wheels are)")
+            raise ValueError("give either metres_per_pulse (pulses are used) or use (the speeds of wheels are)")
         for key, needs in (("pulses", self.pulses is not None), ("columns.pulses", "pulses" in self.columns)):
             if needs and self.metres_per_pulse is None:
                 raise ValueError(f"{key} has no effect without metres_per_pulse, the way of one pulse in m")
@@ -276,7 +278,7 @@ class TruthTable(SensorTable):
     @model_validator(mode="after")
     def _one_kind(self) -> TruthTable:
         if (self.file is None) == (self.closed_loop_sigma is None):
-            raise ValueError("say either file or closed_loop_sigma")
+            raise ValueError("give either file or closed_loop_sigma")
         if self.topic:
             raise ValueError("topic is for imu, gnss and odometer: a bag holds no truth")
         return self

@@ -1,4 +1,4 @@
-"""Removal of invalid rows from other programs' logs: not numbers, impossible positions or times."""
+"""Removal of invalid rows from other programs' logs: not finite, impossible positions or times."""
 
 from __future__ import annotations
 

@@ -118,7 +118,7 @@ def read_table(
         if theirs in header:
             file_names[name] = theirs
         elif name in required or name in renamed:
-            hint = "" if name in renamed else f'; if it has another name, say columns = {{ {name} = "..." }}'
+            hint = "" if name in renamed else f'; if it has another name, set columns = {{ {name} = "..." }}'
             raise RecordingError(
                 f"{path}: no column '{theirs}' (there are: {_list_names(header)}){hint}", key="table.column"
             )

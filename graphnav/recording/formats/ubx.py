@@ -19,7 +19,7 @@ from graphnav.core.files import open_file
 from graphnav.core.notes import format_count
 from graphnav.core.rotation import Array
 from graphnav.core.timescales import WEEK, utc_to_gps
-from graphnav.recording import Gnss, Imu, Odometer, fix_types
+from graphnav.recording import Gnss, Imu, Odometer, convert_fix_types
 from graphnav.recording.formats.registry import Log, log_format, read_first_bytes
 from graphnav.recording.formats.repair import Remarks
 
@@ -190,7 +190,7 @@ def _make_gnss(fixes: list[Any], content: _Content, remarks: Remarks) -> Gnss:
     )
     kinds = np.array([_classify_fix(m) for m in fixes])[order]
     used = np.array([float(m.numSV) for m in fixes])[order]
-    return Gnss(t[order], llh[order], sd[order], v[order], sd_v[order], type=fix_types(kinds), satellites=used)
+    return Gnss(t[order], llh[order], sd[order], v[order], sd_v[order], type=convert_fix_types(kinds), satellites=used)
 
 
 def _classify_fix(message: Any) -> int:

@@ -20,10 +20,10 @@ from graphnav.recording.plausibility.readings import NOISY, RARE
 
 @dataclass(frozen=True)
 class StraightLines:
-    """What tells a row on a line from a measured one."""
+    """Test for rows on straight lines, as opposed to measured ones."""
 
-    steps: tuple[float, ...]  # of the digits of each axis
-    log_chance: float  # of a measured row to lie on a line on all axes
+    steps: tuple[float, ...]  # resolution of each axis
+    log_chance: float  # probability of a measured row to lie on a line on all axes
 
     def hold(self, first: tuple[float, ...], middle: tuple[float, ...], last: tuple[float, ...]) -> bool:
         """Whether a row lies on the line between two others, each its time and its reading of every axis."""
@@ -35,7 +35,7 @@ class StraightLines:
 
 
 def find_filled(t: Array, readings: Iterable[Array]) -> tuple[NDArray[np.bool_], StraightLines | None]:
-    """Which rows no sensor measured: stretches that one in a thousand recordings (`RARE`) would contain by chance.
+    """Find rows that were not measured: stretches that one in a thousand recordings (`RARE`) would contain by chance.
 
     An axis without noise, as of a simulation, whose deviations seldom change their sign, does not count.
 
@@ -55,7 +55,7 @@ def find_filled(t: Array, readings: Iterable[Array]) -> tuple[NDArray[np.bool_],
     n = max(5, round(1.0 / compute_period(t))) if len(t) > 1 else 5
     if len(t) < 10 * n:
         return filled, None
-    share = np.diff(t)[:-1] / (t[2:] - t[:-2])  # of the way from one neighbour to the other
+    share = np.diff(t)[:-1] / (t[2:] - t[:-2])  # fraction of the interval from one neighbour to the other
     on_line, repeats, log_chance, steps = np.ones(len(share), dtype=bool), np.ones(len(share), dtype=bool), 0.0, []
     for x in readings:  # one by one: for a day each temporary array takes a hundred megabytes
         step = np.abs(np.diff(x))

@@ -135,7 +135,7 @@ def screen(recording: Recording) -> Screened:
         path = track
         if path is None and recording.odometer is not None:
             path = plausibility_odometer.build_odometer_track(recording.odometer)
-        # stamps that are late by now this, now that have no clock
+        # stamps with varying delays have no clock offset
         if track is not None and not any(f.key == "gnss.stamped_on_arrival" for f in findings):
             assert recording.gnss is not None
             odometer = crosschecks.fit_odometer(recording.odometer, track) if recording.odometer is not None else None
@@ -186,7 +186,7 @@ def check_imu_scale(recording: Recording) -> Iterator[Finding]:
         yield Finding(
             "refused",
             f"the gyro reads more than {GYRO_RANGE:g} rad/s, which no sensor of a vehicle or a foot does, in "
-            f'{100 * beyond:.0f} % of the rows: if it is deg/s, say units = {{ gyro = "deg/s" }} in [imu]',
+            f'{100 * beyond:.0f} % of the rows: if it is deg/s, set units = {{ gyro = "deg/s" }} in [imu]',
             "imu.gyro_unit",
         )
     with np.errstate(over="ignore", invalid="ignore"):
@@ -209,7 +209,7 @@ def check_imu_scale(recording: Recording) -> Iterator[Finding]:
 
 def _lacks_gravity(recording: Recording, f: float, steady: float) -> bool:
     """Whether a force of f m/s^2 in calm is without gravity: it has no direction that stays (`steady`, the size of its
-    mean over f, is small), or is of the right size otherwise, as the fixes' accelerations are felt so.
+    mean over f, is small), or its scale is right otherwise, by the fixes' accelerations.
     """
     gnss, imu = recording.gnss, recording.imu
     if f > STANDARD_GRAVITY:
@@ -222,7 +222,7 @@ def _lacks_gravity(recording: Recording, f: float, steady: float) -> bool:
     fit = None if track is None else crosschecks.fit_force(imu, track)
     if fit is None or fit.correlation < FAIR:
         return False
-    size = float(np.log(np.linalg.norm(fit.coefficients)))  # of the true one over that felt
+    size = float(np.log(np.linalg.norm(fit.coefficients)))  # ratio of the true acceleration to the measured one
     return abs(size) < abs(size + np.log(f / STANDARD_GRAVITY))
 
 
@@ -238,7 +238,7 @@ def _find_scale(f: float) -> str | None:
     g = STANDARD_GRAVITY
     if g / _SCALE_RATIO < f < g * _SCALE_RATIO:
         return None
-    units = {g / size: f'the accelerometer seems to be in {name}: say units = {{ accel = "{name}" }}'
+    units = {g / size: f'the accelerometer seems to be in {name}: set units = {{ accel = "{name}" }}'
              for name, size in FORCE.items() if name != "m/s2"}  # fmt: skip
     units[g * FORCE["g"]] = "the accelerometer seems to be in m/s2 already: leave out units.accel"
     near = min(units, key=lambda value: abs(np.log(max(f, 1e-9) / value)))

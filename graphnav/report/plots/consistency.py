@@ -77,7 +77,7 @@ def plot_nees(
     """
     scaled = {key: np.where(s.value > 0, s.value / np.array(dofs, float), np.nan) for key, s in series.items()}
     edges = [(chi_square_quantile(0.005, dof) / dof, chi_square_quantile(0.995, dof) / dof) for dof in dofs]
-    # errors cross zero: how close to it they come means nothing
+    # errors cross zero: how close they come to it is without meaning
     ylims = []
     for k, (low, high) in enumerate(edges):
         values = [np.log10(np.maximum(v[:, k], 0.3 * low)) for v in scaled.values()]

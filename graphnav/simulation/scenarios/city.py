@@ -116,5 +116,5 @@ def spread_gaps(path: Path, count: int, length: Span, rng: np.random.Generator) 
 
 SCENARIOS = [
     Scenario("urban", "20 min of town: lights, corners, slopes, two tunnels, parking backwards, wheel pulses", urban),
-    Scenario("electric", "a quarter of an hour of town in a car without an engine: its stops are silent", electric),
+    Scenario("electric", "a quarter of an hour of town in an electric car: no engine vibration at stops", electric),
 ]

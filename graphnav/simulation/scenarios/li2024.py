@@ -90,7 +90,7 @@ def li2024(
 
 
 def _list_events(edges: tuple[float, ...], seed: int) -> list[Boarding | Fidget]:
-    """Passengers: a door at stop 1, most at stop 2, two doors at stop 3; no seat is completely still."""
+    """Passengers: one door at stop 1, most at stop 2, two doors at stop 3; seated passengers move throughout."""
     rng = make_random(seed, "events")
 
     def place_event(stop: int, share: float) -> float:

@@ -48,8 +48,8 @@ _THINKING, _LONGEST_THOUGHT = 1.0 / 8.0, 20.0
 
 
 @dataclass(frozen=True)
-class Answer:
-    """Result of a judgement of the sensors."""
+class EstimationResult:
+    """Result of a noise estimation."""
 
     noise: NoiseModel
     notes: tuple[str, ...]
@@ -59,31 +59,31 @@ class Answer:
 
 
 @dataclass(frozen=True)
-class Question:
-    """What a judgement of the sensors is of."""
+class EstimationTask:
+    """Input of a noise estimation."""
 
     recording: Recording
-    every: Recording  # with the fixes, too, that are not used
+    every: Recording  # including fixes that are not used
     settings: Settings
     frame: LocalFrame
     found: Alignment
     times: Array  # (K,) s, keyframes, the first at the start of the recording: weights of rows hold at these
-    unit: Array  # (3,) m, in which the answer is to tell errors of the fixes that last for minutes and hours
+    unit: Array  # (3,) m, unit of the result for errors of the fixes over minutes and hours
 
 
-def answer(asked: Question) -> Answer:
-    """Judge the sensors.
+def run_estimation(task: EstimationTask) -> EstimationResult:
+    """Estimate the noise model.
 
     Raises
     ------
     EstimationError
-        If the rows do not tell.
+        If the rows do not determine it.
     """
-    settings, start = asked.settings, asked.found
+    settings, start = task.settings, task.found
     try:
-        stationary = detect(asked.every, settings).stationary
+        stationary = detect(task.every, settings).stationary
         base = build_problem(
-            asked.recording, settings, asked.frame, start.state, start_sigma(start), stationary, asked.times,
+            task.recording, settings, task.frame, start.state, start_sigma(start), stationary, task.times,
             parts_of_noise=True,
         )  # fmt: skip
         base = _share_horizontal_unit(base)
@@ -93,41 +93,41 @@ def answer(asked: Question) -> Answer:
         noise = estimate.noise
         used = apply_noise(base, noise)
         words, wrong = describe_noise(noise, used), faults.find_fault_spans(used)
-        return Answer(_convert_unit(noise, base, asked.unit), words, stationary, wrong, check_rows(asked.every))
+        return EstimationResult(_convert_unit(noise, base, task.unit), words, stationary, wrong, check_rows(task.every))
     except np.linalg.LinAlgError as error:
         raise EstimationError(str(error), key="solver.undetermined") from error
 
 
-class Judgement:
-    """An answer that is worked out in a thread of its own, from a copy of the question.
+class BackgroundEstimation:
+    """A noise estimation in a thread of its own, from a copy of its input.
 
-    The copy is because values computed at first use must not appear in the question while a checkpoint is written.
-    A checkpoint keeps the question; it is asked again on resuming.
+    The copy keeps values computed at first use out of the input while a checkpoint is written.
+    A checkpoint keeps the input; the estimation runs again on resuming.
 
     Parameters
     ----------
-    due : s, when the answer is to be used.
+    due : s, when the result is to be used.
     """
 
-    def __init__(self, asked: Question, due: float) -> None:
-        self.asked, self.due = asked, due
-        self._answer: Future[Answer] = _start(answer, copy.deepcopy(asked))
+    def __init__(self, task: EstimationTask, due: float) -> None:
+        self.task, self.due = task, due
+        self._result: Future[EstimationResult] = _start(run_estimation, copy.deepcopy(task))
 
-    def answer(self) -> Answer:
-        """Wait for the result, with the errors of `answer`."""
-        return self._answer.result()
+    def wait(self) -> EstimationResult:
+        """Wait for the result, with the errors of `run_estimation`."""
+        return self._result.result()
 
-    def __reduce__(self) -> tuple[type[Judgement], tuple[Question, float]]:
-        return Judgement, (self.asked, self.due)
+    def __reduce__(self) -> tuple[type[BackgroundEstimation], tuple[EstimationTask, float]]:
+        return BackgroundEstimation, (self.task, self.due)
 
 
-def _start(work: Callable[[Question], Answer], asked: Question) -> Future[Answer]:
+def _start(work: Callable[[EstimationTask], EstimationResult], task: EstimationTask) -> Future[EstimationResult]:
     """Have work done in a thread that nothing waits for at the end of the program."""
-    out: Future[Answer] = Future()
+    out: Future[EstimationResult] = Future()
 
     def do() -> None:
         try:
-            out.set_result(work(asked))
+            out.set_result(work(task))
         except BaseException as error:  # reported by whoever asks for the result
             out.set_exception(error)
 
@@ -158,14 +158,16 @@ def _convert_unit(noise: NoiseModel, base: Problem, unit: Array) -> NoiseModel:
     return replace(noise, figures=figures)
 
 
-def start_judging(
+def start_estimation(
     sensors: Sensors, settings: Settings, frame: LocalFrame, found: Alignment, times: Array, until: float
-) -> Judgement:
-    """Start to judge the sensors by their rows up to a time (s); `times` (K,) are the keyframes so far, s."""
+) -> BackgroundEstimation:
+    """Start a noise estimation from the rows up to a time (s); `times` (K,) are the keyframes so far, s."""
     recording, every = (sensors.make_recording(-np.inf, until, all_of_them) for all_of_them in (False, True))
     due = float(times[-1]) + min(_THINKING * settings.solver.lag, _LONGEST_THOUGHT)
     settings = drop_ambiguities(settings, sensors.setup)
-    return Judgement(Question(recording, every, settings, frame, found, times, sensors.gnss.compute_unit()), due)
+    return BackgroundEstimation(
+        EstimationTask(recording, every, settings, frame, found, times, sensors.gnss.compute_unit()), due
+    )
 
 
 def are_enough(sensors: Sensors, found: Alignment, span: float) -> bool:
