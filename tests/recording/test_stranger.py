@@ -86,6 +86,15 @@ def test_the_folder_of_a_phone(tokyo, tmp_path, capsys, total):
     assert rms(errors(drive, tmp_path / "out")) < rms(stranger.fix_errors(folder, drive))
 
 
+@pytest.mark.parametrize("span", [(0.0, 120.0), (360.0, 480.0), (600.0, 780.0)])
+def test_turns_that_agree_by_chance_shift_no_clock(shared_data, tmp_path, span):
+    """Few turns, wrong velocities in some fixes: another turn fits better than the right one."""
+    (drive,) = stranger.cuts(shared_data / "tokyo_20201105", [span])
+    folder = stranger.write_phone(tmp_path / "ride", drive)
+    run("init", folder, "-o", folder, "--quiet")
+    assert read(folder).gnss.t[-1] == pytest.approx(stranger.UNIX + drive.recording.gnss.t[-1], abs=1.0)
+
+
 def test_heights_of_a_phone_that_wander_are_not_said_to_be_in_another_unit(shared_data, tmp_path):
     (drive,) = stranger.cuts(shared_data / "tokyo_20201105", [(420.0, 600.0)])
     folder = stranger.write_phone(tmp_path / "ride", drive)
