@@ -67,7 +67,7 @@ def find_logs(paths: Sequence[Path], topics: Sequence[str] = ()) -> LogsFound:
             continue
         for sensor, source in found.items():
             every.setdefault(sensor, []).append(source)
-    others = _name_others(paths, files)
+    others = _name_others(paths, [*files, *raw.observed, *(path for some in raw.placing.values() for path in some)])
     if others:
         left.append(f"{others}: no logs of a kind that is known")
     if nothing:
