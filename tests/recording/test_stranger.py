@@ -200,6 +200,24 @@ def test_a_folder_of_what_loggers_leave_there(tokyo, tmp_path, capsys):
     assert len(recording.gnss.t) == len(drive.recording.gnss.t)
 
 
+def test_a_second_of_a_drive_is_drafted(tokyo, tmp_path):
+    (imu_header, imu), (header, fixes) = stranger.tables(tokyo[2])
+    folder = stranger.write_tables(
+        tmp_path / "log", (imu_header, imu[:30]), (header.replace("t,", "t_utc,", 1), fixes[:2])
+    )
+    run("init", folder, "-o", folder, "--quiet")
+    recording = read(folder)
+    assert (len(recording.imu.t), len(recording.gnss.t)) == (30, 2)
+
+
+def test_dates_in_ms_are_told_by_their_size(tokyo, tmp_path, capsys):
+    imu, (header, fixes) = stranger.tables(tokyo[2])
+    folder = stranger.write_tables(tmp_path / "log", imu, (header, [[f"{1e3 * float(t):.0f}", *x] for t, *x in fixes]))
+    text = '[imu]\nfile = "imu.csv"\n[gnss]\nfile = "gnss.csv"\nsd = [1.0, 1.0, 2.0]\n'
+    (folder / "recording.toml").write_text(f'format = "graphnav-recording/1"\nplatform = "vehicle"\n{text}')
+    assert 'units = { t = "ms" }' in refuse_command(capsys, "table.not_finite", "info", folder)
+
+
 def test_one_velocity_is_no_course(tokyo, tmp_path):
     imu, (header, rows) = stranger.tables(tokyo[2])
     some = [[*row, *(("1.0", "2.0", "0.0") if k == 20 else ("", "", ""))] for k, row in enumerate(rows)]

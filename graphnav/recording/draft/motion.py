@@ -111,6 +111,8 @@ def _differentiate(x: Array) -> Array:
 
 def compute_moving_mean(x: Array, window: float = _MEAN_OVER) -> Array:
     """Moving mean over some seconds, of the grid."""
+    if not len(x):
+        return x
     n = 2 * round(window / GRID / 2)
     kernel = np.ones(n + 1)
     kernel[[0, -1]] = 0.5
