@@ -112,7 +112,7 @@ def info(
         bool, typer.Option("--antenna", help="Also estimate the antenna's lever arm from the drive.")
     ] = False,
     quick: Annotated[
-        bool, typer.Option("--quick", help="Leave out the checks that solve the drive: signs of lever arms.")
+        bool, typer.Option("--quick", help="Leave out the checks that solve the drive: axes, signs of lever arms.")
     ] = False,
     format: FormatOption = None,
     topic: Topic = None,
@@ -132,9 +132,10 @@ def info(
         whole = read(pick_one(context, recording), topic or (), allow_outside, format)
         tell("checks")
         found = inspect(whole)
-        from graphnav.estimation.antenna import find_antenna, find_untold_arm, find_wrong_arms
+        from graphnav.estimation.antenna import find_antenna, find_untold_arm, find_wrong_arms, find_wrong_axes
 
-        more = find_wrong_arms(found.recording, found.findings) if found.trusted and not quick else []
+        drive = found.recording, found.findings
+        more = (find_wrong_axes(*drive) or find_wrong_arms(*drive)) if found.trusted and not quick else []
         last = [find_antenna(whole).finding] if antenna else find_untold_arm(found.recording)
         found = replace(found, findings=(*more, *found.findings, *last))
     print_out(found.format, found.to_dict, quiet, json)

@@ -9,8 +9,8 @@ from typing import Annotated
 import typer
 
 from graphnav.app.cli_options import AllowOutside, Export, FormatOption, Json, Point, Quiet, Topic
-from graphnav.app.talk import print_out, say, show_progress
-from graphnav.core.errors import ConfigError
+from graphnav.app.talk import NOT_MET, fail, print_out, say, show_progress
+from graphnav.core.errors import ConfigError, RecordingError
 from graphnav.core.progress import tell
 
 commands = typer.Typer()
@@ -200,17 +200,27 @@ def init(
                 write_csv(part / made, list(columns), list(columns.values()))
             (part / out.name).write_text(drafted.text, encoding="utf-8")
         tell("checking")
-        # the logs are where the user says
-        refuse(recording := read(out, allow_outside=True), screen(recording).findings)
+        open_question = None
+        try:  # the logs are where the user says
+            refuse(recording := read(out, allow_outside=True), screen(recording).findings)
+        except RecordingError as error:
+            open_question = error
     files = [out, *(folder / made for made in drafted.made)]
     print_out(
         lambda: "\n".join(
             [*(f"  {line}" for line in drafted.decisions), f"wrote {out}; look at the lines marked CHECK"]
         ),
-        lambda: {"decisions": drafted.decisions, "files": files},
+        lambda: {
+            "decisions": drafted.decisions,
+            "files": files,
+            "refused": open_question and {"key": open_question.key, "sentence": str(open_question)},
+        },
         quiet,
         json,
     )
+    if open_question is not None:
+        fail(f"{out} is written, but as it stands refused: {open_question}", NOT_MET, debug=False)
+        raise typer.Exit(NOT_MET)
 
 
 @commands.command(epilog="\b\nExample:\n  graphnav simulate urban -o out/urban --seed 1")

@@ -24,13 +24,17 @@ from graphnav.estimation.alignment import align
 from graphnav.estimation.contradictions import PRIOR_SIGMA
 from graphnav.estimation.noise.apply import apply_noise
 from graphnav.estimation.noise.estimate import estimate_noise
+from graphnav.estimation.noise.words import describe_turned_axes
 from graphnav.estimation.pipeline import choose_origin
-from graphnav.estimation.problem import build_problem
+from graphnav.estimation.problem import Problem, build_problem
 from graphnav.estimation.solvers.breakdown import explain_singular
 from graphnav.estimation.solvers.ekf import refilter
-from graphnav.estimation.solvers.passes import compute_sigmas, estimate_parameters
+from graphnav.estimation.solvers.passes import SmootherPass, compute_sigmas, estimate_parameters
 from graphnav.estimation.solvers.rts import smooth_backward
 from graphnav.recording import Recording, take_rows
+from graphnav.recording.checks.crosschecks import fit_forward
+from graphnav.recording.checks.tilt import CORRELATED
+from graphnav.recording.checks.tracks import compute_track
 
 _PRECISE = 0.3  # m, 1-sigma of fixes that are precise enough
 _LEAST_PART = 0.25  # m, of a component of an arm whose sign matters, or of its error: tape measures are better
@@ -96,16 +100,10 @@ def find_wrong_arms(recording: Recording, findings: Sequence[Finding] = ()) -> l
     where one of the `findings` is the cause.
     """
     gnss = recording.gnss
-    if any(f.severity != "note" and f.key in _MENDED_FIRST for f in findings):
+    if gnss is None or not _tells_of_arms(recording, findings) or np.median(gnss.sd[:, :2]) > _PRECISE:
         return []
-    if recording.platform != "vehicle" or gnss is None or len(gnss.t) < _FEWEST_FOR_ARM:
-        return []
-    if np.median(gnss.sd[:, :2]) > _PRECISE:
-        return []
-    second = np.floor(gnss.t)
-    thin = take_rows(gnss, np.concatenate([[True], np.diff(second) > 0.0]))
     try:
-        antenna, axle = _estimate_antenna(_find_turning(replace(recording, gnss=thin)))
+        antenna, axle = _estimate_antenna(_find_turning(recording))
     except EstimationError:
         return []
     out = []
@@ -133,6 +131,25 @@ def find_wrong_arms(recording: Recording, findings: Sequence[Finding] = ()) -> l
     return out
 
 
+def find_wrong_axes(recording: Recording, findings: Sequence[Finding] = ()) -> list[Finding]:
+    """A finding on the IMU's axes where a vehicle accelerates too little to show them, but does not travel along them.
+
+    As `find_wrong_arms`; also of coarse fixes.
+    """
+    gnss = recording.gnss
+    if gnss is None or not _tells_of_arms(recording, findings):
+        return []
+    track = compute_track(gnss)
+    felt = None if track is None else fit_forward(recording.imu, track)
+    if felt is not None and felt.correlation > CORRELATED:
+        return []  # `graphnav.recording.checks.axes` has looked
+    try:
+        turned = describe_turned_axes(*_smooth_with_open_arms(_find_turning(recording)))
+    except EstimationError:
+        return []
+    return [] if turned is None else [Finding("unreliable", turned, "imu.axes")]
+
+
 def find_untold_arm(recording: Recording) -> list[Finding]:
     """A note that the signs of the antenna's lever arm cannot be checked, as the fixes are too coarse for
     `find_wrong_arms`.
@@ -150,8 +167,21 @@ def find_untold_arm(recording: Recording) -> list[Finding]:
     return [Finding("note", sentence, "gnss.lever_arm_untold")]
 
 
+def _tells_of_arms(recording: Recording, findings: Sequence[Finding]) -> bool:
+    """Whether it is a vehicle's with enough fixes, and none of the `findings` comes first."""
+    return (
+        recording.platform == "vehicle"
+        and recording.gnss is not None
+        and len(recording.gnss.t) >= _FEWEST_FOR_ARM
+        and not any(f.severity != "note" and f.key in _MENDED_FIRST for f in findings)
+    )
+
+
 def _find_turning(recording: Recording) -> Recording:
-    """The part of a drive, at most `_PART` s long, that turns most while there are fixes."""
+    """The part of a drive, at most `_PART` s long, that turns most while there are fixes, of which a fix a second."""
+    assert recording.gnss is not None
+    first = np.concatenate([[True], np.diff(np.floor(recording.gnss.t)) > 0.0])
+    recording = replace(recording, gnss=take_rows(recording.gnss, first))
     imu, gnss = recording.imu, recording.gnss
     assert gnss is not None
     if recording.duration <= _PART:
@@ -164,8 +194,8 @@ def _find_turning(recording: Recording) -> Recording:
     return recording.crop(best, best + _PART)
 
 
-def _estimate_antenna(recording: Recording) -> tuple[Antenna, tuple[Array, Array, Array] | None]:
-    """The antenna, and the forward position of the point that does not slip, (1,) m each: stated, found, sigma."""
+def _smooth_with_open_arms(recording: Recording) -> tuple[Problem, SmootherPass]:
+    """A drive smoothed with lever arms that are unknown."""
     if recording.gnss is None or not len(recording.gnss.t):
         raise EstimationError(
             f"'{recording.name}': there is no GNSS whose antenna could be found", key="antenna.no_gnss"
@@ -190,7 +220,13 @@ def _estimate_antenna(recording: Recording) -> tuple[Antenna, tuple[Array, Array
     except np.linalg.LinAlgError as error:
         raise explain_singular(error) from None
     problem = apply_noise(base, found.noise)
-    smoothed = smooth_backward(problem, refilter(problem, found.carry_points(base, problem)))
+    return problem, smooth_backward(problem, refilter(problem, found.carry_points(base, problem)))
+
+
+def _estimate_antenna(recording: Recording) -> tuple[Antenna, tuple[Array, Array, Array] | None]:
+    """The antenna, and the forward position of the point that does not slip, (1,) m each: stated, found, sigma."""
+    problem, smoothed = _smooth_with_open_arms(recording)
+    assert recording.gnss is not None
     parameters = estimate_parameters(problem, smoothed.values, compute_sigmas(smoothed.P))
     arm, axle = parameters[LEVER_ARM], parameters.get(AXLE)
     antenna = Antenna(recording.gnss.lever_arm, arm.value[-1], arm.sigma[-1])

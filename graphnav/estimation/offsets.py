@@ -1,5 +1,6 @@
-"""Stamp offsets: a recording with its stamps moved by them, and whether they are close enough to the linearisation point
-of the fixes' rows, at the start and the end of a drive."""
+"""Stamp offsets: a recording with its stamps moved by them, and whether they are close enough to the linearisation
+point of the fixes' rows, at the start and the end of a drive.
+"""
 
 from __future__ import annotations
 

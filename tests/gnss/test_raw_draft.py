@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import re
 import shutil
 import tomllib
 from pathlib import Path
@@ -10,6 +12,7 @@ import numpy as np
 import pytest
 from helpers import refused
 
+from graphnav.app import cli
 from graphnav.core.errors import RecordingError
 from graphnav.gnss.load import Sources, load_raw
 from graphnav.recording.draft import draft
@@ -97,6 +100,18 @@ def test_a_clock_that_nothing_tells_is_asked_for(folder):
     (path / "recording.toml").write_text(text)
     with refused("clock.unknown", RecordingError):
         read(path)
+
+
+def test_init_writes_the_draft_whose_clock_is_to_be_filled_in(folder, capsys):
+    path = folder(0.0, "rover.obs.gz", "nav.gz")
+    assert cli.run(["init", str(path), "-o", str(path), "--json"]) == 3
+    out = json.loads(capsys.readouterr().out)
+    assert out["refused"]["key"] == "clock.unknown"
+    assert not [line for line in out["decisions"] if line.startswith("not read")]  # observations are
+    draft_file = path / "recording.toml"
+    text = draft_file.read_text()
+    draft_file.write_text(re.sub(r'^# clock = "..."', 'clock = "2021-09-22T06:29:42Z"', text, flags=re.MULTILINE))
+    assert len(read(path).gnss.t) == 41
 
 
 @pytest.mark.parametrize(

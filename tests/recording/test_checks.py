@@ -16,7 +16,7 @@ import oracle
 import pytest
 
 from graphnav.app import cli
-from graphnav.estimation.antenna import find_untold_arm, find_wrong_arms
+from graphnav.estimation.antenna import find_untold_arm, find_wrong_arms, find_wrong_axes
 from graphnav.recording import Recording, take_rows
 from graphnav.recording.checks.crosschecks import fit_yaw_rate
 from graphnav.recording.checks.overview import Inspection, inspect
@@ -437,6 +437,16 @@ def test_a_sign_is_named_where_it_is_all_that_is_wrong(stated: tuple[float, ...]
     assert recording.gnss is not None
     wrong = replace(recording, gnss=replace(recording.gnss, lever_arm=np.array(stated)))
     assert [f.key for f in find_wrong_arms(wrong)] == told
+
+
+def test_axes_that_too_weak_accelerations_do_not_show_are_told_by_the_course(drive: Callable[[str], Recording]) -> None:
+    slow = drive("canada_rover")
+    told = find_wrong_axes(slow, inspect(slow).findings)
+    assert [(f.key, f.severity) for f in told] == [("imu.axes", "unreliable")]
+    assert "RBD" in told[0].sentence
+    R = parse_axes_letters("RBD") @ parse_axes_letters("FRD").T
+    turned = replace(slow, imu=replace(slow.imu, gyro=slow.imu.gyro @ R.T, accel=slow.imu.accel @ R.T))
+    assert find_wrong_axes(turned) == []
 
 
 @pytest.mark.parametrize(

@@ -107,6 +107,14 @@ def test_forces_without_gravity_and_raw_counts_are_refused():
     assert guesses.guess_accel_unit(Path("a.csv"), still / 9.8 + [0, 0, 1.0], None).value == "g"
 
 
+def test_rates_in_no_unit_are_refused_only_as_counts():
+    """A few seconds of motion may agree with anything."""
+    lag, rates = motion.Lag(2.3, -0.96, -1.8 + 0.0j), 0.02 * np.random.default_rng(3).normal(size=(500, 3))
+    assert guesses.guess_gyro_unit(Path("a.csv"), rates, None, lag, vehicle=True).value == "rad/s"
+    with refused("draft.raw_counts", RecordingError, "a.csv"):
+        guesses.guess_gyro_unit(Path("a.csv"), np.round(1e4 * rates), None, motion.Lag(0.0, 0.96, 1e4 + 0.0j), True)
+
+
 def test_white_noise_is_measured():
     rng = np.random.default_rng(2)
     t = np.arange(60000) / 100

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -116,23 +117,31 @@ def test_positions_that_are_not_read_do_not_make_a_walk(plain, tmp_path, capsys,
 
 
 @pytest.mark.parametrize(
-    ("change", "key"),
+    ("name", "change", "key"),
     [
-        (lambda t, w, f: [t, *(f"{7506 * float(x):.0f}" for x in w), *f], "draft.raw_counts"),
-        (lambda t, w, f: [f"{np.floor(float(t) * 5.0) / 5.0 + 1e-2 * (float(t) % 0.2):.6f}", *w, *f], "imu.bursts"),
+        ("imu", lambda t, *x: [f"{np.floor(float(t) * 5.0) / 5.0 + 1e-2 * (float(t) % 0.2):.6f}", *x], "imu.bursts"),
+        ("gnss", lambda t, lat, lon, h: [t, lat, lon, f"{1e3 * float(h)}"], "table.height"),
     ],
 )
-def test_rates_in_counts_and_stamps_of_arrival_are_refused_when_they_are_drafted(plain, tmp_path, capsys, change, key):
+def test_a_draft_that_info_would_refuse_is_written_and_says_so(plain, tmp_path, capsys, name, change, key):
+    tables = {sensor: (header, rows) for sensor, (header, rows) in zip(("imu", "gnss"), plain, strict=True)}
+    header, rows = tables[name]
+    tables[name] = header, [change(*row) for row in rows]
+    folder = stranger.write_tables(tmp_path, *tables.values())
+    assert cli.run(["init", str(folder), "-o", str(folder), "--json"]) == 3
+    out, said = capsys.readouterr()
+    assert json.loads(out)["refused"]["key"] == key
+    assert said.startswith("graphnav: ")
+    assert said.count("\n") == 1
+    assert (folder / "recording.toml").exists()
+
+
+def test_rates_in_counts_are_not_drafted(plain, tmp_path, capsys):
     (header, rows), fixes = plain
-    changed = [change(row[0], row[1:4], row[4:]) for row in rows]
-    folder = stranger.write_tables(tmp_path, (header, changed), fixes)
-    refuse_command(capsys, key, "init", folder, "-o", folder)
-
-
-def test_what_info_would_refuse_is_refused_by_init_as_well(plain, tmp_path, capsys):
-    imu, (header, rows) = plain
-    folder = stranger.write_tables(tmp_path, imu, (header, [[*row[:3], f"{1e3 * float(row[3])}"] for row in rows]))
-    refuse_command(capsys, "table.height", "init", folder, "-o", folder)
+    counts = [[row[0], *(f"{7506 * float(x):.0f}" for x in row[1:4]), *row[4:]] for row in rows]
+    folder = stranger.write_tables(tmp_path, (header, counts), fixes)
+    refuse_command(capsys, "draft.raw_counts", "init", folder, "-o", folder)
+    assert not (folder / "recording.toml").exists()
 
 
 def test_a_course_in_radians_is_told_by_the_positions(plain, tmp_path):

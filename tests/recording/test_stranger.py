@@ -86,6 +86,15 @@ def test_the_folder_of_a_phone(tokyo, tmp_path, capsys, total):
     assert rms(errors(drive, tmp_path / "out")) < rms(stranger.fix_errors(folder, drive))
 
 
+@pytest.mark.parametrize("span", [(0.0, 120.0), (360.0, 480.0), (600.0, 780.0)])
+def test_turns_that_agree_by_chance_shift_no_clock(shared_data, tmp_path, span):
+    """Few turns, wrong velocities in some fixes: another turn fits better than the right one."""
+    (drive,) = stranger.cuts(shared_data / "tokyo_20201105", [span])
+    folder = stranger.write_phone(tmp_path / "ride", drive)
+    run("init", folder, "-o", folder, "--quiet")
+    assert read(folder).gnss.t[-1] == pytest.approx(stranger.UNIX + drive.recording.gnss.t[-1], abs=1.0)
+
+
 def test_heights_of_a_phone_that_wander_are_not_said_to_be_in_another_unit(shared_data, tmp_path):
     (drive,) = stranger.cuts(shared_data / "tokyo_20201105", [(420.0, 600.0)])
     folder = stranger.write_phone(tmp_path / "ride", drive)
@@ -189,6 +198,24 @@ def test_a_folder_of_what_loggers_leave_there(tokyo, tmp_path, capsys):
     recording = read(tmp_path)
     assert recording.imu.gyro == pytest.approx(drive.recording.imu.gyro, abs=1e-6)
     assert len(recording.gnss.t) == len(drive.recording.gnss.t)
+
+
+def test_a_second_of_a_drive_is_drafted(tokyo, tmp_path):
+    (imu_header, imu), (header, fixes) = stranger.tables(tokyo[2])
+    folder = stranger.write_tables(
+        tmp_path / "log", (imu_header, imu[:30]), (header.replace("t,", "t_utc,", 1), fixes[:2])
+    )
+    run("init", folder, "-o", folder, "--quiet")
+    recording = read(folder)
+    assert (len(recording.imu.t), len(recording.gnss.t)) == (30, 2)
+
+
+def test_dates_in_ms_are_told_by_their_size(tokyo, tmp_path, capsys):
+    imu, (header, fixes) = stranger.tables(tokyo[2])
+    folder = stranger.write_tables(tmp_path / "log", imu, (header, [[f"{1e3 * float(t):.0f}", *x] for t, *x in fixes]))
+    text = '[imu]\nfile = "imu.csv"\n[gnss]\nfile = "gnss.csv"\nsd = [1.0, 1.0, 2.0]\n'
+    (folder / "recording.toml").write_text(f'format = "graphnav-recording/1"\nplatform = "vehicle"\n{text}')
+    assert 'units = { t = "ms" }' in refuse_command(capsys, "table.not_finite", "info", folder)
 
 
 def test_one_velocity_is_no_course(tokyo, tmp_path):

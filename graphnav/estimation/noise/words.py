@@ -35,17 +35,8 @@ def describe_far(problem: Problem, smoothed: Points) -> tuple[str, ...]:
         stated, sigma = chain.mean[0], chain.sigma[0]
         away = np.abs(value - stated) / sigma
         k = int(np.argmax(away))
-        if p.name == MOUNTING and away[k] > _FAR and abs(value[k]) > 0.25 * np.pi:
-            (a, b), states = value, smoothed.states
-            up = np.array([0.0, np.sin(a), np.cos(a)])
-            ahead = np.array([-np.sin(b), np.cos(b) * np.cos(a), -np.cos(b) * np.sin(a)])
-            if np.einsum("i,kji,kj", ahead, states.R_nb, states.v) < 0.0:  # which no sideways velocity tells
-                ahead = -ahead
-            letters = write_letters(problem.recording.imu.R_bs, ahead, up)
-            hint = f' (axes = "{letters}" would agree)' if letters else ""
-            off = np.degrees(np.arccos(np.clip(ahead[1], -1.0, 1.0)))
-            sentence = f"the IMU's axes are {off:.0f} deg from those of a vehicle that travels forwards"
-            out.append(Note("doubt.axes", f"The attitude cannot be trusted: {sentence}; check axes in [imu]{hint}"))
+        if p.name == MOUNTING and (turned := describe_turned_axes(problem, smoothed)) is not None:
+            out.append(Note("doubt.axes", f"The attitude cannot be trusted: {turned}"))
         elif away[k] > _FAR:
             shown = name_components(p.name, p.size, p.unit)[k]
             found, given, sd = (float(f"{shown.scale * x:.2g}") for x in (value[k], stated[k], sigma[k]))
@@ -57,6 +48,27 @@ def describe_far(problem: Problem, smoothed: Points) -> tuple[str, ...]:
                 )
             )
     return tuple(out)
+
+
+def describe_turned_axes(problem: Problem, smoothed: Points) -> str | None:
+    """A sentence on axes of the IMU by which the vehicle would not travel forwards; None where the mounting is near."""
+    chain = next((chain for chain in problem.chains if chain.parameter.name == MOUNTING), None)
+    if chain is None:
+        return None
+    value = smoothed.values[0, shift(problem.columns[MOUNTING])]
+    away = np.abs(value - chain.mean[0]) / chain.sigma[0]
+    k = int(np.argmax(away))
+    if away[k] <= _FAR or abs(value[k]) <= 0.25 * np.pi:
+        return None
+    (a, b), states = value, smoothed.states
+    up = np.array([0.0, np.sin(a), np.cos(a)])
+    ahead = np.array([-np.sin(b), np.cos(b) * np.cos(a), -np.cos(b) * np.sin(a)])
+    if np.einsum("i,kji,kj", ahead, states.R_nb, states.v) < 0.0:  # which no sideways velocity tells
+        ahead = -ahead
+    letters = write_letters(problem.recording.imu.R_bs, ahead, up)
+    hint = f' (axes = "{letters}" would agree)' if letters else ""
+    off = np.degrees(np.arccos(np.clip(ahead[1], -1.0, 1.0)))
+    return f"the IMU's axes are {off:.0f} deg from those of a vehicle that travels forwards; check axes in [imu]{hint}"
 
 
 def describe_noise(noise: NoiseModel, problem: Problem) -> tuple[str, ...]:

@@ -98,7 +98,11 @@ class _Writer:
             "# Drafted by graphnav init. Comments say why each line is what it is; look at those marked CHECK.",
             'format = "graphnav-recording/1"', f"name = {quote(name)}",
         ]  # fmt: skip
-        why = "there are fixes or speeds" if vehicle else "CHECK: no fixes and no speed, so a walk is assumed"
+        why = (
+            "there are fixes, speeds or observations of GNSS"
+            if vehicle
+            else "CHECK: no fixes and no speed, so a walk is assumed"
+        )
         self._write_key("platform", '"vehicle"' if vehicle else '"foot"', why)
         if raw is not None:
             self._write_clock(found["imu"], raw)

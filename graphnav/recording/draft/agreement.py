@@ -10,9 +10,11 @@ from graphnav.core.rotation import Array
 from graphnav.recording import Gnss, Imu
 from graphnav.recording.checks.clock import ClockOffsets, measure_clock_offsets
 from graphnav.recording.draft import motion
+from graphnav.recording.formats.schema import RATE_UNITS
 
 CLEAR, LIKELY = 0.8, 0.5  # correlations: certain, likely
 _LEAST_CORRELATION = 0.75  # least correlation for the offset of unrelated clocks
+_SAME_SIZE = 0.3  # of the logarithm of a ratio of turns
 _TWO_CLOCKS = 0.15  # s; velocities with a larger offset from the positions have a latency of their own
 
 
@@ -133,10 +135,21 @@ def _compare_clocks(
 
 
 def _find_turn_lag(grid: Array, rate: Array, course: motion.Course) -> motion.Lag | None:
-    """The offset of overlapping clocks, unless only an arbitrary one makes the turns agree."""
+    """The offset of overlapping clocks, unless only an arbitrary one makes the turns agree.
+
+    Single turns agree at many offsets, but not in size: there the gyro must measure them in a unit that there is.
+    """
     overlap = course.t[0] < grid[-1] and course.t[-1] > grid[0] if len(grid) else False
     near = motion.find_lag(grid, rate, course.t, course.turn, course.speed**2) if overlap else None
     if near is not None and near.correlation > LIKELY:
         return near
     far = motion.find_lag(grid, rate, course.t, course.turn, course.speed**2, anywhere=True)
-    return far if far is not None and far.correlation > _LEAST_CORRELATION else near
+    if far is None or far.correlation < _LEAST_CORRELATION:
+        return near
+    if overlap:
+        size = (
+            far.slope.real / far.correlation**2
+        )  # one over the slope of the course, which has the noise, over the gyro
+        if all(abs(np.log(size * unit)) > _SAME_SIZE for unit in RATE_UNITS.values()):
+            return near
+    return far

@@ -22,13 +22,13 @@ _OF_SPEED = r"sd_?v|sd_?speed|(?:.*_)?(?:s_?acc|(?:speed|velocity|vel)_?acc\w*)|
 _UNCERTAIN = re.compile(
     r"(?:.*_)?(?:sd|std|stdev|sigma|var|variance|cov\w*|accuracy|[hvpgt]dop|err\w*|uncertainty|ep[hves])(?:_.*)?|.*_acc"
 )
-_OF_WEEK = r"(?:gps_?)?time_of_week|gps_?time|(?:gps_?)?[st]ow|i_?tow|gps_?sec(?:onds?)?|gnss_time"
+_OF_WEEK = r"(?:gps_?)?time_of_week|gps_?time|t(?:ime)?_gps|(?:gps_?)?[st]ow|i_?tow|gps_?sec(?:onds?)?|gnss_time"
 _WHEEL, _SPEED = r"(?:wheel_?|speed_?|wheel_?speed_?)*", r"(?:_?wheel)?(?:_?speed)?"
 _PATTERNS: dict[str, tuple[str, ...]] = {
     "t": (
         r"t", r"seconds_elapsed",
         r"time_elapsed|elapsed_time|elapsed|time_since_start(?:_in)?|rel_?time|time_(?:since_)?boot",
-        r"(?:.*_)?header_stamp", r"time(?:stamp)?", _OF_WEEK,
+        r"(?:.*_)?header_stamp", r"(?:time(?:stamp)?|t)(?:_(?:unix|utc))?", _OF_WEEK,
         r"(?:unix|epoch|utc|sensor|logging|local)_?time\w*",
         r"sec(?:onds?)?|stamp|(?:.*_)time(?:stamp)?",
         r"date_?time|unix|epoch|utc|(?:uhr)?zeit(?:stempel)?|clock|hora|heure|tiempo|temps|date|datum|millis|micros|ms|us|ns",

@@ -92,7 +92,7 @@ def guess_gyro_unit(path: Path, gyro: Array, stated: str | None, lag: motion.Lag
     Raises
     ------
     RecordingError
-        If the turns are clearly those of the course, but in no unit: the numbers are raw counts.
+        If the turns are clearly those of the course, but whole numbers in no unit: raw counts.
     """
     if lag is not None and abs(lag.correlation) > _LIKELY:
         for unit, scale in RATE_UNITS.items():
@@ -101,7 +101,7 @@ def guess_gyro_unit(path: Path, gyro: Array, stated: str | None, lag: motion.Lag
                 if lag.correlation < 0.0:
                     words = f"CHECK: {words}: the other way round; the sign of latitudes, longitudes or rates is wrong"
                 return Guess(unit, words)
-        if abs(lag.correlation) > _CLEAR:
+        if abs(lag.correlation) > _CLEAR and np.array_equal(gyro, np.round(gyro)):
             raise RecordingError(
                 f"{path}: the rates are {abs(lag.slope):.3g} times the turns of the fixes in rad/s, which is no "
                 "unit: raw counts?",
@@ -111,7 +111,9 @@ def guess_gyro_unit(path: Path, gyro: Array, stated: str | None, lag: motion.Lag
         return Guess(stated, "as the column's name says")
     large = float(np.percentile(np.abs(gyro), 99.5))
     limit = 2.5 if vehicle else 15.0
-    turns = "no turns to check it" if lag is None else f"the turns agree too little (correlation {lag.correlation:.2f})"
+    turns = "no turns to check it"
+    if lag is not None:
+        turns = f"{abs(lag.slope):.3g} times the turns of the fixes in rad/s (correlation {lag.correlation:.2f})"
     return Guess("deg/s" if large > limit else "rad/s", f"99.5 % of the rates are below {large:.3g}; a guess, {turns}")
 
 

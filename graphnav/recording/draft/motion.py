@@ -111,6 +111,8 @@ def _differentiate(x: Array) -> Array:
 
 def compute_moving_mean(x: Array, window: float = _MEAN_OVER) -> Array:
     """Moving mean over some seconds, of the grid."""
+    if not len(x):
+        return x
     n = 2 * round(window / GRID / 2)
     kernel = np.ones(n + 1)
     kernel[[0, -1]] = 0.5
@@ -146,7 +148,7 @@ def find_lag(t: Array, x: Array, u: Array, y: Array, weight: Array | None = None
             if not np.isfinite(r).any():
                 return None
             best = int(np.nanargmax(np.abs(r)))
-            b = _trim(a, b, w, int(shifts[best]), slope[best])
+            b = _trim(a, b, w, int(shifts[best]))
             r, slope = _list_lags(a, b, w, shifts)
     if not np.isfinite(r).any():
         return None
@@ -209,11 +211,14 @@ def _list_lags(a: Array, b: Array, w: Array, shifts: Array) -> tuple[Array, Arra
     return r, slope
 
 
-def _trim(a: Array, b: Array, w: Array, shift: int, slope: complex) -> Array:
-    """b without the outlying samples at a shift: those beyond four robust sigmas of the weighted residuals."""
+def _trim(a: Array, b: Array, w: Array, shift: int) -> Array:
+    """b without the outlying samples at a shift: those beyond four robust sigmas of the weighted residuals.
+
+    The residuals are those of `b` as a multiple of `a`, whose sensor is an IMU's: outliers of `b` then hardly move it.
+    """
     x, y, v, at = _pair_samples(a, b, w, shift)
-    factor = slope if np.iscomplexobj(y) else slope.real
-    residual = np.abs((x - factor * y) * np.sqrt(v))
+    factor = v @ (y * np.conj(x)) / (v @ np.abs(x) ** 2)
+    residual = np.abs((y - factor * x) * np.sqrt(v))
     out = b.copy()
     out[at[residual > 4.0 * 1.4826 * np.median(residual)]] = np.nan
     return out

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -53,7 +53,7 @@ def find_logs(paths: Sequence[Path], topics: Sequence[str] = ()) -> LogsFound:
         raise RecordingError(f"{paths[0]}: observations of GNSS, and no IMU beside them", key="draft.no_imu")
     every: dict[str, list[Source]] = {}
     left: list[str] = []
-    nothing: list[str] = []
+    nothing: dict[str, str] = {}  # reasons by the names of files
     refused: list[str] = []  # reasons why some are no tables
     for path in files:
         try:
@@ -61,13 +61,13 @@ def find_logs(paths: Sequence[Path], topics: Sequence[str] = ()) -> LogsFound:
         except NoSensorError as error:
             if len(files) == 1 and not raw.observed:
                 raise
-            nothing.append(path.name if path.exists() else str(error))
+            nothing[path.name if path.exists() else str(error)] = str(error)
             if isinstance(error.__cause__, RecordingError) or error.key == "draft.no_time":
                 refused.append(str(error))
             continue
         for sensor, source in found.items():
             every.setdefault(sensor, []).append(source)
-    others = _name_others(paths, files)
+    others = _name_others(paths, [*files, *raw.observed, *(path for some in raw.placing.values() for path in some)])
     if others:
         left.append(f"{others}: no logs of a kind that is known")
     if nothing:
@@ -95,7 +95,7 @@ def find_logs(paths: Sequence[Path], topics: Sequence[str] = ()) -> LogsFound:
             key="draft.no_imu",
         )
     if not sensors.keys() & {"gnss", "odometer"} and not raw.observed:
-        _check_unread(paths, [path for path in files if path.name in nothing])
+        _check_unread(paths, {path: nothing[path.name] for path in files if path.name in nothing})
     _date_times_of_day(sensors)
     parts = [s.path.name for name in ("gyro", "accel", "gravity") for s in every.get(name, ())]
     if "imu" in every and parts:
@@ -120,8 +120,8 @@ def _date_times_of_day(sensors: dict[str, Source]) -> None:
             source.plain = replace(source.plain, words=words)
 
 
-def _check_unread(paths: Sequence[Path], tables: Sequence[Path]) -> None:
-    """Refuse to take for a walk without fixes what has positions in a form that is not read.
+def _check_unread(paths: Sequence[Path], tables: Mapping[Path, str]) -> None:
+    """Refuse to take for a walk without fixes what has positions in a form that is not read, for the reasons given.
 
     Raises
     ------
@@ -131,9 +131,9 @@ def _check_unread(paths: Sequence[Path], tables: Sequence[Path]) -> None:
     inside = [p for path in paths if path.is_dir() for p in sorted(path.iterdir())]
     unread = [p for p in inside if p.suffix.lower() in _TRACKS] + [p for p in tables if _POSITIONS.search(p.name)]
     if unread:
+        why = tables.get(unread[0], "write them as CSV with t, lat and lon in deg and h in m")
         raise RecordingError(
-            f"{unread[0]}: its positions are not read; write them as CSV with t, lat and lon in deg and h in m, or "
-            "take the file out of the folder",
+            f"{unread[0]}: its positions are not read ({why}); else take the file out of the folder",
             key="draft.positions_unread",
         )
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from graphnav.core.errors import RecordingError
 from graphnav.core.notes import Note, format_count
 from graphnav.core.rotation import Array
-from graphnav.core.timescales import find_restarts
+from graphnav.core.timescales import UNIX, find_restarts
 from graphnav.recording import FIX_TYPES, convert_fix_types
 from graphnav.recording.formats.table import Selection, Table
 from graphnav.sensors.tables import TIME_UNITS, Keep
@@ -63,14 +63,17 @@ def select_usable_rows(
     with np.errstate(over="ignore"):
         t = rows["t"] * TIME_UNITS[unit] + offset
     # a stamp of thousands of years is invalid, like an infinite one
+    stamps = rows["t"]
     rows = rows.with_column("t", np.where(np.abs(t) > LATEST, np.inf, rows["t"]))
     for name in rows.columns:
         bad = np.flatnonzero(np.isinf(rows[name]))
         if len(bad) and sensor == "odometer":  # of which single readings can be missing
             rows = rows.with_column(name, np.where(np.isinf(rows[name]), np.nan, rows[name]))
         elif len(bad):
-            what = "no time" if name == "t" else "infinite"
-            raise RecordingError(f"{rows.describe_place(bad[0], name)}: the value is {what}", key="table.not_finite")
+            what = f"{stamps[bad[0]]:.16g} is no time in {unit}" if name == "t" else "the value is infinite"
+            dates = [other for other, scale in TIME_UNITS.items() if UNIX < stamps[bad[0]] * scale < 3.0 * UNIX]
+            hint = f'; say units = {{ t = "{dates[0]}" }}: it is then a date' if name == "t" and dates else ""
+            raise RecordingError(f"{rows.describe_place(bad[0], name)}: {what}{hint}", key="table.not_finite")
     if keep is not None:
         rows = rows.take(rows[Table.KEEP] >= keep.at_least)
         if not len(rows):
