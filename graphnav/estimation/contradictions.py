@@ -135,6 +135,8 @@ def update(base: Problem, best: NoiseEstimate, freed: Freed) -> Freed:
     ----------
     base, best : as for `find_contradicted_constants`.
     """
+    if not freed:
+        return {}
     asked = widen(base, freed)
     return _use(base, asked, *_ask(base, best, freed, asked), mark_free(base, freed))
 

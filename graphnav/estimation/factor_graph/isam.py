@@ -27,8 +27,7 @@ from graphnav.estimation.solvers.stages import Message, Place
 from graphnav.estimation.solvers.window import SettledStates, compute_turn_limit
 
 _SKIP = 10  # least number of keyframes between relinearisation checks, as GTSAM's relinearizeSkip
-# the cost of a check is proportional to the keyframes in the tree: one follows when they have grown by one part in this
-# many
+# the cost of a check is proportional to the keyframes in the tree: one follows when there are a part in this many more
 _GROWN = 8
 _SHARE_OF_TIME = 4  # covariances are eliminated in one part in this many of the time between settlings
 _MAX_UPDATES = 30

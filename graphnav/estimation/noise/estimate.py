@@ -45,6 +45,7 @@ from graphnav.estimation.solvers.ekf import refilter
 from graphnav.estimation.solvers.linearise import Points
 from graphnav.estimation.solvers.passes import DisturbancePass, ForwardRecord, reuse_points
 from graphnav.estimation.solvers.rts import smooth_moments
+from graphnav.estimation.solvers.watch import SIZES
 from graphnav.imu.preintegration import NOISE_FIGURES
 
 # probability of a square of an aiding sensor beyond its bound; up to nearly two rows in five may be wrong
@@ -84,6 +85,7 @@ class _Components:
 
     log: dict[str, float]
     prior_times: dict[str, float]  # s, prior medians of correlation times
+    largest: dict[str, float]  # log factors at which an error is as large as such errors get
     freedom: dict[str, float] = field(default_factory=dict)
     times: dict[str, float] = field(default_factory=dict)
     weights: dict[str, RowWeights] = field(default_factory=dict)
@@ -114,6 +116,12 @@ class _Components:
             m += max(0.0, self.log.get(".".join([sensor, *kind[:-1], axis]), 0.0))
         return m, s
 
+    def get_largest(self, name: str) -> float:
+        """The largest log factor: that of the time-correlated parts of fixes is of the white part."""
+        sensor, *kind, axis = name.split(".")
+        white = ".".join([sensor, *(part for part in kind if part not in TIMES), axis])
+        return self.largest.get(white, np.inf)
+
     def log_prior(self) -> float:
         return -0.5 * sum(((x - m) / s) ** 2 for name, x in self.log.items() for m, s in [self.get_prior(name)])
 
@@ -133,7 +141,7 @@ class _Components:
         self.steps[name] = x
         if 0.0 < ratio < 1.0 and self.extrapolation > 1.0:
             x = float(np.clip(x * min(1.0 / (1.0 - ratio), self.extrapolation), -3.0, 3.0))
-        self.log[name], self.freedom[name] = before + x, B
+        self.log[name], self.freedom[name] = min(before + x, self.get_largest(name)), B
 
 
 def estimate_noise(
@@ -249,18 +257,32 @@ def _begin(problem: Problem, start: NoiseModel | None, changed: bool = False) ->
     log = {name: get_prior(name)[0] for name in dict.fromkeys(names)}
     processes = [p for rows in problem.constraints for p in (*rows.parameters, *rows.processes)]
     times = {p.name: p.correlation_time for p in processes if p.correlation_time is not None}
+    largest = {group: x for rows in problem.constraints if rows.fix_of for group, x in _list_largest(rows).items()}
     if start is None:
-        return _Components(log, times)
+        return _Components(log, times, largest)
     log |= {name: start.figures[name].log_factor for name in log if name in start.figures}
     return _Components(
         log,
         times,
+        largest,
         times=dict(start.times),
         weights=dict(start.weights),
         excluded=start.excluded,
         known=bool(start.figures),
         same_data=bool(start.figures) and not changed,
     )
+
+
+def _list_largest(rows: Constraint) -> dict[str, float]:
+    """Log factors of fixes at which their 1-sigma is that of a fault (`SIZES`): a solution with larger errors of all
+    fixes explains any trajectory.
+    """
+    groups, component = rows.list_noise_groups()
+    sigma: Array = rows.sigma  # type: ignore[attr-defined]
+    medians = {
+        group: float(np.median(sigma[component == i])) for i, group in enumerate(groups) if (component == i).any()
+    }
+    return {group: max(0.0, 2.0 * float(np.log(SIZES[rows.unit] / median))) for group, median in medians.items()}
 
 
 def _splice(about: Points, part: Points) -> Points:
