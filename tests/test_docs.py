@@ -169,7 +169,7 @@ def test_the_picture_is_what_its_command_draws():
 
 
 def test_the_example_of_a_constraint_keeps_the_contract():
-    module = example("constraints.md")
+    module = example()
     recording, _ = oracle.drive(oracle.vehicle_path(120.0, 50.0))
     t = np.arange(recording.start, recording.end, 5.0)
     intervals = preintegrate(bridge_gaps(recording.imu), recording.imu, t, np.zeros(3), np.zeros(3))
@@ -186,18 +186,18 @@ def test_the_example_of_a_constraint_keeps_the_contract():
     assert assemble(found) == pytest.approx(difference(moved, STEPS), abs=1e-8)
 
 
-def example(page_name):
-    """The classes and functions that the example of a page defines, without what it then runs."""
-    (text,) = [text for page, text in PYTHON if page.name == page_name]
-    module = types.ModuleType(page_name.removesuffix(".md"))
+def example():
+    """The classes that the example of a constraint and a detector defines, without what it then runs."""
+    path = ROOT / "docs" / "examples" / "own.py"
+    module = types.ModuleType("own")
     sys.modules[module.__name__] = module
-    defined, _, _ = text.partition("\n\n\nrecording = ")
-    exec(compile(defined, page_name, "exec"), module.__dict__)
+    defined, _, _ = path.read_text(encoding="utf-8").partition("\n\n\nrecording = ")
+    exec(compile(defined, path, "exec"), module.__dict__)
     return module
 
 
 def test_the_example_of_a_detector_finds_the_stops():
-    module = example("detectors.md")
+    module = example()
     recording, settings = read(ROOT / "data" / "tokyo"), Settings().detectors
     found, known = module.Steady.detect(Scene(recording, settings)), detect(recording).stationary
     assert len(found.t) == len(found.statistic) == len(found.mask)
@@ -209,7 +209,7 @@ def test_the_example_of_a_detector_finds_the_stops():
 
 
 def test_own_constraints_and_detectors_are_used_together():
-    constraint, detector = example("constraints.md").NotSteep, example("detectors.md").Steady
+    constraint, detector = example().NotSteep, example().Steady
     recording = read(ROOT / "data" / "tokyo").crop(0.0, 60.0)
     stated = Settings(noise={"mode": "stated"})
     solution = graphnav.run(recording, stated, ("ekf",), constraints=[constraint], detectors=[detector])["ekf"]

@@ -1,8 +1,26 @@
+from dataclasses import dataclass, field
+
 import numpy as np
 
 import graphnav
+from graphnav.constraints.base import Constraint
 from graphnav.detectors.base import NONE, Detection, drop_short, find_spans
 from graphnav.detectors.scene import Detector
+
+
+@dataclass(frozen=True)
+class NotSteep(Constraint):
+    """A vehicle on a road hardly climbs: 0.5 m/s, 1-sigma."""
+
+    name, axes, unit, depends_on = "not_steep", ("up",), "m/s", ("v",)
+    sigma: np.ndarray = field(default_factory=lambda: np.empty((0, 1)))
+
+    @classmethod
+    def build(cls, scene):
+        return cls(keyframe=np.arange(len(scene.t)), sigma=np.full((len(scene.t), 1), 0.5))
+
+    def residual(self, states, parameters, rows):
+        return states.v[:, 2:]
 
 
 class Steady(Detector):
@@ -23,5 +41,5 @@ class Steady(Detector):
 
 
 recording = graphnav.load("data/tokyo").crop(0.0, 60.0)
-solution = graphnav.run(recording, solvers=("rts",), detectors=[Steady])["rts"]
-print([(d.name, len(d.intervals)) for d in solution.detections])
+solution = graphnav.run(recording, solvers=("rts",), constraints=[NotSteep], detectors=[Steady])["rts"]
+print(solution.counts["not_steep"], "rows;", [(d.name, len(d.intervals)) for d in solution.detections])
