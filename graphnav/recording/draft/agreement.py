@@ -147,9 +147,8 @@ def _find_turn_lag(grid: Array, rate: Array, course: motion.Course) -> motion.La
     if far is None or far.correlation < _LEAST_CORRELATION:
         return near
     if overlap:
-        size = (
-            far.slope.real / far.correlation**2
-        )  # one over the slope of the course, which has the noise, over the gyro
+        # one over the slope of the course, which has the noise, over the gyro
+        size = far.slope.real / far.correlation**2
         if all(abs(np.log(size * unit)) > _SAME_SIZE for unit in RATE_UNITS.values()):
             return near
     return far
