@@ -209,11 +209,11 @@ def _find_noise(
     logarithm of the evidence where it is wanted.
     """
     leave_out = _keep_all if builder.settings.gnss.faults == "off" else estimate_without_faults
-    found = _estimate_noise(builder, built, leave_out, progress)
+    found = _estimate_noise(builder.settings, built, leave_out, progress)
     if found.excluded_share > _MOST_WRONG:
         # most fixes contradict the start: align again with the fixes behind those that the alignment used
         try:
-            later = _estimate_noise(builder, builder.build_later(built), leave_out, progress)
+            later = _estimate_noise(builder.settings, builder.build_later(built), leave_out, progress)
             total = found.estimate.passes + later.estimate.passes
             found = min(found, later, key=lambda one: one.excluded_share).count(total)
         except EstimationError:
@@ -232,7 +232,9 @@ def _find_noise(
         one = estimate_noise(base, until, near=near, progress=progress)
         return estimate_disturbed_intervals(base, leave_out(base, one, until, progress))
 
-    found = _free_contradicted(builder, found, estimate)
+    found = _free_contradicted(builder.settings, found, estimate)
+    if found.freed:
+        found = _start_anew(builder, found)
     passes.update(found.estimate.passes + Counter(filter=1))
     best, built = found.estimate, replace(found.built, problem=found.base)
     wanted = weigh is not None and weigh(apply_noise(built.problem, best.noise), best.points)
@@ -249,7 +251,7 @@ def _keep_all(base: Problem, found: NoiseEstimate, *_: object) -> NoiseEstimate:
 
 
 def _estimate_noise(
-    builder: ProblemBuilder,
+    settings: Settings,
     built: BuiltProblem,
     leave_out: Callable[[Problem, NoiseEstimate, float | None, Progress | None], NoiseEstimate],
     progress: Progress | None,
@@ -262,11 +264,11 @@ def _estimate_noise(
     def estimate(base: Problem, near: tuple[Points, Problem] | None) -> NoiseEstimate:
         return estimate_noise(base, built.aligned.until, near=near, progress=progress)
 
-    found = _free_contradicted(builder, _Found(built, {}, estimate(built.problem, None)), estimate)
+    found = _free_contradicted(settings, _Found(built, {}, estimate(built.problem, None)), estimate)
     return replace(found, estimate=leave_out(found.base, found.estimate, built.aligned.until, progress))
 
 
-def _free_contradicted(builder: ProblemBuilder, found: _Found, estimate: Estimate) -> _Found:
+def _free_contradicted(settings: Settings, found: _Found, estimate: Estimate) -> _Found:
     """Free the constants that the drive contradicts as stated, and no others, and estimate the noise model anew.
 
     Where these are free already, the estimate stays. Tested again once all other faults are known: a gyro that misses a
@@ -274,7 +276,7 @@ def _free_contradicted(builder: ProblemBuilder, found: _Found, estimate: Estimat
     """
     base, before = found.built.problem, found.freed
     near = found.estimate.get_linearisation(found.base)
-    names = {CLOCK_RATE} if builder.settings.gnss.clock_rate_sigma is None else set[str]()
+    names = {CLOCK_RATE} if settings.gnss.clock_rate_sigma is None else set[str]()
     if not is_offset_far(near[1], found.estimate.points):
         names |= {LEVER_ARM, TIME_OFFSET, VELOCITY_TIME_OFFSET}
     passes = found.estimate.passes + Counter(filter=1)
@@ -289,15 +291,17 @@ def _free_contradicted(builder: ProblemBuilder, found: _Found, estimate: Estimat
             found, freed = other, update(base, other.estimate, freed)
     except BREAKDOWN:
         return found.count(passes)
-    found = replace(found, freed=freed).count(passes)
-    if not (freed or before):
-        return found
+    return replace(found, freed=freed).count(passes)
+
+
+def _start_anew(builder: ProblemBuilder, found: _Found) -> _Found:
+    """The same with a start that depends on no constant as stated that is free."""
     built = builder.build_without(found.built, found.noise, parts=True, anew=True)
     again = replace(found, built=built)
-    if not np.array_equal(built.problem.t, base.t):
-        best = estimate_noise(again.base, built.aligned.until, found.estimate.noise)
-        again = replace(again, estimate=best).count(passes + best.passes)
-    return again
+    if np.array_equal(built.problem.t, found.built.problem.t):
+        return again
+    best = estimate_noise(again.base, built.aligned.until, found.estimate.noise)
+    return replace(again, estimate=best).count(found.estimate.passes + best.passes)
 
 
 def _is_likelier(base: Problem, plain: NoiseModel, found: NoiseEstimate) -> bool:
