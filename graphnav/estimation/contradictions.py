@@ -128,7 +128,7 @@ def find_contradicted_constants(base: Problem, best: NoiseEstimate, freed: Freed
     return {name: one for name, one in found.items() if one.value != asked[name].value}
 
 
-def update(base: Problem, best: NoiseEstimate, freed: Freed) -> Freed:
+def update_freed(base: Problem, best: NoiseEstimate, freed: Freed) -> Freed:
     """The same constants as an estimate of the noise model has them.
 
     Parameters

@@ -30,7 +30,7 @@ from graphnav.estimation.contradictions import (
     describe_freed,
     find_contradicted_constants,
     free,
-    update,
+    update_freed,
 )
 from graphnav.estimation.fixing import fix, list_float_arcs
 from graphnav.estimation.noise.apply import apply_noise, drop_parts
@@ -288,7 +288,7 @@ def _free_contradicted(settings: Settings, found: _Found, estimate: Estimate) ->
             # with other figures, freed constants may lead to a worse optimum than with all as stated
             if other.compute_evidence() < found.compute_evidence():
                 return found.count(passes)
-            found, freed = other, update(base, other.estimate, freed)
+            found, freed = other, update_freed(base, other.estimate, freed)
     except BREAKDOWN:
         return found.count(passes)
     return replace(found, freed=freed).count(passes)

@@ -39,13 +39,12 @@ from graphnav.estimation.noise.moments import (
     lag_moments,
 )
 from graphnav.estimation.noise.outliers import CHANCE, compute_outlier_cost, count_rows, limit_scaled, list_reduced
-from graphnav.estimation.noise.priors import TIME_WITHIN, get_prior
+from graphnav.estimation.noise.priors import TIME_WITHIN, get_prior, list_largest
 from graphnav.estimation.problem import ParameterChain, Problem
 from graphnav.estimation.solvers.ekf import refilter
 from graphnav.estimation.solvers.linearise import Points
 from graphnav.estimation.solvers.passes import DisturbancePass, ForwardRecord, reuse_points
 from graphnav.estimation.solvers.rts import smooth_moments
-from graphnav.estimation.solvers.watch import SIZES
 from graphnav.imu.preintegration import NOISE_FIGURES
 
 # probability of a square of an aiding sensor beyond its bound; up to nearly two rows in five may be wrong
@@ -117,7 +116,7 @@ class _Components:
         return m, s
 
     def get_largest(self, name: str) -> float:
-        """The largest log factor: that of the time-correlated parts of fixes is of the white part."""
+        """The largest log factor; of the time-correlated parts of fixes, that of the white part."""
         sensor, *kind, axis = name.split(".")
         white = ".".join([sensor, *(part for part in kind if part not in TIMES), axis])
         return self.largest.get(white, np.inf)
@@ -257,7 +256,7 @@ def _begin(problem: Problem, start: NoiseModel | None, changed: bool = False) ->
     log = {name: get_prior(name)[0] for name in dict.fromkeys(names)}
     processes = [p for rows in problem.constraints for p in (*rows.parameters, *rows.processes)]
     times = {p.name: p.correlation_time for p in processes if p.correlation_time is not None}
-    largest = {group: x for rows in problem.constraints if rows.fix_of for group, x in _list_largest(rows).items()}
+    largest = {group: x for rows in problem.constraints if rows.fix_of for group, x in list_largest(rows).items()}
     if start is None:
         return _Components(log, times, largest)
     log |= {name: start.figures[name].log_factor for name in log if name in start.figures}
@@ -271,18 +270,6 @@ def _begin(problem: Problem, start: NoiseModel | None, changed: bool = False) ->
         known=bool(start.figures),
         same_data=bool(start.figures) and not changed,
     )
-
-
-def _list_largest(rows: Constraint) -> dict[str, float]:
-    """Log factors of fixes at which their 1-sigma is that of a fault (`SIZES`): a solution with larger errors of all
-    fixes explains any trajectory.
-    """
-    groups, component = rows.list_noise_groups()
-    sigma: Array = rows.sigma  # type: ignore[attr-defined]
-    medians = {
-        group: float(np.median(sigma[component == i])) for i, group in enumerate(groups) if (component == i).any()
-    }
-    return {group: max(0.0, 2.0 * float(np.log(SIZES[rows.unit] / median))) for group, median in medians.items()}
 
 
 def _splice(about: Points, part: Points) -> Points:
