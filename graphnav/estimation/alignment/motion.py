@@ -18,9 +18,12 @@ from graphnav.core.state import States
 from graphnav.detectors.base import NONE, mask_inside
 from graphnav.estimation.alignment.back import carry_back
 from graphnav.estimation.alignment.course import COURSE_SIGMA, use_course
+from graphnav.estimation.alignment.excess import measure_excess, widen
 from graphnav.estimation.alignment.first import Alignment, level, pick_fixes
 from graphnav.estimation.alignment.travel import average_across, integrate_yaw, measure_travel
 from graphnav.estimation.fixing import split_carriers
+from graphnav.estimation.noise.apply import apply_noise
+from graphnav.estimation.noise.model import STATED
 from graphnav.estimation.problem import Problem, build_problem
 from graphnav.estimation.solution import Solution
 from graphnav.imu.preintegration import integrate_prefix
@@ -34,6 +37,7 @@ _WANTED_FIXES = 10  # fixes that the short problem should contain
 _FEWEST_FOR_ACCELERATION = 3  # fixes without which there is no acceleration
 _MOVING_SIGMAS = 5.0  # sigmas of travel that count as motion: noise reaches them once in 270 000 fixes, exp(-5^2/2)
 _LEAD_TIME = 10.0  # s of the span before the motion
+_MAX_ROUNDS = 10  # of headings tried and sigmas measured; few need more than two
 _OUTLYING = 6.0  # multiple of the typical deviation of fixes from their running median, or of their sigma
 # rad, of the initial headings that are tried, relative to the first guess
 _HEADINGS_TRIED = (0.0, 0.5 * np.pi, 1.5 * np.pi, np.pi)
@@ -121,14 +125,22 @@ def align_in_motion(
     bias = _estimate_rate(imu)
     rp = level(recording, begin)
     heading = _fit_heading(part, frame, rp, bias)
-    tried = _try_headings(part, settings, frame, rp, heading, bias)
-    if not tried:
-        raise EstimationError(
-            f"'{recording.name}': no initial attitude explains the GNSS fixes between {begin - recording.start:.0f} "
-            f"and {end - recording.start:.0f} s; check the axes, the units and the time stamps",
-            key="alignment.not_explained",
-        )
-    best = min(tried, key=lambda one: one.cost)
+    problem, widened = _build_short(part, settings, frame, np.array([*rp, heading]), bias), STATED
+    for _ in range(_MAX_ROUNDS):
+        used = apply_noise(problem, widened)
+        tried = _try_headings(used, rp, heading)
+        if not tried:
+            raise EstimationError(
+                f"'{recording.name}': no initial attitude explains the GNSS fixes between "
+                f"{begin - recording.start:.0f} and {end - recording.start:.0f} s; check the axes, the units and the "
+                "time stamps",
+                key="alignment.not_explained",
+            )
+        best = min(tried, key=lambda one: one.cost)
+        more = measure_excess(used, best)
+        if not more:
+            break
+        widened = widen(widened, more)
     R, P = best.states.R_nb[0], best.covariance[0][:3, :3]
     wide = settings.alignment.prior_inflation * np.sqrt(np.diag(P))
     J = rotation.rph_jacobian(rotation.to_rph(R))
@@ -187,9 +199,7 @@ def _thin(gnss: Gnss, begin: float, end: float, spacing: float = 0.9) -> Gnss:
     return pick_fixes(gnss, np.array(keep))
 
 
-def _try_headings(
-    part: Recording, settings: Settings, frame: LocalFrame, rp: Array, heading: float, bias: Array
-) -> list[Solution]:
+def _try_headings(problem: Problem, rp: Array, heading: float) -> list[Solution]:
     """Solutions of the short problem from each of the initial headings.
 
     Those that point elsewhere mostly lead to the same minimum, and are that solution as soon as they are within a sigma
@@ -197,9 +207,9 @@ def _try_headings(
     beside the best; `worth` successive fixes are worth one in the worst case, over a span with one turn
     (`graphnav.estimation.alignment.course`).
     """
-    problem = _build_short(part, settings, frame, np.array([*rp, heading]), bias)
-    assert part.gnss is not None
-    worth = max(1.0, len(part.gnss.t) / (2.0 * np.pi))
+    gnss = problem.recording.gnss
+    assert gnss is not None
+    worth = max(1.0, len(gnss.t) / (2.0 * np.pi))
     tried: list[Solution] = []
 
     def watch(states: States, cost: float, gain: float, slow: bool) -> None:
