@@ -70,6 +70,19 @@ def test_a_drive_cut_in_motion(path: oracle.ExactPath, begin: float, sd: tuple[f
     assert_good(*judged(recording.crop(begin), truth))
 
 
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("stated", [1.0, 0.01])
+def test_sigmas_of_fixes_that_are_too_small(path: oracle.ExactPath, seed: int, stated: float) -> None:
+    """A robust kernel with a scale a hundred times too small fits a few fixes exactly, and leaves the others."""
+    recording, truth = oracle.drive(path, seed=seed, gnss_sd=oracle.SPP_SD)
+    recording = recording.crop(52.0)
+    gnss = recording.gnss
+    assert gnss is not None
+    error, own, over = judged(replace(recording, gnss=replace(gnss, sd=stated * gnss.sd)), truth)
+    assert np.all(np.abs(error) < 4.0 * own), f"{error / DEG} deg against {own / DEG}"
+    assert np.all(np.abs(over) < 4.0), over
+
+
 def remounted(recording: Recording, R: Array) -> Recording:
     """The same drive with the IMU's axes turned: new = R old."""
     imu, gnss = recording.imu, recording.gnss

@@ -8,6 +8,9 @@ neither speed nor a stationary start is assumed. A vehicle too slow for measurab
 its course, taken as forwards unless they show reverse. From there the gyro carries the attitude back to the first
 sample. Before any motion, two antennas give the heading of a stationary vehicle.
 
+With stated sigmas of fixes that are far too small, a robust kernel fits a few of the fixes exactly. So sigmas that the
+residuals exceed are widened, and the headings tried again (`graphnav.estimation.alignment.scale`).
+
 The whole drive's problem uses the data of the short one again. So the result enters as its initial point, with a prior
 `prior_inflation` times wider than its own sigma: information counts once. Only information that is not in the fixes,
 that a vehicle's forward axis is roughly its course, enters with its own weight.

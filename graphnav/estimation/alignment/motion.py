@@ -18,8 +18,8 @@ from graphnav.core.state import States
 from graphnav.detectors.base import NONE, mask_inside
 from graphnav.estimation.alignment.back import carry_back
 from graphnav.estimation.alignment.course import COURSE_SIGMA, use_course
-from graphnav.estimation.alignment.excess import measure_excess, widen
 from graphnav.estimation.alignment.first import Alignment, level, pick_fixes
+from graphnav.estimation.alignment.scale import measure_scale, widen_sigmas
 from graphnav.estimation.alignment.travel import average_across, integrate_yaw, measure_travel
 from graphnav.estimation.fixing import split_carriers
 from graphnav.estimation.noise.apply import apply_noise
@@ -137,10 +137,10 @@ def align_in_motion(
                 key="alignment.not_explained",
             )
         best = min(tried, key=lambda one: one.cost)
-        more = measure_excess(used, best)
+        more = measure_scale(used, best)
         if not more:
             break
-        widened = widen(widened, more)
+        widened = widen_sigmas(widened, more)
     R, P = best.states.R_nb[0], best.covariance[0][:3, :3]
     wide = settings.alignment.prior_inflation * np.sqrt(np.diag(P))
     J = rotation.rph_jacobian(rotation.to_rph(R))

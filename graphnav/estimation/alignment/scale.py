@@ -16,7 +16,7 @@ from graphnav.estimation.solution import Solution
 _MEDIAN = float(chdtri(1, 0.5))  # of the square of a standard normal number
 
 
-def measure_excess(problem: Problem, solved: Solution) -> dict[str, float]:
+def measure_scale(problem: Problem, solved: Solution) -> dict[str, float]:
     """Log variance factors at which half of the residuals of fixes are within the median of a normal distribution.
 
     By group, of those with more residuals beyond the median of their sigma than by chance (a binomial test). A robust
@@ -43,7 +43,7 @@ def measure_excess(problem: Problem, solved: Solution) -> dict[str, float]:
     return found
 
 
-def widen(noise: NoiseModel, more: dict[str, float]) -> NoiseModel:
+def widen_sigmas(noise: NoiseModel, more: dict[str, float]) -> NoiseModel:
     """A noise model with these logarithms added to its variance factors."""
     log = {name: figure.log_factor for name, figure in noise.figures.items()}
     return NoiseModel({name: VarianceComponent(log.get(name, 0.0) + more.get(name, 0.0)) for name in {**log, **more}})
