@@ -103,6 +103,24 @@ def test_heights_of_a_phone_that_wander_are_not_said_to_be_in_another_unit(share
     assert not {"gnss.feet", "gnss.height_scale"} & {one.key for one in found}
 
 
+def test_a_phone_that_has_no_fix_for_a_while(tokyo, tmp_path):
+    """Its accuracies, speeds and courses are -1 then."""
+    folder = stranger.write_phone(tmp_path / "ride", tokyo[0])
+    head, *rows = (folder / "Location.csv").read_text().splitlines()
+    names = head.split(",")
+    for k in (1, 2, 3, 60, 61):
+        cells = dict(zip(names, rows[k].split(","), strict=True))
+        unknown = ["speed", "bearing", "speedAccuracy", "bearingAccuracy"]
+        unknown += ["horizontalAccuracy", "verticalAccuracy"] if k != 60 else []
+        rows[k] = ",".join((cells | dict.fromkeys(unknown, "-1.0")).values())
+    (folder / "Location.csv").write_text("\n".join([head, *rows]) + "\n")
+    run("init", folder, "-o", folder, "--quiet")
+    gnss = read(folder).gnss
+    assert len(gnss.t) == len(rows) - 4  # those of unknown place
+    assert np.isnan(gnss.v).any(1).sum() == 1
+    assert np.nanmedian(gnss.sd_v[:, :2]) == 0.5  # speedAccuracy
+
+
 def test_a_receiver_beside_an_imu_in_other_units(tokyo, tmp_path, capsys):
     """No edit: deg/s, g and Unix milliseconds beside the GPS week of a .ubx."""
     drive = tokyo[1]
