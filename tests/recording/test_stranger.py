@@ -460,6 +460,7 @@ NOON, UNIX_DAY = 57600.5, 1751932800.0
     [
         ("time  x\n" + "\n".join(f"{row}   1.5" for row in ROWS), NOON),
         ("# time x\n" + "\n".join(f"{row} 1.5" for row in ROWS), NOON),
+        ("% a log\n% time x\n" + "\n% again\n".join(f"{row} 1.5" for row in ROWS), NOON),
         ("time\tx\n" + "\n".join(f"{row}\t1.5".replace(".", ",") for row in ROWS), NOON),
         ("time;x;\n" + "\n".join(f"{row};1,5;" for row in ROWS), NOON),
         ("time;x\n" + "\n".join(f"{row};1,5;" for row in ROWS), NOON),

@@ -21,7 +21,8 @@ from graphnav.core.rotation import Array
 from graphnav.recording.formats.decimals import drop_cut_line, read_decimals
 
 _BLANK_CELL = re.compile(r"(?m)(?:(?<=,)|^(?=[ \t]*,))[ \t]*(?=,|$)")  # an empty cell of a line that is not empty
-_COMMENT = re.compile(r"(?m)(^|[^,\s])[ \t]*#.*")  # what follows a comma is a cell: #N/A
+# to the end of the line from #, unless it begins a cell (#N/A); whole lines from %, which units hold as well
+_COMMENT = re.compile(r"(?m)(^|[^,\s])[ \t]*#.*|^[ \t]*%.*")
 _EMPTY = "is empty; copy the log again, or leave this file out"
 _MARKS = {";": "a semicolon", "\t": "a tab", " ": "blanks"}  # separators, in the order of their tests
 
@@ -258,7 +259,7 @@ def _parse(path: Path, skip: int, header: list[str], use: list[int]) -> tuple[li
 
 
 def _load_text(text: str, skip: int, header: list[str], use: list[int]) -> Array:
-    if "#" in text:
+    if "#" in text or "%" in text:
         text = _COMMENT.sub(r"\1", text)
     # with usecols NumPy checks only that no row is too short for those
     for line in text.splitlines()[skip:]:
