@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import json
+import zipfile
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -158,6 +159,47 @@ def test_a_fix_that_stands_in_every_row_of_the_imu_counts_once(tokyo, tmp_path):
     place = np.column_stack([np.degrees(gnss.llh[:, :2]), gnss.llh[:, 2]])
     differ = 1 + np.sum((np.diff(np.round(place, 8), axis=0) != 0.0).any(axis=1))
     assert len(recording.gnss.t) == differ  # some repeat the one before at a stop
+
+
+def test_stamps_in_no_order_and_names_that_state_another_unit_are_read_by_their_steps(tokyo, tmp_path):
+    """Rows of the IMU shuffled; nanoseconds, of a date and since the start, in a column called t_s."""
+    drive = tokyo[2]
+    (head, rows), fixes = stranger.tables(drive, unix=1000.0)
+    shuffled = [rows[k] for k in np.random.default_rng(2).permutation(len(rows))]
+    folder = stranger.write_tables(tmp_path / "shuffled", (head, shuffled), fixes)
+    run("init", folder, "-o", folder, "--quiet")
+    assert read(folder).imu.t == pytest.approx(1000.0 + drive.recording.imu.t, abs=1e-6)
+    for name, zero in (("date", 1.7e9), ("boot", 12.0)):
+        both = [
+            (head.replace("t,", "t_s,", 1), [[f"{(float(t) - 1000.0 + zero) * 1e9:.0f}", *rest] for t, *rest in rows])
+            for head, rows in stranger.tables(drive, unix=1000.0)
+        ]
+        folder = stranger.write_tables(tmp_path / name, *both)
+        run("init", folder, "-o", folder, "--quiet")
+        assert read(folder).imu.t == pytest.approx(zero + drive.recording.imu.t, abs=1e-5)
+
+
+def test_an_imu_that_reads_the_same_throughout_is_refused(tokyo, tmp_path, capsys):
+    (head, rows), fixes = stranger.tables(tokyo[0])
+    frozen = [[t, *rows[0][1:]] for t, *_ in rows]
+    folder = stranger.write_tables(tmp_path, (head, frozen), fixes)
+    run("init", folder, "-o", folder, "--quiet")
+    refuse_command(capsys, "imu.frozen", "smooth", folder, "-o", tmp_path / "out", "--quiet")
+
+
+def test_links_that_lead_nowhere_are_no_logs(tokyo, tmp_path):
+    folder = stranger.write_tables(tmp_path, *stranger.tables(tokyo[2]))
+    (folder / "old.csv").symlink_to(tmp_path / "none.csv")
+    run("init", folder, "-o", folder, "--quiet")
+    assert len(read(folder).imu.t) == len(tokyo[2].recording.imu.t)
+
+
+def test_a_zip_is_to_be_unpacked(tmp_path, capsys):
+    with zipfile.ZipFile(tmp_path / "ride.zip", "w") as archive:
+        archive.writestr("imu.csv", "t,gx,gy,gz,ax,ay,az\n")
+    for command in ("init", "info", "smooth"):
+        more = [] if command == "info" else ["-o", tmp_path / "out"]
+        refuse_command(capsys, "file.archive", command, tmp_path / "ride.zip", *more)
 
 
 def _wrapped(period: float, first: float, form: str = "{:.6f}"):

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphnav.core.errors import RecordingError
-from graphnav.core.files import exists, is_blank, open_file, parse_number
+from graphnav.core.files import ARCHIVE, ZIP, exists, is_blank, open_file, parse_number
 from graphnav.core.notes import format_count
 from graphnav.core.rotation import Array
 from graphnav.recording.formats.decimals import drop_cut_line, read_decimals
@@ -199,6 +199,8 @@ def _find_header(path: Path) -> tuple[int, list[str]]:
         start = raw.read(1 << 16)
     if start[:2] in (b"\xff\xfe", b"\xfe\xff"):
         raise RecordingError(f"{path}: is UTF-16 text; save it as UTF-8", key="file.text")
+    if start[:4] == ZIP:
+        raise RecordingError(f"{path}: {ARCHIVE}", key="file.archive")
     if b"\0" in start.partition(b"\n")[0]:  # later ones a loss of power leaves
         raise RecordingError(f"{path}: is a binary file, not a CSV table; save it as CSV", key="file.binary")
     text = start.decode("utf-8-sig", errors="replace")
