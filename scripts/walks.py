@@ -58,7 +58,7 @@ def main() -> None:
     print(" | batch, in stance | batch, stances once | batch, point fitted | batch, bias before", end="")
     print(f" | up, m: {', '.join(SOLVERS)} | stride | NEES hor. | NEES up | s per min |")
     print("|" + " --- |" * (3 + len(CASES) * len(SOLVERS) + 9))
-    for name in options.group_arcs.split(","):
+    for name in options.sets.split(","):
         rows, before = [], None
         for plain, path in zip(PLAIN[name], sorted((folder / name).glob("*.toml")), strict=True):
             row, before = one(path, plain, SETS[name], before)

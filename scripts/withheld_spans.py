@@ -85,7 +85,7 @@ def main() -> None:
     starts = moving_spans(recording, options.spans, options.length, options.moving)
     print("| with | solver | end, m: median | worst | max, m: median | worst | drift, % of way | NEES |")
     print("| --- | --- | --- | --- | --- | --- | --- | --- |")
-    for name in options.group_arcs.split(","):
+    for name in options.sets.split(","):
         settings = parse_settings({**only(SETS[name]), **json.loads(options.settings)})
         table: dict[str, list[list[float]]] = {}
         for run in runs_of(starts, options.length):

@@ -169,7 +169,7 @@ MISTAKES: dict[str, list[Mistake]] = {
         Mistake(
             "a spreadsheet (.xlsx) renamed .csv",
             text("imu", lambda s: b"PK\x03\x04" + bytes(200)),
-            ("imu.csv", "binary"),
+            ("imu.csv", "spreadsheet"),
             error=True,
         ),
         Mistake(

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import argparse
+import ast
 import inspect
 import multiprocessing
 import pkgutil
 import re
+import runpy
 import shlex
 import shutil
 import subprocess
@@ -266,6 +269,48 @@ def test_every_table_of_an_experiment_names_its_command_and_commit():
         assert all((ROOT / script).exists() for script in runs), page.name
         before, _, _ = text.partition("```sh")
         assert "| --- " not in before, f"{page.name}: a table that no command printed"
+
+
+SCRIPTS = sorted((ROOT / "scripts").glob("*.py"))
+PRINTED = sorted({line for _, text in blocks("sh") for line in text.splitlines() if line.startswith("python scripts/")})
+
+
+@pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: path.stem)
+def test_a_script_uses_only_options_that_it_has(script):
+    names, known = set(), {"get"}
+    tree = ast.parse(script.read_text(encoding="utf-8"))
+    for node in ast.walk(tree):
+        called = node.func.attr if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) else None
+        if called in ("add_argument", "add_subparsers"):
+            known |= {word.value.lstrip("-").replace("-", "_") for word in node.args if isinstance(word, ast.Constant)}
+            known |= {word.value.value for word in node.keywords if word.arg == "dest"}
+        if isinstance(node, ast.Assign) and ".parse_args(" in ast.unparse(node.value):
+            names |= {ast.unparse(target) for target in node.targets}
+    found = [node for node in ast.walk(tree) if isinstance(node, ast.Attribute) and ast.unparse(node.value) in names]
+    known |= {node.attr for node in found if isinstance(node.ctx, ast.Store)}
+    used = {node.attr for node in found}
+    assert used <= known
+
+
+@pytest.mark.parametrize("line", PRINTED)
+def test_the_commands_of_experiments_are_understood(line, monkeypatch):
+    """As far as their options, by their own parsers: the runs take hours."""
+    _, script, *arguments = shlex.split(line)
+    understood = argparse.ArgumentParser.parse_args
+
+    def parse(parser, *words, **how):
+        understood(parser, *words, **how)
+        raise StopIteration  # before it runs
+
+    monkeypatch.setattr(argparse.ArgumentParser, "parse_args", parse)
+    monkeypatch.setattr(sys, "argv", [script, *arguments])
+    monkeypatch.syspath_prepend(ROOT / "scripts")
+    monkeypatch.chdir(ROOT)
+    if "argparse" in (ROOT / script).read_text(encoding="utf-8"):
+        with pytest.raises(StopIteration):
+            runpy.run_path(script, run_name="__main__")
+    else:
+        assert not arguments
 
 
 def test_toml_examples_are_valid(tmp_path):

@@ -12,6 +12,7 @@ import socket
 import sys
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from types import FrameType, TracebackType
 from typing import TYPE_CHECKING, Annotated, Any
@@ -49,7 +50,8 @@ commands = typer.Typer()
 )
 def online(
     source: Annotated[
-        str, typer.Argument(metavar="SOURCE", help="A recording; - for lines from standard input; tcp:PORT.")
+        str,
+        typer.Argument(metavar="SOURCE", help="A recording; lines: a file of them, - for standard input, tcp:PORT."),
     ],
     out: Annotated[Path | None, typer.Option("-o", "--out", metavar="OUT", help="Folder to write into.")] = None,
     speed: Annotated[
@@ -86,14 +88,15 @@ def online(
     from graphnav.online.session import Session
     from graphnav.recording.formats import read
 
-    live = source == "-" or source.startswith("tcp:")
+    stored = _holds_lines(Path(source))
+    live = source == "-" or source.startswith("tcp:") or stored
     if not speed >= 0.0:
         raise ConfigError(f"--speed {speed:g}: must be a number from 0 on", key="option.value")
     if send and live:
-        raise ConfigError(f"{source}: --send prints a recording; this is a live source", key="option.not_here")
-    for option, value in (("--format", format), ("--topic", topic)):
+        raise ConfigError(f"{source}: --send prints a recording; this gives lines already", key="option.not_here")
+    for option, value in (("--format", format), ("--topic", topic), ("--speed", speed)):
         if live and value:
-            raise ConfigError(f"{option}: is of recordings; {source} is a live source", key="option.not_here")
+            raise ConfigError(f"{option}: is of recordings; {source} gives lines", key="option.not_here")
     if send:
         _send(read(source, topic or (), allow_outside, format), speed)
         return
@@ -106,7 +109,9 @@ def online(
     shown = LiveView(session, quiet)
     with StopRequest() as asked:
         try:
-            if live:
+            if stored:
+                follow(session, _read_chunks(Path(source)), shown, asked)
+            elif live:
                 follow(session, read_standard_input() if source == "-" else read_connections(source), shown, asked)
             else:
                 process_recording(session, Pace(speed), shown, asked)
@@ -120,6 +125,21 @@ def online(
     if asked and not session.done:
         raise Interrupted("interrupted" + (f"; go on with --resume -o {folder}" if folder else ""))
     session.require_settled()
+
+
+def _holds_lines(path: Path) -> bool:
+    """Whether a file begins as a live source does."""
+    from graphnav.online.lines import PROTOCOL
+
+    with suppress(OSError, ValueError), path.open("rb") as file:
+        return file.read(len(PROTOCOL)) == PROTOCOL.encode()
+    return False
+
+
+def _read_chunks(path: Path) -> Iterator[bytes]:
+    with path.open("rb") as file:
+        while chunk := file.read(1 << 16):
+            yield chunk
 
 
 def _override(settings: Settings, lag: float | None, engine: str | None) -> Settings:
@@ -268,6 +288,7 @@ class LiveView:
     def __init__(self, session: Session, quiet: bool) -> None:
         self.session, self.quiet, self.next = session, quiet, 0.0
         self.live: Any = None
+        self.last = ""
         if not quiet and sys.stdout.isatty():
             from rich.live import Live
 
@@ -286,7 +307,10 @@ class LiveView:
         lines = view(self.session, silent)
         if self.live is None:
             self.next = time.monotonic() + 10.0 * TICK
-            say("; ".join(f"{label}: {value}" for label, value in lines))
+            text = "; ".join(f"{label}: {value}" for label, value in lines)
+            if text != self.last:
+                say(text)
+            self.last = text
             return
         from rich.table import Table
 

@@ -127,6 +127,9 @@ def collect_withheld(without: list[str] | None, start: float | None, end: float 
     """What is withheld; the requested span must not be empty."""
     from graphnav.app import workflow
 
+    for name, value in (("--start", start), ("--end", end)):
+        if value is not None and value != value:
+            raise ConfigError(f"{name} {value:g}: must be a number of seconds", key="option.value")
     if start is not None and end is not None and not start < end:
         raise ConfigError(f"--end {end:g}: must be later than --start {start:g}", key="option.value")
     return tuple(workflow.parse_withheld(one) for one in without or ())

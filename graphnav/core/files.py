@@ -30,6 +30,7 @@ _WRITTEN = 64 << 20  # bytes at most of a file that is read as a whole: settings
 _RATIO, _SMALL = 200, 8 << 20  # the size check of a packed log matters only beyond this many bytes
 _READ_SIZE = 1 << 16
 _GZIP = b"\x1f\x8b"
+ZIP, ARCHIVE = b"PK\3\4", "is a zip archive or a spreadsheet; unpack it, or save it as CSV"
 
 Kind = type[GraphnavError]
 

@@ -7,12 +7,13 @@ from collections.abc import Callable
 from pathlib import Path
 
 from graphnav.config import Settings
-from graphnav.core.errors import RecordingError
+from graphnav.core.errors import ConfigError, RecordingError
 from graphnav.core.notes import get_key
 from graphnav.core.trajectory import Trajectory
 from graphnav.online.lines import END, parse_row, parse_setup
 from graphnav.online.replay import drop_rows, list_rows
 from graphnav.online.sensors import Row
+from graphnav.online.start import let_clocks_drift
 from graphnav.online.steady import Online
 from graphnav.online.store import Store
 from graphnav.recording import Recording
@@ -50,6 +51,7 @@ class Session:
         resumed = self.store.resumed if self.store is not None else None
         if resumed is not None:
             self.online, self.done = resumed.online, resumed.done
+            self.settings = self._require_same(settings)
             self.taken, self.rows_settled, self.bad = (resumed.counts[k] for k in ("taken", "settled", "bad"))
             self._kept = self.online.sensors.imu.newest
         elif recording is not None:
@@ -57,6 +59,26 @@ class Session:
         if self.store is not None and resumed is not None and recording is None:
             self.store.recall()
             self._take_pending(self.store)
+
+    def _require_same(self, stated: Settings) -> Settings:
+        """The settings that a resumed run goes on with: those it was made with.
+
+        Raises
+        ------
+        ConfigError
+            If others are stated; the default ones state nothing.
+        """
+        assert self.online is not None
+        made = self.online.settings
+        for table, theirs in let_clocks_drift(stated).model_dump().items():
+            ours, default = (one.model_dump()[table] for one in (made, let_clocks_drift(Settings())))
+            if theirs not in (ours, default):
+                raise ConfigError(
+                    f"--resume: {self.folder} was made with other settings of [{table}]; leave them out to go on with "
+                    "its own, or name another folder",
+                    key="checkpoint.other_settings",
+                )
+        return made
 
     def add(self, row: Row) -> None:
         """Process one row."""

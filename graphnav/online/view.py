@@ -60,7 +60,7 @@ def view(session: Session, silent: float = 0.0) -> list[tuple[str, str]]:
     if late or wrong or odd or session.bad:
         remarks = [f"{late} late rows used"] * bool(late) + [f"{n} {k}" for k, n in sorted(odd.items())]
         remarks += [f"{format_count(wrong, 'wrong fix', 'wrong fixes')} left out"] * bool(wrong)
-        remarks += [f"{session.bad} bad lines ({session.complaints[0]})"] if session.complaints else []
+        remarks += [f"{format_count(session.bad, 'bad line')} ({session.complaints[0]})"] if session.complaints else []
         lines.append(("odd", ", ".join(remarks)))
     if online.failures:
         lines.append(("failed", f"{len(online.failures)} pieces, the last {online.failures[-1]}"))

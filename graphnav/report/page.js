@@ -147,10 +147,13 @@
     const moved = Object.keys(change).some(key => key.startsWith("xaxis."));
     if (!moved || (shared && Math.max(...range.map((x, k) => Math.abs(x - shared[k]))) < 1e-3)) return;
     shared = range;
-    for (const one of others(place)) Plotly.relayout(one, {"xaxis.range": range.map(onClock)});
+    const moves = others(place).map(one => Plotly.relayout(one, {"xaxis.range": range.map(onClock)}));
+    Promise.all(moves).then(() => point(pointed));
   };
 
+  let pointed = null;  // time under the mouse, on the clock
   const point = x => {
+    pointed = x;
     for (const place of places.filter(one => one.data && timed(one))) {
       let cursor = place.querySelector(".cursor");
       if (!cursor) place.append(cursor = Object.assign(document.createElement("div"), {className: "cursor"}));

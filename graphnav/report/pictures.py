@@ -106,15 +106,24 @@ def select_fixes(recording: Recording, solution: Solution) -> plots.DrawnFixes |
 
 
 def _find_truth(recording: Recording, solutions: Mapping[str, Solution]) -> tuple[Array, Array] | None:
-    """Times (M,) and positions (M, 2 or 3) of the truth, in metres of the first solution's frame."""
+    """Times (M,) and positions (M, 2 or 3) of the truth, in metres of the first solution's frame, while it lasts.
+
+    A row without a position, NaN, is where the truth has a gap.
+    """
     truth, first = recording.truth, next(iter(solutions.values()))
     if truth is None or (truth.llh is None and truth.xyz is None):
         return None
     if truth.llh is not None and has_place(first):
-        return truth.t, first.frame.from_llh(truth.llh)
-    own = truth.xyz if truth.llh is None else LocalFrame(truth.llh[0]).from_llh(truth.llh)
-    assert own is not None
-    return _lay_on(truth.t, own, list(select_own(solutions).values())[-1])
+        during = (truth.t >= first.t[0]) & (truth.t <= first.t[-1])
+        found: tuple[Array, Array] | None = truth.t[during], first.frame.from_llh(truth.llh[during])
+    else:
+        own = truth.xyz if truth.llh is None else LocalFrame(truth.llh[0]).from_llh(truth.llh)
+        assert own is not None
+        found = _lay_on(truth.t, own, list(select_own(solutions).values())[-1])
+    if found is None or not len(found[0]):
+        return None
+    t, *p = plots.insert_breaks(found[0], np.arange(len(found[0])), *found[1].T)
+    return t, np.stack(p, axis=-1)
 
 
 def has_place(solution: Solution) -> bool:

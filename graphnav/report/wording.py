@@ -17,16 +17,19 @@ def format_value(value: Any) -> Any:
 
 
 def format_number(value: float, digits: int = 4) -> str:
-    """A number for people: `digits` significant digits, whole from a thousand on, '-' where there is none."""
+    """A number for people: `digits` significant digits, whole from a thousand on, '-' where there is none.
+
+    Below one, four decimals of an error in m are enough; below a hundredth one digit less than `digits`, at least two.
+    """
     if not math.isfinite(value):
         return "-"
     if value == 0:
         return "0"
     size = abs(value)
-    if size >= 1e7 or size < 1e-4:
-        return f"{value:.{digits - 1}g}"
+    if size >= 1e7 or size < 1e-2:
+        return f"{value:.{max(digits - 1, 2)}g}"
     places = max(0, digits - 1 - math.floor(math.log10(size)))
-    return f"{value:.{min(places, digits)}f}"
+    return f"{value:.{min(places, max(digits, 3))}f}"
 
 
 class Quantity(str):

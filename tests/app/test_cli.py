@@ -413,6 +413,7 @@ BAD = {
     "span outside": (["smooth", "kitti", "-o", "o", "--without", "gnss:900-960"], "option.span_outside", "'kitti'"),
     "no such sensor": (["smooth", "kitti", "-o", "o", "--without", "odometer"], "withhold.none", "'odometer'"),
     "end before start": (["smooth", "kitti", "-o", "o", "--start", "9", "--end", "5"], "option.value", "--end 5"),
+    "start is no number": (["smooth", "kitti", "-o", "o", "--start", "nan"], "option.value", "--start nan"),
     "start after the end": (["smooth", "kitti", "-o", "o", "--start", "9999"], "option.span_outside", "--start 9999"),
     "no rate": (["smooth", "kitti", "-o", "o", "--rate", "0"], "option.value", "--rate 0"),
     "no config": (["smooth", "kitti", "-o", "o", "--config", "no.toml"], "file.unreadable", "no.toml"),

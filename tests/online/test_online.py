@@ -471,6 +471,12 @@ def uninterrupted(folder: Path, config: Path, tmp_path_factory: pytest.TempPathF
     return (out / "trajectory.csv").read_bytes()
 
 
+def test_a_file_of_lines_is_a_source(folder: Path, config: Path, uninterrupted: bytes, tmp_path: Path) -> None:
+    process = program(folder, "-o", tmp_path / "out", "--config", config, "--quiet")
+    assert process.wait(60) == 0, process.stderr.read()
+    assert (tmp_path / "out" / "trajectory.csv").read_bytes() == uninterrupted
+
+
 def test_killed_and_resumed_it_ends_with_the_same(
     folder: Path, config: Path, uninterrupted: bytes, tmp_path: Path
 ) -> None:
@@ -567,6 +573,11 @@ def test_folders_and_checkpoints_are_not_mixed_up(drive: tuple[Recording, Trajec
         Session(QUICK, "drive", out, recording=recording)
     with refused("checkpoint.other_source", ConfigError, "'drive'", "'other'"):
         Session(QUICK, "other", out, resume=True, recording=recording)
+    with refused("checkpoint.other_settings", ConfigError, "[solver]"):
+        Session(LONG, "drive", out, resume=True, recording=recording)
+    again = Session(Settings(), "drive", out, resume=True, recording=recording)  # as the advice of an end has it
+    assert again.settings.solver.lag == QUICK.solver.lag
+    again.close()
     body = bytearray((out / "checkpoint").read_bytes())
     body[-5] ^= 1
     (out / "checkpoint").write_bytes(body)
@@ -625,6 +636,7 @@ def test_bad_usage_is_one_line_and_code_two(
         (["-", "--detectors", "fused,fft"], "detectors.fused_alone", "fused"),
         (["-", "--format", "ubx"], "option.not_here", "--format"),
         (["-", "--topic", "/imu"], "option.not_here", "--topic"),
+        (["-", "--speed", "2"], "option.not_here", "--speed"),
         (["-", "--send"], "option.not_here", "--send"),
         (["tcp:x"], "online.cannot_listen", "tcp:x"),
         (["tcp:70000"], "online.cannot_listen", "tcp:70000"),

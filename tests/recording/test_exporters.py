@@ -245,6 +245,13 @@ def test_local_truth_in_two_dimensions(tmp_path: Path) -> None:
     np.testing.assert_array_equal(found.llh, [[0.0, 0.5, np.nan], [0.6, 0.2, np.nan]])
 
 
+@pytest.mark.parametrize("rows", ["t,lat,lon,h\n0,30,114,20\n1,30,114,20\n", "0 1 2 3 0 0 0 1\n1 1 2 3 0 0 0 1\n"])
+def test_comments_of_other_programs_are_no_header_of_rtklib(tmp_path: Path, rows: str) -> None:
+    file = tmp_path / "track.txt"
+    file.write_text(f"% of MATLAB\n%\n{rows}")
+    np.testing.assert_array_equal(read_trajectory(file).t, [0.0, 1.0])
+
+
 @pytest.mark.parametrize(
     ("content", "key", "names"),
     [

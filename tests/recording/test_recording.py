@@ -111,6 +111,39 @@ def test_gnss_velocities_and_their_sigmas_share_the_unit(tmp_path: Path) -> None
     assert np.allclose(gnss.llh[0], [np.radians(50), np.radians(8), 100])
 
 
+def test_speeds_over_ground_have_the_sigmas_of_the_file(tmp_path: Path) -> None:
+    (tmp_path / "g.csv").write_text(
+        "t,lat,lon,h,sd_e,sd_n,sd_u,speed,course,sd_ve,sd_vn,sd_vu\n0,50,8,100,2,2,3,10,90,0.5,0.5,0.5\n"
+        "1,50,8,100,2,2,3,0.1,,0.3,0.3,0.3\n2,50,8,100,2,2,3,10,0,,,\n3,50,8,100,2,2,3,,,0.5,0.5,0.5\n"
+    )
+    gnss = read(describe(tmp_path, rest='[gnss]\nfile = "g.csv"')).gnss
+    assert gnss.v[:3] == pytest.approx(np.array([[10, 0, 0], [0, 0.1, 0], [0, 10, 0]]), abs=1e-12)
+    # upward it is not measured: a slope of one in ten
+    assert gnss.sd_v[:3] == pytest.approx(np.array([[0.5, 0.5, 1.0], [0.3, 0.3, 0.3], [0.2, 0.2, 1.0]]))
+    assert np.isnan(gnss.v[3]).all()
+    assert np.isnan(gnss.sd_v[3]).all()
+
+
+def test_what_a_phone_marks_as_unknown_is_not_used(tmp_path: Path) -> None:
+    """-1, beside which there are no other negative values: courses from -180 to 180 are all known."""
+    head = "t,lat,lon,h,sd_e,sd_n,sd_u,speed,course,sd_ve,sd_vn,sd_vu\n"
+    rows = ["0,50,8,100,2,2,3,-1,-1,-1,-1,-1", "1,50,8,100,-1,-1,3,5,0,1,1,1", "2,50,8,0,2,2,-1,5,0,1,1,1"]
+    rows += ["3,50,8,100,2,2,3,5,0,-1,-1,-1", "4,50,8,100,2,2,3,5,90,1,1,1", "5,50,8,100,2,2,3,0,-1,1,1,1"]
+    (tmp_path / "g.csv").write_text(head + "\n".join(rows) + "\n")
+    recording = read(describe(tmp_path, rest='[gnss]\nfile = "g.csv"'))
+    assert_told(recording.remarks, "gnss.sigma_unknown")
+    assert recording.gnss.t == pytest.approx([0, 3, 4, 5])
+    assert np.isnan(recording.gnss.v[:2]).all()
+    assert recording.gnss.v[2:] == pytest.approx(np.array([[5, 0, 0], [0, 0, 0]]), abs=1e-12)
+    (tmp_path / "g.csv").write_text("t,lat,lon,h,speed,course\n0,50,8,100,5,-1\n1,50,8,100,5,-90\n")
+    signed = read(describe(tmp_path, rest='[gnss]\nfile = "g.csv"')).gnss
+    assert signed.v[1] == pytest.approx([-5, 0, 0], abs=1e-12)
+    assert signed.v[0] == pytest.approx([-5 * np.sin(np.radians(1)), 5 * np.cos(np.radians(1)), 0])
+    (tmp_path / "g.csv").write_text(head + "\n".join(["1,50,8,100,-1,-1,3,5,0,1,1,1"] * 2) + "\n")
+    with refused("gnss.sigma_all_unknown", RecordingError, "g.csv"):
+        read(describe(tmp_path, rest='[gnss]\nfile = "g.csv"'))
+
+
 def test_positions_in_radians_and_longitudes_beyond_180(tmp_path: Path) -> None:
     (tmp_path / "g.csv").write_text("t,lat,lon,h\n0,0.5,-1.5,100\n")
     gnss = read(describe(tmp_path, rest='[gnss]\nfile = "g.csv"\nunits = { angle = "rad" }')).gnss
@@ -130,6 +163,8 @@ def test_positions_in_radians_and_longitudes_beyond_180(tmp_path: Path) -> None:
         IMU_ROWS.rstrip("\n"),
         "# a comment\n\n" + IMU_ROWS + "\n# the end\n",
         IMU_ROWS.replace("\n", " # more, and more\n"),
+        "% a comment, of MATLAB\n%\n" + IMU_ROWS.replace("\n0.02", "\n  % pause, 2\n0.02") + "% the end",
+        "az,load (%),ay,ax,gz,gy,gx,t\n6,5%,5,4,3,2,1,0.01\n6,%,5,4,3,2,1,0.02\n",
         "az,note,ay,ax,gz,gy,gx,t\n6,#N/A,5,4,3,2,1,0.01\n6,# 7,5,4,3,2,1,0.02#\n",
         " t , gx,gy ,gz,ax,ay, az\n 0.01, 1,2,3,4,5,6\n0.02 ,1,2,3,4,5,6 \n",
         "az,note,ay,ax,gz,gy,gx,t\n6,first,5,4,3,2,1,0.01\n6,,5,4,3,2,1,0.02\n",
@@ -142,6 +177,8 @@ def test_positions_in_radians_and_longitudes_beyond_180(tmp_path: Path) -> None:
         "no-last-newline",
         "comments",
         "comments-in-lines",
+        "comments-of-matlab",
+        "percents-in-cells",
         "hashes-in-cells",
         "spaces",
         "any-order-and-text",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import json
+import zipfile
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -103,6 +104,24 @@ def test_heights_of_a_phone_that_wander_are_not_said_to_be_in_another_unit(share
     assert not {"gnss.feet", "gnss.height_scale"} & {one.key for one in found}
 
 
+def test_a_phone_that_has_no_fix_for_a_while(tokyo, tmp_path):
+    """Its accuracies, speeds and courses are -1 then."""
+    folder = stranger.write_phone(tmp_path / "ride", tokyo[0])
+    head, *rows = (folder / "Location.csv").read_text().splitlines()
+    names = head.split(",")
+    for k in (1, 2, 3, 60, 61):
+        cells = dict(zip(names, rows[k].split(","), strict=True))
+        unknown = ["speed", "bearing", "speedAccuracy", "bearingAccuracy"]
+        unknown += ["horizontalAccuracy", "verticalAccuracy"] if k != 60 else []
+        rows[k] = ",".join((cells | dict.fromkeys(unknown, "-1.0")).values())
+    (folder / "Location.csv").write_text("\n".join([head, *rows]) + "\n")
+    run("init", folder, "-o", folder, "--quiet")
+    gnss = read(folder).gnss
+    assert len(gnss.t) == len(rows) - 4  # those of unknown place
+    assert np.isnan(gnss.v).any(1).sum() == 1
+    assert np.nanmedian(gnss.sd_v[:, :2]) == 0.5  # speedAccuracy
+
+
 def test_a_receiver_beside_an_imu_in_other_units(tokyo, tmp_path, capsys):
     """No edit: deg/s, g and Unix milliseconds beside the GPS week of a .ubx."""
     drive = tokyo[1]
@@ -140,6 +159,47 @@ def test_a_fix_that_stands_in_every_row_of_the_imu_counts_once(tokyo, tmp_path):
     place = np.column_stack([np.degrees(gnss.llh[:, :2]), gnss.llh[:, 2]])
     differ = 1 + np.sum((np.diff(np.round(place, 8), axis=0) != 0.0).any(axis=1))
     assert len(recording.gnss.t) == differ  # some repeat the one before at a stop
+
+
+def test_stamps_in_no_order_and_names_that_state_another_unit_are_read_by_their_steps(tokyo, tmp_path):
+    """Rows of the IMU shuffled; nanoseconds, of a date and since the start, in a column called t_s."""
+    drive = tokyo[2]
+    (head, rows), fixes = stranger.tables(drive, unix=1000.0)
+    shuffled = [rows[k] for k in np.random.default_rng(2).permutation(len(rows))]
+    folder = stranger.write_tables(tmp_path / "shuffled", (head, shuffled), fixes)
+    run("init", folder, "-o", folder, "--quiet")
+    assert read(folder).imu.t == pytest.approx(1000.0 + drive.recording.imu.t, abs=1e-6)
+    for name, zero in (("date", 1.7e9), ("boot", 12.0)):
+        both = [
+            (head.replace("t,", "t_s,", 1), [[f"{(float(t) - 1000.0 + zero) * 1e9:.0f}", *rest] for t, *rest in rows])
+            for head, rows in stranger.tables(drive, unix=1000.0)
+        ]
+        folder = stranger.write_tables(tmp_path / name, *both)
+        run("init", folder, "-o", folder, "--quiet")
+        assert read(folder).imu.t == pytest.approx(zero + drive.recording.imu.t, abs=1e-5)
+
+
+def test_an_imu_that_reads_the_same_throughout_is_refused(tokyo, tmp_path, capsys):
+    (head, rows), fixes = stranger.tables(tokyo[0])
+    frozen = [[t, *rows[0][1:]] for t, *_ in rows]
+    folder = stranger.write_tables(tmp_path, (head, frozen), fixes)
+    run("init", folder, "-o", folder, "--quiet")
+    refuse_command(capsys, "imu.frozen", "smooth", folder, "-o", tmp_path / "out", "--quiet")
+
+
+def test_links_that_lead_nowhere_are_no_logs(tokyo, tmp_path):
+    folder = stranger.write_tables(tmp_path, *stranger.tables(tokyo[2]))
+    (folder / "old.csv").symlink_to(tmp_path / "none.csv")
+    run("init", folder, "-o", folder, "--quiet")
+    assert len(read(folder).imu.t) == len(tokyo[2].recording.imu.t)
+
+
+def test_a_zip_is_to_be_unpacked(tmp_path, capsys):
+    with zipfile.ZipFile(tmp_path / "ride.zip", "w") as archive:
+        archive.writestr("imu.csv", "t,gx,gy,gz,ax,ay,az\n")
+    for command in ("init", "info", "smooth"):
+        more = [] if command == "info" else ["-o", tmp_path / "out"]
+        refuse_command(capsys, "file.archive", command, tmp_path / "ride.zip", *more)
 
 
 def _wrapped(period: float, first: float, form: str = "{:.6f}"):
@@ -442,6 +502,7 @@ NOON, UNIX_DAY = 57600.5, 1751932800.0
     [
         ("time  x\n" + "\n".join(f"{row}   1.5" for row in ROWS), NOON),
         ("# time x\n" + "\n".join(f"{row} 1.5" for row in ROWS), NOON),
+        ("% a log\n% time x\n" + "\n% again\n".join(f"{row} 1.5" for row in ROWS), NOON),
         ("time\tx\n" + "\n".join(f"{row}\t1.5".replace(".", ",") for row in ROWS), NOON),
         ("time;x;\n" + "\n".join(f"{row};1,5;" for row in ROWS), NOON),
         ("time;x\n" + "\n".join(f"{row};1,5;" for row in ROWS), NOON),

@@ -62,6 +62,14 @@ def test_every_picture_comes_alive_in_both_colours(tab, pages, page, size):
     checked(tab, size[0])
 
 
+def test_the_first_number_of_a_table_is_seen_on_a_phone(tab, pages):
+    """Beside a long name, without scrolling sideways."""
+    tab.open(pages / "batch/report.html", browser.PHONE)
+    cells = "[...document.querySelectorAll('section td:nth-child(2):not(.words)')].filter(c => c.offsetParent)"
+    assert tab.run(f"{cells}.length") > 20
+    assert tab.run(f"Math.max(...{cells}.map(c => c.getBoundingClientRect().right))") < browser.PHONE[0]
+
+
 def test_without_scripts_a_page_says_what_is_missing(tab, pages):
     tab.open(pages / "batch/report.html", browser.PHONE, scripts=False)
     assert tab.run("document.querySelector('main noscript').innerText").strip()
@@ -113,8 +121,17 @@ def test_hovering_zooming_and_hiding(tab, pages):
     tab.wait(f"!!{other}.querySelector('.js-plotly-plot .plotly')")
     limits = "(f => f.querySelector('.plot').layout.xaxis.range)"
     assert tab.run(f"{limits}({other})") == pytest.approx(tab.run(f"{limits}({place})"))
+    # and the cursor, which is at the time under the mouse in both
+    left, top, width, height = tab.run(
+        f"(r => [r.left, r.top, r.width, r.height])({other}.querySelector('.nsewdrag').getBoundingClientRect())"
+    )
+    for x in (0.49, 0.5):
+        tab.mouse("mouseMoved", left + x * width, top + 0.5 * height)
+    tab.wait(f"{place}.querySelector('.cursor')?.hidden === false")
     tab.run(f"void Plotly.relayout({other}.querySelector('.plot'), {{'xaxis.range': [10, 20]}})")
     tab.wait(f"{limits}({place})[0] === 10")
+    at = "(p => (p.querySelector('.cursor').offsetLeft - p._fullLayout.xaxis._offset) / p._fullLayout.xaxis._length)"
+    tab.wait(f"[{place}, {other}].every(f => Math.abs({at}(f.querySelector('.plot')) - 0.5) < 0.05)")
     # the same on the recording's clock, and back
     choose = "(k => (k.selectedIndex = {}, k.dispatchEvent(new Event('change'))))(document.getElementById('clock'))"
     start = tab.run("Number(document.getElementById('clock').options[1].value)")

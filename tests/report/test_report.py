@@ -718,6 +718,28 @@ def test_a_truth_on_the_earth_is_laid_onto_a_walk_that_counts_from_its_start(rec
     assert laid == pytest.approx(p, abs=0.05)  # the Earth is round
 
 
+def test_a_truth_is_drawn_while_the_run_lasts_and_not_across_its_gaps(recording):
+    """A part of a drive: the truth of the rest, and a straight line where it has none, would be no truth."""
+    one = solution(offset=0.0)
+    t = np.arange(one.t[0] - 50.0, one.t[-1] + 50.0, 0.1)
+    t = t[(t < one.t[0] + 3.0) | (t > one.t[0] + 23.0)]
+    truth = replace(recording.truth, t=t, llh=one.frame.to_llh(way(t - START)))
+    seen, p = report_pictures._find_truth(replace(recording, truth=truth), {"rts": one})
+    assert (seen[0], seen[-1]) == pytest.approx((one.t[0], one.t[-1]), abs=0.1)
+    (gap,) = np.flatnonzero(np.isnan(p).any(axis=1))
+    assert (seen[gap - 1] - one.t[0], seen[gap + 1] - one.t[0]) == pytest.approx((3.0, 23.0), abs=0.11)
+    assert np.isfinite(np.delete(p, gap, axis=0)).all()
+
+
+@pytest.mark.parametrize(
+    ("value", "digits", "text"),
+    [(1.5e-4, 4, "0.00015"), (2.07e-4, 4, "0.000207"), (0.0182, 2, "0.018"), (0.01234, 4, "0.0123"), (0.0, 4, "0"),
+     (1.234e-5, 4, "1.23e-05"), (12.345, 4, "12.35"), (1234.5, 4, "1234"), (0.1, 3, "0.100"), (np.nan, 4, "-")],
+)  # fmt: skip
+def test_small_numbers_keep_their_digits(value, digits, text):
+    assert wording.format_number(value, digits) == text
+
+
 def test_the_page_of_an_allan_variance_draws_the_deviations_and_their_fit(tmp_path):
     rng, rate = np.random.default_rng(3), 50.0
     t = np.arange(1, 6001) / rate

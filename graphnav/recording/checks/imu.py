@@ -12,6 +12,9 @@ from graphnav.core.findings import Finding, compute_period, describe_gaps, find_
 from graphnav.core.notes import format_count
 from graphnav.core.rotation import Array
 from graphnav.recording import Imu, Recording
+from graphnav.recording.checks.tracks import Track
+
+_CHANGED = 3.0  # m/s, of the speed: more than errors of velocities
 
 
 def check_imu_time(imu: Imu) -> Iterator[Finding]:
@@ -33,9 +36,22 @@ def find_gap_limit(t: Array) -> float:
     return 2.5 * compute_period(t)
 
 
-def check_repeats(imu: Imu) -> Iterator[Finding]:
+def check_repeats(imu: Imu, track: Track | None) -> Iterator[Finding]:
+    """Rows that repeat the one before; all of them, in a drive that by its fixes goes faster and slower."""
     gyro, accel = imu.gyro[1:] == imu.gyro[:-1], imu.accel[1:] == imu.accel[:-1]
     same = np.logical_and.reduce([*gyro.T, *accel.T])
+    if same.all() and track is not None:
+        speed = track.speed
+        falls = np.maximum.accumulate(speed) - speed
+        rises = speed - np.minimum.accumulate(speed)
+        if min(falls.max(), rises.max()) > _CHANGED:
+            yield Finding(
+                "refused",
+                f"the IMU reads the same in all of its {len(imu.t)} rows while the fixes speed up and slow down: they "
+                "are no measurements",
+                "imu.frozen",
+            )
+            return
     if same.mean() > 0.002:
         yield Finding(
             "note",

@@ -158,7 +158,7 @@ def inspect(recording: Recording) -> Inspection:
     track = tracks.compute_track(recording.gnss) if recording.gnss is not None else None
     rest = _find_rest(recording, track if overlap else None)
     findings += check_imu_time(stamps)  # rows left out have been reported already
-    findings += check_repeats(recording.imu)
+    findings += check_repeats(recording.imu, track if overlap else None)
     findings += check_saturation(recording.imu)
     if "imu.gyro_unit" not in known:
         findings += check_gyro_unit(recording)

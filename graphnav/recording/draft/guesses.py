@@ -20,6 +20,7 @@ _MEAN_SHARE = 0.5  # share of the typical force that is in its mean, even for a 
 _LIKELY, _CLEAR = 0.5, 0.9  # correlation
 _STRAIGHT_COSINE = np.cos(np.radians(12.0))  # cosine of the angle to a file axis below which the axis is meant
 _QUIET_SPAN = 5.0  # s
+_BACKWARD = 0.01  # share of steps backward from which rows are in no order
 _LARGEST_STEP = 100.0  # s; larger steps between stamps mean a smaller unit
 _FIXED = 0.15  # m; only fixed carrier phases state less
 
@@ -34,16 +35,24 @@ class Guess:
 
 def guess_time_unit(t: Array, stated: str | None, imu: bool) -> Guess:
     """s, ms, us or ns: by the name, by the magnitude of an epoch, by the step."""
-    if stated is not None:
+    step = _compute_step(t)
+    if stated is not None and step * TIME_UNITS[stated] < _LARGEST_STEP:
         return Guess(stated, "as the column's name says")
     if (unit := _guess_unix_unit(t)) is not None:
         return Guess(unit, f"{t[0]:.0f} is then a date of this century in Unix time")
-    step = float(np.median(np.diff(t))) if len(t) > 1 else 1.0
     low, high = (5e-4, 0.11) if imu else (0.02, 11.0)
     fits = [unit for unit, scale in TIME_UNITS.items() if low <= step * scale <= high]
     if not fits:
         return Guess("s", f"rows are {step:g} apart, which fits no unit: a guess")
     return Guess(fits[0], f"rows are then {step * TIME_UNITS[fits[0]]:.4g} s apart")
+
+
+def _compute_step(t: Array) -> float:
+    """The median step between stamps, of rows in any order; 1 of a single row."""
+    step = np.diff(t)
+    if len(step) and (step < 0.0).mean() > _BACKWARD:  # no clock restarts as often
+        step = np.diff(np.sort(t))
+    return float(np.median(step)) if len(step) else 1.0
 
 
 def is_date(t: Array) -> bool:
@@ -52,7 +61,7 @@ def is_date(t: Array) -> bool:
 
 
 def _guess_unix_unit(t: Array) -> str | None:
-    step = float(np.median(np.diff(t))) if len(t) > 1 else 0.0
+    step = _compute_step(t) if len(t) > 1 else 0.0
     return next(
         (u for u, scale in TIME_UNITS.items() if 1e9 <= float(t[0]) * scale < 3e9 and step * scale < _LARGEST_STEP),
         None,

@@ -21,7 +21,7 @@ from graphnav.recording.draft.plain import Plain, read_plain
 from graphnav.recording.formats.folder import read_other_log
 from graphnav.recording.formats.places import check_angles, find_places
 from graphnav.recording.formats.registry import Log
-from graphnav.recording.formats.repair import find_repeated, mask_new_fixes
+from graphnav.recording.formats.repair import blank_unknown, find_repeated, mask_new_fixes
 from graphnav.recording.formats.schema import WHEELS
 from graphnav.recording.formats.table import Table, read_column_names, read_first_rows, read_table
 from graphnav.sensors.tables import ANGLE, TIME_UNITS
@@ -234,6 +234,13 @@ def _read_sensor(path: Path, columns: matching.FileColumns, role: str, plain: Pl
     needed = [n for n in wanted[: _NEEDED.get(role, len(wanted))] if n in names]
     whole = np.asarray(np.isfinite(table.stack(*needed)).all(-1))
     if role == "gnss":
+        table, known = blank_unknown(table)  # as it will be read
+        if not known.any():
+            raise RecordingError(
+                f"{path}: the accuracy of every fix is -1, a phone's mark of one that it does not have",
+                key="draft.no_fix",
+            )
+        whole &= known
         fixed = (table["lat"] != 0.0) | (table["lon"] != 0.0)
         if whole.any() and not (whole & fixed).any():
             raise RecordingError(

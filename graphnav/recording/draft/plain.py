@@ -131,7 +131,7 @@ def _read_lines(text: Sequence[str]) -> NumberedLines:
     """Numbers and text of non-empty lines; after the first row without comments."""
     lines = [(k, line) for k, line in enumerate(text, 1) if line.strip()]
     first = _find_first_row(lines)
-    return [(k, line) for i, (k, line) in enumerate(lines) if i <= (first or 0) or line.lstrip()[0] != "#"]
+    return [(k, line) for i, (k, line) in enumerate(lines) if i <= (first or 0) or line.lstrip()[0] not in "#%"]
 
 
 def _split(line: str, mark: str | None) -> list[str]:

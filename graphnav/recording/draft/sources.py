@@ -150,7 +150,7 @@ def _list_logs(path: Path) -> list[Path]:
     """A log by itself, or those in a folder that is not a log itself."""
     if not path.is_dir() or any(known.load is not None and known.recognises(path) for known in list_formats().values()):
         return [path]
-    every = [p for p in path.iterdir() if not p.name.startswith(".")]
+    every = [p for p in path.iterdir() if not p.name.startswith(".") and p.exists()]  # no links that lead nowhere
     made = {JOINED, "recording.toml"}  # written by an earlier draft
     made |= {name_plain_file(p, sensor) for p in every for sensor in WANTED}
     inside = sorted(p for p in every if p.name not in made)

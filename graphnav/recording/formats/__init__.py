@@ -13,10 +13,10 @@ from pathlib import Path
 
 from graphnav.core.complaints import suggest_nearest
 from graphnav.core.errors import RecordingError
-from graphnav.core.files import exists
+from graphnav.core.files import ARCHIVE, ZIP, exists
 from graphnav.recording import Recording
 from graphnav.recording.exporters import FORMATS as EXPORTED
-from graphnav.recording.formats.registry import Format, Log
+from graphnav.recording.formats.registry import Format, Log, read_first_bytes
 from graphnav.recording.formats.rounding import measure_rounding
 
 __all__ = ["Format", "Log", "is_description", "list_formats", "load", "read"]
@@ -152,6 +152,8 @@ def _explain_unknown(source: str | Path, known: dict[str, Format]) -> RecordingE
                 f"{path}: not a recording; point at its folder or its .toml file (graphnav init drafts one)",
                 key="recording.none",
             )
+        if path.is_file() and read_first_bytes(path)[:4] == ZIP:
+            return RecordingError(f"{path}: {ARCHIVE}", key="file.archive")
         others = ", ".join(name for name, f in known.items() if f.load is not None)
         return RecordingError(
             f"{path}: not a recording; point at its folder or its .toml file, or at a log of a kind that is known "

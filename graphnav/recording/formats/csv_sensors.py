@@ -20,6 +20,7 @@ from graphnav.recording.formats.repair import (
     VAGUEST,
     VAGUEST_V,
     Remarks,
+    blank_unknown,
     choose_sigmas,
     compute_horizontal_velocity,
     parse_fix_types,
@@ -29,6 +30,7 @@ from graphnav.sensors import Sensor, Series
 from graphnav.sensors.tables import ANGLE
 
 _ROWS_AT_ONCE = 1 << 16  # rows at once
+_SD_V = ("sd_ve", "sd_vn", "sd_vu")
 
 
 def build_imu(d: schema.ImuTable, rows: Table, remarks: Remarks) -> Imu:
@@ -65,6 +67,17 @@ def _take_in_body(rows: Table, names: tuple[str, ...], unit: float, R_bs: Array)
 
 def build_gnss(d: schema.GnssTable, rows: Table, remarks: Remarks) -> Gnss:
     """Fixes (rad, m) with their sigmas, without those of useless precision; velocities where all axes are given."""
+    rows, known = blank_unknown(rows)
+    if not known.all():
+        if not known.any():
+            raise RecordingError(
+                f"{rows.path}: the accuracy of every fix is -1, a phone's mark of one that it does not have",
+                key="gnss.sigma_all_unknown",
+            )
+        remarks.add(
+            "gnss.sigma_unknown", f"{format_count((~known).sum(), 'fix', 'fixes')} of accuracy -1 (unknown) left out"
+        )
+        rows = rows.take(known)
     llh, rows = convert_geodetic(rows, d.units.angle, schema.HEIGHT[d.units.height], "GNSS", remarks)
     every = np.ones(len(rows), dtype=bool)
     sd = choose_sigmas(rows, ("sd_e", "sd_n", "sd_u"), d.sd, DEFAULT_SD, "GNSS position", every, remarks)
@@ -84,14 +97,14 @@ def build_gnss(d: schema.GnssTable, rows: Table, remarks: Remarks) -> Gnss:
     if "vd" in rows and "vu" not in rows:
         rows = rows.with_column("vu", -rows["vd"])
     there = [c for c in ("ve", "vn", "vu") if c in rows]
+    scale = schema.SPEED[d.units.speed]
+    for name in _SD_V:  # the file's sigmas have the file's unit, those of the .toml m/s
+        rows = rows.with_column(name, rows[name] * scale) if name in rows else rows
     if len(there) == 3:
-        scale = schema.SPEED[d.units.speed]
-        for name in ("sd_ve", "sd_vn", "sd_vu"):  # the file's sigmas have the file's unit, those of the .toml m/s
-            rows = rows.with_column(name, rows[name] * scale) if name in rows else rows
         v = rows.stack("ve", "vn", "vu") * scale
         absent = np.isnan(v).any(-1)
         v[absent] = np.nan
-        sd_v = choose_sigmas(rows, ("sd_ve", "sd_vn", "sd_vu"), d.sd_v, DEFAULT_SD_V, "GNSS velocity", ~absent, remarks)
+        sd_v = choose_sigmas(rows, _SD_V, d.sd_v, DEFAULT_SD_V, "GNSS velocity", ~absent, remarks)
         absent |= (sd_v > VAGUEST_V).any(-1)
         v[absent] = sd_v[absent] = np.nan
         if absent.all():
@@ -99,9 +112,11 @@ def build_gnss(d: schema.GnssTable, rows: Table, remarks: Remarks) -> Gnss:
             remarks.add("gnss.velocity_blank", "the GNSS velocity columns are blank throughout: no velocities")
     elif "speed" in rows and "course" in rows:
         course = rows["course"] * ANGLE[d.units.angle or "deg"]
-        v, sd_v, sentence = compute_horizontal_velocity(
-            rows["speed"] * schema.SPEED[d.units.speed], course, d.sd_v or DEFAULT_SD_V
-        )
+        stated = np.array(d.sd_v or DEFAULT_SD_V)
+        if any(name in rows for name in _SD_V):
+            known = np.isfinite(rows["speed"])
+            stated = choose_sigmas(rows, _SD_V, d.sd_v, DEFAULT_SD_V, "GNSS velocity", known, remarks)
+        v, sd_v, sentence = compute_horizontal_velocity(rows["speed"] * scale, course, stated)
         remarks.add("gnss.velocity_of_course", sentence)
     elif there:
         remarks.add(

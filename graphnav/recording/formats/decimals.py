@@ -65,7 +65,7 @@ def drop_cut_line(text: bytes, width: int) -> tuple[bytes, bool]:
     """The end of a table without what a loss of power leaves: a line of too few cells, zeros; and whether it had it."""
     kept = text.rstrip(b"\0")
     begin = kept.rfind(b"\n") + 1
-    if kept[begin:].strip()[:1] not in (b"", b"#") and kept.count(b",", begin) < width - 1:
+    if kept[begin:].strip()[:1] not in (b"", b"#", b"%") and kept.count(b",", begin) < width - 1:
         kept = kept[:begin]
     return kept, kept != text
 

@@ -249,7 +249,7 @@ def _read_velocities(fixes: list[_Epoch], remarks: Remarks) -> tuple[Array | Non
     course = np.radians([np.nan if e.course is None else e.course for e in fixes])
     if np.isnan(speed).all():
         return None, None
-    v, sd_v, sentence = compute_horizontal_velocity(speed, course, DEFAULT_SD_V)
+    v, sd_v, sentence = compute_horizontal_velocity(speed, course, np.array(DEFAULT_SD_V))
     remarks.add("gnss.velocity_of_course", sentence)
     return v, sd_v
 

@@ -15,13 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphnav.core.errors import RecordingError
-from graphnav.core.files import exists, is_blank, open_file, parse_number
+from graphnav.core.files import ARCHIVE, ZIP, exists, is_blank, open_file, parse_number
 from graphnav.core.notes import format_count
 from graphnav.core.rotation import Array
 from graphnav.recording.formats.decimals import drop_cut_line, read_decimals
 
 _BLANK_CELL = re.compile(r"(?m)(?:(?<=,)|^(?=[ \t]*,))[ \t]*(?=,|$)")  # an empty cell of a line that is not empty
-_COMMENT = re.compile(r"(?m)(^|[^,\s])[ \t]*#.*")  # what follows a comma is a cell: #N/A
+# to the end of the line from #, unless it begins a cell (#N/A); whole lines from %, which units hold as well
+_COMMENT = re.compile(r"(?m)(^|[^,\s])[ \t]*#.*|^[ \t]*%.*")
 _EMPTY = "is empty; copy the log again, or leave this file out"
 _MARKS = {";": "a semicolon", "\t": "a tab", " ": "blanks"}  # separators, in the order of their tests
 
@@ -198,6 +199,8 @@ def _find_header(path: Path) -> tuple[int, list[str]]:
         start = raw.read(1 << 16)
     if start[:2] in (b"\xff\xfe", b"\xfe\xff"):
         raise RecordingError(f"{path}: is UTF-16 text; save it as UTF-8", key="file.text")
+    if start[:4] == ZIP:
+        raise RecordingError(f"{path}: {ARCHIVE}", key="file.archive")
     if b"\0" in start.partition(b"\n")[0]:  # later ones a loss of power leaves
         raise RecordingError(f"{path}: is a binary file, not a CSV table; save it as CSV", key="file.binary")
     text = start.decode("utf-8-sig", errors="replace")
@@ -258,7 +261,7 @@ def _parse(path: Path, skip: int, header: list[str], use: list[int]) -> tuple[li
 
 
 def _load_text(text: str, skip: int, header: list[str], use: list[int]) -> Array:
-    if "#" in text:
+    if "#" in text or "%" in text:
         text = _COMMENT.sub(r"\1", text)
     # with usecols NumPy checks only that no row is too short for those
     for line in text.splitlines()[skip:]:

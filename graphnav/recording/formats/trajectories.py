@@ -32,6 +32,7 @@ from graphnav.recording.formats.repair import LATEST
 from graphnav.recording.formats.rtklib_solution import parse_solution
 from graphnav.recording.formats.text import parse_table, split_lines
 
+_RTKLIB = re.compile(r"program\s*:|\bQ\b.*\bns\b")  # of its header, other programs have comments from % as well
 _MAX_COORDINATE = 1e8  # m, twice around the Earth, whatever the coordinates' origin
 _DEG = np.pi / 180.0
 _COLUMN_UNITS = {"t": "s", "lat": "deg", "lon": "deg", "h": "m", "x": "m", "y": "m", "z": "m"} | dict.fromkeys(
@@ -69,8 +70,9 @@ def read_trajectory(path: str | Path) -> Trajectory:
     if not rows:
         raise RecordingError(f"{path}: no rows in it; a trajectory file needs at least one", key="file.no_rows")
     first = rows[0][1]
-    if any(line.lstrip().startswith("%") for _, line in numbered[:100]):
-        solution = parse_solution(path, [line.strip() for _, line in numbered if line.lstrip()[0] == "%"], rows)
+    head = [line.strip() for _, line in numbered if line.lstrip()[0] == "%"]
+    if any(_RTKLIB.search(line) for line in head):
+        solution = parse_solution(path, head, rows)
         parts = vars(solution).copy()
         return _build(path, rows, parts.pop("t"), parts.pop("llh"), parts.pop("notes"), **parts)
     if re.match(r"\s*\d{4}/\d\d/\d\d[\s,]", first):
