@@ -270,9 +270,12 @@ def test_where_no_few_satellites_can_be_told_to_have_slipped_all_arcs_end(exact,
 class SlippedEpochs:
     """Ten arcs of one signal, of which some are never consistent with the others, as an epoch that is looked at."""
 
-    def __init__(self, slipped):
-        self.columns = {}
+    def __init__(self, slipped, far=()):
+        self.columns, self.far = {}, far
         self.arcs, self.slipped, self.time = [(f"ambiguity.{k}", 0.0) for k in range(10)], slipped, np.arange(9.0)
+
+    def find_slipped(self, k, here):
+        return frozenset(self.arcs[i] for i in self.far)
 
     def group_arcs(self, k, known):
         sets = {}
@@ -310,6 +313,23 @@ def test_arcs_that_integers_are_twice_not_consistent_with_begin_anew(monkeypatch
     third = fixing.hold_on(second.go_on(), epochs, 2, here, lambda: np.zeros((0, 0)))
     assert third.fixed
     assert not third.anew
+
+
+def test_arcs_that_are_twice_a_quarter_of_a_cycle_off_begin_anew(monkeypatch):
+    """However many they are, and whether their integers are known or not; once is an outlier."""
+    epochs = SlippedEpochs([], far=[1, 3, 4, 6, 8, 9])
+    known = fixing.Known()
+    known.join(epochs.arcs[0], epochs.arcs[1], 5)
+    monkeypatch.setattr(fixing, "_decide", lambda *given, **_: [])
+    here, held = SimpleNamespace(values=np.zeros((1, 0))), [fixing.Held(known)]
+    for k, far in enumerate(([1], [1, 3, 4, 6, 8, 9], [3, 4, 6, 8, 9], [])):
+        epochs.far = far
+        held.append(fixing.hold_on(held[-1].go_on(), epochs, k, here, lambda: np.zeros((0, 0))))
+    wrong = [{epochs.arcs[i] for i in some} for some in ([], [1], [3, 4, 6, 8, 9], [])]
+    assert [set(one.anew) for one in held[1:]] == wrong
+    assert epochs.arcs[1] in held[1].known.of
+    assert epochs.arcs[1] not in held[2].known.of
+    assert held[-1].since == dict.fromkeys(wrong[1], 1.0) | dict.fromkeys(wrong[2], 2.0)
 
 
 def test_an_arc_that_begins_anew_is_another_from_there_on(exact):
@@ -530,6 +550,7 @@ def test_a_wrong_integer_is_let_go_of(drive, monkeypatch):
         return replace(nearest, best=nearest.best + 3 * spoiled)
 
     monkeypatch.setattr(fixing, "find_nearest", wrong)
+    monkeypatch.setattr(fixing.Epochs, "find_slipped", lambda *_: frozenset())
     begin = recording.raw_gnss.t[0]
     until = begin + 13.0
     monkeypatch.setattr(
@@ -545,6 +566,34 @@ def test_a_wrong_integer_is_let_go_of(drive, monkeypatch):
     assert not fixed[t > until].all()
     assert fixed[-1]
     assert off[late & fixed].max() < 0.05
+
+
+def test_slips_that_no_search_finds_are_told_by_the_imu(drive, monkeypatch):
+    """A cycle, up or down, of two thirds of the carriers, in arcs that go on, before the filter knows integers."""
+    recording, truth = drive
+    decide, causal = fixing._decide, []
+
+    def decide_late(*given, impose):
+        causal.append(not impose)
+        return decide(*given, impose=impose) if impose or sum(causal) > 14 else []
+
+    monkeypatch.setattr(fixing, "_decide", decide_late)
+    raw, at = recording.raw_gnss, recording.raw_gnss.t[0] + 12.0
+    satellites = np.random.default_rng(2).permutation(np.unique(raw.satellite[raw.t > at]))
+    sign = np.zeros(1 + satellites.max())
+    sign[satellites[: len(satellites) * 2 // 3]] = 1.0
+    sign[satellites[: len(satellites) // 3]] = -1.0
+    slipped = raw.carrier + sign[raw.satellite] * (raw.t > at)
+    begin = find_arcs(raw, base_arc=raw.base_arc).begin
+    spoilt = replace(recording, raw_gnss=replace(raw, carrier=slipped, arc_begin=begin))
+    for name, one in run(spoilt, STATED, ("ekf", "rts")).items():
+        off, fixed = off_by(one, truth)
+        assert fixed[-5:].all(), name
+        assert off[fixed].max() < 0.1, name  # half a cycle: what a wrong integer is
+        assert off[-5:].max() < 0.05, name
+        error, sigma = errors(one, truth)[:2]
+        late = one.t > at
+        assert np.mean((error[late, :2] / sigma[late, :2]) ** 2) < 4.6, name  # chi-square of two, 99 %, over two
 
 
 def test_records_name_satellites_and_the_report_sums_them_up(drive):
