@@ -15,8 +15,8 @@ millimetres; sets that fail this chi-square test are not held. Where two success
 releases all integers together with the position information that they gave, and searches again; the smoother releases
 the arcs without which most of their epochs are consistent (data snooping: Baarda 1968), which stay float.
 
-Cycle slips that `graphnav.gnss.arcs` does not find are found by the filter: its robust update follows the IMU, and
-leaves slipped carrier phases a cycle off. Those that are off at two successive epochs begin new arcs, float ones too.
+Cycle slips that `graphnav.gnss.arcs` does not find, as of four satellites that nothing checks, are found by the filter:
+its robust update follows the IMU, and leaves slipped carrier phases a cycle off. These begin new arcs, float ones too.
 """
 
 from __future__ import annotations
@@ -230,8 +230,7 @@ class Held:
     found: tuple[tuple[Arc, Arc, int], ...] = ()  # differences that were found there
     let_go: bool = False  # of all that was known
     suspects: frozenset[Arc] = frozenset()  # suspects: the integers are consistent only without these arcs
-    slipped: frozenset[Arc] = frozenset()  # more than a quarter of a cycle off the estimate
-    anew: tuple[Arc, ...] = ()  # arcs suspected, or that far off, twice, whose ambiguities are reset
+    anew: tuple[Arc, ...] = ()  # arcs suspected twice, or a quarter of a cycle off, whose ambiguities are reset
     since: Mapping[Arc, float] = field(default_factory=dict)  # s, start of the arcs that were reset
     fixed: bool = False
     epoch: bool = False  # whether there are carrier phases
@@ -244,28 +243,23 @@ class Held:
 def hold_on(before: Held, epochs: Epochs, k: int, here: Points, covariance: Callable[[], Array]) -> Held:
     """Fix integers with the estimate at a keyframe; release all where two successive epochs contradict them.
 
-    Where the integers of two successive epochs are consistent except for the same arcs, or carrier phases of the same
-    arcs are off by more than a quarter of a cycle, undetected cycle slips occurred: these ambiguities are reset.
+    Where the integers of two successive epochs are consistent except for the same arcs, or carrier phases are off by
+    more than a quarter of a cycle, undetected cycle slips occurred: these ambiguities are reset.
     """
-    known, since = before.known.copy(), before.since
-    slipped = epochs.find_slipped(k, here)
-    gone = tuple(sorted(slipped & before.slipped))
-    for arc in gone:
+    known, anew = before.known.copy(), epochs.find_slipped(k, here)
+    for arc in anew:
         known.forget(arc)
-    since, slipped = {**since, **dict.fromkeys(gone, float(epochs.time[k]))}, slipped.difference(gone)
+    since = {**before.since, **dict.fromkeys(anew, float(epochs.time[k]))}
     if epochs.find_inconsistent(k, here, known):
         known = Known() if before.odd else known
         fixed = epochs.count_differences(k, known) >= ENOUGH
-        return Held(
-            known, True, let_go=before.odd, slipped=slipped, anew=gone, since=since, fixed=fixed, epoch=True
-        )  # fmt: skip
+        return Held(known, True, let_go=before.odd, anew=anew, since=since, fixed=fixed, epoch=True)
     sets, found = epochs.group_arcs(k, known), []
-    if not gone and any(len(some) > 1 for some in sets.values()):
+    if not anew and any(len(some) > 1 for some in sets.values()):
         values = np.concatenate([np.zeros(DIM), here.values[0]])
         lasting = epochs.compute_lasting(k, lambda arc: float(epochs.time[k]), since)
         found = _decide(sets, epochs.columns, values, covariance(), known, lasting, impose=False)
     suspects: frozenset[Arc] = frozenset()
-    anew = gone
     if found:
         held = known.copy()
         for a, b, n in found:
@@ -283,9 +277,7 @@ def hold_on(before: Held, epochs: Epochs, k: int, here: Points, covariance: Call
             for arc in anew:
                 known.forget(arc)
     fixed = epochs.count_differences(k, known) >= ENOUGH
-    return Held(
-        known, False, tuple(found), suspects=suspects, slipped=slipped, anew=anew, since=since, fixed=fixed, epoch=True
-    )  # fmt: skip
+    return Held(known, False, tuple(found), suspects=suspects, anew=anew, since=since, fixed=fixed, epoch=True)
 
 
 class _Causal:

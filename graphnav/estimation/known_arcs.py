@@ -106,10 +106,10 @@ class Epochs:
             kept[np.flatnonzero(kept)[np.argmax(left**2 / share)]] = False
         return [arcs[i] for i in used[~kept]]
 
-    def find_slipped(self, k: int, here: Points) -> frozenset[Arc]:
+    def find_slipped(self, k: int, here: Points) -> tuple[Arc, ...]:
         """Arcs whose carrier phases are more than a quarter of a cycle off an estimate: a slip is the nearer one."""
         off = np.abs(self._linearise(k, here).residual[:, 0]) > 0.25 * self.phase.wavelength[self.rows[k]]
-        return frozenset(self.active[k][i] for i in np.flatnonzero(off).tolist())
+        return tuple(self.active[k][i] for i in np.flatnonzero(off).tolist())
 
     def _linearise(self, k: int, here: Points) -> Rows:
         own = self.rows[k]
