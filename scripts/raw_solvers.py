@@ -2,23 +2,34 @@
 
     python scripts/raw_solvers.py
     python scripts/raw_solvers.py --noise estimated
+    python scripts/raw_solvers.py --width data/kamakura_rtk
 
 Of each, horizontal errors against the truth (95 %, m), and places beside those of batch: the largest difference in
 batch's sigmas (an axis at a time), and the mean square, horizontally and of height, of differences over those of the
-covariances, where the solver knows less than batch: 1 if both are right.
+covariances, where the solver knows less than batch: 1 if both are right. `--width`: the columns of the filter's error
+state, and its processor time an epoch, with the carriers of some of the signals, and of parts of the drive.
 """
 
 from __future__ import annotations
 
 import argparse
+import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from graphnav.config import Settings, parse_settings
-from graphnav.estimation.pipeline import run
+from graphnav.constraints.ambiguities import name_ambiguity
+from graphnav.constraints.raw_rows import CLOCK
+from graphnav.core.earth import LocalFrame
+from graphnav.core.state import DIM
+from graphnav.detectors import detect
+from graphnav.estimation.pipeline import choose_origin, run
+from graphnav.estimation.preparation import prepare
 from graphnav.estimation.solution import Solution
+from graphnav.estimation.solvers.ekf import ekf
 from graphnav.online import Online, drop_rows, list_rows
 from graphnav.recording import Recording
 from graphnav.recording.formats import read
@@ -35,6 +46,7 @@ SOLVERS: tuple[tuple[str, dict[str, Any]], ...] = (
     ("isam2", {"isam2_lag": 10.0}),
 )
 ONLINE = tuple((engine, lag) for lag in (1000.0, 10.0) for engine in ("window", "isam2"))
+SIGNALS, LENGTHS = (0, 10, 20, 30, 40, 60), (40.0, 10.0)  # carriers, and s
 _SAME = 1e-6  # s
 _KNOWS_LESS = 0.01  # of batch's variance, by which a solver's is larger where differences are told by it
 
@@ -68,12 +80,40 @@ def compare(best: Solution, recording: Recording, t: Array, p: Array, variance: 
     return f"{h95:7.3f} {np.max(np.abs(off) / np.sqrt(own[k])):6.2f} {flat:7.2f} {up:6.2f}"
 
 
+def measure_width(whole: Recording) -> None:
+    """Print the filter's columns and its time a keyframe, the least of three, by carriers in use and the length."""
+    raw, stated = whole.raw_gnss, parse_settings({"noise": {"mode": "stated"}})
+    assert raw is not None
+    slot = raw.satellite.astype(int) * 1000 + raw.signal
+    there = np.isfinite(raw.carrier) & np.isfinite(raw.carrier_difference)
+    slots = sorted(set(slot[there].tolist()), key=lambda one: -int(np.sum(there & (slot == one))))
+    print(f"{'s':>4} {'ambiguities':>12} {'clock':>6} {'others':>7} {'keyframes':>10} {'ms each':>8}")
+    for length, many in ((length, many) for length in LENGTHS for many in SIGNALS):
+        carrier = np.where(np.isin(slot, slots[:many]), raw.carrier, np.nan)
+        part = replace(whole, raw_gnss=replace(raw, carrier=carrier)).crop(0.0, length)
+        found = prepare(part, stated, LocalFrame(choose_origin(part), part.start), detect(part, stated))
+        problem, took = found.problem, []
+        for _ in range(3):
+            began = time.process_time()
+            ekf(problem, opening=found.aligned.until)
+            took.append(time.process_time() - began)
+        columns = {name: own.stop - own.start for name, own in problem.columns.items()}
+        own = sum(size for name, size in columns.items() if name.startswith(name_ambiguity("")))
+        clock, n = columns.get(CLOCK, 0), len(problem.t)
+        others = DIM + sum(columns.values()) - own - clock
+        print(f"{length:4.0f} {own:12} {clock:6} {others:7} {n:10} {1e3 * min(took) / n:8.2f}", flush=True)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("recordings", nargs="*", type=Path, default=[ROOT / name for name in RECORDINGS])
     parser.add_argument("--noise", choices=("stated", "estimated"), default="stated")
+    parser.add_argument("--width", action="store_true")
     given = parser.parse_args()
     for path in given.recordings:
+        if given.width:
+            measure_width(read(path))
+            continue
         recording, how = read(path), {"noise": {"mode": given.noise}}
         print(f"{path.name:26} {'H95':>7} {'most':>6} {'H':>7} {'U':>6}", flush=True)
         best = run(recording, parse_settings(how), ("batch",))["batch"]

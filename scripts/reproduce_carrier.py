@@ -4,7 +4,8 @@
     python scripts/reproduce_carrier.py windows ../shared/data/ucr_riverside_20200712 --window 0 300
     python scripts/reproduce_carrier.py canyon ../shared/data/ucr_riverside_20200712
 
-`increments` solves the displacement of each epoch from the carriers' changes alone and compares it with the truth's.
+`increments` solves the displacement of each epoch from the carriers' changes alone and compares it with the truth's,
+and with what residuals and geometry lead to expect; by halves of the satellites, whose errors share only the truth's.
 `windows` has the errors of parts of a drive without a base, with changes of carriers and without; of
 cssrlib_2021_265 as well, with the simulated IMU of scripts/reproduce_rtk.py. `canyon` takes satellites away by a mask:
 in ten spans of 60 s the 4, 3, 2, 1, 0 highest are left, and the table has the horizontal errors in the spans, of
@@ -29,6 +30,8 @@ import numpy as np
 import reproduce_rtk
 from pyins import sim
 from scipy.interpolate import CubicSpline, PchipInterpolator
+from scipy.optimize import brentq
+from scipy.special import erf
 
 from graphnav.config import parse_settings
 from graphnav.core import earth
@@ -39,8 +42,8 @@ from graphnav.gnss.carrier import pair_consecutive
 from graphnav.gnss.load import Sources, load_raw
 from graphnav.gnss.series import RawGnss, choose_primary
 from graphnav.gnss.sigmas import compute_carrier_sigma
-from graphnav.gnss.signals import C
-from graphnav.gnss.single_point import SinglePoint, choose_coefficients, look
+from graphnav.gnss.signals import GPS, C
+from graphnav.gnss.single_point import Geometry, SinglePoint, choose_coefficients, look
 from graphnav.recording import Gnss, Imu, ImuNoise, Recording, Truth
 
 Array = np.ndarray
@@ -50,7 +53,8 @@ MEMS = ImuNoise(1.5e-4, 4e-3, 5e-6, 2e-4, 2e-3, 0.1)
 SPAN, SPANS, FIRST, APART = 60.0, 10, 150.0, 210.0  # s: of a canyon, how many, where the first begins, and the others
 BEFORE, AFTER = 60.0, 30.0  # s, of the drive around a canyon that is solved with it
 SOLVERS = ("ekf", "rts", "batch")
-MOVING = 1.0  # m/s, from which on a heading is that of the way
+MOVING, STANDING = 1.0, 0.1  # m/s, from which on a heading is that of the way, and below which the car stands
+FEWEST, FAR = 6, 0.03  # satellites of an increment; m, of errors of increments that are compared
 
 
 def observations(data: Path) -> tuple[RawGnss, SinglePoint, Array]:
@@ -79,14 +83,7 @@ def increments(data: Path) -> None:
     sigma = np.hypot(
         *(compute_carrier_sigma(raw.cn0[k], geometry.elevation[k], C / raw.frequency[k]) for k in (before, after))
     )
-    off = np.full((len(epochs), 3), np.nan)
-    for k in range(1, len(epochs)):
-        own = np.flatnonzero(of[after] == k)
-        if len(own) < 6:
-            continue
-        H = np.column_stack([-geometry.e[after[own]], np.ones(len(own))]) / sigma[own, None]
-        off[k] = np.linalg.lstsq(H, -change[own] / sigma[own], rcond=None)[0][:3]
-    d = np.einsum("nij,nj->ni", earth.enu_axes(earth.ecef_to_llh(true)), off)
+    d, expected, seen = solve_increments(geometry, true, of, after, change, sigma)
     h, up = np.hypot(d[:, 0], d[:, 1]), np.abs(d[:, 2])
     slips = find_arcs(whole).slips
     print(f"{len(after)} changes of carriers, {slips} slips without a flag, {np.isfinite(h).sum()} epochs")
@@ -98,6 +95,55 @@ def increments(data: Path) -> None:
     both = np.isfinite(d[1:, 0]) & np.isfinite(d[:-1, 0])
     alike = [np.corrcoef(d[1:, i][both], d[:-1, i][both])[0, 1] for i in range(3)]
     print("correlation of an epoch's errors and the next's, east, north, up: " + " ".join(f"{x:.2f}" for x in alike))
+    print(
+        "up, by satellites: 95 % of the errors, and of normal ones of the sigmas that residuals and geometry state; mm"
+    )
+    speed = np.linalg.norm(np.gradient(true, epochs, axis=0), axis=1)
+    solved = np.isfinite(up)
+    for name, some in (
+        ("all", solved),
+        ("standing", solved & (speed < STANDING)),
+        *(
+            (f"{low} to {high - 1}", solved & (seen >= low) & (seen < high))
+            for low, high in ((6, 12), (12, 17), (17, 40))
+        ),
+    ):
+        normal = brentq(lambda x, s=expected[some]: float(np.mean(erf(x / s / np.sqrt(2.0)))) - 0.95, 1e-6, 10.0)
+        print(f"{name:10} {some.sum():5} {1e3 * np.percentile(up[some], 95):6.1f} {1e3 * normal:6.1f}")
+    system = raw.satellite[after] // 100
+    first, second = (
+        solve_increments(geometry, true, of, after, change, np.where(part, sigma, np.inf))[0][:, 2]
+        for part in (system == GPS, system != GPS)
+    )
+    both = (np.abs(first) < FAR) & (np.abs(second) < FAR)
+    rms = (1e3 * np.sqrt(np.mean(x[both] ** 2)) for x in (first, second))
+    print(
+        f"up by GPS and by the others alone, {both.sum()} epochs: rms {' and '.join(f'{x:.1f}' for x in rms)} mm, "
+        f"correlation {np.corrcoef(first[both], second[both])[0, 1]:.2f}"
+    )
+
+
+def solve_increments(
+    geometry: Geometry, true: Array, of: Array, after: Array, change: Array, sigma: Array
+) -> tuple[Array, Array, Array]:
+    """Errors (E, 3) of each epoch's displacement, east, north, up, 1-sigma (E,) of up, m, and satellites (E,).
+
+    The sigma is that of the geometry times the root of the mean square residual. Infinite sigmas leave rows out.
+    """
+    E = len(true)
+    off, up, seen = np.full((E, 3), np.nan), np.full(E, np.nan), np.zeros(E, dtype=int)
+    R = earth.enu_axes(earth.ecef_to_llh(true))
+    for k in range(1, E):
+        own = np.flatnonzero((of[after] == k) & np.isfinite(sigma))
+        seen[k] = len(own)
+        if len(own) < FEWEST:
+            continue
+        H = np.column_stack([-geometry.e[after[own]] @ R[k].T, np.ones(len(own))]) / sigma[own, None]
+        y = -change[own] / sigma[own]
+        Q = np.linalg.pinv(H.T @ H)
+        x = Q @ (H.T @ y)
+        off[k], up[k] = x[:3], np.sqrt(Q[2, 2] * np.sum((y - H @ x) ** 2) / (len(own) - 4))
+    return off, up, seen
 
 
 def simulated_imu(t: Array, place: Array, seed: int = 0) -> tuple[Imu, Array, Array, Array]:

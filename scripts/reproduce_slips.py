@@ -2,11 +2,13 @@
 
     python scripts/reproduce_slips.py ../shared/data/ucr_riverside_20200712 -o build/slips --begin 300 --begin 600
     python scripts/reproduce_slips.py ../shared/data/ucr_riverside_20200712 -o build/slips --begin 600 --unsearched
+    python scripts/reproduce_slips.py ../shared/data/ucr_riverside_20200712 -o build/slips --begin 600 --left 4
 
 Of 50 s from `--begin` on, by filter and smoother with stated noise: slips after 20 s of some satellites that are
 drawn, and of filter and smoother, the worst of the draws: epochs after them that are not fixed, those that are fixed
 and wrong (more than 0.1 m off), and the largest horizontal error at them, m. `--unsearched` takes the arcs from the
-observations without slips, so that integers have to be let go of.
+observations without slips, so that integers have to be let go of. `--left` leaves the highest so many satellites from
+15 s on.
 """
 
 from __future__ import annotations
@@ -28,6 +30,7 @@ from graphnav.recording import Recording
 
 Array = np.ndarray
 _SLIP, _LENGTH = 20.0, 50.0  # s from the begin of a stretch
+_FEW = 5.0  # s before the slips, from which few satellites are left
 
 
 def list_satellites(raw: RawGnss, at: float) -> Array:
@@ -38,6 +41,14 @@ def list_satellites(raw: RawGnss, at: float) -> Array:
     high = look(here, here.antenna, choose_coefficients(here)).elevation >= np.radians(defaults.elevation)
     there = np.isfinite(here.carrier) & np.isfinite(here.carrier_difference)
     return np.unique(here.satellite[there & high & ~(here.cn0 < defaults.cn0)])
+
+
+def leave(raw: RawGnss, at: float, left: int) -> RawGnss:
+    """The observations with the highest so many satellites from before a time on."""
+    elevation = look(raw, raw.antenna, choose_coefficients(raw)).elevation
+    own = list_satellites(raw, at)
+    height = [-float(np.median(elevation[raw.satellite == one])) for one in own]
+    return raw.take((raw.t < at - _FEW) | np.isin(raw.satellite, own[np.argsort(height)[:left]]))
 
 
 def slip(raw: RawGnss, at: float, count: int, seed: int) -> RawGnss:
@@ -71,6 +82,7 @@ def main() -> None:
     parser.add_argument("--begin", type=float, action="append", help="s, of a stretch; repeatable")
     parser.add_argument("--draws", type=int, default=2, help="of each number of satellites")
     parser.add_argument("--unsearched", action="store_true", help="without the search for slips")
+    parser.add_argument("--left", type=int, help="satellites, of the highest, that are left; all without")
     given = parser.parse_args()
     folder = (given.output / given.data.name).resolve()
     folder.mkdir(parents=True, exist_ok=True)
@@ -81,10 +93,12 @@ def main() -> None:
         recording, at = stretch_of(whole, begin)
         raw = recording.raw_gnss
         assert raw is not None
+        if given.left:
+            raw = leave(raw, at, given.left)
         inside = (t >= recording.start) & (t <= recording.end)
         before = find_arcs(raw, base_arc=raw.base_arc)
         many = len(list_satellites(raw, at))
-        for count in (0, 1, 2, 4, many // 2, many - 3):
+        for count in (0, 1, 2) if given.left else (0, 1, 2, 4, many // 2, many - 3):
             found, worst = [], []
             for draw in range(given.draws if count else 1):
                 slipped = slip(raw, at, count, 100 * count + draw)

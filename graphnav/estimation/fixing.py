@@ -14,6 +14,9 @@ Correct integers leave the carrier phases of an epoch consistent with one positi
 millimetres; sets that fail this chi-square test are not held. Where two successive epochs fail it later, the filter
 releases all integers together with the position information that they gave, and searches again; the smoother releases
 the arcs without which most of their epochs are consistent (data snooping: Baarda 1968), which stay float.
+
+Cycle slips that `graphnav.gnss.arcs` does not find, as of four satellites that nothing checks, are found by the filter:
+its robust update follows the IMU, and leaves slipped carrier phases a cycle off. These begin new arcs, float ones too.
 """
 
 from __future__ import annotations
@@ -226,8 +229,7 @@ class Held:
     odd: bool = False  # the epoch is not consistent with the known integers
     found: tuple[tuple[Arc, Arc, int], ...] = ()  # differences that were found there
     let_go: bool = False  # of all that was known
-    suspects: frozenset[Arc] = frozenset()  # suspects: the integers are consistent only without these arcs
-    anew: tuple[Arc, ...] = ()  # arcs suspected twice, whose ambiguities are reset
+    anew: tuple[Arc, ...] = ()  # arcs a quarter of a cycle off, whose ambiguities are reset
     since: Mapping[Arc, float] = field(default_factory=dict)  # s, start of the arcs that were reset
     fixed: bool = False
     epoch: bool = False  # whether there are carrier phases
@@ -240,39 +242,29 @@ class Held:
 def hold_on(before: Held, epochs: Epochs, k: int, here: Points, covariance: Callable[[], Array]) -> Held:
     """Fix integers with the estimate at a keyframe; release all where two successive epochs contradict them.
 
-    Where the integers of two successive epochs are consistent except for the same arcs, undetected cycle slips occurred
-    there: these ambiguities are reset.
+    Where carrier phases are off by more than a quarter of a cycle, undetected cycle slips occurred: their ambiguities
+    are reset.
     """
-    known, since = before.known, before.since
+    known, anew = before.known.copy(), epochs.find_slipped(k, here)
+    for arc in anew:
+        known.forget(arc)
+    since = {**before.since, **dict.fromkeys(anew, float(epochs.time[k]))}
     if epochs.find_inconsistent(k, here, known):
         known = Known() if before.odd else known
         fixed = epochs.count_differences(k, known) >= ENOUGH
-        return Held(known, True, let_go=before.odd, since=since, fixed=fixed, epoch=True)
+        return Held(known, True, let_go=before.odd, anew=anew, since=since, fixed=fixed, epoch=True)
     sets, found = epochs.group_arcs(k, known), []
-    if any(len(some) > 1 for some in sets.values()):
+    if not anew and any(len(some) > 1 for some in sets.values()):
         values = np.concatenate([np.zeros(DIM), here.values[0]])
         lasting = epochs.compute_lasting(k, lambda arc: float(epochs.time[k]), since)
         found = _decide(sets, epochs.columns, values, covariance(), known, lasting, impose=False)
-    suspects: frozenset[Arc] = frozenset()
-    anew: tuple[Arc, ...] = ()
-    if found:
-        held = known.copy()
-        for a, b, n in found:
-            held.join(a, b, n)
-        suspects = frozenset(epochs.find_inconsistent(k, here, held))
-        if not suspects:
-            known = held
-        else:
-            found = []
-            for arc in suspects:
-                held.forget(arc)
-            if epochs.count_differences(k, held) >= ENOUGH:
-                anew = tuple(sorted(suspects & before.suspects))
-            known, since = known.copy(), {**since, **dict.fromkeys(anew, float(epochs.time[k]))}
-            for arc in anew:
-                known.forget(arc)
-    fixed = epochs.count_differences(k, known) >= ENOUGH
-    return Held(known, False, tuple(found), suspects=suspects, anew=anew, since=since, fixed=fixed, epoch=True)
+    held = known.copy()
+    for a, b, n in found:
+        held.join(a, b, n)
+    if found and epochs.find_inconsistent(k, here, held):
+        held, found = known, []
+    fixed = epochs.count_differences(k, held) >= ENOUGH
+    return Held(held, False, tuple(found), anew=anew, since=since, fixed=fixed, epoch=True)
 
 
 class _Causal:
@@ -283,7 +275,7 @@ class _Causal:
         self.known = {k: Known() for k in epochs.keyframes}  # after each epoch
         self._unknown = {p.name: float(np.max(p.sigma)) for p in epochs.phase.parameters}
         self._held = Held()
-        self.anew: list[tuple[Arc, int]] = []  # arcs that are reset, and the keyframes from which they are suspected
+        self.anew: list[tuple[Arc, int]] = []  # arcs that are reset, and the keyframes from which on
         self._before = -1  # keyframe of the previous epoch
 
     def __call__(self, k: int, here: Points, P: Array) -> DecidedRows | None:

@@ -17,7 +17,7 @@ from graphnav.constraints.raw_phase import GnssPhase, compute_variance_left
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM
 from graphnav.estimation.solution import CarrierArcs
-from graphnav.estimation.solvers.linearise import Points, linearise
+from graphnav.estimation.solvers.linearise import Points, Rows, linearise
 
 ENOUGH = 4  # differences of a fixed epoch: one more than a position needs, so that they check each other
 _ALARM = 0.001  # share of epochs with correct integers that fail the consistency test
@@ -82,8 +82,7 @@ class Epochs:
         ----------
         here : a point near enough for the directions to the satellites.
         """
-        own = self.rows[k]
-        rows = linearise(self.phase, here, self._all_columns, own, np.zeros(own.stop - own.start, dtype=int))
+        own, rows = self.rows[k], self._linearise(k, here)
         arcs = self.active[k]
         used = np.array([i for i, arc in enumerate(arcs) if arc in known.of], dtype=int)
         if not len(used):
@@ -106,6 +105,15 @@ class Epochs:
             share = np.maximum(1.0 - np.sum(Q * Q, axis=1), 1e-9)  # share of its own error that remains in a residual
             kept[np.flatnonzero(kept)[np.argmax(left**2 / share)]] = False
         return [arcs[i] for i in used[~kept]]
+
+    def find_slipped(self, k: int, here: Points) -> tuple[Arc, ...]:
+        """Arcs whose carrier phases are more than a quarter of a cycle off an estimate: a slip is the nearer one."""
+        off = np.abs(self._linearise(k, here).residual[:, 0]) > 0.25 * self.phase.wavelength[self.rows[k]]
+        return tuple(self.active[k][i] for i in np.flatnonzero(off).tolist())
+
+    def _linearise(self, k: int, here: Points) -> Rows:
+        own = self.rows[k]
+        return linearise(self.phase, here, self._all_columns, own, np.zeros(own.stop - own.start, dtype=int))
 
     def compute_lasting(
         self, k: int, until: Callable[[Arc], float], since: Mapping[Arc, float] | None = None

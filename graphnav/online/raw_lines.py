@@ -116,8 +116,8 @@ def take_sane(rows: Array) -> Array:
     for name in _NUMBERS:
         some = rows[:, at : at + _WIDTHS.get(name, 1)]
         low, high, needed = _BOUNDS.get(name, (-np.inf, np.inf, False))
-        size = np.linalg.norm(some, axis=1) if name in _WIDTHS else some[:, 0]
-        with np.errstate(invalid="ignore"):
+        with np.errstate(invalid="ignore", over="ignore"):
+            size = np.linalg.norm(some, axis=1) if name in _WIDTHS else some[:, 0]
             good &= ((size >= low) & (size <= high)) | (np.isnan(size) & (not needed))
         at += some.shape[1]
     _, first = np.unique(rows[:, :2], axis=0, return_index=True)

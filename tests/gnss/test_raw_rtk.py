@@ -268,11 +268,14 @@ def test_where_no_few_satellites_can_be_told_to_have_slipped_all_arcs_end(exact,
 
 
 class SlippedEpochs:
-    """Ten arcs of one signal, of which some are never consistent with the others, as an epoch that is looked at."""
+    """Ten arcs of one signal, of which some are far off, as an epoch that is looked at."""
 
-    def __init__(self, slipped):
-        self.columns = {}
-        self.arcs, self.slipped, self.time = [(f"ambiguity.{k}", 0.0) for k in range(10)], slipped, np.arange(9.0)
+    def __init__(self):
+        self.columns, self.far = {}, []
+        self.arcs, self.time = [(f"ambiguity.{k}", 0.0) for k in range(10)], np.arange(9.0)
+
+    def find_slipped(self, k, here):
+        return tuple(self.arcs[i] for i in self.far)
 
     def group_arcs(self, k, known):
         sets = {}
@@ -281,7 +284,7 @@ class SlippedEpochs:
         return {0: sorted(sets.values(), key=len, reverse=True)}
 
     def find_inconsistent(self, k, here, known):
-        return [self.arcs[i] for i in self.slipped if self.arcs[i] in known.of]
+        return []
 
     def count_differences(self, k, known):
         return sum(len(one) - 1 for one in self.group_arcs(k, known)[0])
@@ -290,26 +293,22 @@ class SlippedEpochs:
         return {}
 
 
-@pytest.mark.parametrize(("slipped", "begins"), [([2, 7], True), ([1, 3, 4, 6, 8, 9], False)])
-def test_arcs_that_integers_are_twice_not_consistent_with_begin_anew(monkeypatch, slipped, begins):
-    """Where enough others are consistent with each other; of fewer it cannot be told which are wrong."""
-    epochs = SlippedEpochs(slipped)
-    every = [(arc, epochs.arcs[0], 0) for arc in epochs.arcs[1:]]
-    monkeypatch.setattr(fixing, "_decide", lambda *given, **_: every)
-    here = SimpleNamespace(values=np.zeros((1, 0)))
-    held = [fixing.Held()]
-    for k in range(2):
-        held.append(fixing.hold_on(held[-1], epochs, k, here, lambda: np.zeros((0, 0))))
-    first, second = held[1:]
-    wrong = {epochs.arcs[i] for i in slipped}
-    assert first.suspects == wrong
-    assert not first.anew
-    assert set(second.anew) == (wrong if begins else set())
-    assert second.since == (dict.fromkeys(wrong, 1.0) if begins else {})
-    epochs.slipped = []
-    third = fixing.hold_on(second.go_on(), epochs, 2, here, lambda: np.zeros((0, 0)))
-    assert third.fixed
-    assert not third.anew
+def test_arcs_that_are_a_quarter_of_a_cycle_off_begin_anew(monkeypatch):
+    """However many they are, and whether their integers are known or not; then nothing is decided at the epoch."""
+    epochs = SlippedEpochs()
+    known, asked = fixing.Known(), []
+    for i, cycles in ((1, 5), (2, 7)):
+        known.join(epochs.arcs[0], epochs.arcs[i], cycles)
+    monkeypatch.setattr(fixing, "_decide", lambda *given, **_: asked.append(given) or [])
+    here, held = SimpleNamespace(values=np.zeros((1, 0))), [fixing.Held(known)]
+    for k, far in enumerate(([1], [3, 4, 6, 8, 9], [])):
+        epochs.far = far
+        held.append(fixing.hold_on(held[-1].go_on(), epochs, k, here, lambda: np.zeros((0, 0))))
+        assert set(held[-1].anew) == {epochs.arcs[i] for i in far}
+        assert len(asked) == (not far)
+    assert set(held[-1].known.of) == {epochs.arcs[0], epochs.arcs[2]}
+    assert set(held[0].known.of) == set(epochs.arcs[:3])
+    assert held[-1].since == {epochs.arcs[i]: float(i != 1) for i in (1, 3, 4, 6, 8, 9)}
 
 
 def test_an_arc_that_begins_anew_is_another_from_there_on(exact):
@@ -530,6 +529,7 @@ def test_a_wrong_integer_is_let_go_of(drive, monkeypatch):
         return replace(nearest, best=nearest.best + 3 * spoiled)
 
     monkeypatch.setattr(fixing, "find_nearest", wrong)
+    monkeypatch.setattr(fixing.Epochs, "find_slipped", lambda *_: ())
     begin = recording.raw_gnss.t[0]
     until = begin + 13.0
     monkeypatch.setattr(
@@ -545,6 +545,25 @@ def test_a_wrong_integer_is_let_go_of(drive, monkeypatch):
     assert not fixed[t > until].all()
     assert fixed[-1]
     assert off[late & fixed].max() < 0.05
+
+
+@pytest.mark.parametrize("which", range(4))
+def test_a_slip_of_one_of_four_satellites_is_told_by_the_imu(drive, which):
+    """By a cycle that no flag tells: four changes of carriers fit any displacement."""
+    recording, truth = drive
+    raw, at = recording.raw_gnss, recording.raw_gnss.t[0] + 15.0
+    high = raw.t > at - 3.0
+    elevation = compute_directions(raw.antenna, raw.p)[1]
+    seen = np.unique(raw.satellite[high & (elevation > np.radians(20.0))])
+    left = seen[:: len(seen) // 4][:4]
+    raw = raw.take(~high | np.isin(raw.satellite, left))
+    slipped = replace(raw, carrier=raw.carrier + ((raw.satellite == left[which]) & (raw.t > at - 1e-3)))
+    assert find_arcs(slipped, base_arc=raw.base_arc).slips == find_arcs(raw, base_arc=raw.base_arc).slips
+    for name, one in run(replace(recording, raw_gnss=slipped), STATED, ("ekf", "rts")).items():
+        error, sigma = errors(one, truth)[:2]
+        late = one.t > at
+        assert np.linalg.norm(error[late, :2], axis=1).max() < 0.15, name
+        assert np.mean((error[late, :2] / sigma[late, :2]) ** 2) < 4.6, name  # chi-square of two, 99 %, over two
 
 
 def test_records_name_satellites_and_the_report_sums_them_up(drive):
