@@ -14,7 +14,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from graphnav.config import Settings
-from graphnav.constraints.gnss import CLOCK_RATE, LEVER_ARM, TIME_OFFSET, VELOCITY_TIME_OFFSET
+from graphnav.constraints.antenna_motion import LEVER_ARM
+from graphnav.constraints.gnss import CLOCK_RATE, TIME_OFFSET, VELOCITY_TIME_OFFSET
 from graphnav.core.earth import LocalFrame
 from graphnav.core.errors import EstimationError
 from graphnav.core.progress import Progress, tell
