@@ -25,8 +25,6 @@ from graphnav.imu.unresolved import add_coning, add_unresolved_motion
 from graphnav.recording import ImuNoise, Recording
 from graphnav.recording.odometer import MeanSpeed
 
-_LONGER = 0.01  # share by which an interval may be longer than the rate has it: clocks differ, stamps are rounded
-
 
 @dataclass(frozen=True)
 class ParameterChain:
@@ -182,11 +180,11 @@ def _note_differences(rows: Constraint) -> Constraint:
 
 
 def choose_keyframes(start: float, end: float, epochs: Array, rate: float) -> Array:
-    """Keyframes at both ends, at every epoch between, and in between at least at `rate`, but for `_LONGER`."""
+    """Keyframes at both ends, at every epoch between, and in between at least at `rate`."""
     inside = epochs[(epochs > start + SAME_TIME) & (epochs < end - SAME_TIME)]
     fixed = np.unique(np.concatenate([[start], inside, [end]]))
     fixed = fixed[np.concatenate([[True], np.diff(fixed) > SAME_TIME])]
-    parts = np.maximum(1, np.ceil(np.diff(fixed) * rate - _LONGER).astype(int))
+    parts = np.maximum(1, np.ceil(np.diff(fixed) * rate - 1e-6).astype(int))
     step = np.repeat(np.diff(fixed) / parts, parts)
     within = np.arange(parts.sum()) - np.repeat(np.cumsum(parts) - parts, parts)
     return np.append(np.repeat(fixed[:-1], parts) + within * step, fixed[-1])

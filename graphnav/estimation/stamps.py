@@ -39,8 +39,8 @@ _SIGNIFICANT = 3.0  # sigmas
 _MOVES = 3  # of moving the stamps
 _A_PPM = 1e-6
 
-# a recording whose stamps are moved, and whether evidence is wanted of an estimate -> what its solvers share
-Prepare = Callable[[Recording, Weigh], Prepared]
+# a recording whose stamps are moved, by which rate (s/s), and whether evidence is wanted -> what its solvers share
+Prepare = Callable[[Recording, float, Weigh], Prepared]
 _Candidate = tuple[Recording, Prepared, StampOffsets]
 
 
@@ -61,7 +61,7 @@ def find_stamps(
     clock : offsets between IMU and fixes that the recording shows before any estimation.
     """
     guess = None if clock is None else _guess_offsets(clock)
-    plain: _Candidate = recording, prepare(recording, is_offset_far if guess is None else _accept_all), AS_STATED
+    plain: _Candidate = recording, prepare(recording, 0.0, is_offset_far if guess is None else _accept_all), AS_STATED
     starts = [] if guess is None else [_move(recording, prepare, guess)]
     for start in (*starts, plain):
         found = _move_until_near(recording, prepare, start)
@@ -81,7 +81,7 @@ def _move_until_near(recording: Recording, prepare: Prepare, found: _Candidate) 
 
 def _move(recording: Recording, prepare: Prepare, offsets: StampOffsets) -> _Candidate:
     moved = move_stamps(recording, offsets)
-    return moved, prepare(moved, _accept_all), offsets
+    return moved, prepare(moved, offsets.rate, _accept_all), offsets
 
 
 def _accept_all(problem: Problem, points: Points) -> bool:
