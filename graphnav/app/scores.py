@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from graphnav.constraints.gnss import CLOCK_RATE, LEVER_ARM, TIME_OFFSET
+from graphnav.constraints.antenna_motion import LEVER_ARM
+from graphnav.constraints.gnss import CLOCK_RATE, TIME_OFFSET
 from graphnav.core import rotation
 from graphnav.core.rotation import Array
 from graphnav.core.trajectory import Trajectory

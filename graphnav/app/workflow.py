@@ -17,8 +17,8 @@ import numpy as np
 
 from graphnav.app.scores import Withheld, score
 from graphnav.config import Settings
+from graphnav.constraints.antenna_motion import LEVER_ARM
 from graphnav.constraints.base import SAME_TIME
-from graphnav.constraints.gnss import LEVER_ARM
 from graphnav.core.complaints import suggest_nearest
 from graphnav.core.errors import ConfigError, EstimationError, RecordingError
 from graphnav.core.findings import Finding

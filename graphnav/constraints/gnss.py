@@ -3,11 +3,11 @@
 Groves (2013), eq. 14.103 and 14.104, without its small-angle approximations. Residuals are in the local
 ENU at the fix, where receivers state their sigmas::
 
-    r_p = R_ln (p + R_nb l + u d + a d^2 / 2 - p_meas) + e       u = v + R_nb (omega_nb x l)
-    r_v = R_ln (u + a d) - v_meas                                a = R_nb (f_b - b_a) + g
-    omega_nb = omega_b - b_g - R_nb^T omega_ie
+    r_p = R_ln (p + R_nb l + u d + a(d/3) d^2 / 2 - p_meas) + e       u = v + R_nb (omega_nb x l)
+    r_v = R_ln (u + a(d/2) d) - v_meas                                omega_nb = omega_b - b_g - R_nb^T omega_ie
 
-d is added to the stamps of the fixes. It is a constant, one for positions and one for velocities, as a receiver's
+d is added to the stamps of the fixes, and a(h) is the acceleration a time h after the stamp, linear in h
+(`graphnav.constraints.antenna_motion`). d is a constant, one for positions and one for velocities, as a receiver's
 filters delay them differently (boulder's differ by 0.1 s, dresden's by 0.7 s), and what the clocks of IMU and receiver
 drift apart: the rate of one beside the other, by the time since the drive began. Crystals keep it within some 1e-4
 (boulder's 3e-4): 0.2 s in half an hour. Where fixes are stamped on arrival, each stamp has an error of its own as
@@ -30,14 +30,20 @@ from typing import Any, ClassVar, Self
 import numpy as np
 
 from graphnav.config import Settings
+from graphnav.constraints.antenna_motion import (
+    LEVER_ARM,
+    average_around,
+    compute_acceleration,
+    compute_antenna_velocity,
+    fit_force_line,
+)
 from graphnav.constraints.base import SAME_TIME, BuildContext, Constraint, Linearized, TypicalSigmas
 from graphnav.core import earth, rotation
 from graphnav.core.rotation import Array, mv
 from graphnav.core.running import run_median
 from graphnav.core.state import NODE_SPACING, SECONDS, Parameter, States
-from graphnav.recording import FIX_TYPES, Imu, Recording
+from graphnav.recording import FIX_TYPES, Recording
 
-LEVER_ARM = "gnss_lever_arm"
 TIME_OFFSET = "gnss_time_offset"
 VELOCITY_TIME_OFFSET = "gnss_velocity_time_offset"
 CLOCK_RATE = "gnss_clock_rate"
@@ -52,7 +58,6 @@ OFFSETS = {f"prior.{name}": name for name in (TIME_OFFSET, VELOCITY_TIME_OFFSET,
 _I3 = np.eye(3)
 _MINUTE = 60.0  # s
 _WHITE = 1e-3  # s, a correlation time at which nothing is left from one fix to the next
-_HALF_WINDOW = 0.05  # s each side over which turn rate and force at a fix are averaged
 
 
 def _make_empty(*shape: int) -> Array:
@@ -105,7 +110,54 @@ def _split_time_offset(
 
 
 @dataclass(frozen=True)
-class GnssPosition(Constraint):
+class _Fixes(Constraint):
+    """What both constraints have: the motion of the antenna around the stamps, and the stated sigmas."""
+
+    R_ln: Array = field(default_factory=lambda: _make_empty(0, 3, 3))
+    sigma: Array = field(default_factory=lambda: _make_empty(0, 3))
+    unit_error: Array = field(default_factory=lambda: _make_empty(0, 3))  # the same, smoothed: unit of lasting errors
+    elapsed: Array = field(default_factory=lambda: _make_empty(0))  # s since the epoch of the navigation frame
+    lever_arm: Array = field(default_factory=lambda: np.zeros(3))
+    gyro: Array = field(default_factory=lambda: _make_empty(0, 3))  # measured rate at the fix
+    force: Array = field(default_factory=lambda: _make_empty(0, 3))  # measured specific force at the fix
+    force_slope: Array = field(default_factory=lambda: _make_empty(0, 3))  # m/s^3, its rate of change
+    g_n: Array = field(default_factory=lambda: _make_empty(0, 3))  # gravity there
+    omega_n: Array = field(default_factory=lambda: np.zeros(3))  # Earth rate
+
+    def compute_typical_error(self) -> Array:
+        """At least the stated sigma: a fix within it is not wrong, however good the others are."""
+        lasting = sum(
+            (p.sigma**2 for p in self.parameters if p.name.startswith((*ERRORS, VELOCITY_ERROR))), np.zeros(3)
+        )
+        whole = np.sqrt(self.sigma**2 + lasting * self.unit_error**2)
+        return np.asarray(np.median(np.maximum(whole, self.unit_error), axis=0))
+
+    def _compute_acceleration(
+        self, states: States, rows: slice | Array, ahead: Array
+    ) -> tuple[Array, dict[str, Array]]:
+        """Acceleration in n (n, 3) at `ahead` (n, 1) s after the stamps, and its derivatives by blocks of the state."""
+        measured = self.force[rows], self.force_slope[rows], self.gyro[rows]
+        return compute_acceleration(states, *measured, self.g_n[rows], ahead)
+
+
+def _build_motion(scene: BuildContext, t: Array, p_n: Array) -> dict[str, Any]:
+    """The fields of the antenna's motion around times t (N,) at places p_n (N, 3)."""
+    imu, gnss = scene.recording.imu, scene.recording.gnss
+    assert gnss is not None
+    force, slope = fit_force_line(imu, t)
+    return {
+        "elapsed": t - scene.frame.epoch,
+        "lever_arm": gnss.lever_arm,
+        "gyro": average_around(imu, imu.gyro, t),
+        "force": force,
+        "force_slope": slope,
+        "g_n": scene.frame.gravity_n(p_n),
+        "omega_n": scene.frame.omega_n,
+    }
+
+
+@dataclass(frozen=True)
+class GnssPosition(_Fixes):
     """The position of the antenna at a fix."""
 
     name: ClassVar[str] = "gnss_position"
@@ -115,17 +167,6 @@ class GnssPosition(Constraint):
     fix_of: ClassVar[str] = "p"
 
     p_n: Array = field(default_factory=lambda: _make_empty(0, 3))  # fixes in the navigation frame
-    R_ln: Array = field(default_factory=lambda: _make_empty(0, 3, 3))
-    sigma: Array = field(default_factory=lambda: _make_empty(0, 3))
-    elapsed: Array = field(default_factory=lambda: _make_empty(0))  # s since the epoch of the navigation frame
-    lever_arm: Array = field(default_factory=lambda: np.zeros(3))
-    gyro: Array = field(default_factory=lambda: _make_empty(0, 3))  # measured rate at the fix
-    accel: Array = field(default_factory=lambda: _make_empty(0, 3))  # measured force at the fix
-    g_n: Array = field(default_factory=lambda: _make_empty(0, 3))  # gravity there
-    omega_n: Array = field(default_factory=lambda: np.zeros(3))  # Earth rate
-    unit_error: Array = field(
-        default_factory=lambda: _make_empty(0, 3)
-    )  # the same, smoothed: unit of the time-correlated errors
     drive_error: Array = field(
         default_factory=lambda: np.zeros(3)
     )  # median of these: unit of the errors of minutes and hours
@@ -148,7 +189,7 @@ class GnssPosition(Constraint):
         used = keyframe >= 0
         if not used.any():
             return None
-        llh, sd, imu = gnss.llh[used], gnss.sd[used], scene.recording.imu
+        llh, sd = gnss.llh[used], gnss.sd[used]
         p_n = scene.frame.from_llh(llh)
         kinds = None if gnss.type is None or len(np.unique(gnss.type)) < 2 else gnss.type[used]
         common = _build_common(scene, TIME_OFFSET)
@@ -175,12 +216,7 @@ class GnssPosition(Constraint):
             else scene.typical_sigmas[used],
             drive_error=np.median(sd if scene.typical_sigmas is None else scene.typical_sigmas, axis=0),
             type=kinds,
-            elapsed=gnss.t[used] - scene.frame.epoch,
-            lever_arm=gnss.lever_arm,
-            gyro=average_around(imu, imu.gyro, gnss.t[used]),
-            accel=average_around(imu, imu.accel, gnss.t[used]),
-            g_n=scene.frame.gravity_n(p_n),
-            omega_n=scene.frame.omega_n,
+            **_build_motion(scene, gnss.t[used], p_n),
             processes=(*processes, *_build_stamp_error(scene.settings, gnss.t[used])),
             **common,
         )
@@ -198,9 +234,6 @@ class GnssPosition(Constraint):
         processes = tuple(replace(p, spacing=typical.spacing) for p in self.processes)
         return replace(self, drive_error=typical.overall(), processes=processes)
 
-    def compute_typical_error(self) -> Array:
-        return _bound_typical_error(self)
-
     def linearize(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> Linearized:
         C, R = self.R_ln[rows], states.R_nb
         lever = parameters.get(LEVER_ARM, self.lever_arm)
@@ -211,14 +244,14 @@ class GnssPosition(Constraint):
         offset, by = _split_time_offset(parameters, TIME_OFFSET, self.elapsed[rows])
         if offset is not None:
             velocity, moved = compute_antenna_velocity(states, self.gyro[rows], self.omega_n, lever)
-            change, bent = compute_acceleration(states, self.accel[rows], self.g_n[rows])
+            change, bent = self._compute_acceleration(states, rows, offset / 3.0)
             away = away + velocity * offset + change * (0.5 * offset**2)
             for block in ("theta", "v", "bg", LEVER_ARM):
                 if block != LEVER_ARM or LEVER_ARM in parameters:
                     J[block] = J.get(block, 0.0) + moved[block] * offset[..., None]
-            J["theta"] = J["theta"] + bent["theta"] * (0.5 * offset**2)[..., None]
-            J["ba"] = bent["ba"] * (0.5 * offset**2)[..., None]
-            later = velocity + change * offset
+            for block, x in bent.items():
+                J[block] = J.get(block, 0.0) + x * (0.5 * offset**2)[..., None]
+            later = velocity + self._compute_acceleration(states, rows, offset / 2.0)[0] * offset
             J |= {name: (later * one)[..., None] for name, one in by.items()}
         residual, jacobians = mv(C, away), {block: C @ x for block, x in J.items()}
         for name in parameters:
@@ -239,7 +272,7 @@ class GnssPosition(Constraint):
 
 
 @dataclass(frozen=True)
-class GnssVelocity(Constraint):
+class GnssVelocity(_Fixes):
     """The velocity of the antenna at a fix."""
 
     name: ClassVar[str] = "gnss_velocity"
@@ -249,17 +282,6 @@ class GnssVelocity(Constraint):
     fix_of: ClassVar[str] = "v"
 
     v_l: Array = field(default_factory=lambda: _make_empty(0, 3))
-    R_ln: Array = field(default_factory=lambda: _make_empty(0, 3, 3))
-    sigma: Array = field(default_factory=lambda: _make_empty(0, 3))
-    elapsed: Array = field(default_factory=lambda: _make_empty(0))  # s since the epoch of the navigation frame
-    gyro: Array = field(default_factory=lambda: _make_empty(0, 3))  # measured rate at the fix
-    accel: Array = field(default_factory=lambda: _make_empty(0, 3))  # measured force at the fix
-    g_n: Array = field(default_factory=lambda: _make_empty(0, 3))  # gravity there
-    omega_n: Array = field(default_factory=lambda: np.zeros(3))  # Earth rate
-    lever_arm: Array = field(default_factory=lambda: np.zeros(3))
-    unit_error: Array = field(
-        default_factory=lambda: _make_empty(0, 3)
-    )  # stated sigma, smoothed: unit of the time-correlated errors
 
     @classmethod
     def epochs(cls, recording: Recording, settings: Settings, stationary: Array) -> Array:
@@ -292,12 +314,7 @@ class GnssVelocity(Constraint):
             v_l=gnss.v[used],
             R_ln=earth.enu_axes(gnss.llh[used]) @ scene.frame.R_ne.T,
             sigma=gnss.sd_v[used],
-            elapsed=t - scene.frame.epoch,
-            gyro=average_around(scene.recording.imu, scene.recording.imu.gyro, t),
-            accel=average_around(scene.recording.imu, scene.recording.imu.accel, t),
-            g_n=scene.frame.gravity_n(scene.frame.from_llh(gnss.llh[used])),
-            omega_n=scene.frame.omega_n,
-            lever_arm=gnss.lever_arm,
+            **_build_motion(scene, t, scene.frame.from_llh(gnss.llh[used])),
             unit_error=_compute_running_median(t, gnss.sd_v[used]),
             processes=(lasting, *_build_stamp_error(scene.settings, t)),
             **_build_common(scene, VELOCITY_TIME_OFFSET),
@@ -307,9 +324,6 @@ class GnssVelocity(Constraint):
         processes = tuple(replace(p, spacing=typical.spacing) for p in self.processes)
         return replace(self, unit_error=typical.around(self.keyframe)[:, 3:], processes=processes)
 
-    def compute_typical_error(self) -> Array:
-        return _bound_typical_error(self)
-
     def linearize(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> Linearized:
         C = self.R_ln[rows]
         lever = parameters.get(LEVER_ARM, self.lever_arm)
@@ -318,24 +332,17 @@ class GnssVelocity(Constraint):
         jacobians = {block: C @ J for block, J in moved.items() if block != LEVER_ARM or LEVER_ARM in parameters}
         offset, by = _split_time_offset(parameters, VELOCITY_TIME_OFFSET, self.elapsed[rows])
         if offset is not None:
-            change, bent = compute_acceleration(states, self.accel[rows], self.g_n[rows])
-            change = mv(C, change)
-            residual = residual + change * offset
-            jacobians["theta"] = jacobians["theta"] + C @ bent["theta"] * offset[..., None]
-            jacobians["ba"] = C @ bent["ba"] * offset[..., None]
-            jacobians |= {name: (change * one)[..., None] for name, one in by.items()}
+            change, bent = self._compute_acceleration(states, rows, offset / 2.0)
+            residual = residual + mv(C, change) * offset
+            for block, x in bent.items():
+                jacobians[block] = jacobians.get(block, 0.0) + C @ x * offset[..., None]
+            then = mv(C, self._compute_acceleration(states, rows, offset)[0])
+            jacobians |= {name: (then * one)[..., None] for name, one in by.items()}
         if VELOCITY_ERROR in parameters:
             size = self.unit_error[rows]
             residual = residual + size * parameters[VELOCITY_ERROR]
             jacobians[VELOCITY_ERROR] = size[..., None] * _I3
         return Linearized(residual, jacobians, self.sigma[rows])
-
-
-def _bound_typical_error(rows: GnssPosition | GnssVelocity) -> Array:
-    """At least the stated sigma: a fix within it is not wrong, however good the others are."""
-    lasting = sum((p.sigma**2 for p in rows.parameters if p.name.startswith((*ERRORS, VELOCITY_ERROR))), np.zeros(3))
-    whole = np.sqrt(rows.sigma**2 + lasting * rows.unit_error**2)
-    return np.asarray(np.median(np.maximum(whole, rows.unit_error), axis=0))
 
 
 def find_fix_period(t: Array) -> float:
@@ -358,40 +365,6 @@ def _compute_running_median(t: Array, sigma: Array) -> Array:
     """
     size = 2 * int(np.clip(_MINUTE / find_fix_period(t) / 2, 0, (len(t) - 1) // 2)) + 1
     return run_median(sigma, size)
-
-
-def compute_antenna_velocity(
-    states: States, gyro: Array, omega_n: Array, lever: Array
-) -> tuple[Array, dict[str, Array]]:
-    """v + R_nb (omega_nb x l) in n, (N, 3), and its derivatives by theta, v, bg and the lever arm."""
-    R = states.R_nb
-    omega_ie_b = omega_n @ R
-    omega = gyro - states.bg - omega_ie_b
-    RL = R @ rotation.skew(lever)
-    swing = -mv(RL, omega)  # omega x lever, in n
-    return states.v + swing, {
-        "theta": RL @ rotation.skew(omega_ie_b) - rotation.skew(swing) @ R,
-        "v": _I3[None],
-        "bg": RL,
-        LEVER_ARM: R @ rotation.skew(omega),
-    }
-
-
-def compute_acceleration(states: States, accel: Array, g_n: Array) -> tuple[Array, dict[str, Array]]:
-    """R_nb (f_b - b_a) + g in n, (N, 3), and its derivatives by theta and ba."""
-    R, force = states.R_nb, accel - states.ba
-    return mv(R, force) + g_n, {"theta": -R @ rotation.skew(force), "ba": -R}
-
-
-def average_around(imu: Imu, x: Array, t: Array) -> Array:
-    """(N, 3) mean of an IMU signal around times t: vibration in a single sample, times the lever arm, would be
-    noise.
-    """
-    lo = np.searchsorted(imu.t, t - _HALF_WINDOW)
-    hi = np.maximum(np.searchsorted(imu.t, t + _HALF_WINDOW), lo + 1)
-    lo, hi = np.minimum(lo, len(imu.t) - 1), np.minimum(hi, len(imu.t))
-    total = np.concatenate([np.zeros((1, 3)), np.cumsum(x, axis=0)])
-    return (total[hi] - total[lo]) / (hi - lo)[:, None]
 
 
 def free_constants(rows: Constraint, priors: Mapping[str, tuple[Array, Array]]) -> Constraint:

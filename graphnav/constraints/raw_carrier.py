@@ -34,8 +34,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphnav.config import Settings
+from graphnav.constraints.antenna_motion import LEVER_ARM
 from graphnav.constraints.base import BuildContext, Constraint, Linearized
-from graphnav.constraints.gnss import LEVER_ARM
 from graphnav.constraints.raw_gnss import (
     AXES,
     IONOSPHERE,

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from graphnav.config import Settings
-from graphnav.constraints.gnss import LEVER_ARM
+from graphnav.constraints.antenna_motion import LEVER_ARM
 from graphnav.constraints.vehicle import AXLE
 from graphnav.core.earth import LocalFrame
 from graphnav.core.errors import EstimationError

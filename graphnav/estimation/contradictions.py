@@ -26,9 +26,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from graphnav.constraints.antenna_motion import LEVER_ARM, LINEAR_OFFSET
 from graphnav.constraints.gnss import (
     CLOCK_RATE,
-    LEVER_ARM,
     OFFSETS,
     TIME_OFFSET,
     VELOCITY_TIME_OFFSET,
@@ -42,7 +42,7 @@ from graphnav.core.state import DIM
 from graphnav.estimation.noise.apply import apply_noise
 from graphnav.estimation.noise.estimate import NoiseEstimate
 from graphnav.estimation.noise.model import FreedConstant, StampOffsets
-from graphnav.estimation.offsets import LINEAR_OFFSET, move_stamps
+from graphnav.estimation.offsets import move_stamps
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.ekf import refilter
 from graphnav.estimation.solvers.passes import reuse_points

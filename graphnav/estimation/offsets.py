@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from graphnav.constraints.antenna_motion import LINEAR_OFFSET
 from graphnav.constraints.gnss import CLOCK_RATE, TIME_OFFSET, VELOCITY_TIME_OFFSET
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM
@@ -19,7 +20,6 @@ from graphnav.estimation.solvers.linearise import Points
 from graphnav.recording import Recording
 
 AS_STATED = StampOffsets()
-LINEAR_OFFSET = 0.3  # s from the linearisation point (`graphnav.estimation.stamps`)
 
 
 def is_offset_far(problem: Problem, points: Points) -> bool:

@@ -236,21 +236,24 @@ def _solve(
     recording, shown = apply_measured_floor(recording, settings)
     detection = time.perf_counter() - began
 
-    def prepare_moved(moved: Recording, weigh: Weigh | None = None) -> Prepared:
+    def prepare_moved(moved: Recording, rate: float, weigh: Weigh | None = None) -> Prepared:
         nonlocal detection
         tell("detection")
         began = time.perf_counter()
-        detected = detect(moved, settings)
+        # evidences compare between the same rows: fixes a little closer together must not have fewer keyframes between
+        keyframes = settings.keyframes.model_copy(update={"rate": settings.keyframes.rate / (1.0 + rate)})
+        own = settings.model_copy(update={"keyframes": keyframes})
+        detected = detect(moved, own)
         detection += time.perf_counter() - began
         given = None if noise is None else shift_to_imu_clock(noise)
-        return prepare(moved, settings, frame, detected, given, progress, weigh)
+        return prepare(moved, own, frame, detected, given, progress, weigh)
 
     if noise is None and may_move(recording, settings):
         recording, found, stamps = find_stamps(recording, prepare_moved, clock)
     else:
         stamps = StampOffsets() if noise is None else noise.stamps
         recording = move_stamps(recording, stamps)
-        found = prepare_moved(recording)
+        found = prepare_moved(recording, stamps.rate)
     problem, forward, smoothed = found.problem, found.forward, found.smoothed
     wrong = faults.find_fault_spans(problem, smoothed)
     notes = (

@@ -14,7 +14,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from graphnav.config import Settings
-from graphnav.constraints.gnss import CLOCK_RATE, LEVER_ARM, TIME_OFFSET, VELOCITY_TIME_OFFSET
+from graphnav.constraints.antenna_motion import LEVER_ARM
+from graphnav.constraints.gnss import CLOCK_RATE, TIME_OFFSET, VELOCITY_TIME_OFFSET
 from graphnav.core.earth import LocalFrame
 from graphnav.core.errors import EstimationError
 from graphnav.core.progress import Progress, tell
@@ -286,9 +287,8 @@ def _free_contradicted(settings: Settings, found: _Found, estimate: Estimate) ->
             other = replace(found, freed=freed, estimate=estimate(free(base, freed), near))
             passes = passes + other.estimate.passes + Counter(filter=1)
             # with other figures, freed constants may lead to a worse optimum than with all as stated
-            if other.compute_evidence() < found.compute_evidence():
-                return found.count(passes)
-            found, freed = other, update_freed(base, other.estimate, freed)
+            found = max(found, other, key=lambda one: one.compute_evidence())
+            freed = update_freed(base, found.estimate, found.freed)
     except BREAKDOWN:
         return found.count(passes)
     return replace(found, freed=freed).count(passes)

@@ -1,12 +1,11 @@
 """Stamps that are far off: rows of fixes are linearised about where the offsets of their stamps are estimated.
 
-A fix whose stamp is off by d is predicted from the state at the stamp, by v d + a d^2 / 2
-(`graphnav.constraints.gnss`). The acceleration a of a vehicle changes by a few m/s^3, 5 of them when it brakes, so that
-this is off by 5 d^3 / 6: 2 cm for 0.3 s, as the best fixes are, 0.8 m for a second. So where an offset is estimated
-farther than that from where the rows are linearised, the stamps are moved to the estimate, that of the clocks' rate
-with it, and all is estimated anew, a step of Gauss-Newton, until the estimate stays within. Where the clocks of IMU and
-fixes disagree for certain (`graphnav.recording.checks.clock`), the first step is what they disagree by. The stamps as
-they are remain a candidate: the likelier stands.
+A fix whose stamp is off by d is predicted from the state at the stamp, with an acceleration that is linear in time
+within `LINEAR_OFFSET` of it (`graphnav.constraints.gnss`). Farther away a vehicle's acceleration changes otherwise. So
+where an offset is estimated farther than that from where the rows are linearised, the stamps are moved to the estimate,
+that of the clocks' rate with it, and all is estimated anew, a step of Gauss-Newton, until the estimate stays within.
+Where the clocks of IMU and fixes disagree for certain (`graphnav.recording.checks.clock`), the first step is what they
+disagree by. The stamps as they are remain a candidate: the likelier stands.
 
 A solution is on the clock of the IMU, and what it says of fixes is on theirs (`shift_to_own_clocks`).
 """
@@ -20,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from graphnav.config import Settings
+from graphnav.constraints.antenna_motion import LINEAR_OFFSET
 from graphnav.constraints.gnss import CLOCK_RATE, TIME_OFFSET, VELOCITY_TIME_OFFSET, GnssPosition, GnssVelocity
 from graphnav.constraints.vehicle import ODOMETER_DELAY
 from graphnav.core.notes import Note
@@ -27,7 +27,7 @@ from graphnav.core.rotation import Array
 from graphnav.core.state import DIM
 from graphnav.core.timescales import shift_stamps, shift_stamps_back
 from graphnav.estimation.noise.model import NoiseModel, RowWeights, StampOffsets
-from graphnav.estimation.offsets import AS_STATED, LINEAR_OFFSET, is_offset_far, list_end_rows, move_stamps
+from graphnav.estimation.offsets import AS_STATED, is_offset_far, list_end_rows, move_stamps
 from graphnav.estimation.preparation import Prepared, Weigh
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import ConstraintRecord, ExcludedSpan, ParameterEstimate, Solution
@@ -39,8 +39,8 @@ _SIGNIFICANT = 3.0  # sigmas
 _MOVES = 3  # of moving the stamps
 _A_PPM = 1e-6
 
-# a recording whose stamps are moved, and whether evidence is wanted of an estimate -> what its solvers share
-Prepare = Callable[[Recording, Weigh], Prepared]
+# a recording whose stamps are moved, by which rate (s/s), and whether evidence is wanted -> what its solvers share
+Prepare = Callable[[Recording, float, Weigh], Prepared]
 _Candidate = tuple[Recording, Prepared, StampOffsets]
 
 
@@ -61,7 +61,7 @@ def find_stamps(
     clock : offsets between IMU and fixes that the recording shows before any estimation.
     """
     guess = None if clock is None else _guess_offsets(clock)
-    plain: _Candidate = recording, prepare(recording, is_offset_far if guess is None else _accept_all), AS_STATED
+    plain: _Candidate = recording, prepare(recording, 0.0, is_offset_far if guess is None else _accept_all), AS_STATED
     starts = [] if guess is None else [_move(recording, prepare, guess)]
     for start in (*starts, plain):
         found = _move_until_near(recording, prepare, start)
@@ -81,7 +81,7 @@ def _move_until_near(recording: Recording, prepare: Prepare, found: _Candidate) 
 
 def _move(recording: Recording, prepare: Prepare, offsets: StampOffsets) -> _Candidate:
     moved = move_stamps(recording, offsets)
-    return moved, prepare(moved, _accept_all), offsets
+    return moved, prepare(moved, offsets.rate, _accept_all), offsets
 
 
 def _accept_all(problem: Problem, points: Points) -> bool:

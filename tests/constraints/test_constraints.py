@@ -13,8 +13,9 @@ from helpers import STEPS, Array, difference, random_states, truth_states
 
 from graphnav.config import Settings, parse_settings
 from graphnav.constraints import list_constraints
+from graphnav.constraints.antenna_motion import LEVER_ARM
 from graphnav.constraints.base import BuildContext, Constraint, assemble
-from graphnav.constraints.gnss import LEVER_ARM, GnssPosition
+from graphnav.constraints.gnss import GnssPosition
 from graphnav.constraints.prior import InitialPrior
 from graphnav.core import rotation as ro
 from graphnav.core.earth import LocalFrame
@@ -211,12 +212,11 @@ def test_the_filter_itself_does_that_update(recording: Recording, copies: int) -
     rows = next(c for c in problem.constraints if isinstance(c, GnssPosition))
     k = int(rows.keyframe[1])
     pick = np.array([1, 2][:copies])
+    names = "p_n", "R_ln", "sigma", "unit_error", "elapsed", "gyro", "force", "force_slope", "g_n"
     rows = replace(
         rows,
         keyframe=np.full(copies, k),
-        **{
-            n: getattr(rows, n)[pick] for n in ("p_n", "R_ln", "sigma", "unit_error", "elapsed", "gyro", "accel", "g_n")
-        },
+        **{name: getattr(rows, name)[pick] for name in names},
     )
     problem = replace(problem, constraints=(rows,))
     forward = ekf(problem)

@@ -11,7 +11,8 @@ from helpers import refused
 
 from graphnav import run
 from graphnav.config import parse_settings
-from graphnav.constraints.gnss import CLOCK_RATE, LEVER_ARM, TIME_OFFSET
+from graphnav.constraints.antenna_motion import LEVER_ARM
+from graphnav.constraints.gnss import CLOCK_RATE, TIME_OFFSET
 from graphnav.core.earth import LocalFrame
 from graphnav.core.errors import EstimationError
 from graphnav.core.notes import get_key

@@ -15,7 +15,8 @@ from helpers import refused
 from graphnav.app import cli
 from graphnav.app.workflow import list_unused_noise
 from graphnav.config import Settings
-from graphnav.constraints.gnss import CLOCK_RATE, LEVER_ARM
+from graphnav.constraints.antenna_motion import LEVER_ARM
+from graphnav.constraints.gnss import CLOCK_RATE
 from graphnav.core.earth import LocalFrame
 from graphnav.core.errors import ConfigError
 from graphnav.core.notes import get_key

@@ -13,7 +13,8 @@ import pytest
 from helpers import Array, Factor, at_rate, dense, errors, factors, truth_states
 
 from graphnav.config import Settings, parse_settings
-from graphnav.constraints.gnss import ERRORS, LEVER_ARM
+from graphnav.constraints.antenna_motion import LEVER_ARM
+from graphnav.constraints.gnss import ERRORS
 from graphnav.constraints.standstill import PLACE
 from graphnav.core.earth import LocalFrame
 from graphnav.core.rotation import exp

@@ -14,7 +14,7 @@ from helpers import refuse_command, refused
 from graphnav.app import cli
 from graphnav.app.scores import score
 from graphnav.config import Settings
-from graphnav.constraints.gnss import LEVER_ARM
+from graphnav.constraints.antenna_motion import LEVER_ARM
 from graphnav.core.earth import LocalFrame
 from graphnav.core.errors import RecordingError
 from graphnav.core.interpolation import interpolate, place_on_earth

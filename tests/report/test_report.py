@@ -16,8 +16,9 @@ import pytest
 
 from graphnav import load, run
 from graphnav.config import Settings
+from graphnav.constraints.antenna_motion import LEVER_ARM
 from graphnav.constraints.foot import FOOT_AXIS, PATTERN, PIVOT, TRAVEL
-from graphnav.constraints.gnss import LEVER_ARM, TIME_OFFSET, VELOCITY_TIME_OFFSET
+from graphnav.constraints.gnss import TIME_OFFSET, VELOCITY_TIME_OFFSET
 from graphnav.constraints.vehicle import AXLE, BODY, MOUNTING, ODOMETER_DELAY, ODOMETER_SCALE
 from graphnav.core import rotation
 from graphnav.core.earth import LocalFrame
