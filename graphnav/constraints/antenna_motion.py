@@ -35,11 +35,10 @@ def compute_antenna_velocity(
 
 def compute_acceleration(
     states: States, force: Array, slope: Array, gyro: Array, g_n: Array, ahead: Array
-) -> tuple[Array, dict[str, Array]]:
-    """Acceleration in n (N, 3), m/s^2, and its derivatives by theta, ba and bg.
+) -> tuple[Array, Array, dict[str, Array]]:
+    """Acceleration in n (N, 3), m/s^2, its derivative by the time h after the states, and those by theta, ba and bg.
 
-    R_nb (f_b - b_a + (df_b/dt + (omega_b - b_g) x f_b) h) + g, with h the time after the states, up to
-    `LINEAR_OFFSET` either way.
+    R_nb (f_b - b_a + (df_b/dt + (omega_b - b_g) x f_b) h) + g, for h up to `LINEAR_OFFSET` either way.
 
     Parameters
     ----------
@@ -48,10 +47,12 @@ def compute_acceleration(
     g_n : (N, 3) m/s^2, gravity.
     ahead : (N, 1) s, h.
     """
-    R, ahead = states.R_nb, np.clip(ahead, -LINEAR_OFFSET, LINEAR_OFFSET)
-    then = force - states.ba + (slope + np.cross(gyro - states.bg, force)) * ahead
-    by_bg = R @ rotation.skew(force) * ahead[..., None]
-    return mv(R, then) + g_n, {"theta": -R @ rotation.skew(then), "ba": -R, "bg": by_bg}
+    R, h = states.R_nb, np.clip(ahead, -LINEAR_OFFSET, LINEAR_OFFSET)
+    jerk = slope + np.cross(gyro - states.bg, force)
+    then = force - states.ba + jerk * h
+    by_bg = R @ rotation.skew(force) * h[..., None]
+    by_time = np.where(h == ahead, mv(R, jerk), 0.0)
+    return mv(R, then) + g_n, by_time, {"theta": -R @ rotation.skew(then), "ba": -R, "bg": by_bg}
 
 
 def average_around(imu: Imu, x: Array, t: Array) -> Array:

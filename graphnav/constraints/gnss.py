@@ -134,8 +134,8 @@ class _Fixes(Constraint):
 
     def _compute_acceleration(
         self, states: States, rows: slice | Array, ahead: Array
-    ) -> tuple[Array, dict[str, Array]]:
-        """Acceleration in n (n, 3) at `ahead` (n, 1) s after the stamps, and its derivatives by blocks of the state."""
+    ) -> tuple[Array, Array, dict[str, Array]]:
+        """Acceleration in n (n, 3) at `ahead` (n, 1) s after the stamps, its derivatives by that and the state."""
         measured = self.force[rows], self.force_slope[rows], self.gyro[rows]
         return compute_acceleration(states, *measured, self.g_n[rows], ahead)
 
@@ -244,14 +244,14 @@ class GnssPosition(_Fixes):
         offset, by = _split_time_offset(parameters, TIME_OFFSET, self.elapsed[rows])
         if offset is not None:
             velocity, moved = compute_antenna_velocity(states, self.gyro[rows], self.omega_n, lever)
-            change, bent = self._compute_acceleration(states, rows, offset / 3.0)
+            change, jerk, bent = self._compute_acceleration(states, rows, offset / 3.0)
             away = away + velocity * offset + change * (0.5 * offset**2)
             for block in ("theta", "v", "bg", LEVER_ARM):
                 if block != LEVER_ARM or LEVER_ARM in parameters:
                     J[block] = J.get(block, 0.0) + moved[block] * offset[..., None]
             for block, x in bent.items():
                 J[block] = J.get(block, 0.0) + x * (0.5 * offset**2)[..., None]
-            later = velocity + self._compute_acceleration(states, rows, offset / 2.0)[0] * offset
+            later = velocity + (change + jerk * offset / 6.0) * offset
             J |= {name: (later * one)[..., None] for name, one in by.items()}
         residual, jacobians = mv(C, away), {block: C @ x for block, x in J.items()}
         for name in parameters:
@@ -332,11 +332,11 @@ class GnssVelocity(_Fixes):
         jacobians = {block: C @ J for block, J in moved.items() if block != LEVER_ARM or LEVER_ARM in parameters}
         offset, by = _split_time_offset(parameters, VELOCITY_TIME_OFFSET, self.elapsed[rows])
         if offset is not None:
-            change, bent = self._compute_acceleration(states, rows, offset / 2.0)
+            change, jerk, bent = self._compute_acceleration(states, rows, offset / 2.0)
             residual = residual + mv(C, change) * offset
             for block, x in bent.items():
                 jacobians[block] = jacobians.get(block, 0.0) + C @ x * offset[..., None]
-            then = mv(C, self._compute_acceleration(states, rows, offset)[0])
+            then = mv(C, change + jerk * offset / 2.0)
             jacobians |= {name: (then * one)[..., None] for name, one in by.items()}
         if VELOCITY_ERROR in parameters:
             size = self.unit_error[rows]
