@@ -33,5 +33,6 @@ class GnssSettings(Outliers):
         None,
         ge=0,
         description="s/s, 1-sigma of the rate of the IMU's clock beside the receiver's, 1e-4 for crystals; given, it "
-        "is estimated by this prior, with 0 never; otherwise only where the drive shows that they drift apart",
+        "is estimated by this prior unless the drive contradicts it, with 0 never; otherwise only where the drive "
+        "shows that they drift apart",
     )

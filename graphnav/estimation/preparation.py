@@ -277,7 +277,7 @@ def _free_contradicted(settings: Settings, found: _Found, estimate: Estimate) ->
     """
     base, before = found.built.problem, found.freed
     near = found.estimate.get_linearisation(found.base)
-    names = {CLOCK_RATE} if settings.gnss.clock_rate_sigma is None else set[str]()
+    names = set[str]() if settings.gnss.clock_rate_sigma == 0.0 else {CLOCK_RATE}
     if not is_offset_far(near[1], found.estimate.points):
         names |= {LEVER_ARM, TIME_OFFSET, VELOCITY_TIME_OFFSET}
     passes = found.estimate.passes + Counter(filter=1)
