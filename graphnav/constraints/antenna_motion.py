@@ -12,7 +12,8 @@ from graphnav.recording import Imu
 LEVER_ARM = "gnss_lever_arm"
 LINEAR_OFFSET = 0.3  # s each side of a fix over which its motion is predicted (`graphnav.estimation.stamps`)
 _HALF_WINDOW = 0.05  # s each side over which the turn rate at a fix is averaged
-_FEWEST = 4  # samples that a line is fitted to
+_OF_A_LINE = 2  # parameters; as many samples leave no residual
+_ROWS_AT_ONCE = 4096
 _I3 = np.eye(3)
 
 
@@ -60,7 +61,8 @@ def average_around(imu: Imu, x: Array, t: Array) -> Array:
     noise.
     """
     lo, hi = _find_samples(imu, t, _HALF_WINDOW)
-    return (_sum_before(x)[hi] - _sum_before(x)[lo]) / (hi - lo)[:, None]
+    total = np.concatenate([np.zeros((1, 3)), np.cumsum(x, axis=0)])
+    return (total[hi] - total[lo]) / (hi - lo)[:, None]
 
 
 def fit_force_line(imu: Imu, t: Array) -> tuple[Array, Array]:
@@ -71,16 +73,22 @@ def fit_force_line(imu: Imu, t: Array) -> tuple[Array, Array]:
     tenth of a second of samples of 100 Hz in a car.
     """
     lo, hi = _find_samples(imu, t, LINEAR_OFFSET)
-    since, n = imu.t - imu.t[0], (hi - lo)[:, None]
-    mean = (_sum_before(imu.accel)[hi] - _sum_before(imu.accel)[lo]) / n
-    moments = _sum_before(np.stack([since, since**2], axis=-1))
-    middle, square = ((moments[hi] - moments[lo]) / n).T
-    spread = square - middle**2
-    product = _sum_before(since[:, None] * imu.accel)
-    slope = (product[hi] - product[lo]) / n - middle[:, None] * mean
-    some = (n >= _FEWEST) & (spread[:, None] > 0.0)
-    slope = np.where(some, slope / np.where(some, spread[:, None], 1.0), 0.0)
-    return mean + slope * (t - imu.t[0] - middle)[:, None], slope
+    force, slope = np.empty((len(t), 3)), np.empty((len(t), 3))
+    for begin in range(0, len(t), _ROWS_AT_ONCE):
+        rows = slice(begin, begin + _ROWS_AT_ONCE)
+        at = lo[rows, None] + np.arange((hi - lo)[rows].max())
+        inside = at < hi[rows, None]
+        at = np.minimum(at, len(imu.t) - 1)
+        # times from the row's: sums over hours would cancel
+        u, n = np.where(inside, imu.t[at] - t[rows, None], 0.0), inside.sum(axis=1)
+        f = np.where(inside[..., None], imu.accel[at], 0.0)
+        middle, mean = u.sum(axis=1) / n, f.sum(axis=1) / n[:, None]
+        spread = (u * u).sum(axis=1) / n - middle**2
+        known = (n > _OF_A_LINE) & (spread > 0.0)
+        covariance = np.einsum("ij,ijk->ik", u, f) / n[:, None] - middle[:, None] * mean
+        slope[rows] = np.where(known[:, None], covariance / np.where(known, spread, 1.0)[:, None], 0.0)
+        force[rows] = mean - slope[rows] * middle[:, None]
+    return force, slope
 
 
 def _find_samples(imu: Imu, t: Array, half: float) -> tuple[Array, Array]:
@@ -88,8 +96,3 @@ def _find_samples(imu: Imu, t: Array, half: float) -> tuple[Array, Array]:
     lo = np.searchsorted(imu.t, t - half)
     hi = np.maximum(np.searchsorted(imu.t, t + half), lo + 1)
     return np.minimum(lo, len(imu.t) - 1), np.minimum(hi, len(imu.t))
-
-
-def _sum_before(x: Array) -> Array:
-    """(N+1, k) sums of the rows of x (N, k) before each."""
-    return np.concatenate([np.zeros((1, x.shape[1])), np.cumsum(x, axis=0)])

@@ -13,7 +13,7 @@ from helpers import STEPS, Array, difference, random_states, truth_states
 
 from graphnav.config import Settings, parse_settings
 from graphnav.constraints import list_constraints
-from graphnav.constraints.antenna_motion import LEVER_ARM
+from graphnav.constraints.antenna_motion import LEVER_ARM, fit_force_line
 from graphnav.constraints.base import BuildContext, Constraint, assemble
 from graphnav.constraints.gnss import GnssPosition
 from graphnav.constraints.prior import InitialPrior
@@ -26,7 +26,7 @@ from graphnav.estimation.solvers.ekf import ekf
 from graphnav.estimation.solvers.invariant import add_invariant, transport_covariance
 from graphnav.imu.preintegration import preintegrate
 from graphnav.imu.samples import bridge_gaps
-from graphnav.recording import Recording
+from graphnav.recording import Imu, ImuNoise, Recording
 from graphnav.sensors import Sensor, Series
 from graphnav.sensors import list_sensors as sensors
 
@@ -326,3 +326,20 @@ def test_gnss_position_is_gtsams_gps_factor_with_a_lever_arm(recording: Recordin
         np.testing.assert_allclose(b, -linear.residual[k] * white, rtol=1e-9, atol=1e-9)
         np.testing.assert_allclose(A[:, :3], linear.jacobians["theta"][k] * white[:, None], atol=1e-8)
         np.testing.assert_allclose(A[:, 3:], linear.jacobians["p"][k] @ R * white[:, None], atol=1e-8)
+
+
+def test_the_line_through_the_force_is_exact_for_a_linear_force() -> None:
+    """With uneven stamps, beyond both ends of the samples, through two samples (their mean), and after half an hour."""
+    rng = np.random.default_rng(0)
+    t = np.append(1e6 + np.cumsum(rng.uniform(0.005, 0.015, 180_000)), [1.1e6, 1.1e6 + 0.1])
+    value, slope = np.array([0.5, -1.0, 9.8]), np.array([0.7, -0.2, 0.0])
+    imu = Imu(
+        t, np.zeros((len(t), 3)), value + slope * (t - t[-3])[:, None], ImuNoise(1e-4, 1e-3, 1e-6, 1e-5, 1e-3, 0.1)
+    )
+    at = np.array([t[0] - 0.1, t[0], t[1000] + 0.003, t[-3], t[-3] + 0.1])
+    force, found = fit_force_line(imu, at)
+    np.testing.assert_allclose(found, np.tile(slope, (5, 1)), atol=1e-7)
+    np.testing.assert_allclose(force, value + slope * (at - t[-3])[:, None], atol=1e-7)
+    alone = fit_force_line(imu, t[-1:])
+    np.testing.assert_allclose(alone[0], imu.accel[-2:].mean(axis=0, keepdims=True))
+    np.testing.assert_array_equal(alone[1], 0.0)

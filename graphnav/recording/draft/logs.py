@@ -235,11 +235,6 @@ def _read_sensor(path: Path, columns: matching.FileColumns, role: str, plain: Pl
     whole = np.asarray(np.isfinite(table.stack(*needed)).all(-1))
     if role == "gnss":
         table, known = blank_unknown(table)  # as it will be read
-        if not known.any():
-            raise RecordingError(
-                f"{path}: the accuracy of every fix is -1, a phone's mark of one that it does not have",
-                key="draft.no_fix",
-            )
         whole &= known
         fixed = (table["lat"] != 0.0) | (table["lon"] != 0.0)
         if whole.any() and not (whole & fixed).any():

@@ -69,11 +69,6 @@ def build_gnss(d: schema.GnssTable, rows: Table, remarks: Remarks) -> Gnss:
     """Fixes (rad, m) with their sigmas, without those of useless precision; velocities where all axes are given."""
     rows, known = blank_unknown(rows)
     if not known.all():
-        if not known.any():
-            raise RecordingError(
-                f"{rows.path}: the accuracy of every fix is -1, a phone's mark of one that it does not have",
-                key="gnss.sigma_all_unknown",
-            )
         remarks.add(
             "gnss.sigma_unknown", f"{format_count((~known).sum(), 'fix', 'fixes')} of accuracy -1 (unknown) left out"
         )

@@ -345,11 +345,21 @@ def blank_unknown(rows: Table) -> tuple[Table, Selection]:
 
     A phone marks an unknown value, or the accuracy of one, by -1 (`CLLocation` of Apple's Core Location); where a
     column holds other negative values, -1 is one of them.
+
+    Raises
+    ------
+    RecordingError
+        If no position is known.
     """
     marks = {name: rows[name] == -1.0 for name in _MARKED if name in rows and (rows[name] < 0.0).any()}
     marks = {name: some for name, some in marks.items() if not (some ^ (rows[name] < 0.0)).any()}
     none = np.zeros(len(rows), dtype=bool)
     unknown = (marks.get("sd_e", none) & marks.get("sd_n", none)) | marks.get("sd_u", none)
+    if len(rows) and unknown.all():
+        raise RecordingError(
+            f"{rows.path}: the accuracy of every fix is -1, a phone's mark of one that it does not have",
+            key="gnss.sigma_all_unknown",
+        )
     for name in ("sd_ve", "sd_vn", "sd_vu", "speed", "course"):
         if name in marks:
             rows = rows.with_column(name, np.where(marks[name], np.nan, rows[name]))
