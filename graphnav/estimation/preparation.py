@@ -14,8 +14,6 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from graphnav.config import Settings
-from graphnav.constraints.antenna_motion import LEVER_ARM
-from graphnav.constraints.gnss import CLOCK_RATE, TIME_OFFSET, VELOCITY_TIME_OFFSET
 from graphnav.core.earth import LocalFrame
 from graphnav.core.errors import EstimationError
 from graphnav.core.progress import Progress, tell
@@ -24,29 +22,14 @@ from graphnav.detectors import Detections
 from graphnav.estimation import faults
 from graphnav.estimation.alignment import Alignment, use_known_heading
 from graphnav.estimation.building import BuiltProblem, Clock, ProblemBuilder, has_diverged
-from graphnav.estimation.contradictions import (
-    Freed,
-    are_same,
-    compute_prior_cost,
-    describe_freed,
-    find_contradicted_constants,
-    free,
-    update_freed,
-)
+from graphnav.estimation.contradictions import describe_freed, free
 from graphnav.estimation.fixing import fix, list_float_arcs
+from graphnav.estimation.joint_estimate import JointEstimate, estimate_jointly, revise_jointly
 from graphnav.estimation.noise.apply import apply_noise, drop_parts
-from graphnav.estimation.noise.decision import log_evidence
 from graphnav.estimation.noise.estimate import NoiseEstimate, estimate_noise
-from graphnav.estimation.noise.exclusion import (
-    compute_excluded_share,
-    estimate_disturbed_intervals,
-    estimate_without_faults,
-)
-from graphnav.estimation.noise.initial_points import BREAKDOWN
 from graphnav.estimation.noise.model import STATED, NoiseModel
 from graphnav.estimation.noise.spacing import space_fixes
 from graphnav.estimation.noise.words import describe_noise
-from graphnav.estimation.offsets import is_offset_far
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import CarrierArcs
 from graphnav.estimation.solvers.ekf import ekf, refilter, smooth_near
@@ -169,75 +152,37 @@ def _filter_and_smooth(
         return forward, smooth_backward(problem, forward, progress)
 
 
-@dataclass(frozen=True)
-class _Found:
-    """A noise model, and the constants that are parameters in it instead of as stated."""
-
-    built: BuiltProblem  # all constants as stated
-    freed: Freed
-    estimate: NoiseEstimate
-
-    @property
-    def base(self) -> Problem:
-        """The problem with stated noise that the noise model is of."""
-        return free(self.built.problem, self.freed)
-
-    @property
-    def noise(self) -> NoiseModel:
-        return replace(self.estimate.noise, freed=self.freed)
-
-    @property
-    def excluded_share(self) -> float:
-        return compute_excluded_share(self.built.problem, self.estimate.noise)
-
-    def compute_evidence(self) -> float:
-        """The logarithm of the evidence of the measurements."""
-        return log_evidence(self.base, self.estimate) - compute_prior_cost(self.built.problem, self.freed)
-
-    def count(self, passes: Counter[str]) -> _Found:
-        """The same after this many passes."""
-        return replace(self, estimate=replace(self.estimate, passes=passes))
-
-
-# a problem with stated noise, first points and the problem that they are of -> its noise model
-Estimate = Callable[[Problem, tuple[Points, Problem] | None], NoiseEstimate]
-
-
 def _find_noise(
     builder: ProblemBuilder, built: BuiltProblem, progress: Progress | None, passes: Counter[str], weigh: Weigh | None
 ) -> tuple[NoiseModel, Points | None, BuiltProblem, float]:
     """The noise model, linearisation points, the problem with a start and stops that rest on no excluded fix, and the
     logarithm of the evidence where it is wanted.
     """
-    leave_out = _keep_all if builder.settings.gnss.faults == "off" else estimate_without_faults
-    found = _estimate_noise(builder.settings, built, leave_out, progress)
+    settings = builder.settings.gnss
+    found = estimate_jointly(built.problem, settings, built.aligned.until, progress)
     if found.excluded_share > _MOST_WRONG:
         # most fixes contradict the start: align again with the fixes behind those that the alignment used
         try:
-            later = _estimate_noise(builder.settings, builder.build_later(built), leave_out, progress)
-            total = found.estimate.passes + later.estimate.passes
-            found = min(found, later, key=lambda one: one.excluded_share).count(total)
+            later = builder.build_later(built)
+            other = estimate_jointly(later.problem, settings, later.aligned.until, progress)
+            total = found.estimate.passes + other.estimate.passes
+            if other.excluded_share < found.excluded_share:
+                built, found = later, other
+            found = found.count(total)
         except EstimationError:
             pass  # no motion later on
     if found.noise.excluded:
-        without = builder.build_without(found.built, found.noise, parts=True)
-        if without is not found.built:
-            total = found.estimate.passes
-            found = replace(found, built=without)
-            again = estimate_noise(found.base, without.aligned.until, found.estimate.noise, progress=progress)
+        without = builder.build_without(built, found.noise, parts=True)
+        if without is not built:
+            built, total = without, found.estimate.passes
+            found = replace(found, stated=built.problem)
+            again = estimate_noise(found.base, built.aligned.until, found.estimate.noise, progress=progress)
             found = replace(found, estimate=again).count(total + again.passes)
-    found = replace(found, estimate=estimate_disturbed_intervals(found.base, found.estimate))
-    until = found.built.aligned.until
-
-    def estimate(base: Problem, near: tuple[Points, Problem] | None) -> NoiseEstimate:
-        one = estimate_noise(base, until, near=near, progress=progress)
-        return estimate_disturbed_intervals(base, leave_out(base, one, until, progress))
-
-    found = _free_contradicted(builder.settings, found, estimate)
+    found = revise_jointly(found, settings, built.aligned.until, progress)
     if found.freed:
-        found = _start_anew(builder, found)
+        built, found = _start_anew(builder, built, found)
     passes.update(found.estimate.passes + Counter(filter=1))
-    best, built = found.estimate, replace(found.built, problem=found.base)
+    best, built = found.estimate, replace(built, problem=found.base)
     wanted = weigh is not None and weigh(apply_noise(built.problem, best.noise), best.points)
     evidence = found.compute_evidence() if wanted else np.inf
     plain = NoiseModel(excluded=best.noise.excluded, freed=found.freed)
@@ -247,61 +192,16 @@ def _find_noise(
     return found.noise, Points(best.points.states, best.points.values), built, evidence
 
 
-def _keep_all(base: Problem, found: NoiseEstimate, *_: object) -> NoiseEstimate:
-    return found
-
-
-def _estimate_noise(
-    settings: Settings,
-    built: BuiltProblem,
-    leave_out: Callable[[Problem, NoiseEstimate, float | None, Progress | None], NoiseEstimate],
-    progress: Progress | None,
-) -> _Found:
-    """The noise model, with constants free that the drive contradicts, and without spans of wrong measurements.
-
-    Constants are tested first: their errors are in all measurements, and would be taken for faults of some of them.
-    """
-
-    def estimate(base: Problem, near: tuple[Points, Problem] | None) -> NoiseEstimate:
-        return estimate_noise(base, built.aligned.until, near=near, progress=progress)
-
-    found = _free_contradicted(settings, _Found(built, {}, estimate(built.problem, None)), estimate)
-    return replace(found, estimate=leave_out(found.base, found.estimate, built.aligned.until, progress))
-
-
-def _free_contradicted(settings: Settings, found: _Found, estimate: Estimate) -> _Found:
-    """Free the constants that the drive contradicts as stated, and no others, and estimate the noise model anew.
-
-    Where these are free already, the estimate stays. Tested again once all other faults are known: a gyro that misses a
-    turn looks like a wrong lever arm, and so do wrong fixes and stamps that are still to be moved.
-    """
-    base, before = found.built.problem, found.freed
-    near = found.estimate.get_linearisation(found.base)
-    names = set[str]() if settings.gnss.clock_rate_sigma == 0.0 else {CLOCK_RATE}
-    if not is_offset_far(near[1], found.estimate.points):
-        names |= {LEVER_ARM, TIME_OFFSET, VELOCITY_TIME_OFFSET}
-    passes = found.estimate.passes + Counter(filter=1)
-    try:
-        freed = find_contradicted_constants(base, found.estimate, before, names)
-        if not are_same(freed, before, base):
-            other = replace(found, freed=freed, estimate=estimate(free(base, freed), near))
-            passes = passes + other.estimate.passes + Counter(filter=1)
-            # with other figures, freed constants may lead to a worse optimum than with all as stated
-            found = max(found, other, key=lambda one: one.compute_evidence())
-            freed = update_freed(base, found.estimate, found.freed)
-    except BREAKDOWN:
-        return found.count(passes)
-    return replace(found, freed=freed).count(passes)
-
-
-def _start_anew(builder: ProblemBuilder, found: _Found) -> _Found:
+def _start_anew(
+    builder: ProblemBuilder, built: BuiltProblem, found: JointEstimate
+) -> tuple[BuiltProblem, JointEstimate]:
     """The same with a start that depends on no constant as stated that is free."""
-    built = builder.build_without(found.built, found.noise, parts=True, anew=True)
-    again = replace(found, built=built)
-    if np.array_equal(built.problem.t, found.built.problem.t):
-        return again
-    best = estimate_noise(again.base, built.aligned.until, found.estimate.noise)
-    return replace(again, estimate=best).count(found.estimate.passes + best.passes)
+    anew = builder.build_without(built, found.noise, parts=True, anew=True)
+    again = replace(found, stated=anew.problem)
+    if np.array_equal(anew.problem.t, built.problem.t):
+        return anew, again
+    best = estimate_noise(again.base, anew.aligned.until, found.estimate.noise)
+    return anew, replace(again, estimate=best).count(found.estimate.passes + best.passes)
 
 
 def _is_likelier(base: Problem, plain: NoiseModel, found: NoiseEstimate) -> bool:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import copy
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, replace
 
@@ -26,9 +26,9 @@ from graphnav.detectors import detect
 from graphnav.estimation import faults
 from graphnav.estimation.alignment import Alignment
 from graphnav.estimation.building import start_sigma
+from graphnav.estimation.contradictions import are_same, describe_freed, use_freed
+from graphnav.estimation.joint_estimate import estimate_jointly
 from graphnav.estimation.noise.apply import apply_noise
-from graphnav.estimation.noise.estimate import estimate_noise
-from graphnav.estimation.noise.exclusion import estimate_without_faults
 from graphnav.estimation.noise.model import NoiseModel
 from graphnav.estimation.noise.words import describe_noise
 from graphnav.estimation.problem import Problem, build_problem
@@ -37,6 +37,7 @@ from graphnav.online.checks import check_rows
 from graphnav.online.fixes import compute_unit
 from graphnav.online.raw import drop_ambiguities
 from graphnav.online.sensors import Sensors
+from graphnav.online.start import find_start
 from graphnav.online.tracker import Tracker
 from graphnav.recording import Recording
 
@@ -56,6 +57,8 @@ class EstimationResult:
     stationary: Array  # (M, 2) s
     excluded: tuple[ExcludedSpan, ...]  # spans that the noise model excludes
     doubts: tuple[str, ...]  # findings on units, axes and clocks
+    start: Alignment
+    anew: bool  # whether constants are free, or no longer, that concern all states so far
 
 
 @dataclass(frozen=True)
@@ -69,6 +72,7 @@ class EstimationTask:
     found: Alignment
     times: Array  # (K,) s, keyframes, the first at the start of the recording: weights of rows hold at these
     unit: Array  # (3,) m, unit of the result for errors of the fixes over minutes and hours
+    before: NoiseModel  # in use so far
 
 
 def run_estimation(task: EstimationTask) -> EstimationResult:
@@ -87,15 +91,30 @@ def run_estimation(task: EstimationTask) -> EstimationResult:
             parts_of_noise=True,
         )  # fmt: skip
         base = _share_horizontal_unit(base)
-        estimate = estimate_noise(base, start.until)
-        if settings.gnss.faults != "off":
-            estimate = estimate_without_faults(base, estimate, start.until)
-        noise = estimate.noise
-        used = apply_noise(base, noise)
-        words, wrong = describe_noise(noise, used), faults.find_fault_spans(used)
-        return EstimationResult(_convert_unit(noise, base, task.unit), words, stationary, wrong, check_rows(task.every))
+        found = estimate_jointly(base, settings.gnss, start.until)
+        noise, before = found.noise, task.before.freed
+        anew = not are_same(noise.freed, before, base)
+        if anew:
+            start = _align_again(task, stationary, noise)
+        else:  # they are states already, and need no other prior
+            noise = replace(noise, freed=before)
+        used = apply_noise(found.base, noise)
+        words = (*describe_freed(noise.freed, task.recording), *describe_noise(noise, used))
+        wrong = faults.find_fault_spans(used)
+        noise = _convert_unit(noise, base, task.unit)
+        return EstimationResult(noise, words, stationary, wrong, check_rows(task.every), start, anew)
     except np.linalg.LinAlgError as error:
         raise EstimationError(str(error), key="solver.undetermined") from error
+
+
+def _align_again(task: EstimationTask, stationary: Array, noise: NoiseModel) -> Alignment:
+    """The start without the constants as stated that are free."""
+    rows = use_freed(task.recording, noise.freed, task.frame.epoch)
+    try:
+        found = find_start(rows, stationary, task.settings, task.frame)
+    except EstimationError:
+        return task.found
+    return found if found.motion is not None else task.found
 
 
 class BackgroundEstimation:
@@ -159,14 +178,20 @@ def _convert_unit(noise: NoiseModel, base: Problem, unit: Array) -> NoiseModel:
 
 
 def start_estimation(
-    sensors: Sensors, settings: Settings, frame: LocalFrame, found: Alignment, times: Array, until: float
+    sensors: Sensors,
+    settings: Settings,
+    frame: LocalFrame,
+    found: Alignment,
+    times: Array,
+    until: float,
+    before: NoiseModel,
 ) -> BackgroundEstimation:
     """Start a noise estimation from the rows up to a time (s); `times` (K,) are the keyframes so far, s."""
     recording, every = (sensors.make_recording(-np.inf, until, all_of_them) for all_of_them in (False, True))
     due = float(times[-1]) + min(_THINKING * settings.solver.lag, _LONGEST_THOUGHT)
     settings = drop_ambiguities(settings, sensors.setup)
     return BackgroundEstimation(
-        EstimationTask(recording, every, settings, frame, found, times, sensors.gnss.compute_unit()), due
+        EstimationTask(recording, every, settings, frame, found, times, sensors.gnss.compute_unit(), before), due
     )
 
 
@@ -182,16 +207,17 @@ class CatchUp:
     Parameters
     ----------
     tracker : without keyframes.
+    settled : (K,) s, keyframes that it is to process and that the other no longer has.
     """
 
-    def __init__(self, tracker: Tracker) -> None:
-        self.tracker = tracker
+    def __init__(self, tracker: Tracker, settled: Sequence[float] = ()) -> None:
+        self.tracker, self.settled = tracker, np.array(settled)
 
     def step(self, sensors: Sensors, other: Tracker) -> bool:
         """Process a few more keyframes of the other; True once it has caught up."""
-        t, done = other.window.t, len(self.tracker.window)
+        t, done = np.concatenate([self.settled, other.window.t]), len(self.tracker.window)
         end = min(done + _REPLAYED_PORTION, len(t))
-        while end < len(t) and np.any(np.abs(other.stops[:, 0] - t[end - 1]) < SAME_TIME):
+        while end < len(t) and np.any(np.abs(self.tracker.stops[:, 0] - t[end - 1]) < SAME_TIME):
             end += 1  # the beginning of a stop is known only from later rows
         self.tracker.update(sensors, t[done:end])
         return len(self.tracker.window) >= len(t)

@@ -283,7 +283,7 @@ class Smoother:
         assert self.frame is not None
         times = np.concatenate([self._times, tracker.window.t])
         self._estimation = start_estimation(
-            self.sensors, self.settings, self.frame, found, times, tracker.newest + AFTER
+            self.sensors, self.settings, self.frame, found, times, tracker.newest + AFTER, tracker.noise
         )
 
     def _use(self, estimation: BackgroundEstimation, tracker: Tracker) -> None:
@@ -298,16 +298,18 @@ class Smoother:
         self._replace_notes("noise", found.notes)
         self._replace_notes("units", found.doubts)
         self._left_out = tuple(fault for fault in found.excluded if fault.kind not in FIXES)
-        if tracker.opened:
+        if tracker.opened and not found.anew:
             self._catch_up = CatchUp(tracker.restart_settled(found.noise, self._setup))
         else:
-            again = self._track(estimation.task.found, self._began, found.noise)
-            again.adopt(tracker, found.stationary, float(estimation.task.times[-1]))
-            self._catch_up = CatchUp(again)
+            again = self._track(found.start, self._began, found.noise)
+            again.adopt(tracker, found.stationary, float(estimation.task.times[-1]), self._times)
+            self._catch_up = CatchUp(again, self._times)
 
     def _step_catch_up(self, catch_up: CatchUp, tracker: Tracker) -> None:
         """Process some of them; the new tracker takes over once it has caught up."""
         if catch_up.step(self.sensors, tracker):
+            if not catch_up.tracker.opened:
+                self._times = []  # they are in its window
             self.tracker, self._catch_up, self._tentative = catch_up.tracker, None, False
 
     def _finish_estimation(self) -> None:
@@ -387,7 +389,7 @@ class Smoother:
 
     def _collect(self, tracker: Tracker) -> None:
         for part in tracker.settled:
-            if self._found is not None:
+            if self._found is not None or self._estimation is not None:
                 self._times += part.t.tolist()
             rows = part.t > self._last_settled
             if rows.any():
@@ -397,5 +399,5 @@ class Smoother:
         tracker.settled.clear()
         self.sensors.oldest = max(self.sensors.oldest, tracker.head)
         begin = min([tracker.head, *(max(t, tracker.head - 10.0 * CONTEXT) for t in tracker.stops[:1, 0].tolist())])
-        if self._found is None and self._estimation is None:  # otherwise it is still to be estimated from them
+        if self._found is None and self._estimation is None and self._catch_up is None:  # which still need them
             self.sensors.drop_before(begin - CONTEXT - 5.0)

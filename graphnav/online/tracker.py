@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import copy
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -26,6 +27,7 @@ from graphnav.core.findings import compute_period
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, States
 from graphnav.detectors.base import merge_spans
+from graphnav.estimation.contradictions import free
 from graphnav.estimation.noise.apply import apply_noise
 from graphnav.estimation.noise.model import STATED, NoiseModel
 from graphnav.estimation.problem import Problem, build_problem
@@ -302,19 +304,21 @@ class Tracker(Chain):
         """Whether the unsettled keyframes were built with figures of the odometer that are better known by now."""
         return self._readings.revised
 
-    def adopt(self, other: Tracker, stationary: Array, until: float) -> None:
+    def adopt(self, other: Tracker, stationary: Array, until: float, settled: Sequence[float]) -> None:
         """Take over detections and counts of another tracker, except the stops up to a time, which were detected
-        anew.
+        anew; `settled` are its keyframes before its window, s.
         """
         self._standing, self._readings = copy.copy(other._standing), copy.copy(other._readings)
         before, after = clip_spans(stationary, self.head, until - SURE), clip_spans(other.stops, until - SURE, np.inf)
-        self._standing.replace(merge_spans(np.concatenate([before, after]), gap=SAME_TIME), other.times)
+        spans = merge_spans(np.concatenate([before, after]), gap=SAME_TIME)
+        self._standing.replace(spans, np.concatenate([settled, other.times]))
 
     def rewind(self, t: float, other: Tracker) -> None:
         """Remove the keyframes from a time on, where another tracker has redone them with different stops."""
         self._keep(len(self.window) - len(self.window.select_since(t - SAME_TIME)))
         self._motions = {end: one for end, one in self._motions.items() if end < t}
-        self._standing = copy.copy(other._standing)
+        before, self._standing = clip_spans(self.stops, -np.inf, other.head), copy.copy(other._standing)
+        self._standing.add(before)
 
     def live(self, sensors: Sensors) -> Live:
         """The state at the newest IMU row, predicted from the newest keyframe."""
@@ -374,7 +378,8 @@ class Tracker(Chain):
         )
         usual = TypicalSigmas(fixes.compute_unit, lambda k: fixes.compute_typical_sigmas(problem.t[k]), spacing)
         rows = tuple(c.convert_units(usual) for c in problem.constraints)
-        return apply_noise(replace(problem, constraints=rows), noise or self.noise)
+        noise = noise or self.noise
+        return apply_noise(free(replace(problem, constraints=rows), noise.freed), noise)
 
     def _cut_around(self, sensors: Sensors, begin: float, end: float) -> Recording:
         """The rows that keyframes between two times use.

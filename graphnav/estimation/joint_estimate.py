@@ -1,0 +1,145 @@
+"""The noise model and the stated constants that the drive contradicts, estimated together.
+
+Constants are tested before the search for faults, because their errors are in all measurements and would be taken for
+faults of some of them; and again once all faults are known, because a gyro that misses a turn looks like a wrong lever
+arm, and so do wrong fixes and stamps that are still to be moved.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+from graphnav.config.gnss import GnssSettings
+from graphnav.constraints.antenna_motion import LEVER_ARM
+from graphnav.constraints.gnss import CLOCK_RATE, TIME_OFFSET, VELOCITY_TIME_OFFSET
+from graphnav.core.progress import Progress
+from graphnav.estimation.contradictions import (
+    Freed,
+    are_same,
+    compute_prior_cost,
+    find_contradicted_constants,
+    free,
+    update_freed,
+)
+from graphnav.estimation.noise.decision import log_evidence
+from graphnav.estimation.noise.estimate import NoiseEstimate, estimate_noise
+from graphnav.estimation.noise.exclusion import (
+    compute_excluded_share,
+    estimate_disturbed_intervals,
+    estimate_without_faults,
+)
+from graphnav.estimation.noise.initial_points import BREAKDOWN
+from graphnav.estimation.noise.model import NoiseModel
+from graphnav.estimation.offsets import is_offset_far
+from graphnav.estimation.problem import Problem
+from graphnav.estimation.solvers.linearise import Points
+
+
+@dataclass(frozen=True)
+class JointEstimate:
+    """A noise model, and the constants that are parameters in it instead of as stated."""
+
+    stated: Problem  # with stated noise, and all constants as stated
+    freed: Freed
+    estimate: NoiseEstimate
+
+    @property
+    def base(self) -> Problem:
+        """The problem with stated noise that the noise model is of."""
+        return free(self.stated, self.freed)
+
+    @property
+    def noise(self) -> NoiseModel:
+        """The noise model with the freed constants."""
+        return replace(self.estimate.noise, freed=self.freed)
+
+    @property
+    def excluded_share(self) -> float:
+        """Share of the fixes that are excluded."""
+        return compute_excluded_share(self.stated, self.estimate.noise)
+
+    def compute_evidence(self) -> float:
+        """The logarithm of the evidence of the measurements."""
+        return log_evidence(self.base, self.estimate) - compute_prior_cost(self.stated, self.freed)
+
+    def count(self, passes: Counter[str]) -> JointEstimate:
+        """The same after this many passes."""
+        return replace(self, estimate=replace(self.estimate, passes=passes))
+
+
+# a problem with stated noise, first points and the problem that they are of -> its noise model
+_Estimate = Callable[[Problem, tuple[Points, Problem] | None], NoiseEstimate]
+
+
+def estimate_jointly(
+    stated: Problem, settings: GnssSettings, opening: float | None = None, progress: Progress | None = None
+) -> JointEstimate:
+    """The noise model, with constants free that the drive contradicts, and without spans of wrong measurements.
+
+    Parameters
+    ----------
+    stated : built with stated noise and the parts of its intervals' noise.
+    settings : which constants are exact, and whether spans of wrong measurements are left out.
+    opening : as for `graphnav.estimation.solvers.ekf.ekf`.
+
+    Raises
+    ------
+    EstimationError
+        If the filter breaks down.
+    """
+
+    def estimate(base: Problem, near: tuple[Points, Problem] | None) -> NoiseEstimate:
+        return estimate_noise(base, opening, near=near, progress=progress)
+
+    found = _free_contradicted(JointEstimate(stated, {}, estimate(stated, None)), settings, estimate)
+    return replace(found, estimate=_leave_out_faults(found.base, found.estimate, settings, opening, progress))
+
+
+def revise_jointly(
+    found: JointEstimate, settings: GnssSettings, opening: float | None = None, progress: Progress | None = None
+) -> JointEstimate:
+    """The same with single intervals of the IMU disturbed where they are, and the constants tested again.
+
+    Parameters
+    ----------
+    found : by `estimate_jointly`; the others are as there.
+    """
+
+    def estimate(base: Problem, near: tuple[Points, Problem] | None) -> NoiseEstimate:
+        one = estimate_noise(base, opening, near=near, progress=progress)
+        return estimate_disturbed_intervals(base, _leave_out_faults(base, one, settings, opening, progress))
+
+    found = replace(found, estimate=estimate_disturbed_intervals(found.base, found.estimate))
+    return _free_contradicted(found, settings, estimate)
+
+
+def _leave_out_faults(
+    base: Problem, found: NoiseEstimate, settings: GnssSettings, opening: float | None, progress: Progress | None
+) -> NoiseEstimate:
+    return found if settings.faults == "off" else estimate_without_faults(base, found, opening, progress)
+
+
+def _free_contradicted(found: JointEstimate, settings: GnssSettings, estimate: _Estimate) -> JointEstimate:
+    """Free the constants that the drive contradicts as stated, and no others, and estimate the noise model anew.
+
+    Where these are free already, the estimate stays.
+    """
+    base, before = found.stated, found.freed
+    near = found.estimate.get_linearisation(found.base)
+    names = set[str]() if settings.clock_rate_sigma == 0.0 else {CLOCK_RATE}
+    if not is_offset_far(near[1], found.estimate.points):
+        names |= {LEVER_ARM, TIME_OFFSET, VELOCITY_TIME_OFFSET}
+    passes = found.estimate.passes + Counter(filter=1)
+    try:
+        freed = find_contradicted_constants(base, found.estimate, before, names)
+        if not are_same(freed, before, base):
+            other = replace(found, freed=freed, estimate=estimate(free(base, freed), near))
+            passes = passes + other.estimate.passes + Counter(filter=1)
+            # with other figures, freed constants may lead to a worse optimum than with all as stated
+            found = max(found, other, key=lambda one: one.compute_evidence())
+            freed = update_freed(base, found.estimate, found.freed)
+    except BREAKDOWN:
+        return found.count(passes)
+    return replace(found, freed=freed).count(passes)
