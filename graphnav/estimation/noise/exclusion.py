@@ -67,12 +67,13 @@ from graphnav.estimation.noise.spans import (
     list_repeats,
     mask_times,
     split_at_repeats,
+    split_at_steps,
     sum_lengths,
     trim,
 )
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.ekf import refilter
-from graphnav.estimation.solvers.watch import FALSE_ALARM
+from graphnav.estimation.solvers.watch import FALSE_ALARM, SIZES
 from graphnav.recording import Recording
 
 _REFINEMENTS = 2  # estimates without masked spans: the first trims the spans, the second is free of what is wrong
@@ -190,12 +191,14 @@ def _unmask(base: Problem, found: NoiseEstimate, first: Decision, masked: list[S
     start = NoiseModel(found.noise.figures, found.noise.times, excluded=dict.fromkeys(FIXES, tuple(masked)))
     for _ in range(_REFINEMENTS):
         estimate = estimate_noise(base, None, start, estimate.get_linearisation(base), changed=True)
-        errors = _predict_left_out(apply_noise(base, estimate.noise), estimate)
+        used = apply_noise(base, estimate.noise)
+        errors = _predict_left_out(used, estimate)
         detected = find_suspects(base, replace(estimate.noise, excluded={}), estimate)
         passes = passes + estimate.passes + Counter(filter=1)
         spans, refined = trim(spans, errors), trim(detected, errors)
         # a slow onset is dated better by the tests, an abrupt end by the errors of single fixes
-        for some in list_distinct(spans, trim(spans, errors, FALSE_ALARM), detected):
+        dated = spans, trim(spans, errors, FALSE_ALARM), detected
+        for some in list_distinct(*dated, *(_split(some, used, estimate) for some in dated)):
             candidate = explain(base, _add_outliers(estimate, errors, some), some)
             passes = passes + candidate.passes
             if candidate.log_evidence > best.log_evidence:
@@ -288,6 +291,17 @@ def _predict_left_out(problem: Problem, found: NoiseEstimate) -> LeftOutErrors:
         c.name: (problem.t[c.keyframe], collect_row_moments(problem, c, found.points, len(c)).left_out, len(c.axes))
         for c in fixes
     }
+
+
+def _split(spans: list[Span], problem: Problem, found: NoiseEstimate) -> list[Span]:
+    """Spans cut where the errors of positions have steps, if there are any."""
+    rows = next((c for c in problem.constraints if c.name == FIXES[0]), None)
+    if rows is None:
+        return spans
+    linear = found.points.linearise(rows, problem.columns, len(rows))
+    widths = np.sum(np.log1p(SIZES[rows.unit] / linear.stated), axis=1)
+    cost = float(np.median(widths)) - float(np.log(FALSE_ALARM))
+    return split_at_steps(spans, problem.t[rows.keyframe], linear.residual / linear.stated, cost)
 
 
 def _add_outliers(found: NoiseEstimate, errors: LeftOutErrors, spans: list[Span]) -> NoiseEstimate:
