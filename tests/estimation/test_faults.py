@@ -19,7 +19,7 @@ from graphnav.core.trajectory import Trajectory
 from graphnav.detectors import detect
 from graphnav.estimation import faults
 from graphnav.estimation.alignment import align
-from graphnav.estimation.noise.spans import list_before
+from graphnav.estimation.noise.spans import list_before, split_at_steps
 from graphnav.estimation.pipeline import choose_origin, run
 from graphnav.estimation.problem import Problem, build_problem
 from graphnav.estimation.solution import Solution
@@ -235,6 +235,40 @@ def test_list_before() -> None:
     """As long before each span, up to the span before; nothing before the first measurement."""
     t = np.arange(0.0, 30.0)
     assert list_before([(0.0, 3.0), (10.0, 14.0), (16.0, 26.0)], t) == [(6.0, 9.0), (15.0, 15.0)]
+
+
+def test_split_at_steps() -> None:
+    """Where one more error is worth its cost, beside what the errors change by in any case."""
+    rng = np.random.default_rng(1)
+    t, error, white = np.arange(30.0), rng.standard_normal((30, 3)), np.full((29, 3), 2.0)
+    error[12:20] += [30.0, -20.0, 5.0]
+    error[20:] += [-40.0, 0.0, 0.0]
+    assert split_at_steps([(2.0, 15.0), (18.0, 27.0)], t, error, white, 40.0) == [
+        (2.0, 11.0), (12.0, 15.0), (18.0, 19.0), (20.0, 27.0),
+    ]  # fmt: skip
+    assert split_at_steps([(2.0, 10.0)], t, error, white, 40.0) == [(2.0, 10.0)]
+    uncertain = np.where(np.arange(29)[:, None] == 11, 1000.0, white)  # between the two, as in an outage
+    assert split_at_steps([(2.0, 15.0)], t, error, uncertain, 40.0) == [(2.0, 15.0)]
+    scattered_errors = 50.0 * rng.standard_normal((30, 3))  # no two alike
+    assert split_at_steps([(0.0, 29.0)], t, scattered_errors, white, 40.0) == [(0.0, 29.0)]
+
+
+@pytest.mark.parametrize("without", [(), (40.0, 60.0)], ids=["all", "outage"])
+def test_reflections_that_follow_each_other_are_left_out(shared_data: Path, without: tuple[float, ...]) -> None:
+    """Two errors, one behind the other. As a single one, they would cost one error of each fix, more than jumps of the
+    vehicle that the IMU has missed.
+    """
+    recording = read(shared_data / "boulder_drive_20250708").crop(110.0, 270.0)
+    if without:
+        recording = recording.without("gnss", (without[0], without[1]))
+    assert recording.gnss is not None
+    t = recording.gnss.t - recording.start
+    first, second = (t > 3.0) & (t < 19.5), (t > 20.5) & (t < 70.5)
+    wrong = moved(recording, first, np.array([9.3, 5.2, -9.6]))
+    wrong = moved(wrong, second, np.array([-19.6, 25.4, -6.7]))
+    out = left_out(run(wrong, None, ("rts",))["rts"], wrong)
+    assert out[first | second].mean() > 0.9
+    assert out[~(first | second)].mean() < 0.1
 
 
 # ---------------------------------------------------------------------------------------------------------- noise

@@ -25,6 +25,7 @@ from hypothesis import strategies as st
 import graphnav
 from graphnav.app import cli, cli_online
 from graphnav.config import Settings, parse_settings
+from graphnav.constraints.antenna_motion import LEVER_ARM
 from graphnav.core.errors import ConfigError, GraphnavError, RecordingError
 from graphnav.core.notes import get_key
 from graphnav.core.trajectory import Trajectory
@@ -789,3 +790,30 @@ def test_smooth_driving_with_positions_alone_is_no_stop() -> None:
         assert np.all(speed[inside] < 2.0)
     error = online.frame.from_llh(gnss.llh[-1]) - online.live().state.p[0]
     assert np.linalg.norm(error[:2]) < 3.0
+
+
+@pytest.mark.parametrize("engine", ["window", "isam2"])
+def test_a_lever_arm_that_the_drive_contradicts_is_found_while_it_lasts(engine: str) -> None:
+    """States since the start are solved again with the arm that is found, those that have settled included."""
+    path = oracle.vehicle_path(150.0, 25.0)
+    recording, truth = oracle.drive(path, seed=6)
+    assert recording.gnss is not None
+    wrong = replace(
+        recording, gnss=replace(recording.gnss, lever_arm=recording.gnss.lever_arm + np.array([0.6, 1.0, 0.0]))
+    )
+    how = parse_settings({"solver": {"lag": 20.0, "engine": engine}})
+    online, parts = Online(drop_rows(wrong), how), []
+    for k, row in enumerate(list_rows(wrong)[1]):
+        online.add(row)
+        parts += online.settled()
+        if k % 300 == 299 and online._catch_up is not None:
+            online = pickle.loads(pickle.dumps(online))
+    online.finish()
+    track = joined([*parts, *online.settled()])
+    assert np.all(np.diff(track.t) > 0)
+    error, sd = (x[track.t > 120.0] for x in off(track, truth, recording))
+    assert np.sqrt(np.mean(error[:, :2] ** 2)) < 0.05  # of more than a metre
+    assert np.mean((error / sd) ** 2) < 2.0
+    assert online.tracker is not None
+    assert list(online.tracker.noise.freed) == [LEVER_ARM]
+    assert "gnss.lever_arm_used" in map(get_key, online.notes)

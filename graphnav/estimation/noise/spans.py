@@ -80,19 +80,20 @@ def split_at_repeats(spans: list[Span], recording: Recording) -> list[Span]:
     return sorted([*repeats, *others])
 
 
-def split_at_steps(spans: list[Span], t: Array, error: Array, cost: float) -> list[Span]:
+def split_at_steps(spans: list[Span], t: Array, error: Array, variance: Array, cost: float) -> list[Span]:
     """Spans cut at steps of the errors of fixes in them: each reflection has an error of its own.
 
     Parameters
     ----------
     t : (N,) s
-    error : (N, m) of fixes, in sigmas, predicted by a smoother that does not use them.
+    error : (N, m) of fixes, predicted by a smoother that does not use them.
+    variance : (N-1, m) of the changes from fix to fix without a step.
     cost : negative log-probability of one more unknown error, which a step has to be worth.
     """
     out: list[Span] = []
     for begin, end in spans:
-        own = mask_times(t, [(begin, end)])
-        squared = 0.5 * np.sum(np.diff(error[own], axis=0) ** 2, axis=1)  # a difference of two white errors
+        own = np.flatnonzero(mask_times(t, [(begin, end)]))
+        squared = np.sum(np.diff(error[own], axis=0) ** 2 / variance[own[:-1]], axis=1)
         usual = max(float(np.median(squared)) / float(chdtri(error.shape[1], 0.5)), 1.0) if len(squared) else 1.0
         after = np.flatnonzero(0.5 * squared / usual > cost) + 1
         times = t[own]
