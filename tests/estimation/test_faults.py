@@ -240,17 +240,17 @@ def test_list_before() -> None:
 def test_split_at_steps() -> None:
     """Where one more error is worth its cost, beside what the errors change by in any case."""
     rng = np.random.default_rng(1)
-    t, error, white = np.arange(30.0), rng.standard_normal((30, 3)), np.full((29, 3), 2.0)
+    t, error, sigma = np.arange(30.0), rng.standard_normal((30, 3)), np.ones((30, 3))
     error[12:20] += [30.0, -20.0, 5.0]
     error[20:] += [-40.0, 0.0, 0.0]
-    assert split_at_steps([(2.0, 15.0), (18.0, 27.0)], t, error, white, 40.0) == [
+    assert split_at_steps([(2.0, 15.0), (18.0, 27.0)], t, error, sigma, 40.0) == [
         (2.0, 11.0), (12.0, 15.0), (18.0, 19.0), (20.0, 27.0),
     ]  # fmt: skip
-    assert split_at_steps([(2.0, 10.0)], t, error, white, 40.0) == [(2.0, 10.0)]
-    uncertain = np.where(np.arange(29)[:, None] == 11, 1000.0, white)  # between the two, as in an outage
-    assert split_at_steps([(2.0, 15.0)], t, error, uncertain, 40.0) == [(2.0, 15.0)]
+    assert split_at_steps([(2.0, 10.0)], t, error, sigma, 40.0) == [(2.0, 10.0)]
+    later = t + 20.0 * (t > 11.0)  # behind an outage the prediction has drifted
+    assert split_at_steps([(2.0, 35.0)], later, error, sigma, 40.0) == [(2.0, 35.0)]
     scattered_errors = 50.0 * rng.standard_normal((30, 3))  # no two alike
-    assert split_at_steps([(0.0, 29.0)], t, scattered_errors, white, 40.0) == [(0.0, 29.0)]
+    assert split_at_steps([(0.0, 29.0)], t, scattered_errors, sigma, 40.0) == [(0.0, 29.0)]
 
 
 @pytest.mark.parametrize("without", [(), (40.0, 60.0)], ids=["all", "outage"])

@@ -42,7 +42,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from graphnav.core.state import BLOCKS
 from graphnav.estimation import faults
 from graphnav.estimation.noise.apply import apply_noise, select_weights
 from graphnav.estimation.noise.decision import Decision, explain, list_explanations, log_evidence
@@ -300,11 +299,8 @@ def _split(spans: list[Span], problem: Problem, found: NoiseEstimate) -> list[Sp
     if rows is None:
         return spans
     linear = found.points.linearise(rows, problem.columns, len(rows))
-    t, white = problem.t[rows.keyframe], linear.stated**2
-    speed = found.points.variance[rows.keyframe, BLOCKS["v"]]
-    change = white[1:] + white[:-1] + np.diff(t)[:, None] ** 2 * np.maximum(speed[1:], speed[:-1])
     cost = float(np.median(np.sum(np.log1p(SIZES[rows.unit] / linear.stated), axis=1)) - np.log(FALSE_ALARM))
-    return split_at_steps(spans, t, linear.residual, change, cost)
+    return split_at_steps(spans, problem.t[rows.keyframe], linear.residual, linear.stated, cost)
 
 
 def _add_outliers(found: NoiseEstimate, errors: LeftOutErrors, spans: list[Span]) -> NoiseEstimate:

@@ -80,23 +80,28 @@ def split_at_repeats(spans: list[Span], recording: Recording) -> list[Span]:
     return sorted([*repeats, *others])
 
 
-def split_at_steps(spans: list[Span], t: Array, error: Array, variance: Array, cost: float) -> list[Span]:
+def split_at_steps(spans: list[Span], t: Array, error: Array, sigma: Array, cost: float) -> list[Span]:
     """Spans cut at steps of the errors of fixes in them: each reflection has an error of its own.
+
+    What errors change by without a step is taken from the median; between fixes that are further apart than others the
+    prediction drifts for longer.
 
     Parameters
     ----------
     t : (N,) s
     error : (N, m) of fixes, predicted by a smoother that does not use them.
-    variance : (N-1, m) of the changes from fix to fix without a step.
+    sigma : (N, m) of the fixes.
     cost : negative log-probability of one more unknown error, which a step has to be worth.
     """
     out: list[Span] = []
     for begin, end in spans:
-        own = np.flatnonzero(mask_times(t, [(begin, end)]))
-        squared = np.sum(np.diff(error[own], axis=0) ** 2 / variance[own[:-1]], axis=1)
-        usual = max(float(np.median(squared)) / float(chdtri(error.shape[1], 0.5)), 1.0) if len(squared) else 1.0
-        after = np.flatnonzero(0.5 * squared / usual > cost) + 1
-        times = t[own]
+        own = mask_times(t, [(begin, end)])
+        dt, variance = np.diff(t[own]), sigma[own] ** 2
+        squared = np.sum(np.diff(error[own], axis=0) ** 2 / (variance[1:] + variance[:-1]), axis=1)
+        if len(dt):
+            usual = float(np.median(squared)) / float(chdtri(error.shape[1], 0.5))
+            squared /= max(usual, 1.0) * np.maximum(dt / np.median(dt), 1.0) ** 2
+        times, after = t[own], np.flatnonzero(0.5 * squared > cost) + 1
         out += zip([begin, *times[after].tolist()], [*times[after - 1].tolist(), end], strict=True)
     return out
 
