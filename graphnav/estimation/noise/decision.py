@@ -18,6 +18,7 @@ from graphnav.estimation.noise.explanations import (
     WHEELS,
     Explanation,
     compute_evidence,
+    measure_sizes,
 )
 from graphnav.estimation.noise.model import INTERVALS, NoiseModel, RowWeights
 from graphnav.estimation.noise.outliers import compute_latest_cost, compute_outlier_cost, count_reduced, count_rows
@@ -80,7 +81,8 @@ def explain(
     }
     if INTERVALS in among:
         weighted[INTERVALS] = apply_noise(base, replace(noise, weights=outside | inside[INTERVALS]))
-    before, likelihood, passes = compute_evidence(used, found.carry_points(base, used), spans, weighted, among)
+    sizes = measure_sizes(apply_noise(base, found.noise), found.points, spans)
+    before, likelihood, passes = compute_evidence(used, found.carry_points(base, used), spans, weighted, sizes, among)
     excluded: dict[str, tuple[Span, ...]] = {}
     total = before + found.log_prior
     dropped: dict[str, list[Span]] = {name: [] for name in noise.weights}

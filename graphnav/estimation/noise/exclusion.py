@@ -15,9 +15,10 @@ innovations from the start of the span to the start of the next one:
     rows        single rows have less weight, those that the estimate found to be outliers
 
 An unknown error has a zero-mean Gaussian prior, as wide as such errors get (`watch.SIZES`), and so has its growth; the
-likelihood that this width costs is the Occam factor of the model (MacKay 1992, "Bayesian interpolation"). A fault is
-beforehand as improbable as a false alarm of the tests, a single outlier as improbable as `CHANCE`. The most probable
-model decides what is left out.
+likelihood that this width costs is the Occam factor of the model (MacKay 1992, "Bayesian interpolation"). Where errors
+are correlated from fix to fix, as those of reflections, that of each has the size that the fixes show, at a cost for
+not knowing it beforehand. A fault is beforehand as improbable as a false alarm of the tests, a single outlier as
+improbable as `CHANCE`. The most probable model decides what is left out.
 
 Masking. Figures that are estimated with a fault among the data may have grown until they hide it, so the tests are made
 with the figures at their prior medians as well. If they find more, the figures are estimated again without these spans,
@@ -51,7 +52,7 @@ from graphnav.estimation.noise.explanations import (
 )
 from graphnav.estimation.noise.initial_points import BREAKDOWN
 from graphnav.estimation.noise.model import INTERVALS, NoiseModel, RowWeights
-from graphnav.estimation.noise.moments import collect_row_moments
+from graphnav.estimation.noise.moments import collect_row_moments, predict_errors
 from graphnav.estimation.noise.outliers import (
     limit_squares,
 )
@@ -298,9 +299,9 @@ def _split(spans: list[Span], problem: Problem, found: NoiseEstimate) -> list[Sp
     rows = next((c for c in problem.constraints if c.name == FIXES[0]), None)
     if rows is None:
         return spans
-    linear = found.points.linearise(rows, problem.columns, len(rows))
-    cost = float(np.median(np.sum(np.log1p(SIZES[rows.unit] / linear.stated), axis=1)) - np.log(FALSE_ALARM))
-    return split_at_steps(spans, problem.t[rows.keyframe], linear.residual, linear.stated, cost)
+    error, sigma = predict_errors(problem, rows, found.points)
+    cost = float(np.median(np.sum(np.log1p(SIZES[rows.unit] / sigma), axis=1)) - np.log(FALSE_ALARM))
+    return split_at_steps(spans, problem.t[rows.keyframe], error, sigma, cost)
 
 
 def _add_outliers(found: NoiseEstimate, errors: LeftOutErrors, spans: list[Span]) -> NoiseEstimate:

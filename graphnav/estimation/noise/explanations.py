@@ -8,17 +8,20 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from scipy.special import ndtri  # scipy.stats would take half a second to import
 
 from graphnav.config import Settings
 from graphnav.constraints.base import SAME_TIME, BuildContext, Constraint, Linearized
 from graphnav.core.rotation import Array
 from graphnav.core.state import Parameter, States
 from graphnav.estimation.noise.model import INTERVALS
+from graphnav.estimation.noise.moments import predict_errors
+from graphnav.estimation.noise.outliers import CHANCE
 from graphnav.estimation.noise.spans import Span, mask_times
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.ekf import Comparison
 from graphnav.estimation.solvers.linearise import Points
-from graphnav.estimation.solvers.passes import make_points, split_values
+from graphnav.estimation.solvers.passes import DisturbancePass, make_points, split_values
 from graphnav.estimation.solvers.watch import MINUTE, SIZES
 from graphnav.recording import Recording
 
@@ -27,6 +30,7 @@ ROWS = ("rows",)
 Explanation = tuple[str, ...]  # the constraints whose rows are wrong by it
 EXPLANATIONS: tuple[Explanation, ...] = ((), FIXES[:1], FIXES[1:], FIXES, WHEELS, INTERVALS, ROWS)
 ONE_SENSOR = FIXES[:1], FIXES[1:], WHEELS  # faulty as a whole in a span; other sensors may only have outliers there
+_UNLIKELY = -float(ndtri(CHANCE))  # sigmas
 _NEGLIGIBLE_SIGMA = 1e-9  # sigma of an error outside its span
 
 
@@ -90,18 +94,65 @@ def add_common_errors(problem: Problem, spans: list[Span], kinds: Explanation) -
     return replace(problem, constraints=tuple(add_error(rows) for rows in problem.constraints))
 
 
-def add_own_errors(problem: Problem, spans: list[Span], kinds: Explanation) -> Problem:
-    """The problem with an unknown error for each row of some constraints in the spans (s), as of a frozen receiver."""
+@dataclass(frozen=True)
+class ErrorSizes:
+    """How large the errors of single fixes are in M spans, by constraint, and what it costs that this was not known."""
+
+    sigma: Mapping[str, Array]  # (M,) m or m/s
+    cost: Mapping[str, Array]  # (M,) of the log-likelihood
+
+
+def measure_sizes(problem: Problem, smoothed: DisturbancePass, spans: list[Span]) -> ErrorSizes:
+    """Sizes of errors in spans by maximum likelihood, from those of a smoother that does not use the fix.
+
+    With a prior of the logarithm of the size that is uniform between the sigma of the fixes and `SIZES`, the likelihood
+    of n numbers integrates to its maximum times sqrt(pi / n) over the width of that prior (Laplace's approximation).
+    White errors make fixes less accurate and not wrong, so theirs are as large as faults get.
+    """
+    sigma: dict[str, Array] = {}
+    cost: dict[str, Array] = {}
+    for rows in problem.constraints:
+        if rows.name not in FIXES:
+            continue
+        t, most = problem.t[rows.keyframe], SIZES[rows.unit]
+        error, stated = predict_errors(problem, rows, smoothed)
+        sigma[rows.name], cost[rows.name] = np.full(len(spans), most), np.zeros(len(spans))
+        for k, span in enumerate(spans):
+            own = mask_times(t, [span])
+            if are_white(error[own]):
+                continue
+            least = float(np.median(stated[own]))
+            sigma[rows.name][k] = np.clip(np.sqrt(np.mean(error[own] ** 2)), min(least, most), most)
+            width = max(np.log(most / least), 1.0)
+            cost[rows.name][k] = np.log(width * np.sqrt(error[own].size / np.pi))
+    return ErrorSizes(sigma, cost)
+
+
+def are_white(error: Array) -> bool:
+    """Whether errors (N, m) in order are no more alike from one to the next than by chance.
+
+    Of N white numbers the correlation at one step has a variance of 1 / N (Bartlett 1946).
+    """
+    squares = float(np.sum(error**2))
+    alike = float(np.sum(error[1:] * error[:-1])) / squares if squares else 0.0
+    return alike * np.sqrt(error[1:].size) <= _UNLIKELY
+
+
+def add_own_errors(problem: Problem, spans: list[Span], kinds: Explanation, sizes: ErrorSizes) -> Problem:
+    """The problem with an unknown error for each row of some constraints in the spans (s), as of a frozen receiver or
+    among reflections.
+    """
 
     def widen(rows: Constraint) -> Constraint:
         if rows.name not in kinds:
             return rows
         t = problem.t[rows.keyframe]
-        within = mask_times(t, spans)
         sigma: Array = rows.sigma  # type: ignore[attr-defined]
         weight = np.ones(len(rows)) if rows.weight is None else rows.weight
-        wide = np.min(sigma / np.hypot(sigma, SIZES[rows.unit]), axis=1) ** 2
-        return replace(rows, weight=np.where(within, np.minimum(weight, wide), weight))
+        for span, size in zip(spans, sizes.sigma[rows.name], strict=True):
+            wide = np.min(sigma / np.hypot(sigma, size), axis=1) ** 2
+            weight = np.where(mask_times(t, [span]), np.minimum(weight, wide), weight)
+        return replace(rows, weight=weight)
 
     return replace(problem, constraints=tuple(widen(rows) for rows in problem.constraints))
 
@@ -111,6 +162,7 @@ def compute_evidence(
     about: Points,
     spans: list[Span],
     weighted: Mapping[Explanation, Problem],
+    sizes: ErrorSizes,
     among: Collection[Explanation] = EXPLANATIONS,
 ) -> tuple[float, Array, int]:
     """Log-likelihoods of the innovations by each explanation.
@@ -121,6 +173,7 @@ def compute_evidence(
     about : points of all keyframes.
     spans : s, first and last wrong fix, in order and apart.
     weighted : by explanation, the problem with the weights of rows and intervals that go with it.
+    sizes : of errors that are of one fix each.
     among : explanations to evaluate besides that nothing is wrong; the others have -inf.
 
     Returns
@@ -144,16 +197,18 @@ def compute_evidence(
             found.append(np.full(len(spans), -np.inf))
             continue
         base = weighted.get(kinds, problem)
-        models: list[tuple[Problem, Explanation]] = [(base, ())]
+        none = np.zeros(len(spans))
+        models: list[tuple[Problem, Explanation, Array]] = [(base, (), none)]
         if kinds and kinds not in (INTERVALS, ROWS):
-            models = [(add_common_errors(base, spans, kinds), kinds)]
+            models = [(add_common_errors(base, spans, kinds), kinds, none)]
         if kinds and set(kinds) <= set(FIXES):
-            models.append((add_own_errors(base, spans, kinds), ()))
+            cost = np.sum([sizes.cost[name] for name in kinds], axis=0)
+            models.append((add_own_errors(base, spans, kinds, sizes), (), cost))
         each = []
-        for one, anew in models:
+        for one, anew, cost in models:
             likelihood = comparison.log_likelihood(one, make_points(one, about.states, known), anew)
             passes += 1
             before = float(np.sum(likelihood[: edges[0]])) if not kinds else before
-            each.append([float(np.sum(likelihood[a:b])) for a, b in itertools.pairwise(edges)])
+            each.append([float(np.sum(likelihood[a:b])) for a, b in itertools.pairwise(edges)] - cost)
         found.append(np.max(each, axis=0))
     return before, np.array(found).T, passes

@@ -91,6 +91,15 @@ def collect_process_moments(
     return k, q * smoothed.r[k, at] ** 2, q * np.maximum(N, 0.0)
 
 
+def predict_errors(problem: Problem, rows: Constraint, smoothed: DisturbancePass) -> tuple[Array, Array]:
+    """Errors (N, m) of the rows of a constraint, each number predicted by a smoother without it, and sigmas (N, m)."""
+    n = len(rows)
+    linear = smoothed.linearise(rows, problem.columns, n)
+    w = np.ones((n, 1)) if rows.weight is None else rows.weight[:, None]
+    explained = w * np.diagonal(smoothed.cover_rows(linear, n), axis1=1, axis2=2) / linear.stated**2
+    return linear.residual / np.clip(1.0 - explained, 1e-6, 1.0), linear.stated
+
+
 def collect_row_moments(problem: Problem, rows: Constraint, smoothed: DisturbancePass, n: int) -> RowMoments:
     """Of the first n rows of a constraint."""
     at, values = rows.keyframe[:n], split_values(problem, smoothed)
