@@ -3,11 +3,12 @@ fixes' stamps, and equal rates of the clocks of IMU and fixes.
 
 A wrong lever arm rotates with the vehicle and contradicts every turn. Two crystals drift apart by up to some 1e-4, so
 that stamp errors grow throughout the drive. The test is one filter pass with all of these constants as parameters with
-wide priors, and the noise model estimated with them as stated. Components are freed one by one, each time the one with
-the largest gain in evidence, as long as there is a gain and the component differs from the stated value by more than
-three sigmas; the others are kept. With Lambda and eta the information matrix and vector of the measurements about the
-components, and D the diagonal matrix of the 1-sigmas of a prior (0 of what is known), the logarithm of the evidence is,
-up to a constant,
+wide priors, and the noise model estimated with them as stated. Constants are freed one by one, each time the one with
+the largest gain in evidence, as long as there is a gain and the constant differs from the stated value by more than
+three sigmas; the others are kept. The numbers of a lever arm are of one measuring tape: if one is wrong, the others are
+as uncertain as that. So they are freed together, with the size of their errors by maximum evidence as the 1-sigma of
+their prior. With Lambda and eta the information matrix and vector of the measurements about the constants, and D the
+diagonal matrix of the 1-sigmas of a prior (0 of what is known), the logarithm of the evidence is, up to a constant,
 
     -ln |I + D Lambda D| / 2 + (D eta)^T (I + D Lambda D)^-1 (D eta) / 2
 
@@ -25,6 +26,7 @@ from collections.abc import Collection, Mapping
 from dataclasses import replace
 
 import numpy as np
+from scipy.special import chdtrc, chdtri
 
 from graphnav.constraints.antenna_motion import LEVER_ARM, LINEAR_OFFSET
 from graphnav.constraints.gnss import (
@@ -54,7 +56,8 @@ Freed = Mapping[str, FreedConstant]  # by the parameter's name
 # 1-sigma of a component before the drive. An arm, m: how large a car is. An offset, s: where stamps are moved instead.
 # A rate, s/s: crystals are good to 1e-4, ceramic resonators to 5e-3
 PRIOR_SIGMA = {LEVER_ARM: 2.0, TIME_OFFSET: LINEAR_OFFSET, VELOCITY_TIME_OFFSET: LINEAR_OFFSET, CLOCK_RATE: 1e-3}
-_SIGNIFICANT = 3.0  # sigmas
+_BY_CHANCE = chdtrc(1, 3.0**2)  # probability of three sigmas
+_SIZES = np.geomspace(0.01, 1.0, 24)  # of errors of a constant of several numbers, in the 1-sigmas above
 _WIDER = 2.0  # prior sigma of a freed constant, in sigmas of its estimate
 _KNOWN = 5e-4  # share of that 1-sigma for a component that stays as stated
 
@@ -123,7 +126,7 @@ def find_contradicted_constants(base: Problem, best: NoiseEstimate, freed: Freed
     if not asked:
         return {}
     change, P = _ask(base, best, freed, asked)
-    some = select_contradicted(change, P, _stack(asked, "sigma"), _stack_stated(base, asked))
+    some = select_contradicted(change, P, _stack(asked, "sigma"), _stack_stated(base, asked), _number(asked))
     found = _use(base, asked, change, P, some)
     return {name: one for name, one in found.items() if one.value != asked[name].value}
 
@@ -164,14 +167,37 @@ def _ask(base: Problem, best: NoiseEstimate, freed: Freed, asked: Freed) -> tupl
 def _use(base: Problem, asked: Freed, change: Array, P: Array, some: Array) -> dict[str, FreedConstant]:
     """Constants to be used with some components (k,) as found, the others as stated."""
     stated, prior = _stack(asked, "value"), _stack(asked, "sigma")
-    off, left, _ = _change_prior(change, P, prior, np.where(some, prior, _stack_stated(base, asked)))
-    sigma = np.where(some, _WIDER * np.sqrt(np.diagonal(left)), _KNOWN * prior)
+    used = _fit_prior(change, P, prior, some, _stack_stated(base, asked), _number(asked))
+    off, left, _ = _change_prior(change, P, prior, used)
+    sigma = np.where(some, np.minimum(_WIDER * np.sqrt(np.diagonal(left)), used), _KNOWN * prior)
     return _split(asked, np.where(some, stated + off, stated), sigma)
 
 
-def select_contradicted(change: Array, P: Array, prior: Array, known: Array) -> Array:
-    """Components (k,) that are better free than as stated, found one by one: each time the one with the largest gain in
-    evidence, as long as it has one and is significant.
+def _fit_prior(change: Array, P: Array, prior: Array, some: Array, known: Array, groups: Array) -> Array:
+    """1-sigmas (k,) of the prior where some components are free; of several of one constant, that of the largest
+    evidence.
+    """
+    used = np.where(some, prior, known)
+    several = some & _are_several(groups)
+    if not several.any():
+        return used
+    candidates = [np.where(several, size * prior, used) for size in _SIZES]
+    return max(candidates, key=lambda one: _change_prior(change, P, prior, one)[2])
+
+
+def _number(asked: Freed) -> Array:
+    """(k,) the number of the constant that each component is of."""
+    return np.repeat(np.arange(len(asked)), [len(one.value) for one in asked.values()])
+
+
+def _are_several(groups: Array) -> Array:
+    """(k,) whether a component is one of several of its constant."""
+    return np.asarray(np.bincount(groups)[groups] > 1)
+
+
+def select_contradicted(change: Array, P: Array, prior: Array, known: Array, groups: Array) -> Array:
+    """Components (k,) that are better free than as stated, found group by group: each time the one with the largest
+    gain in evidence, as long as it has one and is significant.
 
     Parameters
     ----------
@@ -179,20 +205,24 @@ def select_contradicted(change: Array, P: Array, prior: Array, known: Array) -> 
     P : (k, k) its covariance.
     prior : (k,) 1-sigmas that it was found with, of what is free.
     known : (k,) 1-sigmas of what is as stated, 0 where it is exact.
+    groups : (k,) numbers of the constants that components are of.
     """
     some = np.zeros(len(change), dtype=bool)
     while not some.all():
-        gains = np.full(len(change), -np.inf)
-        for k in np.flatnonzero(~some):
-            more = some | (np.arange(len(change)) == k)
-            used = np.where(more, prior, known)
+        before = _fit_prior(change, P, prior, some, known, groups)
+        gains: dict[int, float] = {}
+        for group in np.unique(groups[~some]).tolist():
+            own = groups == group
+            used = _fit_prior(change, P, prior, some | own, known, groups)
             off, left, _ = _change_prior(change, P, prior, used)
-            if np.abs(off[k]) > _SIGNIFICANT * np.hypot(np.sqrt(left[k, k]), known[k]):
-                gains[k] = compute_evidence_gain(change, P, prior, used, np.where(some, prior, known))
-        best = int(np.argmax(gains))
-        if gains[best] <= 0.0:
+            spread = left[np.ix_(own, own)] + np.diag(known[own] ** 2)
+            squared = float(off[own] @ np.linalg.solve(spread, off[own]))
+            if squared > float(chdtri(own.sum(), _BY_CHANCE)):
+                gains[group] = compute_evidence_gain(change, P, prior, used, before)
+        best = max(gains, key=lambda group: gains[group], default=None)
+        if best is None or gains[best] <= 0.0:
             break
-        some[best] = True
+        some |= groups == best
     return some
 
 
@@ -233,8 +263,13 @@ def compute_prior_cost(base: Problem, freed: Freed) -> float:
     if not freed:
         return 0.0
     asked, some = widen(base, freed), mark_free(base, freed)
-    used, prior = _stack(freed, "sigma")[some], _stack(asked, "sigma")[some]
-    change, told = (_stack(freed, "value") - _stack(asked, "value"))[some], (used / _WIDER) ** 2
+    used, prior = _stack(freed, "sigma"), _stack(asked, "sigma")
+    change, groups = _stack(freed, "value") - _stack(asked, "value"), _number(asked)
+    for group in np.unique(groups[_are_several(groups)]).tolist():  # with a prior as wide as the errors are
+        own = groups == group
+        prior[own] = np.maximum(used[own], np.sqrt(np.mean(change[own] ** 2)))
+    used, prior, change = used[some], prior[some], change[some]
+    told = (used / _WIDER) ** 2
     narrow, wide = told + used**2, told + prior**2
     return 0.5 * float(np.sum(np.log(wide / narrow) + change**2 / wide))
 

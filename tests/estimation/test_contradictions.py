@@ -16,7 +16,7 @@ from graphnav.constraints.gnss import CLOCK_RATE, TIME_OFFSET
 from graphnav.core.earth import LocalFrame
 from graphnav.core.errors import EstimationError
 from graphnav.core.notes import get_key
-from graphnav.estimation import preparation
+from graphnav.estimation import joint_estimate
 from graphnav.estimation.antenna import find_antenna
 from graphnav.estimation.contradictions import compute_evidence_gain, free, widen
 from graphnav.estimation.noise.apply import apply_noise
@@ -149,7 +149,7 @@ def test_an_arm_whose_prior_is_stated_is_estimated_by_it(drive):
 def test_evidence_of_what_is_freed_is_that_of_the_innovations(drive, monkeypatch, name, off, rate, late):
     """The closed form against filters of all keyframes, with one prior of the constants and with the other."""
     asked = []
-    monkeypatch.setattr(preparation, "find_contradicted_constants", lambda *given: asked.append(given) or {})
+    monkeypatch.setattr(joint_estimate, "find_contradicted_constants", lambda *given: asked.append(given) or {})
     damaged = stretch_stamps(state_arm(drive.crop(0.0, 90.0), np.array([0.3, -off, 0.0]) if off else 0.0), rate)
     run(replace(damaged, gnss=replace(damaged.gnss, t=damaged.gnss.t + late)), solvers=("ekf",))
     base, best, _, _ = asked[-1]
@@ -179,3 +179,17 @@ def test_late_stamps_are_known_to_the_filter(drive, right, late):
     assert np.sqrt(np.mean((interpolate_path(found) - interpolate_path(right["ekf"]))[100:] ** 2)) < 0.1 * 10.0 * abs(
         late
     )
+
+
+def test_an_arm_that_is_wrong_in_one_number_is_not_trusted_in_the_others(drive):
+    """Hardly observable ones have an honest sigma, and the position with them."""
+    wrong = state_arm(drive, np.array([0.5, 0.0, 0.3]))
+    found = run(wrong, solvers=("rts",))["rts"]
+    right = run(drive, solvers=("rts",))["rts"]
+    arm = found.parameters[LEVER_ARM]
+    assert (arm.sigma[-1] > 0.001).all()
+    assert (np.abs(arm.value[-1] - ARM) < 4.0 * arm.sigma[-1]).all()
+    up = np.abs(found.states.p[:, 2] - right.states.p[:, 2])
+    assert (up < 4.0 * np.sqrt(found.covariance[:, 5, 5])).all()
+    late = run(replace(wrong, gnss=replace(wrong.gnss, t=wrong.gnss.t + 0.1)), solvers=("rts",))["rts"]
+    assert set(late.noise.freed) == {LEVER_ARM, TIME_OFFSET}
