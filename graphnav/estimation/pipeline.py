@@ -41,6 +41,7 @@ from graphnav.estimation.solution import Solution, join_solutions
 from graphnav.estimation.solvers.breakdown import explain_singular
 from graphnav.estimation.solvers.ekf import ekf, refilter
 from graphnav.estimation.solvers.linearise import Points
+from graphnav.estimation.solvers.passes import are_near
 from graphnav.estimation.solvers.rts import rts, smooth_backward, smooth_points
 from graphnav.estimation.stamps import (
     describe_stamps,
@@ -335,11 +336,12 @@ def _solve(
 
 
 def _step_ahead(problem: Problem, start: Points) -> Points:
-    """The points after a step of Gauss and Newton, by filter and smoother: a fraction of the time of elimination."""
+    """The points after a step of Gauss and Newton, a fraction of the time by filter and smoother, where it is short."""
     try:
-        return smooth_points(refilter(problem, start, whole=False))
+        ahead = smooth_points(refilter(problem, start, whole=False))
     except BREAKDOWN:
         return start
+    return ahead if are_near(ahead, start) else start
 
 
 def _bind_graph(problem: Problem, solution: Solution) -> Callable[[], tuple[Any, Any]]:

@@ -144,17 +144,6 @@ def test_points_that_lead_nowhere_are_given_up(built: Problem) -> None:
     assert np.max(np.abs(found.states.minus(plain.states)) / sigma) < 0.5
 
 
-def test_a_filter_ends_where_it_would_from_any_guess_of_its_estimates(built: Problem) -> None:
-    """The guess decides how soon the iteration converges, not to what."""
-    plain = ekf(built)
-    smoothed = smooth_backward(built, plain)
-    for near in (smoothed, refilter(built, smoothed)):
-        one = ekf(built, near=near)
-        apart = np.abs(one.states.minus(plain.states)) / sigmas(plain.solution)
-        assert np.max(apart) < 1e-7
-        np.testing.assert_allclose(one.log_likelihood, plain.log_likelihood, atol=1e-6)
-
-
 def test_a_stop_is_found_although_noisy_fixes_speak_of_motion() -> None:
     path = oracle.vehicle_path(duration=420, rate=50.0, seed=11)
     recording = oracle.drive(path, seed=3, gnss_velocity_sd=(0.05, 0.05, 0.05))[0].crop(60.0, 190.0)

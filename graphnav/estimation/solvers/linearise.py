@@ -39,7 +39,7 @@ class Points:
         """The first n rows of a constraint, each at the point of its keyframe."""
         return linearise(constraint, self, columns, slice(0, n))
 
-    def put(self, index: slice | Array, points: Points) -> None:
+    def put(self, index: slice, points: Points) -> None:
         """Some of them, replaced."""
         for name in ("R_nb", "p", "v", "ba", "bg"):
             getattr(self.states, name)[index] = getattr(points.states, name)

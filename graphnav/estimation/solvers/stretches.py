@@ -37,10 +37,9 @@ from graphnav.imu.dynamics import SCALE
 
 _SHORTEST, _LONGEST = 16, 256  # keyframes of a stretch
 _MAX_LINEARISATIONS = 10  # iterations of a stretch: each gains two digits or more
-# convergence threshold in sigmas: the next iteration's correction, by how much this one's is smaller than the last
-# one's, or a tenth of this one's
+# sigmas, convergence threshold of the error that is left: the correction, reduced once more as it was from the last one
 STAYS = 1e-9
-_GAIN = 0.1
+_REDUCED = 0.1  # at least, in an iteration
 
 
 class StretchFilter:
@@ -50,15 +49,14 @@ class StretchFilter:
     ----------
     P_predicted, P : (K, D, D) and
     F : (K-1, 15, w), to be filled.
-    stays : convergence threshold of the guess, sigmas.
-    near : predicted and filtered points of all keyframes that are near the result, to start from.
+    stays : error of the estimates by which the iteration ends, sigmas.
     """
 
     def __init__(
         self, problem: Problem, steps: Advance, stack: Stack, P_predicted: Array, P: Array, F: Array,
-        stays: float = STAYS, near: tuple[Points, Points] | None = None,
+        stays: float = STAYS,
     ) -> None:  # fmt: skip
-        self._problem, self._steps, self._stack, self._near = problem, steps, stack, near
+        self._problem, self._steps, self._stack = problem, steps, stack
         self._P_predicted, self._P, self._F = P_predicted, P, F
         self._length, self._stays, blocks = 2 * _SHORTEST, stays, stack.single
         k = np.repeat(np.arange(stack.K), np.diff(blocks.first))
@@ -104,8 +102,8 @@ class StretchFilter:
     def _run_stretch(
         self, k: int, k1: int, x: Points, P: Array, predicted: Points, filtered: Points, alone: bool = False
     ) -> int:
-        before = np.full(k1 - k, np.nan)  # no rate of convergence after a first correction
-        points = self._guess_points(k, k1, x) if alone or self._near is None else self._take_near(k, k1)
+        before = np.full(k1 - k, np.nan)
+        points = self._guess_points(k, k1, x)
         most = _MAX_LINEARISATIONS + int(self._end[k] - self._start[k]) * alone
         for left in range(most - 1, -1, -1):
             try:
@@ -114,8 +112,8 @@ class StretchFilter:
                 if alone:
                     raise explain_rows(self._stack.get_block(int(self._at[0])).parts) from None
                 break  # because the guess is far off; otherwise a single keyframe will raise the error
-            ahead = size * np.fmin(size / before, _GAIN)
-            stay = k1 if alone and not left else k + int(np.argmax(np.append(~(ahead <= self._stays), True)))
+            error = size * np.fmin(size / before, _REDUCED)
+            stay = k1 if alone and not left else k + int(np.argmax(np.append(~(error <= self._stays), True)))
             before = size[stay - k :]
             if stay > k:
                 own = slice(k, stay)
@@ -144,13 +142,6 @@ class StretchFilter:
             known.append(values)
         each = self._end[k:k1] - self._start[k:k1] + 1
         return Points(States.stack(reached), np.array(known)).take(np.repeat(np.arange(k1 - k), each))
-
-    def _take_near(self, k: int, k1: int) -> Points:
-        """What is near: the prediction, and the estimate in place of those after each kind of rows."""
-        assert self._near is not None
-        points = self._near[1].take(np.repeat(np.arange(k, k1), self._end[k:k1] - self._start[k:k1] + 1))
-        points.put(self._start[k:k1] - self._start[k], self._near[0].take(slice(k, k1)))
-        return points
 
     def _filter_about(self, k: int, k1: int, x: Points, P: Array, points: Points) -> tuple[Array, Points]:
         """Filter keyframes k to k1 about points; returns the largest correction, sigmas, up to each keyframe, and the
@@ -184,7 +175,7 @@ class StretchFilter:
         y[behind] -= added[np.repeat(np.arange(k1 - k), counts - 1), self._stack.single.end[some] - 1]
         e = _turn_errors(T, y - m)
         sigma = np.sqrt(np.diagonal(self._P[k:k1], axis1=1, axis2=2))
-        size = np.max(np.abs(e) / np.repeat(sigma, counts, axis=0), axis=1)
+        size = np.max(np.abs(e) / np.maximum(np.repeat(sigma, counts, axis=0), 1e-300), axis=1)
         return np.maximum.accumulate(np.maximum.reduceat(size, start)), move_points(points, e)
 
     def _step(
