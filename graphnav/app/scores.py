@@ -78,7 +78,7 @@ def score(
     with_truth = find_truth(recording)
     found = {}
     for name, solution in solutions.items():
-        antenna, compared = _read_antenna(solution), with_truth
+        antenna, compared = _read_antenna(solution, recording), with_truth
         if truth is None:
             compared = make_withheld_truth(recording, "gnss", [span for _, span in asked], antenna)
         reference, swings = np.empty(0), False
@@ -99,14 +99,24 @@ def score(
     return found, against, tuple(name for name, _ in spans)
 
 
-def _read_antenna(solution: Solution) -> AntennaCalibration:
-    """The last estimates of the antenna; as stated where there are none, as in another program's trajectory."""
+def _read_antenna(solution: Solution, recording: Recording) -> AntennaCalibration:
+    """The estimates of the antenna, of each piece its last; as stated where there are none, as in another program's
+    trajectory.
+    """
     from graphnav.evaluation.evaluate import AntennaCalibration
 
-    offset, rate, lever = (solution.parameters.get(name) for name in (TIME_OFFSET, CLOCK_RATE, LEVER_ARM))
-    begin = float(offset.value[-1, 0]) if offset else 0.0
-    drift = float(rate.value[-1, 0]) if rate else solution.noise.stamps.rate
-    return AntennaCalibration(begin, lever.value[-1] if lever else None, drift)
+    begin = np.array([-np.inf, *(piece.start for piece in solution.between[1:])])
+
+    def collect(name: str, stated: Array) -> Array:
+        out = np.tile(stated, (len(begin), 1))
+        if (found := solution.parameters.get(name)) is not None:
+            out[np.searchsorted(begin, found.t, side="right") - 1] = found.value  # the last of several stays
+        return out
+
+    arms = None if recording.gnss is None else collect(LEVER_ARM, recording.gnss.lever_arm)
+    offset = collect(TIME_OFFSET, np.zeros(1))[:, 0]
+    rate = collect(CLOCK_RATE, np.array([solution.noise.stamps.rate]))[:, 0]
+    return AntennaCalibration(offset, arms, rate, begin)
 
 
 def _choose_epochs(solution: Solution, truth: Array) -> Array:

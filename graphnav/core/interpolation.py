@@ -37,8 +37,9 @@ def interpolate(
     max_gap
         s, longest gap between rows that is interpolated; a time that falls on a row needs no neighbour.
     lever_arm
-        (3,) m, right, forward, up: position, velocity and covariance are those of the point at its end. Rows
-        without attitude are not moved, and without an attitude sigma the sigmas are unchanged.
+        (3,) m, right, forward, up: position, velocity and covariance are those of the point at its end; (K, 3)
+        where each row has its own, in force until the next. Rows without attitude are not moved, and without an
+        attitude sigma the sigmas are unchanged.
 
     Returns
     -------
@@ -86,11 +87,11 @@ def interpolate(
     cov = fill_covariance(trajectory)
     cov_at = None if cov is None else _blend(cov[k], cov[nxt], s[:, :, None])
 
-    swing = None
+    swing, arm = None, np.zeros(3)
     if lever_arm is not None and R_at is not None and omega is not None:
-        arm = np.asarray(lever_arm, dtype=float)
-        swing = _apply(rotation.skew(omega), np.broadcast_to(arm, omega.shape))
-        step = R_at @ arm
+        arm = np.broadcast_to(np.asarray(lever_arm, dtype=float), trajectory.llh.shape)[k]
+        swing = _apply(rotation.skew(omega), arm)
+        step = _apply(R_at, arm)
         p_at = p_at + np.where(np.isfinite(step), step, 0.0)
         v_at = None if v_at is None else v_at + _apply(R_at, swing)
 
@@ -101,7 +102,7 @@ def interpolate(
     rph = None if R_at is None else rotation.to_rph(R_at)
     known = cov_at is not None and bool(np.isfinite(cov_at[:, 6:9, 6:9]).all((1, 2)).any())
     if known and cov_at is not None and swing is not None and rph is not None and R_at is not None:
-        cov_at = _move_to_point(cov_at, R_at, rph, np.asarray(lever_arm, dtype=float), swing)
+        cov_at = _move_to_point(cov_at, R_at, rph, arm, swing)
     near = np.where(s[:, 0] > 0.5, nxt, k)  # the nearest row, whose fix type is taken
     out = replace(
         trajectory, t=t, llh=p_at if frame is None else frame.to_llh(p_at), v=v_at, rph=rph,

@@ -32,11 +32,13 @@ def _write_value(value: Any, line: str) -> str:
         inner = [f"{_ENCODER.encode(str(key))}: {_write_value(one, deeper)}" for key, one in value.items()]
         return f"{{{deeper}{f',{deeper}'.join(inner)}{line}}}" if inner else "{}"
     if isinstance(value, np.ndarray | np.generic):
-        # one line per row, encoded together
-        if value.ndim == 2 and value.dtype.kind in "iuf" and np.isfinite(value).all():
-            rows = _ENCODER.encode(value.tolist())[1:-1].replace("], [", f"],{deeper}[")
+        plain = value.dtype.kind in "biuf" and bool(np.isfinite(value).all())
+        value, dimensions = value.tolist(), value.ndim
+        if plain and dimensions < 2:
+            return _ENCODER.encode(value)
+        if plain and dimensions == 2:  # one line per row, encoded together
+            rows = _ENCODER.encode(value)[1:-1].replace("], [", f"],{deeper}[")
             return f"[{deeper}{rows}{line}]" if rows else "[]"
-        value = value.tolist()
     if isinstance(value, Sequence) and not isinstance(value, str):
         try:
             if not any(isinstance(one, Mapping | np.ndarray | list | tuple) for one in value):

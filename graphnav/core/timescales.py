@@ -36,14 +36,14 @@ _LEAPS = np.array(
 LEAP = float(len(_LEAPS))  # s, GPS time minus UTC since the last of them
 
 
-def shift_stamps(t: Any, offset: float, rate: float, since: float) -> Any:
-    """Stamps (s, a number or an array) on another clock, ahead by `offset` (s) at the stamp `since` and drifting by
-    `rate` (s/s).
+def shift_stamps(t: Any, offset: Any, rate: Any, since: float) -> Any:
+    """Stamps (s) on another clock, ahead by `offset` (s) at the stamp `since` and drifting by `rate` (s/s); each of
+    the three a number or an array.
     """
     return t + offset + rate * (t - since)
 
 
-def shift_stamps_back(t: Any, offset: float, rate: float, since: float) -> Any:
+def shift_stamps_back(t: Any, offset: Any, rate: Any, since: float) -> Any:
     """The inverse of `shift_stamps`."""
     return since + (t - offset - since) / (1.0 + rate)
 

@@ -172,7 +172,7 @@ def crop_solution(solution: Solution, share: Share, detections: tuple[Detection,
     def crop_parameter(p: ParameterEstimate) -> ParameterEstimate:
         in_force = np.searchsorted(p.t, start, side="right") - 1  # applies from before the span on
         some = np.flatnonzero((p.t < end) & (np.arange(len(p.t)) >= in_force))
-        return replace(p, t=p.t[some], value=p.value[some], sigma=p.sigma[some])
+        return replace(p, t=np.maximum(p.t[some], start), value=p.value[some], sigma=p.sigma[some])
 
     def crop_record(r: ConstraintRecord) -> ConstraintRecord:
         some = find_inside(r.t)

@@ -210,7 +210,7 @@ def _is_likelier(base: Problem, plain: NoiseModel, found: NoiseEstimate) -> bool
     Both leave the same measurements out, so that the likelihoods compare.
     """
     problem = apply_noise(base, plain)
-    forward = refilter(problem, found.carry_points(base, problem))
+    forward = refilter(problem, found.carry_points(base, problem), whole=False)
     return float(np.sum(forward.log_likelihood)) > found.log_posterior
 
 

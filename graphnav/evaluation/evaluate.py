@@ -8,7 +8,7 @@ of its own.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -95,11 +95,30 @@ def find_truth(recording: Recording) -> tuple[Trajectory, Array | None] | None:
 
 @dataclass(frozen=True)
 class AntennaCalibration:
-    """The calibration of the antenna in the solution that is compared with withheld fixes."""
+    """The calibration of the antenna in each of the n pieces of the solution that is compared with withheld fixes."""
 
-    clock_offset: float = 0.0  # s, to be added to the fixes' stamps
-    lever_arm: Array | None = None  # (3,) m, right, forward, up; None: that of the recording
-    clock_rate: float = 0.0  # s/s, to be added to the fixes' stamps by the time since the recording's start
+    clock_offset: Array = field(default_factory=lambda: np.zeros(1))  # (n,) s, to be added to the fixes' stamps
+    lever_arm: Array | None = None  # (n, 3) m, right, forward, up; None: that of the recording
+    # (n,) s/s, to be added to the fixes' stamps by the time since the recording's start
+    clock_rate: Array = field(default_factory=lambda: np.zeros(1))
+    begin: Array = field(default_factory=lambda: np.array([-np.inf]))  # (n,) s, of each piece, on the IMU's clock
+
+    def find_pieces(self, t: Array) -> Array:
+        """The piece of each time (N,), s, on the IMU's clock."""
+        return np.maximum(np.searchsorted(self.begin, t, side="right") - 1, 0)
+
+    def move_stamps(self, t: Array, since: float) -> Array:
+        """Stamps (N,), s, of fixes on the IMU's clock, each as the piece has it in which it then lies; NaN in none."""
+        out = np.full(len(t), np.nan)
+        for k, (late, rate) in enumerate(zip(self.clock_offset, self.clock_rate, strict=True)):
+            moved = shift_stamps(t, late, rate, since)
+            out = np.where(self.find_pieces(moved) == k, moved, out)
+        return out
+
+    def move_back(self, t: Array, since: float) -> Array:
+        """The inverse of `move_stamps`."""
+        piece = self.find_pieces(t)
+        return np.asarray(shift_stamps_back(t, self.clock_offset[piece], self.clock_rate[piece], since))
 
 
 _AS_STATED = AntennaCalibration()
@@ -113,7 +132,7 @@ def make_withheld_truth(
 ) -> tuple[Trajectory, Array]:
     """The fixes withheld in `spans` (s from the start; None: all) as the truth of those spans, with their lever arm.
 
-    A withheld fix is treated like a used one: at its stamp on the IMU's clock, with the estimated lever arm.
+    A withheld fix is treated like a used one: at its stamp on the IMU's clock, with the estimated lever arms.
 
     Parameters
     ----------
@@ -130,7 +149,7 @@ def make_withheld_truth(
     Returns
     -------
     Trajectory, Array
-        The fixes on the IMU's clock, and the (3,) lever arm, m.
+        The fixes on the IMU's clock, and the lever arm (3,) of the recording or (n, 3) of the pieces, m.
 
     Raises
     ------
@@ -146,17 +165,17 @@ def make_withheld_truth(
     mask = np.zeros(len(t), dtype=bool)
     for span in spans:
         mask |= np.ones_like(mask) if span is None else (t >= span[0]) & (t <= span[1])
-    mask &= np.isfinite(gnss.llh).all(axis=1)
+    moved = antenna.move_stamps(gnss.t, recording.start)
+    mask &= np.isfinite(gnss.llh).all(axis=1) & np.isfinite(moved)
     if not mask.any():
         raise RecordingError(
             f"'{recording.name}': no GNSS fix in the withheld spans to compare with", key="truth.no_withheld_fix"
         )
     notes = [Note("truth.withheld_gnss", "the truth is the withheld GNSS itself")]
-    if antenna.clock_offset or antenna.clock_rate:
+    if np.any(antenna.clock_offset) or np.any(antenna.clock_rate):
         notes.append(Note("truth.clock_offset", "the stamps of the withheld fixes are moved as estimated"))
     truth = Trajectory(
-        shift_stamps(gnss.t[mask], antenna.clock_offset, antenna.clock_rate, recording.start),
-        gnss.llh[mask], sd_p=gnss.sd[mask],
+        moved[mask], gnss.llh[mask], sd_p=gnss.sd[mask],
         v=None if gnss.v is None else gnss.v[mask],
         sd_v=None if gnss.sd_v is None else gnss.sd_v[mask], name="withheld GNSS",
         notes=tuple(notes),
@@ -208,19 +227,20 @@ def evaluate_recording(
         sigma = recording.truth.closed_loop_sigma
         note = Note("truth.closed_loop", f"the only truth is that the drive ends where it starts, to {sigma:g} m")
         return Metrics(trajectory.name, closure=measure_closure(trajectory), notes=(*trajectory.notes, note))
-    late = rate = 0.0
+    clock = _AS_STATED
     if found is None and gnss_spans and recording.gnss is not None:
         found = make_withheld_truth(recording, "gnss", gnss_spans, antenna)
-        late, rate = antenna.clock_offset, antenna.clock_rate
+        clock = antenna
     if found is None:
         return None
     truth, lever_arm = found
-    if recording.truth is not None and recording.truth.of == "gnss" and antenna.lever_arm is not None:
-        lever_arm = antenna.lever_arm
+    of_antenna = recording.truth is None or recording.truth.of == "gnss"
+    if of_antenna and antenna.lever_arm is not None:
+        lever_arm = antenna.lever_arm[antenna.find_pieces(trajectory.t)]
     alone = trajectory.frame == "local" or not recording.placed
     found_errors = compute_errors(trajectory, truth, lever_arm=lever_arm, max_gap=max_gap, at=at, from_start=alone)
     # spans are on the fixes' own clock, and so are the errors then
-    found_errors = replace(found_errors, t=shift_stamps_back(found_errors.t, late, rate, recording.start))
+    found_errors = replace(found_errors, t=clock.move_back(found_errors.t, recording.start))
     return measure(found_errors, trajectory.name, spans, start=recording.start)
 
 

@@ -41,7 +41,7 @@ def compute_errors(
         Either may be in a local frame; the yaw and offset that fit best are then found first. A local
         truth without height (NaN) is compared in two dimensions.
     lever_arm
-        (3,) m, RFU: from the estimate's point to the truth's.
+        (3,) m, RFU: from the estimate's point to the truth's; (K, 3) where each of its rows has its own.
     max_gap
         s; the estimate is not interpolated over wider gaps.
     at
@@ -59,7 +59,7 @@ def compute_errors(
     if lever_arm is not None and not np.any(lever_arm):
         lever_arm = None
     if lever_arm is not None and trajectory.rph is None:
-        arm = float(np.linalg.norm(lever_arm))
+        arm = float(np.max(np.linalg.norm(lever_arm, axis=-1)))
         notes.append(
             Note(
                 "truth.lever_arm",

@@ -424,7 +424,7 @@ def test_withheld_fixes_are_met_on_the_receivers_clock_and_at_the_antenna_as_est
     stamps = begin + (fixes.t + 1000.0 + late - begin) / (1.0 + rate)
     recording = _recording(t, Gnss(stamps, fixes.llh, np.full((60, 3), 0.02)))
     estimate = replace(circle(t - 1000.0), t=t)
-    antenna = evaluation.AntennaCalibration(-late, arm, rate)
+    antenna = evaluation.AntennaCalibration(np.array([-late]), arm[None], np.array([rate]))
     metrics = evaluation.evaluate_recording(
         estimate, recording, withheld=[("gnss", (20.05 + late, 30.05 + late))], antenna=antenna
     )
@@ -444,7 +444,7 @@ def test_a_truth_of_the_antenna_is_met_at_the_antenna_as_estimated() -> None:
     antenna = moved(circle(t), arm)
     gnss = Gnss(t, antenna.llh, np.full((len(t), 3), 0.02), lever_arm=np.array([0.4, 0.0, 1.2]))
     recording = _recording(t, gnss, Truth(t, llh=antenna.llh, of="gnss"))
-    for lever_arm, right, up in ((arm, 0.0, 0.0), (None, 0.4, 0.3)):
+    for lever_arm, right, up in ((arm[None], 0.0, 0.0), (None, 0.4, 0.3)):
         metrics = evaluation.evaluate_recording(
             circle(t), recording, antenna=evaluation.AntennaCalibration(lever_arm=lever_arm)
         )

@@ -239,13 +239,13 @@ def solve_rows(rows: WhitenedRows, layout: Layout, damping: float = 0.0) -> tupl
 def _collect_estimates(
     problem: Problem, layout: Layout, point: Iterate, covariances: dict[int, Array]
 ) -> dict[str, ParameterEstimate]:
-    out = {}
+    out, sigmas = {}, dict[str, Array]()
+    for group in layout.groups:
+        P = np.stack([covariances[k] for k in group.keys.tolist()])
+        sigma = np.sqrt(np.diagonal(P, axis1=1, axis2=2))
+        sigmas |= {name: sigma[:, at] for name, at in group.columns.items()}
     for chain in problem.chains:
         p = chain.parameter
-        if not p.listed:
-            continue
-        group = layout.group_of[p.name]
-        at = group.columns[p.name]
-        sigma = np.sqrt(np.stack([np.diag(covariances[int(k)])[at] for k in group.keys]))
-        out[p.name] = ParameterEstimate(chain.t, point.values[p.name], sigma, p.prior_sigma, p.unit)
+        if p.listed:
+            out[p.name] = ParameterEstimate(chain.t, point.values[p.name], sigmas[p.name], p.prior_sigma, p.unit)
     return out

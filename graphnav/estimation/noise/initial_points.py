@@ -22,7 +22,7 @@ from graphnav.estimation.solvers.watch import SIZES
 
 BREAKDOWN = EstimationError, np.linalg.LinAlgError  # errors of a filter with a numerically singular covariance
 _COOLING = 3.0  # factor by which the sigmas of an annealing fall in each round
-_SETTLED = 1e-3  # sigmas by which linearisation points may be off without effect
+_SETTLED = 1e-4  # sigmas by which linearisation points may be off without effect
 _SEARCHES = 5  # searches for gross outliers at most; in most drives the second finds the same ones
 
 

@@ -26,6 +26,7 @@ from functools import cached_property
 import numpy as np
 
 from graphnav.constraints.base import Constraint
+from graphnav.core.compiled import compile_once
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM
 from graphnav.estimation.problem import ParameterChain, Problem
@@ -75,9 +76,20 @@ def collect_imu_moments(problem: Problem, forward: ForwardRecord, smoothed: Dist
     r = (Lt @ smoothed.r[1:, :DIM, None])[..., 0]
     N = Lt @ smoothed.N[1:] @ L
     Q = problem.intervals.parts[: len(r)]
-    both = np.stack([r[:, :, None] * r[:, None], np.swapaxes(N, 1, 2)], axis=-1).reshape(len(r), DIM * DIM, 2)
-    A, B = np.moveaxis(Q.reshape(len(r), -1, DIM * DIM) @ both, -1, 0)
+    A, B = sum_parts(Q, r, N)
     return ImuMoments(A, np.maximum(B, 0.0), Q, N)
+
+
+@compile_once
+def sum_parts(Q: Array, r: Array, N: Array) -> tuple[Array, Array]:
+    """r^T Q r and tr(Q N), (n, f) each, of parts Q (n, f, D, D), r (n, D) and symmetric N (n, D, D)."""
+    n, f, D, _ = Q.shape
+    A, B = np.empty((n, f)), np.empty((n, f))
+    for k in range(n):
+        parts = Q[k].reshape((f, D * D))
+        A[k] = np.dot(parts, np.outer(r[k], r[k]).ravel())
+        B[k] = np.dot(parts, N[k].ravel())
+    return A, B
 
 
 def collect_process_moments(

@@ -31,7 +31,7 @@ from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import Solution
 from graphnav.estimation.solvers.breakdown import explain_smoother
 from graphnav.estimation.solvers.disturbance import smooth_errors, smooth_rows
-from graphnav.estimation.solvers.linearise import find_stepping, linearise, scale_at
+from graphnav.estimation.solvers.linearise import Points, find_stepping, linearise, scale_at
 from graphnav.estimation.solvers.passes import (
     FilterPass,
     ForwardRecord,
@@ -78,19 +78,28 @@ def smooth_backward(problem: Problem, forward: ForwardRecord, progress: Progress
     return SmootherPass(States.stack(states), values, found.r, found.N, found.N_diagonal, P)
 
 
+def smooth_points(forward: ForwardRecord) -> Points:
+    """Smooth a forward pass that was linearised at given points throughout, without covariances: a step of Gauss and
+    Newton from these points.
+    """
+    one = forward.updates
+    assert forward.about is not None
+    assert one is not None
+    assert len(forward.about.values) == len(forward.P)
+    blocks, errors = one.blocks, np.empty(forward.errors.shape)
+    smooth_errors(
+        forward.F, forward.decay, one.Kt, one.H, one.w, blocks.first, blocks.begin, blocks.end, one.taken,
+        forward.errors_predicted, forward.P_predicted, forward.errors, forward.P, errors,
+    )  # fmt: skip
+    return move_points(forward.about, errors)
+
+
 def smooth_moments(problem: Problem, forward: ForwardRecord) -> MomentPass:
     """Smooth a forward pass that was linearised at given points throughout, with covariances for a noise model only."""
     K, D = forward.P.shape[:2]
-    assert forward.about is not None
     assert forward.updates is not None
-    assert len(forward.about.values) == K
+    one, smoothed = forward.updates, smooth_points(forward)
     found, behind = _Disturbances.allocate(K, D), (np.zeros(D), np.zeros((D, D)))
-    one, blocks = forward.updates, forward.updates.blocks
-    smooth_errors(
-        forward.F, forward.decay, one.Kt, one.H, one.w, blocks.first, blocks.begin, blocks.end, one.taken,
-        forward.errors_predicted, forward.P_predicted, forward.errors, forward.P, found.errors,
-    )  # fmt: skip
-    smoothed = move_points(forward.about, found.errors)
     linear, asked = {}, np.zeros_like(one.H)
     for rows in problem.constraints:
         if rows.list_noise_groups()[0]:

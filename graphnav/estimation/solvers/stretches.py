@@ -37,8 +37,9 @@ from graphnav.imu.dynamics import SCALE
 
 _SHORTEST, _LONGEST = 16, 256  # keyframes of a stretch
 _MAX_LINEARISATIONS = 10  # iterations of a stretch: each gains two digits or more
-# convergence threshold in sigmas: an iteration reduces a correction at least tenfold, so the error is within 1e-9
-STAYS = 1e-8
+# sigmas, convergence threshold of the error that is left: the correction, reduced once more as it was from the last one
+STAYS = 1e-9
+_REDUCED = 0.1  # at least, in an iteration
 
 
 class StretchFilter:
@@ -48,7 +49,7 @@ class StretchFilter:
     ----------
     P_predicted, P : (K, D, D) and
     F : (K-1, 15, w), to be filled.
-    stays : convergence threshold of the guess, sigmas.
+    stays : error of the estimates by which the iteration ends, sigmas.
     """
 
     def __init__(
@@ -101,17 +102,19 @@ class StretchFilter:
     def _run_stretch(
         self, k: int, k1: int, x: Points, P: Array, predicted: Points, filtered: Points, alone: bool = False
     ) -> int:
+        before = np.full(k1 - k, np.nan)
         points = self._guess_points(k, k1, x)
         most = _MAX_LINEARISATIONS + int(self._end[k] - self._start[k]) * alone
         for left in range(most - 1, -1, -1):
             try:
-                stay, points = self._filter_about(k, k1, x, P, points)
+                size, points = self._filter_about(k, k1, x, P, points)
             except np.linalg.LinAlgError:
                 if alone:
                     raise explain_rows(self._stack.get_block(int(self._at[0])).parts) from None
                 break  # because the guess is far off; otherwise a single keyframe will raise the error
-            if alone and not left:
-                stay = k1
+            error = size * np.fmin(size / before, _REDUCED)
+            stay = k1 if alone and not left else k + int(np.argmax(np.append(~(error <= self._stays), True)))
+            before = size[stay - k :]
             if stay > k:
                 own = slice(k, stay)
                 predicted.put(own, points.take(self._start[own] - self._start[k]))
@@ -140,9 +143,9 @@ class StretchFilter:
         each = self._end[k:k1] - self._start[k:k1] + 1
         return Points(States.stack(reached), np.array(known)).take(np.repeat(np.arange(k1 - k), each))
 
-    def _filter_about(self, k: int, k1: int, x: Points, P: Array, points: Points) -> tuple[int, Points]:
-        """Filter keyframes k to k1 about points; returns the first keyframe that has not converged, and the new
-        points."""
+    def _filter_about(self, k: int, k1: int, x: Points, P: Array, points: Points) -> tuple[Array, Points]:
+        """Filter keyframes k to k1 about points; returns the largest correction, sigmas, up to each keyframe, and the
+        new points."""
         stack, blocks, own = self._stack, self._stack.joint, slice(max(k - 1, 0), k1)
         start, end = self._start[k:k1] - self._start[k], self._end[k:k1] - self._start[k]
         counts = end - start + 1
@@ -172,9 +175,8 @@ class StretchFilter:
         y[behind] -= added[np.repeat(np.arange(k1 - k), counts - 1), self._stack.single.end[some] - 1]
         e = _turn_errors(T, y - m)
         sigma = np.sqrt(np.diagonal(self._P[k:k1], axis1=1, axis2=2))
-        still = np.all(np.abs(e) <= self._stays * np.repeat(sigma, counts, axis=0), axis=1)
-        still = np.append(np.logical_and.reduceat(still, start), False)
-        return k + int(np.argmin(still)), move_points(points, e)
+        size = np.max(np.abs(e) / np.maximum(np.repeat(sigma, counts, axis=0), 1e-300), axis=1)
+        return np.maximum.accumulate(np.maximum.reduceat(size, start)), move_points(points, e)
 
     def _step(
         self, k: int, k1: int, x: Points, points: Points, start: Array, end: Array, T: Array, m: Array
