@@ -44,6 +44,7 @@ class IonosphereFree:
     code: Array  # (N,) m, with the satellite's clock
     carrier: Array  # (N,) m, with the satellite's clock; NaN where one of the two carrier phases is missing
     wet: Array  # (N,) wet mapping function
+    lane: Array  # (N,) m, change of the carrier by a cycle of both signals: the least of slips of two cycles at most
     growth: Array  # (N,) amplification of white noise of equal size on both signals
     arcs: Arcs  # arcs in which neither carrier phase has slipped; a slot is a pair of signals of a satellite
 
@@ -101,6 +102,7 @@ def combine_ionosphere_free(raw: RawGnss, whole: RawGnss) -> IonosphereFree | No
         code=free(code, other.code) + free(one.clock, other.clock),
         carrier=np.where(good, carrier, np.nan),
         wet=by_wet,
+        lane=C / (f1 + f2),
         growth=np.hypot(alpha, beta),
         arcs=_join_arcs(arcs, first_rows, second[which], good),
     )
