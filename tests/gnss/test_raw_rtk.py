@@ -32,7 +32,7 @@ from graphnav.gnss.ephemeris import OMEGA_WGS84
 from graphnav.gnss.integers import decorrelate, find_nearest
 from graphnav.gnss.series import RawGnss
 from graphnav.gnss.sigmas import REFLECTED, compute_reflection_sigma
-from graphnav.gnss.signals import L1, C, name_satellite
+from graphnav.gnss.signals import L1, C, name_satellite, name_signal
 from graphnav.recording.formats import read
 from graphnav.report.satellites import tabulate_epochs, tabulate_satellites
 
@@ -265,6 +265,40 @@ def test_where_no_few_satellites_can_be_told_to_have_slipped_all_arcs_end(exact,
     arcs = find_arcs(replace(raw, carrier=raw.carrier + cycles * (raw.t >= at)), base_arc=raw.base_arc)
     begun = {int(arcs.satellite[k]) for k, begins in enumerate(arcs.begins) if at in begins}
     assert begun == set((chosen if share < 0.5 else satellites).tolist())
+
+
+def test_the_ionosphere_changes_the_more_the_longer_an_interval_is():
+    """By 7 cm on L1, three sigmas after two minutes, where two frequencies tell it, and a slip after half a minute; nor
+    does it hide a cycle of one signal or of both.
+    """
+    path = oracle.vehicle_path(400.0)
+    made = oracle.drive(path, imu_noise=None, gnss_exact=True)[0]
+    whole = raw_drive.with_observations(made, path, carrier=0.002, second=True).raw_gnss
+    lever = tuple(float(x) for x in made.gnss.lever_arm)
+    for apart in (120, 30):
+        epochs = whole.epochs[0][::apart]
+        raw = whole.take(np.isin(whole.t, epochs))
+        raw = replace(raw, antenna=earth.llh_to_ecef(path.point(raw.t, lever)[0]))
+        own = raw.satellite == raw_drive.number_satellite("E03")  # 23 deg high
+        advance = 0.07 * np.searchsorted(epochs, raw.t)[own] * (L1 / raw.frequency[own]) ** 2
+        carrier = raw.carrier.copy()
+        carrier[own] += advance * raw.frequency[own] / C
+        signals = np.unique(raw.signal[own])
+
+        def count(carrier, signals, raw=raw, own=own):
+            arcs = find_arcs(replace(raw, carrier=carrier).take(~own | np.isin(raw.signal, signals)))
+            return {name: len(begins) for name, begins in zip(arcs.names, arcs.begins, strict=True) if len(begins) > 1}
+
+        if apart == 30:
+            assert set(count(carrier, signals)) == {f"E03.{name_signal(s)}" for s in signals}
+            continue
+        assert count(carrier, signals) == {}
+        assert set(count(carrier, signals[:1])) == {f"E03.{name_signal(signals[0])}"}
+        for some in (signals[:1], signals[1:], signals):
+            slipped = carrier + (own & np.isin(raw.signal, some) & (raw.t >= epochs[2]))
+            found = count(slipped, signals)
+            assert {f"E03.{name_signal(s)}" for s in some} <= found.keys()
+            assert set(found.values()) == {2}
 
 
 class SlippedEpochs:
