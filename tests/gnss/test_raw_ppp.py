@@ -108,7 +108,7 @@ def test_satellites_antennas_bring_them_nearer(tmp_path):
     """By what the file has along the line from the centre of mass to the receiver."""
     path = tmp_path / "some.atx"
     path.write_text(ANTEX)
-    antennas = read_antex(path)
+    antennas, _ = read_antex(path)
     assert set(antennas) == {number_satellite("G01")}
     drive = oracle.vehicle_path(120.0)
     made = raw_drive.with_observations(oracle.drive(drive)[0], drive, carrier=0.0, second=True).crop(0.0, 5.0)
