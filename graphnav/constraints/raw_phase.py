@@ -26,9 +26,9 @@ from typing import ClassVar
 import numpy as np
 
 from graphnav.config import Settings
-from graphnav.constraints.ambiguities import make_ambiguities, name_ambiguity
+from graphnav.constraints.ambiguities import CarrierRows, make_ambiguities, name_ambiguity
 from graphnav.constraints.base import SAME_TIME, BuildContext, Constraint, Linearized
-from graphnav.constraints.raw_gnss import IONOSPHERE, RangeConstraint, list_common_fields, make_ionosphere_parameter
+from graphnav.constraints.raw_gnss import IONOSPHERE, list_common_fields, make_ionosphere_parameter
 from graphnav.constraints.raw_rows import find_epoch_period
 from graphnav.core import rotation
 from graphnav.core.rotation import Array
@@ -47,7 +47,7 @@ EXACT = 1e-3  # cycles, 1-sigma of an ambiguity difference fixed to an integer: 
 
 
 @dataclass(frozen=True)
-class GnssPhase(RangeConstraint):
+class GnssPhase(CarrierRows):
     """Carrier phase of one satellite at the antenna, differenced with a base station's."""
 
     name: ClassVar[str] = "gnss_phase"
@@ -55,15 +55,7 @@ class GnssPhase(RangeConstraint):
     noise_axes: ClassVar[tuple[str, ...]] = ()
 
     slant: Array = field(default_factory=lambda: np.empty(0))  # (N,) ionospheric mapping function
-    wavelength: Array = field(default_factory=lambda: np.empty(0))  # (N,) m
-    slot: Array = field(default_factory=lambda: np.empty(0, dtype=int))  # (N,) index of `slots`
-    begin: Array = field(default_factory=lambda: np.empty(0))  # (N,) s, start of the arc
-    whole: Array = field(default_factory=lambda: np.empty(0, dtype=bool))  # (N,) no unresolved half cycle in the arc
     reflected: Array = field(default_factory=lambda: np.empty((0, 3)))  # (N, 3) m, e.L
-    reflection: Array = field(default_factory=lambda: np.empty(0))  # (N,) cycles, 1-sigma of an arc's mean multipath
-    period: float = 1.0  # s between epochs
-    slots: tuple[str, ...] = ()  # names of the ambiguities
-    group: Array = field(default_factory=lambda: np.empty(0, dtype=int))  # (slots,) system and signal; -1: no integers
 
     def list_noise_groups(self) -> tuple[tuple[str, ...], Array]:
         return (), np.full((len(self), 1), -1)
@@ -94,8 +86,8 @@ class GnssPhase(RangeConstraint):
         there = [k for k in sorted(own) if np.any(used & (arcs.slot == k))]
         place = np.full(len(arcs.names), -1)
         place[there] = np.arange(len(there))
-        group = arcs.satellite[there].astype(int) // 100 * 1000 + arcs.signal[there]
-        group[arcs.satellite[there] // 100 == GLONASS] = -1  # FDMA: each satellite has its own frequency
+        family = arcs.satellite[there].astype(int) // 100 * 1000 + arcs.signal[there]
+        family[arcs.satellite[there] // 100 == GLONASS] = -1  # FDMA: each satellite has its own frequency
         frame, raw = scene.frame, raw.take(used)
         geometry = look(raw, raw.antenna, choose_coefficients(raw))
         common = list_common_fields(scene, found)
@@ -125,12 +117,13 @@ class GnssPhase(RangeConstraint):
             period=find_epoch_period(found.raw, s),
             slant=-compute_obliquity(geometry.elevation) * (L1 / raw.frequency) ** 2,
             wavelength=wavelength[used],
+            half_slip=0.25 * wavelength[used],  # of half a cycle
             sigma=compute_carrier_difference_sigma(raw.cn0, geometry.elevation, wavelength[used])[:, None],
             slot=place[arcs.slot[used]],
             begin=arcs.begin[used],
             whole=~raw.half,
             slots=tuple(name_ambiguity(arcs.names[k]) for k in there),
-            group=group,
+            family=family,
             **common,
         )
 

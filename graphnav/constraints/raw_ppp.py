@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphnav.config import Settings
-from graphnav.constraints.ambiguities import make_ambiguities, name_ambiguity
+from graphnav.constraints.ambiguities import CarrierRows, make_ambiguities, name_ambiguity
 from graphnav.constraints.base import BuildContext, Linearized
 from graphnav.constraints.raw_gnss import (
     BIASES,
@@ -180,15 +180,12 @@ class GnssPppCode(_Ppp):
 
 
 @dataclass(frozen=True)
-class GnssPppCarrier(_Ppp):
+class GnssPppCarrier(CarrierRows, _Ppp):
     """Ionosphere-free carrier phase of one satellite at the antenna."""
 
     name: ClassVar[str] = "gnss_ppp_carrier"
     unit: ClassVar[str] = "m"
 
-    slots: tuple[str, ...] = ()  # names of the ambiguities
-    slot: Array = field(default_factory=lambda: np.empty(0, dtype=int))  # (N,) index of `slots`
-    begin: Array = field(default_factory=lambda: np.empty(0))  # (N,) s, start of the arc
     lasting: Array = field(default_factory=lambda: np.empty(0))  # (N,) m, 1-sigma of the errors over seconds
 
     @classmethod
@@ -234,6 +231,10 @@ class GnssPppCarrier(_Ppp):
             slots=tuple(name_ambiguity(arcs.names[k]) for k in there),
             slot=np.searchsorted(there, arcs.slot[used]),
             begin=arcs.begin[used],
+            wavelength=np.ones(len(used)),  # ambiguities are in m
+            half_slip=0.5 * rows.lane[used],
+            family=np.full(len(there), -1),
+            whole=np.ones(len(used), dtype=bool),
             lasting=np.hypot(off_line, reflected),
             **common,
         )

@@ -118,13 +118,16 @@ def check_regular(path: Path, error: Kind = RecordingError) -> None:
         )
 
 
-def open_file(path: Path, error: Kind = RecordingError, text: bool = True, limit: int | None = None) -> Opened:
+def open_file(
+    path: Path, error: Kind = RecordingError, text: bool = True, limit: int | None = None, up_to_cut: bool = False
+) -> Opened:
     """Open a file for reading bytes, unpacked if it is gzip-compressed; reading raises only `error`.
 
     Parameters
     ----------
     text : whether lines longer than the limit are refused.
     limit : bytes that it may hold unpacked; None: what `GRAPHNAV_MAX_FILE_MB` says.
+    up_to_cut : whether a compressed file that is cut off ends there, and says so, instead of being refused.
     """
     check_regular(path, error)
     most = _read_limit(MAX_FILE, 10**6) if limit is None else limit
@@ -136,7 +139,7 @@ def open_file(path: Path, error: Kind = RecordingError, text: bool = True, limit
     except OSError as cause:
         raise error(f"{path}: cannot be read ({cause.strerror})", key="file.unreadable") from None
     line = _read_limit(MAX_LINE, 1000) if text else None
-    return Opened(_Bounded(path, plain, magic == _GZIP, size, most, line, error), size, magic == _GZIP)
+    return Opened(_Bounded(path, plain, magic == _GZIP, size, most, line, error, up_to_cut), size, magic == _GZIP)
 
 
 def read_bytes(path: Path, error: Kind = RecordingError, text: bool = True, limit: int | None = None) -> bytes:
@@ -232,17 +235,31 @@ class Opened(io.BufferedReader):
 
     def __init__(self, raw: _Bounded, size: int, packed: bool) -> None:
         super().__init__(raw, 4 * _READ_SIZE)
-        self.size, self.packed = size, packed
+        self.size, self.packed, self._bounded = size, packed, raw
+
+    @property
+    def cut(self) -> bool:
+        """Whether it has ended because the compressed file is cut off."""
+        return self._bounded.cut
 
 
 class _Bounded(io.RawIOBase):
     """A stream that raises one sentence where the file exceeds a limit or is damaged."""
 
     def __init__(
-        self, path: Path, plain: IO[bytes], packed: bool, size: int, most: int, line: int | None, error: Kind
+        self,
+        path: Path,
+        plain: IO[bytes],
+        packed: bool,
+        size: int,
+        most: int,
+        line: int | None,
+        error: Kind,
+        up_to_cut: bool,
     ) -> None:
+        self.cut, self._up_to_cut = False, up_to_cut
         self.path, self.error, self._plain = path, error, plain
-        self._source: IO[bytes] = gzip.GzipFile(fileobj=plain, mode="rb") if packed else plain  # type: ignore[assignment]
+        self._source: Any = gzip.GzipFile(fileobj=plain, mode="rb") if packed else plain
         self._size, self._most, self._longest, self._packed = size, most, line, packed
         self._count = self._run = 0
 
@@ -251,9 +268,12 @@ class _Bounded(io.RawIOBase):
 
     def readinto(self, buffer: Any) -> int:
         try:
-            chunk = self._source.read(min(len(buffer), _READ_SIZE))
+            chunk = self._source.read1(min(len(buffer), _READ_SIZE))  # `read` would lose what is before a cut
         except (EOFError, zlib.error, gzip.BadGzipFile) as cause:
             cut = isinstance(cause, EOFError)
+            if cut and self._up_to_cut and self._count:
+                self.cut = True
+                return 0
             why = "the compressed file is cut off" if cut else f"the compressed file is damaged ({cause})"
             raise self.error(f"{self.path}: {why}; copy it again", key="file.damaged") from None
         except OSError as cause:

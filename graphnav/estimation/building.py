@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from graphnav.config import Settings
+from graphnav.constraints.ambiguities import CarrierRows
 from graphnav.constraints.raw_phase import GnssPhase
 from graphnav.core.earth import LocalFrame
 from graphnav.core.errors import EstimationError
@@ -53,7 +54,7 @@ class BuiltProblem:
     """A problem and what it was built from."""
 
     problem: Problem
-    carriers: GnssPhase | None  # carrier phases, which are not part of the problem until they have integers
+    carriers: CarrierRows | None  # carrier phases, which are not part of the problem until they have integers
     aligned: Alignment
     detections: Detections
 
@@ -94,7 +95,7 @@ class ProblemBuilder:
             # linearised at an arbitrary heading, a direction of travel would make an unknown heading appear known
             rows = tuple(c for c in problem.constraints if not c.of_wheels)
             problem = replace(problem, constraints=rows)
-        problem, carriers = split_carriers(problem)  # the noise model depends on the codes
+        problem, carriers = split_carriers(problem, GnssPhase)  # the noise model depends on the codes
         return BuiltProblem(problem, carriers, aligned, detections)
 
     def build_later(self, built: BuiltProblem) -> BuiltProblem:

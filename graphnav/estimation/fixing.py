@@ -16,7 +16,8 @@ releases all integers together with the position information that they gave, and
 the arcs without which most of their epochs are consistent (data snooping: Baarda 1968), which stay float.
 
 Cycle slips that `graphnav.gnss.arcs` does not find, as of four satellites that nothing checks, are found by the filter:
-its robust update follows the IMU, and leaves slipped carrier phases a cycle off. These begin new arcs, float ones too.
+its robust update follows the IMU, and leaves slipped carrier phases a cycle off. These begin new arcs, whether integers
+are looked for or not.
 """
 
 from __future__ import annotations
@@ -27,9 +28,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from graphnav.constraints.ambiguities import list_slots
-from graphnav.constraints.raw_phase import EXACT, GnssPhase, WholeCycles
-from graphnav.constraints.raw_ppp import GnssPppCarrier
+from graphnav.constraints.ambiguities import CarrierRows
+from graphnav.constraints.raw_phase import EXACT, WholeCycles
 from graphnav.core.progress import Progress
 from graphnav.core.rotation import Array
 from graphnav.core.state import BLOCKS, DIM
@@ -63,31 +63,27 @@ class Fixed:
     notes: tuple[str, ...] = ()
 
 
-def split_carriers(problem: Problem) -> tuple[Problem, GnssPhase | None]:
-    """Split a problem into one without carrier phases, and these."""
-    phase = next((c for c in problem.constraints if isinstance(c, GnssPhase)), None)
+def split_carriers(problem: Problem, kind: type[CarrierRows] = CarrierRows) -> tuple[Problem, CarrierRows | None]:
+    """Split a problem into one without carrier phases that have ambiguities, and these."""
+    phase = next((c for c in problem.constraints if isinstance(c, kind)), None)
     if phase is None:
         return problem, None
     return replace(problem, constraints=tuple(c for c in problem.constraints if c is not phase)), phase
 
 
-def list_float_arcs(problem: Problem) -> CarrierArcs:
-    """The arcs of precise point positioning, whose ambiguities stay float."""
-    rows = next((c for c in problem.constraints if isinstance(c, GnssPppCarrier)), None)
-    if rows is None:
-        return CarrierArcs()
-    none = np.zeros(len(rows), dtype=bool)
-    return CarrierArcs.from_rows(problem.t[rows.keyframe], rows.slot, rows.begin, none, list_slots(rows.slots))
+def may_fix(problem: Problem, phase: CarrierRows) -> bool:
+    """Whether integers are looked for."""
+    return problem.settings.raw_gnss.integers and bool(np.any(phase.family >= 0))
 
 
 def fix(
     problem: Problem,
-    phase: GnssPhase,
+    phase: CarrierRows,
     about: Points,
     opening: float | None = None,
     progress: Progress | None = None,
 ) -> Fixed:
-    """Add carrier phases to a problem and fix their ambiguities as far as possible.
+    """Add carrier phases to a problem, begin new arcs where they slip, and fix ambiguities as far as possible.
 
     Parameters
     ----------
@@ -99,9 +95,9 @@ def fix(
     phase = replace(phase, parameters=own)
     whole = _add_phase(problem, phase)
     epochs = Epochs(phase, whole.columns, whole.t)
-    search = whole.settings.raw_gnss.integers
-    causal = _Causal(epochs)
-    forward = ekf(whole, progress, opening, decide=causal if search else None)
+    search = may_fix(whole, phase)
+    causal = _Causal(epochs, search)
+    forward = ekf(whole, progress, opening, decide=causal)
     filtered = epochs.mark_fixed(causal.known), epochs.list_arcs(causal.known)
     if causal.anew:
         phase = _split_arcs(phase, problem.t, causal.anew)
@@ -120,23 +116,25 @@ def fix(
         if _let_go(epochs, smoothed, known):
             found = _hold_arcs(whole, phase, epochs, known)
             smoothed = smooth_backward(found, refilter(found, smoothed, progress), progress)
+    always = dict.fromkeys(epochs.keyframes, known)
+    arcs = epochs.list_arcs(always)
     return Fixed(
         found,
         forward,
         smoothed,
         filtered_epochs=filtered[0],
-        smoothed_epochs=epochs.mark_fixed(dict.fromkeys(epochs.keyframes, known)),
-        filtered_arcs=filtered[1],
-        smoothed_arcs=epochs.list_arcs(dict.fromkeys(epochs.keyframes, known)),
+        smoothed_epochs=epochs.mark_fixed(always),
+        filtered_arcs=filtered[1] if search else arcs,
+        smoothed_arcs=arcs,
         notes=(_note(epochs, known),) if search else (),
     )
 
 
-def _add_phase(problem: Problem, phase: GnssPhase) -> Problem:
+def _add_phase(problem: Problem, phase: CarrierRows) -> Problem:
     return replace(problem, constraints=tuple(sorted((*problem.constraints, phase), key=lambda c: c.name)))
 
 
-def _split_arcs(phase: GnssPhase, t: Array, anew: Sequence[tuple[Arc, int]]) -> GnssPhase:
+def _split_arcs(phase: CarrierRows, t: Array, anew: Sequence[tuple[Arc, int]]) -> CarrierRows:
     """Split arcs of the carrier phases at keyframes."""
     begin, own = phase.begin.copy(), {p.name: p for p in phase.parameters}
     for (name, since), k in sorted(anew, key=lambda one: one[1]):
@@ -229,26 +227,32 @@ class Held:
     odd: bool = False  # the epoch is not consistent with the known integers
     found: tuple[tuple[Arc, Arc, int], ...] = ()  # differences that were found there
     let_go: bool = False  # of all that was known
-    anew: tuple[Arc, ...] = ()  # arcs a quarter of a cycle off, whose ambiguities are reset
+    anew: tuple[Arc, ...] = ()  # slipped arcs, whose ambiguities are reset
     since: Mapping[Arc, float] = field(default_factory=dict)  # s, start of the arcs that were reset
     fixed: bool = False
-    epoch: bool = False  # whether there are carrier phases
+    epoch: bool = False  # whether there are carrier phases whose integers are looked for
 
     def go_on(self) -> Held:
         """The same after a keyframe without carrier phases."""
         return replace(self, found=(), let_go=False, anew=(), epoch=False) if self.epoch else self
 
 
-def hold_on(before: Held, epochs: Epochs, k: int, here: Points, covariance: Callable[[], Array]) -> Held:
+def hold_on(before: Held, epochs: Epochs, k: int, here: Points, covariance: Callable[[], Array], search: bool) -> Held:
     """Fix integers with the estimate at a keyframe; release all where two successive epochs contradict them.
 
-    Where carrier phases are off by more than a quarter of a cycle, undetected cycle slips occurred: their ambiguities
+    Where carrier phases are off by more than half of the least slip, undetected cycle slips occurred: their ambiguities
     are reset.
+
+    Parameters
+    ----------
+    search : whether integers are looked for.
     """
     known, anew = before.known.copy(), epochs.find_slipped(k, here)
     for arc in anew:
         known.forget(arc)
     since = {**before.since, **dict.fromkeys(anew, float(epochs.time[k]))}
+    if not search:
+        return Held(anew=anew, since=since)
     if epochs.find_inconsistent(k, here, known):
         known = Known() if before.odd else known
         fixed = epochs.count_differences(k, known) >= ENOUGH
@@ -270,8 +274,8 @@ def hold_on(before: Held, epochs: Epochs, k: int, here: Points, covariance: Call
 class _Causal:
     """Actions of the filter at a keyframe: fix integers, hold them, release contradicted ones."""
 
-    def __init__(self, epochs: Epochs) -> None:
-        self._epochs = epochs
+    def __init__(self, epochs: Epochs, search: bool) -> None:
+        self._epochs, self._search = epochs, search
         self.known = {k: Known() for k in epochs.keyframes}  # after each epoch
         self._unknown = {p.name: float(np.max(p.sigma)) for p in epochs.phase.parameters}
         self._held = Held()
@@ -283,7 +287,7 @@ class _Causal:
         epochs = self._epochs
         if k not in epochs.active:
             return None
-        held = self._held = hold_on(self._held, epochs, k, here, lambda: P)
+        held = self._held = hold_on(self._held, epochs, k, here, lambda: P, self._search)
         self.known[k] = held.known
         self.anew += [(arc, k) for arc in held.anew]
         if held.let_go:
@@ -326,7 +330,7 @@ def _fix_one(points: Points, k: int) -> Points:
     return Points(points.states[k : k + 1], points.values[k : k + 1])
 
 
-def _hold_arcs(problem: Problem, phase: GnssPhase, epochs: Epochs, known: Known) -> Problem:
+def _hold_arcs(problem: Problem, phase: CarrierRows, epochs: Epochs, known: Known) -> Problem:
     """A problem with rows for the known integers: each arc is held to the first other one at a common epoch."""
     rows: list[tuple[int, str, str, int]] = []
     held = Known()
@@ -341,7 +345,7 @@ def _hold_arcs(problem: Problem, phase: GnssPhase, epochs: Epochs, known: Known)
     return add_integers(problem, phase, rows)
 
 
-def add_integers(problem: Problem, phase: GnssPhase, found: Sequence[tuple[int, str, str, int]]) -> Problem:
+def add_integers(problem: Problem, phase: CarrierRows, found: Sequence[tuple[int, str, str, int]]) -> Problem:
     """A problem with rows for differences: keyframe, in that order, two ambiguities, and cycles between them."""
     if not found:
         return problem

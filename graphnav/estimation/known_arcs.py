@@ -12,8 +12,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.special import gammaincinv  # scipy.stats would take half a second to import
 
-from graphnav.constraints.ambiguities import list_slots
-from graphnav.constraints.raw_phase import GnssPhase, compute_variance_left
+from graphnav.constraints.ambiguities import CarrierRows, list_slots
+from graphnav.constraints.raw_phase import compute_variance_left
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM
 from graphnav.estimation.solution import CarrierArcs
@@ -60,7 +60,7 @@ class Known:
 class Epochs:
     """Arcs at each keyframe with carrier phases, and the positions of their rows."""
 
-    def __init__(self, phase: GnssPhase, columns: dict[str, slice], t: Array) -> None:
+    def __init__(self, phase: CarrierRows, columns: dict[str, slice], t: Array) -> None:
         self.phase, self._all_columns = phase, columns
         self.columns = {name: columns[name].start for name in phase.slots}
         self.keyframes = np.unique(phase.keyframe).tolist()
@@ -68,7 +68,7 @@ class Epochs:
         self.rows: dict[int, slice] = {}
         self.active: dict[int, list[Arc]] = {}
         arcs = [(phase.slots[slot], begin) for slot, begin in zip(phase.slot, phase.begin.tolist(), strict=True)]
-        self._group = dict(zip(phase.slots, phase.group.tolist(), strict=True))
+        self._family = dict(zip(phase.slots, phase.family.tolist(), strict=True))
         self._whole = {arc for arc, whole in zip(arcs, phase.whole.tolist(), strict=True) if whole}
         edges = np.searchsorted(phase.keyframe, [*self.keyframes, len(t)])
         for k, lo, hi in zip(self.keyframes, edges[:-1].tolist(), edges[1:].tolist(), strict=True):
@@ -107,8 +107,8 @@ class Epochs:
         return [arcs[i] for i in used[~kept]]
 
     def find_slipped(self, k: int, here: Points) -> tuple[Arc, ...]:
-        """Arcs whose carrier phases are more than a quarter of a cycle off an estimate: a slip is the nearer one."""
-        off = np.abs(self._linearise(k, here).residual[:, 0]) > 0.25 * self.phase.wavelength[self.rows[k]]
+        """Arcs whose carrier phases are off an estimate by more than half of the least slip."""
+        off = np.abs(self._linearise(k, here).residual[:, 0]) > self.phase.half_slip[self.rows[k]]
         return tuple(self.active[k][i] for i in np.flatnonzero(off).tolist())
 
     def _linearise(self, k: int, here: Points) -> Rows:
@@ -133,10 +133,10 @@ class Epochs:
         return dict(zip(arcs, more.tolist(), strict=True))
 
     def mark_fixed(self, known: Mapping[int, Known]) -> Array:
-        """(E, 2) s, and 1 where enough differences are known; by keyframe."""
-        return np.array(
-            [[self.time[k], self.count_differences(k, known[k]) >= ENOUGH] for k in self.keyframes], dtype=float
-        )
+        """(E, 2) s, and 1 where enough differences are known, by keyframe; empty where none are integers."""
+        some = self.keyframes if np.any(self.phase.family >= 0) else []
+        out = [[self.time[k], self.count_differences(k, known[k]) >= ENOUGH] for k in some]
+        return np.array(out, dtype=float).reshape(-1, 2)
 
     def list_arcs(self, known: Mapping[int, Known]) -> CarrierArcs:
         """The arcs, and the epochs at which their ambiguities are held as integers."""
@@ -148,14 +148,14 @@ class Epochs:
 
     def can(self, arc: Arc) -> bool:
         """Whether it has integers."""
-        return self._group[arc[0]] >= 0 and arc in self._whole
+        return self._family[arc[0]] >= 0 and arc in self._whole
 
     def group_arcs(self, k: int, known: Known) -> dict[int, list[list[Arc]]]:
         """By group, the arcs of an epoch in connected sets, the largest first."""
         out: dict[int, dict[Arc, list[Arc]]] = {}
         for arc in self.active[k]:
             if self.can(arc) and arc not in known.let_go:
-                out.setdefault(self._group[arc[0]], {}).setdefault(known.find(arc)[0], []).append(arc)
+                out.setdefault(self._family[arc[0]], {}).setdefault(known.find(arc)[0], []).append(arc)
         return {group: sorted(sets.values(), key=len, reverse=True) for group, sets in out.items()}
 
     def count_differences(self, k: int, known: Known) -> int:

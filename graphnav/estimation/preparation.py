@@ -23,7 +23,7 @@ from graphnav.estimation import faults
 from graphnav.estimation.alignment import Alignment, use_known_heading
 from graphnav.estimation.building import BuiltProblem, Clock, ProblemBuilder, has_diverged
 from graphnav.estimation.contradictions import describe_freed, free
-from graphnav.estimation.fixing import fix, list_float_arcs
+from graphnav.estimation.fixing import fix, split_carriers
 from graphnav.estimation.joint_estimate import JointEstimate, estimate_jointly, revise_jointly
 from graphnav.estimation.noise.apply import apply_noise, drop_parts
 from graphnav.estimation.noise.estimate import NoiseEstimate, estimate_noise
@@ -128,11 +128,12 @@ def prepare(
         forward, smoothed = _relinearise(problem, aligned, known, forward, smoothed, progress, passes)
     passes.update(filter=1, smoother=1)
     notes = (*describe_freed(noise.freed, recording), *describe_noise(noise, problem))
-    epochs, arcs = {}, {"": list_float_arcs(problem)}
-    if built.carriers is not None:
+    epochs, arcs = dict[str, Array](), {"": CarrierArcs()}
+    rest, carriers = (problem, built.carriers) if built.carriers is not None else split_carriers(problem)
+    if carriers is not None:
         tell("ambiguities")
         with clock.count_time("ambiguities"):
-            fixed = fix(problem, built.carriers, smoothed, aligned.until, progress)
+            fixed = fix(rest, carriers, smoothed, aligned.until, progress)
         problem, forward, smoothed = fixed.problem, fixed.forward, fixed.smoothed
         notes, epochs = (*notes, *fixed.notes), {"ekf": fixed.filtered_epochs, "": fixed.smoothed_epochs}
         arcs = {"ekf": fixed.filtered_arcs, "": fixed.smoothed_arcs}

@@ -28,15 +28,16 @@ class SatelliteAntenna:
 Antennas = dict[int, tuple[SatelliteAntenna, ...]]
 
 
-def read_antex(path: Path) -> Antennas:
-    """Read the satellite antennas of an ANTEX file.
+def read_antex(path: Path) -> tuple[Antennas, tuple[str, ...]]:
+    """Read the satellite antennas of an ANTEX file; remarks say where it ends if it is cut off.
 
     Raises
     ------
     RecordingError
         If it is not an ANTEX file, or a field cannot be read, naming the line.
     """
-    lines = unpack_bytes(path).decode("latin-1").splitlines()
+    data = unpack_bytes(path)
+    lines = data.decode("latin-1").splitlines()
     if not lines or "ANTEX VERSION" not in lines[0]:
         raise RecordingError(f"{path}: not an ANTEX file; its first line names no version", key="file.kind")
     out: dict[int, list[SatelliteAntenna]] = {}
@@ -67,7 +68,7 @@ def read_antex(path: Path) -> Antennas:
             ) from None
     if not out:
         raise RecordingError(f"{path}: holds no antennas of satellites", key="raw.no_antennas")
-    return {one: tuple(many) for one, many in out.items()}
+    return {one: tuple(many) for one, many in out.items()}, data.remarks
 
 
 def compute_antenna_paths(

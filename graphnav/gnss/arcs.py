@@ -7,6 +7,7 @@ Within an arc the carrier phase is a range plus one constant, the ambiguity. A n
 * the base station's arc of that signal ends,
 * the change since the previous epoch deviates by more than a quarter of a cycle from the displacement and clock change
   common to all satellites: a slip is at least half a cycle, so beyond a quarter a slip is the nearer explanation,
+  unless a change of the ionospheric delay explains all signals of the satellite,
 * there is such a change, and fewer than half of the others agree to within their sigmas: any may have slipped.
 """
 
@@ -19,15 +20,23 @@ from numpy.typing import NDArray
 from scipy.special import gammaincinv
 
 from graphnav.core.rotation import Array
+from graphnav.gnss.atmosphere import compute_obliquity
 from graphnav.gnss.series import RawGnss
 from graphnav.gnss.sigmas import compute_carrier_difference_sigma
-from graphnav.gnss.signals import C, Ids, name_satellite, name_signal
+from graphnav.gnss.signals import L1, C, Ids, name_satellite, name_signal
 from graphnav.gnss.single_point import choose_coefficients, look
 
 _REWEIGHTINGS = 20  # iterations of reweighting, for the least sum of absolute residuals
 _SPARE = 2  # least redundancy of the rows that others are tested against
 _ALARM = 0.001  # false alarm probability of the test whether the other rows agree
+# m/sqrt(s), random walk of a satellite's clock about its broadcast line: cesium's, whose Allan deviation at 1 s is
+# 1e-11; with the ionosphere it is 2 mm/sqrt(s) on a drive measured (`graphnav.constraints.raw_carrier`)
+_CLOCK_WALK = 1e-11 * C
+_LEAST_DRIFT = 1e-6  # m, of an ionosphere that does not change
 _NOISE = 0.01  # m, of a carrier-phase difference: smaller residuals have equal weight
+# m/sqrt(s) at the zenith, random walk of the ionospheric delay on L1, and m, the length of a baseline whose ends differ
+# by as much (RTKLIB 2.4.3, prniono in ppp.c, udiono_ppp, and in rtkpos.c, udion)
+_IONOSPHERE_WALK, _APART = 1e-3, 1e4
 
 
 @dataclass(frozen=True)
@@ -155,6 +164,17 @@ def _find_slips(
     near = (w > 0.0) & ~far
     sigma = np.ones(shape)
     sigma[of, place] = _compute_change_sigma(raw, geometry.elevation, wavelength)[now[order]]
+    rows, since = now[order], (raw.t[now] - raw.t[before])[order]
+    walk = _IONOSPHERE_WALK * (raw.baseline / _APART if len(raw.carrier_difference) else 1.0)
+    precise = raw.precise or len(raw.carrier_difference)  # nothing is left of the satellites' clocks
+    drift = np.maximum(walk * compute_obliquity(geometry.elevation[rows]) * np.sqrt(since), _LEAST_DRIFT)
+    group = np.unique(1000 * of + raw.satellite[rows], return_inverse=True)[1]
+    far[of, place] &= ~_find_ionospheric(
+        np.where(usable, r[of, place], 0.0), np.where(usable, sigma[of, place], np.inf), limit[of, place],
+        (L1 / raw.frequency[rows]) ** 2, drift, group,
+    )  # fmt: skip
+    lasting = np.hypot((L1 / raw.frequency[rows]) ** 2 * drift, 0.0 if precise else _CLOCK_WALK * np.sqrt(since))
+    sigma[of, place] = np.hypot(sigma[of, place], lasting)
     freedom = near.sum(axis=1) - unknowns
     # least squares over the rows that agree, whose residuals are no larger than those of the L1 solution
     weight = np.where(near, sigma**-2.0, 0.0)
@@ -167,6 +187,33 @@ def _find_slips(
     out = np.zeros(len(now), dtype=bool)
     out[order] = (far | (every[:, None] & (w > 0.0)))[of, place]
     return out
+
+
+def _find_ionospheric(
+    change: Array, sigma: Array, limit: Array, delay: Array, drift: Array, group: NDArray[np.intp]
+) -> NDArray[np.bool_]:
+    """Mask of changes (N,), m, that a change of the ionospheric delay explains, with the others of their group.
+
+    Parameters
+    ----------
+    sigma : (N,) m, 1-sigma without the ionosphere.
+    limit : (N,) m, largest magnitude of what the ionosphere leaves.
+    delay : (N,) of each frequency, over that on L1.
+    drift : (N,) m, 1-sigma of the change of the delay on L1.
+    group : (N,) the satellite and epoch; two frequencies at least distinguish the ionosphere from a slip.
+    """
+    weight = sigma**-2.0
+
+    def add(x: Array) -> Array:
+        return np.bincount(group, x)
+
+    by_delay = add(weight * delay**2)
+    ionosphere = add(weight * delay * change) / (add(drift**-2.0) / np.bincount(group) + by_delay)
+    square = add(weight * change**2) - ionosphere * add(weight * delay * change)
+    explained = by_delay * add(weight) - add(weight * delay) ** 2 > 1e-3 * by_delay * add(weight)
+    explained &= square <= 2.0 * gammaincinv(0.5 * np.maximum(add(weight > 0.0), 1.0), 1.0 - _ALARM)
+    explained &= add(np.abs(change - delay * ionosphere[group]) > limit) == 0.0
+    return np.asarray(explained[group])
 
 
 def _compute_change_sigma(raw: RawGnss, elevation: Array, wavelength: Array) -> Array:

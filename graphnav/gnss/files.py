@@ -10,23 +10,32 @@ from numpy.typing import NDArray
 
 from graphnav.core import files
 from graphnav.core.errors import RecordingError
+from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 
+_MOST_LINES = 100  # of an epoch of compressed RINEX: a satellite each
 _FIRST_DATE, _LAST_DATE = (
     np.array([1980, 1, 1, 0, 0, 0.0]),
     np.array([2099, 12, 31, 24, 59, 61.0]),
 )  # of GPS; a leap second
 
 
-def unpack_bytes(path: Path) -> bytes:
-    """The content of a file, unpacked if it is compressed.
+class Unpacked(bytes):
+    """The content of a file; `remarks` say where it ends if the compressed file is cut off."""
+
+    remarks: tuple[str, ...] = ()
+
+
+def unpack_bytes(path: Path) -> Unpacked:
+    """The content of a file, unpacked if it is compressed: of a file that is cut off, all whole lines before that.
 
     Raises
     ------
     RecordingError
         If it cannot be read or unpacked, or is empty.
     """
-    data = files.read_bytes(path, text=False)
+    with files.open_file(path, text=False, up_to_cut=True) as file:
+        data, cut = file.read(), file.cut
     if data[:2] in (b"\x1f\x9d", b"PK", b"BZ") or b"COMPACT RINEX FORMAT" in data[:200]:
         try:
             hatanaka = importlib.import_module("hatanaka")
@@ -35,14 +44,28 @@ def unpack_bytes(path: Path) -> bytes:
                 f"{path}: compressed RINEX needs the package hatanaka: pip install -e '.[raw]' in the clone",
                 key="package.missing",
             ) from None
-        try:
-            data = hatanaka.decompress(data)
-        except Exception as error:  # its own exceptions, and those of the decompressors it calls
-            raise RecordingError(f"{path}: cannot be unpacked ({str(error)[:80]})", key="file.damaged") from None
+        whole = data.splitlines(keepends=True) if cut else [data]
+        for left in range(_MOST_LINES if cut else 1):  # an epoch that is cut is refused with all before it
+            try:
+                data = hatanaka.decompress(b"".join(whole[: len(whole) - left]))
+                break
+            except Exception as error:  # its own exceptions, and those of the decompressors it calls
+                if left + 1 == (_MOST_LINES if cut else 1):
+                    raise RecordingError(
+                        f"{path}: cannot be unpacked ({str(error)[:80]})", key="file.damaged"
+                    ) from None
         files.check_size(path, len(data))
+    text = b"\0" not in data
+    if cut and text:
+        data = data[: data.rfind(b"\n") + 1]
     if not data.strip():
         raise RecordingError(f"{path}: is empty", key="file.empty")
-    return data
+    out = Unpacked(data)
+    if cut:
+        where = f"line {data.count(10)}" if text else f"{len(data)} bytes"
+        sentence = f"the compressed file is cut off, after {where} unpacked; everything before that is used"
+        out.remarks = (Note("raw.cut", f"{path.name}: {sentence}"),)
+    return out
 
 
 class Lines:

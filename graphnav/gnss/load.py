@@ -12,7 +12,7 @@ from graphnav.core import earth
 from graphnav.core.errors import RecordingError
 from graphnav.core.notes import Note, get_key
 from graphnav.core.rotation import Array
-from graphnav.gnss.antex import read_antex
+from graphnav.gnss.antex import Antennas, read_antex
 from graphnav.gnss.differential import add_differences
 from graphnav.gnss.ephemeris import Ephemerides
 from graphnav.gnss.files import unpack_bytes
@@ -68,6 +68,8 @@ def read_rover(paths: tuple[Path, ...]) -> tuple[Observations, Ephemerides | Non
             sent = found if sent is None else sent.join(found)
         else:
             obs = parse_observations(data, path)
+        if data.remarks:  # that end is told once
+            obs = replace(obs, remarks=(*(x for x in obs.remarks if get_key(x) != "raw.cut"), *data.remarks))
         parts.append(obs)
     return join_files(parts), sent
 
@@ -103,7 +105,11 @@ def load_raw(
     if sources.nominal_stamps:
         obs = restore_own_stamps(obs, precise or nav, rover, corrected)  # type: ignore[arg-type]
     raw, remarks = place(obs, nav, precise, rover, corrected)
-    antennas = {satellite: some for path in sources.antex for satellite, some in read_antex(path).items()}
+    antennas: Antennas = {}
+    for path in sources.antex:
+        some, ends = read_antex(path)
+        antennas |= some
+        remarks += ends
     raw = replace(
         raw, lever_arm=np.array(sources.lever_arm), precise=precise is not None, antennas=antennas if precise else {},
         clock_noise=precise.compute_clock_noise() if precise else {},

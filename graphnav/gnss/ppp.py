@@ -17,10 +17,9 @@ from numpy.typing import NDArray
 
 from graphnav.core import earth
 from graphnav.core.rotation import Array
-from graphnav.core.timescales import gps_to_utc
 from graphnav.gnss.antex import compute_antenna_paths, compute_satellite_axes, compute_shapiro_delay, compute_wind_up
 from graphnav.gnss.arcs import Arcs, build_arcs, find_arcs
-from graphnav.gnss.atmosphere import compute_niell_mapping, compute_zenith_delays
+from graphnav.gnss.atmosphere import compute_day_of_year, compute_niell_mapping, compute_zenith_delays
 from graphnav.gnss.carrier import find_rows
 from graphnav.gnss.series import RawGnss
 from graphnav.gnss.signals import GALILEO, GPS, QZSS, C, name_signal, number_signal
@@ -44,6 +43,7 @@ class IonosphereFree:
     code: Array  # (N,) m, with the satellite's clock
     carrier: Array  # (N,) m, with the satellite's clock; NaN where one of the two carrier phases is missing
     wet: Array  # (N,) wet mapping function
+    lane: Array  # (N,) m, change of the carrier by a cycle of both signals: the least of slips of two cycles at most
     growth: Array  # (N,) amplification of white noise of equal size on both signals
     arcs: Arcs  # arcs in which neither carrier phase has slipped; a slot is a pair of signals of a satellite
 
@@ -85,12 +85,10 @@ def combine_ionosphere_free(raw: RawGnss, whole: RawGnss) -> IonosphereFree | No
         axes = compute_satellite_axes(geometry.s, sun)
         told = compute_antenna_paths(raw.antennas, one.satellite, both, bands, gps, axes, geometry.e)
         extra = extra + np.nan_to_num(told)
-    utc = gps_to_utc(gps)
-    day = (utc - utc.astype("datetime64[Y]")) / np.timedelta64(1, "D")
     dry, wet = compute_zenith_delays(place)
     if raw.troposphere:  # has been subtracted already
         dry, wet = np.zeros(len(one)), np.zeros(len(one))
-    by_dry, by_wet = compute_niell_mapping(place, geometry.elevation, day)
+    by_dry, by_wet = compute_niell_mapping(place, geometry.elevation, compute_day_of_year(gps))
     carrier = free(one.carrier * C / f1, other.carrier * C / f2) + one.clock
     carrier -= wound * C / (f1 + f2)
     good = (arcs.arc[first_rows] >= 0) & (arcs.arc[second[which]] >= 0) & ~one.half & ~other.half
@@ -101,6 +99,7 @@ def combine_ionosphere_free(raw: RawGnss, whole: RawGnss) -> IonosphereFree | No
         code=free(code, other.code) + free(one.clock, other.clock),
         carrier=np.where(good, carrier, np.nan),
         wet=by_wet,
+        lane=C / (f1 + f2),
         growth=np.hypot(alpha, beta),
         arcs=_join_arcs(arcs, first_rows, second[which], good),
     )

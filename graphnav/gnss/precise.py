@@ -76,7 +76,8 @@ def read_precise(sp3: list[Path], clk: list[Path]) -> Orbits:
     RecordingError
         If a file is not what it should be, naming the line.
     """
-    t, satellite, p, clock = (np.concatenate(x) for x in zip(*(_read_sp3(path) for path in sp3), strict=True))
+    said: list[str] = []
+    t, satellite, p, clock = (np.concatenate(x) for x in zip(*(_read_sp3(path, said) for path in sp3), strict=True))
     orbit, clocks = {}, {}
     for one in np.unique(satellite):
         own = satellite == one
@@ -87,7 +88,7 @@ def read_precise(sp3: list[Path], clk: list[Path]) -> Orbits:
             clocks[int(one)] = _drop_repeated(t[told], clock[told])
     if clk:
         begin, end = t.min(), t.max()
-        t, satellite, clock = (np.concatenate(x) for x in zip(*(_read_clk(path) for path in clk), strict=True))
+        t, satellite, clock = (np.concatenate(x) for x in zip(*(_read_clk(path, said) for path in clk), strict=True))
         if (apart := max(t.min() - end, begin - t.max())) > 0.0:
             raise RecordingError(
                 f"{clk[0]}: its clocks are {apart / 86400.0:.1f} days from the orbits of {sp3[0].name}; they must be "
@@ -108,7 +109,7 @@ def read_precise(sp3: list[Path], clk: list[Path]) -> Orbits:
         if few
         else ()
     )
-    return Orbits({k: x for k, x in orbit.items() if k not in few}, clocks, remarks)
+    return Orbits({k: x for k, x in orbit.items() if k not in few}, clocks, (*said, *remarks))
 
 
 def _drop_repeated(t: Array, x: Array) -> tuple[Array, Array]:
@@ -116,9 +117,11 @@ def _drop_repeated(t: Array, x: Array) -> tuple[Array, Array]:
     return t, x[first]
 
 
-def _read_sp3(path: Path) -> tuple[Array, Ids, Array, Array]:
+def _read_sp3(path: Path, remarks: list[str]) -> tuple[Array, Ids, Array, Array]:
     """Times, satellites, positions (m) and clocks (s) of all position records."""
-    lines = Lines(unpack_bytes(path))
+    data = unpack_bytes(path)
+    lines = Lines(data)
+    remarks += data.remarks
     head = lines.get_text(0)
     if head[:1] != "#" or head[1:2] not in "abcd":
         raise RecordingError(f"{path}: not an SP3 file; its first line begins '{head[:2]}'", key="file.kind")
@@ -150,9 +153,10 @@ def _read_sp3(path: Path) -> tuple[Array, Ids, Array, Array]:
     return t[of[whole]], satellite[whole], value[whole, :3] * 1e3, clock[whole]
 
 
-def _read_clk(path: Path) -> tuple[Array, Ids, Array]:
+def _read_clk(path: Path, remarks: list[str]) -> tuple[Array, Ids, Array]:
     """Times, satellites and clocks (s) of all satellite records."""
     text = unpack_bytes(path)
+    remarks += text.remarks
     if b"CLOCK" not in text[:8000] and b"RINEX VERSION" not in text[:200]:
         raise RecordingError(f"{path}: not a RINEX clock file", key="file.kind")
     scale = "GPS"

@@ -49,7 +49,7 @@ def read_navigation(paths: list[Path]) -> Ephemerides:
     remarks: list[str] = []
     for path in paths:
         found.broken, found.skipped = [], {}
-        _read(path, found)
+        remarks += _read(path, found)
         if found.broken:
             sentence = (
                 f"{format_count(len(found.broken), 'unreadable record')} left out (the first at line {found.broken[0]})"
@@ -66,8 +66,10 @@ def read_navigation(paths: list[Path]) -> Ephemerides:
     return Ephemerides.of(found.kepler, found.glonass, coefficients, tuple(remarks))
 
 
-def _read(path: Path, found: _Navigation) -> None:
-    lines = unpack_bytes(path).decode("latin-1").splitlines()
+def _read(path: Path, found: _Navigation) -> tuple[str, ...]:
+    """Read a file; returns remarks on where it ends."""
+    data = unpack_bytes(path)
+    lines = data.decode("latin-1").splitlines()
     try:
         version = float(lines[0][:9])
     except ValueError:
@@ -124,6 +126,7 @@ def _read(path: Path, found: _Navigation) -> None:
         except (ValueError, IndexError):
             found.broken.append(k + 1)
         k += count if whole else 1
+    return data.remarks
 
 
 def _parse_values(rows: list[tuple[str, int]]) -> list[float]:

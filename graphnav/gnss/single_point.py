@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from graphnav.core import earth
 from graphnav.core.rotation import Array
-from graphnav.gnss.atmosphere import NIGHT, compute_directions, compute_klobuchar_delay, compute_saastamoinen_delay
+from graphnav.gnss.atmosphere import NIGHT, compute_directions, compute_klobuchar_delay, compute_tropospheric_delay
 from graphnav.gnss.ephemeris import OMEGA_WGS84, rotate_earth
 from graphnav.gnss.series import RawGnss
 from graphnav.gnss.sigmas import compute_code_sigma, compute_rate_sigma
@@ -96,7 +96,7 @@ def look(raw: RawGnss, antenna: Array, ionosphere: Array | None) -> Geometry:
     if ionosphere is not None:
         on_l1 = compute_klobuchar_delay(ionosphere, raw.seconds_of_week, llh, azimuth, elevation)
         delay = on_l1 * (L1 / raw.frequency) ** 2
-    wet = np.zeros(len(raw)) if raw.troposphere else compute_saastamoinen_delay(llh, elevation)
+    wet = np.zeros(len(raw)) if raw.troposphere else compute_tropospheric_delay(llh, elevation, raw.t + raw.zero)
     return Geometry(s, away / distance[:, None], distance, azimuth, elevation, delay, wet)
 
 

@@ -17,7 +17,7 @@ from graphnav.constraints.standstill import PLACE
 from graphnav.core.rotation import Array
 from graphnav.core.state import BLOCKS, Parameter
 from graphnav.estimation.factor_graph.tree_window import TreeWindow
-from graphnav.estimation.fixing import LOST_PLACE, LOST_SPEED, Held, add_integers, hold_on, split_carriers
+from graphnav.estimation.fixing import LOST_PLACE, LOST_SPEED, Held, add_integers, hold_on, may_fix, split_carriers
 from graphnav.estimation.known_arcs import Epochs
 from graphnav.estimation.noise.apply import select_weights
 from graphnav.estimation.noise.model import INTERVALS, STATED, NoiseModel
@@ -161,7 +161,7 @@ class Chain:
 
     def _hold(self, problem: Problem) -> Problem:
         """The problem with the integers decided at its keyframes, except released ones."""
-        if not self.settings.raw_gnss.integers or split_carriers(problem)[1] is None:
+        if split_carriers(problem)[1] is None:
             return problem
         begin, end = np.searchsorted(self.window.t, problem.t[[0, -1]] + [-SAME_TIME, SAME_TIME])
         decided = {
@@ -213,15 +213,16 @@ class Chain:
         return turn
 
     def _decide(self, problem: Problem, k: int) -> Held:
-        """Integers that can be decided up to keyframe `k` of a problem, the newest."""
+        """Integers that can be decided up to keyframe `k` of a problem, the newest, and arcs that slipped there."""
         held = (self._held[-1] if self._held else self._head_held).go_on()
         phase, newest = split_carriers(problem)[1], self.window.newest
-        if phase is None or not self.settings.raw_gnss.integers or k not in phase.keyframe:
+        if phase is None or k not in phase.keyframe:
             return held
         if any(name not in newest.columns for name in phase.slots):
             return held
         here = Points(newest.state, newest.values[None])
-        return hold_on(held, Epochs(phase, newest.columns, problem.t), k, here, lambda: newest.covariance)
+        epochs, search = Epochs(phase, newest.columns, problem.t), may_fix(problem, phase)
+        return hold_on(held, epochs, k, here, lambda: newest.covariance, search)
 
     def _begin_ambiguities(self, problem: Problem, steps: tuple[Step, ...], held: Held) -> tuple[Step, ...]:
         """Reset ambiguities about their current estimates, except those that begin anew in any case."""

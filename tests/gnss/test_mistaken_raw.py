@@ -334,3 +334,35 @@ def test_orbits_and_ephemerides_of_another_day_or_constellation(changed, shared_
     assert "raw_gnss.few_satellites" in {finding.key for finding in check_raw(raw_of(one))}
     with refused("raw.no_ephemerides", RecordingError, "nav.gz"):
         changed("nav.gz", only("C"))
+
+
+@pytest.mark.parametrize("crx", [False, True])
+@pytest.mark.parametrize("name", ["rover.obs.gz", "base.obs.gz", "nav.gz"])
+def test_of_a_compressed_file_that_is_cut_off_all_before_that_is_used(
+    tmp_path: Path, whole: RawGnss, name: str, crx: bool
+) -> None:
+    folder = tmp_path / "drive"
+    shutil.copytree(DRIVE, folder)
+    packed = (folder / name).read_bytes()
+    if crx and name != "nav.gz":
+        hatanaka = pytest.importorskip("hatanaka")
+        packed = gzip.compress(hatanaka.rnx2crx(gzip.decompress(packed)))
+    (folder / name).write_bytes(packed[: int(0.7 * len(packed))])
+    found = read(folder)
+    raw, ends = raw_of(found), [note for note in found.remarks if get_key(note) == "raw.cut"]
+    assert len(ends) == 1
+    assert name in ends[0]
+    if name == "rover.obs.gz":
+        n = int(np.searchsorted(raw.t, raw.t[-1] - 1e-3))  # of the last epoch some satellites are lost
+        assert 0.5 < n / len(whole) < 0.8
+        np.testing.assert_array_equal(raw.code[:n], whole.code[:n])
+        np.testing.assert_array_equal(raw.carrier[:n], whole.carrier[:n])
+    elif name == "base.obs.gz":
+        there, before = (np.isfinite(one.carrier_difference).sum() for one in (raw, whole))
+        assert 0.5 < there / before < 0.99
+    else:
+        placed = np.isfinite(raw.p[:, 0])
+        assert 0.5 < placed.mean() < 1.0
+    (folder / name).write_bytes(packed[:40])  # nothing of it can be unpacked
+    with refused("file.damaged", RecordingError):
+        read(folder)

@@ -248,7 +248,7 @@ def antex(tmp_path: Path) -> Path:
 
 
 def test_antennas_are_those_that_rtklib_reads(rt, antex: Path) -> None:
-    pcvs, ours = rt.pcvs_t(), read_antex(antex)
+    pcvs, ours = rt.pcvs_t(), read_antex(antex)[0]
     assert rt.readpcv(str(antex), pcvs)
     theirs = [pcvs.pcv[k] for k in range(pcvs.n) if pcvs.pcv[k].sat]
     assert len(theirs) == 3
@@ -262,12 +262,12 @@ def test_antennas_are_those_that_rtklib_reads(rt, antex: Path) -> None:
 
 
 def test_sigmas_are_no_offsets_and_satellites_have_their_own(antex: Path) -> None:
-    first, second = read_antex(antex)[number_satellite("G22")]
+    first, second = read_antex(antex)[0][number_satellite("G22")]
     np.testing.assert_allclose(first.offset[1], [0.01245, -0.00038, 2.22016])
     np.testing.assert_allclose(first.variation[1][::2], 1e-3 * np.array(PATTERN), atol=1e-15)
     np.testing.assert_allclose(first.variation[1][1], 0.0104)
     np.testing.assert_allclose(second.offset[2], [0.002, 0.003, 1.8])
-    np.testing.assert_allclose(read_antex(antex)[number_satellite("E13")][0].offset[5], [0.002, 0.003, 2.3])
+    np.testing.assert_allclose(read_antex(antex)[0][number_satellite("E13")][0].offset[5], [0.002, 0.003, 2.3])
 
 
 def test_ways_are_by_the_angle_off_the_nadir(antex: Path) -> None:
@@ -276,7 +276,7 @@ def test_ways_are_by_the_angle_off_the_nadir(antex: Path) -> None:
     e = -np.stack([np.sin(angle), np.zeros(3), np.cos(angle)], axis=-1)
     axes, g22 = np.tile(np.eye(3), (3, 1, 1)), np.full(3, number_satellite("G22"), dtype=np.int16)
     hertz, bands = np.tile([1575.42e6, 1227.6e6], (3, 1)), np.tile([1, 2], (3, 1))
-    found = compute_antenna_paths(read_antex(antex), g22, hertz, bands, np.array([1.3e9, 1.3e9, 1.31e9]), axes, e)
+    found = compute_antenna_paths(read_antex(antex)[0], g22, hertz, bands, np.array([1.3e9, 1.3e9, 1.31e9]), axes, e)
     alpha = 1575.42**2 / (1575.42**2 - 1227.6**2)
 
     def way(band: dict[str, tuple[float, ...]], at: float, varied: float, other: float) -> float:
@@ -289,5 +289,5 @@ def test_ways_are_by_the_angle_off_the_nadir(antex: Path) -> None:
                 way(SECOND, angle[1], mean, mean)]  # fmt: skip
     np.testing.assert_allclose(found, expected, atol=1e-12)
     bands[1, 1] = 5
-    found = compute_antenna_paths(read_antex(antex), g22, hertz, bands, np.full(3, 1.3e9), axes, e)
+    found = compute_antenna_paths(read_antex(antex)[0], g22, hertz, bands, np.full(3, 1.3e9), axes, e)
     assert np.isnan(found).tolist() == [False, True, False]

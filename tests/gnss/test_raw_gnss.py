@@ -11,7 +11,8 @@ from helpers import assert_told, refused
 
 from graphnav.core import earth
 from graphnav.core.errors import RecordingError
-from graphnav.gnss.atmosphere import compute_directions, compute_klobuchar_delay, compute_saastamoinen_delay
+from graphnav.gnss.arcs import find_arcs
+from graphnav.gnss.atmosphere import compute_directions, compute_klobuchar_delay, compute_tropospheric_delay
 from graphnav.gnss.load import Sources, load_raw
 from graphnav.gnss.placing import place
 from graphnav.gnss.precise import read_precise
@@ -220,11 +221,30 @@ def test_delays_and_distances_are_rtklibs(rt, shared_data):
         azel[0], azel[1] = float(azimuth[k]), float(elevation[k])
         time = rt.gpst2time(int(raw.zero // 604800), float(raw.t[k]))
         assert geometry.ionosphere[k] == pytest.approx(rt.ionmodel(time, ion, place_, azel), rel=1e-6)
-        assert geometry.troposphere[k] == pytest.approx(rt.tropmodel(time, place_, azel, 0.7), rel=1e-3)
-    below = compute_saastamoinen_delay(llh[:1], np.array([-0.1]))
-    assert below[0] == 0.0
+        upright = rt.Arr1Ddouble(2)
+        upright[1] = np.pi / 2.0
+        dry = rt.tropmodel(time, place_, upright, 0.0)
+        wet, mapping = rt.tropmodel(time, place_, upright, 0.7) - dry, rt.Arr1Ddouble(1)
+        slant = dry * rt.tropmapf(time, place_, azel, mapping) + wet * mapping[0]
+        assert geometry.troposphere[k] == pytest.approx(slant, rel=1e-3)
+    assert compute_tropospheric_delay(llh[:1], np.array([-0.1]), raw.t[:1] + raw.zero)[0] == 0.0
     night = compute_klobuchar_delay(np.zeros((2, 4)), np.zeros(1), llh[:1], np.zeros(1), np.array([np.pi / 2]))
     assert night[0] == pytest.approx(5e-9 * C, rel=2e-3)
+
+
+def test_a_clean_station_has_no_slips_above_the_mask_at_half_a_minute(shared_data):
+    """Neither troposphere nor ionosphere changes as a cycle does, although they do so by centimetres."""
+    folder = shared_data / SLAC
+    precise = {"sp3": tuple(folder.glob("*ORB.SP3.gz")), "clk": tuple(folder.glob("*CLK.CLK.gz"))}
+    raw, _, _ = load_raw(Sources((folder / "slac1180.21o.gz",), (folder / "brdc1180.21n.gz",), **precise))
+    high = compute_directions(raw.antenna, raw.p)[1] > np.radians(10.0)
+    raw = raw.take(high & np.isfinite(raw.clock))
+    arcs = find_arcs(raw)
+    assert arcs.slips == 0
+    assert np.sum(arcs.arc >= 0) > 5000
+    one = np.flatnonzero(raw.satellite == raw.satellite[0])
+    raw.carrier[one[len(one) // 2 :]] += 1.0
+    assert find_arcs(raw).slips > 0
 
 
 @pytest.fixture(scope="module")

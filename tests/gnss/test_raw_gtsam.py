@@ -98,6 +98,26 @@ def test_rows_are_gtsams_undifferenced_factors_and_so_are_their_derivatives(off_
                 assert theirs[4] == pytest.approx(J[slot])
 
 
+def test_code_rows_are_gtsams_differential_factors_of_the_bases_correction(off_the_truth):
+    """The base's correction, and the delay by the model, are taken off the code by a variable of its own."""
+    found, raw, _ = off_the_truth
+    rows, where, states, values, linear = found[GnssCode]
+    for k, here in chosen(rows, where, raw):
+        given, J = gtsam.Values(), linear.jacobians
+        correction = raw.difference[here] - delay_of(rows, raw, here, k) - rows.slant[k] * values[IONOSPHERE][k, 0]
+        for key, value in ((RECEIVER, values[CLOCK][k, 0] / C), (DELAY, correction)):
+            given.insert(key, value)
+        given.insert(POSE, pose_of(states, where.frame, k))
+        factor = gtsam.DifferentialPseudorangeFactorArm(
+            POSE, RECEIVER, DELAY, raw.code[here], raw.p[here], rows.lever_arm, 0.0, UNIT
+        )
+        assert factor.unwhitenedError(given)[0] == pytest.approx(linear.residual[k, 0], abs=1e-3)
+        theirs = np.split(factor.linearize(given).jacobian()[0][0], [6, 7])
+        np.testing.assert_allclose(theirs[0], [*J["theta"][k, 0], *(J["p"][k, 0] @ states.R_nb[k])], atol=1e-5)
+        assert theirs[1] / C == pytest.approx(J[CLOCK][k, 0, :1])
+        assert theirs[2] == pytest.approx([-1.0])  # added to the code, as a correction is
+
+
 def test_differences_of_code_rows_are_gtsams_double_differences(off_the_truth):
     found, raw, position = off_the_truth
     rows, where, states, _, linear = found[GnssCode]

@@ -15,6 +15,7 @@ from graphnav.core import earth
 from graphnav.core.errors import ConfigError, GraphnavError, RecordingError
 from graphnav.estimation.pipeline import run
 from graphnav.gnss.antex import compute_satellite_axes, compute_wind_up, read_antex
+from graphnav.gnss.arcs import find_arcs
 from graphnav.gnss.atmosphere import compute_directions, compute_niell_mapping
 from graphnav.gnss.load import Sources, load_raw
 from graphnav.gnss.ppp import combine_ionosphere_free
@@ -107,7 +108,7 @@ def test_satellites_antennas_bring_them_nearer(tmp_path):
     """By what the file has along the line from the centre of mass to the receiver."""
     path = tmp_path / "some.atx"
     path.write_text(ANTEX)
-    antennas = read_antex(path)
+    antennas, _ = read_antex(path)
     assert set(antennas) == {number_satellite("G01")}
     drive = oracle.vehicle_path(120.0)
     made = raw_drive.with_observations(oracle.drive(drive)[0], drive, carrier=0.0, second=True).crop(0.0, 5.0)
@@ -221,6 +222,38 @@ def test_reflections_that_last_are_in_the_sigma():
         off = errors(found, truth)[0][-1]
         total += off @ np.linalg.solve(found.covariance[-1][3:6, 3:6], off)
     assert 1.15 < total < 27.9  # chi-square of 9, 0.1 and 99.9 %
+
+
+@pytest.fixture(scope="module")
+def slipping():
+    """Four satellites alone for half a minute: as they are, and where both signals of one slip by a cycle."""
+    path = oracle.vehicle_path(120.0, 50.0)
+    made, _ = oracle.drive(path, seed=5, gnss_velocity_sd=(0.1, 0.1, 0.1))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(raw_drive, "SATELLITES", raw_drive.MANY)
+        made = raw_drive.with_observations(made, path, noise=0.3, seed=2, carrier=0.002, second=True).crop(0.0, 60.0)
+    raw, at = made.raw_gnss, 45.0
+    late = raw.t > at - 15.0
+    seen = np.unique(raw.satellite[late & (compute_directions(raw.antenna, raw.p)[1] > np.radians(20.0))])
+    left = seen[:: len(seen) // 4][:4]
+    raw = raw.take(~late | np.isin(raw.satellite, left))
+    slipped = replace(raw, carrier=raw.carrier + ((raw.satellite == left[1]) & (raw.t > at - 1e-3)))
+    assert find_arcs(slipped).slips == find_arcs(raw).slips
+    return at, name_satellite(left[1]), [replace(made, raw_gnss=one) for one in (raw, slipped)]
+
+
+def test_a_slip_that_no_flag_and_no_satellites_tell_begins_a_new_arc(slipping):
+    """Of 11 cm in the combination; changes of carriers of four satellites fit any displacement."""
+    at, name, recordings = slipping
+    how = parse_settings({"noise": {"mode": "stated"}, "raw_gnss": {"ppp": True}})
+    plain, slipped = (run(one, how, ("ekf", "rts")) for one in recordings)
+    for solver, one in slipped.items():
+        own = np.char.startswith(one.arcs.name, name)
+        assert np.abs(one.arcs.begin[own] - at).min() < 1e-3, solver
+        assert not np.any(np.abs(plain[solver].arcs.begin - at) < 1e-3), solver
+        late = one.t > at
+        assert np.linalg.norm((one.states.p - plain[solver].states.p)[late, :2], axis=1).max() < 0.03, solver
+        assert len(one.fixed) == 0, solver  # float ambiguities are no epochs that could be fixed
 
 
 def test_ppp_says_what_it_lacks():

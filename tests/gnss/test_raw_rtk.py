@@ -32,7 +32,7 @@ from graphnav.gnss.ephemeris import OMEGA_WGS84
 from graphnav.gnss.integers import decorrelate, find_nearest
 from graphnav.gnss.series import RawGnss
 from graphnav.gnss.sigmas import REFLECTED, compute_reflection_sigma
-from graphnav.gnss.signals import L1, C
+from graphnav.gnss.signals import L1, C, name_satellite, name_signal
 from graphnav.recording.formats import read
 from graphnav.report.satellites import tabulate_epochs, tabulate_satellites
 
@@ -267,6 +267,40 @@ def test_where_no_few_satellites_can_be_told_to_have_slipped_all_arcs_end(exact,
     assert begun == set((chosen if share < 0.5 else satellites).tolist())
 
 
+def test_the_ionosphere_changes_the_more_the_longer_an_interval_is():
+    """By 7 cm on L1, three sigmas after two minutes, where two frequencies tell it, and a slip after half a minute; nor
+    does it hide a cycle of one signal or of both.
+    """
+    path = oracle.vehicle_path(400.0)
+    made = oracle.drive(path, imu_noise=None, gnss_exact=True)[0]
+    whole = raw_drive.with_observations(made, path, carrier=0.002, second=True).raw_gnss
+    lever = tuple(float(x) for x in made.gnss.lever_arm)
+    for apart in (120, 30):
+        epochs = whole.epochs[0][::apart]
+        raw = whole.take(np.isin(whole.t, epochs))
+        raw = replace(raw, antenna=earth.llh_to_ecef(path.point(raw.t, lever)[0]))
+        own = raw.satellite == raw_drive.number_satellite("E03")  # 23 deg high
+        advance = 0.07 * np.searchsorted(epochs, raw.t)[own] * (L1 / raw.frequency[own]) ** 2
+        carrier = raw.carrier.copy()
+        carrier[own] += advance * raw.frequency[own] / C
+        signals = np.unique(raw.signal[own])
+
+        def count(carrier, signals, raw=raw, own=own):
+            arcs = find_arcs(replace(raw, carrier=carrier).take(~own | np.isin(raw.signal, signals)))
+            return {name: len(begins) for name, begins in zip(arcs.names, arcs.begins, strict=True) if len(begins) > 1}
+
+        if apart == 30:
+            assert set(count(carrier, signals)) == {f"E03.{name_signal(s)}" for s in signals}
+            continue
+        assert count(carrier, signals) == {}
+        assert set(count(carrier, signals[:1])) == {f"E03.{name_signal(signals[0])}"}
+        for some in (signals[:1], signals[1:], signals):
+            slipped = carrier + (own & np.isin(raw.signal, some) & (raw.t >= epochs[2]))
+            found = count(slipped, signals)
+            assert {f"E03.{name_signal(s)}" for s in some} <= found.keys()
+            assert set(found.values()) == {2}
+
+
 class SlippedEpochs:
     """Ten arcs of one signal, of which some are far off, as an epoch that is looked at."""
 
@@ -303,7 +337,7 @@ def test_arcs_that_are_a_quarter_of_a_cycle_off_begin_anew(monkeypatch):
     here, held = SimpleNamespace(values=np.zeros((1, 0))), [fixing.Held(known)]
     for k, far in enumerate(([1], [3, 4, 6, 8, 9], [])):
         epochs.far = far
-        held.append(fixing.hold_on(held[-1].go_on(), epochs, k, here, lambda: np.zeros((0, 0))))
+        held.append(fixing.hold_on(held[-1].go_on(), epochs, k, here, lambda: np.zeros((0, 0)), True))
         assert set(held[-1].anew) == {epochs.arcs[i] for i in far}
         assert len(asked) == (not far)
     assert set(held[-1].known.of) == {epochs.arcs[0], epochs.arcs[2]}
@@ -547,23 +581,33 @@ def test_a_wrong_integer_is_let_go_of(drive, monkeypatch):
     assert off[late & fixed].max() < 0.05
 
 
+def keep_four(raw, begin):
+    """Four satellites alone from a time on (s), and which."""
+    late = raw.t > begin
+    seen = np.unique(raw.satellite[late & (compute_directions(raw.antenna, raw.p)[1] > np.radians(20.0))])
+    left = seen[:: len(seen) // 4][:4]
+    return raw.take(~late | np.isin(raw.satellite, left)), left
+
+
 @pytest.mark.parametrize("which", range(4))
-def test_a_slip_of_one_of_four_satellites_is_told_by_the_imu(drive, which):
+@pytest.mark.parametrize("integers", [True, False])
+def test_a_slip_of_one_of_four_satellites_is_told_by_the_imu(drive, which, integers):
     """By a cycle that no flag tells: four changes of carriers fit any displacement."""
     recording, truth = drive
-    raw, at = recording.raw_gnss, recording.raw_gnss.t[0] + 15.0
-    high = raw.t > at - 3.0
-    elevation = compute_directions(raw.antenna, raw.p)[1]
-    seen = np.unique(raw.satellite[high & (elevation > np.radians(20.0))])
-    left = seen[:: len(seen) // 4][:4]
-    raw = raw.take(~high | np.isin(raw.satellite, left))
+    at = recording.raw_gnss.t[0] + 15.0
+    raw, left = keep_four(recording.raw_gnss, at - 3.0)
     slipped = replace(raw, carrier=raw.carrier + ((raw.satellite == left[which]) & (raw.t > at - 1e-3)))
     assert find_arcs(slipped, base_arc=raw.base_arc).slips == find_arcs(raw, base_arc=raw.base_arc).slips
-    for name, one in run(replace(recording, raw_gnss=slipped), STATED, ("ekf", "rts")).items():
+    how = parse_settings({"noise": {"mode": "stated"}, "raw_gnss": {"integers": integers}})
+    plain, other = (run(replace(recording, raw_gnss=one), how, ("ekf", "rts")) for one in (raw, slipped))
+    for name, one in other.items():
         error, sigma = errors(one, truth)[:2]
         late = one.t > at
-        assert np.linalg.norm(error[late, :2], axis=1).max() < 0.15, name
+        apart = (one.states.p - plain[name].states.p)[late, :2]
+        assert np.linalg.norm(error[late, :2] if integers else apart, axis=1).max() < 0.15, name
         assert np.mean((error[late, :2] / sigma[late, :2]) ** 2) < 4.6, name  # chi-square of two, 99 %, over two
+        own = one.arcs.name == f"{name_satellite(left[which])}.1C"
+        assert np.abs(one.arcs.begin[own] - at).min() < 1e-3, name
 
 
 def test_records_name_satellites_and_the_report_sums_them_up(drive):

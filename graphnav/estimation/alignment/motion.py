@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from graphnav.config import Settings
+from graphnav.constraints.raw_phase import GnssPhase
 from graphnav.core import rotation
 from graphnav.core.earth import LocalFrame
 from graphnav.core.errors import EstimationError
@@ -254,7 +255,7 @@ def _build_short(part: Recording, settings: Settings, frame: LocalFrame, rph: Ar
     robust = settings.gnss.model_copy(update={"robust": "cauchy", "lever_arm_sigma": None, "time_offset_sigma": 0.0})
     # the information of the wheels on the heading is added by `use_course`
     problem = build_problem(part, settings.without_wheels().model_copy(update={"gnss": robust}), frame, start, sigma)
-    return split_carriers(problem)[0]
+    return split_carriers(problem, GnssPhase)[0]
 
 
 def _solve_from(problem: Problem, rph: Array, watch: Callable[[States, float, float, bool], None]) -> Solution:

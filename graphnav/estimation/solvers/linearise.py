@@ -193,14 +193,19 @@ def linearise(
 
     Parameters
     ----------
-    columns : where each parameter stands in the error state.
+    columns : where each parameter stands in the error state; one that has not begun is at its first value.
     at : (n,) which point each row is at; its keyframe when None.
     """
     values, states = points.values, points.states
     at = constraint.keyframe[which] if at is None else at
     if len(at) != 1 or len(values) != 1:
         values, states = values.take(at, axis=0), states[at]
-    given = {p.name: values[:, shift(columns[p.name])] for p in constraint.parameters}
+    given = {
+        p.name: values[:, shift(columns[p.name])]
+        if p.name in columns
+        else np.broadcast_to(np.atleast_2d(p.initial)[0], (len(values), p.size))
+        for p in constraint.parameters
+    }
     linear = constraint.linearize(states, given, which)
     return Rows(constraint, which, linear, Jacobian(linear, columns, DIM + values.shape[1]))
 

@@ -25,7 +25,7 @@ from functools import cache
 import numpy as np
 from scipy.linalg.lapack import dgesv
 
-from graphnav.constraints.base import Constraint
+from graphnav.constraints.base import Constraint, Linearized
 from graphnav.core import rotation
 from graphnav.core.errors import EstimationError
 from graphnav.core.rotation import Array, mv
@@ -336,12 +336,16 @@ def linearise_keyframes(
     parts: list[list[Measured]] = [[] for _ in places]
     for constraint in problem.constraints if rows is None else rows:
         lo, hi = constraint.keyframe.searchsorted((first, first + n))
-        if lo == hi or any(p.name not in columns for p in constraint.parameters):
-            continue  # none here, or of parameters that have not begun
+        if lo == hi:
+            continue
         at = constraint.keyframe[lo:hi] - first + skip
         linear = linearise(constraint, points, columns, slice(lo, hi), at)
-        sigma = linear.sigma
+        sigma, which = linear.sigma, np.arange(lo, hi)
         H, b = linear.H / sigma[..., None], -linear.residual / sigma
+        later = [p.name for p in constraint.parameters if p.name not in columns]
+        if later:  # rows of satellites that were in view already do not depend on ambiguities that begin later
+            begun = ~_depend_on(linear.linear, later)
+            at, sigma, H, b, which = (x[begun] for x in (at, sigma, H, b, which))
         edge = np.searchsorted(at, np.arange(n + 1) + skip)
         for i in np.flatnonzero(np.diff(edge)):
             own = slice(edge[i], edge[i + 1])
@@ -354,8 +358,17 @@ def linearise_keyframes(
                     b[own],
                     sigma[own],
                     kernel,
-                    c.scale_of(slice(lo + own.start, lo + own.stop)),
+                    c.scale_of(which[own]),
                     c.turns,
                 )
             )
     return [Linear(link, tuple(part)) for link, part in zip(links, parts, strict=True)]
+
+
+def _depend_on(linear: Linearized, names: Sequence[str]) -> Array:
+    """(n,) mask of the rows that depend on any of some parameters."""
+    out = np.zeros(len(linear.residual), dtype=bool)
+    for name in names:
+        if name in linear.jacobians:
+            out |= linear.jacobians[name].any(axis=(1, 2))
+    return out
