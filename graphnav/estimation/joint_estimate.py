@@ -36,6 +36,8 @@ from graphnav.estimation.offsets import is_offset_far
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.linearise import Points
 
+_GAINED_BY_CHANCE = 0.5  # log-likelihood that a figure gains by being estimated, in the mean
+
 
 @dataclass(frozen=True)
 class JointEstimate:
@@ -137,8 +139,10 @@ def _free_contradicted(found: JointEstimate, settings: GnssSettings, estimate: _
         if not are_same(freed, before, base):
             other = replace(found, freed=freed, estimate=estimate(free(base, freed), near))
             passes = passes + other.estimate.passes + Counter(filter=1)
-            # with other figures, freed constants may lead to a worse optimum than with all as stated
-            found = max(found, other, key=lambda one: one.compute_evidence())
+            # with other figures, this may lead to a worse optimum than before
+            gained = _GAINED_BY_CHANCE * len(other.noise.figures)
+            if found.compute_evidence() <= other.compute_evidence() + gained:
+                found = other
             freed = update_freed(base, found.estimate, found.freed)
     except BREAKDOWN:
         return found.count(passes)
