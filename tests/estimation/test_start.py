@@ -17,7 +17,7 @@ from graphnav.core.errors import EstimationError
 from graphnav.core.notes import get_key
 from graphnav.core.trajectory import Trajectory
 from graphnav.detectors import detect
-from graphnav.estimation import preparation
+from graphnav.estimation import joint_estimate
 from graphnav.estimation.alignment import Alignment, align
 from graphnav.estimation.alignment.first import pick_fixes
 from graphnav.estimation.alignment.motion import drop_implausible
@@ -142,7 +142,7 @@ def test_what_breaks_down_while_noise_is_estimated_is_solved_as_stated(
 
     plain = {"noise": {"mode": "stated"}, "standstill": {"held_position": False}}
     stated = run(drive, Settings.model_validate(plain), ("ekf",))["ekf"]
-    monkeypatch.setattr(preparation, "estimate_without_faults", break_down)
+    monkeypatch.setattr(joint_estimate, "estimate_without_faults", break_down)
     solution = run(drive, None, ("ekf",))["ekf"]
     assert "noise.not_estimated" in map(get_key, solution.notes)
     np.testing.assert_array_equal(solution.covariance, stated.covariance)

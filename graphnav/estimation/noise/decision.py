@@ -81,7 +81,7 @@ def explain(
     }
     if INTERVALS in among:
         weighted[INTERVALS] = apply_noise(base, replace(noise, weights=outside | inside[INTERVALS]))
-    sizes = measure_sizes(apply_noise(base, found.noise), found.points, spans)
+    sizes = measure_sizes(base, apply_noise(base, found.noise), found.points, spans)
     before, likelihood, passes = compute_evidence(used, found.carry_points(base, used), spans, weighted, sizes, among)
     excluded: dict[str, tuple[Span, ...]] = {}
     total = before + found.log_prior

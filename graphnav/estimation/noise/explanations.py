@@ -22,7 +22,7 @@ from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.ekf import Comparison
 from graphnav.estimation.solvers.linearise import Points
 from graphnav.estimation.solvers.passes import DisturbancePass, make_points, split_values
-from graphnav.estimation.solvers.watch import MINUTE, SIZES
+from graphnav.estimation.solvers.watch import LARGE, MINUTE, SIZES
 from graphnav.recording import Recording
 
 FIXES, WHEELS = ("gnss_position", "gnss_velocity"), ("nhc", "odometer")
@@ -102,13 +102,19 @@ class ErrorSizes:
     cost: Mapping[str, Array]  # (M,) of the log-likelihood
 
 
-def measure_sizes(problem: Problem, smoothed: DisturbancePass, spans: list[Span]) -> ErrorSizes:
+def measure_sizes(base: Problem, problem: Problem, smoothed: DisturbancePass, spans: list[Span]) -> ErrorSizes:
     """Sizes of errors in spans by maximum likelihood, from those of a smoother that does not use the fix.
 
     With a prior of the logarithm of the size that is uniform between the sigma of the fixes and `SIZES`, the likelihood
     of n numbers integrates to its maximum times sqrt(pi / n) over the width of that prior (Laplace's approximation).
-    White errors make fixes less accurate and not wrong, so theirs are as large as faults get.
+    White errors make fixes less accurate and not wrong. If changes from fix to fix agree with the inertial solution to
+    `LARGE` sigmas, the error may as well be that of wheels. Both are given errors as large as faults get.
+
+    Parameters
+    ----------
+    base, problem : with stated noise, and with the noise model.
     """
+    known: dict[str, Array] = {c.name: c.sigma for c in base.constraints if c.name in FIXES}  # type: ignore[attr-defined]
     sigma: dict[str, Array] = {}
     cost: dict[str, Array] = {}
     for rows in problem.constraints:
@@ -119,10 +125,12 @@ def measure_sizes(problem: Problem, smoothed: DisturbancePass, spans: list[Span]
         sigma[rows.name], cost[rows.name] = np.full(len(spans), most), np.zeros(len(spans))
         for k, span in enumerate(spans):
             own = mask_times(t, [span])
-            if are_white(error[own]):
+            if own.sum() < 2 or are_white(error[own]):
                 continue
-            least = float(np.median(stated[own]))
-            sigma[rows.name][k] = np.clip(np.sqrt(np.mean(error[own] ** 2)), min(least, most), most)
+            least = float(np.median(np.maximum(stated, known[rows.name])[own]))
+            if np.sqrt(0.5 * np.mean(np.diff(error[own], axis=0) ** 2)) < LARGE * least:
+                continue
+            sigma[rows.name][k] = min(float(np.sqrt(np.mean(error[own] ** 2))), most)
             width = max(np.log(most / least), 1.0)
             cost[rows.name][k] = np.log(width * np.sqrt(error[own].size / np.pi))
     return ErrorSizes(sigma, cost)
