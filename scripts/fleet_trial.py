@@ -6,9 +6,12 @@ seconds. One recording is poisoned (a cell that is no number) and one is absurd 
 after a fifth of the drives and run again; then a process that solves is ended in the middle of a drive, and later one
 is stopped, which is a drive that hangs. The third run has only the drives to solve that were lost.
 
+With `--undisturbed` nothing happens to it: it is run with one process and again with two. What a second process costs
+is in the processor time of both, which other programs on the machine change less than the wall time.
+
     python scripts/fleet_trial.py --keep build/fleet
     python scripts/fleet_trial.py --keep build/fleet --dask 2
-    python scripts/fleet_trial.py --keep build/long --ways 2 --length 600 --options "--solver rts --noise stated"
+    python scripts/fleet_trial.py --keep build/long --ways 5 --length 600 --options "" --undisturbed
 """
 
 from __future__ import annotations
@@ -54,6 +57,7 @@ def main() -> None:
     parser.add_argument("--processes", type=int, default=1)
     parser.add_argument("--dask", type=int, default=0, metavar="N", help="over a cluster of N workers on this machine")
     parser.add_argument("--options", default="--solver ekf --noise stated --end 60 --no-report", help="(%(default)s)")
+    parser.add_argument("--undisturbed", action="store_true", help="on one process, then on two, and nothing else")
     options = parser.parse_args()
     drives = build(options.keep, options.ways, options.length)
     out = options.keep / f"out-{options.processes}-{options.dask}"
@@ -61,6 +65,10 @@ def main() -> None:
         shutil.rmtree(out)
     command = [str(Path(sys.executable).with_name("graphnav")), "fleet", str(drives), "-o", str(out)]
     command += [*options.options.split(), "--limit", str(options.limit)]
+    if options.undisturbed:
+        runs = {n: run([*command, "--again", "--processes", str(n)], out) for n in (1, 2)}
+        print(json.dumps({"processes": runs, **figures(out)}, indent=1))
+        return
     count = 5 * options.ways + 2
     with cluster(options.dask) as address:
         command += ["--scheduler", address] if address else ["--processes", str(options.processes)]
