@@ -37,7 +37,7 @@ from graphnav.constraints.raw_selection import select_observations
 from graphnav.core.errors import RecordingError
 from graphnav.core.rotation import Array
 from graphnav.core.state import Parameter, States
-from graphnav.gnss.ppp import SECOND, IonosphereFree, choose_second_signals, combine_ionosphere_free
+from graphnav.gnss.ppp import IonosphereFree, choose_second_signals, combine_ionosphere_free
 from graphnav.gnss.series import RawGnss
 from graphnav.gnss.sigmas import REFLECTED, compute_carrier_sigma, compute_code_sigma, compute_reflection_sigma
 from graphnav.gnss.signals import C
@@ -78,8 +78,9 @@ def combine_rows(scene: BuildContext) -> FreeRows | None:
     if rows is None:
         return None
     every, of = found.raw.satellites
-    some = np.isin(every // 100, list(SECOND))
-    systems = [x for x in dict.fromkeys(system for system, _ in group_signals(found.raw)[0]) if x in SECOND]
+    used = {satellite // 100 for satellite in choose_second_signals(whole)}
+    some = np.isin(every // 100, list(used))
+    systems = [x for x in dict.fromkeys(system for system, _ in group_signals(found.raw)[0]) if x in used]
     group = np.array([systems.index(x) for x in (found.raw.satellite[rows.which] // 100).tolist()])
     return FreeRows(found, rows, int(some.sum()), (np.cumsum(some) - 1)[of[rows.which]], group, len(systems))
 

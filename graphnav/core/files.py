@@ -127,7 +127,8 @@ def open_file(
     ----------
     text : whether lines longer than the limit are refused.
     limit : bytes that it may hold unpacked; None: what `GRAPHNAV_MAX_FILE_MB` says.
-    up_to_cut : whether a compressed file that is cut off ends there, and says so, instead of being refused.
+    up_to_cut : whether a compressed file that is cut off, or goes on with something else, ends there, and says so,
+        instead of being refused.
     """
     check_regular(path, error)
     most = _read_limit(MAX_FILE, 10**6) if limit is None else limit
@@ -238,8 +239,8 @@ class Opened(io.BufferedReader):
         self.size, self.packed, self._bounded = size, packed, raw
 
     @property
-    def cut(self) -> bool:
-        """Whether it has ended because the compressed file is cut off."""
+    def cut(self) -> str:
+        """Why it has ended before or other than the compressed file should; empty where it has not."""
         return self._bounded.cut
 
 
@@ -257,7 +258,7 @@ class _Bounded(io.RawIOBase):
         error: Kind,
         up_to_cut: bool,
     ) -> None:
-        self.cut, self._up_to_cut = False, up_to_cut
+        self.cut, self._up_to_cut = "", up_to_cut
         self.path, self.error, self._plain = path, error, plain
         self._source: Any = gzip.GzipFile(fileobj=plain, mode="rb") if packed else plain
         self._size, self._most, self._longest, self._packed = size, most, line, packed
@@ -271,8 +272,9 @@ class _Bounded(io.RawIOBase):
             chunk = self._source.read1(min(len(buffer), _READ_SIZE))  # `read` would lose what is before a cut
         except (EOFError, zlib.error, gzip.BadGzipFile) as cause:
             cut = isinstance(cause, EOFError)
-            if cut and self._up_to_cut and self._count:
-                self.cut = True
+            other = isinstance(cause, gzip.BadGzipFile) and str(cause).startswith("Not a gzipped file")
+            if (cut or other) and self._up_to_cut and self._count:  # what is before has been checked, or cannot be
+                self.cut = "is cut off" if cut else "goes on with something else"
                 return 0
             why = "the compressed file is cut off" if cut else f"the compressed file is damaged ({cause})"
             raise self.error(f"{self.path}: {why}; copy it again", key="file.damaged") from None

@@ -63,7 +63,7 @@ def unpack_bytes(path: Path) -> Unpacked:
     out = Unpacked(data)
     if cut:
         where = f"line {data.count(10)}" if text else f"{len(data)} bytes"
-        sentence = f"the compressed file is cut off, after {where} unpacked; everything before that is used"
+        sentence = f"the compressed file {cut} after {where} unpacked; everything before that is used"
         out.remarks = (Note("raw.cut", f"{path.name}: {sentence}"),)
     return out
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
+from graphnav.gnss.channels import find_channels
 from graphnav.gnss.ephemeris import Ephemerides, Placed, rotate_earth
 from graphnav.gnss.precise import Orbits
 from graphnav.gnss.series import Observations, RawGnss, compute_epoch_medians
@@ -42,6 +43,8 @@ def place(
     """
     if nav is not None and nav.channels:
         obs = replace(obs, channels={**nav.channels, **obs.channels})
+    found_channels = find_channels(obs) if precise is not None else {}
+    obs = replace(obs, channels={**obs.channels, **found_channels})
     frequency = obs.frequency
     # one time of transmission for all signals of a satellite: codes differ by metres, in which it moves 0.1 mm
     told = np.flatnonzero(np.isfinite(obs.code))  # in order of time and satellite
@@ -68,6 +71,9 @@ def place(
     ill = sorted(set(lost_all) & (nav.unhealthy if nav is not None and precise is None else set()))
     without = [s for s in lost_all if s not in ill]
     mute = sorted({int(x) for x in np.unique(obs.satellite[np.isnan(frequency)])} - lost)
+    if found_channels:
+        names = ", ".join(f"{name_satellite(one)} {channel}" for one, channel in found_channels.items())
+        remarks.append(Note("raw.channels_found", f"GLONASS channels by the change of codes with carriers: {names}"))
     if mute:
         names = ", ".join(name_satellite(x) for x in mute)
         sentence = (

@@ -22,12 +22,14 @@ from graphnav.gnss.arcs import Arcs, build_arcs, find_arcs
 from graphnav.gnss.atmosphere import compute_day_of_year, compute_niell_mapping, compute_zenith_delays
 from graphnav.gnss.carrier import find_rows
 from graphnav.gnss.series import RawGnss
-from graphnav.gnss.signals import GALILEO, GPS, QZSS, C, name_signal, number_signal
+from graphnav.gnss.signals import GALILEO, GLONASS, GPS, QZSS, C, name_signal, number_signal
 from graphnav.gnss.single_point import Geometry, look
 from graphnav.gnss.tides import compute_solid_tide, locate_sun_and_moon
 
-# the second band of the combination that precise clocks refer to; for BeiDou and GLONASS it differs between products
-SECOND = {GPS: 2, GALILEO: 5, QZSS: 2}
+# the second band of the combination that precise clocks refer to; for BeiDou it differs between products
+SECOND = {GPS: 2, GLONASS: 2, GALILEO: 5, QZSS: 2}
+# whose antennas are two metres or more off the centre of mass: without an antenna file a station was 15 cm off by them
+_NEEDS_ANTENNA = (GLONASS,)
 # the code on the first band that these clocks refer to, where receivers may also have another: the differential code
 # bias is up to a nanosecond for each satellite, and two and a half times that in the combination
 _OF_CLOCKS = {GPS: number_signal("1W")}
@@ -112,7 +114,7 @@ def choose_second_signals(raw: RawGnss) -> dict[int, int]:
     useful, out = np.isfinite(raw.carrier) & np.isfinite(raw.code) & np.isfinite(raw.clock), {}
     for one in np.unique(raw.satellite[useful]).tolist():
         own = useful & (raw.satellite == one) & (raw.signal // 100 == SECOND.get(one // 100, -1))
-        if own.any():
+        if own.any() and (one in raw.antennas or one // 100 not in _NEEDS_ANTENNA):
             signals, many = np.unique(raw.signal[own], return_counts=True)
             out[one] = int(signals[np.argmax(many)])
     return out

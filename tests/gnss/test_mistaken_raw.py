@@ -363,6 +363,10 @@ def test_of_a_compressed_file_that_is_cut_off_all_before_that_is_used(
     else:
         placed = np.isfinite(raw.p[:, 0])
         assert 0.5 < placed.mean() < 1.0
+    (folder / name).write_bytes(packed + b"rubbish")
+    again = read(folder)
+    assert len([note for note in again.remarks if get_key(note) == "raw.cut" and name in note]) == 1
+    np.testing.assert_array_equal(raw_of(again).code, whole.code)
     (folder / name).write_bytes(packed[:40])  # nothing of it can be unpacked
     with refused("file.damaged", RecordingError):
         read(folder)

@@ -7,6 +7,7 @@ import gzip
 import re
 import zipfile
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
 
@@ -15,12 +16,17 @@ import pytest
 from helpers import assert_told
 
 from graphnav.core.errors import RecordingError
-from graphnav.gnss.antex import compute_antenna_paths, read_antex
+from graphnav.core.notes import get_key
+from graphnav.gnss.antex import SatelliteAntenna, compute_antenna_paths, read_antex
+from graphnav.gnss.channels import find_channels
 from graphnav.gnss.ephemeris import Ephemerides
+from graphnav.gnss.load import Sources, load_raw
+from graphnav.gnss.ppp import choose_second_signals
 from graphnav.gnss.precise import read_precise
 from graphnav.gnss.rinex_nav import read_navigation
 from graphnav.gnss.rinex_obs import read_observations
-from graphnav.gnss.signals import GLONASS, find_frequencies, number_satellite, number_signal
+from graphnav.gnss.series import Observations
+from graphnav.gnss.signals import GLONASS, C, find_frequencies, number_satellite, number_signal
 
 DATA = Path(__file__).resolve().parents[2] / "data"
 KAMAKURA = DATA / "kamakura_rtk"
@@ -291,3 +297,39 @@ def test_ways_are_by_the_angle_off_the_nadir(antex: Path) -> None:
     bands[1, 1] = 5
     found = compute_antenna_paths(read_antex(antex)[0], g22, hertz, bands, np.full(3, 1.3e9), axes, e)
     assert np.isnan(found).tolist() == [False, True, False]
+
+
+@pytest.mark.parametrize("channel", [-7, 0, 6])
+def test_channels_are_told_by_codes_and_carriers_while_the_range_changes(channel):
+    """By both signals, through an arc that ends and a slip; not by some seconds, in which noise moves codes as much."""
+    rng, t = np.random.default_rng(channel + 7), np.arange(0.0, 300.0)
+    parts = []
+    for name in ("1C", "2P"):
+        frequency = find_frequencies(
+            *(np.array([x], dtype=np.int16) for x in (105, number_signal(name))), {105: channel}
+        )
+        way = 2e7 + 400.0 * t + 0.05 * t**2 + 1e3 * np.sin(0.1 * t)  # the receiver's clock wanders
+        carrier = way * frequency / C + np.where(t < 100.0, 7e5, np.where(t < 200.0, -3e6, -3e6 + 1.0))
+        parts.append((way + rng.normal(0.0, 1.0, len(t)), carrier, number_signal(name)))
+    n, none = 2 * len(t), np.full(2 * len(t), np.nan)
+    slip = np.tile(t == 100.0, 2)
+    obs = Observations(
+        0.0, np.tile(t, 2), np.full(n, 105, dtype=np.int16), np.repeat([p[2] for p in parts], len(t)).astype(np.int16),
+        np.concatenate([p[0] for p in parts]), np.concatenate([p[1] for p in parts]), none, none, slip,
+        np.zeros(n, dtype=bool), none,
+    )  # fmt: skip
+    assert find_channels(obs) == {105: channel}
+    assert find_channels(obs.take(obs.t < 5.0)) == {}
+
+
+def test_glonass_is_combined_where_its_antennas_are_known(shared_data):
+    """Channels are found without a navigation file of GLONASS; offsets of metres are not in an ambiguity."""
+    folder = shared_data / "raw_gnss_slac_20210428"
+    precise = {"sp3": tuple(folder.glob("*ORB.SP3.gz")), "clk": tuple(folder.glob("*CLK.CLK.gz"))}
+    raw, _, notes = load_raw(Sources((folder / "slac1180.21o.gz",), (folder / "brdc1180.21n.gz",), **precise))
+    assert "raw.channels_found" in map(get_key, notes)
+    systems = {one // 100 for one in choose_second_signals(raw)}
+    assert GLONASS not in systems
+    known = {number_satellite("R09"): (SatelliteAntenna(-np.inf, np.inf, {1: np.zeros(3), 2: np.zeros(3)}),)}
+    more = choose_second_signals(replace(raw, antennas=known))
+    assert more.keys() - choose_second_signals(raw).keys() == known.keys()

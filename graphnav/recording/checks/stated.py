@@ -44,10 +44,11 @@ def check_lever_arms(recording: Recording) -> Iterator[Finding]:
     """Lever arms in another unit than metres."""
     for name in ("gnss", "odometer"):
         sensor = getattr(recording, name)
+        table = "raw_gnss" if name == "gnss" and sensor is not None and sensor.derived else name
         if sensor is not None and (length := float(np.linalg.norm(sensor.lever_arm))) > _LONGEST_ARM:
             yield Finding(
                 "warning",
-                f"the lever arm in [{name}] is {length:.3g} m long: it is to be in metres",
+                f"the lever arm in [{table}] is {length:.3g} m long: it is to be in metres",
                 f"{name}.lever_arm_unit",
             )
 
