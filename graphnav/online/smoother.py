@@ -304,6 +304,8 @@ class Smoother:
             again = self._track(found.start, self._began, found.noise)
             again.adopt(tracker, found.stationary, float(estimation.task.times[-1]), self._times)
             self._catch_up = CatchUp(again, self._times)
+            if self._found is not None:
+                self._found = found.start
 
     def _step_catch_up(self, catch_up: CatchUp, tracker: Tracker) -> None:
         """Process some of them; the new tracker takes over once it has caught up."""

@@ -199,7 +199,7 @@ def _unmask(base: Problem, found: NoiseEstimate, first: Decision, masked: list[S
         spans, refined = trim(spans, errors), trim(detected, errors)
         # a slow onset is dated better by the tests, an abrupt end by the errors of single fixes
         dated = spans, trim(spans, errors, FALSE_ALARM), detected
-        for some in list_distinct(*dated, *(_split(some, used, estimate) for some in dated)):
+        for some in list_distinct(*dated, *(_cut_at_steps(some, used, estimate) for some in dated)):
             candidate = explain(base, _add_outliers(estimate, errors, some), some)
             passes = passes + candidate.passes
             if candidate.log_evidence > best.log_evidence:
@@ -294,7 +294,7 @@ def _predict_left_out(problem: Problem, found: NoiseEstimate) -> LeftOutErrors:
     }
 
 
-def _split(spans: list[Span], problem: Problem, found: NoiseEstimate) -> list[Span]:
+def _cut_at_steps(spans: list[Span], problem: Problem, found: NoiseEstimate) -> list[Span]:
     """Spans cut where the errors of positions have steps, if there are any."""
     rows = next((c for c in problem.constraints if c.name == FIXES[0]), None)
     if rows is None:
