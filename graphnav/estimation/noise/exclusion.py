@@ -198,10 +198,14 @@ def _unmask(base: Problem, found: NoiseEstimate, first: Decision, masked: list[S
         passes = passes + estimate.passes + Counter(filter=1)
         spans, refined = trim(spans, errors), trim(detected, errors)
         # a slow onset is dated better by the tests, an abrupt end by the errors of single fixes
-        dated = spans, trim(spans, errors, FALSE_ALARM), detected
-        for some in list_distinct(*dated, *(_cut_at_steps(some, used, estimate) for some in dated)):
+        for some in list_distinct(spans, trim(spans, errors, FALSE_ALARM), detected):
             candidate = explain(base, _add_outliers(estimate, errors, some), some)
             passes = passes + candidate.passes
+            cut = _cut_at_steps(some, candidate.noise, used, estimate)
+            if cut != some:
+                finer = explain(base, _add_outliers(estimate, errors, cut), cut)
+                passes = passes + finer.passes
+                candidate = max(candidate, finer, key=lambda one: one.log_evidence)
             if candidate.log_evidence > best.log_evidence:
                 best, leading = candidate, estimate
         if sum_lengths(detected) > 2.0 * sum_lengths(masked):  # more fixes seem wrong outside the span than inside
@@ -294,14 +298,16 @@ def _predict_left_out(problem: Problem, found: NoiseEstimate) -> LeftOutErrors:
     }
 
 
-def _cut_at_steps(spans: list[Span], problem: Problem, found: NoiseEstimate) -> list[Span]:
-    """Spans cut where the errors of positions have steps, if there are any."""
+def _cut_at_steps(spans: list[Span], decided: NoiseModel, problem: Problem, found: NoiseEstimate) -> list[Span]:
+    """Spans cut where the errors of positions have steps, if as a whole they are decided to be wrong."""
     rows = next((c for c in problem.constraints if c.name == FIXES[0]), None)
-    if rows is None:
+    wrong = decided.excluded.get(FIXES[0], ())
+    if rows is None or not wrong:
         return spans
     error, sigma = predict_errors(problem, rows, found.points)
     cost = float(np.median(np.sum(np.log1p(SIZES[rows.unit] / sigma), axis=1)) - np.log(FALSE_ALARM))
-    return split_at_steps(spans, problem.t[rows.keyframe], error, sigma, cost)
+    cut = split_at_steps([span for span in spans if span in wrong], problem.t[rows.keyframe], error, sigma, cost)
+    return sorted([*cut, *(span for span in spans if span not in wrong)])
 
 
 def _add_outliers(found: NoiseEstimate, errors: LeftOutErrors, spans: list[Span]) -> NoiseEstimate:
