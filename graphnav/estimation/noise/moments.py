@@ -30,7 +30,7 @@ from graphnav.core.compiled import compile_once
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM
 from graphnav.estimation.problem import ParameterChain, Problem
-from graphnav.estimation.solvers.linearise import find_stepping, shift
+from graphnav.estimation.solvers.linearise import Rows, find_stepping, shift
 from graphnav.estimation.solvers.passes import DisturbancePass, ForwardRecord, split_values
 
 _FORGOTTEN = 1e-6  # relative remainder of a difference below which it is rounding error
@@ -105,11 +105,15 @@ def collect_process_moments(
 
 def predict_errors(problem: Problem, rows: Constraint, smoothed: DisturbancePass) -> tuple[Array, Array]:
     """Errors (N, m) of the rows of a constraint, each number predicted by a smoother without it, and sigmas (N, m)."""
-    n = len(rows)
-    linear = smoothed.linearise(rows, problem.columns, n)
-    w = np.ones((n, 1)) if rows.weight is None else rows.weight[:, None]
-    explained = w * np.diagonal(smoothed.cover_rows(linear, n), axis1=1, axis2=2) / linear.stated**2
-    return linear.residual / np.clip(1.0 - explained, 1e-6, 1.0), linear.stated
+    linear = smoothed.linearise(rows, problem.columns, len(rows))
+    return linear.residual / _compute_redundancies(linear, smoothed.cover_rows(linear, len(rows)))[1], linear.stated
+
+
+def _compute_redundancies(linear: Rows, HPH: Array) -> tuple[Array, Array]:
+    """Weights (n, 1) of the first n rows, and redundancies (n, m) of their numbers; H P^s H^T is (n, m, m)."""
+    n, weight = len(HPH), linear.constraint.weight
+    w = np.ones((n, 1)) if weight is None else weight[:n, None]
+    return w, np.clip(1.0 - w * np.diagonal(HPH, axis1=1, axis2=2) / linear.stated**2, 1e-6, 1.0)
 
 
 def collect_row_moments(problem: Problem, rows: Constraint, smoothed: DisturbancePass, n: int) -> RowMoments:
@@ -117,9 +121,8 @@ def collect_row_moments(problem: Problem, rows: Constraint, smoothed: Disturbanc
     at, values = rows.keyframe[:n], split_values(problem, smoothed)
     linear = smoothed.linearise(rows, problem.columns, n)
     HPH = smoothed.cover_rows(linear, n)
-    w = np.ones((n, 1)) if rows.weight is None else rows.weight[:n, None]
     R = linear.stated**2
-    B = np.clip(1.0 - w * np.diagonal(HPH, axis1=1, axis2=2) / R, 1e-6, 1.0)
+    w, B = _compute_redundancies(linear, HPH)
     # in axes that diagonalise the whitened covariance: a stamp error affects all components together
     each, axes = np.linalg.eigh(HPH / (linear.stated[:, :, None] * linear.stated[:, None]))
     free = np.clip(1.0 - w * each, 1e-6, 1.0)
