@@ -120,6 +120,8 @@ class _Standing(Constraint):
 
     looks_ahead: ClassVar[bool] = False
     of_stops: ClassVar[bool] = True
+    # estimated like all others: as bounds they would be wider than the truth, and the IMU's figures pay for that
+    noise_axes: ClassVar[tuple[str, ...]] = ("still",) * 3
 
     @classmethod
     def epochs(cls, recording: Recording, settings: Settings, stationary: Array) -> Array:

@@ -57,7 +57,7 @@ _HALF_WHEELBASE = 1.3  # m
 _I2, _I3 = np.eye(2), np.eye(3)
 _E_Y = np.array([[0.0, 1.0, 0.0]])
 _FORWARD = _E_Y[None]
-_SIDE_UP = _I3[None, ::2]
+_SIDE_UP, _UP = _I3[None, ::2], _I3[2]
 _BY_HEADING = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]])  # u @ this = (u_y, -u_x, 0)
 _BY_AXLE = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 0.0], [-1.0, 0.0, 0.0]])  # omega @ this = omega x e_y
 
@@ -122,10 +122,7 @@ class IntervalMotion:
             "bg": by_bg,
         }
         if SCALE in parameters:
-            half = scale.shape[-1] // 2
-            J[SCALE] = np.concatenate(
-                [differentiate_by_scale(by_bg, rate, half), differentiate_by_scale(by_ba, force, half)], axis=-1
-            )
+            J[SCALE] = differentiate_by_scale(by_bg, by_ba, force, rate, scale.shape[-1])
         return found, -seen[:, 2], J
 
 
@@ -288,7 +285,9 @@ class NonHolonomic(Wheels):
         Rt = np.swapaxes(states.R_nb, -1, -2)
         jacobians["theta"][:, 0] += by_w * rotation.skew(mv(Rt, self.past.frame.omega_n))[:, 2]
         if SCALE in parameters:
-            jacobians[SCALE][:, 0, 2] += by_w[:, 0] * self.past.rate[rows][:, 2]
+            by_bg = by_w[:, None] * _UP
+            of_turn = (by_bg, np.zeros_like(by_bg), self.past.force[rows], self.past.rate[rows])
+            jacobians[SCALE][:, :1] += differentiate_by_scale(*of_turn, parameters[SCALE].shape[-1])
         return Linearized(residual - parameters[BODY] * effect, jacobians | lasting, self.sigma[rows])
 
 

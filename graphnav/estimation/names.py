@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 
 from graphnav.constraints import list_constraints
+from graphnav.imu.dynamics import SCALE, TERMS, VEHICLE_TERMS
 
 _AXIS_NAMES = ("right", "forward", "up")
 _TO_DEG = 57.29577951308232
-_CROSS_NAMES = ("right from forward", "right from up", "forward from right", "forward from up", "up from right",
-          "up from forward")  # as `graphnav.imu.dynamics` has them  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -22,12 +22,14 @@ class Component:
     scale: float = 1.0  # from the parameter's own unit
 
 
-def _name_scales(each: int) -> list[Component]:
-    out = []
-    for sensor in ("gyro", "accelerometer"):
-        out += [Component(f"{sensor} scale error, {axis}", "ppm", 1e6) for axis in _AXIS_NAMES]
-        out += [Component(f"{sensor} misalignment, {pair}", "mrad", 1e3) for pair in _CROSS_NAMES[: each - 3]]
-    return out
+def _name_terms(sensor: str, terms: Sequence[tuple[int, int]]) -> list[Component]:
+    """Of terms of the matrix of a triad of the IMU."""
+    return [
+        Component(f"{sensor} scale error, {_AXIS_NAMES[i]}", "ppm", 1e6)
+        if i == j
+        else Component(f"{sensor} misalignment, {_AXIS_NAMES[i]} from {_AXIS_NAMES[j]}", "mrad", 1e3)
+        for i, j in terms
+    ]
 
 
 def _name_axes(words: str) -> list[Component]:
@@ -62,7 +64,7 @@ _NAMED = {
 
 def has_names(name: str) -> bool:
     """Whether a parameter belongs to the calibration and its numbers have names."""
-    return name in _NAMED or name == "imu_scale" or name in _collect_names()
+    return name in _NAMED or name == SCALE or name in _collect_names()
 
 
 @cache
@@ -73,7 +75,9 @@ def _collect_names() -> dict[str, list[Component]]:
 
 def name_components(name: str, size: int, unit: str) -> list[Component]:
     """One per number of a parameter; those without a name are numbered."""
-    known = _name_scales(size // 2) if name == "imu_scale" else (_NAMED | _collect_names()).get(name, [])
+    sensors = zip(("gyro", "accelerometer"), (TERMS, TERMS) if size == 2 * len(TERMS) else VEHICLE_TERMS, strict=True)
+    of_imu = [one for sensor, terms in sensors for one in _name_terms(sensor, terms)] if name == SCALE else []
+    known = of_imu or (_NAMED | _collect_names()).get(name, [])
     if len(known) == size:
         return known
     if size == 1:

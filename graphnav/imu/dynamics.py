@@ -13,8 +13,13 @@ with G = g(p) + omega x (omega x p), and the Coriolis force does not appear. Ove
     v_j = E^T ((v_i + omega x p_i) + int E G + R_i dV) - omega x p_j
 
 E is integrated in closed form and G, which changes only with position, linearly: exact to a millimetre
-in ten minutes of free inertial. Constant scale errors s of the sensors act like biases b + s * mean
-rate (or force) of the interval, which is how they are estimated; so do axes that are not quite square, b + M * mean.
+in ten minutes of free inertial. Scale errors of the sensors and axes that are not quite square, a constant matrix M
+each, act like biases b + M * mean rate (or force) of the interval, which is how they are estimated.
+
+A foot turns and is shaken about all axes. A vehicle turns about its vertical only, and gravity always pulls along it:
+what M makes of gravity is one with the accelerometer's bias, and of pitch and roll, which return to zero, the gyro's
+scale errors and its share in the heading are a ten thousandth of a radian. So it has the other eleven numbers. They
+matter: a gyro that is a milliradian askew tilts by one and a half in every corner.
 
 The residual of an interval is the end state minus this prediction. Its covariance is known in the frames
 of `Intervals.covariance`; there it does not depend on the states. Filter and smoothers use the one
@@ -23,6 +28,8 @@ transition matrix F = d(end)/d(start) below.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cache, cached_property
 
 import numpy as np
@@ -35,37 +42,72 @@ from graphnav.imu.preintegration import Intervals
 from graphnav.recording import ImuNoise, Recording
 
 SCALE = "imu_scale"
-_TO, _FROM = np.array([0, 1, 2, 0, 0, 1, 1, 2, 2]), np.array([0, 1, 2, 1, 2, 0, 2, 0, 1])  # M_ij in its order
-_INTO = np.eye(3)[_TO]
 _I3 = np.eye(3)
+# 1-sigma of cross-axis terms over that of scale errors: data sheets have 0.05 deg beside 0.3 % (ADIS16465)
+ACROSS = 1.0 / 3.0
+# M_ij as (i, j): scale errors, then cross-axis terms
+TERMS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1))
+VEHICLE_TERMS = (TERMS[2:7], (TERMS[0], TERMS[1], TERMS[3], TERMS[5], TERMS[7], TERMS[8]))  # of gyro, accelerometer
+
+
+@dataclass(frozen=True)
+class _Terms:
+    """Which terms of a triad's matrix are estimated."""
+
+    into: Array  # (k,) i
+    of: Array  # (k,) j
+    select: Array  # (k, 3) one in column i
+
+    @classmethod
+    def make(cls, terms: Sequence[tuple[int, int]]) -> _Terms:
+        into, of = np.array(terms, dtype=int).reshape(-1, 2).T
+        return cls(into, of, _I3[into])
+
+    def act(self, scale: Array, mean: Array) -> Array:
+        """The bias (n, 3) that they amount to at means (n, 3)."""
+        return np.asarray((scale * mean[:, self.of]) @ self.select)
+
+    def differentiate(self, by_bias: Array, mean: Array) -> Array:
+        """(n, r, k), from the derivative by the bias (n, r, 3)."""
+        return np.asarray(by_bias[..., self.into] * mean[:, None, self.of])
+
+
+_SETS = {
+    sum(map(len, both)): (_Terms.make(both[0]), _Terms.make(both[1]))
+    for both in (((), ()), VEHICLE_TERMS, (TERMS, TERMS))
+}
 
 
 def make_scale_parameter(recording: Recording) -> tuple[Parameter, ...]:
-    """Scale errors (gyro x y z, accelerometer x y z), where the noise figures leave them open.
-
-    For a foot, which turns and is shaken about all axes, also the cross-axis terms: 9 and 9, the scale errors first.
-    """
-    return _scale_parameter(recording.imu.noise, 9 if recording.platform == "foot" else 3)
+    """The terms of gyro and accelerometer that a platform shows, where the noise figures leave them open."""
+    return _scale_parameter(recording.imu.noise, recording.platform == "foot")
 
 
 @cache
-def _scale_parameter(noise: ImuNoise, each: int) -> tuple[Parameter, ...]:
+def _scale_parameter(noise: ImuNoise, every: bool) -> tuple[Parameter, ...]:
     if noise.gyro_scale_sigma <= 0 and noise.accel_scale_sigma <= 0:
         return ()
-    sigma = np.repeat([max(noise.gyro_scale_sigma, 1e-9), max(noise.accel_scale_sigma, 1e-9)], each)
-    return (Parameter(SCALE, np.zeros(2 * each), sigma, "1"),)
+    sigma = [
+        max(scale * (1.0 if i == j else ACROSS), 1e-9)
+        for scale, terms in zip(
+            (noise.gyro_scale_sigma, noise.accel_scale_sigma), (TERMS, TERMS) if every else VEHICLE_TERMS, strict=True
+        )
+        for i, j in terms
+    ]
+    return (Parameter(SCALE, np.zeros(len(sigma)), np.array(sigma), "1"),)
 
 
 def convert_to_biases(scale: Array, force: Array, rate: Array) -> tuple[Array, Array]:
     """The biases of accelerometer and gyro, (n, 3) each, that scale errors (k,) or (n, k) amount to at means (n, 3)."""
-    half = scale.shape[-1] // 2
-    of_accel, of_gyro = scale[..., half:] * force[:, _FROM[:half]], scale[..., :half] * rate[:, _FROM[:half]]
-    return (of_accel, of_gyro) if half == 3 else (of_accel @ _INTO, of_gyro @ _INTO)
+    gyro, accel = _SETS[scale.shape[-1]]
+    k = len(gyro.of)
+    return accel.act(scale[..., k:], force), gyro.act(scale[..., :k], rate)
 
 
-def differentiate_by_scale(by_bias: Array, mean: Array, k: int) -> Array:
-    """(n, r, k): derivative by k scale errors of a triad, from that by its bias (n, r, 3)."""
-    return np.asarray(by_bias[..., _TO[:k]] * mean[:, None, _FROM[:k]])
+def differentiate_by_scale(by_bg: Array, by_ba: Array, force: Array, rate: Array, k: int) -> Array:
+    """(n, r, k): derivative by k scale errors, from those by the biases (n, r, 3)."""
+    gyro, accel = _SETS[k]
+    return np.concatenate([gyro.differentiate(by_bg, rate), accel.differentiate(by_ba, force)], axis=-1)
 
 
 class EarthMotion:
@@ -155,7 +197,7 @@ class ImuFactors:
     def propagate(self, rows: slice, start: States, scale: Array | None = None) -> tuple[States, Array]:
         """Propagate states to the ends of intervals `rows`, with F (n, 15, 15).
 
-        `scale` is (k,), (n, k) or None, k 6 or 18.
+        `scale` is (k,), (n, k) or None.
         """
         iv, R = self.intervals, start.R_nb
         n = len(R)
@@ -193,10 +235,8 @@ class ImuFactors:
 
     def scale_columns(self, rows: slice, F: Array, k: int) -> Array:
         """d(end) / d(scale), (n, 15, k): the bias columns of F times what the scale errors multiply."""
-        iv, half = self.intervals, k // 2
-        out = np.zeros((len(F), DIM, k))
-        out[:, :9, :half] = differentiate_by_scale(F[:, :9, 12:15], iv.rate[rows], half)
-        out[:, :9, half:] = differentiate_by_scale(F[:, :9, 9:12], iv.force[rows], half)
+        iv, out = self.intervals, np.zeros((len(F), DIM, k))
+        out[:, :9] = differentiate_by_scale(F[:, :9, 12:15], F[:, :9, 9:12], iv.force[rows], iv.rate[rows], k)
         return out
 
     def compute_frames(self, rows: slice, R_nb: Array) -> Array:
@@ -227,7 +267,7 @@ class ImuFactors:
         r = states[1:].minus(ahead)
         r_theta = r[:, :3]
         inverse = rotation.right_jacobian_inverse(r_theta)
-        S = self.scale_columns(rows, F, 6 if scale is None else scale.shape[-1])
+        S = self.scale_columns(rows, F, 0 if scale is None else scale.shape[-1])
         both = -np.concatenate([F, S], -1)
         both[:, :3] = inverse @ rotation.exp(-r_theta) @ both[:, :3]
         Jj = np.zeros_like(F)

@@ -8,6 +8,7 @@ import numpy as np
 
 from graphnav.core.earth import MG
 from graphnav.core.rotation import Array
+from graphnav.imu.dynamics import ACROSS
 from graphnav.recording import ImuNoise
 from graphnav.simulation.splines import make_random
 from graphnav.simulation.vibration import draw_gauss_markov
@@ -93,9 +94,7 @@ class SimulatedImu:
 
     @property
     def noise(self) -> ImuNoise:
-        """The figures that a recording states for it. A misalignment acts as a cross-axis scale error, and is included
-        in the scale.
-        """
+        """The figures that a recording states for it; the scale's covers a misalignment."""
         return ImuNoise(
             gyro_noise_density=self.gyro.noise,
             accel_noise_density=self.accel.noise,
@@ -104,8 +103,8 @@ class SimulatedImu:
             accel_bias_walk=max(self.accel.bias_walk, 1e-2 * self.accel.bias / 60.0),
             gyro_bias_sigma=self.gyro.bias,
             accel_bias_sigma=self.accel.bias,
-            gyro_scale_sigma=float(np.hypot(self.gyro.scale, self.gyro.misalignment)),
-            accel_scale_sigma=float(np.hypot(self.accel.scale, self.accel.misalignment)),
+            gyro_scale_sigma=max(self.gyro.scale, self.gyro.misalignment / ACROSS),
+            accel_scale_sigma=max(self.accel.scale, self.accel.misalignment / ACROSS),
         )
 
     def read(self, gyro: Array, accel: Array, seed: int) -> tuple[Array, Array, Array, Array]:

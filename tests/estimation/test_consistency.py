@@ -17,8 +17,9 @@ from graphnav.core.trajectory import Trajectory
 from graphnav.estimation.pipeline import SOLVERS, run
 from graphnav.estimation.solution import Solution
 from graphnav.recording import Recording
+from graphnav.simulation import simulate
 
-SEEDS = 6
+SEEDS, TOWNS = 6, 10
 RATE = 100.0  # Hz, of the truth; the IMU has a quarter of it, keyframes are a second apart
 # Wheels and stops hold exactly on these drives, which no sigma is made for; simulated ones that slip and sway are in
 # `tests/constraints/test_vehicle.py`.
@@ -118,3 +119,18 @@ def test_with_estimated_noise(estimated: dict[str, Score], solver: str) -> None:
 @pytest.mark.parametrize("solver", CAUSAL_AND_NOT)
 def test_with_positions_and_velocities(velocities: dict[str, Score], solver: str) -> None:
     assert_consistent(velocities[solver])
+
+
+def test_simulated_towns() -> None:
+    """Errors of attitudes last for the whole of a drive: three numbers each."""
+    found = []
+    for seed in range(TOWNS):
+        one = simulate("electric", seed, duration=300.0, tunnels=0)
+        solution = run(one.recording, solvers="rts")["rts"]
+        position, sd_p, rph, sd_rph = errors(solution, one.truth)
+        velocity, sd_v = velocity_errors(solution, one.truth)
+        found.append([np.mean((e / sd) ** 2) for e, sd in ((position, sd_p), (velocity, sd_v), (rph, sd_rph))])
+    low, high = (float(chdtri(3 * TOWNS, p)) / (3 * TOWNS) for p in (0.995, 0.005))
+    nees = np.mean(found, axis=0)
+    assert nees.max() < high, nees.round(2)
+    assert nees[1:].min() > low, nees.round(2)  # fixes are better than stated, so positions are

@@ -381,7 +381,7 @@ def test_each_block_is_judged_by_itself():
 
 
 def test_a_calibration_has_names_and_no_index():
-    sizes = {SCALE: 6, MOUNTING: 2, AXLE: 1, BODY: 2, ODOMETER_SCALE: 1, ODOMETER_DELAY: 1, LEVER_ARM: 3,
+    sizes = {SCALE: 11, MOUNTING: 2, AXLE: 1, BODY: 2, ODOMETER_SCALE: 1, ODOMETER_DELAY: 1, LEVER_ARM: 3,
              TIME_OFFSET: 1, VELOCITY_TIME_OFFSET: 1, PIVOT: 3, TRAVEL: 2, FOOT_AXIS: 2}  # fmt: skip
     for name, size in (*sizes.items(), (SCALE, 18)):
         found = name_components(name, size, "u")

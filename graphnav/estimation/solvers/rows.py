@@ -32,7 +32,7 @@ class Iterate:
 
     @property
     def scale(self) -> Array | None:
-        """The scale errors of the IMU, (6,), where they are parameters."""
+        """The scale errors of the IMU, (k,), where they are parameters."""
         return self.values[SCALE][0] if SCALE in self.values else None
 
     def move(self, step: Correction) -> Iterate:
