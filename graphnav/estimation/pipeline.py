@@ -29,20 +29,17 @@ from graphnav.estimation.building import start_sigma
 from graphnav.estimation.long_drives import OVERLAP, crop_solutions, share_covariances, split_drive
 from graphnav.estimation.noise.files import MODES
 from graphnav.estimation.noise.imu_floor import apply_measured_floor
-from graphnav.estimation.noise.initial_points import BREAKDOWN
 from graphnav.estimation.noise.model import STATED, NoiseModel, StampOffsets
 from graphnav.estimation.noise.words import describe_far
 from graphnav.estimation.offsets import move_stamps
 from graphnav.estimation.pieces import describe_span, split_pieces
-from graphnav.estimation.preparation import Prepared, Weigh, prepare
+from graphnav.estimation.preparation import Prepared, Weigh, prepare, step_ahead
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.separation import compute_separation
 from graphnav.estimation.solution import Solution, join_solutions
 from graphnav.estimation.solvers.breakdown import explain_singular
-from graphnav.estimation.solvers.ekf import ekf, refilter
-from graphnav.estimation.solvers.linearise import Points
-from graphnav.estimation.solvers.passes import are_near
-from graphnav.estimation.solvers.rts import rts, smooth_backward, smooth_points
+from graphnav.estimation.solvers.ekf import ekf
+from graphnav.estimation.solvers.rts import rts, smooth_backward
 from graphnav.estimation.stamps import (
     describe_stamps,
     find_stamps,
@@ -286,8 +283,7 @@ def _solve(
         from graphnav.estimation.factor_graph.batch import batch
 
         began = time.perf_counter()
-        near = _step_ahead(problem, start)
-        passes.update(filter=1, smoother=1)
+        near = found.ahead or step_ahead(problem, start)
         solved = batch(problem, near.states, near.select_nodes(problem), progress=progress)
         seconds = {"batch": solved.timings["batch"] + time.perf_counter() - began - sum(solved.timings.values())}
         # includes the attempts before
@@ -333,15 +329,6 @@ def _solve(
         for name in solvers
     }
     return {name: shift_to_own_clocks(one, stamps) for name, one in by_name.items()}
-
-
-def _step_ahead(problem: Problem, start: Points) -> Points:
-    """The points after a step of Gauss and Newton, a fraction of the time by filter and smoother, where it is short."""
-    try:
-        ahead = smooth_points(refilter(problem, start, whole=False))
-    except BREAKDOWN:
-        return start
-    return ahead if are_near(ahead, start) else start
 
 
 def _bind_graph(problem: Problem, solution: Solution) -> Callable[[], tuple[Any, Any]]:

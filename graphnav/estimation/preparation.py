@@ -27,6 +27,7 @@ from graphnav.estimation.fixing import fix, split_carriers
 from graphnav.estimation.joint_estimate import JointEstimate, estimate_jointly, revise_jointly
 from graphnav.estimation.noise.apply import apply_noise, drop_parts
 from graphnav.estimation.noise.estimate import NoiseEstimate, estimate_noise
+from graphnav.estimation.noise.initial_points import BREAKDOWN
 from graphnav.estimation.noise.model import STATED, NoiseModel
 from graphnav.estimation.noise.spacing import space_fixes
 from graphnav.estimation.noise.words import describe_noise
@@ -38,15 +39,17 @@ from graphnav.estimation.solvers.passes import (
     FilterPass,
     SmootherPass,
     are_near,
+    subtract_points,
     take_solution_points,
 )
-from graphnav.estimation.solvers.rts import smooth_backward
+from graphnav.estimation.solvers.rts import smooth_backward, smooth_points
 from graphnav.recording import Recording
 
 # whether the evidence of a noise model is wanted, by the problem and the points of its estimate
 Weigh = Callable[[Problem, Points], bool]
 
 _LINEAR_ATTITUDE = 0.1  # rad between linearisation point and smoothed attitude, up to which the smoother is used
+_LINEAR = 0.5  # sigmas of what a step still moves: a mean square of errors over sigmas is a quarter larger
 _SMOOTHINGS = 5  # passes of filter and smoother about their previous points; without convergence a batch is solved
 _MOST_WRONG = 0.5  # share of excluded fixes, beyond which the start is wrong rather than the fixes
 
@@ -68,6 +71,7 @@ class Prepared:
     fixed: dict[str, Array] = field(default_factory=dict)  # `Solution.fixed` of the filter, and of the others ("")
     arcs: dict[str, CarrierArcs] = field(default_factory=dict)  # `Solution.arcs`, the same way
     log_evidence: float = np.inf  # of all measurements by the estimated noise model, where that is wanted
+    ahead: Points | None = None  # a step of Gauss and Newton behind `smoothed`, where it is known
 
     @property
     def diverged(self) -> bool:
@@ -125,7 +129,7 @@ def prepare(
         problem = _drop_refused(problem, forward)
         if any(rows.gate is not None for rows in problem.constraints):
             smoothed = smooth_backward(problem, refilter(problem, smoothed, progress), progress)
-        forward, smoothed = _relinearise(problem, aligned, known, forward, smoothed, progress, passes)
+        forward, smoothed, ahead = _relinearise(problem, aligned, known, forward, smoothed, progress, passes)
     passes.update(filter=1, smoother=1)
     notes = (*describe_freed(noise.freed, recording), *describe_noise(noise, problem))
     epochs, arcs = dict[str, Array](), {"": CarrierArcs()}
@@ -134,13 +138,13 @@ def prepare(
         tell("ambiguities")
         with clock.count_time("ambiguities"):
             fixed = fix(rest, carriers, smoothed, aligned.until, progress)
-        problem, forward, smoothed = fixed.problem, fixed.forward, fixed.smoothed
+        problem, forward, smoothed, ahead = fixed.problem, fixed.forward, fixed.smoothed, None
         notes, epochs = (*notes, *fixed.notes), {"ekf": fixed.filtered_epochs, "": fixed.smoothed_epochs}
         arcs = {"ekf": fixed.filtered_arcs, "": fixed.smoothed_arcs}
     start = use_known_heading(aligned, settings)
     return Prepared(
         problem, noise, start, aligned, built.detections, forward, smoothed, notes, clock.seconds, passes, epochs, arcs,
-        evidence,
+        evidence, ahead,
     )  # fmt: skip
 
 
@@ -223,17 +227,27 @@ def _relinearise(
     smoothed: SmootherPass,
     progress: Progress | None,
     passes: Counter[str],
-) -> tuple[FilterPass, SmootherPass]:
+) -> tuple[FilterPass, SmootherPass, Points | None]:
     """Filter and smooth about better points where the filter was linearised too far from the smoothed solution.
 
-    The points are `known`, those of the noise estimate, if there are any, else the smoother's own; each pass about
-    those of the pass before is a Gauss-Newton step. If that does not settle they are those of a batch solution.
+    Where attitudes stayed, all else did if a step of Gauss and Newton from there moves nothing by a good part of its
+    sigma: a barometer's scale times a height that was not known yet, a lever arm. Returns also the points behind it.
+
+    Where they did not, the points are `known`, those of the noise estimate, if there are any, else the smoother's own;
+    each pass about those of the pass before is such a step. If that does not settle they are those of a batch solution.
 
     If the heading is uncertain and fixes weigh little beside wheels, a filter may turn the mounting by half a turn
     instead of the velocity, a local minimum. So the batch is then solved at once, without wheels first.
     """
     if are_near(smoothed, forward.linearised, _LINEAR_ATTITUDE):
-        return forward, smoothed
+        for _ in range(_SMOOTHINGS):
+            ahead = step_ahead(problem, smoothed)
+            passes.update(filter=1, smoother=1)
+            if np.all(subtract_points(ahead, smoothed) ** 2 <= _LINEAR**2 * smoothed.variance):
+                return forward, smoothed, ahead
+            smoothed = smooth_backward(problem, refilter(problem, ahead, progress), progress)
+            passes.update(filter=1, smoother=1)
+        return forward, smoothed, None
     wheels = aligned.motion is not None and any(c.of_wheels for c in problem.constraints)
     about: Points = smoothed if known is None or len(known.states) != len(problem.t) else known
     for _ in range(int(about is known) if wheels else _SMOOTHINGS):
@@ -241,7 +255,7 @@ def _relinearise(
         smoothed = smooth_backward(problem, refilter(problem, about, progress), progress)
         if are_near(smoothed, about, _LINEAR_ATTITUDE):
             passes.update(filter=1)
-            return ekf(problem, progress, aligned.until, known=smoothed), smoothed
+            return ekf(problem, progress, aligned.until, known=smoothed), smoothed, None
         about = smoothed
     from graphnav.estimation.factor_graph.batch import batch  # imports GTSAM, which few filter runs need
 
@@ -254,7 +268,16 @@ def _relinearise(
     about = take_solution_points(problem, solved, smoothed)
     _, smoothed = smooth_near(problem, about, aligned.until, progress)
     passes.update(filter=3, smoother=2)
-    return ekf(problem, progress, aligned.until, known=smoothed), smoothed
+    return ekf(problem, progress, aligned.until, known=smoothed), smoothed, None
+
+
+def step_ahead(problem: Problem, start: Points) -> Points:
+    """The points after a step of Gauss and Newton, a fraction of the time by filter and smoother, where it is short."""
+    try:
+        ahead = smooth_points(refilter(problem, start, whole=False))
+    except BREAKDOWN:
+        return start
+    return ahead if are_near(ahead, start, _LINEAR_ATTITUDE) else start
 
 
 def _drop_refused(problem: Problem, forward: FilterPass) -> Problem:

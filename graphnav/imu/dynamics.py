@@ -39,12 +39,10 @@ from graphnav.core.earth import LocalFrame
 from graphnav.core.rotation import Array, apply, multiply, mv
 from graphnav.core.state import DIM, Parameter, States
 from graphnav.imu.preintegration import Intervals
-from graphnav.recording import ImuNoise, Recording
+from graphnav.recording import ACROSS, ImuNoise, Recording
 
 SCALE = "imu_scale"
 _I3 = np.eye(3)
-# 1-sigma of cross-axis terms over that of scale errors: data sheets have 0.05 deg beside 0.3 % (ADIS16465)
-ACROSS = 1.0 / 3.0
 # M_ij as (i, j): scale errors, then cross-axis terms
 TERMS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1))
 VEHICLE_TERMS = (TERMS[2:7], (TERMS[0], TERMS[1], TERMS[3], TERMS[5], TERMS[7], TERMS[8]))  # of gyro, accelerometer

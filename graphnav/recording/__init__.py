@@ -19,6 +19,9 @@ from graphnav.core.rotation import Array
 from graphnav.gnss.series import RawGnss
 from graphnav.sensors import Series, list_sensors
 
+# 1-sigma of cross-axis terms over that of scale errors: data sheets have 0.05 deg beside 0.3 % (ADIS16465)
+ACROSS = 1.0 / 3.0
+
 
 @dataclass(frozen=True)
 class ImuNoise:

