@@ -83,11 +83,15 @@ def select_own(solutions: Mapping[str, Solution]) -> dict[str, Solution]:
 
 
 def find_antenna_lever_arm(recording: Recording, solution: Solution) -> Array | None:
-    """Lever arm from the IMU to the antenna, m, RFU: as estimated, else as stated; None without GNSS."""
+    """Lever arm from the IMU to the antenna, m, RFU: as estimated, else as stated; None without GNSS.
+
+    Parts of a long drive have an estimate each, of the same antenna: the mean, weighted by their variances.
+    """
     if recording.gnss is None:
         return None
-    estimated = solution.parameters.get(_ARM)
-    return recording.gnss.lever_arm if estimated is None else estimated.value[-1]
+    if (estimated := solution.parameters.get(_ARM)) is None:
+        return recording.gnss.lever_arm
+    return np.average(estimated.value, axis=0, weights=np.maximum(estimated.sigma, 1e-9) ** -2.0)
 
 
 def read_against(asked: Against, name: str, recording: Recording, reference: Solution) -> Foreign:

@@ -22,8 +22,8 @@ from graphnav.core.notes import get_key
 from graphnav.core.trajectory import Trajectory
 from graphnav.estimation.noise.model import FreedConstant
 from graphnav.estimation.pipeline import run
-from graphnav.estimation.solution import Solution
-from graphnav.evaluation.against import Against, read_against
+from graphnav.estimation.solution import ParameterEstimate, Solution
+from graphnav.evaluation.against import Against, find_antenna_lever_arm, read_against
 from graphnav.recording import Truth
 from graphnav.recording.exporters import write_as
 from graphnav.recording.formats.writer import write_folder
@@ -223,3 +223,12 @@ def test_an_arm_that_only_ours_is_compared_with_is_told(ekf, tmp_path, of, used,
     write_as("csv", moved(0.0), tmp_path / "its.csv", None)
     found = read_against(Against(tmp_path / "its.csv"), "its", replace(RECORDING, truth=truth), reference)
     assert ("against.lever_arm" in {get_key(note) for note in found.notes}) == told
+
+
+def test_parts_of_a_long_drive_have_one_antenna(ekf):
+    parts = ParameterEstimate(
+        np.array([0.0, 30.0]), np.array([[0.1, 1.0, 1.0], [0.4, 1.0, 2.0]]), np.array([[0.1] * 3, [0.2] * 3]),
+        np.ones(3), "m",
+    )  # fmt: skip
+    found = find_antenna_lever_arm(RECORDING, replace(ekf, parameters={LEVER_ARM: parts}))
+    np.testing.assert_allclose(found, [0.16, 1.0, 1.2])
