@@ -120,8 +120,7 @@ def prepare(
     aligned = built.aligned
     problem = drop_parts(apply_noise(built.problem, noise))
     try:
-        near = known if known is not None and len(known.values) == len(problem.t) else None
-        forward, smoothed = _filter_and_smooth(problem, aligned.until, None, clock, progress, near)
+        forward, smoothed = _filter_and_smooth(problem, aligned.until, None, clock, progress)
     except EstimationError:  # from a rough start its first pass may diverge, where that of the noise model did not
         if known is None:
             raise
@@ -150,11 +149,10 @@ def prepare(
 
 
 def _filter_and_smooth(
-    problem: Problem, opening: float | None, known: Points | None, clock: Clock, progress: Progress | None,
-    near: Points | None = None,
-) -> tuple[FilterPass, SmootherPass]:  # fmt: skip
-    """Filter, with its opening linearised at known points if there are any, and smooth; it begins `near` others."""
-    forward = ekf(problem, progress, opening, known, guess=near)  # its own solution has the time it takes
+    problem: Problem, opening: float | None, known: Points | None, clock: Clock, progress: Progress | None
+) -> tuple[FilterPass, SmootherPass]:
+    """Filter, with its opening linearised at known points if there are any, and smooth."""
+    forward = ekf(problem, progress, opening, known)  # its own solution has the time it takes
     with clock.count_time("smoother"):
         return forward, smooth_backward(problem, forward, progress)
 

@@ -2,7 +2,7 @@
 
 A filter linearised at its own estimates needs the estimate before it can linearise the next rows: one keyframe at a
 time, one kind of rows after the other. For few rows the calls cost far more than the arithmetic. So the estimates are
-guessed, by an earlier solution or the IMU alone, for a stretch of keyframes: X_0 at the prediction of a keyframe, and X_i after the i-th kind
+guessed, by the IMU alone, for a stretch of keyframes: X_0 at the prediction of a keyframe, and X_i after the i-th kind
 of its rows. All rows and steps are linearised at the guess together, and filtered as rows at given points are, by
 errors y about X_0. An error about X_i is
 
@@ -50,14 +50,12 @@ class StretchFilter:
     P_predicted, P : (K, D, D) and
     F : (K-1, 15, w), to be filled.
     stays : error of the estimates by which the iteration ends, sigmas.
-    guess : points of all keyframes to begin with, as of a smoother before; else the prediction by the IMU alone.
     """
 
     def __init__(
         self, problem: Problem, steps: Advance, stack: Stack, P_predicted: Array, P: Array, F: Array,
-        stays: float = STAYS, guess: Points | None = None,
+        stays: float = STAYS,
     ) -> None:  # fmt: skip
-        self._guess = guess
         self._problem, self._steps, self._stack = problem, steps, stack
         self._P_predicted, self._P, self._F = P_predicted, P, F
         self._length, self._stays, blocks = 2 * _SHORTEST, stays, stack.single
@@ -105,9 +103,7 @@ class StretchFilter:
         self, k: int, k1: int, x: Points, P: Array, predicted: Points, filtered: Points, alone: bool = False
     ) -> int:
         before = np.full(k1 - k, np.nan)
-        each = np.repeat(np.arange(k, k1), self._end[k:k1] - self._start[k:k1] + 1)
-        known = self._guess is not None and not alone
-        points = self._guess.take(each) if known else self._predict_points(k, k1, x).take(each - k)
+        points = self._guess_points(k, k1, x)
         most = _MAX_LINEARISATIONS + int(self._end[k] - self._start[k]) * alone
         for left in range(most - 1, -1, -1):
             try:
@@ -133,8 +129,8 @@ class StretchFilter:
         self._length = max(self._length // 2, _SHORTEST)
         return k
 
-    def _predict_points(self, k: int, k1: int, x: Points) -> Points:
-        """Prediction of keyframes by the IMU alone."""
+    def _guess_points(self, k: int, k1: int, x: Points) -> Points:
+        """Prediction by the IMU alone."""
         states, values, scale = x.states, x.values[0], self._problem.columns.get(SCALE)
         reached, known = [], []
         for j in range(k, k1):
@@ -144,7 +140,8 @@ class StretchFilter:
                 values = self._steps.predict(j - 1, values)
             reached.append(states)
             known.append(values)
-        return Points(States.stack(reached), np.array(known))
+        each = self._end[k:k1] - self._start[k:k1] + 1
+        return Points(States.stack(reached), np.array(known)).take(np.repeat(np.arange(k1 - k), each))
 
     def _filter_about(self, k: int, k1: int, x: Points, P: Array, points: Points) -> tuple[Array, Points]:
         """Filter keyframes k to k1 about points; returns the largest correction, sigmas, up to each keyframe, and the
