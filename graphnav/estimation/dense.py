@@ -3,7 +3,15 @@
 A filter's state between keyframes is that prediction. A smoother knows the next keyframe too; the difference between
 prediction and that keyframe is distributed over the interval so that position, velocity and attitude remain consistent:
 that of position is the cubic that starts at zero and ends with the differences of position and velocity, that of
-velocity its derivative, attitude and biases are linear. Covariances are interpolated linearly.
+velocity its derivative, attitude and biases are linear. Covariances are interpolated linearly, and what white noise of
+the IMU adds between the ends comes on top, alike along all axes: with s the fraction of an interval of length T, q_v
+and q_theta the variances that it has added at its end, to a filter
+
+    theta: q_theta s              v: q_v s                               p: q_v T^2 s^3 / 3
+
+and to a smoother, which knows both ends (the bridges of a Wiener process and of an integrated one)
+
+    theta: q_theta s (1 - s)      v: q_v s (1 - s) (1 - 3 s (1 - s))     p: q_v T^2 (s (1 - s))^3 / 3
 """
 
 from __future__ import annotations
@@ -15,7 +23,7 @@ import numpy as np
 
 from graphnav.core.earth import LocalFrame
 from graphnav.core.rotation import Array
-from graphnav.core.state import States, split_covariance
+from graphnav.core.state import BLOCKS, DIM, States, split_covariance
 from graphnav.estimation.problem import Problem
 from graphnav.imu.dynamics import EarthMotion, convert_to_biases
 from graphnav.imu.preintegration import integrate_within
@@ -61,17 +69,34 @@ class Dense(AtKeyframes):
     ba: Array  # (K-1, 3) biases, scale errors included, of each interval
     bg: Array  # (K-1, 3)
     smooth: bool
+    white: Array  # (2, K-1) q_theta, q_v
 
     def __call__(self, t: Array) -> tuple[States, Array]:
         """States and covariances (M, 15, 15) at ascending times from `start` to `end`."""
         k, s = self._locate(t)
-        return self._reach(t, k, s), _interpolate_covariance(self.covariance, k, s)
+        P = _interpolate_covariance(self.covariance, k, s)
+        for name, more in self._add_white(k, s).items():
+            at = np.arange(*BLOCKS[name].indices(DIM))
+            P[:, at, at] += more[:, None]
+        return self._reach(t, k, s), P
 
     def interpolate_blocks(self, t: Array) -> tuple[States, dict[str, Array]]:
         """The same with covariances (6, M) of position, velocity and attitude each by itself."""
         k, s = self._locate(t)
         apart = {name: own.take(k, axis=1) + s * change.take(k, axis=1) for name, (own, change) in self._apart.items()}
+        for name, more in self._add_white(k, s).items():
+            apart[name][:3] += more
         return self._reach(t, k, s), apart
+
+    def _add_white(self, k: Array, s: Array) -> dict[str, Array]:
+        """Variances (M,) of position, velocity and attitude that are not in those of the keyframes."""
+        turn, gain = self.white.take(k, axis=1)
+        T = np.diff(self.t)[k]
+        if not self.smooth:
+            s = np.where(np.isclose(s, 1.0, rtol=0.0, atol=1e-9), 0.0, s)  # the keyframe's own
+            return {"theta": turn * s, "v": gain * s, "p": gain * T**2 * s**3 / 3.0}
+        b = s * (1.0 - s)
+        return {"theta": turn * b, "v": gain * b * (1.0 - 3.0 * b), "p": gain * T**2 * b**3 / 3.0}
 
     @cached_property
     def _apart(self) -> dict[str, tuple[Array, Array]]:
@@ -143,4 +168,6 @@ def make_dense(problem: Problem, states: States, covariance: Array, scale: Array
         scale = np.broadcast_to(scale, (len(states), scale.shape[-1]))[:-1]
         of_accel, of_gyro = convert_to_biases(scale, problem.intervals.force, problem.intervals.rate)
         ba, bg = ba + of_accel, bg + of_gyro
-    return Dense(problem.t, states, covariance, problem.samples, problem.frame, ba, bg, smooth)
+    noise = np.diagonal(problem.intervals.covariance, axis1=1, axis2=2)
+    white = np.stack([noise[:, BLOCKS[name]].mean(axis=1) for name in ("theta", "v")])
+    return Dense(problem.t, states, covariance, problem.samples, problem.frame, ba, bg, smooth, white)

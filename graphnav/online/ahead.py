@@ -75,7 +75,7 @@ def predict_since(
         ba, bg = ba + of_accel, bg + of_gyro
     ends, both = np.array([T, now.t]), np.stack([newest.covariance[:DIM, :DIM], now.covariance])
     states = States.stack([start, now.state])
-    between = Dense(ends, states, both, bridge_gaps(imu), frame, ba, bg, smooth=False)
+    between = Dense(ends, states, both, bridge_gaps(imu), frame, ba, bg, False, np.zeros((2, len(ba))))
     return t, *between(t)
 
 
