@@ -19,6 +19,10 @@ from graphnav.core.trajectory import Trajectory
 from graphnav.detectors import detect
 from graphnav.estimation import faults
 from graphnav.estimation.alignment import align
+from graphnav.estimation.building import Clock, ProblemBuilder
+from graphnav.estimation.noise.decision import log_evidence
+from graphnav.estimation.noise.estimate import estimate_noise
+from graphnav.estimation.noise.exclusion import estimate_disturbed_intervals, estimate_without_faults
 from graphnav.estimation.noise.spans import list_before, split_at_steps
 from graphnav.estimation.pipeline import choose_origin, run
 from graphnav.estimation.problem import Problem, build_problem
@@ -269,6 +273,23 @@ def test_reflections_that_follow_each_other_are_left_out(shared_data: Path) -> N
 
 
 # ---------------------------------------------------------------------------------------------------------- noise
+
+
+def test_disturbed_intervals_stand_only_with_more_evidence() -> None:
+    """A burst of reflections makes many intervals of the IMU look disturbed, one by one, at a loss for all of them."""
+    recording = read(Path(__file__).parents[2] / "data" / "tokyo").without("odometer")
+    assert recording.gnss is not None
+    t = recording.gnss.t - recording.gnss.t[0]
+    burst = (t > 58.0) & (t < 73.0)
+    recording = moved(recording, np.flatnonzero(burst), np.array([29.0, 25.0, 16.0]))
+    settings = parse_settings({})
+    frame = LocalFrame(choose_origin(recording))
+    every = ProblemBuilder(recording, recording, settings, frame, Clock())
+    detections = detect(recording, settings)
+    base = every.build(every.align(recording, detections.stationary), detections, parts=True).problem
+    found = estimate_without_faults(base, estimate_noise(base))
+    disturbed = estimate_disturbed_intervals(base, found)
+    assert log_evidence(base, disturbed) >= log_evidence(base, found)
 
 
 def scattered(recording: Recording, bad: Array, times: float, seed: int) -> Recording:

@@ -266,7 +266,8 @@ def estimate_disturbed_intervals(base: Problem, found: NoiseEstimate) -> NoiseEs
         if free.noise.excluded == found.noise.excluded:  # the same model, already converging
             start, near = free.noise, free.get_linearisation(base)
     disturbed = estimate_noise(base, None, start, near, intervals=True)
-    return replace(disturbed, passes=passes + disturbed.passes)
+    best = max(found, disturbed, key=lambda one: log_evidence(base, one))
+    return replace(best, passes=passes + disturbed.passes)
 
 
 def find_suspects(base: Problem, noise: NoiseModel, found: NoiseEstimate) -> list[Span]:
