@@ -12,7 +12,7 @@ to k, those of parameters that step to their next node, and those of the measure
 For a chain this is GTSAM's elimination in the same order, on matrices that are dense anyway. This module has the rows
 and the results; `graphnav.estimation.solvers.elimination` performs it.
 
-A message may carry tests (`graphnav.estimation.solvers.watch`) for persistent errors of fixes: additional columns on
+A message may carry tests (`graphnav.estimation.faults.watch`) for persistent errors of fixes: additional columns on
 the right, which go through the same QR.
 """
 
@@ -30,12 +30,12 @@ from graphnav.core import rotation
 from graphnav.core.errors import EstimationError
 from graphnav.core.rotation import Array, mv
 from graphnav.core.state import DIM, States
+from graphnav.estimation.faults.watch import Watch
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.breakdown import explain_smoother
 from graphnav.estimation.solvers.linearise import Columns, Points, Step, linearise, linearise_links, scale_at, shift
 from graphnav.estimation.solvers.robust import soften, weigh_squares
 from graphnav.estimation.solvers.turning import add_turning, change_of_point, split_turn
-from graphnav.estimation.solvers.watch import Watch
 from graphnav.imu.dynamics import SCALE, ImuFactors
 
 _I = np.eye(DIM)

@@ -17,6 +17,7 @@ import numpy as np
 
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, States
+from graphnav.estimation.faults.watch import Watch
 from graphnav.estimation.solvers.elimination import Predicted, predict_message, update_late
 from graphnav.estimation.solvers.linearise import shift
 from graphnav.estimation.solvers.points import move_covariance
@@ -34,7 +35,6 @@ from graphnav.estimation.solvers.stages import (
     predict_stage,
 )
 from graphnav.estimation.solvers.turning import split_turn, turn_covariance
-from graphnav.estimation.solvers.watch import Watch
 from graphnav.recording import ImuNoise
 
 # share of the noise of a second's force that a neglected turn may cause: as it is systematic, it accumulates
