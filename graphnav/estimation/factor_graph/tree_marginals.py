@@ -21,6 +21,7 @@ from graphnav.estimation.factor_graph.tree_nodes import Keyframe, Variable, fill
 from graphnav.estimation.solvers.breakdown import explain_undetermined
 from graphnav.estimation.solvers.linearise import Columns, shift
 from graphnav.estimation.solvers.points import move_covariance
+from graphnav.estimation.solvers.stages import Message
 from graphnav.estimation.solvers.window import SettledStates
 
 _AT_ONCE = 45  # variables: GTSAM's bookkeeping of one elimination grows faster than what it eliminates
@@ -58,6 +59,46 @@ def compute_newest_root(tree: Tree, columns: Columns) -> Array:
     sd = np.sqrt(np.diag(P))
     w, V = np.linalg.eigh(P / sd[:, None] / sd)
     return np.asarray(np.linalg.qr((V / np.sqrt(np.maximum(w, np.finfo(float).eps))).T, "r") / sd)
+
+
+def find_head(tree: Tree) -> Message:
+    """What the first keyframe and all before it say of its state and parameters, about where these are now.
+
+    From the factors themselves: a covariance of ambiguities and clocks, known to kilometres each and to millimetres
+    together, loses what tells them apart.
+    """
+    first = tree.keyframes[0]
+    later = {i for k in tree.keyframes[1:] for i in k.slots.values()}
+    D, own = DIM + len(first.values), {x.key: x for x in tree.variables.values() if x.first <= first.number}
+    into = {key: np.zeros((len(x.unit), D)) for key, x in own.items()}  # errors about anchors by those about values
+    into[first.state.key][:, :DIM] = np.eye(DIM)
+    into[first.state.key][:3, :3] = rotation.right_jacobian_inverse(first.state.delta[None, :3])[0]
+    for name, at in first.columns.items():
+        node, part = first.nodes[name]
+        into[node.key][part, at] = np.eye(at.stop - at.start)
+    gone = [(key, i) for key in own for i in np.flatnonzero(~into[key].any(axis=1))]  # parameters that began anew
+    factors, point = tree.isam.getFactorsUnsafe(), tree.isam.getLinearizationPoint()
+    rows = []
+    for i in range(factors.size()):
+        one = factors.at(i)
+        if i in later or one is None or not own.keys() >= set(one.keys()):
+            continue
+        linear = gtsam.JacobianFactor(one.linearize(point))
+        A, b = linear.jacobian()
+        table, end = np.zeros((len(b), len(gone) + D + 1)), 0
+        table[:, -1] = b
+        for key in list(linear.keys()):
+            x, begin = own[key], end
+            end += len(x.unit)
+            A_e = A[:, begin:end] / x.unit
+            table[:, len(gone) : -1] += A_e @ into[key]
+            table[:, -1] -= A_e @ x.delta
+            for j, (of, row) in enumerate(gone):
+                if of == key:
+                    table[:, j] = A_e[:, row]
+        rows.append(table)
+    R = np.linalg.qr(np.concatenate(rows), "r")[len(gone) :, len(gone) :]
+    return Message.of(first.estimate, first.values, first.columns, R[:D, :D], R[:D, D])
 
 
 @dataclass(frozen=True)
