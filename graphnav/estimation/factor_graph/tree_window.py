@@ -20,6 +20,7 @@ from graphnav.estimation.factor_graph.tree_marginals import (
     begin_elimination,
     compute_newest_root,
     eliminate,
+    find_head,
     settle,
 )
 from graphnav.estimation.solvers.elimination import Predicted
@@ -130,6 +131,8 @@ class TreeWindow(Window):
         self.tree.truncate(keep + self.tree.held)
         if self.stages:
             self._adopt_all()
+        else:
+            self.head = self.head.move(self.head.estimate)
 
     def settle(self, count: int) -> SettledStates:
         """Let the first `count` stages go, as the tree knows them."""
@@ -145,6 +148,7 @@ class TreeWindow(Window):
         if len(self.tree) > self.tree.held + count:
             self.tree.marginalise(self.tree.held + count - 1)
             self.tree.hold()
+            self.head = replace(find_head(self.tree), tests=self.head.tests)
         else:
             self.tree = Tree(self.head, self.turn)
         return out
