@@ -33,16 +33,16 @@ def make_jacobian_factor(blocks: Sequence[tuple[int, Array]], b: Array) -> gtsam
         make: Any = gtsam.JacobianFactor
         parts = ((key, np.asfortranarray(A)) for key, A in blocks)
         return make(*(part for block in parts for part in block), b, _make_unit_noise(len(b)))
-    point = gtsam.Values()
+    keys, point = [key for key, _ in blocks], gtsam.Values()
     for key, A in blocks:
         point.insert(key, np.zeros(A.shape[1]))
 
-    def differentiate(_: gtsam.CustomFactor, __: gtsam.Values, derivatives: list[Array]) -> Array:
+    def differentiate(factor: gtsam.CustomFactor, at: gtsam.Values, derivatives: Any) -> Array:
         for i, (_, A) in enumerate(blocks):
             derivatives[i] = A
         return -b
 
-    rows = gtsam.CustomFactor(_make_unit_noise(len(b)), [key for key, _ in blocks], differentiate)
+    rows = gtsam.CustomFactor(_make_unit_noise(len(b)), keys, differentiate)
     return gtsam.JacobianFactor(rows.linearize(point))
 
 

@@ -97,7 +97,7 @@ def find_head(tree: Tree) -> Message:
                 if of == key:
                     table[:, j] = A_e[:, row]
         rows.append(table)
-    R = np.linalg.qr(np.concatenate(rows), "r")[len(gone) :, len(gone) :]
+    R = np.asarray(np.linalg.qr(np.concatenate(rows), "r"))[len(gone) :, len(gone) :]
     return Message.of(first.estimate, first.values, first.columns, R[:D, :D], R[:D, D])
 
 
