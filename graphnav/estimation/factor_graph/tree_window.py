@@ -47,7 +47,7 @@ class TreeWindow(Window):
             self.tree = Tree(self.head, self.turn)
         ahead = self.expect(place) if ahead is None else replace(ahead, place=place)
         stage, e = self._update(ahead)
-        self.tree.add(place, ahead, stage.measured)
+        self.tree.add(place, ahead, [one.settle(e) for one in stage.measured])
         self._append(self._adopt(stage))
         return float(np.linalg.norm(e[:3]))
 

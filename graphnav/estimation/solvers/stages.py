@@ -19,7 +19,7 @@ the right, which go through the same QR.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
@@ -147,6 +147,11 @@ class Measured:
         weight = np.sqrt(weigh_squares(self.kernel, np.linalg.norm(left, axis=-1), self.scale)[0])[:, None]
         with np.errstate(divide="ignore"):
             return self.H * weight[..., None], self.b * weight, self.sigma / weight
+
+    def settle(self, y: Array) -> Measured:
+        """The same with the kernel's weights for the error state y (D,) for good."""
+        H, b, sigma = self.weigh(y, 1)
+        return replace(self, H=H, b=b, sigma=sigma, kernel="none")
 
 
 @dataclass(frozen=True)
