@@ -167,7 +167,7 @@ def test_what_is_left_of_the_past_is_what_the_last_to_leave_knew(built: Problem)
     tree.marginalise(count)
     other.truncate(count + 1)
     found, newest = find_head(tree), other.newest
-    root = compute_newest_root(other, newest.columns)
+    root = compute_newest_root(other)
     assert found.columns == newest.columns
     moved, P = found.move(found.estimate), np.linalg.inv(root.T @ root)
     sd = np.sqrt(np.diag(P))

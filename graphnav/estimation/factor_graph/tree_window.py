@@ -61,7 +61,7 @@ class TreeWindow(Window):
         """Replace the newest message by the tree's, with its error state."""
         stage = self._adopt(self.stages[-1])
         m = stage.message
-        R = compute_newest_root(self.tree, m.columns)
+        R = compute_newest_root(self.tree)
         self.stages[-1] = replace(stage, message=Message.of(m.state, m.values, m.columns, R, m.z, m.tests))
         self._means = None
 
