@@ -24,7 +24,7 @@ from graphnav.estimation.factor_graph.tree_marginals import (
     settle,
 )
 from graphnav.estimation.solvers.elimination import Predicted
-from graphnav.estimation.solvers.revision import Renewed, Renewing
+from graphnav.estimation.solvers.revision import Renewing
 from graphnav.estimation.solvers.stages import Message, Place, Stage
 from graphnav.estimation.solvers.window import SettledStates, Window
 
@@ -74,29 +74,24 @@ class TreeWindow(Window):
         moved = self.tree.find_moves() > share
         return int(np.argmax(moved)) - self.tree.held if moved.any() else None
 
-    def converge(self, share: float = 1.0, always: bool = False, renewed: Renewed | None = None) -> int:
-        """Relinearise until nothing has moved; returns how often."""
-        if not self.stages:
-            return 0
-        count = 0
-        if always:
-            self.tree.linearise_again(range(self.tree.held, len(self.tree)), renewed)
-            self._relinearise_keyframes(len(self))
-            share, count = min(share, _CONVERGED_SHARE), 1
-        while count < _MAX_STEPS and (done := self.tree.relinearise(share, renewed)):
-            self._relinearise_keyframes(done)
-            count += 1
-        return count
+    def revise(self, count: int, renewed: Renewing | None, always: bool = False, share: float = 1.0) -> bool:
+        """As of `Window`, but all at once; False, as nothing is left to do."""
 
-    def revise(self, count: int, renewed: Renewing, always: bool = False) -> bool:
-        """As `converge`, all at once; False, as nothing is left to do."""
-
-        def solve_at_once(first: int, end: int) -> Sequence[Place]:
+        def renew_at_once(first: int, end: int) -> Sequence[Place]:
+            assert renewed is not None
             while (places := renewed(first, end)) is None:
                 pass
             return places
 
-        self.converge(always=always, renewed=solve_at_once)
+        again = None if renewed is None else renew_at_once
+        if always and self.stages:
+            self.tree.linearise_again(range(self.tree.held, len(self.tree)), again)
+            self._relinearise_keyframes(len(self))
+            share = min(share, _CONVERGED_SHARE)
+        for _ in range(_MAX_STEPS - always if self.stages else 0):
+            if not (done := self.tree.relinearise(share, again)):
+                break
+            self._relinearise_keyframes(done)
         return False
 
     def smooth_back(self, count: int, most: int) -> bool:
