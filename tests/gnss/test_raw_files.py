@@ -144,6 +144,21 @@ def same(found: Ephemerides, whole: Ephemerides) -> None:
     np.testing.assert_array_equal(found.klobuchar, whole.klobuchar)
 
 
+@pytest.mark.parametrize("name", ["raw_gnss_slac_20210428/brdc1180.21n.gz", "ucr_riverside_20200712/nav.gz"])
+def test_of_ephemerides_cut_in_a_record_all_before_it_are_used(shared_data: Path, tmp_path: Path, name: str) -> None:
+    text = gzip.decompress((shared_data / name).read_bytes())
+    begins = [m.start() for m in re.finditer(rb"^(?! {3}).", text.partition(b"END OF HEADER")[2], flags=re.MULTILINE)]
+    begin, end = (text.find(b"END OF HEADER") + 13 + begins[k] for k in (40, 41))
+    path = tmp_path / "nav"
+    path.write_bytes(text[:begin])
+    before = read_navigation([path])
+    for at in range(begin + 2, text.rfind(b"\n", 0, end - 1), 23):
+        path.write_bytes(text[:at])
+        found = read_navigation([path])
+        assert [get_key(note) for note in found.remarks] == ["raw.cut"]
+        same(found, before)
+
+
 def list_records(text: str) -> Iterator[list[str]]:
     """The records of a file of version 3, each as its lines, satellites as G05."""
     body = text.partition("END OF HEADER")[2].split("\n", 1)[1]
