@@ -27,7 +27,7 @@ from graphnav.recording import Recording, take_rows
 STRAIGHT, _STATES = 10_800.0, 44  # s solved at once at most: 3 GB at a keyframe a second and 44 error states
 PART = 3_600.0  # s of a part at most: twice the keyframes that the estimation of noise needs
 OVERLAP = (
-    # s: inertial information from ten minutes ago is negligible (`graphnav.estimation.solvers.watch.OLDEST`)
+    # s: inertial information from ten minutes ago is negligible (`graphnav.estimation.faults.watch.OLDEST`)
     600.0
 )
 

@@ -24,8 +24,8 @@ from graphnav.core.progress import Progress, send_progress, tell
 from graphnav.core.state import BLOCKS
 from graphnav.detectors import Detector, detect
 from graphnav.detectors import check_own as check_detectors
-from graphnav.estimation import faults
 from graphnav.estimation.building import start_sigma
+from graphnav.estimation.faults.excluded import describe_faults, find_fault_spans
 from graphnav.estimation.long_drives import OVERLAP, crop_solutions, share_covariances, split_drive
 from graphnav.estimation.noise.files import MODES
 from graphnav.estimation.noise.imu_floor import apply_measured_floor
@@ -255,7 +255,7 @@ def _solve(
         recording = move_stamps(recording, stamps)
         found = prepare_moved(recording, stamps.rate)
     problem, forward, smoothed = found.problem, found.forward, found.smoothed
-    wrong = faults.find_fault_spans(problem, smoothed)
+    wrong = find_fault_spans(problem, smoothed)
     notes = (
         *found.start.notes,
         *undone,
@@ -263,7 +263,7 @@ def _solve(
         *found.detections.notes,
         *describe_stamps(stamps),
         *found.notes,
-        *faults.describe_faults(wrong, problem),
+        *describe_faults(wrong, problem),
     )
     notes = (*notes, *describe_far(problem, smoothed))
     start, passes = smoothed, Counter(found.passes)

@@ -19,10 +19,10 @@ from graphnav.core.errors import EstimationError
 from graphnav.core.progress import Progress, tell
 from graphnav.core.rotation import Array
 from graphnav.detectors import Detections
-from graphnav.estimation import faults
 from graphnav.estimation.alignment import Alignment, use_known_heading
 from graphnav.estimation.building import BuiltProblem, Clock, ProblemBuilder, has_diverged
 from graphnav.estimation.contradictions import describe_freed, free
+from graphnav.estimation.faults.excluded import weigh_rows
 from graphnav.estimation.fixing import fix, split_carriers
 from graphnav.estimation.joint_estimate import JointEstimate, estimate_jointly, revise_jointly
 from graphnav.estimation.noise.apply import apply_noise, drop_parts
@@ -283,4 +283,4 @@ def step_ahead(problem: Problem, start: Points) -> Points:
 def _drop_refused(problem: Problem, forward: FilterPass) -> Problem:
     """The problem without the rows that a gate refused in the filter: no solver uses them."""
     refused = {c.name: forward.records[c.name].decided for c in problem.constraints if c.gate is not None}
-    return faults.weigh_rows(problem, refused) if refused else problem
+    return weigh_rows(problem, refused) if refused else problem

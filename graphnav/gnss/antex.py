@@ -9,7 +9,7 @@ import numpy as np
 
 from graphnav.core.errors import RecordingError
 from graphnav.core.rotation import Array
-from graphnav.gnss.files import count_days, unpack_bytes
+from graphnav.gnss.files import count_days, take_whole_lines, unpack_bytes
 from graphnav.gnss.signals import SYSTEMS, C, Ids, number_satellite
 
 _UNLIMITED = 1e12  # s
@@ -36,7 +36,7 @@ def read_antex(path: Path) -> tuple[Antennas, tuple[str, ...]]:
     RecordingError
         If it is not an ANTEX file, or a field cannot be read, naming the line.
     """
-    data = unpack_bytes(path)
+    data, ends = take_whole_lines(unpack_bytes(path), path.name, b"END OF ANTENNA")
     lines = data.decode("latin-1").splitlines()
     if not lines or "ANTEX VERSION" not in lines[0]:
         raise RecordingError(f"{path}: not an ANTEX file; its first line names no version", key="file.kind")
@@ -68,7 +68,7 @@ def read_antex(path: Path) -> tuple[Antennas, tuple[str, ...]]:
             ) from None
     if not out:
         raise RecordingError(f"{path}: holds no antennas of satellites", key="raw.no_antennas")
-    return {one: tuple(many) for one, many in out.items()}, data.remarks
+    return {one: tuple(many) for one, many in out.items()}, ends
 
 
 def compute_antenna_paths(

@@ -68,6 +68,25 @@ def unpack_bytes(path: Path) -> Unpacked:
     return out
 
 
+def note_cut(name: str, what: str) -> Note:
+    """Make the remark on a file that ends within a record."""
+    return Note("raw.cut", f"{name}: ends in the middle of a {what}; everything before it is used")
+
+
+def take_whole_lines(data: Unpacked, name: str, last: bytes = b"") -> tuple[bytes, tuple[str, ...]]:
+    """Drop a line that is cut off, as half a number is another number; remarks say so.
+
+    Parameters
+    ----------
+    last : what is in the last line of a whole file of this kind; if nothing is, a line break ends it.
+    """
+    if last and last in data.rstrip().rpartition(b"\n")[2]:
+        return data, data.remarks
+    whole = data[: data.rfind(b"\n") + 1]
+    cut = bool(last) or len(whole) < len(data)
+    return whole, data.remarks or ((note_cut(name, "record"),) if cut else ())
+
+
 class Lines:
     """Text as an array of bytes, with the offsets and lengths of its lines."""
 

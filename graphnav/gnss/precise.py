@@ -18,7 +18,7 @@ from graphnav.core.notes import Note, format_count
 from graphnav.core.rotation import Array
 from graphnav.core.timescales import utc_to_gps
 from graphnav.gnss.ephemeris import Placed, rotate_earth
-from graphnav.gnss.files import Lines, count_days, parse_numbers, unpack_bytes
+from graphnav.gnss.files import Lines, count_days, parse_numbers, take_whole_lines, unpack_bytes
 from graphnav.gnss.signals import SYSTEMS, C, Ids, number_satellite
 
 _NODES = 11  # of the polynomial
@@ -119,9 +119,9 @@ def _drop_repeated(t: Array, x: Array) -> tuple[Array, Array]:
 
 def _read_sp3(path: Path, remarks: list[str]) -> tuple[Array, Ids, Array, Array]:
     """Times, satellites, positions (m) and clocks (s) of all position records."""
-    data = unpack_bytes(path)
+    data, ends = take_whole_lines(unpack_bytes(path), path.name, b"EOF")
     lines = Lines(data)
-    remarks += data.remarks
+    remarks += ends
     head = lines.get_text(0)
     if head[:1] != "#" or head[1:2] not in "abcd":
         raise RecordingError(f"{path}: not an SP3 file; its first line begins '{head[:2]}'", key="file.kind")
@@ -132,8 +132,6 @@ def _read_sp3(path: Path, remarks: list[str]) -> tuple[Array, Ids, Array, Array]
     if not len(epoch) or not len(own):
         raise RecordingError(f"{path}: holds no positions", key="raw.no_positions")
     t = _read_stamps(lines, epoch, 3, scale, path)
-    if not lines.whole and own[-1] == len(lines) - 1:
-        own = own[:-1]
     try:
         value = parse_numbers(lines.take_block(own, 4, 60), 14)
         names = [bytes(x).decode() for x in lines.take_block(own, 1, 4)]
@@ -155,8 +153,8 @@ def _read_sp3(path: Path, remarks: list[str]) -> tuple[Array, Ids, Array, Array]
 
 def _read_clk(path: Path, remarks: list[str]) -> tuple[Array, Ids, Array]:
     """Times, satellites and clocks (s) of all satellite records."""
-    text = unpack_bytes(path)
-    remarks += text.remarks
+    text, ends = take_whole_lines(unpack_bytes(path), path.name)
+    remarks += ends
     if b"CLOCK" not in text[:8000] and b"RINEX VERSION" not in text[:200]:
         raise RecordingError(f"{path}: not a RINEX clock file", key="file.kind")
     scale = "GPS"

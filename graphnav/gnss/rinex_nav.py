@@ -16,7 +16,7 @@ from graphnav.core.files import parse_number
 from graphnav.core.notes import Note, format_count
 from graphnav.core.timescales import WEEK, utc_to_gps
 from graphnav.gnss.ephemeris import Ephemerides, Glonass, Kepler
-from graphnav.gnss.files import count_days, unpack_bytes
+from graphnav.gnss.files import count_days, note_cut, unpack_bytes
 from graphnav.gnss.signals import BEIDOU, GALILEO, GLONASS, GPS, NAVIC, QZSS, SBAS, SYSTEMS
 
 _BDT = 14.0  # s, GPS minus BeiDou time
@@ -112,16 +112,19 @@ def _read(path: Path, found: _Navigation) -> tuple[str, ...]:
             found.skipped[reason] = found.skipped.get(reason, 0) + 1
             k = next((j for j in range(k + 1, len(lines)) if lines[j][:3] != "   "), len(lines))
             continue
+        rest = lines[k + 1 : k + count]
+        if k + count > len(lines) and all("   ".startswith(line[:3]) for line in rest) and (system >= 0 or not rest):
+            return data.remarks or (note_cut(path.name, "record"),)
         if system < 0 or not name[1:].isdigit():
             found.broken.append(k + 1)
             k += 1
             continue
-        whole = len(lines) - k >= count and all(line[:3] == "   " for line in lines[k + 1 : k + count])
+        whole = len(rest) == count - 1 and all(line[:3] == "   " for line in rest)
         try:
             if not whole:
                 raise ValueError
             at = 23 if not default else 22
-            values = _parse_values([(text, at), *((line, at - 19) for line in lines[k + 1 : k + count])])
+            values = _parse_values([(text, at), *((line, at - 19) for line in rest)])
             _add(found, system, int(name[1:]), _parse_date(text, bool(default)), values, message)
         except (ValueError, IndexError):
             found.broken.append(k + 1)

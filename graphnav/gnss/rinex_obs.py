@@ -19,9 +19,9 @@ from graphnav.core.files import parse_number
 from graphnav.core.notes import Note, format_count
 from graphnav.core.rotation import Array
 from graphnav.core.timescales import WEEK, utc_to_gps
-from graphnav.gnss.files import Lines, count_days, find_moved_points, parse_numbers, unpack_bytes
+from graphnav.gnss.files import Lines, count_days, find_moved_points, note_cut, parse_numbers, unpack_bytes
 from graphnav.gnss.rinex_header import Header, read_rinex_header
-from graphnav.gnss.series import Observations, drop_repeated, note_cut
+from graphnav.gnss.series import Observations, drop_repeated
 from graphnav.gnss.signals import (
     BEIDOU,
     GLONASS,

@@ -86,11 +86,6 @@ def join_files(parts: list[Observations]) -> Observations:
     return drop_repeated(whole)
 
 
-def note_cut(name: str, what: str) -> Note:
-    """Make the remark on a file that ends within a record."""
-    return Note("raw.cut", f"{name}: ends in the middle of a {what}; everything before it is used")
-
-
 def drop_repeated(obs: Observations) -> Observations:
     """Sort by time, satellite and signal; of repeated rows the first is kept.
 

@@ -14,8 +14,9 @@ from graphnav.core.errors import RecordingError
 from graphnav.core.notes import Note, format_count
 from graphnav.core.timescales import WEEK
 from graphnav.gnss.ephemeris import Ephemerides
+from graphnav.gnss.files import note_cut
 from graphnav.gnss.messages import Decoder
-from graphnav.gnss.series import Observations, drop_repeated, note_cut
+from graphnav.gnss.series import Observations, drop_repeated
 from graphnav.gnss.signals import BEIDOU, GALILEO, GLONASS, GPS, NAVIC, QZSS, SBAS, number_signal
 
 SYNC = b"\xb5\x62"

@@ -17,6 +17,8 @@ from graphnav.constraints.standstill import PLACE
 from graphnav.core.rotation import Array
 from graphnav.core.state import BLOCKS, Parameter
 from graphnav.estimation.factor_graph.tree_window import TreeWindow
+from graphnav.estimation.faults.verdicts import Verdicts
+from graphnav.estimation.faults.watch import Watch
 from graphnav.estimation.fixing import LOST_PLACE, LOST_SPEED, Held, add_integers, hold_on, may_fix, split_carriers
 from graphnav.estimation.known_arcs import Epochs
 from graphnav.estimation.noise.apply import select_weights
@@ -26,8 +28,6 @@ from graphnav.estimation.solution import ExcludedSpan
 from graphnav.estimation.solvers.elimination import Predicted
 from graphnav.estimation.solvers.linearise import Points, Step
 from graphnav.estimation.solvers.stages import Place
-from graphnav.estimation.solvers.verdicts import Verdicts
-from graphnav.estimation.solvers.watch import Watch
 from graphnav.estimation.solvers.window import Message, SettledStates, Window, compute_turn_limit
 from graphnav.imu.dynamics import ImuFactors
 from graphnav.imu.preintegration import NOISE_FIGURES

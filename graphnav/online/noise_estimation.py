@@ -23,10 +23,10 @@ from graphnav.core.earth import LocalFrame
 from graphnav.core.errors import EstimationError
 from graphnav.core.rotation import Array
 from graphnav.detectors import detect
-from graphnav.estimation import faults
 from graphnav.estimation.alignment import Alignment
 from graphnav.estimation.building import start_sigma
 from graphnav.estimation.contradictions import are_same, describe_freed, use_freed
+from graphnav.estimation.faults.excluded import find_fault_spans
 from graphnav.estimation.joint_estimate import estimate_jointly
 from graphnav.estimation.noise.apply import apply_noise
 from graphnav.estimation.noise.model import NoiseModel
@@ -100,7 +100,7 @@ def run_estimation(task: EstimationTask) -> EstimationResult:
             noise = replace(noise, freed=before)
         used = apply_noise(found.base, noise)
         words = (*describe_freed(noise.freed, task.recording), *describe_noise(noise, used))
-        wrong = faults.find_fault_spans(used)
+        wrong = find_fault_spans(used)
         noise = _convert_unit(noise, base, task.unit)
         return EstimationResult(noise, words, stationary, wrong, check_rows(task.every), start, anew)
     except np.linalg.LinAlgError as error:

@@ -18,11 +18,11 @@ from graphnav.core.errors import EstimationError
 from graphnav.core.notes import Note
 from graphnav.core.trajectory import Trajectory
 from graphnav.estimation.alignment import Alignment
+from graphnav.estimation.faults.watch import OLDEST
 from graphnav.estimation.noise.explanations import FIXES
 from graphnav.estimation.noise.model import STATED, NoiseModel
 from graphnav.estimation.pipeline import choose_origin
 from graphnav.estimation.solution import ExcludedSpan
-from graphnav.estimation.solvers.watch import OLDEST
 from graphnav.online.ahead import Live, export
 from graphnav.online.checks import check_rows
 from graphnav.online.looks import CONTEXT, SURE

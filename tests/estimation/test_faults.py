@@ -17,21 +17,25 @@ from graphnav.core.errors import ConfigError
 from graphnav.core.rotation import Array
 from graphnav.core.trajectory import Trajectory
 from graphnav.detectors import detect
-from graphnav.estimation import faults
 from graphnav.estimation.alignment import align
+from graphnav.estimation.building import Clock, ProblemBuilder
+from graphnav.estimation.faults.excluded import find_fault_spans, weigh_rows
+from graphnav.estimation.faults.likelihood_ratio import update_tests
+from graphnav.estimation.faults.verdicts import Verdicts
+from graphnav.estimation.faults.watch import MINUTE, Bank
+from graphnav.estimation.noise.decision import log_evidence
+from graphnav.estimation.noise.estimate import estimate_noise
+from graphnav.estimation.noise.exclusion import estimate_disturbed_intervals, estimate_without_faults
 from graphnav.estimation.noise.spans import list_before, split_at_steps
 from graphnav.estimation.pipeline import choose_origin, run
 from graphnav.estimation.problem import Problem, build_problem
 from graphnav.estimation.solution import Solution
 from graphnav.estimation.solvers.ekf import ekf, refilter
-from graphnav.estimation.solvers.likelihood_ratio import update_tests
 from graphnav.estimation.solvers.passes import Updates
 from graphnav.estimation.solvers.recursion import move_columns
 from graphnav.estimation.solvers.rows import Iterate, Layout, whiten
 from graphnav.estimation.solvers.rts import smooth_backward
 from graphnav.estimation.solvers.stack import Stack
-from graphnav.estimation.solvers.verdicts import Verdicts
-from graphnav.estimation.solvers.watch import MINUTE, Bank
 from graphnav.evaluation.scoring import compute_errors
 from graphnav.recording import Recording
 from graphnav.recording.formats import read
@@ -224,8 +228,8 @@ def test_spans_and_back(built: Problem) -> None:
     rows = next(c for c in built.constraints if c.name == "gnss_position")
     weight = np.ones(len(rows))
     weight[[3, 4, 5, 9]] = 0.0
-    problem = faults.weigh_rows(built, {rows.name: weight})
-    found = faults.find_fault_spans(problem)
+    problem = weigh_rows(built, {rows.name: weight})
+    found = find_fault_spans(problem)
     assert [(f.count, f.kind) for f in found] == [(3, rows.name), (1, rows.name)]
     t = built.t[rows.keyframe]
     assert [(f.t_start, f.t_end) for f in found] == [(t[3], t[5]), (t[9], t[9])]
@@ -269,6 +273,23 @@ def test_reflections_that_follow_each_other_are_left_out(shared_data: Path) -> N
 
 
 # ---------------------------------------------------------------------------------------------------------- noise
+
+
+def test_disturbed_intervals_stand_only_with_more_evidence() -> None:
+    """A burst of reflections makes many intervals of the IMU look disturbed, one by one, at a loss for all of them."""
+    recording = read(Path(__file__).parents[2] / "data" / "tokyo").without("odometer")
+    assert recording.gnss is not None
+    t = recording.gnss.t - recording.gnss.t[0]
+    burst = (t > 58.0) & (t < 73.0)
+    recording = moved(recording, np.flatnonzero(burst), np.array([29.0, 25.0, 16.0]))
+    settings = parse_settings({})
+    frame = LocalFrame(choose_origin(recording))
+    every = ProblemBuilder(recording, recording, settings, frame, Clock())
+    detections = detect(recording, settings)
+    base = every.build(every.align(recording, detections.stationary), detections, parts=True).problem
+    found = estimate_without_faults(base, estimate_noise(base))
+    disturbed = estimate_disturbed_intervals(base, found)
+    assert log_evidence(base, disturbed) >= log_evidence(base, found)
 
 
 def scattered(recording: Recording, bad: Array, times: float, seed: int) -> Recording:

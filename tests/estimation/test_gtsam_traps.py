@@ -154,16 +154,21 @@ def test_a_long_chain_does_not_exhaust_the_stack() -> None:
     assert x[0] < -0.5
 
 
-def test_rows_may_touch_more_variables_than_the_constructors_know() -> None:
+@pytest.mark.parametrize("share", [0.0, 0.9, 0.97])
+@pytest.mark.parametrize("size", [1.0, 1e5])
+def test_rows_may_touch_more_variables_than_the_constructors_know(share: float, size: float) -> None:
+    """Rows of satellites, each of which touches few of many parameters: a `share` of their entries is zero."""
     rng = np.random.default_rng(4)
-    widths = {1: 15, 2: 4, 3: 6, 4: 1, 5: 3, 6: 2}
-    blocks = [(key, rng.standard_normal((3, w))) for key, w in widths.items()]
-    b = rng.standard_normal(3)
-    for count in (1, 3, 4, 6):
-        factor = make_jacobian_factor(blocks[:count], b)
-        A = np.concatenate([dict(blocks)[key] for key in list(factor.keys())], axis=1)
-        np.testing.assert_allclose(factor.getA().T @ factor.getA(), A.T @ A, atol=1e-12)
-        np.testing.assert_allclose(factor.getA().T @ factor.getb(), A.T @ b, atol=1e-12)
+    for n, m in ((1, 3), (3, 18), (4, 18), (7, 1), (7, 18)):
+        blocks = [(key, size * rng.standard_normal((m, w))) for key, w in enumerate(rng.integers(1, 40, n))]
+        blocks = [(key, A * (rng.random(A.shape) >= share)) for key, A in blocks]
+        b = rng.standard_normal(m)
+        factor = make_jacobian_factor(blocks, b)
+        np.testing.assert_array_equal(factor.getA(), np.concatenate([A for _, A in blocks], axis=1))
+        np.testing.assert_array_equal(factor.getb(), b)
+
+
+def test_a_sum_of_five_variables_is_solved() -> None:
     graph = LinearGraph()
     graph.add([(np.array([key]), np.eye(2)[None]) for key in range(5)], np.array([[1.0, -1.0]]))
     for key in range(5):

@@ -19,7 +19,9 @@ from graphnav.estimation.factor_graph.tree import Tree
 from graphnav.estimation.factor_graph.tree_marginals import (
     begin_elimination,
     compute_newest_covariance,
+    compute_newest_root,
     eliminate,
+    find_head,
     read_keyframes,
     settle,
 )
@@ -157,6 +159,21 @@ def test_what_leaves_takes_no_parameter_along_that_is_in_force(built: Problem) -
     np.testing.assert_allclose(after.covariance / scale, before.covariance / scale, atol=1e-6)
     for own, known in zip(after.sigma, before.sigma, strict=True):
         np.testing.assert_allclose(own, known, rtol=1e-6)
+
+
+def test_what_is_left_of_the_past_is_what_the_last_to_leave_knew(built: Problem) -> None:
+    """As a message, from which a smoother with other noise begins: that of the newest keyframe without later ones."""
+    (tree, _), (other, _), count = _played(built, 60), _played(built, 60), 45
+    tree.marginalise(count)
+    other.truncate(count + 1)
+    found, newest = find_head(tree), other.newest
+    root = compute_newest_root(other)
+    assert found.columns == newest.columns
+    moved, P = found.move(found.estimate), np.linalg.inv(root.T @ root)
+    sd = np.sqrt(np.diag(P))
+    np.testing.assert_allclose(moved.covariance / sd / sd[:, None], P / sd / sd[:, None], atol=1e-4)
+    assert np.abs(np.r_[moved.state.minus(newest.state)[0], moved.values - newest.values] / sd).max() < 1e-3
+    assert np.abs(found.estimate / sd).max() > 0.1  # it is about what is known by later keyframes
 
 
 def test_relinearised_rows_take_the_place_of_the_old(built: Problem) -> None:

@@ -21,7 +21,7 @@ from graphnav.core.trajectory import Trajectory
 from graphnav.detectors import detect
 from graphnav.estimation.alignment import align
 from graphnav.estimation.factor_graph.batch import batch
-from graphnav.estimation.faults import weigh_rows
+from graphnav.estimation.faults.excluded import weigh_rows
 from graphnav.estimation.names import name_components
 from graphnav.estimation.noise import estimate
 from graphnav.estimation.noise.apply import apply_noise, drop_parts, select_weights

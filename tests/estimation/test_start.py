@@ -21,8 +21,8 @@ from graphnav.estimation import joint_estimate
 from graphnav.estimation.alignment import Alignment, align
 from graphnav.estimation.alignment.first import pick_fixes
 from graphnav.estimation.alignment.motion import drop_implausible
+from graphnav.estimation.faults.verdicts import Verdicts
 from graphnav.estimation.pipeline import choose_origin, run
-from graphnav.estimation.solvers.verdicts import Verdicts
 from graphnav.evaluation.scoring import Errors, compute_errors
 from graphnav.online import Online, drop_rows, list_rows
 from graphnav.recording import Recording

@@ -13,13 +13,13 @@ from graphnav.config import parse_settings
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM
 from graphnav.core.trajectory import Trajectory
+from graphnav.estimation.faults import watch
+from graphnav.estimation.faults.watch import Bank
 from graphnav.estimation.noise.apply import select_weights
 from graphnav.estimation.problem import Problem
-from graphnav.estimation.solvers import watch
 from graphnav.estimation.solvers.ekf import ekf, refilter
 from graphnav.estimation.solvers.linearise import list_node_steps
 from graphnav.estimation.solvers.stages import Place
-from graphnav.estimation.solvers.watch import Bank
 from graphnav.estimation.solvers.window import Window, make_first_message
 from graphnav.online import Online, drop_rows, list_rows
 from graphnav.recording import Recording

@@ -103,6 +103,38 @@ def test_what_was_cut_while_packed_is_told(tmp_path: Path) -> None:
         np.testing.assert_array_equal(found.code, whole.code[: len(found)])
 
 
+Nodes = dict[int, tuple[np.ndarray, np.ndarray]]
+
+
+def are_nodes_of(found: Nodes, whole: Nodes) -> bool:
+    """Whether nodes are the first of those of the whole file."""
+    pairs = ((x, y) for one, many in found.items() for x, y in zip(many, whole[one], strict=True))
+    return all(np.array_equal(x, y[: len(x)]) for x, y in pairs)
+
+
+@pytest.mark.parametrize(
+    ("kind", "record", "before"), [("SP3", rb"\nPG05", 15), ("SP3", rb"\n\* ", 14), ("CLK", rb"\nAS G05", 15)]
+)
+def test_of_precise_products_cut_in_a_record_all_before_it_is_used(
+    shared_data: Path, tmp_path: Path, kind: str, record: bytes, before: int
+) -> None:
+    """Cut everywhere in the fifteenth record: `before` are the nodes of the satellite in front of it."""
+    slac = shared_data / "raw_gnss_slac_20210428"
+    sp3, path, g04, g05 = next(slac.glob("*SP3.gz")), tmp_path / f"cut.{kind}", *map(number_satellite, ("G04", "G05"))
+    text = gzip.decompress(next(slac.glob(f"*{kind}.gz")).read_bytes())
+    whole = read_precise([sp3], list(slac.glob("*CLK.gz")) if kind == "CLK" else [])
+    assert "raw.cut" not in {get_key(note) for note in whole.remarks}
+    begin = [m.start() + 1 for m in re.finditer(record, text)][14]
+    for at in range(begin + 1, text.find(b"\n", begin), 3):
+        path.write_bytes(text[:at])
+        found = read_precise([path], []) if kind == "SP3" else read_precise([sp3], [path])
+        assert [get_key(note) for note in found.remarks].count("raw.cut") == 1
+        nodes = found.orbit if kind == "SP3" else found.clock
+        assert [len(nodes[one][0]) for one in (g04, g05)] == [before, 14]
+        assert are_nodes_of(found.orbit, whole.orbit)
+        assert are_nodes_of(found.clock, whole.clock)
+
+
 # ----------------------------------------------------------------------------------------------- navigation
 def same(found: Ephemerides, whole: Ephemerides) -> None:
     """Whether all numbers of two collections are the same."""
@@ -110,6 +142,21 @@ def same(found: Ephemerides, whole: Ephemerides) -> None:
         for name in one:
             np.testing.assert_array_equal(one[name], other[name], name)
     np.testing.assert_array_equal(found.klobuchar, whole.klobuchar)
+
+
+@pytest.mark.parametrize("name", ["raw_gnss_slac_20210428/brdc1180.21n.gz", "ucr_riverside_20200712/nav.gz"])
+def test_of_ephemerides_cut_in_a_record_all_before_it_are_used(shared_data: Path, tmp_path: Path, name: str) -> None:
+    text = gzip.decompress((shared_data / name).read_bytes())
+    begins = [m.start() for m in re.finditer(rb"^(?! {3}).", text.partition(b"END OF HEADER")[2], flags=re.MULTILINE)]
+    begin, end = (text.find(b"END OF HEADER") + 13 + begins[k] for k in (40, 41))
+    path = tmp_path / "nav"
+    path.write_bytes(text[:begin])
+    before = read_navigation([path])
+    for at in range(begin + 2, text.rfind(b"\n", 0, end - 1), 23):
+        path.write_bytes(text[:at])
+        found = read_navigation([path])
+        assert [get_key(note) for note in found.remarks] == ["raw.cut"]
+        same(found, before)
 
 
 def list_records(text: str) -> Iterator[list[str]]:
@@ -274,6 +321,26 @@ def test_sigmas_are_no_offsets_and_satellites_have_their_own(antex: Path) -> Non
     np.testing.assert_allclose(first.variation[1][1], 0.0104)
     np.testing.assert_allclose(second.offset[2], [0.002, 0.003, 1.8])
     np.testing.assert_allclose(read_antex(antex)[0][number_satellite("E13")][0].offset[5], [0.002, 0.003, 2.3])
+
+
+def test_antennas_before_one_that_is_cut_are_used(antex: Path) -> None:
+    text, (whole, ends) = antex.read_bytes(), read_antex(antex)
+    assert not ends
+    first, last = (text.rfind(b"END OF ANTENNA", 0, k) for k in (text.find(b"E13"), len(text)))
+    for at in range(first + 20, last + 13, 11):
+        if text[:at].rstrip().endswith(b"END OF ANTENNA"):
+            continue  # as whole as any
+        antex.write_bytes(text[:at])
+        found, ends = read_antex(antex)
+        assert [get_key(note) for note in ends] == ["raw.cut"]
+        assert [len(found[number_satellite("G22")]), len(found)] == [
+            2,
+            1 + (b"END OF ANTENNA" in text[first + 14 : at]),
+        ]
+        for one, many in found.items():
+            for own, other in zip(many, whole[one], strict=True):
+                assert own.begin == other.begin
+                assert all(np.array_equal(own.variation[band], other.variation[band]) for band in other.variation)
 
 
 def test_ways_are_by_the_angle_off_the_nadir(antex: Path) -> None:

@@ -20,32 +20,30 @@ from scipy.linalg.lapack import dtrtri
 from graphnav.core.rotation import Array
 from graphnav.estimation.solvers.breakdown import explain_undetermined
 
-_SUMS = 1 << 60  # keys of auxiliary variables, which are eliminated at once
 FactorBlocks = Sequence[tuple[Array, Array]]  # (keys (N,), A (N, m, k)) per variable a factor touches
 
 
 def make_jacobian_factor(blocks: Sequence[tuple[int, Array]], b: Array) -> gtsam.JacobianFactor:
     """Whitened rows: the sum of A d[key] over the blocks (key, A) is b.
 
-    GTSAM's constructors know up to three variables. More come in as sums of two: variables s with A d + B e = s
-    exactly, which are eliminated at once.
+    GTSAM's constructors know up to three variables. More are those of a nonlinear factor with these derivatives: sums
+    of two variables as further ones, exact and eliminated at once, lose rows of which many entries are zero.
     """
-    rest = [(key, np.asfortranarray(A)) for key, A in blocks]
-    make: Any = gtsam.JacobianFactor
-    if len(rest) <= 3:
-        return make(*(part for block in rest for part in block), b, _make_unit_noise(len(b)))
-    sums: list[int] = []
-    graph, ordering, one = gtsam.GaussianFactorGraph(), gtsam.Ordering(), np.eye(len(b))
-    while len(rest) > 3:
-        (k0, A0), (k1, A1) = rest.pop(), rest.pop()
-        key = _SUMS + len(sums)
-        graph.push_back(make(k0, A0, k1, A1, key, -one, np.zeros(len(b)), gtsam.noiseModel.Constrained.All(len(b))))
-        rest.insert(0, (key, one))
-        sums.append(key)
-        ordering.push_back(key)
-    graph.push_back(make_jacobian_factor(rest, b))
-    _, left = graph.eliminatePartialSequential(ordering)
-    return gtsam.JacobianFactor(left.at(0)).whiten()
+    if len(blocks) <= 3:
+        make: Any = gtsam.JacobianFactor
+        parts = ((key, np.asfortranarray(A)) for key, A in blocks)
+        return make(*(part for block in parts for part in block), b, _make_unit_noise(len(b)))
+    keys, point = [key for key, _ in blocks], gtsam.Values()
+    for key, A in blocks:
+        point.insert(key, np.zeros(A.shape[1]))
+
+    def differentiate(factor: gtsam.CustomFactor, at: gtsam.Values, derivatives: Any) -> Array:
+        for i, (_, A) in enumerate(blocks):
+            derivatives[i] = A
+        return -b
+
+    rows = gtsam.CustomFactor(_make_unit_noise(len(b)), keys, differentiate)
+    return gtsam.JacobianFactor(rows.linearize(point))
 
 
 @cache

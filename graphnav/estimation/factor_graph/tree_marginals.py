@@ -19,8 +19,9 @@ from graphnav.estimation.factor_graph.gaussian import Eliminated
 from graphnav.estimation.factor_graph.tree import Tree
 from graphnav.estimation.factor_graph.tree_nodes import Keyframe, Variable, fill_keys, read_states
 from graphnav.estimation.solvers.breakdown import explain_undetermined
-from graphnav.estimation.solvers.linearise import Columns, shift
+from graphnav.estimation.solvers.linearise import shift
 from graphnav.estimation.solvers.points import move_covariance
+from graphnav.estimation.solvers.stages import Message
 from graphnav.estimation.solvers.window import SettledStates
 
 _AT_ONCE = 45  # variables: GTSAM's bookkeeping of one elimination grows faster than what it eliminates
@@ -37,27 +38,59 @@ def compute_newest_covariance(tree: Tree) -> Array:
     return move_covariance((x.unit[:, None] * found * x.unit)[None], x.delta[None])[0]
 
 
-def compute_newest_root(tree: Tree, columns: Columns) -> Array:
+def _map_errors(keyframe: Keyframe, J: Array) -> dict[int, Array]:
+    """(D, w) by key: errors about a keyframe's estimate by those about anchors, of which J (3, 3) turns attitudes."""
+    variables = (keyframe.state, *(node for node, _ in keyframe.nodes.values()))
+    out = {x.key: np.zeros((DIM + len(keyframe.values), len(x.unit))) for x in variables}
+    out[keyframe.state.key][:DIM] = np.eye(DIM)
+    out[keyframe.state.key][:3, :3] = J
+    for name, at in keyframe.columns.items():
+        node, own = keyframe.nodes[name]
+        out[node.key][at, own] = np.eye(at.stop - at.start)
+    return out
+
+
+def compute_newest_root(tree: Tree) -> Array:
     """(D, D) R, a triangle: R e are the whitened errors of the newest keyframe and its parameters."""
     last = tree.keyframes[-1]
-    D = DIM + len(last.values)
-    variables = list({x.key: x for x in (last.state, *(n for n, _ in last.nodes.values()))}.values())
-    joint = tree.isam.jointMarginalCovariance([x.key for x in variables])
-    into = {x.key: np.zeros((D, len(x.unit))) for x in variables}
-    into[last.state.key][:DIM] = np.eye(DIM)
-    into[last.state.key][:3, :3] = rotation.right_jacobian(last.state.delta[None, :3])[0]
-    for name, at in columns.items():
-        node, own = last.nodes[name]
-        into[node.key][at, own] = np.eye(at.stop - at.start)
-    P = np.zeros((D, D))
-    for a in variables:
-        for b in variables:
-            A, B = into[a.key] * a.unit, into[b.key] * b.unit
-            P += A @ joint.at(a.key, b.key) @ B.T
+    into = _map_errors(last, rotation.right_jacobian(last.state.delta[None, :3])[0])
+    joint, unit = tree.isam.jointMarginalCovariance(list(into)), {key: tree.variables[key].unit for key in into}
+    P = sum((A * unit[a]) @ joint.at(a, b) @ (B * unit[b]).T for a, A in into.items() for b, B in into.items())
     # of correlations, so that gyro bias and position have the same number of digits
     sd = np.sqrt(np.diag(P))
     w, V = np.linalg.eigh(P / sd[:, None] / sd)
     return np.asarray(np.linalg.qr((V / np.sqrt(np.maximum(w, np.finfo(float).eps))).T, "r") / sd)
+
+
+def find_head(tree: Tree) -> Message:
+    """What the first keyframe and all before it say of its state and parameters, about where these are now.
+
+    From the factors themselves: a covariance of ambiguities and clocks, known to kilometres each and to millimetres
+    together, loses what tells them apart.
+    """
+    first = tree.keyframes[0]
+    into = _map_errors(first, rotation.right_jacobian_inverse(first.state.delta[None, :3])[0].T)
+    own = {x.key: x for x in tree.variables.values() if x.first <= first.number}
+    edge = dict(zip(own, np.cumsum([0, *(len(x.unit) for x in own.values())]).tolist(), strict=False))
+    unit, delta = (np.concatenate([getattr(x, name) for x in own.values()]) for name in ("unit", "delta"))
+    later = {i for k in tree.keyframes[1:] for i in k.slots.values()}
+    factors, point, rows = tree.isam.getFactorsUnsafe(), tree.isam.getLinearizationPoint(), []
+    for i in range(factors.size()):
+        one = factors.at(i)
+        if i not in later and one is not None and own.keys() >= set(one.keys()):
+            linear = gtsam.JacobianFactor(one.linearize(point))
+            A, b = linear.jacobian()
+            row = np.zeros((len(b), len(unit) + 1))
+            row[:, np.concatenate([edge[k] + np.arange(len(own[k].unit)) for k in list(linear.keys())])] = A
+            row[:, -1] = b
+            rows.append(row)
+    table = np.concatenate(rows)
+    A, b = table[:, :-1] / unit, table[:, -1:]
+    known = np.concatenate([into[key].T for key in own])
+    gone = ~known.any(axis=1)  # parameters that began anew
+    R = np.asarray(np.linalg.qr(np.hstack([A[:, gone], A @ known, b - A @ delta[:, None]]), "r"))
+    own_rows = slice(gone.sum(), gone.sum() + known.shape[1])
+    return Message.of(first.estimate, first.values, first.columns, R[own_rows, own_rows], R[own_rows, -1])
 
 
 @dataclass(frozen=True)

@@ -20,10 +20,11 @@ from graphnav.estimation.factor_graph.tree_marginals import (
     begin_elimination,
     compute_newest_root,
     eliminate,
+    find_head,
     settle,
 )
 from graphnav.estimation.solvers.elimination import Predicted
-from graphnav.estimation.solvers.revision import Renewed, Renewing
+from graphnav.estimation.solvers.revision import Renewing
 from graphnav.estimation.solvers.stages import Message, Place, Stage
 from graphnav.estimation.solvers.window import SettledStates, Window
 
@@ -46,7 +47,7 @@ class TreeWindow(Window):
             self.tree = Tree(self.head, self.turn)
         ahead = self.expect(place) if ahead is None else replace(ahead, place=place)
         stage, e = self._update(ahead)
-        self.tree.add(place, ahead, stage.measured)
+        self.tree.add(place, ahead, [one.settle(e) for one in stage.measured])
         self._append(self._adopt(stage))
         return float(np.linalg.norm(e[:3]))
 
@@ -60,7 +61,7 @@ class TreeWindow(Window):
         """Replace the newest message by the tree's, with its error state."""
         stage = self._adopt(self.stages[-1])
         m = stage.message
-        R = compute_newest_root(self.tree, m.columns)
+        R = compute_newest_root(self.tree)
         self.stages[-1] = replace(stage, message=Message.of(m.state, m.values, m.columns, R, m.z, m.tests))
         self._means = None
 
@@ -73,29 +74,24 @@ class TreeWindow(Window):
         moved = self.tree.find_moves() > share
         return int(np.argmax(moved)) - self.tree.held if moved.any() else None
 
-    def converge(self, share: float = 1.0, always: bool = False, renewed: Renewed | None = None) -> int:
-        """Relinearise until nothing has moved; returns how often."""
-        if not self.stages:
-            return 0
-        count = 0
-        if always:
-            self.tree.linearise_again(range(self.tree.held, len(self.tree)), renewed)
-            self._relinearise_keyframes(len(self))
-            share, count = min(share, _CONVERGED_SHARE), 1
-        while count < _MAX_STEPS and (done := self.tree.relinearise(share, renewed)):
-            self._relinearise_keyframes(done)
-            count += 1
-        return count
+    def revise(self, count: int, renewed: Renewing | None, always: bool = False, share: float = 1.0) -> bool:
+        """As of `Window`, but all at once; False, as nothing is left to do."""
 
-    def revise(self, count: int, renewed: Renewing, always: bool = False) -> bool:
-        """As `converge`, all at once; False, as nothing is left to do."""
-
-        def solve_at_once(first: int, end: int) -> Sequence[Place]:
+        def renew_at_once(first: int, end: int) -> Sequence[Place]:
+            assert renewed is not None
             while (places := renewed(first, end)) is None:
                 pass
             return places
 
-        self.converge(always=always, renewed=solve_at_once)
+        again = None if renewed is None else renew_at_once
+        if always and self.stages:
+            self.tree.linearise_again(range(self.tree.held, len(self.tree)), again)
+            self._relinearise_keyframes(len(self))
+            share = min(share, _CONVERGED_SHARE)
+        for _ in range(_MAX_STEPS - always if self.stages else 0):
+            if not (done := self.tree.relinearise(share, again)):
+                break
+            self._relinearise_keyframes(done)
         return False
 
     def smooth_back(self, count: int, most: int) -> bool:
@@ -130,6 +126,8 @@ class TreeWindow(Window):
         self.tree.truncate(keep + self.tree.held)
         if self.stages:
             self._adopt_all()
+        else:
+            self.head = self.head.move(self.head.estimate)
 
     def settle(self, count: int) -> SettledStates:
         """Let the first `count` stages go, as the tree knows them."""
@@ -145,6 +143,7 @@ class TreeWindow(Window):
         if len(self.tree) > self.tree.held + count:
             self.tree.marginalise(self.tree.held + count - 1)
             self.tree.hold()
+            self.head = replace(find_head(self.tree), tests=self.head.tests)
         else:
             self.tree = Tree(self.head, self.turn)
         return out

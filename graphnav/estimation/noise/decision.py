@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from graphnav.estimation.faults.watch import FALSE_ALARM
 from graphnav.estimation.noise.apply import apply_noise, apply_weights
 from graphnav.estimation.noise.estimate import NoiseEstimate
 from graphnav.estimation.noise.explanations import (
@@ -24,7 +25,6 @@ from graphnav.estimation.noise.model import INTERVALS, NoiseModel, RowWeights
 from graphnav.estimation.noise.outliers import compute_latest_cost, compute_outlier_cost, count_reduced, count_rows
 from graphnav.estimation.noise.spans import Span, drop_within, extend_to_next_fix, join
 from graphnav.estimation.problem import Problem
-from graphnav.estimation.solvers.watch import FALSE_ALARM
 
 _BY_ROWS = INTERVALS, ROWS  # explanations by outliers, for which nothing is left out
 _FAULT_COST = -float(np.log(FALSE_ALARM))  # negative prior log-odds of a fault

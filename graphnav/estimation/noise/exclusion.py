@@ -1,6 +1,6 @@
 """Fault detection and exclusion: which measurements are wrong for a span of time, decided by evidence.
 
-Detection. A bank of likelihood-ratio tests (`graphnav.estimation.solvers.watch`) gives the spans in which fixes
+Detection. A bank of likelihood-ratio tests (`graphnav.estimation.faults.watch`) gives the spans in which fixes
 disagree with all other measurements by an error that persists. It does not tell which sensor is wrong. Spans in which a
 receiver repeats one position are suspected without a test: it may hold it because it takes a slow vehicle to stand.
 
@@ -43,7 +43,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from graphnav.estimation import faults
+from graphnav.estimation.faults.excluded import find_fault_spans, weigh_rows
+from graphnav.estimation.faults.watch import FALSE_ALARM, SIZES
 from graphnav.estimation.noise.apply import apply_noise, select_weights
 from graphnav.estimation.noise.decision import Decision, explain, list_explanations, log_evidence
 from graphnav.estimation.noise.estimate import NoiseEstimate, estimate_noise
@@ -74,7 +75,6 @@ from graphnav.estimation.noise.spans import (
 )
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.ekf import refilter
-from graphnav.estimation.solvers.watch import FALSE_ALARM, SIZES
 from graphnav.recording import Recording
 
 _REFINEMENTS = 2  # estimates without masked spans: the first trims the spans, the second is free of what is wrong
@@ -266,7 +266,8 @@ def estimate_disturbed_intervals(base: Problem, found: NoiseEstimate) -> NoiseEs
         if free.noise.excluded == found.noise.excluded:  # the same model, already converging
             start, near = free.noise, free.get_linearisation(base)
     disturbed = estimate_noise(base, None, start, near, intervals=True)
-    return replace(disturbed, passes=passes + disturbed.passes)
+    best = max(found, disturbed, key=lambda one: log_evidence(base, one))
+    return replace(best, passes=passes + disturbed.passes)
 
 
 def find_suspects(base: Problem, noise: NoiseModel, found: NoiseEstimate) -> list[Span]:
@@ -286,7 +287,7 @@ def _find_disagreements(base: Problem, noise: NoiseModel, found: NoiseEstimate) 
     kept = {name: some for name, some in noise.weights.items() if name not in (*FIXES, *INTERVALS)}
     tested = apply_noise(base, replace(noise, weights=kept))
     weights = refilter(tested, found.carry_points(base, tested), watch=True, whole=False).weights
-    return join_faults(faults.find_fault_spans(faults.weigh_rows(tested, weights)))
+    return join_faults(find_fault_spans(weigh_rows(tested, weights)))
 
 
 def _predict_left_out(problem: Problem, found: NoiseEstimate) -> LeftOutErrors:

@@ -14,6 +14,7 @@ from graphnav.config import Settings
 from graphnav.constraints.base import SAME_TIME, BuildContext, Constraint, Linearized
 from graphnav.core.rotation import Array
 from graphnav.core.state import Parameter, States
+from graphnav.estimation.faults.watch import LARGE, MINUTE, SIZES
 from graphnav.estimation.noise.model import INTERVALS
 from graphnav.estimation.noise.moments import predict_errors
 from graphnav.estimation.noise.outliers import CHANCE
@@ -22,7 +23,6 @@ from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.ekf import Comparison
 from graphnav.estimation.solvers.linearise import Points
 from graphnav.estimation.solvers.passes import DisturbancePass, make_points, split_values
-from graphnav.estimation.solvers.watch import LARGE, MINUTE, SIZES
 from graphnav.recording import Recording
 
 FIXES, WHEELS = ("gnss_position", "gnss_velocity"), ("nhc", "odometer")

@@ -8,7 +8,8 @@ import numpy as np
 from scipy.special import chdtri
 
 from graphnav.core.errors import EstimationError
-from graphnav.estimation.faults import weigh_rows
+from graphnav.estimation.faults.excluded import weigh_rows
+from graphnav.estimation.faults.watch import SIZES
 from graphnav.estimation.noise.model import RowWeights
 from graphnav.estimation.noise.moments import collect_row_moments
 from graphnav.estimation.noise.outliers import limit_scaled, limit_squares, list_reduced
@@ -18,7 +19,6 @@ from graphnav.estimation.solvers.linearise import Points, linearise
 from graphnav.estimation.solvers.passes import ForwardRecord, SmootherPass, are_near
 from graphnav.estimation.solvers.robust import weigh_squares
 from graphnav.estimation.solvers.rts import smooth_backward
-from graphnav.estimation.solvers.watch import SIZES
 
 BREAKDOWN = EstimationError, np.linalg.LinAlgError  # errors of a filter with a numerically singular covariance
 _COOLING = 3.0  # factor by which the sigmas of an annealing fall in each round

@@ -16,7 +16,7 @@ import numpy as np
 
 from graphnav.constraints.base import Constraint
 from graphnav.core.rotation import Array
-from graphnav.estimation.solvers.watch import SIZES
+from graphnav.estimation.faults.watch import SIZES
 
 WITHIN = 2.0 * np.log(3.0)  # 1-sigma of the logarithm of a variance: a factor of three in sigma
 _SHARES = {"seconds": 0.25, "minutes": 0.5, "hours": 0.5}  # of a GNSS sensor's stated variance

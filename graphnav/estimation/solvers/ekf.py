@@ -35,10 +35,11 @@ from graphnav.core.progress import Progress
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM
 from graphnav.estimation.dense import make_dense
+from graphnav.estimation.faults.search import FaultSearch, free
+from graphnav.estimation.faults.watch import Bank
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import Solution
 from graphnav.estimation.solvers.decision import Decide, hold
-from graphnav.estimation.solvers.fault_search import FaultSearch, free
 from graphnav.estimation.solvers.invariant import transport_covariance
 from graphnav.estimation.solvers.linearise import Points, advance, scale_at
 from graphnav.estimation.solvers.passes import (
@@ -56,7 +57,6 @@ from graphnav.estimation.solvers.points import FilterErrors, Linearisation, Poin
 from graphnav.estimation.solvers.rts import smooth_backward
 from graphnav.estimation.solvers.stack import Innovations, Stack
 from graphnav.estimation.solvers.stretches import STAYS, StretchFilter
-from graphnav.estimation.solvers.watch import Bank
 from graphnav.imu.dynamics import SCALE
 
 _PASSES = 4  # passes of the opening, each about the points of the one before

@@ -18,11 +18,11 @@ from scipy.linalg.lapack import dgeqrf, dtpmqrt, dtpqrt, dtrtri, dtrtrs
 
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, States
+from graphnav.estimation.faults.watch import Watch
 from graphnav.estimation.solvers.breakdown import explain_smoother
 from graphnav.estimation.solvers.linearise import shift
 from graphnav.estimation.solvers.recursion import PASSES
 from graphnav.estimation.solvers.stages import Columns, Measured, Message, Place, Stage, count_columns, rotate_columns
-from graphnav.estimation.solvers.watch import Watch
 
 _BLOCK = 8  # reflectors that tpqrt applies at once
 

@@ -69,7 +69,6 @@ class Layout:
     def __init__(self, problem: Problem) -> None:
         self.K = K = len(problem.t)
         self.groups: list[_Group] = []
-        self.group_of: dict[str, _Group] = {}
         self.chains: list[list[ParameterChain]] = []  # of each group
         after: dict[int, list[int]] = {}
         self.width, variable, offset = [DIM] * K, [np.arange(K)], [np.zeros(K, dtype=int)]
@@ -89,7 +88,6 @@ class Layout:
             group = _Group(keys, node, columns, at)
             self.groups.append(group)
             self.chains.append(chains)
-            self.group_of |= dict.fromkeys(columns, group)
             self.width += [at] * n
             last = find_last_keyframes(chains[0])
             alone = np.diff(last, prepend=-1) == 1

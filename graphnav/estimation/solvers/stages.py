@@ -12,14 +12,14 @@ to k, those of parameters that step to their next node, and those of the measure
 For a chain this is GTSAM's elimination in the same order, on matrices that are dense anyway. This module has the rows
 and the results; `graphnav.estimation.solvers.elimination` performs it.
 
-A message may carry tests (`graphnav.estimation.solvers.watch`) for persistent errors of fixes: additional columns on
+A message may carry tests (`graphnav.estimation.faults.watch`) for persistent errors of fixes: additional columns on
 the right, which go through the same QR.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
@@ -30,12 +30,12 @@ from graphnav.core import rotation
 from graphnav.core.errors import EstimationError
 from graphnav.core.rotation import Array, mv
 from graphnav.core.state import DIM, States
+from graphnav.estimation.faults.watch import Watch
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.breakdown import explain_smoother
 from graphnav.estimation.solvers.linearise import Columns, Points, Step, linearise, linearise_links, scale_at, shift
 from graphnav.estimation.solvers.robust import soften, weigh_squares
 from graphnav.estimation.solvers.turning import add_turning, change_of_point, split_turn
-from graphnav.estimation.solvers.watch import Watch
 from graphnav.imu.dynamics import SCALE, ImuFactors
 
 _I = np.eye(DIM)
@@ -147,6 +147,11 @@ class Measured:
         weight = np.sqrt(weigh_squares(self.kernel, np.linalg.norm(left, axis=-1), self.scale)[0])[:, None]
         with np.errstate(divide="ignore"):
             return self.H * weight[..., None], self.b * weight, self.sigma / weight
+
+    def settle(self, y: Array) -> Measured:
+        """The same with the kernel's weights for the error state y (D,) for good."""
+        H, b, sigma = self.weigh(y, 1)
+        return replace(self, H=H, b=b, sigma=sigma, kernel="none")
 
 
 @dataclass(frozen=True)

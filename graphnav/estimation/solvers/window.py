@@ -17,6 +17,7 @@ import numpy as np
 
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, States
+from graphnav.estimation.faults.watch import Watch
 from graphnav.estimation.solvers.elimination import Predicted, predict_message, update_late
 from graphnav.estimation.solvers.linearise import shift
 from graphnav.estimation.solvers.points import move_covariance
@@ -34,7 +35,6 @@ from graphnav.estimation.solvers.stages import (
     predict_stage,
 )
 from graphnav.estimation.solvers.turning import split_turn, turn_covariance
-from graphnav.estimation.solvers.watch import Watch
 from graphnav.recording import ImuNoise
 
 # share of the noise of a second's force that a neglected turn may cause: as it is systematic, it accumulates
@@ -277,8 +277,8 @@ class Window:
         beside = psi + [stage.psi for stage in self.stages] - np.concatenate([before, psi[:-1]])
         return np.hypot(np.linalg.norm(left[:, :3], axis=1), beside)
 
-    def converge(self, share: float = 1.0, always: bool = False, renewed: Renewed | None = None) -> int:
-        """Relinearise until nothing has moved; returns how often.
+    def converge(self, share: float = 1.0, always: bool = False, renewed: Renewed | None = None) -> None:
+        """Relinearise until nothing has moved.
 
         Parameters
         ----------
@@ -286,12 +286,9 @@ class Window:
         always : once at least.
         renewed : returns the places of stages between two indices, where these no longer hold their rows.
         """
-        for count in range(_MAX_RELINEARISATIONS):
-            first = self._find_first_again(share, always and not count)
-            if first is None:
-                return count
-            Revision(self, first).step(len(self), renewed)
-        return _MAX_RELINEARISATIONS
+        self._revision, self._rounds = None, 0
+        while self.revise(len(self), renewed, always, share):
+            pass
 
     def _find_first_again(self, share: float, every: bool) -> int | None:
         """The first stage to be relinearised, stages that have moved almost as far included."""
@@ -303,13 +300,13 @@ class Window:
         """Whether `revise` is in progress."""
         return self._revision is not None or self._rounds > 0
 
-    def revise(self, count: int, renewed: Renewing, always: bool = False) -> bool:
+    def revise(self, count: int, renewed: Renewing | None, always: bool = False, share: float = 1.0) -> bool:
         """A portion of `converge`, of at most so many stages; False once there is nothing left to do.
 
         Keyframes may be added and removed before the next portion; rebuilt stages of removed ones are discarded.
         """
         if self._revision is None:
-            first = self._find_first_again(1.0, always and not self._rounds)
+            first = self._find_first_again(share, always and not self._rounds)
             if first is None or self._rounds == _MAX_RELINEARISATIONS:
                 self._rounds = 0
                 return False

@@ -32,7 +32,7 @@ from scipy.special import chdtri, gammaincinv
 
 from graphnav.constraints.base import Constraint
 from graphnav.core.rotation import Array
-from graphnav.estimation.solvers.likelihood_ratio import (
+from graphnav.estimation.faults.likelihood_ratio import (
     add_row,
     begin_slot,
     count_remembered,

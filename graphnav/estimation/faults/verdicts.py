@@ -1,4 +1,4 @@
-"""Exclusion and readmission of fixes when the tests of `graphnav.estimation.solvers.watch` detect a fault."""
+"""Exclusion and readmission of fixes when the tests of `graphnav.estimation.faults.watch` detect a fault."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from collections.abc import Mapping
 import numpy as np
 
 from graphnav.core.rotation import Array
+from graphnav.estimation.faults.watch import OLDEST, PATIENCE
 from graphnav.estimation.solution import ExcludedSpan
-from graphnav.estimation.solvers.watch import OLDEST, PATIENCE
 
 # least number of fixes that agree after a fault; with fewer, a further disagreement continues the fault
 _FEWEST_AGREEING = 3

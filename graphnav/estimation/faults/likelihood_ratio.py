@@ -1,4 +1,4 @@
-"""The tests of `graphnav.estimation.solvers.watch`, on arrays alone: compiled where Numba is there.
+"""The tests of `graphnav.estimation.faults.watch`, on arrays alone: compiled where Numba is there.
 
 The state of all tests of a filter is one vector, so that it is saved and restored by copying: X (D, C), followed by the
 memory of each kind of rows, with L slots of c numbers:

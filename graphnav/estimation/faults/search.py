@@ -12,12 +12,12 @@ import numpy as np
 from graphnav.constraints.base import Constraint
 from graphnav.core.rotation import Array
 from graphnav.core.state import BLOCKS, DIM
+from graphnav.estimation.faults.verdicts import Verdicts
+from graphnav.estimation.faults.watch import Bank
 from graphnav.estimation.solvers.linearise import Advance
 from graphnav.estimation.solvers.points import PointFilter
 from graphnav.estimation.solvers.recursion import UNUSED
 from graphnav.estimation.solvers.stack import RowBlock, Stack
-from graphnav.estimation.solvers.verdicts import Verdicts
-from graphnav.estimation.solvers.watch import Bank
 
 
 class FaultSearch:
