@@ -442,9 +442,12 @@ def test_sigmas_of_the_drive_are_true_with_estimated_figures(
     assert all(low < np.mean(x) < high for x in ratio.values()), ratio
 
 
-def test_an_odometer_that_is_wrong_for_seconds() -> None:
-    """Its errors last for 3 s: they are seen to, and are as large as they are. Without the other wheel rows another
-    optimum, in which the readings are noisy and nothing lasts, is as near for most seeds."""
+_NOISY = pytest.mark.xfail(strict=True, reason="without other wheel rows, readings that are noisy are as likely")
+
+
+@pytest.mark.parametrize("nhc", [True, pytest.param(False, marks=_NOISY)])
+def test_an_odometer_that_is_wrong_for_seconds(nhc: bool) -> None:
+    """Its errors last for 3 s: they are seen to, and are as large as they are."""
     path = oracle.vehicle_path(duration=240, rate=50.0, seed=11)
     found = []
     for seed in (0, 1):
@@ -453,7 +456,8 @@ def test_an_odometer_that_is_wrong_for_seconds() -> None:
         assert odometer is not None
         wrong = 0.3 * markov(odometer.t, 3.0, np.random.default_rng([seed, 5]), 1)[:, 0]
         speed = odometer.speed + wrong * (np.abs(odometer.speed) > 1e-3)
-        base, opening = built(replace(recording, odometer=replace(odometer, speed=speed)))
+        settings = parse_settings({"vehicle": {"nhc": nhc}})
+        base, opening = built(replace(recording, odometer=replace(odometer, speed=speed)), settings)
         noise = estimate_noise(base, opening).noise
         process = next(p for c in base.constraints if c.name == "odometer" for p in c.processes)
         found.append(
