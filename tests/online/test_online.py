@@ -751,8 +751,8 @@ def test_an_imu_is_judged_by_ever_more_rows(drive: tuple[Recording, Trajectory])
     told = [name for name, one in whole.figures.items() if one.freedom > 10.0]
     assert len(told) > 5
     for name in told:  # a recording has keyframes where stops begin and end, and so other intervals and rows there
-        one = whole.figures[name]
-        assert abs(used.figures[name].log_factor - one.log_factor) < 3.0 * one.sigma, name
+        one, other = used.figures[name], whole.figures[name]
+        assert abs(one.log_factor - other.log_factor) < 3.0 * np.hypot(one.sigma, other.sigma), name
     assert sum(get_key(note) == "noise.imu" for note in online.notes) == 1
     assert online.tracker.window.turn > compute_turn_limit(quiet)
 
