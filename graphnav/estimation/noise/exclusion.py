@@ -26,6 +26,9 @@ twice, because the spans shrink to what is wrong. Each set of spans that comes u
 figures, and the decision with the largest evidence stands. If no fault is left by these figures, the estimate that uses
 all measurements and starts from them is one more candidate.
 
+Between. A filter follows errors that last, so the tests find where they begin and where they end, each as the beginning
+of a fault. So every other span from one such beginning to the next is tried as well.
+
 Before or after. The tests run forward in time, so where fixes step from one place to another those behind the step are
 suspected, though those before it may be the wrong ones. So the fixes before each span that is left out, for as long,
 are suspected instead, the same way, and the likelier of both stands.
@@ -43,6 +46,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from graphnav.core.rotation import Array
 from graphnav.estimation.faults.excluded import find_fault_spans, weigh_rows
 from graphnav.estimation.faults.watch import FALSE_ALARM, SIZES
 from graphnav.estimation.noise.apply import apply_noise, select_weights
@@ -65,6 +69,7 @@ from graphnav.estimation.noise.spans import (
     join,
     join_faults,
     list_before,
+    list_between,
     list_distinct,
     list_repeats,
     mask_times,
@@ -156,8 +161,12 @@ def _estimate_without(
 def _list_before(base: Problem, noise: NoiseModel) -> list[Span]:
     """Spans of fixes before those that a noise model leaves out."""
     excluded = join(span for kind in FIXES for span in noise.excluded.get(kind, ()))
-    rows = [c.keyframe for c in base.constraints if c.name in FIXES]
-    return list_before(excluded, base.t[np.unique(np.concatenate(rows))]) if excluded else []
+    return list_before(excluded, _list_fix_times(base)) if excluded else []
+
+
+def _list_fix_times(base: Problem) -> Array:
+    """(N,) s, in order."""
+    return base.t[np.unique(np.concatenate([c.keyframe for c in base.constraints if c.name in FIXES]))]
 
 
 def decide_faults(base: Problem, found: NoiseEstimate) -> Decision:
@@ -198,7 +207,8 @@ def _unmask(base: Problem, found: NoiseEstimate, first: Decision, masked: list[S
         passes = passes + estimate.passes + Counter(filter=1)
         spans, refined = trim(spans, errors), trim(detected, errors)
         # a slow onset is dated better by the tests, an abrupt end by the errors of single fixes
-        for some in list_distinct(spans, trim(spans, errors, FALSE_ALARM), detected):
+        onsets = list_between(refined, _list_fix_times(base)) if len(refined) > 1 else ()
+        for some in list_distinct(spans, trim(spans, errors, FALSE_ALARM), detected, *onsets):
             candidate = explain(base, _add_outliers(estimate, errors, some), some)
             passes = passes + candidate.passes
             cut = _cut_at_steps(some, candidate.noise, used, estimate)
@@ -216,9 +226,9 @@ def _unmask(base: Problem, found: NoiseEstimate, first: Decision, masked: list[S
             passes = passes + free.passes
             if free.log_evidence > first.log_evidence:
                 return Decision(free.noise, free.log_evidence, passes, free)
-        if not refined or refined == spans:
+        if not refined or detected == spans:
             break
-        spans, start = refined, replace(start, excluded=dict.fromkeys(FIXES, tuple(refined)))
+        spans, start = detected, replace(start, excluded=dict.fromkeys(FIXES, tuple(detected)))
     if best is not first and not best.noise.excluded:  # the figures that go with these outliers
         free = estimate_noise(base, None, best.noise, leading.get_linearisation(base))
         return Decision(free.noise, best.log_evidence, passes + free.passes, free)
