@@ -7,6 +7,7 @@ import numpy as np
 from graphnav.config import Settings
 from graphnav.constraints.base import SAME_TIME
 from graphnav.core.earth import LocalFrame
+from graphnav.core.errors import EstimationError
 from graphnav.core.rotation import Array
 from graphnav.detectors import detect
 from graphnav.estimation.alignment import Alignment, align, is_ready, use_known_heading
@@ -38,9 +39,19 @@ def take_start_rows(sensors: Sensors, settings: Settings, now: float, last: bool
     """The rows up to a time (s), and stops (M, 2) in them, if an alignment may succeed; None if it is too early.
 
     With `last`, no more rows will arrive.
+
+    Raises
+    ------
+    EstimationError
+        If GNSS is stated and no more rows will arrive, and none of those kept is a fix: the place is not known.
     """
     sensors.drop_unmeasured()
     recording = sensors.make_recording(-np.inf, now)
+    if last and sensors.setup.gnss is not None and (recording.gnss is None or not len(recording.gnss.t)):
+        raise EstimationError(
+            f"no fix in the last {recording.duration:.0f} s and no motion before: there is no position",
+            key="online.no_place",
+        )
     waits = sensors.setup.gnss is not None and not last
     if waits and (recording.gnss is None or not is_ready(recording, settings)):
         return None

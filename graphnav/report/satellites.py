@@ -131,6 +131,6 @@ def tabulate_epochs(solution: Solution) -> list[Markup]:
     row: list[Any] = [len(epochs), Quantity(f"{np.median(many):.0f}"), int(many.min())]
     if len(kinds := solution.fixed):
         fixed = int(np.sum(kinds[:, 1] > 0.0))
-        head += ["integer ambiguities", "real ambiguities", "share of integer"]
+        head += ["epochs with integers", "epochs without", "share with"]
         row += [fixed, len(kinds) - fixed, Quantity(f"{100.0 * fixed / len(kinds):.1f} %")]
     return [page.heading("Raw GNSS"), page.make_table(head, [row])]

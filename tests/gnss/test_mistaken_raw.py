@@ -105,6 +105,9 @@ def test_a_base_of_another_day_is_refused(changed):
 
 def test_a_base_that_ends_early_leaves_the_rovers_own_observations(changed, whole):
     one = raw_of(changed("base.obs.gz", lambda text: "".join([blocks(text)[0], *blocks(text)[1][:20]])))
+    assert "raw_gnss.base_short" not in {f.key for f in check_raw(one)}  # codes of it are used for a minute more
+    late = replace(one, difference=np.where(one.t < one.t[0] + 20.0, one.difference, np.nan))
+    assert [f.severity for f in check_raw(late) if f.key == "raw_gnss.base_short"] == ["warning"]
     np.testing.assert_array_equal(one.carrier, whole.carrier)
     both = np.isfinite(one.carrier_difference)
     np.testing.assert_allclose(np.diff(one.carrier_difference[both][:40]), np.diff(whole.carrier_difference[both][:40]))

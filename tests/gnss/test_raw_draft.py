@@ -16,6 +16,7 @@ from graphnav.app import cli
 from graphnav.core.errors import RecordingError
 from graphnav.gnss.load import Sources, load_raw
 from graphnav.recording.draft import draft
+from graphnav.recording.draft.raw import tell_kind
 from graphnav.recording.formats import read
 
 DATA = Path(__file__).resolve().parents[2] / "data" / "kamakura_rtk"
@@ -133,3 +134,14 @@ def test_observations_alone_are_no_recording(tmp_path):
     shutil.copy(DATA / "rover.obs.gz", tmp_path / "rover.obs.gz")
     with refused("draft.no_imu", RecordingError, "IMU"):
         draft([tmp_path], tmp_path)
+    (tmp_path / "LICENSE.txt").write_text("terms, of use\n1, 2\n")
+    with refused("draft.no_imu", RecordingError, "IMU", "raw GNSS"):
+        draft([tmp_path], tmp_path)
+
+
+@pytest.mark.parametrize("first", [f"{'':5}3.00{'':11}{'C':<40}", f"{'3.04':<21}{'C':<44}"])
+def test_clocks_are_told_by_either_of_their_headers(tmp_path, first):
+    """That of version 3.04 is wider by five columns."""
+    path = tmp_path / "a.clk"
+    path.write_text(f"{first}RINEX VERSION / TYPE\n")
+    assert tell_kind(path) == ("clk", False)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 from dataclasses import replace
 
 import numpy as np
@@ -96,6 +97,18 @@ def test_the_sky_is_drawn_where_the_satellites_are(solved):
     assert words["G01"]["x"] == pytest.approx(60.0)
     assert words["G01"]["y"] == pytest.approx(0.0, abs=1e-9)
     assert words["N"]["y"] > 0.0
+
+
+def test_a_satellite_with_some_rows_refused_is_not_drawn_as_refused(solved):
+    """Rows of less than half weight are below those used, and none of them is among these."""
+    record = solved[2]["rts"].records["gnss_code"]
+    one = replace(record, weight=np.where(np.arange(len(record.t)) % 9 == 0, 0.1, 1.0))
+    dots = [trace for trace in plots.plot_sky(one, "rts").data if "marker" in trace]
+    drawn = [(trace["marker"]["color"], len(base64.b64decode(trace["customdata"]["bdata"])) // 4) for trace in dots]
+    refused = int(np.sum(one.weight < plots.HALF))
+    assert drawn[0][1] == refused
+    assert sum(n for _, n in drawn[1:]) == len(one.t) - refused
+    assert {colour for colour, _ in drawn[1:]} != {drawn[0][0]}
 
 
 def test_pictures_are_of_raw_observations_alone(solved):

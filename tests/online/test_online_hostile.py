@@ -13,16 +13,16 @@ from pathlib import Path
 import numpy as np
 import oracle
 import pytest
-from helpers import refused
+from helpers import assert_told, refused
 from test_online import off, played, same
 
 import graphnav
 from graphnav.app.cli_online import StopRequest, follow
-from graphnav.config import parse_settings
+from graphnav.config import Settings, parse_settings
 from graphnav.core.errors import ConfigError, GraphnavError, RecordingError
 from graphnav.core.notes import get_key
 from graphnav.core.trajectory import Trajectory
-from graphnav.online import Online, Row, Session, ahead, drop_rows, list_rows
+from graphnav.online import ImuSample, Online, Row, Session, ahead, drop_rows, list_rows, live_setup
 from graphnav.online.lines import PROTOCOL, format_line, format_lines, parse_setup
 from graphnav.online.store import _MAGIC, Store
 from graphnav.online.tracker import Tracker
@@ -516,3 +516,14 @@ def test_a_line_that_never_ends_is_one_bad_line(drive: tuple[Recording, Trajecto
     assert session.bad == 1
     assert session.taken == len(lines)
     assert max(held) < 8 << 20
+
+
+def test_a_drive_whose_fixes_never_came_is_nowhere():
+    """Not where the local frame of a drive without GNSS begins, with a sigma of millimetres."""
+    rng = np.random.default_rng(3)
+    online = Online(live_setup(antenna=(0.0, 0.0, 0.6)), Settings(noise={"mode": "stated"}))
+    for k, w in enumerate(rng.normal(0.0, 1e-3, (500, 3))):
+        online.add(ImuSample(0.02 * k, w, [0.0, 0.0, 9.8] + 10.0 * w))
+    online.finish()
+    assert [len(track) for track in online.settled()] == []
+    assert_told(online.notes, "online.not_aligned", "10 s")

@@ -13,6 +13,7 @@ from graphnav.gnss.signals import SYSTEM_NAMES, SYSTEMS, name_satellite, name_si
 
 _EPOCH_GAP_PERIODS = 2.5  # periods beyond which a step between epochs is a gap
 _BASE_ODD = 4.0  # sigmas of its own position by which a base is off its stated one with a probability of 0.1 %
+_ALONE = 0.05  # share of epochs without the base, above which a gap of its link does not explain it
 _FEWEST_SATELLITES = 5  # satellites, one more than a position with its clock takes
 
 
@@ -75,6 +76,16 @@ def check_raw(raw: RawGnss) -> Iterator[Finding]:
                 f"the base's own codes put it {np.linalg.norm(off):.0f} m from its stated position (east, north, up "
                 f"{each} m, 1-sigma): all positions are off by as much as base_position is",
                 "raw_gnss.base_off",
+            )
+    if raw.differenced:
+        placed = np.isfinite(raw.p[:, 0]) & np.isfinite(raw.code)
+        alone = float(np.mean(_count_satellites(raw, placed & np.isfinite(raw.difference))[by_epoch > 0] == 0))
+        if alone > _ALONE:
+            yield Finding(
+                "warning",
+                f"raw GNSS: in {100.0 * alone:.0f} % of the epochs nothing is there of the base, and nothing used; give "
+                "files of it that cover the drive, or leave it out",
+                "raw_gnss.base_short",
             )
     if not np.isfinite(raw.range_rate).any():
         yield Finding("note", "raw GNSS: no Doppler shifts, so no velocities", "raw_gnss.no_doppler")

@@ -144,7 +144,8 @@ def write_raw(found: RawFound, folder: Path) -> list[tuple[str, str, str]]:
     for key, files in found.files.items():
         names = [Path(os.path.relpath(path.resolve(), folder.resolve())).as_posix() for path in files]
         value = ", ".join('"' + name.replace("\\", "\\\\").replace('"', '\\"') + '"' for name in names)
-        out.append((key, value if len(names) == 1 else f"[{value}]", _WHY[key]))
+        alone = key == "rover" and "base" not in found.files
+        out.append((key, value if len(names) == 1 else f"[{value}]", _ALONE if alone else _WHY[key]))
     if found.base is not None:
         (x, y, z), why = found.base
         out.append(("base_position", f"[{x:.4f}, {y:.4f}, {z:.4f}]", why))
@@ -152,6 +153,7 @@ def write_raw(found: RawFound, folder: Path) -> list[tuple[str, str, str]]:
     return out
 
 
+_ALONE = "raw observations"
 _WHY = {
     "rover": "raw observations of the antenna that moves",
     "base": "observations of an antenna that stands",
@@ -179,7 +181,7 @@ def tell_kind(path: Path) -> tuple[str | None, bool]:
     except RecordingError:  # reported where the file is read
         return None, False
     first = data[:200].partition(b"\n")[0].decode("latin-1")
-    label, kind = first[60:80].strip(), first[20:21]
+    label, kind = first[60:].strip(), first[20:22].strip()[:1]  # five columns further on in clocks of version 3.04
     if "COMPACT RINEX FORMAT" in first:
         return "observed", False
     if label == "RINEX VERSION / TYPE":
@@ -216,8 +218,8 @@ def _choose_rover(
     if sum(moved) != 1:
         why = f", and {'both' if all(moved) else 'neither'} of the antennas moved" if moved else ""
         raise RecordingError(
-            f"{paths[0].parent}: {names} hold observations of the same time{why}; name one of them as the rover, and "
-            'write base = "FILE" in [raw_gnss] for the other',
+            f"{paths[0].parent}: {names} hold observations of the same time{why}; give init that of the rover alone, "
+            'with the IMU\'s log and the ephemerides, and write base = "FILE" in [raw_gnss] for the other',
             key="draft.raw_roles",
         )
     rover = paths[moved.index(True)]

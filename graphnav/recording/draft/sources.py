@@ -86,9 +86,9 @@ def find_logs(paths: Sequence[Path], topics: Sequence[str] = ()) -> LogsFound:
             worst = every["accel"][0]
             guesses.guess_accel_unit(worst.path, worst.stack("ax", "ay", "az"), worst.find_unit("ax", "accel"))
     if "imu" not in sensors:
-        there = ", ".join(sensors) or "nothing"
+        there = ", ".join([*sensors, *(["raw GNSS"] if raw.observed else [])]) or "nothing"
         unread = f" ({refused[0]})" if refused else ""
-        if others and not refused:
+        if others and not refused and not raw.observed:
             unread = f" ({others})"
         raise RecordingError(
             f"{paths[0]}: no IMU in these logs (found: {there}); three gyro and three force columns are one{unread}",

@@ -50,18 +50,20 @@ def plot_sky(record: ConstraintRecord, solver: str) -> Figure:
     ):  # fmt: skip
         panel.write_words(*at, words, align, shift, "ink")
     refused = record.weight < HALF
+    if refused.any():  # below the others, as a rim of those: a satellite that stands still would hide under them
+        own = _choose_rows(np.flatnonzero(refused))
+        panel.draw_dots(x[own], y[own], "alert", "less than half weight", 5.0, t=record.t[own], path=True)
     named = [(_NAME[0] / 2, 90.0 - ring) for ring in _RINGS]  # middles of words
     for name in np.unique(record.satellite):
-        own = _choose_rows(np.flatnonzero(record.satellite == name), _PLENTY // 8)
-        panel.draw_dots(x[own], y[own], solver, "used", 3.0, t=record.t[own], path=True)
+        own = np.flatnonzero(record.satellite == name)
+        used = _choose_rows(own[~refused[own]], _PLENTY // 8)
+        if len(used):
+            panel.draw_dots(x[used], y[used], solver, "used", 3.0, t=record.t[used], path=True)
         at = float(x[own[-1]]), float(y[own[-1]])
         right, left = ((at[0] + side * _NAME[0] / 2, at[1]) for side in (1.0, -1.0))
         turned = _find_room(left, named) > _find_room(right, named)
         panel.write_words(*at, str(name), "right" if turned else "left", (-4 if turned else 4, -4))
         named.append(left if turned else right)
-    if refused.any():
-        own = _choose_rows(np.flatnonzero(refused))
-        panel.draw_dots(x[own], y[own], "alert", "less than half weight", 4.0, t=record.t[own], path=True)
     return figure
 
 
