@@ -83,8 +83,8 @@ def check_raw(raw: RawGnss) -> Iterator[Finding]:
         if alone > _ALONE:
             yield Finding(
                 "warning",
-                f"raw GNSS: in {100.0 * alone:.0f} % of the epochs nothing is there of the base, and nothing used; give "
-                "files of it that cover the drive, or leave it out",
+                f"raw GNSS: in {100.0 * alone:.0f} % of the epochs nothing of the base is there, and nothing is used; "
+                "give files of it that cover the drive, or leave it out",
                 "raw_gnss.base_short",
             )
     if not np.isfinite(raw.range_rate).any():
