@@ -22,12 +22,12 @@ improbable as `CHANCE`. The most probable model decides what is left out.
 
 Masking. Figures that are estimated with a fault among the data may have grown until they hide it, so the tests are made
 with the figures at their prior medians as well. If they find more, the figures are estimated again without these spans,
-twice, because the spans shrink to what is wrong. Each set of spans that comes up on the way is decided by these
-figures, and the decision with the largest evidence stands. If no fault is left by these figures, the estimate that uses
-all measurements and starts from them is one more candidate.
+and once more without those that the tests find by the new figures. Each set of spans that comes up on the way, whole
+and trimmed to what is wrong, is decided by these figures, and the decision with the largest evidence stands. If no
+fault is left by these figures, the estimate that uses all measurements and starts from them is one more candidate.
 
-Between. A filter follows errors that last, so the tests find where they begin and where they end, each as the beginning
-of a fault. So every other span from one such beginning to the next is tried as well.
+Between. A filter follows an error that lasts, so the tests find its beginning, and its end as the beginning of another.
+So every other span from one beginning to the next is tried as well.
 
 Before or after. The tests run forward in time, so where fixes step from one place to another those behind the step are
 suspected, though those before it may be the wrong ones. So the fixes before each span that is left out, for as long,
@@ -82,7 +82,7 @@ from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.ekf import refilter
 from graphnav.recording import Recording
 
-_REFINEMENTS = 2  # estimates without masked spans: the first trims the spans, the second is free of what is wrong
+_REFINEMENTS = 2  # estimates without masked spans: the figures of the second are free of what is wrong
 
 
 def estimate_without_faults(
@@ -207,8 +207,8 @@ def _unmask(base: Problem, found: NoiseEstimate, first: Decision, masked: list[S
         passes = passes + estimate.passes + Counter(filter=1)
         spans, refined = trim(spans, errors), trim(detected, errors)
         # a slow onset is dated better by the tests, an abrupt end by the errors of single fixes
-        onsets = list_between(refined, _list_fix_times(base)) if len(refined) > 1 else ()
-        for some in list_distinct(spans, trim(spans, errors, FALSE_ALARM), detected, *onsets):
+        between = list_between(refined, _list_fix_times(base)) if len(refined) > 1 else ()
+        for some in list_distinct(spans, trim(spans, errors, FALSE_ALARM), detected, *between):
             candidate = explain(base, _add_outliers(estimate, errors, some), some)
             passes = passes + candidate.passes
             cut = _cut_at_steps(some, candidate.noise, used, estimate)
