@@ -203,7 +203,7 @@ def _iterate(
     intervals: bool,
 ) -> NoiseEstimate:
     """Iterate from initial figures and linearisation points to convergence."""
-    passes, total, converged, totals = 0, len(problem.t), False, count_rows(problem)
+    done, total, converged, totals = 0, len(problem.t), False, count_rows(problem)  # keyframes
     ends = [total] if total <= 2 * _FIRST_KEYFRAMES or figures.known else [_FIRST_KEYFRAMES, total]
     latest: tuple[ForwardRecord, DisturbancePass] | None = None
     for end in ends:
@@ -213,7 +213,7 @@ def _iterate(
         for k in range(_MAX_PASSES):
             used, latest = apply_noise(problem, figures.build_model()), None  # releases the memory of the previous pass
             latest = _smooth_about(used, about.take_first(end))
-            passes += 1
+            done += end
             prior_then = figures.log_prior()
             now = float(np.sum(latest[0].log_likelihood)) + prior_then
             if progress is not None:
@@ -234,10 +234,10 @@ def _iterate(
     if not converged:
         latest = None
         latest = _smooth_about(apply_noise(problem, figures.build_model()), about)
-        passes, prior_then = passes + 1, figures.log_prior()
+        done, prior_then = done + total, figures.log_prior()
         now = float(np.sum(latest[0].log_likelihood)) + prior_then
     assert latest is not None
-    evidence = now - compute_outlier_cost(figures.weights, totals)
+    evidence, passes = now - compute_outlier_cost(figures.weights, totals), round(done / total)
     return NoiseEstimate(
         figures.build_model(), latest[1], now, prior_then, evidence, Counter(filter=passes, smoother=passes)
     )
