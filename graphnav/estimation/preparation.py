@@ -186,10 +186,11 @@ def _find_noise(
     found = revise_jointly(found, settings, built.aligned.until, progress)
     if found.freed:
         built, found = _start_anew(builder, built, found)
-    passes.update(found.estimate.passes + Counter(filter=1))
     best, built = found.estimate, replace(built, problem=found.base)
     wanted = weigh is not None and weigh(apply_noise(built.problem, best.noise), best.points)
+    found = found.weigh() if wanted else found
     evidence = found.compute_evidence() if wanted else np.inf
+    passes.update(found.estimate.passes + Counter(filter=1))
     plain = NoiseModel(excluded=best.noise.excluded, freed=found.freed)
     if _is_likelier(built.problem, plain, best):
         return plain, None, built, evidence
@@ -202,7 +203,7 @@ def _start_anew(
 ) -> tuple[BuiltProblem, JointEstimate]:
     """The same with a start that depends on no constant as stated that is free."""
     anew = builder.build_without(built, found.noise, parts=True, anew=True)
-    again = replace(found, stated=anew.problem)
+    again = replace(found, stated=anew.problem, estimate=replace(found.estimate, whole_evidence=None))
     if np.array_equal(anew.problem.t, built.problem.t):
         return anew, again
     best = estimate_noise(again.base, anew.aligned.until, found.estimate.noise)

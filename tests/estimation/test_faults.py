@@ -24,7 +24,7 @@ from graphnav.estimation.faults.likelihood_ratio import update_tests
 from graphnav.estimation.faults.segments import _respond, _Runs, _Set, find_wrong_segments
 from graphnav.estimation.faults.verdicts import Verdicts
 from graphnav.estimation.faults.watch import FALSE_ALARM, MINUTE, Bank
-from graphnav.estimation.noise.decision import log_evidence
+from graphnav.estimation.noise.decision import log_evidence, weigh_evidence
 from graphnav.estimation.noise.estimate import estimate_noise
 from graphnav.estimation.noise.exclusion import estimate_disturbed_intervals, estimate_without_faults
 from graphnav.estimation.noise.explanations import add_common_errors
@@ -338,6 +338,10 @@ def test_disturbed_intervals_stand_only_with_more_evidence() -> None:
     found = estimate_without_faults(base, estimate_noise(base))
     disturbed = estimate_disturbed_intervals(base, found)
     assert log_evidence(base, disturbed) >= log_evidence(base, found)
+    # an evidence is computed once, and what it takes is counted
+    weighed = weigh_evidence(base, replace(found, whole_evidence=None))
+    assert weighed.passes["filter"] > found.passes["filter"]
+    assert weigh_evidence(base, weighed) is weighed
 
 
 def scattered(recording: Recording, bad: Array, times: float, seed: int) -> Recording:

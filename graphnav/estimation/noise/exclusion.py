@@ -53,11 +53,15 @@ from graphnav.estimation.faults.excluded import find_fault_spans, weigh_rows
 from graphnav.estimation.faults.segments import find_wrong_segments
 from graphnav.estimation.faults.watch import FALSE_ALARM, SIZES
 from graphnav.estimation.noise.apply import apply_noise, select_weights
-from graphnav.estimation.noise.decision import Decision, explain, list_explanations, log_evidence
-from graphnav.estimation.noise.estimate import NoiseEstimate, estimate_noise
-from graphnav.estimation.noise.explanations import (
-    FIXES,
+from graphnav.estimation.noise.decision import (
+    Decision,
+    explain,
+    list_explanations,
+    log_evidence,
+    weigh_evidence,
 )
+from graphnav.estimation.noise.estimate import NoiseEstimate, estimate_noise
+from graphnav.estimation.noise.explanations import FIXES, ROWS
 from graphnav.estimation.noise.initial_points import BREAKDOWN
 from graphnav.estimation.noise.model import INTERVALS, NoiseModel, RowWeights
 from graphnav.estimation.noise.moments import collect_row_moments, predict_errors
@@ -117,8 +121,9 @@ def estimate_without_faults(
         with contextlib.suppress(*BREAKDOWN):  # from a filter that follows the wrong fixes
             other = _estimate_other(base, opening, found, best, before, progress)
     if other is not None:
-        passes = passes + other.passes + Counter(filter=2)
-        best = max(best, other, key=lambda one: log_evidence(base, one))
+        both = tuple(weigh_evidence(base, replace(one, passes=Counter())) for one in (best, other))
+        passes = sum((one.passes for one in both), passes + other.passes)
+        best = max(both, key=lambda one: log_evidence(base, one))
     return replace(best, passes=passes)
 
 
@@ -229,7 +234,8 @@ def _unmask(base: Problem, found: NoiseEstimate, first: Decision, masked: list[S
             passes = passes + candidate.passes
             cut = _cut_at_steps(some, candidate.noise, used, estimate)
             if cut != some:
-                finer = explain(base, _add_outliers(estimate, errors, cut), cut)
+                among = {*list_explanations(candidate.noise), ROWS}  # its pieces are wrong the same way, or not at all
+                finer = explain(base, _add_outliers(estimate, errors, cut), cut, among)
                 passes = passes + finer.passes
                 candidate = max(candidate, finer, key=lambda one: one.log_evidence)
             if candidate.log_evidence > best.log_evidence:
@@ -278,6 +284,7 @@ def estimate_disturbed_intervals(base: Problem, found: NoiseEstimate) -> NoiseEs
     base : built with stated noise and the parts of its intervals' noise.
     found : with all intervals alike.
     """
+    found = weigh_evidence(base, found)
     start, near, passes = found.noise, found.get_linearisation(base), found.passes
     if found.noise.excluded:
         free = estimate_noise(base, None, replace(found.noise, excluded={}), near, intervals=True)
@@ -286,12 +293,13 @@ def estimate_disturbed_intervals(base: Problem, found: NoiseEstimate) -> NoiseEs
         if decision.noise.excluded:
             without = replace(free.noise, excluded=decision.noise.excluded)
             free = estimate_noise(base, None, without, free.get_linearisation(base), intervals=True)
+            free = weigh_evidence(base, free)
             passes = passes + free.passes
         if log_evidence(base, free) > log_evidence(base, found):
             return replace(free, passes=passes)
         if free.noise.excluded == found.noise.excluded:  # the same model, already converging
             start, near = free.noise, free.get_linearisation(base)
-    disturbed = estimate_noise(base, None, start, near, intervals=True)
+    disturbed = weigh_evidence(base, estimate_noise(base, None, start, near, intervals=True))
     best = max(found, disturbed, key=lambda one: log_evidence(base, one))
     return replace(best, passes=passes + disturbed.passes)
 
