@@ -26,6 +26,7 @@ from graphnav.estimation.faults.excluded import weigh_rows
 from graphnav.estimation.fixing import fix, split_carriers
 from graphnav.estimation.joint_estimate import JointEstimate, estimate_jointly, revise_jointly
 from graphnav.estimation.noise.apply import apply_noise, drop_parts
+from graphnav.estimation.noise.bias_walks import estimate_bias_walks
 from graphnav.estimation.noise.estimate import NoiseEstimate, estimate_noise
 from graphnav.estimation.noise.initial_points import BREAKDOWN
 from graphnav.estimation.noise.model import STATED, NoiseModel
@@ -105,10 +106,13 @@ def prepare(
     spacing = settings.noise.spacing if noise is None else noise.spacing
     every = ProblemBuilder(recording, recording, settings, frame, clock)
     aligned = every.align(recording, detections.stationary)
-    if noise is None and (settings.noise.mode == "stated" or aligned.motion is None or not settings.gnss.position):
+    unaided = aligned.motion is None or not settings.gnss.position
+    stated = noise is None and (settings.noise.mode == "stated" or unaided)
+    drifts = stated and settings.noise.mode != "stated" and recording.platform == "foot"
+    if stated:
         noise, spacing = STATED, STATED.spacing
     builder = replace(every, used=space_fixes(recording, spacing)) if spacing else every
-    built, known, evidence = builder.build(aligned, detections, parts=noise != STATED), None, np.inf
+    built, known, evidence = builder.build(aligned, detections, parts=drifts or noise != STATED), None, np.inf
     if noise is None:
         tell("noise")
         with clock.count_time("noise"):
@@ -125,6 +129,14 @@ def prepare(
         if known is None:
             raise
         forward, smoothed = _filter_and_smooth(problem, aligned.until, known, clock, progress)
+    if drifts:
+        with clock.count_time("noise"):
+            noise, spent = estimate_bias_walks(built.problem, smoothed)
+            passes.update(spent)
+        if noise.figures:
+            problem = drop_parts(apply_noise(built.problem, noise))
+            forward, smoothed = _filter_and_smooth(problem, aligned.until, None, clock, progress)
+            passes.update(filter=1, smoother=1)
     with clock.count_time("smoother"):
         problem = _drop_refused(problem, forward)
         if any(rows.gate is not None for rows in problem.constraints):

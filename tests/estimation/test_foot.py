@@ -447,6 +447,25 @@ def test_shape_by_epochs_and_by_stances() -> None:
     assert compare_shapes(t, p, truth, np.empty((0, 2))) == (everywhere, everywhere, everywhere)
 
 
+def test_an_accelerometer_that_drifts_more_than_stated_is_seen() -> None:
+    """Its bias walk is estimated, and the heights are no surprise; of an IMU that is as stated nothing is."""
+    assert not solved()["rts"].noise.figures
+    walk = made("normal")
+    imu = walk.recording.imu
+    drift = np.linspace(0.0, 0.03, len(imu.t))[:, None] * [0.0, 0.0, 1.0]  # m/s^2, as 20 in a minute on real walks
+    drifting = replace(walk.recording, imu=replace(imu, accel=imu.accel + drift))
+    found, taken = (run(drifting, noise=mode, solvers=("rts",))["rts"] for mode in ("estimated", "stated"))
+    figures = found.noise.figures
+    assert list(figures) == ["imu.accel_bias_walk"]
+    assert figures["imu.accel_bias_walk"].log_factor > 3.0 * figures["imu.accel_bias_walk"].sigma
+    height = interpolate(walk.truth, found.t)[0].llh[:, 2]
+    up = [one.states.p[:, 2] - (height - height[0]) for one in (found, taken)]
+    later = found.t > found.t[0] + 5.0  # steps have been made
+    nees = [np.mean(e[later] ** 2 / one.covariance[later, 5, 5]) for e, one in zip(up, (found, taken), strict=True)]
+    assert nees[0] < 1.0 < 3.0 < nees[1]
+    assert np.abs(up[0]).max() < 0.3 * np.abs(up[1]).max()
+
+
 # --------------------------------------------------------------------------------------------------------- real walks
 def test_real_walks(shared_data: Path) -> None:
     """Twice as good as a plain zero-velocity filter in the mean of four walks, and none worse, by each solver."""
