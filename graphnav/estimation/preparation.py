@@ -108,11 +108,11 @@ def prepare(
     aligned = every.align(recording, detections.stationary)
     unaided = aligned.motion is None or not settings.gnss.position
     stated = noise is None and (settings.noise.mode == "stated" or unaided)
-    drifts = stated and settings.noise.mode != "stated" and recording.platform == "foot"
+    larger = stated and settings.noise.mode != "stated" and recording.platform == "foot"
     if stated:
         noise, spacing = STATED, STATED.spacing
     builder = replace(every, used=space_fixes(recording, spacing)) if spacing else every
-    built, known, evidence = builder.build(aligned, detections, parts=drifts or noise != STATED), None, np.inf
+    built, known, evidence = builder.build(aligned, detections, parts=larger or noise != STATED), None, np.inf
     if noise is None:
         tell("noise")
         with clock.count_time("noise"):
@@ -129,7 +129,7 @@ def prepare(
         if known is None:
             raise
         forward, smoothed = _filter_and_smooth(problem, aligned.until, known, clock, progress)
-    if drifts:
+    if larger:
         with clock.count_time("noise"):
             noise, spent = estimate_bias_walks(built.problem, smoothed)
             passes.update(spent)

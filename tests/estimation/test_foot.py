@@ -29,8 +29,10 @@ from graphnav.estimation.solution import Solution
 from graphnav.evaluation.strides import compare_shapes, compute_walk_errors, estimate_floor_sigma
 from graphnav.imu.preintegration import preintegrate
 from graphnav.imu.samples import bridge_gaps
-from graphnav.recording import Imu, Recording, Truth
+from graphnav.recording import Imu, Recording, Truth, take_rows
+from graphnav.recording.checks.overview import inspect
 from graphnav.recording.formats import read
+from graphnav.report.doubts import list_doubts
 from graphnav.simulation import Simulated, simulate
 
 PACES = ("slow", "normal", "fast")
@@ -464,6 +466,47 @@ def test_an_accelerometer_that_drifts_more_than_stated_is_seen() -> None:
     nees = [np.mean(e[later] ** 2 / one.covariance[later, 5, 5]) for e, one in zip(up, (found, taken), strict=True)]
     assert nees[0] < 1.0 < 3.0 < nees[1]
     assert np.abs(up[0]).max() < 0.3 * np.abs(up[1]).max()
+
+
+def make_thigh() -> Imu:
+    """Half a minute of an IMU in a pocket: a pendulum that never stands, after three seconds at rest."""
+    rng, t = np.random.default_rng(3), 0.01 * np.arange(1, 3001)
+    phase = 6.0 * t
+    gyro = np.stack(
+        [2.2 * np.sin(phase) + 0.5 * np.sin(2 * phase + 0.3), 0.5 * np.sin(phase + 1), 0.4 * np.cos(phase)], 1
+    )
+    pitch = 0.01 * np.cumsum(gyro[:, 0])
+    pitch -= pitch.mean()
+    bounce = 2.5 * np.sin(2 * phase), 3.5 * np.sin(2 * phase + 0.7)
+    accel = np.stack([0.8 * np.sin(phase), 9.81 * np.sin(pitch) + bounce[0], 9.81 * np.cos(pitch) + bounce[1]], 1)
+    gyro[t < 3.0], accel[t < 3.0] = 0.0, [0.0, 0.0, 9.81]
+    return Imu(t, gyro + 4e-3 * rng.standard_normal(gyro.shape), accel + 0.03 * rng.standard_normal(accel.shape))
+
+
+def test_an_imu_that_is_on_no_foot_is_doubted() -> None:
+    """What was taken for its stances moves; figures of noise do not explain that away."""
+    found = run(Recording("pocket", "foot", make_thigh()), solvers=("ekf",))
+    assert "doubt.stances" in map(get_key, list_doubts(found, {}))
+    assert not found["ekf"].noise.figures
+    for one in ("ekf", "batch"):
+        assert "doubt.stances" not in map(get_key, list_doubts({one: solved()[one]}, {}))
+
+
+def test_parts_between_gaps_are_no_single_walk() -> None:
+    walk = made("normal").recording
+    t = walk.imu.t - walk.start
+    parts = replace(walk, imu=take_rows(walk.imu, (t < 25.0) | (t > 28.0)))
+    assert "doubt.pieces" in map(get_key, list_doubts(run(parts, solvers=("rts",)), {}))
+    assert "doubt.pieces" not in map(get_key, list_doubts({"rts": solved()["rts"]}, {}))
+
+
+def test_a_rate_that_misses_the_impacts_of_steps_is_warned_of() -> None:
+    walk = made("normal").recording
+    found = {
+        n: [one.key for one in inspect(replace(walk, imu=take_rows(walk.imu, slice(0, None, n)))).findings]
+        for n in (1, 2, 5)
+    }
+    assert {n: "imu.slow" in keys for n, keys in found.items()} == {1: False, 2: False, 5: True}
 
 
 # --------------------------------------------------------------------------------------------------------- real walks
