@@ -14,8 +14,10 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from graphnav.config import Settings
+from graphnav.constraints.foot import Stance
 from graphnav.core.earth import LocalFrame
 from graphnav.core.errors import EstimationError
+from graphnav.core.notes import Note
 from graphnav.core.progress import Progress, tell
 from graphnav.core.rotation import Array
 from graphnav.detectors import Detections
@@ -143,7 +145,7 @@ def prepare(
             smoothed = smooth_backward(problem, refilter(problem, smoothed, progress), progress)
         forward, smoothed, ahead = _relinearise(problem, aligned, known, forward, smoothed, progress, passes)
     passes.update(filter=1, smoother=1)
-    notes = (*describe_freed(noise.freed, recording), *describe_noise(noise, problem))
+    notes = (*describe_freed(noise.freed, recording), *describe_noise(noise, problem), *_describe_missing(problem))
     epochs, arcs = dict[str, Array](), {"": CarrierArcs()}
     rest, carriers = (problem, built.carriers) if built.carriers is not None else split_carriers(problem)
     if carriers is not None:
@@ -158,6 +160,15 @@ def prepare(
         problem, noise, start, aligned, built.detections, forward, smoothed, notes, clock.seconds, passes, epochs, arcs,
         evidence, ahead,
     )  # fmt: skip
+
+
+def _describe_missing(problem: Problem) -> tuple[str, ...]:
+    """A doubt on a walk that nothing but the IMU tells of."""
+    recording = problem.recording
+    if recording.platform != "foot" or recording.placed or any(c.name == Stance.name for c in problem.constraints):
+        return ()
+    words = "no stance was found, and without one errors grow as the square of time: is the IMU on a foot?"
+    return (Note("doubt.stances", f"This result cannot be trusted: {words}"),)
 
 
 def _filter_and_smooth(

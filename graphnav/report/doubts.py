@@ -76,7 +76,7 @@ def list_doubts(solutions: Mapping[str, Solution], errors: Mapping[str, Errors])
             out.append(Note("doubt.left_out", words + "other measurements and is left out"))
             break  # all solvers use the same noise model
     notes = dict.fromkeys(note for solution in solutions.values() for note in solution.notes)
-    out += [Note(key, note) for note in notes if (key := get_key(note)) in ("doubt.axes", "doubt.pieces")]
+    out += [Note(key, note) for note in notes if (key := get_key(note)).startswith("doubt.")]
     out += [note for s in solutions.values() if (note := _describe_sliding(s)) is not None][:1]
     for solution in solutions.values():
         if (vague := _describe_vague(solution)) is not None:
