@@ -26,7 +26,7 @@ from graphnav.estimation.faults.watch import MINUTE, Bank
 from graphnav.estimation.noise.decision import log_evidence
 from graphnav.estimation.noise.estimate import estimate_noise
 from graphnav.estimation.noise.exclusion import estimate_disturbed_intervals, estimate_without_faults
-from graphnav.estimation.noise.spans import list_before, split_at_steps
+from graphnav.estimation.noise.spans import list_before, list_between, split_at_steps
 from graphnav.estimation.pipeline import choose_origin, run
 from graphnav.estimation.problem import Problem, build_problem
 from graphnav.estimation.solution import Solution
@@ -39,6 +39,8 @@ from graphnav.estimation.solvers.stack import Stack
 from graphnav.evaluation.scoring import compute_errors
 from graphnav.recording import Recording
 from graphnav.recording.formats import read
+from graphnav.simulation import simulate
+from graphnav.simulation.scenarios.ushaq import FAULTS
 
 # nothing is looked for: everything is what it is stated to be
 OFF = parse_settings({"gnss": {"faults": "off"}, "noise": {"mode": "stated"}})
@@ -241,6 +243,14 @@ def test_list_before() -> None:
     assert list_before([(0.0, 3.0), (10.0, 14.0), (16.0, 26.0)], t) == [(6.0, 9.0), (15.0, 15.0)]
 
 
+def test_list_between() -> None:
+    """From where a span begins to where the next does; whether it is the first that is wrong, or the next, is open."""
+    t = np.arange(0.0, 30.0)
+    first, second = list_between([(3.0, 4.0), (10.0, 14.0), (20.0, 21.0)], t)
+    assert first == [(3.0, 9.0), (20.0, 29.0)]
+    assert second == [(10.0, 19.0)]
+
+
 def test_split_at_steps() -> None:
     """Where one more error is worth its cost, beside what the errors change by in any case."""
     rng = np.random.default_rng(1)
@@ -270,6 +280,18 @@ def test_reflections_that_follow_each_other_are_left_out(shared_data: Path) -> N
     out = left_out(run(wrong, None, ("rts",))["rts"], wrong)
     assert out[first | second].mean() > 0.9
     assert out[~(first | second)].mean() < 0.1
+
+
+def test_positions_and_velocities_that_drift_together() -> None:
+    """Simulated: for seven minutes, after which a filter without wheels has followed them 420 m away."""
+    made = simulate("ushaq", 0, rate=20.0, fault="growing", growth_in_velocity=True)
+    recording = made.recording.crop(500.0, 1900.0)
+    assert recording.gnss is not None
+    wrong = (recording.gnss.t > FAULTS[0][0]) & (recording.gnss.t <= FAULTS[0][1])
+    found = run(recording, parse_settings({"vehicle": {"nhc": False}}), ("rts",))["rts"]
+    out = left_out(found, recording)
+    assert out[wrong].mean() > 0.99
+    assert out[~wrong].mean() < 0.01
 
 
 # ---------------------------------------------------------------------------------------------------------- noise

@@ -22,9 +22,12 @@ improbable as `CHANCE`. The most probable model decides what is left out.
 
 Masking. Figures that are estimated with a fault among the data may have grown until they hide it, so the tests are made
 with the figures at their prior medians as well. If they find more, the figures are estimated again without these spans,
-twice, because the spans shrink to what is wrong. Each set of spans that comes up on the way is decided by these
-figures, and the decision with the largest evidence stands. If no fault is left by these figures, the estimate that uses
-all measurements and starts from them is one more candidate.
+and once more without those that the tests find by the new figures. Each set of spans that comes up on the way, whole
+and trimmed to what is wrong, is decided by these figures, and the decision with the largest evidence stands. If no
+fault is left by these figures, the estimate that uses all measurements and starts from them is one more candidate.
+
+Between. A filter follows an error that lasts, so the tests find its beginning, and its end as the beginning of another.
+So every other span from one beginning to the next is tried as well.
 
 Before or after. The tests run forward in time, so where fixes step from one place to another those behind the step are
 suspected, though those before it may be the wrong ones. So the fixes before each span that is left out, for as long,
@@ -43,6 +46,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from graphnav.core.rotation import Array
 from graphnav.estimation.faults.excluded import find_fault_spans, weigh_rows
 from graphnav.estimation.faults.watch import FALSE_ALARM, SIZES
 from graphnav.estimation.noise.apply import apply_noise, select_weights
@@ -65,6 +69,7 @@ from graphnav.estimation.noise.spans import (
     join,
     join_faults,
     list_before,
+    list_between,
     list_distinct,
     list_repeats,
     mask_times,
@@ -77,7 +82,7 @@ from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.ekf import refilter
 from graphnav.recording import Recording
 
-_REFINEMENTS = 2  # estimates without masked spans: the first trims the spans, the second is free of what is wrong
+_REFINEMENTS = 2  # estimates without masked spans: the figures of the second are free of what is wrong
 
 
 def estimate_without_faults(
@@ -156,8 +161,12 @@ def _estimate_without(
 def _list_before(base: Problem, noise: NoiseModel) -> list[Span]:
     """Spans of fixes before those that a noise model leaves out."""
     excluded = join(span for kind in FIXES for span in noise.excluded.get(kind, ()))
-    rows = [c.keyframe for c in base.constraints if c.name in FIXES]
-    return list_before(excluded, base.t[np.unique(np.concatenate(rows))]) if excluded else []
+    return list_before(excluded, _list_fix_times(base)) if excluded else []
+
+
+def _list_fix_times(base: Problem) -> Array:
+    """(N,) s, in order."""
+    return base.t[np.unique(np.concatenate([c.keyframe for c in base.constraints if c.name in FIXES]))]
 
 
 def decide_faults(base: Problem, found: NoiseEstimate) -> Decision:
@@ -198,7 +207,8 @@ def _unmask(base: Problem, found: NoiseEstimate, first: Decision, masked: list[S
         passes = passes + estimate.passes + Counter(filter=1)
         spans, refined = trim(spans, errors), trim(detected, errors)
         # a slow onset is dated better by the tests, an abrupt end by the errors of single fixes
-        for some in list_distinct(spans, trim(spans, errors, FALSE_ALARM), detected):
+        between = list_between(refined, _list_fix_times(base)) if len(refined) > 1 else ()
+        for some in list_distinct(spans, trim(spans, errors, FALSE_ALARM), detected, *between):
             candidate = explain(base, _add_outliers(estimate, errors, some), some)
             passes = passes + candidate.passes
             cut = _cut_at_steps(some, candidate.noise, used, estimate)
@@ -216,9 +226,9 @@ def _unmask(base: Problem, found: NoiseEstimate, first: Decision, masked: list[S
             passes = passes + free.passes
             if free.log_evidence > first.log_evidence:
                 return Decision(free.noise, free.log_evidence, passes, free)
-        if not refined or refined == spans:
+        if not refined or detected == spans:
             break
-        spans, start = refined, replace(start, excluded=dict.fromkeys(FIXES, tuple(refined)))
+        spans, start = detected, replace(start, excluded=dict.fromkeys(FIXES, tuple(detected)))
     if best is not first and not best.noise.excluded:  # the figures that go with these outliers
         free = estimate_noise(base, None, best.noise, leading.get_linearisation(base))
         return Decision(free.noise, best.log_evidence, passes + free.passes, free)
