@@ -54,7 +54,7 @@ from graphnav.core.rotation import Array
 from graphnav.core.state import Parameter, States
 from graphnav.gnss.atmosphere import compute_obliquity
 from graphnav.gnss.carrier import number_epochs, pair_consecutive
-from graphnav.gnss.series import compute_epoch_medians
+from graphnav.gnss.series import compute_medians
 from graphnav.gnss.sigmas import compute_carrier_sigma
 from graphnav.gnss.signals import L1, C
 from graphnav.recording import Recording
@@ -112,7 +112,7 @@ def pair_rows(scene: BuildContext) -> tuple[PreparedRows, CarrierPairs] | None:
     level = found.known - 2.0 * found.ionosphere - raw.clock - raw.carrier * C / raw.frequency
     change = level[after] - level[before]
     clock = np.zeros(len(epochs))
-    clock[of[after]] = -compute_epoch_medians(raw.t[after], change)
+    clock[of[after]] = -compute_medians(raw.t[after], change)
     some = found.keyframe[after] >= 0  # in a piece, changes at earlier epochs are in use already
     number = number_epochs(raw)[first]
     return found, CarrierPairs(before[some], after[some], number, epochs, first, change[some], clock)

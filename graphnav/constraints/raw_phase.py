@@ -26,7 +26,7 @@ from typing import ClassVar
 import numpy as np
 
 from graphnav.config import Settings
-from graphnav.constraints.ambiguities import CarrierRows, make_ambiguities, name_ambiguity
+from graphnav.constraints.ambiguities import CarrierRows, make_ambiguities, name_ambiguity, replace_gross
 from graphnav.constraints.base import SAME_TIME, BuildContext, Constraint, Linearized
 from graphnav.constraints.raw_gnss import IONOSPHERE, list_common_fields, make_ionosphere_parameter
 from graphnav.constraints.raw_rows import find_epoch_period
@@ -80,7 +80,8 @@ class GnssPhase(CarrierRows):
         if not used.any():
             return None
         wavelength = C / raw.frequency
-        guess = raw.carrier + (raw.carrier_difference - raw.code - raw.difference) / wavelength
+        code = replace_gross(raw, raw.code + raw.difference, geometry)
+        guess = raw.carrier + (raw.carrier_difference - code) / wavelength
         guess = np.where(np.isfinite(guess), guess, 0.0)
         own = make_ambiguities(arcs, guess, wavelength)
         there = [k for k in sorted(own) if np.any(used & (arcs.slot == k))]

@@ -8,8 +8,10 @@ from numpy.typing import NDArray
 from graphnav.config import Settings
 from graphnav.config.raw_gnss import RawGnssSettings
 from graphnav.constraints.base import SAME_TIME
+from graphnav.core.errors import ConfigError
 from graphnav.core.rotation import Array
 from graphnav.gnss.series import RawGnss, choose_primary
+from graphnav.gnss.single_point import choose_coefficients, look
 from graphnav.recording import Recording
 
 EARLY = 0.05  # s by which an epoch may be early: stamps jitter
@@ -28,6 +30,30 @@ def select_observations(recording: Recording, settings: Settings) -> RawGnss | N
     raw = raw.take(used)
     raw = raw.take(choose_primary(raw))
     return raw if len(raw) else None
+
+
+def check_masks(recording: Recording, settings: Settings) -> None:
+    """Check that the masks leave something of a recording's raw observations.
+
+    Raises
+    ------
+    ConfigError
+        If they do not: it would be solved as if there were no GNSS.
+    """
+    s, raw = settings.raw_gnss, recording.raw_gnss
+    if raw is None or not recording.is_tight(s.coupling) or not len(raw):
+        return
+    placed = raw.take(np.isfinite(raw.p[:, 0]))
+    elevation = look(placed, placed.antenna, choose_coefficients(placed)).elevation
+    for key, unit, value, least in (
+        ("cn0", "dB-Hz", placed.cn0, s.cn0),
+        ("elevation", "deg", np.degrees(elevation), s.elevation),
+    ):
+        if len(value) and np.all(value < least):
+            raise ConfigError(
+                f"raw_gnss.{key} = {least:g} {unit} leaves no observation: the largest is {value.max():.0f}; lower it",
+                key="raw_gnss.masks",
+            )
 
 
 def select_usable(raw: RawGnss, settings: RawGnssSettings) -> NDArray[np.bool_]:

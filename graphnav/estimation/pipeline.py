@@ -16,6 +16,7 @@ from graphnav.config import Settings
 from graphnav.constraints import check_own as check_constraints
 from graphnav.constraints.base import Constraint
 from graphnav.constraints.prior import InitialPrior
+from graphnav.constraints.raw_selection import check_masks
 from graphnav.core.earth import LocalFrame
 from graphnav.core.errors import ConfigError, EstimationError, RecordingError
 from graphnav.core.memory import return_memory
@@ -98,8 +99,8 @@ def run(
     EstimationError
         If the recording does not determine a trajectory.
     ConfigError
-        If the settings' profile is of another platform, a class of a script is not complete, or an argument is none of
-        these.
+        If the settings' profile is of another platform, they leave no raw observation, a class of a script is not
+        complete, or an argument is none of these.
     """
     settings = settings or Settings()
     for given, kind, maker in ((recording, Recording, "load"), (settings, Settings, "read_settings or Settings")):
@@ -118,6 +119,7 @@ def run(
     recording, found = screened.recording, state_findings(recording, screened.findings)
     if (apart := describe_gnss_apart(recording)) is not None:  # it would be solved as if there were no GNSS
         raise RecordingError(f"'{recording.name}': {apart}", key="gnss.apart")
+    check_masks(recording, settings)
     with send_progress(progress):
         solutions = _run(recording, settings, solvers, progress, noise, screened.clock)
     return {name: replace(one, notes=(*found, *one.notes)) for name, one in solutions.items()}

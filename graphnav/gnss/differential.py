@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.gnss.arcs import find_arcs
-from graphnav.gnss.series import RawGnss, compute_epoch_medians
+from graphnav.gnss.series import RawGnss, compute_medians
 from graphnav.gnss.signals import C
 from graphnav.gnss.single_point import choose_coefficients, look
 
@@ -45,7 +45,7 @@ def add_differences(rover: RawGnss, base: RawGnss, position: Array) -> tuple[Raw
     error = known + geometry.ionosphere - base.code
     of_carrier = known - geometry.ionosphere - C / base.frequency * base.carrier
     base, error, of_carrier, arc = base.take(high), error[high], of_carrier[high], arcs.arc[high]
-    common = compute_epoch_medians(base.t, error)
+    common = compute_medians(base.t, error)
     error, of_carrier = error - common, of_carrier - common
     difference, carrier_difference = np.full(len(rover), np.nan), np.full(len(rover), np.nan)
     base_arc = np.full(len(rover), -1)

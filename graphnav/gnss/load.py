@@ -20,7 +20,7 @@ from graphnav.gnss.placing import Corrected, place, restore_own_stamps
 from graphnav.gnss.precise import Orbits, read_precise
 from graphnav.gnss.rinex_nav import read_navigation
 from graphnav.gnss.rinex_obs import parse_observations
-from graphnav.gnss.series import Observations, RawGnss, choose_primary, join_files
+from graphnav.gnss.series import Observations, RawGnss, choose_primary, drop_contradictory, join_files
 from graphnav.gnss.signals import C, name_signal
 from graphnav.gnss.single_point import SinglePoint, solve
 from graphnav.gnss.ubx import is_ubx, parse_ubx
@@ -105,6 +105,8 @@ def load_raw(
     if sources.nominal_stamps:
         obs = restore_own_stamps(obs, precise or nav, rover, corrected)  # type: ignore[arg-type]
     raw, remarks = place(obs, nav, precise, rover, corrected)
+    raw, contradictory = drop_contradictory(raw)
+    remarks += contradictory
     antennas: Antennas = {}
     for path in sources.antex:
         some, ends = read_antex(path)
@@ -174,9 +176,14 @@ def _check_agreement(raw: RawGnss, fixes: SinglePoint, path: Path) -> None:
     there = np.bincount(raw.epochs[1], minlength=len(fixes.t))
     share = float(np.median(fixes.satellites[np.isfinite(fixes.p[:, 0])] / there[np.isfinite(fixes.p[:, 0])]))
     if share < 0.5:
+        why = (
+            "its codes are not in metres, corrected or stamps in [raw_gnss] is not what they are"
+            if path.name.endswith((".csv", ".csv.gz"))
+            else "its stamps are not in the time system that its header says"
+        )
         raise RecordingError(
-            f"{path}: only {100.0 * share:.0f} % of an epoch's codes agree on one position: its stamps are not in the "
-            "time system that its header says, or the ephemerides are of other satellites",
+            f"{path}: only {100.0 * share:.0f} % of an epoch's codes agree on one position: {why}, or the ephemerides "
+            "are of other satellites",
             key="raw.contradictory",
         )
 
@@ -200,11 +207,15 @@ def _difference_by_base(
             key="raw.base_time",
         )
     away = float(np.linalg.norm(np.median(raw.antenna, axis=0) - position))
-    base, _ = place(obs, nav, precise, position)
+    base, contradictory = drop_contradictory(place(obs, nav, precise, position)[0])
     one = base.take(choose_primary(base) & np.isfinite(base.p[:, 0]))
+    if not len(one):
+        raise RecordingError(
+            f"{sources.base[0]}: none of its satellites has an ephemeris at its times", key="raw.no_ephemeris_then"
+        )
     base_fixes = solve(one)
     off, sigma = _measure_base(sources.base[0], one, base_fixes, position)
-    notes = [*obs.remarks]
+    notes = [*obs.remarks, *contradictory]
     if given is None:
         notes.append(Note("raw.base_position", "the base's position is that of its header"))
     base, _ = _correct_times(base, base_fixes)

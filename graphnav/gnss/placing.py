@@ -11,7 +11,7 @@ from graphnav.core.rotation import Array
 from graphnav.gnss.channels import find_channels
 from graphnav.gnss.ephemeris import Ephemerides, Placed, rotate_earth
 from graphnav.gnss.precise import Orbits
-from graphnav.gnss.series import Observations, RawGnss, compute_epoch_medians
+from graphnav.gnss.series import Observations, RawGnss, compute_medians
 from graphnav.gnss.signals import C, name_satellite
 
 _FLIGHT = 0.075  # s, flight time of a signal from a medium Earth orbit
@@ -113,5 +113,5 @@ def restore_own_stamps(
     found = source.place(obs.satellite, obs.t - _FLIGHT, obs.zero)
     away = np.linalg.norm(rotate_earth(found.p, np.full(len(obs), _FLIGHT)) - rover, axis=1)
     error = (obs.code - away) / C + (0.0 if corrected.clock else found.clock)
-    off = compute_epoch_medians(obs.t, error)
+    off = compute_medians(obs.t, error)
     return replace(obs, t=obs.t + _TICK * np.round(np.nan_to_num(off) / _TICK))

@@ -7,7 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
+from graphnav.core import earth
 from graphnav.core.errors import RecordingError
+from graphnav.core.notes import format_count
 from graphnav.core.rotation import Array
 from graphnav.gnss.files import Lines
 from graphnav.gnss.signals import GLONASS, SYSTEMS
@@ -25,14 +27,14 @@ class Header:
     system: str = "G"
     types: dict[int, list[str]] = field(default_factory=dict)  # by system, in the file's order: "C1C"
     scale: str = "GPS"  # of time
-    marker: Array | None = None
+    marker: Array | None = None  # (3,) m in e, rough position of the antenna
     channels: dict[int, int] = field(default_factory=dict)
     end: int = 0  # number of lines
 
 
 def read_rinex_header(lines: Lines, path: Path) -> Header:
     """Read the header, up to END OF HEADER."""
-    out, system, many = Header(), -1, 0
+    out, system, announced, above = Header(), -1, dict[int, int](), np.zeros(3)
     for k in range(len(lines)):
         text = lines.get_text(k)
         label, body = text[60:].strip(), text[:60]
@@ -46,15 +48,25 @@ def read_rinex_header(lines: Lines, path: Path) -> Header:
                 out.system = body[40:41].strip() or "G"
             elif label == "SYS / # / OBS TYPES":
                 if body[0] != " ":
-                    system, many = SYSTEMS.find(body[0]), int(body[3:6])
-                    out.types[system] = []
+                    system = SYSTEMS.find(body[0])
+                    out.types[system], announced[system] = [], int(body[3:6])
                 out.types.setdefault(system, []).extend(body[6:].split())
             elif label == "# / TYPES OF OBSERV":
-                many = int(body[:6]) if body[:6].strip() else many
+                if body[:6].strip():
+                    announced[-2] = int(body[:6])
                 out.types.setdefault(-2, []).extend(body[6:].split())
             elif label == "APPROX POSITION XYZ":
                 place = np.array(body.split(), dtype=float)
                 out.marker = place if len(place) == 3 and 6e6 < np.linalg.norm(place) < 7e6 else None
+            elif label == "ANTENNA: DELTA H/E/N":
+                height, east, north = (float(word) for word in body.split()[:3])
+                above = np.array([east, north, height])
+            elif label == "SYS / SCALE FACTOR" and int(body[2:6]) != 1:
+                raise RecordingError(
+                    f"{path}, line {k + 1}: observations multiplied by {int(body[2:6])} are not read; write the file "
+                    "without SYS / SCALE FACTOR",
+                    key="rinex.scale",
+                )
             elif label == "TIME OF FIRST OBS":
                 out.scale = body[48:51].strip() or ("GLO" if out.system == "R" else "GPS")
                 if out.scale not in _SCALES:
@@ -81,6 +93,16 @@ def read_rinex_header(lines: Lines, path: Path) -> Header:
         raise RecordingError(f"{path}: the header has no END OF HEADER; the file is cut off", key="rinex.cut")
     if not 2.0 <= out.version < 5.0:
         raise RecordingError(f"{path}: RINEX version {out.version:g}; 2.11, 3 and 4 are read", key="rinex.version")
+    for one, number in announced.items():
+        if one != -1 and number != len(out.types[one]):
+            of = f" of {SYSTEMS[one]}" if one >= 0 else ""
+            raise RecordingError(
+                f"{path}: the header announces {format_count(number, 'type')} of observations{of} and names "
+                f"{len(out.types[one])}: a line of it is missing or changed",
+                key="rinex.types",
+            )
+    if out.marker is not None and np.isfinite(above).all():
+        out.marker = out.marker + earth.enu_axes(earth.ecef_to_llh(out.marker)).T @ above
     if out.version < 3.0:
         both = out.types.pop(-2, [])
         out.types = dict.fromkeys(range(len(SYSTEMS)), both)

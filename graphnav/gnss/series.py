@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields, replace
+from pathlib import PurePath
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,12 +12,16 @@ from graphnav.core.errors import RecordingError
 from graphnav.core.notes import Note, format_count
 from graphnav.core.rotation import Array
 from graphnav.gnss.antex import Antennas
-from graphnav.gnss.signals import C, Ids, find_frequencies
+from graphnav.gnss.signals import SYSTEM_NAMES, C, Ids, find_frequencies, name_signal
 
 _LARGEST_CODE = 1e9  # m, of a code: satellites are 4.3e7 m away at most, and receiver clocks are not seconds off
 _LARGEST_DOPPLER = 1e6  # Hz, of a Doppler shift: satellite motion causes 1e4, an oscillator off by 1e-4 2e5
 _MOST_CYCLES = 1e11  # of a carrier: more than F14.3 holds
 _LONGEST_SPAN = 3.15e7  # s, a year
+_LEAST_TRACKED = 10.0  # dB-Hz, below which nothing is tracked; strengths in nine classes are below it (RINEX 3.05)
+_TELLING = 50.0  # m, change of a code from epoch to epoch beside which its noise is small
+_FEWEST_CHANGES = 20  # of these, from which a median is taken
+_UNLIKE = 0.3  # of the ratio of changes to those of the codes: another sign or unit is further off, noise is not
 
 
 @dataclass(frozen=True)
@@ -87,12 +92,12 @@ def join_files(parts: list[Observations]) -> Observations:
 
 
 def drop_repeated(obs: Observations) -> Observations:
-    """Sort by time, satellite and signal; of repeated rows the first is kept.
+    """Sort by time, satellite and signal; of repeated rows the first is kept, and none of those that differ.
 
     Raises
     ------
     RecordingError
-        If their times are years apart.
+        If their times are years apart, or files have two receivers' observations of the same time.
     """
     obs = _drop_impossible(obs)
     span = float(np.ptp(obs.t)) if len(obs) else 0.0
@@ -104,18 +109,69 @@ def drop_repeated(obs: Observations) -> Observations:
     key = (tick - tick.min(initial=0)) * 10**7 + obs.satellite.astype(np.int64) * 10**4 + obs.signal
     if np.all(np.diff(key) > 0):
         return obs
-    _, first = np.unique(key, return_index=True)
-    twice = len(obs) - len(first)
-    out = obs.take(first)
-    if not twice:
-        return out
-    return replace(
-        out,
-        remarks=(
-            *out.remarks,
-            Note("raw.twice", f"{format_count(twice, 'repeated observation')} left out; the first of each is used"),
-        ),
+    _, first, of = np.unique(key, return_index=True, return_inverse=True)
+    again = np.delete(np.arange(len(obs)), first)
+    if not len(again):
+        return obs.take(first)
+    of_first = first[of[again]]
+    other = ~np.all(
+        [np.isclose(x[again], x[of_first], 0.0, 1e-3, equal_nan=True) for x in (obs.code, obs.carrier)], axis=0
     )
+    differ, several = np.unique(of[again[other]]), np.unique(of[again])
+    if len(obs.files) > 1 and 2 * len(differ) > len(several):
+        raise RecordingError(
+            f"{' and '.join(obs.files)}: {len(differ)} of {len(several)} observations that two of them have differ: "
+            "they are of two receivers; name the files of one in rover, that of a base station in base",
+            key="raw.two_receivers",
+        )
+    remarks = list(obs.remarks)
+    if same := int(np.sum(~other)):
+        sentence = f"{format_count(same, 'repeated observation')} left out; the first of each is used"
+        remarks.append(Note("raw.twice", sentence))
+    if len(differ):
+        sentence = f"{format_count(len(differ), 'observation')} left out: there twice, with other values"
+        remarks.append(Note("raw.twice_unlike", sentence))
+    return replace(obs.take(np.delete(first, differ)), remarks=tuple(remarks))
+
+
+def drop_contradictory(raw: RawGnss) -> tuple[RawGnss, tuple[str, ...]]:
+    """Drop signal strengths, carrier phases and Doppler shifts that are in another unit, or have another sign.
+
+    From epoch to epoch a carrier phase changes as the code does, and so does the integral of the range rate; the
+    receiver's clock is in all of them. Remarks say what was dropped.
+    """
+    name, notes = PurePath(raw.files[0]).name if raw.files else "rover", []
+    if 0.0 <= (strongest := float(np.max(raw.cn0, initial=-np.inf, where=np.isfinite(raw.cn0)))) < _LEAST_TRACKED:
+        sentence = f"{name}: signal strengths are no C/N0 in dB-Hz, the largest is {strongest:g}: they are not used"
+        raw, notes = replace(raw, cn0=np.full(len(raw), np.nan)), [Note("raw.strength_unit", sentence)]
+    order = np.lexsort((raw.t, raw.signal, raw.satellite))
+    now, before = order[1:], order[:-1]
+    dt = raw.t[now] - raw.t[before]
+    same = (raw.satellite[now] == raw.satellite[before]) & (raw.signal[now] == raw.signal[before]) & (dt > 0.0)
+    now, before, dt = now[same], before[same], dt[same]
+    change = raw.code[now] - raw.code[before]
+    told = np.abs(change) > _TELLING
+    group = raw.satellite // 100 * 1000 + raw.signal
+    with np.errstate(invalid="ignore"):
+        by_carrier = C / raw.frequency[now] * (raw.carrier[now] - raw.carrier[before])
+        by_doppler = 0.5 * (raw.range_rate[now] + raw.range_rate[before]) * dt
+    for what, column, other in (("carriers", "carrier", by_carrier), ("Doppler shifts", "range_rate", by_doppler)):
+        value, wrong = getattr(raw, column).copy(), []
+        for one in np.unique(group).tolist():
+            rows = told & (group[now] == one) & np.isfinite(other)
+            if rows.sum() < _FEWEST_CHANGES:
+                continue
+            if abs((ratio := float(np.median(other[rows] / change[rows]))) - 1.0) > _UNLIKE:
+                value[group == one] = np.nan
+                wrong.append(f"{SYSTEM_NAMES[one // 1000]} {name_signal(one % 1000)} ({ratio:.2f})")
+        if wrong:
+            sentence = (
+                f"{name}: {what} change otherwise than the codes, as by another unit or sign (times what codes do): "
+                f"{', '.join(wrong)}; they are not used"
+            )
+            raw = replace(raw, **{column: value})
+            notes.append(Note("raw.unlike_codes", sentence))
+    return raw, tuple(notes)
 
 
 def _drop_impossible(obs: Observations) -> Observations:
@@ -237,9 +293,9 @@ def choose_primary(raw: RawGnss) -> NDArray[np.bool_]:
     return out & np.isfinite(raw.code)
 
 
-def compute_epoch_medians(t: Array, value: Array) -> Array:
-    """(N,) the median of the values of each row's epoch; NaN where an epoch has none."""
-    epochs, of = np.unique(t, return_inverse=True)
+def compute_medians(of: Array | Ids, value: Array) -> Array:
+    """(N,) the median of the values of each row's epoch, or other group; NaN where a group has none."""
+    epochs, of = np.unique(of, return_inverse=True)
     order = np.lexsort((value, of))  # NaN last
     edge = np.searchsorted(of[order], np.arange(len(epochs) + 1))
     many = np.bincount(of, weights=np.isfinite(value), minlength=len(epochs)).astype(np.intp)

@@ -79,11 +79,11 @@ def parse_ubx(data: bytes, path: Path) -> tuple[Observations, Ephemerides]:
     signal = np.full(len(rows), -1, dtype=np.int16)
     for (gnss, sig), one in names.items():
         signal[(rows["gnss"] == gnss) & (rows["sig"] == sig)] = one
-    known = (signal >= 0) & (system >= 0) & (rows["sv"] > 0) & (rows["sv"] < 255)
-    if not known.all():
-        sentence = f"{format_count((~known).sum(), 'measurement')} of unknown signals left out"
-        remarks.append(Note("raw.unknown_signals", f"{path.name}: {sentence}"))
     number = np.where(rows["gnss"] == 1, rows["sv"].astype(int) - 100, rows["sv"])
+    known = (signal >= 0) & (system >= 0) & (number > 0) & (number < 100)  # 255: a satellite of GLONASS not known yet
+    if not known.all():
+        sentence = f"{format_count((~known).sum(), 'measurement')} of unknown signals or satellites left out"
+        remarks.append(Note("raw.unknown_signals", f"{path.name}: {sentence}"))
     satellite = (100 * system + number).astype(np.int16)
     status, lock = rows["status"], rows["lock"] * 1e-3
     has_carrier = (status & _CARRIER_BIT > 0) & (rows["carrier"] != 0.0)

@@ -28,10 +28,12 @@ def check_mirroring(recording: Recording, track: Track, turns_back: bool) -> Ite
     """A course that turns opposite to the gyro, as positions are mirrored by an exchange or a sign.
 
     Exchanged positions are also stretched, one way by the cosine of the latitude: their course agrees better with the
-    gyro after the exchange if they were exchanged, and worse if only a sign is wrong, or nothing.
+    gyro after the exchange if they were exchanged, and worse if only a sign is wrong, or nothing. Positions computed
+    from raw observations are neither; theirs are of another time.
     """
     gnss = recording.gnss
-    other = exchange_lat_lon(gnss) if gnss is not None else None
+    computed = gnss is not None and gnss.derived
+    other = exchange_lat_lon(gnss) if gnss is not None and not computed else None
     yaw, as_read = (_fit_course(recording.imu, some) for some in (other, gnss))
     better = as_read is None or (yaw is not None and yaw.correlation > as_read.correlation)
     if yaw is not None and better and yaw.correlation > 0.8 and abs(yaw.coefficients[0] - 1.0) < 0.2:
@@ -41,7 +43,16 @@ def check_mirroring(recording: Recording, track: Track, turns_back: bool) -> Ite
     elif (  # the gyro agrees with the force, whose up is that of the stated axes
         turns_back and crosschecks.find_up(recording.imu)[2] > 0.0 and tilt.measure_sideways(recording.imu, track) > 0.0
     ):
-        yield describe_mirroring("latitudes or longitudes have", "the turns of the gyro and the force in curves")
+        by = "the turns of the gyro and the force in curves"
+        if computed:
+            yield Finding(
+                "refused",
+                f"the raw observations are not of the time of the IMU, by {by}: clock, or time_offset in [raw_gnss], "
+                "is off by seconds",
+                "raw_gnss.clock",
+            )
+        else:
+            yield describe_mirroring("latitudes or longitudes have", by)
 
 
 def _fit_course(imu: Imu, gnss: Gnss | None) -> Fit | None:
