@@ -29,7 +29,7 @@ import graphnav
 from graphnav.app.scores import Withheld, score
 from graphnav.recording import Recording
 
-NOISE, SOLVERS = "graphnav.estimation.noise", "graphnav.estimation.solvers"
+NOISE, FAULTS = "graphnav.estimation.noise", "graphnav.estimation.faults"
 SOLVED = ("ekf", "rts")
 DAMAGED = ("bursts", "drifting")
 
@@ -83,22 +83,22 @@ CONSTANTS = (
     Constant(
         f"{NOISE}.exclusion",
         "_REFINEMENTS",
-        "computing: a span comes to what is wrong, and is looked at once more",
+        "computing: estimates without what is suspected, the second by figures that are free of it",
         2.0,
         whole=True,
     ),
     Constant(
-        f"{SOLVERS}.watch", "FALSE_ALARM", "probability: one drive in a hundred of an hour, of Gaussian errors", 100.0
+        f"{FAULTS}.watch", "FALSE_ALARM", "probability: one drive in a hundred of an hour, of Gaussian errors", 100.0
     ),
-    Constant(f"{SOLVERS}.watch", "_ONSET", "95 % of chi-square of one degree of freedom"),
-    Constant(f"{SOLVERS}.watch", "SIZES", "m, m/s: reflections in a city, and speeds in one"),
-    Constant(f"{SOLVERS}.watch", "MINUTE", "s, in which an error may grow by as much as it can be"),
-    Constant(f"{SOLVERS}.watch", "OLDEST", "s: what inertial sensors knew before says little"),
-    Constant(f"{SOLVERS}.watch", "PATIENCE", "s, after which inertial sensors of any grade have lost a position"),
-    Constant(f"{SOLVERS}.watch", "LARGE", "sigmas: less is no fault, however certain"),
-    Constant(f"{SOLVERS}.watch", "_CLOCKS", "s, between the stamps of IMU and receiver"),
-    Constant(f"{SOLVERS}.watch", "_BRAKING", "m/s^2, of a usual manoeuvre"),
-    Constant(f"{SOLVERS}.verdicts", "_FEWEST_AGREEING", "fixes that agree by chance", 2.0, whole=True),
+    Constant(f"{FAULTS}.watch", "_ONSET", "95 % of chi-square of one degree of freedom"),
+    Constant(f"{FAULTS}.watch", "SIZES", "m, m/s: reflections in a city, and speeds in one"),
+    Constant(f"{FAULTS}.watch", "MINUTE", "s, in which an error may grow by as much as it can be"),
+    Constant(f"{FAULTS}.watch", "OLDEST", "s: what inertial sensors knew before says little"),
+    Constant(f"{FAULTS}.watch", "PATIENCE", "s, after which inertial sensors of any grade have lost a position"),
+    Constant(f"{FAULTS}.watch", "LARGE", "sigmas: less is no fault, however certain"),
+    Constant(f"{FAULTS}.watch", "_CLOCKS", "s, between the stamps of IMU and receiver"),
+    Constant(f"{FAULTS}.watch", "_BRAKING", "m/s^2, of a usual manoeuvre"),
+    Constant(f"{FAULTS}.verdicts", "_FEWEST_AGREEING", "fixes that agree by chance", 2.0, whole=True),
     Constant("graphnav.estimation.building", "_FAR_AWAY", "m, single fixes in a city"),
     Constant(
         "graphnav.estimation.preparation",
@@ -106,6 +106,15 @@ CONSTANTS = (
         "rad: half its square is the share of a vector that linearising loses",
     ),
     Constant("graphnav.estimation.preparation", "_MOST_WRONG", "the larger part"),
+    Constant(
+        "graphnav.estimation.preparation",
+        "_LINEAR",
+        "sigmas of a step: a quarter more mean square of errors over sigmas",
+    ),
+    Constant(
+        "graphnav.estimation.contradictions", "_WIDER", "sigmas: a drive's own estimate counts a quarter too much"
+    ),
+    Constant("graphnav.recording", "ACROSS", "data sheets: axes square to 0.05 deg beside scales good to 0.3 %"),
 )
 DERIVED = {
     "CHANCE": ("OUTLIER_COST", lambda x: -float(np.log(x))),

@@ -46,8 +46,8 @@ def run_text(outcome: Outcome, files: Sequence[Path]) -> str:
     lines += [f"  {line}" for line in _describe_noise(outcome)]
     severity = {f.sentence: f.severity for f in outcome.checks}
     for note in dict.fromkeys([*outcome.findings, *notes]):
-        if get_key(note) in TABULATED or note in outcome.defects:
-            continue  # unreliable findings come first
+        if get_key(note) in TABULATED or get_key(note).startswith("doubt.") or note in outcome.defects:
+            continue  # doubts and unreliable findings come first
         lines.append(f"  {severity.get(note, 'note')}: {note}")
     lines.append("")
     lines += _tabulate_errors(outcome)

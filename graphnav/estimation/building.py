@@ -72,14 +72,14 @@ class ProblemBuilder:
     frame: LocalFrame
     clock: Clock
 
-    def align(self, recording: Recording, stationary: Array) -> Alignment:
-        """The first state of the recording, or of a part of it."""
+    def align(self, recording: Recording, stationary: Array, before: Alignment | None = None) -> Alignment:
+        """The first state of the recording, or of a part of it, near that found before, if any."""
         # an alignment needs no carrier phases, and solves dozens of problems
         codes_alone = self.settings.raw_gnss.model_copy(update={"differences": False})
         settings = self.settings.model_copy(update={"raw_gnss": codes_alone})
         tell("alignment")
         with self.clock.count_time("alignment"):
-            return align(recording, settings, self.frame, stationary)
+            return align(recording, settings, self.frame, stationary, before)
 
     def build(self, aligned: Alignment, detections: Detections, parts: bool) -> BuiltProblem:
         """Build the problem; with the contribution of each noise figure to its intervals, if these are to change."""
@@ -127,7 +127,9 @@ class ProblemBuilder:
         seen = self.recording.end if aligned.until is None else aligned.until
         if anew or any(begin <= seen for spans in noise.excluded.values() for begin, _ in spans):
             try:
-                found = self.align(use_freed(fixes, noise.freed, self.frame.epoch), stops.stationary)
+                # wrong fixes may have led the search anywhere, a constant a little off has not
+                before = None if noise.excluded else built.aligned
+                found = self.align(use_freed(fixes, noise.freed, self.frame.epoch), stops.stationary, before)
             except EstimationError:
                 found = aligned
             if found.motion is not None and (anew or found.contradicts(aligned)):

@@ -23,7 +23,7 @@ from graphnav.estimation.contradictions import (
     free,
     update_freed,
 )
-from graphnav.estimation.noise.decision import log_evidence
+from graphnav.estimation.noise.decision import log_evidence, weigh_evidence
 from graphnav.estimation.noise.estimate import NoiseEstimate, estimate_noise
 from graphnav.estimation.noise.exclusion import (
     compute_excluded_share,
@@ -46,6 +46,7 @@ class JointEstimate:
     stated: Problem  # with stated noise, and all constants as stated
     freed: Freed
     estimate: NoiseEstimate
+    tested: NoiseModel | None = None  # with which the constants were tested last, and stayed as they are
 
     @property
     def base(self) -> Problem:
@@ -65,6 +66,10 @@ class JointEstimate:
     def compute_evidence(self) -> float:
         """The logarithm of the evidence of the measurements."""
         return log_evidence(self.base, self.estimate) - compute_prior_cost(self.stated, self.freed)
+
+    def weigh(self) -> JointEstimate:
+        """The same with the evidence of all measurements, and the passes that this takes."""
+        return replace(self, estimate=weigh_evidence(self.base, self.estimate))
 
     def count(self, passes: Counter[str]) -> JointEstimate:
         """The same after this many passes."""
@@ -126,18 +131,22 @@ def _leave_out_faults(
 def _free_contradicted(found: JointEstimate, settings: GnssSettings, estimate: _Estimate) -> JointEstimate:
     """Free the constants that the drive contradicts as stated, and no others, and estimate the noise model anew.
 
-    Where these are free already, the estimate stays.
+    Where these are free already, the estimate stays; where it is the one that they were tested with last, so do they.
     """
+    if found.estimate.noise is found.tested:
+        return found
     base, before = found.stated, found.freed
     near = found.estimate.get_linearisation(found.base)
     names = set[str]() if settings.clock_rate_sigma == 0.0 else {CLOCK_RATE}
     if not is_offset_far(near[1], found.estimate.points):
         names |= {LEVER_ARM, TIME_OFFSET, VELOCITY_TIME_OFFSET}
-    passes = found.estimate.passes + Counter(filter=1)
+    passes, tested = found.estimate.passes + Counter(filter=1), found.estimate.noise
     try:
         freed = find_contradicted_constants(base, found.estimate, before, names)
         if not are_same(freed, before, base):
-            other = replace(found, freed=freed, estimate=estimate(free(base, freed), near))
+            found = found.weigh()
+            passes = found.estimate.passes + Counter(filter=1)
+            other = replace(found, freed=freed, estimate=estimate(free(base, freed), near)).weigh()
             passes = passes + other.estimate.passes + Counter(filter=1)
             # with other figures, this may lead to a worse optimum than before
             gained = _GAINED_BY_CHANCE * len(other.noise.figures)
@@ -146,4 +155,4 @@ def _free_contradicted(found: JointEstimate, settings: GnssSettings, estimate: _
             freed = update_freed(base, found.estimate, found.freed)
     except BREAKDOWN:
         return found.count(passes)
-    return replace(found, freed=freed).count(passes)
+    return replace(found, freed=freed, tested=tested).count(passes)

@@ -39,6 +39,9 @@ def split_pieces(recording: Recording, settings: Settings) -> tuple[list[Recordi
             )
         else:
             pieces.append(recording.crop(begin - 1e-9, end + 1e-9))
+    if len(pieces) > 1 and not recording.placed:
+        sentence = "without fixes, position and heading count from zero again behind each gap of the IMU"
+        notes.append(Note("doubt.pieces", f"These {len(pieces)} parts are no single trajectory: {sentence}"))
     return pieces, notes
 
 

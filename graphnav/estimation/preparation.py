@@ -14,8 +14,10 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from graphnav.config import Settings
+from graphnav.constraints.foot import Stance
 from graphnav.core.earth import LocalFrame
 from graphnav.core.errors import EstimationError
+from graphnav.core.notes import Note
 from graphnav.core.progress import Progress, tell
 from graphnav.core.rotation import Array
 from graphnav.detectors import Detections
@@ -26,6 +28,7 @@ from graphnav.estimation.faults.excluded import weigh_rows
 from graphnav.estimation.fixing import fix, split_carriers
 from graphnav.estimation.joint_estimate import JointEstimate, estimate_jointly, revise_jointly
 from graphnav.estimation.noise.apply import apply_noise, drop_parts
+from graphnav.estimation.noise.bias_walks import estimate_bias_walks
 from graphnav.estimation.noise.estimate import NoiseEstimate, estimate_noise
 from graphnav.estimation.noise.initial_points import BREAKDOWN
 from graphnav.estimation.noise.model import STATED, NoiseModel
@@ -105,10 +108,13 @@ def prepare(
     spacing = settings.noise.spacing if noise is None else noise.spacing
     every = ProblemBuilder(recording, recording, settings, frame, clock)
     aligned = every.align(recording, detections.stationary)
-    if noise is None and (settings.noise.mode == "stated" or aligned.motion is None or not settings.gnss.position):
+    unaided = aligned.motion is None or not settings.gnss.position
+    stated = noise is None and (settings.noise.mode == "stated" or unaided)
+    larger = stated and settings.noise.mode != "stated" and recording.platform == "foot"
+    if stated:
         noise, spacing = STATED, STATED.spacing
     builder = replace(every, used=space_fixes(recording, spacing)) if spacing else every
-    built, known, evidence = builder.build(aligned, detections, parts=noise != STATED), None, np.inf
+    built, known, evidence = builder.build(aligned, detections, parts=larger or noise != STATED), None, np.inf
     if noise is None:
         tell("noise")
         with clock.count_time("noise"):
@@ -125,13 +131,21 @@ def prepare(
         if known is None:
             raise
         forward, smoothed = _filter_and_smooth(problem, aligned.until, known, clock, progress)
+    if larger:
+        with clock.count_time("noise"):
+            noise, spent = estimate_bias_walks(built.problem, smoothed)
+            passes.update(spent)
+        if noise.figures:
+            problem = drop_parts(apply_noise(built.problem, noise))
+            forward, smoothed = _filter_and_smooth(problem, aligned.until, None, clock, progress)
+            passes.update(filter=1, smoother=1)
     with clock.count_time("smoother"):
         problem = _drop_refused(problem, forward)
         if any(rows.gate is not None for rows in problem.constraints):
             smoothed = smooth_backward(problem, refilter(problem, smoothed, progress), progress)
         forward, smoothed, ahead = _relinearise(problem, aligned, known, forward, smoothed, progress, passes)
     passes.update(filter=1, smoother=1)
-    notes = (*describe_freed(noise.freed, recording), *describe_noise(noise, problem))
+    notes = (*describe_freed(noise.freed, recording), *describe_noise(noise, problem), *_describe_missing(problem))
     epochs, arcs = dict[str, Array](), {"": CarrierArcs()}
     rest, carriers = (problem, built.carriers) if built.carriers is not None else split_carriers(problem)
     if carriers is not None:
@@ -146,6 +160,15 @@ def prepare(
         problem, noise, start, aligned, built.detections, forward, smoothed, notes, clock.seconds, passes, epochs, arcs,
         evidence, ahead,
     )  # fmt: skip
+
+
+def _describe_missing(problem: Problem) -> tuple[str, ...]:
+    """A doubt on a walk that nothing but the IMU tells of."""
+    recording = problem.recording
+    if recording.platform != "foot" or recording.placed or any(c.name == Stance.name for c in problem.constraints):
+        return ()
+    words = "no stance was found, and without one errors grow as the square of time: is the IMU on a foot?"
+    return (Note("doubt.stances", f"This result cannot be trusted: {words}"),)
 
 
 def _filter_and_smooth(
@@ -186,10 +209,11 @@ def _find_noise(
     found = revise_jointly(found, settings, built.aligned.until, progress)
     if found.freed:
         built, found = _start_anew(builder, built, found)
-    passes.update(found.estimate.passes + Counter(filter=1))
     best, built = found.estimate, replace(built, problem=found.base)
     wanted = weigh is not None and weigh(apply_noise(built.problem, best.noise), best.points)
+    found = found.weigh() if wanted else found
     evidence = found.compute_evidence() if wanted else np.inf
+    passes.update(found.estimate.passes + Counter(filter=1))
     plain = NoiseModel(excluded=best.noise.excluded, freed=found.freed)
     if _is_likelier(built.problem, plain, best):
         return plain, None, built, evidence
@@ -202,7 +226,7 @@ def _start_anew(
 ) -> tuple[BuiltProblem, JointEstimate]:
     """The same with a start that depends on no constant as stated that is free."""
     anew = builder.build_without(built, found.noise, parts=True, anew=True)
-    again = replace(found, stated=anew.problem)
+    again = replace(found, stated=anew.problem, estimate=replace(found.estimate, whole_evidence=None))
     if np.array_equal(anew.problem.t, built.problem.t):
         return anew, again
     best = estimate_noise(again.base, anew.aligned.until, found.estimate.noise)

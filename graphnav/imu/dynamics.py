@@ -77,10 +77,7 @@ _SETS = {
 
 
 def make_scale_parameter(recording: Recording) -> tuple[Parameter, ...]:
-    """The terms of gyro and accelerometer that a platform shows, where the noise figures leave them open.
-
-    Those of a foot also bear what impacts do to sensors, and are as wide as scale errors.
-    """
+    """The terms of gyro and accelerometer that a platform shows, where the noise figures leave them open."""
     return _scale_parameter(recording.imu.noise, recording.platform == "foot")
 
 
@@ -89,7 +86,7 @@ def _scale_parameter(noise: ImuNoise, every: bool) -> tuple[Parameter, ...]:
     if noise.gyro_scale_sigma <= 0 and noise.accel_scale_sigma <= 0:
         return ()
     sigma = [
-        max(scale * (1.0 if i == j or every else ACROSS), 1e-9)
+        max(scale * (1.0 if i == j else ACROSS), 1e-9)
         for scale, terms in zip(
             (noise.gyro_scale_sigma, noise.accel_scale_sigma), (TERMS, TERMS) if every else VEHICLE_TERMS, strict=True
         )

@@ -76,7 +76,8 @@ def list_doubts(solutions: Mapping[str, Solution], errors: Mapping[str, Errors])
             out.append(Note("doubt.left_out", words + "other measurements and is left out"))
             break  # all solvers use the same noise model
     notes = dict.fromkeys(note for solution in solutions.values() for note in solution.notes)
-    out += [Note(key, note) for note in notes if (key := get_key(note)) == "doubt.axes"]
+    out += [Note(key, note) for note in notes if (key := get_key(note)).startswith("doubt.")]
+    out += [note for s in solutions.values() if (note := _describe_sliding(s)) is not None][:1]
     for solution in solutions.values():
         if (vague := _describe_vague(solution)) is not None:
             out.append(vague)
@@ -99,6 +100,20 @@ def list_doubts(solutions: Mapping[str, Solution], errors: Mapping[str, Errors])
     if wrong:
         out.append(Note("doubt.sigma", f"The result's sigmas cannot be trusted: {'; '.join(wrong)}"))
     return tuple(out)
+
+
+def _describe_sliding(solution: Solution) -> Note | None:
+    """A doubt where most of what was taken for a stance is none."""
+    record = solution.records.get("stance")
+    if record is None or len(record.t) < FEWEST_ROWS:
+        return None
+    # without the kernel's weights, which the squares of innovations include
+    squares = record.nis / np.maximum(record.weight, 1e-9) if record.kind == "innovation" else record.nis
+    size = float(np.sqrt(np.median(squares) / chi_square_quantile(0.5, len(record.axes))))
+    if size <= TOO_LARGE[record.kind]:
+        return None
+    words = f"in its steps nothing stands still as a shoe on the floor does (speeds of {size:.2g} sigma in the median)"
+    return Note("doubt.stances", f"This result cannot be trusted: {words}: is the IMU on a foot?")
 
 
 def _describe_vague(solution: Solution) -> Note | None:

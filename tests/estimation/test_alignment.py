@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import oracle
@@ -14,7 +15,7 @@ from graphnav.core import rotation as ro
 from graphnav.core.earth import LocalFrame
 from graphnav.core.notes import get_key
 from graphnav.core.trajectory import Trajectory
-from graphnav.estimation.alignment import Alignment, align, use_known_heading
+from graphnav.estimation.alignment import Alignment, align, motion, use_known_heading
 from graphnav.recording import Recording
 
 DEG = np.pi / 180.0
@@ -134,6 +135,26 @@ def test_own_sigma_is_honest_over_many_drives(path: oracle.ExactPath) -> None:
     # 12 draws of one axis: 99.9 % of chi-square with 12 degrees of freedom lies below 32.9, 0.1 % below 2.2
     assert np.all(np.sum(over, axis=0) < 32.9), np.mean(over, axis=0)
     assert np.all(np.sum(over, axis=0) > 2.2 / 10), np.mean(over, axis=0)
+
+
+def test_a_second_search_starts_where_the_first_ended(path: oracle.ExactPath, monkeypatch: pytest.MonkeyPatch) -> None:
+    recording, _ = oracle.drive(path, seed=2)
+    solved: list[int] = []
+    batch = motion._solve_from
+
+    def count(*arguments: Any) -> Any:
+        solved.append(1)
+        return batch(*arguments)
+
+    monkeypatch.setattr(motion, "_solve_from", count)
+    first, frame = aligned(recording)
+    gnss = recording.gnss
+    nearly = replace(recording, gnss=replace(gnss, lever_arm=gnss.lever_arm + 0.2))
+    before, anew = len(solved), align(nearly, Settings(), frame)
+    alone, near = len(solved) - before, align(nearly, Settings(), frame, before=first)
+    assert len(solved) - before - alone < alone
+    assert np.abs(near.state.minus(anew.state)[0] / anew.sigma).max() < 0.01
+    assert near.own_sigma == pytest.approx(anew.own_sigma, rel=0.01)
 
 
 def test_a_known_heading_is_taken(path: oracle.ExactPath) -> None:

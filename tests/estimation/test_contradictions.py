@@ -193,3 +193,15 @@ def test_an_arm_that_is_wrong_in_one_number_is_not_trusted_in_the_others(drive):
     assert (up < 4.0 * np.sqrt(found.covariance[:, 5, 5])).all()
     late = run(replace(wrong, gnss=replace(wrong.gnss, t=wrong.gnss.t + 0.1)), solvers=("rts",))["rts"]
     assert set(late.noise.freed) == {LEVER_ARM, TIME_OFFSET}
+
+
+def test_constants_are_not_tested_again_with_the_model_they_were_tested_with(drive, monkeypatch):
+    asked, find = [], joint_estimate.find_contradicted_constants
+
+    def count(base, best, freed, names):
+        asked.append(best.noise)
+        return find(base, best, freed, names)
+
+    monkeypatch.setattr(joint_estimate, "find_contradicted_constants", count)
+    run(drive.crop(0.0, 90.0), solvers="ekf")
+    assert len(asked) == len({id(noise) for noise in asked}) > 0

@@ -303,3 +303,15 @@ def test_fixes_before_a_step_may_be_the_wrong_ones(script, shared_data, start, s
     counted = script.left_out(part, found)
     assert counted["left_out"] > 0
     assert counted["confirmed_left_out"] <= 0.01 * counted["confirmed"]
+
+
+def test_every_constant_is_changed_where_it_is_used(script) -> None:
+    """scripts/constants.py: halved and doubled in every module that has it, and afterwards as it was."""
+    constants = importlib.import_module("constants")
+    for constant in constants.CONSTANTS:
+        module = importlib.import_module(constant.module)
+        usual = getattr(module, constant.name)
+        for _, value in constant.values(usual):
+            with constants.changed(constant, value):
+                assert getattr(module, constant.name) == value != usual
+        assert getattr(module, constant.name) is usual

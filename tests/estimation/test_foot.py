@@ -29,8 +29,10 @@ from graphnav.estimation.solution import Solution
 from graphnav.evaluation.strides import compare_shapes, compute_walk_errors, estimate_floor_sigma
 from graphnav.imu.preintegration import preintegrate
 from graphnav.imu.samples import bridge_gaps
-from graphnav.recording import Imu, Recording, Truth
+from graphnav.recording import Imu, Recording, Truth, take_rows
+from graphnav.recording.checks.overview import inspect
 from graphnav.recording.formats import read
+from graphnav.report.doubts import list_doubts
 from graphnav.simulation import Simulated, simulate
 
 PACES = ("slow", "normal", "fast")
@@ -445,6 +447,70 @@ def test_shape_by_epochs_and_by_stances() -> None:
     assert of_steps == pytest.approx(apart(*means), rel=1e-6)
     assert of_steps < 0.7 * in_stance  # one place of twenty is off, but half of the epochs
     assert compare_shapes(t, p, truth, np.empty((0, 2))) == (everywhere, everywhere, everywhere)
+
+
+def test_an_accelerometer_that_drifts_more_than_stated_is_seen() -> None:
+    """Its bias walk is estimated, and the heights are no surprise; of an IMU that is as stated nothing is."""
+    assert not solved()["rts"].noise.figures
+    walk = made("normal")
+    imu = walk.recording.imu
+    drift = np.linspace(0.0, 0.03, len(imu.t))[:, None] * [0.0, 0.0, 1.0]  # m/s^2, as 20 in a minute on real walks
+    drifting = replace(walk.recording, imu=replace(imu, accel=imu.accel + drift))
+    found, taken = (run(drifting, noise=mode, solvers=("rts",))["rts"] for mode in ("estimated", "stated"))
+    figures = found.noise.figures
+    assert list(figures) == ["imu.accel_bias_walk"]
+    assert figures["imu.accel_bias_walk"].log_factor > 3.0 * figures["imu.accel_bias_walk"].sigma
+    height = interpolate(walk.truth, found.t)[0].llh[:, 2]
+    up = [one.states.p[:, 2] - (height - height[0]) for one in (found, taken)]
+    later = found.t > found.t[0] + 5.0  # steps have been made
+    nees = [np.mean(e[later] ** 2 / one.covariance[later, 5, 5]) for e, one in zip(up, (found, taken), strict=True)]
+    assert nees[0] < 1.0 < 3.0 < nees[1]
+    assert np.abs(up[0]).max() < 0.3 * np.abs(up[1]).max()
+
+
+def make_thigh() -> Imu:
+    """Half a minute of an IMU in a pocket: a pendulum that never stands, after three seconds at rest."""
+    rng, t = np.random.default_rng(3), 0.01 * np.arange(1, 3001)
+    phase = 6.0 * t
+    gyro = np.stack(
+        [2.2 * np.sin(phase) + 0.5 * np.sin(2 * phase + 0.3), 0.5 * np.sin(phase + 1), 0.4 * np.cos(phase)], 1
+    )
+    pitch = 0.01 * np.cumsum(gyro[:, 0])
+    pitch -= pitch.mean()
+    bounce = 2.5 * np.sin(2 * phase), 3.5 * np.sin(2 * phase + 0.7)
+    accel = np.stack([0.8 * np.sin(phase), 9.81 * np.sin(pitch) + bounce[0], 9.81 * np.cos(pitch) + bounce[1]], 1)
+    gyro[t < 3.0], accel[t < 3.0] = 0.0, [0.0, 0.0, 9.81]
+    return Imu(t, gyro + 4e-3 * rng.standard_normal(gyro.shape), accel + 0.03 * rng.standard_normal(accel.shape))
+
+
+def test_an_imu_that_is_on_no_foot_is_doubted() -> None:
+    """What was taken for its stances moves; figures of noise do not explain that away."""
+    found = run(Recording("pocket", "foot", make_thigh()), solvers=("ekf",))
+    assert "doubt.stances" in map(get_key, list_doubts(found, {}))
+    assert not found["ekf"].noise.figures
+    imu = make_thigh()
+    shaken = replace(imu, gyro=imu.gyro + 5.0 * np.sin(np.outer(imu.t, [7.0, 5.0, 6.0])))  # nothing is taken for one
+    found = run(Recording("pocket", "foot", take_rows(shaken, imu.t > 3.0)), solvers=("rts",))
+    assert next(map(get_key, list_doubts(found, {}))) == "doubt.stances"
+    for one in ("ekf", "batch"):
+        assert "doubt.stances" not in map(get_key, list_doubts({one: solved()[one]}, {}))
+
+
+def test_parts_between_gaps_are_no_single_walk() -> None:
+    walk = made("normal").recording
+    t = walk.imu.t - walk.start
+    parts = replace(walk, imu=take_rows(walk.imu, (t < 25.0) | (t > 28.0)))
+    assert "doubt.pieces" in map(get_key, list_doubts(run(parts, solvers=("rts",)), {}))
+    assert "doubt.pieces" not in map(get_key, list_doubts({"rts": solved()["rts"]}, {}))
+
+
+def test_a_rate_that_misses_the_impacts_of_steps_is_warned_of() -> None:
+    walk = made("normal").recording
+    found = {
+        n: [one.key for one in inspect(replace(walk, imu=take_rows(walk.imu, slice(0, None, n)))).findings]
+        for n in (1, 2, 5)
+    }
+    assert {n: "imu.slow" in keys for n, keys in found.items()} == {1: False, 2: False, 5: True}
 
 
 # --------------------------------------------------------------------------------------------------------- real walks

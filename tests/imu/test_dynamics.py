@@ -179,7 +179,7 @@ def test_scale_parameter() -> None:
     assert p.walk == 0.0
     np.testing.assert_allclose(p.sigma, [1e-3, *[1e-3 / 3] * 4, 2e-3, 2e-3, *[2e-3 / 3] * 4])
     (p,) = of(noise, "foot")
-    np.testing.assert_allclose(p.sigma, [*[1e-3] * 9, *[2e-3] * 9])
+    np.testing.assert_allclose(p.sigma, [*[1e-3] * 3, *[1e-3 / 3] * 6, *[2e-3] * 3, *[2e-3 / 3] * 6])
 
 
 def test_scale_errors_are_like_biases_of_a_matrix() -> None:

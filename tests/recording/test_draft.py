@@ -107,6 +107,16 @@ def test_forces_without_gravity_and_raw_counts_are_refused():
     assert guesses.guess_accel_unit(Path("a.csv"), still / 9.8 + [0, 0, 1.0], None).value == "g"
 
 
+def test_a_foot_that_rarely_stands_has_the_unit_of_where_it_does():
+    """A walk with twice gravity at the median, of a foot that stands for a fifth of each second."""
+    rng, t = np.random.default_rng(5), np.arange(4000) / 200
+    swing = 1.3 * np.stack([np.sin(9 * t), np.cos(11 * t), np.sin(13 * t)], axis=1) * (np.mod(t, 1.0) > 0.2)[:, None]
+    accel = 9.8 * (swing + np.array([0.0, 0.0, 1.0])) + rng.normal(0.0, 0.05, (4000, 3))
+    assert np.median(np.linalg.norm(accel, axis=1)) > 1.25 * 9.8
+    assert guesses.guess_accel_unit(Path("a.csv"), accel, None).value == "m/s2"
+    assert guesses.guess_accel_unit(Path("a.csv"), accel / 9.8, None).value == "g"
+
+
 def test_rates_in_no_unit_are_refused_only_as_counts():
     """A few seconds of motion may agree with anything."""
     lag, rates = motion.Lag(2.3, -0.96, -1.8 + 0.0j), 0.02 * np.random.default_rng(3).normal(size=(500, 3))

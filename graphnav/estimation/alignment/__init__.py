@@ -38,13 +38,20 @@ from graphnav.recording import Recording
 __all__ = ["COURSE_SIGMA", "Alignment", "align", "is_ready", "use_known_heading"]
 
 
-def align(recording: Recording, settings: Settings, frame: LocalFrame, stationary: Array = NONE) -> Alignment:
+def align(
+    recording: Recording,
+    settings: Settings,
+    frame: LocalFrame,
+    stationary: Array = NONE,
+    before: Alignment | None = None,
+) -> Alignment:
     """Find the first state of a recording.
 
     Parameters
     ----------
     stationary : (N, 2) s, intervals in which a vehicle stands, where jumps of fixes are
         not motion; of a foot, its stances.
+    before : the alignment of nearly the same recording: the search starts where that one ended.
 
     Raises
     ------
@@ -55,7 +62,8 @@ def align(recording: Recording, settings: Settings, frame: LocalFrame, stationar
     span = find_motion_span(recording, settings, stationary)
     if span is None:
         return level_at_rest(recording, settings, frame, stationary)
-    return replace(align_in_motion(recording, settings, frame, span), motion=span[0], until=span[1])
+    minima = () if before is None else before.minima
+    return replace(align_in_motion(recording, settings, frame, span, minima), motion=span[0], until=span[1])
 
 
 def is_ready(recording: Recording, settings: Settings, stationary: Array | None = None) -> bool:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -113,9 +113,16 @@ def find_motion_span(recording: Recording, settings: Settings, stationary: Array
 
 
 def align_in_motion(
-    recording: Recording, settings: Settings, frame: LocalFrame, span: tuple[float, float]
+    recording: Recording,
+    settings: Settings,
+    frame: LocalFrame,
+    span: tuple[float, float],
+    minima: Sequence[States] = (),
 ) -> Alignment:
-    """The first state from the short problem over `span` (s), carried back to the first sample."""
+    """The first state from the short problem over `span` (s), carried back to the first sample.
+
+    `minima` are those of nearly the same problem, tried in place of initial headings if there are as many keyframes.
+    """
     gnss, imu = recording.gnss, recording.imu
     assert gnss is not None
     begin, end = max(span[0], recording.start), span[1]
@@ -129,7 +136,9 @@ def align_in_motion(
     problem, widened = _build_short(part, settings, frame, np.array([*rp, heading]), bias), STATED
     for _ in range(_MAX_ROUNDS):
         used = apply_noise(problem, widened)
-        tried = _try_headings(used, rp, heading)
+        alike = len(minima) > 0 and len(minima[0]) == len(used.t)
+        starts = minima if alike else [_guess_start(used, rp, heading + turn) for turn in _HEADINGS_TRIED]
+        tried = _try(used, rp, starts)
         if not tried:
             raise EstimationError(
                 f"'{recording.name}': no initial attitude explains the GNSS fixes between "
@@ -149,9 +158,9 @@ def align_in_motion(
     notes: tuple[str, ...] = ()
     if recording.platform == "vehicle":
         assert part.gnss is not None
-        found = use_course(tried, part.gnss, own[2], wide[2])
-        R = rotation.exp(np.array([0.0, 0.0, -found.turn])) @ R  # heading is clockwise, rotation about up is not
-        own[2], wide[2], notes = found.own, found.wide, found.notes
+        course = use_course(tried, part.gnss, own[2], wide[2])
+        R = rotation.exp(np.array([0.0, 0.0, -course.turn])) @ R  # heading is clockwise, rotation about up is not
+        own[2], wide[2], notes = course.own, course.wide, course.notes
     notes = (
         Note(
             "alignment.motion",
@@ -160,7 +169,8 @@ def align_in_motion(
         ),
         *notes,
     )
-    return carry_back(recording, settings, best, R, wide, own, begin, notes)
+    found = tuple({id(one): one.states for one in tried}.values())
+    return replace(carry_back(recording, settings, best, R, wide, own, begin, notes), minima=found)
 
 
 def _fit_heading(part: Recording, frame: LocalFrame, rp: Array, bias: Array) -> float:
@@ -200,12 +210,12 @@ def _thin(gnss: Gnss, begin: float, end: float, spacing: float = 0.9) -> Gnss:
     return pick_fixes(gnss, np.array(keep))
 
 
-def _try_headings(problem: Problem, rp: Array, heading: float) -> list[Solution]:
-    """Solutions of the short problem from each of the initial headings.
+def _try(problem: Problem, rp: Array, starts: Sequence[States]) -> list[Solution]:
+    """Solutions of the short problem from each of the starts, levelled by the IMU beforehand.
 
-    Those that point elsewhere mostly lead to the same minimum, and are that solution as soon as they are within a sigma
-    of it. Or they move slowly along a saddle, and are abandoned where the likelihood they can still reach is negligible
-    beside the best; `worth` successive fixes are worth one in the worst case, over a span with one turn
+    Headings that point elsewhere mostly lead to the same minimum, and are that solution as soon as they are within a
+    sigma of it. Or they move slowly along a saddle, and are abandoned where the likelihood they can still reach is
+    negligible beside the best; `worth` successive fixes are worth one in the worst case, over a span with one turn
     (`graphnav.estimation.alignment.course`).
     """
     gnss = problem.recording.gnss
@@ -220,9 +230,9 @@ def _try_headings(problem: Problem, rp: Array, heading: float) -> list[Solution]
             if gain < 0.5 and cost - gain > one.cost and _is_within_a_sigma(states, one):
                 raise _End(one)
 
-    for turn in _HEADINGS_TRIED:
+    for start in starts:
         try:
-            found: Solution | None = _solve_from(problem, np.array([*rp, heading + turn]), watch)
+            found: Solution | None = _solve_from(problem, rp, start, watch)
         except _End as end:
             found = end.known
         if found is not None and np.isfinite(found.cost):
@@ -258,19 +268,28 @@ def _build_short(part: Recording, settings: Settings, frame: LocalFrame, rph: Ar
     return split_carriers(problem, GnssPhase)[0]
 
 
-def _solve_from(problem: Problem, rph: Array, watch: Callable[[States, float, float, bool], None]) -> Solution:
-    """Solve the short problem from one initial attitude."""
-    from graphnav.estimation.factor_graph.batch import batch  # imports GTSAM, which a recording at rest does not need
-
+def _guess_start(problem: Problem, rp: Array, heading: float) -> States:
+    """States by the fixes, turned by the gyro from one initial attitude."""
     gnss, mean, t = problem.recording.gnss, problem.prior.mean, problem.t
     assert gnss is not None
     assert mean is not None
-    R0, fixes, bias = rotation.from_rph(rph), problem.frame.from_llh(gnss.llh), mean.bg[0]
-    problem = replace(problem, prior=replace(problem.prior, mean=replace(mean, R_nb=R0[None])))
+    R0, fixes, bias = rotation.from_rph(np.array([*rp, heading])), problem.frame.from_llh(gnss.llh), mean.bg[0]
     dR, _, _ = integrate_prefix(problem.samples, t[0], t[1:], np.zeros(3), bias)
     p = np.stack([np.interp(t, gnss.t, fixes[:, k]) for k in range(3)], -1)
     v = np.gradient(p, t, axis=0)
     K = len(t)
     R = R0 @ np.concatenate([np.eye(3)[None], dR])
-    start = States(R, p, v, np.zeros((K, 3)), np.tile(bias, (K, 1)))
+    return States(R, p, v, np.zeros((K, 3)), np.tile(bias, (K, 1)))
+
+
+def _solve_from(
+    problem: Problem, rp: Array, start: States, watch: Callable[[States, float, float, bool], None]
+) -> Solution:
+    """Solve the short problem from a start, with its heading and the level attitude in the prior."""
+    from graphnav.estimation.factor_graph.batch import batch  # imports GTSAM, which a recording at rest does not need
+
+    mean = problem.prior.mean
+    assert mean is not None
+    R0 = rotation.from_rph(np.array([*rp, rotation.to_rph(start.R_nb[0])[2]]))
+    problem = replace(problem, prior=replace(problem.prior, mean=replace(mean, R_nb=R0[None])))
     return batch(problem, start, wanted=(0,), reintegrate=False, watch=watch)

@@ -112,9 +112,22 @@ def list_explanations(noise: NoiseModel) -> set[Explanation]:
     return found
 
 
-def log_evidence(base: Problem, found: NoiseEstimate) -> float:
-    """Of all measurements, excluded ones included; each outlier outside the spans has its cost."""
+def weigh_evidence(base: Problem, found: NoiseEstimate) -> NoiseEstimate:
+    """The estimate with the evidence of all measurements, excluded ones included, and the passes that this takes.
+
+    Each outlier outside the spans has its cost.
+    """
+    if found.whole_evidence is not None:
+        return found
     spans = join(span for some in found.noise.excluded.values() for span in some)
-    whole = explain(base, found, spans, list_explanations(found.noise)).log_evidence if spans else found.log_posterior
+    whole = explain(base, found, spans, list_explanations(found.noise))
     outside = {name: drop_within(some, spans) for name, some in found.noise.weights.items()}
-    return whole - compute_outlier_cost(outside, count_rows(base))
+    evidence = whole.log_evidence - compute_outlier_cost(outside, count_rows(base))
+    return replace(found, whole_evidence=evidence, passes=found.passes + whole.passes)
+
+
+def log_evidence(base: Problem, found: NoiseEstimate) -> float:
+    """The logarithm of the evidence that `weigh_evidence` finds."""
+    evidence = weigh_evidence(base, found).whole_evidence
+    assert evidence is not None
+    return evidence

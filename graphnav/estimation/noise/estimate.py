@@ -68,6 +68,7 @@ class NoiseEstimate:
     log_prior: float
     log_evidence: float  # of the measurements: the same less the cost of rows and intervals of reduced weight
     passes: Counter[str]  # over keyframes, of "filter" and "smoother"
+    whole_evidence: float | None = None  # of all measurements, excluded ones included, where it was computed
 
     def get_linearisation(self, base: Problem) -> tuple[Points, Problem]:
         """Its points and the problem that they are of, to start another estimate from."""
@@ -202,17 +203,17 @@ def _iterate(
     intervals: bool,
 ) -> NoiseEstimate:
     """Iterate from initial figures and linearisation points to convergence."""
-    passes, total, converged, totals = 0, len(problem.t), False, count_rows(problem)
+    done, total, converged, totals = 0, len(problem.t), False, count_rows(problem)  # keyframes
     ends = [total] if total <= 2 * _FIRST_KEYFRAMES or figures.known else [_FIRST_KEYFRAMES, total]
     latest: tuple[ForwardRecord, DisturbancePass] | None = None
     for end in ends:
         before, converged, figures.extrapolation = -np.inf, False, 1.0
         rounds = _AGAIN if figures.same_data or end != ends[0] else _ROUNDS
-        likeliest, most = figures, -np.inf
+        likeliest, most, highest, since = figures, -np.inf, -np.inf, 0
         for k in range(_MAX_PASSES):
             used, latest = apply_noise(problem, figures.build_model()), None  # releases the memory of the previous pass
             latest = _smooth_about(used, about.take_first(end))
-            passes += 1
+            done += end
             prior_then = figures.log_prior()
             now = float(np.sum(latest[0].log_likelihood)) + prior_then
             if progress is not None:
@@ -223,7 +224,9 @@ def _iterate(
             about = _splice(about, latest[1])
             # each figure gains a half by chance; while one sensor is far off, many passes gain little more than that
             converged = k > 1 and abs(now - before) < (0.05 if k + 1 < rounds else 0.5) * len(figures.log)
-            if converged:
+            highest, since = max(highest, now), since + 1 if now <= highest else 0
+            # weights and figures may alternate between two states
+            if converged or since == _ROUNDS // 2:
                 break
             before, figures.extrapolation = now, _EXTRAPOLATION if k > 1 and now > before else 1.0
         if not converged:  # oscillating, or not yet converged
@@ -231,10 +234,10 @@ def _iterate(
     if not converged:
         latest = None
         latest = _smooth_about(apply_noise(problem, figures.build_model()), about)
-        passes, prior_then = passes + 1, figures.log_prior()
+        done, prior_then = done + total, figures.log_prior()
         now = float(np.sum(latest[0].log_likelihood)) + prior_then
     assert latest is not None
-    evidence = now - compute_outlier_cost(figures.weights, totals)
+    evidence, passes = now - compute_outlier_cost(figures.weights, totals), round(done / total)
     return NoiseEstimate(
         figures.build_model(), latest[1], now, prior_then, evidence, Counter(filter=passes, smoother=passes)
     )

@@ -22,12 +22,13 @@ improbable as `CHANCE`. The most probable model decides what is left out.
 
 Masking. Figures that are estimated with a fault among the data may have grown until they hide it, so the tests are made
 with the figures at their prior medians as well. If they find more, the figures are estimated again without these spans,
-twice, because the spans shrink to what is wrong. Each set of spans that comes up on the way is decided by these
-figures, and the decision with the largest evidence stands. If no fault is left by these figures, the estimate that uses
-all measurements and starts from them is one more candidate.
+and once more without those that the tests find by the new figures. Each set of spans that comes up on the way, whole
+and trimmed to what is wrong, is decided by these figures, and the decision with the largest evidence stands. If no
+fault is left by these figures, the estimate that uses all measurements and starts from them is one more candidate.
 
-Between. A filter follows errors that last, so the tests find where they begin and where they end, each as the beginning
-of a fault. So every other span from one such beginning to the next is tried as well.
+Segments. A filter follows an error that lasts, so the tests find its beginning, and its end as the beginning of
+another. So the ends of all suspected spans divide the drive into segments, and those that are wrong together by the
+evidence (`graphnav.estimation.faults.segments`) are one more set of spans.
 
 Before or after. The tests run forward in time, so where fixes step from one place to another those behind the step are
 suspected, though those before it may be the wrong ones. So the fixes before each span that is left out, for as long,
@@ -46,15 +47,21 @@ from dataclasses import replace
 
 import numpy as np
 
+from graphnav.constraints.base import SAME_TIME
 from graphnav.core.rotation import Array
 from graphnav.estimation.faults.excluded import find_fault_spans, weigh_rows
+from graphnav.estimation.faults.segments import find_wrong_segments
 from graphnav.estimation.faults.watch import FALSE_ALARM, SIZES
 from graphnav.estimation.noise.apply import apply_noise, select_weights
-from graphnav.estimation.noise.decision import Decision, explain, list_explanations, log_evidence
-from graphnav.estimation.noise.estimate import NoiseEstimate, estimate_noise
-from graphnav.estimation.noise.explanations import (
-    FIXES,
+from graphnav.estimation.noise.decision import (
+    Decision,
+    explain,
+    list_explanations,
+    log_evidence,
+    weigh_evidence,
 )
+from graphnav.estimation.noise.estimate import NoiseEstimate, estimate_noise
+from graphnav.estimation.noise.explanations import FIXES, ROWS
 from graphnav.estimation.noise.initial_points import BREAKDOWN
 from graphnav.estimation.noise.model import INTERVALS, NoiseModel, RowWeights
 from graphnav.estimation.noise.moments import collect_row_moments, predict_errors
@@ -69,7 +76,6 @@ from graphnav.estimation.noise.spans import (
     join,
     join_faults,
     list_before,
-    list_between,
     list_distinct,
     list_repeats,
     mask_times,
@@ -82,7 +88,7 @@ from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.ekf import refilter
 from graphnav.recording import Recording
 
-_REFINEMENTS = 2  # estimates without masked spans: the first trims the spans, the second is free of what is wrong
+_REFINEMENTS = 2  # estimates without masked spans: the figures of the second are free of what is wrong
 
 
 def estimate_without_faults(
@@ -115,8 +121,9 @@ def estimate_without_faults(
         with contextlib.suppress(*BREAKDOWN):  # from a filter that follows the wrong fixes
             other = _estimate_other(base, opening, found, best, before, progress)
     if other is not None:
-        passes = passes + other.passes + Counter(filter=2)
-        best = max(best, other, key=lambda one: log_evidence(base, one))
+        both = tuple(weigh_evidence(base, replace(one, passes=Counter())) for one in (best, other))
+        passes = sum((one.passes for one in both), passes + other.passes)
+        best = max(both, key=lambda one: log_evidence(base, one))
     return replace(best, passes=passes)
 
 
@@ -164,6 +171,17 @@ def _list_before(base: Problem, noise: NoiseModel) -> list[Span]:
     return list_before(excluded, _list_fix_times(base)) if excluded else []
 
 
+def _find_segments(base: Problem, found: NoiseEstimate, suspected: list[Span]) -> list[Span]:
+    """Wrong segments, of those into which the ends of suspected spans divide the drive."""
+    if not suspected:
+        return []
+    t = _list_fix_times(base)
+    behind = np.searchsorted(t, [end + SAME_TIME for _, end in suspected])
+    edges = sorted({*(begin for begin, _ in suspected), *t[behind[behind < len(t)]].tolist()})
+    used = apply_noise(base, replace(found.noise, excluded={}))
+    return find_wrong_segments(used, found.carry_points(base, used), edges, FIXES)
+
+
 def _list_fix_times(base: Problem) -> Array:
     """(N,) s, in order."""
     return base.t[np.unique(np.concatenate([c.keyframe for c in base.constraints if c.name in FIXES]))]
@@ -177,7 +195,12 @@ def decide_faults(base: Problem, found: NoiseEstimate) -> Decision:
     base : built with stated noise.
     found : estimated with all measurements.
     """
-    first = explain(base, found, find_suspects(base, found.noise, found))
+    suspects = find_suspects(base, found.noise, found)
+    first = explain(base, found, suspects)
+    if segments := _find_segments(base, found, suspects):
+        other = explain(base, found, segments)
+        passes = first.passes + other.passes + Counter(filter=2)
+        first = replace(max(first, other, key=lambda one: one.log_evidence), passes=passes)
     medians = {name: replace(figure, log_factor=figure.prior) for name, figure in found.noise.figures.items()}
     masked = _find_disagreements(base, NoiseModel(medians), found)
     first = replace(first, passes=first.passes + Counter(filter=2))
@@ -207,13 +230,14 @@ def _unmask(base: Problem, found: NoiseEstimate, first: Decision, masked: list[S
         passes = passes + estimate.passes + Counter(filter=1)
         spans, refined = trim(spans, errors), trim(detected, errors)
         # a slow onset is dated better by the tests, an abrupt end by the errors of single fixes
-        onsets = list_between(refined, _list_fix_times(base)) if len(refined) > 1 else ()
-        for some in list_distinct(spans, trim(spans, errors, FALSE_ALARM), detected, *onsets):
+        segments = _find_segments(base, estimate, [*detected, *refined])
+        for some in list_distinct(spans, trim(spans, errors, FALSE_ALARM), detected, segments):
             candidate = explain(base, _add_outliers(estimate, errors, some), some)
             passes = passes + candidate.passes
             cut = _cut_at_steps(some, candidate.noise, used, estimate)
             if cut != some:
-                finer = explain(base, _add_outliers(estimate, errors, cut), cut)
+                among = {*list_explanations(candidate.noise), ROWS}  # its pieces are wrong the same way, or not at all
+                finer = explain(base, _add_outliers(estimate, errors, cut), cut, among)
                 passes = passes + finer.passes
                 candidate = max(candidate, finer, key=lambda one: one.log_evidence)
             if candidate.log_evidence > best.log_evidence:
@@ -262,6 +286,7 @@ def estimate_disturbed_intervals(base: Problem, found: NoiseEstimate) -> NoiseEs
     base : built with stated noise and the parts of its intervals' noise.
     found : with all intervals alike.
     """
+    found = weigh_evidence(base, found)
     start, near, passes = found.noise, found.get_linearisation(base), found.passes
     if found.noise.excluded:
         free = estimate_noise(base, None, replace(found.noise, excluded={}), near, intervals=True)
@@ -270,12 +295,13 @@ def estimate_disturbed_intervals(base: Problem, found: NoiseEstimate) -> NoiseEs
         if decision.noise.excluded:
             without = replace(free.noise, excluded=decision.noise.excluded)
             free = estimate_noise(base, None, without, free.get_linearisation(base), intervals=True)
+            free = weigh_evidence(base, free)
             passes = passes + free.passes
         if log_evidence(base, free) > log_evidence(base, found):
             return replace(free, passes=passes)
         if free.noise.excluded == found.noise.excluded:  # the same model, already converging
             start, near = free.noise, free.get_linearisation(base)
-    disturbed = estimate_noise(base, None, start, near, intervals=True)
+    disturbed = weigh_evidence(base, estimate_noise(base, None, start, near, intervals=True))
     best = max(found, disturbed, key=lambda one: log_evidence(base, one))
     return replace(best, passes=passes + disturbed.passes)
 

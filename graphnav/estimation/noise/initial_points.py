@@ -16,9 +16,9 @@ from graphnav.estimation.noise.outliers import limit_scaled, limit_squares, list
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.ekf import ekf, refilter, smooth_near
 from graphnav.estimation.solvers.linearise import Points, linearise
-from graphnav.estimation.solvers.passes import ForwardRecord, SmootherPass, are_near
+from graphnav.estimation.solvers.passes import are_near
 from graphnav.estimation.solvers.robust import weigh_squares
-from graphnav.estimation.solvers.rts import smooth_backward
+from graphnav.estimation.solvers.rts import smooth_backward, smooth_points
 
 BREAKDOWN = EstimationError, np.linalg.LinAlgError  # errors of a filter with a numerically singular covariance
 _COOLING = 3.0  # factor by which the sigmas of an annealing fall in each round
@@ -33,12 +33,6 @@ class Initial:
     points: Points
     weights: dict[str, RowWeights] = field(default_factory=dict)  # by constraint, of the rows they do not rest on
     log_factors: dict[str, float] = field(default_factory=dict)  # of figures, beyond those of the problem
-
-
-def smooth_about(problem: Problem, about: Points) -> tuple[ForwardRecord, SmootherPass]:
-    """One pass of filter and smoother over the first keyframes, linearised at points of them."""
-    forward = refilter(problem, about)
-    return forward, smooth_backward(problem, forward)
 
 
 def find_initial_points(problem: Problem, opening: float | None) -> tuple[list[Initial], int]:
@@ -81,7 +75,7 @@ def find_initial_points(problem: Problem, opening: float | None) -> tuple[list[I
             passes += 2
         if sound is problem:
             return [Initial(plain)], passes
-        (_, one), (_, other) = (smooth_about(problem, points) for points in (plain, about))
+        one, other = (smooth_points(refilter(problem, points, whole=False)) for points in (plain, about))
     except BREAKDOWN:  # with figures or points that are far off, most rows seem wrong
         return _add_annealed([Initial(plain)], passes, problem, opening)
     weights = {}
@@ -122,7 +116,7 @@ def _anneal(problem: Problem, opening: float | None) -> tuple[Initial, int]:
         share = {c.name: 1.0 / (1.0 + (SIZES[c.unit] * wider / stated[c.name]) ** 2) for c in fixes}
         eased = weigh_rows(problem, {name: x * weights[name] for name, x in share.items()})
         about = smooth_backward(eased, ekf(eased, opening=opening) if about is None else refilter(eased, about))
-        _, about = smooth_about(eased, about)
+        about = smooth_backward(eased, refilter(eased, about))
         passes += 2
         settled = not share or min(np.median(x) for x in share.values()) > 0.5
         for rows in fixes:

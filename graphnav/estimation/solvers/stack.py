@@ -21,7 +21,7 @@ from graphnav.core.rotation import Array, mv
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import ConstraintRecord
 from graphnav.estimation.solvers.recursion import CAUCHY, HUBER, UNUSED, RowBlocks
-from graphnav.estimation.solvers.robust import soften
+from graphnav.estimation.solvers.robust import soften, weigh_squares
 
 _KERNELS = {"none": 0, "huber": HUBER, "cauchy": CAUCHY}
 
@@ -149,18 +149,22 @@ class Stack:
         return RowBlock(some[0][0], b, some[0][4], some[-1][5], parts)
 
     def log_likelihood(self) -> Array:
-        """(K,) of the innovations, up to a constant."""
+        """(K,) of the innovations, up to a constant; of rows with a robust kernel what the kernel makes of them."""
         return self._compute_likelihood((self.solved[:, None] @ self.root)[:, 0])
 
     def _compute_likelihood(self, white: Array) -> Array:
         """Log-likelihood (K,) of whitened innovations (K, M)."""
-        weighs = np.zeros((self.K, self.M), dtype=bool)
+        weighs, squares = np.zeros((self.K, self.M), dtype=bool), white**2
         for c in self._constraints:
             place = self.places[c.name]
             weighs[place] = True if c.weight is None else c.weight[: len(place[0]), None] > 0.0
+            if c.gate is None and c.robust != "none":
+                total = np.sum(squares[place], axis=1)
+                bent = 2.0 * weigh_squares(soften(c.robust), np.sqrt(total), self.scale[place][:, 0])[1]
+                squares[place] *= (bent / np.maximum(total, 1e-300))[:, None]
         spread = np.where(weighs, np.abs(np.diagonal(self.root, axis1=1, axis2=2)), 1.0)
         log_determinant = np.sum(np.log(np.where(spread > 0.0, spread, 1.0)), axis=1)
-        return np.asarray(-log_determinant - 0.5 * np.sum(np.where(weighs, white, 0.0) ** 2, axis=1))
+        return np.asarray(-log_determinant - 0.5 * np.sum(np.where(weighs, squares, 0.0), axis=1))
 
     def finish(self) -> Array:
         """Compute the innovations of each kind; returns their log-likelihood (K,), up to a constant."""

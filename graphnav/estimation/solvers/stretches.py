@@ -38,7 +38,7 @@ from graphnav.imu.dynamics import SCALE
 _SHORTEST, _LONGEST = 16, 256  # keyframes of a stretch
 _MAX_LINEARISATIONS = 10  # iterations of a stretch: each gains two digits or more
 # sigmas, convergence threshold of the error that is left: the correction, reduced once more as it was from the last one
-STAYS = 1e-9
+STAYS = 1e-6
 _REDUCED = 0.1  # at least, in an iteration
 
 

@@ -14,6 +14,7 @@ from graphnav.core.rotation import Array
 from graphnav.recording import Imu, Recording
 from graphnav.recording.checks.tracks import Track
 
+_LEAST_FOOT_RATE = 80.0  # Hz; the impact of a step lasts for 20 to 50 ms
 _CHANGED = 3.0  # m/s, of the speed: more than errors of velocities
 
 
@@ -29,6 +30,17 @@ def check_imu_time(imu: Imu) -> Iterator[Finding]:
             "note",
             f"IMU stamps are uneven: {100 * uneven:.0f} % of the steps differ by over 25 % from {1e3 * period:.4g} ms",
             "imu.uneven",
+        )
+
+
+def check_foot_rate(recording: Recording) -> Iterator[Finding]:
+    rate = 1.0 / compute_period(recording.imu.t)
+    if recording.platform == "foot" and rate < _LEAST_FOOT_RATE:
+        yield Finding(
+            "warning",
+            f"the IMU on the foot is sampled at {rate:.0f} Hz: what impacts do between the rows is lost, and errors "
+            "are several times as large; record at 100 Hz or more",
+            "imu.slow",
         )
 
 

@@ -31,6 +31,7 @@ from graphnav.recording.checks.axes import (
 )
 from graphnav.recording.checks.clock import measure_clock_offsets
 from graphnav.recording.checks.imu import (
+    check_foot_rate,
     check_force_at_rest,
     check_gyro_unit,
     check_imu_time,
@@ -160,6 +161,7 @@ def inspect(recording: Recording) -> Inspection:
     findings += check_imu_time(stamps)  # rows left out have been reported already
     findings += check_repeats(recording.imu, track if overlap else None)
     findings += check_saturation(recording.imu)
+    findings += check_foot_rate(recording)
     if "imu.gyro_unit" not in known:
         findings += check_gyro_unit(recording)
     findings += check_stated_noise(recording.imu.noise)

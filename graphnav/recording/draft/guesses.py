@@ -20,6 +20,7 @@ _MEAN_SHARE = 0.5  # share of the typical force that is in its mean, even for a 
 _LIKELY, _CLEAR = 0.5, 0.9  # correlation
 _STRAIGHT_COSINE = np.cos(np.radians(12.0))  # cosine of the angle to a file axis below which the axis is meant
 _QUIET_SPAN = 5.0  # s
+_CALM_ROWS = 11  # rows, a stance of 0.1 s at 100 Hz
 _BACKWARD = 0.01  # share of steps backward from which rows are in no order
 _LARGEST_STEP = 100.0  # s; larger steps between stamps mean a smaller unit
 _FIXED = 0.15  # m; only fixed carrier phases state less
@@ -76,11 +77,13 @@ def guess_accel_unit(path: Path, accel: Array, stated: str | None) -> Guess:
     RecordingError
         If gravity has been taken out, or the numbers are raw counts.
     """
-    size = float(np.median(np.linalg.norm(accel, axis=-1)))
+    force = np.linalg.norm(accel, axis=-1)
+    size, calm = float(np.median(force)), float(np.median(force[_find_calm(accel)]))
     lasting = float(np.linalg.norm(np.mean(accel, axis=0))) > _MEAN_SHARE * size  # more than motion alone causes
-    for unit, scale in FORCE.items():
-        if lasting and 0.8 * STANDARD_GRAVITY < size * scale < 1.25 * STANDARD_GRAVITY:
-            return Guess(unit, f"the median force, {size:.4g}, is then that of gravity")
+    for typical, words in ((size, "median force"), (calm, "force where it is calm")):  # a foot may rarely stand
+        for unit, scale in FORCE.items():
+            if lasting and 0.8 * STANDARD_GRAVITY < typical * scale < 1.25 * STANDARD_GRAVITY:
+                return Guess(unit, f"the {words}, {typical:.4g}, is then that of gravity")
     if stated is not None and lasting and size * FORCE[stated] > 0.8 * STANDARD_GRAVITY:
         return Guess(stated, f"as the column's name says, though the median force is {size:.4g}")
     if size < 0.5 * STANDARD_GRAVITY or not lasting:
@@ -93,6 +96,14 @@ def guess_accel_unit(path: Path, accel: Array, stated: str | None) -> Guess:
         f"{path}: the accelerations are {size:.3g} in size at the median, which is gravity in no unit: raw counts?",
         key="draft.raw_counts",
     )
+
+
+def _find_calm(accel: Array) -> Array:
+    """(N,) bool, the tenth of rows about which the force changes least."""
+    step = np.linalg.norm(np.diff(accel, axis=0, prepend=accel[:1]), axis=1)
+    width = min(_CALM_ROWS, len(step))
+    around = np.convolve(step, np.ones(width), "same")
+    return np.asarray(around <= np.percentile(around, 10.0))
 
 
 def guess_gyro_unit(path: Path, gyro: Array, stated: str | None, lag: motion.Lag | None, vehicle: bool) -> Guess:
