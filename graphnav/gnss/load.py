@@ -199,11 +199,18 @@ def _difference_by_base(
         raise RecordingError(
             f"{sources.base[0]}: states no position; set base_position in [raw_gnss]", key="raw.base_position"
         )
+    if not 6e6 < np.linalg.norm(position) < 7e6:
+        raise RecordingError(
+            f"{sources.base[0]}: base_position is {np.linalg.norm(position) / 1e3:.0f} km from the Earth's centre; it "
+            "is to be Earth-centred, x, y and z in m",
+            key="raw.base_position",
+        )
     apart = max(obs.t[0] - raw.t[-1], raw.t[0] - obs.t[-1])
     if apart > 0.0:
+        away_by = f"{apart / 3600.0:.1f} h" if apart > 3600.0 else f"{apart:.3g} s"
         raise RecordingError(
-            f"{sources.base[0]}: the base's observations are {apart / 3600.0:.1f} h away from those of the rover; "
-            "it must be of the same time",
+            f"{sources.base[0]}: the base's observations are {away_by} away from those of the rover; it must be of the "
+            "same time",
             key="raw.base_time",
         )
     away = float(np.linalg.norm(np.median(raw.antenna, axis=0) - position))

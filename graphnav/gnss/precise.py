@@ -22,6 +22,7 @@ from graphnav.gnss.files import Lines, count_days, parse_numbers, take_whole_lin
 from graphnav.gnss.signals import SYSTEMS, C, Ids, number_satellite
 
 _NODES = 11  # of the polynomial
+_NEAREST, _FARTHEST = 6.4e3, 1e5  # km, of satellites from the Earth's centre
 _ABSENT = 0.9  # s; a clock of 999999.999999 us is none
 _LONGEST_CLOCK_GAP = 900.0  # s, longest step between nodes of a clock that is interpolated
 _HALF_SPAN = 0.5  # s on either side, for velocities by central differences
@@ -98,6 +99,10 @@ def read_precise(sp3: list[Path], clk: list[Path]) -> Orbits:
         clocks |= {
             int(one): _drop_repeated(t[satellite == one], clock[satellite == one]) for one in np.unique(satellite)
         }
+    if not clocks:
+        raise RecordingError(
+            f"{sp3[0]}: holds orbits without clocks; set clk in [raw_gnss] to a file of these", key="raw.no_clocks"
+        )
     few = sorted(one for one, (t, _) in orbit.items() if len(t) < _NODES)
     remarks = (
         (
@@ -147,6 +152,12 @@ def _read_sp3(path: Path, remarks: list[str]) -> tuple[Array, Ids, Array, Array]
     satellite = np.array([ids[name] for name in names], dtype=np.int16)
     of = np.searchsorted(epoch, own) - 1
     whole = np.isfinite(value[:, :3]).all(axis=1) & (of >= 0) & (satellite >= 0)
+    away = float(np.median(np.linalg.norm(value[whole, :3], axis=1))) if whole.any() else 0.0
+    if away and not _NEAREST < away < _FARTHEST:
+        raise RecordingError(
+            f"{path}: its satellites are {away:.3g} km from the Earth's centre, so its positions are not in km",
+            key="raw.no_positions",
+        )
     clock = np.nan_to_num(value[:, 3] * 1e-6, nan=1.0)
     return t[of[whole]], satellite[whole], value[whole, :3] * 1e3, clock[whole]
 
@@ -174,6 +185,8 @@ def _read_clk(path: Path, remarks: list[str]) -> tuple[Array, Ids, Array]:
             raise ValueError
     except ValueError:
         raise RecordingError(f"{path}: a record of a satellite's clock cannot be read", key="table.cell") from None
+    if (typical := float(np.median(np.abs(table[:, 6])))) > _ABSENT:
+        raise RecordingError(f"{path}: clocks of {typical:.3g}, which are not in s", key="raw.no_clocks")
     satellite = np.array([ids[name] for name in names], dtype=np.int16)
     return t[satellite >= 0], satellite[satellite >= 0], table[satellite >= 0, 6]
 

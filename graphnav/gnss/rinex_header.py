@@ -58,7 +58,7 @@ def read_rinex_header(lines: Lines, path: Path) -> Header:
             elif label == "APPROX POSITION XYZ":
                 place = np.array(body.split(), dtype=float)
                 out.marker = place if len(place) == 3 and 6e6 < np.linalg.norm(place) < 7e6 else None
-            elif label == "ANTENNA: DELTA H/E/N":
+            elif label == "ANTENNA: DELTA H/E/N" and body.strip():
                 height, east, north = (float(word) for word in body.split()[:3])
                 above = np.array([east, north, height])
             elif label == "SYS / SCALE FACTOR" and int(body[2:6]) != 1:

@@ -110,14 +110,14 @@ def _read(path: Path, found: _Navigation) -> tuple[str, ...]:
         if system < 0 and name[:1].isalpha() and name[1:].isdigit():
             reason = f"of the satellite system {name[0]}, which is not known"
             found.skipped[reason] = found.skipped.get(reason, 0) + 1
-            k = next((j for j in range(k + 1, len(lines)) if lines[j][:3] != "   "), len(lines))
+            k = _skip_record(lines, k)
             continue
         rest = lines[k + 1 : k + count]
         if k + count > len(lines) and all("   ".startswith(line[:3]) for line in rest) and (system >= 0 or not rest):
             return data.remarks or (note_cut(path.name, "record"),)
         if system < 0 or not name[1:].isdigit():
             found.broken.append(k + 1)
-            k += 1
+            k = _skip_record(lines, k)
             continue
         whole = len(rest) == count - 1 and all(line[:3] == "   " for line in rest)
         try:
@@ -128,8 +128,13 @@ def _read(path: Path, found: _Navigation) -> tuple[str, ...]:
             _add(found, system, int(name[1:]), _parse_date(text, bool(default)), values, message)
         except (ValueError, IndexError):
             found.broken.append(k + 1)
-        k += count if whole else 1
+        k = k + count if whole else _skip_record(lines, k)
     return data.remarks
+
+
+def _skip_record(lines: list[str], k: int) -> int:
+    """The line after that of k and those that continue it."""
+    return next((j for j in range(k + 1, len(lines)) if lines[j][:3] != "   "), len(lines))
 
 
 def _parse_values(rows: list[tuple[str, int]]) -> list[float]:

@@ -63,8 +63,13 @@ def parse_ubx(data: bytes, path: Path) -> tuple[Observations, Ephemerides]:
         If no raw measurements are in it.
     """
     found = _find_frames(data)
-    if not any(len(rows) for rows in found.rows):
-        raise RecordingError(f"{path}: no RXM-RAWX messages; switch them on in the receiver", key="raw.no_messages")
+    if found.times and not any(len(rows) for rows in found.rows):
+        raise RecordingError(f"{path}: its RXM-RAWX messages hold no measurements", key="raw.no_measurements")
+    if not found.times:
+        whole = f" that are whole, and {found.broken} broken" if found.broken else ""
+        raise RecordingError(
+            f"{path}: no RXM-RAWX messages{whole}; switch them on in the receiver", key="raw.no_messages"
+        )
     remarks = []
     if found.broken:
         remarks.append(Note("raw.broken_records", f"{path.name}: {format_count(found.broken, 'broken frame')} skipped"))
@@ -146,6 +151,8 @@ def _find_frames(data: bytes) -> _RawMessages:
             if np.isfinite(tow) and 0.0 <= tow <= WEEK and week:
                 out.times.append((tow, week))
                 out.rows.append(np.frombuffer(payload, _ROW_TYPE, count=payload[11], offset=16))
+        elif kind == _RAWX:
+            out.broken += 1  # shorter than the measurements that it announces
         elif kind == _SFRBX:
             out.frames.append((len(out.times) - 1, payload))
         at = data.find(SYNC, end)

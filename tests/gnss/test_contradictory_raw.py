@@ -134,6 +134,16 @@ def test_an_antenna_is_as_far_from_its_mark_as_the_header_says(changed):
     np.testing.assert_allclose(found.carrier_difference, stated.carrier_difference, atol=2e-4)
 
 
+def test_a_header_may_leave_the_antennas_offset_blank(observed):
+    blank = re.sub(r".{60}ANTENNA: D", f"{'':60}ANTENNA: D", observed, count=1)
+    np.testing.assert_array_equal(parsed(blank).marker, parsed(observed).marker)
+
+
+def test_a_base_position_that_is_no_place_on_the_ground_is_told(changed):
+    with refused("raw.base_position", RecordingError, "base.obs.gz", "0 km"):
+        changed(recording=lambda text: text.replace("[" + ", ".join(BASE) + "]", "[35.3, 139.5, 60.0]"))
+
+
 # ------------------------------------------------------------------------------------------- by each other
 def test_a_satellite_twice_in_an_epoch_with_other_values_is_left_out(observed):
     found, whole = parsed(in_epochs(observed, "^G13", "G15")), parsed(observed)
@@ -200,6 +210,18 @@ def test_a_code_a_kilometre_off_leaves_the_integers(changed):
 
     done = run(changed(rover=shift), solvers=("rts",))["rts"]
     assert np.mean(done.fixed[:, 1] > 0.0) > 0.9
+
+
+def test_messages_without_measurements_are_no_missing_messages(tmp_path):
+    def cut(announced: int) -> bytes:
+        payload = bytearray(rawx(300.0)[6:-2])
+        payload[11] = announced
+        return frame((0x02, 0x15), bytes(payload))
+
+    for announced, key, said in ((0, "raw.no_measurements", "RXM-RAWX"), (200, "raw.no_messages", "1 broken")):
+        (tmp_path / "a.ubx").write_bytes(cut(announced))
+        with refused(key, RecordingError, "a.ubx", said):
+            read_rover((tmp_path / "a.ubx",))
 
 
 def test_measurements_of_satellites_that_there_are_not_are_left_out(tmp_path):

@@ -150,6 +150,30 @@ def test_clocks_that_are_none(seeds: Path, tmp_path: Path) -> None:
     assert {one // 100 for one in read_precise([seeds / "a.sp3"], [tmp_path / "a.clk"]).clock} == {0}
 
 
+def test_orbits_without_clocks_or_in_another_unit_are_told(seeds: Path, tmp_path: Path) -> None:
+    text, clocks = (seeds / "a.sp3").read_text(), (seeds / "a.clk").read_text()
+    position = re.compile(r"^(P...)(.{42})(.{14})", flags=re.MULTILINE)
+    for by, what in (
+        (lambda m: m[1] + m[2] + " 999999.999999", "clk"),
+        (lambda m: m[1] + "".join(f"{1e-3 * float(m[2][k : k + 14]):14.6f}" for k in (0, 14, 28)) + m[3], "km"),
+    ):
+        (tmp_path / "a.sp3").write_text(position.sub(by, text))
+        with refused("raw.no_clocks" if what == "clk" else "raw.no_positions", RecordingError, "a.sp3", what):
+            read_precise([tmp_path / "a.sp3"], [])
+    (tmp_path / "a.clk").write_text(re.sub(r"(\d)[eE]([+-]\d\d)$", r"\1E+03", clocks, flags=re.MULTILINE))
+    with refused("raw.no_clocks", RecordingError, "a.clk"):
+        read_precise([seeds / "a.sp3"], [tmp_path / "a.clk"])
+
+
+def test_a_record_that_lost_a_line_is_counted_once(seeds: Path, tmp_path: Path) -> None:
+    lines = (seeds / "a.nav").read_text().split("\n")
+    first = next(k for k, line in enumerate(lines) if line.startswith("G"))
+    (tmp_path / "a.nav").write_text("\n".join([*lines[: first + 2], *lines[first + 3 :]]))
+    found = read_navigation([tmp_path / "a.nav"])
+    assert len(found.kepler["toe"]) == len(read_navigation([seeds / "a.nav"]).kepler["toe"]) - 1
+    assert_told(found.remarks, "raw.broken_records", "1 unreadable", f"line {first + 1}")
+
+
 def test_satellites_of_a_table_have_whole_numbers() -> None:
     prn = np.array([5.0, 5.5, -1.0, 0.0, 1e9, np.nan, 32.0])
     found = make_observations({"t": np.arange(7.0), "prn": prn, "code": np.full(7, 2e7)}, 0.0, "a.csv")
