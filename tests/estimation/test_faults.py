@@ -21,17 +21,19 @@ from graphnav.estimation.alignment import align
 from graphnav.estimation.building import Clock, ProblemBuilder
 from graphnav.estimation.faults.excluded import find_fault_spans, weigh_rows
 from graphnav.estimation.faults.likelihood_ratio import update_tests
+from graphnav.estimation.faults.segments import _respond, _Runs, _Set, find_wrong_segments
 from graphnav.estimation.faults.verdicts import Verdicts
-from graphnav.estimation.faults.watch import MINUTE, Bank
+from graphnav.estimation.faults.watch import FALSE_ALARM, MINUTE, Bank
 from graphnav.estimation.noise.decision import log_evidence, weigh_evidence
 from graphnav.estimation.noise.estimate import estimate_noise
 from graphnav.estimation.noise.exclusion import estimate_disturbed_intervals, estimate_without_faults
-from graphnav.estimation.noise.spans import list_before, list_between, split_at_steps
+from graphnav.estimation.noise.explanations import add_common_errors
+from graphnav.estimation.noise.spans import list_before, split_at_steps
 from graphnav.estimation.pipeline import choose_origin, run
 from graphnav.estimation.problem import Problem, build_problem
 from graphnav.estimation.solution import Solution
-from graphnav.estimation.solvers.ekf import ekf, refilter
-from graphnav.estimation.solvers.passes import Updates
+from graphnav.estimation.solvers.ekf import Comparison, ekf, refilter
+from graphnav.estimation.solvers.passes import Updates, make_points, split_values
 from graphnav.estimation.solvers.recursion import move_columns
 from graphnav.estimation.solvers.rows import Iterate, Layout, whiten
 from graphnav.estimation.solvers.rts import smooth_backward
@@ -243,12 +245,36 @@ def test_list_before() -> None:
     assert list_before([(0.0, 3.0), (10.0, 14.0), (16.0, 26.0)], t) == [(6.0, 9.0), (15.0, 15.0)]
 
 
-def test_list_between() -> None:
-    """From where a span begins to where the next does; whether it is the first that is wrong, or the next, is open."""
-    t = np.arange(0.0, 30.0)
-    first, second = list_between([(3.0, 4.0), (10.0, 14.0), (20.0, 21.0)], t)
-    assert first == [(3.0, 9.0), (20.0, 29.0)]
-    assert second == [(10.0, 19.0)]
+def test_evidence_of_segments_is_that_of_filters_with_their_errors(built: Problem) -> None:
+    """Each run, and each beside another one, against a filter that has these errors as parameters."""
+    about = ekf(built)
+    rows = next(c for c in built.constraints if c.name == "gnss_position")
+    begins = np.array([50.0, 83.0, 120.0, 200.0, 201.0, 260.0])
+    t = built.t[rows.keyframe]
+    off = np.zeros((len(t), 3))
+    off[(t >= 83.0) & (t < 200.0)] = [0.4, -0.3, 0.1]
+    off[t >= 260.0] = np.outer(0.02 * (t[t >= 260.0] - 260.0), [0.5, 1.0, 0.0])
+    wrong = replace(rows, p_n=rows.p_n + off)
+    problem = replace(built, constraints=tuple(wrong if c is rows else c for c in built.constraints))
+
+    def evaluate(*spans: tuple[float, float]) -> float:
+        other = add_common_errors(problem, sorted(spans), (rows.name,))
+        points = make_points(other, about.states, split_values(problem, about))
+        return float(Comparison(problem, about).log_likelihood(other, points, (rows.name,)).sum())
+
+    runs = _Runs(begins, [rows.unit], 3)
+    one = _Set(frozenset(), 0.0, *_respond(problem, refilter(problem, about), [wrong], begins))
+    usual, chosen = float(Comparison(problem, about).log_likelihood(problem, about).sum()), []
+    for _ in range(2):
+        better = runs.list_better(one)
+        assert len(better) > 2
+        for gain, j, _ in better:
+            span = begins[runs.first[j]], np.append(begins, t[-1] + 1.0)[runs.behind[j]] - 0.01
+            assert gain - np.log(FALSE_ALARM) == pytest.approx(evaluate(*chosen, span) - usual, rel=1e-5)
+        gain, j, kind = better[0]
+        chosen.append((begins[runs.first[j]], np.append(begins, t[-1] + 1.0)[runs.behind[j]] - 0.01))
+        usual, one = evaluate(*chosen), runs.add(one, gain, j, kind)
+    assert find_wrong_segments(problem, about, begins.tolist(), [rows.name]) == [(83.0, 199.0), (260.0, t[-1])]
 
 
 def test_split_at_steps() -> None:

@@ -26,8 +26,9 @@ and once more without those that the tests find by the new figures. Each set of 
 and trimmed to what is wrong, is decided by these figures, and the decision with the largest evidence stands. If no
 fault is left by these figures, the estimate that uses all measurements and starts from them is one more candidate.
 
-Between. A filter follows an error that lasts, so the tests find its beginning, and its end as the beginning of another.
-So every other span from one beginning to the next is tried as well.
+Segments. A filter follows an error that lasts, so the tests find its beginning, and its end as the beginning of
+another. So the ends of all suspected spans divide the drive into segments, and those that are wrong together by the
+evidence (`graphnav.estimation.faults.segments`) are one more set of spans.
 
 Before or after. The tests run forward in time, so where fixes step from one place to another those behind the step are
 suspected, though those before it may be the wrong ones. So the fixes before each span that is left out, for as long,
@@ -46,8 +47,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from graphnav.constraints.base import SAME_TIME
 from graphnav.core.rotation import Array
 from graphnav.estimation.faults.excluded import find_fault_spans, weigh_rows
+from graphnav.estimation.faults.segments import find_wrong_segments
 from graphnav.estimation.faults.watch import FALSE_ALARM, SIZES
 from graphnav.estimation.noise.apply import apply_noise, select_weights
 from graphnav.estimation.noise.decision import (
@@ -73,7 +76,6 @@ from graphnav.estimation.noise.spans import (
     join,
     join_faults,
     list_before,
-    list_between,
     list_distinct,
     list_repeats,
     mask_times,
@@ -169,6 +171,15 @@ def _list_before(base: Problem, noise: NoiseModel) -> list[Span]:
     return list_before(excluded, _list_fix_times(base)) if excluded else []
 
 
+def _find_segments(base: Problem, found: NoiseEstimate, suspected: list[Span]) -> list[Span]:
+    """Wrong segments, of those into which the ends of suspected spans divide the drive."""
+    t = _list_fix_times(base)
+    behind = np.searchsorted(t, [end + SAME_TIME for _, end in suspected])
+    edges = sorted({*(begin for begin, _ in suspected), *t[behind[behind < len(t)]].tolist()})
+    used = apply_noise(base, replace(found.noise, excluded={}))
+    return find_wrong_segments(used, found.carry_points(base, used), edges, FIXES) if edges else []
+
+
 def _list_fix_times(base: Problem) -> Array:
     """(N,) s, in order."""
     return base.t[np.unique(np.concatenate([c.keyframe for c in base.constraints if c.name in FIXES]))]
@@ -182,7 +193,12 @@ def decide_faults(base: Problem, found: NoiseEstimate) -> Decision:
     base : built with stated noise.
     found : estimated with all measurements.
     """
-    first = explain(base, found, find_suspects(base, found.noise, found))
+    suspects = find_suspects(base, found.noise, found)
+    first = explain(base, found, suspects)
+    if segments := _find_segments(base, found, suspects):
+        other = explain(base, found, segments)
+        passes = first.passes + other.passes + Counter(filter=2)
+        first = replace(max(first, other, key=lambda one: one.log_evidence), passes=passes)
     medians = {name: replace(figure, log_factor=figure.prior) for name, figure in found.noise.figures.items()}
     masked = _find_disagreements(base, NoiseModel(medians), found)
     first = replace(first, passes=first.passes + Counter(filter=2))
@@ -212,8 +228,8 @@ def _unmask(base: Problem, found: NoiseEstimate, first: Decision, masked: list[S
         passes = passes + estimate.passes + Counter(filter=1)
         spans, refined = trim(spans, errors), trim(detected, errors)
         # a slow onset is dated better by the tests, an abrupt end by the errors of single fixes
-        between = list_between(refined, _list_fix_times(base)) if len(refined) > 1 else ()
-        for some in list_distinct(spans, trim(spans, errors, FALSE_ALARM), detected, *between):
+        segments = _find_segments(base, estimate, [*detected, *refined])
+        for some in list_distinct(spans, trim(spans, errors, FALSE_ALARM), detected, segments):
             candidate = explain(base, _add_outliers(estimate, errors, some), some)
             passes = passes + candidate.passes
             cut = _cut_at_steps(some, candidate.noise, used, estimate)

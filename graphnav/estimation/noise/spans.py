@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Iterable, Mapping
 
 import numpy as np
@@ -122,16 +121,6 @@ def list_before(spans: list[Span], t: Array) -> list[Span]:
     ends = [-np.inf, *(end for _, end in spans[:-1])]
     before = ((t >= begin - (end - begin)) & (t > e) & (t < begin) for (begin, end), e in zip(spans, ends, strict=True))
     return [(float(t[some][0]), float(t[some][-1])) for some in before if some.any()]
-
-
-def list_between(spans: list[Span], t: Array) -> tuple[list[Span], list[Span]]:
-    """Measurements at times t (N,) s from the beginning of a span to that of the next, or to the end: every other one
-    from the first on, and from the second on.
-    """
-    edges = [begin for begin, _ in spans] + [np.inf]
-    inside = [t[(t >= a) & (t < b)] for a, b in itertools.pairwise(edges)]
-    between = [(float(some[0]), float(some[-1])) for some in inside]
-    return between[::2], between[1::2]
 
 
 def list_distinct(*candidates: list[Span]) -> list[list[Span]]:

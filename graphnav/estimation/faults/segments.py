@@ -1,0 +1,177 @@
+"""Which segments of a drive have wrong fixes: all sets of them, compared by one pass of the filter.
+
+The tests (`graphnav.estimation.faults.watch`) tell when fixes begin to disagree with everything else. A filter follows
+an error that lasts, so the end of a fault looks like the beginning of another, and either of the segments between may
+be the wrong one. Within a segment, the fixes of a kind have an unknown error b that stays and one that grows. The
+innovations of a linear filter respond to all of them by G b, and are otherwise white, so that with
+
+    score s = sum G^T S^-1 nu      info I = sum G^T S^-1 G
+
+over the whole drive, and W the prior sizes of errors, the evidence of a set A of wrong segments, beside none, is
+
+    s_A^T (W^-2 + I_A)^-1 s_A / 2 - ln |1 + W I_A W| / 2
+
+(Willsky and Jones 1976 for G; MacKay 1992, "Bayesian interpolation"). A run of segments may have one error in common:
+columns of G are then summed. Sets are found by forward selection, the likeliest few of each size; each choice leaves
+the others what is left of s and I when its errors are known as well as they are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from graphnav.constraints.base import Constraint
+from graphnav.core.rotation import Array
+from graphnav.estimation.faults.watch import FALSE_ALARM, MINUTE, SIZES
+from graphnav.estimation.problem import Problem
+from graphnav.estimation.solvers.ekf import refilter
+from graphnav.estimation.solvers.linearise import Points
+from graphnav.estimation.solvers.passes import ForwardRecord
+from graphnav.estimation.solvers.recursion import move_columns
+
+Span = tuple[float, float]
+_COST = -float(np.log(FALSE_ALARM))  # negative prior log-odds of a fault
+_BEAM = 8  # sets of segments that are followed: the likeliest single one need not be among the likeliest two
+
+
+@dataclass(frozen=True)
+class _Set:
+    """A set of wrong runs, and what is left of score and info of all errors when these are known so far."""
+
+    chosen: frozenset[tuple[int, int]]  # first segment of each run, and the one behind it
+    log_odds: float  # beside nothing being wrong
+    score: Array  # (M, C)
+    info: Array  # (M, C, M, C)
+
+
+class _Runs:
+    """All runs of consecutive segments, each with one error in common; C numbers of all kinds.
+
+    Parameters
+    ----------
+    begins : (M,) s, of the segments.
+    units : of each kind of fixes.
+    m : numbers of a fix.
+    """
+
+    def __init__(self, begins: Array, units: list[str], m: int) -> None:
+        first, last = np.triu_indices(len(begins))
+        self.first, self.behind, C = first, last + 1, 2 * m * len(units)
+        # an error b that stays and one g that grows by the minute since a run began, by those since the first segment
+        minutes = (begins[first] - begins[0]) / MINUTE
+        size = np.concatenate([np.full(2 * m, SIZES[unit]) for unit in units])
+        self.shift = np.zeros((len(first), C, C))
+        self.shift[:] = np.diag(size)
+        for one in range(0, C, 2 * m):
+            for i in range(one, one + m):
+                self.shift[:, i, i + m] = -minutes * size[i + m]
+        each = [np.arange(2 * m * i, 2 * m * (i + 1)) for i in range(len(units))]
+        self.kinds = [np.arange(C), *each] if len(units) > 1 else each
+
+    def list_better(self, one: _Set) -> list[tuple[float, int, int]]:
+        """The likeliest of those that share no segment with a set and increase its odds: increase, run, kind."""
+        free = np.ones(len(self.first), dtype=bool)
+        for first, behind in one.chosen:
+            free &= (self.behind <= first) | (self.first >= behind)
+        j = np.flatnonzero(free)
+        lo, hi, shift = self.first[j], self.behind[j], self.shift[j]
+        s, I = _sum_before(one.score, 0), _sum_before(_sum_before(one.info, 0), 2)
+        score = np.einsum("jab,ja->jb", shift, s[hi] - s[lo])
+        some = I[hi, :, hi] - I[hi, :, lo] - I[lo, :, hi] + I[lo, :, lo]
+        info = np.swapaxes(shift, 1, 2) @ some @ shift
+        out = []
+        for number, kind in enumerate(self.kinds):
+            A, y = np.eye(len(kind)) + info[:, kind[:, None], kind], score[:, kind]
+            x = np.linalg.solve(A, y[..., None])[..., 0]
+            gain = 0.5 * np.sum(x * y, axis=1) - 0.5 * np.linalg.slogdet(A)[1] - _COST
+            out += [(float(gain[i]), int(j[i]), number) for i in np.argsort(-gain)[:_BEAM] if gain[i] > 0.0]
+        return sorted(out, reverse=True)[:_BEAM]
+
+    def add(self, one: _Set, gain: float, j: int, kind: int) -> _Set:
+        """A set with another run."""
+        own, C = slice(self.first[j], self.behind[j]), one.score.shape[1]
+        U = self.shift[j][:, self.kinds[kind]]
+        beside = np.sum(one.info[:, :, own], axis=2).reshape(-1, C) @ U
+        within = U.T @ np.sum(one.info[own, :, own], axis=(0, 2)) @ U
+        left = np.linalg.solve(np.eye(U.shape[1]) + within, beside.T)
+        score = one.score - (left.T @ (U.T @ np.sum(one.score[own], axis=0))).reshape(one.score.shape)
+        info = one.info - (beside @ left).reshape(one.info.shape)
+        return _Set(one.chosen | {(int(self.first[j]), int(self.behind[j]))}, one.log_odds + gain, score, info)
+
+
+def find_wrong_segments(problem: Problem, about: Points, edges: Sequence[float], names: Collection[str]) -> list[Span]:
+    """The segments of fixes that are wrong by the evidence: first and last fix of each run of them, s.
+
+    Parameters
+    ----------
+    problem : with its noise model.
+    about : points of all keyframes to linearise at.
+    edges : s, in order: where one segment ends and the next begins. The last one lasts to the end.
+    names : of the constraints that may be wrong, each in some of the segments.
+    """
+    fixes = [rows for rows in problem.constraints if rows.name in names]
+    begins, m = np.array(edges), len(fixes[0].axes)
+    runs = _Runs(begins, [rows.unit for rows in fixes], m)
+    best = _Set(frozenset(), 0.0, *_respond(problem, refilter(problem, about), fixes, begins))
+    beam = [best]
+    while beam:
+        more: dict[frozenset[tuple[int, int]], _Set] = {}
+        for one in beam:
+            for gain, j, kind in runs.list_better(one):
+                chosen = one.chosen | {(int(runs.first[j]), int(runs.behind[j]))}
+                if chosen not in more or one.log_odds + gain > more[chosen].log_odds:
+                    more[chosen] = runs.add(one, gain, j, kind)
+        beam = sorted(more.values(), key=lambda one: -one.log_odds)[:_BEAM]
+        best = max([best, *beam[:1]], key=lambda one: one.log_odds)
+    t = problem.t[np.unique(np.concatenate([rows.keyframe for rows in fixes]))]
+    ends = np.append(begins, np.inf)
+    inside = (t[(t >= ends[first]) & (t < ends[behind])] for first, behind in sorted(best.chosen))
+    return [(float(some[0]), float(some[-1])) for some in inside if len(some)]
+
+
+def _sum_before(x: Array, axis: int) -> Array:
+    """Sums of what is before each place of an axis, and of all."""
+    total = np.cumsum(x, axis)
+    return np.concatenate([np.zeros_like(np.take(total, [0], axis)), total], axis)
+
+
+def _respond(problem: Problem, forward: ForwardRecord, fixes: list[Constraint], begins: Array) -> tuple[Array, Array]:
+    """Score (M, C) and info (M, C, M, C) of all segments' errors, growing ones by the minute since the first began.
+
+    X <- F X from one keyframe to the next, G = U - H X and X <- X + K G at each update.
+    """
+    updates, m = forward.updates, len(fixes[0].axes)
+    assert updates is not None
+    n, numbers, D = updates.H.shape
+    C = 2 * m * len(fixes)
+    column, minutes = np.full((n, numbers), -1), np.zeros((n, numbers))
+    for i, rows in enumerate(fixes):
+        of, place = updates.places[rows.name]
+        t = problem.t[of[:, 0]]
+        segment = np.searchsorted(begins, t, side="right") - 1
+        own = segment >= 0
+        column[of[own], place[own]] = (C * segment[own] + 2 * m * i)[:, None] + np.arange(m)
+        minutes[of[own], place[own]] = ((t[own] - begins[0]) / MINUTE)[:, None]
+    every = C * len(begins)
+    X, score, info = np.zeros((D, every)), np.zeros(every), np.zeros((every, every))
+    blocks, met = updates.blocks, np.maximum(column.max(axis=1) // C + 1, 0) * C
+    known = 0
+    for k in range(n):
+        if known:
+            X[:, :known] = move_columns(forward.F[k - 1], forward.decay[k - 1], np.ascontiguousarray(X[:, :known]))
+        known = max(known, int(met[k]))  # columns from there on are zero still
+        for b in range(blocks.first[k], blocks.first[k + 1]) if known else ():
+            if not updates.taken[b]:
+                continue
+            at = k, slice(blocks.begin[b], blocks.end[b])
+            G = -updates.H[at] @ X[:, :known]
+            some = np.flatnonzero(column[at] >= 0)
+            G[some, column[at][some]] += 1.0
+            G[some, column[at][some] + m] += minutes[at][some]
+            X[:, :known] += updates.Kt[at].T @ G
+            score[:known] += G.T @ updates.w[at]
+            info[:known, :known] += G.T @ (updates.inverse[*at, at[1]] @ G)
+    return score.reshape(-1, C), info.reshape(len(begins), C, -1, C)
