@@ -26,9 +26,7 @@ class Alignment:
     notes: tuple[str, ...]
     motion: float | None = None  # s, from when on the heading is known: the first motion, or two antennas; None: never
     until: float | None = None  # s, end of the span that a filter processes twice: the span of motion, or first steps
-    minima: tuple[
-        States, ...
-    ] = ()  # of the short problem over the span of motion, those that the headings tried led to
+    minima: tuple[States, ...] = ()  # of the problem over the span of motion, from all headings tried
 
     @property
     def rph(self) -> Array:

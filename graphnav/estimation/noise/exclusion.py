@@ -173,11 +173,13 @@ def _list_before(base: Problem, noise: NoiseModel) -> list[Span]:
 
 def _find_segments(base: Problem, found: NoiseEstimate, suspected: list[Span]) -> list[Span]:
     """Wrong segments, of those into which the ends of suspected spans divide the drive."""
+    if not suspected:
+        return []
     t = _list_fix_times(base)
     behind = np.searchsorted(t, [end + SAME_TIME for _, end in suspected])
     edges = sorted({*(begin for begin, _ in suspected), *t[behind[behind < len(t)]].tolist()})
     used = apply_noise(base, replace(found.noise, excluded={}))
-    return find_wrong_segments(used, found.carry_points(base, used), edges, FIXES) if edges else []
+    return find_wrong_segments(used, found.carry_points(base, used), edges, FIXES)
 
 
 def _list_fix_times(base: Problem) -> Array:
