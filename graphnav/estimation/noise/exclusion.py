@@ -184,8 +184,7 @@ def _find_segments(base: Problem, found: NoiseEstimate, suspected: list[Span]) -
 
 def _list_fix_times(base: Problem) -> Array:
     """(N,) s, in order."""
-    of_fixes = [c.keyframe for c in base.constraints if c.name in FIXES]
-    return base.t[np.unique(np.concatenate([np.empty(0, dtype=int), *of_fixes]))]  # raw observations alone have none
+    return base.t[np.unique(np.concatenate([c.keyframe for c in base.constraints if c.name in FIXES]))]
 
 
 def decide_faults(base: Problem, found: NoiseEstimate) -> Decision:
