@@ -36,8 +36,6 @@ from graphnav.estimation.offsets import is_offset_far
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.linearise import Points
 
-_GAINED_BY_CHANCE = 0.5  # log-likelihood that a figure gains by being estimated, in the mean
-
 
 @dataclass(frozen=True)
 class JointEstimate:
@@ -149,8 +147,7 @@ def _free_contradicted(found: JointEstimate, settings: GnssSettings, estimate: _
             other = replace(found, freed=freed, estimate=estimate(free(base, freed), near)).weigh()
             passes = passes + other.estimate.passes + Counter(filter=1)
             # with other figures, this may lead to a worse optimum than before
-            gained = _GAINED_BY_CHANCE * len(other.noise.figures)
-            if found.compute_evidence() <= other.compute_evidence() + gained:
+            if found.compute_evidence() <= other.compute_evidence() + other.estimate.gained_by_chance:
                 found = other
             freed = update_freed(base, found.estimate, found.freed)
     except BREAKDOWN:

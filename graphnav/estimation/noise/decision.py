@@ -38,6 +38,7 @@ class Decision:
     log_evidence: float
     passes: Counter[str] = field(default_factory=Counter)
     estimate: NoiseEstimate | None = None  # with this noise, where nothing is left out but figures were estimated again
+    rival: Decision | None = None  # the likeliest by spans as the tests found them, if this one is by segments
 
 
 def explain(

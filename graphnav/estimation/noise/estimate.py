@@ -69,6 +69,12 @@ class NoiseEstimate:
     log_evidence: float  # of the measurements: the same less the cost of rows and intervals of reduced weight
     passes: Counter[str]  # over keyframes, of "filter" and "smoother"
     whole_evidence: float | None = None  # of all measurements, excluded ones included, where it was computed
+    rival: NoiseEstimate | None = None  # by another decision on what is wrong, nearly as likely
+
+    @property
+    def gained_by_chance(self) -> float:
+        """Log-likelihood that its figures gain by being estimated, in the mean."""
+        return 0.5 * len(self.noise.figures)
 
     def get_linearisation(self, base: Problem) -> tuple[Points, Problem]:
         """Its points and the problem that they are of, to start another estimate from."""

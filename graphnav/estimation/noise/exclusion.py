@@ -28,7 +28,9 @@ fault is left by these figures, the estimate that uses all measurements and star
 
 Segments. A filter follows an error that lasts, so the tests find its beginning, and its end as the beginning of
 another. So the ends of all suspected spans divide the drive into segments, and those that are wrong together by the
-evidence (`graphnav.estimation.faults.segments`) are one more set of spans.
+evidence (`graphnav.estimation.faults.segments`) are one more set of spans. Two disturbances of the IMU make the fixes
+between them look displaced as well. So where segments are the likeliest, the likeliest of the other sets is estimated
+too, and stands unless segments are likelier in the end by more than figures gain by chance.
 
 Before or after. The tests run forward in time, so where fixes step from one place to another those behind the step are
 suspected, though those before it may be the wrong ones. So the fixes before each span that is left out, for as long,
@@ -116,6 +118,12 @@ def estimate_without_faults(
         return replace(decision.estimate or found, passes=passes)
     best = _estimate_without(base, opening, decision, found, progress)
     passes = passes + best.passes
+    rival = None
+    if decision.rival is not None:
+        rival = decision.rival.estimate or found
+        if decision.rival.noise.excluded:
+            rival = _estimate_without(base, opening, decision.rival, found, progress)
+            passes = passes + rival.passes
     before, other = _list_before(base, best.noise), None
     if before:
         with contextlib.suppress(*BREAKDOWN):  # from a filter that follows the wrong fixes
@@ -124,7 +132,7 @@ def estimate_without_faults(
         both = tuple(weigh_evidence(base, replace(one, passes=Counter())) for one in (best, other))
         passes = sum((one.passes for one in both), passes + other.passes)
         best = max(both, key=lambda one: log_evidence(base, one))
-    return replace(best, passes=passes)
+    return replace(best, passes=passes, rival=rival)
 
 
 def _estimate_other(
@@ -199,8 +207,9 @@ def decide_faults(base: Problem, found: NoiseEstimate) -> Decision:
     first = explain(base, found, suspects)
     if segments := _find_segments(base, found, suspects):
         other = explain(base, found, segments)
-        passes = first.passes + other.passes + Counter(filter=2)
-        first = replace(max(first, other, key=lambda one: one.log_evidence), passes=passes)
+        passes = first.passes + other.passes + Counter(filter=1)
+        first = replace(other, rival=first) if other.log_evidence > first.log_evidence else first
+        first = replace(first, passes=passes)
     medians = {name: replace(figure, log_factor=figure.prior) for name, figure in found.noise.figures.items()}
     masked = _find_disagreements(base, NoiseModel(medians), found)
     first = replace(first, passes=first.passes + Counter(filter=2))
@@ -221,6 +230,7 @@ def _unmask(base: Problem, found: NoiseEstimate, first: Decision, masked: list[S
     masked : spans of fixes that are suspected besides those of the first.
     """
     best, leading, estimate, spans, passes = first, found, found, masked, first.passes
+    rival = first.rival or first  # by other spans than segments
     start = NoiseModel(found.noise.figures, found.noise.times, excluded=dict.fromkeys(FIXES, tuple(masked)))
     for _ in range(_REFINEMENTS):
         estimate = estimate_noise(base, None, start, estimate.get_linearisation(base), changed=True)
@@ -231,7 +241,10 @@ def _unmask(base: Problem, found: NoiseEstimate, first: Decision, masked: list[S
         spans, refined = trim(spans, errors), trim(detected, errors)
         # a slow onset is dated better by the tests, an abrupt end by the errors of single fixes
         segments = _find_segments(base, estimate, [*detected, *refined])
-        for some in list_distinct(spans, trim(spans, errors, FALSE_ALARM), detected, segments):
+        passes = passes + Counter(filter=1 if detected or refined else 0)
+        for some in [*list_distinct(spans, trim(spans, errors, FALSE_ALARM), detected), segments]:
+            if not some:
+                continue
             candidate = explain(base, _add_outliers(estimate, errors, some), some)
             passes = passes + candidate.passes
             cut = _cut_at_steps(some, candidate.noise, used, estimate)
@@ -240,6 +253,8 @@ def _unmask(base: Problem, found: NoiseEstimate, first: Decision, masked: list[S
                 finer = explain(base, _add_outliers(estimate, errors, cut), cut, among)
                 passes = passes + finer.passes
                 candidate = max(candidate, finer, key=lambda one: one.log_evidence)
+            if some is not segments and candidate.log_evidence > rival.log_evidence:
+                rival = candidate
             if candidate.log_evidence > best.log_evidence:
                 best, leading = candidate, estimate
         if sum_lengths(detected) > 2.0 * sum_lengths(masked):  # more fixes seem wrong outside the span than inside
@@ -256,7 +271,7 @@ def _unmask(base: Problem, found: NoiseEstimate, first: Decision, masked: list[S
     if best is not first and not best.noise.excluded:  # the figures that go with these outliers
         free = estimate_noise(base, None, best.noise, leading.get_linearisation(base))
         return Decision(free.noise, best.log_evidence, passes + free.passes, free)
-    return replace(best, passes=passes)
+    return replace(best, passes=passes, rival=None if best is rival else rival)
 
 
 def _readmit(base: Problem, found: NoiseEstimate) -> NoiseEstimate:
@@ -286,7 +301,17 @@ def estimate_disturbed_intervals(base: Problem, found: NoiseEstimate) -> NoiseEs
     base : built with stated noise and the parts of its intervals' noise.
     found : with all intervals alike.
     """
-    found = weigh_evidence(base, found)
+    best = _disturb_intervals(base, found)
+    if found.rival is None:
+        return best
+    other = _disturb_intervals(base, found.rival)
+    sure = log_evidence(base, best) > log_evidence(base, other) + best.gained_by_chance
+    return replace(best if sure else other, passes=best.passes + other.passes - found.rival.passes, rival=None)
+
+
+def _disturb_intervals(base: Problem, found: NoiseEstimate) -> NoiseEstimate:
+    """The same from one decision on what is wrong."""
+    found = weigh_evidence(base, replace(found, rival=None))
     start, near, passes = found.noise, found.get_linearisation(base), found.passes
     if found.noise.excluded:
         free = estimate_noise(base, None, replace(found.noise, excluded={}), near, intervals=True)
