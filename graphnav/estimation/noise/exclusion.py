@@ -22,9 +22,9 @@ improbable as `CHANCE`. The most probable model decides what is left out.
 
 Masking. Figures that are estimated with a fault among the data may have grown until they hide it, so the tests are made
 with the figures at their prior medians as well. If they find more, the figures are estimated again without these spans,
-and once more without those that the tests find by the new figures. Each set of spans that comes up on the way, whole
-and trimmed to what is wrong, is decided by these figures, and the decision with the largest evidence stands. If no
-fault is left by these figures, the estimate that uses all measurements and starts from them is one more candidate.
+twice, because the spans shrink to what is wrong. Each set of spans that comes up on the way is decided by these
+figures, and the decision with the largest evidence stands. If no fault is left by these figures, the estimate that uses
+all measurements and starts from them is one more candidate.
 
 Segments. A filter follows an error that lasts for more than `watch.PATIENCE`, so the tests find its beginning, and its
 end as the beginning of another. So the ends of all suspected spans divide the drive into segments, and those that are
@@ -91,7 +91,7 @@ from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.ekf import refilter
 from graphnav.recording import Recording
 
-_REFINEMENTS = 2  # estimates without masked spans: the figures of the second are free of what is wrong
+_REFINEMENTS = 2  # estimates without masked spans: the first trims the spans, the second is free of what is wrong
 
 
 def estimate_without_faults(
@@ -272,9 +272,9 @@ def _unmask(base: Problem, found: NoiseEstimate, first: Decision, masked: list[S
             passes = passes + free.passes
             if free.log_evidence > first.log_evidence:
                 return Decision(free.noise, free.log_evidence, passes, free)
-        if not refined or detected == spans:
+        if not refined or refined == spans:
             break
-        spans, start = detected, replace(start, excluded=dict.fromkeys(FIXES, tuple(detected)))
+        spans, start = refined, replace(start, excluded=dict.fromkeys(FIXES, tuple(refined)))
     if best is not first and not best.noise.excluded:  # the figures that go with these outliers
         free = estimate_noise(base, None, best.noise, leading.get_linearisation(base))
         return Decision(free.noise, best.log_evidence, passes + free.passes, free)
