@@ -48,7 +48,9 @@ class _Set:
 
 
 class _Runs:
-    """All runs of consecutive segments, each with one error in common; C numbers of all kinds.
+    """All runs of consecutive segments but the last, each with one error in common; C numbers of all kinds.
+
+    With the last one, the end of which is not seen, a run is no likelier than the one before it.
 
     Parameters
     ----------
@@ -58,7 +60,7 @@ class _Runs:
     """
 
     def __init__(self, begins: Array, units: list[str], m: int) -> None:
-        first, last = np.triu_indices(len(begins))
+        first, last = np.triu_indices(len(begins) - 1)
         self.first, self.behind, C = first, last + 1, 2 * m * len(units)
         # an error b that stays and one g that grows by the minute since a run began, by those since the first segment
         minutes = (begins[first] - begins[0]) / MINUTE

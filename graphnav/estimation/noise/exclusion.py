@@ -22,15 +22,16 @@ improbable as `CHANCE`. The most probable model decides what is left out.
 
 Masking. Figures that are estimated with a fault among the data may have grown until they hide it, so the tests are made
 with the figures at their prior medians as well. If they find more, the figures are estimated again without these spans,
-and once more without those that the tests find by the new figures. Each set of spans that comes up on the way, whole
-and trimmed to what is wrong, is decided by these figures, and the decision with the largest evidence stands. If no
-fault is left by these figures, the estimate that uses all measurements and starts from them is one more candidate.
+twice, because the spans shrink to what is wrong. Each set of spans that comes up on the way is decided by these
+figures, and the decision with the largest evidence stands. If no fault is left by these figures, the estimate that uses
+all measurements and starts from them is one more candidate.
 
-Segments. A filter follows an error that lasts, so the tests find its beginning, and its end as the beginning of
-another. So the ends of all suspected spans divide the drive into segments, and those that are wrong together by the
-evidence (`graphnav.estimation.faults.segments`) are one more set of spans. Two disturbances of the IMU make the fixes
-between them look displaced as well. So where segments are the likeliest, the likeliest of the other sets is estimated
-too, and stands unless segments are likelier in the end by more than figures gain by chance.
+Segments. A filter follows an error that lasts for more than `watch.PATIENCE`, so the tests find its beginning, and its
+end as the beginning of another. So the ends of all suspected spans divide the drive into segments, and those that are
+wrong together by the evidence (`graphnav.estimation.faults.segments`) are one more set of spans, if one of them is
+such an error. Two disturbances of the IMU make the fixes between them look displaced as well. So where segments are the
+likeliest, the likeliest of the other sets is estimated too, and stands unless segments are likelier in the end by more
+than figures gain by chance.
 
 Before or after. The tests run forward in time, so where fixes step from one place to another those behind the step are
 suspected, though those before it may be the wrong ones. So the fixes before each span that is left out, for as long,
@@ -53,7 +54,7 @@ from graphnav.constraints.base import SAME_TIME
 from graphnav.core.rotation import Array
 from graphnav.estimation.faults.excluded import find_fault_spans, weigh_rows
 from graphnav.estimation.faults.segments import find_wrong_segments
-from graphnav.estimation.faults.watch import FALSE_ALARM, SIZES
+from graphnav.estimation.faults.watch import FALSE_ALARM, PATIENCE, SIZES
 from graphnav.estimation.noise.apply import apply_noise, select_weights
 from graphnav.estimation.noise.decision import (
     Decision,
@@ -90,7 +91,7 @@ from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.ekf import refilter
 from graphnav.recording import Recording
 
-_REFINEMENTS = 2  # estimates without masked spans: the figures of the second are free of what is wrong
+_REFINEMENTS = 2  # estimates without masked spans: the first trims the spans, the second is free of what is wrong
 
 
 def estimate_without_faults(
@@ -180,14 +181,20 @@ def _list_before(base: Problem, noise: NoiseModel) -> list[Span]:
 
 
 def _find_segments(base: Problem, found: NoiseEstimate, suspected: list[Span]) -> list[Span]:
-    """Wrong segments, of those into which the ends of suspected spans divide the drive."""
+    """Wrong segments, of those into which the ends of suspected spans divide the drive.
+
+    None unless one of them outlasts the tests, of which the spans are otherwise.
+    """
     if not suspected:
         return []
     t = _list_fix_times(base)
     behind = np.searchsorted(t, [end + SAME_TIME for _, end in suspected])
     edges = sorted({*(begin for begin, _ in suspected), *t[behind[behind < len(t)]].tolist()})
     used = apply_noise(base, replace(found.noise, excluded={}))
-    return find_wrong_segments(used, found.carry_points(base, used), edges, FIXES)
+    segments = find_wrong_segments(used, found.carry_points(base, used), edges, FIXES)
+    within = join(suspected)
+    outlasting = (one for one in segments if one[1] - one[0] > PATIENCE and not are_covered([one], within))
+    return segments if any(outlasting) else []
 
 
 def _list_fix_times(base: Problem) -> Array:
@@ -265,9 +272,9 @@ def _unmask(base: Problem, found: NoiseEstimate, first: Decision, masked: list[S
             passes = passes + free.passes
             if free.log_evidence > first.log_evidence:
                 return Decision(free.noise, free.log_evidence, passes, free)
-        if not refined or detected == spans:
+        if not refined or refined == spans:
             break
-        spans, start = detected, replace(start, excluded=dict.fromkeys(FIXES, tuple(detected)))
+        spans, start = refined, replace(start, excluded=dict.fromkeys(FIXES, tuple(refined)))
     if best is not first and not best.noise.excluded:  # the figures that go with these outliers
         free = estimate_noise(base, None, best.noise, leading.get_linearisation(base))
         return Decision(free.noise, best.log_evidence, passes + free.passes, free)
