@@ -249,11 +249,12 @@ def test_evidence_of_segments_is_that_of_filters_with_their_errors(built: Proble
     """Each run, and each beside another one, against a filter that has these errors as parameters."""
     about = ekf(built)
     rows = next(c for c in built.constraints if c.name == "gnss_position")
-    begins = np.array([50.0, 83.0, 120.0, 200.0, 201.0, 260.0])
+    begins = np.array([50.0, 83.0, 120.0, 200.0, 201.0, 260.0, 320.0])
     t = built.t[rows.keyframe]
     off = np.zeros((len(t), 3))
-    off[(t >= 83.0) & (t < 200.0)] = [0.4, -0.3, 0.1]
-    off[t >= 260.0] = np.outer(0.02 * (t[t >= 260.0] - 260.0), [0.5, 1.0, 0.0])
+    off[(t >= 83.0) & (t < 200.0)] = [1.2, -0.9, 0.3]
+    growing = (t >= 260.0) & (t < 320.0)
+    off[growing] = np.outer(0.1 * (t[growing] - 260.0), [0.5, 1.0, 0.0])
     wrong = replace(rows, p_n=rows.p_n + off)
     problem = replace(built, constraints=tuple(wrong if c is rows else c for c in built.constraints))
 
@@ -267,14 +268,14 @@ def test_evidence_of_segments_is_that_of_filters_with_their_errors(built: Proble
     usual, chosen = float(Comparison(problem, about).log_likelihood(problem, about).sum()), []
     for _ in range(2):
         better = runs.list_better(one)
-        assert len(better) > 2
+        assert better
         for gain, j, _ in better:
-            span = begins[runs.first[j]], np.append(begins, t[-1] + 1.0)[runs.behind[j]] - 0.01
+            span = begins[runs.first[j]], begins[runs.behind[j]] - 0.01
             assert gain - np.log(FALSE_ALARM) == pytest.approx(evaluate(*chosen, span) - usual, rel=1e-5)
         gain, j, kind = better[0]
-        chosen.append((begins[runs.first[j]], np.append(begins, t[-1] + 1.0)[runs.behind[j]] - 0.01))
+        chosen.append((begins[runs.first[j]], begins[runs.behind[j]] - 0.01))
         usual, one = evaluate(*chosen), runs.add(one, gain, j, kind)
-    assert find_wrong_segments(problem, about, begins.tolist(), [rows.name]) == [(83.0, 199.0), (260.0, t[-1])]
+    assert find_wrong_segments(problem, about, begins.tolist(), [rows.name]) == [(83.0, 199.0), (260.0, 319.0)]
 
 
 def test_split_at_steps() -> None:

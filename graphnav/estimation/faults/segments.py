@@ -48,9 +48,9 @@ class _Set:
 
 
 class _Runs:
-    """All runs of consecutive segments but the last, each with one error in common; C numbers of all kinds.
+    """All runs of consecutive segments, each with one error in common; C numbers of all kinds.
 
-    With the last one, the end of which is not seen, a run is no likelier than the one before it.
+    The last segment is of no run: an error of which the end is not seen may as well be a step to what is right.
 
     Parameters
     ----------

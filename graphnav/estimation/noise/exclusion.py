@@ -185,14 +185,14 @@ def _find_segments(base: Problem, found: NoiseEstimate, suspected: list[Span]) -
 
     None unless one of them outlasts the tests, of which the spans are otherwise.
     """
-    if not suspected:
+    within = join(suspected)
+    if len(within) < 2:
         return []
     t = _list_fix_times(base)
     behind = np.searchsorted(t, [end + SAME_TIME for _, end in suspected])
     edges = sorted({*(begin for begin, _ in suspected), *t[behind[behind < len(t)]].tolist()})
     used = apply_noise(base, replace(found.noise, excluded={}))
     segments = find_wrong_segments(used, found.carry_points(base, used), edges, FIXES)
-    within = join(suspected)
     outlasting = (one for one in segments if one[1] - one[0] > PATIENCE and not are_covered([one], within))
     return segments if any(outlasting) else []
 
@@ -248,7 +248,7 @@ def _unmask(base: Problem, found: NoiseEstimate, first: Decision, masked: list[S
         spans, refined = trim(spans, errors), trim(detected, errors)
         # a slow onset is dated better by the tests, an abrupt end by the errors of single fixes
         segments = _find_segments(base, estimate, [*detected, *refined])
-        passes = passes + Counter(filter=1 if detected or refined else 0)
+        passes = passes + Counter(filter=1 if segments else 0)
         for some in [*list_distinct(spans, trim(spans, errors, FALSE_ALARM), detected), segments]:
             if not some:
                 continue
