@@ -183,6 +183,14 @@ def line(name: str, e: Array) -> str:
     )
 
 
+def consistency(solution: Solution, t: Array, e: Array) -> float:
+    """Horizontal NEES per degree of freedom; the IMU is at the antenna."""
+    k = np.argmin(np.abs(solution.t[None] - t[:, None]), axis=1)
+    good = np.isfinite(e[:, 0])
+    P = solution.covariance[k[good]][:, 3:5, 3:5]
+    return float(np.mean(np.einsum("ni,nij,nj->n", e[good, :2], np.linalg.inv(P), e[good, :2])) / 2.0)
+
+
 def shares(solution: Solution, t: Array, e: Array) -> str:
     """Share of epochs that are fixed, and of the fixed ones that are wrong, %."""
     if not len(solution.fixed):
@@ -224,11 +232,11 @@ def main() -> None:
         recording = replace(recording, imu=replace(recording.imu, noise=loose))
     inside = (t >= recording.start) & (t <= recording.end)
     t, places = t[inside], places[inside]
-    print(f"{'':34} {'epochs':>6} {'H50':>7} {'H95':>7} {'max':>7} {'U95':>7}")
+    print(f"{'':34} {'epochs':>6} {'H50':>7} {'H95':>7} {'max':>7} {'U95':>7} {'NEES':>6}")
     assert recording.gnss is not None
     fixes = errors(recording.gnss.t, recording.gnss.llh, t, places)
     print(line("codes by epoch, no IMU", fixes))
-    solvers = tuple(given.solver or ("ekf", "rts"))
+    solvers = tuple(given.solver or ("ekf", "rts", "batch"))
     for name, chosen in VARIANTS.items():
         if given.only and not any(name.startswith(one) for one in given.only):
             continue
@@ -238,7 +246,7 @@ def main() -> None:
         seconds = time.process_time() - began
         for solver, one in solutions.items():
             e = errors(one.t, one.trajectory().llh, t, places)
-            print(line(f"{name}, {solver}", e) + shares(one, t, e))
+            print(f"{line(f'{name}, {solver}', e)} {consistency(one, t, e):6.2f}{shares(one, t, e)}")
             for gap in given.gap or ():
                 after = again(one, recording.start + gap + _GAP)
                 print(f"{'':34} fixed again {after:.2f} s after {gap:.0f} + {_GAP:.0f} s")
