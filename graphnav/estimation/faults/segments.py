@@ -13,7 +13,8 @@ over the whole drive, and W the prior sizes of errors, the evidence of a set A o
 
 (Willsky and Jones 1976 for G; MacKay 1992, "Bayesian interpolation"). A run of segments may have one error in common:
 columns of G are then summed. Sets are found by forward selection, the likeliest few of each size; each choice leaves
-the others what is left of s and I when its errors are known as well as they are.
+the others what is left of s and I when its errors are known as well as they are. An error that is not large
+(`watch.LARGE`) is no fault, however certain.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ import numpy as np
 
 from graphnav.constraints.base import Constraint
 from graphnav.core.rotation import Array
-from graphnav.estimation.faults.watch import FALSE_ALARM, MINUTE, SIZES
+from graphnav.estimation.faults.watch import FALSE_ALARM, MINUTE, SIZES, is_large
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.ekf import refilter
 from graphnav.estimation.solvers.linearise import Points
@@ -41,7 +42,7 @@ _BEAM = 8  # sets of segments that are followed: the likeliest single one need n
 class _Set:
     """A set of wrong runs, and what is left of score and info of all errors when these are known so far."""
 
-    chosen: frozenset[tuple[int, int]]  # first segment of each run, and the one behind it
+    chosen: frozenset[tuple[int, int]]  # number of each run and of the kinds of fixes that are wrong in it
     log_odds: float  # beside nothing being wrong
     score: Array  # (M, C)
     info: Array  # (M, C, M, C)
@@ -76,8 +77,8 @@ class _Runs:
     def list_better(self, one: _Set) -> list[tuple[float, int, int]]:
         """The likeliest of those that share no segment with a set and increase its odds: increase, run, kind."""
         free = np.ones(len(self.first), dtype=bool)
-        for first, behind in one.chosen:
-            free &= (self.behind <= first) | (self.first >= behind)
+        for other, _ in one.chosen:
+            free &= (self.behind <= self.first[other]) | (self.first >= self.behind[other])
         j = np.flatnonzero(free)
         lo, hi, shift = self.first[j], self.behind[j], self.shift[j]
         s, I = _sum_before(one.score, 0), _sum_before(_sum_before(one.info, 0), 2)
@@ -101,7 +102,23 @@ class _Runs:
         left = np.linalg.solve(np.eye(U.shape[1]) + within, beside.T)
         score = one.score - (left.T @ (U.T @ np.sum(one.score[own], axis=0))).reshape(one.score.shape)
         info = one.info - (beside @ left).reshape(one.info.shape)
-        return _Set(one.chosen | {(int(self.first[j]), int(self.behind[j]))}, one.log_odds + gain, score, info)
+        return _Set(one.chosen | {(j, kind)}, one.log_odds + gain, score, info)
+
+    def estimate(self, none: _Set, chosen: Sequence[tuple[int, int]]) -> list[Array]:
+        """The errors (C,) of each of some runs together, since the run began; `none` is the empty set."""
+        parts = []
+        for j, kind in chosen:
+            U = np.zeros((*none.score.shape, len(self.kinds[kind])))
+            U[self.first[j] : self.behind[j]] = self.shift[j][:, self.kinds[kind]]
+            parts.append(U.reshape(none.score.size, -1))
+        U = np.concatenate(parts, axis=1)
+        x = np.linalg.solve(np.eye(U.shape[1]) + U.T @ none.info.reshape(len(U), -1) @ U, U.T @ none.score.reshape(-1))
+        out = []
+        for j, kind in chosen:
+            own, x = x[: len(self.kinds[kind])], x[len(self.kinds[kind]) :]
+            out.append(np.zeros(none.score.shape[1]))
+            out[-1][self.kinds[kind]] = own * np.diagonal(self.shift[j])[self.kinds[kind]]
+        return out
 
 
 def find_wrong_segments(problem: Problem, about: Points, edges: Sequence[float], names: Collection[str]) -> list[Span]:
@@ -117,21 +134,31 @@ def find_wrong_segments(problem: Problem, about: Points, edges: Sequence[float],
     fixes = [rows for rows in problem.constraints if rows.name in names]
     begins, m = np.array(edges), len(fixes[0].axes)
     runs = _Runs(begins, [rows.unit for rows in fixes], m)
-    best = _Set(frozenset(), 0.0, *_respond(problem, refilter(problem, about), fixes, begins))
+    none = best = _Set(frozenset(), 0.0, *_respond(problem, refilter(problem, about), fixes, begins))
     beam = [best]
     while beam:
         more: dict[frozenset[tuple[int, int]], _Set] = {}
         for one in beam:
             for gain, j, kind in runs.list_better(one):
-                chosen = one.chosen | {(int(runs.first[j]), int(runs.behind[j]))}
-                if chosen not in more or one.log_odds + gain > more[chosen].log_odds:
+                if (chosen := one.chosen | {(j, kind)}) not in more:
                     more[chosen] = runs.add(one, gain, j, kind)
         beam = sorted(more.values(), key=lambda one: -one.log_odds)[:_BEAM]
         best = max([best, *beam[:1]], key=lambda one: one.log_odds)
+    if not best.chosen:
+        return []
     t = problem.t[np.unique(np.concatenate([rows.keyframe for rows in fixes]))]
-    ends = np.append(begins, np.inf)
-    inside = (t[(t >= ends[first]) & (t < ends[behind])] for first, behind in sorted(best.chosen))
-    return [(float(some[0]), float(some[-1])) for some in inside if len(some)]
+    ordered = sorted(best.chosen, key=lambda run: int(runs.first[run[0]]))
+    out = []
+    for (j, _), error in zip(ordered, runs.estimate(none, ordered), strict=True):
+        own = t[(t >= begins[runs.first[j]]) & (t < begins[runs.behind[j]])]
+        speed = float(np.median(np.linalg.norm(about.states.v[np.isin(problem.t, own)], axis=1)))
+        if any(
+            is_large(error[at : at + m] + grown * error[at + m : at + 2 * m], rows, speed)
+            for rows, at in zip(fixes, range(0, len(error), 2 * m), strict=True)
+            for grown in (0.0, (own[-1] - own[0]) / MINUTE)
+        ):
+            out.append((float(own[0]), float(own[-1])))
+    return out
 
 
 def _sum_before(x: Array, axis: int) -> Array:

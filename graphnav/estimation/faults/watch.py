@@ -122,14 +122,23 @@ class _Slots:
         if self.c > self.m:
             minutes = np.where(np.isnan(self.first), 0.0, (t - self.first) / MINUTE)
             now = now + minutes[:, None] * errors[:, self.m :]
-        # clock errors shift a position by the distance travelled in them
-        clocks = _CLOCKS * (speed if self.fix_of == "p" else _BRAKING)
-        large = np.sum(now**2 / (self.typical_error**2 + clocks**2), axis=-1) > LARGE**2  # otherwise it is no fault
-        T = np.where(large, T, 0.0)
+        T = np.where(_are_large(now, self.typical_error, self.fix_of, speed), T, 0.0)
         if T.max() <= factor:
             return None
         # of about equally likely onsets the latest: it excludes least
         return float(np.max(self.first[T.max() - _ONSET / self.threshold <= T]))
+
+
+def is_large(error: Array, rows: Constraint, speed: float) -> bool:
+    """Whether an error (m,) of fixes is large at a speed (m/s) of the vehicle; otherwise it is no fault."""
+    return bool(_are_large(error, rows.compute_typical_error(), rows.fix_of, speed))
+
+
+def _are_large(errors: Array, typical: Array, fix_of: str, speed: float) -> Array:
+    """(...) of errors (..., m)."""
+    # clock errors shift a position by the distance travelled in them
+    clocks = _CLOCKS * (speed if fix_of == "p" else _BRAKING)
+    return np.asarray(np.sum(errors**2 / (typical**2 + clocks**2), axis=-1) > LARGE**2)
 
 
 def _list_slots(
