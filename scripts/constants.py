@@ -118,7 +118,7 @@ CONSTANTS = (
 )
 DERIVED = {
     "CHANCE": ("OUTLIER_COST", lambda x: -float(np.log(x))),
-    "FALSE_ALARM": ("_FAULT_COST", lambda x: -float(np.log(x))),
+    "FALSE_ALARM": ("FAULT_COST", lambda x: -float(np.log(x))),
 }
 
 
@@ -136,7 +136,7 @@ def changed(constant: Constant, value: Any) -> Iterator[None]:
     ]
     if constant.name in DERIVED:
         name, of = DERIVED[constant.name]
-        for module in [module for module in sys.modules if module.startswith(NOISE)]:
+        for module in [module for module in sys.modules if module.startswith("graphnav")]:
             place = vars(sys.modules[module])
             if name in place:
                 places.append((place, name, place[name], of(value)))

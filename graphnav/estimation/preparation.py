@@ -204,8 +204,13 @@ def _find_noise(
         if without is not built:
             built, total = without, found.estimate.passes
             found = replace(found, stated=built.problem)
+            rival = found.estimate.rival
             again = estimate_noise(found.base, built.aligned.until, found.estimate.noise, progress=progress)
-            found = replace(found, estimate=again).count(total + again.passes)
+            total = total + again.passes
+            if rival is not None:
+                rival = estimate_noise(found.base, built.aligned.until, rival.noise, progress=progress)
+                total = total + rival.passes
+            found = replace(found, estimate=replace(again, rival=rival)).count(total)
     found = revise_jointly(found, settings, built.aligned.until, progress)
     if found.freed:
         built, found = _start_anew(builder, built, found)

@@ -17,6 +17,7 @@ from graphnav.gnss.signals import GLONASS, SYSTEMS
 # of time; RINEX 4.01, table 2, in which GLO and UTC count leap seconds
 _SCALES = ("GPS", "GLO", "GAL", "BDT", "QZS", "IRN", "UTC")
 _MOST_TYPES = 200  # of a system; RINEX 4.01 has some 80
+_TYPES_LABEL = (b"SYS / # / OBS TYPES", b"# / TYPES OF OBSERV")  # of version 3, and of 2
 
 
 @dataclass
@@ -114,3 +115,27 @@ def read_rinex_header(lines: Lines, path: Path) -> Header:
             f"{path}: the header names {most} types of observations of a system, more than there are", key="rinex.types"
         )
     return out
+
+
+def check_types_stay(data: bytes, lines: Lines, header: Header, path: Path) -> None:
+    """Check that no header further on, of a file that was appended or in an event, names other types.
+
+    Raises
+    ------
+    RecordingError
+        If one does: the columns after it would be read as those of other types.
+    """
+    first = {lines.get_text(k).rstrip() for k in range(header.end)}
+    at, label = (
+        int(lines.start[header.end]) if header.end < len(lines) else len(data),
+        _TYPES_LABEL[header.version < 3.0],
+    )
+    while (at := data.find(label, at)) >= 0:
+        k = int(np.searchsorted(lines.start, at, side="right")) - 1
+        if (text := lines.get_text(k).rstrip()) not in first and text[60:].encode("latin-1") == label:
+            raise RecordingError(
+                f"{path}, line {k + 1}: the types of observations change here; make two files of it, each with its "
+                "header",
+                key="rinex.types_change",
+            )
+        at += len(label)

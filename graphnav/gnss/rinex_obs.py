@@ -20,7 +20,7 @@ from graphnav.core.notes import Note, format_count
 from graphnav.core.rotation import Array
 from graphnav.core.timescales import WEEK, utc_to_gps
 from graphnav.gnss.files import Lines, count_days, find_moved_points, note_cut, parse_numbers, unpack_bytes
-from graphnav.gnss.rinex_header import Header, read_rinex_header
+from graphnav.gnss.rinex_header import Header, check_types_stay, read_rinex_header
 from graphnav.gnss.series import Observations, drop_repeated
 from graphnav.gnss.signals import (
     BEIDOU,
@@ -40,7 +40,6 @@ for _k, _letter in enumerate(SYSTEMS):
     _SYSTEM_OF[ord(_letter)] = _k
 _KINDS = "CLDS"
 _AUXILIARY = "IXT"  # the ionosphere's phase, the receiver's channel, the Doppler shift of Transit
-_TYPES_LABEL = (b"SYS / # / OBS TYPES", b"# / TYPES OF OBSERV")  # of version 3, and of 2
 _FIELD_WIDTH = 16  # of a field: value F14.3, loss of lock I1, strength I1
 
 
@@ -72,7 +71,7 @@ def parse_observations(data: bytes, path: Path) -> Observations:
     """Parse the content of a RINEX file; `path` is only for messages."""
     lines = Lines(data)
     header = read_rinex_header(lines, path)
-    _check_types_stay(data, lines, header, path)
+    check_types_stay(data, lines, header, path)
     remarks: list[str] = []
     stamp, zero, flag, rows, cells = (_read_version_2 if header.version < 3.0 else _read_version_3)(
         lines, header, path, remarks
@@ -132,30 +131,6 @@ def parse_observations(data: bytes, path: Path) -> Observations:
             header.channels, header.marker, (str(path),), tuple(remarks),
         )
     )  # fmt: skip
-
-
-def _check_types_stay(data: bytes, lines: Lines, header: Header, path: Path) -> None:
-    """Check that no header further on, of a file that was appended or in an event, names other types.
-
-    Raises
-    ------
-    RecordingError
-        If one does: the columns after it would be read as those of other types.
-    """
-    first = {lines.get_text(k).rstrip() for k in range(header.end)}
-    at, label = (
-        int(lines.start[header.end]) if header.end < len(lines) else len(data),
-        _TYPES_LABEL[header.version < 3.0],
-    )
-    while (at := data.find(label, at)) >= 0:
-        k = int(np.searchsorted(lines.start, at, side="right")) - 1
-        if (text := lines.get_text(k).rstrip()) not in first and text[60:].encode("latin-1") == label:
-            raise RecordingError(
-                f"{path}, line {k + 1}: the types of observations change here; make two files of it, each with its "
-                "header",
-                key="rinex.types_change",
-            )
-        at += len(label)
 
 
 def _is_known_type(system: int, name: str) -> bool:

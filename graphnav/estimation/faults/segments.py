@@ -26,15 +26,13 @@ import numpy as np
 
 from graphnav.constraints.base import Constraint
 from graphnav.core.rotation import Array
-from graphnav.estimation.faults.watch import FALSE_ALARM, MINUTE, SIZES, is_large
+from graphnav.estimation.faults.watch import FAULT_COST, MINUTE, SIZES, is_large
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.ekf import refilter
 from graphnav.estimation.solvers.linearise import Points
 from graphnav.estimation.solvers.passes import ForwardRecord
 from graphnav.estimation.solvers.recursion import move_columns
 
-Span = tuple[float, float]
-_COST = -float(np.log(FALSE_ALARM))  # negative prior log-odds of a fault
 _BEAM = 8  # sets of segments that are followed: the likeliest single one need not be among the likeliest two
 
 
@@ -89,7 +87,7 @@ class _Runs:
         for number, kind in enumerate(self.kinds):
             A, y = np.eye(len(kind)) + info[:, kind[:, None], kind], score[:, kind]
             x = np.linalg.solve(A, y[..., None])[..., 0]
-            gain = 0.5 * np.sum(x * y, axis=1) - 0.5 * np.linalg.slogdet(A)[1] - _COST
+            gain = 0.5 * np.sum(x * y, axis=1) - 0.5 * np.linalg.slogdet(A)[1] - FAULT_COST
             out += [(float(gain[i]), int(j[i]), number) for i in np.argsort(-gain)[:_BEAM] if gain[i] > 0.0]
         return sorted(out, reverse=True)[:_BEAM]
 
@@ -121,7 +119,9 @@ class _Runs:
         return out
 
 
-def find_wrong_segments(problem: Problem, about: Points, edges: Sequence[float], names: Collection[str]) -> list[Span]:
+def find_wrong_segments(
+    problem: Problem, about: Points, edges: Sequence[float], names: Collection[str]
+) -> list[tuple[float, float]]:
     """The segments of fixes that are wrong by the evidence: first and last fix of each run of them, s.
 
     Parameters
@@ -134,7 +134,7 @@ def find_wrong_segments(problem: Problem, about: Points, edges: Sequence[float],
     fixes = [rows for rows in problem.constraints if rows.name in names]
     begins, m = np.array(edges), len(fixes[0].axes)
     runs = _Runs(begins, [rows.unit for rows in fixes], m)
-    none = best = _Set(frozenset(), 0.0, *_respond(problem, refilter(problem, about), fixes, begins))
+    none = best = _Set(frozenset(), 0.0, *_respond(problem, refilter(problem, about, whole=False), fixes, begins))
     beam = [best]
     while beam:
         more: dict[frozenset[tuple[int, int]], _Set] = {}

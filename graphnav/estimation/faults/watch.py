@@ -50,6 +50,7 @@ _CLOCKS = 0.05  # s, by which the stamps of IMU and receiver may disagree
 _BRAKING = 3.0  # m/s^2, of a usual manoeuvre
 _ONSET = float(chdtri(1, 0.05))  # of T, by which an onset may be less likely than the most likely one: 95 %
 FALSE_ALARM = 1e-7  # per test: one drive in a hundred of an hour, if errors were Gaussian
+FAULT_COST = -float(np.log(FALSE_ALARM))  # negative prior log-odds of a fault
 SIZES = {"m": 100.0, "m/s": 10.0}  # multipath errors in a city reach a hundred metres; wheel errors their speed
 MINUTE = 60.0  # s, in which an error may grow to its prior size
 _MEMORY = 64  # keyframes with fixes for which the state of the tests is kept

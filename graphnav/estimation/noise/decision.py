@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from graphnav.estimation.faults.watch import FALSE_ALARM
+from graphnav.estimation.faults.watch import FAULT_COST
 from graphnav.estimation.noise.apply import apply_noise, apply_weights
 from graphnav.estimation.noise.estimate import NoiseEstimate
 from graphnav.estimation.noise.explanations import (
@@ -27,7 +27,6 @@ from graphnav.estimation.noise.spans import Span, drop_within, extend_to_next_fi
 from graphnav.estimation.problem import Problem
 
 _BY_ROWS = INTERVALS, ROWS  # explanations by outliers, for which nothing is left out
-_FAULT_COST = -float(np.log(FALSE_ALARM))  # negative prior log-odds of a fault
 
 
 @dataclass(frozen=True)
@@ -88,7 +87,7 @@ def explain(
     total = before + found.log_prior
     dropped: dict[str, list[Span]] = {name: [] for name in noise.weights}
     for k, span in enumerate(spans):
-        cost = np.array([0.0 if not kinds or kinds in _BY_ROWS else _FAULT_COST for kinds in EXPLANATIONS])
+        cost = np.array([0.0 if not kinds or kinds in _BY_ROWS else FAULT_COST for kinds in EXPLANATIONS])
         for kinds, more in outliers.items():
             cost[EXPLANATIONS.index(kinds)] += more[k] if more[k] or kinds not in _BY_ROWS else np.inf
         posterior = likelihood[k] - cost

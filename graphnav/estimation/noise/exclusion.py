@@ -50,11 +50,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from graphnav.constraints.base import SAME_TIME
-from graphnav.core.rotation import Array
-from graphnav.estimation.faults.excluded import find_fault_spans, weigh_rows
-from graphnav.estimation.faults.segments import find_wrong_segments
-from graphnav.estimation.faults.watch import FALSE_ALARM, PATIENCE, SIZES
+from graphnav.estimation.faults.watch import FALSE_ALARM
 from graphnav.estimation.noise.apply import apply_noise, select_weights
 from graphnav.estimation.noise.decision import (
     Decision,
@@ -66,8 +62,7 @@ from graphnav.estimation.noise.decision import (
 from graphnav.estimation.noise.estimate import NoiseEstimate, estimate_noise
 from graphnav.estimation.noise.explanations import FIXES, ROWS
 from graphnav.estimation.noise.initial_points import BREAKDOWN
-from graphnav.estimation.noise.model import INTERVALS, NoiseModel, RowWeights
-from graphnav.estimation.noise.moments import collect_row_moments, predict_errors
+from graphnav.estimation.noise.model import NoiseModel, RowWeights
 from graphnav.estimation.noise.outliers import (
     limit_squares,
 )
@@ -77,18 +72,23 @@ from graphnav.estimation.noise.spans import (
     are_covered,
     drop_within,
     join,
-    join_faults,
     list_before,
     list_distinct,
     list_repeats,
     mask_times,
     split_at_repeats,
-    split_at_steps,
     sum_lengths,
     trim,
 )
+from graphnav.estimation.noise.suspects import (
+    cut_at_steps,
+    find_disagreements,
+    find_segments,
+    find_suspects,
+    list_fix_times,
+    predict_left_out,
+)
 from graphnav.estimation.problem import Problem
-from graphnav.estimation.solvers.ekf import refilter
 from graphnav.recording import Recording
 
 _REFINEMENTS = 2  # estimates without masked spans: the first trims the spans, the second is free of what is wrong
@@ -177,29 +177,7 @@ def _estimate_without(
 def _list_before(base: Problem, noise: NoiseModel) -> list[Span]:
     """Spans of fixes before those that a noise model leaves out."""
     excluded = join(span for kind in FIXES for span in noise.excluded.get(kind, ()))
-    return list_before(excluded, _list_fix_times(base)) if excluded else []
-
-
-def _find_segments(base: Problem, found: NoiseEstimate, suspected: list[Span]) -> list[Span]:
-    """Wrong segments, of those into which the ends of suspected spans divide the drive.
-
-    None unless one of them outlasts the tests, of which the spans are otherwise.
-    """
-    within = join(suspected)
-    if len(within) < 2:
-        return []
-    t = _list_fix_times(base)
-    behind = np.searchsorted(t, [end + SAME_TIME for _, end in suspected])
-    edges = sorted({*(begin for begin, _ in suspected), *t[behind[behind < len(t)]].tolist()})
-    used = apply_noise(base, replace(found.noise, excluded={}))
-    segments = find_wrong_segments(used, found.carry_points(base, used), edges, FIXES)
-    outlasting = (one for one in segments if one[1] - one[0] > PATIENCE and not are_covered([one], within))
-    return segments if any(outlasting) else []
-
-
-def _list_fix_times(base: Problem) -> Array:
-    """(N,) s, in order."""
-    return base.t[np.unique(np.concatenate([c.keyframe for c in base.constraints if c.name in FIXES]))]
+    return list_before(excluded, list_fix_times(base)) if excluded else []
 
 
 def decide_faults(base: Problem, found: NoiseEstimate) -> Decision:
@@ -212,14 +190,15 @@ def decide_faults(base: Problem, found: NoiseEstimate) -> Decision:
     """
     suspects = find_suspects(base, found.noise, found)
     first = explain(base, found, suspects)
-    if segments := _find_segments(base, found, suspects):
+    segments, spent = find_segments(base, found, suspects)
+    passes = first.passes + Counter(filter=spent)
+    if segments:
         other = explain(base, found, segments)
-        passes = first.passes + other.passes + Counter(filter=1)
+        passes = passes + other.passes
         first = replace(other, rival=first) if other.log_evidence > first.log_evidence else first
-        first = replace(first, passes=passes)
     medians = {name: replace(figure, log_factor=figure.prior) for name, figure in found.noise.figures.items()}
-    masked = _find_disagreements(base, NoiseModel(medians), found)
-    first = replace(first, passes=first.passes + Counter(filter=2))
+    masked = find_disagreements(base, NoiseModel(medians), found)
+    first = replace(first, passes=passes + Counter(filter=2))
     excluded = join(span for kind in FIXES for span in first.noise.excluded.get(kind, ()))
     # the figures found also rest on repeated fixes, which may be wrong
     wrong = any(are_covered([span], excluded) for span in list_repeats(base.recording))
@@ -242,19 +221,19 @@ def _unmask(base: Problem, found: NoiseEstimate, first: Decision, masked: list[S
     for _ in range(_REFINEMENTS):
         estimate = estimate_noise(base, None, start, estimate.get_linearisation(base), changed=True)
         used = apply_noise(base, estimate.noise)
-        errors = _predict_left_out(used, estimate)
+        errors = predict_left_out(used, estimate)
         detected = find_suspects(base, replace(estimate.noise, excluded={}), estimate)
         passes = passes + estimate.passes + Counter(filter=1)
         spans, refined = trim(spans, errors), trim(detected, errors)
         # a slow onset is dated better by the tests, an abrupt end by the errors of single fixes
-        segments = _find_segments(base, estimate, [*detected, *refined])
-        passes = passes + Counter(filter=1 if segments else 0)
+        segments, spent = find_segments(base, estimate, [*detected, *refined])
+        passes = passes + Counter(filter=spent)
         for some in [*list_distinct(spans, trim(spans, errors, FALSE_ALARM), detected), segments]:
             if not some:
                 continue
             candidate = explain(base, _add_outliers(estimate, errors, some), some)
             passes = passes + candidate.passes
-            cut = _cut_at_steps(some, candidate.noise, used, estimate)
+            cut = cut_at_steps(some, candidate.noise, used, estimate)
             if cut != some:
                 among = {*list_explanations(candidate.noise), ROWS}  # its pieces are wrong the same way, or not at all
                 finer = explain(base, _add_outliers(estimate, errors, cut), cut, among)
@@ -284,7 +263,7 @@ def _unmask(base: Problem, found: NoiseEstimate, first: Decision, masked: list[S
 def _readmit(base: Problem, found: NoiseEstimate) -> NoiseEstimate:
     """Use measurements at the ends of excluded spans again that agree with the rest, if that increases the evidence."""
     spans = join(span for some in found.noise.excluded.values() for span in some)
-    errors = _predict_left_out(apply_noise(base, found.noise), found)
+    errors = predict_left_out(apply_noise(base, found.noise), found)
     narrow = trim(spans, errors, FALSE_ALARM)
     if not narrow or narrow == spans:
         return found
@@ -336,47 +315,6 @@ def _disturb_intervals(base: Problem, found: NoiseEstimate) -> NoiseEstimate:
     disturbed = weigh_evidence(base, estimate_noise(base, None, start, near, intervals=True))
     best = max(found, disturbed, key=lambda one: log_evidence(base, one))
     return replace(best, passes=passes + disturbed.passes)
-
-
-def find_suspects(base: Problem, noise: NoiseModel, found: NoiseEstimate) -> list[Span]:
-    """Spans (s) in which fixes may be wrong: those that the tests find, and those in which a receiver repeats itself.
-
-    Parameters
-    ----------
-    noise : by which the tests are made; its figures need not be those found.
-    found : with the points to linearise at.
-    """
-    return split_at_repeats(_find_disagreements(base, noise, found), base.recording)
-
-
-def _find_disagreements(base: Problem, noise: NoiseModel, found: NoiseEstimate) -> list[Span]:
-    """Spans (s) in which the tests find fixes in disagreement with everything else."""
-    # weights of fixes and of IMU intervals may hide a fault from the tests
-    kept = {name: some for name, some in noise.weights.items() if name not in (*FIXES, *INTERVALS)}
-    tested = apply_noise(base, replace(noise, weights=kept))
-    weights = refilter(tested, found.carry_points(base, tested), watch=True, whole=False).weights
-    return join_faults(find_fault_spans(weigh_rows(tested, weights)))
-
-
-def _predict_left_out(problem: Problem, found: NoiseEstimate) -> LeftOutErrors:
-    """Squared errors of all fixes, each predicted without itself."""
-    fixes = (rows for rows in problem.constraints if rows.name in FIXES)
-    return {
-        c.name: (problem.t[c.keyframe], collect_row_moments(problem, c, found.points, len(c)).left_out, len(c.axes))
-        for c in fixes
-    }
-
-
-def _cut_at_steps(spans: list[Span], decided: NoiseModel, problem: Problem, found: NoiseEstimate) -> list[Span]:
-    """Spans cut where the errors of positions have steps, if as a whole they are decided to be wrong."""
-    rows = next((c for c in problem.constraints if c.name == FIXES[0]), None)
-    wrong = decided.excluded.get(FIXES[0], ())
-    if rows is None or not wrong:
-        return spans
-    error, sigma = predict_errors(problem, rows, found.points)
-    cost = float(np.median(np.sum(np.log1p(SIZES[rows.unit] / sigma), axis=1)) - np.log(FALSE_ALARM))
-    cut = split_at_steps([span for span in spans if span in wrong], problem.t[rows.keyframe], error, sigma, cost)
-    return sorted([*cut, *(span for span in spans if span not in wrong)])
 
 
 def _add_outliers(found: NoiseEstimate, errors: LeftOutErrors, spans: list[Span]) -> NoiseEstimate:

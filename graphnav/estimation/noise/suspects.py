@@ -1,0 +1,92 @@
+"""Spans of fixes that are suspected, and how they are dated; `graphnav.estimation.noise.exclusion` decides on them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from graphnav.constraints.base import SAME_TIME
+from graphnav.core.rotation import Array
+from graphnav.estimation.faults.excluded import find_fault_spans, weigh_rows
+from graphnav.estimation.faults.segments import find_wrong_segments
+from graphnav.estimation.faults.watch import FAULT_COST, PATIENCE, SIZES
+from graphnav.estimation.noise.apply import apply_noise
+from graphnav.estimation.noise.estimate import NoiseEstimate
+from graphnav.estimation.noise.explanations import FIXES
+from graphnav.estimation.noise.model import INTERVALS, NoiseModel
+from graphnav.estimation.noise.moments import collect_row_moments, predict_errors
+from graphnav.estimation.noise.spans import (
+    LeftOutErrors,
+    Span,
+    are_covered,
+    join,
+    join_faults,
+    split_at_repeats,
+    split_at_steps,
+)
+from graphnav.estimation.problem import Problem
+from graphnav.estimation.solvers.ekf import refilter
+
+
+def find_suspects(base: Problem, noise: NoiseModel, found: NoiseEstimate) -> list[Span]:
+    """Spans (s) in which fixes may be wrong: those that the tests find, and those in which a receiver repeats itself.
+
+    Parameters
+    ----------
+    noise : by which the tests are made; its figures need not be those found.
+    found : with the points to linearise at.
+    """
+    return split_at_repeats(find_disagreements(base, noise, found), base.recording)
+
+
+def find_disagreements(base: Problem, noise: NoiseModel, found: NoiseEstimate) -> list[Span]:
+    """Spans (s) in which the tests find fixes in disagreement with everything else."""
+    # weights of fixes and of IMU intervals may hide a fault from the tests
+    kept = {name: some for name, some in noise.weights.items() if name not in (*FIXES, *INTERVALS)}
+    tested = apply_noise(base, replace(noise, weights=kept))
+    weights = refilter(tested, found.carry_points(base, tested), watch=True, whole=False).weights
+    return join_faults(find_fault_spans(weigh_rows(tested, weights)))
+
+
+def find_segments(base: Problem, found: NoiseEstimate, suspected: list[Span]) -> tuple[list[Span], int]:
+    """Wrong segments, of those into which the ends of suspected spans divide the drive, and filter passes that it took.
+
+    None unless one of them outlasts the tests, of which the spans are otherwise.
+    """
+    within = join(suspected)
+    if len(within) < 2:
+        return [], 0
+    t = list_fix_times(base)
+    behind = np.searchsorted(t, [end + SAME_TIME for _, end in suspected])
+    edges = sorted({*(begin for begin, _ in suspected), *t[behind[behind < len(t)]].tolist()})
+    used = apply_noise(base, replace(found.noise, excluded={}))
+    segments = find_wrong_segments(used, found.carry_points(base, used), edges, FIXES)
+    outlasting = (one for one in segments if one[1] - one[0] > PATIENCE and not are_covered([one], within))
+    return segments if any(outlasting) else [], 1
+
+
+def predict_left_out(problem: Problem, found: NoiseEstimate) -> LeftOutErrors:
+    """Squared errors of all fixes, each predicted without itself."""
+    fixes = (rows for rows in problem.constraints if rows.name in FIXES)
+    return {
+        c.name: (problem.t[c.keyframe], collect_row_moments(problem, c, found.points, len(c)).left_out, len(c.axes))
+        for c in fixes
+    }
+
+
+def cut_at_steps(spans: list[Span], decided: NoiseModel, problem: Problem, found: NoiseEstimate) -> list[Span]:
+    """Spans cut where the errors of positions have steps, if as a whole they are decided to be wrong."""
+    rows = next((c for c in problem.constraints if c.name == FIXES[0]), None)
+    wrong = decided.excluded.get(FIXES[0], ())
+    if rows is None or not wrong:
+        return spans
+    error, sigma = predict_errors(problem, rows, found.points)
+    cost = float(np.median(np.sum(np.log1p(SIZES[rows.unit] / sigma), axis=1)) + FAULT_COST)
+    cut = split_at_steps([span for span in spans if span in wrong], problem.t[rows.keyframe], error, sigma, cost)
+    return sorted([*cut, *(span for span in spans if span not in wrong)])
+
+
+def list_fix_times(base: Problem) -> Array:
+    """(N,) s, in order."""
+    return base.t[np.unique(np.concatenate([c.keyframe for c in base.constraints if c.name in FIXES]))]
