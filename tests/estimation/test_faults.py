@@ -10,6 +10,7 @@ import numpy as np
 import oracle
 import pytest
 from helpers import refused
+from scipy.special import chdtri
 
 from graphnav.config import Settings, parse_settings
 from graphnav.core.earth import LocalFrame
@@ -27,7 +28,14 @@ from graphnav.estimation.faults.watch import FALSE_ALARM, MINUTE, Bank
 from graphnav.estimation.noise.decision import log_evidence, weigh_evidence
 from graphnav.estimation.noise.estimate import estimate_noise
 from graphnav.estimation.noise.exclusion import estimate_disturbed_intervals, estimate_without_faults
-from graphnav.estimation.noise.explanations import add_common_errors
+from graphnav.estimation.noise.explanations import (
+    EXPLANATIONS,
+    ErrorSizes,
+    PriorCosts,
+    add_common_errors,
+    compute_evidence,
+)
+from graphnav.estimation.noise.outliers import CHANCE, OUTLIER_COST
 from graphnav.estimation.noise.spans import list_before, split_at_steps
 from graphnav.estimation.pipeline import choose_origin, run
 from graphnav.estimation.problem import Problem, build_problem
@@ -261,11 +269,11 @@ def test_evidence_of_segments_is_that_of_filters_with_their_errors(built: Proble
     def evaluate(*spans: tuple[float, float]) -> float:
         other = add_common_errors(problem, sorted(spans), (rows.name,))
         points = make_points(other, about.states, split_values(problem, about))
-        return float(Comparison(problem, about).log_likelihood(other, points, (rows.name,)).sum())
+        return float(Comparison(problem, about).filter(other, points, (rows.name,)).log_likelihood().sum())
 
     runs = _Runs(begins, [rows.unit], 3)
     one = _Set(frozenset(), 0.0, *_respond(problem, refilter(problem, about), [wrong], begins))
-    usual, chosen = float(Comparison(problem, about).log_likelihood(problem, about).sum()), []
+    usual, chosen = float(Comparison(problem, about).filter(problem, about).log_likelihood().sum()), []
     for _ in range(2):
         better = runs.list_better(one)
         assert better
@@ -276,6 +284,31 @@ def test_evidence_of_segments_is_that_of_filters_with_their_errors(built: Proble
         chosen.append((begins[runs.first[j]], begins[runs.behind[j]] - 0.01))
         usual, one = evaluate(*chosen), runs.add(one, gain, j, kind)
     assert find_wrong_segments(problem, about, begins.tolist(), [rows.name]) == [(83.0, 199.0), (260.0, 319.0)]
+
+
+def test_evidence_of_a_common_error_with_outliers_besides(built: Problem) -> None:
+    """Two rows that are far off besides: they cost what outliers cost, and not the whole of their squared errors."""
+    about = ekf(built)
+    rows = next(c for c in built.constraints if c.name == "gnss_position")
+    span = (83.0, 199.0)
+    t = built.t[rows.keyframe]
+    off, further = np.zeros((len(t), 3)), np.zeros((len(t), 3))
+    off[(t >= span[0]) & (t <= span[1])] = [1.2, -0.9, 0.3]
+    further[np.searchsorted(t, [110.0, 150.0])] = [[40.0, 0.0, -20.0], [0.0, -60.0, 10.0]]
+    costs = PriorCosts(np.zeros((1, len(EXPLANATIONS))), {c.name: OUTLIER_COST for c in built.constraints})
+    sizes = ErrorSizes({rows.name: np.array([100.0])}, {rows.name: np.zeros(1)})
+    evidence = []
+    for more in (off, off + further):
+        wrong = replace(rows, p_n=rows.p_n + more)
+        problem = replace(built, constraints=tuple(wrong if c is rows else c for c in built.constraints))
+        evidence.append(compute_evidence(problem, about, [span], {}, sizes, costs)[1][0])
+    position = EXPLANATIONS.index((rows.name,))
+    assert all(np.argmax(one) == position for one in evidence)
+    # the limit, by half, the logarithm of the weight, and the cost
+    squared = np.sum((further[further.any(axis=1)] / rows.sigma[0]) ** 2, axis=1)
+    most = chdtri(3, CHANCE)
+    each = 0.5 * most + 1.5 * np.log(squared / most) + OUTLIER_COST
+    assert evidence[0][position] - evidence[1][position] == pytest.approx(np.sum(each), rel=0.2)
 
 
 def test_split_at_steps() -> None:
@@ -319,6 +352,23 @@ def test_positions_and_velocities_that_drift_together() -> None:
     out = left_out(found, recording)
     assert out[wrong].mean() > 0.99
     assert out[~wrong].mean() < 0.01
+
+
+def test_a_drift_is_dated_to_the_fix(shared_data: Path) -> None:
+    """Of positions and velocities, while nothing but a car's IMU contradicts it."""
+    recording = read(shared_data / "boulder_drive_20250708").crop(100.0, 400.0)
+    assert recording.gnss is not None
+    t, rate = recording.gnss.t - recording.start, np.array([0.5, 0.5, 0.0])
+    bad = (t > 100.0) & (t <= 200.0)
+    wrong = moved(recording, bad, np.outer(t[bad] - 100.0, rate))
+    assert wrong.gnss is not None
+    assert wrong.gnss.v is not None
+    faster = (wrong.gnss.velocity_t - recording.start > 100.0) & (wrong.gnss.velocity_t - recording.start <= 200.0)
+    wrong = replace(wrong, gnss=replace(wrong.gnss, v=wrong.gnss.v + np.outer(faster, rate)))
+    found = run(wrong, parse_settings({"vehicle": {"nhc": False}}), ("rts",))["rts"]
+    out = left_out(found, wrong)
+    assert out[bad].mean() > 0.99
+    assert not out[~bad].any()
 
 
 # ---------------------------------------------------------------------------------------------------------- noise

@@ -18,11 +18,18 @@ from graphnav.estimation.noise.explanations import (
     ROWS,
     WHEELS,
     Explanation,
+    PriorCosts,
     compute_evidence,
     measure_sizes,
 )
 from graphnav.estimation.noise.model import INTERVALS, NoiseModel, RowWeights
-from graphnav.estimation.noise.outliers import compute_latest_cost, compute_outlier_cost, count_reduced, count_rows
+from graphnav.estimation.noise.outliers import (
+    OUTLIER_COST,
+    compute_latest_cost,
+    compute_outlier_cost,
+    count_reduced,
+    count_rows,
+)
 from graphnav.estimation.noise.spans import Span, drop_within, extend_to_next_fix, join
 from graphnav.estimation.problem import Problem
 
@@ -82,17 +89,19 @@ def explain(
     if INTERVALS in among:
         weighted[INTERVALS] = apply_noise(base, replace(noise, weights=outside | inside[INTERVALS]))
     sizes = measure_sizes(base, apply_noise(base, found.noise), found.points, spans)
-    before, likelihood, passes = compute_evidence(used, found.carry_points(base, used), spans, weighted, sizes, among)
+    cost = np.zeros((len(spans), len(EXPLANATIONS)))
+    cost[:, [bool(kinds) and kinds not in _BY_ROWS for kinds in EXPLANATIONS]] = FAULT_COST
+    for kinds, more in outliers.items():
+        some = np.array(more)
+        cost[:, EXPLANATIONS.index(kinds)] += np.where((some > 0.0) | (kinds not in _BY_ROWS), some, np.inf)
+    about, costs = found.carry_points(base, used), PriorCosts(cost, dict.fromkeys(totals, OUTLIER_COST) | each)
+    before, posterior, passes = compute_evidence(used, about, spans, weighted, sizes, costs, among)
     excluded: dict[str, tuple[Span, ...]] = {}
     total = before + found.log_prior
     dropped: dict[str, list[Span]] = {name: [] for name in noise.weights}
     for k, span in enumerate(spans):
-        cost = np.array([0.0 if not kinds or kinds in _BY_ROWS else FAULT_COST for kinds in EXPLANATIONS])
-        for kinds, more in outliers.items():
-            cost[EXPLANATIONS.index(kinds)] += more[k] if more[k] or kinds not in _BY_ROWS else np.inf
-        posterior = likelihood[k] - cost
-        best = EXPLANATIONS[int(np.argmax(posterior))]
-        total += float(np.max(posterior))
+        best = EXPLANATIONS[int(np.argmax(posterior[k]))]
+        total += float(np.max(posterior[k]))
         for name in noise.weights.keys() - inside.get(best, {}).keys():
             dropped[name].append(reach[k] if name in INTERVALS else span)
         if best not in _BY_ROWS:

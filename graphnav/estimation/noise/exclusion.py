@@ -50,7 +50,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from graphnav.estimation.faults.watch import FALSE_ALARM
+from graphnav.estimation.faults.watch import FALSE_ALARM, PATIENCE
 from graphnav.estimation.noise.apply import apply_noise, select_weights
 from graphnav.estimation.noise.decision import (
     Decision,
@@ -82,6 +82,7 @@ from graphnav.estimation.noise.spans import (
 )
 from graphnav.estimation.noise.suspects import (
     cut_at_steps,
+    date_segments,
     find_disagreements,
     find_segments,
     find_suspects,
@@ -264,15 +265,20 @@ def _readmit(base: Problem, found: NoiseEstimate) -> NoiseEstimate:
     """Use measurements at the ends of excluded spans again that agree with the rest, if that increases the evidence."""
     spans = join(span for some in found.noise.excluded.values() for span in some)
     errors = predict_left_out(apply_noise(base, found.noise), found)
-    narrow = trim(spans, errors, FALSE_ALARM)
-    if not narrow or narrow == spans:
-        return found
-    among = list_explanations(found.noise)
-    wide, less = (explain(base, _add_outliers(found, errors, some), some, among) for some in (spans, narrow))
-    passes = found.passes + wide.passes + less.passes
-    if less.log_evidence <= wide.log_evidence:
+    narrow, dated, passes = trim(spans, errors, FALSE_ALARM), list[Span](), found.passes
+    if any(end - begin > PATIENCE for begin, end in spans):
+        dated = date_segments(base, found, spans)
+        passes = passes + Counter(filter=1)
+    candidates = list_distinct(spans, narrow, dated)
+    if len(candidates) == 1:
         return replace(found, passes=passes)
-    again = estimate_noise(base, None, less.noise, found.get_linearisation(base))
+    among = list_explanations(found.noise)
+    decisions = [explain(base, _add_outliers(found, errors, some), some, among) for some in candidates]
+    passes = sum((one.passes for one in decisions), passes)
+    best = max(decisions, key=lambda one: one.log_evidence)
+    if best is decisions[0]:
+        return replace(found, passes=passes)
+    again = estimate_noise(base, None, best.noise, found.get_linearisation(base))
     return replace(again, passes=passes + again.passes)
 
 

@@ -8,21 +8,23 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.special import ndtri  # scipy.stats would take half a second to import
+from scipy.special import chdtri, ndtri  # scipy.stats would take half a second to import
 
 from graphnav.config import Settings
 from graphnav.constraints.base import SAME_TIME, BuildContext, Constraint, Linearized
 from graphnav.core.rotation import Array
 from graphnav.core.state import Parameter, States
-from graphnav.estimation.faults.watch import LARGE, MINUTE, SIZES
+from graphnav.estimation.faults.watch import FAULT_COST, LARGE, MINUTE, SIZES
 from graphnav.estimation.noise.model import INTERVALS
-from graphnav.estimation.noise.moments import predict_errors
-from graphnav.estimation.noise.outliers import CHANCE
+from graphnav.estimation.noise.moments import collect_row_moments, predict_errors
+from graphnav.estimation.noise.outliers import CHANCE, limit_squares
 from graphnav.estimation.noise.spans import Span, mask_times
 from graphnav.estimation.problem import Problem
-from graphnav.estimation.solvers.ekf import Comparison
+from graphnav.estimation.solvers.ekf import Comparison, refilter
 from graphnav.estimation.solvers.linearise import Points
 from graphnav.estimation.solvers.passes import DisturbancePass, make_points, split_values
+from graphnav.estimation.solvers.rts import smooth_moments
+from graphnav.estimation.solvers.stack import Stack
 from graphnav.recording import Recording
 
 FIXES, WHEELS = ("gnss_position", "gnss_velocity"), ("nhc", "odometer")
@@ -165,15 +167,27 @@ def add_own_errors(problem: Problem, spans: list[Span], kinds: Explanation, size
     return replace(problem, constraints=tuple(widen(rows) for rows in problem.constraints))
 
 
+@dataclass(frozen=True)
+class PriorCosts:
+    """Negative log-probabilities, before the measurements are known."""
+
+    explanations: Array  # (M, len(EXPLANATIONS)) of each in each span
+    outlier: Mapping[str, float]  # of one more outlier, by constraint
+
+
 def compute_evidence(
     problem: Problem,
     about: Points,
     spans: list[Span],
     weighted: Mapping[Explanation, Problem],
     sizes: ErrorSizes,
+    costs: PriorCosts,
     among: Collection[Explanation] = EXPLANATIONS,
 ) -> tuple[float, Array, int]:
-    """Log-likelihoods of the innovations by each explanation.
+    """Log-probabilities of explanations, up to a constant, from the likelihoods of the innovations.
+
+    Measurements with an error in common may have outliers besides, whose weights are found by a smoother with that
+    error; where the innovations show that these could decide.
 
     Parameters
     ----------
@@ -187,7 +201,7 @@ def compute_evidence(
     Returns
     -------
     float
-        Before the first span.
+        Log-likelihood before the first span.
     Array
         (M, len(EXPLANATIONS)) from the start of each span to the start of the next.
     int
@@ -195,28 +209,73 @@ def compute_evidence(
     """
     edges = np.append(np.searchsorted(problem.t, [a - SAME_TIME for a, _ in spans]), len(problem.t))
     known = split_values(problem, about)
-    found: list[Array] = []
+    posterior = np.full((len(spans), len(EXPLANATIONS)), -np.inf)
+    common: list[tuple[int, Problem, Array, Array]] = []
     before, passes = 0.0, 0
     present = {rows.name for rows in problem.constraints}
     comparison = Comparison(problem, about)
-    for kinds in EXPLANATIONS:
+
+    def evaluate(one: Problem, anew: Explanation) -> tuple[Stack, Array]:
+        nonlocal passes
+        passes += 1
+        stack = comparison.filter(one, make_points(one, about.states, known), anew)
+        return stack, stack.log_likelihood()
+
+    def sum_spans(each: Array) -> Array:
+        return np.array([float(np.sum(each[a:b])) for a, b in itertools.pairwise(edges)])
+
+    for j, kinds in enumerate(EXPLANATIONS):
         possible = present & set(kinds) if kinds == WHEELS else kinds in (INTERVALS, ROWS) or present.issuperset(kinds)
         if not possible or (kinds and kinds not in among):
-            found.append(np.full(len(spans), -np.inf))
             continue
-        base = weighted.get(kinds, problem)
-        none = np.zeros(len(spans))
-        models: list[tuple[Problem, Explanation, Array]] = [(base, (), none)]
-        if kinds and kinds not in (INTERVALS, ROWS):
-            models = [(add_common_errors(base, spans, kinds), kinds, none)]
-        if kinds and set(kinds) <= set(FIXES):
-            cost = np.sum([sizes.cost[name] for name in kinds], axis=0)
-            models.append((add_own_errors(base, spans, kinds, sizes), (), cost))
-        each = []
-        for one, anew, cost in models:
-            likelihood = comparison.log_likelihood(one, make_points(one, about.states, known), anew)
-            passes += 1
+        base, cost = weighted.get(kinds, problem), costs.explanations[:, j]
+        if not kinds or kinds in (INTERVALS, ROWS):
+            likelihood = evaluate(base, ())[1]
+            posterior[:, j] = sum_spans(likelihood) - cost
             before = float(np.sum(likelihood[: edges[0]])) if not kinds else before
-            each.append([float(np.sum(likelihood[a:b])) for a, b in itertools.pairwise(edges)] - cost)
-        found.append(np.max(each, axis=0))
-    return before, np.array(found).T, passes
+            continue
+        one = add_common_errors(base, spans, kinds)
+        stack, likelihood = evaluate(one, kinds)
+        posterior[:, j] = value = sum_spans(likelihood) - cost
+        common.append((j, one, value, sum_spans(_bound_gain(stack))))
+        if set(kinds) <= set(FIXES):
+            value = sum_spans(evaluate(add_own_errors(base, spans, kinds, sizes), ())[1]) - cost
+            posterior[:, j] = np.maximum(posterior[:, j], value - np.sum([sizes.cost[n] for n in kinds], axis=0))
+    for j, one, value, gain in common:
+        kinds, gained = EXPLANATIONS[j], gain > FAULT_COST
+        while np.any(gained & (value + gain > np.max(posterior, axis=1))):
+            one, outliers = _weigh_outliers(one, make_points(one, about.states, known), spans, kinds)
+            passes += 1
+            previous, value = value, sum_spans(evaluate(one, kinds)[1]) - costs.explanations[:, j]
+            value = value - np.sum([costs.outlier[name] * n for name, n in outliers.items()], axis=0)
+            posterior[:, j] = np.maximum(posterior[:, j], value)
+            gain = value - previous  # each time less is gained
+            gained = gain > FAULT_COST
+    return before, posterior, passes
+
+
+def _bound_gain(stack: Stack) -> Array:
+    """(K,) by which the log-likelihood rises at each keyframe if what exceeds the limit of chance is due to outliers, of
+    which some may have been earlier.
+    """
+    squared, count = stack.sum_squares()
+    return 0.5 * np.maximum(squared - chdtri(np.maximum(count, 1), CHANCE), 0.0)
+
+
+def _weigh_outliers(
+    problem: Problem, about: Points, spans: list[Span], kinds: Explanation
+) -> tuple[Problem, dict[str, Array]]:
+    """The problem with weights for outliers among the rows of some constraints in spans, and how many (M,) each has."""
+    smoothed = smooth_moments(problem, refilter(problem, about, whole=False))
+    count: dict[str, Array] = {}
+    weighted = []
+    for rows in problem.constraints:
+        if rows.name in kinds:
+            t = problem.t[rows.keyframe]
+            left_out = collect_row_moments(problem, rows, smoothed, len(rows)).left_out
+            weight = np.ones(len(rows)) if rows.weight is None else rows.weight
+            weight = np.where(mask_times(t, spans), limit_squares(left_out, len(rows.axes)), weight)
+            count[rows.name] = np.array([np.sum(weight[mask_times(t, [span])] < 1.0) for span in spans])
+            rows = replace(rows, weight=weight)
+        weighted.append(rows)
+    return replace(problem, constraints=tuple(weighted)), count

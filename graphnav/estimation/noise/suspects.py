@@ -28,6 +28,8 @@ from graphnav.estimation.noise.spans import (
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.ekf import refilter
 
+_STEPS = 8  # fixes, by which the ends of spans are varied
+
 
 def find_suspects(base: Problem, noise: NoiseModel, found: NoiseEstimate) -> list[Span]:
     """Spans (s) in which fixes may be wrong: those that the tests find, and those in which a receiver repeats itself.
@@ -64,6 +66,22 @@ def find_segments(base: Problem, found: NoiseEstimate, suspected: list[Span]) ->
     segments = find_wrong_segments(used, found.carry_points(base, used), edges, FIXES)
     outlasting = (one for one in segments if one[1] - one[0] > PATIENCE and not are_covered([one], within))
     return segments if any(outlasting) else [], 1
+
+
+def date_segments(base: Problem, found: NoiseEstimate, spans: list[Span]) -> list[Span]:
+    """Wrong segments near some spans, dated to the fix: the errors in them have an onset that each single one has not.
+
+    Parameters
+    ----------
+    found : without the spans.
+    """
+    t, edges = list_fix_times(base), set[int]()
+    for begin, end in spans:
+        steps = _STEPS if end - begin > PATIENCE else 0  # a short one is left out whole
+        for at in np.searchsorted(t, [begin - SAME_TIME, end + SAME_TIME]).tolist():
+            edges |= set(range(max(at - steps, 0), min(at + steps + 1, len(t))))
+    used = apply_noise(base, replace(found.noise, excluded={}))
+    return find_wrong_segments(used, found.carry_points(base, used), t[sorted(edges)].tolist(), FIXES)
 
 
 def predict_left_out(problem: Problem, found: NoiseEstimate) -> LeftOutErrors:

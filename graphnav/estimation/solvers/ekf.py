@@ -146,8 +146,8 @@ class Comparison:
         self._K = len(about.values)
         self._one = Linearisation.of(problem, about, Stack(problem, self._K), advance(problem, self._K))
 
-    def log_likelihood(self, problem: Problem, about: Points, anew: Collection[str] = ()) -> Array:
-        """(K,) as `ForwardRecord.log_likelihood`, by a problem with the same points of what both have.
+    def filter(self, problem: Problem, about: Points, anew: Collection[str] = ()) -> Stack:
+        """The innovations by a problem with the same points of what both have.
 
         `anew` are the constraints whose rows differ.
         """
@@ -156,7 +156,7 @@ class Comparison:
         x, P = _start_from_prior(problem)
         start = _get_start(subtract_points(x, about.take_first(1))[0], P, stack.records)
         filter_likelihood(problem, about, stack, steps, one, start)
-        return stack.log_likelihood()
+        return stack
 
 
 def smooth_near(

@@ -150,14 +150,30 @@ class Stack:
 
     def log_likelihood(self) -> Array:
         """(K,) of the innovations, up to a constant; of rows with a robust kernel what the kernel makes of them."""
-        return self._compute_likelihood((self.solved[:, None] @ self.root)[:, 0])
+        return self._compute_likelihood(self._whiten())
+
+    def sum_squares(self) -> tuple[Array, Array]:
+        """Squared innovations (K,) of a keyframe over their covariances, and how many numbers (K,) they are of."""
+        weighs = self._mask_used()
+        return np.sum(np.where(weighs, self._whiten() ** 2, 0.0), axis=1), np.sum(weighs, axis=1)
+
+    def _whiten(self) -> Array:
+        """(K, M) innovations, whitened."""
+        return np.asarray((self.solved[:, None] @ self.root)[:, 0])
+
+    def _mask_used(self) -> Array:
+        """(K, M) mask of the numbers of rows with a weight."""
+        used = np.zeros((self.K, self.M), dtype=bool)
+        for c in self._constraints:
+            place = self.places[c.name]
+            used[place] = True if c.weight is None else c.weight[: len(place[0]), None] > 0.0
+        return used
 
     def _compute_likelihood(self, white: Array) -> Array:
         """Log-likelihood (K,) of whitened innovations (K, M)."""
-        weighs, squares = np.zeros((self.K, self.M), dtype=bool), white**2
+        weighs, squares = self._mask_used(), white**2
         for c in self._constraints:
             place = self.places[c.name]
-            weighs[place] = True if c.weight is None else c.weight[: len(place[0]), None] > 0.0
             if c.gate is None and c.robust != "none":
                 total = np.sum(squares[place], axis=1)
                 bent = 2.0 * weigh_squares(soften(c.robust), np.sqrt(total), self.scale[place][:, 0])[1]
@@ -172,7 +188,7 @@ class Stack:
         for i, c in enumerate(self._constraints):
             kind[self.places[c.name]] = i
         L = self.root
-        white = (self.solved[:, None] @ L)[:, 0]
+        white = self._whiten()
         log_likelihood = self._compute_likelihood(white)
         L *= kind[:, :, None] == kind[:, None]
         residual, sigma = mv(L, white), np.sqrt(np.einsum("kij,kij->ki", L, L))
