@@ -14,7 +14,7 @@ from graphnav.config import Settings
 from graphnav.constraints.base import SAME_TIME, BuildContext, Constraint, Linearized
 from graphnav.core.rotation import Array
 from graphnav.core.state import Parameter, States
-from graphnav.estimation.faults.watch import FAULT_COST, LARGE, MINUTE, SIZES
+from graphnav.estimation.faults.watch import FAULT_COST, LARGE, MINUTE, PATIENCE, SIZES
 from graphnav.estimation.noise.model import INTERVALS
 from graphnav.estimation.noise.moments import collect_row_moments, predict_errors
 from graphnav.estimation.noise.outliers import CHANCE, limit_squares
@@ -186,8 +186,8 @@ def compute_evidence(
 ) -> tuple[float, Array, int]:
     """Log-probabilities of explanations, up to a constant, from the likelihoods of the innovations.
 
-    Measurements with an error in common may have outliers besides, whose weights are found by a smoother with that
-    error; where the innovations show that these could decide.
+    Measurements that have an error in common for longer than `watch.PATIENCE` may have outliers besides: where the
+    innovations show that these could decide, their weights are found by a smoother with that error.
 
     Parameters
     ----------
@@ -214,6 +214,7 @@ def compute_evidence(
     before, passes = 0.0, 0
     present = {rows.name for rows in problem.constraints}
     comparison = Comparison(problem, about)
+    lasting = np.array([end - begin > PATIENCE for begin, end in spans])
 
     def evaluate(one: Problem, anew: Explanation) -> tuple[Stack, Array]:
         nonlocal passes
@@ -237,35 +238,47 @@ def compute_evidence(
         one = add_common_errors(base, spans, kinds)
         stack, likelihood = evaluate(one, kinds)
         posterior[:, j] = value = sum_spans(likelihood) - cost
-        common.append((j, one, value, sum_spans(_bound_gain(stack))))
+        if lasting.any():
+            gain = np.where(lasting, sum_spans(_bound_gain(stack, kinds, costs.outlier)), 0.0)
+            common.append((j, one, value, gain))
         if set(kinds) <= set(FIXES):
             value = sum_spans(evaluate(add_own_errors(base, spans, kinds, sizes), ())[1]) - cost
             posterior[:, j] = np.maximum(posterior[:, j], value - np.sum([sizes.cost[n] for n in kinds], axis=0))
     for j, one, value, gain in common:
-        kinds, gained = EXPLANATIONS[j], gain > FAULT_COST
-        while np.any(gained & (value + gain > np.max(posterior, axis=1))):
-            one, outliers = _weigh_outliers(one, make_points(one, about.states, known), spans, kinds)
+        kinds = EXPLANATIONS[j]
+        while np.any((gain > FAULT_COST) & (value + gain > np.max(posterior, axis=1))):
+            one, outliers = _weigh_outliers(one, make_points(one, about.states, known), spans, lasting, kinds)
             passes += 1
             previous, value = value, sum_spans(evaluate(one, kinds)[1]) - costs.explanations[:, j]
             value = value - np.sum([costs.outlier[name] * n for name, n in outliers.items()], axis=0)
             posterior[:, j] = np.maximum(posterior[:, j], value)
-            gain = value - previous  # each time less is gained
-            gained = gain > FAULT_COST
+            gain = value - previous  # less each time
     return before, posterior, passes
 
 
-def _bound_gain(stack: Stack) -> Array:
-    """(K,) by which the log-likelihood rises at each keyframe if what exceeds the limit of chance is due to outliers, of
-    which some may have been earlier.
+def _bound_gain(stack: Stack, kinds: Explanation, cost: Mapping[str, float]) -> Array:
+    """(K,) by which the log-probability rises at each keyframe if what exceeds the limit of chance is due to outliers.
+
+    Of successive keyframes that exceed it, the first has the outlier, and the others may be what it did to the state.
+    One of m numbers with a squared innovation s beyond the limit q has a weight of q / s.
     """
     squared, count = stack.sum_squares()
-    return 0.5 * np.maximum(squared - chdtri(np.maximum(count, 1), CHANCE), 0.0)
+    limit = chdtri(np.maximum(count, 1), CHANCE)
+    gain = 0.5 * np.maximum(squared - limit, 0.0)
+    rows = [(stack.places[name], cost[name]) for name in kinds if name in stack.places]
+    has = np.zeros(stack.K, dtype=bool)
+    for (k, _), _ in rows:
+        has[k] = True
+    m, least = min(place[1].shape[1] for place, _ in rows), min(one for _, one in rows)
+    first = (gain > 0.0) & ~np.append(False, gain[:-1] > 0.0)
+    own = np.maximum(gain - 0.5 * m * np.log(np.maximum(squared / limit, 1.0)) - least, 0.0)
+    return np.where(first, np.where(has, own, 0.0), gain)
 
 
 def _weigh_outliers(
-    problem: Problem, about: Points, spans: list[Span], kinds: Explanation
+    problem: Problem, about: Points, spans: list[Span], lasting: Array, kinds: Explanation
 ) -> tuple[Problem, dict[str, Array]]:
-    """The problem with weights for outliers among the rows of some constraints in spans, and how many (M,) each has."""
+    """The problem with weights for outliers among rows of some constraints in lasting spans, and their numbers (M,)."""
     smoothed = smooth_moments(problem, refilter(problem, about, whole=False))
     count: dict[str, Array] = {}
     weighted = []
@@ -274,8 +287,9 @@ def _weigh_outliers(
             t = problem.t[rows.keyframe]
             left_out = collect_row_moments(problem, rows, smoothed, len(rows)).left_out
             weight = np.ones(len(rows)) if rows.weight is None else rows.weight
-            weight = np.where(mask_times(t, spans), limit_squares(left_out, len(rows.axes)), weight)
-            count[rows.name] = np.array([np.sum(weight[mask_times(t, [span])] < 1.0) for span in spans])
+            inside = [mask_times(t, [span]) & some for span, some in zip(spans, lasting, strict=True)]
+            weight = np.where(np.any(inside, axis=0), limit_squares(left_out, len(rows.axes)), weight)
+            count[rows.name] = np.array([np.sum(weight[own] < 1.0) for own in inside])
             rows = replace(rows, weight=weight)
         weighted.append(rows)
     return replace(problem, constraints=tuple(weighted)), count
