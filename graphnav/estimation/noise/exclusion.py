@@ -9,7 +9,7 @@ innovations from the start of the span to the start of the next one:
 
     none        nothing is wrong
     fixes       positions, velocities or both have one unknown error in common, which may grow linearly, or an unknown
-                error each
+                error each; beside a common error that lasts for more than `watch.PATIENCE`, single ones may be outliers
     wheels      the non-holonomic constraint and the odometer have one such error in common
     IMU         single intervals have more noise, those that the smoother needs it for
     rows        single rows have less weight, those that the estimate found to be outliers
@@ -38,7 +38,8 @@ suspected, though those before it may be the wrong ones. So the fixes before eac
 are suspected instead, the same way, and the likelier of both stands.
 
 Readmission. Once the spans are left out, measurements at their ends that agree with the rest are used again, if that
-increases the evidence.
+increases the evidence. Of a span that outlasts the tests, the ends are found among the fixes near them as segments are:
+single errors do not date a slow onset, and two right fixes in it contradict the error that the others have in common.
 """
 
 from __future__ import annotations
