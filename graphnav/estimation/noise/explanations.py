@@ -207,53 +207,88 @@ def compute_evidence(
     int
         Filter passes.
     """
-    edges = np.append(np.searchsorted(problem.t, [a - SAME_TIME for a, _ in spans]), len(problem.t))
-    known = split_values(problem, about)
+    trials = _Trials(problem, about, spans)
     posterior = np.full((len(spans), len(EXPLANATIONS)), -np.inf)
-    common: list[tuple[int, Problem, Array, Array]] = []
-    before, passes = 0.0, 0
-    present = {rows.name for rows in problem.constraints}
-    comparison = Comparison(problem, about)
     lasting = np.array([end - begin > PATIENCE for begin, end in spans])
-
-    def evaluate(one: Problem, anew: Explanation) -> tuple[Stack, Array]:
-        nonlocal passes
-        passes += 1
-        stack = comparison.filter(one, make_points(one, about.states, known), anew)
-        return stack, stack.log_likelihood()
-
-    def sum_spans(each: Array) -> Array:
-        return np.array([float(np.sum(each[a:b])) for a, b in itertools.pairwise(edges)])
-
+    common: list[tuple[int, Problem, Array, Array]] = []
+    before = 0.0
+    present = {rows.name for rows in problem.constraints}
     for j, kinds in enumerate(EXPLANATIONS):
         possible = present & set(kinds) if kinds == WHEELS else kinds in (INTERVALS, ROWS) or present.issuperset(kinds)
         if not possible or (kinds and kinds not in among):
             continue
         base, cost = weighted.get(kinds, problem), costs.explanations[:, j]
         if not kinds or kinds in (INTERVALS, ROWS):
-            likelihood = evaluate(base, ())[1]
-            posterior[:, j] = sum_spans(likelihood) - cost
-            before = float(np.sum(likelihood[: edges[0]])) if not kinds else before
+            likelihood = trials.filter(base).log_likelihood()
+            posterior[:, j] = trials.sum_spans(likelihood) - cost
+            before = before if kinds else float(np.sum(likelihood[: trials.edges[0]]))
             continue
         one = add_common_errors(base, spans, kinds)
-        stack, likelihood = evaluate(one, kinds)
-        posterior[:, j] = value = sum_spans(likelihood) - cost
+        stack = trials.filter(one, kinds)
+        posterior[:, j] = value = trials.sum_spans(stack.log_likelihood()) - cost
         if lasting.any():
-            gain = np.where(lasting, sum_spans(_bound_gain(stack, kinds, costs.outlier)), 0.0)
+            gain = np.where(lasting, trials.sum_spans(_bound_gain(stack, kinds, costs.outlier)), 0.0)
             common.append((j, one, value, gain))
         if set(kinds) <= set(FIXES):
-            value = sum_spans(evaluate(add_own_errors(base, spans, kinds, sizes), ())[1]) - cost
+            value = trials.sum_spans(trials.filter(add_own_errors(base, spans, kinds, sizes)).log_likelihood()) - cost
             posterior[:, j] = np.maximum(posterior[:, j], value - np.sum([sizes.cost[n] for n in kinds], axis=0))
     for j, one, value, gain in common:
         kinds = EXPLANATIONS[j]
         while np.any((gain > FAULT_COST) & (value + gain > np.max(posterior, axis=1))):
-            one, outliers = _weigh_outliers(one, make_points(one, about.states, known), spans, lasting, kinds)
-            passes += 1
-            previous, value = value, sum_spans(evaluate(one, kinds)[1]) - costs.explanations[:, j]
-            value = value - np.sum([costs.outlier[name] * n for name, n in outliers.items()], axis=0)
+            one, outliers = trials.weigh_outliers(one, kinds, lasting)
+            previous, value = value, trials.sum_spans(trials.filter(one, kinds).log_likelihood())
+            value = value - costs.explanations[:, j] - sum(costs.outlier[name] * n for name, n in outliers.items())
             posterior[:, j] = np.maximum(posterior[:, j], value)
             gain = value - previous  # less each time
-    return before, posterior, passes
+    return before, posterior, trials.passes
+
+
+class _Trials:
+    """Filters of a drive by several models with the same linearisation points, and how many passes were made.
+
+    Parameters
+    ----------
+    problem, about, spans : as for `compute_evidence`.
+    """
+
+    def __init__(self, problem: Problem, about: Points, spans: list[Span]) -> None:
+        self.edges = np.append(np.searchsorted(problem.t, [begin - SAME_TIME for begin, _ in spans]), len(problem.t))
+        self.passes = 0
+        self._spans, self._states, self._known = spans, about.states, split_values(problem, about)
+        self._comparison = Comparison(problem, about)
+
+    def filter(self, problem: Problem, anew: Explanation = ()) -> Stack:
+        """The innovations of a model; `anew` are the constraints of which the rows differ."""
+        self.passes += 1
+        return self._comparison.filter(problem, self._make_points(problem), anew)
+
+    def sum_spans(self, each: Array) -> Array:
+        """(M,) sums of what keyframes (K,) have, from the start of each span to the start of the next."""
+        return np.array([float(np.sum(each[a:b])) for a, b in itertools.pairwise(self.edges)])
+
+    def weigh_outliers(self, problem: Problem, kinds: Explanation, where: Array) -> tuple[Problem, dict[str, Array]]:
+        """The problem with weights for outliers among rows of some constraints, and how many (M,) each has of them.
+
+        `where` : (M,) in which spans.
+        """
+        self.passes += 1
+        smoothed = smooth_moments(problem, refilter(problem, self._make_points(problem), whole=False))
+        count: dict[str, Array] = {}
+        weighted = []
+        for rows in problem.constraints:
+            if rows.name in kinds:
+                t = problem.t[rows.keyframe]
+                left_out = collect_row_moments(problem, rows, smoothed, len(rows)).left_out
+                weight = np.ones(len(rows)) if rows.weight is None else rows.weight
+                inside = [mask_times(t, [span]) & some for span, some in zip(self._spans, where, strict=True)]
+                weight = np.where(np.any(inside, axis=0), limit_squares(left_out, len(rows.axes)), weight)
+                count[rows.name] = np.array([np.sum(weight[own] < 1.0) for own in inside])
+                rows = replace(rows, weight=weight)
+            weighted.append(rows)
+        return replace(problem, constraints=tuple(weighted)), count
+
+    def _make_points(self, problem: Problem) -> Points:
+        return make_points(problem, self._states, self._known)
 
 
 def _bound_gain(stack: Stack, kinds: Explanation, cost: Mapping[str, float]) -> Array:
@@ -265,31 +300,9 @@ def _bound_gain(stack: Stack, kinds: Explanation, cost: Mapping[str, float]) -> 
     squared, count = stack.sum_squares()
     limit = chdtri(np.maximum(count, 1), CHANCE)
     gain = 0.5 * np.maximum(squared - limit, 0.0)
-    rows = [(stack.places[name], cost[name]) for name in kinds if name in stack.places]
-    has = np.zeros(stack.K, dtype=bool)
-    for (k, _), _ in rows:
-        has[k] = True
-    m, least = min(place[1].shape[1] for place, _ in rows), min(one for _, one in rows)
+    places = {name: stack.places[name] for name in kinds if name in stack.places}
+    measured = np.isin(np.arange(stack.K), np.concatenate([k[:, 0] for k, _ in places.values()]))
+    m, least = min(place.shape[1] for _, place in places.values()), min(cost[name] for name in places)
     first = (gain > 0.0) & ~np.append(False, gain[:-1] > 0.0)
     own = np.maximum(gain - 0.5 * m * np.log(np.maximum(squared / limit, 1.0)) - least, 0.0)
-    return np.where(first, np.where(has, own, 0.0), gain)
-
-
-def _weigh_outliers(
-    problem: Problem, about: Points, spans: list[Span], lasting: Array, kinds: Explanation
-) -> tuple[Problem, dict[str, Array]]:
-    """The problem with weights for outliers among rows of some constraints in lasting spans, and their numbers (M,)."""
-    smoothed = smooth_moments(problem, refilter(problem, about, whole=False))
-    count: dict[str, Array] = {}
-    weighted = []
-    for rows in problem.constraints:
-        if rows.name in kinds:
-            t = problem.t[rows.keyframe]
-            left_out = collect_row_moments(problem, rows, smoothed, len(rows)).left_out
-            weight = np.ones(len(rows)) if rows.weight is None else rows.weight
-            inside = [mask_times(t, [span]) & some for span, some in zip(spans, lasting, strict=True)]
-            weight = np.where(np.any(inside, axis=0), limit_squares(left_out, len(rows.axes)), weight)
-            count[rows.name] = np.array([np.sum(weight[own] < 1.0) for own in inside])
-            rows = replace(rows, weight=weight)
-        weighted.append(rows)
-    return replace(problem, constraints=tuple(weighted)), count
+    return np.where(first, np.where(measured, own, 0.0), gain)
