@@ -301,14 +301,33 @@ def test_evidence_of_a_common_error_with_outliers_besides(built: Problem) -> Non
     for more in (off, off + further):
         wrong = replace(rows, p_n=rows.p_n + more)
         problem = replace(built, constraints=tuple(wrong if c is rows else c for c in built.constraints))
-        evidence.append(compute_evidence(problem, about, [span], {}, sizes, costs)[1][0])
-    position = EXPLANATIONS.index((rows.name,))
-    assert all(np.argmax(one) == position for one in evidence)
+        found, chosen, _ = compute_evidence(problem, about, [span], {}, sizes, costs)
+        assert chosen == [(rows.name,)]
+        evidence.append(found)
     # the limit, by half, the logarithm of the weight, and the cost
     squared = np.sum((further[further.any(axis=1)] / rows.sigma[0]) ** 2, axis=1)
     most = chdtri(3, CHANCE)
     each = 0.5 * most + 1.5 * np.log(squared / most) + OUTLIER_COST
-    assert evidence[0][position] - evidence[1][position] == pytest.approx(np.sum(each), rel=0.2)
+    assert evidence[0] - evidence[1] == pytest.approx(np.sum(each), rel=0.2)
+
+
+def test_evidence_of_explanations_in_succession(built: Problem) -> None:
+    """Two spans without a fix between them, the second of them wrong: what one filter with that error makes of it."""
+    about = ekf(built)
+    rows = next(c for c in built.constraints if c.name == "gnss_position")
+    spans = [(83.0, 150.0), (151.0, 199.0)]
+    t, off = built.t[rows.keyframe], np.zeros((len(rows), 3))
+    off[(t >= spans[1][0]) & (t <= spans[1][1])] = [1.2, -0.9, 0.3]
+    wrong = replace(rows, p_n=rows.p_n + off)
+    problem = replace(built, constraints=tuple(wrong if c is rows else c for c in built.constraints))
+    costs = PriorCosts(np.zeros((2, len(EXPLANATIONS))), {c.name: OUTLIER_COST for c in built.constraints})
+    sizes = ErrorSizes({rows.name: np.full(2, 100.0)}, {rows.name: np.zeros(2)})
+    found, chosen, _ = compute_evidence(problem, about, spans, {}, sizes, costs, [(rows.name,)])
+    assert chosen == [(), (rows.name,)]
+    one = add_common_errors(problem, spans[1:], (rows.name,))
+    points = make_points(one, about.states, split_values(problem, about))
+    expected = Comparison(problem, about).filter(one, points, (rows.name,)).log_likelihood().sum()
+    assert found == pytest.approx(float(expected), rel=1e-9)
 
 
 def test_split_at_steps() -> None:

@@ -95,21 +95,19 @@ def explain(
         some = np.array(more)
         cost[:, EXPLANATIONS.index(kinds)] += np.where((some > 0.0) | (kinds not in _BY_ROWS), some, np.inf)
     about, costs = found.carry_points(base, used), PriorCosts(cost, dict.fromkeys(totals, OUTLIER_COST) | each)
-    before, posterior, passes = compute_evidence(used, about, spans, weighted, sizes, costs, among)
+    evidence, chosen, passes = compute_evidence(used, about, spans, weighted, sizes, costs, among)
     excluded: dict[str, tuple[Span, ...]] = {}
-    total = before + found.log_prior
     dropped: dict[str, list[Span]] = {name: [] for name in noise.weights}
-    for k, span in enumerate(spans):
-        best = EXPLANATIONS[int(np.argmax(posterior[k]))]
-        total += float(np.max(posterior[k]))
+    for span, to_next, best in zip(spans, reach, chosen, strict=True):
         for name in noise.weights.keys() - inside.get(best, {}).keys():
-            dropped[name].append(reach[k] if name in INTERVALS else span)
+            dropped[name].append(to_next if name in INTERVALS else span)
         if best not in _BY_ROWS:
             excluded |= {name: (*excluded.get(name, ()), span) for name in best}
     present = {rows.name for rows in base.constraints}
     excluded = {name: some for name, some in excluded.items() if name in present}
     weights = {name: drop_within(some, dropped[name]) for name, some in noise.weights.items()}
-    return Decision(replace(noise, weights=weights, excluded=excluded), total, Counter(filter=passes))
+    noise = replace(noise, weights=weights, excluded=excluded)
+    return Decision(noise, evidence + found.log_prior, Counter(filter=passes))
 
 
 def list_explanations(noise: NoiseModel) -> set[Explanation]:

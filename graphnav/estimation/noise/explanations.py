@@ -175,6 +175,22 @@ class PriorCosts:
     outlier: Mapping[str, float]  # of one more outlier, by constraint
 
 
+@dataclass
+class _Model:
+    """A model of all spans by one explanation."""
+
+    kinds: Explanation
+    problem: Problem  # without errors in common
+    common: Explanation  # the constraints that have one
+    likelihood: Array  # (M,) logarithm, of each span by it
+    cost: Array  # (M,) negative log-probability beforehand
+
+    @property
+    def value(self) -> Array:
+        """(M,) log-probability of each span by it, up to a constant."""
+        return self.likelihood - self.cost
+
+
 def compute_evidence(
     problem: Problem,
     about: Points,
@@ -183,11 +199,15 @@ def compute_evidence(
     sizes: ErrorSizes,
     costs: PriorCosts,
     among: Collection[Explanation] = EXPLANATIONS,
-) -> tuple[float, Array, int]:
-    """Log-probabilities of explanations, up to a constant, from the likelihoods of the innovations.
+) -> tuple[float, list[Explanation], int]:
+    """Find the most probable explanation of each span, by the likelihood of the innovations.
 
     Measurements that have an error in common for longer than `watch.PATIENCE` may have outliers besides: where the
     innovations show that these could decide, their weights are found by a smoother with that error.
+
+    Spans are explained each by itself, up to the start of the next one. Where spans without a measurement between them
+    have different explanations, the state at the second is not that of its model, so a filter with all that was chosen
+    is compared with the likeliest single explanation of spans in succession.
 
     Parameters
     ----------
@@ -196,21 +216,21 @@ def compute_evidence(
     spans : s, first and last wrong fix, in order and apart.
     weighted : by explanation, the problem with the weights of rows and intervals that go with it.
     sizes : of errors that are of one fix each.
-    among : explanations to evaluate besides that nothing is wrong; the others have -inf.
+    among : explanations to evaluate besides that nothing is wrong.
 
     Returns
     -------
     float
-        Log-likelihood before the first span.
-    Array
-        (M, len(EXPLANATIONS)) from the start of each span to the start of the next.
+        Log-probability of all measurements and the explanations, up to a constant.
+    list of Explanation
+        Of each span.
     int
         Filter passes.
     """
     trials = _Trials(problem, about, spans)
-    posterior = np.full((len(spans), len(EXPLANATIONS)), -np.inf)
     lasting = np.array([end - begin > PATIENCE for begin, end in spans])
-    common: list[tuple[int, Problem, Array, Array]] = []
+    models: list[_Model] = []
+    common: list[tuple[_Model, Array]] = []
     before = 0.0
     present = {rows.name for rows in problem.constraints}
     for j, kinds in enumerate(EXPLANATIONS):
@@ -220,27 +240,29 @@ def compute_evidence(
         base, cost = weighted.get(kinds, problem), costs.explanations[:, j]
         if not kinds or kinds in (INTERVALS, ROWS):
             likelihood = trials.filter(base).log_likelihood()
-            posterior[:, j] = trials.sum_spans(likelihood) - cost
+            models.append(_Model(kinds, base, (), trials.sum_spans(likelihood), cost))
             before = before if kinds else float(np.sum(likelihood[: trials.edges[0]]))
             continue
-        one = add_common_errors(base, spans, kinds)
-        stack = trials.filter(one, kinds)
-        posterior[:, j] = value = trials.sum_spans(stack.log_likelihood()) - cost
+        stack = trials.filter(add_common_errors(base, spans, kinds), kinds)
+        models.append(_Model(kinds, base, kinds, trials.sum_spans(stack.log_likelihood()), cost))
         if lasting.any():
-            gain = np.where(lasting, trials.sum_spans(_bound_gain(stack, kinds, costs.outlier)), 0.0)
-            common.append((j, one, value, gain))
+            gain = trials.sum_spans(_bound_gain(stack, kinds, costs.outlier))
+            common.append((models[-1], np.where(lasting, gain, 0.0)))
         if set(kinds) <= set(FIXES):
-            value = trials.sum_spans(trials.filter(add_own_errors(base, spans, kinds, sizes)).log_likelihood()) - cost
-            posterior[:, j] = np.maximum(posterior[:, j], value - np.sum([sizes.cost[n] for n in kinds], axis=0))
-    for j, one, value, gain in common:
-        kinds = EXPLANATIONS[j]
-        while np.any((gain > FAULT_COST) & (value + gain > np.max(posterior, axis=1))):
-            one, outliers = trials.weigh_outliers(one, kinds, lasting)
-            previous, value = value, trials.sum_spans(trials.filter(one, kinds).log_likelihood())
-            value = value - costs.explanations[:, j] - sum(costs.outlier[name] * n for name, n in outliers.items())
-            posterior[:, j] = np.maximum(posterior[:, j], value)
-            gain = value - previous  # less each time
-    return before, posterior, trials.passes
+            one = add_own_errors(base, spans, kinds, sizes)
+            more = np.sum([sizes.cost[name] for name in kinds], axis=0)
+            models.append(_Model(kinds, one, (), trials.sum_spans(trials.filter(one).log_likelihood()), cost + more))
+    for model, gain in common:
+        while np.any((gain > FAULT_COST) & (model.value + gain > np.max([one.value for one in models], axis=0))):
+            base, outliers = trials.weigh_outliers(model.problem, model.kinds, lasting)
+            likelihood = trials.filter(add_common_errors(base, spans, model.kinds), model.kinds).log_likelihood()
+            cost = costs.explanations[:, EXPLANATIONS.index(model.kinds)]
+            cost = cost + sum(costs.outlier[name] * n for name, n in outliers.items())
+            previous, model = model, _Model(model.kinds, base, model.common, trials.sum_spans(likelihood), cost)
+            gain = model.value - previous.value  # less each time
+            models.append(model)
+    value, chosen = trials.choose(models)
+    return before + value, chosen, trials.passes
 
 
 class _Trials:
@@ -254,7 +276,8 @@ class _Trials:
     def __init__(self, problem: Problem, about: Points, spans: list[Span]) -> None:
         self.edges = np.append(np.searchsorted(problem.t, [begin - SAME_TIME for begin, _ in spans]), len(problem.t))
         self.passes = 0
-        self._spans, self._states, self._known = spans, about.states, split_values(problem, about)
+        self._problem, self._spans = problem, spans
+        self._states, self._known = about.states, split_values(problem, about)
         self._comparison = Comparison(problem, about)
 
     def filter(self, problem: Problem, anew: Explanation = ()) -> Stack:
@@ -272,13 +295,14 @@ class _Trials:
         `where` : (M,) in which spans.
         """
         self.passes += 1
-        smoothed = smooth_moments(problem, refilter(problem, self._make_points(problem), whole=False))
+        common = add_common_errors(problem, self._spans, kinds)
+        smoothed = smooth_moments(common, refilter(common, self._make_points(common), whole=False))
         count: dict[str, Array] = {}
         weighted = []
-        for rows in problem.constraints:
+        for rows, wrong in zip(problem.constraints, common.constraints, strict=True):
             if rows.name in kinds:
                 t = problem.t[rows.keyframe]
-                left_out = collect_row_moments(problem, rows, smoothed, len(rows)).left_out
+                left_out = collect_row_moments(common, wrong, smoothed, len(rows)).left_out
                 weight = np.ones(len(rows)) if rows.weight is None else rows.weight
                 inside = [mask_times(t, [span]) & some for span, some in zip(self._spans, where, strict=True)]
                 weight = np.where(np.any(inside, axis=0), limit_squares(left_out, len(rows.axes)), weight)
@@ -286,6 +310,51 @@ class _Trials:
                 rows = replace(rows, weight=weight)
             weighted.append(rows)
         return replace(problem, constraints=tuple(weighted)), count
+
+    def choose(self, models: list[_Model]) -> tuple[float, list[Explanation]]:
+        """The most probable explanation of each span, and the log-probability of all together, up to a constant."""
+        values = np.array([one.value for one in models])
+        each = [models[i] for i in np.argmax(values, axis=0)]
+        chosen, runs = [one.kinds for one in each], self._list_runs()
+        if INTERVALS in chosen or all(len(set(chosen[run])) == 1 for run in runs):
+            return float(np.sum(np.max(values, axis=0))), chosen
+        likelihood = self.filter(*self._combine(each)).log_likelihood()[self.edges[0] :]
+        together = float(np.sum(likelihood)) - sum(float(one.cost[k]) for k, one in enumerate(each))
+        alike = [models[int(np.argmax(values[:, run].sum(axis=1)))] for run in runs]
+        single = sum(float(one.value[run].sum()) for one, run in zip(alike, runs, strict=True))
+        if together >= single:
+            return together, chosen
+        return single, [one.kinds for one, run in zip(alike, runs, strict=True) for _ in each[run]]
+
+    def _list_runs(self) -> list[slice]:
+        """Spans in succession without a fix between one and the next."""
+        t = np.unique(
+            np.concatenate([self._problem.t[c.keyframe] for c in self._problem.constraints if c.name in FIXES])
+        )
+        spans = np.array(self._spans)
+        begins = np.searchsorted(t, spans[:, 0] - SAME_TIME)
+        ends = np.searchsorted(t, spans[:, 1] + SAME_TIME)
+        first = np.flatnonzero(np.append(True, begins[1:] > ends[:-1]))
+        return [slice(a, b) for a, b in itertools.pairwise([*first.tolist(), len(self._spans)])]
+
+    def _combine(self, each: list[_Model]) -> tuple[Problem, Explanation]:
+        """The problem with a model for each span, and the constraints that have errors in common."""
+        weighted = []
+        for i, rows in enumerate(self._problem.constraints):
+            t, weight = (
+                self._problem.t[rows.keyframe],
+                np.ones(len(rows)) if rows.weight is None else rows.weight.copy(),
+            )
+            for one, span in zip(each, self._spans, strict=True):
+                other, inside = one.problem.constraints[i].weight, mask_times(t, [span])
+                weight[inside] = 1.0 if other is None else other[inside]
+            weighted.append(replace(rows, weight=weight))
+        problem = replace(self._problem, constraints=tuple(weighted))
+        names = tuple(dict.fromkeys(name for one in each for name in one.common))
+        for name in names:
+            own = [span for one, span in zip(each, self._spans, strict=True) if name in one.common]
+            problem = add_common_errors(problem, own, (name,))
+        return problem, names
 
     def _make_points(self, problem: Problem) -> Points:
         return make_points(problem, self._states, self._known)

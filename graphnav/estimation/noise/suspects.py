@@ -28,7 +28,7 @@ from graphnav.estimation.noise.spans import (
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.ekf import refilter
 
-_STEPS = 8  # fixes, by which the ends of spans are varied
+_STEPS = 8  # fixes by which the ends of spans are varied
 
 
 def find_suspects(base: Problem, noise: NoiseModel, found: NoiseEstimate) -> list[Span]:
@@ -69,7 +69,7 @@ def find_segments(base: Problem, found: NoiseEstimate, suspected: list[Span]) ->
 
 
 def date_segments(base: Problem, found: NoiseEstimate, spans: list[Span]) -> list[Span]:
-    """Wrong segments near some spans, dated to the fix: the errors in them have an onset that each single one has not.
+    """Wrong segments near some spans, dated to the fix: the errors of a drift date its onset together.
 
     Parameters
     ----------
