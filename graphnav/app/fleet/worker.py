@@ -10,13 +10,11 @@ from contextlib import suppress
 from graphnav.app.fleet.drive import solve_drive
 from graphnav.app.fleet.manifest import Task
 from graphnav.core.jsonable import format_json
-from graphnav.core.memory import keep_memory
 
 
 def main() -> None:
     """Solve tasks until the input ends; the argument is the memory limit of this process, MB, 0 for none."""
     _limit_memory(float(sys.argv[1]))
-    keep_memory()
     # anything printed, also by compiled code, must not mix with the rows
     out = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)
