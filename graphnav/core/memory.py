@@ -8,7 +8,7 @@ from contextlib import suppress
 from pathlib import Path
 
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # of mallopt(3)
-_LARGEST = 2**30  # bytes
+_LARGEST, _KEPT = 2**26, 2**30  # bytes: more than an array of an hour with a keyframe a second; what is kept
 
 
 def read_peak_memory_mb() -> float:
@@ -35,7 +35,7 @@ def keep_memory() -> None:
     with suppress(AttributeError, OSError, TypeError):  # of another C library
         library = ctypes.CDLL(None)
         library.mallopt(_MMAP_THRESHOLD, _LARGEST)
-        library.mallopt(_TRIM_THRESHOLD, _LARGEST)
+        library.mallopt(_TRIM_THRESHOLD, _KEPT)
 
 
 def return_memory() -> None:
