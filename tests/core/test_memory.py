@@ -15,7 +15,7 @@ if sys.argv[1] == "kept":
     keep_memory()
 for _ in range(2):
     before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
-    some = np.ones((4, 2**22))
+    some = np.ones((6, 2**20))
     del some
 print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
 """
