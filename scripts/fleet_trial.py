@@ -6,12 +6,15 @@ seconds. One recording is poisoned (a cell that is no number) and one is absurd 
 after a fifth of the drives and run again; then a process that solves is ended in the middle of a drive, and later one
 is stopped, which is a drive that hangs. The third run has only the drives to solve that were lost.
 
+With `--also` the recordings of a folder are solved among them.
+
 With `--undisturbed` nothing happens to it: it is run with one process and again with two. What a second process costs
 is in the processor time of both, which other programs on the machine change less than the wall time.
 
     python scripts/fleet_trial.py --keep build/fleet
     python scripts/fleet_trial.py --keep build/fleet --dask 2
-    python scripts/fleet_trial.py --keep build/long --ways 5 --length 600 --options "" --undisturbed
+    python scripts/fleet_trial.py --keep build/long --ways 12 --length 600 --options "" --also ../shared/data \
+        --undisturbed
 """
 
 from __future__ import annotations
@@ -37,6 +40,7 @@ from typing import Any
 
 import numpy as np
 
+from graphnav.app.fleet.manifest import DriveOptions, read_drives
 from graphnav.recording import Recording
 from graphnav.recording.formats.writer import write_folder
 from graphnav.simulation import simulate
@@ -54,12 +58,15 @@ def main() -> None:
     parser.add_argument("--length", type=float, default=LENGTH, help="s, of each drive (%(default)s)")
     parser.add_argument("--limit", type=float, default=60.0, help="s, that a drive may take (%(default)s)")
     parser.add_argument("--keep", type=Path, required=True, metavar="DIR", help="drives and results go here")
+    parser.add_argument("--also", type=Path, metavar="DIR", help="recordings that are copied among the drives")
     parser.add_argument("--processes", type=int, default=1)
     parser.add_argument("--dask", type=int, default=0, metavar="N", help="over a cluster of N workers on this machine")
     parser.add_argument("--options", default="--solver ekf --noise stated --end 60 --no-report", help="(%(default)s)")
     parser.add_argument("--undisturbed", action="store_true", help="on one process, then on two, and nothing else")
     options = parser.parse_args()
     drives = build(options.keep, options.ways, options.length)
+    if options.also:
+        shutil.copytree(options.also, drives / "also", dirs_exist_ok=True)
     out = options.keep / f"out-{options.processes}-{options.dask}"
     if out.exists():
         shutil.rmtree(out)
@@ -69,7 +76,7 @@ def main() -> None:
         runs = {n: run([*command, "--again", "--processes", str(n)], out) for n in (1, 2)}
         print(json.dumps({"processes": runs, **figures(out)}, indent=1))
         return
-    count = 5 * options.ways + 2
+    count = len(read_drives(drives, DriveOptions()))
     with cluster(options.dask) as address:
         command += ["--scheduler", address] if address else ["--processes", str(options.processes)]
         first = run(command, out, {int(ENDED_AFTER[0] * count): end_all})

@@ -233,10 +233,12 @@ def _solve_and_write(
         from graphnav.app.summary import tabulate_comparison
         from graphnav.config import read_settings
         from graphnav.core.complaints import split_names
+        from graphnav.core.memory import keep_memory
         from graphnav.core.staging import resolve_final_path, stage_results
         from graphnav.evaluation import gates
         from graphnav.recording.exporters import FORMATS
 
+    keep_memory()
     withheld = collect_withheld(asked.without, asked.start, asked.end)
     convert.check_rate(asked.rate)
     names = workflow.name_runs(chosen, loose)

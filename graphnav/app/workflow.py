@@ -251,7 +251,7 @@ def _solve_request(request: Request, progress: Progress | None) -> Outcome:
     if request.judge_arms or list_doubts(solutions, errors):  # which takes a second
         from graphnav.estimation.antenna import find_wrong_arms
 
-        arms = find_wrong_arms(used, checks)
+        arms = find_wrong_arms(used, checks, list(select_own(solutions).values())[-1].graphs)
         # the stated lever arm is not used
         if any(LEVER_ARM in one.noise.freed for one in select_own(solutions).values()):
             arms = [f for f in arms if not f.key.startswith("gnss.")]

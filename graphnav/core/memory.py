@@ -7,6 +7,9 @@ import sys
 from contextlib import suppress
 from pathlib import Path
 
+_TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # of mallopt(3)
+_LARGEST, _KEPT = 2**26, 2**30  # bytes: more than an array of an hour with a keyframe a second; what is kept
+
 
 def read_peak_memory_mb() -> float:
     """Peak memory of this process, MB of 2^20 bytes."""
@@ -23,7 +26,19 @@ def read_peak_memory_mb() -> float:
     return round(size / (1024.0**2 if sys.platform == "darwin" else 1024.0), 1)
 
 
+def keep_memory() -> None:
+    """Let the C library use free memory again, of large arrays too, until `return_memory`.
+
+    Each pass over a drive needs the same arrays; memory anew from the system is cleared page by page, which was a
+    twentieth of all processor time.
+    """
+    with suppress(AttributeError, OSError, TypeError):  # of another C library
+        library = ctypes.CDLL(None)
+        library.mallopt(_MMAP_THRESHOLD, _LARGEST)
+        library.mallopt(_TRIM_THRESHOLD, _KEPT)
+
+
 def return_memory() -> None:
-    """Return free memory to the system; by itself the C library keeps that of arrays of less than 32 MB."""
+    """Return free memory to the system."""
     with suppress(AttributeError, OSError, TypeError):  # of another C library
         ctypes.CDLL(None).malloc_trim(0)

@@ -6,30 +6,34 @@ The estimate is that of `gnss.lever_arm_sigma`, from the first part of the drive
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from graphnav.config import Settings
 from graphnav.constraints.antenna_motion import LEVER_ARM
-from graphnav.constraints.vehicle import AXLE
+from graphnav.constraints.vehicle import AXLE, Wheels
 from graphnav.core.earth import LocalFrame
 from graphnav.core.errors import EstimationError
 from graphnav.core.findings import Finding
 from graphnav.core.progress import tell
 from graphnav.core.rotation import Array
+from graphnav.core.state import Parameter
 from graphnav.detectors import detect
 from graphnav.estimation.alignment import align
-from graphnav.estimation.contradictions import PRIOR_SIGMA
+from graphnav.estimation.contradictions import PRIOR_SIGMA, free
 from graphnav.estimation.noise.apply import apply_noise
 from graphnav.estimation.noise.estimate import estimate_noise
+from graphnav.estimation.noise.initial_points import BREAKDOWN
+from graphnav.estimation.noise.model import FreedConstant
 from graphnav.estimation.noise.words import describe_turned_axes
 from graphnav.estimation.pipeline import choose_origin
-from graphnav.estimation.problem import Problem, build_problem
+from graphnav.estimation.problem import Problem, SolvedProblem, build_problem
 from graphnav.estimation.solvers.breakdown import explain_singular
 from graphnav.estimation.solvers.ekf import refilter
-from graphnav.estimation.solvers.passes import SmootherPass, compute_sigmas, estimate_parameters
+from graphnav.estimation.solvers.linearise import shift
+from graphnav.estimation.solvers.passes import SmootherPass, compute_sigmas, estimate_parameters, make_points
 from graphnav.estimation.solvers.rts import smooth_backward
 from graphnav.recording import Recording, take_rows
 from graphnav.recording.checks.crosschecks import fit_forward
@@ -93,14 +97,18 @@ def find_antenna(recording: Recording) -> Antenna:
     return _estimate_antenna(recording)[0]
 
 
-def find_wrong_arms(recording: Recording, findings: Sequence[Finding] = ()) -> list[Finding]:
+def find_wrong_arms(
+    recording: Recording, findings: Sequence[Finding] = (), solved: Sequence[Callable[[], object]] = ()
+) -> list[Finding]:
     """Findings on lever arms that the drive contradicts: components with the opposite sign; otherwise the antenna's.
 
     Only for a vehicle with sufficiently precise fixes, from the part of the drive with the most turning, and not
-    where one of the `findings` is the cause.
+    where one of the `findings` is the cause, or where arms that are open stay at a solution's (`Solution.graphs`).
     """
     gnss = recording.gnss
     if gnss is None or not _tells_of_arms(recording, findings) or np.median(gnss.sd[:, :2]) > _PRECISE:
+        return []
+    if len(solved) == 1 and isinstance(solved[0], SolvedProblem) and _stay(recording, solved[0]):
         return []
     try:
         antenna, axle = _estimate_antenna(_find_turning(recording))
@@ -129,6 +137,33 @@ def find_wrong_arms(recording: Recording, findings: Sequence[Finding] = ()) -> l
     if not out and not antenna.agrees and np.abs(antenna.found - antenna.stated).max() > _LEAST_PART:
         out.append(antenna.finding)
     return out
+
+
+def _stay(recording: Recording, solved: SolvedProblem) -> bool:
+    """Whether arms that are unknown stay, in a filter pass at the solution, much closer to what is stated than to
+    anything that would be a finding.
+    """
+    assert recording.gnss is not None
+    arm, wide = recording.gnss.lever_arm, PRIOR_SIGMA[LEVER_ARM]
+    opened = free(solved.problem, {LEVER_ARM: FreedConstant(tuple(arm.tolist()), (wide,) * 3)})
+    axle = Parameter(AXLE, np.zeros(1), np.full(1, wide), "m")
+    rows = [_add_axle(one, axle) if isinstance(one, Wheels) else one for one in opened.constraints]
+    opened = replace(opened, constraints=tuple(rows))
+    asked = {LEVER_ARM: arm} if recording.odometer is None else {LEVER_ARM: arm, AXLE: np.zeros(1)}
+    if not asked.keys() <= opened.parameters.keys():
+        return False
+    chains = [chain for chain in opened.chains if chain.parameter.name in solved.values]
+    known = {c.parameter.name: solved.values[c.parameter.name][c.node] for c in chains}
+    try:
+        found = refilter(opened, make_points(opened, solved.states, known), whole=False).values[-1]
+    except BREAKDOWN:
+        return False
+    off = [found[shift(opened.columns[name])] - stated for name, stated in asked.items()]
+    return bool(np.abs(np.concatenate(off)).max() < 0.5 * _LEAST_PART)
+
+
+def _add_axle(rows: Wheels, axle: Parameter) -> Wheels:
+    return replace(rows, parameters=(*(p for p in rows.parameters if p.name != AXLE), axle))
 
 
 def find_wrong_axes(recording: Recording, findings: Sequence[Finding] = ()) -> list[Finding]:

@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -35,7 +35,7 @@ from graphnav.estimation.noise.words import describe_far
 from graphnav.estimation.offsets import move_stamps
 from graphnav.estimation.pieces import describe_span, split_pieces
 from graphnav.estimation.preparation import Prepared, Weigh, prepare, step_ahead
-from graphnav.estimation.problem import Problem
+from graphnav.estimation.problem import Problem, SolvedProblem
 from graphnav.estimation.separation import compute_separation
 from graphnav.estimation.solution import Solution, join_solutions
 from graphnav.estimation.solvers.breakdown import explain_singular
@@ -321,7 +321,7 @@ def _solve(
             detections=found.detections.all,
             excluded=wrong,
             noise=found.noise,
-            graphs=(_bind_graph(problem, out[name]),),
+            graphs=(_bind(problem, out[name]),),
             passes=dict(passes),
             separation=apart,
             fixed=found.fixed.get(name, found.fixed.get("", out[name].fixed)),
@@ -333,16 +333,8 @@ def _solve(
     return {name: shift_to_own_clocks(one, stamps) for name, one in by_name.items()}
 
 
-def _bind_graph(problem: Problem, solution: Solution) -> Callable[[], tuple[Any, Any]]:
-    """Attach the conversion to GTSAM, with a solution's values of parameters."""
-
-    def export() -> tuple[Any, Any]:
-        from graphnav.estimation.factor_graph.nonlinear import Exported  # which needs GTSAM
-
-        values = {name: estimate.value for name, estimate in solution.parameters.items()}
-        return Exported(problem, solution.states, values)()
-
-    return export
+def _bind(problem: Problem, solution: Solution) -> SolvedProblem:
+    return SolvedProblem(problem, solution.states, {name: one.value for name, one in solution.parameters.items()})
 
 
 def check_profile(recording: Recording, settings: Settings) -> list[str]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
+from typing import Any
 
 import numpy as np
 
@@ -98,6 +99,21 @@ class Problem:
         if self.interval_factors is not None:
             intervals = intervals.with_noise(self.interval_factors).without_parts()
         return replace(self, intervals=intervals, motion=ImuFactors(intervals, self.frame))
+
+
+@dataclass(frozen=True)
+class SolvedProblem:
+    """A problem and the values of a solution of it."""
+
+    problem: Problem
+    states: States
+    values: dict[str, Array]  # (nodes, k) per parameter that solutions list
+
+    def __call__(self) -> tuple[Any, Any]:
+        """The graph of `Solution.to_gtsam`, and its values."""
+        from graphnav.estimation.factor_graph.nonlinear import Exported  # which needs GTSAM
+
+        return Exported(self.problem, self.states, self.values)()
 
 
 def build_problem(

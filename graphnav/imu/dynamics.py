@@ -217,6 +217,16 @@ class ImuFactors:
         _, dR, moved = self._correct(rows, start, scale)
         return self._earth.reach(rows, start, dR, moved[:, :3], moved[:, 3:])
 
+    def advance_through(self, rows: slice, start: States, scale: Array | None = None) -> States:
+        """The states (n) at the ends of successive intervals, from one at the start of the first."""
+        _, dR, moved = self._correct(rows, start, scale)
+        reached = []
+        for j in range(len(dR)):
+            at, one = slice(rows.start + j, rows.start + j + 1), slice(j, j + 1)
+            start = self._earth.reach(at, start, dR[one], moved[one, :3], moved[one, 3:])
+            reached.append(start)
+        return States.stack(reached)
+
     def _correct(self, rows: slice, start: States, scale: Array | None) -> tuple[Array, Array, Array]:
         """Rotation (n, 3) by bias and scale errors, and dR, (dP, dV) (n, 6) corrected for them."""
         iv = self.intervals

@@ -35,6 +35,7 @@ from graphnav.estimation.noise.moments import (
     collect_row_moments,
     lag_moments,
 )
+from graphnav.estimation.noise.outliers import may_pay
 from graphnav.estimation.noise.priors import get_prior
 from graphnav.estimation.noise.spacing import space_fixes
 from graphnav.estimation.noise.words import describe_far
@@ -81,7 +82,7 @@ def groups(problem: Problem) -> list[str]:
 def moments(problem: Problem, forward: ForwardRecord, smoothed: SmootherPass) -> dict[str, tuple[float, float]]:
     """A and B of every component."""
     out: dict[str, tuple[float, float]] = {}
-    imu = collect_imu_moments(problem, forward, smoothed)
+    imu = collect_imu_moments(problem, forward.predicted_from.R_nb, smoothed)
     out |= {f"imu.{name}": (imu.A[:, i].sum(), imu.B[:, i].sum()) for i, name in enumerate(NOISE_FIGURES)}
     for chain in problem.chains:
         _, A, B = collect_process_moments(problem, chain, smoothed, len(problem.t))
@@ -502,7 +503,7 @@ def test_disturbances_of_intervals_are_as_large_as_chance_has_them() -> None:
     )
     base, opening = built(recording, INERTIAL)
     forward = refilter(base, smooth_backward(base, ekf(base, opening=opening)))
-    found = collect_imu_moments(base, forward, smooth_backward(base, forward))
+    found = collect_imu_moments(base, forward.predicted_from.R_nb, smooth_backward(base, forward))
     for i in range(2):
         likelihood = chdtrc(found.freedom[:, i], found.A[:, i] / found.B[:, i] * found.freedom[:, i])
         told = found.B[:, i] > 0.01
@@ -680,3 +681,11 @@ def test_a_constant_far_beyond_its_prior_is_said(late: tuple[Recording, Trajecto
     assert shown.unit in line
     well, opening = built(oracle.drive(oracle.vehicle_path(duration=200, rate=50.0, seed=6), seed=5)[0])
     assert not describe_far(well, smooth_backward(well, ekf(well, opening=opening)))
+
+
+@pytest.mark.parametrize(("disturbed", "pays"), [(0, False), (1, True), (40, True)])
+def test_a_search_for_outliers_pays_only_where_there_are_some(disturbed: int, pays: bool) -> None:
+    """An error of seven sigmas on each of three axes is worth more than ln(3000), the cost of one outlier."""
+    squared = np.random.default_rng(1).chisquare(3, 2000)
+    squared[:disturbed] = 3 * 7.0**2
+    assert may_pay(squared, np.full(2000, 3.0)) == pays

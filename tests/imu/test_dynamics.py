@@ -145,6 +145,16 @@ def test_transition_is_the_linearization_where_the_residual_is_zero(motion: ImuF
         )
 
 
+@pytest.mark.parametrize("scale", [None, SCALES])
+def test_successive_intervals_are_one_after_the_other(motion: ImuFactors, start: States, scale: Array | None) -> None:
+    x, ends = start[:1], []
+    for k in range(2, N):
+        x = motion.advance(slice(k, k + 1), x, scale)
+        ends.append(x)
+    through = motion.advance_through(slice(2, N), start[:1], scale)
+    assert np.abs(through.minus(States.stack(ends))).max() < 1e-9
+
+
 def test_noise_by_monte_carlo(motion: ImuFactors, start: States) -> None:
     """Perturb the interval's dR, dV, dP and see where the end goes: the frames and the signs of Q."""
     k, runs = 3, 4000

@@ -15,6 +15,7 @@ import numpy as np
 import oracle
 import pytest
 
+from graphnav import run
 from graphnav.app import cli
 from graphnav.estimation.antenna import find_untold_arm, find_wrong_arms, find_wrong_axes
 from graphnav.recording import Recording, take_rows
@@ -437,6 +438,8 @@ def test_a_sign_is_named_where_it_is_all_that_is_wrong(stated: tuple[float, ...]
     assert recording.gnss is not None
     wrong = replace(recording, gnss=replace(recording.gnss, lever_arm=np.array(stated)))
     assert [f.key for f in find_wrong_arms(wrong)] == told
+    solved = run(wrong, solvers="rts", noise="stated")["rts"].graphs
+    assert [f.key for f in find_wrong_arms(wrong, (), solved)] == told
 
 
 def test_axes_that_too_weak_accelerations_do_not_show_are_told_by_the_course(drive: Callable[[str], Recording]) -> None:

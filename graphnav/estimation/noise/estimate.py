@@ -304,7 +304,7 @@ def _improve(
     figures: _Components, problem: Problem, forward: ForwardRecord, smoothed: DisturbancePass, end: int, intervals: bool
 ) -> None:
     """One step for all figures and weights."""
-    imu = collect_imu_moments(problem, forward, smoothed)
+    imu = collect_imu_moments(problem, forward.predicted_from.R_nb, smoothed)
     for i, name in enumerate(NOISE_FIGURES):
         figures.update(f"imu.{name}", *_bound_squares(imu.A[:, i], imu.B[:, i], 3, CHANCE))
     if intervals:
@@ -335,8 +335,7 @@ def _weigh_intervals(figures: _Components, problem: Problem, imu: ImuMoments) ->
     t, n = problem.t[1:], len(imu.A)
     densities = problem.imu_noise.gyro_noise_density, problem.imu_noise.accel_noise_density
     for i, (name, density, lost) in enumerate(zip(INTERVALS, densities, _MANOEUVRE, strict=True)):
-        freedom = imu.freedom[:, i]
-        ratio = imu.A[:, i] / np.maximum(imu.B[:, i], 1e-30) * freedom
+        freedom, ratio = imu.freedom[:, i], imu.squared[:, i]
         # if half of the intervals are off, it is the variance that has not converged yet
         scale = max(float(np.median(ratio / chdtri(freedom, 0.5))), 1.0)
         more = 1.0 / select_weights(t, figures.build_model(), name)

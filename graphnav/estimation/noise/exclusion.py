@@ -63,10 +63,9 @@ from graphnav.estimation.noise.decision import (
 from graphnav.estimation.noise.estimate import NoiseEstimate, estimate_noise
 from graphnav.estimation.noise.explanations import FIXES, ROWS
 from graphnav.estimation.noise.initial_points import BREAKDOWN
-from graphnav.estimation.noise.model import NoiseModel, RowWeights
-from graphnav.estimation.noise.outliers import (
-    limit_squares,
-)
+from graphnav.estimation.noise.model import INTERVALS, NoiseModel, RowWeights
+from graphnav.estimation.noise.moments import collect_imu_moments
+from graphnav.estimation.noise.outliers import limit_squares, may_pay
 from graphnav.estimation.noise.spans import (
     LeftOutErrors,
     Span,
@@ -306,6 +305,8 @@ def _disturb_intervals(base: Problem, found: NoiseEstimate) -> NoiseEstimate:
     """The same from one decision on what is wrong."""
     found = weigh_evidence(base, replace(found, rival=None))
     start, near, passes = found.noise, found.get_linearisation(base), found.passes
+    if not found.noise.excluded and not _may_be_disturbed(base, found):
+        return found
     if found.noise.excluded:
         free = estimate_noise(base, None, replace(found.noise, excluded={}), near, intervals=True)
         decision = explain(base, free, find_suspects(base, free.noise, free))
@@ -322,6 +323,13 @@ def _disturb_intervals(base: Problem, found: NoiseEstimate) -> NoiseEstimate:
     disturbed = weigh_evidence(base, estimate_noise(base, None, start, near, intervals=True))
     best = max(found, disturbed, key=lambda one: log_evidence(base, one))
     return replace(best, passes=passes + disturbed.passes)
+
+
+def _may_be_disturbed(base: Problem, found: NoiseEstimate) -> bool:
+    """Whether more noise for single intervals may gain more than it costs; seldom, and estimating it takes passes."""
+    points, problem = found.points, apply_noise(base, found.noise)
+    imu = collect_imu_moments(problem, points.states.R_nb[:-1], points)
+    return any(may_pay(imu.squared[:, i], imu.freedom[:, i]) for i in range(len(INTERVALS)))
 
 
 def _add_outliers(found: NoiseEstimate, errors: LeftOutErrors, spans: list[Span]) -> NoiseEstimate:

@@ -109,14 +109,18 @@ def _anneal(problem: Problem, opening: float | None) -> tuple[Initial, int]:
     the sigma in place of mu.)
     """
     fixes = [rows for rows in problem.constraints if rows.fix_of]
-    weights, about, wider, passes = {rows.name: np.ones(len(rows)) for rows in fixes}, None, 1.0, 0
+    weights, wider, passes = {rows.name: np.ones(len(rows)) for rows in fixes}, 1.0, 0
+    about: Points | None = None
     stated = {rows.name: np.min(rows.sigma, axis=1) for rows in fixes}  # type: ignore[attr-defined]
     outliers: dict[str, RowWeights] = {}
     while True:
         share = {c.name: 1.0 / (1.0 + (SIZES[c.unit] * wider / stated[c.name]) ** 2) for c in fixes}
         eased = weigh_rows(problem, {name: x * weights[name] for name, x in share.items()})
-        about = smooth_backward(eased, ekf(eased, opening=opening) if about is None else refilter(eased, about))
-        about = smooth_backward(eased, refilter(eased, about))
+        if about is None:
+            about = smooth_backward(eased, ekf(eased, opening=opening))
+        else:
+            about = smooth_points(refilter(eased, about, whole=False))
+        about = smooth_points(refilter(eased, about, whole=False))
         passes += 2
         settled = not share or min(np.median(x) for x in share.values()) > 0.5
         for rows in fixes:

@@ -31,7 +31,7 @@ from graphnav.core.rotation import Array
 from graphnav.core.state import DIM
 from graphnav.estimation.problem import ParameterChain, Problem
 from graphnav.estimation.solvers.linearise import Rows, find_stepping, shift
-from graphnav.estimation.solvers.passes import DisturbancePass, ForwardRecord, split_values
+from graphnav.estimation.solvers.passes import DisturbancePass, split_values
 
 _FORGOTTEN = 1e-6  # relative remainder of a difference below which it is rounding error
 
@@ -55,6 +55,11 @@ class ImuMoments:
     Q: Array  # (n, 4, 15, 15) what each adds to a step
     N: Array  # (n, 15, 15)
 
+    @property
+    def squared(self) -> Array:
+        """(n, 4) nearly chi-square variables of `freedom` where f is right."""
+        return self.A / np.maximum(self.B, 1e-30) * self.freedom
+
     @cached_property
     def freedom(self) -> Array:
         """(n, 4) of the chi-square variable that A freedom / B is near to where f is right."""
@@ -64,13 +69,12 @@ class ImuMoments:
         return np.maximum(freedom, 1.0)
 
 
-def collect_imu_moments(problem: Problem, forward: ForwardRecord, smoothed: DisturbancePass) -> ImuMoments:
-    """Moments of the intervals.
+def collect_imu_moments(problem: Problem, start: Array, smoothed: DisturbancePass) -> ImuMoments:
+    """Moments of the intervals, by the attitudes R_nb (n, 3, 3) at their starts.
 
     A = |s|^2 with s of covariance M, trace(M) = B, is near to a chi-square variable of B^2 / trace(M^2) degrees of
     freedom times B over these (Satterthwaite 1946, "An approximate distribution of estimates of variance components").
     """
-    start = forward.predicted_from.R_nb
     L = problem.motion.compute_frames(slice(0, len(start)), start)
     Lt = np.swapaxes(L, -1, -2)
     r = (Lt @ smoothed.r[1:, :DIM, None])[..., 0]

@@ -53,8 +53,27 @@ def compute_outlier_cost(weights: Mapping[str, RowWeights], totals: Mapping[str,
     How often a sensor has outliers is unknown. With a Beta prior of 1 and 1 / `CHANCE`, its mean `CHANCE`, k given ones
     of n rows are outliers with a probability of B(k + 1, n - k + 1 / `CHANCE`) / B(1, 1 / `CHANCE`).
     """
-    some = [(float(count_reduced(one)), totals[name] + 1.0 / CHANCE) for name, one in weights.items() if name in totals]
-    return sum((float(betaln(1.0, n) - betaln(k + 1.0, n - k)) for k, n in some), 0.0)
+    some = [(count_reduced(one), totals[name]) for name, one in weights.items() if name in totals]
+    return sum((float(_compute_cost(np.array(k), n)) for k, n in some), 0.0)
+
+
+def _compute_cost(k: Array, total: int) -> Array:
+    """The same of k outliers among all rows of one sensor."""
+    n = total + 1.0 / CHANCE
+    return np.asarray(betaln(1.0, n) - betaln(k + 1.0, n - k))
+
+
+def may_pay(squared: Array, freedom: Array) -> bool:
+    """Whether any number of outliers may gain more log-likelihood than it costs.
+
+    Parameters
+    ----------
+    squared : (N,) errors, as stated chi-square variables of m = `freedom` (N,); with the variance that fits it best,
+        each that exceeds m gains (squared - m - m ln(squared / m)) / 2.
+    """
+    ratio = np.maximum(squared / freedom, 1.0)
+    gain = np.sort(0.5 * freedom * (ratio - 1.0 - np.log(ratio)))[::-1]
+    return bool((np.cumsum(gain) > _compute_cost(np.arange(1, len(gain) + 1), len(gain))).any())
 
 
 def compute_latest_cost(some: RowWeights, total: int) -> float:

@@ -131,17 +131,15 @@ class StretchFilter:
 
     def _guess_points(self, k: int, k1: int, x: Points) -> Points:
         """Prediction by the IMU alone."""
-        states, values, scale = x.states, x.values[0], self._problem.columns.get(SCALE)
-        reached, known = [], []
-        for j in range(k, k1):
-            if j:
-                at = slice(j - 1, j)
-                states = self._problem.motion.advance(at, states, None if scale is None else values[shift(scale)])
-                values = self._steps.predict(j - 1, values)
-            reached.append(states)
-            known.append(values)
+        first, scale, values = max(k, 1), self._problem.columns.get(SCALE), [x.values[0]]
+        states = [x.states] if not k else []
+        if first < k1:
+            of_scale = None if scale is None else x.values[0, shift(scale)]
+            states.append(self._problem.motion.advance_through(slice(first - 1, k1 - 1), x.states, of_scale))
+        for j in range(first, k1):
+            values.append(self._steps.predict(j - 1, values[-1]))
         each = self._end[k:k1] - self._start[k:k1] + 1
-        return Points(States.stack(reached), np.array(known)).take(np.repeat(np.arange(k1 - k), each))
+        return Points(States.stack(states), np.array(values[-(k1 - k) :])).take(np.repeat(np.arange(k1 - k), each))
 
     def _filter_about(self, k: int, k1: int, x: Points, P: Array, points: Points) -> tuple[Array, Points]:
         """Filter keyframes k to k1 about points; returns the largest correction, sigmas, up to each keyframe, and the
