@@ -15,10 +15,10 @@ along its line of sight. The sizes of c and q over hours are stated, because a d
 position; the noise model estimates the others.
 
 Against a base station orbit, clock and atmosphere cancel, and q is the multipath of a satellite's codes over minutes, g
-its size by elevation: taken as white it would determine ambiguities to centimetres. Many satellites tell it from a
-shift of the position, so the noise model estimates it. Ranges also have the term - h sin(elevation): signals are
-received at the antennas' phase centres, and h is the height of the rover's phase centre above the point given by its
-lever arm, less that of the base's above its stated position. A drive does not separate it from its height.
+its size by elevation: taken as white it would determine ambiguities to centimetres. It is stated too: estimated, a
+single satellite that is grossly wrong makes those of all too large. Ranges also have the term - h sin(elevation):
+signals are received at the antennas' phase centres, and h is the height of the rover's phase centre above the point
+given by its lever arm, less that of the base's above its stated position. A drive does not separate it from its height.
 
 Ranges are computed as differences against a nominal position of each epoch, which keeps their precision.
 """
@@ -121,8 +121,7 @@ class SatelliteConstraint(Constraint):
     words: ClassVar[Mapping[str, tuple[tuple[str, str, float], ...]]] = {
         CLOCK: (("receiver ahead of GPS time", "µs", 1e6 / C), ("drift of the receiver clock", "m/s", 1.0))
     }
-    # of white parts, and of what lasts
-    noise_axes: ClassVar[tuple[str, ...]] = (*_CLASSES, "horizontal", "up", "satellite")
+    noise_axes: ClassVar[tuple[str, ...]] = (*_CLASSES, "horizontal", "up")  # of white parts, and of what lasts
 
     s_n: Array = field(default_factory=lambda: np.empty((0, 3)))  # m
     R_ln: Array = field(default_factory=lambda: np.empty((0, 3, 3)))
@@ -249,15 +248,14 @@ class GnssCode(RangeConstraint):
         minutes, hours = settings.gnss.slow_times
         if raw.differenced:  # the base sees the same ionosphere
             delay, lasting = np.zeros(len(raw)), compute_code_reflection_sigma(found.elevation)
-            lasts, own = minutes, f"{cls.name}.{TIMES[1]}.satellite"
         else:
-            delay, lasting, lasts, own = found.ionosphere, np.full(len(raw), ONE), hours, ""
+            delay, lasting = found.ionosphere, np.full(len(raw), ONE)
         sigma, many = compute_code_sigma(raw.cn0, found.elevation, delay), len(satellites)
         common["parameters"] += (
             Parameter(CODE_ERRORS[2], np.zeros(3), less * _HOURS, "m", correlation_time=hours, spacing=spacing),
             Parameter(
-                SATELLITES, np.zeros(many), np.ones(many), "1", correlation_time=lasts, spacing=spacing,
-                noise_groups=(own,) * many if own else (),
+                SATELLITES, np.zeros(many), np.ones(many), "1",
+                correlation_time=minutes if raw.differenced else hours, spacing=spacing,
             ),
         )  # fmt: skip
         processes = tuple(

@@ -75,6 +75,11 @@ class Epochs:
             self.rows[k], self.active[k] = slice(lo, hi), arcs[lo:hi]
         self.last = {arc: float(t[k]) for arc, k in zip(arcs, phase.keyframe.tolist(), strict=True)}  # s
 
+    def list_columns(self, name: str) -> list[int]:
+        """Columns of a parameter in the error state."""
+        own = self._all_columns[name]
+        return list(range(own.start, own.stop))
+
     def find_inconsistent(self, k: int, here: Points, known: Known) -> list[Arc]:
         """Arcs with integers without which an inconsistent epoch is consistent.
 

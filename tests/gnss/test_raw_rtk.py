@@ -18,7 +18,6 @@ from helpers import errors, truth_states
 from test_raw_rows import scene
 
 from graphnav.config import parse_settings
-from graphnav.constraints import raw_phase
 from graphnav.constraints.raw_gnss import CLOCK
 from graphnav.constraints.raw_phase import GnssPhase, WholeCycles
 from graphnav.core import earth
@@ -454,25 +453,6 @@ def test_derivatives_are_those_of_differences(exact):
     np.testing.assert_allclose(held.jacobians["a"][:, 0, 0], [1.0, -1.0])
 
 
-@pytest.mark.parametrize("n", [2, 4, 9])
-def test_reflections_shift_a_place_as_least_squares_would(n):
-    rng = np.random.default_rng(n)
-    towards, sigma = 2e7 * rng.normal(size=(2 * n, 3)), rng.uniform(0.004, 0.02, 2 * n)
-    shifts, keyframe = raw_phase._project(towards, sigma, np.repeat([3, 5], n)), np.repeat([0, 1], n)
-    for k in range(2):
-        own = keyframe == k
-        e = towards[own] / np.linalg.norm(towards[own], axis=1)[:, None]
-        A = np.column_stack([e, np.ones(n)]) / sigma[own, None]
-        # of every difference of two satellites, which no clock is in, where the place explains errors of each
-        D = np.eye(n) - np.ones((n, n)) / n
-        place = np.linalg.pinv(A.T @ A)[:3, :3]
-        if n > 3:
-            np.testing.assert_allclose(D @ shifts[own] @ shifts[own].T @ D, D @ e @ place @ e.T @ D, rtol=1e-9)
-        else:  # as much of a difference as there is of it
-            apart = (D @ shifts[own])[0] - (D @ shifts[own])[1]
-            assert apart @ apart == pytest.approx(np.sum(sigma[own] ** 2))
-
-
 def test_reflections_that_last_are_in_the_sigma(drive):
     """As long and as large as they are taken to be, for each satellite by itself: not a shift of the place."""
     recording, truth = drive
@@ -489,10 +469,10 @@ def test_reflections_that_last_are_in_the_sigma(drive):
     spoilt = replace(recording, raw_gnss=replace(raw, carrier=carrier))
     rows = GnssPhase.build(scene(recording, STATED))
     own = rows.keyframe == rows.keyframe[len(rows) // 2]
-    towards = (rows.s_n - rows.nominal)[own]
-    L = np.linalg.lstsq(towards / np.linalg.norm(towards, axis=1)[:, None], rows.reflected[own], rcond=None)[0]
+    e = (rows.s_n - rows.nominal)[own]
+    A = np.column_stack([e / np.linalg.norm(e, axis=1)[:, None], np.ones(len(e))]) / rows.reflected[own, None]
     # nothing is better than the mean of such a process, whose variance over a time T is at least 2 tau / (T + 2 tau)
-    least = np.trace(L @ L.T) * 2.0 * REFLECTED / (np.ptp(raw.t) + 2.0 * REFLECTED)
+    least = np.trace(np.linalg.inv(A.T @ A)[:3, :3]) * 2.0 * REFLECTED / (np.ptp(raw.t) + 2.0 * REFLECTED)
     for one in run(spoilt, STATED, ("ekf", "rts")).values():
         off, sigma = errors(one, truth)[:2]
         fixed = one.fixed[one.fixed[:, 1] > 0.0, 0]
@@ -510,7 +490,7 @@ def drive():
     with pytest.MonkeyPatch.context() as patch:  # reflections of half a dozen satellites would outlast the drive
         patch.setattr(raw_drive, "SATELLITES", raw_drive.MANY)
         recording = raw_drive.with_observations(made, path, noise=0.5, seed=2).crop(0.0, 26.0)
-        return with_carriers(recording, path, 0.003)[0], truth
+        return with_carriers(recording, path, 0.001)[0], truth  # white as modelled towards the zenith
 
 
 def off_by(solution, truth):
@@ -620,7 +600,7 @@ def test_records_name_satellites_and_the_report_sums_them_up(drive):
     tables = tabulate_satellites(one)
     for name in set(record.satellite):
         own = (record.satellite == name) & (record.weight >= 0.5)
-        assert f"{np.sqrt(np.mean(record.nis[own])):.3g}"[:4] in tables[0]
+        assert f"{np.sqrt(np.mean(record.nis[own])):.4g}"[:4] in tables[0]
         assert name in tables[0]
     fixed = int((one.fixed[:, 1] > 0).sum())
     cells = re.findall(r"<td[^>]*>([^<]*)</td>", tabulate_epochs(one)[1])

@@ -43,7 +43,7 @@ from graphnav.constraints.gnss import (
     VELOCITY_ERROR,
     VELOCITY_TIME_OFFSET,
 )
-from graphnav.constraints.raw_gnss import CODE_ERRORS, RATE_ERROR, SATELLITES
+from graphnav.constraints.raw_gnss import CODE_ERRORS, RATE_ERROR
 from graphnav.constraints.vehicle import NHC_ERROR, ODOMETER_ERROR
 from graphnav.core.complaints import suggest_nearest
 from graphnav.core.errors import ConfigError
@@ -198,7 +198,7 @@ def list_groups() -> tuple[str, ...]:
 def _list_processes() -> tuple[str, ...]:
     typed = [f"{error}_{kind}" for error in ERRORS for kind in FIX_TYPES.values()]
     of_antennas = (kind.name_lasting() for kind in (DualHeading, DualPitch))
-    others = VELOCITY_ERROR, *CODE_ERRORS, SATELLITES, RATE_ERROR, STAMP_ERROR, NHC_ERROR, ODOMETER_ERROR
+    others = VELOCITY_ERROR, *CODE_ERRORS, RATE_ERROR, STAMP_ERROR, NHC_ERROR, ODOMETER_ERROR
     return (*ERRORS, *typed, *others, *of_antennas)
 
 
