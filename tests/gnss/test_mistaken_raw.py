@@ -5,6 +5,7 @@ from __future__ import annotations
 import gzip
 import re
 import shutil
+import struct
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
@@ -12,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers import refused
+from ubx_frames import frame
 
 from graphnav.config import Settings
 from graphnav.constraints.raw_gnss import GnssCode
@@ -101,6 +103,27 @@ def test_a_satellite_without_an_ephemeris_is_named_and_the_others_stay(changed, 
 def test_a_base_of_another_day_is_refused(changed):
     with refused("raw.base_time", RecordingError, "base.obs.gz", "24.0 h"):
         changed("base.obs.gz", lambda text: text.replace("> 2021 09 22", "> 2021 09 23"))
+
+
+@pytest.mark.parametrize(("weeks", "days", "key", "words"), [
+    (1, 0, "raw.base_time", ["base.obs.gz", "2021-09-22", "rover.ubx", "2021-09-29"]),
+    (0, 3, "raw.ephemeris_day", ["rover.ubx", "2.9 days"]),
+])  # fmt: skip
+def test_a_log_with_wrong_times_is_named(tmp_path, weeks, days, key, words):
+    """Its ephemerides tell days from each other, but not weeks; the base has dates."""
+    folder = tmp_path / "drive"
+    shutil.copytree(DRIVE, folder)
+    data, out, at = (folder / "rover.ubx").read_bytes(), b"", 0
+    while at < len(data):
+        end = at + 8 + int.from_bytes(data[at + 4 : at + 6], "little")
+        kind, payload = (data[at + 2], data[at + 3]), data[at + 6 : end - 2]
+        if kind == (0x02, 0x15):  # RXM-RAWX
+            t, week = struct.unpack_from("<dH", payload)
+            payload = struct.pack("<dH", t + 86400.0 * days, week + weeks) + payload[10:]
+        out, at = out + frame(kind, payload), end
+    (folder / "rover.ubx").write_bytes(out)
+    with refused(key, RecordingError, *words):
+        read(folder / "ubx.toml")
 
 
 def test_a_base_that_ends_early_leaves_the_rovers_own_observations(changed, whole):

@@ -30,7 +30,7 @@ from graphnav.gnss.differential import add_differences
 from graphnav.gnss.ephemeris import OMEGA_WGS84
 from graphnav.gnss.integers import decorrelate, find_nearest
 from graphnav.gnss.series import RawGnss
-from graphnav.gnss.sigmas import REFLECTED, compute_reflection_sigma
+from graphnav.gnss.sigmas import REFLECTED, compute_code_reflection_sigma, compute_reflection_sigma
 from graphnav.gnss.signals import L1, C, name_satellite, name_signal
 from graphnav.recording.formats import read
 from graphnav.report.satellites import tabulate_epochs, tabulate_satellites
@@ -481,6 +481,25 @@ def test_reflections_that_last_are_in_the_sigma(drive):
         assert np.sum(sigma[k] ** 2, axis=1).min() > 0.9 * least
         # three numbers that hardly change within the drive: chi-square of three or a few more, 99.9 %
         assert 0.05 < np.mean((off[k] / sigma[k]) ** 2) < 5.4
+
+
+def test_float_ambiguities_know_what_lasts_in_codes():
+    """Codes of each satellite are off for minutes: their mean over a drive is no better than at an epoch."""
+    squares = []
+    for seed in range(10):
+        path = oracle.vehicle_path(120.0, 50.0)
+        made, truth = oracle.drive(path, seed=seed, gnss_velocity_sd=(0.1, 0.1, 0.1))
+        recording = raw_drive.with_observations(made, path, noise=0.1, seed=seed).crop(0.0, 26.0)
+        recording = with_carriers(recording, path, 0.001, seed=seed)[0]
+        raw, rng = recording.raw_gnss, np.random.default_rng(seed)
+        _, elevation = compute_directions(raw.antenna, raw.p)
+        _, which = raw.satellites
+        off = compute_code_reflection_sigma(elevation) * rng.standard_normal(which.max() + 1)[which]
+        how = parse_settings({"noise": {"mode": "stated"}, "raw_gnss": {"integers": False}})
+        one = run(replace(recording, raw_gnss=replace(raw, code=raw.code + off)), how, ("rts",))["rts"]
+        error, sigma = errors(one, truth)[:2]
+        squares.append(np.mean((error[-1, :2] / sigma[-1, :2]) ** 2))
+    assert np.mean(squares) < 2.27  # chi-square of twenty numbers, 99.9 %, over twenty
 
 
 @pytest.fixture(scope="module")
