@@ -35,10 +35,10 @@ from graphnav.config import Settings
 from graphnav.constraints.antenna_motion import LEVER_ARM, average_around, compute_antenna_velocity
 from graphnav.constraints.base import BuildContext, Constraint, Linearized
 from graphnav.constraints.gnss import TIMES
-from graphnav.constraints.raw_rows import CLOCK, PreparedRows
+from graphnav.constraints.raw_rows import CLOCK, GROSS, PreparedRows
 from graphnav.constraints.raw_selection import select_observations
 from graphnav.core import rotation
-from graphnav.core.notes import Note
+from graphnav.core.notes import Note, format_count
 from graphnav.core.rotation import Array
 from graphnav.core.state import SECONDS, Parameter, States
 from graphnav.gnss.atmosphere import compute_obliquity
@@ -111,6 +111,11 @@ def make_ionosphere_parameter(raw: RawGnss, spacing: float) -> Parameter:
     """Zenith error of the ionosphere model; against a base station, its difference between the two."""
     sigma = max(_GRADIENT * raw.baseline, 1e-3) if raw.differenced else _ZENITH
     return Parameter(IONOSPHERE, np.zeros(1), np.full(1, sigma), "m", sigma / _ZENITH * _ZENITH_WALK, spacing=spacing)
+
+
+def _tell_gross(count: int) -> tuple[Note, ...]:
+    sentence = f"gnss_code: {format_count(count, 'row')} left out, {GROSS:.0f} m or more off the others of its epoch"
+    return (Note("gnss_code.gross", sentence),) if count else ()
 
 
 @dataclass(frozen=True)
@@ -277,7 +282,7 @@ class GnssCode(RangeConstraint):
             which=which,
             lasting=lasting,
             processes=processes,
-            notes=(Note("gnss_code.systems", note),),
+            notes=(Note("gnss_code.systems", note), *_tell_gross(found.gross)),
             **common,
         )
 

@@ -27,7 +27,7 @@ from typing import ClassVar
 import numpy as np
 
 from graphnav.config import Settings
-from graphnav.constraints.ambiguities import CarrierRows, make_ambiguities, name_ambiguity, replace_gross
+from graphnav.constraints.ambiguities import CarrierRows, make_ambiguities, name_ambiguity
 from graphnav.constraints.base import SAME_TIME, BuildContext, Constraint, Linearized
 from graphnav.constraints.raw_gnss import (
     IONOSPHERE,
@@ -35,7 +35,7 @@ from graphnav.constraints.raw_gnss import (
     make_ionosphere_parameter,
     select_columns,
 )
-from graphnav.constraints.raw_rows import find_epoch_period
+from graphnav.constraints.raw_rows import find_epoch_period, measure_gross
 from graphnav.core.rotation import Array
 from graphnav.core.state import Parameter, States
 from graphnav.gnss.arcs import find_arcs
@@ -84,7 +84,8 @@ class GnssPhase(CarrierRows):
         if not used.any():
             return None
         wavelength = C / raw.frequency
-        code = replace_gross(raw, raw.code + raw.difference, geometry)
+        code = raw.code + raw.difference
+        code = code - measure_gross(raw, code, geometry)  # an arc begins with what the others predict
         guess = raw.carrier + (raw.carrier_difference - code) / wavelength
         guess = np.where(np.isfinite(guess), guess, 0.0)
         own = make_ambiguities(arcs, guess, wavelength)
@@ -107,7 +108,7 @@ class GnssPhase(CarrierRows):
             "elevation": geometry.elevation,
             "level": np.zeros(int(used.sum()), dtype=int),
         }
-        satellites, _ = found.raw.satellites
+        satellites, which = raw.satellites
         many = len(satellites)
         lasting = Parameter(
             REFLECTIONS, np.zeros(many), np.ones(many), "1", correlation_time=REFLECTED, spacing=found.spacing
@@ -122,7 +123,7 @@ class GnssPhase(CarrierRows):
         return cls(
             offset=known - wavelength[used] * raw.carrier - raw.carrier_difference - raw.clock,
             nominal=(raw.antenna - frame.r_e) @ frame.R_ne.T,
-            which=np.searchsorted(satellites, raw.satellite),
+            which=which,
             reflected=reflection * np.sqrt(share),
             reflection=apart / wavelength[used],
             period=find_epoch_period(found.raw, s),

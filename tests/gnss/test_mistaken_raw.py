@@ -15,7 +15,7 @@ import pytest
 from helpers import refused
 from ubx_frames import frame
 
-from graphnav.config import Settings
+from graphnav.config import Settings, parse_settings
 from graphnav.constraints.raw_gnss import GnssCode
 from graphnav.core.errors import RecordingError
 from graphnav.core.notes import get_key
@@ -23,7 +23,7 @@ from graphnav.estimation.pipeline import run
 from graphnav.gnss.arcs import find_arcs
 from graphnav.gnss.precise import read_precise
 from graphnav.gnss.series import RawGnss
-from graphnav.gnss.signals import number_satellite, number_signal
+from graphnav.gnss.signals import name_satellite, number_satellite, number_signal
 from graphnav.recording import Recording
 from graphnav.recording.checks.aiding import describe_gnss_apart
 from graphnav.recording.checks.raw import check_raw
@@ -103,6 +103,21 @@ def test_a_satellite_without_an_ephemeris_is_named_and_the_others_stay(changed, 
 def test_a_base_of_another_day_is_refused(changed):
     with refused("raw.base_time", RecordingError, "base.obs.gz", "24.0 h"):
         changed("base.obs.gz", lambda text: text.replace("> 2021 09 22", "> 2021 09 23"))
+
+
+@pytest.mark.parametrize("mode", ["stated", "estimated"])
+def test_a_satellite_whose_codes_are_grossly_wrong_costs_its_codes_alone(changed, mode):
+    def spoil(text: str) -> str:
+        return re.sub(
+            r"^(G05)( *[\d.]+)", lambda m: f"{m[1]}{float(m[2][:11]) + 1000.0:14.3f}", text, flags=re.MULTILINE
+        )
+
+    recording = changed("rover.obs.gz", spoil)
+    one = run(recording, parse_settings({"noise": {"mode": mode}}), ("rts",))["rts"]
+    assert "gnss_code.gross" in {get_key(note) for note in one.notes}
+    assert name_satellite(number_satellite("G05")) not in set(one.records["gnss_code"].satellite)
+    assert one.fixed[:, 1].all()
+    assert len(one.arcs.begin) < 70  # 60 without the mistake
 
 
 @pytest.mark.parametrize(("weeks", "days", "key", "words"), [
