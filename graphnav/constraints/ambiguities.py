@@ -11,11 +11,8 @@ from graphnav.constraints.raw_gnss import RangeConstraint
 from graphnav.core.rotation import Array
 from graphnav.core.state import Parameter
 from graphnav.gnss.arcs import Arcs
-from graphnav.gnss.series import RawGnss, compute_medians
-from graphnav.gnss.single_point import Geometry
 
 _PREFIX = "ambiguity."
-_GROSS = 3.0  # sigmas beyond which a code does not determine it
 _SIGMA = 30.0  # m, prior 1-sigma about the value from the codes: uninformative
 
 
@@ -52,21 +49,6 @@ def make_ambiguities(arcs: Arcs, guess: Array, wavelength: Array, unit: str = "c
             sigma = _SIGMA / wavelength[first]
             out[slot] = Parameter(name_ambiguity(arcs.names[slot]), guess[first], sigma, unit, begins=begins)
     return out
-
-
-def replace_gross(raw: RawGnss, code: Array, geometry: Geometry) -> Array:
-    """Codes (N,) m of which those that are off the others by more than the prior allows are what the others predict.
-
-    An arc whose first code is wrong would begin with a wrong ambiguity, that says so with a sigma of metres.
-
-    Parameters
-    ----------
-    geometry : at the single-point positions, which outlying codes do not move.
-    """
-    off = code + raw.clock - geometry.distance - geometry.troposphere - geometry.ionosphere
-    off = off - compute_medians(raw.t, off)  # of the receiver's clock
-    off = off - compute_medians(raw.satellite // 100 * 1000 + raw.signal, off)  # of the signals' biases
-    return np.asarray(code - np.where(np.abs(off) > _GROSS * _SIGMA, off, 0.0))
 
 
 def name_ambiguity(slot: str) -> str:

@@ -3,7 +3,7 @@
 With p_a = p + R_nb l the antenna, e the unit vector from it to the satellite s in the Earth-fixed frame of the
 reception, and u = v + R_nb (omega_nb x l) its velocity (Groves 2013, sections 8.4.1, 9.4.1 and 14.1.2)::
 
-    r_code    = |s - p_a| + b + b_s + m z + I + T - dt - e_l.c + q - P
+    r_code    = |s - p_a| + b + b_s + m z + I + T - dt - e_l.c + g q - P
     r_doppler = e.(v_s - u) / k + b' - dt' - e_l.d - D
 
 b and b' are receiver clock and drift, independent at every epoch; b_s is the inter-system (inter-signal) bias, z the
@@ -14,9 +14,11 @@ over hours; d, the same for velocities over seconds; and q, of one satellite ove
 along its line of sight. The sizes of c and q over hours are stated, because a drive does not separate them from its
 position; the noise model estimates the others.
 
-Against a base station ranges also have the term - h sin(elevation): signals are received at the antennas' phase
-centres, and h is the height of the rover's phase centre above the point given by its lever arm, less that of the base's
-above its stated position. A drive does not separate it from its height.
+Against a base station orbit, clock and atmosphere cancel, and q is the multipath of a satellite's codes over minutes, g
+its size by elevation: taken as white it would determine ambiguities to centimetres. It is stated too: estimated, a
+single satellite that is grossly wrong makes those of all too large. Ranges also have the term - h sin(elevation):
+signals are received at the antennas' phase centres, and h is the height of the rover's phase centre above the point
+given by its lever arm, less that of the base's above its stated position. A drive does not separate it from its height.
 
 Ranges are computed as differences against a nominal position of each epoch, which keeps their precision.
 """
@@ -33,15 +35,15 @@ from graphnav.config import Settings
 from graphnav.constraints.antenna_motion import LEVER_ARM, average_around, compute_antenna_velocity
 from graphnav.constraints.base import BuildContext, Constraint, Linearized
 from graphnav.constraints.gnss import TIMES
-from graphnav.constraints.raw_rows import CLOCK, PreparedRows
+from graphnav.constraints.raw_rows import CLOCK, GROSS, PreparedRows
 from graphnav.constraints.raw_selection import select_observations
 from graphnav.core import rotation
-from graphnav.core.notes import Note
+from graphnav.core.notes import Note, format_count
 from graphnav.core.rotation import Array
 from graphnav.core.state import SECONDS, Parameter, States
 from graphnav.gnss.atmosphere import compute_obliquity
 from graphnav.gnss.series import RawGnss
-from graphnav.gnss.sigmas import compute_code_sigma, compute_rate_sigma
+from graphnav.gnss.sigmas import compute_code_reflection_sigma, compute_code_sigma, compute_rate_sigma
 from graphnav.gnss.signals import L1, SYSTEM_NAMES, C, name_satellite, name_signal
 from graphnav.gnss.single_point import group_signals
 from graphnav.recording import Recording
@@ -109,6 +111,11 @@ def make_ionosphere_parameter(raw: RawGnss, spacing: float) -> Parameter:
     """Zenith error of the ionosphere model; against a base station, its difference between the two."""
     sigma = max(_GRADIENT * raw.baseline, 1e-3) if raw.differenced else _ZENITH
     return Parameter(IONOSPHERE, np.zeros(1), np.full(1, sigma), "m", sigma / _ZENITH * _ZENITH_WALK, spacing=spacing)
+
+
+def _tell_gross(count: int) -> tuple[Note, ...]:
+    sentence = f"gnss_code: {format_count(count, 'row')} left out, {GROSS:.0f} m or more off the others of its epoch"
+    return (Note("gnss_code.gross", sentence),) if count else ()
 
 
 @dataclass(frozen=True)
@@ -212,6 +219,7 @@ class GnssCode(RangeConstraint):
     group: Array = field(default_factory=lambda: np.empty(0, dtype=int))  # (N,) group of the signal, 0 the reference
     which: Array = field(default_factory=lambda: np.empty(0, dtype=int))  # (N,) satellite, index into their errors
     slant: Array = field(default_factory=lambda: np.empty(0))  # (N,) ionospheric mapping function
+    lasting: Array = field(default_factory=lambda: np.empty(0))  # (N,) m, of a unit of the satellites' errors
 
     @classmethod
     def epochs(cls, recording: Recording, settings: Settings, stationary: Array) -> Array:
@@ -242,14 +250,19 @@ class GnssCode(RangeConstraint):
             )
         common["parameters"] += more
         satellites, which = raw.satellites
-        sigma, many = compute_code_sigma(raw.cn0, found.elevation, found.ionosphere), len(satellites)
         minutes, hours = settings.gnss.slow_times
+        if raw.differenced:  # the base sees the same ionosphere
+            delay, lasting = np.zeros(len(raw)), compute_code_reflection_sigma(found.elevation)
+        else:
+            delay, lasting = found.ionosphere, np.full(len(raw), ONE)
+        sigma, many = compute_code_sigma(raw.cn0, found.elevation, delay), len(satellites)
         common["parameters"] += (
             Parameter(CODE_ERRORS[2], np.zeros(3), less * _HOURS, "m", correlation_time=hours, spacing=spacing),
             Parameter(
-                SATELLITES, np.zeros(many), np.full(many, less * ONE), "m", correlation_time=hours, spacing=spacing
+                SATELLITES, np.zeros(many), np.ones(many), "1",
+                correlation_time=minutes if raw.differenced else hours, spacing=spacing,
             ),
-        )
+        )  # fmt: skip
         processes = tuple(
             Parameter(
                 error, np.zeros(3), _ERROR, "m", correlation_time=lasts, spacing=spacing,
@@ -267,18 +280,20 @@ class GnssCode(RangeConstraint):
             slant=compute_obliquity(found.elevation) * (L1 / raw.frequency) ** 2,
             sigma=sigma[:, None],
             which=which,
+            lasting=lasting,
             processes=processes,
-            notes=(Note("gnss_code.systems", note),),
+            notes=(Note("gnss_code.systems", note), *_tell_gross(found.gross)),
             **common,
         )
 
     def linearize(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> Linearized:
         residual, J, e = self._linearize_ranges(states, parameters, rows, IONOSPHERE, self.slant[rows])
-        chosen = {BIASES: self.group[rows] - 1, SATELLITES: self.which[rows]}
-        for name, which in chosen.items():
-            if name in parameters:
-                own, J[name] = select_columns(parameters[name], which)
-                residual = residual + own
+        if BIASES in parameters:
+            own, J[BIASES] = select_columns(parameters[BIASES], self.group[rows] - 1)
+            residual = residual + own
+        own, chosen = select_columns(parameters[SATELLITES], self.which[rows])
+        lasting = self.lasting[rows]
+        residual, J[SATELLITES] = residual + lasting * own, lasting[:, None, None] * chosen
         shift, more = self._sum_lasting_errors(parameters, CODE_ERRORS, rows, e)
         return Linearized((residual + shift)[:, None], J | more, self.sigma[rows])
 

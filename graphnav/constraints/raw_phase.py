@@ -2,7 +2,7 @@
 
 With the quantities of `graphnav.constraints.raw_gnss`, and N the difference of rover's and base's ambiguity (cycles),
 
-    r_phase   = |s - p_a| + b - m z + T - dt - lambda (phi - N) + e.L c - h sin(elevation)
+    r_phase   = |s - p_a| + b - m z + T - dt - lambda (phi - N) + g q - h sin(elevation)
 
 b is the clock of the codes. There is one row per satellite and signal instead of double differences: sigmas are then
 independent, a robust kernel concerns a single satellite, and no satellite is a reference. Receiver phase biases are
@@ -12,10 +12,11 @@ common to all ambiguities of one signal of a system; integers are therefore diff
 
 (Teunissen and Montenbruck 2017, chapters 21, 23, 26). Rows exist only with a base station.
 
-Multipath is time-correlated: residuals at correct integers are correlated over ten seconds and more and do not average
-out like white noise. L c is its effect expressed as a shift of the position, with c a process of unit variance in the
-axes of n, and L L^T the covariance of an epoch's position due to multipath alone. The part of multipath that is no
-shift stays in the sigma of the rows.
+Multipath is time-correlated: residuals at correct integers are correlated over ten seconds to minutes and do not
+average out like white noise. Float ambiguities draw the position from changes of millimetres while the directions to
+the satellites turn, which white noise would tell to a centimetre. So each satellite has an error g q, q a process of
+unit variance and g the size of the mean of its signals' multipath, independent from signal to signal; how signals
+differ from that mean stays in the sigma of the rows.
 """
 
 from __future__ import annotations
@@ -26,23 +27,25 @@ from typing import ClassVar
 import numpy as np
 
 from graphnav.config import Settings
-from graphnav.constraints.ambiguities import CarrierRows, make_ambiguities, name_ambiguity, replace_gross
+from graphnav.constraints.ambiguities import CarrierRows, make_ambiguities, name_ambiguity
 from graphnav.constraints.base import SAME_TIME, BuildContext, Constraint, Linearized
-from graphnav.constraints.raw_gnss import IONOSPHERE, list_common_fields, make_ionosphere_parameter
-from graphnav.constraints.raw_rows import find_epoch_period
-from graphnav.core import rotation
+from graphnav.constraints.raw_gnss import (
+    IONOSPHERE,
+    list_common_fields,
+    make_ionosphere_parameter,
+    select_columns,
+)
+from graphnav.constraints.raw_rows import find_epoch_period, measure_gross
 from graphnav.core.rotation import Array
 from graphnav.core.state import Parameter, States
 from graphnav.gnss.arcs import find_arcs
 from graphnav.gnss.atmosphere import compute_obliquity
-from graphnav.gnss.sigmas import REFLECTED, compute_carrier_difference_sigma, compute_reflection_sigma
+from graphnav.gnss.sigmas import REFLECTED, compute_carrier_sigma, compute_reflection_sigma
 from graphnav.gnss.signals import GLONASS, L1, C
 from graphnav.gnss.single_point import choose_coefficients, look
 from graphnav.recording import Recording
 
 REFLECTIONS = "gnss_reflections"
-# share of the position information in the best-observed direction; directions with less count as unobserved
-_WEAKEST = 1e-3
 EXACT = 1e-3  # cycles, 1-sigma of an ambiguity difference fixed to an integer: a tenth of the phase noise
 
 
@@ -55,7 +58,8 @@ class GnssPhase(CarrierRows):
     noise_axes: ClassVar[tuple[str, ...]] = ()
 
     slant: Array = field(default_factory=lambda: np.empty(0))  # (N,) ionospheric mapping function
-    reflected: Array = field(default_factory=lambda: np.empty((0, 3)))  # (N, 3) m, e.L
+    which: Array = field(default_factory=lambda: np.empty(0, dtype=int))  # (N,) satellite, index into their errors
+    reflected: Array = field(default_factory=lambda: np.empty(0))  # (N,) m, of a unit of these
 
     def list_noise_groups(self) -> tuple[tuple[str, ...], Array]:
         return (), np.full((len(self), 1), -1)
@@ -80,7 +84,8 @@ class GnssPhase(CarrierRows):
         if not used.any():
             return None
         wavelength = C / raw.frequency
-        code = replace_gross(raw, raw.code + raw.difference, geometry)
+        code = raw.code + raw.difference
+        code = code - measure_gross(raw, code, geometry)  # an arc begins with what the others predict
         guess = raw.carrier + (raw.carrier_difference - code) / wavelength
         guess = np.where(np.isfinite(guess), guess, 0.0)
         own = make_ambiguities(arcs, guess, wavelength)
@@ -103,23 +108,29 @@ class GnssPhase(CarrierRows):
             "elevation": geometry.elevation,
             "level": np.zeros(int(used.sum()), dtype=int),
         }
+        satellites, which = raw.satellites
+        many = len(satellites)
         lasting = Parameter(
-            REFLECTIONS, np.zeros(3), np.ones(3), "1", correlation_time=REFLECTED, spacing=found.spacing
+            REFLECTIONS, np.zeros(many), np.ones(many), "1", correlation_time=REFLECTED, spacing=found.spacing
         )
         common["parameters"] += (make_ionosphere_parameter(found.raw, found.spacing), lasting, *(own[k] for k in there))
-        nominal = (raw.antenna - frame.r_e) @ frame.R_ne.T
-        reflection = np.sqrt(2.0) * compute_reflection_sigma(geometry.elevation)  # of two receivers
+        # of two receivers; the mean of a satellite's signals, and their differences from it
+        reflection = np.sqrt(2.0) * compute_reflection_sigma(geometry.elevation)
+        share = 1.0 / _count_signals(keyframe[used], raw.satellite)
+        apart = reflection * np.sqrt(1.0 - share)
+        white = np.sqrt(2.0) * compute_carrier_sigma(raw.cn0, geometry.elevation, wavelength[used])
         known = geometry.distance + geometry.troposphere - geometry.ionosphere
         return cls(
             offset=known - wavelength[used] * raw.carrier - raw.carrier_difference - raw.clock,
-            nominal=nominal,
-            reflected=_project(common["s_n"] - nominal, reflection, keyframe[used]),
-            reflection=reflection / wavelength[used],
+            nominal=(raw.antenna - frame.r_e) @ frame.R_ne.T,
+            which=which,
+            reflected=reflection * np.sqrt(share),
+            reflection=apart / wavelength[used],
             period=find_epoch_period(found.raw, s),
             slant=-compute_obliquity(geometry.elevation) * (L1 / raw.frequency) ** 2,
             wavelength=wavelength[used],
             half_slip=0.25 * wavelength[used],  # of half a cycle
-            sigma=compute_carrier_difference_sigma(raw.cn0, geometry.elevation, wavelength[used])[:, None],
+            sigma=np.hypot(white, apart)[:, None],
             slot=place[arcs.slot[used]],
             begin=arcs.begin[used],
             whole=~raw.half,
@@ -135,9 +146,9 @@ class GnssPhase(CarrierRows):
             name, own = self.slots[k], np.where(slot == k, wavelength, 0.0)
             residual = residual + own * parameters[name][:, 0]
             J[name] = own[:, None, None]
-        if REFLECTIONS in parameters:
-            residual = residual + np.sum(self.reflected[rows] * parameters[REFLECTIONS], axis=1)
-            J[REFLECTIONS] = self.reflected[rows, None]
+        own, chosen = select_columns(parameters[REFLECTIONS], self.which[rows])
+        reflected = self.reflected[rows]
+        residual, J[REFLECTIONS] = residual + reflected * own, reflected[:, None, None] * chosen
         return Linearized(residual[:, None], J, self.sigma[rows])
 
 
@@ -150,30 +161,10 @@ def compute_variance_left(duration: Array, period: float) -> Array:
     return np.asarray(2.0 * a / (n * (1.0 - a)) * (1.0 - (1.0 - a**n) / (n * (1.0 - a))))
 
 
-def _project(towards: Array, sigma: Array, keyframe: Array) -> Array:
-    """(N, 3) m, e.L of each row: L L^T is the covariance of an epoch's position, with a clock, for errors of these
-    sigmas.
-
-    Parameters
-    ----------
-    towards : (N, 3) m, from the antenna to the satellite.
-    sigma : (N,) m.
-    keyframe : (N,) of the epochs.
-    """
-    e = towards / np.linalg.norm(towards, axis=1, keepdims=True)
-    epochs, which = np.unique(keyframe, return_inverse=True)
-    weight = sigma**-2.0
-    total, mean = np.zeros(len(epochs)), np.zeros((len(epochs), 3))
-    np.add.at(total, which, weight)
-    np.add.at(mean, which, weight[:, None] * e)
-    from_mean = e - (mean / total[:, None])[which]
-    information = np.zeros((len(epochs), 3, 3))
-    np.add.at(information, which, weight[:, None, None] * from_mean[:, :, None] * from_mean[:, None])
-    told, axes = np.linalg.eigh(information)
-    known = told > _WEAKEST * told[:, -1:]
-    size = np.where(known, 1.0 / np.sqrt(np.where(known, told, 1.0)), 0.0)
-    root = (axes * size[:, None]) @ np.swapaxes(axes, -1, -2)  # symmetric: independent of the eigenvectors' order
-    return np.asarray(rotation.mv(root[which], e))
+def _count_signals(keyframe: Array, satellite: Array) -> Array:
+    """(N,) number of signals of each row's satellite at its epoch."""
+    _, of, many = np.unique(np.stack([keyframe, satellite]), axis=1, return_inverse=True, return_counts=True)
+    return np.asarray(many[of.reshape(-1)])
 
 
 @dataclass(frozen=True)

@@ -15,11 +15,12 @@ from graphnav.core import earth
 from graphnav.core.rotation import Array
 from graphnav.core.state import Parameter
 from graphnav.gnss.ephemeris import rotate_earth
-from graphnav.gnss.series import RawGnss
+from graphnav.gnss.series import RawGnss, compute_medians
 from graphnav.gnss.signals import C
-from graphnav.gnss.single_point import choose_coefficients, compute_stretch, look
+from graphnav.gnss.single_point import Geometry, choose_coefficients, compute_stretch, look
 
 CLOCK = "receiver_clock"
+GROSS = 90.0  # m off the others, beyond which a code tells nothing: three sigmas of a signal's bias
 _CLOCK_SIGMA = np.array([100.0, 10.0])  # m, m/s, about the single-point solution: uninformative
 
 
@@ -39,6 +40,7 @@ class PreparedRows:
     ionosphere: Array  # (N,) m
     stretch: Array  # (N,)
     spacing: float  # s between nodes of slowly varying parameters
+    gross: int = 0  # rows left out whose codes are grossly wrong
 
     @property
     def clock(self) -> Parameter:
@@ -49,7 +51,7 @@ class PreparedRows:
 
     def take(self, which: NDArray[np.bool_]) -> PreparedRows:
         """Some of the rows."""
-        own = {f.name: getattr(self, f.name)[which] for f in fields(self) if f.name not in ("raw", "spacing")}
+        own = {f.name: getattr(self, f.name)[which] for f in fields(self) if f.name not in ("raw", "spacing", "gross")}
         return replace(self, raw=self.raw.take(which), **own)
 
 
@@ -62,8 +64,11 @@ def prepare_every(scene: BuildContext) -> PreparedRows | None:
     used = geometry.elevation >= np.radians(scene.settings.raw_gnss.elevation)
     if not used.any():
         return None
-    raw = raw.take(used)
-    geometry = look(raw, raw.antenna, choose_coefficients(raw))
+    raw, geometry = raw.take(used), geometry.take(used)
+    gross = measure_gross(raw, raw.code + raw.difference if raw.differenced else raw.code, geometry) != 0.0
+    raw, geometry = raw.take(~gross), geometry.take(~gross)
+    if not len(raw):
+        return None
     frame = scene.frame
     return PreparedRows(
         raw=raw,
@@ -78,7 +83,21 @@ def prepare_every(scene: BuildContext) -> PreparedRows | None:
         ionosphere=geometry.ionosphere,
         stretch=compute_stretch(raw, geometry),
         spacing=find_node_spacing(scene.settings.gnss.slow_times, find_epoch_period(raw, scene.settings.raw_gnss)),
+        gross=int(gross.sum()),
     )
+
+
+def measure_gross(raw: RawGnss, code: Array, geometry: Geometry) -> Array:
+    """(N,) m by which codes (N,) are off the others, where that is gross; 0 elsewhere.
+
+    Parameters
+    ----------
+    geometry : at the single-point positions, which outlying codes do not move.
+    """
+    off = code + raw.clock - geometry.distance - geometry.troposphere - geometry.ionosphere
+    off = off - compute_medians(raw.t, off)  # of the receiver's clock
+    off = off - compute_medians(raw.satellite // 100 * 1000 + raw.signal, off)  # of the signals' biases
+    return np.asarray(np.where(np.abs(off) > GROSS, off, 0.0))
 
 
 def select_rows(every: PreparedRows | None) -> PreparedRows | None:

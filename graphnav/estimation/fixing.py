@@ -29,7 +29,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from graphnav.constraints.ambiguities import CarrierRows
-from graphnav.constraints.raw_phase import EXACT, WholeCycles
+from graphnav.constraints.raw_gnss import SATELLITES
+from graphnav.constraints.raw_phase import EXACT, REFLECTIONS, WholeCycles
 from graphnav.core.progress import Progress
 from graphnav.core.rotation import Array
 from graphnav.core.state import BLOCKS, DIM
@@ -47,6 +48,8 @@ _SUCCESS, _RATIO = 0.999, 3.0
 _FIXING_ROUNDS = 4  # of the smoother: each sweep uses the integers of the one before; the last finds hardly any
 # m, m/s, 1-sigma of position and velocity after wrong integers: wider than from the codes
 LOST_PLACE, LOST_SPEED = 10.0, 1.0
+LOST_ERRORS = (REFLECTIONS, SATELLITES)  # errors that last, of unit variance, which wrong integers leave wrong
+_ANYTHING = 1e6  # variance of one of these before it is reset
 
 
 @dataclass(frozen=True)
@@ -300,12 +303,17 @@ class _Causal:
             added[BLOCKS["p"]], added[BLOCKS["v"]] = LOST_PLACE**2, LOST_SPEED**2
         for name, _ in held.anew:
             added[epochs.columns[name]] = self._unknown[name] ** 2
-        H, r = np.zeros((len(held.found), len(P))), np.zeros(len(held.found))
+        lost = [c for name in LOST_ERRORS for c in epochs.list_columns(name)] if held.let_go else []
+        added[lost] = _ANYTHING
+        count = len(held.found)
+        H, r = np.zeros((count + len(lost), len(P))), np.zeros(count + len(lost))
+        H[count + np.arange(len(lost)), lost], r[count:] = 1.0, values[np.array(lost, dtype=int) - DIM]
+        sigma = np.concatenate([np.full(count, EXACT), np.ones(len(lost))])
         for i, (a, b, n) in enumerate(held.found):
             first, second = epochs.columns[a[0]], epochs.columns[b[0]]
             H[i, first], H[i, second] = 1.0, -1.0
             r[i] = values[first - DIM] - values[second - DIM] - n
-        return DecidedRows(H, r, np.full(len(r), EXACT), added) if len(r) or added.any() else None
+        return DecidedRows(H, r, sigma, added) if len(r) or added.any() else None
 
 
 def _sweep(epochs: Epochs, smoothed: SmootherPass, known: Known) -> None:

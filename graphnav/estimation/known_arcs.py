@@ -13,11 +13,11 @@ import numpy as np
 from scipy.special import gammaincinv  # scipy.stats would take half a second to import
 
 from graphnav.constraints.ambiguities import CarrierRows, list_slots
-from graphnav.constraints.raw_phase import compute_variance_left
+from graphnav.constraints.raw_phase import REFLECTIONS, compute_variance_left
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM
 from graphnav.estimation.solution import CarrierArcs
-from graphnav.estimation.solvers.linearise import Points, Rows, linearise
+from graphnav.estimation.solvers.linearise import Points, Rows, linearise, shift
 
 ENOUGH = 4  # differences of a fixed epoch: one more than a position needs, so that they check each other
 _ALARM = 0.001  # share of epochs with correct integers that fail the consistency test
@@ -75,6 +75,11 @@ class Epochs:
             self.rows[k], self.active[k] = slice(lo, hi), arcs[lo:hi]
         self.last = {arc: float(t[k]) for arc, k in zip(arcs, phase.keyframe.tolist(), strict=True)}  # s
 
+    def list_columns(self, name: str) -> list[int]:
+        """Columns of a parameter in the error state."""
+        own = self._all_columns[name]
+        return list(range(own.start, own.stop))
+
     def find_inconsistent(self, k: int, here: Points, known: Known) -> list[Arc]:
         """Arcs with integers without which an inconsistent epoch is consistent.
 
@@ -93,8 +98,12 @@ class Epochs:
         # with the integers in place of the estimates; a common offset belongs to the clock
         at = np.array([self.columns[arcs[i][0]] for i in used]) - DIM
         off = np.array([known.find(arcs[i])[1] for i in used]) - here.values[0, at]
+        # nor are reflections what a float ambiguity left them: they are a part of the noise here
+        reflected, of_all = rows.linear.jacobians[REFLECTIONS][used, 0], self._all_columns[REFLECTIONS]
         r = rows.residual[used, 0] + self.phase.wavelength[own][used] * off
-        A, r = A / rows.stated[used], r / rows.stated[used, 0]
+        r = r - reflected @ here.values[0, shift(of_all)]
+        sigma = np.hypot(rows.stated[used, 0], np.linalg.norm(reflected, axis=1))
+        A, r = A / sigma[:, None], r / sigma
         kept = np.ones(len(used), dtype=bool)
         while True:
             Q, _ = np.linalg.qr(A[kept][:, A[kept].any(axis=0)])

@@ -12,6 +12,7 @@ from graphnav.core import earth
 from graphnav.core.errors import RecordingError
 from graphnav.core.notes import Note, get_key
 from graphnav.core.rotation import Array
+from graphnav.core.timescales import gps_to_utc
 from graphnav.gnss.antex import Antennas, read_antex
 from graphnav.gnss.differential import add_differences
 from graphnav.gnss.ephemeris import Ephemerides
@@ -208,9 +209,10 @@ def _difference_by_base(
     apart = max(obs.t[0] - raw.t[-1], raw.t[0] - obs.t[-1])
     if apart > 0.0:
         away_by = f"{apart / 3600.0:.1f} h" if apart > 3600.0 else f"{apart:.3g} s"
+        rover_day, base_day = (gps_to_utc(one.zero + one.t[0]).astype("datetime64[D]") for one in (raw, obs))
         raise RecordingError(
-            f"{sources.base[0]}: the base's observations are {away_by} away from those of the rover; it must be of the "
-            "same time",
+            f"{sources.base[0]} and {sources.rover[0].name}: the base's observations are of {base_day}, the rover's of "
+            f"{rover_day}, {away_by} apart; both must be of the same time: is one of the dates wrong?",
             key="raw.base_time",
         )
     away = float(np.linalg.norm(np.median(raw.antenna, axis=0) - position))
@@ -282,6 +284,12 @@ def _check_dates(obs: Observations, nav: Ephemerides | None, precise: Orbits | N
             continue
         low, high = float(np.min(times)), float(np.max(times))
         apart = max(low - end, begin - high)
+        if apart > 6.0 * 3600.0 and not file:  # a log, whose ephemerides have no week of their own
+            raise RecordingError(
+                f"{sources.rover[0]}: its ephemerides are {apart / 86400.0:.1f} days from its observations: the times "
+                "of its RXM-RAWX messages are wrong",
+                key="raw.ephemeris_day",
+            )
         if apart > 6.0 * 3600.0:
             raise RecordingError(
                 f"{file[0]}: its ephemerides are {apart / 86400.0:.1f} days from the observations of "

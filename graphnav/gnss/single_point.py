@@ -14,7 +14,7 @@ at once. Outlying rows of an epoch are down-weighted by Cauchy's kernel.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,6 +46,10 @@ class Geometry:
     elevation: Array  # (N,) rad
     ionosphere: Array  # (N,) m
     troposphere: Array  # (N,) m
+
+    def take(self, which: NDArray[np.bool_]) -> Geometry:
+        """Some of the rows."""
+        return Geometry(**{f.name: getattr(self, f.name)[which] for f in fields(self)})
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,16 @@ from graphnav.core.state import BLOCKS, Parameter
 from graphnav.estimation.factor_graph.tree_window import TreeWindow
 from graphnav.estimation.faults.verdicts import Verdicts
 from graphnav.estimation.faults.watch import Watch
-from graphnav.estimation.fixing import LOST_PLACE, LOST_SPEED, Held, add_integers, hold_on, may_fix, split_carriers
+from graphnav.estimation.fixing import (
+    LOST_ERRORS,
+    LOST_PLACE,
+    LOST_SPEED,
+    Held,
+    add_integers,
+    hold_on,
+    may_fix,
+    split_carriers,
+)
 from graphnav.estimation.known_arcs import Epochs
 from graphnav.estimation.noise.apply import select_weights
 from graphnav.estimation.noise.model import INTERVALS, STATED, NoiseModel
@@ -206,7 +215,7 @@ class Chain:
         if held.found or held.let_go or held.anew:
             self.window.truncate(len(self.window) - 1)
             place = replace(place, problem=_add_decisions(problem, {place.t: held}))
-            place = replace(place, steps=(*place.steps, *self._begin_ambiguities(problem, place.steps, held)))
+            place = replace(place, steps=self._begin_anew(problem, place.steps, held))
             turn = max(turn, self.window.push(place))
         self._nodes.append(nodes)
         self._held.append(held)
@@ -224,16 +233,21 @@ class Chain:
         epochs, search = Epochs(phase, newest.columns, problem.t), may_fix(problem, phase)
         return hold_on(held, epochs, k, here, lambda: newest.covariance, search)
 
-    def _begin_ambiguities(self, problem: Problem, steps: tuple[Step, ...], held: Held) -> tuple[Step, ...]:
-        """Reset ambiguities about their current estimates, except those that begin anew in any case."""
+    def _begin_anew(self, problem: Problem, steps: tuple[Step, ...], held: Held) -> tuple[Step, ...]:
+        """Steps with ambiguities reset about their current estimates, except those that begin anew in any case, and
+        errors that wrong integers left wrong."""
         phase, newest, started = split_carriers(problem)[1], self.window.newest, {step.name for step in steps}
         assert phase is not None
-        return tuple(
+        lost = LOST_ERRORS if held.let_go else ()
+        kept = tuple(step for step in steps if step.name not in lost)
+        errors = ((name, self._parameters[name]) for name in lost if name in newest.columns)
+        again = tuple(
             Step(p.name, newest.get_value(p.name), p.sigma[0])
             for p in phase.parameters
             if p.name in phase.slots and p.name in newest.columns and p.name not in started
             if held.let_go or any(name == p.name for name, _ in held.anew)
         )
+        return (*kept, *again, *(Step(name, p.initial, p.sigma) for name, p in errors))
 
     def _place(self, problem: Problem, k: int) -> tuple[Place, dict[str, float]]:
         """Append keyframe `k` of a problem, with the times when each parameter's node began there."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import gzip
 import re
 import shutil
+import struct
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
@@ -12,8 +13,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers import refused
+from ubx_frames import frame
 
-from graphnav.config import Settings
+from graphnav.config import Settings, parse_settings
 from graphnav.constraints.raw_gnss import GnssCode
 from graphnav.core.errors import RecordingError
 from graphnav.core.notes import get_key
@@ -21,7 +23,7 @@ from graphnav.estimation.pipeline import run
 from graphnav.gnss.arcs import find_arcs
 from graphnav.gnss.precise import read_precise
 from graphnav.gnss.series import RawGnss
-from graphnav.gnss.signals import number_satellite, number_signal
+from graphnav.gnss.signals import name_satellite, number_satellite, number_signal
 from graphnav.recording import Recording
 from graphnav.recording.checks.aiding import describe_gnss_apart
 from graphnav.recording.checks.raw import check_raw
@@ -101,6 +103,42 @@ def test_a_satellite_without_an_ephemeris_is_named_and_the_others_stay(changed, 
 def test_a_base_of_another_day_is_refused(changed):
     with refused("raw.base_time", RecordingError, "base.obs.gz", "24.0 h"):
         changed("base.obs.gz", lambda text: text.replace("> 2021 09 22", "> 2021 09 23"))
+
+
+@pytest.mark.parametrize("mode", ["stated", "estimated"])
+def test_a_satellite_whose_codes_are_grossly_wrong_costs_its_codes_alone(changed, mode):
+    def spoil(text: str) -> str:
+        return re.sub(
+            r"^(G05)( *[\d.]+)", lambda m: f"{m[1]}{float(m[2][:11]) + 1000.0:14.3f}", text, flags=re.MULTILINE
+        )
+
+    recording = changed("rover.obs.gz", spoil)
+    one = run(recording, parse_settings({"noise": {"mode": mode}}), ("rts",))["rts"]
+    assert "gnss_code.gross" in {get_key(note) for note in one.notes}
+    assert name_satellite(number_satellite("G05")) not in set(one.records["gnss_code"].satellite)
+    assert one.fixed[:, 1].all()
+    assert len(one.arcs.begin) < 70  # 60 without the mistake
+
+
+@pytest.mark.parametrize(("weeks", "days", "key", "words"), [
+    (1, 0, "raw.base_time", ["base.obs.gz", "2021-09-22", "rover.ubx", "2021-09-29"]),
+    (0, 3, "raw.ephemeris_day", ["rover.ubx", "2.9 days"]),
+])  # fmt: skip
+def test_a_log_with_wrong_times_is_named(tmp_path, weeks, days, key, words):
+    """Its ephemerides tell days from each other, but not weeks; the base has dates."""
+    folder = tmp_path / "drive"
+    shutil.copytree(DRIVE, folder)
+    data, out, at = (folder / "rover.ubx").read_bytes(), b"", 0
+    while at < len(data):
+        end = at + 8 + int.from_bytes(data[at + 4 : at + 6], "little")
+        kind, payload = (data[at + 2], data[at + 3]), data[at + 6 : end - 2]
+        if kind == (0x02, 0x15):  # RXM-RAWX
+            t, week = struct.unpack_from("<dH", payload)
+            payload = struct.pack("<dH", t + 86400.0 * days, week + weeks) + payload[10:]
+        out, at = out + frame(kind, payload), end
+    (folder / "rover.ubx").write_bytes(out)
+    with refused(key, RecordingError, *words):
+        read(folder / "ubx.toml")
 
 
 def test_a_base_that_ends_early_leaves_the_rovers_own_observations(changed, whole):
