@@ -14,11 +14,11 @@ over hours; d, the same for velocities over seconds; and q, of one satellite ove
 along its line of sight. The sizes of c and q over hours are stated, because a drive does not separate them from its
 position; the noise model estimates the others.
 
-Against a base station orbit, clock and atmosphere cancel, and q is what is left over hours of a satellite's codes, of size
-g: taken as white it would determine ambiguities to centimetres. It is stated too: estimated, a single satellite that is
-grossly wrong makes those of all too large. Ranges also have the term - h sin(elevation): signals are received at the
-antennas' phase centres, and h is the height of the rover's phase centre above the point given by its lever arm, less
-that of the base's above its stated position. A drive does not separate it from its height.
+Against a base station orbit, clock and atmosphere cancel, and q is what is left over hours of a satellite's codes, of
+size g: taken as white it would determine ambiguities to centimetres. It is stated too: estimated, a single satellite
+that is grossly wrong makes those of all too large. Ranges also have the term - h sin(elevation): signals are received
+at the antennas' phase centres, and h is the height of the rover's phase centre above the point given by its lever arm,
+less that of the base's above its stated position. A drive does not separate it from its height.
 
 Ranges are computed as differences against a nominal position of each epoch, which keeps their precision.
 """
