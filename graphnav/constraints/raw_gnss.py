@@ -14,11 +14,13 @@ over hours; d, the same for velocities over seconds; and q, of one satellite ove
 along its line of sight. The sizes of c and q over hours are stated, because a drive does not separate them from its
 position; the noise model estimates the others.
 
-Against a base station orbit, clock and atmosphere cancel, and q is what is left over hours of a satellite's codes, of
-size g: taken as white it would determine ambiguities to centimetres. It is stated too: estimated, a single satellite
-that is grossly wrong makes those of all too large. Ranges also have the term - h sin(elevation): signals are received
-at the antennas' phase centres, and h is the height of the rover's phase centre above the point given by its lever arm,
-less that of the base's above its stated position. A drive does not separate it from its height.
+Against a base station orbit, clock and atmosphere cancel, and little of q is left, of size g. With carriers it is the
+multipath of a satellite's codes over minutes: taken as white it would determine ambiguities, which are constant, to
+centimetres. It is stated too: estimated, a single satellite that is grossly wrong makes those of all too large. Without
+carriers the white sigmas, estimated by the signals' power, hold it: in streets it changes within seconds. Ranges also
+have the term - h sin(elevation): signals are received at the antennas' phase centres, and h is the height of the
+rover's phase centre above the point given by its lever arm, less that of the base's above its stated position. A drive
+does not separate it from its height.
 
 Ranges are computed as differences against a nominal position of each epoch, which keeps their precision.
 """
@@ -43,7 +45,7 @@ from graphnav.core.rotation import Array
 from graphnav.core.state import SECONDS, Parameter, States
 from graphnav.gnss.atmosphere import compute_obliquity
 from graphnav.gnss.series import RawGnss
-from graphnav.gnss.sigmas import compute_code_sigma, compute_rate_sigma
+from graphnav.gnss.sigmas import compute_code_reflection_sigma, compute_code_sigma, compute_rate_sigma
 from graphnav.gnss.signals import L1, SYSTEM_NAMES, C, name_satellite, name_signal
 from graphnav.gnss.single_point import group_signals
 from graphnav.recording import Recording
@@ -63,8 +65,6 @@ AXES = ("horizontal", "horizontal", "up")
 # shift of the position, and of one satellite. Horizontally it is the ionosphere's gradient, a metre. Vertically the
 # ionosphere has its own parameter, and troposphere models leave decimetres (Remote Sensing 13, 2021, 1202)
 _HOURS, ONE = np.array([1.0, 1.0, 0.5]), 0.7
-# m, of a satellite's codes less a base's: 0.16, 0.19 and 0.22 over 6, 40 and 1 minutes of three pairs of receivers
-ONE_DIFFERENCED = 0.2
 _ERROR = np.array([1.0, 1.0, 2.0])  # m, unit of the errors over seconds and minutes
 _DIFFERENCED = 0.1  # factor on the errors over hours against a base station
 # m, 1-sigma of the difference of two antennas: calibrated models have their phase centres on L1 7 cm above their
@@ -253,14 +253,14 @@ class GnssCode(RangeConstraint):
         common["parameters"] += more
         satellites, which = raw.satellites
         minutes, hours = settings.gnss.slow_times
-        if raw.differenced:  # the base sees the same ionosphere
-            delay, lasting = np.zeros(len(raw)), np.full(len(raw), ONE_DIFFERENCED)
-        else:
-            delay, lasting = found.ionosphere, np.full(len(raw), ONE)
+        lasts, lasting = hours, np.full(len(raw), less * ONE)
+        if raw.differenced and settings.raw_gnss.carrier and np.isfinite(raw.carrier).any():
+            lasts, lasting = minutes, compute_code_reflection_sigma(found.elevation)
+        delay = np.zeros(len(raw)) if raw.differenced else found.ionosphere  # the base sees the same
         sigma, many = compute_code_sigma(raw.cn0, found.elevation, delay), len(satellites)
         common["parameters"] += (
             Parameter(CODE_ERRORS[2], np.zeros(3), less * _HOURS, "m", correlation_time=hours, spacing=spacing),
-            Parameter(SATELLITES, np.zeros(many), np.ones(many), "1", correlation_time=hours, spacing=spacing),
+            Parameter(SATELLITES, np.zeros(many), np.ones(many), "1", correlation_time=lasts, spacing=spacing),
         )
         processes = tuple(
             Parameter(

@@ -30,6 +30,11 @@ def compute_code_sigma(cn0: Array, elevation: Array, ionosphere: Array) -> Array
     return np.asarray(np.sqrt(own + (_IONOSPHERE * ionosphere) ** 2 + (0.1 * _TROPOSPHERE * rising) ** 2))
 
 
+def compute_code_reflection_sigma(elevation: Array) -> Array:
+    """(N,) m, 1-sigma of the time-correlated multipath error of a receiver's code."""
+    return np.asarray(_CODE / np.maximum(np.sin(elevation), 0.1))
+
+
 def compute_rate_sigma(cn0: Array, elevation: Array) -> Array:
     """(N,) m/s, 1-sigma of a range rate."""
     rising = 1.0 / np.maximum(np.sin(elevation), 0.1)

@@ -18,7 +18,7 @@ from helpers import errors, truth_states
 from test_raw_rows import scene
 
 from graphnav.config import parse_settings
-from graphnav.constraints.raw_gnss import CLOCK, ONE_DIFFERENCED
+from graphnav.constraints.raw_gnss import CLOCK
 from graphnav.constraints.raw_phase import GnssPhase, WholeCycles
 from graphnav.core import earth
 from graphnav.estimation import fixing
@@ -30,7 +30,7 @@ from graphnav.gnss.differential import add_differences
 from graphnav.gnss.ephemeris import OMEGA_WGS84
 from graphnav.gnss.integers import decorrelate, find_nearest
 from graphnav.gnss.series import RawGnss
-from graphnav.gnss.sigmas import REFLECTED, compute_reflection_sigma
+from graphnav.gnss.sigmas import REFLECTED, compute_code_reflection_sigma, compute_reflection_sigma
 from graphnav.gnss.signals import L1, C, name_satellite, name_signal
 from graphnav.recording.formats import read
 from graphnav.report.satellites import tabulate_epochs, tabulate_satellites
@@ -484,7 +484,7 @@ def test_reflections_that_last_are_in_the_sigma(drive):
 
 
 def test_float_ambiguities_know_what_lasts_in_codes():
-    """Codes of each satellite are off for longer than a drive: their mean is no better than at an epoch."""
+    """Codes of each satellite are off for minutes: their mean over a drive is no better than at an epoch."""
     squares = []
     for seed in range(10):
         path = oracle.vehicle_path(120.0, 50.0)
@@ -492,8 +492,9 @@ def test_float_ambiguities_know_what_lasts_in_codes():
         recording = raw_drive.with_observations(made, path, noise=0.1, seed=seed).crop(0.0, 26.0)
         recording = with_carriers(recording, path, 0.001, seed=seed)[0]
         raw, rng = recording.raw_gnss, np.random.default_rng(seed)
+        _, elevation = compute_directions(raw.antenna, raw.p)
         _, which = raw.satellites
-        off = ONE_DIFFERENCED * rng.standard_normal(which.max() + 1)[which]
+        off = compute_code_reflection_sigma(elevation) * rng.standard_normal(which.max() + 1)[which]
         how = parse_settings({"noise": {"mode": "stated"}, "raw_gnss": {"integers": False}})
         one = run(replace(recording, raw_gnss=replace(raw, code=raw.code + off)), how, ("rts",))["rts"]
         error, sigma = errors(one, truth)[:2]
