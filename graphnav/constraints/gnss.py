@@ -39,6 +39,7 @@ from graphnav.constraints.antenna_motion import (
 )
 from graphnav.constraints.base import SAME_TIME, BuildContext, Constraint, Linearized, TypicalSigmas
 from graphnav.core import earth, rotation
+from graphnav.core.findings import find_runs
 from graphnav.core.rotation import Array, mv
 from graphnav.core.running import run_median
 from graphnav.core.state import NODE_SPACING, SECONDS, Parameter, States
@@ -58,6 +59,19 @@ OFFSETS = {f"prior.{name}": name for name in (TIME_OFFSET, VELOCITY_TIME_OFFSET,
 _I3 = np.eye(3)
 _MINUTE = 60.0  # s
 _WHITE = 1e-3  # s, a correlation time at which nothing is left from one fix to the next
+
+
+def count_repeats(values: Array) -> Array:
+    """(N, m) how many rows in succession have the same number: these share one rounding error, which is as if each of n
+    independent ones had n times the variance.
+    """
+    same = np.zeros((len(values) + 1, values.shape[1]), dtype=bool)
+    same[1:-1] = values[1:] == values[:-1]
+    out = np.ones(values.shape)
+    for column, one in zip(out.T, same.T, strict=True):
+        for begin, end in find_runs(one):
+            column[begin - 1 : end] = end - begin + 1
+    return out
 
 
 def _make_empty(*shape: int) -> Array:
@@ -205,12 +219,13 @@ class GnssPosition(_Fixes):
                         correlation_time=lasts, spacing=spacing, noise_groups=groups,
                     ),
                 )  # fmt: skip
+        rounding = np.array(gnss.rounding) * np.sqrt(count_repeats(gnss.llh[:, [1, 0, 2]]))[used]
         return cls(
             keyframe=keyframe[used],
             p_n=p_n,
             R_ln=earth.enu_axes(llh) @ scene.frame.R_ne.T,
-            sigma=np.hypot(sd, gnss.rounding),
-            unscaled=np.broadcast_to(gnss.rounding, sd.shape),
+            sigma=np.hypot(sd, rounding),
+            unscaled=rounding,
             unit_error=_compute_running_median(gnss.t[used], sd)
             if scene.typical_sigmas is None
             else scene.typical_sigmas[used],

@@ -6,10 +6,14 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import oracle
 import pytest
 
 from graphnav import Settings, load, run
+from graphnav.config import parse_settings
+from graphnav.constraints.gnss import count_repeats
 from graphnav.evaluation.evaluate import evaluate_recording
+from graphnav.evaluation.scoring import compute_errors
 from graphnav.recording.formats.rounding import find_step, measure_rounding
 
 HERE = Path(__file__).resolve().parents[1]
@@ -58,3 +62,23 @@ def test_fixes_better_than_their_digits_leave_a_consistent_solution() -> None:
     tracks = (run(one, Settings(), ("rts",))["rts"].trajectory() for one in (drive, rounded))
     whole, some = (np.mean(evaluate_recording(track, drive).errors.nees_p) for track in tracks)
     assert some < 1.5 * whole
+
+
+def test_a_rounding_error_that_repeats_counts_once() -> None:
+    """Fixes of a vehicle that stands, in whole metres: no better after two minutes than at once."""
+    values = np.array([[1.0, 5.0], [1.0, 5.0], [2.0, 5.0], [2.0, 6.0], [2.0, 5.0]])
+    np.testing.assert_array_equal(count_repeats(values), [[2.0, 3.0], [2.0, 3.0], [3.0, 3.0], [3.0, 1.0], [3.0, 1.0]])
+    away = []
+    for seed in range(12):
+        path = oracle.vehicle_path(duration=120, rate=50.0, seed=seed)
+        drive, truth = oracle.drive(path, seed=seed)
+        assert drive.gnss is not None
+        llh = drive.gnss.llh.copy()
+        llh[:, 2] = np.round(llh[:, 2] + 0.083 * seed)
+        llh[:, 2] -= 0.083 * seed
+        rounded = replace(drive, gnss=replace(drive.gnss, llh=llh, rounding=(0.0, 0.0, float(np.sqrt(1.0 / 12.0)))))
+        found = run(rounded, parse_settings({"noise": {"mode": "stated"}}), ("rts",))["rts"].trajectory()
+        off = compute_errors(found, truth).p[:, 2]
+        sigma = np.asarray(found.sd_p)[: len(off), 2]
+        away.append(np.mean((off / sigma) ** 2))
+    assert np.mean(away) < 1.5
