@@ -328,10 +328,8 @@ class _Trials:
 
     def _list_runs(self) -> list[slice]:
         """Spans in succession without a fix between one and the next."""
-        t = np.unique(
-            np.concatenate([self._problem.t[c.keyframe] for c in self._problem.constraints if c.name in FIXES])
-        )
-        spans = np.array(self._spans)
+        fixes = [c.keyframe for c in self._problem.constraints if c.name in FIXES]
+        t, spans = self._problem.t[np.unique(np.concatenate(fixes))], np.array(self._spans)
         begins = np.searchsorted(t, spans[:, 0] - SAME_TIME)
         ends = np.searchsorted(t, spans[:, 1] + SAME_TIME)
         first = np.flatnonzero(np.append(True, begins[1:] > ends[:-1]))
@@ -341,10 +339,8 @@ class _Trials:
         """The problem with a model for each span, and the constraints that have errors in common."""
         weighted = []
         for i, rows in enumerate(self._problem.constraints):
-            t, weight = (
-                self._problem.t[rows.keyframe],
-                np.ones(len(rows)) if rows.weight is None else rows.weight.copy(),
-            )
+            t = self._problem.t[rows.keyframe]
+            weight = np.ones(len(rows)) if rows.weight is None else rows.weight.copy()
             for one, span in zip(each, self._spans, strict=True):
                 other, inside = one.problem.constraints[i].weight, mask_times(t, [span])
                 weight[inside] = 1.0 if other is None else other[inside]
