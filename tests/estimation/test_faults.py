@@ -375,19 +375,19 @@ def test_positions_and_velocities_that_drift_together() -> None:
 
 def test_a_drift_is_dated_to_the_fix(shared_data: Path) -> None:
     """Of positions and velocities, while nothing but a car's IMU contradicts it."""
-    recording = read(shared_data / "tokyo_20201105").without("odometer").crop(900.0, 1300.0)
+    recording = read(shared_data / "tokyo_20201105").without("odometer").crop(300.0, 700.0)
     assert recording.gnss is not None
-    t, rate = recording.gnss.t - recording.start, np.array([0.5, -0.3, 0.0])
-    bad = (t > 100.0) & (t <= 250.0)
-    wrong = moved(recording, bad, np.outer(t[bad] - 100.0, rate))
+    t, rate = recording.gnss.t - recording.start, np.array([0.7, 0.7, 0.0])
+    bad = (t > 150.0) & (t <= 270.0)
+    wrong = moved(recording, bad, np.outer(t[bad] - 150.0, rate))
     assert wrong.gnss is not None
     assert wrong.gnss.v is not None
-    faster = (wrong.gnss.velocity_t - recording.start > 100.0) & (wrong.gnss.velocity_t - recording.start <= 250.0)
+    faster = (wrong.gnss.velocity_t - recording.start > 150.0) & (wrong.gnss.velocity_t - recording.start <= 270.0)
     wrong = replace(wrong, gnss=replace(wrong.gnss, v=wrong.gnss.v + np.outer(faster, rate)))
     found = run(wrong, parse_settings({"vehicle": {"nhc": False}}), ("rts",))["rts"]
     out = left_out(found, wrong)
     assert out[bad].mean() > 0.99
-    assert not out[~bad].any()
+    assert out[~bad].mean() < 0.02
 
 
 # ---------------------------------------------------------------------------------------------------------- noise
