@@ -39,7 +39,6 @@ from graphnav.constraints.antenna_motion import (
 )
 from graphnav.constraints.base import SAME_TIME, BuildContext, Constraint, Linearized, TypicalSigmas
 from graphnav.core import earth, rotation
-from graphnav.core.findings import find_runs
 from graphnav.core.rotation import Array, mv
 from graphnav.core.running import run_median
 from graphnav.core.state import NODE_SPACING, SECONDS, Parameter, States
@@ -65,13 +64,9 @@ def count_repeats(values: Array) -> Array:
     """(N, m) how many rows in succession have the same number: these share one rounding error, which is as if each of n
     independent ones had n times the variance.
     """
-    same = np.zeros((len(values) + 1, values.shape[1]), dtype=bool)
-    same[1:-1] = values[1:] == values[:-1]
-    out = np.ones(values.shape)
-    for column, one in zip(out.T, same.T, strict=True):
-        for begin, end in find_runs(one):
-            column[begin - 1 : end] = end - begin + 1
-    return out
+    new = np.ones(values.shape, dtype=bool)
+    new[1:] = values[1:] != values[:-1]
+    return np.stack([np.bincount(run)[run] for run in np.cumsum(new, axis=0).T], axis=-1)
 
 
 def _make_empty(*shape: int) -> Array:
