@@ -29,7 +29,7 @@ from graphnav.estimation.fixing import fix, split_carriers
 from graphnav.estimation.joint_estimate import JointEstimate, estimate_jointly, revise_jointly
 from graphnav.estimation.noise.apply import apply_noise, drop_parts
 from graphnav.estimation.noise.bias_walks import estimate_bias_walks
-from graphnav.estimation.noise.estimate import estimate_noise
+from graphnav.estimation.noise.estimate import NoiseEstimate, estimate_noise
 from graphnav.estimation.noise.initial_points import BREAKDOWN
 from graphnav.estimation.noise.model import STATED, NoiseModel
 from graphnav.estimation.noise.spacing import space_fixes
@@ -114,16 +114,11 @@ def prepare(
     if stated:
         noise, spacing = STATED, STATED.spacing
     builder = replace(every, used=space_fixes(recording, spacing)) if spacing else every
-    built, known, near, evidence = (
-        builder.build(aligned, detections, parts=larger or noise != STATED),
-        None,
-        None,
-        np.inf,
-    )
+    built, known, evidence = builder.build(aligned, detections, parts=larger or noise != STATED), None, np.inf
     if noise is None:
         tell("noise")
         with clock.count_time("noise"):
-            noise, known, near, built, evidence = _find_noise(builder, built, progress, passes, weigh)
+            noise, known, built, evidence = _find_noise(builder, built, progress, passes, weigh)
             noise = replace(noise, spacing=spacing)
     else:
         built = builder.build_without(built, noise, parts=noise != STATED, anew=bool(noise.freed))
@@ -131,7 +126,7 @@ def prepare(
     aligned = built.aligned
     problem = drop_parts(apply_noise(built.problem, noise))
     try:
-        forward, smoothed = _filter_and_smooth(problem, aligned.until, None, clock, progress, near)
+        forward, smoothed = _filter_and_smooth(problem, aligned.until, None, clock, progress)
     except EstimationError:  # from a rough start its first pass may diverge, where that of the noise model did not
         if known is None:
             raise
@@ -177,24 +172,19 @@ def _describe_missing(problem: Problem) -> tuple[str, ...]:
 
 
 def _filter_and_smooth(
-    problem: Problem,
-    opening: float | None,
-    known: Points | None,
-    clock: Clock,
-    progress: Progress | None,
-    near: Points | None = None,
+    problem: Problem, opening: float | None, known: Points | None, clock: Clock, progress: Progress | None
 ) -> tuple[FilterPass, SmootherPass]:
-    """Filter, with its opening linearised at known points if there are any, and smooth; `near` as for `ekf`."""
-    forward = ekf(problem, progress, opening, known, near=near)  # its own solution has the time it takes
+    """Filter, with its opening linearised at known points if there are any, and smooth."""
+    forward = ekf(problem, progress, opening, known)  # its own solution has the time it takes
     with clock.count_time("smoother"):
         return forward, smooth_backward(problem, forward, progress)
 
 
 def _find_noise(
     builder: ProblemBuilder, built: BuiltProblem, progress: Progress | None, passes: Counter[str], weigh: Weigh | None
-) -> tuple[NoiseModel, Points | None, Points, BuiltProblem, float]:
-    """The noise model, linearisation points, estimates of a filter, the problem with a start and stops that rest on no
-    excluded fix, and the logarithm of the evidence where it is wanted.
+) -> tuple[NoiseModel, Points | None, BuiltProblem, float]:
+    """The noise model, linearisation points, the problem with a start and stops that rest on no excluded fix, and the
+    logarithm of the evidence where it is wanted.
     """
     settings = builder.settings.gnss
     found = estimate_jointly(built.problem, settings, built.aligned.until, progress)
@@ -230,13 +220,10 @@ def _find_noise(
     evidence = found.compute_evidence() if wanted else np.inf
     passes.update(found.estimate.passes + Counter(filter=1))
     plain = NoiseModel(excluded=best.noise.excluded, freed=found.freed)
-    problem = apply_noise(built.problem, plain)
-    forward = refilter(problem, best.carry_points(built.problem, problem), whole=False)
-    if float(np.sum(forward.log_likelihood)) > best.log_posterior:
-        # the stated figures are more probable, the prior included; the same measurements are left out
-        return plain, None, Points(forward.states, forward.values), built, evidence
+    if _is_likelier(built.problem, plain, best):
+        return plain, None, built, evidence
     # the points alone: the covariances of the last pass are half of all memory
-    return found.noise, Points(best.points.states, best.points.values), best.filtered, built, evidence
+    return found.noise, Points(best.points.states, best.points.values), built, evidence
 
 
 def _start_anew(
@@ -249,6 +236,16 @@ def _start_anew(
         return anew, again
     best = estimate_noise(again.base, anew.aligned.until, found.estimate.noise)
     return anew, replace(again, estimate=best).count(found.estimate.passes + best.passes)
+
+
+def _is_likelier(base: Problem, plain: NoiseModel, found: NoiseEstimate) -> bool:
+    """Whether the stated figures are more probable than the estimate, its prior included.
+
+    Both leave the same measurements out, so that the likelihoods compare.
+    """
+    problem = apply_noise(base, plain)
+    forward = refilter(problem, found.carry_points(base, problem), whole=False)
+    return float(np.sum(forward.log_likelihood)) > found.log_posterior
 
 
 def _relinearise(

@@ -24,7 +24,6 @@ from graphnav.estimation.pipeline import choose_origin, run
 from graphnav.estimation.problem import Problem, build_problem
 from graphnav.estimation.solvers.ekf import ekf, refilter, smooth_near
 from graphnav.estimation.solvers.linearise import Points, advance, linearise
-from graphnav.estimation.solvers.passes import move_points, subtract_points
 from graphnav.estimation.solvers.points import FilterErrors, PointFilter, predict_states
 from graphnav.estimation.solvers.recursion import move_columns
 from graphnav.estimation.solvers.rts import smooth_backward
@@ -123,19 +122,6 @@ def test_rows_taken_together_are_those_taken_one_after_another(built: Problem) -
         np.testing.assert_allclose(mine.sigma, theirs.sigma, rtol=1e-6)
         np.testing.assert_allclose(mine.nis, theirs.nis, rtol=1e-4, atol=1e-6)
         assert np.array_equal(mine.weight, theirs.weight)
-
-
-def test_where_its_iteration_starts_does_not_matter(built: Problem) -> None:
-    """From estimates by other figures, a sigma away and more, the filter converges to its own."""
-    plain = ekf(built)
-    rng = np.random.default_rng(4)
-    sd = np.sqrt(np.diagonal(plain.P, axis1=1, axis2=2))
-    guess = move_points(plain, sd * rng.standard_normal(sd.shape))
-    found = ekf(built, near=guess)
-    apart = subtract_points(found, plain) / sd
-    assert np.max(np.abs(apart)) < 1e-4
-    assert np.max(np.abs(subtract_points(guess, plain) / sd)) > 3.0
-    np.testing.assert_allclose(found.log_likelihood, plain.log_likelihood, rtol=1e-5, atol=1e-4)
 
 
 def test_filtered_again_about_its_own_end_it_is_the_batch_solution(built: Problem) -> None:

@@ -64,7 +64,6 @@ class NoiseEstimate:
 
     noise: NoiseModel
     points: DisturbancePass
-    filtered: Points  # of the filter of that pass
     log_posterior: float
     log_prior: float
     log_evidence: float  # of the measurements: the same less the cost of rows and intervals of reduced weight
@@ -246,13 +245,7 @@ def _iterate(
     assert latest is not None
     evidence, passes = now - compute_outlier_cost(figures.weights, totals), round(done / total)
     return NoiseEstimate(
-        figures.build_model(),
-        latest[1],
-        Points(latest[0].states, latest[0].values),
-        now,
-        prior_then,
-        evidence,
-        Counter(filter=passes, smoother=passes),
+        figures.build_model(), latest[1], now, prior_then, evidence, Counter(filter=passes, smoother=passes)
     )
 
 

@@ -69,7 +69,6 @@ def ekf(
     known: Points | None = None,
     decide: Decide | None = None,
     stays: float = STAYS,
-    near: Points | None = None,
 ) -> FilterPass:
     """Run the filter over all keyframes.
 
@@ -80,7 +79,7 @@ def ekf(
     known : linearisation points of the opening, from its first keyframe on, if better ones than a first pass's are
         known.
     decide : called after the updates of each keyframe; a smoother must not use the result.
-    stays, near : as for `graphnav.estimation.solvers.stretches.StretchFilter`; the estimates of all keyframes.
+    stays : sigmas, as for `graphnav.estimation.solvers.stretches.StretchFilter`.
     """
     began = time.perf_counter()
     K, about = len(problem.t), None
@@ -90,7 +89,7 @@ def ekf(
             if known is None
             else known.take_first(n)
         )
-    one = _run_forward(problem, K, about, progress, decide=decide, stays=stays, near=near)
+    one = _run_forward(problem, K, about, progress, decide=decide, stays=stays)
     seconds = time.perf_counter() - began
     # a copy: a view would keep the parameters' covariance in memory
     filtered, P = one.states, one.P[:, :DIM, :DIM].copy()
@@ -197,7 +196,6 @@ def _run_forward(
     decide: Decide | None = None,
     whole: bool = True,
     stays: float = STAYS,
-    near: Points | None = None,
 ) -> ForwardRecord:
     """Filter the first K keyframes, of which the first n are linearised at given points."""
     n, scale, steps = 0 if about is None else len(about.values), problem.columns.get(SCALE), advance(problem, K)
@@ -229,7 +227,7 @@ def _run_forward(
         P = all_P[n - 1]
     else:
         x, P = _get_start(x, P, stack.records)
-    stretches, k = StretchFilter(problem, steps, stack, all_Pp, all_P, all_F, stays, near), n
+    stretches, k = StretchFilter(problem, steps, stack, all_Pp, all_P, all_F, stays), n
     while k < K:
         before, k = k, stretches.run(k, x, P, ahead, found)
         if decide is not None and (on := _hold(decide, before, k, found, all_P)) < k:

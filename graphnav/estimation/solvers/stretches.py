@@ -2,9 +2,9 @@
 
 A filter linearised at its own estimates needs the estimate before it can linearise the next rows: one keyframe at a
 time, one kind of rows after the other. For few rows the calls cost far more than the arithmetic. So the estimates are
-guessed for a stretch of keyframes, by the IMU alone or by an earlier pass: X_0 at the prediction of a keyframe, and X_i
-after the i-th kind of its rows. All rows and steps are linearised at the guess together, and filtered as rows at given
-points are, by errors y about X_0. An error about X_i is
+guessed, by the IMU alone, for a stretch of keyframes: X_0 at the prediction of a keyframe, and X_i after the i-th kind
+of its rows. All rows and steps are linearised at the guess together, and filtered as rows at given points are, by
+errors y about X_0. An error about X_i is
 
     e_i = T_i (y - m_i)      m_i = sum over j <= i of T_(j-1)^-1 (X_j [-] X_(j-1))
 
@@ -50,17 +50,15 @@ class StretchFilter:
     P_predicted, P : (K, D, D) and
     F : (K-1, 15, w), to be filled.
     stays : error of the estimates by which the iteration ends, sigmas.
-    near : estimates of a filter with nearly the same figures, to start the iteration from.
     """
 
     def __init__(
         self, problem: Problem, steps: Advance, stack: Stack, P_predicted: Array, P: Array, F: Array,
-        stays: float = STAYS, near: Points | None = None,
+        stays: float = STAYS,
     ) -> None:  # fmt: skip
         self._problem, self._steps, self._stack = problem, steps, stack
         self._P_predicted, self._P, self._F = P_predicted, P, F
-        self._near, self._length = near, 2 * _SHORTEST if near is None else _LONGEST
-        self._stays, blocks = stays, stack.single
+        self._length, self._stays, blocks = 2 * _SHORTEST, stays, stack.single
         k = np.repeat(np.arange(stack.K), np.diff(blocks.first))
         # points of all keyframes in order: the prediction, and the estimate after each block
         self._start = np.arange(stack.K) + blocks.first[:-1]
@@ -105,7 +103,7 @@ class StretchFilter:
         self, k: int, k1: int, x: Points, P: Array, predicted: Points, filtered: Points, alone: bool = False
     ) -> int:
         before = np.full(k1 - k, np.nan)
-        points = self._guess_points(k, k1, x) if self._near is None or alone or not k else self._take_near(k, k1, x)
+        points = self._guess_points(k, k1, x)
         most = _MAX_LINEARISATIONS + int(self._end[k] - self._start[k]) * alone
         for left in range(most - 1, -1, -1):
             try:
@@ -142,18 +140,6 @@ class StretchFilter:
             values.append(self._steps.predict(j - 1, values[-1]))
         each = self._end[k:k1] - self._start[k:k1] + 1
         return Points(States.stack(states), np.array(values[-(k1 - k) :])).take(np.repeat(np.arange(k1 - k), each))
-
-    def _take_near(self, k: int, k1: int, x: Points) -> Points:
-        """The estimates of the filter before, and predictions from these."""
-        assert self._near is not None
-        own, steps = self._near.take(slice(k, k1)), slice(k - 1, k1 - 1)
-        before = join_passes([x, own.take(slice(0, k1 - k - 1))])
-        states, _ = predict_states(self._problem, steps, before.states, before.values)
-        ahead = Points(states, self._steps.predict(steps, before.values))
-        each, start = self._end[k:k1] - self._start[k:k1] + 1, self._start[k:k1] - self._start[k]
-        points = own.take(np.repeat(np.arange(k1 - k), each))
-        points.put(start, ahead)
-        return points
 
     def _filter_about(self, k: int, k1: int, x: Points, P: Array, points: Points) -> tuple[Array, Points]:
         """Filter keyframes k to k1 about points; returns the largest correction, sigmas, up to each keyframe, and the
