@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import ctypes
+import gc
 import sys
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # of mallopt(3)
@@ -42,3 +44,18 @@ def return_memory() -> None:
     """Return free memory to the system."""
     with suppress(AttributeError, OSError, TypeError):  # of another C library
         ctypes.CDLL(None).malloc_trim(0)
+
+
+@contextmanager
+def pause_collector() -> Iterator[None]:
+    """Disable garbage collection in this context, and freeze what exists at its end: modules are permanent, and
+    scanning them repeatedly takes a fifth of the time of importing them.
+    """
+    searched = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if searched:
+            gc.freeze()
+            gc.enable()
