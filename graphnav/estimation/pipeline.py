@@ -156,6 +156,8 @@ def _run(
     notes = [*check_profile(recording, settings), *notes]
     found: list[dict[str, Solution]] = []
     parts = [share for piece in pieces for share in split_drive(piece, settings)]
+    if len(parts) > 1:
+        return_memory()
     if len(parts) > len(pieces):
         sentence = f"too long to be solved at once: solved in {len(parts)} parts that overlap by {OVERLAP:.0f} s"
         notes.append(Note("pieces.parts", sentence))
