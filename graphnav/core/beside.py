@@ -71,6 +71,8 @@ class Beside(Generic[T]):
 
         If the process was killed, the work is done in this one.
         """
+        if not self._stop.alive:
+            return self._result
         parts = []
         while part := os.read(self._end, 1 << 20):
             parts.append(part)
@@ -78,10 +80,11 @@ class Beside(Generic[T]):
         try:
             result, error = pickle.loads(b"".join(parts))  # of a process of our own
         except (EOFError, pickle.UnpicklingError):
-            return self._work()
+            result, error = self._work(), None
         if error is not None:
             raise error
-        return result  # type: ignore[no-any-return]
+        self._result: T = result
+        return self._result
 
 
 def _work_and_exit(work: Callable[[], object], begin: int) -> None:
