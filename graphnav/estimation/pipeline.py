@@ -28,6 +28,7 @@ from graphnav.detectors import check_own as check_detectors
 from graphnav.estimation.building import start_sigma
 from graphnav.estimation.faults.excluded import describe_faults, find_fault_spans
 from graphnav.estimation.long_drives import OVERLAP, crop_solutions, share_covariances, split_drive
+from graphnav.estimation.noise.copies import describe_copies
 from graphnav.estimation.noise.files import MODES
 from graphnav.estimation.noise.imu_floor import apply_measured_floor
 from graphnav.estimation.noise.model import STATED, NoiseModel, StampOffsets
@@ -257,7 +258,7 @@ def _solve(
         recording = move_stamps(recording, stamps)
         found = prepare_moved(recording, stamps.rate)
     problem, forward, smoothed = found.problem, found.forward, found.smoothed
-    wrong = find_fault_spans(problem, smoothed)
+    faults = find_fault_spans(problem, smoothed)
     notes = (
         *found.start.notes,
         *undone,
@@ -265,7 +266,8 @@ def _solve(
         *found.detections.notes,
         *describe_stamps(stamps),
         *found.notes,
-        *describe_faults(wrong, problem),
+        *describe_copies(found.copies, recording),
+        *describe_faults(faults, problem),
     )
     notes = (*notes, *describe_far(problem, smoothed))
     start, passes = smoothed, Counter(found.passes)
@@ -319,7 +321,7 @@ def _solve(
             out[name],
             notes=(*notes, *out[name].notes),
             detections=found.detections.all,
-            excluded=wrong,
+            excluded=(*found.copies, *faults),
             noise=found.noise,
             graphs=(_bind(problem, out[name]),),
             passes=dict(passes),
