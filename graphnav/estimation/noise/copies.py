@@ -67,5 +67,5 @@ def mark_copies(gnss: Gnss) -> Array:
     alike = np.log(np.clip(step / (2.0 * np.sqrt(np.pi) * gnss.sd[1:, :2]), 1e-300, 1.0)).sum(axis=1)
     same = (gnss.llh[1:, :2] == gnss.llh[:-1, :2]).all(axis=1)
     for a, b in find_runs(np.concatenate([[False], same])):
-        copied[a:b] = b - a > 1 and alike[a - 1 : b - 1].sum() < np.log(CHANCE)
+        copied[a:b] = alike[a - 1 : b - 1].sum() < np.log(CHANCE)
     return copied
