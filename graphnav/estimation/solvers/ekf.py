@@ -53,7 +53,7 @@ from graphnav.estimation.solvers.passes import (
     move_points,
     subtract_points,
 )
-from graphnav.estimation.solvers.points import FilterErrors, Linearisation, PointFilter, filter_likelihood
+from graphnav.estimation.solvers.points import FilterErrors, Linearisation, PointFilter
 from graphnav.estimation.solvers.rts import smooth_backward
 from graphnav.estimation.solvers.stack import Innovations, Stack
 from graphnav.estimation.solvers.stretches import STAYS, StretchFilter
@@ -155,7 +155,9 @@ class Comparison:
         one = self._one.lift(problem, about, stack, anew)
         x, P = _start_from_prior(problem)
         start = _get_start(subtract_points(x, about.take_first(1))[0], P, stack.records)
-        filter_likelihood(problem, about, stack, steps, one, start)
+        (e, P), last = np.empty((2, 2, *P.shape)), np.empty((2, 2, len(P)))
+        out = FilterErrors(last[0], e, last[1], P)
+        PointFilter(problem, about, stack, steps, one, out, whole=False).run(lambda: start, None, None)
         return stack
 
 
@@ -210,7 +212,9 @@ def _run_forward(
     x, P = _start_from_prior(problem)
     updates, search = None, None
     if about is not None:
-        given = PointFilter(problem, about, stack, steps, all_F, errors)
+        one = Linearisation.of(problem, about, stack, steps)
+        all_F[: n - 1] = one.F
+        given = PointFilter(problem, about, stack, steps, one, errors)
         if watched:
             bank = Bank(watched, problem.t, D, drifts)
             search = FaultSearch(watched, given, steps, stack, bank, problem.t)

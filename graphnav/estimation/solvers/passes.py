@@ -15,7 +15,7 @@ from graphnav.estimation.solution import ConstraintRecord, ParameterEstimate, So
 from graphnav.estimation.solvers.disturbance import compute_row_covariances
 from graphnav.estimation.solvers.invariant import add_invariant, subtract_invariant
 from graphnav.estimation.solvers.linearise import Columns, Points, Rows, find_last_keyframes, linearise, shift
-from graphnav.estimation.solvers.recursion import RowBlocks
+from graphnav.estimation.solvers.recursion import Arrays, RowBlocks
 from graphnav.estimation.solvers.robust import weigh_squares
 from graphnav.estimation.solvers.stack import Innovations
 from graphnav.imu.dynamics import convert_to_biases
@@ -97,12 +97,20 @@ class Updates:
     lossy: Array  # (B,) whether with a loss of digits, but for Joseph's form
     places: dict[str, tuple[Array, Array]]  # of each constraint's rows, as `graphnav.estimation.solvers.stack` has them
 
+    @property
+    def arrays(self) -> Arrays:
+        """Arguments of `graphnav.estimation.solvers.disturbance.smooth_rows`."""
+        return self.Kt, self.H, self.w, self.inverse, self.taken, self.lossy
+
     @classmethod
-    def none(cls, blocks: RowBlocks, H: Array, places: dict[str, tuple[Array, Array]]) -> Updates:
-        """None yet, of rows H (n, M, D)."""
-        n, M, _ = H.shape
+    def allocate(
+        cls, blocks: RowBlocks, H: Array, places: dict[str, tuple[Array, Array]], whole: bool = True
+    ) -> Updates:
+        """None yet, of rows H (n, M, D); without gains if not `whole`."""
+        n, M, D = H.shape
+        n *= whole
         taken, lossy = np.zeros((2, len(blocks.begin)), dtype=bool)
-        return cls(blocks, np.zeros_like(H), H, np.zeros((n, M)), np.zeros((n, M, M)), taken, lossy, places)
+        return cls(blocks, np.zeros((n, M, D)), H, np.zeros((n, M)), np.zeros((n, M, M)), taken, lossy, places)
 
 
 @dataclass(frozen=True)
@@ -122,6 +130,11 @@ class ForwardRecord(Points):
     errors_predicted: Array  # (n, D) and the predicted state is these errors away from them
     updates: Updates | None  # of the keyframes there
     log_likelihood: Array  # (K,) of the innovations at each keyframe, up to a constant
+
+    @property
+    def filtered(self) -> Arrays:
+        """Of the keyframes at given points, as `graphnav.estimation.solvers.recursion.filter_rows` fills them."""
+        return self.errors_predicted, self.P_predicted, self.errors, self.P
 
     @property
     def predicted_from(self) -> States:

@@ -86,11 +86,8 @@ def smooth_points(forward: ForwardRecord) -> Points:
     assert forward.about is not None
     assert one is not None
     assert len(forward.about.values) == len(forward.P)
-    blocks, errors = one.blocks, np.empty(forward.errors.shape)
-    smooth_errors(
-        forward.F, forward.decay, one.Kt, one.H, one.w, blocks.first, blocks.begin, blocks.end, one.taken,
-        forward.errors_predicted, forward.P_predicted, forward.errors, forward.P, errors,
-    )  # fmt: skip
+    errors = np.empty(forward.errors.shape)
+    smooth_errors((forward.F, forward.decay), one.arrays, one.blocks.arrays, forward.filtered, errors)
     return move_points(forward.about, errors)
 
 
@@ -148,7 +145,7 @@ def _smooth_filtered(
         lo = max(hi - STRETCH, end)
         try:
             smooth_filtered(
-                lo - end, hi - end, moved, turned, forward.F[end:], forward.decay[end:],
+                lo - end, hi - end, moved, turned, (forward.F[end:], forward.decay[end:]),
                 forward.P_predicted[some], forward.P[some], all_P[some], errors, at,
             )  # fmt: skip
         except np.linalg.LinAlgError:
@@ -175,7 +172,7 @@ def _smooth_points(
     Where P has no keyframes, variances (end, D) of the columns `wanted` (K, D), and H P^s H^T (end, M, M) of rows
     `asked` (K, M, D).
     """
-    blocks, (r_k, N_k) = one.blocks, behind
+    r_k, N_k = behind
     wanted = np.zeros((0, 0), dtype=bool) if wanted is None else wanted
     asked = np.empty((0, 0, 0)) if asked is None else asked
     variance, of_rows = np.zeros(wanted.shape), np.zeros((len(asked), *asked.shape[1:2] * 2))
@@ -184,10 +181,8 @@ def _smooth_points(
     for hi in range(end, 0, -STRETCH):
         lo = max(hi - STRETCH, 0)
         r_k, N_k = smooth_rows(
-            lo, hi, r_k, N_k, forward.F, forward.decay, one.Kt, one.H, one.w, one.inverse,
-            blocks.first, blocks.begin, blocks.end, one.taken, one.lossy,
-            forward.errors_predicted, forward.P_predicted, forward.errors, forward.P, columns, first,
-            out.r, out.N, out.N_diagonal, out.errors, P, variance, asked, of_rows,
+            lo, hi, r_k, N_k, (forward.F, forward.decay), one.arrays, one.blocks.arrays, forward.filtered,
+            (out.errors, out.r, out.N, out.N_diagonal), (P, variance, of_rows), asked, columns, first,
         )  # fmt: skip
         if progress is not None:
             progress("smoother", 1.0 - lo / len(forward.P))
