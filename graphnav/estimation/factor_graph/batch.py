@@ -22,11 +22,10 @@ from graphnav.core.notes import Note, format_count
 from graphnav.core.progress import Progress
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, States
-from graphnav.estimation.dense import make_dense
 from graphnav.estimation.factor_graph.gaussian import Eliminated, LinearGraph
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import ParameterEstimate, Solution
-from graphnav.estimation.solvers.passes import integrate_again, record_residuals
+from graphnav.estimation.solvers.passes import integrate_again, make_solution, record_residuals
 from graphnav.estimation.solvers.robust import REDESCENDING
 from graphnav.estimation.solvers.rows import (
     Correction,
@@ -92,22 +91,12 @@ def batch(
                     f"most rows of {constraint.name} are down-weighted as outliers: do not trust this solution",
                 )
             )
-    return Solution(
-        solver="batch",
-        frame=problem.frame,
-        t=problem.t,
-        states=point.states,
-        covariance=covariance,
-        parameters=_collect_estimates(problem, layout, point, marginal),
-        records=records,
-        counts={"initial_prior": 1, "imu": layout.K - 1, **{c.name: len(c) for c in problem.constraints}},
-        iterations=found.iterations,
-        cost=found.cost,
-        stopped=found.stopped,
+    return make_solution(
+        problem, "batch", points, covariance, smooth=True, notes=(*found.notes, *notes),
+        parameters=_collect_estimates(problem, layout, point, marginal), records=records,
+        iterations=found.iterations, cost=found.cost, stopped=found.stopped,
         timings={"batch": solved - began, "covariances": done - solved},
-        notes=(*problem.notes, *found.notes, *notes),
-        between=(make_dense(problem, point.states, covariance, point.scale, smooth=True),),
-    )
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -34,14 +34,12 @@ import numpy as np
 from graphnav.core.progress import Progress
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM
-from graphnav.estimation.dense import make_dense
 from graphnav.estimation.faults.search import FaultSearch, free
 from graphnav.estimation.faults.watch import Bank
 from graphnav.estimation.problem import Problem
-from graphnav.estimation.solution import Solution
 from graphnav.estimation.solvers.decision import Decide, hold
 from graphnav.estimation.solvers.invariant import transport_covariance
-from graphnav.estimation.solvers.linearise import Points, advance, scale_at
+from graphnav.estimation.solvers.linearise import Points, advance
 from graphnav.estimation.solvers.passes import (
     FilterPass,
     ForwardRecord,
@@ -50,6 +48,7 @@ from graphnav.estimation.solvers.passes import (
     compute_sigmas,
     estimate_parameters,
     join_passes,
+    make_solution,
     move_points,
     subtract_points,
 )
@@ -92,25 +91,16 @@ def ekf(
     one = _run_forward(problem, K, about, progress, decide=decide, stays=stays)
     seconds = time.perf_counter() - began
     # a copy: a view would keep the parameters' covariance in memory
-    filtered, P = one.states, one.P[:, :DIM, :DIM].copy()
+    P = one.P[:, :DIM, :DIM].copy()
     if about is not None:
         n = len(about.values) - 1
-        P[:n] = transport_covariance(P[:n], about.states[:n], filtered[:n])
-    solution = Solution(
-        solver="ekf",
-        frame=problem.frame,
-        t=problem.t,
-        states=filtered,
-        covariance=P,
+        P[:n] = transport_covariance(P[:n], about.states[:n], one.states[:n])
+    solution = make_solution(
+        problem, "ekf", one, P, smooth=False,
         parameters=estimate_parameters(problem, one.values, compute_sigmas(one.P)),
         records={name: r.record(problem) for name, r in one.records.items()},
-        counts={"imu": K - 1, **{rows.name: len(rows) for rows in problem.constraints}},
-        iterations=1,
-        stopped="one pass forward over all keyframes",
-        timings={"filter": seconds},
-        notes=problem.notes,
-        between=(make_dense(problem, filtered, P, scale_at(problem.columns, one.values), smooth=False),),
-    )
+        iterations=1, stopped="one pass forward over all keyframes", timings={"filter": seconds},
+    )  # fmt: skip
     return FilterPass(**vars(one), solution=solution)
 
 

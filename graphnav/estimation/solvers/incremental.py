@@ -21,7 +21,7 @@ from graphnav.estimation.dense import make_dense
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import Solution
 from graphnav.estimation.solvers.linearise import Points, list_node_steps, scale_at, shift
-from graphnav.estimation.solvers.passes import estimate_parameters, record_residuals
+from graphnav.estimation.solvers.passes import estimate_parameters, make_solution, record_residuals
 from graphnav.estimation.solvers.rows import compute_cost_at
 from graphnav.estimation.solvers.stages import Message, Place
 from graphnav.estimation.solvers.window import SettledStates, Window, compute_turn_limit, make_first_message
@@ -138,26 +138,16 @@ def solve_in_turn(problem: Problem, solver: str, engine: LagSmoother, lag: float
     at = Points(states, values)
     records = {rows.name: record_residuals(problem, rows, at, robust=True) for rows in problem.constraints}
     whole = "all there was" if np.isinf(lag) else f"{lag:g} s of the future, or all there was"
-    settled = Solution(
-        solver=solver,
-        frame=problem.frame,
-        t=problem.t,
-        states=states,
-        covariance=covariance,
-        parameters=estimate_parameters(problem, values, sigma),
-        records=records,
-        counts={"initial_prior": 1, "imu": K - 1, **{c.name: len(c) for c in problem.constraints}},
-        iterations=1,
-        cost=compute_cost_at(problem, at),
-        stopped=f"every keyframe settled with {whole}",
-        timings={solver: elapsed},
-        notes=(
-            *problem.notes,
-            Note("solver.step_times", ("" if np.isinf(lag) else f"lag {lag:g} s: ") + describe_times(seconds)),
-            Note("solver.relinearised", f"{format_count(again, 'keyframe')} relinearised"),
-        ),
-        between=(make_dense(problem, states, covariance, scale_at(problem.columns, values), smooth=True),),
+    notes = (
+        Note("solver.step_times", ("" if np.isinf(lag) else f"lag {lag:g} s: ") + describe_times(seconds)),
+        Note("solver.relinearised", f"{format_count(again, 'keyframe')} relinearised"),
     )
+    settled = make_solution(
+        problem, solver, at, covariance, smooth=True, notes=notes,
+        parameters=estimate_parameters(problem, values, sigma), records=records,
+        iterations=1, cost=compute_cost_at(problem, at), stopped=f"every keyframe settled with {whole}",
+        timings={solver: elapsed},
+    )  # fmt: skip
     scale = scale_at(problem.columns, np.array([newest.values for newest in points])[:, order])
     now = replace(
         settled,

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from graphnav.constraints.base import Constraint
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, States
+from graphnav.estimation.dense import make_dense
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import ConstraintRecord, ParameterEstimate, Solution
 from graphnav.estimation.solvers.disturbance import compute_row_covariances
 from graphnav.estimation.solvers.invariant import add_invariant, subtract_invariant
-from graphnav.estimation.solvers.linearise import Columns, Points, Rows, find_last_keyframes, linearise, shift
+from graphnav.estimation.solvers.linearise import Columns, Points, Rows, find_last_keyframes, linearise, scale_at, shift
 from graphnav.estimation.solvers.recursion import Arrays, RowBlocks
 from graphnav.estimation.solvers.robust import weigh_squares
 from graphnav.estimation.solvers.stack import Innovations
@@ -213,6 +215,32 @@ def record_residuals(problem: Problem, rows: Constraint, points: Points, robust:
     return ConstraintRecord(
         "residual", t, linear.residual, linear.stated, nis, weight, rows.axes, rows.unit, **rows.labels
     )
+
+
+def make_solution(
+    problem: Problem,
+    solver: str,
+    points: Points,
+    covariance: Array,
+    smooth: bool,
+    notes: tuple[str, ...] = (),
+    **found: Any,
+) -> Solution:
+    """The solution of a solver, by its estimates at all keyframes and covariances (K, 15, 15) of their states.
+
+    Parameters
+    ----------
+    smooth : whether they know the future, so that states between them do.
+    found : other fields of the solution.
+    """
+    scale = scale_at(problem.columns, points.values)
+    return Solution(
+        solver, problem.frame, problem.t, points.states, covariance,
+        counts={"initial_prior": 1, "imu": len(problem.t) - 1, **{c.name: len(c) for c in problem.constraints}},
+        notes=(*problem.notes, *notes),
+        between=(make_dense(problem, points.states, covariance, scale, smooth=smooth),),
+        **found,
+    )  # fmt: skip
 
 
 def integrate_again(problem: Problem, states: States, scale: Array | None, first: int = 0) -> tuple[Problem, int]:

@@ -26,12 +26,11 @@ from graphnav.core import rotation
 from graphnav.core.progress import Progress
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, States
-from graphnav.estimation.dense import make_dense
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import Solution
 from graphnav.estimation.solvers.breakdown import explain_smoother
 from graphnav.estimation.solvers.disturbance import smooth_errors, smooth_rows
-from graphnav.estimation.solvers.linearise import Points, find_stepping, linearise, scale_at
+from graphnav.estimation.solvers.linearise import Points, find_stepping, linearise
 from graphnav.estimation.solvers.passes import (
     FilterPass,
     ForwardRecord,
@@ -40,6 +39,7 @@ from graphnav.estimation.solvers.passes import (
     Updates,
     compute_sigmas,
     estimate_parameters,
+    make_solution,
     move_points,
     record_residuals,
 )
@@ -213,22 +213,12 @@ def rts(problem: Problem, forward: FilterPass, found: SmootherPass | None = None
     """The smoothed solution; residuals are its own. `found` is the backward pass where it was done before."""
     began = time.perf_counter()
     found = found or smooth_backward(problem, forward)
-    smoothed, all_values, all_P = found.states, found.values, found.P
     records = {rows.name: record_residuals(problem, rows, found) for rows in problem.constraints}
-    covariance = all_P[:, :DIM, :DIM].copy()  # a copy: a view would keep the parameters' covariance in memory
+    covariance = found.P[:, :DIM, :DIM].copy()  # a copy: a view would keep the parameters' covariance in memory
     seconds = time.perf_counter() - began
-    return Solution(
-        solver="rts",
-        frame=problem.frame,
-        t=problem.t,
-        states=smoothed,
-        covariance=covariance,
-        parameters=estimate_parameters(problem, all_values, compute_sigmas(all_P)),
-        records=records,
-        counts=forward.solution.counts,
-        iterations=1,
-        stopped="one pass forward and one back",
+    return make_solution(
+        problem, "rts", found, covariance, smooth=True,
+        parameters=estimate_parameters(problem, found.values, compute_sigmas(found.P)), records=records,
+        iterations=1, stopped="one pass forward and one back",
         timings={**forward.solution.timings, "smoother": seconds},
-        notes=problem.notes,
-        between=(make_dense(problem, smoothed, covariance, scale_at(problem.columns, all_values), smooth=True),),
-    )
+    )  # fmt: skip
