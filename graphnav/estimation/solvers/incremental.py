@@ -156,6 +156,7 @@ def solve_in_turn(problem: Problem, solver: str, engine: LagSmoother, lag: float
         covariance=P,
         parameters={},
         records={},
+        graphs=(),
         stopped="each keyframe as it was known when it came",
         between=(make_dense(problem, live, P, scale, smooth=False),),
     )

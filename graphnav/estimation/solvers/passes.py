@@ -12,7 +12,7 @@ from graphnav.constraints.base import Constraint
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, States
 from graphnav.estimation.dense import make_dense
-from graphnav.estimation.problem import Problem
+from graphnav.estimation.problem import Problem, SolvedProblem
 from graphnav.estimation.solution import ConstraintRecord, ParameterEstimate, Solution
 from graphnav.estimation.solvers.disturbance import compute_row_covariances
 from graphnav.estimation.solvers.invariant import add_invariant, subtract_invariant
@@ -238,6 +238,7 @@ def make_solution(
         solver, problem.frame, problem.t, points.states, covariance,
         counts={"initial_prior": 1, "imu": len(problem.t) - 1, **{c.name: len(c) for c in problem.constraints}},
         notes=(*problem.notes, *notes),
+        graphs=(SolvedProblem(problem, points.states, points.select_nodes(problem)),),
         between=(make_dense(problem, points.states, covariance, scale, smooth=smooth),),
         **found,
     )  # fmt: skip
