@@ -46,7 +46,6 @@ from graphnav.estimation.solvers.passes import (
     SmootherPass,
     are_near,
     compute_sigmas,
-    estimate_parameters,
     join_passes,
     make_solution,
     move_points,
@@ -96,8 +95,7 @@ def ekf(
         n = len(about.values) - 1
         P[:n] = transport_covariance(P[:n], about.states[:n], one.states[:n])
     solution = make_solution(
-        problem, "ekf", one, P, smooth=False,
-        parameters=estimate_parameters(problem, one.values, compute_sigmas(one.P)),
+        problem, "ekf", one, P, compute_sigmas(one.P), smooth=False,
         records={name: r.record(problem) for name, r in one.records.items()},
         iterations=1, stopped="one pass forward over all keyframes", timings={"filter": seconds},
     )  # fmt: skip

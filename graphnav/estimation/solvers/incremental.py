@@ -21,7 +21,7 @@ from graphnav.estimation.dense import make_dense
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import Solution
 from graphnav.estimation.solvers.linearise import Points, list_node_steps, scale_at, shift
-from graphnav.estimation.solvers.passes import estimate_parameters, make_solution, record_residuals
+from graphnav.estimation.solvers.passes import make_solution, record_residuals
 from graphnav.estimation.solvers.rows import compute_cost_at
 from graphnav.estimation.solvers.stages import Message, Place
 from graphnav.estimation.solvers.window import SettledStates, Window, compute_turn_limit, make_first_message
@@ -143,8 +143,7 @@ def solve_in_turn(problem: Problem, solver: str, engine: LagSmoother, lag: float
         Note("solver.relinearised", f"{format_count(again, 'keyframe')} relinearised"),
     )
     settled = make_solution(
-        problem, solver, at, covariance, smooth=True, notes=notes,
-        parameters=estimate_parameters(problem, values, sigma), records=records,
+        problem, solver, at, covariance, sigma, smooth=True, notes=notes, records=records,
         iterations=1, cost=compute_cost_at(problem, at), stopped=f"every keyframe settled with {whole}",
         timings={solver: elapsed},
     )  # fmt: skip

@@ -222,6 +222,7 @@ def make_solution(
     solver: str,
     points: Points,
     covariance: Array,
+    sigma: Array,
     smooth: bool,
     notes: tuple[str, ...] = (),
     **found: Any,
@@ -230,12 +231,13 @@ def make_solution(
 
     Parameters
     ----------
+    sigma : (K, D-15) of parameters.
     smooth : whether they know the future, so that states between them do.
     found : other fields of the solution.
     """
     scale = scale_at(problem.columns, points.values)
     return Solution(
-        solver, problem.frame, problem.t, points.states, covariance,
+        solver, problem.frame, problem.t, points.states, covariance, estimate_parameters(problem, points.values, sigma),
         counts={"initial_prior": 1, "imu": len(problem.t) - 1, **{c.name: len(c) for c in problem.constraints}},
         notes=(*problem.notes, *notes),
         graphs=(SolvedProblem(problem, points.states, points.select_nodes(problem)),),
