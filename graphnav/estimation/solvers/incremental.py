@@ -121,13 +121,13 @@ def solve_in_turn(problem: Problem, solver: str, engine: LagSmoother, lag: float
     for k in range(K):
         before = time.thread_time()
         newest, P[k] = engine.add(Place(float(problem.t[k]), problem, k, steps.get(k, ()), linked=k > 0))
-        points.append(newest)
+        points.append((newest.state, newest.values))  # without what else a message knows, which is of its size squared
         seconds[k] = time.thread_time() - before
         if progress is not None and k % 64 == 0:
             progress(solver, k / K)
     problem, again = engine.finish(problem)
     elapsed = time.perf_counter() - began
-    parts, live = engine.settled, States.stack([newest.state for newest in points])
+    parts, live = engine.settled, States.stack([state for state, _ in points])
     # in the order that the problem has its parameters in
     columns = parts[-1].columns[-1]
     order = np.concatenate([np.empty(0, dtype=int), *(np.r_[shift(columns[name])] for name in problem.columns)])
@@ -147,7 +147,7 @@ def solve_in_turn(problem: Problem, solver: str, engine: LagSmoother, lag: float
         iterations=1, cost=compute_cost_at(problem, at), stopped=f"every keyframe settled with {whole}",
         timings={solver: elapsed},
     )  # fmt: skip
-    scale = scale_at(problem.columns, np.array([newest.values for newest in points])[:, order])
+    scale = scale_at(problem.columns, np.array([values for _, values in points])[:, order])
     now = replace(
         settled,
         solver="live",
