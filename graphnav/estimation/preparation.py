@@ -37,7 +37,7 @@ from graphnav.estimation.noise.words import describe_noise
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import CarrierArcs
 from graphnav.estimation.solvers.ekf import ekf, refilter, smooth_near
-from graphnav.estimation.solvers.linearise import Points
+from graphnav.estimation.solvers.linearise import Points, scale_at
 from graphnav.estimation.solvers.passes import (
     FilterPass,
     SmootherPass,
@@ -143,6 +143,7 @@ def prepare(
         problem = _drop_refused(problem, forward)
         if any(rows.gate is not None for rows in problem.constraints):
             smoothed = smooth_backward(problem, refilter(problem, smoothed, progress), progress)
+        problem = problem.with_input_noise(smoothed.states, scale_at(problem.columns, smoothed.values))
         forward, smoothed, ahead = _relinearise(problem, aligned, known, forward, smoothed, progress, passes)
     passes.update(filter=1, smoother=1)
     notes = (*describe_freed(noise.freed, recording), *describe_noise(noise, problem), *_describe_missing(problem))

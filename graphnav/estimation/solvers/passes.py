@@ -259,7 +259,7 @@ def integrate_again(problem: Problem, states: States, scale: Array | None, first
     at = np.minimum(np.arange(len(ba) - first), max(len(states) - 2, 0))
     ba[rows], bg[rows] = states.ba[at], states.bg[at]
     if scale is not None:
-        of_accel, of_gyro = convert_to_biases(scale, problem.intervals.force[rows], problem.intervals.rate[rows])
+        of_accel, of_gyro = convert_to_biases(scale, *(x[rows] for x in problem.intervals.inputs))
         ba[rows], bg[rows] = ba[rows] + of_accel, bg[rows] + of_gyro
     far = problem.intervals.is_out_of_range(bg)
     return (problem.reintegrate(ba, bg), int(far.sum())) if far.any() else (problem, 0)
