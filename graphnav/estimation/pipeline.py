@@ -36,7 +36,6 @@ from graphnav.estimation.noise.words import describe_far
 from graphnav.estimation.offsets import move_stamps
 from graphnav.estimation.pieces import describe_span, split_pieces
 from graphnav.estimation.preparation import Prepared, Weigh, prepare, step_ahead
-from graphnav.estimation.problem import Problem, SolvedProblem
 from graphnav.estimation.separation import compute_separation
 from graphnav.estimation.solution import Solution, join_solutions
 from graphnav.estimation.solvers.breakdown import explain_singular
@@ -323,7 +322,6 @@ def _solve(
             detections=found.detections.all,
             excluded=(*found.copies, *faults),
             noise=found.noise,
-            graphs=(_bind(problem, out[name]),),
             passes=dict(passes),
             separation=apart,
             fixed=found.fixed.get(name, found.fixed.get("", out[name].fixed)),
@@ -333,10 +331,6 @@ def _solve(
         for name in solvers
     }
     return {name: shift_to_own_clocks(one, stamps) for name, one in by_name.items()}
-
-
-def _bind(problem: Problem, solution: Solution) -> SolvedProblem:
-    return SolvedProblem(problem, solution.states, {name: one.value for name, one in solution.parameters.items()})
 
 
 def check_profile(recording: Recording, settings: Settings) -> list[str]:

@@ -120,13 +120,13 @@ class SolvedProblem:
 
     problem: Problem
     states: States
-    values: dict[str, Array]  # (nodes, k) per parameter that solutions list
+    values: dict[str, Array]  # (nodes, k) per parameter
 
     def __call__(self) -> tuple[Any, Any]:
         """The graph of `Solution.to_gtsam`, and its values."""
-        from graphnav.estimation.factor_graph.nonlinear import Exported  # which needs GTSAM
+        from graphnav.estimation.factor_graph.nonlinear import make_graph  # which needs GTSAM
 
-        return Exported(self.problem, self.states, self.values)()
+        return make_graph(self.problem, self.states, self.values)
 
 
 def build_problem(
