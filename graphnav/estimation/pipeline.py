@@ -37,7 +37,7 @@ from graphnav.estimation.offsets import move_stamps
 from graphnav.estimation.pieces import describe_span, split_pieces
 from graphnav.estimation.preparation import Prepared, Weigh, prepare, step_ahead
 from graphnav.estimation.separation import compute_separation
-from graphnav.estimation.solution import Solution, join_solutions
+from graphnav.estimation.solution import KNOWN, Solution, join_solutions
 from graphnav.estimation.solvers.breakdown import explain_singular
 from graphnav.estimation.solvers.ekf import ekf
 from graphnav.estimation.solvers.rts import rts, smooth_backward
@@ -55,7 +55,6 @@ from graphnav.recording.checks.clock import ClockOffsets
 from graphnav.recording.plausibility.screening import screen, state_findings
 
 SOLVERS = ("ekf", "rts", "batch")  # run when none is named
-KNOWN = ("ekf", "rts", "incremental", "isam2", "batch")
 _CLEARLY_BETTER = 10.0  # half chi-square; a likelihood ratio of 22,000
 
 Attempt = Callable[[Settings, NoiseModel | None], dict[str, Solution]]  # to solve with these
@@ -157,6 +156,8 @@ def _run(
     notes = [*check_profile(recording, settings), *notes]
     found: list[dict[str, Solution]] = []
     parts = [share for piece in pieces for share in split_drive(piece, settings)]
+    if len(parts) > 1:
+        return_memory()
     if len(parts) > len(pieces):
         sentence = f"too long to be solved at once: solved in {len(parts)} parts that overlap by {OVERLAP:.0f} s"
         notes.append(Note("pieces.parts", sentence))
