@@ -4,9 +4,7 @@
 
 All settings are the defaults; the noise model is estimated once for each recording. A state that has settled with two
 minutes of the future knows less than batch does of the whole drive: a third line has what that makes of it. The last
-line is beside batch of what had come when each state settled: every measurement after that has no weight. Within a lag
-all have their intervals integrated about the biases and scale errors that batch comes to, with --as-built about those
-that each comes to by itself.
+line is beside batch of what had come when each state settled: every measurement after that has no weight.
 """
 
 from __future__ import annotations
@@ -29,9 +27,7 @@ from graphnav.estimation.factor_graph.isam import isam2
 from graphnav.estimation.pipeline import choose_origin
 from graphnav.estimation.preparation import prepare
 from graphnav.estimation.problem import Problem
-from graphnav.estimation.solution import Solution
 from graphnav.estimation.solvers.incremental import are_due, incremental
-from graphnav.imu.dynamics import SCALE, convert_to_biases
 
 RECORDINGS = ("kitti", "gcp_walks/walk31.toml", "oracle_drive", "tokyo_20201105")
 LONGEST = 600.0  # s that are used of a recording
@@ -45,7 +41,6 @@ def main() -> None:
     )
     parser.add_argument("--lag", type=float, default=LAG, help="s (%(default)s)")
     parser.add_argument("--groups", type=int, default=8, help="settled together, that are compared (%(default)s)")
-    parser.add_argument("--as-built", action="store_true", help="intervals integrated about what each comes to itself")
     options = parser.parse_args()
     data, lag = Path(os.environ.get("GRAPHNAV_DATA", "../shared/data")), options.lag
     print("Median / 99 % / most over the keyframes\n")
@@ -59,8 +54,6 @@ def main() -> None:
         best = batch(problem, start, nodes)
         whole = isam2(problem).settled
         tell(name, "batch", (whole.states, whole.covariance), (best.states, best.covariance))
-        if not options.as_built:
-            problem = about(problem, best)
         settled, window = isam2(problem, lag).settled, incremental(problem, lag).settled
         own = settled.states, settled.covariance
         tell(name, f"window, both {lag:.0f} s", own, (window.states, window.covariance))
@@ -73,16 +66,6 @@ def main() -> None:
             of_lag.append((settled.states[first:end], settled.covariance[first:end]))
             of_batch.append((then.states[first:end], then.covariance[first:end]))
         tell(name, f"batch so far, {lag:.0f} s", together(of_lag), together(of_batch))
-
-
-def about(problem: Problem, best: Solution) -> Problem:
-    """A problem with its intervals integrated about the biases and scale errors of a solution."""
-    ba, bg = best.states.ba[:-1], best.states.bg[:-1]
-    if SCALE in best.parameters:
-        scale = best.parameters[SCALE].value[0]
-        of_accel, of_gyro = convert_to_biases(scale, problem.intervals.force, problem.intervals.rate)
-        ba, bg = ba + of_accel, bg + of_gyro
-    return problem.reintegrate(ba, bg)
 
 
 def groups(problem: Problem, lag: float) -> list[tuple[int, int, int]]:

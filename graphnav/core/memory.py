@@ -10,8 +10,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # of mallopt(3)
-# bytes: more than the covariances of an hour with a keyframe a second and sixty error states; of parts of a drive,
-# whose results need the memory; what is kept in all
+# bytes: more than the covariances of an hour with a keyframe a second and sixty error states; while a drive is solved
+# in parts, whose results need the memory; what is kept in all
 _LARGEST, _LARGEST_OF_PARTS, _KEPT = 2**27, 2**26, 2**30
 _keeps = False
 

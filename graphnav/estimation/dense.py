@@ -166,7 +166,7 @@ def make_dense(problem: Problem, states: States, covariance: Array, scale: Array
     ba, bg = states.ba[:-1], states.bg[:-1]
     if scale is not None:
         scale = np.broadcast_to(scale, (len(states), scale.shape[-1]))[:-1]
-        of_accel, of_gyro = convert_to_biases(scale, problem.intervals.force, problem.intervals.rate)
+        of_accel, of_gyro = convert_to_biases(scale, *problem.intervals.inputs)
         ba, bg = ba + of_accel, bg + of_gyro
     noise = np.diagonal(problem.intervals.covariance, axis1=1, axis2=2)
     white = np.stack([noise[:, BLOCKS[name]].mean(axis=1) for name in ("theta", "v")])

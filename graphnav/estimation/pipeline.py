@@ -28,6 +28,7 @@ from graphnav.detectors import check_own as check_detectors
 from graphnav.estimation.building import start_sigma
 from graphnav.estimation.faults.excluded import describe_faults, find_fault_spans
 from graphnav.estimation.long_drives import OVERLAP, crop_solutions, share_covariances, split_drive
+from graphnav.estimation.noise.copies import describe_copies
 from graphnav.estimation.noise.files import MODES
 from graphnav.estimation.noise.imu_floor import apply_measured_floor
 from graphnav.estimation.noise.model import STATED, NoiseModel, StampOffsets
@@ -35,7 +36,6 @@ from graphnav.estimation.noise.words import describe_far
 from graphnav.estimation.offsets import move_stamps
 from graphnav.estimation.pieces import describe_span, split_pieces
 from graphnav.estimation.preparation import Prepared, Weigh, prepare, step_ahead
-from graphnav.estimation.problem import Problem, SolvedProblem
 from graphnav.estimation.separation import compute_separation
 from graphnav.estimation.solution import KNOWN, Solution, join_solutions
 from graphnav.estimation.solvers.breakdown import explain_singular
@@ -258,7 +258,7 @@ def _solve(
         recording = move_stamps(recording, stamps)
         found = prepare_moved(recording, stamps.rate)
     problem, forward, smoothed = found.problem, found.forward, found.smoothed
-    wrong = find_fault_spans(problem, smoothed)
+    faults = find_fault_spans(problem, smoothed)
     notes = (
         *found.start.notes,
         *undone,
@@ -266,7 +266,8 @@ def _solve(
         *found.detections.notes,
         *describe_stamps(stamps),
         *found.notes,
-        *describe_faults(wrong, problem),
+        *describe_copies(found.copies, recording),
+        *describe_faults(faults, problem),
     )
     notes = (*notes, *describe_far(problem, smoothed))
     start, passes = smoothed, Counter(found.passes)
@@ -320,9 +321,8 @@ def _solve(
             out[name],
             notes=(*notes, *out[name].notes),
             detections=found.detections.all,
-            excluded=wrong,
+            excluded=(*found.copies, *faults),
             noise=found.noise,
-            graphs=(_bind(problem, out[name]),),
             passes=dict(passes),
             separation=apart,
             fixed=found.fixed.get(name, found.fixed.get("", out[name].fixed)),
@@ -332,10 +332,6 @@ def _solve(
         for name in solvers
     }
     return {name: shift_to_own_clocks(one, stamps) for name, one in by_name.items()}
-
-
-def _bind(problem: Problem, solution: Solution) -> SolvedProblem:
-    return SolvedProblem(problem, solution.states, {name: one.value for name, one in solution.parameters.items()})
 
 
 def check_profile(recording: Recording, settings: Settings) -> list[str]:

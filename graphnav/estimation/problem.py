@@ -98,6 +98,19 @@ class Problem:
         intervals = preintegrate(self.samples, imu, self.t, ba, bg, self.interval_factors is not None)
         if self.interval_factors is not None:
             intervals = intervals.with_noise(self.interval_factors).without_parts()
+        known = self.intervals
+        intervals = replace(intervals, rate_noise=known.rate_noise, force_noise=known.force_noise)
+        return replace(self, intervals=intervals, motion=ImuFactors(intervals, self.frame))
+
+    def with_input_noise(self, states: States, scale: Array | None) -> Problem:
+        """The problem with scale errors of the IMU that multiply what it measured less the noise that K states show.
+
+        Its noise is in the residuals too. Were they multiplied with it, its squares would count as evidence of a scale
+        error: errors in variables (Fuller 1987, section 1.1), which matter where the platform hardly moves.
+        """
+        if scale is None:
+            return self
+        intervals = self.intervals.with_input_noise(self.motion.compute_residual(states, scale[:-1]))
         return replace(self, intervals=intervals, motion=ImuFactors(intervals, self.frame))
 
 
@@ -107,13 +120,13 @@ class SolvedProblem:
 
     problem: Problem
     states: States
-    values: dict[str, Array]  # (nodes, k) per parameter that solutions list
+    values: dict[str, Array]  # (nodes, k) per parameter
 
     def __call__(self) -> tuple[Any, Any]:
         """The graph of `Solution.to_gtsam`, and its values."""
-        from graphnav.estimation.factor_graph.nonlinear import Exported  # which needs GTSAM
+        from graphnav.estimation.factor_graph.nonlinear import make_graph  # which needs GTSAM
 
-        return Exported(self.problem, self.states, self.values)()
+        return make_graph(self.problem, self.states, self.values)
 
 
 def build_problem(

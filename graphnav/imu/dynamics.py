@@ -14,7 +14,8 @@ with G = g(p) + omega x (omega x p), and the Coriolis force does not appear. Ove
 
 E is integrated in closed form and G, which changes only with position, linearly: exact to a millimetre
 in ten minutes of free inertial. Scale errors of the sensors and axes that are not quite square, a constant matrix M
-each, act like biases b + M * mean rate (or force) of the interval, which is how they are estimated.
+each, act like biases b + M * mean rate (or force) of the interval, which is how they are estimated
+(`Intervals.inputs`).
 
 A foot turns and is shaken about all axes. A vehicle turns about its vertical only, and gravity always pulls along it:
 what M makes of gravity is one with the accelerometer's bias, and of pitch and roll, which return to zero, the gyro's
@@ -162,7 +163,7 @@ class ImuFactors:
         self.bias[:, 3:6, :3], self.bias[:, 3:6, 3:] = intervals.p_ba, intervals.p_bg
         self.bias[:, 6:, :3], self.bias[:, 6:, 3:] = intervals.v_ba, intervals.v_bg
         self.step = np.concatenate([intervals.dP, intervals.dV], axis=-1)
-        self.expected = np.concatenate([intervals.ba, intervals.bg], axis=-1)
+        self.expected, self.inputs = np.concatenate([intervals.ba, intervals.bg], axis=-1), intervals.inputs
 
     def prepare(self) -> ImuFactors:
         """Compute everything that would otherwise be computed at first use; returns itself."""
@@ -232,7 +233,7 @@ class ImuFactors:
         iv = self.intervals
         delta = np.concatenate([start.ba, start.bg], -1) - self.expected[rows]
         if scale is not None:
-            delta += np.concatenate(convert_to_biases(scale, iv.force[rows], iv.rate[rows]), -1)
+            delta += np.concatenate(convert_to_biases(scale, *(x[rows] for x in self.inputs)), -1)
         bent = mv(self.bias[rows], delta)
         turn = bent[:, :3]
         return turn, iv.dR[rows] @ rotation.exp(turn), self.step[rows] + bent[:, 3:]
@@ -243,8 +244,8 @@ class ImuFactors:
 
     def scale_columns(self, rows: slice, F: Array, k: int) -> Array:
         """d(end) / d(scale), (n, 15, k): the bias columns of F times what the scale errors multiply."""
-        iv, out = self.intervals, np.zeros((len(F), DIM, k))
-        out[:, :9] = differentiate_by_scale(F[:, :9, 12:15], F[:, :9, 9:12], iv.force[rows], iv.rate[rows], k)
+        out, (force, rate) = np.zeros((len(F), DIM, k)), self.inputs
+        out[:, :9] = differentiate_by_scale(F[:, :9, 12:15], F[:, :9, 9:12], force[rows], rate[rows], k)
         return out
 
     def compute_frames(self, rows: slice, R_nb: Array) -> Array:

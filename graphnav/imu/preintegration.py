@@ -73,8 +73,10 @@ class Intervals:
     p_bg: Array  # (n, 3, 3) m s
     ba: Array  # (n, 3) the biases used for them
     bg: Array  # (n, 3)
-    rate: Array  # (n, 3) mean rate and force minus those biases: what scale errors multiply
+    rate: Array  # (n, 3) mean rate and force measured, minus those biases
     force: Array  # (n, 3)
+    rate_noise: Array  # (n, 3) their noise, as far as it is known: zero until the states are
+    force_noise: Array  # (n, 3)
     covariance: Array  # (n, 15, 15)
     parts: Array  # (n, 4, 15, 15) contributions of each of `NOISE_FIGURES`; (n, 0, 15, 15) unless asked for
     past_turn: (
@@ -94,6 +96,22 @@ class Intervals:
     def T(self) -> Array:
         """Durations, s."""
         return self.t1 - self.t0
+
+    @property
+    def inputs(self) -> tuple[Array, Array]:
+        """Mean force and rate (n, 3) that scale errors multiply."""
+        return self.force - self.force_noise, self.rate - self.rate_noise
+
+    def with_input_noise(self, residual: Array) -> Intervals:
+        """The intervals with the noise of mean rate and force that a residual (n, 15) of the IMU factor shows.
+
+        It is the bias that would explain the residual.
+        """
+        rate, force = (
+            np.linalg.solve(by, residual[:, at, None])[..., 0]
+            for by, at in ((self.theta_bg, slice(0, 3)), (self.v_ba, slice(6, 9)))
+        )
+        return replace(self, rate_noise=rate, force_noise=force)
 
     def with_noise(self, factors: Array) -> Intervals:
         """The intervals with the variances of `NOISE_FIGURES` multiplied by factors (4,) or (n, 4); needs `parts`."""
@@ -318,9 +336,11 @@ def _integrate(
         parts = turn[:, None] @ np.stack([rate, force, of_gyro, of_accel], 1) @ np.swapaxes(turn, -1, -2)[:, None]
     theta_bg = np.swapaxes(dR, -1, -2) @ v_ba
     mean_rate, mean_force = (np.sum(x * dt[:, None], axis=0).T / T[:, None] for x in (w, f))
+    unknown = np.zeros((n, 3))
     return Intervals(
         t[rows], t[rows + 1], dR, take_last(V), take_last(P), theta_bg, v_ba, v_bg, p_ba, p_bg,
-        np.array(ba), np.array(bg), mean_rate, mean_force, Q, parts, *_compute_mean_velocity_parts(edge, R, V, A),
+        np.array(ba), np.array(bg), mean_rate, mean_force, unknown, unknown, Q, parts,
+        *_compute_mean_velocity_parts(edge, R, V, A),
     )  # fmt: skip
 
 

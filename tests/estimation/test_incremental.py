@@ -136,7 +136,7 @@ def test_a_lag_over_the_outage_gives_the_batch_solution_to_centimetres(drive: tu
 
 # -------------------------------------------------------------------------------------------------------- messages
 def some_message(rng: np.random.Generator) -> Message:
-    return Message.of(random_states(rng, 1), rng.standard_normal(4), {"a": slice(15, 19)}, np.triu(
+    return Message(random_states(rng, 1), rng.standard_normal(4), {"a": slice(15, 19)}, np.triu(
         rng.standard_normal((19, 19)) + 5 * np.eye(19)), rng.standard_normal(19))  # fmt: skip
 
 

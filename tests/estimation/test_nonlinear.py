@@ -21,7 +21,7 @@ from graphnav.core.state import DIM
 from graphnav.detectors import detect
 from graphnav.detectors.base import Detection
 from graphnav.detectors.scene import Detector
-from graphnav.estimation.factor_graph.nonlinear import Exported, get_state
+from graphnav.estimation.factor_graph.nonlinear import get_state, make_graph
 from graphnav.estimation.pipeline import add_own, run
 from graphnav.estimation.problem import build_problem
 from graphnav.estimation.solvers.rows import Iterate, Layout, whiten
@@ -65,7 +65,7 @@ def test_kernels_are_those_of_gtsam(drive, kernel):
     problem = build_problem(drive.crop(0.0, 5.0), settings, frame, start, np.ones(DIM))
     states = random_states(np.random.default_rng(5), len(problem.t), span=2.0)
     values = {c.parameter.name: c.mean for c in problem.chains}
-    graph, at = Exported(problem, states, values)()
+    graph, at = make_graph(problem, states, values)
     _, expected = whiten(problem, Iterate(states, values), Layout(problem))
     assert graph.error(at) == pytest.approx(expected, rel=1e-9)
 

@@ -61,25 +61,21 @@ class Drive:
         out |= {name: np.zeros((n, ROWS)) for name in ("solved", "bent", "w")}
         out |= {"Kt": np.zeros((n, ROWS, D)), "N": np.zeros((n, DIM, DIM))}
         (taken, lossy), blocks = np.zeros((2, 2 * n), dtype=bool), self.blocks
+        steps, updates = (self.F, self.decay), (out["Kt"], self.H, out["w"], out["inverse"], taken, lossy)
+        filtered = out["ahead"], out["P_ahead"], out["errors"], out["P"]
         recursion.filter_rows(
-            0, n, self.e, self.P, self.F, self.decay, self.gap, self.Q, self.added, self.r, self.H, self.variance,
-            self.scale, *blocks.arrays, self.used, out["ahead"], out["P_ahead"], out["errors"], out["P"],
-            out["root"], out["solved"], out["bent"], out["Kt"], out["w"], out["inverse"],
-            taken, lossy, np.zeros(1, dtype=int),
+            0, n, self.e, self.P, (*steps, self.gap, self.Q, self.added), (self.r, self.H, self.variance, self.scale),
+            blocks.arrays, self.used, filtered, (out["root"], out["solved"], out["bent"]), updates,
+            np.zeros(1, dtype=int),
         )  # fmt: skip
         for P_smoothed in (out["P_smoothed"], np.empty((0, D, D))):
             disturbance.smooth_rows(
-                0, n, np.zeros(D), np.zeros((D, D)), self.F, self.decay, out["Kt"], self.H, out["w"], out["inverse"],
-                blocks.first, blocks.begin, blocks.end, taken, lossy,
-                out["ahead"], out["P_ahead"], out["errors"], out["P"], np.tile(np.arange(D), n), D * np.arange(n + 1),
-                out["r"], out["N"], out["N_diagonal"], out["smoothed"], P_smoothed, out["variance"],
-                2.0 * self.H, out["of_rows"],
+                0, n, np.zeros(D), np.zeros((D, D)), steps, updates, blocks.arrays, filtered,
+                (out["smoothed"], out["r"], out["N"], out["N_diagonal"]), (P_smoothed, out["variance"], out["of_rows"]),
+                2.0 * self.H, np.tile(np.arange(D), n), D * np.arange(n + 1),
             )  # fmt: skip
         out |= {"taken": taken, "lossy": lossy, "errors_alone": np.zeros((n, D))}
-        disturbance.smooth_errors(
-            n, np.zeros(D), self.F, self.decay, out["Kt"], self.H, out["w"], blocks.first, blocks.begin, blocks.end,
-            taken, out["ahead"], out["P_ahead"], out["errors"], out["P"], out["errors_alone"],
-        )  # fmt: skip
+        disturbance.smooth_errors(n, np.zeros(D), steps, updates, blocks.arrays, filtered, out["errors_alone"])
         # small, so that turns add up
         moved = 1e-6 * (out["errors"] - out["ahead"])
         half = np.concatenate([np.ones((n, 1)), 0.5 * moved[:, :3]], axis=1)
@@ -87,9 +83,8 @@ class Drive:
         out |= {"away": np.zeros((n, D)), "P_back": out["P"].copy(), "away_alone": np.zeros((n, D))}
         for P_smoothed, away in ((out["P_back"], out["away"]), (np.empty((0, D, D)), out["away_alone"])):
             recursion.smooth_filtered(
-                0, n - 1, moved, turned, self.F, self.decay, out["P_ahead"], out["P"], P_smoothed, away,
-                np.zeros(1, dtype=int),
-            )  # fmt: skip
+                0, n - 1, moved, turned, steps, out["P_ahead"], out["P"], P_smoothed, away, np.zeros(1, dtype=int)
+            )
         return out
 
 

@@ -85,7 +85,7 @@ def test_a_message_that_knows_no_heading_learns_none_where_its_point_moves(moves
     state, A = states[:1], rng.standard_normal((DIM, DIM))
     n = along(state)[0] / np.linalg.norm(along(state)[0])
     R = np.linalg.qr(A - np.outer(A @ n, n))[1]
-    message = Message.of(state, np.zeros(0), {}, R, rng.standard_normal(DIM), turns=True)
+    message = Message(state, np.zeros(0), {}, R, rng.standard_normal(DIM), turns=True)
     moved = message.move(e[0])
     np.testing.assert_allclose(moved.R @ along(moved.state)[0], 0.0, atol=1e-10)
     straight = replace(message, turns=False).move(e[0])

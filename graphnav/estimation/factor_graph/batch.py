@@ -20,13 +20,11 @@ import numpy as np
 
 from graphnav.core.notes import Note, format_count
 from graphnav.core.progress import Progress
-from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, States
-from graphnav.estimation.dense import make_dense
 from graphnav.estimation.factor_graph.gaussian import Eliminated, LinearGraph
 from graphnav.estimation.problem import Problem
-from graphnav.estimation.solution import ParameterEstimate, Solution
-from graphnav.estimation.solvers.passes import integrate_again, record_residuals
+from graphnav.estimation.solution import Solution
+from graphnav.estimation.solvers.passes import integrate_again, make_solution, record_residuals
 from graphnav.estimation.solvers.robust import REDESCENDING
 from graphnav.estimation.solvers.rows import (
     Correction,
@@ -81,6 +79,11 @@ def batch(
     marginal = dict(zip(keys, layout.split(of_variables, keys), strict=True))
     unknown = np.full((DIM, DIM), np.nan)
     covariance = np.stack([marginal.get(k, unknown) for k in range(layout.K)])
+    sigmas: Values = {}
+    for group in layout.groups:
+        P = np.stack([marginal[k] for k in group.keys.tolist()])
+        sigmas |= {name: np.sqrt(np.diagonal(P, axis1=1, axis2=2))[:, at] for name, at in group.columns.items()}
+    sigma = Iterate(point.states, sigmas).make_points(problem).values
     done = time.perf_counter()
     points, records = point.make_points(problem), {}
     for constraint in problem.constraints:
@@ -92,22 +95,11 @@ def batch(
                     f"most rows of {constraint.name} are down-weighted as outliers: do not trust this solution",
                 )
             )
-    return Solution(
-        solver="batch",
-        frame=problem.frame,
-        t=problem.t,
-        states=point.states,
-        covariance=covariance,
-        parameters=_collect_estimates(problem, layout, point, marginal),
-        records=records,
-        counts={"initial_prior": 1, "imu": layout.K - 1, **{c.name: len(c) for c in problem.constraints}},
-        iterations=found.iterations,
-        cost=found.cost,
-        stopped=found.stopped,
+    return make_solution(
+        problem, "batch", points, covariance, sigma, smooth=True, notes=(*found.notes, *notes), records=records,
+        iterations=found.iterations, cost=found.cost, stopped=found.stopped,
         timings={"batch": solved - began, "covariances": done - solved},
-        notes=(*problem.notes, *found.notes, *notes),
-        between=(make_dense(problem, point.states, covariance, point.scale, smooth=True),),
-    )
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -234,18 +226,3 @@ def solve_rows(rows: WhitenedRows, layout: Layout, damping: float = 0.0) -> tupl
     if size is not None:  # the damping rows are not part of the cost
         gain += 0.5 * sum(float(np.sum((s[: len(x)] * x) ** 2)) for s, x in zip(size, found, strict=True))
     return eliminated, layout.unpack(found), gain
-
-
-def _collect_estimates(
-    problem: Problem, layout: Layout, point: Iterate, covariances: dict[int, Array]
-) -> dict[str, ParameterEstimate]:
-    out, sigmas = {}, dict[str, Array]()
-    for group in layout.groups:
-        P = np.stack([covariances[k] for k in group.keys.tolist()])
-        sigma = np.sqrt(np.diagonal(P, axis1=1, axis2=2))
-        sigmas |= {name: sigma[:, at] for name, at in group.columns.items()}
-    for chain in problem.chains:
-        p = chain.parameter
-        if p.listed:
-            out[p.name] = ParameterEstimate(chain.t, point.values[p.name], sigmas[p.name], p.prior_sigma, p.unit)
-    return out

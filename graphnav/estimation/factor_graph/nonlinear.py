@@ -15,13 +15,10 @@ linearises: nonlinear, but slower than C++, and not to be serialised.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from typing import Any
 
 import gtsam
 import numpy as np
-from scipy.sparse import csr_array, diags_array, vstack
-from scipy.sparse.linalg import spsolve
 
 from graphnav.constraints.base import Constraint
 from graphnav.core.errors import EstimationError
@@ -30,7 +27,7 @@ from graphnav.core.state import BLOCKS, DIM, States
 from graphnav.estimation.factor_graph.gaussian import make_jacobian_factor
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.linearise import Points, linearise, linearise_links, shift
-from graphnav.estimation.solvers.rows import Iterate, Layout, linearise_chains
+from graphnav.estimation.solvers.rows import Layout, linearise_chains
 from graphnav.imu.dynamics import SCALE
 
 _ESTIMATORS: dict[str, Any] = {
@@ -40,88 +37,39 @@ _ESTIMATORS: dict[str, Any] = {
     "tukey": gtsam.noiseModel.mEstimator.Tukey,
     "welsch": gtsam.noiseModel.mEstimator.Welsch,
 }
-_MAX_ITERATIONS, _CONVERGED = (
-    20,
-    1e-9,
-)  # iterations of reweighting by kernels; relative change of the cost at convergence
 _X, _V, _B, _Q = (gtsam.symbol_shorthand.X, gtsam.symbol_shorthand.V, gtsam.symbol_shorthand.B,
                   gtsam.symbol_shorthand.Q)  # fmt: skip
 
 
-@dataclass(frozen=True)
-class Exported:
-    """A problem and its solution, converted to a graph when it is called."""
+def make_graph(
+    problem: Problem, states: States, nodes: dict[str, Array]
+) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
+    """The graph of a problem, and a solution of it as its values.
 
-    problem: Problem
-    states: States
-    values: dict[str, Array]  # (nodes, k) per parameter
+    Parameters
+    ----------
+    states : of all K keyframes.
+    nodes : (nodes, k) values of every parameter.
 
-    def __call__(self) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
-        """Make the graph, and the solution as its values.
-
-        Raises
-        ------
-        EstimationError
-            For a robust kernel that GTSAM does not have as a factor.
-        """
-        layout = Layout(self.problem)
-        known = _add_unlisted(self.problem, self.states, self.values)
-        values = gtsam.Values()
-        states = self.states
-        for k in range(len(states)):
-            values.insert(_X(k), gtsam.Pose3(gtsam.Rot3(states.R_nb[k]), states.p[k]))
-            values.insert(_V(k), states.v[k])
-            values.insert(_B(k), gtsam.imuBias.ConstantBias(states.ba[k], states.bg[k]))
-        for group in layout.groups:
-            for j, key in enumerate(group.keys.tolist()):
-                node = np.concatenate([known[name][j] for name in group.columns])
-                values.insert(_Q(key - layout.K), node)
-        graph = gtsam.NonlinearFactorGraph()
-        for one in _make_factors(self.problem, layout):
-            graph.push_back(one)
-        return graph, values
-
-
-def _add_unlisted(problem: Problem, states: States, values: dict[str, Array]) -> dict[str, Array]:
-    """The values together with parameters that solutions do not list, places of stops and ambiguities: optimal given
-    the rest.
-
-    Rows are linear in them, except for their kernels.
+    Raises
+    ------
+    EstimationError
+        For a robust kernel that GTSAM does not have as a factor.
     """
-    out = {c.parameter.name: c.mean for c in problem.chains} | values
-    chains = [c for c in problem.chains if c.parameter.name not in values]
-    if not chains:
-        return out
-    first = np.cumsum([0, *(c.mean.size for c in chains)])
-    sigma = np.concatenate([c.sigma.ravel() for c in chains])
-    mean = at = np.concatenate([c.mean.ravel() for c in chains])
-    for k in range(_MAX_ITERATIONS):
-        points = Iterate(states, out).make_points(problem)
-        parts = [(diags_array(1.0 / sigma), (mean - at) / sigma)]
-        for rows in problem.constraints:
-            names = {p.name for p in rows.parameters}
-            own = {c.parameter.name: (c, i) for c, i in zip(chains, first, strict=False) if c.parameter.name in names}
-            if own:
-                linear = linearise(rows, points, problem.columns)
-                # initially they are too far off for a kernel to distinguish outliers
-                root = np.sqrt(linear.weigh()[0] if k else np.ones(len(rows)))[:, None] / linear.sigma
-                H = csr_array((root.size, len(sigma)))
-                for name, (c, i) in own.items():
-                    block = root[:, :, None] * linear.H[:, :, problem.columns[name]]
-                    column = np.arange(c.parameter.size) + i + c.parameter.size * c.node[rows.keyframe, None, None]
-                    row = np.arange(root.size).reshape(*root.shape, 1)
-                    cells = tuple(np.broadcast_to(x, block.shape).ravel() for x in (row, column))
-                    H = H + csr_array((block.ravel(), cells), H.shape)
-                parts.append((H, -(root * linear.residual).ravel()))
-        A, b = vstack([H for H, _ in parts]).tocsc(), np.concatenate([r for _, r in parts])
-        step = spsolve(A.T @ A, A.T @ b)
-        at = at + step
-        out |= {
-            c.parameter.name: x.reshape(c.mean.shape) for c, x in zip(chains, np.split(at, first[1:-1]), strict=True)
-        }
-        if k and np.all(np.abs(step) < _CONVERGED * sigma):
-            break
-    return out
+    layout = Layout(problem)
+    values = gtsam.Values()
+    for k in range(len(states)):
+        values.insert(_X(k), gtsam.Pose3(gtsam.Rot3(states.R_nb[k]), states.p[k]))
+        values.insert(_V(k), states.v[k])
+        values.insert(_B(k), gtsam.imuBias.ConstantBias(states.ba[k], states.bg[k]))
+    for group in layout.groups:
+        for j, key in enumerate(group.keys.tolist()):
+            node = np.concatenate([nodes[name][j] for name in group.columns])
+            values.insert(_Q(key - layout.K), node)
+    graph = gtsam.NonlinearFactorGraph()
+    for one in _make_factors(problem, layout):
+        graph.push_back(one)
+    return graph, values
 
 
 def get_state(values: gtsam.Values, k: int) -> States:

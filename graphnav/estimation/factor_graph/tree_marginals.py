@@ -90,7 +90,7 @@ def find_head(tree: Tree) -> Message:
     gone = ~known.any(axis=1)  # parameters that began anew
     R = np.asarray(np.linalg.qr(np.hstack([A[:, gone], A @ known, b - A @ delta[:, None]]), "r"))
     own_rows = slice(gone.sum(), gone.sum() + known.shape[1])
-    return Message.of(first.estimate, first.values, first.columns, R[own_rows, own_rows], R[own_rows, -1])
+    return Message(first.estimate, first.values, first.columns, R[own_rows, own_rows], R[own_rows, -1])
 
 
 @dataclass(frozen=True)

@@ -37,11 +37,6 @@ class Variable:
     anchor: Array = field(default_factory=lambda: np.zeros(0))  # of parameters
     limit: Array = field(default_factory=lambda: np.zeros(0))  # how far they may move; empty where nothing limits them
 
-    @property
-    def value(self) -> Array:
-        """Parameters as they are known now."""
-        return self.anchor + self.delta
-
 
 @dataclass(eq=False)
 class Keyframe:

@@ -62,7 +62,7 @@ class TreeWindow(Window):
         stage = self._adopt(self.stages[-1])
         m = stage.message
         R = compute_newest_root(self.tree)
-        self.stages[-1] = replace(stage, message=Message.of(m.state, m.values, m.columns, R, m.z, m.tests))
+        self.stages[-1] = replace(stage, message=replace(m, R=R))
         self._means = None
 
     # ------------------------------------------------------------------------------------------- what the tree knows

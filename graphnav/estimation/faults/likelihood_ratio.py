@@ -16,6 +16,7 @@ import numpy as np
 from graphnav.core.compiled import compile_once
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM
+from graphnav.estimation.solvers.recursion import Arrays
 
 
 def count_remembered(L: int, c: int) -> int:
@@ -81,19 +82,26 @@ def add_row(memory: Array, rho: Array, Gamma: Array, L: int, c: int, errors: Arr
 
 
 @compile_once
+def step(F: Array, decay: Array, X: Array) -> None:
+    """X (D, n) <- F X: what errors have done to the estimate, a step on."""
+    top = np.dot(F, X[: F.shape[1]])
+    for i in range(len(decay)):
+        np.multiply(X[DIM + i], decay[i], X[DIM + i])
+    np.positive(top, X[:DIM])
+
+
+@compile_once
+def respond(H: Array, Kt: Array, X: Array, G: Array) -> None:
+    """G (m, n) <- U - H X and X (D, n) <- X + K G: an update with rows that have the errors G = U themselves."""
+    G -= np.dot(H, X)
+    X += np.dot(Kt.T, G)
+
+
+@compile_once
 def update_tests(
-    X: Array,
-    memory: Array,
-    layout: Array,
-    scale: Array,
-    t: float,
-    H: Array,
-    Kt: Array,
-    root: Array,
-    solved: Array,
-    errors: Array,
-    T: Array,
-) -> None:
+    X: Array, memory: Array, layout: Array, scale: Array, t: float, H: Array, Kt: Array, root: Array, solved: Array,
+    errors: Array, T: Array,
+) -> None:  # fmt: skip
     """A fix of a tested kind has been taken in at time t, s, by the gain transposed.
 
     Parameters
@@ -104,8 +112,7 @@ def update_tests(
     column, L, m, c = layout[1], layout[2], layout[3], layout[4]
     slot, n = begin_slot(memory, t, L, c, scale[0]), len(H)
     X[:, column + c * slot : column + c * (slot + 1)] = 0.0
-    G = np.dot(H, X)
-    np.negative(G, G)
+    G = np.zeros((n, X.shape[1]))
     for one in range(L):
         if not np.isnan(memory[one]):  # a fix itself has the error
             for i in range(n):
@@ -113,7 +120,7 @@ def update_tests(
                 G[i, at] += 1.0
                 if c > m:
                     G[i, at + m] += (t - memory[one]) / scale[1]
-    X += np.dot(Kt.T, G)
+    respond(H, Kt, X, G)
     own = G[:, column : column + L * c].copy()
     for i in range(n):
         for j in range(i):
@@ -135,64 +142,45 @@ def remember(k: int, state: Array, before: Array, keys: Array, ends: Array) -> N
 
 @compile_once
 def follow_filter(
-    k0: int,
-    k1: int,
-    b0: int,
-    t: Array,
-    F: Array,
-    decay: Array,
-    H: Array,
-    Kt: Array,
-    root: Array,
-    solved: Array,
-    first: Array,
-    begin: Array,
-    end: Array,
-    taken: Array,
-    kind: Array,
-    limit: Array,
-    met: Array,
-    layouts: Array,
-    scales: Array,
-    state: Array,
-    before: Array,
-    keys: Array,
-    ends: Array,
-    errors: Array,
-    T: Array,
-) -> tuple[int, int]:
+    k0: int, k1: int, b0: int, t: Array, steps: Arrays, updates: Arrays, root: Array, blocks: Arrays, tests: Arrays,
+    memory: Arrays, found: Arrays,
+) -> tuple[int, int]:  # fmt: skip
     """Follow a filter (`graphnav.estimation.solvers.recursion.filter_rows`) from block b0 of keyframe k0 to k1.
 
     Returns the keyframe and the block at which the first T is above its limit, or k1 and the block there.
 
     Parameters
     ----------
-    kind : (B,) of each block, -1 where it is not tested; `limit` (B,) of its T.
-    met : (K,) whether there are fixes at a keyframe, before which the state is remembered.
-    layouts, scales : of each kind.
+    steps : F and decay; `updates` and `blocks` as the filter has them, `root` (n, M, M) of S, weighted.
+    tests : the kind (B,) of each block, -1 where it is not tested; the limit (B,) of its T; whether there are fixes
+        (K,) at a keyframe, before which the state is remembered; layouts and scales of each kind.
+    memory : the state, and the ring of `remember`.
+    found : of each kind errors and T, as for `add_row`.
     """
-    D, w = H.shape[2], F.shape[2]
-    X = state[: layouts[0, 0]].reshape(D, -1)
+    F, decay = steps
+    Kt, H, solved, _, taken, _ = updates
+    first, begin, end, _, _, _ = blocks
+    kind, limit, met, layouts, scales = tests
+    state, before, keys, ends = memory
+    errors, T = found
+    X = state[: layouts[0, 0]].reshape(H.shape[2], -1)
     for k in range(k0, k1):
         if b0 <= first[k]:
             if met[k]:
                 remember(k, state, before, keys, ends)
             if k:
-                top = np.dot(F[k - 1], X[:w])
-                for i in range(D - DIM):
-                    np.multiply(X[DIM + i], decay[k - 1, i], X[DIM + i])
-                np.positive(top, X[:DIM])
+                step(F[k - 1], decay[k - 1], X)
         for b in range(max(first[k], b0), first[k + 1]):
             if not taken[b]:
                 continue
             lo, hi, i = begin[b], end[b], kind[b]
             own, gain = H[k, lo:hi], Kt[k, lo:hi]
             if i < 0:
-                X -= np.dot(gain.T, np.dot(own, X))
+                respond(own, gain, X, np.zeros((hi - lo, X.shape[1])))
                 continue
             layout, S = layouts[i], np.ascontiguousarray(root[k, lo:hi, lo:hi])
-            memory = state[layout[0] : layout[0] + layout[2] * (1 + layout[4] * (1 + layout[4])) + 1]
-            update_tests(X, memory, layout, scales[i], t[k], own, gain, S, solved[k, lo:hi], errors[i], T[i])
+            own_memory = state[layout[0] : layout[0] + layout[2] * (1 + layout[4] * (1 + layout[4])) + 1]
+            update_tests(X, own_memory, layout, scales[i], t[k], own, gain, S, solved[k, lo:hi], errors[i], T[i])
             if np.max(T[i, : layout[2]]) > limit[b]:
                 return k, b
     return k1, first[k1]

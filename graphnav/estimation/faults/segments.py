@@ -26,12 +26,12 @@ import numpy as np
 
 from graphnav.constraints.base import Constraint
 from graphnav.core.rotation import Array
+from graphnav.estimation.faults.likelihood_ratio import respond, step
 from graphnav.estimation.faults.watch import FAULT_COST, MINUTE, SIZES, is_large
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.ekf import refilter
 from graphnav.estimation.solvers.linearise import Points
 from graphnav.estimation.solvers.passes import ForwardRecord
-from graphnav.estimation.solvers.recursion import move_columns
 
 _BEAM = 8  # sets of segments that are followed: the likeliest single one need not be among the likeliest two
 
@@ -185,22 +185,23 @@ def _respond(problem: Problem, forward: ForwardRecord, fixes: list[Constraint], 
         column[of[own], place[own]] = (C * segment[own] + 2 * m * i)[:, None] + np.arange(m)
         minutes[of[own], place[own]] = ((t[own] - begins[0]) / MINUTE)[:, None]
     every = C * len(begins)
-    X, score, info = np.zeros((D, every)), np.zeros(every), np.zeros((every, every))
+    X, score, info = np.zeros((D, 0)), np.zeros(every), np.zeros((every, every))
     blocks, met = updates.blocks, np.maximum(column.max(axis=1) // C + 1, 0) * C
-    known = 0
     for k in range(n):
-        if known:
-            X[:, :known] = move_columns(forward.F[k - 1], forward.decay[k - 1], np.ascontiguousarray(X[:, :known]))
-        known = max(known, int(met[k]))  # columns from there on are zero still
+        if X.shape[1]:
+            step(forward.F[k - 1], forward.decay[k - 1], X)
+        if met[k] > X.shape[1]:  # columns of segments that have not begun are zero still
+            X = np.pad(X, ((0, 0), (0, met[k] - X.shape[1])))
+        known = X.shape[1]
         for b in range(blocks.first[k], blocks.first[k + 1]) if known else ():
             if not updates.taken[b]:
                 continue
             at = k, slice(blocks.begin[b], blocks.end[b])
-            G = -updates.H[at] @ X[:, :known]
             some = np.flatnonzero(column[at] >= 0)
-            G[some, column[at][some]] += 1.0
-            G[some, column[at][some] + m] += minutes[at][some]
-            X[:, :known] += updates.Kt[at].T @ G
+            G = np.zeros((len(column[at]), known))
+            G[some, column[at][some]] = 1.0
+            G[some, column[at][some] + m] = minutes[at][some]
+            respond(updates.H[at], updates.Kt[at], X, G)
             score[:known] += G.T @ updates.w[at]
             info[:known, :known] += G.T @ (updates.inverse[*at, at[1]] @ G)
     return score.reshape(-1, C), info.reshape(len(begins), C, -1, C)

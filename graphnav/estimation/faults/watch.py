@@ -285,9 +285,9 @@ class Bank:
         k, b = k0, int(blocks.first[k0])
         while True:
             k, b = follow_filter(
-                k, k1, b, self._t, F, decay, updates.H, updates.Kt, root, updates.w,
-                blocks.first, blocks.begin, blocks.end, updates.taken, kind, limit, self._met,
-                self._layouts, self._scales, self._state, self._before, self._keys, self._ends, self._errors, self._T,
+                k, k1, b, self._t, (F, decay), updates.arrays, root, blocks.arrays,
+                (kind, limit, self._met, self._layouts, self._scales),
+                (self._state, self._before, self._keys, self._ends), (self._errors, self._T),
             )  # fmt: skip
             if k == k1:
                 return None

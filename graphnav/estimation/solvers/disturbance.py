@@ -11,6 +11,7 @@ import numpy as np
 from graphnav.core.compiled import compile_once
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, MOVING
+from graphnav.estimation.solvers.recursion import Arrays
 
 
 @compile_once
@@ -67,24 +68,13 @@ def take_back(N: Array, H: Array, Kt: Array, inverse: Array, lossy: bool) -> Arr
 
 @compile_once
 def smooth_errors(
-    k1: int,
-    r: Array,
-    F: Array,
-    decay: Array,
-    Kt: Array,
-    H: Array,
-    w: Array,
-    first: Array,
-    begin: Array,
-    end: Array,
-    taken: Array,
-    errors_predicted: Array,
-    P_predicted: Array,
-    errors: Array,
-    P: Array,
-    smoothed: Array,
+    k1: int, r: Array, steps: Arrays, updates: Arrays, blocks: Arrays, filtered: Arrays, smoothed: Array
 ) -> None:
     """Errors (n, D) of the smoother at keyframes before k1, as `smooth_rows` has them, by r (D,) there alone."""
+    F, decay = steps
+    Kt, H, w, _, taken, _ = updates
+    first, begin, end, _, _, _ = blocks
+    errors_predicted, P_predicted, errors, P = filtered
     for k in range(k1 - 1, -1, -1):
         ahead = k < len(F)
         if ahead:
@@ -100,36 +90,9 @@ def smooth_errors(
 
 @compile_once
 def smooth_rows(
-    k0: int,
-    k1: int,
-    r_k: Array,
-    N_k: Array,
-    F: Array,
-    decay: Array,
-    Kt: Array,
-    H: Array,
-    w: Array,
-    inverse: Array,
-    first: Array,
-    begin: Array,
-    end: Array,
-    taken: Array,
-    lossy: Array,
-    errors_predicted: Array,
-    P_predicted: Array,
-    errors: Array,
-    P: Array,
-    wanted: Array,
-    first_wanted: Array,
-    r: Array,
-    N: Array,
-    N_diagonal: Array,
-    smoothed: Array,
-    P_smoothed: Array,
-    variance: Array,
-    asked: Array,
-    of_rows: Array,
-) -> tuple[Array, Array]:
+    k0: int, k1: int, r_k: Array, N_k: Array, steps: Arrays, updates: Arrays, blocks: Arrays, filtered: Arrays,
+    found: Arrays, covered: Arrays, asked: Array, wanted: Array, first_wanted: Array,
+) -> tuple[Array, Array]:  # fmt: skip
     """r (n, D), and of N the states' part (n, 15, 15) and the diagonal (n, D), of keyframes k1 - 1 down to k0.
 
     From those of k1, zero where there is none; returns those of k0. And errors (n, D) of the smoother there: from the
@@ -138,13 +101,18 @@ def smooth_rows(
 
     Parameters
     ----------
-    Kt, H, w, inverse : of the updates: gains transposed, rows, S^-1 nu and S^-1.
-    taken, lossy : (B,) whether a block was taken in, and whether with a loss of digits.
-    P_smoothed : (n, D, D), filled with covariances of the smoother, if it has any keyframes. If it has none,
-    variance : (n, D), and
-    of_rows : (n, M, M), filled with variances, and with H P^s H^T of rows `asked` (n, M, D).
+    steps : F (n-1, 15, w) and decay (n-1, D-15).
+    updates, blocks, filtered : as of `graphnav.estimation.solvers.recursion.filter_rows`.
+    found : filled with errors, r, N and the diagonal of N.
+    covered : filled with covariances (n, D, D) of the smoother, if it has any keyframes. If it has none, with variances
+        (n, D), and H P^s H^T (n, M, M) of rows `asked` (n, M, D).
     wanted, first_wanted : columns of which variances are wanted, those of keyframe k from `first_wanted[k]` on.
     """
+    F, decay = steps
+    Kt, H, w, inverse, taken, lossy = updates
+    first, begin, end, _, _, _ = blocks
+    errors_predicted, P_predicted, errors, P = filtered
+    smoothed, r, N, N_diagonal = found
     for k in range(k1 - 1, k0 - 1, -1):
         rows = end[first[k + 1] - 1] if first[k] < first[k + 1] else 0
         ahead = k < len(F)  # at the last keyframe the filtered covariance already is of errors about the estimate
@@ -152,7 +120,7 @@ def smooth_rows(
             r_k = step_vector_back(F[k], decay[k], r_k)
             N_k = step_back(F[k], decay[k], N_k)
             np.add(errors[k], np.dot(P[k], r_k), smoothed[k])
-            fill_covariances(k, P[k], N_k, rows, wanted, first_wanted, asked, P_smoothed, variance, of_rows)
+            fill_covariances(k, P[k], N_k, rows, wanted, first_wanted, asked, covered)
         for b in range(first[k + 1] - 1, first[k] - 1, -1):
             if taken[b]:
                 lo, hi = begin[b], end[b]
@@ -166,24 +134,16 @@ def smooth_rows(
         if not ahead:
             ahead_P = P_predicted[k % len(P_predicted)]
             np.add(errors_predicted[k], np.dot(ahead_P, r_k), smoothed[k])
-            fill_covariances(k, ahead_P, N_k, rows, wanted, first_wanted, asked, P_smoothed, variance, of_rows)
+            fill_covariances(k, ahead_P, N_k, rows, wanted, first_wanted, asked, covered)
     return r_k, N_k
 
 
 @compile_once
 def fill_covariances(
-    k: int,
-    P: Array,
-    N: Array,
-    rows: int,
-    wanted: Array,
-    first_wanted: Array,
-    asked: Array,
-    P_smoothed: Array,
-    variance: Array,
-    of_rows: Array,
+    k: int, P: Array, N: Array, rows: int, wanted: Array, first_wanted: Array, asked: Array, covered: Arrays
 ) -> None:
     """What `smooth_rows` is to fill in of P - P N P at keyframe k, the first of `asked` being as many as `rows`."""
+    P_smoothed, variance, of_rows = covered
     if len(P_smoothed) > 0:
         cover(P, N, P_smoothed[k])
         return

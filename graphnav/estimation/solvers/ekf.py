@@ -34,26 +34,24 @@ import numpy as np
 from graphnav.core.progress import Progress
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM
-from graphnav.estimation.dense import make_dense
 from graphnav.estimation.faults.search import FaultSearch, free
 from graphnav.estimation.faults.watch import Bank
 from graphnav.estimation.problem import Problem
-from graphnav.estimation.solution import Solution
 from graphnav.estimation.solvers.decision import Decide, hold
 from graphnav.estimation.solvers.invariant import transport_covariance
-from graphnav.estimation.solvers.linearise import Points, advance, scale_at
+from graphnav.estimation.solvers.linearise import Points, advance
 from graphnav.estimation.solvers.passes import (
     FilterPass,
     ForwardRecord,
     SmootherPass,
     are_near,
     compute_sigmas,
-    estimate_parameters,
     join_passes,
+    make_solution,
     move_points,
     subtract_points,
 )
-from graphnav.estimation.solvers.points import FilterErrors, Linearisation, PointFilter, filter_likelihood
+from graphnav.estimation.solvers.points import FilterErrors, Linearisation, PointFilter
 from graphnav.estimation.solvers.rts import smooth_backward
 from graphnav.estimation.solvers.stack import Innovations, Stack
 from graphnav.estimation.solvers.stretches import STAYS, StretchFilter
@@ -92,25 +90,15 @@ def ekf(
     one = _run_forward(problem, K, about, progress, decide=decide, stays=stays)
     seconds = time.perf_counter() - began
     # a copy: a view would keep the parameters' covariance in memory
-    filtered, P = one.states, one.P[:, :DIM, :DIM].copy()
+    P = one.P[:, :DIM, :DIM].copy()
     if about is not None:
         n = len(about.values) - 1
-        P[:n] = transport_covariance(P[:n], about.states[:n], filtered[:n])
-    solution = Solution(
-        solver="ekf",
-        frame=problem.frame,
-        t=problem.t,
-        states=filtered,
-        covariance=P,
-        parameters=estimate_parameters(problem, one.values, compute_sigmas(one.P)),
+        P[:n] = transport_covariance(P[:n], about.states[:n], one.states[:n])
+    solution = make_solution(
+        problem, "ekf", one, P, compute_sigmas(one.P), smooth=False,
         records={name: r.record(problem) for name, r in one.records.items()},
-        counts={"imu": K - 1, **{rows.name: len(rows) for rows in problem.constraints}},
-        iterations=1,
-        stopped="one pass forward over all keyframes",
-        timings={"filter": seconds},
-        notes=problem.notes,
-        between=(make_dense(problem, filtered, P, scale_at(problem.columns, one.values), smooth=False),),
-    )
+        iterations=1, stopped="one pass forward over all keyframes", timings={"filter": seconds},
+    )  # fmt: skip
     return FilterPass(**vars(one), solution=solution)
 
 
@@ -155,7 +143,9 @@ class Comparison:
         one = self._one.lift(problem, about, stack, anew)
         x, P = _start_from_prior(problem)
         start = _get_start(subtract_points(x, about.take_first(1))[0], P, stack.records)
-        filter_likelihood(problem, about, stack, steps, one, start)
+        (e, P), last = np.empty((2, 2, *P.shape)), np.empty((2, 2, len(P)))
+        out = FilterErrors(last[0], e, last[1], P)
+        PointFilter(problem, about, stack, steps, one, out, whole=False).run(lambda: start, None, None)
         return stack
 
 
@@ -210,7 +200,9 @@ def _run_forward(
     x, P = _start_from_prior(problem)
     updates, search = None, None
     if about is not None:
-        given = PointFilter(problem, about, stack, steps, all_F, errors)
+        one = Linearisation.of(problem, about, stack, steps)
+        all_F[: n - 1] = one.F
+        given = PointFilter(problem, about, stack, steps, one, errors)
         if watched:
             bank = Bank(watched, problem.t, D, drifts)
             search = FaultSearch(watched, given, steps, stack, bank, problem.t)

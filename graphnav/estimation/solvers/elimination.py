@@ -165,7 +165,8 @@ def update_late(ahead: Predicted, rows: Sequence[Measured], weighted: bool = Fal
             raise explain_smoother(place.t)
     measured = (*ahead.measured, *rows)
     turns = ahead.before.turns and all(one.turns for one in measured)
-    message = Message.of(ahead.state, ahead.values, ahead.columns, top[:, :D], top[:, D], beside, turns)
+    R, z = np.ascontiguousarray(top[:, :D]), top[:, D].copy()
+    message = Message(ahead.state, ahead.values, ahead.columns, R, z, beside, turns)
     return Stage(place, message, ahead.G, ahead.g, ahead.lost, ahead.C, measured, fault=fault), y
 
 

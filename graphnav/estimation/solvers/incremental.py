@@ -21,7 +21,7 @@ from graphnav.estimation.dense import make_dense
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import Solution
 from graphnav.estimation.solvers.linearise import Points, list_node_steps, scale_at, shift
-from graphnav.estimation.solvers.passes import estimate_parameters, record_residuals
+from graphnav.estimation.solvers.passes import make_solution, record_residuals
 from graphnav.estimation.solvers.rows import compute_cost_at
 from graphnav.estimation.solvers.stages import Message, Place
 from graphnav.estimation.solvers.window import SettledStates, Window, compute_turn_limit, make_first_message
@@ -121,13 +121,13 @@ def solve_in_turn(problem: Problem, solver: str, engine: LagSmoother, lag: float
     for k in range(K):
         before = time.thread_time()
         newest, P[k] = engine.add(Place(float(problem.t[k]), problem, k, steps.get(k, ()), linked=k > 0))
-        points.append(newest)
+        points.append((newest.state, newest.values))  # without what else a message knows, which is of its size squared
         seconds[k] = time.thread_time() - before
         if progress is not None and k % 64 == 0:
             progress(solver, k / K)
     problem, again = engine.finish(problem)
     elapsed = time.perf_counter() - began
-    parts, live = engine.settled, States.stack([newest.state for newest in points])
+    parts, live = engine.settled, States.stack([state for state, _ in points])
     # in the order that the problem has its parameters in
     columns = parts[-1].columns[-1]
     order = np.concatenate([np.empty(0, dtype=int), *(np.r_[shift(columns[name])] for name in problem.columns)])
@@ -138,27 +138,16 @@ def solve_in_turn(problem: Problem, solver: str, engine: LagSmoother, lag: float
     at = Points(states, values)
     records = {rows.name: record_residuals(problem, rows, at, robust=True) for rows in problem.constraints}
     whole = "all there was" if np.isinf(lag) else f"{lag:g} s of the future, or all there was"
-    settled = Solution(
-        solver=solver,
-        frame=problem.frame,
-        t=problem.t,
-        states=states,
-        covariance=covariance,
-        parameters=estimate_parameters(problem, values, sigma),
-        records=records,
-        counts={"initial_prior": 1, "imu": K - 1, **{c.name: len(c) for c in problem.constraints}},
-        iterations=1,
-        cost=compute_cost_at(problem, at),
-        stopped=f"every keyframe settled with {whole}",
-        timings={solver: elapsed},
-        notes=(
-            *problem.notes,
-            Note("solver.step_times", ("" if np.isinf(lag) else f"lag {lag:g} s: ") + describe_times(seconds)),
-            Note("solver.relinearised", f"{format_count(again, 'keyframe')} relinearised"),
-        ),
-        between=(make_dense(problem, states, covariance, scale_at(problem.columns, values), smooth=True),),
+    notes = (
+        Note("solver.step_times", ("" if np.isinf(lag) else f"lag {lag:g} s: ") + describe_times(seconds)),
+        Note("solver.relinearised", f"{format_count(again, 'keyframe')} relinearised"),
     )
-    scale = scale_at(problem.columns, np.array([newest.values for newest in points])[:, order])
+    settled = make_solution(
+        problem, solver, at, covariance, sigma, smooth=True, notes=notes, records=records,
+        iterations=1, cost=compute_cost_at(problem, at), stopped=f"every keyframe settled with {whole}",
+        timings={solver: elapsed},
+    )  # fmt: skip
+    scale = scale_at(problem.columns, np.array([values for _, values in points])[:, order])
     now = replace(
         settled,
         solver="live",
@@ -166,6 +155,7 @@ def solve_in_turn(problem: Problem, solver: str, engine: LagSmoother, lag: float
         covariance=P,
         parameters={},
         records={},
+        graphs=(),
         stopped="each keyframe as it was known when it came",
         between=(make_dense(problem, live, P, scale, smooth=False),),
     )

@@ -4,18 +4,20 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from graphnav.constraints.base import Constraint
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, States
-from graphnav.estimation.problem import Problem
+from graphnav.estimation.dense import make_dense
+from graphnav.estimation.problem import Problem, SolvedProblem
 from graphnav.estimation.solution import ConstraintRecord, ParameterEstimate, Solution
 from graphnav.estimation.solvers.disturbance import compute_row_covariances
 from graphnav.estimation.solvers.invariant import add_invariant, subtract_invariant
-from graphnav.estimation.solvers.linearise import Columns, Points, Rows, find_last_keyframes, linearise, shift
-from graphnav.estimation.solvers.recursion import RowBlocks
+from graphnav.estimation.solvers.linearise import Columns, Points, Rows, find_last_keyframes, linearise, scale_at, shift
+from graphnav.estimation.solvers.recursion import Arrays, RowBlocks
 from graphnav.estimation.solvers.robust import weigh_squares
 from graphnav.estimation.solvers.stack import Innovations
 from graphnav.imu.dynamics import convert_to_biases
@@ -97,12 +99,20 @@ class Updates:
     lossy: Array  # (B,) whether with a loss of digits, but for Joseph's form
     places: dict[str, tuple[Array, Array]]  # of each constraint's rows, as `graphnav.estimation.solvers.stack` has them
 
+    @property
+    def arrays(self) -> Arrays:
+        """Arguments of `graphnav.estimation.solvers.disturbance.smooth_rows`."""
+        return self.Kt, self.H, self.w, self.inverse, self.taken, self.lossy
+
     @classmethod
-    def none(cls, blocks: RowBlocks, H: Array, places: dict[str, tuple[Array, Array]]) -> Updates:
-        """None yet, of rows H (n, M, D)."""
-        n, M, _ = H.shape
+    def allocate(
+        cls, blocks: RowBlocks, H: Array, places: dict[str, tuple[Array, Array]], whole: bool = True
+    ) -> Updates:
+        """None yet, of rows H (n, M, D); without gains if not `whole`."""
+        n, M, D = H.shape
+        n *= whole
         taken, lossy = np.zeros((2, len(blocks.begin)), dtype=bool)
-        return cls(blocks, np.zeros_like(H), H, np.zeros((n, M)), np.zeros((n, M, M)), taken, lossy, places)
+        return cls(blocks, np.zeros((n, M, D)), H, np.zeros((n, M)), np.zeros((n, M, M)), taken, lossy, places)
 
 
 @dataclass(frozen=True)
@@ -122,6 +132,11 @@ class ForwardRecord(Points):
     errors_predicted: Array  # (n, D) and the predicted state is these errors away from them
     updates: Updates | None  # of the keyframes there
     log_likelihood: Array  # (K,) of the innovations at each keyframe, up to a constant
+
+    @property
+    def filtered(self) -> Arrays:
+        """Of the keyframes at given points, as `graphnav.estimation.solvers.recursion.filter_rows` fills them."""
+        return self.errors_predicted, self.P_predicted, self.errors, self.P
 
     @property
     def predicted_from(self) -> States:
@@ -202,6 +217,35 @@ def record_residuals(problem: Problem, rows: Constraint, points: Points, robust:
     )
 
 
+def make_solution(
+    problem: Problem,
+    solver: str,
+    points: Points,
+    covariance: Array,
+    sigma: Array,
+    smooth: bool,
+    notes: tuple[str, ...] = (),
+    **found: Any,
+) -> Solution:
+    """The solution of a solver, by its estimates at all keyframes and covariances (K, 15, 15) of their states.
+
+    Parameters
+    ----------
+    sigma : (K, D-15) of parameters.
+    smooth : whether they know the future, so that states between them do.
+    found : other fields of the solution.
+    """
+    scale = scale_at(problem.columns, points.values)
+    return Solution(
+        solver, problem.frame, problem.t, points.states, covariance, estimate_parameters(problem, points.values, sigma),
+        counts={"initial_prior": 1, "imu": len(problem.t) - 1, **{c.name: len(c) for c in problem.constraints}},
+        notes=(*problem.notes, *notes),
+        graphs=(SolvedProblem(problem, points.states, points.select_nodes(problem)),),
+        between=(make_dense(problem, points.states, covariance, scale, smooth=smooth),),
+        **found,
+    )  # fmt: skip
+
+
 def integrate_again(problem: Problem, states: States, scale: Array | None, first: int = 0) -> tuple[Problem, int]:
     """The problem integrated about the present biases where the first-order correction no longer holds, and how often.
 
@@ -215,7 +259,7 @@ def integrate_again(problem: Problem, states: States, scale: Array | None, first
     at = np.minimum(np.arange(len(ba) - first), max(len(states) - 2, 0))
     ba[rows], bg[rows] = states.ba[at], states.bg[at]
     if scale is not None:
-        of_accel, of_gyro = convert_to_biases(scale, problem.intervals.force[rows], problem.intervals.rate[rows])
+        of_accel, of_gyro = convert_to_biases(scale, *(x[rows] for x in problem.intervals.inputs))
         ba[rows], bg[rows] = ba[rows] + of_accel, bg[rows] + of_gyro
     far = problem.intervals.is_out_of_range(bg)
     return (problem.reintegrate(ba, bg), int(far.sum())) if far.any() else (problem, 0)

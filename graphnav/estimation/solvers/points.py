@@ -65,8 +65,7 @@ class Linearisation:
         gap = np.concatenate([ahead.minus(end), values - points.values[1:]], axis=1)
         turned = rotation.right_jacobian_inverse(gap[:, :3])
         F[:, :3] = turned @ F[:, :3]
-        r, sigma = np.zeros((n, stack.M)), np.ones((n, stack.M))
-        H = np.zeros((n, stack.M, DIM + points.values.shape[1]))
+        r, sigma, H = _allocate_rows(n, stack.M, points)
         for rows in problem.constraints:
             count = int(rows.keyframe.searchsorted(n))
             place = stack.places[rows.name][0][:count], stack.places[rows.name][1][:count]
@@ -105,23 +104,23 @@ class PointFilter:
 
     Parameters
     ----------
-    F : (n-1, 15, w) or more, for the transition matrices.
-    out : of all n keyframes, to be filled.
+    one : the problem there.
+    out : of all n keyframes, to be filled; of fewer, but two at least, those of the last are left.
+    whole : False for the innovations in the stack only, without gains.
     """
 
     def __init__(
-        self, problem: Problem, points: Points, stack: Stack, steps: Advance, F: Array, out: FilterErrors
-    ) -> None:
+        self, problem: Problem, points: Points, stack: Stack, steps: Advance, one: Linearisation, out: FilterErrors,
+        whole: bool = True,
+    ) -> None:  # fmt: skip
         n = len(points.values)
         self._stack, self._steps, self.out = stack, steps, out
-        one = Linearisation.of(problem, points, stack, steps)
-        F[: n - 1] = one.F
-        self.F, self.Q, self.gap = F[: n - 1], one.compute_noise(problem, points), one.gap
+        self.F, self.Q, self.gap = one.F, one.compute_noise(problem, points), one.gap
         self.speeds = np.linalg.norm(points.states.v, axis=1)
         self.r, self._sigma, self.H = one.r, one.sigma, one.H
         self.variance = (self._sigma / stack.root_weight[:n]) ** 2
         self.used = stack.joint.used.copy()
-        self.updates = Updates.none(stack.joint, self.H, stack.places)
+        self.updates = Updates.allocate(stack.joint, self.H, stack.places, whole)
         self._at = np.zeros(1, dtype=int)
 
     def weigh(self, some: RowBlock, used: bool, root_weight: float | Array) -> None:
@@ -135,7 +134,7 @@ class PointFilter:
         The filter runs ahead by a stretch of keyframes, and `follow` checks it afterwards; at a detection both continue
         from there.
         """
-        n, k, length = len(self.out.filtered), 0, STRETCH
+        n, k, length = len(self.H), 0, STRETCH
         while k < n:
             end = min(k + length, n)
             self._filter(k, end, begin)
@@ -146,39 +145,23 @@ class PointFilter:
                 progress("filter", k / self._stack.K)
 
     def _filter(self, k0: int, k1: int, begin: Callable[[], tuple[Array, Array]]) -> None:
-        out, updates, stack, n = self.out, self.updates, self._stack, len(self.out.filtered)
-        e, P = (out.filtered[k0 - 1], out.P[k0 - 1]) if k0 else begin()
+        out, stack, n = self.out, self._stack, len(self.H)
+        last = (k0 - 1) % len(out.filtered), (k0 - 1) % len(out.P)
+        e, P = (out.filtered[last[0]], out.P[last[1]]) if k0 else begin()
         try:
             filter_rows(
-                k0, k1, e, P, self.F, self._steps.decay, self.gap, self.Q, self._steps.added,
-                self.r, self.H, self.variance, stack.scale[:n], *stack.joint.arrays, self.used,
-                out.predicted, out.P_predicted, out.filtered, out.P,
-                stack.root, stack.solved, stack.bent, updates.Kt, updates.w, updates.inverse,
-                updates.taken, updates.lossy, self._at,
+                k0, k1, e, P, (self.F, self._steps.decay, self.gap, self.Q, self._steps.added),
+                (self.r, self.H, self.variance, stack.scale[:n]), stack.joint.arrays, self.used,
+                (out.predicted, out.P_predicted, out.filtered, out.P),
+                (stack.root, stack.solved, stack.bent), self.updates.arrays, self._at,
             )  # fmt: skip
         except np.linalg.LinAlgError:
             raise explain_rows(stack.get_block(int(self._at[0])).parts) from None
 
 
-def filter_likelihood(
-    problem: Problem, points: Points, stack: Stack, steps: Advance, one: Linearisation, start: tuple[Array, Array]
-) -> None:
-    """Filter all keyframes for the innovations in the stack only.
-
-    `start`: errors (D,) before the first keyframe, and their covariance.
-    """
-    n, M, D = one.H.shape
-    e, P, at = np.empty((2, 2, D)), np.empty((2, 2, D, D)), np.zeros(1, dtype=int)
-    taken, lossy = np.zeros((2, len(stack.joint.begin)), dtype=bool)
-    try:
-        filter_rows(
-            0, n, *start, one.F, steps.decay, one.gap, one.compute_noise(problem, points), steps.added,
-            one.r, one.H, (one.sigma / stack.root_weight) ** 2, stack.scale, *stack.joint.arrays, stack.joint.used,
-            e[0], P[0], e[1], P[1], stack.root, stack.solved, stack.bent,
-            np.empty((0, M, D)), np.empty((0, M)), np.empty((0, M, M)), taken, lossy, at,
-        )  # fmt: skip
-    except np.linalg.LinAlgError:
-        raise explain_rows(stack.get_block(int(at[0])).parts) from None
+def _allocate_rows(n: int, M: int, points: Points) -> tuple[Array, Array, Array]:
+    """Residuals (n, M), sigmas (n, M) and Jacobians (n, M, D) of no rows yet."""
+    return np.zeros((n, M)), np.ones((n, M)), np.zeros((n, M, DIM + points.values.shape[1]))
 
 
 def predict_states(problem: Problem, at: slice, states: States, values: Array) -> tuple[States, Array]:
@@ -208,8 +191,7 @@ def linearise_all(
     moved : T (n, 9, 9) and m (n, D), where the errors about a point are T (y - m) of the errors y that rows are about.
     """
     n, (T, m) = own.stop - own.start, moved
-    r, sigma = np.zeros((n, stack.M)), np.ones((n, stack.M))
-    H = np.zeros((n, stack.M, DIM + points.values.shape[1]))
+    r, sigma, H = _allocate_rows(n, stack.M, points)
     for rows in problem.constraints:
         which = slice(*rows.keyframe.searchsorted((first, own.stop)))
         if which.start == which.stop:

@@ -20,6 +20,7 @@ STRETCH = 256  # keyframes between progress reports
 PASSES = 4  # iterations of reweighting at the first use of a measurement
 UNUSED = 1e-12  # weight of a row that is not used beside others of its keyframe
 HUBER, CAUCHY = 1, 2
+Arrays = tuple[Array, ...]
 _LOSSY = 1e4  # times R that H P H^T may be for P - W^T W to keep twelve digits
 
 
@@ -39,7 +40,7 @@ class RowBlocks:
     kind: Array  # (B,) number of the constraint, of the first where several are taken in together
 
     @property
-    def arrays(self) -> tuple[Array, Array, Array, Array, Array, Array]:
+    def arrays(self) -> Arrays:
         """Arguments of `filter_rows`: compiled code on disk must not depend on classes."""
         return self.first, self.begin, self.end, self.gate, self.kernel, self.size
 
@@ -166,58 +167,33 @@ def weigh_robustly(
 
 @compile_once
 def filter_rows(
-    k0: int,
-    k1: int,
-    e: Array,
-    P: Array,
-    F: Array,
-    decay: Array,
-    gap: Array,
-    Q: Array,
-    added: Array,
-    r: Array,
-    H: Array,
-    variance: Array,
-    scale: Array,
-    first: Array,
-    begin: Array,
-    end: Array,
-    gate: Array,
-    kernel: Array,
-    size: Array,
-    used: Array,
-    errors_predicted: Array,
-    P_predicted: Array,
-    errors: Array,
-    P_filtered: Array,
-    root: Array,
-    solved: Array,
-    bent: Array,
-    Kt: Array,
-    w: Array,
-    inverse: Array,
-    taken: Array,
-    lossy: Array,
-    at: Array,
-) -> None:
+    k0: int, k1: int, e: Array, P: Array, steps: Arrays, rows: Arrays, blocks: Arrays, used: Array,
+    filtered: Arrays, innovations: Arrays, updates: Arrays, at: Array,
+) -> None:  # fmt: skip
     """Filter keyframes k0 to k1, linearised throughout, from errors e (D,) and P before them.
 
     Parameters
     ----------
-    gap : (n-1, D) where a step leads from a point, less the next point.
-    Q, added : (n-1, 15, 15) and (n-1, D-15) as for `predict_covariance`.
-    r, H, variance, scale : (n, M), (n, M, D), (n, M), (n, M) of the rows at the points, and of their kernels.
-    first, begin, end, gate, kernel, size : `RowBlocks.arrays`.
+    steps : F (n-1, 15, w), decay (n-1, D-15); gap (n-1, D) where a step leads from a point, less the next point;
+        Q (n-1, 15, 15) and added (n-1, D-15) as for `predict_covariance`.
+    rows : r (n, M), H (n, M, D) and variance (n, M) at the points, and the scale (n, M) of their kernels.
+    blocks : `RowBlocks.arrays`.
     used : (B,) whether a block is taken in; of one that is not there is an innovation only.
-    root, solved : (n, M, M), (n, M), filled with roots of S and S^-1 (r + H e), before any kernel.
-    bent : (n, M), filled with weights of kernels, 0 of rows that a gate refuses.
-    errors_predicted, P_predicted, errors, P_filtered : filled with what is predicted and filtered; of fewer than n,
-        but two at least that are predicted, those of the last keyframes are left.
-    Kt, w, inverse : (n, M, D), (n, M), (n, M, M), filled with gains transposed, S^-1 nu and S^-1; without a row, if
-        nobody will ask.
-    taken, lossy : (B,), filled with whether a block was taken in, and whether P - W^T W would have lost digits.
+    filtered : errors and P predicted, errors and P filtered, to be filled; of fewer than n, but two at least that are
+        predicted, those of the last keyframes are left.
+    innovations : root (n, M, M) and solved (n, M), filled with roots of S and S^-1 (r + H e), before any kernel; bent
+        (n, M), filled with weights of kernels, 0 of rows that a gate refuses.
+    updates : Kt (n, M, D), H, w (n, M) and inverse (n, M, M), all but H filled with gains transposed, S^-1 nu and
+        S^-1, without a row if nobody will ask; taken and lossy (B,), filled with whether a block was taken in, and
+        whether P - W^T W would have lost digits.
     at : (1,), the block that is taken in.
     """
+    F, decay, gap, Q, added = steps
+    r, H, variance, scale = rows
+    first, begin, end, gate, kernel, size = blocks
+    errors_predicted, P_predicted, errors, P_filtered = filtered
+    root, solved, bent = innovations
+    Kt, _, w, inverse, taken, lossy = updates
     gains, told = len(Kt) > 0, len(inverse) > 0
     for k in range(k0, k1):
         ahead = k % len(P_predicted)
@@ -311,18 +287,9 @@ def compose_turns(q: Array, v: Array) -> tuple[float, float, float]:
 
 @compile_once
 def smooth_filtered(
-    k0: int,
-    k1: int,
-    moved: Array,
-    turned: Array,
-    F: Array,
-    decay: Array,
-    P_predicted: Array,
-    P: Array,
-    P_smoothed: Array,
-    errors: Array,
-    at: Array,
-) -> None:
+    k0: int, k1: int, moved: Array, turned: Array, steps: Arrays, P_predicted: Array, P: Array,
+    P_smoothed: Array, errors: Array, at: Array,
+) -> None:  # fmt: skip
     """Smoothed errors (n, D) about filtered states, and covariances, of keyframes k1 - 1 down to k0, from those of k1.
 
     C = P F^T P-^-1     e = C (x^s - x-) of the next     P^s = P + C (P^s - P-) C^T
@@ -330,9 +297,11 @@ def smooth_filtered(
     Parameters
     ----------
     moved : (n, D) filtered states less predicted ones; `turned` (n, 4) the quaternions of their rotations.
+    steps : F (n-1, 15, w) and decay (n-1, D-15).
     P_smoothed : without any keyframes where covariances are not wanted.
     at : (1,), the keyframe that is smoothed.
     """
+    F, decay = steps
     for k in range(k1 - 1, k0 - 1, -1):
         at[0] = k
         ahead = P_predicted[k + 1]

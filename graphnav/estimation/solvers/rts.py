@@ -26,12 +26,11 @@ from graphnav.core import rotation
 from graphnav.core.progress import Progress
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM
-from graphnav.estimation.dense import make_dense
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import Solution
 from graphnav.estimation.solvers.breakdown import explain_smoother
 from graphnav.estimation.solvers.disturbance import smooth_errors, smooth_rows
-from graphnav.estimation.solvers.linearise import Points, find_stepping, linearise, scale_at
+from graphnav.estimation.solvers.linearise import Points, find_stepping, linearise
 from graphnav.estimation.solvers.passes import (
     FilterPass,
     ForwardRecord,
@@ -39,8 +38,8 @@ from graphnav.estimation.solvers.passes import (
     SmootherPass,
     Updates,
     compute_sigmas,
-    estimate_parameters,
     join_passes,
+    make_solution,
     move_points,
     record_residuals,
 )
@@ -86,11 +85,8 @@ def smooth_points(forward: ForwardRecord) -> Points:
             if info:
                 raise explain_smoother()
         if one is not None:
-            blocks = one.blocks
-            smooth_errors(
-                end, r, forward.F, forward.decay, one.Kt, one.H, one.w, blocks.first, blocks.begin, blocks.end,
-                one.taken, forward.errors_predicted, forward.P_predicted, forward.errors, forward.P, errors,
-            )  # fmt: skip
+            steps = forward.F, forward.decay
+            smooth_errors(end, r, steps, one.arrays, one.blocks.arrays, forward.filtered, errors)
         parts = [move_points(forward.about.take_first(end), errors[:end]), *parts]
     return join_passes(parts)
 
@@ -163,7 +159,7 @@ def _smooth_filtered(
         lo = max(hi - STRETCH, end)
         try:
             smooth_filtered(
-                lo - end, hi - end, moved, turned, forward.F[end:], forward.decay[end:],
+                lo - end, hi - end, moved, turned, (forward.F[end:], forward.decay[end:]),
                 forward.P_predicted[some], forward.P[some], all_P[some], errors, at,
             )  # fmt: skip
         except np.linalg.LinAlgError:
@@ -189,7 +185,7 @@ def _smooth_points(
     Where P has no keyframes, variances (end, D) of the columns `wanted` (K, D), and H P^s H^T (end, M, M) of rows
     `asked` (K, M, D).
     """
-    blocks, (r_k, N_k) = one.blocks, behind
+    r_k, N_k = behind
     wanted = np.zeros((0, 0), dtype=bool) if wanted is None else wanted
     asked = np.empty((0, 0, 0)) if asked is None else asked
     variance, of_rows = np.zeros(wanted.shape), np.zeros((len(asked), *asked.shape[1:2] * 2))
@@ -198,10 +194,8 @@ def _smooth_points(
     for hi in range(end, 0, -STRETCH):
         lo = max(hi - STRETCH, 0)
         r_k, N_k = smooth_rows(
-            lo, hi, r_k, N_k, forward.F, forward.decay, one.Kt, one.H, one.w, one.inverse,
-            blocks.first, blocks.begin, blocks.end, one.taken, one.lossy,
-            forward.errors_predicted, forward.P_predicted, forward.errors, forward.P, columns, first,
-            out.r, out.N, out.N_diagonal, out.errors, P, variance, asked, of_rows,
+            lo, hi, r_k, N_k, (forward.F, forward.decay), one.arrays, one.blocks.arrays, forward.filtered,
+            (out.errors, out.r, out.N, out.N_diagonal), (P, variance, of_rows), asked, columns, first,
         )  # fmt: skip
         if progress is not None:
             progress("smoother", 1.0 - lo / len(forward.P))
@@ -232,22 +226,11 @@ def rts(problem: Problem, forward: FilterPass, found: SmootherPass | None = None
     """The smoothed solution; residuals are its own. `found` is the backward pass where it was done before."""
     began = time.perf_counter()
     found = found or smooth_backward(problem, forward)
-    smoothed, all_values, all_P = found.states, found.values, found.P
     records = {rows.name: record_residuals(problem, rows, found) for rows in problem.constraints}
-    covariance = all_P[:, :DIM, :DIM].copy()  # a copy: a view would keep the parameters' covariance in memory
+    covariance = found.P[:, :DIM, :DIM].copy()  # a copy: a view would keep the parameters' covariance in memory
     seconds = time.perf_counter() - began
-    return Solution(
-        solver="rts",
-        frame=problem.frame,
-        t=problem.t,
-        states=smoothed,
-        covariance=covariance,
-        parameters=estimate_parameters(problem, all_values, compute_sigmas(all_P)),
-        records=records,
-        counts=forward.solution.counts,
-        iterations=1,
+    return make_solution(
+        problem, "rts", found, covariance, compute_sigmas(found.P), smooth=True, records=records, iterations=1,
         stopped="one pass forward and one back",
         timings={**forward.solution.timings, "smoother": seconds},
-        notes=problem.notes,
-        between=(make_dense(problem, smoothed, covariance, scale_at(problem.columns, all_values), smooth=True),),
-    )
+    )  # fmt: skip

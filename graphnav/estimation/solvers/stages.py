@@ -20,7 +20,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
 
 import numpy as np
 from scipy.linalg.lapack import dgesv
@@ -59,40 +58,17 @@ class Place:
 class Message:
     """R y = z about a point; `columns` says where the parameters stand behind the fifteen states.
 
-    R is a triangle whose first nine columns may be full because its point has moved. A window has hundreds of such
-    matrices, so only their possible non-zeros are stored (`Message.of`).
+    R is a triangle whose first nine columns may be full because its point has moved.
     """
 
     state: States  # one
     values: Array  # (D-15,)
     columns: Columns
-    packed: Array  # (D (D + 1) / 2 + 36,) of R, row by row
+    R: Array  # (D, D)
     z: Array  # (D,)
     tests: Watch | None = None
     # whether all rows in it, except the prior, are invariant to a rotation about the vertical
     turns: bool = False
-
-    @classmethod
-    def of(
-        cls,
-        state: States,
-        values: Array,
-        columns: Columns,
-        R: Array,
-        z: Array,
-        tests: Watch | None = None,
-        turns: bool = False,
-    ) -> Message:
-        """Make one from R (D, D); entries below the triangle and its first nine rows are ignored."""
-        return cls(state, values, columns, R[_list_triangle(len(z))], np.array(z), tests, turns)
-
-    @property
-    def R(self) -> Array:
-        """(D, D)"""
-        D = len(self.z)
-        out = np.zeros((D, D))
-        out[_list_triangle(D)] = self.packed
-        return out
 
     @property
     def estimate(self) -> Array:
@@ -118,8 +94,8 @@ class Message:
         """The same about the point moved by the error state e (D,); J is `change_of_point`, if known."""
         J = self.change_of_point(e) if J is None else J
         state = add_error(self.state, e[None, :DIM], self.turns)
-        values, R = self.values + e[DIM:], self.R
-        return Message.of(state, values, self.columns, rotate_columns(R, J), self.z - R @ e, self.tests, self.turns)
+        R, z = rotate_columns(self.R, J), self.z - self.R @ e
+        return replace(self, state=state, values=self.values + e[DIM:], R=R, z=z)
 
     def get_value(self, name: str) -> Array:
         """A parameter at the point."""
@@ -193,15 +169,6 @@ class Stage:
         out[:, lost] = cross[:, :n].T
         out[lost[:, None], lost] = cross @ self.G.T + self.C
         return out
-
-
-@cache
-def _list_triangle(D: int) -> tuple[Array, Array]:
-    """Rows and columns of possible non-zeros in R: an upper triangle, and full first nine columns."""
-    R = np.triu(np.ones((D, D)))
-    R[:9, :9] = 1.0
-    rows, columns = np.nonzero(R)
-    return rows, columns
 
 
 def add_error(states: States, e: Array, turns: bool) -> States:

@@ -155,12 +155,12 @@ class StretchFilter:
         predicted, errors, Kt, w = np.empty((n, D)), np.empty((n, D)), np.zeros_like(H), r.copy()
         steps = slice(own.start, k1 - 1)
         filter_rows(
-            k - own.start, n, np.zeros(D), P, F, self._steps.decay[steps], gap, Q, self._steps.added[steps],
-            r, H, (sigma / stack.root_weight[own]) ** 2, stack.scale[own],
-            blocks.first[own.start : k1 + 1], *blocks.arrays[1:], blocks.used,
-            predicted, self._P_predicted[own], errors, self._P[own],
-            stack.root[own], stack.solved[own], stack.bent[own], Kt, w, np.empty((0, 0, 0)),
-            self._taken, self._lossy, self._at,
+            k - own.start, n, np.zeros(D), P, (F, self._steps.decay[steps], gap, Q, self._steps.added[steps]),
+            (r, H, (sigma / stack.root_weight[own]) ** 2, stack.scale[own]),
+            (blocks.first[own.start : k1 + 1], *blocks.arrays[1:]), blocks.used,
+            (predicted, self._P_predicted[own], errors, self._P[own]),
+            (stack.root[own], stack.solved[own], stack.bent[own]),
+            (Kt, H, w, np.empty((0, 0, 0)), self._taken, self._lossy), self._at,
         )  # fmt: skip
         self._P[k:k1] = turn(self._P[k:k1], np.ascontiguousarray(T[end]))
         # what each number adds to y, by the root of all numbers' covariance: (L^T K^T) (L^-1 nu)

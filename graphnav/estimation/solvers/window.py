@@ -328,7 +328,7 @@ def compute_turn_limit(noise: ImuNoise) -> float:
 
 def make_first_message(state: States, sigma: Array, turns: bool = False) -> Message:
     """A prior: one state and its fifteen sigmas; `turns` as of `Message`."""
-    return Message.of(state, np.zeros(0), {}, np.diag(1.0 / sigma), np.zeros(DIM), turns=turns)
+    return Message(state, np.zeros(0), {}, np.diag(1.0 / sigma), np.zeros(DIM), turns=turns)
 
 
 def find_parameter_limits(columns: Columns, place: Place) -> Array:
