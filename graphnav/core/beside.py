@@ -43,7 +43,10 @@ def begin_beside(work: Callable[[], T], shared: Sequence[object] = ()) -> Beside
     shared : what the result may contain and need not be sent, because this process has it.
     """
     several = sys.platform == "linux" and len(os.sched_getaffinity(0)) > 1
-    return Beside(work, shared) if _allowed and several and read_peak_memory_mb() < _LARGEST else Done(work())
+    if _allowed and several and read_peak_memory_mb() < _LARGEST:
+        with suppress(OSError):  # no more processes, files or memory
+            return Beside(work, shared)
+    return Done(work())
 
 
 @dataclass(frozen=True)
@@ -65,7 +68,12 @@ class Beside(Generic[T]):
         end, begin = os.pipe()
         with warnings.catch_warnings():  # of other threads, which hold no lock that the work needs
             warnings.simplefilter("ignore", DeprecationWarning)
-            process = os.fork()
+            try:
+                process = os.fork()
+            except OSError:
+                os.close(end)
+                os.close(begin)
+                raise
         if not process:
             _work_and_exit(work, shared, begin)
         os.close(begin)

@@ -328,6 +328,20 @@ def test_a_run_is_repeated_from_the_provenance_of_its_report_alone(drive, tmp_pa
     assert (elsewhere / "plain" / "trajectory.csv").read_bytes() != track.read_bytes()
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="a second process is begun on Linux only")
+def test_with_a_second_processor_the_results_are_the_same(tmp_path, monkeypatch):
+    found = []
+    for processors in (1, 2):
+        monkeypatch.setattr(os, "sched_getaffinity", lambda _, n=processors: set(range(n)))
+        out = tmp_path / str(processors)
+        assert cli.run(["compare", "kitti", "--end", "60", "--quiet", "-o", str(out)]) == 0
+        assert all((out / solver / "report.html").exists() for solver in SOLVERS)
+        tracks = [(out / solver / "trajectory.csv").read_bytes() for solver in SOLVERS]
+        noise = [summary(out / solver)["noise"] for solver in SOLVERS]
+        found.append((tracks, noise, sorted(str(path.relative_to(out)) for path in out.rglob("*"))))
+    assert found[0] == found[1]
+
+
 def test_a_run_is_repeated_with_the_noise_model_of_its_summary(tmp_path):
     """Byte for byte, on a part of a real drive; and the noise model matters."""
     tokyo = Path(__file__).resolve().parents[2] / "data" / "tokyo"

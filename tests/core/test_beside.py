@@ -42,6 +42,16 @@ def test_it_is_done_at_once_without_a_processor_or_memory(
     assert isinstance(begin_beside(os.getpid), Done)
 
 
+def test_it_is_done_here_where_the_system_has_no_more_processes(monkeypatch: pytest.MonkeyPatch) -> None:
+    allow_second_process()
+
+    def fail() -> int:
+        raise BlockingIOError(11, "Resource temporarily unavailable")
+
+    monkeypatch.setattr(os, "fork", fail)
+    assert begin_beside(os.getpid).get_result() == os.getpid()
+
+
 def test_large_results_come_back() -> None:
     allow_second_process()
     numbers = np.random.default_rng(1).standard_normal(500_000)
