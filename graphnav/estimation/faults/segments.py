@@ -49,6 +49,12 @@ class _Set:
     score: Array  # (M+1, C)
     info: Array  # (M+1, C, M+1, C)
 
+    @classmethod
+    def none(cls, score: Array, info: Array) -> _Set:
+        """The empty set, of score (M, C) and info (M, C, M, C)."""
+        both = np.swapaxes(_sum_before(np.swapaxes(_sum_before(info), 0, 2)), 0, 2)
+        return cls(frozenset(), 0.0, _sum_before(score), np.ascontiguousarray(both))
+
 
 class _Runs:
     """All runs of consecutive segments, each with one error in common; C numbers of all kinds.
@@ -138,9 +144,7 @@ def find_wrong_segments(
     fixes = [rows for rows in problem.constraints if rows.name in names]
     begins, m = np.array(edges), len(fixes[0].axes)
     runs = _Runs(begins, [rows.unit for rows in fixes], m)
-    score, info = _respond(problem, refilter(problem, about, whole=False), fixes, begins)
-    info = np.swapaxes(_sum_before(np.swapaxes(_sum_before(info), 0, 2)), 0, 2)
-    none = best = _Set(frozenset(), 0.0, _sum_before(score), np.ascontiguousarray(info))
+    none = best = _Set.none(*_respond(problem, refilter(problem, about, whole=False), fixes, begins))
     beam = [best]
     while beam:
         more: dict[frozenset[tuple[int, int]], tuple[float, _Set, tuple[float, int, int]]] = {}
