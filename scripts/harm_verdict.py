@@ -27,6 +27,7 @@ BOUNDS = {
     "smoother": 1.1,  # a smoother's pooled error over its filter's
     "time": 3.0,  # processor time estimated over stated
 }
+OF_ESTIMATED = "confirmed", "smoother"  # the bounds that need no rows with stated noise
 
 
 def key_of(row: Row) -> tuple[str, ...]:

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from graphnav.app.talk import pause_collector
 from graphnav.core.errors import ConfigError
+from graphnav.core.memory import pause_collector
 
 if TYPE_CHECKING:
     from graphnav.config import Settings
@@ -170,9 +170,9 @@ def choose_solvers(context: typer.Context, names: str) -> tuple[str, ...]:
     from graphnav.core.complaints import split_names
 
     with pause_collector():
-        from graphnav.estimation import pipeline
+        from graphnav.estimation.solution import KNOWN
 
-    return split_names(names, pipeline.KNOWN, _read_option_name(context), "solver")
+    return split_names(names, KNOWN, _read_option_name(context), "solver")
 
 
 def choose_solver(context: typer.Context, name: str) -> tuple[str, ...]:

@@ -36,8 +36,9 @@ from graphnav.app.cli_options import (
     collect_withheld,
     pick_one,
 )
-from graphnav.app.talk import insist, pause_collector, print_out, show_progress
+from graphnav.app.talk import insist, print_out, show_progress
 from graphnav.core.errors import ConfigError
+from graphnav.core.memory import pause_collector
 from graphnav.core.progress import tell
 
 commands = typer.Typer()
@@ -228,10 +229,10 @@ def _solve_and_write(
     loose: bool = False,
 ) -> None:
     with pause_collector():
-        import graphnav.estimation.pipeline  # noqa: F401
         from graphnav.app import convert, outputs, terminal, workflow
         from graphnav.app.summary import tabulate_comparison
         from graphnav.config import read_settings
+        from graphnav.core.beside import allow_second_process
         from graphnav.core.complaints import split_names
         from graphnav.core.memory import keep_memory
         from graphnav.core.staging import resolve_final_path, stage_results
@@ -239,6 +240,7 @@ def _solve_and_write(
         from graphnav.recording.exporters import FORMATS
 
     keep_memory()
+    allow_second_process()
     withheld = collect_withheld(asked.without, asked.start, asked.end)
     convert.check_rate(asked.rate)
     names = workflow.name_runs(chosen, loose)

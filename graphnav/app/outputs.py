@@ -7,6 +7,7 @@ import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,6 +18,7 @@ from graphnav.app.scores import find_outages
 from graphnav.app.stored import write_outcome
 from graphnav.app.summary import gather_provenance, list_noise_figures, summarise_solver, tabulate_comparison
 from graphnav.app.workflow import Outcome
+from graphnav.core.beside import begin_beside
 from graphnav.core.errors import ConfigError, PartlyWrittenError
 from graphnav.core.files import exists
 from graphnav.core.jsonable import write_json
@@ -110,14 +112,19 @@ def write_comparison_files(outcome: Outcome, folder: Path, pages: bool = True) -
         from graphnav.report import documents as report
 
         detectors = report.draw_detectors(outcome.recording, next(iter(outcome.solutions.values())))
-    failed: dict[Path, str] = {}
-    for name in select_own(outcome.solutions):
-        failed |= write_solver(outcome, name, folder / name, provenance, detectors, pages)
+    first, *others = select_own(outcome.solutions)
+
+    def write(names: Sequence[str]) -> dict[Path, str]:
+        each = (write_solver(outcome, name, folder / name, provenance, detectors, pages) for name in names)
+        return {path: why for failed in each for path, why in failed.items()}
+
+    writing = begin_beside(partial(write, others))
+    failed = write([first])
     write_comparison_csv(folder / "comparison.csv", tabulate_comparison(outcome))
     if pages:
         failed |= _attempt(lambda path: _draw_comparison(outcome, path.parent, provenance), folder / "comparison.html")
     failed |= _attempt(lambda path: write_outcome(outcome, provenance, path), folder / stored.RUN_FILE)
-    _insist(failed)
+    _insist(failed | writing.get_result())
     return [*([folder / "comparison.html"] if pages else []), folder / "comparison.csv"]
 
 

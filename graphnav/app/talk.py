@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 import os
 import sys
 import traceback
@@ -51,21 +50,6 @@ def show_progress(quiet: bool, *work: str) -> Iterator[Progress | None]:
 
     with show_progress_bar(quiet, work) as progress, send_progress(progress):
         yield progress
-
-
-@contextmanager
-def pause_collector() -> Iterator[None]:
-    """Disable garbage collection in this context, and freeze what exists at its end: modules are permanent, and
-    scanning them repeatedly takes a fifth of the time of importing them.
-    """
-    searched = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if searched:
-            gc.freeze()
-            gc.enable()
 
 
 def say(text: str, flush: bool = True) -> None:

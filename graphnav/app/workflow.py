@@ -10,6 +10,7 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,9 +20,11 @@ from graphnav.app.scores import Withheld, score
 from graphnav.config import Settings
 from graphnav.constraints.antenna_motion import LEVER_ARM
 from graphnav.constraints.base import SAME_TIME
+from graphnav.core.beside import begin_beside
 from graphnav.core.complaints import suggest_nearest
 from graphnav.core.errors import ConfigError, EstimationError, RecordingError
 from graphnav.core.findings import Finding
+from graphnav.core.memory import pause_collector
 from graphnav.core.notes import Note, format_count, get_key
 from graphnav.core.progress import Progress, send_progress, tell
 from graphnav.estimation.noise.model import INTERVALS, NoiseModel, StampOffsets
@@ -32,6 +35,7 @@ from graphnav.recording.exporters import check_names
 
 if TYPE_CHECKING:
     from graphnav.evaluation.metrics import Metrics
+    from graphnav.recording.plausibility.screening import Screened
 
 
 LOOSE = "-loose"  # suffix of the name of a solution from fixes in place of raw observations
@@ -188,9 +192,9 @@ def run_request(request: Request, progress: Progress | None = None) -> Outcome:
 
 
 def _solve_request(request: Request, progress: Progress | None) -> Outcome:
-    from graphnav.recording.checks.overview import inspect
     from graphnav.recording.checks.stated import is_truth_apart
     from graphnav.recording.formats import read
+    from graphnav.recording.plausibility.screening import refuse, screen
 
     timings: dict[str, float] = {}
     with _measure_time(timings, "reading"):
@@ -202,11 +206,15 @@ def _solve_request(request: Request, progress: Progress | None) -> Outcome:
     zero = recording.start - whole.start if recording is not whole else 0.0
     moved = _shift_spans(request.withheld, zero)
     with _measure_time(timings, "checks"):
-        inspection = inspect(recording)
-        inspection.refuse()
-    recording = inspection.recording
+        screened = screen(recording)
+        checking = begin_beside(partial(_check, recording, screened))
+    _import_solvers(request.solvers)  # which takes as long as the checks
+    with _measure_time(timings, "checks"):
+        found = checking.get_result()
+        refuse(recording, found)
+    recording = screened.recording
     used, notes = _withhold(recording, moved, zero)
-    findings = [f.sentence for f in inspection.findings]
+    findings = [f.sentence for f in found]
     if is_truth_apart(recording):
         recording = replace(recording, truth=None)
 
@@ -222,7 +230,7 @@ def _solve_request(request: Request, progress: Progress | None) -> Outcome:
     try:
         solutions = run(used, request.settings, request.solvers, progress, model)
     except EstimationError as error:
-        raise _name_cause(error, inspection.findings) from None
+        raise _name_cause(error, found) from None
     if request.loose:
         others = run(used, couple_loosely(request.settings), request.solvers, progress, model)
         solutions |= {name + LOOSE: replace(one, solver=name + LOOSE) for name, one in others.items()}
@@ -242,12 +250,12 @@ def _solve_request(request: Request, progress: Progress | None) -> Outcome:
                 raise
             metrics, against, names = {}, None, ()
             findings.append(Note(error.key, f"not compared with the truth: {error}"))
-    for name, found in metrics.items():
-        for note in found.notes:
+    for name, compared in metrics.items():
+        for note in compared.notes:
             shared = all(note in other.notes for other in metrics.values())
             findings.append(note if shared else Note(get_key(note), f"{name}: {note}"))
-    errors = {name: found.errors for name, found in metrics.items() if found.errors is not None}
-    checks = _mitigate(inspection.findings, solutions)
+    errors = {name: one.errors for name, one in metrics.items() if one.errors is not None}
+    checks = _mitigate(found, solutions)
     if request.judge_arms or list_doubts(solutions, errors):  # which takes a second
         from graphnav.estimation.antenna import find_wrong_arms
 
@@ -262,6 +270,20 @@ def _solve_request(request: Request, progress: Progress | None) -> Outcome:
         request, recording, zero, solutions, metrics, against, names, tuple(dict.fromkeys(findings)),
         tuple(f.sentence for f in checks if f.severity != "note"), timings | seconds, checks, densities,
     )  # fmt: skip
+
+
+def _check(recording: Recording, screened: Screened) -> tuple[Finding, ...]:
+    from graphnav.recording.checks.overview import inspect
+
+    return inspect(recording, screened).findings
+
+
+def _import_solvers(solvers: Sequence[str]) -> None:
+    with pause_collector():
+        import graphnav.estimation.pipeline
+
+        if "batch" in solvers:
+            import graphnav.estimation.factor_graph.batch  # noqa: F401
 
 
 def _mitigate(findings: tuple[Finding, ...], solutions: Mapping[str, Solution]) -> tuple[Finding, ...]:
@@ -366,7 +388,7 @@ def _measure_time(timings: dict[str, float], stage: str) -> Iterator[None]:
     tell(stage)
     began = time.perf_counter()
     yield
-    timings[stage] = time.perf_counter() - began
+    timings[stage] = timings.get(stage, 0.0) + time.perf_counter() - began
 
 
 def _crop(whole: Recording, request: Request) -> Recording:

@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import ctypes
+import gc
 import sys
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # of mallopt(3)
-_LARGEST, _KEPT = 2**26, 2**30  # bytes: more than an array of an hour with a keyframe a second; what is kept
+# bytes: more than the covariances of an hour with a keyframe a second and sixty error states; while a drive is solved
+# in parts, whose results need the memory; what is kept in all
+_LARGEST, _LARGEST_OF_PARTS, _KEPT = 2**27, 2**26, 2**30
+_keeps = False
 
 
 def read_peak_memory_mb() -> float:
@@ -32,6 +37,8 @@ def keep_memory() -> None:
     Each pass over a drive needs the same arrays; memory anew from the system is cleared page by page, which was a
     twentieth of all processor time.
     """
+    global _keeps
+    _keeps = True
     with suppress(AttributeError, OSError, TypeError):  # of another C library
         library = ctypes.CDLL(None)
         library.mallopt(_MMAP_THRESHOLD, _LARGEST)
@@ -39,6 +46,24 @@ def keep_memory() -> None:
 
 
 def return_memory() -> None:
-    """Return free memory to the system."""
+    """Return free memory to the system, and from now on that of the largest arrays at once."""
     with suppress(AttributeError, OSError, TypeError):  # of another C library
-        ctypes.CDLL(None).malloc_trim(0)
+        library = ctypes.CDLL(None)
+        library.malloc_trim(0)
+        if _keeps:
+            library.mallopt(_MMAP_THRESHOLD, _LARGEST_OF_PARTS)
+
+
+@contextmanager
+def pause_collector() -> Iterator[None]:
+    """Disable garbage collection in this context, and freeze what exists at its end: modules are permanent, and
+    scanning them repeatedly takes a fifth of the time of importing them.
+    """
+    searched = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if searched:
+            gc.freeze()
+            gc.enable()

@@ -28,6 +28,7 @@ from graphnav.detectors import check_own as check_detectors
 from graphnav.estimation.building import start_sigma
 from graphnav.estimation.faults.excluded import describe_faults, find_fault_spans
 from graphnav.estimation.long_drives import OVERLAP, crop_solutions, share_covariances, split_drive
+from graphnav.estimation.noise.copies import describe_copies
 from graphnav.estimation.noise.files import MODES
 from graphnav.estimation.noise.imu_floor import apply_measured_floor
 from graphnav.estimation.noise.model import STATED, NoiseModel, StampOffsets
@@ -36,7 +37,7 @@ from graphnav.estimation.offsets import move_stamps
 from graphnav.estimation.pieces import describe_span, split_pieces
 from graphnav.estimation.preparation import Prepared, Weigh, prepare, step_ahead
 from graphnav.estimation.separation import compute_separation
-from graphnav.estimation.solution import Solution, join_solutions
+from graphnav.estimation.solution import KNOWN, Solution, join_solutions
 from graphnav.estimation.solvers.breakdown import explain_singular
 from graphnav.estimation.solvers.ekf import ekf
 from graphnav.estimation.solvers.rts import rts, smooth_backward
@@ -54,7 +55,6 @@ from graphnav.recording.checks.clock import ClockOffsets
 from graphnav.recording.plausibility.screening import screen, state_findings
 
 SOLVERS = ("ekf", "rts", "batch")  # run when none is named
-KNOWN = ("ekf", "rts", "incremental", "isam2", "batch")
 _CLEARLY_BETTER = 10.0  # half chi-square; a likelihood ratio of 22,000
 
 Attempt = Callable[[Settings, NoiseModel | None], dict[str, Solution]]  # to solve with these
@@ -156,6 +156,8 @@ def _run(
     notes = [*check_profile(recording, settings), *notes]
     found: list[dict[str, Solution]] = []
     parts = [share for piece in pieces for share in split_drive(piece, settings)]
+    if len(parts) > 1:
+        return_memory()
     if len(parts) > len(pieces):
         sentence = f"too long to be solved at once: solved in {len(parts)} parts that overlap by {OVERLAP:.0f} s"
         notes.append(Note("pieces.parts", sentence))
@@ -256,7 +258,7 @@ def _solve(
         recording = move_stamps(recording, stamps)
         found = prepare_moved(recording, stamps.rate)
     problem, forward, smoothed = found.problem, found.forward, found.smoothed
-    wrong = find_fault_spans(problem, smoothed)
+    faults = find_fault_spans(problem, smoothed)
     notes = (
         *found.start.notes,
         *undone,
@@ -264,7 +266,8 @@ def _solve(
         *found.detections.notes,
         *describe_stamps(stamps),
         *found.notes,
-        *describe_faults(wrong, problem),
+        *describe_copies(found.copies, recording),
+        *describe_faults(faults, problem),
     )
     notes = (*notes, *describe_far(problem, smoothed))
     start, passes = smoothed, Counter(found.passes)
@@ -318,7 +321,7 @@ def _solve(
             out[name],
             notes=(*notes, *out[name].notes),
             detections=found.detections.all,
-            excluded=wrong,
+            excluded=(*found.copies, *faults),
             noise=found.noise,
             passes=dict(passes),
             separation=apart,

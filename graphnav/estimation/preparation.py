@@ -29,13 +29,14 @@ from graphnav.estimation.fixing import fix, split_carriers
 from graphnav.estimation.joint_estimate import JointEstimate, estimate_jointly, revise_jointly
 from graphnav.estimation.noise.apply import apply_noise, drop_parts
 from graphnav.estimation.noise.bias_walks import estimate_bias_walks
+from graphnav.estimation.noise.copies import drop_copies, list_copies
 from graphnav.estimation.noise.estimate import NoiseEstimate, estimate_noise
 from graphnav.estimation.noise.initial_points import BREAKDOWN
 from graphnav.estimation.noise.model import STATED, NoiseModel
 from graphnav.estimation.noise.spacing import space_fixes
 from graphnav.estimation.noise.words import describe_noise
 from graphnav.estimation.problem import Problem
-from graphnav.estimation.solution import CarrierArcs
+from graphnav.estimation.solution import CarrierArcs, ExcludedSpan
 from graphnav.estimation.solvers.ekf import ekf, refilter, smooth_near
 from graphnav.estimation.solvers.linearise import Points, scale_at
 from graphnav.estimation.solvers.passes import (
@@ -76,6 +77,8 @@ class Prepared:
     log_evidence: float = np.inf  # of all measurements by the estimated noise model, where that is wanted
     ahead: Points | None = None  # a step of Gauss and Newton behind `smoothed`, where it is known
 
+    copies: tuple[ExcludedSpan, ...] = ()  # fixes that are no part of the problem
+
     @property
     def diverged(self) -> bool:
         """Whether the stated start is so far from the one found that a filter from there diverges for a while."""
@@ -105,6 +108,9 @@ def prepare(
         If the recording does not determine a trajectory.
     """
     clock, passes = Clock(), Counter[str]()
+    as_stated = settings.noise.mode == "stated" if noise is None else noise == STATED
+    copies = () if as_stated else list_copies(recording)
+    recording = recording if as_stated else drop_copies(recording)
     spacing = settings.noise.spacing if noise is None else noise.spacing
     every = ProblemBuilder(recording, recording, settings, frame, clock)
     aligned = every.align(recording, detections.stationary)
@@ -159,7 +165,7 @@ def prepare(
     start = use_known_heading(aligned, settings)
     return Prepared(
         problem, noise, start, aligned, built.detections, forward, smoothed, notes, clock.seconds, passes, epochs, arcs,
-        evidence, ahead,
+        evidence, ahead, copies,
     )  # fmt: skip
 
 

@@ -17,6 +17,7 @@ from graphnav.core.trajectory import Trajectory
 from graphnav.detectors.base import Detection
 from graphnav.estimation.noise.model import STATED, NoiseModel, RowWeights
 
+KNOWN = ("ekf", "rts", "incremental", "isam2", "batch")  # solvers
 _OUT = 9  # errors of attitude, position, velocity, which are those of a trajectory
 _BLOCK_ROWS = 4096  # rows of a block: 25 MB while it is processed
 

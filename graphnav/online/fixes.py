@@ -9,11 +9,15 @@ import numpy as np
 
 from graphnav.constraints.gnss import find_fix_period
 from graphnav.core.rotation import Array
+from graphnav.estimation.alignment.first import pick_fixes
+from graphnav.estimation.noise.copies import mark_copies
 from graphnav.estimation.noise.spacing import find_grid_start, select_best_fixes
 from graphnav.online.buffers import Buffer
 from graphnav.recording import Gnss
 
 _WIDTH, _USED = 19, 19  # the last columns: six typical sigmas, and whether the fix is used
+_COPY = -1.0  # in the last column: a copy of the fix before
+_NEAR = 8  # rows either side of a new one among which copies are sought
 _AVERAGED_OVER = 60.0  # s over which the typical sigma of fixes is averaged
 
 
@@ -27,7 +31,8 @@ class Fixes(Buffer):
 
     def __init__(self, setup: Gnss | None) -> None:
         super().__init__(_WIDTH)
-        self.left: list[float] = []  # s, fixes that were used until better ones of their span arrived
+        self.left: list[float] = []  # s, fixes that were used until better ones of their span, or another copy, arrived
+        self._selects = False  # whether not all fixes are used
         self._setup = setup
         # begin and duration of the spans, s, of which the best fix is used
         self._grid: tuple[float, float] | None = None
@@ -48,25 +53,33 @@ class Fixes(Buffer):
         """Reset the typical sigmas: what follows is of another receiver or clock."""
         self._means = {}
 
-    def space(self, spacing: float) -> None:
-        """Use the best fix of every span of `spacing` (s), as `estimation.noise.spacing` sets it; 0: use all."""
+    def space(self, spacing: float | None) -> None:
+        """Use the best fix of every span of `spacing` (s), 0 for each of them, but no copies; None: use all."""
         self.rows[:, _USED], self._grid, self.left = 1.0, None, []
+        self._selects = spacing is not None
         gnss = self.select_as_gnss(-np.inf, np.inf)
-        if not spacing or gnss is None or len(gnss.t) < 2 or find_fix_period(gnss.t) > 0.5 * spacing:
+        if spacing is None or gnss is None or len(gnss.t) < 2:
+            return
+        self.rows[mark_copies(gnss), _USED] = _COPY
+        if find_fix_period(gnss.t) > 0.5 * spacing:
             return
         begin = find_grid_start(gnss)
         self._grid = begin, spacing
-        self.rows[:, _USED] = 0.0
-        self.rows[select_best_fixes(gnss, np.floor((gnss.t - begin) / spacing)), _USED] = 1.0
+        own = np.flatnonzero(self.rows[:, _USED] != _COPY)
+        gnss = pick_fixes(gnss, own)
+        self.rows[own, _USED] = 0.0
+        self.rows[own[select_best_fixes(gnss, np.floor((gnss.t - begin) / spacing))], _USED] = 1.0
 
     def choose(self, t: float) -> bool:
-        """Whether the fix at a time is among the best of its span; fixes that no longer are go to `left`."""
+        """Whether a new fix is no copy and among the best of its span; those that no longer are go to `left`."""
+        if self._selects and self._is_copy(t):
+            return False
         if self._grid is None:
             return True
         begin, spacing = self._grid
         span = np.floor((t - begin) / spacing)
         near = self.rows[slice(*np.searchsorted(self.t, [t - 1.1 * spacing, t + 1.1 * spacing]))]
-        rows = np.flatnonzero(np.floor((near[:, 0] - begin) / spacing) == span)
+        rows = np.flatnonzero((np.floor((near[:, 0] - begin) / spacing) == span) & (near[:, _USED] != _COPY))
         gnss = self._make_gnss(near[rows])
         assert gnss is not None
         best = rows[select_best_fixes(gnss, np.zeros(len(rows)))]
@@ -75,6 +88,18 @@ class Fixes(Buffer):
         near[rows, _USED] = 0.0
         near[best, _USED] = 1.0
         return bool(np.any(near[best, 0] == t))
+
+    def _is_copy(self, t: float) -> bool:
+        """Whether the fix at a time is a copy; those near it that turn out to be go to `left`."""
+        at = int(np.searchsorted(self.t, t))
+        first = max(at - _NEAR, 0)
+        near = self.rows[first : at + _NEAR + 1]
+        gnss = self._make_gnss(near)
+        assert gnss is not None
+        copied = mark_copies(gnss)
+        self.left += [float(x) for x in near[copied & (near[:, _USED] > 0.0), 0] if x != t]
+        near[copied, _USED] = _COPY
+        return bool(copied[at - first])
 
     def compute_typical_sigmas(self, t: Array) -> Array:
         """(N, 6) typical sigmas of the fixes at some times, m and m/s: the units of time-correlated errors."""

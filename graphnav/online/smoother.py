@@ -336,14 +336,14 @@ class Smoother:
         self._faults = self.excluded
         self._begin_anew(before)
         sensors.put_back(later)
-        sensors.gnss.space(0.0)  # all of them, until the next alignment
+        sensors.gnss.space(None)  # all of them, until the next alignment
 
     def _begin_anew(self, oldest: float) -> None:
         """Drop all rows and states; rows up to a time (s) are too late from now on."""
         self.tracker = self._found = self._estimation = self._catch_up = None
         self._tentative, self._times, self._left_out = False, [], ()
         self.sensors.drop_before(np.inf)
-        self.sensors.gnss.space(0.0)
+        self.sensors.gnss.space(None)
         self.sensors.oldest = oldest
         self._fixes, self._dirty = [], np.inf
         self._due = self._awake = -np.inf

@@ -16,7 +16,8 @@ from graphnav.estimation.alignment import align
 from graphnav.estimation.factor_graph.batch import batch
 from graphnav.estimation.problem import Problem, build_problem
 from graphnav.estimation.solvers.ekf import ekf
-from graphnav.estimation.solvers.rts import rts
+from graphnav.estimation.solvers.passes import subtract_points
+from graphnav.estimation.solvers.rts import rts, smooth_backward, smooth_points
 
 
 @dataclass(frozen=True)
@@ -82,6 +83,14 @@ def test_it_changes_nothing_where_the_problem_is_linear(kind: str) -> None:
         twice = rts(problem, ekf(problem, opening=problem.t[0] + share * (problem.t[-1] - problem.t[0])))
         np.testing.assert_allclose(twice.states.minus(once.states) / sigmas(once), 0.0, atol=1e-3)
         np.testing.assert_allclose(sigmas(twice), sigmas(once), rtol=1e-4)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
+def test_points_are_smoothed_without_covariances_as_with_them(share: float) -> None:
+    problem = nearly_linear("slow").problem
+    forward = ekf(problem, opening=problem.t[0] + share * (problem.t[-1] - problem.t[0]))
+    alone, whole = smooth_points(forward), smooth_backward(problem, forward)
+    np.testing.assert_allclose(subtract_points(alone, whole) / np.sqrt(whole.variance), 0.0, atol=1e-7)
 
 
 def test_an_opening_before_the_first_keyframe_is_none(start: Start) -> None:

@@ -75,16 +75,16 @@ class Drive:
                 2.0 * self.H, np.tile(np.arange(D), n), D * np.arange(n + 1),
             )  # fmt: skip
         out |= {"taken": taken, "lossy": lossy, "errors_alone": np.zeros((n, D))}
-        disturbance.smooth_errors(steps, updates, blocks.arrays, filtered, out["errors_alone"])
+        disturbance.smooth_errors(n, np.zeros(D), steps, updates, blocks.arrays, filtered, out["errors_alone"])
         # small, so that turns add up
         moved = 1e-6 * (out["errors"] - out["ahead"])
         half = np.concatenate([np.ones((n, 1)), 0.5 * moved[:, :3]], axis=1)
         turned = half / np.linalg.norm(half, axis=1, keepdims=True)
-        out |= {"away": np.zeros((n, D)), "P_back": out["P"].copy()}
-        recursion.smooth_filtered(
-            0, n - 1, moved, turned, steps, out["P_ahead"], out["P"], out["P_back"], out["away"],
-            np.zeros(1, dtype=int),
-        )  # fmt: skip
+        out |= {"away": np.zeros((n, D)), "P_back": out["P"].copy(), "away_alone": np.zeros((n, D))}
+        for P_smoothed, away in ((out["P_back"], out["away"]), (np.empty((0, D, D)), out["away_alone"])):
+            recursion.smooth_filtered(
+                0, n - 1, moved, turned, steps, out["P_ahead"], out["P"], P_smoothed, away, np.zeros(1, dtype=int)
+            )
         return out
 
 
@@ -116,6 +116,7 @@ def test_filter_and_smoother_are_one_update_of_the_whole_drive() -> None:
     np.testing.assert_allclose(found["smoothed"], mean, atol=1e-8)
     np.testing.assert_allclose(found["errors"][-1], mean[-1], atol=1e-8)
     np.testing.assert_allclose(found["errors"] + 1e6 * found["away"], mean, atol=1e-4)
+    np.testing.assert_allclose(found["away_alone"], found["away"], atol=1e-12)
     np.testing.assert_allclose(found["P_back"], found["P_smoothed"], atol=1e-8)
     for k in range(n):
         np.testing.assert_allclose(found["P_smoothed"][k], blocks[k, :, k], atol=1e-8)

@@ -11,12 +11,11 @@ import pytest
 import graphnav
 from graphnav.app.scores import score
 from graphnav.core.earth import LocalFrame
-from graphnav.estimation.noise.spans import list_repeats
+from graphnav.estimation.noise.copies import list_copies, mark_copies
 from graphnav.evaluation.metrics import summarise
 from graphnav.recording import Recording
 
 ROOT = Path(__file__).resolve().parents[2]
-_BELOW = 0.9  # m/s
 
 
 @pytest.fixture(scope="module")
@@ -24,15 +23,15 @@ def drive() -> Recording:
     return graphnav.load(ROOT / "data" / "tokyo").crop(20.0, 110.0)
 
 
-def held(recording: Recording) -> Recording:
-    """The recording with fixes of one sigma, without velocities, held below a speed."""
+def held(recording: Recording, below: float = 0.9) -> Recording:
+    """The recording with fixes of one sigma, without velocities, held below a speed, m/s."""
     gnss = recording.gnss
     assert gnss is not None
     p = LocalFrame(gnss.llh[0]).from_llh(gnss.llh)
     speed = np.linalg.norm(np.gradient(p[:, :2], gnss.t, axis=0), axis=1)
     row = np.arange(len(p))
     for k in range(1, len(p)):
-        row[k] = row[k - 1] if speed[k] < _BELOW else k
+        row[k] = row[k - 1] if speed[k] < below else k
     some = replace(gnss, llh=gnss.llh[row], v=None, sd_v=None, sd=np.ones_like(gnss.sd))
     return replace(recording, gnss=some)
 
@@ -47,11 +46,28 @@ def test_what_a_receiver_holds_is_left_out(drive: Recording) -> None:
     assert error[None]["nees_p"] < 3.0
 
 
-def test_repeats_that_digits_explain_are_none(drive: Recording) -> None:
+def test_a_lever_arm_is_not_bent_to_what_a_receiver_holds(drive: Recording) -> None:
+    """At a stop it holds where the vehicle was at this speed, a metre behind, and says that it stands."""
+    used = held(drive, 1.4)
+    gnss, before = used.gnss, drive.gnss
+    assert gnss is not None
+    assert before is not None
+    assert before.v is not None
+    copied = mark_copies(gnss)
+    exact = replace(gnss, v=np.where(copied[:, None], 0.0, before.v), sd_v=before.sd_v, sd=before.sd)
+    error = {
+        name: summarise(score(drive, one, graphnav.run(one, solvers=("rts",)), ())[0]["rts"])
+        for name, one in {"all": drive, "held": replace(used, gnss=exact)}.items()
+    }
+    assert error["held"]["h_rms_m"] < 2.0 * error["all"]["h_rms_m"]
+    assert error["held"]["nees_p"] < 2.0
+
+
+def test_repeats_that_digits_explain_are_no_copies(drive: Recording) -> None:
     used = held(drive)
     gnss = used.gnss
     assert gnss is not None
     coarse = replace(gnss, rounding=(0.3, 0.3, 0.0), sd=np.full_like(gnss.sd, 0.1))
-    assert list_repeats(used) != []
-    assert list_repeats(drive) == []
-    assert list_repeats(replace(used, gnss=coarse)) == []
+    assert mark_copies(gnss).any()
+    assert not list_copies(drive)
+    assert not mark_copies(coarse).any()

@@ -82,3 +82,16 @@ def test_a_rounding_error_that_repeats_counts_once() -> None:
         sigma = np.asarray(found.sd_p)[: len(off), 2]
         away.append(np.mean((off / sigma) ** 2))
     assert np.mean(away) < 1.5
+
+
+@pytest.mark.parametrize(("digits", "minutes"), [(8, 4), (7, 3), (9, 5)])
+def test_degrees_that_were_converted_from_minutes(digits: int, minutes: int) -> None:
+    """As by a logger of NMEA sentences that writes degrees with more digits than the receiver's."""
+    x = 42.0 + np.random.default_rng(3).uniform(0.0, 0.01, 60)
+    written = np.round(np.round(60.0 * x, minutes) / 60.0, digits)
+    found = np.sqrt(12.0) * np.array(measure_rounding(np.column_stack([np.radians(written), np.zeros(60), x])))
+    assert found[1] == pytest.approx(np.radians(10.0**-minutes / 60.0) * 6378137.0)
+    other = np.sqrt(12.0) * np.array(
+        measure_rounding(np.column_stack([np.radians(np.round(x, digits)), np.zeros(60), x]))
+    )
+    assert other[1] == pytest.approx(np.radians(10.0**-digits) * 6378137.0)

@@ -21,7 +21,7 @@ from graphnav.core.complaints import read_toml, suggest_nearest
 from graphnav.core.errors import ConfigError
 from graphnav.core.files import exists, is_inside, read_text
 from graphnav.estimation.noise.files import MODES
-from graphnav.estimation.pipeline import KNOWN
+from graphnav.estimation.solution import KNOWN
 from graphnav.recording.formats import is_description, list_formats
 
 

@@ -1,8 +1,7 @@
 """Fault detection and exclusion: which measurements are wrong for a span of time, decided by evidence.
 
 Detection. A bank of likelihood-ratio tests (`graphnav.estimation.faults.watch`) gives the spans in which fixes
-disagree with all other measurements by an error that persists. It does not tell which sensor is wrong. Spans in which a
-receiver repeats one position are suspected without a test: it may hold it because it takes a slow vehicle to stand.
+disagree with all other measurements by an error that persists. It does not tell which sensor is wrong.
 
 Decision. With the noise model as it is, each span is explained by several models, each with its own likelihood of the
 innovations from the start of the span to the start of the next one:
@@ -74,16 +73,13 @@ from graphnav.estimation.noise.spans import (
     join,
     list_before,
     list_distinct,
-    list_repeats,
     mask_times,
-    split_at_repeats,
     sum_lengths,
     trim,
 )
 from graphnav.estimation.noise.suspects import (
     cut_at_steps,
     date_segments,
-    find_disagreements,
     find_segments,
     find_suspects,
     list_fix_times,
@@ -198,14 +194,10 @@ def decide_faults(base: Problem, found: NoiseEstimate) -> Decision:
         passes = passes + other.passes
         first = replace(other, rival=first) if other.log_evidence > first.log_evidence else first
     medians = {name: replace(figure, log_factor=figure.prior) for name, figure in found.noise.figures.items()}
-    masked = find_disagreements(base, NoiseModel(medians), found)
+    masked = find_suspects(base, NoiseModel(medians), found)
     first = replace(first, passes=passes + Counter(filter=2))
     excluded = join(span for kind in FIXES for span in first.noise.excluded.get(kind, ()))
-    # the figures found also rest on repeated fixes, which may be wrong
-    wrong = any(are_covered([span], excluded) for span in list_repeats(base.recording))
-    if are_covered(masked, excluded) and not wrong:
-        return first
-    return _unmask(base, found, first, split_at_repeats(masked, base.recording))
+    return first if are_covered(masked, excluded) else _unmask(base, found, first, masked)
 
 
 def _unmask(base: Problem, found: NoiseEstimate, first: Decision, masked: list[Span]) -> Decision:

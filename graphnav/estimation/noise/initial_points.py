@@ -16,9 +16,9 @@ from graphnav.estimation.noise.outliers import limit_scaled, limit_squares, list
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.ekf import ekf, refilter, smooth_near
 from graphnav.estimation.solvers.linearise import Points, linearise
-from graphnav.estimation.solvers.passes import are_near
+from graphnav.estimation.solvers.passes import SmootherPass, are_near
 from graphnav.estimation.solvers.robust import weigh_squares
-from graphnav.estimation.solvers.rts import smooth_backward, smooth_points
+from graphnav.estimation.solvers.rts import smooth_points
 
 BREAKDOWN = EstimationError, np.linalg.LinAlgError  # errors of a filter with a numerically singular covariance
 _COOLING = 3.0  # factor by which the sigmas of an annealing fall in each round
@@ -61,19 +61,20 @@ def find_initial_points(problem: Problem, opening: float | None) -> tuple[list[I
         If the filter breaks down with large sigmas of all fixes, too.
     """
     try:
-        plain = about = smooth_backward(problem, ekf(problem, opening=opening, stays=_SETTLED))
+        plain = smooth_points(ekf(problem, opening=opening, stays=_SETTLED))
     except BREAKDOWN:  # outliers of hundreds of sigmas make its covariance numerically singular
         initial, passes = _anneal(problem, opening)
         return [initial], passes
-    sound, passes = problem, 1
+    sound, about, passes = problem, plain, 1
+    smoothed: SmootherPass | None = None
     try:
         for _ in range(_SEARCHES):
             found = weigh_rows(problem, refilter(problem, about, watch=True, drifts=False).weights)
             if _list_unused(found) == _list_unused(sound):
                 break
-            sound, (_, about) = found, smooth_near(found, about, opening)
-            passes += 2
-        if sound is problem:
+            sound, (_, smoothed) = found, smooth_near(found, about, opening)
+            about, passes = smoothed, passes + 2
+        if smoothed is None:
             return [Initial(plain)], passes
         one, other = (smooth_points(refilter(problem, points, whole=False)) for points in (plain, about))
     except BREAKDOWN:  # with figures or points that are far off, most rows seem wrong
@@ -82,7 +83,7 @@ def find_initial_points(problem: Problem, opening: float | None) -> tuple[list[I
     for rows in sound.constraints:
         if rows.weight is not None and np.any(rows.weight == 0.0):
             every = np.ones(len(rows), dtype=bool)
-            weight = limit_scaled(collect_row_moments(sound, rows, about, len(rows)).left_out, len(rows.axes), every)
+            weight = limit_scaled(collect_row_moments(sound, rows, smoothed, len(rows)).left_out, len(rows.axes), every)
             weights[rows.name] = list_reduced(sound.t[rows.keyframe], weight, every)
     if are_near(other, one):
         return [Initial(one, weights)], passes + 2
@@ -117,7 +118,7 @@ def _anneal(problem: Problem, opening: float | None) -> tuple[Initial, int]:
         share = {c.name: 1.0 / (1.0 + (SIZES[c.unit] * wider / stated[c.name]) ** 2) for c in fixes}
         eased = weigh_rows(problem, {name: x * weights[name] for name, x in share.items()})
         if about is None:
-            about = smooth_backward(eased, ekf(eased, opening=opening))
+            about = smooth_points(ekf(eased, opening=opening))
         else:
             about = smooth_points(refilter(eased, about, whole=False))
         about = smooth_points(refilter(eased, about, whole=False))

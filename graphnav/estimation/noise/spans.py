@@ -8,13 +8,11 @@ import numpy as np
 from scipy.special import chdtri
 
 from graphnav.constraints.base import SAME_TIME
-from graphnav.core.findings import find_runs
 from graphnav.core.rotation import Array
 from graphnav.estimation.noise.model import RowWeights
 from graphnav.estimation.noise.outliers import CHANCE, OUTLIER_COST
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import ExcludedSpan
-from graphnav.recording import Recording
 
 Span = tuple[float, float]  # s, first and last measurement in it
 LeftOutErrors = Mapping[str, tuple[Array, Array, int]]  # by constraint: (N,) s, (N,) squared errors, degrees of freedom
@@ -48,36 +46,6 @@ def join(spans: Iterable[Span]) -> list[Span]:
 def join_faults(faults: Iterable[ExcludedSpan]) -> list[Span]:
     """Spans of several measurements; single ones are handled by their weights."""
     return join((fault.t_start, fault.t_end) for fault in faults if fault.count > 1)
-
-
-def list_repeats(recording: Recording) -> list[Span]:
-    """Spans (s) in which fixes repeat a position to the last digit, more often than rounding explains by chance.
-
-    Two white errors of sigma fall on the same step q of a log's digits with a probability of q / (2 sqrt(pi) sigma).
-    The first fix of each is new, so it is no part of the span.
-    """
-    gnss = recording.gnss
-    if gnss is None or len(gnss.t) < 2:
-        return []
-    step = np.sqrt(12.0) * np.array(gnss.rounding[:2])
-    alike = np.log(np.clip(step / (2.0 * np.sqrt(np.pi) * gnss.sd[1:, :2]), 1e-300, 1.0)).sum(axis=1)
-    same = np.r_[False, (gnss.llh[1:, :2] == gnss.llh[:-1, :2]).all(axis=1)]
-    same &= (gnss.t >= recording.start) & (gnss.t <= recording.end)
-    return [
-        (float(gnss.t[a]), float(gnss.t[b - 1]))
-        for a, b in find_runs(same)
-        if b - a > 1 and alike[a - 1 : b - 1].sum() < np.log(CHANCE)
-    ]
-
-
-def split_at_repeats(spans: list[Span], recording: Recording) -> list[Span]:
-    """Repeats and, separately, the rest of other spans: one may be wrong and the other not."""
-    gnss, repeats = recording.gnss, list_repeats(recording)
-    if gnss is None or not repeats:
-        return spans
-    rest = mask_times(gnss.t, spans) & ~mask_times(gnss.t, repeats)
-    others = [(float(gnss.t[a]), float(gnss.t[b - 1])) for a, b in find_runs(rest) if b - a > 1]
-    return sorted([*repeats, *others])
 
 
 def split_at_steps(spans: list[Span], t: Array, error: Array, sigma: Array, cost: float) -> list[Span]:

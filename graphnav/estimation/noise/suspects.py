@@ -22,7 +22,6 @@ from graphnav.estimation.noise.spans import (
     are_covered,
     join,
     join_faults,
-    split_at_repeats,
     split_at_steps,
 )
 from graphnav.estimation.problem import Problem
@@ -32,18 +31,13 @@ _STEPS = 8  # fixes by which the ends of spans are varied
 
 
 def find_suspects(base: Problem, noise: NoiseModel, found: NoiseEstimate) -> list[Span]:
-    """Spans (s) in which fixes may be wrong: those that the tests find, and those in which a receiver repeats itself.
+    """Spans (s) in which the tests find fixes in disagreement with everything else.
 
     Parameters
     ----------
     noise : by which the tests are made; its figures need not be those found.
     found : with the points to linearise at.
     """
-    return split_at_repeats(find_disagreements(base, noise, found), base.recording)
-
-
-def find_disagreements(base: Problem, noise: NoiseModel, found: NoiseEstimate) -> list[Span]:
-    """Spans (s) in which the tests find fixes in disagreement with everything else."""
     # weights of fixes and of IMU intervals may hide a fault from the tests
     kept = {name: some for name, some in noise.weights.items() if name not in (*FIXES, *INTERVALS)}
     tested = apply_noise(base, replace(noise, weights=kept))

@@ -67,22 +67,24 @@ def take_back(N: Array, H: Array, Kt: Array, inverse: Array, lossy: bool) -> Arr
 
 
 @compile_once
-def smooth_errors(steps: Arrays, updates: Arrays, blocks: Arrays, filtered: Arrays, smoothed: Array) -> None:
-    """Errors (n, D) of the smoother at all keyframes, as `smooth_rows` has them, and nothing else of it."""
+def smooth_errors(
+    k1: int, r: Array, steps: Arrays, updates: Arrays, blocks: Arrays, filtered: Arrays, smoothed: Array
+) -> None:
+    """Errors (n, D) of the smoother at keyframes before k1, as `smooth_rows` has them, by r (D,) there alone."""
     F, decay = steps
     Kt, H, w, _, taken, _ = updates
     first, begin, end, _, _, _ = blocks
     errors_predicted, P_predicted, errors, P = filtered
-    r, last = np.zeros(errors.shape[1]), len(errors) - 1
-    for k in range(last, -1, -1):
-        if k < last:
+    for k in range(k1 - 1, -1, -1):
+        ahead = k < len(F)
+        if ahead:
             r = step_vector_back(F[k], decay[k], r)
             np.add(errors[k], np.dot(P[k], r), smoothed[k])
         for b in range(first[k + 1] - 1, first[k] - 1, -1):
             if taken[b]:
                 lo, hi = begin[b], end[b]
                 r = r + np.dot(w[k, lo:hi] - np.dot(Kt[k, lo:hi], r), H[k, lo:hi])
-        if k == last:
+        if not ahead:
             np.add(errors_predicted[k], np.dot(P_predicted[k % len(P_predicted)], r), smoothed[k])
 
 

@@ -293,6 +293,7 @@ def smooth_filtered(
     ----------
     moved : (n, D) filtered states less predicted ones; `turned` (n, 4) the quaternions of their rotations.
     steps : F (n-1, 15, w) and decay (n-1, D-15).
+    P_smoothed : without any keyframes where covariances are not wanted.
     at : (1,), the keyframe that is smoothed.
     """
     F, decay = steps
@@ -302,6 +303,10 @@ def smooth_filtered(
         away = moved[k + 1] + errors[k + 1]
         away[0], away[1], away[2] = compose_turns(turned[k + 1], errors[k + 1])
         Ct = move_columns(F[k], decay[k], P[k])
+        if len(P_smoothed) == 0:
+            divide_covariance(ahead, away.reshape(-1, 1))
+            np.dot(away, Ct, errors[k])
+            continue
         divide_covariance(ahead, Ct)
         np.dot(away, Ct, errors[k])
         two = P[k] + np.dot(Ct.T, np.dot(P_smoothed[k + 1] - ahead, Ct))

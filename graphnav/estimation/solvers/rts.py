@@ -25,7 +25,7 @@ from scipy.linalg.lapack import dposv
 from graphnav.core import rotation
 from graphnav.core.progress import Progress
 from graphnav.core.rotation import Array
-from graphnav.core.state import DIM, States
+from graphnav.core.state import DIM
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import Solution
 from graphnav.estimation.solvers.breakdown import explain_smoother
@@ -38,6 +38,7 @@ from graphnav.estimation.solvers.passes import (
     SmootherPass,
     Updates,
     compute_sigmas,
+    join_passes,
     make_solution,
     move_points,
     record_residuals,
@@ -51,18 +52,12 @@ _CANCELLED = 7e4
 def smooth_backward(problem: Problem, forward: ForwardRecord, progress: Progress | None = None) -> SmootherPass:
     """Smooth a forward pass: keyframes linearised at the filter's estimates, and before them those at given points."""
     K, D = forward.P.shape[:2]
-    n = 0 if forward.about is None else len(forward.about.values)
-    end = max(n - 1, 0) if n < K else K  # for keyframes whose errors are about points
-    P, values = np.empty((K, D, D)), np.empty((K, D - DIM))
-    found, behind = _Disturbances.allocate(n, D), (np.zeros(D), np.zeros((D, D)))
-    states = []
-    if end < K:
-        states = [_smooth_filtered(problem, forward, end, values, P, progress)]
+    n, end = _count_given(forward)
+    P, found, behind = np.empty((K, D, D)), _Disturbances.allocate(n, D), (np.zeros(D), np.zeros((D, D)))
+    parts = [_smooth_filtered(forward, end, P, problem.t, progress)] if end < K else []
     if forward.about is not None:
-        if n == end + 1:  # later information, as a disturbance of the prediction
-            away = states[0][:1].minus(forward.about.states[end:n])[0]
-            away = np.concatenate([away, values[end] - forward.about.values[end]]) - forward.errors_predicted[end]
-            ahead = forward.P_predicted[end]
+        if n == end + 1:
+            ahead, away = forward.P_predicted[end], _find_later(forward, parts[0], end)
             _, inverse, info = dposv(ahead, np.eye(D))
             if info:
                 raise explain_smoother(float(problem.t[end]))
@@ -71,23 +66,43 @@ def smooth_backward(problem: Problem, forward: ForwardRecord, progress: Progress
         if forward.updates is not None:
             _smooth_points(forward, forward.updates, behind, end, found, P, progress=progress)
             _restore_digits(forward, P, end)
-        first = move_points(forward.about.take_first(end), found.errors[:end])
-        values[:end] = first.values
-        states = [first.states, *states]
-    return SmootherPass(States.stack(states), values, found.r, found.N, found.N_diagonal, P)
+        parts = [move_points(forward.about.take_first(end), found.errors[:end]), *parts]
+    smoothed = join_passes(parts)
+    return SmootherPass(smoothed.states, smoothed.values, found.r, found.N, found.N_diagonal, P)
 
 
 def smooth_points(forward: ForwardRecord) -> Points:
-    """Smooth a forward pass that was linearised at given points throughout, without covariances: a step of Gauss and
+    """Smooth a forward pass without covariances; of one linearised at given points throughout, a step of Gauss and
     Newton from these points.
     """
-    one = forward.updates
+    (K, D), one = forward.P.shape[:2], forward.updates
+    n, end = _count_given(forward)
+    r, errors = np.zeros(D), np.empty(forward.errors.shape)
+    parts = [_smooth_filtered(forward, end, np.empty((0, D, D)))] if end < K else []
+    if forward.about is not None:
+        if n == end + 1:
+            _, r, info = dposv(forward.P_predicted[end], _find_later(forward, parts[0], end))
+            if info:
+                raise explain_smoother()
+        if one is not None:
+            steps = forward.F, forward.decay
+            smooth_errors(end, r, steps, one.arrays, one.blocks.arrays, forward.filtered, errors)
+        parts = [move_points(forward.about.take_first(end), errors[:end]), *parts]
+    return join_passes(parts)
+
+
+def _count_given(forward: ForwardRecord) -> tuple[int, int]:
+    """How many keyframes were linearised at given points, and how many of them have errors about these points ahead."""
+    n = 0 if forward.about is None else len(forward.about.values)
+    return n, max(n - 1, 0) if n < len(forward.P) else n
+
+
+def _find_later(forward: ForwardRecord, smoothed: Points, end: int) -> Array:
+    """(D,) what later keyframes add to the prediction of keyframe `end`, of which `smoothed` is the first."""
     assert forward.about is not None
-    assert one is not None
-    assert len(forward.about.values) == len(forward.P)
-    errors = np.empty(forward.errors.shape)
-    smooth_errors((forward.F, forward.decay), one.arrays, one.blocks.arrays, forward.filtered, errors)
-    return move_points(forward.about, errors)
+    point = forward.about.take(slice(end, end + 1))
+    away = np.concatenate([smoothed.states[:1].minus(point.states)[0], (smoothed.values[:1] - point.values)[0]])
+    return away - forward.errors_predicted[end]
 
 
 def smooth_moments(problem: Problem, forward: ForwardRecord) -> MomentPass:
@@ -131,15 +146,15 @@ class _Disturbances:
 
 
 def _smooth_filtered(
-    problem: Problem, forward: ForwardRecord, end: int, all_values: Array, all_P: Array, progress: Progress | None
-) -> States:
-    """States from keyframe `end` on, with values and covariances in their places."""
+    forward: ForwardRecord, end: int, all_P: Array, t: Array | None = None, progress: Progress | None = None
+) -> Points:
+    """Points from keyframe `end` on; covariances in their places of (K, D, D), unless there are none."""
     K, D = forward.P.shape[:2]
     own, before, some = forward.take(slice(end, K)), forward.predicted.take(slice(end, K)), slice(end, K)
     moved = np.concatenate([own.states.minus(before.states), own.values - before.values], axis=1)
     turned = rotation.to_quaternion(np.swapaxes(before.states.R_nb, -1, -2) @ own.states.R_nb)
     errors, at = np.zeros((K - end, D)), np.zeros(1, dtype=int)
-    all_P[K - 1] = forward.P[K - 1]
+    all_P[K - 1 :] = forward.P[K - 1]
     for hi in range(K - 1, end, -STRETCH):
         lo = max(hi - STRETCH, end)
         try:
@@ -148,11 +163,10 @@ def _smooth_filtered(
                 forward.P_predicted[some], forward.P[some], all_P[some], errors, at,
             )  # fmt: skip
         except np.linalg.LinAlgError:
-            raise explain_smoother(float(problem.t[end + int(at[0])])) from None
+            raise explain_smoother(None if t is None else float(t[end + int(at[0])])) from None
         if progress is not None:
             progress("smoother", 1.0 - lo / K)
-    all_values[some] = own.values + errors[:, DIM:]
-    return own.states.plus(errors[:, :DIM])
+    return Points(own.states.plus(errors[:, :DIM]), own.values + errors[:, DIM:])
 
 
 def _smooth_points(

@@ -53,7 +53,7 @@ from graphnav.recording.checks.stated import (
     check_velocities,
 )
 from graphnav.recording.checks.tracks import Track
-from graphnav.recording.plausibility.screening import refuse, screen
+from graphnav.recording.plausibility.screening import Screened, refuse, screen
 
 _REST_WINDOW = 1.0  # s
 
@@ -128,13 +128,15 @@ def _format_number(name: str, value: Any) -> str:
     return f"{' '.join(words[:-1] if unit else words)} {number} {unit}".rstrip()
 
 
-def inspect(recording: Recording) -> Inspection:
+def inspect(recording: Recording, screened: Screened | None = None) -> Inspection:
     """Check a recording before solving.
 
     Parameters
     ----------
     recording
         As read.
+    screened
+        What `screen` makes of it, if that is known.
 
     Returns
     -------
@@ -142,7 +144,7 @@ def inspect(recording: Recording) -> Inspection:
         Facts by sensor, the recording without impossible rows, and findings: the most severe first, then in the
         order of the checks, beginning with the loader's remarks.
     """
-    stamps, whole = recording.imu, screen(recording)
+    stamps, whole = recording.imu, screened or screen(recording)
     recording = whole.recording
     findings = [Finding("note", remark, get_key(remark) or "recording.remark") for remark in recording.remarks]
     findings += whole.findings

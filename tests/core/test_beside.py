@@ -1,0 +1,82 @@
+"""Work in a second process: its result, its errors, and its end."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import time
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from graphnav.core import beside
+from graphnav.core.beside import Beside, Done, allow_second_process, begin_beside
+from graphnav.core.errors import RecordingError
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="a second process is begun on Linux only")
+
+
+@pytest.fixture(autouse=True)
+def two_processors(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    monkeypatch.setattr(beside, "_allowed", False)
+    monkeypatch.setattr(beside, "read_peak_memory_mb", lambda: 100.0)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1})
+    yield
+    with pytest.raises(ChildProcessError):  # none is left
+        os.waitpid(-1, os.WNOHANG)
+
+
+def test_it_is_done_at_once_unless_allowed() -> None:
+    assert begin_beside(os.getpid).get_result() == os.getpid()
+
+
+@pytest.mark.parametrize(("processors", "mb"), [({0}, 100.0), ({0, 1}, 5000.0)])
+def test_it_is_done_at_once_without_a_processor_or_memory(
+    processors: set[int], mb: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    allow_second_process()
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: processors)
+    monkeypatch.setattr(beside, "read_peak_memory_mb", lambda: mb)
+    assert isinstance(begin_beside(os.getpid), Done)
+
+
+def test_large_results_come_back() -> None:
+    allow_second_process()
+    numbers = np.random.default_rng(1).standard_normal(500_000)
+    work = begin_beside(lambda: (os.getpid(), 2.0 * numbers))
+    process, found = work.get_result()
+    assert process != os.getpid()
+    np.testing.assert_array_equal(found, 2.0 * numbers)
+
+
+def test_an_error_is_raised_where_the_result_is_wanted() -> None:
+    allow_second_process()
+
+    def refuse() -> None:
+        raise RecordingError("no GNSS", key="gnss.none")
+
+    work = begin_beside(refuse)
+    with pytest.raises(RecordingError, match="no GNSS") as caught:
+        work.get_result()
+    assert caught.value.key == "gnss.none"
+
+
+def test_where_the_process_is_killed_the_work_is_done_here() -> None:
+    allow_second_process()
+    own = os.getpid()
+
+    def work() -> int:
+        if os.getpid() != own:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return os.getpid()
+
+    assert begin_beside(work).get_result() == own
+
+
+def test_it_ends_with_what_it_was_begun_for() -> None:
+    allow_second_process()
+    work = begin_beside(lambda: time.sleep(1000.0))
+    assert isinstance(work, Beside)
+    del work  # the fixture sees that nothing is left
