@@ -273,7 +273,7 @@ def test_evidence_of_segments_is_that_of_filters_with_their_errors(built: Proble
         return float(Comparison(problem, about).filter(other, points, (rows.name,)).log_likelihood().sum())
 
     runs = _Runs(begins, [rows.unit], 3)
-    one = _Set(frozenset(), 0.0, *_respond(problem, refilter(problem, about), [wrong], begins))
+    one = _Set.none(*_respond(problem, refilter(problem, about), [wrong], begins))
     usual, chosen = float(Comparison(problem, about).filter(problem, about).log_likelihood().sum()), []
     for _ in range(2):
         better = runs.list_better(one)
