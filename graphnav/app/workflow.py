@@ -9,7 +9,7 @@ import re
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, is_dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -194,7 +194,7 @@ def run_request(request: Request, progress: Progress | None = None) -> Outcome:
 def _solve_request(request: Request, progress: Progress | None) -> Outcome:
     from graphnav.recording.checks.stated import is_truth_apart
     from graphnav.recording.formats import read
-    from graphnav.recording.plausibility.screening import refuse, screen
+    from graphnav.recording.plausibility.screening import refuse
 
     timings: dict[str, float] = {}
     with _measure_time(timings, "reading"):
@@ -206,12 +206,11 @@ def _solve_request(request: Request, progress: Progress | None) -> Outcome:
     zero = recording.start - whole.start if recording is not whole else 0.0
     moved = _shift_spans(request.withheld, zero)
     with _measure_time(timings, "checks"):
-        screened = screen(recording)
-        checking = begin_beside(partial(_check, recording, screened))
-    _import_solvers(request.solvers)  # which takes as long as the checks
+        checking = begin_beside(partial(_check, recording), _list_parts(recording))
+    _load_solvers(request.solvers)  # which takes as long as the checks
     with _measure_time(timings, "checks"):
-        found = checking.get_result()
-        refuse(recording, found)
+        screened, found = checking.get_result()
+        refuse(screened.recording, found)
     recording = screened.recording
     used, notes = _withhold(recording, moved, zero)
     findings = [f.sentence for f in found]
@@ -272,18 +271,28 @@ def _solve_request(request: Request, progress: Progress | None) -> Outcome:
     )  # fmt: skip
 
 
-def _check(recording: Recording, screened: Screened) -> tuple[Finding, ...]:
+def _check(recording: Recording) -> tuple[Screened, tuple[Finding, ...]]:
     from graphnav.recording.checks.overview import inspect
+    from graphnav.recording.plausibility.screening import screen
 
-    return inspect(recording, screened).findings
+    screened = screen(recording)
+    return screened, inspect(recording, screened).findings
 
 
-def _import_solvers(solvers: Sequence[str]) -> None:
+def _list_parts(recording: Recording) -> list[object]:
+    """Sensors and their arrays, of which most are sound and stay as they are."""
+    sensors = [one for one in vars(recording).values() if is_dataclass(one)]
+    return [*sensors, *(value for one in sensors for value in vars(one).values() if isinstance(value, np.ndarray))]
+
+
+def _load_solvers(solvers: Sequence[str]) -> None:
     with pause_collector():
         import graphnav.estimation.pipeline
+        from graphnav.estimation.solvers.recursion import load_compiled
 
         if "batch" in solvers:
             import graphnav.estimation.factor_graph.batch  # noqa: F401
+        load_compiled()
 
 
 def _mitigate(findings: tuple[Finding, ...], solutions: Mapping[str, Solution]) -> tuple[Finding, ...]:

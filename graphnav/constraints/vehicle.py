@@ -39,7 +39,7 @@ from graphnav.core.rotation import Array, mv, stack_columns
 from graphnav.core.state import SECONDS, Parameter, States
 from graphnav.imu.dynamics import SCALE, convert_to_biases, differentiate_by_scale, make_scale_parameter
 from graphnav.imu.preintegration import Intervals
-from graphnav.recording import Imu, Odometer, Recording
+from graphnav.recording import Recording
 from graphnav.recording.odometer import MeanSpeed, ReadingStatistics, find_wrong_readings
 
 MOUNTING = "mounting"
@@ -291,9 +291,13 @@ class NonHolonomic(Wheels):
         return Linearized(residual - parameters[BODY] * effect, jacobians | lasting, self.sigma[rows])
 
 
-def _average_speed(odometer: Odometer, imu: Imu) -> MeanSpeed:
+def average_speed(recording: Recording, settings: Settings) -> MeanSpeed | None:
+    """The odometer's mean speed over any intervals, without wrong readings; None where no odometer is used."""
+    odometer = recording.odometer
+    if recording.platform != "vehicle" or odometer is None or not settings.vehicle.odometer:
+        return None
     figures = ReadingStatistics.of(odometer)
-    return MeanSpeed.of(odometer, find_wrong_readings(odometer, imu, figures).spans, figures)
+    return MeanSpeed.of(odometer, find_wrong_readings(odometer, recording.imu, figures).spans, figures)
 
 
 @dataclass(frozen=True)
@@ -315,9 +319,9 @@ class OdometerSpeed(Wheels):
     @classmethod
     def build(cls, scene: BuildContext) -> OdometerSpeed | None:
         s, odometer = scene.settings.vehicle, scene.recording.odometer
-        if scene.recording.platform != "vehicle" or odometer is None or not s.odometer:
+        speed = scene.speed or average_speed(scene.recording, scene.settings)
+        if speed is None or odometer is None:
             return None
-        speed = scene.speed or _average_speed(odometer, scene.recording.imu)
         rows, past = scene.moving_rows, scene.interval_motion
         begin, end = scene.intervals.t0[rows], scene.intervals.t1[rows]
         reach = DELAY_SIGMAS * odometer.delay_sigma

@@ -14,6 +14,7 @@ import numpy as np
 from graphnav.config import Settings
 from graphnav.constraints.ambiguities import CarrierRows
 from graphnav.constraints.raw_phase import GnssPhase
+from graphnav.core.beside import Beside, Done
 from graphnav.core.earth import LocalFrame
 from graphnav.core.errors import EstimationError
 from graphnav.core.progress import tell
@@ -28,6 +29,7 @@ from graphnav.estimation.noise.exclusion import drop_excluded
 from graphnav.estimation.noise.model import NoiseModel
 from graphnav.estimation.problem import Problem, build_problem
 from graphnav.recording import Recording
+from graphnav.recording.odometer import MeanSpeed
 
 _DIVERGED_BY = 0.5  # rad between the stated and the found initial attitude, beyond which a filter diverges for a while
 _FAR_AWAY = 100.0  # m, error of single fixes in a city
@@ -71,6 +73,7 @@ class ProblemBuilder:
     settings: Settings
     frame: LocalFrame
     clock: Clock
+    averaging: Beside[MeanSpeed | None] | Done[MeanSpeed | None]  # the odometer's
 
     def align(self, recording: Recording, stationary: Array, before: Alignment | None = None) -> Alignment:
         """The first state of the recording, or of a part of it, near that found before, if any."""
@@ -89,7 +92,7 @@ class ProblemBuilder:
             start = aligned if has_diverged(aligned, stated) else stated
             problem = build_problem(
                 self.used, self.settings, self.frame, start.state, start_sigma(start), detections.stationary,
-                parts_of_noise=parts,
+                speed=self.averaging.get_result(), parts_of_noise=parts,
             )  # fmt: skip
         if aligned.motion is None and self.recording.placed and self.settings.alignment.heading is None:
             # linearised at an arbitrary heading, a direction of travel would make an unknown heading appear known

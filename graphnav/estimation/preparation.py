@@ -10,11 +10,14 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 
 from graphnav.config import Settings
 from graphnav.constraints.foot import Stance
+from graphnav.constraints.vehicle import average_speed
+from graphnav.core.beside import begin_beside
 from graphnav.core.earth import LocalFrame
 from graphnav.core.errors import EstimationError
 from graphnav.core.notes import Note
@@ -112,7 +115,8 @@ def prepare(
     copies = () if as_stated else list_copies(recording)
     recording = recording if as_stated else drop_copies(recording)
     spacing = settings.noise.spacing if noise is None else noise.spacing
-    every = ProblemBuilder(recording, recording, settings, frame, clock)
+    averaging = begin_beside(partial(average_speed, recording, settings))
+    every = ProblemBuilder(recording, recording, settings, frame, clock, averaging)
     aligned = every.align(recording, detections.stationary)
     unaided = aligned.motion is None or not settings.gnss.position
     stated = noise is None and (settings.noise.mode == "stated" or unaided)

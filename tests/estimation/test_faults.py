@@ -13,6 +13,7 @@ from helpers import refused
 from scipy.special import chdtri
 
 from graphnav.config import Settings, parse_settings
+from graphnav.core.beside import Done
 from graphnav.core.earth import LocalFrame
 from graphnav.core.errors import ConfigError
 from graphnav.core.rotation import Array
@@ -272,7 +273,7 @@ def test_evidence_of_segments_is_that_of_filters_with_their_errors(built: Proble
         return float(Comparison(problem, about).filter(other, points, (rows.name,)).log_likelihood().sum())
 
     runs = _Runs(begins, [rows.unit], 3)
-    one = _Set(frozenset(), 0.0, *_respond(problem, refilter(problem, about), [wrong], begins))
+    one = _Set.none(*_respond(problem, refilter(problem, about), [wrong], begins))
     usual, chosen = float(Comparison(problem, about).filter(problem, about).log_likelihood().sum()), []
     for _ in range(2):
         better = runs.list_better(one)
@@ -402,7 +403,7 @@ def test_disturbed_intervals_stand_only_with_more_evidence() -> None:
     recording = moved(recording, np.flatnonzero(burst), np.array([29.0, 25.0, 16.0]))
     settings = parse_settings({})
     frame = LocalFrame(choose_origin(recording))
-    every = ProblemBuilder(recording, recording, settings, frame, Clock())
+    every = ProblemBuilder(recording, recording, settings, frame, Clock(), Done(None))
     detections = detect(recording, settings)
     base = every.build(every.align(recording, detections.stationary), detections, parts=True).problem
     found = estimate_without_faults(base, estimate_noise(base))

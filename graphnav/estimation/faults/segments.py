@@ -33,17 +33,27 @@ from graphnav.estimation.solvers.ekf import refilter
 from graphnav.estimation.solvers.linearise import Points
 from graphnav.estimation.solvers.passes import ForwardRecord
 
+_TOGETHER = 128  # rows whose squares are summed at once
 _BEAM = 8  # sets of segments that are followed: the likeliest single one need not be among the likeliest two
 
 
 @dataclass(frozen=True)
 class _Set:
-    """A set of wrong runs, and what is left of score and info of all errors when these are known so far."""
+    """A set of wrong runs, and what is left of score and info of all errors when these are known so far.
+
+    Both are sums over the segments before each, so that a run has the difference of two.
+    """
 
     chosen: frozenset[tuple[int, int]]  # number of each run and of the kinds of fixes that are wrong in it
     log_odds: float  # beside nothing being wrong
-    score: Array  # (M, C)
-    info: Array  # (M, C, M, C)
+    score: Array  # (M+1, C)
+    info: Array  # (M+1, C, M+1, C)
+
+    @classmethod
+    def none(cls, score: Array, info: Array) -> _Set:
+        """The empty set, of score (M, C) and info (M, C, M, C)."""
+        both = np.swapaxes(_sum_before(np.swapaxes(_sum_before(info), 0, 2)), 0, 2)
+        return cls(frozenset(), 0.0, _sum_before(score), np.ascontiguousarray(both))
 
 
 class _Runs:
@@ -78,8 +88,7 @@ class _Runs:
         for other, _ in one.chosen:
             free &= (self.behind <= self.first[other]) | (self.first >= self.behind[other])
         j = np.flatnonzero(free)
-        lo, hi, shift = self.first[j], self.behind[j], self.shift[j]
-        s, I = _sum_before(one.score, 0), _sum_before(_sum_before(one.info, 0), 2)
+        lo, hi, shift, s, I = self.first[j], self.behind[j], self.shift[j], one.score, one.info
         score = np.einsum("jab,ja->jb", shift, s[hi] - s[lo])
         some = I[hi, :, hi] - I[hi, :, lo] - I[lo, :, hi] + I[lo, :, lo]
         info = np.swapaxes(shift, 1, 2) @ some @ shift
@@ -93,12 +102,12 @@ class _Runs:
 
     def add(self, one: _Set, gain: float, j: int, kind: int) -> _Set:
         """A set with another run."""
-        own, C = slice(self.first[j], self.behind[j]), one.score.shape[1]
+        lo, hi, C = self.first[j], self.behind[j], one.score.shape[1]
         U = self.shift[j][:, self.kinds[kind]]
-        beside = np.sum(one.info[:, :, own], axis=2).reshape(-1, C) @ U
-        within = U.T @ np.sum(one.info[own, :, own], axis=(0, 2)) @ U
-        left = np.linalg.solve(np.eye(U.shape[1]) + within, beside.T)
-        score = one.score - (left.T @ (U.T @ np.sum(one.score[own], axis=0))).reshape(one.score.shape)
+        beside = (one.info[:, :, hi] - one.info[:, :, lo]).reshape(-1, C) @ U
+        own = beside.reshape(-1, C, U.shape[1])
+        left = np.linalg.solve(np.eye(U.shape[1]) + U.T @ (own[hi] - own[lo]), beside.T)
+        score = one.score - (left.T @ (U.T @ (one.score[hi] - one.score[lo]))).reshape(one.score.shape)
         info = one.info - (beside @ left).reshape(one.info.shape)
         return _Set(one.chosen | {(j, kind)}, one.log_odds + gain, score, info)
 
@@ -107,7 +116,8 @@ class _Runs:
         parts = []
         for j, kind in chosen:
             U = np.zeros((*none.score.shape, len(self.kinds[kind])))
-            U[self.first[j] : self.behind[j]] = self.shift[j][:, self.kinds[kind]]
+            U[self.behind[j]] = self.shift[j][:, self.kinds[kind]]
+            U[self.first[j]] = -U[self.behind[j]]
             parts.append(U.reshape(none.score.size, -1))
         U = np.concatenate(parts, axis=1)
         x = np.linalg.solve(np.eye(U.shape[1]) + U.T @ none.info.reshape(len(U), -1) @ U, U.T @ none.score.reshape(-1))
@@ -134,15 +144,15 @@ def find_wrong_segments(
     fixes = [rows for rows in problem.constraints if rows.name in names]
     begins, m = np.array(edges), len(fixes[0].axes)
     runs = _Runs(begins, [rows.unit for rows in fixes], m)
-    none = best = _Set(frozenset(), 0.0, *_respond(problem, refilter(problem, about, whole=False), fixes, begins))
+    none = best = _Set.none(*_respond(problem, refilter(problem, about, whole=False), fixes, begins))
     beam = [best]
     while beam:
-        more: dict[frozenset[tuple[int, int]], _Set] = {}
+        more: dict[frozenset[tuple[int, int]], tuple[float, _Set, tuple[float, int, int]]] = {}
         for one in beam:
-            for gain, j, kind in runs.list_better(one):
-                if (chosen := one.chosen | {(j, kind)}) not in more:
-                    more[chosen] = runs.add(one, gain, j, kind)
-        beam = sorted(more.values(), key=lambda one: -one.log_odds)[:_BEAM]
+            for added in runs.list_better(one):
+                more.setdefault(one.chosen | {added[1:]}, (one.log_odds + added[0], one, added))
+        likeliest = sorted(more.values(), key=lambda some: -some[0])[:_BEAM]
+        beam = [runs.add(one, *added) for _, one, added in likeliest]
         best = max([best, *beam[:1]], key=lambda one: one.log_odds)
     if not best.chosen:
         return []
@@ -161,10 +171,11 @@ def find_wrong_segments(
     return out
 
 
-def _sum_before(x: Array, axis: int) -> Array:
-    """Sums of what is before each place of an axis, and of all."""
-    total = np.cumsum(x, axis)
-    return np.concatenate([np.zeros_like(np.take(total, [0], axis)), total], axis)
+def _sum_before(x: Array) -> Array:
+    """Sums of what is before each place of the first axis, and of all."""
+    out = np.zeros((len(x) + 1, *x.shape[1:]))
+    np.cumsum(x, axis=0, out=out[1:])
+    return out
 
 
 def _respond(problem: Problem, forward: ForwardRecord, fixes: list[Constraint], begins: Array) -> tuple[Array, Array]:
@@ -187,6 +198,7 @@ def _respond(problem: Problem, forward: ForwardRecord, fixes: list[Constraint], 
     every = C * len(begins)
     X, score, info = np.zeros((D, 0)), np.zeros(every), np.zeros((every, every))
     blocks, met = updates.blocks, np.maximum(column.max(axis=1) // C + 1, 0) * C
+    whitened, count = np.zeros((_TOGETHER + numbers, every)), 0
     for k in range(n):
         if X.shape[1]:
             step(forward.F[k - 1], forward.decay[k - 1], X)
@@ -203,5 +215,10 @@ def _respond(problem: Problem, forward: ForwardRecord, fixes: list[Constraint], 
             G[some, column[at][some] + m] = minutes[at][some]
             respond(updates.H[at], updates.Kt[at], X, G)
             score[:known] += G.T @ updates.w[at]
-            info[:known, :known] += G.T @ (updates.inverse[*at, at[1]] @ G)
+            whitened[count : count + len(G), :known] = np.linalg.cholesky(updates.inverse[*at, at[1]]).T @ G
+            count += len(G)
+            if count >= _TOGETHER:
+                info[:known, :known] += whitened[:count, :known].T @ whitened[:count, :known]
+                count = 0
+    info += whitened[:count].T @ whitened[:count]
     return score.reshape(-1, C), info.reshape(len(begins), C, -1, C)
