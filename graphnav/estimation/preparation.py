@@ -79,7 +79,6 @@ class Prepared:
     arcs: dict[str, CarrierArcs] = field(default_factory=dict)  # `Solution.arcs`, the same way
     log_evidence: float = np.inf  # of all measurements by the estimated noise model, where that is wanted
     ahead: Points | None = None  # a step of Gauss and Newton behind `smoothed`, where it is known
-
     copies: tuple[ExcludedSpan, ...] = ()  # fixes that are no part of the problem
 
     @property
