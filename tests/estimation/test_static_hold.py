@@ -67,7 +67,7 @@ def test_repeats_that_digits_explain_are_no_copies(drive: Recording) -> None:
     used = held(drive)
     gnss = used.gnss
     assert gnss is not None
-    coarse = replace(gnss, rounding=(0.3, 0.3, 0.0), sd=np.full_like(gnss.sd, 0.1))
+    coarse = replace(gnss, rounding=(0.3, 0.3, 0.3), sd=np.full_like(gnss.sd, 0.1))
     assert mark_copies(gnss).any()
     assert not list_copies(drive)
     assert not mark_copies(coarse).any()

@@ -62,9 +62,9 @@ def mark_copies(gnss: Gnss) -> Array:
     copied = np.zeros(len(gnss.t), dtype=bool)
     if len(gnss.t) < 2:
         return copied
-    step = np.sqrt(12.0) * np.array(gnss.rounding[:2])
-    alike = np.log(np.clip(step / (2.0 * np.sqrt(np.pi) * gnss.sd[1:, :2]), 1e-300, 1.0)).sum(axis=1)
-    same = (gnss.llh[1:, :2] == gnss.llh[:-1, :2]).all(axis=1)
+    step = np.sqrt(12.0) * np.array(gnss.rounding)
+    alike = np.log(np.clip(step / (2.0 * np.sqrt(np.pi) * gnss.sd[1:]), 1e-300, 1.0)).sum(axis=1)
+    same = (gnss.llh[1:] == gnss.llh[:-1]).all(axis=1)
     for a, b in find_runs(np.concatenate([[False], same])):
         copied[a:b] = alike[a - 1 : b - 1].sum() < np.log(CHANCE)
     return copied
