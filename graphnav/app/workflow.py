@@ -9,22 +9,20 @@ import re
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, is_dataclass, replace
-from functools import partial
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from graphnav.app.checking import begin_checks, load_solvers
 from graphnav.app.scores import Withheld, score
 from graphnav.config import Settings
 from graphnav.constraints.antenna_motion import LEVER_ARM
 from graphnav.constraints.base import SAME_TIME
-from graphnav.core.beside import begin_beside
 from graphnav.core.complaints import suggest_nearest
 from graphnav.core.errors import ConfigError, EstimationError, RecordingError
 from graphnav.core.findings import Finding
-from graphnav.core.memory import pause_collector
 from graphnav.core.notes import Note, format_count, get_key
 from graphnav.core.progress import Progress, send_progress, tell
 from graphnav.estimation.noise.model import INTERVALS, NoiseModel, StampOffsets
@@ -35,7 +33,6 @@ from graphnav.recording.exporters import check_names
 
 if TYPE_CHECKING:
     from graphnav.evaluation.metrics import Metrics
-    from graphnav.recording.plausibility.screening import Screened
 
 
 LOOSE = "-loose"  # suffix of the name of a solution from fixes in place of raw observations
@@ -206,8 +203,8 @@ def _solve_request(request: Request, progress: Progress | None) -> Outcome:
     zero = recording.start - whole.start if recording is not whole else 0.0
     moved = _shift_spans(request.withheld, zero)
     with _measure_time(timings, "checks"):
-        checking = begin_beside(partial(_check, recording), _list_parts(recording))
-    _load_solvers(request.solvers)  # which takes as long as the checks
+        checking = begin_checks(recording)
+    load_solvers(request.solvers)  # which takes as long as the checks
     with _measure_time(timings, "checks"):
         screened, found = checking.get_result()
         refuse(screened.recording, found)
@@ -269,30 +266,6 @@ def _solve_request(request: Request, progress: Progress | None) -> Outcome:
         request, recording, zero, solutions, metrics, against, names, tuple(dict.fromkeys(findings)),
         tuple(f.sentence for f in checks if f.severity != "note"), timings | seconds, checks, densities,
     )  # fmt: skip
-
-
-def _check(recording: Recording) -> tuple[Screened, tuple[Finding, ...]]:
-    from graphnav.recording.checks.overview import inspect
-    from graphnav.recording.plausibility.screening import screen
-
-    screened = screen(recording)
-    return screened, inspect(recording, screened).findings
-
-
-def _list_parts(recording: Recording) -> list[object]:
-    """Sensors and their arrays, of which most are sound and stay as they are."""
-    sensors = [one for one in vars(recording).values() if is_dataclass(one)]
-    return [*sensors, *(value for one in sensors for value in vars(one).values() if isinstance(value, np.ndarray))]
-
-
-def _load_solvers(solvers: Sequence[str]) -> None:
-    with pause_collector():
-        import graphnav.estimation.pipeline
-        from graphnav.estimation.solvers.recursion import load_compiled
-
-        if "batch" in solvers:
-            import graphnav.estimation.factor_graph.batch  # noqa: F401
-        load_compiled()
 
 
 def _mitigate(findings: tuple[Finding, ...], solutions: Mapping[str, Solution]) -> tuple[Finding, ...]:

@@ -32,7 +32,7 @@ from graphnav.estimation.fixing import fix, split_carriers
 from graphnav.estimation.joint_estimate import JointEstimate, estimate_jointly, revise_jointly
 from graphnav.estimation.noise.apply import apply_noise, drop_parts
 from graphnav.estimation.noise.bias_walks import estimate_bias_walks
-from graphnav.estimation.noise.copies import drop_copies, list_copies
+from graphnav.estimation.noise.copies import drop_copies
 from graphnav.estimation.noise.estimate import NoiseEstimate, estimate_noise
 from graphnav.estimation.noise.initial_points import BREAKDOWN
 from graphnav.estimation.noise.model import STATED, NoiseModel
@@ -111,8 +111,7 @@ def prepare(
     """
     clock, passes = Clock(), Counter[str]()
     as_stated = settings.noise.mode == "stated" if noise is None else noise == STATED
-    copies = () if as_stated else list_copies(recording)
-    recording = recording if as_stated else drop_copies(recording)
+    recording, copies = (recording, ()) if as_stated else drop_copies(recording)
     spacing = settings.noise.spacing if noise is None else noise.spacing
     averaging = begin_beside(partial(average_speed, recording, settings))
     every = ProblemBuilder(recording, recording, settings, frame, clock, averaging)

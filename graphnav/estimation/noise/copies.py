@@ -21,23 +21,19 @@ from graphnav.estimation.solution import ExcludedSpan
 from graphnav.recording import Gnss, Recording
 
 
-def drop_copies(recording: Recording) -> Recording:
-    """A recording without fixes that are copies of one within the IMU's time."""
-    gnss = recording.gnss
-    if gnss is None or not (copied := _mark_within(recording, gnss)).any():
-        return recording
-    return replace(recording, gnss=pick_fixes(gnss, ~copied))
-
-
-def list_copies(recording: Recording) -> tuple[ExcludedSpan, ...]:
-    """Spans of fixes that are copies of one within the IMU's time."""
+def drop_copies(recording: Recording) -> tuple[Recording, tuple[ExcludedSpan, ...]]:
+    """A recording without fixes that are copies of one within the IMU's time, and the spans of these."""
     gnss = recording.gnss
     if gnss is None:
-        return ()
-    return tuple(
+        return recording, ()
+    within = (gnss.t >= recording.start) & (gnss.t <= recording.end)
+    copied = np.zeros(len(gnss.t), dtype=bool)
+    copied[within] = mark_copies(pick_fixes(gnss, within))
+    spans = tuple(
         ExcludedSpan(GnssPosition.name, float(gnss.t[a]), float(gnss.t[b - 1]), b - a, "copies of the fix before")
-        for a, b in find_runs(_mark_within(recording, gnss))
+        for a, b in find_runs(copied)
     )
+    return (replace(recording, gnss=pick_fixes(gnss, ~copied)) if spans else recording), spans
 
 
 def describe_copies(copies: tuple[ExcludedSpan, ...], recording: Recording) -> tuple[str, ...]:
@@ -67,11 +63,4 @@ def mark_copies(gnss: Gnss) -> Array:
     same = (gnss.llh[1:] == gnss.llh[:-1]).all(axis=1)
     for a, b in find_runs(np.concatenate([[False], same])):
         copied[a:b] = alike[a - 1 : b - 1].sum() < np.log(CHANCE)
-    return copied
-
-
-def _mark_within(recording: Recording, gnss: Gnss) -> Array:
-    within = (gnss.t >= recording.start) & (gnss.t <= recording.end)
-    copied = np.zeros(len(gnss.t), dtype=bool)
-    copied[within] = mark_copies(pick_fixes(gnss, within))
     return copied
