@@ -15,8 +15,7 @@ import numpy as np
 
 from graphnav.core.compiled import compile_once
 from graphnav.core.rotation import Array
-from graphnav.core.state import DIM
-from graphnav.estimation.solvers.recursion import Arrays
+from graphnav.estimation.solvers.recursion import Arrays, move_columns
 
 
 def count_remembered(L: int, c: int) -> int:
@@ -79,15 +78,6 @@ def add_row(memory: Array, rho: Array, Gamma: Array, L: int, c: int, errors: Arr
             for h in range(i + 1, c):
                 b[i] -= root[h, i] * b[h]
             b[i] /= root[i, i]
-
-
-@compile_once
-def step(F: Array, decay: Array, X: Array) -> None:
-    """X (D, n) <- F X: what errors have done to the estimate, a step on."""
-    top = np.dot(F, X[: F.shape[1]])
-    for i in range(len(decay)):
-        np.multiply(X[DIM + i], decay[i], X[DIM + i])
-    np.positive(top, X[:DIM])
 
 
 @compile_once
@@ -169,7 +159,7 @@ def follow_filter(
             if met[k]:
                 remember(k, state, before, keys, ends)
             if k:
-                step(F[k - 1], decay[k - 1], X)
+                np.positive(move_columns(F[k - 1], decay[k - 1], X), X)
         for b in range(max(first[k], b0), first[k + 1]):
             if not taken[b]:
                 continue

@@ -26,12 +26,13 @@ import numpy as np
 
 from graphnav.constraints.base import Constraint
 from graphnav.core.rotation import Array
-from graphnav.estimation.faults.likelihood_ratio import respond, step
+from graphnav.estimation.faults.likelihood_ratio import respond
 from graphnav.estimation.faults.watch import FAULT_COST, MINUTE, SIZES, is_large
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.ekf import refilter
 from graphnav.estimation.solvers.linearise import Points
 from graphnav.estimation.solvers.passes import ForwardRecord
+from graphnav.estimation.solvers.recursion import move_columns
 
 _TOGETHER = 128  # rows whose squares are summed at once
 _BEAM = 8  # sets of segments that are followed: the likeliest single one need not be among the likeliest two
@@ -201,7 +202,7 @@ def _respond(problem: Problem, forward: ForwardRecord, fixes: list[Constraint], 
     whitened, count = np.zeros((_TOGETHER + numbers, every)), 0
     for k in range(n):
         if X.shape[1]:
-            step(forward.F[k - 1], forward.decay[k - 1], X)
+            X = move_columns(forward.F[k - 1], forward.decay[k - 1], X)
         if met[k] > X.shape[1]:  # columns of segments that have not begun are zero still
             X = np.pad(X, ((0, 0), (0, met[k] - X.shape[1])))
         known = X.shape[1]
