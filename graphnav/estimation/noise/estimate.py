@@ -13,7 +13,10 @@ once, so none is favoured by the order. The influence of few rows is bounded: a 
 it exceeds once in a thousand times (`CHANCE`), and an outlying row, or a wheel error that lasts for seconds, gets the
 weight at which it would be that large.
 
-The first passes use the first `_FIRST_KEYFRAMES` keyframes only, the last ones all.
+Scales are robust first and then efficient (the MM-estimates of Yohai 1987): while they may be far off, a square counts
+for no more than the value it exceeds once in twenty times (`_BOUNDED`), by which nearly two rows in five may be wrong.
+From there they go on with the bound of the weights, `CHANCE`: of the same likelihood that is the evidence. The first
+passes of a long drive use its first `_FIRST_KEYFRAMES` keyframes only.
 """
 
 from __future__ import annotations
@@ -47,12 +50,11 @@ from graphnav.estimation.solvers.passes import DisturbancePass, ForwardRecord, r
 from graphnav.estimation.solvers.rts import smooth_moments
 from graphnav.imu.preintegration import NOISE_FIGURES
 
-# probability of a square of an aiding sensor beyond its bound; up to nearly two rows in five may be wrong
-_BOUNDED = 0.05
+_BOUNDED = 0.05  # probability of a square of an aiding sensor beyond its bound, at first
 _FIRST_KEYFRAMES = 1500  # keyframes: a variance estimated from a thousand numbers is good to a twentieth
 _ROUNDS, _AGAIN = 8, 3  # passes to convergence, from the priors and from figures that were estimated before
 _MAX_PASSES = 3 * _ROUNDS  # passes at most
-_EXTRAPOLATION = 2.0  # longest step, in steps as computed (Aitken's extrapolation)
+_EXTRAPOLATION = 8.0  # longest step, in steps as computed (Aitken's extrapolation)
 _TIME_RANGE = 30.0  # factor by which a correlation time may differ from its prior median either way
 _MANOEUVRE = 1.0, 10.0  # rad/s, m/s^2, of a vehicle: uncertainty of an interval whose samples are lost
 _TIME_GRID = np.linspace(-1.0, 1.0, 21)
@@ -210,11 +212,14 @@ def _iterate(
 ) -> NoiseEstimate:
     """Iterate from initial figures and linearisation points to convergence."""
     done, total, converged, totals = 0, len(problem.t), False, count_rows(problem)  # keyframes
-    ends = [total] if total <= 2 * _FIRST_KEYFRAMES or figures.known else [_FIRST_KEYFRAMES, total]
+    stages = [(total, CHANCE)]
+    if not figures.same_data:
+        long = total > 2 * _FIRST_KEYFRAMES and not figures.known
+        stages.insert(0, (_FIRST_KEYFRAMES if long else total, _BOUNDED))
     latest: tuple[ForwardRecord, DisturbancePass] | None = None
-    for end in ends:
+    for end, bound in stages:
         before, converged, figures.extrapolation = -np.inf, False, 1.0
-        rounds = _AGAIN if figures.same_data or end != ends[0] else _ROUNDS
+        rounds = _AGAIN if bound == CHANCE else _ROUNDS
         likeliest, most, highest, since = figures, -np.inf, -np.inf, 0
         for k in range(_MAX_PASSES):
             used, latest = apply_noise(problem, figures.build_model()), None  # releases the memory of the previous pass
@@ -226,7 +231,7 @@ def _iterate(
                 progress("noise", min((k + 1) / rounds, 1.0))
             if (evidence := now - compute_outlier_cost(figures.weights, totals)) > most:
                 likeliest, most = figures.copy(), evidence
-            _improve(figures, used, *latest, end, intervals)
+            _improve(figures, used, *latest, end, intervals, bound)
             about = _splice(about, latest[1])
             # each figure gains a half by chance; while one sensor is far off, many passes gain little more than that
             converged = k > 1 and abs(now - before) < (0.05 if k + 1 < rounds else 0.5) * len(figures.log)
@@ -301,9 +306,15 @@ def _bound_squares(A: Array, B: Array, freedom: int, chance: float) -> tuple[flo
 
 
 def _improve(
-    figures: _Components, problem: Problem, forward: ForwardRecord, smoothed: DisturbancePass, end: int, intervals: bool
+    figures: _Components,
+    problem: Problem,
+    forward: ForwardRecord,
+    smoothed: DisturbancePass,
+    end: int,
+    intervals: bool,
+    bound: float,
 ) -> None:
-    """One step for all figures and weights."""
+    """One step for all figures and weights; `bound` is the chance of a square of an aiding sensor beyond its bound."""
     imu = collect_imu_moments(problem, forward.predicted_from.R_nb, smoothed)
     for i, name in enumerate(NOISE_FIGURES):
         figures.update(f"imu.{name}", *_bound_squares(imu.A[:, i], imu.B[:, i], 3, CHANCE))
@@ -313,7 +324,7 @@ def _improve(
     for chain in problem.chains:
         if chain.parameter.noise_groups:
             driven[chain.parameter.name] = collect_process_moments(problem, chain, smoothed, end)
-            _improve_process(figures, chain, driven[chain.parameter.name])
+            _improve_process(figures, chain, driven[chain.parameter.name], bound)
             observed = _is_observed(figures, chain)
             if chain.parameter.correlation_time is not None and observed.any():
                 _improve_time(figures, chain, observed, lag_moments(problem, chain, smoothed, end))
@@ -326,7 +337,7 @@ def _improve(
         for i, name in enumerate(names):
             own = index[:n] == i
             if own.any():
-                figures.update(name, *_bound_squares(found.A[own], found.B[own], 1, _BOUNDED))
+                figures.update(name, *_bound_squares(found.A[own], found.B[own], 1, bound))
         _weigh_rows(figures, problem, rows, np.maximum(found.left_out, found.whole), n)
 
 
@@ -345,12 +356,14 @@ def _weigh_intervals(figures: _Components, problem: Problem, imu: ImuMoments) ->
         figures.weights[name] = RowWeights(t[some], 1.0 / more[some])
 
 
-def _improve_process(figures: _Components, chain: ParameterChain, moments: tuple[Array, Array, Array]) -> None:
+def _improve_process(
+    figures: _Components, chain: ParameterChain, moments: tuple[Array, Array, Array], bound: float
+) -> None:
     _, A, B = moments
     groups = np.array(chain.parameter.noise_groups)
     for group in dict.fromkeys(chain.parameter.noise_groups):
         own = groups == group
-        figures.update(group, *_bound_squares(A[:, own], B[:, own], 1, _BOUNDED))
+        figures.update(group, *_bound_squares(A[:, own], B[:, own], 1, bound))
 
 
 def _is_observed(figures: _Components, chain: ParameterChain) -> Array:

@@ -34,7 +34,7 @@ than figures gain by chance.
 
 Before or after. The tests run forward in time, so where fixes step from one place to another those behind the step are
 suspected, though those before it may be the wrong ones. So the fixes before each span that is left out, for as long,
-are suspected instead, the same way, and the likelier of both stands.
+are suspected instead, the same way, and the likeliest stands, of both and of the estimate with all measurements.
 
 Readmission. Once the spans are left out, measurements at their ends that agree with the rest are used again, if that
 increases the evidence. Of a span that outlasts the tests, the ends are found among the fixes near them as segments are:
@@ -113,7 +113,9 @@ def estimate_without_faults(
     decision = decide_faults(base, found)
     passes = found.passes + decision.passes
     if not decision.noise.excluded:
-        return replace(decision.estimate or found, passes=passes)
+        # estimated anew, the figures of the decision may lead to a worse optimum than before
+        best = max(found, decision.estimate or found, key=lambda one: one.log_evidence)
+        return replace(best, passes=passes)
     best = _estimate_without(base, opening, decision, found, progress)
     passes = passes + best.passes
     rival = None
@@ -122,15 +124,15 @@ def estimate_without_faults(
         if decision.rival.noise.excluded:
             rival = _estimate_without(base, opening, decision.rival, found, progress)
             passes = passes + rival.passes
-    before, other = _list_before(base, best.noise), None
+    candidates, before = [found, best], _list_before(base, best.noise)
     if before:
         with contextlib.suppress(*BREAKDOWN):  # from a filter that follows the wrong fixes
             other = _estimate_other(base, opening, found, best, before, progress)
-    if other is not None:
-        both = tuple(weigh_evidence(base, replace(one, passes=Counter())) for one in (best, other))
-        passes = sum((one.passes for one in both), passes + other.passes)
-        best = max(both, key=lambda one: log_evidence(base, one))
-    return replace(best, passes=passes, rival=rival)
+            candidates += [] if other is None else [other]
+            passes = passes + (Counter() if other is None else other.passes)
+    candidates = [weigh_evidence(base, replace(one, passes=Counter())) for one in candidates]
+    passes = sum((one.passes for one in candidates), passes)
+    return replace(max(candidates, key=lambda one: log_evidence(base, one)), passes=passes, rival=rival)
 
 
 def _estimate_other(
