@@ -11,6 +11,7 @@ import stranger
 from helpers import refuse_command
 
 from graphnav.app import cli
+from graphnav.core.timescales import unix_to_gps
 from graphnav.recording.draft import draft
 from graphnav.recording.draft.clocks import read_clock_seconds, read_serial_days
 from graphnav.recording.formats import read
@@ -157,6 +158,67 @@ def test_a_course_in_radians_is_told_by_the_positions(plain, tmp_path):
         for name, one in (("deg", np.degrees(course)), ("rad", course))
     ]  # fmt: skip
     assert found[1] == pytest.approx(found[0], abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("names", "scales", "more"),
+    [
+        ("lat,lon,alt,vel_n,vel_e,vel_d", (1e7, 1e7, 1e3, 1e2, 1e2, 1e2), ""),  # as MAVLink; its speeds are left alone
+        ("lat,lon,hMSL [mm],hacc_mm,vacc_mm,velN_mm_s,velE_mm_s,velD_mm_s", (1, 1, 1e3, *[1e3] * 5), "v"),
+        ("lat,lon,alt,NedVelX,NedVelY,NedVelZ", (1,) * 6, "v"),
+        ("lat,lon,alt,vx,heading", (1,) * 5, ""),  # of which axes is not said: no speed along the heading
+    ],
+    ids=["whole degrees", "millimetres", "axes in the name", "axes unknown"],
+)
+def test_units_and_axes_that_the_names_of_columns_state(plain, tmp_path, names, scales, more):
+    imu, (_, rows) = plain
+    t, *place = np.array(rows, dtype=float).T
+    moves = np.gradient(np.column_stack([place[0], place[1], place[2]]), t, axis=0)
+    north, east = np.radians(moves[:, 0]) * 6.371e6, np.radians(moves[:, 1]) * 6.371e6 * np.cos(np.radians(place[0]))
+    own = {"vn": north, "ve": east, "vd": -moves[:, 2], "sd": np.full(len(t), 0.03)}
+    columns = [*place, *(own[x] for x in (["sd"] * 2 if "acc" in names else []) + ["vn", "ve", "vd"])]
+    digits = 9 if scales[0] == 1 else 0
+    cells = [[x, *(f"{y * s:.{digits}f}" for y, s in zip(row, scales, strict=False))]
+             for (x, *_), row in zip(rows, zip(*columns, strict=True), strict=True)]  # fmt: skip
+    gnss = read_drafted(tmp_path, imu, (f"t,{names}", cells)).gnss
+    assert gnss.llh == pytest.approx(np.column_stack([*np.radians(place[:2]), place[2]]), abs=1e-3)
+    assert gnss.llh[:, :2] == pytest.approx(np.radians(place[:2]).T, abs=2e-9)
+    assert (gnss.v is not None) == (more == "v")
+    if more:
+        assert gnss.v == pytest.approx(np.column_stack([east, north, moves[:, 2]]), abs=1e-4)
+    if "acc" in names:
+        assert gnss.sd == pytest.approx(np.full((len(t), 3), 0.03))
+
+
+@pytest.mark.parametrize(
+    "header", ["GForceX,GForceY,GForceZ", "accelerometer_m_s2[0],accelerometer_m_s2[1],accelerometer_m_s2[2]"]
+)
+def test_more_names_of_an_imu_and_what_is_not_used_is_said(plain, tmp_path, capsys, header):
+    (_, rows), gnss = plain
+    stranger.write_tables(
+        tmp_path, (f"t,gyro[0],gyro[1],gyro[2],{header},q0,mag", [[*r, "1", "2"] for r in rows]), gnss
+    )
+    assert cli.run(["init", str(tmp_path), "-o", str(tmp_path), "--json"]) == 0
+    (unused,) = [line for line in json.loads(capsys.readouterr().out)["decisions"] if "q0" in line]
+    assert unused.startswith("[imu] imu.csv: ")
+    assert unused.endswith(" q0, mag")
+    assert len(read(tmp_path).imu.t) == len(rows)
+
+
+def test_stamps_since_the_gps_epoch_are_no_unix_time(plain, tmp_path):
+    """A receiver's beside an IMU's in Unix time: the clocks are known, and nothing need be found."""
+    (header, rows), (_, fixes) = plain
+    unix = float(rows[0][0])
+    zero = float(unix_to_gps(np.array([unix]))[0])
+    gps = [[f"{1e9 * (float(t) - unix + zero):.0f}", *place] for t, *place in fixes]
+    got = read_drafted(tmp_path / "fixes", (header, rows), ("TimeGps,lat,lon,h", gps))
+    assert got.gnss.t == pytest.approx(np.array([float(t) for t, *_ in fixes]), abs=1e-3)
+    both = read_drafted(
+        tmp_path / "both",
+        (header.replace("t,", "gps_time_ns,"), [[f"{1e9 * (float(t) - unix + zero):.0f}", *r] for t, *r in rows]),
+        ("TimeGps,lat,lon,h", gps),
+    )
+    assert both.gps_zero + both.imu.t[0] == pytest.approx(zero, abs=0.1)
 
 
 def test_stamps_that_are_one_number():

@@ -141,8 +141,11 @@ def _check_unread(paths: Sequence[Path], tables: Mapping[Path, str]) -> None:
 def _find_unix_start(source: Source) -> float | None:
     """Unix time of the first row of a log with a known date, s."""
     if source.log is None:
-        return float(source.t[0]) if guesses.is_date(source.t) else None
-    begin = next(sensor.t[0] for sensor in source.held)
+        begin = float(source.t[0])
+        if source.week is None:
+            return begin if guesses.is_date(source.t) else None
+    else:
+        begin = next(sensor.t[0] for sensor in source.held)
     return None if source.gps_zero is None else float(source.gps_zero + begin + GPS_TO_UNIX)
 
 
