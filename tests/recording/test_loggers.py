@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+from functools import reduce
+from operator import xor
 from pathlib import Path
 
 import numpy as np
@@ -203,6 +205,30 @@ def test_more_names_of_an_imu_and_what_is_not_used_is_said(plain, tmp_path, caps
     assert unused.startswith("[imu] imu.csv: ")
     assert unused.endswith(" q0, mag")
     assert len(read(tmp_path).imu.t) == len(rows)
+
+
+def test_the_speed_of_a_wheel_beside_fixes_is_an_odometer_and_makes_no_new_fixes(plain, tmp_path):
+    (header, rows), (_, fixes) = plain
+    t, at = np.array([float(r[0]) for r in rows]), np.array([float(r[0]) for r in fixes])
+    k = np.maximum(np.searchsorted(at, t + 1e-6) - 1, 0)
+    speed = 10.0 + np.sin(t)
+    one = [[*row, *fixes[j][1:], "90.0", f"{3.6 * x:.4f}"] for row, j, x in zip(rows, k, speed, strict=True)]
+    (tmp_path / "log.csv").write_text("\n".join(map(",".join, [[header, "lat,lon,h,heading,obd_speed_kmh"], *one])))
+    assert cli.run(["init", str(tmp_path), "-o", str(tmp_path), "--quiet"]) == 0
+    got = read(tmp_path)
+    assert got.gnss.v is None
+    assert len(got.gnss.t) == len(np.unique(k))
+    assert got.odometer.speed == pytest.approx(speed, abs=1e-3)
+
+
+def test_lines_of_an_imu_among_nmea_are_pointed_at(tmp_path, capsys):
+    body = "GPGGA,120000.00,4000.000,N,10500.000,W,4,12,0.8,1600.0,M,-20.0,M,1.0,0001"
+    sentence = f"${body}*{reduce(xor, body.encode()):02X}"
+    later = sentence.replace("120000.00", "120001.00")
+    later = f"{later[:-2]}{int(later[-2:], 16) ^ 1:02X}"
+    (tmp_path / "log.txt").write_text(f"{sentence}\nIMU,0,0,0,9.8,0,0,0\n{later}\nIMU,1,0,0,9.8,0,0,0\n")
+    said = refuse_command(capsys, "draft.no_imu", "init", tmp_path, "-o", tmp_path)
+    assert "log.txt, line 2: " in said
 
 
 def test_stamps_since_the_gps_epoch_are_no_unix_time(plain, tmp_path):

@@ -230,7 +230,8 @@ class _Writer:
         if source.log is None:
             if "h" not in values:
                 raise RecordingError(
-                    f"{source.path}: no column of heights beside {source.columns.names['lat']}; log them too",
+                    f"{source.path}: no column of heights beside {source.columns.names['lat']}: add a column h, "
+                    "in m; one height throughout, that of the place, is given a large sigma",
                     key="draft.no_heights",
                 )
             units = {"t": source.t_unit}

@@ -23,6 +23,7 @@ _UNCERTAIN = re.compile(
     r"(?:.*_)?(?:sd|std|stdev|sigma|var|variance|cov\w*|accuracy|[hvpgt]dop|err\w*|uncertainty|ep[hves])(?:_.*)?|.*_acc"
 )
 _OF_WEEK = r"(?:gps_?)?time_of_week|gps_?time|t(?:ime)?_gps|(?:gps_?)?[st]ow|i_?tow|gps_?sec(?:onds?)?|gnss_time"
+_OF_WHEELS = r"(?:.*_)?(?:wheel|odo|odometer|obd\d?|can)_?(?:speed|velocity)"
 _WHEEL, _SPEED = r"(?:wheel_?|speed_?|wheel_?speed_?)*", r"(?:_?wheel)?(?:_?speed)?"
 _PATTERNS: dict[str, tuple[str, ...]] = {
     "t": (
@@ -162,6 +163,15 @@ def match_columns(header: Sequence[str], stem: str = "") -> FileColumns:
             for x in "xyz":
                 names.pop(f"{kind}{x}", None)
     return FileColumns(names, units)
+
+
+def find_wheels(header: Sequence[str]) -> list[str]:
+    """The columns of wheels' speeds in a table of fixes, where they are not the receiver's."""
+    spelt = [(name, split_unit(name)[0]) for name in header]
+    if not all(any(re.fullmatch(p, plain) for _, plain in spelt for p in _PATTERNS[ours]) for ours in ("lat", "lon")):
+        return []
+    each = [*_PATTERNS["speed_fl"], *_PATTERNS["speed_fr"], *_PATTERNS["speed_rl"], *_PATTERNS["speed_rr"]]
+    return [name for name, plain in spelt if any(re.fullmatch(p, plain) for p in (_OF_WHEELS, *each))]
 
 
 def find_clocks(header: Sequence[str]) -> list[str]:

@@ -137,7 +137,8 @@ def read_log(path: Path, topics: Sequence[str] = ()) -> dict[str, Source]:
     except RecordingError as error:
         words = f"{path}: no table of a sensor is recognised in it" if error.key == "table.separator" else str(error)
         raise NoSensorError(words, key=error.key) from error
-    columns = matching.match_columns(header, path.name.split(".")[0])
+    wheels = matching.find_wheels(header)
+    columns = matching.match_columns([name for name in header if name not in wheels], path.name.split(".")[0])
     sensor = columns.sensor
     if sensor is None and "t" not in columns.names and matching.FileColumns({**columns.names, "t": ""}).sensor:
         raise _make_times_error(path, header, {} if plain is None else plain.words_in)
@@ -157,8 +158,15 @@ def read_log(path: Path, topics: Sequence[str] = ()) -> dict[str, Source]:
         roles.append("gnss")
     elif sensor == "imu" and "speed" in columns.names:
         roles.append("odometer")
-    found = {role: _read_sensor(path, columns, role, plain) for role in roles}
-    taken = {columns.names[ours] for source in found.values() for ours in source.values} | {columns.names.get("week")}
+    of = dict.fromkeys(roles, columns)
+    if wheels := [name for name in wheels if _read_numbers(path, name, plain)]:
+        own = matching.match_columns([columns.names["t"], *wheels])
+        clock = {"t": columns.units["t"]} if "t" in columns.units else {}
+        of["odometer"] = matching.FileColumns({**own.names, "t": columns.names["t"]}, {**own.units, **clock})
+    found = {role: _read_sensor(path, some, role, plain) for role, some in of.items()}
+    taken = {of[role].names.get(ours) for role, source in found.items() for ours in source.values} | {
+        columns.names.get("week")
+    }
     found[sensor].unused = tuple(name for name in header if name and name not in taken)
     for role, source in found.items():
         source.second = _find_second(header, columns, WANTED[role][1:3] if role == "gnss" else WANTED[role][1:])

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from graphnav.core.errors import RecordingError
+from graphnav.core.notes import get_key
 from graphnav.core.rotation import Array
 from graphnav.core.timescales import DAY, GPS_TO_UNIX
 from graphnav.recording.draft import columns as matching
@@ -90,6 +91,9 @@ def find_logs(paths: Sequence[Path], topics: Sequence[str] = ()) -> LogsFound:
         unread = f" ({refused[0]})" if refused else ""
         if others and not refused and not raw.observed:
             unread = f" ({others})"
+        logs = [source.log for some in every.values() for source in some if source.log is not None]
+        if skipped := [note for log in logs for note in log.remarks if get_key(note) == "log.broken_lines"]:
+            unread = f" ({skipped[0]}; lines of an IMU belong in a table of their own, with a header)"
         raise RecordingError(
             f"{paths[0]}: no IMU in these logs (found: {there}); three gyro and three force columns are one{unread}",
             key="draft.no_imu",
