@@ -291,10 +291,19 @@ def run(arguments: list[str]) -> int:
     except Exception as error:
         if hasattr(error, "format_message"):  # typer's own usage errors
             return fail(_describe_usage_error(error), BAD_INPUT, debug)
-        return fail(_describe_internal_error(error), INTERNAL, debug)
+        if not _is_of_interrupt(error):
+            return fail(_describe_internal_error(error), INTERNAL, debug)
+        code = INTERRUPTED
     if code == INTERRUPTED:
         return fail("interrupted", INTERRUPTED, False)
     return code if isinstance(code, int) else 0
+
+
+def _is_of_interrupt(error: BaseException | None) -> bool:
+    """Whether Ctrl-C led to an error, as where it ends the import of compiled code."""
+    while error is not None and not isinstance(error, KeyboardInterrupt):
+        error = error.__cause__ or error.__context__
+    return error is not None
 
 
 def _describe_usage_error(error: Any) -> str:
