@@ -221,6 +221,30 @@ def test_the_speed_of_a_wheel_beside_fixes_is_an_odometer_and_makes_no_new_fixes
     assert got.odometer.speed == pytest.approx(speed, abs=1e-3)
 
 
+@pytest.mark.parametrize("order", ["linear, total", "linear, gravity"])
+def test_forces_without_gravity_are_not_taken_where_the_table_has_it(plain, tmp_path, order):
+    (_, rows), gnss = plain
+    imu = np.array(rows, dtype=float)
+    force, pull = imu[:, 4:], np.tile(imu[:, 4:].mean(axis=0), (len(imu), 1))
+    header = "t,gx,gy,gz,lin_acc_x,lin_acc_y,lin_acc_z"
+    header += ",acc_x,acc_y,acc_z" if "total" in order else ",gravity_x,gravity_y,gravity_z"
+    both = np.column_stack([imu[:, :4], force - pull, force if "total" in order else pull])
+    got = read_drafted(tmp_path, (header, [[f"{x:.8f}" for x in row] for row in both]), gnss).imu
+    assert got.accel @ got.R_bs == pytest.approx(force, abs=1e-6)
+
+
+def test_one_table_has_one_clock(plain, tmp_path):
+    """At 100 Hz in ms: a fix in every row, 10 apart, might be one every ten seconds."""
+    (header, rows), (_, fixes) = plain
+    t, at = np.array([float(r[0]) for r in rows]), np.array([float(r[0]) for r in fixes])
+    k = np.maximum(np.searchsorted(at, t + 1e-6) - 1, 0)
+    one = [[f"{10 * i + 5000}", *row[1:], *fixes[j][1:]] for i, (row, j) in enumerate(zip(rows, k, strict=True))]
+    text = "\n".join(map(",".join, [[header.replace("t,", "time,"), "lat,lon,h"], *one]))
+    (tmp_path / "log.csv").write_text(text + "\n")
+    found = draft([tmp_path / "log.csv"], tmp_path)
+    assert found.text.count('t = "ms"') == 2
+
+
 def test_lines_of_an_imu_among_nmea_are_pointed_at(tmp_path, capsys):
     body = "GPGGA,120000.00,4000.000,N,10500.000,W,4,12,0.8,1600.0,M,-20.0,M,1.0,0001"
     sentence = f"${body}*{reduce(xor, body.encode()):02X}"

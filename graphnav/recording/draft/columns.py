@@ -174,6 +174,13 @@ def find_wheels(header: Sequence[str]) -> list[str]:
     return [name for name, plain in spelt if any(re.fullmatch(p, plain) for p in (_OF_WHEELS, *each))]
 
 
+def find_gravity(header: Sequence[str]) -> list[str]:
+    """The three columns of a phone's own estimate of gravity, or none."""
+    spelt = [(name, split_unit(name)[0]) for name in header]
+    found = [next((n for n, plain in spelt if re.fullmatch(rf"(?:.*_)?grav(?:ity)?_?{x}", plain)), "") for x in "xyz"]
+    return found if all(found) else []
+
+
 def find_clocks(header: Sequence[str]) -> list[str]:
     """The columns that may be times, the likeliest first."""
     spelt = [(name, split_unit(name)[0]) for name in header]

@@ -163,14 +163,65 @@ def read_log(path: Path, topics: Sequence[str] = ()) -> dict[str, Source]:
         own = matching.match_columns([columns.names["t"], *wheels])
         clock = {"t": columns.units["t"]} if "t" in columns.units else {}
         of["odometer"] = matching.FileColumns({**own.names, "t": columns.names["t"]}, {**own.units, **clock})
-    found = {role: _read_sensor(path, some, role, plain) for role, some in of.items()}
-    taken = {of[role].names.get(ours) for role, source in found.items() for ours in source.values} | {
-        columns.names.get("week")
-    }
+    found: dict[str, Source] = {}
+    for role, some in of.items():  # whose clock is that of the first, whose rows are the most
+        found[role] = _read_sensor(path, some, role, plain, found[sensor].t_unit if found else None)
+    if sensor == "imu" and not has_gravity(found["imu"]):
+        found["imu"], of["imu"] = _find_gravity(path, header, columns, plain, found["imu"])
+    taken = {
+        theirs
+        for role, source in found.items()
+        for ours, theirs in of[role].names.items()
+        if ours in source.values or ours in "xyz"
+    } | {columns.names.get("week")}
     found[sensor].unused = tuple(name for name in header if name and name not in taken)
     for role, source in found.items():
         source.second = _find_second(header, columns, WANTED[role][1:3] if role == "gnss" else WANTED[role][1:])
     return found
+
+
+def has_gravity(source: Source) -> bool:
+    """Whether the forces of a log are those of a raw accelerometer, in some unit."""
+    try:
+        guesses.guess_accel_unit(source.path, source.stack("ax", "ay", "az"), source.find_unit("ax", "accel"))
+    except RecordingError:
+        return False
+    return True
+
+
+def _find_gravity(
+    path: Path, header: list[str], columns: matching.FileColumns, plain: Plain | None, bare: Source
+) -> tuple[Source, matching.FileColumns]:
+    """An IMU whose forces are without gravity: with the table's other forces, or plus its columns of gravity."""
+    axes = ("ax", "ay", "az")
+    rest = [name for name in header if name not in [columns.names[ours] for ours in axes]]
+    other = matching.match_columns(rest)
+    if set(axes) <= other.names.keys():
+        both = matching.FileColumns(
+            {**columns.names, **{ours: other.names[ours] for ours in axes}},
+            {
+                ours: unit
+                for ours, unit in (columns.units | other.units).items()
+                if ours not in axes or ours in other.units
+            },
+        )
+        source = _read_sensor(path, both, "imu", plain)
+        if has_gravity(source):
+            return source, both
+    pull = matching.find_gravity(rest)
+    if len(pull) == len(axes):
+        sources = [
+            _read_sensor(path, matching.FileColumns({**columns.names, ours: theirs}, columns.units), "imu", plain)
+            for ours, theirs in zip(axes, pull, strict=True)
+        ]
+        values = {ours: bare.values[ours] + one.values[ours] for ours, one in zip(axes, sources, strict=True)}
+        names = {**bare.columns.names, **{ours: ours for ours in axes}}
+        words = f"forces are the sum of '{columns.names['ax']}' and '{pull[0]}', and so on"
+        plain = replace(bare.plain, words=f"{bare.plain.words}, {words}") if bare.plain else Plain({}, words)
+        whole = replace(bare, columns=replace(bare.columns, names=names), values={**bare.values, **values}, plain=plain)
+        if has_gravity(whole):
+            return whole, matching.FileColumns({**columns.names, **dict(zip("xyz", pull, strict=True))}, columns.units)
+    return bare, columns
 
 
 def _convert_small_units(
@@ -278,8 +329,10 @@ def _read_numbers(path: Path, name: str, plain: Plain | None) -> bool:
         return False
 
 
-def _read_sensor(path: Path, columns: matching.FileColumns, role: str, plain: Plain | None) -> Source:
-    """The columns of one sensor: rows complete in what it needs, in order of time."""
+def _read_sensor(
+    path: Path, columns: matching.FileColumns, role: str, plain: Plain | None, clock: Guess | None = None
+) -> Source:
+    """The columns of one sensor: rows complete in what it needs, in order of time; `clock` is their unit, if known."""
     wanted = WANTED[role]
     names = {ours: theirs for ours, theirs in columns.names.items() if ours in wanted}
     if role in ("imu", "gnss") and "week" in columns.names:
@@ -320,7 +373,7 @@ def _read_sensor(path: Path, columns: matching.FileColumns, role: str, plain: Pl
         words = f"days of '{names['t']}', as a spreadsheet counts them, as Unix time in s; CHECK: taken as UTC"
         values["t"], plain = seconds, Plain({}, words)
     inertial = role not in ("gnss", "odometer", "barometer")
-    unit = guesses.guess_time_unit(values["t"], matching.find_stated_unit(columns, "t", "t"), inertial)
+    unit = clock or guesses.guess_time_unit(values["t"], matching.find_stated_unit(columns, "t", "t"), inertial)
     if (later := find_restarts(values["t"], TIME_UNITS[str(unit.value)])) is not None:  # as it will be read
         values["t"] = values["t"] + later
     order = np.argsort(values["t"], kind="stable")

@@ -16,7 +16,7 @@ from graphnav.core.timescales import DAY, GPS_TO_UNIX
 from graphnav.recording.draft import columns as matching
 from graphnav.recording.draft import guesses, motion
 from graphnav.recording.draft.guesses import Guess
-from graphnav.recording.draft.logs import WANTED, NoSensorError, Source, read_log
+from graphnav.recording.draft.logs import WANTED, NoSensorError, Source, has_gravity, read_log
 from graphnav.recording.draft.parts import join_parts
 from graphnav.recording.draft.raw import RawFiles, separate_raw, tell_kind
 from graphnav.recording.formats import list_formats
@@ -192,7 +192,7 @@ def _is_known(path: Path) -> bool:
 def _choose_source(sensor: str, some: list[Source], left: list[str]) -> Source | None:
     """The log to use of several of one sensor; the others are noted with the reason."""
     if sensor == "accel":
-        with_gravity = [s for s in some if _has_gravity(s)]
+        with_gravity = [s for s in some if has_gravity(s)]
         if len(with_gravity) < len(some) and with_gravity:
             names = ", ".join(s.path.name for s in some if s not in with_gravity)
             left.append(f"left out: {names}: accelerations without gravity")
@@ -214,14 +214,6 @@ def _choose_source(sensor: str, some: list[Source], left: list[str]) -> Source |
     if others:
         left.append(f"left out: {', '.join(others)}: a second {sensor}, beside {best.path.name}")
     return best
-
-
-def _has_gravity(source: Source) -> bool:
-    try:
-        guesses.guess_accel_unit(source.path, source.stack("ax", "ay", "az"), source.find_unit("ax", "accel"))
-    except RecordingError:
-        return False
-    return True
 
 
 def _add_gravity(accel: Source, gravity: Source, left: list[str]) -> Source:
