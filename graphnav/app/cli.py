@@ -273,6 +273,9 @@ def run(arguments: list[str]) -> int:
         import warnings
 
         warnings.simplefilter("ignore")
+    if empty := [k for k, word in enumerate(arguments) if not word or (word[:2] == "--" and word[-1] == "=")]:
+        before = " ".join(arguments[: empty[0] + 1]).strip()
+        return fail(f"{before}: an empty word follows; a variable of the shell that is not set?", BAD_INPUT, debug)
     try:
         code = build_program()(arguments, prog_name="graphnav", standalone_mode=False, obj=tuple(arguments))
     except GraphnavError as error:

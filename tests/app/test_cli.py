@@ -434,6 +434,8 @@ BAD = {
     "unknown noise": (["smooth", "kitti", "-o", "o", "--noise", "statd"], "file.missing", "--noise statd"),
     "unknown key": (["smooth", "kitti", "-o", "o", "--config", "bad.toml"], "key.unknown", "'rate'"),
     "two logs": (["info", "a.csv", "b.csv"], "recording.several", "graphnav init a.csv b.csv"),
+    "empty": (["smooth", "kitti", "-o", ""], "", "smooth kitti -o: "),
+    "empty, with =": (["smooth", "kitti", "--out="], "", "smooth kitti --out=: "),
     "no sensor": (["smooth", "kitti", "-o", "o", "--without", "400-460"], "option.withheld", "gnss:400-460"),
     "two formats": (
         ["convert", "file", "-o", "o", "--format", "nav", "--export", "gpx"],
