@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import gzip
 import json
+from datetime import UTC, datetime
 from functools import reduce
 from operator import xor
 from pathlib import Path
@@ -219,6 +221,17 @@ def test_the_speed_of_a_wheel_beside_fixes_is_an_odometer_and_makes_no_new_fixes
     assert got.gnss.v is None
     assert len(got.gnss.t) == len(np.unique(k))
     assert got.odometer.speed == pytest.approx(speed, abs=1e-3)
+
+
+@pytest.mark.parametrize("name", ["imu.csv.gz", "imu.txt.gz"])
+def test_a_packed_table_may_have_dates(plain, tmp_path, name):
+    (header, rows), gnss = plain
+    dated = [[datetime.fromtimestamp(float(t), UTC).isoformat(), *rest] for t, *rest in rows]
+    stranger.write_tables(tmp_path, (header, dated), gnss)
+    (tmp_path / name).write_bytes(gzip.compress((tmp_path / "imu.csv").read_bytes()))
+    (tmp_path / "imu.csv").unlink()
+    assert cli.run(["init", str(tmp_path), "-o", str(tmp_path), "--quiet"]) == 0
+    assert read(tmp_path).imu.t == pytest.approx(np.array([float(t) for t, *_ in rows]), abs=1e-5)
 
 
 @pytest.mark.parametrize("order", ["linear, total", "linear, gravity"])

@@ -25,7 +25,7 @@ from graphnav.sensors.tables import ANGLE
 
 JOINED = "joined_imu.csv.gz"  # the file combined from a gyro's and an accelerometer's; no log has this name
 
-_TEXT_ENDINGS = (".csv", ".csv.gz", ".txt", ".tsv", ".dat", ".asc", ".log")  # files of a folder that are considered
+_TEXT_ENDINGS = (".csv", ".txt", ".tsv", ".dat", ".asc", ".log")  # of files of a folder that are considered
 
 _TRACKS = (".gpx", ".kml", ".kmz", ".fit", ".tcx", ".geojson")
 _POSITIONS = re.compile(r"(?:^|[^a-z])(?:gnss|gps|rtk|location|position|track|fix)(?:$|[^a-rt-z])", re.IGNORECASE)
@@ -161,7 +161,11 @@ def _list_logs(path: Path) -> list[Path]:
     made = {JOINED, "recording.toml"}  # written by an earlier draft
     made |= {name_plain_file(p, sensor) for p in every for sensor in WANTED}
     inside = sorted(p for p in every if p.name not in made)
-    logs = [p for p in inside if p.name.lower().endswith(_TEXT_ENDINGS) or _is_known(p) or tell_kind(p)[0]]
+    logs = [
+        p
+        for p in inside
+        if p.name.lower().removesuffix(".gz").endswith(_TEXT_ENDINGS) or _is_known(p) or tell_kind(p)[0]
+    ]
     if not logs:
         there = f" ({others})" if (others := _name_others([path], [])) else ""
         raise RecordingError(
