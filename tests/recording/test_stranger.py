@@ -158,6 +158,16 @@ def test_a_phone_whose_forces_point_down_is_refused_until_its_unit_says_so(tokyo
     assert rms(errors(drive, tmp_path / "out")) < 1.0
 
 
+def test_a_motorbike_with_such_a_phone_gets_the_axes_that_are_right(shared_data):
+    """A real one, that leans: nothing tells whether fixes or forces are mirrored, so both are named."""
+    recording = read(shared_data / "motorbike_dresden_20160809")
+    turned = np.diag([1.0, -1.0, -1.0])  # as drafted from forces that point down
+    imu = replace(recording.imu, gyro=recording.imu.gyro @ turned, accel=-recording.imu.accel @ turned,
+                  R_bs=turned @ recording.imu.R_bs)  # fmt: skip
+    (found,) = [f for f in inspect(replace(recording, imu=imu)).findings if f.key == "imu.gyro_sign"]
+    assert re.search(r'axes = "([A-Z]{3})"', found.sentence)[1] == "LBU"
+
+
 def test_the_tables_of_a_spreadsheet(tokyo, tmp_path):
     """No edit: semicolons, decimal commas, German names, degrees, g, km/h, and dates, of which init makes CSV files."""
     drive = tokyo[1]

@@ -104,6 +104,13 @@ def turns_against(yaw: Fit | None) -> bool:
     return yaw.correlation > 0.8 or (alike and tilt.SIGMAS * yaw.relative_sigma < 1.0)
 
 
+def describe_reversed(imu: Imu) -> str:
+    """That the accelerometer may be reversed, as those of some phones, and what to set then."""
+    letters = write_letters(imu.R_bs, np.array([0.0, -1.0, 0.0]), np.array([0.0, 0.0, -1.0]))
+    axes = f'axes = "{letters}"' if letters else "forward and up negated"
+    return f"the accelerometer is reversed, as some phones': set {schema.REVERSED} in [imu], and {axes}"
+
+
 def check_gyro_sign(imu: Imu, track: Track) -> Iterator[Finding]:
     """The gyro about the mean force turns opposite to the course: no choice of axes explains that.
 
@@ -117,9 +124,8 @@ def check_gyro_sign(imu: Imu, track: Track) -> Iterator[Finding]:
         yield Finding("warning", f"{what}; {mend}", "imu.force_sign")
     elif not tilt.measure_sideways(imu, track):
         what = "the gyro turns against the GNSS course: its sign is reversed, or latitudes or longitudes have the wrong"
-        yield Finding(
-            "warning", f"{what} sign (south and west are negative); negate it, or them, in the file", "imu.gyro_sign"
-        )
+        mend = f"negate it, or them, in the file; or {describe_reversed(imu)}"
+        yield Finding("warning", f"{what} sign (south and west are negative); {mend}", "imu.gyro_sign")
     else:
         what = "the gyro's sign is reversed: it turns against the GNSS course while gravity points as stated"
         yield Finding("warning", f"{what}; negate it in the file", "imu.gyro_sign")

@@ -12,12 +12,12 @@ from graphnav.core.findings import Finding, compute_period
 from graphnav.core.rotation import Array
 from graphnav.recording import Gnss, Imu, Recording
 from graphnav.recording.checks import crosschecks, tilt, tracks
-from graphnav.recording.checks.axes import write_letters
+from graphnav.recording.checks.axes import describe_reversed
 from graphnav.recording.checks.clock import CLEAR, FAIR
 from graphnav.recording.checks.crosschecks import Fit
 from graphnav.recording.checks.stated import describe_exchange, describe_mirroring, exchange_lat_lon
 from graphnav.recording.checks.tracks import Track, compute_local_positions
-from graphnav.recording.formats.schema import FOOT, REVERSED
+from graphnav.recording.formats.schema import FOOT
 
 _SLOPE_SPAN, _SLOPES = 8.0, 6  # s over which a slope is taken: the force is then known to a tenth of a per cent
 _TURNING_RADIUS = 5.0  # m, of the smallest cars
@@ -53,10 +53,8 @@ def check_mirroring(recording: Recording, track: Track, turns_back: bool) -> Ite
                 "raw_gnss.clock",
             )
         else:
-            letters = write_letters(recording.imu.R_bs, np.array([0.0, -1.0, 0.0]), np.array([0.0, 0.0, -1.0]))
-            axes = f'axes = "{letters}"' if letters else "forward and up negated"
-            other_way = f"; if the places are right, the accelerometer is reversed, as some phones': set {REVERSED} in "
-            yield describe_mirroring("latitudes or longitudes have", by, f"{other_way}[imu], and {axes}")
+            or_else = f"; if the places are right, {describe_reversed(recording.imu)}"
+            yield describe_mirroring("latitudes or longitudes have", by, or_else)
 
 
 def _fit_course(imu: Imu, gnss: Gnss | None) -> Fit | None:
