@@ -374,7 +374,7 @@ MISTAKES: dict[str, list[Mistake]] = {
         Mistake(
             "an accelerometer that reads -9.8 at rest",
             scaled("imu", "ax ay az", -1.0),
-            ("accelerometer's sign is reversed", "negate"),
+            ("accelerometer's sign is reversed", 'accel = "-g"'),
         ),
         Mistake(
             "the accelerometer's vertical axis reversed",

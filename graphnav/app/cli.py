@@ -273,6 +273,9 @@ def run(arguments: list[str]) -> int:
         import warnings
 
         warnings.simplefilter("ignore")
+    if empty := [k for k, word in enumerate(arguments) if not word or (word[:2] == "--" and word[-1] == "=")]:
+        before = " ".join(arguments[: empty[0] + 1]).strip()
+        return fail(f"{before}: an empty word follows; a variable of the shell that is not set?", BAD_INPUT, debug)
     try:
         code = build_program()(arguments, prog_name="graphnav", standalone_mode=False, obj=tuple(arguments))
     except GraphnavError as error:
@@ -291,10 +294,19 @@ def run(arguments: list[str]) -> int:
     except Exception as error:
         if hasattr(error, "format_message"):  # typer's own usage errors
             return fail(_describe_usage_error(error), BAD_INPUT, debug)
-        return fail(_describe_internal_error(error), INTERNAL, debug)
+        if not _is_of_interrupt(error):
+            return fail(_describe_internal_error(error), INTERNAL, debug)
+        code = INTERRUPTED
     if code == INTERRUPTED:
         return fail("interrupted", INTERRUPTED, False)
     return code if isinstance(code, int) else 0
+
+
+def _is_of_interrupt(error: BaseException | None) -> bool:
+    """Whether Ctrl-C led to an error, as where it ends the import of compiled code."""
+    while error is not None and not isinstance(error, KeyboardInterrupt):
+        error = error.__cause__ or error.__context__
+    return error is not None
 
 
 def _describe_usage_error(error: Any) -> str:

@@ -175,10 +175,10 @@ def init(
     """
     from graphnav.app.outputs import check_output_folder
     from graphnav.core.staging import stage_results
+    from graphnav.recording.checks.overview import inspect
     from graphnav.recording.draft import draft
     from graphnav.recording.formats import read
     from graphnav.recording.formats.writer import write_csv
-    from graphnav.recording.plausibility.screening import refuse, screen
 
     out = out / "recording.toml" if out.is_dir() or not out.suffix else out
     if out.suffix != ".toml":
@@ -202,7 +202,7 @@ def init(
         tell("checking")
         open_question = None
         try:  # the logs are where the user says
-            refuse(recording := read(out, allow_outside=True), screen(recording).findings)
+            inspect(read(out, allow_outside=True)).refuse()
         except RecordingError as error:
             open_question = error
     files = [out, *(folder / made for made in drafted.made)]

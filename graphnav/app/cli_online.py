@@ -124,7 +124,7 @@ def online(
             shown.finish()
     if asked and not session.done:
         raise Interrupted("interrupted" + (f"; go on with --resume -o {folder}" if folder else ""))
-    session.require_settled()
+    session.require_result()
 
 
 def _holds_lines(path: Path) -> bool:

@@ -134,10 +134,10 @@ def compute_clock_offset(t: float, zero: float | None, u: float, other: float | 
     """The offset from a clock that reads `u` to one that reads `t`, s; their zeros (s since the GPS epoch) may be
     known.
 
-    Stamps above 1e9 are Unix time; those below a week are seconds of the GPS week of the others, where these are known.
-    None where this does not determine it, or the clocks are the same.
+    Stamps above 1e9 of an unknown clock are Unix time; those below a week are seconds of the GPS week of the others,
+    where these are known. None where this does not determine it, or the clocks are the same.
     """
-    unix = [x > UNIX for x in (t, u)]
+    unix = [x > UNIX and clock is None for x, clock in ((t, zero), (u, other))]
     first = parse_clock("unix", t) if unix[0] else zero
     second = parse_clock("unix", u) if unix[1] else other
     if first is None and second is not None and 0.0 <= t < WEEK:
@@ -148,7 +148,7 @@ def compute_clock_offset(t: float, zero: float | None, u: float, other: float | 
         return None
     offset = second - first
     week = second if unix[0] else first
-    if unix[0] == unix[1] or week % WEEK:
+    if unix[0] == unix[1] or week % WEEK or not week:
         return ClockOffset(offset, f"the clocks count from {format_clock(first)} and {format_clock(second)}")
     leap = float(count_leap_seconds(gps_to_utc(np.array([week])))[0])
     begins = week + GPS_TO_UNIX - leap

@@ -1,4 +1,4 @@
-"""Checks of the rows of a running drive: units, axes, clocks. They give notes and leave the estimate unchanged.
+"""Checks of the rows of a running drive: units, axes, clocks. They leave the estimate unchanged.
 
 The checks are those of a recording before it is solved (`graphnav.recording.checks.overview`).
 """
@@ -6,7 +6,9 @@ The checks are those of a recording before it is solved (`graphnav.recording.che
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import replace
 
+from graphnav.core.findings import Finding
 from graphnav.core.notes import Note, format_count
 from graphnav.recording import Recording
 from graphnav.recording.checks.overview import inspect
@@ -25,17 +27,17 @@ _CAUSES = {
 }
 
 
-def check_rows(recording: Recording) -> tuple[Note, ...]:
-    """Notes on rows that are impossible or unlikely; none while there are too few rows."""
+def check_rows(recording: Recording) -> tuple[Finding, ...]:
+    """Findings on rows that are impossible or unlikely, the most severe first; none while there are too few rows."""
     if len(recording.imu.t) < _FEWEST_IMU_ROWS:
         return ()
     try:
         findings = inspect(recording).findings
     except Exception:  # a background check must never end the drive
         return ()
-    return tuple(
-        Note(f.key, f"rows sent up to {recording.end:.1f} s: {f.sentence}") for f in findings if f.severity != "note"
-    )
+    until = f"rows sent up to {recording.end:.1f} s"
+    keys = " (a live source has no keys for it: send it so)" if recording.source is None else ""
+    return tuple(replace(f, sentence=f"{until}: {f.sentence}{keys}") for f in findings if f.severity != "note")
 
 
 def check_counts(counts: Counter[str]) -> tuple[Note, ...]:

@@ -21,6 +21,7 @@ from graphnav.constraints.base import SAME_TIME
 from graphnav.constraints.gnss import TIMES, GnssPosition
 from graphnav.core.earth import LocalFrame
 from graphnav.core.errors import EstimationError
+from graphnav.core.findings import Finding
 from graphnav.core.rotation import Array
 from graphnav.detectors import detect
 from graphnav.estimation.alignment import Alignment
@@ -56,7 +57,7 @@ class EstimationResult:
     notes: tuple[str, ...]
     stationary: Array  # (M, 2) s
     excluded: tuple[ExcludedSpan, ...]  # spans that the noise model excludes
-    doubts: tuple[str, ...]  # findings on units, axes and clocks
+    doubts: tuple[Finding, ...]  # findings on units, axes and clocks
     start: Alignment
     anew: bool  # whether constants are free, or no longer, that concern all states so far
 

@@ -110,15 +110,18 @@ class Session:
         if self.store is not None:  # again where a finished run is resumed: its summary may have been missing
             self.store.summarise(json.dumps(self.summarise(), indent=2) + "\n")
 
-    def require_settled(self) -> None:
-        """Refuse a finished run that has no result.
+    def require_result(self) -> None:
+        """Refuse a finished run that has no result, or one of rows that are refused of a recording.
 
         Raises
         ------
         RecordingError
-            Saying why no state settled.
+            Saying why.
         """
         if self.rows_settled:
+            for finding in self.online.findings if self.online is not None else ():
+                if finding.severity == "refused":
+                    raise RecordingError(f"what has settled is wrong: {finding.sentence}", key=finding.key)
             return
         if self.online is None:
             raise RecordingError("the source ended before the line that describes its sensors", key="online.no_setup")
@@ -159,6 +162,7 @@ class Session:
             "excluded": [
                 {"kind": f.kind, "from_s": f.t_start, "to_s": f.t_end, "count": f.count} for f in online.excluded
             ],
+            "findings": [finding.to_dict() for finding in online.findings],
             "notes": online.notes,
             "messages": [{"key": get_key(note), "sentence": note} for note in online.notes],
             "lag_s": self.settings.solver.lag,

@@ -15,6 +15,7 @@ from graphnav.constraints.base import SAME_TIME
 from graphnav.constraints.raw_ppp import require_precise
 from graphnav.core.earth import LocalFrame
 from graphnav.core.errors import EstimationError
+from graphnav.core.findings import Finding
 from graphnav.core.notes import Note
 from graphnav.core.trajectory import Trajectory
 from graphnav.estimation.alignment import Alignment
@@ -65,6 +66,7 @@ class Smoother:
         self.frame: LocalFrame | None = None
         self.tracker: Tracker | None = None
         self.notes: list[str] = []
+        self.findings: tuple[Finding, ...] = ()  # on the rows so far, the most severe first; they are notes too
         self.late: Counter[str] = Counter()  # used rows that arrived after the keyframe they should have entered
         self._estimation: BackgroundEstimation | None = None  # estimation of the noise model in progress
         self._catch_up: CatchUp | None = None  # tracker that processes the unsettled keyframes with the new model
@@ -212,7 +214,7 @@ class Smoother:
             except EstimationError as error:
                 self.notes.append(Note("online.not_aligned", str(error)))
             if "units" not in self._notes_on:
-                self._replace_notes("units", check_rows(self.sensors.make_recording(every=True)))
+                self._take_findings(check_rows(self.sensors.make_recording(every=True)))
         if self.tracker is not None:
             self._finish_estimation()
             self._advance(self.tracker, self.sensors.imu.newest, last=True)
@@ -245,7 +247,7 @@ class Smoother:
             self._wait(now)
             return
         tracker = self.tracker = self._track(found, recording.start, STATED)
-        self._replace_notes("units", check_rows(sensors.make_recording(-np.inf, now, every=True)))
+        self._take_findings(check_rows(sensors.make_recording(-np.inf, now, every=True)))
         told = found.motion is not None and self.settings.gnss.position and recording.platform != "foot"
         if told and self.settings.noise.mode == "estimated":
             self._found, self._tentative = found, True
@@ -263,6 +265,10 @@ class Smoother:
         tracker, notes = make_tracker(found, start, noise, self.settings, self.frame, self._setup)
         self.notes += [note for note in notes if note not in self.notes]
         return tracker
+
+    def _take_findings(self, found: tuple[Finding, ...]) -> None:
+        self.findings = found
+        self._replace_notes("units", tuple(Note(f.key, f.sentence) for f in found))
 
     def _replace_notes(self, matter: str, words: tuple[str, ...]) -> None:
         """Note what is known about the noise, the units, ..., replacing the earlier note on the same subject."""
@@ -296,7 +302,7 @@ class Smoother:
             self._tentative = False
             return
         self._replace_notes("noise", found.notes)
-        self._replace_notes("units", found.doubts)
+        self._take_findings(found.doubts)
         self._left_out = tuple(fault for fault in found.excluded if fault.kind not in FIXES)
         if tracker.opened and not found.anew:
             self._catch_up = CatchUp(tracker.restart_settled(found.noise, self._setup))
@@ -324,7 +330,7 @@ class Smoother:
     def _wait(self, now: float) -> None:
         """Keep the rows that the next attempt at an alignment may need."""
         if now - float(self.sensors.imu.t[0]) > _PATIENCE:
-            self._replace_notes("units", check_rows(self.sensors.make_recording(every=True)))
+            self._take_findings(check_rows(self.sensors.make_recording(every=True)))
             self.sensors.drop_before(now - 0.5 * _PATIENCE)
 
     def _restart(self, before: float, why: str) -> None:

@@ -18,6 +18,7 @@ def view(session: Session, silent: float = 0.0) -> list[tuple[str, str]]:
     sensors, tracker = online.sensors, online.tracker
     status = "done" if session.done else online.status
     lines = [("status", status + (f", the source is silent for {silent:.0f} s" if silent > 1.0 else ""))]
+    lines += [(f.severity, f.sentence) for f in online.findings[:1]]
     if tracker is None or online.frame is None:
         since = sensors.imu.newest - float(sensors.imu.t[0]) if len(sensors.imu) else 0.0
         fixes = len(sensors.gnss)
@@ -64,6 +65,6 @@ def view(session: Session, silent: float = 0.0) -> list[tuple[str, str]]:
         lines.append(("odd", ", ".join(remarks)))
     if online.failures:
         lines.append(("failed", f"{len(online.failures)} pieces, the last {online.failures[-1]}"))
-    if online.notes:
-        lines.append(("note", online.notes[-1]))
+    if notes := [note for note in online.notes if note not in [f.sentence for f in online.findings]]:
+        lines.append(("note", notes[-1]))
     return lines

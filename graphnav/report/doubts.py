@@ -98,7 +98,12 @@ def list_doubts(solutions: Mapping[str, Solution], errors: Mapping[str, Errors])
             words = f"forward filter and later measurements are {apart.size:.2g} times their sigma apart"
             wrong.append(f"{words} ({apart.block})")
     if wrong:
-        out.append(Note("doubt.sigma", f"The result's sigmas cannot be trusted: {'; '.join(wrong)}"))
+        out.append(
+            Note(
+                "doubt.sigma",
+                f"The result's sigmas cannot be trusted: {'; '.join(wrong)}; count on errors larger by that factor",
+            )
+        )
     return tuple(out)
 
 

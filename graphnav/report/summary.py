@@ -114,7 +114,7 @@ def tabulate_sigmas(solution: Solution) -> list[Markup]:
 
 
 def tabulate_fixes(recording: Recording, solution: Solution, withheld: Removed) -> list[Markup]:
-    """Fixes of each kind: number, excluded or used, longest gap, largest residual; or epochs of raw observations."""
+    """Fixes of each kind: number, excluded or used, longest gap, farthest; or epochs of raw observations."""
     fixes, nan = select_fixes(recording, solution), float("nan")
     raw = tabulate_epochs(solution)
     if raw:
@@ -127,6 +127,10 @@ def tabulate_fixes(recording: Recording, solution: Solution, withheld: Removed) 
             gone |= True if span is None else (fixes.t >= span[0]) & (fixes.t <= span[1])
     record = solution.records.get("gnss_position")
     at = _find_rows(fixes.t + recording.start, None if record is None else record.t)
+    state = _find_rows(fixes.t + recording.start, solution.t)
+    assert recording.gnss is not None
+    antenna = solution.states.p + solution.states.R_nb @ recording.gnss.lever_arm
+    away = np.where(state >= 0, np.linalg.norm((fixes.enu - antenna[state])[:, :2], axis=1), nan)
     kinds = {**fixes.kinds, **({"all": np.ones(len(gone), bool)} if len(fixes.kinds) > 1 else {})}
     rows = []
     for kind, of_it in kinds.items():
@@ -137,16 +141,17 @@ def tabulate_fixes(recording: Recording, solution: Solution, withheld: Removed) 
         ]
         largest, over, gap = nan, nan, nan
         if record is not None and len(used):
-            residual = record.residual[at[used]]
-            largest = float(np.nanmax(np.linalg.norm(residual, axis=1)))
-            over = float(np.nanmax(np.abs(residual / record.sigma[at[used]])))
+            # of the residual the part of an error that lasts is taken off; what a reader sees beside the path is not
+            largest = float(np.nanmax(away[used]))
+            over = float(np.nanmax(np.abs(record.residual / record.sigma)[at[used]]))
             gap = float(np.max(np.diff(fixes.t[used]), initial=0.0))
         rows.append([*cells, len(used), gap, largest, over, *_list_stated(recording, np.flatnonzero(of_it))])
-    head = ["fixes", "count", "withheld", "left out", "used", "longest gap [s]", "largest residual [m]", "over sigma"]
+    head = ["fixes", "count", "withheld", "left out", "used", "longest gap [s]", "farthest [m]", "residual / sigma"]
     head.append("stated [m]")
     if recording.gnss is not None and recording.gnss.satellites is not None:
         head += ["satellites", "fewest"]
     out = [page.heading("Fixes"), page.make_table(head, rows)]
+    out.append(page.paragraph("Farthest: level, from the antenna as estimated at that time.", "soft"))
     if any(row[4] < row[1] - row[3] for row in rows):
         out.append(page.paragraph("Of fixes that come more often than noise.spacing, the best one is used.", "soft"))
     return out

@@ -16,15 +16,16 @@ _MAX_COMPONENT = 1e7  # of the components of a vector: m from the Earth's centre
 Number = Annotated[float, Strict(), Field(allow_inf_nan=False)]
 
 
-def _check_magnitude(value: float) -> float:
+def check_magnitude(value: float) -> float:
+    """Check a number whose square is to be inverted; ValueError otherwise."""
     if value and not _SMALLEST <= abs(value) <= _LARGEST:
         raise ValueError(f"{value:g} must lie between {_SMALLEST:g} and {_LARGEST:g}")
     return value
 
 
-Positive = Annotated[float, Strict(), Field(allow_inf_nan=False, gt=0), AfterValidator(_check_magnitude)]
+Positive = Annotated[float, Strict(), Field(allow_inf_nan=False, gt=0), AfterValidator(check_magnitude)]
 
-NotNegative = Annotated[float, Strict(), Field(allow_inf_nan=False, ge=0), AfterValidator(_check_magnitude)]
+NotNegative = Annotated[float, Strict(), Field(allow_inf_nan=False, ge=0), AfterValidator(check_magnitude)]
 
 
 def check_three_numbers(value: Any) -> Any:

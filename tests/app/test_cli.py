@@ -434,6 +434,8 @@ BAD = {
     "unknown noise": (["smooth", "kitti", "-o", "o", "--noise", "statd"], "file.missing", "--noise statd"),
     "unknown key": (["smooth", "kitti", "-o", "o", "--config", "bad.toml"], "key.unknown", "'rate'"),
     "two logs": (["info", "a.csv", "b.csv"], "recording.several", "graphnav init a.csv b.csv"),
+    "empty": (["smooth", "kitti", "-o", ""], "", "smooth kitti -o: "),
+    "empty, with =": (["smooth", "kitti", "--out="], "", "smooth kitti --out=: "),
     "no sensor": (["smooth", "kitti", "-o", "o", "--without", "400-460"], "option.withheld", "gnss:400-460"),
     "two formats": (
         ["convert", "file", "-o", "o", "--format", "nav", "--export", "gpx"],
@@ -461,21 +463,42 @@ def test_bad_input_is_one_line_and_exit_code_2(arguments, key, name, tmp_path, m
     assert {p.name for p in tmp_path.iterdir()} == {"file", "link", "bad.toml"}  # nothing was written
 
 
+@pytest.mark.parametrize("number", ["1e300", "1e-300", "[1e300, 1.0]"])
+def test_numbers_of_settings_have_a_square_that_can_be_inverted(number, tmp_path, capsys):
+    key = "slow_times" if "[" in number else "lever_arm_sigma"
+    (tmp_path / "s.toml").write_text(f"[gnss]\n{key} = {number}\n")
+    arguments = ["smooth", "kitti", "-o", str(tmp_path / "o"), "--config", str(tmp_path / "s.toml")]
+    assert f"s.toml, line 2: 'gnss.{key}" in refuse_command(capsys, "key.value", *arguments)
+
+
+@pytest.mark.parametrize("closed", ["<&-", ">&-", "2>&-", "<&- >&- 2>&-"])
+def test_a_service_may_have_closed_the_streams(closed):
+    run = subprocess.run(["sh", "-c", f"'{PROGRAM}' info nothing-here {closed}"], capture_output=True, check=False)
+    assert (run.returncode, run.stdout) == (2, b"")
+    assert (run.stderr == b"") == ("2>&-" in closed)
+
+
 def test_exit_code_and_sentence_of_the_installed_program():
     run = program("smooth", "nothing-here", "-o", os.devnull)
     assert (run.returncode, run.stdout) == (2, "")
     assert run.stderr == f"graphnav: -o {os.devnull}: is a file; name a folder to write into\n"
 
 
+def _raise_from(error: Exception, cause: BaseException) -> Exception:
+    error.__cause__ = cause
+    return error
+
+
 @pytest.mark.parametrize(
     ("error", "code", "words"),
     [
         (KeyboardInterrupt(), 130, "interrupted"),
+        (_raise_from(ImportError("initialization failed"), KeyboardInterrupt()), 130, "interrupted"),
         (TypeError("what\nis this"), 1, "internal error: TypeError: what is this in cli_solve.py:"),
         (MemoryError(), 1, "out of memory"),
         (OSError(28, "No space left on device", "o/summary.json"), 2, "o/summary.json: No space left on device"),
     ],
-    ids=["ctrl-c", "internal", "memory", "disk full"],
+    ids=["ctrl-c", "ctrl-c in an import", "internal", "memory", "disk full"],
 )
 def test_no_traceback_reaches_a_user(error, code, words, tmp_path, monkeypatch, capsys):
     def failing(*_):

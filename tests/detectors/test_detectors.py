@@ -429,7 +429,7 @@ def test_the_command_writes_what_it_promises(tmp_path, capsys):
         (["detect", "kitti"], "", "-o"),
         (["detect", "kitti", "-o", "out", "--detectors", "fft,sway"], "option.unknown_name", "'sway'"),
         (["detect", "kitti", "-o", "out", "--detectors", "fft,fused"], "detectors.fused_alone", "fft,fused"),
-        (["smooth", "kitti", "-o", "out", "--detectors", ""], "option.no_name", "--detectors"),
+        (["smooth", "kitti", "-o", "out", "--detectors", ","], "option.no_name", "--detectors"),
     ],
 )
 def test_bad_input_is_one_line(arguments, key, name, tmp_path, monkeypatch, capsys):

@@ -649,7 +649,7 @@ def test_the_detectors_that_decide_can_be_named(monkeypatch: pytest.MonkeyPatch)
     fired = []
     monkeypatch.setattr(signal, "signal", lambda *_: None)
     monkeypatch.setattr(cli_online, "follow", lambda session, *_: fired.append(session.settings.detectors.fire))
-    monkeypatch.setattr(Session, "require_settled", lambda _: None)
+    monkeypatch.setattr(Session, "require_result", lambda _: None)
     for more in ([], ["--detectors", "fft,glrt"]):
         assert cli.run(["online", "-", "--quiet", *more]) == 0
     assert fired == [("fused",), ("fft", "glrt")]

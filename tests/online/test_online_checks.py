@@ -7,8 +7,12 @@ import oracle
 import pytest
 
 from graphnav.config import parse_settings
+from graphnav.core.errors import RecordingError
 from graphnav.core.notes import get_key
 from graphnav.online import Online, Row, drop_rows, list_rows
+from graphnav.online.lines import format_line, format_lines, parse_row
+from graphnav.online.session import Session
+from graphnav.online.view import view
 from graphnav.recording import Recording
 
 QUICK = parse_settings({"noise": {"mode": "stated"}, "solver": {"lag": 10.0}})
@@ -65,3 +69,16 @@ def test_a_session_in_a_wrong_unit_says_so(drive: Recording, how: str, keys: set
     assert found == keys
     assert early == found  # while it runs, not only at the end
     assert not online.failures
+
+
+def test_what_is_refused_of_a_recording_is_so_while_it_is_driven_and_at_the_end(drive: Recording) -> None:
+    session = Session(QUICK, "-", None)
+    *lines, end = (line for _, line in format_lines(drive))
+    session.add_lines([lines[0], *(format_line(spoil(row, "g")) for row in map(parse_row, lines[1:]) if row)])
+    assert [label for label, _ in view(session)[:2]] == ["status", "refused"]
+    session.add_lines([end])
+    session.finish()
+    with pytest.raises(RecordingError) as error:
+        session.require_result()
+    assert error.value.key == "imu.force_scale"
+    assert session.rows_settled

@@ -425,7 +425,7 @@ def test_a_session_with_nothing_to_show_says_why(tmp_path: Path, case: str) -> N
     session.finish()
     session.close()
     with refused(key, RecordingError):
-        session.require_settled()
+        session.require_result()
 
 
 # --------------------------------------------------------------------------------------------------------- disks

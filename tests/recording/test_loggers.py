@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import gzip
 import json
+from datetime import UTC, datetime
+from functools import reduce
+from operator import xor
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +15,7 @@ import stranger
 from helpers import refuse_command
 
 from graphnav.app import cli
+from graphnav.core.timescales import unix_to_gps
 from graphnav.recording.draft import draft
 from graphnav.recording.draft.clocks import read_clock_seconds, read_serial_days
 from graphnav.recording.formats import read
@@ -157,6 +162,126 @@ def test_a_course_in_radians_is_told_by_the_positions(plain, tmp_path):
         for name, one in (("deg", np.degrees(course)), ("rad", course))
     ]  # fmt: skip
     assert found[1] == pytest.approx(found[0], abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("names", "scales", "more"),
+    [
+        ("lat,lon,alt,vel_n,vel_e,vel_d", (1e7, 1e7, 1e3, 1e2, 1e2, 1e2), ""),  # as MAVLink; its speeds are left alone
+        ("lat,lon,hMSL [mm],hacc_mm,vacc_mm,velN_mm_s,velE_mm_s,velD_mm_s", (1, 1, 1e3, *[1e3] * 5), "v"),
+        ("lat,lon,alt,NedVelX,NedVelY,NedVelZ", (1,) * 6, "v"),
+        ("lat,lon,alt,vx,heading", (1,) * 5, ""),  # of which axes is not said: no speed along the heading
+    ],
+    ids=["whole degrees", "millimetres", "axes in the name", "axes unknown"],
+)
+def test_units_and_axes_that_the_names_of_columns_state(plain, tmp_path, names, scales, more):
+    imu, (_, rows) = plain
+    t, *place = np.array(rows, dtype=float).T
+    moves = np.gradient(np.column_stack([place[0], place[1], place[2]]), t, axis=0)
+    north, east = np.radians(moves[:, 0]) * 6.371e6, np.radians(moves[:, 1]) * 6.371e6 * np.cos(np.radians(place[0]))
+    own = {"vn": north, "ve": east, "vd": -moves[:, 2], "sd": np.full(len(t), 0.03)}
+    columns = [*place, *(own[x] for x in (["sd"] * 2 if "acc" in names else []) + ["vn", "ve", "vd"])]
+    digits = 9 if scales[0] == 1 else 0
+    cells = [[x, *(f"{y * s:.{digits}f}" for y, s in zip(row, scales, strict=False))]
+             for (x, *_), row in zip(rows, zip(*columns, strict=True), strict=True)]  # fmt: skip
+    gnss = read_drafted(tmp_path, imu, (f"t,{names}", cells)).gnss
+    assert gnss.llh == pytest.approx(np.column_stack([*np.radians(place[:2]), place[2]]), abs=1e-3)
+    assert gnss.llh[:, :2] == pytest.approx(np.radians(place[:2]).T, abs=2e-9)
+    assert (gnss.v is not None) == (more == "v")
+    if more:
+        assert gnss.v == pytest.approx(np.column_stack([east, north, moves[:, 2]]), abs=1e-4)
+    if "acc" in names:
+        assert gnss.sd == pytest.approx(np.full((len(t), 3), 0.03))
+
+
+@pytest.mark.parametrize(
+    "header", ["GForceX,GForceY,GForceZ", "accelerometer_m_s2[0],accelerometer_m_s2[1],accelerometer_m_s2[2]"]
+)
+def test_more_names_of_an_imu_and_what_is_not_used_is_said(plain, tmp_path, capsys, header):
+    (_, rows), gnss = plain
+    stranger.write_tables(
+        tmp_path, (f"t,gyro[0],gyro[1],gyro[2],{header},q0,mag", [[*r, "1", "2"] for r in rows]), gnss
+    )
+    assert cli.run(["init", str(tmp_path), "-o", str(tmp_path), "--json"]) == 0
+    (unused,) = [line for line in json.loads(capsys.readouterr().out)["decisions"] if "q0" in line]
+    assert unused.startswith("[imu] imu.csv: ")
+    assert unused.endswith(" q0, mag")
+    assert len(read(tmp_path).imu.t) == len(rows)
+
+
+def test_the_speed_of_a_wheel_beside_fixes_is_an_odometer_and_makes_no_new_fixes(plain, tmp_path):
+    (header, rows), (_, fixes) = plain
+    t, at = np.array([float(r[0]) for r in rows]), np.array([float(r[0]) for r in fixes])
+    k = np.maximum(np.searchsorted(at, t + 1e-6) - 1, 0)
+    speed = 10.0 + np.sin(t)
+    one = [[*row, *fixes[j][1:], "90.0", f"{3.6 * x:.4f}"] for row, j, x in zip(rows, k, speed, strict=True)]
+    (tmp_path / "log.csv").write_text("\n".join(map(",".join, [[header, "lat,lon,h,heading,obd_speed_kmh"], *one])))
+    assert cli.run(["init", str(tmp_path), "-o", str(tmp_path), "--quiet"]) == 0
+    got = read(tmp_path)
+    assert got.gnss.v is None
+    assert len(got.gnss.t) == len(np.unique(k))
+    assert got.odometer.speed == pytest.approx(speed, abs=1e-3)
+
+
+@pytest.mark.parametrize("name", ["imu.csv.gz", "imu.txt.gz"])
+def test_a_packed_table_may_have_dates(plain, tmp_path, name):
+    (header, rows), gnss = plain
+    dated = [[datetime.fromtimestamp(float(t), UTC).isoformat(), *rest] for t, *rest in rows]
+    stranger.write_tables(tmp_path, (header, dated), gnss)
+    (tmp_path / name).write_bytes(gzip.compress((tmp_path / "imu.csv").read_bytes()))
+    (tmp_path / "imu.csv").unlink()
+    assert cli.run(["init", str(tmp_path), "-o", str(tmp_path), "--quiet"]) == 0
+    assert read(tmp_path).imu.t == pytest.approx(np.array([float(t) for t, *_ in rows]), abs=1e-5)
+
+
+@pytest.mark.parametrize("order", ["linear, total", "linear, gravity"])
+def test_forces_without_gravity_are_not_taken_where_the_table_has_it(plain, tmp_path, order):
+    (_, rows), gnss = plain
+    imu = np.array(rows, dtype=float)
+    force, pull = imu[:, 4:], np.tile(imu[:, 4:].mean(axis=0), (len(imu), 1))
+    header = "t,gx,gy,gz,lin_acc_x,lin_acc_y,lin_acc_z"
+    header += ",acc_x,acc_y,acc_z" if "total" in order else ",gravity_x,gravity_y,gravity_z"
+    both = np.column_stack([imu[:, :4], force - pull, force if "total" in order else pull])
+    got = read_drafted(tmp_path, (header, [[f"{x:.8f}" for x in row] for row in both]), gnss).imu
+    assert got.accel @ got.R_bs == pytest.approx(force, abs=1e-6)
+
+
+def test_one_table_has_one_clock(plain, tmp_path):
+    """At 100 Hz in ms: a fix in every row, 10 apart, might be one every ten seconds."""
+    (header, rows), (_, fixes) = plain
+    t, at = np.array([float(r[0]) for r in rows]), np.array([float(r[0]) for r in fixes])
+    k = np.maximum(np.searchsorted(at, t + 1e-6) - 1, 0)
+    one = [[f"{10 * i + 5000}", *row[1:], *fixes[j][1:]] for i, (row, j) in enumerate(zip(rows, k, strict=True))]
+    text = "\n".join(map(",".join, [[header.replace("t,", "time,"), "lat,lon,h"], *one]))
+    (tmp_path / "log.csv").write_text(text + "\n")
+    found = draft([tmp_path / "log.csv"], tmp_path)
+    assert found.text.count('t = "ms"') == 2
+
+
+def test_lines_of_an_imu_among_nmea_are_pointed_at(tmp_path, capsys):
+    body = "GPGGA,120000.00,4000.000,N,10500.000,W,4,12,0.8,1600.0,M,-20.0,M,1.0,0001"
+    sentence = f"${body}*{reduce(xor, body.encode()):02X}"
+    later = sentence.replace("120000.00", "120001.00")
+    later = f"{later[:-2]}{int(later[-2:], 16) ^ 1:02X}"
+    (tmp_path / "log.txt").write_text(f"{sentence}\nIMU,0,0,0,9.8,0,0,0\n{later}\nIMU,1,0,0,9.8,0,0,0\n")
+    said = refuse_command(capsys, "draft.no_imu", "init", tmp_path, "-o", tmp_path)
+    assert "log.txt, line 2: " in said
+
+
+def test_stamps_since_the_gps_epoch_are_no_unix_time(plain, tmp_path):
+    """A receiver's beside an IMU's in Unix time: the clocks are known, and nothing need be found."""
+    (header, rows), (_, fixes) = plain
+    unix = float(rows[0][0])
+    zero = float(unix_to_gps(np.array([unix]))[0])
+    gps = [[f"{1e9 * (float(t) - unix + zero):.0f}", *place] for t, *place in fixes]
+    got = read_drafted(tmp_path / "fixes", (header, rows), ("TimeGps,lat,lon,h", gps))
+    assert got.gnss.t == pytest.approx(np.array([float(t) for t, *_ in fixes]), abs=1e-3)
+    both = read_drafted(
+        tmp_path / "both",
+        (header.replace("t,", "gps_time_ns,"), [[f"{1e9 * (float(t) - unix + zero):.0f}", *r] for t, *r in rows]),
+        ("TimeGps,lat,lon,h", gps),
+    )
+    assert both.gps_zero + both.imu.t[0] == pytest.approx(zero, abs=0.1)
 
 
 def test_stamps_that_are_one_number():

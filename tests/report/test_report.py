@@ -302,14 +302,15 @@ def test_fixes_are_counted_and_coloured_by_type(tmp_path, recording):
     typed = replace(recording, gnss=replace(recording.gnss, type=kinds))
     found = replace(solution(), t=solution().t)
     rows = {row[0]: row for row in cells(tabulate_fixes(typed, found, [("gnss", (200.5, 230.5))])[1])}
-    # row 50 was rejected, and 30 are withheld; every row has a record, of which the largest is what the fit left there
+    # row 50 was rejected, and 30 are withheld; of a fix the distance from the antenna counts, whatever the residual
     assert [rows[k][1:5] for k in ("fixed", "float", "all")] == [
         ["520", "30", "1", "519"], ["50", "0", "0", "50"], ["570", "30", "1", "569"],
     ]  # fmt: skip
     assert float(rows["all"][5]) == 31.0
     used = np.delete(np.arange(COUNT), [50, *range(200, 230)])
-    size = np.linalg.norm(record().residual[used], axis=1).max()
-    assert float(rows["all"][6]) == pytest.approx(size, rel=1e-3)
+    apart = found.frame.from_llh(typed.gnss.llh) - found.states.p - found.states.R_nb @ typed.gnss.lever_arm
+    assert float(rows["all"][6]) == pytest.approx(np.hypot(*apart[used, :2].T).max(), rel=1e-3)
+    assert float(rows["all"][7]) == pytest.approx(np.abs(record().residual / record().sigma)[used].max(), rel=1e-3)
     path = write_report(tmp_path / "r.html", typed, found, settings={})
     way_of_it = figures_of(path)["Plan view"]["data"]
     shown = {trace["name"]: trace for trace in way_of_it}

@@ -13,6 +13,7 @@ from graphnav.recording.checks import crosschecks, tilt
 from graphnav.recording.checks.crosschecks import Fit
 from graphnav.recording.checks.tilt import CORRELATED
 from graphnav.recording.checks.tracks import Track
+from graphnav.recording.formats import schema
 
 _NO_BETTER = 0.05  # of a correlation
 
@@ -92,6 +93,24 @@ def check_forward_sign(imu: Imu, track: Track | None, forward: Fit | None) -> It
         yield Finding("refused", f"{along}: {finding.sentence}", "imu.axes_turned")
 
 
+def turns_against(yaw: Fit | None) -> bool:
+    """Whether the course turns as much as the gyro, and surely the other way.
+
+    Courses of a few fixes, some of them wrong, are hardly correlated, but by their number they may show the sign.
+    """
+    if yaw is None or not yaw.coefficients[0] < 0.0:
+        return False
+    alike = tilt.NEAR_ONE[0] < -yaw.coefficients[0] < tilt.NEAR_ONE[1]
+    return yaw.correlation > 0.8 or (alike and tilt.SIGMAS * yaw.relative_sigma < 1.0)
+
+
+def describe_reversed(imu: Imu) -> str:
+    """That the accelerometer may be reversed, as those of some phones, and what to set then."""
+    letters = write_letters(imu.R_bs, np.array([0.0, -1.0, 0.0]), np.array([0.0, 0.0, -1.0]))
+    axes = f'axes = "{letters}"' if letters else "forward and up negated"
+    return f"the accelerometer is reversed, as some phones': set {schema.REVERSED} in [imu], and {axes}"
+
+
 def check_gyro_sign(imu: Imu, track: Track) -> Iterator[Finding]:
     """The gyro about the mean force turns opposite to the course: no choice of axes explains that.
 
@@ -101,12 +120,12 @@ def check_gyro_sign(imu: Imu, track: Track) -> Iterator[Finding]:
         alone = tilt.measure_sideways(imu, track) > 0.0  # its other axes agree with the gyro
         which = "accelerometer's vertical axis" if alone else "accelerometer's sign"
         what = f"the {which} is reversed (gyro and course contradict it), it must read +9.8 upward at rest"
-        yield Finding("warning", f"{what}; negate it in the file", "imu.force_sign")
+        mend = "negate it in the file" if alone else f"set {schema.REVERSED} in [imu]"
+        yield Finding("warning", f"{what}; {mend}", "imu.force_sign")
     elif not tilt.measure_sideways(imu, track):
         what = "the gyro turns against the GNSS course: its sign is reversed, or latitudes or longitudes have the wrong"
-        yield Finding(
-            "warning", f"{what} sign (south and west are negative); negate it, or them, in the file", "imu.gyro_sign"
-        )
+        mend = f"negate it, or them, in the file; or {describe_reversed(imu)}"
+        yield Finding("warning", f"{what} sign (south and west are negative); {mend}", "imu.gyro_sign")
     else:
         what = "the gyro's sign is reversed: it turns against the GNSS course while gravity points as stated"
         yield Finding("warning", f"{what}; negate it in the file", "imu.gyro_sign")

@@ -28,6 +28,7 @@ from graphnav.recording.checks.axes import (
     check_imu_axes,
     check_sideways,
     check_yaw_scale,
+    turns_against,
 )
 from graphnav.recording.checks.clock import measure_clock_offsets
 from graphnav.recording.checks.imu import (
@@ -197,7 +198,7 @@ def inspect(recording: Recording, screened: Screened | None = None) -> Inspectio
             track = tracks.compute_track(replace(recording.gnss, v=None)) or track
         yaw = crosschecks.fit_yaw_rate(recording.imu, track)
         forward = clock.by_velocity if track.instant else clock.by_places
-        turns_back = yaw is not None and yaw.correlation > 0.8 and yaw.coefficients[0] < 0
+        turns_back = turns_against(yaw)
         turns_so = yaw is not None and yaw.correlation > 0.8 and not turns_back
         if not turns_so and (mirrored := list(check_mirroring(recording, track, turns_back))):
             findings += mirrored

@@ -148,11 +148,11 @@ def describe_exchange(sensor: str) -> Finding:
     )
 
 
-def describe_mirroring(which: str, sensor: str) -> Finding:
-    """The finding that positions have the wrong sign, by `sensor`."""
+def describe_mirroring(which: str, sensor: str, else_: str = "") -> Finding:
+    """The finding that positions have the wrong sign, by `sensor`; `else_` is what mirrors them as well."""
     return Finding(
         "refused",
-        f"{which} the wrong sign, by {sensor}: south and west are negative; negate the column in the file",
+        f"{which} the wrong sign, by {sensor}: south and west are negative; negate the column in the file{else_}",
         "gnss.mirrored",
     )
 

@@ -90,6 +90,7 @@ class _Writer:
         self.epochs: ClockOffset | None = None  # delays between the clocks of IMU and fixes
         self.lines: list[str] = []
         self.decisions: list[str] = []
+        self.table = ""  # before each decision, as the same keys are in several
         self.made: dict[str, dict[str, Array]] = {}
 
     def format(self, found: dict[str, Source], raw: RawFound | None, name: str) -> str:
@@ -106,17 +107,18 @@ class _Writer:
         self._write_key("platform", '"vehicle"' if vehicle else '"foot"', why)
         if raw is not None:
             self._write_clock(found["imu"], raw)
+        elif found["imu"].week is not None:
+            why = "as a column of the IMU's file says" if found["imu"].week else "the stamps are s since the GPS epoch"
+            self._write_key("clock", f'"gps week {found["imu"].week}"', why)
         elif found["imu"].log is None and found["imu"].t[0] > UNIX:
             self._write_key("clock", '"unix"', "the stamps are dates of this century, s since 1970")
-        elif found["imu"].week is not None:
-            self._write_key("clock", f'"gps week {found["imu"].week}"', "as a column of the IMU's file says")
         agreement, felt = self._write_imu(found["imu"], found.get("gnss"), raw, vehicle)
         course = None
         if "gnss" in found:
             course = motion.compute_course(*read_fixes(found["gnss"]))
             self._write_gnss(found["gnss"], agreement)
         if raw is not None:
-            self.lines += ["", "[raw_gnss]"]
+            self._begin("raw_gnss")
             self.decisions += raw.notes
             for key, value, why in write_raw(raw, self.folder):
                 self._write_key(key, value, why)
@@ -137,13 +139,13 @@ class _Writer:
         elif imu.log is None:
             words = f'CHECK: state what t = 0 of {imu.path.name} is, as "gps week 2130" or a UTC date'
             self.lines.append(f'# clock = "..."                             # {words}')
-            self.decisions.append(f"clock: {words}; the observations begin at {raw.begin}")
+            self._decide(f"clock: {words}; the observations begin at {raw.begin}")
 
     def _write_imu(
         self, source: Source, gnss: Source | None, raw: RawFound | None, vehicle: bool
     ) -> tuple[Agreement, tuple[Array, Array]]:
         """Write [imu]; returns the comparison with the fixes, and times and forward forces."""
-        self.lines += ["", "[imu]"]
+        self._begin("imu")
         self._write_file(source, "imu")
         if source.log is not None:
             assert source.log.imu is not None
@@ -170,7 +172,7 @@ class _Writer:
             front = self._write_axes(up, up_why, agreement)
         elif source.log.mount_known or agreement.clearest is None:
             assert source.log.imu is not None
-            self.decisions.append(f"IMU: axes and units are those of {source.path.name}")
+            self._decide(f"IMU: axes and units are those of {source.path.name}")
             front = source.log.imu.R_bs[1]
         else:
             front = self._write_axes(up, up_why, agreement)
@@ -209,7 +211,7 @@ class _Writer:
                 )
 
     def _write_gnss(self, source: Source, agreement: Agreement) -> None:
-        self.lines += ["", "[gnss]"]
+        self._begin("gnss")
         values = source.values
         late = agreement.late_velocity
         dropped = ("ve", "vn", "vu", "vd", "sd_ve", "sd_vn", "sd_vu", "speed", "course") if late is not None else ()
@@ -220,7 +222,7 @@ class _Writer:
             theirs = source.columns.names["type"]
             if numbers.value is None and theirs != "type":
                 dropped = (*dropped, "type")
-                self.decisions.append(f"types of fixes: column '{theirs}' is left alone: {numbers.why}")
+                self._decide(f"types of fixes: column '{theirs}' is left alone: {numbers.why}")
         missing = {"sd_e", "sd_n", "sd_u"} - values.keys()
         if missing:  # all three or none
             dropped = (*dropped, "sd_e", "sd_n", "sd_u")
@@ -228,7 +230,8 @@ class _Writer:
         if source.log is None:
             if "h" not in values:
                 raise RecordingError(
-                    f"{source.path}: no column of heights beside {source.columns.names['lat']}; log them too",
+                    f"{source.path}: no column of heights beside {source.columns.names['lat']}: add a column h, "
+                    "in m; one height throughout, that of the place, is given a large sigma",
                     key="draft.no_heights",
                 )
             units = {"t": source.t_unit}
@@ -253,11 +256,11 @@ class _Writer:
                 self._write_key("sd", _SD, why)
             height = source.columns.names["h"]
             if "msl" in height.lower() or "alt" in height.lower():
-                self.decisions.append(f"heights: '{height}' may be above mean sea level; they are used as they are")
+                self._decide(f"heights: '{height}' may be above mean sea level; they are used as they are")
         if late is not None:
             words = f"velocities are not used: they come {late:.2f} s after the positions"
             self.lines.append(f"# {words}")
-            self.decisions.append(words)
+            self._decide(words)
         self._write_lever_arm(
             source.log.gnss if source.log else None, "from the IMU to the antenna: right, forward, up"
         )
@@ -279,7 +282,7 @@ class _Writer:
             self._write_key("time_offset", f"{seconds:.2f}", why)
 
     def _write_odometer(self, source: Source, course: motion.Course | None, felt: tuple[Array, Array]) -> None:
-        self.lines += ["", "[odometer]"]
+        self._begin("odometer")
         self._write_file(source, "odometer")
         if source.log is None:
             speed = guesses.guess_speed_unit(
@@ -296,7 +299,7 @@ class _Writer:
         )
 
     def _write_barometer(self, source: Source) -> None:
-        self.lines += ["", "[barometer]"]
+        self._begin("barometer")
         self._write_file(source, "barometer")
         unit = guess_file_pressure_unit(source)
         assert unit is not None
@@ -311,9 +314,16 @@ class _Writer:
 
     # ---- lines
 
+    def _begin(self, table: str) -> None:
+        self.lines += ["", f"[{table}]"]
+        self.table = f"[{table}] "
+
+    def _decide(self, words: str) -> None:
+        self.decisions.append(self.table + words)
+
     def _write_key(self, key: str, value: str, why: str) -> None:
         self.lines.append(f"{key} = {value}".ljust(43) + f" # {why}")
-        self.decisions.append(f"{key} = {value}: {why}")
+        self._decide(f"{key} = {value}: {why}")
 
     def _write_file(self, source: Source, sensor: str, dropped: Sequence[str] = ()) -> None:
         relative = Path(os.path.relpath(source.path.resolve(), self.folder.resolve())).as_posix()
@@ -321,18 +331,20 @@ class _Writer:
             relative = JOINED
             self.made[relative] = source.values
             rates, forces = (path.name for path in source.joined_from)
-            self.decisions.append(f"{relative}: made of {rates} and {forces}, the forces at the times of the rates")
+            self._decide(f"{relative}: made of {rates} and {forces}, the forces at the times of the rates")
         elif source.plain is not None:
             relative = name_plain_file(source.path, sensor)
             self.made[relative] = {source.columns.names[ours]: x for ours, x in source.values.items()}
             words = f"made of {source.path.name}: {source.plain.words}"
             self.lines.append(f"# {words}")
-            self.decisions.append(f"{relative}: {words}")
+            self._decide(f"{relative}: {words}")
         self.lines.append(f"file = {quote(relative)}")
+        if source.unused:
+            self._decide(f"{source.path.name}: columns not used: {', '.join(source.unused)}")
         if source.second:
             words = f"CHECK: {source.second} may be of another sensor of this kind; to use that, give those in columns"
             self.lines.append(f"# {words}")
-            self.decisions.append(f"{relative}: {words}")
+            self._decide(f"{relative}: {words}")
         if source.log is not None and (topics := source.log.topics.get(sensor, ())):
             why = "the only one"
             if len(topics) > 1 and topics[0] in self.asked:
@@ -345,7 +357,7 @@ class _Writer:
             self._write_key("topic", quote(topics[0]), why)
         if source.joined_from is None and source.plain is None and not is_inside(source.path, self.folder):
             words = f"{relative}: lies outside the folder of this file; use --allow-outside to read it"
-            self.decisions += [words] if words not in self.decisions else []
+            self._decide(words)
         names = {o: theirs for o, theirs in source.columns.names.items() if o != theirs and o not in dropped}
         if names:
             pairs = ", ".join(f"{ours} = {quote(theirs)}" for ours, theirs in names.items())
@@ -354,7 +366,8 @@ class _Writer:
     def _write_units(self, units: dict[str, Guess]) -> None:
         default = {"type": "rtklib", "t": "s", "gyro": "rad/s", "accel": "m/s2", "angle": "deg", "speed": "m/s"}
         default |= {"height": "m", "pressure": "Pa"}
-        self.decisions += [f"{key} in {guess.value}: {guess.why}" for key, guess in units.items()]
+        for key, guess in units.items():
+            self._decide(f"{key} in {guess.value}: {guess.why}")
         other = {key: guess for key, guess in units.items() if guess.value != default[key]}
         if other:
             pairs = ", ".join(f'{key} = "{guess.value}"' for key, guess in other.items())

@@ -12,7 +12,7 @@ _TURNING = (
 )
 _GYRO = rf"(?:.*_)?(?:gyr\w*?|{_TURNING}|ang_vel|omega|rotation_rate|rot_rate|imu_w|w|turn_rate|g)_?"
 _ACCEL = (
-    r"(?:.*_)?(?:acc\w*?|beschleunigung|acel\w*?|linear_acceleration|total_acceleration|specific_force|imu_a|imu_f|force"
+    r"(?:.*_)?(?:acc\w*?|g_?force|beschleunigung|acel\w*?|linear_acceleration|total_acceleration|specific_force|imu_a|imu_f|force"
     r"|a|f)_?"
 )
 _HORIZONTAL = r"sd_?h|(?:.*_)?(?:h_?acc\w*|horizontal_accuracy)|accuracy|eph|epe(?:_m)?"
@@ -23,6 +23,7 @@ _UNCERTAIN = re.compile(
     r"(?:.*_)?(?:sd|std|stdev|sigma|var|variance|cov\w*|accuracy|[hvpgt]dop|err\w*|uncertainty|ep[hves])(?:_.*)?|.*_acc"
 )
 _OF_WEEK = r"(?:gps_?)?time_of_week|gps_?time|t(?:ime)?_gps|(?:gps_?)?[st]ow|i_?tow|gps_?sec(?:onds?)?|gnss_time"
+_OF_WHEELS = r"(?:.*_)?(?:wheel|odo|odometer|obd\d?|can)_?(?:speed|velocity)"
 _WHEEL, _SPEED = r"(?:wheel_?|speed_?|wheel_?speed_?)*", r"(?:_?wheel)?(?:_?speed)?"
 _PATTERNS: dict[str, tuple[str, ...]] = {
     "t": (
@@ -43,10 +44,16 @@ _PATTERNS: dict[str, tuple[str, ...]] = {
         r"(?:.*_)?(?:alt(?:itude?)?|height|h_?msl|elevation|ele)",
         r"(?:.*_)?(?:alt(?:itude)?|height|h)_?(?:msl|wgs84)?", r"h_he|hoehe|hauteur|altura",
     ),
-    "ve": (r"ve|v_?east|vel_?e(?:ast)?|east_vel\w*|velocity_e(?:ast)?|e_vel",),
-    "vn": (r"vn|v_?north|vel_?n(?:orth)?|north_vel\w*|velocity_n(?:orth)?|n_vel",),
-    "vu": (r"vu|v_?up|vel_?u(?:p)?|up_vel\w*|velocity_u(?:p)?|u_vel",),
-    "vd": (r"vd|v_?down|vel_?d(?:own)?|down_vel\w*|velocity_d(?:own)?|d_vel",),
+    **{
+        f"v{way[0]}": (
+            rf"v{way[0]}|v_?{way}|vel_?{way[0]}(?:{way[1:]})?|{way}_vel\w*|velocity_{way[0]}(?:{way[1:]})?|{way[0]}_vel",
+            rf"vel_?(?:m_s_)?{way[0]}(?:_m_s)?|{of_axes}",
+        )
+        for way, of_axes in (
+            ("east", r"ned_?v(?:el)?_?y|enu_?v(?:el)?_?x"), ("north", r"ned_?v(?:el)?_?x|enu_?v(?:el)?_?y"),
+            ("up", r"enu_?v(?:el)?_?z"), ("down", r"ned_?v(?:el)?_?z"),
+        )
+    },
     "sd_e": (r"sd_?e|std_?e|sigma_?e|e(?:ast)?_(?:sd|std|sigma)", _HORIZONTAL),
     "sd_n": (r"sd_?n|std_?n|sigma_?n|n(?:orth)?_(?:sd|std|sigma)", _HORIZONTAL),
     "sd_u": (r"sd_?u|std_?u|sigma_?u|u(?:p)?_(?:sd|std|sigma)", _VERTICAL),
@@ -91,6 +98,7 @@ NAMED_UNITS = {
     "kph": ("speed", "km/h"), "kmph": ("speed", "km/h"), "mph": ("speed", "mph"), "kn": ("speed", "knots"),
     "knots": ("speed", "knots"), "kt": ("speed", "knots"), "kts": ("speed", "knots"),
     "deg": ("angle", "deg"), "degrees": ("angle", "deg"), "rad": ("angle", "rad"), "m": ("length", "m"),
+    "mm": ("length", "mm"), "cm": ("length", "cm"), "mm_s": ("speed", "mm/s"), "cm_s": ("speed", "cm/s"),
     "pa": ("pressure", "Pa"), "hpa": ("pressure", "hPa"), "mbar": ("pressure", "mbar"), "kpa": ("pressure", "kPa"),
     "inhg": ("pressure", "inHg"),
     "ft": ("length", "ft"), "feet": ("length", "ft"), "foot": ("length", "ft"),
@@ -145,6 +153,8 @@ def match_columns(header: Sequence[str], stem: str = "") -> FileColumns:
             names[f"{kind}{x}"] = bare[x][0]
             if bare[x][1]:
                 units[f"{kind}{x}"] = bare[x][1]
+    if {"lat", "lon"} <= names.keys() and split_unit(names.get("speed", ""))[0].endswith("x"):
+        del names["speed"]  # one of three components, in axes that are not stated
     if "week" in names and not re.fullmatch(_OF_WEEK, split_unit(names.get("t", ""))[0]):
         del names["week"]
     # a single letter does not identify an incomplete triple
@@ -153,6 +163,22 @@ def match_columns(header: Sequence[str], stem: str = "") -> FileColumns:
             for x in "xyz":
                 names.pop(f"{kind}{x}", None)
     return FileColumns(names, units)
+
+
+def find_wheels(header: Sequence[str]) -> list[str]:
+    """The columns of wheels' speeds in a table of fixes, where they are not the receiver's."""
+    spelt = [(name, split_unit(name)[0]) for name in header]
+    if not all(any(re.fullmatch(p, plain) for _, plain in spelt for p in _PATTERNS[ours]) for ours in ("lat", "lon")):
+        return []
+    each = [*_PATTERNS["speed_fl"], *_PATTERNS["speed_fr"], *_PATTERNS["speed_rl"], *_PATTERNS["speed_rr"]]
+    return [name for name, plain in spelt if any(re.fullmatch(p, plain) for p in (_OF_WHEELS, *each))]
+
+
+def find_gravity(header: Sequence[str]) -> list[str]:
+    """The three columns of a phone's own estimate of gravity, or none."""
+    spelt = [(name, split_unit(name)[0]) for name in header]
+    found = [next((n for n, plain in spelt if re.fullmatch(rf"(?:.*_)?grav(?:ity)?_?{x}", plain)), "") for x in "xyz"]
+    return found if all(found) else []
 
 
 def find_clocks(header: Sequence[str]) -> list[str]:
@@ -166,6 +192,7 @@ def split_unit(name: str) -> tuple[str, str]:
     """The normalised name and the unit in it ('' if none)."""
     # part of the name, not a unit
     name = re.sub(r"[(\[]\s*([xyz]|lat|lon|alt)\s*[)\]]\s*$", r"_\1", name, flags=re.IGNORECASE)
+    name = re.sub(r"\[([012])\]\s*$", lambda found: "_" + "xyz"[int(found[1])], name)  # of an array of three
     bracket = re.search(r"[(\[]([^)\]]*)[)\]]\s*$", name)
     base = name[: bracket.start()] if bracket else name
     base = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", base)

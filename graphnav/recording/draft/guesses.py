@@ -119,7 +119,7 @@ def guess_gyro_unit(path: Path, gyro: Array, stated: str | None, lag: motion.Lag
             if 0.6 < abs(lag.slope) * scale < 1.6:
                 words = f"the turns are then those of the course (correlation {lag.correlation:.2f})"
                 if lag.correlation < 0.0:
-                    words = f"CHECK: {words}: the other way round; the sign of latitudes, longitudes or rates is wrong"
+                    words = f"CHECK: {words}: the other way round; the sign of positions, rates or forces is wrong"
                 return Guess(unit, words)
         if abs(lag.correlation) > _CLEAR and np.array_equal(gyro, np.round(gyro)):
             raise RecordingError(

@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from time import time
 
 import numpy as np
 
 from graphnav.core.errors import RecordingError
 from graphnav.core.rotation import Array
-from graphnav.core.timescales import WEEK, find_restarts
+from graphnav.core.timescales import GPS_TO_UNIX, UNIX, WEEK, find_restarts
 from graphnav.recording import Gnss, Imu, Odometer
 from graphnav.recording.draft import columns as matching
 from graphnav.recording.draft import guesses
@@ -19,7 +20,7 @@ from graphnav.recording.draft.guesses import Guess
 from graphnav.recording.draft.motion import is_course_in_radians
 from graphnav.recording.draft.plain import Plain, read_plain
 from graphnav.recording.formats.folder import read_other_log
-from graphnav.recording.formats.places import check_angles, find_places
+from graphnav.recording.formats.places import check_angles, find_places, is_in_whole_degrees
 from graphnav.recording.formats.registry import Log
 from graphnav.recording.formats.repair import blank_unknown, find_repeated, mask_new_fixes
 from graphnav.recording.formats.schema import WHEELS
@@ -54,6 +55,8 @@ WANTED = {
     "barometer": ("t", "pressure"),
     "gravity": ("t", "pull_x", "pull_y", "pull_z"),
 }
+_SMALL_UNITS = {"mm": 1e-3, "cm": 1e-2, "mm/s": 1e-3, "cm/s": 1e-2}  # m, m/s
+_OF_MOTION = ("ve", "vn", "vu", "vd", "sd_ve", "sd_vn", "sd_vu", "speed", "course")
 _PAUSES = 1000.0  # ratio of a log's duration to that of all its rows together, at most
 _NEEDED = {"gnss": 4, "odometer": 2}  # number of these that a row must have
 
@@ -69,6 +72,7 @@ class Source:
     t_unit: Guess = field(default_factory=lambda: Guess("s", ""))
     joined_from: tuple[Path, Path] | None = None  # files of a gyro and an accelerometer, whose rows are combined
     week: int | None = None  # the GPS week of the first row, where a column has it beside the seconds
+    unused: tuple[str, ...] = ()  # columns of the file that no sensor is read from
     second: str = ""  # columns of the file that might be this sensor's too, in words
     plain: Plain | None = None  # a table that is not a CSV file of numbers, which is converted into one
 
@@ -133,7 +137,8 @@ def read_log(path: Path, topics: Sequence[str] = ()) -> dict[str, Source]:
     except RecordingError as error:
         words = f"{path}: no table of a sensor is recognised in it" if error.key == "table.separator" else str(error)
         raise NoSensorError(words, key=error.key) from error
-    columns = matching.match_columns(header, path.name.split(".")[0])
+    wheels = matching.find_wheels(header)
+    columns = matching.match_columns([name for name in header if name not in wheels], path.name.split(".")[0])
     sensor = columns.sensor
     if sensor is None and "t" not in columns.names and matching.FileColumns({**columns.names, "t": ""}).sensor:
         raise _make_times_error(path, header, {} if plain is None else plain.words_in)
@@ -153,10 +158,117 @@ def read_log(path: Path, topics: Sequence[str] = ()) -> dict[str, Source]:
         roles.append("gnss")
     elif sensor == "imu" and "speed" in columns.names:
         roles.append("odometer")
-    found = {role: _read_sensor(path, columns, role, plain) for role in roles}
+    of = dict.fromkeys(roles, columns)
+    if wheels := [name for name in wheels if _read_numbers(path, name, plain)]:
+        own = matching.match_columns([columns.names["t"], *wheels])
+        clock = {"t": columns.units["t"]} if "t" in columns.units else {}
+        of["odometer"] = matching.FileColumns({**own.names, "t": columns.names["t"]}, {**own.units, **clock})
+    found: dict[str, Source] = {}
+    for role, some in of.items():  # whose clock is that of the first, whose rows are the most
+        found[role] = _read_sensor(path, some, role, plain, found[sensor].t_unit if found else None)
+    if sensor == "imu" and not has_gravity(found["imu"]):
+        found["imu"], of["imu"] = _find_gravity(path, header, columns, plain, found["imu"])
+    taken = {
+        theirs
+        for role, source in found.items()
+        for ours, theirs in of[role].names.items()
+        if ours in source.values or ours in "xyz"
+    } | {columns.names.get("week")}
+    found[sensor].unused = tuple(name for name in header if name and name not in taken)
     for role, source in found.items():
         source.second = _find_second(header, columns, WANTED[role][1:3] if role == "gnss" else WANTED[role][1:])
     return found
+
+
+def has_gravity(source: Source) -> bool:
+    """Whether the forces of a log are those of a raw accelerometer, in some unit."""
+    try:
+        guesses.guess_accel_unit(source.path, source.stack("ax", "ay", "az"), source.find_unit("ax", "accel"))
+    except RecordingError:
+        return False
+    return True
+
+
+def _find_gravity(
+    path: Path, header: list[str], columns: matching.FileColumns, plain: Plain | None, bare: Source
+) -> tuple[Source, matching.FileColumns]:
+    """An IMU whose forces are without gravity: with the table's other forces, or plus its columns of gravity."""
+    axes = ("ax", "ay", "az")
+    rest = [name for name in header if name not in [columns.names[ours] for ours in axes]]
+    other = matching.match_columns(rest)
+    if set(axes) <= other.names.keys():
+        both = matching.FileColumns(
+            {**columns.names, **{ours: other.names[ours] for ours in axes}},
+            {
+                ours: unit
+                for ours, unit in (columns.units | other.units).items()
+                if ours not in axes or ours in other.units
+            },
+        )
+        source = _read_sensor(path, both, "imu", plain)
+        if has_gravity(source):
+            return source, both
+    pull = matching.find_gravity(rest)
+    if len(pull) == len(axes):
+        sources = [
+            _read_sensor(path, matching.FileColumns({**columns.names, ours: theirs}, columns.units), "imu", plain)
+            for ours, theirs in zip(axes, pull, strict=True)
+        ]
+        values = {ours: bare.values[ours] + one.values[ours] for ours, one in zip(axes, sources, strict=True)}
+        names = {**bare.columns.names, **{ours: ours for ours in axes}}
+        words = f"forces are the sum of '{columns.names['ax']}' and '{pull[0]}', and so on"
+        plain = replace(bare.plain, words=f"{bare.plain.words}, {words}") if bare.plain else Plain({}, words)
+        whole = replace(bare, columns=replace(bare.columns, names=names), values={**bare.values, **values}, plain=plain)
+        if has_gravity(whole):
+            return whole, matching.FileColumns({**columns.names, **dict(zip("xyz", pull, strict=True))}, columns.units)
+    return bare, columns
+
+
+def _convert_small_units(
+    columns: matching.FileColumns, names: dict[str, str], values: dict[str, Array], plain: Plain | None
+) -> tuple[matching.FileColumns, dict[str, str], Plain | None]:
+    """Columns whose names state mm, cm, or these per second, made m and m/s, which are the units of a recording."""
+    stated = {ours: matching.NAMED_UNITS.get(columns.units.get(ours, ""), ("", ""))[1] for ours in values}
+    small = {ours: unit for ours, unit in stated.items() if unit in _SMALL_UNITS}
+    if not small:
+        return columns, names, plain
+    for ours, unit in small.items():
+        values[ours] = values[ours] * _SMALL_UNITS[unit]
+    pairs = dict.fromkeys(f"'{names[ours]}' in {unit}" for ours, unit in small.items())
+    words = f"{', '.join(pairs)}, made m or m/s"
+    plain = replace(plain, words=f"{plain.words}, {words}") if plain is not None else Plain({}, words)
+    units = {ours: unit for ours, unit in columns.units.items() if ours not in small}
+    return matching.FileColumns(columns.names, units), {**names, **{ours: ours for ours in small}}, plain
+
+
+def _read_whole_degrees(table: Table, names: dict[str, str], plain: Plain | None) -> tuple[Table, Plain | None]:
+    """Places in whole numbers of 1e-7 deg, as u-blox and MAVLink have them, in deg, and heights beside them in m.
+
+    Whole numbers of speed and course beside them are in units that these do not share, so they are left alone.
+    """
+    at = {ours: x[np.isfinite(x)] for ours, x in table.columns.items() if ours != "t"}
+    if not (is_in_whole_degrees(at["lat"], at["lon"]) and all(map(_are_whole, (at["lat"], at["lon"])))):
+        return table, plain
+    for ours in [o for o in at if o in _OF_MOTION and _are_whole(at[o])]:
+        del names[ours]
+    heights = ["h"] if "h" in at and _are_whole(at["h"]) else []
+    for ours in ("lat", "lon", *heights):
+        table = table.with_column(ours, table[ours] * (1e-3 if ours == "h" else 1e-7))
+    words = f"'{names['lat']}', '{names['lon']}' in 1e-7 deg, made deg" + f", '{names['h']}' in mm, made m" * len(
+        heights
+    )
+    for ours in ("lat", "lon", *heights):
+        names[ours] = ours
+    return table, replace(plain, words=f"{plain.words}, {words}") if plain is not None else Plain({}, words)
+
+
+def _are_whole(x: Array) -> bool:
+    return np.array_equal(x, np.round(x))
+
+
+def _are_gps_seconds(t: Array) -> bool:
+    """Whether stamps of a receiver (s) count from the GPS epoch: as such they are dates, and not of the future."""
+    return float(t[0]) > UNIX and float(t[-1]) + GPS_TO_UNIX < time()
 
 
 def _find_second(header: list[str], columns: matching.FileColumns, core: Sequence[str]) -> str:
@@ -217,8 +329,10 @@ def _read_numbers(path: Path, name: str, plain: Plain | None) -> bool:
         return False
 
 
-def _read_sensor(path: Path, columns: matching.FileColumns, role: str, plain: Plain | None) -> Source:
-    """The columns of one sensor: rows complete in what it needs, in order of time."""
+def _read_sensor(
+    path: Path, columns: matching.FileColumns, role: str, plain: Plain | None, clock: Guess | None = None
+) -> Source:
+    """The columns of one sensor: rows complete in what it needs, in order of time; `clock` is their unit, if known."""
     wanted = WANTED[role]
     names = {ours: theirs for ours, theirs in columns.names.items() if ours in wanted}
     if role in ("imu", "gnss") and "week" in columns.names:
@@ -242,6 +356,7 @@ def _read_sensor(path: Path, columns: matching.FileColumns, role: str, plain: Pl
                 f"{path}: every row is at 0, 0: the receiver had no fix, or its positions are in other columns",
                 key="draft.no_fix",
             )
+        table, plain = _read_whole_degrees(table, names, plain)
         whole[whole] = find_places(table["lat"][whole], table["lon"][whole], ANGLE["deg"])  # as it will be read
         check_angles(table.take(whole), ANGLE["deg"], "GNSS")
     if whole.sum() < 2:
@@ -258,7 +373,7 @@ def _read_sensor(path: Path, columns: matching.FileColumns, role: str, plain: Pl
         words = f"days of '{names['t']}', as a spreadsheet counts them, as Unix time in s; CHECK: taken as UTC"
         values["t"], plain = seconds, Plain({}, words)
     inertial = role not in ("gnss", "odometer", "barometer")
-    unit = guesses.guess_time_unit(values["t"], matching.find_stated_unit(columns, "t", "t"), inertial)
+    unit = clock or guesses.guess_time_unit(values["t"], matching.find_stated_unit(columns, "t", "t"), inertial)
     if (later := find_restarts(values["t"], TIME_UNITS[str(unit.value)])) is not None:  # as it will be read
         values["t"] = values["t"] + later
     order = np.argsort(values["t"], kind="stable")
@@ -276,6 +391,7 @@ def _read_sensor(path: Path, columns: matching.FileColumns, role: str, plain: Pl
             values["course"] = np.degrees(values["course"])
             words = f"'{names['course']}' is in rad, by the positions; made deg"
             plain = replace(plain, words=f"{plain.words}, {words}") if plain is not None else Plain({}, words)
+    columns, names, plain = _convert_small_units(columns, names, values, plain)
     step = np.diff(values["t"])
     if step.sum() > _PAUSES * len(step) * np.median(step):
         k = int(np.argmax(step))
@@ -289,4 +405,6 @@ def _read_sensor(path: Path, columns: matching.FileColumns, role: str, plain: Pl
         values["speed"] = np.mean([values[w] for w in rear], axis=0)
         columns = matching.FileColumns(columns.names, {**columns.units, "speed": columns.units.get(rear[0], "")})
     week = int(weeks[0]) if len(weeks) and weeks[0] > 0 and np.isfinite(weeks[0]) else None
+    if week is None and "gps" in names["t"].lower() and _are_gps_seconds(values["t"] * TIME_UNITS[str(unit.value)]):
+        week, unit = 0, replace(unit, why=f"as s since the GPS epoch '{names['t']}' is then a date in the past")
     return Source(path, matching.FileColumns(names, columns.units), values, t_unit=unit, week=week, plain=plain)

@@ -83,9 +83,14 @@ def read_plain(path: Path) -> Plain | None:
     if len(start) == _START:  # probably cut off within a line
         start = start[: start.rindex(b"\n")] if b"\n" in start else start
     begin, _ = _decode(start)
-    layout = _lay_out(path, _read_lines(begin.splitlines()))
-    if layout is None or (path.suffix == ".gz" and layout.mark == "," and not layout.done):
-        return None  # what is packed is large, and no spreadsheet's
+    head = _read_lines(begin.splitlines())
+    layout = _lay_out(path, head)
+    if layout is None:
+        return None
+    cells_of_first = _split(head[layout.first][1], layout.mark)
+    plainly = layout.mark == "," and not layout.done and all(_parse_column([x]) is not None for x in cells_of_first)
+    if path.suffix == ".gz" and plainly:  # what is packed is large
+        return None
     text, encoding = _decode(read_bytes(path))
     lines = _read_lines(text.splitlines())
     rows = [_split(line, layout.mark) for _, line in lines[layout.first :]]

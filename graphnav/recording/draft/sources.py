@@ -10,12 +10,13 @@ from pathlib import Path
 import numpy as np
 
 from graphnav.core.errors import RecordingError
+from graphnav.core.notes import get_key
 from graphnav.core.rotation import Array
 from graphnav.core.timescales import DAY, GPS_TO_UNIX
 from graphnav.recording.draft import columns as matching
 from graphnav.recording.draft import guesses, motion
 from graphnav.recording.draft.guesses import Guess
-from graphnav.recording.draft.logs import WANTED, NoSensorError, Source, read_log
+from graphnav.recording.draft.logs import WANTED, NoSensorError, Source, has_gravity, read_log
 from graphnav.recording.draft.parts import join_parts
 from graphnav.recording.draft.raw import RawFiles, separate_raw, tell_kind
 from graphnav.recording.formats import list_formats
@@ -24,7 +25,7 @@ from graphnav.sensors.tables import ANGLE
 
 JOINED = "joined_imu.csv.gz"  # the file combined from a gyro's and an accelerometer's; no log has this name
 
-_TEXT_ENDINGS = (".csv", ".csv.gz", ".txt", ".tsv", ".dat", ".asc", ".log")  # files of a folder that are considered
+_TEXT_ENDINGS = (".csv", ".txt", ".tsv", ".dat", ".asc", ".log")  # of files of a folder that are considered
 
 _TRACKS = (".gpx", ".kml", ".kmz", ".fit", ".tcx", ".geojson")
 _POSITIONS = re.compile(r"(?:^|[^a-z])(?:gnss|gps|rtk|location|position|track|fix)(?:$|[^a-rt-z])", re.IGNORECASE)
@@ -90,6 +91,9 @@ def find_logs(paths: Sequence[Path], topics: Sequence[str] = ()) -> LogsFound:
         unread = f" ({refused[0]})" if refused else ""
         if others and not refused and not raw.observed:
             unread = f" ({others})"
+        logs = [source.log for some in every.values() for source in some if source.log is not None]
+        if skipped := [note for log in logs for note in log.remarks if get_key(note) == "log.broken_lines"]:
+            unread = f" ({skipped[0]}; lines of an IMU belong in a table of their own, with a header)"
         raise RecordingError(
             f"{paths[0]}: no IMU in these logs (found: {there}); three gyro and three force columns are one{unread}",
             key="draft.no_imu",
@@ -141,8 +145,11 @@ def _check_unread(paths: Sequence[Path], tables: Mapping[Path, str]) -> None:
 def _find_unix_start(source: Source) -> float | None:
     """Unix time of the first row of a log with a known date, s."""
     if source.log is None:
-        return float(source.t[0]) if guesses.is_date(source.t) else None
-    begin = next(sensor.t[0] for sensor in source.held)
+        begin = float(source.t[0])
+        if source.week is None:
+            return begin if guesses.is_date(source.t) else None
+    else:
+        begin = next(sensor.t[0] for sensor in source.held)
     return None if source.gps_zero is None else float(source.gps_zero + begin + GPS_TO_UNIX)
 
 
@@ -154,7 +161,11 @@ def _list_logs(path: Path) -> list[Path]:
     made = {JOINED, "recording.toml"}  # written by an earlier draft
     made |= {name_plain_file(p, sensor) for p in every for sensor in WANTED}
     inside = sorted(p for p in every if p.name not in made)
-    logs = [p for p in inside if p.name.lower().endswith(_TEXT_ENDINGS) or _is_known(p) or tell_kind(p)[0]]
+    logs = [
+        p
+        for p in inside
+        if p.name.lower().removesuffix(".gz").endswith(_TEXT_ENDINGS) or _is_known(p) or tell_kind(p)[0]
+    ]
     if not logs:
         there = f" ({others})" if (others := _name_others([path], [])) else ""
         raise RecordingError(
@@ -185,7 +196,7 @@ def _is_known(path: Path) -> bool:
 def _choose_source(sensor: str, some: list[Source], left: list[str]) -> Source | None:
     """The log to use of several of one sensor; the others are noted with the reason."""
     if sensor == "accel":
-        with_gravity = [s for s in some if _has_gravity(s)]
+        with_gravity = [s for s in some if has_gravity(s)]
         if len(with_gravity) < len(some) and with_gravity:
             names = ", ".join(s.path.name for s in some if s not in with_gravity)
             left.append(f"left out: {names}: accelerations without gravity")
@@ -207,14 +218,6 @@ def _choose_source(sensor: str, some: list[Source], left: list[str]) -> Source |
     if others:
         left.append(f"left out: {', '.join(others)}: a second {sensor}, beside {best.path.name}")
     return best
-
-
-def _has_gravity(source: Source) -> bool:
-    try:
-        guesses.guess_accel_unit(source.path, source.stack("ax", "ay", "az"), source.find_unit("ax", "accel"))
-    except RecordingError:
-        return False
-    return True
 
 
 def _add_gravity(accel: Source, gravity: Source, left: list[str]) -> Source:

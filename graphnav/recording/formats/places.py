@@ -100,9 +100,14 @@ def check_angles(rows: Table, scale: float, label: str) -> None:
         )
 
 
+def is_in_whole_degrees(lat: Array, lon: Array) -> bool:
+    """Whether latitudes and longitudes (N,) may be in units of 1e-7 deg: they are none in degrees."""
+    return bool((np.abs(lat) <= 90e7).all() and np.median(np.abs(lat)) > 1e5 and (np.abs(lon) <= 360e7).all())
+
+
 def _guess_other_form(lat: Array, lon: Array, label: str) -> str:
     """The likely mistake behind latitudes and longitudes out of range."""
-    if (np.abs(lat) <= 90e7).all() and np.median(np.abs(lat)) > 1e5 and (np.abs(lon) <= 360e7).all():
+    if is_in_whole_degrees(lat, lon):
         return "; in units of 1e-7 deg, as u-blox and MAVLink have them? Write degrees"
     if all((np.abs(x) % 100.0 < 60.0).all() and np.abs(x).max() < 100.0 * top for x, top in ((lat, 91), (lon, 181))):
         whole, minutes = divmod(abs(lat[0]), 100.0)

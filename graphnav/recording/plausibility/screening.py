@@ -239,7 +239,7 @@ def _find_scale(f: float) -> str | None:
     if g / _SCALE_RATIO < f < g * _SCALE_RATIO:
         return None
     units = {g / size: f'the accelerometer seems to be in {name}: set units = {{ accel = "{name}" }}'
-             for name, size in FORCE.items() if name != "m/s2"}  # fmt: skip
+             for name, size in FORCE.items() if size > 0.0 and name != "m/s2"}  # fmt: skip
     units[g * FORCE["g"]] = "the accelerometer seems to be in m/s2 already: leave out units.accel"
     near = min(units, key=lambda value: abs(np.log(max(f, 1e-9) / value)))
     if 1.0 / _UNIT_RATIO < f / near < _UNIT_RATIO:
