@@ -58,7 +58,7 @@ def explain(
     among : explanations to compare with that nothing is wrong.
     """
     if not spans:
-        return Decision(found.noise, found.log_posterior)
+        return Decision(found.noise, found.log_evidence)
     noise = replace(found.noise, excluded={})
     reach = extend_to_next_fix(base, spans, FIXES)
     outside = {name: drop_within(some, reach if name in INTERVALS else spans) for name, some in noise.weights.items()}
@@ -107,7 +107,8 @@ def explain(
     excluded = {name: some for name, some in excluded.items() if name in present}
     weights = {name: drop_within(some, dropped[name]) for name, some in noise.weights.items()}
     noise = replace(noise, weights=weights, excluded=excluded)
-    return Decision(noise, evidence + found.log_prior, Counter(filter=passes))
+    evidence += found.log_prior - compute_outlier_cost(outside, totals)
+    return Decision(noise, evidence, Counter(filter=passes))
 
 
 def list_explanations(noise: NoiseModel) -> set[Explanation]:
@@ -120,17 +121,12 @@ def list_explanations(noise: NoiseModel) -> set[Explanation]:
 
 
 def weigh_evidence(base: Problem, found: NoiseEstimate) -> NoiseEstimate:
-    """The estimate with the evidence of all measurements, excluded ones included, and the passes that this takes.
-
-    Each outlier outside the spans has its cost.
-    """
+    """The estimate with the evidence of all measurements, excluded ones included, and the passes that this takes."""
     if found.whole_evidence is not None:
         return found
     spans = join(span for some in found.noise.excluded.values() for span in some)
     whole = explain(base, found, spans, list_explanations(found.noise))
-    outside = {name: drop_within(some, spans) for name, some in found.noise.weights.items()}
-    evidence = whole.log_evidence - compute_outlier_cost(outside, count_rows(base))
-    return replace(found, whole_evidence=evidence, passes=found.passes + whole.passes)
+    return replace(found, whole_evidence=whole.log_evidence, passes=found.passes + whole.passes)
 
 
 def log_evidence(base: Problem, found: NoiseEstimate) -> float:

@@ -13,8 +13,6 @@ from graphnav.estimation.problem import Problem
 
 CHANCE = 1e-3  # probability of a larger squared error, below which a row is an outlier
 OUTLIER_COST = -float(np.log(CHANCE))  # negative prior log-probability of one outlier
-# exponent of the density of a row with a limited square, per logarithm of its weight, beyond the Gaussian's
-_TAIL = 0.5 * (float(chdtri(1, CHANCE)) - 1.0)
 
 
 def limit_squares(squared: Array, m: int) -> Array:
@@ -39,14 +37,9 @@ def list_reduced(t: Array, weight: Array, used: Array) -> RowWeights:
     return RowWeights(t[less], weight[less])
 
 
-def count_reduced(some: RowWeights) -> float:
-    """How many outliers rows of reduced weight amount to; they are listed with all rows of their times.
-
-    A square s^2 beyond the limit q has the weight w = q / s^2, so the density of its row falls as (q / s^2)^(q/2). The
-    Gaussian of a variance divided by w has (q / s^2)^(1/2) there instead, and w^-(q-1)/2 is what it has too much. A row
-    just beyond the limit costs next to nothing, therefore, and none costs more than an outlier.
-    """
-    return float(np.sum(np.minimum(-_TAIL / OUTLIER_COST * np.log(some.weight), 1.0)))
+def count_reduced(some: RowWeights) -> int:
+    """How many rows have a weight below 1; they are listed with all rows of their times."""
+    return int(np.sum(some.weight < 1.0))
 
 
 def count_rows(problem: Problem) -> dict[str, int]:
@@ -55,7 +48,7 @@ def count_rows(problem: Problem) -> dict[str, int]:
 
 
 def compute_outlier_cost(weights: Mapping[str, RowWeights], totals: Mapping[str, int]) -> float:
-    """Negative prior log-probability of as many outliers as reduced weights amount to, less that of none.
+    """Negative prior log-probability of as many outliers as there are reduced weights, less that of none.
 
     How often a sensor has outliers is unknown. With a Beta prior of 1 and 1 / `CHANCE`, its mean `CHANCE`, k given ones
     of n rows are outliers with a probability of B(k + 1, n - k + 1 / `CHANCE`) / B(1, 1 / `CHANCE`).
@@ -85,5 +78,5 @@ def may_pay(squared: Array, freedom: Array) -> bool:
 
 def compute_latest_cost(some: RowWeights, total: int) -> float:
     """The cost of the latest of some outliers among all rows of a sensor."""
-    k = max(count_reduced(some), 1.0)
+    k = max(count_reduced(some), 1)
     return float(np.log((total - k + 1.0 / CHANCE) / k))
