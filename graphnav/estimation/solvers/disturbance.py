@@ -13,28 +13,50 @@ from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, MOVING
 from graphnav.estimation.solvers.recursion import Arrays
 
+_FORWARD = 64  # keyframes that are smoothed from one that is filtered
+
 
 @compile_once
 def step_back(F: Array, decay: Array, N: Array) -> Array:
-    """N (D, D) before a step from that behind it."""
+    """N (D, D) before a step from that behind it.
+
+    With M the rows of F for what moves, d the factors of everything else, and X = M N_mm / 2 + N_m. d:
+    M^T X + X^T M, and d N d of everything else.
+    """
     w, D = F.shape[1], len(N)
-    moving, one, out = F[:MOVING], np.empty((D, D)), np.empty((D, D))
-    top = np.dot(moving.T, N[:MOVING])
+    moving, out = F[:MOVING], np.empty((D, D))
+    X = np.zeros((MOVING, D))
+    np.multiply(0.5, np.dot(np.ascontiguousarray(N[:MOVING, :MOVING]), moving), X[:, :w])
+    for i in range(MOVING):
+        row, values = X[i], N[i]
+        for j in range(MOVING, DIM):
+            row[j] += values[j]
+        behind, shrunk = row[DIM:], values[DIM:]
+        for j in range(D - DIM):
+            behind[j] += shrunk[j] * decay[j]
+    Y = np.dot(moving.T, X)
     for i in range(D):
-        d = 1.0 if i < DIM else decay[i - DIM]
-        for j in range(D):
-            one[i, j] = d * N[i, j] if i >= MOVING else 0.0
+        row, values = out[i], N[i]
+        if i < MOVING:
+            row[:] = 0.0
+        else:
+            d = 1.0 if i < DIM else decay[i - DIM]
+            for j in range(MOVING):
+                row[j] = 0.0
+            for j in range(MOVING, DIM):
+                row[j] = d * values[j]
+            behind, shrunk = row[DIM:], values[DIM:]
+            for j in range(D - DIM):
+                behind[j] = shrunk[j] * (d * decay[j])
         if i < w:
-            for j in range(D):
-                one[i, j] += top[i, j]
-    left = np.dot(np.ascontiguousarray(one[:, :MOVING]), moving)
-    for j in range(D):
-        d = 0.0 if j < MOVING else 1.0 if j < DIM else decay[j - DIM]
-        for i in range(j, D):
-            x = d * one[i, j]
-            if j < w:
-                x += left[i, j]
-            out[i, j] = out[j, i] = x
+            own = Y[i]
+            for j in range(w):
+                row[j] += own[j] + Y[j, i]
+            for j in range(w, D):
+                row[j] += own[j]
+        else:
+            for j in range(w):
+                row[j] += Y[j, i]
     return out
 
 
@@ -68,24 +90,47 @@ def take_back(N: Array, H: Array, Kt: Array, inverse: Array, lossy: bool) -> Arr
 
 @compile_once
 def smooth_errors(
-    k1: int, r: Array, steps: Arrays, updates: Arrays, blocks: Arrays, filtered: Arrays, smoothed: Array
+    k1: int, r: Array, steps: Arrays, driven: Arrays, updates: Arrays, blocks: Arrays, filtered: Arrays, smoothed: Array
 ) -> None:
-    """Errors (n, D) of the smoother at keyframes before k1, as `smooth_rows` has them, by r (D,) there alone."""
+    """Errors (n, D) of the smoother at keyframes before k1, as `smooth_rows` has them, by r (D,) there alone.
+
+    From the filtered ones of a keyframe, those behind it without their covariances: e_{k+1} = gap + F e_k + Q r_{k+1}
+    (Koopman 1993, "fast state smoothing"); from a filtered one again before rounding errors grow with the free inertial
+    solution.
+
+    Parameters
+    ----------
+    driven : gap, Q and added of the steps, as of `graphnav.estimation.solvers.recursion.filter_rows`.
+    """
     F, decay = steps
+    gap, Q, added = driven
     Kt, H, w, _, taken, _ = updates
     first, begin, end, _, _, _ = blocks
     errors_predicted, P_predicted, errors, P = filtered
-    for k in range(k1 - 1, -1, -1):
-        ahead = k < len(F)
-        if ahead:
-            r = step_vector_back(F[k], decay[k], r)
-            np.add(errors[k], np.dot(P[k], r), smoothed[k])
-        for b in range(first[k + 1] - 1, first[k] - 1, -1):
-            if taken[b]:
-                lo, hi = begin[b], end[b]
-                r = r + np.dot(w[k, lo:hi] - np.dot(Kt[k, lo:hi], r), H[k, lo:hi])
-        if not ahead:
-            np.add(errors_predicted[k], np.dot(P_predicted[k % len(P_predicted)], r), smoothed[k])
+    kept, pushed = np.empty((_FORWARD, len(r))), np.empty(DIM)
+    for hi in range(k1, 0, -_FORWARD):
+        lo = max(hi - _FORWARD, 0)
+        for k in range(hi - 1, lo - 1, -1):
+            if k < len(F):
+                r = step_vector_back(F[k], decay[k], r)
+                if k == lo:
+                    np.add(errors[k], np.dot(P[k], r), smoothed[k])
+            for b in range(first[k + 1] - 1, first[k] - 1, -1):
+                if taken[b]:
+                    here = slice(begin[b], end[b])
+                    r = r + np.dot(w[k, here] - np.dot(Kt[k, here], r), H[k, here])
+            if k == lo and k == len(F):
+                np.add(errors_predicted[k], np.dot(P_predicted[k % len(P_predicted)], r), smoothed[k])
+            np.positive(r, kept[k - lo])
+        for k in range(lo, hi - 1):
+            e, behind, drives = smoothed[k], smoothed[k + 1], kept[k + 1 - lo]
+            np.dot(F[k], e[: F.shape[2]], behind[:DIM])
+            np.dot(Q[k], drives[:DIM], pushed)
+            for i in range(len(r)):
+                if i < DIM:
+                    behind[i] += gap[k, i] + pushed[i]
+                else:
+                    behind[i] = gap[k, i] + decay[k, i - DIM] * e[i] + added[k, i - DIM] * drives[i]
 
 
 @compile_once
@@ -95,9 +140,9 @@ def smooth_rows(
 ) -> tuple[Array, Array]:  # fmt: skip
     """r (n, D), and of N the states' part (n, 15, 15) and the diagonal (n, D), of keyframes k1 - 1 down to k0.
 
-    From those of k1, zero where there is none; returns those of k0. And errors (n, D) of the smoother there: from the
-    filtered ones, because predicted errors of a position that only the first fix determines are larger by ten orders
-    than their smoothed values.
+    From those of k1, zero where there is none; returns those of k0. With covariances of the smoother, its errors (n, D)
+    too: from the filtered ones, because predicted errors of a position that only the first fix determines are larger by
+    ten orders than their smoothed values.
 
     Parameters
     ----------
@@ -113,13 +158,15 @@ def smooth_rows(
     first, begin, end, _, _, _ = blocks
     errors_predicted, P_predicted, errors, P = filtered
     smoothed, r, N, N_diagonal = found
+    whole = len(covered[0]) > 0
     for k in range(k1 - 1, k0 - 1, -1):
         rows = end[first[k + 1] - 1] if first[k] < first[k + 1] else 0
         ahead = k < len(F)  # at the last keyframe the filtered covariance already is of errors about the estimate
         if ahead:
             r_k = step_vector_back(F[k], decay[k], r_k)
             N_k = step_back(F[k], decay[k], N_k)
-            np.add(errors[k], np.dot(P[k], r_k), smoothed[k])
+            if whole:
+                np.add(errors[k], np.dot(P[k], r_k), smoothed[k])
             fill_covariances(k, P[k], N_k, rows, wanted, first_wanted, asked, covered)
         for b in range(first[k + 1] - 1, first[k] - 1, -1):
             if taken[b]:
@@ -133,7 +180,8 @@ def smooth_rows(
             N_diagonal[k, i] = N_k[i, i]
         if not ahead:
             ahead_P = P_predicted[k % len(P_predicted)]
-            np.add(errors_predicted[k], np.dot(ahead_P, r_k), smoothed[k])
+            if whole:
+                np.add(errors_predicted[k], np.dot(ahead_P, r_k), smoothed[k])
             fill_covariances(k, ahead_P, N_k, rows, wanted, first_wanted, asked, covered)
     return r_k, N_k
 

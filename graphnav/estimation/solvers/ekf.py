@@ -52,6 +52,7 @@ from graphnav.estimation.solvers.passes import (
     subtract_points,
 )
 from graphnav.estimation.solvers.points import FilterErrors, Linearisation, PointFilter
+from graphnav.estimation.solvers.recursion import Arrays
 from graphnav.estimation.solvers.rts import smooth_backward
 from graphnav.estimation.solvers.stack import Innovations, Stack
 from graphnav.estimation.solvers.stretches import STAYS, StretchFilter
@@ -199,6 +200,7 @@ def _run_forward(
     errors = FilterErrors(np.empty((n, D)), all_Pp, np.empty((n, D)), all_P)
     x, P = _start_from_prior(problem)
     updates, search = None, None
+    driven: Arrays = ()
     if about is not None:
         one = Linearisation.of(problem, about, stack, steps)
         all_F[: n - 1] = one.F
@@ -211,7 +213,7 @@ def _run_forward(
             follow = partial(_hold_errors, decide, about, errors)
         start = subtract_points(x, about.take_first(1))[0]
         given.run(partial(_get_start, start, P, stack.records, search), follow, progress)
-        updates = given.updates
+        updates, driven = given.updates, (given.gap, given.Q, steps.added)
         # from there on it is linearised at the filter's estimate
         last = about.take(slice(n - 1, n))
         x = move_points(last, errors.filtered[n - 1 :])
@@ -248,6 +250,7 @@ def _run_forward(
         errors.filtered,
         errors.predicted,
         updates,
+        driven,
         log_likelihood,
     )
 

@@ -86,7 +86,9 @@ def smooth_points(forward: ForwardRecord) -> Points:
                 raise explain_smoother()
         if one is not None:
             steps = forward.F, forward.decay
-            smooth_errors(end, r, steps, one.arrays, one.blocks.arrays, forward.filtered, errors)
+            smooth_errors(
+                end, r, steps, forward.driven, one.arrays, one.blocks.arrays, forward.filtered, errors
+            )  # fmt: skip
         parts = [move_points(forward.about.take_first(end), errors[:end]), *parts]
     return join_passes(parts)
 
