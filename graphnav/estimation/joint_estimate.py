@@ -23,6 +23,7 @@ from graphnav.estimation.contradictions import (
     free,
     update_freed,
 )
+from graphnav.estimation.noise.apply import apply_noise
 from graphnav.estimation.noise.decision import log_evidence, weigh_evidence
 from graphnav.estimation.noise.estimate import NoiseEstimate, estimate_noise
 from graphnav.estimation.noise.exclusion import (
@@ -31,10 +32,9 @@ from graphnav.estimation.noise.exclusion import (
     estimate_without_faults,
 )
 from graphnav.estimation.noise.initial_points import BREAKDOWN
-from graphnav.estimation.noise.model import NoiseModel
+from graphnav.estimation.noise.model import INTERVALS, NoiseModel
 from graphnav.estimation.offsets import is_offset_far
 from graphnav.estimation.problem import Problem
-from graphnav.estimation.solvers.linearise import Points
 
 
 @dataclass(frozen=True)
@@ -74,8 +74,8 @@ class JointEstimate:
         return replace(self, estimate=replace(self.estimate, passes=passes))
 
 
-# a problem with stated noise, first points and the problem that they are of -> its noise model
-_Estimate = Callable[[Problem, tuple[Points, Problem] | None], NoiseEstimate]
+# a problem with stated noise, and an estimate of nearly the same to start from, if any -> its noise model
+_Estimate = Callable[[Problem, JointEstimate | None], NoiseEstimate]
 
 
 def estimate_jointly(
@@ -95,8 +95,8 @@ def estimate_jointly(
         If the filter breaks down.
     """
 
-    def estimate(base: Problem, near: tuple[Points, Problem] | None) -> NoiseEstimate:
-        return estimate_noise(base, opening, near=near, progress=progress)
+    def estimate(base: Problem, before: JointEstimate | None) -> NoiseEstimate:
+        return _estimate_from(before, base, opening, progress)
 
     found = _free_contradicted(JointEstimate(stated, {}, estimate(stated, None)), settings, estimate)
     return replace(found, estimate=_leave_out_faults(found.base, found.estimate, settings, opening, progress))
@@ -112,12 +112,24 @@ def revise_jointly(
     found : by `estimate_jointly`; the others are as there.
     """
 
-    def estimate(base: Problem, near: tuple[Points, Problem] | None) -> NoiseEstimate:
-        one = estimate_noise(base, opening, near=near, progress=progress)
+    def estimate(base: Problem, before: JointEstimate | None) -> NoiseEstimate:
+        one = _estimate_from(before, base, opening, progress)
         return estimate_disturbed_intervals(base, _leave_out_faults(base, one, settings, opening, progress))
 
     found = replace(found, estimate=estimate_disturbed_intervals(found.base, found.estimate))
     return _free_contradicted(found, settings, estimate)
+
+
+def _estimate_from(
+    before: JointEstimate | None, base: Problem, opening: float | None, progress: Progress | None
+) -> NoiseEstimate:
+    """Estimate with all measurements, from the figures of another estimate, which the priors are further from."""
+    if before is None:
+        return estimate_noise(base, opening, progress=progress)
+    noise = before.estimate.noise
+    weights = {name: some for name, some in noise.weights.items() if name not in INTERVALS}
+    start, near = replace(noise, weights=weights, excluded={}), before.estimate.get_linearisation(before.base)
+    return estimate_noise(base, opening, start, near, progress, changed=True)
 
 
 def _leave_out_faults(
@@ -134,17 +146,16 @@ def _free_contradicted(found: JointEstimate, settings: GnssSettings, estimate: _
     if found.estimate.noise is found.tested:
         return found
     base, before = found.stated, found.freed
-    near = found.estimate.get_linearisation(found.base)
-    names = set[str]() if settings.clock_rate_sigma == 0.0 else {CLOCK_RATE}
-    if not is_offset_far(near[1], found.estimate.points):
-        names |= {LEVER_ARM, TIME_OFFSET, VELOCITY_TIME_OFFSET}
     passes, tested = found.estimate.passes + Counter(filter=1), found.estimate.noise
+    names = set[str]() if settings.clock_rate_sigma == 0.0 else {CLOCK_RATE}
+    if not is_offset_far(apply_noise(found.base, tested), found.estimate.points):
+        names |= {LEVER_ARM, TIME_OFFSET, VELOCITY_TIME_OFFSET}
     try:
         freed = find_contradicted_constants(base, found.estimate, before, names)
         if not are_same(freed, before, base):
             found = found.weigh()
             passes = found.estimate.passes + Counter(filter=1)
-            other = replace(found, freed=freed, estimate=estimate(free(base, freed), near)).weigh()
+            other = replace(found, freed=freed, estimate=estimate(free(base, freed), found)).weigh()
             passes = passes + other.estimate.passes + Counter(filter=1)
             # with other figures, this may lead to a worse optimum than before
             if found.compute_evidence() <= other.compute_evidence() + other.estimate.gained_by_chance:
