@@ -32,7 +32,7 @@ from graphnav.estimation.noise.exclusion import (
     estimate_without_faults,
 )
 from graphnav.estimation.noise.initial_points import BREAKDOWN
-from graphnav.estimation.noise.model import INTERVALS, NoiseModel
+from graphnav.estimation.noise.model import NoiseModel
 from graphnav.estimation.offsets import is_offset_far
 from graphnav.estimation.problem import Problem
 
@@ -74,8 +74,8 @@ class JointEstimate:
         return replace(self, estimate=replace(self.estimate, passes=passes))
 
 
-# a problem with stated noise, and an estimate of nearly the same to start from, if any -> its noise model
-_Estimate = Callable[[Problem, JointEstimate | None], NoiseEstimate]
+# a problem with stated noise, and the estimate with other constants free -> its noise model
+_Estimate = Callable[[Problem, JointEstimate], NoiseEstimate]
 
 
 def estimate_jointly(
@@ -95,10 +95,15 @@ def estimate_jointly(
         If the filter breaks down.
     """
 
-    def estimate(base: Problem, before: JointEstimate | None) -> NoiseEstimate:
-        return _estimate_from(before, base, opening, progress)
+    def estimate(base: Problem, before: JointEstimate, start: NoiseModel | None = None) -> NoiseEstimate:
+        near = before.estimate.get_linearisation(before.base)
+        return estimate_noise(base, opening, start, near, progress, changed=True)
 
-    found = _free_contradicted(JointEstimate(stated, {}, estimate(stated, None)), settings, estimate)
+    def go_on(base: Problem, before: JointEstimate) -> NoiseEstimate:
+        return estimate(base, before, before.estimate.noise)
+
+    found = JointEstimate(stated, {}, estimate_noise(stated, opening, progress=progress))
+    found = _free_contradicted(found, settings, go_on, estimate)
     return replace(found, estimate=_leave_out_faults(found.base, found.estimate, settings, opening, progress))
 
 
@@ -112,24 +117,13 @@ def revise_jointly(
     found : by `estimate_jointly`; the others are as there.
     """
 
-    def estimate(base: Problem, before: JointEstimate | None) -> NoiseEstimate:
-        one = _estimate_from(before, base, opening, progress)
+    def estimate(base: Problem, before: JointEstimate) -> NoiseEstimate:
+        near = before.estimate.get_linearisation(before.base)
+        one = estimate_noise(base, opening, near=near, progress=progress)
         return estimate_disturbed_intervals(base, _leave_out_faults(base, one, settings, opening, progress))
 
     found = replace(found, estimate=estimate_disturbed_intervals(found.base, found.estimate))
     return _free_contradicted(found, settings, estimate)
-
-
-def _estimate_from(
-    before: JointEstimate | None, base: Problem, opening: float | None, progress: Progress | None
-) -> NoiseEstimate:
-    """Estimate with all measurements, from the figures of another estimate, which the priors are further from."""
-    if before is None:
-        return estimate_noise(base, opening, progress=progress)
-    noise = before.estimate.noise
-    weights = {name: some for name, some in noise.weights.items() if name not in INTERVALS}
-    start, near = replace(noise, weights=weights, excluded={}), before.estimate.get_linearisation(before.base)
-    return estimate_noise(base, opening, start, near, progress, changed=True)
 
 
 def _leave_out_faults(
@@ -138,8 +132,10 @@ def _leave_out_faults(
     return found if settings.faults == "off" else estimate_without_faults(base, found, opening, progress)
 
 
-def _free_contradicted(found: JointEstimate, settings: GnssSettings, estimate: _Estimate) -> JointEstimate:
-    """Free the constants that the drive contradicts as stated, and no others, and estimate the noise model anew.
+def _free_contradicted(found: JointEstimate, settings: GnssSettings, *ways: _Estimate) -> JointEstimate:
+    """Free the constants that the drive contradicts as stated, and no others, and estimate the noise model anew, in the
+    first of some ways by which the evidence is no smaller: figures found so far lead to the nearest optimum soonest,
+    and where a wrong constant made many rows outliers, that is a bad one.
 
     Where these are free already, the estimate stays; where it is the one that they were tested with last, so do they.
     """
@@ -155,11 +151,13 @@ def _free_contradicted(found: JointEstimate, settings: GnssSettings, estimate: _
         if not are_same(freed, before, base):
             found = found.weigh()
             passes = found.estimate.passes + Counter(filter=1)
-            other = replace(found, freed=freed, estimate=estimate(free(base, freed), found)).weigh()
-            passes = passes + other.estimate.passes + Counter(filter=1)
-            # with other figures, this may lead to a worse optimum than before
-            if found.compute_evidence() <= other.compute_evidence() + other.estimate.gained_by_chance:
-                found = other
+            for estimate in ways:
+                other = replace(found, freed=freed, estimate=estimate(free(base, freed), found)).weigh()
+                passes = passes + other.estimate.passes + Counter(filter=1)
+                # with other figures, this may lead to a worse optimum than before
+                if found.compute_evidence() <= other.compute_evidence() + other.estimate.gained_by_chance:
+                    found = other
+                    break
             freed = update_freed(base, found.estimate, found.freed)
     except BREAKDOWN:
         return found.count(passes)
