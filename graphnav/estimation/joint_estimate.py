@@ -134,8 +134,8 @@ def _leave_out_faults(
 
 def _free_contradicted(found: JointEstimate, settings: GnssSettings, *ways: _Estimate) -> JointEstimate:
     """Free the constants that the drive contradicts as stated, and no others, and estimate the noise model anew, in the
-    first of some ways by which the evidence is no smaller: figures found so far lead to the nearest optimum soonest,
-    and where a wrong constant made many rows outliers, that is a bad one.
+    first of some ways by which the evidence is no smaller: the figures found lead to the nearest optimum soonest, and
+    where a wrong constant or a fault is behind them, that is a bad one.
 
     Where these are free already, the estimate stays; where it is the one that they were tested with last, so do they.
     """
@@ -154,8 +154,9 @@ def _free_contradicted(found: JointEstimate, settings: GnssSettings, *ways: _Est
             for estimate in ways:
                 other = replace(found, freed=freed, estimate=estimate(free(base, freed), found)).weigh()
                 passes = passes + other.estimate.passes + Counter(filter=1)
-                # with other figures, this may lead to a worse optimum than before
-                if found.compute_evidence() <= other.compute_evidence() + other.estimate.gained_by_chance:
+                # from the priors, figures may lead to a worse optimum than before
+                by_chance = other.estimate.gained_by_chance if estimate is ways[-1] else 0.0
+                if found.compute_evidence() <= other.compute_evidence() + by_chance:
                     found = other
                     break
             freed = update_freed(base, found.estimate, found.freed)
