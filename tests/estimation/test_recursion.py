@@ -75,8 +75,7 @@ class Drive:
                 2.0 * self.H, np.tile(np.arange(D), n), D * np.arange(n + 1),
             )  # fmt: skip
         out |= {"taken": taken, "lossy": lossy, "errors_alone": np.zeros((n, D))}
-        driven = self.gap, self.Q, self.added
-        disturbance.smooth_errors(n, np.zeros(D), steps, driven, updates, blocks.arrays, filtered, out["errors_alone"])
+        disturbance.smooth_errors(n, np.zeros(D), steps, updates, blocks.arrays, filtered, out["errors_alone"])
         # small, so that turns add up
         moved = 1e-6 * (out["errors"] - out["ahead"])
         half = np.concatenate([np.ones((n, 1)), 0.5 * moved[:, :3]], axis=1)

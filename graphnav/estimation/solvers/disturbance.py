@@ -13,8 +13,6 @@ from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, MOVING
 from graphnav.estimation.solvers.recursion import Arrays
 
-_FORWARD = 64  # keyframes that are smoothed from one that is filtered
-
 
 @compile_once
 def step_back(F: Array, decay: Array, N: Array) -> Array:
@@ -90,47 +88,24 @@ def take_back(N: Array, H: Array, Kt: Array, inverse: Array, lossy: bool) -> Arr
 
 @compile_once
 def smooth_errors(
-    k1: int, r: Array, steps: Arrays, driven: Arrays, updates: Arrays, blocks: Arrays, filtered: Arrays, smoothed: Array
+    k1: int, r: Array, steps: Arrays, updates: Arrays, blocks: Arrays, filtered: Arrays, smoothed: Array
 ) -> None:
-    """Errors (n, D) of the smoother at keyframes before k1, as `smooth_rows` has them, by r (D,) there alone.
-
-    From the filtered ones of a keyframe, those behind it without their covariances: e_{k+1} = gap + F e_k + Q r_{k+1}
-    (Koopman 1993, "fast state smoothing"); from a filtered one again before rounding errors grow with the free inertial
-    solution.
-
-    Parameters
-    ----------
-    driven : gap, Q and added of the steps, as of `graphnav.estimation.solvers.recursion.filter_rows`.
-    """
+    """Errors (n, D) of the smoother at keyframes before k1, as `smooth_rows` has them, by r (D,) there alone."""
     F, decay = steps
-    gap, Q, added = driven
     Kt, H, w, _, taken, _ = updates
     first, begin, end, _, _, _ = blocks
     errors_predicted, P_predicted, errors, P = filtered
-    kept, pushed = np.empty((_FORWARD, len(r))), np.empty(DIM)
-    for hi in range(k1, 0, -_FORWARD):
-        lo = max(hi - _FORWARD, 0)
-        for k in range(hi - 1, lo - 1, -1):
-            if k < len(F):
-                r = step_vector_back(F[k], decay[k], r)
-                if k == lo:
-                    np.add(errors[k], np.dot(P[k], r), smoothed[k])
-            for b in range(first[k + 1] - 1, first[k] - 1, -1):
-                if taken[b]:
-                    here = slice(begin[b], end[b])
-                    r = r + np.dot(w[k, here] - np.dot(Kt[k, here], r), H[k, here])
-            if k == lo and k == len(F):
-                np.add(errors_predicted[k], np.dot(P_predicted[k % len(P_predicted)], r), smoothed[k])
-            np.positive(r, kept[k - lo])
-        for k in range(lo, hi - 1):
-            e, behind, drives = smoothed[k], smoothed[k + 1], kept[k + 1 - lo]
-            np.dot(F[k], e[: F.shape[2]], behind[:DIM])
-            np.dot(Q[k], drives[:DIM], pushed)
-            for i in range(len(r)):
-                if i < DIM:
-                    behind[i] += gap[k, i] + pushed[i]
-                else:
-                    behind[i] = gap[k, i] + decay[k, i - DIM] * e[i] + added[k, i - DIM] * drives[i]
+    for k in range(k1 - 1, -1, -1):
+        ahead = k < len(F)
+        if ahead:
+            r = step_vector_back(F[k], decay[k], r)
+            np.add(errors[k], np.dot(P[k], r), smoothed[k])
+        for b in range(first[k + 1] - 1, first[k] - 1, -1):
+            if taken[b]:
+                lo, hi = begin[b], end[b]
+                r = r + np.dot(w[k, lo:hi] - np.dot(Kt[k, lo:hi], r), H[k, lo:hi])
+        if not ahead:
+            np.add(errors_predicted[k], np.dot(P_predicted[k % len(P_predicted)], r), smoothed[k])
 
 
 @compile_once

@@ -52,7 +52,6 @@ from graphnav.estimation.solvers.passes import (
     subtract_points,
 )
 from graphnav.estimation.solvers.points import FilterErrors, Linearisation, PointFilter
-from graphnav.estimation.solvers.recursion import Arrays
 from graphnav.estimation.solvers.rts import smooth_backward
 from graphnav.estimation.solvers.stack import Innovations, Stack
 from graphnav.estimation.solvers.stretches import STAYS, StretchFilter
@@ -202,7 +201,6 @@ def _run_forward(
     errors = FilterErrors(np.empty((n, D)), all_Pp, np.empty((n, D)), all_P)
     x, P = _start_from_prior(problem)
     updates, search = None, None
-    driven: Arrays = ()
     if about is not None:
         one = Linearisation.of(problem, about, stack, steps)
         all_F[: n - 1] = one.F
@@ -215,7 +213,7 @@ def _run_forward(
             follow = partial(_hold_errors, decide, about, errors)
         start = subtract_points(x, about.take_first(1))[0]
         given.run(partial(_get_start, start, P, stack.records, search), follow, progress)
-        updates, driven = given.updates, (given.gap, given.Q, steps.added)
+        updates = given.updates
         # from there on it is linearised at the filter's estimate
         last = about.take(slice(n - 1, n))
         x = move_points(last, errors.filtered[n - 1 :])
@@ -252,7 +250,6 @@ def _run_forward(
         errors.filtered,
         errors.predicted,
         updates,
-        driven,
         log_likelihood,
     )
 

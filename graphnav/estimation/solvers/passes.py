@@ -131,7 +131,6 @@ class ForwardRecord(Points):
     errors: Array  # (n, D) these points, and the filtered
     errors_predicted: Array  # (n, D) and the predicted state is these errors away from them
     updates: Updates | None  # of the keyframes there
-    driven: Arrays  # gap, Q and added of the steps there, as of `graphnav.estimation.solvers.recursion.filter_rows`
     log_likelihood: Array  # (K,) of the innovations at each keyframe, up to a constant
 
     @property

@@ -86,9 +86,7 @@ def smooth_points(forward: ForwardRecord) -> Points:
                 raise explain_smoother()
         if one is not None:
             steps = forward.F, forward.decay
-            smooth_errors(
-                end, r, steps, forward.driven, one.arrays, one.blocks.arrays, forward.filtered, errors
-            )  # fmt: skip
+            smooth_errors(end, r, steps, one.arrays, one.blocks.arrays, forward.filtered, errors)
         parts = [move_points(forward.about.take_first(end), errors[:end]), *parts]
     return join_passes(parts)
 
