@@ -23,6 +23,7 @@ from graphnav.estimation.contradictions import (
     free,
     update_freed,
 )
+from graphnav.estimation.noise.apply import apply_noise
 from graphnav.estimation.noise.decision import log_evidence, weigh_evidence
 from graphnav.estimation.noise.estimate import NoiseEstimate, estimate_noise
 from graphnav.estimation.noise.exclusion import (
@@ -34,7 +35,6 @@ from graphnav.estimation.noise.initial_points import BREAKDOWN
 from graphnav.estimation.noise.model import NoiseModel
 from graphnav.estimation.offsets import is_offset_far
 from graphnav.estimation.problem import Problem
-from graphnav.estimation.solvers.linearise import Points
 
 
 @dataclass(frozen=True)
@@ -74,8 +74,8 @@ class JointEstimate:
         return replace(self, estimate=replace(self.estimate, passes=passes))
 
 
-# a problem with stated noise, first points and the problem that they are of -> its noise model
-_Estimate = Callable[[Problem, tuple[Points, Problem] | None], NoiseEstimate]
+# a problem with stated noise, and the estimate with other constants free -> its noise model
+_Estimate = Callable[[Problem, JointEstimate], NoiseEstimate]
 
 
 def estimate_jointly(
@@ -95,10 +95,15 @@ def estimate_jointly(
         If the filter breaks down.
     """
 
-    def estimate(base: Problem, near: tuple[Points, Problem] | None) -> NoiseEstimate:
-        return estimate_noise(base, opening, near=near, progress=progress)
+    def estimate(base: Problem, before: JointEstimate, start: NoiseModel | None = None) -> NoiseEstimate:
+        near = before.estimate.get_linearisation(before.base)
+        return estimate_noise(base, opening, start, near, progress, changed=True)
 
-    found = _free_contradicted(JointEstimate(stated, {}, estimate(stated, None)), settings, estimate)
+    def go_on(base: Problem, before: JointEstimate) -> NoiseEstimate:
+        return estimate(base, before, before.estimate.noise)
+
+    found = JointEstimate(stated, {}, estimate_noise(stated, opening, progress=progress))
+    found = _free_contradicted(found, settings, go_on, estimate)
     return replace(found, estimate=_leave_out_faults(found.base, found.estimate, settings, opening, progress))
 
 
@@ -112,7 +117,8 @@ def revise_jointly(
     found : by `estimate_jointly`; the others are as there.
     """
 
-    def estimate(base: Problem, near: tuple[Points, Problem] | None) -> NoiseEstimate:
+    def estimate(base: Problem, before: JointEstimate) -> NoiseEstimate:
+        near = before.estimate.get_linearisation(before.base)
         one = estimate_noise(base, opening, near=near, progress=progress)
         return estimate_disturbed_intervals(base, _leave_out_faults(base, one, settings, opening, progress))
 
@@ -126,29 +132,33 @@ def _leave_out_faults(
     return found if settings.faults == "off" else estimate_without_faults(base, found, opening, progress)
 
 
-def _free_contradicted(found: JointEstimate, settings: GnssSettings, estimate: _Estimate) -> JointEstimate:
-    """Free the constants that the drive contradicts as stated, and no others, and estimate the noise model anew.
+def _free_contradicted(found: JointEstimate, settings: GnssSettings, *ways: _Estimate) -> JointEstimate:
+    """Free the constants that the drive contradicts as stated, and no others, and estimate the noise model anew, in the
+    first of some ways by which the evidence is no smaller: the figures found lead to the nearest optimum soonest, and
+    where a wrong constant or a fault is behind them, that is a bad one.
 
     Where these are free already, the estimate stays; where it is the one that they were tested with last, so do they.
     """
     if found.estimate.noise is found.tested:
         return found
     base, before = found.stated, found.freed
-    near = found.estimate.get_linearisation(found.base)
-    names = set[str]() if settings.clock_rate_sigma == 0.0 else {CLOCK_RATE}
-    if not is_offset_far(near[1], found.estimate.points):
-        names |= {LEVER_ARM, TIME_OFFSET, VELOCITY_TIME_OFFSET}
     passes, tested = found.estimate.passes + Counter(filter=1), found.estimate.noise
+    names = set[str]() if settings.clock_rate_sigma == 0.0 else {CLOCK_RATE}
+    if not is_offset_far(apply_noise(found.base, tested), found.estimate.points):
+        names |= {LEVER_ARM, TIME_OFFSET, VELOCITY_TIME_OFFSET}
     try:
         freed = find_contradicted_constants(base, found.estimate, before, names)
         if not are_same(freed, before, base):
             found = found.weigh()
             passes = found.estimate.passes + Counter(filter=1)
-            other = replace(found, freed=freed, estimate=estimate(free(base, freed), near)).weigh()
-            passes = passes + other.estimate.passes + Counter(filter=1)
-            # with other figures, this may lead to a worse optimum than before
-            if found.compute_evidence() <= other.compute_evidence() + other.estimate.gained_by_chance:
-                found = other
+            for estimate in ways:
+                other = replace(found, freed=freed, estimate=estimate(free(base, freed), found)).weigh()
+                passes = passes + other.estimate.passes + Counter(filter=1)
+                # from the priors, figures may lead to a worse optimum than before
+                by_chance = other.estimate.gained_by_chance if estimate is ways[-1] else 0.0
+                if found.compute_evidence() <= other.compute_evidence() + by_chance:
+                    found = other
+                    break
             freed = update_freed(base, found.estimate, found.freed)
     except BREAKDOWN:
         return found.count(passes)

@@ -30,6 +30,7 @@ transition matrix F = d(end)/d(start) below.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass
 from functools import cache, cached_property
 
@@ -169,6 +170,13 @@ class ImuFactors:
         """Compute everything that would otherwise be computed at first use; returns itself."""
         _ = self.whitener, self.inner
         return self
+
+    def replace_noise(self, intervals: Intervals) -> ImuFactors:
+        """The same of intervals that differ in covariances only."""
+        _, other = self.inner, copy(self)  # computed once for all of them
+        other.intervals = intervals
+        other.__dict__.pop("whitener", None)
+        return other
 
     @cached_property
     def inner(self) -> Array:

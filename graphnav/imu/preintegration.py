@@ -79,6 +79,7 @@ class Intervals:
     force_noise: Array  # (n, 3)
     covariance: Array  # (n, 15, 15)
     parts: Array  # (n, 4, 15, 15) contributions of each of `NOISE_FIGURES`; (n, 0, 15, 15) unless asked for
+    factors: Array  # (n, 4) of the parts in the covariance
     past_turn: (
         Array  # (n, 3, 3) means over the interval, s before its end: C(s) from the axes at its end to those at s,
     )
@@ -115,9 +116,9 @@ class Intervals:
 
     def with_noise(self, factors: Array) -> Intervals:
         """The intervals with the variances of `NOISE_FIGURES` multiplied by factors (4,) or (n, 4); needs `parts`."""
-        flat = self.parts.reshape(*self.parts.shape[:2], -1)
-        more = ((factors - 1.0)[..., None, :] @ flat).reshape(self.covariance.shape)
-        return replace(self, covariance=self.covariance + more, parts=factors[..., None, None] * self.parts)
+        more = ((factors - 1.0) * self.factors)[:, None] @ self.parts.reshape(*self.parts.shape[:2], -1)
+        covariance = self.covariance + more.reshape(self.covariance.shape)
+        return replace(self, covariance=covariance, factors=factors * self.factors)
 
     def without_parts(self) -> Intervals:
         """The intervals without the contributions of each noise figure, to save memory."""
@@ -339,7 +340,7 @@ def _integrate(
     unknown = np.zeros((n, 3))
     return Intervals(
         t[rows], t[rows + 1], dR, take_last(V), take_last(P), theta_bg, v_ba, v_bg, p_ba, p_bg,
-        np.array(ba), np.array(bg), mean_rate, mean_force, unknown, unknown, Q, parts,
+        np.array(ba), np.array(bg), mean_rate, mean_force, unknown, unknown, Q, parts, np.ones((n, 4)),
         *_compute_mean_velocity_parts(edge, R, V, A),
     )  # fmt: skip
 

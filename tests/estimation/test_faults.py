@@ -23,7 +23,7 @@ from graphnav.estimation.alignment import align
 from graphnav.estimation.building import Clock, ProblemBuilder
 from graphnav.estimation.faults.excluded import find_fault_spans, weigh_rows
 from graphnav.estimation.faults.likelihood_ratio import update_tests
-from graphnav.estimation.faults.segments import _respond, _Runs, _Set, find_wrong_segments
+from graphnav.estimation.faults.segments import _respond, _Runs, find_wrong_segments
 from graphnav.estimation.faults.verdicts import Verdicts
 from graphnav.estimation.faults.watch import FALSE_ALARM, MINUTE, Bank
 from graphnav.estimation.noise.decision import log_evidence, weigh_evidence
@@ -272,8 +272,8 @@ def test_evidence_of_segments_is_that_of_filters_with_their_errors(built: Proble
         points = make_points(other, about.states, split_values(problem, about))
         return float(Comparison(problem, about).filter(other, points, (rows.name,)).log_likelihood().sum())
 
-    runs = _Runs(begins, [rows.unit], 3)
-    one = _Set.none(*_respond(problem, refilter(problem, about), [wrong], begins))
+    runs = _Runs(begins, [rows.unit], 3, *_respond(problem, refilter(problem, about), [wrong], begins))
+    one = runs.begin()
     usual, chosen = float(Comparison(problem, about).filter(problem, about).log_likelihood().sum()), []
     for _ in range(2):
         better = runs.list_better(one)

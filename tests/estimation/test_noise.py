@@ -233,7 +233,7 @@ def test_factors_of_the_imu_are_those_of_its_figures() -> None:
     whole = preintegrate(base.samples, other, base.t, iv.ba, iv.bg, parts_of_noise=True)
     mine = iv.with_noise(factors)
     size = np.sqrt(np.einsum("nii->ni", whole.covariance))
-    for a, b in ((mine.covariance, whole.covariance), (mine.parts, whole.parts)):
+    for a, b in ((mine.covariance, whole.covariance), (factors[:, None, None] * mine.parts, whole.parts)):
         scale = size[:, :, None] * size[:, None, :]
         np.testing.assert_allclose(
             (a if a.ndim == 3 else a.sum(1)) / scale, (b if b.ndim == 3 else b.sum(1)) / scale, atol=1e-9

@@ -25,6 +25,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from graphnav.constraints.base import Constraint
+from graphnav.core.compiled import compile_once
 from graphnav.core.rotation import Array
 from graphnav.estimation.faults.likelihood_ratio import respond
 from graphnav.estimation.faults.watch import FAULT_COST, MINUTE, SIZES, is_large
@@ -40,21 +41,14 @@ _BEAM = 8  # sets of segments that are followed: the likeliest single one need n
 
 @dataclass(frozen=True)
 class _Set:
-    """A set of wrong runs, and what is left of score and info of all errors when these are known so far.
-
-    Both are sums over the segments before each, so that a run has the difference of two.
-    """
+    """A set of wrong runs, and what is left of score and info of the other runs when its errors are known so far."""
 
     chosen: frozenset[tuple[int, int]]  # number of each run and of the kinds of fixes that are wrong in it
     log_odds: float  # beside nothing being wrong
-    score: Array  # (M+1, C)
-    info: Array  # (M+1, C, M+1, C)
-
-    @classmethod
-    def none(cls, score: Array, info: Array) -> _Set:
-        """The empty set, of score (M, C) and info (M, C, M, C)."""
-        both = np.swapaxes(_sum_before(np.swapaxes(_sum_before(info), 0, 2)), 0, 2)
-        return cls(frozenset(), 0.0, _sum_before(score), np.ascontiguousarray(both))
+    runs: Array  # (J,) that share no segment with it
+    score: Array  # (J, C)
+    info: Array  # (J, C, C)
+    taken: tuple[Array, ...]  # (M+1, C, c) of each choice: X X^T is what it took of the info of sums before segments
 
 
 class _Runs:
@@ -67,9 +61,10 @@ class _Runs:
     begins : (M,) s, of the segments.
     units : of each kind of fixes.
     m : numbers of a fix.
+    score, info : (M, C) and (M, C, M, C) of the errors of all segments.
     """
 
-    def __init__(self, begins: Array, units: list[str], m: int) -> None:
+    def __init__(self, begins: Array, units: list[str], m: int, score: Array, info: Array) -> None:
         first, last = np.triu_indices(len(begins) - 1)
         self.first, self.behind, C = first, last + 1, 2 * m * len(units)
         # an error b that stays and one g that grows by the minute since a run began, by those since the first segment
@@ -82,50 +77,55 @@ class _Runs:
                 self.shift[:, i, i + m] = -minutes * size[i + m]
         each = [np.arange(2 * m * i, 2 * m * (i + 1)) for i in range(len(units))]
         self.kinds = [np.arange(C), *each] if len(units) > 1 else each
+        # sums over the segments before each: a run has the difference of two
+        self.score = _sum_before(score)
+        self.info = np.ascontiguousarray(np.swapaxes(_sum_before(np.swapaxes(_sum_before(info), 0, 2)), 0, 2))
+
+    def begin(self) -> _Set:
+        """The empty set."""
+        lo, hi, back, I = self.first, self.behind, np.swapaxes(self.shift, 1, 2), self.info
+        some = I[hi, :, hi] - I[hi, :, lo] - I[lo, :, hi] + I[lo, :, lo]
+        score = (back @ (self.score[hi] - self.score[lo])[..., None])[..., 0]
+        return _Set(frozenset(), 0.0, np.arange(len(lo)), score, back @ some @ self.shift, ())
 
     def list_better(self, one: _Set) -> list[tuple[float, int, int]]:
         """The likeliest of those that share no segment with a set and increase its odds: increase, run, kind."""
-        free = np.ones(len(self.first), dtype=bool)
-        for other, _ in one.chosen:
-            free &= (self.behind <= self.first[other]) | (self.first >= self.behind[other])
-        j = np.flatnonzero(free)
-        lo, hi, shift, s, I = self.first[j], self.behind[j], self.shift[j], one.score, one.info
-        score = np.einsum("jab,ja->jb", shift, s[hi] - s[lo])
-        some = I[hi, :, hi] - I[hi, :, lo] - I[lo, :, hi] + I[lo, :, lo]
-        info = np.swapaxes(shift, 1, 2) @ some @ shift
         out = []
         for number, kind in enumerate(self.kinds):
-            A, y = np.eye(len(kind)) + info[:, kind[:, None], kind], score[:, kind]
-            x = np.linalg.solve(A, y[..., None])[..., 0]
-            gain = 0.5 * np.sum(x * y, axis=1) - 0.5 * np.linalg.slogdet(A)[1] - FAULT_COST
-            out += [(float(gain[i]), int(j[i]), number) for i in np.argsort(-gain)[:_BEAM] if gain[i] > 0.0]
+            gain = compute_gains(one.score[:, kind], one.info[:, kind[:, None], kind]) - FAULT_COST
+            out += [(float(gain[i]), int(one.runs[i]), number) for i in np.argsort(-gain)[:_BEAM] if gain[i] > 0.0]
         return sorted(out, reverse=True)[:_BEAM]
 
     def add(self, one: _Set, gain: float, j: int, kind: int) -> _Set:
         """A set with another run."""
-        lo, hi, C = self.first[j], self.behind[j], one.score.shape[1]
-        U = self.shift[j][:, self.kinds[kind]]
-        beside = (one.info[:, :, hi] - one.info[:, :, lo]).reshape(-1, C) @ U
-        own = beside.reshape(-1, C, U.shape[1])
-        left = np.linalg.solve(np.eye(U.shape[1]) + U.T @ (own[hi] - own[lo]), beside.T)
-        score = one.score - (left.T @ (U.T @ (one.score[hi] - one.score[lo]))).reshape(one.score.shape)
-        info = one.info - (beside @ left).reshape(one.info.shape)
-        return _Set(one.chosen | {(j, kind)}, one.log_odds + gain, score, info)
+        lo, hi, own, (at,) = self.first[j], self.behind[j], self.kinds[kind], np.flatnonzero(one.runs == j)
+        U = self.shift[j][:, own]
+        beside = (self.info[:, :, hi] - self.info[:, :, lo]) @ U
+        for X in one.taken:
+            beside -= X @ ((X[hi] - X[lo]).T @ U)
+        root = np.linalg.cholesky(np.eye(len(own)) + U.T @ (beside[hi] - beside[lo]))
+        taken, white = beside @ np.linalg.inv(root).T, np.linalg.solve(root, one.score[at, own])
+        free = (self.behind[one.runs] <= lo) | (self.first[one.runs] >= hi)
+        runs = one.runs[free]
+        V = np.swapaxes(self.shift[runs], 1, 2) @ (taken[self.behind[runs]] - taken[self.first[runs]])
+        score, info = one.score[free] - V @ white, one.info[free] - V @ np.swapaxes(V, 1, 2)
+        return _Set(one.chosen | {(j, kind)}, one.log_odds + gain, runs, score, info, (*one.taken, taken))
 
-    def estimate(self, none: _Set, chosen: Sequence[tuple[int, int]]) -> list[Array]:
-        """The errors (C,) of each of some runs together, since the run began; `none` is the empty set."""
+    def estimate(self, chosen: Sequence[tuple[int, int]]) -> list[Array]:
+        """The errors (C,) of each of some runs together, since the run began."""
         parts = []
         for j, kind in chosen:
-            U = np.zeros((*none.score.shape, len(self.kinds[kind])))
+            U = np.zeros((*self.score.shape, len(self.kinds[kind])))
             U[self.behind[j]] = self.shift[j][:, self.kinds[kind]]
             U[self.first[j]] = -U[self.behind[j]]
-            parts.append(U.reshape(none.score.size, -1))
+            parts.append(U.reshape(self.score.size, -1))
         U = np.concatenate(parts, axis=1)
-        x = np.linalg.solve(np.eye(U.shape[1]) + U.T @ none.info.reshape(len(U), -1) @ U, U.T @ none.score.reshape(-1))
+        info, score = self.info.reshape(len(U), -1), self.score.reshape(-1)
+        x = np.linalg.solve(np.eye(U.shape[1]) + U.T @ info @ U, U.T @ score)
         out = []
         for j, kind in chosen:
             own, x = x[: len(self.kinds[kind])], x[len(self.kinds[kind]) :]
-            out.append(np.zeros(none.score.shape[1]))
+            out.append(np.zeros(self.score.shape[1]))
             out[-1][self.kinds[kind]] = own * np.diagonal(self.shift[j])[self.kinds[kind]]
         return out
 
@@ -144,8 +144,9 @@ def find_wrong_segments(
     """
     fixes = [rows for rows in problem.constraints if rows.name in names]
     begins, m = np.array(edges), len(fixes[0].axes)
-    runs = _Runs(begins, [rows.unit for rows in fixes], m)
-    none = best = _Set.none(*_respond(problem, refilter(problem, about, whole=False), fixes, begins))
+    responses = _respond(problem, refilter(problem, about, whole=False), fixes, begins)
+    runs = _Runs(begins, [rows.unit for rows in fixes], m, *responses)
+    best = runs.begin()
     beam = [best]
     while beam:
         more: dict[frozenset[tuple[int, int]], tuple[float, _Set, tuple[float, int, int]]] = {}
@@ -160,7 +161,7 @@ def find_wrong_segments(
     t = problem.t[np.unique(np.concatenate([rows.keyframe for rows in fixes]))]
     ordered = sorted(best.chosen, key=lambda run: int(runs.first[run[0]]))
     out = []
-    for (j, _), error in zip(ordered, runs.estimate(none, ordered), strict=True):
+    for (j, _), error in zip(ordered, runs.estimate(ordered), strict=True):
         own = t[(t >= begins[runs.first[j]]) & (t < begins[runs.behind[j]])]
         speed = float(np.median(np.linalg.norm(about.states.v[np.isin(problem.t, own)], axis=1)))
         if any(
@@ -169,6 +170,26 @@ def find_wrong_segments(
             for grown in (0.0, (own[-1] - own[0]) / MINUTE)
         ):
             out.append((float(own[0]), float(own[-1])))
+    return out
+
+
+@compile_once
+def compute_gains(score: Array, info: Array) -> Array:
+    """(J,) logarithms of the evidence of errors of unit prior beside none, by score (J, c) and info (J, c, c)."""
+    J, c = score.shape
+    out, root, white = np.zeros(J), np.empty((c, c)), np.empty(c)
+    for j in range(J):
+        for i in range(c):
+            for h in range(i + 1):
+                x = info[j, i, h]
+                for g in range(h):
+                    x -= root[i, g] * root[h, g]
+                root[i, h] = np.sqrt(1.0 + x) if h == i else x / root[h, h]
+            x = score[j, i]
+            for h in range(i):
+                x -= root[i, h] * white[h]
+            white[i] = x / root[i, i]
+            out[j] += 0.5 * white[i] * white[i] - np.log(root[i, i])
     return out
 
 

@@ -13,7 +13,6 @@ from graphnav.core.rotation import Array
 from graphnav.core.state import Parameter
 from graphnav.estimation.noise.model import INTERVALS, NoiseModel, RowWeights
 from graphnav.estimation.problem import Problem
-from graphnav.imu.dynamics import ImuFactors
 from graphnav.imu.preintegration import NOISE_FIGURES
 
 
@@ -35,7 +34,7 @@ def apply_noise(problem: Problem, noise: NoiseModel) -> Problem:
         problem = replace(
             problem,
             intervals=intervals,
-            motion=ImuFactors(intervals, problem.frame),
+            motion=problem.motion.replace_noise(intervals),
             imu_noise=replace(problem.imu_noise, **figures),
             interval_factors=each,
         )
@@ -129,4 +128,4 @@ def select_weights(t: Array, noise: NoiseModel, name: str) -> Array:
 def drop_parts(problem: Problem) -> Problem:
     """The same without the contributions of each noise figure, which take memory and are no longer needed."""
     intervals = problem.intervals.without_parts()
-    return replace(problem, intervals=intervals, motion=ImuFactors(intervals, problem.frame))
+    return replace(problem, intervals=intervals, motion=problem.motion.replace_noise(intervals))

@@ -52,8 +52,9 @@ class ImuMoments:
 
     A: Array  # (n, 4) of `NOISE_FIGURES`
     B: Array  # (n, 4)
-    Q: Array  # (n, 4, 15, 15) what each adds to a step
+    Q: Array  # (n, 4, 15, 15) what each adds to a step, as stated
     N: Array  # (n, 15, 15)
+    factors: Array  # (n, 4) of these
 
     @property
     def squared(self) -> Array:
@@ -65,7 +66,7 @@ class ImuMoments:
         """(n, 4) of the chi-square variable that A freedom / B is near to where f is right."""
         QN = self.Q @ self.N[:, None]
         squared = np.einsum("nfij,nfji->nf", QN, QN)
-        freedom = np.where(self.B > 0.0, self.B**2 / np.maximum(squared, 1e-300), 1.0)
+        freedom = np.where(self.B > 0.0, (self.B / self.factors) ** 2 / np.maximum(squared, 1e-300), 1.0)
         return np.maximum(freedom, 1.0)
 
 
@@ -79,9 +80,9 @@ def collect_imu_moments(problem: Problem, start: Array, smoothed: DisturbancePas
     Lt = np.swapaxes(L, -1, -2)
     r = (Lt @ smoothed.r[1:, :DIM, None])[..., 0]
     N = Lt @ smoothed.N[1:] @ L
-    Q = problem.intervals.parts[: len(r)]
+    Q, factors = problem.intervals.parts[: len(r)], problem.intervals.factors[: len(r)]
     A, B = sum_parts(Q, r, N)
-    return ImuMoments(A, np.maximum(B, 0.0), Q, N)
+    return ImuMoments(factors * A, factors * np.maximum(B, 0.0), Q, N, factors)
 
 
 @compile_once

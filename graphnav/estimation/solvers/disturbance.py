@@ -16,25 +16,45 @@ from graphnav.estimation.solvers.recursion import Arrays
 
 @compile_once
 def step_back(F: Array, decay: Array, N: Array) -> Array:
-    """N (D, D) before a step from that behind it."""
+    """N (D, D) before a step from that behind it.
+
+    With M the rows of F for what moves, d the factors of everything else, and X = M N_mm / 2 + N_m. d:
+    M^T X + X^T M, and d N d of everything else.
+    """
     w, D = F.shape[1], len(N)
-    moving, one, out = F[:MOVING], np.empty((D, D)), np.empty((D, D))
-    top = np.dot(moving.T, N[:MOVING])
+    moving, out = F[:MOVING], np.empty((D, D))
+    X = np.zeros((MOVING, D))
+    np.multiply(0.5, np.dot(np.ascontiguousarray(N[:MOVING, :MOVING]), moving), X[:, :w])
+    for i in range(MOVING):
+        row, values = X[i], N[i]
+        for j in range(MOVING, DIM):
+            row[j] += values[j]
+        behind, shrunk = row[DIM:], values[DIM:]
+        for j in range(D - DIM):
+            behind[j] += shrunk[j] * decay[j]
+    Y = np.dot(moving.T, X)
     for i in range(D):
-        d = 1.0 if i < DIM else decay[i - DIM]
-        for j in range(D):
-            one[i, j] = d * N[i, j] if i >= MOVING else 0.0
+        row, values = out[i], N[i]
+        if i < MOVING:
+            row[:] = 0.0
+        else:
+            d = 1.0 if i < DIM else decay[i - DIM]
+            for j in range(MOVING):
+                row[j] = 0.0
+            for j in range(MOVING, DIM):
+                row[j] = d * values[j]
+            behind, shrunk = row[DIM:], values[DIM:]
+            for j in range(D - DIM):
+                behind[j] = shrunk[j] * (d * decay[j])
         if i < w:
-            for j in range(D):
-                one[i, j] += top[i, j]
-    left = np.dot(np.ascontiguousarray(one[:, :MOVING]), moving)
-    for j in range(D):
-        d = 0.0 if j < MOVING else 1.0 if j < DIM else decay[j - DIM]
-        for i in range(j, D):
-            x = d * one[i, j]
-            if j < w:
-                x += left[i, j]
-            out[i, j] = out[j, i] = x
+            own = Y[i]
+            for j in range(w):
+                row[j] += own[j] + Y[j, i]
+            for j in range(w, D):
+                row[j] += own[j]
+        else:
+            for j in range(w):
+                row[j] += Y[j, i]
     return out
 
 
@@ -95,9 +115,9 @@ def smooth_rows(
 ) -> tuple[Array, Array]:  # fmt: skip
     """r (n, D), and of N the states' part (n, 15, 15) and the diagonal (n, D), of keyframes k1 - 1 down to k0.
 
-    From those of k1, zero where there is none; returns those of k0. And errors (n, D) of the smoother there: from the
-    filtered ones, because predicted errors of a position that only the first fix determines are larger by ten orders
-    than their smoothed values.
+    From those of k1, zero where there is none; returns those of k0. With covariances of the smoother, its errors (n, D)
+    too: from the filtered ones, because predicted errors of a position that only the first fix determines are larger by
+    ten orders than their smoothed values.
 
     Parameters
     ----------
@@ -113,13 +133,15 @@ def smooth_rows(
     first, begin, end, _, _, _ = blocks
     errors_predicted, P_predicted, errors, P = filtered
     smoothed, r, N, N_diagonal = found
+    whole = len(covered[0]) > 0
     for k in range(k1 - 1, k0 - 1, -1):
         rows = end[first[k + 1] - 1] if first[k] < first[k + 1] else 0
         ahead = k < len(F)  # at the last keyframe the filtered covariance already is of errors about the estimate
         if ahead:
             r_k = step_vector_back(F[k], decay[k], r_k)
             N_k = step_back(F[k], decay[k], N_k)
-            np.add(errors[k], np.dot(P[k], r_k), smoothed[k])
+            if whole:
+                np.add(errors[k], np.dot(P[k], r_k), smoothed[k])
             fill_covariances(k, P[k], N_k, rows, wanted, first_wanted, asked, covered)
         for b in range(first[k + 1] - 1, first[k] - 1, -1):
             if taken[b]:
@@ -133,7 +155,8 @@ def smooth_rows(
             N_diagonal[k, i] = N_k[i, i]
         if not ahead:
             ahead_P = P_predicted[k % len(P_predicted)]
-            np.add(errors_predicted[k], np.dot(ahead_P, r_k), smoothed[k])
+            if whole:
+                np.add(errors_predicted[k], np.dot(ahead_P, r_k), smoothed[k])
             fill_covariances(k, ahead_P, N_k, rows, wanted, first_wanted, asked, covered)
     return r_k, N_k
 

@@ -133,6 +133,7 @@ class Comparison:
     def __init__(self, problem: Problem, about: Points) -> None:
         self._K = len(about.values)
         self._one = Linearisation.of(problem, about, Stack(problem, self._K), advance(problem, self._K))
+        self._motion, self._Q = problem.motion, self._one.compute_noise(problem, about)
 
     def filter(self, problem: Problem, about: Points, anew: Collection[str] = ()) -> Stack:
         """The innovations by a problem with the same points of what both have.
@@ -145,7 +146,8 @@ class Comparison:
         start = _get_start(subtract_points(x, about.take_first(1))[0], P, stack.records)
         (e, P), last = np.empty((2, 2, *P.shape)), np.empty((2, 2, len(P)))
         out = FilterErrors(last[0], e, last[1], P)
-        PointFilter(problem, about, stack, steps, one, out, whole=False).run(lambda: start, None, None)
+        Q = self._Q if problem.motion is self._motion else None
+        PointFilter(problem, about, stack, steps, one, out, whole=False, Q=Q).run(lambda: start, None, None)
         return stack
 
 

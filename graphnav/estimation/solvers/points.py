@@ -78,10 +78,10 @@ class Linearisation:
         if not anew and problem.columns == self.columns:
             return self
         n, M, _ = self.H.shape
-        moved = [np.arange(DIM), *(np.arange(*problem.columns[name].indices(1 << 30)) for name in self.columns)]
-        own = np.concatenate(moved)
         gap, H = np.zeros((n - 1, DIM + points.values.shape[1])), np.zeros((n, M, DIM + points.values.shape[1]))
-        gap[:, own], H[:, :, own] = self.gap, self.H
+        states = slice(0, DIM)
+        for to, own in ((states, states), *((problem.columns[name], own) for name, own in self.columns.items())):
+            gap[:, to], H[:, :, to] = self.gap[:, own], self.H[:, :, own]
         r, sigma = self.r.copy(), self.sigma.copy()
         for rows in problem.constraints:
             if rows.name in anew:
@@ -107,15 +107,17 @@ class PointFilter:
     one : the problem there.
     out : of all n keyframes, to be filled; of fewer, but two at least, those of the last are left.
     whole : False for the innovations in the stack only, without gains.
+    Q : of the steps, where it is known.
     """
 
     def __init__(
         self, problem: Problem, points: Points, stack: Stack, steps: Advance, one: Linearisation, out: FilterErrors,
-        whole: bool = True,
+        whole: bool = True, Q: Array | None = None,
     ) -> None:  # fmt: skip
         n = len(points.values)
         self._stack, self._steps, self.out = stack, steps, out
-        self.F, self.Q, self.gap = one.F, one.compute_noise(problem, points), one.gap
+        self.F, self.gap = one.F, one.gap
+        self.Q = one.compute_noise(problem, points) if Q is None else Q
         self.speeds = np.linalg.norm(points.states.v, axis=1)
         self.r, self._sigma, self.H = one.r, one.sigma, one.H
         self.variance = (self._sigma / stack.root_weight[:n]) ** 2

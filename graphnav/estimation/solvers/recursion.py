@@ -65,26 +65,32 @@ def predict_covariance(P: Array, F: Array, decay: Array, Q: Array, added: Array,
     w, D = F.shape[1], len(P)
     top = np.dot(F[:MOVING], P[:w])
     own = np.dot(np.ascontiguousarray(top[:, :w]), F[:MOVING].T)
+    # row by row, in loops that become vector instructions
     for i in range(MOVING):
+        row, values, more = out[i], top[i], Q[i]
         for j in range(i + 1):
-            out[i, j] = out[j, i] = own[i, j] + Q[i, j]
+            row[j] = out[j, i] = own[i, j] + more[j]
         for j in range(MOVING, DIM):
-            out[i, j] = top[i, j] + Q[i, j]
-        for j in range(DIM, D):
-            out[i, j] = top[i, j] * decay[j - DIM]
-        for j in range(MOVING, D):
-            out[j, i] = out[i, j]
-    for i in range(MOVING, DIM):
+            row[j] = values[j] + more[j]
+        behind, shrunk = row[DIM:], values[DIM:]
+        for j in range(D - DIM):
+            behind[j] = shrunk[j] * decay[j]
+    for i in range(MOVING, D):
+        row, values = out[i], P[i]
+        for j in range(MOVING):
+            row[j] = out[j, i]
+        d = 1.0 if i < DIM else decay[i - DIM]
         for j in range(MOVING, DIM):
-            out[i, j] = P[i, j] + Q[i, j]
-        for j in range(DIM, D):
-            out[i, j] = P[i, j] * decay[j - DIM]
-            out[j, i] = out[i, j]
-    for i in range(DIM, D):
-        d = decay[i - DIM]
-        for j in range(DIM, D):
-            out[i, j] = P[i, j] * (d * decay[j - DIM])
-        out[i, i] += added[i - DIM]
+            row[j] = values[j] * d
+        behind, shrunk = row[DIM:], values[DIM:]
+        for j in range(D - DIM):
+            behind[j] = shrunk[j] * (d * decay[j])
+        if i < DIM:
+            more = Q[i]
+            for j in range(MOVING, DIM):
+                row[j] += more[j]
+        else:
+            row[i] += added[i - DIM]
 
 
 @compile_once
