@@ -13,10 +13,12 @@ once, so none is favoured by the order. The influence of few rows is bounded: a 
 it exceeds once in a thousand times (`CHANCE`), and an outlying row, or a wheel error that lasts for seconds, gets the
 weight at which it would be that large.
 
-Scales are robust first and then efficient (the MM-estimates of Yohai 1987): while they may be far off, a square counts
-for no more than the value it exceeds once in twenty times (`_BOUNDED`), by which nearly two rows in five may be wrong.
-From there they go on with the bound of the weights, `CHANCE`: of the same likelihood that is the evidence. The first
-passes of a long drive use its first `_FIRST_KEYFRAMES` keyframes only.
+Scales are robust first: a square of an aiding sensor counts for no more than the value it exceeds once in twenty times
+(`_BOUNDED`), by which nearly two rows in five may be wrong. Beside these scales wrong rows stand out, so faults are
+sought by them; where errors have heavy tails they are too small. From there the figures go on with the bound of the
+weights, `CHANCE`, to nearly the largest evidence. (So location is estimated robustly and then efficiently: Yohai 1987,
+"High breakdown-point and high efficiency robust estimates for regression".) The first passes of a long drive use its
+first `_FIRST_KEYFRAMES` keyframes only.
 """
 
 from __future__ import annotations
@@ -72,6 +74,7 @@ class NoiseEstimate:
     passes: Counter[str]  # over keyframes, of "filter" and "smoother"
     whole_evidence: float | None = None  # of all measurements, excluded ones included, where it was computed
     rival: NoiseEstimate | None = None  # by another decision on what is wrong, nearly as likely
+    robust: NoiseModel | None = None  # by robust scales, beside which wrong rows stand out
 
     @property
     def gained_by_chance(self) -> float:
@@ -217,6 +220,7 @@ def _iterate(
         long = total > 2 * _FIRST_KEYFRAMES and not figures.known
         stages.insert(0, (_FIRST_KEYFRAMES if long else total, _BOUNDED))
     latest: tuple[ForwardRecord, DisturbancePass] | None = None
+    robust: NoiseModel | None = None
     for end, bound in stages:
         before, converged, figures.extrapolation = -np.inf, False, 1.0
         rounds = _AGAIN if bound == CHANCE else _ROUNDS
@@ -242,6 +246,7 @@ def _iterate(
             before, figures.extrapolation = now, _EXTRAPOLATION if k > 1 and now > before else 1.0
         if not converged:  # oscillating, or not yet converged
             figures = likeliest
+        robust = figures.build_model() if bound != CHANCE else robust
     if not converged:
         latest = None
         latest = _smooth_about(apply_noise(problem, figures.build_model()), about)
@@ -250,7 +255,13 @@ def _iterate(
     assert latest is not None
     evidence, passes = now - compute_outlier_cost(figures.weights, totals), round(done / total)
     return NoiseEstimate(
-        figures.build_model(), latest[1], now, prior_then, evidence, Counter(filter=passes, smoother=passes)
+        figures.build_model(),
+        latest[1],
+        now,
+        prior_then,
+        evidence,
+        Counter(filter=passes, smoother=passes),
+        robust=robust,
     )
 
 
