@@ -62,7 +62,9 @@ CONSTANTS = (
     Constant(f"{NOISE}.priors", "_SHARES", "lasting parts of a stated variance: as much as the whole, all together"),
     Constant(f"{NOISE}.estimate", "CHANCE", "probability of an outlier", 10.0),
     Constant(
-        f"{NOISE}.estimate", "_BOUNDED", "share of squares that are bounded: nearly two in five rows may be wrong"
+        f"{NOISE}.estimate",
+        "_BOUNDED",
+        "share of squares that are bounded while faults are sought: nearly two in five rows may be wrong",
     ),
     Constant(f"{NOISE}.estimate", "_TIME_RANGE", "a correlation time between a tenth of a second and an hour"),
     Constant(
