@@ -244,7 +244,7 @@ def _iterate(
             # weights and figures may alternate between two states
             if converged or since == _ROUNDS // 2:
                 break
-            longest = _EXTRAPOLATION * (_LATER if bound == CHANCE else 1.0)
+            longest = _EXTRAPOLATION * (_LATER if bound == CHANCE and not figures.same_data else 1.0)
             before, figures.extrapolation = now, longest if k > 1 and now > before else 1.0
         if not converged:  # oscillating, or not yet converged
             figures = likeliest

@@ -144,7 +144,7 @@ def find_repeated(path: Path, t: Array) -> NDArray[np.bool_]:
     if repeated.mean() > _REPEATED and (~repeated).sum() > 1:
         raise RecordingError(
             f"{path}: {format_row_count(repeated, '')} of {len(t)} with the time of the row before: the fraction of "
-            "the seconds was lost, or several rows are stamped at once; log the time of each",
+            "the seconds was lost, or several rows are stamped at once; log the time of each, with milliseconds",
             key="table.times_repeated",
         )
     return repeated
