@@ -103,7 +103,7 @@ def estimate_jointly(
         return estimate(base, before, before.estimate.noise)
 
     found = JointEstimate(stated, {}, estimate_noise(stated, opening, progress=progress))
-    found = _free_contradicted(found, settings, go_on, estimate)
+    found = _free_constants(found, settings, go_on, estimate)
     return replace(found, estimate=_leave_out_faults(found.base, found.estimate, settings, opening, progress))
 
 
@@ -123,7 +123,7 @@ def revise_jointly(
         return estimate_disturbed_intervals(base, _leave_out_faults(base, one, settings, opening, progress))
 
     found = replace(found, estimate=estimate_disturbed_intervals(found.base, found.estimate))
-    return _free_contradicted(found, settings, estimate)
+    return _free_constants(found, settings, estimate)
 
 
 def _leave_out_faults(
@@ -132,7 +132,7 @@ def _leave_out_faults(
     return found if settings.faults == "off" else estimate_without_faults(base, found, opening, progress)
 
 
-def _free_contradicted(found: JointEstimate, settings: GnssSettings, *ways: _Estimate) -> JointEstimate:
+def _free_constants(found: JointEstimate, settings: GnssSettings, *ways: _Estimate) -> JointEstimate:
     """Free the constants that the drive contradicts as stated, and no others, and estimate the noise model anew, in the
     first of some ways by which the evidence is no smaller: the figures found lead to the nearest optimum soonest, and
     where a wrong constant or a fault is behind them, that is a bad one.

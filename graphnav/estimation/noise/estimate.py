@@ -56,8 +56,7 @@ _BOUNDED = 0.05  # probability of a square of an aiding sensor beyond its bound,
 _FIRST_KEYFRAMES = 1500  # keyframes: a variance estimated from a thousand numbers is good to a twentieth
 _ROUNDS, _AGAIN = 8, 3  # passes to convergence, from the priors and from figures that were estimated before
 _MAX_PASSES = 3 * _ROUNDS  # passes at most
-_EXTRAPOLATION = 2.0  # longest step, in steps as computed (Aitken's extrapolation), while figures may be far off
-_LATER = 4.0  # how much longer it may be near the maximum, where steps do fall geometrically
+_EXTRAPOLATION = 2.0  # longest step, in steps as computed (Aitken's extrapolation)
 _TIME_RANGE = 30.0  # factor by which a correlation time may differ from its prior median either way
 _MANOEUVRE = 1.0, 10.0  # rad/s, m/s^2, of a vehicle: uncertainty of an interval whose samples are lost
 _TIME_GRID = np.linspace(-1.0, 1.0, 21)
@@ -244,11 +243,11 @@ def _iterate(
             # weights and figures may alternate between two states
             if converged or since == _ROUNDS // 2:
                 break
-            longest = _EXTRAPOLATION * (_LATER if bound == CHANCE and not figures.same_data else 1.0)
-            before, figures.extrapolation = now, longest if k > 1 and now > before else 1.0
+            before, figures.extrapolation = now, _EXTRAPOLATION if k > 1 and now > before else 1.0
         if not converged:  # oscillating, or not yet converged
             figures = likeliest
-        robust = figures.build_model() if bound != CHANCE else robust
+        if bound != CHANCE:
+            robust = figures.build_model()
     if not converged:
         latest = None
         latest = _smooth_about(apply_noise(problem, figures.build_model()), about)

@@ -104,7 +104,7 @@ def turns_against(yaw: Fit | None) -> bool:
     return yaw.correlation > 0.8 or (alike and tilt.SIGMAS * yaw.relative_sigma < 1.0)
 
 
-def describe_reversed(imu: Imu) -> str:
+def describe_reversal(imu: Imu) -> str:
     """That the accelerometer may be reversed, as those of some phones, and what to set then."""
     letters = write_letters(imu.R_bs, np.array([0.0, -1.0, 0.0]), np.array([0.0, 0.0, -1.0]))
     axes = f'axes = "{letters}"' if letters else "forward and up negated"
@@ -124,7 +124,7 @@ def check_gyro_sign(imu: Imu, track: Track) -> Iterator[Finding]:
         yield Finding("warning", f"{what}; {mend}", "imu.force_sign")
     elif not tilt.measure_sideways(imu, track):
         what = "the gyro turns against the GNSS course: its sign is reversed, or latitudes or longitudes have the wrong"
-        mend = f"negate it, or them, in the file; or {describe_reversed(imu)}"
+        mend = f"negate it, or them, in the file; or {describe_reversal(imu)}"
         yield Finding("warning", f"{what} sign (south and west are negative); {mend}", "imu.gyro_sign")
     else:
         what = "the gyro's sign is reversed: it turns against the GNSS course while gravity points as stated"

@@ -12,7 +12,7 @@ from graphnav.core.findings import Finding, compute_period
 from graphnav.core.rotation import Array
 from graphnav.recording import Gnss, Imu, Recording
 from graphnav.recording.checks import crosschecks, tilt, tracks
-from graphnav.recording.checks.axes import describe_reversed
+from graphnav.recording.checks.axes import describe_reversal
 from graphnav.recording.checks.clock import CLEAR, FAIR
 from graphnav.recording.checks.crosschecks import Fit
 from graphnav.recording.checks.stated import describe_exchange, describe_mirroring, exchange_lat_lon
@@ -53,7 +53,7 @@ def check_mirroring(recording: Recording, track: Track, turns_back: bool) -> Ite
                 "raw_gnss.clock",
             )
         else:
-            or_else = f"; if the places are right, {describe_reversed(recording.imu)}"
+            or_else = f"; if the places are right, {describe_reversal(recording.imu)}"
             yield describe_mirroring("latitudes or longitudes have", by, or_else)
 
 

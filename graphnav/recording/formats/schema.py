@@ -51,9 +51,8 @@ Sigmas = Annotated[tuple[float, float, float], BeforeValidator(_three_positive)]
 
 FOOT = 0.3048  # m
 RATE_UNITS = {"rad/s": 1.0, "deg/s": np.pi / 180.0, "mdeg/s": np.pi / 180e3}
-FORCE = {"m/s2": 1.0, "g": STANDARD_GRAVITY, "mg": MG, "ft/s2": FOOT}
-# of accelerometers that point down at rest: accelerations against gravity, as phones by Apple have them
-FORCE |= {"-m/s2": -1.0, "-g": -STANDARD_GRAVITY}
+# negative: of accelerometers that point down at rest, as in phones by Apple
+FORCE = {"m/s2": 1.0, "g": STANDARD_GRAVITY, "mg": MG, "ft/s2": FOOT, "-m/s2": -1.0, "-g": -STANDARD_GRAVITY}
 REVERSED = 'units = { accel = "-g" }, or "-m/s2"'
 HEIGHT = {"m": 1.0, "ft": FOOT}
 SPEED = {"m/s": 1.0, "km/h": 1 / 3.6, "mph": 0.44704, "knots": 1852 / 3600}
