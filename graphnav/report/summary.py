@@ -11,6 +11,7 @@ from markupsafe import Markup
 from graphnav.core.notes import Note, format_count
 from graphnav.core.rotation import Array
 from graphnav.estimation.solution import Solution
+from graphnav.evaluation.against import find_antenna_lever_arm
 from graphnav.evaluation.segments import compute_relative_errors, compute_rms
 from graphnav.recording import Recording
 from graphnav.report import page, wording
@@ -128,8 +129,9 @@ def tabulate_fixes(recording: Recording, solution: Solution, withheld: Removed) 
     record = solution.records.get("gnss_position")
     at = _find_rows(fixes.t + recording.start, None if record is None else record.t)
     state = _find_rows(fixes.t + recording.start, solution.t)
-    assert recording.gnss is not None
-    antenna = solution.states.p + solution.states.R_nb @ recording.gnss.lever_arm
+    arm = find_antenna_lever_arm(recording, solution)
+    assert arm is not None
+    antenna = solution.states.p + solution.states.R_nb @ arm
     away = np.where(state >= 0, np.linalg.norm((fixes.enu - antenna[state])[:, :2], axis=1), nan)
     kinds = {**fixes.kinds, **({"all": np.ones(len(gone), bool)} if len(fixes.kinds) > 1 else {})}
     rows = []

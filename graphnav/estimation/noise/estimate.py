@@ -24,18 +24,18 @@ first `_FIRST_KEYFRAMES` keyframes only.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.special import chdtrc, chdtri
 
 from graphnav.constraints.base import Constraint
-from graphnav.constraints.gnss import TIMES
 from graphnav.core.rotation import Array
 from graphnav.estimation.noise.apply import apply_noise, select_weights
+from graphnav.estimation.noise.components import Components, begin_components
 from graphnav.estimation.noise.initial_points import BREAKDOWN, find_initial_points
-from graphnav.estimation.noise.model import INTERVALS, NoiseModel, RowWeights, VarianceComponent
+from graphnav.estimation.noise.model import INTERVALS, NoiseModel, RowWeights
 from graphnav.estimation.noise.moments import (
     ImuMoments,
     collect_imu_moments,
@@ -44,7 +44,7 @@ from graphnav.estimation.noise.moments import (
     lag_moments,
 )
 from graphnav.estimation.noise.outliers import CHANCE, compute_outlier_cost, count_rows, limit_scaled, list_reduced
-from graphnav.estimation.noise.priors import TIME_WITHIN, get_prior, list_largest
+from graphnav.estimation.noise.priors import TIME_WITHIN
 from graphnav.estimation.problem import ParameterChain, Problem
 from graphnav.estimation.solvers.ekf import refilter
 from graphnav.estimation.solvers.linearise import Points
@@ -90,71 +90,6 @@ class NoiseEstimate:
         return reuse_points(*self.get_linearisation(base), problem)
 
 
-@dataclass
-class _Components:
-    """The figures of the current pass."""
-
-    log: dict[str, float]
-    prior_times: dict[str, float]  # s, prior medians of correlation times
-    largest: dict[str, float]  # log factors at which an error is as large as such errors get
-    freedom: dict[str, float] = field(default_factory=dict)
-    times: dict[str, float] = field(default_factory=dict)
-    weights: dict[str, RowWeights] = field(default_factory=dict)
-    excluded: Mapping[str, tuple[tuple[float, float], ...]] = field(default_factory=dict)
-    steps: dict[str, float] = field(default_factory=dict)  # the latest of each, before extrapolation
-    extrapolation: float = 1.0  # longest step allowed, in steps as computed
-    known: bool = False  # whether they were estimated before
-    same_data: bool = False  # and from the same measurements
-
-    def copy(self) -> _Components:
-        """An independent copy."""
-        times, weights, steps = dict(self.times), dict(self.weights), dict(self.steps)
-        return replace(self, log=dict(self.log), freedom=dict(self.freedom), times=times, weights=weights, steps=steps)
-
-    def build_model(self) -> NoiseModel:
-        figures = {}
-        for name, x in self.log.items():
-            m, s = self.get_prior(name)
-            B = self.freedom.get(name, 0.0)
-            figures[name] = VarianceComponent(x, float((0.5 * B + s**-2.0) ** -0.5), m, s, B)
-        return NoiseModel(figures, dict(self.times), dict(self.weights), self.excluded)
-
-    def get_prior(self, name: str) -> tuple[float, float]:
-        """Median and 1-sigma of a log factor; where the white part of fixes exceeds the stated, so do the others."""
-        m, s = get_prior(name)
-        sensor, *kind, axis = name.split(".")
-        if sensor == "gnss_position" and kind and kind[-1] in TIMES:
-            m += max(0.0, self.log.get(".".join([sensor, *kind[:-1], axis]), 0.0))
-        return m, s
-
-    def get_largest(self, name: str) -> float:
-        """The largest log factor; of the time-correlated parts of fixes, that of the white part."""
-        sensor, *kind, axis = name.split(".")
-        white = ".".join([sensor, *(part for part in kind if part not in TIMES), axis])
-        return self.largest.get(white, np.inf)
-
-    def log_prior(self) -> float:
-        return -0.5 * sum(((x - m) / s) ** 2 for name, x in self.log.items() for m, s in [self.get_prior(name)])
-
-    def update(self, name: str, A: float, B: float) -> None:
-        """One step of a component with sum of squares A and redundancy B."""
-        m, s = self.get_prior(name)
-        x, before = 0.0, self.log[name]
-        for _ in range(50):
-            slope = 0.5 * (A * np.exp(-x) - B) - (before + x - m) / s**2
-            step = float(np.clip(slope / (0.5 * A * np.exp(-x) + s**-2.0), -1.0, 1.0))
-            x += step
-            if abs(step) < 1e-6:
-                break
-        x = float(np.clip(x, -3.0, 3.0))
-        # correlated components converge slowly, by steps in geometric progression: go to the limit of their sum
-        ratio = x / self.steps[name] if self.steps.get(name) else 0.0
-        self.steps[name] = x
-        if 0.0 < ratio < 1.0 and self.extrapolation > 1.0:
-            x = float(np.clip(x * min(1.0 / (1.0 - ratio), self.extrapolation), -3.0, 3.0))
-        self.log[name], self.freedom[name] = min(before + x, self.get_largest(name)), B
-
-
 def estimate_noise(
     problem: Problem,
     opening: float | None = None,
@@ -179,7 +114,7 @@ def estimate_noise(
     EstimationError
         If the filter breaks down.
     """
-    figures = _begin(problem, start, changed)
+    figures = begin_components(problem, start, changed)
     if near is not None:
         return _iterate(
             problem, figures, reuse_points(*near, apply_noise(problem, figures.build_model())), progress, intervals
@@ -192,7 +127,7 @@ def estimate_noise(
         initials = [replace(one, points=reuse_points(one.points, problem, used)) for one in initials]
     found: list[NoiseEstimate] = []
     for initial in initials:
-        figures = _begin(problem, start)
+        figures = begin_components(problem, start)
         figures.weights |= initial.weights
         for name, more in initial.log_factors.items():
             figures.log[name] += more
@@ -208,7 +143,7 @@ def estimate_noise(
 
 def _iterate(
     problem: Problem,
-    figures: _Components,
+    figures: Components,
     about: Points,
     progress: Callable[[str, float], None] | None,
     intervals: bool,
@@ -271,33 +206,6 @@ def _smooth_about(problem: Problem, about: Points) -> tuple[ForwardRecord, Distu
     return forward, smooth_moments(problem, forward)
 
 
-def _begin(problem: Problem, start: NoiseModel | None, changed: bool = False) -> _Components:
-    names = [f"imu.{name}" for name in NOISE_FIGURES]
-    for rows in problem.constraints:
-        names += [
-            *rows.list_noise_groups()[0],
-            *(g for p in (*rows.parameters, *rows.processes) for g in p.noise_groups),
-        ]
-    names += [group for p in problem.parameters.values() for group in p.noise_groups]
-    log = {name: get_prior(name)[0] for name in dict.fromkeys(names)}
-    processes = [p for rows in problem.constraints for p in (*rows.parameters, *rows.processes)]
-    times = {p.name: p.correlation_time for p in processes if p.correlation_time is not None}
-    largest = {group: x for rows in problem.constraints if rows.fix_of for group, x in list_largest(rows).items()}
-    if start is None:
-        return _Components(log, times, largest)
-    log |= {name: start.figures[name].log_factor for name in log if name in start.figures}
-    return _Components(
-        log,
-        times,
-        largest,
-        times=dict(start.times),
-        weights=dict(start.weights),
-        excluded=start.excluded,
-        known=bool(start.figures),
-        same_data=bool(start.figures) and not changed,
-    )
-
-
 def _splice(about: Points, part: Points) -> Points:
     """Points with the first ones replaced."""
     n = len(part.values)
@@ -318,7 +226,7 @@ def _bound_squares(A: Array, B: Array, freedom: int, chance: float) -> tuple[flo
 
 
 def _improve(
-    figures: _Components,
+    figures: Components,
     problem: Problem,
     forward: ForwardRecord,
     smoothed: DisturbancePass,
@@ -353,7 +261,7 @@ def _improve(
         _weigh_rows(figures, problem, rows, np.maximum(found.left_out, found.whole), n)
 
 
-def _weigh_intervals(figures: _Components, problem: Problem, imu: ImuMoments) -> None:
+def _weigh_intervals(figures: Components, problem: Problem, imu: ImuMoments) -> None:
     """Give outlying intervals the noise by which their disturbance is as large as the limit of `CHANCE`."""
     t, n = problem.t[1:], len(imu.A)
     densities = problem.imu_noise.gyro_noise_density, problem.imu_noise.accel_noise_density
@@ -369,7 +277,7 @@ def _weigh_intervals(figures: _Components, problem: Problem, imu: ImuMoments) ->
 
 
 def _improve_process(
-    figures: _Components, chain: ParameterChain, moments: tuple[Array, Array, Array], bound: float
+    figures: Components, chain: ParameterChain, moments: tuple[Array, Array, Array], bound: float
 ) -> None:
     _, A, B = moments
     groups = np.array(chain.parameter.noise_groups)
@@ -378,12 +286,12 @@ def _improve_process(
         figures.update(group, *_bound_squares(A[:, own], B[:, own], 1, bound))
 
 
-def _is_observed(figures: _Components, chain: ParameterChain) -> Array:
+def _is_observed(figures: Components, chain: ParameterChain) -> Array:
     """(k,) whether the data determine the variance of each number of a process."""
     return np.array([figures.freedom.get(group, 0.0) > 1.0 for group in chain.parameter.noise_groups])
 
 
-def _improve_time(figures: _Components, chain: ParameterChain, observed: Array, lags: tuple[Array, ...]) -> None:
+def _improve_time(figures: Components, chain: ParameterChain, observed: Array, lags: tuple[Array, ...]) -> None:
     """One expectation-maximisation step of the correlation time, on a grid, with a log-normal prior.
 
     `observed` (k,) of its numbers are used.
@@ -413,7 +321,7 @@ def _improve_time(figures: _Components, chain: ParameterChain, observed: Array, 
     figures.times[p.name] = float(np.clip(found, median / _TIME_RANGE, median * _TIME_RANGE))
 
 
-def _weigh_rows(figures: _Components, problem: Problem, rows: Constraint, squared: Array, n: int) -> None:
+def _weigh_rows(figures: Components, problem: Problem, rows: Constraint, squared: Array, n: int) -> None:
     """Weights of the first n rows by their squared errors (n,)."""
     before = np.ones(len(rows)) if rows.weight is None else rows.weight
     used = before > 0.0

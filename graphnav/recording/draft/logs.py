@@ -16,11 +16,12 @@ from graphnav.recording import Gnss, Imu, Odometer
 from graphnav.recording.draft import columns as matching
 from graphnav.recording.draft import guesses
 from graphnav.recording.draft.clocks import read_clock_seconds, read_serial_days
+from graphnav.recording.draft.conversion import convert_small_units, convert_whole_degrees
 from graphnav.recording.draft.guesses import Guess
 from graphnav.recording.draft.motion import is_course_in_radians
-from graphnav.recording.draft.plain import Plain, read_plain
+from graphnav.recording.draft.plain import Plain, add_words, read_plain
 from graphnav.recording.formats.folder import read_other_log
-from graphnav.recording.formats.places import check_angles, find_places, is_in_whole_degrees
+from graphnav.recording.formats.places import check_angles, find_places
 from graphnav.recording.formats.registry import Log
 from graphnav.recording.formats.repair import blank_unknown, find_repeated, mask_new_fixes
 from graphnav.recording.formats.schema import WHEELS
@@ -55,8 +56,6 @@ WANTED = {
     "barometer": ("t", "pressure"),
     "gravity": ("t", "pull_x", "pull_y", "pull_z"),
 }
-_SMALL_UNITS = {"mm": 1e-3, "cm": 1e-2, "mm/s": 1e-3, "cm/s": 1e-2}  # m, m/s
-_OF_MOTION = ("ve", "vn", "vu", "vd", "sd_ve", "sd_vn", "sd_vu", "speed", "course")
 _PAUSES = 1000.0  # ratio of a log's duration to that of all its rows together, at most
 _NEEDED = {"gnss": 4, "odometer": 2}  # number of these that a row must have
 
@@ -217,53 +216,15 @@ def _find_gravity(
         values = {ours: bare.values[ours] + one.values[ours] for ours, one in zip(axes, sources, strict=True)}
         names = {**bare.columns.names, **{ours: ours for ours in axes}}
         words = f"forces are the sum of '{columns.names['ax']}' and '{pull[0]}', and so on"
-        plain = replace(bare.plain, words=f"{bare.plain.words}, {words}") if bare.plain else Plain({}, words)
-        whole = replace(bare, columns=replace(bare.columns, names=names), values={**bare.values, **values}, plain=plain)
+        whole = replace(
+            bare,
+            columns=replace(bare.columns, names=names),
+            values={**bare.values, **values},
+            plain=add_words(bare.plain, words),
+        )
         if has_gravity(whole):
             return whole, matching.FileColumns({**columns.names, **dict(zip("xyz", pull, strict=True))}, columns.units)
     return bare, columns
-
-
-def _convert_small_units(
-    columns: matching.FileColumns, names: dict[str, str], values: dict[str, Array], plain: Plain | None
-) -> tuple[matching.FileColumns, dict[str, str], Plain | None]:
-    """Columns whose names state mm, cm, or these per second, made m and m/s, which are the units of a recording."""
-    stated = {ours: matching.NAMED_UNITS.get(columns.units.get(ours, ""), ("", ""))[1] for ours in values}
-    small = {ours: unit for ours, unit in stated.items() if unit in _SMALL_UNITS}
-    if not small:
-        return columns, names, plain
-    for ours, unit in small.items():
-        values[ours] = values[ours] * _SMALL_UNITS[unit]
-    pairs = dict.fromkeys(f"'{names[ours]}' in {unit}" for ours, unit in small.items())
-    words = f"{', '.join(pairs)}, made m or m/s"
-    plain = replace(plain, words=f"{plain.words}, {words}") if plain is not None else Plain({}, words)
-    units = {ours: unit for ours, unit in columns.units.items() if ours not in small}
-    return matching.FileColumns(columns.names, units), {**names, **{ours: ours for ours in small}}, plain
-
-
-def _read_whole_degrees(table: Table, names: dict[str, str], plain: Plain | None) -> tuple[Table, Plain | None]:
-    """Places in whole numbers of 1e-7 deg, as u-blox and MAVLink have them, in deg, and heights beside them in m.
-
-    Whole numbers of speed and course beside them are in units that these do not share, so they are left alone.
-    """
-    at = {ours: x[np.isfinite(x)] for ours, x in table.columns.items() if ours != "t"}
-    if not (is_in_whole_degrees(at["lat"], at["lon"]) and all(map(_are_whole, (at["lat"], at["lon"])))):
-        return table, plain
-    for ours in [o for o in at if o in _OF_MOTION and _are_whole(at[o])]:
-        del names[ours]
-    heights = ["h"] if "h" in at and _are_whole(at["h"]) else []
-    for ours in ("lat", "lon", *heights):
-        table = table.with_column(ours, table[ours] * (1e-3 if ours == "h" else 1e-7))
-    words = f"'{names['lat']}', '{names['lon']}' in 1e-7 deg, made deg" + f", '{names['h']}' in mm, made m" * len(
-        heights
-    )
-    for ours in ("lat", "lon", *heights):
-        names[ours] = ours
-    return table, replace(plain, words=f"{plain.words}, {words}") if plain is not None else Plain({}, words)
-
-
-def _are_whole(x: Array) -> bool:
-    return np.array_equal(x, np.round(x))
 
 
 def _are_gps_seconds(t: Array) -> bool:
@@ -356,7 +317,7 @@ def _read_sensor(
                 f"{path}: every row is at 0, 0: the receiver had no fix, or its positions are in other columns",
                 key="draft.no_fix",
             )
-        table, plain = _read_whole_degrees(table, names, plain)
+        table, plain = convert_whole_degrees(table, names, plain)
         whole[whole] = find_places(table["lat"][whole], table["lon"][whole], ANGLE["deg"])  # as it will be read
         check_angles(table.take(whole), ANGLE["deg"], "GNSS")
     if whole.sum() < 2:
@@ -390,8 +351,8 @@ def _read_sensor(
         if "course" in values and is_course_in_radians(values["lat"], values["lon"], values["course"]):
             values["course"] = np.degrees(values["course"])
             words = f"'{names['course']}' is in rad, by the positions; made deg"
-            plain = replace(plain, words=f"{plain.words}, {words}") if plain is not None else Plain({}, words)
-    columns, names, plain = _convert_small_units(columns, names, values, plain)
+            plain = add_words(plain, words)
+    columns, names, plain = convert_small_units(columns, names, values, plain)
     step = np.diff(values["t"])
     if step.sum() > _PAUSES * len(step) * np.median(step):
         k = int(np.argmax(step))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, time, timedelta
 from pathlib import Path
 
@@ -55,6 +55,11 @@ class _Layout:
     above: list[str]  # lines before the header
     first: int  # index of the first row among the lines
     done: list[str] = field(default_factory=list)  # notes on deviations from a CSV file
+
+
+def add_words(plain: Plain | None, words: str) -> Plain:
+    """The same with words about what else was done to the columns."""
+    return Plain({}, words) if plain is None else replace(plain, words=f"{plain.words}, {words}")
 
 
 def read_plain(path: Path) -> Plain | None:

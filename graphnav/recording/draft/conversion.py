@@ -1,0 +1,60 @@
+"""Columns of a log in other units than those of a recording, made m, m/s and deg."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from graphnav.core.rotation import Array
+from graphnav.recording.draft import columns as matching
+from graphnav.recording.draft.plain import Plain, add_words
+from graphnav.recording.formats.places import is_in_whole_degrees
+from graphnav.recording.formats.table import Table
+
+_SMALL_UNITS = {"mm": 1e-3, "cm": 1e-2, "mm/s": 1e-3, "cm/s": 1e-2}  # m, m/s
+_OF_MOTION = ("ve", "vn", "vu", "vd", "sd_ve", "sd_vn", "sd_vu", "speed", "course")
+
+
+def convert_small_units(
+    columns: matching.FileColumns, names: dict[str, str], values: dict[str, Array], plain: Plain | None
+) -> tuple[matching.FileColumns, dict[str, str], Plain | None]:
+    """Columns whose names state mm, cm, or these per second, made m and m/s, which are the units of a recording.
+
+    `values` are changed.
+    """
+    stated = {ours: matching.NAMED_UNITS.get(columns.units.get(ours, ""), ("", ""))[1] for ours in values}
+    small = {ours: unit for ours, unit in stated.items() if unit in _SMALL_UNITS}
+    if not small:
+        return columns, names, plain
+    for ours, unit in small.items():
+        values[ours] = values[ours] * _SMALL_UNITS[unit]
+    pairs = dict.fromkeys(f"'{names[ours]}' in {unit}" for ours, unit in small.items())
+    words = f"{', '.join(pairs)}, made m or m/s"
+    units = {ours: unit for ours, unit in columns.units.items() if ours not in small}
+    names = {**names, **{ours: ours for ours in small}}
+    return matching.FileColumns(columns.names, units), names, add_words(plain, words)
+
+
+def convert_whole_degrees(table: Table, names: dict[str, str], plain: Plain | None) -> tuple[Table, Plain | None]:
+    """Places in whole numbers of 1e-7 deg, as u-blox and MAVLink have them, in deg, and heights beside them in m.
+
+    Whole numbers of speed and course beside them are in units that these do not share, so they are left alone.
+    `names` are changed.
+    """
+    at = {ours: x[np.isfinite(x)] for ours, x in table.columns.items() if ours != "t"}
+    if not (is_in_whole_degrees(at["lat"], at["lon"]) and all(map(_are_whole, (at["lat"], at["lon"])))):
+        return table, plain
+    for ours in [o for o in at if o in _OF_MOTION and _are_whole(at[o])]:
+        del names[ours]
+    heights = ["h"] if "h" in at and _are_whole(at["h"]) else []
+    for ours in ("lat", "lon", *heights):
+        table = table.with_column(ours, table[ours] * (1e-3 if ours == "h" else 1e-7))
+    words = f"'{names['lat']}', '{names['lon']}' in 1e-7 deg, made deg"
+    if heights:
+        words += f", '{names['h']}' in mm, made m"
+    for ours in ("lat", "lon", *heights):
+        names[ours] = ours
+    return table, add_words(plain, words)
+
+
+def _are_whole(x: Array) -> bool:
+    return np.array_equal(x, np.round(x))
