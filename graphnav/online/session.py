@@ -132,6 +132,13 @@ class Session:
             why = "; ".join(["no row of the IMU was taken in", *odd, *self.complaints[:1]])
         raise RecordingError(f"nothing could be smoothed: {why}", key="online.nothing")
 
+    def list_doubts(self) -> list[str]:
+        """Reasons why what has settled cannot be trusted."""
+        if self.online is None:
+            return []
+        found = [f"unreliable: {f.sentence}" for f in self.online.findings if f.severity == "unreliable"]
+        return found + [f"warning: {n}" for n in self.online.notes if get_key(n).startswith("doubt.")]
+
     def stop(self) -> None:
         """End before the source does: write a checkpoint."""
         if self.store is not None and self.online is not None and not self.done:

@@ -71,14 +71,17 @@ def test_a_session_in_a_wrong_unit_says_so(drive: Recording, how: str, keys: set
     assert not online.failures
 
 
-def test_what_is_refused_of_a_recording_is_so_while_it_is_driven_and_at_the_end(drive: Recording) -> None:
+@pytest.mark.parametrize(("unit", "key"), [("g", "imu.force_scale"), ("deg/s", "imu.gyro_unit")])
+def test_what_is_refused_of_a_recording_is_so_while_it_is_driven_and_at_the_end(
+    drive: Recording, unit: str, key: str
+) -> None:
     session = Session(QUICK, "-", None)
     *lines, end = (line for _, line in format_lines(drive))
-    session.add_lines([lines[0], *(format_line(spoil(row, "g")) for row in map(parse_row, lines[1:]) if row)])
+    session.add_lines([lines[0], *(format_line(spoil(row, unit)) for row in map(parse_row, lines[1:]) if row)])
     assert [label for label, _ in view(session)[:2]] == ["status", "refused"]
     session.add_lines([end])
     session.finish()
     with pytest.raises(RecordingError) as error:
         session.require_result()
-    assert error.value.key == "imu.force_scale"
+    assert error.value.key == key
     assert session.rows_settled

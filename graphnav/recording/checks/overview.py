@@ -77,7 +77,17 @@ class Inspection:
     @property
     def trusted(self) -> bool:
         """Whether there is no finding because of which a result may be entirely wrong."""
-        return all(f.severity in ("note", "warning") for f in self.findings)
+        return not self.list_defects()
+
+    def list_defects(self) -> list[str]:
+        """A line for each finding because of which a result may be entirely wrong.
+
+        Returns
+        -------
+        list of str
+            Severity and sentence.
+        """
+        return [f"{f.severity}: {f.sentence}" for f in self.findings if f.severity not in ("note", "warning")]
 
     def refuse(self) -> None:
         """Raise an error if the recording cannot be solved.
@@ -194,9 +204,10 @@ def inspect(recording: Recording, screened: Screened | None = None) -> Inspectio
     upright = not known & {"imu.force_scale", "imu.dead_axis"}
     if vehicle and overlap and track is not None and recording.gnss is not None and upright:
         clock = whole.clock or measure_clock_offsets(recording.imu, recording.gnss)
+        yaw = whole.yaw or crosschecks.fit_yaw_rate(recording.imu, track)
         if any(f.key == "gnss.velocity_axes" for f in wrong):  # their comparison with the IMU is meaningless
             track = tracks.compute_track(replace(recording.gnss, v=None)) or track
-        yaw = crosschecks.fit_yaw_rate(recording.imu, track)
+            yaw = crosschecks.fit_yaw_rate(recording.imu, track)
         forward = clock.by_velocity if track.instant else clock.by_places
         turns_back = turns_against(yaw)
         turns_so = yaw is not None and yaw.correlation > 0.8 and not turns_back
@@ -209,7 +220,7 @@ def inspect(recording: Recording, screened: Screened | None = None) -> Inspectio
                 wrong = list(check_imu_axes(recording.imu, forward, track))
                 wrong = wrong or list(check_sideways(recording.imu, forward, track, yaw))
                 findings += wrong or check_gyro_tilt(recording.imu, track)
-            findings += check_yaw_scale(yaw)
+            findings += [] if "imu.gyro_unit" in known else check_yaw_scale(yaw)
             findings += check_height_unit(recording, track, forward)
     elif vehicle and not turned:
         findings += check_imu_axes(recording.imu, None, None)
