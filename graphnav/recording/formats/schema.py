@@ -115,10 +115,8 @@ Noise = create_model(  # type: ignore[call-overload]
 )
 
 
-class ImuTable(SensorTable):
-    """[imu]"""
-
-    required = ("t", "gx", "gy", "gz", "ax", "ay", "az")
+class ImuDescription(TomlTable):
+    """What the readings of an IMU are, wherever they come from: axes, units and noise."""
 
     axes: str | None = None
     forward: Vector | None = None
@@ -137,7 +135,7 @@ class ImuTable(SensorTable):
         return model
 
     @model_validator(mode="after")
-    def _one_mount(self) -> ImuTable:
+    def _one_mount(self) -> ImuDescription:
         if self.axes is not None and (self.forward is not None or self.up is not None):
             raise ValueError("give either axes or forward and up, not both")
         if (self.forward is None) != (self.up is None):
@@ -157,6 +155,12 @@ class ImuTable(SensorTable):
         if self.forward is not None and self.up is not None:
             return parse_axes_vectors(self.forward, self.up)
         return parse_axes_letters(self.axes or "RFU")
+
+
+class ImuTable(ImuDescription, SensorTable):
+    """[imu]"""
+
+    required = ("t", "gx", "gy", "gz", "ax", "ay", "az")
 
 
 class GnssTable(SensorTable):
