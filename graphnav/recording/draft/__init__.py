@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,11 +28,14 @@ from graphnav.recording.draft.sources import (
     name_plain_file,
     read_fixes,
 )
-from graphnav.recording.formats.schema import FORCE, RATE_UNITS, SPEED
+from graphnav.recording.formats.schema import FORCE, GEOID, RATE_UNITS, SPEED
 from graphnav.recording.formats.writer import quote
 
 __all__ = ["Draft", "draft"]
 
+# heights by the names of their columns; others are taken as above the ellipsoid
+_ABOVE_SEA = re.compile(r"msl|alt|elev|orth|sea", re.IGNORECASE)
+_ABOVE_ELLIPSOID = re.compile(r"ell|hae|wgs", re.IGNORECASE)
 _SMALL = 0.03  # s; smaller clock offsets are left to the smoother, which estimates them
 _SD = "[3.3, 3.3, 6.6]"  # m, assumed of fixes that state none (graphnav.recording.formats.repair.DEFAULT_SD)
 
@@ -226,6 +230,17 @@ class _Writer:
         missing = {"sd_e", "sd_n", "sd_u"} - values.keys()
         if missing:  # all three or none
             dropped = (*dropped, "sd_e", "sd_n", "sd_u")
+        height = source.columns.names.get("h", "")
+        of_sea = bool(_ABOVE_SEA.search(height)) and not _ABOVE_ELLIPSOID.search(height)
+        if "geoid" in values:
+            pair = f"'{height}' and '{source.columns.names['geoid']}'"
+            same = (source.find_unit("h", "length") or "m") == (source.find_unit("geoid", "length") or "m")
+            if of_sea and same:
+                self._decide(f"heights: above the ellipsoid, as {pair} add up")
+            else:
+                dropped = (*dropped, "geoid")
+                why = "one is not in the other's unit" if of_sea else "a height above the ellipsoid needs none"
+                self._decide(f"heights: CHECK: {pair} are not added up: {why}")
         self._write_file(source, "gnss", dropped)
         if source.log is None:
             if "h" not in values:
@@ -254,8 +269,7 @@ class _Writer:
                     f"CHECK: m, 1-sigma east, north, up; the file states {none}, this is a receiver without corrections"
                 )
                 self._write_key("sd", _SD, why)
-            height = source.columns.names["h"]
-            if "msl" in height.lower() or "alt" in height.lower():
+            if of_sea and ("geoid" not in values or "geoid" in dropped):
                 self._decide(f"heights: '{height}' may be above mean sea level; they are used as they are")
         if late is not None:
             words = f"velocities are not used: they come {late:.2f} s after the positions"
@@ -358,7 +372,8 @@ class _Writer:
         if source.joined_from is None and source.plain is None and not is_inside(source.path, self.folder):
             words = f"{relative}: lies outside the folder of this file; use --allow-outside to read it"
             self._decide(words)
-        names = {o: theirs for o, theirs in source.columns.names.items() if o != theirs and o not in dropped}
+        names = {o: theirs for o, theirs in source.columns.names.items() if o not in dropped}
+        names = {o: theirs for o, theirs in names.items() if o != theirs or o == GEOID}
         if names:
             pairs = ", ".join(f"{ours} = {quote(theirs)}" for ours, theirs in names.items())
             self.lines.append(f"columns = {{ {pairs} }}")

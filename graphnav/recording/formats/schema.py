@@ -163,13 +163,16 @@ class ImuTable(ImuDescription, SensorTable):
     required = ("t", "gx", "gy", "gz", "ax", "ay", "az")
 
 
+GEOID = "geoid"  # added to h, only where `columns` names it: in other files h may be above the ellipsoid already
+
+
 class GnssTable(SensorTable):
     """[gnss]"""
 
     required = ("t", "lat", "lon", "h")
     optional = (
         "sd_e", "sd_n", "sd_u", "ve", "vn", "vu", "sd_ve", "sd_vn", "sd_vu", "vd", "speed", "course", "type",
-        "satellites",
+        "satellites", GEOID,
     )  # fmt: skip
 
     units: FixUnits = FixUnits()
