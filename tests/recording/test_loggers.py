@@ -112,7 +112,14 @@ def test_two_imus_at_once_are_refused_and_a_second_in_the_same_file_is_named(pla
     assert [line for line in drafted.decisions if "rear_gyro_x" in line and "rear_acc_z" in line and "CHECK" in line]
 
 
-@pytest.mark.parametrize(("name", "text"), [("track.gpx", "<gpx/>"), ("gps.csv", "t,easting,northing\n0,1,2\n1,2,3\n")])
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("track.gpx", "<gpx/>"),
+        ("gps.csv", "t,easting,northing\n0,1,2\n1,2,3\n"),
+        ("rover.rtcm3", "\xd3"),
+    ],
+)
 def test_positions_that_are_not_read_do_not_make_a_walk(plain, tmp_path, capsys, name, text):
     folder = stranger.write_tables(tmp_path, plain[0], plain[1])
     (folder / name).write_text(text)

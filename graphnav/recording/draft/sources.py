@@ -27,7 +27,9 @@ JOINED = "joined_imu.csv.gz"  # the file combined from a gyro's and an accelerom
 
 _TEXT_ENDINGS = (".csv", ".txt", ".tsv", ".dat", ".asc", ".log")  # of files of a folder that are considered
 
+_PROSE = re.compile(r"licen[cs]e|readme|copying|notice", re.IGNORECASE)  # names of files beside logs
 _TRACKS = (".gpx", ".kml", ".kmz", ".fit", ".tcx", ".geojson")
+_OF_RECEIVERS = (".rtcm", ".rtcm2", ".rtcm3", ".sbf", ".t02", ".t04", ".jps", ".gps", ".bnx")  # their own forms
 _POSITIONS = re.compile(r"(?:^|[^a-z])(?:gnss|gps|rtk|location|position|track|fix)(?:$|[^a-rt-z])", re.IGNORECASE)
 
 
@@ -153,9 +155,13 @@ def _check_unread(paths: Sequence[Path], tables: Mapping[Path, str]) -> None:
         Naming the file.
     """
     inside = [p for path in paths if path.is_dir() for p in sorted(path.iterdir())]
-    unread = [p for p in inside if p.suffix.lower() in _TRACKS] + [p for p in tables if _POSITIONS.search(p.name)]
+    unread = [p for p in inside if p.suffix.lower() in (*_TRACKS, *_OF_RECEIVERS)]
+    unread += [p for p in tables if _POSITIONS.search(p.name)]
     if unread:
-        why = tables.get(unread[0], "write them as CSV with t, lat and lon in deg and h in m")
+        why = "write them as CSV with t, lat and lon in deg and h in m"
+        if unread[0].suffix.lower() in _OF_RECEIVERS:
+            why = "write its observations as RINEX, as RTKLIB's convbin does"
+        why = tables.get(unread[0], why)
         raise RecordingError(
             f"{unread[0]}: its positions are not read ({why}); else take the file out of the folder",
             key="draft.positions_unread",
@@ -183,7 +189,7 @@ def _list_logs(path: Path) -> list[Path]:
     every = [p for p in path.iterdir() if not p.name.startswith(".") and p.exists()]  # no links that lead nowhere
     made = {JOINED, "recording.toml"}  # written by an earlier draft
     made |= {name_plain_file(p, sensor) for p in every for sensor in WANTED}
-    inside = sorted(p for p in every if p.name not in made)
+    inside = sorted(p for p in every if p.name not in made and not _PROSE.match(p.name))
     logs = [
         p
         for p in inside
@@ -206,7 +212,9 @@ def _name_others(paths: Sequence[Path], files: Sequence[Path]) -> str:
     """The files of folders that are no logs, in words; '' where there are none."""
     known = {*(p.name for p in files), *(name_plain_file(p, s) for p in files for s in WANTED), JOINED}
     every = {p.name for path in paths if path.is_dir() and path not in files for p in path.iterdir() if p.is_file()}
-    others = sorted(name for name in every - known if not name.startswith(".") and not name.endswith(".toml"))
+    others = sorted(
+        n for n in every - known if not n.startswith(".") and not n.endswith(".toml") and not _PROSE.match(n)
+    )
     return f"not read: {', '.join(others[:5])}{', ...' if len(others) > 5 else ''}" if others else ""
 
 
