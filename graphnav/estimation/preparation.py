@@ -32,14 +32,14 @@ from graphnav.estimation.fixing import fix, split_carriers
 from graphnav.estimation.joint_estimate import JointEstimate, estimate_jointly, revise_jointly
 from graphnav.estimation.noise.apply import apply_noise, drop_parts
 from graphnav.estimation.noise.bias_walks import estimate_bias_walks
-from graphnav.estimation.noise.copies import drop_copies
 from graphnav.estimation.noise.estimate import NoiseEstimate, estimate_noise
 from graphnav.estimation.noise.initial_points import BREAKDOWN
 from graphnav.estimation.noise.model import STATED, NoiseModel
 from graphnav.estimation.noise.spacing import space_fixes
+from graphnav.estimation.noise.unmeasured import UnmeasuredRows, drop_unmeasured
 from graphnav.estimation.noise.words import describe_noise
 from graphnav.estimation.problem import Problem
-from graphnav.estimation.solution import CarrierArcs, ExcludedSpan
+from graphnav.estimation.solution import CarrierArcs
 from graphnav.estimation.solvers.ekf import ekf, refilter, smooth_near
 from graphnav.estimation.solvers.linearise import Points, scale_at
 from graphnav.estimation.solvers.passes import (
@@ -79,7 +79,7 @@ class Prepared:
     arcs: dict[str, CarrierArcs] = field(default_factory=dict)  # `Solution.arcs`, the same way
     log_evidence: float = np.inf  # of all measurements by the estimated noise model, where that is wanted
     ahead: Points | None = None  # a step of Gauss and Newton behind `smoothed`, where it is known
-    copies: tuple[ExcludedSpan, ...] = ()  # fixes that are no part of the problem
+    unmeasured: UnmeasuredRows = field(default_factory=UnmeasuredRows)  # no part of the problem
 
     @property
     def diverged(self) -> bool:
@@ -111,7 +111,7 @@ def prepare(
     """
     clock, passes = Clock(), Counter[str]()
     as_stated = settings.noise.mode == "stated" if noise is None else noise == STATED
-    recording, copies = (recording, ()) if as_stated else drop_copies(recording)
+    recording, unmeasured = (recording, UnmeasuredRows()) if as_stated else drop_unmeasured(recording)
     spacing = settings.noise.spacing if noise is None else noise.spacing
     averaging = begin_beside(partial(average_speed, recording, settings))
     every = ProblemBuilder(recording, recording, settings, frame, clock, averaging)
@@ -167,7 +167,7 @@ def prepare(
     start = use_known_heading(aligned, settings)
     return Prepared(
         problem, noise, start, aligned, built.detections, forward, smoothed, notes, clock.seconds, passes, epochs, arcs,
-        evidence, ahead, copies,
+        evidence, ahead, unmeasured,
     )  # fmt: skip
 
 
