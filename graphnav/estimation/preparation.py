@@ -44,6 +44,7 @@ from graphnav.estimation.solution import CarrierArcs
 from graphnav.estimation.solvers.ekf import ekf, refilter
 from graphnav.estimation.solvers.linearise import Points, scale_at
 from graphnav.estimation.solvers.passes import (
+    LINEAR_ATTITUDE,
     FilterPass,
     SmootherPass,
     are_near,
@@ -56,7 +57,6 @@ from graphnav.recording import Recording
 # whether the evidence of a noise model is wanted, by the problem and the points of its estimate
 Weigh = Callable[[Problem, Points], bool]
 
-_LINEAR_ATTITUDE = 0.1  # rad between linearisation point and smoothed attitude, up to which the smoother is used
 _LINEAR = 0.5  # sigmas of what a step still moves: a mean square of errors over sigmas is a quarter larger
 _SMOOTHINGS = 5  # passes of filter and smoother about their previous points; without convergence a batch is solved
 _MOST_WRONG = 0.5  # share of excluded fixes, beyond which the start is wrong rather than the fixes
@@ -273,7 +273,7 @@ def _relinearise(
     nothing by a good part of its sigma: a barometer's scale times a height that was not known yet, a lever arm, a place
     that few fixes tell of. Returns also the points behind that step.
     """
-    if not are_near(smoothed, forward.linearised, _LINEAR_ATTITUDE):
+    if not are_near(smoothed, forward.linearised, LINEAR_ATTITUDE):
         forward, smoothed, ahead = _linearise_far(problem, aligned, known, smoothed, progress, passes)
         if ahead is not None:
             return forward, smoothed, ahead
@@ -310,7 +310,7 @@ def _linearise_far(
     for _ in range(int(about is known) if wheels else _SMOOTHINGS):
         passes.update(filter=1, smoother=1)
         smoothed = smooth_backward(problem, refilter(problem, about, progress), progress)
-        if are_near(smoothed, about, _LINEAR_ATTITUDE):
+        if are_near(smoothed, about, LINEAR_ATTITUDE):
             passes.update(filter=1)
             return ekf(problem, progress, aligned.until, known=smoothed), smoothed, None
         about = smoothed
@@ -348,7 +348,7 @@ def _step(problem: Problem, start: Points) -> Points | None:
         ahead = smooth_points(refilter(problem, start, whole=False))
     except BREAKDOWN:
         return None
-    return ahead if are_near(ahead, start, _LINEAR_ATTITUDE) else None
+    return ahead if are_near(ahead, start, LINEAR_ATTITUDE) else None
 
 
 def step_ahead(problem: Problem, start: Points) -> Points:
