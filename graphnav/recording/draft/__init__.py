@@ -70,8 +70,8 @@ def draft(paths: Sequence[Path], folder: Path, name: str | None = None, topics: 
     return Draft(text, tuple(writer.decisions), writer.made)
 
 
-def read_imu_in_si(path: Path) -> tuple[Array, Array, Array]:
-    """Times (N,), rates and forces (N, 3) of a CSV file in SI, units as `draft` would guess them.
+def read_imu_in_si(path: Path) -> tuple[Array, Array, Array, list[str]]:
+    """Times (N,), rates and forces (N, 3) of a CSV file in SI, units as `draft` would guess them, and which these are.
 
     Raises
     ------
@@ -82,7 +82,8 @@ def read_imu_in_si(path: Path) -> tuple[Array, Array, Array]:
     gyro, accel = source.stack("gx", "gy", "gz"), source.stack("ax", "ay", "az")
     force = guesses.guess_accel_unit(path, accel, source.find_unit("ax", "accel"))
     rate = guesses.guess_gyro_unit(path, gyro, source.find_unit("gx", "gyro"), None, vehicle=False)
-    return source.t, gyro * RATE_UNITS[str(rate.value)], accel * FORCE[str(force.value)]
+    words = [f"{name} in {guess.value}: {guess.why}" for name, guess in (("gyro", rate), ("accel", force))]
+    return source.t, gyro * RATE_UNITS[str(rate.value)], accel * FORCE[str(force.value)], words
 
 
 class _Writer:
