@@ -222,6 +222,13 @@ def test_a_unit_of_the_gyro_is_refused_where_the_courses_determine_it(
     assert [f.severity for f in found if f.key == "imu.gyro_unit"] == ["refused"] * sure
 
 
+@pytest.mark.parametrize("name", ["openshoe_loops/run02.toml", "pyshoe_vicon/2017-11-22-11-23-25.toml"])
+def test_a_walk_is_not_solved_as_a_drive_without_a_word(drive: Callable[[str], Recording], name: str) -> None:
+    recording = drive(name)
+    assert not warned(recording, "recording.platform")
+    assert len(warned(replace(recording, platform="vehicle"), "recording.platform")) == 1
+
+
 def test_milliseconds_that_count_from_the_start_of_the_imu_are_found(part: Callable[[str], Recording]) -> None:
     """The first fix, at 0 ms, lies within the IMU's time."""
     recording = part("dresden_car_20140326")

@@ -15,6 +15,8 @@ from graphnav.core.files import is_inside
 from graphnav.core.rotation import Array
 from graphnav.core.timescales import NEAR, UNIX, ClockOffset, compute_clock_offset
 from graphnav.recording import Gnss, Odometer
+from graphnav.recording.checks.imu import is_shaken_as_a_foot
+from graphnav.recording.checks.stated import moves_as_a_foot
 from graphnav.recording.draft import guesses, motion
 from graphnav.recording.draft.agreement import CLEAR, LIKELY, Agreement, compare_with_fixes
 from graphnav.recording.draft.guesses import Guess
@@ -99,7 +101,9 @@ class _Writer:
         self.made: dict[str, dict[str, Array]] = {}
 
     def format(self, found: dict[str, Source], raw: RawFound | None, name: str) -> str:
-        vehicle = "gnss" in found or "odometer" in found or raw is not None
+        moved = "gnss" in found or raw is not None
+        stepping = moved and "odometer" not in found and self._walks(found["imu"], found.get("gnss"))
+        vehicle = (moved or "odometer" in found) and not stepping
         self.lines += [
             "# Drafted by graphnav init. Comments say why each line is what it is; look at those marked CHECK.",
             'format = "graphnav-recording/1"', f"name = {quote(name)}",
@@ -107,6 +111,8 @@ class _Writer:
         why = (
             "there are fixes, speeds or observations of GNSS"
             if vehicle
+            else "CHECK: the fixes walk, and the force changes from step to step as on a shoe"
+            if stepping
             else "CHECK: no fixes and no speed, so a walk is assumed"
         )
         self._write_key("platform", '"vehicle"' if vehicle else '"foot"', why)
@@ -134,6 +140,17 @@ class _Writer:
         if "barometer" in found:
             self._write_barometer(found["barometer"])
         return "\n".join(self.lines) + "\n"
+
+    def _walks(self, imu: Source, gnss: Source | None) -> bool:
+        """Whether the IMU is shaken as one on a foot is, and fixes, if there are any, are as slow."""
+        if gnss is not None and not moves_as_a_foot(motion.compute_course(*read_fixes(gnss)).speed):
+            return False
+        if imu.log is not None:
+            assert imu.log.imu is not None
+            return is_shaken_as_a_foot(imu.log.imu.t, imu.log.imu.accel)
+        accel = imu.stack("ax", "ay", "az")
+        unit = guesses.guess_accel_unit(imu.path, accel, imu.find_unit("ax", "accel"))
+        return is_shaken_as_a_foot(imu.t, accel * FORCE[str(unit.value)])
 
     # ---- one table each
 
