@@ -6,6 +6,7 @@ first (`graphnav.recording.plausibility.screening`), and the rest is checked wit
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -120,14 +121,23 @@ class Inspection:
         """
         lines = [f"{self.name} ({self.platform})"]
         for sensor, facts in self.facts.items():
-            shown = ", ".join(_format_number(name, value) for name, value in facts.items())
-            lines.append(f"  {sensor:<9} {shown}")
+            lines.append(f"  {sensor:<9} {', '.join(_format_numbers(facts))}")
         for finding in self.findings:
             lines.append(f"  {finding.severity}: {finding.sentence}")
         return "\n".join(lines)
 
 
 _VALUE_UNITS = {"hz": "Hz", "s": "s", "m": "m", "mps": "m/s", "mps2": "m/s2", "dbhz": "dB-Hz"}
+
+
+def _format_numbers(facts: dict[str, Any]) -> Iterator[str]:
+    """Each fact with its name, of which words that the name before begins with too are not repeated."""
+    before = ""
+    for name, value in facts.items():
+        words, said = name.split("_"), before.split("_")
+        common = next((k for k, (a, b) in enumerate(zip(words[:-1], said, strict=False)) if a != b), len(words) - 1)
+        yield _format_number("_".join(words[min(common, len(words) - 1) :]) if len(said) > 1 else name, value)
+        before = name
 
 
 def _format_number(name: str, value: Any) -> str:
