@@ -5,8 +5,10 @@ I,t,gx,gy,gz,ax,ay,az
 G,t,lat,lon,h,sd_e,sd_n,sd_u[,ve,vn,vu,sd_ve,sd_vn,sd_vu]
 O,t,speed
 R,t,place and clock;satellite,signal,...;...   raw observations, one epoch per line (`graphnav.online.raw_lines`)
-S,name,t,...                  another sensor (`graphnav.sensors`): its columns; all in default units, or those that the first line states
+S,name,t,...                  another sensor (`graphnav.sensors`): its columns
 E
+
+All in the default units of files, and axes of the body, unless the first line states others.
 """
 
 from __future__ import annotations
