@@ -28,10 +28,10 @@ from graphnav.detectors import check_own as check_detectors
 from graphnav.estimation.building import start_sigma
 from graphnav.estimation.faults.excluded import describe_faults, find_fault_spans
 from graphnav.estimation.long_drives import OVERLAP, crop_solutions, share_covariances, split_drive
-from graphnav.estimation.noise.copies import describe_copies
 from graphnav.estimation.noise.files import MODES
 from graphnav.estimation.noise.imu_floor import apply_measured_floor
 from graphnav.estimation.noise.model import STATED, NoiseModel, StampOffsets
+from graphnav.estimation.noise.unmeasured import describe_unmeasured
 from graphnav.estimation.noise.words import describe_far
 from graphnav.estimation.offsets import move_stamps
 from graphnav.estimation.pieces import describe_span, split_pieces
@@ -266,7 +266,7 @@ def _solve(
         *found.detections.notes,
         *describe_stamps(stamps),
         *found.notes,
-        *describe_copies(found.copies, recording),
+        *describe_unmeasured(found.unmeasured, recording),
         *describe_faults(faults, problem),
     )
     notes = (*notes, *describe_far(problem, smoothed))
@@ -321,7 +321,7 @@ def _solve(
             out[name],
             notes=(*notes, *out[name].notes),
             detections=found.detections.all,
-            excluded=(*found.copies, *faults),
+            excluded=(*found.unmeasured.copies, *faults),
             noise=found.noise,
             passes=dict(passes),
             separation=apart,

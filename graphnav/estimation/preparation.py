@@ -23,6 +23,7 @@ from graphnav.core.errors import EstimationError
 from graphnav.core.notes import Note
 from graphnav.core.progress import Progress, tell
 from graphnav.core.rotation import Array
+from graphnav.core.state import States
 from graphnav.detectors import Detections
 from graphnav.estimation.alignment import Alignment, use_known_heading
 from graphnav.estimation.building import BuiltProblem, Clock, ProblemBuilder, has_diverged
@@ -32,17 +33,18 @@ from graphnav.estimation.fixing import fix, split_carriers
 from graphnav.estimation.joint_estimate import JointEstimate, estimate_jointly, revise_jointly
 from graphnav.estimation.noise.apply import apply_noise, drop_parts
 from graphnav.estimation.noise.bias_walks import estimate_bias_walks
-from graphnav.estimation.noise.copies import drop_copies
 from graphnav.estimation.noise.estimate import NoiseEstimate, estimate_noise
 from graphnav.estimation.noise.initial_points import BREAKDOWN
 from graphnav.estimation.noise.model import STATED, NoiseModel
 from graphnav.estimation.noise.spacing import space_fixes
+from graphnav.estimation.noise.unmeasured import UnmeasuredRows, drop_unmeasured
 from graphnav.estimation.noise.words import describe_noise
 from graphnav.estimation.problem import Problem
-from graphnav.estimation.solution import CarrierArcs, ExcludedSpan
-from graphnav.estimation.solvers.ekf import ekf, refilter, smooth_near
+from graphnav.estimation.solution import CarrierArcs
+from graphnav.estimation.solvers.ekf import ekf, refilter
 from graphnav.estimation.solvers.linearise import Points, scale_at
 from graphnav.estimation.solvers.passes import (
+    LINEAR_ATTITUDE,
     FilterPass,
     SmootherPass,
     are_near,
@@ -55,7 +57,6 @@ from graphnav.recording import Recording
 # whether the evidence of a noise model is wanted, by the problem and the points of its estimate
 Weigh = Callable[[Problem, Points], bool]
 
-_LINEAR_ATTITUDE = 0.1  # rad between linearisation point and smoothed attitude, up to which the smoother is used
 _LINEAR = 0.5  # sigmas of what a step still moves: a mean square of errors over sigmas is a quarter larger
 _SMOOTHINGS = 5  # passes of filter and smoother about their previous points; without convergence a batch is solved
 _MOST_WRONG = 0.5  # share of excluded fixes, beyond which the start is wrong rather than the fixes
@@ -79,7 +80,7 @@ class Prepared:
     arcs: dict[str, CarrierArcs] = field(default_factory=dict)  # `Solution.arcs`, the same way
     log_evidence: float = np.inf  # of all measurements by the estimated noise model, where that is wanted
     ahead: Points | None = None  # a step of Gauss and Newton behind `smoothed`, where it is known
-    copies: tuple[ExcludedSpan, ...] = ()  # fixes that are no part of the problem
+    unmeasured: UnmeasuredRows = field(default_factory=UnmeasuredRows)  # no part of the problem
 
     @property
     def diverged(self) -> bool:
@@ -111,7 +112,7 @@ def prepare(
     """
     clock, passes = Clock(), Counter[str]()
     as_stated = settings.noise.mode == "stated" if noise is None else noise == STATED
-    recording, copies = (recording, ()) if as_stated else drop_copies(recording)
+    recording, unmeasured = (recording, UnmeasuredRows()) if as_stated else drop_unmeasured(recording)
     spacing = settings.noise.spacing if noise is None else noise.spacing
     averaging = begin_beside(partial(average_speed, recording, settings))
     every = ProblemBuilder(recording, recording, settings, frame, clock, averaging)
@@ -167,7 +168,7 @@ def prepare(
     start = use_known_heading(aligned, settings)
     return Prepared(
         problem, noise, start, aligned, built.detections, forward, smoothed, notes, clock.seconds, passes, epochs, arcs,
-        evidence, ahead, copies,
+        evidence, ahead, unmeasured,
     )  # fmt: skip
 
 
@@ -268,54 +269,91 @@ def _relinearise(
 ) -> tuple[FilterPass, SmootherPass, Points | None]:
     """Filter and smooth about better points where the filter was linearised too far from the smoothed solution.
 
-    Where attitudes stayed, all else did if a step of Gauss and Newton from there moves nothing by a good part of its
-    sigma: a barometer's scale times a height that was not known yet, a lever arm. Returns also the points behind it.
+    Attitudes first (`_linearise_far`); where these stay, all else does if a step of Gauss and Newton from there moves
+    nothing by a good part of its sigma: a barometer's scale times a height that was not known yet, a lever arm, a place
+    that few fixes tell of. Returns also the points behind that step.
+    """
+    if not are_near(smoothed, forward.linearised, LINEAR_ATTITUDE):
+        forward, smoothed, ahead = _linearise_far(problem, aligned, known, smoothed, progress, passes)
+        if ahead is not None:
+            return forward, smoothed, ahead
+    for _ in range(_SMOOTHINGS):
+        ahead = _step(problem, smoothed)
+        passes.update(filter=1, smoother=1)
+        if ahead is None:
+            break
+        if np.all(subtract_points(ahead, smoothed) ** 2 <= _LINEAR**2 * smoothed.variance):
+            return forward, smoothed, ahead
+        smoothed = smooth_backward(problem, refilter(problem, ahead, progress), progress)
+        passes.update(filter=1, smoother=1)
+    return _linearise_at_batch(problem, aligned, smoothed, smoothed.states, progress, passes)
 
-    Where they did not, the points are `known`, those of the noise estimate, if there are any, else the smoother's own;
-    each pass about those of the pass before is such a step. If that does not settle they are those of a batch solution.
+
+def _linearise_far(
+    problem: Problem,
+    aligned: Alignment,
+    known: Points | None,
+    smoothed: SmootherPass,
+    progress: Progress | None,
+    passes: Counter[str],
+) -> tuple[FilterPass, SmootherPass, Points | None]:
+    """Filter and smooth where attitudes were linearised too far off; and the points of a batch solution, if any.
+
+    The points are `known`, those of the noise estimate, if there are any, else the smoother's own; each pass about
+    those of the pass before is a step of Gauss and Newton. If that does not settle they are those of a batch solution.
 
     If the heading is uncertain and fixes weigh little beside wheels, a filter may turn the mounting by half a turn
     instead of the velocity, a local minimum. So the batch is then solved at once, without wheels first.
     """
-    if are_near(smoothed, forward.linearised, _LINEAR_ATTITUDE):
-        for _ in range(_SMOOTHINGS):
-            ahead = step_ahead(problem, smoothed)
-            passes.update(filter=1, smoother=1)
-            if np.all(subtract_points(ahead, smoothed) ** 2 <= _LINEAR**2 * smoothed.variance):
-                return forward, smoothed, ahead
-            smoothed = smooth_backward(problem, refilter(problem, ahead, progress), progress)
-            passes.update(filter=1, smoother=1)
-        return forward, smoothed, None
     wheels = aligned.motion is not None and any(c.of_wheels for c in problem.constraints)
     about: Points = smoothed if known is None or len(known.states) != len(problem.t) else known
     for _ in range(int(about is known) if wheels else _SMOOTHINGS):
         passes.update(filter=1, smoother=1)
         smoothed = smooth_backward(problem, refilter(problem, about, progress), progress)
-        if are_near(smoothed, about, _LINEAR_ATTITUDE):
+        if are_near(smoothed, about, LINEAR_ATTITUDE):
             passes.update(filter=1)
             return ekf(problem, progress, aligned.until, known=smoothed), smoothed, None
         about = smoothed
-    from graphnav.estimation.factor_graph.batch import batch  # imports GTSAM, which few filter runs need
-
     states = smoothed.states
     if wheels:
+        from graphnav.estimation.factor_graph.batch import batch  # imports GTSAM, which few filter runs need
+
         free = replace(problem, constraints=tuple(c for c in problem.constraints if not c.of_wheels))
         states = smooth_backward(free, ekf(free, progress, aligned.until)).states
         states = batch(free, states, wanted=(), reintegrate=False).states
-    solved = batch(problem, states, wanted=(), reintegrate=False)
-    about = take_solution_points(problem, solved, smoothed)
-    _, smoothed = smooth_near(problem, about, aligned.until, progress)
-    passes.update(filter=3, smoother=2)
-    return ekf(problem, progress, aligned.until, known=smoothed), smoothed, None
+        passes.update(filter=1, smoother=1)
+    return _linearise_at_batch(problem, aligned, smoothed, states, progress, passes)
+
+
+def _linearise_at_batch(
+    problem: Problem,
+    aligned: Alignment,
+    smoothed: SmootherPass,
+    states: States,
+    progress: Progress | None,
+    passes: Counter[str],
+) -> tuple[FilterPass, SmootherPass, Points]:
+    """Filter and smooth about the batch solution that is found from some states, and its points."""
+    from graphnav.estimation.factor_graph.batch import batch
+
+    found = take_solution_points(problem, batch(problem, states, wanted=(), reintegrate=False), smoothed)
+    smoothed = smooth_backward(problem, refilter(problem, found, progress), progress)
+    passes.update(filter=2, smoother=1)
+    return ekf(problem, progress, aligned.until, known=smoothed), smoothed, found
+
+
+def _step(problem: Problem, start: Points) -> Points | None:
+    """The points after a step of Gauss and Newton, if it leads to any and attitudes are near the start's."""
+    try:
+        ahead = smooth_points(refilter(problem, start, whole=False))
+    except BREAKDOWN:
+        return None
+    return ahead if are_near(ahead, start, LINEAR_ATTITUDE) else None
 
 
 def step_ahead(problem: Problem, start: Points) -> Points:
     """The points after a step of Gauss and Newton, a fraction of the time by filter and smoother, where it is short."""
-    try:
-        ahead = smooth_points(refilter(problem, start, whole=False))
-    except BREAKDOWN:
-        return start
-    return ahead if are_near(ahead, start, _LINEAR_ATTITUDE) else start
+    return _step(problem, start) or start
 
 
 def _drop_refused(problem: Problem, forward: FilterPass) -> Problem:

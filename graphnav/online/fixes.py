@@ -10,8 +10,8 @@ import numpy as np
 from graphnav.constraints.gnss import find_fix_period
 from graphnav.core.rotation import Array
 from graphnav.estimation.alignment.first import pick_fixes
-from graphnav.estimation.noise.copies import mark_copies
 from graphnav.estimation.noise.spacing import find_grid_start, select_best_fixes
+from graphnav.estimation.noise.unmeasured import mark_copies
 from graphnav.online.buffers import Buffer
 from graphnav.recording import Gnss
 

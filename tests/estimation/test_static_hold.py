@@ -1,4 +1,4 @@
-"""Receivers that hold a position while they take a slow vehicle to stand."""
+"""Rows of fixes that are no measurements: positions that a receiver holds, and lines between fixes."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ import pytest
 import graphnav
 from graphnav.app.scores import score
 from graphnav.core.earth import LocalFrame
-from graphnav.estimation.noise.copies import drop_copies, mark_copies
+from graphnav.estimation.noise.unmeasured import UnmeasuredRows, drop_unmeasured, mark_copies, mark_interpolated
 from graphnav.evaluation.metrics import summarise
-from graphnav.recording import Recording
+from graphnav.recording import Gnss, Recording
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -69,5 +69,43 @@ def test_repeats_that_digits_explain_are_no_copies(drive: Recording) -> None:
     assert gnss is not None
     coarse = replace(gnss, rounding=(0.3, 0.3, 0.3), sd=np.full_like(gnss.sd, 0.1))
     assert mark_copies(gnss).any()
-    assert drop_copies(drive) == (drive, ())
+    assert drop_unmeasured(drive) == (drive, UnmeasuredRows())
     assert not mark_copies(coarse).any()
+
+
+def interpolate(gnss: Gnss, more: float) -> Gnss:
+    """Rows on the lines between every fifth fix, at a multiple of their rate."""
+    fixes = np.arange(0, len(gnss.t), 5)
+    t = np.interp(np.arange(0.0, len(fixes) - 1 + 1e-9, 1.0 / more), np.arange(len(fixes)), gnss.t[fixes])
+    llh = np.stack([np.interp(t, gnss.t[fixes], x) for x in gnss.llh[fixes].T], axis=-1)
+    return Gnss(t, llh, np.full_like(llh, 3.0), lever_arm=gnss.lever_arm, rounding=gnss.rounding)
+
+
+@pytest.mark.parametrize("more", [4.0, 10.0, 7.3])
+def test_interpolated_rows_are_known_from_fixes(drive: Recording, more: float) -> None:
+    assert drive.gnss is not None
+    gnss = interpolate(drive.gnss, more)
+    between = mark_interpolated(gnss)
+    fixes = drive.gnss.t[::5]
+    off_fix = np.abs(gnss.t[:, None] - fixes).min(axis=1) > 0.99 * np.diff(gnss.t).max()
+    moving = np.linalg.norm(np.gradient(LocalFrame(gnss.llh[0]).from_llh(gnss.llh), gnss.t, axis=0), axis=1) > 1.0
+    assert between[off_fix][1:-1].all()  # what is farther from a fix than the next row
+    assert not between[~off_fix & moving][1:-1].all()
+
+
+def test_measured_rows_are_not_taken_for_interpolated(drive: Recording) -> None:
+    assert drive.gnss is not None
+    assert not mark_interpolated(drive.gnss).any()
+    coarse = replace(drive.gnss, llh=np.round(drive.gnss.llh, 7), rounding=(0.2, 0.2, 0.0))
+    assert not mark_interpolated(coarse).any()
+
+
+def test_a_log_of_interpolated_rows_is_solved_as_one_of_its_fixes(drive: Recording) -> None:
+    assert drive.gnss is not None
+    error = {}
+    for name, used in {
+        "fixes": replace(drive, gnss=interpolate(drive.gnss, 1.0)),
+        "rows": replace(drive, gnss=interpolate(drive.gnss, 10.0)),
+    }.items():
+        error[name] = summarise(score(drive, used, graphnav.run(used, solvers=("rts",)), ())[0]["rts"])
+    assert error["rows"]["h_rms_m"] < 1.1 * error["fixes"]["h_rms_m"]

@@ -9,8 +9,8 @@ from test_online import joined
 
 from graphnav.config import parse_settings
 from graphnav.core.trajectory import Trajectory
-from graphnav.estimation.noise.copies import drop_copies
 from graphnav.estimation.noise.spacing import space_fixes
+from graphnav.estimation.noise.unmeasured import drop_unmeasured
 from graphnav.online import Online, drop_rows, list_rows
 from graphnav.online.sensors import Sensors
 from graphnav.recording import Gnss, Imu, Recording
@@ -39,7 +39,7 @@ def test_the_same_fixes_are_used_as_of_the_whole_recording(late: int) -> None:
         if n == 100:
             sensors.gnss.space(1.0)
             assert len(sensors.gnss.used) < 40
-    expected = space_fixes(drop_copies(recording)[0], 1.0).gnss
+    expected = space_fixes(drop_unmeasured(recording)[0], 1.0).gnss
     assert expected is not None
     np.testing.assert_array_equal(sensors.gnss.used, expected.t)
     assert sensors.make_recording().gnss.t.tolist() == expected.t.tolist()

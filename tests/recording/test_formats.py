@@ -237,6 +237,21 @@ def test_broken_nmea_lines_are_skipped_and_named(tmp_path):
         load(path)
 
 
+@pytest.mark.parametrize(
+    ("gga", "said"),
+    [
+        ("$GPGGA,125106,3854.5087,N,07726.4523,W,8,10,2.0,268.8,M,-33.9,M,,*7F", "1 by dead reckoning"),
+        ("$GPGGA,001901.00,,,,,0,00,99.99,,,,,,*6F", "1 GGA sentence"),
+        ("$GPGGA,112257.00,3844.24011,N,00908.43828,W,1,03,10.5,,,,,,*72", "height"),
+    ],
+)
+def test_nmea_without_a_measured_position_says_why(tmp_path, gga, said):
+    path = tmp_path / "a.nmea"
+    path.write_text(f"{gga}\r\n")
+    with refused("log.no_positions", RecordingError, "a.nmea", said):
+        load(path)
+
+
 # ---- a recording.toml that names other programs' logs
 
 

@@ -48,7 +48,8 @@ from graphnav.estimation.noise.priors import TIME_WITHIN
 from graphnav.estimation.problem import ParameterChain, Problem
 from graphnav.estimation.solvers.ekf import refilter
 from graphnav.estimation.solvers.linearise import Points
-from graphnav.estimation.solvers.passes import DisturbancePass, ForwardRecord, reuse_points
+from graphnav.estimation.solvers.passes import LINEAR_ATTITUDE, DisturbancePass, ForwardRecord, are_near, reuse_points
+from graphnav.estimation.solvers.rows import shorten_step
 from graphnav.estimation.solvers.rts import smooth_moments
 from graphnav.imu.preintegration import NOISE_FIGURES
 
@@ -177,8 +178,10 @@ def _iterate(
             if (evidence := now - compute_outlier_cost(figures.weights, totals)) > most:
                 likeliest, most = figures.copy(), evidence
             begun, ended = figures.copy(), end
+            ahead = _splice(about, latest[1])
+            linear = are_near(ahead, about, LINEAR_ATTITUDE)
+            about = ahead if linear else shorten_step(used, about, ahead)
             _improve(figures, used, *latest, end, intervals, bound)
-            about = _splice(about, latest[1])
             # each figure gains a half by chance; while one sensor is far off, many passes gain little more than that
             converged = k > 1 and abs(now - before) < (0.05 if k + 1 < rounds else 0.5) * len(figures.log)
             highest, since = max(highest, now), since + 1 if now <= highest else 0

@@ -170,7 +170,12 @@ def _estimate_without(
     # from the priors: figures estimated with the fault among the data are far from their final values
     start = NoiseModel(weights=decision.noise.weights, excluded=decision.noise.excluded)
     near = (decision.estimate or found).get_linearisation(base)
-    return _readmit(base, estimate_noise(base, opening, start, near, progress))
+    estimate = weigh_evidence(base, estimate_noise(base, opening, start, near, progress))
+    if log_evidence(base, estimate) < decision.log_evidence:  # a worse optimum than the one that the decision is near
+        other = weigh_evidence(base, estimate_noise(base, opening, decision.noise, near, progress))
+        best = max(estimate, other, key=lambda one: log_evidence(base, one))
+        estimate = replace(best, passes=estimate.passes + other.passes)
+    return _readmit(base, estimate)
 
 
 def _list_before(base: Problem, noise: NoiseModel) -> list[Span]:
@@ -273,8 +278,9 @@ def _readmit(base: Problem, found: NoiseEstimate) -> NoiseEstimate:
     best = max(decisions, key=lambda one: one.log_evidence)
     if best is decisions[0]:
         return replace(found, passes=passes)
-    again = estimate_noise(base, None, best.noise, found.get_linearisation(base))
-    return replace(again, passes=passes + again.passes)
+    again = weigh_evidence(base, estimate_noise(base, None, best.noise, found.get_linearisation(base)))
+    passes = passes + again.passes
+    return replace(max(found, again, key=lambda one: log_evidence(base, one)), passes=passes)
 
 
 def estimate_disturbed_intervals(base: Problem, found: NoiseEstimate) -> NoiseEstimate:

@@ -22,6 +22,7 @@ from graphnav.estimation.solvers.robust import weigh_squares
 from graphnav.estimation.solvers.stack import Innovations
 from graphnav.imu.dynamics import convert_to_biases
 
+LINEAR_ATTITUDE = 0.1  # rad between linearisation point and smoothed attitude, up to which the smoother is used
 _TURN = 0.02  # rad; what is linear in an error of attitude is wrong by half its square
 
 

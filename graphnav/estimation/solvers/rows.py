@@ -15,8 +15,10 @@ from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, States
 from graphnav.estimation.problem import ParameterChain, Problem
 from graphnav.estimation.solvers.linearise import Points, find_last_keyframes, linearise, linearise_links
+from graphnav.estimation.solvers.passes import move_points, subtract_points
 from graphnav.imu.dynamics import SCALE
 
+_SHORTEST = 6  # times that a step is halved
 _SHARED_BLOCKS = 6  # blocks of rows with the same variables
 Values = dict[str, Array]  # parameter name -> (nodes, k)
 WhitenedRows = list[tuple[list[tuple[Array, Array]], Array]]  # blocks of (keys, A (N, m, k)), and b (N, m)
@@ -198,6 +200,16 @@ def _group_rows(blocks: list[tuple[Array, Array]], b: Array) -> WhitenedRows:
 def compute_cost_at(problem: Problem, points: Points) -> float:
     """The cost at points of all keyframes."""
     return whiten(problem, Iterate(points.states, points.select_nodes(problem)), Layout(problem))[1]
+
+
+def shorten_step(problem: Problem, about: Points, ahead: Points) -> Points:
+    """The points after a step of Gauss and Newton, halved until the cost falls; `about` if it does not."""
+    step, now = subtract_points(ahead, about), compute_cost_at(problem, about)
+    for share in 0.5 ** np.arange(_SHORTEST + 1.0):
+        points = move_points(about, share * step)
+        if compute_cost_at(problem, points) < now:
+            return points
+    return about
 
 
 def compute_column_norms(rows: WhitenedRows, layout: Layout) -> Array:

@@ -32,6 +32,9 @@ _SENTENCE = re.compile(rb"(?:^|[\s>\])|:])\$(?!P)[A-Za-z]{5},")
 _BY_QUALITY = {1: 2.5, 2: 1.0, 4: 0.02, 5: 0.4}
 
 
+_NOT_MEASURED = (6, 7, 8)  # GGA's quality: dead reckoning, manual input, simulator
+
+
 @dataclass
 class _Epoch:
     """The data of the sentences of one time; angles in degrees."""
@@ -72,13 +75,11 @@ def load(path: Path) -> Log:
             f"{path.name}, line {broken[0]}: not a sound sentence (checksum or form); skipped {len(broken)} of "
             f"{format_count(lines, 'line')}",
         )
-    fixes = [e for e in epochs if e.gga is not None and e.gga.quality not in (0, 6, 7, 8) and e.gga.lat != ""]
+    ggas = [e for e in epochs if e.gga is not None]
+    fixes = [e for e in ggas if e.gga.quality not in (0, *_NOT_MEASURED) and e.gga.lat != ""]
     if not fixes:
-        at = f", line {broken[0]}: not a sound sentence (checksum or form), and" if broken else ":"
-        raise RecordingError(
-            f"{path}{at} no GGA sentence with a position and a right checksum is in it", key="log.no_positions"
-        )
-    simulated = sum(e.gga is not None and e.gga.quality in (6, 7, 8) for e in epochs)
+        raise RecordingError(_explain_no_fix(path, ggas, broken), key="log.no_positions")
+    simulated = sum(e.gga is not None and e.gga.quality in _NOT_MEASURED for e in epochs)
     if simulated:
         remarks.add(
             "gnss.not_measured",
@@ -108,6 +109,8 @@ def load(path: Path) -> Log:
     v, sd_v = _read_velocities(fixes, remarks)
     order = np.argsort(t, kind="stable")
     order = order[np.concatenate([[True], np.diff(t[order]) > 0]) & np.isfinite(llh[order]).all(-1)]
+    if not len(order):
+        raise RecordingError(f"{path}: no GGA sentence has a height beside its position", key="log.no_positions")
     if len(order) < len(t):
         remarks.add(
             "gnss.rows_left_out",
@@ -121,6 +124,16 @@ def load(path: Path) -> Log:
         "gnss.lever_arm_unknown", "GNSS: position of the antenna; its lever arm is not in the log and taken as zero"
     )
     return Log(path.stem, gnss=gnss, gps_zero=zero, remarks=tuple(remarks))
+
+
+def _explain_no_fix(path: Path, ggas: list[_Epoch], broken: list[int]) -> str:
+    """Why no sentence gives a position."""
+    if ggas:
+        not_measured = sum(e.gga.quality in _NOT_MEASURED for e in ggas)
+        words = f"{path}: none of its {format_count(len(ggas), 'GGA sentence')} has a measured position"
+        return words + (f" ({not_measured} by dead reckoning, manual input or a simulator)" if not_measured else "")
+    at = f", line {broken[0]}: not a sound sentence (checksum or form), and" if broken else ":"
+    return f"{path}{at} no GGA sentence, which gives position and height, with a right checksum is in it"
 
 
 def _collect_epochs(path: Path) -> tuple[list[_Epoch], list[int], int]:
