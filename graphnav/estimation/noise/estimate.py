@@ -177,10 +177,10 @@ def _iterate(
                 progress("noise", min((k + 1) / rounds, 1.0))
             if (evidence := now - compute_outlier_cost(figures.weights, totals)) > most:
                 likeliest, most = figures.copy(), evidence
-            begun, ended = figures.copy(), end
             ahead = _splice(about, latest[1])
-            linear = are_near(ahead, about, LINEAR_ATTITUDE)
-            about = ahead if linear else shorten_step(used, about, ahead)
+            near = are_near(ahead, about, LINEAR_ATTITUDE)
+            about = ahead if near else shorten_step(used, about, ahead)
+            begun, ended = figures.copy(), end
             _improve(figures, used, *latest, end, intervals, bound)
             # each figure gains a half by chance; while one sensor is far off, many passes gain little more than that
             converged = k > 1 and abs(now - before) < (0.05 if k + 1 < rounds else 0.5) * len(figures.log)
