@@ -31,8 +31,7 @@ HEAD = """\
 
 Mistakes that the tests make on `data/tokyo`, and the [key](keys.md) of what `graphnav info` finds; the first finding
 may be the cause of the others. A note changes nothing; a warning makes results worse; an unreliable one may be wrong
-whatever its sigmas say; what is refused is not solved. What cannot be read, or is no key, setting or command, is an
-error: exit code 2 and a line that names file, line and column, and what to do.
+whatever its sigmas say; what is refused is not solved.
 """
 _AND, _ERROR = "; ", "error"
 

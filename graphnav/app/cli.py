@@ -138,7 +138,7 @@ def info(
         more = (find_wrong_axes(*drive) or find_wrong_arms(*drive)) if found.trusted and not quick else []
         last = [find_antenna(whole).finding] if antenna else find_untold_arm(found.recording)
         found = replace(found, findings=(*more, *found.findings, *last))
-    print_out(found.format, found.to_dict, quiet, json)
+    print_out(found.format, found.to_dict, quiet, json, found.list_defects)
 
 
 @app.command(context_settings=SEVERAL, epilog="\b\nExample:\n  graphnav detect kitti -o out/kitti")

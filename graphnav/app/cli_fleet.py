@@ -140,6 +140,7 @@ def fleet(
         },
         quiet,
         json,
+        lambda: [f"{row['drive']}: {row.get('doubts') or _format_drive(row)}" for row in _select_wrong(rows)],
     )
     if not any(row["status"] == DONE for row in rows):
         raise ConfigError(
@@ -155,6 +156,11 @@ def _count_processors() -> int:
 
 def _resolve_noise(noise: str) -> str:
     return str(Path(noise).resolve()) if Path(noise).is_file() else noise
+
+
+def _select_wrong(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The drives without a result, and those whose result cannot be trusted."""
+    return [row for row in rows if row.get("verdict") != "sound"]
 
 
 def _format_drive(row: dict[str, Any]) -> str:

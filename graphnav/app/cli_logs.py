@@ -118,12 +118,12 @@ def allan(
     with show_progress(quiet, "allan"):
         tell("reading")
         if format is None and log.endswith((".csv", ".csv.gz")):
-            t, gyro, accel = read_imu_in_si(Path(log))
+            t, gyro, accel, units = read_imu_in_si(Path(log))
         else:
             imu = load(log, format, topic or (), allow_outside).imu
             if imu is None:
                 raise RecordingError(f"{log}: holds no IMU", key="log.no_imu")
-            t, gyro, accel = imu.t, imu.gyro, imu.accel
+            t, gyro, accel, units = imu.t, imu.gyro, imu.accel, []
         since = t - t[0]
         part_asked = (since >= (start or 0.0)) & (since <= (since[-1] if end is None else end))
         if part_asked.sum() < 2:
@@ -135,17 +135,26 @@ def allan(
         try:
             result = compute_allan(t[part_asked], gyro[part_asked], accel[part_asked])
         except RecordingError as error:
-            raise RecordingError(f"{log}: {error}", key=error.key) from None
+            taken = f" ({'; '.join(units)})" if units and error.key == "allan.moves" else ""
+            raise RecordingError(f"{log}: {error}{taken}", key=error.key) from None
         tell("writing")
         with stage_results(folder) as part:
             written = pages.write_allan(result, part)
     written = resolve_final_path(written, part, folder)
-    lines = [f"{result.duration:.0f} s at rest, {result.rate:.4g} Hz", "", "[imu.noise]", *result.format_lines(), ""]
+    lines = [
+        f"{result.duration:.0f} s at rest, {result.rate:.4g} Hz",
+        *(f"  {one}" for one in units),
+        "",
+        "[imu.noise]",
+        *result.format_lines(),
+        "",
+    ]
     print_out(
         lambda: "\n".join([*lines, *(f"wrote {path}" for path in written)]),
         lambda: {
             "duration_s": result.duration,
             "rate_hz": result.rate,
+            "units": units,
             "noise": loads("\n".join(result.format_lines())),
             "files": written,
         },

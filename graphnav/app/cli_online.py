@@ -29,7 +29,7 @@ from graphnav.app.cli_options import (
     Topic,
     choose_detectors,
 )
-from graphnav.app.talk import Interrupted, say
+from graphnav.app.talk import Interrupted, say, warn
 from graphnav.core.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -122,6 +122,8 @@ def online(
         finally:
             session.close()
             shown.finish()
+            if quiet:
+                warn(session.list_doubts())
     if asked and not session.done:
         raise Interrupted("interrupted" + (f"; go on with --resume -o {folder}" if folder else ""))
     session.require_result()

@@ -91,7 +91,7 @@ Topic = Annotated[
     list[str] | None,
     typer.Option("--topic", metavar="NAME", help="Topic of a ROS bag to use; may be repeated, once for each sensor."),
 ]
-Quiet = Annotated[bool, typer.Option("--quiet", help="Print nothing but errors.")]
+Quiet = Annotated[bool, typer.Option("--quiet", help="Print nothing but errors and why a result cannot be trusted.")]
 Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")]
 Require = Annotated[
     list[str] | None,

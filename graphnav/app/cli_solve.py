@@ -294,6 +294,7 @@ def _solve_and_write(
         return {**found, "requirements": gates.list_verdicts(verdicts), "files": files}
 
     print_out(
-        lambda: terminal.run_text(outcome, files) + gates.format_verdicts(verdicts), make_json, asked.quiet, asked.json
-    )
+        lambda: terminal.run_text(outcome, files) + gates.format_verdicts(verdicts), make_json, asked.quiet, asked.json,
+        lambda: terminal.describe_doubts(outcome),
+    )  # fmt: skip
     insist(verdicts)

@@ -248,7 +248,7 @@ def _draw_solver(
         provenance=provenance,
         detectors=detectors,
         noise=list_noise_figures(outcome, solution),
-        beside=("trajectory.kml", "trajectory.gpx", "trajectory.csv"),
+        beside=(*(("trajectory.kml", "trajectory.gpx") if outcome.recording.placed else ()), "trajectory.csv"),
     )
 
 

@@ -90,7 +90,8 @@ def read_outcome(path: Path) -> tuple[Outcome, dict[str, Any]]:
             values = parse_json(file["text"].tobytes().decode())
             arrays = [file[f"a{k}"] for k in range(len(file.files) - 1)]
     except (OSError, ValueError, KeyError, BadZipFile, zlib.error, EOFError, RuntimeError, MemoryError) as error:
-        raise ConfigError(f"{path}: cannot be read ({error})", key="file.unreadable") from None
+        why = "is damaged" if isinstance(error, BadZipFile) else "is none that smooth or compare wrote, or damaged"
+        raise ConfigError(f"{path}: {why}; solve again", key="file.unreadable") from None
     if not isinstance(values, dict) or values.get("form") != _RUN_FORMAT:
         raise ConfigError(f"{path}: is of another version of graphnav; solve again", key="results.other_version")
     try:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import sys
 import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
@@ -33,14 +33,28 @@ def insist(verdicts: Sequence[Verdict]) -> None:
         raise typer.Exit(NOT_MET)
 
 
-def print_out(text: Callable[[], str], values: Callable[[], Any], quiet: bool, json: bool) -> None:
-    """Print the result of a command: for people, for programs, or not at all."""
+def print_out(
+    text: Callable[[], str],
+    values: Callable[[], Any],
+    quiet: bool,
+    json: bool,
+    doubts: Callable[[], Iterable[str]] = tuple,
+) -> None:
+    """Print the result of a command: for people, for programs, or only `doubts`, lines that both of them contain."""
     if json:
         from graphnav.core.jsonable import format_json
 
         say(format_json(values()))
-    elif not quiet:
+    elif quiet:
+        warn(doubts())
+    else:
         say(text().rstrip("\n"))
+
+
+def warn(lines: Iterable[str]) -> None:
+    """Print lines to stderr, whatever else is printed."""
+    for line in lines:
+        print(f"graphnav: {_strip_controls(line)}", file=sys.stderr)
 
 
 @contextmanager

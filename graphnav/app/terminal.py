@@ -37,9 +37,7 @@ _WIDEST_TABLE = 1000  # characters of a table
 
 def run_text(outcome: Outcome, files: Sequence[Path]) -> str:
     """Summary of a run: what was read, findings, errors, and files to look at."""
-    lines = [f"warning: {doubt[0].lower()}{doubt[1:]}" for doubt in _list_doubts(outcome)]
-    lines += [f"unreliable: {sentence}" for sentence in outcome.defects]
-    lines.append(_describe_recording(outcome))
+    lines = [*describe_doubts(outcome), _describe_recording(outcome)]
     lines += [f"  {source} withheld{'' if span is None else f' {span[0]:g}-{span[1]:g} s'}"
               for source, span in outcome.request.withheld]  # fmt: skip
     notes = [note for s in outcome.solutions.values() for note in s.notes]
@@ -56,10 +54,13 @@ def run_text(outcome: Outcome, files: Sequence[Path]) -> str:
     return "\n".join([*lines, *(f"  {file}" for file in files)])
 
 
-def _list_doubts(outcome: Outcome) -> tuple[str, ...]:
+def describe_doubts(outcome: Outcome) -> list[str]:
+    """A line for each reason why the result cannot be trusted."""
     from graphnav.report.doubts import list_doubts
 
-    return list_doubts(outcome.solutions, {k: m.errors for k, m in outcome.metrics.items() if m.errors is not None})
+    errors = {name: m.errors for name, m in outcome.metrics.items() if m.errors is not None}
+    lines = [f"warning: {doubt[0].lower()}{doubt[1:]}" for doubt in list_doubts(outcome.solutions, errors)]
+    return lines + [f"unreliable: {sentence}" for sentence in outcome.defects]
 
 
 def _describe_noise(outcome: Outcome) -> list[str]:

@@ -40,7 +40,7 @@ def _name_axes(words: str) -> list[Component]:
 _NAMED = {
     "mounting": [Component("mounting, pitch", "deg", _TO_DEG), Component("mounting, heading", "deg", _TO_DEG)],
     "gnss_lever_arm": _name_axes("antenna lever arm"),
-    "axle": [Component("axle without side slip, before the stated place", "m")],
+    "axle": [Component("axle without side slip, ahead of the stated one", "m")],
     "gnss_time_offset": [Component("stamps of the positions, to add", "ms", 1e3)],
     "gnss_velocity_time_offset": [Component("stamps of the GNSS velocities, to add", "ms", 1e3)],
     "gnss_clock_rate": [Component("clock of the IMU, fast by", "ppm", 1e6)],

@@ -17,12 +17,13 @@ from graphnav.core import rotation
 from graphnav.core.earth import LocalFrame
 from graphnav.core.errors import RecordingError
 from graphnav.core.interpolation import fit_yaw, interpolate, place_on_earth
-from graphnav.core.notes import Note, format_count
+from graphnav.core.notes import Note, format_count, get_key
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, States
 from graphnav.core.timescales import LEAP, NEAR, compute_clock_offset
 from graphnav.core.trajectory import Trajectory
 from graphnav.estimation.solution import Solution
+from graphnav.evaluation.conventions import find_other_axes, require_right_handed
 from graphnav.evaluation.metrics import Metrics
 from graphnav.recording import Gnss, Recording
 from graphnav.recording.checks import crosschecks, tracks
@@ -103,7 +104,7 @@ def read_against(asked: Against, name: str, recording: Recording, reference: Sol
         If it cannot be read, shares no time with the recording, or its point is the antenna and there is no GNSS.
     """
     track = read_trajectory(asked.path)
-    notes = list(track.notes)
+    notes: list[str] = list(track.notes)
     if asked.shift is not None:
         track = replace(track, t=track.t + asked.shift)
         notes.append(Note("against.shift", f"{asked.path.name}: stamps shifted by {asked.shift:+g} s, as asked"))
@@ -121,7 +122,9 @@ def read_against(asked: Against, name: str, recording: Recording, reference: Sol
         )
     if track.frame == "local":
         at = track.t[inside]
-        yaw, offset = fit_yaw(track.llh[inside], reference.at(at)[1].p)
+        p = reference.at(at)[1].p
+        require_right_handed(str(asked.path), track.llh[inside], p)
+        yaw, offset = fit_yaw(track.llh[inside], p)
         track = place_on_earth(track, reference.frame, yaw, offset)
         notes.append(
             Note(
@@ -147,6 +150,13 @@ def read_against(asked: Against, name: str, recording: Recording, reference: Sol
                 f"{asked.path.name}: has no attitude; that of {reference.solver} places its lever arm",
             )
         )
+    elif recording.truth is None or recording.truth.rph is None:  # else it is compared with that
+        inside = (track.t >= reference.t[0]) & (track.t <= reference.t[-1])
+        states = reference.at(track.t[inside])[1]
+        R_lb = track.take(inside).R_lb
+        assert R_lb is not None
+        other = find_other_axes(R_lb, reference.frame.R_ln(states.p) @ states.R_nb)
+        notes.extend(Note(get_key(one), f"{asked.path.name}: {one}") for one in other)
     if np.any(arm):
         track = interpolate(track, track.t, max_gap=_MAX_GAP, lever_arm=-arm)[0]
         notes.append(
@@ -234,7 +244,7 @@ def _require_same_drive(asked: Against, track: Trajectory, recording: Recording,
         if np.nanmin(apart) > _FARTHEST:
             raise RecordingError(
                 f"{asked.path}: lies {np.nanmin(apart) / 1e3:.0f} km or more from '{recording.name}': it is of another "
-                "drive, or its latitudes and longitudes are wrong",
+                "drive, or its latitudes and longitudes are wrong, or in rad",
                 key="against.elsewhere",
             )
     if asked.shift is not None:

@@ -13,6 +13,7 @@ from graphnav.core.interpolation import differentiate, fill_covariance, fit_yaw,
 from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.core.trajectory import Trajectory
+from graphnav.evaluation.conventions import find_other_axes, find_other_heights, require_right_handed
 from graphnav.evaluation.fitted import propagate_fit
 from graphnav.evaluation.metrics import Closure, Errors
 
@@ -103,7 +104,10 @@ def compute_errors(
     if estimate.rph is not None and seen.rph is not None:
         rph = rotation.wrap(estimate.rph - seen.rph)
         # by the rotation, not the angles: these are strongly nonlinear where a foot points down
-        theta = rotation.log(np.swapaxes(rotation.from_rph(estimate.rph), -1, -2) @ rotation.from_rph(seen.rph))
+        mine, theirs = rotation.from_rph(estimate.rph), rotation.from_rph(seen.rph)
+        theta = rotation.log(np.swapaxes(mine, -1, -2) @ theirs)
+        notes += find_other_axes(mine, theirs)
+    notes += find_other_heights(p[:, 2])
 
     cov = fill_covariance(estimate)
     cov = np.full((len(seen), 9, 9), np.nan) if cov is None else cov
@@ -195,6 +199,7 @@ def _fit_frames(
             f"the {len(source)} common epochs extend over {spread:.3f} m only: too little to fit a yaw",
             key="truth.too_little",
         )
+    require_right_handed("the truth" if truth_is_local else trajectory.name or "the estimate", source, target)
     yaw, offset = fit_yaw(source, target)
     notes.append(
         Note(

@@ -97,7 +97,9 @@ def load_raw(
     precise = read_precise(list(sources.sp3), list(sources.clk)) if sources.sp3 else None
     if nav is None and precise is None:
         raise RecordingError(
-            f"{sources.rover[0]}: holds no ephemerides; set nav or sp3 in [raw_gnss]", key="raw.no_ephemerides"
+            f"{sources.rover[0]}: holds no ephemerides; they are in a RINEX navigation file of that day: set nav, or "
+            "sp3, in [raw_gnss]",
+            key="raw.no_ephemerides",
         )
     _check_dates(obs, nav, precise, sources)
     if zero is not None:

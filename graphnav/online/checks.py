@@ -36,7 +36,7 @@ def check_rows(recording: Recording) -> tuple[Finding, ...]:
     except Exception:  # a background check must never end the drive
         return ()
     until = f"rows sent up to {recording.end:.1f} s"
-    keys = " (a live source has no keys for it: send it so)" if recording.source is None else ""
+    keys = " (keys of a live source are in its first line)" if recording.source is None else ""
     return tuple(replace(f, sentence=f"{until}: {f.sentence}{keys}") for f in findings if f.severity != "note")
 
 

@@ -12,24 +12,33 @@ E
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator
-from dataclasses import asdict
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, ValidationError, create_model
+from pydantic import ValidationError, create_model
 
 from graphnav.core.complaints import describe_invalid, suggest_nearest
 from graphnav.core.errors import RecordingError
 from graphnav.core.files import parse_json, parse_number
+from graphnav.core.rotation import Array
 from graphnav.online.raw import RAW
 from graphnav.online.raw_lines import LiveRaw, describe_live_raw, format_epoch, parse_epoch
 from graphnav.online.replay import list_rows
 from graphnav.online.sensors import Row
 from graphnav.recording import Gnss, Imu, ImuNoise, Odometer, Recording
-from graphnav.recording.formats.schema import Noise
-from graphnav.sensors import Column, Series, list_sensors
-from graphnav.sensors.tables import NotNegative, Positive, Vector
+from graphnav.recording.formats.schema import (
+    FORCE,
+    HEIGHT,
+    RATE_UNITS,
+    SPEED,
+    GnssUnits,
+    ImuDescription,
+    OdometerUnits,
+)
+from graphnav.sensors import Column, Sensor, Series, list_sensors
+from graphnav.sensors.tables import ANGLE, TIME_UNITS, NotNegative, Number, Positive, TomlTable, Vector
 
 PROTOCOL = "graphnav-online/1"
 END = "E"
@@ -37,19 +46,19 @@ _NONE, _ROWS = np.empty(0), np.empty((0, 3))
 _BLANK = (float("nan"),) * 6
 
 
-class _Part(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
+class _Imu(ImuDescription):
+    time_offset: Number = 0.0
 
 
-class _Imu(_Part):
-    noise: Noise = Noise()  # type: ignore[valid-type]
-
-
-class _Gnss(_Part):
+class _Gnss(TomlTable):
+    time_offset: Number = 0.0
+    units: GnssUnits = GnssUnits()
     lever_arm: Vector = (0.0, 0.0, 0.0)
 
 
-class _Odometer(_Part):
+class _Odometer(TomlTable):
+    time_offset: Number = 0.0
+    units: OdometerUnits = OdometerUnits()
     lever_arm: Vector = (0.0, 0.0, 0.0)
     scale_sigma: Positive = 0.02
     signed: bool = True
@@ -57,7 +66,7 @@ class _Odometer(_Part):
     delay_sigma: NotNegative = 0.0
 
 
-class _Setup(_Part):
+class _Setup(TomlTable):
     name: str = "online"
     platform: Literal["vehicle", "foot"] = "vehicle"
     imu: _Imu = _Imu()
@@ -66,8 +75,34 @@ class _Setup(_Part):
     raw_gnss: LiveRaw | None = None
 
 
+@dataclass(frozen=True)
+class LineUnits:
+    """Units and axes of the numbers in a source's lines, by sensor; those of rows where a sensor is not named."""
+
+    times: Mapping[str, tuple[float, float]] = field(default_factory=dict)  # size of the unit and offset, s
+    sizes: Mapping[str, tuple[float, ...]] = field(default_factory=dict)  # of the units of its numbers, in SI
+    R_bs: Array | None = None  # body (RFU) from the IMU's axes, (3, 3); None: they are those of the body
+
+    def convert(self, row: Row) -> Row:
+        """A row in SI and body axes of one in the source's units, on the clock that its offsets make common."""
+        sensor, t, values = row
+        if sensor in self.times:
+            size, offset = self.times[sensor]
+            t = size * t + offset
+        if sensor in self.sizes:
+            values = tuple(x * size for x, size in zip(values, self.sizes[sensor], strict=True))
+        if sensor == "imu" and self.R_bs is not None:
+            values = (*(self.R_bs @ values[:3]).tolist(), *(self.R_bs @ values[3:]).tolist())
+        return sensor, t, values
+
+
 def parse_setup(line: str) -> Recording:
-    """The sensors described by the first line of a source.
+    """The sensors described by the first line of a source, as `read_setup`."""
+    return read_setup(line)[0]
+
+
+def read_setup(line: str) -> tuple[Recording, LineUnits]:
+    """The sensors described by the first line of a source, and the units of the lines that follow.
 
     Raises
     ------
@@ -81,7 +116,7 @@ def parse_setup(line: str) -> Recording:
             key="online.first_line",
         )
     known = list_sensors()
-    others: Any = {name: (sensor.figures | None, None) for name, sensor in known.items()}
+    others: Any = {name: (_describe_live(sensor) | None, None) for name, sensor in known.items()}
     model = create_model("_Setup", __base__=_Setup, **others)
     try:
         found = model.model_validate(parse_json(text or "{}"))
@@ -89,7 +124,11 @@ def parse_setup(line: str) -> Recording:
         raise RecordingError(describe_invalid("line 1: setup", error, model)) from None
     except ValueError as error:
         raise RecordingError(f"line 1: the setup is not JSON ({error})", key="online.setup_json") from None
-    stated = found.imu.noise.model_dump(exclude_none=True)  # type: ignore[attr-defined]
+    try:
+        R_bs = found.imu.R_bs
+    except ValueError as error:
+        raise RecordingError(f"line 1: setup: 'imu.axes', 'forward' or 'up' {error}", key="key.value") from None
+    stated = found.imu.figures
     gnss = odometer = None
     if found.gnss is not None:
         derived = found.raw_gnss is not None  # fixes are used for the start
@@ -99,18 +138,60 @@ def parse_setup(line: str) -> Recording:
             _NONE, _NONE, np.array(o.lever_arm), o.scale_sigma,
             signed=o.signed, speed_sigma=o.speed_sigma, delay_sigma=o.delay_sigma,
         )  # fmt: skip
-    imu = Imu(_NONE, _ROWS, _ROWS, ImuNoise(**stated), noise_assumed=not stated)
+    imu = Imu(_NONE, _ROWS, _ROWS, ImuNoise(**stated), R_bs, noise_assumed=not stated)
+    others = {name: (sensor, one) for name, sensor in known.items() if (one := getattr(found, name)) is not None}
     sensors = {
-        name: Series(sensor, _NONE, np.empty((0, len(sensor.names))), figures)
-        for name, sensor in known.items()
-        if (figures := getattr(found, name)) is not None
+        name: Series(
+            sensor,
+            _NONE,
+            np.empty((0, len(sensor.names))),
+            sensor.figures(**{key: getattr(one, key) for key in sensor.figures.model_fields}),
+        )
+        for name, (sensor, one) in others.items()
     }
     raw = None if found.raw_gnss is None else found.raw_gnss.make_setup()
-    return Recording(found.name, found.platform, imu, gnss, odometer, sensors=sensors, raw_gnss=raw)
+    recording = Recording(found.name, found.platform, imu, gnss, odometer, sensors=sensors, raw_gnss=raw)
+    return recording, _find_units(found, others)
 
 
-def parse_row(line: str) -> Row | None:
-    """Parse a row; None for an empty line or a comment.
+def _describe_live(sensor: Sensor) -> type[TomlTable]:
+    """The model of a sensor in the first line: its figures, and the units of its columns."""
+    units = sensor.table.model_fields["units"]
+    make: Any = create_model  # whose fields are not known statically
+    return make(  # type: ignore[no-any-return]
+        f"{sensor.name}_live",
+        __base__=(sensor.figures,),
+        units=(units.annotation, units.default),
+        time_offset=(Number, 0.0),
+    )
+
+
+def _find_units(found: Any, others: Mapping[str, tuple[Sensor, Any]]) -> LineUnits:
+    """The units that a setup states, of those sensors where they are not the units of rows."""
+    given = {"imu": found.imu, "gnss": found.gnss, "odometer": found.odometer}
+    given |= {name: one for name, (_, one) in others.items()}
+    given = {name: one for name, one in given.items() if one is not None}
+    times = {name: (TIME_UNITS[one.units.t], one.time_offset) for name, one in given.items()}
+    sizes: dict[str, tuple[float, ...]] = {
+        "imu": (RATE_UNITS[found.imu.units.gyro],) * 3 + (FORCE[found.imu.units.accel],) * 3
+    }
+    if (gnss := found.gnss) is not None:
+        angle = ANGLE[gnss.units.angle or "deg"] / ANGLE["deg"]
+        sizes["gnss"] = angle, angle, HEIGHT[gnss.units.height], *(1.0,) * 3, *(SPEED[gnss.units.speed],) * 6
+    if found.odometer is not None:
+        sizes["odometer"] = (SPEED[found.odometer.units.speed],) * 6
+    for name, (sensor, one) in others.items():
+        sizes[name] = tuple(c.units[getattr(one.units, c.name)] / _tell_scale(c) for c in sensor.columns)
+    R_bs = found.imu.R_bs
+    return LineUnits(
+        {name: time for name, time in times.items() if time != (1.0, 0.0)},
+        {name: size for name, size in sizes.items() if set(size) != {1.0}},
+        None if np.array_equal(R_bs, np.eye(3)) else R_bs,
+    )
+
+
+def parse_row(line: str, units: LineUnits | None = None) -> Row | None:
+    """Parse a row into SI; None for an empty line or a comment.
 
     Raises
     ------
@@ -120,6 +201,12 @@ def parse_row(line: str) -> Row | None:
     line = line.strip()
     if not line or line.startswith("#"):
         return None
+    row = _parse_line(line)
+    return row if units is None else units.convert(row)
+
+
+def _parse_line(line: str) -> Row:
+    """A row in the units of a source that states none."""
     kind, *cells = line.split(",")
     if kind == "S":
         return _parse_series_row(cells)

@@ -10,7 +10,7 @@ from graphnav.config import Settings
 from graphnav.core.errors import ConfigError, RecordingError
 from graphnav.core.notes import get_key
 from graphnav.core.trajectory import Trajectory
-from graphnav.online.lines import END, parse_row, parse_setup
+from graphnav.online.lines import END, LineUnits, parse_row, read_setup
 from graphnav.online.replay import drop_rows, list_rows
 from graphnav.online.sensors import Row
 from graphnav.online.start import let_clocks_drift
@@ -43,6 +43,7 @@ class Session:
         self.settings, self.folder = settings, folder
         self.store = None if folder is None else Store(folder, source, resume, live=recording is None)
         self.online: Online | None = None
+        self.units: LineUnits | None = None if self.store is None else self.store.units
         self.taken = self.bad = self.rows_settled = 0
         self.done = False
         self.complaints: list[str] = []
@@ -132,6 +133,13 @@ class Session:
             why = "; ".join(["no row of the IMU was taken in", *odd, *self.complaints[:1]])
         raise RecordingError(f"nothing could be smoothed: {why}", key="online.nothing")
 
+    def list_doubts(self) -> list[str]:
+        """Reasons why what has settled cannot be trusted."""
+        if self.online is None:
+            return []
+        found = [f"unreliable: {f.sentence}" for f in self.online.findings if f.severity == "unreliable"]
+        return found + [f"warning: {n}" for n in self.online.notes if get_key(n).startswith("doubt.")]
+
     def stop(self) -> None:
         """End before the source does: write a checkpoint."""
         if self.store is not None and self.online is not None and not self.done:
@@ -192,7 +200,10 @@ class Session:
     def _take_line(self, line: str) -> None:
         if self.online is None:
             if line.strip() and not line.startswith("#"):
-                self._begin(Online(parse_setup(line), self.settings))
+                setup, self.units = read_setup(line)
+                if self.store is not None:
+                    self.store.units = self.units
+                self._begin(Online(setup, self.settings))
             return
         if line.strip() == END:
             self.finish()
@@ -200,7 +211,7 @@ class Session:
         if self.done or line.startswith("graphnav-online/"):
             return  # a sender that restarts
         try:
-            row = parse_row(line)
+            row = parse_row(line, self.units)
         except ValueError as error:
             self.bad += 1
             if len(self.complaints) < _REPORTED_LINES:

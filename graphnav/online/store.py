@@ -23,11 +23,12 @@ from typing import Any, BinaryIO
 
 from graphnav.core.errors import ConfigError, GraphnavError
 from graphnav.core.trajectory import Trajectory
+from graphnav.online.lines import LineUnits
 from graphnav.online.steady import Online
 from graphnav.recording.exporters import csv
 
 TRAJECTORY, CHECKPOINT, SUMMARY = "trajectory.csv", "checkpoint", "summary.json"
-_MAGIC = b"graphnav checkpoint 14\n"
+_MAGIC = b"graphnav checkpoint 15\n"
 _DIGEST = hashlib.sha256
 
 _PLAIN = {
@@ -56,6 +57,7 @@ class Checkpoint:
     journal: int  # number of the journal with the lines since
     done: bool  # end of the input was reached
     piece: int = 1  # number of the clock that the times are of
+    units: LineUnits | None = None  # of the lines of a live source
 
 
 class Store:
@@ -72,6 +74,7 @@ class Store:
         self.pending: deque[bytes] = deque()  # lines in the journal that have not been processed
         self._journal: FileIO | None = None
         self._number, self.piece = 0, 1
+        self.units: LineUnits | None = None  # of the lines of a live source, once it has described its sensors
         path = folder / CHECKPOINT
         self.resumed: Checkpoint | None = None
         if resume:
@@ -83,7 +86,7 @@ class Store:
                     f"--resume: {folder} was made from '{self.resumed.source}', not from '{source}'",
                     key="checkpoint.other_source",
                 )
-            self._length = self.resumed.length
+            self._length, self.units = self.resumed.length, self.resumed.units
             self._number, self.piece = self.resumed.journal, self.resumed.piece
         elif path.exists():
             raise ConfigError(
@@ -163,7 +166,7 @@ class Store:
     def write_checkpoint(self, online: Online, counts: dict[str, int], done: bool = False) -> None:
         """Write a checkpoint of the smoother; lines of the journal before it are no longer needed."""
         number = self._number + 1
-        now = Checkpoint(online, self.source, counts, self._length, number, done, self.piece)
+        now = Checkpoint(online, self.source, counts, self._length, number, done, self.piece, self.units)
         path, fresh = self.folder / CHECKPOINT, self.folder / (CHECKPOINT + ".new")
 
         def write() -> None:

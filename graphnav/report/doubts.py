@@ -98,12 +98,9 @@ def list_doubts(solutions: Mapping[str, Solution], errors: Mapping[str, Errors])
             words = f"forward filter and later measurements are {apart.size:.2g} times their sigma apart"
             wrong.append(f"{words} ({apart.block})")
     if wrong:
-        out.append(
-            Note(
-                "doubt.sigma",
-                f"The result's sigmas cannot be trusted: {'; '.join(wrong)}; count on errors larger by that factor",
-            )
-        )
+        whose = "Sigmas" if len(solutions) > 1 else "The result's sigmas"
+        words = f"{whose} cannot be trusted: {'; '.join(wrong)}; count on errors larger by that factor"
+        out.append(Note("doubt.sigma", words))
     return tuple(out)
 
 

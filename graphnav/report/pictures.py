@@ -265,7 +265,7 @@ def draw_separation(solution: Solution, start: float, end: float, spans: Shades)
     if found is None or not np.isfinite(found.value).any():
         return []
     series = {"ekf": Curve(found.t - start, found.value, found.sigma)}
-    note = "Position of the forward filter less that of all later measurements; it should lie within the band."
+    note = "Position by the forward filter minus that by later measurements alone; it should lie within the band."
     return [
         page.place_picture(
             plots.plot_bands(series, ENU, "m", end, spans=spans), "Combined separation and 3 sigma", note
@@ -394,7 +394,7 @@ def draw_detections(recording: Recording, found: Sequence[Detection]) -> list[Ma
     """Signals and statistics of the detectors."""
     if not found:
         return []
-    note = "Tinted: the intervals in which it stands, all detectors together."
+    note = "Tinted: stationary, by all detectors together."
     return [
         page.place_picture(
             plots.plot_detections(recording, found), "Signals, statistics and thresholds", note, kind="large"

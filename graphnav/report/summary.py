@@ -148,12 +148,26 @@ def tabulate_fixes(recording: Recording, solution: Solution, withheld: Removed) 
             over = float(np.nanmax(np.abs(record.residual / record.sigma)[at[used]]))
             gap = float(np.max(np.diff(fixes.t[used]), initial=0.0))
         rows.append([*cells, len(used), gap, largest, over, *_list_stated(recording, np.flatnonzero(of_it))])
-    head = ["fixes", "count", "withheld", "left out", "used", "longest gap [s]", "farthest [m]", "residual / sigma"]
-    head.append("stated [m]")
+    head = [
+        "fixes",
+        "count",
+        "withheld",
+        "left out",
+        "used",
+        "longest gap [s]",
+        "farthest [m]",
+        "largest residual / sigma",
+    ]
+    head.append("stated sigma [m]")
     if recording.gnss is not None and recording.gnss.satellites is not None:
         head += ["satellites", "fewest"]
     out = [page.heading("Fixes"), page.make_table(head, rows)]
-    out.append(page.paragraph("Farthest: level, from the antenna as estimated at that time.", "soft"))
+    out.append(
+        page.paragraph(
+            "Farthest: horizontally, from the estimated antenna. Residuals are over the sigma of the noise model.",
+            "soft",
+        )
+    )
     if any(row[4] < row[1] - row[3] for row in rows):
         out.append(page.paragraph("Of fixes that come more often than noise.spacing, the best one is used.", "soft"))
     return out
@@ -186,7 +200,7 @@ def tabulate_separation(solution: Solution) -> list[Markup]:
             )
     if not rows:
         return []
-    note = "Forward filter less what comes after each keyframe; over its sigma it is 1 (rms) where sigma is true."
+    note = "Forward filter minus the estimate from later measurements; over its sigma, about 1 where sigmas are true."
     head = ["axis", "50 % [m]", "95 % [m]", "largest [m]", "over sigma, rms"]
     return [page.heading("Combined separation"), page.make_table(head, rows), page.paragraph(note, "soft")]
 

@@ -132,7 +132,7 @@ def _list_notes(errors: Mapping[str, Errors]) -> list[Markup]:
 
 _OF_IMU = dict(zip(INTERVALS, ("gyro", "accelerometer"), strict=True))
 NOISE_HEAD = ("figure", "stated", "used", "unit", "times stated sigma", "1-sigma", "correlation time [s]",
-              "degrees of freedom", "expected beforehand")  # fmt: skip
+              "degrees of freedom", "prior")  # fmt: skip
 
 
 def tabulate_noise(rows: Sequence[FigureRow], solution: Solution) -> list[Markup]:
@@ -332,7 +332,7 @@ def tabulate_stops(solution: Solution, start: float, decided_by: str) -> list[Ma
     if len(stops) > _MAX_ROWS:
         note += f" {len(stops) - _MAX_ROWS} more are in detections.csv."
     return [
-        *_format_long_table(["stands from", "for", "share by detector", "rows"], rows),
+        *_format_long_table(["stationary from", "for", "share by detector", "rows"], rows),
         page.paragraph(note, "soft"),
     ]
 

@@ -296,6 +296,26 @@ def test_quiet_is_silent_and_a_config_file_counts(drive, tmp_path, capfd):
     assert s["keyframes"] == pytest.approx(240, abs=5)
 
 
+def test_a_result_that_cannot_be_trusted_is_told_quiet_or_not(drive, tmp_path, capfd):
+    """Sigmas a hundred times too small, and nothing estimated."""
+    bold = tmp_path / "bold"
+    shutil.copytree(drive, bold)
+    fixes = rows(bold / "gnss.csv")
+    small = [{k: str(0.01 * float(x)) if k.startswith("sd_") else x for k, x in row.items()} for row in fixes]
+    lines = [",".join(row.values()) for row in small]
+    (bold / "gnss.csv").write_text("\n".join([",".join(small[0]), *lines]) + "\n")
+    asked = ["smooth", bold, "--noise", "stated", "--solver", "ekf", "--end", 120, "--no-report", "-o", tmp_path / "o"]
+    assert command(*asked) == 0
+    loud = capfd.readouterr()
+    assert command(*asked, "--quiet") == 0
+    quiet = capfd.readouterr()
+    doubts = summary(tmp_path / "o")["doubts"]
+    assert doubts
+    assert (loud.err, quiet.out) == ("", "")
+    told = [line.removeprefix("graphnav: ") for line in quiet.err.splitlines()]
+    assert told == loud.out.splitlines()[: len(doubts)]
+
+
 def test_rate_is_that_of_the_output(tmp_path):
     part = ["kitti", "--end", "60", "--noise", "stated", "--solver", "rts", "--quiet"]
     assert cli.run(["smooth", *part, "--rate", "20", "-o", str(tmp_path)]) == 0

@@ -211,6 +211,12 @@ def test_a_manifest_gives_each_drive_its_own_settings(tmp_path: Path) -> None:
     assert (found[0][0].end, found[0][0].without, found[0][1].without) == (60.0, ("gnss:10-20", "odometer"), ())
 
 
+def test_a_manifest_of_a_spreadsheet_may_have_semicolons(tmp_path: Path) -> None:
+    (tmp_path / "m.csv").write_text("recording;name;end\nkitti;one;60\n")
+    (task,) = [build_task(drive, tmp_path, {}) for drive in read_drives(tmp_path / "m.csv", DriveOptions())]
+    assert (task.name, task.end) == ("one", 60.0)
+
+
 @pytest.mark.parametrize(
     ("text", "words"),
     [

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from graphnav.app import cli
 from graphnav.app.scores import score
 from graphnav.config import Settings
 from graphnav.constraints.antenna_motion import LEVER_ARM
+from graphnav.core import rotation
 from graphnav.core.earth import LocalFrame
 from graphnav.core.errors import RecordingError
 from graphnav.core.interpolation import interpolate, place_on_earth
@@ -24,6 +26,7 @@ from graphnav.estimation.noise.model import FreedConstant
 from graphnav.estimation.pipeline import run
 from graphnav.estimation.solution import ParameterEstimate, Solution
 from graphnav.evaluation.against import Against, find_antenna_lever_arm, read_against
+from graphnav.evaluation.scoring import compute_errors
 from graphnav.recording import Truth
 from graphnav.recording.exporters import write_as
 from graphnav.recording.formats.writer import write_folder
@@ -94,6 +97,46 @@ def test_three_kinds_of_files_stand_beside_ours(drive, tmp_path):
     page = (tmp_path / "out" / "comparison.html").read_text(encoding="utf-8")
     assert all(name in page for name in rows)
     assert {p.name for p in (tmp_path / "out").iterdir()} == {"comparison.csv", "comparison.html", "run.npz", "ekf"}
+
+
+FLU = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])  # columns: its axes in RFU
+
+
+@pytest.mark.parametrize(
+    ("change", "keys", "number"),
+    [
+        (lambda rph: rph, [], ""),
+        (lambda rph: rph + np.radians([0.0, 0.0, 10.0]), [], ""),  # an error, and no convention
+        (lambda rph: rotation.to_rph(rotation.from_rph(rph) @ FLU), ["against.attitude"], r" 90 deg .* FLU,"),
+        (lambda rph: rph * [1.0, 1.0, 0.0], ["against.attitude"], r"\d deg"),
+    ],
+    ids=["same", "wrong", "FLU", "no-heading"],
+)
+def test_other_axes_of_the_body_are_told(ekf, tmp_path, change, keys, number):
+    own = moved(0.0)
+    write_as("csv", replace(own, rph=change(own.rph)), tmp_path / "other.csv", None)
+    notes = read_against(Against(tmp_path / "other.csv"), "other", replace(RECORDING, truth=None), ekf).notes
+    found = [note for note in notes if get_key(note) == "against.attitude"]
+    assert [get_key(note) for note in found] == keys
+    assert all(re.search(number, note) for note in found)
+
+
+def test_heights_above_the_sea_are_told(tmp_path):
+    for up, keys in ((-40.0, ["against.heights"]), (-2.0, [])):
+        lower = replace(moved(0.0), llh=moved(0.0).llh + np.array([0.0, 0.0, up]))
+        notes = compute_errors(lower, TRUTH).notes
+        assert [get_key(note) for note in notes if get_key(note) == "against.heights"] == keys
+
+
+def test_north_before_east_is_refused(drive, tmp_path, capsys):
+    """A frame of north, east and down is another way, not another yaw."""
+    part = moved(0.0)
+    frame = LocalFrame(part.llh[0])
+    ned = replace(part, llh=frame.from_llh(part.llh)[:, [1, 0, 2]] * [1.0, 1.0, -1.0], frame="local", v=None)
+    write_as("tum", ned, tmp_path / "ned.tum", None)
+    where = ["--solvers", "ekf", "--noise", "stated", "-o", tmp_path / "out", "--against", tmp_path / "ned.tum"]
+    refuse_command(capsys, "against.left_handed", "compare", drive, *where)
+    refuse_command(capsys, "against.left_handed", "evaluate", tmp_path / "ned.tum", drive)
 
 
 def test_a_file_with_few_rows_is_compared_at_these(drive, tmp_path):

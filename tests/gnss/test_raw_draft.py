@@ -134,7 +134,8 @@ def test_observations_alone_are_no_recording(tmp_path):
     shutil.copy(DATA / "rover.obs.gz", tmp_path / "rover.obs.gz")
     with refused("draft.no_imu", RecordingError, "IMU"):
         draft([tmp_path], tmp_path)
-    (tmp_path / "LICENSE.txt").write_text("terms, of use\n1, 2\n")
+    (tmp_path / "LICENSE.txt").write_text("terms")
+    (tmp_path / "terms.txt").write_text("terms, of use\n1, 2\n")
     with refused("draft.no_imu", RecordingError, "IMU", "raw GNSS"):
         draft([tmp_path], tmp_path)
 

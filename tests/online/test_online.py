@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import pickle
 import signal
@@ -35,7 +36,7 @@ from graphnav.estimation.solvers.window import compute_turn_limit
 from graphnav.evaluation.scoring import compute_errors
 from graphnav.online import Online, Row, Session, drop_rows, list_rows, noise_estimation, smoother
 from graphnav.online.buffers import Buffer
-from graphnav.online.lines import END, format_head, format_line, format_lines, parse_row, parse_setup
+from graphnav.online.lines import END, PROTOCOL, format_head, format_line, format_lines, parse_row, parse_setup
 from graphnav.online.tracker import Tracker
 from graphnav.online.view import view
 from graphnav.recording import Recording
@@ -411,6 +412,40 @@ def test_lines_read_back_as_they_were(drive: tuple[Recording, Trajectory], rows:
         np.testing.assert_allclose(values, row[2], rtol=1e-15)
 
 
+def test_lines_in_other_units_and_axes_are_the_same_rows(
+    drive: tuple[Recording, Trajectory], rows: list[Row], tmp_path: Path
+) -> None:
+    """As the keys of recording.toml state them, also after a run is resumed, whose lines have no first one."""
+    recording, deg = drive[0], 180.0 / np.pi
+    setup = json.loads(format_head(recording).partition(" ")[2])
+    setup["imu"] |= {"axes": "FRD", "units": {"t": "ms", "gyro": "deg/s", "accel": "g"}}
+    setup["gnss"] |= {"units": {"angle": "rad", "height": "ft", "speed": "knots"}, "time_offset": -18.0}
+    setup["odometer"]["units"] = {"speed": "km/h"}
+    knot = 1852.0 / 3600.0
+
+    def write(row: Row) -> str:
+        sensor, t, x = row
+        if sensor == "imu":
+            turned = [deg * x[1], deg * x[0], -deg * x[2], x[4] / 9.80665, x[3] / 9.80665, -x[5] / 9.80665]
+            return "I," + ",".join(map(repr, [1e3 * t, *turned]))
+        if sensor == "odometer":
+            return f"O,{t!r},{3.6 * x[0]!r}"
+        speeds = [] if np.isnan(x[6]) else [one / knot for one in x[6:]]
+        return "G," + ",".join(map(repr, [t + 18.0, *x[:2], x[2] / 0.3048, *x[3:6], *speeds]))
+
+    one = Session(QUICK, "-", tmp_path)
+    one.add_lines([f"{PROTOCOL} {json.dumps(setup)}", *map(write, rows[:200])])
+    one.stop()
+    one.close()
+    other = Session(QUICK, "-", tmp_path, resume=True)
+    other.close()
+    for session in (one, other):
+        for row in rows[::500]:
+            sensor, t, values = parse_row(write(row), session.units)
+            assert (sensor, t) == (row[0], pytest.approx(row[1], abs=1e-9))
+            np.testing.assert_allclose(values, row[2], rtol=1e-12, atol=1e-12)
+
+
 @pytest.mark.parametrize(
     ("line", "named"),
     [
@@ -433,6 +468,8 @@ def test_bad_lines_are_named_with_what_they_lack(line: str, named: str) -> None:
         ("graphnav-online/1 {", "online.setup_json", "line 1"),
         ('graphnav-online/1 {"platfrom": "vehicle"}', "key.unknown", "'platform'"),
         ('graphnav-online/1 {"imu": {"noise": {"gyro": 1}}}', "key.unknown", "'imu.noise.gyro'"),
+        ('graphnav-online/1 {"imu": {"axes": "XYZ"}}', "key.value", "'imu.axes'"),
+        ('graphnav-online/1 {"imu": {"units": {"gyro": "dps"}}}', "key.value", "'imu.units.gyro'"),
     ],
 )
 def test_bad_setups_say_why(line: str, key: str, name: str) -> None:

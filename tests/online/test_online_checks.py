@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import json
+from pathlib import Path
+
 import numpy as np
 import oracle
 import pytest
+from helpers import run_here
 
 from graphnav.config import parse_settings
 from graphnav.core.errors import RecordingError
@@ -71,14 +75,32 @@ def test_a_session_in_a_wrong_unit_says_so(drive: Recording, how: str, keys: set
     assert not online.failures
 
 
-def test_what_is_refused_of_a_recording_is_so_while_it_is_driven_and_at_the_end(drive: Recording) -> None:
+@pytest.mark.parametrize(("unit", "key"), [("g", "imu.force_scale"), ("deg/s", "imu.gyro_unit")])
+def test_what_is_refused_of_a_recording_is_so_while_it_is_driven_and_at_the_end(
+    drive: Recording, unit: str, key: str
+) -> None:
     session = Session(QUICK, "-", None)
     *lines, end = (line for _, line in format_lines(drive))
-    session.add_lines([lines[0], *(format_line(spoil(row, "g")) for row in map(parse_row, lines[1:]) if row)])
+    session.add_lines([lines[0], *(format_line(spoil(row, unit)) for row in map(parse_row, lines[1:]) if row)])
     assert [label for label, _ in view(session)[:2]] == ["status", "refused"]
     session.add_lines([end])
     session.finish()
     with pytest.raises(RecordingError) as error:
         session.require_result()
-    assert error.value.key == "imu.force_scale"
+    assert error.value.key == key
     assert session.rows_settled
+
+
+def test_a_result_that_is_unreliable_is_told_quiet_or_not(drive: Recording, tmp_path: Path) -> None:
+    """The fixes a second late: solved, and wrong whatever its sigmas say."""
+    first, *lines, end = (line for _, line in format_lines(drive))
+    late = [(row[0], row[1] + (row[0] == "gnss"), row[2]) for row in map(parse_row, lines) if row]
+    (tmp_path / "lines.txt").write_text("\n".join([first, *map(format_line, late), end]) + "\n")
+    (tmp_path / "quick.toml").write_text('[noise]\nmode = "stated"\n[solver]\nlag = 10.0\n')
+    run = run_here(
+        "online", tmp_path / "lines.txt", "--config", tmp_path / "quick.toml", "-o", tmp_path / "out", "--quiet"
+    )
+    assert (run.returncode, run.stdout) == (0, "")
+    found = json.loads((tmp_path / "out" / "summary.json").read_text())["findings"]
+    assert [one["key"] for one in found if one["severity"] == "unreliable"] == ["imu.clock"]
+    assert run.stderr.count("\n") == 1

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import allantools
 import numpy as np
 import pytest
@@ -96,3 +98,19 @@ def test_what_is_not_at_rest_or_too_short_is_refused(tmp_path, capsys):
     with refused("allan.gaps", RecordingError, "0.520 s", "40.0 s"):
         allan.compute_allan(t[:3000], gyro[:3000], accel[:3000])
     assert "kitti" in refuse_command(capsys, "allan.gaps", "allan", "kitti", "-o", tmp_path)
+
+
+def test_the_units_that_were_taken_are_told(tmp_path, capsys):
+    """Of a log at rest nothing shows the gyro's: the name of its columns does, or it is a guess."""
+    t, gyro, accel = at_rest(300.0)
+    rows = np.column_stack([t, np.degrees(0.1 * gyro), accel])  # a quiet one
+    for k, unit in enumerate(("", "_deg_s")):
+        names = [f"gyro_{x}{unit}" for x in "xyz"] + [f"acc_{x}" for x in "xyz"]
+        np.savetxt(tmp_path / "rest.csv", rows, "%.9g", ",", header=",".join(["t", *names]), comments="")
+        assert cli.run(["allan", str(tmp_path / "rest.csv"), "-o", str(tmp_path / f"out{k}"), "--json"]) == 0
+        found = json.loads(capsys.readouterr().out)
+        assert [one.partition(":")[0] for one in found["units"]] == [
+            f"gyro in {'deg' if k else 'rad'}/s",
+            "accel in m/s2",
+        ]
+        assert found["noise"]["gyro_noise_density"] == pytest.approx(2e-5 * (1.0 if k else np.degrees(1.0)), rel=0.05)

@@ -24,6 +24,7 @@ from graphnav.recording.checks.overview import Inspection, inspect
 from graphnav.recording.checks.tracks import compute_track
 from graphnav.recording.formats import read
 from graphnav.recording.formats.schema import parse_axes_letters
+from graphnav.recording.plausibility.screening import screen
 from graphnav.simulation import simulate
 
 TURNS_LITTLE = (100.0, 160.0)  # s of oracle_drive: it stands, and turns once
@@ -207,6 +208,25 @@ def test_a_broken_imu_is_found(drive: Callable[[str], Recording], case: str) -> 
     change, key, hint = BROKEN[case]
     # ten minutes in motion of a drive that gets no warning at all: test_no_false_alarm_on_a_drive
     assert len(warned(change(drive("tokyo_20201105").crop(900.0, 1500.0)), key, hint)) >= 1
+
+
+@pytest.mark.parametrize(("name", "sure"), [("dresden_car_20140326", True), ("oracle_drive/recording_spp.toml", False)])
+@pytest.mark.parametrize("factor", [DEG, 1.0 / DEG])
+def test_a_unit_of_the_gyro_is_refused_where_the_courses_determine_it(
+    drive: Callable[[str], Recording], name: str, sure: bool, factor: float
+) -> None:
+    """Single-point fixes show the turns to a factor of two and no better."""
+    recording = drive(name)
+    assert not {f.key for f in screen(recording).findings} & {"imu.gyro_unit"}
+    found = screen(imu(gyro=lambda x: x * factor)(recording)).findings
+    assert [f.severity for f in found if f.key == "imu.gyro_unit"] == ["refused"] * sure
+
+
+@pytest.mark.parametrize("name", ["openshoe_loops/run02.toml", "pyshoe_vicon/2017-11-22-11-23-25.toml"])
+def test_a_walk_is_not_solved_as_a_drive_without_a_word(drive: Callable[[str], Recording], name: str) -> None:
+    recording = drive(name)
+    assert not warned(recording, "recording.platform")
+    assert len(warned(replace(recording, platform="vehicle"), "recording.platform")) == 1
 
 
 def test_milliseconds_that_count_from_the_start_of_the_imu_are_found(part: Callable[[str], Recording]) -> None:

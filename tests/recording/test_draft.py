@@ -349,3 +349,17 @@ def test_the_pressure_of_the_air_in_its_units(name: str, pressure: float, unit: 
     made = tomllib.loads(draft([imu, air], tmp_path).text)
     assert made.get("barometer", {}).get("units", {}).get("pressure", "Pa") == (unit or "Pa")
     assert ("barometer" in made) == (unit is not None)
+
+
+@pytest.mark.parametrize(("speed", "platform", "unit"), [(1.2, "foot", "rad/s"), (12.0, "vehicle", "deg/s")])
+def test_fixes_that_walk_beside_a_shoes_imu_are_of_a_walk(shared_data, tmp_path, speed, platform, unit):
+    """Rates of a swing are no deg/s then; nothing else that moves so slowly is shaken as much."""
+    imu = read(shared_data / "openshoe_loops" / "run02.toml").imu
+    rows = np.column_stack([imu.t, imu.gyro, imu.accel])
+    np.savetxt(tmp_path / "imu.csv", rows, "%.9g", ",", header="t,gx,gy,gz,ax,ay,az", comments="")
+    t = np.arange(1.0, 60.0)
+    fixes = np.column_stack([t, 50.0 + speed * t / 111_200.0, np.full((len(t), 2), [8.0, 100.0])])
+    np.savetxt(tmp_path / "gnss.csv", fixes, "%.9f", ",", header="t,lat,lon,h", comments="")
+    found = tomllib.loads(draft([tmp_path], tmp_path).text)
+    assert found["platform"] == platform
+    assert found["imu"].get("units", {}).get("gyro", "rad/s") == unit

@@ -112,7 +112,14 @@ def test_two_imus_at_once_are_refused_and_a_second_in_the_same_file_is_named(pla
     assert [line for line in drafted.decisions if "rear_gyro_x" in line and "rear_acc_z" in line and "CHECK" in line]
 
 
-@pytest.mark.parametrize(("name", "text"), [("track.gpx", "<gpx/>"), ("gps.csv", "t,easting,northing\n0,1,2\n1,2,3\n")])
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("track.gpx", "<gpx/>"),
+        ("gps.csv", "t,easting,northing\n0,1,2\n1,2,3\n"),
+        ("rover.rtcm3", "\xd3"),
+    ],
+)
 def test_positions_that_are_not_read_do_not_make_a_walk(plain, tmp_path, capsys, name, text):
     folder = stranger.write_tables(tmp_path, plain[0], plain[1])
     (folder / name).write_text(text)
@@ -266,6 +273,42 @@ def test_lines_of_an_imu_among_nmea_are_pointed_at(tmp_path, capsys):
     (tmp_path / "log.txt").write_text(f"{sentence}\nIMU,0,0,0,9.8,0,0,0\n{later}\nIMU,1,0,0,9.8,0,0,0\n")
     said = refuse_command(capsys, "draft.no_imu", "init", tmp_path, "-o", tmp_path)
     assert "log.txt, line 2: " in said
+
+
+@pytest.mark.parametrize(
+    ("height", "geoid", "added"),
+    [
+        ("alt", "geoid_sep", True),
+        ("altitude_msl_m", "Geoid separation (m)", True),
+        ("h", "geoid", False),
+        ("height_ell", "undulation", False),
+        ("alt_ft", "geoid_sep_m", False),
+    ],
+)
+def test_a_height_above_the_sea_and_the_geoids_add_up(plain, tmp_path, height, geoid, added):
+    """A blank separation is that of its neighbours; where h is above the ellipsoid already, it is left alone."""
+    imu, (_, rows) = plain
+    fixes = [
+        [t, lat, lon, f"{float(h) - 40.0:.3f}", "" if k == 7 else "40.0"] for k, (t, lat, lon, h) in enumerate(rows)
+    ]
+    got = read_drafted(tmp_path, imu, (f"t,lat,lon,{height},{geoid}", fixes))
+    unit = 0.3048 if height.endswith("ft") else 1.0
+    want = [unit * (float(h) - (0.0 if added else 40.0)) for *_, h in rows]
+    assert got.gnss.llh[:, 2] == pytest.approx(np.array(want), abs=2e-3)
+
+
+@pytest.mark.parametrize("year", [2009, 2013, 2020])
+@pytest.mark.parametrize("scale", ["GPS", "Unix"])
+def test_a_receivers_seconds_are_told_from_unix_time_by_the_other_logs_date(plain, tmp_path, year, scale):
+    """In 2013 either is a date in the past; leap seconds are those of the date."""
+    (header, rows), (fixed, fixes) = plain
+    begin = datetime(year, 5, 1, tzinfo=UTC).timestamp()
+    unix = [[f"{begin + float(t) - float(rows[0][0]):.3f}", *r] for t, *r in rows]
+    places = [begin + float(t) - float(rows[0][0]) for t, *_ in fixes]
+    stamps = unix_to_gps(np.array(places)) if scale == "GPS" else places
+    theirs = [[f"{t:.3f}", *r] for t, (_, *r) in zip(stamps, fixes, strict=True)]
+    got = read_drafted(tmp_path, (header, unix), (f"gps_time,{fixed.partition(',')[2]}", theirs))
+    assert got.gnss.t == pytest.approx(np.array(places), abs=0.01)
 
 
 def test_stamps_since_the_gps_epoch_are_no_unix_time(plain, tmp_path):

@@ -247,7 +247,7 @@ def test_timeline_has_a_row_per_constraint():
 def test_detections_show_statistics_thresholds_and_the_idle_line():
     recording, found = detected()
     figure = plots.plot_detections(recording, found)
-    assert [y_of(line)[0] for line in drawn_as(figure, "threshold: below it stands")] == [3.0, 1.0]
+    assert [y_of(line)[0] for line in drawn_as(figure, "threshold: stationary below")] == [3.0, 1.0]
     tints = [(shape["yref"], shape["x0"], shape["x1"]) for shape in figure.shapes]
     ahead = START - recording.start
     # force, rate and two statistics: nothing measures a speed

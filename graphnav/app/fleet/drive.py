@@ -168,7 +168,7 @@ def _collect_figures(outcome: Outcome) -> FleetRow:
     measured: Mapping[str, Any] = {**(summary["errors"] or {}), **(summary["nees"] or {})}
     ends = [span["end_h_m"] for span in summary["spans"] if span.get("end_h_m") is not None]
     speed = np.linalg.norm(solution.states.v[:, :2], axis=1)
-    doubts = summary["doubts"]
+    doubts = [*summary["doubts"], *outcome.defects]
     return {
         "verdict": "doubtful" if doubts else "sound",
         "doubts": "; ".join(doubts) or None,

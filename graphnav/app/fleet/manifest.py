@@ -191,7 +191,10 @@ def _number_clones(drives: list[tuple[str, str, DriveOptions, str]]) -> list[tup
 
 
 def _parse_csv(path: Path) -> list[tuple[str, Mapping[str, Any]]]:
-    reader = csv.DictReader(io.StringIO(read_text(path, ConfigError)), strict=True)
+    text = read_text(path, ConfigError)
+    head = text.partition("\n")[0]
+    mark = ";" if ";" in head and "," not in head else ","  # spreadsheets write either
+    reader = csv.DictReader(io.StringIO(text), delimiter=mark, strict=True)
     rows: list[tuple[str, Mapping[str, Any]]] = []
     try:
         _check_columns(reader.fieldnames or (), f"{path}, line 1")

@@ -11,6 +11,7 @@ import numpy as np
 
 from graphnav.app.fleet.drive import DONE, FleetRow
 from graphnav.app.fleet.tables import collect_numbers, compute_totals, describe_totals, sort_by_error
+from graphnav.core.notes import format_count
 from graphnav.core.rotation import Array
 
 _MAX_DRIVES = 1000  # drives in the page's table; the files contain all
@@ -157,7 +158,9 @@ def _draw_map(group: Sequence[tuple[Array, FleetRow]]) -> str:
         line = f'<polyline class="{kind}" points="{corners}"><title>{escape(str(row["drive"]))}</title></polyline>'
         lines.append(f'<a href="{escape(str(row["report"]))}">{line}</a>' if row.get("report") else line)
     km = size * 111.2
-    about = f"{len(group)} tracks about {low[1]:.3f}, {low[0]:.3f} deg; {km:.3g} km across; doubtful ones red"
+    across = f"{km:.3g} km" if km >= 1.0 else f"{1e3 * km:.3g} m"
+    tracks = format_count(len(group), "track")
+    about = f"{tracks} about {low[1]:.3f}, {low[0]:.3f} deg; {across} across; doubtful ones red"
     return (
         f'<figure><svg viewBox="0 0 {width:g} {max(tall, 40.0):.1f}" role="img" aria-label="{escape(about)}">'
         f"{''.join(lines)}</svg><figcaption>{escape(about)}</figcaption></figure>"

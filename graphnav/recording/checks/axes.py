@@ -16,6 +16,7 @@ from graphnav.recording.checks.tracks import Track
 from graphnav.recording.formats import schema
 
 _NO_BETTER = 0.05  # of a correlation
+_ALIKE = 0.8  # correlation above which course and gyro show the same turns
 
 
 def check_imu_axes(imu: Imu, forward: Fit | None, track: Track | None) -> Iterator[Finding]:
@@ -101,7 +102,7 @@ def turns_against(yaw: Fit | None) -> bool:
     if yaw is None or not yaw.coefficients[0] < 0.0:
         return False
     alike = tilt.NEAR_ONE[0] < -yaw.coefficients[0] < tilt.NEAR_ONE[1]
-    return yaw.correlation > 0.8 or (alike and tilt.SIGMAS * yaw.relative_sigma < 1.0)
+    return yaw.correlation > _ALIKE or (alike and tilt.SIGMAS * yaw.relative_sigma < 1.0)
 
 
 def describe_reversal(imu: Imu) -> str:
@@ -132,22 +133,21 @@ def check_gyro_sign(imu: Imu, track: Track) -> Iterator[Finding]:
 
 
 def check_yaw_scale(yaw: Fit | None) -> Iterator[Finding]:
-    if yaw is None or abs(yaw.correlation) < 0.8:
+    """The course turns by another ratio than the gyro; that of a unit, with the interval of the fit, is refused."""
+    if yaw is None or not yaw.correlation:
         return
-    scale = abs(float(yaw.coefficients[0]))
-    if 40.0 < scale < 80.0:
-        yield Finding(
-            "warning",
-            "the gyro is 57 times too small for the GNSS course: it is in rad/s already, leave out units.gyro",
-            "imu.gyro_unit",
-        )
-    elif 1 / 80.0 < scale < 1 / 40.0:
-        yield Finding(
-            "warning",
-            'the gyro is 57 times too large for the GNSS course: set units = { gyro = "deg/s" }',
-            "imu.gyro_unit",
-        )
-    elif abs(scale - 1.0) > max(0.1, tilt.SIGMAS * scale * yaw.relative_sigma):
+    scale, least, most = abs(float(yaw.coefficients[0])), *tilt.NEAR_FACTOR
+    spread = tilt.SIGMAS * yaw.relative_sigma
+    for unit, words in (
+        (np.degrees(1.0), "small for the GNSS course: it is in rad/s already, leave out units.gyro"),
+        (np.radians(1.0), 'large for the GNSS course: set units = { gyro = "deg/s" }'),
+    ):
+        ratio = scale / unit
+        sure = ratio * (1.0 - spread) > least and ratio * (1.0 + spread) < most
+        if least < ratio < most and (sure or abs(yaw.correlation) > _ALIKE):
+            yield Finding("refused" if sure else "warning", f"the gyro is 57 times too {words}", "imu.gyro_unit")
+            return
+    if abs(yaw.correlation) > _ALIKE and abs(scale - 1.0) > max(0.1, spread * scale):
         yield Finding(
             "warning", f"the course turns {scale:.2f} times as much as the gyro about the vertical", "imu.gyro_scale"
         )

@@ -15,6 +15,7 @@ from graphnav.recording import Imu, Recording
 from graphnav.recording.checks.tracks import Track
 
 _LEAST_FOOT_RATE = 80.0  # Hz; the impact of a step lasts for 20 to 50 ms
+_SHAKEN_OVER = 0.02  # s
 _CHANGED = 3.0  # m/s, of the speed: more than errors of velocities
 
 
@@ -42,6 +43,19 @@ def check_foot_rate(recording: Recording) -> Iterator[Finding]:
             "are several times as large; record at 100 Hz or more",
             "imu.slow",
         )
+
+
+def is_shaken_as_a_foot(t: Array, accel: Array) -> bool:
+    """Whether forces (N, 3) m/s^2 are those of a shoe, thrown and stopped by more than gravity.
+
+    So is more than a hundredth of its time; a vehicle would leave the road: of those measured a motorbike comes next,
+    with 7 m/s^2, before a slow walk with 10. Means over 20 ms leave a chassis's vibrations out.
+    """
+    n = max(round(_SHAKEN_OVER / compute_period(t)), 1)
+    means = accel[: len(accel) // n * n].reshape(-1, n, 3).mean(axis=1)
+    if not len(means):
+        return False
+    return float(np.percentile(np.abs(np.linalg.norm(means, axis=1) - STANDARD_GRAVITY), 99.0)) > STANDARD_GRAVITY
 
 
 def find_gap_limit(t: Array) -> float:

@@ -6,6 +6,7 @@ first (`graphnav.recording.plausibility.screening`), and the rest is checked wit
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -46,8 +47,8 @@ from graphnav.recording.checks.raw import check_raw, describe_raw
 from graphnav.recording.checks.series import check_series, describe_series
 from graphnav.recording.checks.stated import (
     check_fix_types,
-    check_foot_speed,
     check_lever_arms,
+    check_platform,
     check_rounding,
     check_stated_noise,
     check_truth,
@@ -77,7 +78,17 @@ class Inspection:
     @property
     def trusted(self) -> bool:
         """Whether there is no finding because of which a result may be entirely wrong."""
-        return all(f.severity in ("note", "warning") for f in self.findings)
+        return not self.list_defects()
+
+    def list_defects(self) -> list[str]:
+        """A line for each finding because of which a result may be entirely wrong.
+
+        Returns
+        -------
+        list of str
+            Severity and sentence.
+        """
+        return [f"{f.severity}: {f.sentence}" for f in self.findings if f.severity not in ("note", "warning")]
 
     def refuse(self) -> None:
         """Raise an error if the recording cannot be solved.
@@ -110,14 +121,23 @@ class Inspection:
         """
         lines = [f"{self.name} ({self.platform})"]
         for sensor, facts in self.facts.items():
-            shown = ", ".join(_format_number(name, value) for name, value in facts.items())
-            lines.append(f"  {sensor:<9} {shown}")
+            lines.append(f"  {sensor:<9} {', '.join(_format_numbers(facts))}")
         for finding in self.findings:
             lines.append(f"  {finding.severity}: {finding.sentence}")
         return "\n".join(lines)
 
 
 _VALUE_UNITS = {"hz": "Hz", "s": "s", "m": "m", "mps": "m/s", "mps2": "m/s2", "dbhz": "dB-Hz"}
+
+
+def _format_numbers(facts: dict[str, Any]) -> Iterator[str]:
+    """Each fact with its name, of which words that the name before begins with too are not repeated."""
+    before = ""
+    for name, value in facts.items():
+        words, said = name.split("_"), before.split("_")
+        common = next((k for k, (a, b) in enumerate(zip(words[:-1], said, strict=False)) if a != b), len(words) - 1)
+        yield _format_number("_".join(words[min(common, len(words) - 1) :]) if len(said) > 1 else name, value)
+        before = name
 
 
 def _format_number(name: str, value: Any) -> str:
@@ -169,7 +189,7 @@ def inspect(recording: Recording, screened: Screened | None = None) -> Inspectio
         findings += check_gyro_unit(recording)
     findings += check_stated_noise(recording.imu.noise)
     findings += check_lever_arms(recording)
-    findings += check_foot_speed(recording, track)
+    findings += [] if "imu.force_scale" in known else check_platform(recording, track)
     if rest.any():
         facts["imu"]["still_s"] = float(rest.sum() * compute_period(recording.imu.t))
         findings += check_force_at_rest(recording, rest, facts["imu"])
@@ -194,9 +214,10 @@ def inspect(recording: Recording, screened: Screened | None = None) -> Inspectio
     upright = not known & {"imu.force_scale", "imu.dead_axis"}
     if vehicle and overlap and track is not None and recording.gnss is not None and upright:
         clock = whole.clock or measure_clock_offsets(recording.imu, recording.gnss)
+        yaw = whole.yaw or crosschecks.fit_yaw_rate(recording.imu, track)
         if any(f.key == "gnss.velocity_axes" for f in wrong):  # their comparison with the IMU is meaningless
             track = tracks.compute_track(replace(recording.gnss, v=None)) or track
-        yaw = crosschecks.fit_yaw_rate(recording.imu, track)
+            yaw = crosschecks.fit_yaw_rate(recording.imu, track)
         forward = clock.by_velocity if track.instant else clock.by_places
         turns_back = turns_against(yaw)
         turns_so = yaw is not None and yaw.correlation > 0.8 and not turns_back
@@ -209,7 +230,7 @@ def inspect(recording: Recording, screened: Screened | None = None) -> Inspectio
                 wrong = list(check_imu_axes(recording.imu, forward, track))
                 wrong = wrong or list(check_sideways(recording.imu, forward, track, yaw))
                 findings += wrong or check_gyro_tilt(recording.imu, track)
-            findings += check_yaw_scale(yaw)
+            findings += [] if "imu.gyro_unit" in known else check_yaw_scale(yaw)
             findings += check_height_unit(recording, track, forward)
     elif vehicle and not turned:
         findings += check_imu_axes(recording.imu, None, None)

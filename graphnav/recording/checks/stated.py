@@ -13,6 +13,7 @@ from graphnav.core.rotation import Array
 from graphnav.core.timescales import LEAP
 from graphnav.recording import Gnss, ImuNoise, Recording, Truth
 from graphnav.recording.checks import crosschecks, tracks
+from graphnav.recording.checks.imu import is_shaken_as_a_foot
 from graphnav.recording.checks.tracks import Track
 
 _LONGEST_ARM = 15.0  # m; no lever arm on a road vehicle is that long
@@ -53,16 +54,30 @@ def check_lever_arms(recording: Recording) -> Iterator[Finding]:
             )
 
 
-def check_foot_speed(recording: Recording, track: Track | None) -> Iterator[Finding]:
-    """A vehicle's log with the platform "foot"."""
-    if recording.platform == "foot" and track is not None:
+def moves_as_a_foot(speed: Array) -> bool:
+    """Whether speeds of fixes (N,) m/s are those of a walk or run."""
+    speed = speed[np.isfinite(speed)]
+    return bool(len(speed)) and float(np.percentile(speed, 95.0)) <= _RUN
+
+
+def check_platform(recording: Recording, track: Track | None) -> Iterator[Finding]:
+    """A vehicle's log with the platform "foot", or a foot's with the platform "vehicle"."""
+    slow = track is None or moves_as_a_foot(track.speed)
+    if recording.platform == "foot" and track is not None and not slow:
         speed = float(np.percentile(track.speed, 95.0))
-        if speed > _RUN:
-            yield Finding(
-                "warning",
-                f'the fixes move at {speed:.3g} m/s, too fast for a foot: if it is a car, set platform = "vehicle"',
-                "recording.platform",
-            )
+        yield Finding(
+            "warning",
+            f'the fixes move at {speed:.3g} m/s, too fast for a foot: if it is a car, set platform = "vehicle"',
+            "recording.platform",
+        )
+    shaken = recording.platform == "vehicle" and slow and recording.odometer is None
+    if shaken and is_shaken_as_a_foot(recording.imu.t, recording.imu.accel):
+        yield Finding(
+            "warning",
+            "the force departs from gravity by more than that from step to step, as on a shoe: if it is on a foot, set "
+            'platform = "foot"',
+            "recording.platform",
+        )
 
 
 def check_rounding(gnss: Gnss) -> Iterator[Finding]:

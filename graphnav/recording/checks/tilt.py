@@ -12,6 +12,8 @@ from graphnav.recording.checks.tracks import Track
 CORRELATED = 0.7  # threshold of a correlation, or of a unit vector's component, for a decision
 SIGMAS = 4.0  # significance of a slope, in sigmas
 NEAR_ONE = 0.5, 1.5  # slopes nearer to 1 than to 0 and 2
+# A factor of two is the smallest by which a scale is mistaken (the ranges of a sensor are that far apart): the middle.
+NEAR_FACTOR = float(np.sqrt(0.5)), float(np.sqrt(2.0))
 
 
 def _average_seconds(imu: Imu, track: Track) -> tuple[Array, Array, Array, Array]:

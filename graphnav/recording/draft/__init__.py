@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +15,8 @@ from graphnav.core.files import is_inside
 from graphnav.core.rotation import Array
 from graphnav.core.timescales import NEAR, UNIX, ClockOffset, compute_clock_offset
 from graphnav.recording import Gnss, Odometer
+from graphnav.recording.checks.imu import is_shaken_as_a_foot
+from graphnav.recording.checks.stated import moves_as_a_foot
 from graphnav.recording.draft import guesses, motion
 from graphnav.recording.draft.agreement import CLEAR, LIKELY, Agreement, compare_with_fixes
 from graphnav.recording.draft.guesses import Guess
@@ -27,11 +30,14 @@ from graphnav.recording.draft.sources import (
     name_plain_file,
     read_fixes,
 )
-from graphnav.recording.formats.schema import FORCE, RATE_UNITS, SPEED
+from graphnav.recording.formats.schema import FORCE, GEOID, RATE_UNITS, SPEED
 from graphnav.recording.formats.writer import quote
 
 __all__ = ["Draft", "draft"]
 
+# heights by the names of their columns; others are taken as above the ellipsoid
+_ABOVE_SEA = re.compile(r"msl|alt|elev|orth|sea", re.IGNORECASE)
+_ABOVE_ELLIPSOID = re.compile(r"ell|hae|wgs", re.IGNORECASE)
 _SMALL = 0.03  # s; smaller clock offsets are left to the smoother, which estimates them
 _SD = "[3.3, 3.3, 6.6]"  # m, assumed of fixes that state none (graphnav.recording.formats.repair.DEFAULT_SD)
 
@@ -66,8 +72,8 @@ def draft(paths: Sequence[Path], folder: Path, name: str | None = None, topics: 
     return Draft(text, tuple(writer.decisions), writer.made)
 
 
-def read_imu_in_si(path: Path) -> tuple[Array, Array, Array]:
-    """Times (N,), rates and forces (N, 3) of a CSV file in SI, units as `draft` would guess them.
+def read_imu_in_si(path: Path) -> tuple[Array, Array, Array, list[str]]:
+    """Times (N,), rates and forces (N, 3) of a CSV file in SI, units as `draft` would guess them, and which these are.
 
     Raises
     ------
@@ -78,7 +84,8 @@ def read_imu_in_si(path: Path) -> tuple[Array, Array, Array]:
     gyro, accel = source.stack("gx", "gy", "gz"), source.stack("ax", "ay", "az")
     force = guesses.guess_accel_unit(path, accel, source.find_unit("ax", "accel"))
     rate = guesses.guess_gyro_unit(path, gyro, source.find_unit("gx", "gyro"), None, vehicle=False)
-    return source.t, gyro * RATE_UNITS[str(rate.value)], accel * FORCE[str(force.value)]
+    words = [f"{name} in {guess.value}: {guess.why}" for name, guess in (("gyro", rate), ("accel", force))]
+    return source.t, gyro * RATE_UNITS[str(rate.value)], accel * FORCE[str(force.value)], words
 
 
 class _Writer:
@@ -94,7 +101,9 @@ class _Writer:
         self.made: dict[str, dict[str, Array]] = {}
 
     def format(self, found: dict[str, Source], raw: RawFound | None, name: str) -> str:
-        vehicle = "gnss" in found or "odometer" in found or raw is not None
+        moved = "gnss" in found or raw is not None
+        stepping = moved and "odometer" not in found and self._walks(found["imu"], found.get("gnss"))
+        vehicle = (moved or "odometer" in found) and not stepping
         self.lines += [
             "# Drafted by graphnav init. Comments say why each line is what it is; look at those marked CHECK.",
             'format = "graphnav-recording/1"', f"name = {quote(name)}",
@@ -102,6 +111,8 @@ class _Writer:
         why = (
             "there are fixes, speeds or observations of GNSS"
             if vehicle
+            else "CHECK: the fixes walk, and the force changes from step to step as on a shoe"
+            if stepping
             else "CHECK: no fixes and no speed, so a walk is assumed"
         )
         self._write_key("platform", '"vehicle"' if vehicle else '"foot"', why)
@@ -129,6 +140,17 @@ class _Writer:
         if "barometer" in found:
             self._write_barometer(found["barometer"])
         return "\n".join(self.lines) + "\n"
+
+    def _walks(self, imu: Source, gnss: Source | None) -> bool:
+        """Whether the IMU is shaken as one on a foot is, and fixes, if there are any, are as slow."""
+        if gnss is not None and not moves_as_a_foot(motion.compute_course(*read_fixes(gnss)).speed):
+            return False
+        if imu.log is not None:
+            assert imu.log.imu is not None
+            return is_shaken_as_a_foot(imu.log.imu.t, imu.log.imu.accel)
+        accel = imu.stack("ax", "ay", "az")
+        unit = guesses.guess_accel_unit(imu.path, accel, imu.find_unit("ax", "accel"))
+        return is_shaken_as_a_foot(imu.t, accel * FORCE[str(unit.value)])
 
     # ---- one table each
 
@@ -226,6 +248,17 @@ class _Writer:
         missing = {"sd_e", "sd_n", "sd_u"} - values.keys()
         if missing:  # all three or none
             dropped = (*dropped, "sd_e", "sd_n", "sd_u")
+        height = source.columns.names.get("h", "")
+        of_sea = bool(_ABOVE_SEA.search(height)) and not _ABOVE_ELLIPSOID.search(height)
+        if "geoid" in values:
+            pair = f"'{height}' and '{source.columns.names['geoid']}'"
+            same = (source.find_unit("h", "length") or "m") == (source.find_unit("geoid", "length") or "m")
+            if of_sea and same:
+                self._decide(f"heights: above the ellipsoid, as {pair} add up")
+            else:
+                dropped = (*dropped, "geoid")
+                why = "one is not in the other's unit" if of_sea else "a height above the ellipsoid needs none"
+                self._decide(f"heights: CHECK: {pair} are not added up: {why}")
         self._write_file(source, "gnss", dropped)
         if source.log is None:
             if "h" not in values:
@@ -254,8 +287,7 @@ class _Writer:
                     f"CHECK: m, 1-sigma east, north, up; the file states {none}, this is a receiver without corrections"
                 )
                 self._write_key("sd", _SD, why)
-            height = source.columns.names["h"]
-            if "msl" in height.lower() or "alt" in height.lower():
+            if of_sea and ("geoid" not in values or "geoid" in dropped):
                 self._decide(f"heights: '{height}' may be above mean sea level; they are used as they are")
         if late is not None:
             words = f"velocities are not used: they come {late:.2f} s after the positions"
@@ -358,7 +390,8 @@ class _Writer:
         if source.joined_from is None and source.plain is None and not is_inside(source.path, self.folder):
             words = f"{relative}: lies outside the folder of this file; use --allow-outside to read it"
             self._decide(words)
-        names = {o: theirs for o, theirs in source.columns.names.items() if o != theirs and o not in dropped}
+        names = {o: theirs for o, theirs in source.columns.names.items() if o not in dropped}
+        names = {o: theirs for o, theirs in names.items() if o != theirs or o == GEOID}
         if names:
             pairs = ", ".join(f"{ours} = {quote(theirs)}" for ours, theirs in names.items())
             self.lines.append(f"columns = {{ {pairs} }}")

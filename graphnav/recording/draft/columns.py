@@ -44,6 +44,9 @@ _PATTERNS: dict[str, tuple[str, ...]] = {
         r"(?:.*_)?(?:alt(?:itude?)?|height|h_?msl|elevation|ele)",
         r"(?:.*_)?(?:alt(?:itude)?|height|h)_?(?:msl|wgs84)?", r"h_he|hoehe|hauteur|altura",
     ),
+    "geoid": (
+        r"(?:.*_)?geoid(?:al)?(?:_?(?:sep(?:aration)?|height|undulation|h|n))?|undulation|(?:geo_?)?sep(?:aration)?",
+    ),
     **{
         f"v{way[0]}": (
             rf"v{way[0]}|v_?{way}|vel_?{way[0]}(?:{way[1:]})?|{way}_vel\w*|velocity_{way[0]}(?:{way[1:]})?|{way[0]}_vel",

@@ -48,6 +48,8 @@ def convert_whole_degrees(table: Table, names: dict[str, str], plain: Plain | No
     heights = ["h"] if "h" in at and _are_whole(at["h"]) else []
     for ours in ("lat", "lon", *heights):
         table = table.with_column(ours, table[ours] * (1e-3 if ours == "h" else 1e-7))
+    if heights:
+        names.pop("geoid", None)  # whose unit is another or not known
     words = f"'{names['lat']}', '{names['lon']}' in 1e-7 deg, made deg"
     if heights:
         words += f", '{names['h']}' in mm, made m"

@@ -51,6 +51,7 @@ WANTED = {
         "course",
         "type",
         "satellites",
+        "geoid",
     ),
     "odometer": ("t", "speed", *WHEELS),
     "barometer": ("t", "pressure"),
@@ -228,8 +229,10 @@ def _find_gravity(
 
 
 def _are_gps_seconds(t: Array) -> bool:
-    """Whether stamps of a receiver (s) count from the GPS epoch: as such they are dates, and not of the future."""
-    return float(t[0]) > UNIX and float(t[-1]) + GPS_TO_UNIX < time()
+    """Whether stamps of a receiver (s) may count from the GPS epoch: as such they are dates of this century, and not
+    of the future. Of those that are dates in Unix time too `sources` decides by the other logs.
+    """
+    return float(t[0]) + GPS_TO_UNIX > UNIX and float(t[-1]) + GPS_TO_UNIX < time()
 
 
 def _find_second(header: list[str], columns: matching.FileColumns, core: Sequence[str]) -> str:
@@ -298,7 +301,7 @@ def _read_sensor(
     names = {ours: theirs for ours, theirs in columns.names.items() if ours in wanted}
     if role in ("imu", "gnss") and "week" in columns.names:
         names["week"] = columns.names["week"]
-    for extra in ("type", "satellites", "week"):
+    for extra in ("type", "satellites", "geoid", "week"):
         if extra in names and not _read_numbers(path, names[extra], plain):
             del names[extra]
     if plain is None:

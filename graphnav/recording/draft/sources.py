@@ -12,7 +12,7 @@ import numpy as np
 from graphnav.core.errors import RecordingError
 from graphnav.core.notes import get_key
 from graphnav.core.rotation import Array
-from graphnav.core.timescales import DAY, GPS_TO_UNIX
+from graphnav.core.timescales import DAY, NEAR, UNIX, gps_to_utc
 from graphnav.recording.draft import columns as matching
 from graphnav.recording.draft import guesses, motion
 from graphnav.recording.draft.guesses import Guess
@@ -27,7 +27,9 @@ JOINED = "joined_imu.csv.gz"  # the file combined from a gyro's and an accelerom
 
 _TEXT_ENDINGS = (".csv", ".txt", ".tsv", ".dat", ".asc", ".log")  # of files of a folder that are considered
 
+_PROSE = re.compile(r"licen[cs]e|readme|copying|notice", re.IGNORECASE)  # names of files beside logs
 _TRACKS = (".gpx", ".kml", ".kmz", ".fit", ".tcx", ".geojson")
+_OF_RECEIVERS = (".rtcm", ".rtcm2", ".rtcm3", ".sbf", ".t02", ".t04", ".jps", ".gps", ".bnx")  # their own forms
 _POSITIONS = re.compile(r"(?:^|[^a-z])(?:gnss|gps|rtk|location|position|track|fix)(?:$|[^a-rt-z])", re.IGNORECASE)
 
 
@@ -101,6 +103,7 @@ def find_logs(paths: Sequence[Path], topics: Sequence[str] = ()) -> LogsFound:
     if not sensors.keys() & {"gnss", "odometer"} and not raw.observed:
         _check_unread(paths, {path: nothing[path.name] for path in files if path.name in nothing})
     _date_times_of_day(sensors)
+    _tell_gps_from_unix(sensors)
     parts = [s.path.name for name in ("gyro", "accel", "gravity") for s in every.get(name, ())]
     if "imu" in every and parts:
         left.append(f"left out: {', '.join(parts)}: {sensors['imu'].path.name} holds both")
@@ -124,6 +127,25 @@ def _date_times_of_day(sensors: dict[str, Source]) -> None:
             source.plain = replace(source.plain, words=words)
 
 
+def _tell_gps_from_unix(sensors: dict[str, Source]) -> None:
+    """Decide what stamps count from that are dates both since the GPS epoch and in Unix time: by the other logs."""
+    is_open = {name: s.log is None and s.week == 0 and float(s.t[0]) > UNIX for name, s in sensors.items()}
+    known = [unix for name, s in sensors.items() if not is_open[name] and (unix := _find_unix_start(s)) is not None]
+    for source in (s for name, s in sensors.items() if is_open[name]):
+        as_unix = float(source.t[0])
+        as_gps = _find_unix_start(source)
+        gps, unix = (any(t is not None and abs(x - t) < NEAR for x in known) for t in (as_gps, as_unix))
+        stamps = source.columns.names["t"]
+        if unix and not gps:
+            why = f"'{stamps}' is Unix time, by the date of the other log"
+            source.week = None
+        elif gps:
+            why = f"'{stamps}' counts from the GPS epoch, by the date of the other log"
+        else:
+            why = f"CHECK: '{stamps}' is taken as s since the GPS epoch, of which it is a date as in Unix time"
+        source.t_unit = replace(source.t_unit, why=why)
+
+
 def _check_unread(paths: Sequence[Path], tables: Mapping[Path, str]) -> None:
     """Refuse to take for a walk without fixes what has positions in a form that is not read, for the reasons given.
 
@@ -133,9 +155,13 @@ def _check_unread(paths: Sequence[Path], tables: Mapping[Path, str]) -> None:
         Naming the file.
     """
     inside = [p for path in paths if path.is_dir() for p in sorted(path.iterdir())]
-    unread = [p for p in inside if p.suffix.lower() in _TRACKS] + [p for p in tables if _POSITIONS.search(p.name)]
+    unread = [p for p in inside if p.suffix.lower() in (*_TRACKS, *_OF_RECEIVERS)]
+    unread += [p for p in tables if _POSITIONS.search(p.name)]
     if unread:
-        why = tables.get(unread[0], "write them as CSV with t, lat and lon in deg and h in m")
+        why = "write them as CSV with t, lat and lon in deg and h in m"
+        if unread[0].suffix.lower() in _OF_RECEIVERS:
+            why = "write its observations as RINEX, as RTKLIB's convbin does"
+        why = tables.get(unread[0], why)
         raise RecordingError(
             f"{unread[0]}: its positions are not read ({why}); else take the file out of the folder",
             key="draft.positions_unread",
@@ -150,7 +176,10 @@ def _find_unix_start(source: Source) -> float | None:
             return begin if guesses.is_date(source.t) else None
     else:
         begin = next(sensor.t[0] for sensor in source.held)
-    return None if source.gps_zero is None else float(source.gps_zero + begin + GPS_TO_UNIX)
+    if source.gps_zero is None:
+        return None
+    utc = gps_to_utc(np.array([source.gps_zero + begin]))[0]
+    return float((utc - np.datetime64(0, "s")) / np.timedelta64(1, "us")) * 1e-6
 
 
 def _list_logs(path: Path) -> list[Path]:
@@ -160,7 +189,7 @@ def _list_logs(path: Path) -> list[Path]:
     every = [p for p in path.iterdir() if not p.name.startswith(".") and p.exists()]  # no links that lead nowhere
     made = {JOINED, "recording.toml"}  # written by an earlier draft
     made |= {name_plain_file(p, sensor) for p in every for sensor in WANTED}
-    inside = sorted(p for p in every if p.name not in made)
+    inside = sorted(p for p in every if p.name not in made and not _PROSE.match(p.name))
     logs = [
         p
         for p in inside
@@ -183,7 +212,9 @@ def _name_others(paths: Sequence[Path], files: Sequence[Path]) -> str:
     """The files of folders that are no logs, in words; '' where there are none."""
     known = {*(p.name for p in files), *(name_plain_file(p, s) for p in files for s in WANTED), JOINED}
     every = {p.name for path in paths if path.is_dir() and path not in files for p in path.iterdir() if p.is_file()}
-    others = sorted(name for name in every - known if not name.startswith(".") and not name.endswith(".toml"))
+    others = sorted(
+        n for n in every - known if not n.startswith(".") and not n.endswith(".toml") and not _PROSE.match(n)
+    )
     return f"not read: {', '.join(others[:5])}{', ...' if len(others) > 5 else ''}" if others else ""
 
 
@@ -242,7 +273,7 @@ def _join_imu(gyro: Source, accel: Source) -> Source:
     values |= {f"a{x}": np.interp(t[inside], at, accel.values[f"a{x}"]) for x in "xyz"}
     units = {k: u for s in (gyro, accel) for k, u in s.columns.units.items() if k != "t"}
     joined = Source(gyro.path, matching.FileColumns({name: name for name in values}, units), values)
-    joined.joined_from = (gyro.path, accel.path)
+    joined.joined_from, joined.week = (gyro.path, accel.path), gyro.week
     joined.t_unit = Guess("s", f"made of {gyro.columns.names['t']} in {gyro.t_unit.value}: {gyro.t_unit.why}")
     return joined
 

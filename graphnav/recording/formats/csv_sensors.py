@@ -73,6 +73,8 @@ def build_gnss(d: schema.GnssTable, rows: Table, remarks: Remarks) -> Gnss:
             "gnss.sigma_unknown", f"{format_count((~known).sum(), 'fix', 'fixes')} of accuracy -1 (unknown) left out"
         )
         rows = rows.take(known)
+    if schema.GEOID in d.columns and schema.GEOID in rows:
+        rows = rows.with_column("h", rows["h"] + _fill(rows[schema.GEOID], rows))
     llh, rows = convert_geodetic(rows, d.units.angle, schema.HEIGHT[d.units.height], "GNSS", remarks)
     every = np.ones(len(rows), dtype=bool)
     sd = choose_sigmas(rows, ("sd_e", "sd_n", "sd_u"), d.sd, DEFAULT_SD, "GNSS position", every, remarks)
@@ -123,6 +125,22 @@ def build_gnss(d: schema.GnssTable, rows: Table, remarks: Remarks) -> Gnss:
         rows["t"], llh, sd, v, sd_v, np.array(d.lever_arm), kinds, kinds is not None and d.units.type == "rtklib"
     )
     return replace(gnss, satellites=rows["satellites"]) if "satellites" in rows else gnss
+
+
+def _fill(values: Array, rows: Table) -> Array:
+    """A column that changes slowly, without blanks.
+
+    Raises
+    ------
+    RecordingError
+        If all of it is blank.
+    """
+    known = np.flatnonzero(np.isfinite(values))
+    if not len(known):
+        raise RecordingError(
+            f"{rows.path}: the column of columns.geoid is blank; leave it out, or fill it in", key="table.column"
+        )
+    return np.asarray(np.interp(np.arange(len(values)), known, values[known]))
 
 
 def build_odometer(d: schema.OdometerTable, rows: Table, remarks: Remarks) -> Odometer:

@@ -115,10 +115,8 @@ Noise = create_model(  # type: ignore[call-overload]
 )
 
 
-class ImuTable(SensorTable):
-    """[imu]"""
-
-    required = ("t", "gx", "gy", "gz", "ax", "ay", "az")
+class ImuDescription(TomlTable):
+    """What the readings of an IMU are, wherever they come from: axes, units and noise."""
 
     axes: str | None = None
     forward: Vector | None = None
@@ -137,7 +135,7 @@ class ImuTable(SensorTable):
         return model
 
     @model_validator(mode="after")
-    def _one_mount(self) -> ImuTable:
+    def _one_mount(self) -> ImuDescription:
         if self.axes is not None and (self.forward is not None or self.up is not None):
             raise ValueError("give either axes or forward and up, not both")
         if (self.forward is None) != (self.up is None):
@@ -159,13 +157,22 @@ class ImuTable(SensorTable):
         return parse_axes_letters(self.axes or "RFU")
 
 
+class ImuTable(ImuDescription, SensorTable):
+    """[imu]"""
+
+    required = ("t", "gx", "gy", "gz", "ax", "ay", "az")
+
+
+GEOID = "geoid"  # added to h, only where `columns` names it: in other files h may be above the ellipsoid already
+
+
 class GnssTable(SensorTable):
     """[gnss]"""
 
     required = ("t", "lat", "lon", "h")
     optional = (
         "sd_e", "sd_n", "sd_u", "ve", "vn", "vu", "sd_ve", "sd_vn", "sd_vu", "vd", "speed", "course", "type",
-        "satellites",
+        "satellites", GEOID,
     )  # fmt: skip
 
     units: FixUnits = FixUnits()

@@ -21,9 +21,11 @@ from graphnav.core.rotation import Array
 from graphnav.recording import Imu, Recording, take_rows
 from graphnav.recording.checks import crosschecks, tracks
 from graphnav.recording.checks.aiding import check_imu_clock, measure_common_time
-from graphnav.recording.checks.axes import check_forward_sign
+from graphnav.recording.checks.axes import check_forward_sign, check_yaw_scale
 from graphnav.recording.checks.clock import FAIR, ClockOffsets, measure_clock_offsets
+from graphnav.recording.checks.crosschecks import Fit
 from graphnav.recording.checks.series import screen_series
+from graphnav.recording.checks.tilt import NEAR_FACTOR
 from graphnav.recording.checks.tracks import Track
 from graphnav.recording.formats.schema import FORCE
 from graphnav.recording.plausibility import fixes as plausibility_gnss
@@ -37,8 +39,6 @@ ACCEL_RANGE = 1000.0  # m/s^2
 GYRO_RANGE = 70.0  # rad/s
 _ISOLATED = 0.01  # share of the rows; above it the cause is not in single rows
 _QUIET_PERCENTILE = 10.0  # percentile of the turn rate up to which a foot stands and a vehicle moves calmly
-# A factor of two is the smallest by which a scale is mistaken (the ranges of a sensor are that far apart): the middle.
-_SCALE_RATIO = np.sqrt(2.0)
 _STEADY = 0.7  # of a force that scatters by 45 deg; of real drives 0.99 and more with gravity, at most 0.5 without
 _UNIT_RATIO = 1.2  # ratio of the force found and that of a unit: a biased sensor among vibration
 _DEAD = 10.0  # s; the longest repetition of an axis in thirty real recordings while others move is 0.08 s
@@ -60,6 +60,7 @@ class Screened:
     recording: Recording
     findings: tuple[Finding, ...] = ()
     clock: ClockOffsets | None = None  # clock offset of the IMU against the fixes, where it was measured
+    yaw: Fit | None = None  # changes of course on the gyro, likewise
 
 
 def refuse(recording: Recording, findings: tuple[Finding, ...]) -> None:
@@ -129,6 +130,7 @@ def screen(recording: Recording) -> Screened:
         return Screened(recording)
     recording, of_imu, of_aiding, track = _screen_rows(recording)
     dead, clock = list(check_dead_axes(recording)), None
+    yaw: Fit | None = None
     findings = [*of_imu, *dead, *of_aiding]
     wrong_unit = any(f.key in _UNIT_FINDINGS for f in of_imu)
     if recording.platform == "vehicle" and not dead and not wrong_unit:
@@ -147,9 +149,11 @@ def screen(recording: Recording) -> Screened:
         else:
             forward = crosschecks.fit_forward(recording.imu, path) if path is not None else None
         findings += check_forward_sign(recording.imu, path, forward)
+        yaw = None if track is None else crosschecks.fit_yaw_rate(recording.imu, track)
+        findings += [finding for finding in check_yaw_scale(yaw) if finding.severity == "refused"]
         if clock is not None:
             findings += check_imu_clock(clock)
-    return Screened(recording, tuple(findings), clock)
+    return Screened(recording, tuple(findings), clock, yaw)
 
 
 def _screen_rows(recording: Recording) -> tuple[Recording, list[Finding], list[Finding], Track | None]:
@@ -236,7 +240,7 @@ def _measure_gravity(recording: Recording) -> float:
 def _find_scale(f: float) -> str | None:
     """The likely unit or scale of a force at rest that is not gravity; None if it is."""
     g = STANDARD_GRAVITY
-    if g / _SCALE_RATIO < f < g * _SCALE_RATIO:
+    if NEAR_FACTOR[0] < f / g < NEAR_FACTOR[1]:
         return None
     units = {g / size: f'the accelerometer seems to be in {name}: set units = {{ accel = "{name}" }}'
              for name, size in FORCE.items() if size > 0.0 and name != "m/s2"}  # fmt: skip

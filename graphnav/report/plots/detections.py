@@ -44,8 +44,8 @@ def plot_detections(recording: Recording, found: Sequence[Detection]) -> Figure:
     force, rate = _compute_norms(imu.accel[shown]), np.degrees(_compute_norms(imu.gyro[shown]))
     speeds = _collect_speeds(recording)
     rows: list[tuple[str, str, tuple[float, float], bool]] = [
-        ("size of the specific force [m/s²]", "m/s²", find_axis_limits([force]), False),
-        ("size of the angular rate [deg/s]", "deg/s", find_axis_limits([rate]), False),
+        ("magnitude of the specific force [m/s²]", "m/s²", find_axis_limits([force]), False),
+        ("magnitude of the angular rate [deg/s]", "deg/s", find_axis_limits([rate]), False),
     ]
     if speeds:
         rows.append(("speed [m/s]", "m/s", find_axis_limits([y for _, _, y, _ in speeds]), False))
@@ -58,7 +58,7 @@ def plot_detections(recording: Recording, found: Sequence[Detection]) -> Figure:
         [title for title, _, _, _ in rows], (0.0, recording.duration), [ylim for _, _, ylim, _ in rows],
         units=[unit for _, unit, _, _ in rows], log=[log for _, _, _, log in rows], height=76,
     )  # fmt: skip
-    stood = {"stands": stands}
+    stood = {"stationary": stands}
     for panel in figure.panels[: len(rows) - bool(pictured)]:
         panel.shade(stood)
     panels = iter(figure.panels)
@@ -108,7 +108,7 @@ def _find_axis_limits(every: Sequence[Detection]) -> tuple[float, float]:
 def _plot_statistic(panel: Panel, d: Detection, t0: float) -> None:
     panel.draw_line(d.t - t0, np.maximum(d.statistic, _LOWEST), "batch", "statistic", width=1.1)
     threshold = np.broadcast_to(d.threshold, d.t.shape)
-    panel.draw_line(d.t - t0, threshold, "alert", "threshold: below it stands", dash=True)
+    panel.draw_line(d.t - t0, threshold, "alert", "threshold: stationary below", dash=True)
 
 
 def _plot_spectrogram(panel: Panel, pictured: Sequence[Detection], t0: float) -> None:

@@ -16,7 +16,7 @@ from graphnav.core.rotation import Array
 from graphnav.report.plots.colours import name_variable
 from graphnav.report.plots.thinning import BINS, choose_rows, insert_breaks, thin
 
-SHADES = {"withheld": "withheld", "no GNSS": "outage", "excluded": "alert", "stands": "stop"}  # span -> colour
+SHADES = {"withheld": "withheld", "no GNSS": "outage", "excluded": "alert", "stationary": "stop"}  # span -> colour
 TIME_NAME = "time from the start [s]"
 Tinted = Sequence[tuple[float, float]]
 _PANEL, _GAP, _ABOVE, _BELOW, _LEFT, _RIGHT = 104, 30, 20, 42, 58, 10  # pixels
