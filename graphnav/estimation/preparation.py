@@ -7,6 +7,7 @@ solver its first linearisation point.
 
 from __future__ import annotations
 
+import contextlib
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -319,8 +320,9 @@ def _linearise_far(
         from graphnav.estimation.factor_graph.batch import batch  # imports GTSAM, which few filter runs need
 
         free = replace(problem, constraints=tuple(c for c in problem.constraints if not c.of_wheels))
-        states = smooth_backward(free, ekf(free, progress, aligned.until)).states
-        states = batch(free, states, wanted=(), reintegrate=False).states
+        with contextlib.suppress(*BREAKDOWN):
+            states = smooth_backward(free, ekf(free, progress, aligned.until)).states
+            states = batch(free, states, wanted=(), reintegrate=False).states
         passes.update(filter=1, smoother=1)
     return _linearise_at_batch(problem, aligned, smoothed, states, progress, passes)
 

@@ -12,6 +12,7 @@ A solution is on the clock of the IMU, and what it says of fixes is on theirs (`
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -26,6 +27,7 @@ from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM
 from graphnav.core.timescales import shift_stamps, shift_stamps_back
+from graphnav.estimation.noise.initial_points import BREAKDOWN
 from graphnav.estimation.noise.model import NoiseModel, RowWeights, StampOffsets
 from graphnav.estimation.offsets import AS_STATED, is_offset_far, list_end_rows, move_stamps
 from graphnav.estimation.preparation import Prepared, Weigh
@@ -62,11 +64,12 @@ def find_stamps(
     """
     guess = None if clock is None else _guess_offsets(clock)
     plain: _Candidate = recording, prepare(recording, 0.0, is_offset_far if guess is None else _accept_all), AS_STATED
-    starts = [] if guess is None else [_move(recording, prepare, guess)]
-    for start in (*starts, plain):
-        found = _move_until_near(recording, prepare, start)
-        if found is not None and found is not plain and found[1].log_evidence > plain[1].log_evidence:
-            return found
+    for first in (plain,) if guess is None else (guess, plain):
+        with contextlib.suppress(*BREAKDOWN):  # with stamps that are farther off than before
+            start = _move(recording, prepare, first) if isinstance(first, StampOffsets) else first
+            found = _move_until_near(recording, prepare, start)
+            if found is not None and found is not plain and found[1].log_evidence > plain[1].log_evidence:
+                return found
     return plain
 
 

@@ -253,3 +253,18 @@ def test_errors_of_fixes_never_explain_any_trajectory(shared_data: Path, monkeyp
         p = np.stack([np.interp(fixes.t, path.t, x) for x in frame.from_llh(path.llh).T], axis=-1)
         rms.append(np.sqrt(np.mean(np.sum((p - frame.from_llh(fixes.llh))[:, :2] ** 2, axis=1))))
     assert rms[0] < rms[1]
+
+
+def test_a_smoother_is_at_the_optimum_that_steps_from_its_own_points_leave(
+    shared_data: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Seventy seconds of fixes, most of them wrong, and an IMU nine times as noisy: undamped steps lead 100 m away."""
+    monkeypatch.syspath_prepend(str(SCRIPTS))
+    draws = importlib.import_module("damage_draws")
+    options = argparse.Namespace(data=shared_data, drives=list(draws.NAMES), family="faults", seed=9705)
+    _, clean, damaged, _ = draws.draw(11, options)
+    for source, span in draws.withheld_of(clean, clean.duration):
+        damaged = damaged.without(source, span)
+    found = run(damaged, parse_settings({}), ("rts", "batch"))
+    sigma = np.sqrt(np.diagonal(found["batch"].covariance, axis1=1, axis2=2)[:, 3:6])
+    assert np.max(np.abs(found["rts"].states.p - found["batch"].states.p) / sigma) < 0.2

@@ -27,11 +27,12 @@ from graphnav.estimation.noise.model import STATED, NoiseModel, VarianceComponen
 from graphnav.estimation.pipeline import run
 from graphnav.estimation.problem import Problem, build_problem
 from graphnav.estimation.solution import Solution
-from graphnav.estimation.solvers.ekf import ekf
+from graphnav.estimation.solvers.ekf import ekf, refilter
 from graphnav.estimation.solvers.incremental import Replay, incremental
+from graphnav.estimation.solvers.passes import move_points
 from graphnav.estimation.solvers.robust import weigh_squares
-from graphnav.estimation.solvers.rows import Iterate, Layout, whiten
-from graphnav.estimation.solvers.rts import rts
+from graphnav.estimation.solvers.rows import Iterate, Layout, compute_cost_at, shorten_step, whiten
+from graphnav.estimation.solvers.rts import rts, smooth_backward
 from graphnav.imu.dynamics import SCALE
 from graphnav.recording import Gnss, Recording
 from graphnav.recording.formats import read
@@ -286,6 +287,27 @@ def test_covariances_of_some_keyframes_only(lap: tuple[Recording, Trajectory]) -
     rest = np.setdiff1d(np.arange(len(problem.t)), [0, 7])
     np.testing.assert_array_equal(some.covariance[[0, 7]], whole.covariance[[0, 7]])
     assert np.isnan(some.covariance[rest]).all()
+
+
+def test_steps_that_are_halved_reach_the_optimum_from_a_heading_that_is_far_off(
+    lap: tuple[Recording, Trajectory],
+) -> None:
+    recording, truth = lap
+    part = recording.crop(20.0, 60.0)
+    frame = LocalFrame(part.gnss.llh[0])
+    start = truth_states(truth, np.round(np.array([part.start]), 6), frame)
+    problem = build_problem(part, Settings(), frame, start, np.repeat([2.0, 1.0, 0.5, 0.03, 2e-3], 3))
+    optimum = smooth_backward(problem, ekf(problem))
+    best, away = compute_cost_at(problem, optimum), np.zeros((len(problem.t), DIM + optimum.values.shape[1]))
+    away[:, :3] = optimum.states.R_nb[:, 2] * 2.0  # rad about the vertical
+    points = move_points(optimum, away)
+    costs = [compute_cost_at(problem, points)]
+    for _ in range(20):
+        points = shorten_step(problem, points, smooth_backward(problem, refilter(problem, points)))
+        costs.append(compute_cost_at(problem, points))
+    assert costs[0] > 100.0 * best
+    assert np.all(np.diff(costs) <= 0.0)
+    assert costs[-1] < 1.01 * best
 
 
 # -------------------------------------------------------------------------------------------------------- robust

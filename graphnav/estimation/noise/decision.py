@@ -48,7 +48,11 @@ class Decision:
 
 
 def explain(
-    base: Problem, found: NoiseEstimate, spans: list[Span], among: Collection[Explanation] = EXPLANATIONS
+    base: Problem,
+    found: NoiseEstimate,
+    spans: list[Span],
+    among: Collection[Explanation] = EXPLANATIONS,
+    least: float = -np.inf,
 ) -> Decision:
     """Choose the most probable fault model of each span.
 
@@ -56,6 +60,7 @@ def explain(
     ----------
     found : the figures, and weights of rows.
     among : explanations to compare with that nothing is wrong.
+    least : evidence that other decisions have; one that cannot reach it is not refined.
     """
     if not spans:
         return Decision(found.noise, found.log_evidence)
@@ -95,7 +100,8 @@ def explain(
         some = np.array(more)
         cost[:, EXPLANATIONS.index(kinds)] += np.where((some > 0.0) | (kinds not in _BY_ROWS), some, np.inf)
     about, costs = found.carry_points(base, used), PriorCosts(cost, dict.fromkeys(totals, OUTLIER_COST) | each)
-    evidence, chosen, passes = compute_evidence(used, about, spans, weighted, sizes, costs, among)
+    rest = found.log_prior - compute_outlier_cost(outside, totals)
+    evidence, chosen, passes = compute_evidence(used, about, spans, weighted, sizes, costs, among, least - rest)
     excluded: dict[str, tuple[Span, ...]] = {}
     dropped: dict[str, list[Span]] = {name: [] for name in noise.weights}
     for span, to_next, best in zip(spans, reach, chosen, strict=True):
@@ -107,8 +113,7 @@ def explain(
     excluded = {name: some for name, some in excluded.items() if name in present}
     weights = {name: drop_within(some, dropped[name]) for name, some in noise.weights.items()}
     noise = replace(noise, weights=weights, excluded=excluded)
-    evidence += found.log_prior - compute_outlier_cost(outside, totals)
-    return Decision(noise, evidence, Counter(filter=passes))
+    return Decision(noise, evidence + rest, Counter(filter=passes))
 
 
 def list_explanations(noise: NoiseModel) -> set[Explanation]:

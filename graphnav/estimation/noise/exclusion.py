@@ -197,7 +197,7 @@ def decide_faults(base: Problem, found: NoiseEstimate) -> Decision:
     segments, spent = find_segments(base, found, suspects)
     passes = first.passes + Counter(filter=spent)
     if segments:
-        other = explain(base, found, segments)
+        other = explain(base, found, segments, least=first.log_evidence)
         passes = passes + other.passes
         first = replace(other, rival=first) if other.log_evidence > first.log_evidence else first
     medians = {name: replace(figure, log_factor=figure.prior) for name, figure in found.noise.figures.items()}
@@ -231,12 +231,13 @@ def _unmask(base: Problem, found: NoiseEstimate, first: Decision, masked: list[S
         for some in [*list_distinct(spans, trim(spans, errors, FALSE_ALARM), detected), segments]:
             if not some:
                 continue
-            candidate = explain(base, _add_outliers(estimate, errors, some), some)
+            least = min(best.log_evidence, rival.log_evidence)
+            candidate = explain(base, _add_outliers(estimate, errors, some), some, least=least)
             passes = passes + candidate.passes
             cut = cut_at_steps(some, candidate.noise, used, estimate)
             if cut != some:
                 among = {*list_explanations(candidate.noise), ROWS}  # its pieces are wrong the same way, or not at all
-                finer = explain(base, _add_outliers(estimate, errors, cut), cut, among)
+                finer = explain(base, _add_outliers(estimate, errors, cut), cut, among, least)
                 passes = passes + finer.passes
                 candidate = max(candidate, finer, key=lambda one: one.log_evidence)
             if some is not segments and candidate.log_evidence > rival.log_evidence:

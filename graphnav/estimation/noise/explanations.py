@@ -199,11 +199,13 @@ def compute_evidence(
     sizes: ErrorSizes,
     costs: PriorCosts,
     among: Collection[Explanation] = EXPLANATIONS,
+    least: float = -np.inf,
 ) -> tuple[float, list[Explanation], int]:
     """Find the most probable explanation of each span, by the likelihood of the innovations.
 
     Measurements that have an error in common for longer than `watch.PATIENCE` may have outliers besides: where the
-    innovations show that these could decide, their weights are found by a smoother with that error.
+    innovations show that these could decide, their weights are found by a smoother with that error; not if all that
+    they could gain would leave the log-probability below `least`.
 
     Spans are explained each by itself, up to the start of the next one. Where spans without a measurement between them
     have different explanations, the state at the second is not that of its model, so a filter with all that was chosen
@@ -217,6 +219,7 @@ def compute_evidence(
     weighted : by explanation, the problem with the weights of rows and intervals that go with it.
     sizes : of errors that are of one fix each.
     among : explanations to evaluate besides that nothing is wrong.
+    least : log-probability below which the decision does not matter.
 
     Returns
     -------
@@ -252,7 +255,8 @@ def compute_evidence(
             one = add_own_errors(base, spans, kinds, sizes)
             more = np.sum([sizes.cost[name] for name in kinds], axis=0)
             models.append(_Model(kinds, one, (), trials.sum_spans(trials.filter(one).log_likelihood()), cost + more))
-    for model, gain in common:
+    highest = np.max([one.value for one in models] + [model.value + gain for model, gain in common], axis=0)
+    for model, gain in common if before + float(np.sum(highest)) > least else ():
         while np.any((gain > FAULT_COST) & (model.value + gain > np.max([one.value for one in models], axis=0))):
             base, outliers = trials.weigh_outliers(model.problem, model.kinds, lasting)
             likelihood = trials.filter(add_common_errors(base, spans, model.kinds), model.kinds).log_likelihood()
