@@ -157,17 +157,11 @@ def _iterate(
         stages.insert(0, (_FIRST_KEYFRAMES if long else total, _BOUNDED))
     latest: tuple[ForwardRecord, DisturbancePass] | None = None
     robust: NoiseModel | None = None
-    begun, used, now, ended = figures, problem, -np.inf, 0  # of the latest pass
     for end, bound in stages:
-        first = int(converged and end == ended)
-        if first:  # by its moments
-            assert latest is not None
-            figures, begun.extrapolation = begun, 1.0
-            _improve(figures, used, *latest, end, intervals, bound)
-        before, converged, figures.extrapolation = now if first else -np.inf, False, 1.0
+        before, converged, figures.extrapolation = -np.inf, False, 1.0
         rounds = _AGAIN if bound == CHANCE else _ROUNDS
         likeliest, most, highest, since = figures, -np.inf, -np.inf, 0
-        for k in range(first, _MAX_PASSES):
+        for k in range(_MAX_PASSES):
             used, latest = apply_noise(problem, figures.build_model()), None  # releases the memory of the previous pass
             latest = _smooth_about(used, about.take_first(end))
             done += end
@@ -180,7 +174,6 @@ def _iterate(
             ahead = _splice(about, latest[1])
             near = are_near(ahead, about, LINEAR_ATTITUDE)
             about = ahead if near else shorten_step(used, about, ahead)
-            begun, ended = figures.copy(), end
             _improve(figures, used, *latest, end, intervals, bound)
             # each figure gains a half by chance; while one sensor is far off, many passes gain little more than that
             converged = k > 1 and abs(now - before) < (0.05 if k + 1 < rounds else 0.5) * len(figures.log)
