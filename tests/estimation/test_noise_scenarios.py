@@ -228,9 +228,17 @@ def test_an_imu_far_worse_than_stated_is_not_taken_for_bad_fixes(shared_data: Pa
 def test_wheels_tell_errors_that_last_from_a_bad_imu(many_houses: tuple[Recording, dict[str, Solution]]) -> None:
     """Most fixes contradict the filter; the other explanation is an IMU ten times as bad."""
     recording, solutions = many_houses
-    noise = solutions["batch"].noise
-    assert recording.gnss is not None
-    assert np.mean(select_weights(recording.gnss.t, noise, "gnss_position") < 0.5) > 0.1
+    noise, fixes, truth = solutions["batch"].noise, recording.gnss, recording.truth
+    assert fixes is not None
+    assert truth is not None
+    assert truth.llh is not None
+    frame = LocalFrame(fixes.llh[0])
+    there = np.stack([np.interp(fixes.t, truth.t, x) for x in frame.from_llh(truth.llh).T], axis=-1)
+    off = np.linalg.norm(((frame.from_llh(fixes.llh) - there) / fixes.sd)[:, :2], axis=1)  # sigmas
+    unused = select_weights(fixes.t, noise, "gnss_position") < 0.5
+    wrong, right = np.mean(unused[off > 5.0 * np.sqrt(2.0)]), np.mean(unused[off < 2.0 * np.sqrt(2.0)])
+    assert wrong > 0.5
+    assert right < 0.1 * wrong
     assert 2.0 < noise.times["gnss_error_of_seconds"] < 8.0
     assert times(noise, "imu.gyro_noise_density") < 2.0
     assert times(noise, "imu.accel_noise_density") < 7.0

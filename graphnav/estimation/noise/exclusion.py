@@ -171,7 +171,8 @@ def _estimate_without(
     start = NoiseModel(weights=decision.noise.weights, excluded=decision.noise.excluded)
     near = (decision.estimate or found).get_linearisation(base)
     estimate = weigh_evidence(base, estimate_noise(base, opening, start, near, progress))
-    if log_evidence(base, estimate) < decision.log_evidence:  # a worse optimum than the one that the decision is near
+    if log_evidence(base, estimate) + estimate.gained_by_chance < decision.log_evidence:
+        # a worse optimum than the one that the decision is near
         other = weigh_evidence(base, estimate_noise(base, opening, decision.noise, near, progress))
         best = max(estimate, other, key=lambda one: log_evidence(base, one))
         estimate = replace(best, passes=estimate.passes + other.passes)
