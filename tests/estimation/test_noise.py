@@ -443,7 +443,10 @@ def test_sigmas_of_the_drive_are_true_with_estimated_figures(
     assert all(low < np.mean(x) < high for x in ratio.values()), ratio
 
 
-@pytest.mark.parametrize("nhc", [True, False])
+_NOISY = pytest.mark.xfail(strict=True, reason="without other wheel rows, readings that are noisy are as likely")
+
+
+@pytest.mark.parametrize("nhc", [True, pytest.param(False, marks=_NOISY)])
 def test_an_odometer_that_is_wrong_for_seconds(nhc: bool) -> None:
     """Its errors last for 3 s: they are seen to, and are as large as they are."""
     path = oracle.vehicle_path(duration=240, rate=50.0, seed=11)

@@ -72,7 +72,7 @@ class Drive:
             disturbance.smooth_rows(
                 0, n, np.zeros(D), np.zeros((D, D)), steps, updates, blocks.arrays, filtered,
                 (out["smoothed"], out["r"], out["N"], out["N_diagonal"]), (P_smoothed, out["variance"], out["of_rows"]),
-                np.tile(np.arange(D), n), D * np.arange(n + 1),
+                2.0 * self.H, np.tile(np.arange(D), n), D * np.arange(n + 1),
             )  # fmt: skip
         out |= {"taken": taken, "lossy": lossy, "errors_alone": np.zeros((n, D))}
         disturbance.smooth_errors(n, np.zeros(D), steps, updates, blocks.arrays, filtered, out["errors_alone"])
@@ -121,7 +121,7 @@ def test_filter_and_smoother_are_one_update_of_the_whole_drive() -> None:
     for k in range(n):
         np.testing.assert_allclose(found["P_smoothed"][k], blocks[k, :, k], atol=1e-8)
         np.testing.assert_allclose(found["variance"][k], np.diag(blocks[k, :, k]), atol=1e-8)
-        own = drive.H[k]
+        own = 2.0 * drive.H[k]
         np.testing.assert_allclose(found["of_rows"][k], own @ blocks[k, :, k] @ own.T, atol=1e-8)
     np.testing.assert_allclose(found["errors_alone"], found["smoothed"], atol=1e-12)
 

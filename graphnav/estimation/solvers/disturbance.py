@@ -111,13 +111,13 @@ def smooth_errors(
 @compile_once
 def smooth_rows(
     k0: int, k1: int, r_k: Array, N_k: Array, steps: Arrays, updates: Arrays, blocks: Arrays, filtered: Arrays,
-    found: Arrays, covered: Arrays, wanted: Array, first_wanted: Array,
+    found: Arrays, covered: Arrays, asked: Array, wanted: Array, first_wanted: Array,
 ) -> tuple[Array, Array]:  # fmt: skip
     """r (n, D), and of N the states' part (n, 15, 15) and the diagonal (n, D), of keyframes k1 - 1 down to k0.
 
-    From those of k1, zero where there is none; returns those of k0. Errors (n, D) of the smoother follow from the
-    filtered ones, because predicted errors of a position that only the first fix determines are larger by ten orders
-    than their smoothed values.
+    From those of k1, zero where there is none; returns those of k0. With covariances of the smoother, its errors (n, D)
+    too: from the filtered ones, because predicted errors of a position that only the first fix determines are larger by
+    ten orders than their smoothed values.
 
     Parameters
     ----------
@@ -125,7 +125,7 @@ def smooth_rows(
     updates, blocks, filtered : as of `graphnav.estimation.solvers.recursion.filter_rows`.
     found : filled with errors, r, N and the diagonal of N.
     covered : filled with covariances (n, D, D) of the smoother, if it has any keyframes. If it has none, with variances
-        (n, D), and H P^s H^T (n, M, M).
+        (n, D), and H P^s H^T (n, M, M) of rows `asked` (n, M, D).
     wanted, first_wanted : columns of which variances are wanted, those of keyframe k from `first_wanted[k]` on.
     """
     F, decay = steps
@@ -133,14 +133,16 @@ def smooth_rows(
     first, begin, end, _, _, _ = blocks
     errors_predicted, P_predicted, errors, P = filtered
     smoothed, r, N, N_diagonal = found
+    whole = len(covered[0]) > 0
     for k in range(k1 - 1, k0 - 1, -1):
         rows = end[first[k + 1] - 1] if first[k] < first[k + 1] else 0
         ahead = k < len(F)  # at the last keyframe the filtered covariance already is of errors about the estimate
         if ahead:
             r_k = step_vector_back(F[k], decay[k], r_k)
             N_k = step_back(F[k], decay[k], N_k)
-            np.add(errors[k], np.dot(P[k], r_k), smoothed[k])
-            fill_covariances(k, P[k], N_k, H[k, :rows], wanted, first_wanted, covered)
+            if whole:
+                np.add(errors[k], np.dot(P[k], r_k), smoothed[k])
+            fill_covariances(k, P[k], N_k, rows, wanted, first_wanted, asked, covered)
         for b in range(first[k + 1] - 1, first[k] - 1, -1):
             if taken[b]:
                 lo, hi = begin[b], end[b]
@@ -153,21 +155,24 @@ def smooth_rows(
             N_diagonal[k, i] = N_k[i, i]
         if not ahead:
             ahead_P = P_predicted[k % len(P_predicted)]
-            np.add(errors_predicted[k], np.dot(ahead_P, r_k), smoothed[k])
-            fill_covariances(k, ahead_P, N_k, H[k, :rows], wanted, first_wanted, covered)
+            if whole:
+                np.add(errors_predicted[k], np.dot(ahead_P, r_k), smoothed[k])
+            fill_covariances(k, ahead_P, N_k, rows, wanted, first_wanted, asked, covered)
     return r_k, N_k
 
 
 @compile_once
-def fill_covariances(k: int, P: Array, N: Array, H: Array, wanted: Array, first_wanted: Array, covered: Arrays) -> None:
-    """What `smooth_rows` is to fill in of P - P N P at keyframe k with rows H (m, D)."""
+def fill_covariances(
+    k: int, P: Array, N: Array, rows: int, wanted: Array, first_wanted: Array, asked: Array, covered: Arrays
+) -> None:
+    """What `smooth_rows` is to fill in of P - P N P at keyframe k, the first of `asked` being as many as `rows`."""
     P_smoothed, variance, of_rows = covered
     if len(P_smoothed) > 0:
         cover(P, N, P_smoothed[k])
         return
     vary(P, N, wanted[first_wanted[k] : first_wanted[k + 1]], variance[k])
-    if len(H) > 0:
-        cover_rows(P, N, H, of_rows[k])
+    if rows > 0:
+        cover_rows(P, N, asked[k, :rows], of_rows[k])
 
 
 @compile_once

@@ -67,7 +67,7 @@ class MomentPass(DisturbancePass):
 
     variances: Array  # (n, D), of parameters with a correlation time
     linear: dict[str, Rows]  # of constraints with variance components, linearised at the smoothed points
-    of_rows: Array  # (n, M, M) H P^s H^T, where each of these stands, linearised at the points of the filter
+    of_rows: Array  # (n, M, M) H P^s H^T, where each of these stands
     places: dict[str, tuple[Array, Array]]
 
     @property

@@ -108,22 +108,21 @@ def _find_later(forward: ForwardRecord, smoothed: Points, end: int) -> Array:
 def smooth_moments(problem: Problem, forward: ForwardRecord) -> MomentPass:
     """Smooth a forward pass that was linearised at given points throughout, with covariances for a noise model only."""
     K, D = forward.P.shape[:2]
-    one, about = forward.updates, forward.about
-    assert one is not None
-    assert about is not None
+    assert forward.updates is not None
+    one, smoothed = forward.updates, smooth_points(forward)
     found, behind = _Disturbances.allocate(K, D), (np.zeros(D), np.zeros((D, D)))
+    linear, asked = {}, np.zeros_like(one.H)
+    for rows in problem.constraints:
+        if rows.list_noise_groups()[0]:
+            which = slice(0, int(np.searchsorted(rows.keyframe, K)))
+            linear[rows.name] = linearise(rows, smoothed, problem.columns, which)
+            asked[one.places[rows.name]] = linear[rows.name].H
     wanted = np.zeros((K, D), dtype=bool)  # at both ends of their steps
     for chain in problem.chains:
         if chain.parameter.correlation_time is not None:
             k, own = find_stepping(chain, K), problem.columns[chain.parameter.name]
             wanted[k, own] = wanted[k - 1, own] = True
-    variance, of_rows = _smooth_points(forward, one, behind, K, found, np.empty((0, D, D)), wanted)
-    smoothed = move_points(about.take_first(K), found.errors)
-    linear = {}
-    for rows in problem.constraints:
-        if rows.list_noise_groups()[0]:
-            which = slice(0, int(np.searchsorted(rows.keyframe, K)))
-            linear[rows.name] = linearise(rows, smoothed, problem.columns, which)
+    variance, of_rows = _smooth_points(forward, one, behind, K, found, np.empty((0, D, D)), wanted, asked)
     return MomentPass(
         smoothed.states, smoothed.values, found.r, found.N, found.N_diagonal, variance, linear, of_rows, one.places
     )
@@ -178,24 +177,25 @@ def _smooth_points(
     out: _Disturbances,
     P: Array,
     wanted: Array | None = None,
+    asked: Array | None = None,
     progress: Progress | None = None,
 ) -> tuple[Array, Array]:
     """Smoothed errors, covariances, r and N of the first keyframes up to `end`, from r and N behind them.
 
-    Where P has no keyframes, variances (end, D) of the columns `wanted` (K, D), and H P^s H^T (end, M, M) of the rows
-    as they were taken in.
+    Where P has no keyframes, variances (end, D) of the columns `wanted` (K, D), and H P^s H^T (end, M, M) of rows
+    `asked` (K, M, D).
     """
     r_k, N_k = behind
-    n, M = one.H.shape[:2] if wanted is not None else (0, 0)
     wanted = np.zeros((0, 0), dtype=bool) if wanted is None else wanted
-    variance, of_rows = np.zeros(wanted.shape), np.zeros((n, M, M))
+    asked = np.empty((0, 0, 0)) if asked is None else asked
+    variance, of_rows = np.zeros(wanted.shape), np.zeros((len(asked), *asked.shape[1:2] * 2))
     # contiguous, like an empty one: another layout would compile `smooth_rows` a second time
     columns, first = np.ascontiguousarray(np.nonzero(wanted)[1]), np.append(0, np.cumsum(wanted.sum(axis=1)))
     for hi in range(end, 0, -STRETCH):
         lo = max(hi - STRETCH, 0)
         r_k, N_k = smooth_rows(
             lo, hi, r_k, N_k, (forward.F, forward.decay), one.arrays, one.blocks.arrays, forward.filtered,
-            (out.errors, out.r, out.N, out.N_diagonal), (P, variance, of_rows), columns, first,
+            (out.errors, out.r, out.N, out.N_diagonal), (P, variance, of_rows), asked, columns, first,
         )  # fmt: skip
         if progress is not None:
             progress("smoother", 1.0 - lo / len(forward.P))
