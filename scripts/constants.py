@@ -100,11 +100,14 @@ CONSTANTS = (
     Constant(f"{FAULTS}.watch", "LARGE", "sigmas: less is no fault, however certain"),
     Constant(f"{FAULTS}.watch", "_CLOCKS", "s, between the stamps of IMU and receiver"),
     Constant(f"{FAULTS}.watch", "_BRAKING", "m/s^2, of a usual manoeuvre"),
+    Constant(
+        f"{NOISE}.unmeasured", "_KINK", "steps of rounding: the bound of chance beside a row is by three sigmas", 3.0
+    ),
     Constant(f"{FAULTS}.verdicts", "_FEWEST_AGREEING", "fixes that agree by chance", 2.0, whole=True),
     Constant("graphnav.estimation.building", "_FAR_AWAY", "m, single fixes in a city"),
     Constant(
-        "graphnav.estimation.preparation",
-        "_LINEAR_ATTITUDE",
+        "graphnav.estimation.solvers.passes",
+        "LINEAR_ATTITUDE",
         "rad: half its square is the share of a vector that linearising loses",
     ),
     Constant("graphnav.estimation.preparation", "_MOST_WRONG", "the larger part"),
