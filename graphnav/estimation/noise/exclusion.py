@@ -313,9 +313,10 @@ def _disturb_intervals(base: Problem, found: NoiseEstimate) -> NoiseEstimate:
         free = estimate_noise(base, None, replace(found.noise, excluded={}), near, intervals=True)
         decision = explain(base, free, find_suspects(base, free.noise, free))
         passes = passes + free.passes + decision.passes + Counter(filter=1)
-        if decision.noise.excluded:
-            without = replace(free.noise, excluded=decision.noise.excluded)
-            free = estimate_noise(base, None, without, free.get_linearisation(base), intervals=True)
+        if decision.noise.excluded or decision.log_evidence > free.log_evidence + free.gained_by_chance:
+            # without an exclusion, figures that go with the outliers of the decision
+            again = replace(free.noise, excluded=decision.noise.excluded) if decision.noise.excluded else decision.noise
+            free = estimate_noise(base, None, again, free.get_linearisation(base), intervals=True)
             free = weigh_evidence(base, free)
             passes = passes + free.passes
         if log_evidence(base, free) > log_evidence(base, found):
