@@ -287,7 +287,9 @@ def _relinearise(
             return forward, smoothed, ahead
         smoothed = smooth_backward(problem, refilter(problem, ahead, progress), progress)
         passes.update(filter=1, smoother=1)
-    return _linearise_at_batch(problem, aligned, smoothed, smoothed.states, progress, passes)
+    with contextlib.suppress(*BREAKDOWN):
+        return _linearise_at_batch(problem, aligned, smoothed, smoothed.states, progress, passes)
+    return forward, smoothed, None
 
 
 def _linearise_far(
