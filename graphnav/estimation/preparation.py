@@ -211,17 +211,7 @@ def _find_noise(
         except EstimationError:
             pass  # no motion later on
     if found.noise.excluded:
-        without = builder.build_without(built, found.noise, parts=True)
-        if without is not built:
-            built, total = without, found.estimate.passes
-            found = replace(found, stated=built.problem)
-            rival = found.estimate.rival
-            again = estimate_noise(found.base, built.aligned.until, found.estimate.noise, progress=progress)
-            total = total + again.passes
-            if rival is not None:
-                rival = estimate_noise(found.base, built.aligned.until, rival.noise, progress=progress)
-                total = total + rival.passes
-            found = replace(found, estimate=replace(again, rival=rival)).count(total)
+        built, found = _start_without(builder, built, found, progress)
     found = revise_jointly(found, settings, built.aligned.until, progress)
     if found.freed:
         built, found = _start_anew(builder, built, found)
@@ -235,6 +225,29 @@ def _find_noise(
         return plain, None, built, evidence
     # the points alone: the covariances of the last pass are half of all memory
     return found.noise, Points(best.points.states, best.points.values), built, evidence
+
+
+def _start_without(
+    builder: ProblemBuilder, built: BuiltProblem, found: JointEstimate, progress: Progress | None
+) -> tuple[BuiltProblem, JointEstimate]:
+    """The same with a start and stops that rest on no excluded fix."""
+    without = builder.build_without(built, found.noise, parts=True)
+    if without is built:
+        return built, found
+    again = replace(found, stated=without.problem)
+    # all measurements tell of the points, another start changes them little; a filter from it may diverge
+    same = np.array_equal(without.problem.t, built.problem.t)
+
+    def go_on(before: NoiseEstimate) -> NoiseEstimate:
+        near = before.get_linearisation(found.base) if same else None
+        return estimate_noise(again.base, without.aligned.until, before.noise, near, progress)
+
+    best, rival = go_on(found.estimate), found.estimate.rival
+    total = found.estimate.passes + best.passes
+    if rival is not None:
+        rival = go_on(rival)
+        total = total + rival.passes
+    return without, replace(again, estimate=replace(best, rival=rival)).count(total)
 
 
 def _start_anew(

@@ -34,7 +34,8 @@ than figures gain by chance.
 
 Before or after. The tests run forward in time, so where fixes step from one place to another those behind the step are
 suspected, though those before it may be the wrong ones. So the fixes before each span that is left out, for as long,
-are suspected instead, the same way, and the likeliest stands, of both and of the estimate with all measurements.
+are suspected instead, the same way, and the likeliest stands, of both and of the estimate with all measurements. Where
+that leaves other spans out, so are the fixes before these.
 
 Readmission. Once the spans are left out, measurements at their ends that agree with the rest are used again, if that
 increases the evidence. Of a span that outlasts the tests, the ends are found among the fixes near them as segments are:
@@ -43,7 +44,6 @@ single errors do not date a slow onset, and two right fixes in it contradict the
 
 from __future__ import annotations
 
-import contextlib
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
@@ -124,14 +124,23 @@ def estimate_without_faults(
         if decision.rival.noise.excluded:
             rival = _estimate_without(base, opening, decision.rival, found, progress)
             passes = passes + rival.passes
-    candidates, before = [found, best], _list_before(base, best.noise)
-    if before:
-        with contextlib.suppress(*BREAKDOWN):  # from a filter that follows the wrong fixes
-            other = _estimate_other(base, opening, found, best, before, progress)
-            candidates += [] if other is None else [other]
-            passes = passes + (Counter() if other is None else other.passes)
-    candidates = [weigh_evidence(base, replace(one, passes=Counter())) for one in candidates]
+    candidates = [weigh_evidence(base, replace(one, passes=Counter())) for one in (found, best)]
     passes = sum((one.passes for one in candidates), passes)
+    leading, suspected = candidates[-1], list[Span]()
+    while (before := _list_before(base, leading.noise)) and before != suspected:
+        suspected = before
+        try:
+            other = _estimate_other(base, opening, found, leading, suspected, progress)
+        except BREAKDOWN:  # from a filter that follows the wrong fixes
+            break
+        if other is None:
+            break
+        other = weigh_evidence(base, other)
+        passes = passes + other.passes
+        candidates.append(other)
+        if log_evidence(base, other) <= log_evidence(base, leading):
+            break
+        leading = other
     return replace(max(candidates, key=lambda one: log_evidence(base, one)), passes=passes, rival=rival)
 
 
