@@ -59,27 +59,14 @@ class Points:
 
 
 @dataclass(frozen=True)
-class Jacobian:
-    """Derivatives of rows by all D error states, assembled when they are asked for."""
-
-    linear: Linearized
-    columns: Columns
-    width: int
-
-    @cached_property
-    def H(self) -> Array:
-        """(n, m, D) derivative of the residual."""
-        return assemble(self.linear, self.columns, self.width)
-
-
-@dataclass(frozen=True)
 class Rows:
     """Some rows of a constraint at points: residual (n, m), its Jacobian over D error states, sigma."""
 
     constraint: Constraint
     which: slice | Array
     linear: Linearized
-    jacobian: Jacobian
+    columns: Columns  # of the parameters in H
+    H: Array  # (n, m, D) derivative of the residual
 
     @property
     def residual(self) -> Array:
@@ -95,16 +82,6 @@ class Rows:
     def sigma(self) -> Array:
         """(n, m) sigmas with the rows' weights in them: infinite where a row is not used."""
         return weigh_sigma(self.constraint, self.linear.sigma, self.which)
-
-    @property
-    def H(self) -> Array:
-        """(n, m, D) derivative of the residual."""
-        return self.jacobian.H
-
-    @property
-    def columns(self) -> Columns:
-        """Columns of the parameters in H."""
-        return self.jacobian.columns
 
     @property
     def states_sigmas(self) -> bool:
@@ -207,7 +184,7 @@ def linearise(
         for p in constraint.parameters
     }
     linear = constraint.linearize(states, given, which)
-    return Rows(constraint, which, linear, Jacobian(linear, columns, DIM + values.shape[1]))
+    return Rows(constraint, which, linear, columns, assemble(linear, columns, DIM + values.shape[1]))
 
 
 def linearise_links(motion: ImuFactors, states: States, scale: Array | None) -> tuple[Array, Array, Array, Array]:

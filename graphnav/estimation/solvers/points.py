@@ -23,7 +23,7 @@ from graphnav.core.state import DIM, MOVING, States
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.breakdown import explain_rows
 from graphnav.estimation.solvers.invariant import turn
-from graphnav.estimation.solvers.linearise import Advance, Columns, Points, linearise, shift
+from graphnav.estimation.solvers.linearise import Advance, Columns, Points, Rows, linearise, shift
 from graphnav.estimation.solvers.passes import Updates
 from graphnav.estimation.solvers.recursion import STRETCH, filter_rows
 from graphnav.estimation.solvers.stack import RowBlock, Stack
@@ -67,10 +67,8 @@ class Linearisation:
         F[:, :3] = turned @ F[:, :3]
         r, sigma, H = _allocate_rows(n, stack.M, points)
         for rows in problem.constraints:
-            count = int(rows.keyframe.searchsorted(n))
-            place = stack.places[rows.name][0][:count], stack.places[rows.name][1][:count]
-            linear = points.linearise(rows, problem.columns, count)
-            r[place], sigma[place], H[place] = linear.residual, linear.stated, linear.H
+            linear = points.linearise(rows, problem.columns, int(rows.keyframe.searchsorted(n)))
+            _put_rows(linear, stack, r, sigma, H)
         return cls(problem.columns, F, gap, turned, r, sigma, H)
 
     def lift(self, problem: Problem, points: Points, stack: Stack, anew: Collection[str]) -> Linearisation:
@@ -85,10 +83,7 @@ class Linearisation:
         r, sigma = self.r.copy(), self.sigma.copy()
         for rows in problem.constraints:
             if rows.name in anew:
-                which = slice(*rows.keyframe.searchsorted((0, n)))
-                linear = linearise(rows, points, problem.columns, which)
-                place = stack.places[rows.name]
-                r[place], sigma[place], H[place] = linear.residual, linear.stated, linear.H
+                _put_rows(linearise(rows, points, problem.columns), stack, r, sigma, H)
         return Linearisation(problem.columns, self.F, gap, self.turned, r, sigma, H)
 
     def compute_noise(self, problem: Problem, points: Points) -> Array:
@@ -164,6 +159,12 @@ class PointFilter:
 def _allocate_rows(n: int, M: int, points: Points) -> tuple[Array, Array, Array]:
     """Residuals (n, M), sigmas (n, M) and Jacobians (n, M, D) of no rows yet."""
     return np.zeros((n, M)), np.ones((n, M)), np.zeros((n, M, DIM + points.values.shape[1]))
+
+
+def _put_rows(linear: Rows, stack: Stack, r: Array, sigma: Array, H: Array) -> None:
+    """The first rows of a constraint, in their places."""
+    k, place = (x[: len(linear.residual)] for x in stack.places[linear.constraint.name])
+    r[k, place], sigma[k, place], H[k, place] = linear.residual, linear.stated, linear.H
 
 
 def predict_states(problem: Problem, at: slice, states: States, values: Array) -> tuple[States, Array]:

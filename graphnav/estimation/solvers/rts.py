@@ -72,12 +72,13 @@ def _smooth(forward: ForwardRecord, P: Array, t: Array | None = None, progress: 
     if n == end + 1:  # what later keyframes add to the prediction of keyframe `end`
         ahead, own = forward.P_predicted[end], about.take(slice(end, n))
         later = np.append(parts[0].states[:1].minus(own.states)[0], parts[0].values[0] - own.values[0])
-        solved, info = dposv(ahead, np.column_stack([later - forward.errors_predicted[end], np.eye(D)]))[1:]
+        later -= forward.errors_predicted[end]
+        _, solved, info = dposv(ahead, np.eye(D) if len(P) else later[:, None])
         if info:
             raise explain_smoother(None if t is None else float(t[end]))
-        r, inverse = solved[:, 0].copy(), solved[:, 1:]
+        r = solved @ later if len(P) else solved[:, 0]
         if len(P):
-            N = inverse @ (ahead - P[end]) @ inverse
+            N = solved @ (ahead - P[end]) @ solved
     if forward.updates is not None:
         errors = _smooth_given(forward, forward.updates, end, r, N, P, progress=progress)[0]
         if len(P):
