@@ -59,9 +59,8 @@ class MomentPass(Points):
         own = self.linear.get(constraint.name)
         if own is None or own.columns != columns or own.constraint.keyframe is not constraint.keyframe:
             return super().linearise(constraint, columns, n)
-        if len(own.residual) != n or not own.states_sigmas:
-            return super().linearise(constraint, columns, n)
-        return own.restate(constraint)
+        known = len(own.residual) == n and own.states_sigmas
+        return own.restate(constraint) if known else super().linearise(constraint, columns, n)
 
     def cover_rows(self, linear: Rows, n: int) -> Array:
         """As of `SmootherPass`."""
