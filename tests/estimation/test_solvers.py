@@ -27,9 +27,9 @@ from graphnav.estimation.pipeline import run
 from graphnav.estimation.problem import Problem, build_problem
 from graphnav.estimation.solution import Solution
 from graphnav.estimation.solvers.ekf import ekf, refilter
-from graphnav.estimation.solvers.passes import move_points
+from graphnav.estimation.solvers.passes import make_points, move_points
 from graphnav.estimation.solvers.robust import weigh_squares
-from graphnav.estimation.solvers.rows import Iterate, Layout, compute_cost_at, shorten_step, whiten
+from graphnav.estimation.solvers.rows import Layout, compute_cost_at, shorten_step, whiten
 from graphnav.estimation.solvers.rts import rts, smooth_backward
 from graphnav.imu.dynamics import SCALE
 from graphnav.recording import Gnss, Recording
@@ -258,12 +258,11 @@ def test_the_gain_of_a_step_is_by_what_the_linear_rows_fall(
     """Damped or not, of the rows themselves; from a point that is not the optimum."""
     problem, solution = solved_lap
     rng, layout = np.random.default_rng(6), Layout(problem)
-    values = {c.parameter.name: c.mean for c in problem.chains}
-    point = Iterate(solution.states.plus(1e-2 * rng.standard_normal((len(problem.t), DIM))), values)
+    point = make_points(problem, solution.states.plus(1e-2 * rng.standard_normal((len(problem.t), DIM))), {})
     rows, _ = whiten(problem, point, layout)
     _, step, gain = solve_rows(rows, layout, damping)
-    by_key = [*step[0], *(np.concatenate([step[1][n][j] for n in g.columns]) for g in layout.groups for j in
-                          range(len(g.keys)))]  # fmt: skip
+    by_key = [*step[:, :DIM], *(np.concatenate([step[np.argmax(g.node == j), problem.columns[n]] for n in g.columns])
+                                for g in layout.groups for j in range(len(g.keys)))]  # fmt: skip
     fall = 0.0
     for blocks, b in rows:
         for i, own in enumerate(b):

@@ -51,11 +51,13 @@ class Points:
         return Points(States(np.empty((n, 3, 3)), *np.empty((4, n, 3))), np.empty((n, width)))
 
     def select_nodes(self, problem: Problem) -> dict[str, Array]:
-        """(n, k) per parameter: the value of each node after the last keyframe that it governs."""
-        return {
-            c.parameter.name: self.values[find_last_keyframes(c), shift(problem.columns[c.parameter.name])]
-            for c in problem.chains
-        }
+        """(n, k) per parameter: the value of each node after the last keyframe that it governs, its mean if none."""
+        out = {}
+        for c in problem.chains:
+            last, at = find_last_keyframes(c), shift(problem.columns[c.parameter.name])
+            governs = c.node[last] == np.arange(len(c.t))
+            out[c.parameter.name] = np.where(governs[:, None], self.values[last, at], c.mean)
+        return out
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -156,11 +157,7 @@ def are_near(points: Points, about: Points, turn: float = _TURN) -> bool:
 def take_solution_points(problem: Problem, solved: Solution, before: Points) -> Points:
     """Points of a solution; unlisted parameters, such as places of stops, keep their values: rows are linear in
     them."""
-    told = {
-        c.parameter.name: solved.parameters[c.parameter.name].value[c.node]
-        for c in problem.chains
-        if c.parameter.name in solved.parameters
-    }
+    told = spread_nodes(problem, {name: p.value for name, p in solved.parameters.items()})
     return make_points(problem, solved.states, split_values(problem, before) | told)
 
 
@@ -168,6 +165,11 @@ def make_points(problem: Problem, states: States, known: dict[str, Array]) -> Po
     """Points of all keyframes: states, and values (K, k) of parameters, expected ones where they are not known."""
     values = [known.get(c.parameter.name, c.mean[c.node]) for c in problem.chains]
     return Points(states, np.concatenate([np.empty((len(states), 0)), *values], axis=1))
+
+
+def spread_nodes(problem: Problem, nodes: Mapping[str, Array]) -> dict[str, Array]:
+    """Values (K, k) at all keyframes of parameters of which those of the nodes are given."""
+    return {c.parameter.name: nodes[c.parameter.name][c.node] for c in problem.chains if c.parameter.name in nodes}
 
 
 def reuse_points(points: Points, before: Problem, after: Problem) -> Points:
