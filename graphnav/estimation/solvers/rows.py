@@ -6,7 +6,7 @@ same nodes: one for the constants, one for slow parameters, one for those that a
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -31,6 +31,7 @@ class _Group:
     node: Array  # (K,) the node in force at each keyframe
     columns: dict[str, slice]
     width: int
+    chains: tuple[ParameterChain, ...]
 
 
 class Layout:
@@ -48,7 +49,6 @@ class Layout:
         self.K, self._columns = len(problem.t), problem.columns
         K = self.K
         self.groups: list[_Group] = []
-        self.chains: list[list[ParameterChain]] = []  # of each group
         after: dict[int, list[int]] = {}
         self.width, variable, offset = [DIM] * K, [np.arange(K)], [np.zeros(K, dtype=int)]
         joined_width = np.full(K, DIM)
@@ -64,9 +64,7 @@ class Layout:
             node = chains[0].node
             n = len(chains[0].t)
             keys = np.arange(len(self.width), len(self.width) + n)
-            group = _Group(keys, node, columns, at)
-            self.groups.append(group)
-            self.chains.append(chains)
+            self.groups.append(_Group(keys, node, columns, at, tuple(chains)))
             self.width += [at] * n
             last = find_last_keyframes(chains[0])
             alone = np.diff(last, prepend=-1) == 1
@@ -155,8 +153,8 @@ def whiten(problem: Problem, points: Points, layout: Layout) -> tuple[WhitenedRo
         blocks = [(rows.keyframe, H[:, :, :DIM])]
         out += _group_rows(blocks + layout.find_parameter_blocks(rows.keyframe, weighted), -root * linear.residual)
     nodes = points.select_nodes(problem)
-    for group, chains in zip(layout.groups, layout.chains, strict=True):
-        own = linearise_chains(chains, group, nodes)
+    for group in layout.groups:
+        own = linearise_nodes(group, nodes)
         total += sum(0.5 * float(np.sum(b * b)) for _, b in own)
         out += own
     return out, total
@@ -201,23 +199,15 @@ def compute_column_norms(rows: WhitenedRows, layout: Layout) -> Array:
     return np.sqrt(total)
 
 
-def linearise_chains(chains: Sequence[ParameterChain], group: _Group, nodes: dict[str, Array]) -> WhitenedRows:
-    """Prior on the first node of a group's parameters, and their process model."""
-    out: WhitenedRows = []
-    for alike in zip(*(_linearise_chain(c, group, nodes[c.parameter.name]) for c in chains), strict=True):
-        A = [np.concatenate([blocks[i][1] for blocks, _ in alike], axis=1) for i in range(len(alike[0][0]))]
-        keys = [keys for keys, _ in alike[0][0]]
-        out.append((list(zip(keys, A, strict=True)), np.concatenate([b for _, b in alike], axis=1)))
-    return out
-
-
-def _linearise_chain(chain: ParameterChain, group: _Group, value: Array) -> WhitenedRows:
-    pick = np.eye(group.width)[group.columns[chain.parameter.name]]  # (k, width)
-    keys, off = group.keys, value - chain.mean
-    A = pick / chain.sigma[..., None]
-    out: WhitenedRows = [([(keys[:1], A[:1])], -off[:1] / chain.sigma[:1])]
+def linearise_nodes(group: _Group, nodes: Mapping[str, Array]) -> WhitenedRows:
+    """Prior on the first node of a group's parameters, and their process model, at values (nodes, k)."""
+    chains, keys = group.chains, group.keys
+    sigma = np.concatenate([c.sigma for c in chains], axis=1)
+    decay = np.concatenate([np.broadcast_to(c.decay[:, None], c.sigma.shape) for c in chains], axis=1)
+    off = np.concatenate([nodes[c.parameter.name] - c.mean for c in chains], axis=1)
+    A = np.eye(group.width) / sigma[..., None]
+    out: WhitenedRows = [([(keys[:1], A[:1])], -off[:1] / sigma[:1])]
     if len(keys) > 1:
-        decay = chain.decay[1:]
-        out.append(([(keys[:-1], -decay[:, None, None] * A[1:]), (keys[1:], A[1:])],
-                    (decay[:, None] * off[:-1] - off[1:]) / chain.sigma[1:]))  # fmt: skip
+        before, driven = -decay[1:, :, None] * A[1:], (decay[1:] * off[:-1] - off[1:]) / sigma[1:]
+        out.append(([(keys[:-1], before), (keys[1:], A[1:])], driven))
     return out
