@@ -26,14 +26,13 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
 import oracle
 from benchmark_online import LAP, RATE, build_with_noise, memory_mb
+from replay import Replay, play_isam2, play_window
 
 from graphnav.config import Settings
 from graphnav.core.progress import Progress
-from graphnav.estimation.factor_graph.isam import isam2
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import Solution
 from graphnav.estimation.solvers.ekf import ekf
-from graphnav.estimation.solvers.incremental import Replay, incremental
 
 LAG = 120.0
 BLOCK = 600.0  # s
@@ -64,11 +63,11 @@ def main() -> None:
     runs: dict[str, Run] = {}
     solvers: dict[str, Callable[[Progress], Replay | np.ndarray]] = {
         "filter, means of 256": lambda progress: filtered(problem, progress),
-        "window": lambda progress: incremental(problem, LAG, progress),
-        "iSAM2": lambda progress: isam2(problem, LAG, progress),
+        "window": lambda progress: play_window(problem, LAG, progress),
+        "iSAM2": lambda progress: play_isam2(problem, LAG, progress),
     }
     if not options.no_whole:
-        solvers["iSAM2, whole drive"] = lambda progress: isam2(problem, progress=progress)
+        solvers["iSAM2, whole drive"] = lambda progress: play_isam2(problem, progress=progress)
     for name, solve in solvers.items():
         runs[name] = alone(solve)
         print(f"{name}: {of(runs[name].seconds)}", file=sys.stderr, flush=True)

@@ -52,9 +52,9 @@ def main() -> None:
         found = prepare(recording, settings, frame, detect(recording, settings))
         problem, start, nodes = found.problem, found.smoothed.states, found.smoothed.select_nodes(found.problem)
         best = batch(problem, start, nodes)
-        whole = isam2(problem).settled
+        whole = isam2(problem)
         tell(name, "batch", (whole.states, whole.covariance), (best.states, best.covariance))
-        settled, window = isam2(problem, lag).settled, incremental(problem, lag).settled
+        settled, window = isam2(problem, lag), incremental(problem, lag)
         own = settled.states, settled.covariance
         tell(name, f"window, both {lag:.0f} s", own, (window.states, window.covariance))
         tell(name, f"batch, {lag:.0f} s", own, (best.states, best.covariance))

@@ -17,7 +17,8 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 
-from graphnav.app.workflow import Request, parse_withheld, run_request
+from graphnav.app.withholding import parse_withheld
+from graphnav.app.workflow import Request, run_request
 from graphnav.config import Settings, parse_settings
 from graphnav.evaluation.evaluate import find_truth
 from graphnav.report.plots import PALETTE

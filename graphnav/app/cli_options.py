@@ -125,14 +125,14 @@ def pick_one(context: typer.Context, recording: str) -> str:
 
 def collect_withheld(without: list[str] | None, start: float | None, end: float | None) -> tuple[Any, ...]:
     """What is withheld; the requested span must not be empty."""
-    from graphnav.app import workflow
+    from graphnav.app.withholding import parse_withheld
 
     for name, value in (("--start", start), ("--end", end)):
         if value is not None and value != value:
             raise ConfigError(f"{name} {value:g}: must be a number of seconds", key="option.value")
     if start is not None and end is not None and not start < end:
         raise ConfigError(f"--end {end:g}: must be later than --start {start:g}", key="option.value")
-    return tuple(workflow.parse_withheld(one) for one in without or ())
+    return tuple(parse_withheld(one) for one in without or ())
 
 
 def choose_detectors(settings: Settings, names: str | None) -> Settings:

@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import re
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -17,10 +16,10 @@ import numpy as np
 
 from graphnav.app.checking import begin_checks, load_solvers
 from graphnav.app.scores import Withheld, score
+from graphnav.app.withholding import shift_spans, withhold
 from graphnav.config import Settings
 from graphnav.constraints.antenna_motion import LEVER_ARM
 from graphnav.constraints.base import SAME_TIME
-from graphnav.core.complaints import suggest_nearest
 from graphnav.core.errors import ConfigError, EstimationError, RecordingError
 from graphnav.core.findings import Finding
 from graphnav.core.notes import Note, format_count, get_key
@@ -28,7 +27,7 @@ from graphnav.core.progress import Progress, send_progress, tell
 from graphnav.estimation.noise.model import INTERVALS, NoiseModel, StampOffsets
 from graphnav.estimation.solution import Solution
 from graphnav.evaluation.against import Against, read_against, select_own
-from graphnav.recording import ImuNoise, Recording, list_sources
+from graphnav.recording import ImuNoise, Recording
 from graphnav.recording.exporters import check_names
 
 if TYPE_CHECKING:
@@ -103,7 +102,7 @@ class Outcome:
     @property
     def used_withheld(self) -> tuple[Withheld, ...]:
         """The withheld spans, in s from the start of `recording`."""
-        return _shift_spans(self.request.withheld, self.zero)
+        return shift_spans(self.request.withheld, self.zero)
 
 
 def name_runs(solvers: tuple[str, ...], loose: bool) -> tuple[str, ...]:
@@ -114,41 +113,6 @@ def name_runs(solvers: tuple[str, ...], loose: bool) -> tuple[str, ...]:
 def couple_loosely(settings: Settings) -> Settings:
     """The settings with fixes in place of raw observations."""
     return settings.model_copy(update={"raw_gnss": settings.raw_gnss.model_copy(update={"coupling": "loose"})})
-
-
-def parse_withheld(text: str) -> Withheld:
-    """Parse ``gnss:600-660`` or ``odometer`` into (source, span in s or None).
-
-    Raises
-    ------
-    ConfigError
-        If it is not of that form, or no source of that name can be withheld.
-    """
-    found = re.fullmatch(r"([^:]*)(?::([^-]+)-([^-]+))?", text.strip())
-    if re.fullmatch(r"[\d.]+-[\d.]+", text.strip()):
-        first, *others = list_sources()
-        words = f"{first}:{text.strip()}, or the same of {' or '.join(others)}"
-        raise ConfigError(f"--without {text}: name the sensor: {words}", key="option.withheld")
-    usage = "write SOURCE or SOURCE:FROM-TO in seconds from the start, such as gnss:600-660"
-    if found is None:
-        raise ConfigError(f"--without {text}: not a source and a span; {usage}", key="option.withheld")
-    source, first, last = found.groups()
-    if source not in list_sources():
-        raise ConfigError(
-            f"--without {text}: no source '{source}' can be withheld; {suggest_nearest(source, list_sources())}",
-            key="option.withheld",
-        )
-    if first is None:
-        return source, None
-    try:
-        span = float(first), float(last)
-    except ValueError:
-        raise ConfigError(
-            f"--without {text}: '{first}-{last}' is not a span of two numbers; {usage}", key="option.withheld"
-        ) from None
-    if not (np.isfinite(span).all() and span[0] < span[1]):
-        raise ConfigError(f"--without {text}: the span must end after it begins; {usage}", key="option.withheld")
-    return source, span
 
 
 def parse_noise(text: str | None, settings: Settings) -> tuple[Settings, GivenNoise | None]:
@@ -201,7 +165,7 @@ def _solve_request(request: Request, progress: Progress | None) -> Outcome:
         raise ConfigError("--point antenna: the recording has no GNSS", key="option.point")
     recording = _crop(whole, request)
     zero = recording.start - whole.start if recording is not whole else 0.0
-    moved = _shift_spans(request.withheld, zero)
+    moved = shift_spans(request.withheld, zero)
     with _measure_time(timings, "checks"):
         checking = begin_checks(recording)
     load_solvers(request.solvers)  # which takes as long as the checks
@@ -209,7 +173,7 @@ def _solve_request(request: Request, progress: Progress | None) -> Outcome:
         screened, found = checking.get_result()
         refuse(screened.recording, found)
     recording = screened.recording
-    used, notes = _withhold(recording, moved, zero)
+    used, notes = withhold(recording, moved, zero)
     findings = [f.sentence for f in found]
     if is_truth_apart(recording):
         recording = replace(recording, truth=None)
@@ -362,7 +326,7 @@ def read_part(
     whole = read(source, topics, allow_outside, name)
     part = _crop(whole, Request(source, (), start=start, end=end))
     zero = part.start - whole.start if part is not whole else 0.0
-    return _withhold(part, _shift_spans(withheld, zero), zero)[0]
+    return withhold(part, shift_spans(withheld, zero), zero)[0]
 
 
 @contextmanager
@@ -382,28 +346,3 @@ def _crop(whole: Recording, request: Request) -> Recording:
             key="option.span_outside",
         )
     return whole.crop(request.start, request.end)
-
-
-def _shift_spans(withheld: tuple[Withheld, ...], by: float) -> tuple[Withheld, ...]:
-    return tuple((source, span and (span[0] - by, span[1] - by)) for source, span in withheld)
-
-
-def _withhold(recording: Recording, withheld: tuple[Withheld, ...], zero: float) -> tuple[Recording, list[str]]:
-    """The recording without what is withheld (s from its start), and notes where that changed nothing."""
-    used = recording
-    notes: list[str] = []
-    for source, span in withheld:
-        name = source if span is None else f"{source}:{span[0] + zero:g}-{span[1] + zero:g}"
-        if span is not None and (span[1] <= 0.0 or span[0] >= recording.duration):
-            raise RecordingError(
-                f"--without {name}: lies outside '{recording.name}', which runs from {zero:.0f} to "
-                f"{zero + recording.duration:.1f} s",
-                key="option.span_outside",
-            )
-        if source in recording.aiding and source not in used.aiding:
-            continue  # already removed
-        before = used
-        used = used.without(source, span)
-        if span is not None and len(used.aiding[source].t) == len(before.aiding[source].t):
-            notes.append(Note("withheld.nothing", f"--without {name}: there was no {source} row in that span anyway"))
-    return used, notes

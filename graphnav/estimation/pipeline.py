@@ -296,12 +296,12 @@ def _solve(
     if "incremental" in solvers:
         from graphnav.estimation.solvers.incremental import incremental
 
-        out["incremental"] = incremental(problem, settings.solver.lag, progress, begin).settled
+        out["incremental"] = incremental(problem, settings.solver.lag, progress, begin)
     if "isam2" in solvers:
         from graphnav.estimation.factor_graph.isam import isam2
         from graphnav.estimation.solvers.rows import compute_cost_at
 
-        out["isam2"] = one = isam2(problem, settings.solver.isam2_lag or np.inf, progress, begin).settled
+        out["isam2"] = one = isam2(problem, settings.solver.isam2_lag or np.inf, progress, begin)
         best = compute_cost_at(problem, smoothed)
         if not settings.solver.isam2_lag and one.cost is not None and one.cost > best + _CLEARLY_BETTER:
             note = Note(

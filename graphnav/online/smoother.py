@@ -29,16 +29,14 @@ from graphnav.online.checks import check_rows
 from graphnav.online.looks import CONTEXT, SURE
 from graphnav.online.noise_estimation import BackgroundEstimation, CatchUp, are_enough, start_estimation
 from graphnav.online.sanity import find_period
+from graphnav.online.schedule import AFTER, expect_keyframe, find_due, find_limit, list_keyframes
 from graphnav.online.sensors import Row, Sensors
-from graphnav.online.start import find_start, let_clocks_drift, list_keyframes, make_tracker, take_start_rows
+from graphnav.online.start import find_start, let_clocks_drift, make_tracker, take_start_rows
 from graphnav.online.tracker import Tracker
 from graphnav.online.walker import Walker
 from graphnav.recording import Recording
 from graphnav.recording.plausibility.readings import HOLE
 
-AFTER = 0.05  # s of IMU rows after a keyframe that a fix may use
-_ODOMETER = 0.3  # s that a keyframe waits for the odometer
-_SILENT = 2.0  # s of silence after which an odometer is not waited for
 _STEP_DETECTION = 0.5  # s between detections of steps in a walk
 _FINAL_STOPS = 4.0  # s before the newest keyframe up to which the stops are final
 _TRY = 2.0  # s between attempts at an alignment
@@ -179,7 +177,7 @@ class Smoother:
             self._step_catch_up(self._catch_up, tracker)
         elif self._estimation is not None and tracker.newest >= self._estimation.due:
             self._use(self._estimation, tracker)
-        elif tracker.work_ahead(self.sensors, expected := self._predict_keyframe(tracker), not self._tentative):
+        elif tracker.work_ahead(self.sensors, expected := self._expect(tracker.newest), not self._tentative):
             self._collect(tracker)
         elif tracker.stale and not self._tentative:
             self._catch_up = CatchUp(tracker.restart_settled(tracker.noise, self._setup))
@@ -188,11 +186,8 @@ class Smoother:
                 self._estimate_again(self._found, tracker)
             self._awake = expected if now < expected else self._due
 
-    def _predict_keyframe(self, tracker: Tracker) -> float:
-        """Expected time of the next keyframe, s."""
-        T, period = tracker.newest, 1.0 / self.settings.keyframes.rate
-        fix = min((t for t in self._fixes if t > T + SAME_TIME), default=np.inf)
-        return fix if fix - T <= period * (1.0 + 1e-6) else T + period
+    def _expect(self, T: float) -> float:
+        return expect_keyframe(T, self._fixes, 1.0 / self.settings.keyframes.rate)
 
     def live(self) -> Live | None:
         """The state at the newest IMU row; None while aligning."""
@@ -361,12 +356,7 @@ class Smoother:
         if isinstance(tracker, Walker):
             self._advance_walk(tracker, now, last)
             return
-        period, now = 1.0 / self.settings.keyframes.rate, sensors.imu.newest
-        limit = now if last else now - AFTER
-        odometer = sensors.odometer.newest
-        if not last and now - odometer < _SILENT:
-            limit = min(limit, max(odometer, now - _ODOMETER))
-        T = tracker.newest
+        period, limit, T = 1.0 / self.settings.keyframes.rate, find_limit(sensors, last), tracker.newest
         started = bool(len(tracker.window)) or tracker.opened
         times = ([] if started else [T]) + list_keyframes(T, limit, self._fixes, period, last)
         late = [t for t in self._fixes if t <= T + SAME_TIME]
@@ -384,8 +374,7 @@ class Smoother:
                 words = f"for {OLDEST:.0f} s fixes contradicted all else, until {tracker.newest:.3f} s"
                 self._restart(tracker.newest, words)
                 return
-        T = tracker.newest
-        self._due = min([T + period, *(t for t in self._fixes if t > T)]) + AFTER
+        self._due = find_due(tracker.newest, self._fixes, period)
 
     def _advance_walk(self, walker: Walker, now: float, last: bool) -> None:
         self._period = find_period(self.sensors.imu.t)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from graphnav.config import Settings
-from graphnav.constraints.base import SAME_TIME
 from graphnav.core.earth import LocalFrame
 from graphnav.core.errors import EstimationError
 from graphnav.core.rotation import Array
@@ -85,22 +84,3 @@ def make_tracker(
     if found is not stated:
         tracker.window.head = message.move(found.state.minus(stated.state)[0])
     return tracker, tuple(stated.notes)
-
-
-def list_keyframes(T: float, limit: float, fixes: list[float], period: float, last: bool) -> list[float]:
-    """Times of the keyframes after T up to `limit`, s: at fixes, and every `period` between.
-
-    The last of a drive is at `limit`.
-    """
-    needs_keyframes = [t for t in fixes if T + SAME_TIME < t <= limit]
-    if last and limit > T + SAME_TIME and (not needs_keyframes or limit > needs_keyframes[-1] + SAME_TIME):
-        needs_keyframes.append(limit)
-    times, at = [], T
-    for anchor in [*needs_keyframes, np.inf]:
-        while anchor - at > period * (1.0 + 1e-6) and at + period <= limit:
-            at += period
-            times.append(at)
-        if np.isfinite(anchor):
-            at = anchor
-            times.append(at)
-    return times

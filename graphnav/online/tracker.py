@@ -23,7 +23,6 @@ from graphnav.constraints.base import SAME_TIME, TypicalSigmas
 from graphnav.constraints.gnss import find_fix_period, find_node_spacing
 from graphnav.constraints.vehicle import DELAY_SIGMAS
 from graphnav.core.earth import LocalFrame
-from graphnav.core.findings import compute_period
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, States
 from graphnav.detectors.base import merge_spans
@@ -36,8 +35,9 @@ from graphnav.estimation.solvers.stages import Place
 from graphnav.estimation.solvers.window import Message, SettledStates
 from graphnav.imu.dynamics import ImuFactors
 from graphnav.imu.preintegration import preintegrate
-from graphnav.imu.samples import GAP, bridge_gaps
+from graphnav.imu.samples import bridge_gaps
 from graphnav.online.ahead import Live, live, predict_since
+from graphnav.online.around import ROWS_AFTER, ROWS_BEFORE, compute_error_units, cut_around
 from graphnav.online.chain import BuiltKeyframes, Chain, find_turn
 from graphnav.online.looks import CONTEXT, SURE, Readings, clip_spans
 from graphnav.online.sensors import Sensors
@@ -45,8 +45,6 @@ from graphnav.online.steps import StepCutter
 from graphnav.recording import Recording
 from graphnav.recording.odometer import MeanSpeed
 
-ROWS_AFTER = 0.1  # s of rows that keyframes use after the last of them
-_ROWS_BEFORE = 2.0  # s of rows before a keyframe that its constraints use where the IMU has no gap; else `CONTEXT`
 _REBUILT_BEFORE = 6  # keyframes built again with a new one in a stop, so that the stop is recognised
 _PORTIONS = 8  # of the lag: keyframes settle in groups of this duration
 _SMOOTHED = 8  # covariances smoothed in the time of one relinearisation
@@ -208,7 +206,7 @@ class Tracker(Chain):
     def _integrate(self, sensors: Sensors, expected: float) -> None:
         """Integrate the interval up to the expected keyframe."""
         T, start = self.newest, self.window.newest.state
-        imu = self._cut_around(sensors, T, sensors.imu.newest).imu
+        imu = cut_around(sensors, T, sensors.imu.newest).imu
         ends = np.array([T, expected])
         interval = preintegrate(bridge_gaps(imu), imu, ends, start.ba[0], start.bg[0], self._estimates_imu)
         self._motions[expected] = ImuFactors(interval, self.frame).prepare()
@@ -241,8 +239,8 @@ class Tracker(Chain):
         """The prepared keyframe with its fix, if one was prepared."""
         if ahead is None or len(times) > 1 or len(ahead.problem.t) != len(before) + 1:
             return None
-        recording = sensors.make_recording(float(ahead.problem.t[0]) - _ROWS_BEFORE, float(times[-1]) + ROWS_AFTER)
-        problem = ahead.problem.complete(recording, self._scale_errors(sensors, recording))
+        recording = sensors.make_recording(float(ahead.problem.t[0]) - ROWS_BEFORE, float(times[-1]) + ROWS_AFTER)
+        problem = ahead.problem.complete(recording, compute_error_units(sensors, recording))
         known = {c.name for c in ahead.problem.constraints}
         late = replace(problem, constraints=tuple(c for c in problem.constraints if c.name not in known))
         added = {c.name: c for c in self._apply_noise(late, sensors, self._noise_of_rows).constraints}
@@ -337,25 +335,19 @@ class Tracker(Chain):
             before.insert(0, self.head)
         return before
 
-    def _scale_errors(self, sensors: Sensors, recording: Recording) -> Array | None:
-        """The unit of time-correlated errors of a recording's fixes, m."""
-        if recording.gnss is None:
-            return None
-        return sensors.gnss.compute_typical_sigmas(recording.gnss.t)[:, :3]
-
     def _build(self, sensors: Sensors, times: Array, complete: bool = True) -> Problem:
         begin, stops = float(times[0]), self.stops
         if len(stops):  # a stop is built as a whole, so that its place begins where it began
             stops = stops if self.foot else stops[stops[:, 1] > begin]
             here = stops[(stops[:, 0] < begin) & (stops[:, 1] > begin)]
             begin = min([begin, *here[:, 0].tolist()])
-        recording = self._cut_around(
+        recording = cut_around(
             sensors, begin, max(float(times[-1]) + ROWS_AFTER, sensors.find_imu_until(float(times[-1])))
         )
         start, speed = self.window.newest.state, None
         if recording.odometer is not None:
             speed = MeanSpeed.of(recording.odometer, self._readings.wrong, self._readings.figures)
-        usual = self._scale_errors(sensors, recording)
+        usual = compute_error_units(sensors, recording)
         found = ((t, self._motions.get(t)) for t in times[1:].tolist())
         known = {t: one for t, one in found if one is not None and not one.intervals.is_out_of_range(start.bg)[0]}
         problem = build_problem(
@@ -380,16 +372,6 @@ class Tracker(Chain):
         rows = tuple(c.convert_units(usual) for c in problem.constraints)
         noise = noise or self.noise
         return apply_noise(free(replace(problem, constraints=rows), noise.freed), noise)
-
-    def _cut_around(self, sensors: Sensors, begin: float, end: float) -> Recording:
-        """The rows that keyframes between two times use.
-
-        Only the noise of bridged IMU gaps depends on the signal of the last half minute.
-        """
-        near = sensors.make_recording(begin - _ROWS_BEFORE, end)
-        t = near.imu.t
-        whole = len(t) > 2 and float((t[1:] - t[:-1]).max()) < GAP * compute_period(t)
-        return near if whole else sensors.make_recording(begin - CONTEXT, end)
 
     def _renew(self, sensors: Sensors, first: int, end: int) -> list[Place] | None:
         """As `_build_again`; None if the work for this row is done, and it is to be called again at the next."""

@@ -18,11 +18,12 @@ from graphnav.estimation.noise.model import NoiseModel
 from graphnav.estimation.solvers.stages import Place
 from graphnav.estimation.solvers.window import Message
 from graphnav.online.ahead import Live, live, predict_since
+from graphnav.online.around import ROWS_AFTER
 from graphnav.online.chain import BuiltKeyframes
 from graphnav.online.looks import CONTEXT, SURE
 from graphnav.online.sanity import CERTAIN_SPAN
 from graphnav.online.sensors import Sensors
-from graphnav.online.tracker import ROWS_AFTER, Tracker
+from graphnav.online.tracker import Tracker
 from graphnav.recording import Recording
 
 _ENTERING = 4  # keyframes that enter per row: half of the 4 ms between rows of an IMU at 250 Hz

@@ -20,6 +20,7 @@ from graphnav.report import pictures as pictures
 from graphnav.report import sentences as words
 from graphnav.report import summary as summary
 from graphnav.report import tables as tables
+from graphnav.report.beside import has_place
 from graphnav.report.doubts import list_doubts
 from graphnav.report.plots import PALETTE, Shades, Tinted
 from graphnav.report.provenance import tabulate_provenance
@@ -72,7 +73,7 @@ def write_report(
     spans = _list_shades(solution, start, withheld, outages)
     if detectors is None:
         detectors = draw_detectors(recording, solution)
-    if not pictures.has_place(solution):  # nor the keyframes after it
+    if not has_place(solution):  # nor the keyframes after it
         solution = replace(solution, separation=None)
     own, others = ({k: p for k, p in solution.parameters.items() if has_names(k) == of_it} for of_it in (True, False))
     sections: Sections = [

@@ -9,16 +9,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 from markupsafe import Markup
 
-from graphnav.core.earth import LocalFrame
-from graphnav.core.interpolation import fit_yaw, make_yaw_matrix
 from graphnav.core.rotation import Array
 from graphnav.core.trajectory import Trajectory
 from graphnav.detectors.base import Detection
 from graphnav.estimation.names import name_components
 from graphnav.estimation.solution import ParameterEstimate, Solution
 from graphnav.evaluation.against import select_own
-from graphnav.recording import FIX_TYPES, Recording
+from graphnav.recording import Recording
 from graphnav.report import page, plots
+from graphnav.report.beside import has_place, locate_truth, select_fixes
 from graphnav.report.plots import Curve, Shades, Tinted
 from graphnav.report.plots.paths import draw_fixes
 
@@ -36,7 +35,7 @@ def draw_trajectory(recording: Recording, solutions: Mapping[str, Solution], spa
     """The track from above, with the fixes that were and were not used."""
     start = recording.start
     first = next(iter(solutions.values()))
-    truth = _find_truth(recording, solutions)
+    truth = locate_truth(recording, solutions)
     figure = plots.plot_trajectory(
         {name: (s.t - start, s.states.p[:, :2]) for name, s in solutions.items()},
         fixes=select_fixes(recording, first),
@@ -61,7 +60,7 @@ def draw_profile(recording: Recording, solutions: Mapping[str, Solution]) -> Mar
         return np.interp(t, first.t, distance), h
 
     lines, points = {}, {}
-    truth, fixes = _find_truth(recording, solutions), select_fixes(recording, first)
+    truth, fixes = locate_truth(recording, solutions), select_fixes(recording, first)
     base = float(first.frame.origin[2]) if has_place(first) else 0.0
     if truth is not None and truth[1].shape[1] > 2:
         lines["truth"] = interpolate_over_distance(truth[0], base + truth[1][:, 2])
@@ -75,74 +74,6 @@ def draw_profile(recording: Recording, solutions: Mapping[str, Solution]) -> Mar
     if not has_place(first):
         note = "Heights count from the start."
     return page.place_picture(plots.plot_profile(lines, points), "Height profile", note, kind="large")
-
-
-def select_fixes(recording: Recording, solution: Solution) -> plots.DrawnFixes | None:
-    """The fixes in metres, the kind of each, and those that the solver did not use though they were not withheld."""
-    if recording.gnss is None or not has_place(solution):
-        return None
-    gnss, t = recording.gnss, recording.gnss.t
-    out = np.zeros(len(t), dtype=bool)
-    record = solution.records.get("gnss_position")
-    if record is not None and len(record.t):
-        gone = record.t[record.weight <= 1e-9]
-        out |= np.isin(np.round(t, 3), np.round(gone, 3))
-    for part in solution.excluded:
-        if part.kind in ("gnss", "gnss_position"):
-            out |= (t >= part.t_start) & (t <= part.t_end)
-    kinds = {"GNSS fix": np.ones(len(t), dtype=bool)}
-    if gnss.type is not None:
-        kinds = {FIX_TYPES[k]: gnss.type == k for k in (1, 2, 6, 4, 3, 5, 0) if np.any(gnss.type == k)}
-    elif gnss.sd is not None:
-        sd = np.hypot(gnss.sd[:, 0], gnss.sd[:, 1])
-        classes = {
-            "sigma below 0.1 m": sd < 0.1,
-            "sigma 0.1 to 1 m": (sd >= 0.1) & (sd < 1.0),
-            "sigma 1 m and more": ~(sd < 1.0),
-        }
-        present = {name: rows for name, rows in classes.items() if rows.any()}
-        kinds = present if len(present) > 1 else kinds
-    return plots.DrawnFixes(t - recording.start, solution.frame.from_llh(gnss.llh), out, kinds)
-
-
-def _find_truth(recording: Recording, solutions: Mapping[str, Solution]) -> tuple[Array, Array] | None:
-    """Times (M,) and positions (M, 2 or 3) of the truth, in metres of the first solution's frame, while it lasts.
-
-    A row without a position, NaN, is where the truth has a gap.
-    """
-    truth, first = recording.truth, next(iter(solutions.values()))
-    if truth is None or (truth.llh is None and truth.xyz is None):
-        return None
-    if truth.llh is not None and has_place(first):
-        during = (truth.t >= first.t[0]) & (truth.t <= first.t[-1])
-        found: tuple[Array, Array] | None = truth.t[during], first.frame.from_llh(truth.llh[during])
-    else:
-        own = truth.xyz if truth.llh is None else LocalFrame(truth.llh[0]).from_llh(truth.llh)
-        assert own is not None
-        found = _lay_on(truth.t, own, list(select_own(solutions).values())[-1])
-    if found is None or not len(found[0]):
-        return None
-    t, *p = plots.insert_breaks(found[0], np.arange(len(found[0])), *found[1].T)
-    return t, np.stack(p, axis=-1)
-
-
-def has_place(solution: Solution) -> bool:
-    """Whether a solution has a place on the Earth; otherwise position and heading count from the start."""
-    return any(kind.startswith("gnss") for kind in solution.records)
-
-
-def _lay_on(t: Array, xyz: Array, solution: Solution) -> tuple[Array, Array] | None:
-    """A truth (M, 2 or 3) in another frame, fitted to a solution by yaw and offset: times (N,) and positions (N, 2 or
-    3).
-    """
-    shared = (t >= solution.t[0]) & (t <= solution.t[-1]) & np.isfinite(xyz).all(axis=1)
-    if shared.sum() < 2:
-        return None
-    p = np.column_stack([np.interp(t[shared], solution.t, x) for x in solution.states.p.T])
-    own = np.zeros_like(p)
-    own[:, : xyz.shape[1]] = xyz[shared]
-    yaw, offset = fit_yaw(own, p)
-    return t[shared], np.asarray((own @ make_yaw_matrix(yaw).T + offset)[:, : xyz.shape[1]])
 
 
 def collect_error_series(errors: Errors, start: float) -> dict[str, Curve]:

@@ -15,8 +15,9 @@ from graphnav.evaluation.against import find_antenna_lever_arm
 from graphnav.evaluation.segments import compute_relative_errors, compute_rms
 from graphnav.recording import Recording
 from graphnav.report import page, wording
+from graphnav.report.beside import select_fixes
 from graphnav.report.consistency import summarise_record
-from graphnav.report.pictures import ENU, select_fixes
+from graphnav.report.pictures import ENU
 from graphnav.report.satellites import tabulate_epochs
 from graphnav.report.tables import Removed
 from graphnav.report.wording import Quantity, join_words

@@ -23,6 +23,7 @@ from helpers import refuse_command, run_here
 
 from graphnav import load
 from graphnav.app import cli, stored, workflow
+from graphnav.app.withholding import parse_withheld
 from graphnav.estimation.noise.files import write_noise
 from graphnav.estimation.noise.model import NoiseModel
 from graphnav.report.plots.detections import select_drawn_rows
@@ -569,8 +570,8 @@ def test_no_command_shows_help(capsys):
 
 # ------------------------------------------------------------------------------------------------------------- details
 def test_spans_of_the_command_line():
-    assert workflow.parse_withheld("gnss:600-660.5") == ("gnss", (600.0, 660.5))
-    assert workflow.parse_withheld("odometer") == ("odometer", None)
+    assert parse_withheld("gnss:600-660.5") == ("gnss", (600.0, 660.5))
+    assert parse_withheld("odometer") == ("odometer", None)
 
 
 @pytest.mark.parametrize(

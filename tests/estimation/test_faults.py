@@ -44,7 +44,7 @@ from graphnav.estimation.solution import Solution
 from graphnav.estimation.solvers.ekf import Comparison, ekf, refilter
 from graphnav.estimation.solvers.passes import Updates, make_points, split_values
 from graphnav.estimation.solvers.recursion import move_columns
-from graphnav.estimation.solvers.rows import Iterate, Layout, whiten
+from graphnav.estimation.solvers.rows import Layout, whiten
 from graphnav.estimation.solvers.rts import smooth_backward
 from graphnav.estimation.solvers.stack import Stack
 from graphnav.evaluation.scoring import compute_errors
@@ -454,7 +454,7 @@ def test_kernel_is_of_whole_measurements(built: Problem) -> None:
     """A fix with 2 sigma on each of three axes is beyond a scale of 3, one with 2 sigma on one is not."""
     rows = next(c for c in built.constraints if c.name == "gnss_position")
     layout = Layout(built)
-    point = Iterate(smooth_backward(built, ekf(built)).states, {c.parameter.name: c.mean for c in built.chains})
+    point = make_points(built, smooth_backward(built, ekf(built)).states, {})
     linear = rows.linearize(point.states[rows.keyframe], {}, slice(None))
     p = rows.p_n + np.einsum("nji,nj->ni", rows.R_ln, linear.residual)  # nothing left
     for axes, weighed in ((3, True), (1, False)):

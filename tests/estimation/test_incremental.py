@@ -9,6 +9,7 @@ import numpy as np
 import oracle
 import pytest
 from helpers import Array, at_rate, dense, errors, factors, random_states, truth_states
+from replay import play_window
 
 from graphnav.config import parse_settings
 from graphnav.constraints.vehicle import OdometerSpeed
@@ -82,7 +83,7 @@ def solved(built: Problem) -> Solution:
 
 # ------------------------------------------------------------------------------------------------------- exactness
 def test_with_all_the_future_it_is_the_batch_solution(built: Problem, solved: Solution) -> None:
-    found = incremental(built, lag=EVERYTHING).settled
+    found = incremental(built, lag=EVERYTHING)
     assert np.abs(apart(found, solved)).max() < 2e-3
     np.testing.assert_allclose(sigmas(found), sigmas(solved), rtol=1e-3)
     for name, p in solved.parameters.items():
@@ -96,7 +97,7 @@ def test_a_window_is_the_dense_least_squares_solution(drive: tuple[Recording, Tr
     part = built.recording.crop(40.0, 50.0)
     start = truth_states(drive[1], np.round(np.array([part.start]), 6), built.frame)
     problem = apply_noise(build_problem(part, built.settings, built.frame, start, built.prior.sigma[0]), LASTING)
-    found = incremental(problem, lag=EVERYTHING).settled
+    found = incremental(problem, lag=EVERYTHING)
     parts, widths = factors(problem, found.states, {n: p.value for n, p in found.parameters.items()})
     step, covariance = dense(parts, widths)
     K = len(problem.t)
@@ -106,7 +107,7 @@ def test_a_window_is_the_dense_least_squares_solution(drive: tuple[Recording, Tr
 
 
 def test_the_live_estimate_is_the_end_of_a_batch_solution_so_far(built: Problem) -> None:
-    live = incremental(built, lag=EVERYTHING).live
+    live = play_window(built, lag=EVERYTHING).live
     speed = next(rows.speed for rows in built.constraints if isinstance(rows, OdometerSpeed))
     for end in (60.0, 130.0, 200.0):  # the second in the outage
         # what the odometer is worth is told from its readings: the same ones

@@ -43,8 +43,8 @@ from graphnav.estimation.pipeline import SOLVERS, choose_origin, run
 from graphnav.estimation.problem import Problem, build_problem
 from graphnav.estimation.solution import Solution
 from graphnav.estimation.solvers.ekf import ekf, refilter
-from graphnav.estimation.solvers.linearise import linearise
-from graphnav.estimation.solvers.passes import ForwardRecord, SmootherPass
+from graphnav.estimation.solvers.linearise import Points, linearise
+from graphnav.estimation.solvers.passes import SmootherPass
 from graphnav.estimation.solvers.rts import rts, smooth_backward, smooth_moments
 from graphnav.evaluation.scoring import compute_errors
 from graphnav.imu.preintegration import NOISE_FIGURES, preintegrate
@@ -79,10 +79,11 @@ def groups(problem: Problem) -> list[str]:
     return list(dict.fromkeys(names))
 
 
-def moments(problem: Problem, forward: ForwardRecord, smoothed: SmootherPass) -> dict[str, tuple[float, float]]:
+def moments(problem: Problem, about: Points) -> dict[str, tuple[float, float]]:
     """A and B of every component."""
     out: dict[str, tuple[float, float]] = {}
-    imu = collect_imu_moments(problem, forward.predicted_from.R_nb, smoothed)
+    smoothed = smooth_moments(problem, refilter(problem, about, whole=False))
+    imu = collect_imu_moments(problem, about.states.R_nb[:-1], smoothed)
     out |= {f"imu.{name}": (imu.A[:, i].sum(), imu.B[:, i].sum()) for i, name in enumerate(NOISE_FIGURES)}
     for chain in problem.chains:
         _, A, B = collect_process_moments(problem, chain, smoothed, len(problem.t))
@@ -139,8 +140,7 @@ def test_moments_are_the_derivative_of_the_likelihood() -> None:
     """A - B of every component, against the innovations' likelihood by central differences in ln f."""
     base, opening = built(lap())
     used, noise, about = mixed(base, opening)
-    forward = refilter(used, about)
-    found = moments(used, forward, smooth_backward(used, forward))
+    found = moments(used, about)
     assert set(found) == set(groups(base))
     h = 0.01
     for group, (A, B) in found.items():
@@ -192,8 +192,7 @@ def test_lag_moments_are_the_derivative_of_the_likelihood_by_the_correlation_tim
     """Fisher's identity: the derivative of what expectation and maximisation goes by is that of the likelihood."""
     base, opening = built(lap())
     used, noise, about = mixed(base, opening)
-    forward = refilter(used, about)
-    smoothed = smooth_backward(used, forward)
+    smoothed = smooth_moments(used, refilter(used, about, whole=False))
     h, K = 0.01, len(used.t)
     lasting = [c for c in used.chains if c.parameter.correlation_time is not None]
     assert len(lasting) >= 8
@@ -502,8 +501,9 @@ def test_disturbances_of_intervals_are_as_large_as_chance_has_them() -> None:
         oracle.vehicle_path(duration=300, rate=50.0, seed=4), seed=2, gnss_velocity_sd=(0.05, 0.05, 0.08)
     )
     base, opening = built(recording, INERTIAL)
-    forward = refilter(base, smooth_backward(base, ekf(base, opening=opening)))
-    found = collect_imu_moments(base, forward.predicted_from.R_nb, smooth_backward(base, forward))
+    about = smooth_backward(base, ekf(base, opening=opening))
+    smoothed = smooth_moments(base, refilter(base, about, whole=False))
+    found = collect_imu_moments(base, about.states.R_nb[:-1], smoothed)
     for i in range(2):
         likelihood = chdtrc(found.freedom[:, i], found.A[:, i] / found.B[:, i] * found.freedom[:, i])
         told = found.B[:, i] > 0.01

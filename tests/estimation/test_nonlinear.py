@@ -24,7 +24,8 @@ from graphnav.detectors.scene import Detector
 from graphnav.estimation.factor_graph.nonlinear import get_state, make_graph
 from graphnav.estimation.pipeline import add_own, run
 from graphnav.estimation.problem import build_problem
-from graphnav.estimation.solvers.rows import Iterate, Layout, whiten
+from graphnav.estimation.solvers.passes import make_points
+from graphnav.estimation.solvers.rows import Layout, whiten
 from graphnav.recording import Recording
 from graphnav.sensors import list_sensors
 
@@ -66,7 +67,7 @@ def test_kernels_are_those_of_gtsam(drive, kernel):
     states = random_states(np.random.default_rng(5), len(problem.t), span=2.0)
     values = {c.parameter.name: c.mean for c in problem.chains}
     graph, at = make_graph(problem, states, values)
-    _, expected = whiten(problem, Iterate(states, values), Layout(problem))
+    _, expected = whiten(problem, make_points(problem, states, {}), Layout(problem))
     assert graph.error(at) == pytest.approx(expected, rel=1e-9)
 
 

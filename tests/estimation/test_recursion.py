@@ -68,14 +68,18 @@ class Drive:
             blocks.arrays, self.used, filtered, (out["root"], out["solved"], out["bent"]), updates,
             np.zeros(1, dtype=int),
         )  # fmt: skip
-        for P_smoothed in (out["P_smoothed"], np.empty((0, D, D))):
+        out |= {"taken": taken, "lossy": lossy, "errors_alone": np.zeros((n, D))}
+        none = np.empty((0, D, D))
+        for P_smoothed, N, errors in (
+            (out["P_smoothed"], np.zeros((D, D)), out["smoothed"]),
+            (none, np.zeros((D, D)), out["smoothed"]),
+            (none, np.zeros((0, 0)), out["errors_alone"]),
+        ):
             disturbance.smooth_rows(
-                0, n, np.zeros(D), np.zeros((D, D)), steps, updates, blocks.arrays, filtered,
-                (out["smoothed"], out["r"], out["N"], out["N_diagonal"]), (P_smoothed, out["variance"], out["of_rows"]),
+                0, n, np.zeros(D), N, steps, updates, blocks.arrays, filtered,
+                (errors, out["r"], out["N"], out["N_diagonal"]), (P_smoothed, out["variance"], out["of_rows"]),
                 2.0 * self.H, np.tile(np.arange(D), n), D * np.arange(n + 1),
             )  # fmt: skip
-        out |= {"taken": taken, "lossy": lossy, "errors_alone": np.zeros((n, D))}
-        disturbance.smooth_errors(n, np.zeros(D), steps, updates, blocks.arrays, filtered, out["errors_alone"])
         # small, so that turns add up
         moved = 1e-6 * (out["errors"] - out["ahead"])
         half = np.concatenate([np.ones((n, 1)), 0.5 * moved[:, :3]], axis=1)

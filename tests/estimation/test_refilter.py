@@ -137,7 +137,7 @@ def test_filtered_again_about_its_own_end_it_is_the_batch_solution(built: Proble
 def test_points_that_lead_nowhere_are_given_up(built: Problem) -> None:
     """From anywhere at all the drive is found, if need be as a filter would."""
     plain = smooth_backward(built, ekf(built))
-    _, found = smooth_near(built, scattered_points(built, 2))
+    found = smooth_near(built, scattered_points(built, 2))
     sigma = np.sqrt(np.diagonal(plain.P[:, :DIM, :DIM], axis1=1, axis2=2))
     assert np.max(np.abs(found.states.minus(plain.states)) / sigma) < 0.5
 

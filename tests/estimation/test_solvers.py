@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -11,6 +10,7 @@ import numpy as np
 import oracle
 import pytest
 from helpers import Array, Factor, at_rate, dense, errors, factors, truth_states
+from replay import Play, play_isam2, play_window
 
 from graphnav.config import Settings, parse_settings
 from graphnav.constraints.antenna_motion import LEVER_ARM
@@ -21,24 +21,21 @@ from graphnav.core.rotation import exp
 from graphnav.core.state import DIM
 from graphnav.core.trajectory import Trajectory
 from graphnav.estimation.factor_graph.batch import batch, solve_rows
-from graphnav.estimation.factor_graph.isam import isam2
 from graphnav.estimation.noise.apply import apply_noise
 from graphnav.estimation.noise.model import STATED, NoiseModel, VarianceComponent
 from graphnav.estimation.pipeline import run
 from graphnav.estimation.problem import Problem, build_problem
 from graphnav.estimation.solution import Solution
 from graphnav.estimation.solvers.ekf import ekf, refilter
-from graphnav.estimation.solvers.incremental import Replay, incremental
-from graphnav.estimation.solvers.passes import move_points
+from graphnav.estimation.solvers.passes import make_points, move_points
 from graphnav.estimation.solvers.robust import weigh_squares
-from graphnav.estimation.solvers.rows import Iterate, Layout, compute_cost_at, shorten_step, whiten
+from graphnav.estimation.solvers.rows import Layout, compute_cost_at, shorten_step, whiten
 from graphnav.estimation.solvers.rts import rts, smooth_backward
 from graphnav.imu.dynamics import SCALE
 from graphnav.recording import Gnss, Recording
 from graphnav.recording.formats import read
 from graphnav.simulation import simulate
 
-Replayed = Callable[[Problem], Replay]
 KERNELS = ("none", "huber", "cauchy", "geman-mcclure", "tukey", "welsch")
 NO_WHEELS = {"nhc": False, "odometer": False}
 WHITE = {
@@ -166,8 +163,8 @@ def test_both_are_the_dense_least_squares_solution(trio: Trio) -> None:
             np.testing.assert_allclose(p.sigma, sigma, rtol=1e-3, err_msg=solution.solver)
 
 
-@pytest.mark.parametrize("solve", [isam2, lambda problem: incremental(problem, lag=1e9)], ids=["isam2", "window"])
-def test_what_takes_keyframe_by_keyframe_is_batch_and_filter_on_a_linear_problem(trio: Trio, solve: Replayed) -> None:
+@pytest.mark.parametrize("solve", [play_isam2, play_window], ids=["isam2", "window"])
+def test_what_takes_keyframe_by_keyframe_is_batch_and_filter_on_a_linear_problem(trio: Trio, solve: Play) -> None:
     """What has settled is the elimination of everything; what was live, of everything so far: the filter's update."""
     found, filtered = solve(trio.problem), ekf(trio.problem).solution
     for mine, its in ((found.settled, trio.batch), (found.live, filtered)):
@@ -261,12 +258,11 @@ def test_the_gain_of_a_step_is_by_what_the_linear_rows_fall(
     """Damped or not, of the rows themselves; from a point that is not the optimum."""
     problem, solution = solved_lap
     rng, layout = np.random.default_rng(6), Layout(problem)
-    values = {c.parameter.name: c.mean for c in problem.chains}
-    point = Iterate(solution.states.plus(1e-2 * rng.standard_normal((len(problem.t), DIM))), values)
+    point = make_points(problem, solution.states.plus(1e-2 * rng.standard_normal((len(problem.t), DIM))), {})
     rows, _ = whiten(problem, point, layout)
     _, step, gain = solve_rows(rows, layout, damping)
-    by_key = [*step[0], *(np.concatenate([step[1][n][j] for n in g.columns]) for g in layout.groups for j in
-                          range(len(g.keys)))]  # fmt: skip
+    by_key = [*step[:, :DIM], *(np.concatenate([step[np.argmax(g.node == j), problem.columns[n]] for n in g.columns])
+                                for g in layout.groups for j in range(len(g.keys)))]  # fmt: skip
     fall = 0.0
     for blocks, b in rows:
         for i, own in enumerate(b):

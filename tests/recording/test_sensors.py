@@ -14,7 +14,7 @@ from helpers import refuse_command, refused
 
 from graphnav.app import cli
 from graphnav.app.convert import convert_log
-from graphnav.app.workflow import parse_withheld
+from graphnav.app.withholding import parse_withheld
 from graphnav.config import Settings, format_settings, parse_settings, read_settings
 from graphnav.core.errors import ConfigError, RecordingError
 from graphnav.online import Sensors, drop_rows, list_rows

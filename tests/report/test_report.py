@@ -44,6 +44,7 @@ from graphnav.recording.allan import compute_allan
 from graphnav.report import allan as allan_page
 from graphnav.report import page, wording
 from graphnav.report import pictures as report_pictures
+from graphnav.report.beside import locate_truth, select_fixes
 from graphnav.report.consistency import summarise_record
 from graphnav.report.documents import write_comparison, write_report
 from graphnav.report.doubts import find_departures, list_doubts
@@ -271,7 +272,7 @@ def test_what_was_excluded_is_listed_and_marked(tmp_path, recording):
     for words in ("200.0 to 219.5 s", "jumped by 31 m <sideways>", "20 measurements", "excluded fix"):
         assert words in text, words
     # seconds 200 to 219, and the one that the record says was rejected
-    fixes = report_pictures.select_fixes(recording, found)
+    fixes = select_fixes(recording, found)
     np.testing.assert_allclose(fixes.t[fixes.excluded], [51.0, *np.arange(200.0, 220.0)])
     assert "excluded fix" in checked(write(tmp_path, recording))[1]
     kept = replace(solution(), records={})
@@ -318,7 +319,7 @@ def test_fixes_are_counted_and_coloured_by_type(tmp_path, recording):
     assert len(set(colours.values())) == 3
     stated = np.where(np.arange(COUNT) < 9, 5.0, 0.01)[:, None] * np.ones(3)
     unknown = replace(recording, gnss=replace(recording.gnss, sd=stated))
-    assert {name: rows.sum() for name, rows in report_pictures.select_fixes(unknown, found).kinds.items()} == {
+    assert {name: rows.sum() for name, rows in select_fixes(unknown, found).kinds.items()} == {
         "sigma below 0.1 m": COUNT - 9, "sigma 1 m and more": 9,
     }  # fmt: skip
 
@@ -715,7 +716,7 @@ def test_a_truth_on_the_earth_is_laid_onto_a_walk_that_counts_from_its_start(rec
     states = replace(turned.states, p=p)
     walk = replace(turned, states=states, records={"stance": record()})
     walked = replace(recording, gnss=None, truth=replace(recording.truth, llh=far.to_llh(way(turned.t - START))))
-    t, laid = report_pictures._find_truth(walked, {"ekf": walk})
+    t, laid = locate_truth(walked, {"ekf": walk})
     assert t == pytest.approx(turned.t)
     assert laid == pytest.approx(p, abs=0.05)  # the Earth is round
 
@@ -726,7 +727,7 @@ def test_a_truth_is_drawn_while_the_run_lasts_and_not_across_its_gaps(recording)
     t = np.arange(one.t[0] - 50.0, one.t[-1] + 50.0, 0.1)
     t = t[(t < one.t[0] + 3.0) | (t > one.t[0] + 23.0)]
     truth = replace(recording.truth, t=t, llh=one.frame.to_llh(way(t - START)))
-    seen, p = report_pictures._find_truth(replace(recording, truth=truth), {"rts": one})
+    seen, p = locate_truth(replace(recording, truth=truth), {"rts": one})
     assert (seen[0], seen[-1]) == pytest.approx((one.t[0], one.t[-1]), abs=0.1)
     (gap,) = np.flatnonzero(np.isnan(p).any(axis=1))
     assert (seen[gap - 1] - one.t[0], seen[gap + 1] - one.t[0]) == pytest.approx((3.0, 23.0), abs=0.11)

@@ -19,7 +19,8 @@ import graphnav
 from graphnav.app import outputs
 from graphnav.app.fleet.manifest import Task
 from graphnav.app.summary import compute_median_sigmas, summarise_solver
-from graphnav.app.workflow import Outcome, Request, parse_noise, parse_withheld, read_part, run_request
+from graphnav.app.withholding import parse_withheld
+from graphnav.app.workflow import Outcome, Request, parse_noise, read_part, run_request
 from graphnav.config.files import parse_settings
 from graphnav.core.errors import GraphnavError
 from graphnav.core.files import check_regular, hash_file, parse_json, read_text

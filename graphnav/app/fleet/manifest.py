@@ -14,7 +14,8 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
-from graphnav.app.workflow import parse_noise, parse_withheld
+from graphnav.app.withholding import parse_withheld
+from graphnav.app.workflow import parse_noise
 from graphnav.config import read_settings
 from graphnav.config.files import parse_settings
 from graphnav.core.complaints import read_toml, suggest_nearest

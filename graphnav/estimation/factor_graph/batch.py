@@ -13,24 +13,29 @@ step, in units of half squared sigmas: the optimum is then within sqrt(2 toleran
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from graphnav.core.notes import Note, format_count
 from graphnav.core.progress import Progress
+from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, States
 from graphnav.estimation.factor_graph.gaussian import Eliminated, LinearGraph
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import Solution
-from graphnav.estimation.solvers.passes import integrate_again, make_solution, record_residuals
+from graphnav.estimation.solvers.linearise import Points, scale_at
+from graphnav.estimation.solvers.passes import (
+    integrate_again,
+    make_points,
+    make_solution,
+    record_residuals,
+    spread_nodes,
+)
 from graphnav.estimation.solvers.robust import REDESCENDING
 from graphnav.estimation.solvers.rows import (
-    Correction,
-    Iterate,
     Layout,
-    Values,
     WhitenedRows,
     compute_column_norms,
     whiten,
@@ -47,29 +52,28 @@ Callback = Callable[[States, float, float, bool], None]
 def batch(
     problem: Problem,
     start: States,
-    values: Values | None = None,
+    values: Mapping[str, Array] | None = None,
     progress: Progress | None = None,
     wanted: tuple[int, ...] | None = None,
     reintegrate: bool = True,
     watch: Callback | None = None,
 ) -> Solution:
-    """Solve a problem from any starting states (K rows) and parameter values.
+    """Solve a problem from any starting states (K rows) and values (nodes, k) of parameters, their means if not given.
 
     `wanted` are the keyframes whose covariance is wanted, all when None; others are NaN. `reintegrate`
     allows intervals to be integrated again when the gyro bias moves far. `watch` sees each undamped step
     before it is made, and what it raises ends the iterations.
     """
     began = time.perf_counter()
-    values = {c.parameter.name: c.mean for c in problem.chains} | (values or {})
-    point, notes = Iterate(start, values), []
+    points, notes = make_points(problem, start, spread_nodes(problem, values or {})), []
     if any(c.robust in REDESCENDING and c.robust != "gnc" for c in problem.constraints):
         # a redescending kernel ignores rows far from the start; Cauchy's keeps some of their influence and leads there
         rows = (replace(c, robust="cauchy") if c.robust in REDESCENDING else c for c in problem.constraints)
-        point = _minimise(replace(problem, constraints=tuple(rows)), point, progress, reintegrate).point
-    for gentle in _graduate(problem, point):
-        point = _minimise(gentle, point, progress, reintegrate, 1).point
-    found = _minimise(problem, point, progress, reintegrate, watch=watch)
-    problem, point, layout = found.problem, found.point, found.layout
+        points = _minimise(replace(problem, constraints=tuple(rows)), points, progress, reintegrate).points
+    for gentle in _graduate(problem, points):
+        points = _minimise(gentle, points, progress, reintegrate, 1).points
+    found = _minimise(problem, points, progress, reintegrate, watch=watch)
+    problem, points, layout = found.problem, found.points, found.layout
     solved = time.perf_counter()
     if progress is not None:
         progress("covariances", 0.0)
@@ -79,13 +83,8 @@ def batch(
     marginal = dict(zip(keys, layout.split(of_variables, keys), strict=True))
     unknown = np.full((DIM, DIM), np.nan)
     covariance = np.stack([marginal.get(k, unknown) for k in range(layout.K)])
-    sigmas: Values = {}
-    for group in layout.groups:
-        P = np.stack([marginal[k] for k in group.keys.tolist()])
-        sigmas |= {name: np.sqrt(np.diagonal(P, axis1=1, axis2=2))[:, at] for name, at in group.columns.items()}
-    sigma = Iterate(point.states, sigmas).make_points(problem).values
-    done = time.perf_counter()
-    points, records = point.make_points(problem), {}
+    sigma = layout.unpack([np.sqrt(np.diagonal(marginal.get(key, unknown))) for key in layout.keys])[:, DIM:]
+    done, records = time.perf_counter(), {}
     for constraint in problem.constraints:
         record = records[constraint.name] = record_residuals(problem, constraint, points, robust=True)
         if constraint.robust != "none" and np.mean(record.weight < 0.1) > 0.5:
@@ -105,7 +104,7 @@ def batch(
 @dataclass(frozen=True)
 class _Minimum:
     problem: Problem  # with intervals integrated about the final biases
-    point: Iterate
+    points: Points
     layout: Layout
     eliminated: Eliminated | None  # undamped, at the point; None where the iterations were limited
     cost: float
@@ -114,10 +113,9 @@ class _Minimum:
     notes: tuple[str, ...]
 
 
-def _graduate(problem: Problem, point: Iterate) -> Iterator[Problem]:
+def _graduate(problem: Problem, points: Points) -> Iterator[Problem]:
     """The problem with its "gnc" kernels convex at first and then ever less so, for a step each."""
     mu: dict[str, float] = {}
-    points = point.make_points(problem)
     for c in problem.constraints:
         if c.robust == "gnc":
             s2 = record_residuals(problem, c, points).nis * (1.0 if c.weight is None else c.weight)
@@ -131,7 +129,7 @@ def _graduate(problem: Problem, point: Iterate) -> Iterator[Problem]:
 
 def _minimise(
     problem: Problem,
-    point: Iterate,
+    points: Points,
     progress: Progress | None,
     reintegrate: bool,
     iterations: int | None = None,
@@ -142,9 +140,9 @@ def _minimise(
         settings = settings.model_copy(update={"max_iterations": iterations})
     renewed = refused = 0
     if reintegrate:
-        problem, renewed = integrate_again(problem, point.states, point.scale)
+        problem, renewed = integrate_again(problem, points.states, scale_at(problem.columns, points.values[0]))
     layout = Layout(problem)
-    rows, now = whiten(problem, point, layout)
+    rows, now = whiten(problem, points, layout)
     damping, gentlest, slow = 0.0, _MIN_DAMPING, False
     stopped = f"stopped at the limit of {settings.max_iterations} iterations"
     eliminated: Eliminated | None = None
@@ -156,15 +154,15 @@ def _minimise(
         while True:
             eliminated, step, gain = solve_rows(rows, layout, damping)
             if watch is not None and damping == 0.0:
-                watch(point.states, now, gain, slow)
-            candidate = point.move(step)
+                watch(points.states, now, gain, slow)
+            candidate = _move(points, step)
             rows_ahead, ahead = whiten(problem, candidate, layout)
             if ahead < now or gain < settings.tolerance:
                 break
             if damping == 0.0:
                 # a correction of an early heading moves all later positions along tangents, off the track by the square
                 # of the angle; the next step corrects that, so both are assessed together
-                beyond = candidate.move(solve_rows(rows_ahead, layout)[1])
+                beyond = _move(candidate, solve_rows(rows_ahead, layout)[1])
                 rows_beyond, behind = whiten(problem, beyond, layout)
                 if behind < now:
                     candidate, rows_ahead, ahead = beyond, rows_beyond, behind
@@ -178,22 +176,22 @@ def _minimise(
             break
         if gain < settings.tolerance and damping == 0.0:
             if ahead < now:
-                point, now = candidate, ahead  # the last small step is free
+                points, now = candidate, ahead  # the last small step is free
             stopped = f"converged: one more step would lower the cost by {gain:.1e}"
             break
         slow = damping > 0.0 and ahead > 0.5 * now
         if ahead < now:
-            point, rows, now = candidate, rows_ahead, ahead
+            points, rows, now = candidate, rows_ahead, ahead
         eliminated = None
         # a damped step promises little by construction: convergence is judged by an undamped one
         if damping == gentlest:
             gentlest /= 10.0  # a larger step would have been possible: less damping in a long valley
         damping = 0.0 if damping <= _MIN_DAMPING or gain < settings.tolerance else damping / 10.0
         if reintegrate:
-            problem, again = integrate_again(problem, point.states, point.scale)
+            problem, again = integrate_again(problem, points.states, scale_at(problem.columns, points.values[0]))
             if again:
                 layout = Layout(problem)
-                rows, now = whiten(problem, point, layout)
+                rows, now = whiten(problem, points, layout)
                 renewed += again
     if eliminated is None and iterations is None:
         eliminated = solve_rows(rows, layout)[0]
@@ -207,11 +205,16 @@ def _minimise(
                 f"{format_count(renewed, 'interval')} re-integrated because the gyro bias estimate had changed",
             )
         )
-    return _Minimum(problem, point, layout, eliminated, now, iteration, stopped, tuple(notes))
+    return _Minimum(problem, points, layout, eliminated, now, iteration, stopped, tuple(notes))
 
 
-def solve_rows(rows: WhitenedRows, layout: Layout, damping: float = 0.0) -> tuple[Eliminated, Correction, float]:
-    """Eliminate the rows; the step to their optimum, and the decrease of their cost by it."""
+def _move(points: Points, step: Array) -> Points:
+    """Points moved by a step (K, D)."""
+    return Points(points.states.plus(step[:, :DIM]), points.values + step[:, DIM:])
+
+
+def solve_rows(rows: WhitenedRows, layout: Layout, damping: float = 0.0) -> tuple[Eliminated, Array, float]:
+    """Eliminate the rows; the step (K, D) to their optimum, and the decrease of their cost by it."""
     graph, size = LinearGraph(), np.sqrt(damping) * compute_column_norms(rows, layout) if damping else None
     if size is not None:
         rows = list(rows)

@@ -1,4 +1,4 @@
-"""A recorded drive solved by GTSAM's iSAM2, keyframe by keyframe: its own live and settled estimates.
+"""A recorded drive solved by GTSAM's iSAM2, keyframe by keyframe: its own settled estimates.
 
 The rows are those of every solver; the tree is that of `graphnav.estimation.factor_graph.tree`. With a lag, keyframes
 older than it are settled and marginalised; without one, the whole drive is relinearised until nothing moves any more.
@@ -11,18 +11,17 @@ from dataclasses import replace
 import numpy as np
 
 from graphnav.core.progress import Progress
-from graphnav.core.rotation import Array
 from graphnav.core.state import States
 from graphnav.estimation.factor_graph.tree import Tree
 from graphnav.estimation.factor_graph.tree_marginals import (
     Elimination,
     begin_elimination,
-    compute_newest_covariance,
     eliminate,
     settle,
 )
 from graphnav.estimation.problem import Problem
-from graphnav.estimation.solvers.incremental import FINE, Replay, are_due, begin_at, solve_in_turn
+from graphnav.estimation.solution import Solution
+from graphnav.estimation.solvers.incremental import FINE, are_due, begin_at, solve_in_turn
 from graphnav.estimation.solvers.stages import Message, Place
 from graphnav.estimation.solvers.window import SettledStates, compute_turn_limit
 
@@ -51,7 +50,7 @@ class TreeSmoother:
         self._leaving: Elimination | None = None  # elimination for the keyframes to settle
         self._portion = 0  # variables eliminated for that per keyframe
 
-    def add(self, place: Place) -> tuple[Message, Array]:
+    def add(self, place: Place) -> None:
         """As of `LagSmoother`."""
         tree = self.tree
         turn = tree.add(replace(place, problem=self._problem))
@@ -69,7 +68,6 @@ class TreeSmoother:
             count = int(np.searchsorted(self._problem.t[: place.k], place.t - self.lag)) - oldest.k
             self._leaving = begin_elimination(tree, count)
             self._portion = 1 + _SHARE_OF_TIME * len(self._leaving.behind) // count
-        return tree.newest, compute_newest_covariance(tree)
 
     def _drop_leaving(self, leaving: Elimination) -> None:
         """Let its keyframes go."""
@@ -94,7 +92,7 @@ def isam2(
     lag: float = np.inf,
     progress: Progress | None = None,
     start: States | None = None,
-) -> Replay:
+) -> Solution:
     """Solve a problem keyframe by keyframe with iSAM2.
 
     Parameters

@@ -27,7 +27,7 @@ from graphnav.core.state import BLOCKS, DIM, States
 from graphnav.estimation.factor_graph.gaussian import make_jacobian_factor
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.linearise import Points, linearise, linearise_links, shift
-from graphnav.estimation.solvers.rows import Layout, linearise_chains
+from graphnav.estimation.solvers.rows import Layout, linearise_nodes
 from graphnav.imu.dynamics import SCALE
 
 _ESTIMATORS: dict[str, Any] = {
@@ -91,11 +91,11 @@ def _make_factors(problem: Problem, layout: Layout) -> Iterator[Any]:
         for i, k in enumerate(rows.keyframe.tolist()):
             if rows.weight is None or rows.weight[i] > 0.0:
                 yield _make_custom(_make_noise(rows, i), layout, (k,), names, _evaluate_row(rows, i, problem))
-    for group, own in zip(layout.groups, layout.chains, strict=True):
-        means = gtsam.Values()
+    for group in layout.groups:
+        own, means = group.chains, gtsam.Values()
         for key, mean in zip(group.keys.tolist(), np.concatenate([c.mean for c in own], axis=1), strict=True):
             means.insert(_Q(key - layout.K), mean)
-        for blocks, b in linearise_chains(own, group, {c.parameter.name: c.mean for c in own}):
+        for blocks, b in linearise_nodes(group, {c.parameter.name: c.mean for c in own}):
             for n in range(len(b)):
                 touched = [(_Q(int(keys[n]) - layout.K), A[n]) for keys, A in blocks]
                 yield gtsam.LinearContainerFactor(make_jacobian_factor(touched, b[n]), means)

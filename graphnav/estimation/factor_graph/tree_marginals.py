@@ -27,17 +27,6 @@ from graphnav.estimation.solvers.window import SettledStates
 _AT_ONCE = 45  # variables: GTSAM's bookkeeping of one elimination grows faster than what it eliminates
 
 
-def compute_newest_covariance(tree: Tree) -> Array:
-    """(15, 15) of the newest state."""
-    last = tree.keyframes[-1]
-    x = last.state
-    try:
-        found = tree.isam.marginalCovariance(x.key)
-    except RuntimeError:
-        raise explain_undetermined(last.place.t) from None
-    return move_covariance((x.unit[:, None] * found * x.unit)[None], x.delta[None])[0]
-
-
 def _map_errors(keyframe: Keyframe, J: Array) -> dict[int, Array]:
     """(D, w) by key: errors about a keyframe's estimate by those about anchors, of which J (3, 3) turns attitudes."""
     variables = (keyframe.state, *(node for node, _ in keyframe.nodes.values()))

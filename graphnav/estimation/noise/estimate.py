@@ -48,7 +48,7 @@ from graphnav.estimation.noise.priors import TIME_WITHIN
 from graphnav.estimation.problem import ParameterChain, Problem
 from graphnav.estimation.solvers.ekf import refilter
 from graphnav.estimation.solvers.linearise import Points
-from graphnav.estimation.solvers.passes import LINEAR_ATTITUDE, DisturbancePass, ForwardRecord, are_near, reuse_points
+from graphnav.estimation.solvers.passes import LINEAR_ATTITUDE, ForwardRecord, MomentPass, are_near, reuse_points
 from graphnav.estimation.solvers.rows import shorten_step
 from graphnav.estimation.solvers.rts import smooth_moments
 from graphnav.imu.preintegration import NOISE_FIGURES
@@ -68,7 +68,7 @@ class NoiseEstimate:
     """A noise model, the smoothed points of its last pass, and how it was found."""
 
     noise: NoiseModel
-    points: DisturbancePass
+    points: MomentPass
     log_posterior: float
     log_prior: float
     log_evidence: float  # of the measurements: the same less the cost of rows and intervals of reduced weight
@@ -155,7 +155,7 @@ def _iterate(
     if not figures.same_data:
         long = total > 2 * _FIRST_KEYFRAMES and not figures.known
         stages.insert(0, (_FIRST_KEYFRAMES if long else total, _BOUNDED))
-    latest: tuple[ForwardRecord, DisturbancePass] | None = None
+    latest: tuple[ForwardRecord, MomentPass] | None = None
     robust: NoiseModel | None = None
     for end, bound in stages:
         before, converged, figures.extrapolation = -np.inf, False, 1.0
@@ -204,7 +204,7 @@ def _iterate(
     )
 
 
-def _smooth_about(problem: Problem, about: Points) -> tuple[ForwardRecord, DisturbancePass]:
+def _smooth_about(problem: Problem, about: Points) -> tuple[ForwardRecord, MomentPass]:
     forward = refilter(problem, about, whole=False)
     return forward, smooth_moments(problem, forward)
 
@@ -232,13 +232,13 @@ def _improve(
     figures: Components,
     problem: Problem,
     forward: ForwardRecord,
-    smoothed: DisturbancePass,
+    smoothed: MomentPass,
     end: int,
     intervals: bool,
     bound: float,
 ) -> None:
     """One step for all figures and weights; `bound` is the chance of a square of an aiding sensor beyond its bound."""
-    imu = collect_imu_moments(problem, forward.predicted_from.R_nb, smoothed)
+    imu = collect_imu_moments(problem, forward.about.states.R_nb[:-1], smoothed)
     for i, name in enumerate(NOISE_FIGURES):
         figures.update(f"imu.{name}", *_bound_squares(imu.A[:, i], imu.B[:, i], 3, CHANCE))
     if intervals:

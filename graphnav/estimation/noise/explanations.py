@@ -22,7 +22,7 @@ from graphnav.estimation.noise.spans import Span, mask_times
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.ekf import Comparison, refilter
 from graphnav.estimation.solvers.linearise import Points
-from graphnav.estimation.solvers.passes import DisturbancePass, make_points, split_values
+from graphnav.estimation.solvers.passes import MomentPass, make_points, split_values
 from graphnav.estimation.solvers.rts import smooth_moments
 from graphnav.estimation.solvers.stack import Stack
 from graphnav.recording import Recording
@@ -104,7 +104,7 @@ class ErrorSizes:
     cost: Mapping[str, Array]  # (M,) of the log-likelihood
 
 
-def measure_sizes(base: Problem, problem: Problem, smoothed: DisturbancePass, spans: list[Span]) -> ErrorSizes:
+def measure_sizes(base: Problem, problem: Problem, smoothed: MomentPass, spans: list[Span]) -> ErrorSizes:
     """Sizes of errors in spans by maximum likelihood, from those of a smoother that does not use the fix.
 
     With a prior of the logarithm of the size that is uniform between the sigma of the fixes and `SIZES`, the likelihood

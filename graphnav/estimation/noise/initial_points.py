@@ -72,7 +72,7 @@ def find_initial_points(problem: Problem, opening: float | None) -> tuple[list[I
             found = weigh_rows(problem, refilter(problem, about, watch=True, drifts=False).weights)
             if _list_unused(found) == _list_unused(sound):
                 break
-            sound, (_, smoothed) = found, smooth_near(found, about, opening)
+            sound, smoothed = found, smooth_near(found, about, opening)
             about, passes = smoothed, passes + 2
         if smoothed is None:
             return [Initial(plain)], passes

@@ -31,7 +31,7 @@ from graphnav.core.rotation import Array
 from graphnav.core.state import DIM
 from graphnav.estimation.problem import ParameterChain, Problem
 from graphnav.estimation.solvers.linearise import Rows, find_stepping, shift
-from graphnav.estimation.solvers.passes import DisturbancePass, split_values
+from graphnav.estimation.solvers.passes import MomentPass, SmootherPass, split_values
 
 _FORGOTTEN = 1e-6  # relative remainder of a difference below which it is rounding error
 
@@ -70,7 +70,7 @@ class ImuMoments:
         return np.maximum(freedom, 1.0)
 
 
-def collect_imu_moments(problem: Problem, start: Array, smoothed: DisturbancePass) -> ImuMoments:
+def collect_imu_moments(problem: Problem, start: Array, smoothed: MomentPass) -> ImuMoments:
     """Moments of the intervals, by the attitudes R_nb (n, 3, 3) at their starts.
 
     A = |s|^2 with s of covariance M, trace(M) = B, is near to a chi-square variable of B^2 / trace(M^2) degrees of
@@ -98,7 +98,7 @@ def sum_parts(Q: Array, r: Array, N: Array) -> tuple[Array, Array]:
 
 
 def collect_process_moments(
-    problem: Problem, chain: ParameterChain, smoothed: DisturbancePass, end: int
+    problem: Problem, chain: ParameterChain, smoothed: MomentPass, end: int
 ) -> tuple[Array, Array, Array]:
     """Keyframes (n,) at which a process is driven, and A and B (n, k) there; the first is its steady variance."""
     at = problem.columns[chain.parameter.name]
@@ -108,7 +108,7 @@ def collect_process_moments(
     return k, q * smoothed.r[k, at] ** 2, q * np.maximum(N, 0.0)
 
 
-def predict_errors(problem: Problem, rows: Constraint, smoothed: DisturbancePass) -> tuple[Array, Array]:
+def predict_errors(problem: Problem, rows: Constraint, smoothed: MomentPass) -> tuple[Array, Array]:
     """Errors (N, m) of the rows of a constraint, each number predicted by a smoother without it, and sigmas (N, m)."""
     linear = smoothed.linearise(rows, problem.columns, len(rows))
     return linear.residual / _compute_redundancies(linear, smoothed.cover_rows(linear, len(rows)))[1], linear.stated
@@ -121,7 +121,7 @@ def _compute_redundancies(linear: Rows, HPH: Array) -> tuple[Array, Array]:
     return w, np.clip(1.0 - w * np.diagonal(HPH, axis1=1, axis2=2) / linear.stated**2, 1e-6, 1.0)
 
 
-def collect_row_moments(problem: Problem, rows: Constraint, smoothed: DisturbancePass, n: int) -> RowMoments:
+def collect_row_moments(problem: Problem, rows: Constraint, smoothed: MomentPass | SmootherPass, n: int) -> RowMoments:
     """Of the first n rows of a constraint."""
     at, values = rows.keyframe[:n], split_values(problem, smoothed)
     linear = smoothed.linearise(rows, problem.columns, n)
@@ -146,7 +146,7 @@ def collect_row_moments(problem: Problem, rows: Constraint, smoothed: Disturbanc
     return RowMoments(A, share * np.where(w > 0.0, B, 0.0), left_out, whole)
 
 
-def lag_moments(problem: Problem, chain: ParameterChain, smoothed: DisturbancePass, end: int) -> tuple[Array, ...]:
+def lag_moments(problem: Problem, chain: ParameterChain, smoothed: MomentPass, end: int) -> tuple[Array, ...]:
     """Of a process, from node to node: times between (n,), E[c' c'], E[c' c] and E[c c] (n, k), c' the later.
 
     As c' = a c + w, E[c' c] is half of (E[c' c'] + a^2 E[c c] - E[w w]) / a. Where the correlation is negligible

@@ -87,37 +87,16 @@ def take_back(N: Array, H: Array, Kt: Array, inverse: Array, lossy: bool) -> Arr
 
 
 @compile_once
-def smooth_errors(
-    k1: int, r: Array, steps: Arrays, updates: Arrays, blocks: Arrays, filtered: Arrays, smoothed: Array
-) -> None:
-    """Errors (n, D) of the smoother at keyframes before k1, as `smooth_rows` has them, by r (D,) there alone."""
-    F, decay = steps
-    Kt, H, w, _, taken, _ = updates
-    first, begin, end, _, _, _ = blocks
-    errors_predicted, P_predicted, errors, P = filtered
-    for k in range(k1 - 1, -1, -1):
-        ahead = k < len(F)
-        if ahead:
-            r = step_vector_back(F[k], decay[k], r)
-            np.add(errors[k], np.dot(P[k], r), smoothed[k])
-        for b in range(first[k + 1] - 1, first[k] - 1, -1):
-            if taken[b]:
-                lo, hi = begin[b], end[b]
-                r = r + np.dot(w[k, lo:hi] - np.dot(Kt[k, lo:hi], r), H[k, lo:hi])
-        if not ahead:
-            np.add(errors_predicted[k], np.dot(P_predicted[k % len(P_predicted)], r), smoothed[k])
-
-
-@compile_once
 def smooth_rows(
     k0: int, k1: int, r_k: Array, N_k: Array, steps: Arrays, updates: Arrays, blocks: Arrays, filtered: Arrays,
     found: Arrays, covered: Arrays, asked: Array, wanted: Array, first_wanted: Array,
 ) -> tuple[Array, Array]:  # fmt: skip
-    """r (n, D), and of N the states' part (n, 15, 15) and the diagonal (n, D), of keyframes k1 - 1 down to k0.
+    """Errors (n, D) of the smoother, r (n, D), and of N the states' part (n, 15, 15) and the diagonal (n, D), of
+    keyframes k1 - 1 down to k0.
 
-    From those of k1, zero where there is none; returns those of k0. With covariances of the smoother, its errors (n, D)
-    too: from the filtered ones, because predicted errors of a position that only the first fix determines are larger by
-    ten orders than their smoothed values.
+    From r_k (D,) and N_k (D, D) of k1, zero where there is none; returns those of k0. Without N_k (0, 0) there is
+    nothing of N, nor covariances. Errors are from the filtered ones, because predicted errors of a position that only
+    the first fix determines are larger by ten orders than their smoothed values.
 
     Parameters
     ----------
@@ -133,31 +112,33 @@ def smooth_rows(
     first, begin, end, _, _, _ = blocks
     errors_predicted, P_predicted, errors, P = filtered
     smoothed, r, N, N_diagonal = found
-    whole = len(covered[0]) > 0
+    informed = len(N_k) > 0
     for k in range(k1 - 1, k0 - 1, -1):
         rows = end[first[k + 1] - 1] if first[k] < first[k + 1] else 0
         ahead = k < len(F)  # at the last keyframe the filtered covariance already is of errors about the estimate
         if ahead:
             r_k = step_vector_back(F[k], decay[k], r_k)
-            N_k = step_back(F[k], decay[k], N_k)
-            if whole:
-                np.add(errors[k], np.dot(P[k], r_k), smoothed[k])
-            fill_covariances(k, P[k], N_k, rows, wanted, first_wanted, asked, covered)
+            np.add(errors[k], np.dot(P[k], r_k), smoothed[k])
+            if informed:
+                N_k = step_back(F[k], decay[k], N_k)
+                fill_covariances(k, P[k], N_k, rows, wanted, first_wanted, asked, covered)
         for b in range(first[k + 1] - 1, first[k] - 1, -1):
             if taken[b]:
                 lo, hi = begin[b], end[b]
                 own, gain = H[k, lo:hi], Kt[k, lo:hi]
                 r_k = r_k + np.dot(w[k, lo:hi] - np.dot(gain, r_k), own)
-                N_k = take_back(N_k, own, gain, np.ascontiguousarray(inverse[k, lo:hi, lo:hi]), lossy[b])
+                if informed:
+                    N_k = take_back(N_k, own, gain, np.ascontiguousarray(inverse[k, lo:hi, lo:hi]), lossy[b])
         np.positive(r_k, r[k])
-        np.positive(N_k[:DIM, :DIM], N[k])
-        for i in range(len(r_k)):
-            N_diagonal[k, i] = N_k[i, i]
+        if informed:
+            np.positive(N_k[:DIM, :DIM], N[k])
+            for i in range(len(r_k)):
+                N_diagonal[k, i] = N_k[i, i]
         if not ahead:
             ahead_P = P_predicted[k % len(P_predicted)]
-            if whole:
-                np.add(errors_predicted[k], np.dot(ahead_P, r_k), smoothed[k])
-            fill_covariances(k, ahead_P, N_k, rows, wanted, first_wanted, asked, covered)
+            np.add(errors_predicted[k], np.dot(ahead_P, r_k), smoothed[k])
+            if informed:
+                fill_covariances(k, ahead_P, N_k, rows, wanted, first_wanted, asked, covered)
     return r_k, N_k
 
 
@@ -201,16 +182,3 @@ def cover_rows(P: Array, N: Array, H: Array, out: Array) -> None:
     for i in range(m):
         for j in range(m):
             out[i, j] = found[i, j]
-
-
-@compile_once
-def compute_row_covariances(H: Array, P: Array, k: Array) -> Array:
-    """(n, m, m) H P_k H^T of rows H (n, m, D) at keyframes k (n,)."""
-    n, m, _ = H.shape
-    out = np.empty((n, m, m))
-    for i in range(n):
-        HP = np.dot(H[i], P[k[i]])
-        for j in range(m):
-            for c in range(j + 1):
-                out[i, j, c] = out[i, c, j] = np.dot(HP[j], H[i, c])
-    return out

@@ -83,7 +83,7 @@ def ekf(
     K, about = len(problem.t), None
     if opening is not None and (n := int(np.searchsorted(problem.t, opening, side="right"))) > 1:
         about = (
-            _smooth_first(problem, smooth_backward(problem, _run_forward(problem, n)))[1]
+            _smooth_first(problem, smooth_backward(problem, _run_forward(problem, n)))[0]
             if known is None
             else known.take_first(n)
         )
@@ -151,31 +151,23 @@ class Comparison:
         return stack
 
 
-def smooth_near(
-    problem: Problem, about: Points, opening: float | None = None, progress: Progress | None = None
-) -> tuple[ForwardRecord, SmootherPass]:
+def smooth_near(problem: Problem, about: Points, opening: float | None = None) -> SmootherPass:
     """Smooth a drive again near a known solution, after a change of figures or weights only.
 
     Where attitudes do not stay, it is smoothed from the start as a filter would be, with `opening` as for `ekf`.
     """
-    forward, smoothed, stays = _smooth_first(problem, about, progress)
-    if stays:
-        return forward, smoothed
-    forward = ekf(problem, progress, opening)
-    return forward, smooth_backward(problem, forward, progress)
+    smoothed, stay = _smooth_first(problem, about)
+    return smoothed if stay else smooth_backward(problem, ekf(problem, opening=opening))
 
 
-def _smooth_first(
-    problem: Problem, about: Points, progress: Progress | None = None
-) -> tuple[ForwardRecord, SmootherPass, bool]:
-    """Smooth the first keyframes about points, repeatedly until attitudes converge, if they do."""
+def _smooth_first(problem: Problem, about: Points) -> tuple[SmootherPass, bool]:
+    """Smooth the first keyframes about points, repeatedly until attitudes converge, and whether they do."""
     for _ in range(_PASSES):
-        forward = refilter(problem, about, progress)
-        smoothed = smooth_backward(problem, forward, progress)
+        smoothed = smooth_backward(problem, refilter(problem, about))
         if are_near(smoothed, about):
-            return forward, smoothed, True
+            return smoothed, True
         about = smoothed
-    return forward, smoothed, False
+    return smoothed, False
 
 
 def _run_forward(
@@ -190,8 +182,10 @@ def _run_forward(
     stays: float = STAYS,
 ) -> ForwardRecord:
     """Filter the first K keyframes, of which the first n are linearised at given points."""
-    n, scale, steps = 0 if about is None else len(about.values), problem.columns.get(SCALE), advance(problem, K)
+    scale, steps = problem.columns.get(SCALE), advance(problem, K)
     D = DIM + steps.decay.shape[1]
+    about = Points.allocate(0, D - DIM) if about is None else about
+    n = len(about.values)
     all_P, all_Pp = np.empty((K, D, D)), np.empty((K if whole else 2, D, D))
     all_F = np.empty((K - 1, DIM, DIM if scale is None else scale.stop))
     fixes = [c for c in problem.constraints if watch and c.fix_of]
@@ -200,11 +194,12 @@ def _run_forward(
     ahead, found = Points.allocate(K, D - DIM), Points.allocate(K, D - DIM)
     errors = FilterErrors(np.empty((n, D)), all_Pp, np.empty((n, D)), all_P)
     x, P = _start_from_prior(problem)
-    updates, search = None, None
-    if about is not None:
+    updates = None
+    if n:
         one = Linearisation.of(problem, about, stack, steps)
         all_F[: n - 1] = one.F
         given = PointFilter(problem, about, stack, steps, one, errors)
+        search = None
         if watched:
             bank = Bank(watched, problem.t, D, drifts)
             search = FaultSearch(watched, given, steps, stack, bank, problem.t)
@@ -231,10 +226,8 @@ def _run_forward(
         if progress is not None:
             progress("filter", k / K)
     log_likelihood = stack.finish() if whole or watch else stack.log_likelihood()
-    filtered, predicted = found, ahead
-    if about is not None:
-        filtered = join_passes([move_points(about, errors.filtered), found.take(slice(n, None))])
-        predicted = join_passes([move_points(about, errors.predicted), ahead.take(slice(n, None))])
+    filtered = join_passes([move_points(about, errors.filtered), found.take(slice(n, None))])
+    predicted = join_passes([move_points(about, errors.predicted), ahead.take(slice(n, None))])
     return ForwardRecord(
         filtered.states,
         filtered.values,
@@ -245,7 +238,6 @@ def _run_forward(
         steps.decay,
         stack.records,
         {c.name: stack.records[c.name].decided for c in fixes},
-        search is not None and bool(search.verdicts.anew),
         about,
         errors.filtered,
         errors.predicted,

@@ -1,26 +1,24 @@
 """Incremental fixed-lag smoother: the batch problem, solved keyframe by keyframe.
 
-`Incremental` takes the keyframes of a problem one by one. After each there is a live estimate from past measurements,
-and keyframes older than the lag settle, each with at least the lag's future measurements. The algorithm is that of
+`Incremental` takes the keyframes of a problem one by one. After each, keyframes older than the lag
+settle, each with at least the lag's future measurements. The algorithm is that of
 `graphnav.estimation.solvers.window`; `graphnav.online` feeds it from sensors instead of a recording.
 """
 
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
 
 from graphnav.core.notes import Note, format_count
 from graphnav.core.progress import Progress
-from graphnav.core.rotation import Array
-from graphnav.core.state import DIM, States
-from graphnav.estimation.dense import make_dense
+from graphnav.core.state import States
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import Solution
-from graphnav.estimation.solvers.linearise import Points, list_node_steps, scale_at, shift
+from graphnav.estimation.solvers.linearise import Points, list_node_steps, shift
 from graphnav.estimation.solvers.passes import make_solution, record_residuals
 from graphnav.estimation.solvers.rows import compute_cost_at
 from graphnav.estimation.solvers.stages import Message, Place
@@ -35,8 +33,8 @@ class LagSmoother(Protocol):
 
     settled: list[SettledStates]  # in order; readers may clear them
 
-    def add(self, place: Place) -> tuple[Message, Array]:
-        """Add a keyframe; returns its live estimate and the covariance (15, 15) of its state."""
+    def add(self, place: Place) -> None:
+        """Add a keyframe, and settle those that are older than the lag by then."""
 
     def finish(self, problem: Problem) -> tuple[Problem, int]:
         """End of input: settle all; returns the problem as solved, and the number of relinearised keyframes."""
@@ -61,7 +59,7 @@ class Incremental:
     lag: float = 120.0
     settled: list[SettledStates] = field(default_factory=list)
 
-    def add(self, place: Place) -> tuple[Message, Array]:
+    def add(self, place: Place) -> None:
         """As of `LagSmoother`."""
         if self.window.push(place) > self.window.turn:
             self.window.converge()
@@ -69,8 +67,6 @@ class Incremental:
             assert place.problem is not None
             self.window.converge(always=any(c.robust != "none" for c in place.problem.constraints))
             self.settled.append(self.window.settle(int(np.searchsorted(self.window.t, place.t - self.lag))))
-        newest = self.window.newest
-        return newest, newest.covariance[:DIM, :DIM]
 
     def finish(self, problem: Problem) -> tuple[Problem, int]:
         """As of `LagSmoother`."""
@@ -80,21 +76,12 @@ class Incremental:
         return problem, self.window.relinearized
 
 
-@dataclass(frozen=True)
-class Replay:
-    """A whole problem solved incrementally: settled states, live states, and the time of each keyframe."""
-
-    settled: Solution
-    live: Solution
-    seconds: Array  # (K,) processor time of the thread per keyframe
-
-
 def incremental(
     problem: Problem,
     lag: float = 120.0,
     progress: Progress | None = None,
     start: States | None = None,
-) -> Replay:
+) -> Solution:
     """Solve a problem keyframe by keyframe.
 
     Parameters
@@ -113,23 +100,23 @@ def begin_at(problem: Problem, start: States | None) -> Message:
     return message if start is None else message.move(start.minus(problem.prior.mean)[0])
 
 
-def solve_in_turn(problem: Problem, solver: str, engine: LagSmoother, lag: float, progress: Progress | None) -> Replay:
-    """Add all keyframes of a problem in order, and return the results as solutions."""
+def solve_in_turn(
+    problem: Problem, solver: str, engine: LagSmoother, lag: float, progress: Progress | None
+) -> Solution:
+    """Add all keyframes of a problem in order, and return what settles as a solution."""
     began = time.perf_counter()
     K, steps = len(problem.t), list_node_steps(problem)
-    points, P, seconds = [], np.empty((K, DIM, DIM)), np.empty(K)
+    seconds = np.empty(K)  # processor time of the thread
     for k in range(K):
         before = time.thread_time()
-        newest, P[k] = engine.add(Place(float(problem.t[k]), problem, k, steps.get(k, ()), linked=k > 0))
-        points.append((newest.state, newest.values))  # without what else a message knows, which is of its size squared
+        engine.add(Place(float(problem.t[k]), problem, k, steps.get(k, ()), linked=k > 0))
         seconds[k] = time.thread_time() - before
         if progress is not None and k % 64 == 0:
             progress(solver, k / K)
     problem, again = engine.finish(problem)
     elapsed = time.perf_counter() - began
-    parts, live = engine.settled, States.stack([state for state, _ in points])
     # in the order that the problem has its parameters in
-    columns = parts[-1].columns[-1]
+    parts, columns = engine.settled, engine.settled[-1].columns[-1]
     order = np.concatenate([np.empty(0, dtype=int), *(np.r_[shift(columns[name])] for name in problem.columns)])
     values = np.array([row for part in parts for row in part.values])[:, order]
     sigma = np.array([row for part in parts for row in part.sigma])[:, order]
@@ -138,31 +125,14 @@ def solve_in_turn(problem: Problem, solver: str, engine: LagSmoother, lag: float
     at = Points(states, values)
     records = {rows.name: record_residuals(problem, rows, at, robust=True) for rows in problem.constraints}
     whole = "all there was" if np.isinf(lag) else f"{lag:g} s of the future, or all there was"
+    middle, high, most = 1e3 * np.quantile(seconds, [0.5, 0.99, 1.0])
+    took = f"a keyframe took {middle:.1f} ms (median), {high:.1f} ms (99 %), {most:.0f} ms (most)"
     notes = (
-        Note("solver.step_times", ("" if np.isinf(lag) else f"lag {lag:g} s: ") + describe_times(seconds)),
+        Note("solver.step_times", ("" if np.isinf(lag) else f"lag {lag:g} s: ") + took),
         Note("solver.relinearised", f"{format_count(again, 'keyframe')} relinearised"),
     )
-    settled = make_solution(
+    return make_solution(
         problem, solver, at, covariance, sigma, smooth=True, notes=notes, records=records,
         iterations=1, cost=compute_cost_at(problem, at), stopped=f"every keyframe settled with {whole}",
         timings={solver: elapsed},
     )  # fmt: skip
-    scale = scale_at(problem.columns, np.array([values for _, values in points])[:, order])
-    now = replace(
-        settled,
-        solver="live",
-        states=live,
-        covariance=P,
-        parameters={},
-        records={},
-        graphs=(),
-        stopped="each keyframe as it was known when it came",
-        between=(make_dense(problem, live, P, scale, smooth=False),),
-    )
-    return Replay(settled, now, seconds)
-
-
-def describe_times(seconds: Array) -> str:
-    """Processing time per keyframe, in words."""
-    middle, high, most = 1e3 * np.quantile(seconds, [0.5, 0.99, 1.0])
-    return f"a keyframe took {middle:.1f} ms (median), {high:.1f} ms (99 %), {most:.0f} ms (most)"

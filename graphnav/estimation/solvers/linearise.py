@@ -51,25 +51,13 @@ class Points:
         return Points(States(np.empty((n, 3, 3)), *np.empty((4, n, 3))), np.empty((n, width)))
 
     def select_nodes(self, problem: Problem) -> dict[str, Array]:
-        """(n, k) per parameter: the value of each node after the last keyframe that it governs."""
-        return {
-            c.parameter.name: self.values[find_last_keyframes(c), shift(problem.columns[c.parameter.name])]
-            for c in problem.chains
-        }
-
-
-@dataclass(frozen=True)
-class Jacobian:
-    """Derivatives of rows by all D error states, assembled when they are asked for."""
-
-    linear: Linearized
-    columns: Columns
-    width: int
-
-    @cached_property
-    def H(self) -> Array:
-        """(n, m, D) derivative of the residual."""
-        return assemble(self.linear, self.columns, self.width)
+        """(n, k) per parameter: the value of each node after the last keyframe that it governs, its mean if none."""
+        out = {}
+        for c in problem.chains:
+            last, at = find_last_keyframes(c), shift(problem.columns[c.parameter.name])
+            governs = c.node[last] == np.arange(len(c.t))
+            out[c.parameter.name] = np.where(governs[:, None], self.values[last, at], c.mean)
+        return out
 
 
 @dataclass(frozen=True)
@@ -79,7 +67,8 @@ class Rows:
     constraint: Constraint
     which: slice | Array
     linear: Linearized
-    jacobian: Jacobian
+    columns: Columns  # of the parameters in H
+    H: Array  # (n, m, D) derivative of the residual
 
     @property
     def residual(self) -> Array:
@@ -95,16 +84,6 @@ class Rows:
     def sigma(self) -> Array:
         """(n, m) sigmas with the rows' weights in them: infinite where a row is not used."""
         return weigh_sigma(self.constraint, self.linear.sigma, self.which)
-
-    @property
-    def H(self) -> Array:
-        """(n, m, D) derivative of the residual."""
-        return self.jacobian.H
-
-    @property
-    def columns(self) -> Columns:
-        """Columns of the parameters in H."""
-        return self.jacobian.columns
 
     @property
     def states_sigmas(self) -> bool:
@@ -207,7 +186,7 @@ def linearise(
         for p in constraint.parameters
     }
     linear = constraint.linearize(states, given, which)
-    return Rows(constraint, which, linear, Jacobian(linear, columns, DIM + values.shape[1]))
+    return Rows(constraint, which, linear, columns, assemble(linear, columns, DIM + values.shape[1]))
 
 
 def linearise_links(motion: ImuFactors, states: States, scale: Array | None) -> tuple[Array, Array, Array, Array]:

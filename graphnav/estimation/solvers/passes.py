@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,7 +14,6 @@ from graphnav.core.state import DIM, States
 from graphnav.estimation.dense import make_dense
 from graphnav.estimation.problem import Problem, SolvedProblem
 from graphnav.estimation.solution import ConstraintRecord, ParameterEstimate, Solution
-from graphnav.estimation.solvers.disturbance import compute_row_covariances
 from graphnav.estimation.solvers.invariant import add_invariant, subtract_invariant
 from graphnav.estimation.solvers.linearise import Columns, Points, Rows, find_last_keyframes, linearise, scale_at, shift
 from graphnav.estimation.solvers.recursion import Arrays, RowBlocks
@@ -27,62 +26,45 @@ _TURN = 0.02  # rad; what is linear in an error of attitude is wrong by half its
 
 
 @dataclass(frozen=True)
-class DisturbancePass(Points, ABC):
-    """A backward pass: states and parameter values, and what it says of the disturbances before each keyframe.
-
-    Of the first n keyframes, which were linearised at given points: P^s = P- - P- N P-.
-    """
-
-    r: Array  # (n, D)
-    N: Array  # (n, 15, 15) of the states
-    N_diagonal: Array  # (n, D)
-
-    @property
-    @abstractmethod
-    def variance(self) -> Array:
-        """(K, D) of the errors; of those of parameters without a correlation time it may be unknown."""
-
-    @abstractmethod
-    def cover_rows(self, linear: Rows, n: int) -> Array:
-        """H P^s H^T (n, m, m) of the first n rows of a constraint, linearised at the smoothed points."""
-
-
-@dataclass(frozen=True)
-class SmootherPass(DisturbancePass):
+class SmootherPass(Points):
     """A backward pass with the joint covariance of states and parameters at every keyframe."""
 
     P: Array  # (K, D, D)
 
     @property
     def variance(self) -> Array:
+        """(K, D) of the errors."""
         return np.diagonal(self.P, axis1=1, axis2=2)
 
     def cover_rows(self, linear: Rows, n: int) -> Array:
-        return compute_row_covariances(linear.H, self.P, linear.constraint.keyframe[:n])
+        """H P^s H^T (n, m, m) of the first n rows of a constraint, linearised at the smoothed points."""
+        return linear.H @ self.P[linear.constraint.keyframe[:n]] @ np.swapaxes(linear.H, 1, 2)
 
 
 @dataclass(frozen=True)
-class MomentPass(DisturbancePass):
-    """A backward pass with only the covariances that noise estimation needs, at half the cost."""
+class MomentPass(Points):
+    """A backward pass with what it says of the disturbances before each of n keyframes, linearised at given points.
 
-    variances: Array  # (n, D), of parameters with a correlation time
-    linear: dict[str, Rows]  # of constraints with variance components, linearised at the smoothed points
+    P^s = P- - P- N P-. Of covariances it has only those that noise estimation needs, at half the cost.
+    """
+
+    r: Array  # (n, D)
+    N: Array  # (n, 15, 15) of the states
+    N_diagonal: Array  # (n, D)
+    variance: Array  # (n, D) of the errors, of parameters with a correlation time
     of_rows: Array  # (n, M, M) H P^s H^T, where each of these stands
+    linear: dict[str, Rows]  # of constraints with variance components, linearised at the smoothed points
     places: dict[str, tuple[Array, Array]]
-
-    @property
-    def variance(self) -> Array:
-        return self.variances
 
     def linearise(self, constraint: Constraint, columns: Columns, n: int) -> Rows:
         own = self.linear.get(constraint.name)
         if own is None or own.columns != columns or own.constraint.keyframe is not constraint.keyframe:
             return super().linearise(constraint, columns, n)
-        if len(own.residual) != n or not own.states_sigmas:
-            return super().linearise(constraint, columns, n)
-        return own.restate(constraint)
+        known = len(own.residual) == n and own.states_sigmas
+        return own.restate(constraint) if known else super().linearise(constraint, columns, n)
 
     def cover_rows(self, linear: Rows, n: int) -> Array:
+        """As of `SmootherPass`."""
         k, place = self.places[linear.constraint.name]
         return self.of_rows[k[:n, :, None], place[:n, :, None], place[:n, None]]
 
@@ -127,8 +109,7 @@ class ForwardRecord(Points):
     decay: Array  # (K-1, D-15) of the steps, as `graphnav.estimation.solvers.recursion` has them
     records: dict[str, Innovations]
     weights: dict[str, Array]  # (N,) of fixes: 0 where a fault was found, less than 1 where noisy
-    anew: bool  # the filter was reset somewhere, which no other solver can: its estimates must not be used
-    about: Points | None  # where the first n keyframes were linearised; up to the last of them P is of errors about
+    about: Points  # where the first n keyframes were linearised, maybe none; up to the last P is of errors about
     errors: Array  # (n, D) these points, and the filtered
     errors_predicted: Array  # (n, D) and the predicted state is these errors away from them
     updates: Updates | None  # of the keyframes there
@@ -140,19 +121,9 @@ class ForwardRecord(Points):
         return self.errors_predicted, self.P_predicted, self.errors, self.P
 
     @property
-    def predicted_from(self) -> States:
-        """(K-1) the states that the steps to the next keyframes were linearised at."""
-        n = 0 if self.about is None else len(self.about.values)
-        given = [] if self.about is None else [self.about.states[: min(n, len(self.values) - 1)]]
-        return States.stack([*given, self.states[n:-1]]) if n < len(self.values) else given[0]
-
-    @property
     def linearised(self) -> Points:
         """Where its rows were linearised: at points given, then where it was."""
-        if self.about is None:
-            return self.predicted
-        n = len(self.about.values)
-        return join_passes([self.about, Points(self.predicted.states[n:], self.predicted.values[n:])])
+        return join_passes([self.about, self.predicted.take(slice(len(self.about.values), None))])
 
 
 @dataclass(frozen=True)
@@ -186,11 +157,7 @@ def are_near(points: Points, about: Points, turn: float = _TURN) -> bool:
 def take_solution_points(problem: Problem, solved: Solution, before: Points) -> Points:
     """Points of a solution; unlisted parameters, such as places of stops, keep their values: rows are linear in
     them."""
-    told = {
-        c.parameter.name: solved.parameters[c.parameter.name].value[c.node]
-        for c in problem.chains
-        if c.parameter.name in solved.parameters
-    }
+    told = spread_nodes(problem, {name: p.value for name, p in solved.parameters.items()})
     return make_points(problem, solved.states, split_values(problem, before) | told)
 
 
@@ -198,6 +165,11 @@ def make_points(problem: Problem, states: States, known: dict[str, Array]) -> Po
     """Points of all keyframes: states, and values (K, k) of parameters, expected ones where they are not known."""
     values = [known.get(c.parameter.name, c.mean[c.node]) for c in problem.chains]
     return Points(states, np.concatenate([np.empty((len(states), 0)), *values], axis=1))
+
+
+def spread_nodes(problem: Problem, nodes: Mapping[str, Array]) -> dict[str, Array]:
+    """Values (K, k) at all keyframes of parameters of which those of the nodes are given."""
+    return {c.parameter.name: nodes[c.parameter.name][c.node] for c in problem.chains if c.parameter.name in nodes}
 
 
 def reuse_points(points: Points, before: Problem, after: Problem) -> Points:

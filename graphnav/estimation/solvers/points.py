@@ -11,19 +11,19 @@ A pass at given points takes a fraction of the time of one linearised at its own
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 
 import numpy as np
 
 from graphnav.core import rotation
 from graphnav.core.progress import Progress
-from graphnav.core.rotation import Array, mv
-from graphnav.core.state import DIM, MOVING, States
+from graphnav.core.rotation import Array
+from graphnav.core.state import DIM, States
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.breakdown import explain_rows
 from graphnav.estimation.solvers.invariant import turn
-from graphnav.estimation.solvers.linearise import Advance, Columns, Points, linearise, shift
+from graphnav.estimation.solvers.linearise import Advance, Columns, Points, Rows, linearise, shift
 from graphnav.estimation.solvers.passes import Updates
 from graphnav.estimation.solvers.recursion import STRETCH, filter_rows
 from graphnav.estimation.solvers.stack import RowBlock, Stack
@@ -65,12 +65,10 @@ class Linearisation:
         gap = np.concatenate([ahead.minus(end), values - points.values[1:]], axis=1)
         turned = rotation.right_jacobian_inverse(gap[:, :3])
         F[:, :3] = turned @ F[:, :3]
-        r, sigma, H = _allocate_rows(n, stack.M, points)
+        r, sigma, H = allocate_rows(n, stack.M, points)
         for rows in problem.constraints:
-            count = int(rows.keyframe.searchsorted(n))
-            place = stack.places[rows.name][0][:count], stack.places[rows.name][1][:count]
-            linear = points.linearise(rows, problem.columns, count)
-            r[place], sigma[place], H[place] = linear.residual, linear.stated, linear.H
+            linear = points.linearise(rows, problem.columns, int(rows.keyframe.searchsorted(n)))
+            _put_rows(linear, stack, r, sigma, H)
         return cls(problem.columns, F, gap, turned, r, sigma, H)
 
     def lift(self, problem: Problem, points: Points, stack: Stack, anew: Collection[str]) -> Linearisation:
@@ -85,10 +83,7 @@ class Linearisation:
         r, sigma = self.r.copy(), self.sigma.copy()
         for rows in problem.constraints:
             if rows.name in anew:
-                which = slice(*rows.keyframe.searchsorted((0, n)))
-                linear = linearise(rows, points, problem.columns, which)
-                place = stack.places[rows.name]
-                r[place], sigma[place], H[place] = linear.residual, linear.stated, linear.H
+                _put_rows(linearise(rows, points, problem.columns), stack, r, sigma, H)
         return Linearisation(problem.columns, self.F, gap, self.turned, r, sigma, H)
 
     def compute_noise(self, problem: Problem, points: Points) -> Array:
@@ -161,9 +156,15 @@ class PointFilter:
             raise explain_rows(stack.get_block(int(self._at[0])).parts) from None
 
 
-def _allocate_rows(n: int, M: int, points: Points) -> tuple[Array, Array, Array]:
+def allocate_rows(n: int, M: int, points: Points) -> tuple[Array, Array, Array]:
     """Residuals (n, M), sigmas (n, M) and Jacobians (n, M, D) of no rows yet."""
     return np.zeros((n, M)), np.ones((n, M)), np.zeros((n, M, DIM + points.values.shape[1]))
+
+
+def _put_rows(linear: Rows, stack: Stack, r: Array, sigma: Array, H: Array) -> None:
+    """The first rows of a constraint, in their places."""
+    k, place = (x[: len(linear.residual)] for x in stack.places[linear.constraint.name])
+    r[k, place], sigma[k, place], H[k, place] = linear.residual, linear.stated, linear.H
 
 
 def predict_states(problem: Problem, at: slice, states: States, values: Array) -> tuple[States, Array]:
@@ -173,39 +174,6 @@ def predict_states(problem: Problem, at: slice, states: States, values: Array) -
         return motion.propagate(at, states)
     ahead, F = motion.propagate(at, states, values[:, shift(scale)])
     return ahead, np.concatenate([F, motion.scale_columns(at, F, scale.stop - scale.start)], axis=2)
-
-
-def linearise_all(
-    problem: Problem,
-    stack: Stack,
-    points: Points,
-    own: slice,
-    of_rows: Mapping[str, Array],
-    first: int,
-    offset: int,
-    moved: tuple[Array, Array],
-) -> tuple[Array, Array, Array]:
-    """Residuals, sigmas (n, M) and Jacobians (n, M, D) of the rows of keyframes `own`, from keyframe `first` on.
-
-    Parameters
-    ----------
-    of_rows : of each constraint the point that each row is at, less `offset`.
-    moved : T (n, 9, 9) and m (n, D), where the errors about a point are T (y - m) of the errors y that rows are about.
-    """
-    n, (T, m) = own.stop - own.start, moved
-    r, sigma, H = _allocate_rows(n, stack.M, points)
-    for rows in problem.constraints:
-        which = slice(*rows.keyframe.searchsorted((first, own.stop)))
-        if which.start == which.stop:
-            continue
-        at = of_rows[rows.name][which] - offset
-        linear = linearise(rows, points, problem.columns, which, at)
-        J = linear.H
-        J[:, :, :MOVING] = J[:, :, :MOVING] @ T[at]
-        residual = linear.residual - mv(J, m[at])
-        place = rows.keyframe[which, None] - own.start, stack.places[rows.name][1][which]
-        r[place], sigma[place], H[place] = residual, linear.stated, J
-    return r, sigma, H
 
 
 def move_covariance(P: Array, e: Array) -> Array:

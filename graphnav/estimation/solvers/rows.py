@@ -6,45 +6,21 @@ same nodes: one for the constants, one for slow parameters, one for those that a
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
 from graphnav.core.rotation import Array
-from graphnav.core.state import DIM, States
+from graphnav.core.state import DIM
 from graphnav.estimation.problem import ParameterChain, Problem
-from graphnav.estimation.solvers.linearise import Points, find_last_keyframes, linearise, linearise_links
-from graphnav.estimation.solvers.passes import move_points, subtract_points
+from graphnav.estimation.solvers.linearise import Points, find_last_keyframes, linearise, linearise_links, scale_at
+from graphnav.estimation.solvers.passes import make_points, move_points, spread_nodes, subtract_points
 from graphnav.imu.dynamics import SCALE
 
 _SHORTEST = 6  # times that a step is halved
 _SHARED_BLOCKS = 6  # blocks of rows with the same variables
-Values = dict[str, Array]  # parameter name -> (nodes, k)
 WhitenedRows = list[tuple[list[tuple[Array, Array]], Array]]  # blocks of (keys, A (N, m, k)), and b (N, m)
-Correction = tuple[Array, Values]  # (K, 15) and per parameter
-
-
-@dataclass(frozen=True)
-class Iterate:
-    """States of all keyframes and values of all parameter nodes."""
-
-    states: States
-    values: Values
-
-    @property
-    def scale(self) -> Array | None:
-        """The scale errors of the IMU, (k,), where they are parameters."""
-        return self.values[SCALE][0] if SCALE in self.values else None
-
-    def move(self, step: Correction) -> Iterate:
-        """Move by a step."""
-        return Iterate(self.states.plus(step[0]), {name: v + step[1][name] for name, v in self.values.items()})
-
-    def make_points(self, problem: Problem) -> Points:
-        """The same with the parameters' values at every keyframe."""
-        values = [self.values[c.parameter.name][c.node] for c in problem.chains]
-        return Points(self.states, np.concatenate([np.empty((len(self.states), 0)), *values], axis=1))
 
 
 @dataclass(frozen=True)
@@ -55,6 +31,7 @@ class _Group:
     node: Array  # (K,) the node in force at each keyframe
     columns: dict[str, slice]
     width: int
+    chains: tuple[ParameterChain, ...]
 
 
 class Layout:
@@ -69,9 +46,9 @@ class Layout:
     """
 
     def __init__(self, problem: Problem) -> None:
-        self.K = K = len(problem.t)
+        self.K, self._columns = len(problem.t), problem.columns
+        K = self.K
         self.groups: list[_Group] = []
-        self.chains: list[list[ParameterChain]] = []  # of each group
         after: dict[int, list[int]] = {}
         self.width, variable, offset = [DIM] * K, [np.arange(K)], [np.zeros(K, dtype=int)]
         joined_width = np.full(K, DIM)
@@ -87,9 +64,7 @@ class Layout:
             node = chains[0].node
             n = len(chains[0].t)
             keys = np.arange(len(self.width), len(self.width) + n)
-            group = _Group(keys, node, columns, at)
-            self.groups.append(group)
-            self.chains.append(chains)
+            self.groups.append(_Group(keys, node, columns, at, tuple(chains)))
             self.width += [at] * n
             last = find_last_keyframes(chains[0])
             alone = np.diff(last, prepend=-1) == 1
@@ -135,13 +110,15 @@ class Layout:
             out.append(one[(at,) * one.ndim])
         return out
 
-    def unpack(self, vectors: list[Array]) -> Correction:
-        """Steps per state and parameter from one vector per key."""
-        nodes: Values = {}
+    def unpack(self, vectors: list[Array]) -> Array:
+        """(K, D) of states and of the nodes in force at each keyframe, from one vector per key."""
+        out = np.empty((self.K, DIM + sum(group.width for group in self.groups)))
+        out[:, :DIM] = vectors[: self.K]
         for group in self.groups:
-            stacked = np.stack([vectors[k] for k in group.keys])
-            nodes |= {name: stacked[:, at] for name, at in group.columns.items()}
-        return np.stack(vectors[: self.K]), nodes
+            each = np.stack([vectors[k] for k in group.keys])[group.node]
+            for name, at in group.columns.items():
+                out[:, self._columns[name]] = each[:, at]
+        return out
 
     def find_parameter_blocks(self, keyframe: Array, jacobians: dict[str, Array]) -> list[tuple[Array, Array]]:
         """Blocks of the parameter variables that rows at `keyframe` touch."""
@@ -157,27 +134,27 @@ class Layout:
         return blocks
 
 
-def whiten(problem: Problem, point: Iterate, layout: Layout) -> tuple[WhitenedRows, float]:
-    """All factors at a point, and its cost: half their squared residuals, through the robust kernels."""
-    first = np.arange(layout.K - 1)
-    start, end, S, b = linearise_links(problem.motion, point.states, point.scale)
+def whiten(problem: Problem, points: Points, layout: Layout) -> tuple[WhitenedRows, float]:
+    """All factors at points, and their cost: half the squared residuals, through the robust kernels."""
+    first, scale = np.arange(layout.K - 1), scale_at(problem.columns, points.values[0])
+    start, end, S, b = linearise_links(problem.motion, points.states, scale)
     links = [(first, start), (first + 1, end)]
-    if point.scale is not None:
+    if scale is not None:
         links += layout.find_parameter_blocks(first, {SCALE: S})
     out: WhitenedRows = [(links, b)]
     total = 0.5 * float(np.sum(b * b))
-    points = point.make_points(problem)
     for rows in (problem.prior, *problem.constraints):
         linear = linearise(rows, points, problem.columns)
         weight, costs = linear.weigh()
         total += float(np.sum(costs))
-        scale = np.sqrt(weight)[:, None] / linear.sigma
-        H = scale[..., None] * linear.H
+        root = np.sqrt(weight)[:, None] / linear.sigma
+        H = root[..., None] * linear.H
         weighted = {p.name: H[:, :, problem.columns[p.name]] for p in rows.parameters}
         blocks = [(rows.keyframe, H[:, :, :DIM])]
-        out += _group_rows(blocks + layout.find_parameter_blocks(rows.keyframe, weighted), -scale * linear.residual)
-    for group, chains in zip(layout.groups, layout.chains, strict=True):
-        own = linearise_chains(chains, group, point.values)
+        out += _group_rows(blocks + layout.find_parameter_blocks(rows.keyframe, weighted), -root * linear.residual)
+    nodes = points.select_nodes(problem)
+    for group in layout.groups:
+        own = linearise_nodes(group, nodes)
         total += sum(0.5 * float(np.sum(b * b)) for _, b in own)
         out += own
     return out, total
@@ -198,8 +175,9 @@ def _group_rows(blocks: list[tuple[Array, Array]], b: Array) -> WhitenedRows:
 
 
 def compute_cost_at(problem: Problem, points: Points) -> float:
-    """The cost at points of all keyframes."""
-    return whiten(problem, Iterate(points.states, points.select_nodes(problem)), Layout(problem))[1]
+    """The cost at points of all keyframes, with the values that nodes have at their last."""
+    at = make_points(problem, points.states, spread_nodes(problem, points.select_nodes(problem)))
+    return whiten(problem, at, Layout(problem))[1]
 
 
 def shorten_step(problem: Problem, about: Points, ahead: Points) -> Points:
@@ -221,23 +199,15 @@ def compute_column_norms(rows: WhitenedRows, layout: Layout) -> Array:
     return np.sqrt(total)
 
 
-def linearise_chains(chains: Sequence[ParameterChain], group: _Group, values: Values) -> WhitenedRows:
-    """Prior on the first node of a group's parameters, and their process model."""
-    out: WhitenedRows = []
-    for alike in zip(*(_linearise_chain(c, group, values[c.parameter.name]) for c in chains), strict=True):
-        A = [np.concatenate([blocks[i][1] for blocks, _ in alike], axis=1) for i in range(len(alike[0][0]))]
-        keys = [keys for keys, _ in alike[0][0]]
-        out.append((list(zip(keys, A, strict=True)), np.concatenate([b for _, b in alike], axis=1)))
-    return out
-
-
-def _linearise_chain(chain: ParameterChain, group: _Group, value: Array) -> WhitenedRows:
-    pick = np.eye(group.width)[group.columns[chain.parameter.name]]  # (k, width)
-    keys, off = group.keys, value - chain.mean
-    A = pick / chain.sigma[..., None]
-    out: WhitenedRows = [([(keys[:1], A[:1])], -off[:1] / chain.sigma[:1])]
+def linearise_nodes(group: _Group, nodes: Mapping[str, Array]) -> WhitenedRows:
+    """Prior on the first node of a group's parameters, and their process model, at values (nodes, k)."""
+    chains, keys = group.chains, group.keys
+    sigma = np.concatenate([c.sigma for c in chains], axis=1)
+    decay = np.concatenate([np.broadcast_to(c.decay[:, None], c.sigma.shape) for c in chains], axis=1)
+    off = np.concatenate([nodes[c.parameter.name] - c.mean for c in chains], axis=1)
+    A = np.eye(group.width) / sigma[..., None]
+    out: WhitenedRows = [([(keys[:1], A[:1])], -off[:1] / sigma[:1])]
     if len(keys) > 1:
-        decay = chain.decay[1:]
-        out.append(([(keys[:-1], -decay[:, None, None] * A[1:]), (keys[1:], A[1:])],
-                    (decay[:, None] * off[:-1] - off[1:]) / chain.sigma[1:]))  # fmt: skip
+        before, driven = -decay[1:, :, None] * A[1:], (decay[1:] * off[:-1] - off[1:]) / sigma[1:]
+        out.append(([(keys[:-1], before), (keys[1:], A[1:])], driven))
     return out

@@ -17,7 +17,6 @@ The noise model is estimated from r and N (`graphnav.estimation.noise.moments`).
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg.lapack import dposv
@@ -29,7 +28,7 @@ from graphnav.core.state import DIM
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import Solution
 from graphnav.estimation.solvers.breakdown import explain_smoother
-from graphnav.estimation.solvers.disturbance import smooth_errors, smooth_rows
+from graphnav.estimation.solvers.disturbance import smooth_rows
 from graphnav.estimation.solvers.linearise import Points, find_stepping, linearise
 from graphnav.estimation.solvers.passes import (
     FilterPass,
@@ -51,58 +50,41 @@ _CANCELLED = 7e4
 
 def smooth_backward(problem: Problem, forward: ForwardRecord, progress: Progress | None = None) -> SmootherPass:
     """Smooth a forward pass: keyframes linearised at the filter's estimates, and before them those at given points."""
-    K, D = forward.P.shape[:2]
-    n, end = _count_given(forward)
-    P, found, behind = np.empty((K, D, D)), _Disturbances.allocate(n, D), (np.zeros(D), np.zeros((D, D)))
-    parts = [_smooth_filtered(forward, end, P, problem.t, progress)] if end < K else []
-    if forward.about is not None:
-        if n == end + 1:
-            ahead, away = forward.P_predicted[end], _find_later(forward, parts[0], end)
-            _, inverse, info = dposv(ahead, np.eye(D))
-            if info:
-                raise explain_smoother(float(problem.t[end]))
-            behind = inverse @ away, inverse @ (ahead - P[end]) @ inverse
-            found.put(end, *behind)
-        if forward.updates is not None:
-            _smooth_points(forward, forward.updates, behind, end, found, P, progress=progress)
-            _restore_digits(forward, P, end)
-        parts = [move_points(forward.about.take_first(end), found.errors[:end]), *parts]
-    smoothed = join_passes(parts)
-    return SmootherPass(smoothed.states, smoothed.values, found.r, found.N, found.N_diagonal, P)
+    P = np.empty(forward.P.shape)
+    smoothed = _smooth(forward, P, problem.t, progress)
+    return SmootherPass(smoothed.states, smoothed.values, P)
 
 
 def smooth_points(forward: ForwardRecord) -> Points:
     """Smooth a forward pass without covariances; of one linearised at given points throughout, a step of Gauss and
     Newton from these points.
     """
-    (K, D), one = forward.P.shape[:2], forward.updates
-    n, end = _count_given(forward)
-    r, errors = np.zeros(D), np.empty(forward.errors.shape)
-    parts = [_smooth_filtered(forward, end, np.empty((0, D, D)))] if end < K else []
-    if forward.about is not None:
-        if n == end + 1:
-            _, r, info = dposv(forward.P_predicted[end], _find_later(forward, parts[0], end))
-            if info:
-                raise explain_smoother()
-        if one is not None:
-            steps = forward.F, forward.decay
-            smooth_errors(end, r, steps, one.arrays, one.blocks.arrays, forward.filtered, errors)
-        parts = [move_points(forward.about.take_first(end), errors[:end]), *parts]
+    return _smooth(forward, np.empty((0, *forward.P.shape[1:])))
+
+
+def _smooth(forward: ForwardRecord, P: Array, t: Array | None = None, progress: Progress | None = None) -> Points:
+    """Smoothed points; covariances in P (K, D, D), unless it has no keyframes. Times t (K,) are for errors."""
+    (K, D), about = forward.P.shape[:2], forward.about
+    n = len(about.values)
+    end = n if n == K else max(n - 1, 0)  # so many have errors about given points ahead
+    parts = [_smooth_filtered(forward, end, P, t, progress)] if end < K else []
+    r, N = np.zeros(D), np.zeros((D, D) if len(P) else (0, 0))
+    if n == end + 1:  # what later keyframes add to the prediction of keyframe `end`
+        ahead, own = forward.P_predicted[end], about.take(slice(end, n))
+        later = np.append(parts[0].states[:1].minus(own.states)[0], parts[0].values[0] - own.values[0])
+        later -= forward.errors_predicted[end]
+        _, solved, info = dposv(ahead, np.eye(D) if len(P) else later[:, None])
+        if info:
+            raise explain_smoother(None if t is None else float(t[end]))
+        r = solved @ later if len(P) else solved[:, 0]
+        if len(P):
+            N = solved @ (ahead - P[end]) @ solved
+    if forward.updates is not None:
+        errors = _smooth_given(forward, forward.updates, end, r, N, P, progress=progress)[0]
+        if len(P):
+            _restore_digits(forward, P, end)
+        parts = [move_points(about.take_first(end), errors), *parts]
     return join_passes(parts)
-
-
-def _count_given(forward: ForwardRecord) -> tuple[int, int]:
-    """How many keyframes were linearised at given points, and how many of them have errors about these points ahead."""
-    n = 0 if forward.about is None else len(forward.about.values)
-    return n, max(n - 1, 0) if n < len(forward.P) else n
-
-
-def _find_later(forward: ForwardRecord, smoothed: Points, end: int) -> Array:
-    """(D,) what later keyframes add to the prediction of keyframe `end`, of which `smoothed` is the first."""
-    assert forward.about is not None
-    point = forward.about.take(slice(end, end + 1))
-    away = np.concatenate([smoothed.states[:1].minus(point.states)[0], (smoothed.values[:1] - point.values)[0]])
-    return away - forward.errors_predicted[end]
 
 
 def smooth_moments(problem: Problem, forward: ForwardRecord) -> MomentPass:
@@ -110,7 +92,6 @@ def smooth_moments(problem: Problem, forward: ForwardRecord) -> MomentPass:
     K, D = forward.P.shape[:2]
     assert forward.updates is not None
     one, smoothed = forward.updates, smooth_points(forward)
-    found, behind = _Disturbances.allocate(K, D), (np.zeros(D), np.zeros((D, D)))
     linear, asked = {}, np.zeros_like(one.H)
     for rows in problem.constraints:
         if rows.list_noise_groups()[0]:
@@ -122,27 +103,9 @@ def smooth_moments(problem: Problem, forward: ForwardRecord) -> MomentPass:
         if chain.parameter.correlation_time is not None:
             k, own = find_stepping(chain, K), problem.columns[chain.parameter.name]
             wanted[k, own] = wanted[k - 1, own] = True
-    variance, of_rows = _smooth_points(forward, one, behind, K, found, np.empty((0, D, D)), wanted, asked)
-    return MomentPass(
-        smoothed.states, smoothed.values, found.r, found.N, found.N_diagonal, variance, linear, of_rows, one.places
-    )
-
-
-@dataclass(frozen=True)
-class _Disturbances:
-    """Results of the disturbance smoother's recursion for n keyframes."""
-
-    errors: Array  # (n, D)
-    r: Array  # (n, D)
-    N: Array  # (n, 15, 15)
-    N_diagonal: Array  # (n, D)
-
-    @classmethod
-    def allocate(cls, n: int, D: int) -> _Disturbances:
-        return cls(np.empty((n, D)), np.empty((n, D)), np.empty((n, DIM, DIM)), np.empty((n, D)))
-
-    def put(self, k: int, r: Array, N: Array) -> None:
-        self.r[k], self.N[k], self.N_diagonal[k] = r, N[:DIM, :DIM], np.diagonal(N)
+    none = np.zeros(D), np.zeros((D, D)), np.empty((0, D, D))
+    _, r, N, N_diagonal, variance, of_rows = _smooth_given(forward, one, K, *none, wanted, asked)
+    return MomentPass(smoothed.states, smoothed.values, r, N, N_diagonal, variance, of_rows, linear, one.places)
 
 
 def _smooth_filtered(
@@ -169,37 +132,38 @@ def _smooth_filtered(
     return Points(own.states.plus(errors[:, :DIM]), own.values + errors[:, DIM:])
 
 
-def _smooth_points(
+def _smooth_given(
     forward: ForwardRecord,
     one: Updates,
-    behind: tuple[Array, Array],
     end: int,
-    out: _Disturbances,
+    r_k: Array,
+    N_k: Array,
     P: Array,
     wanted: Array | None = None,
     asked: Array | None = None,
     progress: Progress | None = None,
-) -> tuple[Array, Array]:
-    """Smoothed errors, covariances, r and N of the first keyframes up to `end`, from r and N behind them.
+) -> tuple[Array, ...]:
+    """Errors, r, N and its diagonal of the first keyframes up to `end`, as `smooth_rows` has them, from r_k and N_k.
 
-    Where P has no keyframes, variances (end, D) of the columns `wanted` (K, D), and H P^s H^T (end, M, M) of rows
-    `asked` (K, M, D).
+    Covariances in P; where it has no keyframes, also variances (end, D) of the columns `wanted` (K, D), and H P^s H^T
+    (end, M, M) of rows `asked` (K, M, D).
     """
-    r_k, N_k = behind
     wanted = np.zeros((0, 0), dtype=bool) if wanted is None else wanted
     asked = np.empty((0, 0, 0)) if asked is None else asked
     variance, of_rows = np.zeros(wanted.shape), np.zeros((len(asked), *asked.shape[1:2] * 2))
+    D, n = len(r_k), end if len(N_k) else 0
+    found = np.empty((end, D)), np.empty((end, D)), np.empty((n, DIM, DIM)), np.empty((n, D))
     # contiguous, like an empty one: another layout would compile `smooth_rows` a second time
     columns, first = np.ascontiguousarray(np.nonzero(wanted)[1]), np.append(0, np.cumsum(wanted.sum(axis=1)))
     for hi in range(end, 0, -STRETCH):
         lo = max(hi - STRETCH, 0)
         r_k, N_k = smooth_rows(
             lo, hi, r_k, N_k, (forward.F, forward.decay), one.arrays, one.blocks.arrays, forward.filtered,
-            (out.errors, out.r, out.N, out.N_diagonal), (P, variance, of_rows), asked, columns, first,
+            found, (P, variance, of_rows), asked, columns, first,
         )  # fmt: skip
         if progress is not None:
             progress("smoother", 1.0 - lo / len(forward.P))
-    return variance, of_rows
+    return *found, variance, of_rows
 
 
 def _restore_digits(forward: ForwardRecord, P: Array, end: int) -> None:

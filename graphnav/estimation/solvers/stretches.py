@@ -28,9 +28,9 @@ from graphnav.core.state import DIM, MOVING, States
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.breakdown import explain_rows
 from graphnav.estimation.solvers.invariant import compute_transport, subtract_invariant, turn
-from graphnav.estimation.solvers.linearise import Advance, Points, shift
+from graphnav.estimation.solvers.linearise import Advance, Points, linearise, shift
 from graphnav.estimation.solvers.passes import join_passes, move_points
-from graphnav.estimation.solvers.points import linearise_all, predict_states
+from graphnav.estimation.solvers.points import allocate_rows, predict_states
 from graphnav.estimation.solvers.recursion import filter_rows
 from graphnav.estimation.solvers.stack import Stack
 from graphnav.imu.dynamics import SCALE
@@ -150,7 +150,7 @@ class StretchFilter:
         of_first = np.repeat(start, counts)
         T, m = _move_errors(points, of_first)
         gap, Q, F = self._step(k, k1, x, points, start, end, T, m)
-        r, sigma, H = linearise_all(self._problem, stack, points, own, self._of_rows, k, self._start[k], (T, m))
+        r, sigma, H = self._linearise(own, k, points, T, m)
         n, D = r.shape[0], H.shape[2]
         predicted, errors, Kt, w = np.empty((n, D)), np.empty((n, D)), np.zeros_like(H), r.copy()
         steps = slice(own.start, k1 - 1)
@@ -175,6 +175,21 @@ class StretchFilter:
         sigma = np.sqrt(np.diagonal(self._P[k:k1], axis1=1, axis2=2))
         size = np.max(np.abs(e) / np.maximum(np.repeat(sigma, counts, axis=0), 1e-300), axis=1)
         return np.maximum.accumulate(np.maximum.reduceat(size, start)), move_points(points, e)
+
+    def _linearise(self, own: slice, k: int, points: Points, T: Array, m: Array) -> tuple[Array, Array, Array]:
+        """Residuals, sigmas (n, M) and Jacobians (n, M, D) of the rows of keyframes `own`, from keyframe k on."""
+        r, sigma, H = allocate_rows(own.stop - own.start, self._stack.M, points)
+        for rows in self._problem.constraints:
+            which = slice(*rows.keyframe.searchsorted((k, own.stop)))
+            if which.start == which.stop:
+                continue
+            at = self._of_rows[rows.name][which] - self._start[k]
+            linear = linearise(rows, points, self._problem.columns, which, at)
+            J = linear.H
+            J[:, :, :MOVING] = J[:, :, :MOVING] @ T[at]
+            place = rows.keyframe[which, None] - own.start, self._stack.places[rows.name][1][which]
+            r[place], sigma[place], H[place] = linear.residual - mv(J, m[at]), linear.stated, J
+        return r, sigma, H
 
     def _step(
         self, k: int, k1: int, x: Points, points: Points, start: Array, end: Array, T: Array, m: Array

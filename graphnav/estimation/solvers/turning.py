@@ -27,7 +27,8 @@ from graphnav.core.rotation import Array, mv
 from graphnav.core.state import DIM, MOVING, States
 from graphnav.estimation.solvers.invariant import turn
 
-_Z = rotation.skew(np.array([0.0, 0.0, 1.0]))
+_UP = np.array([0.0, 0.0, 1.0])
+_Z = rotation.skew(_UP)
 _I3 = np.eye(3)
 
 
@@ -53,7 +54,7 @@ def split_turn(states: States, e: Array) -> tuple[Array, Array]:
 def add_turning(states: States, e: Array) -> States:
     """K states moved by error states (K, 15) along the turns about the vertical."""
     psi, left = split_turn(states, e)
-    Rz = _rotate_about_vertical(psi)
+    Rz = rotation.exp(psi[:, None] * _UP)
     return States(
         Rz @ states.R_nb @ rotation.exp(left[:, :3]),
         mv(Rz, states.p + left[:, 3:6]),
@@ -84,7 +85,7 @@ def change_of_point(states: States, e: Array) -> Array:
     after = mv(np.swapaxes(rotation.exp(tilt), -1, -2), u)  # the vertical in the body there
     w = np.einsum("ki,kij->kj", u, J)
     w /= np.sum(w * after, axis=1)[:, None]
-    T, back = np.zeros((len(e), MOVING, MOVING)), np.swapaxes(_rotate_about_vertical(psi), -1, -2)
+    T, back = np.zeros((len(e), MOVING, MOVING)), rotation.exp(-psi[:, None] * _UP)
     T[:, :3, :3] = u[:, :, None] * w[:, None] + J @ (_I3 - after[:, :, None] * w[:, None])
     for at in (slice(3, 6), slice(6, 9)):
         T[:, at, :3] = -(left[:, at] @ _Z.T)[:, :, None] * w[:, None]
@@ -95,10 +96,3 @@ def change_of_point(states: States, e: Array) -> Array:
 def turn_covariance(P: Array, states: States, e: Array) -> Array:
     """Covariances (K, 15, 15) of errors about points turned into those about the points moved by e (K, 15)."""
     return np.asarray(turn(P, np.linalg.inv(change_of_point(states, e))))
-
-
-def _rotate_about_vertical(psi: Array) -> Array:
-    """(K, 3, 3) Rz"""
-    c, s, out = np.cos(psi), np.sin(psi), np.zeros((len(psi), 3, 3))
-    out[:, 0, 0], out[:, 0, 1], out[:, 1, 0], out[:, 1, 1], out[:, 2, 2] = c, -s, s, c, 1.0
-    return out

@@ -28,7 +28,6 @@ from graphnav.estimation.solvers.stages import (
     Place,
     Stage,
     add_error,
-    append_columns,
     count_columns,
     linearise_rows,
     pad,
@@ -341,4 +340,4 @@ def find_parameter_limits(columns: Columns, place: Place) -> Array:
     return limit
 
 
-__all__ = ["Message", "Place", "SettledStates", "Window", "append_columns", "make_first_message"]
+__all__ = ["Message", "Place", "SettledStates", "Window", "make_first_message"]

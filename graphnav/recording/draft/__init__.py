@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,26 +10,23 @@ from pathlib import Path
 import numpy as np
 
 from graphnav.core.errors import RecordingError
-from graphnav.core.files import is_inside
 from graphnav.core.rotation import Array
 from graphnav.core.timescales import NEAR, UNIX, ClockOffset, compute_clock_offset
-from graphnav.recording import Gnss, Odometer
 from graphnav.recording.checks.imu import is_shaken_as_a_foot
 from graphnav.recording.checks.stated import moves_as_a_foot
 from graphnav.recording.draft import guesses, motion
 from graphnav.recording.draft.agreement import CLEAR, LIKELY, Agreement, compare_with_fixes
+from graphnav.recording.draft.document import Document, format_vector
 from graphnav.recording.draft.guesses import Guess
 from graphnav.recording.draft.logs import Source
 from graphnav.recording.draft.raw import RawFound, find_raw, write_raw
 from graphnav.recording.draft.sources import (
-    JOINED,
     find_logs,
     guess_file_pressure_unit,
     guess_fix_speed_unit,
-    name_plain_file,
     read_fixes,
 )
-from graphnav.recording.formats.schema import FORCE, GEOID, RATE_UNITS, SPEED
+from graphnav.recording.formats.schema import FORCE, RATE_UNITS, SPEED
 from graphnav.recording.formats.writer import quote
 
 __all__ = ["Draft", "draft"]
@@ -63,13 +59,13 @@ def draft(paths: Sequence[Path], folder: Path, name: str | None = None, topics: 
         If a file cannot be read, holds nothing that is known, or there is no IMU among them.
     """
     found = find_logs(paths, topics)
-    writer = _Writer(folder, topics)
-    writer.decisions += found.notes
+    file = Document(folder, topics)
+    file.decisions += found.notes
     imu = found.sensors["imu"]
     t = imu.t if imu.log is None else imu.log.imu.t  # type: ignore[union-attr]
     raw = find_raw(found.raw, t, imu.gps_zero)
-    text = writer.format(found.sensors, raw, name or folder.resolve().name or "drive")
-    return Draft(text, tuple(writer.decisions), writer.made)
+    text = _Writer(file).format(found.sensors, raw, name or folder.resolve().name or "drive")
+    return Draft(text, tuple(file.decisions), file.made)
 
 
 def read_imu_in_si(path: Path) -> tuple[Array, Array, Array, list[str]]:
@@ -89,22 +85,17 @@ def read_imu_in_si(path: Path) -> tuple[Array, Array, Array, list[str]]:
 
 
 class _Writer:
-    """Writes the lines of the file; every decision goes into a comment and into a list."""
+    """Decides on the tables of a file, and writes them."""
 
-    def __init__(self, folder: Path, asked: Sequence[str]) -> None:
-        self.folder = folder
-        self.asked = asked  # topics
+    def __init__(self, file: Document) -> None:
+        self.file = file
         self.epochs: ClockOffset | None = None  # delays between the clocks of IMU and fixes
-        self.lines: list[str] = []
-        self.decisions: list[str] = []
-        self.table = ""  # before each decision, as the same keys are in several
-        self.made: dict[str, dict[str, Array]] = {}
 
     def format(self, found: dict[str, Source], raw: RawFound | None, name: str) -> str:
         moved = "gnss" in found or raw is not None
         stepping = moved and "odometer" not in found and self._walks(found["imu"], found.get("gnss"))
         vehicle = (moved or "odometer" in found) and not stepping
-        self.lines += [
+        self.file.lines += [
             "# Drafted by graphnav init. Comments say why each line is what it is; look at those marked CHECK.",
             'format = "graphnav-recording/1"', f"name = {quote(name)}",
         ]  # fmt: skip
@@ -115,31 +106,31 @@ class _Writer:
             if stepping
             else "CHECK: no fixes and no speed, so a walk is assumed"
         )
-        self._write_key("platform", '"vehicle"' if vehicle else '"foot"', why)
+        self.file.write_key("platform", '"vehicle"' if vehicle else '"foot"', why)
         if raw is not None:
             self._write_clock(found["imu"], raw)
         elif found["imu"].week is not None:
             why = "as a column of the IMU's file says" if found["imu"].week else "the stamps are s since the GPS epoch"
-            self._write_key("clock", f'"gps week {found["imu"].week}"', why)
+            self.file.write_key("clock", f'"gps week {found["imu"].week}"', why)
         elif found["imu"].log is None and found["imu"].t[0] > UNIX:
-            self._write_key("clock", '"unix"', "the stamps are dates of this century, s since 1970")
+            self.file.write_key("clock", '"unix"', "the stamps are dates of this century, s since 1970")
         agreement, felt = self._write_imu(found["imu"], found.get("gnss"), raw, vehicle)
         course = None
         if "gnss" in found:
             course = motion.compute_course(*read_fixes(found["gnss"]))
             self._write_gnss(found["gnss"], agreement)
         if raw is not None:
-            self._begin("raw_gnss")
-            self.decisions += raw.notes
-            for key, value, why in write_raw(raw, self.folder):
-                self._write_key(key, value, why)
+            self.file.begin("raw_gnss")
+            self.file.decisions += raw.notes
+            for key, value, why in write_raw(raw, self.file.folder):
+                self.file.write_key(key, value, why)
             if "gnss" not in found:
                 self._write_time_offset(agreement)
         if "odometer" in found:
             self._write_odometer(found["odometer"], course if course is not None and len(course.t) > 50 else None, felt)
         if "barometer" in found:
             self._write_barometer(found["barometer"])
-        return "\n".join(self.lines) + "\n"
+        return "\n".join(self.file.lines) + "\n"
 
     def _walks(self, imu: Source, gnss: Source | None) -> bool:
         """Whether the IMU is shaken as one on a foot is, and fixes, if there are any, are as slow."""
@@ -157,18 +148,18 @@ class _Writer:
     def _write_clock(self, imu: Source, raw: RawFound) -> None:
         """Write what t = 0 of the IMU is, which observations are dated by."""
         if raw.clock.value is not None:
-            self._write_key("clock", quote(str(raw.clock.value)), raw.clock.why)
+            self.file.write_key("clock", quote(str(raw.clock.value)), raw.clock.why)
         elif imu.log is None:
             words = f'CHECK: state what t = 0 of {imu.path.name} is, as "gps week 2130" or a UTC date'
-            self.lines.append(f'# clock = "..."                             # {words}')
-            self._decide(f"clock: {words}; the observations begin at {raw.begin}")
+            self.file.lines.append(f'# clock = "..."                             # {words}')
+            self.file.decide(f"clock: {words}; the observations begin at {raw.begin}")
 
     def _write_imu(
         self, source: Source, gnss: Source | None, raw: RawFound | None, vehicle: bool
     ) -> tuple[Agreement, tuple[Array, Array]]:
         """Write [imu]; returns the comparison with the fixes, and times and forward forces."""
-        self._begin("imu")
-        self._write_file(source, "imu")
+        self.file.begin("imu")
+        self.file.write_file(source, "imu")
         if source.log is not None:
             assert source.log.imu is not None
             imu = source.log.imu
@@ -190,11 +181,11 @@ class _Writer:
             stated = source.find_unit("gx", "gyro")
             rate = guesses.guess_gyro_unit(source.path, gyro, stated, agreement.turn, vehicle)
             gyro = gyro * RATE_UNITS[str(rate.value)]
-            self._write_units({"t": source.t_unit, "gyro": rate, "accel": force})
+            self.file.write_units({"t": source.t_unit, "gyro": rate, "accel": force})
             front = self._write_axes(up, up_why, agreement)
         elif source.log.mount_known or agreement.clearest is None:
             assert source.log.imu is not None
-            self._decide(f"IMU: axes and units are those of {source.path.name}")
+            self.file.decide(f"IMU: axes and units are those of {source.path.name}")
             front = source.log.imu.R_bs[1]
         else:
             front = self._write_axes(up, up_why, agreement)
@@ -214,26 +205,26 @@ class _Writer:
             )
         letters, (front, top) = guesses.guess_axes(up, forward)
         if letters is not None:
-            self._write_key("axes", f'"{letters}"', f"{up_why}; {words}")
+            self.file.write_key("axes", f'"{letters}"', f"{up_why}; {words}")
         else:
-            self._write_key("forward", _format_vector(front), words)
-            self._write_key("up", _format_vector(top), up_why)
+            self.file.write_key("forward", format_vector(front), words)
+            self.file.write_key("up", format_vector(top), up_why)
         return front
 
     def _write_noise(self, t: Array, gyro: Array, accel: Array) -> None:
-        self.lines += ['# model = "..."                             # the IMU, if docs/imu-models.md has it']
-        self.lines += ["", "[imu.noise]                                 # better: the data sheet's figures"]
+        self.file.lines += ['# model = "..."                             # the IMU, if docs/imu-models.md has it']
+        self.file.lines += ["", "[imu.noise]                                 # better: the data sheet's figures"]
         for key, samples, unit in (("gyro", gyro, "rad/s/sqrt(Hz)"), ("accel", accel, "m/s2/sqrt(Hz)")):
             value = guesses.estimate_noise_density(t, samples)
             if value > 0:
-                self._write_key(
+                self.file.write_key(
                     f"{key}_noise_density",
                     f"{value:.2g}",
                     f"{unit}, measured, between its quietest and usual state",
                 )
 
     def _write_gnss(self, source: Source, agreement: Agreement) -> None:
-        self._begin("gnss")
+        self.file.begin("gnss")
         values = source.values
         late = agreement.late_velocity
         dropped = ("ve", "vn", "vu", "vd", "sd_ve", "sd_vn", "sd_vu", "speed", "course") if late is not None else ()
@@ -244,7 +235,7 @@ class _Writer:
             theirs = source.columns.names["type"]
             if numbers.value is None and theirs != "type":
                 dropped = (*dropped, "type")
-                self._decide(f"types of fixes: column '{theirs}' is left alone: {numbers.why}")
+                self.file.decide(f"types of fixes: column '{theirs}' is left alone: {numbers.why}")
         missing = {"sd_e", "sd_n", "sd_u"} - values.keys()
         if missing:  # all three or none
             dropped = (*dropped, "sd_e", "sd_n", "sd_u")
@@ -254,12 +245,12 @@ class _Writer:
             pair = f"'{height}' and '{source.columns.names['geoid']}'"
             same = (source.find_unit("h", "length") or "m") == (source.find_unit("geoid", "length") or "m")
             if of_sea and same:
-                self._decide(f"heights: above the ellipsoid, as {pair} add up")
+                self.file.decide(f"heights: above the ellipsoid, as {pair} add up")
             else:
                 dropped = (*dropped, "geoid")
                 why = "one is not in the other's unit" if of_sea else "a height above the ellipsoid needs none"
-                self._decide(f"heights: CHECK: {pair} are not added up: {why}")
-        self._write_file(source, "gnss", dropped)
+                self.file.decide(f"heights: CHECK: {pair} are not added up: {why}")
+        self.file.write_file(source, "gnss", dropped)
         if source.log is None:
             if "h" not in values:
                 raise RecordingError(
@@ -278,7 +269,7 @@ class _Writer:
                 units["speed"] = guess_fix_speed_unit(source)
             elif stated := source.find_unit("ve", "speed"):
                 units["speed"] = Guess(stated, "as the column's name says")
-            self._write_units(units)
+            self.file.write_units(units)
             if missing:
                 none = (
                     "none" if len(missing) == 3 else f"none {'of heights' if missing == {'sd_u'} else 'of all three'}"
@@ -286,14 +277,14 @@ class _Writer:
                 why = (
                     f"CHECK: m, 1-sigma east, north, up; the file states {none}, this is a receiver without corrections"
                 )
-                self._write_key("sd", _SD, why)
+                self.file.write_key("sd", _SD, why)
             if of_sea and ("geoid" not in values or "geoid" in dropped):
-                self._decide(f"heights: '{height}' may be above mean sea level; they are used as they are")
+                self.file.decide(f"heights: '{height}' may be above mean sea level; they are used as they are")
         if late is not None:
             words = f"velocities are not used: they come {late:.2f} s after the positions"
-            self.lines.append(f"# {words}")
-            self._decide(words)
-        self._write_lever_arm(
+            self.file.lines.append(f"# {words}")
+            self.file.decide(words)
+        self.file.write_lever_arm(
             source.log.gnss if source.log else None, "from the IMU to the antenna: right, forward, up"
         )
         self._write_time_offset(agreement)
@@ -311,101 +302,31 @@ class _Writer:
                     why += (
                         f"; the rest, {rest:+.2f} +-{max(sigma, 0.01):.2f}, is what the accelerations agree best with"
                     )
-            self._write_key("time_offset", f"{seconds:.2f}", why)
+            self.file.write_key("time_offset", f"{seconds:.2f}", why)
 
     def _write_odometer(self, source: Source, course: motion.Course | None, felt: tuple[Array, Array]) -> None:
-        self._begin("odometer")
-        self._write_file(source, "odometer")
+        self.file.begin("odometer")
+        self.file.write_file(source, "odometer")
         if source.log is None:
             speed = guesses.guess_speed_unit(
                 source.t, source.values["speed"], course, source.find_unit("speed", "speed")
             )
-            self._write_units({"t": source.t_unit, "speed": speed})
+            self.file.write_units({"t": source.t_unit, "speed": speed})
             lag = _find_odometer_lag(source.t, source.values["speed"] * SPEED[str(speed.value)], felt)
             if lag is not None and lag.correlation > LIKELY and abs(lag.seconds) > _SMALL:
                 sure = "" if lag.correlation > CLEAR else "CHECK: "
-                self._write_key("time_offset", f"{-lag.seconds:.2f}", f"{sure}s; {_describe_agreement(lag)}")
-                self._write_key("delay_sigma", "0.05", "s, what is left of it; it is estimated")
-        self._write_lever_arm(
+                self.file.write_key("time_offset", f"{-lag.seconds:.2f}", f"{sure}s; {_describe_agreement(lag)}")
+                self.file.write_key("delay_sigma", "0.05", "s, what is left of it; it is estimated")
+        self.file.write_lever_arm(
             source.log.odometer if source.log else None, "from the IMU to the middle of the rear axle"
         )
 
     def _write_barometer(self, source: Source) -> None:
-        self._begin("barometer")
-        self._write_file(source, "barometer")
+        self.file.begin("barometer")
+        self.file.write_file(source, "barometer")
         unit = guess_file_pressure_unit(source)
         assert unit is not None
-        self._write_units({"t": source.t_unit, "pressure": unit})
-
-    def _write_lever_arm(self, sensor: Gnss | Odometer | None, what: str) -> None:
-        """Write the lever arm of a log, if it has one."""
-        if sensor is not None and np.any(sensor.lever_arm):
-            self._write_key("lever_arm", _format_vector(sensor.lever_arm), f"m, {what}; as the log says")
-        else:
-            self._write_key("lever_arm", "[0.0, 0.0, 0.0]", f"CHECK: m, {what}")
-
-    # ---- lines
-
-    def _begin(self, table: str) -> None:
-        self.lines += ["", f"[{table}]"]
-        self.table = f"[{table}] "
-
-    def _decide(self, words: str) -> None:
-        self.decisions.append(self.table + words)
-
-    def _write_key(self, key: str, value: str, why: str) -> None:
-        self.lines.append(f"{key} = {value}".ljust(43) + f" # {why}")
-        self._decide(f"{key} = {value}: {why}")
-
-    def _write_file(self, source: Source, sensor: str, dropped: Sequence[str] = ()) -> None:
-        relative = Path(os.path.relpath(source.path.resolve(), self.folder.resolve())).as_posix()
-        if source.joined_from is not None:
-            relative = JOINED
-            self.made[relative] = source.values
-            rates, forces = (path.name for path in source.joined_from)
-            self._decide(f"{relative}: made of {rates} and {forces}, the forces at the times of the rates")
-        elif source.plain is not None:
-            relative = name_plain_file(source.path, sensor)
-            self.made[relative] = {source.columns.names[ours]: x for ours, x in source.values.items()}
-            words = f"made of {source.path.name}: {source.plain.words}"
-            self.lines.append(f"# {words}")
-            self._decide(f"{relative}: {words}")
-        self.lines.append(f"file = {quote(relative)}")
-        if source.unused:
-            self._decide(f"{source.path.name}: columns not used: {', '.join(source.unused)}")
-        if source.second:
-            words = f"CHECK: {source.second} may be of another sensor of this kind; to use that, give those in columns"
-            self.lines.append(f"# {words}")
-            self._decide(f"{relative}: {words}")
-        if source.log is not None and (topics := source.log.topics.get(sensor, ())):
-            why = "the only one"
-            if len(topics) > 1 and topics[0] in self.asked:
-                why = "as was asked"
-            elif len(topics) > 1:
-                why = (
-                    f"CHECK: it has the most messages; there is also {', '.join(topics[1:])}: to use it, draft again "
-                    f"with --topic {topics[1]} --force"
-                ) + (", since axes and noise are of this one" if sensor == "imu" else "")
-            self._write_key("topic", quote(topics[0]), why)
-        if source.joined_from is None and source.plain is None and not is_inside(source.path, self.folder):
-            words = f"{relative}: lies outside the folder of this file; use --allow-outside to read it"
-            self._decide(words)
-        names = {o: theirs for o, theirs in source.columns.names.items() if o not in dropped}
-        names = {o: theirs for o, theirs in names.items() if o != theirs or o == GEOID}
-        if names:
-            pairs = ", ".join(f"{ours} = {quote(theirs)}" for ours, theirs in names.items())
-            self.lines.append(f"columns = {{ {pairs} }}")
-
-    def _write_units(self, units: dict[str, Guess]) -> None:
-        default = {"type": "rtklib", "t": "s", "gyro": "rad/s", "accel": "m/s2", "angle": "deg", "speed": "m/s"}
-        default |= {"height": "m", "pressure": "Pa"}
-        for key, guess in units.items():
-            self._decide(f"{key} in {guess.value}: {guess.why}")
-        other = {key: guess for key, guess in units.items() if guess.value != default[key]}
-        if other:
-            pairs = ", ".join(f'{key} = "{guess.value}"' for key, guess in other.items())
-            why = "; ".join(f"{key}: {guess.why}" for key, guess in other.items())
-            self.lines.append(f"units = {{ {pairs} }}".ljust(43) + f" # {why}")
+        self.file.write_units({"t": source.t_unit, "pressure": unit})
 
 
 def _find_odometer_lag(t: Array, speed: Array, felt: tuple[Array, Array]) -> motion.Lag | None:
@@ -431,7 +352,3 @@ def _read_first(source: Source, sensor: str) -> float:
 
 def _describe_agreement(lag: motion.Lag) -> str:
     return f"the accelerations agree best with the IMU's so (coherence {lag.correlation:.2f})"
-
-
-def _format_vector(v: Array) -> str:
-    return "[" + ", ".join(f"{x:.4f}" for x in v) + "]"

@@ -1,0 +1,29 @@
+"""The rows around the keyframes that are built of them."""
+
+from __future__ import annotations
+
+from graphnav.core.findings import compute_period
+from graphnav.core.rotation import Array
+from graphnav.imu.samples import GAP
+from graphnav.online.looks import CONTEXT
+from graphnav.online.sensors import Sensors
+from graphnav.recording import Recording
+
+ROWS_AFTER = 0.1  # s of rows that keyframes use after the last of them
+ROWS_BEFORE = 2.0  # s of rows before a keyframe that its constraints use where the IMU has no gap; else `CONTEXT`
+
+
+def cut_around(sensors: Sensors, begin: float, end: float) -> Recording:
+    """The rows that keyframes between two times (s) use.
+
+    Only the noise of bridged IMU gaps depends on the signal of the last half minute.
+    """
+    near = sensors.make_recording(begin - ROWS_BEFORE, end)
+    t = near.imu.t
+    whole = len(t) > 2 and float((t[1:] - t[:-1]).max()) < GAP * compute_period(t)
+    return near if whole else sensors.make_recording(begin - CONTEXT, end)
+
+
+def compute_error_units(sensors: Sensors, recording: Recording) -> Array | None:
+    """(M, 3) m, the unit of time-correlated errors of a recording's fixes."""
+    return None if recording.gnss is None else sensors.gnss.compute_typical_sigmas(recording.gnss.t)[:, :3]
