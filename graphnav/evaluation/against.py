@@ -174,8 +174,10 @@ def read_against(asked: Against, name: str, recording: Recording, reference: Sol
     t = reference.t[known]
     states = _build_states(reference.frame, interpolate(track, t, max_gap=_MAX_GAP)[0])
     unknown = np.full((len(t), DIM, DIM), np.nan)
-    own = {"track": track, "borrowed": borrowed, "lever_arm": lever_arm}
-    return Foreign(name, reference.frame, t, states, unknown, notes=tuple(notes), **own)
+    return Foreign(
+        name, reference.frame, t, states, unknown,
+        notes=tuple(notes), track=track, borrowed=borrowed, lever_arm=lever_arm,
+    )  # fmt: skip
 
 
 def _shift(path: Path, track: Trajectory, recording: Recording, reference: Solution) -> tuple[float, list[str]]:
