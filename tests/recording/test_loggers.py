@@ -175,11 +175,12 @@ def test_a_course_in_radians_is_told_by_the_positions(plain, tmp_path):
     ("names", "scales", "more"),
     [
         ("lat,lon,alt,vel_n,vel_e,vel_d", (1e7, 1e7, 1e3, 1e2, 1e2, 1e2), ""),  # as MAVLink; its speeds are left alone
+        ("lat,lon,height,hAcc,vAcc,velN,velE,velD", (1e7, 1e7, *[1e3] * 6), ""),  # as u-blox
         ("lat,lon,hMSL [mm],hacc_mm,vacc_mm,velN_mm_s,velE_mm_s,velD_mm_s", (1, 1, 1e3, *[1e3] * 5), "v"),
         ("lat,lon,alt,NedVelX,NedVelY,NedVelZ", (1,) * 6, "v"),
         ("lat,lon,alt,vx,heading", (1,) * 5, ""),  # of which axes is not said: no speed along the heading
     ],
-    ids=["whole degrees", "millimetres", "axes in the name", "axes unknown"],
+    ids=["whole degrees", "whole degrees and mm", "millimetres", "axes in the name", "axes unknown"],
 )
 def test_units_and_axes_that_the_names_of_columns_state(plain, tmp_path, names, scales, more):
     imu, (_, rows) = plain
@@ -187,7 +188,7 @@ def test_units_and_axes_that_the_names_of_columns_state(plain, tmp_path, names, 
     moves = np.gradient(np.column_stack([place[0], place[1], place[2]]), t, axis=0)
     north, east = np.radians(moves[:, 0]) * 6.371e6, np.radians(moves[:, 1]) * 6.371e6 * np.cos(np.radians(place[0]))
     own = {"vn": north, "ve": east, "vd": -moves[:, 2], "sd": np.full(len(t), 0.03)}
-    columns = [*place, *(own[x] for x in (["sd"] * 2 if "acc" in names else []) + ["vn", "ve", "vd"])]
+    columns = [*place, *(own[x] for x in (["sd"] * 2 if "acc" in names.lower() else []) + ["vn", "ve", "vd"])]
     digits = 9 if scales[0] == 1 else 0
     cells = [[x, *(f"{y * s:.{digits}f}" for y, s in zip(row, scales, strict=False))]
              for (x, *_), row in zip(rows, zip(*columns, strict=True), strict=True)]  # fmt: skip
@@ -197,7 +198,7 @@ def test_units_and_axes_that_the_names_of_columns_state(plain, tmp_path, names, 
     assert (gnss.v is not None) == (more == "v")
     if more:
         assert gnss.v == pytest.approx(np.column_stack([east, north, moves[:, 2]]), abs=1e-4)
-    if "acc" in names:
+    if "acc" in names.lower():
         assert gnss.sd == pytest.approx(np.full((len(t), 3), 0.03))
 
 
