@@ -202,6 +202,23 @@ def test_units_and_axes_that_the_names_of_columns_state(plain, tmp_path, names, 
         assert gnss.sd == pytest.approx(np.full((len(t), 3), 0.03))
 
 
+@pytest.mark.parametrize("of", ["position_covariance_{}", "field.position_covariance{}", "position_covariance[{}]"])
+def test_a_table_of_ros_is_stamped_by_its_messages_and_its_variances_are_sigmas(plain, tmp_path, of):
+    imu, (_, rows) = plain
+    whole = read_drafted(tmp_path / "as it was", imu, ("t,lat,lon,h", [row[:4] for row in rows]))
+    late = [f"{1.7e9 + float(t) + 0.15:.6f}" for t, *_ in rows]
+    stamps = [(f"{1.7e9 + np.floor(float(t)):.0f}", f"{1e9 * (float(t) % 1.0):.0f}") for t, *_ in rows]
+    cells = [
+        [arrival, *stamp, *row[1:4], "0.04", "0", "0", "0", "0.09", "0", "0", "0", "0.25"]
+        for arrival, stamp, row in zip(late, stamps, rows, strict=True)
+    ]
+    head = ["Time", "header.stamp.secs", "header.stamp.nsecs", "latitude", "longitude", "altitude"]
+    moved = imu[0], [[f"{1.7e9 + float(t):.6f}", *rest] for t, *rest in imu[1]]
+    gnss = read_drafted(tmp_path / "ros", moved, (",".join([*head, *map(of.format, range(9))]), cells)).gnss
+    np.testing.assert_allclose(gnss.t - 1.7e9, whole.gnss.t, atol=1e-5)
+    np.testing.assert_allclose(gnss.sd, np.tile([0.2, 0.3, 0.5], (len(gnss.t), 1)))
+
+
 @pytest.mark.parametrize(
     "header", ["GForceX,GForceY,GForceZ", "accelerometer_m_s2[0],accelerometer_m_s2[1],accelerometer_m_s2[2]"]
 )

@@ -35,6 +35,18 @@ def convert_small_units(
     return matching.FileColumns(columns.names, units), names, add_words(plain, words)
 
 
+def convert_variances(table: Table, names: dict[str, str], plain: Plain | None) -> tuple[Table, Plain | None]:
+    """Sigmas of variances, which are what columns of a covariance hold; `names` are changed."""
+    squared = [ours for ours in _SIGMAS if "cov" in names.get(ours, "").lower()]
+    if not squared:
+        return table, plain
+    words = f"{', '.join(repr(names[ours]) for ours in squared)} are variances, made sigmas"
+    for ours in squared:
+        table = table.with_column(ours, np.sqrt(np.maximum(table[ours], 0.0)))
+        names[ours] = ours
+    return table, add_words(plain, words)
+
+
 def convert_whole_degrees(table: Table, names: dict[str, str], plain: Plain | None) -> tuple[Table, Plain | None]:
     """Places in whole numbers of 1e-7 deg, as u-blox and MAVLink have them, in deg, heights and accuracies in m.
 
