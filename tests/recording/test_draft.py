@@ -198,6 +198,15 @@ def test_axes_are_found_in_any_mount(tmp_path, letters):
     assert "time_offset" not in found.text
 
 
+def test_a_named_file_that_is_no_table_is_not_left_out_of_a_drive(tmp_path):
+    """Else an IMU beside fixes that are not read would become a walk."""
+    imu, *_ = write_logs(tmp_path)
+    other = tmp_path / "inspva.log"
+    other.write_text("#INSPVAXA,COM1,0,73.5,FINESTEERING,2130,345600.000;35.6,139.7\n" * 9)
+    with refused("draft.positions_unread", RecordingError, "inspva.log"):
+        draft([imu, other], tmp_path)
+
+
 def test_a_tilted_mount_gets_two_vectors(tmp_path):
     turn = exp(np.array([0.3, 0.2, 0.5]))
     found, recording = drafted(tmp_path, write_logs(tmp_path, turn=turn))

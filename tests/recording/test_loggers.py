@@ -202,6 +202,12 @@ def test_units_and_axes_that_the_names_of_columns_state(plain, tmp_path, names, 
         assert gnss.sd == pytest.approx(np.full((len(t), 3), 0.03))
 
 
+def test_first_rows_in_which_little_is_known_are_no_header(plain, tmp_path):
+    (header, rows), gnss = plain
+    first = [[t, *["#N/A"] * (len(rest))] for t, *rest in rows[:3]]
+    assert len(read_drafted(tmp_path, (header, [*first, *rows[3:]]), gnss).imu.t) == len(rows) - 3
+
+
 @pytest.mark.parametrize("of", ["position_covariance_{}", "field.position_covariance{}", "position_covariance[{}]"])
 def test_a_table_of_ros_is_stamped_by_its_messages_and_its_variances_are_sigmas(plain, tmp_path, of):
     imu, (_, rows) = plain

@@ -50,8 +50,8 @@ def convert_variances(table: Table, names: dict[str, str], plain: Plain | None) 
 def convert_whole_degrees(table: Table, names: dict[str, str], plain: Plain | None) -> tuple[Table, Plain | None]:
     """Places in whole numbers of 1e-7 deg, as u-blox and MAVLink have them, in deg, heights and accuracies in m.
 
-    Both write accuracies in mm (h_acc, v_acc); MAVLink's eph and epv, and whole numbers of speed and course, are in units
-    that these do not share, so they are left alone. `names` are changed.
+    Both write accuracies in mm (h_acc, v_acc); MAVLink's eph and epv, and whole numbers of speed and course, are in
+    units that these do not share, so they are left alone. `names` are changed.
     """
     at = {ours: x[np.isfinite(x)] for ours, x in table.columns.items() if ours != "t"}
     if not (is_in_whole_degrees(at["lat"], at["lon"]) and all(map(_are_whole, (at["lat"], at["lon"])))):
