@@ -50,6 +50,8 @@ DRIVE, _ = oracle.drive(
          {"t": "iTOW", "h": "height", "ve": "velE", "vd": "velD", "sd_e": "hAcc", "sd_u": "vAcc", "course": "headMot"}),
         ("time,seconds_elapsed,latitude,longitude,altitude,speed,bearing,horizontalAccuracy,verticalAccuracy", "gnss",
          {"h": "altitude", "course": "bearing", "sd_n": "horizontalAccuracy", "sd_u": "verticalAccuracy"}),
+        ("Time (s),Latitude (°),Longitude (°),Height (m),Velocity (m/s),Direction (°),Horizontal Accuracy (m)", "gnss",
+         {"speed": "Velocity (m/s)", "course": "Direction (°)", "sd_e": "Horizontal Accuracy (m)"}),
         ("t_s,lat_deg,lon_deg,h_m,speed_mps,course_deg,epe_m,hdop", "gnss", {"h": "h_m", "course": "course_deg"}),
         ("timestamp,wheel_speed_kmh,gear", "odometer", {"speed": "wheel_speed_kmh"}),
         ("t,wheel_fl_kmh,wheel_fr_kmh,RearLeft,rr", "odometer", {"speed_fl": "wheel_fl_kmh", "speed_rl": "RearLeft"}),

@@ -75,7 +75,7 @@ _PATTERNS: dict[str, tuple[str, ...]] = {
     "speed_rr": (rf"{_WHEEL}(?:rr|rear_right|right_rear){_SPEED}",),
     "course": (
         r"course(?:_over_ground)?|cog", r"(?:.*_)?(?:bearing|track|course|head_mot|motion_heading|heading_of_motion)",
-        r"heading|kurs",
+        r"heading|direction|kurs",  # phyphox has a direction beside its velocity
     ),
     "pressure": (
         r"(?:air_?|baro(?:met(?:er|ric))?_?|atmospheric_?|static_?|abs(?:olute)?_?)?pressure|baro(?:meter)?",
