@@ -34,7 +34,7 @@ from graphnav.core.earth import LocalFrame
 from graphnav.detectors import detect
 from graphnav.estimation.alignment import align
 from graphnav.estimation.noise.apply import apply_noise
-from graphnav.estimation.noise.estimate import estimate_noise
+from graphnav.estimation.noise.estimate import NoiseEstimate, estimate_noise
 from graphnav.estimation.pipeline import choose_origin
 from graphnav.estimation.problem import Problem, build_problem
 from graphnav.estimation.solvers.ekf import ekf
@@ -155,7 +155,13 @@ def filter_seconds(recording: Recording, settings: Settings) -> float:
 
 
 def build_with_noise(recording: Recording, settings: Settings, known_from: float = np.inf) -> Problem:
-    """A recording aligned and built with its noise model, as for any solver.
+    """A recording aligned and built with its noise model, as for any solver."""
+    base, found = estimate(recording, settings, known_from)
+    return apply_noise(base, found.noise)
+
+
+def estimate(recording: Recording, settings: Settings, known_from: float = np.inf) -> tuple[Problem, NoiseEstimate]:
+    """A recording aligned and built with stated noise, and its noise model.
 
     `known_from` are the first seconds of it from which the noise model is estimated.
     """
@@ -168,7 +174,7 @@ def build_with_noise(recording: Recording, settings: Settings, known_from: float
 
     base = build(recording)
     first = build(recording.crop(0.0, known_from)) if known_from < recording.end - recording.start else base
-    return apply_noise(base, estimate_noise(first, found.until).noise)
+    return base, estimate_noise(first, found.until)
 
 
 def report(hour: int, found: np.ndarray, filtered: float, errors: np.ndarray, cpu: float, rows: int) -> None:

@@ -140,7 +140,7 @@ def made(mistake: Mistake, room: Path) -> tuple[int, list[str]]:
     if command[0] == "info":  # for the keys
         command = (*command, "--json")
     code, out, err = run(command, room, full="no space" in mistake.what)
-    if code:
+    if code and not out:
         return code, err.splitlines()
     found = json.loads(out)["findings"] if command[0] == "info" else []
     return code, [Note(one["key"], f"{one['severity']}: {one['sentence']}") for one in found]

@@ -122,7 +122,8 @@ def info(
 ) -> None:
     """Check a recording: its contents, and errors in it.
 
-    Clocks, units, axes and lever arms of the sensors are checked against each other.
+    Clocks, units, axes and lever arms of the sensors are checked against each other. Leaves with 2 if the recording
+    cannot be solved.
     """
     from graphnav.recording.checks.overview import inspect
     from graphnav.recording.formats import read
@@ -138,7 +139,8 @@ def info(
         more = (find_wrong_axes(*drive) or find_wrong_arms(*drive)) if found.trusted and not quick else []
         last = [find_antenna(whole).finding] if antenna else find_untold_arm(found.recording)
         found = replace(found, findings=(*more, *found.findings, *last))
-    print_out(found.format, found.to_dict, quiet, json, found.list_defects)
+    print_out(found.format, found.to_dict, quiet, json, lambda: found.list_defects("unreliable"))
+    found.refuse()
 
 
 @app.command(context_settings=SEVERAL, epilog="\b\nExample:\n  graphnav detect kitti -o out/kitti")

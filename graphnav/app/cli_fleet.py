@@ -23,7 +23,7 @@ from graphnav.app.cli_options import (
     Without,
     choose_solver,
 )
-from graphnav.app.talk import Interrupted, print_out, say
+from graphnav.app.talk import NOT_MET, Interrupted, print_out, say, warn
 from graphnav.core.errors import ConfigError
 from graphnav.core.notes import format_count
 
@@ -76,7 +76,8 @@ def fleet(
 ) -> None:
     """Solve many recordings and tabulate the results.
 
-    Each is solved as smooth would. The same command goes on after an interruption.
+    Each is solved as smooth would. The same command goes on after an interruption. Leaves with 3 if some drives have no
+    result, with 2 if none has.
     """
     from graphnav.app import convert, outputs
     from graphnav.app.fleet import manifest, page, tables, workers
@@ -142,11 +143,17 @@ def fleet(
         json,
         lambda: [f"{row['drive']}: {row.get('doubts') or _format_drive(row)}" for row in _select_wrong(rows)],
     )
-    if not any(row["status"] == DONE for row in rows):
+    lost = sum(row["status"] != DONE for row in rows)
+    if lost == len(rows):
         raise ConfigError(
-            f"{source}: none of {format_count(len(rows), 'drive')} could be solved; {folder / 'fleet.csv'} says why",
+            f"{source}: none of {format_count(lost, 'drive')} could be solved; {folder / 'fleet.csv'} says why",
             key="fleet.none_solved",
         )
+    if lost:
+        warn(
+            [f"{source}: {lost} of {format_count(len(rows), 'drive')} have no result; {folder / 'fleet.csv'} says why"]
+        )
+        raise typer.Exit(NOT_MET)
 
 
 def _count_processors() -> int:

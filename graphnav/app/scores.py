@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -11,10 +11,11 @@ import numpy as np
 from graphnav.constraints.antenna_motion import LEVER_ARM
 from graphnav.constraints.gnss import CLOCK_RATE, TIME_OFFSET
 from graphnav.core import rotation
+from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.core.trajectory import Trajectory
 from graphnav.estimation.solution import Solution, make_trajectory
-from graphnav.evaluation.against import Foreign, drop_attitude, select_own
+from graphnav.evaluation.against import Foreign, drop_attitude, find_antenna_lever_arm, format_arm, select_own
 from graphnav.evaluation.scoring import MAX_GAP, measure_spacing
 from graphnav.recording import Recording
 
@@ -30,6 +31,7 @@ _MOST_TURNING = 20_000  # the same where a point at the end of a lever arm moves
 _ENOUGH_KEYFRAMES = 1000  # number of keyframes that makes other epochs unnecessary
 # s; between epochs that count as one, and between rows too close for anything to happen
 _SAME, _BETWEEN_ROWS = 1e-4, 0.02
+_SAME_POINT = 1e-3  # m
 OUTAGE = 10.0  # s; a longer interval between fixes is scored as an outage
 
 
@@ -94,17 +96,30 @@ def score(
         metrics = evaluate_recording(track, recording, withheld=asked, at=epochs, antenna=antenna)
         if metrics is None:
             return {}, None, ()
-        borrowed = isinstance(solution, Foreign) and solution.borrowed
-        found[name] = drop_attitude(metrics) if borrowed else metrics
+        if isinstance(solution, Foreign):
+            metrics = drop_attitude(metrics) if solution.borrowed else metrics
+            if truth is None or truth.of == "gnss":
+                ours = list(select_own(solutions).values())
+                metrics = replace(metrics, notes=(*metrics.notes, *_tell_arms(name, solution, ours, recording)))
+        found[name] = metrics
     return found, against, tuple(name for name, _ in spans)
 
 
+def _tell_arms(name: str, other: Foreign, ours: Sequence[Solution], recording: Recording) -> list[str]:
+    """A note where another program's antenna is elsewhere on the body than ours."""
+    own = find_antenna_lever_arm(recording, ours[-1]) if ours else None
+    if own is None or other.lever_arm is None or np.allclose(own, other.lever_arm, rtol=0.0, atol=_SAME_POINT):
+        return []
+    words = f"[{format_arm(other.lever_arm)}] m as stated, ours at [{format_arm(own)}] m as found"
+    return [Note("against.lever_arm", f"{name}: its antenna is at {words} (right, forward, up)")]
+
+
 def _read_antenna(solution: Solution, recording: Recording) -> AntennaCalibration:
-    """The estimates of the antenna, of each piece its last; as stated where there are none, as in another program's
-    trajectory.
-    """
+    """The estimates of the antenna, of each piece its last; as stated where there are none."""
     from graphnav.evaluation.evaluate import AntennaCalibration
 
+    if isinstance(solution, Foreign):
+        return AntennaCalibration(lever_arm=None if solution.lever_arm is None else solution.lever_arm[None])
     begin = np.array([-np.inf, *(piece.start for piece in solution.between[1:])])
 
     def collect(name: str, stated: Array) -> Array:

@@ -17,6 +17,7 @@ from graphnav.constraints.gnss import TIMES
 from graphnav.core.notes import format_count, get_key
 from graphnav.core.progress import Progress
 from graphnav.core.staging import defer_interrupts
+from graphnav.estimation.names import name_rows
 from graphnav.estimation.noise.model import TABULATED
 from graphnav.estimation.solution import Solution
 from graphnav.evaluation.metrics import SpanErrors
@@ -25,7 +26,6 @@ _OF_IMU = {
     "imu.gyro_noise_density": "gyro", "imu.accel_noise_density": "accelerometer",
     "imu.gyro_bias_walk": "gyro bias walk", "imu.accel_bias_walk": "accelerometer bias walk",
 }  # fmt: skip
-_FIXES = {"gnss_position": "positions", "gnss_velocity": "velocities"}
 _ERRORS = (
     ("hor. rms", "h", "rms", "m"), ("hor. max", "h", "max", "m"), ("up rms", "up", "rms", "m"),
     ("roll rms", "roll", "rms", "deg"), ("pitch rms", "pitch", "rms", "deg"), ("head. rms", "heading", "rms", "deg"),
@@ -79,7 +79,7 @@ def _describe_noise(outcome: Outcome) -> list[str]:
         ratios = [(axis, compute_whole_ratio(noise, source, axis)) for axis in ("horizontal", "up")]
         factors = " and ".join(f"x {format_short(ratio)} {axis}" for axis, ratio in ratios if ratio is not None)
         if factors:  # no common figure where each type has its own
-            parts.append(f"{_FIXES.get(name, name)}{f' ({kind})' if kind else ''} {factors}")
+            parts.append(f"{name_rows(name)}{f' ({kind})' if kind else ''} {factors}")
     given = outcome.request.noise
     how = "estimated" if given is None else "as given" if given.file is None else f"from {given.file}"
     return [f"noise {how}, in stated sigmas: {', '.join(parts)}"]

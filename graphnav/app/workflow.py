@@ -24,6 +24,7 @@ from graphnav.core.errors import ConfigError, EstimationError, RecordingError
 from graphnav.core.findings import Finding
 from graphnav.core.notes import Note, format_count, get_key
 from graphnav.core.progress import Progress, send_progress, tell
+from graphnav.estimation.names import name_rows
 from graphnav.estimation.noise.model import INTERVALS, NoiseModel, StampOffsets
 from graphnav.estimation.solution import Solution
 from graphnav.evaluation.against import Against, read_against, select_own
@@ -273,7 +274,7 @@ def list_unused_noise(noise: NoiseModel, solution: Solution) -> list[str]:
     have = dict.fromkeys(INTERVALS, solution.t) | {name: record.t for name, record in solution.records.items()}
     named = {group.split(".")[0] for group in noise.figures} - {"imu"} | set(noise.weights) | set(noise.excluded)
     notes: list[str] = [
-        Note("noise.file.unused", f"noise model: figures of {name}, which are not used for this recording")
+        Note("noise.file.unused", f"noise model: figures of {name_rows(name)}, which are not used for this recording")
         for name in sorted(named - set(have))
     ]
     for name, some in noise.weights.items():
@@ -286,7 +287,7 @@ def list_unused_noise(noise: NoiseModel, solution: Solution) -> list[str]:
                 notes.append(
                     Note(
                         "noise.file.rows",
-                        f"noise model: {format_count(lost, 'weight')} of {len(some.t)} for {name} "
+                        f"noise model: {format_count(lost, 'weight')} of {len(some.t)} for {name_rows(name)} "
                         "without a row in this recording",
                     )
                 )
@@ -296,7 +297,7 @@ def list_unused_noise(noise: NoiseModel, solution: Solution) -> list[str]:
             notes.append(
                 Note(
                     "noise.file.spans",
-                    f"noise model: {format_count(lost, 'excluded span')} of {len(spans)} of {name} "
+                    f"noise model: {format_count(lost, 'excluded span')} of {len(spans)} of {name_rows(name)} "
                     "without a row in this recording",
                 )
             )

@@ -1,4 +1,4 @@
-"""Names and units, for people, of the numbers of a calibration, by the names that constraints give them."""
+"""Names, for people, of constraints' rows and of the numbers of a calibration, by the names in code and files."""
 
 from __future__ import annotations
 
@@ -9,6 +9,17 @@ from functools import cache
 from graphnav.constraints import list_constraints
 from graphnav.imu.dynamics import SCALE, TERMS, VEHICLE_TERMS
 
+# the rows of constraints whose own names say too little
+_ROWS = {
+    "gnss_position": "GNSS positions", "gnss_velocity": "GNSS velocities", "gnss_code": "GNSS codes",
+    "gnss_doppler": "Doppler shifts", "gnss_carrier": "carriers between epochs", "gnss_phase": "carrier phases",
+    "gnss_integers": "integers of carriers", "gnss_ppp_code": "codes of two signals",
+    "gnss_ppp_carrier": "carriers of two signals", "gnss_antenna_clone": "antenna at the epoch before",
+    "nhc": "non-holonomic constraint", "stance": "stances", "foot_lateral": "sideways speed of the foot",
+    "barometer": "barometric heights", "dual_antenna_heading": "heading of two antennas",
+    "dual_antenna_pitch": "pitch of two antennas", "zero_velocity": "zero velocity at stops",
+    "zero_rate": "zero rate at stops", "held_position": "held position at stops",
+}  # fmt: skip
 _AXIS_NAMES = ("right", "forward", "up")
 _TO_DEG = 57.29577951308232
 
@@ -60,6 +71,11 @@ _NAMED = {
         Component("foot's sideways axis, upward part", "deg", _TO_DEG),
     ],
 }
+
+
+def name_rows(name: str) -> str:
+    """The rows of a constraint."""
+    return _ROWS.get(name, name.replace("_", " "))
 
 
 def has_names(name: str) -> bool:

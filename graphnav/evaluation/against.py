@@ -61,6 +61,8 @@ class Foreign(Solution):
     track: Trajectory = field(default_factory=lambda: Trajectory(np.empty(0), np.empty((0, 3))))
     # whether the attitude is borrowed from our solution to refer points of the body, and not its own
     borrowed: bool = False
+    # (3,) m from the IMU to its antenna, RFU: by which a file of the antenna was moved, else as stated
+    lever_arm: Array | None = None
 
     def trajectory(self, rate: float | None = None, joint: bool = True) -> Trajectory:
         """The trajectory at the keyframes of the solution beside it, or at `rate` (Hz), with what it states."""
@@ -132,14 +134,16 @@ def read_against(asked: Against, name: str, recording: Recording, reference: Sol
                 f"{asked.path.name}: metres in a local frame, rotated by {np.degrees(yaw):.1f} deg onto ours",
             )
         )
-    arm = asked.point
-    if isinstance(arm, str):
-        stated = find_antenna_lever_arm(recording, reference) if arm == "antenna" else np.zeros(3)
-        if stated is None:
+    arm, ours = asked.point, find_antenna_lever_arm(recording, reference)
+    lever_arm = None if recording.gnss is None else recording.gnss.lever_arm
+    if isinstance(arm, str) and arm == "antenna":
+        if ours is None:
             raise RecordingError(
                 f"{asked.path}: is to be of the antenna, and '{recording.name}' has no GNSS", key="against.no_gnss"
             )
-        arm = stated
+        arm = lever_arm = ours
+    elif isinstance(arm, str):
+        arm = np.zeros(3)
     _require_same_drive(asked, track, recording, reference)
     borrowed = track.rph is None
     if borrowed:
@@ -161,26 +165,19 @@ def read_against(asked: Against, name: str, recording: Recording, reference: Sol
         track = interpolate(track, track.t, max_gap=_MAX_GAP, lever_arm=-arm)[0]
         notes.append(
             Note(
-                "against.point", f"{asked.path.name}: moved to the IMU from [{_format_arm(arm)}] m (right, forward, up)"
+                "against.point", f"{asked.path.name}: moved to the IMU from [{format_arm(arm)}] m (right, forward, up)"
             )
         )
-    if _ARM in reference.noise.freed and recording.truth is not None and recording.truth.of == "gnss":
-        found = find_antenna_lever_arm(recording, reference)
-        assert found is not None
-        notes.append(
-            Note(
-                "against.lever_arm",
-                f"{asked.path.name}: compared with the antenna's truth at lever_arm as stated, ours at "
-                f"[{_format_arm(found)}] m as found",
-            )
-        )
-    notes += _find_other_point(asked.path, track, arm, find_antenna_lever_arm(recording, reference), reference)
+    notes += _find_other_point(asked.path, track, arm, ours, reference)
     track = replace(track, name=name)
     _, known = interpolate(track, reference.t, max_gap=_MAX_GAP)
     t = reference.t[known]
     states = _build_states(reference.frame, interpolate(track, t, max_gap=_MAX_GAP)[0])
     unknown = np.full((len(t), DIM, DIM), np.nan)
-    return Foreign(name, reference.frame, t, states, unknown, notes=tuple(notes), track=track, borrowed=borrowed)
+    return Foreign(
+        name, reference.frame, t, states, unknown,
+        notes=tuple(notes), track=track, borrowed=borrowed, lever_arm=lever_arm,
+    )  # fmt: skip
 
 
 def _shift(path: Path, track: Trajectory, recording: Recording, reference: Solution) -> tuple[float, list[str]]:
@@ -298,10 +295,10 @@ def _find_other_point(
         # a stationary vehicle adds little
         return float(np.mean(np.linalg.norm(left - np.median(left, axis=0), axis=1)))
 
-    points = {f"[{_format_arm(-arm)}] m, the arm with the other signs": -arm, "the IMU": np.zeros(3)}
+    points = {f"[{format_arm(-arm)}] m, the arm with the other signs": -arm, "the IMU": np.zeros(3)}
     if antenna is not None:
         points["the antenna"] = antenna
-        points[f"[{_format_arm(-antenna)}] m, the antenna's arm with the other signs"] = -antenna
+        points[f"[{format_arm(-antenna)}] m, the antenna's arm with the other signs"] = -antenna
     misses = {name: miss(point) for name, point in points.items()}
     best = min(misses, key=lambda name: misses[name])
     if not misses[best] < _MENDED * miss(arm):
@@ -315,7 +312,8 @@ def _find_other_point(
     ]
 
 
-def _format_arm(arm: Array) -> str:
+def format_arm(arm: Array) -> str:
+    """A lever arm (3,), m, to the centimetre."""
     return ", ".join(f"{x:.2f}" for x in arm)
 
 

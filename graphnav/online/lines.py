@@ -117,19 +117,46 @@ def read_setup(line: str) -> tuple[Recording, LineUnits]:
             f"line 1: a live source begins with '{PROTOCOL}' and a setup as JSON, not with '{line[:40]}'",
             key="online.first_line",
         )
+    try:
+        keys = parse_json(text or "{}")
+    except ValueError as error:
+        raise RecordingError(f"line 1: the setup is not JSON ({error})", key="online.setup_json") from None
+    return make_setup(keys, "line 1: setup")
+
+
+def make_setup(keys: Mapping[str, Any], where: str = "setup") -> tuple[Recording, LineUnits]:
+    """The sensors described by the keys of the first line of a source, and the units of its numbers.
+
+    Parameters
+    ----------
+    keys
+        Tables of recording.toml without files: ``{"imu": {"axes": "FRD", "units": {"gyro": "deg/s"}}, "gnss": {}}``.
+    where
+        They stand, for errors.
+
+    Returns
+    -------
+    setup : Recording
+        Without rows, as `Online` needs it.
+    units : LineUnits
+        For `ImuSample`, `Fix`, `WheelSpeed` and `Reading`.
+
+    Raises
+    ------
+    RecordingError
+        In one plain sentence, if a key or value is none.
+    """
     known = list_sensors()
     others: Any = {name: (_describe_live(sensor) | None, None) for name, sensor in known.items()}
     model = create_model("_Setup", __base__=_Setup, **others)
     try:
-        found = model.model_validate(parse_json(text or "{}"))
+        found = model.model_validate(keys)
     except ValidationError as error:
-        raise RecordingError(describe_invalid("line 1: setup", error, model)) from None
-    except ValueError as error:
-        raise RecordingError(f"line 1: the setup is not JSON ({error})", key="online.setup_json") from None
+        raise RecordingError(describe_invalid(where, error, model)) from None
     try:
         R_bs = found.imu.R_bs
     except ValueError as error:
-        raise RecordingError(f"line 1: setup: 'imu.axes', 'forward' or 'up' {error}", key="key.value") from None
+        raise RecordingError(f"{where}: 'imu.axes', 'forward' or 'up' {error}", key="key.value") from None
     stated = found.imu.figures
     gnss = odometer = None
     if found.gnss is not None:
@@ -183,7 +210,7 @@ def _find_units(found: Any, others: Mapping[str, tuple[Sensor, Any]]) -> LineUni
     if found.odometer is not None:
         sizes["odometer"] = (SPEED[found.odometer.units.speed],) * 6
     for name, (sensor, one) in others.items():
-        sizes[name] = tuple(c.units[getattr(one.units, c.name)] / _tell_scale(c) for c in sensor.columns)
+        sizes[name] = tuple(c.units[getattr(one.units, c.name)] / tell_scale(c) for c in sensor.columns)
     R_bs = found.imu.R_bs
     return LineUnits(
         {name: time for name, time in times.items() if time != (1.0, 0.0)},
@@ -242,10 +269,10 @@ def _parse_series_row(cells: list[str]) -> Row:
         t, *numbers = (parse_number(cell) if cell.strip() else float("nan") for cell in cells[1:])
     except ValueError:
         raise ValueError(f"'S,{','.join(cells)[:40]}' holds something that is no number") from None
-    return name, t, tuple(x * _tell_scale(c) for x, c in zip(numbers, sensor.columns, strict=True))
+    return name, t, tuple(x * tell_scale(c) for x, c in zip(numbers, sensor.columns, strict=True))
 
 
-def _tell_scale(column: Column) -> float:
+def tell_scale(column: Column) -> float:
     """Size in SI of the default unit of files."""
     return next(iter(column.units.values()))
 
@@ -279,7 +306,7 @@ def format_line(row: Row) -> str:
         return f"R,{t!r},{format_epoch(values)}"
     if sensor != "gnss":
         columns = list_sensors()[sensor].columns
-        numbers = [x / _tell_scale(column) for x, column in zip(values, columns, strict=True)]
+        numbers = [x / tell_scale(column) for x, column in zip(values, columns, strict=True)]
         return f"S,{sensor},{t!r}," + ",".join("" if np.isnan(x) else repr(x) for x in numbers)
     lat, lon = float(np.degrees(values[0])), float(np.degrees(values[1]))
     rest = values[2:6] if np.isnan(values[6]) else values[2:]

@@ -14,6 +14,7 @@ from graphnav.core.complaints import suggest_nearest
 from graphnav.core.errors import RecordingError
 from graphnav.core.trajectory import Trajectory
 from graphnav.estimation.solution import make_trajectory
+from graphnav.online.lines import LineUnits, tell_scale
 from graphnav.online.steady import Online
 from graphnav.recording import Gnss, Imu, ImuNoise, Odometer, Recording
 from graphnav.recording.plausibility.fixes import FASTEST
@@ -22,6 +23,7 @@ from graphnav.sensors import Sensor, Series
 
 _NONE, _ROWS = np.empty(0), np.empty((0, 3))
 _UNKNOWN = (float("nan"),) * 3
+_SI = LineUnits()
 _HEIGHTS = (-1000.0, 50000.0)  # m, as in files
 
 
@@ -38,7 +40,7 @@ class ImuSample(_Row):
     """The mean rate and specific force of the sample period that ends at `t` (s).
 
     `gyro` (3,) in rad/s with respect to inertial space, about right, forward, up of the body; `accel` (3,) in m/s^2,
-    specific force along them, +9.8 upward at rest.
+    specific force along them, +9.8 upward at rest; in the units and axes of `units`, by `make_setup`, where given.
 
     Raises
     ------
@@ -48,17 +50,19 @@ class ImuSample(_Row):
 
     __slots__ = ()
 
-    def __new__(cls, t: float, gyro: Sequence[float], accel: Sequence[float]) -> ImuSample:
-        rate = _check_vector(cls, t, "gyro", "rad/s", gyro, GYRO_RANGE, "is it in deg/s?")
-        force = _check_vector(cls, t, "accel", "m/s2", accel, ACCEL_RANGE, "is it in mg?")
-        return super().__new__(cls, ("imu", _check_time(cls, t), (*rate, *force)))
+    def __new__(cls, t: float, gyro: Sequence[float], accel: Sequence[float], units: LineUnits = _SI) -> ImuSample:
+        given = (*_check_vector(cls, t, "gyro", "rad/s", gyro), *_check_vector(cls, t, "accel", "m/s2", accel))
+        row = units.convert(("imu", _check_number(cls, t, "t", t), given))
+        rate = _check_vector(cls, t, "gyro", "rad/s", row[2][:3], GYRO_RANGE, "is it in deg/s?")
+        force = _check_vector(cls, t, "accel", "m/s2", row[2][3:], ACCEL_RANGE, "is it in mg?")
+        return super().__new__(cls, ("imu", row[1], (*rate, *force)))
 
 
 class Fix(_Row):
     """A position of the antenna at `t` (s, on the IMU's clock), and its velocity if there is one.
 
     `lat`, `lon` in deg, `h` in m above the ellipsoid, `sd` (3,) in m, 1-sigma east, north, up; `v` and `sd_v` (3,) in
-    m/s, east, north, up, and its 1-sigmas.
+    m/s, east, north, up, and its 1-sigmas; in those of `units`, by `make_setup`, where given.
 
     Raises
     ------
@@ -77,30 +81,34 @@ class Fix(_Row):
         sd: Sequence[float],
         v: Sequence[float] | None = None,
         sd_v: Sequence[float] | None = None,
+        units: LineUnits = _SI,
     ) -> Fix:
         place = [_check_number(cls, t, name, x) for name, x in (("lat", lat), ("lon", lon), ("h", h))]
-        if not abs(place[0]) <= 90.0 or not -180.0 <= place[1] <= 360.0:
-            raise RecordingError(f"Fix at t = {t}: lat {lat}, lon {lon} is no place in degrees", key="row.place")
-        if not _HEIGHTS[0] <= place[2] <= _HEIGHTS[1]:
-            raise RecordingError(f"Fix at t = {t}: h {h} is no height of a drive in m", key="row.height")
-        sigmas = _check_vector(cls, t, "sd", "m", sd, np.inf)
+        place[:2] = np.radians(place[:2]).tolist()
+        sigma = _check_vector(cls, t, "sd", "m", sd)
         speeds, of_speeds = _UNKNOWN, _UNKNOWN
         if (v is None) != (sd_v is None):
             raise RecordingError(f"Fix at t = {t}: v and sd_v go together, m/s east, north, up", key="row.velocity")
         if v is not None and sd_v is not None:
-            speeds = _check_vector(cls, t, "v", "m/s", v, FASTEST, "is it in km/h or mm/s?")
-            of_speeds = _check_vector(cls, t, "sd_v", "m/s", sd_v, np.inf)
-        for name, values in (("sd", sigmas), ("sd_v", of_speeds)):
+            speeds, of_speeds = (_check_vector(cls, t, name, "m/s", x) for name, x in (("v", v), ("sd_v", sd_v)))
+        given = (*place, *sigma, *speeds, *of_speeds)
+        row = units.convert(("gnss", _check_number(cls, t, "t", t), given))
+        lat_rad, lon_rad, height = row[2][:3]
+        if not abs(lat_rad) <= 0.5 * np.pi or not -np.pi <= lon_rad <= 2.0 * np.pi:
+            raise RecordingError(f"Fix at t = {t}: lat {lat}, lon {lon} is no place in degrees", key="row.place")
+        if not _HEIGHTS[0] <= height <= _HEIGHTS[1]:
+            raise RecordingError(f"Fix at t = {t}: h {h} is no height of a drive in m", key="row.height")
+        if v is not None:
+            _check_vector(cls, t, "v", "m/s", row[2][6:9], FASTEST, "is it in km/h or mm/s?")
+        for name, values in (("sd", row[2][3:6]), ("sd_v", row[2][9:])):
             if min(values) <= 0.0:
                 raise RecordingError(f"Fix at t = {t}: {name} {values}: 1-sigmas must be above zero", key="row.sigma")
-        lat_rad, lon_rad = (float(x) for x in np.radians(place[:2]))
-        return super().__new__(
-            cls, ("gnss", _check_time(cls, t), (lat_rad, lon_rad, place[2], *sigmas, *speeds, *of_speeds))
-        )
+        return super().__new__(cls, row)
 
 
 class WheelSpeed(_Row):
-    """The forward speed of the point that does not slip, m/s, forward positive, at `t` (s).
+    """The forward speed of the point that does not slip, m/s, forward positive, at `t` (s); in those of `units`, by
+    `make_setup`, where given.
 
     Raises
     ------
@@ -110,17 +118,20 @@ class WheelSpeed(_Row):
 
     __slots__ = ()
 
-    def __new__(cls, t: float, speed: float) -> WheelSpeed:
-        value = _check_number(cls, t, "speed", speed)
-        if not abs(value) <= FASTEST:
+    def __new__(cls, t: float, speed: float, units: LineUnits = _SI) -> WheelSpeed:
+        given = (_check_number(cls, t, "speed", speed), *_UNKNOWN, *_UNKNOWN[:2])
+        row = units.convert(("odometer", _check_number(cls, t, "t", t), given))
+        if not abs(row[2][0]) <= FASTEST:
             raise RecordingError(
-                f"WheelSpeed at t = {t}: {speed} m/s, which no vehicle reaches: is it in km/h or mm/s?", key="row.speed"
+                f"WheelSpeed at t = {t}: {row[2][0]:g} m/s, which no vehicle reaches: is it in km/h or mm/s?",
+                key="row.speed",
             )
-        return super().__new__(cls, ("odometer", _check_time(cls, t), (value, *_UNKNOWN, *_UNKNOWN[:2])))
+        return super().__new__(cls, row)
 
 
 class Reading(_Row):
-    """A row of another sensor (`graphnav.sensors`) at `t` (s): its columns by name, in SI.
+    """A row of another sensor (`graphnav.sensors`) at `t` (s): its columns by name, in SI; in those of `units`, by
+    `make_setup`, where given.
 
     Raises
     ------
@@ -130,19 +141,24 @@ class Reading(_Row):
 
     __slots__ = ()
 
-    def __new__(cls, t: float, sensor: Sensor, **columns: float) -> Reading:
+    def __new__(cls, t: float, sensor: Sensor, units: LineUnits | None = None, **columns: float) -> Reading:
         for name in columns:
             if name not in sensor.names:
                 raise RecordingError(
                     f"Reading of {sensor.name} at t = {t}: {suggest_nearest(name, sensor.names)}", key="row.name"
                 )
-        values = np.array([_check_number(cls, t, n, columns[n]) if n in columns else np.nan for n in sensor.names])
+        given = [_check_number(cls, t, n, columns[n]) if n in columns else np.nan for n in sensor.names]
+        time = _check_number(cls, t, "t", t)
+        if units is not None:
+            as_in_files = tuple(x * tell_scale(c) for x, c in zip(given, sensor.columns, strict=True))
+            _, time, given[:] = units.convert((sensor.name, time, as_in_files))
+        values = np.array(given)
         if not sensor.mask_usable(sensor.mask_outside_bounds(values)[None])[0]:
             wanted = " or ".join(" and ".join(some) for some in sensor.needs)
             raise RecordingError(
                 f"Reading of {sensor.name} at t = {t}: needs {wanted}, in SI and within its bounds", key="row.bounds"
             )
-        return super().__new__(cls, (sensor.name, _check_time(cls, t), tuple(values.tolist())))
+        return super().__new__(cls, (sensor.name, time, tuple(values.tolist())))
 
 
 def live_setup(
@@ -177,7 +193,7 @@ def live_setup(
     if platform not in ("vehicle", "foot"):
         raise RecordingError(f"live_setup: platform '{platform}': vehicle or foot", key="row.platform")
     imu = Imu(_NONE, _ROWS, _ROWS, noise or ImuNoise(), noise_assumed=noise is None)
-    arms = [None if arm is None else np.array(_check_vector(None, 0.0, what, "m", arm, np.inf))
+    arms = [None if arm is None else np.array(_check_vector(None, 0.0, what, "m", arm))
             for what, arm in (("antenna", antenna), ("axle", axle))]  # fmt: skip
     gnss = None if arms[0] is None else Gnss(_NONE, _ROWS, _ROWS, lever_arm=arms[0])
     odometer = None if arms[1] is None else Odometer(_NONE, _NONE, arms[1])
@@ -217,12 +233,8 @@ def _check_number(kind: type | None, t: float, name: str, value: float) -> float
     return found
 
 
-def _check_time(kind: type, t: float) -> float:
-    return _check_number(kind, t, "t", t)
-
-
 def _check_vector(
-    kind: type | None, t: float, name: str, unit: str, values: Sequence[float], most: float, hint: str = ""
+    kind: type | None, t: float, name: str, unit: str, values: Sequence[float], most: float = np.inf, hint: str = ""
 ) -> tuple[float, float, float]:
     """Check three finite numbers of limited size."""
     try:

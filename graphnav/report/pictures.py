@@ -12,7 +12,7 @@ from markupsafe import Markup
 from graphnav.core.rotation import Array
 from graphnav.core.trajectory import Trajectory
 from graphnav.detectors.base import Detection
-from graphnav.estimation.names import name_components
+from graphnav.estimation.names import name_components, name_rows
 from graphnav.estimation.solution import ParameterEstimate, Solution
 from graphnav.evaluation.against import select_own
 from graphnav.recording import Recording
@@ -308,7 +308,7 @@ def record_pictures(solution: Solution, start: float, end: float, spans: Shades)
         dof = record.residual.shape[1]
         note = f"The lines are at 3 sigma; NIS is chi-square with {dof} degree{'s' if dof > 1 else ''} of freedom"
         note += "." if record.kind == "innovation" else " at most, as a fit takes up part of the noise."
-        out.append(page.place_picture(figure, f"{kind}: {record.kind}s over their sigma", note))
+        out.append(page.place_picture(figure, f"{name_rows(kind)}: {record.kind}s over their sigma", note))
     return out
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from markupsafe import Markup
 
 from graphnav.core.rotation import Array
+from graphnav.estimation.names import name_rows
 from graphnav.estimation.solution import ConstraintRecord, Solution
 from graphnav.report import page
 from graphnav.report.plots import Shades
@@ -33,7 +34,7 @@ def make_satellite_parts(solution: Solution, start: float, end: float, spans: Sh
     what = " and ".join(sorted(f"{one}s" for one in kinds)).capitalize()
     seen = [
         page.place_picture(
-            plots.plot_sky(first, name), f"Sky, by the rows of {kind}", "North is up, the zenith in the middle."
+            plots.plot_sky(first, name), f"Sky, by {name_rows(kind)}", "North is up, the zenith in the middle."
         ),
         page.place_picture(
             plots.plot_used_satellites(records, start, end, name, spans=spans),
@@ -41,7 +42,7 @@ def make_satellite_parts(solution: Solution, start: float, end: float, spans: Sh
         ),
     ]
     by_satellite = [
-        page.place_picture(plots.plot_residuals_by_satellite(one, r, name), f"{one}: {r.kind}s by satellite")
+        page.place_picture(plots.plot_residuals_by_satellite(one, r, name), f"{name_rows(one)}: {r.kind}s by satellite")
         for one, r in records.items()
     ]
     out = [
@@ -49,7 +50,8 @@ def make_satellite_parts(solution: Solution, start: float, end: float, spans: Sh
         page.gallery(
             [
                 page.place_picture(
-                    plots.plot_satellite_rows(first, start, end, name, spans=spans), f"{kind}: use by satellite"
+                    plots.plot_satellite_rows(first, start, end, name, spans=spans),
+                    f"{name_rows(kind)}: use by satellite",
                 ),
                 page.place_picture(
                     plots.plot_residuals_by_elevation(records, name),
@@ -98,7 +100,7 @@ def tabulate_satellites(solution: Solution) -> list[Markup]:
         for low, high in itertools.pairwise(_ELEVATIONS)
     ]
     by_elevation = [row for row in by_elevation if any(cell != "-" for cell in row[1:])]
-    head = [cell for kind in records for cell in (f"{kind} rows", "weight < 0.5", "RMS / sigma")]
+    head = [cell for kind in records for cell in (f"{name_rows(kind)}, rows", "weight < 0.5", "RMS / sigma")]
     return [
         page.make_table(["satellite", *head], by_satellite),
         page.make_table(["elevation", *head], by_elevation),

@@ -10,6 +10,7 @@ from markupsafe import Markup
 
 from graphnav.core.notes import Note, format_count
 from graphnav.core.rotation import Array
+from graphnav.estimation.names import name_rows
 from graphnav.estimation.solution import Solution
 from graphnav.evaluation.against import find_antenna_lever_arm
 from graphnav.evaluation.segments import compute_relative_errors, compute_rms
@@ -219,7 +220,7 @@ def describe_excluded(solution: Solution, start: float) -> list[Markup]:
     spans = sorted(solution.excluded, key=lambda p: -p.count)
     some = spans[:_MAX_LINES] if len(spans) <= _MAX_LINES else spans[: _MAX_LINES - 1]
     lines = [
-        f"{p.kind}, {format_count(p.count, 'row')} from {p.t_start - start:.1f} to {p.t_end - start:.1f} s: "
+        f"{name_rows(p.kind)}, {format_count(p.count, 'row')} from {p.t_start - start:.1f} to {p.t_end - start:.1f} s: "
         f"{p.reason or 'faulty'}"
         for p in some
     ]
@@ -229,7 +230,7 @@ def describe_excluded(solution: Solution, start: float) -> list[Markup]:
             f"{format_count(sum(int(p.count) for p in rest), 'row')} in {len(rest)} more spans: see the noise model"
         )
     less = [
-        f"{count} of {name}"
+        f"{count} of {name_rows(name)}"
         for name, record in solution.records.items()
         if (count := np.count_nonzero((record.weight > 0) & (record.weight < 0.5)))
     ]

@@ -10,7 +10,7 @@ from markupsafe import Markup
 
 from graphnav.core.notes import Note, get_key
 from graphnav.core.rotation import Array
-from graphnav.estimation.names import name_components
+from graphnav.estimation.names import name_components, name_rows
 from graphnav.estimation.noise.model import INTERVALS, TABULATED
 from graphnav.estimation.solution import ParameterEstimate, Solution
 from graphnav.estimation.stops import list_solution_stops
@@ -324,7 +324,7 @@ def tabulate_stops(solution: Solution, start: float, decided_by: str) -> list[Ma
             Quantity(f"{stop.start - start:.2f} s"),
             Quantity(f"{stop.end - stop.start:.2f} s"),
             ", ".join(f"{name} {100.0 * share:.0f} %" for name, share in stop.fired.items()),
-            ", ".join(f"{count} {name}" for name, count in stop.rows.items()) or "none",
+            ", ".join(f"{count} {name_rows(name)}" for name, count in stop.rows.items()) or "none",
         ]
         for stop in stops[:_MAX_ROWS]
     ]

@@ -416,6 +416,26 @@ def test_info_of_a_real_drive(capsys):
     assert re.search(r"\b100\b", printed)
 
 
+@pytest.mark.parametrize("how", [(), ("--json",), ("--quiet",)])
+def test_info_shows_what_it_can_of_a_recording_that_is_refused(tmp_path, capsys, how):
+    """And leaves with what `smooth` says of it, and its code."""
+    folder = tmp_path / "drive"
+    folder.mkdir()
+    for file in (Path(__file__).parents[2] / "data" / "tokyo").iterdir():
+        (folder / file.name).write_bytes(file.read_bytes())
+    text = (folder / "recording.toml").read_text(encoding="utf-8")
+    assert "[imu]\n" in text
+    (folder / "recording.toml").write_text(
+        text.replace("[imu]\n", '[imu]\nunits = { accel = "g" }\n', 1), encoding="utf-8"
+    )
+    assert command("smooth", folder, "-o", tmp_path / "o") == 2
+    reason = capsys.readouterr().err
+    assert command("info", folder, "--quick", *how) == 2
+    printed = capsys.readouterr()
+    assert printed.err == reason
+    assert ("refused" in printed.out) == (how != ("--quiet",))
+
+
 # ----------------------------------------------------------------------------------------------------------- bad input
 BAD = {
     "no such recording": (["info", "nothing/here"], "file.missing", "nothing/here"),

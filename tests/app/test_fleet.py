@@ -46,8 +46,11 @@ def walks(shared_data: Path, tmp_path: Path) -> Path:
 def run(capsys: pytest.CaptureFixture[str], folder: Path, out: Path) -> dict[str, dict[str, object]]:
     """The rows of a fleet, by drive."""
     arguments = ["--solver", "ekf", "--noise", "stated", "--end", "8", "--no-report", "--processes", "1", "--json"]
-    assert cli.run(["fleet", str(folder), "-o", str(out), *arguments]) == 0
-    return {row["drive"]: row for row in json.loads(capsys.readouterr().out)["rows"]}
+    code = cli.run(["fleet", str(folder), "-o", str(out), *arguments])
+    rows = {row["drive"]: row for row in json.loads(capsys.readouterr().out)["rows"]}
+    # 0 says that every drive has a result
+    assert code == (0 if all(row["status"] == DONE for row in rows.values()) else 3)
+    return rows
 
 
 def test_a_bad_drive_costs_itself_alone_and_what_is_done_stays(
@@ -74,6 +77,9 @@ def test_a_bad_drive_costs_itself_alone_and_what_is_done_stays(
     assert {name for name, row in again.items() if row.get("skipped")} == {"run02", "worse"}
     assert again["run30"]["sd_h_median_m"] == rows["run30"]["sd_h_median_m"]
     assert again["run31"]["sd_h_median_m"] != rows["run31"]["sd_h_median_m"]
+
+    shutil.rmtree(walks / "worse")
+    assert {row["status"] for row in run(capsys, walks, out).values()} == {DONE}
 
 
 def test_a_killed_process_and_one_that_takes_too_long_are_said_and_replaced(tmp_path: Path) -> None:

@@ -16,6 +16,7 @@ from helpers import parse_code
 
 from graphnav.app import cli
 from graphnav.app.stored import RUN_FILE, read_outcome
+from graphnav.constraints import list_constraints
 from graphnav.core import errors
 from graphnav.core.errors import RecordingError
 from graphnav.core.notes import Note, get_key
@@ -93,6 +94,8 @@ def test_all_that_a_run_says_has_a_key(tmp_path):
     assert {*summary["notes"], *summary["doubts"]} <= {m["sentence"] for m in messages}
     assert [m for m in messages if not KEY.fullmatch(m["key"])] == []
     assert {"alignment.motion", "imu.gaps_bridged", "noise.rows"} <= {m["key"] for m in messages}
+    code = [kind.name for kind in list_constraints() if "_" in kind.name]
+    assert [m["sentence"] for m in messages if any(name in m["sentence"] for name in code)] == []
     kept, _ = read_outcome(out / RUN_FILE)
     notes = kept.solutions["rts"].notes
     assert [get_key(note) for note in notes] == [m["key"] for m in messages if m["sentence"] in notes]

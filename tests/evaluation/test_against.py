@@ -22,7 +22,6 @@ from graphnav.core.errors import RecordingError
 from graphnav.core.interpolation import interpolate, place_on_earth
 from graphnav.core.notes import get_key
 from graphnav.core.trajectory import Trajectory
-from graphnav.estimation.noise.model import FreedConstant
 from graphnav.estimation.pipeline import run
 from graphnav.estimation.solution import ParameterEstimate, Solution
 from graphnav.evaluation.against import Against, find_antenna_lever_arm, read_against
@@ -258,14 +257,29 @@ def test_a_point_that_the_file_is_not_of_is_told(ekf, tmp_path, point, told):
     assert ("against.other_point" in [get_key(note) for note in found.notes]) == told
 
 
-@pytest.mark.parametrize(("of", "used", "told"), [("gnss", True, True), ("gnss", False, False), ("imu", True, False)])
-def test_an_arm_that_only_ours_is_compared_with_is_told(ekf, tmp_path, of, used, told):
-    freed = {LEVER_ARM: FreedConstant((0.5, 0.2, 1.0), (0.01, 0.01, 0.01))} if used else {}
-    reference = replace(ekf, noise=replace(ekf.noise, freed=freed))
-    truth = Truth(TRUTH.t, TRUTH.llh, None, TRUTH.v, TRUTH.rph, of=of)
-    write_as("csv", moved(0.0), tmp_path / "its.csv", None)
-    found = read_against(Against(tmp_path / "its.csv"), "its", replace(RECORDING, truth=truth), reference)
-    assert ("against.lever_arm" in {get_key(note) for note in found.notes}) == told
+@pytest.mark.parametrize("point", ["imu", "antenna"])
+@pytest.mark.parametrize("of", ["imu", "gnss", None])
+def test_a_file_of_the_antenna_is_met_there_whatever_arm_ours_has_found(ekf, tmp_path, point, of):
+    """With a truth of the antenna, or withheld fixes, the arm is of no consequence to it; a file of the IMU has its own
+    program's, which is told.
+    """
+    found = np.array([[0.6, 0.1, 1.0]])
+    estimate = ParameterEstimate(np.zeros(1), found, np.full((1, 3), 0.01), np.ones(3), "m")
+    ours = replace(ekf, parameters={LEVER_ARM: estimate})
+    antenna = interpolate(moved(0.0), every(0.1, moved(0.0)).t, lever_arm=logs.LEVER_ARM)[0]
+    path = tmp_path / "its.csv"
+    write_as("csv", antenna if point == "antenna" else every(0.1, moved(0.0)), path, None)
+    at = antenna if of == "gnss" else TRUTH
+    whole = replace(RECORDING, truth=None if of is None else Truth(at.t, at.llh, None, at.v, at.rph, of=of))
+    its = read_against(Against(path, point), "its", whole, ours)
+    metrics, _, _ = score(whole, whole, {"ekf": ours, "its": its}, () if of else (("gnss", None),))
+    assert ("against.lever_arm" in {get_key(note) for note in metrics["its"].notes}) == (of != "imu" and point == "imu")
+    if of != "imu" or point == "imu":
+        assert metrics["its"].components["3d"].max < 0.02
+    else:  # moved to the IMU by the arm found
+        np.testing.assert_allclose(
+            metrics["its"].components["3d"].max, np.linalg.norm(found - logs.LEVER_ARM), atol=0.02
+        )  # fmt: skip
 
 
 def test_parts_of_a_long_drive_have_one_antenna(ekf):

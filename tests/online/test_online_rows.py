@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import pickle
 from collections.abc import Callable
 from dataclasses import replace
@@ -12,8 +13,22 @@ import pytest
 from helpers import refused
 
 from graphnav.config import Settings
+from graphnav.core.earth import STANDARD_GRAVITY as G
 from graphnav.core.errors import RecordingError
-from graphnav.online import Fix, ImuSample, Online, WheelSpeed, drop_rows, list_rows, live_setup, live_trajectory
+from graphnav.online import (
+    Fix,
+    ImuSample,
+    Online,
+    Reading,
+    WheelSpeed,
+    drop_rows,
+    list_rows,
+    live_setup,
+    live_trajectory,
+    make_setup,
+)
+from graphnav.online.lines import PROTOCOL, format_head, parse_row, read_setup
+from graphnav.sensors.barometer import SENSOR as BAROMETER
 
 SD = (0.02, 0.02, 0.04)
 
@@ -112,3 +127,44 @@ def test_the_setup_of_a_recording_holds_no_row() -> None:
     for sensor, count in ((setup.gnss, n), (setup.odometer, m), (setup.imu, len(recording.imu.t))):
         kept = [name for name, x in vars(sensor).items() if isinstance(x, np.ndarray) and len(x) == count]
         assert kept == []
+
+
+def test_rows_in_the_units_and_axes_of_a_source_are_those_of_its_lines() -> None:
+    keys = {
+        "imu": {"axes": "FRD", "units": {"t": "ms", "gyro": "deg/s", "accel": "g"}, "time_offset": 0.25},
+        "gnss": {"units": {"t": "ms", "angle": "rad", "height": "ft", "speed": "km/h"}, "lever_arm": [0.1, 0.2, 0.3]},
+        "odometer": {"units": {"speed": "km/h"}},
+        "barometer": {"units": {"pressure": "hPa"}},
+    }
+    setup, units = make_setup(keys)
+    gyro, accel, sd, v, sd_v = (
+        (1.0, -2.0, 300.0),
+        (0.1, 0.02, -1.0),
+        (1.0, 1.5, 2.0),
+        (30.0, -40.0, 1.0),
+        (3.0, 2.0, 1.0),
+    )
+    llh = (0.84, 0.19, 1600.0)
+    rows = [
+        (ImuSample(1000.0, gyro, accel, units), ("I", 1000.0, *gyro, *accel)),
+        (Fix(1000.0, *llh, sd, v, sd_v, units), ("G", 1000.0, *llh, *sd, *v, *sd_v)),
+        (Fix(2000.0, *llh, sd, units=units), ("G", 2000.0, *llh, *sd)),
+        (WheelSpeed(1.5, 36.0, units), ("O", 1.5, 36.0)),
+        (Reading(1.5, BAROMETER, units, pressure=950.0), ("S", "barometer", 1.5, 950.0, "")),
+    ]
+    line = f"{PROTOCOL} {json.dumps(keys)}"
+    assert format_head(read_setup(line)[0]) == format_head(setup)
+    for row, cells in rows:
+        other = parse_row(",".join(map(str, cells)), read_setup(line)[1])
+        assert other is not None
+        assert row[0] == other[0]
+        np.testing.assert_allclose(row[1], other[1], rtol=1e-15)
+        np.testing.assert_allclose(row[2], other[2], rtol=1e-14)
+    np.testing.assert_allclose(
+        rows[0][0][2], [np.radians(-2.0), np.radians(1.0), np.radians(-300.0), 0.02 * G, 0.1 * G, G]
+    )
+    assert rows[0][0][1] == 1.25
+    with refused("row.bounds", RecordingError, "gyro"):
+        ImuSample(1.0, (5000.0, 0.0, 0.0), accel, units)
+    with refused("key.unknown", RecordingError, "axis"):
+        make_setup({"imu": {"axis": "FRD"}})

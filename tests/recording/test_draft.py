@@ -50,6 +50,8 @@ DRIVE, _ = oracle.drive(
          {"t": "iTOW", "h": "height", "ve": "velE", "vd": "velD", "sd_e": "hAcc", "sd_u": "vAcc", "course": "headMot"}),
         ("time,seconds_elapsed,latitude,longitude,altitude,speed,bearing,horizontalAccuracy,verticalAccuracy", "gnss",
          {"h": "altitude", "course": "bearing", "sd_n": "horizontalAccuracy", "sd_u": "verticalAccuracy"}),
+        ("Time (s),Latitude (°),Longitude (°),Height (m),Velocity (m/s),Direction (°),Horizontal Accuracy (m)", "gnss",
+         {"speed": "Velocity (m/s)", "course": "Direction (°)", "sd_e": "Horizontal Accuracy (m)"}),
         ("t_s,lat_deg,lon_deg,h_m,speed_mps,course_deg,epe_m,hdop", "gnss", {"h": "h_m", "course": "course_deg"}),
         ("timestamp,wheel_speed_kmh,gear", "odometer", {"speed": "wheel_speed_kmh"}),
         ("t,wheel_fl_kmh,wheel_fr_kmh,RearLeft,rr", "odometer", {"speed_fl": "wheel_fl_kmh", "speed_rl": "RearLeft"}),
@@ -196,6 +198,15 @@ def test_axes_are_found_in_any_mount(tmp_path, letters):
     assert recording.imu.gyro == pytest.approx(DRIVE.imu.gyro, abs=1e-7)
     assert recording.gnss.v == pytest.approx(DRIVE.gnss.v, abs=1e-9)  # the file's is down
     assert "time_offset" not in found.text
+
+
+def test_a_named_file_that_is_no_table_is_not_left_out_of_a_drive(tmp_path):
+    """Else an IMU beside fixes that are not read would become a walk."""
+    imu, *_ = write_logs(tmp_path)
+    other = tmp_path / "inspva.log"
+    other.write_text("#INSPVAXA,COM1,0,73.5,FINESTEERING,2130,345600.000;35.6,139.7\n" * 9)
+    with refused("draft.positions_unread", RecordingError, "inspva.log"):
+        draft([imu, other], tmp_path)
 
 
 def test_a_tilted_mount_gets_two_vectors(tmp_path):

@@ -175,11 +175,12 @@ def test_a_course_in_radians_is_told_by_the_positions(plain, tmp_path):
     ("names", "scales", "more"),
     [
         ("lat,lon,alt,vel_n,vel_e,vel_d", (1e7, 1e7, 1e3, 1e2, 1e2, 1e2), ""),  # as MAVLink; its speeds are left alone
+        ("lat,lon,height,hAcc,vAcc,velN,velE,velD", (1e7, 1e7, *[1e3] * 6), ""),  # as u-blox
         ("lat,lon,hMSL [mm],hacc_mm,vacc_mm,velN_mm_s,velE_mm_s,velD_mm_s", (1, 1, 1e3, *[1e3] * 5), "v"),
         ("lat,lon,alt,NedVelX,NedVelY,NedVelZ", (1,) * 6, "v"),
         ("lat,lon,alt,vx,heading", (1,) * 5, ""),  # of which axes is not said: no speed along the heading
     ],
-    ids=["whole degrees", "millimetres", "axes in the name", "axes unknown"],
+    ids=["whole degrees", "whole degrees and mm", "millimetres", "axes in the name", "axes unknown"],
 )
 def test_units_and_axes_that_the_names_of_columns_state(plain, tmp_path, names, scales, more):
     imu, (_, rows) = plain
@@ -187,7 +188,7 @@ def test_units_and_axes_that_the_names_of_columns_state(plain, tmp_path, names, 
     moves = np.gradient(np.column_stack([place[0], place[1], place[2]]), t, axis=0)
     north, east = np.radians(moves[:, 0]) * 6.371e6, np.radians(moves[:, 1]) * 6.371e6 * np.cos(np.radians(place[0]))
     own = {"vn": north, "ve": east, "vd": -moves[:, 2], "sd": np.full(len(t), 0.03)}
-    columns = [*place, *(own[x] for x in (["sd"] * 2 if "acc" in names else []) + ["vn", "ve", "vd"])]
+    columns = [*place, *(own[x] for x in (["sd"] * 2 if "acc" in names.lower() else []) + ["vn", "ve", "vd"])]
     digits = 9 if scales[0] == 1 else 0
     cells = [[x, *(f"{y * s:.{digits}f}" for y, s in zip(row, scales, strict=False))]
              for (x, *_), row in zip(rows, zip(*columns, strict=True), strict=True)]  # fmt: skip
@@ -197,8 +198,31 @@ def test_units_and_axes_that_the_names_of_columns_state(plain, tmp_path, names, 
     assert (gnss.v is not None) == (more == "v")
     if more:
         assert gnss.v == pytest.approx(np.column_stack([east, north, moves[:, 2]]), abs=1e-4)
-    if "acc" in names:
+    if "acc" in names.lower():
         assert gnss.sd == pytest.approx(np.full((len(t), 3), 0.03))
+
+
+def test_first_rows_in_which_little_is_known_are_no_header(plain, tmp_path):
+    (header, rows), gnss = plain
+    first = [[t, *["#N/A"] * (len(rest))] for t, *rest in rows[:3]]
+    assert len(read_drafted(tmp_path, (header, [*first, *rows[3:]]), gnss).imu.t) == len(rows) - 3
+
+
+@pytest.mark.parametrize("of", ["position_covariance_{}", "field.position_covariance{}", "position_covariance[{}]"])
+def test_a_table_of_ros_is_stamped_by_its_messages_and_its_variances_are_sigmas(plain, tmp_path, of):
+    imu, (_, rows) = plain
+    whole = read_drafted(tmp_path / "as it was", imu, ("t,lat,lon,h", [row[:4] for row in rows]))
+    late = [f"{1.7e9 + float(t) + 0.15:.6f}" for t, *_ in rows]
+    stamps = [(f"{1.7e9 + np.floor(float(t)):.0f}", f"{1e9 * (float(t) % 1.0):.0f}") for t, *_ in rows]
+    cells = [
+        [arrival, *stamp, *row[1:4], "0.04", "0", "0", "0", "0.09", "0", "0", "0", "0.25"]
+        for arrival, stamp, row in zip(late, stamps, rows, strict=True)
+    ]
+    head = ["Time", "header.stamp.secs", "header.stamp.nsecs", "latitude", "longitude", "altitude"]
+    moved = imu[0], [[f"{1.7e9 + float(t):.6f}", *rest] for t, *rest in imu[1]]
+    gnss = read_drafted(tmp_path / "ros", moved, (",".join([*head, *map(of.format, range(9))]), cells)).gnss
+    np.testing.assert_allclose(gnss.t - 1.7e9, whole.gnss.t, atol=1e-5)
+    np.testing.assert_allclose(gnss.sd, np.tile([0.2, 0.3, 0.5], (len(gnss.t), 1)))
 
 
 @pytest.mark.parametrize(

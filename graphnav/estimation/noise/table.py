@@ -10,6 +10,7 @@ from graphnav.constraints.dual_antenna import DualHeading, DualPitch
 from graphnav.constraints.gnss import OFFSETS, STAMPS, TIMES, VELOCITY_ERROR
 from graphnav.constraints.vehicle import NHC_ERROR, ODOMETER_ERROR
 from graphnav.core.state import SECONDS
+from graphnav.estimation.names import name_rows
 from graphnav.estimation.noise.model import NoiseModel, VarianceComponent
 from graphnav.recording import FIX_TYPES, ImuNoise, Recording
 
@@ -18,12 +19,6 @@ _IMU_FIGURES = {
     "accel_noise_density": ("accelerometer, noise density", "m/s^2/sqrt(Hz)"),
     "gyro_bias_walk": ("gyro, bias random walk", "rad/s/sqrt(s)"),
     "accel_bias_walk": ("accelerometer, bias random walk", "m/s^2/sqrt(s)"),
-}
-_OF = {
-    "gnss_position": "fixes, position",
-    "gnss_velocity": "fixes, velocity",
-    "nhc": "non-holonomic constraint",
-    "odometer": "odometer",
 }
 _AXIS_SLICES = {"horizontal": slice(0, 2), "up": slice(2, 3)}
 
@@ -71,7 +66,7 @@ def tabulate_figures(
         kind = next((part for part in middle if part not in lasts), None)
         # errors over minutes and hours have one unit, whatever the fix type
         sigma = _read_sigma(recording, source, None if time in TIMES[1:] else kind, axis)
-        words = f"{_OF.get(source, source)}{f' ({kind})' if kind else ''}, {axis}"
+        words = f"{name_rows(source)}{f' ({kind})' if kind else ''}, {axis}"
         words += ", white" if time is None else f", lasting {time}"
         out.append(
             FigureRow(

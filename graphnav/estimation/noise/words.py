@@ -7,7 +7,7 @@ import numpy as np
 from graphnav.constraints.gnss import STAMP_ERROR, GnssPosition
 from graphnav.constraints.vehicle import MOUNTING
 from graphnav.core.notes import Note, format_count
-from graphnav.estimation.names import name_components
+from graphnav.estimation.names import name_components, name_rows
 from graphnav.estimation.noise.model import INTERVALS, NoiseModel
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.linearise import Points, shift
@@ -96,19 +96,21 @@ def describe_noise(noise: NoiseModel, problem: Problem) -> tuple[str, ...]:
         for p in errors:
             sizes = dict.fromkeys(p.noise_groups)
             each = ", ".join(f"{g.rsplit('.', 1)[-1]} {np.sqrt(noise.get_factor(g, 0.0)):.2g}" for g in sizes)
-            out_time = f"{p.correlation_time:.2g} s"
+            out_time = f"{float(f'{p.correlation_time:.2g}'):g} s"
             parts.append(f"Gauss-Markov with {out_time}: {each}")
         stamps = next((p for p in rows.parameters if p.name == STAMP_ERROR), None)
         if stamps is not None and rows.name == GnssPosition.name:
             parts.append(f"stamp of each fix {stamps.sigma[0]:.2g} s")
-        out.append(Note("noise.rows", f"noise model, {rows.name}: white part in stated sigmas: {'; '.join(parts)}"))
+        out.append(
+            Note("noise.rows", f"noise model, {name_rows(rows.name)}: white part in stated sigmas: {'; '.join(parts)}")
+        )
         some = noise.weights.get(rows.name)
         if some is not None and len(some.t):
             less = int(np.count_nonzero(some.weight < 1.0))
             out.append(
                 Note(
                     "noise.outliers",
-                    f"{rows.name}: {format_count(less, 'outlier')} among {len(rows)} rows, down-weighted",
+                    f"{name_rows(rows.name)}: {format_count(less, 'outlier')} among {len(rows)} rows, down-weighted",
                 )
             )
     return tuple(out)

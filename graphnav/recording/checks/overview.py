@@ -80,15 +80,21 @@ class Inspection:
         """Whether there is no finding because of which a result may be entirely wrong."""
         return not self.list_defects()
 
-    def list_defects(self) -> list[str]:
+    def list_defects(self, *severities: str) -> list[str]:
         """A line for each finding because of which a result may be entirely wrong.
+
+        Parameters
+        ----------
+        severities
+            Of these alone: "unreliable", "refused"; both when none is named.
 
         Returns
         -------
         list of str
             Severity and sentence.
         """
-        return [f"{f.severity}: {f.sentence}" for f in self.findings if f.severity not in ("note", "warning")]
+        asked = severities or ("unreliable", "refused")
+        return [f"{f.severity}: {f.sentence}" for f in self.findings if f.severity in asked]
 
     def refuse(self) -> None:
         """Raise an error if the recording cannot be solved.

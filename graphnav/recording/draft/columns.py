@@ -17,6 +17,7 @@ _ACCEL = (
 )
 _HORIZONTAL = r"sd_?h|(?:.*_)?(?:h_?acc\w*|horizontal_accuracy)|accuracy|eph|epe(?:_m)?"
 _VERTICAL = r"sd_?v|(?:.*_)?(?:v_?acc\w*|vertical_accuracy)|altitude_accuracy|epv"
+_COVARIANCE = r"(?:.*_)?position_cov(?:ariance)?_?"  # of ROS, 3 x 3 by rows, east, north, up
 _OF_SPEED = r"sd_?v|sd_?speed|(?:.*_)?(?:s_?acc|(?:speed|velocity|vel)_?acc\w*)|eps"
 # columns of uncertainties, or of satellite geometry, are not the quantity itself
 _UNCERTAIN = re.compile(
@@ -29,7 +30,7 @@ _PATTERNS: dict[str, tuple[str, ...]] = {
     "t": (
         r"t", r"seconds_elapsed",
         r"time_elapsed|elapsed_time|elapsed|time_since_start(?:_in)?|rel_?time|time_(?:since_)?boot",
-        r"(?:.*_)?header_stamp", r"(?:time(?:stamp)?|t)(?:_(?:unix|utc))?", _OF_WEEK,
+        r"(?:.*_)?header_stamp(?:_secs?)?", r"(?:time(?:stamp)?|t)(?:_(?:unix|utc))?", _OF_WEEK,
         r"(?:unix|epoch|utc|sensor|logging|local)_?time\w*",
         r"sec(?:onds?)?|stamp|(?:.*_)time(?:stamp)?",
         r"date_?time|unix|epoch|utc|(?:uhr)?zeit(?:stempel)?|clock|hora|heure|tiempo|temps|date|datum|millis|micros|ms|us|ns",
@@ -57,9 +58,9 @@ _PATTERNS: dict[str, tuple[str, ...]] = {
             ("up", r"enu_?v(?:el)?_?z"), ("down", r"ned_?v(?:el)?_?z"),
         )
     },
-    "sd_e": (r"sd_?e|std_?e|sigma_?e|e(?:ast)?_(?:sd|std|sigma)", _HORIZONTAL),
-    "sd_n": (r"sd_?n|std_?n|sigma_?n|n(?:orth)?_(?:sd|std|sigma)", _HORIZONTAL),
-    "sd_u": (r"sd_?u|std_?u|sigma_?u|u(?:p)?_(?:sd|std|sigma)", _VERTICAL),
+    "sd_e": (r"sd_?e|std_?e|sigma_?e|e(?:ast)?_(?:sd|std|sigma)", rf"{_COVARIANCE}[0x]", _HORIZONTAL),
+    "sd_n": (r"sd_?n|std_?n|sigma_?n|n(?:orth)?_(?:sd|std|sigma)", rf"{_COVARIANCE}4", _HORIZONTAL),
+    "sd_u": (r"sd_?u|std_?u|sigma_?u|u(?:p)?_(?:sd|std|sigma)", rf"{_COVARIANCE}8", _VERTICAL),
     "sd_ve": (r"(?:sd|std|sigma)_?ve(?:_?east)?|ve_(?:sd|std|sigma)", _OF_SPEED),
     "sd_vn": (r"(?:sd|std|sigma)_?vn(?:_?north)?|vn_(?:sd|std|sigma)", _OF_SPEED),
     "sd_vu": (r"(?:sd|std|sigma)_?vu(?:_?up)?|vu_(?:sd|std|sigma)", _OF_SPEED),
@@ -74,7 +75,7 @@ _PATTERNS: dict[str, tuple[str, ...]] = {
     "speed_rr": (rf"{_WHEEL}(?:rr|rear_right|right_rear){_SPEED}",),
     "course": (
         r"course(?:_over_ground)?|cog", r"(?:.*_)?(?:bearing|track|course|head_mot|motion_heading|heading_of_motion)",
-        r"heading|kurs",
+        r"heading|direction|kurs",  # phyphox has a direction beside its velocity
     ),
     "pressure": (
         r"(?:air_?|baro(?:met(?:er|ric))?_?|atmospheric_?|static_?|abs(?:olute)?_?)?pressure|baro(?:meter)?",
@@ -196,6 +197,7 @@ def split_unit(name: str) -> tuple[str, str]:
     # part of the name, not a unit
     name = re.sub(r"[(\[]\s*([xyz]|lat|lon|alt)\s*[)\]]\s*$", r"_\1", name, flags=re.IGNORECASE)
     name = re.sub(r"\[([012])\]\s*$", lambda found: "_" + "xyz"[int(found[1])], name)  # of an array of three
+    name = re.sub(r"\[([3-8])\]\s*$", r"_\1", name)  # of a matrix
     bracket = re.search(r"[(\[]([^)\]]*)[)\]]\s*$", name)
     base = name[: bracket.start()] if bracket else name
     base = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", base)

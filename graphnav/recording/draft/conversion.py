@@ -11,6 +11,7 @@ from graphnav.recording.formats.places import is_in_whole_degrees
 from graphnav.recording.formats.table import Table
 
 _SMALL_UNITS = {"mm": 1e-3, "cm": 1e-2, "mm/s": 1e-3, "cm/s": 1e-2}  # m, m/s
+_SIGMAS = ("sd_e", "sd_n", "sd_u")
 _OF_MOTION = ("ve", "vn", "vu", "vd", "sd_ve", "sd_vn", "sd_vu", "speed", "course")
 
 
@@ -34,26 +35,40 @@ def convert_small_units(
     return matching.FileColumns(columns.names, units), names, add_words(plain, words)
 
 
-def convert_whole_degrees(table: Table, names: dict[str, str], plain: Plain | None) -> tuple[Table, Plain | None]:
-    """Places in whole numbers of 1e-7 deg, as u-blox and MAVLink have them, in deg, and heights beside them in m.
+def convert_variances(table: Table, names: dict[str, str], plain: Plain | None) -> tuple[Table, Plain | None]:
+    """Sigmas of variances, which are what columns of a covariance hold; `names` are changed."""
+    squared = [ours for ours in _SIGMAS if "cov" in names.get(ours, "").lower()]
+    if not squared:
+        return table, plain
+    words = f"{', '.join(repr(names[ours]) for ours in squared)} are variances, made sigmas"
+    for ours in squared:
+        table = table.with_column(ours, np.sqrt(np.maximum(table[ours], 0.0)))
+        names[ours] = ours
+    return table, add_words(plain, words)
 
-    Whole numbers of speed and course beside them are in units that these do not share, so they are left alone.
-    `names` are changed.
+
+def convert_whole_degrees(table: Table, names: dict[str, str], plain: Plain | None) -> tuple[Table, Plain | None]:
+    """Places in whole numbers of 1e-7 deg, as u-blox and MAVLink have them, in deg, heights and accuracies in m.
+
+    Both write accuracies in mm (h_acc, v_acc); MAVLink's eph and epv, and whole numbers of speed and course, are in
+    units that these do not share, so they are left alone. `names` are changed.
     """
     at = {ours: x[np.isfinite(x)] for ours, x in table.columns.items() if ours != "t"}
     if not (is_in_whole_degrees(at["lat"], at["lon"]) and all(map(_are_whole, (at["lat"], at["lon"])))):
         return table, plain
-    for ours in [o for o in at if o in _OF_MOTION and _are_whole(at[o])]:
+    whole = [ours for ours in at if ours not in ("lat", "lon") and _are_whole(at[ours])]
+    lengths = [ours for ours in whole if ours == "h" or (ours in _SIGMAS and "acc" in names[ours].lower())]
+    if "h" not in lengths:
+        lengths = []
+    for ours in set(whole) & {*_OF_MOTION, *_SIGMAS} - {*lengths}:
         del names[ours]
-    heights = ["h"] if "h" in at and _are_whole(at["h"]) else []
-    for ours in ("lat", "lon", *heights):
-        table = table.with_column(ours, table[ours] * (1e-3 if ours == "h" else 1e-7))
-    if heights:
-        names.pop("geoid", None)  # whose unit is another or not known
+    for ours in ("lat", "lon", *lengths):
+        table = table.with_column(ours, table[ours] * (1e-3 if ours in lengths else 1e-7))
     words = f"'{names['lat']}', '{names['lon']}' in 1e-7 deg, made deg"
-    if heights:
-        words += f", '{names['h']}' in mm, made m"
-    for ours in ("lat", "lon", *heights):
+    if lengths:
+        names.pop("geoid", None)  # whose unit is another or not known
+        words += f", {', '.join(dict.fromkeys(repr(names[ours]) for ours in lengths))} in mm, made m"
+    for ours in ("lat", "lon", *lengths):
         names[ours] = ours
     return table, add_words(plain, words)
 

@@ -16,7 +16,7 @@ from graphnav.recording import Gnss, Imu, Odometer
 from graphnav.recording.draft import columns as matching
 from graphnav.recording.draft import guesses
 from graphnav.recording.draft.clocks import read_clock_seconds, read_serial_days
-from graphnav.recording.draft.conversion import convert_small_units, convert_whole_degrees
+from graphnav.recording.draft.conversion import convert_small_units, convert_variances, convert_whole_degrees
 from graphnav.recording.draft.guesses import Guess
 from graphnav.recording.draft.motion import is_course_in_radians
 from graphnav.recording.draft.plain import Plain, add_words, read_plain
@@ -321,6 +321,7 @@ def _read_sensor(
                 key="draft.no_fix",
             )
         table, plain = convert_whole_degrees(table, names, plain)
+        table, plain = convert_variances(table, names, plain)
         whole[whole] = find_places(table["lat"][whole], table["lon"][whole], ANGLE["deg"])  # as it will be read
         check_angles(table.take(whole), ANGLE["deg"], "GNSS")
     if whole.sum() < 2:

@@ -140,7 +140,7 @@ def _decode(data: bytes) -> tuple[str, list[str]]:
 def _read_lines(text: Sequence[str]) -> NumberedLines:
     """Numbers and text of non-empty lines; after the first row without comments."""
     lines = [(k, line) for k, line in enumerate(text, 1) if line.strip()]
-    first = _find_first_row(lines)
+    first, _ = _find_first_row(lines)
     return [(k, line) for i, (k, line) in enumerate(lines) if i <= (first or 0) or line.lstrip()[0] not in "#%"]
 
 
@@ -168,12 +168,20 @@ def _is_value(cell: str) -> bool:
     )
 
 
-def _find_first_row(lines: NumberedLines) -> int | None:
-    """Index of the first of two consecutive lines that are rows of one table."""
+def _find_first_row(lines: NumberedLines) -> tuple[int | None, str | None]:
+    """Index of the first row of a table, known by two in succession, and the separator of its fields."""
     for k in range(len(lines) - 1):
-        if _find_mark([line for _, line in lines[k : k + 2]]) != "":
-            return k
-    return None
+        if (mark := _find_mark([line for _, line in lines[k : k + 2]])) != "":
+            width = len(_split(lines[k][1], mark))
+            while k > 1 and _is_sparse(_split(lines[k - 1][1], mark), width):
+                k -= 1
+            return k, mark
+    return None, ""
+
+
+def _is_sparse(cells: Sequence[str], width: int) -> bool:
+    """Whether fields of a line are a row of a table of that width in which little is known yet."""
+    return len(cells) == width and _is_value(cells[0]) and all(is_blank(c) or _is_value(c) for c in cells)
 
 
 def _find_mark(rows: Sequence[str]) -> str | None:
@@ -191,10 +199,9 @@ def _find_mark(rows: Sequence[str]) -> str | None:
 
 def _lay_out(path: Path, lines: NumberedLines) -> _Layout | None:
     """The layout of a table; None for a CSV file or no table with a header."""
-    first = _find_first_row(lines)
+    first, mark = _find_first_row(lines)
     if not first:  # none, or no line before it
         return None
-    mark = _find_mark([line for _, line in lines[first : first + 2]])
     row = _split(lines[first][1], mark)
     head, units = first - 1, []
     two = [_split(_COMMENT.sub("", line), mark) for _, line in lines[max(first - 2, 0) : first]]

@@ -57,7 +57,7 @@ def find_logs(paths: Sequence[Path], topics: Sequence[str] = ()) -> LogsFound:
     every: dict[str, list[Source]] = {}
     left: list[str] = []
     nothing: dict[str, str] = {}  # reasons by the names of files
-    refused: list[str] = []  # reasons why some are no tables
+    refused: dict[Path, str] = {}  # reasons why some are no tables
     for path in files:
         try:
             found = read_log(path, topics)
@@ -66,7 +66,7 @@ def find_logs(paths: Sequence[Path], topics: Sequence[str] = ()) -> LogsFound:
                 raise
             nothing[path.name if path.exists() else str(error)] = str(error)
             if isinstance(error.__cause__, RecordingError) or error.key == "draft.no_time":
-                refused.append(str(error))
+                refused[path] = str(error)
             continue
         for sensor, source in found.items():
             every.setdefault(sensor, []).append(source)
@@ -90,7 +90,7 @@ def find_logs(paths: Sequence[Path], topics: Sequence[str] = ()) -> LogsFound:
             guesses.guess_accel_unit(worst.path, worst.stack("ax", "ay", "az"), worst.find_unit("ax", "accel"))
     if "imu" not in sensors:
         there = ", ".join([*sensors, *(["raw GNSS"] if raw.observed else [])]) or "nothing"
-        unread = f" ({refused[0]})" if refused else ""
+        unread = f" ({next(iter(refused.values()))})" if refused else ""
         if others and not refused and not raw.observed:
             unread = f" ({others})"
         logs = [source.log for some in every.values() for source in some if source.log is not None]
@@ -101,7 +101,8 @@ def find_logs(paths: Sequence[Path], topics: Sequence[str] = ()) -> LogsFound:
             key="draft.no_imu",
         )
     if not sensors.keys() & {"gnss", "odometer"} and not raw.observed:
-        _check_unread(paths, {path: nothing[path.name] for path in files if path.name in nothing})
+        named = {path: why for path, why in refused.items() if path in paths}
+        _check_unread(paths, {path: nothing[path.name] for path in files if path.name in nothing}, named)
     _date_times_of_day(sensors)
     _tell_gps_from_unix(sensors)
     parts = [s.path.name for name in ("gyro", "accel", "gravity") for s in every.get(name, ())]
@@ -146,8 +147,13 @@ def _tell_gps_from_unix(sensors: dict[str, Source]) -> None:
         source.t_unit = replace(source.t_unit, why=why)
 
 
-def _check_unread(paths: Sequence[Path], tables: Mapping[Path, str]) -> None:
+def _check_unread(paths: Sequence[Path], tables: Mapping[Path, str], named: Mapping[Path, str]) -> None:
     """Refuse to take for a walk without fixes what has positions in a form that is not read, for the reasons given.
+
+    Parameters
+    ----------
+    tables : those of no known sensor, with the reasons.
+    named : files that were asked for and are no tables, with the reasons.
 
     Raises
     ------
@@ -156,14 +162,14 @@ def _check_unread(paths: Sequence[Path], tables: Mapping[Path, str]) -> None:
     """
     inside = [p for path in paths if path.is_dir() for p in sorted(path.iterdir())]
     unread = [p for p in inside if p.suffix.lower() in (*_TRACKS, *_OF_RECEIVERS)]
-    unread += [p for p in tables if _POSITIONS.search(p.name)]
+    unread += [p for p in tables if _POSITIONS.search(p.name) or p in named]
     if unread:
         why = "write them as CSV with t, lat and lon in deg and h in m"
         if unread[0].suffix.lower() in _OF_RECEIVERS:
             why = "write its observations as RINEX, as RTKLIB's convbin does"
         why = tables.get(unread[0], why)
         raise RecordingError(
-            f"{unread[0]}: its positions are not read ({why}); else take the file out of the folder",
+            f"{unread[0]}: its positions are not read ({why}); else leave the file out",
             key="draft.positions_unread",
         )
 

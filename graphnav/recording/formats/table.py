@@ -23,7 +23,7 @@ from graphnav.recording.formats.decimals import drop_cut_line, read_decimals
 _BLANK_CELL = re.compile(r"(?m)(?:(?<=,)|^(?=[ \t]*,))[ \t]*(?=,|$)")  # an empty cell of a line that is not empty
 # to the end of the line from #, unless it begins a cell (#N/A); whole lines from %, which units hold as well
 _COMMENT = re.compile(r"(?m)(^|[^,\s])[ \t]*#.*|^[ \t]*%.*")
-_EMPTY = "is empty; copy the log again, or leave this file out"
+_EMPTY = "is empty, or holds comments (#) alone; copy the log again, or leave this file out"
 _MARKS = {";": "a semicolon", "\t": "a tab", " ": "blanks"}  # separators, in the order of their tests
 
 
