@@ -235,12 +235,22 @@ def _start_without(
     if without is built:
         return built, found
     again = replace(found, stated=without.problem)
-    # all measurements tell of the points, another start changes them little; a filter from it may diverge
     same = np.array_equal(without.problem.t, built.problem.t)
 
-    def go_on(before: NoiseEstimate) -> NoiseEstimate:
-        near = before.get_linearisation(found.base) if same else None
+    def estimate(before: NoiseEstimate, near: tuple[Points, Problem] | None = None) -> NoiseEstimate:
         return estimate_noise(again.base, without.aligned.until, before.noise, near, progress)
+
+    def go_on(before: NoiseEstimate) -> NoiseEstimate:
+        if not same:
+            return estimate(before)
+        # the points known rest on the start before, and a filter from the new one may diverge: the likelier
+        near = estimate(before, before.get_linearisation(found.base))
+        try:
+            fresh = estimate(before)
+        except BREAKDOWN:
+            return near
+        best = max(near, fresh, key=lambda one: one.log_evidence)
+        return replace(best, passes=near.passes + fresh.passes)
 
     best, rival = go_on(found.estimate), found.estimate.rival
     total = found.estimate.passes + best.passes
