@@ -9,6 +9,7 @@ import numpy as np
 
 from graphnav.core.notes import Note, format_count
 from graphnav.core.rotation import Array
+from graphnav.estimation.names import name_rows
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import ExcludedSpan
 from graphnav.estimation.solvers.passes import SmootherPass, record_residuals
@@ -49,7 +50,7 @@ def describe_faults(faults: tuple[ExcludedSpan, ...], problem: Problem) -> tuple
             out.append(
                 Note(
                     "gnss.excluded",
-                    f"{rows.name}: {many} left out as faulty, {where} {begin:.1f} to "
+                    f"{name_rows(rows.name)}: {many} left out as faulty, {where} {begin:.1f} to "
                     f"{begin + longest.t_end - longest.t_start:.1f} s: {longest.reason}",
                 )
             )
