@@ -6,6 +6,7 @@ import argparse
 import importlib
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import oracle
@@ -245,14 +246,22 @@ def test_wheels_tell_errors_that_last_from_a_bad_imu(many_houses: tuple[Recordin
     assert times(noise, "imu.accel_noise_density") < 7.0
 
 
+def draw_damaged(
+    shared_data: Path, monkeypatch: pytest.MonkeyPatch, seed: int, number: int
+) -> tuple[Any, Recording, Recording]:
+    """The script, and a window and the same damaged, as `damage_draws.py` draws them."""
+    monkeypatch.syspath_prepend(str(SCRIPTS))
+    draws = importlib.import_module("damage_draws")
+    options = argparse.Namespace(data=shared_data, drives=list(draws.NAMES), family="faults", seed=seed)
+    _, clean, damaged, _ = draws.draw(number, options)
+    return draws, clean, damaged
+
+
 def test_errors_of_fixes_never_explain_any_trajectory(shared_data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A minute of a highway with sigmas a quarter of what they were, errors of 6 m that last, and a burst of 34 m: with
     errors of hundreds of metres that last for minutes, a solution a kilometre off has more evidence than a right one.
     """
-    monkeypatch.syspath_prepend(str(SCRIPTS))
-    draws = importlib.import_module("damage_draws")
-    options = argparse.Namespace(data=shared_data, drives=list(draws.NAMES), family="faults", seed=5005)
-    _, clean, damaged, _ = draws.draw(12, options)
+    _, clean, damaged = draw_damaged(shared_data, monkeypatch, 5005, 12)
     assert clean.name.startswith("comma")
     assert clean.gnss is not None
     fixes, frame = clean.gnss, LocalFrame(clean.gnss.llh[0])
@@ -268,10 +277,7 @@ def test_a_smoother_is_at_the_optimum_that_steps_from_its_own_points_leave(
     shared_data: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Seventy seconds of fixes, most of them wrong, and an IMU nine times as noisy: undamped steps lead 100 m away."""
-    monkeypatch.syspath_prepend(str(SCRIPTS))
-    draws = importlib.import_module("damage_draws")
-    options = argparse.Namespace(data=shared_data, drives=list(draws.NAMES), family="faults", seed=9705)
-    _, clean, damaged, _ = draws.draw(11, options)
+    draws, clean, damaged = draw_damaged(shared_data, monkeypatch, 9705, 11)
     for source, span in draws.withheld_of(clean, clean.duration):
         damaged = damaged.without(source, span)
     found = run(damaged, parse_settings({}), ("rts", "batch"))
@@ -283,10 +289,7 @@ def test_the_first_fixes_after_an_outage_are_wrong_and_not_the_later_ones(
     shared_data: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Nine fixes after 20 s without any are 3 m off and agree with each other; the first right ones look displaced."""
-    monkeypatch.syspath_prepend(str(SCRIPTS))
-    draws = importlib.import_module("damage_draws")
-    options = argparse.Namespace(data=shared_data, drives=list(draws.NAMES), family="faults", seed=9706)
-    _, clean, damaged, _ = draws.draw(3, options)
+    draws, clean, damaged = draw_damaged(shared_data, monkeypatch, 9706, 3)
     withheld, undamaged = draws.withheld_of(clean, clean.duration), clean
     for source, span in withheld:
         undamaged, damaged = undamaged.without(source, span), damaged.without(source, span)
@@ -297,8 +300,8 @@ def test_the_first_fixes_after_an_outage_are_wrong_and_not_the_later_ones(
 
 
 def test_stamps_of_an_imu_that_jitter_make_nothing_worse(monkeypatch: pytest.MonkeyPatch) -> None:
-    """An IMU stamped on arrival, late by up to four tenths of its period, with a turn of which it lost a sample: spans
-    are left out that the start rests on, and a filter from a start without them diverges.
+    """An IMU stamped on arrival, late by up to four tenths of its period, beside a row that its neighbours contradict:
+    spans are left out that the start rests on, and a filter from a start without them diverges.
     """
     monkeypatch.syspath_prepend(str(SCRIPTS))
     withheld_of = importlib.import_module("do_no_harm").withheld_of
