@@ -202,14 +202,14 @@ def crop_solution(solution: Solution, share: Share, detections: tuple[Detection,
         )  # fmt: skip
 
     def crop_noise(model: NoiseModel) -> NoiseModel:
+        def crop_spans(spans: tuple[tuple[float, float], ...]) -> tuple[tuple[float, float], ...]:
+            return tuple((max(a, start), min(b, end)) for a, b in spans if a < end and b >= start)
+
         weights = {
             name: RowWeights(w.t[find_inside(w.t)], w.weight[find_inside(w.t)]) for name, w in model.weights.items()
         }
-        spans = {
-            name: tuple((max(a, start), min(b, end)) for a, b in some if a < end and b >= start)
-            for name, some in model.excluded.items()
-        }
-        return replace(model, weights=weights, excluded=spans)
+        excluded = {name: crop_spans(spans) for name, spans in model.excluded.items()}
+        return replace(model, weights=weights, excluded=excluded, false_stops=crop_spans(model.false_stops))
 
     def crop_arcs(arcs: CarrierArcs) -> CarrierArcs:
         some = (arcs.begin < end) & (arcs.end >= start)

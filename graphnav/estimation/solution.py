@@ -112,13 +112,14 @@ class CarrierArcs:
 
 @dataclass(frozen=True)
 class ExcludedSpan:
-    """Consecutive rows of one constraint that no solver uses."""
+    """Consecutive rows of one constraint that are wrong: not used, or with the variance that their errors show."""
 
     kind: str  # name of the constraint
     t_start: float  # s, of the first row
     t_end: float  # s, of the last
     count: int
     reason: str = ""
+    sigma_factor: float = np.inf  # by which their sigmas are multiplied; infinite where no solver uses them
 
 
 @dataclass(frozen=True)
@@ -366,7 +367,8 @@ def _join_noise(parts: list[NoiseModel]) -> NoiseModel:
         weights[name] = RowWeights(np.concatenate([w.t for w in own]), np.concatenate([w.weight for w in own]))
     names = dict.fromkeys(key for part in parts for key in part.excluded)
     excluded = {name: tuple(span for part in parts for span in part.excluded.get(name, ())) for name in names}
-    return replace(parts[0], weights=weights, excluded=excluded)
+    moving = tuple(span for part in parts for span in part.false_stops)
+    return replace(parts[0], weights=weights, excluded=excluded, false_stops=moving)
 
 
 def _join_separations(parts: list[Separation | None]) -> Separation | None:

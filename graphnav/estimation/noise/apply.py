@@ -12,6 +12,7 @@ from graphnav.constraints.base import SAME_TIME, Constraint
 from graphnav.core.rotation import Array
 from graphnav.core.state import Parameter
 from graphnav.estimation.noise.model import INTERVALS, NoiseModel, RowWeights
+from graphnav.estimation.noise.spans import mask_times
 from graphnav.estimation.problem import Problem
 from graphnav.imu.preintegration import NOISE_FIGURES
 
@@ -113,15 +114,13 @@ def _scale_process(p: Parameter, noise: NoiseModel, missing: float) -> Parameter
 
 def select_weights(t: Array, noise: NoiseModel, name: str) -> Array:
     """(N,) weights of a constraint's rows at times t (N,), s; rows of one time, as of satellites, keep their order."""
-    out = np.ones(len(t))
+    out = np.where(mask_times(t, noise.excluded.get(name, ())), 0.0, 1.0)
     some = noise.weights.get(name)
     if some is not None and len(some.t):
         number = np.arange(len(t)) - np.searchsorted(t, t - SAME_TIME)  # index among the rows of its time
         at = np.clip(np.searchsorted(some.t, t - SAME_TIME) + number, 0, len(some.t) - 1)
         same = np.abs(some.t[at] - t) <= SAME_TIME
         out[same] = some.weight[at[same]]
-    for begin, end in noise.excluded.get(name, ()):
-        out[(t >= begin - SAME_TIME) & (t <= end + SAME_TIME)] = 0.0
     return out
 
 
