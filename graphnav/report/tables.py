@@ -12,7 +12,6 @@ from graphnav.core.notes import Note, get_key
 from graphnav.core.rotation import Array
 from graphnav.estimation.names import name_components, name_rows
 from graphnav.estimation.noise.model import INTERVALS, TABULATED
-from graphnav.estimation.noise.spans import list_outliers
 from graphnav.estimation.solution import ParameterEstimate, Solution
 from graphnav.estimation.stops import list_solution_stops
 from graphnav.evaluation.against import select_own
@@ -170,7 +169,7 @@ def tabulate_noise(rows: Sequence[FigureRow], solution: Solution) -> list[Markup
         f"Rows of {name} with less weight, because they are off by more than chance allows once in a thousand times: "
         f"{np.count_nonzero(some.weight < 1.0)} of {len(solution.records[name].t)}; the least counts as "
         f"{wording.format_number(float(some.weight.min()), 2)} of a row."
-        for name, some in list_outliers(noise).items()
+        for name, some in noise.weights.items()
         if len(some.t) and name in solution.records
     ]
     less += [

@@ -114,13 +114,16 @@ def _scale_process(p: Parameter, noise: NoiseModel, missing: float) -> Parameter
 
 def select_weights(t: Array, noise: NoiseModel, name: str) -> Array:
     """(N,) weights of a constraint's rows at times t (N,), s; rows of one time, as of satellites, keep their order."""
-    out = np.where(mask_times(t, noise.excluded.get(name, ())), 0.0, 1.0)
+    out = np.ones(len(t))
     some = noise.weights.get(name)
     if some is not None and len(some.t):
         number = np.arange(len(t)) - np.searchsorted(t, t - SAME_TIME)  # index among the rows of its time
         at = np.clip(np.searchsorted(some.t, t - SAME_TIME) + number, 0, len(some.t) - 1)
         same = np.abs(some.t[at] - t) <= SAME_TIME
         out[same] = some.weight[at[same]]
+    out[mask_times(t, noise.excluded.get(name, ()))] = 0.0
+    for begin, end, weight in noise.span_weights.get(name, ()):
+        out[mask_times(t, [(begin, end)])] = weight
     return out
 
 

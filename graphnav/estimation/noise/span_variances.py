@@ -24,9 +24,9 @@ import numpy as np
 
 from graphnav.core.rotation import Array
 from graphnav.estimation.noise.apply import apply_noise
-from graphnav.estimation.noise.model import NoiseModel, RowWeights
+from graphnav.estimation.noise.model import NoiseModel
 from graphnav.estimation.noise.moments import predict_errors
-from graphnav.estimation.noise.spans import Span, drop_within, mask_times
+from graphnav.estimation.noise.spans import Span, mask_times
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.ekf import refilter
 from graphnav.estimation.solvers.linearise import Points
@@ -61,7 +61,7 @@ def weigh_excluded(base: Problem, noise: NoiseModel, near: tuple[Points, Problem
         used = apply_noise(base, noise)
         smoothed = smooth_moments(used, refilter(used, reuse_points(*near, used), whole=False))
         factors, settled = _measure_factors(used, noise, smoothed, factors)
-        noise = replace(noise, weights=_merge_weights(used, noise, factors))
+        noise = replace(noise, span_weights=_list_weights(factors))
         passes += 1
     return noise, Points(smoothed.states, smoothed.values), passes
 
@@ -98,18 +98,7 @@ def count_repetition(error: Array) -> float:
     return float(1.0 + 2.0 * np.sum((1.0 - k / n) * r**k))
 
 
-def _merge_weights(problem: Problem, noise: NoiseModel, factors: _Factors) -> dict[str, RowWeights]:
-    """The weights of the noise model with those of the rows in its spans."""
-    weights = dict(noise.weights)
-    empty = RowWeights(np.empty(0), np.empty(0))
-    for rows in problem.constraints:
-        own = {span: 1.0 / factor for (name, span), factor in factors.items() if name == rows.name}
-        if not own:
-            continue
-        t, kept = problem.t[rows.keyframe], drop_within(weights.get(rows.name, empty), own)
-        inside = [t[mask_times(t, [span])] for span in own]
-        each = np.repeat(list(own.values()), [len(one) for one in inside])
-        both, of_both = np.concatenate([kept.t, *inside]), np.concatenate([kept.weight, each])
-        order = np.argsort(both, kind="stable")
-        weights[rows.name] = RowWeights(both[order], of_both[order])
-    return weights
+def _list_weights(factors: _Factors) -> dict[str, tuple[tuple[float, float, float], ...]]:
+    """`NoiseModel.span_weights` by the factors on variances."""
+    names = dict.fromkeys(name for name, _ in factors)
+    return {name: tuple((*span, 1.0 / f) for (of, span), f in factors.items() if of == name) for name in names}

@@ -9,7 +9,7 @@ from scipy.special import chdtri
 
 from graphnav.constraints.base import SAME_TIME
 from graphnav.core.rotation import Array
-from graphnav.estimation.noise.model import NoiseModel, RowWeights
+from graphnav.estimation.noise.model import RowWeights
 from graphnav.estimation.noise.outliers import CHANCE, OUTLIER_COST
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import ExcludedSpan
@@ -30,11 +30,6 @@ def drop_within(some: RowWeights, spans: Iterable[Span]) -> RowWeights:
     """The weights of the rows outside all spans."""
     keep = ~mask_times(some.t, spans)
     return RowWeights(some.t[keep], some.weight[keep])
-
-
-def list_outliers(noise: NoiseModel) -> dict[str, RowWeights]:
-    """The weights of a noise model, those of rows in excluded spans aside."""
-    return {name: drop_within(some, noise.excluded.get(name, ())) for name, some in noise.weights.items()}
 
 
 def join(spans: Iterable[Span]) -> list[Span]:

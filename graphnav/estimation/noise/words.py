@@ -9,7 +9,6 @@ from graphnav.constraints.vehicle import MOUNTING
 from graphnav.core.notes import Note, format_count
 from graphnav.estimation.names import name_components, name_rows
 from graphnav.estimation.noise.model import INTERVALS, NoiseModel
-from graphnav.estimation.noise.spans import list_outliers
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.linearise import Points, shift
 from graphnav.recording.checks.axes import write_letters
@@ -105,7 +104,7 @@ def describe_noise(noise: NoiseModel, problem: Problem) -> tuple[str, ...]:
         out.append(
             Note("noise.rows", f"noise model, {name_rows(rows.name)}: white part in stated sigmas: {'; '.join(parts)}")
         )
-        some = list_outliers(noise).get(rows.name)
+        some = noise.weights.get(rows.name)
         if some is not None and len(some.t):
             less = int(np.count_nonzero(some.weight < 1.0))
             out.append(
