@@ -126,10 +126,8 @@ def prepare(
     if noise is None:
         tell("noise")
         with clock.count_time("noise"):
-            builder, built, first = _drop_false_stops(builder, built, progress)
-            noise, known, built, evidence = _find_noise(builder, built, first, progress, passes, weigh)
-            moving = tuple((float(begin), float(end)) for begin, end in builder.false_stops)
-            noise = replace(noise, spacing=spacing, false_stops=moving)
+            noise, known, built, evidence = _find_noise(builder, built, progress, passes, weigh)
+            noise = replace(noise, spacing=spacing)
     else:
         built = builder.build_without(built, noise, parts=noise != STATED, anew=bool(noise.freed))
         built = replace(built, problem=free(built.problem, noise.freed))
@@ -192,18 +190,13 @@ def _filter_and_smooth(
 
 
 def _find_noise(
-    builder: ProblemBuilder,
-    built: BuiltProblem,
-    first: NoiseEstimate,
-    progress: Progress | None,
-    passes: Counter[str],
-    weigh: Weigh | None,
+    builder: ProblemBuilder, built: BuiltProblem, progress: Progress | None, passes: Counter[str], weigh: Weigh | None
 ) -> tuple[NoiseModel, Points | None, BuiltProblem, float]:
-    """The noise model, linearisation points, the problem with a start and stops that rest on no excluded fix, and the
-    logarithm of the evidence where it is wanted.
+    """The noise model, linearisation points, the problem with a start and stops that rest on no excluded fix, and
+    without stops that the other measurements contradict, and the logarithm of the evidence where it is wanted.
     """
     settings = builder.settings.gnss
-    found = estimate_jointly(built.problem, settings, built.aligned.until, progress, first)
+    found = estimate_jointly(built.problem, settings, built.aligned.until, progress)
     if found.excluded_share > _MOST_WRONG:
         # most fixes contradict the start: align again with the fixes behind those that the alignment used
         try:
@@ -220,6 +213,12 @@ def _find_noise(
     found = revise_jointly(found, settings, built.aligned.until, progress)
     if found.freed:
         built, found = _start_anew(builder, built, found)
+    false, spent = find_false_stops(found.base, found.estimate, built.detections.stationary)
+    passes.update(filter=spent)
+    if len(false):
+        passes.update(found.estimate.passes)
+        moving = replace(builder, false_stops=merge_spans(np.concatenate([builder.false_stops, false])))
+        return _find_noise(moving, moving.build_moving(built), progress, passes, weigh)
     best, built = found.estimate, replace(built, problem=found.base)
     wanted = weigh is not None and weigh(apply_noise(built.problem, best.noise), best.points)
     found = found.weigh() if wanted else found
@@ -232,24 +231,8 @@ def _find_noise(
     if best.noise.excluded:
         chosen, points, spent = weigh_excluded(built.problem, chosen, best.get_linearisation(built.problem))
         passes.update(filter=spent, smoother=spent)
-    return chosen, None if stated else points, built, evidence
-
-
-def _drop_false_stops(
-    builder: ProblemBuilder, built: BuiltProblem, progress: Progress | None
-) -> tuple[ProblemBuilder, BuiltProblem, NoiseEstimate]:
-    """The problem without the stops that the other measurements contradict, and a noise model with nothing else left
-    out.
-    """
-    passes = Counter[str]()
-    while True:
-        found = estimate_noise(built.problem, built.aligned.until, progress=progress)
-        false, spent = find_false_stops(built.problem, found, built.detections.stationary)
-        passes += found.passes + Counter(filter=spent)
-        if not len(false):
-            return builder, built, replace(found, passes=passes)
-        builder = replace(builder, false_stops=merge_spans(np.concatenate([builder.false_stops, false])))
-        built = builder.build_moving(built)
+    moving_spans = tuple((float(begin), float(end)) for begin, end in builder.false_stops)
+    return replace(chosen, false_stops=moving_spans), None if stated else points, built, evidence
 
 
 def _start_without(

@@ -21,10 +21,11 @@ from graphnav.estimation.noise.apply import apply_noise
 from graphnav.estimation.noise.estimate import NoiseEstimate
 from graphnav.estimation.noise.explanations import FIXES, Trials, add_common_errors
 from graphnav.estimation.noise.model import INTERVALS
+from graphnav.estimation.noise.spans import join
 from graphnav.estimation.problem import Problem
 
 _OF_STOPS = (ZeroVelocity.name,)
-_MASKING = (*FIXES, *INTERVALS, ZeroVelocity.name, ZeroRate.name, HeldPosition.name)  # their weights hide a false stop
+_MASKING = (*INTERVALS, ZeroVelocity.name, ZeroRate.name, HeldPosition.name)  # their weights may hide a false stop
 
 
 def find_false_stops(base: Problem, found: NoiseEstimate, stationary: Array) -> tuple[Array, int]:
@@ -33,7 +34,7 @@ def find_false_stops(base: Problem, found: NoiseEstimate, stationary: Array) -> 
     Parameters
     ----------
     base : built with stated noise.
-    found : estimated with all measurements.
+    found : with its constants and what it leaves out.
     stationary : (M, 2) s, by which the problem was built.
 
     Returns
@@ -50,11 +51,13 @@ def find_false_stops(base: Problem, found: NoiseEstimate, stationary: Array) -> 
     first, behind = np.searchsorted(t, stationary[:, 0] - SAME_TIME), np.searchsorted(t, stationary[:, 1] + SAME_TIME)
     spans = stationary[behind > first]
     listed = [(float(begin), float(end)) for begin, end in spans]
-    noise = found.robust or found.noise
+    excluded = {name: list(some) for name, some in found.noise.excluded.items()}
+    for name in (*FIXES, HeldPosition.name):
+        excluded[name] = join([*excluded.get(name, ()), *listed])
     noise = replace(
-        noise,
-        weights={name: some for name, some in noise.weights.items() if name not in _MASKING},
-        excluded=dict.fromkeys((*FIXES, HeldPosition.name), tuple(listed)),
+        found.noise,
+        weights={name: some for name, some in found.noise.weights.items() if name not in _MASKING},
+        excluded={name: tuple(some) for name, some in excluded.items()},
     )
     used = apply_noise(base, noise)
     trials = Trials(used, found.carry_points(base, used), listed)
