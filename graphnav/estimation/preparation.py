@@ -35,7 +35,7 @@ from graphnav.estimation.noise.apply import apply_noise, drop_parts
 from graphnav.estimation.noise.bias_walks import estimate_bias_walks
 from graphnav.estimation.noise.estimate import NoiseEstimate, estimate_noise
 from graphnav.estimation.noise.false_stops import find_false_stops
-from graphnav.estimation.noise.initial_points import BREAKDOWN
+from graphnav.estimation.noise.initial_points import BREAKDOWN, find_initial_points
 from graphnav.estimation.noise.model import STATED, NoiseModel
 from graphnav.estimation.noise.spacing import space_fixes
 from graphnav.estimation.noise.span_variances import weigh_excluded
@@ -122,11 +122,11 @@ def prepare(
     if stated:
         noise, spacing = STATED, STATED.spacing
     builder = replace(every, used=space_fixes(recording, spacing)) if spacing else every
-    built, known, evidence = builder.build(aligned, detections, parts=larger or noise != STATED), None, np.inf
+    built, evidence = builder.build(aligned, detections, parts=larger or noise != STATED), np.inf
     if noise is None:
         tell("noise")
         with clock.count_time("noise"):
-            noise, known, built, evidence = _find_noise(builder, built, progress, passes, weigh)
+            noise, built, evidence = _find_noise(builder, built, progress, passes, weigh)
             noise = replace(noise, spacing=spacing)
     else:
         built = builder.build_without(built, noise, parts=noise != STATED, anew=bool(noise.freed))
@@ -135,10 +135,10 @@ def prepare(
     problem = drop_parts(apply_noise(built.problem, noise))
     try:
         forward, smoothed = _filter_and_smooth(problem, aligned.until, None, clock, progress)
-    except EstimationError:  # from a rough start its first pass may diverge, where that of the noise model did not
-        if known is None:
-            raise
-        forward, smoothed = _filter_and_smooth(problem, aligned.until, known, clock, progress)
+    except EstimationError:  # from a rough start its first pass may diverge
+        (initial, *_), more = find_initial_points(problem, aligned.until)
+        passes.update(filter=more, smoother=more)
+        forward, smoothed = _filter_and_smooth(problem, aligned.until, initial.points, clock, progress)
     if larger:
         with clock.count_time("noise"):
             noise, spent = estimate_bias_walks(built.problem, smoothed)
@@ -152,7 +152,7 @@ def prepare(
         if any(rows.gate is not None for rows in problem.constraints):
             smoothed = smooth_backward(problem, refilter(problem, smoothed, progress), progress)
         problem = problem.with_input_noise(smoothed.states, scale_at(problem.columns, smoothed.values))
-        forward, smoothed, ahead = relinearise(problem, aligned, known, forward, smoothed, progress, passes)
+        forward, smoothed, ahead = relinearise(problem, aligned, forward, smoothed, progress, passes)
     passes.update(filter=1, smoother=1)
     notes = (*describe_freed(noise.freed, recording), *describe_noise(noise, problem), *_describe_missing(problem))
     epochs, arcs = dict[str, Array](), {"": CarrierArcs()}
@@ -191,8 +191,8 @@ def _filter_and_smooth(
 
 def _find_noise(
     builder: ProblemBuilder, built: BuiltProblem, progress: Progress | None, passes: Counter[str], weigh: Weigh | None
-) -> tuple[NoiseModel, Points | None, BuiltProblem, float]:
-    """The noise model, linearisation points, the problem with a start and stops that rest on no excluded fix, and
+) -> tuple[NoiseModel, BuiltProblem, float]:
+    """The noise model, the problem with a start and stops that rest on no excluded fix, and
     without stops that the other measurements contradict, and the logarithm of the evidence where it is wanted.
     """
     settings = builder.settings.gnss
@@ -225,14 +225,12 @@ def _find_noise(
     evidence = found.compute_evidence() if wanted else np.inf
     passes.update(found.estimate.passes + Counter(filter=1))
     plain = NoiseModel(excluded=best.noise.excluded, freed=found.freed)
-    stated = _is_likelier(built.problem, plain, best)
-    # the points alone: the covariances of the last pass are half of all memory
-    chosen, points = plain if stated else found.noise, Points(best.points.states, best.points.values)
-    if best.noise.excluded:
-        chosen, points, spent = weigh_excluded(built.problem, chosen, best.get_linearisation(built.problem))
+    noise = plain if _is_likelier(built.problem, plain, best) else found.noise
+    if noise.excluded:
+        noise, spent = weigh_excluded(built.problem, noise, best.get_linearisation(built.problem))
         passes.update(filter=spent, smoother=spent)
-    moving_spans = tuple((float(begin), float(end)) for begin, end in builder.false_stops)
-    return replace(chosen, false_stops=moving_spans), None if stated else points, built, evidence
+    spans = tuple((float(begin), float(end)) for begin, end in builder.false_stops)
+    return replace(noise, false_stops=spans), built, evidence
 
 
 def _start_without(

@@ -32,7 +32,6 @@ _SMOOTHINGS = 5  # passes of filter and smoother about their previous points; wi
 def relinearise(
     problem: Problem,
     aligned: Alignment,
-    known: Points | None,
     forward: FilterPass,
     smoothed: SmootherPass,
     progress: Progress | None,
@@ -45,7 +44,7 @@ def relinearise(
     that few fixes tell of. Returns also the points behind that step.
     """
     if not are_near(smoothed, forward.linearised, LINEAR_ATTITUDE):
-        forward, smoothed, ahead = _linearise_far(problem, aligned, known, smoothed, progress, passes)
+        forward, smoothed, ahead = _linearise_far(problem, aligned, smoothed, progress, passes)
         if ahead is not None:
             return forward, smoothed, ahead
     for _ in range(_SMOOTHINGS):
@@ -65,22 +64,21 @@ def relinearise(
 def _linearise_far(
     problem: Problem,
     aligned: Alignment,
-    known: Points | None,
     smoothed: SmootherPass,
     progress: Progress | None,
     passes: Counter[str],
 ) -> tuple[FilterPass, SmootherPass, Points | None]:
     """Filter and smooth where attitudes were linearised too far off; and the points of a batch solution, if any.
 
-    The points are `known`, those of the noise estimate, if there are any, else the smoother's own; each pass about
-    those of the pass before is a step of Gauss and Newton. If that does not settle they are those of a batch solution.
+    Each pass about the points of the pass before is a step of Gauss and Newton. If that does not settle the points are
+    those of a batch solution.
 
     If the heading is uncertain and fixes weigh little beside wheels, a filter may turn the mounting by half a turn
     instead of the velocity, a local minimum. So the batch is then solved at once, without wheels first.
     """
     wheels = aligned.motion is not None and any(c.of_wheels for c in problem.constraints)
-    about: Points = smoothed if known is None or len(known.states) != len(problem.t) else known
-    for _ in range(int(about is known) if wheels else _SMOOTHINGS):
+    about = smoothed
+    for _ in range(0 if wheels else _SMOOTHINGS):
         passes.update(filter=1, smoother=1)
         smoothed = smooth_backward(problem, refilter(problem, about, progress), progress)
         if are_near(smoothed, about, LINEAR_ATTITUDE):

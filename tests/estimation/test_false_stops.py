@@ -73,7 +73,7 @@ def test_a_stop_at_speed_is_none(
     np.testing.assert_allclose(found.states.p[-1], true.states.p[-1], atol=0.1)
     kept = read_noise(write_noise(tmp_path / "noise.json", found.noise))
     again = run(recording, SETTINGS, ("rts",), noise=kept)["rts"]
-    np.testing.assert_allclose(again.states.p, found.states.p, atol=0.01)
+    np.testing.assert_array_equal(again.states.p, found.states.p)
 
 
 def test_a_motorbike_that_rides_steadily_does_not_stand(shared_data: Path) -> None:

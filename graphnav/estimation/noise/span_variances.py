@@ -37,7 +37,7 @@ _ROUNDS = 8  # passes at most
 _Factors = dict[tuple[str, Span], float]  # on the variance of a constraint's rows in a span
 
 
-def weigh_excluded(base: Problem, noise: NoiseModel, near: tuple[Points, Problem]) -> tuple[NoiseModel, Points, int]:
+def weigh_excluded(base: Problem, noise: NoiseModel, near: tuple[Points, Problem]) -> tuple[NoiseModel, int]:
     """Give the measurements of excluded spans weights by which they can be used.
 
     Parameters
@@ -50,8 +50,6 @@ def weigh_excluded(base: Problem, noise: NoiseModel, near: tuple[Points, Problem
     -------
     NoiseModel
         With a weight for each row of the spans.
-    Points
-        Of the last pass.
     int
         Passes of filter and smoother.
     """
@@ -63,7 +61,7 @@ def weigh_excluded(base: Problem, noise: NoiseModel, near: tuple[Points, Problem
         factors, settled = _measure_factors(used, noise, smoothed, factors)
         noise = replace(noise, span_weights=_list_weights(factors))
         passes += 1
-    return noise, Points(smoothed.states, smoothed.values), passes
+    return noise, passes
 
 
 def _measure_factors(
