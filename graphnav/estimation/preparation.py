@@ -190,10 +190,18 @@ def _filter_and_smooth(
 
 
 def _find_noise(
-    builder: ProblemBuilder, built: BuiltProblem, progress: Progress | None, passes: Counter[str], weigh: Weigh | None
+    builder: ProblemBuilder,
+    built: BuiltProblem,
+    progress: Progress | None,
+    passes: Counter[str],
+    weigh: Weigh | None,
+    first: int = 1,
 ) -> tuple[NoiseModel, BuiltProblem, float]:
-    """The noise model, the problem with a start and stops that rest on no excluded fix, and
-    without stops that the other measurements contradict, and the logarithm of the evidence where it is wanted.
+    """The noise model, the problem with a start and stops that rest on no excluded fix, and the logarithm of the
+    evidence where it is wanted.
+
+    Of stops that the other measurements contradict, the first are dropped, twice as many each time, and all is found
+    anew.
     """
     settings = builder.settings.gnss
     found = estimate_jointly(built.problem, settings, built.aligned.until, progress)
@@ -217,8 +225,8 @@ def _find_noise(
     passes.update(filter=spent)
     if len(false):
         passes.update(found.estimate.passes)
-        moving = replace(builder, false_stops=merge_spans(np.concatenate([builder.false_stops, false])))
-        return _find_noise(moving, moving.build_moving(built), progress, passes, weigh)
+        moving = replace(builder, false_stops=merge_spans(np.concatenate([builder.false_stops, false[:first]])))
+        return _find_noise(moving, moving.build_moving(built), progress, passes, weigh, 2 * first)
     best, built = found.estimate, replace(built, problem=found.base)
     wanted = weigh is not None and weigh(apply_noise(built.problem, best.noise), best.points)
     found = found.weigh() if wanted else found

@@ -576,7 +576,7 @@ def test_nothing_is_left_out_of_clean_data(seed: int, wheels: bool) -> None:
 def test_fixes_that_are_wrong_alike_are_left_out(wheels: bool) -> None:
     wrong, bad = shifted(clean(0, wheels)[0], 90.0, 120.0, (8.0, -6.0, 0.0))
     found = run(wrong, None, ("rts",))["rts"]
-    assert np.array_equal(found.records["gnss_position"].weight == 0.0, bad)
+    assert np.array_equal(found.records["gnss_position"].weight < 1e-3, bad)
     assert not set(found.noise.excluded) & set(WHEELS)
 
 
@@ -609,7 +609,7 @@ def test_a_run_with_the_noise_that_another_found_is_the_same() -> None:
     noise = one["batch"].noise
     assert noise.excluded
     for solver, solution in one.items():
-        assert np.all(solution.records["gnss_position"].weight[61:80] == 0.0), solver
+        assert np.all(solution.records["gnss_position"].weight[61:80] < 1e-3), solver
     assert np.abs(one["incremental"].states.p - one["batch"].states.p).max() < 0.01
     other = run(recording, noise=noise)
     for solver in SOLVERS:

@@ -40,7 +40,8 @@ def find_false_stops(base: Problem, found: NoiseEstimate, stationary: Array) -> 
     Returns
     -------
     array
-        (n, 2) s, those of the spans in which a constant velocity is the likelier.
+        (n, 2) s, those of the spans in which a constant velocity is the likelier. A false stop leads the solution
+        astray, so that later ones may be contradicted though they are true.
     int
         Filter passes.
     """
@@ -61,12 +62,6 @@ def find_false_stops(base: Problem, found: NoiseEstimate, stationary: Array) -> 
     )
     used = apply_noise(base, noise)
     trials = Trials(used, found.carry_points(base, used), listed)
+    stands = trials.sum_spans(trials.filter(used).log_likelihood())
     moves = trials.sum_spans(trials.filter(add_common_errors(used, listed, _OF_STOPS), _OF_STOPS).log_likelihood())
-    false: list[int] = []
-    while True:
-        some = add_common_errors(used, [listed[k] for k in false], _OF_STOPS) if false else used
-        stands = trials.sum_spans(trials.filter(some, _OF_STOPS).log_likelihood())
-        more = np.setdiff1d(np.flatnonzero(moves - stands > FAULT_COST), false)
-        if not len(more):
-            return spans[false], trials.passes
-        false = sorted([*false, int(more[0])])  # later ones may be contradicted by what the first has done
+    return spans[moves - stands > FAULT_COST], trials.passes
