@@ -39,8 +39,9 @@ import numpy as np
 from graphnav.core import rotation
 from graphnav.core.earth import LocalFrame
 from graphnav.core.rotation import Array, mv
+from graphnav.core.running import sum_running
 from graphnav.core.state import DIM, Parameter, States
-from graphnav.imu.preintegration import Intervals
+from graphnav.imu.preintegration import Intervals, multiply_up
 from graphnav.recording import ACROSS, ImuNoise, Recording
 
 SCALE = "imu_scale"
@@ -233,14 +234,17 @@ class ImuFactors:
         return self._earth.reach(rows, start, dR, moved[:, :3], moved[:, 3:])
 
     def advance_through(self, rows: slice, start: States, scale: Array | None = None) -> States:
-        """The states (n) at the ends of successive intervals, from one at the start of the first."""
+        """The states (n) at the ends of successive intervals, from one at the start of the first.
+
+        Over all of them gravity changes linearly.
+        """
         _, dR, moved = self._correct(rows, start, scale)
-        reached = []
-        for j in range(len(dR)):
-            at, one = slice(rows.start + j, rows.start + j + 1), slice(j, j + 1)
-            start = self._earth.reach(at, start, dR[one], moved[one, :3], moved[one, 3:])
-            reached.append(start)
-        return States.stack(reached)
+        T = self.intervals.T[rows]
+        R = multiply_up(dR[:, None])[:, 0]
+        V = sum_running(mv(R[:-1], moved[:, 3:]))
+        P = sum_running(V[:-1] * T[:, None] + mv(R[:-1], moved[:, :3]))
+        one = np.zeros(len(T), dtype=int)
+        return EarthMotion(np.cumsum(T), self.frame).reach(slice(None), start, R[1:], P[1:], V[1:], one)
 
     def _correct(self, rows: slice, start: States, scale: Array | None) -> tuple[Array, Array, Array]:
         """Rotation (n, 3) by bias and scale errors, and dR, (dP, dV) (n, 6) corrected for them."""
