@@ -112,7 +112,7 @@ CONSTANTS = (
     ),
     Constant("graphnav.estimation.preparation", "_MOST_WRONG", "the larger part"),
     Constant(
-        "graphnav.estimation.preparation",
+        "graphnav.estimation.relinearisation",
         "_LINEAR",
         "sigmas of a step: a quarter more mean square of errors over sigmas",
     ),

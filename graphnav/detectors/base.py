@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from graphnav.config.detectors import FUSED
+from graphnav.core.notes import Note, format_count
 from graphnav.core.rotation import Array, stack_columns
 
 Mask = NDArray[np.bool_]
@@ -48,6 +50,27 @@ class Detections:
             if detection.name == name:
                 return detection
         raise KeyError(name)
+
+    def without(self, spans: Array) -> Detections:
+        """The same if the platform moves in some of the stationary spans.
+
+        Parameters
+        ----------
+        spans
+            (n, 2) s.
+
+        Returns
+        -------
+        Detections
+            The fused answer without these.
+        """
+        if not len(spans):
+            return self
+        kept = subtract_spans(self.stationary, spans)
+        many = format_count(int(len(self.stationary) - len(kept)), "smooth stretch", "smooth stretches")
+        note = Note("detectors.contradicted", f"{many} not taken as a stop: the other measurements show motion")
+        answers = (replace(d, intervals=kept, mask=mask_inside(d.t, kept)) if d.name == FUSED else d for d in self.all)
+        return Detections(kept, tuple(answers), (*self.notes, note))
 
 
 def find_spans(mask: Mask, t: Array, half: float = 0.0) -> Array:

@@ -21,6 +21,7 @@ from graphnav.core.progress import tell
 from graphnav.core.rotation import Array
 from graphnav.core.state import BLOCKS
 from graphnav.detectors import Detections, detect
+from graphnav.detectors.base import NONE
 from graphnav.estimation.alignment import Alignment, align, use_known_heading
 from graphnav.estimation.alignment.first import pick_fixes
 from graphnav.estimation.contradictions import use_freed
@@ -74,6 +75,9 @@ class ProblemBuilder:
     frame: LocalFrame
     clock: Clock
     averaging: Beside[MeanSpeed | None] | Done[MeanSpeed | None]  # the odometer's
+    false_stops: Array = field(
+        default_factory=lambda: NONE
+    )  # (n, 2) s, in which the platform moves, whatever the detectors say
 
     def align(self, recording: Recording, stationary: Array, before: Alignment | None = None) -> Alignment:
         """The first state of the recording, or of a part of it, near that found before, if any."""
@@ -101,6 +105,11 @@ class ProblemBuilder:
         problem, carriers = split_carriers(problem, GnssPhase)  # the noise model depends on the codes
         return BuiltProblem(problem, carriers, aligned, detections)
 
+    def build_moving(self, built: BuiltProblem) -> BuiltProblem:
+        """The problem without the false stops, aligned again."""
+        detections = built.detections.without(self.false_stops)
+        return self.build(self.align(self.recording, detections.stationary), detections, parts=True)
+
     def build_later(self, built: BuiltProblem) -> BuiltProblem:
         """The problem with a start that is sought after the fixes used by the first alignment."""
         gnss, until = self.recording.gnss, built.aligned.until
@@ -124,7 +133,7 @@ class ProblemBuilder:
             return built
         aligned, detections = built.aligned, built.detections
         fixes = drop_excluded(self.recording, noise)
-        stops = detect(fixes, self.settings)
+        stops = detect(fixes, self.settings).without(self.false_stops)
         changed = _differ(stops.stationary, detections.stationary)
         stops = stops if changed else detections
         seen = self.recording.end if aligned.until is None else aligned.until

@@ -79,7 +79,11 @@ _Estimate = Callable[[Problem, JointEstimate], NoiseEstimate]
 
 
 def estimate_jointly(
-    stated: Problem, settings: GnssSettings, opening: float | None = None, progress: Progress | None = None
+    stated: Problem,
+    settings: GnssSettings,
+    opening: float | None = None,
+    progress: Progress | None = None,
+    first: NoiseEstimate | None = None,
 ) -> JointEstimate:
     """The noise model, with constants free that the drive contradicts, and without spans of wrong measurements.
 
@@ -88,6 +92,7 @@ def estimate_jointly(
     stated : built with stated noise and the parts of its intervals' noise.
     settings : which constants are exact, and whether spans of wrong measurements are left out.
     opening : as for `graphnav.estimation.solvers.ekf.ekf`.
+    first : with all constants as stated and all measurements, where it is known.
 
     Raises
     ------
@@ -102,7 +107,7 @@ def estimate_jointly(
     def go_on(base: Problem, before: JointEstimate) -> NoiseEstimate:
         return estimate(base, before, before.estimate.noise)
 
-    found = JointEstimate(stated, {}, estimate_noise(stated, opening, progress=progress))
+    found = JointEstimate(stated, {}, first or estimate_noise(stated, opening, progress=progress))
     found = _free_constants(found, settings, go_on, estimate)
     return replace(found, estimate=_leave_out_faults(found.base, found.estimate, settings, opening, progress))
 

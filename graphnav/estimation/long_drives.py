@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -202,14 +203,16 @@ def crop_solution(solution: Solution, share: Share, detections: tuple[Detection,
         )  # fmt: skip
 
     def crop_noise(model: NoiseModel) -> NoiseModel:
+        def crop_spans(spans: tuple[tuple[float, ...], ...]) -> tuple[Any, ...]:
+            return tuple((max(a, start), min(b, end), *more) for a, b, *more in spans if a < end and b >= start)
+
         weights = {
             name: RowWeights(w.t[find_inside(w.t)], w.weight[find_inside(w.t)]) for name, w in model.weights.items()
         }
-        spans = {
-            name: tuple((max(a, start), min(b, end)) for a, b in some if a < end and b >= start)
-            for name, some in model.excluded.items()
-        }
-        return replace(model, weights=weights, excluded=spans)
+        excluded = {name: crop_spans(spans) for name, spans in model.excluded.items()}
+        used = {name: crop_spans(spans) for name, spans in model.span_weights.items()}
+        stops = crop_spans(model.false_stops)
+        return replace(model, weights=weights, excluded=excluded, span_weights=used, false_stops=stops)
 
     def crop_arcs(arcs: CarrierArcs) -> CarrierArcs:
         some = (arcs.begin < end) & (arcs.end >= start)

@@ -35,7 +35,8 @@ from graphnav.estimation.noise.unmeasured import describe_unmeasured
 from graphnav.estimation.noise.words import describe_far
 from graphnav.estimation.offsets import move_stamps
 from graphnav.estimation.pieces import describe_span, split_pieces
-from graphnav.estimation.preparation import Prepared, Weigh, prepare, step_ahead
+from graphnav.estimation.preparation import Prepared, Weigh, prepare
+from graphnav.estimation.relinearisation import step_ahead
 from graphnav.estimation.separation import compute_separation
 from graphnav.estimation.solution import KNOWN, Solution, join_solutions
 from graphnav.estimation.solvers.breakdown import explain_singular
@@ -258,7 +259,7 @@ def _solve(
         recording = move_stamps(recording, stamps)
         found = prepare_moved(recording, stamps.rate)
     problem, forward, smoothed = found.problem, found.forward, found.smoothed
-    faults = find_fault_spans(problem, smoothed)
+    faults = find_fault_spans(problem, smoothed, found.noise.excluded)
     notes = (
         *found.start.notes,
         *undone,

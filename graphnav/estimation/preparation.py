@@ -7,7 +7,6 @@ solver its first linearisation point.
 
 from __future__ import annotations
 
-import contextlib
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -24,8 +23,8 @@ from graphnav.core.errors import EstimationError
 from graphnav.core.notes import Note
 from graphnav.core.progress import Progress, tell
 from graphnav.core.rotation import Array
-from graphnav.core.state import States
 from graphnav.detectors import Detections
+from graphnav.detectors.base import merge_spans
 from graphnav.estimation.alignment import Alignment, use_known_heading
 from graphnav.estimation.building import BuiltProblem, Clock, ProblemBuilder, has_diverged
 from graphnav.estimation.contradictions import describe_freed, free
@@ -35,31 +34,28 @@ from graphnav.estimation.joint_estimate import JointEstimate, estimate_jointly, 
 from graphnav.estimation.noise.apply import apply_noise, drop_parts
 from graphnav.estimation.noise.bias_walks import estimate_bias_walks
 from graphnav.estimation.noise.estimate import NoiseEstimate, estimate_noise
+from graphnav.estimation.noise.false_stops import find_false_stops
 from graphnav.estimation.noise.initial_points import BREAKDOWN
 from graphnav.estimation.noise.model import STATED, NoiseModel
 from graphnav.estimation.noise.spacing import space_fixes
+from graphnav.estimation.noise.span_variances import weigh_excluded
 from graphnav.estimation.noise.unmeasured import UnmeasuredRows, drop_unmeasured
 from graphnav.estimation.noise.words import describe_noise
 from graphnav.estimation.problem import Problem
+from graphnav.estimation.relinearisation import relinearise
 from graphnav.estimation.solution import CarrierArcs
 from graphnav.estimation.solvers.ekf import ekf, refilter
 from graphnav.estimation.solvers.linearise import Points, scale_at
 from graphnav.estimation.solvers.passes import (
-    LINEAR_ATTITUDE,
     FilterPass,
     SmootherPass,
-    are_near,
-    subtract_points,
-    take_solution_points,
 )
-from graphnav.estimation.solvers.rts import smooth_backward, smooth_points
+from graphnav.estimation.solvers.rts import smooth_backward
 from graphnav.recording import Recording
 
 # whether the evidence of a noise model is wanted, by the problem and the points of its estimate
 Weigh = Callable[[Problem, Points], bool]
 
-_LINEAR = 0.5  # sigmas of what a step still moves: a mean square of errors over sigmas is a quarter larger
-_SMOOTHINGS = 5  # passes of filter and smoother about their previous points; without convergence a batch is solved
 _MOST_WRONG = 0.5  # share of excluded fixes, beyond which the start is wrong rather than the fixes
 
 
@@ -116,7 +112,9 @@ def prepare(
     recording, unmeasured = (recording, UnmeasuredRows()) if as_stated else drop_unmeasured(recording)
     spacing = settings.noise.spacing if noise is None else noise.spacing
     averaging = begin_beside(partial(average_speed, recording, settings))
-    every = ProblemBuilder(recording, recording, settings, frame, clock, averaging)
+    false_stops = np.array(() if noise is None else noise.false_stops).reshape(-1, 2)
+    detections = detections.without(false_stops)
+    every = ProblemBuilder(recording, recording, settings, frame, clock, averaging, false_stops)
     aligned = every.align(recording, detections.stationary)
     unaided = aligned.motion is None or not settings.gnss.position
     stated = noise is None and (settings.noise.mode == "stated" or unaided)
@@ -128,8 +126,10 @@ def prepare(
     if noise is None:
         tell("noise")
         with clock.count_time("noise"):
-            noise, known, built, evidence = _find_noise(builder, built, progress, passes, weigh)
-            noise = replace(noise, spacing=spacing)
+            builder, built, first = _drop_false_stops(builder, built, progress)
+            noise, known, built, evidence = _find_noise(builder, built, first, progress, passes, weigh)
+            moving = tuple((float(begin), float(end)) for begin, end in builder.false_stops)
+            noise = replace(noise, spacing=spacing, false_stops=moving)
     else:
         built = builder.build_without(built, noise, parts=noise != STATED, anew=bool(noise.freed))
         built = replace(built, problem=free(built.problem, noise.freed))
@@ -154,7 +154,7 @@ def prepare(
         if any(rows.gate is not None for rows in problem.constraints):
             smoothed = smooth_backward(problem, refilter(problem, smoothed, progress), progress)
         problem = problem.with_input_noise(smoothed.states, scale_at(problem.columns, smoothed.values))
-        forward, smoothed, ahead = _relinearise(problem, aligned, known, forward, smoothed, progress, passes)
+        forward, smoothed, ahead = relinearise(problem, aligned, known, forward, smoothed, progress, passes)
     passes.update(filter=1, smoother=1)
     notes = (*describe_freed(noise.freed, recording), *describe_noise(noise, problem), *_describe_missing(problem))
     epochs, arcs = dict[str, Array](), {"": CarrierArcs()}
@@ -192,13 +192,18 @@ def _filter_and_smooth(
 
 
 def _find_noise(
-    builder: ProblemBuilder, built: BuiltProblem, progress: Progress | None, passes: Counter[str], weigh: Weigh | None
+    builder: ProblemBuilder,
+    built: BuiltProblem,
+    first: NoiseEstimate,
+    progress: Progress | None,
+    passes: Counter[str],
+    weigh: Weigh | None,
 ) -> tuple[NoiseModel, Points | None, BuiltProblem, float]:
     """The noise model, linearisation points, the problem with a start and stops that rest on no excluded fix, and the
     logarithm of the evidence where it is wanted.
     """
     settings = builder.settings.gnss
-    found = estimate_jointly(built.problem, settings, built.aligned.until, progress)
+    found = estimate_jointly(built.problem, settings, built.aligned.until, progress, first)
     if found.excluded_share > _MOST_WRONG:
         # most fixes contradict the start: align again with the fixes behind those that the alignment used
         try:
@@ -221,10 +226,30 @@ def _find_noise(
     evidence = found.compute_evidence() if wanted else np.inf
     passes.update(found.estimate.passes + Counter(filter=1))
     plain = NoiseModel(excluded=best.noise.excluded, freed=found.freed)
-    if _is_likelier(built.problem, plain, best):
-        return plain, None, built, evidence
+    stated = _is_likelier(built.problem, plain, best)
     # the points alone: the covariances of the last pass are half of all memory
-    return found.noise, Points(best.points.states, best.points.values), built, evidence
+    chosen, points = plain if stated else found.noise, Points(best.points.states, best.points.values)
+    if best.noise.excluded:
+        chosen, points, spent = weigh_excluded(built.problem, chosen, best.get_linearisation(built.problem))
+        passes.update(filter=spent, smoother=spent)
+    return chosen, None if stated else points, built, evidence
+
+
+def _drop_false_stops(
+    builder: ProblemBuilder, built: BuiltProblem, progress: Progress | None
+) -> tuple[ProblemBuilder, BuiltProblem, NoiseEstimate]:
+    """The problem without the stops that the other measurements contradict, and a noise model with nothing else left
+    out.
+    """
+    passes = Counter[str]()
+    while True:
+        found = estimate_noise(built.problem, built.aligned.until, progress=progress)
+        false, spent = find_false_stops(built.problem, found, built.detections.stationary)
+        passes += found.passes + Counter(filter=spent)
+        if not len(false):
+            return builder, built, replace(found, passes=passes)
+        builder = replace(builder, false_stops=merge_spans(np.concatenate([builder.false_stops, false])))
+        built = builder.build_moving(built)
 
 
 def _start_without(
@@ -280,107 +305,6 @@ def _is_likelier(base: Problem, plain: NoiseModel, found: NoiseEstimate) -> bool
     problem = apply_noise(base, plain)
     forward = refilter(problem, found.carry_points(base, problem), whole=False)
     return float(np.sum(forward.log_likelihood)) > found.log_posterior
-
-
-def _relinearise(
-    problem: Problem,
-    aligned: Alignment,
-    known: Points | None,
-    forward: FilterPass,
-    smoothed: SmootherPass,
-    progress: Progress | None,
-    passes: Counter[str],
-) -> tuple[FilterPass, SmootherPass, Points | None]:
-    """Filter and smooth about better points where the filter was linearised too far from the smoothed solution.
-
-    Attitudes first (`_linearise_far`); where these stay, all else does if a step of Gauss and Newton from there moves
-    nothing by a good part of its sigma: a barometer's scale times a height that was not known yet, a lever arm, a place
-    that few fixes tell of. Returns also the points behind that step.
-    """
-    if not are_near(smoothed, forward.linearised, LINEAR_ATTITUDE):
-        forward, smoothed, ahead = _linearise_far(problem, aligned, known, smoothed, progress, passes)
-        if ahead is not None:
-            return forward, smoothed, ahead
-    for _ in range(_SMOOTHINGS):
-        ahead = _step(problem, smoothed)
-        passes.update(filter=1, smoother=1)
-        if ahead is None:
-            break
-        if np.all(subtract_points(ahead, smoothed) ** 2 <= _LINEAR**2 * smoothed.variance):
-            return forward, smoothed, ahead
-        smoothed = smooth_backward(problem, refilter(problem, ahead, progress), progress)
-        passes.update(filter=1, smoother=1)
-    with contextlib.suppress(*BREAKDOWN):
-        return _linearise_at_batch(problem, aligned, smoothed, smoothed.states, progress, passes)
-    return forward, smoothed, None
-
-
-def _linearise_far(
-    problem: Problem,
-    aligned: Alignment,
-    known: Points | None,
-    smoothed: SmootherPass,
-    progress: Progress | None,
-    passes: Counter[str],
-) -> tuple[FilterPass, SmootherPass, Points | None]:
-    """Filter and smooth where attitudes were linearised too far off; and the points of a batch solution, if any.
-
-    The points are `known`, those of the noise estimate, if there are any, else the smoother's own; each pass about
-    those of the pass before is a step of Gauss and Newton. If that does not settle they are those of a batch solution.
-
-    If the heading is uncertain and fixes weigh little beside wheels, a filter may turn the mounting by half a turn
-    instead of the velocity, a local minimum. So the batch is then solved at once, without wheels first.
-    """
-    wheels = aligned.motion is not None and any(c.of_wheels for c in problem.constraints)
-    about: Points = smoothed if known is None or len(known.states) != len(problem.t) else known
-    for _ in range(int(about is known) if wheels else _SMOOTHINGS):
-        passes.update(filter=1, smoother=1)
-        smoothed = smooth_backward(problem, refilter(problem, about, progress), progress)
-        if are_near(smoothed, about, LINEAR_ATTITUDE):
-            passes.update(filter=1)
-            return ekf(problem, progress, aligned.until, known=smoothed), smoothed, None
-        about = smoothed
-    states = smoothed.states
-    if wheels:
-        from graphnav.estimation.factor_graph.batch import batch  # imports GTSAM, which few filter runs need
-
-        free = replace(problem, constraints=tuple(c for c in problem.constraints if not c.of_wheels))
-        with contextlib.suppress(*BREAKDOWN):
-            states = smooth_backward(free, ekf(free, progress, aligned.until)).states
-            states = batch(free, states, wanted=(), reintegrate=False).states
-        passes.update(filter=1, smoother=1)
-    return _linearise_at_batch(problem, aligned, smoothed, states, progress, passes)
-
-
-def _linearise_at_batch(
-    problem: Problem,
-    aligned: Alignment,
-    smoothed: SmootherPass,
-    states: States,
-    progress: Progress | None,
-    passes: Counter[str],
-) -> tuple[FilterPass, SmootherPass, Points]:
-    """Filter and smooth about the batch solution that is found from some states, and its points."""
-    from graphnav.estimation.factor_graph.batch import batch
-
-    found = take_solution_points(problem, batch(problem, states, wanted=(), reintegrate=False), smoothed)
-    smoothed = smooth_backward(problem, refilter(problem, found, progress), progress)
-    passes.update(filter=2, smoother=1)
-    return ekf(problem, progress, aligned.until, known=smoothed), smoothed, found
-
-
-def _step(problem: Problem, start: Points) -> Points | None:
-    """The points after a step of Gauss and Newton, if it leads to any and attitudes are near the start's."""
-    try:
-        ahead = smooth_points(refilter(problem, start, whole=False))
-    except BREAKDOWN:
-        return None
-    return ahead if are_near(ahead, start, LINEAR_ATTITUDE) else None
-
-
-def step_ahead(problem: Problem, start: Points) -> Points:
-    """The points after a step of Gauss and Newton, a fraction of the time by filter and smoother, where it is short."""
-    return _step(problem, start) or start
 
 
 def _drop_refused(problem: Problem, forward: FilterPass) -> Problem:

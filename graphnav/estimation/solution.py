@@ -112,13 +112,14 @@ class CarrierArcs:
 
 @dataclass(frozen=True)
 class ExcludedSpan:
-    """Consecutive rows of one constraint that no solver uses."""
+    """Consecutive rows of one constraint that are wrong: not used, or with the variance that their errors show."""
 
     kind: str  # name of the constraint
     t_start: float  # s, of the first row
     t_end: float  # s, of the last
     count: int
     reason: str = ""
+    sigma_factor: float = np.inf  # by which their sigmas are multiplied; infinite where no solver uses them
 
 
 @dataclass(frozen=True)
@@ -364,9 +365,18 @@ def _join_noise(parts: list[NoiseModel]) -> NoiseModel:
     for name in dict.fromkeys(key for part in parts for key in part.weights):
         own = [part.weights[name] for part in parts if name in part.weights]
         weights[name] = RowWeights(np.concatenate([w.t for w in own]), np.concatenate([w.weight for w in own]))
-    names = dict.fromkeys(key for part in parts for key in part.excluded)
-    excluded = {name: tuple(span for part in parts for span in part.excluded.get(name, ())) for name in names}
-    return replace(parts[0], weights=weights, excluded=excluded)
+    return replace(
+        parts[0],
+        weights=weights,
+        excluded=_join_spans([part.excluded for part in parts]),
+        span_weights=_join_spans([part.span_weights for part in parts]),
+        false_stops=tuple(span for part in parts for span in part.false_stops),
+    )
+
+
+def _join_spans(parts: list[Mapping[str, tuple[Any, ...]]]) -> dict[str, tuple[Any, ...]]:
+    names = dict.fromkeys(key for part in parts for key in part)
+    return {name: tuple(span for part in parts for span in part.get(name, ())) for name in names}
 
 
 def _join_separations(parts: list[Separation | None]) -> Separation | None:

@@ -202,4 +202,8 @@ def _shift_noise(noise: NoiseModel, change: Callable[[Any, float, float, float],
         excluded={
             name: tuple((move(a, name), move(b, name)) for a, b in spans) for name, spans in noise.excluded.items()
         },
+        span_weights={
+            name: tuple((move(a, name), move(b, name), weight) for a, b, weight in spans)
+            for name, spans in noise.span_weights.items()
+        },
     )

@@ -75,7 +75,7 @@ def describe_run(recording: Recording, solutions: Mapping[str, Solution], withhe
         words += f" There were no GNSS fixes from {join_words([*listed, *more])}."
     excluded = sum(int(part.count) for part in solution.excluded)
     if excluded:
-        words += f" Left out: {format_count(excluded, 'measurement')}."
+        words += f" Excluded, or used with larger sigmas: {format_count(excluded, 'measurement')}."
     if not several and solution.stopped:
         words += f" {solution.stopped[0].upper()}{solution.stopped[1:].rstrip('.')}."
     return words

@@ -11,6 +11,7 @@ from markupsafe import Markup
 from graphnav.core.notes import Note, format_count
 from graphnav.core.rotation import Array
 from graphnav.estimation.names import name_rows
+from graphnav.estimation.noise.spans import mask_times
 from graphnav.estimation.solution import Solution
 from graphnav.evaluation.against import find_antenna_lever_arm
 from graphnav.evaluation.segments import compute_relative_errors, compute_rms
@@ -154,7 +155,7 @@ def tabulate_fixes(recording: Recording, solution: Solution, withheld: Removed) 
         "fixes",
         "count",
         "withheld",
-        "left out",
+        "excluded",
         "used",
         "longest gap [s]",
         "farthest [m]",
@@ -232,11 +233,16 @@ def describe_excluded(solution: Solution, start: float) -> list[Markup]:
     less = [
         f"{count} of {name_rows(name)}"
         for name, record in solution.records.items()
-        if (count := np.count_nonzero((record.weight > 0) & (record.weight < 0.5)))
+        if (count := np.count_nonzero((record.weight > 0) & (record.weight < 0.5) & ~_mask_excluded(solution, name)))
     ]
     if less and len(lines) < _MAX_LINES:
         lines.append(f"less than half weight, because their residuals exceed what chance allows: {join_words(less)}")
-    return [page.heading("Left out"), page.bullets(lines or [Note("left_out.nothing", "Nothing was left out.")])]
+    return [page.heading("Excluded"), page.bullets(lines or [Note("left_out.nothing", "Nothing was left out.")])]
+
+
+def _mask_excluded(solution: Solution, name: str) -> Array:
+    """Which rows of a constraint are in spans that the noise model excludes."""
+    return mask_times(solution.records[name].t, solution.noise.excluded.get(name, ()))
 
 
 def list_links(files: Sequence[str]) -> list[Markup]:

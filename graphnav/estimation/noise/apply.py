@@ -12,6 +12,7 @@ from graphnav.constraints.base import SAME_TIME, Constraint
 from graphnav.core.rotation import Array
 from graphnav.core.state import Parameter
 from graphnav.estimation.noise.model import INTERVALS, NoiseModel, RowWeights
+from graphnav.estimation.noise.spans import mask_times
 from graphnav.estimation.problem import Problem
 from graphnav.imu.preintegration import NOISE_FIGURES
 
@@ -120,8 +121,9 @@ def select_weights(t: Array, noise: NoiseModel, name: str) -> Array:
         at = np.clip(np.searchsorted(some.t, t - SAME_TIME) + number, 0, len(some.t) - 1)
         same = np.abs(some.t[at] - t) <= SAME_TIME
         out[same] = some.weight[at[same]]
-    for begin, end in noise.excluded.get(name, ()):
-        out[(t >= begin - SAME_TIME) & (t <= end + SAME_TIME)] = 0.0
+    out[mask_times(t, noise.excluded.get(name, ()))] = 0.0
+    for begin, end, weight in noise.span_weights.get(name, ()):
+        out[mask_times(t, [(begin, end)])] = weight
     return out
 
 

@@ -364,14 +364,12 @@ def compute_excluded_share(problem: Problem, noise: NoiseModel) -> float:
 
 
 def drop_excluded(recording: Recording, noise: NoiseModel) -> Recording:
-    """The recording without the fixes that a noise model leaves out."""
+    """The recording without the fixes in the excluded spans of a noise model."""
     gnss = recording.gnss
     assert gnss is not None
-    p = select_weights(gnss.t, noise, "gnss_position")[:, None]
-    v = select_weights(gnss.velocity_t, noise, "gnss_velocity")[:, None]
-    gnss = replace(
-        gnss,
-        llh=np.where(p > 0.0, gnss.llh, np.nan),
-        v=None if gnss.v is None else np.where(v > 0.0, gnss.v, np.nan),
+    p, v = (
+        mask_times(t, noise.excluded.get(name, ()))[:, None]
+        for name, t in zip(FIXES, (gnss.t, gnss.velocity_t), strict=True)
     )
+    gnss = replace(gnss, llh=np.where(p, np.nan, gnss.llh), v=None if gnss.v is None else np.where(v, np.nan, gnss.v))
     return replace(recording, gnss=gnss)

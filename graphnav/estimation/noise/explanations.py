@@ -230,7 +230,7 @@ def compute_evidence(
     int
         Filter passes.
     """
-    trials = _Trials(problem, about, spans)
+    trials = Trials(problem, about, spans)
     lasting = np.array([end - begin > PATIENCE for begin, end in spans])
     models: list[_Model] = []
     common: list[tuple[_Model, Array]] = []
@@ -269,7 +269,7 @@ def compute_evidence(
     return before + value, chosen, trials.passes
 
 
-class _Trials:
+class Trials:
     """Filters of a drive by several models with the same linearisation points, and how many passes were made.
 
     Parameters

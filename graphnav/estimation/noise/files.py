@@ -7,7 +7,9 @@ Under the key "noise", in a file of its own or in the summary.json of a run::
     correlation_times   s, by the parameter of a process
     weights             by constraint: t (s) and weight of rows with less information; by imu.gyro and imu.accel: end
                         (s) of intervals between keyframes with more white noise, and 1 over its variance's factor
-    excluded            by constraint: [begin, end] (s) of spans left out
+    excluded            by constraint: [begin, end] (s) of spans of faulty rows
+    span_weights        by constraint: [begin, end, weight] of those that are used after all, with less information
+    false_stops         [begin, end] (s) of spans that are no stops, whatever the detectors say, if there are any
     spacing             s between the fixes that are used, 0 for all
     stamps              s, offsets of the stamps of positions, velocities and odometer about which rows are linearised
     lever_arm           m, only where the antenna's is not used as stated: value (right, forward, up) and its sigma
@@ -75,7 +77,19 @@ _FREED = {
     "velocity_time_offset": (VELOCITY_TIME_OFFSET, 1, _LARGEST_OFFSET, "s to be added to stamps"),
     "clock_rate": (CLOCK_RATE, 1, _LARGEST_RATE, "s/s, of the clocks of IMU and receiver"),
 }
-_KEYS = ("mode", "pieces", "figures", "correlation_times", "weights", "excluded", "spacing", "stamps", *_FREED)
+_KEYS = (
+    "mode",
+    "pieces",
+    "figures",
+    "correlation_times",
+    "weights",
+    "excluded",
+    "span_weights",
+    "false_stops",
+    "spacing",
+    "stamps",
+    *_FREED,
+)
 _LEAST_SIGMA = 1e-9  # of what is the most: nothing is better known
 _FIGURE_KEYS = {"log_factor": "log_factor", "sigma": "sigma", "prior": "prior", "prior_sigma": "prior_sigma",
            "degrees_of_freedom": "freedom"}  # fmt: skip
@@ -108,6 +122,8 @@ def list_noise(noise: NoiseModel, mode: str = "estimated") -> dict[str, Any]:
         "excluded": {name: [[float(a), float(b)] for a, b in spans] for name, spans in noise.excluded.items() if spans},
         "spacing": float(noise.spacing),
         "stamps": {name: float(getattr(noise.stamps, name)) for name in _STAMPS},
+        "span_weights": {name: [[*map(float, one)] for one in spans] for name, spans in noise.span_weights.items()},
+        **({"false_stops": [[float(a), float(b)] for a, b in noise.false_stops]} if noise.false_stops else {}),
     } | {
         key: {of: list(getattr(noise.freed[name], of)) for of in _PRIOR}
         for key, (name, *_) in _FREED.items()
@@ -219,9 +235,11 @@ class _Reader:
             self.read_each(values, "correlation_times", _list_processes(), self.read_time),
             self.read_each(values, "weights", [*constraints, *INTERVALS], self.read_weights),
             self.read_each(values, "excluded", constraints, self.read_spans),
+            self.read_each(values, "span_weights", constraints, self.read_weighted_spans),
             self.read_number("noise.spacing", values.get("spacing", 0.0), 0.0, 60.0, "s between fixes"),
             StampOffsets(**self.read_each(values, "stamps", _STAMPS, self.read_offset)),
             {name: self.read_constant(key, values) for key, (name, *_) in _FREED.items() if key in values},
+            self.read_spans("noise.false_stops", values.get("false_stops", [])),
         ), mode
 
     def make_error(self, key: str, value: Any, why: str) -> ConfigError:
@@ -334,14 +352,23 @@ class _Reader:
         return RowWeights(t, weight)
 
     def read_spans(self, key: str, value: Any) -> tuple[tuple[float, float], ...]:
+        return self._read_spans(key, value, "[begin, end], s", 2)
+
+    def read_weighted_spans(self, key: str, value: Any) -> tuple[tuple[float, float, float], ...]:
+        found = self._read_spans(key, value, "[begin, end, weight], s and of information", 3)
+        for _, _, weight in found:
+            self.read_number(key, weight, 0.0, 1.0, "of information")
+        return found
+
+    def _read_spans(self, key: str, value: Any, each: str, count: int) -> tuple[Any, ...]:
         if not isinstance(value, list):
-            raise self.make_error(key, value, "must be a list of [begin, end], s")
+            raise self.make_error(key, value, f"must be a list of {each}")
         out = []
         for one in value:
-            if not isinstance(one, list) or len(one) != 2:
-                raise self.make_error(key, one, "must be [begin, end], s")
-            begin, end = (self.read_number(key, x, -math.inf, math.inf, "s") for x in one)
-            if end < begin:
+            if not isinstance(one, list) or len(one) != count:
+                raise self.make_error(key, one, f"must be {each}")
+            numbers = tuple(self.read_number(key, x, -math.inf, math.inf, "s") for x in one)
+            if numbers[1] < numbers[0]:
                 raise self.make_error(key, one, "ends before it begins")
-            out.append((begin, end))
+            out.append(numbers)
         return tuple(out)

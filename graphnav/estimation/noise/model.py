@@ -76,9 +76,12 @@ class NoiseModel:
     times: Mapping[str, float] = field(default_factory=dict)  # s, correlation time of a process by its parameter
     weights: Mapping[str, RowWeights] = field(default_factory=dict)  # by constraint, and by `INTERVALS`
     excluded: Mapping[str, tuple[tuple[float, float], ...]] = field(default_factory=dict)  # spans (s) by constraint
+    # weights, by constraint and span, of what is excluded (`graphnav.estimation.noise.span_variances`)
+    span_weights: Mapping[str, tuple[tuple[float, float, float], ...]] = field(default_factory=dict)
     spacing: float = 0.0  # s, at least, between the fixes that are used (`graphnav.estimation.noise.spacing`)
     stamps: StampOffsets = StampOffsets()
     freed: Mapping[str, FreedConstant] = field(default_factory=dict)  # by the parameter's name
+    false_stops: tuple[tuple[float, float], ...] = ()  # spans (s) in which the platform moves, whatever detectors say
 
     def get_factor(self, group: str, missing: float) -> float:
         """The factor on the variance of a group.
