@@ -41,6 +41,7 @@ from graphnav.estimation.separation import compute_separation
 from graphnav.estimation.solution import KNOWN, Solution, join_solutions
 from graphnav.estimation.solvers.breakdown import explain_singular
 from graphnav.estimation.solvers.ekf import ekf
+from graphnav.estimation.solvers.passes import drop_covariances
 from graphnav.estimation.solvers.rts import rts, smooth_backward
 from graphnav.estimation.stamps import (
     describe_stamps,
@@ -271,7 +272,7 @@ def _solve(
         *describe_faults(faults, problem),
     )
     notes = (*notes, *describe_far(problem, smoothed))
-    start, passes = smoothed, Counter(found.passes)
+    passes = Counter(found.passes)
     if found.diverged:
         prior = InitialPrior(
             keyframe=problem.prior.keyframe, mean=found.start.state, sigma=start_sigma(found.start)[None]
@@ -283,12 +284,20 @@ def _solve(
     out = {"ekf": forward.solution}
     if "rts" in solvers:
         out["rts"] = rts(problem, forward, smoothed)
+    place = BLOCKS["p"]
+    apart = compute_separation(
+        frame, problem.t, forward.solution.states.p, forward.solution.covariance[:, place, place],
+        smoothed.states.p, smoothed.P[:, place, place],
+    )  # fmt: skip
+    # of the memory at this place most; a graph needs its own
+    found = replace(found, forward=drop_covariances(found.forward), smoothed=drop_covariances(found.smoothed))
+    forward, smoothed = drop_covariances(forward), drop_covariances(smoothed)
     # modules are imported only where a run needs them, above all GTSAM
     if "batch" in solvers:
         from graphnav.estimation.factor_graph.batch import batch
 
         began = time.perf_counter()
-        near = found.ahead or step_ahead(problem, start)
+        near = found.ahead or step_ahead(problem, found.smoothed)
         solved = batch(problem, near.states, near.select_nodes(problem), progress=progress)
         seconds = {"batch": solved.timings["batch"] + time.perf_counter() - began - sum(solved.timings.values())}
         # includes the attempts before
@@ -312,11 +321,6 @@ def _solve(
             )
             out["isam2"] = replace(one, notes=(note, *one.notes))
     timings = {"detection": detection, **found.timings}
-    place = BLOCKS["p"]
-    apart = compute_separation(
-        frame, problem.t, forward.solution.states.p, forward.solution.covariance[:, place, place],
-        smoothed.states.p, smoothed.P[:, place, place],
-    )  # fmt: skip
     by_name = {
         name: replace(
             out[name],

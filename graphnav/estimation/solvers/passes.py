@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -131,6 +131,17 @@ class FilterPass(ForwardRecord):
     """A forward pass over the whole problem."""
 
     solution: Solution
+
+
+AnyPass = TypeVar("AnyPass", FilterPass, SmootherPass)
+
+
+def drop_covariances(one: AnyPass) -> AnyPass:
+    """A pass without covariances and gains, which are nearly all of its memory."""
+    none = np.empty((0, *one.P.shape[1:]))
+    if isinstance(one, ForwardRecord):
+        return replace(one, P=none, P_predicted=none, updates=None)
+    return replace(one, P=none)
 
 
 def move_points(points: Points, errors: Array) -> Points:
