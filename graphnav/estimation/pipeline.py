@@ -41,7 +41,6 @@ from graphnav.estimation.separation import compute_separation
 from graphnav.estimation.solution import KNOWN, Solution, join_solutions
 from graphnav.estimation.solvers.breakdown import explain_singular
 from graphnav.estimation.solvers.ekf import ekf
-from graphnav.estimation.solvers.passes import drop_covariances
 from graphnav.estimation.solvers.rts import rts, smooth_backward
 from graphnav.estimation.stamps import (
     describe_stamps,
@@ -289,9 +288,9 @@ def _solve(
         frame, problem.t, forward.solution.states.p, forward.solution.covariance[:, place, place],
         smoothed.states.p, smoothed.P[:, place, place],
     )  # fmt: skip
-    # of the memory at this place most; a graph needs its own
-    found = replace(found, forward=drop_covariances(found.forward), smoothed=drop_covariances(found.smoothed))
-    forward, smoothed = drop_covariances(forward), drop_covariances(smoothed)
+    # a graph needs the memory itself
+    forward, smoothed = forward.drop_covariances(), smoothed.drop_covariances()
+    found = replace(found, forward=found.forward.drop_covariances(), smoothed=found.smoothed.drop_covariances())
     # modules are imported only where a run needs them, above all GTSAM
     if "batch" in solvers:
         from graphnav.estimation.factor_graph.batch import batch

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, TypeVar
+from typing import Any, Self
 
 import numpy as np
 
@@ -35,6 +35,10 @@ class SmootherPass(Points):
     def variance(self) -> Array:
         """(K, D) of the errors."""
         return np.diagonal(self.P, axis1=1, axis2=2)
+
+    def drop_covariances(self) -> SmootherPass:
+        """The same without covariances, which are nearly all of its memory."""
+        return replace(self, P=self.P[:0].copy())
 
     def cover_rows(self, linear: Rows, n: int) -> Array:
         """H P^s H^T (n, m, m) of the first n rows of a constraint, linearised at the smoothed points."""
@@ -120,6 +124,11 @@ class ForwardRecord(Points):
         """Of the keyframes at given points, as `graphnav.estimation.solvers.recursion.filter_rows` fills them."""
         return self.errors_predicted, self.P_predicted, self.errors, self.P
 
+    def drop_covariances(self) -> Self:
+        """The same without covariances and gains, which are nearly all of its memory."""
+        none = self.P[:0].copy()
+        return replace(self, P=none, P_predicted=none, updates=None)
+
     @property
     def linearised(self) -> Points:
         """Where its rows were linearised: at points given, then where it was."""
@@ -131,17 +140,6 @@ class FilterPass(ForwardRecord):
     """A forward pass over the whole problem."""
 
     solution: Solution
-
-
-AnyPass = TypeVar("AnyPass", FilterPass, SmootherPass)
-
-
-def drop_covariances(one: AnyPass) -> AnyPass:
-    """A pass without covariances and gains, which are nearly all of its memory."""
-    none = np.empty((0, *one.P.shape[1:]))
-    if isinstance(one, ForwardRecord):
-        return replace(one, P=none, P_predicted=none, updates=None)
-    return replace(one, P=none)
 
 
 def move_points(points: Points, errors: Array) -> Points:
