@@ -75,7 +75,10 @@ class MomentPass(Points):
 
 @dataclass(frozen=True)
 class Updates:
-    """The updates of n keyframes, block by block as `graphnav.estimation.solvers.recursion.RowBlocks` has them."""
+    """The updates of n keyframes, block by block as `graphnav.estimation.solvers.recursion.RowBlocks` has them.
+
+    Of blocks that were not taken in there is nothing.
+    """
 
     blocks: RowBlocks
     Kt: Array  # (n, M, D) gains transposed
@@ -99,7 +102,7 @@ class Updates:
         n, M, D = H.shape
         n *= whole
         taken, lossy = np.zeros((2, len(blocks.begin)), dtype=bool)
-        return cls(blocks, np.zeros((n, M, D)), H, np.zeros((n, M)), np.zeros((n, M, M)), taken, lossy, places)
+        return cls(blocks, np.empty((n, M, D)), H, np.empty((n, M)), np.empty((n, M, M)), taken, lossy, places)
 
 
 @dataclass(frozen=True)
