@@ -58,7 +58,12 @@ def find_false_stops(base: Problem, found: NoiseEstimate, stationary: Array) -> 
     )
     used = apply_noise(base, noise)
     trials = Trials(used, found.carry_points(base, used), listed)
-    stands = trials.sum_spans(trials.filter(used).log_likelihood())
-    moving = add_common_errors(used, listed, _OF_STOPS)
-    moves = trials.sum_spans(trials.filter(moving, _OF_STOPS).log_likelihood())
-    return spans[moves - stands > FAULT_COST], trials.passes
+    moves = trials.sum_spans(trials.filter(add_common_errors(used, listed, _OF_STOPS), _OF_STOPS).log_likelihood())
+    false: list[int] = []
+    while True:
+        some = add_common_errors(used, [listed[k] for k in false], _OF_STOPS) if false else used
+        stands = trials.sum_spans(trials.filter(some, _OF_STOPS).log_likelihood())
+        more = np.setdiff1d(np.flatnonzero(moves - stands > FAULT_COST), false)
+        if not len(more):
+            return spans[false], trials.passes
+        false = sorted([*false, int(more[0])])  # later ones may be contradicted by what the first has done

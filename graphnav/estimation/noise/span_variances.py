@@ -3,7 +3,7 @@
 Which spans are faulty is decided by evidence (`graphnav.estimation.noise.exclusion`), with nothing in them in use. But
 fixes that are wrong by 30 m still tell within 30 m where a vehicle is; the IMU alone, after a minute, does not. So in
 the end each constraint has in each span a variance of its own: the mean square of its errors, each predicted by a
-smoother without it, in units of the noise model's variance and at least 1,
+smoother without it, in units of the noise model's variance, of the axis in which it is largest, and at least 1,
 
     f = sum e^2 / R / n
 
@@ -83,7 +83,7 @@ def _measure_factors(
             if not e.size:
                 continue
             c = count_repetition(e)
-            factor = max(float(np.mean((e / sigma[own]) ** 2)), 1.0) * c
+            factor = max(float(np.max(np.mean((e / sigma[own]) ** 2, axis=0))), 1.0) * c
             factors[rows.name, span] = factor
             chance = np.sqrt(2.0 * c / e.size)
             settled &= abs(np.log(factor / before.get((rows.name, span), np.inf))) < chance
@@ -92,8 +92,8 @@ def _measure_factors(
 
 def count_repetition(error: Array) -> float:
     """How many errors (n, m) in succession count as one independent error."""
-    n, squares = len(error), float(np.sum(error**2))
-    r = float(np.clip(np.sum(error[1:] * error[:-1]) / squares, 0.0, 1.0)) if squares else 0.0
+    n, square = len(error), float(np.mean(error**2))
+    r = float(np.clip(np.mean(error[1:] * error[:-1]) / square, 0.0, 1.0)) if n > 1 and square else 0.0
     k = np.arange(1, n)
     return float(1.0 + 2.0 * np.sum((1.0 - k / n) * r**k))
 

@@ -1,0 +1,88 @@
+"""Stops that the other measurements contradict."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from graphnav import load
+from graphnav.config import parse_settings
+from graphnav.config.detectors import FUSED
+from graphnav.core.earth import LocalFrame
+from graphnav.core.rotation import Array
+from graphnav.detectors import Detections, detect
+from graphnav.detectors.base import mask_inside, merge_spans
+from graphnav.estimation import building, pipeline
+from graphnav.estimation.noise.files import read_noise, write_noise
+from graphnav.estimation.pipeline import run
+from graphnav.recording import Recording
+
+SETTINGS = parse_settings({"gnss": {"velocity": False}})
+
+
+def claim_stops(monkeypatch: pytest.MonkeyPatch, claimed: Array) -> None:
+    """Detectors that call some spans stationary, whatever the sensors say."""
+
+    def claim(*given: object) -> Detections:
+        found = detect(*given)
+        spans = merge_spans(np.concatenate([found.stationary, claimed]))
+        answers = (
+            replace(d, intervals=spans, mask=mask_inside(d.t, spans)) if d.name == FUSED else d for d in found.all
+        )
+        return Detections(spans, tuple(answers), found.notes)
+
+    for module in (pipeline, building):
+        monkeypatch.setattr(module, "detect", claim)
+
+
+def find_steady_motion(recording: Recording, seconds: float, slowest: float) -> Array:
+    """(2,) s, the span in which the speed of the truth changes least."""
+    truth = recording.truth
+    assert truth is not None
+    assert truth.llh is not None
+    inside = (truth.t > recording.start + 20.0) & (truth.t < recording.end - 20.0)
+    t, p = truth.t[inside], LocalFrame(truth.llh[0]).from_llh(truth.llh[inside])
+    every = max(round(1.0 / np.median(np.diff(t))), 1)
+    t, v = t[every::every], np.diff(p[::every], axis=0) / np.diff(t[::every])[:, None]
+    n = int(seconds)
+    scatter = [np.std(v[k : k + n], axis=0).max() for k in range(len(v) - n)]
+    slow = [np.linalg.norm(v[k : k + n], axis=1).min() < slowest for k in range(len(v) - n)]
+    k = int(np.argmin(np.where(slow, np.inf, scatter)))
+    return np.array([t[k] - 0.5, t[k] - 0.5 + seconds])
+
+
+@pytest.mark.parametrize(
+    ("folder", "file", "begin"),
+    [("tokyo_20201105", "recording_spp.toml", 350.0), ("oracle_drive", "recording_spp.toml", 50.0)],
+)
+def test_a_stop_at_speed_is_none(
+    shared_data: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, folder: str, file: str, begin: float
+) -> None:
+    """Fixes good to metres, no speed measured: the true stops stay, and the result is that without the false one."""
+    recording = replace(load(shared_data / folder / file).crop(begin, begin + 200.0), odometer=None)
+    true = run(recording, SETTINGS, ("rts",))["rts"]
+    assert true.noise.false_stops == ()
+    span = find_steady_motion(recording, 4.0, slowest=4.0)
+    claim_stops(monkeypatch, span[None])
+    found = run(recording, SETTINGS, ("rts",))["rts"]
+    np.testing.assert_allclose(found.noise.false_stops, span[None])
+    np.testing.assert_allclose(found.stationary, true.stationary)
+    np.testing.assert_allclose(found.states.p[-1], true.states.p[-1], atol=0.1)
+    kept = read_noise(write_noise(tmp_path / "noise.json", found.noise))
+    again = run(recording, SETTINGS, ("rts",), noise=kept)["rts"]
+    np.testing.assert_allclose(again.states.p, found.states.p, atol=0.01)
+
+
+def test_a_motorbike_that_rides_steadily_does_not_stand(shared_data: Path) -> None:
+    """Two seconds at 8 m/s, as quiet as its stops might be, with fixes of which the stated sigma is 5 m."""
+    recording = load(shared_data / "motorbike_dresden_20160809")
+    claimed = detect(recording).stationary
+    assert len(claimed) == 1
+    solution = run(recording, None, ("rts",))["rts"]
+    np.testing.assert_allclose(solution.noise.false_stops, claimed)
+    assert len(solution.stationary) == 0
+    at = (solution.t > claimed[0, 0]) & (solution.t < claimed[0, 1])
+    assert np.linalg.norm(solution.states.v[at], axis=1).min() > 5.0
