@@ -41,7 +41,7 @@ def compute_white_variances(
         In addition along each axis of the body; (0, 3, n) where there is none.
     """
     alike, n = density**2 * (edge[1:] - edge[:-1]), edge.shape[1]
-    own = extra.take(index, axis=0)
+    own = extra[index]  # one for all samples is not copied whole
     if not own.any():
         return alike, np.empty((0, 3, n))
     along = np.diff(sum_running(np.swapaxes(own, 1, 2) * dt[:, None])[cut], axis=0)
