@@ -24,7 +24,6 @@ _GENERATORS = np.array(
 _TAYLOR = np.array([[(-1.0) ** j / math.factorial(2 * j + 1 + k) for k in range(4)] for j in range(5)])
 # of ww, xx, yy, zz, wx, wy, wz, xy, xz, yz: the products of each component with w, x, y, z
 _WITH = np.array([[0, 4, 5, 6], [4, 1, 7, 8], [5, 7, 2, 9], [6, 8, 9, 3]])
-_MANY_MATRICES = 100  # matrices, of which sums over arrays are faster than products of each
 _LEAST_COSINE = 1e-16  # of a pitch
 _TINY = 1e-300  # makes sin(x)/x = 1 at x = 0 without a separate case
 
@@ -54,22 +53,6 @@ def mv(M: Array, v: Array) -> Array:
 def move_components_first(M: Array) -> Array:
     """Matrices or vectors (n, ...) as (..., n), so that operations on a component run over contiguous numbers."""
     return np.ascontiguousarray(np.moveaxis(M, 0, -1))
-
-
-def multiply(A: Array, B: Array) -> Array:
-    """``A @ B`` of (n, 3, 3); several times faster where they are many."""
-    if len(A) < _MANY_MATRICES:
-        return np.asarray(A @ B)
-    A, B, out = move_components_first(A), move_components_first(B), np.empty((len(A), 3, 3))
-    for i in range(3):
-        for j in range(3):
-            out[:, i, j] = A[i, 0] * B[0, j] + A[i, 1] * B[1, j] + A[i, 2] * B[2, j]
-    return out
-
-
-def apply(M: Array, v: Array) -> Array:
-    """`mv` of (n, 3, 3) and (n, 3), faster where they are many."""
-    return mv(M, v) if len(M) < _MANY_MATRICES else np.einsum("nij,nj->ni", M, v)
 
 
 def compute_coefficients(theta2: Array) -> tuple[Array, Array, Array, Array]:

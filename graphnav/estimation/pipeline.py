@@ -271,7 +271,7 @@ def _solve(
         *describe_faults(faults, problem),
     )
     notes = (*notes, *describe_far(problem, smoothed))
-    start, passes = smoothed, Counter(found.passes)
+    passes = Counter(found.passes)
     if found.diverged:
         prior = InitialPrior(
             keyframe=problem.prior.keyframe, mean=found.start.state, sigma=start_sigma(found.start)[None]
@@ -283,12 +283,20 @@ def _solve(
     out = {"ekf": forward.solution}
     if "rts" in solvers:
         out["rts"] = rts(problem, forward, smoothed)
+    place = BLOCKS["p"]
+    apart = compute_separation(
+        frame, problem.t, forward.solution.states.p, forward.solution.covariance[:, place, place],
+        smoothed.states.p, smoothed.P[:, place, place],
+    )  # fmt: skip
+    # a graph needs the memory itself
+    forward, smoothed = forward.drop_covariances(), smoothed.drop_covariances()
+    found = replace(found, forward=found.forward.drop_covariances(), smoothed=found.smoothed.drop_covariances())
     # modules are imported only where a run needs them, above all GTSAM
     if "batch" in solvers:
         from graphnav.estimation.factor_graph.batch import batch
 
         began = time.perf_counter()
-        near = found.ahead or step_ahead(problem, start)
+        near = found.ahead or step_ahead(problem, found.smoothed)
         solved = batch(problem, near.states, near.select_nodes(problem), progress=progress)
         seconds = {"batch": solved.timings["batch"] + time.perf_counter() - began - sum(solved.timings.values())}
         # includes the attempts before
@@ -312,11 +320,6 @@ def _solve(
             )
             out["isam2"] = replace(one, notes=(note, *one.notes))
     timings = {"detection": detection, **found.timings}
-    place = BLOCKS["p"]
-    apart = compute_separation(
-        frame, problem.t, forward.solution.states.p, forward.solution.covariance[:, place, place],
-        smoothed.states.p, smoothed.P[:, place, place],
-    )  # fmt: skip
     by_name = {
         name: replace(
             out[name],

@@ -186,7 +186,8 @@ def _filter_and_smooth(
     """Filter, with its opening linearised at known points if there are any, and smooth."""
     forward = ekf(problem, progress, opening, known)  # its own solution has the time it takes
     with clock.count_time("smoother"):
-        return forward, smooth_backward(problem, forward, progress)
+        smoothed = smooth_backward(problem, forward, progress)
+    return forward.drop_covariances(), smoothed
 
 
 def _find_noise(

@@ -38,9 +38,10 @@ import numpy as np
 
 from graphnav.core import rotation
 from graphnav.core.earth import LocalFrame
-from graphnav.core.rotation import Array, apply, multiply, mv
+from graphnav.core.rotation import Array, mv
+from graphnav.core.running import sum_running
 from graphnav.core.state import DIM, Parameter, States
-from graphnav.imu.preintegration import Intervals
+from graphnav.imu.preintegration import Intervals, multiply_up
 from graphnav.recording import ACROSS, ImuNoise, Recording
 
 SCALE = "imu_scale"
@@ -121,11 +122,9 @@ class EarthMotion:
         h = self._h
         a, b, c, d = rotation.compute_coefficients(float(frame.omega_n @ frame.omega_n) * h * h)
         I, W, W2 = (x.ravel() for x in (_I3, frame.W, frame.W2))
-        once = b * h * h
-        twice = c * h * h * h
-        self.back = (I - (a * h) * W + once * W2).reshape(-1, 3, 3)  # E^T
-        self._once = (h * I + once * W + twice * W2).reshape(-1, 3, 3)  # int E, and iint E
-        self._twice = (0.5 * h * h * I + twice * W + (d * h**4) * W2).reshape(-1, 3, 3)
+        self.back = (I - (a * h) * W + (b * h * h) * W2).reshape(-1, 3, 3)  # E^T
+        # of I, W and W^2 in int E and in iint E
+        self._once, self._twice = (h, b * h * h, c * h**3), (0.5 * h * h, c * h**3, d * h**4)
 
     def reach(self, rows: slice, start: States, dR: Array, dP: Array, dV: Array, of: Array | None = None) -> States:
         """The states after times `rows`, by dR (n, 3, 3), dP and dV (n, 3) in the axes of their starts.
@@ -133,16 +132,24 @@ class EarthMotion:
         `of` (n,) tells the start of each, where several have the same.
         """
         frame, h, back = self._frame, self._h[rows], self.back[rows]
-        by_place = start.p @ frame.W.T
         G = frame.gravity_n(start.p) + start.p @ frame.W2.T
-        bent, u = start.v @ frame.gravity_gradient.T, start.v + by_place  # gravity changes over the interval
+        fall = np.concatenate([G, G @ frame.W.T, G @ frame.W2.T], axis=1)
+        # gravity changes over the interval
+        bent, u = start.v @ frame.gravity_gradient.T, start.v + start.p @ frame.W.T
         if of is not None:
-            start, G, bent, u = start[of], *(x.take(of, axis=0) for x in (G, bent, u))
-        R, once, twice = start.R_nb, self._once[rows], self._twice[rows]
-        p = start.p + h * (u + h * h / 6.0 * bent) + apply(twice, G) + apply(R, dP)
-        p = apply(back, p)
-        v = apply(back, u + 0.5 * h * h * bent + apply(once, G) + apply(R, dV)) - p @ frame.W.T
-        return States(multiply(back, multiply(R, dR)), p, v, start.ba, start.bg)
+            start, fall, bent, u = start[of], *(x.take(of, axis=0) for x in (fall, bent, u))
+        moved = np.empty((len(dR), 3, 5))  # attitude, position, velocity
+        moved[:, :, :3], moved[:, :, 3], moved[:, :, 4] = dR, dP, dV
+        moved = start.R_nb @ moved
+        moved[:, :, 3] += start.p + h * (u + h * h / 6.0 * bent)
+        moved[:, :, 4] += u + 0.5 * h * h * bent
+        for k, (once, twice) in enumerate(zip(self._once, self._twice, strict=True)):
+            of_gravity = fall[:, 3 * k : 3 * k + 3]
+            moved[:, :, 3] += twice[rows] * of_gravity
+            moved[:, :, 4] += once[rows] * of_gravity
+        moved = back @ moved
+        R, p = moved[:, :, :3].copy(), moved[:, :, 3].copy()
+        return States(R, p, moved[:, :, 4] - p @ frame.W.T, start.ba, start.bg)
 
 
 class ImuFactors:
@@ -227,14 +234,17 @@ class ImuFactors:
         return self._earth.reach(rows, start, dR, moved[:, :3], moved[:, 3:])
 
     def advance_through(self, rows: slice, start: States, scale: Array | None = None) -> States:
-        """The states (n) at the ends of successive intervals, from one at the start of the first."""
+        """The states (n) at the ends of successive intervals, from one at the start of the first.
+
+        Over all of them gravity changes linearly.
+        """
         _, dR, moved = self._correct(rows, start, scale)
-        reached = []
-        for j in range(len(dR)):
-            at, one = slice(rows.start + j, rows.start + j + 1), slice(j, j + 1)
-            start = self._earth.reach(at, start, dR[one], moved[one, :3], moved[one, 3:])
-            reached.append(start)
-        return States.stack(reached)
+        T = self.intervals.T[rows]
+        R = multiply_up(dR[:, None])[:, 0]
+        V = sum_running(mv(R[:-1], moved[:, 3:]))
+        P = sum_running(V[:-1] * T[:, None] + mv(R[:-1], moved[:, :3]))
+        one = np.zeros(len(T), dtype=int)
+        return EarthMotion(np.cumsum(T), self.frame).reach(slice(None), start, R[1:], P[1:], V[1:], one)
 
     def _correct(self, rows: slice, start: States, scale: Array | None) -> tuple[Array, Array, Array]:
         """Rotation (n, 3) by bias and scale errors, and dR, (dP, dV) (n, 6) corrected for them."""

@@ -41,9 +41,10 @@ def compute_white_variances(
         In addition along each axis of the body; (0, 3, n) where there is none.
     """
     alike, n = density**2 * (edge[1:] - edge[:-1]), edge.shape[1]
-    if not extra.any():
+    own = extra[index]  # one for all samples is not copied whole
+    if not own.any():
         return alike, np.empty((0, 3, n))
-    along = np.diff(sum_running(np.swapaxes(extra.take(index, axis=0), 1, 2) * dt[:, None])[cut], axis=0)
+    along = np.diff(sum_running(np.swapaxes(own, 1, 2) * dt[:, None])[cut], axis=0)
     least = along.min(axis=1)
     along -= least[:, None]
     return alike + least, along if along.any() else np.empty((0, 3, n))

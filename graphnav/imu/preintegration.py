@@ -246,7 +246,7 @@ def _integrate_pieces(w: Array, f: Array, dt: Array) -> tuple[Array, Array, Arra
         step[:, i, i] += cosine
         step[:, j, i] += sine[:, k]
         step[:, i, j] -= sine[:, k]
-    R = np.ascontiguousarray(_multiply_up(turn).transpose(0, 2, 3, 1))
+    R = np.ascontiguousarray(multiply_up(turn).transpose(0, 2, 3, 1))
     one = _multiply_cross(phi, f)
     two = _multiply_cross(phi, one)
     V = sum_running(_multiply(R[:-1], (f + b * one + c * two) * h))
@@ -254,7 +254,7 @@ def _integrate_pieces(w: Array, f: Array, dt: Array) -> tuple[Array, Array, Arra
     return R, V, P
 
 
-def _multiply_up(turn: Array) -> Array:
+def multiply_up(turn: Array) -> Array:
     """Running products of rotations (L, n, 3, 3) along the first axis, from the identity: one more than there are
     factors.
     """

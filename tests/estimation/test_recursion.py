@@ -147,6 +147,19 @@ def test_both_forms_of_an_update_are_the_same_where_no_digits_are_lost(prior: fl
         np.testing.assert_allclose(recursion.reduce(drive.P, inverse @ HP), joseph, atol=1e-12)
 
 
+def test_errors_behind_each_block_of_a_joint_update() -> None:
+    """Beside updates with the rows up to there alone."""
+    drive = Drive()
+    H, left, ends = drive.H[0], drive.r[0] + drive.H[0] @ drive.e, (3, ROWS)
+    S = H @ drive.P @ H.T + np.diag(drive.variance[0])
+    root, solved, Kt = np.linalg.cholesky(S), np.linalg.solve(S, left), np.linalg.solve(S, H @ drive.P)
+    y = np.tile(drive.e, (3, 1))
+    recursion.follow_blocks(np.array([0, 2]), np.array(ends), root[None], solved[None], Kt[None], y)
+    for n, found in zip((0, *ends), y, strict=True):
+        expected = drive.e - drive.P @ H[:n].T @ np.linalg.solve(S[:n, :n], left[:n])
+        np.testing.assert_allclose(found, expected, atol=1e-12)
+
+
 @pytest.mark.parametrize("kernel", ["huber", "cauchy"])
 def test_a_kernel_weighs_rows_by_what_their_update_leaves(kernel: str) -> None:
     """Of weights that are found by the last update the next finds the same, but for what is left to converge."""

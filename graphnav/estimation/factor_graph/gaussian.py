@@ -15,7 +15,7 @@ from typing import Any
 
 import gtsam
 import numpy as np
-from scipy.linalg.lapack import dtrtri
+from scipy.linalg.lapack import dgeqrf, dtrtri
 
 from graphnav.core.rotation import Array
 from graphnav.estimation.solvers.breakdown import explain_undetermined
@@ -134,14 +134,14 @@ class Eliminated:
             kept = [*parents, *(k for k in where if first.get(k, i) < i and k not in parents)]
             index = [column for p in kept for column in where[p]]
             below = root[:, index]
-            root = np.zeros((n + len(below), n + len(index)))
+            root = np.zeros((n + len(below), n + len(index)), order="F")  # as LAPACK has it
             root[:n, :n] = R_inverse.T
             root[n:, n:] = below
             if parents:
                 U = -R_inverse @ conditional.S()
                 root[n:, :n] = below[:, : U.shape[1]] @ U.T
             if len(root) > 2 * root.shape[1]:
-                root = np.asarray(np.linalg.qr(root, mode="r"))
+                root = np.triu(dgeqrf(root, overwrite_a=True)[0][: root.shape[1]])
             edges = list(itertools.accumulate([n, *(len(where[p]) for p in kept)], initial=0))
             where = {k: range(lo, hi) for k, lo, hi in zip([key, *kept], edges, edges[1:], strict=False)}
             if keys is None or key in keys:

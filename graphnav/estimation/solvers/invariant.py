@@ -56,27 +56,31 @@ def subtract_invariant(states: States, other: States) -> Array:
 
 @compile_once
 def turn(P: Array, T: Array) -> Array:
-    """Covariances P (K, D, D) of errors of which the first m are now T (K, m, m) times what they were.
+    """Turn, in place, covariances P (K, D, D) of errors of which the first m are now T (K, m, m) times what they were.
 
     T is what a move of the point that errors are about makes of them, by how they move it: with `States.plus` a right
     Jacobian (`graphnav.estimation.solvers.points`), in the filter, whose errors turn together, that of
     `compute_transport`, and along turns about the vertical that of
     `graphnav.estimation.solvers.turning`.
+
+    Returns
+    -------
+    array
+        P.
     """
-    out, m = np.empty(P.shape), T.shape[1]
+    m = T.shape[1]
     for k in range(len(P)):
-        own, J, to = P[k], T[k], out[k]
-        top = np.dot(J, own[:m])
-        np.positive(own[m:, m:], to[m:, m:])
-        np.positive(np.dot(np.ascontiguousarray(top[:, :m]), J.T), to[:m, :m])
-        np.positive(top[:, m:], to[:m, m:])
-        np.positive(top[:, m:].T, to[m:, :m])
-    return out
+        own = P[k]
+        top = np.dot(T[k], own[:m])
+        np.positive(np.dot(np.ascontiguousarray(top[:, :m]), T[k].T), own[:m, :m])
+        np.positive(top[:, m:], own[:m, m:])
+        np.positive(top[:, m:].T, own[m:, :m])
+    return P
 
 
 def transport_covariance(P: Array, states: States, moved: States) -> Array:
     """Covariances (K, D, D) of errors about K states turned into those about the states they have moved to."""
-    return np.asarray(turn(P, compute_transport(states, moved)))
+    return np.asarray(turn(P.copy(), compute_transport(states, moved)))
 
 
 def compute_transport(states: States, moved: States) -> Array:

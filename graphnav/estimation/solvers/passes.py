@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, Self
 
 import numpy as np
 
@@ -35,6 +35,10 @@ class SmootherPass(Points):
     def variance(self) -> Array:
         """(K, D) of the errors."""
         return np.diagonal(self.P, axis1=1, axis2=2)
+
+    def drop_covariances(self) -> SmootherPass:
+        """The same without covariances, which are nearly all of its memory."""
+        return replace(self, P=self.P[:0].copy())
 
     def cover_rows(self, linear: Rows, n: int) -> Array:
         """H P^s H^T (n, m, m) of the first n rows of a constraint, linearised at the smoothed points."""
@@ -71,7 +75,10 @@ class MomentPass(Points):
 
 @dataclass(frozen=True)
 class Updates:
-    """The updates of n keyframes, block by block as `graphnav.estimation.solvers.recursion.RowBlocks` has them."""
+    """The updates of n keyframes, block by block as `graphnav.estimation.solvers.recursion.RowBlocks` has them.
+
+    Of blocks that were not taken in there is nothing.
+    """
 
     blocks: RowBlocks
     Kt: Array  # (n, M, D) gains transposed
@@ -95,7 +102,7 @@ class Updates:
         n, M, D = H.shape
         n *= whole
         taken, lossy = np.zeros((2, len(blocks.begin)), dtype=bool)
-        return cls(blocks, np.zeros((n, M, D)), H, np.zeros((n, M)), np.zeros((n, M, M)), taken, lossy, places)
+        return cls(blocks, np.empty((n, M, D)), H, np.empty((n, M)), np.empty((n, M, M)), taken, lossy, places)
 
 
 @dataclass(frozen=True)
@@ -119,6 +126,11 @@ class ForwardRecord(Points):
     def filtered(self) -> Arrays:
         """Of the keyframes at given points, as `graphnav.estimation.solvers.recursion.filter_rows` fills them."""
         return self.errors_predicted, self.P_predicted, self.errors, self.P
+
+    def drop_covariances(self) -> Self:
+        """The same without covariances and gains, which are nearly all of its memory."""
+        none = self.P[:0].copy()
+        return replace(self, P=none, P_predicted=none, updates=None)
 
     @property
     def linearised(self) -> Points:

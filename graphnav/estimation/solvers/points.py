@@ -181,4 +181,4 @@ def move_covariance(P: Array, e: Array) -> Array:
 
     Exp(e + x) = Exp(e) Exp(J_r(e) x) to first order in x.
     """
-    return np.asarray(turn(np.ascontiguousarray(P), rotation.right_jacobian(e[:, :3])))
+    return np.asarray(turn(np.array(P, order="C"), rotation.right_jacobian(e[:, :3])))

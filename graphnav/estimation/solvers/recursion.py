@@ -250,6 +250,37 @@ def filter_rows(
 
 
 @compile_once
+def follow_blocks(first: Array, end: Array, root: Array, solved: Array, Kt: Array, y: Array) -> None:
+    """Errors y (points, D) after each block of rows, in place, from the predicted ones of each keyframe before them.
+
+    By the root L of all numbers' covariance, number i adds row i of L^T K^T times that of L^-1 nu.
+
+    Parameters
+    ----------
+    first, end : of blocks that each have a point, as of `RowBlocks`, of these n keyframes.
+    root, solved, Kt : (n, M, M), (n, M) and (n, M, D) of the updates, as `filter_rows` has them.
+    """
+    at, D = 0, y.shape[1]
+    for k in range(len(Kt)):
+        lo, last = 0, end[first[k + 1] - 1] if first[k] < first[k + 1] else 0
+        for b in range(first[k], first[k + 1]):
+            now, before = y[at + 1], y[at]
+            for c in range(D):
+                now[c] = before[c]
+            for i in range(lo, end[b]):
+                white = 0.0
+                for j in range(i, last):
+                    white += root[k, j, i] * solved[k, j]
+                for j in range(i, last):
+                    x, gain = white * root[k, j, i], Kt[k, j]
+                    for c in range(D):
+                        now[c] -= x * gain[c]
+            lo = end[b]
+            at += 1
+        at += 1
+
+
+@compile_once
 def divide_covariance(P: Array, X: Array) -> None:
     """X (D, n) <- P^-1 X by Cholesky's root of P (D, D)."""
     L = np.linalg.cholesky(P)

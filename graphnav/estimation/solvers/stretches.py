@@ -31,7 +31,7 @@ from graphnav.estimation.solvers.invariant import compute_transport, subtract_in
 from graphnav.estimation.solvers.linearise import Advance, Points, linearise, shift
 from graphnav.estimation.solvers.passes import join_passes, move_points
 from graphnav.estimation.solvers.points import allocate_rows, predict_states
-from graphnav.estimation.solvers.recursion import filter_rows
+from graphnav.estimation.solvers.recursion import filter_rows, follow_blocks
 from graphnav.estimation.solvers.stack import Stack
 from graphnav.imu.dynamics import SCALE
 
@@ -162,15 +162,12 @@ class StretchFilter:
             (stack.root[own], stack.solved[own], stack.bent[own]),
             (Kt, H, w, np.empty((0, 0, 0)), self._taken, self._lossy), self._at,
         )  # fmt: skip
-        self._P[k:k1] = turn(self._P[k:k1], np.ascontiguousarray(T[end]))
-        # what each number adds to y, by the root of all numbers' covariance: (L^T K^T) (L^-1 nu)
-        root = np.swapaxes(stack.root[k:k1], -1, -2)
-        Kt = Kt[k - own.start :]
-        added = np.cumsum((root @ Kt) * (root @ stack.solved[k:k1, :, None]), axis=1)
-        y = np.repeat(predicted[k - own.start :], counts, axis=0)
-        some = slice(self._stack.single.first[k], self._stack.single.first[k1])
-        behind = self._before[some] - self._start[k] + 1
-        y[behind] -= added[np.repeat(np.arange(k1 - k), counts - 1), self._stack.single.end[some] - 1]
+        turn(self._P[k:k1], np.ascontiguousarray(T[end]))
+        y, some = np.repeat(predicted[k - own.start :], counts, axis=0), slice(k, k1)
+        single = self._stack.single
+        follow_blocks(
+            single.first[k : k1 + 1], single.end, stack.root[some], stack.solved[some], Kt[k - own.start :], y
+        )
         e = _turn_errors(T, y - m)
         sigma = np.sqrt(np.diagonal(self._P[k:k1], axis1=1, axis2=2))
         size = np.max(np.abs(e) / np.maximum(np.repeat(sigma, counts, axis=0), 1e-300), axis=1)

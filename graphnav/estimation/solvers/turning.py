@@ -95,4 +95,4 @@ def change_of_point(states: States, e: Array) -> Array:
 
 def turn_covariance(P: Array, states: States, e: Array) -> Array:
     """Covariances (K, 15, 15) of errors about points turned into those about the points moved by e (K, 15)."""
-    return np.asarray(turn(P, np.linalg.inv(change_of_point(states, e))))
+    return np.asarray(turn(P.copy(), np.linalg.inv(change_of_point(states, e))))

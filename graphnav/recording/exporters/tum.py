@@ -40,7 +40,7 @@ def open_writer(path: Path, name: str = "") -> Iterator[Add]:
                 p_n = frame.from_llh(block.llh)
                 # attitudes refer to the local level of each point; the file has one frame for all of them
                 R_ln = (enu_axes(block.llh).reshape(-1, 3) @ frame.R_ne.T).reshape(-1, 3, 3)
-                R_nb = rotation.multiply(np.swapaxes(R_ln, -1, -2), R_lb)
+                R_nb = np.swapaxes(R_ln, -1, -2) @ R_lb
             q = rotation.to_quaternion(R_nb)
             table = np.column_stack([block.t, p_n, q[:, 1:], q[:, 0]])
             file.write(encode_rows(table, " ".join(["%.6f"] + ["%.5f"] * 3 + ["%.10f"] * 4)))

@@ -79,6 +79,7 @@ class _InertialMotion:
     force: Array  # (M,) m/s, forward force integrated, without slope and bias
     known: NDArray[np.bool_]  # (M,)
     lag: float  # s, delay of the odometer
+    up: Array  # (3,) by gravity, body axes
 
 
 def _find_axes(imu: Imu) -> tuple[Array, Array]:
@@ -128,7 +129,7 @@ def _compute_motion(odometer: Odometer, imu: Imu, known: float | None) -> _Inert
     hole = holes[np.clip(np.searchsorted(imu.t, at), 0, len(imu.t))]
     inside = (at >= imu.t[0]) & (at <= imu.t[-1])
     # a different number of holes before two readings: the force between them is not known. A step no speed makes
-    return _InertialMotion(np.interp(at, imu.t, gained) + np.interp(at, ends, drift) + 1e6 * hole, inside, lag)
+    return _InertialMotion(np.interp(at, imu.t, gained) + np.interp(at, ends, drift) + 1e6 * hole, inside, lag, up)
 
 
 def _find_breaks(
@@ -195,7 +196,7 @@ def _find_wrong(
     bad += _find_stuck(t, v, motion, breaks, stays)
     bad += _find_noiseless(v, figures, equal, stays)
     if motion is not None and imu is not None:
-        bad += _find_moving_zeros(odometer, imu, motion.lag, stays)
+        bad += _find_moving_zeros(odometer, imu, motion, stays)
     bad += _find_islands(t, v, motion, breaks, stays, _ISLAND)
     bad += [(k + 1, max(m, k + 2), WILD) for k, m in breaks]  # it is unknown which side is right
     return _merge(t, bad)
@@ -278,11 +279,10 @@ def _find_departure(t: Array, force: Array, earliest: int, k: int) -> int:
 
 
 def _find_moving_zeros(
-    odometer: Odometer, imu: Imu, lag: float, stays: list[tuple[int, int]]
+    odometer: Odometer, imu: Imu, motion: _InertialMotion, stays: list[tuple[int, int]]
 ) -> list[tuple[int, int, str]]:
     """Zeros while the vehicle turns, or vibrates as in motion."""
-    t, v = odometer.t, odometer.speed
-    up = _find_axes(imu)[1]
+    t, v, lag, up = odometer.t, odometer.speed, motion.lag, motion.up
     n = max(2, round(1.0 / compute_period(imu.t)))
     count = len(imu.t) // n
     gyro, accel = (x[: count * n].reshape(count, n, 3) for x in (imu.gyro, imu.accel))
