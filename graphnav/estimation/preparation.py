@@ -7,6 +7,7 @@ solver its first linearisation point.
 
 from __future__ import annotations
 
+import contextlib
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -24,7 +25,7 @@ from graphnav.core.notes import Note
 from graphnav.core.progress import Progress, tell
 from graphnav.core.rotation import Array
 from graphnav.detectors import Detections
-from graphnav.detectors.base import merge_spans
+from graphnav.detectors.base import NONE, merge_spans
 from graphnav.estimation.alignment import Alignment, use_known_heading
 from graphnav.estimation.building import BuiltProblem, Clock, ProblemBuilder, has_diverged
 from graphnav.estimation.contradictions import describe_freed, free
@@ -222,8 +223,10 @@ def _find_noise(
     found = revise_jointly(found, settings, built.aligned.until, progress)
     if found.freed:
         built, found = _start_anew(builder, built, found)
-    false, spent = find_false_stops(found.base, found.estimate, built.detections.stationary)
-    passes.update(filter=spent)
+    false = NONE
+    with contextlib.suppress(*BREAKDOWN):
+        false, spent = find_false_stops(found.base, found.estimate, built.detections.stationary)
+        passes.update(filter=spent)
     if len(false):
         passes.update(found.estimate.passes)
         moving = replace(builder, false_stops=merge_spans(np.concatenate([builder.false_stops, false[:first]])))
@@ -236,8 +239,9 @@ def _find_noise(
     plain = NoiseModel(excluded=best.noise.excluded, freed=found.freed)
     noise = plain if _is_likelier(built.problem, plain, best) else found.noise
     if noise.excluded:
-        noise, spent = weigh_excluded(built.problem, noise, best.get_linearisation(built.problem))
-        passes.update(filter=spent, smoother=spent)
+        with contextlib.suppress(*BREAKDOWN):
+            noise, spent = weigh_excluded(built.problem, noise, best.get_linearisation(built.problem))
+            passes.update(filter=spent, smoother=spent)
     spans = tuple((float(begin), float(end)) for begin, end in builder.false_stops)
     return replace(noise, false_stops=spans), built, evidence
 
