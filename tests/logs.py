@@ -191,3 +191,80 @@ def write_bag(path: Path, kind: str, messages, unix: float) -> Path:
             serialise = store.serialize_ros1 if kind == "bag" else store.serialize_cdr
             writer.write(connections[topic], round((unix + t) * 1e9), serialise(message, message.__msgtype__))
     return path
+
+
+def novatel(name: str, body: str, t: float) -> str:
+    """An ASCII log of NovAtel's with its CRC, by the bit-wise algorithm of the manual; short headers have a %."""
+    short = name in ("RAWIMUSA", "RAWIMUSXA", "INSPVASA")
+    stamp = f"{WEEK},{TOW + t:.3f}"
+    head = f"{name},{stamp}" if short else f"{name},COM1,0,60.0,FINESTEERING,{stamp},02000020,0dc5,16809"
+    crc = 0
+    for byte in f"{head};{body}".encode():
+        crc ^= byte
+        for _ in range(8):
+            crc = crc >> 1 ^ (0xEDB88320 if crc & 1 else 0)
+    return f"{'%' if short else '#'}{head};{body}*{crc:08x}\r\n"
+
+
+def write_novatel(
+    path: Path, recording: Recording, truth: Trajectory, imu: str = "RAWIMUSXA", kind: int = 26, latency: float = 0.0,
+    counts: tuple[float, float] = (1e-9, 2e-8),
+) -> Path:  # fmt: skip
+    """Counts of the IMU (of `counts` rad and m/s, by default of an ISA-100C, type 26), BESTPOS, BESTVEL and INSPVA."""
+    gnss, dt = recording.gnss, float(np.median(np.diff(recording.imu.t)))
+    lines = []
+    for t, gyro, accel in zip(recording.imu.t, recording.imu.gyro, recording.imu.accel, strict=True):
+        rate, force = (np.round(x * dt / one).astype(int) for x, one in zip((gyro, accel), counts, strict=True))
+        some = (force[2], -force[1], force[0], rate[2], -rate[1], rate[0])
+        body = f"{WEEK},{TOW + t:.6f},00170705,{','.join(map(str, some))}"
+        lines.append((t, novatel(imu, f"00,{kind},{body}" if "X" in imu else body, t)))
+    for k, t in enumerate(gnss.t):
+        lat, lon = np.degrees(gnss.llh[k, :2])
+        (e, n, u), (ve, vn, vu) = gnss.sd[k], gnss.v[k]
+        place = f"{lat:.11f},{lon:.11f},{gnss.llh[k, 2] - 40.0:.4f},40.0000,WGS84,{n},{e},{u}"
+        body = f'SOL_COMPUTED,NARROW_INT,{place},"0",1.000,0.000,18,15,15,12,00,00,00,01'
+        course = np.degrees(np.arctan2(ve, vn)) % 360
+        speed = f"SOL_COMPUTED,NARROW_INT,{latency:.3f},1.000,{np.hypot(ve, vn):.6f},{course:.6f},{vu:.6f},0.0"
+        lines += [(t, novatel("BESTPOSA", body, t)), (t, novatel("BESTVELA", speed, t))]
+    for k in np.flatnonzero((truth.t >= recording.start) & (truth.t <= recording.end)):
+        lat, lon = np.degrees(truth.llh[k, :2])
+        (ve, vn, vu), (roll, pitch, heading) = truth.v[k], np.degrees(truth.rph[k])
+        body = f"{WEEK},{TOW + truth.t[k]:.9f},{lat:.11f},{lon:.11f},{truth.llh[k, 2]:.4f},{vn:.6f},{ve:.6f},{vu:.6f},"
+        body += f"{roll:.9f},{pitch:.9f},{heading % 360:.9f},INS_SOLUTION_GOOD"
+        lines.append((truth.t[k], novatel("INSPVASA", body, truth.t[k])))
+    path.write_text("".join(line for _, line in sorted(lines, key=lambda one: one[0])))
+    return path
+
+
+def write_gnsslogger(path: Path, recording: Recording, boot: float = 65_000.0) -> Path:
+    """A GnssLogger's text: rates and forces at times of their own, in stamps since boot, and fixes in UTC."""
+    imu, gnss = recording.imu, recording.gnss
+    unix = (UTC_MIDNIGHT - datetime.datetime(1970, 1, 1)).total_seconds()
+    drift, between = (0.01, -0.02, 0.003), imu.t[:-1] + 0.3 * np.diff(imu.t)
+    forces = np.stack([np.interp(between, imu.t, imu.accel[:, k]) for k in range(3)], -1)
+    rows = [(t, f"UncalGyro,{stamp(unix + t)},{(boot + t) * 1e9:.0f},{join(x + drift)},{join(drift)}")
+            for t, x in zip(imu.t, imu.gyro, strict=True)]  # fmt: skip
+    rows += [(t, f"UncalAccel,{stamp(unix + t)},{(boot + t) * 1e9:.0f},{join(x)},0.0,0.0,0.0")
+             for t, x in zip(between, forces, strict=True)]  # fmt: skip
+    for k, t in enumerate(gnss.t):
+        lat, lon = np.degrees(gnss.llh[k, :2])
+        speed, course = np.hypot(*gnss.v[k, :2]), np.degrees(np.arctan2(gnss.v[k, 0], gnss.v[k, 1])) % 360
+        fix = f"{lat:.10f},{lon:.10f},{gnss.llh[k, 2]:.6f},{speed:.6f},{1.51 * gnss.sd[k, 0]},{course:.6f}"
+        rest = f"{stamp(unix + t)},0.1,,{(boot + t) * 1e9:.0f},{gnss.sd[k, 2]},0"
+        rows += [(t, f"Fix,GPS,{fix},{rest}"), (t, f"Fix,NLP,{fix},{rest}"), (t, f"Raw,{stamp(unix + t)},1,18")]
+    header = (
+        "# Version: v3.1.0.4 Platform: 13\n#\n# Raw,utcTimeMillis,TimeNanos,LeapSecond\n#\n# Fix,Provider,"
+        "LatitudeDegrees,LongitudeDegrees,AltitudeMeters,SpeedMps,AccuracyMeters,BearingDegrees,UnixTimeMillis,SpeedAccuracyMps,"
+        "BearingAccuracyDegrees,elapsedRealtimeNanos,VerticalAccuracyMeters,MockLocation\n"
+    )
+    path.write_text(header + "".join(f"{row}\n" for _, row in sorted(rows, key=lambda one: one[0])))
+    return path
+
+
+def stamp(unix: float) -> str:
+    """Milliseconds of Unix time."""
+    return f"{unix * 1e3:.0f}"
+
+
+def join(numbers) -> str:
+    return ",".join(repr(float(x)) for x in numbers)

@@ -122,8 +122,9 @@ def build_gnss(d: schema.GnssTable, rows: Table, remarks: Remarks) -> Gnss:
         )
     kinds = parse_fix_types(rows, d.units.type) if "type" in rows else None
     gnss = Gnss(
-        rows["t"], llh, sd, v, sd_v, np.array(d.lever_arm), kinds, kinds is not None and d.units.type == "rtklib"
-    )
+        rows["t"], llh, sd, v, sd_v, np.array(d.lever_arm), kinds, kinds is not None and d.units.type == "rtklib",
+        velocity_offset=d.velocity_offset,
+    )  # fmt: skip
     return replace(gnss, satellites=rows["satellites"]) if "satellites" in rows else gnss
 
 

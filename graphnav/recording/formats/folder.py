@@ -250,7 +250,8 @@ def _complete_gnss(d: schema.GnssTable, gnss: Gnss) -> Gnss:
     sd_v = gnss.sd_v
     if gnss.v is not None and d.sd_v is not None:
         sd_v = np.where(np.isnan(gnss.v), np.nan, np.array(d.sd_v))
-    return replace(gnss, t=gnss.t + d.time_offset, lever_arm=lever_arm, sd=sd, sd_v=sd_v)
+    offset = d.velocity_offset if "velocity_offset" in d.model_fields_set else gnss.velocity_offset
+    return replace(gnss, t=gnss.t + d.time_offset, lever_arm=lever_arm, sd=sd, sd_v=sd_v, velocity_offset=offset)
 
 
 def _complete_odometer(d: schema.OdometerTable, odometer: Odometer) -> Odometer:

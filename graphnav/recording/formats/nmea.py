@@ -19,7 +19,7 @@ from graphnav.core.notes import format_count
 from graphnav.core.rotation import Array
 from graphnav.core.timescales import date_week_times, utc_to_gps
 from graphnav.recording import Gnss, convert_fix_types
-from graphnav.recording.formats import ubx
+from graphnav.recording.formats import novatel, ubx
 from graphnav.recording.formats.registry import Log, log_format, read_first_bytes
 from graphnav.recording.formats.repair import DEFAULT_SD, DEFAULT_SD_V, NMEA_TYPES, Remarks, compute_horizontal_velocity
 
@@ -49,11 +49,12 @@ class _Epoch:
 
 
 def recognises(path: Path) -> bool:
-    """Whether one of the first lines holds a sentence ($, talker and type, a comma) and the file is not mainly UBX.
+    """Whether one of the first lines holds a sentence ($, talker and type, a comma) and the file is not mainly UBX or
+    NovAtel's.
 
     A logger may have put the time before it.
     """
-    if ubx.recognises(path):
+    if ubx.recognises(path) or novatel.recognises(path):
         return False
     lines = read_first_bytes(path).splitlines()[:20]
     return any(_SENTENCE.search(line) for line in lines)

@@ -179,6 +179,7 @@ class GnssTable(SensorTable):
     lever_arm: Vector = Field((0.0, 0.0, 0.0), description="m from the IMU: right, forward, up")
     sd: Sigmas | None = Field(None, description="m: east, north, up")
     sd_v: Sigmas | None = Field(None, description="m/s: east, north, up")
+    velocity_offset: Number = Field(0.0, description="s from the stamps to the times of the velocities")
 
 
 def _names(value: Any) -> Any:

@@ -199,6 +199,10 @@ def _write_toml(log: Log) -> str:
         lines += [
             f"lever_arm = {_format_list(log.gnss.lever_arm)}    # from the IMU to the antenna, m: right, forward, up"
         ]
+        if log.gnss.velocity_offset:
+            lines += [
+                f"velocity_offset = {log.gnss.velocity_offset!r}".ljust(31) + "# s from t to the times of velocities"
+            ]
     if log.odometer is not None:
         lines += ["", "[odometer]", 'file = "odometer.csv.gz"       # t,speed; s, m/s, forward positive']
         lines += [
