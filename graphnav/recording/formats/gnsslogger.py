@@ -18,10 +18,10 @@ from graphnav.core.files import parse_number, read_bytes
 from graphnav.core.findings import compute_period
 from graphnav.core.notes import format_count
 from graphnav.core.rotation import Array
-from graphnav.core.timescales import date_week_times, unix_to_gps
+from graphnav.core.timescales import UNIX, date_week_times, unix_to_gps
 from graphnav.recording import Gnss, Imu
 from graphnav.recording.formats.registry import Log, log_format, read_first_bytes
-from graphnav.recording.formats.repair import DEFAULT_SD, DEFAULT_SD_V, Remarks, compute_horizontal_velocity
+from graphnav.recording.formats.repair import DEFAULT_SD, DEFAULT_SD_V, LATEST, Remarks, compute_horizontal_velocity
 
 _BEGIN = re.compile(
     rb"^(?:#\s*)?(?:Raw,(?:utcTime|Elapsed)|Fix,(?:Provider|GPS|gps|FLP),|(?:Uncal)?(?:Gyro|Accel),\w)", re.M
@@ -58,8 +58,7 @@ def load(path: Path) -> Log:
     remarks = Remarks()
     fixes, sensors, unix = _collect_rows(path, remarks)
     chosen = next((some for some in ("gps", "flp", "fused") if some in fixes), None)
-    fused = np.array(fixes[chosen]) if chosen else np.empty((0, len(_FIX)))
-    gnss = None
+    table = np.array(fixes[chosen]) if chosen else np.empty((0, len(_FIX)))
     if others := {name: rows for name, rows in fixes.items() if name != chosen}:
         many = ", ".join(f"{len(rows)} {name}" for name, rows in others.items())
         remarks.add("gnss.providers", f"GNSS: fixes of other providers left out: {many}")
@@ -67,17 +66,16 @@ def load(path: Path) -> Log:
         remarks.add(
             "gnss.dead_reckoning", "the fixes are a phone's fused ones: they may already have its sensors in them"
         )
-    stamps = dict(zip(_FIX, fused.T, strict=True))
+    stamps = dict(zip(_FIX, table.T, strict=True))
     both = np.isfinite(stamps["boot"])
     if both.any():  # the receiver's UTC at a time since boot
         ahead = float(np.median(stamps["unix"][both] * 1e-3 - stamps["boot"][both] * 1e-9))
     else:
         ahead = float(np.median(unix)) if unix else 0.0
-        if unix and len(fused):
+        if unix and len(table):
             remarks.add("log.sensor_clock", "clock of the sensors: the phone's UTC, not the receiver's")
     imu = _join_imu(sensors, ahead, remarks)
-    if len(fused):
-        gnss = _make_gnss(stamps, remarks)
+    gnss = _make_gnss(stamps, remarks) if len(table) else None
     if imu is None and gnss is None:
         raise RecordingError(
             f"{path}: no fixes, and not both a gyro and an accelerometer{''.join(f'; {remark}' for remark in remarks)}",
@@ -118,14 +116,14 @@ def _collect_rows(path: Path, remarks: Remarks) -> tuple[_Rows, _Rows, list[floa
         try:
             if name in (*_GYRO, *_ACCEL):
                 utc, boot, *values = [parse_number(x) for x in rest.decode("ascii").split(",")[:8]]
-                if len(values) < 3:
+                if len(values) < 3 or not _is_date(utc * 1e-3) or not abs(boot * 1e-9) < LATEST:
                     raise ValueError("fields")
                 sensors.setdefault(name, []).append([boot * 1e-9, *values, *[0.0] * (6 - len(values))])
                 unix.append(utc * 1e-3 - boot * 1e-9)
             elif name == "Fix":
                 cells = ["", *rest.decode("ascii").strip().split(",")]
                 row = [parse_number(cells[k] or "nan") if k is not None and k < len(cells) else np.nan for k in at]
-                if not np.isfinite(row[list(_FIX).index("unix")]):
+                if not _is_date(row[list(_FIX).index("unix")] * 1e-3):
                     raise ValueError("time")
                 fixes.setdefault(cells[1].lower(), []).append(row)
             elif name.strip():
@@ -142,6 +140,10 @@ def _collect_rows(path: Path, remarks: Remarks) -> tuple[_Rows, _Rows, list[floa
         hint = "; of Raw, RINEX can be made for [raw_gnss]" if "Raw" in unused else ""
         remarks.add("log.unused", f"{path.name}: lines not used: {many}{hint}")
     return fixes, sensors, unix
+
+
+def _is_date(t: float) -> bool:
+    return UNIX < t < LATEST
 
 
 def _find_fields(header: str) -> list[int | None]:

@@ -12,6 +12,7 @@ import zlib
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from math import isfinite
 from pathlib import Path
 from sys import intern
 
@@ -25,7 +26,7 @@ from graphnav.core.rotation import Array
 from graphnav.core.timescales import WEEK, date_week_times
 from graphnav.recording import Gnss, Imu, Truth, convert_fix_types
 from graphnav.recording.formats.registry import Log, log_format, read_first_bytes
-from graphnav.recording.formats.repair import DEFAULT_SD_V, Remarks
+from graphnav.recording.formats.repair import DEFAULT_SD_V, LATEST, Remarks
 
 _HEADER = re.compile(rb"[#%][A-Z][A-Z0-9]{3,}A,[^;\r\n]{4,200};")
 _BEGIN = re.compile(rb"[#%](?=[A-Z]{3})")
@@ -159,7 +160,7 @@ def _collect_rows(path: Path) -> _Content:
             continue
         if row is None:
             content.others[name] += 1
-        elif not WEEK < row[0] < np.inf:
+        elif not WEEK < row[0] < LATEST:
             content.undated += 1
         else:
             content.rows.setdefault(name, []).append(row)
@@ -189,7 +190,10 @@ def _parse_line(line: bytes) -> tuple[str, _Row | None]:
     dated = fields[5 if len(fields) > 3 else 1 :] if kind.date is None else body[kind.date :]
     t = WEEK * int(dated[0]) + parse_number(dated[1])
     words = tuple(intern(body[k]) for k in kind.words)
-    return _SHORT.get(name, name), (t, words, tuple(parse_number(body[k]) for k in kind.numbers))
+    numbers = tuple(parse_number(body[k]) for k in kind.numbers)
+    if not all(map(isfinite, numbers)):
+        raise ValueError("number")
+    return _SHORT.get(name, name), (t, words, numbers)
 
 
 def _read_imu(path: Path, content: _Content, zero: float, remarks: Remarks) -> Imu | None:
@@ -201,8 +205,8 @@ def _read_imu(path: Path, content: _Content, zero: float, remarks: Remarks) -> I
         If it is not known what a count is.
     """
     name = "RAWIMUX" if "RAWIMUX" in content.rows else "RAWIMU"
-    # of the information's bits, 0 is an error of the IMU and 1 encryption
-    t, _, numbers = content.take(name, lambda words: not words or not int(words[0], 16) & 3)
+    # of the information's bits (hexadecimal), 0 is an error of the IMU and 1 encryption
+    t, _, numbers = content.take(name, lambda words: not words or words[0][-1:] in "048cC")
     if left := len(content.rows.get(name, ())) - len(t):
         remarks.add(
             "imu.rows_left_out", f"IMU: {format_count(left, 'row')} repeated, with an error or encrypted left out"
