@@ -40,22 +40,24 @@ class Samples:
         return replace(self, **rows)
 
 
-def bridge_gaps(imu: Imu, factor: float = GAP) -> Samples:
+def bridge_gaps(imu: Imu, begin: float = -np.inf) -> Samples:
     """Fill every gap with the rows that `graphnav.imu.bridging` expects there, with the appropriate noise.
 
     A row covers only one sample period before its stamp. The error of the mean signal in a gap of length g lasts for
-    the whole gap, so the equivalent white density is its variance times g.
+    the whole gap, so the equivalent white density is its variance times g. Gaps that end before `begin` (s) are left as
+    they are, for what is integrated from there.
     """
     dt = imu.t[1:] - imu.t[:-1]
     period = compute_period(imu.t)
-    gap = np.flatnonzero(dt > factor * period)
+    every = np.flatnonzero(dt > GAP * period)
+    gap = every[imu.t[every + 1] >= begin]
     zero = np.broadcast_to(np.zeros(3), (len(imu.t), 3))
     if not len(gap):
         return Samples(imu.t, imu.gyro, imu.accel, zero, zero, float(imu.t[0] - period), np.empty((0, 2)))
     t_fill = imu.t[gap + 1] - period
     length = t_fill - imu.t[gap]
     lost = np.maximum(1, np.rint(length / period)).astype(int)
-    rows, variance = fill_gaps(np.hstack([imu.gyro, imu.accel]), gap, lost)
+    rows, variance = fill_gaps(np.hstack([imu.gyro, imu.accel]), gap, lost, every)
     filled, extra = np.concatenate(rows), np.repeat(variance * length[:, None], lost, axis=0)
     at = np.repeat(gap + 1, lost)  # added samples precede the row that ends the gap
     part = np.concatenate([np.arange(1, n + 1) / n for n in lost])

@@ -246,6 +246,16 @@ def test_a_gap_gets_rows_at_the_sensors_rate() -> None:
         np.testing.assert_array_equal((getattr(bridged, f"extra_{name}") > 0.0).all(axis=1), ~there)
 
 
+def test_an_axis_that_never_changes_goes_on_as_it_is() -> None:
+    imu = random_imu(np.random.default_rng(9), 10.0, 100.0)
+    imu.gyro[:, 1], imu.accel[:, 2] = 0.25, 9.8
+    bridged = bridge_gaps(gap_in(imu, 4.0, 4.5))
+    np.testing.assert_allclose(bridged.gyro[:, 1], 0.25)
+    np.testing.assert_allclose(bridged.accel[:, 2], 9.8)
+    assert np.isfinite(bridged.extra_gyro).all()
+    assert bridged.extra_gyro[:, 1].max() < 1e-12 * bridged.extra_gyro[:, 0].max()
+
+
 def test_a_gap_in_a_short_log_gets_the_mean_of_its_neighbours() -> None:
     imu = random_imu(np.random.default_rng(9), 1.0, 100.0)
     bridged = bridge_gaps(gap_in(imu, 0.4, 0.7))

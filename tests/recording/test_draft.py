@@ -204,7 +204,7 @@ def test_a_named_file_that_is_no_table_is_not_left_out_of_a_drive(tmp_path):
     """Else an IMU beside fixes that are not read would become a walk."""
     imu, *_ = write_logs(tmp_path)
     other = tmp_path / "inspva.log"
-    other.write_text("#INSPVAXA,COM1,0,73.5,FINESTEERING,2130,345600.000;35.6,139.7\n" * 9)
+    other.write_text("<INSPVAX COM1 0 73.5 FINESTEERING 2130 345600.000\n< 35.6 139.7\n" * 9)
     with refused("draft.positions_unread", RecordingError, "inspva.log"):
         draft([imu, other], tmp_path)
 
