@@ -88,9 +88,11 @@ def compute_walk_errors(recording: Recording, solution: Solution, truth_sigma: f
     q = p if X.shape[1] == 2 else p + states.R_nb @ arm
     at_start = q[0] if X.shape[1] == 2 else q[t <= t[0] + _INITIAL_STANCE].mean(axis=0)
     a, b = X[:, :2] - first[:2], (q - at_start)[:, :2]
-    anchored = _rotate_by_yaw(a, float(np.arctan2(np.sum(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]), np.sum(a * b))))
-    e = b - anchored
     R = truth_sigma**2
+    # by the sigmas, lest a heading that was lost midway turns what came before, which is known to centimetres
+    weight = 1.0 / (0.5 * (P[:, 0, 0] + P[:, 1, 1]) + R)
+    across, along = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0], np.sum(a * b, axis=1)
+    e = b - _rotate_by_yaw(a, float(np.arctan2(weight @ across, weight @ along)))
     nees_h = 0.5 * np.einsum("ni,nij,nj->n", e, np.linalg.inv(P[:, :2, :2] + R * np.eye(2)), e)
     up = nees_up = stride = np.nan
     if X.shape[1] == 3:
