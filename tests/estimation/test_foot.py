@@ -401,6 +401,22 @@ def test_strides_and_shape_of_a_walk() -> None:
     assert long.nees_h == pytest.approx(0.5 * np.mean(np.sum((0.02 * xy) ** 2, axis=1)) / 0.01, rel=1e-6)
 
 
+def test_what_is_known_well_is_not_turned_by_what_is_not() -> None:
+    """A walk whose second half is turned by 0.5 rad about where it begins, and known to metres there: one sigma."""
+    recording, solution = line_walk(0.0)
+    p, half = solution.states.p.copy(), len(solution.t) // 2
+    known = np.arange(len(p)) <= half
+    c, s = np.cos(0.5), np.sin(0.5)
+    at = p[half, :2].copy()
+    p[half:, :2] = at + (p[half:, :2] - at) @ np.array([[c, s], [-s, c]])
+    off = np.linalg.norm(p - solution.states.p, axis=1)
+    P = solution.covariance.copy()
+    P[:, 3:6, 3:6] = np.where(known, 1e-4, np.maximum(0.5 * off**2, 1e-4))[:, None, None] * np.eye(3)
+    states = replace(solution.states, p=p)
+    found = compute_walk_errors(recording, replace(solution, states=states, between=(_Rows(solution.t, states, P),)))
+    assert found.nees_h == pytest.approx(np.mean(~known & (off > 1e-9)), rel=0.2)
+
+
 def test_a_dense_truth_of_another_point_on_the_foot() -> None:
     """Its lever arm is fitted, and what it says of its own noise is how high it finds a flat floor."""
     t = np.arange(0.0, 40.0, 0.05)
