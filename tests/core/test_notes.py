@@ -46,6 +46,8 @@ LOGS = {
     "rtklib": lambda folder, recording, truth: logs.write_rtklib(folder / "a.pos", recording, "UTC"),
     "nmea": lambda folder, recording, truth: logs.write_nmea(folder / "a.nmea", recording, gst=False),
     "kitti-raw": logs.write_kitti,
+    "novatel": lambda folder, recording, truth: logs.write_novatel(folder / "a.log", recording, truth),
+    "gnsslogger": lambda folder, recording, truth: logs.write_gnsslogger(folder / "a.txt", recording),
 }
 
 

@@ -366,16 +366,17 @@ def cut_sources(folder):
     return [
         folder / "kf" / "imu.txt", folder / "kf" / "gnss.txt", folder / "kf" / "kf-gins.yaml",
         logs.write_rtklib(folder / "a.pos", RECORDING), logs.write_nmea(folder / "a.nmea", RECORDING),
+        logs.write_novatel(folder / "a.log", RECORDING, TRUTH), logs.write_gnsslogger(folder / "a.txt", RECORDING),
     ]  # fmt: skip
 
 
 @pytest.mark.parametrize("share", [0.0, 0.013, 0.31, 0.777, 0.99])
-@pytest.mark.parametrize("which", range(5), ids=["imu", "gnss", "yaml", "pos", "nmea"])
+@pytest.mark.parametrize("which", range(7), ids=["imu", "gnss", "yaml", "pos", "nmea", "novatel", "gnsslogger"])
 def test_a_file_that_is_cut_off_is_read_to_there_or_refused_in_a_line(tmp_path, which, share):
     path = cut_sources(tmp_path)[which]
     data = path.read_bytes()
     path.write_bytes(data[: int(share * len(data))])
-    name = ("kf-gins", "kf-gins", "kf-gins", "rtklib", "nmea")[which]
+    name = ("kf-gins", "kf-gins", "kf-gins", "rtklib", "nmea", "novatel", "gnsslogger")[which]
     log, refusal = None, ""
     try:
         log = load(path, name)
@@ -385,7 +386,7 @@ def test_a_file_that_is_cut_off_is_read_to_there_or_refused_in_a_line(tmp_path, 
         assert path.name in refusal
         assert "\n" not in refusal
     else:
-        sensor = log.imu if which == 0 else log.gnss
+        sensor = log.imu if which in (0, 5, 6) else log.gnss
         assert 0 < len(sensor.t) <= len(RECORDING.imu.t)
 
 
