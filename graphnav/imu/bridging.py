@@ -22,7 +22,7 @@ from graphnav.core.running import sum_running
 
 _BESIDE = 4  # rows before and after a gap that are compared
 _ALIKE = 10  # places: their mean is as wrong as the scatter about it to a twentieth
-_TRIALS = 50  # determine a variance to a fifth
+_TRIALS = 200  # determine a variance to a tenth
 _PLACES, _LEAST = 100_000, 2_000  # looked at for all lengths of gaps, and for one; of longer logs every second, ...
 _AT_ONCE = 16  # gaps
 _SHARES = np.r_[0.0, np.logspace(-4.0, 1.0, 11)]  # values of b
