@@ -9,6 +9,11 @@ so is the NEES of a dense truth, the noise of which is how heights scatter over 
 bias as the walk before on the same sensor and day had it. "plain filter": what a nine-state zero-velocity filter of the
 usual kind reached on the same recordings, in stance (`plain_filter.py`).
 "s per min": processor time of all three solvers, alignment and detection per minute of walk.
+
+    python scripts/walks.py --gaps 3
+
+Instead: so many times without six pieces of the IMU's log, of 15 to 300 ms, as a radio loses them; rms of the errors
+and means of the NEES over the times.
 """
 
 from __future__ import annotations
@@ -16,7 +21,8 @@ from __future__ import annotations
 import argparse
 import os
 import time
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +31,7 @@ from graphnav import load
 from graphnav.config import parse_settings
 from graphnav.estimation.pipeline import SOLVERS, run
 from graphnav.evaluation.strides import WalkErrors, compute_walk_errors, estimate_floor_sigma
-from graphnav.recording import Recording
+from graphnav.recording import Recording, take_rows
 
 # m: how far a coordinate of the truth may be off. None: measured. Points taken by hand where the shoe stood, of a place
 # on it that is not stated; the footprint that a loop ends in
@@ -52,8 +58,12 @@ class Before:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--sets", default=",".join(SETS), help="folders, comma separated (%(default)s)")
+    parser.add_argument("--gaps", type=int, default=0, help="times without pieces of the log (%(default)s)")
     options = parser.parse_args()
     folder = Path(os.environ["GRAPHNAV_DATA"])
+    if options.gaps:
+        list_gaps(folder, options.sets.split(","), options.gaps)
+        return
     print("| walk | s | plain filter | " + " | ".join(f"{s}, {c} lateral" for c in CASES for s in SOLVERS), end="")
     print(" | batch, in stance | batch, stances once | batch, point fitted | batch, bias before", end="")
     print(f" | up, m: {', '.join(SOLVERS)} | stride | NEES hor. | NEES up | s per min |")
@@ -65,6 +75,40 @@ def main() -> None:
             rows.append(row)
         median = [f"{np.median([row[k] for row in rows]):.3f}" for k in range(len(rows[0]))]
         print(f"| **{name}, median** | | {' | '.join(median)} |" + " |" * 5)
+
+
+def list_gaps(folder: Path, sets: list[str], draws: int) -> None:
+    columns = [f"{what}, {solver}" for what in ("m", "NEES hor.") for solver in SOLVERS]
+    print(f"| walk | {' | '.join(columns)} |\n|{' --- |' * (1 + len(columns))}")
+    for name in sets:
+        rows = []
+        for path in sorted((folder / name).glob("*.toml")):
+            recording, errors = load(path), []
+            for draw in range(draws):
+                lost = lose_pieces(recording, np.random.default_rng(draw))
+                solutions = run(lost)
+                stated = SETS[name]
+                sigma = estimate_floor_sigma(recording, solutions["batch"]) if stated is None else stated
+                found = [compute_walk_errors(recording, solutions[solver], sigma) for solver in SOLVERS]
+                errors.append([*(one.horizontal for one in found), *(one.nees_h for one in found)])
+            off, nees = np.hsplit(np.array(errors), 2)
+            rows.append([*np.sqrt((off**2).mean(axis=0)), *nees.mean(axis=0)])
+            print(f"| {recording.name} | {format_gaps(rows[-1])} |", flush=True)
+        print(f"| **{name}, median** | {format_gaps(np.median(rows, axis=0))} |", flush=True)
+
+
+def format_gaps(row: Iterable[float]) -> str:
+    return " | ".join(f"{x:.{3 if k < len(SOLVERS) else 2}f}" for k, x in enumerate(row))
+
+
+def lose_pieces(recording: Recording, rng: np.random.Generator) -> Recording:
+    """The recording without six pieces of the IMU's rows after the first quarter."""
+    t = recording.imu.t
+    keep = np.ones(len(t), dtype=bool)
+    for _ in range(6):
+        begin = t[rng.integers(len(t) // 4, len(t) - 200)]
+        keep &= (t <= begin) | (t > begin + rng.uniform(0.015, 0.3))
+    return replace(recording, imu=take_rows(recording.imu, keep))
 
 
 def shown(x: float, digits: int = 3) -> str:

@@ -166,7 +166,7 @@ def build_problem(
         epochs = np.concatenate([*wanted, np.empty(0)])
         times = choose_keyframes(recording.start, recording.end, epochs, settings.keyframes.rate)
     t = times
-    samples = bridge_gaps(recording.imu)
+    samples = bridge_gaps(recording.imu, float(t[0]))
     remarks: tuple[str, ...] = ()
     if recording.platform == "foot":
         samples, remarks = restore_peaks(samples, recording.imu.R_bs, highest)
@@ -265,10 +265,7 @@ def _describe_samples(samples: Samples, recording: Recording) -> tuple[str, ...]
         return ()
     begin, end = samples.bridged.T
     sentence = (
-        f"{describe_gaps('the IMU', end - begin, begin - recording.start)}: bridged by the mean of the neighbours"
+        f"{describe_gaps('the IMU', end - begin, begin - recording.start)}: filled by the parts of the recording that "
+        "are most like what is beside them, with their scatter as its noise"
     )
-    return (
-        Note(
-            "imu.gaps_bridged", f"{sentence}, with the error of such a bridge elsewhere in the recording as its noise"
-        ),
-    )
+    return (Note("imu.gaps_bridged", sentence),)

@@ -9,12 +9,11 @@ import numpy as np
 
 from graphnav.core.findings import compute_period
 from graphnav.core.rotation import Array
-from graphnav.core.running import sum_running
+from graphnav.imu.bridging import fill_gaps
 from graphnav.recording import Imu
 
 GAP = 1.5  # sample periods between rows above which there is a gap
 MANY = 64  # pieces above which an interval is processed apart from shorter ones
-_SPANS = 10  # times a gap's length on either side of it: twenty spans determine a variance to a third
 _PIECES_AT_ONCE = 40_000  # pieces processed at once: keeps the working arrays in the processor's cache
 
 
@@ -41,75 +40,36 @@ class Samples:
         return replace(self, **rows)
 
 
-def bridge_gaps(imu: Imu, factor: float = GAP) -> Samples:
-    """Fill every gap with one sample: the mean of its neighbours, with the appropriate noise.
+def bridge_gaps(imu: Imu, begin: float = -np.inf) -> Samples:
+    """Fill every gap with the rows that `graphnav.imu.bridging` expects there, with the appropriate noise.
 
-    A row covers only one sample period before its stamp. The variance of the mean signal in a gap about that of its
-    neighbours is `_measure_bridge_error`. That error lasts for the whole gap of length g, so the equivalent white
-    density is the variance times g.
+    A row covers only one sample period before its stamp. The error of the mean signal in a gap of length g lasts for
+    the whole gap, so the equivalent white density is its variance times g. Gaps that end before `begin` (s) are left as
+    they are, for what is integrated from there.
     """
     dt = imu.t[1:] - imu.t[:-1]
     period = compute_period(imu.t)
-    gap = np.flatnonzero(dt > factor * period)
+    every = np.flatnonzero(dt > GAP * period)
+    gap = every[imu.t[every + 1] >= begin]
     zero = np.broadcast_to(np.zeros(3), (len(imu.t), 3))
     if not len(gap):
         return Samples(imu.t, imu.gyro, imu.accel, zero, zero, float(imu.t[0] - period), np.empty((0, 2)))
     t_fill = imu.t[gap + 1] - period
     length = t_fill - imu.t[gap]
-    at = gap + 1  # the added sample precedes the row that ends the gap
-    fill = {name: 0.5 * (getattr(imu, name)[gap] + getattr(imu, name)[gap + 1]) for name in ("gyro", "accel")}
     lost = np.maximum(1, np.rint(length / period)).astype(int)
-    extra = {name: _measure_bridge_error(getattr(imu, name), gap, lost) * length[:, None] for name in ("gyro", "accel")}
+    rows, variance = fill_gaps(np.hstack([imu.gyro, imu.accel]), gap, lost, every)
+    filled, extra = np.concatenate(rows), np.repeat(variance * length[:, None], lost, axis=0)
+    at = np.repeat(gap + 1, lost)  # added samples precede the row that ends the gap
+    part = np.concatenate([np.arange(1, n + 1) / n for n in lost])
     return Samples(
-        t=np.insert(imu.t, at, t_fill),
-        gyro=np.insert(imu.gyro, at, fill["gyro"], axis=0),
-        accel=np.insert(imu.accel, at, fill["accel"], axis=0),
-        extra_gyro=np.insert(zero, at, extra["gyro"], axis=0),
-        extra_accel=np.insert(zero, at, extra["accel"], axis=0),
+        t=np.insert(imu.t, at, np.repeat(imu.t[gap], lost) + part * np.repeat(length, lost)),
+        gyro=np.insert(imu.gyro, at, filled[:, :3], axis=0),
+        accel=np.insert(imu.accel, at, filled[:, 3:], axis=0),
+        extra_gyro=np.insert(zero, at, extra[:, :3], axis=0),
+        extra_accel=np.insert(zero, at, extra[:, 3:], axis=0),
         start=float(imu.t[0] - period),
         bridged=np.stack([imu.t[gap], t_fill], -1),
     )
-
-
-def _measure_bridge_error(x: Array, gap: Array, lost: Array) -> Array:
-    """Error variance of bridging gaps by the mean of their neighbours, axis by axis.
-
-    It is measured where there are rows, as the mean squared error of bridging as many as were lost, and predicted in
-    three ways: by that near the gap, for a straight road differs from a curve; by the change across the gap, to whose
-    square the error is on average in proportion; and by the level of the neighbours about the mean, in the same way,
-    for a signal changes most where it is large. The mean of the three is returned.
-
-    Parameters
-    ----------
-    x : (N, 3) rows.
-    gap : (g,) the row before each gap.
-    lost : (g,) rows lost in each.
-
-    Returns
-    -------
-    (g, 3)
-    """
-    out = 0.5 * (x[gap + 1] - x[gap]) ** 2
-    if len(x) < 3:
-        return np.asarray(out)
-    sums, mean = sum_running(x), x.mean(axis=0)
-    for n in np.unique(lost):
-        here = np.flatnonzero(lost == n)
-        k = gap[here]
-        n = max(1, min(n, len(x) - 2))
-        before, after = x[: -n - 1], x[n + 1 :]
-        error = ((sums[n + 1 : -1] - sums[1 : -n - 1]) / n - 0.5 * (before + after)) ** 2
-        change, level = ((after - before) ** 2).mean(axis=0), ((0.5 * (before + after) - mean) ** 2).mean(axis=0)
-        average, total = error.mean(axis=0), sum_running(error)
-        first = np.clip([k - (_SPANS + 1) * n, k + 1], 0, len(error))
-        last = np.clip([k - n, k + 1 + _SPANS * n], 0, len(error))
-        count = (last - first).sum(axis=0)[:, None]
-        near = np.where(count > 0, (total[last] - total[first]).sum(axis=0) / np.maximum(count, 1), average)
-        for_change, for_level = (np.divide(average, of, out=np.zeros(3), where=of > 0.0) for of in (change, level))
-        by_change = (x[k + 1] - x[k]) ** 2 * for_change
-        by_level = (0.5 * (x[k + 1] + x[k]) - mean) ** 2 * for_level
-        out[here] = (near + by_change + by_level) / 3.0
-    return np.asarray(out)
 
 
 @dataclass(frozen=True)

@@ -40,7 +40,7 @@ def live(newest: Message, T: float, frame: LocalFrame, sensors: Sensors, noise: 
         imu = sensors.make_recording(T - 1.0, now).imu
         factors = np.array([noise.get_factor(f"imu.{name}", 1.0) for name in NOISE_FIGURES])
         ends, differs = np.array([T, now]), bool(np.any(factors != 1.0))
-        intervals = preintegrate(bridge_gaps(imu), imu, ends, state.ba[0], state.bg[0], differs)
+        intervals = preintegrate(bridge_gaps(imu, T), imu, ends, state.ba[0], state.bg[0], differs)
         if differs:
             intervals = intervals.with_noise(factors)
         motion, one = ImuFactors(intervals, frame), slice(0, 1)

@@ -16,7 +16,7 @@ ROWS_BEFORE = 2.0  # s of rows before a keyframe that its constraints use where 
 def cut_around(sensors: Sensors, begin: float, end: float) -> Recording:
     """The rows that keyframes between two times (s) use.
 
-    Only the noise of bridged IMU gaps depends on the signal of the last half minute.
+    Only what fills gaps of the IMU depends on the signal of the last half minute.
     """
     near = sensors.make_recording(begin - ROWS_BEFORE, end)
     t = near.imu.t

@@ -208,7 +208,7 @@ class Tracker(Chain):
         T, start = self.newest, self.window.newest.state
         imu = cut_around(sensors, T, sensors.imu.newest).imu
         ends = np.array([T, expected])
-        interval = preintegrate(bridge_gaps(imu), imu, ends, start.ba[0], start.bg[0], self._estimates_imu)
+        interval = preintegrate(bridge_gaps(imu, T), imu, ends, start.ba[0], start.bg[0], self._estimates_imu)
         self._motions[expected] = ImuFactors(interval, self.frame).prepare()
 
     def _is_covered(self, sensors: Sensors, t: float) -> bool:
