@@ -28,6 +28,7 @@ from graphnav.estimation.contradictions import use_freed
 from graphnav.estimation.fixing import split_carriers
 from graphnav.estimation.noise.exclusion import drop_excluded
 from graphnav.estimation.noise.model import NoiseModel
+from graphnav.estimation.noise.spacing import space_fixes
 from graphnav.estimation.problem import Problem, build_problem
 from graphnav.recording import Recording
 from graphnav.recording.odometer import MeanSpeed
@@ -78,6 +79,10 @@ class ProblemBuilder:
     false_stops: Array = field(
         default_factory=lambda: NONE
     )  # (n, 2) s, in which the platform moves, whatever the detectors say
+
+    def use_spaced(self, recording: Recording, spacing: float) -> ProblemBuilder:
+        """The same with the fixes of a recording, thinned to one in `spacing` (s); as they are where that is 0."""
+        return replace(self, used=space_fixes(recording, spacing) if spacing else recording)
 
     def align(self, recording: Recording, stationary: Array, before: Alignment | None = None) -> Alignment:
         """The first state of the recording, or of a part of it, near that found before, if any."""

@@ -34,13 +34,13 @@ from graphnav.estimation.fixing import fix, split_carriers
 from graphnav.estimation.joint_estimate import JointEstimate, estimate_jointly, revise_jointly
 from graphnav.estimation.noise.apply import apply_noise, drop_parts
 from graphnav.estimation.noise.bias_walks import estimate_bias_walks
+from graphnav.estimation.noise.chords import find_filled_gaps
 from graphnav.estimation.noise.estimate import NoiseEstimate, estimate_noise
 from graphnav.estimation.noise.false_stops import find_false_stops
 from graphnav.estimation.noise.initial_points import BREAKDOWN, find_initial_points
 from graphnav.estimation.noise.model import STATED, NoiseModel
-from graphnav.estimation.noise.spacing import space_fixes
 from graphnav.estimation.noise.span_variances import weigh_excluded
-from graphnav.estimation.noise.unmeasured import UnmeasuredRows, drop_unmeasured
+from graphnav.estimation.noise.unmeasured import UnmeasuredRows, drop_in_gaps, drop_unmeasured
 from graphnav.estimation.noise.words import describe_noise
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.relinearisation import relinearise
@@ -122,8 +122,16 @@ def prepare(
     larger = stated and settings.noise.mode != "stated" and recording.platform == "foot"
     if stated:
         noise, spacing = STATED, STATED.spacing
-    builder = replace(every, used=space_fixes(recording, spacing)) if spacing else every
+    builder = every.use_spaced(recording, spacing)
     built, evidence = builder.build(aligned, detections, parts=larger or noise != STATED), np.inf
+    if not as_stated:
+        with contextlib.suppress(*BREAKDOWN):
+            gaps, count = find_filled_gaps(apply_noise(built.problem, STATED), aligned.until)
+            passes.update(filter=count, smoother=count)
+            if len(gaps):
+                recording, unmeasured = drop_in_gaps(recording, gaps, unmeasured)
+                builder = replace(every, recording=recording).use_spaced(recording, spacing)
+                built = builder.build(aligned, detections, parts=larger or noise != STATED)
     if noise is None:
         tell("noise")
         with clock.count_time("noise"):
@@ -229,8 +237,10 @@ def _find_noise(
         passes.update(filter=spent)
     if len(false):
         passes.update(found.estimate.passes)
+        found = found.count(Counter())
         moving = replace(builder, false_stops=merge_spans(np.concatenate([builder.false_stops, false[:first]])))
-        return _find_noise(moving, moving.build_moving(built), progress, passes, weigh, 2 * first)
+        with contextlib.suppress(*BREAKDOWN):  # it may not be aligned without them
+            return _find_noise(moving, moving.build_moving(built), progress, passes, weigh, 2 * first)
     best, built = found.estimate, replace(built, problem=found.base)
     wanted = weigh is not None and weigh(apply_noise(built.problem, best.noise), best.points)
     found = found.weigh() if wanted else found

@@ -12,6 +12,7 @@ from graphnav import load
 from graphnav.config import parse_settings
 from graphnav.config.detectors import FUSED
 from graphnav.core.earth import LocalFrame
+from graphnav.core.errors import EstimationError
 from graphnav.core.rotation import Array
 from graphnav.detectors import Detections, detect
 from graphnav.detectors.base import mask_inside, merge_spans
@@ -74,6 +75,21 @@ def test_a_stop_at_speed_is_none(
     kept = read_noise(write_noise(tmp_path / "noise.json", found.noise))
     again = run(recording, SETTINGS, ("rts",), noise=kept)["rts"]
     np.testing.assert_array_equal(again.states.p, found.states.p)
+
+
+def test_a_drive_that_cannot_be_aligned_without_a_false_stop_keeps_it(
+    shared_data: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recording = replace(load(shared_data / "oracle_drive" / "recording_spp.toml").crop(50.0, 250.0), odometer=None)
+    claim_stops(monkeypatch, find_steady_motion(recording, 4.0, slowest=4.0)[None])
+
+    def fail(*given: object) -> None:
+        raise EstimationError("no motion")
+
+    monkeypatch.setattr(building.ProblemBuilder, "build_moving", fail)
+    found = run(recording, SETTINGS, ("rts",))["rts"]
+    assert found.noise.false_stops == ()
+    assert found.noise.figures
 
 
 def test_a_motorbike_that_rides_steadily_does_not_stand(shared_data: Path) -> None:

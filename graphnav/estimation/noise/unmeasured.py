@@ -1,4 +1,4 @@
-"""Rows of fixes that are no measurements: copies of the one before, and points on the line between two fixes.
+"""Rows of fixes that are no measurements: copies of the one before, and points on a line that a logger has drawn.
 
 A receiver that takes a slow vehicle to stand holds its position, and a logger that runs faster than the receiver writes
 the last fix again, or interpolates. A copy is of the time of the first of them: it says nothing of a vehicle that
@@ -35,6 +35,7 @@ class UnmeasuredRows:
 
     copies: tuple[ExcludedSpan, ...] = ()
     interpolated: int = 0
+    filled: int = 0  # in gaps of the IMU
 
 
 def drop_unmeasured(recording: Recording) -> tuple[Recording, UnmeasuredRows]:
@@ -47,6 +48,14 @@ def drop_unmeasured(recording: Recording) -> tuple[Recording, UnmeasuredRows]:
     if between.any():
         recording = replace(recording, gnss=pick_fixes(gnss, ~between))
     return recording, UnmeasuredRows(copies, int(between.sum()))
+
+
+def drop_in_gaps(recording: Recording, gaps: Array, before: UnmeasuredRows) -> tuple[Recording, UnmeasuredRows]:
+    """A recording without the fixes in gaps (g, 2) of the IMU, s, and all rows that are dropped."""
+    gnss = recording.gnss
+    assert gnss is not None
+    filled = np.any((gnss.t[:, None] >= gaps[:, 0]) & (gnss.t[:, None] <= gaps[:, 1]), axis=1)
+    return replace(recording, gnss=pick_fixes(gnss, ~filled)), replace(before, filled=int(filled.sum()))
 
 
 def _drop_copies(recording: Recording) -> tuple[Recording, tuple[ExcludedSpan, ...]]:
@@ -81,6 +90,12 @@ def describe_unmeasured(rows: UnmeasuredRows, recording: Recording) -> tuple[str
             "and after: interpolated and not measured, so not used"
         )
         notes.append(Note("gnss.interpolated", sentence))
+    if rows.filled and gnss is not None:
+        sentence = (
+            f"gnss: {format_count(rows.filled, 'fix', 'fixes')} in gaps of the IMU lie on the line from end to end of "
+            "a gap and not on the path: interpolated by the logger, so not used"
+        )
+        notes.append(Note("gnss.filled", sentence))
     return tuple(notes)
 
 
