@@ -6,6 +6,7 @@ import os
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -110,8 +111,11 @@ def write_comparison_files(outcome: Outcome, folder: Path, pages: bool = True) -
     detectors = None
     if pages:
         from graphnav.report import documents as report
+        from graphnav.report.page import read_library
 
         detectors = report.draw_detectors(outcome.recording, next(iter(outcome.solutions.values())))
+        with suppress(ConfigError):  # each page says what is missing
+            read_library()  # once, before there are two processes
     first, *others = select_own(outcome.solutions)
 
     def write(names: Sequence[str]) -> dict[Path, str]:

@@ -22,6 +22,7 @@ from graphnav.constraints.antenna_motion import LEVER_ARM
 from graphnav.constraints.base import SAME_TIME
 from graphnav.core.errors import ConfigError, EstimationError, RecordingError
 from graphnav.core.findings import Finding
+from graphnav.core.memory import return_memory
 from graphnav.core.notes import Note, format_count, get_key
 from graphnav.core.progress import Progress, send_progress, tell
 from graphnav.estimation.names import name_rows
@@ -211,6 +212,9 @@ def _solve_request(request: Request, progress: Progress | None) -> Outcome:
                 raise
             metrics, against, names = {}, None, ()
             findings.append(Note(error.key, f"not compared with the truth: {error}"))
+    in_parts = any(len(one.between) > 1 for one in select_own(solutions).values())
+    if in_parts:
+        return_memory()
     for name, compared in metrics.items():
         for note in compared.notes:
             shared = all(note in other.notes for other in metrics.values())
@@ -227,6 +231,8 @@ def _solve_request(request: Request, progress: Progress | None) -> Outcome:
         checks = (*arms, *checks)
         findings = [*(f.sentence for f in checks), *findings]
     densities = _find_densities(used, request.settings, solutions)
+    if in_parts:
+        return_memory()
     return Outcome(
         request, recording, zero, solutions, metrics, against, names, tuple(dict.fromkeys(findings)),
         tuple(f.sentence for f in checks if f.severity != "note"), timings | seconds, checks, densities,

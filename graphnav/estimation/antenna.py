@@ -221,7 +221,10 @@ def _find_turning(recording: Recording) -> Recording:
     assert gnss is not None
     if recording.duration <= _PART:
         return recording
-    turned = np.concatenate([[0.0], np.cumsum(np.linalg.norm(imu.gyro[1:], axis=1) * np.diff(imu.t))])
+    turned = np.zeros(len(imu.t))  # in place: a day's gyro by itself is half a gigabyte
+    np.sqrt(np.einsum("ij,ij->i", imu.gyro[1:], imu.gyro[1:], out=turned[1:]), out=turned[1:])
+    turned[1:] *= np.diff(imu.t)
+    np.cumsum(turned, out=turned)
     starts = np.arange(recording.start, recording.end - _PART, 0.1 * _PART)
     way = np.interp(starts + _PART, imu.t, turned) - np.interp(starts, imu.t, turned)
     fixes = np.searchsorted(gnss.t, starts + _PART) - np.searchsorted(gnss.t, starts)

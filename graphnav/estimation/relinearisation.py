@@ -9,7 +9,6 @@ from dataclasses import replace
 import numpy as np
 
 from graphnav.core.progress import Progress
-from graphnav.core.state import States
 from graphnav.estimation.alignment import Alignment
 from graphnav.estimation.noise.initial_points import BREAKDOWN
 from graphnav.estimation.problem import Problem
@@ -20,9 +19,11 @@ from graphnav.estimation.solvers.passes import (
     FilterPass,
     SmootherPass,
     are_near,
+    reuse_points,
     subtract_points,
     take_solution_points,
 )
+from graphnav.estimation.solvers.rows import compute_cost_at
 from graphnav.estimation.solvers.rts import smooth_backward, smooth_points
 
 _LINEAR = 0.5  # sigmas of what a step still moves: a mean square of errors over sigmas is a quarter larger
@@ -57,7 +58,7 @@ def relinearise(
         smoothed = smooth_backward(problem, refilter(problem, ahead, progress), progress)
         passes.update(filter=1, smoother=1)
     with contextlib.suppress(*BREAKDOWN):
-        return _linearise_at_batch(problem, aligned, smoothed, smoothed.states, progress, passes)
+        return _linearise_at(problem, aligned, _solve_batch(problem, smoothed), progress, passes)
     return forward, smoothed, None
 
 
@@ -74,41 +75,55 @@ def _linearise_far(
     those of a batch solution.
 
     If the heading is uncertain and fixes weigh little beside wheels, a filter may turn the mounting by half a turn
-    instead of the velocity, a local minimum. So the batch is then solved at once, without wheels first.
+    instead of the velocity, a local minimum. So the minimum is then sought at once, from that without wheels.
     """
-    wheels = aligned.motion is not None and any(c.of_wheels for c in problem.constraints)
-    about = smoothed
-    for _ in range(0 if wheels else _SMOOTHINGS):
+    if aligned.motion is not None and any(c.of_wheels for c in problem.constraints):
+        start: Points = smoothed
+        free = replace(problem, constraints=tuple(c for c in problem.constraints if not c.of_wheels))
+        with contextlib.suppress(*BREAKDOWN):
+            first = smooth_backward(free, ekf(free, progress, aligned.until))
+            start = reuse_points(_minimise(free, first, passes), free, problem)
+        passes.update(filter=1, smoother=1)
+        return _linearise_at(problem, aligned, _minimise(problem, start, passes), progress, passes)
+    for _ in range(_SMOOTHINGS):
+        about = smoothed
         passes.update(filter=1, smoother=1)
         smoothed = smooth_backward(problem, refilter(problem, about, progress), progress)
         if are_near(smoothed, about, LINEAR_ATTITUDE):
             passes.update(filter=1)
             return ekf(problem, progress, aligned.until, known=smoothed), smoothed, None
-        about = smoothed
-    states = smoothed.states
-    if wheels:
-        from graphnav.estimation.factor_graph.batch import batch  # imports GTSAM, which few filter runs need
-
-        free = replace(problem, constraints=tuple(c for c in problem.constraints if not c.of_wheels))
-        with contextlib.suppress(*BREAKDOWN):
-            states = smooth_backward(free, ekf(free, progress, aligned.until)).states
-            states = batch(free, states, wanted=(), reintegrate=False).states
-        passes.update(filter=1, smoother=1)
-    return _linearise_at_batch(problem, aligned, smoothed, states, progress, passes)
+    return _linearise_at(problem, aligned, _solve_batch(problem, smoothed), progress, passes)
 
 
-def _linearise_at_batch(
-    problem: Problem,
-    aligned: Alignment,
-    smoothed: SmootherPass,
-    states: States,
-    progress: Progress | None,
-    passes: Counter[str],
+def _minimise(problem: Problem, start: Points, passes: Counter[str]) -> Points:
+    """The points of least cost, by steps of filter and smoother while they lower it, a fraction of the time of a batch
+    solution; of that from the start where a step raises the cost.
+    """
+    points, cost = start, compute_cost_at(problem, start)
+    with contextlib.suppress(*BREAKDOWN):
+        for _ in range(problem.settings.solver.max_iterations):
+            ahead, before = smooth_points(refilter(problem, points, whole=False)), cost
+            passes.update(filter=1, smoother=1)
+            cost = compute_cost_at(problem, ahead)
+            if abs(before - cost) < problem.settings.solver.tolerance:
+                return ahead
+            if not cost < before:
+                break
+            points = ahead
+    return _solve_batch(problem, start)
+
+
+def _solve_batch(problem: Problem, start: Points) -> Points:
+    """The points of the batch solution that is found from some states."""
+    from graphnav.estimation.factor_graph.batch import batch  # imports GTSAM, which few filter runs need
+
+    return take_solution_points(problem, batch(problem, start.states, wanted=(), reintegrate=False), start)
+
+
+def _linearise_at(
+    problem: Problem, aligned: Alignment, found: Points, progress: Progress | None, passes: Counter[str]
 ) -> tuple[FilterPass, SmootherPass, Points]:
-    """Filter and smooth about the batch solution that is found from some states, and its points."""
-    from graphnav.estimation.factor_graph.batch import batch
-
-    found = take_solution_points(problem, batch(problem, states, wanted=(), reintegrate=False), smoothed)
+    """Filter and smooth about points, and these."""
     smoothed = smooth_backward(problem, refilter(problem, found, progress), progress)
     passes.update(filter=2, smoother=1)
     return ekf(problem, progress, aligned.until, known=smoothed), smoothed, found

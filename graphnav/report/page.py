@@ -125,7 +125,7 @@ def make_page(
     drawn = any("<figure" in part for _, parts in sections for part in parts)
     return _TEMPLATES.get_template("page.html").render(
         title=title, lead=lead, sections=sections, clocks=clocks, time=TIME_NAME,
-        library=_read_library() if drawn else None,
+        library=read_library() if drawn else None,
         style=Markup(format_css(others) + _read_asset("page.css")), script=Markup(_read_asset("page.js")),
     )  # fmt: skip
 
@@ -143,7 +143,14 @@ class Packed:
 
 
 @lru_cache(maxsize=1)
-def _read_library() -> Packed:
+def read_library() -> Packed:
+    """Plotly's script, compressed once in a process.
+
+    Raises
+    ------
+    ConfigError
+        If plotly is not installed.
+    """
     found = importlib.util.find_spec("plotly")
     if found is None or found.origin is None:
         raise ConfigError(

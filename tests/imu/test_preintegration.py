@@ -246,6 +246,13 @@ def test_a_gap_gets_rows_at_the_sensors_rate() -> None:
         np.testing.assert_array_equal((getattr(bridged, f"extra_{name}") > 0.0).all(axis=1), ~there)
 
 
+def test_of_gaps_only_those_behind_the_beginning_are_filled_each_time() -> None:
+    cut = gap_in(gap_in(random_imu(np.random.default_rng(9), 10.0, 100.0), 2.0, 2.5), 6.0, 6.5)
+    for begin, first in ((-np.inf, 0), (4.0, 1), (-np.inf, 0), (8.0, 2)):
+        bridged = bridge_gaps(cut, begin).bridged
+        np.testing.assert_allclose(bridged, [[2.0, 2.5], [6.0, 6.5]][first:] or np.empty((0, 2)), atol=1e-9)
+
+
 def test_an_axis_that_never_changes_goes_on_as_it_is() -> None:
     imu = random_imu(np.random.default_rng(9), 10.0, 100.0)
     imu.gyro[:, 1], imu.accel[:, 2] = 0.25, 9.8
