@@ -58,6 +58,8 @@ DRIVE, _ = oracle.drive(
         ("t_s,lat,lat_std,lon,alt,std_alt,ve,vn,vu,sd_v,speedAccuracy", "gnss",
          {"lat": "lat", "h": "alt", "sd_u": "sd_v", "sd_ve": "speedAccuracy"}),
         ("t_s,lat,lon,h,sd_e,sd_n,sd_u,ve,vn,vu,sd_v,hdop", "gnss", {"sd_u": "sd_u", "sd_vn": "sd_v", "speed": None}),
+        ("week,sow,lat,lon,h,vn,ve,vd,std_n,std_e,std_d,std_vn,std_ve,std_vd", "gnss",
+         {"sd_u": "std_d", "sd_vu": "std_vd"}),
         ("time,temperature,pressure", "barometer", {"t": "time", "pressure": "pressure"}),
         ("time,temperature,humidity", None, {"t": "time"}),
     ],

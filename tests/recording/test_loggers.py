@@ -174,13 +174,14 @@ def test_a_course_in_radians_is_told_by_the_positions(plain, tmp_path):
 @pytest.mark.parametrize(
     ("names", "scales", "more"),
     [
-        ("lat,lon,alt,vel_n,vel_e,vel_d", (1e7, 1e7, 1e3, 1e2, 1e2, 1e2), ""),  # as MAVLink; its speeds are left alone
-        ("lat,lon,height,hAcc,vAcc,velN,velE,velD", (1e7, 1e7, *[1e3] * 6), ""),  # as u-blox
+        ("lat,lon,alt,vel_n,vel_e,vel_d", (1e7, 1e7, 1e3, 1e2, 1e2, 1e2), "v"),  # as MAVLink
+        ("lat,lon,height,hAcc,vAcc,velN,velE,velD", (1e7, 1e7, *[1e3] * 6), "v"),  # as u-blox
+        ("lat,lon,alt,vel_n,vel_e,vel_d", (1e7, 1e7, 1e3, 1e5, 1e5, 1e5), ""),  # in no unit
         ("lat,lon,hMSL [mm],hacc_mm,vacc_mm,velN_mm_s,velE_mm_s,velD_mm_s", (1, 1, 1e3, *[1e3] * 5), "v"),
         ("lat,lon,alt,NedVelX,NedVelY,NedVelZ", (1,) * 6, "v"),
         ("lat,lon,alt,vx,heading", (1,) * 5, ""),  # of which axes is not said: no speed along the heading
     ],
-    ids=["whole degrees", "whole degrees and mm", "millimetres", "axes in the name", "axes unknown"],
+    ids=["whole degrees", "whole degrees and mm", "no unit", "millimetres", "axes in the name", "axes unknown"],
 )
 def test_units_and_axes_that_the_names_of_columns_state(plain, tmp_path, names, scales, more):
     imu, (_, rows) = plain
@@ -197,7 +198,8 @@ def test_units_and_axes_that_the_names_of_columns_state(plain, tmp_path, names, 
     assert gnss.llh[:, :2] == pytest.approx(np.radians(place[:2]).T, abs=2e-9)
     assert (gnss.v is not None) == (more == "v")
     if more:
-        assert gnss.v == pytest.approx(np.column_stack([east, north, moves[:, 2]]), abs=1e-4)
+        rounded = 0.51 / scales[-1] if digits == 0 else 1e-4
+        assert gnss.v == pytest.approx(np.column_stack([east, north, moves[:, 2]]), abs=rounded)
     if "acc" in names.lower():
         assert gnss.sd == pytest.approx(np.full((len(t), 3), 0.03))
 

@@ -16,7 +16,12 @@ from graphnav.recording import Gnss, Imu, Odometer
 from graphnav.recording.draft import columns as matching
 from graphnav.recording.draft import guesses
 from graphnav.recording.draft.clocks import read_clock_seconds, read_serial_days
-from graphnav.recording.draft.conversion import convert_small_units, convert_variances, convert_whole_degrees
+from graphnav.recording.draft.conversion import (
+    convert_small_units,
+    convert_variances,
+    convert_whole_degrees,
+    convert_whole_velocities,
+)
 from graphnav.recording.draft.guesses import Guess
 from graphnav.recording.draft.motion import is_course_in_radians
 from graphnav.recording.draft.plain import Plain, add_words, read_plain
@@ -313,6 +318,7 @@ def _read_sensor(
     whole = np.asarray(np.isfinite(table.stack(*needed)).all(-1))
     if role == "gnss":
         table, known = blank_unknown(table)  # as it will be read
+        before = table
         whole &= known
         fixed = (table["lat"] != 0.0) | (table["lon"] != 0.0)
         if whole.any() and not (whole & fixed).any():
@@ -321,6 +327,7 @@ def _read_sensor(
                 key="draft.no_fix",
             )
         table, plain = convert_whole_degrees(table, names, plain)
+        counted = table is not before
         table, plain = convert_variances(table, names, plain)
         whole[whole] = find_places(table["lat"][whole], table["lon"][whole], ANGLE["deg"])  # as it will be read
         check_angles(table.take(whole), ANGLE["deg"], "GNSS")
@@ -356,6 +363,8 @@ def _read_sensor(
             values["course"] = np.degrees(values["course"])
             words = f"'{names['course']}' is in rad, by the positions; made deg"
             plain = add_words(plain, words)
+        if counted:
+            plain = convert_whole_velocities(names, values, values["t"] * TIME_UNITS[str(unit.value)], plain)
     columns, names, plain = convert_small_units(columns, names, values, plain)
     step = np.diff(values["t"])
     if step.sum() > _PAUSES * len(step) * np.median(step):
