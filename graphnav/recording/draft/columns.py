@@ -67,7 +67,8 @@ _PATTERNS: dict[str, tuple[str, ...]] = {
     "speed": (
         r"speed", r"(?:wheel|vehicle|odo(?:meter)?|ground|gps|gnss|can|car)_?(?:speed|velocity)",
         r"speed_over_ground|sog|g_?speed",
-        r"(?:.*_)?(?:speed|velocity|v_?x|twist_linear_x|linear_x|v)", r"geschwindigkeit",
+        r"(?:.*_)?(?:speed|velocity|v_?x|twist_linear_x|linear_x|v)",
+        r"geschwindigkeit|tacho(?:meter)?|vitesse|velocidad",
     ),
     "speed_fl": (rf"{_WHEEL}(?:fl|front_left|left_front){_SPEED}",),
     "speed_fr": (rf"{_WHEEL}(?:fr|front_right|right_front){_SPEED}",),

@@ -8,7 +8,7 @@ from graphnav.core.rotation import Array
 from graphnav.recording.draft import columns as matching
 from graphnav.recording.draft import guesses, motion
 from graphnav.recording.draft.plain import Plain, add_words
-from graphnav.recording.formats.places import is_in_whole_degrees
+from graphnav.recording.formats.places import is_in_degrees_and_minutes, is_in_whole_degrees
 from graphnav.recording.formats.table import Table
 
 _SMALL_UNITS = {"mm": 1e-3, "cm": 1e-2, "mm/s": 1e-3, "cm/s": 1e-2}  # m, m/s
@@ -71,6 +71,22 @@ def convert_whole_degrees(table: Table, names: dict[str, str], plain: Plain | No
         names.pop("geoid", None)  # whose unit is another or not known
         words += f", {', '.join(dict.fromkeys(repr(names[ours]) for ours in lengths))} in mm, made m"
     for ours in ("lat", "lon", *lengths):
+        names[ours] = ours
+    return table, add_words(plain, words)
+
+
+def convert_minutes(table: Table, names: dict[str, str], plain: Plain | None) -> tuple[Table, Plain | None]:
+    """Places as receivers' sentences have them, degrees and minutes together, in deg.
+
+    They are no degrees, as latitudes are beyond 90. `names` are changed.
+    """
+    at = [table[ours][np.isfinite(table[ours])] for ours in ("lat", "lon")]
+    if not (all(map(len, at)) and np.abs(at[0]).max() > 90.0 and is_in_degrees_and_minutes(*at)):
+        return table, plain
+    words = f"'{names['lat']}', '{names['lon']}' are degrees and minutes together, made deg"
+    for ours in ("lat", "lon"):
+        whole, minutes = np.divmod(np.abs(table[ours]), 100.0)
+        table = table.with_column(ours, np.sign(table[ours]) * (whole + minutes / 60.0))
         names[ours] = ours
     return table, add_words(plain, words)
 
