@@ -203,6 +203,8 @@ def _list_logs(path: Path) -> list[Path]:
     ]
     if not logs:
         there = f" ({others})" if (others := _name_others([path], [])) else ""
+        if deeper := sorted(p.name for p in inside if p.is_dir()):
+            there += f"; folders in it are not looked into: name {', '.join(deeper[:5])} itself"
         raise RecordingError(
             f"{path}: no log in this folder: no CSV file, and none of a kind that is known{there}", key="draft.no_log"
         )
