@@ -13,6 +13,7 @@ from graphnav.core.rotation import Array
 
 Severity = Literal["note", "warning", "unreliable", "refused"]
 SEVERITIES: tuple[Severity, ...] = ("refused", "unreliable", "warning", "note")  # the most severe first
+_GAP = 1.5  # sample periods between rows of an IMU above which some are lost
 
 
 @dataclass(frozen=True)
@@ -47,6 +48,11 @@ def compute_period(t: Array) -> float:
     half = len(steps) // 2
     steps.partition((max(half - 1, 0), half))  # np.median's own checks would double the time
     return float(steps[half] if len(steps) % 2 else 0.5 * (steps[half - 1] + steps[half]))
+
+
+def find_gap_limit(t: Array) -> float:
+    """The step between stamps (N,) of an IMU above which rows are lost, and are filled in for a solution, s."""
+    return _GAP * compute_period(t)
 
 
 def find_runs(mask: NDArray[Any]) -> list[tuple[int, int]]:

@@ -8,12 +8,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from graphnav.core.findings import compute_period
+from graphnav.core.findings import compute_period, find_gap_limit
 from graphnav.core.rotation import Array
 from graphnav.imu.bridging import fill_gaps
 from graphnav.recording import Imu
 
-GAP = 1.5  # sample periods between rows above which there is a gap
 MANY = 64  # pieces above which an interval is processed apart from shorter ones
 _PIECES_AT_ONCE = 40_000  # pieces processed at once: keeps the working arrays in the processor's cache
 # the last result with gaps, as long as its IMU lives: an alignment and the problem after it ask for the same
@@ -52,7 +51,7 @@ def bridge_gaps(imu: Imu, begin: float = -np.inf) -> Samples:
     """
     dt = imu.t[1:] - imu.t[:-1]
     period = compute_period(imu.t)
-    every = np.flatnonzero(dt > GAP * period)
+    every = np.flatnonzero(dt > find_gap_limit(imu.t))
     gap = every[imu.t[every + 1] >= begin]
     zero = np.broadcast_to(np.zeros(3), (len(imu.t), 3))
     if not len(gap):

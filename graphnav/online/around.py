@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from graphnav.core.findings import compute_period
+from graphnav.core.findings import find_gap_limit
 from graphnav.core.rotation import Array
-from graphnav.imu.samples import GAP
 from graphnav.online.looks import CONTEXT
 from graphnav.online.sensors import Sensors
 from graphnav.recording import Recording
@@ -20,7 +19,7 @@ def cut_around(sensors: Sensors, begin: float, end: float) -> Recording:
     """
     near = sensors.make_recording(begin - ROWS_BEFORE, end)
     t = near.imu.t
-    whole = len(t) > 2 and float((t[1:] - t[:-1]).max()) < GAP * compute_period(t)
+    whole = len(t) > 2 and float((t[1:] - t[:-1]).max()) < find_gap_limit(t)
     return near if whole else sensors.make_recording(begin - CONTEXT, end)
 
 

@@ -12,7 +12,7 @@ from markupsafe import Markup
 
 from graphnav.core.notes import Note, get_key
 from graphnav.core.timescales import GPS_TO_UNIX, gps_to_utc
-from graphnav.estimation.names import has_names
+from graphnav.estimation.names import has_names, name_rows
 from graphnav.estimation.solution import Solution
 from graphnav.recording import Recording
 from graphnav.report import page
@@ -195,7 +195,11 @@ def write_comparison(
     if not gone:
         zooms = pictures.zoom_pictures(every, start, outages, "no GNSS")
     rows = [
-        [kind, page.format_solver(name), *tables.tabulate_record(tables.summarise_record(solution.records[kind]))]
+        [
+            name_rows(kind),
+            page.format_solver(name),
+            *tables.tabulate_record(tables.summarise_record(solution.records[kind])),
+        ]
         for kind in dict.fromkeys(kind for s in solutions.values() for kind in s.records)
         for name, solution in solutions.items()
         if kind in solution.records

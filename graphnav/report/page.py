@@ -47,7 +47,7 @@ def format_solver(name: str) -> Markup:
 
 
 def make_table(head: Sequence[Any], rows: Iterable[Sequence[Any]], best: Sequence[int] = ()) -> Markup:
-    """A table, text left and numbers right; in the columns `best` the smallest number is bold.
+    """A table, text left and numbers right; in the columns `best` what is the smallest number as displayed is bold.
 
     A column without any number is omitted.
     """
@@ -60,7 +60,10 @@ def make_table(head: Sequence[Any], rows: Iterable[Sequence[Any]], best: Sequenc
     }
 
     def choose_class(k: int, value: Any) -> str:
-        return "best" if k in least and value == least[k] else _choose_class(value) if k else ""
+        is_least = (
+            least.get(k) is not None and isinstance(value, float) and format_value(value) == format_value(least[k])
+        )
+        return "best" if is_least else _choose_class(value) if k else ""
 
     return _PARTS.table(
         [(head[k], max((_choose_class(row[k]) for row in rows), default="", key=len) if k else "") for k in columns],

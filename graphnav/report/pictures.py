@@ -183,7 +183,7 @@ def draw_motion(recording: Recording, solutions: Mapping[str, Solution], spans: 
     ):
         if series:
             figure = plots.plot_bands(series, parts, unit, end, spans=spans, about_zero=False, under=under)
-            note = ""
+            note = "The fixes are of the antenna." if title == "Position" and fixes is not None else ""
             if title == "Attitude" and any(np.nanmax(s.value[:, 2], initial=0.0) > 360.0 for s in series.values()):
                 note = "The heading is continued beyond 360 deg."
             out.append(page.place_picture(figure, f"{title} and 3 sigma" if len(series) < 3 else title, note))
@@ -314,7 +314,7 @@ def record_pictures(solution: Solution, start: float, end: float, spans: Shades)
 
 def draw_timeline(solution: Solution, recording: Recording, spans: Shades) -> list[Markup]:
     """Times at which each constraint was used."""
-    records = {kind: record for kind, record in solution.records.items() if len(record.t)}
+    records = {name_rows(kind): record for kind, record in solution.records.items() if len(record.t)}
     if not records:
         return []
     figure = plots.plot_timeline(records, recording.start, recording.duration, solution.solver, spans=spans)

@@ -91,7 +91,7 @@ def _judge_by_records(solution: Solution) -> dict[str, tuple[str, str]]:
                 continue
             bad = c.mean_nis / c.dof > (1.5 if c.kind == "innovation" else 1.3)
             mark = "bad" if bad else "good" if c.kind == "innovation" else ""
-            out[block] = mark, f"no truth; {kind}: {c.verdict}"
+            out[block] = mark, f"no truth; {name_rows(kind)}: {c.verdict}"
             break
     return out
 
@@ -142,7 +142,7 @@ def tabulate_fixes(recording: Recording, solution: Solution, withheld: Removed) 
         used = np.flatnonzero(of_it & ~gone & ~fixes.excluded & (at >= 0))
         cells: list[Any] = [
             kind,
-            *(int(np.count_nonzero(of_it & mask)) for mask in (~gone, gone, fixes.excluded & ~gone)),
+            *(int(np.count_nonzero(of_it & mask)) for mask in (of_it, gone, fixes.excluded & ~gone)),
         ]
         largest, over, gap = nan, nan, nan
         if record is not None and len(used):
@@ -171,7 +171,7 @@ def tabulate_fixes(recording: Recording, solution: Solution, withheld: Removed) 
             "soft",
         )
     )
-    if any(row[4] < row[1] - row[3] for row in rows):
+    if any(row[4] < row[1] - row[2] - row[3] for row in rows):
         out.append(page.paragraph("Of fixes that come more often than noise.spacing, the best one is used.", "soft"))
     return out
 
@@ -216,12 +216,18 @@ def _find_rows(t: Array, of: Array | None) -> np.ndarray:
     return np.where(np.abs(of[k] - t) <= 1e-3, k, -1)
 
 
+def _format_span(begin: float, end: float) -> str:
+    """When a span is, as displayed, s."""
+    first, last = f"{begin:.1f}", f"{end:.1f}"
+    return f"at {first}" if first == last else f"from {first} to {last}"
+
+
 def describe_excluded(solution: Solution, start: float) -> list[Markup]:
     """What was excluded and why, in three lines: the largest spans, the rest together, what was down-weighted."""
     spans = sorted(solution.excluded, key=lambda p: -p.count)
     some = spans[:_MAX_LINES] if len(spans) <= _MAX_LINES else spans[: _MAX_LINES - 1]
     lines = [
-        f"{name_rows(p.kind)}, {format_count(p.count, 'row')} from {p.t_start - start:.1f} to {p.t_end - start:.1f} s: "
+        f"{name_rows(p.kind)}, {format_count(p.count, 'row')} {_format_span(p.t_start - start, p.t_end - start)} s: "
         f"{p.reason or 'faulty'}"
         for p in some
     ]

@@ -34,7 +34,7 @@ Removed = Sequence[tuple[str, tuple[float, float] | None]]
 def tabulate_constraints(solution: Solution) -> list[Markup]:
     """Counts of everything used, and the consistency of each record."""
     out = []
-    rows = [[kind, *tabulate_record(summarise_record(record))] for kind, record in solution.records.items()]
+    rows = [[name_rows(kind), *tabulate_record(summarise_record(record))] for kind, record in solution.records.items()]
     if rows:
         out.append(page.make_table(["constraint", *CONSISTENCY_HEAD], rows))
         kinds = {r.kind for r in solution.records.values()}
@@ -45,7 +45,7 @@ def tabulate_constraints(solution: Solution) -> list[Markup]:
             note += "A fit takes up part of the noise: the mean NIS of its residuals lies below the components."
         out.append(page.paragraph(note, "soft"))
     if solution.counts:
-        counted = join_words([f"{count} {kind}" for kind, count in solution.counts.items()])
+        counted = join_words([f"{count} {name_rows(kind)}" for kind, count in solution.counts.items()])
         out.append(page.paragraph(f"Factors or updates by kind: {counted}.", "soft"))
     return out
 
@@ -217,7 +217,9 @@ def tabulate_rejected(solution: Solution, start: float) -> list[Markup]:
         for k in np.flatnonzero(r.weight <= 1e-9):
             worst = int(np.argmax(white[k]))
             size = f"{r.residual[k, worst]:+.3g} {r.unit}, {r.axes[worst]}"
-            rows.append((float(r.t[k]), [Quantity(f"{r.t[k] - start:.2f} s"), kind, size, float(white[k, worst])]))
+            rows.append(
+                (float(r.t[k]), [Quantity(f"{r.t[k] - start:.2f} s"), name_rows(kind), size, float(white[k, worst])])
+            )
     if not rows:
         return []
     largest = sorted(rows, key=lambda row: -row[1][3])[:_MAX_ROWS]

@@ -40,8 +40,8 @@ def format_to_sigma(value: float, sigma: float) -> Quantity:
     """A value with as many decimals as its sigma justifies."""
     if not (math.isfinite(value) and math.isfinite(sigma)) or sigma <= 0:
         return Quantity(format_number(value))
-    places = 1 - math.floor(math.log10(sigma))
-    return Quantity(f"{value:.{max(places, 0)}f}" if places <= 8 else f"{value:.4g}")
+    places = max(1 - math.floor(math.log10(sigma)), 0)
+    return Quantity(f"{round(value, places) + 0.0:.{places}f}" if places <= 8 else f"{value:.4g}")  # without -0
 
 
 def join_words(parts: Sequence[str]) -> str:

@@ -15,6 +15,7 @@ from helpers import refuse_command, refused
 from graphnav.app import cli
 from graphnav.core.errors import RecordingError
 from graphnav.core.rotation import exp
+from graphnav.recording.checks.overview import inspect
 from graphnav.recording.draft import columns, draft, guesses, motion
 from graphnav.recording.draft.agreement import find_level_axes
 from graphnav.recording.formats import read
@@ -58,6 +59,10 @@ DRIVE, _ = oracle.drive(
         ("t_s,lat,lat_std,lon,alt,std_alt,ve,vn,vu,sd_v,speedAccuracy", "gnss",
          {"lat": "lat", "h": "alt", "sd_u": "sd_v", "sd_ve": "speedAccuracy"}),
         ("t_s,lat,lon,h,sd_e,sd_n,sd_u,ve,vn,vu,sd_v,hdop", "gnss", {"sd_u": "sd_u", "sd_vn": "sd_v", "speed": None}),
+        ("week,sow,lat,lon,h,vn,ve,vd,std_n,std_e,std_d,std_vn,std_ve,std_vd", "gnss",
+         {"sd_u": "std_d", "sd_vu": "std_vd"}),
+        ("Zeit [s],Tacho (km/h)", "odometer", {"speed": "Tacho (km/h)"}),
+        ("Zeit,Breitengrad,Längengrad,Höhe,Geschwindigkeit (km/h),Richtung", "gnss", {"course": "Richtung"}),
         ("time,temperature,pressure", "barometer", {"t": "time", "pressure": "pressure"}),
         ("time,temperature,humidity", None, {"t": "time"}),
     ],
@@ -198,6 +203,13 @@ def test_axes_are_found_in_any_mount(tmp_path, letters):
     assert recording.imu.gyro == pytest.approx(DRIVE.imu.gyro, abs=1e-7)
     assert recording.gnss.v == pytest.approx(DRIVE.gnss.v, abs=1e-9)  # the file's is down
     assert "time_offset" not in found.text
+
+
+def test_forces_that_point_down_leave_the_axes_to_be_found_but_for_their_sign(tmp_path):
+    """So that what refuses them then names the one key that mends all."""
+    found, recording = drafted(tmp_path, write_logs(tmp_path, "RFU", accel=-1.0))
+    assert 'axes = "RBD"' in found.text
+    assert [f.key for f in inspect(recording).findings if f.severity == "refused"] == ["gnss.mirrored"]
 
 
 def test_a_named_file_that_is_no_table_is_not_left_out_of_a_drive(tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from dataclasses import replace
 
@@ -235,6 +236,20 @@ def test_broken_nmea_lines_are_skipped_and_named(tmp_path):
     path.write_text("".join(line.replace("*", "*0") for line in lines))
     with refused("log.no_positions", RecordingError, "a.nmea, line 1", "GGA"):
         load(path)
+
+
+def test_nmea_without_any_checksum_is_read_as_that_with_them(tmp_path):
+    path = logs.write_nmea(tmp_path / "a.nmea", RECORDING)
+    log, text = load(path), path.read_text()
+    path.write_text(re.sub(r"\*..\n", "\r\n", text)[:-30])  # the last sentence, an RMC, is cut off
+    bare = load(path)
+    assert np.array_equal(bare.gnss.t, log.gnss.t)
+    assert np.array_equal(bare.gnss.llh, log.gnss.llh)
+    assert np.array_equal(bare.gnss.v[:-1], log.gnss.v[:-1])
+    assert np.isnan(bare.gnss.v[-1]).all()
+    assert_told(bare.remarks, "log.no_checksums")
+    path.write_text(text.replace("*", "", 1))  # one of many is missing: damage
+    assert len(load(path).gnss.t) == len(log.gnss.t) - 1
 
 
 @pytest.mark.parametrize(

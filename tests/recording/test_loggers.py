@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import json
+import re
 from datetime import UTC, datetime
 from functools import reduce
 from operator import xor
@@ -43,13 +44,16 @@ def write_dms(angle: float, sides: str) -> str:
     return f"{whole:.0f}°{minutes:02.0f}'{seconds:.6f}\"{sides[angle < 0.0]}"
 
 
-@pytest.mark.parametrize("form", ["letter", "degrees", "column"])
+@pytest.mark.parametrize("form", ["letter", "degrees", "column", "minutes"])
 def test_hemispheres_and_minutes_are_read_as_signs_and_degrees(plain, tmp_path, form):
     """South and west: whoever drops these is on the other side of the Earth."""
     imu, (header, rows) = plain
     imu = imu[0], [[t, *w[:2], f"{-float(w[2])}", *f] for t, *w, f1, f2, f3 in imu[1] for f in [(f1, f2, f3)]]
     south = [[t, f"-{lat}", lon, h] for t, lat, lon, h in rows]  # mirrored once, so turns are, too
-    if form == "column":
+    if form == "minutes":
+        joined = [[t, *(f"{float(x) // 1 * 100 + float(x) % 1 * 60:.8f}" for x in place), h] for t, *place, h in rows]
+        shown = "t,lat,ns,lon,ew,h", [[t, lat, "S", lon, "E", h] for t, lat, lon, h in joined]
+    elif form == "column":
         shown = "t,lat,N/S,lon,E/W,h", [[t, lat, "S", lon, "E", h] for t, lat, lon, h in rows]
     elif form == "letter":
         shown = header, [[t, f"{lat}S", f"{lon}E", h] for t, lat, lon, h in rows]
@@ -174,13 +178,14 @@ def test_a_course_in_radians_is_told_by_the_positions(plain, tmp_path):
 @pytest.mark.parametrize(
     ("names", "scales", "more"),
     [
-        ("lat,lon,alt,vel_n,vel_e,vel_d", (1e7, 1e7, 1e3, 1e2, 1e2, 1e2), ""),  # as MAVLink; its speeds are left alone
-        ("lat,lon,height,hAcc,vAcc,velN,velE,velD", (1e7, 1e7, *[1e3] * 6), ""),  # as u-blox
+        ("lat,lon,alt,vel_n,vel_e,vel_d", (1e7, 1e7, 1e3, 1e2, 1e2, 1e2), "v"),  # as MAVLink
+        ("lat,lon,height,hAcc,vAcc,velN,velE,velD", (1e7, 1e7, *[1e3] * 6), "v"),  # as u-blox
+        ("lat,lon,alt,vel_n,vel_e,vel_d", (1e7, 1e7, 1e3, 1e5, 1e5, 1e5), ""),  # in no unit
         ("lat,lon,hMSL [mm],hacc_mm,vacc_mm,velN_mm_s,velE_mm_s,velD_mm_s", (1, 1, 1e3, *[1e3] * 5), "v"),
         ("lat,lon,alt,NedVelX,NedVelY,NedVelZ", (1,) * 6, "v"),
         ("lat,lon,alt,vx,heading", (1,) * 5, ""),  # of which axes is not said: no speed along the heading
     ],
-    ids=["whole degrees", "whole degrees and mm", "millimetres", "axes in the name", "axes unknown"],
+    ids=["whole degrees", "whole degrees and mm", "no unit", "millimetres", "axes in the name", "axes unknown"],
 )
 def test_units_and_axes_that_the_names_of_columns_state(plain, tmp_path, names, scales, more):
     imu, (_, rows) = plain
@@ -197,7 +202,8 @@ def test_units_and_axes_that_the_names_of_columns_state(plain, tmp_path, names, 
     assert gnss.llh[:, :2] == pytest.approx(np.radians(place[:2]).T, abs=2e-9)
     assert (gnss.v is not None) == (more == "v")
     if more:
-        assert gnss.v == pytest.approx(np.column_stack([east, north, moves[:, 2]]), abs=1e-4)
+        rounded = 0.51 / scales[-1] if digits == 0 else 1e-4
+        assert gnss.v == pytest.approx(np.column_stack([east, north, moves[:, 2]]), abs=rounded)
     if "acc" in names.lower():
         assert gnss.sd == pytest.approx(np.full((len(t), 3), 0.03))
 
@@ -238,6 +244,18 @@ def test_more_names_of_an_imu_and_what_is_not_used_is_said(plain, tmp_path, caps
     assert unused.startswith("[imu] imu.csv: ")
     assert unused.endswith(" q0, mag")
     assert len(read(tmp_path).imu.t) == len(rows)
+
+
+def test_rows_that_a_written_file_lacks_are_counted(plain, tmp_path, capsys):
+    """Nobody tells later: what is written is whole."""
+    (header, rows), gnss = plain
+    some = [*rows[:9], rows[8], *rows[9:]]
+    some[20:22] = [[*row[:3], "NaN", *row[4:]] for row in some[20:22]]
+    stranger.write_tables(tmp_path, (header, some), gnss, mark=";")
+    assert cli.run(["init", str(tmp_path), "-o", str(tmp_path), "--json"]) == 0
+    (made,) = [x for x in json.loads(capsys.readouterr().out)["decisions"] if x.startswith("[imu] imu-imu.csv.gz")]
+    assert {f"2 of {len(rows) + 1} ", f"1 of {len(rows) - 1} "} <= set(re.findall(r"\d+ of \d+ ", made))
+    assert len(read(tmp_path).imu.t) == len(rows) - 2
 
 
 def test_the_speed_of_a_wheel_beside_fixes_is_an_odometer_and_makes_no_new_fixes(plain, tmp_path):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import json
+import os
 import re
 import zipfile
 from dataclasses import replace
@@ -228,6 +229,19 @@ def test_links_that_lead_nowhere_are_no_logs(tokyo, tmp_path):
     assert len(read(folder).imu.t) == len(tokyo[2].recording.imu.t)
 
 
+def test_folders_in_a_folder_are_named(tokyo, tmp_path, capsys):
+    """They are not looked into, where an export of a phone may have its parts."""
+    stranger.write_tables(tmp_path / "ride" / "part 1", *stranger.tables(tokyo[2]))
+    assert "part 1" in refuse_command(capsys, "draft.no_log", "init", tmp_path / "ride", "-o", tmp_path / "out")
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may read everything")
+def test_a_log_that_nobody_may_read_is_not_said_to_be_no_recording(tmp_path, capsys):
+    (tmp_path / "imu.csv").write_text("t,gx,gy,gz,ax,ay,az\n")
+    (tmp_path / "imu.csv").chmod(0)
+    refuse_command(capsys, "file.unreadable", "info", tmp_path / "imu.csv")
+
+
 def test_a_zip_is_to_be_unpacked(tmp_path, capsys):
     with zipfile.ZipFile(tmp_path / "ride.zip", "w") as archive:
         archive.writestr("imu.csv", "t,gx,gy,gz,ax,ay,az\n")
@@ -391,13 +405,15 @@ def test_stamps_that_are_no_times_and_files_that_are_not_read_are_named(tokyo, t
         ("2025-07-08 16:00:00.5", 1751990400.5),
         ("08.07.2025 16:00:00,25", 1751990400.25),
         ("2025/7/8 16:00:00", 1751990400.0),
+        ("08-Jul-2025 16:00:00.250", 1751990400.25),
+        ("20250708T160000.250Z", 1751990400.25),
     ],
 )
 def test_dates_are_unix_time(tmp_path, text, unix):
-    (tmp_path / "a.csv").write_text(f"time;x\n{text};1,5\n{text};2,5\n")
+    (tmp_path / "a.csv").write_text(f"time;x\n{text};1,5\n{text};2,5\n;3,5\n")
     found = read_plain(tmp_path / "a.csv")
-    assert found.columns["time"][0] == pytest.approx(unix, abs=1e-6)
-    assert found.columns["x"].tolist() == [1.5, 2.5]
+    assert found.columns["time"] == pytest.approx([unix, unix, np.nan], abs=1e-6, nan_ok=True)
+    assert found.columns["x"].tolist() == [1.5, 2.5, 3.5]
 
 
 def test_words_with_dates_do_not_stop_a_draft_and_what_is_no_table_is_named(tokyo, tmp_path, capsys):

@@ -58,6 +58,7 @@ from graphnav.report.tables import (
     tabulate_span,
     tabulate_stops,
 )
+from graphnav.report.wording import format_to_sigma
 
 START, COUNT = 1000.0, 600
 NAME = "drive <script>alert('x')</script> & \"co\""
@@ -224,7 +225,7 @@ def test_report_holds_what_it_was_given(tmp_path, recording):
     _, text = checked(write(tmp_path, recording, metrics={"h_rms_m": 0.8765}, errors=errors_of()))
     for words in (
         "539 GNSS fixes", "gnss 99.5 to 160.5 s", "all of odometer",
-        "101.23", "0.04", "599 gnss_position", "0.321", "1.821", "1237",
+        "101.23", "0.04", "599 GNSS positions", "0.321", "1.821", "1237",
         "the IMU clock drifts by 12 ppm", "3 rows < NaN were left out", "9.8.7", "deadbeef", "[gnss]",
         "robust_scale = 3.25", "0.8765", "an IMU at 10 Hz", "Spans without", "99.5 to 160.5 s",
     ):  # fmt: skip
@@ -305,7 +306,7 @@ def test_fixes_are_counted_and_coloured_by_type(tmp_path, recording):
     rows = {row[0]: row for row in cells(tabulate_fixes(typed, found, [("gnss", (200.5, 230.5))])[1])}
     # row 50 was rejected, and 30 are withheld; of a fix the distance from the antenna counts, whatever the residual
     assert [rows[k][1:5] for k in ("fixed", "float", "all")] == [
-        ["520", "30", "1", "519"], ["50", "0", "0", "50"], ["570", "30", "1", "569"],
+        ["550", "30", "1", "519"], ["50", "0", "0", "50"], ["600", "30", "1", "569"],
     ]  # fmt: skip
     assert float(rows["all"][5]) == 31.0
     used = np.delete(np.arange(COUNT), [50, *range(200, 230)])
@@ -564,6 +565,13 @@ def test_innovations_speak_for_all_solvers(tmp_path, recording):
     met, fitted = solution("ekf"), replace(solution("batch"), records={"gnss_position": record(kind="residual")})
     page, _ = checked(write_comparison(tmp_path / "c.html", recording, {"ekf": met, "batch": fitted}, settings={}))
     assert [key for key in page.keys if key.startswith("no_truth.")] == ["no_truth.consistent"]
+
+
+def test_numbers_that_are_displayed_alike_are_best_alike_and_none_is_minus_zero():
+    rows = [["ekf", 0.5], ["rts", 0.093512], ["batch", 0.093518]]
+    assert page.make_table(["solver", "a"], rows, best=[1]).count('class="best"') == 2
+    assert format_to_sigma(-0.2, 13.0) == "0"
+    assert format_to_sigma(-4058.2, 728.0) == "-4058"
 
 
 def test_a_column_without_any_number_is_left_out():

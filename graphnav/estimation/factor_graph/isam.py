@@ -43,7 +43,7 @@ class TreeSmoother:
     """
 
     def __init__(self, prior: Message, problem: Problem, lag: float) -> None:
-        self.tree, self.lag = Tree(prior, compute_turn_limit(problem.imu_noise)), lag
+        self.tree, self.lag = Tree(prior, compute_turn_limit(problem.imu_noise), whole=np.isinf(lag)), lag
         self.settled: list[SettledStates] = []
         self._problem = problem
         self._look = _SKIP  # the keyframe of the next relinearisation check

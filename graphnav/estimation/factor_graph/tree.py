@@ -75,10 +75,11 @@ class Tree:
     ----------
     prior : message on the first keyframe before any measurement.
     turn : rad that an attitude may move before its rows are linearised anew.
+    whole : whether keyframes are never marginalised.
     """
 
-    def __init__(self, prior: Message, turn: float) -> None:
-        self.isam = make_isam()
+    def __init__(self, prior: Message, turn: float, whole: bool = False) -> None:
+        self.isam = make_isam(reuses_slots=not whole)
         self.turn = turn
         self.keyframes: list[Keyframe] = []
         self.relinearised = 0  # keyframes

@@ -72,11 +72,18 @@ class Keyframe:
 Made = tuple[Keyframe, str, Any]  # a factor of a keyframe, by the name of its constraint
 
 
-def make_isam() -> gtsam.ISAM2:
+def make_isam(reuses_slots: bool = True) -> gtsam.ISAM2:
+    """An empty tree.
+
+    Parameters
+    ----------
+    reuses_slots : whether new factors take the places of removed ones in GTSAM's list, which each update looks through
+        for them: its length is then bounded where factors leave, and else costs more than all the rest of an update.
+    """
     parameters = gtsam.ISAM2Params()
     parameters.setFactorization("QR")
     parameters.enableRelinearization = False  # by GTSAM: it has a linear problem
-    parameters.findUnusedFactorSlots = True
+    parameters.findUnusedFactorSlots = reuses_slots
     parameters.setOptimizationParams(gtsam.ISAM2GaussNewtonParams(_WILDFIRE))
     return gtsam.ISAM2(parameters)
 

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
 from graphnav.core.earth import STANDARD_GRAVITY, gravity
-from graphnav.core.findings import Finding, compute_period, describe_gaps, find_runs
+from graphnav.core.findings import Finding, compute_period, describe_gaps, find_gap_limit, find_runs
 from graphnav.core.notes import format_count
 from graphnav.core.rotation import Array
 from graphnav.recording import Imu, Recording
 from graphnav.recording.checks.tracks import Track
 
 _LEAST_FOOT_RATE = 80.0  # Hz; the impact of a step lasts for 20 to 50 ms
+_LONG_GAP = 0.2  # s; over longer ones the motion changes
 _SHAKEN_OVER = 0.02  # s
 _CHANGED = 3.0  # m/s, of the speed: more than errors of velocities
 
@@ -22,9 +23,9 @@ _CHANGED = 3.0  # m/s, of the speed: more than errors of velocities
 def check_imu_time(imu: Imu) -> Iterator[Finding]:
     step, period = np.diff(imu.t), compute_period(imu.t)
     gaps = np.flatnonzero(step > find_gap_limit(imu.t))
-    if len(gaps):
-        severity: Literal["note", "warning"] = "warning" if step.max() > 0.2 else "note"
-        yield Finding(severity, describe_gaps("the IMU", step[gaps], imu.t[gaps] - imu.t[0]), "imu.gap")
+    lost = step[gaps] - period
+    if len(gaps) and lost.max() > _LONG_GAP:  # shorter ones are counted, and told where they are filled in
+        yield Finding("warning", describe_gaps("the IMU", lost, imu.t[gaps] - imu.t[0]), "imu.gap")
     uneven = float((np.abs(step - period) > 0.25 * period).mean())
     if uneven > 0.05:
         yield Finding(
@@ -56,10 +57,6 @@ def is_shaken_as_a_foot(t: Array, accel: Array) -> bool:
     if not len(means):
         return False
     return float(np.percentile(np.abs(np.linalg.norm(means, axis=1) - STANDARD_GRAVITY), 99.0)) > STANDARD_GRAVITY
-
-
-def find_gap_limit(t: Array) -> float:
-    return 2.5 * compute_period(t)
 
 
 def check_repeats(imu: Imu, track: Track | None) -> Iterator[Finding]:

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from graphnav.core.findings import SEVERITIES, Finding, compute_period, find_runs
+from graphnav.core.findings import SEVERITIES, Finding, compute_period, find_gap_limit, find_runs
 from graphnav.core.notes import get_key
 from graphnav.core.rotation import Array
 from graphnav.recording import Recording
@@ -40,7 +40,6 @@ from graphnav.recording.checks.imu import (
     check_noise_at_rest,
     check_repeats,
     check_saturation,
-    find_gap_limit,
 )
 from graphnav.recording.checks.places import check_frozen, check_height_unit, check_mirroring, find_mirrored
 from graphnav.recording.checks.raw import check_raw, describe_raw

@@ -98,13 +98,14 @@ def _compare(t: Array, gyro: Array, accel: Array, up: Array, fixes: tuple[Array,
     grid, rate = motion.resample_on_grid(t, gyro @ up[:, None])
     turns = [lag for course in courses if (lag := _find_turn_lag(grid, rate[:, 0], course)) is not None]
     turn = max(turns, key=lambda lag: lag.correlation, default=None)
+    mirrored = turn is not None and turn.correlation < -LIKELY  # as by a reversed accelerometer: then so are curves
     shift = turn.seconds if turn is not None and abs(turn.seconds) > motion.SEARCHED else 0.0
     axes = find_level_axes(up)
     grid, felt = motion.resample_on_grid(t, accel @ np.stack(axes, -1))
     s = motion.filter_band(felt[:, 0]) + 1j * motion.filter_band(felt[:, 1])
     lags: list[motion.Lag | None] = []
     for one in courses:
-        z = motion.filter_band(one.forward) + 1j * motion.filter_band(one.left)
+        z = motion.filter_band(one.forward) + (-1j if mirrored else 1j) * motion.filter_band(one.left)
         found = motion.find_lag(grid, s, one.t - shift, z)
         if found is None:
             lags.append(None)

@@ -60,14 +60,15 @@ _PATTERNS: dict[str, tuple[str, ...]] = {
     },
     "sd_e": (r"sd_?e|std_?e|sigma_?e|e(?:ast)?_(?:sd|std|sigma)", rf"{_COVARIANCE}[0x]", _HORIZONTAL),
     "sd_n": (r"sd_?n|std_?n|sigma_?n|n(?:orth)?_(?:sd|std|sigma)", rf"{_COVARIANCE}4", _HORIZONTAL),
-    "sd_u": (r"sd_?u|std_?u|sigma_?u|u(?:p)?_(?:sd|std|sigma)", rf"{_COVARIANCE}8", _VERTICAL),
+    "sd_u": (r"sd_?[ud]|std_?[ud]|sigma_?[ud]|(?:up?|d(?:own)?)_(?:sd|std|sigma)", rf"{_COVARIANCE}8", _VERTICAL),
     "sd_ve": (r"(?:sd|std|sigma)_?ve(?:_?east)?|ve_(?:sd|std|sigma)", _OF_SPEED),
     "sd_vn": (r"(?:sd|std|sigma)_?vn(?:_?north)?|vn_(?:sd|std|sigma)", _OF_SPEED),
-    "sd_vu": (r"(?:sd|std|sigma)_?vu(?:_?up)?|vu_(?:sd|std|sigma)", _OF_SPEED),
+    "sd_vu": (r"(?:sd|std|sigma)_?v(?:u(?:_?up)?|d(?:_?down)?)|v[ud]_(?:sd|std|sigma)", _OF_SPEED),
     "speed": (
         r"speed", r"(?:wheel|vehicle|odo(?:meter)?|ground|gps|gnss|can|car)_?(?:speed|velocity)",
         r"speed_over_ground|sog|g_?speed",
-        r"(?:.*_)?(?:speed|velocity|v_?x|twist_linear_x|linear_x|v)", r"geschwindigkeit",
+        r"(?:.*_)?(?:speed|velocity|v_?x|twist_linear_x|linear_x|v)",
+        r"geschwindigkeit|tacho(?:meter)?|vitesse|velocidad",
     ),
     "speed_fl": (rf"{_WHEEL}(?:fl|front_left|left_front){_SPEED}",),
     "speed_fr": (rf"{_WHEEL}(?:fr|front_right|right_front){_SPEED}",),
@@ -75,7 +76,7 @@ _PATTERNS: dict[str, tuple[str, ...]] = {
     "speed_rr": (rf"{_WHEEL}(?:rr|rear_right|right_rear){_SPEED}",),
     "course": (
         r"course(?:_over_ground)?|cog", r"(?:.*_)?(?:bearing|track|course|head_mot|motion_heading|heading_of_motion)",
-        r"heading|direction|kurs",  # phyphox has a direction beside its velocity
+        r"heading|direction|kurs|richtung",  # phyphox has a direction beside its velocity
     ),
     "pressure": (
         r"(?:air_?|baro(?:met(?:er|ric))?_?|atmospheric_?|static_?|abs(?:olute)?_?)?pressure|baro(?:meter)?",

@@ -6,13 +6,15 @@ import numpy as np
 
 from graphnav.core.rotation import Array
 from graphnav.recording.draft import columns as matching
+from graphnav.recording.draft import guesses, motion
 from graphnav.recording.draft.plain import Plain, add_words
-from graphnav.recording.formats.places import is_in_whole_degrees
+from graphnav.recording.formats.places import is_in_degrees_and_minutes, is_in_whole_degrees
 from graphnav.recording.formats.table import Table
 
 _SMALL_UNITS = {"mm": 1e-3, "cm": 1e-2, "mm/s": 1e-3, "cm/s": 1e-2}  # m, m/s
 _SIGMAS = ("sd_e", "sd_n", "sd_u")
-_OF_MOTION = ("ve", "vn", "vu", "vd", "sd_ve", "sd_vn", "sd_vu", "speed", "course")
+_VELOCITIES, _OF_VELOCITIES = ("ve", "vn", "vu", "vd"), ("sd_ve", "sd_vn", "sd_vu")
+_WHOLE_UNITS = {"mm/s": 1e-3, "cm/s": 1e-2, "m/s": 1.0}  # of velocities in whole numbers: u-blox, MAVLink, rounded
 
 
 def convert_small_units(
@@ -51,7 +53,7 @@ def convert_whole_degrees(table: Table, names: dict[str, str], plain: Plain | No
     """Places in whole numbers of 1e-7 deg, as u-blox and MAVLink have them, in deg, heights and accuracies in m.
 
     Both write accuracies in mm (h_acc, v_acc); MAVLink's eph and epv, and whole numbers of speed and course, are in
-    units that these do not share, so they are left alone. `names` are changed.
+    units that these do not share, so they are left alone; for velocities see below. `names` are changed.
     """
     at = {ours: x[np.isfinite(x)] for ours, x in table.columns.items() if ours != "t"}
     if not (is_in_whole_degrees(at["lat"], at["lon"]) and all(map(_are_whole, (at["lat"], at["lon"])))):
@@ -60,7 +62,7 @@ def convert_whole_degrees(table: Table, names: dict[str, str], plain: Plain | No
     lengths = [ours for ours in whole if ours == "h" or (ours in _SIGMAS and "acc" in names[ours].lower())]
     if "h" not in lengths:
         lengths = []
-    for ours in set(whole) & {*_OF_MOTION, *_SIGMAS} - {*lengths}:
+    for ours in set(whole) & {"speed", "course", *_SIGMAS} - {*lengths}:
         del names[ours]
     for ours in ("lat", "lon", *lengths):
         table = table.with_column(ours, table[ours] * (1e-3 if ours in lengths else 1e-7))
@@ -73,5 +75,51 @@ def convert_whole_degrees(table: Table, names: dict[str, str], plain: Plain | No
     return table, add_words(plain, words)
 
 
+def convert_minutes(table: Table, names: dict[str, str], plain: Plain | None) -> tuple[Table, Plain | None]:
+    """Places as receivers' sentences have them, degrees and minutes together, in deg.
+
+    They are no degrees, as latitudes are beyond 90. `names` are changed.
+    """
+    at = [table[ours][np.isfinite(table[ours])] for ours in ("lat", "lon")]
+    if not (all(map(len, at)) and np.abs(at[0]).max() > 90.0 and is_in_degrees_and_minutes(*at)):
+        return table, plain
+    words = f"'{names['lat']}', '{names['lon']}' are degrees and minutes together, made deg"
+    for ours in ("lat", "lon"):
+        whole, minutes = np.divmod(np.abs(table[ours]), 100.0)
+        table = table.with_column(ours, np.sign(table[ours]) * (whole + minutes / 60.0))
+        names[ours] = ours
+    return table, add_words(plain, words)
+
+
+def convert_whole_velocities(
+    names: dict[str, str], values: dict[str, Array], t: Array, plain: Plain | None
+) -> Plain | None:
+    """Velocities beside places in whole numbers, where they are whole too: mm/s or cm/s, as the places move, made m/s.
+
+    They are left alone where the places do not tell. `t` (N,) is in s; `names` and `values` are changed.
+    """
+    there = [ours for ours in _VELOCITIES if ours in values and _are_whole(values[ours])]
+    if not {"ve", "vn"} <= set(there):
+        return plain
+    place = np.column_stack([np.radians([values["lat"], values["lon"]]).T, np.zeros(len(t))])
+    course = motion.compute_course(t, place, None)
+    found = guesses.find_speed_unit(t, np.hypot(values["ve"], values["vn"]), course, _WHOLE_UNITS)
+    if found is not None and found.value == "m/s":
+        return plain
+    words = ", ".join(repr(names[ours]) for ours in there)
+    if found is not None and found.value == "mm/s":  # accuracies are in mm/s beside velocities in either
+        there += [ours for ours in _OF_VELOCITIES if ours in values and _are_whole(values[ours])]
+    for ours in {*there, *(name for name in _OF_VELOCITIES if name in values)}:
+        if found is None or ours not in there:
+            del names[ours], values[ours]
+        else:
+            values[ours] = values[ours] * _WHOLE_UNITS[str(found.value)]
+            names[ours] = ours
+    if found is None:
+        return plain
+    return add_words(plain, f"{words} in {found.value}, as {found.why}, made m/s")
+
+
 def _are_whole(x: Array) -> bool:
+    x = x[np.isfinite(x)]
     return np.array_equal(x, np.round(x))

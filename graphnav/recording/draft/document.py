@@ -17,6 +17,8 @@ from graphnav.recording.draft.sources import JOINED, name_plain_file
 from graphnav.recording.formats.schema import GEOID
 from graphnav.recording.formats.writer import quote
 
+_SHOWN = 8  # unused columns that are named: covariances of ROS are 27
+
 
 class Document:
     """A recording.toml as it is written, table by table.
@@ -60,7 +62,9 @@ class Document:
             self.decide(f"{relative}: {words}")
         self.lines.append(f"file = {quote(relative)}")
         if source.unused:
-            self.decide(f"{source.path.name}: columns not used: {', '.join(source.unused)}")
+            more = len(source.unused) - _SHOWN
+            shown = [*source.unused[:_SHOWN], *([f"and {more} more"] if more > 0 else [])]
+            self.decide(f"{source.path.name}: columns not used: {', '.join(shown)}")
         if source.second:
             words = f"CHECK: {source.second} may be of another sensor of this kind; to use that, give those in columns"
             self.lines.append(f"# {words}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -137,16 +138,22 @@ def guess_gyro_unit(path: Path, gyro: Array, stated: str | None, lag: motion.Lag
     return Guess("deg/s" if large > limit else "rad/s", f"99.5 % of the rates are below {large:.3g}; a guess, {turns}")
 
 
+def find_speed_unit(t: Array, speed: Array, course: motion.Course, units: Mapping[str, float]) -> Guess | None:
+    """The unit, of those with their scales to m/s, in which speeds (N,) are those of the fixes; None if in none."""
+    mine = np.interp(course.t, t, speed, np.nan, np.nan)
+    ok = np.isfinite(mine) & (course.speed > 3.0)
+    if ok.sum() <= 50 or not (ratio := float(np.median(np.abs(mine[ok]) / course.speed[ok]))) > 0.0:
+        return None
+    unit = min(units, key=lambda u: abs(np.log(ratio * units[u])))
+    if abs(np.log(ratio * units[unit])) > 0.08:
+        return None
+    return Guess(unit, f"the fixes move {1 / ratio / units[unit]:.3f} times as fast")
+
+
 def guess_speed_unit(t: Array, speed: Array, course: motion.Course | None, stated: str | None) -> Guess:
     """m/s, km/h, mph or knots: by the fixes if there are any, by the name, by the magnitude."""
-    if course is not None:
-        mine = np.interp(course.t, t, speed, np.nan, np.nan)
-        ok = np.isfinite(mine) & (course.speed > 3.0)
-        if ok.sum() > 50:
-            ratio = float(np.median(np.abs(mine[ok]) / course.speed[ok]))
-            unit = min(SPEED, key=lambda u: abs(np.log(ratio * SPEED[u])))
-            if abs(np.log(ratio * SPEED[unit])) < 0.08:
-                return Guess(unit, f"the fixes move {1 / ratio / SPEED[unit]:.3f} times as fast")
+    if course is not None and (found := find_speed_unit(t, speed, course, SPEED)) is not None:
+        return found
     if stated is not None:
         return Guess(stated, "as the column's name says")
     large = float(np.percentile(np.abs(speed), 95))

@@ -16,7 +16,13 @@ from graphnav.recording import Gnss, Imu, Odometer
 from graphnav.recording.draft import columns as matching
 from graphnav.recording.draft import guesses
 from graphnav.recording.draft.clocks import read_clock_seconds, read_serial_days
-from graphnav.recording.draft.conversion import convert_small_units, convert_variances, convert_whole_degrees
+from graphnav.recording.draft.conversion import (
+    convert_minutes,
+    convert_small_units,
+    convert_variances,
+    convert_whole_degrees,
+    convert_whole_velocities,
+)
 from graphnav.recording.draft.guesses import Guess
 from graphnav.recording.draft.motion import is_course_in_radians
 from graphnav.recording.draft.plain import Plain, add_words, read_plain
@@ -57,6 +63,7 @@ WANTED = {
     "barometer": ("t", "pressure"),
     "gravity": ("t", "pull_x", "pull_y", "pull_z"),
 }
+CALLED = "t; gx gy gz ax ay az; lat lon h; speed"  # names that all sensors' columns can have
 _PAUSES = 1000.0  # ratio of a log's duration to that of all its rows together, at most
 _NEEDED = {"gnss": 4, "odometer": 2}  # number of these that a row must have
 
@@ -144,8 +151,7 @@ def read_log(path: Path, topics: Sequence[str] = ()) -> dict[str, Source]:
         raise _make_times_error(path, header, {} if plain is None else plain.words_in)
     if sensor is None:
         raise NoSensorError(
-            f"{path}, line 1: no sensor is recognised in the columns {', '.join(header[:12])}; "
-            "rename them (t; gx gy gz ax ay az; lat lon h; speed)",
+            f"{path}, line 1: no sensor is recognised in the columns {', '.join(header[:12])}; rename them ({CALLED})",
             key="draft.no_columns",
         )
     if plain is None:
@@ -313,6 +319,7 @@ def _read_sensor(
     whole = np.asarray(np.isfinite(table.stack(*needed)).all(-1))
     if role == "gnss":
         table, known = blank_unknown(table)  # as it will be read
+        before = table
         whole &= known
         fixed = (table["lat"] != 0.0) | (table["lon"] != 0.0)
         if whole.any() and not (whole & fixed).any():
@@ -321,6 +328,8 @@ def _read_sensor(
                 key="draft.no_fix",
             )
         table, plain = convert_whole_degrees(table, names, plain)
+        counted = table is not before
+        table, plain = convert_minutes(table, names, plain)
         table, plain = convert_variances(table, names, plain)
         whole[whole] = find_places(table["lat"][whole], table["lon"][whole], ANGLE["deg"])  # as it will be read
         check_angles(table.take(whole), ANGLE["deg"], "GNSS")
@@ -342,7 +351,8 @@ def _read_sensor(
     if (later := find_restarts(values["t"], TIME_UNITS[str(unit.value)])) is not None:  # as it will be read
         values["t"] = values["t"] + later
     order = np.argsort(values["t"], kind="stable")
-    order = order[~find_repeated(path, values["t"][order])]
+    repeated = find_repeated(path, values["t"][order])
+    order = order[~repeated]
     if len(order) < 2:
         raise RecordingError(
             f"{path}, column '{names['t']}': every row has the time {values['t'][0]:.10g}; log it with milliseconds",
@@ -356,6 +366,8 @@ def _read_sensor(
             values["course"] = np.degrees(values["course"])
             words = f"'{names['course']}' is in rad, by the positions; made deg"
             plain = add_words(plain, words)
+        if counted:
+            plain = convert_whole_velocities(names, values, values["t"] * TIME_UNITS[str(unit.value)], plain)
     columns, names, plain = convert_small_units(columns, names, values, plain)
     step = np.diff(values["t"])
     if step.sum() > _PAUSES * len(step) * np.median(step):
@@ -372,4 +384,9 @@ def _read_sensor(
     week = int(weeks[0]) if len(weeks) and weeks[0] > 0 and np.isfinite(weeks[0]) else None
     if week is None and "gps" in names["t"].lower() and _are_gps_seconds(values["t"] * TIME_UNITS[str(unit.value)]):
         week, unit = 0, replace(unit, why=f"as s since the GPS epoch '{names['t']}' is then a date in the past")
+    if plain is not None:  # what is written is whole, so nobody tells later
+        gone = ((~whole, "without all of its numbers"), (repeated, "with the time of another"))
+        for some, what in gone:
+            if some.any():
+                plain = add_words(plain, f"{some.sum()} of {len(some)} rows {what} left out")
     return Source(path, matching.FileColumns(names, columns.units), values, t_unit=unit, week=week, plain=plain)

@@ -24,7 +24,11 @@ _MARKS = {"\t": "a tab", ";": "a semicolon", ",": "a comma", "|": "a bar", None:
 _WIDE = (b"\xff\xfe", b"\xfe\xff")  # marks at the start of UTF-16
 _COMMENT = re.compile(r"\s*(?:#|%|//)+\s?")
 _DAY_FIRST = re.compile(r"(\d{1,2})\.(\d{1,2})\.(\d{4})(.*)")  # 08.07.2025
-_YEAR_FIRST = re.compile(r"(\d{4})[-/.](\d{1,2})[-/.](\d{1,2})(.*)")  # 2025-07-08
+_MONTH_NAMED = re.compile(r"(\d{1,2})[- ]([A-Za-z]{3})[- ](\d{4})(.*)")  # 08-Jul-2025, as MATLAB writes it
+_MONTHS = ("jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec")
+_YEAR_FIRST = re.compile(
+    r"(\d{4})[-/.](\d{1,2})[-/.](\d{1,2})(.*)|(\d{4})(\d{2})(\d{2})(T\d{6}.*)"
+)  # 2025-07-08, 20250708T
 _SLASHES = re.compile(r"(\d{1,2})/(\d{1,2})/(\d{4})(.*)")  # 07/08/2025, where one number may identify the month
 _TIME_OF_DAY = re.compile(r"(\d{1,2}):(\d{2}):(\d{2})(?:[.,:](\d{1,9}))?\s*([AaPp][Mm])?")
 _MARKED = re.compile(r"[+-]?\d[\d.,'\u2019\u00a0\u202f ]*(?:[eE][+-]?\d+)?")  # a number in some country
@@ -307,7 +311,7 @@ def _parse_times(
         (name for name, some in words.items() if all(not c or _parse_clock(c) is not None for c in some)), None
     )
     days = next((some for name, some in words.items() if name != daily and _parse_date(some[0]) is not None), None)
-    if days is not None and any(":" in cell for cell in days):
+    if days is not None and any(":" in cell or "T" in cell for cell in days):
         daily = next(name for name, some in words.items() if some is days)
         clocks = days
     elif daily is not None:
@@ -325,10 +329,12 @@ def _parse_times(
     else:
         return None, None, notes
     stamps = [_parse_date(text) for text in clocks]
-    if any(x is None for x in stamps):
+    if any(x is None and not is_blank(text) for x, text in zip(stamps, clocks, strict=True)):
         return None, None, notes
     zone = stamps[0] is not None and stamps[0].tzinfo is not None
-    columns[daily] = np.array([(x if x.tzinfo else x.replace(tzinfo=UTC)).timestamp() for x in stamps if x is not None])
+    columns[daily] = np.array(
+        [np.nan if x is None else (x if x.tzinfo else x.replace(tzinfo=UTC)).timestamp() for x in stamps]
+    )
     why = "" if zone else "; CHECK: they state no zone and are taken as UTC"
     return daily, None, [*notes, f"dates of '{daily}' as Unix time in s{why}"]
 
@@ -349,13 +355,14 @@ def _parse_date(text: str) -> datetime | None:
     """A date with or without a time of day; None if it is none."""
     if len(text) < 8 or not text[:1].isdigit() or not text.isascii():
         return None
-    if found := _DAY_FIRST.fullmatch(text):
+    if found := _DAY_FIRST.fullmatch(text) or _MONTH_NAMED.fullmatch(text):
         day, month, year, rest = found.groups()
     elif found := _YEAR_FIRST.fullmatch(text):
-        year, month, day, rest = found.groups()
+        year, month, day, rest = filter(lambda part: part is not None, found.groups())
     else:
         return None
     try:
+        month = month if month.isdigit() else str(_MONTHS.index(month.lower()) + 1)
         start = datetime(int(year), int(month), int(day))
         rest = rest.strip(" T").replace(",", ".")
         if (seconds := _parse_clock(rest) if rest else 0.0) is not None:

@@ -16,7 +16,7 @@ from graphnav.core.timescales import DAY, NEAR, UNIX, gps_to_utc
 from graphnav.recording.draft import columns as matching
 from graphnav.recording.draft import guesses, motion
 from graphnav.recording.draft.guesses import Guess
-from graphnav.recording.draft.logs import WANTED, NoSensorError, Source, has_gravity, read_log
+from graphnav.recording.draft.logs import CALLED, WANTED, NoSensorError, Source, has_gravity, read_log
 from graphnav.recording.draft.parts import join_parts
 from graphnav.recording.draft.raw import RawFiles, separate_raw, tell_kind
 from graphnav.recording.formats import list_formats
@@ -74,7 +74,7 @@ def find_logs(paths: Sequence[Path], topics: Sequence[str] = ()) -> LogsFound:
     if others:
         left.append(f"{others}: no logs of a kind that is known")
     if nothing:
-        left.append(f"left out: {', '.join(nothing)}: no sensor is recognised in the columns")
+        left.append(f"left out: {', '.join(nothing)}: no sensor is recognised in the columns; names that are: {CALLED}")
     sensors = {
         sensor: chosen for sensor, some in every.items() if (chosen := _choose_source(sensor, some, left)) is not None
     }
@@ -203,6 +203,8 @@ def _list_logs(path: Path) -> list[Path]:
     ]
     if not logs:
         there = f" ({others})" if (others := _name_others([path], [])) else ""
+        if deeper := sorted(p.name for p in inside if p.is_dir()):
+            there += f"; folders in it are not looked into: name {', '.join(deeper[:5])} itself"
         raise RecordingError(
             f"{path}: no log in this folder: no CSV file, and none of a kind that is known{there}", key="draft.no_log"
         )

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from graphnav.core.complaints import suggest_nearest
 from graphnav.core.errors import RecordingError
-from graphnav.core.files import ARCHIVE, ZIP, exists
+from graphnav.core.files import ARCHIVE, ZIP, exists, open_file
 from graphnav.recording import Recording
 from graphnav.recording.exporters import FORMATS as EXPORTED
 from graphnav.recording.formats.registry import Format, Log, read_first_bytes
@@ -147,6 +147,9 @@ def _explain_unknown(source: str | Path, known: dict[str, Format]) -> RecordingE
         hint = f"point at one of {', '.join(there)} in it" if there else f"graphnav init {path} -o {path} drafts one"
         return RecordingError(f"{path}: the folder holds no recording.toml; {hint}", key="recording.none")
     if path.exists():
+        if path.is_file():
+            with open_file(path):  # says so, if nobody may
+                pass
         if path.suffix == ".csv" or path.name.endswith(".csv.gz"):
             return RecordingError(
                 f"{path}: not a recording; point at its folder or its .toml file (graphnav init drafts one)",

@@ -1,6 +1,7 @@
 """NMEA 0183 sentences of any receiver: GGA positions, GST sigmas, RMC and VTG speed and course, ZDA and RMC dates.
 
-Sentences with the same time of day make one fix. Parsed and checked by pynmeagps.
+Sentences with the same time of day make one fix. Parsed and checked by pynmeagps; the standard does not require
+checksums of them, so those of a file without any are not.
 """
 
 from __future__ import annotations
@@ -8,6 +9,8 @@ from __future__ import annotations
 import datetime
 import re
 from dataclasses import dataclass
+from functools import reduce
+from operator import xor
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +30,7 @@ KNOTS = 1852 / 3600  # m/s
 KMH = 1 / 3.6
 _DAY = 86400.0
 _SENTENCE = re.compile(rb"(?:^|[\s>\])|:])\$(?!P)[A-Za-z]{5},")
+_CHECKSUM = re.compile(rb"\*[0-9A-Fa-f]{2}\s*$", re.MULTILINE)
 # 1-sigma (m, one horizontal axis) by GGA's quality, multiplied by HDOP, where there is no GST: user range errors of
 # the standard service and of corrections of the code; fixed and float carrier phases as receivers state them
 _BY_QUALITY = {1: 2.5, 2: 1.0, 4: 0.02, 5: 0.4}
@@ -69,7 +73,11 @@ def load(path: Path) -> Log:
         If no sentence gives a position, naming the first line that is no sentence, if any.
     """
     remarks = Remarks()
-    epochs, broken, lines = _collect_epochs(path)
+    data = read_bytes(path)
+    checked = _CHECKSUM.search(data) is not None
+    if not checked:
+        remarks.add("log.no_checksums", "no sentence has a checksum: all are taken as they are")
+    epochs, broken, lines = _collect_epochs(data, checked)
     if broken:
         remarks.add(
             "log.broken_lines",
@@ -137,14 +145,17 @@ def _explain_no_fix(path: Path, ggas: list[_Epoch], broken: list[int]) -> str:
     return f"{path}{at} no GGA sentence, which gives position and height, with a right checksum is in it"
 
 
-def _collect_epochs(path: Path) -> tuple[list[_Epoch], list[int], int]:
-    """Epochs in the order of the file, the numbers of invalid lines, and the number of non-empty lines."""
+def _collect_epochs(data: bytes, checked: bool) -> tuple[list[_Epoch], list[int], int]:
+    """Epochs in the order of the file, the numbers of invalid lines, and the number of non-empty lines.
+
+    Checksums must be there and right if they are to be `checked`.
+    """
     import pynmeagps
 
     epochs: list[_Epoch] = []
     broken: list[int] = []
     count = 0
-    for number, raw in enumerate(read_bytes(path).splitlines(), 1):
+    for number, raw in enumerate(data.splitlines(), 1):
         start = raw.find(b"$")
         if start < 0:
             count += bool(raw.strip())
@@ -158,7 +169,8 @@ def _collect_epochs(path: Path) -> tuple[list[_Epoch], list[int], int]:
             broken.append(number)
             continue
         try:
-            message = pynmeagps.NMEAReader.parse(raw[start:].strip() + b"\r\n")
+            own = b"" if checked else b"*%02X" % reduce(xor, raw[start + 1 :].strip())  # which the parser requires
+            message = pynmeagps.NMEAReader.parse(raw[start:].strip() + own + b"\r\n")
         except Exception:  # the parser's own errors and any that a truncated line causes in it
             broken.append(number)
             continue

@@ -105,11 +105,16 @@ def is_in_whole_degrees(lat: Array, lon: Array) -> bool:
     return bool((np.abs(lat) <= 90e7).all() and np.median(np.abs(lat)) > 1e5 and (np.abs(lon) <= 360e7).all())
 
 
+def is_in_degrees_and_minutes(lat: Array, lon: Array) -> bool:
+    """Whether latitudes and longitudes (N,) may be degrees and minutes together: 3539.55 is 35 deg 39.55'."""
+    return all((np.abs(x) % 100.0 < 60.0).all() and np.abs(x).max() < 100.0 * top for x, top in ((lat, 91), (lon, 181)))
+
+
 def _guess_other_form(lat: Array, lon: Array, label: str) -> str:
     """The likely mistake behind latitudes and longitudes out of range."""
     if is_in_whole_degrees(lat, lon):
         return "; in units of 1e-7 deg, as u-blox and MAVLink have them? Write degrees"
-    if all((np.abs(x) % 100.0 < 60.0).all() and np.abs(x).max() < 100.0 * top for x, top in ((lat, 91), (lon, 181))):
+    if is_in_degrees_and_minutes(lat, lon):
         whole, minutes = divmod(abs(lat[0]), 100.0)
         return f"; degrees and minutes together, as in NMEA? {lat[0]:g} is then {whole:g} deg {minutes:g} min"
     return '; if they are metres, name them x and y and set frame = "local"' if label == "truth" else ""
