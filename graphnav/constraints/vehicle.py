@@ -13,8 +13,10 @@ R_vb = Rz(-beta) Rx(alpha), and u_v = R_vb u = (right, forward, up)::
 
     right:    u_v,x - slip  u_v,y (u_v,y omega_z)     tyres need a slip angle for lateral acceleration
     up:       u_v,z - squat u_v,y a_y                 springs pitch the body under forward acceleration a_y
-    forward:  u_v,y - (1 + k) s                       s: mean of the odometer, k: its scale error
+    forward:  u_v,y / (1 + k) - s                     s: mean of the odometer, k: its scale error
 
+The error is one of the reading s. As u_v,y - (1 + k) s it would vanish for k = -1 and an IMU that is mounted across,
+and its likelihood would lack the factor 1 + k of each reading, so that noise figures grew likelier by ending there.
 Both coefficients, the mounting angles (which wander: load, wind, the crown of the road), the forward place of the
 axle that does not slip, and the scale are estimated.
 
@@ -54,6 +56,7 @@ _LINEAR_TYRES = 3.0  # m/s^2, lateral force up to which tyres behave linearly
 _BEYOND = 0.1  # m/s of sideways speed per m/s^2 beyond that
 _AXLE_LEFT = 0.2  # m, uncertainty of the axle's place in a turn: front wheels steer, tyres have width
 _HALF_WHEELBASE = 1.3  # m
+_LEAST_FACTOR = 0.1  # least 1 + k: a step may go beyond what a unit can be wrong by, not to where readings are infinite
 _I2, _I3 = np.eye(2), np.eye(3)
 _E_Y = np.array([[0.0, 1.0, 0.0]])
 _FORWARD = _E_Y[None]
@@ -369,13 +372,15 @@ class OdometerSpeed(Wheels):
             read, by_delay = self.speed(self.begin[rows], self.end[rows], delay)
         else:
             read = self._read[rows]
-        scale, ahead = 1.0 + parameters[ODOMETER_SCALE][:, 0], found.u[:, 1]
-        A = _FORWARD if self.signed else np.where(ahead < 0.0, -1.0, 1.0)[:, None, None] * _FORWARD
-        residual = (A[:, 0, 1] * ahead - scale * read)[:, None]
+        factor = np.maximum(1.0 + parameters[ODOMETER_SCALE][:, 0], _LEAST_FACTOR)
+        sign = np.where(found.u[:, 1] < 0.0, -1.0, 1.0) if not self.signed else 1.0
+        A = (sign / factor)[:, None, None] * _FORWARD
+        expected = sign / factor * found.u[:, 1]
+        residual = (expected - read)[:, None]
         jacobians = found.differentiate(A, parameters)
-        jacobians[ODOMETER_SCALE] = -read[:, None, None]
+        jacobians[ODOMETER_SCALE] = -(expected / factor)[:, None, None]
         if ODOMETER_DELAY in parameters:
-            jacobians[ODOMETER_DELAY] = -(scale * by_delay)[:, None, None]
+            jacobians[ODOMETER_DELAY] = -by_delay[:, None, None]
         if ODOMETER_ERROR in parameters:
             residual = residual + parameters[ODOMETER_ERROR]
             jacobians[ODOMETER_ERROR] = np.ones((len(residual), 1, 1))
