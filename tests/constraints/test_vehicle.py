@@ -13,7 +13,15 @@ from helpers import Array, truth_states
 from graphnav.config import Settings, parse_settings
 from graphnav.constraints.base import BuildContext
 from graphnav.constraints.standstill import PLACE, HeldPosition, ZeroRate, ZeroVelocity
-from graphnav.constraints.vehicle import AXLE, MOUNTING, ODOMETER_DELAY, ODOMETER_SCALE, NonHolonomic, OdometerSpeed
+from graphnav.constraints.vehicle import (
+    AXLE,
+    MOUNTING,
+    ODOMETER_DELAY,
+    ODOMETER_SCALE,
+    NonHolonomic,
+    OdometerSpeed,
+    _compute_gain,
+)
 from graphnav.core import rotation
 from graphnav.core.earth import EARTH_RATE, LocalFrame
 from graphnav.core.rotation import mv
@@ -79,6 +87,27 @@ def test_the_axle_of_an_exact_drive_moves_straight_ahead(exact: tuple[Recording,
     """
     assert np.abs(residual(NonHolonomic, *exact, {})).max() < 2e-4
     assert np.abs(residual(OdometerSpeed, *exact, {ODOMETER_SCALE: np.array([1.0 / 1.01 - 1.0])})).max() < 2e-3
+
+
+def test_a_reading_is_expected_as_the_sensor_shows_it(exact: tuple[Recording, Trajectory]) -> None:
+    """An IMU across the vehicle and a scale of -100 % explain no reading, though the sideways speed and (1 + k) s agree
+    there: in speeds on the road that is the least residual of all."""
+    across = {MOUNTING: np.array([0.0, 0.5 * np.pi])}
+    true = np.square(residual(OdometerSpeed, *exact, {ODOMETER_SCALE: np.array([1.0 / 1.01 - 1.0])})).mean()
+    read = np.square(exact[0].odometer.speed).mean()
+    for scale in (-0.999, -0.9, -0.5, 0.0):
+        found = np.square(residual(OdometerSpeed, *exact, across | {ODOMETER_SCALE: np.array([scale])})).mean()
+        assert found > 0.5 * read > 100.0 * true
+
+
+@pytest.mark.parametrize("unit", [1.0 / 3.6, 1.0, 3.6])
+def test_gauss_newton_steps_end_at_a_scale_far_from_that_stated(unit: float) -> None:
+    """From 0 the first step for a unit of 3.6 goes beyond -100 %."""
+    scale = np.zeros(1)
+    for _ in range(30):
+        gain, slope = _compute_gain(scale)
+        scale = scale - (gain - unit) / slope
+    assert scale[0] == pytest.approx(1.0 / unit - 1.0, abs=1e-9)
 
 
 def test_mounting_angles_are_those_of_a_turned_imu(exact: tuple[Recording, Trajectory]) -> None:
