@@ -61,15 +61,6 @@ def test_large_results_come_back() -> None:
     np.testing.assert_array_equal(found, 2.0 * numbers)
 
 
-def test_what_both_have_is_not_sent() -> None:
-    allow_second_process()
-    own, other = np.arange(3.0), np.arange(3.0)
-    found = begin_beside(lambda: {"own": own, "other": other}, [own]).get_result()
-    assert found["own"] is own
-    assert found["other"] is not other
-    np.testing.assert_array_equal(found["other"], other)
-
-
 def test_an_error_is_raised_where_the_result_is_wanted() -> None:
     allow_second_process()
 
