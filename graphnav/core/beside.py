@@ -16,7 +16,7 @@ import warnings
 import weakref
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
+from functools import cached_property
 from typing import Generic, TypeVar
 
 from graphnav.core.memory import read_peak_memory_mb
@@ -34,24 +34,28 @@ def allow_second_process() -> None:
     _allowed = True
 
 
-def begin_beside(work: Callable[[], T]) -> Beside[T] | Done[T]:
-    """Begin some work in a second process; where there is to be none, do it at once."""
+def begin_beside(work: Callable[[], T]) -> Beside[T] | Later[T]:
+    """Begin some work in a second process; where there is to be none, it is done when its result is wanted."""
     several = sys.platform == "linux" and len(os.sched_getaffinity(0)) > 1
     if _allowed and several and read_peak_memory_mb() < _LARGEST:
         with suppress(OSError):  # no more processes, files or memory
             return Beside(work)
-    return Done(work())
+    return Later(work)
 
 
-@dataclass(frozen=True)
-class Done(Generic[T]):
-    """Work that is done."""
+class Later(Generic[T]):
+    """Work that is done when its result is wanted first."""
 
-    result: T
+    def __init__(self, work: Callable[[], T]) -> None:
+        self._work = work
+
+    @cached_property
+    def _result(self) -> T:
+        return self._work()
 
     def get_result(self) -> T:
         """The result."""
-        return self.result
+        return self._result
 
 
 class Beside(Generic[T]):

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from graphnav.core import beside
-from graphnav.core.beside import Beside, Done, allow_second_process, begin_beside
+from graphnav.core.beside import Beside, Later, allow_second_process, begin_beside
 from graphnav.core.errors import RecordingError
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="a second process is begun on Linux only")
@@ -28,18 +28,18 @@ def two_processors(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
         os.waitpid(-1, os.WNOHANG)
 
 
-def test_it_is_done_at_once_unless_allowed() -> None:
+def test_it_is_done_here_unless_allowed() -> None:
     assert begin_beside(os.getpid).get_result() == os.getpid()
 
 
 @pytest.mark.parametrize(("processors", "mb"), [({0}, 100.0), ({0, 1}, 5000.0)])
-def test_it_is_done_at_once_without_a_processor_or_memory(
+def test_it_is_done_here_without_a_processor_or_memory(
     processors: set[int], mb: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     allow_second_process()
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: processors)
     monkeypatch.setattr(beside, "read_peak_memory_mb", lambda: mb)
-    assert isinstance(begin_beside(os.getpid), Done)
+    assert isinstance(begin_beside(os.getpid), Later)
 
 
 def test_it_is_done_here_where_the_system_has_no_more_processes(monkeypatch: pytest.MonkeyPatch) -> None:
