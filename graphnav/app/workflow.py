@@ -36,7 +36,7 @@ from graphnav.recording.exporters import check_names
 
 if TYPE_CHECKING:
     from graphnav.evaluation.metrics import Metrics
-    from graphnav.recording.plausibility.screening import Screened
+    from graphnav.recording.plausibility.screening import ScreenedRows
 
 
 _SOLVING = "preintegration"  # the stage at which a recording that cannot be solved is refused at the latest
@@ -160,14 +160,16 @@ def run_request(request: Request, progress: Progress | None = None) -> Outcome:
 
 def _solve_request(request: Request, progress: Progress | None) -> Outcome:
     from graphnav.recording.checks.stated import is_truth_apart
-    from graphnav.recording.plausibility.screening import refuse
+    from graphnav.recording.plausibility.screening import refuse, screen
 
     tell("reading")
     reading = begin_beside(partial(_read_and_screen, request))
     load_solvers(request.solvers)  # which takes as long
-    recording, screened, zero, timings = reading.get_result()
-    refuse(screened.recording, screened.findings)
-    checks = Checks(recording, screened)
+    recording, rows, zero, timings = reading.get_result()
+    with _measure_time(timings, "checks"):
+        screened = screen(recording, rows)
+        refuse(screened.recording, screened.findings)
+        checks = Checks(recording, screened)
     recording, moved = screened.recording, shift_spans(request.withheld, zero)
     used, notes = withhold(recording, moved, zero)
     if is_truth_apart(recording):
@@ -334,10 +336,12 @@ def read_part(
     return withhold(part, shift_spans(withheld, zero), zero)[0]
 
 
-def _read_and_screen(request: Request) -> tuple[Recording, Screened, float, dict[str, float]]:
-    """The requested part of the recording, as read and screened, its start from that of the whole, s, and timings."""
+def _read_and_screen(request: Request) -> tuple[Recording, ScreenedRows, float, dict[str, float]]:
+    """The requested part of the recording, as read and its rows screened, its start from that of the whole, s, and
+    timings.
+    """
     from graphnav.recording.formats import read
-    from graphnav.recording.plausibility.screening import screen
+    from graphnav.recording.plausibility.screening import screen_rows
 
     timings: dict[str, float] = {}
     with _measure_time(timings, "reading"):
@@ -347,8 +351,8 @@ def _read_and_screen(request: Request) -> tuple[Recording, Screened, float, dict
         raise ConfigError("--point antenna: the recording has no GNSS", key="option.point")
     part = _crop(whole, request)
     with _measure_time(timings, "checks"):
-        screened = screen(part)
-    return part, screened, part.start - whole.start if part is not whole else 0.0, timings
+        rows = screen_rows(part)
+    return part, rows, part.start - whole.start if part is not whole else 0.0, timings
 
 
 @contextmanager
