@@ -21,7 +21,7 @@ from graphnav.app.withholding import shift_spans, withhold
 from graphnav.config import Settings
 from graphnav.constraints.antenna_motion import LEVER_ARM
 from graphnav.constraints.base import SAME_TIME
-from graphnav.core.beside import begin_beside
+from graphnav.core.beside import Later, begin_beside
 from graphnav.core.errors import ConfigError, EstimationError, RecordingError
 from graphnav.core.findings import Finding
 from graphnav.core.memory import return_memory
@@ -203,6 +203,9 @@ def _solve_request(request: Request, progress: Progress | None) -> Outcome:
     solutions = {
         name: replace(s, timings={**timings, **s.timings}, notes=(*notes, *s.notes)) for name, s in solutions.items()
     }
+    known = _mitigate(found, solutions)
+    look = partial(_find_wrong_arms, used, known, dict(solutions))
+    looking = begin_beside(look) if request.judge_arms else Later(look)  # which takes a second
     solutions |= _read_others(request, recording, solutions)
     with _measure_time(timings, "evaluation"):
         try:
@@ -220,15 +223,8 @@ def _solve_request(request: Request, progress: Progress | None) -> Outcome:
             shared = all(note in other.notes for other in metrics.values())
             findings.append(note if shared else Note(get_key(note), f"{name}: {note}"))
     errors = {name: one.errors for name, one in metrics.items() if one.errors is not None}
-    known = _mitigate(found, solutions)
-    if request.judge_arms or list_doubts(solutions, errors):  # which takes a second
-        from graphnav.estimation.antenna import find_wrong_arms
-
-        arms = find_wrong_arms(used, known, list(select_own(solutions).values())[-1].graphs)
-        # the stated lever arm is not used
-        if any(LEVER_ARM in one.noise.freed for one in select_own(solutions).values()):
-            arms = [f for f in arms if not f.key.startswith("gnss.")]
-        known = (*arms, *known)
+    if request.judge_arms or list_doubts(solutions, errors):
+        known = (*looking.get_result(), *known)
         findings = [*(f.sentence for f in known), *findings]
     densities = _find_densities(used, request.settings, solutions)
     if in_parts:
@@ -237,6 +233,17 @@ def _solve_request(request: Request, progress: Progress | None) -> Outcome:
         request, recording, zero, solutions, metrics, against, names, tuple(dict.fromkeys(findings)),
         tuple(f.sentence for f in known if f.severity != "note"), timings, known, densities,
     )  # fmt: skip
+
+
+def _find_wrong_arms(
+    used: Recording, known: tuple[Finding, ...], solutions: Mapping[str, Solution]
+) -> tuple[Finding, ...]:
+    """Lever arms that the drive contradicts, other than those that are not used as stated."""
+    from graphnav.estimation.antenna import find_wrong_arms
+
+    arms = find_wrong_arms(used, known, list(solutions.values())[-1].graphs)
+    freed = any(LEVER_ARM in one.noise.freed for one in solutions.values())
+    return tuple(f for f in arms if not (freed and f.key.startswith("gnss.")))
 
 
 def _mitigate(findings: tuple[Finding, ...], solutions: Mapping[str, Solution]) -> tuple[Finding, ...]:
