@@ -63,7 +63,7 @@ def load_solvers(solvers: Sequence[str]) -> None:
     """Import what solvers need, and load what is compiled; it takes as long as reading an hour."""
     with pause_collector():
         import graphnav.estimation.pipeline
-        from graphnav.estimation.solvers.recursion import load_compiled
+        from graphnav.estimation.solvers.disturbance import load_compiled
 
         if "batch" in solvers:
             import graphnav.estimation.factor_graph.batch  # noqa: F401
