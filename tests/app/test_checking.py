@@ -12,6 +12,7 @@ from graphnav.app.workflow import Request, run_request
 from graphnav.core.errors import EstimationError, RecordingError
 from graphnav.core.findings import Finding
 from graphnav.estimation import building
+from graphnav.estimation.solvers import disturbance, recursion
 from graphnav.recording.formats.registry import Log
 from graphnav.recording.formats.writer import write_recording
 
@@ -48,3 +49,10 @@ def test_a_refusal_comes_before_what_it_causes(folder: Path, monkeypatch: pytest
     with pytest.raises(RecordingError) as caught:
         run_request(Request(str(folder), ("ekf",)))
     assert caught.value.key == "imu.gyro_unit"
+
+
+def test_what_is_loaded_is_what_solvers_call(folder: Path) -> None:
+    """Otherwise each recursion would be compiled a second time."""
+    run_request(Request(str(folder), ("rts",)))
+    compiled = recursion.filter_rows, recursion.smooth_filtered, disturbance.smooth_rows
+    assert [len(getattr(one, "signatures", [()])) for one in compiled] == [1, 1, 1]

@@ -9,10 +9,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import oracle
 import pytest
 
-from graphnav import run
 from graphnav.core import rotation
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM
@@ -235,12 +233,3 @@ def test_turns_one_behind_the_other() -> None:
         both = rotation.exp(first) @ rotation.exp(then)
         found = recursion.compose_turns(rotation.to_quaternion(rotation.exp(first)), then)
         np.testing.assert_allclose(found, rotation.log(both), atol=1e-12)
-
-
-def test_what_is_loaded_at_the_start_is_what_solvers_call() -> None:
-    """Otherwise each of them would be compiled a second time."""
-    run(oracle.drive(oracle.vehicle_path(duration=120, rate=50.0, seed=6), seed=5)[0], None, ("rts",), noise="stated")
-    functions = recursion.filter_rows, disturbance.smooth_rows, recursion.smooth_filtered
-    used = [getattr(one, "signatures", None) for one in functions]
-    disturbance.load_compiled()
-    assert [getattr(one, "signatures", None) for one in functions] == used
