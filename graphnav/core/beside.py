@@ -76,6 +76,7 @@ class Beside(Generic[T]):
             _work_and_exit(work, begin)
         os.close(begin)
         self._end = end
+        self._found: tuple[T, Exception | None]
         self._stop = weakref.finalize(self, _stop, process, end)
 
     def get_result(self) -> T:
@@ -83,20 +84,18 @@ class Beside(Generic[T]):
 
         If the process was killed, the work is done in this one.
         """
-        if not self._stop.alive:
-            return self._result
-        parts = []
-        while part := os.read(self._end, 1 << 20):
-            parts.append(part)
-        self._stop()
-        try:
-            result, error = pickle.loads(b"".join(parts))  # of a process of our own
-        except (EOFError, pickle.UnpicklingError):
-            result, error = self._work(), None
+        if self._stop.alive:
+            try:
+                with os.fdopen(self._end, "rb", closefd=False) as pipe:
+                    self._found = pickle.load(pipe)  # of a process of our own, and never twice in memory
+            except Exception:  # it was killed, or this is not to be sent
+                self._stop()
+                self._found = self._work(), None
+            self._stop()
+        result, error = self._found
         if error is not None:
             raise error
-        self._result: T = result
-        return self._result
+        return result
 
 
 def _work_and_exit(work: Callable[[], object], begin: int) -> None:

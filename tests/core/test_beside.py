@@ -7,13 +7,14 @@ import signal
 import sys
 import time
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from graphnav.core import beside
 from graphnav.core.beside import Beside, Later, allow_second_process, begin_beside
-from graphnav.core.errors import RecordingError
+from graphnav.core.errors import PartlyWrittenError, RecordingError
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="a second process is begun on Linux only")
 
@@ -71,6 +72,21 @@ def test_an_error_is_raised_where_the_result_is_wanted() -> None:
     with pytest.raises(RecordingError, match="no GNSS") as caught:
         work.get_result()
     assert caught.value.key == "gnss.none"
+    with pytest.raises(RecordingError, match="no GNSS"):
+        work.get_result()
+
+
+def test_what_is_not_to_be_sent_is_done_here() -> None:
+    allow_second_process()
+    assert begin_beside(lambda: lambda: 2.0).get_result()() == 2.0
+    missing = (Path("a"),)
+
+    def fail() -> None:
+        raise PartlyWrittenError("one is missing", key="output.partly_written", missing=missing)
+
+    with pytest.raises(PartlyWrittenError) as caught:
+        begin_beside(fail).get_result()
+    assert caught.value.missing == missing
 
 
 def test_where_the_process_is_killed_the_work_is_done_here() -> None:
