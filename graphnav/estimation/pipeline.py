@@ -26,7 +26,6 @@ from graphnav.core.state import BLOCKS
 from graphnav.detectors import Detector, detect
 from graphnav.detectors import check_own as check_detectors
 from graphnav.estimation.building import start_sigma
-from graphnav.estimation.early_batch import EarlyBatch
 from graphnav.estimation.faults.excluded import describe_faults, find_fault_spans
 from graphnav.estimation.long_drives import OVERLAP, crop_solutions, share_covariances, split_drive
 from graphnav.estimation.noise.files import MODES
@@ -37,13 +36,11 @@ from graphnav.estimation.noise.words import describe_far
 from graphnav.estimation.offsets import move_stamps
 from graphnav.estimation.pieces import describe_span, split_pieces
 from graphnav.estimation.preparation import Prepared, Weigh, prepare
-from graphnav.estimation.problem import Problem
 from graphnav.estimation.relinearisation import step_ahead
 from graphnav.estimation.separation import compute_separation
 from graphnav.estimation.solution import KNOWN, Solution, join_solutions
 from graphnav.estimation.solvers.breakdown import explain_singular
 from graphnav.estimation.solvers.ekf import ekf
-from graphnav.estimation.solvers.linearise import Points
 from graphnav.estimation.solvers.rts import rts, smooth_backward
 from graphnav.estimation.stamps import (
     describe_stamps,
@@ -253,12 +250,7 @@ def _solve(
         detected = detect(moved, own)
         detection += time.perf_counter() - began
         given = None if noise is None else shift_to_imu_clock(noise)
-        return prepare(moved, own, frame, detected, given, progress, weigh, begin_batch if "batch" in solvers else None)
-
-    early: list[EarlyBatch] = []
-
-    def begin_batch(problem: Problem, near: Points) -> None:
-        early[:] = [EarlyBatch(problem, near)]
+        return prepare(moved, own, frame, detected, given, progress, weigh)
 
     if noise is None and may_move(recording, settings):
         recording, found, stamps = find_stamps(recording, prepare_moved, clock)
@@ -305,13 +297,10 @@ def _solve(
 
         began = time.perf_counter()
         near = found.ahead or step_ahead(problem, found.smoothed)
-        tell("batch")
-        solved = early[0].get_solution(problem, near) if early else None
-        solved = solved or batch(problem, near.states, near.select_nodes(problem), progress=progress)
-        seconds = time.perf_counter() - began  # what was waited for, and includes the attempts before
-        last = min(solved.timings["covariances"], seconds)
-        timings = {**forward.solution.timings, "batch": seconds - last, "covariances": last}
-        out["batch"] = replace(solved, timings=timings)
+        solved = batch(problem, near.states, near.select_nodes(problem), progress=progress)
+        seconds = {"batch": solved.timings["batch"] + time.perf_counter() - began - sum(solved.timings.values())}
+        # includes the attempts before
+        out["batch"] = replace(solved, timings={**forward.solution.timings, **solved.timings, **seconds})
     begin = found.aligned.state if found.diverged else None
     if "incremental" in solvers:
         from graphnav.estimation.solvers.incremental import incremental

@@ -57,7 +57,6 @@ from graphnav.recording import Recording
 # whether the evidence of a noise model is wanted, by the problem and the points of its estimate
 Weigh = Callable[[Problem, Points], bool]
 
-Begin = Callable[[Problem, Points], None]
 _MOST_WRONG = 0.5  # share of excluded fixes, beyond which the start is wrong rather than the fixes
 
 
@@ -95,7 +94,6 @@ def prepare(
     noise: NoiseModel | None = None,
     progress: Progress | None = None,
     weigh: Weigh | None = None,
-    begin: Begin | None = None,
 ) -> Prepared:
     """Align a recording, build its problem and find its noise model.
 
@@ -104,8 +102,6 @@ def prepare(
     detections : where the platform stands.
     noise : used as it is; when None it is estimated, or stated, according to the settings.
     weigh : whether the evidence of a noise model that is estimated is wanted; never when None.
-    begin : called with the problem that all solvers will get, but for the noise in what scale errors multiply, and
-        points near its optimum, where these are known before the filter runs.
 
     Raises
     ------
@@ -128,7 +124,6 @@ def prepare(
         noise, spacing = STATED, STATED.spacing
     builder = every.use_spaced(recording, spacing)
     built, evidence = builder.build(aligned, detections, parts=larger or noise != STATED), np.inf
-    near: Points | None = None
     if not as_stated:
         with contextlib.suppress(*BREAKDOWN):
             gaps, count = find_filled_gaps(apply_noise(built.problem, STATED), aligned.until)
@@ -140,16 +135,13 @@ def prepare(
     if noise is None:
         tell("noise")
         with clock.count_time("noise"):
-            noise, built, evidence, near = _find_noise(builder, built, progress, passes, weigh)
+            noise, built, evidence = _find_noise(builder, built, progress, passes, weigh)
             noise = replace(noise, spacing=spacing)
     else:
         built = builder.build_without(built, noise, parts=noise != STATED, anew=bool(noise.freed))
         built = replace(built, problem=free(built.problem, noise.freed))
     aligned = built.aligned
     problem = drop_parts(apply_noise(built.problem, noise))
-    same = built.carriers is None and all(rows.gate is None for rows in problem.constraints)
-    if begin is not None and near is not None and same:
-        begin(problem, near)
     try:
         forward, smoothed = _filter_and_smooth(problem, aligned.until, None, clock, progress)
     except EstimationError:  # from a rough start its first pass may diverge
@@ -214,9 +206,9 @@ def _find_noise(
     passes: Counter[str],
     weigh: Weigh | None,
     first: int = 1,
-) -> tuple[NoiseModel, BuiltProblem, float, Points]:
-    """The noise model, the problem with a start and stops that rest on no excluded fix, the logarithm of the evidence
-    where it is wanted, and points near the problem's optimum.
+) -> tuple[NoiseModel, BuiltProblem, float]:
+    """The noise model, the problem with a start and stops that rest on no excluded fix, and the logarithm of the
+    evidence where it is wanted.
 
     Of stops that the other measurements contradict, the first are dropped, twice as many each time, and all is found
     anew.
@@ -261,8 +253,7 @@ def _find_noise(
             noise, spent = weigh_excluded(built.problem, noise, best.get_linearisation(built.problem))
             passes.update(filter=spent, smoother=spent)
     spans = tuple((float(begin), float(end)) for begin, end in builder.false_stops)
-    near = best.carry_points(built.problem, apply_noise(built.problem, noise))
-    return replace(noise, false_stops=spans), built, evidence, near
+    return replace(noise, false_stops=spans), built, evidence
 
 
 def _start_without(

@@ -64,21 +64,8 @@ def batch(
     allows intervals to be integrated again when the gyro bias moves far. `watch` sees each undamped step
     before it is made, and what it raises ends the iterations.
     """
-    return describe_optimum(problem, find_optimum(problem, start, values, progress, wanted, reintegrate, watch))
-
-
-def find_optimum(
-    problem: Problem,
-    start: States,
-    values: Mapping[str, Array] | None = None,
-    progress: Progress | None = None,
-    wanted: tuple[int, ...] | None = None,
-    reintegrate: bool = True,
-    watch: Callback | None = None,
-) -> Optimum:
-    """The optimum of a problem, and its covariances; the arguments are those of `batch`."""
-    began, given = time.perf_counter(), problem
-    points = make_points(problem, start, spread_nodes(problem, values or {}))
+    began = time.perf_counter()
+    points, notes = make_points(problem, start, spread_nodes(problem, values or {})), []
     if any(c.robust in REDESCENDING and c.robust != "gnc" for c in problem.constraints):
         # a redescending kernel ignores rows far from the start; Cauchy's keeps some of their influence and leads there
         rows = (replace(c, robust="cauchy") if c.robust in REDESCENDING else c for c in problem.constraints)
@@ -97,17 +84,7 @@ def find_optimum(
     unknown = np.full((DIM, DIM), np.nan)
     covariance = np.stack([marginal.get(k, unknown) for k in range(layout.K)])
     sigma = layout.unpack([np.sqrt(np.diagonal(marginal.get(key, unknown))) for key in layout.keys])[:, DIM:]
-    timings = {"batch": solved - began, "covariances": time.perf_counter() - solved}
-    changed = None if problem is given else problem
-    return Optimum(
-        changed, points, covariance, sigma, found.cost, found.iterations, found.stopped, found.notes, timings
-    )
-
-
-def describe_optimum(problem: Problem, found: Optimum) -> Solution:
-    """The solution of a problem by its optimum."""
-    problem, points = found.changed or problem, found.points
-    records, notes = {}, []
+    done, records = time.perf_counter(), {}
     for constraint in problem.constraints:
         record = records[constraint.name] = record_residuals(problem, constraint, points, robust=True)
         if constraint.robust != "none" and np.mean(record.weight < 0.1) > 0.5:
@@ -118,24 +95,10 @@ def describe_optimum(problem: Problem, found: Optimum) -> Solution:
                 )
             )
     return make_solution(
-        problem, "batch", points, found.covariance, found.sigma, smooth=True, notes=(*found.notes, *notes),
-        records=records, iterations=found.iterations, cost=found.cost, stopped=found.stopped, timings=found.timings,
+        problem, "batch", points, covariance, sigma, smooth=True, notes=(*found.notes, *notes), records=records,
+        iterations=found.iterations, cost=found.cost, stopped=found.stopped,
+        timings={"batch": solved - began, "covariances": done - solved},
     )  # fmt: skip
-
-
-@dataclass(frozen=True)
-class Optimum:
-    """The optimum of a problem, without what a process that has the problem can compute from it soon."""
-
-    changed: Problem | None  # the problem with intervals integrated about other biases, where some are
-    points: Points
-    covariance: Array  # (K, 15, 15) of the states
-    sigma: Array  # (K, D-15) of parameters
-    cost: float
-    iterations: int
-    stopped: str
-    notes: tuple[str, ...]
-    timings: dict[str, float]  # s by stage
 
 
 @dataclass(frozen=True)
