@@ -1,49 +1,69 @@
-"""Checks of a recording, beside the loading of the solvers."""
+"""Checks of a recording beside the first stages of solving, and the loading of the solvers."""
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
-from dataclasses import is_dataclass
 from functools import partial
 from typing import TYPE_CHECKING
 
-import numpy as np
-
-from graphnav.core.beside import Beside, Done, begin_beside
+from graphnav.core.beside import begin_beside
 from graphnav.core.findings import Finding
 from graphnav.core.memory import pause_collector
+from graphnav.core.progress import Progress
 from graphnav.recording import Recording
 
 if TYPE_CHECKING:
     from graphnav.recording.plausibility.screening import Screened
 
-    Checked = tuple[Screened, tuple[Finding, ...]]
+
+class Checks:
+    """All checks of a recording that was screened, begun beside what follows."""
+
+    def __init__(self, recording: Recording, screened: Screened) -> None:
+        self._screened, self.seconds = screened.recording, 0.0  # that were waited for them
+        self._work, self._awaited = begin_beside(partial(_check, recording, screened)), False
+
+    def get_findings(self) -> tuple[Finding, ...]:
+        """Wait for all findings.
+
+        Raises
+        ------
+        RecordingError
+            If the recording cannot be solved.
+        """
+        from graphnav.recording.plausibility.screening import refuse
+
+        began = time.perf_counter()
+        findings = self._work.get_result()
+        self.seconds += time.perf_counter() - began
+        self._awaited = True
+        refuse(self._screened, findings)
+        return findings
+
+    def await_before(self, stage: str, progress: Progress | None) -> Progress:
+        """`progress`, and a recording that cannot be solved is refused at this stage at the latest."""
+
+        def listen(now: str, share: float) -> None:
+            if now == stage and not self._awaited:
+                self.get_findings()
+            if progress is not None:
+                progress(now, share)
+
+        return listen
 
 
-def begin_checks(recording: Recording) -> Beside[Checked] | Done[Checked]:
-    """Begin to screen and check a recording: what `screen` makes of it, and all findings."""
-    return begin_beside(partial(_check, recording), _list_parts(recording))
-
-
-def _check(recording: Recording) -> tuple[Screened, tuple[Finding, ...]]:
+def _check(recording: Recording, screened: Screened) -> tuple[Finding, ...]:
     from graphnav.recording.checks.overview import inspect
-    from graphnav.recording.plausibility.screening import screen
 
-    screened = screen(recording)
-    return screened, inspect(recording, screened).findings
-
-
-def _list_parts(recording: Recording) -> list[object]:
-    """Sensors and their arrays, of which most are sound and stay as they are."""
-    sensors = [one for one in vars(recording).values() if is_dataclass(one)]
-    return [*sensors, *(value for one in sensors for value in vars(one).values() if isinstance(value, np.ndarray))]
+    return inspect(recording, screened).findings
 
 
 def load_solvers(solvers: Sequence[str]) -> None:
-    """Import what solvers need, and load what is compiled; it takes as long as the checks."""
+    """Import what solvers need, and load what is compiled; it takes as long as reading an hour."""
     with pause_collector():
         import graphnav.estimation.pipeline
-        from graphnav.estimation.solvers.recursion import load_compiled
+        from graphnav.estimation.solvers.disturbance import load_compiled
 
         if "batch" in solvers:
             import graphnav.estimation.factor_graph.batch  # noqa: F401

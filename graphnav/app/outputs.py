@@ -6,6 +6,7 @@ import os
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
@@ -107,15 +108,17 @@ def write_comparison_files(outcome: Outcome, folder: Path, pages: bool = True) -
     """
     from graphnav.evaluation.metrics import write_comparison_csv
 
-    provenance = gather_provenance(outcome)
     detectors = None
-    if pages:
-        from graphnav.report import documents as report
-        from graphnav.report.page import read_library
+    with ThreadPoolExecutor(1) as beside:
+        if pages:
+            from graphnav.report import documents as report
+            from graphnav.report.page import read_library
 
-        detectors = report.draw_detectors(outcome.recording, next(iter(outcome.solutions.values())))
-        with suppress(ConfigError):  # each page says what is missing
-            read_library()  # once, before there are two processes
+            library = beside.submit(read_library)  # once, before there are two processes
+            detectors = report.draw_detectors(outcome.recording, next(iter(outcome.solutions.values())))
+            with suppress(ConfigError):  # each page says what is missing
+                library.result()
+        provenance = gather_provenance(outcome)
     first, *others = select_own(outcome.solutions)
 
     def write(names: Sequence[str]) -> dict[Path, str]:

@@ -9,17 +9,19 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from graphnav.app.checking import begin_checks, load_solvers
+from graphnav.app.checking import Checks, load_solvers
 from graphnav.app.scores import Withheld, score
 from graphnav.app.withholding import shift_spans, withhold
 from graphnav.config import Settings
 from graphnav.constraints.antenna_motion import LEVER_ARM
 from graphnav.constraints.base import SAME_TIME
+from graphnav.core.beside import Later, begin_beside
 from graphnav.core.errors import ConfigError, EstimationError, RecordingError
 from graphnav.core.findings import Finding
 from graphnav.core.memory import return_memory
@@ -34,8 +36,10 @@ from graphnav.recording.exporters import check_names
 
 if TYPE_CHECKING:
     from graphnav.evaluation.metrics import Metrics
+    from graphnav.recording.plausibility.screening import ScreenedRows
 
 
+_SOLVING = "preintegration"  # the stage at which a recording that cannot be solved is refused at the latest
 LOOSE = "-loose"  # suffix of the name of a solution from fixes in place of raw observations
 
 
@@ -156,27 +160,18 @@ def run_request(request: Request, progress: Progress | None = None) -> Outcome:
 
 def _solve_request(request: Request, progress: Progress | None) -> Outcome:
     from graphnav.recording.checks.stated import is_truth_apart
-    from graphnav.recording.formats import read
-    from graphnav.recording.plausibility.screening import refuse
+    from graphnav.recording.plausibility.screening import refuse, screen
 
-    timings: dict[str, float] = {}
-    with _measure_time(timings, "reading"):
-        whole = read(request.source, request.topics, request.allow_outside, request.format)
-    check_names(request.exported, whole.gps_zero)
-    if request.point == "antenna" and whole.gnss is None:
-        raise ConfigError("--point antenna: the recording has no GNSS", key="option.point")
-    recording = _crop(whole, request)
-    zero = recording.start - whole.start if recording is not whole else 0.0
-    moved = shift_spans(request.withheld, zero)
+    tell("reading")
+    reading = begin_beside(partial(_read_and_screen, request))
+    load_solvers(request.solvers)  # which takes as long
+    recording, rows, zero, timings = reading.get_result()
     with _measure_time(timings, "checks"):
-        checking = begin_checks(recording)
-    load_solvers(request.solvers)  # which takes as long as the checks
-    with _measure_time(timings, "checks"):
-        screened, found = checking.get_result()
-        refuse(screened.recording, found)
-    recording = screened.recording
+        screened = screen(recording, rows)
+        refuse(screened.recording, screened.findings)
+        checks = Checks(recording, screened)
+    recording, moved = screened.recording, shift_spans(request.withheld, zero)
     used, notes = withhold(recording, moved, zero)
-    findings = [f.sentence for f in found]
     if is_truth_apart(recording):
         recording = replace(recording, truth=None)
 
@@ -190,9 +185,15 @@ def _solve_request(request: Request, progress: Progress | None) -> Outcome:
             f"--loose: '{used.name}' has no raw observations that are used in place of fixes", key="option.not_here"
         )
     try:
-        solutions = run(used, request.settings, request.solvers, progress, model)
-    except EstimationError as error:
-        raise _name_cause(error, found) from None
+        solutions = run(used, request.settings, request.solvers, checks.await_before(_SOLVING, progress), model)
+    except Exception as error:  # where the recording cannot be solved, that comes first
+        found = checks.get_findings()
+        if isinstance(error, EstimationError):
+            raise _name_cause(error, found) from None
+        raise
+    found = checks.get_findings()
+    timings["checks"] += checks.seconds
+    findings = [f.sentence for f in found]
     if request.loose:
         others = run(used, couple_loosely(request.settings), request.solvers, progress, model)
         solutions |= {name + LOOSE: replace(one, solver=name + LOOSE) for name, one in others.items()}
@@ -202,9 +203,11 @@ def _solve_request(request: Request, progress: Progress | None) -> Outcome:
     solutions = {
         name: replace(s, timings={**timings, **s.timings}, notes=(*notes, *s.notes)) for name, s in solutions.items()
     }
+    known = _mitigate(found, solutions)
+    look = partial(_find_wrong_arms, used, known, dict(solutions))
+    looking = begin_beside(look) if request.judge_arms else Later(look)  # which takes a second
     solutions |= _read_others(request, recording, solutions)
-    seconds: dict[str, float] = {}
-    with _measure_time(seconds, "evaluation"):
+    with _measure_time(timings, "evaluation"):
         try:
             metrics, against, names = score(recording, used, solutions, moved)
         except RecordingError as error:
@@ -220,23 +223,27 @@ def _solve_request(request: Request, progress: Progress | None) -> Outcome:
             shared = all(note in other.notes for other in metrics.values())
             findings.append(note if shared else Note(get_key(note), f"{name}: {note}"))
     errors = {name: one.errors for name, one in metrics.items() if one.errors is not None}
-    checks = _mitigate(found, solutions)
-    if request.judge_arms or list_doubts(solutions, errors):  # which takes a second
-        from graphnav.estimation.antenna import find_wrong_arms
-
-        arms = find_wrong_arms(used, checks, list(select_own(solutions).values())[-1].graphs)
-        # the stated lever arm is not used
-        if any(LEVER_ARM in one.noise.freed for one in select_own(solutions).values()):
-            arms = [f for f in arms if not f.key.startswith("gnss.")]
-        checks = (*arms, *checks)
-        findings = [*(f.sentence for f in checks), *findings]
+    if request.judge_arms or list_doubts(solutions, errors):
+        known = (*looking.get_result(), *known)
+        findings = [*(f.sentence for f in known), *findings]
     densities = _find_densities(used, request.settings, solutions)
     if in_parts:
         return_memory()
     return Outcome(
         request, recording, zero, solutions, metrics, against, names, tuple(dict.fromkeys(findings)),
-        tuple(f.sentence for f in checks if f.severity != "note"), timings | seconds, checks, densities,
+        tuple(f.sentence for f in known if f.severity != "note"), timings, known, densities,
     )  # fmt: skip
+
+
+def _find_wrong_arms(
+    used: Recording, known: tuple[Finding, ...], solutions: Mapping[str, Solution]
+) -> tuple[Finding, ...]:
+    """Lever arms that the drive contradicts, other than those that are not used as stated."""
+    from graphnav.estimation.antenna import find_wrong_arms
+
+    arms = find_wrong_arms(used, known, list(solutions.values())[-1].graphs)
+    freed = any(LEVER_ARM in one.noise.freed for one in solutions.values())
+    return tuple(f for f in arms if not (freed and f.key.startswith("gnss.")))
 
 
 def _mitigate(findings: tuple[Finding, ...], solutions: Mapping[str, Solution]) -> tuple[Finding, ...]:
@@ -334,6 +341,25 @@ def read_part(
     part = _crop(whole, Request(source, (), start=start, end=end))
     zero = part.start - whole.start if part is not whole else 0.0
     return withhold(part, shift_spans(withheld, zero), zero)[0]
+
+
+def _read_and_screen(request: Request) -> tuple[Recording, ScreenedRows, float, dict[str, float]]:
+    """The requested part of the recording, as read and its rows screened, its start from that of the whole, s, and
+    timings.
+    """
+    from graphnav.recording.formats import read
+    from graphnav.recording.plausibility.screening import screen_rows
+
+    timings: dict[str, float] = {}
+    with _measure_time(timings, "reading"):
+        whole = read(request.source, request.topics, request.allow_outside, request.format)
+    check_names(request.exported, whole.gps_zero)
+    if request.point == "antenna" and whole.gnss is None:
+        raise ConfigError("--point antenna: the recording has no GNSS", key="option.point")
+    part = _crop(whole, request)
+    with _measure_time(timings, "checks"):
+        rows = screen_rows(part)
+    return part, rows, part.start - whole.start if part is not whole else 0.0, timings
 
 
 @contextmanager

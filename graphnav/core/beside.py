@@ -8,17 +8,16 @@ Linux with a second processor, and while this process is small. Elsewhere the sa
 from __future__ import annotations
 
 import ctypes
-import io
 import os
 import pickle
 import signal
 import sys
 import warnings
 import weakref
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
-from typing import IO, Generic, TypeVar
+from functools import cached_property
+from typing import Generic, TypeVar
 
 from graphnav.core.memory import read_peak_memory_mb
 from graphnav.core.progress import send_progress
@@ -35,36 +34,35 @@ def allow_second_process() -> None:
     _allowed = True
 
 
-def begin_beside(work: Callable[[], T], shared: Sequence[object] = ()) -> Beside[T] | Done[T]:
-    """Begin some work in a second process; where there is to be none, do it at once.
-
-    Parameters
-    ----------
-    shared : what the result may contain and need not be sent, because this process has it.
-    """
+def begin_beside(work: Callable[[], T]) -> Beside[T] | Later[T]:
+    """Begin some work in a second process; where there is to be none, it is done when its result is wanted."""
     several = sys.platform == "linux" and len(os.sched_getaffinity(0)) > 1
     if _allowed and several and read_peak_memory_mb() < _LARGEST:
         with suppress(OSError):  # no more processes, files or memory
-            return Beside(work, shared)
-    return Done(work())
+            return Beside(work)
+    return Later(work)
 
 
-@dataclass(frozen=True)
-class Done(Generic[T]):
-    """Work that is done."""
+class Later(Generic[T]):
+    """Work that is done when its result is wanted first."""
 
-    result: T
+    def __init__(self, work: Callable[[], T]) -> None:
+        self._work = work
+
+    @cached_property
+    def _result(self) -> T:
+        return self._work()
 
     def get_result(self) -> T:
         """The result."""
-        return self.result
+        return self._result
 
 
 class Beside(Generic[T]):
     """Work that a second process has begun; it ends with this object, or with this process."""
 
-    def __init__(self, work: Callable[[], T], shared: Sequence[object] = ()) -> None:
-        self._work, self._shared = work, shared
+    def __init__(self, work: Callable[[], T]) -> None:
+        self._work = work
         end, begin = os.pipe()
         with warnings.catch_warnings():  # of other threads, which hold no lock that the work needs
             warnings.simplefilter("ignore", DeprecationWarning)
@@ -75,9 +73,10 @@ class Beside(Generic[T]):
                 os.close(begin)
                 raise
         if not process:
-            _work_and_exit(work, shared, begin)
+            _work_and_exit(work, begin)
         os.close(begin)
         self._end = end
+        self._found: tuple[T, Exception | None]
         self._stop = weakref.finalize(self, _stop, process, end)
 
     def get_result(self) -> T:
@@ -85,41 +84,21 @@ class Beside(Generic[T]):
 
         If the process was killed, the work is done in this one.
         """
-        if not self._stop.alive:
-            return self._result
-        parts = []
-        while part := os.read(self._end, 1 << 20):
-            parts.append(part)
-        self._stop()
-        try:
-            result, error = _Unpickler(b"".join(parts), self._shared).load()  # of a process of our own
-        except (EOFError, pickle.UnpicklingError):
-            result, error = self._work(), None
+        if self._stop.alive:
+            try:
+                with os.fdopen(self._end, "rb", closefd=False) as pipe:
+                    self._found = pickle.load(pipe)  # of a process of our own, and never twice in memory
+            except Exception:  # it was killed, or this is not to be sent
+                self._stop()
+                self._found = self._work(), None
+            self._stop()
+        result, error = self._found
         if error is not None:
             raise error
-        self._result: T = result
-        return self._result
+        return result
 
 
-class _Pickler(pickle.Pickler):
-    def __init__(self, file: IO[bytes], shared: Sequence[object]) -> None:
-        super().__init__(file, protocol=5)
-        self._place = {id(one): place for place, one in enumerate(shared)}
-
-    def persistent_id(self, one: object) -> int | None:
-        return self._place.get(id(one))
-
-
-class _Unpickler(pickle.Unpickler):
-    def __init__(self, content: bytes, shared: Sequence[object]) -> None:
-        super().__init__(io.BytesIO(content))
-        self._shared = shared
-
-    def persistent_load(self, place: int) -> object:
-        return self._shared[place]
-
-
-def _work_and_exit(work: Callable[[], object], shared: Sequence[object], begin: int) -> None:
+def _work_and_exit(work: Callable[[], object], begin: int) -> None:
     """Work, write the result into a pipe, and end without anything that this process has registered for its end."""
     try:
         signal.signal(signal.SIGINT, signal.SIG_DFL)  # the other one says that it was interrupted
@@ -131,7 +110,7 @@ def _work_and_exit(work: Callable[[], object], shared: Sequence[object], begin: 
             except Exception as error:
                 found = None, error
         with os.fdopen(begin, "wb") as pipe:
-            _Pickler(pipe, shared).dump(found)
+            pickle.dump(found, pipe, protocol=5)
     finally:
         os._exit(0)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.special import gammaincinv  # importing scipy.stats would take a second
 
 from graphnav.core.rotation import Array
 
@@ -52,4 +51,6 @@ def chi_square_band(dof: int, n: float, outside: float = 0.05) -> tuple[float, f
 
 def chi_square_quantile(probability: float, dof: float) -> float:
     """The quantile of the chi-square distribution (inverse of the regularised incomplete gamma function)."""
+    from scipy.special import gammaincinv  # which takes a fifth of a second to import, and scipy.stats a second
+
     return 2.0 * float(gammaincinv(0.5 * dof, probability))

@@ -14,7 +14,7 @@ import numpy as np
 from graphnav.config import Settings
 from graphnav.constraints.ambiguities import CarrierRows
 from graphnav.constraints.raw_phase import GnssPhase
-from graphnav.core.beside import Beside, Done
+from graphnav.core.beside import Beside, Later
 from graphnav.core.earth import LocalFrame
 from graphnav.core.errors import EstimationError
 from graphnav.core.progress import tell
@@ -75,7 +75,7 @@ class ProblemBuilder:
     settings: Settings
     frame: LocalFrame
     clock: Clock
-    averaging: Beside[MeanSpeed | None] | Done[MeanSpeed | None]  # the odometer's
+    averaging: Beside[MeanSpeed | None] | Later[MeanSpeed | None]  # the odometer's
     false_stops: Array = field(
         default_factory=lambda: NONE
     )  # (n, 2) s, in which the platform moves, whatever the detectors say

@@ -7,13 +7,14 @@ import signal
 import sys
 import time
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from graphnav.core import beside
-from graphnav.core.beside import Beside, Done, allow_second_process, begin_beside
-from graphnav.core.errors import RecordingError
+from graphnav.core.beside import Beside, Later, allow_second_process, begin_beside
+from graphnav.core.errors import PartlyWrittenError, RecordingError
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="a second process is begun on Linux only")
 
@@ -28,18 +29,18 @@ def two_processors(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
         os.waitpid(-1, os.WNOHANG)
 
 
-def test_it_is_done_at_once_unless_allowed() -> None:
+def test_it_is_done_here_unless_allowed() -> None:
     assert begin_beside(os.getpid).get_result() == os.getpid()
 
 
 @pytest.mark.parametrize(("processors", "mb"), [({0}, 100.0), ({0, 1}, 5000.0)])
-def test_it_is_done_at_once_without_a_processor_or_memory(
+def test_it_is_done_here_without_a_processor_or_memory(
     processors: set[int], mb: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     allow_second_process()
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: processors)
     monkeypatch.setattr(beside, "read_peak_memory_mb", lambda: mb)
-    assert isinstance(begin_beside(os.getpid), Done)
+    assert isinstance(begin_beside(os.getpid), Later)
 
 
 def test_it_is_done_here_where_the_system_has_no_more_processes(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -61,15 +62,6 @@ def test_large_results_come_back() -> None:
     np.testing.assert_array_equal(found, 2.0 * numbers)
 
 
-def test_what_both_have_is_not_sent() -> None:
-    allow_second_process()
-    own, other = np.arange(3.0), np.arange(3.0)
-    found = begin_beside(lambda: {"own": own, "other": other}, [own]).get_result()
-    assert found["own"] is own
-    assert found["other"] is not other
-    np.testing.assert_array_equal(found["other"], other)
-
-
 def test_an_error_is_raised_where_the_result_is_wanted() -> None:
     allow_second_process()
 
@@ -80,6 +72,21 @@ def test_an_error_is_raised_where_the_result_is_wanted() -> None:
     with pytest.raises(RecordingError, match="no GNSS") as caught:
         work.get_result()
     assert caught.value.key == "gnss.none"
+    with pytest.raises(RecordingError, match="no GNSS"):
+        work.get_result()
+
+
+def test_what_is_not_to_be_sent_is_done_here() -> None:
+    allow_second_process()
+    assert begin_beside(lambda: lambda: 2.0).get_result()() == 2.0
+    missing = (Path("a"),)
+
+    def fail() -> None:
+        raise PartlyWrittenError("one is missing", key="output.partly_written", missing=missing)
+
+    with pytest.raises(PartlyWrittenError) as caught:
+        begin_beside(fail).get_result()
+    assert caught.value.missing == missing
 
 
 def test_where_the_process_is_killed_the_work_is_done_here() -> None:

@@ -13,7 +13,7 @@ from helpers import refused
 from scipy.special import chdtri
 
 from graphnav.config import Settings, parse_settings
-from graphnav.core.beside import Done
+from graphnav.core.beside import Later
 from graphnav.core.earth import LocalFrame
 from graphnav.core.errors import ConfigError
 from graphnav.core.rotation import Array
@@ -403,7 +403,7 @@ def test_disturbed_intervals_stand_only_with_more_evidence() -> None:
     recording = moved(recording, np.flatnonzero(burst), np.array([29.0, 25.0, 16.0]))
     settings = parse_settings({})
     frame = LocalFrame(choose_origin(recording))
-    every = ProblemBuilder(recording, recording, settings, frame, Clock(), Done(None))
+    every = ProblemBuilder(recording, recording, settings, frame, Clock(), Later(lambda: None))
     detections = detect(recording, settings)
     base = every.build(every.align(recording, detections.stationary), detections, parts=True).problem
     found = estimate_without_faults(base, estimate_noise(base))

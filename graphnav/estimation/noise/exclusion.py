@@ -47,9 +47,11 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
+from graphnav.core.beside import begin_beside
 from graphnav.estimation.faults.watch import FALSE_ALARM, PATIENCE
 from graphnav.estimation.noise.apply import apply_noise, select_weights
 from graphnav.estimation.noise.decision import (
@@ -202,6 +204,8 @@ def decide_faults(base: Problem, found: NoiseEstimate) -> Decision:
     base : built with stated noise.
     found : estimated with all measurements.
     """
+    medians = {name: replace(figure, log_factor=figure.prior) for name, figure in found.noise.figures.items()}
+    masking = begin_beside(partial(find_suspects, base, NoiseModel(medians), found))
     suspects = find_suspects(base, found.robust or found.noise, found)
     first = explain(base, found, suspects)
     segments, spent = find_segments(base, found, suspects)
@@ -210,8 +214,7 @@ def decide_faults(base: Problem, found: NoiseEstimate) -> Decision:
         other = explain(base, found, segments, least=first.log_evidence)
         passes = passes + other.passes
         first = replace(other, rival=first) if other.log_evidence > first.log_evidence else first
-    medians = {name: replace(figure, log_factor=figure.prior) for name, figure in found.noise.figures.items()}
-    masked = find_suspects(base, NoiseModel(medians), found)
+    masked = masking.get_result()
     first = replace(first, passes=passes + Counter(filter=2))
     excluded = join(span for kind in FIXES for span in first.noise.excluded.get(kind, ()))
     return first if are_covered(masked, excluded) else _unmask(base, found, first, masked)

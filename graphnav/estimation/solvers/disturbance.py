@@ -11,7 +11,7 @@ import numpy as np
 from graphnav.core.compiled import compile_once
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, MOVING
-from graphnav.estimation.solvers.recursion import Arrays
+from graphnav.estimation.solvers.recursion import Arrays, filter_rows, smooth_filtered
 
 
 @compile_once
@@ -182,3 +182,13 @@ def cover_rows(P: Array, N: Array, H: Array, out: Array) -> None:
     for i in range(m):
         for j in range(m):
             out[i, j] = found[i, j]
+
+
+def load_compiled() -> None:
+    """Load the recursions that every solver needs, and Numba's own modules with them, by calls for no keyframes."""
+    v, m, c = (np.empty((0,) * n) for n in (1, 2, 3))
+    which, flags = np.empty(0, dtype=int), np.empty(0, dtype=bool)
+    blocks, updates, errors = (which, which, which, v, which, which), (c, c, m, c, flags, flags), (m, c, m, c)
+    filter_rows(0, 0, v, m, (c, m, m, c, m), (m, c, m, m), blocks, flags, errors, (c, m, m), updates, which)
+    smooth_rows(0, 0, v, m, (c, m), updates, blocks, errors, (m, m, c, m), (c, m, c), c, which, which)
+    smooth_filtered(0, 0, m, m, (c, m), c, c, c, m, which)

@@ -54,11 +54,6 @@ def move_columns(F: Array, decay: Array, X: Array) -> Array:
     return out
 
 
-def load_compiled() -> None:
-    """Load what the first call of a compiled function loads, half of it Numba's own modules."""
-    move_columns(np.zeros((DIM, DIM)), np.zeros(0), np.zeros((DIM, DIM)))
-
-
 @compile_once
 def predict_covariance(P: Array, F: Array, decay: Array, Q: Array, added: Array, out: Array) -> None:
     """The covariance (D, D) after a step, in `out`: with Q (15, 15) of the states and `added` (D-15) of parameters."""

@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import betainc
 
 from graphnav.core.rotation import Array, wrap
 from graphnav.recording import Imu, Odometer
@@ -200,6 +199,8 @@ def _search_shift(
     # a correlation that white rows would reach at one of so many lags is none
     trials = 2.0 * (_NEAR_CLOCKS if abs(lag) <= _NEAR_CLOCKS else reach)
     freedom = seconds - len(b) - 1
+    from scipy.special import betainc  # which takes a fifth of a second to import
+
     chance = betainc(0.5 * freedom, 0.5 * len(b), 1.0 - r * r) if freedom > 0 else 1.0
     return Fit(lag, spread, r if trials * chance < RARE else 0.0, b, seconds)
 

@@ -63,6 +63,9 @@ class Screened:
     yaw: Fit | None = None  # changes of course on the gyro, likewise
 
 
+ScreenedRows = tuple[Recording, list[Finding], list[Finding], Track | None]  # as of `screen_rows`
+
+
 def refuse(recording: Recording, findings: tuple[Finding, ...]) -> None:
     """Raise an error if a recording cannot be solved.
 
@@ -113,13 +116,15 @@ def state_findings(recording: Recording, findings: tuple[Finding, ...]) -> list[
     return [Note(f.key, f.sentence) for f in findings]
 
 
-def screen(recording: Recording) -> Screened:
+def screen(recording: Recording, rows: ScreenedRows | None = None) -> Screened:
     """Screen a recording for impossible rows.
 
     Parameters
     ----------
     recording
         As read; one that was screened before is returned as it is, without findings.
+    rows
+        By `screen_rows`, where they are known.
 
     Returns
     -------
@@ -128,7 +133,7 @@ def screen(recording: Recording) -> Screened:
     """
     if recording.screened:
         return Screened(recording)
-    recording, of_imu, of_aiding, track = _screen_rows(recording)
+    recording, of_imu, of_aiding, track = rows or screen_rows(recording)
     dead, clock = list(check_dead_axes(recording)), None
     yaw: Fit | None = None
     findings = [*of_imu, *dead, *of_aiding]
@@ -156,7 +161,7 @@ def screen(recording: Recording) -> Screened:
     return Screened(recording, tuple(findings), clock, yaw)
 
 
-def _screen_rows(recording: Recording) -> tuple[Recording, list[Finding], list[Finding], Track | None]:
+def screen_rows(recording: Recording) -> ScreenedRows:
     """The recording without impossible rows, findings on the IMU and on the others, and the track by the fixes."""
     of_imu: list[Finding] = list(check_imu_scale(recording))
     if not of_imu:  # where a unit is wrong throughout, single rows cannot be judged
