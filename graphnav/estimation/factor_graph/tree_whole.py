@@ -38,9 +38,9 @@ class WholeTree(Tree):
     def add(self, place: Place, ahead: Predicted | None = None, rows: Sequence[Measured] = ()) -> float:
         """As of `Tree`."""
         last = len(self) - 1
+        known = self._find_marginal(last) if len(self) else None  # a little at each, not all where it is needed
         if self.isam is self._all or last - self._begun >= _NEWEST:
-            variables, known = self._list_variables(last), self._find_marginal(last)
-            self.isam, self._begun = make_isam(), last
+            variables, self.isam, self._begun = self._list_variables(last), make_isam(), last
             update_isam(self.isam, place.t, fresh=[*((x, None) for x in variables[1:]), (variables[0], known)])
         self._factors.append({})
         self._fresh.append(())
@@ -83,7 +83,7 @@ class WholeTree(Tree):
     def _find_marginal(self, last: int) -> Any:
         """A factor of what a keyframe and all before it say of its variables."""
         begin = max(self._marginals, default=-1)
-        for before, k in pairwise([*range(begin, last, _NEWEST), last]):
+        for before, k in pairwise([begin, *(k for k in range(begin + 1, last) if k % _NEWEST == 0), last]):
             inside = {x.key: x for i in range(max(before, 0), k + 1) for x in self._list_variables(i)}
             graph = gtsam.GaussianFactorGraph()
             for i in range(before + 1, k + 1):
@@ -95,4 +95,6 @@ class WholeTree(Tree):
             gone = sorted((x for x in inside.values() if x.key not in stay), key=lambda x: x.last)
             left = graph.eliminatePartialSequential(fill_keys(gtsam.Ordering(), gone), gtsam.EliminateQR)[1]
             self._marginals[k] = gtsam.LinearContainerFactor(gtsam.JacobianFactor(left))
+            if before % _NEWEST:
+                self._marginals.pop(before, None)
         return self._marginals[last]
