@@ -78,7 +78,7 @@ class Chain:
         self.head = t0  # time of the message before the window, or of the first keyframe while it is in the window
         self.opened = False  # whether the first keyframe has left the window
         self.verdicts = Verdicts({}, {})  # mask of the fixes in use
-        self._standing = Stops()
+        self._standing = Stops(noise.false_stops)
         self._nodes: list[dict[str, float]] = []  # per stage, when each parameter's node began
         self._head_nodes: dict[str, float] = {}
         self._held: list[Held] = []  # per stage, integers of ambiguities

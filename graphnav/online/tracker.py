@@ -290,10 +290,12 @@ class Tracker(Chain):
         """A tracker with another noise model, with the settled states of this one and no keyframes since."""
         other, head = copy.copy(self), self.window.head
         other.noise, other._parameters, other.verdicts = noise, {}, copy.deepcopy(self.verdicts)
+        if moving := set(noise.false_stops) - set(self.noise.false_stops):
+            other.verdicts.readmit(min(moving)[0])
         other.window = type(self.window)(head.move(head.estimate), find_turn(setup, noise))
         other._nodes, other._held, other._motions, other.settled, other._ahead = [], [], {}, [], None
         other._settling = False
-        other._standing, other._readings = copy.copy(self._standing), copy.copy(self._readings)
+        other._standing, other._readings = self._standing.without(noise.false_stops), copy.copy(self._readings)
         other._readings.revised = False
         return other
 
@@ -306,7 +308,8 @@ class Tracker(Chain):
         """Take over detections and counts of another tracker, except the stops up to a time, which were detected
         anew; `settled` are its keyframes before its window, s.
         """
-        self._standing, self._readings = copy.copy(other._standing), copy.copy(other._readings)
+        self._standing = other._standing.without(self.noise.false_stops)
+        self._readings = copy.copy(other._readings)
         before, after = clip_spans(stationary, self.head, until - SURE), clip_spans(other.stops, until - SURE, np.inf)
         spans = merge_spans(np.concatenate([before, after]), gap=SAME_TIME)
         self._standing.replace(spans, np.concatenate([settled, other.times]))
@@ -315,7 +318,8 @@ class Tracker(Chain):
         """Remove the keyframes from a time on, where another tracker has redone them with different stops."""
         self._keep(len(self.window) - len(self.window.select_since(t - SAME_TIME)))
         self._motions = {end: one for end, one in self._motions.items() if end < t}
-        before, self._standing = clip_spans(self.stops, -np.inf, other.head), copy.copy(other._standing)
+        before = clip_spans(self.stops, -np.inf, other.head)
+        self._standing = other._standing.without(self.noise.false_stops)
         self._standing.add(before)
 
     def live(self, sensors: Sensors) -> Live:
