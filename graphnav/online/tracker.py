@@ -31,8 +31,8 @@ from graphnav.estimation.noise.apply import apply_noise
 from graphnav.estimation.noise.model import STATED, NoiseModel
 from graphnav.estimation.problem import Problem, build_problem
 from graphnav.estimation.solvers.elimination import Predicted
-from graphnav.estimation.solvers.stages import Place
-from graphnav.estimation.solvers.window import Message, SettledStates
+from graphnav.estimation.solvers.stages import Message, Place, forget_rows
+from graphnav.estimation.solvers.window import SettledStates
 from graphnav.imu.dynamics import ImuFactors
 from graphnav.imu.preintegration import preintegrate
 from graphnav.imu.samples import bridge_gaps
@@ -157,7 +157,7 @@ class Tracker(Chain):
     def _finish_keyframes(self) -> None:
         """Called when keyframes have entered."""
         self.in_force = {rows.name: len(rows.b) for rows in self.window.stages[-1].measured if rows.H.any()}
-        self._forget()
+        forget_rows(self.window.stages)
 
     def _go_back(self, sensors: Sensors, built: BuiltKeyframes, back: float) -> float:
         """Redo keyframes from a time on, in which a fault was found; returns the first that was redone, s."""
@@ -250,7 +250,7 @@ class Tracker(Chain):
     def _revise(self, sensors: Sensors, always: bool = False) -> bool:
         """Relinearise as much as one row permits; False once nothing is left to do."""
         more = self.window.revise(self.at_a_row, lambda *which: self._renew(sensors, *which), always)
-        self._forget()
+        forget_rows(self.window.stages)
         return more
 
     @property
@@ -284,7 +284,7 @@ class Tracker(Chain):
         self.settled.append(self._leave(count))
         self._ahead = None  # settled states may show that sigmas have changed
         self._motions = {t: one for t, one in self._motions.items() if t > self.head - CONTEXT}
-        self._forget()
+        forget_rows(self.window.stages)
 
     def restart_settled(self, noise: NoiseModel, setup: Recording) -> Tracker:
         """A tracker with another noise model, with the settled states of this one and no keyframes since."""
