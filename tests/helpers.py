@@ -264,3 +264,19 @@ def full_disk() -> dict[str, Any]:
     """
     limit = lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))  # noqa: E731
     return {"preexec_fn": limit, "env": {**os.environ, "PYTHONDONTWRITEBYTECODE": "1"}}
+
+
+def find_steady_motion(recording: Recording, seconds: float, slowest: float) -> Array:
+    """(2,) s, the span in which the speed of the truth changes least."""
+    truth = recording.truth
+    assert truth is not None
+    assert truth.llh is not None
+    inside = (truth.t > recording.start + 20.0) & (truth.t < recording.end - 20.0)
+    t, p = truth.t[inside], LocalFrame(truth.llh[0]).from_llh(truth.llh[inside])
+    every = max(round(1.0 / np.median(np.diff(t))), 1)
+    t, v = t[every::every], np.diff(p[::every], axis=0) / np.diff(t[::every])[:, None]
+    n = int(seconds)
+    scatter = [np.std(v[k : k + n], axis=0).max() for k in range(len(v) - n)]
+    slow = [np.linalg.norm(v[k : k + n], axis=1).min() < slowest for k in range(len(v) - n)]
+    k = int(np.argmin(np.where(slow, np.inf, scatter)))
+    return np.array([t[k] - 0.5, t[k] - 0.5 + seconds])

@@ -67,10 +67,16 @@ class Detections:
         if not len(spans):
             return self
         kept = subtract_spans(self.stationary, spans)
-        many = format_count(int(len(self.stationary) - len(kept)), "smooth stretch", "smooth stretches")
-        note = Note("detectors.contradicted", f"{many} not taken as a stop: the other measurements show motion")
+        notes = describe_false_stops(len(self.stationary) - len(kept))
         answers = (replace(d, intervals=kept, mask=mask_inside(d.t, kept)) if d.name == FUSED else d for d in self.all)
-        return Detections(kept, tuple(answers), (*self.notes, note))
+        return Detections(kept, tuple(answers), (*self.notes, *notes))
+
+
+def describe_false_stops(count: int) -> tuple[Note, ...]:
+    """A note on stationary spans in which the platform moves, if there are any."""
+    many = format_count(count, "smooth stretch", "smooth stretches")
+    words = f"{many} not taken as a stop: the other measurements show motion"
+    return (Note("detectors.contradicted", words),) if count else ()
 
 
 def find_spans(mask: Mask, t: Array, half: float = 0.0) -> Array:

@@ -25,7 +25,6 @@ from graphnav.core.notes import Note
 from graphnav.core.progress import Progress, tell
 from graphnav.core.rotation import Array
 from graphnav.detectors import Detections
-from graphnav.detectors.base import NONE, merge_spans
 from graphnav.estimation.alignment import Alignment, use_known_heading
 from graphnav.estimation.building import BuiltProblem, Clock, ProblemBuilder, has_diverged
 from graphnav.estimation.contradictions import describe_freed, free
@@ -36,7 +35,7 @@ from graphnav.estimation.noise.apply import apply_noise, drop_parts
 from graphnav.estimation.noise.bias_walks import estimate_bias_walks
 from graphnav.estimation.noise.chords import find_filled_gaps
 from graphnav.estimation.noise.estimate import NoiseEstimate, estimate_noise
-from graphnav.estimation.noise.false_stops import find_false_stops
+from graphnav.estimation.noise.false_stops import find_false_stops, leave_out_false_stops, unite_stops
 from graphnav.estimation.noise.initial_points import BREAKDOWN, find_initial_points
 from graphnav.estimation.noise.model import STATED, NoiseModel
 from graphnav.estimation.noise.span_variances import weigh_excluded
@@ -56,6 +55,8 @@ from graphnav.recording import Recording
 
 # whether the evidence of a noise model is wanted, by the problem and the points of its estimate
 Weigh = Callable[[Problem, Points], bool]
+
+_Estimated = tuple[BuiltProblem, JointEstimate]  # a problem and the estimate on it
 
 _MOST_WRONG = 0.5  # share of excluded fixes, beyond which the start is wrong rather than the fixes
 
@@ -205,14 +206,43 @@ def _find_noise(
     progress: Progress | None,
     passes: Counter[str],
     weigh: Weigh | None,
-    first: int = 1,
 ) -> tuple[NoiseModel, BuiltProblem, float]:
     """The noise model, the problem with a start and stops that rest on no excluded fix, and the logarithm of the
     evidence where it is wanted.
 
-    Of stops that the other measurements contradict, the first are dropped, twice as many each time, and all is found
-    anew.
+    Where the other measurements contradict stops, all is found anew without these.
     """
+
+    def judge(one: _Estimated) -> Array:
+        built, found = one
+        near = found.estimate.get_linearisation(found.base)
+        false, spent = find_false_stops(found.base, found.estimate.noise, near, built.detections.stationary)
+        passes.update(filter=spent)
+        return false
+
+    def estimate_without(before: _Estimated, false: Array) -> _Estimated:
+        moving = replace(builder, false_stops=false)
+        built, found = _estimate_with_start(moving, moving.build_moving(before[0]), progress)
+        return built, found.count(before[1].estimate.passes + found.estimate.passes)
+
+    one = _estimate_with_start(builder, built, progress)
+    (built, found), false = leave_out_false_stops(one, judge, estimate_without)
+    best, built = found.estimate, replace(built, problem=found.base)
+    wanted = weigh is not None and weigh(apply_noise(built.problem, best.noise), best.points)
+    found = found.weigh() if wanted else found
+    evidence = found.compute_evidence() if wanted else np.inf
+    passes.update(found.estimate.passes + Counter(filter=1))
+    plain = NoiseModel(excluded=best.noise.excluded, freed=found.freed)
+    noise = plain if _is_likelier(built.problem, plain, best) else found.noise
+    if noise.excluded:
+        with contextlib.suppress(*BREAKDOWN):
+            noise, spent = weigh_excluded(built.problem, noise, best.get_linearisation(built.problem))
+            passes.update(filter=spent, smoother=spent)
+    return replace(noise, false_stops=unite_stops(false)), built, evidence
+
+
+def _estimate_with_start(builder: ProblemBuilder, built: BuiltProblem, progress: Progress | None) -> _Estimated:
+    """The problem with a start and stops that rest on no excluded fix, and the estimate on it."""
     settings = builder.settings.gnss
     found = estimate_jointly(built.problem, settings, built.aligned.until, progress)
     if found.excluded_share > _MOST_WRONG:
@@ -229,31 +259,7 @@ def _find_noise(
     if found.noise.excluded:
         built, found = _start_without(builder, built, found, progress)
     found = revise_jointly(found, settings, built.aligned.until, progress)
-    if found.freed:
-        built, found = _start_anew(builder, built, found)
-    false = NONE
-    with contextlib.suppress(*BREAKDOWN):
-        false, spent = find_false_stops(found.base, found.estimate, built.detections.stationary)
-        passes.update(filter=spent)
-    if len(false):
-        passes.update(found.estimate.passes)
-        found = found.count(Counter())
-        moving = replace(builder, false_stops=merge_spans(np.concatenate([builder.false_stops, false[:first]])))
-        with contextlib.suppress(*BREAKDOWN):  # it may not be aligned without them
-            return _find_noise(moving, moving.build_moving(built), progress, passes, weigh, 2 * first)
-    best, built = found.estimate, replace(built, problem=found.base)
-    wanted = weigh is not None and weigh(apply_noise(built.problem, best.noise), best.points)
-    found = found.weigh() if wanted else found
-    evidence = found.compute_evidence() if wanted else np.inf
-    passes.update(found.estimate.passes + Counter(filter=1))
-    plain = NoiseModel(excluded=best.noise.excluded, freed=found.freed)
-    noise = plain if _is_likelier(built.problem, plain, best) else found.noise
-    if noise.excluded:
-        with contextlib.suppress(*BREAKDOWN):
-            noise, spent = weigh_excluded(built.problem, noise, best.get_linearisation(built.problem))
-            passes.update(filter=spent, smoother=spent)
-    spans = tuple((float(begin), float(end)) for begin, end in builder.false_stops)
-    return replace(noise, false_stops=spans), built, evidence
+    return _start_anew(builder, built, found) if found.freed else (built, found)
 
 
 def _start_without(

@@ -15,7 +15,8 @@ from graphnav.core.trajectory import Trajectory
 from graphnav.estimation.dense import Dense
 from graphnav.estimation.noise.model import NoiseModel
 from graphnav.estimation.solution import make_trajectory
-from graphnav.estimation.solvers.window import Message, SettledStates
+from graphnav.estimation.solvers.stages import Message
+from graphnav.estimation.solvers.window import SettledStates
 from graphnav.imu.dynamics import SCALE, ImuFactors, convert_to_biases
 from graphnav.imu.preintegration import NOISE_FIGURES, preintegrate
 from graphnav.imu.samples import bridge_gaps

@@ -36,8 +36,8 @@ from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import ExcludedSpan
 from graphnav.estimation.solvers.elimination import Predicted
 from graphnav.estimation.solvers.linearise import Points, Step
-from graphnav.estimation.solvers.stages import Place
-from graphnav.estimation.solvers.window import Message, SettledStates, Window, compute_turn_limit
+from graphnav.estimation.solvers.stages import Message, Place
+from graphnav.estimation.solvers.window import SettledStates, Window, compute_turn_limit
 from graphnav.imu.dynamics import ImuFactors
 from graphnav.imu.preintegration import NOISE_FIGURES
 from graphnav.online.looks import Stops
@@ -78,7 +78,7 @@ class Chain:
         self.head = t0  # time of the message before the window, or of the first keyframe while it is in the window
         self.opened = False  # whether the first keyframe has left the window
         self.verdicts = Verdicts({}, {})  # mask of the fixes in use
-        self._standing = Stops()
+        self._standing = Stops(noise.false_stops)
         self._nodes: list[dict[str, float]] = []  # per stage, when each parameter's node began
         self._head_nodes: dict[str, float] = {}
         self._held: list[Held] = []  # per stage, integers of ambiguities
@@ -298,14 +298,6 @@ class Chain:
         settled = self.window.settle(count)
         del self._nodes[:count], self._held[:count]
         return settled
-
-    def _forget(self) -> None:
-        """Drop the records of where the rows of stages come from; they are rebuilt when needed."""
-        stages = self.window.stages
-        for k in range(len(stages) - 1, -1, -1):
-            if stages[k].place.problem is None:
-                break  # nor for those before it
-            stages[k] = replace(stages[k], place=replace(stages[k].place, problem=None))
 
 
 def find_turn(setup: Recording, noise: NoiseModel) -> float:

@@ -6,13 +6,16 @@ next keyframe.
 
 from __future__ import annotations
 
+import copy
+from collections.abc import Sequence
+
 import numpy as np
 
 from graphnav.config import Settings
 from graphnav.constraints.base import SAME_TIME
 from graphnav.core.rotation import Array
 from graphnav.detectors import find_stops
-from graphnav.detectors.base import merge_spans
+from graphnav.detectors.base import merge_spans, subtract_spans
 from graphnav.online.sensors import Sensors
 from graphnav.recording.odometer import ReadingStatistics, find_wrong_readings
 
@@ -29,8 +32,11 @@ _WHEELS, _WHEELS_LOOK = 10.0, 40.0  # s between checks of the odometer, and s of
 class Stops:
     """Stops of the vehicle as far as the detectors have found them."""
 
-    def __init__(self) -> None:
+    def __init__(self, false: Sequence[tuple[float, float]] = ()) -> None:
         self.spans: Array = np.empty((0, 2))  # s, between keyframes
+        self._false = np.array(false).reshape(
+            -1, 2
+        )  # s, in order, spans in which the platform moves, whatever the detectors say
         self.looked = -np.inf  # s, up to where
         self._reviewed = -np.inf
         self._seen: tuple[float, Array | None] | None = None  # since when, and which; not yet in `spans`
@@ -53,6 +59,13 @@ class Stops:
         self.looked = now
         recording = sensors.make_recording(-np.inf if whole else now - _DETECTOR_SPAN, now, every=True)
         self._seen = since, find_stops(recording, settings, since, now - SURE, self.spans, answered)
+
+    def without(self, false: Sequence[tuple[float, float]]) -> Stops:
+        """The same with other false stops, in order and apart."""
+        other = copy.copy(self)
+        other._false = np.array(false).reshape(-1, 2)
+        other.spans = subtract_spans(self.spans, other._false)
+        return other
 
     def replace(self, spans: Array, edges: Array) -> None:
         """Replace the spans, cut to keyframes `edges`."""
@@ -77,7 +90,7 @@ class Stops:
         (since, found), self._seen = self._seen, None
         if found is None or (not len(found) and not len(self.spans)):
             return np.inf
-        edges = np.unique(edges)
+        edges, found = np.unique(edges), subtract_spans(found, self._false)
         spans = merge_spans(np.concatenate([clip_spans(self.spans, -np.inf, since), found]), gap=SAME_TIME)
         spans = spans[spans[:, 1] >= edges[0] - SAME_TIME] if len(spans) else spans
         aligned = []

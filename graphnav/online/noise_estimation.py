@@ -10,9 +10,10 @@ from __future__ import annotations
 
 import copy
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, replace
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -24,12 +25,14 @@ from graphnav.core.errors import EstimationError
 from graphnav.core.findings import Finding
 from graphnav.core.rotation import Array
 from graphnav.detectors import detect
+from graphnav.detectors.base import subtract_spans
 from graphnav.estimation.alignment import Alignment
 from graphnav.estimation.building import start_sigma
 from graphnav.estimation.contradictions import are_same, describe_freed, use_freed
 from graphnav.estimation.faults.excluded import find_fault_spans
-from graphnav.estimation.joint_estimate import estimate_jointly
+from graphnav.estimation.joint_estimate import JointEstimate, estimate_jointly
 from graphnav.estimation.noise.apply import apply_noise
+from graphnav.estimation.noise.false_stops import find_false_stops, leave_out_false_stops, unite_stops
 from graphnav.estimation.noise.model import NoiseModel
 from graphnav.estimation.noise.words import describe_noise
 from graphnav.estimation.problem import Problem, build_problem
@@ -59,7 +62,11 @@ class EstimationResult:
     excluded: tuple[ExcludedSpan, ...]  # spans that the noise model excludes
     doubts: tuple[Finding, ...]  # findings on units, axes and clocks
     start: Alignment
-    anew: bool  # whether constants are free, or no longer, that concern all states so far
+    anew: bool  # whether constants are free, or no longer, or the start is another: all states so far are concerned
+
+    def keep_false_stops(self, before: NoiseModel) -> NoiseModel:
+        """The noise model with the false stops of the one in use as well."""
+        return replace(self.noise, false_stops=unite_stops(before.false_stops, self.noise.false_stops))
 
 
 @dataclass(frozen=True)
@@ -75,6 +82,13 @@ class EstimationTask:
     unit: Array  # (3,) m, unit of the result for errors of the fixes over minutes and hours
     before: NoiseModel  # in use so far
 
+    def run(self) -> EstimationResult:
+        """As `run_estimation`."""
+        return run_estimation(self)
+
+
+_Estimated = tuple[Alignment, Array, JointEstimate]  # a start, stops (M, 2) s, and what is estimated with them
+
 
 def run_estimation(task: EstimationTask) -> EstimationResult:
     """Estimate the noise model.
@@ -84,25 +98,42 @@ def run_estimation(task: EstimationTask) -> EstimationResult:
     EstimationError
         If the rows do not determine it.
     """
-    settings, start = task.settings, task.found
-    try:
-        stationary = detect(task.every, settings).stationary
+    settings, before = task.settings, task.before
+
+    def estimate(start: Alignment, stationary: Array) -> JointEstimate:
         base = build_problem(
             task.recording, settings, task.frame, start.state, start_sigma(start), stationary, task.times,
             parts_of_noise=True,
         )  # fmt: skip
-        base = _share_horizontal_unit(base)
-        found = estimate_jointly(base, settings.gnss, start.until)
-        noise, before = found.noise, task.before.freed
-        anew = not are_same(noise.freed, before, base)
-        if anew:
+        return estimate_jointly(_share_horizontal_unit(base), settings.gnss, start.until)
+
+    def judge(one: _Estimated) -> Array:
+        _, stationary, found = one
+        near = found.estimate.get_linearisation(found.base)
+        return find_false_stops(found.base, found.estimate.noise, near, stationary)[0]
+
+    def estimate_without(one: _Estimated, false: Array) -> _Estimated:
+        start, stationary = one[0], subtract_spans(every, false)
+        if start.until is None or false[0, 0] < start.until:
+            start = _align_again(task, stationary, before)
+        return start, stationary, estimate(start, stationary)
+
+    try:
+        every = subtract_spans(detect(task.every, settings).stationary, np.array(before.false_stops).reshape(-1, 2))
+        one = task.found, every, estimate(task.found, every)
+        (start, stationary, found), false = leave_out_false_stops(one, judge, estimate_without)
+        noise, base = found.noise, found.stated
+        freed_anew = not are_same(noise.freed, before.freed, base)
+        if freed_anew:
             start = _align_again(task, stationary, noise)
         else:  # they are states already, and need no other prior
-            noise = replace(noise, freed=before)
+            noise = replace(noise, freed=before.freed)
+        anew = freed_anew or start is not task.found
         used = apply_noise(found.base, noise)
         words = (*describe_freed(noise.freed, task.recording), *describe_noise(noise, used))
         wrong = find_fault_spans(used)
         noise = _convert_unit(noise, base, task.unit)
+        noise = replace(noise, false_stops=unite_stops(before.false_stops, false))
         return EstimationResult(noise, words, stationary, wrong, check_rows(task.every), start, anew)
     except np.linalg.LinAlgError as error:
         raise EstimationError(str(error), key="solver.undetermined") from error
@@ -118,8 +149,15 @@ def _align_again(task: EstimationTask, stationary: Array, noise: NoiseModel) -> 
     return found if found.motion is not None else task.found
 
 
+class BackgroundTask(Protocol):
+    """Input of something that is estimated beside the drive."""
+
+    def run(self) -> Any:
+        """Estimate it."""
+
+
 class BackgroundEstimation:
-    """A noise estimation in a thread of its own, from a copy of its input.
+    """An estimation in a thread of its own, from a copy of its input.
 
     The copy keeps values computed at first use out of the input while a checkpoint is written.
     A checkpoint keeps the input; the estimation runs again on resuming.
@@ -129,25 +167,26 @@ class BackgroundEstimation:
     due : s, when the result is to be used.
     """
 
-    def __init__(self, task: EstimationTask, due: float) -> None:
-        self.task, self.due = task, due
-        self._result: Future[EstimationResult] = _start(run_estimation, copy.deepcopy(task))
+    def __init__(self, task: BackgroundTask, due: float) -> None:
+        self.task: Any = task
+        self.due = due
+        self._result: Future[Any] = _start(copy.deepcopy(task))
 
-    def wait(self) -> EstimationResult:
-        """Wait for the result, with the errors of `run_estimation`."""
+    def wait(self) -> Any:
+        """Wait for the result, with the errors of the estimation."""
         return self._result.result()
 
-    def __reduce__(self) -> tuple[type[BackgroundEstimation], tuple[EstimationTask, float]]:
+    def __reduce__(self) -> tuple[type[BackgroundEstimation], tuple[BackgroundTask, float]]:
         return BackgroundEstimation, (self.task, self.due)
 
 
-def _start(work: Callable[[EstimationTask], EstimationResult], task: EstimationTask) -> Future[EstimationResult]:
-    """Have work done in a thread that nothing waits for at the end of the program."""
-    out: Future[EstimationResult] = Future()
+def _start(task: BackgroundTask) -> Future[Any]:
+    """Run a task in a thread that nothing waits for at the end of the program."""
+    out: Future[Any] = Future()
 
     def do() -> None:
         try:
-            out.set_result(work(task))
+            out.set_result(task.run())
         except BaseException as error:  # reported by whoever asks for the result
             out.set_exception(error)
 
@@ -189,11 +228,16 @@ def start_estimation(
 ) -> BackgroundEstimation:
     """Start a noise estimation from the rows up to a time (s); `times` (K,) are the keyframes so far, s."""
     recording, every = (sensors.make_recording(-np.inf, until, all_of_them) for all_of_them in (False, True))
-    due = float(times[-1]) + min(_THINKING * settings.solver.lag, _LONGEST_THOUGHT)
+    due = float(times[-1]) + limit_thought(settings.solver.lag)
     settings = drop_ambiguities(settings, sensors.setup)
     return BackgroundEstimation(
         EstimationTask(recording, every, settings, frame, found, times, sensors.gnss.compute_unit(), before), due
     )
+
+
+def limit_thought(lag: float) -> float:
+    """Time (s of the drive) that an estimation may take."""
+    return min(_THINKING * lag, _LONGEST_THOUGHT)
 
 
 def are_enough(sensors: Sensors, found: Alignment, span: float) -> bool:

@@ -12,12 +12,12 @@ import numpy as np
 
 from graphnav.config import Settings
 from graphnav.constraints.base import SAME_TIME
-from graphnav.constraints.raw_ppp import require_precise
 from graphnav.core.earth import LocalFrame
 from graphnav.core.errors import EstimationError
 from graphnav.core.findings import Finding
 from graphnav.core.notes import Note
 from graphnav.core.trajectory import Trajectory
+from graphnav.detectors.base import describe_false_stops
 from graphnav.estimation.alignment import Alignment
 from graphnav.estimation.faults.watch import OLDEST
 from graphnav.estimation.noise.explanations import FIXES
@@ -31,7 +31,8 @@ from graphnav.online.noise_estimation import BackgroundEstimation, CatchUp, are_
 from graphnav.online.sanity import find_period
 from graphnav.online.schedule import AFTER, expect_keyframe, find_due, find_limit, list_keyframes
 from graphnav.online.sensors import Row, Sensors
-from graphnav.online.start import find_start, let_clocks_drift, make_tracker, take_start_rows
+from graphnav.online.start import choose_settings, find_start, make_tracker, take_start_rows
+from graphnav.online.stop_judgement import StopJudge
 from graphnav.online.tracker import Tracker
 from graphnav.online.walker import Walker
 from graphnav.recording import Recording
@@ -56,10 +57,7 @@ class Smoother:
 
     def __init__(self, setup: Recording, settings: Settings | None = None) -> None:
         self._setup = setup
-        self.settings = let_clocks_drift(settings or Settings())
-        raw, s = setup.raw_gnss, self.settings.raw_gnss
-        if s.ppp and raw is not None and setup.is_tight(s.coupling):
-            require_precise(setup.name, raw)
+        self.settings = choose_settings(setup, settings)
         self.sensors = Sensors(setup, self.settings.keyframes.bridge, self.settings.raw_gnss)
         self.frame: LocalFrame | None = None
         self.tracker: Tracker | None = None
@@ -68,6 +66,7 @@ class Smoother:
         self.late: Counter[str] = Counter()  # used rows that arrived after the keyframe they should have entered
         self._estimation: BackgroundEstimation | None = None  # estimation of the noise model in progress
         self._catch_up: CatchUp | None = None  # tracker that processes the unsettled keyframes with the new model
+        self._judge = StopJudge()
         self._tentative = False  # nothing may settle before the noise model has been estimated once
         self._found: Alignment | None = None  # whether the noise model is to be estimated again
         self._notes_on: dict[str, tuple[str, ...]] = {}  # notes that further rows may change, by subject
@@ -98,8 +97,7 @@ class Smoother:
         `graphnav.online.sensors.Sensors.add`.
         """
         sensor, t, values = row
-        sensors = self.sensors
-        before = sensors.imu.newest
+        sensors, before = self.sensors, self.sensors.imu.newest
         if sensor == "imu" and sensors.add_next(t, values, before):  # the common case
             self._take_newest(t, before)
             return
@@ -141,17 +139,6 @@ class Smoother:
         void = self.sensors.compare_newest()
         if void is not None and self.tracker is not None:
             self._redo(void, self.tracker)
-        self._look_if_due(now, before)
-
-    def _redo(self, t: float, tracker: Tracker) -> None:
-        """A row of the IMU was removed: redo everything that used it, from a time (s) on."""
-        tracker.finish_entering(self.sensors)
-        self._awake = -np.inf
-        tracker.note_late_row("imu", t)
-        if t <= tracker.newest + SAME_TIME:
-            self._dirty = min(self._dirty, t)
-
-    def _look_if_due(self, now: float, before: float) -> None:
         if now < self._awake:
             return
         if now - before > HOLE * self._period and self.tracker is not None and self.tracker.at_every_row:
@@ -160,6 +147,14 @@ class Smoother:
                 if before + k * self._period >= self._awake - SAME_TIME:
                     self._look(before + k * self._period)
         self._look(now)
+
+    def _redo(self, t: float, tracker: Tracker) -> None:
+        """A row of the IMU was removed: redo everything that used it, from a time (s) on."""
+        tracker.finish_entering(self.sensors)
+        self._awake = -np.inf
+        tracker.note_late_row("imu", t)
+        if t <= tracker.newest + SAME_TIME:
+            self._dirty = min(self._dirty, t)
 
     def _look(self, now: float) -> None:
         """Do the work that is due; without keyframes to make, one task per row, so that no row waits for long."""
@@ -177,17 +172,22 @@ class Smoother:
             self._step_catch_up(self._catch_up, tracker)
         elif self._estimation is not None and tracker.newest >= self._estimation.due:
             self._use(self._estimation, tracker)
-        elif tracker.work_ahead(self.sensors, expected := self._expect(tracker.newest), not self._tentative):
+        elif tracker.work_ahead(self.sensors, expected := self._expect(tracker.newest), not self._holds(tracker)):
             self._collect(tracker)
         elif tracker.stale and not self._tentative:
             self._catch_up = CatchUp(tracker.restart_settled(tracker.noise, self._setup))
         else:
-            if self._found is not None and self._estimation is None and not self._tentative:
-                self._estimate_again(self._found, tracker)
+            if self._estimation is None and not self._tentative:
+                if self._found is not None:
+                    self._estimate_again(self._found, tracker)
+                self._catch_up = self._judge.look(self.sensors, tracker)
             self._awake = expected if now < expected else self._due
 
     def _expect(self, T: float) -> float:
         return expect_keyframe(T, self._fixes, 1.0 / self.settings.keyframes.rate)
+
+    def _holds(self, tracker: Tracker) -> bool:
+        return self._tentative or self._judge.holds(tracker)
 
     def live(self) -> Live | None:
         """The state at the newest IMU row; None while aligning."""
@@ -200,9 +200,6 @@ class Smoother:
 
     def finish(self) -> None:
         """End of the input: settle everything."""
-        self._settle_all()
-
-    def _settle_all(self) -> None:
         if self.tracker is None:
             try:
                 self._align(last=True)
@@ -281,10 +278,9 @@ class Smoother:
         self._begin_estimation(found, tracker)
 
     def _begin_estimation(self, found: Alignment, tracker: Tracker) -> None:
-        assert self.frame is not None
         times = np.concatenate([self._times, tracker.window.t])
         self._estimation = start_estimation(
-            self.sensors, self.settings, self.frame, found, times, tracker.newest + AFTER, tracker.noise
+            self.sensors, self.settings, tracker.frame, found, times, tracker.newest + AFTER, tracker.noise
         )
 
     def _use(self, estimation: BackgroundEstimation, tracker: Tracker) -> None:
@@ -299,10 +295,11 @@ class Smoother:
         self._replace_notes("noise", found.notes)
         self._take_findings(found.doubts)
         self._left_out = tuple(fault for fault in found.excluded if fault.kind not in FIXES)
+        noise = found.keep_false_stops(tracker.noise)
         if tracker.opened and not found.anew:
-            self._catch_up = CatchUp(tracker.restart_settled(found.noise, self._setup))
+            self._catch_up = CatchUp(tracker.restart_settled(noise, self._setup))
         else:
-            again = self._track(found.start, self._began, found.noise)
+            again = self._track(found.start, self._began, noise)
             again.adopt(tracker, found.stationary, float(estimation.task.times[-1]), self._times)
             self._catch_up = CatchUp(again, self._times)
             if self._found is not None:
@@ -314,12 +311,17 @@ class Smoother:
             if not catch_up.tracker.opened:
                 self._times = []  # they are in its window
             self.tracker, self._catch_up, self._tentative = catch_up.tracker, None, False
+            self._replace_notes("stops", describe_false_stops(len(catch_up.tracker.noise.false_stops)))
 
     def _finish_estimation(self) -> None:
-        """End of the input: do not wait for an estimation in progress."""
+        """End of the input: do not wait for an estimation in progress, and judge stops by what there is."""
         if self._estimation is not None and self.tracker is not None:
             self._use(self._estimation, self.tracker)
-        while self._catch_up is not None and self.tracker is not None:
+        while self.tracker is not None:
+            if self._catch_up is None and not self._tentative:
+                self._catch_up = self._judge.look(self.sensors, self.tracker, last=True)
+            if self._catch_up is None:
+                return
             self._step_catch_up(self._catch_up, self.tracker)
 
     def _wait(self, now: float) -> None:
@@ -333,7 +335,7 @@ class Smoother:
         sensors = self.sensors
         self.notes.append(Note("online.anew", f"{why}: aligning anew"))
         later = sensors.cut_after(before)
-        self._settle_all()
+        Smoother.finish(self)
         self._faults = self.excluded
         self._begin_anew(before)
         sensors.put_back(later)
@@ -342,12 +344,11 @@ class Smoother:
     def _begin_anew(self, oldest: float) -> None:
         """Drop all rows and states; rows up to a time (s) are too late from now on."""
         self.tracker = self._found = self._estimation = self._catch_up = None
-        self._tentative, self._times, self._left_out = False, [], ()
+        self._judge, self._tentative, self._times, self._left_out = StopJudge(), False, [], ()
         self.sensors.drop_before(np.inf)
         self.sensors.gnss.space(None)
         self.sensors.oldest = oldest
-        self._fixes, self._dirty = [], np.inf
-        self._due = self._awake = -np.inf
+        self._fixes, self._dirty, self._due, self._awake = [], np.inf, -np.inf, -np.inf
 
     def _advance(self, tracker: Tracker, now: float, last: bool = False) -> None:
         """Make the keyframes that are due at a time, s."""
@@ -390,8 +391,7 @@ class Smoother:
                 self._times += part.t.tolist()
             rows = part.t > self._last_settled
             if rows.any():
-                assert self.frame is not None
-                self._settled.append(export(part, rows, self.frame))
+                self._settled.append(export(part, rows, tracker.frame))
                 self._last_settled = float(part.t[-1])
         tracker.settled.clear()
         self.sensors.oldest = max(self.sensors.oldest, tracker.head)

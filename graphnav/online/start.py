@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from graphnav.config import Settings
+from graphnav.constraints.raw_ppp import require_precise
 from graphnav.core.earth import LocalFrame
 from graphnav.core.errors import EstimationError
 from graphnav.core.rotation import Array
@@ -32,6 +33,21 @@ def let_clocks_drift(settings: Settings) -> Settings:
     if settings.gnss.clock_rate_sigma is not None:
         return settings
     return settings.model_copy(update={"gnss": settings.gnss.model_copy(update={"clock_rate_sigma": _CRYSTALS})})
+
+
+def choose_settings(setup: Recording, stated: Settings | None) -> Settings:
+    """The settings of a running drive.
+
+    Raises
+    ------
+    RecordingError
+        If precise point positioning is wanted without what it needs.
+    """
+    settings = let_clocks_drift(stated or Settings())
+    raw, s = setup.raw_gnss, settings.raw_gnss
+    if s.ppp and raw is not None and setup.is_tight(s.coupling):
+        require_precise(setup.name, raw)
+    return settings
 
 
 def take_start_rows(sensors: Sensors, settings: Settings, now: float, last: bool) -> tuple[Recording, Array] | None:

@@ -28,7 +28,7 @@ from graphnav.online.steady import Online
 from graphnav.recording.exporters import csv
 
 TRAJECTORY, CHECKPOINT, SUMMARY = "trajectory.csv", "checkpoint", "summary.json"
-_MAGIC = b"graphnav checkpoint 15\n"
+_MAGIC = b"graphnav checkpoint 16\n"
 _DIGEST = hashlib.sha256
 
 _PLAIN = {

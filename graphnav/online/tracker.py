@@ -31,8 +31,8 @@ from graphnav.estimation.noise.apply import apply_noise
 from graphnav.estimation.noise.model import STATED, NoiseModel
 from graphnav.estimation.problem import Problem, build_problem
 from graphnav.estimation.solvers.elimination import Predicted
-from graphnav.estimation.solvers.stages import Place
-from graphnav.estimation.solvers.window import Message, SettledStates
+from graphnav.estimation.solvers.stages import Message, Place, forget_rows
+from graphnav.estimation.solvers.window import SettledStates
 from graphnav.imu.dynamics import ImuFactors
 from graphnav.imu.preintegration import preintegrate
 from graphnav.imu.samples import bridge_gaps
@@ -157,7 +157,7 @@ class Tracker(Chain):
     def _finish_keyframes(self) -> None:
         """Called when keyframes have entered."""
         self.in_force = {rows.name: len(rows.b) for rows in self.window.stages[-1].measured if rows.H.any()}
-        self._forget()
+        forget_rows(self.window.stages)
 
     def _go_back(self, sensors: Sensors, built: BuiltKeyframes, back: float) -> float:
         """Redo keyframes from a time on, in which a fault was found; returns the first that was redone, s."""
@@ -250,7 +250,7 @@ class Tracker(Chain):
     def _revise(self, sensors: Sensors, always: bool = False) -> bool:
         """Relinearise as much as one row permits; False once nothing is left to do."""
         more = self.window.revise(self.at_a_row, lambda *which: self._renew(sensors, *which), always)
-        self._forget()
+        forget_rows(self.window.stages)
         return more
 
     @property
@@ -284,16 +284,18 @@ class Tracker(Chain):
         self.settled.append(self._leave(count))
         self._ahead = None  # settled states may show that sigmas have changed
         self._motions = {t: one for t, one in self._motions.items() if t > self.head - CONTEXT}
-        self._forget()
+        forget_rows(self.window.stages)
 
     def restart_settled(self, noise: NoiseModel, setup: Recording) -> Tracker:
         """A tracker with another noise model, with the settled states of this one and no keyframes since."""
         other, head = copy.copy(self), self.window.head
         other.noise, other._parameters, other.verdicts = noise, {}, copy.deepcopy(self.verdicts)
+        if moving := set(noise.false_stops) - set(self.noise.false_stops):
+            other.verdicts.readmit(min(moving)[0])
         other.window = type(self.window)(head.move(head.estimate), find_turn(setup, noise))
         other._nodes, other._held, other._motions, other.settled, other._ahead = [], [], {}, [], None
         other._settling = False
-        other._standing, other._readings = copy.copy(self._standing), copy.copy(self._readings)
+        other._standing, other._readings = self._standing.without(noise.false_stops), copy.copy(self._readings)
         other._readings.revised = False
         return other
 
@@ -306,7 +308,8 @@ class Tracker(Chain):
         """Take over detections and counts of another tracker, except the stops up to a time, which were detected
         anew; `settled` are its keyframes before its window, s.
         """
-        self._standing, self._readings = copy.copy(other._standing), copy.copy(other._readings)
+        self._standing = other._standing.without(self.noise.false_stops)
+        self._readings = copy.copy(other._readings)
         before, after = clip_spans(stationary, self.head, until - SURE), clip_spans(other.stops, until - SURE, np.inf)
         spans = merge_spans(np.concatenate([before, after]), gap=SAME_TIME)
         self._standing.replace(spans, np.concatenate([settled, other.times]))
@@ -315,7 +318,8 @@ class Tracker(Chain):
         """Remove the keyframes from a time on, where another tracker has redone them with different stops."""
         self._keep(len(self.window) - len(self.window.select_since(t - SAME_TIME)))
         self._motions = {end: one for end, one in self._motions.items() if end < t}
-        before, self._standing = clip_spans(self.stops, -np.inf, other.head), copy.copy(other._standing)
+        before = clip_spans(self.stops, -np.inf, other.head)
+        self._standing = other._standing.without(self.noise.false_stops)
         self._standing.add(before)
 
     def live(self, sensors: Sensors) -> Live:

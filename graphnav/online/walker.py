@@ -15,8 +15,7 @@ from graphnav.constraints.base import SAME_TIME
 from graphnav.core.rotation import Array
 from graphnav.core.state import States
 from graphnav.estimation.noise.model import NoiseModel
-from graphnav.estimation.solvers.stages import Place
-from graphnav.estimation.solvers.window import Message
+from graphnav.estimation.solvers.stages import Message, Place
 from graphnav.online.ahead import Live, live, predict_since
 from graphnav.online.around import ROWS_AFTER
 from graphnav.online.chain import BuiltKeyframes

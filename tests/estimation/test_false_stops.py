@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers import find_steady_motion
 
 from graphnav import load
 from graphnav.config import parse_settings
 from graphnav.config.detectors import FUSED
-from graphnav.core.earth import LocalFrame
 from graphnav.core.errors import EstimationError
 from graphnav.core.rotation import Array
 from graphnav.detectors import Detections, detect
@@ -19,7 +19,6 @@ from graphnav.detectors.base import mask_inside, merge_spans
 from graphnav.estimation import building, pipeline
 from graphnav.estimation.noise.files import read_noise, write_noise
 from graphnav.estimation.pipeline import run
-from graphnav.recording import Recording
 
 SETTINGS = parse_settings({"gnss": {"velocity": False}})
 
@@ -37,22 +36,6 @@ def claim_stops(monkeypatch: pytest.MonkeyPatch, claimed: Array) -> None:
 
     for module in (pipeline, building):
         monkeypatch.setattr(module, "detect", claim)
-
-
-def find_steady_motion(recording: Recording, seconds: float, slowest: float) -> Array:
-    """(2,) s, the span in which the speed of the truth changes least."""
-    truth = recording.truth
-    assert truth is not None
-    assert truth.llh is not None
-    inside = (truth.t > recording.start + 20.0) & (truth.t < recording.end - 20.0)
-    t, p = truth.t[inside], LocalFrame(truth.llh[0]).from_llh(truth.llh[inside])
-    every = max(round(1.0 / np.median(np.diff(t))), 1)
-    t, v = t[every::every], np.diff(p[::every], axis=0) / np.diff(t[::every])[:, None]
-    n = int(seconds)
-    scatter = [np.std(v[k : k + n], axis=0).max() for k in range(len(v) - n)]
-    slow = [np.linalg.norm(v[k : k + n], axis=1).min() < slowest for k in range(len(v) - n)]
-    k = int(np.argmin(np.where(slow, np.inf, scatter)))
-    return np.array([t[k] - 0.5, t[k] - 0.5 + seconds])
 
 
 @pytest.mark.parametrize(

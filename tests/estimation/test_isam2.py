@@ -26,6 +26,7 @@ from graphnav.estimation.factor_graph.tree_marginals import (
     settle,
 )
 from graphnav.estimation.factor_graph.tree_nodes import update_isam
+from graphnav.estimation.factor_graph.tree_whole import WholeTree
 from graphnav.estimation.noise.apply import apply_noise
 from graphnav.estimation.noise.model import NoiseModel, VarianceComponent
 from graphnav.estimation.problem import Problem, build_problem
@@ -103,6 +104,32 @@ def test_a_start_that_is_off_by_sixty_degrees_is_mended_by_relinearisation(built
     found = isam2(problem)
     assert apart(found, best).max() < 0.02
     assert np.abs(found.states.p - best.states.p).max() < 1e-3
+
+
+@pytest.mark.parametrize("kernel", ["none", "huber"])
+def test_a_tree_of_the_newest_keyframes_knows_what_that_of_all_does(built: Problem, kernel: str) -> None:
+    """Live estimates and covariances, before and after relinearisations that reach behind it or do not."""
+    rows = (replace(c, robust=kernel) if c.name == "gnss_position" else c for c in built.constraints)
+    problem, mean = replace(built, constraints=tuple(rows)), built.prior.mean
+    assert mean is not None
+    prior, steps = make_first_message(mean, built.prior.sigma[0]), list_node_steps(built)
+    one, other = (kind(prior, compute_turn_limit(built.imu_noise)) for kind in (Tree, WholeTree))
+    for k in range(len(built.t)):
+        for tree in (one, other):
+            tree.add(Place(float(built.t[k]), problem, k, steps.get(k, ()), linked=k > 0))
+            if k in (60, 135):
+                assert tree.relinearise(0.02)
+        if k == 140:
+            for tree in (one, other):
+                tree.read()
+                tree.linearise_again(range(136, 141))
+        a, b = one.newest, other.newest
+        root = compute_newest_root(one)
+        moved = root @ np.r_[a.state.minus(b.state)[0], a.values - b.values]
+        np.testing.assert_allclose(moved, 0.0, atol=1e-5, err_msg=f"{k}")
+        mine, its = (np.linalg.inv(R.T @ R) for R in (compute_newest_root(other), root))
+        sd = np.sqrt(np.diag(its))
+        np.testing.assert_allclose(mine / sd / sd[:, None], its / sd / sd[:, None], atol=1e-6, err_msg=f"{k}")
 
 
 def test_within_a_lag_it_is_the_window(built: Problem, solved: Solution) -> None:

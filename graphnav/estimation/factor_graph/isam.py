@@ -19,6 +19,7 @@ from graphnav.estimation.factor_graph.tree_marginals import (
     eliminate,
     settle,
 )
+from graphnav.estimation.factor_graph.tree_whole import WholeTree
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import Solution
 from graphnav.estimation.solvers.incremental import FINE, are_due, begin_at, solve_in_turn
@@ -43,7 +44,8 @@ class TreeSmoother:
     """
 
     def __init__(self, prior: Message, problem: Problem, lag: float) -> None:
-        self.tree, self.lag = Tree(prior, compute_turn_limit(problem.imu_noise), whole=np.isinf(lag)), lag
+        self.tree = (WholeTree if np.isinf(lag) else Tree)(prior, compute_turn_limit(problem.imu_noise))
+        self.lag = lag
         self.settled: list[SettledStates] = []
         self._problem = problem
         self._look = _SKIP  # the keyframe of the next relinearisation check

@@ -27,6 +27,7 @@ from graphnav.core.rotation import Array
 from graphnav.core.state import DIM
 from graphnav.estimation.factor_graph.tree_nodes import (
     LINK,
+    Fresh,
     Keyframe,
     Made,
     Variable,
@@ -75,11 +76,10 @@ class Tree:
     ----------
     prior : message on the first keyframe before any measurement.
     turn : rad that an attitude may move before its rows are linearised anew.
-    whole : whether keyframes are never marginalised.
     """
 
-    def __init__(self, prior: Message, turn: float, whole: bool = False) -> None:
-        self.isam = make_isam(reuses_slots=not whole)
+    def __init__(self, prior: Message, turn: float) -> None:
+        self.isam = make_isam()
         self.turn = turn
         self.keyframes: list[Keyframe] = []
         self.relinearised = 0  # keyframes
@@ -118,7 +118,7 @@ class Tree:
             rows = linearise_rows(place, state, values, columns).measured
         else:
             state, values, columns, link = ahead.state, ahead.values, ahead.columns, ahead.link
-        fresh: list[tuple[Variable, Any]] = []  # new variables, and priors of parameters among them
+        fresh: list[Fresh] = []  # new variables, and priors of parameters among them
         x = self._add_variable(np.zeros(DIM), _UNIT, place.t)
         nodes = self._open(place, fresh)
         keyframe = Keyframe(self._number, place, x, state, columns, nodes, {})
@@ -141,7 +141,7 @@ class Tree:
         # along time, where the order is free; CCOLAMD wants labels below the number of variables it is to order
         most = min(3, len({key for _, _, one in made for key in list(one.keys())}) - 1)
         order = [(v, max(v.last - self._number + most, 0)) for v in self._find_recent()]
-        update_isam(self.isam, place.t, made, order, fresh=fresh)
+        self._update(made, order, fresh=fresh)
         self._number += 1
         keyframe.read(self.isam)
         for _ in range(PASSES - 1 if any(one.kernel != "none" for one in rows) else 0):
@@ -168,7 +168,7 @@ class Tree:
         self._in_force = nodes
         before = Place(place.t, None)
         self.keyframes.append(Keyframe(self._number, before, x, prior.state, prior.columns, nodes, {}))
-        update_isam(self.isam, place.t, fresh=[*fresh, (x, make_factor(blocks, prior.z))])
+        self._update(fresh=[*fresh, (x, make_factor(blocks, prior.z))])
         self._number += 1
         self.held = 1
         self.keyframes[0].read(self.isam)
@@ -186,7 +186,7 @@ class Tree:
         self._key += 1
         return out
 
-    def _open(self, place: Place, fresh: list[tuple[Variable, Any]]) -> dict[str, tuple[Variable, slice]]:
+    def _open(self, place: Place, fresh: list[Fresh]) -> dict[str, tuple[Variable, slice]]:
         """Begin the nodes of parameters that step at a keyframe, and the next ones of constants; which are in force."""
         steps = list(place.steps)
         self._constant |= {s.name for s in steps if is_constant(place, s.name)}
@@ -224,15 +224,25 @@ class Tree:
         self._in_force = in_force
         return in_force
 
-    def _replace(self, made: Sequence[Made], gone: Sequence[int], first: int) -> None:
+    def _update(
+        self,
+        made: Sequence[Made] = (),
+        order: Iterable[tuple[Variable, int]] | None = None,
+        gone: Sequence[int] = (),
+        fresh: Sequence[Fresh] = (),
+        anew: Iterable[Variable] | None = None,
+    ) -> None:
+        """As `update_isam`."""
+        update_isam(self.isam, self.keyframes[-1].place.t, made, order, gone, fresh, anew)
+
+    def _replace(self, made: Sequence[Made], gone: Sequence[int], first: int, fresh: Sequence[Fresh] = ()) -> None:
         """Have factors in place of others, on keyframes from number `first` on."""
         # elimination order is that of time; with much to do, GTSAM rebuilds the whole tree
         late = [v for v in self.variables.values() if v.last >= first]
-        every = 2 * len(late) > len(self.variables)
+        every = 2 * len(late) > len(self.variables) and not fresh
         if every:
             late, first = list(self.variables.values()), self.keyframes[0].number
-        t, order = self.keyframes[-1].place.t, [(v, v.last - first) for v in late]
-        update_isam(self.isam, t, made, order, gone, anew=late if every else None)
+        self._update(made, [(v, v.last - first) for v in late], gone, fresh, late if every else None)
 
     # ------------------------------------------------------------------------------------------ linearising again
     def read(self) -> None:

@@ -70,6 +70,7 @@ class Keyframe:
 
 
 Made = tuple[Keyframe, str, Any]  # a factor of a keyframe, by the name of its constraint
+Fresh = tuple[Variable, Any]  # a variable that begins, with a factor that comes with it or None
 
 
 def make_isam(reuses_slots: bool = True) -> gtsam.ISAM2:
@@ -94,7 +95,7 @@ def update_isam(
     made: Sequence[Made] = (),
     order: Iterable[tuple[Variable, int]] | None = None,
     gone: Sequence[int] = (),
-    fresh: Sequence[tuple[Variable, Any]] = (),
+    fresh: Sequence[Fresh] = (),
     anew: Iterable[Variable] | None = None,
 ) -> None:
     """Add factors to a tree and remove others.
@@ -105,7 +106,7 @@ def update_isam(
     made : their keyframes note where they are.
     order : when variables are eliminated; None leaves it to GTSAM.
     gone : indices.
-    fresh : variables that begin, each with a factor that comes with it or None.
+    fresh : variables that begin.
     anew : variables that are all eliminated again.
 
     Raises

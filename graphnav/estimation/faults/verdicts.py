@@ -85,6 +85,12 @@ class Verdicts:
             return self._take_fixes_back(name, before, begin, end)
         return float(t[fault])
 
+    def readmit(self, since: float) -> None:
+        """Use the fixes from a time (s) on again: what they disagreed with has been taken back."""
+        for name, t in self.times.items():
+            self.used[name][t >= since] = 1.0
+        self._trial = None
+
     def set_ended(self) -> float | None:
         """The time to continue from at the end of the fixes, where no later ones can confirm a fault."""
         for name, used in self.used.items():

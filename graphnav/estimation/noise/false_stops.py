@@ -9,39 +9,49 @@ span itself do not count: those of a receiver at rest may wander. A false stop i
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import TypeVar
 
 import numpy as np
 
 from graphnav.constraints.base import SAME_TIME
 from graphnav.constraints.standstill import HeldPosition, ZeroRate, ZeroVelocity
 from graphnav.core.rotation import Array
+from graphnav.detectors.base import NONE, merge_spans
 from graphnav.estimation.faults.watch import FAULT_COST
 from graphnav.estimation.noise.apply import apply_noise
-from graphnav.estimation.noise.estimate import NoiseEstimate
 from graphnav.estimation.noise.explanations import FIXES, Trials, add_common_errors
-from graphnav.estimation.noise.model import INTERVALS
+from graphnav.estimation.noise.initial_points import BREAKDOWN
+from graphnav.estimation.noise.model import INTERVALS, NoiseModel
 from graphnav.estimation.noise.spans import join
 from graphnav.estimation.problem import Problem
+from graphnav.estimation.solvers.linearise import Points
+from graphnav.estimation.solvers.passes import reuse_points
+
+Found = TypeVar("Found")
 
 _OF_STOPS = (ZeroVelocity.name,)
 _MASKING = (*INTERVALS, ZeroVelocity.name, ZeroRate.name, HeldPosition.name)  # their weights may hide a false stop
 
 
-def find_false_stops(base: Problem, found: NoiseEstimate, stationary: Array) -> tuple[Array, int]:
+def find_false_stops(
+    base: Problem, noise: NoiseModel, near: tuple[Points, Problem], stationary: Array
+) -> tuple[Array, int]:
     """Find the stationary spans in which the platform moves.
 
     Parameters
     ----------
-    base : built with stated noise.
-    found : with its constants and what it leaves out.
-    stationary : (M, 2) s, by which the problem was built.
+    base : built with stated noise and these spans, and with the constants that are free.
+    noise : of it, with what it leaves out.
+    near : smoothed points of all keyframes, and the problem that they are of.
+    stationary : (M, 2) s
 
     Returns
     -------
     array
-        (n, 2) s, those of the spans in which a constant velocity is the likelier. A false stop leads the solution
-        astray, so that later ones may be contradicted though they are true.
+        (n, 2) s, those of the spans in which a constant velocity is the likelier.
     int
         Filter passes.
     """
@@ -52,16 +62,51 @@ def find_false_stops(base: Problem, found: NoiseEstimate, stationary: Array) -> 
     first, behind = np.searchsorted(t, stationary[:, 0] - SAME_TIME), np.searchsorted(t, stationary[:, 1] + SAME_TIME)
     spans = stationary[behind > first]
     listed = [(float(begin), float(end)) for begin, end in spans]
-    excluded = {name: list(some) for name, some in found.noise.excluded.items()}
+    excluded = {name: list(some) for name, some in noise.excluded.items()}
     for name in (*FIXES, HeldPosition.name):
         excluded[name] = join([*excluded.get(name, ()), *listed])
     noise = replace(
-        found.noise,
-        weights={name: some for name, some in found.noise.weights.items() if name not in _MASKING},
+        noise,
+        weights={name: some for name, some in noise.weights.items() if name not in _MASKING},
         excluded={name: tuple(some) for name, some in excluded.items()},
     )
     used = apply_noise(base, noise)
-    trials = Trials(used, found.carry_points(base, used), listed)
+    trials = Trials(used, reuse_points(*near, used), listed)
     stands = trials.sum_spans(trials.filter(used).log_likelihood())
     moves = trials.sum_spans(trials.filter(add_common_errors(used, listed, _OF_STOPS), _OF_STOPS).log_likelihood())
     return spans[moves - stands > FAULT_COST], trials.passes
+
+
+def leave_out_false_stops(
+    found: Found, judge: Callable[[Found], Array], estimate: Callable[[Found, Array], Found]
+) -> tuple[Found, Array]:
+    """Estimate anew without the stops in which the platform moves, until there are none.
+
+    A false stop leads the solution astray, so that later ones may be contradicted though they are true: the first are
+    left out, twice as many each time.
+
+    Parameters
+    ----------
+    found : with all of them.
+    judge : the false stops (n, 2) of an estimate, s.
+    estimate : one without the false stops (n, 2) so far, from the one before.
+
+    Returns
+    -------
+    Found
+        The last estimate that did not break down.
+    array
+        (n, 2) s, the stops that it is without.
+    """
+    false, first = NONE, 1
+    with contextlib.suppress(*BREAKDOWN):
+        while len(wrong := judge(found)):
+            without = merge_spans(np.concatenate([false, wrong[:first]]))
+            found, false, first = estimate(found, without), without, 2 * first
+    return found, false
+
+
+def unite_stops(*parts: Array | Sequence[tuple[float, float]]) -> tuple[tuple[float, float], ...]:
+    """Spans (M, 2), s, of several sets, in order and apart, as `NoiseModel.false_stops` has them."""
+    spans = merge_spans(np.concatenate([np.reshape(np.asarray(one, dtype=float), (-1, 2)) for one in parts]))
+    return tuple((float(begin), float(end)) for begin, end in spans)

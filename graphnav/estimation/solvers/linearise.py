@@ -6,7 +6,7 @@ iSAM2 and the window take from here what they stack, eliminate or update with.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -34,10 +34,6 @@ class Points:
     def take(self, index: slice | Array) -> Points:
         """Some of them."""
         return Points(self.states[index], self.values[index])
-
-    def linearise(self, constraint: Constraint, columns: Columns, n: int) -> Rows:
-        """The first n rows of a constraint, each at the point of its keyframe."""
-        return linearise(constraint, self, columns, slice(0, n))
 
     def put(self, index: slice, points: Points) -> None:
         """Some of them, replaced."""
@@ -84,18 +80,6 @@ class Rows:
     def sigma(self) -> Array:
         """(n, m) sigmas with the rows' weights in them: infinite where a row is not used."""
         return weigh_sigma(self.constraint, self.linear.sigma, self.which)
-
-    @property
-    def states_sigmas(self) -> bool:
-        """Whether its sigmas are those of the constraint, whatever the point."""
-        sigma: Array = self.constraint.sigma  # type: ignore[attr-defined]
-        return bool(np.array_equal(self.stated, sigma[self.which]))
-
-    def restate(self, constraint: Constraint) -> Rows:
-        """The same of a constraint that a noise model has with other sigmas and weights."""
-        sigma: Array = constraint.sigma  # type: ignore[attr-defined]
-        linear = replace(self.linear, sigma=sigma[self.which])
-        return replace(self, constraint=constraint, linear=linear)
 
     def weigh(self) -> tuple[Array, Array]:
         """Weight and cost (n,) of each row by its robust kernel."""

@@ -15,7 +15,7 @@ from graphnav.estimation.dense import make_dense
 from graphnav.estimation.problem import Problem, SolvedProblem
 from graphnav.estimation.solution import ConstraintRecord, ParameterEstimate, Solution
 from graphnav.estimation.solvers.invariant import add_invariant, subtract_invariant
-from graphnav.estimation.solvers.linearise import Columns, Points, Rows, find_last_keyframes, linearise, scale_at, shift
+from graphnav.estimation.solvers.linearise import Points, Rows, find_last_keyframes, linearise, scale_at, shift
 from graphnav.estimation.solvers.recursion import Arrays, RowBlocks
 from graphnav.estimation.solvers.robust import weigh_squares
 from graphnav.estimation.solvers.stack import Innovations
@@ -57,15 +57,7 @@ class MomentPass(Points):
     N_diagonal: Array  # (n, D)
     variance: Array  # (n, D) of the errors, of parameters with a correlation time
     of_rows: Array  # (n, M, M) H P^s H^T, where each of these stands
-    linear: dict[str, Rows]  # of constraints with variance components, linearised at the smoothed points
     places: dict[str, tuple[Array, Array]]
-
-    def linearise(self, constraint: Constraint, columns: Columns, n: int) -> Rows:
-        own = self.linear.get(constraint.name)
-        if own is None or own.columns != columns or own.constraint.keyframe is not constraint.keyframe:
-            return super().linearise(constraint, columns, n)
-        known = len(own.residual) == n and own.states_sigmas
-        return own.restate(constraint) if known else super().linearise(constraint, columns, n)
 
     def cover_rows(self, linear: Rows, n: int) -> Array:
         """As of `SmootherPass`."""

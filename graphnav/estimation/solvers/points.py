@@ -67,7 +67,7 @@ class Linearisation:
         F[:, :3] = turned @ F[:, :3]
         r, sigma, H = allocate_rows(n, stack.M, points)
         for rows in problem.constraints:
-            linear = points.linearise(rows, problem.columns, int(rows.keyframe.searchsorted(n)))
+            linear = linearise(rows, points, problem.columns, slice(0, int(rows.keyframe.searchsorted(n))))
             _put_rows(linear, stack, r, sigma, H)
         return cls(problem.columns, F, gap, turned, r, sigma, H)
 

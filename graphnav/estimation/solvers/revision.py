@@ -42,7 +42,8 @@ class Revision:
         self._was = window.stages[first - 1] if first else None
         self._stage = None if self._was is None else self._was.move(e)  # the one before, where it is in the window
         self._before = window.head.move(e) if self._stage is None else self._stage.message
-        self._made: list[tuple[Stage, Stage]] = []  # old stages, and their replacements
+        self._old: list[Stage] = []
+        self.made: list[Stage] = []  # their replacements
 
     def step(self, count: int, renewed: Renewing | None) -> bool:
         """Rebuild at most so many stages; True once they are in place, or no longer wanted.
@@ -51,11 +52,11 @@ class Revision:
         ----------
         renewed : gives the places of stages, from an index to another, if not where their rows came from before.
         """
-        window, made = self.window, self._made
+        window, made = self.window, self.made
         if self._was is not None and not _is(window.stages, self.first - 1, self._was):
             return True
-        while made and not _is(window.stages, self.first + len(made) - 1, made[-1][0]):
-            made.pop()
+        while made and not _is(window.stages, self.first + len(made) - 1, self._old[-1]):
+            made.pop(), self._old.pop()
         begin = self.first + len(made)
         end = min(begin + count, len(window))
         if begin < end:
@@ -63,28 +64,21 @@ class Revision:
             places = [stage.place for stage in old] if renewed is None else renewed(begin, end)
             if places is None:
                 return False
-            made += zip(old, self._smooth_again(old, window.compute_means()[begin + 1 : end + 1], places), strict=True)
+            made += self._smooth_again(old, window.compute_means()[begin + 1 : end + 1], places)
+            self._old += old
         if end < len(window):
             return False
         # the effect of an error of the fixes on the estimate is the same to first order
         stages = [
             new if now.message.tests is None else replace(new, message=replace(new.message, tests=now.message.tests))
-            for now, (_, new) in zip(window.stages[self.first :], made, strict=True)
+            for now, new in zip(window.stages[self.first :], made, strict=True)
         ]
         window.replace_from(self.first, self._before, self._stage, stages)
         return True
 
-    def forget(self) -> None:
-        """Drop references to the rows of stages rebuilt so far: each would keep those of its neighbours in memory."""
-        for k in range(len(self._made) - 1, -1, -1):
-            was, stage = self._made[k]
-            if stage.place.problem is None:
-                break  # nor do those before it
-            self._made[k] = was, replace(stage, place=replace(stage.place, problem=None))
-
     def _smooth_again(self, old: Sequence[Stage], means: Sequence[Array], places: Sequence[Place]) -> list[Stage]:
         """The stages about their smoothed means, each from the one before."""
-        before = self._made[-1][1].message if self._made else self._before
+        before = self.made[-1].message if self.made else self._before
         around = [before, *(stage.message for stage in old)]
         moves = [np.zeros(len(before.z)), *means]
         states = add_error(States.stack([m.state for m in around]), np.array([e[:DIM] for e in moves]), before.turns)

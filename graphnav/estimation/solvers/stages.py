@@ -267,6 +267,14 @@ def follows(place: Place, last: Place) -> bool:
     return place.problem is last.problem and place.k == last.k + 1
 
 
+def forget_rows(stages: list[Stage]) -> None:
+    """Drop the problems that the rows of the last stages come from: each would keep the rows around it in memory."""
+    for k in range(len(stages) - 1, -1, -1):
+        if stages[k].place.problem is None:
+            break  # nor have those before it
+        stages[k] = replace(stages[k], place=replace(stages[k].place, problem=None))
+
+
 def group_runs(which: Iterable[int], alike: Callable[[int, int], bool]) -> list[list[int]]:
     """Indices in runs, in which each is `alike` the one before it."""
     runs: list[list[int]] = []

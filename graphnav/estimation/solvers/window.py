@@ -29,6 +29,7 @@ from graphnav.estimation.solvers.stages import (
     Stage,
     add_error,
     count_columns,
+    forget_rows,
     linearise_rows,
     pad,
     predict_stage,
@@ -98,7 +99,6 @@ class Window:
         self._limit: tuple[Columns, Array] = {}, np.empty(0)
         self._covariances: _Covariances | None = None  # covariances of stages to be settled
         self._means: list[Array] | None = None
-        self._moved: Array | None = None  # `_moves`, of these
         self._revision: Revision | None = None
         self._rounds = 0  # of it
 
@@ -198,7 +198,7 @@ class Window:
                 e = stage.smooth_back(e)
                 e += stage.g
                 out.append(e)
-            self._means, self._moved = out[::-1], None
+            self._means = out[::-1]
         return self._means
 
     def smooth_back(self, count: int, most: int) -> bool:
@@ -257,11 +257,11 @@ class Window:
     def _moves(self) -> Array:
         """(n,) how far the smoothed states are from their points, 1 at the limit."""
         means, limit = self.compute_means()[1:], self._limit[1]
-        if self._moved is None and means:
-            e = pad(means, max(len(x) for x in means))
-            turn = self._measure_turns(e) / self.turn
-            self._moved = np.maximum(turn, np.abs(e[:, DIM:] / limit[: e.shape[1] - DIM]).max(axis=1, initial=0.0))
-        return np.empty(0) if self._moved is None else self._moved
+        if not means:
+            return np.empty(0)
+        e = pad(means, max(len(x) for x in means))
+        turn = self._measure_turns(e) / self.turn
+        return np.maximum(turn, np.abs(e[:, DIM:] / limit[: e.shape[1] - DIM]).max(axis=1, initial=0.0))
 
     def _measure_turns(self, e: Array) -> Array:
         """(n,) rad, how far attitudes move by e (n, D) from where their rows are linearised.
@@ -291,8 +291,10 @@ class Window:
 
     def _find_first_again(self, share: float, every: bool) -> int | None:
         """The first stage to be relinearised, stages that have moved almost as far included."""
-        first = 0 if every else self.find_first_moved(share)
-        return min(first, self.find_first_moved(_ALMOST * share) or 0) if first else first
+        if every:
+            return 0
+        moves = self._moves()
+        return int(np.argmax(moves > _ALMOST * share)) if np.any(moves > share) else None
 
     @property
     def revising(self) -> bool:
@@ -313,7 +315,7 @@ class Window:
         if self._revision.step(count, renewed):
             self._revision = None
         else:
-            self._revision.forget()
+            forget_rows(self._revision.made)
         return True
 
 
@@ -338,6 +340,3 @@ def find_parameter_limits(columns: Columns, place: Place) -> Array:
         if name in parameters:
             limit[shift(at)] = _LIMITS.get(parameters[name].unit, np.inf)
     return limit
-
-
-__all__ = ["Message", "Place", "SettledStates", "Window", "make_first_message"]
