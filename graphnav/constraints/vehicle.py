@@ -16,7 +16,10 @@ R_vb = Rz(-beta) Rx(alpha), and u_v = R_vb u = (right, forward, up)::
     forward:  u_v,y / (1 + k) - s                     s: mean of the odometer, k: its scale error
 
 The error is one of the reading s. As u_v,y - (1 + k) s it would vanish for k = -1 and an IMU that is mounted across,
-and its likelihood would lack the factor 1 + k of each reading, so that noise figures grew likelier by ending there.
+and its likelihood would lack the factor 1 + k of each reading, so that noise figures grew likelier by ending there. A
+step holds that factor, as it holds robust weights: by the derivative of 1 / (1 + k) a velocity that is far off, as at
+the start, would change the scale instead of the velocity.
+
 Both coefficients, the mounting angles (which wander: load, wind, the crown of the road), the forward place of the
 axle that does not slip, and the scale are estimated.
 
@@ -56,7 +59,7 @@ _LINEAR_TYRES = 3.0  # m/s^2, lateral force up to which tyres behave linearly
 _BEYOND = 0.1  # m/s of sideways speed per m/s^2 beyond that
 _AXLE_LEFT = 0.2  # m, uncertainty of the axle's place in a turn: front wheels steer, tyres have width
 _HALF_WHEELBASE = 1.3  # m
-_LEAST_FACTOR = 0.1  # of 1 + k; units are wrong by 3.6 at most
+_LEAST_FACTOR = 0.1  # of 1 + k: units are wrong by 3.6 at most, and a step may go further
 _I2, _I3 = np.eye(2), np.eye(3)
 _E_Y = np.array([[0.0, 1.0, 0.0]])
 _FORWARD = _E_Y[None]
@@ -294,14 +297,6 @@ class NonHolonomic(Wheels):
         return Linearized(residual - parameters[BODY] * effect, jacobians | lasting, self.sigma[rows])
 
 
-def _compute_gain(scale: Array) -> tuple[Array, Array]:
-    """1 / (1 + k) and its derivative; below `_LEAST_FACTOR` its tangent, from which a Gauss-Newton step that went too
-    far comes back."""
-    factor = np.maximum(1.0 + scale, _LEAST_FACTOR)
-    slope = -(factor**-2.0)
-    return 1.0 / factor + slope * (1.0 + scale - factor), slope
-
-
 def average_speed(recording: Recording, settings: Settings) -> MeanSpeed | None:
     """The odometer's mean speed over any intervals, without wrong readings; None where no odometer is used."""
     odometer = recording.odometer
@@ -380,12 +375,12 @@ class OdometerSpeed(Wheels):
             read, by_delay = self.speed(self.begin[rows], self.end[rows], delay)
         else:
             read = self._read[rows]
-        gain, by_scale = _compute_gain(parameters[ODOMETER_SCALE][:, 0])
-        ahead = found.u[:, 1] if self.signed else np.abs(found.u[:, 1])
-        A = (gain if self.signed else np.where(found.u[:, 1] < 0.0, -gain, gain))[:, None, None] * _FORWARD
-        residual = (gain * ahead - read)[:, None]
+        factor = np.maximum(1.0 + parameters[ODOMETER_SCALE][:, 0], _LEAST_FACTOR)
+        sign = np.ones(len(read)) if self.signed else np.where(found.u[:, 1] < 0.0, -1.0, 1.0)
+        A = (sign / factor)[:, None, None] * _FORWARD
+        residual = (sign / factor * found.u[:, 1] - read)[:, None]
         jacobians = found.differentiate(A, parameters)
-        jacobians[ODOMETER_SCALE] = (by_scale * ahead)[:, None, None]
+        jacobians[ODOMETER_SCALE] = -(read / factor)[:, None, None]  # of u - (1 + k) s, as a weight is held
         if ODOMETER_DELAY in parameters:
             jacobians[ODOMETER_DELAY] = -by_delay[:, None, None]
         if ODOMETER_ERROR in parameters:
