@@ -16,9 +16,9 @@ R_vb = Rz(-beta) Rx(alpha), and u_v = R_vb u = (right, forward, up)::
     forward:  u_v,y / (1 + k) - s                     s: mean of the odometer, k: its scale error
 
 The error is one of the reading s. As u_v,y - (1 + k) s it would vanish for k = -1 and an IMU that is mounted across,
-and its likelihood would lack the factor 1 + k of each reading, so that noise figures grew likelier by ending there. A
-step holds that factor, as it holds robust weights: by the derivative of 1 / (1 + k) a velocity that is far off, as at
-the start, would change the scale instead of the velocity.
+and its likelihood would lack the factor 1 + k of each reading, so that noise figures grew likelier by ending there. Its
+derivative by k is -u_v,y / (1 + k)^2; where the velocity is far off, as at the start, that would change the scale in
+place of the velocity, so it is taken near the reading.
 
 Both coefficients, the mounting angles (which wander: load, wind, the crown of the road), the forward place of the
 axle that does not slip, and the scale are estimated.
@@ -60,6 +60,7 @@ _BEYOND = 0.1  # m/s of sideways speed per m/s^2 beyond that
 _AXLE_LEFT = 0.2  # m, uncertainty of the axle's place in a turn: front wheels steer, tyres have width
 _HALF_WHEELBASE = 1.3  # m
 _LEAST_FACTOR = 0.1  # of 1 + k: units are wrong by 3.6 at most, and a step may go further
+_NEAR = 3.0  # sigmas of a reading within which its derivative by the scale is that of the velocity
 _I2, _I3 = np.eye(2), np.eye(3)
 _E_Y = np.array([[0.0, 1.0, 0.0]])
 _FORWARD = _E_Y[None]
@@ -380,7 +381,9 @@ class OdometerSpeed(Wheels):
         A = (sign / factor)[:, None, None] * _FORWARD
         residual = (sign / factor * found.u[:, 1] - read)[:, None]
         jacobians = found.differentiate(A, parameters)
-        jacobians[ODOMETER_SCALE] = -(read / factor)[:, None, None]  # of u - (1 + k) s, as a weight is held
+        near = _NEAR * self.sigma[rows]
+        expected = read + np.clip(residual, -near, near)[:, 0]
+        jacobians[ODOMETER_SCALE] = -(expected / factor)[:, None, None]
         if ODOMETER_DELAY in parameters:
             jacobians[ODOMETER_DELAY] = -by_delay[:, None, None]
         if ODOMETER_ERROR in parameters:

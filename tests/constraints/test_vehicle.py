@@ -11,7 +11,7 @@ import pytest
 from helpers import Array, truth_states
 
 from graphnav.config import Settings, parse_settings
-from graphnav.constraints.base import BuildContext
+from graphnav.constraints.base import BuildContext, Linearized
 from graphnav.constraints.standstill import PLACE, HeldPosition, ZeroRate, ZeroVelocity
 from graphnav.constraints.vehicle import (
     AXLE,
@@ -100,19 +100,27 @@ def test_a_reading_is_expected_as_the_sensor_shows_it(exact: tuple[Recording, Tr
 
 
 @pytest.mark.parametrize("unit", [1.0 / 3.6, 1.0, 3.6])
-def test_a_step_finds_a_scale_far_from_that_stated(exact: tuple[Recording, Trajectory], unit: float) -> None:
+def test_steps_find_a_scale_far_from_that_stated(exact: tuple[Recording, Trajectory], unit: float) -> None:
+    """There the derivative by the scale is the numerical one."""
     recording, truth = exact
     other = replace(recording.odometer, speed=recording.odometer.speed * unit)
     scene = scene_of(replace(recording, odometer=other), Settings())
     rows = OdometerSpeed.build(scene)
-    states, scale = truth_states(truth, scene.t[rows.keyframe], scene.frame), 0.0
-    for _ in range(3):
+    states = truth_states(truth, scene.t[rows.keyframe], scene.frame)
+
+    def linearize(scale: float) -> Linearized:
         given = {p.name: np.tile(p.initial, (len(rows), 1)) for p in rows.parameters}
         given[ODOMETER_SCALE][:] = scale
-        linear = rows.linearize(states, given, slice(None))
+        return rows.linearize(states, given, slice(None))
+
+    scale = 0.0
+    for _ in range(8):
+        linear = linearize(scale)
         J = linear.jacobians[ODOMETER_SCALE][:, :, 0]
         scale -= float(np.sum(J * linear.residual) / np.sum(J * J))
     assert scale == pytest.approx(1.0 / (1.01 * unit) - 1.0, abs=1e-4)
+    numerical = (linearize(scale + 1e-6).residual - linearize(scale - 1e-6).residual) / 2e-6
+    np.testing.assert_allclose(linearize(scale).jacobians[ODOMETER_SCALE][:, :, 0], numerical, atol=1e-5)
 
 
 def test_mounting_angles_are_those_of_a_turned_imu(exact: tuple[Recording, Trajectory]) -> None:

@@ -178,7 +178,7 @@ def test_a_pass_for_a_noise_model_says_what_one_with_all_covariances_says() -> N
     for problem in (base, apply_noise(stated, replace(noise, figures=larger))):
         for rows in problem.constraints:
             n = len(rows)
-            one, other = (some.linearise(rows, problem.columns, n) for some in (short, whole))
+            one, other = (linearise(rows, some, problem.columns) for some in (short, whole))
             for name in ("residual", "stated", "H"):
                 np.testing.assert_allclose(getattr(one, name), getattr(other, name), atol=1e-8)
             if rows.list_noise_groups()[0]:
