@@ -34,9 +34,8 @@ class Stops:
 
     def __init__(self, false: Sequence[tuple[float, float]] = ()) -> None:
         self.spans: Array = np.empty((0, 2))  # s, between keyframes
-        self._false = np.array(false).reshape(
-            -1, 2
-        )  # s, in order, spans in which the platform moves, whatever the detectors say
+        # s, in order, spans in which the platform moves, whatever the detectors say
+        self._false = np.array(false).reshape(-1, 2)
         self.looked = -np.inf  # s, up to where
         self._reviewed = -np.inf
         self._seen: tuple[float, Array | None] | None = None  # since when, and which; not yet in `spans`
