@@ -38,12 +38,14 @@ from graphnav.constraints.lasting import (
     MULTIPATH_ERROR,
     compute_running_median,
     find_fix_period,
+    find_least_period,
     find_node_spacing,
     list_processes,
+    make_multipath,
 )
 from graphnav.core import earth, rotation
 from graphnav.core.rotation import Array, mv
-from graphnav.core.state import NODE_SPACING, SECONDS, Parameter, States
+from graphnav.core.state import SECONDS, Parameter, States
 from graphnav.gnss.residuals import compute_range_sigma
 from graphnav.recording import FIX_TYPES, Recording
 
@@ -99,9 +101,7 @@ def _build_stamp_error(settings: Settings, t: Array) -> tuple[Parameter, ...]:
     sigma = np.full(1, settings.gnss.time_offset_sigma)
     if not sigma[0] > 0.0:
         return ()
-    # a node at every fix, however close: two fixes with one stamp error would contradict each other
-    spacing = min(float(np.diff(t).min()), NODE_SPACING) if len(t) > 1 else NODE_SPACING
-    own = (STAMPS,)
+    own, spacing = (STAMPS,), find_least_period(t)
     return (
         Parameter(STAMP_ERROR, np.zeros(1), sigma, "s", correlation_time=_WHITE, spacing=spacing, noise_groups=own),
     )
@@ -207,12 +207,16 @@ class GnssPosition(_Fixes):
         p_n = scene.frame.from_llh(llh)
         kinds = None if gnss.type is None or len(np.unique(gnss.type)) < 2 else gnss.type[used]
         common = _build_common(scene, TIME_OFFSET)
-        reflected = None
-        if gnss.residual_rms is not None:
-            reflected = sd * compute_range_sigma(gnss.residual_rms, gnss.satellites)[used, None]
         types = [] if kinds is None else [FIX_TYPES[int(kind)] for kind in np.unique(kinds)]
         spacing = find_node_spacing(scene.settings.gnss.slow_times, find_fix_period(gnss.t[used]))
-        processes = list_processes(types, scene.settings.gnss.slow_times, spacing, reflected is not None)
+        processes = (
+            *list_processes(types, scene.settings.gnss.slow_times, spacing),
+            *_build_stamp_error(scene.settings, gnss.t[used]),
+        )
+        reflected = None
+        if gnss.residual_rms is not None:
+            reflected = compute_range_sigma(gnss.residual_rms, gnss.satellites)
+            processes += (make_multipath(gnss.t, reflected, find_least_period(gnss.t[used])),)
         rounding = np.array(gnss.rounding) * np.sqrt(count_repeats(gnss.llh[:, [1, 0, 2]]))[used]
         return cls(
             keyframe=keyframe[used],
@@ -225,9 +229,9 @@ class GnssPosition(_Fixes):
             else scene.typical_sigmas[used],
             drive_error=np.median(sd if scene.typical_sigmas is None else scene.typical_sigmas, axis=0),
             type=kinds,
-            multipath_sigma=reflected,
+            multipath_sigma=None if reflected is None else sd * reflected[used, None],
             **_build_motion(scene, gnss.t[used], p_n),
-            processes=(*processes, *_build_stamp_error(scene.settings, gnss.t[used])),
+            processes=processes,
             **common,
         )
 

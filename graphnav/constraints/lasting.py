@@ -19,12 +19,14 @@ are unrelated. With one error in common, either would make the other wrong.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from graphnav.core.rotation import Array
 from graphnav.core.running import run_median
 from graphnav.core.state import NODE_SPACING, SECONDS, Parameter
+from graphnav.gnss.sigmas import REFLECTED
 
 TIMES = ("seconds", "minutes", "hours")  # correlation times of the processes of a position's error
 ERRORS = tuple(f"gnss_error_of_{time}" for time in TIMES)
@@ -35,10 +37,8 @@ _ROWS, _AXES = "gnss_position", ("horizontal", "horizontal", "up")
 _MINUTE = 60.0  # s
 
 
-def list_processes(
-    types: Sequence[str], slow_times: tuple[float, float], spacing: float, multipath: bool = False
-) -> tuple[Parameter, ...]:
-    """The processes of a position's error.
+def list_processes(types: Sequence[str], slow_times: tuple[float, float], spacing: float) -> tuple[Parameter, ...]:
+    """The processes of a position's error in units that are smooth.
 
     Parameters
     ----------
@@ -48,8 +48,6 @@ def list_processes(
         s, correlation times of minutes and of hours.
     spacing
         s, of their nodes.
-    multipath
-        Whether the fixes state what their residuals are.
 
     Returns
     -------
@@ -57,22 +55,33 @@ def list_processes(
         In units of a sigma.
     """
     lasts = dict(zip(TIMES, (SECONDS, *slow_times), strict=True))
-    kinds = [(f".{one}" if one else "", error) for one in types or [""] for error in lasts]
-    if multipath:
-        kinds, lasts = [*kinds, ("", MULTIPATH)], lasts | {MULTIPATH: SECONDS}
-    return tuple(
-        Parameter(
-            f"gnss_error_of_{error}{kind.replace('.', '_')}", np.zeros(3), np.ones(3), "sd",
-            correlation_time=lasts[error], spacing=spacing,
-            noise_groups=tuple(f"{_ROWS}{kind}.{error}.{axis}" for axis in _AXES),
-        )
-        for kind, error in kinds
+    kinds = [f".{one}" for one in types] or [""]
+    return tuple(_make_process(error, lasts[error], spacing, kind) for kind in kinds for error in lasts)
+
+
+def make_multipath(t: Array, range_sigma: Array, spacing: float) -> Parameter:
+    """The process of multipath of fixes at times t (N,), s, whose pseudoranges have 1-sigmas (N,), m."""
+    return replace(_make_process(MULTIPATH, REFLECTED, spacing), sizes=(t, range_sigma))
+
+
+def _make_process(error: str, lasts: float, spacing: float, kind: str = "") -> Parameter:
+    return Parameter(
+        f"gnss_error_of_{error}{kind.replace('.', '_')}", np.zeros(3), np.ones(3), "sd",
+        correlation_time=lasts, spacing=spacing,
+        noise_groups=tuple(f"{_ROWS}{kind}.{error}.{axis}" for axis in _AXES),
     )  # fmt: skip
 
 
 def find_fix_period(t: Array) -> float:
     """Usual time between fixes, s."""
     return max(float(np.median(np.diff(t))), 1e-3) if len(t) > 1 else 1.0
+
+
+def find_least_period(t: Array) -> float:
+    """Least time between fixes, s: the spacing of nodes by which each fix has its own, since two fixes with one error
+    in different units would contradict each other.
+    """
+    return min(float(np.diff(t).min()), NODE_SPACING) if len(t) > 1 else NODE_SPACING
 
 
 def find_node_spacing(slow_times: tuple[float, ...], dt: float) -> float:

@@ -13,6 +13,7 @@ from graphnav.constraints.vehicle import NHC_ERROR, ODOMETER_ERROR
 from graphnav.core.state import SECONDS
 from graphnav.estimation.names import name_rows
 from graphnav.estimation.noise.model import NoiseModel, VarianceComponent
+from graphnav.gnss.sigmas import REFLECTED
 from graphnav.recording import FIX_TYPES, ImuNoise, Recording
 
 _IMU_FIGURES = {
@@ -48,7 +49,7 @@ def tabulate_figures(
     slow_times : s, correlation times of a fix's errors of minutes and of hours, of the settings.
     imu : what the factors of the IMU are relative to; what the recording states when None.
     """
-    lasts = dict(zip(LASTING, (SECONDS, *slow_times, SECONDS), strict=True))
+    lasts = dict(zip(LASTING, (SECONDS, *slow_times, REFLECTED), strict=True))
     out = []
     for group, figure in noise.figures.items():
         source, *middle, axis = group.split(".")
