@@ -46,7 +46,7 @@ from graphnav.constraints.lasting import (
 from graphnav.core import earth, rotation
 from graphnav.core.rotation import Array, mv
 from graphnav.core.state import SECONDS, Parameter, States
-from graphnav.gnss.residuals import compute_range_sigma
+from graphnav.gnss.residuals import compute_multipath_sigma
 from graphnav.recording import FIX_TYPES, Recording
 
 TIME_OFFSET = "gnss_time_offset"
@@ -215,7 +215,7 @@ class GnssPosition(_Fixes):
         )
         reflected = None
         if gnss.residual_rms is not None:
-            reflected = compute_range_sigma(gnss.residual_rms, gnss.satellites)
+            reflected = compute_multipath_sigma(gnss.residual_rms, gnss.satellites)
             processes += (make_multipath(gnss.t, reflected, find_least_period(gnss.t[used])),)
         rounding = np.array(gnss.rounding) * np.sqrt(count_repeats(gnss.llh[:, [1, 0, 2]]))[used]
         return cls(

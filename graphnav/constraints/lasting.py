@@ -11,9 +11,11 @@ These units are smooth in time. A lasting error in units that change from fix to
 changes.
 
 Where fixes state the rms of their pseudorange residuals, there is a fourth process, of multipath, in units of each
-fix's stated sigma times that of its pseudoranges (`graphnav.gnss.residuals`). This unit does change from fix to fix:
-where satellites behind a corner come and go, right and wrong fixes follow each other within a second, and their errors
-are unrelated. With one error in common, either would make the other wrong.
+fix's stated sigma times the multipath in its pseudoranges (`graphnav.gnss.residuals`). This unit does change from fix
+to fix: where satellites behind a corner come and go, right and wrong fixes follow each other within a second. With one
+error in common, either would make the other wrong. What reflections add when the unit rises is independent of what was
+there, and what is left when it falls again is a part of that: errors of variances a and b a moment apart have a
+covariance of min(a, b), as in Tokyo's streets the true ones have.
 """
 
 from __future__ import annotations
@@ -59,9 +61,9 @@ def list_processes(types: Sequence[str], slow_times: tuple[float, float], spacin
     return tuple(_make_process(error, lasts[error], spacing, kind) for kind in kinds for error in lasts)
 
 
-def make_multipath(t: Array, range_sigma: Array, spacing: float) -> Parameter:
-    """The process of multipath of fixes at times t (N,), s, whose pseudoranges have 1-sigmas (N,), m."""
-    return replace(_make_process(MULTIPATH, REFLECTED, spacing), sizes=(t, range_sigma))
+def make_multipath(t: Array, size: Array, spacing: float) -> Parameter:
+    """The process of multipath of fixes at times t (N,), s, that is of a size (N,), m, in their pseudoranges."""
+    return replace(_make_process(MULTIPATH, REFLECTED, spacing), sizes=(t, size))
 
 
 def _make_process(error: str, lasts: float, spacing: float, kind: str = "") -> Parameter:
