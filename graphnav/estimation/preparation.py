@@ -314,7 +314,7 @@ def _is_likelier(base: Problem, plain: NoiseModel, found: NoiseEstimate) -> bool
     """
     problem = apply_noise(base, plain)
     forward = refilter(problem, found.carry_points(base, problem), whole=False)
-    return float(np.sum(forward.log_likelihood)) > found.log_posterior
+    return float(np.sum(forward.log_likelihood)) > found.log_evidence
 
 
 def _drop_refused(problem: Problem, forward: FilterPass) -> Problem:

@@ -43,8 +43,9 @@ from graphnav.estimation.noise.moments import (
     collect_row_moments,
     lag_moments,
 )
-from graphnav.estimation.noise.outliers import CHANCE, compute_outlier_cost, count_rows, limit_scaled, list_reduced
+from graphnav.estimation.noise.outliers import compute_interval_cost, compute_row_costs, list_reduced
 from graphnav.estimation.noise.priors import TIME_WITHIN
+from graphnav.estimation.noise.tails import CHANCE, estimate_tail_index, get_tail_index, weigh_scaled
 from graphnav.estimation.problem import ParameterChain, Problem
 from graphnav.estimation.solvers.ekf import refilter
 from graphnav.estimation.solvers.linearise import Points
@@ -150,7 +151,7 @@ def _iterate(
     intervals: bool,
 ) -> NoiseEstimate:
     """Iterate from initial figures and linearisation points to convergence."""
-    done, total, converged, totals = 0, len(problem.t), False, count_rows(problem)  # keyframes
+    done, total, converged = 0, len(problem.t), False  # keyframes
     stages = [(total, CHANCE)]
     if not figures.same_data:
         long = total > 2 * _FIRST_KEYFRAMES and not figures.known
@@ -169,30 +170,34 @@ def _iterate(
             now = float(np.sum(latest[0].log_likelihood)) + prior_then
             if progress is not None:
                 progress("noise", min((k + 1) / rounds, 1.0))
-            if (evidence := now - compute_outlier_cost(figures.weights, totals)) > most:
-                likeliest, most = figures.copy(), evidence
+            here, evidence = figures.copy(), now - _compute_weight_cost(used, figures)
+            if evidence > most:
+                likeliest, most = here, evidence
             ahead = _splice(about, latest[1])
             near = are_near(ahead, about, LINEAR_ATTITUDE)
             about = ahead if near else shorten_step(used, about, ahead)
             _improve(figures, used, *latest, end, intervals, bound)
             # each figure gains a half by chance; while one sensor is far off, many passes gain little more than that
-            converged = k > 1 and abs(now - before) < (0.05 if k + 1 < rounds else 0.5) * len(figures.log)
-            highest, since = max(highest, now), since + 1 if now <= highest else 0
+            converged = k > 1 and abs(evidence - before) < (0.05 if k + 1 < rounds else 0.5) * len(figures.log)
+            highest, since = max(highest, evidence), since + 1 if evidence <= highest else 0
             # weights and figures may alternate between two states
             if converged or since == _ROUNDS // 2:
                 break
-            before, figures.extrapolation = now, _EXTRAPOLATION if k > 1 and now > before else 1.0
+            before, figures.extrapolation = evidence, _EXTRAPOLATION if k > 1 and evidence > before else 1.0
         if not converged:  # oscillating, or not yet converged
             figures = likeliest
+        elif bound == CHANCE:
+            figures = here
         if bound != CHANCE:
             robust = figures.build_model()
     if not converged:
         latest = None
-        latest = _smooth_about(apply_noise(problem, figures.build_model()), about)
+        used = apply_noise(problem, figures.build_model())
+        latest = _smooth_about(used, about)
         done, prior_then = done + total, figures.log_prior()
         now = float(np.sum(latest[0].log_likelihood)) + prior_then
     assert latest is not None
-    evidence, passes = now - compute_outlier_cost(figures.weights, totals), round(done / total)
+    evidence, passes = now - _compute_weight_cost(used, figures), round(done / total)
     return NoiseEstimate(
         figures.build_model(),
         latest[1],
@@ -202,6 +207,12 @@ def _iterate(
         Counter(filter=passes, smoother=passes),
         robust=robust,
     )
+
+
+def _compute_weight_cost(used: Problem, figures: Components) -> float:
+    """By which the log-likelihood of a problem with the weights of these figures is above the evidence."""
+    intervals = compute_interval_cost(figures.weights, len(used.t) - 1)
+    return float(np.sum(compute_row_costs(used, figures.tails))) + intervals
 
 
 def _smooth_about(problem: Problem, about: Points) -> tuple[ForwardRecord, MomentPass]:
@@ -256,12 +267,18 @@ def _improve(
         if not names:
             continue
         n = int(np.searchsorted(rows.keyframe, end))
-        found = collect_row_moments(problem, rows, smoothed, n)
+        found, index = collect_row_moments(problem, rows, smoothed, n), index[:n]
+        grown = np.ones(found.A.shape)
         for i, name in enumerate(names):
-            own = index[:n] == i
+            own, before = index == i, figures.log[name]
             if own.any():
-                figures.update(name, *_bound_squares(found.A[own], found.B[own], 1, bound))
-        _weigh_rows(figures, problem, rows, np.maximum(found.left_out, found.whole), n)
+                A, B = found.A[own], found.B[own]
+                sums = (float(np.sum(A)), float(np.sum(B))) if bound == CHANCE else _bound_squares(A, B, 1, bound)
+                figures.update(name, *sums)
+            grown[own] = np.exp(figures.log[name] - before)
+        # with the figures of the next pass: B is the share of the row's own variance in that of its prediction
+        squared = np.maximum(found.left_out, found.whole) / np.mean(1.0 + found.B * (grown - 1.0), axis=1)
+        _weigh_rows(figures, problem, rows, squared, bound == CHANCE)
 
 
 def _weigh_intervals(figures: Components, problem: Problem, imu: ImuMoments) -> None:
@@ -324,9 +341,13 @@ def _improve_time(figures: Components, chain: ParameterChain, observed: Array, l
     figures.times[p.name] = float(np.clip(found, median / _TIME_RANGE, median * _TIME_RANGE))
 
 
-def _weigh_rows(figures: Components, problem: Problem, rows: Constraint, squared: Array, n: int) -> None:
-    """Weights of the first n rows by their squared errors (n,)."""
+def _weigh_rows(figures: Components, problem: Problem, rows: Constraint, squared: Array, anew: bool) -> None:
+    """Weights of the first n rows by their squared errors (n,), with the tail index estimated anew or as it was."""
+    n, m = len(squared), len(rows.axes)
     before = np.ones(len(rows)) if rows.weight is None else rows.weight
     used = before > 0.0
-    weight = np.concatenate([limit_scaled(squared, len(rows.axes), used[:n]), before[n:]])  # later ones as they were
+    if anew:
+        figures.tails[rows.name] = estimate_tail_index(squared[used[:n]], m)
+    weight = weigh_scaled(squared, m, get_tail_index(figures.tails, rows.name, m), used[:n])
+    weight = np.concatenate([weight, before[n:]])  # later ones as they were
     figures.weights[rows.name] = list_reduced(problem.t[rows.keyframe], weight, used)

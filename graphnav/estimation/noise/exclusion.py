@@ -62,11 +62,11 @@ from graphnav.estimation.noise.decision import (
     weigh_evidence,
 )
 from graphnav.estimation.noise.estimate import NoiseEstimate, estimate_noise
-from graphnav.estimation.noise.explanations import FIXES, ROWS
+from graphnav.estimation.noise.explanations import FIXES
 from graphnav.estimation.noise.initial_points import BREAKDOWN
 from graphnav.estimation.noise.model import INTERVALS, NoiseModel, RowWeights
 from graphnav.estimation.noise.moments import collect_imu_moments
-from graphnav.estimation.noise.outliers import limit_squares, may_pay
+from graphnav.estimation.noise.outliers import may_pay
 from graphnav.estimation.noise.spans import (
     LeftOutErrors,
     Span,
@@ -87,6 +87,7 @@ from graphnav.estimation.noise.suspects import (
     list_fix_times,
     predict_left_out,
 )
+from graphnav.estimation.noise.tails import get_tail_index, weigh_outlying
 from graphnav.estimation.problem import Problem
 from graphnav.recording import Recording
 
@@ -249,7 +250,7 @@ def _unmask(base: Problem, found: NoiseEstimate, first: Decision, masked: list[S
             passes = passes + candidate.passes
             cut = cut_at_steps(some, candidate.noise, used, estimate)
             if cut != some:
-                among = {*list_explanations(candidate.noise), ROWS}  # its pieces are wrong the same way, or not at all
+                among = list_explanations(candidate.noise)  # its pieces are wrong the same way, or not at all
                 finer = explain(base, _add_outliers(estimate, errors, cut), cut, among, least)
                 passes = passes + finer.passes
                 candidate = max(candidate, finer, key=lambda one: one.log_evidence)
@@ -351,7 +352,7 @@ def _add_outliers(found: NoiseEstimate, errors: LeftOutErrors, spans: list[Span]
     """The estimate with weights for fixes in spans that it leaves out, so that each may be a single outlier."""
     weights = dict(found.noise.weights)
     for name, (t, squared, m) in errors.items():
-        weight = limit_squares(squared, m)
+        weight = weigh_outlying(squared, m, get_tail_index(found.noise.tails, name, m))
         kept = drop_within(weights.get(name, RowWeights(np.empty(0), np.empty(0))), spans)
         inside = mask_times(t, spans) & np.isin(t, t[weight < 1.0])  # with all rows of their times
         both, of_both = np.concatenate([kept.t, t[inside]]), np.concatenate([kept.weight, weight[inside]])

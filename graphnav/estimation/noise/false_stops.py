@@ -17,14 +17,16 @@ from typing import TypeVar
 import numpy as np
 
 from graphnav.constraints.base import SAME_TIME
-from graphnav.constraints.standstill import HeldPosition, ZeroRate, ZeroVelocity
+from graphnav.constraints.standstill import HeldPosition, ZeroVelocity
 from graphnav.core.rotation import Array
 from graphnav.detectors.base import NONE, merge_spans
+from graphnav.estimation.faults.excluded import weigh_rows
 from graphnav.estimation.faults.watch import FAULT_COST
 from graphnav.estimation.noise.apply import apply_noise
 from graphnav.estimation.noise.explanations import FIXES, Trials, add_common_errors
 from graphnav.estimation.noise.initial_points import BREAKDOWN
 from graphnav.estimation.noise.model import INTERVALS, NoiseModel
+from graphnav.estimation.noise.outliers import compute_row_costs
 from graphnav.estimation.noise.spans import join
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.linearise import Points
@@ -33,7 +35,6 @@ from graphnav.estimation.solvers.passes import reuse_points
 Found = TypeVar("Found")
 
 _OF_STOPS = (ZeroVelocity.name,)
-_MASKING = (*INTERVALS, ZeroVelocity.name, ZeroRate.name, HeldPosition.name)  # their weights may hide a false stop
 
 
 def find_false_stops(
@@ -67,14 +68,15 @@ def find_false_stops(
         excluded[name] = join([*excluded.get(name, ()), *listed])
     noise = replace(
         noise,
-        weights={name: some for name, some in noise.weights.items() if name not in _MASKING},
+        weights={name: some for name, some in noise.weights.items() if name not in INTERVALS},  # they may hide a stop
         excluded={name: tuple(some) for name, some in excluded.items()},
     )
     used = apply_noise(base, noise)
     trials = Trials(used, reuse_points(*near, used), listed)
-    stands = trials.sum_spans(trials.filter(used).log_likelihood())
-    moves = trials.sum_spans(trials.filter(add_common_errors(used, listed, _OF_STOPS), _OF_STOPS).log_likelihood())
-    return spans[moves - stands > FAULT_COST], trials.passes
+    stands = trials.filter(used).log_likelihood() - compute_row_costs(used, noise.tails)
+    free = add_common_errors(weigh_rows(used, {rows.name: np.ones(len(rows))}), listed, _OF_STOPS)
+    moves = trials.filter(free, _OF_STOPS).log_likelihood() - compute_row_costs(used, noise.tails, without=_OF_STOPS)
+    return spans[trials.sum_spans(moves - stands) > FAULT_COST], trials.passes
 
 
 def leave_out_false_stops(

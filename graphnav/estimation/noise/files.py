@@ -83,6 +83,7 @@ _KEYS = (
     "figures",
     "correlation_times",
     "weights",
+    "tails",
     "excluded",
     "span_weights",
     "false_stops",
@@ -119,6 +120,7 @@ def list_noise(noise: NoiseModel, mode: str = "estimated") -> dict[str, Any]:
             for name, some in noise.weights.items()
             if len(some.t)
         },
+        "tails": {name: float(index) for name, index in noise.tails.items()},
         "excluded": {name: [[float(a), float(b)] for a, b in spans] for name, spans in noise.excluded.items() if spans},
         "spacing": float(noise.spacing),
         "stamps": {name: float(getattr(noise.stamps, name)) for name in _STAMPS},
@@ -239,6 +241,7 @@ class _Reader:
             self.read_number("noise.spacing", values.get("spacing", 0.0), 0.0, 60.0, "s between fixes"),
             StampOffsets(**self.read_each(values, "stamps", _STAMPS, self.read_offset)),
             {name: self.read_constant(key, values) for key, (name, *_) in _FREED.items() if key in values},
+            self.read_each(values, "tails", constraints, self.read_tail),
             self.read_spans("noise.false_stops", values.get("false_stops", [])),
         ), mode
 
@@ -303,6 +306,9 @@ class _Reader:
                 f"{key}.degrees_of_freedom", value.get("degrees_of_freedom", 0.0), 0.0, math.inf, "a count"
             ),
         )
+
+    def read_tail(self, key: str, value: Any) -> float:
+        return self.read_number(key, value, 0.01, 1e9, "degrees of freedom of the tails of errors")
 
     def read_time(self, key: str, value: Any) -> float:
         return self.read_number(key, value, 1e-3, 1e9, "s, a correlation time")
