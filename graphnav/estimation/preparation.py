@@ -39,6 +39,7 @@ from graphnav.estimation.noise.false_stops import find_false_stops, leave_out_fa
 from graphnav.estimation.noise.initial_points import BREAKDOWN, find_initial_points
 from graphnav.estimation.noise.model import STATED, NoiseModel
 from graphnav.estimation.noise.span_variances import weigh_excluded
+from graphnav.estimation.noise.tails import widen_by_tails
 from graphnav.estimation.noise.unmeasured import UnmeasuredRows, drop_in_gaps, drop_unmeasured
 from graphnav.estimation.noise.words import describe_noise
 from graphnav.estimation.problem import Problem
@@ -233,7 +234,8 @@ def _find_noise(
     evidence = found.compute_evidence() if wanted else np.inf
     passes.update(found.estimate.passes + Counter(filter=1))
     plain = NoiseModel(excluded=best.noise.excluded, freed=found.freed)
-    noise = plain if _is_likelier(built.problem, plain, best) else found.noise
+    likelier = _is_likelier(built.problem, plain, best)
+    noise = plain if likelier else widen_by_tails(built.problem, found.noise)
     if noise.excluded:
         with contextlib.suppress(*BREAKDOWN):
             noise, spent = weigh_excluded(built.problem, noise, best.get_linearisation(built.problem))

@@ -17,11 +17,14 @@ adaptive robust loss function", CVPR (2019).
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 from scipy.special import chdtrc, chdtri, gammaln
 
 from graphnav.core.rotation import Array
+from graphnav.estimation.noise.model import NoiseModel
+from graphnav.estimation.problem import Problem
 
 CHANCE = 1e-3  # probability of a larger squared error, below which a row is an outlier
 _WITHIN = float(np.log(3.0))  # 1-sigma of the logarithm of a tail index
@@ -79,3 +82,15 @@ def compute_information_share(index: float, m: int) -> float:
     beyond = float(np.exp(-0.5 * limit + 0.5 * m * np.log(0.5 * limit) - gammaln(0.5 * m))) * 2.0 / (index + 2.0)
     fisher = float(1.0 - chdtrc(m + 2, limit)) + limit / m * beyond
     return fisher / (float(1.0 - chdtrc(m, limit)) + beyond)
+
+
+def widen_by_tails(problem: Problem, noise: NoiseModel) -> NoiseModel:
+    """The noise model with which weighted rows, taken as Gaussian by a solver, tell no more than their information."""
+    figures = dict(noise.figures)
+    for rows in problem.constraints:
+        if rows.name in noise.tails:
+            share = compute_information_share(noise.tails[rows.name], len(rows.axes))
+            for group in rows.list_noise_groups()[0]:
+                if group in figures:
+                    figures[group] = replace(figures[group], log_factor=figures[group].log_factor - float(np.log(share)))
+    return replace(noise, figures=figures)
