@@ -92,5 +92,7 @@ def widen_by_tails(problem: Problem, noise: NoiseModel) -> NoiseModel:
             share = compute_information_share(noise.tails[rows.name], len(rows.axes))
             for group in rows.list_noise_groups()[0]:
                 if group in figures:
-                    figures[group] = replace(figures[group], log_factor=figures[group].log_factor - float(np.log(share)))
+                    figures[group] = replace(
+                        figures[group], log_factor=figures[group].log_factor - float(np.log(share))
+                    )
     return replace(noise, figures=figures)
