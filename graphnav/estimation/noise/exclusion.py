@@ -337,8 +337,15 @@ def _disturb_intervals(base: Problem, found: NoiseEstimate) -> NoiseEstimate:
         if free.noise.excluded == found.noise.excluded:  # the same model, already converging
             start, near = free.noise, free.get_linearisation(base)
     disturbed = weigh_evidence(base, estimate_noise(base, None, start, near, intervals=True))
-    best = max(found, disturbed, key=lambda one: log_evidence(base, one))
-    return replace(best, passes=passes + disturbed.passes)
+    passes = passes + disturbed.passes
+    if log_evidence(base, disturbed) <= log_evidence(base, found):
+        return replace(found, passes=passes)
+    # from the priors: figures estimated with all intervals alike may be far from their final values
+    anew = NoiseModel(weights=disturbed.noise.weights, excluded=disturbed.noise.excluded)
+    other = estimate_noise(base, None, anew, disturbed.get_linearisation(base), intervals=True)
+    other = weigh_evidence(base, other)
+    best = max(disturbed, other, key=lambda one: log_evidence(base, one))
+    return replace(best, passes=passes + other.passes)
 
 
 def _may_be_disturbed(base: Problem, found: NoiseEstimate) -> bool:

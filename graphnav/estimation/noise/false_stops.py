@@ -27,7 +27,7 @@ from graphnav.estimation.noise.explanations import FIXES, Trials, add_common_err
 from graphnav.estimation.noise.initial_points import BREAKDOWN
 from graphnav.estimation.noise.model import INTERVALS, NoiseModel
 from graphnav.estimation.noise.outliers import compute_row_costs
-from graphnav.estimation.noise.spans import join
+from graphnav.estimation.noise.spans import drop_within, join
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.linearise import Points
 from graphnav.estimation.solvers.passes import reuse_points
@@ -68,7 +68,8 @@ def find_false_stops(
         excluded[name] = join([*excluded.get(name, ()), *listed])
     noise = replace(
         noise,
-        weights={name: some for name, some in noise.weights.items() if name not in INTERVALS},  # they may hide a stop
+        # disturbed intervals may hide a false stop
+        weights={n: drop_within(some, listed) if n in INTERVALS else some for n, some in noise.weights.items()},
         excluded={name: tuple(some) for name, some in excluded.items()},
     )
     used = apply_noise(base, noise)
