@@ -39,7 +39,7 @@ from graphnav.estimation.noise.false_stops import find_false_stops, leave_out_fa
 from graphnav.estimation.noise.initial_points import BREAKDOWN, find_initial_points
 from graphnav.estimation.noise.model import STATED, NoiseModel
 from graphnav.estimation.noise.span_variances import weigh_excluded
-from graphnav.estimation.noise.tails import widen_by_tails
+from graphnav.estimation.noise.tails import are_of_others, widen_by_tails, widen_unweighted
 from graphnav.estimation.noise.unmeasured import UnmeasuredRows, drop_in_gaps, drop_unmeasured
 from graphnav.estimation.noise.words import describe_noise
 from graphnav.estimation.problem import Problem
@@ -140,6 +140,8 @@ def prepare(
             noise, built, evidence = _find_noise(builder, built, progress, passes, weigh)
             noise = replace(noise, spacing=spacing)
     else:
+        if are_of_others(built.problem, noise):
+            noise = widen_unweighted(built.problem, noise)
         built = builder.build_without(built, noise, parts=noise != STATED, anew=bool(noise.freed))
         built = replace(built, problem=free(built.problem, noise.freed))
     aligned = built.aligned

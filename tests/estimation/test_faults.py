@@ -37,8 +37,8 @@ from graphnav.estimation.noise.explanations import (
     compute_evidence,
 )
 from graphnav.estimation.noise.outliers import OUTLIER_COST
-from graphnav.estimation.noise.tails import CHANCE
 from graphnav.estimation.noise.spans import list_before, split_at_steps
+from graphnav.estimation.noise.tails import CHANCE
 from graphnav.estimation.pipeline import choose_origin, run
 from graphnav.estimation.problem import Problem, build_problem
 from graphnav.estimation.solution import Solution

@@ -63,9 +63,8 @@ class NoiseEstimate:
 
     noise: NoiseModel
     points: MomentPass
-    log_posterior: float
     log_prior: float
-    log_evidence: float  # of the measurements: the same less the cost of rows and intervals of reduced weight
+    log_evidence: float  # of the measurements, and prior: of the likelihood, rows of reduced weight have that of tails
     passes: Counter[str]  # over keyframes, of "filter" and "smoother"
     whole_evidence: float | None = None  # of all measurements, excluded ones included, where it was computed
     rival: NoiseEstimate | None = None  # by another decision on what is wrong, nearly as likely
@@ -183,7 +182,7 @@ def _iterate(
     assert latest is not None
     evidence, passes = now - _compute_weight_cost(used, figures), round(done / total)
     return NoiseEstimate(
-        figures.build_model(), latest[1], now, prior_then, evidence, Counter(filter=passes, smoother=passes)
+        figures.build_model(), latest[1], prior_then, evidence, Counter(filter=passes, smoother=passes)
     )
 
 

@@ -87,7 +87,7 @@ from graphnav.estimation.noise.suspects import (
     list_fix_times,
     predict_left_out,
 )
-from graphnav.estimation.noise.tails import get_tail_index, weigh_outlying
+from graphnav.estimation.noise.tails import get_tail_index, relate_to_gaussian, weigh_outlying
 from graphnav.estimation.problem import Problem
 from graphnav.recording import Recording
 
@@ -371,7 +371,10 @@ def _add_outliers(found: NoiseEstimate, errors: LeftOutErrors, spans: list[Span]
 def compute_excluded_share(problem: Problem, noise: NoiseModel) -> float:
     """Share of the information of the positions that a noise model leaves out."""
     rows = next((c for c in problem.constraints if c.name == FIXES[0]), None)
-    return 0.0 if rows is None else 1.0 - float(np.mean(select_weights(problem.t[rows.keyframe], noise, rows.name)))
+    if rows is None:
+        return 0.0
+    weight = select_weights(problem.t[rows.keyframe], noise, rows.name)
+    return 1.0 - float(np.mean(relate_to_gaussian(weight, len(rows.axes), noise.tails.get(rows.name))))
 
 
 def drop_excluded(recording: Recording, noise: NoiseModel) -> Recording:

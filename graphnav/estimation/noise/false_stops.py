@@ -28,6 +28,7 @@ from graphnav.estimation.noise.initial_points import BREAKDOWN
 from graphnav.estimation.noise.model import INTERVALS, NoiseModel
 from graphnav.estimation.noise.outliers import compute_row_costs
 from graphnav.estimation.noise.spans import drop_within, join
+from graphnav.estimation.noise.tails import relate_to_gaussian
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.linearise import Points
 from graphnav.estimation.solvers.passes import reuse_points
@@ -66,11 +67,15 @@ def find_false_stops(
     excluded = {name: list(some) for name, some in noise.excluded.items()}
     for name in (*FIXES, HeldPosition.name):
         excluded[name] = join([*excluded.get(name, ()), *listed])
+    # disturbed intervals may hide a false stop, and so may tails that are as long as rows of false stops make them
+    weights = {name: drop_within(w, listed) if name in INTERVALS else w for name, w in noise.weights.items()}
+    if rows.name in weights:
+        w = weights[rows.name]
+        shorter = relate_to_gaussian(w.weight, len(rows.axes), noise.tails.get(rows.name))
+        weights[rows.name] = replace(w, weight=shorter)
+    tails = {name: index for name, index in noise.tails.items() if name != rows.name}
     noise = replace(
-        noise,
-        # disturbed intervals may hide a false stop
-        weights={n: drop_within(some, listed) if n in INTERVALS else some for n, some in noise.weights.items()},
-        excluded={name: tuple(some) for name, some in excluded.items()},
+        noise, weights=weights, tails=tails, excluded={name: tuple(some) for name, some in excluded.items()}
     )
     used = apply_noise(base, noise)
     trials = Trials(used, reuse_points(*near, used), listed)

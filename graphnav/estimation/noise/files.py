@@ -7,6 +7,7 @@ Under the key "noise", in a file of its own or in the summary.json of a run::
     correlation_times   s, by the parameter of a process
     weights             by constraint: t (s) and weight of rows with less information; by imu.gyro and imu.accel: end
                         (s) of intervals between keyframes with more white noise, and 1 over its variance's factor
+    tails               by constraint: degrees of freedom of the tails of its rows' errors
     excluded            by constraint: [begin, end] (s) of spans of faulty rows
     span_weights        by constraint: [begin, end, weight] of those that are used after all, with less information
     false_stops         [begin, end] (s) of spans that are no stops, whatever the detectors say, if there are any

@@ -16,12 +16,13 @@ adaptive robust loss function", CVPR (2019).
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 import numpy as np
 from scipy.special import chdtrc, chdtri, gammaln
 
+from graphnav.constraints.base import SAME_TIME
 from graphnav.core.rotation import Array
 from graphnav.estimation.noise.model import NoiseModel
 from graphnav.estimation.problem import Problem
@@ -49,6 +50,11 @@ def weigh_scaled(squared: Array, m: int, index: float, used: Array) -> Array:
     some = squared[used]
     scale = float(np.median(some)) / float(chdtri(m, 0.5)) if len(some) else 1.0
     return weigh_outlying(squared / max(scale, 1.0), m, index)
+
+
+def relate_to_gaussian(weight: Array, m: int, index: float | None) -> Array:
+    """Weights (N,) below 1 only of rows that exceed what a Gaussian does once in a thousand times (`CHANCE`)."""
+    return weight if index is None else np.minimum(weight * float(chdtri(m, CHANCE)) / (index + m), 1.0)
 
 
 def compute_log_normaliser(index: float | Array, m: int) -> Array:
@@ -84,15 +90,57 @@ def compute_information_share(index: float, m: int) -> float:
     return fisher / (float(1.0 - chdtrc(m, limit)) + beyond)
 
 
+def compute_unweighted_factor(index: float, m: int) -> float:
+    """Variance factor of a Gaussian that stands for rows whose weights are not known.
+
+    It is the robust one: of squares that count for no more than the value that a Gaussian exceeds once in a thousand
+    times (`CHANCE`), the mean is that of a Gaussian.
+    """
+    limit, most = index + m, float(chdtri(m, CHANCE))
+    log_s = np.linspace(-15.0, 60.0, 7501)
+    s = np.exp(log_s)
+    density = np.exp(0.5 * m * log_s - 0.5 * np.minimum(s, limit) * (1.0 + np.log(np.maximum(s / limit, 1.0))))
+    density /= np.sum(density)
+    factors = np.linspace(0.0, 7.0, 141)
+    means = np.minimum(s / np.exp(factors[:, None]), most) @ density
+    expected = m * float(1.0 - chdtrc(m + 2, most)) + most * CHANCE
+    return float(np.exp(np.interp(-expected, -means, factors)))
+
+
 def widen_by_tails(problem: Problem, noise: NoiseModel) -> NoiseModel:
     """The noise model with which weighted rows, taken as Gaussian by a solver, tell no more than their information."""
+    return _widen(problem, noise, lambda index, m: 1.0 / compute_information_share(index, m))
+
+
+def widen_unweighted(problem: Problem, noise: NoiseModel) -> NoiseModel:
+    """The noise model for rows to come, whose weights are not known; the others keep their variances at least."""
+    wider = _widen(problem, noise, compute_unweighted_factor)
+    weights = dict(noise.weights)
+    for rows in problem.constraints:
+        if rows.name in noise.tails and rows.name in weights:
+            factor, some = compute_unweighted_factor(noise.tails[rows.name], len(rows.axes)), weights[rows.name]
+            weights[rows.name] = replace(some, weight=np.minimum(factor * some.weight, 1.0))
+    return replace(wider, weights=weights, tails={})
+
+
+def _widen(problem: Problem, noise: NoiseModel, compute_factor: Callable[[float, int], float]) -> NoiseModel:
     figures = dict(noise.figures)
     for rows in problem.constraints:
         if rows.name in noise.tails:
-            share = compute_information_share(noise.tails[rows.name], len(rows.axes))
+            more = float(np.log(compute_factor(noise.tails[rows.name], len(rows.axes))))
             for group in rows.list_noise_groups()[0]:
                 if group in figures:
-                    figures[group] = replace(
-                        figures[group], log_factor=figures[group].log_factor - float(np.log(share))
-                    )
+                    figures[group] = replace(figures[group], log_factor=figures[group].log_factor + more)
     return replace(noise, figures=figures)
+
+
+def are_of_others(problem: Problem, noise: NoiseModel) -> bool:
+    """Whether a noise model has weights, and none of them at a row of this problem: those of another recording."""
+    known = {rows.name: problem.t[rows.keyframe] for rows in problem.constraints}
+    of_rows = {name: some.t for name, some in noise.weights.items() if name in noise.tails and len(some.t)}
+    return bool(of_rows) and not any(
+        np.any(np.abs(t - known[name][np.clip(np.searchsorted(known[name], t - SAME_TIME), 0, len(known[name]) - 1)])
+               <= SAME_TIME)
+        for name, t in of_rows.items()
+        if len(known.get(name, ()))
+    )  # fmt: skip
