@@ -10,9 +10,9 @@ the points that the pass before left, every factor f with redundancy B and the s
 the likelihood of A / f as a chi-square variable of B degrees of freedom, and the prior. Without a prior that is the
 fixed point f <- f A / B of Foerstner (1979), Koch (1999, section 3.6) and MacKay (1992). All sensors are estimated at
 once, so none is favoured by the order. Squares of rows have the weights of their tails, whose index is estimated in the
-same pass (`graphnav.estimation.noise.tails`), so a wheel error that lasts for seconds has little weight as well; of the
-IMU and of processes, a square counts for no more than the value it exceeds once in a thousand times (`CHANCE`). The
-first passes of a long drive use its first `_FIRST_KEYFRAMES` keyframes only.
+same pass (`graphnav.estimation.noise.tails`); of the IMU and of processes, a square counts for no more than the value
+that it exceeds once in a thousand times (`CHANCE`). The first passes of a long drive use its first `_FIRST_KEYFRAMES`
+keyframes only.
 """
 
 from __future__ import annotations
@@ -251,7 +251,7 @@ def _improve(
                 figures.update(name, float(np.sum(found.A[own])), float(np.sum(found.B[own])))
             grown[own] = np.exp(figures.log[name] - before)
         # with the figures of the next pass: B is the share of the row's own variance in that of its prediction
-        squared = np.maximum(found.left_out, found.whole) / np.mean(1.0 + found.B * (grown - 1.0), axis=1)
+        squared = found.left_out / np.mean(1.0 + found.B * (grown - 1.0), axis=1)
         _weigh_rows(figures, problem, rows, squared)
 
 
