@@ -60,12 +60,8 @@ CONSTANTS = (
     Constant(f"{NOISE}.priors", "WITHIN", "data sheets and receivers: right within a factor of three"),
     Constant(f"{NOISE}.priors", "TIME_WITHIN", "the same of correlation times"),
     Constant(f"{NOISE}.priors", "_SHARES", "lasting parts of a stated variance: as much as the whole, all together"),
-    Constant(f"{NOISE}.estimate", "CHANCE", "probability of an outlier", 10.0),
-    Constant(
-        f"{NOISE}.estimate",
-        "_BOUNDED",
-        "share of squares that are bounded while faults are sought: nearly two in five rows may be wrong",
-    ),
+    Constant(f"{NOISE}.tails", "CHANCE", "probability of an outlier", 10.0),
+    Constant(f"{NOISE}.tails", "_WITHIN", "tail indices: a factor of three about that of a Gaussian, as other figures"),
     Constant(f"{NOISE}.estimate", "_TIME_RANGE", "a correlation time between a tenth of a second and an hour"),
     Constant(
         f"{NOISE}.estimate", "_MANOEUVRE", "what a vehicle turns and accelerates by at most while samples are lost"

@@ -32,7 +32,7 @@ from graphnav.estimation.noise.exclusion import (
     estimate_without_faults,
 )
 from graphnav.estimation.noise.initial_points import BREAKDOWN
-from graphnav.estimation.noise.model import NoiseModel
+from graphnav.estimation.noise.model import INTERVALS, NoiseModel
 from graphnav.estimation.offsets import is_offset_far
 from graphnav.estimation.problem import Problem
 
@@ -122,8 +122,12 @@ def revise_jointly(
         one = estimate_noise(base, opening, near=near, progress=progress)
         return estimate_disturbed_intervals(base, _leave_out_faults(base, one, settings, opening, progress))
 
+    def go_on(base: Problem, before: JointEstimate) -> NoiseEstimate:
+        noise, near = before.estimate.noise, before.estimate.get_linearisation(before.base)
+        return estimate_noise(base, opening, noise, near, progress, any(name in noise.weights for name in INTERVALS))
+
     found = replace(found, estimate=estimate_disturbed_intervals(found.base, found.estimate))
-    return _free_constants(found, settings, estimate)
+    return _free_constants(found, settings, go_on, estimate)
 
 
 def _leave_out_faults(

@@ -39,6 +39,7 @@ from graphnav.estimation.noise.false_stops import find_false_stops, leave_out_fa
 from graphnav.estimation.noise.initial_points import BREAKDOWN, find_initial_points
 from graphnav.estimation.noise.model import STATED, NoiseModel
 from graphnav.estimation.noise.span_variances import weigh_excluded
+from graphnav.estimation.noise.tails import are_of_others, widen_by_tails, widen_unweighted
 from graphnav.estimation.noise.unmeasured import UnmeasuredRows, drop_in_gaps, drop_unmeasured
 from graphnav.estimation.noise.words import describe_noise
 from graphnav.estimation.problem import Problem
@@ -139,6 +140,8 @@ def prepare(
             noise, built, evidence = _find_noise(builder, built, progress, passes, weigh)
             noise = replace(noise, spacing=spacing)
     else:
+        if are_of_others(built.problem, noise):
+            noise = widen_unweighted(built.problem, noise)
         built = builder.build_without(built, noise, parts=noise != STATED, anew=bool(noise.freed))
         built = replace(built, problem=free(built.problem, noise.freed))
     aligned = built.aligned
@@ -233,7 +236,8 @@ def _find_noise(
     evidence = found.compute_evidence() if wanted else np.inf
     passes.update(found.estimate.passes + Counter(filter=1))
     plain = NoiseModel(excluded=best.noise.excluded, freed=found.freed)
-    noise = plain if _is_likelier(built.problem, plain, best) else found.noise
+    likelier = _is_likelier(built.problem, plain, best)
+    noise = plain if likelier else widen_by_tails(built.problem, found.noise)
     if noise.excluded:
         with contextlib.suppress(*BREAKDOWN):
             noise, spent = weigh_excluded(built.problem, noise, best.get_linearisation(built.problem))
@@ -314,7 +318,7 @@ def _is_likelier(base: Problem, plain: NoiseModel, found: NoiseEstimate) -> bool
     """
     problem = apply_noise(base, plain)
     forward = refilter(problem, found.carry_points(base, problem), whole=False)
-    return float(np.sum(forward.log_likelihood)) > found.log_posterior
+    return float(np.sum(forward.log_likelihood)) > found.log_evidence
 
 
 def _drop_refused(problem: Problem, forward: FilterPass) -> Problem:

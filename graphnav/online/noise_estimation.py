@@ -35,6 +35,7 @@ from graphnav.estimation.joint_estimate import JointEstimate, estimate_jointly
 from graphnav.estimation.noise.apply import apply_noise
 from graphnav.estimation.noise.false_stops import find_false_stops, leave_out_false_stops, unite_stops
 from graphnav.estimation.noise.model import NoiseModel
+from graphnav.estimation.noise.tails import widen_unweighted
 from graphnav.estimation.noise.words import describe_noise
 from graphnav.estimation.problem import Problem, build_problem
 from graphnav.estimation.solution import ExcludedSpan
@@ -133,7 +134,7 @@ def run_estimation(task: EstimationTask) -> EstimationResult:
         used = apply_noise(found.base, noise)
         words = (*describe_freed(noise.freed, task.recording), *describe_noise(noise, used))
         wrong = find_fault_spans(used)
-        noise = _convert_unit(noise, base, task.unit)
+        noise = widen_unweighted(used, _convert_unit(noise, base, task.unit))
         noise = replace(noise, false_stops=unite_stops(before.false_stops, false))
         return EstimationResult(noise, words, stationary, wrong, check_rows(task.every), start, anew)
     except np.linalg.LinAlgError as error:

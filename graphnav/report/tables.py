@@ -166,9 +166,10 @@ def tabulate_noise(rows: Sequence[FigureRow], solution: Solution) -> list[Markup
             out.append(page.paragraph(Note("noise.of_first_piece", cut), "soft"))
         out.append(page.paragraph(note, "soft"))
     less = [
-        f"Rows of {name} with less weight, because they are off by more than chance allows once in a thousand times: "
-        f"{np.count_nonzero(some.weight < 1.0)} of {len(solution.records[name].t)}; the least counts as "
-        f"{wording.format_number(float(some.weight.min()), 2)} of a row."
+        f"Errors of {name} have tails as of a Student t distribution with "
+        f"{wording.format_number(noise.tails.get(name, np.inf), 2)} degrees of freedom: less weight for "
+        f"{np.count_nonzero(some.weight < 1.0)} of {len(solution.records[name].t)} rows; the least counts as "
+        f"{wording.format_number(float(some.weight.min()), 2)} of one."
         for name, some in noise.weights.items()
         if len(some.t) and name in solution.records
     ]

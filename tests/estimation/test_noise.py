@@ -404,7 +404,7 @@ def test_once_more_from_its_end_an_estimate_is_the_same(estimated: Estimated) ->
     for drive, found in zip(estimated.drives[:2], estimated.found[:2], strict=True):
         near = found.points, apply_noise(drive.base, found.noise)
         again = estimate_noise(drive.base, drive.opening, found.noise, near)
-        assert again.log_posterior - found.log_posterior < 1.0
+        assert again.log_evidence - found.log_evidence < 1.0
 
 
 def test_figures_are_true_within_their_sigmas(estimated: Estimated) -> None:
@@ -474,7 +474,7 @@ def test_sensors_in_any_order_give_the_same() -> None:
     turned = replace(base, constraints=base.constraints[::-1])
     one, other = estimate_noise(base, opening), estimate_noise(turned, opening)
     assert one.passes == other.passes
-    assert one.log_posterior == pytest.approx(other.log_posterior, abs=1e-3)
+    assert one.log_evidence == pytest.approx(other.log_evidence, abs=1e-3)
     for name, figure in one.noise.figures.items():
         assert figure.log_factor == pytest.approx(other.noise.figures[name].log_factor, abs=1e-3), name
 

@@ -9,7 +9,7 @@ from scipy.special import bdtrc, chdtri
 
 from graphnav.core.rotation import Array
 from graphnav.estimation.noise.model import NoiseModel, VarianceComponent
-from graphnav.estimation.noise.outliers import CHANCE
+from graphnav.estimation.noise.tails import CHANCE
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import Solution
 

@@ -25,6 +25,7 @@ class Components:
     times: dict[str, float] = field(default_factory=dict)
     weights: dict[str, RowWeights] = field(default_factory=dict)
     excluded: Mapping[str, tuple[tuple[float, float], ...]] = field(default_factory=dict)
+    tails: dict[str, float] = field(default_factory=dict)
     steps: dict[str, float] = field(default_factory=dict)  # the latest of each, before extrapolation
     extrapolation: float = 1.0  # longest step allowed, in steps as computed
     known: bool = False  # whether they were estimated before
@@ -32,8 +33,9 @@ class Components:
 
     def copy(self) -> Components:
         """An independent copy."""
-        times, weights, steps = dict(self.times), dict(self.weights), dict(self.steps)
-        return replace(self, log=dict(self.log), freedom=dict(self.freedom), times=times, weights=weights, steps=steps)
+        times, weights, tails, steps = dict(self.times), dict(self.weights), dict(self.tails), dict(self.steps)
+        log, freedom = dict(self.log), dict(self.freedom)
+        return replace(self, log=log, freedom=freedom, times=times, weights=weights, tails=tails, steps=steps)
 
     def build_model(self) -> NoiseModel:
         """The noise model with these figures."""
@@ -42,7 +44,7 @@ class Components:
             m, s = self.get_prior(name)
             B = self.freedom.get(name, 0.0)
             figures[name] = VarianceComponent(x, float((0.5 * B + s**-2.0) ** -0.5), m, s, B)
-        return NoiseModel(figures, dict(self.times), dict(self.weights), self.excluded)
+        return NoiseModel(figures, dict(self.times), dict(self.weights), self.excluded, tails=dict(self.tails))
 
     def get_prior(self, name: str) -> tuple[float, float]:
         """Median and 1-sigma of a log factor; where the white part of fixes exceeds the stated, so do the others."""
@@ -109,6 +111,7 @@ def begin_components(problem: Problem, start: NoiseModel | None, changed: bool =
         largest,
         times=dict(start.times),
         weights=dict(start.weights),
+        tails=dict(start.tails),
         excluded=start.excluded,
         known=bool(start.figures),
         same_data=bool(start.figures) and not changed,

@@ -15,7 +15,6 @@ from graphnav.estimation.noise.explanations import (
     EXPLANATIONS,
     FIXES,
     ONE_SENSOR,
-    ROWS,
     WHEELS,
     Explanation,
     PriorCosts,
@@ -24,16 +23,13 @@ from graphnav.estimation.noise.explanations import (
 )
 from graphnav.estimation.noise.model import INTERVALS, NoiseModel, RowWeights
 from graphnav.estimation.noise.outliers import (
-    OUTLIER_COST,
+    compute_interval_cost,
     compute_latest_cost,
-    compute_outlier_cost,
+    compute_row_costs,
     count_reduced,
-    count_rows,
 )
-from graphnav.estimation.noise.spans import Span, drop_within, extend_to_next_fix, join
+from graphnav.estimation.noise.spans import Span, drop_within, extend_to_next_fix, join, mask_times
 from graphnav.estimation.problem import Problem
-
-_BY_ROWS = INTERVALS, ROWS  # explanations by outliers, for which nothing is left out
 
 
 @dataclass(frozen=True)
@@ -67,47 +63,41 @@ def explain(
     noise = replace(found.noise, excluded={})
     reach = extend_to_next_fix(base, spans, FIXES)
     outside = {name: drop_within(some, reach if name in INTERVALS else spans) for name, some in noise.weights.items()}
-    # weights inside the spans, by explanation: where one sensor is wrong, the others keep their outliers
+    # weights inside the spans, by explanation: where one sensor is wrong, the others keep theirs
     inside: dict[Explanation, dict[str, RowWeights]] = {
         kinds: {name: some for name, some in noise.weights.items() if name not in (*kinds, *INTERVALS)}
-        for kinds in (*ONE_SENSOR, ROWS)
+        for kinds in ((), *ONE_SENSOR, FIXES)
     }
-    inside[INTERVALS] = {name: some for name, some in noise.weights.items() if name in INTERVALS}
+    inside[INTERVALS] = dict(noise.weights)
     used = apply_noise(base, replace(noise, weights=outside))
-    totals = count_rows(base)
-    each = {name: compute_latest_cost(some, totals[name]) for name, some in noise.weights.items() if name in totals}
-    outliers = {
-        kinds: [
-            sum(
-                each[name] * (count_reduced(one) - count_reduced(drop_within(one, [within])))
-                for name, one in some.items()
-                if name in each
-            )
-            for within in (reach if kinds == INTERVALS else spans)
-        ]
-        for kinds, some in inside.items()
-    }
-    among = [kinds for kinds in among if kinds not in _BY_ROWS or any(outliers[kinds])]
-    weighted: dict[Explanation, Problem] = {
-        kinds: apply_weights(used, outside | inside[kinds]) for kinds in (*ONE_SENSOR, ROWS)
-    }
-    if INTERVALS in among:
-        weighted[INTERVALS] = apply_noise(base, replace(noise, weights=outside | inside[INTERVALS]))
+    weighted = {kinds: apply_weights(used, outside | some) for kinds, some in inside.items() if kinds != INTERVALS}
+    weighted[INTERVALS] = apply_noise(base, noise)
+    within = [mask_times(base.t, [span]) for span in spans]
+    cost = np.full((len(spans), len(EXPLANATIONS)), FAULT_COST)
+    for j, kinds in enumerate(EXPLANATIONS):
+        if kinds in weighted:  # a sensor that is wrong has an error of its own instead of tails
+            each = compute_row_costs(weighted[kinds], noise.tails, without=kinds)
+            cost[:, j] = [np.sum(each[span]) for span in within]
+            if kinds and kinds != INTERVALS:
+                cost[:, j] += FAULT_COST
+    disturbed = np.zeros(len(spans))
+    for name in noise.weights.keys() & set(INTERVALS):
+        latest, some = compute_latest_cost(noise.weights[name], len(base.t) - 1), noise.weights[name]
+        disturbed += [latest * (count_reduced(some) - count_reduced(drop_within(some, [span]))) for span in reach]
+    cost[:, EXPLANATIONS.index(INTERVALS)] += np.where(disturbed > 0.0, disturbed, np.inf)
+    among = [kinds for kinds in among if kinds != INTERVALS or disturbed.any()]
     sizes = measure_sizes(base, apply_noise(base, found.noise), found.points, spans)
-    cost = np.zeros((len(spans), len(EXPLANATIONS)))
-    cost[:, [bool(kinds) and kinds not in _BY_ROWS for kinds in EXPLANATIONS]] = FAULT_COST
-    for kinds, more in outliers.items():
-        some = np.array(more)
-        cost[:, EXPLANATIONS.index(kinds)] += np.where((some > 0.0) | (kinds not in _BY_ROWS), some, np.inf)
-    about, costs = found.carry_points(base, used), PriorCosts(cost, dict.fromkeys(totals, OUTLIER_COST) | each)
-    rest = found.log_prior - compute_outlier_cost(outside, totals)
+    about, costs = found.carry_points(base, used), PriorCosts(cost, noise.tails)
+    anywhere = np.any(within, axis=0)
+    rest = found.log_prior - float(np.sum(compute_row_costs(used, noise.tails)[~anywhere]))
+    rest -= compute_interval_cost(outside, len(base.t) - 1)
     evidence, chosen, passes = compute_evidence(used, about, spans, weighted, sizes, costs, among, least - rest)
     excluded: dict[str, tuple[Span, ...]] = {}
     dropped: dict[str, list[Span]] = {name: [] for name in noise.weights}
     for span, to_next, best in zip(spans, reach, chosen, strict=True):
-        for name in noise.weights.keys() - inside.get(best, {}).keys():
+        for name in noise.weights.keys() - inside[best].keys():
             dropped[name].append(to_next if name in INTERVALS else span)
-        if best not in _BY_ROWS:
+        if best != INTERVALS:
             excluded |= {name: (*excluded.get(name, ()), span) for name in best}
     present = {rows.name for rows in base.constraints}
     excluded = {name: some for name, some in excluded.items() if name in present}

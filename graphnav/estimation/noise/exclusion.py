@@ -62,11 +62,11 @@ from graphnav.estimation.noise.decision import (
     weigh_evidence,
 )
 from graphnav.estimation.noise.estimate import NoiseEstimate, estimate_noise
-from graphnav.estimation.noise.explanations import FIXES, ROWS
+from graphnav.estimation.noise.explanations import FIXES
 from graphnav.estimation.noise.initial_points import BREAKDOWN
 from graphnav.estimation.noise.model import INTERVALS, NoiseModel, RowWeights
 from graphnav.estimation.noise.moments import collect_imu_moments
-from graphnav.estimation.noise.outliers import limit_squares, may_pay
+from graphnav.estimation.noise.outliers import may_pay
 from graphnav.estimation.noise.spans import (
     LeftOutErrors,
     Span,
@@ -87,6 +87,7 @@ from graphnav.estimation.noise.suspects import (
     list_fix_times,
     predict_left_out,
 )
+from graphnav.estimation.noise.tails import get_tail_index, relate_to_gaussian, weigh_outlying
 from graphnav.estimation.problem import Problem
 from graphnav.recording import Recording
 
@@ -206,7 +207,7 @@ def decide_faults(base: Problem, found: NoiseEstimate) -> Decision:
     """
     medians = {name: replace(figure, log_factor=figure.prior) for name, figure in found.noise.figures.items()}
     masking = begin_beside(partial(find_suspects, base, NoiseModel(medians), found))
-    suspects = find_suspects(base, found.robust or found.noise, found)
+    suspects = find_suspects(base, found.noise, found)
     first = explain(base, found, suspects)
     segments, spent = find_segments(base, found, suspects)
     passes = first.passes + Counter(filter=spent)
@@ -235,7 +236,7 @@ def _unmask(base: Problem, found: NoiseEstimate, first: Decision, masked: list[S
         estimate = estimate_noise(base, None, start, estimate.get_linearisation(base), changed=True)
         used = apply_noise(base, estimate.noise)
         errors = predict_left_out(used, estimate)
-        detected = find_suspects(base, replace(estimate.robust or estimate.noise, excluded={}), estimate)
+        detected = find_suspects(base, replace(estimate.noise, excluded={}), estimate)
         passes = passes + estimate.passes + Counter(filter=1)
         spans, refined = trim(spans, errors), trim(detected, errors)
         # a slow onset is dated better by the tests, an abrupt end by the errors of single fixes
@@ -249,7 +250,7 @@ def _unmask(base: Problem, found: NoiseEstimate, first: Decision, masked: list[S
             passes = passes + candidate.passes
             cut = cut_at_steps(some, candidate.noise, used, estimate)
             if cut != some:
-                among = {*list_explanations(candidate.noise), ROWS}  # its pieces are wrong the same way, or not at all
+                among = list_explanations(candidate.noise)  # its pieces are wrong the same way, or not at all
                 finer = explain(base, _add_outliers(estimate, errors, cut), cut, among, least)
                 passes = passes + finer.passes
                 candidate = max(candidate, finer, key=lambda one: one.log_evidence)
@@ -336,8 +337,15 @@ def _disturb_intervals(base: Problem, found: NoiseEstimate) -> NoiseEstimate:
         if free.noise.excluded == found.noise.excluded:  # the same model, already converging
             start, near = free.noise, free.get_linearisation(base)
     disturbed = weigh_evidence(base, estimate_noise(base, None, start, near, intervals=True))
-    best = max(found, disturbed, key=lambda one: log_evidence(base, one))
-    return replace(best, passes=passes + disturbed.passes)
+    passes = passes + disturbed.passes
+    if log_evidence(base, disturbed) <= log_evidence(base, found):
+        return replace(found, passes=passes)
+    # from the priors: figures estimated with all intervals alike may be far from their final values
+    anew = NoiseModel(weights=disturbed.noise.weights, excluded=disturbed.noise.excluded)
+    other = estimate_noise(base, None, anew, disturbed.get_linearisation(base), intervals=True)
+    other = weigh_evidence(base, other)
+    best = max(disturbed, other, key=lambda one: log_evidence(base, one))
+    return replace(best, passes=passes + other.passes)
 
 
 def _may_be_disturbed(base: Problem, found: NoiseEstimate) -> bool:
@@ -351,7 +359,7 @@ def _add_outliers(found: NoiseEstimate, errors: LeftOutErrors, spans: list[Span]
     """The estimate with weights for fixes in spans that it leaves out, so that each may be a single outlier."""
     weights = dict(found.noise.weights)
     for name, (t, squared, m) in errors.items():
-        weight = limit_squares(squared, m)
+        weight = weigh_outlying(squared, m, get_tail_index(found.noise.tails, name, m))
         kept = drop_within(weights.get(name, RowWeights(np.empty(0), np.empty(0))), spans)
         inside = mask_times(t, spans) & np.isin(t, t[weight < 1.0])  # with all rows of their times
         both, of_both = np.concatenate([kept.t, t[inside]]), np.concatenate([kept.weight, weight[inside]])
@@ -363,7 +371,10 @@ def _add_outliers(found: NoiseEstimate, errors: LeftOutErrors, spans: list[Span]
 def compute_excluded_share(problem: Problem, noise: NoiseModel) -> float:
     """Share of the information of the positions that a noise model leaves out."""
     rows = next((c for c in problem.constraints if c.name == FIXES[0]), None)
-    return 0.0 if rows is None else 1.0 - float(np.mean(select_weights(problem.t[rows.keyframe], noise, rows.name)))
+    if rows is None:
+        return 0.0
+    weight = select_weights(problem.t[rows.keyframe], noise, rows.name)
+    return 1.0 - float(np.mean(relate_to_gaussian(weight, len(rows.axes), noise.tails.get(rows.name))))
 
 
 def drop_excluded(recording: Recording, noise: NoiseModel) -> Recording:

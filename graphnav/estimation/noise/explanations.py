@@ -17,8 +17,9 @@ from graphnav.core.state import Parameter, States
 from graphnav.estimation.faults.watch import FAULT_COST, LARGE, MINUTE, PATIENCE, SIZES
 from graphnav.estimation.noise.model import INTERVALS
 from graphnav.estimation.noise.moments import collect_row_moments, predict_errors
-from graphnav.estimation.noise.outliers import CHANCE, limit_squares
+from graphnav.estimation.noise.outliers import compute_row_costs
 from graphnav.estimation.noise.spans import Span, mask_times
+from graphnav.estimation.noise.tails import CHANCE, get_tail_index, weigh_outlying
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.ekf import Comparison, refilter
 from graphnav.estimation.solvers.linearise import Points
@@ -28,9 +29,8 @@ from graphnav.estimation.solvers.stack import Stack
 from graphnav.recording import Recording
 
 FIXES, WHEELS = ("gnss_position", "gnss_velocity"), ("nhc", "odometer")
-ROWS = ("rows",)
 Explanation = tuple[str, ...]  # the constraints whose rows are wrong by it
-EXPLANATIONS: tuple[Explanation, ...] = ((), FIXES[:1], FIXES[1:], FIXES, WHEELS, INTERVALS, ROWS)
+EXPLANATIONS: tuple[Explanation, ...] = ((), FIXES[:1], FIXES[1:], FIXES, WHEELS, INTERVALS)
 ONE_SENSOR = FIXES[:1], FIXES[1:], WHEELS  # faulty as a whole in a span; other sensors may only have outliers there
 _UNLIKELY = -float(ndtri(CHANCE))  # sigmas
 _NEGLIGIBLE_SIGMA = 1e-9  # sigma of an error outside its span
@@ -172,7 +172,7 @@ class PriorCosts:
     """Negative log-probabilities, before the measurements are known."""
 
     explanations: Array  # (M, len(EXPLANATIONS)) of each in each span
-    outlier: Mapping[str, float]  # of one more outlier, by constraint
+    tails: Mapping[str, float]  # `NoiseModel.tails`
 
 
 @dataclass
@@ -237,11 +237,11 @@ def compute_evidence(
     before = 0.0
     present = {rows.name for rows in problem.constraints}
     for j, kinds in enumerate(EXPLANATIONS):
-        possible = present & set(kinds) if kinds == WHEELS else kinds in (INTERVALS, ROWS) or present.issuperset(kinds)
+        possible = present & set(kinds) if kinds == WHEELS else kinds == INTERVALS or present.issuperset(kinds)
         if not possible or (kinds and kinds not in among):
             continue
         base, cost = weighted.get(kinds, problem), costs.explanations[:, j]
-        if not kinds or kinds in (INTERVALS, ROWS):
+        if not kinds or kinds == INTERVALS:
             likelihood = trials.filter(base).log_likelihood()
             models.append(_Model(kinds, base, (), trials.sum_spans(likelihood), cost))
             before = before if kinds else float(np.sum(likelihood[: trials.edges[0]]))
@@ -249,7 +249,7 @@ def compute_evidence(
         stack = trials.filter(add_common_errors(base, spans, kinds), kinds)
         models.append(_Model(kinds, base, kinds, trials.sum_spans(stack.log_likelihood()), cost))
         if lasting.any():
-            gain = trials.sum_spans(_bound_gain(stack, kinds, costs.outlier))
+            gain = trials.sum_spans(_bound_gain(stack, kinds, costs.tails))
             common.append((models[-1], np.where(lasting, gain, 0.0)))
         if set(kinds) <= set(FIXES):
             one = add_own_errors(base, spans, kinds, sizes)
@@ -258,10 +258,9 @@ def compute_evidence(
     highest = np.max([one.value for one in models] + [model.value + gain for model, gain in common], axis=0)
     for model, gain in common if before + float(np.sum(highest)) > least else ():
         while np.any((gain > FAULT_COST) & (model.value + gain > np.max([one.value for one in models], axis=0))):
-            base, outliers = trials.weigh_outliers(model.problem, model.kinds, lasting)
+            base, more = trials.weigh_outliers(model.problem, model.kinds, lasting, costs.tails)
             likelihood = trials.filter(add_common_errors(base, spans, model.kinds), model.kinds).log_likelihood()
-            cost = costs.explanations[:, EXPLANATIONS.index(model.kinds)]
-            cost = cost + sum(costs.outlier[name] * n for name, n in outliers.items())
+            cost = costs.explanations[:, EXPLANATIONS.index(model.kinds)] + more
             previous, model = model, _Model(model.kinds, base, model.common, trials.sum_spans(likelihood), cost)
             gain = model.value - previous.value  # less each time
             models.append(model)
@@ -293,27 +292,32 @@ class Trials:
         """(M,) sums of what keyframes (K,) have, from the start of each span to the start of the next."""
         return np.array([float(np.sum(each[a:b])) for a, b in itertools.pairwise(self.edges)])
 
-    def weigh_outliers(self, problem: Problem, kinds: Explanation, where: Array) -> tuple[Problem, dict[str, Array]]:
-        """The problem with weights for outliers among rows of some constraints, and how many (M,) each has of them.
+    def weigh_outliers(
+        self, problem: Problem, kinds: Explanation, where: Array, tails: Mapping[str, float]
+    ) -> tuple[Problem, Array]:
+        """The problem with weights for outliers among rows of some constraints, and what these cost in each span (M,).
 
         `where` : (M,) in which spans.
         """
         self.passes += 1
         common = add_common_errors(problem, self._spans, kinds)
         smoothed = smooth_moments(common, refilter(common, self._make_points(common), whole=False))
-        count: dict[str, Array] = {}
         weighted = []
         for rows, wrong in zip(problem.constraints, common.constraints, strict=True):
             if rows.name in kinds:
-                t = problem.t[rows.keyframe]
+                t, m = problem.t[rows.keyframe], len(rows.axes)
+                index = get_tail_index(tails, rows.name, m)
                 left_out = collect_row_moments(common, wrong, smoothed, len(rows)).left_out
                 weight = np.ones(len(rows)) if rows.weight is None else rows.weight
                 inside = [mask_times(t, [span]) & some for span, some in zip(self._spans, where, strict=True)]
-                weight = np.where(np.any(inside, axis=0), limit_squares(left_out, len(rows.axes)), weight)
-                count[rows.name] = np.array([np.sum(weight[own] < 1.0) for own in inside])
+                weight = np.where(np.any(inside, axis=0), weigh_outlying(left_out, m, index), weight)
                 rows = replace(rows, weight=weight)
             weighted.append(rows)
-        return replace(problem, constraints=tuple(weighted)), count
+        problem = replace(problem, constraints=tuple(weighted))
+        others = [rows.name for rows in problem.constraints if rows.name not in kinds]
+        each = compute_row_costs(problem, tails, without=others)
+        spans = zip(self._spans, where, strict=True)
+        return problem, np.array([np.sum(each[mask_times(problem.t, [span])]) if some else 0.0 for span, some in spans])
 
     def choose(self, models: list[_Model]) -> tuple[float, list[Explanation]]:
         """The most probable explanation of each span, and the log-probability of all together, up to a constant."""
@@ -360,18 +364,18 @@ class Trials:
         return make_points(problem, self._states, self._known)
 
 
-def _bound_gain(stack: Stack, kinds: Explanation, cost: Mapping[str, float]) -> Array:
+def _bound_gain(stack: Stack, kinds: Explanation, tails: Mapping[str, float]) -> Array:
     """(K,) by which the log-probability rises at each keyframe if what exceeds the limit of chance is due to outliers.
 
     Of successive keyframes that exceed it, the first has the outlier, and the others may be what it did to the state.
-    One of m numbers with a squared innovation s beyond the limit q has a weight of q / s.
+    Its density is that of tails instead of a Gaussian.
     """
     squared, count = stack.sum_squares()
     limit = chdtri(np.maximum(count, 1), CHANCE)
     gain = 0.5 * np.maximum(squared - limit, 0.0)
     places = {name: stack.places[name] for name in kinds if name in stack.places}
     measured = np.isin(np.arange(stack.K), np.concatenate([k[:, 0] for k, _ in places.values()]))
-    m, least = min(place.shape[1] for _, place in places.values()), min(cost[name] for name in places)
+    least = min(get_tail_index(tails, name, p.shape[1]) + p.shape[1] for name, (_, p) in places.items())
     first = (gain > 0.0) & ~np.append(False, gain[:-1] > 0.0)
-    own = np.maximum(gain - 0.5 * m * np.log(np.maximum(squared / limit, 1.0)) - least, 0.0)
+    own = np.maximum(0.5 * (squared - least - least * np.log(np.maximum(squared / least, 1.0))), 0.0)
     return np.where(first, np.where(measured, own, 0.0), gain)

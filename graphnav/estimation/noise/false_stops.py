@@ -17,15 +17,18 @@ from typing import TypeVar
 import numpy as np
 
 from graphnav.constraints.base import SAME_TIME
-from graphnav.constraints.standstill import HeldPosition, ZeroRate, ZeroVelocity
+from graphnav.constraints.standstill import HeldPosition, ZeroVelocity
 from graphnav.core.rotation import Array
 from graphnav.detectors.base import NONE, merge_spans
+from graphnav.estimation.faults.excluded import weigh_rows
 from graphnav.estimation.faults.watch import FAULT_COST
 from graphnav.estimation.noise.apply import apply_noise
 from graphnav.estimation.noise.explanations import FIXES, Trials, add_common_errors
 from graphnav.estimation.noise.initial_points import BREAKDOWN
 from graphnav.estimation.noise.model import INTERVALS, NoiseModel
-from graphnav.estimation.noise.spans import join
+from graphnav.estimation.noise.outliers import compute_row_costs
+from graphnav.estimation.noise.spans import drop_within, join
+from graphnav.estimation.noise.tails import relate_to_gaussian
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.linearise import Points
 from graphnav.estimation.solvers.passes import reuse_points
@@ -33,7 +36,6 @@ from graphnav.estimation.solvers.passes import reuse_points
 Found = TypeVar("Found")
 
 _OF_STOPS = (ZeroVelocity.name,)
-_MASKING = (*INTERVALS, ZeroVelocity.name, ZeroRate.name, HeldPosition.name)  # their weights may hide a false stop
 
 
 def find_false_stops(
@@ -65,16 +67,22 @@ def find_false_stops(
     excluded = {name: list(some) for name, some in noise.excluded.items()}
     for name in (*FIXES, HeldPosition.name):
         excluded[name] = join([*excluded.get(name, ()), *listed])
+    # disturbed intervals may hide a false stop, and so may tails that are as long as rows of false stops make them
+    weights = {name: drop_within(w, listed) if name in INTERVALS else w for name, w in noise.weights.items()}
+    if rows.name in weights:
+        w = weights[rows.name]
+        shorter = relate_to_gaussian(w.weight, len(rows.axes), noise.tails.get(rows.name))
+        weights[rows.name] = replace(w, weight=shorter)
+    tails = {name: index for name, index in noise.tails.items() if name != rows.name}
     noise = replace(
-        noise,
-        weights={name: some for name, some in noise.weights.items() if name not in _MASKING},
-        excluded={name: tuple(some) for name, some in excluded.items()},
+        noise, weights=weights, tails=tails, excluded={name: tuple(some) for name, some in excluded.items()}
     )
     used = apply_noise(base, noise)
     trials = Trials(used, reuse_points(*near, used), listed)
-    stands = trials.sum_spans(trials.filter(used).log_likelihood())
-    moves = trials.sum_spans(trials.filter(add_common_errors(used, listed, _OF_STOPS), _OF_STOPS).log_likelihood())
-    return spans[moves - stands > FAULT_COST], trials.passes
+    stands = trials.filter(used).log_likelihood() - compute_row_costs(used, noise.tails)
+    free = add_common_errors(weigh_rows(used, {rows.name: np.ones(len(rows))}), listed, _OF_STOPS)
+    moves = trials.filter(free, _OF_STOPS).log_likelihood() - compute_row_costs(used, noise.tails, without=_OF_STOPS)
+    return spans[trials.sum_spans(moves - stands) > FAULT_COST], trials.passes
 
 
 def leave_out_false_stops(

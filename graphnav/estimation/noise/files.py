@@ -7,6 +7,7 @@ Under the key "noise", in a file of its own or in the summary.json of a run::
     correlation_times   s, by the parameter of a process
     weights             by constraint: t (s) and weight of rows with less information; by imu.gyro and imu.accel: end
                         (s) of intervals between keyframes with more white noise, and 1 over its variance's factor
+    tails               by constraint: degrees of freedom of the tails of its rows' errors
     excluded            by constraint: [begin, end] (s) of spans of faulty rows
     span_weights        by constraint: [begin, end, weight] of those that are used after all, with less information
     false_stops         [begin, end] (s) of spans that are no stops, whatever the detectors say, if there are any
@@ -82,6 +83,7 @@ _KEYS = (
     "figures",
     "correlation_times",
     "weights",
+    "tails",
     "excluded",
     "span_weights",
     "false_stops",
@@ -118,6 +120,7 @@ def list_noise(noise: NoiseModel, mode: str = "estimated") -> dict[str, Any]:
             for name, some in noise.weights.items()
             if len(some.t)
         },
+        "tails": {name: float(index) for name, index in noise.tails.items()},
         "excluded": {name: [[float(a), float(b)] for a, b in spans] for name, spans in noise.excluded.items() if spans},
         "spacing": float(noise.spacing),
         "stamps": {name: float(getattr(noise.stamps, name)) for name in _STAMPS},
@@ -238,6 +241,7 @@ class _Reader:
             self.read_number("noise.spacing", values.get("spacing", 0.0), 0.0, 60.0, "s between fixes"),
             StampOffsets(**self.read_each(values, "stamps", _STAMPS, self.read_offset)),
             {name: self.read_constant(key, values) for key, (name, *_) in _FREED.items() if key in values},
+            self.read_each(values, "tails", constraints, self.read_tail),
             self.read_spans("noise.false_stops", values.get("false_stops", [])),
         ), mode
 
@@ -302,6 +306,9 @@ class _Reader:
                 f"{key}.degrees_of_freedom", value.get("degrees_of_freedom", 0.0), 0.0, math.inf, "a count"
             ),
         )
+
+    def read_tail(self, key: str, value: Any) -> float:
+        return self.read_number(key, value, 0.01, 1e9, "degrees of freedom of the tails of errors")
 
     def read_time(self, key: str, value: Any) -> float:
         return self.read_number(key, value, 1e-3, 1e9, "s, a correlation time")

@@ -12,7 +12,8 @@ from graphnav.estimation.faults.excluded import weigh_rows
 from graphnav.estimation.faults.watch import SIZES
 from graphnav.estimation.noise.model import RowWeights
 from graphnav.estimation.noise.moments import collect_row_moments
-from graphnav.estimation.noise.outliers import limit_scaled, limit_squares, list_reduced
+from graphnav.estimation.noise.outliers import list_reduced
+from graphnav.estimation.noise.tails import get_tail_index, weigh_outlying, weigh_scaled
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.ekf import ekf, refilter, smooth_near
 from graphnav.estimation.solvers.linearise import Points, linearise
@@ -82,8 +83,9 @@ def find_initial_points(problem: Problem, opening: float | None) -> tuple[list[I
     weights = {}
     for rows in sound.constraints:
         if rows.weight is not None and np.any(rows.weight == 0.0):
+            left_out, m = collect_row_moments(sound, rows, smoothed, len(rows)).left_out, len(rows.axes)
             every = np.ones(len(rows), dtype=bool)
-            weight = limit_scaled(collect_row_moments(sound, rows, smoothed, len(rows)).left_out, len(rows.axes), every)
+            weight = weigh_scaled(left_out, m, get_tail_index({}, rows.name, m), every)
             weights[rows.name] = list_reduced(sound.t[rows.keyframe], weight, every)
     if are_near(other, one):
         return [Initial(one, weights)], passes + 2
@@ -131,7 +133,8 @@ def _anneal(problem: Problem, opening: float | None) -> tuple[Initial, int]:
             weights[rows.name] = weigh_squares("geman-mcclure", np.sqrt(squared), np.sqrt(m))[0]
             settled |= bool(np.median(squared) > chdtri(m, 0.5))
             every = np.ones(len(rows), dtype=bool)
-            outliers[rows.name] = list_reduced(problem.t[rows.keyframe], limit_squares(squared, m), every)
+            weight = weigh_outlying(squared, m, get_tail_index({}, rows.name, m))
+            outliers[rows.name] = list_reduced(problem.t[rows.keyframe], weight, every)
         if settled:
             break
         wider /= _COOLING

@@ -81,6 +81,8 @@ class NoiseModel:
     spacing: float = 0.0  # s, at least, between the fixes that are used (`graphnav.estimation.noise.spacing`)
     stamps: StampOffsets = StampOffsets()
     freed: Mapping[str, FreedConstant] = field(default_factory=dict)  # by the parameter's name
+    # index of the errors of a constraint's rows (`graphnav.estimation.noise.tails`)
+    tails: Mapping[str, float] = field(default_factory=dict)
     false_stops: tuple[tuple[float, float], ...] = ()  # spans (s) in which the platform moves, whatever detectors say
 
     def get_factor(self, group: str, missing: float) -> float:

@@ -31,7 +31,7 @@ from graphnav.core.rotation import Array
 from graphnav.core.state import DIM
 from graphnav.estimation.problem import ParameterChain, Problem
 from graphnav.estimation.solvers.linearise import Rows, find_stepping, linearise, shift
-from graphnav.estimation.solvers.passes import MomentPass, SmootherPass, split_values
+from graphnav.estimation.solvers.passes import MomentPass, SmootherPass
 
 _FORGOTTEN = 1e-6  # relative remainder of a difference below which it is rounding error
 
@@ -43,7 +43,6 @@ class RowMoments:
     A: Array  # (N, m) w e^2 / R
     B: Array  # (N, m) redundancy
     left_out: Array  # (N,) squared residual over its covariance, predicted without the row, at weight 1
-    whole: Array  # (N,) squared total error, time-correlated part included, over its stationary covariance
 
 
 @dataclass(frozen=True)
@@ -123,7 +122,6 @@ def _compute_redundancies(linear: Rows, HPH: Array) -> tuple[Array, Array]:
 
 def collect_row_moments(problem: Problem, rows: Constraint, smoothed: MomentPass | SmootherPass, n: int) -> RowMoments:
     """Of the first n rows of a constraint."""
-    at, values = rows.keyframe[:n], split_values(problem, smoothed)
     linear = linearise(rows, smoothed, problem.columns, slice(0, n))
     HPH = smoothed.cover_rows(linear, n)
     R = linear.stated**2
@@ -133,17 +131,10 @@ def collect_row_moments(problem: Problem, rows: Constraint, smoothed: MomentPass
     free = np.clip(1.0 - w * each, 1e-6, 1.0)
     predicted = np.einsum("nji,nj->ni", axes, linear.residual / linear.stated) / free
     left_out = np.sum(predicted**2 / (1.0 + np.maximum(each, 0.0) / free), axis=1)
-    error, covariance = linear.residual, R[:, :, None] * np.eye(R.shape[1])
-    for p in rows.parameters:
-        if p.correlation_time is not None:
-            J = linear.linear.jacobians[p.name]
-            error = error - np.einsum("nij,nj->ni", J, values[p.name][at])
-            covariance = covariance + (J * p.sigma**2) @ np.swapaxes(J, 1, 2)
-    whole = np.sum(error * np.linalg.solve(covariance, error[..., None])[..., 0], axis=1)
     # of the component that a factor scales
     share = 1.0 if rows.unscaled is None else 1.0 - rows.unscaled[:n] ** 2 / R
     A = share * w * linear.residual**2 / R
-    return RowMoments(A, share * np.where(w > 0.0, B, 0.0), left_out, whole)
+    return RowMoments(A, share * np.where(w > 0.0, B, 0.0), left_out)
 
 
 def lag_moments(problem: Problem, chain: ParameterChain, smoothed: MomentPass, end: int) -> tuple[Array, ...]:

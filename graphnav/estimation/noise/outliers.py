@@ -1,33 +1,18 @@
-"""Which rows are outliers, by their squared errors, and what weight they have."""
+"""What rows and intervals of reduced weight cost, of the logarithm of the evidence."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 
 import numpy as np
-from scipy.special import betaln, chdtri
+from scipy.special import betaln
 
 from graphnav.core.rotation import Array
 from graphnav.estimation.noise.model import INTERVALS, RowWeights
+from graphnav.estimation.noise.tails import CHANCE, compute_log_normaliser, get_tail_index
 from graphnav.estimation.problem import Problem
 
-CHANCE = 1e-3  # probability of a larger squared error, below which a row is an outlier
 OUTLIER_COST = -float(np.log(CHANCE))  # negative prior log-probability of one outlier
-
-
-def limit_squares(squared: Array, m: int) -> Array:
-    """(N,) weights that bring squared errors (N,) of m degrees of freedom down to the limit of `CHANCE`."""
-    return np.asarray(np.minimum(1.0, float(chdtri(m, CHANCE)) / np.maximum(squared, 1e-30)))
-
-
-def limit_scaled(squared: Array, m: int, used: Array) -> Array:
-    """The same weights, with the squared errors scaled to the expected median where the median is larger than that.
-
-    If half of the rows in use (N,) are off, the variance has not converged yet.
-    """
-    some = squared[used]
-    scale = float(np.median(some)) / float(chdtri(m, 0.5)) if len(some) else 1.0
-    return limit_squares(squared / max(scale, 1.0), m)
 
 
 def list_reduced(t: Array, weight: Array, used: Array) -> RowWeights:
@@ -38,33 +23,49 @@ def list_reduced(t: Array, weight: Array, used: Array) -> RowWeights:
 
 
 def count_reduced(some: RowWeights) -> int:
-    """How many rows have a weight below 1; they are listed with all rows of their times."""
+    """How many have a weight below 1."""
     return int(np.sum(some.weight < 1.0))
 
 
-def count_rows(problem: Problem) -> dict[str, int]:
-    """How many rows may be outliers, by constraint and by `INTERVALS`."""
-    return {c.name: len(c) for c in problem.constraints} | dict.fromkeys(INTERVALS, len(problem.t) - 1)
+def compute_row_costs(problem: Problem, tails: Mapping[str, float], without: Collection[str] = ()) -> Array:
+    """(K,) by keyframe, what the log-likelihood of rows that are Gaussian with their weights is above that of their
+    density with `tails`.
 
-
-def compute_outlier_cost(weights: Mapping[str, RowWeights], totals: Mapping[str, int]) -> float:
-    """Negative prior log-probability of as many outliers as there are reduced weights, less that of none.
-
-    How often a sensor has outliers is unknown. With a Beta prior of 1 and 1 / `CHANCE`, its mean `CHANCE`, k given ones
-    of n rows are outliers with a probability of B(k + 1, n - k + 1 / `CHANCE`) / B(1, 1 / `CHANCE`).
+    Parameters
+    ----------
+    problem : with a noise model.
+    without : names of constraints that are Gaussian.
     """
-    some = [(count_reduced(one), totals[name]) for name, one in weights.items() if name in totals]
-    return sum((float(_compute_cost(np.array(k), n)) for k, n in some), 0.0)
+    cost = np.zeros(len(problem.t))
+    for rows in problem.constraints:
+        if rows.list_noise_groups()[0] and rows.name not in without:
+            m = len(rows.axes)
+            index = get_tail_index(tails, rows.name, m)
+            weight = np.ones(len(rows)) if rows.weight is None else rows.weight
+            used = weight > 0.0
+            each = compute_log_normaliser(index, m) - 0.5 * index * np.log(weight[used])
+            np.add.at(cost, rows.keyframe[used], each)
+    return cost
+
+
+def compute_interval_cost(weights: Mapping[str, RowWeights], total: int) -> float:
+    """Negative prior log-probability of as many disturbed intervals as there are, less that of none.
+
+    How often intervals are disturbed is unknown. With a Beta prior of 1 and 1 / `CHANCE`, its mean `CHANCE`, k given
+    ones of n have a probability of B(k + 1, n - k + 1 / `CHANCE`) / B(1, 1 / `CHANCE`).
+    """
+    some = [count_reduced(weights[name]) for name in INTERVALS if name in weights]
+    return sum(float(_compute_cost(np.array(k), total)) for k in some)
 
 
 def _compute_cost(k: Array, total: int) -> Array:
-    """The same of k outliers among all rows of one sensor."""
+    """That of k disturbed ones among all intervals."""
     n = total + 1.0 / CHANCE
     return np.asarray(betaln(1.0, n) - betaln(k + 1.0, n - k))
 
 
 def may_pay(squared: Array, freedom: Array) -> bool:
-    """Whether any number of outliers may gain more log-likelihood than it costs.
+    """Whether any number of disturbed intervals may gain more log-likelihood than it costs.
 
     Parameters
     ----------
@@ -77,6 +78,6 @@ def may_pay(squared: Array, freedom: Array) -> bool:
 
 
 def compute_latest_cost(some: RowWeights, total: int) -> float:
-    """The cost of the latest of some outliers among all rows of a sensor."""
+    """The cost of the latest of some disturbed intervals among all."""
     k = max(count_reduced(some), 1)
     return float(np.log((total - k + 1.0 / CHANCE) / k))

@@ -10,7 +10,8 @@ from scipy.special import chdtri
 from graphnav.constraints.base import SAME_TIME
 from graphnav.core.rotation import Array
 from graphnav.estimation.noise.model import RowWeights
-from graphnav.estimation.noise.outliers import CHANCE, OUTLIER_COST
+from graphnav.estimation.noise.outliers import OUTLIER_COST
+from graphnav.estimation.noise.tails import CHANCE
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import ExcludedSpan
 

@@ -19,7 +19,7 @@ from graphnav.core.findings import find_runs
 from graphnav.core.notes import Note, format_count
 from graphnav.core.rotation import Array
 from graphnav.estimation.alignment.first import pick_fixes
-from graphnav.estimation.noise.outliers import CHANCE
+from graphnav.estimation.noise.tails import CHANCE
 from graphnav.estimation.solution import ExcludedSpan
 from graphnav.recording import Gnss, Recording
 

@@ -8,7 +8,8 @@ from graphnav.constraints.gnss import STAMP_ERROR, GnssPosition
 from graphnav.constraints.vehicle import MOUNTING
 from graphnav.core.notes import Note, format_count
 from graphnav.estimation.names import name_components, name_rows
-from graphnav.estimation.noise.model import INTERVALS, NoiseModel
+from graphnav.estimation.noise.model import INTERVALS, NoiseModel, RowWeights
+from graphnav.estimation.noise.tails import relate_to_gaussian
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.linearise import Points, shift
 from graphnav.recording.checks.axes import write_letters
@@ -101,12 +102,14 @@ def describe_noise(noise: NoiseModel, problem: Problem) -> tuple[str, ...]:
         stamps = next((p for p in rows.parameters if p.name == STAMP_ERROR), None)
         if stamps is not None and rows.name == GnssPosition.name:
             parts.append(f"stamp of each fix {stamps.sigma[0]:.2g} s")
+        if rows.name in noise.tails:
+            parts.append(f"tail index {noise.tails[rows.name]:.2g}")
         out.append(
             Note("noise.rows", f"noise model, {name_rows(rows.name)}: white part in stated sigmas: {'; '.join(parts)}")
         )
         some = noise.weights.get(rows.name)
-        if some is not None and len(some.t):
-            less = int(np.count_nonzero(some.weight < 1.0))
+        less = 0 if some is None else _count_outliers(some, len(rows.axes), noise.tails.get(rows.name))
+        if less:
             out.append(
                 Note(
                     "noise.outliers",
@@ -114,3 +117,7 @@ def describe_noise(noise: NoiseModel, problem: Problem) -> tuple[str, ...]:
                 )
             )
     return tuple(out)
+
+
+def _count_outliers(some: RowWeights, m: int, index: float | None) -> int:
+    return int(np.count_nonzero(relate_to_gaussian(some.weight, m, index) < 1.0))
