@@ -141,6 +141,12 @@ def at_rate(recording: Recording, rate: float) -> Recording:
     )
 
 
+def forget_residuals(recording: Recording) -> Recording:
+    """The recording with fixes that do not tell the residuals of their pseudoranges."""
+    assert recording.gnss is not None
+    return replace(recording, gnss=replace(recording.gnss, residual_rms=None))
+
+
 def truth_states(truth: Trajectory, t: Array, frame: LocalFrame) -> States:
     """The truth as states in a navigation frame, straight between its rows, of which there is one a few ms away."""
     i = np.clip(np.searchsorted(truth.t, t - 1e-6), 1, len(truth.t) - 1)

@@ -13,7 +13,7 @@ import numpy as np
 
 from graphnav.app.summary import compute_median_sigmas
 from graphnav.app.workflow import Outcome
-from graphnav.constraints.gnss import TIMES
+from graphnav.constraints.lasting import LASTING
 from graphnav.core.notes import format_count, get_key
 from graphnav.core.progress import Progress
 from graphnav.core.staging import defer_interrupts
@@ -73,7 +73,7 @@ def _describe_noise(outcome: Outcome) -> list[str]:
     estimated = {words: noise.figures[group].log_factor for group, words in _OF_IMU.items() if group in noise.figures}
     parts = [f"{words} x {format_short(float(np.exp(0.5 * factor)))}" for words, factor in estimated.items()]
     for source in dict.fromkeys(group.rpartition(".")[0] for group in noise.figures if group.startswith("gnss_")):
-        if source.rpartition(".")[2] in TIMES:
+        if source.rpartition(".")[2] in LASTING:
             continue
         name, _, kind = source.partition(".")
         ratios = [(axis, compute_whole_ratio(noise, source, axis)) for axis in ("horizontal", "up")]

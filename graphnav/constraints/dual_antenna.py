@@ -20,7 +20,7 @@ import numpy as np
 
 from graphnav.config import Settings
 from graphnav.constraints.base import SAME_TIME, BuildContext, Constraint, Linearized
-from graphnav.constraints.gnss import TIMES, find_fix_period, find_node_spacing
+from graphnav.constraints.lasting import TIMES, find_fix_period, find_node_spacing
 from graphnav.core import rotation
 from graphnav.core.earth import LocalFrame
 from graphnav.core.rotation import Array

@@ -13,12 +13,7 @@ drift apart: the rate of one beside the other, by the time since the drive began
 (boulder's 3e-4): 0.2 s in half an hour. Where fixes are stamped on arrival, each stamp has an error of its own as
 well: white, and common to the position and velocity of a fix.
 
-e is the time-correlated part of a position's error: errors of one receiver's fixes seconds apart are nearly equal, so a
-thousand fixes are not a thousand independent measurements. It is the sum of three Gauss-Markov processes in units of
-the stated sigma: one of seconds (multipath), one of minutes (multipath as satellites move, changes of the satellites in
-view) and one of hours (orbits, atmosphere, coordinates of the base). The stated sigma itself is that of the white part.
-The noise model estimates the size of each (`graphnav.estimation.noise`), for each type of fix where there are several:
-errors of fixed and of single-point solutions are unrelated. With stated noise there is only the white part.
+e is the time-correlated part of a position's error (`graphnav.constraints.lasting`).
 """
 
 from __future__ import annotations
@@ -38,25 +33,32 @@ from graphnav.constraints.antenna_motion import (
     fit_force_line,
 )
 from graphnav.constraints.base import SAME_TIME, BuildContext, Constraint, Linearized, TypicalSigmas
+from graphnav.constraints.lasting import (
+    ERRORS,
+    MULTIPATH_ERROR,
+    compute_running_median,
+    find_fix_period,
+    find_least_period,
+    find_node_spacing,
+    list_processes,
+    make_multipath,
+)
 from graphnav.core import earth, rotation
 from graphnav.core.rotation import Array, mv
-from graphnav.core.running import run_median
-from graphnav.core.state import NODE_SPACING, SECONDS, Parameter, States
+from graphnav.core.state import SECONDS, Parameter, States
+from graphnav.gnss.residuals import compute_multipath_sigma
 from graphnav.recording import FIX_TYPES, Recording
 
 TIME_OFFSET = "gnss_time_offset"
 VELOCITY_TIME_OFFSET = "gnss_velocity_time_offset"
 CLOCK_RATE = "gnss_clock_rate"
 _UNITS = {LEVER_ARM: "m", TIME_OFFSET: "s", VELOCITY_TIME_OFFSET: "s", CLOCK_RATE: "s/s"}
-TIMES = ("seconds", "minutes", "hours")  # correlation times of the processes of a position's error
-ERRORS = tuple(f"gnss_error_of_{time}" for time in TIMES)
 VELOCITY_ERROR = "gnss_velocity_error"
 STAMP_ERROR = "gnss_stamp_error"
 STAMPS = "gnss_position.stamps"  # variance component of the stamp errors
 # variance components of the offsets' priors
 OFFSETS = {f"prior.{name}": name for name in (TIME_OFFSET, VELOCITY_TIME_OFFSET, CLOCK_RATE)}
 _I3 = np.eye(3)
-_MINUTE = 60.0  # s
 _WHITE = 1e-3  # s, a correlation time at which nothing is left from one fix to the next
 
 
@@ -99,9 +101,7 @@ def _build_stamp_error(settings: Settings, t: Array) -> tuple[Parameter, ...]:
     sigma = np.full(1, settings.gnss.time_offset_sigma)
     if not sigma[0] > 0.0:
         return ()
-    # a node at every fix, however close: two fixes with one stamp error would contradict each other
-    spacing = min(float(np.diff(t).min()), NODE_SPACING) if len(t) > 1 else NODE_SPACING
-    own = (STAMPS,)
+    own, spacing = (STAMPS,), find_least_period(t)
     return (
         Parameter(STAMP_ERROR, np.zeros(1), sigma, "s", correlation_time=_WHITE, spacing=spacing, noise_groups=own),
     )
@@ -135,11 +135,15 @@ class _Fixes(Constraint):
 
     def compute_typical_error(self) -> Array:
         """At least the stated sigma: a fix within it is not wrong, however good the others are."""
+        whole = np.sqrt(self.sigma**2 + self._compute_lasting_variance())
+        return np.asarray(np.median(np.maximum(whole, self.unit_error), axis=0))
+
+    def _compute_lasting_variance(self) -> Array:
+        """(N, 3) of the time-correlated errors."""
         lasting = sum(
             (p.sigma**2 for p in self.parameters if p.name.startswith((*ERRORS, VELOCITY_ERROR))), np.zeros(3)
         )
-        whole = np.sqrt(self.sigma**2 + lasting * self.unit_error**2)
-        return np.asarray(np.median(np.maximum(whole, self.unit_error), axis=0))
+        return np.asarray(lasting * self.unit_error**2)
 
     def _compute_acceleration(
         self, states: States, rows: slice | Array, ahead: Array
@@ -180,6 +184,7 @@ class GnssPosition(_Fixes):
         default_factory=lambda: np.zeros(3)
     )  # median of these: unit of the errors of minutes and hours
     type: Array | None = None  # (N,) index into graphnav.recording.FIX_TYPES, where there are several types
+    multipath_sigma: Array | None = None  # (N, 3) m, unit of what the residuals tell of, where fixes state these
 
     @classmethod
     def epochs(cls, recording: Recording, settings: Settings, stationary: Array) -> Array:
@@ -202,18 +207,16 @@ class GnssPosition(_Fixes):
         p_n = scene.frame.from_llh(llh)
         kinds = None if gnss.type is None or len(np.unique(gnss.type)) < 2 else gnss.type[used]
         common = _build_common(scene, TIME_OFFSET)
-        names = [""] if kinds is None else [f".{FIX_TYPES[int(kind)]}" for kind in np.unique(kinds)]
-        processes: tuple[Parameter, ...] = ()
+        types = [] if kinds is None else [FIX_TYPES[int(kind)] for kind in np.unique(kinds)]
         spacing = find_node_spacing(scene.settings.gnss.slow_times, find_fix_period(gnss.t[used]))
-        for name in names:
-            for error, time, lasts in zip(ERRORS, TIMES, (SECONDS, *scene.settings.gnss.slow_times), strict=True):
-                groups = tuple(f"{cls.name}{name}.{time}.{axis}" for axis in cls.noise_axes)
-                processes += (
-                    Parameter(
-                        error + name.replace(".", "_"), np.zeros(3), np.ones(3), "sd",
-                        correlation_time=lasts, spacing=spacing, noise_groups=groups,
-                    ),
-                )  # fmt: skip
+        processes = (
+            *list_processes(types, scene.settings.gnss.slow_times, spacing),
+            *_build_stamp_error(scene.settings, gnss.t[used]),
+        )
+        reflected = None
+        if gnss.residual_rms is not None:
+            reflected = compute_multipath_sigma(gnss.residual_rms, gnss.satellites)
+            processes += (make_multipath(gnss.t, reflected, find_least_period(gnss.t[used])),)
         rounding = np.array(gnss.rounding) * np.sqrt(count_repeats(gnss.llh[:, [1, 0, 2]]))[used]
         return cls(
             keyframe=keyframe[used],
@@ -221,13 +224,14 @@ class GnssPosition(_Fixes):
             R_ln=earth.enu_axes(llh) @ scene.frame.R_ne.T,
             sigma=np.hypot(sd, rounding),
             unscaled=rounding,
-            unit_error=_compute_running_median(gnss.t[used], sd)
+            unit_error=compute_running_median(gnss.t[used], sd)
             if scene.typical_sigmas is None
             else scene.typical_sigmas[used],
             drive_error=np.median(sd if scene.typical_sigmas is None else scene.typical_sigmas, axis=0),
             type=kinds,
+            multipath_sigma=None if reflected is None else sd * reflected[used, None],
             **_build_motion(scene, gnss.t[used], p_n),
-            processes=(*processes, *_build_stamp_error(scene.settings, gnss.t[used])),
+            processes=processes,
             **common,
         )
 
@@ -265,20 +269,30 @@ class GnssPosition(_Fixes):
             J |= {name: (later * one)[..., None] for name, one in by.items()}
         residual, jacobians = mv(C, away), {block: C @ x for block, x in J.items()}
         for name in parameters:
-            if name.startswith(ERRORS):
-                # a lasting error in units that change from fix to fix would be observable by these changes
-                unit = self.drive_error if name.startswith(ERRORS[1:]) else self.unit_error[rows]
-                size = np.broadcast_to(unit, residual.shape) * self._mask_type(name, rows)
+            if name.startswith((*ERRORS, MULTIPATH_ERROR)):
+                size = np.broadcast_to(self._select_unit(name, rows), residual.shape)
                 residual = residual + size * parameters[name]
                 jacobians[name] = size[..., None] * _I3
         return Linearized(residual, jacobians, self.sigma[rows])
 
-    def _mask_type(self, name: str, rows: slice | Array) -> float | Array:
-        """1 where a process is the error of a fix, 0 where the fix is of another type."""
+    def _compute_lasting_variance(self) -> Array:
+        variance = super()._compute_lasting_variance()
+        for p in self.parameters:
+            if p.name == MULTIPATH_ERROR:
+                assert self.multipath_sigma is not None
+                variance = variance + p.sigma**2 * self.multipath_sigma**2
+        return variance
+
+    def _select_unit(self, name: str, rows: slice | Array) -> Array:
+        """What a process of lasting errors is in units of, m; 0 where it is that of fixes of another type."""
+        if name == MULTIPATH_ERROR:
+            assert self.multipath_sigma is not None
+            return self.multipath_sigma[rows]
+        unit = self.drive_error if name.startswith(ERRORS[1:]) else self.unit_error[rows]
         if self.type is None:
-            return 1.0
+            return unit
         kind = next(k for k, kind in FIX_TYPES.items() if name.endswith(kind))
-        return np.asarray(self.type[rows] == kind, dtype=float)[..., None]
+        return np.asarray(unit * (self.type[rows] == kind)[..., None])
 
 
 @dataclass(frozen=True)
@@ -325,7 +339,7 @@ class GnssVelocity(_Fixes):
             R_ln=earth.enu_axes(gnss.llh[used]) @ scene.frame.R_ne.T,
             sigma=gnss.sd_v[used],
             **_build_motion(scene, t, scene.frame.from_llh(gnss.llh[used])),
-            unit_error=_compute_running_median(t, gnss.sd_v[used]),
+            unit_error=compute_running_median(t, gnss.sd_v[used]),
             processes=(lasting, *_build_stamp_error(scene.settings, t)),
             **_build_common(scene, VELOCITY_TIME_OFFSET),
         )
@@ -353,28 +367,6 @@ class GnssVelocity(_Fixes):
             residual = residual + size * parameters[VELOCITY_ERROR]
             jacobians[VELOCITY_ERROR] = size[..., None] * _I3
         return Linearized(residual, jacobians, self.sigma[rows])
-
-
-def find_fix_period(t: Array) -> float:
-    """Usual time between fixes, s."""
-    return max(float(np.median(np.diff(t))), 1e-3) if len(t) > 1 else 1.0
-
-
-def find_node_spacing(slow_times: tuple[float, ...], dt: float) -> float:
-    """Spacing (s) of the nodes of time-correlated errors, between which the value is held.
-
-    A process of seconds needs one node per fix, `dt` s apart, up to a fifth of its correlation time.
-    """
-    return max(dt, min(0.2 * SECONDS, *(0.01 * time for time in slow_times), NODE_SPACING))
-
-
-def _compute_running_median(t: Array, sigma: Array) -> Array:
-    """Running median of sigmas over a minute.
-
-    A lasting error times a sigma that jumps from fix to fix would jump too, and thus be observable.
-    """
-    size = 2 * int(np.clip(_MINUTE / find_fix_period(t) / 2, 0, (len(t) - 1) // 2)) + 1
-    return run_median(sigma, size)
 
 
 def free_constants(rows: Constraint, priors: Mapping[str, tuple[Array, Array]]) -> Constraint:

@@ -36,7 +36,7 @@ import numpy as np
 from graphnav.config import Settings
 from graphnav.constraints.antenna_motion import LEVER_ARM, average_around, compute_antenna_velocity
 from graphnav.constraints.base import BuildContext, Constraint, Linearized
-from graphnav.constraints.gnss import TIMES
+from graphnav.constraints.lasting import TIMES
 from graphnav.constraints.raw_rows import CLOCK, GROSS, PreparedRows
 from graphnav.constraints.raw_selection import select_observations
 from graphnav.core import rotation

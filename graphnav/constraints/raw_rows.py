@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from graphnav.config.raw_gnss import RawGnssSettings
 from graphnav.constraints.base import BuildContext
-from graphnav.constraints.gnss import find_fix_period, find_node_spacing
+from graphnav.constraints.lasting import find_fix_period, find_node_spacing
 from graphnav.constraints.raw_selection import select_observations
 from graphnav.core import earth
 from graphnav.core.rotation import Array

@@ -46,6 +46,8 @@ class Parameter:
     unit: str
     walk: float | Array = 0.0  # unit/sqrt(s) of a random walk, (k,) or one for all; 0 = constant
     correlation_time: float | None = None  # s; if given, a Gauss-Markov process about zero with `sigma` at all times
+    # of such a process: (n,) s, from when on it is in units of each of (n,) sizes
+    sizes: tuple[Array, Array] | None = None
     spacing: float = NODE_SPACING  # s, at least, between two nodes
     begins: Array | None = None  # (n,) s; if given, `initial` and `sigma` apply anew from each of these times on
     reported: bool = False  # whether a solution reports its values
@@ -73,12 +75,23 @@ class Parameter:
         """Whether one value holds for the whole recording."""
         return self.begins is None and self.correlation_time is None and not np.any(self.walk)
 
-    def step(self, dt: Array) -> tuple[Array, Array]:
-        """Decay (n,) and 1-sigma (n, k) of the process noise over times dt (n,)."""
+    def step(self, begin: Array, end: Array) -> tuple[Array, Array]:
+        """Decay (n,) and 1-sigma (n, k) of the process noise from times `begin` to times `end` (n,), s."""
+        dt = end - begin
         if self.correlation_time is None:
             return np.ones_like(dt), np.sqrt(dt)[:, None] * np.broadcast_to(self.walk, self.sigma.shape)
-        decay = np.exp(-dt / self.correlation_time)
+        decay = np.exp(-dt / self.correlation_time) * self.compare_sizes(begin, end)
         return decay, np.sqrt(1.0 - decay**2)[:, None] * self.sigma
+
+    def compare_sizes(self, begin: Array, end: Array) -> Array:
+        """(n,) the smaller over the larger of the sizes at two times (n,): the correlation that is left of the process
+        where the larger error is the smaller one and an independent one beside it.
+        """
+        if self.sizes is None:
+            return np.ones(len(begin))
+        t, size = self.sizes
+        a, b = (size[np.maximum(np.searchsorted(t, x + 1e-6, side="right") - 1, 0)] for x in (begin, end))
+        return np.asarray(np.minimum(a, b) / np.maximum(a, b))
 
 
 def split_covariance(P: Array) -> dict[str, Array]:

@@ -241,7 +241,7 @@ def _build_chains(parameters: Iterable[Parameter], t: Array) -> tuple[ParameterC
             nodes, mean, sigma, decay = p.begins, p.initial, p.sigma, np.zeros(len(p.begins))
         else:
             nodes = t[:1] if p.constant else _keep_apart(t.tobytes(), p.spacing)
-            ahead, added = p.step(np.diff(nodes))
+            ahead, added = p.step(nodes[:-1], nodes[1:])
             mean = np.tile(p.initial, (len(nodes), 1))
             sigma, decay = np.concatenate([p.sigma[None], added]), np.concatenate([[0.0], ahead])
         node = np.maximum(np.searchsorted(nodes, t + SAME_TIME, side="right") - 1, 0)

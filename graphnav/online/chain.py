@@ -275,7 +275,7 @@ class Chain:
                 steps.append(Step(name, np.atleast_2d(p.initial)[0], np.atleast_2d(p.sigma)[0]))
                 nodes[name] = t
             elif t - nodes[name] >= p.spacing - SAME_TIME and not p.constant:
-                ahead, added = p.step(np.array([t - nodes[name]]))
+                ahead, added = p.step(np.array([nodes[name]]), np.array([t]))
                 steps.append(Step(name, p.initial, added[0], float(ahead[0]), p.initial))
                 nodes[name] = t
         return tuple(steps)

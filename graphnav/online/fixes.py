@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from graphnav.constraints.gnss import find_fix_period
+from graphnav.constraints.lasting import find_fix_period
 from graphnav.core.rotation import Array
 from graphnav.estimation.alignment.first import pick_fixes
 from graphnav.estimation.noise.spacing import find_grid_start, select_best_fixes
@@ -15,7 +15,8 @@ from graphnav.estimation.noise.unmeasured import mark_copies
 from graphnav.online.buffers import Buffer
 from graphnav.recording import Gnss
 
-_WIDTH, _USED = 19, 19  # the last columns: six typical sigmas, and whether the fix is used
+_WIDTH = 21  # after a fix's values six typical sigmas, whether it is used, rms of its residuals and satellites
+_USED, _RESIDUALS = 19, 20
 _COPY = -1.0  # in the last column: a copy of the fix before
 _NEAR = 8  # rows either side of a new one among which copies are sought
 _AVERAGED_OVER = 60.0  # s over which the typical sigma of fixes is averaged
@@ -32,6 +33,7 @@ class Fixes(Buffer):
     def __init__(self, setup: Gnss | None) -> None:
         super().__init__(_WIDTH)
         self.left: list[float] = []  # s, fixes that were used until better ones of their span, or another copy, arrived
+        self._states_residuals = False  # whether a fix has had an rms of its residuals
         self._selects = False  # whether not all fixes are used
         self._setup = setup
         # begin and duration of the spans, s, of which the best fix is used
@@ -47,7 +49,9 @@ class Fixes(Buffer):
     def complete(self, t: float, values: tuple[float, ...]) -> tuple[float, ...]:
         """The row of a fix at a time (s): its values, typical sigmas, and the mark that it is used."""
         position, velocity = (self._track_sigma(kind, t, values[k : k + 3]) for kind, k in (("p", 3), ("v", 9)))
-        return (*values, *position, *velocity, 1.0)
+        of_residuals = values[12:] or (math.nan, math.nan)
+        self._states_residuals |= math.isfinite(of_residuals[0])
+        return (*values[:12], *position, *velocity, 1.0, *of_residuals)
 
     def forget_typical(self) -> None:
         """Reset the typical sigmas: what follows is of another receiver or clock."""
@@ -122,7 +126,11 @@ class Fixes(Buffer):
         v = sd_v = None
         if np.isfinite(rows[:, 7:13]).all(axis=1).any():
             v, sd_v = rows[:, 7:10], rows[:, 10:13]
-        return replace(self._setup, t=rows[:, 0], llh=rows[:, 1:4], sd=rows[:, 4:7], v=v, sd_v=sd_v)
+        rms, satellites = rows[:, _RESIDUALS:].T if self._states_residuals else (None, None)
+        return replace(
+            self._setup, t=rows[:, 0], llh=rows[:, 1:4], sd=rows[:, 4:7], v=v, sd_v=sd_v,
+            residual_rms=rms, satellites=satellites,
+        )  # fmt: skip
 
     def _track_sigma(self, kind: str, t: float, sd: tuple[float, ...]) -> tuple[float, ...]:
         """A causal mean, which does not change after a fix has been built.

@@ -2,7 +2,7 @@
 
 graphnav-online/1 {"platform": "vehicle", "imu": {"noise": {...}}, "gnss": {"lever_arm": [0, 0, 1.2]}}
 I,t,gx,gy,gz,ax,ay,az
-G,t,lat,lon,h,sd_e,sd_n,sd_u[,ve,vn,vu,sd_ve,sd_vn,sd_vu]
+G,t,lat,lon,h,sd_e,sd_n,sd_u[,ve,vn,vu,sd_ve,sd_vn,sd_vu[,resid_rms_m,nsat]]
 O,t,speed
 R,t,place and clock;satellite,signal,...;...   raw observations, one epoch per line (`graphnav.online.raw_lines`)
 S,name,t,...                  another sensor (`graphnav.sensors`): its columns
@@ -92,7 +92,7 @@ class LineUnits:
             size, offset = self.times[sensor]
             t = size * t + offset
         if sensor in self.sizes:
-            values = tuple(x * size for x, size in zip(values, self.sizes[sensor], strict=True))
+            values = tuple(x * size for x, size in zip(values, self.sizes[sensor], strict=False))
         if sensor == "imu" and self.R_bs is not None:
             values = (*(self.R_bs @ values[:3]).tolist(), *(self.R_bs @ values[3:]).tolist())
         return sensor, t, values
@@ -206,7 +206,7 @@ def _find_units(found: Any, others: Mapping[str, tuple[Sensor, Any]]) -> LineUni
     }
     if (gnss := found.gnss) is not None:
         angle = ANGLE[gnss.units.angle or "deg"] / ANGLE["deg"]
-        sizes["gnss"] = angle, angle, HEIGHT[gnss.units.height], *(1.0,) * 3, *(SPEED[gnss.units.speed],) * 6
+        sizes["gnss"] = angle, angle, HEIGHT[gnss.units.height], *(1.0,) * 3, *(SPEED[gnss.units.speed],) * 6, 1.0, 1.0
     if found.odometer is not None:
         sizes["odometer"] = (SPEED[found.odometer.units.speed],) * 6
     for name, (sensor, one) in others.items():
@@ -248,12 +248,12 @@ def _parse_line(line: str) -> Row:
         raise ValueError(f"'{line[:40]}' holds something that is no number") from None
     if kind == "I" and len(numbers) == 7:
         return "imu", numbers[0], tuple(numbers[1:])
-    if kind == "G" and len(numbers) in (7, 13):
+    if kind == "G" and len(numbers) in (7, 13, 15):
         place = (np.radians(numbers[1]), np.radians(numbers[2]), *numbers[3:7])
         return "gnss", numbers[0], (*map(float, place), *(numbers[7:] or _BLANK))
     if kind == "O" and len(numbers) == 2:
         return "odometer", numbers[0], (numbers[1], *_BLANK[:5])
-    wanted = {"I": "7", "G": "7 or 13", "O": "2"}.get(kind)
+    wanted = {"I": "7", "G": "7, 13 or 15", "O": "2"}.get(kind)
     raise ValueError(
         f"'{kind}' needs {wanted} numbers, not {len(numbers)}" if wanted else f"no rows of kind '{kind[:10]}'"
     )
@@ -309,7 +309,7 @@ def format_line(row: Row) -> str:
         numbers = [x / tell_scale(column) for x, column in zip(values, columns, strict=True)]
         return f"S,{sensor},{t!r}," + ",".join("" if np.isnan(x) else repr(x) for x in numbers)
     lat, lon = float(np.degrees(values[0])), float(np.degrees(values[1]))
-    rest = values[2:6] if np.isnan(values[6]) else values[2:]
+    rest = values[2:6] if np.isnan(values[6]) and len(values) == 12 else values[2:]
     return f"G,{t!r},{lat!r},{lon!r}," + ",".join("" if np.isnan(x) else repr(x) for x in rest)
 
 

@@ -19,7 +19,8 @@ import numpy as np
 
 from graphnav.config import Settings
 from graphnav.constraints.base import SAME_TIME
-from graphnav.constraints.gnss import TIMES, GnssPosition
+from graphnav.constraints.gnss import GnssPosition
+from graphnav.constraints.lasting import TIMES
 from graphnav.core.earth import LocalFrame
 from graphnav.core.errors import EstimationError
 from graphnav.core.findings import Finding

@@ -24,7 +24,7 @@ from typing import Annotated
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from graphnav.constraints.gnss import find_fix_period
+from graphnav.constraints.lasting import find_fix_period
 from graphnav.core.errors import RecordingError
 from graphnav.core.files import parse_number
 from graphnav.core.rotation import Array

@@ -20,7 +20,8 @@ def drop_rows(recording: Recording) -> Recording:
     return replace(
         recording,
         imu=replace(recording.imu, t=none, gyro=rows, accel=rows),
-        gnss=gnss and replace(gnss, t=none, llh=rows, sd=rows, v=None, sd_v=None, type=None, satellites=None),
+        gnss=gnss
+        and replace(gnss, t=none, llh=rows, sd=rows, v=None, sd_v=None, type=None, satellites=None, residual_rms=None),
         odometer=odometer and replace(odometer, t=none, speed=none, counted=None, wheels=None),
         truth=None,
         raw_gnss=recording.raw_gnss and drop_epochs(recording.raw_gnss),
@@ -46,6 +47,9 @@ def list_rows(recording: Recording) -> tuple[Array, list[Row]]:
         blank[:, :3], blank[:, 3:6] = g.llh, g.sd
         if g.v is not None and g.sd_v is not None:
             blank[:, 6:9], blank[:, 9:] = g.v, g.sd_v
+        if g.residual_rms is not None:
+            satellites = np.full(len(g.t), np.nan) if g.satellites is None else g.satellites
+            blank = np.column_stack([blank, g.residual_rms, satellites])
         parts.append((g.t, "gnss", blank))
     parts += [(series.t, name, series.values) for name, series in recording.sensors.items()]
     parts.append((recording.imu.t, "imu", np.concatenate([recording.imu.gyro, recording.imu.accel], axis=1)))

@@ -62,7 +62,8 @@ class Fix(_Row):
     """A position of the antenna at `t` (s, on the IMU's clock), and its velocity if there is one.
 
     `lat`, `lon` in deg, `h` in m above the ellipsoid, `sd` (3,) in m, 1-sigma east, north, up; `v` and `sd_v` (3,) in
-    m/s, east, north, up, and its 1-sigmas; in those of `units`, by `make_setup`, where given.
+    m/s, east, north, up, and its 1-sigmas; in those of `units`, by `make_setup`, where given. `resid_rms_m` in m is the
+    rms of the residuals of its pseudoranges, and `nsat` how many satellites it used.
 
     Raises
     ------
@@ -82,6 +83,8 @@ class Fix(_Row):
         v: Sequence[float] | None = None,
         sd_v: Sequence[float] | None = None,
         units: LineUnits = _SI,
+        resid_rms_m: float | None = None,
+        nsat: float | None = None,
     ) -> Fix:
         place = [_check_number(cls, t, name, x) for name, x in (("lat", lat), ("lon", lon), ("h", h))]
         place[:2] = np.radians(place[:2]).tolist()
@@ -91,7 +94,12 @@ class Fix(_Row):
             raise RecordingError(f"Fix at t = {t}: v and sd_v go together, m/s east, north, up", key="row.velocity")
         if v is not None and sd_v is not None:
             speeds, of_speeds = (_check_vector(cls, t, name, "m/s", x) for name, x in (("v", v), ("sd_v", sd_v)))
-        given = (*place, *sigma, *speeds, *of_speeds)
+        given: tuple[float, ...] = (*place, *sigma, *speeds, *of_speeds)
+        if resid_rms_m is not None:
+            rms = _check_number(cls, t, "resid_rms_m", resid_rms_m)
+            if rms < 0.0:
+                raise RecordingError(f"Fix at t = {t}: resid_rms_m {rms} is below zero", key="row.residuals")
+            given = (*given, rms, np.nan if nsat is None else _check_number(cls, t, "nsat", nsat))
         row = units.convert(("gnss", _check_number(cls, t, "t", t), given))
         lat_rad, lon_rad, height = row[2][:3]
         if not abs(lat_rad) <= 0.5 * np.pi or not -np.pi <= lon_rad <= 2.0 * np.pi:
@@ -100,7 +108,7 @@ class Fix(_Row):
             raise RecordingError(f"Fix at t = {t}: h {h} is no height of a drive in m", key="row.height")
         if v is not None:
             _check_vector(cls, t, "v", "m/s", row[2][6:9], FASTEST, "is it in km/h or mm/s?")
-        for name, values in (("sd", row[2][3:6]), ("sd_v", row[2][9:])):
+        for name, values in (("sd", row[2][3:6]), ("sd_v", row[2][9:12])):
             if min(values) <= 0.0:
                 raise RecordingError(f"Fix at t = {t}: {name} {values}: 1-sigmas must be above zero", key="row.sigma")
         return super().__new__(cls, row)

@@ -78,7 +78,7 @@ def drop_insane_velocity(values: tuple[float, ...]) -> tuple[tuple[float, ...], 
         return values, False
     if math.hypot(*v) <= FASTEST and all(_LEAST_SIGMA_LIVE <= one <= VAGUEST_V for one in sd):
         return values, False
-    return (*values[:6], *_BLANK), True
+    return (*values[:6], *_BLANK, *values[12:]), True
 
 
 @dataclass

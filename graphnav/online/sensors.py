@@ -30,6 +30,7 @@ from graphnav.recording.formats.repair import LATEST
 
 AHEAD = 60.0  # s; stamps of other sensors that are further before the IMU's are wrong
 _ROW_WIDTH = {"imu": 6, "gnss": 12, "odometer": 6}
+_LONGER = {"gnss": 14}  # of a fix that states the rms of its residuals and its satellites
 _IDENTIFYING = {"gnss": 3, "odometer": 1}  # number of values by which a repeated row is recognised
 
 
@@ -100,7 +101,7 @@ class Sensors:
         if width is None and sensor != RAW:
             known = suggest_nearest(str(sensor), (*self._widths, RAW))
             raise RecordingError(f"row at t = {t}: no sensor '{sensor}'; {known}", key="row.name")
-        if width is not None and count != width:
+        if width is not None and count not in (width, _LONGER.get(sensor)):
             raise RecordingError(
                 f"{sensor} row at t = {t}: needs {width} numbers, not {count}; Fix, ImuSample, WheelSpeed and Reading "
                 "of graphnav.online make rows",
@@ -130,7 +131,8 @@ class Sensors:
         clock.
 
         The values are gyro and force of an IMU (rad/s, m/s^2); latitude, longitude (rad), height, three sigmas,
-        velocity and its sigmas (NaN where there is none) of a fix; speed, counted distance and four wheels of an
+        velocity and its sigmas (NaN where there is none) of a fix, and where known the rms of its residuals (m) and the
+        number of its satellites; speed, counted distance and four wheels of an
         odometer; of other sensors their columns in SI, NaN where there is none. Rows of `released` were held before and
         are not held again.
         """

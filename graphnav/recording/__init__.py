@@ -71,7 +71,8 @@ class Gnss:
     type: NDArray[np.intp] | None = None  # (M,) of FIX_TYPES; None: no fix states its type
     type_assumed: bool = False  # True when they are numbers of a CSV file, which were taken for RTKLIB's
     derived: bool = False  # whether these are single-point positions computed from the recording's raw observations
-    satellites: Array | None = None  # (M,) number used in each fix, NaN where unknown; only displayed
+    satellites: Array | None = None  # (M,) number used in each fix, NaN where unknown
+    residual_rms: Array | None = None  # (M,) m, of the pseudoranges used in each fix, NaN where unknown
     rounding: tuple[float, ...] = (0.0, 0.0, 0.0)  # m, east, north, up: standard deviation of the log's last digits
     velocity_offset: float = 0.0  # s; velocities are of `t` plus this
 

@@ -108,7 +108,8 @@ def lap() -> Recording:
     )
     gnss = recording.gnss
     assert gnss is not None
-    return replace(recording, gnss=replace(gnss, type=np.where(np.arange(len(gnss.t)) % 3 == 0, 2, 1)))
+    kinds, rms = np.where(np.arange(len(gnss.t)) % 3 == 0, 2, 1), np.where(np.arange(len(gnss.t)) % 7 < 3, 3.0, 0.5)
+    return replace(recording, gnss=replace(gnss, type=kinds, residual_rms=rms))
 
 
 @pytest.mark.parametrize("row", [40, 80])
@@ -199,10 +200,10 @@ def test_lag_moments_are_the_derivative_of_the_likelihood_by_the_correlation_tim
     for chain in lasting:
         p = chain.parameter
         assert p.correlation_time is not None
-        dt, later, cross, before = lag_moments(used, chain, smoothed, K)
+        dt, left, later, cross, before = lag_moments(used, chain, smoothed, K)
 
-        def expected(time: float, p=p, dt=dt, later=later, cross=cross, before=before) -> float:
-            a = np.exp(-dt / time)[:, None]
+        def expected(time: float, p=p, dt=dt, left=left, later=later, cross=cross, before=before) -> float:
+            a = (np.exp(-dt / time) * left)[:, None]
             q = (1.0 - a * a) * p.sigma**2
             return float(-0.5 * np.sum(np.log(q) + (later - 2.0 * a * cross + a * a * before) / q))
 

@@ -12,7 +12,8 @@ from test_constraints import scene_of
 from test_noise_scenarios import times, wandering, whole
 
 from graphnav.config import Settings
-from graphnav.constraints.gnss import ERRORS, GnssPosition
+from graphnav.constraints.gnss import GnssPosition
+from graphnav.constraints.lasting import ERRORS
 from graphnav.core.earth import LocalFrame
 from graphnav.core.rotation import Array
 from graphnav.core.trajectory import Trajectory

@@ -14,7 +14,7 @@ from replay import Play, play_isam2, play_window
 
 from graphnav.config import Settings, parse_settings
 from graphnav.constraints.antenna_motion import LEVER_ARM
-from graphnav.constraints.gnss import ERRORS
+from graphnav.constraints.lasting import ERRORS
 from graphnav.constraints.standstill import PLACE
 from graphnav.core.earth import LocalFrame
 from graphnav.core.rotation import exp

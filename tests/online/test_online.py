@@ -34,7 +34,7 @@ from graphnav.estimation.pipeline import run
 from graphnav.estimation.solution import make_trajectory
 from graphnav.estimation.solvers.window import compute_turn_limit
 from graphnav.evaluation.scoring import compute_errors
-from graphnav.online import Online, Row, Session, drop_rows, list_rows, noise_estimation, smoother
+from graphnav.online import Fix, Online, Row, Session, drop_rows, list_rows, noise_estimation, smoother
 from graphnav.online.buffers import Buffer
 from graphnav.online.lines import END, PROTOCOL, format_head, format_line, format_lines, parse_row, parse_setup
 from graphnav.online.tracker import Tracker
@@ -412,6 +412,31 @@ def test_lines_read_back_as_they_were(drive: tuple[Recording, Trajectory], rows:
         np.testing.assert_allclose(values, row[2], rtol=1e-15)
 
 
+def test_residuals_of_fixes_come_in_lines_and_rows(drive: tuple[Recording, Trajectory]) -> None:
+    """With and without velocities; what one fix does not state is unknown in the noise model's rows."""
+    recording = drive[0].crop(0.0, 6.0)
+    gnss = recording.gnss
+    rms, many = np.linspace(0.0, 9.0, len(gnss.t)), np.full(len(gnss.t), 8.0)
+    rms[2] = np.nan
+    stating = replace(recording, gnss=replace(gnss, residual_rms=rms, satellites=many))
+    online = Online(drop_rows(stating), QUICK)
+    for row in list_rows(stating)[1]:
+        again = parse_row(format_line(row))
+        assert again[:2] == row[:2]
+        np.testing.assert_allclose(again[2], row[2], rtol=1e-15)
+        online.add(again)
+    kept = online.sensors.gnss.select_as_gnss(-np.inf, np.inf)
+    np.testing.assert_array_equal(kept.residual_rms, rms)
+    np.testing.assert_array_equal(kept.satellites, many)
+    plain = next(row for row in list_rows(recording)[1] if row[0] == "gnss")
+    given = np.degrees(plain[2][0]), np.degrees(plain[2][1]), plain[2][2], plain[2][3:6]
+    fix = Fix(plain[1], *given, resid_rms_m=0.5, nsat=9)
+    assert fix[2][12:] == (0.5, 9.0)
+    assert Fix(plain[1], *given)[2] == pytest.approx(plain[2], rel=1e-12, nan_ok=True)
+    with refused("row.residuals", RecordingError, "-0.5"):
+        Fix(plain[1], *given, resid_rms_m=-0.5)
+
+
 def test_lines_in_other_units_and_axes_are_the_same_rows(
     drive: tuple[Recording, Trajectory], rows: list[Row], tmp_path: Path
 ) -> None:
@@ -450,7 +475,7 @@ def test_lines_in_other_units_and_axes_are_the_same_rows(
     ("line", "named"),
     [
         ("I,1,2,3", "'I'.* 7 .* 3$"),
-        ("G,1,2,3,4", "'G'.* 7 .* 13 .* 4$"),
+        ("G,1,2,3,4", "'G'.* 7, 13 .* 15 .* 4$"),
         ("X,1", "'X'"),
         ("O,1,fast", "'O,1,fast'"),
         ("\x00\xff", "'\x00\xff'"),

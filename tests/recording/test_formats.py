@@ -10,10 +10,12 @@ import logs
 import numpy as np
 import pytest
 from helpers import assert_told, refused, same_recording
+from test_bad_input import write_small
 
 from graphnav.app import convert
 from graphnav.core.errors import ConfigError, RecordingError
 from graphnav.core.timescales import count_leap_seconds, format_clock, gps_to_utc, parse_clock, unix_to_gps, utc_to_gps
+from graphnav.estimation.alignment.first import pick_fixes
 from graphnav.recording.formats import load, read
 from graphnav.recording.formats.writer import convert_to_degrees, write_recording
 
@@ -422,3 +424,34 @@ def test_satellites_are_read_and_kept(tmp_path):
     assert (read(tmp_path / "out").gnss.satellites == 12).all()
     part = read(tmp_path / "out").crop(5.0, 10.0).gnss
     assert len(part.satellites) == len(part.t) > 3
+
+
+def test_residuals_are_read_and_kept(tmp_path):
+    """Under the names that they have, blanks as unknown; in a part of the recording, and written again."""
+    folder = write_small(tmp_path)
+    rows = (folder / "gnss.csv").read_text().splitlines()
+    more = ["nsat,resid_rms_m", "9,0.75", ",", "12,21.5", "4,0", "11,"]
+    (folder / "gnss.csv").write_text("\n".join(f"{row},{x}" for row, x in zip(rows, more, strict=True)) + "\n")
+    recording = read(folder)
+    gnss = recording.gnss
+    np.testing.assert_array_equal(gnss.residual_rms, [0.75, np.nan, 21.5, 0.0, np.nan])
+    np.testing.assert_array_equal(gnss.satellites, [9.0, np.nan, 12.0, 4.0, 11.0])
+    np.testing.assert_array_equal(recording.crop(0.3, 0.7).gnss.residual_rms, [21.5, 0.0])
+    assert (pick_fixes(gnss, np.array([2])).residual_rms == [21.5]).all()
+    write_recording(recording, tmp_path / "out")
+    again = read(tmp_path / "out").gnss
+    np.testing.assert_array_equal(again.residual_rms, gnss.residual_rms)
+    np.testing.assert_array_equal(again.satellites, gnss.satellites)
+
+
+@pytest.mark.parametrize("value", ["-0.5", "much", "1e999"])
+def test_residuals_that_are_none_are_one_line(tmp_path, value):
+    folder = write_small(tmp_path)
+    rows = (folder / "gnss.csv").read_text().splitlines()
+    rows = [f"{rows[0]},resid_rms_m", *(f"{row},0.8" for row in rows[1:3]), f"{rows[3]},{value}"]
+    (folder / "gnss.csv").write_text("\n".join(rows) + "\n")
+    with pytest.raises(RecordingError) as refusal:
+        read(folder)
+    said = str(refusal.value)
+    assert "\n" not in said
+    assert all(word in said for word in ("gnss.csv", "line 4", "resid_rms_m"))

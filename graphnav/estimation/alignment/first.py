@@ -53,5 +53,5 @@ def pick_fixes(gnss: Gnss, rows: Array) -> Gnss:
     pick: dict[str, Any] = {"t": gnss.t[rows], "llh": gnss.llh[rows], "sd": gnss.sd[rows]}
     if gnss.v is not None and gnss.sd_v is not None:
         pick |= {"v": gnss.v[rows], "sd_v": gnss.sd_v[rows]}
-    pick |= {name: x[rows] for name in ("type", "satellites") if (x := getattr(gnss, name)) is not None}
+    pick |= {name: x[rows] for name in ("type", "satellites", "residual_rms") if (x := getattr(gnss, name)) is not None}
     return replace(gnss, **pick)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from graphnav.constraints.gnss import TIMES
+from graphnav.constraints.lasting import LASTING
 from graphnav.estimation.noise.model import NoiseModel, RowWeights, VarianceComponent
 from graphnav.estimation.noise.priors import get_prior, list_largest
 from graphnav.estimation.problem import Problem
@@ -50,14 +50,14 @@ class Components:
         """Median and 1-sigma of a log factor; where the white part of fixes exceeds the stated, so do the others."""
         m, s = get_prior(name)
         sensor, *kind, axis = name.split(".")
-        if sensor == "gnss_position" and kind and kind[-1] in TIMES:
+        if sensor == "gnss_position" and kind and kind[-1] in LASTING:
             m += max(0.0, self.log.get(".".join([sensor, *kind[:-1], axis]), 0.0))
         return m, s
 
     def get_largest(self, name: str) -> float:
         """The largest log factor; of the time-correlated parts of fixes, that of the white part."""
         sensor, *kind, axis = name.split(".")
-        white = ".".join([sensor, *(part for part in kind if part not in TIMES), axis])
+        white = ".".join([sensor, *(part for part in kind if part not in LASTING), axis])
         return self.largest.get(white, np.inf)
 
     def log_prior(self) -> float:

@@ -288,18 +288,18 @@ def _improve_time(figures: Components, chain: ParameterChain, observed: Array, l
 
     `observed` (k,) of its numbers are used.
     """
-    dt, later, cross, before = lags
+    dt, left, later, cross, before = lags
     p = chain.parameter
     assert p.correlation_time is not None
     if not len(dt):
         return
-    dt, first = np.unique(dt, return_inverse=True)  # few differ
+    (dt, left), first = np.unique([dt, left], axis=1, return_inverse=True)  # few differ
     later, cross, before, count = (
         np.stack([np.bincount(first, one, len(dt)) for one in some.T[observed]], axis=-1)
         for some in (later, cross, before, np.ones_like(before))
     )
     times = p.correlation_time * np.exp(_TIME_GRID)
-    a = np.exp(-dt[:, None] / times)[..., None]
+    a = (np.exp(-dt[:, None] / times) * left[:, None])[..., None]
     q = (1.0 - a * a) * chain.sigma[0, observed] ** 2
     squares = later[:, None] - 2.0 * a * cross[:, None] + a * a * before[:, None]
     value = -0.5 * np.sum(count[:, None] * np.log(q) + squares / q, axis=(0, 2))

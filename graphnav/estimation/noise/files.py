@@ -36,16 +36,15 @@ from graphnav.constraints import list_constraints
 from graphnav.constraints.dual_antenna import DualHeading, DualPitch
 from graphnav.constraints.gnss import (
     CLOCK_RATE,
-    ERRORS,
     LEVER_ARM,
     OFFSETS,
     STAMP_ERROR,
     STAMPS,
     TIME_OFFSET,
-    TIMES,
     VELOCITY_ERROR,
     VELOCITY_TIME_OFFSET,
 )
+from graphnav.constraints.lasting import ERRORS, LASTING, MULTIPATH_ERROR
 from graphnav.constraints.raw_gnss import CODE_ERRORS, RATE_ERROR
 from graphnav.constraints.vehicle import NHC_ERROR, ODOMETER_ERROR
 from graphnav.core.complaints import suggest_nearest
@@ -208,7 +207,7 @@ def list_groups() -> tuple[str, ...]:
         out += [
             f"{cls.name}{kind}{time}.{axis}"
             for kind in kinds
-            for time in ("", *(f".{t}" for t in TIMES))
+            for time in ("", *(f".{t}" for t in LASTING))
             for axis in axes
         ]
     return tuple(out)
@@ -218,7 +217,7 @@ def _list_processes() -> tuple[str, ...]:
     typed = [f"{error}_{kind}" for error in ERRORS for kind in FIX_TYPES.values()]
     of_antennas = (kind.name_lasting() for kind in (DualHeading, DualPitch))
     others = VELOCITY_ERROR, *CODE_ERRORS, RATE_ERROR, STAMP_ERROR, NHC_ERROR, ODOMETER_ERROR
-    return (*ERRORS, *typed, *others, *of_antennas)
+    return (*ERRORS, MULTIPATH_ERROR, *typed, *others, *of_antennas)
 
 
 class _Reader:

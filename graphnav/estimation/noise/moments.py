@@ -138,7 +138,8 @@ def collect_row_moments(problem: Problem, rows: Constraint, smoothed: MomentPass
 
 
 def lag_moments(problem: Problem, chain: ParameterChain, smoothed: MomentPass, end: int) -> tuple[Array, ...]:
-    """Of a process, from node to node: times between (n,), E[c' c'], E[c' c] and E[c c] (n, k), c' the later.
+    """Of a process, from node to node: times between (n,), the correlation (n,) that a change of its size leaves, and
+    E[c' c'], E[c' c] and E[c c] (n, k), c' the later.
 
     As c' = a c + w, E[c' c] is half of (E[c' c'] + a^2 E[c c] - E[w w]) / a. Where the correlation is negligible
     (`_FORGOTTEN`), the two are taken as independent.
@@ -152,4 +153,5 @@ def lag_moments(problem: Problem, chain: ParameterChain, smoothed: MomentPass, e
     before, later = c0 * c0 + smoothed.variance[k - 1, at], c1 * c1 + smoothed.variance[k, at]
     a = np.maximum(chain.decay[j], _FORGOTTEN)[:, None]
     cross = np.where(a > _FORGOTTEN, 0.5 * (later + a * a * before - driven) / a, c1 * c0)
-    return np.diff(chain.t)[j - 1], later, cross, before
+    left = chain.parameter.compare_sizes(chain.t[j - 1], chain.t[j])
+    return np.diff(chain.t)[j - 1], left, later, cross, before

@@ -19,7 +19,7 @@ from graphnav.core.rotation import Array
 from graphnav.estimation.faults.watch import SIZES
 
 WITHIN = 2.0 * np.log(3.0)  # 1-sigma of the logarithm of a variance: a factor of three in sigma
-_SHARES = {"seconds": 0.25, "minutes": 0.5, "hours": 0.5}  # of a GNSS sensor's stated variance
+_SHARES = {"seconds": 0.25, "minutes": 0.5, "hours": 0.5, "multipath": 0.25}  # of a GNSS sensor's stated variance
 _OF_RECEIVER = "gnss", "dual_antenna"
 TIME_WITHIN = np.log(3.0)  # 1-sigma of the logarithm of a correlation time
 

@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from graphnav.constraints.gnss import find_fix_period
+from graphnav.constraints.lasting import find_fix_period
 from graphnav.core.rotation import Array
 from graphnav.estimation.alignment.first import pick_fixes
 from graphnav.recording import Gnss, Recording

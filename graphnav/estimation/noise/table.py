@@ -7,11 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from graphnav.constraints.dual_antenna import DualHeading, DualPitch
-from graphnav.constraints.gnss import OFFSETS, STAMPS, TIMES, VELOCITY_ERROR
+from graphnav.constraints.gnss import OFFSETS, STAMPS, VELOCITY_ERROR
+from graphnav.constraints.lasting import LASTING, MULTIPATH, TIMES
 from graphnav.constraints.vehicle import NHC_ERROR, ODOMETER_ERROR
 from graphnav.core.state import SECONDS
 from graphnav.estimation.names import name_rows
 from graphnav.estimation.noise.model import NoiseModel, VarianceComponent
+from graphnav.gnss.sigmas import REFLECTED
 from graphnav.recording import FIX_TYPES, ImuNoise, Recording
 
 _IMU_FIGURES = {
@@ -47,7 +49,7 @@ def tabulate_figures(
     slow_times : s, correlation times of a fix's errors of minutes and of hours, of the settings.
     imu : what the factors of the IMU are relative to; what the recording states when None.
     """
-    lasts = dict(zip(TIMES, (SECONDS, *slow_times), strict=True))
+    lasts = dict(zip(LASTING, (SECONDS, *slow_times, REFLECTED), strict=True))
     out = []
     for group, figure in noise.figures.items():
         source, *middle, axis = group.split(".")
@@ -65,9 +67,9 @@ def tabulate_figures(
         time = next((part for part in middle if part in lasts), None)
         kind = next((part for part in middle if part not in lasts), None)
         # errors over minutes and hours have one unit, whatever the fix type
-        sigma = _read_sigma(recording, source, None if time in TIMES[1:] else kind, axis)
+        sigma = _read_sigma(recording, source, None if time in LASTING[1:] else kind, axis)
         words = f"{name_rows(source)}{f' ({kind})' if kind else ''}, {axis}"
-        words += ", white" if time is None else f", lasting {time}"
+        words += ", white" if time is None else f", {MULTIPATH}" if time == MULTIPATH else f", lasting {time}"
         out.append(
             FigureRow(
                 group,

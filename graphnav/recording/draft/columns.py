@@ -89,6 +89,7 @@ _PATTERNS: dict[str, tuple[str, ...]] = {
         r"satellites",
         r"(?:num|n|no|number_of|used)_?(?:sats?|sv|svs|satellites)(?:_used)?", r"(?:sats?|satellites)_?used|sats?",
     ),
+    "resid_rms_m": (r"resid(?:ual)?s?_?rms(?:_m)?", r"rms_?(?:of_?)?resid(?:ual)?s?(?:_m)?"),
 }  # fmt: skip
 
 NAMED_UNITS = {

@@ -57,6 +57,7 @@ WANTED = {
         "course",
         "type",
         "satellites",
+        "resid_rms_m",
         "geoid",
     ),
     "odometer": ("t", "speed", *WHEELS),
@@ -307,7 +308,7 @@ def _read_sensor(
     names = {ours: theirs for ours, theirs in columns.names.items() if ours in wanted}
     if role in ("imu", "gnss") and "week" in columns.names:
         names["week"] = columns.names["week"]
-    for extra in ("type", "satellites", "geoid", "week"):
+    for extra in ("type", "satellites", "resid_rms_m", "geoid", "week"):
         if extra in names and not _read_numbers(path, names[extra], plain):
             del names[extra]
     if plain is None:

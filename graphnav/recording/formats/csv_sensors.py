@@ -21,6 +21,7 @@ from graphnav.recording.formats.repair import (
     VAGUEST_V,
     Remarks,
     blank_unknown,
+    check_residuals,
     choose_sigmas,
     compute_horizontal_velocity,
     parse_fix_types,
@@ -125,7 +126,9 @@ def build_gnss(d: schema.GnssTable, rows: Table, remarks: Remarks) -> Gnss:
         rows["t"], llh, sd, v, sd_v, np.array(d.lever_arm), kinds, kinds is not None and d.units.type == "rtklib",
         velocity_offset=d.velocity_offset,
     )  # fmt: skip
-    return replace(gnss, satellites=rows["satellites"]) if "satellites" in rows else gnss
+    if (count := next((name for name in ("satellites", "nsat") if name in rows), None)) is not None:
+        gnss = replace(gnss, satellites=rows[count])
+    return replace(gnss, residual_rms=check_residuals(rows)) if "resid_rms_m" in rows else gnss
 
 
 def _fill(values: Array, rows: Table) -> Array:

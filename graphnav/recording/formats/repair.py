@@ -307,6 +307,25 @@ def parse_fix_types(rows: Table, numbers: str) -> NDArray[np.intp] | None:
     return convert_fix_types(types, known)
 
 
+def check_residuals(rows: Table) -> Array:
+    """The rms (N,) of the residuals of fixes, m, NaN where unknown.
+
+    Raises
+    ------
+    RecordingError
+        If one is below zero.
+    """
+    rms = rows["resid_rms_m"]
+    bad = np.flatnonzero(rms < 0.0)
+    if len(bad):
+        raise RecordingError(
+            f"{rows.describe_place(bad[0], 'resid_rms_m')}: an rms of residuals is no less than zero, not "
+            f"{rms[bad[0]]:g}; leave it blank where it is unknown",
+            key="gnss.residuals",
+        )
+    return rms
+
+
 # 1-sigma of a vertical velocity that is taken as zero because a receiver gives only speed and course: a slope of 10 %
 _STEEPEST = 0.1
 

@@ -172,7 +172,7 @@ class GnssTable(SensorTable):
     required = ("t", "lat", "lon", "h")
     optional = (
         "sd_e", "sd_n", "sd_u", "ve", "vn", "vu", "sd_ve", "sd_vn", "sd_vu", "vd", "speed", "course", "type",
-        "satellites", GEOID,
+        "satellites", "nsat", "resid_rms_m", GEOID,
     )  # fmt: skip
 
     units: FixUnits = FixUnits()

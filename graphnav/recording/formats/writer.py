@@ -115,6 +115,8 @@ def _write_gnss(log: Log) -> _File | None:
         columns, header = [*columns, np.where(gnss.type > 0, gnss.type, np.nan)], [*header, "type"]
     if gnss.satellites is not None:
         columns, header = [*columns, gnss.satellites], [*header, "satellites"]
+    if gnss.residual_rms is not None:
+        columns, header = [*columns, gnss.residual_rms], [*header, "resid_rms_m"]
     return _File("gnss.csv.gz", header, columns)
 
 

@@ -32,6 +32,7 @@ def round_recording(recording: Recording) -> Recording:
         gnss = replace(
             gnss, t=_round_to(gnss.t, _T), llh=llh, sd=_round_to(gnss.sd, _M), rounding=measure_rounding(llh),
             v=None if v is None else _round_to(v, _M_S), sd_v=None if sd_v is None else _round_to(sd_v, _M_S),
+            residual_rms=None if gnss.residual_rms is None else _round_to(gnss.residual_rms, _M),
         )  # fmt: skip
     if odometer is not None:
         wheels = None if odometer.wheels is None else _round_to(odometer.wheels, _M_S)
