@@ -63,9 +63,14 @@ class Keyframe:
             out[shift(at)] = node.anchor[own] + node.delta[own]
         return out
 
+    @property
+    def variables(self) -> Collection[Variable]:
+        """That its rows may touch, its state first."""
+        return {x.key: x for x in (self.state, *(node for node, _ in self.nodes.values()))}.values()
+
     def read(self, isam: gtsam.ISAM2) -> None:
         """Bring its variables up to date, where it is the newest: they are in the root, or were eliminated just now."""
-        for x in {x.key: x for x in (self.state, *(node for node, _ in self.nodes.values()))}.values():
+        for x in self.variables:
             x.delta = x.unit * isam.calculateEstimateVector(x.key)
 
 
