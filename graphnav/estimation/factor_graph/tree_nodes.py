@@ -98,9 +98,9 @@ def update_isam(
     isam: gtsam.ISAM2,
     t: float,
     made: Sequence[Made] = (),
-    order: Iterable[tuple[Variable, int]] | None = None,
     gone: Sequence[int] = (),
     fresh: Sequence[Fresh] = (),
+    order: Iterable[tuple[Variable, int]] | None = None,
     anew: Iterable[Variable] | None = None,
 ) -> None:
     """Add factors to a tree and remove others.
@@ -109,9 +109,9 @@ def update_isam(
     ----------
     t : s, of the newest keyframe.
     made : their keyframes note where they are.
-    order : when variables are eliminated; None leaves it to GTSAM.
     gone : indices.
     fresh : variables that begin.
+    order : when variables are eliminated; None leaves it to GTSAM.
     anew : variables that are all eliminated again.
 
     Raises

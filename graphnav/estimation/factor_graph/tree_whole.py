@@ -10,6 +10,7 @@ made anew where factors of it were replaced meanwhile.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from typing import Any
 
 import gtsam
 
@@ -65,14 +66,9 @@ class WholeTree(Tree):
         super().read()
 
     def _update(
-        self,
-        made: Sequence[Made] = (),
-        order: Iterable[tuple[Variable, int]] | None = None,
-        gone: Sequence[int] = (),
-        fresh: Sequence[Fresh] = (),
-        anew: Iterable[Variable] | None = None,
+        self, made: Sequence[Made] = (), gone: Sequence[int] = (), fresh: Sequence[Fresh] = (), **how: Any
     ) -> None:
-        super()._update(made, order, gone, fresh, anew)
+        super()._update(made, gone, fresh, **how)
         if self.isam is not self._all:
             self._made.update(((keyframe.number, name), (keyframe, name, one)) for keyframe, name, one in made)
             self._fresh += fresh
