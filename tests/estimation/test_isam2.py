@@ -14,6 +14,7 @@ from graphnav.config import parse_settings
 from graphnav.core.earth import LocalFrame
 from graphnav.core.rotation import exp
 from graphnav.core.state import States
+from graphnav.estimation.factor_graph import tree_whole
 from graphnav.estimation.factor_graph.batch import batch
 from graphnav.estimation.factor_graph.isam import isam2
 from graphnav.estimation.factor_graph.tree import Tree
@@ -106,9 +107,15 @@ def test_a_start_that_is_off_by_sixty_degrees_is_mended_by_relinearisation(built
     assert np.abs(found.states.p - best.states.p).max() < 1e-3
 
 
-@pytest.mark.parametrize("kernel", ["none", "huber"])
-def test_a_tree_of_the_newest_keyframes_knows_what_that_of_all_does(built: Problem, kernel: str) -> None:
-    """Live estimates and covariances, before and after relinearisations that reach behind it or do not."""
+@pytest.mark.parametrize(("kernel", "newest"), [("none", 48), ("huber", 48), ("none", 1)])
+def test_a_tree_of_the_newest_keyframes_knows_what_that_of_all_does(
+    built: Problem, kernel: str, newest: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Live estimates and covariances, before and after relinearisations that reach behind it or do not.
+
+    It begins at keyframes of all kinds, some of whose parameters no row has touched for a while.
+    """
+    monkeypatch.setattr(tree_whole, "_NEWEST", newest)
     rows = (replace(c, robust=kernel) if c.name == "gnss_position" else c for c in built.constraints)
     problem, mean = replace(built, constraints=tuple(rows)), built.prior.mean
     assert mean is not None

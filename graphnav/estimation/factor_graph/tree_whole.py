@@ -38,10 +38,6 @@ class WholeTree(Tree):
         """As of `Tree`."""
         if self._newest is None:
             self._newest, self._begun = gtsam.ISAM2(self._all), 0
-            # a copy shares its cliques: those at the root are its own before anything in them is marginalised
-            last = self.keyframes[-2:]
-            own = {x.key: x for k in last for x in k.variables}.values()
-            update_isam(self._newest, place.t, order=[(x, x.last - last[0].number) for x in own], anew=own)
             self._begin_at_last(self._newest)
         elif len(self) - self._begun > _NEWEST:
             self._begin_at_last(self._newest)
@@ -49,9 +45,14 @@ class WholeTree(Tree):
         return super().add(place, ahead, rows)
 
     def _begin_at_last(self, isam: gtsam.ISAM2) -> None:
-        """Marginalise all but the last keyframe in a tree, of which it is the root: it was eliminated last."""
+        """Marginalise all but the last keyframe in a tree."""
+        last = self.keyframes[-2:]
+        own = {x.key: x for k in last for x in k.variables}.values()
+        # its variables become the root: rows of the newest keyframes need not have touched all of them, and GTSAM would
+        # drop what stands below others; besides, a copy shares its cliques, and of these some are to change
+        update_isam(isam, last[-1].place.t, order=[(x, x.last - last[0].number) for x in own], anew=own)
         inside = {x.key: x for k in self.keyframes[self._begun :] for x in k.variables}
-        for x in self.keyframes[-1].variables:
+        for x in last[-1].variables:
             del inside[x.key]
         isam.marginalizeLeaves(fill_keys(gtsam.KeyList(), inside.values()))
         self._begun = len(self) - 1
