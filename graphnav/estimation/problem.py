@@ -160,7 +160,7 @@ def build_problem(
     parts_of_noise : keep what each noise figure contributes to the intervals' covariances, for
     `graphnav.estimation.noise`.
     """
-    stops = limit_to_samples(stationary, recording)
+    stops = limit_to_samples(stationary, recording, times)
     if times is None:
         wanted = [cls.epochs(recording, settings, stops) for cls in list_kinds(recording)]
         epochs = np.concatenate([*wanted, np.empty(0)])
@@ -219,8 +219,8 @@ def choose_keyframes(start: float, end: float, epochs: Array, rate: float) -> Ar
     return np.append(np.repeat(fixed[:-1], parts) + within * step, fixed[-1])
 
 
-def limit_to_samples(stationary: Array | None, recording: Recording) -> Array:
-    """The parts of stationary spans that a recording covers, (M, 2), limited to IMU samples."""
+def limit_to_samples(stationary: Array | None, recording: Recording, keyframes: Array | None = None) -> Array:
+    """The parts of stationary spans that a recording covers, (M, 2), limited to IMU samples and to known keyframes."""
     if stationary is None or not len(stationary):
         return np.empty((0, 2))
     begin, end = recording.start, recording.end
@@ -228,6 +228,8 @@ def limit_to_samples(stationary: Array | None, recording: Recording) -> Array:
     if not len(stationary):
         return np.empty((0, 2))
     t = np.concatenate([[begin], recording.imu.t])
+    if keyframes is not None:  # spans that end at these end at no sample
+        t = np.unique(np.concatenate([t, keyframes]))
     first = np.searchsorted(t, stationary[:, 0] - SAME_TIME)
     last = np.searchsorted(t, stationary[:, 1] + SAME_TIME, side="right") - 1
     kept = last > first

@@ -245,6 +245,19 @@ def tiny_problem(recording: Recording, settings: Settings) -> Problem:
     return build_problem(recording.crop(0.0, 4.0), settings, frame, start, SIGMA)
 
 
+@pytest.mark.parametrize("phase", [0.0, 0.0021], ids=["at samples", "between samples"])
+def test_a_stop_between_keyframes_has_rows_at_the_ends_of_all_its_intervals(recording: Recording, phase: float) -> None:
+    """Online keyframes are where fixes are, and a stop is cut to these."""
+    frame, start = LocalFrame(recording.gnss.llh[0]), random_states(np.random.default_rng(2), 1)
+    part = recording.crop(0.0, 8.0)
+    times = part.start + phase + np.arange(0.0, 7.0)
+    for stop, standing in (((2, 5), [3, 4, 5]), ((3, 4), [4])):
+        problem = build_problem(part, Settings(), frame, start, SIGMA, times[None, stop], times)
+        rows = {c.name: c.keyframe.tolist() for c in problem.constraints}
+        assert rows["zero_velocity"] == rows["zero_rate"] == rows["held_position"] == standing
+        assert not set(standing) & set(rows["nhc"])
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_epochs_lie_within_the_imu(name: str, recording: Recording) -> None:
     """Measurements before the first and after the last IMU sample ask for no keyframes and make no rows.

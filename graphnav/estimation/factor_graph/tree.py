@@ -141,7 +141,7 @@ class Tree:
         # along time, where the order is free; CCOLAMD wants labels below the number of variables it is to order
         most = min(3, len({key for _, _, one in made for key in list(one.keys())}) - 1)
         order = [(v, max(v.last - self._number + most, 0)) for v in self._find_recent()]
-        self._update(made, order, fresh=fresh)
+        self._update(made, fresh=fresh, order=order)
         self._number += 1
         keyframe.read(self.isam)
         for _ in range(PASSES - 1 if any(one.kernel != "none" for one in rows) else 0):
@@ -225,15 +225,10 @@ class Tree:
         return in_force
 
     def _update(
-        self,
-        made: Sequence[Made] = (),
-        order: Iterable[tuple[Variable, int]] | None = None,
-        gone: Sequence[int] = (),
-        fresh: Sequence[Fresh] = (),
-        anew: Iterable[Variable] | None = None,
+        self, made: Sequence[Made] = (), gone: Sequence[int] = (), fresh: Sequence[Fresh] = (), **how: Any
     ) -> None:
         """As `update_isam`."""
-        update_isam(self.isam, self.keyframes[-1].place.t, made, order, gone, fresh, anew)
+        update_isam(self.isam, self.keyframes[-1].place.t, made, gone, fresh, **how)
 
     def _replace(self, made: Sequence[Made], gone: Sequence[int], first: int, fresh: Sequence[Fresh] = ()) -> None:
         """Have factors in place of others, on keyframes from number `first` on."""
@@ -242,7 +237,8 @@ class Tree:
         every = 2 * len(late) > len(self.variables) and not fresh
         if every:
             late, first = list(self.variables.values()), self.keyframes[0].number
-        self._update(made, [(v, v.last - first) for v in late], gone, fresh, late if every else None)
+        order = [(v, v.last - first) for v in late]
+        self._update(made, gone, fresh, order=order, anew=late if every else None)
 
     # ------------------------------------------------------------------------------------------ linearising again
     def read(self) -> None:

@@ -29,8 +29,8 @@ _AT_ONCE = 45  # variables: GTSAM's bookkeeping of one elimination grows faster 
 
 def _map_errors(keyframe: Keyframe, J: Array) -> dict[int, Array]:
     """(D, w) by key: errors about a keyframe's estimate by those about anchors, of which J (3, 3) turns attitudes."""
-    variables = (keyframe.state, *(node for node, _ in keyframe.nodes.values()))
-    out = {x.key: np.zeros((DIM + len(keyframe.values), len(x.unit))) for x in variables}
+    D = DIM + len(keyframe.values)
+    out = {x.key: np.zeros((D, len(x.unit))) for x in keyframe.variables}
     out[keyframe.state.key][:DIM] = np.eye(DIM)
     out[keyframe.state.key][:3, :3] = J
     for name, at in keyframe.columns.items():

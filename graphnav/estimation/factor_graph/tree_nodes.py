@@ -63,9 +63,14 @@ class Keyframe:
             out[shift(at)] = node.anchor[own] + node.delta[own]
         return out
 
+    @property
+    def variables(self) -> Collection[Variable]:
+        """That its rows may touch, its state first."""
+        return {x.key: x for x in (self.state, *(node for node, _ in self.nodes.values()))}.values()
+
     def read(self, isam: gtsam.ISAM2) -> None:
         """Bring its variables up to date, where it is the newest: they are in the root, or were eliminated just now."""
-        for x in {x.key: x for x in (self.state, *(node for node, _ in self.nodes.values()))}.values():
+        for x in self.variables:
             x.delta = x.unit * isam.calculateEstimateVector(x.key)
 
 
@@ -93,9 +98,9 @@ def update_isam(
     isam: gtsam.ISAM2,
     t: float,
     made: Sequence[Made] = (),
-    order: Iterable[tuple[Variable, int]] | None = None,
     gone: Sequence[int] = (),
     fresh: Sequence[Fresh] = (),
+    order: Iterable[tuple[Variable, int]] | None = None,
     anew: Iterable[Variable] | None = None,
 ) -> None:
     """Add factors to a tree and remove others.
@@ -104,9 +109,9 @@ def update_isam(
     ----------
     t : s, of the newest keyframe.
     made : their keyframes note where they are.
-    order : when variables are eliminated; None leaves it to GTSAM.
     gone : indices.
     fresh : variables that begin.
+    order : when variables are eliminated; None leaves it to GTSAM.
     anew : variables that are all eliminated again.
 
     Raises

@@ -2,15 +2,14 @@
 
 GTSAM's `ISAM2.update` eliminates few variables anew, but walks the whole tree: what was eliminated is a tree for a
 moment, and is released clique by clique with all that hangs below it. With 900 keyframes that takes longer than all
-else, and with 15,000 sixteen times as long. So a keyframe enters a tree of the newest ones, at the root of which is the
-marginal of all before, which one elimination after the other finds. The tree of all takes in what has come since when
-it is asked for. Errors are about anchors that stay, and so the marginals stay until factors behind them are replaced.
+else, and with 15,000 sixteen times as long. So a keyframe enters a copy of the tree of all, in which everything before
+the newest keyframes is marginalised. The tree of all takes in what has come since when it is asked for; the copy is
+made anew where factors of it were replaced meanwhile.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from itertools import pairwise
 from typing import Any
 
 import gtsam
@@ -28,73 +27,54 @@ class WholeTree(Tree):
 
     def __init__(self, prior: Message, turn: float) -> None:
         super().__init__(prior, turn)
-        self._all = make_isam(reuses_slots=False)  # `isam` is this one, or that of the newest
-        self._gathered = 0  # keyframes in it
-        self._begun = 0  # the keyframe that the other begins at
-        self._factors: list[dict[str, Any]] = []  # of each keyframe, by the name of the constraint
-        self._fresh: list[Sequence[Fresh]] = []
-        self._marginals: dict[int, Any] = {}  # factor on a keyframe and its parameters, of all rows up to it
+        self._all = make_isam(reuses_slots=False)
+        self._newest: gtsam.ISAM2 | None = self.isam  # `isam` is this one or that of all; None where it holds no more
+        self._begun = 0  # the keyframe that it begins at
+        self._gathered = 0  # keyframes in the other, and what has come since
+        self._made: dict[tuple[int, str], Made] = {}
+        self._fresh: list[Fresh] = []
 
     def add(self, place: Place, ahead: Predicted | None = None, rows: Sequence[Measured] = ()) -> float:
         """As of `Tree`."""
-        last = len(self) - 1
-        known = self._find_marginal(last) if len(self) else None  # a little at each, not all where it is needed
-        if self.isam is self._all or last - self._begun >= _NEWEST:
-            variables, self.isam, self._begun = self._list_variables(last), make_isam(), last
-            update_isam(self.isam, place.t, fresh=[*((x, None) for x in variables[1:]), (variables[0], known)])
-        self._factors.append({})
-        self._fresh.append(())
+        if self._newest is None:
+            self._newest, self._begun = gtsam.ISAM2(self._all), 0
+            self._begin_at_last(self._newest)
+        elif len(self) - self._begun > _NEWEST:
+            self._begin_at_last(self._newest)
+        self.isam = self._newest
         return super().add(place, ahead, rows)
+
+    def _begin_at_last(self, isam: gtsam.ISAM2) -> None:
+        """Marginalise all but the last keyframe in a tree."""
+        last = self.keyframes[-2:]
+        own = {x.key: x for k in last for x in k.variables}.values()
+        # its variables become the root: rows of the newest keyframes need not have touched all of them, and GTSAM would
+        # drop what stands below others; besides, a copy shares its cliques, and of these some are to change
+        update_isam(isam, last[-1].place.t, order=[(x, x.last - last[0].number) for x in own], anew=own)
+        inside = {x.key: x for k in self.keyframes[self._begun :] for x in k.variables}
+        for x in last[-1].variables:
+            del inside[x.key]
+        isam.marginalizeLeaves(fill_keys(gtsam.KeyList(), inside.values()))
+        self._begun = len(self) - 1
 
     def read(self) -> None:
         """Bring all estimates up to date."""
-        first, self._gathered, self.isam = self._gathered, len(self), self._all
-        if first < len(self):
-            some = zip(self.keyframes[first:], self._factors[first:], strict=True)
-            made = [(k, name, one) for k, factors in some for name, one in factors.items()]
-            self._replace(made, [], first, [one for fresh in self._fresh[first:] for one in fresh])
+        self.isam = self._all
+        if self._gathered < len(self):
+            made, fresh, first = list(self._made.values()), self._fresh, max(self._gathered - 1, 0)
+            self._made, self._fresh, self._gathered = {}, [], len(self)
+            self._replace(made, [], first, fresh)
         super().read()
 
     def _update(
-        self,
-        made: Sequence[Made] = (),
-        order: Iterable[tuple[Variable, int]] | None = None,
-        gone: Sequence[int] = (),
-        fresh: Sequence[Fresh] = (),
-        anew: Iterable[Variable] | None = None,
+        self, made: Sequence[Made] = (), gone: Sequence[int] = (), fresh: Sequence[Fresh] = (), **how: Any
     ) -> None:
-        super()._update(made, order, gone, fresh, anew)
-        for keyframe, name, one in made:
-            self._factors[keyframe.number][name] = one
-        if self.isam is not self._all and fresh:
-            self._fresh[-1] = fresh
-        if gone:
-            first = min(keyframe.number for keyframe, _, _ in made)
-            self._marginals = {k: one for k, one in self._marginals.items() if k < first}
+        super()._update(made, gone, fresh, **how)
+        if self.isam is not self._all:
+            self._made.update(((keyframe.number, name), (keyframe, name, one)) for keyframe, name, one in made)
+            self._fresh += fresh
+        elif gone:
+            self._newest = None
 
     def _find_recent(self) -> Iterable[Variable]:
         return (x for x in super()._find_recent() if x.last >= self._begun)
-
-    def _list_variables(self, k: int) -> list[Variable]:
-        """A keyframe's, its state first."""
-        own = self.keyframes[k]
-        return list({x.key: x for x in (own.state, *(node for node, _ in own.nodes.values()))}.values())
-
-    def _find_marginal(self, last: int) -> Any:
-        """A factor of what a keyframe and all before it say of its variables."""
-        begin = max(self._marginals, default=-1)
-        for before, k in pairwise([begin, *(k for k in range(begin + 1, last) if k % _NEWEST == 0), last]):
-            inside = {x.key: x for i in range(max(before, 0), k + 1) for x in self._list_variables(i)}
-            graph = gtsam.GaussianFactorGraph()
-            for i in range(before + 1, k + 1):
-                for one in (*self._factors[i].values(), *(prior for _, prior in self._fresh[i] if prior is not None)):
-                    graph.push_back(one.factor())
-            if before in self._marginals:
-                graph.push_back(self._marginals[before].factor())
-            stay = {x.key for x in self._list_variables(k)}
-            gone = sorted((x for x in inside.values() if x.key not in stay), key=lambda x: x.last)
-            left = graph.eliminatePartialSequential(fill_keys(gtsam.Ordering(), gone), gtsam.EliminateQR)[1]
-            self._marginals[k] = gtsam.LinearContainerFactor(gtsam.JacobianFactor(left))
-            if before % _NEWEST:
-                self._marginals.pop(before, None)
-        return self._marginals[last]
