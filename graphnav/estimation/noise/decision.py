@@ -68,24 +68,24 @@ def explain(
         kinds: {name: some for name, some in noise.weights.items() if name not in (*kinds, *INTERVALS)}
         for kinds in ((), *ONE_SENSOR, FIXES)
     }
-    inside[INTERVALS] = dict(noise.weights)
     used = apply_noise(base, replace(noise, weights=outside))
-    weighted = {kinds: apply_weights(used, outside | some) for kinds, some in inside.items() if kinds != INTERVALS}
-    weighted[INTERVALS] = apply_noise(base, noise)
+    weighted = {kinds: apply_weights(used, outside | some) for kinds, some in inside.items()}
     within = [mask_times(base.t, [span]) for span in spans]
-    cost = np.full((len(spans), len(EXPLANATIONS)), FAULT_COST)
-    for j, kinds in enumerate(EXPLANATIONS):
-        if kinds in weighted:  # a sensor that is wrong has an error of its own instead of tails
-            each = compute_row_costs(weighted[kinds], noise.tails, without=kinds)
-            cost[:, j] = [np.sum(each[span]) for span in within]
-            if kinds and kinds != INTERVALS:
-                cost[:, j] += FAULT_COST
-    disturbed = np.zeros(len(spans))
-    for name in noise.weights.keys() & set(INTERVALS):
-        latest, some = compute_latest_cost(noise.weights[name], len(base.t) - 1), noise.weights[name]
-        disturbed += [latest * (count_reduced(some) - count_reduced(drop_within(some, [span]))) for span in reach]
-    cost[:, EXPLANATIONS.index(INTERVALS)] += np.where(disturbed > 0.0, disturbed, np.inf)
+    disturbed = np.zeros(len(spans))  # cost of disturbed intervals
+    for name in INTERVALS:
+        if (some := noise.weights.get(name)) is not None:
+            latest = compute_latest_cost(some, len(base.t) - 1)
+            disturbed += [latest * (count_reduced(some) - count_reduced(drop_within(some, [span]))) for span in reach]
     among = [kinds for kinds in among if kinds != INTERVALS or disturbed.any()]
+    cost = np.empty((len(spans), len(EXPLANATIONS)))
+    for j, kinds in enumerate(EXPLANATIONS):
+        by_rows = () if kinds == INTERVALS else kinds  # a sensor that is wrong has an error of its own instead of tails
+        each = compute_row_costs(weighted[by_rows], noise.tails, without=by_rows)
+        cost[:, j] = [np.sum(each[span]) for span in within]
+        cost[:, j] += np.where(disturbed > 0.0, disturbed, np.inf) if kinds == INTERVALS else FAULT_COST * bool(kinds)
+    inside[INTERVALS] = dict(noise.weights)
+    if INTERVALS in among:
+        weighted[INTERVALS] = apply_noise(base, noise)
     sizes = measure_sizes(base, apply_noise(base, found.noise), found.points, spans)
     about, costs = found.carry_points(base, used), PriorCosts(cost, noise.tails)
     anywhere = np.any(within, axis=0)
