@@ -89,7 +89,11 @@ def counted(pairs: list[Pair]) -> list[Pair]:
 
 
 def against_filter(groups: dict[Group, list[Pair]], group: Group, axis: str) -> float:
-    """A solver's pooled error over its filter's, estimated; NaN where not known or neither is large enough."""
+    """A solver's pooled error over its filter's, estimated; NaN where not known, neither is large enough, or there is
+    one window alone: an error that all its fixes share is no smoother's.
+    """
+    if len(pairs := groups[group]) == 1 and pairs[0].estimated["window"] != "whole":
+        return math.nan
     own, of_filter = (
         pooled((p.estimated for p in counted(groups.get(g, []))), axis) for g in (group, (*group[:2], "ekf"))
     )

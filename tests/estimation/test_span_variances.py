@@ -60,37 +60,44 @@ def test_a_filter_does_not_drift_where_fixes_are_wrong(
     among_houses: tuple[Recording, dict[str, Solution], dict[str, Solution]],
 ) -> None:
     recording, solutions, stated = among_houses
-    longest = max(end - begin for begin, end in solutions["ekf"].noise.excluded["gnss_position"])
-    assert longest > 30.0
     found = summarise(score(recording, recording, solutions, ())[0]["ekf"])
     plain = summarise(score(recording, recording, stated, ())[0]["ekf"])
     assert found["h_rms_m"] < 1.3 * plain["h_rms_m"]
-    assert 0.3 < found["nees_p"] < 2.0
+    assert found["nees_p"] < 2.0 < plain["nees_p"]
 
 
-def test_the_weights_are_part_of_the_noise_model(
-    among_houses: tuple[Recording, dict[str, Solution], dict[str, Solution]], tmp_path: Path
-) -> None:
-    recording, solutions, _ = among_houses
+def test_the_weights_are_part_of_the_noise_model(shared_data: Path, tmp_path: Path) -> None:
+    recording = displace_a_minute(load(shared_data / "tokyo_20201105").crop(600.0, 900.0))
+    settings = parse_settings({"gnss": {"velocity": False}})
+    solutions = run(recording, settings, ("rts",))
     noise = solutions["rts"].noise
-    for span in solutions["rts"].excluded:
+    decided = [
+        span for span in solutions["rts"].excluded if span.kind in noise.span_weights and span.sigma_factor < np.inf
+    ]
+    assert sum(span.count for span in decided) > 30
+    for span in decided:
         t = np.array([span.t_start, span.t_end])
         np.testing.assert_allclose(select_weights(t, noise, span.kind), span.sigma_factor**-2.0)
         assert 1.0 < span.sigma_factor < np.inf
     kept = read_noise(write_noise(tmp_path / "noise.json", noise))
-    again = run(recording, parse_settings(FIXES_ALONE), ("rts",), noise=kept)["rts"]
+    again = run(recording, settings, ("rts",), noise=kept)["rts"]
     np.testing.assert_array_equal(again.states.p, solutions["rts"].states.p)
     assert again.excluded == solutions["rts"].excluded
+
+
+def displace_a_minute(clean: Recording) -> Recording:
+    """A minute of fixes 20 m farther north."""
+    gnss = clean.gnss
+    assert gnss is not None
+    llh = gnss.llh.copy()
+    llh[(gnss.t > clean.start + 150.0) & (gnss.t < clean.start + 210.0), 0] += 20.0 / 6.37e6
+    return replace(clean, gnss=replace(gnss, llh=llh))
 
 
 def test_fixes_displaced_together_do_no_harm(shared_data: Path) -> None:
     """A minute of good fixes displaced by 20 m: as good as without them, which a drive with wheels can do without."""
     clean = load(shared_data / "tokyo_20201105").crop(600.0, 900.0)
-    gnss = clean.gnss
-    assert gnss is not None
-    llh = gnss.llh.copy()
-    llh[(gnss.t > clean.start + 150.0) & (gnss.t < clean.start + 210.0), 0] += 20.0 / 6.37e6
-    damaged, settings = replace(clean, gnss=replace(gnss, llh=llh)), parse_settings({"gnss": {"velocity": False}})
+    damaged, settings = displace_a_minute(clean), parse_settings({"gnss": {"velocity": False}})
     used = run(damaged, settings, ("ekf", "rts"))
     without = run(damaged, settings, ("ekf", "rts"), noise=replace(used["rts"].noise, span_weights={}))
     (span,) = [one for one in used["rts"].excluded if one.count > 30]
