@@ -6,18 +6,17 @@ disagree with all other measurements by an error that persists. It does not tell
 Decision. With the noise model as it is, each span is explained by several models, each with its own likelihood of the
 innovations from the start of the span to the start of the next one:
 
-    none        nothing is wrong
+    none        nothing is wrong: errors have the tails that they have elsewhere
     fixes       positions, velocities or both have one unknown error in common, which may grow linearly, or an unknown
                 error each; beside a common error that lasts for more than `watch.PATIENCE`, single ones may be outliers
     wheels      the non-holonomic constraint and the odometer have one such error in common
     IMU         single intervals have more noise, those that the smoother needs it for
-    rows        single rows have less weight, those that the estimate found to be outliers
 
 An unknown error has a zero-mean Gaussian prior, as wide as such errors get (`watch.SIZES`), and so has its growth; the
 likelihood that this width costs is the Occam factor of the model (MacKay 1992, "Bayesian interpolation"). Where errors
 are correlated from fix to fix, as those of reflections, that of each has the size that the fixes show, at a cost for
-not knowing it beforehand. A fault is beforehand as improbable as a false alarm of the tests, a single outlier as
-improbable as `CHANCE`. The most probable model decides what is left out.
+not knowing it beforehand. A fault is beforehand as improbable as a false alarm of the tests. The most probable model
+decides what is left out.
 
 Masking. Figures that are estimated with a fault among the data may have grown until they hide it, so the tests are made
 with the figures at their prior medians as well. If they find more, the figures are estimated again without these spans,
