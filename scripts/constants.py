@@ -61,7 +61,6 @@ CONSTANTS = (
     Constant(f"{NOISE}.priors", "TIME_WITHIN", "the same of correlation times"),
     Constant(f"{NOISE}.priors", "_SHARES", "lasting parts of a stated variance: as much as the whole, all together"),
     Constant(f"{NOISE}.tails", "CHANCE", "probability of an outlier", 10.0),
-    Constant(f"{NOISE}.estimate", "_BOUNDED", "share of squares that are bounded at first: two in five may be wrong"),
     Constant(f"{NOISE}.tails", "_WITHIN", "tail indices: a factor of three about that of a Gaussian, as other figures"),
     Constant(f"{NOISE}.estimate", "_TIME_RANGE", "a correlation time between a tenth of a second and an hour"),
     Constant(

@@ -11,13 +11,8 @@ the likelihood of A / f as a chi-square variable of B degrees of freedom, and th
 fixed point f <- f A / B of Foerstner (1979), Koch (1999, section 3.6) and MacKay (1992). All sensors are estimated at
 once, so none is favoured by the order. Squares of rows have the weights of their tails, whose index is estimated in the
 same pass (`graphnav.estimation.noise.tails`); of the IMU and of processes, a square counts for no more than the value
-that it exceeds once in a thousand times (`CHANCE`).
-
-Scales are robust first: squares of rows and processes count for no more than the value that they exceed once in twenty
-times (`_BOUNDED`), by which nearly two rows in five may be wrong, and tails are a Gaussian's. Beside these scales wrong
-rows stand out, so faults are sought by them; from there the likelihood leads to an optimum that is not one of the wrong
-rows. (So location is estimated robustly and then efficiently: Yohai 1987, "High breakdown-point and high
-efficiency robust estimates for regression".) Of a long drive, these passes use its first `_FIRST_KEYFRAMES` keyframes.
+that it exceeds once in a thousand times (`CHANCE`). The first passes of a long drive use its first `_FIRST_KEYFRAMES`
+keyframes only.
 """
 
 from __future__ import annotations
@@ -44,7 +39,7 @@ from graphnav.estimation.noise.moments import (
 )
 from graphnav.estimation.noise.outliers import compute_interval_cost, compute_row_costs, list_reduced
 from graphnav.estimation.noise.priors import TIME_WITHIN
-from graphnav.estimation.noise.tails import CHANCE, estimate_tail_index, get_tail_index, weigh_scaled
+from graphnav.estimation.noise.tails import CHANCE, estimate_tail_index, weigh_scaled
 from graphnav.estimation.problem import ParameterChain, Problem
 from graphnav.estimation.solvers.ekf import refilter
 from graphnav.estimation.solvers.linearise import Points
@@ -53,7 +48,6 @@ from graphnav.estimation.solvers.rows import shorten_step
 from graphnav.estimation.solvers.rts import smooth_moments
 from graphnav.imu.preintegration import NOISE_FIGURES
 
-_BOUNDED = 0.05  # probability of a square beyond its bound, at first
 _FIRST_KEYFRAMES = 1500  # keyframes: a variance estimated from a thousand numbers is good to a twentieth
 _ROUNDS, _AGAIN = 8, 3  # passes to convergence, from the priors and from figures that were estimated before
 _MAX_PASSES = 3 * _ROUNDS  # passes at most
@@ -74,7 +68,6 @@ class NoiseEstimate:
     passes: Counter[str]  # over keyframes, of "filter" and "smoother"
     whole_evidence: float | None = None  # of all measurements, excluded ones included, where it was computed
     rival: NoiseEstimate | None = None  # by another decision on what is wrong, nearly as likely
-    robust: NoiseModel | None = None  # by robust scales, beside which wrong rows stand out
 
     @property
     def gained_by_chance(self) -> float:
@@ -150,14 +143,10 @@ def _iterate(
 ) -> NoiseEstimate:
     """Iterate from initial figures and linearisation points to convergence."""
     done, total, converged = 0, len(problem.t), False  # keyframes
-    stages = [(total, CHANCE)]
-    if not figures.same_data:
-        long = total > 2 * _FIRST_KEYFRAMES and not figures.known
-        stages.insert(0, (_FIRST_KEYFRAMES if long else total, _BOUNDED))
+    long = total > 2 * _FIRST_KEYFRAMES and not figures.known
+    rounds = _AGAIN if figures.same_data else _ROUNDS
     latest: tuple[ForwardRecord, MomentPass] | None = None
-    robust: NoiseModel | None = None
-    for end, bound in stages:
-        rounds = _AGAIN if bound == CHANCE else _ROUNDS
+    for end in (_FIRST_KEYFRAMES, total) if long else (total,):
         before, converged, figures.extrapolation = -np.inf, False, 1.0
         here, likeliest, most, since = figures, figures, -np.inf, 0
         for k in range(_MAX_PASSES):
@@ -173,7 +162,7 @@ def _iterate(
             ahead = _splice(about, latest[1])
             near = are_near(ahead, about, LINEAR_ATTITUDE)
             about = ahead if near else shorten_step(used, about, ahead)
-            _improve(figures, used, *latest, end, intervals, bound)
+            _improve(figures, used, *latest, end, intervals)
             # each figure gains a half by chance; while one sensor is far off, many passes gain little more than that
             converged = k > 1 and abs(evidence - before) < (0.05 if k + 1 < rounds else 0.5) * len(figures.log)
             # weights and figures may alternate between two states
@@ -182,10 +171,8 @@ def _iterate(
             before, figures.extrapolation = evidence, _EXTRAPOLATION if k > 1 and evidence > before else 1.0
         if not converged:  # oscillating, or not yet converged
             figures = likeliest
-        elif bound == CHANCE:
+        elif end == total:
             figures = here
-        if bound != CHANCE:
-            robust = figures.build_model()
     if not converged:
         latest = None
         used = apply_noise(problem, figures.build_model())
@@ -194,8 +181,9 @@ def _iterate(
         now = float(np.sum(latest[0].log_likelihood)) + prior_then
     assert latest is not None
     evidence, passes = now - _compute_weight_cost(used, figures), round(done / total)
-    counted = Counter(filter=passes, smoother=passes)
-    return NoiseEstimate(figures.build_model(), latest[1], prior_then, evidence, counted, robust=robust)
+    return NoiseEstimate(
+        figures.build_model(), latest[1], prior_then, evidence, Counter(filter=passes, smoother=passes)
+    )
 
 
 def _compute_weight_cost(used: Problem, figures: Components) -> float:
@@ -218,13 +206,13 @@ def _splice(about: Points, part: Points) -> Points:
     return Points(states, np.concatenate([part.values, about.values[n:]]))
 
 
-def _bound_squares(A: Array, B: Array, freedom: int, chance: float) -> tuple[float, float]:
+def _bound_squares(A: Array, B: Array, freedom: int) -> tuple[float, float]:
     """Sums of bounded squares and of redundancies; the bound's effect on the mean is compensated.
 
     For z^2 chi-square with m degrees of freedom and the limit q, E[min(z^2, q)] = m P(chi2_m+2 < q) + q P(chi2_m > q).
     """
-    most = float(chdtri(freedom, chance))
-    mean = freedom * (1.0 - float(chdtrc(freedom + 2, most))) + most * chance
+    most = float(chdtri(freedom, CHANCE))
+    mean = freedom * (1.0 - float(chdtrc(freedom + 2, most))) + most * CHANCE
     return float(np.sum(np.minimum(A, most / freedom * B))) * freedom / mean, float(np.sum(B))
 
 
@@ -235,19 +223,18 @@ def _improve(
     smoothed: MomentPass,
     end: int,
     intervals: bool,
-    bound: float,
 ) -> None:
-    """One step for all figures and weights; `bound` is the chance of a square beyond its bound."""
+    """One step for all figures and weights."""
     imu = collect_imu_moments(problem, forward.about.states.R_nb[:-1], smoothed)
     for i, name in enumerate(NOISE_FIGURES):
-        figures.update(f"imu.{name}", *_bound_squares(imu.A[:, i], imu.B[:, i], 3, CHANCE))
+        figures.update(f"imu.{name}", *_bound_squares(imu.A[:, i], imu.B[:, i], 3))
     if intervals:
         _weigh_intervals(figures, problem, imu)
     driven: dict[str, tuple[Array, Array, Array]] = {}
     for chain in problem.chains:
         if chain.parameter.noise_groups:
             driven[chain.parameter.name] = collect_process_moments(problem, chain, smoothed, end)
-            _improve_process(figures, chain, driven[chain.parameter.name], bound)
+            _improve_process(figures, chain, driven[chain.parameter.name])
             observed = _is_observed(figures, chain)
             if chain.parameter.correlation_time is not None and observed.any():
                 _improve_time(figures, chain, observed, lag_moments(problem, chain, smoothed, end))
@@ -261,13 +248,11 @@ def _improve(
         for i, name in enumerate(names):
             own, before = index == i, figures.log[name]
             if own.any():
-                A, B = found.A[own], found.B[own]
-                sums = (float(np.sum(A)), float(np.sum(B))) if bound == CHANCE else _bound_squares(A, B, 1, bound)
-                figures.update(name, *sums)
+                figures.update(name, float(np.sum(found.A[own])), float(np.sum(found.B[own])))
             grown[own] = np.exp(figures.log[name] - before)
         # with the figures of the next pass: B is the share of the row's own variance in that of its prediction
         squared = found.left_out / np.mean(1.0 + found.B * (grown - 1.0), axis=1)
-        _weigh_rows(figures, problem, rows, squared, bound == CHANCE)
+        _weigh_rows(figures, problem, rows, squared)
 
 
 def _weigh_intervals(figures: Components, problem: Problem, imu: ImuMoments) -> None:
@@ -285,14 +270,12 @@ def _weigh_intervals(figures: Components, problem: Problem, imu: ImuMoments) -> 
         figures.weights[name] = RowWeights(t[some], 1.0 / more[some])
 
 
-def _improve_process(
-    figures: Components, chain: ParameterChain, moments: tuple[Array, Array, Array], bound: float
-) -> None:
+def _improve_process(figures: Components, chain: ParameterChain, moments: tuple[Array, Array, Array]) -> None:
     _, A, B = moments
     groups = np.array(chain.parameter.noise_groups)
     for group in dict.fromkeys(chain.parameter.noise_groups):
         own = groups == group
-        figures.update(group, *_bound_squares(A[:, own], B[:, own], 1, bound))
+        figures.update(group, *_bound_squares(A[:, own], B[:, own], 1))
 
 
 def _is_observed(figures: Components, chain: ParameterChain) -> Array:
@@ -330,13 +313,11 @@ def _improve_time(figures: Components, chain: ParameterChain, observed: Array, l
     figures.times[p.name] = float(np.clip(found, median / _TIME_RANGE, median * _TIME_RANGE))
 
 
-def _weigh_rows(figures: Components, problem: Problem, rows: Constraint, squared: Array, anew: bool) -> None:
-    """Weights of a constraint's first n rows by their squared errors (n,), and its tail index if estimated anew."""
+def _weigh_rows(figures: Components, problem: Problem, rows: Constraint, squared: Array) -> None:
+    """The tail index of a constraint, and weights of its first n rows, by their squared errors (n,)."""
     n, m = len(squared), len(rows.axes)
     before = np.ones(len(rows)) if rows.weight is None else rows.weight
     used = before > 0.0
-    index = estimate_tail_index(squared[used[:n]], m) if anew else get_tail_index(figures.tails, rows.name, m)
-    if anew:
-        figures.tails[rows.name] = index
+    figures.tails[rows.name] = index = estimate_tail_index(squared[used[:n]], m)
     weight = np.concatenate([weigh_scaled(squared, m, index, used[:n]), before[n:]])  # later ones as they were
     figures.weights[rows.name] = list_reduced(problem.t[rows.keyframe], weight, used)

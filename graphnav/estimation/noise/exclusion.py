@@ -206,7 +206,7 @@ def decide_faults(base: Problem, found: NoiseEstimate) -> Decision:
     """
     medians = {name: replace(figure, log_factor=figure.prior) for name, figure in found.noise.figures.items()}
     masking = begin_beside(partial(find_suspects, base, NoiseModel(medians), found))
-    suspects = find_suspects(base, found.robust or found.noise, found)
+    suspects = find_suspects(base, found.noise, found)
     first = explain(base, found, suspects)
     segments, spent = find_segments(base, found, suspects)
     passes = first.passes + Counter(filter=spent)
@@ -235,7 +235,7 @@ def _unmask(base: Problem, found: NoiseEstimate, first: Decision, masked: list[S
         estimate = estimate_noise(base, None, start, estimate.get_linearisation(base), changed=True)
         used = apply_noise(base, estimate.noise)
         errors = predict_left_out(used, estimate)
-        detected = find_suspects(base, replace(estimate.robust or estimate.noise, excluded={}), estimate)
+        detected = find_suspects(base, replace(estimate.noise, excluded={}), estimate)
         passes = passes + estimate.passes + Counter(filter=1)
         spans, refined = trim(spans, errors), trim(detected, errors)
         # a slow onset is dated better by the tests, an abrupt end by the errors of single fixes
