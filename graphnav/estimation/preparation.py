@@ -31,7 +31,7 @@ from graphnav.estimation.contradictions import describe_freed, free
 from graphnav.estimation.faults.excluded import weigh_rows
 from graphnav.estimation.fixing import fix, split_carriers
 from graphnav.estimation.joint_estimate import JointEstimate, estimate_jointly, revise_jointly
-from graphnav.estimation.noise.apply import apply_noise, drop_parts
+from graphnav.estimation.noise.apply import apply_noise, are_of_others, drop_parts
 from graphnav.estimation.noise.bias_walks import estimate_bias_walks
 from graphnav.estimation.noise.chords import find_filled_gaps
 from graphnav.estimation.noise.estimate import NoiseEstimate, estimate_noise
@@ -39,7 +39,7 @@ from graphnav.estimation.noise.false_stops import find_false_stops, leave_out_fa
 from graphnav.estimation.noise.initial_points import BREAKDOWN, find_initial_points
 from graphnav.estimation.noise.model import STATED, NoiseModel
 from graphnav.estimation.noise.span_variances import weigh_excluded
-from graphnav.estimation.noise.tails import are_of_others, widen_by_tails, widen_unweighted
+from graphnav.estimation.noise.tails import widen_by_tails, widen_unweighted
 from graphnav.estimation.noise.unmeasured import UnmeasuredRows, drop_in_gaps, drop_unmeasured
 from graphnav.estimation.noise.words import describe_noise
 from graphnav.estimation.problem import Problem

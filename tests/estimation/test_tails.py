@@ -19,12 +19,11 @@ from graphnav.core.rotation import Array
 from graphnav.core.trajectory import Trajectory
 from graphnav.detectors import detect
 from graphnav.estimation.alignment import align
-from graphnav.estimation.noise.apply import apply_noise
+from graphnav.estimation.noise.apply import apply_noise, are_of_others
 from graphnav.estimation.noise.model import NoiseModel, RowWeights
 from graphnav.estimation.noise.outliers import compute_row_costs, list_reduced
 from graphnav.estimation.noise.tails import (
     CHANCE,
-    are_of_others,
     compute_information_share,
     compute_log_normaliser,
     compute_unweighted_factor,

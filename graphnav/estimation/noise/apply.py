@@ -127,6 +127,14 @@ def select_weights(t: Array, noise: NoiseModel, name: str) -> Array:
     return out
 
 
+def are_of_others(problem: Problem, noise: NoiseModel) -> bool:
+    """Whether a noise model has weights, and none of them at a row of this problem: those of another recording."""
+    weights = {name: some for name, some in noise.weights.items() if name in noise.tails and len(some.t)}
+    alone = NoiseModel(weights=weights)
+    rows = [(c.name, problem.t[c.keyframe]) for c in problem.constraints if c.name in weights]
+    return bool(weights) and not any(np.any(select_weights(t, alone, name) < 1.0) for name, t in rows)
+
+
 def drop_parts(problem: Problem) -> Problem:
     """The same without the contributions of each noise figure, which take memory and are no longer needed."""
     intervals = problem.intervals.without_parts()

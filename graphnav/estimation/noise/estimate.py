@@ -22,7 +22,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import chdtrc, chdtri
+from scipy.special import chdtri
 
 from graphnav.constraints.base import Constraint
 from graphnav.core.rotation import Array
@@ -39,7 +39,7 @@ from graphnav.estimation.noise.moments import (
 )
 from graphnav.estimation.noise.outliers import compute_interval_cost, compute_row_costs, list_reduced
 from graphnav.estimation.noise.priors import TIME_WITHIN
-from graphnav.estimation.noise.tails import CHANCE, estimate_tail_index, weigh_scaled
+from graphnav.estimation.noise.tails import CHANCE, compute_bounded_mean, estimate_tail_index, weigh_scaled
 from graphnav.estimation.problem import ParameterChain, Problem
 from graphnav.estimation.solvers.ekf import refilter
 from graphnav.estimation.solvers.linearise import Points
@@ -207,12 +207,8 @@ def _splice(about: Points, part: Points) -> Points:
 
 
 def _bound_squares(A: Array, B: Array, freedom: int) -> tuple[float, float]:
-    """Sums of bounded squares and of redundancies; the bound's effect on the mean is compensated.
-
-    For z^2 chi-square with m degrees of freedom and the limit q, E[min(z^2, q)] = m P(chi2_m+2 < q) + q P(chi2_m > q).
-    """
-    most = float(chdtri(freedom, CHANCE))
-    mean = freedom * (1.0 - float(chdtrc(freedom + 2, most))) + most * CHANCE
+    """Sums of bounded squares and of redundancies; the bound's effect on the mean is compensated."""
+    most, mean = float(chdtri(freedom, CHANCE)), compute_bounded_mean(freedom)
     return float(np.sum(np.minimum(A, most / freedom * B))) * freedom / mean, float(np.sum(B))
 
 

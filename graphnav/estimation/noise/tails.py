@@ -22,7 +22,6 @@ from dataclasses import replace
 import numpy as np
 from scipy.special import chdtrc, chdtri, gammaln
 
-from graphnav.constraints.base import SAME_TIME
 from graphnav.core.rotation import Array
 from graphnav.estimation.noise.model import NoiseModel
 from graphnav.estimation.problem import Problem
@@ -103,8 +102,15 @@ def compute_unweighted_factor(index: float, m: int) -> float:
     density /= np.sum(density)
     factors = np.linspace(0.0, 7.0, 141)
     means = np.minimum(s / np.exp(factors[:, None]), most) @ density
-    expected = m * float(1.0 - chdtrc(m + 2, most)) + most * CHANCE
-    return float(np.exp(np.interp(-expected, -means, factors)))
+    return float(np.exp(np.interp(-compute_bounded_mean(m), -means, factors)))
+
+
+def compute_bounded_mean(m: int) -> float:
+    """E[min(s, q)] of a chi-square variable s of m degrees of freedom that exceeds q with a probability of `CHANCE`:
+    m P(chi2_m+2 < q) + q P(chi2_m > q).
+    """
+    most = float(chdtri(m, CHANCE))
+    return m * (1.0 - float(chdtrc(m + 2, most))) + most * CHANCE
 
 
 def widen_by_tails(problem: Problem, noise: NoiseModel) -> NoiseModel:
@@ -132,15 +138,3 @@ def _widen(problem: Problem, noise: NoiseModel, compute_factor: Callable[[float,
                 if group in figures:
                     figures[group] = replace(figures[group], log_factor=figures[group].log_factor + more)
     return replace(noise, figures=figures)
-
-
-def are_of_others(problem: Problem, noise: NoiseModel) -> bool:
-    """Whether a noise model has weights, and none of them at a row of this problem: those of another recording."""
-    known = {rows.name: problem.t[rows.keyframe] for rows in problem.constraints}
-    of_rows = {name: some.t for name, some in noise.weights.items() if name in noise.tails and len(some.t)}
-    return bool(of_rows) and not any(
-        np.any(np.abs(t - known[name][np.clip(np.searchsorted(known[name], t - SAME_TIME), 0, len(known[name]) - 1)])
-               <= SAME_TIME)
-        for name, t in of_rows.items()
-        if len(known.get(name, ()))
-    )  # fmt: skip
