@@ -50,6 +50,7 @@ from graphnav.estimation.solvers.linearise import Points, scale_at
 from graphnav.estimation.solvers.passes import (
     FilterPass,
     SmootherPass,
+    reuse_points,
 )
 from graphnav.estimation.solvers.rts import smooth_backward
 from graphnav.recording import Recording
@@ -124,7 +125,7 @@ def prepare(
     larger = stated and settings.noise.mode != "stated" and recording.platform == "foot"
     if stated:
         noise, spacing = STATED, STATED.spacing
-    builder = every.use_spaced(recording, spacing)
+    builder, near = every.use_spaced(recording, spacing), None
     built, evidence = builder.build(aligned, detections, parts=larger or noise != STATED), np.inf
     if not as_stated:
         with contextlib.suppress(*BREAKDOWN):
@@ -137,7 +138,7 @@ def prepare(
     if noise is None:
         tell("noise")
         with clock.count_time("noise"):
-            noise, built, evidence = _find_noise(builder, built, progress, passes, weigh)
+            noise, built, evidence, near = _find_noise(builder, built, progress, passes, weigh)
             noise = replace(noise, spacing=spacing)
     else:
         if are_of_others(built.problem, noise):
@@ -165,7 +166,8 @@ def prepare(
         if any(rows.gate is not None for rows in problem.constraints):
             smoothed = smooth_backward(problem, refilter(problem, smoothed, progress), progress)
         problem = problem.with_input_noise(smoothed.states, scale_at(problem.columns, smoothed.values))
-        forward, smoothed, ahead = relinearise(problem, aligned, forward, smoothed, progress, passes)
+        known = None if near is None else reuse_points(*near, problem)
+        forward, smoothed, ahead = relinearise(problem, aligned, forward, smoothed, progress, passes, known)
     passes.update(filter=1, smoother=1)
     notes = (*describe_freed(noise.freed, recording), *describe_noise(noise, problem), *_describe_missing(problem))
     epochs, arcs = dict[str, Array](), {"": CarrierArcs()}
@@ -209,9 +211,9 @@ def _find_noise(
     progress: Progress | None,
     passes: Counter[str],
     weigh: Weigh | None,
-) -> tuple[NoiseModel, BuiltProblem, float]:
-    """The noise model, the problem with a start and stops that rest on no excluded fix, and the logarithm of the
-    evidence where it is wanted.
+) -> tuple[NoiseModel, BuiltProblem, float, tuple[Points, Problem]]:
+    """The noise model, the problem with a start and stops that rest on no excluded fix, the logarithm of the evidence
+    where it is wanted, and the points of the estimate with the problem that they are of.
 
     Where the other measurements contradict stops, all is found anew without these.
     """
@@ -238,11 +240,12 @@ def _find_noise(
     plain = NoiseModel(excluded=best.noise.excluded, freed=found.freed)
     likelier = _is_likelier(built.problem, plain, best)
     noise = plain if likelier else widen_by_tails(built.problem, found.noise)
+    near = best.get_linearisation(built.problem)
     if noise.excluded:
         with contextlib.suppress(*BREAKDOWN):
-            noise, spent = weigh_excluded(built.problem, noise, best.get_linearisation(built.problem))
+            noise, spent = weigh_excluded(built.problem, noise, near)
             passes.update(filter=spent, smoother=spent)
-    return replace(noise, false_stops=unite_stops(false)), built, evidence
+    return replace(noise, false_stops=unite_stops(false)), built, evidence, near
 
 
 def _estimate_with_start(builder: ProblemBuilder, built: BuiltProblem, progress: Progress | None) -> _Estimated:
