@@ -110,6 +110,11 @@ class ProblemBuilder:
         problem, carriers = split_carriers(problem, GnssPhase)  # the noise model depends on the codes
         return BuiltProblem(problem, carriers, aligned, detections)
 
+    def build_every(self, built: BuiltProblem) -> BuiltProblem:
+        """The problem with every stop but the false ones, whichever it was built without before, aligned again."""
+        detections = detect(self.recording, self.settings).without(self.false_stops)
+        return self.build(self.align(self.recording, detections.stationary), detections, parts=True)
+
     def build_moving(self, built: BuiltProblem) -> BuiltProblem:
         """The problem without the false stops, aligned again."""
         detections = built.detections.without(self.false_stops)

@@ -94,6 +94,23 @@ def estimate_jointly(
     EstimationError
         If the filter breaks down.
     """
+    found = begin_jointly(stated, settings, opening, progress)
+    return leave_out_jointly(found, settings, opening, progress)
+
+
+def begin_jointly(
+    stated: Problem,
+    settings: GnssSettings,
+    opening: float | None = None,
+    progress: Progress | None = None,
+    start: NoiseModel | None = None,
+) -> JointEstimate:
+    """The same with all measurements; what is given is as for `estimate_jointly`.
+
+    Parameters
+    ----------
+    start : initial figures, of nearly the same measurements.
+    """
 
     def estimate(base: Problem, before: JointEstimate, start: NoiseModel | None = None) -> NoiseEstimate:
         near = before.estimate.get_linearisation(before.base)
@@ -102,8 +119,15 @@ def estimate_jointly(
     def go_on(base: Problem, before: JointEstimate) -> NoiseEstimate:
         return estimate(base, before, before.estimate.noise)
 
-    found = JointEstimate(stated, {}, estimate_noise(stated, opening, progress=progress))
-    found = _free_constants(found, settings, go_on, estimate)
+    first = estimate_noise(stated, opening, start, progress=progress, changed=True)
+    found = JointEstimate(stated, {}, first)
+    return _free_constants(found, settings, go_on, estimate)
+
+
+def leave_out_jointly(
+    found: JointEstimate, settings: GnssSettings, opening: float | None = None, progress: Progress | None = None
+) -> JointEstimate:
+    """The same without spans of wrong measurements; what is given is as for `estimate_jointly`."""
     return replace(found, estimate=_leave_out_faults(found.base, found.estimate, settings, opening, progress))
 
 
