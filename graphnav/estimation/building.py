@@ -26,7 +26,7 @@ from graphnav.estimation.alignment import Alignment, align, use_known_heading
 from graphnav.estimation.alignment.first import pick_fixes
 from graphnav.estimation.contradictions import use_freed
 from graphnav.estimation.fixing import split_carriers
-from graphnav.estimation.noise.exclusion import drop_excluded
+from graphnav.estimation.noise.left_out import drop_excluded
 from graphnav.estimation.noise.model import NoiseModel
 from graphnav.estimation.noise.spacing import space_fixes
 from graphnav.estimation.problem import Problem, build_problem

@@ -26,12 +26,9 @@ from graphnav.estimation.contradictions import (
 from graphnav.estimation.noise.apply import apply_noise
 from graphnav.estimation.noise.decision import log_evidence, weigh_evidence
 from graphnav.estimation.noise.estimate import NoiseEstimate, estimate_noise
-from graphnav.estimation.noise.exclusion import (
-    compute_excluded_share,
-    estimate_disturbed_intervals,
-    estimate_without_faults,
-)
+from graphnav.estimation.noise.exclusion import estimate_disturbed_intervals, estimate_without_faults
 from graphnav.estimation.noise.initial_points import BREAKDOWN
+from graphnav.estimation.noise.left_out import compute_excluded_share
 from graphnav.estimation.noise.model import INTERVALS, NoiseModel
 from graphnav.estimation.offsets import is_offset_far
 from graphnav.estimation.problem import Problem
