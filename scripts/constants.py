@@ -106,7 +106,7 @@ CONSTANTS = (
         "LINEAR_ATTITUDE",
         "rad: half its square is the share of a vector that linearising loses",
     ),
-    Constant("graphnav.estimation.preparation", "_MOST_WRONG", "the larger part"),
+    Constant("graphnav.estimation.noise_search", "_MOST_WRONG", "the larger part"),
     Constant(
         "graphnav.estimation.relinearisation",
         "_LINEAR",

@@ -25,7 +25,7 @@ from graphnav.detectors import detect
 from graphnav.estimation.factor_graph.batch import batch
 from graphnav.estimation.factor_graph.isam import isam2
 from graphnav.estimation.pipeline import choose_origin
-from graphnav.estimation.preparation import prepare
+from graphnav.estimation.preparation import begin_preparation, prepare
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.incremental import are_due, incremental
 
@@ -49,7 +49,7 @@ def main() -> None:
     for name in options.recordings:
         recording = load(data / name if (data / name).exists() else name).crop(0.0, LONGEST)
         settings, frame = Settings(), LocalFrame(choose_origin(recording), recording.start)
-        found = prepare(recording, settings, frame, detect(recording, settings))
+        found = prepare(begin_preparation(recording, settings, frame, detect(recording, settings)))
         problem, start, nodes = found.problem, found.smoothed.states, found.smoothed.select_nodes(found.problem)
         best = batch(problem, start, nodes)
         whole = isam2(problem)

@@ -27,7 +27,7 @@ from graphnav.core.earth import LocalFrame
 from graphnav.core.state import DIM
 from graphnav.detectors import detect
 from graphnav.estimation.pipeline import choose_origin, run
-from graphnav.estimation.preparation import prepare
+from graphnav.estimation.preparation import begin_preparation, prepare
 from graphnav.estimation.solution import Solution
 from graphnav.estimation.solvers.ekf import ekf
 from graphnav.online import Online, drop_rows, list_rows
@@ -91,7 +91,8 @@ def measure_width(whole: Recording) -> None:
     for length, many in ((length, many) for length in LENGTHS for many in SIGNALS):
         carrier = np.where(np.isin(slot, slots[:many]), raw.carrier, np.nan)
         part = replace(whole, raw_gnss=replace(raw, carrier=carrier)).crop(0.0, length)
-        found = prepare(part, stated, LocalFrame(choose_origin(part), part.start), detect(part, stated))
+        frame = LocalFrame(choose_origin(part), part.start)
+        found = prepare(begin_preparation(part, stated, frame, detect(part, stated)))
         problem, took = found.problem, []
         for _ in range(3):
             began = time.process_time()

@@ -26,7 +26,7 @@ from graphnav.estimation.alignment import Alignment, align, use_known_heading
 from graphnav.estimation.alignment.first import pick_fixes
 from graphnav.estimation.contradictions import use_freed
 from graphnav.estimation.fixing import split_carriers
-from graphnav.estimation.noise.exclusion import drop_excluded
+from graphnav.estimation.noise.left_out import drop_excluded
 from graphnav.estimation.noise.model import NoiseModel
 from graphnav.estimation.noise.spacing import space_fixes
 from graphnav.estimation.problem import Problem, build_problem
@@ -109,6 +109,11 @@ class ProblemBuilder:
             problem = replace(problem, constraints=rows)
         problem, carriers = split_carriers(problem, GnssPhase)  # the noise model depends on the codes
         return BuiltProblem(problem, carriers, aligned, detections)
+
+    def build_every(self, built: BuiltProblem) -> BuiltProblem:
+        """The problem with every stop but the false ones, whichever it was built without before, aligned again."""
+        detections = detect(self.recording, self.settings).without(self.false_stops)
+        return self.build(self.align(self.recording, detections.stationary), detections, parts=True)
 
     def build_moving(self, built: BuiltProblem) -> BuiltProblem:
         """The problem without the false stops, aligned again."""

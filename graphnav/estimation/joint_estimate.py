@@ -26,12 +26,9 @@ from graphnav.estimation.contradictions import (
 from graphnav.estimation.noise.apply import apply_noise
 from graphnav.estimation.noise.decision import log_evidence, weigh_evidence
 from graphnav.estimation.noise.estimate import NoiseEstimate, estimate_noise
-from graphnav.estimation.noise.exclusion import (
-    compute_excluded_share,
-    estimate_disturbed_intervals,
-    estimate_without_faults,
-)
+from graphnav.estimation.noise.exclusion import estimate_disturbed_intervals, estimate_without_faults
 from graphnav.estimation.noise.initial_points import BREAKDOWN
+from graphnav.estimation.noise.left_out import compute_excluded_share
 from graphnav.estimation.noise.model import INTERVALS, NoiseModel
 from graphnav.estimation.offsets import is_offset_far
 from graphnav.estimation.problem import Problem
@@ -94,6 +91,23 @@ def estimate_jointly(
     EstimationError
         If the filter breaks down.
     """
+    found = begin_jointly(stated, settings, opening, progress)
+    return leave_out_jointly(found, settings, opening, progress)
+
+
+def begin_jointly(
+    stated: Problem,
+    settings: GnssSettings,
+    opening: float | None = None,
+    progress: Progress | None = None,
+    start: NoiseModel | None = None,
+) -> JointEstimate:
+    """The same with all measurements; what is given is as for `estimate_jointly`.
+
+    Parameters
+    ----------
+    start : initial figures, of nearly the same measurements.
+    """
 
     def estimate(base: Problem, before: JointEstimate, start: NoiseModel | None = None) -> NoiseEstimate:
         near = before.estimate.get_linearisation(before.base)
@@ -102,8 +116,15 @@ def estimate_jointly(
     def go_on(base: Problem, before: JointEstimate) -> NoiseEstimate:
         return estimate(base, before, before.estimate.noise)
 
-    found = JointEstimate(stated, {}, estimate_noise(stated, opening, progress=progress))
-    found = _free_constants(found, settings, go_on, estimate)
+    first = estimate_noise(stated, opening, start, progress=progress, changed=True)
+    found = JointEstimate(stated, {}, first)
+    return _free_constants(found, settings, go_on, estimate)
+
+
+def leave_out_jointly(
+    found: JointEstimate, settings: GnssSettings, opening: float | None = None, progress: Progress | None = None
+) -> JointEstimate:
+    """The same without spans of wrong measurements; what is given is as for `estimate_jointly`."""
     return replace(found, estimate=_leave_out_faults(found.base, found.estimate, settings, opening, progress))
 
 

@@ -33,9 +33,10 @@ from graphnav.estimation.noise.imu_floor import apply_measured_floor
 from graphnav.estimation.noise.model import STATED, NoiseModel, StampOffsets
 from graphnav.estimation.noise.unmeasured import describe_unmeasured
 from graphnav.estimation.noise.words import describe_far
+from graphnav.estimation.noise_search import Weigh
 from graphnav.estimation.offsets import move_stamps
 from graphnav.estimation.pieces import describe_span, split_pieces
-from graphnav.estimation.preparation import Prepared, Weigh, prepare
+from graphnav.estimation.preparation import Begun, Prepared, begin_preparation, prepare
 from graphnav.estimation.relinearisation import CLEARLY_BETTER, step_ahead
 from graphnav.estimation.separation import compute_separation
 from graphnav.estimation.solution import KNOWN, Solution, join_solutions
@@ -239,7 +240,7 @@ def _solve(
     recording, shown = apply_measured_floor(recording, settings)
     detection = time.perf_counter() - began
 
-    def prepare_moved(moved: Recording, rate: float, weigh: Weigh | None = None) -> Prepared:
+    def begin_moved(moved: Recording, rate: float, before: Begun | None = None) -> Begun:
         nonlocal detection
         tell("detection")
         began = time.perf_counter()
@@ -249,14 +250,17 @@ def _solve(
         detected = detect(moved, own)
         detection += time.perf_counter() - began
         given = None if noise is None else shift_to_imu_clock(noise)
-        return prepare(moved, own, frame, detected, given, progress, weigh)
+        return begin_preparation(moved, own, frame, detected, given, progress, before)
+
+    def finish(begun: Begun, weigh: Weigh) -> Prepared:
+        return prepare(begun, progress, weigh)
 
     if noise is None and may_move(recording, settings):
-        recording, found, stamps = find_stamps(recording, prepare_moved, clock)
+        recording, found, stamps = find_stamps(recording, begin_moved, finish, clock)
     else:
         stamps = StampOffsets() if noise is None else noise.stamps
         recording = move_stamps(recording, stamps)
-        found = prepare_moved(recording, stamps.rate)
+        found = prepare(begin_moved(recording, stamps.rate), progress)
     problem, forward, smoothed = found.problem, found.forward, found.smoothed
     faults = find_fault_spans(problem, smoothed, found.noise.excluded)
     notes = (

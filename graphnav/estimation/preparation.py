@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import contextlib
 from collections import Counter
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
 
@@ -24,24 +23,25 @@ from graphnav.core.errors import EstimationError
 from graphnav.core.notes import Note
 from graphnav.core.progress import Progress, tell
 from graphnav.core.rotation import Array
+from graphnav.core.state import DIM
 from graphnav.detectors import Detections
+from graphnav.detectors.base import NONE
 from graphnav.estimation.alignment import Alignment, use_known_heading
 from graphnav.estimation.building import BuiltProblem, Clock, ProblemBuilder, has_diverged
 from graphnav.estimation.contradictions import describe_freed, free
 from graphnav.estimation.faults.excluded import weigh_rows
 from graphnav.estimation.fixing import fix, split_carriers
-from graphnav.estimation.joint_estimate import JointEstimate, estimate_jointly, revise_jointly
+from graphnav.estimation.joint_estimate import JointEstimate
 from graphnav.estimation.noise.apply import apply_noise, are_of_others, drop_parts
 from graphnav.estimation.noise.bias_walks import estimate_bias_walks
 from graphnav.estimation.noise.chords import find_filled_gaps
-from graphnav.estimation.noise.estimate import NoiseEstimate, estimate_noise
-from graphnav.estimation.noise.false_stops import find_false_stops, leave_out_false_stops, unite_stops
 from graphnav.estimation.noise.initial_points import BREAKDOWN, find_initial_points
 from graphnav.estimation.noise.model import STATED, NoiseModel
-from graphnav.estimation.noise.span_variances import weigh_excluded
-from graphnav.estimation.noise.tails import widen_by_tails, widen_unweighted
+from graphnav.estimation.noise.tails import widen_unweighted
 from graphnav.estimation.noise.unmeasured import UnmeasuredRows, drop_in_gaps, drop_unmeasured
 from graphnav.estimation.noise.words import describe_noise
+from graphnav.estimation.noise_search import Weigh, begin_noise, find_noise
+from graphnav.estimation.offsets import is_offset_far
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.relinearisation import relinearise
 from graphnav.estimation.solution import CarrierArcs
@@ -54,13 +54,6 @@ from graphnav.estimation.solvers.passes import (
 )
 from graphnav.estimation.solvers.rts import smooth_backward
 from graphnav.recording import Recording
-
-# whether the evidence of a noise model is wanted, by the problem and the points of its estimate
-Weigh = Callable[[Problem, Points], bool]
-
-_Estimated = tuple[BuiltProblem, JointEstimate]  # a problem and the estimate on it
-
-_MOST_WRONG = 0.5  # share of excluded fixes, beyond which the start is wrong rather than the fixes
 
 
 @dataclass(frozen=True)
@@ -88,23 +81,77 @@ class Prepared:
         """Whether the stated start is so far from the one found that a filter from there diverges for a while."""
         return has_diverged(self.aligned, self.start)
 
+    def estimate_parameters(self) -> tuple[Problem, Array, Array]:
+        """The problem, its parameters (D-15,) at the start and their covariance."""
+        return self.problem, self.smoothed.values[0], self.smoothed.P[0][DIM:, DIM:]
 
-def prepare(
+
+@dataclass(frozen=True)
+class Begun:
+    """A recording aligned, its problem built, and a noise model of all measurements, before any is left out."""
+
+    recording: Recording
+    unmeasured: UnmeasuredRows
+    builder: ProblemBuilder
+    built: BuiltProblem
+    noise: NoiseModel | None  # as given, or None where it is estimated
+    found: JointEstimate | None  # the estimate so far, without the builder's false stops
+    spacing: float  # s, between fixes
+    larger: bool  # whether bias walks are to be estimated
+    passes: Counter[str]
+
+    @property
+    def log_evidence(self) -> float:
+        """Of all measurements by the noise model that is estimated."""
+        return np.inf if self.found is None else self.found.compute_evidence()
+
+    @property
+    def all_passes(self) -> Counter[str]:
+        """Those of the estimate as well."""
+        return self.passes if self.found is None else self.passes + self.found.estimate.passes
+
+    @property
+    def gained_by_chance(self) -> float:
+        """As of `NoiseEstimate`."""
+        return 0.0 if self.found is None else self.found.estimate.gained_by_chance
+
+    @property
+    def figures(self) -> NoiseModel | None:
+        """The figures of the estimate so far, to begin another with."""
+        if self.found is None:
+            return None
+        best = self.found.estimate.noise
+        return NoiseModel(best.figures, best.times, tails=best.tails)
+
+    def estimate_parameters(self) -> tuple[Problem, Array, Array] | None:
+        """The problem, its parameters (D-15,) at the end and their covariance; None where no stamp is far off."""
+        if self.found is None:
+            return None
+        best = self.found.estimate
+        problem = apply_noise(self.found.base, best.noise)
+        if not is_offset_far(problem, best.points):
+            return None
+        self.passes.update(filter=1)
+        forward = refilter(problem, best.points, whole=False)
+        return problem, forward.values[-1], forward.P[-1][DIM:, DIM:]
+
+
+def begin_preparation(
     recording: Recording,
     settings: Settings,
     frame: LocalFrame,
     detections: Detections,
     noise: NoiseModel | None = None,
     progress: Progress | None = None,
-    weigh: Weigh | None = None,
-) -> Prepared:
-    """Align a recording, build its problem and find its noise model.
+    before: Begun | None = None,
+) -> Begun:
+    """Align a recording, build its problem and begin to estimate its noise model.
 
     Parameters
     ----------
     detections : where the platform stands.
     noise : used as it is; when None it is estimated, or stated, according to the settings.
-    weigh : whether the evidence of a noise model that is estimated is wanted; never when None.
+    before : what was begun with nearly the same recording: its figures, and false stops, are initial ones.
 
     Raises
     ------
@@ -116,17 +163,20 @@ def prepare(
     recording, unmeasured = (recording, UnmeasuredRows()) if as_stated else drop_unmeasured(recording)
     spacing = settings.noise.spacing if noise is None else noise.spacing
     averaging = begin_beside(partial(average_speed, recording, settings))
-    false_stops = np.array(() if noise is None else noise.false_stops).reshape(-1, 2)
-    detections = detections.without(false_stops)
+    if noise is None:
+        false_stops = NONE if before is None else before.builder.false_stops
+    else:
+        false_stops = np.array(noise.false_stops).reshape(-1, 2)
     every = ProblemBuilder(recording, recording, settings, frame, clock, averaging, false_stops)
+    detections = detections.without(false_stops)
     aligned = every.align(recording, detections.stationary)
     unaided = aligned.motion is None or not settings.gnss.position
     stated = noise is None and (settings.noise.mode == "stated" or unaided)
     larger = stated and settings.noise.mode != "stated" and recording.platform == "foot"
     if stated:
         noise, spacing = STATED, STATED.spacing
-    builder, near = every.use_spaced(recording, spacing), None
-    built, evidence = builder.build(aligned, detections, parts=larger or noise != STATED), np.inf
+    builder = every.use_spaced(recording, spacing)
+    built = builder.build(aligned, detections, parts=larger or noise != STATED)
     if not as_stated:
         with contextlib.suppress(*BREAKDOWN):
             gaps, count = find_filled_gaps(apply_noise(built.problem, STATED), aligned.until)
@@ -135,16 +185,43 @@ def prepare(
                 recording, unmeasured = drop_in_gaps(recording, gaps, unmeasured)
                 builder = replace(every, recording=recording).use_spaced(recording, spacing)
                 built = builder.build(aligned, detections, parts=larger or noise != STATED)
-    if noise is None:
+    if noise is not None:
+        return Begun(recording, unmeasured, builder, built, noise, None, spacing, larger, passes)
+    tell("noise")
+    with clock.count_time("noise"):
+        false_stops, (built, found) = begin_noise(
+            builder, built, progress, passes, None if before is None else before.figures
+        )
+    builder = replace(builder, false_stops=false_stops)
+    return Begun(recording, unmeasured, builder, built, None, found, spacing, larger, passes)
+
+
+def prepare(begun: Begun, progress: Progress | None = None, weigh: Weigh | None = None) -> Prepared:
+    """Find the noise model of a recording, and its first solution.
+
+    Parameters
+    ----------
+    weigh : whether the evidence of a noise model that is estimated is wanted; never when None.
+
+    Raises
+    ------
+    EstimationError
+        If the recording does not determine a trajectory.
+    """
+    recording, builder, built, noise = begun.recording, begun.builder, begun.built, begun.noise
+    settings, clock, passes, evidence = builder.settings, builder.clock, Counter(begun.passes), np.inf
+    near: tuple[Points, Problem] | None = None
+    if begun.found is not None:
         tell("noise")
         with clock.count_time("noise"):
-            noise, built, evidence, near = _find_noise(builder, built, progress, passes, weigh)
-            noise = replace(noise, spacing=spacing)
-    else:
+            noise, built, evidence, near = find_noise(builder, (built, begun.found), progress, passes, weigh)
+            noise = replace(noise, spacing=begun.spacing)
+    elif noise is not None:
         if are_of_others(built.problem, noise):
             noise = widen_unweighted(built.problem, noise)
         built = builder.build_without(built, noise, parts=noise != STATED, anew=bool(noise.freed))
         built = replace(built, problem=free(built.problem, noise.freed))
+    assert noise is not None
     aligned = built.aligned
     problem = drop_parts(apply_noise(built.problem, noise))
     try:
@@ -153,7 +230,7 @@ def prepare(
         (initial, *_), more = find_initial_points(problem, aligned.until)
         passes.update(filter=more, smoother=more)
         forward, smoothed = _filter_and_smooth(problem, aligned.until, initial.points, clock, progress)
-    if larger:
+    if begun.larger:
         with clock.count_time("noise"):
             noise, spent = estimate_bias_walks(built.problem, smoothed)
             passes.update(spent)
@@ -182,7 +259,7 @@ def prepare(
     start = use_known_heading(aligned, settings)
     return Prepared(
         problem, noise, start, aligned, built.detections, forward, smoothed, notes, clock.seconds, passes, epochs, arcs,
-        evidence, ahead, unmeasured,
+        evidence, ahead, begun.unmeasured,
     )  # fmt: skip
 
 
@@ -203,125 +280,6 @@ def _filter_and_smooth(
     with clock.count_time("smoother"):
         smoothed = smooth_backward(problem, forward, progress)
     return forward.drop_covariances(), smoothed
-
-
-def _find_noise(
-    builder: ProblemBuilder,
-    built: BuiltProblem,
-    progress: Progress | None,
-    passes: Counter[str],
-    weigh: Weigh | None,
-) -> tuple[NoiseModel, BuiltProblem, float, tuple[Points, Problem]]:
-    """The noise model, the problem with a start and stops that rest on no excluded fix, the logarithm of the evidence
-    where it is wanted, and the points of the estimate with the problem that they are of.
-
-    Where the other measurements contradict stops, all is found anew without these.
-    """
-
-    def judge(one: _Estimated) -> Array:
-        built, found = one
-        near = found.estimate.get_linearisation(found.base)
-        false, spent = find_false_stops(found.base, found.estimate.noise, near, built.detections.stationary)
-        passes.update(filter=spent)
-        return false
-
-    def estimate_without(before: _Estimated, false: Array) -> _Estimated:
-        moving = replace(builder, false_stops=false)
-        built, found = _estimate_with_start(moving, moving.build_moving(before[0]), progress)
-        return built, found.count(before[1].estimate.passes + found.estimate.passes)
-
-    one = _estimate_with_start(builder, built, progress)
-    (built, found), false = leave_out_false_stops(one, judge, estimate_without)
-    best, built = found.estimate, replace(built, problem=found.base)
-    wanted = weigh is not None and weigh(apply_noise(built.problem, best.noise), best.points)
-    found = found.weigh() if wanted else found
-    evidence = found.compute_evidence() if wanted else np.inf
-    passes.update(found.estimate.passes + Counter(filter=1))
-    plain = NoiseModel(excluded=best.noise.excluded, freed=found.freed)
-    likelier = _is_likelier(built.problem, plain, best)
-    noise = plain if likelier else widen_by_tails(built.problem, found.noise)
-    near = best.get_linearisation(built.problem)
-    if noise.excluded:
-        with contextlib.suppress(*BREAKDOWN):
-            noise, spent = weigh_excluded(built.problem, noise, near)
-            passes.update(filter=spent, smoother=spent)
-    return replace(noise, false_stops=unite_stops(false)), built, evidence, near
-
-
-def _estimate_with_start(builder: ProblemBuilder, built: BuiltProblem, progress: Progress | None) -> _Estimated:
-    """The problem with a start and stops that rest on no excluded fix, and the estimate on it."""
-    settings = builder.settings.gnss
-    found = estimate_jointly(built.problem, settings, built.aligned.until, progress)
-    if found.excluded_share > _MOST_WRONG:
-        # most fixes contradict the start: align again with the fixes behind those that the alignment used
-        try:
-            later = builder.build_later(built)
-            other = estimate_jointly(later.problem, settings, later.aligned.until, progress)
-            total = found.estimate.passes + other.estimate.passes
-            if other.excluded_share < found.excluded_share:
-                built, found = later, other
-            found = found.count(total)
-        except EstimationError:
-            pass  # no motion later on
-    if found.noise.excluded:
-        built, found = _start_without(builder, built, found, progress)
-    found = revise_jointly(found, settings, built.aligned.until, progress)
-    return _start_anew(builder, built, found) if found.freed else (built, found)
-
-
-def _start_without(
-    builder: ProblemBuilder, built: BuiltProblem, found: JointEstimate, progress: Progress | None
-) -> tuple[BuiltProblem, JointEstimate]:
-    """The same with a start and stops that rest on no excluded fix."""
-    without = builder.build_without(built, found.noise, parts=True)
-    if without is built:
-        return built, found
-    again = replace(found, stated=without.problem)
-    same = np.array_equal(without.problem.t, built.problem.t)
-
-    def estimate(before: NoiseEstimate, near: tuple[Points, Problem] | None = None) -> NoiseEstimate:
-        return estimate_noise(again.base, without.aligned.until, before.noise, near, progress)
-
-    def go_on(before: NoiseEstimate) -> NoiseEstimate:
-        if not same:
-            return estimate(before)
-        # the points known rest on the start before, and a filter from the new one may diverge: the likelier
-        near = estimate(before, before.get_linearisation(found.base))
-        try:
-            fresh = estimate(before)
-        except BREAKDOWN:
-            return near
-        best = max(near, fresh, key=lambda one: one.log_evidence)
-        return replace(best, passes=near.passes + fresh.passes)
-
-    best, rival = go_on(found.estimate), found.estimate.rival
-    total = found.estimate.passes + best.passes
-    if rival is not None:
-        rival = go_on(rival)
-        total = total + rival.passes
-    return without, replace(again, estimate=replace(best, rival=rival)).count(total)
-
-
-def _start_anew(
-    builder: ProblemBuilder, built: BuiltProblem, found: JointEstimate
-) -> tuple[BuiltProblem, JointEstimate]:
-    """The same with a start that depends on no constant as stated that is free."""
-    anew = builder.build_without(built, found.noise, parts=True, anew=True)
-    again = replace(found, stated=anew.problem, estimate=replace(found.estimate, whole_evidence=None))
-    if np.array_equal(anew.problem.t, built.problem.t):
-        return anew, again
-    best = estimate_noise(again.base, anew.aligned.until, found.estimate.noise)
-    return anew, replace(again, estimate=best).count(found.estimate.passes + best.passes)
-
-
-def _is_likelier(base: Problem, plain: NoiseModel, found: NoiseEstimate) -> bool:
-    """Whether the stated figures are more probable than the estimate, its prior included.
-
-    Both leave the same measurements out, so that the likelihoods compare.
-    """
-    problem = apply_noise(base, plain)
-    forward = refilter(problem, found.carry_points(base, problem), whole=False)
-    return float(np.sum(forward.log_likelihood)) > found.log_evidence
 
 
 def _drop_refused(problem: Problem, forward: FilterPass) -> Problem:

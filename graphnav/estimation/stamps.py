@@ -5,7 +5,8 @@ within `LINEAR_OFFSET` of it (`graphnav.constraints.gnss`). Farther away a vehic
 where an offset is estimated farther than that from where the rows are linearised, the stamps are moved to the estimate,
 that of the clocks' rate with it, and all is estimated anew, a step of Gauss-Newton, until the estimate stays within.
 Where the clocks of IMU and fixes disagree for certain (`graphnav.recording.checks.clock`), the first step is what they
-disagree by. The stamps as they are remain a candidate: the likelier stands.
+disagree by. The stamps as they are remain a candidate: the likelier stands. Stamps are moved before wrong measurements
+are searched for, as late fixes look wrong in every bend, and once more where the search has changed the noise model.
 
 A solution is on the clock of the IMU, and what it says of fixes is on theirs (`shift_to_own_clocks`).
 """
@@ -13,8 +14,9 @@ A solution is on the clock of the IMU, and what it says of fixes is on theirs (`
 from __future__ import annotations
 
 import contextlib
+from collections import Counter
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -25,12 +27,12 @@ from graphnav.constraints.gnss import CLOCK_RATE, TIME_OFFSET, VELOCITY_TIME_OFF
 from graphnav.constraints.vehicle import ODOMETER_DELAY
 from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
-from graphnav.core.state import DIM
 from graphnav.core.timescales import shift_stamps, shift_stamps_back
 from graphnav.estimation.noise.initial_points import BREAKDOWN
 from graphnav.estimation.noise.model import NoiseModel, RowWeights, StampOffsets
+from graphnav.estimation.noise_search import Weigh
 from graphnav.estimation.offsets import AS_STATED, is_offset_far, list_end_rows, move_stamps
-from graphnav.estimation.preparation import Prepared, Weigh
+from graphnav.estimation.preparation import Begun, Prepared
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import ConstraintRecord, ExcludedSpan, ParameterEstimate, Solution
 from graphnav.estimation.solvers.linearise import Points, shift
@@ -41,9 +43,31 @@ _SIGNIFICANT = 3.0  # sigmas
 _MOVES = 3  # of moving the stamps
 _A_PPM = 1e-6
 
-# a recording whose stamps are moved, by which rate (s/s), and whether evidence is wanted -> what its solvers share
-Prepare = Callable[[Recording, float, Weigh], Prepared]
-_Candidate = tuple[Recording, Prepared, StampOffsets]
+# a recording whose stamps are moved, by which rate (s/s), and what was begun with others, if anything -> its beginning
+Begin = Callable[[Recording, float, Begun | None], Begun]
+# what is begun, and whether evidence is wanted -> what its solvers share
+Finish = Callable[[Begun, Weigh], Prepared]
+
+
+@dataclass(frozen=True)
+class _Candidate:
+    """A recording with its stamps moved: begun, and finished where that was done."""
+
+    offsets: StampOffsets
+    begun: Begun
+    prepared: Prepared | None = None
+
+    @property
+    def log_evidence(self) -> float:
+        return self.begun.log_evidence if self.prepared is None else self.prepared.log_evidence
+
+    @property
+    def passes(self) -> Counter[str]:
+        return self.begun.all_passes if self.prepared is None else self.prepared.passes
+
+
+# stamp offsets, and what was begun with others, if anything -> the recording with its stamps moved by these
+_Move = Callable[[StampOffsets, Begun | None], _Candidate]
 
 
 def may_move(recording: Recording, settings: Settings) -> bool:
@@ -54,7 +78,7 @@ def may_move(recording: Recording, settings: Settings) -> bool:
 
 
 def find_stamps(
-    recording: Recording, prepare: Prepare, clock: ClockOffsets | None
+    recording: Recording, begin: Begin, finish: Finish, clock: ClockOffsets | None
 ) -> tuple[Recording, Prepared, StampOffsets]:
     """The recording with its stamps where their offsets are estimated, and what its solvers share.
 
@@ -62,29 +86,53 @@ def find_stamps(
     ----------
     clock : offsets between IMU and fixes that the recording shows before any estimation.
     """
-    guess = None if clock is None else _guess_offsets(clock)
-    plain: _Candidate = recording, prepare(recording, 0.0, is_offset_far if guess is None else _accept_all), AS_STATED
+    tried: dict[int, _Candidate] = {}
+
+    def begin_moved(offsets: StampOffsets, before: Begun | None) -> _Candidate:
+        begun = begin(move_stamps(recording, offsets), offsets.rate, before)
+        return tried.setdefault(id(begun), _Candidate(offsets, begun))
+
+    def solve(one: _Candidate, weigh: Weigh) -> _Candidate:
+        tried[id(one.begun)] = one = replace(one, prepared=finish(one.begun, weigh))
+        return one
+
+    def solve_moved(offsets: StampOffsets, before: Begun | None) -> _Candidate:
+        return solve(begin_moved(offsets, before), _accept_all)
+
+    as_stated = begin_moved(AS_STATED, None)
+    early = _find(begin_moved, as_stated, None if clock is None else _guess_offsets(clock))
+    try:
+        found = solve(early, is_offset_far)
+    except BREAKDOWN:
+        if early is as_stated:
+            raise
+        found = solve(as_stated, is_offset_far)
+    # wrong measurements may have hidden an offset, or been taken for one
+    if found.log_evidence > found.begun.log_evidence + found.begun.gained_by_chance:
+        found = _find(solve_moved, found)
+    assert found.prepared is not None
+    prepared = replace(found.prepared, passes=sum((one.passes for one in tried.values()), Counter()))
+    return move_stamps(recording, found.offsets), prepared, found.offsets
+
+
+def _find(move: _Move, plain: _Candidate, guess: StampOffsets | None = None) -> _Candidate:
+    """What is likeliest, with its stamps as they are or moved until their offsets are estimated near where they are."""
     for first in (plain,) if guess is None else (guess, plain):
         with contextlib.suppress(*BREAKDOWN):  # with stamps that are farther off than before
-            start = _move(recording, prepare, first) if isinstance(first, StampOffsets) else first
-            found = _move_until_near(recording, prepare, start)
-            if found is not None and found is not plain and found[1].log_evidence > plain[1].log_evidence:
+            start = move(first, None) if isinstance(first, StampOffsets) else first
+            found = _move_until_near(move, start)
+            if found is not None and found is not plain and found.log_evidence > plain.log_evidence:
                 return found
     return plain
 
 
-def _move_until_near(recording: Recording, prepare: Prepare, found: _Candidate) -> _Candidate | None:
+def _move_until_near(move: _Move, found: _Candidate) -> _Candidate | None:
     """Move the stamps until their offsets are estimated near where they are; None where that does not come about."""
     for _ in range(_MOVES):
-        if (ahead := _estimate_offsets(*found[1:])) == found[2]:
+        if (ahead := _estimate_offsets(found)) == found.offsets:
             return found
-        found = _move(recording, prepare, ahead)
-    return found if _estimate_offsets(*found[1:]) == found[2] else None
-
-
-def _move(recording: Recording, prepare: Prepare, offsets: StampOffsets) -> _Candidate:
-    moved = move_stamps(recording, offsets)
-    return moved, prepare(moved, offsets.rate, _accept_all), offsets
+        found = move(ahead, found.begun)
+    return found if _estimate_offsets(found) == found.offsets else None
 
 
 def _accept_all(problem: Problem, points: Points) -> bool:
@@ -110,10 +158,12 @@ def _join(offsets: StampOffsets) -> StampOffsets:
     return replace(offsets, velocities=offsets.positions) if near else offsets
 
 
-def _estimate_offsets(prepared: Prepared, at: StampOffsets) -> StampOffsets:
+def _estimate_offsets(candidate: _Candidate) -> StampOffsets:
     """The offsets estimated, those that are far and significant; the others as they are."""
-    problem = prepared.problem
-    values, P = prepared.smoothed.values[0], prepared.smoothed.P[0][DIM:, DIM:]
+    at, known = candidate.offsets, (candidate.prepared or candidate.begun).estimate_parameters()
+    if known is None:
+        return at
+    problem, values, P = known
     ends, new = list_end_rows(problem), {}
     for key, name in (("positions", TIME_OFFSET), ("velocities", VELOCITY_TIME_OFFSET)):
         if name in ends:

@@ -12,6 +12,7 @@ from helpers import find_steady_motion
 from graphnav import load
 from graphnav.config import parse_settings
 from graphnav.config.detectors import FUSED
+from graphnav.core.earth import LocalFrame
 from graphnav.core.errors import EstimationError
 from graphnav.core.rotation import Array
 from graphnav.detectors import Detections, detect
@@ -19,6 +20,7 @@ from graphnav.detectors.base import mask_inside, merge_spans
 from graphnav.estimation import building, pipeline
 from graphnav.estimation.noise.files import read_noise, write_noise
 from graphnav.estimation.pipeline import run
+from graphnav.recording import Recording
 
 SETTINGS = parse_settings({"gnss": {"velocity": False}})
 
@@ -58,6 +60,31 @@ def test_a_stop_at_speed_is_none(
     kept = read_noise(write_noise(tmp_path / "noise.json", found.noise))
     again = run(recording, SETTINGS, ("rts",), noise=kept)["rts"]
     np.testing.assert_array_equal(again.states.p, found.states.p)
+
+
+def displace(recording: Recording, begin: float, end: float) -> Recording:
+    """Fixes 30 m east of where they were measured for a while."""
+    gnss = recording.gnss
+    assert gnss is not None
+    frame, wrong = LocalFrame(gnss.llh[0]), (gnss.t >= begin) & (gnss.t <= end)
+    east = np.outer(wrong, [30.0, 0.0, 0.0])
+    return replace(recording, gnss=replace(gnss, llh=frame.to_llh(frame.from_llh(gnss.llh) + east)))
+
+
+def test_wrong_fixes_beside_a_false_stop_are_told_apart(shared_data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Fixes that are wrong from the middle of a true stop on; and the same with a false stop elsewhere."""
+    recording = replace(load(shared_data / "oracle_drive" / "recording_spp.toml").crop(50.0, 250.0), odometer=None)
+    span, (begin, end) = find_steady_motion(recording, 4.0, slowest=4.0), (141.0, 193.0)
+    assert not begin - 20.0 < span[0] < end
+    wrong = displace(recording, begin, end)
+    found = run(wrong, SETTINGS, ("rts",))["rts"]
+    claim_stops(monkeypatch, span[None])
+    both = run(wrong, SETTINGS, ("rts",))["rts"]
+    assert found.noise.false_stops == ()
+    np.testing.assert_allclose(both.noise.false_stops, span[None])
+    for one in (found, both):
+        assert sum(b - a for a, b in one.noise.excluded["gnss_position"]) == pytest.approx(end - begin, abs=5.0)
+    np.testing.assert_allclose(both.states.p, found.states.p, atol=0.1)
 
 
 def test_a_drive_that_cannot_be_aligned_without_a_false_stop_keeps_it(

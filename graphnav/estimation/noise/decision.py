@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -30,6 +30,7 @@ from graphnav.estimation.noise.outliers import (
 )
 from graphnav.estimation.noise.spans import Span, drop_within, extend_to_next_fix, join, mask_times
 from graphnav.estimation.problem import Problem
+from graphnav.estimation.solvers.ekf import refilter
 
 
 @dataclass(frozen=True)
@@ -129,3 +130,12 @@ def log_evidence(base: Problem, found: NoiseEstimate) -> float:
     evidence = weigh_evidence(base, found).whole_evidence
     assert evidence is not None
     return evidence
+
+
+def weigh_rest(base: Problem, found: NoiseEstimate, excluded: Mapping[str, tuple[Span, ...]]) -> float:
+    """The logarithm of the evidence of the measurements outside some spans, by the figures found."""
+    noise = replace(found.noise, excluded=excluded)
+    used = apply_noise(base, noise)
+    forward = refilter(used, found.carry_points(base, used), whole=False)
+    costs = float(np.sum(compute_row_costs(used, noise.tails))) + compute_interval_cost(noise.weights, len(used.t) - 1)
+    return float(np.sum(forward.log_likelihood)) + found.log_prior - costs

@@ -120,7 +120,7 @@ def estimate_noise(
         initials = [replace(one, points=reuse_points(one.points, problem, used)) for one in initials]
     found: list[NoiseEstimate] = []
     for initial in initials:
-        figures = begin_components(problem, start)
+        figures = begin_components(problem, start, changed)
         figures.weights |= initial.weights
         for name, more in initial.log_factors.items():
             figures.log[name] += more

@@ -19,10 +19,11 @@ not knowing it beforehand. A fault is beforehand as improbable as a false alarm 
 decides what is left out.
 
 Masking. Figures that are estimated with a fault among the data may have grown until they hide it, so the tests are made
-with the figures at their prior medians as well. If they find more, the figures are estimated again without these spans,
-twice, because the spans shrink to what is wrong. Each set of spans that comes up on the way is decided by these
-figures, and the decision with the largest evidence stands. If no fault is left by these figures, the estimate that uses
-all measurements and starts from them is one more candidate.
+with the figures at their prior medians as well. If they find more, the figures are estimated again without these spans.
+Unless these explain the rest better than the figures found, beyond chance, nothing was masked. Each set of spans that
+comes up on the way is decided by these figures, and the decision with the largest evidence stands. All that is done
+once more, as the spans shrink to what is wrong, unless the figures lose more evidence inside them than they gain
+outside. If no fault is left, the estimate that uses all measurements and starts from these figures is a candidate.
 
 Segments. A filter follows an error that lasts for more than `watch.PATIENCE`, so the tests find its beginning, and its
 end as the beginning of another. So the ends of all suspected spans divide the drive into segments, and those that are
@@ -52,13 +53,14 @@ import numpy as np
 
 from graphnav.core.beside import begin_beside
 from graphnav.estimation.faults.watch import FALSE_ALARM, PATIENCE
-from graphnav.estimation.noise.apply import apply_noise, select_weights
+from graphnav.estimation.noise.apply import apply_noise
 from graphnav.estimation.noise.decision import (
     Decision,
     explain,
     list_explanations,
     log_evidence,
     weigh_evidence,
+    weigh_rest,
 )
 from graphnav.estimation.noise.estimate import NoiseEstimate, estimate_noise
 from graphnav.estimation.noise.explanations import FIXES
@@ -86,9 +88,8 @@ from graphnav.estimation.noise.suspects import (
     list_fix_times,
     predict_left_out,
 )
-from graphnav.estimation.noise.tails import get_tail_index, relate_to_gaussian, weigh_outlying
+from graphnav.estimation.noise.tails import get_tail_index, weigh_outlying
 from graphnav.estimation.problem import Problem
-from graphnav.recording import Recording
 
 _REFINEMENTS = 2  # estimates without masked spans: the first trims the spans, the second is free of what is wrong
 
@@ -229,10 +230,15 @@ def _unmask(base: Problem, found: NoiseEstimate, first: Decision, masked: list[S
     masked : spans of fixes that are suspected besides those of the first.
     """
     best, leading, estimate, spans, passes = first, found, found, masked, first.passes
-    rival = first.rival or first  # by other spans than segments
+    rival, gain = first.rival or first, np.inf  # rival: by other spans than segments
     start = NoiseModel(found.noise.figures, found.noise.times, excluded=dict.fromkeys(FIXES, tuple(masked)))
     for _ in range(_REFINEMENTS):
         estimate = estimate_noise(base, None, start, estimate.get_linearisation(base), changed=True)
+        if spans is masked and np.isfinite(first.log_evidence):
+            gain = estimate.log_evidence - weigh_rest(base, found, estimate.noise.excluded)
+            passes = passes + Counter(filter=1)
+            if gain <= estimate.gained_by_chance:
+                return _use_all(base, first, estimate, passes + estimate.passes)
         used = apply_noise(base, estimate.noise)
         errors = predict_left_out(used, estimate)
         detected = find_suspects(base, replace(estimate.noise, excluded={}), estimate)
@@ -241,6 +247,7 @@ def _unmask(base: Problem, found: NoiseEstimate, first: Decision, masked: list[S
         # a slow onset is dated better by the tests, an abrupt end by the errors of single fixes
         segments, spent = find_segments(base, estimate, [*detected, *refined])
         passes = passes + Counter(filter=spent)
+        most = -np.inf
         for some in [*list_distinct(spans, trim(spans, errors, FALSE_ALARM), detected), segments]:
             if not some:
                 continue
@@ -253,6 +260,7 @@ def _unmask(base: Problem, found: NoiseEstimate, first: Decision, masked: list[S
                 finer = explain(base, _add_outliers(estimate, errors, cut), cut, among, least)
                 passes = passes + finer.passes
                 candidate = max(candidate, finer, key=lambda one: one.log_evidence)
+            most = max(most, candidate.log_evidence)
             if some is not segments and candidate.log_evidence > rival.log_evidence:
                 rival = candidate
             if candidate.log_evidence > best.log_evidence:
@@ -260,18 +268,27 @@ def _unmask(base: Problem, found: NoiseEstimate, first: Decision, masked: list[S
         if sum_lengths(detected) > 2.0 * sum_lengths(masked):  # more fixes seem wrong outside the span than inside
             break
         if not refined:  # single outliers and no fault
-            everything = replace(estimate.noise, excluded={})
-            free = estimate_noise(base, None, everything, estimate.get_linearisation(base))
-            passes = passes + free.passes
-            if free.log_evidence > first.log_evidence:
-                return Decision(free.noise, free.log_evidence, passes, free)
-        if not refined or refined == spans:
+            kept = _use_all(base, first, estimate, passes)
+            passes = kept.passes
+            if kept.log_evidence > first.log_evidence:
+                return kept
+        # figures that lose more inside the spans than they gain outside: these are of good measurements
+        if not refined or refined == spans or first.log_evidence - most > gain:
             break
         spans, start = refined, replace(start, excluded=dict.fromkeys(FIXES, tuple(refined)))
     if best is not first and not best.noise.excluded:  # the figures that go with these outliers
         free = estimate_noise(base, None, best.noise, leading.get_linearisation(base))
         return Decision(free.noise, best.log_evidence, passes + free.passes, free)
     return replace(best, passes=passes, rival=None if best is rival else rival)
+
+
+def _use_all(base: Problem, first: Decision, estimate: NoiseEstimate, passes: Counter[str]) -> Decision:
+    """The first decision, or the estimate with all measurements that starts from one without some, if likelier."""
+    free = estimate_noise(base, None, replace(estimate.noise, excluded={}), estimate.get_linearisation(base))
+    passes = passes + free.passes
+    if free.log_evidence > first.log_evidence:
+        return Decision(free.noise, free.log_evidence, passes, free)
+    return replace(first, passes=passes)
 
 
 def _readmit(base: Problem, found: NoiseEstimate) -> NoiseEstimate:
@@ -365,24 +382,3 @@ def _add_outliers(found: NoiseEstimate, errors: LeftOutErrors, spans: list[Span]
         order = np.argsort(both, kind="stable")
         weights[name] = RowWeights(both[order], of_both[order])
     return replace(found, noise=replace(found.noise, weights=weights))
-
-
-def compute_excluded_share(problem: Problem, noise: NoiseModel) -> float:
-    """Share of the information of the positions that a noise model leaves out."""
-    rows = next((c for c in problem.constraints if c.name == FIXES[0]), None)
-    if rows is None:
-        return 0.0
-    weight = select_weights(problem.t[rows.keyframe], noise, rows.name)
-    return 1.0 - float(np.mean(relate_to_gaussian(weight, len(rows.axes), noise.tails.get(rows.name))))
-
-
-def drop_excluded(recording: Recording, noise: NoiseModel) -> Recording:
-    """The recording without the fixes in the excluded spans of a noise model."""
-    gnss = recording.gnss
-    assert gnss is not None
-    p, v = (
-        mask_times(t, noise.excluded.get(name, ()))[:, None]
-        for name, t in zip(FIXES, (gnss.t, gnss.velocity_t), strict=True)
-    )
-    gnss = replace(gnss, llh=np.where(p, np.nan, gnss.llh), v=None if gnss.v is None else np.where(v, np.nan, gnss.v))
-    return replace(recording, gnss=gnss)

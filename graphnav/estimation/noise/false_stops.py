@@ -86,7 +86,7 @@ def find_false_stops(
 
 
 def leave_out_false_stops(
-    found: Found, judge: Callable[[Found], Array], estimate: Callable[[Found, Array], Found]
+    found: Found, judge: Callable[[Found], Array], estimate: Callable[[Found, Array], Found], false: Array = NONE
 ) -> tuple[Found, Array]:
     """Estimate anew without the stops in which the platform moves, until there are none.
 
@@ -95,7 +95,7 @@ def leave_out_false_stops(
 
     Parameters
     ----------
-    found : with all of them.
+    found : with all of them, but some `false` ones (n, 2), s.
     judge : the false stops (n, 2) of an estimate, s.
     estimate : one without the false stops (n, 2) so far, from the one before.
 
@@ -106,7 +106,7 @@ def leave_out_false_stops(
     array
         (n, 2) s, the stops that it is without.
     """
-    false, first = NONE, 1
+    first = 1
     with contextlib.suppress(*BREAKDOWN):
         while len(wrong := judge(found)):
             without = merge_spans(np.concatenate([false, wrong[:first]]))

@@ -1,0 +1,228 @@
+"""The search for a recording's noise model: figures, constants, false stops, spans that are left out, and a start that
+rests on none of these.
+
+In order of what it costs, so that what has one simple cause is not searched for twice: figures and constants of all
+measurements; the stops that these contradict; and only then spans of wrong measurements. A fault of the fixes may be
+what contradicts a stop. So where spans are left out although stops are, all is found anew with every stop, and these
+are judged when the faults are known.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+
+from graphnav.core.errors import EstimationError
+from graphnav.core.progress import Progress
+from graphnav.core.rotation import Array
+from graphnav.detectors.base import NONE
+from graphnav.estimation.building import BuiltProblem, ProblemBuilder
+from graphnav.estimation.joint_estimate import (
+    JointEstimate,
+    begin_jointly,
+    estimate_jointly,
+    leave_out_jointly,
+    revise_jointly,
+)
+from graphnav.estimation.noise.apply import apply_noise
+from graphnav.estimation.noise.estimate import NoiseEstimate, estimate_noise
+from graphnav.estimation.noise.false_stops import find_false_stops, leave_out_false_stops, unite_stops
+from graphnav.estimation.noise.initial_points import BREAKDOWN
+from graphnav.estimation.noise.model import NoiseModel
+from graphnav.estimation.noise.span_variances import weigh_excluded
+from graphnav.estimation.noise.tails import widen_by_tails
+from graphnav.estimation.problem import Problem
+from graphnav.estimation.solvers.ekf import refilter
+from graphnav.estimation.solvers.linearise import Points
+
+# whether the evidence of a noise model is wanted, by the problem and the points of its estimate
+Weigh = Callable[[Problem, Points], bool]
+
+Estimated = tuple[BuiltProblem, JointEstimate]  # a problem and the estimate on it
+
+_MOST_WRONG = 0.5  # share of excluded fixes, beyond which the start is wrong rather than the fixes
+
+
+def begin_noise(
+    builder: ProblemBuilder,
+    built: BuiltProblem,
+    progress: Progress | None,
+    passes: Counter[str],
+    start: NoiseModel | None = None,
+) -> tuple[Array, Estimated]:
+    """The false stops (n, 2), s, by all other measurements, and the noise model of these, with nothing else left out.
+
+    Parameters
+    ----------
+    built : without the false stops of the builder.
+    passes : to which those made for stops are added; the others are with the estimate.
+    start : initial figures, of nearly the same measurements.
+
+    Raises
+    ------
+    EstimationError
+        If the filter breaks down.
+    """
+
+    def begin_without(before: Estimated, false: Array) -> Estimated:
+        moving = replace(builder, false_stops=false)
+        return _count(_begin(moving, moving.build_moving(before[0]), progress), before)
+
+    begun = _begin(builder, built, progress, start)
+    one, false = leave_out_false_stops(begun, partial(_judge, passes), begin_without, builder.false_stops)
+    return false, one
+
+
+def find_noise(
+    builder: ProblemBuilder,
+    begun: Estimated,
+    progress: Progress | None,
+    passes: Counter[str],
+    weigh: Weigh | None,
+) -> tuple[NoiseModel, BuiltProblem, float, tuple[Points, Problem]]:
+    """The noise model, the problem with a start and stops that rest on no excluded fix, the logarithm of the evidence
+    where it is wanted, and the points of the estimate with the problem that they are of.
+
+    Where the other measurements contradict stops, all is found anew without these.
+
+    Parameters
+    ----------
+    builder, begun : with the false stops of `begin_noise`, and what it found.
+    passes : to which those made are added.
+    """
+
+    def judge(one: Estimated) -> Array:
+        return NONE if one[1].estimate.noise is begun[1].estimate.noise else _judge(passes, one)
+
+    def find_without(before: Estimated, false: Array) -> Estimated:
+        if np.array_equal(false, builder.false_stops):
+            return _count(found, before)
+        moving = replace(builder, false_stops=false)
+        return _count(_find(moving, _begin(moving, moving.build_moving(before[0]), progress), progress), before)
+
+    one = found = _find(builder, begun, progress)
+    false = builder.false_stops
+    if len(false) and found[1].noise.excluded:
+        with contextlib.suppress(*BREAKDOWN):
+            every = replace(builder, false_stops=NONE)
+            one = _count(_find(every, _begin(every, every.build_every(found[0]), progress), progress), found)
+            false = NONE
+    (built, joint), false = leave_out_false_stops(one, judge, find_without, false)
+    best, built = joint.estimate, replace(built, problem=joint.base)
+    wanted = weigh is not None and weigh(apply_noise(built.problem, best.noise), best.points)
+    joint = joint.weigh() if wanted else joint
+    evidence = joint.compute_evidence() if wanted else np.inf
+    passes.update(joint.estimate.passes + Counter(filter=1))
+    plain = NoiseModel(excluded=best.noise.excluded, freed=joint.freed)
+    likelier = _is_likelier(built.problem, plain, best)
+    noise = plain if likelier else widen_by_tails(built.problem, joint.noise)
+    near = best.get_linearisation(built.problem)
+    if noise.excluded:
+        with contextlib.suppress(*BREAKDOWN):
+            noise, spent = weigh_excluded(built.problem, noise, near)
+            passes.update(filter=spent, smoother=spent)
+    return replace(noise, false_stops=unite_stops(false)), built, evidence, near
+
+
+def _judge(passes: Counter[str], one: Estimated) -> Array:
+    """The false stops (n, 2) of an estimate, s; the passes that it takes are added."""
+    built, found = one
+    near = found.estimate.get_linearisation(found.base)
+    false, spent = find_false_stops(found.base, found.estimate.noise, near, built.detections.stationary)
+    passes.update(filter=spent)
+    return false
+
+
+def _count(one: Estimated, before: Estimated) -> Estimated:
+    """The estimate with the passes of one before it as well."""
+    return one[0], one[1].count(before[1].estimate.passes + one[1].estimate.passes)
+
+
+def _begin(
+    builder: ProblemBuilder, built: BuiltProblem, progress: Progress | None, start: NoiseModel | None = None
+) -> Estimated:
+    """The problem and its noise model of all measurements."""
+    return built, begin_jointly(built.problem, builder.settings.gnss, built.aligned.until, progress, start)
+
+
+def _find(builder: ProblemBuilder, begun: Estimated, progress: Progress | None) -> Estimated:
+    """The problem with a start and stops that rest on no excluded fix, and the estimate on it, from that of all
+    measurements.
+    """
+    settings, built = builder.settings.gnss, begun[0]
+    found = leave_out_jointly(begun[1], settings, built.aligned.until, progress)
+    if found.excluded_share > _MOST_WRONG:
+        # most fixes contradict the start: align again with the fixes behind those that the alignment used
+        try:
+            later = builder.build_later(built)
+            other = estimate_jointly(later.problem, settings, later.aligned.until, progress)
+            total = found.estimate.passes + other.estimate.passes
+            if other.excluded_share < found.excluded_share:
+                built, found = later, other
+            found = found.count(total)
+        except EstimationError:
+            pass  # no motion later on
+    if found.noise.excluded:
+        built, found = _start_without(builder, built, found, progress)
+    found = revise_jointly(found, settings, built.aligned.until, progress)
+    return _start_anew(builder, built, found) if found.freed else (built, found)
+
+
+def _start_without(
+    builder: ProblemBuilder, built: BuiltProblem, found: JointEstimate, progress: Progress | None
+) -> tuple[BuiltProblem, JointEstimate]:
+    """The same with a start and stops that rest on no excluded fix."""
+    without = builder.build_without(built, found.noise, parts=True)
+    if without is built:
+        return built, found
+    again = replace(found, stated=without.problem)
+    same = np.array_equal(without.problem.t, built.problem.t)
+
+    def estimate(before: NoiseEstimate, near: tuple[Points, Problem] | None = None) -> NoiseEstimate:
+        return estimate_noise(again.base, without.aligned.until, before.noise, near, progress)
+
+    def go_on(before: NoiseEstimate) -> NoiseEstimate:
+        if not same:
+            return estimate(before)
+        # the points known rest on the start before, and a filter from the new one may diverge: the likelier
+        near = estimate(before, before.get_linearisation(found.base))
+        try:
+            fresh = estimate(before)
+        except BREAKDOWN:
+            return near
+        best = max(near, fresh, key=lambda one: one.log_evidence)
+        return replace(best, passes=near.passes + fresh.passes)
+
+    best, rival = go_on(found.estimate), found.estimate.rival
+    total = found.estimate.passes + best.passes
+    if rival is not None:
+        rival = go_on(rival)
+        total = total + rival.passes
+    return without, replace(again, estimate=replace(best, rival=rival)).count(total)
+
+
+def _start_anew(
+    builder: ProblemBuilder, built: BuiltProblem, found: JointEstimate
+) -> tuple[BuiltProblem, JointEstimate]:
+    """The same with a start that depends on no constant as stated that is free."""
+    anew = builder.build_without(built, found.noise, parts=True, anew=True)
+    again = replace(found, stated=anew.problem, estimate=replace(found.estimate, whole_evidence=None))
+    if np.array_equal(anew.problem.t, built.problem.t):
+        return anew, again
+    best = estimate_noise(again.base, anew.aligned.until, found.estimate.noise)
+    return anew, replace(again, estimate=best).count(found.estimate.passes + best.passes)
+
+
+def _is_likelier(base: Problem, plain: NoiseModel, found: NoiseEstimate) -> bool:
+    """Whether the stated figures are more probable than the estimate, its prior included.
+
+    Both leave the same measurements out, so that the likelihoods compare.
+    """
+    problem = apply_noise(base, plain)
+    forward = refilter(problem, found.carry_points(base, problem), whole=False)
+    return float(np.sum(forward.log_likelihood)) > found.log_evidence
