@@ -30,7 +30,7 @@ quickly (ramps, bumps) front and rear axle are on different slopes, half a wheel
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import ClassVar
 
@@ -53,6 +53,7 @@ BODY = "slip_squat"
 ODOMETER_SCALE = "odometer_scale"
 ODOMETER_DELAY = "odometer_delay"
 NHC_ERROR, ODOMETER_ERROR = "nhc_error", "odometer_error"
+LONGEST_DELAY = 1.0  # s, of readings over a vehicle's bus or a phone's adapter, where the delay is not stated
 DELAY_SIGMAS = 4.0  # sigmas of the delay that the rows cover
 _SHORTEST_MEAN = 0.02  # s; the mean over a shorter interval carries no information
 _LINEAR_TYRES = 3.0  # m/s^2, lateral force up to which tyres behave linearly
@@ -362,6 +363,12 @@ class OdometerSpeed(Wheels):
             **s.outliers,
         )
 
+    def free_delay(self, value: Array, sigma: Array) -> OdometerSpeed:
+        """These rows with their delay (1,), s, as a parameter."""
+        others = (p for p in self.parameters if p.name != ODOMETER_DELAY)
+        delay = Parameter(ODOMETER_DELAY, value, sigma, "s")
+        return replace(self, parameters=(*others, delay), reach=LONGEST_DELAY)
+
     @cached_property
     def _read(self) -> Array:
         """(N,) mean of the readings over the interval of each row, m/s."""
@@ -374,6 +381,8 @@ class OdometerSpeed(Wheels):
         if ODOMETER_DELAY in parameters:  # the current speed is read `delay` later
             delay = np.minimum(np.maximum(parameters[ODOMETER_DELAY][:, 0], -self.reach), self.reach)
             read, by_delay = self.speed(self.begin[rows], self.end[rows], delay)
+            unread = np.isnan(read)  # beside gaps
+            read, by_delay = np.where(unread, self._read[rows], read), np.where(unread, 0.0, by_delay)
         else:
             read = self._read[rows]
         factor = np.maximum(1.0 + parameters[ODOMETER_SCALE][:, 0], _LEAST_FACTOR)

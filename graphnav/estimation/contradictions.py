@@ -1,5 +1,5 @@
 """Stated constants that the drive contradicts, and that are therefore estimated: the antenna's lever arm, delays of the
-fixes' stamps, and equal rates of the clocks of IMU and fixes.
+stamps of fixes and odometer, and equal rates of the clocks of IMU and fixes.
 
 A wrong lever arm rotates with the vehicle and contradicts every turn. Two crystals drift apart by up to some 1e-4, so
 that stamp errors grow throughout the drive. The test is one filter pass with all of these constants as parameters with
@@ -29,6 +29,7 @@ import numpy as np
 from scipy.special import chdtrc, chdtri
 
 from graphnav.constraints.antenna_motion import LEVER_ARM, LINEAR_OFFSET
+from graphnav.constraints.base import Constraint
 from graphnav.constraints.gnss import (
     CLOCK_RATE,
     OFFSETS,
@@ -38,6 +39,7 @@ from graphnav.constraints.gnss import (
     GnssVelocity,
     free_constants,
 )
+from graphnav.constraints.vehicle import ODOMETER_DELAY, OdometerSpeed
 from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM
@@ -55,7 +57,10 @@ Freed = Mapping[str, FreedConstant]  # by the parameter's name
 
 # 1-sigma of a component before the drive. An arm, m: how large a car is. An offset, s: where stamps are moved instead.
 # A rate, s/s: crystals are good to 1e-4, ceramic resonators to 5e-3
-PRIOR_SIGMA = {LEVER_ARM: 2.0, TIME_OFFSET: LINEAR_OFFSET, VELOCITY_TIME_OFFSET: LINEAR_OFFSET, CLOCK_RATE: 1e-3}
+PRIOR_SIGMA = {
+    LEVER_ARM: 2.0, TIME_OFFSET: LINEAR_OFFSET, VELOCITY_TIME_OFFSET: LINEAR_OFFSET, ODOMETER_DELAY: LINEAR_OFFSET,
+    CLOCK_RATE: 1e-3,
+}  # fmt: skip
 _BY_CHANCE = chdtrc(1, 3.0**2)  # probability of three sigmas
 _SIZES = np.geomspace(0.01, 1.0, 24)  # of errors of a constant of several numbers, in the 1-sigmas above
 _WIDER = 2.0  # prior sigma of a freed constant, in sigmas of its estimate
@@ -67,11 +72,13 @@ def free(problem: Problem, freed: Freed) -> Problem:
     if not freed:
         return problem
     priors = {name: (np.array(one.value), np.array(one.sigma)) for name, one in freed.items()}
-    rows = [
-        free_constants(one, priors) if isinstance(one, GnssPosition | GnssVelocity) else one
-        for one in problem.constraints
-    ]
-    return replace(problem, constraints=tuple(rows))
+
+    def free_rows(rows: Constraint) -> Constraint:
+        if isinstance(rows, OdometerSpeed) and ODOMETER_DELAY in priors:
+            return rows.free_delay(*priors[ODOMETER_DELAY])
+        return free_constants(rows, priors) if isinstance(rows, GnssPosition | GnssVelocity) else rows
+
+    return replace(problem, constraints=tuple(map(free_rows, problem.constraints)))
 
 
 def use_freed(recording: Recording, freed: Freed, since: float) -> Recording:
@@ -83,7 +90,8 @@ def use_freed(recording: Recording, freed: Freed, since: float) -> Recording:
     """
     value = {name: one.value for name, one in freed.items()}
     late, of_velocities, rate = (value.get(name, (0.0,))[0] for name in (TIME_OFFSET, VELOCITY_TIME_OFFSET, CLOCK_RATE))
-    moved = move_stamps(recording, StampOffsets(late, of_velocities, rate=rate, since=since))
+    delay = value.get(ODOMETER_DELAY, (0.0,))[0]
+    moved = move_stamps(recording, StampOffsets(late, of_velocities, rate=rate, since=since, odometer=-delay))
     if moved.gnss is None or LEVER_ARM not in value:
         return moved
     return replace(moved, gnss=replace(moved.gnss, lever_arm=np.array(value[LEVER_ARM])))
@@ -94,7 +102,8 @@ def widen(problem: Problem, names: Collection[str]) -> dict[str, FreedConstant]:
 
     Parameters
     ----------
-    names : constants to test. Excluded are all without fixes, exact offsets, and a lever arm that has a prior already.
+    names : constants to test. Excluded are all without fixes, exact offsets, and a lever arm or a delay of the odometer
+        that has a prior already.
     """
     rows = next((rows for rows in problem.constraints if isinstance(rows, GnssPosition)), None)
     if rows is None:
@@ -102,6 +111,8 @@ def widen(problem: Problem, names: Collection[str]) -> dict[str, FreedConstant]:
     stated: dict[str, Array] = {}
     if problem.recording.platform == "vehicle" and LEVER_ARM not in problem.parameters:
         stated[LEVER_ARM] = rows.lever_arm
+    if ODOMETER_DELAY not in problem.parameters and any(isinstance(one, OdometerSpeed) for one in problem.constraints):
+        stated[ODOMETER_DELAY] = np.zeros(1)
     stated |= {name: p.initial for name, p in problem.parameters.items() if name in OFFSETS.values()}
     if stated.keys() & OFFSETS.values():
         stated.setdefault(CLOCK_RATE, np.zeros(1))
@@ -293,6 +304,13 @@ def describe_freed(freed: Freed, recording: Recording) -> tuple[str, ...]:
             "[gnss]"
         )
         notes.append(Note("gnss.time_offset_used", sentence))
+    if ODOMETER_DELAY in freed:
+        late_by = freed[ODOMETER_DELAY].value[0]
+        sentence = (
+            f"odometer: the drive contradicts its stamps and is solved with readings {late_by:.3f} s late: take it off "
+            "them, or state delay_sigma in [odometer]"
+        )
+        notes.append(Note("odometer.delay_used", sentence))
     if CLOCK_RATE in freed:
         ppm = freed[CLOCK_RATE].value[0] * 1e6
         sentence = (

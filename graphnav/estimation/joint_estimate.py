@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from graphnav.config.gnss import GnssSettings
 from graphnav.constraints.antenna_motion import LEVER_ARM
 from graphnav.constraints.gnss import CLOCK_RATE, TIME_OFFSET, VELOCITY_TIME_OFFSET
+from graphnav.constraints.vehicle import ODOMETER_DELAY
 from graphnav.core.progress import Progress
 from graphnav.estimation.contradictions import (
     Freed,
@@ -170,7 +171,7 @@ def _free_constants(found: JointEstimate, settings: GnssSettings, *ways: _Estima
     passes, tested = found.estimate.passes + Counter(filter=1), found.estimate.noise
     names = set[str]() if settings.clock_rate_sigma == 0.0 else {CLOCK_RATE}
     if not is_offset_far(apply_noise(found.base, tested), found.estimate.points):
-        names |= {LEVER_ARM, TIME_OFFSET, VELOCITY_TIME_OFFSET}
+        names |= {LEVER_ARM, TIME_OFFSET, VELOCITY_TIME_OFFSET, ODOMETER_DELAY}
     try:
         freed = find_contradicted_constants(base, found.estimate, before, names)
         if not are_same(freed, before, base):

@@ -21,7 +21,7 @@ import numpy as np
 from graphnav.config import Settings
 from graphnav.constraints.base import SAME_TIME, TypicalSigmas
 from graphnav.constraints.lasting import find_fix_period, find_node_spacing
-from graphnav.constraints.vehicle import DELAY_SIGMAS
+from graphnav.constraints.vehicle import DELAY_SIGMAS, ODOMETER_DELAY
 from graphnav.core.earth import LocalFrame
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, States
@@ -213,8 +213,11 @@ class Tracker(Chain):
 
     def _is_covered(self, sensors: Sensors, t: float) -> bool:
         """Whether the odometer's rows reach as far as a keyframe needs them."""
-        o = sensors.setup.odometer
-        return o is None or sensors.odometer.newest >= t + DELAY_SIGMAS * o.delay_sigma
+        o, freed = sensors.setup.odometer, self.noise.freed.get(ODOMETER_DELAY)
+        if o is None:
+            return True
+        reach = DELAY_SIGMAS * o.delay_sigma if freed is None else freed.value[0] + DELAY_SIGMAS * freed.sigma[0]
+        return sensors.odometer.newest >= t + max(reach, 0.0)
 
     def _prepare(self, sensors: Sensors, expected: float) -> None:
         """Build and predict the expected keyframe, except for the fix."""

@@ -13,6 +13,7 @@ from graphnav import run
 from graphnav.config import parse_settings
 from graphnav.constraints.antenna_motion import LEVER_ARM
 from graphnav.constraints.gnss import CLOCK_RATE, TIME_OFFSET
+from graphnav.constraints.vehicle import ODOMETER_DELAY
 from graphnav.core.earth import LocalFrame
 from graphnav.core.errors import EstimationError
 from graphnav.core.notes import get_key
@@ -179,6 +180,28 @@ def test_late_stamps_are_known_to_the_filter(drive, right, late):
     assert np.sqrt(np.mean((interpolate_path(found) - interpolate_path(right["ekf"]))[100:] ** 2)) < 0.1 * 10.0 * abs(
         late
     )
+
+
+@pytest.mark.parametrize("late", [-0.1, 0.2, 0.6])
+def test_an_odometer_whose_readings_are_late_is_read_earlier(drive, late):
+    """As accurate without fixes for a minute as if its readings were on time."""
+    wheels, _ = oracle.drive(oracle.vehicle_path(180.0, 50.0), seed=5, lever_arm=tuple(ARM), odometer_rate=20.0)
+    wheels = wheels.without("gnss", (80.0, 140.0))
+    delayed = replace(wheels, odometer=replace(wheels.odometer, t=wheels.odometer.t + late))
+    right, found, stated = (
+        run(one, solvers=("ekf", "rts"), noise=noise)
+        for one, noise in ((wheels, None), (delayed, None), (delayed, "stated"))
+    )
+    freed = found["rts"].noise.freed
+    assert set(freed) == {ODOMETER_DELAY}
+    assert not right["rts"].noise.freed
+    assert freed[ODOMETER_DELAY].value[0] == pytest.approx(late, abs=min(4.0 * freed[ODOMETER_DELAY].sigma[0], 0.02))
+    assert "odometer.delay_used" in map(get_key, found["rts"].notes)
+    for name in ("ekf", "rts"):
+        apart, before = (
+            np.max(np.linalg.norm(x[name].states.p - right[name].states.p, axis=1)) for x in (found, stated)
+        )
+        assert apart < 0.2 * before
 
 
 def test_an_arm_that_is_wrong_in_one_number_is_not_trusted_in_the_others(drive):

@@ -17,6 +17,7 @@ from graphnav.app.workflow import list_unused_noise
 from graphnav.config import Settings
 from graphnav.constraints.antenna_motion import LEVER_ARM
 from graphnav.constraints.gnss import CLOCK_RATE
+from graphnav.constraints.vehicle import ODOMETER_DELAY
 from graphnav.core.earth import LocalFrame
 from graphnav.core.errors import ConfigError
 from graphnav.core.notes import get_key
@@ -44,6 +45,7 @@ def some_noise(seed: int = 0) -> NoiseModel:
         freed={
             LEVER_ARM: FreedConstant(tuple(rng.normal(size=3).tolist()), tuple(rng.uniform(0.001, 0.1, 3).tolist())),
             CLOCK_RATE: FreedConstant((float(rng.normal(0.0, 1e-4)),), (float(rng.uniform(1e-6, 1e-5)),)),
+            ODOMETER_DELAY: FreedConstant((float(rng.normal(0.0, 0.1)),), (float(rng.uniform(0.001, 0.01)),)),
         },
     )
 
@@ -150,6 +152,11 @@ BAD = {
     ),
     "two rates": (changed("noise/clock_rate/value", [0.0, 1.0]), "key.value", ("clock_rate.value'", "[0.0, 1.0]")),
     "rate of a stopped clock": (changed("noise/clock_rate/value", [-1.0]), "key.value", ("clock_rate.value'", "-1.0")),
+    "readings of an hour ago": (
+        changed("noise/odometer_delay", {"value": [3600.0], "sigma": [0.01]}),
+        "key.value",
+        ("odometer_delay.value'", "[3600.0]"),
+    ),
     "half a span": (changed("noise/excluded/nhc", [[1.0]]), "key.value", ("excluded.nhc'", "[1.0]")),
     "backward span": (changed("noise/excluded/nhc", [[2.0, 1.0]]), "key.value", ("excluded.nhc'", "[2.0, 1.0]")),
 }

@@ -27,6 +27,7 @@ import graphnav
 from graphnav.app import cli, cli_online
 from graphnav.config import Settings, parse_settings
 from graphnav.constraints.antenna_motion import LEVER_ARM
+from graphnav.constraints.vehicle import ODOMETER_DELAY
 from graphnav.core.errors import ConfigError, GraphnavError, RecordingError
 from graphnav.core.notes import get_key
 from graphnav.core.trajectory import Trajectory
@@ -879,3 +880,26 @@ def test_a_lever_arm_that_the_drive_contradicts_is_found_while_it_lasts(engine: 
     assert online.tracker is not None
     assert list(online.tracker.noise.freed) == [LEVER_ARM]
     assert "gnss.lever_arm_used" in map(get_key, online.notes)
+
+
+@pytest.mark.parametrize("engine", ["window", "isam2"])
+def test_an_odometer_whose_readings_are_late_is_waited_for(engine: str) -> None:
+    """A keyframe is solved with the readings that came later than it by as much as they are late."""
+    late, path = 0.3, oracle.vehicle_path(150.0, 25.0)
+    recording, truth = oracle.drive(path, seed=6, odometer_rate=20.0)
+    assert recording.odometer is not None
+    wrong = replace(recording, odometer=replace(recording.odometer, t=recording.odometer.t + late))
+    online, parts = Online(drop_rows(wrong), parse_settings({"solver": {"lag": 20.0, "engine": engine}})), []
+    for row in list_rows(wrong)[1]:
+        online.add(row)
+        parts += online.settled()
+    online.finish()
+    track = joined([*parts, *online.settled()])
+    assert np.all(np.diff(track.t) > 0)
+    error, sd = (x[track.t > 120.0] for x in off(track, truth, recording))
+    assert np.mean((error / sd) ** 2) < 2.0
+    assert online.tracker is not None
+    freed = online.tracker.noise.freed
+    assert list(freed) == [ODOMETER_DELAY]
+    assert freed[ODOMETER_DELAY].value[0] == pytest.approx(late, abs=0.02)
+    assert "odometer.delay_used" in map(get_key, online.notes)
