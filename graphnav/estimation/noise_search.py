@@ -84,9 +84,9 @@ def find_noise(
     progress: Progress | None,
     passes: Counter[str],
     weigh: Weigh | None,
-) -> tuple[NoiseModel, BuiltProblem, float]:
-    """The noise model, the problem with a start and stops that rest on no excluded fix, and the logarithm of the
-    evidence where it is wanted.
+) -> tuple[NoiseModel, BuiltProblem, float, tuple[Points, Problem]]:
+    """The noise model, the problem with a start and stops that rest on no excluded fix, the logarithm of the evidence
+    where it is wanted, and the points of the estimate with the problem that they are of.
 
     Where the other measurements contradict stops, all is found anew without these.
 
@@ -121,11 +121,12 @@ def find_noise(
     plain = NoiseModel(excluded=best.noise.excluded, freed=joint.freed)
     likelier = _is_likelier(built.problem, plain, best)
     noise = plain if likelier else widen_by_tails(built.problem, joint.noise)
+    near = best.get_linearisation(built.problem)
     if noise.excluded:
         with contextlib.suppress(*BREAKDOWN):
-            noise, spent = weigh_excluded(built.problem, noise, best.get_linearisation(built.problem))
+            noise, spent = weigh_excluded(built.problem, noise, near)
             passes.update(filter=spent, smoother=spent)
-    return replace(noise, false_stops=unite_stops(false)), built, evidence
+    return replace(noise, false_stops=unite_stops(false)), built, evidence, near
 
 
 def _judge(passes: Counter[str], one: Estimated) -> Array:

@@ -37,7 +37,7 @@ from graphnav.estimation.noise_search import Weigh
 from graphnav.estimation.offsets import move_stamps
 from graphnav.estimation.pieces import describe_span, split_pieces
 from graphnav.estimation.preparation import Begun, Prepared, begin_preparation, prepare
-from graphnav.estimation.relinearisation import step_ahead
+from graphnav.estimation.relinearisation import CLEARLY_BETTER, step_ahead
 from graphnav.estimation.separation import compute_separation
 from graphnav.estimation.solution import KNOWN, Solution, join_solutions
 from graphnav.estimation.solvers.breakdown import explain_singular
@@ -57,7 +57,6 @@ from graphnav.recording.checks.clock import ClockOffsets
 from graphnav.recording.plausibility.screening import screen, state_findings
 
 SOLVERS = ("ekf", "rts", "batch")  # run when none is named
-_CLEARLY_BETTER = 10.0  # half chi-square; a likelihood ratio of 22,000
 
 Attempt = Callable[[Settings, NoiseModel | None], dict[str, Solution]]  # to solve with these
 
@@ -316,7 +315,7 @@ def _solve(
 
         out["isam2"] = one = isam2(problem, settings.solver.isam2_lag or np.inf, progress, begin)
         best = compute_cost_at(problem, smoothed)
-        if not settings.solver.isam2_lag and one.cost is not None and one.cost > best + _CLEARLY_BETTER:
+        if not settings.solver.isam2_lag and one.cost is not None and one.cost > best + CLEARLY_BETTER:
             note = Note(
                 "solver.worse_optimum",
                 f"isam2 converged to a worse optimum than rts (half chi-square {one.cost:.0f}, not {best:.0f}): do not "

@@ -50,6 +50,7 @@ from graphnav.estimation.solvers.linearise import Points, scale_at
 from graphnav.estimation.solvers.passes import (
     FilterPass,
     SmootherPass,
+    reuse_points,
 )
 from graphnav.estimation.solvers.rts import smooth_backward
 from graphnav.recording import Recording
@@ -209,10 +210,11 @@ def prepare(begun: Begun, progress: Progress | None = None, weigh: Weigh | None 
     """
     recording, builder, built, noise = begun.recording, begun.builder, begun.built, begun.noise
     settings, clock, passes, evidence = builder.settings, builder.clock, Counter(begun.passes), np.inf
+    near: tuple[Points, Problem] | None = None
     if begun.found is not None:
         tell("noise")
         with clock.count_time("noise"):
-            noise, built, evidence = find_noise(builder, (built, begun.found), progress, passes, weigh)
+            noise, built, evidence, near = find_noise(builder, (built, begun.found), progress, passes, weigh)
             noise = replace(noise, spacing=begun.spacing)
     elif noise is not None:
         if are_of_others(built.problem, noise):
@@ -241,7 +243,8 @@ def prepare(begun: Begun, progress: Progress | None = None, weigh: Weigh | None 
         if any(rows.gate is not None for rows in problem.constraints):
             smoothed = smooth_backward(problem, refilter(problem, smoothed, progress), progress)
         problem = problem.with_input_noise(smoothed.states, scale_at(problem.columns, smoothed.values))
-        forward, smoothed, ahead = relinearise(problem, aligned, forward, smoothed, progress, passes)
+        known = None if near is None else reuse_points(*near, problem)
+        forward, smoothed, ahead = relinearise(problem, aligned, forward, smoothed, progress, passes, known)
     passes.update(filter=1, smoother=1)
     notes = (*describe_freed(noise.freed, recording), *describe_noise(noise, problem), *_describe_missing(problem))
     epochs, arcs = dict[str, Array](), {"": CarrierArcs()}

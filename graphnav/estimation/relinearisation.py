@@ -26,6 +26,7 @@ from graphnav.estimation.solvers.passes import (
 from graphnav.estimation.solvers.rows import compute_cost_at
 from graphnav.estimation.solvers.rts import smooth_backward, smooth_points
 
+CLEARLY_BETTER = 10.0  # half chi-square; a likelihood ratio of 22,000
 _LINEAR = 0.5  # sigmas of what a step still moves: a mean square of errors over sigmas is a quarter larger
 _SMOOTHINGS = 5  # passes of filter and smoother about their previous points; without convergence a batch is solved
 
@@ -37,13 +38,35 @@ def relinearise(
     smoothed: SmootherPass,
     progress: Progress | None,
     passes: Counter[str],
+    known: Points | None = None,
 ) -> tuple[FilterPass, SmootherPass, Points | None]:
     """Filter and smooth about better points where the filter was linearised too far from the smoothed solution.
 
     Attitudes first (`_linearise_far`); where these stay, all else does if a step of Gauss and Newton from there moves
     nothing by a good part of its sigma: a barometer's scale times a height that was not known yet, a lever arm, a place
     that few fixes tell of. Returns also the points behind that step.
+
+    Parameters
+    ----------
+    known : points of another estimate, as that of the noise model. Where the result is clearly a worse optimum, as
+        that of a filter which diverged from an uncertain heading, the one near these points is the result.
     """
+    found = _relinearise(problem, aligned, forward, smoothed, progress, passes)
+    if known is None or compute_cost_at(problem, found[1]) < compute_cost_at(problem, known) + CLEARLY_BETTER:
+        return found
+    points = _minimise(problem, known, passes)
+    return _linearise_at(problem, aligned, points, progress, passes)
+
+
+def _relinearise(
+    problem: Problem,
+    aligned: Alignment,
+    forward: FilterPass,
+    smoothed: SmootherPass,
+    progress: Progress | None,
+    passes: Counter[str],
+) -> tuple[FilterPass, SmootherPass, Points | None]:
+    """The same from the filter's own points."""
     if not are_near(smoothed, forward.linearised, LINEAR_ATTITUDE):
         forward, smoothed, ahead = _linearise_far(problem, aligned, smoothed, progress, passes)
         if ahead is not None:

@@ -14,6 +14,7 @@ from graphnav.config import Settings, parse_settings
 from graphnav.config.gnss import GnssSettings
 from graphnav.constraints.base import Constraint
 from graphnav.constraints.gnss import STAMP_ERROR, STAMPS
+from graphnav.core import rotation
 from graphnav.core.earth import LocalFrame
 from graphnav.core.errors import EstimationError
 from graphnav.core.rotation import Array
@@ -27,7 +28,7 @@ from graphnav.estimation.noise import estimate
 from graphnav.estimation.noise.apply import apply_noise, drop_parts, select_weights
 from graphnav.estimation.noise.estimate import NoiseEstimate, estimate_noise
 from graphnav.estimation.noise.explanations import FIXES, WHEELS
-from graphnav.estimation.noise.initial_points import Initial, find_initial_points
+from graphnav.estimation.noise.initial_points import Initial, anneal, find_initial_points
 from graphnav.estimation.noise.model import STATED, NoiseModel, RowWeights, VarianceComponent
 from graphnav.estimation.noise.moments import (
     collect_imu_moments,
@@ -491,6 +492,22 @@ def test_an_estimate_that_cannot_begin_at_the_medians_begins_with_stated_noise(m
     monkeypatch.setattr(estimate, "find_initial_points", find)
     found = estimate_noise(base, opening)
     assert found.log_evidence == pytest.approx(usual.log_evidence, abs=0.05 * len(usual.noise.figures))
+
+
+@pytest.mark.parametrize("wrong", [90.0, 135.0])
+def test_annealing_finds_a_heading_that_is_far_off(wrong: float) -> None:
+    """While the heading is still wrong, half of the fixes look hundreds of metres off, and none is."""
+    base, opening = built(lap())
+    about = anneal(base, opening)[0].points.states
+    prior, far = base.prior, np.radians(wrong)
+    assert prior.mean is not None
+    mean = replace(prior.mean, R_nb=rotation.exp(np.array([[0.0, 0.0, far]])) @ prior.mean.R_nb)
+    sigma = prior.sigma.copy()
+    sigma[:, 2] = far
+    found, _ = anneal(replace(base, prior=replace(prior, mean=mean, sigma=sigma)), opening)
+    off = np.abs(found.points.states.minus(about))
+    assert np.max(off[:, :3]) < 0.01  # rad
+    assert np.max(off[:, 3:6]) < 0.1  # m
 
 
 # ---------------------------------------------------------------------------------------------------------- intervals

@@ -23,6 +23,7 @@ from graphnav.estimation.solvers.rts import smooth_points
 
 BREAKDOWN = EstimationError, np.linalg.LinAlgError  # errors of a filter with a numerically singular covariance
 _COOLING = 3.0  # factor by which the sigmas of an annealing fall in each round
+_STEPS = 20  # of Gauss and Newton in a round at most; residuals of a heading that is still wrong tell nothing
 _SETTLED = 1e-4  # sigmas by which linearisation points may be off without effect
 _SEARCHES = 5  # searches for gross outliers at most; in most drives the second finds the same ones
 
@@ -64,7 +65,7 @@ def find_initial_points(problem: Problem, opening: float | None) -> tuple[list[I
     try:
         plain = smooth_points(ekf(problem, opening=opening, stays=_SETTLED))
     except BREAKDOWN:  # outliers of hundreds of sigmas make its covariance numerically singular
-        initial, passes = _anneal(problem, opening)
+        initial, passes = anneal(problem, opening)
         return [initial], passes
     sound, about, passes = problem, plain, 1
     smoothed: SmootherPass | None = None
@@ -97,13 +98,13 @@ def _add_annealed(
 ) -> tuple[list[Initial], int]:
     """The initial points with annealed ones, if these do not break down, and all passes."""
     try:
-        annealed, more = _anneal(problem, opening)
+        annealed, more = anneal(problem, opening)
     except BREAKDOWN:
         return initials, passes
     return [*initials, annealed], passes + more
 
 
-def _anneal(problem: Problem, opening: float | None) -> tuple[Initial, int]:
+def anneal(problem: Problem, opening: float | None) -> tuple[Initial, int]:
     """Points and figures that are robust against outliers, by deterministic annealing, and the number of passes.
 
     The errors of fixes are assumed to be as large as they get, then a third of that in each round, with weights by the
@@ -120,11 +121,11 @@ def _anneal(problem: Problem, opening: float | None) -> tuple[Initial, int]:
         share = {c.name: 1.0 / (1.0 + (SIZES[c.unit] * wider / stated[c.name]) ** 2) for c in fixes}
         eased = weigh_rows(problem, {name: x * weights[name] for name, x in share.items()})
         if about is None:
-            about = smooth_points(ekf(eased, opening=opening))
-        else:
-            about = smooth_points(refilter(eased, about, whole=False))
-        about = smooth_points(refilter(eased, about, whole=False))
-        passes += 2
+            about, passes = smooth_points(ekf(eased, opening=opening)), 1
+        for _ in range(_STEPS):
+            before, about, passes = about, smooth_points(refilter(eased, about, whole=False)), passes + 1
+            if are_near(about, before):
+                break
         settled = not share or min(np.median(x) for x in share.values()) > 0.5
         for rows in fixes:
             error = linearise(rows, about, problem.columns)
