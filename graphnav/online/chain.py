@@ -40,7 +40,7 @@ from graphnav.estimation.solvers.stages import Message, Place
 from graphnav.estimation.solvers.window import SettledStates, Window, compute_turn_limit
 from graphnav.imu.dynamics import ImuFactors
 from graphnav.imu.preintegration import NOISE_FIGURES
-from graphnav.online.looks import Stops
+from graphnav.online.looks import SURE, Stops
 from graphnav.online.sensors import Sensors
 from graphnav.recording import Recording
 
@@ -112,6 +112,11 @@ class Chain:
     def stops(self) -> Array:
         """Spans (M, 2) between keyframes in which the vehicle, or the foot, is stationary, s."""
         return self._standing.spans
+
+    @property
+    def detected_until(self) -> float:
+        """Time up to which it is known where stops are, s."""
+        return self._standing.looked - SURE
 
     @property
     def times(self) -> Array:
