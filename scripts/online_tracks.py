@@ -9,6 +9,7 @@ import numpy as np
 from graphnav.config import Settings
 from graphnav.constraints.antenna_motion import LEVER_ARM
 from graphnav.constraints.gnss import CLOCK_RATE, TIME_OFFSET
+from graphnav.core.errors import GraphnavError
 from graphnav.core.rotation import Array
 from graphnav.core.trajectory import Trajectory
 from graphnav.evaluation.evaluate import AntennaCalibration
@@ -56,4 +57,6 @@ def run_online(recording: Recording, settings: Settings) -> tuple[Online, dict[s
             tracks["at once"].add([now], antenna)
     online.finish()
     tracks["settled"].add(online.settled(), antenna)
+    if not all(track.pieces for track in tracks.values()):
+        raise GraphnavError(f"not aligned before the end: {online.notes[-1] if online.notes else 'too few rows'}")
     return online, tracks
