@@ -7,6 +7,9 @@ Every drive is solved whole and in windows at random starts, with one sensor set
 that the recording states and every fix used, once with the defaults. Errors are against the drive's own truth; where
 it has none, against spans of fixes that are withheld. Rows go to the file as they come, and those that are there
 already are not solved again. Exit code 1 where a bound of `BOUNDS` is broken.
+
+With `--online window` or `--online isam2` each recording comes row by row instead: what is known at once takes the
+filter's place, what settles the smoother's.
 """
 
 from __future__ import annotations
@@ -19,14 +22,15 @@ import os
 import random
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from harm_verdict import BOUNDS, FLOOR, OF_ESTIMATED, Row, broken, compared, failures, key_of, metres, table
+from harm_verdict import BOUNDS, FLOOR, OF_ESTIMATED, ONLINE, Row, broken, compared, failures, key_of, metres, table
+from online_tracks import Track, run_online
 from scipy.stats import chi2
 
 import graphnav
@@ -35,9 +39,9 @@ from graphnav.config import parse_settings
 from graphnav.core.earth import LocalFrame
 from graphnav.core.interpolation import interpolate
 from graphnav.estimation.pipeline import SOLVERS
-from graphnav.estimation.solution import Solution
-from graphnav.evaluation.evaluate import find_truth
-from graphnav.evaluation.metrics import summarise
+from graphnav.estimation.solution import ConstraintRecord, ExcludedSpan
+from graphnav.evaluation.evaluate import evaluate_recording, find_truth
+from graphnav.evaluation.metrics import Metrics, summarise
 from graphnav.recording import Recording
 
 HERE = Path(__file__).resolve().parents[1]
@@ -77,20 +81,22 @@ SURE = chi2.isf(math.erfc(3.0 / math.sqrt(2.0)), 3)  # of three axes together, a
 TRUTH_GAP = 0.5  # s; between rows further apart braking at 3 m/s^2 bends the way by more than 3 * 0.5^2 / 8 = 0.1 m
 
 
-def settings_of(variant: str, sensors: str, doppler: bool = True) -> graphnav.Settings:
+def settings_of(variant: str, sensors: str, doppler: bool = True, engine: str | None = None) -> graphnav.Settings:
     """The settings of one cell of the table."""
     values: dict[str, dict[str, Any]] = {"gnss": {"velocity": doppler}}
     if sensors == "gnss":
         values["standstill"] = {"zero_velocity": False, "zero_rate": False, "held_position": False}
     values["vehicle"] = {"nhc": sensors != "gnss", "odometer": sensors == "+odometer"}
     values["noise"] = {"mode": variant}
+    if engine is not None:
+        values["solver"] = {"engine": engine}
     return parse_settings(values)
 
 
 # ------------------------------------------------------------------------------------------------------- what is solved
 @dataclass(frozen=True)
 class Job:
-    """One window of one drive with one sensor set and one variant of noise: three rows, one of each solver."""
+    """One window of one drive with one sensor set and one variant of noise: a row of each solver."""
 
     drive: str
     source: str
@@ -98,6 +104,11 @@ class Job:
     span: Span
     sensors: str
     variant: str
+    engine: str | None = None  # online
+
+    @property
+    def solvers(self) -> tuple[str, ...]:
+        return ONLINE if self.engine else SOLVERS
 
     def key(self, solver: str) -> tuple[str, ...]:
         return self.drive, self.window, self.sensors, self.variant, solver
@@ -143,7 +154,9 @@ def plan(options: argparse.Namespace) -> list[Job]:
         recording = load(source)
         for window, span in windows(recording, DRIVES[name].source, options):
             sets = SENSORS if recording.odometer is not None else SENSORS[:2]
-            cells += [[Job(name, source, window, span, sensors, variant) for variant in VARIANTS] for sensors in sets]
+            cells += [
+                [Job(name, source, window, span, sensors, v, options.online) for v in VARIANTS] for sensors in sets
+            ]
     if options.share < 1.0:
         picked = random.Random(options.seed).sample(range(len(cells)), max(1, round(options.share * len(cells))))
         cells = [cells[k] for k in sorted(picked)]
@@ -164,7 +177,7 @@ def solve(job: Job) -> list[Row]:
     drive, whole = DRIVES[job.drive], load(job.source)
     names = ("drive", "window", "sensors", "variant", "solver")
     rows: list[Row] = [
-        {**dict(zip(names, job.key(solver), strict=True)), "simulated": drive.simulated} for solver in SOLVERS
+        {**dict(zip(names, job.key(solver), strict=True)), "simulated": drive.simulated} for solver in job.solvers
     ]
     began = time.process_time()
     try:
@@ -175,34 +188,55 @@ def solve(job: Job) -> list[Row]:
         used = part
         for source, span in withheld:
             used = used.without(source, span)
+        settings = settings_of(job.variant, job.sensors, drive.doppler, job.engine)
         began = time.process_time()
-        solutions = graphnav.run(used, settings_of(job.variant, job.sensors, drive.doppler), SOLVERS)
-        seconds = time.process_time() - began
-        metrics = score(part, used, solutions, withheld)[0]
+        if job.engine is None:
+            solutions = graphnav.run(used, settings, SOLVERS)
+            seconds = time.process_time() - began
+            metrics = score(part, used, solutions, withheld)[0]
+            out = {
+                name: {**left_out(used, one.excluded, one.records["gnss_position"]), "seconds": round(seconds, 2)}
+                for name, one in solutions.items()
+            }
+        else:
+            online, tracks = run_online(used, settings)
+            seconds = time.process_time() - began
+            metrics = {name: evaluate_online(track, part, withheld) for name, track in tracks.items()}
+            false_stops = 0 if online.tracker is None else len(online.tracker.noise.false_stops)
+            more = {"seconds": round(seconds, 2), "false_stops": false_stops, "notes": online.notes}
+            out = dict.fromkeys(tracks, left_out(used, online.excluded) | more)
         for row in rows:
             said = summarise(metrics[row["solver"]])
             row |= {"h": said.get("h_rms_m"), "up": said.get("up_rms_m"), "nees": said.get("nees_p")}
-            row |= {**left_out(used, solutions[row["solver"]]), "seconds": round(seconds, 2)}
+            row |= out[row["solver"]]
     except Exception as error:  # another kind than GraphnavError is a bug; the table shows it and goes on
-        said = str(error) if isinstance(error, graphnav.GraphnavError) else f"{type(error).__name__}: {error}"
-        said = " ".join(said.split("\n\n")[0].split())
-        rows = [row | {"error": said, "seconds": round(time.process_time() - began, 2)} for row in rows]
+        words = str(error) if isinstance(error, graphnav.GraphnavError) else f"{type(error).__name__}: {error}"
+        words = " ".join(words.split("\n\n")[0].split())
+        rows = [row | {"error": words, "seconds": round(time.process_time() - began, 2)} for row in rows]
     return rows
 
 
-def left_out(recording: Recording, solution: Solution) -> Row:
+def evaluate_online(track: Track, recording: Recording, withheld: tuple[Withheld, ...]) -> Metrics:
+    """Errors of a trajectory that came out online."""
+    whole, antenna = track.join()
+    metrics = evaluate_recording(whole, recording, withheld=withheld, antenna=antenna)
+    assert metrics is not None
+    return metrics
+
+
+def left_out(recording: Recording, excluded: Iterable[ExcludedSpan], record: ConstraintRecord | None = None) -> Row:
     """How many fixes there are and are left out, and the same of those that the truth confirms (None without truth)."""
-    gnss, record = recording.gnss, solution.records["gnss_position"]
+    gnss = recording.gnss
     assert gnss is not None
     there = np.isfinite(gnss.llh).all(axis=1)
     out = np.zeros(len(gnss.t), dtype=bool)
-    for t in record.t[record.weight == 0.0]:
+    for t in record.t[record.weight == 0.0] if record is not None else ():
         out |= np.abs(gnss.t - t) < 1e-5
-    for fault in solution.excluded:
+    for fault in excluded:
         if fault.kind == "gnss_position":
             out |= (gnss.t >= fault.t_start - 1e-5) & (gnss.t <= fault.t_end + 1e-5)
     out &= there
-    velocities = sum(fault.count for fault in solution.excluded if fault.kind == "gnss_velocity")
+    velocities = sum(fault.count for fault in excluded if fault.kind == "gnss_velocity")
     found: Row = {"fixes": int(there.sum()), "left_out": int(out.sum()), "left_out_velocities": velocities}
     reference = find_truth(recording)
     if reference is None:
@@ -221,7 +255,7 @@ def left_out(recording: Recording, solution: Solution) -> Row:
 def run(jobs: list[Job], path: Path, rows: list[Row], processes: int) -> list[Row]:
     """All rows: those that are there, and those of the jobs that are not, written as they come."""
     have = {key_of(row) for row in rows}
-    todo = [job for job in jobs if job.key(SOLVERS[0]) not in have]
+    todo = [job for job in jobs if job.key(job.solvers[0]) not in have]
     pool = multiprocessing.get_context("spawn").Pool(processes) if processes > 1 and len(todo) > 1 else None
     try:
         for k, new in enumerate(pool.imap(solve, todo) if pool else map(solve, todo), 1):
@@ -251,6 +285,7 @@ def options_of(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--share", type=float, default=1.0, help="of all cells, drawn by the seed")
     parser.add_argument("--seed", type=int, default=1, help="of where windows start, and of the share")
     parser.add_argument("--only", choices=VARIANTS, help="solve with one noise only")
+    parser.add_argument("--online", choices=("window", "isam2"), help="row by row, with this engine")
     parser.add_argument("--jobs", type=int, default=1, help="processes")
     parser.add_argument("--compare", type=Path, metavar="OLD.json", help="the rows of an earlier run")
     options = parser.parse_args(arguments)
@@ -284,7 +319,7 @@ def main(arguments: list[str] | None = None) -> int:
     except graphnav.GraphnavError as error:
         print(error, file=sys.stderr)
         return 2
-    wanted = {job.key(solver) for job in jobs for solver in SOLVERS}
+    wanted = {job.key(solver) for job in jobs for solver in job.solvers}
     todo = [job for job in jobs if options.only in (None, job.variant)]
     rows = [row for row in run(todo, options.output, rows, options.jobs) if key_of(row) in wanted]
     print("\n".join(table(rows)))

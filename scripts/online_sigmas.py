@@ -24,10 +24,10 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
 import oracle
 from benchmark_online import estimate
+from online_tracks import run_online
 
 from graphnav import load, run
 from graphnav.config import Settings, parse_settings
-from graphnav.constraints.antenna_motion import LEVER_ARM
 from graphnav.core.earth import LocalFrame
 from graphnav.core.trajectory import Trajectory
 from graphnav.estimation.noise.apply import apply_noise
@@ -35,7 +35,6 @@ from graphnav.estimation.solvers.ekf import refilter
 from graphnav.evaluation.against import find_antenna_lever_arm
 from graphnav.evaluation.evaluate import find_truth
 from graphnav.evaluation.scoring import compute_errors
-from graphnav.online import Online, drop_rows, list_rows, live_trajectory
 from graphnav.recording import Recording
 
 LASTING = ((0.25, 3.0), (0.5, 100.0), (0.5, 3600.0))  # share of the stated variance, and correlation time, s
@@ -85,8 +84,8 @@ def simulated(kind: str, seed: int, seconds: float) -> Recording:
 def tabulate(name: str, kind: str, mode: str, drives: list[Recording]) -> None:
     found: dict[str, list[np.ndarray]] = {}
     for recording in drives:
-        for solver, tracks, arms in solve(recording, mode):
-            found.setdefault(solver, []).append(measure(tracks, arms, recording))
+        for solver, whole, arms in solve(recording, mode):
+            found.setdefault(solver, []).append(measure(whole, arms, recording))
     for solver, some in found.items():
         h, up, nees_h, nees_up = np.mean(some, axis=0)
         print(
@@ -95,46 +94,28 @@ def tabulate(name: str, kind: str, mode: str, drives: list[Recording]) -> None:
         )
 
 
-def solve(recording: Recording, mode: str) -> Iterator[tuple[str, list[Trajectory], list[np.ndarray]]]:
+def solve(recording: Recording, mode: str) -> Iterator[tuple[str, Trajectory, np.ndarray]]:
     """Filter and smoother offline, window and iSAM2 online, as they settle and at once; and the antenna's arms."""
-    assert recording.gnss is not None
     solutions = run(recording, parse_settings({"noise": {"mode": mode}}), ("ekf", "rts"))
     for solver, solution in solutions.items():
         arm = find_antenna_lever_arm(recording, solution)
         assert arm is not None
-        yield f"{solver}, offline", [solution.trajectory()], [arm]
+        yield f"{solver}, offline", solution.trajectory(), arm
     for engine in ("window", "isam2"):
-        online = Online(drop_rows(recording), parse_settings({"noise": {"mode": mode}, "solver": {"engine": engine}}))
-        settled, live, newest, known = [], [], -np.inf, recording.gnss.lever_arm
-        arms: tuple[list[np.ndarray], list[np.ndarray]] = [], []  # as they are when these come out
-        for row in list_rows(recording)[1]:
-            online.add(row)
-            if online.tracker is None or online.tracker.newest <= newest:
-                continue
-            newest = online.tracker.newest
-            state = online.tracker.window.newest
-            arm = state.get_value(LEVER_ARM) if LEVER_ARM in state.columns else known
-            settled += (some := online.settled())
-            arms[0].extend([arm] * len(some))
-            if (now := live_trajectory(online)) is not None:
-                live.append(now)
-                arms[1].append(arm)
-        online.finish()
-        settled += (some := online.settled())
-        yield f"{engine}, settled", settled, arms[0] + [arm] * len(some)
-        yield f"{engine}, at once", live, arms[1]
+        _, tracks = run_online(recording, parse_settings({"noise": {"mode": mode}, "solver": {"engine": engine}}))
+        for name, track in tracks.items():
+            whole, antenna = track.join()
+            assert antenna.lever_arm is not None
+            yield f"{engine}, {name}", whole, antenna.lever_arm
 
 
-def measure(tracks: list[Trajectory], arms: list[np.ndarray], recording: Recording) -> np.ndarray:
+def measure(whole: Trajectory, arms: np.ndarray, recording: Recording) -> np.ndarray:
     """(4,) mean squares of horizontal and upward errors, and NEES of both per degree of freedom."""
     truth, of = find_truth(recording) or (None, None)
     assert truth is not None
-    names = ("t", "llh", "v", "rph", "sd_p", "sd_v", "sd_rph", "covariance")
-    whole = Trajectory(**{name: np.concatenate([getattr(track, name) for track in tracks]) for name in names})
     k = np.clip(np.searchsorted(truth.t, whole.t), 1, len(truth.t) - 1)
     near = whole.t[(whole.t <= truth.t[-1]) & (truth.t[k] - truth.t[k - 1] < DENSE)]
-    arm = np.concatenate([np.tile(arm, (len(track.t), 1)) for arm, track in zip(arms, tracks, strict=True)])
-    found = compute_errors(whole, truth, lever_arm=None if of is None else arm, at=near)
+    found = compute_errors(whole, truth, lever_arm=None if of is None else arms, at=near)
     e = np.nanmean(np.column_stack([found.p**2, found.nees_axis]), axis=0)
     return np.array([e[0] + e[1], e[2], 0.5 * (e[3] + e[4]), e[5]])
 

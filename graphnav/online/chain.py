@@ -40,7 +40,7 @@ from graphnav.estimation.solvers.stages import Message, Place
 from graphnav.estimation.solvers.window import SettledStates, Window, compute_turn_limit
 from graphnav.imu.dynamics import ImuFactors
 from graphnav.imu.preintegration import NOISE_FIGURES
-from graphnav.online.looks import Stops
+from graphnav.online.looks import SURE, Stops
 from graphnav.online.sensors import Sensors
 from graphnav.recording import Recording
 
@@ -78,6 +78,7 @@ class Chain:
         self.head = t0  # time of the message before the window, or of the first keyframe while it is in the window
         self.opened = False  # whether the first keyframe has left the window
         self.verdicts = Verdicts({}, {})  # mask of the fixes in use
+        self.judged = -np.inf  # s, up to where the noise model tells which fixes are wrong, by evidence
         self._standing = Stops(noise.false_stops)
         self._nodes: list[dict[str, float]] = []  # per stage, when each parameter's node began
         self._head_nodes: dict[str, float] = {}
@@ -114,6 +115,11 @@ class Chain:
         return self._standing.spans
 
     @property
+    def detected_until(self) -> float:
+        """Time up to which it is known where stops are, s."""
+        return self._standing.looked - SURE
+
+    @property
     def times(self) -> Array:
         """Times of all keyframes at the ends of intervals in the window, s."""
         t = self.window.t
@@ -145,9 +151,10 @@ class Chain:
 
     # ------------------------------------------------------------------------------------------ entering, leaving
     def _watch(self, problem: Problem, sensors: Sensors) -> None:
-        """Start to watch the fixes for lasting errors, once their period is known."""
+        """Start to watch the fixes for lasting errors, behind those judged by evidence, once their period is known."""
         if (
             self.window.newest.tests is not None
+            or problem.t[-1] <= self.judged + SAME_TIME
             or self.settings.gnss.faults == "off"
             or len(sensors.gnss.used) < _FEWEST_FOR_PERIOD
         ):

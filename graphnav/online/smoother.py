@@ -42,7 +42,6 @@ _STEP_DETECTION = 0.5  # s between detections of steps in a walk
 _FINAL_STOPS = 4.0  # s before the newest keyframe up to which the stops are final
 _TRY = 2.0  # s between attempts at an alignment
 _LEVELLING_SPAN = 5.0  # s of rest that determine the level of a vehicle without GNSS
-_ESTIMATED_AFTER = 120.0  # s of rows after which the noise model is estimated again
 _PATIENCE = 300.0  # s of rows kept while there is no motion to align with
 
 
@@ -268,10 +267,10 @@ class Smoother:
         self._notes_on[matter] = words
 
     def _estimate_again(self, found: Alignment, tracker: Tracker) -> None:
-        """Estimate the noise model again before a state settles, then from ever more rows until they suffice."""
+        """Estimate the noise model again from ever more rows until they suffice."""
         span = tracker.newest - self._began
         enough = are_enough(self.sensors, found, span)
-        if not enough and span < max(min(self.settings.solver.lag, _ESTIMATED_AFTER), 2.0 * self._estimated_from):
+        if not enough and span < 2.0 * self._estimated_from:
             return
         self._estimated_from = span
         self._found = None if enough else found
@@ -295,12 +294,12 @@ class Smoother:
         self._replace_notes("noise", found.notes)
         self._take_findings(found.doubts)
         self._left_out = tuple(fault for fault in found.excluded if fault.kind not in FIXES)
-        noise = found.keep_false_stops(tracker.noise)
+        noise, until = found.keep_false_stops(tracker.noise), float(estimation.task.times[-1])
         if tracker.opened and not found.anew:
-            self._catch_up = CatchUp(tracker.restart_settled(noise, self._setup))
+            self._catch_up = CatchUp(tracker.restart_settled(noise, self._setup, until))
         else:
             again = self._track(found.start, self._began, noise)
-            again.adopt(tracker, found.stationary, float(estimation.task.times[-1]), self._times)
+            again.adopt(tracker, found.stationary, until, self._times)
             self._catch_up = CatchUp(again, self._times)
             if self._found is not None:
                 self._found = found.start

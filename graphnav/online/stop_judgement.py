@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from graphnav.config import Settings
+from graphnav.constraints.base import SAME_TIME
 from graphnav.constraints.gnss import GnssPosition
 from graphnav.core.earth import LocalFrame
 from graphnav.core.rotation import Array
@@ -23,6 +24,9 @@ from graphnav.estimation.noise.apply import apply_noise
 from graphnav.estimation.noise.false_stops import find_false_stops, leave_out_false_stops, unite_stops
 from graphnav.estimation.noise.initial_points import BREAKDOWN
 from graphnav.estimation.noise.model import NoiseModel
+from graphnav.estimation.noise.moments import collect_row_moments
+from graphnav.estimation.noise.outliers import list_reduced
+from graphnav.estimation.noise.tails import get_tail_index, weigh_outlying
 from graphnav.estimation.problem import Problem, build_problem
 from graphnav.estimation.solvers.ekf import ekf
 from graphnav.estimation.solvers.passes import SmootherPass
@@ -60,9 +64,20 @@ class StopTask:
 
         def judge(one: tuple[Problem, Problem, SmootherPass, Array]) -> Array:
             base, used, smoothed, stationary = one
-            return find_false_stops(base, self.noise, (smoothed, used), stationary)[0]
+            return find_false_stops(base, self._weigh(used, smoothed), (smoothed, used), stationary)[0]
 
         return leave_out_false_stops(self._solve(None, NONE), judge, self._solve)[1]
+
+    def _weigh(self, used: Problem, smoothed: SmootherPass) -> NoiseModel:
+        """The noise model with weights for rows in the tails since it was estimated: one wrong fix outweighs a stop."""
+        weights = dict(self.noise.weights)
+        for rows in used.constraints:
+            if rows.list_noise_groups()[0] and not rows.of_stops and len(rows):
+                left_out, m = collect_row_moments(used, rows, smoothed, len(rows)).left_out, len(rows.axes)
+                before = np.ones(len(rows)) if rows.weight is None else rows.weight
+                weight = np.minimum(before, weigh_outlying(left_out, m, get_tail_index({}, rows.name, m)))
+                weights[rows.name] = list_reduced(used.t[rows.keyframe], weight, before > 0.0)
+        return replace(self.noise, weights=weights)
 
     def _solve(self, _: object, false: Array) -> tuple[Problem, Problem, SmootherPass, Array]:
         """The window without false stops, with stated noise; as it is solved, and its solution; and the stops."""
@@ -129,6 +144,8 @@ def _can_judge(tracker: Tracker) -> bool:
 
 def _describe(sensors: Sensors, tracker: Tracker) -> StopTask:
     times, head, noise = tracker.times, tracker.window.head, tracker.noise
+    # behind these a stop may go on: fixes there are no more to be believed than those in it
+    times = times[times <= tracker.detected_until + SAME_TIME]
     recording = cut_around(sensors, float(times[0]), float(times[-1]) + ROWS_AFTER)
     excluded = {name: list(spans) for name, spans in noise.excluded.items()}
     for fault in tracker.excluded:

@@ -289,15 +289,18 @@ class Tracker(Chain):
         self._motions = {t: one for t, one in self._motions.items() if t > self.head - CONTEXT}
         forget_rows(self.window.stages)
 
-    def restart_settled(self, noise: NoiseModel, setup: Recording) -> Tracker:
-        """A tracker with another noise model, with the settled states of this one and no keyframes since."""
+    def restart_settled(self, noise: NoiseModel, setup: Recording, judged: float = -np.inf) -> Tracker:
+        """A tracker with this one's settled states, and a noise model that may tell of fixes until `judged` (s)."""
         other, head = copy.copy(self), self.window.head
         other.noise, other._parameters, other.verdicts = noise, {}, copy.deepcopy(self.verdicts)
-        if moving := set(noise.false_stops) - set(self.noise.false_stops):
-            other.verdicts.readmit(min(moving)[0])
+        since = [begin for begin, _ in set(noise.false_stops) - set(self.noise.false_stops)]
+        if judged > self.judged:
+            other.judged, since = judged, [self.head + SAME_TIME]
+        if since:
+            other.verdicts.readmit(min(since))
         other.window = type(self.window)(head.move(head.estimate), find_turn(setup, noise))
-        other._nodes, other._held, other._motions, other.settled, other._ahead = [], [], {}, [], None
-        other._settling = False
+        other._nodes, other._held, other._motions, other.settled = [], [], {}, []
+        other._ahead, other._settling = None, False
         other._standing, other._readings = self._standing.without(noise.false_stops), copy.copy(self._readings)
         other._readings.revised = False
         return other
@@ -309,13 +312,14 @@ class Tracker(Chain):
 
     def adopt(self, other: Tracker, stationary: Array, until: float, settled: Sequence[float]) -> None:
         """Take over detections and counts of another tracker, except the stops up to a time, which were detected
-        anew; `settled` are its keyframes before its window, s.
+        anew, as was which fixes are wrong; `settled` are its keyframes before its window, s.
         """
         self._standing = other._standing.without(self.noise.false_stops)
         self._readings = copy.copy(other._readings)
         before, after = clip_spans(stationary, self.head, until - SURE), clip_spans(other.stops, until - SURE, np.inf)
         spans = merge_spans(np.concatenate([before, after]), gap=SAME_TIME)
         self._standing.replace(spans, np.concatenate([settled, other.times]))
+        self.judged = until
 
     def rewind(self, t: float, other: Tracker) -> None:
         """Remove the keyframes from a time on, where another tracker has redone them with different stops."""

@@ -195,8 +195,8 @@ class Walker(Tracker):
         if np.isfinite(t):
             self._renewal = _Renewal()
 
-    def restart_settled(self, noise: NoiseModel, setup: Recording) -> Tracker:
-        other = super().restart_settled(noise, setup)
+    def restart_settled(self, noise: NoiseModel, setup: Recording, judged: float = -np.inf) -> Tracker:
+        other = super().restart_settled(noise, setup, judged)
         assert isinstance(other, Walker)
         other._work, other._renewal = None, _Renewal()
         return other

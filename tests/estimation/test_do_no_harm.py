@@ -181,9 +181,7 @@ def counts(script, recording, first, last, weight=None):
     t = recording.gnss.t
     record = SimpleNamespace(t=t, weight=np.ones(len(t)) if weight is None else weight)
     fault = ExcludedSpan("gnss_position", t[first], t[last], last - first + 1)
-    return script.left_out(
-        recording, SimpleNamespace(records={"gnss_position": record}, excluded=(fault,) if weight is None else ())
-    )
+    return script.left_out(recording, (fault,) if weight is None else (), record)
 
 
 def test_fixes_that_the_truth_confirms_are_told_from_others(script, tokyo):
@@ -302,7 +300,7 @@ def test_fixes_before_a_step_may_be_the_wrong_ones(script, shared_data, start, s
     part = whole.crop(start, start + 100.0)
     part = part if sensors == "+odometer" else part.without("odometer")
     found = graphnav.run(part, script.settings_of("estimated", sensors), ("ekf",))["ekf"]
-    counted = script.left_out(part, found)
+    counted = script.left_out(part, found.excluded, found.records["gnss_position"])
     assert counted["left_out"] > 0
     assert counted["confirmed_left_out"] <= 0.01 * counted["confirmed"]
 

@@ -92,3 +92,16 @@ def test_a_stop_at_speed_is_taken_back_before_anything_settles_by_it(
         _, same = play(recording, checkpoints=True)
         a, b = (np.concatenate([track.llh for track in some]) for some in (found, same))
         np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize("step", [1.3, 1.8])
+def test_a_step_of_the_fixes_at_a_true_stop_does_not_take_it_back(shared_data: Path, step: float) -> None:
+    """As of wrongly fixed integers: much larger than the errors of the fixes, no larger than they are stated to be."""
+    part = load(shared_data / "oracle_drive" / "recording.toml").crop(160.0, 312.0)
+    assert part.gnss is not None
+    frame, sd = LocalFrame(part.gnss.llh[0]), 10.0 * part.gnss.sd
+    moved = frame.from_llh(part.gnss.llh) + step * np.array([-0.7, 0.7, -1.4]) * sd * (part.gnss.t > 291.5)[:, None]
+    online, _ = play(replace(part, gnss=replace(part.gnss, llh=frame.to_llh(moved), sd=sd)))
+    assert online.tracker is not None
+    assert np.any((online.tracker.stops[:, 0] < 296.0) & (online.tracker.stops[:, 1] > 305.0))  # from 293 on
+    assert online.tracker.noise.false_stops == ()
