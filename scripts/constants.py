@@ -112,6 +112,7 @@ CONSTANTS = (
         "_LINEAR",
         "sigmas of a step: a quarter more mean square of errors over sigmas",
     ),
+    Constant("graphnav.estimation.relinearisation", "CLEARLY_BETTER", "half chi-square: a likelihood ratio of 22,000"),
     Constant(
         "graphnav.estimation.contradictions", "_WIDER", "sigmas: a drive's own estimate counts a quarter too much"
     ),
