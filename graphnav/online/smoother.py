@@ -19,7 +19,7 @@ from graphnav.core.notes import Note
 from graphnav.core.trajectory import Trajectory
 from graphnav.detectors.base import describe_false_stops
 from graphnav.estimation.alignment import Alignment
-from graphnav.estimation.faults.watch import OLDEST
+from graphnav.estimation.faults.watch import OLDEST, PATIENCE
 from graphnav.estimation.noise.explanations import FIXES
 from graphnav.estimation.noise.model import STATED, NoiseModel
 from graphnav.estimation.pipeline import choose_origin
@@ -295,11 +295,12 @@ class Smoother:
         self._take_findings(found.doubts)
         self._left_out = tuple(fault for fault in found.excluded if fault.kind not in FIXES)
         noise, until = found.keep_false_stops(tracker.noise), float(estimation.task.times[-1])
+        judged = until - PATIENCE  # of a fault that has just begun, evidence may still know too little
         if tracker.opened and not found.anew:
-            self._catch_up = CatchUp(tracker.restart_settled(noise, self._setup, until))
+            self._catch_up = CatchUp(tracker.restart_settled(noise, self._setup, judged))
         else:
             again = self._track(found.start, self._began, noise)
-            again.adopt(tracker, found.stationary, until, self._times)
+            again.adopt(tracker, found.stationary, until, self._times, judged)
             self._catch_up = CatchUp(again, self._times)
             if self._found is not None:
                 self._found = found.start

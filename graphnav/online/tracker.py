@@ -310,16 +310,18 @@ class Tracker(Chain):
         """Whether the unsettled keyframes were built with figures of the odometer that are better known by now."""
         return self._readings.revised
 
-    def adopt(self, other: Tracker, stationary: Array, until: float, settled: Sequence[float]) -> None:
+    def adopt(
+        self, other: Tracker, stationary: Array, until: float, settled: Sequence[float], judged: float = -np.inf
+    ) -> None:
         """Take over detections and counts of another tracker, except the stops up to a time, which were detected
-        anew, as was which fixes are wrong; `settled` are its keyframes before its window, s.
+        anew, as was until `judged` (s) which fixes are wrong; `settled` are its keyframes before its window, s.
         """
         self._standing = other._standing.without(self.noise.false_stops)
         self._readings = copy.copy(other._readings)
         before, after = clip_spans(stationary, self.head, until - SURE), clip_spans(other.stops, until - SURE, np.inf)
         spans = merge_spans(np.concatenate([before, after]), gap=SAME_TIME)
         self._standing.replace(spans, np.concatenate([settled, other.times]))
-        self.judged = until
+        self.judged = judged
 
     def rewind(self, t: float, other: Tracker) -> None:
         """Remove the keyframes from a time on, where another tracker has redone them with different stops."""

@@ -155,7 +155,7 @@ BAD = {
     "readings of an hour ago": (
         changed("noise/odometer_delay", {"value": [3600.0], "sigma": [0.01]}),
         "key.value",
-        ("odometer_delay.value'", "[3600.0]"),
+        ("odometer_delay.value'", "3600.0"),
     ),
     "half a span": (changed("noise/excluded/nhc", [[1.0]]), "key.value", ("excluded.nhc'", "[1.0]")),
     "backward span": (changed("noise/excluded/nhc", [[2.0, 1.0]]), "key.value", ("excluded.nhc'", "[2.0, 1.0]")),
