@@ -123,6 +123,32 @@ def test_steps_find_a_scale_far_from_that_stated(exact: tuple[Recording, Traject
     np.testing.assert_allclose(linearize(scale).jacobians[ODOMETER_SCALE][:, :, 0], numerical, atol=1e-5)
 
 
+def test_late_readings_are_read_later_where_there_are_any(exact: tuple[Recording, Trajectory]) -> None:
+    """Its derivative is the numerical one; beside a gap, and at the end, the reading stays that without delay."""
+    recording, truth = exact
+    odometer, late, h = recording.odometer, 0.3, 1e-3
+    kept = (odometer.t < 60.0) | (odometer.t > 65.0)
+    delayed = replace(odometer, t=odometer.t[kept] + late, speed=odometer.speed[kept])
+    scene = scene_of(replace(recording, odometer=delayed), Settings())
+    rows = OdometerSpeed.build(scene).free_delay(np.zeros(1), np.ones(1))
+    states = truth_states(truth, scene.t[rows.keyframe], scene.frame)
+
+    def linearize(delay: float) -> Linearized:
+        values = {ODOMETER_SCALE: 1.0 / 1.01 - 1.0, ODOMETER_DELAY: delay}
+        given = {p.name: np.tile(values.get(p.name, p.initial), (len(rows), 1)) for p in rows.parameters}
+        return rows.linearize(states, given, slice(None))
+
+    read = (rows.end + late <= delayed.t[-1]) & ((rows.end < 60.0) | (rows.begin > 65.0))
+    assert 0 < np.sum(~read) < 10
+    right, stated = linearize(late), linearize(0.0)
+    assert np.abs(right.residual[read]).max() < 2e-3
+    assert np.abs(stated.residual[read]).max() > 0.1  # or it would show nothing
+    np.testing.assert_array_equal(right.residual[~read], stated.residual[~read])
+    numerical = (linearize(late + h).residual - linearize(late - h).residual)[read, 0] / (2.0 * h)
+    np.testing.assert_allclose(right.jacobians[ODOMETER_DELAY][read, 0, 0], numerical, atol=0.02)
+    assert not right.jacobians[ODOMETER_DELAY][~read].any()
+
+
 def test_mounting_angles_are_those_of_a_turned_imu(exact: tuple[Recording, Trajectory]) -> None:
     recording, truth, _ = mounted(*exact)
     assert np.abs(residual(NonHolonomic, recording, truth, {MOUNTING: MOUNT})).max() < 2e-4
