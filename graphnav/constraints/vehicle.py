@@ -1,4 +1,4 @@
-"""Constraints of wheels: no sideways or upward velocity, and the forward speed that the odometer measured.
+"""Constraints of wheels: no sideways or upward velocity; and what the forward speed (`constraints.odometer`) shares.
 
 Zhu 2020, eq. 10-19, with two differences. First, the constraint is on the mean velocity over the whole interval
 that ends at a keyframe, not on the velocity at one moment. Expressed by the state at the end, s seconds later, with
@@ -15,11 +15,6 @@ R_vb = Rz(-beta) Rx(alpha), and u_v = R_vb u = (right, forward, up)::
     up:       u_v,z - squat u_v,y a_y                 springs pitch the body under forward acceleration a_y
     forward:  u_v,y / (1 + k) - s                     s: mean of the odometer, k: its scale error
 
-The error is one of the reading s. As u_v,y - (1 + k) s it would vanish for k = -1 and an IMU that is mounted across,
-and its likelihood would lack the factor 1 + k of each reading, so that noise figures grew likelier by ending there. Its
-derivative by k is -u_v,y / (1 + k)^2; where the velocity is far off, as at the start, that would change the scale in
-place of the velocity, so it is taken near the reading.
-
 Both coefficients, the mounting angles (which wander: load, wind, the crown of the road), the forward place of the
 axle that does not slip, and the scale are estimated.
 
@@ -30,8 +25,7 @@ quickly (ramps, bumps) front and rear axle are on different slopes, half a wheel
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
-from functools import cached_property
+from dataclasses import dataclass, field
 from typing import ClassVar
 
 import numpy as np
@@ -45,26 +39,18 @@ from graphnav.core.state import SECONDS, Parameter, States
 from graphnav.imu.dynamics import SCALE, convert_to_biases, differentiate_by_scale, make_scale_parameter
 from graphnav.imu.preintegration import Intervals
 from graphnav.recording import Recording
-from graphnav.recording.odometer import MeanSpeed, ReadingStatistics, find_wrong_readings
 
 MOUNTING = "mounting"
 AXLE = "axle"
 BODY = "slip_squat"
-ODOMETER_SCALE = "odometer_scale"
-ODOMETER_DELAY = "odometer_delay"
-NHC_ERROR, ODOMETER_ERROR = "nhc_error", "odometer_error"
-LONGEST_DELAY = 1.0  # s, of readings over a vehicle's bus or a phone's adapter, where the delay is not stated
-DELAY_SIGMAS = 4.0  # sigmas of the delay that the rows cover
+NHC_ERROR = "nhc_error"
 _SHORTEST_MEAN = 0.02  # s; the mean over a shorter interval carries no information
 _LINEAR_TYRES = 3.0  # m/s^2, lateral force up to which tyres behave linearly
 _BEYOND = 0.1  # m/s of sideways speed per m/s^2 beyond that
 _AXLE_LEFT = 0.2  # m, uncertainty of the axle's place in a turn: front wheels steer, tyres have width
 _HALF_WHEELBASE = 1.3  # m
-_LEAST_FACTOR = 0.1  # of 1 + k: units are wrong by 3.6 at most, and a step may go further
-_NEAR = 3.0  # sigmas of a reading within which its derivative by the scale is that of the velocity
 _I2, _I3 = np.eye(2), np.eye(3)
 _E_Y = np.array([[0.0, 1.0, 0.0]])
-_FORWARD = _E_Y[None]
 _SIDE_UP, _UP = _I3[None, ::2], _I3[2]
 _BY_HEADING = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]])  # u @ this = (u_y, -u_x, 0)
 _BY_AXLE = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 0.0], [-1.0, 0.0, 0.0]])  # omega @ this = omega x e_y
@@ -297,105 +283,3 @@ class NonHolonomic(Wheels):
             of_turn = (by_bg, np.zeros_like(by_bg), self.past.force[rows], self.past.rate[rows])
             jacobians[SCALE][:, :1] += differentiate_by_scale(*of_turn, parameters[SCALE].shape[-1])
         return Linearized(residual - parameters[BODY] * effect, jacobians | lasting, self.sigma[rows])
-
-
-def average_speed(recording: Recording, settings: Settings) -> MeanSpeed | None:
-    """The odometer's mean speed over any intervals, without wrong readings; None where no odometer is used."""
-    odometer = recording.odometer
-    if recording.platform != "vehicle" or odometer is None or not settings.vehicle.odometer:
-        return None
-    figures = ReadingStatistics.of(odometer)
-    return MeanSpeed.of(odometer, find_wrong_readings(odometer, recording.imu, figures).spans, figures)
-
-
-@dataclass(frozen=True)
-class OdometerSpeed(Wheels):
-    """The forward speed that the odometer measured."""
-
-    name: ClassVar[str] = "odometer"
-    axes: ClassVar[tuple[str, ...]] = ("forward",)
-    noise_axes: ClassVar[tuple[str, ...]] = ("forward",)
-    unit: ClassVar[str] = "m/s"
-
-    begin: Array = field(default_factory=lambda: np.empty(0))  # interval of each row, s
-    end: Array = field(default_factory=lambda: np.empty(0))
-    speed: MeanSpeed | None = None
-    signed: bool = True  # False: it does not distinguish forwards from backwards
-    reach: float = 0.0  # s, the longest delay for which the readings of all rows are available
-    sigma: Array = field(default_factory=lambda: np.empty((0, 1)))
-
-    @classmethod
-    def build(cls, scene: BuildContext) -> OdometerSpeed | None:
-        s, odometer = scene.settings.vehicle, scene.recording.odometer
-        speed = scene.speed or average_speed(scene.recording, scene.settings)
-        if speed is None or odometer is None:
-            return None
-        rows, past = scene.moving_rows, scene.interval_motion
-        begin, end = scene.intervals.t0[rows], scene.intervals.t1[rows]
-        reach = DELAY_SIGMAS * odometer.delay_sigma
-        good = np.all([np.isfinite(speed(begin, end, d)[0]) for d in {-reach, 0.0, reach}], axis=0)
-        if not good.all():
-            rows, begin, end = rows[good], begin[good], end[good]
-            past = IntervalMotion.of(scene.intervals, rows, scene.frame)
-        if not len(rows):
-            return None
-        lever_arm, parameters = make_wheel_parameters(scene)
-        walk = s.scale_walk / np.sqrt(60.0)
-        parameters.append(Parameter(ODOMETER_SCALE, np.zeros(1), np.full(1, odometer.scale_sigma), "1", walk=walk))
-        if odometer.delay_sigma > 0:
-            parameters.append(Parameter(ODOMETER_DELAY, np.zeros(1), np.full(1, odometer.delay_sigma), "s"))
-        density = np.atleast_1d(
-            np.hypot(s.odometer_density, np.median(speed.compute_sigma(begin, end) * np.sqrt(end - begin)))
-        )
-        sigma = np.hypot(speed.compute_sigma(begin, end), s.odometer_density / np.sqrt(end - begin))
-        return cls(
-            keyframe=rows + 1,
-            past=past,
-            begin=begin,
-            end=end,
-            speed=speed,
-            signed=odometer.signed,
-            sigma=sigma[:, None],
-            reach=reach,
-            lever_arm=lever_arm,
-            parameters=tuple(parameters),
-            processes=(make_slow_error_parameter(ODOMETER_ERROR, density, cls),),
-            **s.outliers,
-        )
-
-    def free_delay(self, value: Array, sigma: Array) -> OdometerSpeed:
-        """These rows with their delay (1,), s, as a parameter."""
-        others = (p for p in self.parameters if p.name != ODOMETER_DELAY)
-        delay = Parameter(ODOMETER_DELAY, value, sigma, "s")
-        return replace(self, parameters=(*others, delay), reach=LONGEST_DELAY)
-
-    @cached_property
-    def _read(self) -> Array:
-        """(N,) mean of the readings over the interval of each row, m/s."""
-        assert self.speed is not None
-        return self.speed(self.begin, self.end)[0]
-
-    def linearize(self, states: States, parameters: dict[str, Array], rows: slice | Array) -> Linearized:
-        assert self.speed is not None
-        found = self._compute_velocity(states, parameters, rows)
-        if ODOMETER_DELAY in parameters:  # the current speed is read `delay` later
-            delay = np.minimum(np.maximum(parameters[ODOMETER_DELAY][:, 0], -self.reach), self.reach)
-            read, by_delay = self.speed(self.begin[rows], self.end[rows], delay)
-            unread = np.isnan(read)  # beside gaps
-            read, by_delay = np.where(unread, self._read[rows], read), np.where(unread, 0.0, by_delay)
-        else:
-            read = self._read[rows]
-        factor = np.maximum(1.0 + parameters[ODOMETER_SCALE][:, 0], _LEAST_FACTOR)
-        sign = np.ones(len(read)) if self.signed else np.where(found.u[:, 1] < 0.0, -1.0, 1.0)
-        A = (sign / factor)[:, None, None] * _FORWARD
-        residual = (sign / factor * found.u[:, 1] - read)[:, None]
-        jacobians = found.differentiate(A, parameters)
-        near = _NEAR * self.sigma[rows]
-        expected = read + np.clip(residual, -near, near)[:, 0]
-        jacobians[ODOMETER_SCALE] = -(expected / factor)[:, None, None]
-        if ODOMETER_DELAY in parameters:
-            jacobians[ODOMETER_DELAY] = -by_delay[:, None, None]
-        if ODOMETER_ERROR in parameters:
-            residual = residual + parameters[ODOMETER_ERROR]
-            jacobians[ODOMETER_ERROR] = np.ones((len(residual), 1, 1))
-        return Linearized(residual, jacobians, self.sigma[rows])

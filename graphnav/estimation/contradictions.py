@@ -39,7 +39,7 @@ from graphnav.constraints.gnss import (
     GnssVelocity,
     free_constants,
 )
-from graphnav.constraints.vehicle import ODOMETER_DELAY, OdometerSpeed
+from graphnav.constraints.odometer import ODOMETER_DELAY, OdometerSpeed
 from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from graphnav.config.gnss import GnssSettings
 from graphnav.constraints.antenna_motion import LEVER_ARM
 from graphnav.constraints.gnss import CLOCK_RATE, TIME_OFFSET, VELOCITY_TIME_OFFSET
-from graphnav.constraints.vehicle import ODOMETER_DELAY
+from graphnav.constraints.odometer import ODOMETER_DELAY
 from graphnav.core.progress import Progress
 from graphnav.estimation.contradictions import (
     Freed,

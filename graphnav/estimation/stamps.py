@@ -24,7 +24,7 @@ import numpy as np
 from graphnav.config import Settings
 from graphnav.constraints.antenna_motion import LINEAR_OFFSET
 from graphnav.constraints.gnss import CLOCK_RATE, TIME_OFFSET, VELOCITY_TIME_OFFSET, GnssPosition, GnssVelocity
-from graphnav.constraints.vehicle import ODOMETER_DELAY
+from graphnav.constraints.odometer import ODOMETER_DELAY
 from graphnav.core.notes import Note
 from graphnav.core.rotation import Array
 from graphnav.core.timescales import shift_stamps, shift_stamps_back

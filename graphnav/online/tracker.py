@@ -21,7 +21,7 @@ import numpy as np
 from graphnav.config import Settings
 from graphnav.constraints.base import SAME_TIME, TypicalSigmas
 from graphnav.constraints.lasting import find_fix_period, find_node_spacing
-from graphnav.constraints.vehicle import DELAY_SIGMAS, ODOMETER_DELAY
+from graphnav.constraints.odometer import DELAY_SIGMAS, ODOMETER_DELAY
 from graphnav.core.earth import LocalFrame
 from graphnav.core.rotation import Array
 from graphnav.core.state import DIM, States

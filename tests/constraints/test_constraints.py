@@ -16,8 +16,8 @@ from graphnav.constraints import list_constraints
 from graphnav.constraints.antenna_motion import LEVER_ARM, fit_force_line
 from graphnav.constraints.base import BuildContext, Constraint, assemble
 from graphnav.constraints.gnss import GnssPosition
+from graphnav.constraints.odometer import ODOMETER_SCALE
 from graphnav.constraints.prior import InitialPrior
-from graphnav.constraints.vehicle import ODOMETER_SCALE
 from graphnav.core import rotation as ro
 from graphnav.core.earth import LocalFrame
 from graphnav.core.state import BLOCKS, DIM, States

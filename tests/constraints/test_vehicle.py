@@ -12,15 +12,9 @@ from helpers import Array, truth_states
 
 from graphnav.config import Settings, parse_settings
 from graphnav.constraints.base import BuildContext, Linearized
+from graphnav.constraints.odometer import ODOMETER_DELAY, ODOMETER_SCALE, OdometerSpeed
 from graphnav.constraints.standstill import PLACE, HeldPosition, ZeroRate, ZeroVelocity
-from graphnav.constraints.vehicle import (
-    AXLE,
-    MOUNTING,
-    ODOMETER_DELAY,
-    ODOMETER_SCALE,
-    NonHolonomic,
-    OdometerSpeed,
-)
+from graphnav.constraints.vehicle import AXLE, MOUNTING, NonHolonomic
 from graphnav.core import rotation
 from graphnav.core.earth import EARTH_RATE, LocalFrame
 from graphnav.core.rotation import mv

@@ -13,7 +13,7 @@ from graphnav import run
 from graphnav.config import parse_settings
 from graphnav.constraints.antenna_motion import LEVER_ARM
 from graphnav.constraints.gnss import CLOCK_RATE, TIME_OFFSET
-from graphnav.constraints.vehicle import ODOMETER_DELAY
+from graphnav.constraints.odometer import ODOMETER_DELAY
 from graphnav.core.earth import LocalFrame
 from graphnav.core.errors import EstimationError
 from graphnav.core.notes import get_key

@@ -12,7 +12,7 @@ from helpers import Array, at_rate, dense, errors, factors, random_states, truth
 from replay import play_window
 
 from graphnav.config import parse_settings
-from graphnav.constraints.vehicle import OdometerSpeed
+from graphnav.constraints.odometer import OdometerSpeed
 from graphnav.core.earth import LocalFrame
 from graphnav.core.notes import get_key
 from graphnav.core.rotation import exp, right_jacobian_inverse

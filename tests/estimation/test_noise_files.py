@@ -17,7 +17,7 @@ from graphnav.app.workflow import list_unused_noise
 from graphnav.config import Settings
 from graphnav.constraints.antenna_motion import LEVER_ARM
 from graphnav.constraints.gnss import CLOCK_RATE
-from graphnav.constraints.vehicle import ODOMETER_DELAY
+from graphnav.constraints.odometer import ODOMETER_DELAY
 from graphnav.core.earth import LocalFrame
 from graphnav.core.errors import ConfigError
 from graphnav.core.notes import get_key

@@ -27,7 +27,7 @@ import graphnav
 from graphnav.app import cli, cli_online
 from graphnav.config import Settings, parse_settings
 from graphnav.constraints.antenna_motion import LEVER_ARM
-from graphnav.constraints.vehicle import ODOMETER_DELAY
+from graphnav.constraints.odometer import ODOMETER_DELAY
 from graphnav.core.errors import ConfigError, GraphnavError, RecordingError
 from graphnav.core.notes import get_key
 from graphnav.core.trajectory import Trajectory

@@ -19,7 +19,8 @@ from graphnav.config import Settings
 from graphnav.constraints.antenna_motion import LEVER_ARM
 from graphnav.constraints.foot import FOOT_AXIS, PATTERN, PIVOT, TRAVEL
 from graphnav.constraints.gnss import TIME_OFFSET, VELOCITY_TIME_OFFSET
-from graphnav.constraints.vehicle import AXLE, BODY, MOUNTING, ODOMETER_DELAY, ODOMETER_SCALE
+from graphnav.constraints.odometer import ODOMETER_DELAY, ODOMETER_SCALE
+from graphnav.constraints.vehicle import AXLE, BODY, MOUNTING
 from graphnav.core import rotation
 from graphnav.core.earth import LocalFrame
 from graphnav.core.notes import Note, get_key

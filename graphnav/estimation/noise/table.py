@@ -9,7 +9,8 @@ import numpy as np
 from graphnav.constraints.dual_antenna import DualHeading, DualPitch
 from graphnav.constraints.gnss import OFFSETS, STAMPS, VELOCITY_ERROR
 from graphnav.constraints.lasting import LASTING, MULTIPATH, TIMES
-from graphnav.constraints.vehicle import NHC_ERROR, ODOMETER_ERROR
+from graphnav.constraints.odometer import ODOMETER_ERROR
+from graphnav.constraints.vehicle import NHC_ERROR
 from graphnav.core.state import SECONDS
 from graphnav.estimation.names import name_rows
 from graphnav.estimation.noise.model import NoiseModel, VarianceComponent
