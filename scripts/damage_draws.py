@@ -33,6 +33,7 @@ from graphnav.constraints.gnss import CLOCK_RATE, TIME_OFFSET
 from graphnav.estimation.solution import Solution
 from graphnav.evaluation.metrics import summarise
 from graphnav.recording import Recording
+from graphnav.recording.plausibility.screening import drop_filled
 
 SOLVERS = ("ekf", "rts", "batch")
 LENGTHS = 120.0, 300.0  # s, of a window
@@ -51,7 +52,8 @@ def draw(number: int, options: argparse.Namespace) -> tuple[dict[str, Any], Reco
     clean = whole.crop(begin, begin + length)
     if clean.odometer is not None and rng.random() < 0.4:
         clean = clean.without("odometer")
-    used, done = clean, []
+    # what damage adds to rows that were filled in would make measurements of them
+    used, done = replace(clean, imu=drop_filled(clean.imu, clean.start)[0]), list[str]()
     for fault in FAMILIES[options.family]:
         sensor = getattr(used, fault.sensor)
         if rng.random() < fault.chance and sensor is not None:

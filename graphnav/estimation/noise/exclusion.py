@@ -372,12 +372,15 @@ def _may_be_disturbed(base: Problem, found: NoiseEstimate) -> bool:
 
 
 def _add_outliers(found: NoiseEstimate, errors: LeftOutErrors, spans: list[Span]) -> NoiseEstimate:
-    """The estimate with weights for fixes in spans that it leaves out, so that each may be a single outlier."""
-    weights = dict(found.noise.weights)
+    """The estimate with weights for fixes in some spans and in those that it leaves out, so that each of them may be a
+    single outlier, used again or not.
+    """
+    weights, excluded = dict(found.noise.weights), found.noise.excluded.values()
+    within = [*spans, *(span for some in excluded for span in some)]
     for name, (t, squared, m) in errors.items():
         weight = weigh_outlying(squared, m, get_tail_index(found.noise.tails, name, m))
-        kept = drop_within(weights.get(name, RowWeights(np.empty(0), np.empty(0))), spans)
-        inside = mask_times(t, spans) & np.isin(t, t[weight < 1.0])  # with all rows of their times
+        kept = drop_within(weights.get(name, RowWeights(np.empty(0), np.empty(0))), within)
+        inside = mask_times(t, within) & np.isin(t, t[weight < 1.0])  # with all rows of their times
         both, of_both = np.concatenate([kept.t, t[inside]]), np.concatenate([kept.weight, weight[inside]])
         order = np.argsort(both, kind="stable")
         weights[name] = RowWeights(both[order], of_both[order])
