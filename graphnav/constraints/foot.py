@@ -107,7 +107,7 @@ class Stance(Constraint):
             share=_interpolate_phase(landed - leaves) * _mark_rolling(t, span, scene, s.correlation)[:, None],
             sigma=np.repeat(sigma[:, None], 3, axis=1),
             parameters=(
-                *make_scale_parameter(scene.recording),
+                *make_scale_parameter(scene.recording.imu.noise, scene.recording.platform),
                 Parameter(PIVOT, np.zeros(3), np.full(3, s.pivot_sigma), "m"),
                 Parameter(TRAVEL, np.zeros(2), np.full(2, s.travel_sigma), "m"),
                 *((Parameter(PATTERN, np.zeros(_WIDE), np.full(_WIDE, s.pattern), "m/s"),) if s.pattern else ()),
@@ -182,7 +182,7 @@ class FootLateral(Constraint):
             past=past,
             sigma=sigma[:, None],
             parameters=(
-                *make_scale_parameter(scene.recording),
+                *make_scale_parameter(scene.recording.imu.noise, scene.recording.platform),
                 Parameter(FOOT_AXIS, np.zeros(2), np.full(2, np.radians(s.axis_sigma)), "rad"),
             ),
             **s.outliers,

@@ -193,7 +193,7 @@ def find_moving_rows(scene: BuildContext) -> Array:
 def make_wheel_parameters(scene: BuildContext) -> tuple[Array, list[Parameter]]:
     """Lever arm (3,) of the point that does not slip, m, and the parameters of both constraints."""
     s, odometer = scene.settings.vehicle, scene.recording.odometer
-    parameters = list(make_scale_parameter(scene.recording))
+    parameters = list(make_scale_parameter(scene.recording.imu.noise, scene.recording.platform))
     lever = np.zeros(3) if odometer is None else odometer.lever_arm
     if s.mounting_sigma > 0:
         sigma, walk = np.radians(s.mounting_sigma), np.radians(s.mounting_walk) / 60.0

@@ -31,8 +31,10 @@ from graphnav.estimation.noise.exclusion import estimate_disturbed_intervals, es
 from graphnav.estimation.noise.initial_points import BREAKDOWN
 from graphnav.estimation.noise.left_out import compute_excluded_share
 from graphnav.estimation.noise.model import INTERVALS, NoiseModel
+from graphnav.estimation.noise.scales import are_scales_contradicted
 from graphnav.estimation.offsets import is_offset_far
 from graphnav.estimation.problem import Problem
+from graphnav.imu.dynamics import PRIORS
 
 
 @dataclass(frozen=True)
@@ -149,7 +151,27 @@ def revise_jointly(
         return estimate_noise(base, opening, noise, near, progress, any(name in noise.weights for name in INTERVALS))
 
     found = replace(found, estimate=estimate_disturbed_intervals(found.base, found.estimate))
-    return _free_constants(found, settings, go_on, estimate)
+    return _estimate_scales(_free_constants(found, settings, go_on, estimate), progress)
+
+
+def _estimate_scales(found: JointEstimate, progress: Progress | None) -> JointEstimate:
+    """The same with the sizes of the IMU's scale errors, if these are significantly other than stated.
+
+    Last of all, because a turn that the gyro misses and fixes that are wrong look like scale errors too.
+    """
+    base, best = found.base, found.estimate
+    if not are_scales_contradicted(base, best):
+        return found
+    intervals = any(name in best.noise.weights for name in INTERVALS)
+    near = best.get_linearisation(base)
+    try:
+        one = estimate_noise(base, None, best.noise, near, progress, intervals, changed=True, scales=True)
+        before, after = found.weigh(), replace(found, estimate=one).weigh()
+    except BREAKDOWN:
+        return found
+    gained = after.compute_evidence() - before.compute_evidence()
+    taken = after if gained > 0.5 * len(PRIORS) else before  # half of each figure by chance
+    return taken.count(before.estimate.passes + after.estimate.passes)
 
 
 def _leave_out_faults(

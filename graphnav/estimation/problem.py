@@ -57,14 +57,14 @@ class Problem:
     prior: InitialPrior
     constraints: tuple[Constraint, ...]
     notes: tuple[str, ...] = ()
-    imu_noise: ImuNoise = field(default_factory=ImuNoise)  # biases that the intervals were integrated with
+    imu_noise: ImuNoise = field(default_factory=ImuNoise)  # in use; intervals are integrated with it
     interval_factors: Array | None = None  # (K-1, 4) factors on the variances of `NOISE_FIGURES`; ones when None
 
     @cached_property
     def parameters(self) -> dict[str, Parameter]:
         """The parameters estimated beside the states, by name."""
-        own = (*make_scale_parameter(self.recording), *(p for rows in self.constraints for p in rows.parameters))
-        return {p.name: p for p in own}
+        of_imu = make_scale_parameter(self.imu_noise, self.recording.platform)
+        return {p.name: p for p in (*of_imu, *(p for rows in self.constraints for p in rows.parameters))}
 
     @cached_property
     def chains(self) -> tuple[ParameterChain, ...]:

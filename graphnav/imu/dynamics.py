@@ -32,7 +32,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 
@@ -42,9 +42,10 @@ from graphnav.core.rotation import Array, mv
 from graphnav.core.running import sum_running
 from graphnav.core.state import DIM, Parameter, States
 from graphnav.imu.preintegration import Intervals, multiply_up
-from graphnav.recording import ACROSS, ImuNoise, Recording
+from graphnav.recording import ACROSS, ImuNoise
 
 SCALE = "imu_scale"
+PRIORS = {"prior.gyro_scale": "gyro_scale_sigma", "prior.accel_scale": "accel_scale_sigma"}  # variance components
 _I3 = np.eye(3)
 # M_ij as (i, j): scale errors, then cross-axis terms
 TERMS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1))
@@ -79,23 +80,22 @@ _SETS = {
 }
 
 
-def make_scale_parameter(recording: Recording) -> tuple[Parameter, ...]:
+@lru_cache(maxsize=16)
+def make_scale_parameter(noise: ImuNoise, platform: str) -> tuple[Parameter, ...]:
     """The terms of gyro and accelerometer that a platform shows, where the noise figures leave them open."""
-    return _scale_parameter(recording.imu.noise, recording.platform == "foot")
-
-
-@cache
-def _scale_parameter(noise: ImuNoise, every: bool) -> tuple[Parameter, ...]:
     if noise.gyro_scale_sigma <= 0 and noise.accel_scale_sigma <= 0:
         return ()
+    stated, sets = (
+        (noise.gyro_scale_sigma, noise.accel_scale_sigma),
+        (TERMS, TERMS) if platform == "foot" else VEHICLE_TERMS,
+    )
     sigma = [
         max(scale * (1.0 if i == j else ACROSS), 1e-9)
-        for scale, terms in zip(
-            (noise.gyro_scale_sigma, noise.accel_scale_sigma), (TERMS, TERMS) if every else VEHICLE_TERMS, strict=True
-        )
+        for scale, terms in zip(stated, sets, strict=True)
         for i, j in terms
     ]
-    return (Parameter(SCALE, np.zeros(len(sigma)), np.array(sigma), "1"),)
+    groups = tuple(group for group, terms in zip(PRIORS, sets, strict=True) for _ in terms)
+    return (Parameter(SCALE, np.zeros(len(sigma)), np.array(sigma), "1", noise_groups=groups),)
 
 
 def convert_to_biases(scale: Array, force: Array, rate: Array) -> tuple[Array, Array]:

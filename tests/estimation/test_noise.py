@@ -48,6 +48,7 @@ from graphnav.estimation.solvers.linearise import Points, linearise
 from graphnav.estimation.solvers.passes import SmootherPass
 from graphnav.estimation.solvers.rts import rts, smooth_backward, smooth_moments
 from graphnav.evaluation.scoring import compute_errors
+from graphnav.imu.dynamics import SCALE
 from graphnav.imu.preintegration import NOISE_FIGURES, preintegrate
 from graphnav.recording import Recording
 
@@ -285,6 +286,17 @@ def test_factors_of_rows_and_processes_are_of_their_own_components() -> None:
     assert process.correlation_time == 40.0
     assert process.sigma[2] == pytest.approx(3.0)
     assert np.all(process.sigma[:2] < 1e-3)  # what nothing is said of does not exist
+
+
+@pytest.mark.parametrize("wheels", [True, False])
+def test_factors_of_scale_errors_are_those_of_their_prior(wheels: bool) -> None:
+    base, _ = built(lap().crop(0.0, 60.0))
+    if not wheels:
+        base = replace(base, constraints=tuple(c for c in base.constraints if not c.of_wheels))
+    used = apply_noise(base, NoiseModel({"prior.accel_scale": VarianceComponent(np.log(16.0))}))
+    before, after = (problem.parameters[SCALE] for problem in (base, used))
+    assert after.sigma == pytest.approx(before.sigma * np.repeat([1.0, 4.0], [5, 6]))
+    assert used.columns == base.columns
 
 
 def test_weights_and_spans_are_of_the_rows_at_their_times() -> None:

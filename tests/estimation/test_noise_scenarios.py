@@ -27,7 +27,8 @@ from graphnav.estimation.solution import Solution
 from graphnav.evaluation.evaluate import evaluate_recording
 from graphnav.evaluation.metrics import summarise
 from graphnav.evaluation.scoring import Errors, compute_errors
-from graphnav.recording import Recording
+from graphnav.imu.dynamics import PRIORS
+from graphnav.recording import ACROSS, Recording
 
 SCRIPTS = Path(__file__).resolve().parents[2] / "scripts"
 STATED_ONLY = parse_settings({"noise": {"mode": "stated"}})
@@ -134,6 +135,32 @@ def test_an_imu_noisier_than_stated() -> None:
     for name in ("gyro_noise_density", "accel_noise_density"):
         assert 2.0 < times(noise, f"imu.{name}") < 5.0, name
     assert found_in(stating(recording, imu=4.0), STATED_ONLY).get_factor("imu.gyro_noise_density", 1.0) == 1.0
+
+
+@pytest.mark.parametrize("size", [1.0, 5.0])
+def test_scale_errors_of_an_imu(size: float) -> None:
+    """Drawn with so many times the stated sigma: as stated where that is likely; else the factor, over drives, is that
+    to three sigmas of their freedom.
+    """
+    logs, freedom = np.zeros(2), np.zeros(2)
+    for seed in range(3):
+        recording, _ = oracle.drive(oracle.vehicle_path(duration=300, rate=50.0, seed=seed), seed=seed)
+        rng, imu = np.random.default_rng(100 + seed), recording.imu
+
+        def turn(sigma: float, rng: np.random.Generator = rng) -> Array:
+            return np.eye(3) + size * sigma * np.where(np.eye(3), 1.0, ACROSS) * rng.standard_normal((3, 3))
+
+        gyro = imu.gyro @ turn(imu.noise.gyro_scale_sigma).T
+        imu = replace(imu, gyro=gyro, accel=imu.accel @ turn(imu.noise.accel_scale_sigma).T)
+        figures = found_in(replace(recording, imu=imu)).figures
+        own = [figures[name] for name in PRIORS if name in figures]
+        assert len(own) == (2 if size > 1.0 else 0)
+        if own:
+            logs += [one.freedom * one.log_factor for one in own]
+            freedom += [one.freedom for one in own]
+    if size > 1.0:
+        assert np.all(freedom > 6.0)
+        assert np.all(np.abs(logs / freedom - 2.0 * np.log(size)) < 3.0 * np.sqrt(2.0 / freedom))
 
 
 def nees(recording: Recording, truth: Trajectory, settings: Settings | None = None) -> Array:

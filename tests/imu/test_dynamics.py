@@ -14,7 +14,7 @@ from graphnav.core.state import DIM, Parameter, States
 from graphnav.imu.dynamics import SCALE, ImuFactors, convert_to_biases, make_scale_parameter
 from graphnav.imu.preintegration import preintegrate
 from graphnav.imu.samples import bridge_gaps
-from graphnav.recording import Imu, ImuNoise, Recording
+from graphnav.recording import Imu, ImuNoise
 
 N = 6
 
@@ -187,7 +187,7 @@ def test_noise_by_monte_carlo(motion: ImuFactors, start: States) -> None:
 def test_scale_parameter() -> None:
     def of(noise: ImuNoise, platform: str = "vehicle") -> tuple[Parameter, ...]:
         imu = Imu(np.empty(0), np.empty((0, 3)), np.empty((0, 3)), noise)
-        return make_scale_parameter(Recording("none", platform, imu))
+        return make_scale_parameter(imu.noise, platform)
 
     noise = ImuNoise(gyro_scale_sigma=1e-3, accel_scale_sigma=2e-3)
     assert of(ImuNoise(gyro_scale_sigma=0.0, accel_scale_sigma=0.0)) == ()

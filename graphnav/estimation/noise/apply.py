@@ -14,6 +14,7 @@ from graphnav.core.state import Parameter
 from graphnav.estimation.noise.model import INTERVALS, NoiseModel, RowWeights
 from graphnav.estimation.noise.spans import mask_times
 from graphnav.estimation.problem import Problem
+from graphnav.imu.dynamics import PRIORS
 from graphnav.imu.preintegration import NOISE_FIGURES
 
 
@@ -39,8 +40,14 @@ def apply_noise(problem: Problem, noise: NoiseModel) -> Problem:
             imu_noise=replace(problem.imu_noise, **figures),
             interval_factors=each,
         )
+    scales = {
+        figure: float(np.sqrt(noise.get_factor(group, 1.0))) * getattr(problem.imu_noise, figure)
+        for group, figure in PRIORS.items()
+    }
     return replace(
-        problem, constraints=_share_nodes([_scale_rows(problem, rows, noise) for rows in problem.constraints])
+        problem,
+        imu_noise=replace(problem.imu_noise, **scales),
+        constraints=_share_nodes([_scale_rows(problem, rows, noise) for rows in problem.constraints]),
     )
 
 

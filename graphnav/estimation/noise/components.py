@@ -11,6 +11,7 @@ from graphnav.constraints.lasting import LASTING
 from graphnav.estimation.noise.model import NoiseModel, RowWeights, VarianceComponent
 from graphnav.estimation.noise.priors import get_prior, list_largest
 from graphnav.estimation.problem import Problem
+from graphnav.imu.dynamics import PRIORS
 from graphnav.imu.preintegration import NOISE_FIGURES
 
 
@@ -83,13 +84,15 @@ class Components:
         self.log[name], self.freedom[name] = min(before + x, self.get_largest(name)), B
 
 
-def begin_components(problem: Problem, start: NoiseModel | None, changed: bool = False) -> Components:
+def begin_components(
+    problem: Problem, start: NoiseModel | None, changed: bool = False, scales: bool = False
+) -> Components:
     """The figures that an estimate begins with: prior medians, or those of another estimate.
 
     Parameters
     ----------
     problem : with stated noise.
-    start, changed : as for `graphnav.estimation.noise.estimate.estimate_noise`.
+    start, changed, scales : as for `graphnav.estimation.noise.estimate.estimate_noise`.
     """
     names = [f"imu.{name}" for name in NOISE_FIGURES]
     for rows in problem.constraints:
@@ -98,10 +101,11 @@ def begin_components(problem: Problem, start: NoiseModel | None, changed: bool =
             *(g for p in (*rows.parameters, *rows.processes) for g in p.noise_groups),
         ]
     names += [group for p in problem.parameters.values() for group in p.noise_groups]
-    log = {name: get_prior(name)[0] for name in dict.fromkeys(names)}
+    known = {} if start is None else start.figures
+    log = {name: get_prior(name)[0] for name in dict.fromkeys(names) if scales or name not in PRIORS or name in known}
     processes = [p for rows in problem.constraints for p in (*rows.parameters, *rows.processes)]
     times = {p.name: p.correlation_time for p in processes if p.correlation_time is not None}
-    largest = {group: x for rows in problem.constraints if rows.fix_of for group, x in list_largest(rows).items()}
+    largest = list_largest(problem)
     if start is None:
         return Components(log, times, largest)
     log |= {name: start.figures[name].log_factor for name in log if name in start.figures}

@@ -91,6 +91,7 @@ def estimate_noise(
     progress: Callable[[str, float], None] | None = None,
     intervals: bool = False,
     changed: bool = False,
+    scales: bool = False,
 ) -> NoiseEstimate:
     """Estimate the noise model of a problem built with stated noise and with the parts of its intervals' noise.
 
@@ -101,13 +102,14 @@ def estimate_noise(
     near : first linearisation points, of all keyframes, and the problem that they are of.
     intervals : whether single intervals of the IMU may have more noise than the others.
     changed : whether the initial figures were estimated with other measurements left out, and may have far to go.
+    scales : whether the IMU's scale errors may be larger or smaller than stated.
 
     Raises
     ------
     EstimationError
         If the filter breaks down.
     """
-    figures = begin_components(problem, start, changed)
+    figures = begin_components(problem, start, changed, scales)
     if near is not None:
         return _iterate(
             problem, figures, reuse_points(*near, apply_noise(problem, figures.build_model())), progress, intervals
@@ -120,7 +122,7 @@ def estimate_noise(
         initials = [replace(one, points=reuse_points(one.points, problem, used)) for one in initials]
     found: list[NoiseEstimate] = []
     for initial in initials:
-        figures = begin_components(problem, start, changed)
+        figures = begin_components(problem, start, changed, scales)
         figures.weights |= initial.weights
         for name, more in initial.log_factors.items():
             figures.log[name] += more
@@ -269,7 +271,7 @@ def _weigh_intervals(figures: Components, problem: Problem, imu: ImuMoments) -> 
 def _improve_process(figures: Components, chain: ParameterChain, moments: tuple[Array, Array, Array]) -> None:
     _, A, B = moments
     groups = np.array(chain.parameter.noise_groups)
-    for group in dict.fromkeys(chain.parameter.noise_groups):
+    for group in dict.fromkeys(name for name in chain.parameter.noise_groups if name in figures.log):
         own = groups == group
         figures.update(group, *_bound_squares(A[:, own], B[:, own], 1))
 

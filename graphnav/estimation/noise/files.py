@@ -60,6 +60,7 @@ from graphnav.estimation.noise.model import (
     StampOffsets,
     VarianceComponent,
 )
+from graphnav.imu.dynamics import PRIORS
 from graphnav.imu.preintegration import NOISE_FIGURES
 from graphnav.recording import FIX_TYPES
 from graphnav.recording.checks.crosschecks import LARGEST_SHIFT
@@ -202,7 +203,7 @@ def read_noise_and_mode(path: str | Path) -> tuple[NoiseModel, str]:
 
 def list_groups() -> tuple[str, ...]:
     """Names of all variance components that a recording can have."""
-    out = [*(f"imu.{name}" for name in NOISE_FIGURES), STAMPS, *OFFSETS]
+    out = [*(f"imu.{name}" for name in NOISE_FIGURES), STAMPS, *OFFSETS, *PRIORS]
     for cls in list_constraints():
         axes = dict.fromkeys(cls.noise_axes)
         kinds = ["", *(f".{kind}" for kind in FIX_TYPES.values())] if cls.name == "gnss_position" else [""]

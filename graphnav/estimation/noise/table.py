@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from graphnav.constraints.dual_antenna import DualHeading, DualPitch
-from graphnav.constraints.gnss import OFFSETS, STAMPS, VELOCITY_ERROR
+from graphnav.constraints.gnss import CLOCK_RATE, OFFSETS, STAMPS, VELOCITY_ERROR
 from graphnav.constraints.lasting import LASTING, MULTIPATH, TIMES
 from graphnav.constraints.odometer import ODOMETER_ERROR
 from graphnav.constraints.vehicle import NHC_ERROR
@@ -15,6 +15,7 @@ from graphnav.core.state import SECONDS
 from graphnav.estimation.names import name_rows
 from graphnav.estimation.noise.model import NoiseModel, VarianceComponent
 from graphnav.gnss.sigmas import REFLECTED
+from graphnav.imu.dynamics import PRIORS
 from graphnav.recording import FIX_TYPES, ImuNoise, Recording
 
 _IMU_FIGURES = {
@@ -22,6 +23,8 @@ _IMU_FIGURES = {
     "accel_noise_density": ("accelerometer, noise density", "m/s^2/sqrt(Hz)"),
     "gyro_bias_walk": ("gyro, bias random walk", "rad/s/sqrt(s)"),
     "accel_bias_walk": ("accelerometer, bias random walk", "m/s^2/sqrt(s)"),
+    "gyro_scale_sigma": ("gyro, scale errors", "1"),
+    "accel_scale_sigma": ("accelerometer, scale errors", "1"),
 }
 _AXIS_SLICES = {"horizontal": slice(0, 2), "up": slice(2, 3)}
 
@@ -55,7 +58,8 @@ def tabulate_figures(
     for group, figure in noise.figures.items():
         source, *middle, axis = group.split(".")
         root = float(np.exp(0.5 * figure.log_factor))
-        if source == "imu":
+        if source == "imu" or group in PRIORS:
+            axis = PRIORS.get(group, axis)
             words, unit = _IMU_FIGURES[axis]
             stated = float(getattr(recording.imu.noise, axis))
             used = root * float(getattr(imu or recording.imu.noise, axis))
@@ -63,7 +67,8 @@ def tabulate_figures(
             continue
         if group == STAMPS or group in OFFSETS:
             words = "fixes, stamp of each" if group == STAMPS else f"{OFFSETS[group]}, prior".replace("_", " ")
-            out.append(FigureRow(group, words, figure, None, None, "s", None))
+            unit = "s/s" if OFFSETS.get(group) == CLOCK_RATE else "s"
+            out.append(FigureRow(group, words, figure, None, None, unit, None))
             continue
         time = next((part for part in middle if part in lasts), None)
         kind = next((part for part in middle if part not in lasts), None)

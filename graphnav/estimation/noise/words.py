@@ -19,6 +19,8 @@ _NAMES = {
     "imu.accel_noise_density": "accelerometer noise",
     "imu.gyro_bias_walk": "gyro bias walk",
     "imu.accel_bias_walk": "accelerometer bias walk",
+    "prior.gyro_scale": "gyro scale errors",
+    "prior.accel_scale": "accelerometer scale errors",
 }
 
 _IMU_WHITE = dict(zip(INTERVALS, ("gyro noise", "accelerometer noise"), strict=True))
