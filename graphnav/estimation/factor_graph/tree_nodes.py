@@ -63,6 +63,13 @@ class Keyframe:
             out[shift(at)] = node.anchor[own] + node.delta[own]
         return out
 
+    def put(self, state: States, values: Array) -> None:
+        """Set what is known now."""
+        self.state.delta = state.minus(self.anchor)[0]
+        for name, at in self.columns.items():
+            node, own = self.nodes[name]
+            node.delta[own] = values[shift(at)] - node.anchor[own]
+
     @property
     def variables(self) -> Collection[Variable]:
         """That its rows may touch, its state first."""
