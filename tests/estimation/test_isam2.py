@@ -23,7 +23,6 @@ from graphnav.estimation.factor_graph.tree_marginals import (
     begin_elimination,
     eliminate,
     find_head,
-    read_keyframes,
     settle,
 )
 from graphnav.estimation.factor_graph.tree_nodes import update_isam
@@ -298,8 +297,8 @@ def test_covariances_from_the_other_end_are_the_marginals_of_the_tree(built: Pro
         unit = tree.keyframes[0].state.unit
         if not again:
             fill(window, built, 60, 61)
-        delta = read_keyframes(tree, 0, count).delta if again else leaving.estimates.delta
         found = settle(tree, leaving)
+        delta = np.array([k.state.delta for k in tree.keyframes[:count]])
         own = move_covariance(unit[:, None] * np.array(expected) * unit, delta)
         for a, b in zip(found.covariance, own, strict=True):
             sd = np.sqrt(np.diag(b))

@@ -87,7 +87,7 @@ class Tree:
         self.variables: dict[int, Variable] = {}
         self._first_sigma: dict[str, Array] = {}
         self._constant: set[str] = set()
-        self.version = 0  # grows where factors are replaced
+        self.version = 0  # grows when factors are replaced
         self.held = 0  # keyframes at the front that stay as they are: 1 where the first is behind the window
 
     def __len__(self) -> int:
@@ -239,20 +239,6 @@ class Tree:
         self._enter()
         read_estimates(self.isam, self.variables.values())
 
-    def _change(self, keyframes: Iterable[Keyframe]) -> None:
-        """Factors of some keyframes are replaced."""
-        self.version += 1
-        for k in keyframes:
-            k.version = self.version
-
-    def find_oldest_relinearised(self, version: int) -> float:
-        """Number of the oldest keyframe whose factors were replaced after a version; infinite if there is none."""
-        return (
-            next((k.number for k in self.keyframes if k.version > version), np.inf)
-            if self.version > version
-            else np.inf
-        )
-
     def find_moves(self) -> Array:
         """(K,) how far keyframes' estimates are from where their rows were linearised, 1 at the limit."""
         if len(self) <= self.held:
@@ -313,7 +299,7 @@ class Tree:
             x.point = x.delta.copy()
             for node, _ in self.keyframes[i].nodes.values():
                 node.point = node.delta.copy()
-        self._change(self.keyframes[i] for i in rows)
+        self.version += 1
         self._replace(made, gone, self.keyframes[max(min(rows) - 1, 0)].number)
 
     # ---------------------------------------------------------------------------------------------------- leaving
@@ -333,7 +319,7 @@ class Tree:
             del self.variables[key]
         for x in self.variables.values():
             x.last = min(x.last, last.number)
-        self._change([last])
+        self.version += 1
         self._replace([], own, last.number)
         self.read()
 

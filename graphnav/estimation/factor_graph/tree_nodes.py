@@ -47,7 +47,6 @@ class Keyframe:
     columns: Columns
     nodes: dict[str, tuple[Variable, slice]]  # the node of each parameter in force
     slots: dict[str, int]  # index of its factor of each constraint
-    version: int = 0  # of the tree when its rows were linearised anew, or what followed it was taken back
 
     @property
     def estimate(self) -> States:

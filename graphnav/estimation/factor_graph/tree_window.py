@@ -164,7 +164,7 @@ class TreeWindow(Window):
             return super().settle(0)
         if self._leaving is None or self.leaving != count:
             self._leaving = begin_elimination(self.tree, self.tree.held + count, self.tree.held)
-        out, self._leaving = settle(self.tree, self._leaving, now=True), None  # wherever a run may have been resumed
+        out, self._leaving = settle(self.tree, self._leaving), None
         self.head = gone[-1].message
         del self.stages[:count]
         if len(self.tree) > self.tree.held + count:
