@@ -27,17 +27,19 @@ from graphnav.core.state import DIM, States
 from graphnav.detectors.base import NONE, subtract_spans
 from graphnav.estimation.contradictions import free
 from graphnav.estimation.faults.excluded import weigh_rows
+from graphnav.estimation.faults.watch import FALSE_ALARM
 from graphnav.estimation.noise.apply import apply_noise
 from graphnav.estimation.noise.decision import explain
 from graphnav.estimation.noise.estimate import NoiseEstimate
+from graphnav.estimation.noise.exclusion import add_outliers
 from graphnav.estimation.noise.explanations import FIXES
 from graphnav.estimation.noise.false_stops import find_false_stops, leave_out_false_stops, unite_stops
 from graphnav.estimation.noise.initial_points import BREAKDOWN
 from graphnav.estimation.noise.model import NoiseModel
 from graphnav.estimation.noise.moments import collect_row_moments
 from graphnav.estimation.noise.outliers import compute_row_costs, list_reduced
-from graphnav.estimation.noise.spans import Span, join, join_faults, mask_times
-from graphnav.estimation.noise.suspects import find_suspects
+from graphnav.estimation.noise.spans import Span, join, join_faults, list_distinct, mask_times, trim
+from graphnav.estimation.noise.suspects import predict_left_out
 from graphnav.estimation.noise.tails import get_tail_index, weigh_outlying
 from graphnav.estimation.problem import Problem, build_problem
 from graphnav.estimation.solution import ExcludedSpan
@@ -101,16 +103,18 @@ class WindowTask:
         return Judgement(false, self._explain(false) if self.suspects else None)
 
     def _explain(self, false: Array) -> Mapping[str, tuple[Span, ...]]:
-        """What is wrong in the suspected spans, by the noise model as it is."""
-        noise = replace(self.noise, excluded={})
+        """What is wrong in the suspected spans, or in the part of them that fixes disagree with, by the noise model."""
+        noise = replace(self.noise, excluded=dict.fromkeys(FIXES, tuple(self.suspects)))
         base, used, smoothed, _ = self._solve(noise, True, None, false)
         noise = weigh_tails(noise, used, smoothed)
         weighed = apply_noise(base, noise)
         forward = refilter(weighed, reuse_points(smoothed, used, weighed), whole=False)
-        costs = float(np.sum(compute_row_costs(weighed, noise.tails)))
-        evidence = float(np.sum(forward.log_likelihood)) - costs
+        evidence = float(np.sum(forward.log_likelihood)) - float(np.sum(compute_row_costs(weighed, noise.tails)))
         found = NoiseEstimate(noise, smooth_moments(weighed, forward), 0.0, evidence, Counter())
-        return explain(base, found, join([*self.suspects, *find_suspects(base, noise, found)])).noise.excluded
+        errors = predict_left_out(weighed, found)
+        candidates = list_distinct(self.suspects, trim(self.suspects, errors), trim(self.suspects, errors, FALSE_ALARM))
+        decisions = (explain(base, add_outliers(found, errors, some), some) for some in candidates)
+        return max(decisions, key=lambda one: one.log_evidence).noise.excluded
 
     def _solve(
         self, noise: NoiseModel, standing: bool, _: object, false: Array
@@ -178,14 +182,15 @@ class WindowJudge:
         if self._running is None:
             age, before = now - tracker.stops[:, 0], np.maximum(self._begun - tracker.stops[:, 0], 0.0)
             due = (before < _OLDEST * lag) & ((age >= np.maximum(2.0 * before, _FIRST)) | (last and now > self._begun))
-            old = self._list_old(tracker, _OLDEST)
+            youngest = _OVER if last else _OLDEST
+            old = self._list_old(tracker, youngest)
             over = [f for f in old if last or f.t_end <= now - _OVER * lag] or self._list_old(tracker, _OLDEST + _OVER)
             if not _can_judge(tracker) or not (due.any() or over):
                 return None
             task = _describe(sensors, tracker, bool(due.any()), bool(over))
             self._running = BackgroundEstimation(task, now + _THINKING * limit_thought(lag))
             self._begun = now
-            young = [f.t_start - SAME_TIME for f in _list_tested(tracker) if f.t_start > now - _OLDEST * lag]
+            young = [f.t_start - SAME_TIME for f in _list_tested(tracker) if f.t_start > now - youngest * lag]
             self._explains = min([now - _OVER * lag, *young])
         if not last and now < self._running.due:
             return None

@@ -252,12 +252,12 @@ def _unmask(base: Problem, found: NoiseEstimate, first: Decision, masked: list[S
             if not some:
                 continue
             least = min(best.log_evidence, rival.log_evidence)
-            candidate = explain(base, _add_outliers(estimate, errors, some), some, least=least)
+            candidate = explain(base, add_outliers(estimate, errors, some), some, least=least)
             passes = passes + candidate.passes
             cut = cut_at_steps(some, candidate.noise, used, estimate)
             if cut != some:
                 among = list_explanations(candidate.noise)  # its pieces are wrong the same way, or not at all
-                finer = explain(base, _add_outliers(estimate, errors, cut), cut, among, least)
+                finer = explain(base, add_outliers(estimate, errors, cut), cut, among, least)
                 passes = passes + finer.passes
                 candidate = max(candidate, finer, key=lambda one: one.log_evidence)
             most = max(most, candidate.log_evidence)
@@ -303,7 +303,7 @@ def _readmit(base: Problem, found: NoiseEstimate) -> NoiseEstimate:
     if len(candidates) == 1:
         return replace(found, passes=passes)
     among = list_explanations(found.noise)
-    decisions = [explain(base, _add_outliers(found, errors, some), some, among) for some in candidates]
+    decisions = [explain(base, add_outliers(found, errors, some), some, among) for some in candidates]
     passes = sum((one.passes for one in decisions), passes)
     best = max(decisions, key=lambda one: one.log_evidence)
     if best is decisions[0]:
@@ -371,7 +371,7 @@ def _may_be_disturbed(base: Problem, found: NoiseEstimate) -> bool:
     return any(may_pay(imu.squared[:, i], imu.freedom[:, i]) for i in range(len(INTERVALS)))
 
 
-def _add_outliers(found: NoiseEstimate, errors: LeftOutErrors, spans: list[Span]) -> NoiseEstimate:
+def add_outliers(found: NoiseEstimate, errors: LeftOutErrors, spans: list[Span]) -> NoiseEstimate:
     """The estimate with weights for fixes in spans that it leaves out, so that each may be a single outlier."""
     weights = dict(found.noise.weights)
     for name, (t, squared, m) in errors.items():
