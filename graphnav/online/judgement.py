@@ -35,10 +35,10 @@ from graphnav.estimation.noise.exclusion import add_outliers
 from graphnav.estimation.noise.explanations import FIXES
 from graphnav.estimation.noise.false_stops import find_false_stops, leave_out_false_stops, unite_stops
 from graphnav.estimation.noise.initial_points import BREAKDOWN
-from graphnav.estimation.noise.model import NoiseModel
+from graphnav.estimation.noise.model import NoiseModel, RowWeights
 from graphnav.estimation.noise.moments import collect_row_moments
 from graphnav.estimation.noise.outliers import compute_row_costs, list_reduced
-from graphnav.estimation.noise.spans import Span, join, join_faults, list_distinct, mask_times, trim
+from graphnav.estimation.noise.spans import Span, drop_within, join, join_faults, list_distinct, mask_times, trim
 from graphnav.estimation.noise.suspects import predict_left_out
 from graphnav.estimation.noise.tails import get_tail_index, weigh_outlying
 from graphnav.estimation.problem import Problem, build_problem
@@ -66,7 +66,7 @@ class Judgement:
     """What evidence decides of a window."""
 
     false_stops: Array  # (n, 2) s, stops in which the platform moves
-    excluded: Mapping[str, tuple[Span, ...]] | None  # s, where fixes or wheels are wrong, if that was asked
+    decided: NoiseModel | None  # with what is wrong left out and the weights of what is right, if that was asked
 
 
 @dataclass(frozen=True)
@@ -100,11 +100,10 @@ class WindowTask:
         if len(self.stationary):
             how = partial(self._solve, noise, False)
             false = leave_out_false_stops(how(None, NONE), judge, how)[1]
-        return Judgement(false, self._explain(false) if self.suspects else None)
+        return Judgement(false, self._explain(noise, false) if self.suspects else None)
 
-    def _explain(self, false: Array) -> Mapping[str, tuple[Span, ...]]:
+    def _explain(self, noise: NoiseModel, false: Array) -> NoiseModel:
         """What is wrong in the suspected spans, or in the part of them that fixes disagree with, by the noise model."""
-        noise = replace(self.noise, excluded=dict.fromkeys(FIXES, tuple(self.suspects)))
         base, used, smoothed, _ = self._solve(noise, True, None, false)
         noise = weigh_tails(noise, used, smoothed)
         weighed = apply_noise(base, noise)
@@ -112,9 +111,11 @@ class WindowTask:
         evidence = float(np.sum(forward.log_likelihood)) - float(np.sum(compute_row_costs(weighed, noise.tails)))
         found = NoiseEstimate(noise, smooth_moments(weighed, forward), 0.0, evidence, Counter())
         errors = predict_left_out(weighed, found)
+        # what is left out beside the suspects, such as single fixes, is an outlier
+        found = add_outliers(found, errors, join(span for some in noise.excluded.values() for span in some))
         candidates = list_distinct(self.suspects, trim(self.suspects, errors), trim(self.suspects, errors, FALSE_ALARM))
-        decisions = (explain(base, add_outliers(found, errors, some), some) for some in candidates)
-        return max(decisions, key=lambda one: one.log_evidence).noise.excluded
+        decisions = (explain(base, found, some) for some in candidates)
+        return max(decisions, key=lambda one: one.log_evidence).noise
 
     def _solve(
         self, noise: NoiseModel, standing: bool, _: object, false: Array
@@ -203,24 +204,29 @@ class WindowJudge:
         except BREAKDOWN:
             return None
         noise, judged = tracker.noise, -np.inf
-        if found.excluded is not None and until > tracker.judged:
-            excluded = {name: tuple(s for s in spans if s[0] <= until) for name, spans in found.excluded.items()}
+        if found.decided is not None and until > tracker.judged:
+            excluded = {n: tuple(s for s in spans if s[0] <= until) for n, spans in found.decided.excluded.items()}
+            excluded = join_excluded(noise.excluded, excluded)
             if not _are_alike(tracker, excluded, until):
-                noise, judged = replace(noise, excluded=join_excluded(noise.excluded, excluded)), until
+                within = [(float(running.task.times[0]), until)]
+                weights = {
+                    n: _replace_within(noise.weights.get(n), found.decided.weights.get(n), within) for n in FIXES
+                }
+                noise, judged = replace(noise, excluded=excluded, weights={**noise.weights, **weights}), until
         if len(found.false_stops):
             noise = replace(noise, false_stops=unite_stops(noise.false_stops, found.false_stops))
         return None if noise is tracker.noise else CatchUp(tracker.restart_settled(noise, sensors.setup, judged))
 
 
 def _are_alike(tracker: Tracker, excluded: Mapping[str, tuple[Span, ...]], until: float) -> bool:
-    """Whether the same is left out by evidence as by tests, up to a time (s)."""
-    left_out = _list_spans(_list_tested(tracker))
-    for name in {*left_out, *excluded}:
-        t = tracker.verdicts.times.get(name, np.empty(0)) if name in FIXES else np.empty(0)
-        t = t[(t > tracker.head) & (t <= until)]
-        if name not in FIXES or np.any(mask_times(t, left_out.get(name, ())) != mask_times(t, excluded.get(name, ()))):
-            return False
-    return True
+    """Whether a tracker leaves out the same up to a time (s), but for single fixes."""
+    before = join_excluded(tracker.noise.excluded, _list_spans(_list_tested(tracker)))
+    if any(before.get(name) != spans for name, spans in excluded.items() if name not in FIXES):
+        return False
+    times = ((name, t[(t > tracker.head) & (t <= until)]) for name, t in tracker.verdicts.times.items())
+    return all(
+        np.array_equal(mask_times(t, before.get(name, ())), mask_times(t, excluded.get(name, ()))) for name, t in times
+    )
 
 
 def _list_tested(tracker: Tracker) -> list[ExcludedSpan]:
@@ -233,6 +239,16 @@ def _list_spans(faults: Iterable[ExcludedSpan]) -> dict[str, tuple[Span, ...]]:
     for fault in faults:
         out[fault.kind] = (*out.get(fault.kind, ()), (fault.t_start, fault.t_end))
     return out
+
+
+def _replace_within(some: RowWeights | None, others: RowWeights | None, spans: list[Span]) -> RowWeights:
+    """Weights with those in some spans replaced."""
+    none = RowWeights(np.empty(0), np.empty(0))
+    kept, others = drop_within(some or none, spans), others or none
+    inside = mask_times(others.t, spans)
+    t, weight = np.append(kept.t, others.t[inside]), np.append(kept.weight, others.weight[inside])
+    order = np.argsort(t, kind="stable")
+    return RowWeights(t[order], weight[order])
 
 
 def join_excluded(
