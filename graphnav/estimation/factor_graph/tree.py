@@ -27,6 +27,7 @@ from graphnav.core.rotation import Array
 from graphnav.core.state import DIM
 from graphnav.estimation.factor_graph.tree_nodes import (
     LINK,
+    ROWS,
     Fresh,
     Keyframe,
     Made,
@@ -108,7 +109,8 @@ class Tree:
             self._add_first_keyframe(place)
         x = self._add_variable(np.zeros(DIM), _UNIT, place.t)
         nodes = self._open(place, fresh)
-        keyframe = Keyframe(self._number, place, x, ahead.state, columns, nodes, {})
+        names = frozenset(one.name for one in rows)
+        keyframe = Keyframe(self._number, place, x, ahead.state, columns, nodes, names)
         for node, _ in nodes.values():
             node.last = self._number
         keyframe.put(ahead.state, ahead.values)
@@ -122,7 +124,8 @@ class Tree:
             fresh.append((x, None))
             turns = compute_turns([self.keyframes[-1], keyframe])
             made.append((keyframe, LINK, make_interval_factor(self.keyframes[-1], x, ahead.link, turns)))
-        made += [(keyframe, one.name, make_row_factor(keyframe, one, False, np.eye(3))) for one in rows]
+        if rows:
+            made.append((keyframe, ROWS, make_row_factor(keyframe, rows, False, np.eye(3))))
         self.keyframes.append(keyframe)
         self._number += 1
         if self._whole:
@@ -154,7 +157,7 @@ class Tree:
                 self._first_sigma[name] = p.sigma
         self._in_force = nodes
         before = Place(place.t, None)
-        self.keyframes.append(Keyframe(self._number, before, x, prior.state, prior.columns, nodes, {}))
+        self.keyframes.append(Keyframe(self._number, before, x, prior.state, prior.columns, nodes, frozenset()))
         self._update(fresh=[*fresh, (x, make_factor(blocks, prior.z))])
         self._number += 1
         self.held = 1
@@ -289,10 +292,9 @@ class Tree:
                         (keyframe, LINK, make_interval_factor(around[k], keyframe.state, linear.link, turns[k : k + 2]))
                     )
                 if i in rows:
-                    measured = (one for one in linear.measured if one.name in keyframe.slots)
-                    made += [
-                        (keyframe, one.name, make_row_factor(keyframe, one, True, turns[k + 1])) for one in measured
-                    ]
+                    measured = [one for one in linear.measured if one.name in keyframe.names]
+                    if measured and ROWS in keyframe.slots:
+                        made.append((keyframe, ROWS, make_row_factor(keyframe, measured, True, turns[k + 1])))
         gone = [keyframe.slots.pop(name) for keyframe, name, _ in made]
         for i in rows:
             x = self.keyframes[i].state

@@ -139,9 +139,9 @@ def settle(tree: Tree, so_far: Elimination) -> SettledStates:
     tree.read()
     found = Eliminated(so_far.net).compute_covariances()
     marginal = {x.key: x.unit[:, None] * found[x.key] * x.unit for x in so_far.own}
-    sigma = []
-    for k in own:
-        out = np.zeros(len(k.values))
+    values, sigma = tuple(k.values for k in own), []
+    for k, known in zip(own, values, strict=True):
+        out = np.zeros(len(known))
         for name, at in k.columns.items():
             node, part = k.nodes[name]
             out[shift(at)] = np.sqrt(np.maximum(np.diag(marginal[node.key])[part], 0.0))
@@ -152,6 +152,6 @@ def settle(tree: Tree, so_far: Elimination) -> SettledStates:
         states=read_states(own),
         covariance=move_covariance(about, np.array([k.state.delta for k in own])),
         columns=tuple(k.columns for k in own),
-        values=tuple(k.values for k in own),
+        values=values,
         sigma=tuple(sigma),
     )

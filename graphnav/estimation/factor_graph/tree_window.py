@@ -71,22 +71,18 @@ class TreeWindow(Window):
         if self.stages:  # of those before, the tree knows
             self.stages[-1] = _forget_message(self.stages[-1])
         newest = self.tree.keyframes[-1]
-        moved = np.concatenate([newest.estimate.minus(message.state)[0], newest.values - message.values])
-        self._append(self._adopt(stage, message.move(moved).R))
+        state, values = newest.estimate, newest.values
+        moved = message.move(np.concatenate([state.minus(message.state)[0], values - message.values]))
+        self._append(_replace_message(stage, state, values, moved.R))
         if self._whole and len(self) >= self._look:
             self.converge()
             self._look = len(self) + max(_LEAST, len(self) // _GROWN)
         return float(np.linalg.norm(e[:3]))
 
-    def _adopt(self, stage: Stage, R: Array) -> Stage:
-        """The newest stage about the tree's estimate, of which R (D, D) is what is known."""
-        newest = self.tree.keyframes[-1]
-        own = replace(stage.message, state=newest.estimate, values=newest.values, R=R, z=np.zeros(len(R)))
-        return replace(stage, message=own)
-
     def _adopt_all(self) -> None:
         """Replace the newest message by what the tree makes of all of its rows now."""
-        self.stages[-1] = self._adopt(self.stages[-1], compute_newest_root(self.tree))
+        newest, R = self.tree.keyframes[-1], compute_newest_root(self.tree)
+        self.stages[-1] = _replace_message(self.stages[-1], newest.estimate, newest.values, R)
 
     # ------------------------------------------------------------------------------------------- what the tree knows
     def read_states(self) -> States:
@@ -174,6 +170,11 @@ class TreeWindow(Window):
         else:
             self.tree = Tree(self.head, self.turn, self._whole)
         return out
+
+
+def _replace_message(stage: Stage, state: States, values: Array, R: Array) -> Stage:
+    """A stage about what is most likely, of which R (D, D) is known."""
+    return replace(stage, message=replace(stage.message, state=state, values=values, R=R, z=np.zeros(len(R))))
 
 
 def _forget_message(stage: Stage) -> Stage:
