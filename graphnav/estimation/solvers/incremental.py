@@ -55,11 +55,9 @@ class Incremental:
         window = self.window
         if window.push(replace(place, problem=self.problem)) > window.turn:
             window.converge(renewed=self._renew)
-        if not (count := window.leaving) and are_due(window.stages[0].place.t, place.t, self.lag):
+        if are_due(window.stages[0].place.t, place.t, self.lag):
             self._converge(_SETTLING, any(c.robust != "none" for c in self.problem.constraints))
-            count = int(np.searchsorted(window.t, place.t - self.lag))
-        if count and window.smooth_back(count, len(window)):
-            self.settled.append(window.settle(count))
+            self.settled.append(window.settle(int(np.searchsorted(window.t, place.t - self.lag))))
 
     def finish(self) -> None:
         """End of input: settle all."""
