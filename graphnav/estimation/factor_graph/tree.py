@@ -102,7 +102,7 @@ class Tree:
         ----------
         ahead : its prediction, from where the newest keyframe is now.
         rows : measurements, linearised there.
-        found : what a filter makes of them, as the tree does: this is substituted back only when it is read.
+        found : what a filter makes of them, until the tree is read.
         """
         place, columns, fresh = ahead.place, ahead.columns, list[Fresh]()  # new variables, with priors among them
         if not self.keyframes and place.linked:
@@ -128,15 +128,16 @@ class Tree:
             made.append((keyframe, ROWS, make_row_factor(keyframe, rows, False, np.eye(3))))
         self.keyframes.append(keyframe)
         self._number += 1
-        keyframe.put(found.state, found.values)
         if self._whole:
             self._waiting[0].extend(made)
             self._waiting[1].extend(fresh)
+            keyframe.put(found.state, found.values)
             return
         # along time, where the order is free; CCOLAMD wants labels below the number of variables it is to order
         most = min(3, len({key for _, _, one in made for key in list(one.keys())}) - 1)
         order = [(v, max(v.last - keyframe.number + most, 0)) for v in self._find_recent()]
         self._update(made, fresh=fresh, order=order)
+        keyframe.read(self.isam)
 
     def _add_first_keyframe(self, place: Place) -> None:
         """Add the initial message as a keyframe before the first."""
@@ -160,8 +161,7 @@ class Tree:
         self._update(fresh=[*fresh, (x, make_factor(blocks, prior.z))])
         self._number += 1
         self.held = 1
-        known = prior.move(prior.estimate)
-        self.keyframes[0].put(known.state, known.values)
+        self.keyframes[0].read(self.isam)
 
     def _find_recent(self) -> Iterable[Variable]:
         for keyframe in self.keyframes[-3:]:

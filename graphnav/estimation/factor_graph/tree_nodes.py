@@ -75,6 +75,10 @@ class Keyframe:
         """That its rows may touch, its state first."""
         return {x.key: x for x in (self.state, *(node for node, _ in self.nodes.values()))}.values()
 
+    def read(self, isam: gtsam.ISAM2) -> None:
+        """Bring its variables up to date, where it is the newest: they are in the root, or were eliminated just now."""
+        take_deltas(isam, self.variables)
+
 
 Made = tuple[Keyframe, str, Any]  # a factor of a keyframe, `LINK` or `ROWS`
 Fresh = tuple[Variable, Any]  # a variable that begins, with a factor that comes with it or None
@@ -146,6 +150,11 @@ def update_isam(
 def read_estimates(isam: gtsam.ISAM2, variables: Collection[Variable]) -> None:
     """Bring many variables up to date, by back-substitution through the whole tree."""
     isam.calculateBestEstimate()
+    take_deltas(isam, variables)
+
+
+def take_deltas(isam: gtsam.ISAM2, variables: Collection[Variable]) -> None:
+    """Take over what a tree has computed of some variables."""
     flat = np.asarray(isam.getDelta().vector([x.key for x in variables])).ravel()
     begin = 0
     for x in variables:

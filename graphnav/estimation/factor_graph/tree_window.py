@@ -1,9 +1,8 @@
 """A window on GTSAM's iSAM2: its keyframes are smoothed, relinearised and marginalised in a tree.
 
 Keyframes are prepared as in `graphnav.estimation.solvers.window`: predicted from a message of the newest keyframe,
-innovations tested, robust rows weighted. From then on the tree holds the rows. Settled estimates are its own, and so is
-the message of the newest keyframe once the past has been linearised anew; in between that is the filter's, which solves
-the same rows: substituting back in GTSAM's tree takes half as long as its update. The keyframe that
+innovations tested, robust rows weighted. From then on the tree holds the rows. Live and settled estimates are its own,
+and so is the message that the next keyframe is predicted from once the past has been linearised anew. The keyframe that
 settled last stays in the tree, so that all behind it can be taken back.
 
 Of a recording, `isam2` smooths the whole drive in one tree, or as it would be online.
@@ -18,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from graphnav.core.progress import Progress
+from graphnav.core.rotation import Array
 from graphnav.core.state import States
 from graphnav.estimation.factor_graph.tree import Tree
 from graphnav.estimation.factor_graph.tree_marginals import (
@@ -66,11 +66,14 @@ class TreeWindow(Window):
             self.tree = Tree(self.head, self.turn, self._whole)
         ahead = self.expect(place) if ahead is None else replace(ahead, place=place)
         stage, e = self._update(ahead)
-        settled, stage = [one.settle(e) for one in stage.measured], stage.move(e)
-        self.tree.add(ahead, settled, stage.message)
+        message = stage.message.move(e)
+        self.tree.add(ahead, [one.settle(e) for one in stage.measured], message)
         if self.stages:  # of those before, the tree knows
             self.stages[-1] = _forget_message(self.stages[-1])
-        self._append(stage)
+        newest = self.tree.keyframes[-1]
+        state, values = newest.estimate, newest.values
+        moved = message.move(np.concatenate([state.minus(message.state)[0], values - message.values]))
+        self._append(_replace_message(stage, state, values, moved.R))
         if self._whole and len(self) >= self._look:
             self.converge()
             self._look = len(self) + max(_LEAST, len(self) // _GROWN)
@@ -78,9 +81,8 @@ class TreeWindow(Window):
 
     def _adopt_all(self) -> None:
         """Replace the newest message by what the tree makes of all of its rows now."""
-        stage, newest, R = self.stages[-1], self.tree.keyframes[-1], compute_newest_root(self.tree)
-        own = replace(stage.message, state=newest.estimate, values=newest.values, R=R, z=np.zeros(len(R)))
-        self.stages[-1] = replace(stage, message=own)
+        newest, R = self.tree.keyframes[-1], compute_newest_root(self.tree)
+        self.stages[-1] = _replace_message(self.stages[-1], newest.estimate, newest.values, R)
 
     # ------------------------------------------------------------------------------------------- what the tree knows
     def read_states(self) -> States:
@@ -168,6 +170,11 @@ class TreeWindow(Window):
         else:
             self.tree = Tree(self.head, self.turn, self._whole)
         return out
+
+
+def _replace_message(stage: Stage, state: States, values: Array, R: Array) -> Stage:
+    """A stage about what is most likely, of which R (D, D) is known."""
+    return replace(stage, message=replace(stage.message, state=state, values=values, R=R, z=np.zeros(len(R))))
 
 
 def _forget_message(stage: Stage) -> Stage:
