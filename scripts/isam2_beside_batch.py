@@ -23,7 +23,7 @@ from graphnav.core.rotation import Array
 from graphnav.core.state import States
 from graphnav.detectors import detect
 from graphnav.estimation.factor_graph.batch import batch
-from graphnav.estimation.factor_graph.isam import isam2
+from graphnav.estimation.factor_graph.tree_window import isam2
 from graphnav.estimation.pipeline import choose_origin
 from graphnav.estimation.preparation import begin_preparation, prepare
 from graphnav.estimation.problem import Problem

@@ -10,12 +10,11 @@ import numpy as np
 
 from graphnav.core.progress import Progress
 from graphnav.core.state import DIM, States
-from graphnav.estimation.factor_graph.isam import TreeSmoother
-from graphnav.estimation.factor_graph.tree_marginals import compute_newest_root
+from graphnav.estimation.factor_graph.tree_window import TreeWindow
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import Solution
 from graphnav.estimation.solvers.incremental import Incremental, begin_at, solve_in_turn
-from graphnav.estimation.solvers.stages import Place
+from graphnav.estimation.solvers.stages import Message, Place
 from graphnav.estimation.solvers.window import Window, compute_turn_limit
 
 
@@ -28,21 +27,20 @@ class Replay:
     seconds: np.ndarray
 
 
-class _Recorded:
+class _Recorded(Incremental):
     """A smoother that keeps its live estimates, with the covariances (15, 15) of their states."""
 
-    def __init__(self, engine: Incremental | TreeSmoother) -> None:
-        self._engine, self.settled, self.finish = engine, engine.settled, engine.finish
+    def __init__(self, window: Window, problem: Problem, lag: float) -> None:
+        super().__init__(window, problem, lag)
         self.states: list[States] = []
         self.covariance: list[np.ndarray] = []
         self.seconds: list[float] = []
 
     def add(self, place: Place) -> None:
-        began, engine = time.thread_time(), self._engine
-        engine.add(place)
-        newest = engine.window.newest if isinstance(engine, Incremental) else engine.tree.newest
-        R = newest.R if isinstance(engine, Incremental) else compute_newest_root(engine.tree)
-        root = np.linalg.inv(R)[:DIM]
+        began = time.thread_time()
+        super().add(place)
+        newest = self.window.newest
+        root = np.linalg.inv(newest.R)[:DIM]
         self.seconds.append(time.thread_time() - began)
         self.states.append(newest.state)
         self.covariance.append(root @ root.T)
@@ -50,20 +48,21 @@ class _Recorded:
 
 def play_window(problem: Problem, lag: float = np.inf, progress: Progress | None = None) -> Replay:
     """By the window."""
-    window = Window(begin_at(problem, None), compute_turn_limit(problem.imu_noise))
-    return _play(problem, "incremental", Incremental(window, lag), lag, progress)
+    return _play(problem, "incremental", Window(*_begin(problem)), lag, progress)
 
 
 def play_isam2(problem: Problem, lag: float = np.inf, progress: Progress | None = None) -> Replay:
     """By GTSAM's iSAM2."""
-    return _play(problem, "isam2", TreeSmoother(begin_at(problem, None), problem, lag), lag, progress)
+    return _play(problem, "isam2", TreeWindow(*_begin(problem), whole=bool(np.isinf(lag))), lag, progress)
 
 
-def _play(
-    problem: Problem, solver: str, engine: Incremental | TreeSmoother, lag: float, progress: Progress | None
-) -> Replay:
-    recorded = _Recorded(engine)
-    settled = solve_in_turn(problem, solver, recorded, lag, progress)
+def _begin(problem: Problem) -> tuple[Message, float]:
+    return begin_at(problem, None), compute_turn_limit(problem.imu_noise)
+
+
+def _play(problem: Problem, solver: str, window: Window, lag: float, progress: Progress | None) -> Replay:
+    recorded = _Recorded(window, problem, lag)
+    settled = solve_in_turn(problem, solver, recorded, progress)
     live = replace(
         settled, solver="live", states=States.stack(recorded.states), covariance=np.array(recorded.covariance)
     )

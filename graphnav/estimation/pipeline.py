@@ -310,7 +310,7 @@ def _solve(
 
         out["incremental"] = incremental(problem, settings.solver.lag, progress, begin)
     if "isam2" in solvers:
-        from graphnav.estimation.factor_graph.isam import isam2
+        from graphnav.estimation.factor_graph.tree_window import isam2
         from graphnav.estimation.solvers.rows import compute_cost_at
 
         out["isam2"] = one = isam2(problem, settings.solver.isam2_lag or np.inf, progress, begin)

@@ -152,8 +152,11 @@ class Chain:
     # ------------------------------------------------------------------------------------------ entering, leaving
     def _watch(self, problem: Problem, sensors: Sensors) -> None:
         """Start to watch the fixes for lasting errors, behind those judged by evidence, once their period is known."""
+        tests = self.window.newest.tests
+        if tests is not None and self.newest <= self.judged + SAME_TIME < problem.t[-1]:
+            self.window.watch(tests.forget_onsets())  # the size of usual innovations stays known
         if (
-            self.window.newest.tests is not None
+            tests is not None
             or problem.t[-1] <= self.judged + SAME_TIME
             or self.settings.gnss.faults == "off"
             or len(sensors.gnss.used) < _FEWEST_FOR_PERIOD
@@ -200,7 +203,7 @@ class Chain:
             turn = max(turn, self._push(problem, k, ahead))
             ahead = None
             fault = self.window.stages[-1].fault
-            if fault is not None:
+            if fault is not None and problem.t[k] > self.judged + SAME_TIME:
                 again = self.verdicts.settle(*fault, now=float(problem.t[k]))
                 if again < problem.t[first] - SAME_TIME:
                     if again <= self.head + SAME_TIME:

@@ -26,13 +26,13 @@ from graphnav.estimation.pipeline import choose_origin
 from graphnav.estimation.solution import ExcludedSpan
 from graphnav.online.ahead import Live, export
 from graphnav.online.checks import check_rows
+from graphnav.online.judgement import WindowJudge
 from graphnav.online.looks import CONTEXT, SURE
 from graphnav.online.noise_estimation import BackgroundEstimation, CatchUp, are_enough, start_estimation
 from graphnav.online.sanity import find_period
 from graphnav.online.schedule import AFTER, expect_keyframe, find_due, find_limit, list_keyframes
 from graphnav.online.sensors import Row, Sensors
 from graphnav.online.start import choose_settings, find_start, make_tracker, take_start_rows
-from graphnav.online.stop_judgement import StopJudge
 from graphnav.online.tracker import Tracker
 from graphnav.online.walker import Walker
 from graphnav.recording import Recording
@@ -65,7 +65,7 @@ class Smoother:
         self.late: Counter[str] = Counter()  # used rows that arrived after the keyframe they should have entered
         self._estimation: BackgroundEstimation | None = None  # estimation of the noise model in progress
         self._catch_up: CatchUp | None = None  # tracker that processes the unsettled keyframes with the new model
-        self._judge = StopJudge()
+        self._judge = WindowJudge()
         self._tentative = False  # nothing may settle before the noise model has been estimated once
         self._found: Alignment | None = None  # whether the noise model is to be estimated again
         self._notes_on: dict[str, tuple[str, ...]] = {}  # notes that further rows may change, by subject
@@ -344,7 +344,7 @@ class Smoother:
     def _begin_anew(self, oldest: float) -> None:
         """Drop all rows and states; rows up to a time (s) are too late from now on."""
         self.tracker = self._found = self._estimation = self._catch_up = None
-        self._judge, self._tentative, self._times, self._left_out = StopJudge(), False, [], ()
+        self._judge, self._tentative, self._times, self._left_out = WindowJudge(), False, [], ()
         self.sensors.drop_before(np.inf)
         self.sensors.gnss.space(None)
         self.sensors.oldest = oldest

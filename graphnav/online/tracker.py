@@ -294,8 +294,8 @@ class Tracker(Chain):
         other, head = copy.copy(self), self.window.head
         other.noise, other._parameters, other.verdicts = noise, {}, copy.deepcopy(self.verdicts)
         since = [begin for begin, _ in set(noise.false_stops) - set(self.noise.false_stops)]
-        if judged > self.judged:
-            other.judged, since = judged, [self.head + SAME_TIME]
+        if judged > -np.inf:
+            other.judged, since = max(judged, self.judged), [self.head + SAME_TIME]
         if since:
             other.verdicts.readmit(min(since))
         other.window = type(self.window)(head.move(head.estimate), find_turn(setup, noise))

@@ -1,11 +1,22 @@
-"""Wrong fixes of a running drive: evidence decides on those that the noise model was estimated from."""
+"""Wrong fixes of a running drive: evidence decides, on the rows of a noise estimate, and on a window."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
+import pytest
 
 from graphnav import load
-from graphnav.online import Online, drop_rows, list_rows
+from graphnav.config import parse_settings
+from graphnav.core.earth import LocalFrame
+from graphnav.estimation.faults.watch import Watch
+from graphnav.online import Online, drop_rows, list_rows, smoother
+from graphnav.online.judgement import WindowJudge
+from graphnav.recording import Recording
+
+_JUDGE = {"holds": WindowJudge.holds, "look": WindowJudge.look}
 
 
 def test_no_right_fix_is_left_out_that_the_noise_model_was_estimated_from() -> None:
@@ -20,3 +31,47 @@ def test_no_right_fix_is_left_out_that_the_noise_model_was_estimated_from() -> N
     assert online.tracker is not None
     assert np.isfinite(online.tracker.judged)
     assert online.excluded == ()
+
+
+def play(recording: Recording) -> Online:
+    """Without another estimate of the noise model than that from the rows of the alignment."""
+    online = Online(drop_rows(recording), parse_settings({"gnss": {"velocity": False}, "solver": {"lag": 60.0}}))
+    for row in list_rows(recording)[1]:
+        online.add(row)
+    online.finish()
+    assert not online.failures
+    return online
+
+
+@pytest.fixture
+def recording(shared_data: Path, monkeypatch: pytest.MonkeyPatch) -> Recording:
+    monkeypatch.setattr(smoother, "are_enough", lambda *_: True)
+    return load(shared_data / "oracle_drive").crop(50.0, 230.0)
+
+
+def test_right_fixes_that_tests_leave_out_are_used_before_anything_settles_without_them(
+    recording: Recording, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begin, end = recording.start + 100.5, recording.start + 110.5
+    find = Watch.find_onset
+    monkeypatch.setattr(
+        Watch,
+        "find_onset",
+        lambda self, name, t, *a: begin if name == "gnss_position" and begin < t < end else find(self, name, t, *a),
+    )
+    monkeypatch.setattr(WindowJudge, "holds", lambda *_: False)
+    monkeypatch.setattr(WindowJudge, "look", lambda *_, **__: None)
+    assert sum(fault.count for fault in play(recording).excluded) >= 10
+    for name in ("holds", "look"):
+        monkeypatch.setattr(WindowJudge, name, _JUDGE[name])
+    assert play(recording).excluded == ()
+
+
+def test_wrong_fixes_stay_left_out(recording: Recording) -> None:
+    gnss, wrong = recording.gnss, (100.5, 110.5)
+    assert gnss is not None
+    frame, t = LocalFrame(gnss.llh[0]), gnss.t - recording.start
+    p = frame.from_llh(gnss.llh) + ((t > wrong[0]) & (t < wrong[1]))[:, None] * np.array([6.0, -3.0, 2.0])
+    online = play(replace(recording, gnss=replace(gnss, llh=frame.to_llh(p))))
+    (fault,) = online.excluded
+    np.testing.assert_allclose([fault.t_start, fault.t_end], recording.start + np.array(wrong), atol=1.0)

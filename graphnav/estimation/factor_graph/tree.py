@@ -27,6 +27,7 @@ from graphnav.core.rotation import Array
 from graphnav.core.state import DIM
 from graphnav.estimation.factor_graph.tree_nodes import (
     LINK,
+    ROWS,
     Fresh,
     Keyframe,
     Made,
@@ -46,11 +47,8 @@ from graphnav.estimation.factor_graph.tree_nodes import (
     update_isam,
     write_factors,
 )
-from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.elimination import Predicted
-from graphnav.estimation.solvers.linearise import Step, scale_at, shift
-from graphnav.estimation.solvers.passes import integrate_again
-from graphnav.estimation.solvers.recursion import PASSES
+from graphnav.estimation.solvers.linearise import Step, shift
 from graphnav.estimation.solvers.revision import Renewed, linearise_runs
 from graphnav.estimation.solvers.stages import (
     Measured,
@@ -59,8 +57,6 @@ from graphnav.estimation.solvers.stages import (
     append_columns,
     count_columns,
     group_runs,
-    linearise_rows,
-    predict_stage,
 )
 
 NODE_EVERY = 30.0  # s from one node of a constant to the next
@@ -76,78 +72,72 @@ class Tree:
     ----------
     prior : message on the first keyframe before any measurement.
     turn : rad that an attitude may move before its rows are linearised anew.
+    whole : whether nothing is ever marginalised. GTSAM's `ISAM2.update` eliminates few variables anew, but releases
+        what it has eliminated clique by clique with all that hangs below: over a whole drive that takes longer than
+        all else. So keyframes wait, and enter together when the tree is read.
     """
 
-    def __init__(self, prior: Message, turn: float) -> None:
-        self.isam = make_isam()
-        self.turn = turn
+    def __init__(self, prior: Message, turn: float, whole: bool = False) -> None:
+        self.isam = make_isam(reuses_slots=not whole)
+        self.turn, self._whole = turn, whole
+        self._waiting: tuple[list[Made], list[Fresh]] = [], []  # factors and variables of a whole drive, to enter
         self.keyframes: list[Keyframe] = []
-        self.relinearised = 0  # keyframes
         self._prior = prior
         self._number = self._key = 0
         self._in_force: dict[str, tuple[Variable, slice]] = {}
         self.variables: dict[int, Variable] = {}
         self._first_sigma: dict[str, Array] = {}
         self._constant: set[str] = set()
-        self.version = 0  # grows where factors are replaced
+        self.version = 0  # grows when factors are replaced
         self.held = 0  # keyframes at the front that stay as they are: 1 where the first is behind the window
 
     def __len__(self) -> int:
         return len(self.keyframes)
 
     # --------------------------------------------------------------------------------------------------- entering
-    @property
-    def newest(self) -> Message:
-        """State and parameter values of the newest keyframe as estimated now, without covariance."""
-        if not self.keyframes:
-            return self._prior
-        last, none = self.keyframes[-1], np.empty(0)
-        return Message(last.estimate, last.values, last.columns, none, none)
-
-    def add(self, place: Place, ahead: Predicted | None = None, rows: Sequence[Measured] = ()) -> float:
-        """Add a keyframe; returns by how much its rows turned its attitude, rad.
+    def add(self, ahead: Predicted, rows: Sequence[Measured], found: Message) -> None:
+        """Add a keyframe.
 
         Parameters
         ----------
-        ahead, rows : what it is predicted to be from `newest`, and its rows there, where that is known already.
+        ahead : its prediction, from where the newest keyframe is now.
+        rows : measurements, linearised there.
+        found : what a filter makes of them, until the tree is read.
         """
+        place, columns, fresh = ahead.place, ahead.columns, list[Fresh]()  # new variables, with priors among them
         if not self.keyframes and place.linked:
             self._add_first_keyframe(place)
-        if ahead is None:
-            state, values, columns, link = predict_stage(self.newest, place)
-            rows = linearise_rows(place, state, values, columns).measured
-        else:
-            state, values, columns, link = ahead.state, ahead.values, ahead.columns, ahead.link
-        fresh: list[Fresh] = []  # new variables, and priors of parameters among them
         x = self._add_variable(np.zeros(DIM), _UNIT, place.t)
         nodes = self._open(place, fresh)
-        keyframe = Keyframe(self._number, place, x, state, columns, nodes, {})
+        names = frozenset(one.name for one in rows)
+        keyframe = Keyframe(self._number, place, x, ahead.state, columns, nodes, names)
         for node, _ in nodes.values():
             node.last = self._number
-        for name, at in columns.items():
-            node, own = nodes[name]
-            node.delta[own] = values[shift(at)] - node.anchor[own]
+        keyframe.put(ahead.state, ahead.values)
+        for node, own in nodes.values():
             if node.t == place.t:
                 node.point[own] = node.delta[own]
         made: list[Made] = []
-        if link is None:
+        if ahead.link is None:
             fresh.append((x, make_factor([(x, self._prior.R[:, :DIM])], self._prior.z)))
         else:
             fresh.append((x, None))
             turns = compute_turns([self.keyframes[-1], keyframe])
-            made.append((keyframe, LINK, make_interval_factor(self.keyframes[-1], x, link, turns)))
-        made += [(keyframe, one.name, make_row_factor(keyframe, one, False, np.eye(3))) for one in rows]
+            made.append((keyframe, LINK, make_interval_factor(self.keyframes[-1], x, ahead.link, turns)))
+        if rows:
+            made.append((keyframe, ROWS, make_row_factor(keyframe, rows, False, np.eye(3))))
         self.keyframes.append(keyframe)
+        self._number += 1
+        if self._whole:
+            self._waiting[0].extend(made)
+            self._waiting[1].extend(fresh)
+            keyframe.put(found.state, found.values)
+            return
         # along time, where the order is free; CCOLAMD wants labels below the number of variables it is to order
         most = min(3, len({key for _, _, one in made for key in list(one.keys())}) - 1)
-        order = [(v, max(v.last - self._number + most, 0)) for v in self._find_recent()]
+        order = [(v, max(v.last - keyframe.number + most, 0)) for v in self._find_recent()]
         self._update(made, fresh=fresh, order=order)
-        self._number += 1
         keyframe.read(self.isam)
-        for _ in range(PASSES - 1 if any(one.kernel != "none" for one in rows) else 0):
-            self.linearise_again([len(self.keyframes) - 1])
-            keyframe.read(self.isam)
-        return float(np.linalg.norm(x.delta[:3]))
 
     def _add_first_keyframe(self, place: Place) -> None:
         """Add the initial message as a keyframe before the first."""
@@ -167,7 +157,7 @@ class Tree:
                 self._first_sigma[name] = p.sigma
         self._in_force = nodes
         before = Place(place.t, None)
-        self.keyframes.append(Keyframe(self._number, before, x, prior.state, prior.columns, nodes, {}))
+        self.keyframes.append(Keyframe(self._number, before, x, prior.state, prior.columns, nodes, frozenset()))
         self._update(fresh=[*fresh, (x, make_factor(blocks, prior.z))])
         self._number += 1
         self.held = 1
@@ -177,7 +167,7 @@ class Tree:
         for keyframe in self.keyframes[-3:]:
             yield keyframe.state
         yield from {id(n): n for k in self.keyframes[-3:] for n, _ in k.nodes.values()
-                    if n.last >= self._number - 2}.values()  # fmt: skip
+                    if n.last >= self._number - 3}.values()  # fmt: skip
 
     def _add_variable(self, anchor: Array, unit: Array, t: float) -> Variable:
         none = np.zeros(len(unit))
@@ -230,6 +220,12 @@ class Tree:
         """As `update_isam`."""
         update_isam(self.isam, self.keyframes[-1].place.t, made, gone, fresh, **how)
 
+    def _enter(self) -> None:
+        """Take in the keyframes of a whole drive that wait."""
+        (made, fresh), self._waiting = self._waiting, ([], [])
+        if fresh:
+            self._replace(made, [], max(made[0][0].number - 1, 0) if made else 0, fresh)
+
     def _replace(self, made: Sequence[Made], gone: Sequence[int], first: int, fresh: Sequence[Fresh] = ()) -> None:
         """Have factors in place of others, on keyframes from number `first` on."""
         # elimination order is that of time; with much to do, GTSAM rebuilds the whole tree
@@ -243,21 +239,8 @@ class Tree:
     # ------------------------------------------------------------------------------------------ linearising again
     def read(self) -> None:
         """Bring all estimates up to date."""
+        self._enter()
         read_estimates(self.isam, self.variables.values())
-
-    def _change(self, keyframes: Iterable[Keyframe]) -> None:
-        """Factors of some keyframes are replaced."""
-        self.version += 1
-        for k in keyframes:
-            k.version = self.version
-
-    def find_oldest_relinearised(self, version: int) -> float:
-        """Number of the oldest keyframe whose factors were replaced after a version; infinite if there is none."""
-        return (
-            next((k.number for k in self.keyframes if k.version > version), np.inf)
-            if self.version > version
-            else np.inf
-        )
 
     def find_moves(self) -> Array:
         """(K,) how far keyframes' estimates are from where their rows were linearised, 1 at the limit."""
@@ -284,23 +267,12 @@ class Tree:
         self.read()
         return len(which)
 
-    def integrate_again(self, problem: Problem) -> tuple[Problem, bool]:
-        """Where biases have moved too far, have their intervals integrated about them; all are of one problem."""
-        self.read()
-        own = self.keyframes
-        scale = scale_at(own[-1].columns, own[-1].values)
-        problem, count = integrate_again(problem, read_states(own), scale, own[0].place.k)
-        if count:
-            for k in own:
-                k.place = replace(k.place, problem=problem)
-            self.linearise_again(range(len(self)))
-        return problem, count > 0
-
     def linearise_again(self, which: Iterable[int], renewed: Renewed | None = None) -> None:
         """Linearise keyframes, and the intervals on either side, where they are now."""
         rows = {i for i in map(int, which) if i >= self.held}
         if not rows:
             return
+        self._enter()
         links = {k for i in rows for k in (i, i + 1) if k < len(self) and LINK in self.keyframes[k].slots}
         made: list[Made] = []
         for run in group_runs(sorted(rows | links), lambda last, i: i == last + 1):
@@ -320,18 +292,16 @@ class Tree:
                         (keyframe, LINK, make_interval_factor(around[k], keyframe.state, linear.link, turns[k : k + 2]))
                     )
                 if i in rows:
-                    measured = (one for one in linear.measured if one.name in keyframe.slots)
-                    made += [
-                        (keyframe, one.name, make_row_factor(keyframe, one, True, turns[k + 1])) for one in measured
-                    ]
+                    measured = [one for one in linear.measured if one.name in keyframe.names]
+                    if measured and ROWS in keyframe.slots:
+                        made.append((keyframe, ROWS, make_row_factor(keyframe, measured, True, turns[k + 1])))
         gone = [keyframe.slots.pop(name) for keyframe, name, _ in made]
         for i in rows:
             x = self.keyframes[i].state
             x.point = x.delta.copy()
             for node, _ in self.keyframes[i].nodes.values():
                 node.point = node.delta.copy()
-        self.relinearised += len(rows)
-        self._change(self.keyframes[i] for i in rows)
+        self.version += 1
         self._replace(made, gone, self.keyframes[max(min(rows) - 1, 0)].number)
 
     # ---------------------------------------------------------------------------------------------------- leaving
@@ -351,7 +321,7 @@ class Tree:
             del self.variables[key]
         for x in self.variables.values():
             x.last = min(x.last, last.number)
-        self._change([last])
+        self.version += 1
         self._replace([], own, last.number)
         self.read()
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from graphnav.core import rotation
 from graphnav.core.rotation import Array
-from graphnav.core.state import DIM, States
+from graphnav.core.state import DIM
 from graphnav.estimation.factor_graph.gaussian import Eliminated
 from graphnav.estimation.factor_graph.tree import Tree
 from graphnav.estimation.factor_graph.tree_nodes import Keyframe, Variable, fill_keys, read_states
@@ -83,47 +83,27 @@ def find_head(tree: Tree) -> Message:
 
 
 @dataclass(frozen=True)
-class Estimates:
-    """Estimates of a tree's keyframes at some time, without covariances."""
-
-    keyframes: tuple[Keyframe, ...]
-    delta: Array  # (n, 15) of their states
-    states: States
-    values: tuple[Array, ...]  # (D-15,) each
-
-
-@dataclass(frozen=True)
 class Elimination:
     """Elimination of all later keyframes of a tree, in progress or complete, for the marginal of the oldest."""
 
     first: int  # keyframes from here
     count: int  # to here
-    estimates: Estimates  # of these
     version: int  # of the tree when it began
-    newest: int  # number of its newest keyframe then
     behind: tuple[Variable, ...]  # still to be eliminated
     own: tuple[Variable, ...]  # those of the keyframes
     graph: gtsam.GaussianFactorGraph
     net: gtsam.GaussianBayesNet | None = None  # of the keyframes' own, at the end
 
 
-def read_keyframes(tree: Tree, first: int, count: int) -> Estimates:
-    """Estimates of the keyframes from `first` to `count`."""
-    tree.read()
-    own = tuple(tree.keyframes[first:count])
-    return Estimates(own, np.array([k.state.delta for k in own]), read_states(own), tuple(k.values for k in own))
-
-
 def begin_elimination(tree: Tree, count: int, first: int = 0) -> Elimination:
     """Nothing eliminated yet, of the first `count` keyframes, or those of them from `first` on."""
+    tree.read()
     behind = tree.keyframes[count].number if count < len(tree) else np.inf
     variables = tree.variables.values()
     return Elimination(
         first,
         count,
-        read_keyframes(tree, first, count),
         tree.version,
-        tree.keyframes[-1].number,
         tuple(sorted((x for x in variables if x.first >= behind), key=lambda x: x.first)),
         tuple(sorted((x for x in variables if x.first < behind), key=lambda x: x.last)),
         tree.isam.getFactorsUnsafe().linearize(tree.isam.getLinearizationPoint()),
@@ -135,7 +115,7 @@ def eliminate(tree: Tree, so_far: Elimination, most: int) -> Elimination:
 
     Keyframes added since it began do not count; after a relinearisation it starts again.
     """
-    if tree.find_oldest_relinearised(so_far.version) <= so_far.newest:
+    if tree.version != so_far.version:
         so_far = begin_elimination(tree, so_far.count, so_far.first)
     if so_far.behind:
         order = fill_keys(gtsam.Ordering(), reversed(so_far.behind[-most:]))
@@ -147,34 +127,31 @@ def eliminate(tree: Tree, so_far: Elimination, most: int) -> Elimination:
     return so_far
 
 
-def settle(tree: Tree, so_far: Elimination, now: bool = False) -> SettledStates:
-    """States, parameters and covariances, all at once of what is left to be done.
-
-    Parameters
-    ----------
-    now : states and parameters as they are known now, not as when the elimination began.
-    """
+def settle(tree: Tree, so_far: Elimination) -> SettledStates:
+    """States and parameters as they are known now, and covariances, all at once of what is left to be done."""
+    own = tree.keyframes[so_far.first : so_far.count]
     try:
         while (further := eliminate(tree, so_far, _AT_ONCE)) is not so_far:
             so_far = further
     except RuntimeError:  # GTSAM's for a variable that nothing determines
-        raise explain_undetermined(so_far.estimates.keyframes[0].place.t) from None
+        raise explain_undetermined(own[0].place.t) from None
     assert so_far.net is not None
-    one = read_keyframes(tree, so_far.first, so_far.count) if now else so_far.estimates
+    tree.read()
     found = Eliminated(so_far.net).compute_covariances()
     marginal = {x.key: x.unit[:, None] * found[x.key] * x.unit for x in so_far.own}
-    sigma = []
-    for k, values in zip(one.keyframes, one.values, strict=True):
-        out = np.zeros(len(values))
+    values, sigma = tuple(k.values for k in own), []
+    for k, known in zip(own, values, strict=True):
+        out = np.zeros(len(known))
         for name, at in k.columns.items():
             node, part = k.nodes[name]
             out[shift(at)] = np.sqrt(np.maximum(np.diag(marginal[node.key])[part], 0.0))
         sigma.append(out)
+    about = np.stack([marginal[k.state.key] for k in own])
     return SettledStates(
-        t=np.array([k.place.t for k in one.keyframes]),
-        states=one.states,
-        covariance=move_covariance(np.stack([marginal[k.state.key] for k in one.keyframes]), one.delta),
-        columns=tuple(k.columns for k in one.keyframes),
-        values=one.values,
+        t=np.array([k.place.t for k in own]),
+        states=read_states(own),
+        covariance=move_covariance(about, np.array([k.state.delta for k in own])),
+        columns=tuple(k.columns for k in own),
+        values=values,
         sigma=tuple(sigma),
     )

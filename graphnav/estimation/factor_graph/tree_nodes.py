@@ -19,7 +19,7 @@ from graphnav.estimation.solvers.stages import Measured, Place
 from graphnav.estimation.solvers.stages import rotate_columns as turned_by
 from graphnav.estimation.solvers.window import find_parameter_limits
 
-LINK = "imu"  # among the constraints of a keyframe: the interval before it
+LINK, ROWS = "interval", "rows"  # factors of a keyframe: the interval before it, and all of its measurements together
 _WILDFIRE = np.inf  # updates of older keyframes are propagated when these are read
 
 
@@ -46,8 +46,8 @@ class Keyframe:
     anchor: States  # one
     columns: Columns
     nodes: dict[str, tuple[Variable, slice]]  # the node of each parameter in force
-    slots: dict[str, int]  # index of its factor of each constraint
-    version: int = 0  # of the tree when its rows were linearised anew, or what followed it was taken back
+    names: frozenset[str]  # of the constraints that it has rows of
+    slots: dict[str, int] = field(default_factory=dict)  # index of each of its factors
 
     @property
     def estimate(self) -> States:
@@ -63,6 +63,13 @@ class Keyframe:
             out[shift(at)] = node.anchor[own] + node.delta[own]
         return out
 
+    def put(self, state: States, values: Array) -> None:
+        """Set what is known now."""
+        self.state.delta = state.minus(self.anchor)[0]
+        for name, at in self.columns.items():
+            node, own = self.nodes[name]
+            node.delta[own] = values[shift(at)] - node.anchor[own]
+
     @property
     def variables(self) -> Collection[Variable]:
         """That its rows may touch, its state first."""
@@ -70,11 +77,10 @@ class Keyframe:
 
     def read(self, isam: gtsam.ISAM2) -> None:
         """Bring its variables up to date, where it is the newest: they are in the root, or were eliminated just now."""
-        for x in self.variables:
-            x.delta = x.unit * isam.calculateEstimateVector(x.key)
+        take_deltas(isam, self.variables)
 
 
-Made = tuple[Keyframe, str, Any]  # a factor of a keyframe, by the name of its constraint
+Made = tuple[Keyframe, str, Any]  # a factor of a keyframe, `LINK` or `ROWS`
 Fresh = tuple[Variable, Any]  # a variable that begins, with a factor that comes with it or None
 
 
@@ -144,6 +150,11 @@ def update_isam(
 def read_estimates(isam: gtsam.ISAM2, variables: Collection[Variable]) -> None:
     """Bring many variables up to date, by back-substitution through the whole tree."""
     isam.calculateBestEstimate()
+    take_deltas(isam, variables)
+
+
+def take_deltas(isam: gtsam.ISAM2, variables: Collection[Variable]) -> None:
+    """Take over what a tree has computed of some variables."""
     flat = np.asarray(isam.getDelta().vector([x.key for x in variables])).ravel()
     begin = 0
     for x in variables:
@@ -184,11 +195,12 @@ def make_interval_factor(last: Keyframe, x: Variable, link: Array, turns: Array)
     return _make_factor(last, blocks, link[:, DIM:-1], link[:, -1])
 
 
-def make_row_factor(keyframe: Keyframe, one: Measured, weighted: bool, turn: Array) -> Any:
+def make_row_factor(keyframe: Keyframe, measured: Sequence[Measured], weighted: bool, turn: Array) -> Any:
     """A factor of measurements linearised where keyframe, of J_r (3, 3), and parameters are now."""
-    H, b, _ = one.weigh(np.zeros(one.H.shape[-1]), int(weighted))
-    H = H.reshape(-1, H.shape[-1])
-    return _make_factor(keyframe, [(keyframe.state, turned_by(H[:, :DIM], turn))], H, b.ravel())
+    D = measured[0].H.shape[-1]
+    parts = [one.weigh(np.zeros(D), int(weighted)) for one in measured]
+    H, b = np.concatenate([H.reshape(-1, D) for H, _, _ in parts]), np.concatenate([b.ravel() for _, b, _ in parts])
+    return _make_factor(keyframe, [(keyframe.state, turned_by(H[:, :DIM], turn))], H, b)
 
 
 def _make_factor(keyframe: Keyframe, blocks: list[tuple[Variable, Array]], H: Array, b: Array) -> Any:

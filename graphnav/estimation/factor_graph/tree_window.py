@@ -1,9 +1,11 @@
-"""The window of an online run on GTSAM's iSAM2: its keyframes are smoothed, relinearised and marginalised in a tree.
+"""A window on GTSAM's iSAM2: its keyframes are smoothed, relinearised and marginalised in a tree.
 
 Keyframes are prepared as in `graphnav.estimation.solvers.window`: predicted from a message of the newest keyframe,
 innovations tested, robust rows weighted. From then on the tree holds the rows. Live and settled estimates are its own,
 and so is the message that the next keyframe is predicted from once the past has been linearised anew. The keyframe that
 settled last stays in the tree, so that all behind it can be taken back.
+
+Of a recording, `isam2` smooths the whole drive in one tree, or as it would be online.
 """
 
 from __future__ import annotations
@@ -14,6 +16,9 @@ from typing import Any
 
 import numpy as np
 
+from graphnav.core.progress import Progress
+from graphnav.core.rotation import Array
+from graphnav.core.state import States
 from graphnav.estimation.factor_graph.tree import Tree
 from graphnav.estimation.factor_graph.tree_marginals import (
     Elimination,
@@ -23,49 +28,68 @@ from graphnav.estimation.factor_graph.tree_marginals import (
     find_head,
     settle,
 )
+from graphnav.estimation.factor_graph.tree_nodes import read_states
+from graphnav.estimation.problem import Problem
+from graphnav.estimation.solution import Solution
 from graphnav.estimation.solvers.elimination import Predicted
+from graphnav.estimation.solvers.incremental import Incremental, begin_at, solve_in_turn
 from graphnav.estimation.solvers.revision import Renewing
 from graphnav.estimation.solvers.stages import Message, Place, Stage
-from graphnav.estimation.solvers.window import SettledStates, Window
+from graphnav.estimation.solvers.window import SettledStates, Window, compute_turn_limit
 
 _MAX_STEPS = 5
 _COVARIANCE_PORTION = 48  # variables that are eliminated at one row of the IMU for covariances
 _CONVERGED_SHARE = 0.02  # of the usual limits, within which the last window is converged
+# a look at what has moved of a whole drive costs as much as there are keyframes: the next one follows when there are a
+# part in this many more, and at least so many
+_GROWN, _LEAST = 8, 10
 
 
 class TreeWindow(Window):
-    """A window whose estimates are a `Tree`'s; parameters as of `Window`."""
+    """A window whose estimates are a `Tree`'s.
 
-    def __init__(self, prior: Message, turn: float) -> None:
+    Parameters
+    ----------
+    prior, turn : as of `Window`.
+    whole : whether nothing ever leaves, as of `Tree`.
+    """
+
+    def __init__(self, prior: Message, turn: float, whole: bool = False) -> None:
         super().__init__(prior, turn)
-        self.tree = Tree(prior, turn)
+        self._whole, self._look = whole, _LEAST
+        self.tree = Tree(prior, turn, whole)
         self._leaving: Elimination | None = None  # of stages that are to leave
 
     def push(self, place: Place, ahead: Predicted | None = None) -> float:
         """As of `Window`; the newest message is about the tree's estimate."""
         if not self.tree.keyframes:
-            self.tree = Tree(self.head, self.turn)
+            self.tree = Tree(self.head, self.turn, self._whole)
         ahead = self.expect(place) if ahead is None else replace(ahead, place=place)
         stage, e = self._update(ahead)
-        self.tree.add(place, ahead, [one.settle(e) for one in stage.measured])
-        self._append(self._adopt(stage))
+        message = stage.message.move(e)
+        self.tree.add(ahead, [one.settle(e) for one in stage.measured], message)
+        if self.stages:  # of those before, the tree knows
+            self.stages[-1] = _forget_message(self.stages[-1])
+        newest = self.tree.keyframes[-1]
+        state, values = newest.estimate, newest.values
+        moved = message.move(np.concatenate([state.minus(message.state)[0], values - message.values]))
+        self._append(_replace_message(stage, state, values, moved.R))
+        if self._whole and len(self) >= self._look:
+            self.converge()
+            self._look = len(self) + max(_LEAST, len(self) // _GROWN)
         return float(np.linalg.norm(e[:3]))
 
-    def _adopt(self, stage: Stage) -> Stage:
-        """The newest stage about the tree's estimate."""
-        now, message = self.tree.newest, stage.message
-        moved = stage.move(np.concatenate([now.state.minus(message.state)[0], now.values - message.values]))
-        return replace(moved, message=replace(moved.message, z=np.zeros(len(message.z))))
-
     def _adopt_all(self) -> None:
-        """Replace the newest message by the tree's, with its error state."""
-        stage = self._adopt(self.stages[-1])
-        m = stage.message
-        R = compute_newest_root(self.tree)
-        self.stages[-1] = replace(stage, message=replace(m, R=R))
-        self._means = None
+        """Replace the newest message by what the tree makes of all of its rows now."""
+        newest, R = self.tree.keyframes[-1], compute_newest_root(self.tree)
+        self.stages[-1] = _replace_message(self.stages[-1], newest.estimate, newest.values, R)
 
     # ------------------------------------------------------------------------------------------- what the tree knows
+    def read_states(self) -> States:
+        """As of `Window`."""
+        self.tree.read()
+        return read_states(self.tree.keyframes[self.tree.held :])
+
     def find_first_moved(self, share: float = 1.0) -> int | None:
         """The first stage that the tree would linearise anew; None if there is none."""
         if not self.stages:
@@ -119,9 +143,9 @@ class TreeWindow(Window):
         if keep >= len(self.stages):
             return
         del self.stages[keep:]
-        self._means = self._leaving = None
+        self._leaving = None
         if keep + self.tree.held == 0:
-            self.tree = Tree(self.head, self.turn)  # it had only just begun
+            self.tree = Tree(self.head, self.turn, self._whole)  # it had only just begun
             return
         self.tree.truncate(keep + self.tree.held)
         if self.stages:
@@ -136,14 +160,41 @@ class TreeWindow(Window):
             return super().settle(0)
         if self._leaving is None or self.leaving != count:
             self._leaving = begin_elimination(self.tree, self.tree.held + count, self.tree.held)
-        out, self._leaving = settle(self.tree, self._leaving, now=True), None  # wherever a run may have been resumed
+        out, self._leaving = settle(self.tree, self._leaving), None
         self.head = gone[-1].message
         del self.stages[:count]
-        self._means = None
         if len(self.tree) > self.tree.held + count:
             self.tree.marginalise(self.tree.held + count - 1)
             self.tree.hold()
             self.head = replace(find_head(self.tree), tests=self.head.tests)
         else:
-            self.tree = Tree(self.head, self.turn)
+            self.tree = Tree(self.head, self.turn, self._whole)
         return out
+
+
+def _replace_message(stage: Stage, state: States, values: Array, R: Array) -> Stage:
+    """A stage about what is most likely, of which R (D, D) is known."""
+    return replace(stage, message=replace(stage.message, state=state, values=values, R=R, z=np.zeros(len(R))))
+
+
+def _forget_message(stage: Stage) -> Stage:
+    """A stage without what only the newest one needs."""
+    none = np.empty((0, 0))
+    return replace(stage, message=replace(stage.message, R=none, z=none.ravel()), G=none, C=none, measured=())
+
+
+def isam2(
+    problem: Problem,
+    lag: float = np.inf,
+    progress: Progress | None = None,
+    start: States | None = None,
+) -> Solution:
+    """Solve a problem keyframe by keyframe with iSAM2.
+
+    Parameters
+    ----------
+    lag : s of future that every settled state has seen; infinite smooths the whole drive.
+    start : one state to begin at, where that is not the prior's mean.
+    """
+    window = TreeWindow(begin_at(problem, start), compute_turn_limit(problem.imu_noise), whole=bool(np.isinf(lag)))
+    return solve_in_turn(problem, "isam2", Incremental(window, problem, lag), progress)

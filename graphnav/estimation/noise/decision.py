@@ -124,7 +124,7 @@ def explain_with_outliers(
     errors : of all fixes by `found`. Those of what it leaves out are small only as far as it is right.
     """
     excluded = [span for some in found.noise.excluded.values() for span in some]
-    inside, every = (_add_outliers(found, errors, some) for some in (spans, [*spans, *excluded]))
+    inside, every = (add_outliers(found, errors, some) for some in (spans, [*spans, *excluded]))
     one = explain(base, inside, spans, among, least)
     if all(len(some.t) == len(every.noise.weights[name].t) for name, some in inside.noise.weights.items()):
         return one
@@ -132,7 +132,7 @@ def explain_with_outliers(
     return replace(max(one, other, key=lambda each: each.log_evidence), passes=one.passes + other.passes)
 
 
-def _add_outliers(found: NoiseEstimate, errors: LeftOutErrors, spans: list[Span]) -> NoiseEstimate:
+def add_outliers(found: NoiseEstimate, errors: LeftOutErrors, spans: list[Span]) -> NoiseEstimate:
     """The estimate with weights for fixes in spans, so that each may be a single outlier."""
     weights = dict(found.noise.weights)
     for name, (t, squared, m) in errors.items():

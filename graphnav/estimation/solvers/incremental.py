@@ -8,8 +8,7 @@ settle, each with at least the lag's future measurements. The algorithm is that 
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, field
-from typing import Protocol
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -18,26 +17,16 @@ from graphnav.core.progress import Progress
 from graphnav.core.state import States
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solution import Solution
-from graphnav.estimation.solvers.linearise import Points, list_node_steps, shift
-from graphnav.estimation.solvers.passes import make_solution, record_residuals
+from graphnav.estimation.solvers.linearise import Points, list_node_steps, scale_at, shift
+from graphnav.estimation.solvers.passes import integrate_again, make_solution, record_residuals
 from graphnav.estimation.solvers.rows import compute_cost_at
 from graphnav.estimation.solvers.stages import Message, Place
 from graphnav.estimation.solvers.window import SettledStates, Window, compute_turn_limit, make_first_message
 
 _PORTIONS = 8  # of the lag: keyframes settle in groups this long
-FINE = 0.02  # share of the usual limits to which the remaining keyframes converge at the end
-
-
-class LagSmoother(Protocol):
-    """Interface of a smoother that takes keyframes one by one."""
-
-    settled: list[SettledStates]  # in order; readers may clear them
-
-    def add(self, place: Place) -> None:
-        """Add a keyframe, and settle those that are older than the lag by then."""
-
-    def finish(self, problem: Problem) -> tuple[Problem, int]:
-        """End of input: settle all; returns the problem as solved, and the number of relinearised keyframes."""
+_MAX_INTEGRATIONS = 5
+# shares of the usual limits within which keyframes have converged that settle, as they are not linearised again
+_SETTLING, _FINE = 0.25, 0.02  # and all that remain at the end
 
 
 def are_due(first: float, last: float, lag: float) -> bool:
@@ -52,28 +41,42 @@ class Incremental:
     Parameters
     ----------
     window : with its prior.
+    problem : that all keyframes are of; where biases have moved too far, its intervals are integrated again.
     lag : s of future that every settled state has seen; infinite smooths everything, and settles at the end.
     """
 
     window: Window
+    problem: Problem
     lag: float = 120.0
-    settled: list[SettledStates] = field(default_factory=list)
+    settled: list[SettledStates] = field(default_factory=list)  # in order; readers may clear them
 
     def add(self, place: Place) -> None:
-        """As of `LagSmoother`."""
-        if self.window.push(place) > self.window.turn:
-            self.window.converge()
-        if are_due(self.window.stages[0].place.t, place.t, self.lag):
-            assert place.problem is not None
-            self.window.converge(always=any(c.robust != "none" for c in place.problem.constraints))
-            self.settled.append(self.window.settle(int(np.searchsorted(self.window.t, place.t - self.lag))))
+        """Add a keyframe, and settle those that are older than the lag by then."""
+        window = self.window
+        if window.push(replace(place, problem=self.problem)) > window.turn:
+            window.converge(renewed=self._renew)
+        if are_due(window.stages[0].place.t, place.t, self.lag):
+            self._converge(_SETTLING, any(c.robust != "none" for c in self.problem.constraints))
+            self.settled.append(window.settle(int(np.searchsorted(window.t, place.t - self.lag))))
 
-    def finish(self, problem: Problem) -> tuple[Problem, int]:
-        """As of `LagSmoother`."""
+    def finish(self) -> None:
+        """End of input: settle all."""
         if len(self.window):
-            self.window.converge(FINE, always=True)
+            self._converge(_FINE, always=True)
             self.settled.append(self.window.settle(len(self.window)))
-        return problem, self.window.relinearized
+
+    def _converge(self, share: float = 1.0, always: bool = False) -> None:
+        """Relinearise until nothing has moved, about intervals integrated at the present biases."""
+        window, newest = self.window, self.window.newest
+        for _ in range(_MAX_INTEGRATIONS):
+            states, scale = window.read_states(), scale_at(newest.columns, newest.values)
+            self.problem, count = integrate_again(self.problem, states, scale, window.stages[0].place.k)
+            window.converge(share, always or count > 0, self._renew)
+            if not count:
+                return
+
+    def _renew(self, first: int, end: int) -> list[Place]:
+        return [replace(stage.place, problem=self.problem) for stage in self.window.stages[first:end]]
 
 
 def incremental(
@@ -90,7 +93,7 @@ def incremental(
     start : one state to begin at, where that is not the prior's mean.
     """
     window = Window(begin_at(problem, start), compute_turn_limit(problem.imu_noise))
-    return solve_in_turn(problem, "incremental", Incremental(window, lag), lag, progress)
+    return solve_in_turn(problem, "incremental", Incremental(window, problem, lag), progress)
 
 
 def begin_at(problem: Problem, start: States | None) -> Message:
@@ -100,9 +103,7 @@ def begin_at(problem: Problem, start: States | None) -> Message:
     return message if start is None else message.move(start.minus(problem.prior.mean)[0])
 
 
-def solve_in_turn(
-    problem: Problem, solver: str, engine: LagSmoother, lag: float, progress: Progress | None
-) -> Solution:
+def solve_in_turn(problem: Problem, solver: str, engine: Incremental, progress: Progress | None) -> Solution:
     """Add all keyframes of a problem in order, and return what settles as a solution."""
     began = time.perf_counter()
     K, steps = len(problem.t), list_node_steps(problem)
@@ -113,7 +114,8 @@ def solve_in_turn(
         seconds[k] = time.thread_time() - before
         if progress is not None and k % 64 == 0:
             progress(solver, k / K)
-    problem, again = engine.finish(problem)
+    engine.finish()
+    problem, lag, again = engine.problem, engine.lag, engine.window.relinearized
     elapsed = time.perf_counter() - began
     # in the order that the problem has its parameters in
     parts, columns = engine.settled, engine.settled[-1].columns[-1]

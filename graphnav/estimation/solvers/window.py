@@ -201,6 +201,11 @@ class Window:
             self._means = out[::-1]
         return self._means
 
+    def read_states(self) -> States:
+        """Smoothed states, one of each stage."""
+        points, e = States.stack([stage.message.state for stage in self.stages]), self.compute_means()[1:]
+        return add_error(points, np.array([one[:DIM] for one in e]), self.newest.turns)
+
     def smooth_back(self, count: int, most: int) -> bool:
         """A portion of `settle` for the first stages, over at most so many; True once it is done.
 
