@@ -7,6 +7,7 @@ arm, and so do wrong fixes and stamps that are still to be moved.
 
 from __future__ import annotations
 
+import contextlib
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -163,15 +164,17 @@ def _estimate_scales(found: JointEstimate, progress: Progress | None) -> JointEs
     if not are_scales_contradicted(base, best):
         return found
     intervals = any(name in best.noise.weights for name in INTERVALS)
-    near = best.get_linearisation(base)
-    try:
-        one = estimate_noise(base, None, best.noise, near, progress, intervals, changed=True, scales=True)
-        before, after = found.weigh(), replace(found, estimate=one).weigh()
-    except BREAKDOWN:
-        return found
-    gained = after.compute_evidence() - before.compute_evidence()
-    taken = after if gained > 0.5 * len(PRIORS) else before  # half of each figure by chance
-    return taken.count(before.estimate.passes + after.estimate.passes)
+    near, found = best.get_linearisation(base), found.weigh()
+    passes, limit = found.estimate.passes, found.compute_evidence() + 0.5 * len(PRIORS)  # half of each figure by chance
+    # the figures found lead to the nearest optimum soonest; with other scale errors behind them it may be a bad one
+    for start in (best.noise, NoiseModel(weights=best.noise.weights, excluded=best.noise.excluded)):
+        with contextlib.suppress(*BREAKDOWN):
+            one = estimate_noise(base, None, start, near, progress, intervals, changed=True, scales=True)
+            other = replace(found, estimate=one).weigh()
+            passes = passes + other.estimate.passes
+            if other.compute_evidence() > limit:
+                return other.count(passes)
+    return found.count(passes)
 
 
 def _leave_out_faults(

@@ -105,7 +105,7 @@ def begin_components(
     log = {name: get_prior(name)[0] for name in dict.fromkeys(names) if scales or name not in PRIORS or name in known}
     processes = [p for rows in problem.constraints for p in (*rows.parameters, *rows.processes)]
     times = {p.name: p.correlation_time for p in processes if p.correlation_time is not None}
-    largest = list_largest(problem)
+    largest = {group: x for rows in problem.constraints if rows.fix_of for group, x in list_largest(rows).items()}
     if start is None:
         return Components(log, times, largest)
     log |= {name: start.figures[name].log_factor for name in log if name in start.figures}

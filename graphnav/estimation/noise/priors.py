@@ -7,7 +7,7 @@ none is favoured; with tens of degrees of freedom in the data the prior has no w
 A receiver's sigma is meant to hold for the whole of its error. What part of that is white is not stated: the medians
 of the processes give it half to hours, half to minutes, and a quarter to seconds, in units of the stated variance, and
 the white part starts at all of it; the data separate them. None makes fixes worse than a fault can (`SIZES`): larger
-errors of all fixes would explain any trajectory. Nor are an IMU's scale errors larger than the cheapest have.
+errors of all fixes would explain any trajectory.
 """
 
 from __future__ import annotations
@@ -17,14 +17,11 @@ import numpy as np
 from graphnav.constraints.base import Constraint
 from graphnav.core.rotation import Array
 from graphnav.estimation.faults.watch import SIZES
-from graphnav.estimation.problem import Problem
-from graphnav.imu.dynamics import PRIORS
 
 WITHIN = 2.0 * np.log(3.0)  # 1-sigma of the logarithm of a variance: a factor of three in sigma
 _SHARES = {"seconds": 0.25, "minutes": 0.5, "hours": 0.5, "multipath": 0.25}  # of a GNSS sensor's stated variance
 _OF_RECEIVER = "gnss", "dual_antenna"
 TIME_WITHIN = np.log(3.0)  # 1-sigma of the logarithm of a correlation time
-_CHEAPEST = 0.03  # tolerance of the scales of gyro and accelerometer (InvenSense MPU-6050, data sheet 3.4)
 
 
 def get_prior(group: str) -> tuple[float, float]:
@@ -35,22 +32,8 @@ def get_prior(group: str) -> tuple[float, float]:
     return float(np.log(share)), WITHIN
 
 
-def list_largest(problem: Problem) -> dict[str, float]:
-    """The largest logarithms of variance factors, by group: of fixes, scale errors of the IMU.
-
-    Parameters
-    ----------
-    problem : with stated noise.
-    """
-    stated = {group: getattr(problem.imu_noise, figure) for group, figure in PRIORS.items()}
-    out = {group: max(0.0, 2.0 * float(np.log(_CHEAPEST / sigma))) for group, sigma in stated.items() if sigma > 0.0}
-    for rows in problem.constraints:
-        out |= _list_largest_of_fixes(rows) if rows.fix_of else {}
-    return out
-
-
-def _list_largest_of_fixes(rows: Constraint) -> dict[str, float]:
-    """The same of a constraint on fixes: at most as large as faults get."""
+def list_largest(rows: Constraint) -> dict[str, float]:
+    """The largest logarithms of variance factors of a constraint on fixes, by group: at most as large as faults get."""
     groups, component = rows.list_noise_groups()
     sigma: Array = rows.sigma  # type: ignore[attr-defined]
     medians = {

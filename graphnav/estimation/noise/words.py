@@ -12,6 +12,7 @@ from graphnav.estimation.noise.model import INTERVALS, NoiseModel, RowWeights
 from graphnav.estimation.noise.tails import relate_to_gaussian
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.linearise import Points, shift
+from graphnav.imu.dynamics import make_scale_parameter
 from graphnav.recording.checks.axes import write_letters
 
 _NAMES = {
@@ -30,12 +31,14 @@ _FAR = 5.0  # prior sigmas, beyond chance
 def describe_far(problem: Problem, smoothed: Points) -> tuple[str, ...]:
     """Sentences on parameters whose estimates are implausibly far from their stated values."""
     out = []
+    of_imu = make_scale_parameter(problem.recording.imu.noise, problem.recording.platform)
+    scales = {p.name: p.sigma for p in of_imu}  # as stated, whatever the noise model makes of it
     for chain in problem.chains:
         p = chain.parameter
         if p.correlation_time is not None:  # an error, whose size is estimated
             continue
         value = smoothed.values[0, shift(problem.columns[p.name])]  # where the prior is of one that walks as well
-        stated, sigma = chain.mean[0], chain.sigma[0]
+        stated, sigma = chain.mean[0], scales.get(p.name, chain.sigma[0])
         away = np.abs(value - stated) / sigma
         k = int(np.argmax(away))
         if p.name == MOUNTING and (turned := describe_turned_axes(problem, smoothed)) is not None:
