@@ -54,9 +54,7 @@ from graphnav.recording import Recording
 
 _FIRST = 4.0  # s after its beginning at which a stop is judged first
 _OLDEST = 0.5  # of the lag, the age at which a stop is judged last, and fixes that tests have left out at first
-_OVER = (
-    0.25  # of the lag, the time for which these should be in use again: of a fault too new, evidence knows too little
-)
+_OVER = 0.25  # of the lag, for which these should be in use again: of a fault too new, evidence knows too little
 _THINKING = 0.25  # of the time that an estimation of the noise model may take: one filter and smoother
 
 
