@@ -64,7 +64,7 @@ class FusionSettings(Section):
     )
     bridge_speed: float = Field(0.1, gt=0, description="m/s, of that integral, above which the vehicle has moved")
     max_speed: float = Field(0.15, gt=0, description="m/s, of a measured speed that is not yet motion")
-    odometer_delay: float = Field(1.0, ge=0, description="s, by which an odometer may be late at most")
+    odometer_delay: float = Field(0.7, ge=0, description="s, by which an odometer may be late")
 
 
 FUSED: Final = "fused"

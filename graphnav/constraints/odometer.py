@@ -28,6 +28,7 @@ from graphnav.recording.odometer import MeanSpeed, ReadingStatistics, find_wrong
 ODOMETER_SCALE = "odometer_scale"
 ODOMETER_DELAY = "odometer_delay"
 ODOMETER_ERROR = "odometer_error"
+LONGEST_DELAY = 1.0  # s, of readings over a vehicle's bus or a phone's adapter, where the delay is not stated
 DELAY_SIGMAS = 4.0  # sigmas of the delay that the rows cover
 _LEAST_FACTOR = 0.1  # of 1 + k: units are wrong by 3.6 at most, and a step may go further
 _NEAR = 3.0  # sigmas of a reading within which its derivative by the scale is that of the velocity
@@ -57,7 +58,6 @@ class OdometerSpeed(Wheels):
     speed: MeanSpeed | None = None
     signed: bool = True  # False: it does not distinguish forwards from backwards
     reach: float = 0.0  # s, the longest delay for which the readings of all rows are available
-    longest_delay: float = 0.0  # s, where the delay is not stated
     sigma: Array = field(default_factory=lambda: np.empty((0, 1)))
 
     @classmethod
@@ -93,7 +93,6 @@ class OdometerSpeed(Wheels):
             signed=odometer.signed,
             sigma=sigma[:, None],
             reach=reach,
-            longest_delay=scene.settings.detectors.fusion.odometer_delay,
             lever_arm=lever_arm,
             parameters=tuple(parameters),
             processes=(make_slow_error_parameter(ODOMETER_ERROR, density, cls),),
@@ -104,7 +103,7 @@ class OdometerSpeed(Wheels):
         """These rows with their delay (1,), s, as a parameter."""
         others = (p for p in self.parameters if p.name != ODOMETER_DELAY)
         delay = Parameter(ODOMETER_DELAY, value, sigma, "s")
-        return replace(self, parameters=(*others, delay), reach=self.longest_delay)
+        return replace(self, parameters=(*others, delay), reach=LONGEST_DELAY)
 
     @cached_property
     def _read(self) -> Array:

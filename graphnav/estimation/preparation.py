@@ -43,7 +43,7 @@ from graphnav.estimation.noise.words import describe_noise
 from graphnav.estimation.noise_search import Weigh, begin_noise, find_noise
 from graphnav.estimation.offsets import is_offset_far
 from graphnav.estimation.problem import Problem
-from graphnav.estimation.relinearisation import is_clearly_worse, relinearise
+from graphnav.estimation.relinearisation import relinearise
 from graphnav.estimation.solution import CarrierArcs
 from graphnav.estimation.solvers.ekf import ekf, refilter
 from graphnav.estimation.solvers.linearise import Points, scale_at
@@ -224,15 +224,12 @@ def prepare(begun: Begun, progress: Progress | None = None, weigh: Weigh | None 
     assert noise is not None
     aligned = built.aligned
     problem = drop_parts(apply_noise(built.problem, noise))
-    known = None if near is None else reuse_points(*near, problem)
     try:
         forward, smoothed = _filter_and_smooth(problem, aligned.until, None, clock, progress)
     except EstimationError:  # from a rough start its first pass may diverge
-        if known is None:
-            (initial, *_), more = find_initial_points(problem, aligned.until)
-            passes.update(filter=more, smoother=more)
-            known = initial.points
-        forward, smoothed = _filter_and_smooth(problem, aligned.until, known, clock, progress)
+        (initial, *_), more = find_initial_points(problem, aligned.until)
+        passes.update(filter=more, smoother=more)
+        forward, smoothed = _filter_and_smooth(problem, aligned.until, initial.points, clock, progress)
     if begun.larger:
         with clock.count_time("noise"):
             noise, spent = estimate_bias_walks(built.problem, smoothed)
@@ -245,8 +242,8 @@ def prepare(begun: Begun, progress: Progress | None = None, weigh: Weigh | None 
         problem = _drop_refused(problem, forward)
         if any(rows.gate is not None for rows in problem.constraints):
             smoothed = smooth_backward(problem, refilter(problem, smoothed, progress), progress)
-        points: Points = smoothed if known is None or not is_clearly_worse(problem, smoothed, known) else known
-        problem = problem.with_input_noise(points.states, scale_at(problem.columns, points.values))
+        problem = problem.with_input_noise(smoothed.states, scale_at(problem.columns, smoothed.values))
+        known = None if near is None else reuse_points(*near, problem)
         forward, smoothed, ahead = relinearise(problem, aligned, forward, smoothed, progress, passes, known)
     passes.update(filter=1, smoother=1)
     notes = (*describe_freed(noise.freed, recording), *describe_noise(noise, problem), *_describe_missing(problem))

@@ -52,14 +52,10 @@ def relinearise(
         that of a filter which diverged from an uncertain heading, the one near these points is the result.
     """
     found = _relinearise(problem, aligned, forward, smoothed, progress, passes)
-    if known is None or not is_clearly_worse(problem, found[1], known):
+    if known is None or compute_cost_at(problem, found[1]) < compute_cost_at(problem, known) + CLEARLY_BETTER:
         return found
-    return _linearise_at(problem, aligned, _minimise(problem, known, passes), progress, passes)
-
-
-def is_clearly_worse(problem: Problem, found: Points, known: Points) -> bool:
-    """Whether the cost at some points is so much higher that they are near another, worse optimum."""
-    return not compute_cost_at(problem, found) < compute_cost_at(problem, known) + CLEARLY_BETTER  # NaN is worse
+    points = _minimise(problem, known, passes)
+    return _linearise_at(problem, aligned, points, progress, passes)
 
 
 def _relinearise(

@@ -80,15 +80,16 @@ _SETS = {
 }
 
 
-@lru_cache(maxsize=16)
 def make_scale_parameter(noise: ImuNoise, platform: str) -> tuple[Parameter, ...]:
     """The terms of gyro and accelerometer that a platform shows, where the noise figures leave them open."""
+    return _scale_parameter(noise, platform == "foot")
+
+
+@lru_cache(maxsize=16)
+def _scale_parameter(noise: ImuNoise, every: bool) -> tuple[Parameter, ...]:
     if noise.gyro_scale_sigma <= 0 and noise.accel_scale_sigma <= 0:
         return ()
-    stated, sets = (
-        (noise.gyro_scale_sigma, noise.accel_scale_sigma),
-        (TERMS, TERMS) if platform == "foot" else VEHICLE_TERMS,
-    )
+    stated, sets = (noise.gyro_scale_sigma, noise.accel_scale_sigma), (TERMS, TERMS) if every else VEHICLE_TERMS
     sigma = [
         max(scale * (1.0 if i == j else ACROSS), 1e-9)
         for scale, terms in zip(stated, sets, strict=True)

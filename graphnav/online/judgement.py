@@ -29,8 +29,9 @@ from graphnav.estimation.contradictions import free
 from graphnav.estimation.faults.excluded import weigh_rows
 from graphnav.estimation.faults.watch import FALSE_ALARM
 from graphnav.estimation.noise.apply import apply_noise
-from graphnav.estimation.noise.decision import add_outliers, explain
+from graphnav.estimation.noise.decision import explain
 from graphnav.estimation.noise.estimate import NoiseEstimate
+from graphnav.estimation.noise.exclusion import add_outliers
 from graphnav.estimation.noise.explanations import FIXES
 from graphnav.estimation.noise.false_stops import find_false_stops, leave_out_false_stops, unite_stops
 from graphnav.estimation.noise.initial_points import BREAKDOWN

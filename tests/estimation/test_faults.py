@@ -27,7 +27,7 @@ from graphnav.estimation.faults.verdicts import Verdicts
 from graphnav.estimation.faults.watch import FALSE_ALARM, MINUTE, Bank
 from graphnav.estimation.noise.decision import log_evidence, weigh_evidence
 from graphnav.estimation.noise.estimate import estimate_noise
-from graphnav.estimation.noise.exclusion import _readmit, estimate_disturbed_intervals, estimate_without_faults
+from graphnav.estimation.noise.exclusion import estimate_disturbed_intervals, estimate_without_faults
 from graphnav.estimation.noise.explanations import (
     EXPLANATIONS,
     ErrorSizes,
@@ -35,7 +35,6 @@ from graphnav.estimation.noise.explanations import (
     add_common_errors,
     compute_evidence,
 )
-from graphnav.estimation.noise.model import NoiseModel
 from graphnav.estimation.noise.spans import list_before, split_at_steps
 from graphnav.estimation.noise.tails import compute_log_normaliser
 from graphnav.estimation.pipeline import choose_origin, run
@@ -418,27 +417,6 @@ def test_disturbed_intervals_stand_only_with_more_evidence() -> None:
     weighed = weigh_evidence(base, replace(found, whole_evidence=None))
     assert weighed.passes["filter"] > found.passes["filter"]
     assert weigh_evidence(base, weighed) is weighed
-
-
-def test_right_fixes_are_used_again_past_an_outlier() -> None:
-    """A span left out that begins too early, with a single outlier among the right fixes at its start."""
-    recording = read(Path(__file__).parents[2] / "data" / "tokyo").without("odometer")
-    assert recording.gnss is not None
-    t = recording.gnss.t - recording.gnss.t[0]
-    burst, single = (t > 58.0) & (t < 73.0), np.arange(len(t)) == np.searchsorted(t, 52.0)
-    wrong = moved(recording, burst, np.array([29.0, 25.0, 16.0]))
-    wrong = moved(wrong, single, np.array([-20.0, 15.0, 5.0]))
-    settings = parse_settings({"gnss": {"velocity": False}})
-    frame = LocalFrame(choose_origin(wrong))
-    every = ProblemBuilder(wrong, wrong, settings, frame, Clock(), Later(lambda: None))
-    detections = detect(wrong, settings)
-    base = every.build(every.align(wrong, detections.stationary), detections, parts=True).problem
-    within = recording.gnss.t[(t > 45.0) & (t < 73.0)]
-    early = NoiseModel(excluded={"gnss_position": ((float(within[0]), float(within[-1])),)})
-    found = estimate_noise(base, None, early)
-    ((begin, end),) = _readmit(base, found).noise.excluded["gnss_position"]
-    assert recording.gnss.t[burst][0] - 2.0 < begin <= recording.gnss.t[burst][0]
-    assert end == pytest.approx(within[-1], abs=1.1)
 
 
 def scattered(recording: Recording, bad: Array, times: float, seed: int) -> Recording:

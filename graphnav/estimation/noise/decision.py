@@ -28,8 +28,7 @@ from graphnav.estimation.noise.outliers import (
     compute_row_costs,
     count_reduced,
 )
-from graphnav.estimation.noise.spans import LeftOutErrors, Span, drop_within, extend_to_next_fix, join, mask_times
-from graphnav.estimation.noise.tails import get_tail_index, weigh_outlying
+from graphnav.estimation.noise.spans import Span, drop_within, extend_to_next_fix, join, mask_times
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.ekf import refilter
 
@@ -106,43 +105,6 @@ def explain(
     weights = {name: drop_within(some, dropped[name]) for name, some in noise.weights.items()}
     noise = replace(noise, weights=weights, excluded=excluded)
     return Decision(noise, evidence + rest, Counter(filter=passes))
-
-
-def explain_with_outliers(
-    base: Problem,
-    found: NoiseEstimate,
-    errors: LeftOutErrors,
-    spans: list[Span],
-    among: Collection[Explanation] = EXPLANATIONS,
-    least: float = -np.inf,
-) -> Decision:
-    """`explain`, where each fix in the spans may be a single outlier; or those that are used again too, if likelier.
-
-    Parameters
-    ----------
-    found : without other spans; the others as for `explain`.
-    errors : of all fixes by `found`. Those of what it leaves out are small only as far as it is right.
-    """
-    excluded = [span for some in found.noise.excluded.values() for span in some]
-    inside, every = (add_outliers(found, errors, some) for some in (spans, [*spans, *excluded]))
-    one = explain(base, inside, spans, among, least)
-    if all(len(some.t) == len(every.noise.weights[name].t) for name, some in inside.noise.weights.items()):
-        return one
-    other = explain(base, every, spans, among, max(least, one.log_evidence))
-    return replace(max(one, other, key=lambda each: each.log_evidence), passes=one.passes + other.passes)
-
-
-def add_outliers(found: NoiseEstimate, errors: LeftOutErrors, spans: list[Span]) -> NoiseEstimate:
-    """The estimate with weights for fixes in spans, so that each may be a single outlier."""
-    weights = dict(found.noise.weights)
-    for name, (t, squared, m) in errors.items():
-        weight = weigh_outlying(squared, m, get_tail_index(found.noise.tails, name, m))
-        kept = drop_within(weights.get(name, RowWeights(np.empty(0), np.empty(0))), spans)
-        inside = mask_times(t, spans) & np.isin(t, t[weight < 1.0])  # with all rows of their times
-        both, of_both = np.concatenate([kept.t, t[inside]]), np.concatenate([kept.weight, weight[inside]])
-        order = np.argsort(both, kind="stable")
-        weights[name] = RowWeights(both[order], of_both[order])
-    return replace(found, noise=replace(found.noise, weights=weights))
 
 
 def list_explanations(noise: NoiseModel) -> set[Explanation]:

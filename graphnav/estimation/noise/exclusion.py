@@ -57,7 +57,6 @@ from graphnav.estimation.noise.apply import apply_noise
 from graphnav.estimation.noise.decision import (
     Decision,
     explain,
-    explain_with_outliers,
     list_explanations,
     log_evidence,
     weigh_evidence,
@@ -66,15 +65,18 @@ from graphnav.estimation.noise.decision import (
 from graphnav.estimation.noise.estimate import NoiseEstimate, estimate_noise
 from graphnav.estimation.noise.explanations import FIXES
 from graphnav.estimation.noise.initial_points import BREAKDOWN
-from graphnav.estimation.noise.model import INTERVALS, NoiseModel
+from graphnav.estimation.noise.model import INTERVALS, NoiseModel, RowWeights
 from graphnav.estimation.noise.moments import collect_imu_moments
 from graphnav.estimation.noise.outliers import may_pay
 from graphnav.estimation.noise.spans import (
+    LeftOutErrors,
     Span,
     are_covered,
+    drop_within,
     join,
     list_before,
     list_distinct,
+    mask_times,
     sum_lengths,
     trim,
 )
@@ -86,6 +88,7 @@ from graphnav.estimation.noise.suspects import (
     list_fix_times,
     predict_left_out,
 )
+from graphnav.estimation.noise.tails import get_tail_index, weigh_outlying
 from graphnav.estimation.problem import Problem
 
 _REFINEMENTS = 2  # estimates without masked spans: the first trims the spans, the second is free of what is wrong
@@ -249,12 +252,12 @@ def _unmask(base: Problem, found: NoiseEstimate, first: Decision, masked: list[S
             if not some:
                 continue
             least = min(best.log_evidence, rival.log_evidence)
-            candidate = explain_with_outliers(base, estimate, errors, some, least=least)
+            candidate = explain(base, add_outliers(estimate, errors, some), some, least=least)
             passes = passes + candidate.passes
             cut = cut_at_steps(some, candidate.noise, used, estimate)
             if cut != some:
                 among = list_explanations(candidate.noise)  # its pieces are wrong the same way, or not at all
-                finer = explain_with_outliers(base, estimate, errors, cut, among, least)
+                finer = explain(base, add_outliers(estimate, errors, cut), cut, among, least)
                 passes = passes + finer.passes
                 candidate = max(candidate, finer, key=lambda one: one.log_evidence)
             most = max(most, candidate.log_evidence)
@@ -300,7 +303,7 @@ def _readmit(base: Problem, found: NoiseEstimate) -> NoiseEstimate:
     if len(candidates) == 1:
         return replace(found, passes=passes)
     among = list_explanations(found.noise)
-    decisions = [explain_with_outliers(base, found, errors, some, among) for some in candidates]
+    decisions = [explain(base, add_outliers(found, errors, some), some, among) for some in candidates]
     passes = sum((one.passes for one in decisions), passes)
     best = max(decisions, key=lambda one: one.log_evidence)
     if best is decisions[0]:
@@ -366,3 +369,16 @@ def _may_be_disturbed(base: Problem, found: NoiseEstimate) -> bool:
     points, problem = found.points, apply_noise(base, found.noise)
     imu = collect_imu_moments(problem, points.states.R_nb[:-1], points)
     return any(may_pay(imu.squared[:, i], imu.freedom[:, i]) for i in range(len(INTERVALS)))
+
+
+def add_outliers(found: NoiseEstimate, errors: LeftOutErrors, spans: list[Span]) -> NoiseEstimate:
+    """The estimate with weights for fixes in spans that it leaves out, so that each may be a single outlier."""
+    weights = dict(found.noise.weights)
+    for name, (t, squared, m) in errors.items():
+        weight = weigh_outlying(squared, m, get_tail_index(found.noise.tails, name, m))
+        kept = drop_within(weights.get(name, RowWeights(np.empty(0), np.empty(0))), spans)
+        inside = mask_times(t, spans) & np.isin(t, t[weight < 1.0])  # with all rows of their times
+        both, of_both = np.concatenate([kept.t, t[inside]]), np.concatenate([kept.weight, weight[inside]])
+        order = np.argsort(both, kind="stable")
+        weights[name] = RowWeights(both[order], of_both[order])
+    return replace(found, noise=replace(found.noise, weights=weights))

@@ -45,7 +45,7 @@ from graphnav.constraints.gnss import (
     VELOCITY_TIME_OFFSET,
 )
 from graphnav.constraints.lasting import ERRORS, LASTING, MULTIPATH_ERROR
-from graphnav.constraints.odometer import ODOMETER_DELAY, ODOMETER_ERROR
+from graphnav.constraints.odometer import LONGEST_DELAY, ODOMETER_DELAY, ODOMETER_ERROR
 from graphnav.constraints.raw_gnss import CODE_ERRORS, RATE_ERROR
 from graphnav.constraints.vehicle import NHC_ERROR
 from graphnav.core.complaints import suggest_nearest
@@ -77,7 +77,7 @@ _FREED = {
     "lever_arm": (LEVER_ARM, 3, _LONGEST_ARM, "m: right, forward, up"),
     "time_offset": (TIME_OFFSET, 1, _LARGEST_OFFSET, "s to be added to stamps"),
     "velocity_time_offset": (VELOCITY_TIME_OFFSET, 1, _LARGEST_OFFSET, "s to be added to stamps"),
-    "odometer_delay": (ODOMETER_DELAY, 1, _LARGEST_OFFSET, "s by which readings are late"),
+    "odometer_delay": (ODOMETER_DELAY, 1, LONGEST_DELAY, "s by which readings are late"),
     "clock_rate": (CLOCK_RATE, 1, _LARGEST_RATE, "s/s, of the clocks of IMU and receiver"),
 }
 _KEYS = (
