@@ -43,7 +43,7 @@ from graphnav.estimation.noise.words import describe_noise
 from graphnav.estimation.noise_search import Weigh, begin_noise, find_noise
 from graphnav.estimation.offsets import is_offset_far
 from graphnav.estimation.problem import Problem
-from graphnav.estimation.relinearisation import relinearise
+from graphnav.estimation.relinearisation import is_clearly_worse, linearise_known, linearise_searched, relinearise
 from graphnav.estimation.solution import CarrierArcs
 from graphnav.estimation.solvers.ekf import ekf, refilter
 from graphnav.estimation.solvers.linearise import Points, scale_at
@@ -243,8 +243,15 @@ def prepare(begun: Begun, progress: Progress | None = None, weigh: Weigh | None 
         if any(rows.gate is not None for rows in problem.constraints):
             smoothed = smooth_backward(problem, refilter(problem, smoothed, progress), progress)
         problem = problem.with_input_noise(smoothed.states, scale_at(problem.columns, smoothed.values))
+        found = relinearise(problem, aligned, forward, smoothed, progress, passes)
         known = None if near is None else reuse_points(*near, problem)
-        forward, smoothed, ahead = relinearise(problem, aligned, forward, smoothed, progress, passes, known)
+        if noise.searched or (known is not None and is_clearly_worse(problem, found[1], known)):
+            with contextlib.suppress(*BREAKDOWN):  # searched for, so that a run with this noise model finds the same
+                found, noise = linearise_searched(problem, aligned, progress, passes), replace(noise, searched=True)
+            if known is not None and is_clearly_worse(problem, found[1], known):
+                found = linearise_known(problem, aligned, known, progress, passes)
+                noise = replace(noise, searched=False)
+        forward, smoothed, ahead = found
     passes.update(filter=1, smoother=1)
     notes = (*describe_freed(noise.freed, recording), *describe_noise(noise, problem), *_describe_missing(problem))
     epochs, arcs = dict[str, Array](), {"": CarrierArcs()}

@@ -10,7 +10,7 @@ import numpy as np
 
 from graphnav.core.progress import Progress
 from graphnav.estimation.alignment import Alignment
-from graphnav.estimation.noise.initial_points import BREAKDOWN
+from graphnav.estimation.noise.initial_points import BREAKDOWN, find_initial_points
 from graphnav.estimation.problem import Problem
 from graphnav.estimation.solvers.ekf import ekf, refilter
 from graphnav.estimation.solvers.linearise import Points
@@ -38,35 +38,13 @@ def relinearise(
     smoothed: SmootherPass,
     progress: Progress | None,
     passes: Counter[str],
-    known: Points | None = None,
 ) -> tuple[FilterPass, SmootherPass, Points | None]:
     """Filter and smooth about better points where the filter was linearised too far from the smoothed solution.
 
     Attitudes first (`_linearise_far`); where these stay, all else does if a step of Gauss and Newton from there moves
     nothing by a good part of its sigma: a barometer's scale times a height that was not known yet, a lever arm, a place
     that few fixes tell of. Returns also the points behind that step.
-
-    Parameters
-    ----------
-    known : points of another estimate, as that of the noise model. Where the result is clearly a worse optimum, as
-        that of a filter which diverged from an uncertain heading, the one near these points is the result.
     """
-    found = _relinearise(problem, aligned, forward, smoothed, progress, passes)
-    if known is None or compute_cost_at(problem, found[1]) < compute_cost_at(problem, known) + CLEARLY_BETTER:
-        return found
-    points = _minimise(problem, known, passes)
-    return _linearise_at(problem, aligned, points, progress, passes)
-
-
-def _relinearise(
-    problem: Problem,
-    aligned: Alignment,
-    forward: FilterPass,
-    smoothed: SmootherPass,
-    progress: Progress | None,
-    passes: Counter[str],
-) -> tuple[FilterPass, SmootherPass, Points | None]:
-    """The same from the filter's own points."""
     if not are_near(smoothed, forward.linearised, LINEAR_ATTITUDE):
         forward, smoothed, ahead = _linearise_far(problem, aligned, smoothed, progress, passes)
         if ahead is not None:
@@ -83,6 +61,37 @@ def _relinearise(
     with contextlib.suppress(*BREAKDOWN):
         return _linearise_at(problem, aligned, _solve_batch(problem, smoothed), progress, passes)
     return forward, smoothed, None
+
+
+def linearise_searched(
+    problem: Problem, aligned: Alignment, progress: Progress | None, passes: Counter[str]
+) -> tuple[FilterPass, SmootherPass, Points]:
+    """The same about the best optimum that initial points lead to which rest on few outliers.
+
+    For a filter that diverges from an uncertain heading, where the noise model's own estimate did not.
+
+    Raises
+    ------
+    EstimationError
+        If the filter breaks down.
+    """
+    initials, spent = find_initial_points(problem, aligned.until)
+    passes.update(filter=spent, smoother=spent)
+    optima = [_minimise(problem, one.points, passes) for one in initials]
+    best = min(optima, key=lambda points: compute_cost_at(problem, points))
+    return _linearise_at(problem, aligned, best, progress, passes)
+
+
+def linearise_known(
+    problem: Problem, aligned: Alignment, known: Points, progress: Progress | None, passes: Counter[str]
+) -> tuple[FilterPass, SmootherPass, Points]:
+    """The same about the optimum near points of another estimate, as that of the noise model."""
+    return _linearise_at(problem, aligned, _minimise(problem, known, passes), progress, passes)
+
+
+def is_clearly_worse(problem: Problem, found: Points, known: Points) -> bool:
+    """Whether the cost at some points is so much higher that they are near another, worse optimum."""
+    return not compute_cost_at(problem, found) < compute_cost_at(problem, known) + CLEARLY_BETTER  # NaN is worse
 
 
 def _linearise_far(

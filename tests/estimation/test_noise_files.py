@@ -102,6 +102,7 @@ BAD = {
         ("imu.gyro_noise'", "'imu.gyro_noise_density'"),
     ),
     "unknown key of a figure": (changed(f"{FIGURE}/sigmas", 1.0), "key.unknown", ("sigmas'", "'sigma'")),
+    "no flag": (changed("noise/searched", 1), "key.value", ("'noise.searched'", "= 1")),
     "no figure": (changed(FIGURE, {"sigma": 1.0}), "key.missing", ("log_factor",)),
     "a figure is a number": (changed(FIGURE, 2.0), "key.value", ("= 2.0",)),
     "words": (changed(f"{FIGURE}/log_factor", "1"), "key.value", ("log_factor", '"1"')),

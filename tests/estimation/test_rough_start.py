@@ -8,7 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import oracle
+import pytest
 from helpers import forget_residuals
+from test_noise_scenarios import draw_damaged
 
 import graphnav
 from graphnav.app.scores import score
@@ -18,9 +20,10 @@ from graphnav.core.rotation import exp
 from graphnav.detectors import detect
 from graphnav.estimation.alignment import align
 from graphnav.estimation.alignment.first import pick_fixes
+from graphnav.estimation.noise.files import read_noise, write_noise
 from graphnav.estimation.pipeline import choose_origin
 from graphnav.estimation.problem import build_problem
-from graphnav.estimation.relinearisation import relinearise
+from graphnav.estimation.relinearisation import is_clearly_worse, linearise_known, relinearise
 from graphnav.estimation.solvers.ekf import ekf
 from graphnav.estimation.solvers.rts import smooth_backward
 from graphnav.evaluation.metrics import summarise
@@ -54,9 +57,26 @@ def test_a_filter_that_diverges_is_taken_to_the_optimum_that_another_estimate_fo
     problem = build_problem(recording, settings, frame, start, sigma, stops)
     forward = ekf(problem, opening=aligned.until)
     smoothed = smooth_backward(problem, forward)
-    off = {}
-    for points in (None, known):
-        found = relinearise(problem, aligned, forward, smoothed, None, Counter(), points)
-        off[points is known] = [np.max(np.abs(one.states.minus(known.states)[-1, :3])) for one in found[:2]]
-    assert min(off[False]) > 1.0  # rad
-    assert max(off[True]) < 0.01
+    plain = relinearise(problem, aligned, forward, smoothed, None, Counter())
+    found = linearise_known(problem, aligned, known, None, Counter())
+    off, near = ([np.max(np.abs(one.states.minus(known.states)[-1, :3])) for one in x[:2]] for x in (plain, found))
+    assert min(off) > 1.0  # rad
+    assert max(near) < 0.01
+    assert is_clearly_worse(problem, plain[1], known)
+
+
+def test_what_is_searched_for_is_found_again(
+    shared_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A minute of a highway with wrong fixes and sigmas, whose filter ends 200 m away; and the run repeated."""
+    _, _, damaged = draw_damaged(shared_data, monkeypatch, 5150, 14)
+    settings = Settings()
+    found = graphnav.run(damaged, settings, ("ekf", "rts"))
+    noise = found["rts"].noise
+    assert noise.searched
+    kept = read_noise(write_noise(tmp_path / "noise.json", noise))
+    again = graphnav.run(damaged, settings, ("ekf", "rts"), noise=kept)
+    plain = graphnav.run(damaged, settings, ("rts",), noise=replace(kept, searched=False))["rts"]
+    for name, one in found.items():
+        np.testing.assert_array_equal(one.states.p, again[name].states.p)
+    assert np.max(np.abs(plain.states.p - found["rts"].states.p)) > 100.0

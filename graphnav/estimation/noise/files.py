@@ -90,6 +90,7 @@ _KEYS = (
     "excluded",
     "span_weights",
     "false_stops",
+    "searched",
     "spacing",
     "stamps",
     *_FREED,
@@ -129,6 +130,7 @@ def list_noise(noise: NoiseModel, mode: str = "estimated") -> dict[str, Any]:
         "stamps": {name: float(getattr(noise.stamps, name)) for name in _STAMPS},
         "span_weights": {name: [[*map(float, one)] for one in spans] for name, spans in noise.span_weights.items()},
         **({"false_stops": [[float(a), float(b)] for a, b in noise.false_stops]} if noise.false_stops else {}),
+        **({"searched": True} if noise.searched else {}),
     } | {
         key: {of: list(getattr(noise.freed[name], of)) for of in _PRIOR}
         for key, (name, *_) in _FREED.items()
@@ -246,7 +248,13 @@ class _Reader:
             {name: self.read_constant(key, values) for key, (name, *_) in _FREED.items() if key in values},
             self.read_each(values, "tails", constraints, self.read_tail),
             self.read_spans("noise.false_stops", values.get("false_stops", [])),
+            self.read_flag("noise.searched", values.get("searched", False)),
         ), mode
+
+    def read_flag(self, key: str, value: Any) -> bool:
+        if not isinstance(value, bool):
+            raise self.make_error(key, value, "must be true or false")
+        return value
 
     def make_error(self, key: str, value: Any, why: str) -> ConfigError:
         shown = json.dumps(value)

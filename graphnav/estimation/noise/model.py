@@ -84,6 +84,7 @@ class NoiseModel:
     # index of the errors of a constraint's rows (`graphnav.estimation.noise.tails`)
     tails: Mapping[str, float] = field(default_factory=dict)
     false_stops: tuple[tuple[float, float], ...] = ()  # spans (s) in which the platform moves, whatever detectors say
+    searched: bool = False  # whether initial points are searched for, because the filter's lead to a worse optimum
 
     def get_factor(self, group: str, missing: float) -> float:
         """The factor on the variance of a group.
