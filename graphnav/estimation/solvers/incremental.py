@@ -24,7 +24,7 @@ from graphnav.estimation.solvers.stages import Message, Place
 from graphnav.estimation.solvers.window import SettledStates, Window, compute_turn_limit, make_first_message
 
 _PORTIONS = 8  # of the lag: keyframes settle in groups this long
-_MAX_INTEGRATIONS = 5  # computing: about the present biases, which a second one moves no more
+_MAX_INTEGRATIONS = 5  # computing: rounds of integrating about the present biases and relinearising
 # shares of the usual limits within which keyframes have converged that settle, as they are not linearised again
 _SETTLING, _FINE = 0.25, 0.02  # and all that remain at the end
 
