@@ -28,6 +28,7 @@ from graphnav.estimation.noise import estimate
 from graphnav.estimation.noise.apply import apply_noise, drop_parts, select_weights
 from graphnav.estimation.noise.estimate import NoiseEstimate, estimate_noise
 from graphnav.estimation.noise.explanations import FIXES, WHEELS
+from graphnav.estimation.noise.information import compute_information
 from graphnav.estimation.noise.initial_points import Initial, anneal, find_initial_points
 from graphnav.estimation.noise.model import STATED, NoiseModel, RowWeights, VarianceComponent
 from graphnav.estimation.noise.moments import (
@@ -153,6 +154,27 @@ def test_moments_are_the_derivative_of_the_likelihood() -> None:
             both.append(refilter(apply_noise(base, replace(noise, figures=other)), about).log_likelihood.sum())
         slope = (both[1] - both[0]) / (2.0 * h)
         assert pytest.approx(slope, abs=2e-4 * (1.0 + A + B)) == 0.5 * (A - B), group
+
+
+def test_information_is_the_derivative_of_the_squares() -> None:
+    """dA_i / dx_j is A_i where i = j, less y^T P V_i P V_j P y twice; by central differences of A in ln f."""
+    base, opening = built(lap())
+    used, noise, about = mixed(base, opening)
+    names = list(moments(used, about))
+    forward = refilter(used, about, whole=False)
+    found = compute_information(used, forward, smooth_moments(used, forward), names)
+    A = np.array([A for A, _ in moments(used, about).values()])
+    h = 0.01
+    for j, name in enumerate(names):
+        both = []
+        for step in (-h, h):
+            other = {**noise.figures, name: VarianceComponent(noise.figures[name].log_factor + step)}
+            squares = moments(apply_noise(base, replace(noise, figures=other)), about).values()
+            both.append(np.array([A for A, _ in squares]))
+        slope = (both[1] - both[0]) / (2.0 * h)
+        slope[j] -= A[j]
+        off = np.abs(found[j] + 0.25 * slope) / np.sqrt(found[j, j] * np.diag(found))
+        assert np.max(off) < 2e-3, name
 
 
 def mixed(base: Problem, opening: float | None) -> tuple[Problem, NoiseModel, SmootherPass]:
@@ -428,6 +450,49 @@ def test_figures_are_true_within_their_sigmas(estimated: Estimated) -> None:
             for drive, found in zip(estimated.drives, estimated.found, strict=True)
         ]
         assert np.sum(np.square(z)) < chdtri(len(z), 1e-4), (name, z)
+
+
+def test_figures_drawn_from_a_prior_are_true_within_their_sigmas() -> None:
+    """Figures of all sizes, some of them hidden by others; by redundancies alone, less than half are."""
+    path = oracle.vehicle_path(duration=240, rate=50.0, seed=11)
+    z = []
+    for seed in range(6):
+        base, opening, true = drawn(path, seed)
+        figures = estimate_noise(base, opening).noise.figures
+        z += [(figures[name].log_factor - x) / figures[name].sigma for name, x in true.items()]
+    within = np.mean(np.abs(z) < 1.0)
+    assert abs(within - 0.683) < 3.0 * np.sqrt(0.683 * 0.317 / len(z)), within
+    assert np.mean(np.abs(z) < 3.0) > 0.95
+
+
+def drawn(path: oracle.ExactPath, seed: int) -> tuple[Problem, float | None, dict[str, float]]:
+    """A drive whose true log factors are drawn about their prior medians, by a factor of two in sigma."""
+    rng = np.random.default_rng([seed, 77])
+
+    def draw(name: str, median: float) -> float:
+        true[name] = median + 1.5 * rng.standard_normal()
+        return np.exp(0.5 * true[name])
+
+    true: dict[str, float] = {}
+    recording, _ = oracle.drive(path, seed=seed)
+    gnss, noise = recording.gnss, recording.imu.noise
+    assert gnss is not None
+    size = {axis: draw(f"gnss_position.{axis}", 0.0) for axis in ("horizontal", "up")}
+    stated = gnss.sd / np.array([size["horizontal"], size["horizontal"], size["up"]])
+    errors = np.zeros_like(stated)
+    for part, time in {"seconds": 3.0, "minutes": 100.0, "hours": 3600.0}.items():
+        level, up = (
+            draw(name, get_prior(name)[0] + max(0.0, true[f"gnss_position.{axis}"]))
+            for axis, name in ((axis, f"gnss_position.{part}.{axis}") for axis in size)
+        )
+        errors += markov(gnss.t, time, rng) * stated * np.array([level, level, up])
+    densities = {name: getattr(noise, name) / draw(f"imu.{name}", 0.0) for name in NOISE_FIGURES}
+    recording = replace(
+        recording,
+        gnss=replace(gnss, llh=gnss.llh + oracle.llh_rate(gnss.llh, errors), sd=stated),
+        imu=replace(recording.imu, noise=replace(noise, **densities)),
+    )
+    return *built(recording, INERTIAL), true
 
 
 def test_sigmas_of_the_drive_are_true_with_estimated_figures(

@@ -22,7 +22,8 @@ class Components:
     log: dict[str, float]
     prior_times: dict[str, float]  # s, prior medians of correlation times
     largest: dict[str, float]  # log factors at which an error is as large as such errors get
-    freedom: dict[str, float] = field(default_factory=dict)
+    freedom: dict[str, float] = field(default_factory=dict)  # redundancy B of each
+    sigmas: dict[str, float] = field(default_factory=dict)  # of their logarithms, once they have converged
     times: dict[str, float] = field(default_factory=dict)
     weights: dict[str, RowWeights] = field(default_factory=dict)
     excluded: Mapping[str, tuple[tuple[float, float], ...]] = field(default_factory=dict)
@@ -43,8 +44,8 @@ class Components:
         figures = {}
         for name, x in self.log.items():
             m, s = self.get_prior(name)
-            B = self.freedom.get(name, 0.0)
-            figures[name] = VarianceComponent(x, float((0.5 * B + s**-2.0) ** -0.5), m, s, B)
+            sigma = self.sigmas.get(name, s)
+            figures[name] = VarianceComponent(x, sigma, m, s, max(2.0 * (sigma**-2.0 - s**-2.0), 0.0))
         return NoiseModel(figures, dict(self.times), dict(self.weights), self.excluded, tails=dict(self.tails))
 
     def get_prior(self, name: str) -> tuple[float, float]:

@@ -28,6 +28,7 @@ from graphnav.constraints.base import Constraint
 from graphnav.core.rotation import Array
 from graphnav.estimation.noise.apply import apply_noise, select_weights
 from graphnav.estimation.noise.components import Components, begin_components
+from graphnav.estimation.noise.information import compute_information
 from graphnav.estimation.noise.initial_points import BREAKDOWN, find_initial_points
 from graphnav.estimation.noise.model import INTERVALS, NoiseModel, RowWeights
 from graphnav.estimation.noise.moments import (
@@ -183,9 +184,19 @@ def _iterate(
         now = float(np.sum(latest[0].log_likelihood)) + prior_then
     assert latest is not None
     evidence, passes = now - _compute_weight_cost(used, figures), round(done / total)
+    figures.sigmas = _compute_sigmas(figures, used, *latest)
     return NoiseEstimate(
         figures.build_model(), latest[1], prior_then, evidence, Counter(filter=passes, smoother=passes)
     )
+
+
+def _compute_sigmas(
+    figures: Components, used: Problem, forward: ForwardRecord, smoothed: MomentPass
+) -> dict[str, float]:
+    """1-sigma of every logarithm, whatever the others are."""
+    information = compute_information(used, forward, smoothed, tuple(figures.log))
+    information += np.diag([figures.get_prior(name)[1] ** -2.0 for name in figures.log])
+    return dict(zip(figures.log, np.sqrt(np.diag(np.linalg.inv(information))).tolist(), strict=True))
 
 
 def _compute_weight_cost(used: Problem, figures: Components) -> float:

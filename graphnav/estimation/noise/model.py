@@ -33,7 +33,7 @@ class VarianceComponent:
     sigma: float = 0.0  # 1-sigma of `log_factor`
     prior: float = 0.0  # median of the prior, log
     prior_sigma: float = 0.0
-    freedom: float = 0.0  # degrees of freedom of the data
+    freedom: float = 0.0  # degrees of freedom: of as many squares alone, its factor would be as uncertain
 
     @property
     def factor(self) -> float:

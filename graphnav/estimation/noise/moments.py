@@ -43,6 +43,7 @@ class RowMoments:
     A: Array  # (N, m) w e^2 / R
     B: Array  # (N, m) redundancy
     left_out: Array  # (N,) squared residual over its covariance, predicted without the row, at weight 1
+    error: Array  # (N, m) the component's share in the residual e
 
 
 @dataclass(frozen=True)
@@ -54,6 +55,7 @@ class ImuMoments:
     Q: Array  # (n, 4, 15, 15) what each adds to a step, as stated
     N: Array  # (n, 15, 15)
     factors: Array  # (n, 4) of these
+    disturbance: Array  # (n, 4, 15) what each adds to the error behind a step
 
     @property
     def squared(self) -> Array:
@@ -80,20 +82,22 @@ def collect_imu_moments(problem: Problem, start: Array, smoothed: MomentPass) ->
     r = (Lt @ smoothed.r[1:, :DIM, None])[..., 0]
     N = Lt @ smoothed.N[1:] @ L
     Q, factors = problem.intervals.parts[: len(r)], problem.intervals.factors[: len(r)]
-    A, B = sum_parts(Q, r, N)
-    return ImuMoments(factors * A, factors * np.maximum(B, 0.0), Q, N, factors)
+    Qr, B = sum_parts(Q, r, N)
+    disturbance = factors[..., None] * Qr
+    return ImuMoments(
+        np.sum(disturbance * r[:, None], axis=2), factors * np.maximum(B, 0.0), Q, N, factors, disturbance
+    )
 
 
 @compile_once
 def sum_parts(Q: Array, r: Array, N: Array) -> tuple[Array, Array]:
-    """r^T Q r and tr(Q N), (n, f) each, of parts Q (n, f, D, D), r (n, D) and symmetric N (n, D, D)."""
+    """Q r (n, f, D) and tr(Q N) (n, f) of parts Q (n, f, D, D), by r (n, D) and symmetric N (n, D, D)."""
     n, f, D, _ = Q.shape
-    A, B = np.empty((n, f)), np.empty((n, f))
+    Qr, B = np.empty((n, f, D)), np.empty((n, f))
     for k in range(n):
-        parts = Q[k].reshape((f, D * D))
-        A[k] = np.dot(parts, np.outer(r[k], r[k]).ravel())
-        B[k] = np.dot(parts, N[k].ravel())
-    return A, B
+        Qr[k] = np.dot(Q[k].reshape((f * D, D)), r[k]).reshape((f, D))
+        B[k] = np.dot(Q[k].reshape((f, D * D)), N[k].ravel())
+    return Qr, B
 
 
 def collect_process_moments(
@@ -134,7 +138,7 @@ def collect_row_moments(problem: Problem, rows: Constraint, smoothed: MomentPass
     # of the component that a factor scales
     share = 1.0 if rows.unscaled is None else 1.0 - rows.unscaled[:n] ** 2 / R
     A = share * w * linear.residual**2 / R
-    return RowMoments(A, share * np.where(w > 0.0, B, 0.0), left_out)
+    return RowMoments(A, share * np.where(w > 0.0, B, 0.0), left_out, share * linear.residual)
 
 
 def lag_moments(problem: Problem, chain: ParameterChain, smoothed: MomentPass, end: int) -> tuple[Array, ...]:

@@ -184,6 +184,48 @@ def cover_rows(P: Array, N: Array, H: Array, out: Array) -> None:
             out[i, j] = found[i, j]
 
 
+@compile_once
+def compare_disturbances(
+    steps: Arrays, updates: Arrays, blocks: Arrays, common: Array, driven: Array, of_driven: Array, errors: Array,
+    of_errors: Array, out: Array,
+) -> None:  # fmt: skip
+    """Fill `out` (J, J) with u_i^T S^-1 u_j, u_j (n, M, J) the innovations of the j-th of J kinds of disturbances.
+
+    Parameters
+    ----------
+    steps, updates, blocks : as of `smooth_rows`, with gains.
+    common : (n, 15, c) disturbances of the states before each keyframe, of the first c kinds.
+    driven, of_driven : (n, D-15) those of the parameters, and the kind (D-15,) of each, -1 for none.
+    errors, of_errors : (n, M) those of the rows, and the kind (n, M) of each, -1 for none.
+    """
+    F, decay = steps
+    Kt, H, _, inverse, taken, _ = updates
+    first, begin, end, _, _, _ = blocks
+    n, c, J, w, D = len(common), common.shape[2], len(out), F.shape[2], H.shape[2]
+    moved = np.zeros((D, J))
+    for k in range(n):
+        if k:
+            moved[:MOVING] = np.dot(F[k - 1, :MOVING], moved[:w])
+            for i in range(D - DIM):
+                for j in range(J):
+                    moved[DIM + i, j] *= decay[k - 1, i]
+        for i in range(DIM):
+            for j in range(c):
+                moved[i, j] += common[k, i, j]
+        for i in range(D - DIM):
+            if of_driven[i] >= 0:
+                moved[DIM + i, of_driven[i]] += driven[k, i]
+        for b in range(first[k], first[k + 1]):
+            if taken[b]:
+                lo, hi = begin[b], end[b]
+                u = np.dot(H[k, lo:hi], moved)
+                for i in range(lo, hi):
+                    if of_errors[k, i] >= 0:
+                        u[i - lo, of_errors[k, i]] += errors[k, i]
+                out += np.dot(u.T, np.dot(np.ascontiguousarray(inverse[k, lo:hi, lo:hi]), u))
+                moved -= np.dot(Kt[k, lo:hi].T, u)
+
+
 def load_compiled() -> None:
     """Load the recursions that every solver needs, and Numba's own modules with them, by calls for no keyframes."""
     v, m, c = (np.empty((0,) * n) for n in (1, 2, 3))
@@ -192,3 +234,4 @@ def load_compiled() -> None:
     filter_rows(0, 0, v, m, (c, m, m, c, m), (m, c, m, m), blocks, flags, errors, (c, m, m), updates, which)
     smooth_rows(0, 0, v, m, (c, m), updates, blocks, errors, (m, m, c, m), (c, m, c), c, which, which)
     smooth_filtered(0, 0, m, m, (c, m), c, c, c, m, which)
+    compare_disturbances((c, m), (c, c, m, c, flags, flags), blocks, c, m, which, m, which.reshape(0, 0), m)
