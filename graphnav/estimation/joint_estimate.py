@@ -121,8 +121,34 @@ def begin_jointly(
         return estimate(base, before, before.estimate.noise)
 
     first = estimate_noise(stated, opening, start, progress=progress, changed=True)
-    found = JointEstimate(stated, {}, first)
+    found = JointEstimate(stated, {}, _compare_with_worse_imu(stated, first, opening, progress))
     return _free_constants(found, settings, go_on, estimate)
+
+
+def _compare_with_worse_imu(
+    stated: Problem, found: NoiseEstimate, opening: float | None, progress: Progress | None
+) -> NoiseEstimate:
+    """The likelier of an estimate by which an aiding sensor is worse than its prior's sigma, and one that begins with
+    the IMU as many sigmas worse instead.
+
+    A bias walk that is small beside all other noise changes nothing, so that no step leads from there to an optimum at
+    which it explains everything.
+    """
+    figures = found.noise.figures
+    of_imu = {name for name in figures if name.startswith("imu.")}
+    most = max(
+        ((x.log_factor - x.prior) / x.prior_sigma for name, x in figures.items() if name not in of_imu), default=0.0
+    )
+    if most <= 1.0:
+        return found
+    worse = {
+        name: replace(x, log_factor=x.prior + (name in of_imu) * most * x.prior_sigma) for name, x in figures.items()
+    }
+    with contextlib.suppress(*BREAKDOWN):
+        other = estimate_noise(stated, opening, NoiseModel(worse), progress=progress, changed=True)
+        passes = found.passes + other.passes
+        return replace(max(found, other, key=lambda one: one.log_evidence), passes=passes)
+    return found
 
 
 def leave_out_jointly(
