@@ -128,8 +128,8 @@ def begin_jointly(
 def _compare_with_worse_imu(
     stated: Problem, found: NoiseEstimate, opening: float | None, progress: Progress | None
 ) -> NoiseEstimate:
-    """The likelier of an estimate by which an aiding sensor is worse than its prior's sigma, and one that begins with
-    the IMU as many sigmas worse instead.
+    """An estimate, or, where by it an aiding sensor is worse than its prior's sigma, one that begins with the IMU as
+    many sigmas worse instead, if that is likelier by more than chance.
 
     A bias walk that is small beside all other noise changes nothing, so that no step leads from there to an optimum at
     which it explains everything.
@@ -146,8 +146,8 @@ def _compare_with_worse_imu(
     }
     with contextlib.suppress(*BREAKDOWN):
         other = estimate_noise(stated, opening, NoiseModel(worse), progress=progress, changed=True)
-        passes = found.passes + other.passes
-        return replace(max(found, other, key=lambda one: one.log_evidence), passes=passes)
+        likelier = other.log_evidence > found.log_evidence + found.gained_by_chance
+        return replace(other if likelier else found, passes=found.passes + other.passes)
     return found
 
 

@@ -20,6 +20,7 @@ from graphnav.config import Settings, parse_settings
 from graphnav.core.earth import LocalFrame
 from graphnav.core.rotation import Array
 from graphnav.core.trajectory import Trajectory
+from graphnav.estimation.alignment.first import pick_fixes
 from graphnav.estimation.noise.apply import select_weights
 from graphnav.estimation.noise.model import NoiseModel
 from graphnav.estimation.pipeline import run
@@ -254,6 +255,21 @@ def test_an_imu_far_worse_than_stated_is_not_taken_for_bad_fixes(shared_data: Pa
     assert found is not None
     assert found.errors is not None
     assert float(np.sqrt(np.mean(found.errors.horizontal**2))) < 0.03
+
+
+def test_one_imu_row_in_eight_is_not_taken_for_bad_fixes(shared_data: Path) -> None:
+    """The accelerometer's bias walk is 90 times what it states, with fixes every ten seconds. By steps from the stated
+    figures it stays as it is, and fixes are called ten times worse than they are.
+    """
+    whole = load(shared_data / "oracle_drive").without("odometer").crop(380.0, 550.0)
+    imu, gnss = whole.imu, whole.gnss
+    assert gnss is not None
+    rare = pick_fixes(gnss, np.arange(len(gnss.t)) % 10 == 0)
+    imu = replace(imu, t=imu.t[::8], gyro=imu.gyro[::8], accel=imu.accel[::8])
+    part = replace(whole, imu=imu, gnss=rare)
+    solutions = run(part, solvers=("rts",))
+    assert times(solutions["rts"].noise, "gnss_position.horizontal") < 3.0
+    assert summarise(score(whole, part, solutions, ())[0]["rts"])["h_rms_m"] < 1.0
 
 
 def test_wheels_tell_errors_that_last_from_a_bad_imu(many_houses: tuple[Recording, dict[str, Solution]]) -> None:
