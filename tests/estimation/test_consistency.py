@@ -18,7 +18,7 @@ from graphnav.core.trajectory import Trajectory
 from graphnav.estimation.pipeline import SOLVERS, run
 from graphnav.estimation.solution import Solution
 from graphnav.recording import Recording
-from graphnav.simulation import simulate
+from graphnav.simulation import Simulated, simulate
 
 SEEDS, TOWNS = 6, 10
 RATE = 100.0  # Hz, of the truth; the IMU has a quarter of it, keyframes are a second apart
@@ -124,12 +124,18 @@ def test_with_positions_and_velocities(velocities: dict[str, Score], solver: str
     assert_consistent(velocities[solver])
 
 
-def test_simulated_towns() -> None:
+@pytest.fixture(scope="module")
+def towns() -> list[tuple[Simulated, dict[str, Solution]]]:
+    """Simulated drives through a town, and the smoother's solutions."""
+    drives = [simulate("electric", seed, duration=300.0, tunnels=0) for seed in range(TOWNS)]
+    return [(one, run(one.recording, solvers="rts")) for one in drives]
+
+
+def test_simulated_towns(towns: list[tuple[Simulated, dict[str, Solution]]]) -> None:
     """Errors of attitudes last for the whole of a drive: three numbers each."""
     found = []
-    for seed in range(TOWNS):
-        one = simulate("electric", seed, duration=300.0, tunnels=0)
-        solution = run(one.recording, solvers="rts")["rts"]
+    for one, solutions in towns:
+        solution = solutions["rts"]
         position, sd_p, rph, sd_rph = errors(solution, one.truth)
         velocity, sd_v = velocity_errors(solution, one.truth)
         found.append([np.mean((e / sd) ** 2) for e, sd in ((position, sd_p), (velocity, sd_v), (rph, sd_rph))])
@@ -139,8 +145,8 @@ def test_simulated_towns() -> None:
     assert nees[1:].min() > low, nees.round(2)  # fixes are better than stated, so positions are
 
 
-def test_between_keyframes() -> None:
+def test_between_keyframes(towns: list[tuple[Simulated, dict[str, Solution]]]) -> None:
     """At stops the velocity is known to a tenth of a millimetre a second where a row says so, and not between rows."""
-    one = simulate("electric", 4, duration=300.0, tunnels=0)
-    found = score(one.recording, one.recording, run(one.recording, solvers="rts"), ())[0]["rts"].errors
+    one, solutions = towns[4]
+    found = score(one.recording, one.recording, solutions, ())[0]["rts"].errors
     assert np.nanmean(found.nees_v) / 3.0 < 1.5

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import oracle
@@ -61,9 +62,20 @@ def state_arm(recording, off):
     return replace(recording, gnss=replace(recording.gnss, lever_arm=recording.gnss.lever_arm + off))
 
 
+@pytest.fixture(scope="module")
+def solved(drive):
+    """Recordings that contradict what they state, and what the smoother and the filter make of them."""
+    recordings = {
+        "arm": state_arm(drive, np.array([0.5, 0.0, 0.0])),
+        "clocks": stretch_stamps(drive, 2e-4),
+        "stamps": replace(drive, gnss=replace(drive.gnss, t=drive.gnss.t + 0.12)).crop(0.0, drive.duration),
+    }
+    return cache(lambda name: (recordings[name], run(recordings[name])))
+
+
 @pytest.mark.parametrize("off", [(0.5, 0.0, 0.0), (-0.3, 0.8, 0.5)])
-def test_a_drive_with_a_wrong_arm_is_solved_as_with_the_right_one(drive, right, off):
-    wrong = run(state_arm(drive, np.array(off)))
+def test_a_drive_with_a_wrong_arm_is_solved_as_with_the_right_one(drive, right, solved, off):
+    wrong = solved("arm")[1] if off == (0.5, 0.0, 0.0) else run(state_arm(drive, np.array(off)))
     stated = run(state_arm(drive, np.array(off)), noise="stated")
     for name in ("ekf", "rts", "batch"):
         assert not right[name].noise.freed
@@ -92,8 +104,8 @@ def interpolate_path(solution, begin=5.0, end=175.0):
 
 
 @pytest.mark.parametrize("rate", [2e-4, -1e-3])
-def test_clocks_that_drift_apart_are_solved_as_one_clock(drive, right, rate):
-    apart = run(stretch_stamps(drive, rate), solvers=("ekf", "rts"))
+def test_clocks_that_drift_apart_are_solved_as_one_clock(drive, right, solved, rate):
+    apart = solved("clocks")[1] if rate == 2e-4 else run(stretch_stamps(drive, rate), solvers=("ekf", "rts"))
     stated = run(stretch_stamps(drive, rate), parse_settings({"gnss": {"clock_rate_sigma": 0.0}}), ("rts",))["rts"]
     for name in ("ekf", "rts"):
         freed = apart[name].noise.freed[CLOCK_RATE]
@@ -117,13 +129,9 @@ def test_late_stamps_spoil_neither_the_start_nor_another_constant():
 
 
 @pytest.mark.parametrize("wrong", ["arm", "clocks", "stamps"])
-def test_what_was_freed_is_in_the_noise_model_of_the_run(drive, tmp_path, wrong):
-    recording = {
-        "arm": state_arm(drive, np.array([0.5, 0.0, 0.0])),
-        "clocks": stretch_stamps(drive, 2e-4),
-        "stamps": replace(drive, gnss=replace(drive.gnss, t=drive.gnss.t + 0.1)),
-    }[wrong]
-    found = run(recording, solvers=("rts",))["rts"]
+def test_what_was_freed_is_in_the_noise_model_of_the_run(solved, tmp_path, wrong):
+    recording, solutions = solved(wrong)
+    found = solutions["rts"]
     noise = read_noise(write_noise(tmp_path / "noise.json", found.noise))
     assert noise.freed == found.noise.freed
     again = run(recording, solvers=("rts",), noise=noise)["rts"]
@@ -170,9 +178,9 @@ def test_evidence_of_what_is_freed_is_that_of_the_innovations(drive, monkeypatch
 
 
 @pytest.mark.parametrize("late", [0.12, -0.2])
-def test_late_stamps_are_known_to_the_filter(drive, right, late):
+def test_late_stamps_are_known_to_the_filter(drive, right, solved, late):
     wrong = replace(drive, gnss=replace(drive.gnss, t=drive.gnss.t + late)).crop(0.0, drive.duration)
-    found = run(wrong, solvers=("ekf",))["ekf"]
+    found = (solved("stamps")[1] if late == 0.12 else run(wrong, solvers=("ekf",)))["ekf"]
     freed = found.noise.freed[TIME_OFFSET]
     assert freed.value[0] == pytest.approx(-late, abs=4.0 * freed.sigma[0])
     assert not right["ekf"].noise.freed
@@ -182,16 +190,20 @@ def test_late_stamps_are_known_to_the_filter(drive, right, late):
     )
 
 
+@pytest.fixture(scope="module")
+def wheels():
+    """A drive with wheels and without fixes for a minute, and what solvers make of it."""
+    made, _ = oracle.drive(oracle.vehicle_path(180.0, 50.0), seed=5, lever_arm=tuple(ARM), odometer_rate=20.0)
+    dark = made.without("gnss", (80.0, 140.0))
+    return dark, run(dark, solvers=("ekf", "rts"))
+
+
 @pytest.mark.parametrize("late", [-0.1, 0.2, 0.6])
-def test_an_odometer_whose_readings_are_late_is_read_earlier(drive, late):
+def test_an_odometer_whose_readings_are_late_is_read_earlier(wheels, late):
     """As accurate without fixes for a minute as if its readings were on time."""
-    wheels, _ = oracle.drive(oracle.vehicle_path(180.0, 50.0), seed=5, lever_arm=tuple(ARM), odometer_rate=20.0)
-    wheels = wheels.without("gnss", (80.0, 140.0))
-    delayed = replace(wheels, odometer=replace(wheels.odometer, t=wheels.odometer.t + late))
-    right, found, stated = (
-        run(one, solvers=("ekf", "rts"), noise=noise)
-        for one, noise in ((wheels, None), (delayed, None), (delayed, "stated"))
-    )
+    recording, right = wheels
+    delayed = replace(recording, odometer=replace(recording.odometer, t=recording.odometer.t + late))
+    found, stated = (run(delayed, solvers=("ekf", "rts"), noise=noise) for noise in (None, "stated"))
     freed = found["rts"].noise.freed
     assert set(freed) == {ODOMETER_DELAY}
     assert not right["rts"].noise.freed
@@ -204,15 +216,14 @@ def test_an_odometer_whose_readings_are_late_is_read_earlier(drive, late):
         assert apart < 0.2 * before
 
 
-def test_an_arm_that_is_wrong_in_one_number_is_not_trusted_in_the_others(drive):
+def test_an_arm_that_is_wrong_in_one_number_is_not_trusted_in_the_others(drive, right):
     """Hardly observable ones have an honest sigma, and the position with them."""
     wrong = state_arm(drive, np.array([0.5, 0.0, 0.3]))
     found = run(wrong, solvers=("rts",))["rts"]
-    right = run(drive, solvers=("rts",))["rts"]
     arm = found.parameters[LEVER_ARM]
     assert (arm.sigma[-1] > 0.001).all()
     assert (np.abs(arm.value[-1] - ARM) < 4.0 * arm.sigma[-1]).all()
-    up = np.abs(found.states.p[:, 2] - right.states.p[:, 2])
+    up = np.abs(found.states.p[:, 2] - right["rts"].states.p[:, 2])
     assert (up < 4.0 * np.sqrt(found.covariance[:, 5, 5])).all()
     late = run(replace(wrong, gnss=replace(wrong.gnss, t=wrong.gnss.t + 0.1)), solvers=("rts",))["rts"]
     assert set(late.noise.freed) == {LEVER_ARM, TIME_OFFSET}

@@ -485,9 +485,8 @@ def test_reflections_that_last_are_in_the_sigma(drive):
 
 def test_float_ambiguities_know_what_lasts_in_codes():
     """Codes of each satellite are off for minutes: their mean over a drive is no better than at an epoch."""
-    squares = []
+    squares, path = [], oracle.vehicle_path(120.0, 50.0)
     for seed in range(10):
-        path = oracle.vehicle_path(120.0, 50.0)
         made, truth = oracle.drive(path, seed=seed, gnss_velocity_sd=(0.1, 0.1, 0.1))
         recording = raw_drive.with_observations(made, path, noise=0.1, seed=seed).crop(0.0, 26.0)
         recording = with_carriers(recording, path, 0.001, seed=seed)[0]
@@ -588,22 +587,28 @@ def keep_four(raw, begin):
     return raw.take(~late | np.isin(raw.satellite, left)), left
 
 
-@pytest.mark.parametrize("which", range(4))
-@pytest.mark.parametrize("integers", [True, False])
-def test_a_slip_of_one_of_four_satellites_is_told_by_the_imu(drive, which, integers):
-    """By a cycle that no flag tells: four changes of carriers fit any displacement."""
-    recording, truth = drive
+@pytest.fixture(scope="module", params=[True, False])
+def four(drive, request):
+    """Four satellites alone from 3 s before a time on (s), their names, and what solvers make of the drive."""
+    recording, integers = drive[0], request.param
     at = recording.raw_gnss.t[0] + 15.0
     raw, left = keep_four(recording.raw_gnss, at - 3.0)
+    how = parse_settings({"noise": {"mode": "stated"}, "raw_gnss": {"integers": integers}})
+    return at, raw, left, how, run(replace(recording, raw_gnss=raw), how, ("ekf", "rts"))
+
+
+@pytest.mark.parametrize("which", range(4))
+def test_a_slip_of_one_of_four_satellites_is_told_by_the_imu(drive, four, which):
+    """By a cycle that no flag tells: four changes of carriers fit any displacement."""
+    recording, truth = drive
+    at, raw, left, how, plain = four
     slipped = replace(raw, carrier=raw.carrier + ((raw.satellite == left[which]) & (raw.t > at - 1e-3)))
     assert find_arcs(slipped, base_arc=raw.base_arc).slips == find_arcs(raw, base_arc=raw.base_arc).slips
-    how = parse_settings({"noise": {"mode": "stated"}, "raw_gnss": {"integers": integers}})
-    plain, other = (run(replace(recording, raw_gnss=one), how, ("ekf", "rts")) for one in (raw, slipped))
-    for name, one in other.items():
+    for name, one in run(replace(recording, raw_gnss=slipped), how, ("ekf", "rts")).items():
         error, sigma = errors(one, truth)[:2]
         late = one.t > at
         apart = (one.states.p - plain[name].states.p)[late, :2]
-        assert np.linalg.norm(error[late, :2] if integers else apart, axis=1).max() < 0.15, name
+        assert np.linalg.norm(error[late, :2] if how.raw_gnss.integers else apart, axis=1).max() < 0.15, name
         assert np.mean((error[late, :2] / sigma[late, :2]) ** 2) < 4.6, name  # chi-square of two, 99 %, over two
         own = one.arcs.name == f"{name_satellite(left[which])}.1C"
         assert np.abs(one.arcs.begin[own] - at).min() < 1e-3, name

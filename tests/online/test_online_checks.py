@@ -53,8 +53,6 @@ def spoil(row: Row, how: str) -> Row:
     ("how", "keys"),
     [
         ("as it is", set()),
-        ("g", {"imu.force_scale"}),
-        ("deg/s", {"imu.gyro_unit"}),
         ("lon, lat", {"gnss.left_out"}),
         ("lon, lat in Europe", {"gnss.lat_lon"}),
         ("degrees", {"gnss.left_out"}),
@@ -63,7 +61,7 @@ def spoil(row: Row, how: str) -> Row:
         ("IMU in ms", {"imu.left_out"}),
     ],
 )
-def test_a_session_in_a_wrong_unit_says_so(drive: Recording, how: str, keys: set[str]) -> None:
+def test_a_session_with_wrong_numbers_says_so(drive: Recording, how: str, keys: set[str]) -> None:
     online = Online(drop_rows(drive), QUICK)
     for row in list_rows(drive)[1]:
         online.add(spoil(row, how))
@@ -79,15 +77,25 @@ def test_a_session_in_a_wrong_unit_says_so(drive: Recording, how: str, keys: set
 def test_what_is_refused_of_a_recording_is_so_while_it_is_driven_and_at_the_end(
     drive: Recording, unit: str, key: str
 ) -> None:
+    """And nothing else is said of it."""
+
+    def find_told() -> set[str]:
+        assert session.online is not None
+        return {get_key(note) for note in session.online.notes} & TOLD
+
     session = Session(QUICK, "-", None)
     *lines, end = (line for _, line in format_lines(drive))
     session.add_lines([lines[0], *(format_line(spoil(row, unit)) for row in map(parse_row, lines[1:]) if row)])
     assert [label for label, _ in view(session)[:2]] == ["status", "refused"]
+    assert find_told() == {key}
     session.add_lines([end])
     session.finish()
     with pytest.raises(RecordingError) as error:
         session.require_result()
     assert error.value.key == key
+    assert find_told() == {key}
+    assert session.online is not None
+    assert not session.online.failures
     assert session.rows_settled
 
 

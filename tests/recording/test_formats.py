@@ -377,8 +377,10 @@ def test_real_recordings_convert_unchanged(shared_data, tmp_path):
         same_recording(read(tmp_path / name), read(shared_data / name))
 
 
-def cut_sources(folder):
+@pytest.fixture(scope="module")
+def cut_sources(tmp_path_factory):
     """A log of every text form."""
+    folder = tmp_path_factory.mktemp("whole")
     logs.write_kf_gins(folder / "kf", RECORDING, TRUTH)
     return [
         folder / "kf" / "imu.txt", folder / "kf" / "gnss.txt", folder / "kf" / "kf-gins.yaml",
@@ -389,9 +391,10 @@ def cut_sources(folder):
 
 @pytest.mark.parametrize("share", [0.0, 0.013, 0.31, 0.777, 0.99])
 @pytest.mark.parametrize("which", range(7), ids=["imu", "gnss", "yaml", "pos", "nmea", "novatel", "gnsslogger"])
-def test_a_file_that_is_cut_off_is_read_to_there_or_refused_in_a_line(tmp_path, which, share):
-    path = cut_sources(tmp_path)[which]
-    data = path.read_bytes()
+def test_a_file_that_is_cut_off_is_read_to_there_or_refused_in_a_line(cut_sources, tmp_path, which, share):
+    whole = cut_sources[which]
+    path = shutil.copytree(whole.parent, tmp_path / "cut") / whole.name
+    data = whole.read_bytes()
     path.write_bytes(data[: int(share * len(data))])
     name = ("kf-gins", "kf-gins", "kf-gins", "rtklib", "nmea", "novatel", "gnsslogger")[which]
     log, refusal = None, ""

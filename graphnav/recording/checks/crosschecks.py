@@ -159,9 +159,8 @@ def _search_shift(
 
     def correlate_all(rows: Index, lags: Array) -> Array:
         found = []
-        for r, of in lags_of_clocks.share_rows(lags, rows, valid):
-            few = len(r) < MIN_PAIRS
-            found.append(np.zeros(len(of)) if few else _correlate_each(x_at(r, of), y[r]))
+        for r, x in lags_of_clocks.sample_shared(lags, rows, x_at, valid):
+            found.append(np.zeros(len(x)) if len(r) < MIN_PAIRS else _correlate_each(x, y[r]))
         return np.concatenate(found)
 
     def correlate(lag: float, rows: Index) -> float:

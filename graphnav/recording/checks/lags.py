@@ -8,6 +8,7 @@ from the curvature at the best one: where speed hardly changes, several lags exp
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -63,12 +64,11 @@ def refine_lag(
 
     def interpolate_each(lags: Array, some: Index) -> list[_At | None]:
         every: list[_At | None] = []
-        for kept, of in share_rows(lags, some, valid):
-            if len(kept) < fewest:
-                every += [None] * len(of)
-                continue
-            x = x_at(kept, of)
+        for kept, x in sample_shared(lags, some, x_at, valid):
             L, K, m = x.shape
+            if len(kept) < fewest:
+                every += [None] * L
+                continue
             both = remove_slow(t[kept], np.column_stack([x.transpose(1, 0, 2).reshape(K, L * m), y[kept]]))
             x, left = both[:, :-1].reshape(K, L, m).transpose(1, 0, 2), both[:, -1]
             b = regress_each(x, left)
@@ -114,15 +114,23 @@ def refine_lag(
     return lag, float(max(spread, by_likelihood))
 
 
-def share_rows(lags: Array, rows: Index, valid: Callable[[float], Array]) -> Iterator[tuple[Index, Array]]:
-    """Group successive lags at which the same rows are valid: these rows, and the lags; large groups are split."""
+def sample_shared(
+    lags: Array, rows: Index, x_at: Regressors, valid: Callable[[float], Array]
+) -> Iterator[tuple[Index, Array]]:
+    """Group successive lags (L,) at which the same rows are valid: these rows (K,), and their regressors (l, K, m).
+
+    A row more or less at the ends makes a group, so regressors of many groups are sampled at once.
+    """
     inside = np.array([valid(float(lag))[rows] for lag in lags])
-    begin = 0
-    for k in range(1, len(lags) + 1):
-        full = (k - begin) * len(rows) >= _NUMBERS_AT_ONCE
-        if k == len(lags) or full or not np.array_equal(inside[k], inside[begin]):
-            yield rows[inside[begin]], lags[begin:k]
-            begin = k
+    most = max(1, _NUMBERS_AT_ONCE // max(1, len(rows)))
+    for first in range(0, len(lags), most):
+        some = inside[first : first + most]
+        kept = np.flatnonzero(some.any(axis=0))
+        x = x_at(rows[kept], lags[first : first + most]) if len(kept) else np.empty((len(some), 0, 1))
+        begins = [0, *(1 + np.flatnonzero((some[1:] != some[:-1]).any(axis=1))).tolist(), len(some)]
+        for k, end in itertools.pairwise(begins):
+            own = np.flatnonzero(some[k][kept])
+            yield rows[kept[own]], x[k:end] if len(own) == len(kept) else x[k:end].take(own, axis=1)
 
 
 def regress_each(x: Array, y: Array) -> Array:
